@@ -1,4 +1,6 @@
-"""Build step of `pyproject.toml`: states the commit of the source in a wheel and in a source archive."""
+"""Build step of `pyproject.toml`: states the commit of the source in a wheel and in a source
+archive.
+"""
 
 import sys
 from pathlib import Path
@@ -13,7 +15,9 @@ from membrane_ctrl.model import program
 
 
 def _write_commit(root: str) -> None:
-    (Path(root) / program.PACKAGE.name / program.BUILD_FILE).write_text(program.program_commit() + "\n")
+    (Path(root) / program.PACKAGE.name / program.BUILD_FILE).write_text(
+        program.program_commit() + "\n"
+    )
 
 
 class BuildWithCommit(build_py):

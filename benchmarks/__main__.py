@@ -1,6 +1,8 @@
-"""Run benchmarks, print a table each, and put the figures with the machine's description into a JSON file and a page.
+"""Run benchmarks, print a table each, and put the figures with the machine's description into a
+JSON file and a page.
 
-Each benchmark's entry carries its own date and machine, so that a part can be measured again by itself.
+Each benchmark's entry carries its own date and machine, so that a part can be measured again by
+itself.
 """
 
 from __future__ import annotations
@@ -56,17 +58,31 @@ def main(names: list[str]) -> int:
     """Run the named benchmarks, all by default; 1 if a target was missed."""
     unknown = [name for name in names if name not in NAMES]
     if unknown:
-        print(f"benchmarks: unknown {', '.join(unknown)}; known are {', '.join(NAMES)}", file=sys.stderr)
+        print(
+            f"benchmarks: unknown {', '.join(unknown)}; known are {', '.join(NAMES)}",
+            file=sys.stderr,
+        )
         return 2
-    if len(names) != 1:  # each in a process of its own: memory and compiled code of one are no figure of another
+    if (
+        len(names) != 1
+    ):  # each in a process of its own: memory and compiled code of one are no figure of another
         command = [sys.executable, "-m", "benchmarks"]
-        return max(subprocess.run([*command, name], check=False).returncode for name in names or NAMES)
+        return max(
+            subprocess.run([*command, name], check=False).returncode for name in names or NAMES
+        )
     (name,) = names
     about = machine()
     Console(width=150).print(", ".join(f"{key} {value}" for key, value in about.items()))
     figures = importlib.import_module(f"benchmarks.{name}").run()
     show(name, figures)
-    _record(name, {"date_utc": f"{datetime.now(UTC):%Y-%m-%d}", "machine": about, "figures": as_json(figures)})
+    _record(
+        name,
+        {
+            "date_utc": f"{datetime.now(UTC):%Y-%m-%d}",
+            "machine": about,
+            "figures": as_json(figures),
+        },
+    )
     print(f"written to {OUT} and {PAGE}")
     return int(any(figure.met is False for figure in figures))
 

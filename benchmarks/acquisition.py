@@ -1,7 +1,10 @@
-"""The measurement cycle on devices: an emulated GigE Vision camera at full size that sees a 60 Hz panel in the film.
+"""The measurement cycle on devices: an emulated GigE Vision camera at full size that sees a 60 Hz
+panel in the film.
 
-The camera is a real GenICam acquisition over loopback, the screen a real X display; the panel between them (refresh,
-16.7 ms latency, 12 ms first-order response) is emulated, and its settle time is measured by the camera as on a bench.
+The camera is a real GenICam acquisition over loopback, the screen a real X display; the panel
+between them (refresh,
+16.7 ms latency, 12 ms first-order response) is emulated, and its settle time is measured by the
+camera as on a bench.
 """
 
 from __future__ import annotations
@@ -61,21 +64,34 @@ class PanelScene:
         self._panel = panel
         renderer = OpticsRenderer(OPTICS, typical_film(37.1, 500.0, 1), seed=1)
         patterns = full_sequence(OPTICS.pattern)
-        self._pictures: dict[Shown, Any] = {pattern: renderer.render(pattern, 0.0).copy() for pattern in patterns}
-        self._white, self._black = self._pictures[Pattern("white")], self._pictures[Pattern("black")]
+        self._pictures: dict[Shown, Any] = {
+            pattern: renderer.render(pattern, 0.0).copy() for pattern in patterns
+        }
+        self._white, self._black = (
+            self._pictures[Pattern("white")],
+            self._pictures[Pattern("black")],
+        )
 
     def expose(self, exposure_ms: float, gain: int) -> Any:
         """One frame."""
-        lit = [(share, image) for share, image in self._panel.lit(exposure_ms / 1000.0) if share > 0.5 / 255]
+        lit = [
+            (share, image)
+            for share, image in self._panel.lit(exposure_ms / 1000.0)
+            if share > 0.5 / 255
+        ]
         if len(lit) == 1:
             return self._picture(lit[0][1])
         (newest, image), (_, before), *_ = lit
-        return cv2.addWeighted(self._picture(image), newest, self._picture(before), 1.0 - newest, 0.0)
+        return cv2.addWeighted(
+            self._picture(image), newest, self._picture(before), 1.0 - newest, 0.0
+        )
 
     def _picture(self, shown: Shown) -> Any:
         if shown not in self._pictures:
             assert isinstance(shown, float)
-            self._pictures[shown] = cv2.addWeighted(self._white, shown, self._black, 1.0 - shown, 0.0)
+            self._pictures[shown] = cv2.addWeighted(
+                self._white, shown, self._black, 1.0 - shown, 0.0
+            )
         return self._pictures[shown]
 
 
@@ -160,7 +176,9 @@ def run() -> list[Figure]:
     clock = WaitingClock(RunClock.start())
     panel: EmulatedPanel[Shown] = EmulatedPanel(PanelResponse(), clock.now)
     patterns = full_sequence(OPTICS.pattern)
-    raster = ScreenRaster(WIDTH_PX, HEIGHT_PX, PIXEL_MM, OPTICS.pattern.periods, OPTICS.pattern.period_mm)
+    raster = ScreenRaster(
+        WIDTH_PX, HEIGHT_PX, PIXEL_MM, OPTICS.pattern.periods, OPTICS.pattern.period_mm
+    )
     config = AravisCameraConfig(camera="127.0.0.1", exposure_ms=EXPOSURE_MS, packet_bytes=60_000)
     size_px = OPTICS.camera.width_px, OPTICS.camera.height_px
     with ExitStack() as stack:
@@ -171,8 +189,12 @@ def run() -> list[Figure]:
         driver = AravisCamera(config, sensor, waits)
         camera = GuardedCamera(driver, sensor, clock.now, "camera aravis")
         stack.callback(camera.close)
-        display = PygameDisplay(PygameScreenConfig(width_px=WIDTH_PX, height_px=HEIGHT_PX, pixel_mm=PIXEL_MM))
-        screen = ScreenOnPanel(PatternScreen(display, raster, patterns, waits, "screen pygame"), panel)
+        display = PygameDisplay(
+            PygameScreenConfig(width_px=WIDTH_PX, height_px=HEIGHT_PX, pixel_mm=PIXEL_MM)
+        )
+        screen = ScreenOnPanel(
+            PatternScreen(display, raster, patterns, waits, "screen pygame"), panel
+        )
         stack.callback(screen.close)
         camera.open()
         screen.screen.open()
@@ -196,7 +218,9 @@ def run() -> list[Figure]:
         return _figures(cycle, spent_s, found.settle_s, driver)
 
 
-def _figures(cycle: ShapeCycle, spent_s: dict[str, float], settle_s: float, camera: AravisCamera) -> list[Figure]:
+def _figures(
+    cycle: ShapeCycle, spent_s: dict[str, float], settle_s: float, camera: AravisCamera
+) -> list[Figure]:
     _take(cycle)  # compiles
     full_s = []
     for _ in range(3):
@@ -205,25 +229,50 @@ def _figures(cycle: ShapeCycle, spent_s: dict[str, float], settle_s: float, came
     spent_s.clear()
     fringes_s = [_take(cycle) for _ in range(CYCLES)]
     per_frame = {name: 1e3 * seconds / (8 * CYCLES) for name, seconds in spent_s.items()}
-    words = {"begin": "flip", "wait": "rest of settling", "expose": "expose", "fetch": "rest of transfer"}
+    words = {
+        "begin": "flip",
+        "wait": "rest of settling",
+        "expose": "expose",
+        "fetch": "rest of transfer",
+    }
     budget = [Figure(f"per frame: {word}", per_frame[name], "ms") for name, word in words.items()]
     total_ms = 1e3 * statistics.median(fringes_s) / 8
     return [
         Figure(
-            "settle time of the panel as measured", 1e3 * settle_s, "ms", "its model, worst phase", _true_settle_ms()
+            "settle time of the panel as measured",
+            1e3 * settle_s,
+            "ms",
+            "its model, worst phase",
+            _true_settle_ms(),
         ),
-        at_most("cycle of 8 frames, 2448 x 2048, median", statistics.median(fringes_s), "s", 1.0, "the paper", 4.0),
-        at_most("cycle of 18 frames, median", statistics.median(full_s), "s", 2.2, "the paper", 8.0),
+        at_most(
+            "cycle of 8 frames, 2448 x 2048, median",
+            statistics.median(fringes_s),
+            "s",
+            1.0,
+            "the paper",
+            4.0,
+        ),
+        at_most(
+            "cycle of 18 frames, median", statistics.median(full_s), "s", 2.2, "the paper", 8.0
+        ),
         *budget,
         Figure("per frame: reconstruct", per_frame["fringes"], "ms"),
         Figure("per frame: all", total_ms, "ms"),
-        at_most("frames lost and retaken", camera.counts.incomplete + camera.counts.missing, "of all", None),
+        at_most(
+            "frames lost and retaken",
+            camera.counts.incomplete + camera.counts.missing,
+            "of all",
+            None,
+        ),
     ]
 
 
 def _true_settle_ms() -> float:
     response = PanelResponse()
-    return 1e3 * (1 / response.refresh_hz + response.latency_s + response.tau_s * float(np.log(256)))
+    return 1e3 * (
+        1 / response.refresh_hz + response.latency_s + response.tau_s * float(np.log(256))
+    )
 
 
 def _take(cycle: ShapeCycle) -> float:

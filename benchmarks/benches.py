@@ -1,8 +1,11 @@
-"""Benches drawn at random in the second world: a hold with defaults, a whole session, a hold with what it kept.
+"""Benches drawn at random in the second world: a hold with defaults, a whole session, a hold with
+what it kept.
 
-The benches share no physics with the twin (`tests/support/second_world.py`). The session knows of them what a lab
-knows: the rate, and which sensors there are. `python -m benchmarks.benches --benches 200` examines them, one line
-each in `build/benches.jsonl`; a second call goes on where the first ended. It prints the tables of docs/tuning.md.
+The benches share no physics with the twin (`tests/support/second_world.py`). The session knows of
+them what a lab
+knows: the rate, and which sensors there are. `python -m benchmarks.benches --benches 200` examines
+them, one line each in `build/benches.jsonl`; a second call goes on where the first ended. It prints
+the tables of docs/tuning.md.
 """
 
 from __future__ import annotations
@@ -38,12 +41,14 @@ from tuning.opening import TuneOptions, TwinHold
 
 DEFAULT_FILE = Path("build/benches.jsonl")
 SETTLE_S, HOLD_S = 120.0, 600.0
-GUSTY_HOLD_S = 3600.0  # ten minutes with gusts differ from ten others by a fifth, and up to 1.7 times
+# ten minutes with gusts differ from ten others by a fifth, and up to 1.7 times
+GUSTY_HOLD_S = 3600.0
 LIMIT_UM = 10.0  # of the experiments: `tune run --limit-um`
 FRESH = 3  # benches of `make bench`, others every day
 OBEYED_MOST = 2  # refusals of a bench; what they ask for is done
 _ASKED = re.compile(
-    r"loop\.bleed_fraction larger by (?P<bleed>[\d.]+)|--limit-um (?P<limit>[\d.]+)|(?P<larger>a larger --limit-um)"
+    r"loop\.bleed_fraction larger by (?P<bleed>[\d.]+)|--limit-um "
+    r"(?P<limit>[\d.]+)|(?P<larger>a larger --limit-um)"
 )
 _SLOWER = "halve loop.kp_per_s and double loop.ti_s"
 SOUND = 1.2  # least ratio of full flow to leak of a bench that can be held
@@ -71,7 +76,13 @@ class DrawnBench:
     def plant(self, weather_seed: int) -> second_world.ForeignPlant:
         """The bench, in weather that no other bench has: what one hour shares is no proof."""
         pump = second_world.ForeignPump(
-            self.shape, self.full_um_per_s, self.delay_s, self.lag_s, self.start, self.stall, self.play
+            self.shape,
+            self.full_um_per_s,
+            self.delay_s,
+            self.lag_s,
+            self.start,
+            self.stall,
+            self.play,
         )
         return second_world.ForeignPlant(
             pump,
@@ -85,12 +96,17 @@ class DrawnBench:
 
     def config(self) -> Config:
         """The configuration of somebody who knows the rate and which sensors there are."""
-        sensors = {"feedforward_barometer": self.barometer, "feedforward_temperature": self.barometer}
+        sensors = {
+            "feedforward_barometer": self.barometer,
+            "feedforward_temperature": self.barometer,
+        }
         return second_world.foreign_config(rate_hz=self.rate_hz, **sensors)
 
 
 def drawn(seed: int) -> DrawnBench:
-    """A sound bench: gain 0.3 to 3, delay, lag, leak, laser, rate, sensors and weather at random."""
+    """A sound bench: gain 0.3 to 3, delay, lag, leak, laser, rate,
+    sensors and weather at random.
+    """
     rng = np.random.default_rng([20261122, seed])
 
     def log(low: float, high: float) -> float:
@@ -124,19 +140,22 @@ def drawn(seed: int) -> DrawnBench:
 def least_std_um(bench: DrawnBench, weather_seed: int) -> float:
     """The minimum-variance bound of this bench with its laser alone.
 
-    The centre's error is at least that of the best linear prediction of the disturbance over the dead time from the
-    readings until now (see `minimum_variance`); here the predictor is fitted to one half of the weather itself and
-    judged by the other one, as the second world's weather has no model. A finite predictor: the bound is an
-    estimate, a few per cent too high.
+    The centre's error is at least that of the best linear prediction of the disturbance over the
+    dead time from the readings until now (see `minimum_variance`); here the predictor is fitted to
+    one half of the weather itself and judged by the other one, as the second world's weather has no
+    model. A finite predictor: the bound is an estimate, a few per cent too high.
     """
     plant = bench.plant(weather_seed)
     centre_um = plant.undisturbed_um()
     step_s = 1 / bench.rate_hz
     time_s = np.arange(0.0, plant.weather_s, step_s)
-    true = np.interp(time_s, np.linspace(0, plant.weather_s, centre_um.size, endpoint=False), centre_um)
+    true = np.interp(
+        time_s, np.linspace(0, plant.weather_s, centre_um.size, endpoint=False), centre_um
+    )
     read = true + bench.laser_um * np.random.default_rng(weather_seed).standard_normal(true.size)
     ahead = max(1, round((bench.delay_s + 0.5 * step_s) * bench.rate_hz))
-    # means over spans that grow with age: the newest readings one by one, older ones in ever longer means
+    # means over spans that grow with age: the newest readings one by one, older ones in ever longer
+    # means
     edges = np.unique(np.round(np.geomspace(1, min(4096, true.size // 8), 40)).astype(int))
     total = np.concatenate(([0.0], np.cumsum(read)))
     now = np.arange(edges[-1], true.size - ahead, max(1, round(0.2 * bench.rate_hz)))
@@ -149,7 +168,9 @@ def least_std_um(bench: DrawnBench, weather_seed: int) -> float:
 
 
 def examined(bench: DrawnBench, short: bool = False) -> dict[str, Any]:
-    """Figures of one bench; a refusal or an error is a figure as well. What a refusal asks for is done."""
+    """Figures of one bench; a refusal or an error is a figure as well. What a refusal asks for is
+    done.
+    """
     found: dict[str, Any] = asdict(bench) | {"least_um": least_std_um(bench, 3), "obeyed": []}
     config, limit_um = bench.config(), LIMIT_UM
     found |= _held("default", bench, config)
@@ -166,7 +187,9 @@ def examined(bench: DrawnBench, short: bool = False) -> dict[str, Any]:
         found["obeyed"].append(found.pop("refused"))
         if asked["bleed"]:
             opened = config.loop.bleed_fraction + float(asked["bleed"])
-            config = config.model_copy(update={"loop": config.loop.model_copy(update={"bleed_fraction": opened})})
+            config = config.model_copy(
+                update={"loop": config.loop.model_copy(update={"bleed_fraction": opened})}
+            )
         else:
             limit_um = float(asked["limit"] or 1.5 * limit_um)
     return found
@@ -198,7 +221,9 @@ def _session(bench: DrawnBench, config: Config, limit_um: float, short: bool) ->
         rows = [row for each in hold for row in each.rows if row.state in (State.HOLD, State.TUNE)]
         rate = bench.rate_hz
         found["minutes"] = len(rows) / rate / 60
-        found["excursion_um"] = max((abs(row.truth_displacement_um) for row in rows[round(60 * rate) :]), default=0.0)
+        found["excursion_um"] = max(
+            (abs(row.truth_displacement_um) for row in rows[round(60 * rate) :]), default=0.0
+        )
         with contextlib.suppress(CommandError, OSError):
             found |= _kept(bench, Path(folder), config)
     return found
@@ -206,10 +231,23 @@ def _session(bench: DrawnBench, config: Config, limit_um: float, short: bool) ->
 
 def _options(config: Config, logs: Path, limit_um: float, short: bool = False) -> TuneOptions:
     return TuneOptions(
-        config=config, twin=True, where=Where(), logs=logs, session=None, name="bench", author="benchmark",
-        reason="drawn bench", limit_um=limit_um, observe_s=session.OBSERVE_S, verify_s=300.0 if short else 600.0,
-        take_over=False, yes=not short, choose="same-load" if short else "", json=False, short=short,
-    )  # fmt: skip
+        config=config,
+        twin=True,
+        where=Where(),
+        logs=logs,
+        session=None,
+        name="bench",
+        author="benchmark",
+        reason="drawn bench",
+        limit_um=limit_um,
+        observe_s=session.OBSERVE_S,
+        verify_s=300.0 if short else 600.0,
+        take_over=False,
+        yes=not short,
+        choose="same-load" if short else "",
+        json=False,
+        short=short,
+    )
 
 
 def _kept(bench: DrawnBench, logs: Path, config: Config) -> dict[str, Any]:
@@ -217,7 +255,11 @@ def _kept(bench: DrawnBench, logs: Path, config: Config) -> dict[str, Any]:
     done = session.verified_of(folder)
     gains = gains_file.load_gains(folder.file("gains.toml"))
     sigma = session.offered(folder)[1].sigma
-    found: dict[str, Any] = {"kept": done.kept, "reason": done.reason, "predicted_um": gains.predicted_std_um}
+    found: dict[str, Any] = {
+        "kept": done.kept,
+        "reason": done.reason,
+        "predicted_um": gains.predicted_std_um,
+    }
     found["predicted_sigma_um"] = sigma.std_um if sigma is not None else math.nan
     if not done.kept:
         return found
@@ -274,16 +316,24 @@ def table(rows: Sequence[dict[str, Any]]) -> str:
     lines += [f"| {word} | {words.count(word)} |" for word in sorted(set(words))]
     if ratio.size:
         lines += [
-            f"| std with defaults / bound: median, worst | {np.median(default):.2f}, {default.max():.2f} |",
-            f"| std after tuning / bound: median, worst | {np.median(ratio):.2f}, {ratio.max():.2f} |",
-            f"| predicted over achieved | {said.min():.2f} to {said.max():.2f}, median {np.median(said):.2f} |",
+            f"| std with defaults / bound: median, worst | {np.median(default):.2f}, "
+            f"{default.max():.2f} |",
+            f"| std after tuning / bound: median, worst | {np.median(ratio):.2f}, "
+            f"{ratio.max():.2f} |",
+            f"| predicted over achieved | {said.min():.2f} to {said.max():.2f}, median "
+            f"{np.median(said):.2f} |",
             f"| predicted within 20 % of achieved | {np.mean(abs(said - 1) <= 0.2):.0%} |",
             f"| achieved within 2 sigma of the prediction | {np.mean(np.abs(off) <= 2):.0%} |",
         ]
     lines.append(f"| excursion above the limit | {sum(_too_far(row) for row in rows)} |")
     lines += ["", "| bench | outcome | why |", "|---|---|---|"]
     for row in rows:
-        last = row.get("crashed") or row.get("default_error") or row.get("refused") or row.get("reason", "")
+        last = (
+            row.get("crashed")
+            or row.get("default_error")
+            or row.get("refused")
+            or row.get("reason", "")
+        )
         why = "; then: ".join([*row.get("obeyed", ()), last or "kept"])
         over = f"; excursion {row['excursion_um']:.1f} µm" if _too_far(row) else ""
         if outcome(row) != "kept" or over:
@@ -297,12 +347,18 @@ def _too_far(row: dict[str, Any]) -> bool:
 
 
 def run(count: int = FRESH) -> list[Figure]:
-    """Figures of `make bench`: benches that nobody has seen, beside the stored table of docs/tuning.md."""
+    """Figures of `make bench`: benches that nobody has seen, beside the stored table of
+    docs/tuning.md.
+    """
     first = 1000 + FRESH * datetime.now(UTC).toordinal()
     rows = [_one(seed) for seed in range(first, first + count)]
     kept = [row for row in rows if "tuned_um" in row]
     figures = [at_least("kept gains", 100 * len(kept) / count, "%", 95.0)]
-    figures.append(at_most("furthest excursion", max(row.get("excursion_um", 0.0) for row in rows), "um", LIMIT_UM))
+    figures.append(
+        at_most(
+            "furthest excursion", max(row.get("excursion_um", 0.0) for row in rows), "um", LIMIT_UM
+        )
+    )
     if kept:
         ratio = float(np.median([row["tuned_um"] / row["least_um"] for row in kept]))
         said = max(abs(row["predicted_um"] / row["tuned_um"] - 1) for row in kept)
@@ -314,7 +370,8 @@ def run(count: int = FRESH) -> list[Figure]:
 def _short(row: dict[str, Any]) -> str:
     return (
         f"{row['shape']}, {row['full_um_per_s']:.1f} against {row['leak_um_per_s']:.1f} µm/s, "
-        f"{row['delay_s']:.2f} + {row['lag_s']:.2f} s, laser {row['laser_um']:.1f} µm, {row['rate_hz']:g} Hz"
+        f"{row['delay_s']:.2f} + {row['lag_s']:.2f} s, laser {row['laser_um']:.1f} µm, "
+        f"{row['rate_hz']:g} Hz"
         f"{', gusty' if row['gusts'] else ''}"
     )
 
@@ -329,7 +386,11 @@ def main() -> None:
     parser.add_argument("--short", action="store_true")
     given = parser.parse_args()
     given.file.parent.mkdir(parents=True, exist_ok=True)
-    rows = [json.loads(line) for line in given.file.read_text().splitlines()] if given.file.exists() else []
+    rows = (
+        [json.loads(line) for line in given.file.read_text().splitlines()]
+        if given.file.exists()
+        else []
+    )
     known = {row["seed"] for row in rows}
     with Pool(given.processes) as pool, given.file.open("a", encoding="utf-8") as file:
         missing = sorted({*range(given.first, given.first + given.benches)} - known)

@@ -1,8 +1,9 @@
 """The mirror calibrates its optics: accuracy over seeds, truth of the covariance, bow.
 
-Accuracy: five sets a seed, rendered and decoded as `calibrate` does, at a quarter of the camera's resolution with the
-noise of the sixteen pixels that each large one stands for (16-bit frames). The true bench is drawn from the
-parameters' sigmas: the paper's 2 mm, 2 mm and 0.3 degrees, 0.5 degrees of screen tilt, and the other eight likewise.
+Accuracy: five sets a seed, rendered and decoded as `calibrate` does, at a quarter of the camera's
+resolution with the noise of the sixteen pixels that each large one stands for (16-bit frames). The
+true bench is drawn from the parameters' sigmas: the paper's 2 mm, 2 mm and 0.3 degrees, 0.5 degrees
+of screen tilt, and the other eight likewise.
 Covariance: a hundred seeds of traced points with the information of all pixels.
 """
 
@@ -15,7 +16,13 @@ from numpy.typing import NDArray
 
 from benchmarks.figures import Figure, at_least, at_most
 from membrane_ctrl.calibration.sets import phases_of
-from membrane_ctrl.config.optics import CameraConfig, CameraPoseConfig, GeometryConfig, OpticsConfig, ScreenPoseConfig
+from membrane_ctrl.config.optics import (
+    CameraConfig,
+    CameraPoseConfig,
+    GeometryConfig,
+    OpticsConfig,
+    ScreenPoseConfig,
+)
 from membrane_ctrl.metrology.calibrate.diagnose import suspects
 from membrane_ctrl.metrology.calibrate.parameters import ALL, NAMES, BenchGeometry, bench_at, sigmas
 from membrane_ctrl.metrology.calibrate.residuals import SetPhases, residual_mm
@@ -63,18 +70,24 @@ def _off(seed: int) -> FloatArray:
     return own * np.random.default_rng(1000 + seed).normal(size=own.size)
 
 
-def _rendered(seed: int, bow_mm: float = 0.0, shrink: int = 4) -> tuple[FilmShape, tuple[SetPhases, ...]]:
+def _rendered(
+    seed: int, bow_mm: float = 0.0, shrink: int = 4
+) -> tuple[FilmShape, tuple[SetPhases, ...]]:
     """Five sets of one seed's bench, decoded as the stated bench would."""
     values, camera = _off(seed), _camera(shrink)
     film = typical_film(37.1, 500.0, seed)
     stated = OpticsConfig(geometry=STATED, camera=camera)
-    true = OpticsConfig(geometry=_config(bench_at(Geometry.from_config(stated), values).geometry), camera=camera)
+    true = OpticsConfig(
+        geometry=_config(bench_at(Geometry.from_config(stated), values).geometry), camera=camera
+    )
     rng = np.random.default_rng(seed)
     shown = pattern_sequence("full", true.pattern)
     sets = []
     for k, moved_um in enumerate(MOVED_UM):
         # one renderer a set: its noise must be its own
-        renderer = OpticsRenderer(true, film, screen_error=ScreenError(bow_mm=bow_mm), seed=100 * seed + k)
+        renderer = OpticsRenderer(
+            true, film, screen_error=ScreenError(bow_mm=bow_mm), seed=100 * seed + k
+        )
         frames = np.stack([renderer.render(pattern, moved_um) for pattern in shown])
         reading_um = moved_um / (1 + values[NAMES.index("laser_relative")]) + rng.normal(0, 1.0)
         stack = FrameStack(frames, tuple(shown), np.full(len(shown), reading_um), {})
@@ -85,10 +98,13 @@ def _rendered(seed: int, bow_mm: float = 0.0, shrink: int = 4) -> tuple[FilmShap
 def _config(geometry: Geometry) -> GeometryConfig:
     """Poses for the twin."""
     camera = CameraPoseConfig(
-        position_mm=tuple(geometry.pinhole_mm), rotation=tuple(tuple(row) for row in geometry.rotation)
+        position_mm=tuple(geometry.pinhole_mm),
+        rotation=tuple(tuple(row) for row in geometry.rotation),
     )
     screen = ScreenPoseConfig(
-        origin_mm=tuple(geometry.screen_origin_mm), s_x=tuple(geometry.screen_s_x), s_y=tuple(geometry.screen_s_y)
+        origin_mm=tuple(geometry.screen_origin_mm),
+        s_x=tuple(geometry.screen_s_x),
+        s_y=tuple(geometry.screen_s_y),
     )
     return GeometryConfig(camera=camera, screen=screen, reference_displacement_um=0.0)
 
@@ -103,7 +119,9 @@ def _plain(problem: Problem) -> Problem:
     held = {p.name: 0.0 for p in ALL if p.name not in ("a_mm", "b_mm", "alpha_deg")}
     sets = []
     for phases, state in zip(problem.sets, first_states(problem), strict=True):
-        left = np.std(residual_mm(BenchGeometry(problem.stated), phases, state.surface, state.vertex_z_mm))
+        left = np.std(
+            residual_mm(BenchGeometry(problem.stated), phases, state.surface, state.vertex_z_mm)
+        )
         few = phases.thinned(5000)
         sets.append(
             SetPhases(
@@ -115,7 +133,9 @@ def _plain(problem: Problem) -> Problem:
                 few.displacement_um,
             )
         )
-    return Problem(problem.stated, tuple(sets), sigmas(held), References(0.0, 1.0, 1e6), problem.radius_mm)
+    return Problem(
+        problem.stated, tuple(sets), sigmas(held), References(0.0, 1.0, 1e6), problem.radius_mm
+    )
 
 
 def errors_um(surface: Surface, film: FilmShape, moved_um: float) -> tuple[float, float]:
@@ -148,18 +168,49 @@ def _accuracy() -> list[Figure]:
     for seed in range(SEEDS):
         film, sets = _rendered(seed)
         problem = _problem(sets)
-        stated = fit_on(BenchGeometry(problem.stated), sets[2], 500.0, -1e-3 * sets[2].displacement_um).surface
+        stated = fit_on(
+            BenchGeometry(problem.stated), sets[2], 500.0, -1e-3 * sets[2].displacement_um
+        ).surface
         none.append(errors_um(stated, film, MOVED_UM[2]))
         plain.append(_measured(solve(_plain(problem)), film))
         full.append(_measured(solve(problem), film))
     where = f"({SEEDS} seeds, a quarter of the resolution)"
-    rows = [at_most(f"sag error, RMS {where}", _rms(full, 0), "um", 5.0, "no calibration", _rms(none, 0))]
-    rows.append(at_most("figure error, RMS, tilt removed", _rms(full, 1), "um", 5.0, "no calibration", _rms(none, 1)))
+    rows = [
+        at_most(
+            f"sag error, RMS {where}", _rms(full, 0), "um", 5.0, "no calibration", _rms(none, 0)
+        )
+    ]
+    rows.append(
+        at_most(
+            "figure error, RMS, tilt removed",
+            _rms(full, 1),
+            "um",
+            5.0,
+            "no calibration",
+            _rms(none, 1),
+        )
+    )
     rows.append(at_most("sag error, worst seed", max(abs(s) for s, _ in full), "um"))
     rows.append(at_most("figure error, worst seed", max(f for _, f in full), "um"))
-    rows.append(at_most("plain a, b, alpha: sag error", _rms(plain, 0), "um", None, "no calibration", _rms(none, 0)))
     rows.append(
-        at_most("plain a, b, alpha: figure error", _rms(plain, 1), "um", None, "no calibration", _rms(none, 1))
+        at_most(
+            "plain a, b, alpha: sag error",
+            _rms(plain, 0),
+            "um",
+            None,
+            "no calibration",
+            _rms(none, 0),
+        )
+    )
+    rows.append(
+        at_most(
+            "plain a, b, alpha: figure error",
+            _rms(plain, 1),
+            "um",
+            None,
+            "no calibration",
+            _rms(none, 1),
+        )
     )
     return rows
 
@@ -175,8 +226,22 @@ def _bowed() -> list[Figure]:
         freed.append(errors_um(solution.states[2].surface, film, MOVED_UM[2]))
     return [
         at_least("screen bowed by 1 mm: named", told / BOWED_SEEDS, "share", 1.0),
-        at_most("... figure error with the bow freed", _rms(freed, 1), "um", 8.0, "bow held", _rms(held, 1)),
-        at_most("... sag error with the bow freed", _rms(freed, 0), "um", None, "bow held", _rms(held, 0)),
+        at_most(
+            "... figure error with the bow freed",
+            _rms(freed, 1),
+            "um",
+            8.0,
+            "bow held",
+            _rms(held, 1),
+        ),
+        at_most(
+            "... sag error with the bow freed",
+            _rms(freed, 0),
+            "um",
+            None,
+            "bow held",
+            _rms(held, 0),
+        ),
     ]
 
 
@@ -204,7 +269,9 @@ def _traced(values: FloatArray, seed: int) -> tuple[SetPhases, ...]:
     screen = ScreenPose(geometry.screen_origin_mm, geometry.screen_s_x, geometry.screen_s_y)
     rng = np.random.default_rng(seed)
     width, height = _camera(4).width_px, _camera(4).height_px
-    sigma_mm = 49.82 / (2 * np.pi) * math.sqrt(2 / 4) * _PIXEL_NOISE_ADU / 80 * math.sqrt(POINTS / _PIXELS)
+    sigma_mm = (
+        49.82 / (2 * np.pi) * math.sqrt(2 / 4) * _PIXEL_NOISE_ADU / 80 * math.sqrt(POINTS / _PIXELS)
+    )
     sets = []
     for k, moved_um in enumerate(MOVED_UM):
         count = int(POINTS / 0.43)  # share of the picture that sees the mirror

@@ -1,11 +1,13 @@
-"""Do the error bars of `calibrate` hold the truth? Random benches, wrong in everything that the budget names.
+"""Do the error bars of `calibrate` hold the truth? Random benches, wrong in everything that the
+budget names.
 
-As in `benchmarks.coverage`, whose rays and rooms these are: poses, lens, screen and laser drawn from the sigmas that
-are stated, glass, air, growth, gamma, light, blur, motion, dust, stale frames, a film of any pre-strain and Poisson
-ratio. Five sets over 8 mm are calibrated as the command does; the middle one is then measured with the new geometry.
-Benches take turns: known by rulers and data sheets; with a, b, the screen's pitch and the ring better known; by
-rulers and data sheets, with a set of a sphere in the mirror's place, whose radius, place and form are drawn as well;
-two sets only, both again with the screen on a rail, and two of the screen itself, its pitch known to 1e-4.
+As in `benchmarks.coverage`, whose rays and rooms these are: poses, lens, screen and laser drawn
+from the sigmas that are stated, glass, air, growth, gamma, light, blur, motion, dust, stale frames,
+a film of any pre-strain and Poisson ratio. Five sets over 8 mm are calibrated as the command does;
+the middle one is then measured with the new geometry. Benches take turns: known by rulers and data
+sheets; with a, b, the screen's pitch and the ring better known; by rulers and data sheets, with a
+set of a sphere in the mirror's place, whose radius, place and form are drawn as well; two sets
+only, both again with the screen on a rail, and two of the screen itself, its pitch known to 1e-4.
 `python -m benchmarks.calibration_coverage 60` adds benches to the file until there are 60.
 """
 
@@ -33,7 +35,14 @@ from benchmarks.coverage import (
     true_bench,
 )
 from benchmarks.figures import Figure, at_most
-from membrane_ctrl.calibration.sets import Bundle, CalibrateOptions, join, phases_of, phases_of_screen, problem_of
+from membrane_ctrl.calibration.sets import (
+    Bundle,
+    CalibrateOptions,
+    join,
+    phases_of,
+    phases_of_screen,
+    problem_of,
+)
 from membrane_ctrl.config.optics import CameraConfig, OpticsConfig, ScreenPoseConfig
 from membrane_ctrl.geometry.file import ScreenMovedTable, origin_of, screen_elsewhere
 from membrane_ctrl.measure.capture_set import CaptureHead, CaptureSet
@@ -86,7 +95,9 @@ def _stated(kind: int) -> tuple[OpticsConfig, float]:
     if kind == 1:
         better |= BETTER
     geometry = stated.geometry.model_copy(update=better)
-    return stated.model_copy(update={"geometry": geometry}), RADIUS_SIGMA_MM / (2 if kind == 1 else 1)
+    return stated.model_copy(update={"geometry": geometry}), RADIUS_SIGMA_MM / (
+        2 if kind == 1 else 1
+    )
 
 
 @dataclass(frozen=True)
@@ -116,24 +127,44 @@ class DrawnBench:
         room = replace(Room.drawn(rng), laser=True, held=seed % len(KINDS) == 3)
         air, glass = rng.standard_normal(2) * (sigmas.air_k_per_m, sigmas.glass_mm)
         bends = {"air_k_per_m": air, "glass_mm": abs(glass)}
-        return cls(stated, radius_sigma_mm, there.model_copy(update={"mirror": mirror}), off, film, room, bends)
+        return cls(
+            stated,
+            radius_sigma_mm,
+            there.model_copy(update={"mirror": mirror}),
+            off,
+            film,
+            room,
+            bends,
+        )
 
-    def render(self, renderer: BentRays, moved_um: float, pattern: Any, more_um: float, gain: float) -> FloatArray:
+    def render(
+        self, renderer: BentRays, moved_um: float, pattern: Any, more_um: float, gain: float
+    ) -> FloatArray:
         """A picture of the set at a displacement, as `Room.stack` asks for it."""
         return renderer.render(pattern, moved_um + more_um, gain=gain).astype(float)
 
-    def set_at(self, moved_um: float, seed: int, there: OpticsConfig | None = None) -> tuple[FrameStack, float]:
-        """The frames of a film set, and the film's true mean displacement; `there` is the bench if not its own."""
+    def set_at(
+        self, moved_um: float, seed: int, there: OpticsConfig | None = None
+    ) -> tuple[FrameStack, float]:
+        """The frames of a film set, and the film's true mean displacement; `there` is the bench if
+        not its own.
+        """
         light = Light(gamma=self.room.gamma)
         renderer = BentRays(there or self.there, self.film, light, seed=seed, **self.bends)
-        stack = self.room.stack(partial(self.render, renderer, moved_um), np.random.default_rng(seed), CAMERA)
+        stack = self.room.stack(
+            partial(self.render, renderer, moved_um), np.random.default_rng(seed), CAMERA
+        )
         readings_um = (moved_um + stack.displacement_um) / (1 + self.off["laser_relative"])
-        return FrameStack(stack.frames, stack.patterns, readings_um, {}), moved_um + self.room.mean_um
+        return FrameStack(
+            stack.frames, stack.patterns, readings_um, {}
+        ), moved_um + self.room.mean_um
 
     def sphere_set(self, seed: int) -> SetPhases:
         """What the camera sees in the sphere, which leans and is not quite as stated."""
         rng, radius_mm = np.random.default_rng(seed), SPHERE.radius_mm
-        curvature_mm = 1 / (SPHERE.curvature_per_mm + SPHERE.curvature_sigma_per_mm * rng.standard_normal())
+        curvature_mm = 1 / (
+            SPHERE.curvature_per_mm + SPHERE.curvature_sigma_per_mm * rng.standard_normal()
+        )
         form_um = 1e3 * SPHERE.form_sigma_mm * rng.standard_normal(ZERNIKE_TERMS)
         shape = leaning(curvature_mm, radius_mm, *rng.uniform(-2e-3, 2e-3, 2), form_um)
         mirror = self.stated.mirror.model_copy(
@@ -141,9 +172,13 @@ class DrawnBench:
         )
         vertex_mm = SPHERE.vertex_sigma_mm * rng.standard_normal()
         renderer = BentRays(
-            self.there.model_copy(update={"mirror": mirror}), shape, Light(gamma=self.room.gamma), 1e3 * vertex_mm,
-            seed=seed, **self.bends,
-        )  # fmt: skip
+            self.there.model_copy(update={"mirror": mirror}),
+            shape,
+            Light(gamma=self.room.gamma),
+            1e3 * vertex_mm,
+            seed=seed,
+            **self.bends,
+        )
         room = replace(self.room, moves_um=0.0, laser=False)
         stack = room.stack(partial(self.render, renderer, 0.0), rng, CAMERA)
         stated = self.stated.model_copy(update={"mirror": mirror})
@@ -152,31 +187,53 @@ class DrawnBench:
     def on_rail(self, seed: int) -> OpticsConfig:
         """The bench with its screen at the rail's other end, about as stated."""
         rng, shift_mm = np.random.default_rng(seed), np.array(RAIL.shift_mm)
-        rail, turn = (_turn(np.radians(RAIL.turn_sigma_deg) * rng.standard_normal(3)) for _ in range(2))
+        rail, turn = (
+            _turn(np.radians(RAIL.turn_sigma_deg) * rng.standard_normal(3)) for _ in range(2)
+        )
         x, y, z = (rail @ shift_mm + RAIL.shift_sigma_mm * rng.standard_normal(3)).tolist()
-        return self.there.model_copy(update={"geometry": screen_elsewhere(self.there.geometry, (x, y, z), turn)})
+        return self.there.model_copy(
+            update={"geometry": screen_elsewhere(self.there.geometry, (x, y, z), turn)}
+        )
 
     def screen_set(self, name: str, side_rad: float, seed: int) -> SetPhases:
         """What the camera sees of the screen itself, tilted to a side."""
         rng = np.random.default_rng(seed)
         pose = camera_pose(self.there.geometry)
         pinhole, (right, down, forward) = pose.position_mm, pose.rotation
-        turn = _turn(np.radians(TILT_DEG) * (math.cos(side_rad) * right + math.sin(side_rad) * down))
+        turn = _turn(
+            np.radians(TILT_DEG) * (math.cos(side_rad) * right + math.sin(side_rad) * down)
+        )
         turn = turn @ _turn(rng.uniform(0, 2 * math.pi) * forward)
-        place = {"origin_mm": pinhole + DIRECT_MM * forward, "s_x": turn @ right, "s_y": -turn @ down}
+        place = {
+            "origin_mm": pinhole + DIRECT_MM * forward,
+            "s_x": turn @ right,
+            "s_y": -turn @ down,
+        }
         screen = (self.there.geometry.screen or ScreenPoseConfig()).model_copy(
             update={key: tuple(value.tolist()) for key, value in place.items()}
         )
         geometry = self.there.geometry.model_copy(update={"screen": screen})
         there = self.there.model_copy(update={"geometry": geometry})
-        renderer = DirectRays(there, self.film, Light(gamma=self.room.gamma), seed=seed, **self.bends)
+        renderer = DirectRays(
+            there, self.film, Light(gamma=self.room.gamma), seed=seed, **self.bends
+        )
         room = replace(self.room, moves_um=0.0, laser=False)
         stack = room.stack(partial(self.render, renderer, 0.0), rng, CAMERA)
         none = np.full(len(stack.patterns), np.nan)
         head = CaptureHead(
-            Path(name), "full", None, self.stated, True, (), stack.patterns, none, none, math.nan, (),
+            Path(name),
+            "full",
+            None,
+            self.stated,
+            True,
+            (),
+            stack.patterns,
+            none,
+            none,
+            math.nan,
+            (),
             origin_of(self.stated),
-        )  # fmt: skip
+        )
         return phases_of_screen(CaptureSet(head, stack.frames, {}))
 
 
@@ -188,8 +245,12 @@ def _turn(vector: FloatArray) -> FloatArray:
 def _edges(checked: Checked, surface: Surface) -> FloatArray | None:
     """As the command finds them."""
     names = [pattern.name for pattern in checked.stack.patterns]
-    white, black = (checked.stack.frames[names.index(name)].astype(float) for name in ("white", "black"))
-    return find_edges(white - black, checked.tracer.geometry, 500.0, checked.tracer.vertex_z_mm + surface.sag_mm)
+    white, black = (
+        checked.stack.frames[names.index(name)].astype(float) for name in ("white", "black")
+    )
+    return find_edges(
+        white - black, checked.tracer.geometry, 500.0, checked.tracer.vertex_z_mm + surface.sag_mm
+    )
 
 
 def _with_more_screens(drawn: DrawnBench, sets: list[SetPhases], seed: int) -> None:
@@ -204,7 +265,9 @@ def _with_more_screens(drawn: DrawnBench, sets: list[SetPhases], seed: int) -> N
 
 
 def calibrated(drawn: DrawnBench, seed: int) -> tuple[Solution, list[float]]:
-    """The solution, and the true displacement of each set. Raises ValueError or RejectedSetError."""
+    """The solution, and the true displacement of each set.
+    Raises ValueError or RejectedSetError.
+    """
     kind, sets, edges, true_um = seed % len(KINDS), [], [], []
     for k, moved_um in enumerate(TWO_UM if kind == 3 else MOVED_UM):
         stack, mean_um = drawn.set_at(moved_um, 100 * seed + k)
@@ -218,14 +281,20 @@ def calibrated(drawn: DrawnBench, seed: int) -> tuple[Solution, list[float]]:
     if kind == 3:
         _with_more_screens(drawn, sets, 100 * seed + 10)
     bundle = Bundle(tuple(sets), drawn.stated, 0.0, edges_px=tuple(edges))
-    options = CalibrateOptions((), None, Path(), (), 1.0, False, radius_sigma_mm=drawn.radius_sigma_mm)
+    options = CalibrateOptions(
+        (), None, Path(), (), 1.0, False, radius_sigma_mm=drawn.radius_sigma_mm
+    )
     return solve(problem_of(bundle, {}, options)), true_um
 
 
 def bench(seed: int) -> dict[str, Any]:
     """Errors and claims of one bench."""
     drawn = DrawnBench.drawn(seed)
-    answer: dict[str, Any] = {"seed": seed, "kind": seed % len(KINDS), "causes": drawn.room.causes()}
+    answer: dict[str, Any] = {
+        "seed": seed,
+        "kind": seed % len(KINDS),
+        "causes": drawn.room.causes(),
+    }
     try:
         solution, true_um = calibrated(drawn, seed)
         findings = verdict.after(solution)
@@ -248,9 +317,14 @@ def bench(seed: int) -> dict[str, Any]:
 
 
 def _still(solution: Solution, index: int) -> SetPhases:
-    """A set without what its film moved from x to y, as `measure` corrects it with the new geometry."""
+    """A set without what its film moved from x to y, as `measure` corrects it with the new
+    geometry.
+    """
     phases, state = solution.problem.sets[index], solution.states[index]
-    phases, turns = phases.subset(phases.seen_with(0)), pose_derivatives(solution.problem.stated, solution.values)
+    phases, turns = (
+        phases.subset(phases.seen_with(0)),
+        pose_derivatives(solution.problem.stated, solution.values),
+    )
     parts = chunks(solution.bench, turns, phases, state.surface, state.vertex_z_mm)
     by_motion = np.concatenate([part.derivatives[:, MOTION] for part in parts], axis=1)
     return replace(phases, screen_mm=phases.screen_mm - state.motion_mm * by_motion)
@@ -270,11 +344,19 @@ def run(count: int = BENCHES) -> list[Figure]:
         for what in ("sag_um", "figure_um"):
             error, claim = np.abs([one[what] for one in good]).T
             label = f"{name}: {what[:-3]} error, RMS of {len(good)}"
-            figures.append(Figure(label, float(np.sqrt(np.mean(error**2))), "um", "claim", float(np.mean(claim))))
+            figures.append(
+                Figure(
+                    label, float(np.sqrt(np.mean(error**2))), "um", "claim", float(np.mean(claim))
+                )
+            )
             worst = f"... over the claim, worst {float(np.max(error / claim)):.1f}"
             figures.append(at_most(worst, float(np.sqrt(np.mean((error / claim) ** 2))), "", 1.3))
         z = np.concatenate([one["z"] for one in good])
-        figures.append(at_most(f"{name}: parameters' errors over sigma, worst", float(np.abs(z).max()), "", 4.0))
+        figures.append(
+            at_most(
+                f"{name}: parameters' errors over sigma, worst", float(np.abs(z).max()), "", 4.0
+            )
+        )
         figures.append(Figure("... RMS", float(np.sqrt(np.mean(z**2))), ""))
         figures.append(Figure("... refused", 100 * (1 - len(good) / len(some)), "%"))
     return figures

@@ -30,19 +30,26 @@ def run() -> list[Figure]:
 def _time(shrink: int, count: int, limit_s: float) -> list[Figure]:
     with tempfile.TemporaryDirectory() as folder:
         folders = [Path(folder) / f"{k}" for k in range(count)]
-        camera = CameraConfig(width_px=2448 // shrink, height_px=2048 // shrink, pixel_um=3.45 * shrink)
+        camera = CameraConfig(
+            width_px=2448 // shrink, height_px=2048 // shrink, pixel_um=3.45 * shrink
+        )
         optics = OpticsConfig(geometry=STATED, camera=camera)
         film = typical_film(37.1, 500.0, 1)
         for k, path in enumerate(folders):
             motion = Motion(start_um=-4000.0 + 8000.0 * k / (count - 1))
-            simulate_set(path, SimulationSpec(optics, film, motion=motion, laser_noise_um=1.0, seed=k))
+            simulate_set(
+                path, SimulationSpec(optics, film, motion=motion, laser_noise_um=1.0, seed=k)
+            )
         seconds = processors = 0.0
         for _ in range(2):  # the first compiles
             begin, busy = time.perf_counter(), time.process_time()
             options = CalibrateOptions(folders, None, Path(), (), 1.0, False)
             solve(problem_of(read_sets(folders, None), {}, options))
             seconds, processors = time.perf_counter() - begin, time.process_time() - busy
-    what = f"{count} {'full-resolution sets' if shrink == 1 else 'sets of a quarter of the resolution'}"
+    what = (
+        f"{count} "
+        f"{'full-resolution sets' if shrink == 1 else 'sets of a quarter of the resolution'}"
+    )
     return [
         at_most(f"{what}, files to geometry", seconds, "s", limit_s),
         Figure(f"{what}, CPU time", processors, "s"),

@@ -1,7 +1,9 @@
-"""Days of a mirror held by the estimate of its centre, in virtual time, in which everything happens to its sensors.
+"""Days of a mirror held by the estimate of its centre, in virtual time, in which everything happens
+to its sensors.
 
-Sensors are lost and come back, the laser is knocked and drifts, its mount and the optics' stand move with the day's
-temperature, the leak changes, the camera tracks, measures in cycles, or is switched off. Each change is judged by
+Sensors are lost and come back, the laser is knocked and drifts, its mount and the optics' stand
+move with the day's temperature, the leak changes, the camera tracks, measures in cycles, or is
+switched off. Each change is judged by
 itself: how far the mirror moved, what was told.
 
 python -m benchmarks.centre_week [--days 1] [--seeds 3]
@@ -30,12 +32,25 @@ from membrane_ctrl.sim.virtual_bench import VirtualBench
 DAY_S, RATE_HZ, TRACK_S, CYCLE_S = 86_400.0, 10.0, 0.2, 2.0
 FIRST_S = 600.0  # before the first change
 BUMP_UM = 0.3
-BEFORE_S, AFTER_S, TOLD_S = 5.0, 10.0, 120.0  # of a change: means before it, its bump, what is told of it
-STAND_UM_PER_K, STAND_TOLD_UM_PER_K, STAND_S = 0.44, 0.34, 1800.0  # what is known of the stand is 30 % wrong
+BEFORE_S, AFTER_S, TOLD_S = (
+    5.0,
+    10.0,
+    120.0,
+)  # of a change: means before it, its bump, what is told of it
+STAND_UM_PER_K, STAND_TOLD_UM_PER_K, STAND_S = (
+    0.44,
+    0.34,
+    1800.0,
+)  # what is known of the stand is 30 % wrong
 SENSORS = ("no_light", "laser_stuck", "camera_lost", "barometer_lost", "thermometer_lost")
 KINDS = (*SENSORS, "knock", "cycle", "shape_off")
-TOLD = {"no_light": "laser", "camera_lost": "optics", "shape_off": "optics", "barometer_lost": "barometer",
-        "thermometer_lost": "thermometer"}  # fmt: skip
+TOLD = {
+    "no_light": "laser",
+    "camera_lost": "optics",
+    "shape_off": "optics",
+    "barometer_lost": "barometer",
+    "thermometer_lost": "thermometer",
+}
 TOLD_AFTER_S = 10.0  # a loss that lasts longer is told
 
 
@@ -53,11 +68,17 @@ class Change:
 
     @property
     def told_once(self) -> bool:
-        """A loss and its end are told by an event each, a knock by the jump and its judgement, all else by none."""
+        """A loss and its end are told by an event each, a knock by the jump and its judgement, all
+        else by none.
+        """
         jumps = [words for words in self.held_by if ";" in words]
         if self.kind == "knock":
             return len(jumps) == 1 and self.liars == ["laser", "none"]
-        plain = [TOLD[self.kind] in words for words in self.held_by] if self.kind in TOLD else self.held_by
+        plain = (
+            [TOLD[self.kind] in words for words in self.held_by]
+            if self.kind in TOLD
+            else self.held_by
+        )
         if self.kind in TOLD and self.lasts_s > TOLD_AFTER_S:
             return plain == [not self.begins]
         return not jumps and (not plain or self.kind in TOLD)
@@ -99,7 +120,9 @@ def config_of(seed: int) -> Config:
 
 
 def _upsets(seed: int) -> Iterator[tuple[float, str, float]]:
-    """Which change begins when, and how long it lasts; the first ones are all kinds in a random order."""
+    """Which change begins when, and how long it lasts; the first ones are all kinds in a random
+    order.
+    """
     rng = np.random.default_rng([21, seed])
     at_s, first = FIRST_S, list(rng.permutation(KINDS))
     while True:
@@ -113,11 +136,18 @@ def _upsets(seed: int) -> Iterator[tuple[float, str, float]]:
         at_s += lasts_s + float(rng.uniform(300.0, 1500.0))
 
 
-def _slow(seed: int, days: float) -> tuple[DailyTemperature | PressureWeather | LaserDrift | LeakChange, ...]:
-    """What goes on beside: a day's temperature, highs and lows, a drifting mount, a leak that grows and shrinks."""
+def _slow(
+    seed: int, days: float
+) -> tuple[DailyTemperature | PressureWeather | LaserDrift | LeakChange, ...]:
+    """What goes on beside: a day's temperature, highs and lows, a drifting mount, a leak that grows
+    and shrinks.
+    """
     rng = np.random.default_rng([22, seed])
     hours = np.arange(1.0, 24.0 * days)
-    drifts = (LaserDrift(3600 * h + rng.uniform(0, 1800), float(rng.choice([-2.0, 2.0])), 600.0) for h in hours[::2])
+    drifts = (
+        LaserDrift(3600 * h + rng.uniform(0, 1800), float(rng.choice([-2.0, 2.0])), 600.0)
+        for h in hours[::2]
+    )
     leaks = (
         LeakChange(3600 * h + rng.uniform(1800, 3000), 1.5 if n % 2 == 0 else 1 / 1.5)
         for n, h in enumerate(hours[1::2])
@@ -131,7 +161,9 @@ class _Week:
     def __init__(self, days: float, seed: int) -> None:
         config = config_of(seed)
         self.bench = VirtualBench(Plant(config.twin, config.pump, _slow(seed, days)))
-        self.run = VirtualRun(config, self.bench, zernike_projection(), TruthShape(self.bench, config, seed, 0.036))
+        self.run = VirtualRun(
+            config, self.bench, zernike_projection(), TruthShape(self.bench, config, seed, 0.036)
+        )
         self.run._shape_period_s = TRACK_S
         self.day, self._rng = Day(), np.random.default_rng([23, seed])
         self._stand_k = [0.0, 0.0]
@@ -199,7 +231,9 @@ class _Week:
             self.day.notices.append(f"{now_s:.0f} s {event.name}")
         last = self._open[-1][0] if self._open else None
         if isinstance(event, HeldBy) and last:
-            last.held_by.append("; ".join(filter(None, (", ".join(event.sensors), ", ".join(event.jumped)))))
+            last.held_by.append(
+                "; ".join(filter(None, (", ".join(event.sensors), ", ".join(event.jumped))))
+            )
         if isinstance(event, Plausibility) and last:
             last.liars.append(event.faulty)
         if isinstance(event, HeldBy | Plausibility) and not last:
@@ -236,14 +270,21 @@ def figures(day: Day, count: float) -> list[Figure]:
         Figure("the same in an hour, median", day.hour_um, "um"),
         at_most("largest bump of a change", max(bumps), "um", BUMP_UM),
         at_most("changes with a larger one", sum(bump > BUMP_UM for bump in bumps), "", 0),
-        at_most("changes that are not told once", sum(not change.told_once for change in day.changes), "", 0),
+        at_most(
+            "changes that are not told once",
+            sum(not change.told_once for change in day.changes),
+            "",
+            0,
+        ),
         Figure("CPU time", day.cpu_s, "s"),
     ]
 
 
 def main() -> None:
     """Print each seed's figures, and the changes that were not bumpless."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("--days", type=float, default=1.0, help="of each seed")
     parser.add_argument("--seeds", type=int, default=3)
     parser.add_argument("--first", type=int, default=1)

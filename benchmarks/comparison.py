@@ -1,8 +1,9 @@
-"""How often `report --compare` calls alike runs different, and how often it finds a known difference.
+"""How often `report --compare` calls alike runs different, and how often it finds a known
+difference.
 
-`python -m benchmarks.comparison` prints the tables of docs/review.md. Series are 1 s means with a standard deviation
-of 1 and an exponential autocorrelation; those with excursions step away for 20 s, twice an hour on average, by up to
-six times that.
+`python -m benchmarks.comparison` prints the tables of docs/review.md. Series are 1 s means with a
+standard deviation of 1 and an exponential autocorrelation; those with excursions step away for 20
+s, twice an hour on average, by up to six times that.
 """
 
 from __future__ import annotations
@@ -28,7 +29,9 @@ def series(
     """(2, size): seconds and values."""
     keep = math.exp(-1 / memory_s) if memory_s else 0.0
     before = round(10 * memory_s)
-    values = signal.lfilter([math.sqrt(1 - keep**2)], [1.0, -keep], rng.normal(size=size + before))[before:]
+    values = signal.lfilter([math.sqrt(1 - keep**2)], [1.0, -keep], rng.normal(size=size + before))[
+        before:
+    ]
     for first in rng.integers(0, size, rng.poisson(EXCURSIONS_PER_S * size) if excursions else 0):
         values[first : first + EXCURSION_S] += rng.uniform(-6.0, 6.0)
     return np.stack((np.arange(size) + 0.5, std * values))
@@ -37,9 +40,14 @@ def series(
 def rates(
     size: int, memory_s: float, ratio: float, trials: int, excursions: bool = False, seed: int = 1
 ) -> tuple[float, float]:
-    """Share of pairs whose spreads, and whose means, are called different at `LEVEL`; they differ by `ratio`."""
+    """Share of pairs whose spreads, and whose means, are called different at `LEVEL`; they differ
+    by `ratio`.
+    """
     rng = np.random.default_rng(seed)
-    pairs = [[series(rng, size, memory_s, std, excursions) for std in (1.0, ratio)] for _ in range(trials)]
+    pairs = [
+        [series(rng, size, memory_s, std, excursions) for std in (1.0, ratio)]
+        for _ in range(trials)
+    ]
     spreads, means = ([test(a, b) < LEVEL for a, b in pairs] for test in (spread_p, mean_p))
     return float(np.mean(spreads)), float(np.mean(means))
 
@@ -51,13 +59,23 @@ def main() -> None:
     for length, size in LENGTHS_S.items():
         found = [rates(size, memory_s, 1.0, 400) for memory_s in MEMORIES_S.values()]
         found.append(rates(size, 3.0, 1.0, 400, excursions=True))
-        print(f"| {length} | " + " | ".join(f"{spread:.3f}, {mean:.3f}" for spread, mean in found) + " |")
-    print("\n| length, correlation time | " + " | ".join(f"{ratio:g} times" for ratio in RATIOS) + " |")
+        print(
+            f"| {length} | "
+            + " | ".join(f"{spread:.3f}, {mean:.3f}" for spread, mean in found)
+            + " |"
+        )
+    print(
+        "\n| length, correlation time | "
+        + " | ".join(f"{ratio:g} times" for ratio in RATIOS)
+        + " |"
+    )
     print("|---" * (len(RATIOS) + 1) + "|")
     for length, size in LENGTHS_S.items():
         for name in ("3 s", "30 s", "300 s"):
             found = [rates(size, MEMORIES_S[name], ratio, 100) for ratio in RATIOS]
-            print(f"| {length}, {name} | " + " | ".join(f"{spread:.2f}" for spread, _ in found) + " |")
+            print(
+                f"| {length}, {name} | " + " | ".join(f"{spread:.2f}" for spread, _ in found) + " |"
+            )
 
 
 if __name__ == "__main__":

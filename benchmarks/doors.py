@@ -1,11 +1,13 @@
-"""Doors beside a real `hold --twin`: ticks, memory, and how old the values are while every other side restarts.
+"""Doors beside a real `hold --twin`: ticks, memory, and how old the values are while every other
+side restarts.
 
 python -m benchmarks.doors FOLDER [--minutes 30] [--apart-minutes 10] [--raised]
 
-Phases: without doors, with doors, without doors. With doors, a client of each kind (mosquitto with aiomqtt, asyncua,
-caproto for Channel Access, p4p for PV Access) reads all names twice a second. Broker and clients are killed and
-started again four times each, then the door three times. A bare loop of the hold's rate, in a process of its own,
-tells what the machine does to any such loop. FOLDER gets the raw lines; `--tell` prints the figures from them again.
+Phases: without doors, with doors, without doors. With doors, a client of each kind (mosquitto with
+aiomqtt, asyncua, caproto for Channel Access, p4p for PV Access) reads all names twice a second.
+Broker and clients are killed and started again four times each, then the door three times. A bare
+loop of the hold's rate, in a process of its own, tells what the machine does to any such loop.
+FOLDER gets the raw lines; `--tell` prints the figures from them again.
 """
 
 from __future__ import annotations
@@ -58,7 +60,9 @@ def lines(path: Path) -> list[Line]:
     if not path.exists():
         return []
     return [
-        json.loads(line) for line in path.read_text(encoding="utf-8").splitlines(keepends=True) if line[-1] == "\n"
+        json.loads(line)
+        for line in path.read_text(encoding="utf-8").splitlines(keepends=True)
+        if line[-1] == "\n"
     ]
 
 
@@ -72,7 +76,8 @@ class Told:
         self._file.write(json.dumps({"utc_s": round(time.time(), 3)} | line) + "\n")
 
 
-# The clients: each a process that says in every sweep how old the oldest of all names is, or what failed.
+# The clients: each a process that says in every sweep how old the oldest of all names is, or what
+# failed.
 
 
 def _sweeps(tell: Told, read: Read) -> None:
@@ -133,7 +138,9 @@ def _opcua(tell: Told, ports: dict[str, int]) -> None:
             client = opened()
             space = client.get_namespace_index("urn:membrane-ctrl:mirror")
             ids = [ua.NodeId(f"mirror.{name}", space) for name in NAMES]
-            wait = client.tloop.post(client.aio_obj.uaclient.read_attributes(ids, ua.AttributeIds.Value))
+            wait = client.tloop.post(
+                client.aio_obj.uaclient.read_attributes(ids, ua.AttributeIds.Value)
+            )
             return [value.SourceTimestamp.replace(tzinfo=UTC).timestamp() for value in wait]
         except Exception:
             if open_one:
@@ -155,7 +162,8 @@ def _ca(tell: Told, ports: dict[str, int]) -> None:
 
 
 def _pva(tell: Told, _: dict[str, int]) -> None:
-    # as in a lab; through a TCP name server it would look again every 10 s only (benchmarks/epics_return.py)
+    # as in a lab; through a TCP name server it would look again every 10 s only
+    # (benchmarks/epics_return.py)
     os.environ.setdefault("EPICS_PVA_ADDR_LIST", "127.0.0.1")
     os.environ["EPICS_PVA_AUTO_ADDR_LIST"] = "NO"
     from p4p.client.thread import Context
@@ -165,7 +173,9 @@ def _pva(tell: Told, _: dict[str, int]) -> None:
 
 
 def _bare(tell: Told, _: dict[str, int]) -> None:
-    """A loop of the hold's rate that does nothing: how late it is, and what it misses, every ten seconds."""
+    """A loop of the hold's rate that does nothing: how late it is, and what it misses, every ten
+    seconds.
+    """
     deadline_s, late_ms, missed = time.monotonic(), [], 0
     while True:
         deadline_s += 1 / RATE_HZ
@@ -226,7 +236,16 @@ class Bench:
         config = ["--config", str(self._folder / "lab.toml"), "--logs", str(self._folder / "logs")]
         broker = shutil.which("mosquitto") or "/usr/sbin/mosquitto"
         command = {
-            "hold": [sys.executable, "-m", "membrane_ctrl", "hold", "--twin", *config, "--json", *more],
+            "hold": [
+                sys.executable,
+                "-m",
+                "membrane_ctrl",
+                "hold",
+                "--twin",
+                *config,
+                "--json",
+                *more,
+            ],
             "door": [sys.executable, "-m", "membrane_ctrl", "doors", *config],
             "broker": [broker, "-p", str(self._ports["mqtt"])],
         }.get(who, part)
@@ -263,7 +282,9 @@ class Bench:
         """Note the memory of door and hold, and the machine's load."""
         rss_mb = {}
         for who in {"door", "hold"} & set(self._running):
-            pages = Path(f"/proc/{self._running[who].pid}/statm").read_text(encoding="utf-8").split()[1]
+            pages = (
+                Path(f"/proc/{self._running[who].pid}/statm").read_text(encoding="utf-8").split()[1]
+            )
             rss_mb[who] = round(int(pages) * os.sysconf("SC_PAGE_SIZE") / 1e6, 2)
         self.tell(rss_mb=rss_mb, load=os.getloadavg()[0])
 
@@ -321,7 +342,9 @@ def tick_figures(folder: Path, told: list[Line]) -> list[Figure]:
     """Lateness and missed ticks of the hold in each phase, beside those of the bare loop."""
     from membrane_ctrl.run_files.run import open_run
 
-    (run_folder,) = (path for path in (folder / "logs").iterdir() if (path / "config.toml").exists())
+    (run_folder,) = (
+        path for path in (folder / "logs").iterdir() if (path / "config.toml").exists()
+    )
     run = open_run(run_folder)
     ticks = run.ticks(["time_s", "lateness_ms", "missed_ticks"])
     utc_s = ticks.column("time_s").to_numpy() + run.origin_utc.timestamp()
@@ -333,10 +356,18 @@ def tick_figures(folder: Path, told: list[Line]) -> list[Figure]:
         beside = [line for line in bare if begin <= line["utc_s"] < end]
         beside_ms = np.concatenate([line["late_ms"] for line in beside])
         load = float(np.mean([line["load"] for line in loads if begin <= line["utc_s"] < end]))
-        lost, bare_lost = int(missed[within][-1] - missed[within][0]), sum(line["missed"] for line in beside)
-        p99_ms, bare_p99_ms = float(np.percentile(late_ms[within], 99)), float(np.percentile(beside_ms, 99))
+        lost, bare_lost = (
+            int(missed[within][-1] - missed[within][0]),
+            sum(line["missed"] for line in beside),
+        )
+        p99_ms, bare_p99_ms = (
+            float(np.percentile(late_ms[within], 99)),
+            float(np.percentile(beside_ms, 99)),
+        )
         found += [
-            at_most(f"{name}: missed of {within.sum()} ticks", lost, "", None, "bare loop", bare_lost),
+            at_most(
+                f"{name}: missed of {within.sum()} ticks", lost, "", None, "bare loop", bare_lost
+            ),
             at_most(f"{name}: tick lateness p99", p99_ms, "ms", None, "bare loop", bare_p99_ms),
             at_most(f"{name}: load", load, ""),
         ]
@@ -352,11 +383,15 @@ def _good(sweep: Line) -> bool:
 
 
 def age_figures(folder: Path, told: list[Line]) -> list[Figure]:
-    """How soon each client has all names anew after a restart, and how old they become between restarts."""
+    """How soon each client has all names anew after a restart, and how old they become between
+    restarts.
+    """
     ((_, begin_s, end_s),) = (each for each in _phases(told) if each[0] == "doors")
     found = []
     for name in CLIENTS:
-        sweeps = [line for line in lines(folder / f"{name}.jsonl") if begin_s <= line["utc_s"] < end_s]
+        sweeps = [
+            line for line in lines(folder / f"{name}.jsonl") if begin_s <= line["utc_s"] < end_s
+        ]
         back_s, between, first = [], [], True
         events = [line for line in told if begin_s < line["utc_s"] < end_s]
         returns = [line["utc_s"] for line in events if name in _affected(line.get("started", ""))]
@@ -375,8 +410,12 @@ def age_figures(folder: Path, told: list[Line]) -> list[Figure]:
         old_s = max(line.get("oldest_s", float("inf")) for line in between)
         bad = sum(not _good(line) for line in between)
         found += [
-            at_most(f"{name}: slowest of {len(back_s)} returns to all names", max(back_s), "s", FRESH_S),
-            at_most(f"{name}: oldest value between restarts, {len(between)} sweeps", old_s, "s", FRESH_S),
+            at_most(
+                f"{name}: slowest of {len(back_s)} returns to all names", max(back_s), "s", FRESH_S
+            ),
+            at_most(
+                f"{name}: oldest value between restarts, {len(between)} sweeps", old_s, "s", FRESH_S
+            ),
             at_most(f"{name}: sweeps with a failure or an older value", bad, "", 0),
         ]
     return found
@@ -389,11 +428,15 @@ def memory_figures(told: list[Line]) -> list[Figure]:
     begin_s, end_s = max(zip(starts, ends, strict=True), key=lambda life: life[1] - life[0])
     found = []
     for who in ("door", "hold"):
-        at = [(line["utc_s"], line["rss_mb"][who]) for line in told if who in line.get("rss_mb", {})]
+        at = [
+            (line["utc_s"], line["rss_mb"][who]) for line in told if who in line.get("rss_mb", {})
+        ]
         part = [mb for utc_s, mb in at if begin_s + WARM_S <= utc_s < end_s]
         minutes = (end_s - begin_s - WARM_S) / 60
         name = f"{who}: memory at the end of {minutes:.0f} min with doors"
-        found.append(at_most(name, part[-1], "MB", round(1.05 * part[0], 1), "first minute", part[0]))
+        found.append(
+            at_most(name, part[-1], "MB", round(1.05 * part[0], 1), "first minute", part[0])
+        )
     return found
 
 
@@ -407,14 +450,20 @@ def figures(folder: Path) -> list[Figure]:
 
 def main() -> int:
     """The command line."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("folder", type=Path)
     parser.add_argument("--minutes", type=float, default=30.0)
     parser.add_argument("--apart-minutes", type=float, default=10.0)
     parser.add_argument(
-        "--raised", action="store_true", help="raise hold and bare loop above the machine's other work"
+        "--raised",
+        action="store_true",
+        help="raise hold and bare loop above the machine's other work",
     )
-    parser.add_argument("--tell", action="store_true", help="only the figures of a folder that was measured")
+    parser.add_argument(
+        "--tell", action="store_true", help="only the figures of a folder that was measured"
+    )
     parser.add_argument("--part", choices=PARTS, help=argparse.SUPPRESS)
     parser.add_argument("--ports", type=json.loads, help=argparse.SUPPRESS)
     options = parser.parse_args()

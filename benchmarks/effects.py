@@ -1,9 +1,9 @@
 """One effect at a time that `measure` is not told of: true error, error bar and verdict.
 
-The benches are those of `benchmarks.coverage`, rendered by the twin's ray tracer, exact but for the one effect; four
-films each, an eighth of the resolution. Effects of the light and of the film have sigmas of a hundredth, so that
-the bar is not that of the geometry. Sets have a laser unless said. `python -m benchmarks.effects` prints the table of
-docs/uncertainty.md; it takes a minute.
+The benches are those of `benchmarks.coverage`, rendered by the twin's ray tracer, exact but for the
+one effect; four films each, an eighth of the resolution. Effects of the light and of the film have
+sigmas of a hundredth, so that the bar is not that of the geometry. Sets have a laser unless said.
+`python -m benchmarks.effects` prints the table of docs/uncertainty.md; it takes a minute.
 """
 
 from __future__ import annotations
@@ -15,7 +15,15 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from benchmarks.coverage import BentRays, Room, bench_off_by, measured, quantities, stated_bench, truth_of
+from benchmarks.coverage import (
+    BentRays,
+    Room,
+    bench_off_by,
+    measured,
+    quantities,
+    stated_bench,
+    truth_of,
+)
 from membrane_ctrl.metrology.checked import RejectedSetError
 from membrane_ctrl.sim.optics.film_shape import Ripple, typical_film
 from membrane_ctrl.sim.optics.shade import Light
@@ -41,7 +49,9 @@ class Effect:
 
     @property
     def of_geometry(self) -> bool:
-        """Whether the bench itself is stated wrong: then its sigmas are those of rulers and data sheets."""
+        """Whether the bench itself is stated wrong: then its sigmas are those of rulers and data
+        sheets.
+        """
         return bool(self.off)
 
 
@@ -68,10 +78,14 @@ EFFECTS = (
 
 
 def answer(effect: Effect, seed: int) -> tuple[FloatArray, FloatArray, str, tuple[str, ...]] | str:
-    """Errors and sigmas (n,) in µm of sag, Z4..Z11 and heights, verdict and its reasons; why, if rejected."""
+    """Errors and sigmas (n,) in µm of sag, Z4..Z11 and heights, verdict and its reasons; why, if
+    rejected.
+    """
     rng, room = np.random.default_rng((19, seed)), replace(STEADY, **effect.room)
     stated = stated_bench(calibrated=not effect.of_geometry)
-    film = replace(typical_film(37.1, 500.0, seed, effect.prestrain, effect.poisson), ripples=effect.ripple)
+    film = replace(
+        typical_film(37.1, 500.0, seed, effect.prestrain, effect.poisson), ripples=effect.ripple
+    )
     renderer = BentRays(bench_off_by(stated, effect.off), film, Light(gamma=room.gamma), seed=seed)
 
     def render(pattern: Any, displacement_um: float, gain: float) -> FloatArray:
@@ -91,7 +105,12 @@ def answer(effect: Effect, seed: int) -> tuple[FloatArray, FloatArray, str, tupl
         return "quality"
     covariance = examined.budget.covariance(True) + examined.budget.covariance(False)
     sigma_mm = np.sqrt(np.einsum("ij,jk,ik->i", rows, covariance, rows))
-    return 1e3 * (rows @ full.surface.parameters - truth_mm), 1e3 * sigma_mm, verdict, tuple(examined.doubts)
+    return (
+        1e3 * (rows @ full.surface.parameters - truth_mm),
+        1e3 * sigma_mm,
+        verdict,
+        tuple(examined.doubts),
+    )
 
 
 def row(effect: Effect) -> str:
@@ -103,7 +122,11 @@ def row(effect: Effect) -> str:
         return f"| {effect.says} | - | - | - | rejected: {' / '.join(sorted(said))} |"
     errors, sigmas = (np.array([each[k] for each in good]) for k in (0, 1))
     worst = float(np.max(np.abs(errors) / sigmas))
-    cells = [f"{_rms(part[:, where]):.3g}" for where in (slice(0, 1), slice(9, None)) for part in (errors, sigmas)]
+    cells = [
+        f"{_rms(part[:, where]):.3g}"
+        for where in (slice(0, 1), slice(9, None))
+        for part in (errors, sigmas)
+    ]
     figures = f"{cells[0]}, {cells[1]} | {cells[2]}, {cells[3]} | {worst:.1f}"
     return f"| {effect.says} | {figures} | {' / '.join(sorted(said))} |"
 
@@ -113,7 +136,10 @@ def _rms(values: FloatArray) -> float:
 
 
 if __name__ == "__main__":
-    print("| effect | sag: error, sigma, µm | map: error, sigma, µm RMS | worst error / sigma | verdict |")
+    print(
+        "| effect | sag: error, sigma, µm | map: error, sigma, µm RMS | worst error / sigma "
+        "| verdict |"
+    )
     print("|---|---|---|---|---|")
     for each in EFFECTS:
         print(row(each), flush=True)

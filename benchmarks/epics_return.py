@@ -2,10 +2,11 @@
 
 python -m benchmarks.epics_return [--restarts 8] [--repeater]
 
-The clients: p4p, which looks for the door by UDP or through a TCP name server; caproto; and EPICS' own Channel Access
-library, if aioca is there (`pip install aioca`). `--repeater` runs the repeater, which passes the beacons of the door
-on to Channel Access clients; on most EPICS machines one runs. Each client reads three names, again and again; its
-time runs from the door's word that it serves to the end of the first read of values younger than 2 s.
+The clients: p4p, which looks for the door by UDP or through a TCP name server; caproto; and EPICS'
+own Channel Access library, if aioca is there (`pip install aioca`). `--repeater` runs the repeater,
+which passes the beacons of the door on to Channel Access clients; on most EPICS machines one runs.
+Each client reads three names, again and again; its time runs from the door's word that it serves to
+the end of the first read of values younger than 2 s.
 """
 
 from __future__ import annotations
@@ -41,7 +42,9 @@ def _pva(**found: str) -> Read:
 
 
 def _caproto(port: str) -> Read:
-    os.environ.update(EPICS_CA_ADDR_LIST="127.0.0.1", EPICS_CA_AUTO_ADDR_LIST="NO", EPICS_CA_SERVER_PORT=port)
+    os.environ.update(
+        EPICS_CA_ADDR_LIST="127.0.0.1", EPICS_CA_AUTO_ADDR_LIST="NO", EPICS_CA_SERVER_PORT=port
+    )
     from caproto.threading.client import Context
 
     pvs = Context(timeout=READ_S).get_pvs(*NAMES)
@@ -49,7 +52,9 @@ def _caproto(port: str) -> Read:
 
 
 def _own(port: str) -> Read:
-    os.environ.update(EPICS_CA_ADDR_LIST="127.0.0.1", EPICS_CA_AUTO_ADDR_LIST="NO", EPICS_CA_SERVER_PORT=port)
+    os.environ.update(
+        EPICS_CA_ADDR_LIST="127.0.0.1", EPICS_CA_AUTO_ADDR_LIST="NO", EPICS_CA_SERVER_PORT=port
+    )
     import aioca
 
     loop = asyncio.new_event_loop()
@@ -82,7 +87,9 @@ def be_client(name: str, out: Path, ca: str, pva: str) -> None:
 @contextlib.contextmanager
 def started(*words: object) -> Iterator[subprocess.Popen[bytes]]:
     """A program, killed at the end."""
-    process = subprocess.Popen(list(map(str, words)), stdout=subprocess.DEVNULL, stderr=subprocess.PIPE)
+    process = subprocess.Popen(
+        list(map(str, words)), stdout=subprocess.DEVNULL, stderr=subprocess.PIPE
+    )
     try:
         yield process
     finally:
@@ -92,7 +99,16 @@ def started(*words: object) -> Iterator[subprocess.Popen[bytes]]:
 
 def serving(folder: Path) -> Iterator[float]:
     """Start the door, yield when it served, and kill it; for ever."""
-    door = (sys.executable, "-m", "membrane_ctrl", "doors", "--config", folder / "lab.toml", "--logs", folder)
+    door = (
+        sys.executable,
+        "-m",
+        "membrane_ctrl",
+        "doors",
+        "--config",
+        folder / "lab.toml",
+        "--logs",
+        folder,
+    )
     while True:
         with started(*door) as process:
             assert process.stderr is not None
@@ -115,7 +131,17 @@ async def measure(restarts: int, repeater: bool, folder: Path) -> list[Figure]:
         async with port_run(folder) as run:
             task = asyncio.create_task(ticking(run))
             for name, file in files.items():
-                words = ("-m", "benchmarks.epics_return", "--client", name, "--ports", ca, pva, "--out", file)
+                words = (
+                    "-m",
+                    "benchmarks.epics_return",
+                    "--client",
+                    name,
+                    "--ports",
+                    ca,
+                    pva,
+                    "--out",
+                    file,
+                )
                 stack.enter_context(started(sys.executable, *words))
             door = serving(folder)
             for _ in range(1 + restarts):
@@ -126,7 +152,9 @@ async def measure(restarts: int, repeater: bool, folder: Path) -> list[Figure]:
     found = []
     for name, file in files.items():
         fresh_s = [line["utc_s"] for line in lines(file)]
-        after_s = [min((at - up for at in fresh_s if at > up), default=float("inf")) for up in served_s[1:]]
+        after_s = [
+            min((at - up for at in fresh_s if at > up), default=float("inf")) for up in served_s[1:]
+        ]
         median_s, worst_s = sorted(after_s)[len(after_s) // 2], max(after_s)
         found += [
             at_most(f"{name}: median return of {restarts}", median_s, "s"),
@@ -137,9 +165,13 @@ async def measure(restarts: int, repeater: bool, folder: Path) -> list[Figure]:
 
 def main() -> None:
     """The command line."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("--restarts", type=int, default=8)
-    parser.add_argument("--repeater", action="store_true", help="run a repeater of Channel Access beacons")
+    parser.add_argument(
+        "--repeater", action="store_true", help="run a repeater of Channel Access beacons"
+    )
     parser.add_argument("--client", choices=CLIENTS, help=argparse.SUPPRESS)
     parser.add_argument("--ports", nargs=2, help=argparse.SUPPRESS)
     parser.add_argument("--out", type=Path, help=argparse.SUPPRESS)

@@ -21,7 +21,9 @@ HOURS = 8.0
 REACH_S = {DOOR: 4.0, LEAK: 240.0, GLITCH: 2.0, LOST: 7.0, LATE: 12.0, JUMP: 30.0}
 
 
-def search(seed: int, scenario: str, hours: float = HOURS) -> tuple[list[Planted], list[FoundEvent]]:
+def search(
+    seed: int, scenario: str, hours: float = HOURS
+) -> tuple[list[Planted], list[FoundEvent]]:
     """Events planted in a night, and events found in it."""
     rng = np.random.default_rng(1000 + seed)
     events = planted(rng, hours)
@@ -31,16 +33,25 @@ def search(seed: int, scenario: str, hours: float = HOURS) -> tuple[list[Planted
     return events, find_events(level, shapes, Config().limits.band_um)
 
 
-def matched(events: list[Planted], found: list[FoundEvent]) -> tuple[list[Planted], list[FoundEvent]]:
+def matched(
+    events: list[Planted], found: list[FoundEvent]
+) -> tuple[list[Planted], list[FoundEvent]]:
     """Planted events not found, and found ones that nobody planted."""
     left = list(found)
     missed = []
     for event in events:
-        near = [f for f in left if f.kind == event.kind and abs(f.time_s - event.time_s) <= REACH_S[event.kind]]
+        near = [
+            f
+            for f in left
+            if f.kind == event.kind and abs(f.time_s - event.time_s) <= REACH_S[event.kind]
+        ]
         missed += [] if near else [event]
         left = [f for f in left if f not in near]
-    # side effects of an event are no false alarm: a leak step raises the noise, a lost laser ends in a spike
-    return missed, [f for f in left if not any(abs(f.time_s - e.time_s) < 900 and _echo(f, e) for e in events)]
+    # side effects of an event are no false alarm: a leak step raises the noise, a lost laser ends
+    # in a spike
+    return missed, [
+        f for f in left if not any(abs(f.time_s - e.time_s) < 900 and _echo(f, e) for e in events)
+    ]
 
 
 def _echo(found: FoundEvent, event: Planted) -> bool:
@@ -48,7 +59,9 @@ def _echo(found: FoundEvent, event: Planted) -> bool:
 
 
 def run(nights: int = 100) -> list[Figure]:
-    """Share found by kind, false alarms a night; two nights in three are typical, the others quiet."""
+    """Share found by kind, false alarms a night; two nights in three are typical,
+    the others quiet.
+    """
     total: dict[str, int] = {}
     lost: dict[str, int] = {}
     alarms = 0

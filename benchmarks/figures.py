@@ -55,14 +55,23 @@ def at_most(
     """A figure that should not be more than `limit`."""
     if limit is None:
         return Figure(name, value, unit, reference, reference_value)
-    return Figure(name, value, unit, reference, reference_value, f"<= {limit:g}", bool(value <= limit))
+    return Figure(
+        name, value, unit, reference, reference_value, f"<= {limit:g}", bool(value <= limit)
+    )
 
 
 def at_least(
-    name: str, value: float, unit: str, limit: float, reference: str = "", reference_value: float | None = None
+    name: str,
+    value: float,
+    unit: str,
+    limit: float,
+    reference: str = "",
+    reference_value: float | None = None,
 ) -> Figure:
     """A figure that should not be less than `limit`."""
-    return Figure(name, value, unit, reference, reference_value, f">= {limit:g}", bool(value >= limit))
+    return Figure(
+        name, value, unit, reference, reference_value, f">= {limit:g}", bool(value >= limit)
+    )
 
 
 def machine() -> dict[str, Any]:
@@ -91,7 +100,11 @@ def show(title: str, figures: list[Figure]) -> None:
     for column in ("figure", "value", "unit", "reference", "ratio", "target", "met"):
         table.add_column(column, justify="right" if column in {"value", "ratio"} else "left")
     for f in figures:
-        reference = f"{f.reference} {f.reference_value:.4g}" if f.reference_value is not None else f.reference
+        reference = (
+            f"{f.reference} {f.reference_value:.4g}"
+            if f.reference_value is not None
+            else f.reference
+        )
         table.add_row(
             f.name,
             f"{f.value:.4g}",

@@ -1,6 +1,8 @@
-"""The true centre in typical weather at 50 Hz and 1 µm of laser noise, in virtual time: four seeds of five minutes.
+"""The true centre in typical weather at 50 Hz and 1 µm of laser noise, in virtual time: four seeds
+of five minutes.
 
-The reference is the least standard deviation any controller could reach with the same sensors (minimum variance).
+The reference is the least standard deviation any controller could reach with the same sensors
+(minimum variance).
 """
 
 from __future__ import annotations
@@ -27,7 +29,9 @@ def run() -> list[Figure]:
                 "least",
                 s["least_std_um"],
             ),
-            at_most(f"{sensors}: standard deviation, worst seed", s["worst_std_um"], "um", limit_um),
+            at_most(
+                f"{sensors}: standard deviation, worst seed", s["worst_std_um"], "um", limit_um
+            ),
             at_most(f"{sensors}: worst |bias|", s["worst_bias_um"], "um", 0.1),
             at_least(f"{sensors}: 1 s means within +-2 µm", s["in_band_1s_fraction"], "", 1.0),
         ]

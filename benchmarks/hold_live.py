@@ -1,6 +1,8 @@
-"""The main job for two minutes in real time: lateness with the metrology busy, cycles, and the true centre.
+"""The main job for two minutes in real time: lateness with the metrology busy, cycles, and the true
+centre.
 
-The reference for lateness is a bare asyncio loop of the same rate on the same machine, measured just before.
+The reference for lateness is a bare asyncio loop of the same rate on the same machine, measured
+just before.
 """
 
 from __future__ import annotations
@@ -38,7 +40,9 @@ def hold_twin(duration_s: float, config: str = "") -> dict[str, Any]:
         path.write_text(f"[twin]\nport = 0\n{config}")
         command = [sys.executable, "-m", "membrane_ctrl", "hold", "--twin", "--config", str(path)]
         command += ["--duration", f"{duration_s}s", "--logs", folder, "--json"]
-        done = subprocess.run(command, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, text=True, check=True)
+        done = subprocess.run(
+            command, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, text=True, check=True
+        )
         summary: dict[str, Any] = json.loads(done.stdout)
         return summary
 
@@ -54,7 +58,14 @@ def run() -> list[Figure]:
         at_most("true centre, standard deviation", s["true_std_um"], "um", 0.15),
         at_most("true centre, |bias|", abs(s["true_bias_um"]), "um", 0.1),
         at_least("1 s means within +-2 µm", s["in_band_1s_fraction"], "", 1.0),
-        at_most("tick lateness p99, metrology busy", late["p99"], "ms", 5.0, "bare asyncio loop", bare_p99_ms),
+        at_most(
+            "tick lateness p99, metrology busy",
+            late["p99"],
+            "ms",
+            5.0,
+            "bare asyncio loop",
+            bare_p99_ms,
+        ),
         at_most("ticks lost", s["missed_ticks"], "", 0, "ticks", s["ticks"]),
         at_most("standby to hold", entered_s["hold"] - entered_s["check"], "s", 15.0),
         at_least("shape cycles", s["cycles"], "", 1),

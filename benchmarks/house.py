@@ -1,7 +1,10 @@
-"""Figures of the house: its size and its order; `python -m benchmarks.house` prints both and judges the order.
+"""Figures of the house: its size and its order; `python -m benchmarks.house` prints both and judges
+the order.
 
-A *room* is a package directly under `membrane_ctrl`, a loose module there, `firmware_iface` or `tuning`. A room's
-*floor* is one above the highest floor that it imports from; rooms that import each other in a circle share one.
+A *room* is a package directly under `membrane_ctrl`, a loose module there, `firmware_iface` or
+`tuning`. A room's
+*floor* is one above the highest floor that it imports from; rooms that import each other in a
+circle share one.
 """
 
 from __future__ import annotations
@@ -42,7 +45,9 @@ class Module:
 
     @property
     def room(self) -> str:
-        """Where it lives: `membrane_ctrl/<package or loose module>`, `firmware_iface` or `tuning`."""
+        """Where it lives: `membrane_ctrl/<package or loose module>`,
+        `firmware_iface` or `tuning`.
+        """
         parts = self.name.split(".")
         return "/".join(parts[:2]) if parts[0] == "membrane_ctrl" else parts[0]
 
@@ -60,9 +65,12 @@ class HouseFigures:
     largest_circle: int
 
 
-# The size has no limit: a module is as large as its concept. The order has: rooms must not import each other in a
-# circle, `docs/architecture.md` explains nine floors, and a loose module belongs to no room. More than 6 %
-# of the lines as imports means that concepts are spread over too many modules; a concept a module has 5 %.
+# The size has no limit: a module is as large as its concept. The order has: rooms must not import
+# each other in a circle, `docs/architecture.md` explains nine floors, and a loose module belongs to
+# no room. More than 6 % of the lines as imports means that concepts are spread over too many
+# modules; a concept a
+# module
+# has 5 %.
 ORDER_LIMITS = {"import_percent": 6.0, "loose": 3, "floors": 9, "largest_circle": 1}
 
 
@@ -94,7 +102,9 @@ def module_of(name: str, known: frozenset[str]) -> str | None:
 def modules(root: Path = ROOT) -> dict[str, Module]:
     """Read every module of the product; keys are dotted names."""
     paths = {
-        ".".join(p.relative_to(root).with_suffix("").parts): p for top in TOPS for p in (root / top).rglob("*.py")
+        ".".join(p.relative_to(root).with_suffix("").parts): p
+        for top in TOPS
+        for p in (root / top).rglob("*.py")
     }
     known = frozenset(paths)
     found = {}
@@ -102,14 +112,18 @@ def modules(root: Path = ROOT) -> dict[str, Module]:
         text = path.read_text(encoding="utf-8")
         tree = ast.parse(text)
         targets = frozenset(target for full in imported(tree) if (target := module_of(full, known)))
-        import_lines = sum(node.end_lineno - node.lineno + 1 for node in import_nodes(tree) if node.end_lineno)
+        import_lines = sum(
+            node.end_lineno - node.lineno + 1 for node in import_nodes(tree) if node.end_lineno
+        )
         found[name] = Module(name, path, text.count("\n"), import_lines, targets)
     return found
 
 
 def rooms(found: dict[str, Module]) -> dict[str, set[str]]:
     """Return the rooms that each room imports from."""
-    edges: dict[str, set[str]] = {module.room: set() for module in found.values() if "__init__" not in module.room}
+    edges: dict[str, set[str]] = {
+        module.room: set() for module in found.values() if "__init__" not in module.room
+    }
     for module in found.values():
         targets = {found[name].room for name in module.imports} - {module.room}
         edges.setdefault(module.room, set()).update(t for t in targets if "__init__" not in t)
@@ -128,7 +142,10 @@ def circle_of(edges: dict[str, set[str]]) -> dict[str, frozenset[str]]:
         return seen
 
     reach = {room: reached(room) for room in edges}
-    return {room: frozenset({room} | {other for other in reach[room] if room in reach[other]}) for room in edges}
+    return {
+        room: frozenset({room} | {other for other in reach[room] if room in reach[other]})
+        for room in edges
+    }
 
 
 def floors(edges: dict[str, set[str]]) -> dict[str, int]:
@@ -137,7 +154,9 @@ def floors(edges: dict[str, set[str]]) -> dict[str, int]:
 
     @cache
     def floor(circle: frozenset[str]) -> int:
-        return 1 + max((floor(circles[t]) for room in circle for t in edges[room] - circle), default=0)
+        return 1 + max(
+            (floor(circles[t]) for room in circle for t in edges[room] - circle), default=0
+        )
 
     return {room: floor(circle) for room, circle in circles.items()}
 

@@ -1,6 +1,7 @@
 """The inner loop on the simulated bench, in virtual time: the true motion of the centre.
 
-`run()` gives the figures, `python -m benchmarks.inner_loop` prints them as the tables of docs/control.md.
+`run()` gives the figures, `python -m benchmarks.inner_loop` prints them as the tables of
+docs/control.md.
 """
 
 from __future__ import annotations
@@ -21,7 +22,11 @@ from membrane_ctrl.sim.surroundings import AmbientChange, BenchEvent, LeakChange
 
 SETTLED_S = 40.0
 SCENARIOS = ("quiet", "typical", "gusty")
-SENSORS = {"laser": (False, False), "barometer": (True, False), "barometer and thermometer": (True, True)}
+SENSORS = {
+    "laser": (False, False),
+    "barometer": (True, False),
+    "barometer and thermometer": (True, True),
+}
 LEAK_TIME_CONSTANTS_S = (1e4, 2e4, 3e4, 5e4, 1e5)
 
 Array = NDArray[np.float64]
@@ -52,7 +57,9 @@ def hold(
     target_um: Callable[[float], float] = lambda time_s: 0.0,
     true_pump: PumpConfig = PumpConfig(),  # noqa: B008 (frozen)
 ) -> HeldRun:
-    """Hold the simulated mirror; `lost_s` is a span without readings, `true_pump` a pump unknown to the loop."""
+    """Hold the simulated mirror; `lost_s` is a span without readings, `true_pump` a pump unknown to
+    the loop.
+    """
     plant, controller = Plant(twin, true_pump, events), InnerLoop(loop, PumpConfig())
     dt_s = 1 / loop.rate_hz
     controller.start(plant.sample().displacement_um, plant.truth().leak_um_per_s)
@@ -69,7 +76,9 @@ def hold(
         plant.actuate(out.pump_fraction, loop.bleed_fraction)
         true_um = plant.truth().displacement_um
         plant.advance(dt_s - WRITE_S)
-        rows.append((now_s, true_um, out.setpoint_um, out.flow_um_per_s, out.leak_um_per_s, out.too_tight))
+        rows.append(
+            (now_s, true_um, out.setpoint_um, out.flow_um_per_s, out.leak_um_per_s, out.too_tight)
+        )
     columns = np.array(rows).T
     return HeldRun(*columns[:5], too_tight=columns[5].astype(bool))
 
@@ -77,11 +86,17 @@ def hold(
 def _configs(sensors: str, scenario: str, seed: int, **twin: Any) -> tuple[LoopConfig, TwinConfig]:
     barometer, thermometer = SENSORS[sensors]
     loop = LoopConfig(feedforward_barometer=barometer, feedforward_temperature=thermometer)
-    return loop, TwinConfig.model_validate({"scenario": scenario, "seed": seed, "start_error_um": 0.0} | twin)
+    return loop, TwinConfig.model_validate(
+        {"scenario": scenario, "seed": seed, "start_error_um": 0.0} | twin
+    )
 
 
-def steady(sensors: str, scenario: str, seeds: Sequence[int], duration_s: float, **twin: Any) -> dict[str, float]:
-    """Statistics of the true centre after settling; the bias is setpoint minus truth, as everywhere."""
+def steady(
+    sensors: str, scenario: str, seeds: Sequence[int], duration_s: float, **twin: Any
+) -> dict[str, float]:
+    """Statistics of the true centre after settling; the bias is setpoint minus truth, as
+    everywhere.
+    """
     runs = []
     for seed in seeds:
         loop, bench = _configs(sensors, scenario, seed, **twin)
@@ -89,7 +104,9 @@ def steady(sensors: str, scenario: str, seeds: Sequence[int], duration_s: float,
         true_um = held.after(SETTLED_S)
         ticks = round(loop.rate_hz)
         means_um = true_um[: true_um.size // ticks * ticks].reshape(-1, ticks).mean(axis=1)
-        runs.append((true_um.std(), -true_um.mean(), np.mean(np.abs(means_um) <= 2.0), held.too_tight[-1]))
+        runs.append(
+            (true_um.std(), -true_um.mean(), np.mean(np.abs(means_um) <= 2.0), held.too_tight[-1])
+        )
     std_um, bias_um, in_band, too_tight = np.array(runs, dtype=float).T
     return {
         "std_um": float(np.sqrt(np.mean(std_um**2))),
@@ -102,7 +119,9 @@ def steady(sensors: str, scenario: str, seeds: Sequence[int], duration_s: float,
     }
 
 
-def answer(sensors: str, event: BenchEvent, seeds: Sequence[int], near_um: float) -> dict[str, float]:
+def answer(
+    sensors: str, event: BenchEvent, seeds: Sequence[int], near_um: float
+) -> dict[str, float]:
     """Peak of the true centre after an event at 60 s, and the time until it stays near."""
     peaks_um, back_s = [], []
     for seed in seeds:
@@ -111,14 +130,20 @@ def answer(sensors: str, event: BenchEvent, seeds: Sequence[int], near_um: float
         away = np.flatnonzero(np.abs(true_um) > near_um)
         peaks_um.append(np.abs(true_um).max())
         back_s.append(0.0 if away.size == 0 else (away[-1] + 1) / 50.0)
-    return {"peak_um": float(np.mean(peaks_um)), "worst_peak_um": float(max(peaks_um)), "back_s": float(max(back_s))}
+    return {
+        "peak_um": float(np.mean(peaks_um)),
+        "worst_peak_um": float(max(peaks_um)),
+        "back_s": float(max(back_s)),
+    }
 
 
 def lost_reading(sensors: str, seeds: Sequence[int], seconds: float = 10.0) -> dict[str, float]:
     """Largest excursion of the true centre when the reading is lost in typical weather."""
     peaks_um = []
     for seed in seeds:
-        held = hold(*_configs(sensors, "typical", seed), 70.0 + seconds, lost_s=(60.0, 60.0 + seconds))
+        held = hold(
+            *_configs(sensors, "typical", seed), 70.0 + seconds, lost_s=(60.0, 60.0 + seconds)
+        )
         peaks_um.append(float(np.abs(held.after(60.0)).max()))
     return {"mean_um": float(np.mean(peaks_um)), "worst_um": max(peaks_um)}
 
@@ -127,7 +152,9 @@ def start_up(seeds: Sequence[int]) -> dict[str, float]:
     """From 25 µm off: time until the true centre stays within 2 µm, and the overshoot."""
     times_s, over_um = [], []
     for seed in seeds:
-        held = hold(*_configs("barometer and thermometer", "typical", seed, start_error_um=-25.0), 40.0)
+        held = hold(
+            *_configs("barometer and thermometer", "typical", seed, start_error_um=-25.0), 40.0
+        )
         away = np.flatnonzero(np.abs(held.true_um) > 2.0)
         times_s.append(held.time_s[away[-1]])
         over_um.append(held.true_um.max())
@@ -145,7 +172,9 @@ def run(seeds: int = 4, duration_s: float = 300.0) -> dict[str, Any]:
         "10 s without a reading": {k: lost_reading(k, many) for k in SENSORS},
         "start": start_up(few),
         "tight": {
-            f"{1.24e4 / t:.2f}": steady(list(SENSORS)[2], "typical", few, duration_s, leak_time_constant_s=t)
+            f"{1.24e4 / t:.2f}": steady(
+                list(SENSORS)[2], "typical", few, duration_s, leak_time_constant_s=t
+            )
             for t in LEAK_TIME_CONSTANTS_S
         },
     }
@@ -153,7 +182,10 @@ def run(seeds: int = 4, duration_s: float = 300.0) -> dict[str, Any]:
 
 def _print(figures: dict[str, Any]) -> None:
     head = (
-        "| {} | std µm | worst | least possible | bias µm | worst | 1 s means in band |" + "\n|---" + "|---" * 6 + "|"
+        "| {} | std µm | worst | least possible | bias µm | worst | 1 s means in band |"
+        + "\n|---"
+        + "|---" * 6
+        + "|"
     )
     row = (
         "| {} | {std_um:.3f} | {worst_std_um:.3f} | {least_std_um:.3f} "
@@ -168,7 +200,9 @@ def _print(figures: dict[str, Any]) -> None:
         print(row.format(f"{leak} ({case['too_tight_fraction']:.0%})", **case))
     print("\n| event | " + " | ".join(SENSORS) + " |\n|---" + "|---" * len(SENSORS) + "|")
     for event in ("leak doubled", "door +20 Pa", "door -20 Pa", "10 s without a reading"):
-        cells = (", ".join(f"{k} {v:.2f}" for k, v in case.items()) for case in figures[event].values())
+        cells = (
+            ", ".join(f"{k} {v:.2f}" for k, v in case.items()) for case in figures[event].values()
+        )
         print(f"| {event} | " + " | ".join(cells) + " |")
     print("\nstart from -25 µm: " + ", ".join(f"{k} {v:.2f}" for k, v in figures["start"].items()))
 

@@ -1,4 +1,5 @@
-"""The laser's mount drifts 2 µm/min for ten minutes: with the shape loop on rendered full-size frames, and without.
+"""The laser's mount drifts 2 µm/min for ten minutes: with the shape loop on rendered full-size
+frames, and without.
 
 Virtual time: the same controller, the same camera frames, the same reconstruction, without waiting.
 """
@@ -22,7 +23,9 @@ MINUTES = 10
 
 
 def true_sag_moved_um(with_shape: bool) -> float:
-    """Largest movement of the true centre from its place at the start of the drift, as 10 s means."""
+    """Largest movement of the true centre from its place at the start of the drift,
+    as 10 s means.
+    """
     twin = TwinConfig(laser_drift_um_per_min=DRIFT_UM_PER_MIN)
     config = Config(twin=twin, shape=ShapeConfig(enabled=with_shape))
     plant = Plant(twin, config.pump)
@@ -42,6 +45,20 @@ def run() -> list[Figure]:
     """Both cases; the reference is the drift itself."""
     drift_um = DRIFT_UM_PER_MIN * MINUTES
     return [
-        at_most("true sag moved, shape loop on", true_sag_moved_um(True), "um", 1.0, "laser drift", drift_um),
-        at_most("true sag moved, shape loop off", true_sag_moved_um(False), "um", None, "laser drift", drift_um),
+        at_most(
+            "true sag moved, shape loop on",
+            true_sag_moved_um(True),
+            "um",
+            1.0,
+            "laser drift",
+            drift_um,
+        ),
+        at_most(
+            "true sag moved, shape loop off",
+            true_sag_moved_um(False),
+            "um",
+            None,
+            "laser drift",
+            drift_um,
+        ),
     ]

@@ -1,10 +1,12 @@
-"""Serial links under random faults: how many wrong values are accepted (none), and how far off the worst one is.
+"""Serial links under random faults: how many wrong values are accepted (none), and how far off the
+worst one is.
 
-Link, driver and emulated instrument are the real ones, the wire between them is memory and time is virtual: late
-answers and timeouts cost nothing, and every run is the same. A tenth of all questions or answers is hit. Only Modbus
-TCP goes through real sockets and real time.
+Link, driver and emulated instrument are the real ones, the wire between them is memory and time is
+virtual: late answers and timeouts cost nothing, and every run is the same. A tenth of all questions
+or answers is hit. Only Modbus TCP goes through real sockets and real time.
 
-`run()` gives the figures for `make bench`, `audit(name, transactions)` those of one link for the tests.
+`run()` gives the figures for `make bench`, `audit(name, transactions)` those of one link for the
+tests.
 """
 
 from __future__ import annotations
@@ -31,7 +33,12 @@ from firmware_iface.links.modbus_rtu import RtuBus
 from firmware_iface.links.modbus_tcp import GuardedModbusTcp, ModbusLink
 from firmware_iface.links.serial_port import SerialSettings
 from firmware_iface.roles import Device, DisplacementSensor, LinkDownError, LinkError, Pump
-from firmware_iface.settings import KeyenceDlRs1aConfig, Optoncdt1420Config, VaisalaPtb330Config, VentusConfig
+from firmware_iface.settings import (
+    KeyenceDlRs1aConfig,
+    Optoncdt1420Config,
+    VaisalaPtb330Config,
+    VentusConfig,
+)
 from tests.support.faulty_devices import (
     KeyenceDlRs1aEmulator,
     MemoryWire,
@@ -53,7 +60,9 @@ HIT = 0.05  # of all questions, and of all answers
 
 @dataclass(slots=True)
 class Audit:
-    """Results of the transactions of one link. `worst` is the largest error of an accepted value."""
+    """Results of the transactions of one link. `worst` is the largest
+    error of an accepted value.
+    """
 
     believed: int = 0
     refused: int = 0
@@ -74,7 +83,9 @@ class Audit:
 
 
 def random_faults(seed: int) -> Callable[[], SerialFaults]:
-    """One fault at a time: late by up to four timeouts, lost, cut, garbage, one to three flipped bits."""
+    """One fault at a time: late by up to four timeouts, lost, cut, garbage, one to three flipped
+    bits.
+    """
     dice = random.Random(seed)
 
     def draw() -> SerialFaults:
@@ -132,7 +143,9 @@ async def _tcp(transactions: int, audit: Audit, seed: int) -> None:
             lambda: Answer(reply, delay_s=dice.uniform(0.0, 4 * TCP_TIMEOUT_S)),
             lambda: Answer(reply, transaction_offset=dice.choice((1, -1))),
             lambda: Answer(bytes([23 if reply[0] == 3 else 6]) + reply[1:]),
-            lambda: Answer(bytes([3, 2]) + reply[2:4] if reply[0] == 3 else reply[:3] + b"\0" + reply[4:]),
+            lambda: Answer(
+                bytes([3, 2]) + reply[2:4] if reply[0] == 3 else reply[:3] + b"\0" + reply[4:]
+            ),
             lambda: Answer(hang_up=True),
         ]
         return dice.choice(kinds)()
@@ -140,7 +153,9 @@ async def _tcp(transactions: int, audit: Audit, seed: int) -> None:
     server = ModbusTcpServer(answer, "127.0.0.1", 0)
     await server.start()
     seconds = itertools.count()  # the back-off is over at every look
-    device = GuardedModbusTcp("127.0.0.1", server.port, 1, TCP_TIMEOUT_S, clock=lambda: 10.0 * next(seconds))
+    device = GuardedModbusTcp(
+        "127.0.0.1", server.port, 1, TCP_TIMEOUT_S, clock=lambda: 10.0 * next(seconds)
+    )
     await _numbers({1: device}, {1: table}, transactions, audit, random.Random(seed))
     await device.close()
     await server.stop()
@@ -155,8 +170,8 @@ async def _numbers(
 ) -> None:
     """Numbers that never come twice are written and read back, to three places of each device.
 
-    A confirmed write must be in the device. A read must give the number last confirmed at this place, or one tried
-    since.
+    A confirmed write must be in the device. A read must give the number last confirmed at this
+    place, or one tried since.
     """
     possible = {(unit, address): {0} for unit in tables for address in (0, 4, 8)}
     number = 0
@@ -165,12 +180,16 @@ async def _numbers(
         while not devices[unit].connected:
             try:
                 await devices[unit].connect()
-            except LinkDownError:  # the time-out is short: on a busy machine a connection may take longer
+            except (
+                LinkDownError
+            ):  # the time-out is short: on a busy machine a connection may take longer
                 await asyncio.sleep(TCP_TIMEOUT_S)
         number += 1
         if write := dice.random() < 0.5:
             possible[place].add(number)
-            call: Coroutine[Any, Any, Any] = devices[unit].write_registers(address, divmod(number, 2**16))
+            call: Coroutine[Any, Any, Any] = devices[unit].write_registers(
+                address, divmod(number, 2**16)
+            )
         else:
             call = devices[unit].read_holding(address, 2)
         try:
@@ -181,7 +200,10 @@ async def _numbers(
             audit.refused += 1
         else:
             found = tables[unit].words[address : address + 2] if write else words
-            audit.judge(float(found[0] * 2**16 + found[1] not in ({number} if write else possible[place])), 0.0)
+            audit.judge(
+                float(found[0] * 2**16 + found[1] not in ({number} if write else possible[place])),
+                0.0,
+            )
             if write:
                 possible[place] = {number}
 
@@ -199,7 +221,8 @@ async def _keyence(transactions: int, audit: Audit, seed: int) -> None:
     """Displacement that ramps at the speed of a fill; wrong is more than the driver's own gate."""
     emulator = KeyenceDlRs1aEmulator(_ramp_um, baud=38_400, parity="E", seed=seed)
     driver = KeyenceDlRs1a(
-        KeyenceDlRs1aConfig(port="memory", baud=38_400, parity="E", timeout_s=TIMEOUT_S), MemoryWire(emulator)
+        KeyenceDlRs1aConfig(port="memory", baud=38_400, parity="E", timeout_s=TIMEOUT_S),
+        MemoryWire(emulator),
     )
     await _displacements(driver, emulator, transactions, audit, seed)
 
@@ -208,7 +231,8 @@ async def _optoncdt(transactions: int, audit: Audit, seed: int) -> None:
     """The same with a stream; wrong is more than ten times its noise."""
     emulator = Optoncdt1420Emulator(_ramp_um, noise_um=1.0, seed=seed)
     driver = Optoncdt1420(
-        Optoncdt1420Config(port="memory", rate_khz=1.0, step_max_um=10.0, timeout_s=TIMEOUT_S), MemoryWire(emulator)
+        Optoncdt1420Config(port="memory", rate_khz=1.0, step_max_um=10.0, timeout_s=TIMEOUT_S),
+        MemoryWire(emulator),
     )
     await _displacements(driver, emulator, transactions, audit, seed)
 
@@ -254,7 +278,9 @@ async def _ventus(transactions: int, audit: Audit, seed: int) -> None:
 async def _propar(transactions: int, audit: Audit, seed: int) -> None:
     """A flow controller with steps of 1/32000, on a line without checksums."""
     driven = [0.0]
-    flow = Instrument("DMFC", "M1", 360.0, "mln/min", actuate=lambda fraction: driven.__setitem__(0, fraction))
+    flow = Instrument(
+        "DMFC", "M1", 360.0, "mln/min", actuate=lambda fraction: driven.__setitem__(0, fraction)
+    )
     emulator = ProparDevice(flow, SerialSettings(38_400), seed=seed)
     driver = BronkhorstFlow(ProparParameters(MemoryWire(emulator), timeout_s=TIMEOUT_S))
     await _pump(driver, emulator, driven, 1 / 32_000, transactions, audit, seed)
@@ -293,7 +319,9 @@ async def _pump(
 
 
 async def _ptb330(transactions: int, audit: Audit, seed: int) -> None:
-    """Pressure that rises and falls; message and age together may be off by its change in three seconds."""
+    """Pressure that rises and falls; message and age together may be off by its change in three
+    seconds.
+    """
 
     def pressure_pa() -> float:
         return 101_325.0 + 0.1 * abs(asyncio.get_running_loop().time() % 4000.0 - 2000.0)
@@ -354,7 +382,14 @@ def run(transactions: int = 10**6) -> list[Figure]:
     for name, (_, unit) in LINKS.items():
         found = audit(name, transactions)
         figures += [
-            at_most(f"{name}: wrong values accepted", found.wrong, "", 0, "transactions", found.transactions),
+            at_most(
+                f"{name}: wrong values accepted",
+                found.wrong,
+                "",
+                0,
+                "transactions",
+                found.transactions,
+            ),
             at_most(f"{name}: largest error accepted", found.worst, unit),
             at_least(f"{name}: share accepted", found.believed / found.transactions, "", 0.5),
         ]

@@ -1,4 +1,6 @@
-"""The live cycle at full size: time against copying the frames and against the paper's method, and its accuracy."""
+"""The live cycle at full size: time against copying the frames and against the paper's method, and
+its accuracy.
+"""
 
 from __future__ import annotations
 
@@ -19,7 +21,9 @@ from membrane_ctrl.sim.optics.camera import OpticsRenderer
 from membrane_ctrl.sim.optics.film_shape import FilmShape
 
 OPTICS = OpticsConfig()
-FILM = FilmShape(37.1, 500.0, "hencky", (0, 0, 0, 0, 800, -500, 300, 0, 400, 0, 0, 0, 50, *[0] * 23))
+FILM = FilmShape(
+    37.1, 500.0, "hencky", (0, 0, 0, 0, 800, -500, 300, 0, 400, 0, 0, 0, 50, *[0] * 23)
+)
 MOVED_UM = (1.0, -0.5, 2.0, 0.0)
 
 
@@ -50,10 +54,14 @@ def run() -> list[Figure]:
         at_most("8 frames of 2448 x 2048 to figure with covariance", live_ms, "ms", 25),
         at_most("worst of 20 cycles", max(durations[4:]), "ms", 150),
         at_most("cycle over copying its 8 frames", live_ms / copy_ms, "x", 10, "copy, ms", copy_ms),
-        at_least("faster than the paper's method in NumPy", speed, "x", 500, "its time, s", reference_s),
+        at_least(
+            "faster than the paper's method in NumPy", speed, "x", 500, "its time, s", reference_s
+        ),
         at_most("full cycle, 18 frames", full_ms, "ms", 150),
         at_most("full cycle over copying 8 frames", full_ms / copy_ms, "x", 60),
-        at_most("error of the figure, RMS", 1e3 * max(errors), "nm", 10, terms_alone, 1e3 * reference_um),
+        at_most(
+            "error of the figure, RMS", 1e3 * max(errors), "nm", 10, terms_alone, 1e3 * reference_um
+        ),
     ]
 
 
@@ -78,7 +86,9 @@ def _copy_ms(frames: list[np.ndarray]) -> float:
     return _median_ms(copy, 20)
 
 
-def _rms_um(live: LiveReconstructor, coeffs_um: np.ndarray, hencky_um: float, displacement_um: float) -> float:
+def _rms_um(
+    live: LiveReconstructor, coeffs_um: np.ndarray, hencky_um: float, displacement_um: float
+) -> float:
     x, y, h = live.height_map(coeffs_um, hencky_um, 128)
     truth = FILM.height_mm(*np.meshgrid(x, y), displacement_um)
     return float(np.sqrt(np.nanmean((1e3 * (h - truth)) ** 2)))
@@ -87,10 +97,13 @@ def _rms_um(live: LiveReconstructor, coeffs_um: np.ndarray, hencky_um: float, di
 def _reference(live: LiveReconstructor, frames: list[np.ndarray]) -> tuple[float, float]:
     """Seconds of the paper's method on the same 8 frames, and its error in µm.
 
-    Fringe orders are those of the known film: the paper takes them from its Gray codes, whose time is left out.
+    Fringe orders are those of the known film: the paper takes them from its Gray codes, whose time
+    is left out.
     """
     geometry = Geometry.from_config(OPTICS)
-    columns, rows = np.meshgrid(np.arange(OPTICS.camera.width_px), np.arange(OPTICS.camera.height_px))
+    columns, rows = np.meshgrid(
+        np.arange(OPTICS.camera.width_px), np.arange(OPTICS.camera.height_px)
+    )
     rays = geometry.rays(columns.ravel(), rows.ravel())
     expected = _expected_screen(geometry, rays)
     inside = np.isfinite(expected[0])
@@ -118,8 +131,12 @@ def _expected_screen(geometry: Geometry, rays: np.ndarray) -> np.ndarray:
         t = (FILM.height_mm(x, y, 0.0) - f[2]) / d[2]
     p = f[:, None] + t * d
     step = 0.1
-    hx = (FILM.height_mm(p[0] + step, p[1], 0.0) - FILM.height_mm(p[0] - step, p[1], 0.0)) / (2 * step)
-    hy = (FILM.height_mm(p[0], p[1] + step, 0.0) - FILM.height_mm(p[0], p[1] - step, 0.0)) / (2 * step)
+    hx = (FILM.height_mm(p[0] + step, p[1], 0.0) - FILM.height_mm(p[0] - step, p[1], 0.0)) / (
+        2 * step
+    )
+    hy = (FILM.height_mm(p[0], p[1] + step, 0.0) - FILM.height_mm(p[0], p[1] - step, 0.0)) / (
+        2 * step
+    )
     n = np.stack([-hx, -hy, np.ones_like(hx)])
     u = d - 2 * np.sum(d * n, axis=0) / np.sum(n * n, axis=0) * n
     face = np.cross(geometry.screen_s_x, geometry.screen_s_y)

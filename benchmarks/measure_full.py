@@ -1,4 +1,6 @@
-"""The full measurement of a set at full size: every pixel, slopes, residual, zonal map; time, memory, accuracy."""
+"""The full measurement of a set at full size: every pixel, slopes, residual, zonal map; time,
+memory, accuracy.
+"""
 
 from __future__ import annotations
 
@@ -37,7 +39,9 @@ def run() -> list[Figure]:
 
 
 def _measured(shrink: int) -> tuple[FullResult, float, float]:
-    """Result, time of a run after one that compiles, and the process' largest memory so far in MB."""
+    """Result, time of a run after one that compiles, and the process'
+    largest memory so far in MB.
+    """
     large = OpticsConfig().camera
     camera = large.model_copy(
         update={

@@ -2,12 +2,13 @@
 
 python -m benchmarks memory [the whole takes about ten minutes]
 
-Recorder, console and alarms are the real processes on the real rings. They get a week of a hold at 10 Hz as fast
-as the recorder takes it. The hours that are compared, the first and the last two, are written second by second, as in
-a run: Rerun's index of an open segment grows with every write. The days between come in a minute a write. The run's
-clock is a number in shared memory. Shapes come once a minute of run. The acquisition measures frames of its twin
-(306 x 256 pixels) at five cycles a second; a week of its cycles is not run, so its figure says over how many cycles
-it was seen to grow. The control process in virtual time is in `soak`.
+Recorder, console and alarms are the real processes on the real rings. They get a week of a hold at
+10 Hz as fast as the recorder takes it. The hours that are compared, the first and the last two, are
+written second by second, as in a run: Rerun's index of an open segment grows with every write. The
+days between come in a minute a write. The run's clock is a number in shared memory. Shapes come
+once a minute of run. The acquisition measures frames of its twin (306 x 256 pixels) at five cycles
+a second; a week of its cycles is not run, so its figure says over how many cycles it was seen to
+grow. The control process in virtual time is in `soak`.
 """
 
 from __future__ import annotations
@@ -99,7 +100,9 @@ def run() -> list[Figure]:
 
 def _fed_figures(folder: Path, stack: ExitStack) -> list[Figure]:
     config = Config(
-        loop=LoopConfig(rate_hz=RATE_HZ), shape=ShapeConfig(period_s=60.0), recording=RecordingConfig(min_free_mb=1.0)
+        loop=LoopConfig(rate_hz=RATE_HZ),
+        shape=ShapeConfig(period_s=60.0),
+        recording=RecordingConfig(min_free_mb=1.0),
     )
     clock_memory = SharedMemory(create=True, size=8)
     stack.callback(clock_memory.unlink)
@@ -137,9 +140,18 @@ def _children(
 ) -> tuple[list[Child], Connection]:
     ours, theirs = pipe()
     spec = RecorderSpec(
-        run_dir, "week", clock, config, rings["inputs"], rings["events"], rings["shapes"], flush_s=0.0
+        run_dir,
+        "week",
+        clock,
+        config,
+        rings["inputs"],
+        rings["events"],
+        rings["shapes"],
+        flush_s=0.0,
     )
-    screen = ConsoleSpec(clock, rings["telemetry"], rings["events"], rings["shapes"], run_dir, config)
+    screen = ConsoleSpec(
+        clock, rings["telemetry"], rings["events"], rings["shapes"], run_dir, config
+    )
     alarms = AlarmsSpec(clock, rings["telemetry"], rings["events"], config.alarms, "week")
     return [
         Child("recorder", "benchmarks.memory:hurried_recorder", (spec, theirs), nice=5),
@@ -212,7 +224,9 @@ def _thin_out(run_dir: Path) -> None:
 
 
 def _own_mb(children: list[Child]) -> dict[str, float]:
-    """Without shared pages: libraries, and rings, of fixed size, whose pages count once they were touched."""
+    """Without shared pages: libraries, and rings, of fixed size, whose pages count once they were
+    touched.
+    """
     found = {child.name: psutil.Process(child.pid).memory_info() for child in children}
     return {name: (info.rss - info.shared) / 1e6 for name, info in found.items()}
 

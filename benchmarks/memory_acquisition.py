@@ -39,7 +39,12 @@ def acquisition_figures() -> list[Figure]:
         clock = RunClock.start()
         ours, theirs = pipe()
         spec = AcquisitionSpec(_CONFIG, clock, telemetry, shapes, truths, frames.address)
-        child = Child("acquisition", "membrane_ctrl.acquisition.process:acquisition_main", (spec, theirs), nice=10)
+        child = Child(
+            "acquisition",
+            "membrane_ctrl.acquisition.process:acquisition_main",
+            (spec, theirs),
+            nice=10,
+        )
         rows = stack.enter_context(closing(RingWriter(telemetry)))
         truth = stack.enter_context(closing(RingWriter(truths)))
         reader = stack.enter_context(closing(RingReader(shapes)))

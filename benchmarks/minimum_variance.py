@@ -1,9 +1,9 @@
 """The least standard deviation of the true centre that any linear controller could reach.
 
-No controller can avoid the pump's dead time theta: a decision now acts at t + theta, so the centre's error is at
-least the error of the best prediction of the disturbance over theta from the readings until now (Astrom, Introduction
-to Stochastic Control Theory, 1970, chapter 6). The best prediction is the Kalman filter's. The pump's lag is no limit
-of its own: it can be inverted.
+No controller can avoid the pump's dead time theta: a decision now acts at t + theta, so the
+centre's error is at least the error of the best prediction of the disturbance over theta from the
+readings until now (Astrom, Introduction to Stochastic Control Theory, 1970, chapter 6). The best
+prediction is the Kalman filter's. The pump's lag is no limit of its own: it can be inverted.
 """
 
 from __future__ import annotations
@@ -36,12 +36,15 @@ def least_std_um(
 ) -> float:
     """Bound in µm for the loop's rate and sensors in the twin's scenario.
 
-    `optics_um_per_root_hz`: noise of the measured sag times the root of the interval of frames; they count as prompt.
+    `optics_um_per_root_hz`: noise of the measured sag times the root of the interval of frames;
+    they count as prompt.
     """
     (pressure_pa, pressure_s), (air_k, air_s) = SCENARIOS[twin.scenario]
     follow_s = loop.gas_follows_air_s
     # states: ambient pressure, air temperature, gas temperature
-    drift = np.array([[-1 / pressure_s, 0, 0], [0, -1 / air_s, 0], [0, 1 / follow_s, -1 / follow_s]])
+    drift = np.array(
+        [[-1 / pressure_s, 0, 0], [0, -1 / air_s, 0], [0, 1 / follow_s, -1 / follow_s]]
+    )
     diffusion = np.diag([2 * pressure_pa**2 / pressure_s, 2 * air_k**2 / air_s, 0.0])
     centre = np.array([loop.barometer_gain_um_per_pa, 0.0, loop.temperature_gain_um_per_k])
     readings: list[Matrix] = []

@@ -36,7 +36,9 @@ GRID = HeightMap.over(OPTICS.mirror.analysis_radius_mm, OPTICS.mirror.radius_mm)
 def run() -> list[Figure]:
     """Full-size sets written to disk, read and measured as `stability` does, and their trials."""
     with tempfile.TemporaryDirectory() as folder:
-        spec = SimulationSpec(OPTICS, typical_film(37.1, 500.0, 1), motion=Motion(drift_um_per_s=SLOW_UM_PER_S))
+        spec = SimulationSpec(
+            OPTICS, typical_film(37.1, 500.0, 1), motion=Motion(drift_um_per_s=SLOW_UM_PER_S)
+        )
         simulate_run(Path(folder), spec, MEASURED + 1)
         figures = Figures()
         second = figures.of(Path(folder) / "0001")  # reads the reference as well
@@ -61,7 +63,9 @@ def run() -> list[Figure]:
     ]
 
 
-def _papers(benches: list[TrialBench], trials: np.ndarray, linear: np.ndarray, swing_adu: float) -> list[Figure]:
+def _papers(
+    benches: list[TrialBench], trials: np.ndarray, linear: np.ndarray, swing_adu: float
+) -> list[Figure]:
     """The paper's figures beside ours (docs/uncertainty.md explains the differences)."""
     many = run_trials(benches[:1], PAPER_SPREAD, 2, range(1000))[:, 0]
     absolute = 1e3 * GRID.sigma(trial_covariance(many))
@@ -78,18 +82,26 @@ def _papers(benches: list[TrialBench], trials: np.ndarray, linear: np.ndarray, s
             "paper",
             4.5,
         ),
-        Figure("linear covariance, mean 1 sigma", float(by_hand.mean()), "um", "trials", float(absolute.mean())),
+        Figure(
+            "linear covariance, mean 1 sigma",
+            float(by_hand.mean()),
+            "um",
+            "trials",
+            float(absolute.mean()),
+        ),
     ]
 
 
 def _one_pixel_um(sag_mm: float, swing_adu: float) -> float:
     """Mean RMSE of a pair if both phases are counted from one pixel at O'.
 
-    Its noise then shifts the whole phase map: a tilt of the mirror about its vertex, sigma r at radius r, with r on
-    average 2/3 of the radius; sqrt(2) for two sets.
+    Its noise then shifts the whole phase map: a tilt of the mirror about its vertex, sigma r at
+    radius r, with r on average 2/3 of the radius; sqrt(2) for two sets.
     """
     sigma = pixel_sigma_adu(OPTICS.camera.noise_adu)
-    shift_mm = mm_per_rad(OPTICS.pattern) * phase_sigma_rad(equal_shifts(OPTICS.pattern.steps), sigma, swing_adu)
+    shift_mm = mm_per_rad(OPTICS.pattern) * phase_sigma_rad(
+        equal_shifts(OPTICS.pattern.steps), sigma, swing_adu
+    )
     gain = slope_per_screen(Geometry.from_config(OPTICS), OPTICS.mirror.radius_mm, sag_mm)
     slope = shift_mm * math.sqrt(float(gain.sum()) / 2)
     return 1e3 * math.sqrt(2) * slope * OPTICS.mirror.analysis_radius_mm * 2 / 3

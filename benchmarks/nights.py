@@ -1,8 +1,10 @@
-"""Simulated nights with known events, far faster than the twin: for judging the review, not the control.
+"""Simulated nights with known events, far faster than the twin: for judging the review, not the
+control.
 
-The film as an integrator of pump flow, leak, air pressure and gas temperature with the numbers of docs/physics.md and
-of the twin's scenarios; a 10 Hz PI loop with filter, feed-forward, dead time and pump lag; laser noise, quantisation;
-Ornstein-Uhlenbeck weather. A night of eight hours takes a quarter of a second. Written by the recorder's own code.
+The film as an integrator of pump flow, leak, air pressure and gas temperature with the numbers of
+docs/physics.md and of the twin's scenarios; a 10 Hz PI loop with filter, feed-forward, dead time
+and pump lag; laser noise, quantisation; Ornstein-Uhlenbeck weather. A night of eight hours takes a
+quarter of a second. Written by the recorder's own code.
 """
 
 from __future__ import annotations
@@ -39,8 +41,13 @@ LEAK_UM_PER_S = 1.24
 SHAPE_PERIOD_S = 4.0
 _SYNC_MINUTES = 10
 DOOR, LEAK, GLITCH, LOST, LATE, JUMP = (
-    "pressure step", "leak step", "laser glitch", "laser lost", "lateness burst", "shape jump",
-)  # fmt: skip
+    "pressure step",
+    "leak step",
+    "laser glitch",
+    "laser lost",
+    "lateness burst",
+    "shape jump",
+)
 
 
 @dataclass(frozen=True, slots=True)
@@ -54,19 +61,25 @@ class Planted:
 
 def planted(rng: np.random.Generator, hours: float, share: float = 1.0) -> list[Planted]:
     """A night's worth of events, ten minutes or more apart; `share` of them for a calmer one."""
-    slots = rng.permutation(np.arange(1, int(hours * 6)))  # ten minutes each, the first one left alone
+    slots = rng.permutation(
+        np.arange(1, int(hours * 6))
+    )  # ten minutes each, the first one left alone
     kinds = [DOOR] * 4 + [LEAK] * 2 + [GLITCH] * 4 + [LOST] * 2 + [LATE] * 2 + [JUMP]
     kinds = [kind for kind in kinds if rng.random() < share]
     events = []
     leaks: list[float] = []
     for kind in kinds:
-        free = next((s for s in slots if kind != LEAK or all(abs(s - other) >= 3 for other in leaks)), None)
+        free = next(
+            (s for s in slots if kind != LEAK or all(abs(s - other) >= 3 for other in leaks)), None
+        )
         if free is None:
             break
         slots = slots[slots != free]
         if kind == LEAK:
             leaks.append(float(free))
-        events.append(Planted(kind, 600.0 * float(free) + float(rng.uniform(100, 500)), _size(kind, rng)))
+        events.append(
+            Planted(kind, 600.0 * float(free) + float(rng.uniform(100, 500)), _size(kind, rng))
+        )
     return sorted(events, key=lambda event: event.time_s)
 
 
@@ -112,7 +125,9 @@ def night(
             lateness[late] += event.size * rng.uniform(0.6, 1.0, late.size)
     loop = CONFIG.loop
     noise = rng.normal(size=count)
-    columns = _closed_loop(pressure, air, leak, noise, spikes, lost, loop.kp_per_s, loop.ti_s, 1 / RATE_HZ)
+    columns = _closed_loop(
+        pressure, air, leak, noise, spikes, lost, loop.kp_per_s, loop.ti_s, 1 / RATE_HZ
+    )
     for name, values in zip(_LOOP_COLUMNS, columns.T, strict=True):
         rows[:, COLUMN[name]] = values
     rows[:, COLUMN["mono_s"]] = time_s + 1e-3 * lateness
@@ -143,7 +158,10 @@ def batch_of(rows: Rows) -> TickBatch:
 def messages_of(rows: Rows) -> list[bytes]:
     """These ticks as they cross to the recorder."""
     batch = batch_of(rows)
-    return [TICK + record.tobytes() + row.tobytes() for record, row in zip(batch.records, rows, strict=True)]
+    return [
+        TICK + record.tobytes() + row.tobytes()
+        for record, row in zip(batch.records, rows, strict=True)
+    ]
 
 
 def _wander(rng: np.random.Generator, count: int, sd: float, tau_s: float) -> NDArray[np.float64]:
@@ -161,9 +179,17 @@ def _first_order(noise: NDArray[np.float64], keep: float, sd: float) -> NDArray[
 
 
 _LOOP_COLUMNS = (
-    "displacement_um", "filtered_um", "error_um", "p_um_per_s", "i_um_per_s", "feedforward_um_per_s",
-    "flow_wanted_um_per_s", "flow_um_per_s", "leak_um_per_s", "truth_displacement_um",
-)  # fmt: skip
+    "displacement_um",
+    "filtered_um",
+    "error_um",
+    "p_um_per_s",
+    "i_um_per_s",
+    "feedforward_um_per_s",
+    "flow_wanted_um_per_s",
+    "flow_um_per_s",
+    "leak_um_per_s",
+    "truth_displacement_um",
+)
 
 
 @njit(cache=True)
@@ -178,7 +204,9 @@ def _closed_loop(
     ti: float,
     dt: float,
 ) -> NDArray[np.float64]:
-    """(n, 10) columns of `_LOOP_COLUMNS`; a tick of dead time, 0.15 s pump lag, filters of 0.2 s."""
+    """(n, 10) columns of `_LOOP_COLUMNS`; a tick of dead time, 0.15 s pump lag,
+    filters of 0.2 s.
+    """
     out = np.empty((pressure.size, 10))
     true = filtered = ff = 0.0
     integral = flow = leak_seen = leak[0]
@@ -251,7 +279,9 @@ def _shapes(
 
 
 def write_run(folder: Path, parts: Iterator[tuple[Rows, list[ShapeEstimate]]]) -> None:
-    """A run folder as the recorder leaves it, without Rerun segments: batches of a minute, as they come in a run."""
+    """A run folder as the recorder leaves it, without Rerun segments: batches of a minute, as they
+    come in a run.
+    """
     folder.mkdir(parents=True)
     (folder / "config.toml").write_text(config_file.dump(CONFIG), encoding="utf-8")
     tables = RunTables(folder)
@@ -269,13 +299,19 @@ def write_run(folder: Path, parts: Iterator[tuple[Rows, list[ShapeEstimate]]]) -
     tables.close()
     events = [
         {"mono_s": 0.0, "kind": "start"},
-        {"mono_s": 0.0, "kind": "state", "state": "hold", "from": "settle", "why": "inside the band"},
+        {
+            "mono_s": 0.0,
+            "kind": "state",
+            "state": "hold",
+            "from": "settle",
+            "why": "inside the band",
+        },
         {"mono_s": end_s, "kind": "end", "exit": "done", "exit_code": 0},
     ]
     lines = [
         json.dumps({"time_utc": (STARTED_UTC + timedelta(seconds=e["mono_s"])).isoformat(), **e})
         for e in events
-    ]  # fmt: skip
+    ]
     (folder / "events.jsonl").write_text("\n".join(lines) + "\n", encoding="utf-8")
     summary = {"schema": "membrane-summary/2", "exit": "done", "duration_s": end_s}
     (folder / "summary.json").write_text(json.dumps(summary) + "\n", encoding="utf-8")

@@ -1,7 +1,9 @@
-"""Pumps drawn at random in the second world, each surveyed: a curve or a refusal, its error, the excursion.
+"""Pumps drawn at random in the second world, each surveyed: a curve or a refusal, its error, the
+excursion.
 
-`python -m benchmarks.pumps --pumps 40` prints a line for each and the table of docs/tuning.md; 5 s of CPU for each.
-`--first 28 --pumps 1` looks at one, `--shape root --full-um-per-s 3.1 --leak-um-per-s 2.1` at pumps of a kind.
+`python -m benchmarks.pumps --pumps 40` prints a line for each and the table of docs/tuning.md; 5 s
+of CPU for each. `--first 28 --pumps 1` looks at one, `--shape root --full-um-per-s 3.1
+--leak-um-per-s 2.1` at pumps of a kind.
 """
 
 from __future__ import annotations
@@ -49,21 +51,33 @@ class DrawnPump:
     def plant(self) -> second_world.ForeignPlant:
         """The bench in weather of its own."""
         pump = second_world.ForeignPump(
-            self.shape, self.full_um_per_s, self.delay_s, self.lag_s, self.start, self.stall, self.play
+            self.shape,
+            self.full_um_per_s,
+            self.delay_s,
+            self.lag_s,
+            self.start,
+            self.stall,
+            self.play,
         )
-        return second_world.ForeignPlant(pump, self.seed, self.weather, self.leak_um_per_s, self.gusts, self.laser_um)
+        return second_world.ForeignPlant(
+            pump, self.seed, self.weather, self.leak_um_per_s, self.gusts, self.laser_um
+        )
 
     @property
     def named(self) -> str:
         """The pump in a few words."""
         return (
-            f"{self.seed}: {self.shape}, {self.full_um_per_s:.1f} against {self.leak_um_per_s:.1f} µm/s, "
-            f"{self.delay_s:.2f} + {self.lag_s:.2f} s, laser {self.laser_um:.1f} um{', gusty' if self.gusts else ''}"
+            f"{self.seed}: {self.shape}, {self.full_um_per_s:.1f} against "
+            f"{self.leak_um_per_s:.1f} µm/s, "
+            f"{self.delay_s:.2f} + {self.lag_s:.2f} s, laser {self.laser_um:.1f} "
+            f"um{', gusty' if self.gusts else ''}"
         )
 
 
 def drawn(seed: int) -> DrawnPump:
-    """Any shape, full flow 1.2 to 20 times a leak of 0.5 to 3 µm/s, delay and lag together 0.15 to 2 s."""
+    """Any shape, full flow 1.2 to 20 times a leak of 0.5 to 3 µm/s, delay and lag together 0.15 to
+    2 s.
+    """
     rng = np.random.default_rng([20261123, seed])
 
     def log(low: float, high: float) -> float:
@@ -72,7 +86,9 @@ def drawn(seed: int) -> DrawnPump:
     shape = str(rng.choice(sorted(second_world.CURVES)))
     leak = log(0.5, 3.0)
     full, late_s, share = leak * log(1.2, 20.0), log(0.15, 2.0), float(rng.uniform(0.2, 0.8))
-    starts = next((float(d) for d in np.linspace(0, 1, 1001) if second_world.CURVES[shape](d) > 0), 0.0)
+    starts = next(
+        (float(d) for d in np.linspace(0, 1, 1001) if second_world.CURVES[shape](d) > 0), 0.0
+    )
     stiction = float(rng.uniform(0.0, 0.08)) if rng.random() < 0.5 else 0.0
     return DrawnPump(
         seed=seed,
@@ -119,7 +135,9 @@ class SurveyedPump:
 def surveyed(pump: DrawnPump, limit_um: float = 10.0) -> SurveyedPump:
     """Hold the bench with the default gains, then with cautious ones, and survey its pump."""
     plant = pump.plant()
-    link = TwinHold(second_world.foreign_config(rate_hz=RATE_HZ), bench=second_world.foreign_bench(plant))
+    link = TwinHold(
+        second_world.foreign_config(rate_hz=RATE_HZ), bench=second_world.foreign_bench(plant)
+    )
     rig = HoldRig(link, "benchmark")
     rig.hold(SETTLED_S)
     pump_trial._calmed(rig, limit_um)
@@ -137,9 +155,14 @@ def surveyed(pump: DrawnPump, limit_um: float = 10.0) -> SurveyedPump:
             refused = str(error)
     rows = [row for row in link.rows[before:] if row.state in (State.HOLD, State.TUNE)]
     return SurveyedPump(
-        pump, off, _levels_off(made, plant.pump), max(abs(row.truth_displacement_um) for row in rows),
-        made[0].duration_s if made else 0.0, len(rows) / RATE_HZ, refused,
-    )  # fmt: skip
+        pump,
+        off,
+        _levels_off(made, plant.pump),
+        max(abs(row.truth_displacement_um) for row in rows),
+        made[0].duration_s if made else 0.0,
+        len(rows) / RATE_HZ,
+        refused,
+    )
 
 
 def _levels_off(made: Sequence[PumpSurvey], pump: second_world.ForeignPump) -> tuple[float, ...]:
@@ -167,8 +190,11 @@ def table(rows: Sequence[SurveyedPump]) -> str:
         "| worst error over the curve, of the full flow: median, largest | "
         f"{np.median(off):.1f} %, {off.max():.1f} %: {beyond} beyond its limit (3 %, gusty 5 %) |",
         f"| levels within two standard errors | {np.mean(levels <= 2):.0%} of {levels.size} |",
-        f"| furthest excursion: median, largest (limit 10 µm) | {np.median(far):.1f}, {far.max():.1f} µm |",
-        "| experiments; with the holds | {:.0f} min; {:.0f} min in the median |".format(*np.median(minutes, axis=0)),
+        f"| furthest excursion: median, largest (limit 10 µm) | {np.median(far):.1f}, "
+        f"{far.max():.1f} µm |",
+        "| experiments; with the holds | {:.0f} min; {:.0f} min in the median |".format(
+            *np.median(minutes, axis=0)
+        ),
         "",
         "| pump | worst error | furthest | refused |",
         "|---|---|---|---|",
@@ -176,7 +202,9 @@ def table(rows: Sequence[SurveyedPump]) -> str:
     for row in rows:
         if row.refused or row.off_share > row.most or row.excursion_um > 10.0:
             share = "" if row.refused else f"{100 * row.off_share:.1f} %"
-            lines.append(f"| {row.drawn.named} | {share} | {row.excursion_um:.1f} µm | {row.refused} |")
+            lines.append(
+                f"| {row.drawn.named} | {share} | {row.excursion_um:.1f} µm | {row.refused} |"
+            )
     return "\n".join(lines)
 
 
@@ -186,7 +214,9 @@ def main() -> None:
     parser.add_argument("--pumps", type=int, default=40)
     parser.add_argument("--first", type=int, default=0)
     parser.add_argument("--limit-um", type=float, default=10.0)
-    parser.add_argument("--shape", choices=sorted(second_world.CURVES), help="of all, instead of any")
+    parser.add_argument(
+        "--shape", choices=sorted(second_world.CURVES), help="of all, instead of any"
+    )
     parser.add_argument("--full-um-per-s", type=float, help="likewise")
     parser.add_argument("--leak-um-per-s", type=float, help="likewise")
     given = parser.parse_args()
@@ -199,9 +229,11 @@ def main() -> None:
         rows.append(surveyed(replace(drawn(seed), **alike), given.limit_um))
         row = rows[-1]
         print(
-            f"{row.drawn.named}: off {100 * row.off_share:.1f} %, furthest {row.excursion_um:.1f} µm, "
-            f"{row.experiments_s / 60:.0f} of {row.whole_s / 60:.0f} min {row.refused}", flush=True,
-        )  # fmt: skip
+            f"{row.drawn.named}: off {100 * row.off_share:.1f} %, furthest "
+            f"{row.excursion_um:.1f} µm, "
+            f"{row.experiments_s / 60:.0f} of {row.whole_s / 60:.0f} min {row.refused}",
+            flush=True,
+        )
     print(table(rows))
 
 

@@ -1,4 +1,6 @@
-"""A held mirror in virtual time as the messages that a recorder gets: rows, inputs, shapes, events."""
+"""A held mirror in virtual time as the messages that a recorder gets: rows, inputs, shapes,
+events.
+"""
 
 from __future__ import annotations
 
@@ -43,7 +45,8 @@ _COVARIANCE_EVERY = 200  # tracked frames: 10 s
 
 
 class RealisticShapes:
-    """Shapes of the truth with the noise and the full covariance of a reconstruction, which do not compress.
+    """Shapes of the truth with the noise and the full covariance of a reconstruction, which do not
+    compress.
 
     Tracked ones are rounded, and keep their covariance for a while, as those of `LiveTracker`.
     """
@@ -60,17 +63,26 @@ class RealisticShapes:
         estimate = self._truth(now_s)
         if estimate is None:
             return None
-        noisy = estimate.coeffs_um + (FRAME_UM if self._track else 1e-3) * self._rng.normal(size=ZERNIKE_TERMS)
+        noisy = estimate.coeffs_um + (FRAME_UM if self._track else 1e-3) * self._rng.normal(
+            size=ZERNIKE_TERMS
+        )
         if not self._track or estimate.cycle % _COVARIANCE_EVERY == 1:
             self._kept_um2 = self._covariance_um2 * (1 + 1e-3 * self._rng.normal())
         found = replace(estimate, coeffs_um=noisy, covariance_um2=self._kept_um2)
         if self._track:
-            latency_s, residual_urad = round(self._rng.normal(0.013, 0.002), 5), round(self._rng.normal(30.0, 0.5), 2)
+            latency_s, residual_urad = (
+                round(self._rng.normal(0.013, 0.002), 5),
+                round(self._rng.normal(30.0, 0.5), 2),
+            )
             found = replace(
-                found, kind="track", coeffs_um=noisy.round(3) + 0.0,
-                sag_um=round(found.sag_um, 4), latency_s=latency_s,
-                displacement_um=round(found.displacement_um, 3), slope_residual_urad=residual_urad,
-            )  # fmt: skip
+                found,
+                kind="track",
+                coeffs_um=noisy.round(3) + 0.0,
+                sag_um=round(found.sag_um, 4),
+                latency_s=latency_s,
+                displacement_um=round(found.displacement_um, 3),
+                slope_residual_urad=residual_urad,
+            )
         return ring_trip(found)
 
 
@@ -95,7 +107,9 @@ def parts_of(config: Config, duration_s: float, part_s: float) -> Iterator[RunPa
 
 
 def _begun(first: RunPart) -> RunPart:
-    return replace(first, events=[json.dumps({"kind": "start", "mono_s": 0.0}).encode(), *first.events])
+    return replace(
+        first, events=[json.dumps({"kind": "start", "mono_s": 0.0}).encode(), *first.events]
+    )
 
 
 def _take(made: RunPart, tick: VirtualTick, number: int) -> None:
@@ -105,5 +119,6 @@ def _take(made: RunPart, tick: VirtualTick, number: int) -> None:
     if tick.inputs.estimate is not None:
         made.shapes.append(pack_estimate(tick.inputs.estimate))
     made.events += [
-        json.dumps({"mono_s": tick.row.mono_s, **event.to_dict()}, default=str).encode() for event in tick.events
+        json.dumps({"mono_s": tick.row.mono_s, **event.to_dict()}, default=str).encode()
+        for event in tick.events
     ]

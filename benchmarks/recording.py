@@ -1,4 +1,5 @@
-"""Bytes of a day: an hour of hold at 50 Hz with a shape every 2 s through the real recorder, a write every 0.8 s.
+"""Bytes of a day: an hour of hold at 50 Hz with a shape every 2 s through the real recorder, a
+write every 0.8 s.
 
 python -m benchmarks recording
 """
@@ -67,7 +68,11 @@ class Recorded:
     @property
     def tables_mb(self) -> float:
         """All tables but thumbnails, a day."""
-        return sum(self.mb_a_day[spec.name] for spec in table_specs.ALL if spec is not table_specs.THUMBNAILS)
+        return sum(
+            self.mb_a_day[spec.name]
+            for spec in table_specs.ALL
+            if spec is not table_specs.THUMBNAILS
+        )
 
 
 def run() -> list[Figure]:
@@ -77,7 +82,14 @@ def run() -> list[Figure]:
     return [
         at_most("tables, without thumbnails", found.tables_mb, "MB a day", 300.0),
         *(at_most(f"of it {name}", mb[name], "MB a day") for name in ("ticks", "inputs", "shapes")),
-        at_most("Rerun segments, optimised", mb["*.rrd"], "MB a day", None, "before optimising", found.rrd_before_mb),
+        at_most(
+            "Rerun segments, optimised",
+            mb["*.rrd"],
+            "MB a day",
+            None,
+            "before optimising",
+            found.rrd_before_mb,
+        ),
         at_most("bytes written for tables, to bytes kept", found.written_share, "", 3.0),
         at_most("optimising an hour at the lowest priority", found.optimising_s, "s"),
         at_most("recorder, share of a core", 100 * found.busy, "%", 3.0),
@@ -119,7 +131,13 @@ def _measured(folder: Path, stack: ExitStack, config: Config, duration_s: float)
     mb = {spec.name: _bytes(run_dir, f"{spec.name}/*") * a_day for spec in table_specs.ALL}
     mb["*.rrd"] = _bytes(run_dir, "*.rrd") * a_day
     kept_bytes = sum(_bytes(run_dir, f"{spec.name}/*") for spec in table_specs.ALL)
-    return Recorded(mb, before * a_day, optimising_s, busy_s / duration_s, CountingDisk.written_bytes / kept_bytes)
+    return Recorded(
+        mb,
+        before * a_day,
+        optimising_s,
+        busy_s / duration_s,
+        CountingDisk.written_bytes / kept_bytes,
+    )
 
 
 def _optimised_s(run_dir: Path) -> float:

@@ -1,4 +1,5 @@
-"""Bytes of a day of a hold that tracks, twenty figures a second through the real recorder: the growth of its files.
+"""Bytes of a day of a hold that tracks, twenty figures a second through the real recorder: the
+growth of its files.
 
 The start of a run takes as much as minutes of it, so that two runs are compared.
 
@@ -21,7 +22,8 @@ def run() -> list[Figure]:
     config = Config(shape=ShapeConfig(mode="track", track_rate_hz=RATE_HZ))
     short, whole = (recorded(config, lasts_s) for lasts_s in (SHORT_S, LONG_S))
     mb = {
-        files: (LONG_S * whole.mb_a_day[files] - SHORT_S * short.mb_a_day[files]) / (LONG_S - SHORT_S)
+        files: (LONG_S * whole.mb_a_day[files] - SHORT_S * short.mb_a_day[files])
+        / (LONG_S - SHORT_S)
         for files in whole.mb_a_day
     }
     return [

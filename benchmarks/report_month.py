@@ -1,8 +1,8 @@
 """A simulated month: how long its report and its overview take, and how much memory.
 
-2.6e7 ticks at 10 Hz and a figure every 4 s, written by the recorder's own tables in batches of a minute (the Rerun
-segments, which neither command reads, are left out). Writing takes some minutes, so the month is kept in a folder
-for as long as the benchmark runs only.
+2.6e7 ticks at 10 Hz and a figure every 4 s, written by the recorder's own tables in batches of a
+minute (the Rerun segments, which neither command reads, are left out). Writing takes some minutes,
+so the month is kept in a folder for as long as the benchmark runs only.
 """
 
 from __future__ import annotations
@@ -50,7 +50,9 @@ def parts(days: float, seed: int = 1) -> Iterator[tuple[Rows, list[ShapeEstimate
 
 def timed(*arguments: str) -> dict[str, float]:
     """Wall time and peak memory of a command in a process of its own."""
-    done = subprocess.run([sys.executable, "-c", _CHILD, *arguments], capture_output=True, text=True, check=True)
+    done = subprocess.run(
+        [sys.executable, "-c", _CHILD, *arguments], capture_output=True, text=True, check=True
+    )
     found = dict(json.loads(done.stdout.splitlines()[-1]))
     if found.pop("code"):
         raise RuntimeError(f"{' '.join(arguments)}: {done.stderr.strip()}")
@@ -60,13 +62,18 @@ def timed(*arguments: str) -> dict[str, float]:
 def run(days: float = MONTH_DAYS) -> list[Figure]:
     """Report and review of a month, and of half an hour."""
     with tempfile.TemporaryDirectory(prefix="membrane-month-") as folder:
-        month, short = Path(folder) / "20261121T180000Z-month", Path(folder) / "20261121T180000Z-short"
+        month, short = (
+            Path(folder) / "20261121T180000Z-month",
+            Path(folder) / "20261121T180000Z-short",
+        )
         began_s = time.monotonic()
         write_run(month, parts(days))
         wrote_s = time.monotonic() - began_s
         write_run(short, parts(0.5 / 24))
         size_gb = sum(path.stat().st_size for path in month.rglob("*") if path.is_file()) / 1e9
-        timed("report", str(short), "--out", f"{folder}/warm")  # imports from the disk, kernels from their cache
+        timed(
+            "report", str(short), "--out", f"{folder}/warm"
+        )  # imports from the disk, kernels from their cache
         brief = timed("report", str(short), "--out", f"{folder}/a")
         whole = timed("report", str(month), "--out", f"{folder}/b")
         opened = timed("review", str(month), "--save", f"{folder}/review.rrd")

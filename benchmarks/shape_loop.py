@@ -1,4 +1,5 @@
-"""The shape loop on the simulated bench, in virtual time, with shape estimates made from the truth and noise.
+"""The shape loop on the simulated bench, in virtual time, with shape estimates made from the truth
+and noise.
 
 `run()` gives the figures, `python -m benchmarks.shape_loop` prints them.
 """
@@ -19,7 +20,8 @@ from membrane_ctrl.model.telemetry import ShapeState
 from membrane_ctrl.model.zernike_terms import ZERNIKE_TERMS
 from membrane_ctrl.sim.plant import Plant
 
-# Of a paraboloid with a little of the Hencky bowl's spherical terms (Noll 4, 11, 22); piston follows the vertex.
+# Of a paraboloid with a little of the Hencky bowl's spherical terms (Noll 4, 11, 22); piston
+# follows the vertex.
 SENSITIVITY = np.zeros(ZERNIKE_TERMS)
 SENSITIVITY[[0, 3, 10, 21]] = 0.5, 0.2887, -0.012, 0.001
 
@@ -44,7 +46,9 @@ class Tracked:
 def estimate_of(
     time_s: float, sag_change_um: float, displacement_um: float, noise_um: NDArray[np.float64]
 ) -> ShapeEstimate:
-    """A shape estimate of a mirror whose sag has changed; `noise_um` (terms,) is added to the coefficients."""
+    """A shape estimate of a mirror whose sag has changed; `noise_um` (terms,) is added to the
+    coefficients.
+    """
     return ShapeEstimate(
         time_s=time_s,
         kind="fringes",
@@ -63,7 +67,9 @@ def estimate_of(
 
 
 class EstimateMaker:
-    """Estimates as a cycle gives them: mean of the truth and of the laser over the exposures, then the latency."""
+    """Estimates as a cycle gives them: mean of the truth and of the laser over the exposures, then
+    the latency.
+    """
 
     def __init__(self, period_s: float, sag_noise_um: float, seed: int) -> None:
         self._period_s = period_s
@@ -86,10 +92,17 @@ class EstimateMaker:
         return estimate_of(middle_s, float(sag_um), float(mean_laser_um), noise_um)
 
 
-def track(twin: TwinConfig, duration_s: float, sag_noise_um: float = 0.2, shape: ShapeConfig = SHAPE) -> Tracked:
-    """Hold the mirror with both loops, for `duration_s` from when the shape loop is switched on, if enabled."""
+def track(
+    twin: TwinConfig, duration_s: float, sag_noise_um: float = 0.2, shape: ShapeConfig = SHAPE
+) -> Tracked:
+    """Hold the mirror with both loops, for `duration_s` from when the shape loop is switched on, if
+    enabled.
+    """
     plant, inner = Plant(twin, PumpConfig()), InnerLoop(LOOP, PumpConfig())
-    shape_loop, maker = ShapeLoop(shape, SENSITIVITY), EstimateMaker(shape.period_s, sag_noise_um, twin.seed)
+    shape_loop, maker = (
+        ShapeLoop(shape, SENSITIVITY),
+        EstimateMaker(shape.period_s, sag_noise_um, twin.seed),
+    )
     dt_s = 1 / LOOP.rate_hz
     inner.start(plant.sample().displacement_um, plant.truth().leak_um_per_s)
     out = ShapeOutput(ShapeState.OFF, "", 0.0, np.nan, np.nan, np.nan)
@@ -110,13 +123,21 @@ def track(twin: TwinConfig, duration_s: float, sag_noise_um: float = 0.2, shape:
 
 
 def run(duration_s: float = 600.0) -> dict[str, dict[str, float]]:
-    """Movement of the true sag over the run (10 s means) with the laser drifting 2 µm/min, and the trim's noise."""
+    """Movement of the true sag over the run (10 s means) with the laser drifting 2 µm/min, and the
+    trim's noise.
+    """
     figures = {}
     drifting = TwinConfig(laser_drift_um_per_min=2.0, start_error_um=0.0)
-    for name, noise_um, enabled in (("on, 0.1 µm", 0.1, True), ("on, 0.3 µm", 0.3, True), ("off", 0.1, False)):
+    for name, noise_um, enabled in (
+        ("on, 0.1 µm", 0.1, True),
+        ("on, 0.3 µm", 0.3, True),
+        ("off", 0.1, False),
+    ):
         shape = SHAPE.model_copy(update={"enabled": enabled})
         run_ = track(drifting, duration_s, noise_um, shape)
-        means_um = run_.true_um[run_.time_s >= ON_S].reshape(-1, round(10 * LOOP.rate_hz)).mean(axis=1)
+        means_um = (
+            run_.true_um[run_.time_s >= ON_S].reshape(-1, round(10 * LOOP.rate_hz)).mean(axis=1)
+        )
         still = track(TwinConfig(start_error_um=0.0), duration_s, noise_um, shape)
         figures[name] = {
             "sag_moved_um": float(np.ptp(means_um)),

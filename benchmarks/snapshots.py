@@ -1,8 +1,10 @@
-"""Snapshots of the controller: what one costs a tick at 200 Hz, its size, and how fast a replay starts with it.
+"""Snapshots of the controller: what one costs a tick at 200 Hz, its size, and how fast a replay
+starts with it.
 
-The estimator runs, with its covariance of 71 x 71 states. A snapshot is taken between two ticks of a held mirror, in
-the same run as the ticks that are its reference, and goes into a ring as in a hold. Between two snapshots plant and
-board of the twin run, so that nothing is warm in the caches that would not be so in a hold.
+The estimator runs, with its covariance of 71 x 71 states. A snapshot is taken between two ticks of
+a held mirror, in the same run as the ticks that are its reference, and goes into a ring as in a
+hold. Between two snapshots plant and board of the twin run, so that nothing is warm in the caches
+that would not be so in a hold.
 """
 
 from __future__ import annotations
@@ -67,8 +69,22 @@ def run() -> list[Figure]:
     tick_ms, snapshot_ms = 1e3 * np.median(ticks_s), 1e3 * np.median(snapshots_s)
     late_ms = 1e3 * np.quantile(snapshots_s, 0.95)
     return [
-        at_most("a snapshot, median", float(snapshot_ms), "ms", MOST_MS, "a tick, median", float(tick_ms)),
-        at_most("a snapshot, 95 % of them within", float(late_ms), "ms", None, "a tick, median", float(tick_ms)),
+        at_most(
+            "a snapshot, median",
+            float(snapshot_ms),
+            "ms",
+            MOST_MS,
+            "a tick, median",
+            float(tick_ms),
+        ),
+        at_most(
+            "a snapshot, 95 % of them within",
+            float(late_ms),
+            "ms",
+            None,
+            "a tick, median",
+            float(tick_ms),
+        ),
         at_most("size of a snapshot", len(snapshot) / 1e3, "kB"),
         at_most("its size compressed", len(zlib.compress(snapshot, 1)) / 1e3, "kB"),
         at_most("a controller made from it, median", float(1e3 * np.median(starts_s)), "ms"),

@@ -1,4 +1,5 @@
-"""Days of simulated hold: weather, a day's temperature, creep, and faults at random; memory must stay flat.
+"""Days of simulated hold: weather, a day's temperature, creep, and faults at random; memory must
+stay flat.
 
 python -m benchmarks.soak [--days 30] [--seed 1]
 """
@@ -24,7 +25,12 @@ from membrane_ctrl.hold.virtual_run import TruthShape, VirtualRun, VirtualTick
 from membrane_ctrl.metrology.optics.film_law import zernike_projection
 from membrane_ctrl.model.telemetry import State
 from membrane_ctrl.sim.plant import Plant
-from membrane_ctrl.sim.surroundings import BenchEvent, DailyTemperature, LaserDropout, PressureWeather
+from membrane_ctrl.sim.surroundings import (
+    BenchEvent,
+    DailyTemperature,
+    LaserDropout,
+    PressureWeather,
+)
 from membrane_ctrl.sim.virtual_bench import VirtualBench
 
 DAY_S = 86_400.0
@@ -40,7 +46,9 @@ Take = Callable[[VirtualTick], None]
 
 @dataclass
 class Means:
-    """Streaming means over a window; counts how many are in a band. Memory does not grow with time."""
+    """Streaming means over a window; counts how many are in a band.
+    Memory does not grow with time.
+    """
 
     window: int
     band_um: float
@@ -99,9 +107,15 @@ def soak_config(seed: int) -> Config:
 
 
 def soak(
-    days: float, seed: int, faults: bool = True, events: tuple[BenchEvent, ...] = (), take: Take | None = None
+    days: float,
+    seed: int,
+    faults: bool = True,
+    events: tuple[BenchEvent, ...] = (),
+    take: Take | None = None,
 ) -> SoakTally:
-    """Hold for `days` or until Ctrl-C; with `faults` something goes wrong six times a day. `take` gets every tick."""
+    """Hold for `days` or until Ctrl-C; with `faults` something goes wrong six times a day. `take`
+    gets every tick.
+    """
     config = soak_config(seed)
     bench = VirtualBench(Plant(config.twin, config.pump, events))
     run = VirtualRun(config, bench, zernike_projection(), TruthShape(bench, config, seed))
@@ -171,13 +185,17 @@ def rss_mb() -> float:
 
 
 def dropout_excursions_um(seeds: range = range(12)) -> list[float]:
-    """Excursion of the true centre in 10 s without a laser, one figure a seed of typical weather."""
+    """Excursion of the true centre in 10 s without a laser,
+    one figure a seed of typical weather.
+    """
     return [_dropout_excursion_um(seed) for seed in seeds]
 
 
 def _dropout_excursion_um(seed: int) -> float:
     config = Config(loop=LoopConfig(rate_hz=RATE_HZ), twin=TwinConfig(seed=seed))
-    plant = Plant(config.twin, config.pump, (LaserDropout(LASER_LOST_S, LASER_BACK_S - LASER_LOST_S),))
+    plant = Plant(
+        config.twin, config.pump, (LaserDropout(LASER_LOST_S, LASER_BACK_S - LASER_LOST_S),)
+    )
     run = VirtualRun(config, VirtualBench(plant), zernike_projection())
     run.tick((Command("hold", "soak"),))
     worst_um = 0.0
@@ -198,10 +216,19 @@ def figures(days: float, seed: int = 1, take: Take | None = None) -> list[Figure
         at_least("speed against real time", days * DAY_S / tally.wall_s, "", 1000.0),
         at_least("held", 100 * tally.held_s / (days * DAY_S), "% of the time", 98.0),
         at_most("faults, latched or cleared", tally.events["fault"], ""),
-        at_most("standard deviation of the true centre", (tally.square_um2 / tally.ticks) ** 0.5, "um"),
+        at_most(
+            "standard deviation of the true centre", (tally.square_um2 / tally.ticks) ** 0.5, "um"
+        ),
         at_least("1 s means within 2 µm", 100 * tally.second.fraction, "%", 99.9),
         at_least("60 s means within 0.5 µm", 100 * tally.minute.fraction, "%", 99.0),
-        at_most("growth of memory since the first hour", grown, "%", 5.0, "MB after it", tally.rss_after_hour_mb),
+        at_most(
+            "growth of memory since the first hour",
+            grown,
+            "%",
+            5.0,
+            "MB after it",
+            tally.rss_after_hour_mb,
+        ),
         at_most("events", tally.event_bytes / days / 1e3, "kB a day"),
     ]
 
@@ -212,14 +239,21 @@ def everything(seed: int) -> tuple[BenchEvent, ...]:
 
 
 def run() -> list[Figure]:
-    """A day of typical weather (more seeds: tests/campaign), the laser lost, a day with everything."""
+    """A day of typical weather (more seeds: tests/campaign), the laser lost,
+    a day with everything.
+    """
     day = soak(1.0, 1, faults=False)
     excursions_um = dropout_excursions_um()
     return [
         at_least("24 h typical: 1 s means within 2 µm", 100 * day.second.fraction, "%", 99.9),
         at_most("24 h typical: worst 60 s mean", day.minute.worst_um, "um", MINUTE_BAND_UM),
         at_most("24 h typical: standard deviation", (day.square_um2 / day.ticks) ** 0.5, "um"),
-        at_most("10 s without laser, worst of 12 seeds: excursion of the true centre", max(excursions_um), "um", 4.0),
+        at_most(
+            "10 s without laser, worst of 12 seeds: excursion of the true centre",
+            max(excursions_um),
+            "um",
+            4.0,
+        ),
         at_most("10 s without laser, mean of 12 seeds", float(np.mean(excursions_um)), "um"),
         *figures(1.0),
     ]
@@ -229,12 +263,18 @@ def _tell_days(tick: VirtualTick) -> None:
     """Print a line per simulated day."""
     day, second = divmod(tick.row.mono_s, DAY_S)
     if second < tick.row.dt_s / 2:
-        print(f"day {day:.0f}: {tick.row.state.name.lower()}, {rss_mb():.1f} MB", file=sys.stderr, flush=True)
+        print(
+            f"day {day:.0f}: {tick.row.state.name.lower()}, {rss_mb():.1f} MB",
+            file=sys.stderr,
+            flush=True,
+        )
 
 
 def main() -> int:
     """The command line."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("--days", type=float, default=30.0)
     parser.add_argument("--seed", type=int, default=1)
     options = parser.parse_args()

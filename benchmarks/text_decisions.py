@@ -1,10 +1,11 @@
-"""Finds decisions that are taken on a text made for people; `python -m benchmarks.text_decisions` lists them.
+"""Finds decisions that are taken on a text made for people; `python -m benchmarks.text_decisions`
+lists them.
 
-A sentence may be improved at any time, so no code may depend on its words: a code, an enum or a flag decides, and the
-sentence is made where it is shown. A text for people is `str` of a caught exception, and whatever is called as such
-texts are called (`why`, `reason`, `message`, ...) unless its annotation or value in the same file shows that it is no
-text. A decision is a test of its words: `startswith`, `in`, `==` with a literal, a regular expression, or taking it
-apart at a word.
+A sentence may be improved at any time, so no code may depend on its words: a code, an enum or a
+flag decides, and the sentence is made where it is shown. A text for people is `str` of a caught
+exception, and whatever is called as such texts are called (`why`, `reason`, `message`, ...) unless
+its annotation or value in the same file shows that it is no text. A decision is a test of its
+words: `startswith`, `in`, `==` with a literal, a regular expression, or taking it apart at a word.
 """
 
 from __future__ import annotations
@@ -19,10 +20,26 @@ from pathlib import Path
 ROOT = Path(__file__).parents[1]
 TOPS = ("membrane_ctrl", "firmware_iface", "tuning")
 
-_TEXTS = frozenset({
-    "why", "reason", "message", "sentence", "remedy", "cause", "says", "said", "told", "words", "note", "problem",
-    "refusal", "refused", "failure", "outcome",
-})  # fmt: skip
+_TEXTS = frozenset(
+    {
+        "why",
+        "reason",
+        "message",
+        "sentence",
+        "remedy",
+        "cause",
+        "says",
+        "said",
+        "told",
+        "words",
+        "note",
+        "problem",
+        "refusal",
+        "refused",
+        "failure",
+        "outcome",
+    }
+)
 _WORD = re.compile("[A-Za-z]{2,}")
 _TESTS = frozenset({"startswith", "endswith"})
 _DISSECTIONS = frozenset({"find", "index", "partition", "rpartition", "translate"})
@@ -31,9 +48,9 @@ _PATTERNS = frozenset({"match", "search", "fullmatch"})
 # Functions that may: `file:function` and why.
 EXCEPTIONS: dict[str, str] = {
     "membrane_ctrl/config/toml_file.py:_cause": "the parser of TOML gives no more than a message",
-    "membrane_ctrl/config/toml_file.py:describe": "joins a message to its key; only a point or a colon depends on it",
-    "membrane_ctrl/model/errors.py:named": "puts a file's name before a message; nothing but the message changes",
-    "firmware_iface/driver_calls.py:_name_device": "puts a device's name before a message without it",
+    "membrane_ctrl/config/toml_file.py:describe": "joins a message to its key; only a point or a colon depends on it",  # noqa: E501
+    "membrane_ctrl/model/errors.py:named": "puts a file's name before a message; nothing but the message changes",  # noqa: E501
+    "firmware_iface/driver_calls.py:_name_device": "puts a device's name before a message without it",  # noqa: E501
 }
 
 
@@ -98,7 +115,11 @@ class _Finder(ast.NodeVisitor):
             self._note(node, self._is_text(left) and _has_words(right))
             self._note(node, self._is_text(right) and _has_words(left))
         elif isinstance(operator, ast.In | ast.NotIn) and self._is_text(left):
-            self._note(node, isinstance(right, ast.Tuple | ast.Set | ast.List) and any(map(_has_words, right.elts)))
+            self._note(
+                node,
+                isinstance(right, ast.Tuple | ast.Set | ast.List)
+                and any(map(_has_words, right.elts)),
+            )
         self.generic_visit(node)
 
     def visit_Call(self, node: ast.Call) -> None:
@@ -107,7 +128,9 @@ class _Finder(ast.NodeVisitor):
         if isinstance(function, ast.Attribute):
             if self._is_text(function.value):
                 words = [each for argument in node.args for each in _elements(argument)]
-                tests = function.attr in _TESTS and any(_has_words(each) or not _is_literal(each) for each in words)
+                tests = function.attr in _TESTS and any(
+                    _has_words(each) or not _is_literal(each) for each in words
+                )
                 self._note(node, tests or function.attr in _DISSECTIONS)
             self._note(node, function.attr in _PATTERNS and any(map(self._is_text, node.args)))
         self.generic_visit(node)
@@ -118,9 +141,16 @@ class _Finder(ast.NodeVisitor):
         self._functions.pop()
 
     def _is_text(self, node: ast.expr) -> bool:
-        if isinstance(node, ast.Call) and isinstance(node.func, ast.Name) and node.func.id == "str" and node.args:
+        if (
+            isinstance(node, ast.Call)
+            and isinstance(node.func, ast.Name)
+            and node.func.id == "str"
+            and node.args
+        ):
             argument = node.args[0]
-            return (isinstance(argument, ast.Name) and argument.id in self._caught) or self._is_text(argument)
+            return (
+                isinstance(argument, ast.Name) and argument.id in self._caught
+            ) or self._is_text(argument)
         name = _last_name(node)
         return name.lstrip("_") in _TEXTS and name not in self._not_texts
 
@@ -147,7 +177,11 @@ def _is_literal(node: ast.expr) -> bool:
 def _has_words(node: ast.expr) -> bool:
     if isinstance(node, ast.JoinedStr):
         return True
-    return isinstance(node, ast.Constant) and isinstance(node.value, str) and bool(_WORD.search(node.value))
+    return (
+        isinstance(node, ast.Constant)
+        and isinstance(node.value, str)
+        and bool(_WORD.search(node.value))
+    )
 
 
 def _is_constant_name(node: ast.expr) -> bool:
@@ -155,10 +189,16 @@ def _is_constant_name(node: ast.expr) -> bool:
 
 
 def _names_of_other_types(tree: ast.Module) -> frozenset[str]:
-    """Return names that the file declares as something else than a text, or fills with a container."""
+    """Return names that the file declares as something else than a text,
+    or fills with a container.
+    """
     names = set[str]()
     for node in ast.walk(tree):
-        if isinstance(node, ast.arg) and node.annotation is not None and not _declares_text(node.annotation):
+        if (
+            isinstance(node, ast.arg)
+            and node.annotation is not None
+            and not _declares_text(node.annotation)
+        ):
             names.add(node.arg)
         elif isinstance(node, ast.AnnAssign) and not _declares_text(node.annotation):
             names.add(_last_name(node.target))
@@ -168,12 +208,22 @@ def _names_of_other_types(tree: ast.Module) -> frozenset[str]:
 
 
 def _declares_text(annotation: ast.expr) -> bool:
-    return re.fullmatch(r"'?(\(?str\)?|Any|object)( \| None)?'?", ast.unparse(annotation)) is not None
+    return (
+        re.fullmatch(r"'?(\(?str\)?|Any|object)( \| None)?'?", ast.unparse(annotation)) is not None
+    )
 
 
 def _is_container(value: ast.expr) -> bool:
     if isinstance(value, ast.Call):
-        return _last_name(value.func) in {"set", "frozenset", "list", "dict", "tuple", "deque", "Counter"}
+        return _last_name(value.func) in {
+            "set",
+            "frozenset",
+            "list",
+            "dict",
+            "tuple",
+            "deque",
+            "Counter",
+        }
     kinds = ast.Set | ast.List | ast.Dict | ast.Tuple | ast.SetComp | ast.ListComp | ast.DictComp
     return isinstance(value, kinds)
 
@@ -187,11 +237,15 @@ def decisions(root: Path = ROOT) -> Iterator[TextDecision]:
     """Yield the decisions on texts in the product, also those of `EXCEPTIONS`."""
     for top in TOPS:
         for path in sorted((root / top).rglob("*.py")):
-            yield from decisions_in(path.relative_to(root).as_posix(), path.read_text(encoding="utf-8"))
+            yield from decisions_in(
+                path.relative_to(root).as_posix(), path.read_text(encoding="utf-8")
+            )
 
 
 def main() -> int:
-    """Print every decision on a text, and every exception that is none; return 1 if there is one."""
+    """Print every decision on a text, and every exception that is none;
+    return 1 if there is one.
+    """
     found = list(decisions())
     keys = {each.key for each in found}
     wrong = [

@@ -1,7 +1,8 @@
 """Reading and commanding the pump board tick by tick: how late ticks begin, and how long one takes.
 
-The reference for lateness is a bare asyncio loop of the same rate, measured just before. Modbus RTU is paced as a
-line of 115200 baud. Board, line and driver share one process, so the figures include their cost.
+The reference for lateness is a bare asyncio loop of the same rate, measured just before. Modbus RTU
+is paced as a line of 115200 baud. Board, line and driver share one process, so the figures include
+their cost.
 """
 
 from __future__ import annotations
@@ -34,7 +35,9 @@ class _StillPlant:
     """Always the same."""
 
     def sample(self) -> BoardSample:
-        return BoardSample(0.0, 0, 600.0, 101_325.0, 20.0, 20.0, round(time.monotonic() * 200), time.monotonic())
+        return BoardSample(
+            0.0, 0, 600.0, 101_325.0, 20.0, 20.0, round(time.monotonic() * 200), time.monotonic()
+        )
 
     def actuate(self, pump_fraction: float, vent_fraction: float) -> None:
         """Nothing moves."""
@@ -44,7 +47,9 @@ async def _nothing() -> None:
     """The tick of a bare loop."""
 
 
-async def lateness_ms(rate_hz: float, duration_s: float, tick: Callable[[], Awaitable[None]]) -> tuple[float, float]:
+async def lateness_ms(
+    rate_hz: float, duration_s: float, tick: Callable[[], Awaitable[None]]
+) -> tuple[float, float]:
     """p99 of how late a tick begins, and of how long it takes, both in ms."""
     deadline_s, late_ms, took_ms = time.monotonic(), [], []
     for _ in range(round(rate_hz * duration_s)):
@@ -74,7 +79,9 @@ async def _board(url: str, rate_hz: float, duration_s: float) -> tuple[float, fl
 async def _measure(duration_s: float) -> list[Figure]:
     emulator = PumpBoardEmulator(_StillPlant(), port=0)
     await emulator.start()
-    bus = RtuBusEmulator(SerialSettings(BAUD, parity="E"), {1: partial(respond, table=emulator.state)})
+    bus = RtuBusEmulator(
+        SerialSettings(BAUD, parity="E"), {1: partial(respond, table=emulator.state)}
+    )
     figures = []
     with tempfile.TemporaryDirectory() as folder:
         wire = PtyWire(bus, Path(folder) / "tty")
@@ -88,7 +95,9 @@ async def _measure(duration_s: float) -> list[Figure]:
             late_ms, took_ms = await _board(url, rate_hz, duration_s)
             what = f"{name}, {rate_hz:g} Hz"
             figures += [
-                at_most(f"{what}: tick lateness p99", late_ms, "ms", 5.0, "bare asyncio loop", bare_ms),
+                at_most(
+                    f"{what}: tick lateness p99", late_ms, "ms", 5.0, "bare asyncio loop", bare_ms
+                ),
                 at_most(f"{what}: read and write p99", took_ms, "ms", None, "tick", 1e3 / rate_hz),
             ]
         wire.unplug()

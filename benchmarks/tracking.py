@@ -1,4 +1,6 @@
-"""Tracking at full size: figures per second of one core, and the error against the frames' own bound."""
+"""Tracking at full size: figures per second of one core, and the error against the frames' own
+bound.
+"""
 
 from __future__ import annotations
 
@@ -39,7 +41,9 @@ def run() -> list[Figure]:
     tracker = Tracker(scene, (camera.height_px, camera.width_px), 255, camera.noise_adu)
     renderer = OpticsRenderer(OPTICS, FILM, seed=2)
     shown = [Pattern("crossed", "", 32, float(x), shift_y_rad=float(y)) for x, y in STEPS]
-    tracker.anchor([renderer.render(p, 0.0) for p in shown], STEPS, np.arange(5) / 20, np.full(5, math.nan))
+    tracker.anchor(
+        [renderer.render(p, 0.0) for p in shown], STEPS, np.arange(5) / 20, np.full(5, math.nan)
+    )
     moved_um = 0.2 * np.sin(np.arange(FRAMES))
     frames = [renderer.render(shown[0], float(um)) for um in moved_um]
     tracker.follow(renderer.render(shown[0], 0.0), (0.0, 0.0), 0.5)
@@ -56,20 +60,31 @@ def run() -> list[Figure]:
     rate, by_clock = FRAMES / busy_s, FRAMES / passed_s
     name = f"noise of terms 4 to {ZERNIKE_TERMS}, RMS"
     return [
-        at_least("figures of 2448 x 2048 per second of one core", rate, "1/s", 50, "by the clock", by_clock),
+        at_least(
+            "figures of 2448 x 2048 per second of one core",
+            rate,
+            "1/s",
+            50,
+            "by the clock",
+            by_clock,
+        ),
         at_most(name, 1e3 * noise_um, "nm", 1.3e3 * bound_um, "bound", 1e3 * bound_um),
         at_most("error / sigma, mean of the terms", ratio, "", 1.3),
     ]
 
 
 def _bound_um(scene: CrossedScene, noise_adu: float) -> float:
-    """The least RMS error of the terms from 4 that frames of this noise allow, their light refitted."""
+    """The least RMS error of the terms from 4 that frames of this noise allow, their light
+    refitted.
+    """
     once = scene.taper > 0  # the others repeat a bin
     phases, jacobian = scene.phase_rad(scene.surface), scene.jacobian(scene.surface)
     level, swing_x, swing_y = scene.light_adu
     (cos_x, cos_y), (sin_x, sin_y) = np.cos(phases), np.sin(phases)
     shape: FloatArray = -swing_x * sin_x * jacobian[0] - swing_y * sin_y * jacobian[1]
-    columns = np.concatenate([shape, *(scene.basis * wave for wave in (level, swing_x * cos_x, swing_y * cos_y))])
+    columns = np.concatenate(
+        [shape, *(scene.basis * wave for wave in (level, swing_x * cos_x, swing_y * cos_y))]
+    )
     columns = columns[:, once]
     sigma_adu = math.hypot(noise_adu, math.sqrt(1 / 12)) / scene.bin_px
     covariance = sigma_adu**2 * np.linalg.inv(columns @ columns.T)

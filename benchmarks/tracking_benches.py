@@ -1,9 +1,12 @@
-"""Do tracked figures hold on benches that nobody tuned them to? Random ones, with disturbances and planted faults.
+"""Do tracked figures hold on benches that nobody tuned them to? Random ones, with disturbances and
+planted faults.
 
-The number of a bench gives its geometry, film, camera, pattern, disturbances and timing. The pictures are those of a
-world that shares no code with the product (`tests/support/crossed_world.py`). A figure is silently wrong if it is
-called ok and off by more than 5 sigma and 0.1 µm. A bench whose reference `measure` rejects, or whose fringes `track`
-refuses, does not count. Answers go to a file, line by line: a run that is stopped goes on where it was.
+The number of a bench gives its geometry, film, camera, pattern, disturbances and timing. The
+pictures are those of a world that shares no code with the product
+(`tests/support/crossed_world.py`). A figure is silently wrong if it is called ok and off by more
+than 5 sigma and 0.1 µm. A bench whose reference `measure` rejects, or whose fringes `track`
+refuses, does not count. Answers go to a file, line by line: a run that is stopped goes on where it
+was.
 
 python -m benchmarks.tracking_benches [--benches N] [--first K]
 """
@@ -35,14 +38,29 @@ FAR_SIGMAS, FAR_UM, WIDTHS = 5.0, 0.1, (245, 300, 345, 400)
 PIXEL_RAD = 2.3  # of the crossed fringes, in 95 % of the pixels
 # Largest sizes of what disturbs, each present in half of the benches; docs/tracking.md
 DISTURBANCES = {
-    "drift_um_per_s": 0.01, "swing_um": 0.3, "shimmer_um": 0.1, "brightness": 0.005, "ambient_adu": 2.0, "bend": 0.04,
-    "dim_per_s": 1e-4, "dust": 20, "air_um": 0.1, "sticking": 0.02, "drum_nm": 5.0,
-}  # fmt: skip
+    "drift_um_per_s": 0.01,
+    "swing_um": 0.3,
+    "shimmer_um": 0.1,
+    "brightness": 0.005,
+    "ambient_adu": 2.0,
+    "bend": 0.04,
+    "dim_per_s": 1e-4,
+    "dust": 20,
+    "air_um": 0.1,
+    "sticking": 0.02,
+    "drum_nm": 5.0,
+}
 # What a planted fault must be called; a jump may also be followed, if the figure is right
 NAMES = {
-    "frozen": "frozen", "saturated": "saturated", "dark": "dark", "exposure": "exposure changed", "hand": "covered",
-    "jump": "", "blank": "no fringes", "missing": "",
-}  # fmt: skip
+    "frozen": "frozen",
+    "saturated": "saturated",
+    "dark": "dark",
+    "exposure": "exposure changed",
+    "hand": "covered",
+    "jump": "",
+    "blank": "no fringes",
+    "missing": "",
+}
 GAINS = {"saturated": 2.5, "dark": 0.1, "blank": math.nan}
 
 
@@ -52,7 +70,11 @@ class Bench(CrossedWorld):
 
     gains: dict[float, float] = field(default_factory=dict)  # by time; NaN is a grey screen
     jump_s: float = math.inf
-    jump_um: tuple[float, float, float] = (0.0, 0.0, 0.0)  # of the sag, and a tilt along x and y at the rim
+    jump_um: tuple[float, float, float] = (
+        0.0,
+        0.0,
+        0.0,
+    )  # of the sag, and a tilt along x and y at the rim
 
     def sag_um(self, t: Any) -> Any:
         return super().sag_um(t) + self.jump_um[0] * (t >= self.jump_s)
@@ -61,7 +83,9 @@ class Bench(CrossedWorld):
         tilt_um = (self.jump_um[1] * x + self.jump_um[2] * y) / RADIUS_MM
         return np.asarray(super().film_mm(x, y, t) + 1e-3 * tilt_um * (t >= self.jump_s))
 
-    def crossed(self, t: float, shift_x: float = 0.0, shift_y: float = 0.0, gain: float = 1.0) -> NDArray[Any]:
+    def crossed(
+        self, t: float, shift_x: float = 0.0, shift_y: float = 0.0, gain: float = 1.0
+    ) -> NDArray[Any]:
         gain = self.gains.get(t, gain)
         if math.isnan(gain):
             return self.frame(t, lambda s_x, _: np.full_like(s_x, 0.5))
@@ -82,24 +106,43 @@ def geometry_of(random: np.random.Generator) -> dict[str, Any]:
     while True:
         alpha_deg, focal_mm, fill = random.uniform((74.0, 8.0, 0.8), (86.0, 50.0, 0.96))
         setup: dict[str, Any] = {
-            "a_mm": random.uniform(1500, 5000), "b_mm": random.uniform(1500, 5000), "alpha_deg": alpha_deg,
-            "sag_mm": random.uniform(20, 60), "focal_mm": focal_mm, "coma_mm": random.uniform(-0.1, 0.1),
-            "astigmatism_mm": tuple(random.uniform(-0.5, 0.5, 2).tolist()), "ripple_mm": random.uniform(0, 0.004),
+            "a_mm": random.uniform(1500, 5000),
+            "b_mm": random.uniform(1500, 5000),
+            "alpha_deg": alpha_deg,
+            "sag_mm": random.uniform(20, 60),
+            "focal_mm": focal_mm,
+            "coma_mm": random.uniform(-0.1, 0.1),
+            "astigmatism_mm": tuple(random.uniform(-0.5, 0.5, 2).tolist()),
+            "ripple_mm": random.uniform(0, 0.004),
             "ripple_waves": tuple(random.uniform(-7, 7, 2).tolist()),
             "crossed_periods": int(random.choice([16, 24, 32, 40])),
-        }  # fmt: skip
+        }
         for width in WIDTHS:
             setup |= {"width": width, "height": round(width * 205 / 245)}
-            setup["pixel_um"] = 1e3 * RADIUS_MM * 2 * focal_mm / setup["a_mm"] / (fill * setup["height"])
+            setup["pixel_um"] = (
+                1e3 * RADIUS_MM * 2 * focal_mm / setup["a_mm"] / (fill * setup["height"])
+            )
             s_x, s_y, x, y, _ = CrossedWorld(**setup | CLEAN).trace(0.0)
             used = np.hypot(x, y) < 475.0
-            side_mm = 2 * max(np.abs(s_x[used]).max(), np.abs(s_y[used]).max()) * random.uniform(0.8, 1.05)
-            turned = np.array([[np.gradient(s, axis=axis)[used] for axis in (0, 1)] for s in (s_x, s_y)])
+            side_mm = (
+                2
+                * max(np.abs(s_x[used]).max(), np.abs(s_y[used]).max())
+                * random.uniform(0.8, 1.05)
+            )
+            turned = np.array(
+                [[np.gradient(s, axis=axis)[used] for axis in (0, 1)] for s in (s_x, s_y)]
+            )
             area = turned[0, 0] * turned[1, 1] - turned[0, 1] * turned[1, 0]
             least = np.abs(area).min() / np.median(np.abs(area))
             if not 250 < side_mm < 700 or np.ptp(np.sign(area)) or least < 0.03:
                 break
-            steps = np.quantile(np.abs(turned), 0.95, axis=2).max() * 2 * math.pi * setup["crossed_periods"] / side_mm
+            steps = (
+                np.quantile(np.abs(turned), 0.95, axis=2).max()
+                * 2
+                * math.pi
+                * setup["crossed_periods"]
+                / side_mm
+            )
             if steps < PIXEL_RAD:
                 return setup | {"side_mm": float(side_mm)}
 
@@ -109,14 +152,29 @@ def bench_of(number: int) -> tuple[Bench, Run]:
     random = np.random.default_rng((20, number))
     setup = geometry_of(random)
     off = {name: type(most)(0) for name, most in DISTURBANCES.items()}
-    some = {name: type(most)(random.uniform(0, most)) for name, most in DISTURBANCES.items() if random.random() < 0.5}
-    slow = {"backlight_hz": random.uniform(1000, 3000), "rolling_s": random.uniform(0, 0.02), "laser_um": 1.0}
+    some = {
+        name: type(most)(random.uniform(0, most))
+        for name, most in DISTURBANCES.items()
+        if random.random() < 0.5
+    }
+    slow = {
+        "backlight_hz": random.uniform(1000, 3000),
+        "rolling_s": random.uniform(0, 0.02),
+        "laser_um": 1.0,
+    }
     some |= {name: value for name, value in slow.items() if random.random() < 0.5}
     world = Bench(
-        **setup | off | some, sticking_s=random.uniform(60, 3600), bits=int(random.choice([8, 12, 16])),
-        noise_adu=float(np.exp(random.uniform(np.log(0.1), np.log(2)))), contrast=random.uniform(0.5, 1), seed=number,
-    )  # fmt: skip
-    frames, frame_s = int(random.integers(60, 101)), float(np.exp(random.uniform(np.log(0.05), np.log(2))))
+        **setup | off | some,
+        sticking_s=random.uniform(60, 3600),
+        bits=int(random.choice([8, 12, 16])),
+        noise_adu=float(np.exp(random.uniform(np.log(0.1), np.log(2)))),
+        contrast=random.uniform(0.5, 1),
+        seed=number,
+    )
+    frames, frame_s = (
+        int(random.integers(60, 101)),
+        float(np.exp(random.uniform(np.log(0.05), np.log(2)))),
+    )
     step_s = float(random.choice([random.uniform(5, 30), math.inf]))
     times = np.asarray(0.5 + frame_s * np.arange(frames), float)
     faults = _planted(world, times, random) if random.random() < 0.5 else {}
@@ -124,7 +182,9 @@ def bench_of(number: int) -> tuple[Bench, Run]:
 
 
 def _planted(world: Bench, times: Array, random: np.random.Generator) -> dict[int, str]:
-    """Faults in frames that do not touch each other; the world is told of those that it shows itself."""
+    """Faults in frames that do not touch each other; the world is told of those that it shows
+    itself.
+    """
     places = np.sort(random.choice(np.arange(1, times.size // 2 - 1), 5, replace=False)) * 2
     kinds = random.choice([kind for kind in NAMES if kind != "jump"], places.size).tolist()
     faults = dict(zip(places.tolist(), kinds, strict=True))
@@ -135,7 +195,9 @@ def _planted(world: Bench, times: Array, random: np.random.Generator) -> dict[in
             world.gains[float(times[k])] = GAINS[kind]
     if random.random() < 0.5:
         k = min(max(faults) + 2, times.size - 1)
-        deeper_um, tilt_um = random.uniform((-1e3, 0), (1e3, 10 * RADIUS_MM)) * random.random(2)  # often small
+        deeper_um, tilt_um = random.uniform((-1e3, 0), (1e3, 10 * RADIUS_MM)) * random.random(
+            2
+        )  # often small
         azimuth, faults[k], world.jump_s = random.uniform(0, 2 * math.pi), "jump", float(times[k])
         world.jump_um = (deeper_um, tilt_um * math.cos(azimuth), tilt_um * math.sin(azimuth))
     return faults
@@ -159,14 +221,24 @@ def spoil(world: Bench, folder: Path, faults: dict[int, str]) -> None:
 def answer(number: int) -> dict[str, Any]:
     """What a bench gave."""
     world, plan = bench_of(number)
-    about = {"number": number, "faults": {str(k): kind for k, kind in plan.faults.items()}, "jump_um": world.jump_um}
+    about = {
+        "number": number,
+        "faults": {str(k): kind for k, kind in plan.faults.items()},
+        "jump_um": world.jump_um,
+    }
     said = io.StringIO()
-    with tempfile.TemporaryDirectory() as name, contextlib.redirect_stdout(said), contextlib.redirect_stderr(said):
+    with (
+        tempfile.TemporaryDirectory() as name,
+        contextlib.redirect_stdout(said),
+        contextlib.redirect_stderr(said),
+    ):
         folder = Path(name)
         world.write_reference(folder / "full")
         if command(["measure", str(folder / "full"), "--no-pictures"]):
             return about | {"counts": "reference rejected", "said": said.getvalue()}
-        world.write_track(folder / "track", plan.times, plan.step_every_s, first_steps=plan.first_steps)
+        world.write_track(
+            folder / "track", plan.times, plan.step_every_s, first_steps=plan.first_steps
+        )
         spoil(world, folder / "track", plan.faults)
         if command(["track", str(folder / "track"), "--no-pictures"]) not in (0, 3):
             return about | {"counts": "fringes refused", "said": said.getvalue()}
@@ -181,30 +253,60 @@ def judged(found: TrackedErrors, plan: Run) -> dict[str, Any]:
     frames = np.flatnonzero(found.given)
     good = np.array([found.verdicts[k] == "ok" for k in frames], bool)
     jumped = min([k for k, kind in plan.faults.items() if kind == "jump"], default=plan.times.size)
-    sound = [k for k in range(jumped) if k not in plan.faults and plan.faults.get(k - 1) != "exposure"]
-    said = [f"{verdict} {reason}" for verdict, reason in zip(found.verdicts, found.reasons, strict=True)]
+    sound = [
+        k for k in range(jumped) if k not in plan.faults and plan.faults.get(k - 1) != "exposure"
+    ]
+    said = [
+        f"{verdict} {reason}" for verdict, reason in zip(found.verdicts, found.reasons, strict=True)
+    ]
     about: dict[str, Any] = {
-        "frames": len(said), "verdicts": dict(Counter(found.verdicts)), "silent": frames[good & far].tolist(),
+        "frames": len(said),
+        "verdicts": dict(Counter(found.verdicts)),
+        "silent": frames[good & far].tolist(),
         "false": dict(Counter(said[k].split(":")[0] for k in sound if found.verdicts[k] != "ok")),
         "planted": [
-            {"frame": k, "fault": kind, "said": said[k], "right": k not in frames[far],
-             "named": found.verdicts[k] != "ok" and NAMES[kind] in said[k]} for k, kind in plan.faults.items()
+            {
+                "frame": k,
+                "fault": kind,
+                "said": said[k],
+                "right": k not in frames[far],
+                "named": found.verdicts[k] != "ok" and NAMES[kind] in said[k],
+            }
+            for k, kind in plan.faults.items()
         ],
-    }  # fmt: skip
-    return about if not good.any() else about | {
-        "sag": rms(ratio[good, 0]), "terms": rms(ratio[good, 1:]), "largest": float(np.abs(ratio[good]).max()),
-        "sag_um": rms(errors[good, 0]), "terms_um": rms(errors[good, 1:]),
-        "worst": int(np.argmax(np.abs(ratio[good]).max(axis=0))) + 1,
-    }  # fmt: skip
+    }
+    return (
+        about
+        if not good.any()
+        else about
+        | {
+            "sag": rms(ratio[good, 0]),
+            "terms": rms(ratio[good, 1:]),
+            "largest": float(np.abs(ratio[good]).max()),
+            "sag_um": rms(errors[good, 0]),
+            "terms_um": rms(errors[good, 1:]),
+            "worst": int(np.argmax(np.abs(ratio[good]).max(axis=0))) + 1,
+        }
+    )
 
 
 def _report(one: dict[str, Any]) -> str:
     if "sag" not in one:
-        return f"{one['number']:4d} {one['counts']} {one.get('verdicts', '')} {one.get('said', '')[-200:].strip()}"
-    missed = [f"{f['fault']}: {f['said'][:40]}" for f in one["planted"] if not (f["named"] and f["right"])]
-    sag, terms = (f"{name} {one[name]:.2f} ({one[name + '_um']:.4f} µm)" for name in ("sag", "terms"))
+        return (
+            f"{one['number']:4d} {one['counts']} {one.get('verdicts', '')} "
+            f"{one.get('said', '')[-200:].strip()}"
+        )
+    missed = [
+        f"{f['fault']}: {f['said'][:40]}" for f in one["planted"] if not (f["named"] and f["right"])
+    ]
+    sag, terms = (
+        f"{name} {one[name]:.2f} ({one[name + '_um']:.4f} µm)" for name in ("sag", "terms")
+    )
     wrong = f"silently wrong {len(one['silent'])}, not ok {one['false']}, missed {missed}"
-    return f"{one['number']:4d} {one['verdicts']} {sag}, {terms}, {one['largest']:.1f} at Z{one['worst']}, {wrong}"
+    return (
+        f"{one['number']:4d} {one['verdicts']} {sag}, {terms}, {one['largest']:.1f} at "
+        f"Z{one['worst']}, {wrong}"
+    )
 
 
 def summary(given: list[dict[str, Any]]) -> list[str]:
@@ -213,28 +315,45 @@ def summary(given: list[dict[str, Any]]) -> list[str]:
     lines = [f"benches: {dict(counts)}, {len(used)} with frames that are ok"]
     for name in ("sag", "terms", "largest"):
         values = np.array([one[name] for one in used])
-        quantiles = ", ".join(f"{value:.2f}" for value in np.quantile(values, (0, 0.1, 0.5, 0.9, 1)))
+        quantiles = ", ".join(
+            f"{value:.2f}" for value in np.quantile(values, (0, 0.1, 0.5, 0.9, 1))
+        )
         worst = [used[k]["number"] for k in np.argsort(-values)[:5]]
-        lines.append(f"error / sigma, {name}: {quantiles} (least, 10, 50, 90 %, most); worst benches {worst}")
+        lines.append(
+            f"error / sigma, {name}: {quantiles} (least, 10, 50, 90 %, most); worst benches {worst}"
+        )
     silent = {one["number"]: len(one["silent"]) for one in used if one["silent"]}
     false: Counter[str] = sum((Counter(one["false"]) for one in given if "false" in one), Counter())
-    lines.append(f"silently wrong: {sum(silent.values())} of {sum(one['frames'] for one in used)} frames, {silent}")
+    lines.append(
+        f"silently wrong: {sum(silent.values())} of {sum(one['frames'] for one in used)} "
+        f"frames, {silent}"
+    )
     lines.append(f"sound frames that were not ok: {dict(false.most_common())}")
     planted = [fault for one in given for fault in one.get("planted", ())]
     for kind in NAMES:
-        named, right = ([fault[key] for fault in planted if fault["fault"] == kind] for key in ("named", "right"))
-        lines.append(f"{kind}: {len(named)} planted, {sum(named)} named, {right.count(False)} with a wrong figure")
+        named, right = (
+            [fault[key] for fault in planted if fault["fault"] == kind]
+            for key in ("named", "right")
+        )
+        lines.append(
+            f"{kind}: {len(named)} planted, {sum(named)} named, {right.count(False)} with a "
+            "wrong figure"
+        )
     return lines
 
 
 def main() -> None:
     """Run the benches that the file lacks; print each and the summary."""
-    options = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
+    options = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawTextHelpFormatter
+    )
     options.add_argument("--benches", type=int, default=60)
     options.add_argument("--first", type=int, default=0)
     options.add_argument("--answers", type=Path, default=ANSWERS)
     chosen = options.parse_args()
-    lines = chosen.answers.read_text(encoding="utf-8").splitlines() if chosen.answers.exists() else []
+    lines = (
+        chosen.answers.read_text(encoding="utf-8").splitlines() if chosen.answers.exists() else []
+    )
     known = {one["number"]: one for one in map(json.loads, lines)}
     wanted = range(chosen.first, chosen.first + chosen.benches)
     with chosen.answers.open("a", encoding="utf-8", buffering=1) as file:

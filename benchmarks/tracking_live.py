@@ -1,7 +1,9 @@
-"""Tracking on devices: an emulated GigE Vision camera at full size, read, decoded and fitted 20 times a second.
+"""Tracking on devices: an emulated GigE Vision camera at full size, read, decoded and fitted 20
+times a second.
 
-The camera is a process of its own, so that its work is not counted; its pictures are rendered beforehand. What is
-counted is one process that does what a hold's acquisition does: read the camera, keep the frame, fit its figure.
+The camera is a process of its own, so that its work is not counted; its pictures are rendered
+beforehand. What is counted is one process that does what a hold's acquisition does: read the
+camera, keep the frame, fit its figure.
 """
 
 from __future__ import annotations
@@ -36,7 +38,8 @@ from tests.support.gige_camera import GigeCameraEmulator
 
 OPTICS = OpticsConfig()
 RATE_HZ, EXPOSURE_MS, PERIODS, STEP_S = 20.0, 10.0, 32, 10.0
-NOISES = 4  # pictures of each crossed pattern, and one that gives the bins their light and never comes again
+# pictures of each crossed pattern, and one that gives the bins their light and never comes again
+NOISES = 4
 FRAMES = 400
 SETTLE_S = 0.03
 PATIENCE_S = 120.0
@@ -44,9 +47,16 @@ PATIENCE_S = 120.0
 
 def _camera(shown: Synchronized[int], ready: Any, done: Any) -> None:
     """Answer as a camera until `done`."""
-    renderers = [OpticsRenderer(OPTICS, typical_film(37.1, 500.0, 1), seed=seed) for seed in range(NOISES + 1)]
-    pictures = [[renderers[0].render(pattern, 0.0).copy()] for pattern in full_sequence(OPTICS.pattern)]
-    pictures += [[r.render(pattern, 0.0).copy() for r in renderers] for pattern in crossed_patterns(PERIODS)]
+    renderers = [
+        OpticsRenderer(OPTICS, typical_film(37.1, 500.0, 1), seed=seed)
+        for seed in range(NOISES + 1)
+    ]
+    pictures = [
+        [renderers[0].render(pattern, 0.0).copy()] for pattern in full_sequence(OPTICS.pattern)
+    ]
+    pictures += [
+        [r.render(pattern, 0.0).copy() for r in renderers] for pattern in crossed_patterns(PERIODS)
+    ]
     counts = [0] * len(pictures)
 
     def expose(exposure_ms: float, gain: int) -> Any:
@@ -132,13 +142,18 @@ def _measured(screen: Panel) -> list[Figure]:
     good = verdicts.count("ok")
     return [
         at_most(
-            "one core's share, 20 figures a second, camera's reading included", 100 * busy_s / passed_s, "%", 15.0
+            "one core's share, 20 figures a second, camera's reading included",
+            100 * busy_s / passed_s,
+            "%",
+            15.0,
         ),
         Figure("processor of one figure", 1e3 * busy_s / FRAMES, "ms"),
         at_least("figures a second", FRAMES / passed_s, "1/s", RATE_HZ / 1.1),
         at_least("figures that are ok", 100 * good / FRAMES, "%", 99.0),
         at_most("figure after the frame's end, median", float(np.median(late_ms)), "ms", 15.0),
-        Figure("figure after the frame's end, 95th percentile", float(np.percentile(late_ms, 95)), "ms"),
+        Figure(
+            "figure after the frame's end, 95th percentile", float(np.percentile(late_ms, 95)), "ms"
+        ),
         Figure("figures within 15 ms", 100 * float(np.mean(np.array(late_ms) < 15.0)), "%"),
         at_most("frames lost and retaken", lost, "of all", None),
     ]

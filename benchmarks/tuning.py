@@ -1,6 +1,8 @@
-"""Tuning on the simulated bench, in virtual time, seed by seed: identified, proposed and achieved figures.
+"""Tuning on the simulated bench, in virtual time, seed by seed: identified, proposed and achieved
+figures.
 
-`run()` gives the figures, `python -m benchmarks.tuning` prints them as the tables of docs/tuning.md.
+`run()` gives the figures, `python -m benchmarks.tuning` prints them as the tables of
+docs/tuning.md.
 """
 
 from __future__ import annotations
@@ -87,7 +89,9 @@ class TwinBench:
         sample = self.plant.sample()
         if not self._sensors:
             return BenchSample(sample.displacement_um)
-        return BenchSample(sample.displacement_um, sample.ambient_pressure_pa, sample.air_temperature_c)
+        return BenchSample(
+            sample.displacement_um, sample.ambient_pressure_pa, sample.air_temperature_c
+        )
 
 
 def identified(case: Case, seed: int) -> dict[str, float]:
@@ -120,8 +124,12 @@ def _identified(case: Case, bench: TwinBench, done: Characterised) -> dict[str, 
     }
 
 
-def session(case: Case, seed: int, rules: bool = False, judge_s: float = VERIFY_S) -> dict[str, float]:
-    """A whole session on one twin, then the true centre in fresh weather; with `rules` also textbook gains."""
+def session(
+    case: Case, seed: int, rules: bool = False, judge_s: float = VERIFY_S
+) -> dict[str, float]:
+    """A whole session on one twin, then the true centre in fresh weather; with `rules` also
+    textbook gains.
+    """
     bench, before = TwinBench(case, seed), case.loop()
     rig = Rig(bench, before, PumpConfig(), case.holding_flow_um_per_s)
     done = characterise(rig)
@@ -158,13 +166,21 @@ def session(case: Case, seed: int, rules: bool = False, judge_s: float = VERIFY_
     return figures
 
 
-def achieved(name: str, loop: LoopConfig, case: Case, seed: int, least_um: float, judge_s: float) -> dict[str, float]:
-    """True centre under a loop in weather that no session saw; 600 s scatter by 2 to 6 %, an hour by 1 to 2 %."""
+def achieved(
+    name: str, loop: LoopConfig, case: Case, seed: int, least_um: float, judge_s: float
+) -> dict[str, float]:
+    """True centre under a loop in weather that no session saw; 600 s scatter by 2 to 6 %, an hour
+    by 1 to 2 %.
+    """
     bench = TwinBench(case, 1000 + seed)
     Rig(bench, loop, PumpConfig(), case.holding_flow_um_per_s).hold(SETTLE_S + judge_s)
     true_um = np.array(bench.true_um)[round(SETTLE_S * loop.rate_hz) :]
     std_um = float(true_um.std())
-    return {f"{name}_um": std_um, f"{name}_bias_um": float(-true_um.mean()), f"{name}_ratio": std_um / least_um}
+    return {
+        f"{name}_um": std_um,
+        f"{name}_bias_um": float(-true_um.mean()),
+        f"{name}_ratio": std_um / least_um,
+    }
 
 
 SESSIONS = {
@@ -189,7 +205,10 @@ def summary(rows: Iterable[dict[str, float]]) -> dict[str, dict[str, float]]:
     """Mean, smallest, largest of each figure."""
     listed = list(rows)
     columns = {key: np.array([row[key] for row in listed]) for key in listed[0]}
-    found = {k: {"mean": float(v.mean()), "min": float(v.min()), "max": float(v.max())} for k, v in columns.items()}
+    found = {
+        k: {"mean": float(v.mean()), "min": float(v.min()), "max": float(v.max())}
+        for k, v in columns.items()
+    }
     for key in ("gain_z", "dead_time_z", "delay_z"):
         found[key]["within_2_sigma"] = float(np.mean(np.abs(columns[key]) <= 2))
     return found
@@ -204,28 +223,35 @@ def run(seeds: int = 16, judge_s: float = VERIFY_S) -> dict[str, Any]:
             name: summary(session(case, seed, name == "typical, 1 µm", judge_s) for seed in chosen)
             for name, case in SESSIONS.items()
         },
-        "plants": {name: summary(identified(case, seed) for seed in chosen) for name, case in PLANTS.items()},
+        "plants": {
+            name: summary(identified(case, seed) for seed in chosen)
+            for name, case in PLANTS.items()
+        },
     }
 
 
 def _print(figures: dict[str, Any]) -> None:
     print(
         "| bench | k error: mean, worst | 2 sigma | dead time error s: mean, worst | 2 sigma "
-        "| delay error s: mean, worst | within 2 sigma (k, dead time, delay) | excursion µm, worst | minutes |\n|---"
-        + "|---" * 8
-        + "|"
+        "| delay error s: mean, worst | within 2 sigma (k, dead time, delay) | excursion µm, "
+        "worst | minutes |\n|---" + "|---" * 8 + "|"
     )
     for name, case in (figures["sessions"] | figures["plants"]).items():
         k, dead, delay = case["gain_error"], case["dead_time_error_s"], case["delay_error_s"]
-        cover = ", ".join(f"{case[key]['within_2_sigma']:.0%}" for key in ("gain_z", "dead_time_z", "delay_z"))
+        cover = ", ".join(
+            f"{case[key]['within_2_sigma']:.0%}" for key in ("gain_z", "dead_time_z", "delay_z")
+        )
         print(
             f"| {name} | {k['mean']:+.1%}, {_worst(k):.1%} | {2 * case['gain_sigma']['mean']:.1%} "
-            f"| {dead['mean']:+.3f}, {_worst(dead):.3f} | {2 * case['dead_time_sigma_s']['mean']:.3f} "
-            f"| {delay['mean']:+.3f}, {_worst(delay):.3f} | {cover} | {case['excursion_um']['max']:.1f} "
+            f"| {dead['mean']:+.3f}, {_worst(dead):.3f} | "
+            f"{2 * case['dead_time_sigma_s']['mean']:.3f} "
+            f"| {delay['mean']:+.3f}, {_worst(delay):.3f} | {cover} | "
+            f"{case['excursion_um']['max']:.1f} "
             f"| {case['duration_s']['mean'] / 60:.1f} |"
         )
     print(
-        "\n| bench | least µm | achieved µm | / least: mean, worst | predicted / achieved: min, max "
+        "\n| bench | least µm | achieved µm | / least: mean, worst | predicted / achieved: "
+        "min, max "
         "| bias µm, worst | K 1/s | Ti s | filter s | Ms |\n|---" + "|---" * 9 + "|"
     )
     for name, case in figures["sessions"].items():
@@ -233,10 +259,14 @@ def _print(figures: dict[str, Any]) -> None:
         print(
             f"| {name} | {case['least_um']['mean']:.3f} | {case['ours_um']['mean']:.3f} "
             f"| {ratio['mean']:.2f}, {ratio['max']:.2f} | {said['min']:.2f}, {said['max']:.2f} "
-            f"| {_worst(case['ours_bias_um']):.3f} | {case['kp_per_s']['mean']:.2f} | {case['ti_s']['mean']:.1f} "
+            f"| {_worst(case['ours_bias_um']):.3f} | {case['kp_per_s']['mean']:.2f} | "
+            f"{case['ti_s']['mean']:.1f} "
             f"| {case['filter_s']['mean']:.2f} | {case['ms']['mean']:.2f} |"
         )
-    print("\n| typical, 1 µm, laser only | std µm: mean, worst | / least | bias µm, worst |\n|---|---|---|---|")
+    print(
+        "\n| typical, 1 µm, laser only | std µm: mean, worst | / least | bias µm, worst "
+        "|\n|---|---|---|---|"
+    )
     case = figures["sessions"]["typical, 1 µm"]
     for key in ("ours", "default", "simc", "amigo", "zn"):
         std = case[f"{key}_um"]

@@ -1,8 +1,8 @@
 """A hold with its page, fifty viewers and one that has stopped reading: do its ticks notice?
 
-Phases without and with viewers alternate in one hold; the page runs in all of them. A viewer speaks socket.io as a
-browser does and fetches the charts and maps that it is told to. `python -m benchmarks.viewers LINK COUNT` is such
-viewers, until its standard input ends.
+Phases without and with viewers alternate in one hold; the page runs in all of them. A viewer speaks
+socket.io as a browser does and fetches the charts and maps that it is told to. `python -m
+benchmarks.viewers LINK COUNT` is such viewers, until its standard input ends.
 """
 
 from __future__ import annotations
@@ -57,7 +57,12 @@ class Viewer:
         assert found is not None
         self._client = found[1]
         names = ("client_id", "document_id", "tab_id")
-        query = "&".join([*(f"{name}={self._client}" for name in names), "implicit_handshake=true&next_message_id=0"])
+        query = "&".join(
+            [
+                *(f"{name}={self._client}" for name in names),
+                "implicit_handshake=true&next_message_id=0",
+            ]
+        )
         where = {"transports": ["websocket"], "socketio_path": "/_nicegui_ws/socket.io"}
         await self.socket.connect(f"{self._base}?{query}", wait_timeout=60, **where)
 
@@ -69,7 +74,9 @@ class Viewer:
         self._fetch(data["code"], data.get("request_id", ""))
 
     def _fetch(self, text: str, answer_to: str) -> None:
-        task = asyncio.create_task(self._fetched(re.findall(r"/(?:chart|map)\?[^'\"]*", text), answer_to))
+        task = asyncio.create_task(
+            self._fetched(re.findall(r"/(?:chart|map)\?[^'\"]*", text), answer_to)
+        )
         self._fetching.add(task)
         task.add_done_callback(self._fetching.discard)
 
@@ -77,12 +84,16 @@ class Viewer:
         for path in paths:
             try:
                 status = await self._got(path)
-            except ClientConnectionError:  # the server closed an idle connection meanwhile: a browser asks again
+            except (
+                ClientConnectionError
+            ):  # the server closed an idle connection meanwhile: a browser asks again
                 status = await self._got(path)
             if status != 200:
                 self.failed = f"{path}: {status}"
         if answer_to and self.socket.connected:
-            await self.socket.emit("javascript_response", {"client_id": self._client, "request_id": answer_to})
+            await self.socket.emit(
+                "javascript_response", {"client_id": self._client, "request_id": answer_to}
+            )
 
     async def _got(self, path: str) -> int:
         """Status of the answer; 204 for one that is empty."""
@@ -96,7 +107,9 @@ class Viewer:
 
 
 async def view(link: str, count: int) -> None:
-    """Be viewers; print a line when all are there, and one at the end: the longest gap of each, and what failed."""
+    """Be viewers; print a line when all are there, and one at the end: the longest gap of each, and
+    what failed.
+    """
     jar = CookieJar(unsafe=True)
     async with ClientSession(cookie_jar=jar) as http, ClientSession(cookie_jar=jar) as sockets:
         async with http.get(link):  # gives the cookie
@@ -131,7 +144,9 @@ def viewers(link: str, count: int) -> Iterator[subprocess.Popen[str]]:
     """Viewers in a session of their own, as on other machines."""
     command = [sys.executable, "-m", "benchmarks.viewers", link, str(count)]
     pipe = subprocess.PIPE
-    with subprocess.Popen(command, stdin=pipe, stdout=pipe, text=True, start_new_session=True) as process:
+    with subprocess.Popen(
+        command, stdin=pipe, stdout=pipe, text=True, start_new_session=True
+    ) as process:
         try:
             assert process.stdout is not None
             assert process.stdout.readline() == "open\n"
@@ -142,14 +157,28 @@ def viewers(link: str, count: int) -> Iterator[subprocess.Popen[str]]:
 
 @contextmanager
 def hold_with_page(folder: Path) -> Iterator[tuple[psutil.Process, psutil.Process, str, Path]]:
-    """A `hold --twin`, its page, the page's link and the folder of the run; the hold is stopped afterwards."""
+    """A `hold --twin`, its page, the page's link and the folder of the run; the hold is stopped
+    afterwards.
+    """
     (folder / "lab.toml").write_text("[twin]\nport = 0\n[web]\nport = 7489\n")
-    command = [sys.executable, "-m", "membrane_ctrl", "hold", "--twin", "--config", str(folder / "lab.toml")]
+    command = [
+        sys.executable,
+        "-m",
+        "membrane_ctrl",
+        "hold",
+        "--twin",
+        "--config",
+        str(folder / "lab.toml"),
+    ]
     none = subprocess.DEVNULL
-    hold = psutil.Popen([*command, "--logs", str(folder / "logs")], stdin=none, stdout=none, stderr=none)
+    hold = psutil.Popen(
+        [*command, "--logs", str(folder / "logs")], stdin=none, stdout=none, stderr=none
+    )
     try:
         give_up_s = time.monotonic() + 120.0
-        while not (found := [log for log in folder.glob("logs/*/web.log") if "?key=" in log.read_text()]):
+        while not (
+            found := [log for log in folder.glob("logs/*/web.log") if "?key=" in log.read_text()]
+        ):
             assert time.monotonic() < give_up_s, "the page does not start"
             time.sleep(0.5)
         time.sleep(_HOLDS_S)
@@ -174,7 +203,9 @@ def _phase(page: psutil.Process, viewed: subprocess.Popen[str] | None) -> Phase:
     return phase
 
 
-def phases_of(link: str, page: psutil.Process, count: int, cycles: int, beside: Beside) -> Iterator[Phase]:
+def phases_of(
+    link: str, page: psutil.Process, count: int, cycles: int, beside: Beside
+) -> Iterator[Phase]:
     """Phases without viewers and with, in turn."""
     for _ in range(cycles):
         yield _phase(page, None)
@@ -212,11 +243,22 @@ def run(count: int = VIEWERS, cycles: int = CYCLES, beside: Beside = nullcontext
     gaps = [gap for phase in viewed for gap in phase.gaps]
     share = max(phase.page_cpu_s for phase in viewed) / PHASE_S
     return [
-        at_most(f"tick lateness p99, {count} viewers", late_ms[1], "ms", 5.0, "no viewers", late_ms[0]),
+        at_most(
+            f"tick lateness p99, {count} viewers", late_ms[1], "ms", 5.0, "no viewers", late_ms[0]
+        ),
         at_most(f"ticks missed, {count} viewers", missed[1], "", 0, "no viewers", missed[0]),
-        at_most("longest time without an update, median viewer", median(gap for gap, _ in gaps), "s", 2.0),
-        at_most("longest time without an update, worst viewer", max(gap for gap, _ in gaps), "s", 5.0),
-        at_most("viewers lost", sum(bool(failed) for _, failed in gaps), "", 0, "viewers", len(gaps)),
+        at_most(
+            "longest time without an update, median viewer",
+            median(gap for gap, _ in gaps),
+            "s",
+            2.0,
+        ),
+        at_most(
+            "longest time without an update, worst viewer", max(gap for gap, _ in gaps), "s", 5.0
+        ),
+        at_most(
+            "viewers lost", sum(bool(failed) for _, failed in gaps), "", 0, "viewers", len(gaps)
+        ),
         at_most("stalled viewers not hung up on", cycles - hung_up, "", 0, "stalled", cycles),
         at_most("processor of the page", 100 * share, "%", 50.0),
         at_most("memory of the page, growth", grown_mb, "MB", 200.0),

@@ -1,4 +1,6 @@
-"""How much faster than real time a hold runs in virtual time, board included, and where the time goes."""
+"""How much faster than real time a hold runs in virtual time, board included, and where the time
+goes.
+"""
 
 from __future__ import annotations
 
@@ -61,7 +63,10 @@ def _shares() -> dict[str, float]:
     totals: dict[str, float] = defaultdict(float)
     for (file, _, _), (_, _, own_s, _, _) in pstats.Stats(profile).stats.items():  # type: ignore[attr-defined]
         path = Path(file).as_posix()
-        part = next((name for name, marks in _SHARES.items() if any(mark in path for mark in marks)), "built-ins")
+        part = next(
+            (name for name, marks in _SHARES.items() if any(mark in path for mark in marks)),
+            "built-ins",
+        )
         totals[part] += own_s
     whole_s = sum(totals.values())
     return {part: own_s / whole_s for part, own_s in totals.items()}
@@ -75,9 +80,16 @@ def run() -> list[Figure]:
     alone = VIRTUAL_S / (time.process_time() - start_s)
     figures = [
         at_least(
-            "hold at 10 Hz on one core, speed against real time", _times_real(False), "", 1000.0, "plant alone", alone
+            "hold at 10 Hz on one core, speed against real time",
+            _times_real(False),
+            "",
+            1000.0,
+            "plant alone",
+            alone,
         ),
-        at_least("the same with a shape every 2 s", _times_real(True), "", 1000.0, "plant alone", alone),
+        at_least(
+            "the same with a shape every 2 s", _times_real(True), "", 1000.0, "plant alone", alone
+        ),
     ]
     shares = sorted(_shares().items(), key=lambda item: -item[1])
     return figures + [at_most(f"share of {part}", 100 * share, "%") for part, share in shares]

@@ -1,4 +1,6 @@
-"""A hook of MkDocs: a page for each notebook of docs/notebooks, as it is stored, with what it prints and draws."""
+"""A hook of MkDocs: a page for each notebook of docs/notebooks, as it is stored, with what it
+prints and draws.
+"""
 
 from pathlib import Path
 from typing import Any
@@ -30,5 +32,8 @@ def _output(output: Any) -> str:
         return f"```text\n{output.text.rstrip()}\n```"
     shown = output.get("data", {})
     if "image/png" in shown:
-        return f"![What the cell above draws](data:image/png;base64,{''.join(shown['image/png'].split())})"
+        return (
+            "![What the cell above "
+            f"draws](data:image/png;base64,{''.join(shown['image/png'].split())})"
+        )
     return str(shown.get("text/markdown", ""))

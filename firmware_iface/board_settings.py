@@ -1,7 +1,7 @@
 """The record of settings that a pump board keeps in its flash, made from a TOML file.
 
-`python -m firmware_iface.board_settings board.toml settings.bin` writes the record, which `board/core/settings.h`
-describes. A board with a damaged record runs no pump.
+`python -m firmware_iface.board_settings board.toml settings.bin` writes the record, which
+`board/core/settings.h` describes. A board with a damaged record runs no pump.
 """
 
 import argparse
@@ -15,14 +15,29 @@ from typing import Any
 
 from firmware_iface.register_map import default_map
 
-CHANNELS = ("displacement_um", "gauge_pressure_pa", "ambient_pressure_pa", "air_temperature_c", "gas_temperature_c")
+CHANNELS = (
+    "displacement_um",
+    "gauge_pressure_pa",
+    "ambient_pressure_pa",
+    "air_temperature_c",
+    "gas_temperature_c",
+)
 _MAGIC = 0x4D425331
 _PARITIES = ("N", "E", "O")
 _I32_MAX = 2**31 - 1
 _KEYS = {
-    "unit_id", "baud", "parity", "silence_us", "pressure_limit_pa", "pump_limit_fraction", "channel", "gauge_fitted",
-    "gauge_timeout_s", "gauge_frozen_s", "interlocks_fitted",
-}  # fmt: skip
+    "unit_id",
+    "baud",
+    "parity",
+    "silence_us",
+    "pressure_limit_pa",
+    "pump_limit_fraction",
+    "channel",
+    "gauge_fitted",
+    "gauge_timeout_s",
+    "gauge_frozen_s",
+    "interlocks_fitted",
+}
 _CHANNEL_KEYS = {"points", "plausible_raw"}
 _INTERLOCK_INPUTS = 16
 # as settings.h has them for records that do not state them
@@ -37,13 +52,15 @@ class BoardSettingsError(ValueError):
 def record(table: Mapping[str, Any]) -> bytes:
     """The record of a board's settings.
 
-    `table`, as read from TOML, has `unit_id`, `baud`, `parity` ("N", "E", "O"), `silence_us` (by default the
-    standard's), `pressure_limit_pa`, `pump_limit_fraction`, and `channel.<register>` with `points` ([[raw, value],
-    [raw, value]], in the register's unit) and `plausible_raw` ([lowest, highest]; anything else is "no value"). An
-    omitted channel arrives in counts of its register.
+    `table`, as read from TOML, has `unit_id`, `baud`, `parity` ("N", "E", "O"), `silence_us` (by
+    default the standard's), `pressure_limit_pa`, `pump_limit_fraction`, and `channel.<register>`
+    with `points` ([[raw, value], [raw, value]], in the register's unit) and `plausible_raw`
+    ([lowest, highest]; anything else is "no value"). An omitted channel arrives in counts of its
+    register.
 
-    `gauge_fitted` (true) with `gauge_timeout_s` (15) and `gauge_frozen_s` (60; 0: not judged) state how the board
-    guards its pump against a lost gauge; `interlocks_fitted` lists the interlock inputs in use, from 0 (none).
+    `gauge_fitted` (true) with `gauge_timeout_s` (15) and `gauge_frozen_s` (60; 0: not judged) state
+    how the board guards its pump against a lost gauge; `interlocks_fitted` lists the interlock
+    inputs in use, from 0 (none).
 
     Raises BoardSettingsError (an unknown or missing key, or a value outside what the board takes).
     """
@@ -82,7 +99,9 @@ def _protection(table: Mapping[str, Any]) -> bytes:
     timeout_ms = round(1000 * _number(table, "gauge_timeout_s", 0.1, 60.0, GAUGE_TIMEOUT_S))
     frozen_s = _number(table, "gauge_frozen_s", 0.0, 600.0, GAUGE_FROZEN_S)
     if 0.0 < frozen_s < 1.0:
-        raise BoardSettingsError(f"gauge_frozen_s is {frozen_s:g}, expected 0 or a number within 1..600")
+        raise BoardSettingsError(
+            f"gauge_frozen_s is {frozen_s:g}, expected 0 or a number within 1..600"
+        )
     return struct.pack(">4I", fitted, timeout_ms, round(1000 * frozen_s), _interlock_mask(table))
 
 
@@ -90,10 +109,13 @@ def _interlock_mask(table: Mapping[str, Any]) -> int:
     """Return the mask of the fitted interlock inputs, which the file lists by number."""
     inputs = table.get("interlocks_fitted", [])
     known = range(_INTERLOCK_INPUTS)
-    numbers = isinstance(inputs, list) and all(type(number) is int and number in known for number in inputs)
+    numbers = isinstance(inputs, list) and all(
+        type(number) is int and number in known for number in inputs
+    )
     if not numbers or len(set(inputs)) < len(inputs):
         raise BoardSettingsError(
-            f"interlocks_fitted is {inputs!r}, expected a list of different inputs, 0..{_INTERLOCK_INPUTS - 1}"
+            f"interlocks_fitted is {inputs!r}, expected a list of different inputs, "
+            f"0..{_INTERLOCK_INPUTS - 1}"
         )
     return sum(1 << number for number in inputs)
 
@@ -112,37 +134,50 @@ def _scale(name: str, table: Mapping[str, Any]) -> bytes:
         return struct.pack(">6i", *words)
     except (TypeError, ValueError, struct.error) as error:
         raise BoardSettingsError(
-            f"channel.{name}: {error}; expected points = [[raw, value], [raw, value]] with whole raw values"
+            f"channel.{name}: {error}; expected points = [[raw, value], [raw, value]] with "
+            "whole raw values"
         ) from error
 
 
 def _check_keys(where: str, table: Mapping[str, Any], known: set[str]) -> None:
     if unknown := sorted(set(table) - known):
-        raise BoardSettingsError(f"{where}{unknown[0]} is unknown; known are {', '.join(sorted(known))}")
+        raise BoardSettingsError(
+            f"{where}{unknown[0]} is unknown; known are {', '.join(sorted(known))}"
+        )
 
 
 def _whole(table: Mapping[str, Any], key: str, least: int, most: int, default: int) -> int:
     value = table.get(key, default)
     if isinstance(value, bool) or not isinstance(value, int) or not least <= value <= most:
-        raise BoardSettingsError(f"{key} is {value!r}, expected a whole number within {least}..{most}")
+        raise BoardSettingsError(
+            f"{key} is {value!r}, expected a whole number within {least}..{most}"
+        )
     return value
 
 
-def _number(table: Mapping[str, Any], key: str, least: float, most: float, default: float | None = None) -> float:
+def _number(
+    table: Mapping[str, Any], key: str, least: float, most: float, default: float | None = None
+) -> float:
     value = table.get(key, default)
     if isinstance(value, bool) or not isinstance(value, int | float) or not least <= value <= most:
-        raise BoardSettingsError(f"{key} is {value!r}, expected a number within {least:g}..{most:g}")
+        raise BoardSettingsError(
+            f"{key} is {value!r}, expected a number within {least:g}..{most:g}"
+        )
     return float(value)
 
 
 def main(arguments: list[str] | None = None) -> int:
     """Write the record; returns the exit code."""
-    parser = argparse.ArgumentParser(prog="python -m firmware_iface.board_settings", description=__doc__)
+    parser = argparse.ArgumentParser(
+        prog="python -m firmware_iface.board_settings", description=__doc__
+    )
     parser.add_argument("source", type=Path, help="the board's settings, TOML")
     parser.add_argument("target", type=Path, help="the record to write into the board's flash")
     options = parser.parse_args(arguments)
     try:
-        options.target.write_bytes(record(tomllib.loads(options.source.read_text(encoding="utf-8"))))
+        options.target.write_bytes(
+            record(tomllib.loads(options.source.read_text(encoding="utf-8")))
+        )
     except (OSError, UnicodeDecodeError, tomllib.TOMLDecodeError, BoardSettingsError) as error:
         print(f"{options.source}: {error}", file=sys.stderr)
         return 2

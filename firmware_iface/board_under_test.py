@@ -16,9 +16,13 @@ _U32_MAX = 2**32 - 1
 
 
 class BoardUnderTest:
-    """A connected board, the test's claim on it, and its heartbeat; times are those of the board's clock."""
+    """A connected board, the test's claim on it, and its heartbeat; times are those of the board's
+    clock.
+    """
 
-    def __init__(self, link: ModbusLink, sleep: Callable[[float], Awaitable[None]] = asyncio.sleep) -> None:
+    def __init__(
+        self, link: ModbusLink, sleep: Callable[[float], Awaitable[None]] = asyncio.sleep
+    ) -> None:
         self._link = link
         self._sleep = sleep
         self._registers: register_map.RegisterMap = (
@@ -71,8 +75,11 @@ class BoardUnderTest:
     async def _rest(self) -> None:
         """Pump off, faults cleared, watchdog off: the state before and after every check."""
         steps: tuple[Callable[[], Awaitable[None]], ...] = (
-            partial(self._arm, REST_S), self._clear, partial(self._write, 0.0), partial(self._arm, arm=0.0),
-        )  # fmt: skip
+            partial(self._arm, REST_S),
+            self._clear,
+            partial(self._write, 0.0),
+            partial(self._arm, arm=0.0),
+        )
         for step in steps:
             try:
                 await step()
@@ -87,7 +94,10 @@ class BoardUnderTest:
         require(value == 0, f"holds the pump at {value:g} after {after}")
         mask = self._registers.fault_mask("watchdog")
         require(found["watchdog_tripped"] == 1, f"does not report watchdog_tripped after {after}")
-        require(bool(int(found["latched_faults"]) & mask), f"does not latch the watchdog fault after {after}")
+        require(
+            bool(int(found["latched_faults"]) & mask),
+            f"does not latch the watchdog fault after {after}",
+        )
 
     async def _refused(self, words: Sequence[int], address: int, what: str, why: str) -> None:
         try:

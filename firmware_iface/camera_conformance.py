@@ -1,7 +1,8 @@
 """Tests whether a camera driver does what the cycle needs, against an emulated camera.
 
-A package's tests extend `CameraBench` and run each check of `list_checks`. A check that needs a fault which the
-emulated camera cannot bring about is left out; docs/new-camera.md lists the requirements.
+A package's tests extend `CameraBench` and run each check of `list_checks`. A check that needs a
+fault which the emulated camera cannot bring about is left out; docs/new-camera.md lists the
+requirements.
 """
 
 import gc
@@ -37,7 +38,8 @@ class VirtualTime:
 
 
 class CameraBench:
-    """An emulated camera that sees `scene`, and its driver. Override `make`, and each possible fault.
+    """An emulated camera that sees `scene`, and its driver. Override `make`, and each possible
+    fault.
 
     Attributes
     ----------
@@ -114,7 +116,10 @@ def check_identity(bench: CameraBench) -> None:
         described = driver.describe()
         require("port" in described, "describe has no port")
         words = [word for pair in described.items() for word in pair]
-        require(all(isinstance(word, str) for word in words), "describe returns something else than text")
+        require(
+            all(isinstance(word, str) for word in words),
+            "describe returns something else than text",
+        )
 
 
 def check_pictures(bench: CameraBench) -> None:
@@ -130,7 +135,9 @@ def check_pictures(bench: CameraBench) -> None:
 
 
 def check_given_array_is_not_kept(bench: CameraBench) -> None:
-    """The array for a frame is memory that others use: a driver keeps no reference to it after `fetch`."""
+    """The array for a frame is memory that others use: a driver keeps no reference to it after
+    `fetch`.
+    """
     with _camera(bench) as camera:
         out = np.zeros(bench.sensor.shape, bench.sensor.dtype)
         kept = weakref.ref(out)
@@ -143,7 +150,9 @@ def check_given_array_is_not_kept(bench: CameraBench) -> None:
 
 
 def check_time_stamps(bench: CameraBench) -> None:
-    """A frame's time is the start of its exposure on the given clock; an exposure lasts as long as configured."""
+    """A frame's time is the start of its exposure on the given clock; an exposure lasts as long as
+    configured.
+    """
     with _camera(bench) as camera:
         earlier_s = bench.clock.now()
         for _ in range(_REPEATS):
@@ -151,7 +160,10 @@ def check_time_stamps(bench: CameraBench) -> None:
             camera.expose()
             over_s = bench.clock.now()
             frame = camera.fetch()
-            require(before_s <= frame.time_s <= over_s, f"time_s = {frame.time_s:g} is not within its exposure")
+            require(
+                before_s <= frame.time_s <= over_s,
+                f"time_s = {frame.time_s:g} is not within its exposure",
+            )
             require(frame.time_s > earlier_s, "time_s does not advance")
             require(
                 over_s >= frame.time_s + bench.exposure_s,
@@ -161,14 +173,20 @@ def check_time_stamps(bench: CameraBench) -> None:
 
 
 def check_screen_may_change_after_exposure(bench: CameraBench) -> None:
-    """What changes between `expose` and `fetch` is not in the frame; each exposure is fetched once."""
+    """What changes between `expose` and `fetch` is not in the frame;
+    each exposure is fetched once.
+    """
     with _camera(bench) as camera:
         scene = bench.change_scene()
         camera.expose()
         if isinstance(camera.driver, roles.ExposingCamera):
             bench.change_scene()
-        _require_picture(camera.fetch(), scene, "a frame whose exposure was over before the scene changed")
-        fetch = camera.driver.fetch if isinstance(camera.driver, roles.ExposingCamera) else camera.fetch
+        _require_picture(
+            camera.fetch(), scene, "a frame whose exposure was over before the scene changed"
+        )
+        fetch = (
+            camera.driver.fetch if isinstance(camera.driver, roles.ExposingCamera) else camera.fetch
+        )
         require_error(fetch, roles.LinkError)
 
 
@@ -236,7 +254,10 @@ def check_other_sensor(bench: CameraBench) -> None:
     with _driver(bench, other) as driver:
         message = require_error(driver.open, roles.DeviceRefusedError)
         for width_px in (bench.sensor.width_px, other.width_px):
-            require(str(width_px) in message, f"{message!r} does not name the width of {width_px} pixels")
+            require(
+                str(width_px) in message,
+                f"{message!r} does not name the width of {width_px} pixels",
+            )
 
 
 def check_closing(bench: CameraBench) -> None:
@@ -271,7 +292,9 @@ _CHECKS: dict[Check, tuple[str, ...]] = {
 
 
 @contextmanager
-def _driver(bench: CameraBench, sensor: roles.SensorFormat | None = None) -> Iterator[roles.OpticalDevice]:
+def _driver(
+    bench: CameraBench, sensor: roles.SensorFormat | None = None
+) -> Iterator[roles.OpticalDevice]:
     driver = bench.make(sensor or bench.sensor)
     try:
         yield driver

@@ -1,6 +1,8 @@
-"""Tests whether a board does what a pump board must, over its own protocol and without touching anything else.
+"""Tests whether a board does what a pump board must, over its own protocol and without touching
+anything else.
 
-docs/firmware.md explains the requirements; each check names its section. The pump is briefly commanded to a few per
+docs/firmware.md explains the requirements; each check names its section. The pump is briefly
+commanded to a few per
 cent: do not run it on a mirror that must not move.
 """
 
@@ -20,7 +22,9 @@ _NEAR = 0.002  # of a fraction: counts of a board that rounds its output
 _FEED_S = 0.2  # between two commands where a check keeps the pump commanded for long
 _UNDISTURBED_S = 1.0
 
-_Check = tuple[str, str, Callable[[], Awaitable[None]]]  # its name, the section of docs/firmware.md, the check
+_Check = tuple[
+    str, str, Callable[[], Awaitable[None]]
+]  # its name, the section of docs/firmware.md, the check
 
 
 @dataclass(frozen=True, slots=True)
@@ -43,7 +47,9 @@ class Conformance(board_under_test.BoardUnderTest):
         findings = [await self._made("identity", "Registers", self._identity)]
         if findings[0].problem:
             return findings
-        with contextlib.suppress(roles.DeviceRefusedError):  # the check of the watchdog reports a failure to arm it
+        with contextlib.suppress(
+            roles.DeviceRefusedError
+        ):  # the check of the watchdog reports a failure to arm it
             await self._arm(REST_S)
         await self._rest()
         checks, not_run = await self._possible_checks()
@@ -51,13 +57,16 @@ class Conformance(board_under_test.BoardUnderTest):
             findings.append(await self._made(check, section, partial(self._armed, test)))
             await self._rest()
         if not_run:
-            findings.append(CheckResult("all other requirements", "The conformance test", f"not run: {not_run}"))
+            findings.append(
+                CheckResult("all other requirements", "The conformance test", f"not run: {not_run}")
+            )
         return findings
 
     async def _possible_checks(self) -> tuple[list[_Check], str]:
         """Return the checks that the board's inputs allow now, and why the others cannot be run.
 
-        An open interlock or a missing gauge keeps the pump off, so that only the board's reaction to it is tested.
+        An open interlock or a missing gauge keeps the pump off, so that only the board's reaction
+        to it is tested.
         """
         if not self._guards:
             return self._checks(), ""
@@ -69,14 +78,19 @@ class Conformance(board_under_test.BoardUnderTest):
                 f"interlock inputs {open_inputs:#x} are open; close them and run it again",
             )
         if self._gauge_fitted and math.isnan(sensors["gauge_pressure_pa"]):
-            return self._gauge_checks(), "the fitted gauge has no value; connect it and run it again"
+            return (
+                self._gauge_checks(),
+                "the fitted gauge has no value; connect it and run it again",
+            )
         return self._checks(), ""
 
     async def _armed(self, test: Callable[[], Awaitable[None]]) -> None:
         await self._arm(REST_S)
         await test()
 
-    async def _made(self, check: str, section: str, test: Callable[[], Awaitable[None]]) -> CheckResult:
+    async def _made(
+        self, check: str, section: str, test: Callable[[], Awaitable[None]]
+    ) -> CheckResult:
         problem = ""
         try:
             await test()
@@ -116,21 +130,35 @@ class Conformance(board_under_test.BoardUnderTest):
             ("anybody may stop the pump", "Stop", self._stopped),
         ]
         if self._guards:
-            checks.append(("a gauge with a value and closed interlocks let the pump run", "Gauge", self._undisturbed))
+            checks.append(
+                (
+                    "a gauge with a value and closed interlocks let the pump run",
+                    "Gauge",
+                    self._undisturbed,
+                )
+            )
         return checks
 
     def _gauge_checks(self) -> list[_Check]:
         return [
             ("every block is read whole", "Registers", self._blocks),
             ("without a gauge the pump is off after the time-out", "Gauge", self._without_gauge),
-            ("clearing does not run the pump without a gauge", "Gauge", self._cleared_without_gauge),
+            (
+                "clearing does not run the pump without a gauge",
+                "Gauge",
+                self._cleared_without_gauge,
+            ),
         ]
 
     def _interlock_checks(self) -> list[_Check]:
         return [
             ("every block is read whole", "Registers", self._blocks),
             ("an open interlock keeps the pump off", "Interlocks", self._open_interlock),
-            ("clearing does not run the pump with an open interlock", "Interlocks", self._cleared_interlock),
+            (
+                "clearing does not run the pump with an open interlock",
+                "Interlocks",
+                self._cleared_interlock,
+            ),
         ]
 
     async def _identity(self) -> None:
@@ -139,7 +167,10 @@ class Conformance(board_under_test.BoardUnderTest):
         wanted = self._registers.device_kind
         require(kind == wanted, f"device kind is {kind}, expected {wanted}")
         known = ", ".join(str(known) for known in register_map.known_maps())
-        require(version in register_map.known_maps(), f"map version is {version}, this test knows {known}")
+        require(
+            version in register_map.known_maps(),
+            f"map version is {version}, this test knows {known}",
+        )
         self._registers = register_map.known_maps()[version]
         found = await self._read(self._registers.block("identity"))
         require(found["gauge_pressure_limit_pa"] > 0, "gauge_pressure_limit_pa is not above 0")
@@ -150,10 +181,15 @@ class Conformance(board_under_test.BoardUnderTest):
 
     def _note_protections(self, identity: dict[str, float]) -> None:
         """Take over which protections are fitted, and check that their times are possible."""
-        fitted, timeout_s, frozen_s = (identity[f"gauge_{name}"] for name in ("fitted", "timeout_s", "frozen_s"))
+        fitted, timeout_s, frozen_s = (
+            identity[f"gauge_{name}"] for name in ("fitted", "timeout_s", "frozen_s")
+        )
         require(fitted in (0, 1), f"gauge_fitted is {fitted:g}, expected 0 or 1")
         require(0.1 <= timeout_s <= 60, f"gauge_timeout_s is {timeout_s:g}, expected 0.1..60")
-        require(frozen_s == 0 or 1 <= frozen_s <= 600, f"gauge_frozen_s is {frozen_s:g}, expected 0 or 1..600")
+        require(
+            frozen_s == 0 or 1 <= frozen_s <= 600,
+            f"gauge_frozen_s is {frozen_s:g}, expected 0 or 1..600",
+        )
         self._gauge_fitted, self._gauge_timeout_s = fitted == 1, timeout_s
         self._interlocks_fitted = int(identity["interlocks_fitted"])
 
@@ -165,7 +201,10 @@ class Conformance(board_under_test.BoardUnderTest):
         before = await self._sensors()
         await self._sleep(0.1)
         after = await self._sensors()
-        require(after["sample_counter"] != before["sample_counter"], "sample_counter stands still for 0.1 s")
+        require(
+            after["sample_counter"] != before["sample_counter"],
+            "sample_counter stands still for 0.1 s",
+        )
         passed_s = _time_s(after) - _time_s(before)
         require(0.02 < passed_s < 1.0, f"device time went {passed_s:.3f} s in 0.1 s")
 
@@ -176,19 +215,35 @@ class Conformance(board_under_test.BoardUnderTest):
             found = await self._sensors()
             for name, wanted in (("pump", pump), ("vent", vent)):
                 value = found[f"{name}_readback_fraction"]
-                require(abs(value - wanted) < _NEAR, f"{name} commanded {wanted:g}, read back {value:g}")
-        require(int(found["heartbeat_echo"]) == self._heartbeat, "heartbeat_echo is not the last heartbeat")
+                require(
+                    abs(value - wanted) < _NEAR, f"{name} commanded {wanted:g}, read back {value:g}"
+                )
+        require(
+            int(found["heartbeat_echo"]) == self._heartbeat,
+            "heartbeat_echo is not the last heartbeat",
+        )
 
     async def _limits(self) -> None:
         """Each value outside its limits, in a block that is right otherwise."""
-        right = self._command(0.0, 0.0) | {"claim_id": self._id, "claim_key": self._key, "clear_key": self._key}
-        right |= {"watchdog_period_s": REST_S, "watchdog_arm": 1.0, "clear_faults": 0.0, "stop": 1.0}
+        right = self._command(0.0, 0.0) | {
+            "claim_id": self._id,
+            "claim_key": self._key,
+            "clear_key": self._key,
+        }
+        right |= {
+            "watchdog_period_s": REST_S,
+            "watchdog_arm": 1.0,
+            "clear_faults": 0.0,
+            "stop": 1.0,
+        }
         for block in self._registers.blocks:
             for register in block.registers:
                 for raw in _outside(register):
                     words = block.encode(right)
                     at = register.address - block.address
-                    words[at : at + register.words] = [raw] * register.words  # of two words only 0 is outside
+                    words[at : at + register.words] = [
+                        raw
+                    ] * register.words  # of two words only 0 is outside
                     what = f"{register.name} = {raw / register.counts_per_unit:g}"
                     await self._refused(words, block.address, what, "limits")
 
@@ -197,7 +252,9 @@ class Conformance(board_under_test.BoardUnderTest):
         block = self._registers.block("command")
         words = block.encode(self._command(0.0, 1.0))
         words[0] = 0xFFFF  # a pump command of 1.31
-        await self._refused(words, block.address, "a command block with one value of 1.31", "limits")
+        await self._refused(
+            words, block.address, "a command block with one value of 1.31", "limits"
+        )
         found = await self._read(block)
         require(
             abs(found["vent_command_fraction"] - 0.25) < _NEAR,
@@ -206,7 +263,9 @@ class Conformance(board_under_test.BoardUnderTest):
 
     async def _read_only(self) -> None:
         for name in ("identity", "sensors"):
-            await self._refused([0], self._registers.block(name).address, f"a write to {name}", "rights")
+            await self._refused(
+                [0], self._registers.block(name).address, f"a write to {name}", "rights"
+            )
         last = max(block.address + block.count for block in self._registers.blocks)
         try:
             await self._link.read_holding(last, 1)
@@ -220,8 +279,13 @@ class Conformance(board_under_test.BoardUnderTest):
             found = await self._read(self._registers.block("settings"))
             require(found["watchdog_arm"] == 1, "watchdog_arm written 1, read back 0")
             value_s = found["watchdog_period_s"]
-            require(abs(value_s - period_s) < 1e-3, f"watchdog_period_s written {period_s:g}, read back {value_s:g}")
-        require((await self._sensors())["watchdog_armed"] == 1, "watchdog_armed stays 0 after arming")
+            require(
+                abs(value_s - period_s) < 1e-3,
+                f"watchdog_period_s written {period_s:g}, read back {value_s:g}",
+            )
+        require(
+            (await self._sensors())["watchdog_armed"] == 1, "watchdog_armed stays 0 after arming"
+        )
 
     async def _disarm(self) -> None:
         await self._write(PUMP_FRACTION)
@@ -236,7 +300,9 @@ class Conformance(board_under_test.BoardUnderTest):
         await self._write(PUMP_FRACTION)
         await self._sleep(PERIOD_S / 2)
         found = await self._sensors()
-        require(found["pump_readback_fraction"] > 0, "stops the pump before the watchdog period is over")
+        require(
+            found["pump_readback_fraction"] > 0, "stops the pump before the watchdog period is over"
+        )
         await self._sleep(PERIOD_S / 2 + _GRACE_S)
         await self._tripped("a host silent for longer than the watchdog period")
 
@@ -255,7 +321,9 @@ class Conformance(board_under_test.BoardUnderTest):
         for _ in range(4):
             await self._sleep((PERIOD_S + _GRACE_S) / 4)
             try:
-                await self._link.write_registers(pump.address, [round(PUMP_FRACTION * pump.counts_per_unit)])
+                await self._link.write_registers(
+                    pump.address, [round(PUMP_FRACTION * pump.counts_per_unit)]
+                )
             except roles.DeviceRefusedError:
                 continue  # as a board with claims has to
             require(not self._claims, "accepts a part of the command block, which carries no claim")
@@ -277,7 +345,10 @@ class Conformance(board_under_test.BoardUnderTest):
         await self._write(PUMP_FRACTION)
         await self._clear()
         found = await self._sensors()
-        require(found["latched_faults"] == 0, f"faults stay {found['latched_faults']:g} after they were cleared")
+        require(
+            found["latched_faults"] == 0,
+            f"faults stay {found['latched_faults']:g} after they were cleared",
+        )
         value = found["pump_readback_fraction"]
         require(value == 0, f"starts the pump at {value:g} when faults are cleared")
 
@@ -286,23 +357,37 @@ class Conformance(board_under_test.BoardUnderTest):
         found = await self._sensors()
         claim, period_s = int(found["claim_in_force"]), found["period_in_force_s"]
         require(claim == self._id, f"claimed as {self._id:#x}, claim_in_force reads {claim:#x}")
-        require(abs(period_s - 1.5) < 1e-3, f"watchdog period set to 1.5 s, period_in_force_s reads {period_s:g}")
-        for name, key in (("settings", "claim_key"), ("command", "command_key"), ("reset", "clear_key")):
+        require(
+            abs(period_s - 1.5) < 1e-3,
+            f"watchdog period set to 1.5 s, period_in_force_s reads {period_s:g}",
+        )
+        for name, key in (
+            ("settings", "claim_key"),
+            ("command", "command_key"),
+            ("reset", "clear_key"),
+        ):
             require((await self._read(self._registers.block(name)))[key] == 0, f"{key} can be read")
 
     async def _second(self) -> None:
         await self._write(PUMP_FRACTION)
-        await self._busy(self._claim(other_key(self._key)), "a second claim while the watchdog is fed")
+        await self._busy(
+            self._claim(other_key(self._key)), "a second claim while the watchdog is fed"
+        )
         found = await self._sensors()
         require(found["period_in_force_s"] == REST_S, "a refused claim changed the watchdog period")
         require(int(found["claim_in_force"]) == self._id, "a refused claim changed the claim")
 
     async def _strangers(self) -> None:
         await self._put("stop", {"stop": 1.0})
-        for key in (self._key ^ 1 or 2, self._key ^ (1 << 31) or 2):  # the low word, and the high word
+        for key in (
+            self._key ^ 1 or 2,
+            self._key ^ (1 << 31) or 2,
+        ):  # the low word, and the high word
             self._heartbeat = (self._heartbeat + 1) % 2**16
             other = "with another key than the claim's"
-            await self._busy(self._put("command", self._command(PUMP_FRACTION, 1.0, key)), f"a command {other}")
+            await self._busy(
+                self._put("command", self._command(PUMP_FRACTION, 1.0, key)), f"a command {other}"
+            )
             await self._busy(self._clear(key), f"clear_faults {other}")
             await self._busy(self._claim(key, arm=0.0), f"disarming {other}")
         found = await self._sensors()
@@ -324,20 +409,27 @@ class Conformance(board_under_test.BoardUnderTest):
         await self._sleep(PERIOD_S + _GRACE_S)
         theirs = other_key(self._key)
         await self._claim(theirs, PERIOD_S)
-        await self._busy(self._put("command", self._command(PUMP_FRACTION, 0.0)), "a command of a claim that lapsed")
+        await self._busy(
+            self._put("command", self._command(PUMP_FRACTION, 0.0)),
+            "a command of a claim that lapsed",
+        )
         await self._sleep(PERIOD_S + _GRACE_S)
         await self._arm(REST_S)
 
     async def _unclaimed(self) -> None:
         await self._arm(REST_S, 0.0)
-        require((await self._sensors())["claim_in_force"] == 0, "keeps the claim when it is disarmed")
+        require(
+            (await self._sensors())["claim_in_force"] == 0, "keeps the claim when it is disarmed"
+        )
         self._heartbeat = (self._heartbeat + 1) % 2**16
         for name, values in (
             ("command", self._command(PUMP_FRACTION, 0.0)),
             ("reset", {"clear_faults": 0xFFFF, "clear_key": self._key}),
         ):
             block = self._registers.block(name)
-            await self._refused(block.encode(values), block.address, f"a write to {name} without a claim", "rights")
+            await self._refused(
+                block.encode(values), block.address, f"a write to {name} without a claim", "rights"
+            )
 
     async def _stopped(self) -> None:
         await self._write(PUMP_FRACTION, 0.25)
@@ -390,7 +482,9 @@ class Conformance(board_under_test.BoardUnderTest):
         require(value == 0, f"runs the pump at {value:g} after {after}")
         latched = int(found["latched_faults"]) & self._registers.fault_mask(fault)
         require(bool(latched), f"does not latch the fault `{fault}` after {after}")
-        require(abs(found["vent_readback_fraction"] - 0.25) < _NEAR, f"moves the vent after {after}")
+        require(
+            abs(found["vent_readback_fraction"] - 0.25) < _NEAR, f"moves the vent after {after}"
+        )
 
 
 def _time_s(values: dict[str, float]) -> float:
@@ -403,8 +497,12 @@ def _outside(register: register_map.Register) -> list[int]:
         return []
     if register.words != 1:
         return [0]
-    low, high = (round(limit * register.counts_per_unit) for limit in (register.minimum, register.maximum))
-    return [raw for raw in (low - 1, high + 1, 0xFFFF) if 0 <= raw <= 0xFFFF and not low <= raw <= high]
+    low, high = (
+        round(limit * register.counts_per_unit) for limit in (register.minimum, register.maximum)
+    )
+    return [
+        raw for raw in (low - 1, high + 1, 0xFFFF) if 0 <= raw <= 0xFFFF and not low <= raw <= high
+    ]
 
 
 async def examine(url: str, unit_id: int = 1, timeout_s: float = 0.5) -> list[CheckResult]:
@@ -417,6 +515,8 @@ async def examine(url: str, unit_id: int = 1, timeout_s: float = 0.5) -> list[Ch
     try:
         return await Conformance(link).run()
     except roles.DeviceBusyError as error:
-        raise roles.DeviceBusyError(f"{error}: another program holds the board; stop that one first") from None
+        raise roles.DeviceBusyError(
+            f"{error}: another program holds the board; stop that one first"
+        ) from None
     finally:
         await link.close()

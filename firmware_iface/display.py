@@ -1,4 +1,6 @@
-"""The screen's patterns, and measurements of the screen, as pure functions of images and numbers."""
+"""The screen's patterns, and measurements of the screen,
+as pure functions of images and numbers.
+"""
 
 import math
 from dataclasses import dataclass
@@ -12,7 +14,9 @@ FloatArray = NDArray[np.float64]
 
 # The display's response, measured with a grey ramp, and the levels that make its light linear.
 
-RAMP_LEVELS = tuple(round(255 * step / 16) for step in range(17))  # a cubic between 17 points is off by < 0.2 %
+RAMP_LEVELS = tuple(
+    round(255 * step / 16) for step in range(17)
+)  # a cubic between 17 points is off by < 0.2 %
 # Least share of the light between the end levels; less means that the ramp was not seen
 _LEAST_SWING_ADU = 10.0
 # A step back by more than this share is not noise: something moved, or the display adapts its light
@@ -49,7 +53,8 @@ def linear_response() -> DisplayResponse:
 
 
 def measured_response(levels: ArrayLike, seen_adu: ArrayLike) -> DisplayResponse:
-    """The response from a ramp: `levels` (K,) rising from 0 to 255, and `seen_adu` (K,), unsaturated.
+    """The response from a ramp: `levels` (K,) rising from 0 to 255, and `seen_adu` (K,),
+    unsaturated.
 
     Raises ValueError if the camera saw no ramp, with the remedy.
     """
@@ -64,10 +69,14 @@ def measured_response(levels: ArrayLike, seen_adu: ArrayLike) -> DisplayResponse
         raise ValueError("a ramp has rising levels from 0 to 255, and one reading each")
     swing_adu = seen[-1] - seen[0]
     if not np.isfinite(seen).all() or swing_adu < _LEAST_SWING_ADU:
-        raise ValueError(f"the camera sees no ramp ({swing_adu:.1f} counts from black to white); exposure, aim?")
+        raise ValueError(
+            f"the camera sees no ramp ({swing_adu:.1f} counts from black to white); exposure, aim?"
+        )
     light = (seen - seen[0]) / swing_adu
     if np.min(np.diff(light)) < -_LARGEST_STEP_BACK:
-        raise ValueError("the light falls where the level rises: switch off the display's dynamic contrast")
+        raise ValueError(
+            "the light falls where the level rises: switch off the display's dynamic contrast"
+        )
     if np.count_nonzero(light > 0.995) > 2:
         raise ValueError("the ramp saturates; lower the camera's exposure_ms")
     rising = np.maximum.accumulate(light) + 1e-9 * np.arange(light.size)
@@ -91,15 +100,20 @@ class ScreenRaster:
     pixel_mm: float  # pitch
     periods: int
     period_mm: float
-    centre_px: tuple[float, float] | None = None  # (column, row) of O'; None: the middle of the screen
+    # (column, row) of O'; None: the middle of the screen
+    centre_px: tuple[float, float] | None = None
 
     def __post_init__(self) -> None:
         (column, row), half_px = self.centre, self.half_side_mm / self.pixel_mm
-        room_px = min(column + 0.5, row + 0.5, self.width_px - 0.5 - column, self.height_px - 0.5 - row)
+        room_px = min(
+            column + 0.5, row + 0.5, self.width_px - 0.5 - column, self.height_px - 0.5 - row
+        )
         if half_px > room_px:
             raise ValueError(
-                f"the pattern of {self.periods} x {self.period_mm:g} mm needs {2 * half_px:.0f} pixels of "
-                f"{self.pixel_mm:g} mm, the screen has {2 * room_px:.0f}; lower period_mm or periods"
+                f"the pattern of {self.periods} x {self.period_mm:g} mm needs "
+                f"{2 * half_px:.0f} pixels of "
+                f"{self.pixel_mm:g} mm, the screen has {2 * room_px:.0f}; lower period_mm or "
+                "periods"
             )
 
     @property
@@ -113,7 +127,9 @@ class ScreenRaster:
         return self.periods * self.period_mm / 2
 
     def from_low_edge_mm(self, axis: str) -> FloatArray:
-        """Distance s from the low edge of the region, of each column ("x") or row ("y": s grows upward)."""
+        """Distance s from the low edge of the region, of each column ("x") or row ("y": s grows
+        upward).
+        """
         column, row = self.centre
         if axis == "x":
             pixels = np.arange(self.width_px, dtype=np.float64) - column
@@ -127,14 +143,18 @@ def pattern_light(pattern: Pattern, raster: ScreenRaster) -> NDArray[np.float32]
 
     Raises ValueError for a role or Gray bit that is unknown.
     """
-    inside = {axis: _inside(raster.from_low_edge_mm(axis), 2 * raster.half_side_mm) for axis in "xy"}
+    inside = {
+        axis: _inside(raster.from_low_edge_mm(axis), 2 * raster.half_side_mm) for axis in "xy"
+    }
     lit = {axis: inside[axis].astype(np.float32) for axis in "xy"}
     if pattern.role in ("white", "black"):
         return np.outer(lit["y"], lit["x"]) * np.float32(pattern.role == "white")
     if pattern.role == "crossed":
         period_mm = 2 * raster.half_side_mm / pattern.index
         for axis, shift_rad in (("x", pattern.shift_rad), ("y", pattern.shift_y_rad)):
-            wave = _profile(Pattern("sin", axis, shift_rad=shift_rad), raster.from_low_edge_mm(axis), period_mm)
+            wave = _profile(
+                Pattern("sin", axis, shift_rad=shift_rad), raster.from_low_edge_mm(axis), period_mm
+            )
             lit[axis] = 0.5 * wave.astype(np.float32)
         return np.add.outer(lit["y"], lit["x"]) * np.outer(inside["y"], inside["x"])
     profile = _profile(pattern, raster.from_low_edge_mm(pattern.axis), raster.period_mm)
@@ -158,14 +178,18 @@ def _profile(pattern: Pattern, s_mm: FloatArray, period_mm: float) -> FloatArray
     if pattern.role == "gray" and 1 <= pattern.index <= _GRAY_BITS:
         v2 = np.floor(2 * s_mm / period_mm).astype(np.int64)
         return np.asarray((v2 ^ (v2 >> 1)) >> (_GRAY_BITS - pattern.index) & 1, np.float64)
-    raise ValueError(f"pattern {pattern.name!r}: role must be sin, gray (bit 1..{_GRAY_BITS}), white or black")
+    raise ValueError(
+        f"pattern {pattern.name!r}: role must be sin, gray (bit 1..{_GRAY_BITS}), white or black"
+    )
 
 
 # The time a display needs from the command until a frame may be exposed.
 #
-# After a step a panel's light stays constant for a latency L (queue, refresh, scan) and then approaches its end as
-# exp(-(t - L) / tau). Frames exposed at known times after the step give both; the wait ends when less than one of 256
-# levels remains: L + tau ln 256. Doubling an observed settle time would double the latency too.
+# After a step a panel's light stays constant for a latency L (queue, refresh, scan) and then
+# approaches its end as exp(-(t - L) / tau). Frames exposed at known times after the step give both;
+# the wait ends when less than one of 256 levels remains: L + tau ln 256. Doubling an observed
+# settle time would double
+# the latency too.
 
 _LEFT = 1.0 / 256.0  # of the step: one level
 _FIT_FROM, _FIT_TO = 0.6, 1.0 / 32.0  # of the step; below, noise bends the logarithm
@@ -179,27 +203,33 @@ class Settling:
     """Result of the measurement."""
 
     settle_s: float  # from the command to the start of an exposure
-    latency_s: float  # of the model; NaN if the display was too fast for the camera to see the transition
+    latency_s: (
+        float  # of the model; NaN if the display was too fast for the camera to see the transition
+    )
     tau_s: float
 
 
 def share_left(frame: ArrayLike, before: ArrayLike, after: ArrayLike) -> float:
-    """Remaining share of a step in a frame: the worst block's difference from the end, over the largest step.
+    """Remaining share of a step in a frame: the worst block's difference from the end, over the
+    largest step.
 
     Each picture is (H, W); `before` is from before the step, `after` from long after it.
     """
     end = block_means(after)
     step = np.abs(block_means(before) - end)
     # the worst block except a thousandth, to exclude glints and dead pixels
-    return float(np.quantile(np.abs(block_means(frame) - end), 0.999) / max(float(np.quantile(step, 0.999)), 1e-9))
+    return float(
+        np.quantile(np.abs(block_means(frame) - end), 0.999)
+        / max(float(np.quantile(step, 0.999)), 1e-9)
+    )
 
 
 def settling(delay_s: ArrayLike, left: ArrayLike, noise: float = 0.0) -> Settling:
     """Latency, time constant and the time to wait.
 
-    `delay_s` (K,) are the starts of the exposures after the command, from any number of steps; `left` (K,) the
-    remaining shares of the step (`share_left`), `noise` the value of `left` at the end. Raises ValueError if the
-    display never settles.
+    `delay_s` (K,) are the starts of the exposures after the command, from any number of steps;
+    `left` (K,) the remaining shares of the step (`share_left`), `noise` the value of `left` at the
+    end. Raises ValueError if the display never settles.
     """
     delays, shares = np.asarray(delay_s, np.float64), np.asarray(left, np.float64)
     order = np.argsort(delays)
@@ -211,7 +241,8 @@ def settling(delay_s: ArrayLike, left: ArrayLike, noise: float = 0.0) -> Settlin
         return Settling(float(delays[0]) * math.log(_LEFT) / math.log(still), math.nan, math.nan)
     if unsettled[-1] == len(delays) - 1:
         raise ValueError(
-            f"{100 * shares[-1]:.0f} % of a step is left after {delays[-1]:.2f} s: does the camera see the screen, "
+            f"{100 * shares[-1]:.0f} % of a step is left after {delays[-1]:.2f} s: does the "
+            "camera see the screen, "
             "and is its light steady (dynamic backlight, another lamp)?"
         )
     seen_s = float(delays[unsettled[-1] + 1])  # the first of the good frames
@@ -227,11 +258,15 @@ def settling(delay_s: ArrayLike, left: ArrayLike, noise: float = 0.0) -> Settlin
         return Settling(2 * seen_s, math.nan, math.nan)
     tau_s, latency_s = -1.0 / slope, offset / -slope
     # accept a display whose tail is slower than its start
-    return Settling(max(latency_s - tau_s * math.log(_LEFT), seen_s), float(latency_s), float(tau_s))
+    return Settling(
+        max(latency_s - tau_s * math.log(_LEFT), seen_s), float(latency_s), float(tau_s)
+    )
 
 
 def block_means(image: ArrayLike) -> FloatArray:
-    """Means of square blocks without incomplete ones at the edges; for small images the pixels themselves."""
+    """Means of square blocks without incomplete ones at the edges; for small images the pixels
+    themselves.
+    """
     pixels = np.asarray(image, np.float64)
     side = max(1, min(_BLOCK_PX, min(pixels.shape) // 8))
     rows, columns = (length // side for length in pixels.shape)
@@ -248,23 +283,28 @@ _LEAST_CONTRAST = 3.0
 
 
 def exposure_problem(white: Pixels, black: Pixels, full_scale_adu: int, exposure_ms: float) -> str:
-    """The problem and its remedy, from frames (H, W) of a white and a black screen; empty if none."""
+    """The problem and its remedy, from frames (H, W) of a white and a black screen;
+    empty if none.
+    """
     saturated = float(np.mean(white >= full_scale_adu))
     bright, dark = float(np.quantile(white, 0.99)), float(np.quantile(black, 0.99))
     if saturated > _SATURATED_SHARE:
         return (
-            f"{100 * saturated:.1f} % of the pixels are saturated on white; lower exposure_ms = {exposure_ms:g} "
+            f"{100 * saturated:.1f} % of the pixels are saturated on white; lower "
+            f"exposure_ms = {exposure_ms:g} "
             f"to about {_two_digits(exposure_ms / 2)}, or the gain"
         )
     if bright < _LEAST * full_scale_adu:
         wanted_ms = exposure_ms * _TARGET * full_scale_adu / max(bright, 1.0)
         return (
-            f"white gives only {bright:.0f} of {full_scale_adu} counts; raise exposure_ms = {exposure_ms:g} to about "
+            f"white gives only {bright:.0f} of {full_scale_adu} counts; raise exposure_ms = "
+            f"{exposure_ms:g} to about "
             f"{_two_digits(wanted_ms)}, open the lens, or is the mirror covered?"
         )
     if bright < _LEAST_CONTRAST * dark:
         return (
-            f"black gives {dark:.0f} counts where white gives {bright:.0f}: other light reaches the camera; darken "
+            f"black gives {dark:.0f} counts where white gives {bright:.0f}: other light "
+            "reaches the camera; darken "
             "the room"
         )
     return ""
@@ -274,12 +314,15 @@ def _two_digits(number: float) -> str:
     return f"{float(f'{number:.2g}'):g}"
 
 
-# Checks whether the screen shows every pixel as sent, with a one-pixel checkerboard that the camera does not resolve.
+# Checks whether the screen shows every pixel as sent, with a one-pixel checkerboard that the camera
+# does not resolve.
 #
-# Shown as sent, half of the pixels are lit, and a camera that cannot tell them apart sees half of the white screen's
-# light everywhere. A scaler in between mixes neighbours before the display's gamma: 0 and 255 become 127, which is a
-# quarter of the light (gamma 2.2: 0.22); where its grid and the panel's agree again the half comes back. So a panel
-# that announces 1360 and has 1366 columns shows six bands.
+# Shown as sent, half of the pixels are lit, and a camera that cannot tell them apart sees half of
+# the white screen's light everywhere. A scaler in between mixes neighbours before the display's
+# gamma: 0 and 255 become 127, which is a quarter of the light (gamma 2.2: 0.22); where its grid and
+# the panel's agree again the half comes back. So a panel that announces 1360 and has 1366 columns
+# shows six
+# bands.
 
 _LIT_SHARE = 0.3  # of the brightest block: where the mirror shows the screen
 _LEAST_LIT = 0.02  # of all blocks
@@ -289,7 +332,9 @@ _LARGEST_BAND = 0.10
 
 
 def checkerboard_problem(seen: ArrayLike, white: ArrayLike, black: ArrayLike) -> str:
-    """The problem and its remedy, from frames (H, W) of checkerboard, white and black; empty if none."""
+    """The problem and its remedy, from frames (H, W) of checkerboard, white and black; empty if
+    none.
+    """
     dark = block_means(black)
     full = block_means(white) - dark
     lit = full > _LIT_SHARE * float(np.max(full))
@@ -299,12 +344,14 @@ def checkerboard_problem(seen: ArrayLike, white: ArrayLike, black: ArrayLike) ->
     low, middle, high = (float(value) for value in np.percentile(share, (2, 50, 98)))
     if high - low > _LARGEST_BAND:
         return (
-            f"a one-pixel checkerboard shows bands ({100 * low:.0f} .. {100 * high:.0f} % of white): the screen "
+            f"a one-pixel checkerboard shows bands ({100 * low:.0f} .. {100 * high:.0f} % of "
+            "white): the screen "
             "rescales; set the panel's own resolution and switch off overscan and scaling"
         )
     if not _HALF_RANGE[0] < middle < _HALF_RANGE[1]:
         return (
-            f"a one-pixel checkerboard gives {100 * middle:.0f} % of white instead of 50: the screen sharpens or "
+            f"a one-pixel checkerboard gives {100 * middle:.0f} % of white instead of 50: "
+            "the screen sharpens or "
             "mixes pixels; set the panel's own resolution and switch off picture improvements"
         )
     return ""

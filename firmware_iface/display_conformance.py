@@ -1,7 +1,8 @@
 """Tests whether a display driver does what a screen needs, against an emulated display.
 
-A package's tests extend `DisplayBench` and run each check of `list_checks`. A check that needs a fault which the
-emulated display cannot bring about is left out; docs/new-camera.md lists the requirements.
+A package's tests extend `DisplayBench` and run each check of `list_checks`. A check that needs a
+fault which the emulated display cannot bring about is left out; docs/new-camera.md lists the
+requirements.
 """
 
 from collections.abc import Callable, Iterator
@@ -17,7 +18,8 @@ _REPEATS = 3
 
 
 class DisplayBench:
-    """An emulated display and its driver. Override `make`, and `unplug` and `plug_in` if they can be brought about.
+    """An emulated display and its driver. Override `make`, and `unplug` and `plug_in` if they can
+    be brought about.
 
     Attributes
     ----------
@@ -74,7 +76,10 @@ def check_identity(bench: DisplayBench) -> None:
         described = display.describe()
         require("port" in described, "describe has no port")
         words = [word for pair in described.items() for word in pair]
-        require(all(isinstance(word, str) for word in words), "describe returns something else than text")
+        require(
+            all(isinstance(word, str) for word in words),
+            "describe returns something else than text",
+        )
 
 
 def check_pictures(bench: DisplayBench) -> None:
@@ -90,7 +95,9 @@ def check_pictures(bench: DisplayBench) -> None:
 
 
 def check_prepared_pictures(bench: DisplayBench) -> None:
-    """A prepared picture can be shown any number of times, whatever became of the array that it was made from."""
+    """A prepared picture can be shown any number of times, whatever became of the array that it was
+    made from.
+    """
     pictures = [bench.make_picture() for _ in range(_REPEATS)]
     with _display(bench) as display:
         display.open()
@@ -126,7 +133,10 @@ def check_other_size(bench: DisplayBench) -> None:
     with _display(bench, other_px) as display:
         message = require_error(display.open, DeviceRefusedError)
         for width_px in (bench.width_px, other_px):
-            require(str(width_px) in message, f"{message!r} does not name the width of {width_px} pixels")
+            require(
+                str(width_px) in message,
+                f"{message!r} does not name the width of {width_px} pixels",
+            )
 
 
 def check_closing(bench: DisplayBench) -> None:
@@ -162,4 +172,7 @@ def _display(bench: DisplayBench, width_px: int | None = None) -> Iterator[Displ
 
 
 def _require_lit(bench: DisplayBench, picture: Levels, what: str) -> None:
-    require(bench.lit is not None and np.array_equal(bench.lit, picture), f"the panel does not show {what} as sent")
+    require(
+        bench.lit is not None and np.array_equal(bench.lit, picture),
+        f"the panel does not show {what} as sent",
+    )

@@ -1,4 +1,6 @@
-"""Calls of drivers of cameras and displays, whose code may be another package's: any failure becomes a LinkError."""
+"""Calls of drivers of cameras and displays, whose code may be another package's: any failure
+becomes a LinkError.
+"""
 
 import contextlib
 from typing import Any
@@ -8,7 +10,9 @@ from firmware_iface.roles import LinkError
 _SHOWN = 300  # characters of a driver's message
 
 
-def call_driver(name: str, driver: Any, method: str, *arguments: Any, returns: type[Any] = object) -> Any:
+def call_driver(
+    name: str, driver: Any, method: str, *arguments: Any, returns: type[Any] = object
+) -> Any:
     """Call a method of a driver and check the type of its result.
 
     Raises LinkError (a subclass of it if the driver does) with one line that names the device.
@@ -31,7 +35,9 @@ def call_driver(name: str, driver: Any, method: str, *arguments: Any, returns: t
     except (Exception, SystemExit) as error:  # whatever its code does
         raise LinkError(f"{name}: {method}: {type(error).__name__}: {_one_line(error)}") from error
     if not isinstance(found, returns):
-        raise LinkError(f"{name}: {method} returned {type(found).__name__} instead of {returns.__name__}")
+        raise LinkError(
+            f"{name}: {method} returned {type(found).__name__} instead of {returns.__name__}"
+        )
     return found
 
 

@@ -1,7 +1,8 @@
-"""Writes the files generated from the register map: `docs/registers.md`, `membrane_board.h` and the board's table.
+"""Writes the files generated from the register map: `docs/registers.md`, `membrane_board.h` and the
+board's table.
 
-Run `python -m firmware_iface.generate` after changing the map; with `--check` it writes nothing and exits with 1
-if a file is out of date.
+Run `python -m firmware_iface.generate` after changing the map; with `--check` it writes nothing and
+exits with 1 if a file is out of date.
 """
 
 import argparse
@@ -24,21 +25,30 @@ def markdown(registers: RegisterMap) -> str:
         "",
         f"Generated from {_SOURCE}; do not edit.",
         "",
-        f"Map version {registers.map_version}, device kind {registers.device_kind} (0x{registers.device_kind:04X}).",
-        "`since` is the first map version that has a register; a board of an earlier version has the map without it.",
+        f"Map version {registers.map_version}, device kind {registers.device_kind} "
+        f"(0x{registers.device_kind:04X}).",
+        "`since` is the first map version that has a register; a board of an earlier version "
+        "has the map without it.",
         "",
-        "Modbus holding registers, function codes 3 (read), 6 and 16 (write) and 23 (write, then read); addresses",
+        "Modbus holding registers, function codes 3 (read), 6 and 16 (write) and 23 (write, "
+        "then read); addresses",
         "count from 0; 32-bit values have the big word first. value = raw / counts per unit.",
-        f"An `i32` of {I32_NO_VALUE} means that there is no value. A write outside the limits is answered with",
-        "exception 3 and changes nothing; one to a read-only or unknown address, or to half a value, with 2.",
-        "From map version 2 on, a part of a block is refused with 2, and a write without the claim in force with 6",
+        f"An `i32` of {I32_NO_VALUE} means that there is no value. A write outside the "
+        "limits is answered with",
+        "exception 3 and changes nothing; one to a read-only or unknown address, or to half "
+        "a value, with 2.",
+        "From map version 2 on, a part of a block is refused with 2, and a write without the "
+        "claim in force with 6",
         "while a program holds the board, with 3 otherwise ([firmware](firmware.md#claim)).",
     ]
     for block in registers.blocks:
         lines += ["", *_markdown_block(block)]
     lines += ["", "## Faults", "", "Bits of `latched_faults` and `clear_faults`.", ""]
     lines += ["| bit | name | since | meaning |", "|---|---|---|---|"]
-    lines += [f"| {fault.bit} | `{fault.name}` | {fault.since} | {fault.meaning} |" for fault in registers.faults]
+    lines += [
+        f"| {fault.bit} | `{fault.name}` | {fault.since} | {fault.meaning} |"
+        for fault in registers.faults
+    ]
     return "\n".join(lines) + "\n"
 
 
@@ -59,7 +69,8 @@ def _markdown_row(register: Register) -> str:
     limits = f"{register.minimum:g} .. {register.maximum:g}" if register.access == "rw" else ""
     return (
         f"| {register.address} | `{register.name}` | {register.type} | {register.unit} | "
-        f"{register.counts_per_unit} | {limits} | {register.access} | {register.since} | {register.meaning} |"
+        f"{register.counts_per_unit} | {limits} | {register.access} | {register.since} | "
+        f"{register.meaning} |"
     )
 
 
@@ -67,7 +78,8 @@ def c_header(registers: RegisterMap) -> str:
     """The map as a C header (C89 and later, preprocessor only) for authors of firmware."""
     lines = [
         f"/* Registers of the membrane pump board. Generated from {_SOURCE}; do not edit.",
-        " * Modbus holding registers, addresses from 0, big word first. value = raw / COUNTS_PER_UNIT. */",
+        " * Modbus holding registers, addresses from 0, big word first. value = raw / "
+        "COUNTS_PER_UNIT. */",
         "#ifndef MEMBRANE_BOARD_H",
         "#define MEMBRANE_BOARD_H",
         "",
@@ -82,16 +94,22 @@ def c_header(registers: RegisterMap) -> str:
         for register in block.registers:
             lines += _c_register(register)
     lines += ["", "/* bits of latched_faults and clear_faults */"]
-    lines += [_define(f"FAULT_{fault.name}", f"0x{fault.mask:04X}u", fault.meaning) for fault in registers.faults]
+    lines += [
+        _define(f"FAULT_{fault.name}", f"0x{fault.mask:04X}u", fault.meaning)
+        for fault in registers.faults
+    ]
     return "\n".join([*lines, "", "#endif"]) + "\n"
 
 
 def c_table(registers: RegisterMap) -> str:
-    """The map as tables in C11: the blocks, and the limits of every register that can be written."""
+    """The map as tables in C11: the blocks, and the limits of every
+    register that can be written.
+    """
     limited = [register for register in registers if register.access == "rw"]
     return "\n".join(
         [
-            f"/* Blocks of registers and limits of writes. Generated from {_SOURCE}; do not edit. */",
+            f"/* Blocks of registers and limits of writes. Generated from {_SOURCE}; do not "
+            "edit. */",
             "#ifndef MEMBRANE_REGISTER_TABLE_H",
             "#define MEMBRANE_REGISTER_TABLE_H",
             "",
@@ -116,14 +134,18 @@ def c_table(registers: RegisterMap) -> str:
             "",
             "static const struct register_block REGISTER_BLOCKS[REGISTER_BLOCKS_COUNT] = {",
             *(
-                f"    {{{block.address}u, {block.count}u, {str(block.access == 'rw').lower()}}}, /* {block.name} */"
+                (
+                    f"    {{{block.address}u, {block.count}u, "
+                    f"{str(block.access == 'rw').lower()}}}, /* {block.name} */"
+                )
                 for block in registers.blocks
             ),
             "};",
             "",
             "static const struct register_limits REGISTER_LIMITS[REGISTER_LIMITS_COUNT] = {",
             *(
-                f"    {{{register.address}u, {register.words}u, {register.to_raw(register.minimum):.0f}u, "
+                f"    {{{register.address}u, {register.words}u, "
+                f"{register.to_raw(register.minimum):.0f}u, "
                 f"{register.to_raw(register.maximum):.0f}u}}, /* {register.name} */"
                 for register in limited
             ),
@@ -136,12 +158,22 @@ def c_table(registers: RegisterMap) -> str:
 
 
 def _c_register(register: Register) -> list[str]:
-    lines = [_define(f"{register.name}_ADDRESS", f"{register.address}u", f"{register.type}: {register.meaning}")]
+    lines = [
+        _define(
+            f"{register.name}_ADDRESS",
+            f"{register.address}u",
+            f"{register.type}: {register.meaning}",
+        )
+    ]
     if register.counts_per_unit != 1:
         lines.append(_define(f"{register.name}_COUNTS_PER_UNIT", str(register.counts_per_unit)))
     if register.access == "rw":
-        lines.append(_define(f"{register.name}_MIN_RAW", f"{register.to_raw(register.minimum):.0f}"))
-        lines.append(_define(f"{register.name}_MAX_RAW", f"{register.to_raw(register.maximum):.0f}"))
+        lines.append(
+            _define(f"{register.name}_MIN_RAW", f"{register.to_raw(register.minimum):.0f}")
+        )
+        lines.append(
+            _define(f"{register.name}_MAX_RAW", f"{register.to_raw(register.maximum):.0f}")
+        )
     return lines
 
 
@@ -152,11 +184,17 @@ def _define(name: str, value: str, comment: str = "") -> str:
 def main(arguments: list[str] | None = None) -> int:
     """Write the files, or report which are out of date; returns the exit code."""
     parser = argparse.ArgumentParser(prog="python -m firmware_iface.generate", description=__doc__)
-    parser.add_argument("--check", action="store_true", help="write nothing; exit with 1 when a file is out of date")
+    parser.add_argument(
+        "--check", action="store_true", help="write nothing; exit with 1 when a file is out of date"
+    )
     check = parser.parse_args(arguments).check
     registers = default_map()
     stale = False
-    files = {DOCS_PATH: markdown(registers), HEADER_PATH: c_header(registers), TABLE_PATH: c_table(registers)}
+    files = {
+        DOCS_PATH: markdown(registers),
+        HEADER_PATH: c_header(registers),
+        TABLE_PATH: c_table(registers),
+    }
     for path, text in files.items():
         if path.exists() and path.read_text(encoding="utf-8") == text:
             continue

@@ -1,8 +1,9 @@
-"""A camera for the measurement cycle, whichever its driver: opened when needed, every frame checked.
+"""A camera for the measurement cycle, whichever its driver: opened when needed, every frame
+checked.
 
-A driver takes a frame in one call (`grab`), or triggers (`expose`) and transfers (`fetch`) in two. This class offers
-all three. Whatever the driver raises becomes a LinkError with one line; after any failure but a lost frame the driver
-is closed, and opened again by the next exposure.
+A driver takes a frame in one call (`grab`), or triggers (`expose`) and transfers (`fetch`) in two.
+This class offers all three. Whatever the driver raises becomes a LinkError with one line; after any
+failure but a lost frame the driver is closed, and opened again by the next exposure.
 """
 
 import math
@@ -13,7 +14,8 @@ import numpy as np
 from firmware_iface import roles
 from firmware_iface.driver_calls import call_driver, close_driver
 
-# A camera's clock, converted to the run's clock, may be off by this; a frame of an earlier trigger is older
+# A camera's clock, converted to the run's clock, may be off by this; a frame of an earlier trigger
+# is older
 _CLOCK_TOLERANCE_S = 0.005
 
 
@@ -23,10 +25,14 @@ class GuardedCamera:
     Raises ValueError if the driver is no camera.
     """
 
-    def __init__(self, driver: roles.OpticalDevice, sensor: roles.SensorFormat, now: roles.Clock, name: str) -> None:
+    def __init__(
+        self, driver: roles.OpticalDevice, sensor: roles.SensorFormat, now: roles.Clock, name: str
+    ) -> None:
         self._overlaps = isinstance(driver, roles.ExposingCamera)
         if not self._overlaps and not isinstance(driver, roles.Camera):
-            raise ValueError(f"{name}: the driver has neither grab nor expose and fetch, so it is no camera")
+            raise ValueError(
+                f"{name}: the driver has neither grab nor expose and fetch, so it is no camera"
+            )
         self.driver, self._sensor, self._now, self._name = driver, sensor, now, name
         self._opened = False
         self._triggered_s = math.nan
@@ -68,7 +74,9 @@ class GuardedCamera:
         return found
 
     def grab(self, out: roles.Pixels | None = None) -> roles.Frame:
-        """One exposure, taken again when it is lost. Raises LinkError (no camera, or three frames lost in a row)."""
+        """One exposure, taken again when it is lost. Raises LinkError (no camera, or three frames
+        lost in a row).
+        """
         for _ in range(roles.TRIES - 1):
             try:
                 self.expose(out)
@@ -98,18 +106,26 @@ class GuardedCamera:
             raise
 
     def _check(self, frame: roles.Frame, triggered_s: float) -> None:
-        """Refuse a frame of another size or type, and one that was not exposed after its trigger."""
+        """Refuse a frame of another size or type, and one that was
+        not exposed after its trigger.
+        """
         pixels, sensor = frame.pixels, self._sensor
-        if not isinstance(pixels, np.ndarray) or pixels.shape != sensor.shape or pixels.dtype != sensor.dtype:
+        if (
+            not isinstance(pixels, np.ndarray)
+            or pixels.shape != sensor.shape
+            or pixels.dtype != sensor.dtype
+        ):
             self.close()
             raise roles.LinkError(
-                f"{self._name}: gave {_describe_array(pixels)}, [optics.camera] states {sensor.width_px} x "
+                f"{self._name}: gave {_describe_array(pixels)}, [optics.camera] states "
+                f"{sensor.width_px} x "
                 f"{sensor.height_px} {sensor.dtype}"
             )
         earliest_s, latest_s = triggered_s - _CLOCK_TOLERANCE_S, self._now() + _CLOCK_TOLERANCE_S
         if not isinstance(frame.time_s, int | float) or not earliest_s <= frame.time_s <= latest_s:
             raise roles.FrameLostError(
-                f"{self._name}: gave a frame of {frame.time_s} s for the trigger at {triggered_s:.3f} s: late, or "
+                f"{self._name}: gave a frame of {frame.time_s} s for the trigger at "
+                f"{triggered_s:.3f} s: late, or "
                 "its time is not on the run's clock"
             )
 

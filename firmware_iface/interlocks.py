@@ -1,13 +1,13 @@
 """Interlock circuits that are not inputs of the pump board, added to the readings of any bench.
 
-An interlock is a normally closed circuit: an emergency stop, a door, an oxygen monitor, the supply's pressure switch.
-Three rules:
+An interlock is a normally closed circuit: an emergency stop, a door, an oxygen monitor, the
+supply's pressure switch. Three rules:
 
 - A source is read by a task of its own, so that the tick never waits for it.
-- An answer counts from the moment of its request, and only for `age_max_s`. A source that is slow, hangs, answers
-  with errors or was never reached has no younger answer: its circuits count as open.
-- A source that cannot be opened does not keep the bench from opening: the pump must remain within reach. Its circuits
-  are open, which is enough to prevent a hold.
+- An answer counts from the moment of its request, and only for `age_max_s`. A source that is slow,
+  hangs, answers with errors or was never reached has no younger answer: its circuits count as open.
+- A source that cannot be opened does not keep the bench from opening: the pump must remain within
+  reach. Its circuits are open, which is enough to prevent a hold.
 """
 
 import asyncio
@@ -30,9 +30,13 @@ class CircuitMemory:
         self._asked_s = -math.inf
 
     def take(self, closed: Sequence[bool], asked_s: float) -> None:
-        """Take the answer to a request that was sent at a time. Raises LinkError if circuits are missing."""
+        """Take the answer to a request that was sent at a time. Raises LinkError if circuits are
+        missing.
+        """
         if len(closed) != len(self._closed):
-            raise roles.LinkError(f"{len(closed)} circuits in the answer, expected {len(self._closed)}")
+            raise roles.LinkError(
+                f"{len(closed)} circuits in the answer, expected {len(self._closed)}"
+            )
         self._closed = [found is True for found in closed]
         self._asked_s = asked_s
 
@@ -47,8 +51,8 @@ class CircuitMemory:
 class PolledSource:
     """A source, and the bit of `BenchReading.interlocks_open` of each of its circuits.
 
-    `period_s` is the interval of the requests, `age_max_s` the age from which an answer no longer counts, and
-    `first_s` the longest wait for the first answer when the bench opens.
+    `period_s` is the interval of the requests, `age_max_s` the age from which an answer no longer
+    counts, and `first_s` the longest wait for the first answer when the bench opens.
     """
 
     source: roles.InterlockSource
@@ -70,7 +74,9 @@ class CircuitPoller:
         self.problem = "not read yet"  # why there is no newer answer; empty if there is one
 
     async def start(self) -> None:
-        """Wait for the first answer, not longer than `first_s`, and go on in the background; again: no effect."""
+        """Wait for the first answer, not longer than `first_s`, and go on in the background; again:
+        no effect.
+        """
         if self._task is not None and not self._task.done():
             return
         first = asyncio.Event()
@@ -91,7 +97,11 @@ class CircuitPoller:
     def open_mask(self) -> int:
         """Bits of the circuits that are open now, or whose signal is lost."""
         open_circuits = self._memory.open_circuits(self._clock())
-        return sum(1 << bit for bit, is_open in zip(self.polled.bits, open_circuits, strict=True) if is_open)
+        return sum(
+            1 << bit
+            for bit, is_open in zip(self.polled.bits, open_circuits, strict=True)
+            if is_open
+        )
 
     async def stop(self) -> None:
         """Stop reading and close the source. Never raises."""
@@ -99,7 +109,9 @@ class CircuitPoller:
         if task is not None:
             task.cancel()
             await asyncio.gather(task, return_exceptions=True)
-        with contextlib.suppress(Exception):  # one driver's mistake must not leave the next device open
+        with contextlib.suppress(
+            Exception
+        ):  # one driver's mistake must not leave the next device open
             await self.polled.source.close()
         self._opened = False
 
@@ -131,8 +143,12 @@ class CircuitPoller:
 
 
 def open_board_inputs(reading: roles.BenchReading, board_inputs: Mapping[int, int]) -> int:
-    """Bits of the interlocks at the board's inputs whose circuits are open; `board_inputs` as in `InterlockBench`."""
-    return sum(1 << bit for bit, place in board_inputs.items() if not reading.interlock_inputs >> place & 1)
+    """Bits of the interlocks at the board's inputs whose circuits are open; `board_inputs` as in
+    `InterlockBench`.
+    """
+    return sum(
+        1 << bit for bit, place in board_inputs.items() if not reading.interlock_inputs >> place & 1
+    )
 
 
 class InterlockBench:
@@ -161,7 +177,9 @@ class InterlockBench:
         self._pollers = tuple(CircuitPoller(polled, clock) for polled in sources)
 
     async def open(self) -> roles.BenchIdentity:
-        """Start reading the sources, then open the bench: its watchdog runs from then on. Raises as the bench's."""
+        """Start reading the sources, then open the bench: its watchdog runs from then on. Raises as
+        the bench's.
+        """
         await asyncio.gather(*(poller.start() for poller in self._pollers))
         return await self._bench.open()
 
@@ -183,7 +201,9 @@ class InterlockBench:
 
     def dead_guards(self) -> tuple[str, ...]:
         """The bench's guards that no longer run, and readers of interlocks that have ended."""
-        ended = tuple(f"interlock reader of {poller.name}" for poller in self._pollers if poller.ended)
+        ended = tuple(
+            f"interlock reader of {poller.name}" for poller in self._pollers if poller.ended
+        )
         return (*self._bench.dead_guards(), *ended)
 
     async def close(self) -> None:

@@ -1,7 +1,8 @@
-"""A screen: shows patterns on any display, corrected for its response, and waits until they are settled.
+"""A screen: shows patterns on any display, corrected for its response, and waits until they are
+settled.
 
-Patterns are rendered once, when the screen is opened. A display returns when a picture is queued, not when it is lit:
-`wait` lasts for the settle time, which `firmware_iface.display` measures.
+Patterns are rendered once, when the screen is opened. A display returns when a picture is queued,
+not when it is lit: `wait` lasts for the settle time, which `firmware_iface.display` measures.
 """
 
 from collections.abc import Sequence
@@ -17,13 +18,18 @@ SETTLE_S = 0.3  # until it is measured
 class PatternScreen:
     """The role Screen on a display, from `open` to `close`.
 
-    `response` makes the patterns' light linear; `wait` lasts for `settle_s` from the command on, which may be set.
-    Whatever the display's driver raises becomes a LinkError that begins with `name`, and the display is opened again
-    by the next picture.
+    `response` makes the patterns' light linear; `wait` lasts for `settle_s` from the command on,
+    which may be set. Whatever the display's driver raises becomes a LinkError that begins with
+    `name`, and the display is opened again by the next picture.
     """
 
     def __init__(
-        self, display: Display, raster: ScreenRaster, patterns: Sequence[Pattern], clock: DriverClock, name: str
+        self,
+        display: Display,
+        raster: ScreenRaster,
+        patterns: Sequence[Pattern],
+        clock: DriverClock,
+        name: str,
     ) -> None:
         self.settle_s = SETTLE_S
         self.response = linear_response()
@@ -67,7 +73,9 @@ class PatternScreen:
         self._clock.sleep(max(0.0, self._shown_s + self.settle_s - self._clock.now()))
 
     def show_levels(self, levels: Levels) -> None:
-        """Send an image (height, width), level for level, for tests of the display; not waited for."""
+        """Send an image (height, width), level for level, for tests of the display;
+        not waited for.
+        """
         shape = self._raster.height_px, self._raster.width_px
         if levels.shape != shape:
             raise ValueError(f"image is {levels.shape}, the screen {shape}")

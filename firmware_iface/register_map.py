@@ -1,4 +1,6 @@
-"""The register map: loaded from `registers.toml`, checked, and used to turn registers into values and back."""
+"""The register map: loaded from `registers.toml`, checked, and used to turn registers into values
+and back.
+"""
 
 import math
 import struct
@@ -21,7 +23,17 @@ I32_NO_VALUE = -(2**31)
 _SUFFIXES = {"s": "_s", "um": "_um", "Pa": "_pa", "degC": "_c", "fraction": "_fraction", "1": ""}
 _ADDRESSES = 2**16
 _READ_MAX_WORDS = 125  # Modbus application protocol 1.1b3, function code 3
-_REGISTER_KEYS = {"name", "address", "type", "unit", "counts_per_unit", "min", "max", "meaning", "since"}
+_REGISTER_KEYS = {
+    "name",
+    "address",
+    "type",
+    "unit",
+    "counts_per_unit",
+    "min",
+    "max",
+    "meaning",
+    "since",
+}
 
 
 class RegisterMapError(ValueError):
@@ -92,16 +104,25 @@ class Block:
         return self.layout.size // 2
 
     def encode(self, values: Mapping[str, float]) -> list[int]:
-        """Values by name to words, big word first. Raises ValueError if one does not fit its type."""
-        packed = self.layout.pack(*(register.to_raw(values[register.name]) for register in self.registers))
+        """Values by name to words, big word first. Raises ValueError
+        if one does not fit its type.
+        """
+        packed = self.layout.pack(
+            *(register.to_raw(values[register.name]) for register in self.registers)
+        )
         return list(struct.unpack(f">{self.count}H", packed))
 
     def decode(self, words: Sequence[int]) -> dict[str, float]:
-        """Words, big word first, to values by name. Raises ValueError if there are not `count` of them."""
+        """Words, big word first, to values by name. Raises ValueError if there are not `count` of
+        them.
+        """
         if len(words) != self.count:
             raise ValueError(f"block {self.name} has {self.count} registers, not {len(words)}")
         raws = self.layout.unpack(struct.pack(f">{self.count}H", *words))
-        return {register.name: register.to_value(raw) for register, raw in zip(self.registers, raws, strict=True)}
+        return {
+            register.name: register.to_value(raw)
+            for register, raw in zip(self.registers, raws, strict=True)
+        }
 
 
 @dataclass(frozen=True, slots=True)
@@ -149,13 +170,20 @@ class RegisterMap:
         return {fault.name: fault.since for fault in self.faults}[name]
 
     def of_version(self, version: int) -> "RegisterMap":
-        """The map of boards of an earlier version. Raises RegisterMapError for an unknown version."""
+        """The map of boards of an earlier version. Raises
+        RegisterMapError for an unknown version.
+        """
         if not 1 <= version <= self.map_version:
             raise RegisterMapError(f"map version {version} is none of 1..{self.map_version}")
         had = {
-            block: [register for register in block.registers if register.since <= version] for block in self.blocks
+            block: [register for register in block.registers if register.since <= version]
+            for block in self.blocks
         }
-        blocks = [make_block(block.name, block.access, block.meaning, found) for block, found in had.items() if found]
+        blocks = [
+            make_block(block.name, block.access, block.meaning, found)
+            for block, found in had.items()
+            if found
+        ]
         faults = tuple(fault for fault in self.faults if fault.since <= version)
         return RegisterMap(version, self.device_kind, tuple(blocks), faults)
 
@@ -182,8 +210,8 @@ def known_maps() -> dict[int, RegisterMap]:
 def load(path: Path) -> RegisterMap:
     """Read and check a map.
 
-    Raises RegisterMapError for a file that is not a map, and for overlaps, gaps, wrong order, unknown types or
-    keys, missing limits and names that do not end in their unit.
+    Raises RegisterMapError for a file that is not a map, and for overlaps, gaps, wrong order,
+    unknown types or keys, missing limits and names that do not end in their unit.
     """
     try:
         return parse(tomllib.loads(path.read_text(encoding="utf-8")))
@@ -198,7 +226,8 @@ def parse(table: Mapping[str, Any]) -> RegisterMap:
     try:
         blocks = tuple(_parse_block(entry) for entry in table["block"])
         faults = tuple(
-            FaultBit(entry["bit"], entry["name"], entry["meaning"], entry.get("since", 1)) for entry in table["fault"]
+            FaultBit(entry["bit"], entry["name"], entry["meaning"], entry.get("since", 1))
+            for entry in table["fault"]
         )
         found = RegisterMap(table["map_version"], table["device_kind"], blocks, faults)
     except KeyError as error:
@@ -216,13 +245,17 @@ def _parse_block(entry: Mapping[str, Any]) -> Block:
         raise RegisterMapError(f"block {name} has no registers")
     block = make_block(name, access, entry["meaning"], registers)
     if block.count > _READ_MAX_WORDS:
-        raise RegisterMapError(f"block {name} has {block.count} words; one transaction carries {_READ_MAX_WORDS}")
+        raise RegisterMapError(
+            f"block {name} has {block.count} words; one transaction carries {_READ_MAX_WORDS}"
+        )
     for before, after in pairwise(registers):
         _check_sequence(before, after)
         if after.address > before.address + before.words:
             raise RegisterMapError(f"block {name}: gap between {before.name} and {after.name}")
         if after.since < before.since:  # the earlier map would have a gap
-            raise RegisterMapError(f"block {name}: {after.name} is older than {before.name} before it")
+            raise RegisterMapError(
+                f"block {name}: {after.name} is older than {before.name} before it"
+            )
     return block
 
 
@@ -258,7 +291,9 @@ def _check_register(register: Register) -> None:
     if not name.endswith(_SUFFIXES[register.unit]):
         raise RegisterMapError(f"{name}: the name must end in {_SUFFIXES[register.unit]}")
     if not 0 <= register.address <= _ADDRESSES - register.words:
-        raise RegisterMapError(f"{name}: address {register.address} is outside 0..{_ADDRESSES - register.words}")
+        raise RegisterMapError(
+            f"{name}: address {register.address} is outside 0..{_ADDRESSES - register.words}"
+        )
     if register.counts_per_unit <= 0 or (register.type == "f32" and register.counts_per_unit != 1):
         raise RegisterMapError(f"{name}: counts_per_unit must be above 0, and 1 for an f32")
     has_limits = register.minimum <= register.maximum
@@ -275,7 +310,9 @@ def _check_order(found: RegisterMap) -> None:
     registers = list(found)
     for register in registers:
         if not 1 <= register.since <= found.map_version:
-            raise RegisterMapError(f"{register.name}: since must be a map version, 1..{found.map_version}")
+            raise RegisterMapError(
+                f"{register.name}: since must be a map version, 1..{found.map_version}"
+            )
     for before, after in pairwise(registers):
         _check_sequence(before, after)
     names = [register.name for register in registers]
@@ -288,6 +325,8 @@ def _check_order(found: RegisterMap) -> None:
 
 def _check_sequence(before: Register, after: Register) -> None:
     if after.address < before.address:
-        raise RegisterMapError(f"{after.name} (address {after.address}) comes after {before.name}: order them")
+        raise RegisterMapError(
+            f"{after.name} (address {after.address}) comes after {before.name}: order them"
+        )
     if after.address < before.address + before.words:
         raise RegisterMapError(f"{after.name} (address {after.address}) overlaps {before.name}")

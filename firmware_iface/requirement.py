@@ -24,5 +24,7 @@ def require_error(act: Callable[[], object], kind: type[LinkError]) -> str:
         require(bool(message) and "\n" not in message, f"{message!r} is not a message of one line")
         return message
     except LinkError as error:
-        raise ConformanceError(f"raises {type(error).__name__} instead of {kind.__name__}: {error}") from error
+        raise ConformanceError(
+            f"raises {type(error).__name__} instead of {kind.__name__}: {error}"
+        ) from error
     raise ConformanceError(f"raises no {kind.__name__}")

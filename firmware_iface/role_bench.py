@@ -1,14 +1,17 @@
 """A `Bench` composed of single devices, one per role.
 
-The actuators decide whether the bench is there. Without the pump (and the vent, if there is one) nothing can be made
-safe, so their errors are raised, and the loss of their link is the loss of the bench's. A failed sensor is a missing
-value: NaN, on which the controller holds the flow, ramps down or continues without it, and the sensor is reopened in
-the background, so that a replugged cable gives good readings within its back-off.
+The actuators decide whether the bench is there. Without the pump (and the vent, if there is one)
+nothing can be made safe, so their errors are raised, and the loss of their link is the loss of the
+bench's. A failed sensor is a missing
+value: NaN, on which the controller holds the flow, ramps down or continues without it, and the
+sensor is reopened in the background, so that a replugged cable gives good readings within its
+back-off.
 
-Watchdog: only the pump board has its own. An instrument keeps its last setpoint, so this bench watches itself:
-without a `write` within `watchdog_s` it sets the pump to 0 and reports that. This covers a controller that hangs in a
-tick, not one that is killed: then the last flow continues until the gas is shut off by hand or by a relief valve, as
-docs/decisions/35-single-instruments.md and `check` state.
+Watchdog: only the pump board has its own. An instrument keeps its last setpoint, so this bench
+watches itself: without a `write` within `watchdog_s` it sets the pump to 0 and reports that. This
+covers a controller that hangs in a tick, not one that is killed: then the last flow continues until
+the gas is shut off by hand or by a relief valve, as docs/decisions/35-single-instruments.md and
+`check` state.
 """
 
 import asyncio
@@ -23,14 +26,17 @@ from firmware_iface import roles
 
 T = TypeVar("T")
 WATCHDOG_BIT = 0  # in latched_faults, as on the pump board
-NO_ANSWER = 0xFFFF  # displacement_quality when the sensor itself does not answer; no instrument's code
+# displacement_quality when the sensor itself does not answer; no instrument's code
+NO_ANSWER = 0xFFFF
 _ANY = (-math.inf, math.inf)
 _RETRY_S = 0.1  # between two attempts to open a lost sensor; its link has the longer back-off
 
 
 @dataclass(frozen=True, slots=True)
 class RoleDevices:
-    """Which device fills which role; None where the bench has none. `others` are further ones of `roles.SENSORS`."""
+    """Which device fills which role; None where the bench has none. `others` are further ones of
+    `roles.SENSORS`.
+    """
 
     displacement: roles.DisplacementSensor | None
     pump: roles.Pump
@@ -39,7 +45,9 @@ class RoleDevices:
     others: Mapping[str, roles.Device] = field(default_factory=dict)
 
     def by_role(self) -> dict[str, roles.Device]:
-        """The filled roles, actuators last: nothing may move gas before the sensors are connected."""
+        """The filled roles, actuators last: nothing may move gas
+        before the sensors are connected.
+        """
         filled: dict[str, roles.Device | None] = {
             "displacement": self.displacement,
             **self.sensors(),
@@ -54,9 +62,13 @@ class RoleDevices:
 
 
 class RoleBench:
-    """Reads all sensors at once and drives pump and vent; no `write` for `watchdog_s` sets the pump to 0."""
+    """Reads all sensors at once and drives pump and vent; no `write` for `watchdog_s` sets the pump
+    to 0.
+    """
 
-    def __init__(self, devices: RoleDevices, watchdog_s: float = 0.5, clock: roles.Clock = time.monotonic) -> None:
+    def __init__(
+        self, devices: RoleDevices, watchdog_s: float = 0.5, clock: roles.Clock = time.monotonic
+    ) -> None:
         self._devices = devices
         self._watchdog_s = watchdog_s
         self._clock = clock
@@ -89,7 +101,9 @@ class RoleBench:
         self._fed_s, self._commanded = self._clock(), 0.0
         self._watchdog = asyncio.create_task(self._watch(), name="software watchdog")
         kinds = ", ".join(f"{role} {identity.kind}" for role, identity in self.identities.items())
-        firmware = ", ".join(dict.fromkeys(i.firmware for i in self.identities.values() if i.firmware))
+        firmware = ", ".join(
+            dict.fromkeys(i.firmware for i in self.identities.values() if i.firmware)
+        )
         return roles.BenchIdentity(
             f"composed of {kinds}",
             0,
@@ -104,8 +118,8 @@ class RoleBench:
     async def read(self) -> roles.BenchReading:
         """Read all sensors at once; missing values are NaN.
 
-        Raises LinkError (pump or vent gave no valid answer; LinkDownError if its link is lost, or the watchdog has
-        ended).
+        Raises LinkError (pump or vent gave no valid answer; LinkDownError if its link is lost, or
+        the watchdog has ended).
         """
         await self._require_watchdog()
         sensors = asyncio.ensure_future(self._sensors())  # never raises
@@ -114,8 +128,13 @@ class RoleBench:
         finally:
             sample, values = await sensors
         if sample.quality == NO_ANSWER and math.isfinite(values["gauge_pressure_pa"]):
-            # the laser is lost, or there is none, and the bench is not: counted downwards, as no laser does
-            sample = replace(sample, sample_counter=min(sample.sample_counter, 0) - 1, device_time_s=self._clock())
+            # the laser is lost, or there is none, and the bench is not: counted downwards, as no
+            # laser does
+            sample = replace(
+                sample,
+                sample_counter=min(sample.sample_counter, 0) - 1,
+                device_time_s=self._clock(),
+            )
             self._last_sample = sample
         return replace(
             roles.NO_READING,
@@ -133,8 +152,8 @@ class RoleBench:
     async def write(self, command: roles.BenchCommand) -> None:
         """Command pump and vent at once, and feed the watchdog; after a trip the pump stays off.
 
-        Raises ValueError (a fraction outside 0..1, or NaN; nothing is sent), LinkError (the device may or may not
-        have received it; the other one was commanded anyway).
+        Raises ValueError (a fraction outside 0..1, or NaN; nothing is sent), LinkError (the device
+        may or may not have received it; the other one was commanded anyway).
         """
         for name, fraction in (("pump", command.pump_fraction), ("vent", command.vent_fraction)):
             if not 0.0 <= fraction <= 1.0:
@@ -164,11 +183,15 @@ class RoleBench:
         await self._stop_reopening()
         await self._stop_watchdog()
         for device in reversed(self._devices.by_role().values()):
-            with contextlib.suppress(Exception):  # one driver's mistake must not leave the next device open
+            with contextlib.suppress(
+                Exception
+            ):  # one driver's mistake must not leave the next device open
                 await device.close()
 
     async def _sensors(self) -> tuple[roles.DisplacementSample, dict[str, Any]]:
-        """The displacement, and the values of the other sensors by their field of `BenchReading`."""
+        """The displacement, and the values of the other sensors by
+        their field of `BenchReading`.
+        """
         asked = asyncio.gather(*(self._value(role) for role in roles.SENSORS.values()))
         sample, values = await asyncio.gather(self._sample(), asked)
         return sample, dict(zip(roles.SENSORS, values, strict=True))
@@ -178,7 +201,10 @@ class RoleBench:
         vent = self._devices.vent
         if vent is None:
             return await answer("pump", self._devices.pump.pump_fraction()), math.nan
-        asked = (answer("pump", self._devices.pump.pump_fraction()), answer("vent", vent.vent_fraction()))
+        asked = (
+            answer("pump", self._devices.pump.pump_fraction()),
+            answer("vent", vent.vent_fraction()),
+        )
         found = await asyncio.gather(*asked, return_exceptions=True)
         _raise_first(found)
         pump_fraction, vent_fraction = (value for value in found if isinstance(value, float))
@@ -212,7 +238,9 @@ class RoleBench:
             self._tasks[role] = asyncio.create_task(self._reopen(role), name=f"open {role} again")
 
     async def _reopen(self, role: str) -> None:
-        """Reopen a lost sensor until the same one is back; a different one in its place needs a person."""
+        """Reopen a lost sensor until the same one is back; a different one in its place needs a
+        person.
+        """
         device = self._devices.by_role()[role]
         while True:
             with contextlib.suppress(roles.LinkError):
@@ -222,7 +250,9 @@ class RoleBench:
         del self._tasks[role]
 
     async def _watch(self) -> None:
-        """The software watchdog: after any exception of a driver, it retries a quarter of a period later."""
+        """The software watchdog: after any exception of a driver, it retries a quarter of a period
+        later.
+        """
         while True:
             await asyncio.sleep(self._watchdog_s / 4)
             if self._commanded > 0 and self._clock() - self._fed_s > self._watchdog_s:
@@ -234,8 +264,8 @@ class RoleBench:
     async def _require_watchdog(self) -> None:
         """Refuse to read or command without the watchdog.
 
-        A watchdog that has ended leaves an unguarded pump: it is set to 0 here, and the bench counts as lost until it
-        is reopened, which starts another watchdog.
+        A watchdog that has ended leaves an unguarded pump: it is set to 0 here, and the bench
+        counts as lost until it is reopened, which starts another watchdog.
         """
         if self._watchdog is not None and not self._watchdog.done():
             return
@@ -243,7 +273,9 @@ class RoleBench:
         self._tripped = True
         with contextlib.suppress(Exception):
             await self._devices.pump.set_pump(0.0)
-        raise roles.LinkDownError(f"the software watchdog {error}; the pump was set to 0, open the devices again")
+        raise roles.LinkDownError(
+            f"the software watchdog {error}; the pump was set to 0, open the devices again"
+        )
 
     async def _stop_watchdog(self) -> None:
         task, self._watchdog = self._watchdog, None

@@ -53,8 +53,8 @@ class Role:
     ----------
     name : str
     reads : str
-        The driver's method that is asked in every tick. Of a sensor also the quantity that it measures: a simulated
-        mirror has an attribute of this name.
+        The driver's method that is asked in every tick. Of a sensor also the quantity that it
+        measures: a simulated mirror has an attribute of this name.
     unit : str
         Of the answer.
     needed : bool
@@ -71,7 +71,9 @@ _ROLE = "role"
 
 
 def _sensor(name: str, reads: str, unit: str, needed: bool = False) -> dict[str, Role]:
-    """Return the metadata of a field of `BenchReading` that the sensor of a role fills. Parameters: see `Role`."""
+    """Return the metadata of a field of `BenchReading` that the sensor of a role fills. Parameters:
+    see `Role`.
+    """
     return {_ROLE: Role(name, reads, unit, needed)}
 
 
@@ -83,20 +85,23 @@ FOREIGN_CLAIM, FOREIGN_PERIOD = 1, 2
 class BenchReading:
     """One consistent sample of all sensors.
 
-    A field with a role is filled by the sensor of that role. To add a sensor role, add a field with its role here, a
-    row of the same name to the table of telemetry columns, and a rule that uses it: configuration, bench, record,
-    check, wizard and emulated lab follow. An instrument of a new quantity also needs a contract below and its drivers
-    in `settings.SENSOR_DRIVERS`.
+    A field with a role is filled by the sensor of that role. To add a sensor role, add a field with
+    its role here, a row of the same name to the table of telemetry columns, and a rule that uses
+    it: configuration, bench, record, check, wizard and emulated lab follow. An instrument of a new
+    quantity also needs a contract below and its drivers in `settings.SENSOR_DRIVERS`.
 
-    `sample_counter` and `device_time_s` advance with every sample of the device, to reveal frozen values. Quantities
-    the bench lacks are NaN. `displacement_quality` is 0 when good (else the laser's error code). `foreign` tells
-    which of claim and watchdog another program has changed (FOREIGN_ bits). Bit i of `interlocks_open` is set while
-    the circuit of the configuration's interlock i is open, or its signal is lost.
+    `sample_counter` and `device_time_s` advance with every sample of the device, to reveal frozen
+    values. Quantities the bench lacks are NaN. `displacement_quality` is 0 when good (else the
+    laser's error code). `foreign` tells which of claim and watchdog another program has changed
+    (FOREIGN_ bits). Bit i of `interlocks_open` is set while the circuit of the configuration's
+    interlock i is open, or its signal is lost.
     """
 
     displacement_um: float
     displacement_quality: int
-    gauge_pressure_pa: float = field(metadata=_sensor("gauge_pressure", "gauge_pressure_pa", "Pa", needed=True))
+    gauge_pressure_pa: float = field(
+        metadata=_sensor("gauge_pressure", "gauge_pressure_pa", "Pa", needed=True)
+    )
     ambient_pressure_pa: float = field(metadata=_sensor("barometer", "ambient_pressure_pa", "Pa"))
     air_temperature_c: float = field(metadata=_sensor("thermometer", "air_temperature_c", "°C"))
     gas_temperature_c: float
@@ -107,7 +112,8 @@ class BenchReading:
     watchdog_tripped: bool
     latched_faults: int
     foreign: int = 0
-    interlock_inputs: int = 0  # bit i: the board's interlock input i is closed; 0 without inputs: all open
+    # bit i: the board's interlock input i is closed; 0 without inputs: all open
+    interlock_inputs: int = 0
     interlocks_open: int = 0
 
 
@@ -128,8 +134,11 @@ NO_READING = BenchReading(
 )
 
 # Roles of sensors that give one value a tick, by the field of `BenchReading`.
-SENSORS: dict[str, Role] = {each.name: each.metadata[_ROLE] for each in fields(BenchReading) if each.metadata}
-# All roles in the order in which a person is asked for their devices: first those that every bench needs.
+SENSORS: dict[str, Role] = {
+    each.name: each.metadata[_ROLE] for each in fields(BenchReading) if each.metadata
+}
+# All roles in the order in which a person is asked for their devices: first those that every bench
+# needs.
 ROLES: dict[str, Role] = {
     role.name: role
     for role in (
@@ -164,12 +173,17 @@ class BenchIdentity:
     displacement_range_um: tuple[float, float] = (-math.inf, math.inf)  # range of the sensor
     gauge_range_pa: tuple[float, float] = (-math.inf, math.inf)
     gauge_fitted: bool = True  # False: the board has no gauge, and so no over-pressure protection
-    gauge_timeout_s: float = math.inf  # the board itself stops the pump this long after its gauge fails
-    interlocks_fitted: int = 0  # bit i: the board itself stops the pump when interlock input i opens
+    gauge_timeout_s: float = (
+        math.inf
+    )  # the board itself stops the pump this long after its gauge fails
+    # bit i: the board itself stops the pump when interlock input i opens
+    interlocks_fitted: int = 0
 
 
 class Bench(Protocol):
-    """Displacement sensor, pressure sensors, thermometers, pump and vent, however many devices fill the roles."""
+    """Displacement sensor, pressure sensors, thermometers, pump and vent, however many devices fill
+    the roles.
+    """
 
     async def open(self) -> BenchIdentity:
         """Connect, check the identity, arm the watchdog and read it back. Raises LinkError."""
@@ -211,9 +225,9 @@ class DeviceIdentity:
 class DisplacementSample:
     """The newest sample; for a streaming sensor the median of all values since the last one.
 
-    `quality` is 0 when good, else the device's error code, and then `displacement_um` is NaN. Counter and time
-    advance only with new data; the driver provides them if the device has none (valid messages so far, time
-    of arrival).
+    `quality` is 0 when good, else the device's error code, and then `displacement_um` is NaN.
+    Counter and time advance only with new data; the driver provides them if the device has none
+    (valid messages so far, time of arrival).
     """
 
     displacement_um: float
@@ -225,15 +239,16 @@ class DisplacementSample:
 class Device(Protocol):
     """One instrument; it fills one role or several.
 
-    A task of the driver refreshes quantities slower than the tick (a barometer at 4800 baud); the driver returns the
-    newest value, or NaN once it is older than a stated limit.
+    A task of the driver refreshes quantities slower than the tick (a barometer at 4800 baud); the
+    driver returns the newest value, or NaN once it is older than a stated limit.
     """
 
     async def open(self) -> DeviceIdentity:
-        """Connect, check the identity, apply the settings and read them back; again after every lost link.
+        """Connect, check the identity, apply the settings and read them back; again after every
+        lost link.
 
-        Raises LinkError (no valid answer; LinkDownError without a connection), DeviceRefusedError (not the configured
-        device, or one that does not accept its settings).
+        Raises LinkError (no valid answer; LinkDownError without a connection), DeviceRefusedError
+        (not the configured device, or one that does not accept its settings).
         """
 
     async def close(self) -> None:
@@ -275,7 +290,9 @@ class Pump(Device, Protocol):
     """The source of gas: a pump, or a flow controller on a bottle."""
 
     async def set_pump(self, fraction: float) -> None:
-        """Command it, 0..1 of full scale. Raises LinkError: the device may or may not have received it."""
+        """Command it, 0..1 of full scale. Raises LinkError: the device may or may not have received
+        it.
+        """
 
     async def pump_fraction(self) -> float:
         """The commanded (or actual) value reported by the device. Raises LinkError."""
@@ -295,15 +312,19 @@ class InterlockSource(Device, Protocol):
     """A device that reads the circuits of one or several interlocks."""
 
     async def closed_circuits(self) -> tuple[bool, ...]:
-        """Whether each circuit is closed, in the order in which the source was given them. Raises LinkError."""
+        """Whether each circuit is closed, in the order in which the source was given them. Raises
+        LinkError.
+        """
 
 
 @dataclass(frozen=True, slots=True)
 class Pattern:
-    """One image on the screen: role "sin" (index k of N, shift_rad), "gray" (bit from 1), "white" or "black".
+    """One image on the screen: role "sin" (index k of N, shift_rad), "gray" (bit from 1), "white"
+    or "black".
 
     `period_mm` is that of further sinusoids, which are coarser than the pattern's own (0).
-    "crossed" shows sinusoids of x and y at once, `index` periods of each, with `shift_rad` and `shift_y_rad`.
+    "crossed" shows sinusoids of x and y at once, `index` periods of each, with `shift_rad` and
+    `shift_y_rad`.
     """
 
     role: str
@@ -315,7 +336,9 @@ class Pattern:
 
     @property
     def name(self) -> str:
-        """The name used for files and Rerun paths: `x_sin_0`, `y_gray_1`, `white`, `x_sin_0_of_61.7mm`."""
+        """The name used for files and Rerun paths: `x_sin_0`, `y_gray_1`, `white`,
+        `x_sin_0_of_61.7mm`.
+        """
         coarser = f"_of_{self.period_mm:g}mm" if self.period_mm else ""
         return f"{self.axis}_{self.role}_{self.index}{coarser}" if self.axis else self.role
 
@@ -326,7 +349,9 @@ Pixels = Levels | NDArray[np.uint16]
 
 @dataclass(frozen=True, slots=True)
 class Frame:
-    """One exposure: `pixels` (height, width) uint8 or uint16, `time_s` the start of exposure on the run's clock."""
+    """One exposure: `pixels` (height, width) uint8 or uint16, `time_s` the start of exposure on the
+    run's clock.
+    """
 
     pixels: Pixels
     time_s: float
@@ -347,7 +372,9 @@ class Camera(Protocol):
     """Takes frames."""
 
     def grab(self, out: Pixels | None = None) -> Frame:
-        """Trigger one exposure and return it, in `out` if the camera supports that. Raises LinkError."""
+        """Trigger one exposure and return it, in `out` if the camera supports that. Raises
+        LinkError.
+        """
 
     def close(self) -> None:
         """Release the camera."""
@@ -372,12 +399,15 @@ class ExposingCamera(Protocol):
         """The frame of the last `expose`. Raises FrameLostError, LinkError."""
 
 
-# Drivers of cameras and displays. They run in the acquisition process, which waits for them: nothing is awaited.
+# Drivers of cameras and displays. They run in the acquisition process, which waits for them:
+# nothing is awaited.
 
 
 @dataclass(frozen=True, slots=True)
 class SensorFormat:
-    """Picture of a camera as configured in `[optics.camera]`; a driver refuses a sensor that gives another one."""
+    """Picture of a camera as configured in `[optics.camera]`; a driver refuses a sensor that gives
+    another one.
+    """
 
     width_px: int
     height_px: int
@@ -403,13 +433,16 @@ class DriverClock:
 
 
 class OpticalDevice(Protocol):
-    """A camera or a display. A camera is a `Camera` or, if its transfer may overlap, an `ExposingCamera` as well."""
+    """A camera or a display. A camera is a `Camera` or, if its transfer may overlap, an
+    `ExposingCamera` as well.
+    """
 
     def open(self) -> DeviceIdentity:
-        """Connect, check the identity, apply the settings and read them back; again after every lost link.
+        """Connect, check the identity, apply the settings and read them back; again after every
+        lost link.
 
-        Raises LinkError (no valid answer; LinkDownError without a connection), DeviceRefusedError (not the configured
-        device, or one that does not accept its settings).
+        Raises LinkError (no valid answer; LinkDownError without a connection), DeviceRefusedError
+        (not the configured device, or one that does not accept its settings).
         """
 
     def close(self) -> None:
@@ -423,7 +456,9 @@ class Display(OpticalDevice, Protocol):
     """A panel or projector that shows pictures pixel by pixel, without scaling or correction."""
 
     def prepare(self, levels: Levels) -> Any:
-        """Convert a picture (height, width) to the form that `show` takes; called once for each pattern."""
+        """Convert a picture (height, width) to the form that `show` takes; called once for each
+        pattern.
+        """
 
     def show(self, picture: Any) -> None:
         """Send a prepared picture to the display; returns once it is queued. Raises LinkError."""

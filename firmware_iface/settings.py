@@ -6,14 +6,18 @@ from pydantic import BaseModel, ConfigDict, Field, model_validator
 
 
 class Section(BaseModel):
-    """A configuration table: immutable, no unknown keys, no NaN or infinity, no `true` in place of a number."""
+    """A configuration table: immutable, no unknown keys, no NaN or infinity, no `true` in place of
+    a number.
+    """
 
     model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
 
     @model_validator(mode="before")
     @classmethod
     def _only_numbers_are_numbers(cls, table: Any) -> Any:
-        """Refuse `true` and "1" for a number, 1 for a switch: pydantic takes them all for what they are not."""
+        """Refuse `true` and "1" for a number, 1 for a switch: pydantic takes them all for what they
+        are not.
+        """
         for name, value in table.items() if isinstance(table, dict) else ():
             field = cls.model_fields.get(name)
             kinds = set() if field is None else _kinds(field.annotation)
@@ -22,18 +26,29 @@ class Section(BaseModel):
             if kinds and _has(value, bool) and not kinds & {bool, Any}:
                 raise ValueError(f"{name}: {str(value).lower()} is neither a number nor a text")
             if _has(value, str) and kinds & {int, float} and not kinds & {str, Any}:
-                raise ValueError(f"{name}: {value!r}: write a number, without quotes, with a decimal point")
+                raise ValueError(
+                    f"{name}: {value!r}: write a number, without quotes, with a decimal point"
+                )
         return table
 
 
 def _has(value: Any, kind: Any) -> bool:
-    return isinstance(value, kind) or (isinstance(value, list | tuple) and any(_has(part, kind) for part in value))
+    return isinstance(value, kind) or (
+        isinstance(value, list | tuple) and any(_has(part, kind) for part in value)
+    )
 
 
 def _kinds(annotation: Any) -> set[Any]:
     """Return the types in an annotation; of a literal, that of its values."""
-    inner = [_kinds(part) if not isinstance(part, int | str) else {type(part)} for part in get_args(annotation)]
-    return {annotation}.union(*inner) if inner or isinstance(annotation, type) or annotation is Any else set()
+    inner = [
+        _kinds(part) if not isinstance(part, int | str) else {type(part)}
+        for part in get_args(annotation)
+    ]
+    return (
+        {annotation}.union(*inner)
+        if inner or isinstance(annotation, type) or annotation is Any
+        else set()
+    )
 
 
 Fraction = Annotated[float, Field(ge=0, le=1)]
@@ -55,9 +70,13 @@ _TIMEOUT = "Longest wait for an answer. Raise it on a slow line or machine."
 Timeout = Annotated[float, Field(gt=0, le=5, description=_TIMEOUT)]
 _BAUD = "Baud rate as stored in the device. Change it if the device was set to another."
 Baud = Annotated[int, Field(ge=300, le=1_000_000, description=_BAUD)]
-_DIRECTION = "Sign of the reading; -1: the laser is behind the mirror. Set it to 1 for a laser in front."
+_DIRECTION = (
+    "Sign of the reading; -1: the laser is behind the mirror. Set it to 1 for a laser in front."
+)
 Direction = Annotated[Literal[-1, 1], Field(description=_DIRECTION)]
-_STEP = "Readings farther than this from both previous ones are rejected. Raise it at low tick rates."
+_STEP = (
+    "Readings farther than this from both previous ones are rejected. Raise it at low tick rates."
+)
 StepMax = Annotated[float, Field(gt=0, le=10_000, description=_STEP)]
 
 
@@ -72,19 +91,28 @@ class Optoncdt1420Config(Section):
     range_mm: Annotated[float, Field(gt=0, le=500)] | None = None
     """Measuring range of the sensor. Set it to refuse a sensor of another range."""
     zero_mm: Distance | None = None
-    """Distance from the start of the range at displacement 0; its middle when absent. Set it to move the zero."""
+    """Distance from the start of the range at displacement 0; its middle when absent. Set it to
+    move the zero.
+    """
     direction: Direction = -1
     step_max_um: StepMax = 50.0
     timeout_s: Timeout = 0.2
-    """Longest wait for an answer, and for a new value after a reading. Raise it on a slow machine."""
+    """Longest wait for an answer, and for a new value after a reading. Raise it on a slow machine.
+    """
 
     @model_validator(mode="after")
     def _rate(self) -> "Optoncdt1420Config":
         rates_khz = (0.25, 0.5, 1.0, 2.0, 4.0)
         if self.rate_khz not in rates_khz:
-            raise ValueError(f"rate_khz = {self.rate_khz:g}: the sensor has {', '.join(f'{r:g}' for r in rates_khz)}")
+            raise ValueError(
+                f"rate_khz = {self.rate_khz:g}: the sensor has "
+                f"{', '.join(f'{r:g}' for r in rates_khz)}"
+            )
         if (busy := 1000 * self.rate_khz * 60 / self.baud) > 0.9:  # six bytes of ten bits a value
-            raise ValueError(f"baud = {self.baud} cannot carry rate_khz = {self.rate_khz:g} (line {busy:.0%} busy)")
+            raise ValueError(
+                f"baud = {self.baud} cannot carry rate_khz = {self.rate_khz:g} (line "
+                f"{busy:.0%} busy)"
+            )
         return self
 
 
@@ -94,9 +122,13 @@ class KeyenceDlRs1aConfig(Section):
     driver: Literal["keyence_dl_rs1a"] = "keyence_dl_rs1a"
     port: Port
     baud: Literal[2400, 4800, 9600, 19_200, 38_400] = 9600
-    """Baud rate as set by its switches; 9600 gives 25 readings per second, 38400 gives 80. Set it to 38400."""
+    """Baud rate as set by its switches; 9600 gives 25 readings per second, 38400 gives 80. Set it
+    to 38400.
+    """
     parity: Literal["N", "E", "O"] = "N"
-    """Parity as set by the switches. Set it to E, with the switches: without it a corrupted digit passes."""
+    """Parity as set by the switches. Set it to E, with the switches: without it a corrupted digit
+    passes.
+    """
     amplifier: Annotated[int, Field(ge=0, le=14)] = 0
     """0 is the main unit, 1 to 14 are expansions. Change it if the head is at an expansion."""
     zero_mm: Distance = 0.0
@@ -113,7 +145,8 @@ class VaisalaPtb330Config(Section):
     port: Port
     baud: Baud = 4800
     period_s: Annotated[float, Field(gt=0, le=60)] = 0.2
-    """Interval between requests; a message takes 80 ms at 4800 baud. Raise it at lower baud rates."""
+    """Interval between requests; a message takes 80 ms at 4800 baud. Raise it at lower baud rates.
+    """
     age_max_s: Annotated[float, Field(gt=0, le=600)] = 3.0
     """Age from which a value is no longer used. Raise it for a slow measurement."""
     timeout_s: Timeout = 0.3
@@ -125,17 +158,22 @@ class Mks937bConfig(Section):
     driver: Literal["mks_937b"] = "mks_937b"
     port: Port
     baud: Literal[9600, 19_200, 38_400, 57_600, 115_200] = 115_200
-    """Baud rate as set in the controller, which is delivered with 9600. Set both to 115200: 9600 takes 30 ms."""
+    """Baud rate as set in the controller, which is delivered with 9600. Set both to 115200: 9600
+    takes 30 ms.
+    """
     parity: Literal["N", "E", "O"] = "N"
     """Parity as set in the controller. Set it to E, with the controller, if that offers it."""
     address: Annotated[int, Field(ge=1, le=253)] = 253
     """Address as set in the controller. Change it if the controller was set to another."""
     channel: Annotated[int, Field(ge=1, le=6)] = 1
-    """Channel of the manometer: 1 and 2 are in slot A, 3 and 4 in B, 5 and 6 in C. Set it as plugged in."""
+    """Channel of the manometer: 1 and 2 are in slot A, 3 and 4 in B, 5 and 6 in C. Set it as
+    plugged in.
+    """
     range_pa: Annotated[float, Field(gt=0, le=1e7)] | None = None
     """Full scale of the manometer. Set it to have the limits checked against it."""
     step_max_pa: Annotated[float, Field(gt=0, le=1e6)] = 50.0
-    """Readings farther than this from both previous ones are rejected. Raise it at low tick rates."""
+    """Readings farther than this from both previous ones are rejected. Raise it at low tick rates.
+    """
     serial: Serial = ""
     timeout_s: Timeout = 0.1
 
@@ -146,7 +184,9 @@ class VentusConfig(Section):
     driver: Literal["ventus"] = "ventus"
     port: Port
     power_max_mw: Annotated[float, Field(gt=0, le=1400)] = 1000.0
-    """Power at full drive; none of these pumps takes more than 1400. Change it to your pump's rating."""
+    """Power at full drive; none of these pumps takes more than 1400. Change it to your pump's
+    rating.
+    """
     timeout_s: Timeout = 0.1
 
 
@@ -183,21 +223,30 @@ class ModbusMapConfig(Section):
     unit_id: UnitId = 1
     timeout_s: Timeout = 0.2
     preset: str = ""
-    """File of firmware_iface/presets with defaults for the keys below. Set it if your device has one."""
+    """File of firmware_iface/presets with defaults for the keys below. Set it if your device has
+    one.
+    """
     function: Literal["holding", "input"] | None = None
     """Kind of register; holding when absent. Set it from the device's manual."""
     type: Literal["u16", "i16", "u32", "i32", "f32"] | None = None
     """Type of the value in the registers; u16 when absent. Set it from the device's manual."""
     word_order: Literal["big", "little"] | None = None
-    """Which word of a 32-bit value comes first; big when absent. Set it from the device's manual."""
+    """Which word of a 32-bit value comes first; big when absent. Set it from the device's manual.
+    """
     address: Word
     """Address of the first register, counted from 0. Set it from the device's manual."""
     raw: tuple[Number, Number] | None = None
-    """Register contents at the two ends of `value`. Set it from the manual, e.g. the counts at 4 and 20 mA."""
+    """Register contents at the two ends of `value`. Set it from the manual, e.g. the counts at 4
+    and 20 mA.
+    """
     value: tuple[Number, Number]
-    """Two values in the role's unit (µm, Pa, degC, fraction), at the contents `raw`. Set it as scaled."""
+    """Two values in the role's unit (µm, Pa, degC, fraction), at the contents `raw`. Set it as
+    scaled.
+    """
     limits: tuple[Number, Number] | None = None
-    """Values outside are refused; the span of `value` when absent. Set it wider for a sensor that exceeds it."""
+    """Values outside are refused; the span of `value` when absent. Set it wider for a sensor that
+    exceeds it.
+    """
     identity_address: Word | None = None
     """Holding register that identifies the device. Set it to refuse any other device."""
     identity_equals: Word | None = None
@@ -214,7 +263,9 @@ class ModbusMapConfig(Section):
 
 
 class ExternalSection(Section):
-    """A device whose driver is a package of its own. Reading a configuration never loads that package."""
+    """A device whose driver is a package of its own. Reading a configuration never loads that
+    package.
+    """
 
     model_config = ConfigDict(extra="allow")
 
@@ -229,7 +280,8 @@ class ExternalSection(Section):
 
 
 class ExternalConfig(ExternalSection):
-    """An instrument whose driver is a package of its own (docs/new-device.md). The driver defines more keys.
+    """An instrument whose driver is a package of its own (docs/new-device.md). The driver defines
+    more keys.
 
     Reading a configuration never loads that package: only opening or emulating the devices does.
     """
@@ -239,12 +291,24 @@ class ExternalConfig(ExternalSection):
 
 
 Driver = Field(discriminator="driver")
-DisplacementDriver = Annotated[Optoncdt1420Config | KeyenceDlRs1aConfig | ModbusMapConfig | ExternalConfig, Driver]
+DisplacementDriver = Annotated[
+    Optoncdt1420Config | KeyenceDlRs1aConfig | ModbusMapConfig | ExternalConfig, Driver
+]
 PumpDriver = Annotated[
-    BronkhorstModbusConfig | BronkhorstProparConfig | VentusConfig | ModbusMapConfig | ExternalConfig, Driver
+    BronkhorstModbusConfig
+    | BronkhorstProparConfig
+    | VentusConfig
+    | ModbusMapConfig
+    | ExternalConfig,
+    Driver,
 ]
 PressureDriver = Annotated[
-    BronkhorstModbusConfig | BronkhorstProparConfig | Mks937bConfig | ModbusMapConfig | ExternalConfig, Driver
+    BronkhorstModbusConfig
+    | BronkhorstProparConfig
+    | Mks937bConfig
+    | ModbusMapConfig
+    | ExternalConfig,
+    Driver,
 ]
 BarometerDriver = Annotated[VaisalaPtb330Config | ModbusMapConfig | ExternalConfig, Driver]
 ValueDriver = Annotated[ModbusMapConfig | ExternalConfig, Driver]
@@ -269,8 +333,8 @@ class InterlockConfig(Section):
     text: Annotated[str, Field(min_length=1, max_length=200)]
     """For people, while the circuit is open. Set it to what is open and what to do."""
     safe_level: Literal["ramp_down", "pump_off", "vent"] = "pump_off"
-    """Safe level that an open circuit, or a lost signal, enters. Set it to vent where pressure in the mirror is the
-    danger, to ramp_down where a sudden stop is."""
+    """Safe level that an open circuit, or a lost signal, enters. Set it to vent where pressure in
+    the mirror is the danger, to ramp_down where a sudden stop is."""
 
     @model_validator(mode="after")
     def _one_line_of_text(self) -> "InterlockConfig":
@@ -293,7 +357,9 @@ class PolledInterlockConfig(InterlockConfig):
     period_s: Annotated[float, Field(ge=0.01, le=10)] = 0.1
     """Interval between requests. Lower it for a contact that may open for a moment only."""
     age_max_s: Annotated[float, Field(ge=0.05, le=30)] = 0.5
-    """Age from which an answer no longer counts: the circuit is then open. Raise it for a slow line."""
+    """Age from which an answer no longer counts: the circuit is then open. Raise it for a slow
+    line.
+    """
 
 
 class ModbusInputConfig(PolledInterlockConfig):
@@ -304,7 +370,9 @@ class ModbusInputConfig(PolledInterlockConfig):
     unit_id: UnitId = 1
     timeout_s: Timeout = 0.2
     function: Literal["discrete", "coil"] = "discrete"
-    """Kind of bit. Set it to coil for a device without discrete inputs: a coil keeps what was last written."""
+    """Kind of bit. Set it to coil for a device without discrete inputs: a coil keeps what was last
+    written.
+    """
     address: Word
     """Address of the bit, counted from 0. Set it from the device's manual."""
 
@@ -318,9 +386,12 @@ class GpioLineConfig(PolledInterlockConfig):
     line: Annotated[int, Field(ge=0, le=4095)]
     """Number of the line on its chip. Set it as wired; `gpioinfo` lists names and numbers."""
     wiring: Literal["to_ground", "to_supply"] = "to_ground"
-    """What the closed contact connects the line to. Set it as wired; a cut wire then reads as open."""
+    """What the closed contact connects the line to. Set it as wired; a cut wire then reads as open.
+    """
     pull: Literal["internal", "external"] = "internal"
-    """Resistor that defines the level of an open contact. Set it to external if the chip has none of its own."""
+    """Resistor that defines the level of an open contact. Set it to external if the chip has none
+    of its own.
+    """
 
 
 InterlockDriver = Annotated[BoardInputConfig | ModbusInputConfig | GpioLineConfig, Driver]
@@ -350,10 +421,12 @@ class AravisCameraConfig(CameraSection):
 
     driver: Literal["aravis"] = "aravis"
     camera: str = ""
-    """Name as `devices` lists it, or its address; empty: the first one found. Set it if there are several."""
-    pixel_format: Literal["Mono8", "Mono10", "Mono12", "Mono16", "BayerRG8", "BayerGR8", "BayerGB8", "BayerBG8"] = (
-        "Mono8"
-    )
+    """Name as `devices` lists it, or its address; empty: the first one found. Set it if there are
+    several.
+    """
+    pixel_format: Literal[
+        "Mono8", "Mono10", "Mono12", "Mono16", "BayerRG8", "BayerGR8", "BayerGB8", "BayerBG8"
+    ] = "Mono8"
     """Format of a pixel. Bayer needs no demosaicing: each pixel's phase is independent of its gain.
     Change it with `optics.camera.bits`, for a colour camera or for more depth."""
     exposure_ms: Annotated[float, Field(gt=0, le=10_000)] = 20.0
@@ -361,7 +434,9 @@ class AravisCameraConfig(CameraSection):
     gain_db: Annotated[float, Field(ge=0, le=48)] = 0.0
     """Gain of the sensor. Raise it only if the exposure cannot be longer: it adds noise."""
     packet_bytes: Annotated[int, Field(ge=0, le=65_000)] = 0
-    """GigE Vision: size of a packet; 0: negotiated by camera and network. Set it to 8000 with jumbo frames."""
+    """GigE Vision: size of a packet; 0: negotiated by camera and network. Set it to 8000 with jumbo
+    frames.
+    """
     timeout_s: Annotated[float, Field(gt=0, le=60)] = 1.0
     """Longest wait for a frame, from the end of its exposure. Raise it on a slow network."""
 
@@ -381,11 +456,16 @@ class UvcCameraConfig(CameraSection):
 
     driver: Literal["uvc"] = "uvc"
     port: str = "0"
-    """Its number, or its path such as /dev/video0. Set it to a path below /dev/v4l/by-id, which stays the same."""
+    """Its number, or its path such as /dev/video0. Set it to a path below /dev/v4l/by-id, which
+    stays the same.
+    """
     exposure: Annotated[float, Field(ge=0, le=1e6)] = 0.0
-    """Exposure in the camera's own unit, often 0.1 ms; 0 leaves it. Set it so that white does not saturate."""
+    """Exposure in the camera's own unit, often 0.1 ms; 0 leaves it. Set it so that white does not
+    saturate.
+    """
     gain: Annotated[float, Field(ge=0, le=1e6)] = 0.0
-    """Gain in the camera's own unit; 0 leaves it. Raise it only if the exposure cannot be longer."""
+    """Gain in the camera's own unit; 0 leaves it. Raise it only if the exposure cannot be longer.
+    """
 
     @property
     def frame_bits(self) -> int:
@@ -407,13 +487,15 @@ class FolderCameraConfig(CameraSection):
 
 
 class ExternalCameraConfig(CameraSection, ExternalSection):
-    """A camera whose driver is a package of its own (docs/new-camera.md). The driver defines more keys.
+    """A camera whose driver is a package of its own (docs/new-camera.md). The driver defines more
+    keys.
 
     Reading a configuration never loads that package: only opening or emulating the camera does.
     """
 
     exposure_ms: Annotated[float, Field(gt=0, le=10_000)] | None = None
-    """Exposure of a frame; absent: the driver does not state it. Set it if the driver has this key."""
+    """Exposure of a frame; absent: the driver does not state it. Set it if the driver has this key.
+    """
 
     @property
     def frame_exposure_s(self) -> float | None:
@@ -422,7 +504,9 @@ class ExternalCameraConfig(CameraSection, ExternalSection):
 
 
 class ScreenSection(Section):
-    """A screen's table: what the program must know of its pixels and its light, whichever the driver."""
+    """A screen's table: what the program must know of its pixels and its light, whichever the
+    driver.
+    """
 
     width_px: Annotated[int, Field(ge=16, le=16_384)]
     """Columns of the panel. Set it to the panel's own; `devices` lists them."""
@@ -431,11 +515,16 @@ class ScreenSection(Section):
     pixel_mm: Annotated[float, Field(gt=0.01, le=10)]
     """Pitch of its pixels. Set it from a rule laid over 1000 pixels."""
     centre_px: tuple[Number, Number] | None = None
-    """(column, row) of O'; the screen's middle when absent. Set it if the pattern must be shifted."""
+    """(column, row) of O'; the screen's middle when absent. Set it if the pattern must be shifted.
+    """
     settle_ms: Annotated[float, Field(ge=0, le=5000)] | None = None
-    """Time until a new picture stands; measured at the start when absent. Set it to save that measurement."""
+    """Time until a new picture stands; measured at the start when absent. Set it to save that
+    measurement.
+    """
     linearise: bool = True
-    """Measure the display's response at the start and correct it. Set it to false for a linear display."""
+    """Measure the display's response at the start and correct it. Set it to false for a linear
+    display.
+    """
     self_test: bool = True
     """Test exposure and panel at the start. Set it to false to start sooner."""
 
@@ -449,11 +538,14 @@ class PygameScreenConfig(ScreenSection):
 
 
 class ExternalScreenConfig(ScreenSection, ExternalSection):
-    """A screen whose driver is a package of its own (docs/new-camera.md). The driver defines more keys.
+    """A screen whose driver is a package of its own (docs/new-camera.md). The driver defines more
+    keys.
 
     Reading a configuration never loads that package: only opening or emulating the screen does.
     """
 
 
-CameraConfig = Annotated[AravisCameraConfig | UvcCameraConfig | FolderCameraConfig | ExternalCameraConfig, Driver]
+CameraConfig = Annotated[
+    AravisCameraConfig | UvcCameraConfig | FolderCameraConfig | ExternalCameraConfig, Driver
+]
 ScreenConfig = Annotated[PygameScreenConfig | ExternalScreenConfig, Driver]

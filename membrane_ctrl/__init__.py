@@ -1,4 +1,6 @@
-"""Holds a pneumatic membrane mirror to the micrometre and measures its optical figure while it does so."""
+"""Holds a pneumatic membrane mirror to the micrometre and measures its optical figure while it does
+so.
+"""
 
 import contextlib
 import os
@@ -6,7 +8,8 @@ from pathlib import Path
 
 __version__ = "0.1.0"
 
-# Compiled kernels beside the modules would outlive `pip uninstall`. Without a home directory they stay there.
+# Compiled kernels beside the modules would outlive `pip uninstall`. Without a home directory they
+# stay there.
 with contextlib.suppress(RuntimeError):
     _CACHES = Path(os.environ.get("XDG_CACHE_HOME") or "~/.cache").expanduser()
     os.environ.setdefault("NUMBA_CACHE_DIR", str(_CACHES / "membrane-ctrl"))

@@ -9,7 +9,8 @@ import sys
 
 def main() -> None:
     """Run the command line and exit with its code."""
-    # Matrices are small: a second thread of OpenBLAS would only wait, for a third of the CPU time of `measure`
+    # Matrices are small: a second thread of OpenBLAS would only wait, for a third of the CPU time
+    # of `measure`
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
     from membrane_ctrl.cli import run
 

@@ -21,7 +21,8 @@ from steady_loop import SteadyLoop
 from membrane_ctrl.instruments import lock_store
 from tests.support.undrawn import undrawn_figures
 
-# No test sees or leaves locks on this machine's devices, nor does a program that a module's fixture starts.
+# No test sees or leaves locks on this machine's devices, nor does a program that a module's fixture
+# starts.
 _LOCKS_FOLDER = tempfile.mkdtemp(prefix="membrane-locks-")
 _NUMBERS = itertools.count()
 os.environ[lock_store.VARIABLE] = _LOCKS_FOLDER
@@ -36,7 +37,9 @@ def pytest_asyncio_loop_factories() -> dict[str, Callable[[], SteadyLoop]]:
 
 @pytest.hookimpl(wrapper=True)
 def pytest_collection() -> Generator[None, object, object]:
-    """What is imported and collected stays to the end: the collector of garbage need not look at it."""
+    """What is imported and collected stays to the end: the collector of garbage need not look at
+    it.
+    """
     gc.disable()
     collected = yield
     gc.freeze()
@@ -52,13 +55,17 @@ def pytest_sessionfinish() -> None:
 async def leaves_no_task() -> AsyncIterator[None]:
     before = asyncio.all_tasks()
     yield
-    left = {task for task in asyncio.all_tasks() - before if not task.done()} - {asyncio.current_task()}
+    left = {task for task in asyncio.all_tasks() - before if not task.done()} - {
+        asyncio.current_task()
+    }
     assert not left, f"left running: {left}"
 
 
 @pytest.fixture
 def signals_are_heeded() -> Iterator[None]:
-    """Started with `nohup`, or by a script's `&`, a test ignores signals, and so would its children."""
+    """Started with `nohup`, or by a script's `&`, a test ignores signals, and so would its
+    children.
+    """
     before = {number: signal.getsignal(number) for number in (signal.SIGHUP, signal.SIGINT)}
     signal.signal(signal.SIGHUP, signal.SIG_DFL)
     signal.signal(signal.SIGINT, signal.default_int_handler)
@@ -77,7 +84,9 @@ def undrawn() -> Iterator[None]:
 @pytest.fixture(autouse=True)
 def own_locks() -> Iterator[None]:
     """The locks of a test are its own."""
-    folder = Path(_LOCKS_FOLDER, str(next(_NUMBERS)))  # mktemp would list the folders of all tests before
+    folder = Path(
+        _LOCKS_FOLDER, str(next(_NUMBERS))
+    )  # mktemp would list the folders of all tests before
     folder.mkdir()
     os.environ[lock_store.VARIABLE] = str(folder)
     yield

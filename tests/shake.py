@@ -1,7 +1,8 @@
 """Runs a command on a busy machine that pauses now and then, as a virtual one does: `make shake`.
 
-`python tests/shake.py [--every A B] [--still A B] [--hogs N] [--seed N] COMMAND...` stops all processes of the
-command for `still` seconds at random moments, `every` so many seconds. The clock goes on meanwhile.
+`python tests/shake.py [--every A B] [--still A B] [--hogs N] [--seed N] COMMAND...` stops all
+processes of the command for `still` seconds at random moments, `every` so many seconds. The clock
+goes on meanwhile.
 """
 
 from __future__ import annotations

@@ -1,4 +1,6 @@
-"""Files and functions that docs/ names exist, and the counts of files in docs/code-flow.md are right."""
+"""Files and functions that docs/ names exist, and the counts of files in docs/code-flow.md are
+right.
+"""
 
 import ast
 import re
@@ -16,7 +18,9 @@ STEP = re.compile(r"^\| (\d+) \| `([^`]+)` \| (.+?) \|", re.MULTILINE)
 
 def path_of(name: str) -> Path:
     """Where a file of the page is."""
-    return ROOT / (name if name.startswith(("firmware_iface/", "tuning/")) else f"membrane_ctrl/{name}")
+    return ROOT / (
+        name if name.startswith(("firmware_iface/", "tuning/")) else f"membrane_ctrl/{name}"
+    )
 
 
 def defined_in(path: Path) -> set[str]:
@@ -26,7 +30,9 @@ def defined_in(path: Path) -> set[str]:
         if isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef | ast.ClassDef):
             found.add(node.name)
         if isinstance(node, ast.ClassDef):
-            methods = (n for n in node.body if isinstance(n, ast.FunctionDef | ast.AsyncFunctionDef))
+            methods = (
+                n for n in node.body if isinstance(n, ast.FunctionDef | ast.AsyncFunctionDef)
+            )
             found.update(f"{node.name}.{method.name}" for method in methods)
     return found
 

@@ -25,7 +25,9 @@ CONFTEST = Path(__file__).with_name("conftest.py").read_text(encoding="utf-8")
 )
 def test_what_is_left_behind_fails_the_test(pytester: pytest.Pytester, body: str) -> None:
     pytester.makeconftest(CONFTEST)
-    pytester.makeini("[pytest]\nasyncio_mode = auto\nasyncio_default_fixture_loop_scope = function\n")
+    pytester.makeini(
+        "[pytest]\nasyncio_mode = auto\nasyncio_default_fixture_loop_scope = function\n"
+    )
     pytester.makepyfile(body)
     result = pytester.runpytest_inprocess("-p", "no:cacheprovider", "-W", "ignore")
     result.assert_outcomes(passed=1, errors=1)

@@ -1,4 +1,6 @@
-"""The examples of docs/data.md run, where runs and results are, and give the figures of `report`."""
+"""The examples of docs/data.md run, where runs and results are,
+and give the figures of `report`.
+"""
 
 from __future__ import annotations
 
@@ -37,7 +39,10 @@ def lab(tmp_path_factory: pytest.TempPathFactory) -> Path:
     (folder / "sets" / "0000").rename(folder / "set")
     result = folder / "set" / "result"
     assert run(["measure", str(folder / "set"), "--no-pictures"]) == 0
-    assert run(["export-figure", str(result), "--format", "fits", "--remove", "piston,tilt,power"]) == 0
+    assert (
+        run(["export-figure", str(result), "--format", "fits", "--remove", "piston,tilt,power"])
+        == 0
+    )
     return folder
 
 
@@ -45,7 +50,10 @@ def lab(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def reported(lab: Path) -> Figures:
     """The figures of `report`."""
     tables = [report_table(analyse(open_run(lab / "logs" / name))) for name in NIGHTS]
-    return {table["run"]: (table["ticks"], table["ticks_settled"], table["std_single_ticks_um"]) for table in tables}
+    return {
+        table["run"]: (table["ticks"], table["ticks_settled"], table["std_single_ticks_um"])
+        for table in tables
+    }
 
 
 def example_with(words: str) -> str:
@@ -71,24 +79,38 @@ def check_figures(rows: list[Mapping[str, Any]], reported: Figures) -> None:
 
 
 def test_report_has_figures_to_compare_with(reported: Figures) -> None:
-    assert all(0 < settled < ticks and 0.1 < std_um < 10 for ticks, settled, std_um in reported.values())
+    assert all(
+        0 < settled < ticks and 0.1 < std_um < 10 for ticks, settled, std_um in reported.values()
+    )
 
 
 @pytest.mark.parametrize("library", ["duckdb", "polars", "pandas"])
 def test_a_library_gives_the_figures_of_report(
     library: str, lab: Path, reported: Figures, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    words = {"duckdb": "import duckdb", "polars": "import polars", "pandas": "import pandas"}[library]
+    words = {"duckdb": "import duckdb", "polars": "import polars", "pandas": "import pandas"}[
+        library
+    ]
     table = executed(example_with(words), lab, monkeypatch)["table"]
     check_figures(table.to_dicts() if library == "polars" else table.to_dict("records"), reported)
 
 
-def test_a_cluster_of_two_workers_gives_the_figures_of_report(lab: Path, reported: Figures, tmp_path: Path) -> None:
+def test_a_cluster_of_two_workers_gives_the_figures_of_report(
+    lab: Path, reported: Figures, tmp_path: Path
+) -> None:
     """As a script of its own: workers import the script that starts them."""
-    pandas = example_with("import pandas").replace("table = ", "alone = ").replace("print(table)", "")
-    script = pandas + example_with("dask.distributed") + "    table.to_json('dask.json', double_precision=15)\n"
+    pandas = (
+        example_with("import pandas").replace("table = ", "alone = ").replace("print(table)", "")
+    )
+    script = (
+        pandas
+        + example_with("dask.distributed")
+        + "    table.to_json('dask.json', double_precision=15)\n"
+    )
     (tmp_path / "script.py").write_text(script)
-    subprocess.run([sys.executable, tmp_path / "script.py"], check=True, cwd=lab, env=os.environ | PATIENT)
+    subprocess.run(
+        [sys.executable, tmp_path / "script.py"], check=True, cwd=lab, env=os.environ | PATIENT
+    )
     columns = json.loads((lab / "dask.json").read_text())
     rows = [{name: values[number] for name, values in columns.items()} for number in columns["run"]]
     check_figures(rows, reported)

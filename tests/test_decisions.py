@@ -25,7 +25,9 @@ def test_a_record_has_context_decision_and_consequences(record: Path) -> None:
 
 def test_the_index_lists_every_record_once_in_order_under_its_number() -> None:
     index = (ROOT / "docs" / "decisions" / "INDEX.md").read_text()
-    assert re.findall(r"\[(\d+)\]\(([^)]*)\)", index) == [(record.name[:2], record.name) for record in RECORDS]
+    assert re.findall(r"\[(\d+)\]\(([^)]*)\)", index) == [
+        (record.name[:2], record.name) for record in RECORDS
+    ]
     assert len(NUMBERS) == len(RECORDS)
 
 

@@ -1,4 +1,6 @@
-"""Every configuration in membrane_ctrl/examples/ passes `check` against emulators of the devices that it names."""
+"""Every configuration in membrane_ctrl/examples/ passes `check` against emulators of the devices
+that it names.
+"""
 
 from __future__ import annotations
 
@@ -31,14 +33,18 @@ class StillPlant:
 
     def sample(self) -> BoardSample:
         self._counter += 1
-        return BoardSample(12.5, 0, 600.0, 101_325.0, 22.5, 23.0, self._counter, self._counter / 200)
+        return BoardSample(
+            12.5, 0, 600.0, 101_325.0, 22.5, 23.0, self._counter, self._counter / 200
+        )
 
     def actuate(self, pump_fraction: float, vent_fraction: float) -> None:
         self.outputs.append((pump_fraction, vent_fraction))
 
 
 def test_there_are_examples() -> None:
-    assert {"paper-bench", "all-serial", "all-modbus-tcp", "twin"} <= {path.stem for path in EXAMPLES}
+    assert {"paper-bench", "all-serial", "all-modbus-tcp", "twin"} <= {
+        path.stem for path in EXAMPLES
+    }
 
 
 def test_an_example_is_printed_as_it_is(capsys: pytest.CaptureFixture[str]) -> None:
@@ -56,7 +62,9 @@ def _without_optics(devices: DevicesConfig) -> DevicesConfig:
 
 
 @pytest.mark.parametrize("example", EXAMPLES, ids=lambda path: path.stem)
-async def test_the_example_passes_check(example: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+async def test_the_example_passes_check(
+    example: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     config = load(example, Config)
     plant = StillPlant()
     if config.devices is None:
@@ -64,7 +72,9 @@ async def test_the_example_passes_check(example: Path, tmp_path: Path, capsys: p
         return
     lab = Lab(plant, config.devices)
     try:
-        devices = _without_optics(await lab.start())  # those: tests/acquisition/test_example_optics.py
+        devices = _without_optics(
+            await lab.start()
+        )  # those: tests/acquisition/test_example_optics.py
         path = tmp_path / "moved.toml"
         path.write_text(dump(config.model_copy(update={"devices": devices})))
         with patient_check():
@@ -112,7 +122,10 @@ async def test_check_names_every_broken_device_and_the_remedy(
             '[devices.displacement]\ndriver = "optoncdt1421"\nport = "/dev/x"\n',
             ["devices.displacement", "optoncdt1420"],
         ),
-        ('[devices.displacement]\ndriver = "optoncdt1420"\nprot = "/dev/x"\n', ["devices.displacement", "port"]),
+        (
+            '[devices.displacement]\ndriver = "optoncdt1420"\nprot = "/dev/x"\n',
+            ["devices.displacement", "port"],
+        ),
         (
             '[devices]\nboard = "tcp://h"\n[devices.pump]\ndriver = "ventus"\nport = "/dev/x"\n',
             ["not board and pump"],
@@ -120,14 +133,18 @@ async def test_check_names_every_broken_device_and_the_remedy(
         ('[devices.pump]\ndriver = "ventus"\nport = "/dev/x"\n', ["no device for displacement"]),
         (
             '[devices.displacement]\ndriver = "optoncdt1420"\nport = "/dev/x"\n'
-            '[devices.pump]\ndriver = "bronkhorst_modbus"\nlink = "rtu:///dev/x?baud=19200"\nunit_id = 3\n'
-            '[devices.gauge_pressure]\ndriver = "bronkhorst_modbus"\nlink = "rtu:///dev/y"\nunit_id = 5\n',
+            '[devices.pump]\ndriver = "bronkhorst_modbus"\nlink = '
+            '"rtu:///dev/x?baud=19200"\nunit_id = 3\n'
+            '[devices.gauge_pressure]\ndriver = "bronkhorst_modbus"\nlink = '
+            '"rtu:///dev/y"\nunit_id = 5\n',
             ["displacement and pump name the same port, /dev/x"],
         ),
         (
             '[devices.displacement]\ndriver = "optoncdt1420"\nport = "/dev/x"\n'
-            '[devices.pump]\ndriver = "bronkhorst_modbus"\nlink = "rtu:///dev/y?baud=19200"\nunit_id = 3\n'
-            '[devices.gauge_pressure]\ndriver = "bronkhorst_modbus"\nlink = "rtu:///dev/y"\nunit_id = 5\n',
+            '[devices.pump]\ndriver = "bronkhorst_modbus"\nlink = '
+            '"rtu:///dev/y?baud=19200"\nunit_id = 3\n'
+            '[devices.gauge_pressure]\ndriver = "bronkhorst_modbus"\nlink = '
+            '"rtu:///dev/y"\nunit_id = 5\n',
             ["pump and gauge_pressure name the same port, /dev/y"],
         ),
         ("[devices]\n", ["name the pump board"]),
@@ -160,7 +177,11 @@ def test_a_preset_refuses_what_its_device_does_not_have(
     assert config.devices.pump is not None
     pump = config.devices.pump.model_copy(update=change)
     path = tmp_path / "lab.toml"
-    path.write_text(dump(config.model_copy(update={"devices": config.devices.model_copy(update={"pump": pump})})))
+    path.write_text(
+        dump(
+            config.model_copy(update={"devices": config.devices.model_copy(update={"pump": pump})})
+        )
+    )
     assert run(["check", str(path)]) == 2
     (line,) = capsys.readouterr().err.splitlines()
     assert words in line
@@ -179,7 +200,12 @@ def test_the_dashboard_asks_for_metrics_that_exist() -> None:
         assert names, expression
         assert names <= served, expression
     places = [panel["gridPos"] for panel in panels]
-    cells = [(x, y) for p in places for x in range(p["x"], p["x"] + p["w"]) for y in range(p["y"], p["y"] + p["h"])]
+    cells = [
+        (x, y)
+        for p in places
+        for x in range(p["x"], p["x"] + p["w"])
+        for y in range(p["y"], p["y"] + p["h"])
+    ]
     assert len(set(cells)) == len(cells), "no panel covers another"
     assert max(x for x, _ in cells) < 24
     assert len({panel["id"] for panel in panels}) == len(panels)

@@ -1,4 +1,6 @@
-"""Who may import whom (docs/architecture.md). A broken rule here means that the design has slipped."""
+"""Who may import whom (docs/architecture.md). A broken rule here
+means that the design has slipped.
+"""
 
 from __future__ import annotations
 
@@ -24,14 +26,29 @@ IO = {
     "pymodbus",
 }
 PLAIN_DATA = {"membrane_ctrl.config", "membrane_ctrl.model"}
-NOT_PLAIN = {"membrane_ctrl.model.files", "membrane_ctrl.model.terminal", "membrane_ctrl.config.toml_file"}  # I/O
+NOT_PLAIN = {
+    "membrane_ctrl.model.files",
+    "membrane_ctrl.model.terminal",
+    "membrane_ctrl.config.toml_file",
+}  # I/O
 
-# Each room with its floor: it imports from lower floors only. A new room is entered here and in docs/architecture.md.
+# Each room with its floor: it imports from lower floors only. A new room is entered here and in
+# docs/architecture.md.
 FLOORS = {
     1: {"firmware_iface", "membrane_ctrl/__init__", "membrane_ctrl/model"},
     2: {"membrane_ctrl/config"},
-    3: {"membrane_ctrl/control", "membrane_ctrl/instruments", "membrane_ctrl/metrology", "membrane_ctrl/processes"},
-    4: {"membrane_ctrl/alarms", "membrane_ctrl/controller", "membrane_ctrl/geometry", "membrane_ctrl/sim"},
+    3: {
+        "membrane_ctrl/control",
+        "membrane_ctrl/instruments",
+        "membrane_ctrl/metrology",
+        "membrane_ctrl/processes",
+    },
+    4: {
+        "membrane_ctrl/alarms",
+        "membrane_ctrl/controller",
+        "membrane_ctrl/geometry",
+        "membrane_ctrl/sim",
+    },
     5: {"membrane_ctrl/control_port", "membrane_ctrl/measure", "membrane_ctrl/run_files"},
     6: {
         "membrane_ctrl/acquisition",
@@ -40,7 +57,12 @@ FLOORS = {
         "membrane_ctrl/replay",
         "membrane_ctrl/sessions",
     },
-    7: {"membrane_ctrl/calibration", "membrane_ctrl/commissioning", "membrane_ctrl/hold", "membrane_ctrl/review"},
+    7: {
+        "membrane_ctrl/calibration",
+        "membrane_ctrl/commissioning",
+        "membrane_ctrl/hold",
+        "membrane_ctrl/review",
+    },
     8: {"membrane_ctrl/cli", "membrane_ctrl/web", "tuning"},
     9: {"membrane_ctrl/__main__", "membrane_ctrl/doors"},
 }
@@ -65,14 +87,20 @@ def imports_of(path: Path) -> set[str]:
 def files_of(*folders: str) -> list[Path]:
     """Python files under the folders (or the file itself)."""
     paths = [ROOT / folder for folder in folders]
-    files = [file for path in paths for file in ([path] if path.suffix else sorted(path.rglob("*.py")))]
+    files = [
+        file for path in paths for file in ([path] if path.suffix else sorted(path.rglob("*.py")))
+    ]
     assert files, folders
     return files
 
 
 def ours(names: set[str]) -> set[str]:
     """Those of `names` that are this project's."""
-    return {name for name in names if name.split(".")[0] in {"membrane_ctrl", "firmware_iface", "tuning"}}
+    return {
+        name
+        for name in names
+        if name.split(".")[0] in {"membrane_ctrl", "firmware_iface", "tuning"}
+    }
 
 
 def allowed(module: str, prefixes: set[str]) -> bool:
@@ -94,7 +122,9 @@ def test_a_circle_is_seen() -> None:
 
 def test_a_class_name_means_one_thing() -> None:
     trees = (tree_of(file) for file in files_of(*TOPS))
-    names = Counter(node.name for tree in trees for node in tree.body if isinstance(node, ast.ClassDef))
+    names = Counter(
+        node.name for tree in trees for node in tree.body if isinstance(node, ast.ClassDef)
+    )
     assert [name for name, count in names.items() if count > 1] == []
 
 
@@ -123,7 +153,9 @@ def test_the_tick_is_pure(file: Path) -> None:
 
 def test_safety_knows_only_plain_data() -> None:
     (file,) = files_of("membrane_ctrl/controller/safety.py")
-    assert not {m for m in ours(imports_of(file)) if not allowed(m, {"firmware_iface.roles"} | PLAIN_DATA)}
+    assert not {
+        m for m in ours(imports_of(file)) if not allowed(m, {"firmware_iface.roles"} | PLAIN_DATA)
+    }
 
 
 @pytest.mark.parametrize("file", files_of("membrane_ctrl/sim"), ids=str)
@@ -132,7 +164,9 @@ def test_the_twin_shares_nothing_with_the_inverse(file: Path) -> None:
 
 
 def modules_reached(start: str) -> set[str]:
-    """All modules of ours that importing `start` pulls in at import time (imports inside functions are not)."""
+    """All modules of ours that importing `start` pulls in at import time (imports inside functions
+    are not).
+    """
     known = modules()
     seen: set[str] = set()
     todo = [start]
@@ -142,22 +176,41 @@ def modules_reached(start: str) -> set[str]:
             continue
         seen.add(name)
         top = tree_of(known[name].path).body
-        plain = ast.Module([node for node in top if isinstance(node, ast.Import | ast.ImportFrom)], [])
-        todo += [target for full in imported(plain) if (target := module_of(full, frozenset(known)))]
+        plain = ast.Module(
+            [node for node in top if isinstance(node, ast.Import | ast.ImportFrom)], []
+        )
+        todo += [
+            target for full in imported(plain) if (target := module_of(full, frozenset(known)))
+        ]
     return seen
 
 
 def test_the_control_process_loads_no_image_code_and_no_rerun() -> None:
     """Nothing that could stall a tick is even imported."""
     reached = modules_reached("membrane_ctrl.hold.supervisor")
-    heavy = {"membrane_ctrl.recorder", "membrane_ctrl.acquisition", "membrane_ctrl.metrology", "membrane_ctrl.sim"}
+    heavy = {
+        "membrane_ctrl.recorder",
+        "membrane_ctrl.acquisition",
+        "membrane_ctrl.metrology",
+        "membrane_ctrl.sim",
+    }
     assert not {m for m in reached if allowed(m, heavy)}
 
 
-# What runs code, or makes arbitrary objects, from bytes. Between this program's own parent and children
-# `multiprocessing` pickles by itself (what a child is given, what it reports): neither a file nor a name that a
-# stranger could give leads there.
-MAKES_OBJECTS = {"pickle", "_pickle", "marshal", "shelve", "dill", "cloudpickle", "joblib", "yaml", "jsonpickle"}
+# What runs code, or makes arbitrary objects, from bytes. Between this program's own parent and
+# children `multiprocessing` pickles by itself (what a child is given, what it reports): neither a
+# file nor a name that a stranger could give leads there.
+MAKES_OBJECTS = {
+    "pickle",
+    "_pickle",
+    "marshal",
+    "shelve",
+    "dill",
+    "cloudpickle",
+    "joblib",
+    "yaml",
+    "jsonpickle",
+}
 RUNS_CODE = {"eval", "exec", "compile", "__import__", "execfile"}
 
 

@@ -26,7 +26,9 @@ def test_a_notebook_shows_what_is_stored_in_it(name: str, tmp_path: Path) -> Non
     said, again = text_of(stored), text_of(fresh)
     assert _NUMBER.sub("#", again).split() == _NUMBER.sub("#", said).split()
     expected = [float(number) for number in _NUMBER.findall(said)]
-    assert [float(number) for number in _NUMBER.findall(again)] == pytest.approx(expected, rel=0.1, abs=0.02)
+    assert [float(number) for number in _NUMBER.findall(again)] == pytest.approx(
+        expected, rel=0.1, abs=0.02
+    )
     assert _pictures(fresh) == _pictures(stored) >= 1
 
 

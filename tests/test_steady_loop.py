@@ -42,7 +42,9 @@ async def test_a_silent_device_is_late_after_its_time() -> None:
     assert time.monotonic() - begin_s >= 0.05
 
 
-def test_a_wait_in_which_the_machine_stood_still_is_no_time(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_wait_in_which_the_machine_stood_still_is_no_time(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     wait = selectors.DefaultSelector.select
 
     def stopped(selector: selectors.BaseSelector, timeout: float | None = None) -> object:

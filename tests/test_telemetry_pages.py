@@ -18,7 +18,9 @@ def test_the_committed_files_are_fresh(capsys: pytest.CaptureFixture[str]) -> No
 def test_every_column_has_a_row_on_the_page() -> None:
     page = telemetry_pages.telemetry_page()
     for each in COLUMNS.values():
-        assert page.count(f"| `{each.name}` | {each.unit} | {each.label} | {each.description} |") == 1
+        assert (
+            page.count(f"| `{each.name}` | {each.unit} | {each.label} | {each.description} |") == 1
+        )
 
 
 def test_every_published_column_is_in_the_dashboard() -> None:

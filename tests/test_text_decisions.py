@@ -16,7 +16,11 @@ def expressions_in(source: str) -> list[str]:
 
 
 def test_the_product_takes_no_decision_on_a_text() -> None:
-    found = [f"{each.path}:{each.line}: {each.expression}" for each in decisions() if each.key not in EXCEPTIONS]
+    found = [
+        f"{each.path}:{each.line}: {each.expression}"
+        for each in decisions()
+        if each.key not in EXCEPTIONS
+    ]
     assert found == []
 
 
@@ -59,7 +63,10 @@ def test_a_caught_exception_as_text_is_found_wherever_its_words_decide() -> None
         if "words" in str(number):
             act()
     """
-    assert expressions_in(source) == ["str(problem_of_act).startswith('faults')", "MAP in str(problem_of_act)"]
+    assert expressions_in(source) == [
+        "str(problem_of_act).startswith('faults')",
+        "MAP in str(problem_of_act)",
+    ]
 
 
 @pytest.mark.parametrize(
@@ -101,7 +108,9 @@ def test_a_container_with_such_a_name_is_no_text(source: str) -> None:
 
 @pytest.mark.parametrize("annotation", ["str", "str | None", "Any", "object"])
 def test_an_annotation_that_allows_a_text_keeps_it_one(annotation: str) -> None:
-    assert expressions_in(f'def f(why: {annotation}) -> bool:\n    return "apple" in why') == ["'apple' in why"]
+    assert expressions_in(f'def f(why: {annotation}) -> bool:\n    return "apple" in why') == [
+        "'apple' in why"
+    ]
 
 
 def test_a_decision_names_its_place() -> None:

@@ -34,10 +34,21 @@ duration_s: str = open_run("logs/last").utc(0.0)
 
 
 def run(*words: object, cwd: Path, **environment: str) -> str:
-    """Output of a command that succeeds, in an environment that knows neither the sources nor their kernels."""
-    clean = {name: value for name, value in os.environ.items() if name not in ("PYTHONPATH", "NUMBA_CACHE_DIR")}
+    """Output of a command that succeeds, in an environment that knows neither the sources nor their
+    kernels.
+    """
+    clean = {
+        name: value
+        for name, value in os.environ.items()
+        if name not in ("PYTHONPATH", "NUMBA_CACHE_DIR")
+    }
     done = subprocess.run(
-        [str(word) for word in words], cwd=cwd, env=clean | environment, capture_output=True, text=True, check=False
+        [str(word) for word in words],
+        cwd=cwd,
+        env=clean | environment,
+        capture_output=True,
+        text=True,
+        check=False,
     )
     assert done.returncode == 0, done.stdout + done.stderr
     return done.stdout
@@ -45,10 +56,16 @@ def run(*words: object, cwd: Path, **environment: str) -> str:
 
 @pytest.fixture(scope="module")
 def wheel(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Built offline, from a copy of the sources: what an earlier build left in the checkout does not count."""
+    """Built offline, from a copy of the sources: what an earlier build left in the checkout does
+    not count.
+    """
     source, out = tmp_path_factory.mktemp("source"), tmp_path_factory.mktemp("wheel")
     for name in (*PACKAGES, "tests", "benchmarks", "logs"):
-        shutil.copytree(ROOT / name, source / name, ignore=shutil.ignore_patterns("__pycache__", "*Z-*", "*.sock"))
+        shutil.copytree(
+            ROOT / name,
+            source / name,
+            ignore=shutil.ignore_patterns("__pycache__", "*Z-*", "*.sock"),
+        )
     for name in ("pyproject.toml", "setup.py", "README.md", "LICENSE"):
         shutil.copy(ROOT / name, source)
     (source / ".git" / "refs").mkdir(parents=True)
@@ -70,7 +87,15 @@ class Installed:
         self.empty = folder / "empty"
         self.empty.mkdir()
         self.before = self.files()
-        self.pip("install", "--quiet", "--no-index", "--no-deps", "--no-compile", "--ignore-installed", wheel)
+        self.pip(
+            "install",
+            "--quiet",
+            "--no-index",
+            "--no-deps",
+            "--no-compile",
+            "--ignore-installed",
+            wheel,
+        )
 
     def pip(self, *words: object) -> None:
         run(sys.executable, "-m", "pip", "--python", self.python, *words, cwd=self.folder)
@@ -90,8 +115,12 @@ def installed(wheel: Path, tmp_path: Path) -> Installed:
 def test_the_wheel_holds_the_packages_with_their_data_and_nothing_else(wheel: Path) -> None:
     with zipfile.ZipFile(wheel) as archive:
         names = {name for name in archive.namelist() if ".dist-info/" not in name}
-    sources = [path for package in PACKAGES for path in (ROOT / package).rglob("*") if path.is_file()]
-    expected = {path.relative_to(ROOT).as_posix() for path in sources if "__pycache__" not in path.parts}
+    sources = [
+        path for package in PACKAGES for path in (ROOT / package).rglob("*") if path.is_file()
+    ]
+    expected = {
+        path.relative_to(ROOT).as_posix() for path in sources if "__pycache__" not in path.parts
+    }
     assert names == expected | {"membrane_ctrl/build_commit.txt"}
     assert {f"{package}/py.typed" for package in PACKAGES} < names
 
@@ -100,7 +129,13 @@ def test_an_installed_copy_runs_and_leaves_nothing_behind(installed: Installed) 
     assert installed.command("--version").strip() == f"membrane-ctrl {__version__} (0123456789ab)"
     (installed.empty / "twin.toml").write_text(installed.command("examples", "twin.toml"))
     assert "twin.toml" in installed.command("check", "twin.toml")
-    run(installed.python, "-c", _KERNEL, cwd=installed.empty, XDG_CACHE_HOME=str(installed.folder / "caches"))
+    run(
+        installed.python,
+        "-c",
+        _KERNEL,
+        cwd=installed.empty,
+        XDG_CACHE_HOME=str(installed.folder / "caches"),
+    )
     assert list(installed.folder.glob("caches/membrane-ctrl/*/*.nbi"))
     installed.pip("uninstall", "--quiet", "--yes", "membrane-ctrl")
     assert installed.files() == installed.before
@@ -119,7 +154,9 @@ def test_an_outside_program_sees_the_types(installed: Installed) -> None:
     (installed.empty / "program.py").write_text(_PROGRAM)
     (installed.empty / "mypy.ini").write_text("[mypy]\nfollow_imports = silent\n")
     words = ["-m", "mypy", "--strict", "--python-executable", str(installed.python), "program.py"]
-    done = subprocess.run([sys.executable, *words], cwd=installed.empty, capture_output=True, text=True, check=False)
+    done = subprocess.run(
+        [sys.executable, *words], cwd=installed.empty, capture_output=True, text=True, check=False
+    )
     assert done.stdout.splitlines()[:-1] == [
         "program.py:6: error: Incompatible types in assignment "
         '(expression has type "datetime", variable has type "str")  [assignment]'

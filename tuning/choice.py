@@ -1,4 +1,6 @@
-"""What a person decides: which candidate is applied, and whether kept gains become those of the configuration."""
+"""What a person decides: which candidate is applied, and whether kept gains become those of the
+configuration.
+"""
 
 import contextlib
 import difflib
@@ -24,10 +26,13 @@ from tuning.rig import HoldRig
 
 
 def require_an_answer(yes: bool, name: str) -> None:
-    """Raises InputError before anything moves if nobody could choose the gains, or the name is no candidate's."""
+    """Raises InputError before anything moves if nobody could choose the gains, or the name is no
+    candidate's.
+    """
     if not (yes or name or sys.stdin.isatty()):
         raise InputError(
-            "the gains to apply are chosen on a terminal; elsewhere add --yes (the proposal) or --choose NAME"
+            "the gains to apply are chosen on a terminal; elsewhere add --yes (the proposal) "
+            "or --choose NAME"
         )
     if name and name not in design.NAMES:
         raise InputError(f"--choose {name}: not a candidate; known: {', '.join(design.NAMES)}")
@@ -69,10 +74,13 @@ def for_hold(folder: SessionFolder, link: HoldLink) -> SessionFolder:
         if all(getattr(running, key) != getattr(loop, key) for loop in known):
             raise InputError(
                 f"{where}: loop.{key} = {getattr(running, key):g}, {folder.path.name} began with "
-                f"{getattr(known[0], key):g}: set that with `ctl gains`, or start a new session with another --name"
+                f"{getattr(known[0], key):g}: set that with `ctl gains`, or start a new "
+                "session with another --name"
             )
     bleed = {"bleed_fraction": running.bleed_fraction}  # perhaps opened since, as a refusal asked
-    return replace(folder, head=replace(folder.head, before=folder.head.before.model_copy(update=bleed)))
+    return replace(
+        folder, head=replace(folder.head, before=folder.head.before.model_copy(update=bleed))
+    )
 
 
 # Kept gains into the configuration, so that the next hold starts with them.
@@ -90,7 +98,8 @@ _ANY = ("setpoint_um", "bleed_fraction", "probe_um", "change_max")
 
 
 def save(path: Path, name: Path | None, logs: Path, author: str, yes: bool) -> int:
-    """Save what a session kept into a configuration file: gains, curve of the pump, time constant of the shape loop.
+    """Save what a session kept into a configuration file: gains, curve of the pump, time constant
+    of the shape loop.
 
     By default the gains and the time constant that were kept last. Returns the exit code.
 
@@ -100,7 +109,9 @@ def save(path: Path, name: Path | None, logs: Path, author: str, yes: bool) -> i
     """
     config = toml_file.load(path, schema.Config)
     if config.estimator.process_value != "laser":
-        return _save_estimator(path, newest_session(logs) if name is None else open_session(name), config, yes)
+        return _save_estimator(
+            path, newest_session(logs) if name is None else open_session(name), config, yes
+        )
     folder, shape_s = _named(name, logs)
     keys: tuple[str, ...] = GAIN_KEYS
     gains, pump = config.loop, config.pump
@@ -115,7 +126,9 @@ def save(path: Path, name: Path | None, logs: Path, author: str, yes: bool) -> i
     else:
         _require_same_devices(path, config, folder)
     before = files.read_text(path, follow=True)
-    shape = config.shape.model_copy(update={"time_constant_s": shape_s or config.shape.time_constant_s})
+    shape = config.shape.model_copy(
+        update={"time_constant_s": shape_s or config.shape.time_constant_s}
+    )
     changed = {
         "loop": _changes(config.loop, gains, keys),
         "pump": _changes(config.pump, pump),
@@ -129,22 +142,29 @@ def save(path: Path, name: Path | None, logs: Path, author: str, yes: bool) -> i
         return errors.Exit.DONE
     if not _replaced(path, before, after, folder, yes):
         return errors.Exit.DONE
-    told = gains_file.entry("saved", folder.path.name, author, str(path.resolve()), folder.head.before, gains)
+    told = gains_file.entry(
+        "saved", folder.path.name, author, str(path.resolve()), folder.head.before, gains
+    )
     gains_file.note(folder.path.resolve().parents[1], told)
     return errors.Exit.DONE
 
 
 def _save_estimator(path: Path, folder: SessionFolder, config: schema.Config, yes: bool) -> int:
-    """Save the pump and the noise levels that a session measured: the loop of an estimate has no other gains.
+    """Save the pump and the noise levels that a session measured: the loop of an estimate has no
+    other gains.
 
-    With the pump's curve, if it measured one, come the gains that suit it, for a hold that begins on the laser.
+    With the pump's curve, if it measured one, come the gains that suit it, for a hold that begins
+    on the laser.
     """
     _require_same_devices(path, config, folder)
     tables: dict[str, Section] = {}
     if pump_trial.mapped(folder):
         pump = folder.config.pump
         if config.pump not in (pump, pump_trial.mapped_of(folder).before):
-            raise InputError(f"{path}: has another [pump] than the session began with: tune with this configuration")
+            raise InputError(
+                f"{path}: has another [pump] than the session began with: tune with this "
+                "configuration"
+            )
         keys = {*GAIN_KEYS, "flow_max_um_per_s"}
         loop = config.loop.model_copy(update=folder.head.before.model_dump(include=keys))
         tables = {"pump": pump, "loop": loop}
@@ -167,7 +187,9 @@ def _replaced(path: Path, before: str, after: str, folder: SessionFolder, yes: b
         before.splitlines(), after.splitlines(), str(path), folder.path.name, lineterm="", n=1
     )
     print("\n".join(shown))
-    if not yes and not (sys.stdin.isatty() and Progress().ask(f"save to {path}? [y/N]").lower() in ("y", "yes")):
+    if not yes and not (
+        sys.stdin.isatty() and Progress().ask(f"save to {path}? [y/N]").lower() in ("y", "yes")
+    ):
         print(f"{path} is unchanged; --yes saves without asking", file=sys.stderr)
         return False
     _replace(path, before, after)
@@ -175,7 +197,8 @@ def _replaced(path: Path, before: str, after: str, folder: SessionFolder, yes: b
 
 
 def _named(name: Path | None, logs: Path) -> tuple[SessionFolder, float | None]:
-    """A session, by default the one whose gains were kept last; and the time constant of the shape loop it kept.
+    """A session, by default the one whose gains were kept last; and the time constant of the shape
+    loop it kept.
 
     By default that is the one kept last. Raises InputError if nothing was kept.
     """
@@ -200,7 +223,9 @@ def _kept(folder: SessionFolder) -> schema.LoopConfig:
 
     Raises InputError if there are none, or they were rolled back.
     """
-    if pump_trial.mapped(folder) and not (folder.done("verify") and session.verified_of(folder).kept):
+    if pump_trial.mapped(folder) and not (
+        folder.done("verify") and session.verified_of(folder).kept
+    ):
         return folder.head.before
     done = session.verified_of(folder)
     if not done.kept:
@@ -208,13 +233,19 @@ def _kept(folder: SessionFolder) -> schema.LoopConfig:
     noted = gains_file.entries(folder.path.resolve().parents[1])
     last = [line for line in noted if line.session == folder.path.name and line.shape_s is None]
     if last and last[-1].what == "rolled_back":
-        raise InputError(f"{folder.path}: its gains were rolled back on {last[-1].time_utc} ({last[-1].reason})")
+        raise InputError(
+            f"{folder.path}: its gains were rolled back on {last[-1].time_utc} ({last[-1].reason})"
+        )
     return done.after
 
 
 def _require_same_devices(path: Path | str, config: schema.Config, folder: SessionFolder) -> None:
-    """Raises InputError if the session tuned the simulated bench, and the configuration is another."""
-    if config.devices is not None and (folder.config.devices is None or folder.head.source == "twin"):
+    """Raises InputError if the session tuned the simulated bench,
+    and the configuration is another.
+    """
+    if config.devices is not None and (
+        folder.config.devices is None or folder.head.source == "twin"
+    ):
         raise InputError(f"{path}: has [devices], but the session tuned the simulated bench")
 
 
@@ -228,13 +259,16 @@ def _require_same_bench(path: Path | str, config: schema.Config, folder: Session
             now, then = getattr(here, key), getattr(there, key)
             if now != then and key not in (*GAIN_KEYS, *_ANY):
                 raise InputError(
-                    f"{path}: {section}.{key} = {now}, the session had {then}: its gains do not fit; tune with this "
+                    f"{path}: {section}.{key} = {now}, the session had {then}: its gains do "
+                    "not fit; tune with this "
                     "configuration"
                 )
 
 
 def _with(text: str, changed: dict[str, dict[str, Any]], path: Path) -> str:
-    """The configuration's text with these keys of its tables; nothing else changes, or InputError is raised."""
+    """The configuration's text with these keys of its tables; nothing else changes, or InputError
+    is raised.
+    """
     import tomlkit
     from tomlkit.exceptions import TOMLKitError
 
@@ -251,14 +285,17 @@ def _with(text: str, changed: dict[str, dict[str, Any]], path: Path) -> str:
     except (TOMLKitError, ValueError):
         pass
     lines = "; ".join(
-        f"set in [{name}]: " + ", ".join(f"{key} = {json.dumps(value)}" for key, value in keys.items())
+        f"set in [{name}]: "
+        + ", ".join(f"{key} = {json.dumps(value)}" for key, value in keys.items())
         for name, keys in changed.items()
     )
     raise InputError(f"{path}: cannot be edited by a program; {lines}")
 
 
 def _replace(path: Path, before: str, after: str) -> None:
-    """Write the file a link leads to, with its permissions. Raises InputError also if it has changed meanwhile."""
+    """Write the file a link leads to, with its permissions. Raises InputError also if it has
+    changed meanwhile.
+    """
     target = path.resolve()
     with errors.writing(path):
         mode = target.stat().st_mode
@@ -274,7 +311,8 @@ _WEATHER_KEYS = ("barometer_gain_um_per_pa", "temperature_gain_um_per_k")
 
 
 def compared(a: SessionFolder, b: SessionFolder) -> str:
-    """Return Markdown: the plants, the gains, and the prediction for each set of gains on each plant.
+    """Return Markdown: the plants, the gains, and the prediction for each set of gains on each
+    plant.
 
     Raises InputError if one of the sessions has no design yet.
     """
@@ -285,12 +323,16 @@ def compared(a: SessionFolder, b: SessionFolder) -> str:
 
 
 def _plants(a: SessionFolder, b: SessionFolder, files: list[gains_file.GainsFile]) -> list[str]:
-    head = "| plant | k | +- | dead time s | lag s | delay +- s | leak µm/s | laser µm | least std µm |"
+    head = (
+        "| plant | k | +- | dead time s | lag s | delay +- s | leak µm/s | laser µm | least std "
+        "µm |"
+    )
     lines = [head, "|---" + "|---:" * 8 + "|"]
     for each, gains in zip((a, b), files, strict=True):
         plant = gains.plant
         lines.append(
-            f"| {each.path.name} | {plant.gain:.3f} | {plant.gain_sigma:.3f} | {plant.dead_time_s:.3f} "
+            f"| {each.path.name} | {plant.gain:.3f} | {plant.gain_sigma:.3f} | "
+            f"{plant.dead_time_s:.3f} "
             f"| {plant.lag_s:.3f} | {plant.delay_sigma_s:.3f} | {plant.leak_um_per_s:.2f} "
             f"| {session.disturbance_of(each).laser_um:.2f} | {gains.least_std_um:.3f} |"
         )
@@ -301,7 +343,9 @@ def _gains(files: list[gains_file.GainsFile]) -> list[str]:
     """Table of the loop settings that differ."""
     left, right = (gains.loop.model_dump() for gains in files)
     lines = ["| setting | A | B |", "|---|---:|---:|"]
-    lines += [f"| {name} | {left[name]} | {right[name]} |" for name in left if left[name] != right[name]]
+    lines += [
+        f"| {name} | {left[name]} | {right[name]} |" for name in left if left[name] != right[name]
+    ]
     return lines
 
 
@@ -316,7 +360,15 @@ def _crossed(a: SessionFolder, b: SessionFolder, files: list[gains_file.GainsFil
             loop = schema.LoopConfig.model_validate(
                 gains.loop.model_dump() | {key: getattr(own, key) for key in _WEATHER_KEYS}
             )
-            row = design.candidate(name, Gains.of(loop), found.identified.model, weather, loop, candidates.Demands())
-            std = f"{row.predicted.std_um:.3f} | {row.ratio:.2f}" if row.predicted is not None else "unstable | "
-            lines.append(f"| {name} | {place} | {std} | {row.margins.ms:.2f} | {row.load_peak_um:.2f} |")
+            row = design.candidate(
+                name, Gains.of(loop), found.identified.model, weather, loop, candidates.Demands()
+            )
+            std = (
+                f"{row.predicted.std_um:.3f} | {row.ratio:.2f}"
+                if row.predicted is not None
+                else "unstable | "
+            )
+            lines.append(
+                f"| {name} | {place} | {std} | {row.margins.ms:.2f} | {row.load_peak_um:.2f} |"
+            )
     return lines

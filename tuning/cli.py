@@ -21,40 +21,58 @@ app = typer.Typer(
 )
 
 TwinOption = Annotated[bool, typer.Option("--twin", help="Work on the twin, in virtual time.")]
-ConfigOption = Annotated[Path | None, typer.Option("--config", help="With --twin: its configuration.")]
+ConfigOption = Annotated[
+    Path | None, typer.Option("--config", help="With --twin: its configuration.")
+]
 RunOption = Annotated[Path | None, typer.Option("--run", help="Run folder of the hold.")]
 SocketOption = Annotated[Path | None, typer.Option("--socket", help="Control port of the hold.")]
 LogsOption = Annotated[Path, typer.Option("--logs", help="Keep sessions in LOGS/tuning.")]
-SessionOption = Annotated[Path | None, typer.Option("--session", "--resume", help="Resume this session.")]
+SessionOption = Annotated[
+    Path | None, typer.Option("--session", "--resume", help="Resume this session.")
+]
 NameOption = Annotated[str, typer.Option("--name", help="Name of a new session.")]
-AuthorOption = Annotated[str | None, typer.Option("--author", help="Who is tuning; your login by default.")]
-ReasonOption = Annotated[str, typer.Option("--reason", help="Reason, for the gains file and the journal.")]
+AuthorOption = Annotated[
+    str | None, typer.Option("--author", help="Who is tuning; your login by default.")
+]
+ReasonOption = Annotated[
+    str, typer.Option("--reason", help="Reason, for the gains file and the journal.")
+]
 LimitOption = Annotated[
     float, typer.Option(min=3, max=30, help="Largest excursion of the centre in an experiment, µm.")
 ]
 ObserveOption = Annotated[str, typer.Option(help="Duration of the quiet hold, 5m to 15m.")]
 VerifyOption = Annotated[str, typer.Option(help="Duration of the verification.")]
 YesOption = Annotated[bool, typer.Option("--yes", help="Apply the proposal without asking.")]
-ChooseOption = Annotated[str, typer.Option("--choose", help="Apply this candidate without asking.", metavar="NAME")]
-PageOption = Annotated[bool, typer.Option("--page", help="With `run`: serve a live page on localhost.")]
+ChooseOption = Annotated[
+    str, typer.Option("--choose", help="Apply this candidate without asking.", metavar="NAME")
+]
+PageOption = Annotated[
+    bool, typer.Option("--page", help="With `run`: serve a live page on localhost.")
+]
 ShortOption = Annotated[
-    bool, typer.Option("--short", help="Short form: five minutes of experiments, five of verification.")
+    bool,
+    typer.Option("--short", help="Short form: five minutes of experiments, five of verification."),
 ]
 WaitOption = Annotated[bool, typer.Option("--wait", help="Wait until the mirror is held.")]
 JsonOption = Annotated[bool, typer.Option("--json", help="Print the result as JSON.")]
-TakeOverOption = Annotated[bool, typer.Option("--take-over", help="Take command from whoever has it.")]
+TakeOverOption = Annotated[
+    bool, typer.Option("--take-over", help="Take command from whoever has it.")
+]
 
 _STEPS = {
-    "characterise": "Excite the loop with a relay and doublets about the mean flow; starts a session.",
-    "identify": "Identify gain, dead time and lag with their errors; judge whether the data support a proposal.",
+    "characterise": "Excite the loop with a relay and doublets about the mean flow; starts a session.",  # noqa: E501
+    "identify": "Identify gain, dead time and lag with their errors; judge whether the data support a "  # noqa: E501
+    "proposal.",
     "observe": "Observe a quiet hold: laser noise and weather.",
     "design": "Compare candidates side by side and propose gains.",
     "preview": "Simulate present and proposed gains on the fitted twin.",
     "apply": "Apply the gains that you choose on trial; they revert unless `verify` keeps them.",
     "verify": "Verify the new gains over ten minutes of hold; keep them, or revert (exit 3).",
-    "run": "Run all steps that are not done yet; shows the candidates and asks before any gains change.",
+    "run": "Run all steps that are not done yet; shows the candidates and asks before any gains "
+    "change.",
     "pump": "Measure the pump's curve (flow, start, stall, delay) and the leak, for [pump].",
-    "outer": "Measure sag sensitivity, noise and drift of the figure; try a time constant for the shape loop.",
+    "outer": "Measure sag sensitivity, noise and drift of the figure; try a time constant for the "
+    "shape loop.",
     "watch": "Watch a hold without touching it; report whether a session is due (exit 3).",
     "rollback": "Restore the gains from before the last kept session.",
 }
@@ -145,13 +163,19 @@ def history(logs: LogsOption = Path("logs"), json: JsonOption = False) -> int:
 
 @app.command()
 def save(
-    config: Annotated[Path, typer.Option("--config", help="Configuration to save them to, one TOML file.")],
-    session: Annotated[Path | None, typer.Argument(metavar="SESSION", help="By default the one kept last.")] = None,
+    config: Annotated[
+        Path, typer.Option("--config", help="Configuration to save them to, one TOML file.")
+    ],
+    session: Annotated[
+        Path | None, typer.Argument(metavar="SESSION", help="By default the one kept last.")
+    ] = None,
     logs: LogsOption = Path("logs"),
     author: AuthorOption = None,
     yes: Annotated[bool, typer.Option("--yes", help="Save without asking.")] = False,
 ) -> int:
-    """Save the kept gains of a session into a configuration, so that the next hold starts with them."""
+    """Save the kept gains of a session into a configuration, so that the next hold starts with
+    them.
+    """
     from tuning import choice, opening
 
     return choice.save(config, session, logs, author or opening.author_name(), yes)
@@ -174,10 +198,14 @@ def compare(
 def explore(
     folder: Annotated[Path, typer.Argument(metavar="RUN|SESSION", help="Run or session folder.")],
     logs: LogsOption = Path("logs"),
-    port: Annotated[int, typer.Option(min=0, max=65535, help="Port on localhost; a free one by default.")] = 0,
+    port: Annotated[
+        int, typer.Option(min=0, max=65535, help="Port on localhost; a free one by default.")
+    ] = 0,
     author: AuthorOption = None,
 ) -> int:
-    """Explore gains by hand: a page with sliders, on the fitted plant in the recorded weather; a session live."""
+    """Explore gains by hand: a page with sliders, on the fitted plant in the recorded weather; a
+    session live.
+    """
     from tuning.command import NEEDS_BOKEH
     from tuning.opening import author_name
 

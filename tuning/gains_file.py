@@ -1,7 +1,7 @@
 """Gains and their origin: the loop's settings, the plant they are for, data, author, date, reason.
 
-A hand-edited file is read like any other: its gains are checked on its plant, and gains that are unstable
-or have too little margin are refused by name.
+A hand-edited file is read like any other: its gains are checked on its plant, and gains that are
+unstable or have too little margin are refused by name.
 """
 
 import json
@@ -80,13 +80,15 @@ def load_gains(path: Path) -> GainsFile:
 def require_sound(gains: GainsFile, where: str, running: LoopConfig) -> None:
     """Refuse gains that must not be applied.
 
-    Raises InputError if the loop is unstable or has too little margin on the file's own plant, or its tick rate
-    differs from that of the hold (`running`); `where` names the file.
+    Raises InputError if the loop is unstable or has too little margin on the file's own plant, or
+    its tick rate differs from that of the hold (`running`); `where` names the file.
     """
     dt_s = 1 / gains.loop.rate_hz
     found = loop_model.margins(loop_model.Gains.of(gains.loop), gains.plant.model, dt_s)
     if not found.stable:
-        raise errors.InputError(f"{where}: loop: unstable on this file's plant; was the file edited by hand?")
+        raise errors.InputError(
+            f"{where}: loop: unstable on this file's plant; was the file edited by hand?"
+        )
     if not found.ms <= MS_MAX or math.isnan(found.ms):
         raise errors.InputError(
             f"{where}: loop: sensitivity {found.ms:.2f} on this file's plant, the limit is "
@@ -94,7 +96,8 @@ def require_sound(gains: GainsFile, where: str, running: LoopConfig) -> None:
         )
     if gains.loop.rate_hz != running.rate_hz:
         raise errors.InputError(
-            f"{where}: loop.rate_hz: {gains.loop.rate_hz:g} Hz, the hold ticks at {running.rate_hz:g} Hz"
+            f"{where}: loop.rate_hz: {gains.loop.rate_hz:g} Hz, the hold ticks at "
+            f"{running.rate_hz:g} Hz"
         )
 
 
@@ -102,11 +105,14 @@ _NO_GAINS = {"setpoint_um", "bleed_fraction", "flow_max_um_per_s"}
 
 
 def for_hold(gains: LoopConfig, running: LoopConfig) -> LoopConfig:
-    """The gains for a hold, which keeps its own setpoint, bleed and limit of the flow: those are not gains."""
+    """The gains for a hold, which keeps its own setpoint, bleed and limit of the flow: those are
+    not gains.
+    """
     return LoopConfig.model_validate(gains.model_dump() | running.model_dump(include=_NO_GAINS))
 
 
-# `<logs>/tuning/journal.jsonl`: which gains were kept, taken back or rolled back, when, by whom and why.
+# `<logs>/tuning/journal.jsonl`: which gains were kept, taken back or rolled back, when, by whom and
+# why.
 
 _FILE = "journal.jsonl"
 What = Literal["kept", "taken_back", "rolled_back", "saved"]
@@ -124,7 +130,9 @@ class Traded:
     def words(self) -> tuple[str, ...]:
         """Standard deviation in µm, load peak in µm, recovery in s, Ms: each before and after."""
         pairs = zip(astuple(self.before), astuple(self.after), (3, 2, 1, 2), strict=True)
-        return tuple(f"{before:.{digits}f} -> {after:.{digits}f}" for before, after, digits in pairs)
+        return tuple(
+            f"{before:.{digits}f} -> {after:.{digits}f}" for before, after, digits in pairs
+        )
 
     def __str__(self) -> str:
         std, peak, recovery, ms = self.words
@@ -136,14 +144,16 @@ class GainsEntry:
     """One line of the journal."""
 
     time_utc: str
-    what: What  # "kept": verified; "taken_back": the verification failed; "rolled_back", "saved": by a person
+    # "kept": verified; "taken_back": the verification failed; "rolled_back", "saved": by a person
+    what: What
     session: str
     author: str
     reason: str
     before: LoopConfig  # gains before and with it; after "taken_back" the former are in force again
     after: LoopConfig
     traded: Traded | None = None
-    shape_s: tuple[float, float] | None = None  # time constant of the shape loop before and after, if that was tried
+    # time constant of the shape loop before and after, if that was tried
+    shape_s: tuple[float, float] | None = None
 
 
 def entry(
@@ -162,7 +172,9 @@ def entry(
 
 
 def note(logs: Path, what: GainsEntry) -> None:
-    """Append an entry. Raises InputError if it cannot be written; symbolic links are not followed."""
+    """Append an entry. Raises InputError if it cannot be written;
+    symbolic links are not followed.
+    """
     path = logs / "tuning" / _FILE
     with errors.writing(path):
         files.make_folder(path.parent)
@@ -171,7 +183,9 @@ def note(logs: Path, what: GainsEntry) -> None:
 
 
 def entries(logs: Path) -> list[GainsEntry]:
-    """All entries, oldest first, without truncated lines. Raises InputError if it is not a regular file."""
+    """All entries, oldest first, without truncated lines. Raises InputError if it is not a regular
+    file.
+    """
     path = logs / "tuning" / _FILE
     try:
         text = files.read_text(path, errors="replace")
@@ -200,7 +214,9 @@ def to_roll_back(logs: Path, gains_only: bool = False) -> GainsEntry:
 
 
 def kept_shape_s(logs: Path, session: str = "") -> float | None:
-    """The shape loop's time constant kept last, by any or this session, and not rolled back since."""
+    """The shape loop's time constant kept last, by any or this session,
+    and not rolled back since.
+    """
     of_it = (line.shape_s for line in _in_force(logs) if session in ("", line.session))
     return next((shape_s[1] for shape_s in of_it if shape_s is not None), None)
 
@@ -219,19 +235,26 @@ def _in_force(logs: Path) -> Iterator[GainsEntry]:
 def history_table(found: list[GainsEntry]) -> str:
     """The journal as a Markdown table."""
     lines = [
-        "| time | what | session | author | K 1/s | Ti s | filter s | candidate | std µm | load peak µm | recovery s "
+        "| time | what | session | author | K 1/s | Ti s | filter s | candidate | std µm | "
+        "load peak µm | recovery s "
         "| Ms | reason |",
         "|---|---|---|---|---:|---:|---:|---|---:|---:|---:|---:|---|",
     ]
     for line in found:
         loop = line.before if line.what == "rolled_back" else line.after
-        traded = (line.traded.candidate, *line.traded.words) if line.traded is not None else [""] * 5
+        traded = (
+            (line.traded.candidate, *line.traded.words) if line.traded is not None else [""] * 5
+        )
         reason = line.reason
         if line.shape_s is not None:
-            before_s, after_s = reversed(line.shape_s) if line.what == "rolled_back" else line.shape_s
+            before_s, after_s = (
+                reversed(line.shape_s) if line.what == "rolled_back" else line.shape_s
+            )
             reason = f"shape loop {before_s:.0f} -> {after_s:.0f} s: {reason}"
         lines.append(
-            f"| {line.time_utc} | {line.what} | {line.session} | {line.author} | {loop.kp_per_s:.3f} "
-            f"| {loop.ti_s:.2f} | {loop.measurement_filter_s:.2f} | {' | '.join(traded)} | {reason} |"
+            f"| {line.time_utc} | {line.what} | {line.session} | {line.author} | "
+            f"{loop.kp_per_s:.3f} "
+            f"| {loop.ti_s:.2f} | {loop.measurement_filter_s:.2f} | {' | '.join(traded)} | "
+            f"{reason} |"
         )
     return "\n".join(lines)

@@ -1,4 +1,6 @@
-"""Opening a session: its options, its folder, and the hold on which it works, live or of the twin in virtual time."""
+"""Opening a session: its options, its folder, and the hold on which it works, live or of the twin
+in virtual time.
+"""
 
 import contextlib
 import getpass
@@ -14,7 +16,12 @@ from membrane_ctrl.metrology.optics.film_law import zernike_projection
 from membrane_ctrl.model import shape_estimate, telemetry
 from membrane_ctrl.model.errors import DeviceError, InputError, writing
 from membrane_ctrl.model.events import CommandTaken, Event
-from membrane_ctrl.sessions.folder import SessionFolder, create_session, newest_session, open_session
+from membrane_ctrl.sessions.folder import (
+    SessionFolder,
+    create_session,
+    newest_session,
+    open_session,
+)
 from membrane_ctrl.sessions.live_hold import HoldError, HoldLink, News, Progress, live_hold
 from membrane_ctrl.sessions.live_log import LiveLog
 from membrane_ctrl.sim import plant, surroundings, virtual_bench
@@ -54,7 +61,9 @@ class TuneOptions:
 
     @property
     def stages(self) -> tuple[tuple[float, float], ...]:
-        """Stages of the verification that fit in the time available; none earlier: one gust is half of 30 s."""
+        """Stages of the verification that fit in the time available; none earlier: one gust is half
+        of 30 s.
+        """
         early = tuple(stage for stage in STAGES[:-1] if stage[0] < self.verify_s)
         return (*early, (self.verify_s, STAGES[-1][1]))
 
@@ -73,7 +82,9 @@ def opened(
     again: str = "resume it with `membrane-ctrl tune run --resume {}`",
     refusal: Callable[[Config], str] = lambda config: "",
 ) -> Iterator[tuple[SessionFolder, HoldRig, Progress]]:
-    """Yield a session's folder and hold; restore the last good gains if it ends early, and say how to go on."""
+    """Yield a session's folder and hold; restore the last good gains if it ends early, and say how
+    to go on.
+    """
     progress = Progress()
     with linked(options, f"tune {options.name}") as link:
         if refused := refusal(link.config):
@@ -103,7 +114,9 @@ def _go_back(rig: HoldRig, progress: Progress) -> None:
     try:
         rig.go_back()
     except HoldError as error:
-        progress.say(f"could not restore the last good gains ({error}); gains on trial revert automatically")
+        progress.say(
+            f"could not restore the last good gains ({error}); gains on trial revert automatically"
+        )
         return
     progress.say("holding the mirror with the last good gains")
 
@@ -122,7 +135,11 @@ def linked(options: TuneOptions, session: str = "") -> contextlib.AbstractContex
 def folder_of(options: TuneOptions, link: HoldLink | None, fresh: bool = False) -> SessionFolder:
     """Return the named session, else the newest, or a new one if there is a hold to start it on."""
     if link is None:
-        return newest_session(options.logs) if options.session is None else open_session(options.session)
+        return (
+            newest_session(options.logs)
+            if options.session is None
+            else open_session(options.session)
+        )
     if options.session is not None:
         return choice.for_hold(open_session(options.session), link)
     begun: SessionFolder | None = None
@@ -132,7 +149,9 @@ def folder_of(options: TuneOptions, link: HoldLink | None, fresh: bool = False) 
     of = None if begun is None else (begun.head.source, begun.head.name)
     if begun is not None and of == (link.name, options.name) and not begun.done("verify"):
         return choice.for_hold(begun, link)
-    return create_session(options.logs, options.name, options.author, link.name, link.config, link.config.loop)
+    return create_session(
+        options.logs, options.name, options.author, link.name, link.config, link.config.loop
+    )
 
 
 _NEWS_S = 0.5
@@ -171,7 +190,9 @@ class TwinHold:
         figures: ShapeSource | None = None,
     ) -> None:
         self.config = config
-        self.bench = bench or virtual_bench.VirtualBench(plant.Plant(config.twin, config.pump, events))
+        self.bench = bench or virtual_bench.VirtualBench(
+            plant.Plant(config.twin, config.pump, events)
+        )
         source = figures
         if source is None and config.shape.enabled:
             source = TruthShape(self.bench, config, config.twin.seed)
@@ -191,7 +212,8 @@ class TwinHold:
             self._advance(1)
             if self._run.now_s > _HELD_WITHIN_S:
                 raise HoldError(
-                    f"the twin is not held within {_HELD_WITHIN_S:g} s: if it swings, halve loop.kp_per_s and double "
+                    f"the twin is not held within {_HELD_WITHIN_S:g} s: if it swings, halve "
+                    "loop.kp_per_s and double "
                     "loop.ti_s; else see `membrane-ctrl check`"
                 )
 

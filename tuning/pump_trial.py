@@ -1,4 +1,6 @@
-"""The measured curve of the pump on trial: measured, applied, checked by steps of the flow, kept or taken back."""
+"""The measured curve of the pump on trial: measured, applied, checked by steps of the flow, kept or
+taken back.
+"""
 
 import contextlib
 from collections.abc import Sequence
@@ -12,16 +14,29 @@ from membrane_ctrl.control.experiments import machine, trial
 from membrane_ctrl.model import errors, telemetry
 from membrane_ctrl.sessions import folder
 from tuning.gains_file import MS_MAX
-from tuning.identification import characterise, identify, loop_model, pump_curve, pump_map, pump_survey
+from tuning.identification import (
+    characterise,
+    identify,
+    loop_model,
+    pump_curve,
+    pump_map,
+    pump_survey,
+)
 from tuning.rig import HoldRig
 
 _MAP_S = 3600.0
-# Between two rounds the mirror returns. A slow loop does not swing even where the actuator takes seconds to answer;
-# behind a slow ramp an actuator several times as strong as configured does not carry the mirror past the setpoint.
+# Between two rounds the mirror returns. A slow loop does not swing even where the actuator takes
+# seconds to answer; behind a slow ramp an actuator several times as strong as configured does not
+# carry the mirror
+# past the setpoint.
 _CAUTIOUS = {"kp_per_s": 0.12, "ti_s": 35.0, "td_s": 0.0, "setpoint_ramp_um_per_s": 0.5}
-_SLOW, _SLOWER = 0.5, 0.25  # K times how late the actuator is; SIMC with that as time constant has 0.5
+_SLOW, _SLOWER = (
+    0.5,
+    0.25,
+)  # K times how late the actuator is; SIMC with that as time constant has 0.5
 _BACK_S, _BACK_WITHIN_UM, _BACK_MOST = 6.0, 2.5, 30
-# Leaks that a curve must reach: with 1.5, neither known well yet, gusts let the mirror sink by 21 µm
+# Leaks that a curve must reach: with 1.5, neither known well yet, gusts let the mirror sink by 21
+# µm
 _LIFTS = 2.0
 _AT_ONCE_S = 1.5  # a round that begins at its limit is over
 _BEFORE_S = 20.0  # whose mean flow about holds the mirror
@@ -55,9 +70,9 @@ def map_pump(
 ) -> tuple[MappedPump, folder.SessionFolder]:
     """Measure the pump's curve, apply it on trial, check it with steps of the flow, and keep it.
 
-    The session begins anew on it. The gains stay if they suit the measured actuator; else they become slower ones
-    that do. Raises RejectedError with what to do if there is no curve, or the steps contradict it; the former curve
-    and gains are then in force.
+    The session begins anew on it. The gains stay if they suit the measured actuator; else they
+    become slower ones that do. Raises RejectedError with what to do if there is no curve, or the
+    steps contradict it; the former curve and gains are then in force.
     """
     before = rig.pump
     try:
@@ -82,13 +97,18 @@ def map_pump(
 def _calmed(rig: HoldRig, limit_um: float) -> None:
     """Cautious gains from the mean flow, with which an experiment gives the mirror back.
 
-    Without a bump they would begin at the flow of a moment: of a loop that swings on an actuator that takes seconds,
-    up to twice the leak, and they are too slow to take that back before the mirror is 20 µm high.
+    Without a bump they would begin at the flow of a moment: of a loop that swings on an actuator
+    that takes seconds, up to twice the leak, and they are too slow to take that back before the
+    mirror is 20 µm high.
     """
     around = rig.around(rig.hold(_BEFORE_S), limit_um)
     rig.set_gains(rig.loop.model_copy(update=_CAUTIOUS), "pump map", _MAP_S)
-    mean = trial.PumpStep(fraction=gas.PumpCurve(rig.pump).fraction(around.holding_flow_um_per_s), duration_s=0.1)
-    rig.performed(characterise.spec_of("pump_map", around, 600.0).model_copy(update={"steps": (mean,)}))
+    mean = trial.PumpStep(
+        fraction=gas.PumpCurve(rig.pump).fraction(around.holding_flow_um_per_s), duration_s=0.1
+    )
+    rig.performed(
+        characterise.spec_of("pump_map", around, 600.0).model_copy(update={"steps": (mean,)})
+    )
 
 
 def _surveyed(rig: HoldRig, limit_um: float) -> pump_map.PumpMap:
@@ -98,7 +118,9 @@ def _surveyed(rig: HoldRig, limit_um: float) -> pump_map.PumpMap:
     survey = pump_survey.PumpSurvey(holding, around.limit_um, around.laser_um)
     held = True
     while held and (steps := survey.steps()):
-        if flow_um_per_s := gas.PumpCurve(rig.pump).flow(survey.holding):  # none, on a curve far from the true
+        if flow_um_per_s := gas.PumpCurve(rig.pump).flow(
+            survey.holding
+        ):  # none, on a curve far from the true
             around = replace(around, holding_flow_um_per_s=flow_um_per_s)
         around = replace(around, late_s=max(around.late_s, survey.fit.delay_s + survey.fit.lag_s))
         spec = characterise.spec_of("pump_map", around, 600.0).model_copy(update={"steps": steps})
@@ -123,8 +145,12 @@ def _holds(found: pump_map.PumpMap) -> bool:
     return curve.least_flow_um_per_s < found.leak_um_per_s < found.pump.flow_full_um_per_s / _LIFTS
 
 
-def _freed(loop: schema.LoopConfig, before: schema.PumpConfig, pump: schema.PumpConfig) -> schema.LoopConfig:
-    """The loop with the flow of the measured pump, unless its limit was below what the pump was taken for."""
+def _freed(
+    loop: schema.LoopConfig, before: schema.PumpConfig, pump: schema.PumpConfig
+) -> schema.LoopConfig:
+    """The loop with the flow of the measured pump, unless its limit was below what the pump was
+    taken for.
+    """
     if loop.flow_max_um_per_s < before.flow_full_um_per_s:
         return loop  # somebody wants it gentle
     # from none to full within two seconds, as `check` demands
@@ -133,7 +159,9 @@ def _freed(loop: schema.LoopConfig, before: schema.PumpConfig, pump: schema.Pump
 
 
 def _safe(loop: schema.LoopConfig, found: pump_map.PumpMap) -> schema.LoopConfig:
-    """The gains, or slower ones (SIMC with the delay as time constant) if they lack margin on this actuator."""
+    """The gains, or slower ones (SIMC with the delay as time constant) if they lack margin on this
+    actuator.
+    """
     model = loop_model.PlantModel(1.0, found.delay_s, found.lag_s, found.leak_um_per_s)
     margins = loop_model.margins(loop_model.Gains.of(loop), model, 1 / loop.rate_hz)
     if margins.stable and margins.ms <= MS_MAX:
@@ -143,15 +171,17 @@ def _safe(loop: schema.LoopConfig, found: pump_map.PumpMap) -> schema.LoopConfig
 
 def _slowed(loop: schema.LoopConfig, found: pump_map.PumpMap, share: float) -> schema.LoopConfig:
     late_s = found.delay_s + found.lag_s + loop.measurement_filter_s + 0.5 / loop.rate_hz
-    return loop.model_copy(update={"kp_per_s": share / late_s, "ti_s": 4 * late_s / share, "td_s": 0.0})
+    return loop.model_copy(
+        update={"kp_per_s": share / late_s, "ti_s": 4 * late_s / share, "td_s": 0.0}
+    )
 
 
 def _checked(rig: HoldRig, late_s: float) -> tuple[float, float]:
     """The gain of the mirror on the curve in force, and its error, from steps of the flow.
 
-    Steps that contradict the curve, or see little in their weather, are repeated for twice as long. Raises ValueError
-    if the longest find a gain far from 1, or one that differs above and below the holding flow; one that they do not
-    know contradicts nothing.
+    Steps that contradict the curve, or see little in their weather, are repeated for twice as long.
+    Raises ValueError if the longest find a gain far from 1, or one that differs above and below the
+    holding flow; one that they do not know contradicts nothing.
     """
     for steps_s in _CHECKS_S:
         _returned(rig)
@@ -161,19 +191,24 @@ def _checked(rig: HoldRig, late_s: float) -> tuple[float, float]:
         record, _ = rig.perform(characterise.spec_of("steps", around, steps_s))
         found = identify.identify(record.followed_by(rig.hold(_CHECK_AFTER_S)))
         gain, sigma = found.model.gain, found.sigma.gain
-        contradicted = bool(characterise.bent(record, found)) or abs(gain - 1) > max(_CURVE_OFF, _CERTAIN * sigma)
+        contradicted = bool(characterise.bent(record, found)) or abs(gain - 1) > max(
+            _CURVE_OFF, _CERTAIN * sigma
+        )
         if not contradicted and sigma < _CURVE_OFF:
             return gain, sigma
     if not contradicted:
         return gain, sigma
     raise ValueError(
-        f"steps of the flow contradict the curve (k = {gain:.2f} +- {sigma:.2f}): the weather was too strong, or "
-        "the pump has changed meanwhile; the former curve is back; run `tune pump` again in steadier weather"
+        f"steps of the flow contradict the curve (k = {gain:.2f} +- {sigma:.2f}): the "
+        "weather was too strong, or "
+        "the pump has changed meanwhile; the former curve is back; run `tune pump` again in "
+        "steadier weather"
     )
 
 
 def _brought_back(rig: HoldRig) -> bool:
-    """`_returned`; if slow gains leave it above in strong weather, with those that held the mirror before.
+    """`_returned`; if slow gains leave it above in strong weather, with those that held the mirror
+    before.
 
     From above a faster loop only stops the pump; from below it would drive a stuck one.
     """
@@ -188,7 +223,9 @@ def _brought_back(rig: HoldRig) -> bool:
 
 
 def _returned(rig: HoldRig) -> bool:
-    """Hold until the mirror is back where it is to stand, at the end of its ramp; not if three minutes are over."""
+    """Hold until the mirror is back where it is to stand, at the end of its ramp; not if three
+    minutes are over.
+    """
     for _ in range(_BACK_MOST):
         rows = rig.ticks(_BACK_S)
         off_um = rig.record(rows).filled_displacement_um() - rows[-1].target_um - rows[-1].trim_um
@@ -198,9 +235,14 @@ def _returned(rig: HoldRig) -> bool:
 
 
 def run_of(rows: Sequence[telemetry.TelemetryRow], dt_s: float) -> pump_curve.PumpRun:
-    """The ticks of an experiment with pump commands; the hold before and after it does not count."""
-    tune = [row for row in rows if row.state == telemetry.State.TUNE][1:]  # the first still has the loop's command
+    """The ticks of an experiment with pump commands; the hold before
+    and after it does not count.
+    """
+    tune = [row for row in rows if row.state == telemetry.State.TUNE][
+        1:
+    ]  # the first still has the loop's command
     columns = (
-        [getattr(row, name) for row in tune] for name in ("pump_fraction", "displacement_um", "ambient_pressure_pa")
+        [getattr(row, name) for row in tune]
+        for name in ("pump_fraction", "displacement_um", "ambient_pressure_pa")
     )
     return pump_curve.PumpRun(dt_s, *(np.array(column, dtype=float) for column in columns))

@@ -1,4 +1,6 @@
-"""The report of a session: one self-contained HTML file and a Rerun recording, updated after each step."""
+"""The report of a session: one self-contained HTML file and a Rerun recording, updated after each
+step.
+"""
 
 import base64
 import html
@@ -28,16 +30,23 @@ _TIMELINE = "session_time"
 
 
 def draw_experiments(path: Path, record: Record, found: identify.Identified | None) -> None:
-    """Draw flow and readings and, once fitted, the model's response to the flow with the residuals."""
+    """Draw flow and readings and, once fitted, the model's response
+    to the flow with the residuals.
+    """
     figure = Figure(figsize=(11, 7), layout="constrained")
     upper, middle, lower = figure.subplots(3, 1, sharex=True)
     time_s = np.arange(len(record)) * record.dt_s
     upper.step(time_s, record.flow_um_per_s, where="post", linewidth=0.8)
     upper.set(ylabel="flow (µm/s)")
-    middle.plot(time_s, record.displacement_um, ".", markersize=1, color="tab:gray", label="reading")
+    middle.plot(
+        time_s, record.displacement_um, ".", markersize=1, color="tab:gray", label="reading"
+    )
     if found is not None:
         middle.plot(
-            time_s, loop_model.pump_share_um(record, found.model), linewidth=1, label="response to the pump (model)"
+            time_s,
+            loop_model.pump_share_um(record, found.model),
+            linewidth=1,
+            label="response to the pump (model)",
         )
         lower.plot(time_s[1:], found.residual_um, linewidth=0.4)
     middle.set(ylabel="centre (µm)")
@@ -49,26 +58,46 @@ def draw_experiments(path: Path, record: Record, found: identify.Identified | No
 def draw_weather(
     path: Path, record: Record, model: loop_model.PlantModel, weather: disturbance.DisturbanceModel
 ) -> None:
-    """Draw the spectrum of a quiet hold's readings less the pump's response, and the fitted parts."""
+    """Draw the spectrum of a quiet hold's readings less the pump's response,
+    and the fitted parts.
+    """
     figure = Figure(figsize=(8, 5), layout="constrained")
     axes = figure.subplots()
     x = loop_model.driven_um(record.flow_um_per_s, model.dead_time_s, model.lag_s, record.dt_s)
     rest = record.filled_displacement_um() - model.gain * x
-    frequency_hz, power = welch(np.diff(rest), 1 / record.dt_s, nperseg=round(_SEGMENT_S / record.dt_s))
+    frequency_hz, power = welch(
+        np.diff(rest), 1 / record.dt_s, nperseg=round(_SEGMENT_S / record.dt_s)
+    )
     w: Series = 2 * np.pi * frequency_hz[1:]
     back = 1 / np.abs(1 - np.exp(-1j * w * record.dt_s)) ** 2  # from increments to readings
-    axes.loglog(frequency_hz[1:], power[1:] * back, linewidth=0.7, color="tab:gray", label="readings less pump")
+    axes.loglog(
+        frequency_hz[1:],
+        power[1:] * back,
+        linewidth=0.7,
+        color="tab:gray",
+        label="readings less pump",
+    )
     blind = LoopConfig(feedforward_barometer=False, feedforward_temperature=False)
-    axes.loglog(frequency_hz[1:], 2 * weather.psd(w, model, blind), label="fitted motion")  # one-sided
-    axes.loglog(frequency_hz[1:], 2 * weather.rest.moving_psd(w), label="motion not explained by weather sensors")
-    axes.axhline(2 * weather.rest.white_psd, color="tab:red", linestyle="--", label="noise of a reading")
+    axes.loglog(
+        frequency_hz[1:], 2 * weather.psd(w, model, blind), label="fitted motion"
+    )  # one-sided
+    axes.loglog(
+        frequency_hz[1:],
+        2 * weather.rest.moving_psd(w),
+        label="motion not explained by weather sensors",
+    )
+    axes.axhline(
+        2 * weather.rest.white_psd, color="tab:red", linestyle="--", label="noise of a reading"
+    )
     axes.set(xlabel="frequency (Hz)", ylabel="um^2/Hz", ylim=(1e-4 * weather.rest.white_psd, None))
     axes.legend(loc="best")
     write_figure(users(path), figure, _DPI)
 
 
 def draw_candidates(path: Path, design: Design, model: loop_model.PlantModel, dt_s: float) -> None:
-    """Draw all candidates: predicted standard deviation, Ms, load peak, recovery, pump activity, |S|."""
+    """Draw all candidates: predicted standard deviation, Ms, load peak, recovery, pump activity,
+    |S|.
+    """
     sound = [(row, row.predicted) for row in design.candidates if row.predicted is not None]
     rows, names = [row for row, _ in sound], [row.name for row, _ in sound]
     stds, flows = ([getattr(p, name) for _, p in sound] for name in ("std_um", "flow_std_um_per_s"))
@@ -79,7 +108,12 @@ def draw_candidates(path: Path, design: Design, model: loop_model.PlantModel, dt
         (a, stds, "predicted std (µm)", design.least_std_um),
         (b, [row.margins.ms for row in rows], "Ms", 1.4),
         (c, [row.load_peak_um for row in rows], "load peak (µm)", math.nan),
-        (d, np.minimum([row.load_recovery_s for row in rows], 60.0), "recovery (s, cut at 60)", math.nan),
+        (
+            d,
+            np.minimum([row.load_recovery_s for row in rows], 60.0),
+            "recovery (s, cut at 60)",
+            math.nan,
+        ),
         (e, np.minimum(flows, 3.0), "flow std (µm/s, cut at 3)", math.nan),
     ):
         axes.barh(places, values, color=["tab:green"] + ["tab:blue"] * (len(names) - 1))
@@ -100,7 +134,9 @@ def draw_candidates(path: Path, design: Design, model: loop_model.PlantModel, dt
 def draw_verification(
     path: Path, before: Record, after: Record | None, model: loop_model.PlantModel, done: Verified
 ) -> None:
-    """Draw the readings' spectra before and after, and the ratio of standard deviations per stage."""
+    """Draw the readings' spectra before and after, and the ratio of
+    standard deviations per stage.
+    """
     figure = Figure(figsize=(11, 4.5), layout="constrained")
     left, right = figure.subplots(1, 2)
     dt_s = before.dt_s
@@ -108,14 +144,25 @@ def draw_verification(
         if record is None:
             continue
         readings = record.filled_displacement_um()
-        f, power = welch(readings - readings.mean(), 1 / dt_s, nperseg=min(readings.size, round(_SEGMENT_S / dt_s)))
-        response = loop_model.loop_response(loop_model.Gains.of(loop), model, loop_model.frequencies(dt_s), dt_s)
+        f, power = welch(
+            readings - readings.mean(),
+            1 / dt_s,
+            nperseg=min(readings.size, round(_SEGMENT_S / dt_s)),
+        )
+        response = loop_model.loop_response(
+            loop_model.Gains.of(loop), model, loop_model.frequencies(dt_s), dt_s
+        )
         ms = float(np.max(np.abs(1 / (1 + response))))
         left.loglog(f[1:], power[1:], linewidth=0.8, label=f"{name}, Ms {ms:.2f}")
     left.set(xlabel="frequency (Hz)", ylabel="readings (µm^2/Hz)")
     left.legend(loc="best")
     times = [stage.time_s for stage in done.stages]
-    right.plot(times, [stage.growth for stage in done.stages], "o-", label="std relative to the previous gains")
+    right.plot(
+        times,
+        [stage.growth for stage in done.stages],
+        "o-",
+        label="std relative to the previous gains",
+    )
     right.plot(times, [stage.growth_max for stage in done.stages], "r--", label="limit")
     right.set(xlabel="time (s)", title="kept" if done.kept else f"reverted: {done.reason}"[:90])
     right.title.set_fontsize(8)
@@ -124,8 +171,10 @@ def draw_verification(
 
 
 _STYLE = (
-    "body{font-family:sans-serif;max-width:70em;margin:2em auto;padding:0 1em}table{border-collapse:collapse}"
-    "td,th{border:1px solid #bbb;padding:.2em .5em;font-size:85%;text-align:right}td:first-child{text-align:left}"
+    "body{font-family:sans-serif;max-width:70em;margin:2em auto;padding:0 "
+    "1em}table{border-collapse:collapse}"
+    "td,th{border:1px solid #bbb;padding:.2em "
+    ".5em;font-size:85%;text-align:right}td:first-child{text-align:left}"
     "img{max-width:100%}.refused{color:#a00}.ok{color:#060}"
 )
 
@@ -144,7 +193,10 @@ def write_report(folder: SessionFolder) -> Path:
         *_verified(folder),
     ]
     path = folder.file("report.html")
-    text = f"<!doctype html><meta charset=utf-8><title>{html.escape(head.name)}</title><style>{_STYLE}</style>"
+    text = (
+        "<!doctype html><meta "
+        f"charset=utf-8><title>{html.escape(head.name)}</title><style>{_STYLE}</style>"
+    )
     write_text_atomic(users(path), text + "\n".join(parts))
     write_recording(folder)
     return path
@@ -152,21 +204,29 @@ def write_report(folder: SessionFolder) -> Path:
 
 def draw(folder: SessionFolder) -> None:
     """Draw the pictures of the finished steps that are missing or older than what they show."""
-    if folder.done("characterise") and _outdated(folder, "experiments.png", "characterise", "identify"):
+    if folder.done("characterise") and _outdated(
+        folder, "experiments.png", "characterise", "identify"
+    ):
         found = session.found_of(folder).identified if folder.done("identify") else None
-        draw_experiments(folder.file("experiments.png"), session.experiments_of(folder).record, found)
+        draw_experiments(
+            folder.file("experiments.png"), session.experiments_of(folder).record, found
+        )
     if not folder.done("observe"):
         return
     model = session.found_of(folder).identified.model
     quiet = loop_model.load_record(folder.file("quiet.npz"))
     if _outdated(folder, "weather.png", "identify", "observe"):
         draw_weather(folder.file("weather.png"), quiet, model, session.disturbance_of(folder))
-    if folder.done("design") and _outdated(folder, "candidates.png", "identify", "observe", "design"):
+    if folder.done("design") and _outdated(
+        folder, "candidates.png", "identify", "observe", "design"
+    ):
         draw_candidates(folder.file("candidates.png"), session.design_of(folder), model, quiet.dt_s)
     if folder.done("verify") and _outdated(folder, "verify.png", "identify", "observe", "verify"):
         path = folder.file("verify.npz")
         after = loop_model.load_record(path) if path.exists() else None
-        draw_verification(folder.file("verify.png"), quiet, after, model, session.verified_of(folder))
+        draw_verification(
+            folder.file("verify.png"), quiet, after, model, session.verified_of(folder)
+        )
 
 
 def _outdated(folder: SessionFolder, picture: str, *steps: str) -> bool:
@@ -175,7 +235,9 @@ def _outdated(folder: SessionFolder, picture: str, *steps: str) -> bool:
     if path.is_symlink() or not path.is_file():
         return True
     results = [folder.file(name) for step in steps for name in FILES[step]]
-    return max(each.stat().st_mtime_ns for each in results if each.exists()) >= path.stat().st_mtime_ns
+    return (
+        max(each.stat().st_mtime_ns for each in results if each.exists()) >= path.stat().st_mtime_ns
+    )
 
 
 def _identified(folder: SessionFolder) -> list[str]:
@@ -196,8 +258,10 @@ def _identified(folder: SessionFolder) -> list[str]:
     ]
     parts.append(_table(("", "value", "1 sigma"), rows))
     parts.append(
-        f"<p>Residuals: whiteness p = {found.identified.whiteness_p:.3g}, independence of the flow p = "
-        f"{found.identified.independence_p:.3g}, largest {found.identified.largest_residual:.1f} sigma. "
+        f"<p>Residuals: whiteness p = {found.identified.whiteness_p:.3g}, independence of "
+        "the flow p = "
+        f"{found.identified.independence_p:.3g}, largest "
+        f"{found.identified.largest_residual:.1f} sigma. "
         f"Data {found.data_sha256[:16]}.</p>"
     )
     return parts
@@ -208,8 +272,10 @@ def _designed(folder: SessionFolder) -> list[str]:
         return []
     weather = session.disturbance_of(folder)
     parts = [
-        f"<h2>Weather</h2><p>Noise of a reading {weather.laser_um:.3f} µm. Every predicted std rests on this "
-        f"record: ten other minutes of weather like it change it by {weather.unsteady:.0%} (1 sigma), and its "
+        f"<h2>Weather</h2><p>Noise of a reading {weather.laser_um:.3f} µm. Every predicted "
+        "std rests on this "
+        f"record: ten other minutes of weather like it change it by {weather.unsteady:.0%} "
+        "(1 sigma), and its "
         "fit has an error.</p>",
         _image(folder, "weather.png"),
     ]
@@ -223,20 +289,32 @@ def _designed(folder: SessionFolder) -> list[str]:
         "<h2>Candidates</h2>",
         _table(cells[0], cells[2:]),
         _image(folder, "candidates.png"),
-        f"<p>{html.escape(traded.candidate)} is {by}: K {gains.loop.kp_per_s:.3f} 1/s, Ti {gains.loop.ti_s:.2f} s, "
-        f"filter {gains.loop.measurement_filter_s:.2f} s. Present and new gains: {html.escape(str(traded))}. Lower "
-        f"bound of the std: {gains.least_std_um:.3f} µm. The proposal over plants drawn from the fit: Ms "
+        f"<p>{html.escape(traded.candidate)} is {by}: K {gains.loop.kp_per_s:.3f} 1/s, Ti "
+        f"{gains.loop.ti_s:.2f} s, "
+        f"filter {gains.loop.measurement_filter_s:.2f} s. Present and new gains: "
+        f"{html.escape(str(traded))}. Lower "
+        f"bound of the std: {gains.least_std_um:.3f} µm. The proposal over plants drawn from "
+        "the fit: Ms "
         f"{design.robustness.ms_p95:.2f}, std {design.robustness.std_p95_um:.3f} µm at 95 %, "
         f"{design.robustness.stable_fraction:.0%} stable.</p>",
     ]
     if folder.done("preview"):
         shown = session.preview_of(folder)
         rows = [
-            (name, f"{p.std_um:.3f}", f"{p.bias_um:+.3f}", f"{p.load_peak_um:.2f}", f"{p.recovery_s:.1f}")
+            (
+                name,
+                f"{p.std_um:.3f}",
+                f"{p.bias_um:+.3f}",
+                f"{p.load_peak_um:.2f}",
+                f"{p.recovery_s:.1f}",
+            )
             for name, group in (("present", shown.present), ("proposed", shown.proposed))
             for p in group
         ]
-        parts += ["<h2>Preview on the fitted twin</h2>", _table(("", "std", "bias", "load peak", "recovery s"), rows)]
+        parts += [
+            "<h2>Preview on the fitted twin</h2>",
+            _table(("", "std", "bias", "load peak", "recovery s"), rows),
+        ]
     return parts
 
 
@@ -247,12 +325,20 @@ def _verified(folder: SessionFolder) -> list[str]:
     words = "kept" if done.kept else f"reverted: {done.reason}"
     seen = [f"{s.ms:.2f}" if math.isfinite(s.ms) else "record too short" for s in done.stages]
     rows = [
-        (f"{s.time_s:.0f} s", f"{s.std_um:.3f}", f"{s.before_um:.3f}", f"{s.growth:.2f}", ms, s.reason)
+        (
+            f"{s.time_s:.0f} s",
+            f"{s.std_um:.3f}",
+            f"{s.before_um:.3f}",
+            f"{s.growth:.2f}",
+            ms,
+            s.reason,
+        )
         for s, ms in zip(done.stages, seen, strict=True)
     ]
     heads = ("after", "std µm", "previous µm", "ratio", "observed sensitivity", "")
     return [
-        f"<h2>Verification</h2><p class={'ok' if done.kept else 'refused'}>{html.escape(words)}</p>",
+        "<h2>Verification</h2><p "
+        f"class={'ok' if done.kept else 'refused'}>{html.escape(words)}</p>",
         _table(heads, rows),
         _image(folder, "verify.png"),
     ]
@@ -260,7 +346,9 @@ def _verified(folder: SessionFolder) -> list[str]:
 
 def _table(heads: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
     head = "".join(f"<th>{html.escape(cell)}</th>" for cell in heads)
-    body = "".join("<tr>" + "".join(f"<td>{html.escape(cell)}</td>" for cell in row) + "</tr>" for row in rows)
+    body = "".join(
+        "<tr>" + "".join(f"<td>{html.escape(cell)}</td>" for cell in row) + "</tr>" for row in rows
+    )
     return f"<table><tr>{head}</tr>{body}</table>"
 
 
@@ -285,7 +373,9 @@ def write_recording(folder: SessionFolder) -> None:
         _record(stream, "before", loop_model.load_record(folder.file("quiet.npz")))
     if folder.done("design"):
         markdown = folder.candidates()
-        stream.log("candidates/table", rr.TextDocument(markdown, media_type="text/markdown"), static=True)
+        stream.log(
+            "candidates/table", rr.TextDocument(markdown, media_type="text/markdown"), static=True
+        )
         rows = [row for row in session.design_of(folder).candidates if row.predicted is not None]
         stds = [row.predicted.std_um for row in rows if row.predicted is not None]
         stream.log("candidates/std_um", rr.BarChart(stds), static=True)
@@ -328,7 +418,11 @@ def _blueprint() -> rrb.Blueprint:
 
     experiment = rrb.Vertical(
         plot("Flow, µm/s", "experiment/flow_um_per_s"),
-        plot("Centre and its response to the pump, µm", "experiment/displacement_um", "fit/pump_share_um"),
+        plot(
+            "Centre and its response to the pump, µm",
+            "experiment/displacement_um",
+            "fit/pump_share_um",
+        ),
         plot("Residual, µm", "residual/prediction_error_um"),
         name="Experiment and fit",
     )

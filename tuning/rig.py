@@ -1,4 +1,6 @@
-"""A bench under the tuner's control: bumpless holds and experiments on one loop, each of which gives a record."""
+"""A bench under the tuner's control: bumpless holds and experiments on one loop, each of which
+gives a record.
+"""
 
 import math
 from collections import deque
@@ -28,12 +30,16 @@ class DrivenBench(Protocol):
 class Rig:
     """One loop on one bench, tick by tick; it starts with the flow `leak_um_per_s`."""
 
-    def __init__(self, bench: DrivenBench, loop: LoopConfig, pump: PumpConfig, leak_um_per_s: float) -> None:
+    def __init__(
+        self, bench: DrivenBench, loop: LoopConfig, pump: PumpConfig, leak_um_per_s: float
+    ) -> None:
         self._bench = bench
         self._config, self._pump = loop, pump
         self._loop = inner_loop.InnerLoop(loop, pump)
         self.dt_s = 1 / loop.rate_hz
-        fraction = gas.PumpCurve(pump).command(leak_um_per_s, self.dt_s) if leak_um_per_s > 0 else 0.0
+        fraction = (
+            gas.PumpCurve(pump).command(leak_um_per_s, self.dt_s) if leak_um_per_s > 0 else 0.0
+        )
         self._last = bench.exchange(fraction, loop.bleed_fraction)
         self._loop.start(self._last.displacement_um, leak_um_per_s)
 
@@ -58,7 +64,9 @@ class Rig:
         begun = trial.begin_trial(spec, self._config, self._pump, 0.0)
         return self._run(trial.Trial(begun, self._config.rate_hz), spec.holding_flow_um_per_s)
 
-    def _run(self, guard: machine.Experiment, holding_flow_um_per_s: float) -> tuple[Record, machine.Finished]:
+    def _run(
+        self, guard: machine.Experiment, holding_flow_um_per_s: float
+    ) -> tuple[Record, machine.Finished]:
         flows: list[float] = []
         samples: list[machine.BenchSample] = []
         while True:
@@ -94,7 +102,8 @@ def around_of(held: Record, loop: LoopConfig, pump: PumpConfig, limit_um: float)
 
 
 def laser_noise_um(record: Record) -> float:
-    """Standard deviation of a reading, from differences of successive readings: the mirror hardly moves in a tick.
+    """Standard deviation of a reading, from differences of successive readings: the mirror hardly
+    moves in a tick.
 
     Uses the median, so that jumps do not count. Raises ValueError for fewer than two readings.
     """
@@ -104,10 +113,11 @@ def laser_noise_um(record: Record) -> float:
     return float(np.median(np.abs(steps_um)) / 0.6745 / math.sqrt(2))
 
 
-# A running hold under the tuner's control: the supervisor stays in charge; its ticks are the record.
+# A running hold under the tuner's control: the supervisor stays in charge; its ticks are the
+# record.
 #
-# Successive records have no gap: each starts with the tick after the last one taken, so that what happens
-# in between (a fit takes a second) is in the next record and not lost.
+# Successive records have no gap: each starts with the tick after the last one taken, so that what
+# happens in between (a fit takes a second) is in the next record and not lost.
 
 _FIGURE_LATE_S = 1.5  # a figure takes 0.1 s; after this long, none shows the tick
 _WITHIN = 0.1  # of a tick: figures of about its time
@@ -115,17 +125,20 @@ _FIGURES_APART_S = 0.4  # further apart, a line between them shows nothing
 
 
 class TicksByFigures:
-    """Gives the ticks of a hold without a laser the displacement that the figures show at their time.
+    """Gives the ticks of a hold without a laser the displacement that the figures show at their
+    time.
 
-    A figure shows the mirror of some time before it arrives: a tick waits for the figures before and after it. In the
-    telemetry it has the last figure that had arrived by then.
+    A figure shows the mirror of some time before it arrives: a tick waits for the figures before
+    and after it. In the telemetry it has the last figure that had arrived by then.
     """
 
     def __init__(self, config: Config) -> None:
         self._zero_um = 1e3 * config.optics.mirror.sag_mm
         self._asked_s = 1 / config.shape.track_rate_hz
         self._waiting: deque[telemetry.TelemetryRow] = deque()
-        self._shown: deque[tuple[float, float]] = deque([(-math.inf, math.nan)])  # time, displacement
+        self._shown: deque[tuple[float, float]] = deque(
+            [(-math.inf, math.nan)]
+        )  # time, displacement
         self._intervals_s: list[float] = []
 
     @property
@@ -136,7 +149,9 @@ class TicksByFigures:
     def take(
         self, rows: Sequence[telemetry.TelemetryRow], shapes: Sequence[shape_estimate.ShapeEstimate]
     ) -> list[telemetry.TelemetryRow]:
-        """Return the ticks that are complete, of these and earlier ones; NaN where no figure shows the mirror."""
+        """Return the ticks that are complete, of these and earlier ones; NaN where no figure shows
+        the mirror.
+        """
         self._waiting.extend(rows)
         for shape in shapes:
             newest_s = self._shown[-1][0]
@@ -155,10 +170,15 @@ class TicksByFigures:
     def _at(self, time_s: float) -> float:
         while len(self._shown) > 1 and self._shown[1][0] <= time_s:
             self._shown.popleft()
-        (before_s, before_um), (after_s, after_um) = self._shown[0], self._shown[min(1, len(self._shown) - 1)]
+        (before_s, before_um), (after_s, after_um) = (
+            self._shown[0],
+            self._shown[min(1, len(self._shown) - 1)],
+        )
         if not before_s <= time_s <= after_s or after_s - before_s > _FIGURES_APART_S:
             return math.nan
-        return before_um + (after_um - before_um) * (time_s - before_s) / max(after_s - before_s, 1e-9)
+        return before_um + (after_um - before_um) * (time_s - before_s) / max(
+            after_s - before_s, 1e-9
+        )
 
 
 Progress = Callable[[float], None]  # seconds of hold recorded since the last call
@@ -167,7 +187,9 @@ _ANSWER_TICKS = 500  # for the state to change after a command: 10 s at 50 Hz
 
 
 class HoldRig:
-    """Runs holds and experiments and sets gains on a running hold; every command is recorded with `who`."""
+    """Runs holds and experiments and sets gains on a running hold; every command is recorded with
+    `who`.
+    """
 
     def __init__(self, link: HoldLink, who: str, progress: Progress = lambda seconds: None) -> None:
         self._link, self._who, self._progress = link, who, progress
@@ -183,7 +205,9 @@ class HoldRig:
         self.shapes: list[shape_estimate.ShapeEstimate] = []  # all so far
 
     def hold(self, duration_s: float) -> Record:
-        """Record the next seconds of hold. Raises HoldError if the mirror is not held throughout."""
+        """Record the next seconds of hold. Raises HoldError if the
+        mirror is not held throughout.
+        """
         return self.record(self.ticks(duration_s))
 
     def ticks(self, duration_s: float) -> list[telemetry.TelemetryRow]:
@@ -191,7 +215,9 @@ class HoldRig:
         return [self._next_held() for _ in range(round(duration_s / self.dt_s))]
 
     def hold_about(self, duration_s: float) -> tuple[Record, Series]:
-        """As `hold`, with each sample's setpoint in µm, because the shape loop moves setpoint and mirror."""
+        """As `hold`, with each sample's setpoint in µm, because the shape loop moves setpoint and
+        mirror.
+        """
         rows = self.ticks(duration_s)
         record = self.record(rows)
         ticks = np.array([row.tick + row.missed_ticks for row in rows])
@@ -211,7 +237,9 @@ class HoldRig:
         rows, finished = self.performed(spec)
         return self.record(rows), finished
 
-    def performed(self, spec: trial.ExperimentSpec) -> tuple[list[telemetry.TelemetryRow], machine.Finished]:
+    def performed(
+        self, spec: trial.ExperimentSpec
+    ) -> tuple[list[telemetry.TelemetryRow], machine.Finished]:
         """As `perform`, with the ticks instead of a record."""
         self._events.clear()
         self._link.ask(Command("tune", self._who, f"tuning session: {spec.kind}", experiment=spec))
@@ -236,10 +264,12 @@ class HoldRig:
     ) -> None:
         """Set gains without a bump; on trial, the hold restores the old ones unless `keep` follows.
 
-        `shape_s`: time constant of the shape loop, `pump`: the pump's curve; NaN and None leave them. With
-        `setpoint_step_um` the trial moves the setpoint too, with the shape loop off.
+        `shape_s`: time constant of the shape loop, `pump`: the pump's curve; NaN and None leave
+        them. With `setpoint_step_um` the trial moves the setpoint too, with the shape loop off.
         """
-        told = Command("gains", self._who, why, trial_s, loop=loop, shape_time_constant_s=shape_s, pump=pump)
+        told = Command(
+            "gains", self._who, why, trial_s, loop=loop, shape_time_constant_s=shape_s, pump=pump
+        )
         self._link.ask(replace(told, setpoint_step_um=setpoint_step_um))
         self.loop, self.pump = loop, pump or self.pump
 
@@ -254,7 +284,9 @@ class HoldRig:
             self.set_gains(self.good[0], "back to the last good gains", pump=self.good[1])
 
     def end_experiment(self) -> None:
-        """End the experiment that runs, perhaps that of a session that was killed, and discard its ticks."""
+        """End the experiment that runs, perhaps that of a session that was killed, and discard its
+        ticks.
+        """
         self._take()
         if self._state != telemetry.State.TUNE:
             return
@@ -271,15 +303,20 @@ class HoldRig:
         self._rows.clear()
 
     def record(self, rows: Sequence[telemetry.TelemetryRow]) -> Record:
-        """Return ticks as an evenly sampled record; a skipped tick has no reading and keeps the flow.
+        """Return ticks as an evenly sampled record; a skipped tick has no reading and keeps the
+        flow.
 
-        Without a laser there is a reading for each figure, and further ticks are taken until they are whole ones.
+        Without a laser there is a reading for each figure, and further ticks are taken until they
+        are whole ones.
         """
         self._every = self._every or self._ticks_of_a_figure()
         rows = list(rows)
         while (
             rows
-            and round(rows[-1].tick + rows[-1].missed_ticks - rows[0].tick - rows[0].missed_ticks + 1) % self._every
+            and round(
+                rows[-1].tick + rows[-1].missed_ticks - rows[0].tick - rows[0].missed_ticks + 1
+            )
+            % self._every
         ):
             rows.append(self._next_held())
         flows: list[float] = []
@@ -290,15 +327,25 @@ class HoldRig:
             place = row.tick + row.missed_ticks
             gap = max(0, round(place - tick))
             flows += [flow] * gap
-            samples += [machine.BenchSample(math.nan, row.ambient_pressure_pa, row.air_temperature_c)] * gap
+            samples += [
+                machine.BenchSample(math.nan, row.ambient_pressure_pa, row.air_temperature_c)
+            ] * gap
             flow = row.flow_um_per_s if math.isfinite(row.flow_um_per_s) else flow
             flows.append(flow)
-            samples.append(machine.BenchSample(row.displacement_um, row.ambient_pressure_pa, row.air_temperature_c))
+            samples.append(
+                machine.BenchSample(
+                    row.displacement_um, row.ambient_pressure_pa, row.air_temperature_c
+                )
+            )
             tick = place + 1
         return Record.from_samples(self.dt_s, flows, samples).every(self._every)
 
     def _ticks_of_a_figure(self) -> int:
-        return 1 if self._figures is None else max(1, math.ceil(self._figures.interval_s / self.dt_s - _WITHIN))
+        return (
+            1
+            if self._figures is None
+            else max(1, math.ceil(self._figures.interval_s / self.dt_s - _WITHIN))
+        )
 
     def _next_held(self) -> telemetry.TelemetryRow:
         while not self._rows:
@@ -306,7 +353,8 @@ class HoldRig:
         row = self._rows[0]
         if row.state not in _HELD:
             raise HoldError(
-                f"the mirror is not held (state {telemetry.State(int(row.state)).name.lower()}): {self._why()}; "
+                "the mirror is not held (state "
+                f"{telemetry.State(int(row.state)).name.lower()}): {self._why()}; "
                 "start or resume the hold, then repeat this step"
             )
         self._progress(self.dt_s)
@@ -316,7 +364,9 @@ class HoldRig:
     def _take(self) -> None:
         news = self._link.news()
         self._state = news.rows[-1].state if news.rows else self._state
-        self._rows.extend(news.rows if self._figures is None else self._figures.take(news.rows, news.shapes))
+        self._rows.extend(
+            news.rows if self._figures is None else self._figures.take(news.rows, news.shapes)
+        )
         self._events.extend(news.events)
         self.shapes += news.shapes
 

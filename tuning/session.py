@@ -13,7 +13,15 @@ from membrane_ctrl.config import schema
 from membrane_ctrl.control.experiments import machine
 from membrane_ctrl.model import errors, files
 from membrane_ctrl.sessions import folder, live_hold
-from tuning.gains_file import GainsFile, PlantSection, Traded, for_hold, load_gains, require_sound, save_gains
+from tuning.gains_file import (
+    GainsFile,
+    PlantSection,
+    Traded,
+    for_hold,
+    load_gains,
+    require_sound,
+    save_gains,
+)
 from tuning.identification import characterise, identify, loop_model
 from tuning.identification.disturbance import DisturbanceModel, observe
 from tuning.proposal import candidates, design, prediction, verify
@@ -76,11 +84,16 @@ class Verified:
 
 
 class PumpUnknownError(errors.RejectedError):
-    """The experiments fail, or contradict themselves, in a way that the pump's curve may explain."""
+    """The experiments fail, or contradict themselves, in a way that
+    the pump's curve may explain.
+    """
 
 
 def characterise_step(
-    session: folder.SessionFolder, rig: HoldRig, limit_um: float = 10.0, plan: characterise.Plan = characterise.FULL
+    session: folder.SessionFolder,
+    rig: HoldRig,
+    limit_um: float = 10.0,
+    plan: characterise.Plan = characterise.FULL,
 ) -> characterise.Experiments:
     """Run the experiments on the mirror. Raises RejectedError with a remedy if none completes.
 
@@ -106,7 +119,9 @@ def experiments_of(session: folder.SessionFolder) -> characterise.Experiments:
     """Results of the experiments."""
     head = session.result("characterise", "experiments.json", ExperimentsHead)
     record = loop_model.load_record(session.file("experiments.npz"))
-    return characterise.Experiments(head.around, record, head.relays_s, head.pulses_s, head.finished)
+    return characterise.Experiments(
+        head.around, record, head.relays_s, head.pulses_s, head.finished
+    )
 
 
 def identify_step(session: folder.SessionFolder) -> IdentifiedPlant:
@@ -128,12 +143,18 @@ def found_of(session: folder.SessionFolder) -> IdentifiedPlant:
     record = experiments_of(session).record
     steps = len(record) - 1
     if found.data_sha256 != record.sha256() or found.identified.residual_um.shape != (steps,):
-        raise errors.InputError(f"{session.path}: identified.json comes from other experiments; run identify again")
+        raise errors.InputError(
+            f"{session.path}: identified.json comes from other experiments; run identify again"
+        )
     return found
 
 
-def observe_step(session: folder.SessionFolder, rig: HoldRig, duration_s: float = OBSERVE_S) -> DisturbanceModel:
-    """Observe a quiet hold, in a short session the one before its experiments: laser noise and weather."""
+def observe_step(
+    session: folder.SessionFolder, rig: HoldRig, duration_s: float = OBSERVE_S
+) -> DisturbanceModel:
+    """Observe a quiet hold, in a short session the one before its experiments: laser noise and
+    weather.
+    """
     model = found_of(session).identified.model
     session.begin("observe")
     held = session.file(_HELD)
@@ -152,11 +173,14 @@ def disturbance_of(session: folder.SessionFolder) -> DisturbanceModel:
     return session.result("observe", "disturbance.json", DisturbanceModel)
 
 
-_WALK_RAD_PER_S = 1.0  # where the estimate weighs the weather sensors against what it expects of the weather
+# where the estimate weighs the weather sensors against what it expects of the weather
+_WALK_RAD_PER_S = 1.0
 
 
 def estimator_of(session: folder.SessionFolder) -> dict[str, float]:
-    """What the session measured of `[estimator]`: the pump, and noise and unrest of the sensors that are there."""
+    """What the session measured of `[estimator]`: the pump, and noise and unrest of the sensors
+    that are there.
+    """
     model, seen = found_of(session).identified.model, disturbance_of(session)
     levels = {"pump_delay_s": model.dead_time_s, "pump_lag_s": model.lag_s}
     if not session.config.by_optics:  # a figure states its own noise
@@ -174,17 +198,23 @@ def estimator_of(session: folder.SessionFolder) -> dict[str, float]:
 
 
 def design_step(session: folder.SessionFolder, reason: str = "tuning session") -> GainsFile:
-    """Compute the candidates and propose gains. Raises RejectedError if the data do not support a proposal."""
+    """Compute the candidates and propose gains. Raises RejectedError if the data do not support a
+    proposal.
+    """
     found, disturbance = found_of(session), disturbance_of(session)
     session.begin("design")
     before = session.head.before
     try:
-        made = design.propose(found.identified, disturbance, before, session.config.pump, found.quality)
+        made = design.propose(
+            found.identified, disturbance, before, session.config.pump, found.quality
+        )
     except design.RefusedError as error:
         raise errors.RejectedError(f"design: {error}") from None
     assert made.chosen.predicted is not None  # a proposal keeps its margins
     if not math.isfinite(made.chosen.predicted.std_um + made.least_std_um):
-        raise errors.RejectedError("design: cannot predict a std from this noise and weather: observe again")
+        raise errors.RejectedError(
+            "design: cannot predict a std from this noise and weather: observe again"
+        )
     gains = GainsFile(
         author=session.head.author,
         date_utc=session.head.created_utc,
@@ -196,7 +226,9 @@ def design_step(session: folder.SessionFolder, reason: str = "tuning session") -
         plant=PlantSection.of(found.identified),
         loop=made.loop,
     )
-    files.write_text_atomic(files.users(session.file("candidates.md")), design.table(made.candidates) + "\n")
+    files.write_text_atomic(
+        files.users(session.file("candidates.md")), design.table(made.candidates) + "\n"
+    )
     kept = Design(made.candidates, made.least_std_um, made.preview, made.robustness)
     folder.write(session.file("proposal.json"), kept)
     save_gains(session.file("gains.toml"), gains)
@@ -212,14 +244,18 @@ EDITED = "edited"  # gains of a file edited by hand
 
 
 def offered(session: folder.SessionFolder) -> tuple[tuple[design.Candidate, ...], design.Candidate]:
-    """The candidates, and the one in `gains.toml`, which is a further one if that was edited by hand."""
+    """The candidates, and the one in `gains.toml`, which is a further one if that was edited by
+    hand.
+    """
     rows, loop = design_of(session).candidates, load_gains(session.file("gains.toml")).loop
     gains = loop_model.Gains.of(loop)
     for row in rows:
         if row.gains == gains:
             return rows, row
     model = found_of(session).identified.model
-    edited = design.candidate(EDITED, gains, model, disturbance_of(session), loop, candidates.Demands())
+    edited = design.candidate(
+        EDITED, gains, model, disturbance_of(session), loop, candidates.Demands()
+    )
     return (*rows, edited), edited
 
 
@@ -227,17 +263,23 @@ def choices(session: folder.SessionFolder) -> tuple[str, ...]:
     """Names of the candidates that may be applied, the proposed one first."""
     rows, now = offered(session)
     ordered = sorted(rows, key=lambda row: row is not now)
-    return tuple(row.name for row in ordered if row.name != design.PRESENT and not design.refusal(row))
+    return tuple(
+        row.name for row in ordered if row.name != design.PRESENT and not design.refusal(row)
+    )
 
 
 def choose(session: folder.SessionFolder, name: str) -> None:
-    """Put a candidate into `gains.toml`. Raises InputError if it is unknown or must not be applied."""
+    """Put a candidate into `gains.toml`. Raises InputError if it is
+    unknown or must not be applied.
+    """
     rows, now = offered(session)
     known = {row.name: row for row in rows if row.name != design.PRESENT}
     if name == design.SAME_LOAD and name not in known:
         name = design.NAMES[0]  # answers a step of the leak no worse
     if name not in known:
-        raise errors.InputError(f"{name}: not a candidate of {session.path.name}; known: {', '.join(known)}")
+        raise errors.InputError(
+            f"{name}: not a candidate of {session.path.name}; known: {', '.join(known)}"
+        )
     if why := design.refusal(row := known[name]):
         raise errors.InputError(f"{name}: is not applied: {why}")
     assert row.predicted is not None  # else refused
@@ -258,14 +300,19 @@ def traded(session: folder.SessionFolder) -> Traded:
 
 
 def preview_step(session: folder.SessionFolder) -> Previewed:
-    """Simulate present and proposed gains on the fitted twin with its one-sided pump, for several weather seeds."""
+    """Simulate present and proposed gains on the fitted twin with its one-sided pump, for several
+    weather seeds.
+    """
     session.require("design")
     found, disturbance = found_of(session), disturbance_of(session)
     gains = load_gains(session.file("gains.toml"))
     session.begin("preview")
     pump, model = session.config.pump, found.identified.model
     present, proposed = (
-        tuple(prediction.preview(loop, pump, model, disturbance, seed) for seed in range(1, _PREVIEW_SEEDS + 1))
+        tuple(
+            prediction.preview(loop, pump, model, disturbance, seed)
+            for seed in range(1, _PREVIEW_SEEDS + 1)
+        )
         for loop in (session.head.before, gains.loop)
     )
     done = Previewed(present, proposed)
@@ -302,7 +349,9 @@ def verify_step(
     told: Callable[[verify.Stage], None] = lambda stage: None,
     stages: tuple[tuple[float, float], ...] = verify.STAGES,
 ) -> Verified:
-    """Hold with the new gains and judge them in stages; keep them, or restore the old ones at once."""
+    """Hold with the new gains and judge them in stages; keep them,
+    or restore the old ones at once.
+    """
     session.require("apply")
     after, before = checked_gains(session), session.head.before
     accepted = load_gains(session.file("gains.toml")).candidate == offered(session)[1].name

@@ -1,9 +1,10 @@
 """Drivers of devices, each of which fills a role of `roles.py`; and those of other packages.
 
-A package names its driver in the entry point group of its kind, and an emulator of the device in the group of its
-emulators (docs/new-device.md). The drivers of this package that are made from their settings alone, and those of
-cameras and screens, are entry points as well, listed below. Only an installed package is ever executed, and only when
-a configuration names it: no configuration, run folder or working folder can name a file.
+A package names its driver in the entry point group of its kind, and an emulator of the device in
+the group of its emulators (docs/new-device.md). The drivers of this package that are made from
+their settings alone, and those of cameras and screens, are entry points as well, listed below. Only
+an installed package is ever executed, and only when a configuration names it: no configuration, run
+folder or working folder can name a file.
 """
 
 from dataclasses import dataclass
@@ -15,7 +16,9 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, slots=True)
 class DriverKind:
-    """A kind of driver: its name for people, its entry point groups, and the drivers of this package in the first."""
+    """A kind of driver: its name for people, its entry point groups, and the drivers of this
+    package in the first.
+    """
 
     name: str
     group: str
@@ -77,8 +80,12 @@ def load_driver(name: str, kind: DriverKind) -> Any:
 
 
 def load_emulator(name: str, kind: DriverKind) -> Any:
-    """Import the emulator class of the device of this driver. Raises ValueError as `load_driver`."""
-    return _load(name, f"{kind.name.removesuffix('driver')}emulator", list_installed(kind.emulators))
+    """Import the emulator class of the device of this driver.
+    Raises ValueError as `load_driver`.
+    """
+    return _load(
+        name, f"{kind.name.removesuffix('driver')}emulator", list_installed(kind.emulators)
+    )
 
 
 def has_emulator(name: str, kind: DriverKind) -> bool:
@@ -90,7 +97,9 @@ def _load(name: str, what: str, entries: list["EntryPoint"]) -> Any:
     found = [entry for entry in entries if entry.name == name]
     if not found:
         known = ", ".join(entry.name for entry in entries) or "none"
-        raise ValueError(f"no {what} {name!r} is installed; installed: {known} (docs/new-device.md)")
+        raise ValueError(
+            f"no {what} {name!r} is installed; installed: {known} (docs/new-device.md)"
+        )
     if len(found) > 1:
         packages = " and ".join(entry.dist.name if entry.dist else entry.value for entry in found)
         raise ValueError(f"{packages} both install a {what} {name!r}; uninstall one")

@@ -1,7 +1,8 @@
 """Bronkhorst EL-FLOW and EL-PRESS, whichever protocol they speak.
 
-Parameters have a process and a number; Modbus and ProPar are two ways to reach them. Sources: manual 9.17.027 (RS232
-interface, ProPar), 9.17.035 (Modbus slave interface, section 4.4.6: parameters), 9.17.023 (meaning of parameters).
+Parameters have a process and a number; Modbus and ProPar are two ways to reach them. Sources:
+manual 9.17.027 (RS232 interface, ProPar), 9.17.035 (Modbus slave interface, section 4.4.6:
+parameters), 9.17.023 (meaning of parameters).
 """
 
 import contextlib
@@ -15,7 +16,10 @@ from firmware_iface.roles import DeviceIdentity, DeviceRefusedError, LinkDownErr
 
 FULL_SCALE = 32_000  # of measure and setpoint: 100 %
 BUS_SETPOINT = 0  # control mode: the setpoint comes over the interface
-FLOW_CONTROLLERS = ("DMFC", "DLFC")  # device type (113, 1) of an EL-FLOW, and of its sister for liquids
+FLOW_CONTROLLERS = (
+    "DMFC",
+    "DLFC",
+)  # device type (113, 1) of an EL-FLOW, and of its sister for liquids
 PRESSURE_INSTRUMENTS = ("DEPC", "DEPM")  # EL-PRESS controller and meter
 # a pressure "(a)" against vacuum would be 1e5 Pa off
 _GAUGE_UNITS_PA = {
@@ -32,7 +36,9 @@ _GAUGE_UNITS_PA = {
 
 @dataclass(frozen=True, slots=True)
 class InstrumentParameter:
-    """One value of an instrument; `kind` is "u8", "u16", "f32" or "text", `chars` the length of a text."""
+    """One value of an instrument; `kind` is "u8", "u16", "f32" or "text", `chars` the length of a
+    text.
+    """
 
     name: str
     process: int
@@ -87,8 +93,8 @@ class ParameterPort(Protocol):
 async def identify(port: ParameterPort, types: tuple[str, ...], serial: str) -> DeviceIdentity:
     """Connect and identify the instrument.
 
-    Raises DeviceRefusedError: another type of instrument, or another serial number than `serial` (if that is not
-    empty).
+    Raises DeviceRefusedError: another type of instrument, or another serial number than `serial`
+    (if that is not empty).
     """
     await port.connect()
     found = await port.text(DEVICE_TYPE)
@@ -98,16 +104,21 @@ async def identify(port: ParameterPort, types: tuple[str, ...], serial: str) -> 
             f"{port.name}: a {found or 'nameless device'} answers, expected {' or '.join(types)}"
         )
     if serial and number != serial:
-        raise DeviceRefusedError(f"{port.name}: serial number {number} answers, but the configuration names {serial}")
+        raise DeviceRefusedError(
+            f"{port.name}: serial number {number} answers, but the configuration names {serial}"
+        )
     firmware = await port.text(FIRMWARE)
     capacity, unit = await port.number(CAPACITY), await port.text(CAPACITY_UNIT)
     if not (math.isfinite(capacity) and capacity > 0):
-        raise DeviceRefusedError(f"{port.name}: capacity {capacity:g} {unit}; the instrument is not set up")
+        raise DeviceRefusedError(
+            f"{port.name}: capacity {capacity:g} {unit}; the instrument is not set up"
+        )
     return DeviceIdentity(f"Bronkhorst {found}", number, firmware, f"0 .. {capacity:g} {unit}")
 
 
 class BronkhorstFlow:
-    """An EL-FLOW as the pump: fraction 1 is its capacity. Only the instrument `serial` is accepted; empty: any.
+    """An EL-FLOW as the pump: fraction 1 is its capacity. Only the instrument `serial` is accepted;
+    empty: any.
 
     It has no watchdog: without a host it continues with its last setpoint.
     """
@@ -117,13 +128,17 @@ class BronkhorstFlow:
         self._serial = serial
 
     async def open(self) -> DeviceIdentity:
-        """Identify it, close its valve, take the control mode "bus". Raises LinkError, DeviceRefusedError."""
+        """Identify it, close its valve, take the control mode "bus". Raises LinkError,
+        DeviceRefusedError.
+        """
         identity = await identify(self._port, FLOW_CONTROLLERS, self._serial)
         await self._port.write(SETPOINT, 0)
         await self._port.write(CONTROL_MODE, BUS_SETPOINT)
         mode = await self._port.number(CONTROL_MODE)
         if mode != BUS_SETPOINT:
-            raise DeviceRefusedError(f"{self._port.name}: control mode stays {mode:g}, expected {BUS_SETPOINT}")
+            raise DeviceRefusedError(
+                f"{self._port.name}: control mode stays {mode:g}, expected {BUS_SETPOINT}"
+            )
         return identity
 
     async def set_pump(self, fraction: float) -> None:
@@ -138,19 +153,27 @@ class BronkhorstFlow:
 
     async def close(self) -> None:
         """Close the valve and disconnect. Never raises."""
-        with contextlib.suppress(LinkError):  # out of reach: it keeps its last setpoint (see the class)
+        with contextlib.suppress(
+            LinkError
+        ):  # out of reach: it keeps its last setpoint (see the class)
             await self._port.write(SETPOINT, 0)
         await self._port.close()
 
     def describe(self) -> dict[str, str]:
         """Port, settings, manual."""
-        return {**self._port.describe(), "watchdog": "none of its own: keeps its last setpoint without a host"}
+        return {
+            **self._port.describe(),
+            "watchdog": "none of its own: keeps its last setpoint without a host",
+        }
 
 
 class BronkhorstPressure:
-    """An EL-PRESS as the gauge pressure sensor. Only the instrument `serial` is accepted; empty: any."""
+    """An EL-PRESS as the gauge pressure sensor. Only the instrument `serial` is accepted; empty:
+    any.
+    """
 
-    # slightly below zero (noise), above full scale up to the sensor's limit (131.07 % of 32000 is 41942)
+    # slightly below zero (noise), above full scale up to the sensor's limit (131.07 % of 32000 is
+    # 41942)
     _FRACTIONS = (-0.1, 1.3107)
 
     def __init__(self, port: ParameterPort, serial: str = "") -> None:
@@ -165,7 +188,8 @@ class BronkhorstPressure:
         unit = await self._port.text(CAPACITY_UNIT)
         if unit not in _GAUGE_UNITS_PA:
             raise DeviceRefusedError(
-                f"{self._port.name}: its unit is {unit!r}; set it to a gauge pressure, for example mbar(g)"
+                f"{self._port.name}: its unit is {unit!r}; set it to a gauge pressure, for "
+                "example mbar(g)"
             )
         self._unit_pa = _GAUGE_UNITS_PA[unit]
         self._full_pa = await self._port.number(CAPACITY) * self._unit_pa
@@ -179,7 +203,10 @@ class BronkhorstPressure:
         if math.isnan(self._full_pa):
             raise LinkDownError(f"{self._port.name}: not open")
         if not low * self._full_pa <= value_pa <= high * self._full_pa:
-            raise LinkError(f"{self._port.name}: {value_pa:g} Pa is not within its range of {self._full_pa:g} Pa")
+            raise LinkError(
+                f"{self._port.name}: {value_pa:g} Pa is not within its range of "
+                f"{self._full_pa:g} Pa"
+            )
         return value_pa
 
     async def close(self) -> None:
@@ -193,9 +220,9 @@ class BronkhorstPressure:
 
 # Bronkhorst parameters over Modbus.
 #
-# Source: manual 9.17.035, section 4.4.6. Bytes and words of process p, parameter n have a register of their own at 32
-# p + n; everything longer is in eight registers from 0x8000 + 256 p + 8 n, the big word first, texts two characters a
-# register.
+# Source: manual 9.17.035, section 4.4.6. Bytes and words of process p, parameter n have a register
+# of their own at 32 p + n; everything longer is in eight registers from 0x8000 + 256 p + 8 n, the
+# big word first, texts two characters a register.
 
 MANUAL = "Bronkhorst 9.17.035, section 4.4.6"
 
@@ -242,7 +269,9 @@ class ModbusParameters:
         try:
             return await self._link.read_holding(address, count)
         except DeviceRefusedError as error:
-            raise DeviceRefusedError(f"{error}; not a Bronkhorst, or one without {parameter.name}") from error
+            raise DeviceRefusedError(
+                f"{error}; not a Bronkhorst, or one without {parameter.name}"
+            ) from error
 
     async def write(self, parameter: InstrumentParameter, value: int) -> None:
         """Write one register; the echo carries address and value back. Raises LinkError."""

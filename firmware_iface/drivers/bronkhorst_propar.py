@@ -1,8 +1,8 @@
 """Bronkhorst parameters over ProPar on a serial line, in its binary form.
 
-Source: manual 9.17.027. Binary, because its messages carry a sequence number: an answer is never taken for that of
-another question. ProPar lacks a checksum. So every number is requested three times in one message, and written
-values are read back; a flipped bit then makes the answers differ.
+Source: manual 9.17.027. Binary, because its messages carry a sequence number: an answer is never
+taken for that of another question. ProPar lacks a checksum. So every number is requested three
+times in one message, and written values are read back; a flipped bit then makes the answers differ.
 """
 
 import struct
@@ -13,10 +13,11 @@ from firmware_iface.drivers.bronkhorst import MEASURE, InstrumentParameter
 from firmware_iface.links import exchange, serial_port
 from firmware_iface.roles import DeviceRefusedError, LinkError
 
-# ProPar messages (Bronkhorst, manual 9.17.027): data of requests and answers, and the two ways to frame them.
+# ProPar messages (Bronkhorst, manual 9.17.027): data of requests and answers, and the two ways to
+# frame them.
 #
-# Binary: DLE STX sequence node length data DLE ETX, a DLE inside doubled (section 3.6). ASCII: a colon, then
-# length + 1, node and data as hexadecimal, CR LF (section 3.5). Neither has a checksum.
+# Binary: DLE STX sequence node length data DLE ETX, a DLE inside doubled (section 3.6). ASCII: a
+# colon, then length + 1, node and data as hexadecimal, CR LF (section 3.5). Neither has a checksum.
 
 
 STATUS, WRITE, VALUES, REQUEST = 0, 1, 2, 4  # commands: status, write with answer, values, request
@@ -58,7 +59,11 @@ def binary_frame(message: ProparMessage) -> bytes:
 
 def ascii_frame(message: ProparMessage) -> bytes:
     """As sent in ASCII."""
-    return b":%02X%02X%s\r\n" % (len(message.data) + 1, message.node, message.data.hex().upper().encode())
+    return b":%02X%02X%s\r\n" % (
+        len(message.data) + 1,
+        message.node,
+        message.data.hex().upper().encode(),
+    )
 
 
 def split_binary(heard: bytes) -> tuple[list[ProparMessage], bytes]:
@@ -89,12 +94,15 @@ def parse_ascii(line: bytes) -> ProparMessage | None:
 
 
 def request(parameters: Sequence[InstrumentParameter]) -> bytes:
-    """Data that asks for parameters of one process or several, each under its place in the list as its index."""
+    """Data that asks for parameters of one process or several, each under its place in the list as
+    its index.
+    """
     data = bytearray([REQUEST])
     for place, parameter in enumerate(parameters):
         more = 0x80 if place + 1 < len(parameters) else 0
         kind = _TYPES[parameter.kind]
-        # each parameter has its own process group: the place is both the group's and the parameter's index
+        # each parameter has its own process group: the place is both the group's and the
+        # parameter's index
         data += bytes([place | more, place | kind, parameter.process, parameter.number | kind])
         if parameter.kind == "text":
             data.append(parameter.chars)
@@ -104,11 +112,14 @@ def request(parameters: Sequence[InstrumentParameter]) -> bytes:
 def write_data(parameter: InstrumentParameter, value: int) -> bytes:
     """Data that writes a number and wants an answer."""
     kind = _TYPES[parameter.kind]
-    return bytes([WRITE, parameter.process, parameter.number | kind]) + struct.pack(_PROPAR_FORMATS[kind], value)
+    return bytes([WRITE, parameter.process, parameter.number | kind]) + struct.pack(
+        _PROPAR_FORMATS[kind], value
+    )
 
 
 def values(data: bytes) -> list[tuple[int, int, bytes]]:
-    """Index of process, index of parameter and raw value of each parameter in data of an answer or a write.
+    """Index of process, index of parameter and raw value of each parameter in data of an answer or
+    a write.
 
     Raises ValueError when the data do not add up.
     """
@@ -151,9 +162,13 @@ _FORMATS = {"u8": ">B", "u16": ">H", "f32": ">f"}
 
 
 class ProparParameters:
-    """Parameters of one instrument on its own line; node 128 is whichever is at the end of the cable."""
+    """Parameters of one instrument on its own line; node 128 is whichever is at the end of the
+    cable.
+    """
 
-    def __init__(self, port: serial_port.SerialPort, node: int = 128, timeout_s: float = 0.2) -> None:
+    def __init__(
+        self, port: serial_port.SerialPort, node: int = 128, timeout_s: float = 0.2
+    ) -> None:
         self._port = port
         self._node = node
         self._timeout_s = timeout_s
@@ -182,14 +197,18 @@ class ProparParameters:
         """A text that arrived twice the same. Raises LinkError."""
         first, second = (await self._asked(parameter))[0], (await self._asked(parameter))[0]
         if first != second:
-            raise LinkError(f"{self.name}: {parameter.name} read as {first!r}, then as {second!r}; noise")
+            raise LinkError(
+                f"{self.name}: {parameter.name} read as {first!r}, then as {second!r}; noise"
+            )
         return first.split(b"\0")[0].decode("ascii", "replace").strip()
 
     async def write(self, parameter: InstrumentParameter, value: int) -> None:
         """Write, and read back. Raises LinkError."""
         answer = await self._transact(write_data(parameter, value), f"writing {parameter.name}")
         if answer[0] != STATUS:
-            raise LinkError(f"{self.name}: writing {parameter.name}: command {answer[0]} instead of a status")
+            raise LinkError(
+                f"{self.name}: writing {parameter.name}: command {answer[0]} instead of a status"
+            )
         found = await self.number(parameter)
         if found != value:
             raise LinkError(f"{self.name}: {parameter.name} written {value}, read back {found:g}")

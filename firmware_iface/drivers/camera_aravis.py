@@ -2,9 +2,9 @@
 
 Standards: GenICam SFNC 2.7 (features' names), GigE Vision 2.0, USB3 Vision 1.1; aravis 0.8 manual.
 
-A software trigger starts every exposure, so that a frame belongs to the pattern on the screen. An incomplete frame is
-counted as lost. After a timeout the stream is restarted, as a late frame would be taken for
-the answer to the next trigger.
+A software trigger starts every exposure, so that a frame belongs to the pattern on the screen. An
+incomplete frame is counted as lost. After a timeout the stream is restarted, as a late frame would
+be taken for the answer to the next trigger.
 """
 
 import ctypes
@@ -24,7 +24,12 @@ _BUFFERS = 3
 _SOCKET_BYTES = 8 << 20
 # A newly started stream misses the first trigger (seen on loopback without this)
 _STREAM_READY_S = 0.2
-_AUTO_OFF, _CONTINUOUS, _ADJUST_NEVER, _NO_PACKET_SOCKET = 0, 0, 0, 1  # arvenums.h, arvgvdevice.h, arvgvstream.h
+_AUTO_OFF, _CONTINUOUS, _ADJUST_NEVER, _NO_PACKET_SOCKET = (
+    0,
+    0,
+    0,
+    1,
+)  # arvenums.h, arvgvdevice.h, arvgvstream.h
 _RANGE_CHECKED = 1  # arvdevice.h; by default the library writes values outside the camera's range
 _SUCCESS = 0  # ArvBufferStatus
 _REAL_TIME = roles.DriverClock()
@@ -34,7 +39,9 @@ _TAKEN = (arv.NOT_CONTROLLER, arv.ACCESS_DENIED, arv.BUSY)
 
 @dataclass(slots=True)
 class FrameCounts:
-    """Results of the triggers: `taken` whole, `incomplete`, `missing` (no frame came), and `reconnects`."""
+    """Results of the triggers: `taken` whole, `incomplete`, `missing` (no frame came), and
+    `reconnects`.
+    """
 
     taken: int = 0
     incomplete: int = 0
@@ -49,7 +56,10 @@ class AravisCamera:
     """
 
     def __init__(
-        self, config: settings.AravisCameraConfig, sensor: roles.SensorFormat, clock: roles.DriverClock = _REAL_TIME
+        self,
+        config: settings.AravisCameraConfig,
+        sensor: roles.SensorFormat,
+        clock: roles.DriverClock = _REAL_TIME,
     ) -> None:
         self.config = config
         self.counts = FrameCounts()
@@ -64,8 +74,8 @@ class AravisCamera:
     def open(self) -> roles.DeviceIdentity:
         """Connect, apply the settings, read them back, start the stream.
 
-        Raises LinkError (no library, no camera, camera in use), DeviceRefusedError (a setting that the camera does
-        not take).
+        Raises LinkError (no library, no camera, camera in use), DeviceRefusedError (a setting that
+        the camera does not take).
         """
         self.close()
         library, config = arv.aravis(), self.config
@@ -85,7 +95,8 @@ class AravisCamera:
         return identity
 
     def expose(self, out: roles.Pixels | None = None) -> None:
-        """Trigger, and return when the exposure is over: the screen may change while the frame is transferred.
+        """Trigger, and return when the exposure is over: the screen may change while the frame is
+        transferred.
 
         Raises LinkError without a camera.
         """
@@ -108,8 +119,8 @@ class AravisCamera:
     def fetch(self) -> roles.Frame:
         """The frame of the last `expose`, in its `out` if one was given.
 
-        Raises FrameLostError (it did not come, or not whole: show the pattern again and expose again), LinkError
-        (nothing was exposed).
+        Raises FrameLostError (it did not come, or not whole: show the pattern again and expose
+        again), LinkError (nothing was exposed).
         """
         if self._pending is None or self._stream is None:
             raise roles.LinkError(f"{self._name}: no exposure to fetch")
@@ -120,13 +131,16 @@ class AravisCamera:
         if not buffer:
             self.counts.missing += 1
             self._restart()
-            raise roles.FrameLostError(f"{self._name}: no frame within {self.config.timeout_s:g} s of its trigger")
+            raise roles.FrameLostError(
+                f"{self._name}: no frame within {self.config.timeout_s:g} s of its trigger"
+            )
         try:
             status = library.call("arv_buffer_get_status", buffer)
             if status != _SUCCESS:
                 self.counts.incomplete += 1
                 raise roles.FrameLostError(
-                    f"{self._name}: frame not whole (aravis status {status}); cable, packet size, other traffic?"
+                    f"{self._name}: frame not whole (aravis status {status}); cable, packet "
+                    "size, other traffic?"
                 )
             frame = roles.Frame(self._pixels(buffer, out), time_s)
         finally:
@@ -142,11 +156,15 @@ class AravisCamera:
         self._camera = self._pending = None
 
     def _abandon(self) -> None:
-        """Drop a camera that does not answer, in a thread, as the library takes 10 s to close it."""
+        """Drop a camera that does not answer, in a thread,
+        as the library takes 10 s to close it.
+        """
         left = [instance for instance in (self._stream, self._camera) if instance is not None]
         self._stream = self._camera = self._pending = None
         unref = arv.aravis().call
-        threading.Thread(target=lambda: [unref("g_object_unref", instance) for instance in left], daemon=True).start()
+        threading.Thread(
+            target=lambda: [unref("g_object_unref", instance) for instance in left], daemon=True
+        ).start()
 
     def describe(self) -> dict[str, str]:
         """For people: where, settings, what was lost."""
@@ -155,7 +173,8 @@ class AravisCamera:
             "port": config.camera or "first GenICam camera",
             "settings": f"{self._size[0]} x {self._size[1]} {config.pixel_format}, "
             f"{config.exposure_ms:g} ms, {config.gain_db:g} dB",
-            "frames": f"{counts.taken} taken, {counts.incomplete} incomplete, {counts.missing} missing, "
+            "frames": f"{counts.taken} taken, {counts.incomplete} incomplete, {counts.missing} "
+            "missing, "
             f"{counts.reconnects} reconnects",
             "manual": "GenICam SFNC 2.7; aravis 0.8",
         }
@@ -169,11 +188,15 @@ class AravisCamera:
         return roles.DeviceIdentity(f"{vendor} {model}", serial, "", self.describe()["settings"])
 
     def _look_whether_ours(self) -> None:
-        """Check control: a GigE Vision camera lets anyone read, but ignores writes except its controller's."""
+        """Check control: a GigE Vision camera lets anyone read, but ignores writes except its
+        controller's.
+        """
         call = arv.aravis().call
         device = call("arv_camera_get_device", self._camera)
         call("arv_device_set_range_check_policy", device, _RANGE_CHECKED)
-        if call("arv_camera_is_gv_device", self._camera) and not call("arv_gv_device_is_controller", device):
+        if call("arv_camera_is_gv_device", self._camera) and not call(
+            "arv_gv_device_is_controller", device
+        ):
             raise arv.AravisError("another controller", arv.NOT_CONTROLLER)
 
     def _apply(self) -> None:
@@ -193,15 +216,17 @@ class AravisCamera:
         size = tuple(number.value for number in region)
         self._must_be("x, y, width and height in px", size, (0, 0, *self._size))
         call("arv_camera_set_acquisition_mode", camera, _CONTINUOUS)
-        # every trigger of the camera is cleared first; the library finds the selector that exists (FrameStart, or
-        # only FrameBurstStart as on Hikrobot's cameras)
+        # every trigger of the camera is cleared first; the library finds the selector that exists
+        # (FrameStart, or only FrameBurstStart as on Hikrobot's cameras)
         call("arv_camera_set_trigger", camera, b"Software")
         self._must_be("trigger source", call("arv_camera_get_trigger_source", camera), b"Software")
         if call("arv_camera_is_exposure_auto_available", camera):
             call("arv_camera_set_exposure_time_auto", camera, _AUTO_OFF)
         call("arv_camera_set_exposure_time", camera, 1000.0 * config.exposure_ms)
         exposure_ms = call("arv_camera_get_exposure_time", camera) / 1000.0
-        if abs(exposure_ms - config.exposure_ms) > max(0.02 * config.exposure_ms, 0.02):  # sensors count in lines
+        if abs(exposure_ms - config.exposure_ms) > max(
+            0.02 * config.exposure_ms, 0.02
+        ):  # sensors count in lines
             self._must_be("exposure_ms", exposure_ms, config.exposure_ms)
         if call("arv_camera_is_gain_auto_available", camera):
             call("arv_camera_set_gain_auto", camera, _AUTO_OFF)
@@ -223,7 +248,9 @@ class AravisCamera:
         library, camera = arv.aravis(), self._camera
         gige = bool(library.call("arv_camera_is_gv_device", camera))
         if gige:
-            library.call("arv_camera_gv_set_stream_options", camera, _NO_PACKET_SOCKET)  # packet sockets need root
+            library.call(
+                "arv_camera_gv_set_stream_options", camera, _NO_PACKET_SOCKET
+            )  # packet sockets need root
             if self.config.packet_bytes:
                 library.call("arv_camera_gv_set_packet_size_adjustment", camera, _ADJUST_NEVER)
                 library.call("arv_camera_gv_set_packet_size", camera, self.config.packet_bytes)
@@ -241,7 +268,9 @@ class AravisCamera:
         self._throw_one_away()
 
     def _throw_one_away(self) -> None:
-        """The first frame after a start may be exposed up to 0.1 s after its trigger, with the next pattern lit."""
+        """The first frame after a start may be exposed up to 0.1 s after its trigger, with the next
+        pattern lit.
+        """
         library = arv.aravis()
         library.call("arv_camera_software_trigger", self._camera)
         wait_us = round(1e6 * (self.config.timeout_s + self.config.exposure_ms / 1000.0))
@@ -258,7 +287,9 @@ class AravisCamera:
         self._stream = None
 
     def _discard_pending(self) -> None:
-        """Wait for the frame of an exposure that was not fetched: later it would answer the next trigger."""
+        """Wait for the frame of an exposure that was not fetched: later it would answer the next
+        trigger.
+        """
         self._pending = None
         library = arv.aravis()
         timeout_us = round(1e6 * self.config.timeout_s)
@@ -269,7 +300,9 @@ class AravisCamera:
             self._restart()
 
     def _restart(self) -> None:
-        """A new stream to the same camera; a new connection if that fails (at the next exposure)."""
+        """A new stream to the same camera; a new connection if that
+        fails (at the next exposure).
+        """
         self._stop_stream()
         try:
             self._start_stream()
@@ -280,24 +313,31 @@ class AravisCamera:
         """Copy a whole frame's pixels."""
         library = arv.aravis()
         found = tuple(
-            library.call(f"arv_buffer_get_image_{word}", buffer) for word in ("height", "width", "pixel_format")
+            library.call(f"arv_buffer_get_image_{word}", buffer)
+            for word in ("height", "width", "pixel_format")
         )
         height_px, width_px = self._size[::-1]
         if found != (height_px, width_px, self._format):
-            raise roles.LinkError(f"{self._name}: sent a frame of {found[1]} x {found[0]}, format {found[2]:#x}")
+            raise roles.LinkError(
+                f"{self._name}: sent a frame of {found[1]} x {found[0]}, format {found[2]:#x}"
+            )
         wide = (self._format >> 16) & 0xFF > 8  # bits a pixel, in the format's number
         dtype: np.dtype[Any] = np.dtype(np.uint16 if wide else np.uint8)
         size = ctypes.c_size_t()
         start = library.call("arv_buffer_get_data", buffer, ctypes.byref(size))
         count = height_px * width_px
         if size.value < count * dtype.itemsize:
-            raise roles.LinkError(f"{self._name}: sent {size.value} bytes instead of {count * dtype.itemsize}")
+            raise roles.LinkError(
+                f"{self._name}: sent {size.value} bytes instead of {count * dtype.itemsize}"
+            )
         memory = memoryview((ctypes.c_char * (count * dtype.itemsize)).from_address(start))
         seen: roles.Pixels = np.ndarray(count, dtype, memory).reshape(height_px, width_px)
         if out is None:
             return seen.copy()
         if out.shape != seen.shape or out.dtype != seen.dtype:
-            raise ValueError(f"camera gives {seen.shape} {seen.dtype}, expected {out.shape} {out.dtype}")
+            raise ValueError(
+                f"camera gives {seen.shape} {seen.dtype}, expected {out.shape} {out.dtype}"
+            )
         np.copyto(out, seen)
         return out
 
@@ -306,13 +346,18 @@ class AravisCamera:
         name, message = self._name, str(error)
         code = error.code if isinstance(error, arv.AravisError) else -1
         if code in _TAKEN:
-            return roles.LinkError(f"{name}: in use by another program ({message}); close it, then try again")
+            return roles.LinkError(
+                f"{name}: in use by another program ({message}); close it, then try again"
+            )
         if code == arv.NOT_FOUND:
             return roles.LinkDownError(
-                f"{name}: not found; is it on and plugged in? `membrane-ctrl devices` lists the cameras"
+                f"{name}: not found; is it on and plugged in? `membrane-ctrl devices` lists "
+                "the cameras"
             )
         if code in _GONE:
-            return roles.LinkDownError(f"{name}: {doing}: no answer ({message}); is it on and plugged in?")
+            return roles.LinkDownError(
+                f"{name}: {doing}: no answer ({message}); is it on and plugged in?"
+            )
         if isinstance(error, roles.LinkDownError) or message == arv.MISSING:
             return error
         return roles.DeviceRefusedError(f"{name}: {doing}: {message}; see [devices.camera]")

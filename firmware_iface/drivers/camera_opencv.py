@@ -1,11 +1,12 @@
 """Cameras through OpenCV: role Camera.
 
-USB cameras without GenICam (UVC) by its VideoCapture. Source: OpenCV 4 documentation, `cv::VideoCapture` and
-`VideoCaptureProperties`. Such a camera runs freely and keeps frames in a queue; a frame belongs to a pattern only if
-its exposure started after the pattern appeared, so earlier frames are read and discarded.
+USB cameras without GenICam (UVC) by its VideoCapture. Source: OpenCV 4 documentation,
+`cv::VideoCapture` and `VideoCaptureProperties`. Such a camera runs freely and keeps frames in a
+queue; a frame belongs to a pattern only if its exposure started after the pattern appeared, so
+earlier frames are read and discarded.
 
-A folder of pictures: one file per exposure, in order of name, repeated endlessly. For trying the cycle without a
-camera, with pictures of a bench or from `membrane-ctrl simulate`.
+A folder of pictures: one file per exposure, in order of name, repeated endlessly. For trying the
+cycle without a camera, with pictures of a bench or from `membrane-ctrl simulate`.
 """
 
 from collections.abc import Callable
@@ -60,14 +61,19 @@ class UvcCamera:
         self._capture: VideoCapture | None = None
 
     def open(self) -> roles.DeviceIdentity:
-        """Connect and set. Raises LinkDownError without a camera, DeviceRefusedError for another size or exposure."""
+        """Connect and set. Raises LinkDownError without a camera, DeviceRefusedError for another
+        size or exposure.
+        """
         self.close()
         config = self._config
-        self._capture = capture = self._make(int(config.port) if config.port.isdigit() else config.port)
+        self._capture = capture = self._make(
+            int(config.port) if config.port.isdigit() else config.port
+        )
         if not capture.isOpened():
             self.close()
             raise roles.LinkDownError(
-                f"camera {config.port}: cannot be opened; is it plugged in, used by another program, "
+                f"camera {config.port}: cannot be opened; is it plugged in, used by another "
+                "program, "
                 "and are you in the group video?"
             )
         wanted = [
@@ -90,7 +96,8 @@ class UvcCamera:
         return roles.DeviceIdentity("UVC camera", "", "", self.describe()["settings"])
 
     def grab(self, out: roles.Levels | None = None) -> roles.Frame:
-        """The next complete frame that starts after the call, as grey (the green channel of a colour camera).
+        """The next complete frame that starts after the call, as grey (the green channel of a
+        colour camera).
 
         Raises LinkDownError (the camera went away).
         """
@@ -110,7 +117,9 @@ class UvcCamera:
         if out is None:
             return roles.Frame(pixels.copy(), time_s)
         if out.shape != pixels.shape:
-            raise roles.DeviceRefusedError(f"camera {self._config.port}: sent {pixels.shape}, expected {out.shape}")
+            raise roles.DeviceRefusedError(
+                f"camera {self._config.port}: sent {pixels.shape}, expected {out.shape}"
+            )
         np.copyto(out, pixels)
         return roles.Frame(out, time_s)
 
@@ -125,7 +134,8 @@ class UvcCamera:
         config = self._config
         return {
             "port": config.port,
-            "settings": f"{self._size[0]} x {self._size[1]}, exposure {config.exposure:g}, gain {config.gain:g}",
+            "settings": f"{self._size[0]} x {self._size[1]}, exposure {config.exposure:g}, gain "
+            f"{config.gain:g}",
         }
 
 
@@ -135,24 +145,40 @@ _SUFFIXES = (".png", ".tif", ".tiff", ".bmp", ".pgm")
 class FolderCamera:
     """Camera and screen: after `show(pattern)` the next picture is the one of that name.
 
-    The pictures are 8 or 16 bit grey and of one size; `x_sin_0.png` is the picture of the pattern `x_sin_0`.
+    The pictures are 8 or 16 bit grey and of one size; `x_sin_0.png` is the picture of the pattern
+    `x_sin_0`.
     """
 
     def __init__(
-        self, config: settings.FolderCameraConfig, sensor: roles.SensorFormat, clock: roles.DriverClock = _REAL_TIME
+        self,
+        config: settings.FolderCameraConfig,
+        sensor: roles.SensorFormat,
+        clock: roles.DriverClock = _REAL_TIME,
     ) -> None:
-        self._folder, self._size, self._now = Path(config.folder).expanduser(), sensor.shape, clock.now
+        self._folder, self._size, self._now = (
+            Path(config.folder).expanduser(),
+            sensor.shape,
+            clock.now,
+        )
         self._files: list[Path] = []
         self._next = 0
 
     def open(self) -> roles.DeviceIdentity:
-        """List the pictures. Raises LinkError without pictures, DeviceRefusedError for another size."""
+        """List the pictures. Raises LinkError without pictures, DeviceRefusedError for another
+        size.
+        """
         if self._folder.is_dir():
-            self._files = sorted(path for path in self._folder.iterdir() if path.suffix.lower() in _SUFFIXES)
+            self._files = sorted(
+                path for path in self._folder.iterdir() if path.suffix.lower() in _SUFFIXES
+            )
         if not self._files:
-            raise roles.LinkError(f"camera: {self._folder}: contains no pictures ({', '.join(_SUFFIXES)})")
+            raise roles.LinkError(
+                f"camera: {self._folder}: contains no pictures ({', '.join(_SUFFIXES)})"
+            )
         self._read(self._files[0])
-        return roles.DeviceIdentity("folder of frames", "", "", f"{len(self._files)} pictures in {self._folder}")
+        return roles.DeviceIdentity(
+            "folder of frames", "", "", f"{len(self._files)} pictures in {self._folder}"
+        )
 
     def show(self, pattern: roles.Pattern) -> None:
         """Role Screen: choose the picture of this name; without one the next in the order comes."""
@@ -173,7 +199,8 @@ class FolderCamera:
             return roles.Frame(pixels, time_s)
         if out.dtype != pixels.dtype:
             raise roles.LinkError(
-                f"camera: {self._folder}: pictures are {pixels.dtype}, [optics.camera] bits requires {out.dtype}"
+                f"camera: {self._folder}: pictures are {pixels.dtype}, [optics.camera] bits "
+                f"requires {out.dtype}"
             )
         np.copyto(out, pixels)
         return roles.Frame(out, time_s)

@@ -1,11 +1,13 @@
 """Interlock circuits at GPIO lines of this machine, by Linux' GPIO character device.
 
-The package `gpiod` (libgpiod 2, the kernel developers' own binding) requests the lines; the kernel then refuses them
-to every other program. A line of an I2C or USB expander may take long to answer, and a request for it cannot be
-abandoned: each call runs in a thread, so that the tick never waits for it. The threads are daemons and not those of
-asyncio's executor, for whose end the program would wait.
+The package `gpiod` (libgpiod 2, the kernel developers' own binding) requests the lines; the kernel
+then refuses them to every other program. A line of an I2C or USB expander may take long to answer,
+and a request for it cannot be
+abandoned: each call runs in a thread, so that the tick never waits for it. The threads are daemons
+and not those of asyncio's executor, for whose end the program would wait.
 
-Source: libgpiod 2, Python bindings; Documentation/userspace-api/gpio/chardev.rst of the Linux kernel.
+Source: libgpiod 2, Python bindings; Documentation/userspace-api/gpio/chardev.rst of the Linux
+kernel.
 """
 
 import asyncio
@@ -32,7 +34,9 @@ def load_gpiod() -> Any:
     except ImportError:
         raise ValueError(MISSING) from None
     if not hasattr(module, "request_lines"):
-        raise ValueError("the Python package gpiod is older than version 2: pip install 'membrane-ctrl[gpio]'")
+        raise ValueError(
+            "the Python package gpiod is older than version 2: pip install 'membrane-ctrl[gpio]'"
+        )
     return module
 
 
@@ -40,9 +44,10 @@ def load_gpiod() -> Any:
 class GpioCircuit:
     """One circuit: the line's number on its chip, and how the contact is wired.
 
-    "to_ground": a closed contact connects the line to ground, and a pull-up raises it otherwise. "to_supply": a
-    closed contact connects the line to the supply, and a pull-down lowers it otherwise. Either way a broken wire
-    reads as an open circuit. `pull` "external": resistors outside do what the chip's own cannot.
+    "to_ground": a closed contact connects the line to ground, and a pull-up raises it otherwise.
+    "to_supply": a closed contact connects the line to the supply, and a pull-down lowers it
+    otherwise. Either way a broken wire reads as an open circuit. `pull` "external": resistors
+    outside do what the chip's own cannot.
     """
 
     line: int
@@ -58,14 +63,15 @@ class GpioLines:
         self._chip = chip
         self._circuits = tuple(circuits)
         self._request: Any = None
-        # a thread that hangs in the driver keeps this; later calls then fail at once instead of piling up
+        # a thread that hangs in the driver keeps this; later calls then fail at once instead of
+        # piling up
         self._busy = threading.Lock()
 
     async def open(self) -> DeviceIdentity:
         """Request the lines from the kernel, and read them once.
 
-        Raises LinkDownError (the chip is absent), DeviceRefusedError (another program has a line, or the chip lacks
-        the line or its pull resistor).
+        Raises LinkDownError (the chip is absent), DeviceRefusedError (another program has a line,
+        or the chip lacks the line or its pull resistor).
         """
         if self._request is not None:
             await self.close()
@@ -87,7 +93,9 @@ class GpioLines:
         """Give the lines back. Never raises."""
         request, self._request = self._request, None
         if request is not None:
-            with contextlib.suppress(LinkError):  # the chip is gone, or its driver hangs: nothing can be given back
+            with contextlib.suppress(
+                LinkError
+            ):  # the chip is gone, or its driver hangs: nothing can be given back
                 await self._in_thread(request.release)
 
     def describe(self) -> dict[str, str]:
@@ -107,7 +115,9 @@ class GpioLines:
         to_ground = circuit.wiring == "to_ground"
         own_pull = line.Bias.PULL_UP if to_ground else line.Bias.PULL_DOWN
         bias = own_pull if circuit.pull == "internal" else line.Bias.DISABLED
-        return self._gpiod.LineSettings(direction=line.Direction.INPUT, bias=bias, active_low=to_ground)
+        return self._gpiod.LineSettings(
+            direction=line.Direction.INPUT, bias=bias, active_low=to_ground
+        )
 
     def _read_values(self) -> list[Any]:
         return list(self._request.get_values([circuit.line for circuit in self._circuits]))
@@ -142,10 +152,14 @@ class GpioLines:
     def _refusal(self, error: OSError) -> LinkError:
         what = error.strerror or str(error)
         if error.errno == errno.EBUSY:
-            return DeviceRefusedError(f"{self._chip}: another program or the kernel uses the line ({what})")
+            return DeviceRefusedError(
+                f"{self._chip}: another program or the kernel uses the line ({what})"
+            )
         if error.errno in (errno.EINVAL, errno.ENXIO, errno.EOPNOTSUPP):
             hint = 'without a pull resistor of its own use pull = "external"'
-            return DeviceRefusedError(f"{self._chip}: the chip does not accept the line or its pull ({what}); {hint}")
+            return DeviceRefusedError(
+                f"{self._chip}: the chip does not accept the line or its pull ({what}); {hint}"
+            )
         if error.errno == errno.EACCES:
             return DeviceRefusedError(f"{self._chip}: {what}; add this user to the device's group")
         return LinkDownError(f"{self._chip}: {what}")

@@ -1,12 +1,12 @@
 """MKS 937B and 946 controllers with a capacitance manometer (Baratron), on RS-232 or RS-485.
 
-Manuals: 937B operation manual, page 86 (question `@<aaa><command>?;FF`, answer `@<aaa>ACK<response>;FF`); 946
-instruction manual, page 103 (system commands `U`, `MD`, `SN`, `FV6`, `STA`..`STC`). An error answers `NAK` and a
-number.
+Manuals: 937B operation manual, page 86 (question `@<aaa><command>?;FF`, answer
+`@<aaa>ACK<response>;FF`); 946 instruction manual, page 103 (system commands `U`, `MD`, `SN`, `FV6`,
+`STA`..`STC`). An error answers `NAK` and a number.
 
-A reading has neither unit nor checksum. The unit is set to pascal at every opening. A reading that differs from the
-two before it by more than `step_max_pa` is refused, and after it the unit is read again: it could have been changed
-at the front panel.
+A reading has neither unit nor checksum. The unit is set to pascal at every opening. A reading that
+differs from the two before it by more than `step_max_pa` is refused, and after it the unit is read
+again: it could have been changed at the front panel.
 """
 
 import math
@@ -26,14 +26,20 @@ class Mks937b(exchange.LineDriver):
 
     manual = "937B operation manual, page 86; 946 instruction manual, page 103"
 
-    def __init__(self, config: settings.Mks937bConfig, port: serial_port.SerialPort | None = None) -> None:
+    def __init__(
+        self, config: settings.Mks937bConfig, port: serial_port.SerialPort | None = None
+    ) -> None:
         line = serial_port.SerialSettings(config.baud, parity=config.parity)
         self._config = config
         self._to = f"@{config.address:03d}"
         self._answer = re.compile(rf"{self._to}(?:ACK([^;@]{{0,20}})|NAK(\d{{1,3}}));FF")
         # a model has a digit, as no word in place of a reading has, and no decimal point
-        fence = exchange.LineFence(f"{self._to}MD?", re.compile(rf"{self._to}ACK(?=[A-Z]*\d)[A-Z\d]{{3,6}};FF"))
-        super().__init__(port or serial_port.SerialPort(config.port, line), ";FF", config.timeout_s, fence)
+        fence = exchange.LineFence(
+            f"{self._to}MD?", re.compile(rf"{self._to}ACK(?=[A-Z]*\d)[A-Z\d]{{3,6}};FF")
+        )
+        super().__init__(
+            port or serial_port.SerialPort(config.port, line), ";FF", config.timeout_s, fence
+        )
         self._begin_anew()
 
     def _begin_anew(self) -> None:
@@ -43,8 +49,9 @@ class Mks937b(exchange.LineDriver):
     async def open(self) -> roles.DeviceIdentity:
         """Open the port, check model and sensor, set the unit to pascal and read it back.
 
-        Raises LinkError (no valid answer; LinkDownError without a port), DeviceRefusedError (another instrument, no
-        capacitance manometer on the channel, or a unit that it does not take).
+        Raises LinkError (no valid answer; LinkDownError without a port), DeviceRefusedError
+        (another instrument, no capacitance manometer on the channel, or a unit that it does not
+        take).
         """
         await self._link.close()
         self._begin_anew()
@@ -54,15 +61,20 @@ class Mks937b(exchange.LineDriver):
         config = self._config
         model, serial, firmware = [await self._asked(command) for command in ("MD?", "SN?", "FV6?")]
         if config.serial not in ("", serial):
-            raise roles.DeviceRefusedError(f"{self._link.name}: serial number {serial}, expected {config.serial}")
+            raise roles.DeviceRefusedError(
+                f"{self._link.name}: serial number {serial}, expected {config.serial}"
+            )
         if model not in _MODELS:
-            raise roles.DeviceRefusedError(f"{self._link.name}: {model} is not a {' or '.join(_MODELS)}")
+            raise roles.DeviceRefusedError(
+                f"{self._link.name}: {model} is not a {' or '.join(_MODELS)}"
+            )
         module = "ABC"[(config.channel - 1) // 2]
         kinds = _SENSORS.fullmatch(await self._asked(f"ST{module}?"))
         kind = kinds[1 + (config.channel - 1) % 2] if kinds else "none"
         if kind != _MANOMETER:
             raise roles.DeviceRefusedError(
-                f"{self._link.name}: channel {config.channel} has the sensor {kind}, not {_MANOMETER}, "
+                f"{self._link.name}: channel {config.channel} has the sensor {kind}, not "
+                f"{_MANOMETER}, "
                 "a capacitance manometer"
             )
         await self._asked("U!PASCAL")
@@ -76,14 +88,16 @@ class Mks937b(exchange.LineDriver):
     async def gauge_pressure_pa(self) -> float:
         """The pressure now, NaN when the controller shows a word instead (no sensor, over range).
 
-        Raises LinkError (no valid answer, or a jump that is ignored until it repeats), LinkDownError (the port is
-        gone, or the unit was changed: open it again).
+        Raises LinkError (no valid answer, or a jump that is ignored until it repeats),
+        LinkDownError (the port is gone, or the unit was changed: open it again).
         """
         if self._jumped:
             await self._require_pascal()
         pressure_pa, self._jumped = await self._reading_pa()
         if self._jumped:
-            raise roles.LinkError(f"{self._link.name}: a jump to {pressure_pa:.1f} Pa is ignored until it repeats")
+            raise roles.LinkError(
+                f"{self._link.name}: a jump to {pressure_pa:.1f} Pa is ignored until it repeats"
+            )
         return pressure_pa
 
     async def _reading_pa(self) -> tuple[float, bool]:

@@ -1,7 +1,7 @@
 """Interlock circuits at the discrete inputs or coils of a Modbus device.
 
-A closed circuit reads 1. There is no setting that inverts it: a broken wire and a module without its supply read 0,
-which must mean "open".
+A closed circuit reads 1. There is no setting that inverts it: a broken wire and a module without
+its supply read 0, which must mean "open".
 """
 
 from collections.abc import Sequence
@@ -38,7 +38,8 @@ class ModbusInputs:
     async def closed_circuits(self) -> tuple[bool, ...]:
         """Whether each circuit is closed. Raises LinkError.
 
-        Each bit is a request of its own: a range with addresses that the device does not have would be refused.
+        Each bit is a request of its own: a range with addresses that the device does not have would
+        be refused.
         """
         closed = [await self._closed(function, address) for function, address in self._bits]
         return tuple(closed)

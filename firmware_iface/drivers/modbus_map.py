@@ -9,7 +9,13 @@ from pathlib import Path
 from typing import Any
 
 from firmware_iface.links.modbus_tcp import ModbusLink
-from firmware_iface.roles import Clock, DeviceIdentity, DeviceRefusedError, DisplacementSample, LinkError
+from firmware_iface.roles import (
+    Clock,
+    DeviceIdentity,
+    DeviceRefusedError,
+    DisplacementSample,
+    LinkError,
+)
 
 PRESETS = Path(__file__).parents[1] / "presets"
 _FORMATS = {"u16": "H", "i16": "h", "u32": "I", "i32": "i", "f32": "f"}
@@ -21,7 +27,9 @@ class ValueMap:
 
     address: int  # of its first register, counted from 0
     value: tuple[float, float]  # two values in the role's unit ...
-    raw: tuple[float, float]  # ... and the register's contents there; linear between and beyond them
+    raw: tuple[
+        float, float
+    ]  # ... and the register's contents there; linear between and beyond them
     limits: tuple[float, float]  # values outside are refused, read or written
     function: str = "holding"  # "holding" or "input"
     type: str = "u16"  # "u16", "i16", "u32", "i32" or "f32"
@@ -38,7 +46,9 @@ class ValueMap:
     def decode(self, words: list[int]) -> float:
         """Registers to a value; NaN for a float that is not a number."""
         ordered = words if self.word_order == "big" else words[::-1]
-        (raw,) = struct.unpack(">" + _FORMATS[self.type], struct.pack(f">{len(ordered)}H", *ordered))
+        (raw,) = struct.unpack(
+            ">" + _FORMATS[self.type], struct.pack(f">{len(ordered)}H", *ordered)
+        )
         (raw_0, raw_1), (value_0, value_1) = self.raw, self.value
         return float(value_0 + (raw - raw_0) * (value_1 - value_0) / (raw_1 - raw_0))
 
@@ -67,12 +77,17 @@ def preset(name: str) -> dict[str, Any]:
 
 
 def make_map(given: dict[str, Any], preset_name: str = "") -> tuple[ValueMap, bool]:
-    """The map, configured keys over those of the preset, and whether the device supports function 8.
+    """The map, configured keys over those of the preset, and whether the device supports function
+    8.
 
-    Raises ValueError (an unknown preset, a missing key, an address or a raw value that the device does not have).
+    Raises ValueError (an unknown preset, a missing key, an address or a raw value that the device
+    does not have).
     """
     defaults = preset(preset_name) if preset_name else {}
-    raw_limits, address_limits = defaults.pop("raw_limits", None), defaults.pop("address_limits", None)
+    raw_limits, address_limits = (
+        defaults.pop("raw_limits", None),
+        defaults.pop("address_limits", None),
+    )
     fence = bool(defaults.pop("fence", True))
     keys = {**defaults, **{key: value for key, value in given.items() if value is not None}}
     if "raw" not in keys:
@@ -83,7 +98,10 @@ def make_map(given: dict[str, Any], preset_name: str = "") -> tuple[ValueMap, bo
     }
     made = ValueMap(**settings)
     if address_limits and not address_limits[0] <= made.address <= address_limits[1]:
-        raise ValueError(f"address = {made.address}: {preset_name} has {address_limits[0]} .. {address_limits[1]}")
+        raise ValueError(
+            f"address = {made.address}: {preset_name} has {address_limits[0]} .. "
+            f"{address_limits[1]}"
+        )
     _check_raw(made, raw_limits)
     return made, fence
 
@@ -94,9 +112,13 @@ def _check_raw(made: ValueMap, raw_limits: list[float] | None) -> None:
         try:
             words = made.encode(value)
         except struct.error:
-            raise ValueError(f"limits: {value:g} does not fit a register of type {made.type}") from None
+            raise ValueError(
+                f"limits: {value:g} does not fit a register of type {made.type}"
+            ) from None
         if raw_limits and not raw_limits[0] <= words[0] <= raw_limits[1]:
-            raise ValueError(f"raw: {words[0]} at {value:g}; the device takes {raw_limits[0]} .. {raw_limits[1]}")
+            raise ValueError(
+                f"raw: {words[0]} at {value:g}; the device takes {raw_limits[0]} .. {raw_limits[1]}"
+            )
 
 
 class ModbusValue:
@@ -106,7 +128,11 @@ class ModbusValue:
     """
 
     def __init__(
-        self, link: ModbusLink, value_map: ValueMap, rest: float | None = None, clock: Clock = time.monotonic
+        self,
+        link: ModbusLink,
+        value_map: ValueMap,
+        rest: float | None = None,
+        clock: Clock = time.monotonic,
     ) -> None:
         self._link = link
         self._map = value_map
@@ -117,7 +143,8 @@ class ModbusValue:
     async def open(self) -> DeviceIdentity:
         """Connect, check the identity register if there is one, put an actuator to rest.
 
-        Raises DeviceRefusedError (the identity register holds something else, or the device has no such registers).
+        Raises DeviceRefusedError (the identity register holds something else, or the device has no
+        such registers).
         """
         if not self._link.connected:
             await self._link.connect()
@@ -126,7 +153,9 @@ class ModbusValue:
             address, wanted = self._map.identity
             (found,) = await self._link.read_holding(address, 1)
             if found != wanted:
-                raise DeviceRefusedError(f"{self._link.name}: register {address} holds {found}, expected {wanted}")
+                raise DeviceRefusedError(
+                    f"{self._link.name}: register {address} holds {found}, expected {wanted}"
+                )
             detail = f"register {address} = {found}"
         if self._map.version_address is not None:
             (number,) = await self._link.read_holding(self._map.version_address, 1)
@@ -145,8 +174,15 @@ class ModbusValue:
 
     def describe(self) -> dict[str, str]:
         """Location of the value."""
-        found = {"port": self._link.name, "register": f"{self._map.function} {self._map.address}, {self._map.type}"}
-        return found if self._rest is None else {**found, "watchdog": "none known: check what its output does alone"}
+        found = {
+            "port": self._link.name,
+            "register": f"{self._map.function} {self._map.address}, {self._map.type}",
+        }
+        return (
+            found
+            if self._rest is None
+            else {**found, "watchdog": "none known: check what its output does alone"}
+        )
 
     async def _get(self) -> float:
         read = self._link.read_input if self._map.function == "input" else self._link.read_holding
@@ -154,7 +190,8 @@ class ModbusValue:
         if not self._map.allows(value):
             low, high = self._map.limits
             raise LinkError(
-                f"{self._link.name}: register {self._map.address} says {value:g}, not {low:g} .. {high:g}"
+                f"{self._link.name}: register {self._map.address} says {value:g}, not "
+                f"{low:g} .. {high:g}"
             )
         return value
 
@@ -166,7 +203,9 @@ class ModbusValue:
             await self._link.write_registers(self._map.address, words)
 
     async def displacement(self) -> DisplacementSample:
-        """As `DisplacementSensor`; counter and time are of arrival; a frozen register is not detected."""
+        """As `DisplacementSensor`; counter and time are of arrival; a frozen register is not
+        detected.
+        """
         value_um = await self._get()
         self._samples += 1
         return DisplacementSample(value_um, 0, self._samples, self._clock())

@@ -1,17 +1,20 @@
 """Micro-Epsilon optoNCDT 1420 laser triangulation sensor on RS-422.
 
-Manual: optoNCDT 1420 instruction manual; commands in its appendix A 3 (pages 93-110), digital values and error codes
-in 7.5.2 (pages 65-67). A command ends in LF, its answer in `->` (line ends after it are accepted), an error is `Exxx`
-before that. The answer may repeat the command and write a rate as `4`, `4.0` or `4 kHz`.
+Manual: optoNCDT 1420 instruction manual; commands in its appendix A 3 (pages 93-110), digital
+values and error codes in 7.5.2 (pages 65-67). A command ends in LF, its answer in `->` (line ends
+after it are accepted), an error is `Exxx` before that. The answer may repeat the command and write
+a rate as `4`, `4.0` or `4 kHz`.
 
-The sensor streams; a reading is the mean of the middle half of everything since the last one (at 4 kHz and 50 Hz: 40
-of 80 values). A corrupted byte, which the protocol cannot detect, is one outlier among many and is dropped; and
-unlike the median, the mean resolves less than a digital step (0.8 µm at 50 mm range).
+The sensor streams; a reading is the mean of the middle half of everything since the last one (at 4
+kHz and 50 Hz: 40 of 80 values). A corrupted byte, which the protocol cannot detect, is one outlier
+among many and is dropped; and unlike the median, the mean resolves less than a digital step (0.8 µm
+at 50 mm range).
 
-In the stream (pages 65-67) a value is 18 bits in three bytes of six, marked in their two highest bits: low `00`,
-middle `01`, high `10` for the first value of a measurement and `11` for further ones. Here a measurement is distance
-and measurement counter (`OUTADD_RS422 COUNTER`), six bytes. There is no checksum, and lost bytes can join two
-measurements to a false one: a measurement is trusted only when its counter is the last one plus one.
+In the stream (pages 65-67) a value is 18 bits in three bytes of six, marked in their two highest
+bits: low `00`, middle `01`, high `10` for the first value of a measurement and `11` for further
+ones. Here a measurement is distance and measurement counter (`OUTADD_RS422 COUNTER`), six bytes.
+There is no checksum, and lost bytes can join two measurements to a false one: a measurement is
+trusted only when its counter is the last one plus one.
 """
 
 import asyncio
@@ -42,8 +45,8 @@ _MARKS = (0, 1, 2, 0, 1, 3)
 class StreamParser:
     """Bytes in any portions to measurements.
 
-    It counts `bytes_lost`, which belonged to no measurement, and `untrusted` measurements, whose counter did not
-    follow the one before.
+    It counts `bytes_lost`, which belonged to no measurement, and `untrusted` measurements, whose
+    counter did not follow the one before.
     """
 
     def __init__(self) -> None:
@@ -53,7 +56,9 @@ class StreamParser:
         self._counter = -1
 
     def feed(self, data: bytes) -> NDArray[np.int64]:
-        """Digital values or error codes (n,) of the trusted measurements that are complete with these bytes."""
+        """Digital values or error codes (n,) of the trusted measurements that are complete with
+        these bytes.
+        """
         stream = np.frombuffer(self._rest + data, np.uint8)
         marks = stream >> 6
         starts = np.arange(max(0, len(stream) - _BYTES + 1))
@@ -78,21 +83,28 @@ class StreamParser:
 
 
 def distance_mm(raw: float, range_mm: float) -> float:
-    """Distance from the start of the measuring range (page 65, without mastering): (1.02 x / 65520 - 0.01) range."""
+    """Distance from the start of the measuring range (page 65, without mastering): (1.02 x / 65520
+    - 0.01) range.
+    """
     return (1.02 * raw / _RAW_MAX - 0.01) * range_mm
 
 
 class Optoncdt1420:
     """A `DisplacementSensor`; `port` stands in for the configured one.
 
-    Displacement = direction * (distance - zero). The sensor is behind the mirror: when the bowl deepens the vertex
-    comes nearer, so the default direction is -1. Counter and time are the driver's: trusted values so far, time of
-    arrival. A sensor that repeats a value repeats its counter too, so the value is not new.
+    Displacement = direction * (distance - zero). The sensor is behind the mirror: when the bowl
+    deepens the vertex comes nearer, so the default direction is -1. Counter and time are the
+    driver's: trusted values so far, time of arrival. A sensor that repeats a value repeats its
+    counter too, so the value is not new.
     """
 
-    def __init__(self, config: settings.Optoncdt1420Config, port: serial_port.SerialPort | None = None) -> None:
+    def __init__(
+        self, config: settings.Optoncdt1420Config, port: serial_port.SerialPort | None = None
+    ) -> None:
         self._config = config
-        self._port = port or serial_port.SerialPort(config.port, serial_port.SerialSettings(config.baud))
+        self._port = port or serial_port.SerialPort(
+            config.port, serial_port.SerialSettings(config.baud)
+        )
         self._settle_anew()
 
     def _settle_anew(self) -> None:
@@ -107,16 +119,19 @@ class Optoncdt1420:
         self._silent = 0
 
     async def open(self) -> roles.DeviceIdentity:
-        """Open the port, stop the stream, check its identity, set it and read it back, start the stream.
+        """Open the port, stop the stream, check its identity, set it and read it back, start the
+        stream.
 
-        Raises LinkError (no valid answer; LinkDownError without a port), DeviceRefusedError (another device, another
-        range, or a setting that the sensor does not take).
+        Raises LinkError (no valid answer; LinkDownError without a port), DeviceRefusedError
+        (another device, another range, or a setting that the sensor does not take).
         """
         await self.close()
         self._settle_anew()
         self._port.open(self)
         try:
-            with contextlib.suppress(roles.DeviceRefusedError):  # refused together with a half-sent earlier command
+            with contextlib.suppress(
+                roles.DeviceRefusedError
+            ):  # refused together with a half-sent earlier command
                 await self._command("OUTPUT NONE")
             await self._command("OUTPUT NONE")
             identity = await self._identify()
@@ -146,16 +161,24 @@ class Optoncdt1420:
         name, measuring_range = fields.get("Name", ""), fields.get("Measuring range", "")
         found = re.match(r"([\d.]+)\s*mm", measuring_range)
         if "1420" not in name or found is None:
-            raise roles.DeviceRefusedError(f"{self._port.name}: {name or text[:40]!r} is not an optoNCDT 1420")
+            raise roles.DeviceRefusedError(
+                f"{self._port.name}: {name or text[:40]!r} is not an optoNCDT 1420"
+            )
         self._range_mm = float(found[1])
         if self._config.range_mm is not None and self._range_mm != self._config.range_mm:
             raise roles.DeviceRefusedError(
-                f"{self._port.name}: {name} measures {self._range_mm:g} mm, range_mm = {self._config.range_mm:g}"
+                f"{self._port.name}: {name} measures {self._range_mm:g} mm, range_mm = "
+                f"{self._config.range_mm:g}"
             )
         self._zero_mm = self._range_mm / 2 if self._config.zero_mm is None else self._config.zero_mm
-        ends = [1000 * self._config.direction * (end_mm - self._zero_mm) for end_mm in (0.0, self._range_mm)]
+        ends = [
+            1000 * self._config.direction * (end_mm - self._zero_mm)
+            for end_mm in (0.0, self._range_mm)
+        ]
         serial, version = fields.get("Serial", ""), fields.get("Version", "")
-        return roles.DeviceIdentity(name, serial, version, f"{self._range_mm:g} mm", (min(ends), max(ends)))
+        return roles.DeviceIdentity(
+            name, serial, version, f"{self._range_mm:g} mm", (min(ends), max(ends))
+        )
 
     async def _set(self, setting: str) -> None:
         name = setting.split()[0]
@@ -163,7 +186,9 @@ class Optoncdt1420:
         text = await self._command(name)
         found = re.search(rf"^\s*{name} +(.+?)\s*$", text, re.MULTILINE)
         if found is None or _plain(found[1]) != _plain(setting.split()[1]):
-            raise roles.DeviceRefusedError(f"{self._port.name}: set {setting!r}, read back {text.strip()[:60]!r}")
+            raise roles.DeviceRefusedError(
+                f"{self._port.name}: set {setting!r}, read back {text.strip()[:60]!r}"
+            )
 
     async def _command(self, command: str) -> str:
         """The answer without its prompt. Raises LinkError, DeviceRefusedError."""
@@ -174,12 +199,21 @@ class Optoncdt1420:
             async with asyncio.timeout(self._config.timeout_s):
                 while not self._heard.rstrip().endswith(_PROMPT):
                     await self._stirred()
-        if not self._heard.rstrip().endswith(_PROMPT):  # it may have arrived while this process was suspended
-            hint = f"no answer within {self._config.timeout_s:g} s; is it on, wired and set to {self._port.settings}?"
+        if not self._heard.rstrip().endswith(
+            _PROMPT
+        ):  # it may have arrived while this process was suspended
+            hint = (
+                f"no answer within {self._config.timeout_s:g} s; is it on, wired and set to "
+                f"{self._port.settings}?"
+            )
             if self._heard:
-                hint = f"{len(self._heard)} bytes but no prompt within {self._config.timeout_s:g} s; wrong baud rate?"
+                hint = (
+                    f"{len(self._heard)} bytes but no prompt within {self._config.timeout_s:g} "
+                    "s; wrong baud rate?"
+                )
             raise roles.LinkError(f"{what}: {hint}")
-        # bytes of a stream that is just stopping contain no text that could be an error: see the marks
+        # bytes of a stream that is just stopping contain no text that could be an error: see the
+        # marks
         text = self._heard.rstrip()[: -len(_PROMPT)].decode("ascii", "replace")
         if error := _ERROR.search(text):
             raise roles.DeviceRefusedError(f"{what}: E{error[1]}{error[2]}")
@@ -195,10 +229,11 @@ class Optoncdt1420:
                 self._gate.passes(self._displacement_um(middle(good)))
 
     async def displacement(self) -> roles.DisplacementSample:
-        """Mean of the middle half of all values since the last call; waits for one when there is none yet.
+        """Mean of the middle half of all values since the last call; waits for one when there is
+        none yet.
 
-        Raises LinkError (no value in time, or an impossible one, which is dropped), LinkDownError (the port is gone,
-        or the sensor stopped streaming: open it again).
+        Raises LinkError (no value in time, or an impossible one, which is dropped), LinkDownError
+        (the port is gone, or the sensor stopped streaming: open it again).
         """
         try:
             await self._wait_for_values()
@@ -209,14 +244,18 @@ class Optoncdt1420:
             if self._silent < _SILENT_MAX:
                 raise
             await self.close()
-            raise roles.LinkDownError(f"{error}; it restarted or lost its power: open it again") from error
+            raise roles.LinkDownError(
+                f"{error}; it restarted or lost its power: open it again"
+            ) from error
         self._silent = 0
         self._port.succeeded()
         values = self._taken()
         good = values[values <= _RAW_MAX]
         if 2 * len(good) <= len(values):
             codes, counts = np.unique(values[values > _RAW_MAX], return_counts=True)
-            return roles.DisplacementSample(math.nan, int(codes[np.argmax(counts)]), self._counted, self._arrived_s)
+            return roles.DisplacementSample(
+                math.nan, int(codes[np.argmax(counts)]), self._counted, self._arrived_s
+            )
         raw = middle(good)
         displacement_um = self._displacement_um(raw)
         if not self._gate.passes(displacement_um):
@@ -239,7 +278,9 @@ class Optoncdt1420:
                 while not self._batches:
                     await self._stirred()
         if not self._batches:
-            raise roles.LinkError(f"{self._port.name}: no value within {self._config.timeout_s:g} s")
+            raise roles.LinkError(
+                f"{self._port.name}: no value within {self._config.timeout_s:g} s"
+            )
 
     def _taken(self) -> NDArray[np.int64]:
         values = np.concatenate(self._batches)
@@ -275,11 +316,17 @@ class Optoncdt1420:
 
     def describe(self) -> dict[str, str]:
         """For people: port, settings, manual."""
-        zero = "middle of the range" if self._config.zero_mm is None else f"{self._config.zero_mm:g} mm"
+        zero = (
+            "middle of the range"
+            if self._config.zero_mm is None
+            else f"{self._config.zero_mm:g} mm"
+        )
         return {
             "port": f"{self._port.name}, {self._port.settings}",
-            "settings": f"{self._config.rate_khz:g} kHz, zero at {zero}, direction {self._config.direction:+d}",
-            "lost": f"{self._parser.bytes_lost} bytes outside of values, {self._parser.untrusted} values untrusted",
+            "settings": f"{self._config.rate_khz:g} kHz, zero at {zero}, direction "
+            f"{self._config.direction:+d}",
+            "lost": f"{self._parser.bytes_lost} bytes outside of values, {self._parser.untrusted} "
+            "values untrusted",
             "manual": "optoNCDT 1420 instruction manual, 7.5.2 and appendix A 3",
         }
 

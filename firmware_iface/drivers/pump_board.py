@@ -12,29 +12,33 @@ from firmware_iface.links import modbus_rtu, modbus_tcp
 _KIND = "membrane pump board"
 # of a board of map version 1, for people
 NO_CLAIM = (
-    "this board has no claim (register map 1): any program that reaches it can run its pump, and two programs on two "
+    "this board has no claim (register map 1): any program that reaches it can run its pump, "
+    "and two programs on two "
     "machines are not kept apart; update its firmware"
 )
 _HEARTBEATS = 2**16
 _U32_MAX = 2**32 - 1
-# refused writes in a row until a claim counts as lost although its name is still there: one may be a gateway's answer
+# refused writes in a row until a claim counts as lost although its name is still there: one may be
+# a gateway's answer
 _BUSY_WRITES_MAX = 3
 
 
 class PumpBoard:
     """All sensors, pump and vent of the bench on one board.
 
-    After a lost link (LinkDownError) call `open` again, as often as wanted: it tries when its back-off allows.
-    Whether the watchdog tripped meanwhile is in the next reading; nothing but `clear_faults` clears it, and until
-    then the board keeps the pump off.
+    After a lost link (LinkDownError) call `open` again, as often as wanted: it tries when its
+    back-off allows. Whether the watchdog tripped meanwhile is in the next reading; nothing but
+    `clear_faults` clears it, and until then the board keeps the pump off.
 
-    `open` claims a board of map version 2 for this object: until it is closed, or its watchdog has run out, the board
-    takes commands from nobody else. A board of map version 1 has no claim and obeys every program. Boards before map
-    version 3 do not stop the pump when their gauge fails, and have no interlock inputs: readings show none closed.
+    `open` claims a board of map version 2 for this object: until it is closed, or its watchdog has
+    run out, the board takes commands from nobody else. A board of map version 1 has no claim and
+    obeys every program. Boards before map version 3 do not stop the pump when their gauge fails,
+    and have no interlock inputs: readings show none closed.
 
-    The board turns the pump off when it gets no `write` for `watchdog_s`. The URL is `tcp://HOST:PORT` (502 when left
-    out) or `rtu:///dev/ttyUSB0?baud=115200`; an existing `link` replaces it. Raises ValueError (an invalid URL, or a
-    watchdog period that the board cannot have).
+    The board turns the pump off when it gets no `write` for `watchdog_s`. The URL is
+    `tcp://HOST:PORT` (502 when left out) or `rtu:///dev/ttyUSB0?baud=115200`; an existing `link`
+    replaces it. Raises ValueError (an invalid URL, or a watchdog period that the board cannot
+    have).
     """
 
     def __init__(
@@ -47,15 +51,20 @@ class PumpBoard:
     ) -> None:
         if link is None:
             link = modbus_rtu.ModbusLinks().link(url, unit_id, timeout_s)
-        self._registers = register_map.default_map()  # of the board that answers, once its version is known
+        self._registers = (
+            register_map.default_map()
+        )  # of the board that answers, once its version is known
         period = self._registers.register("watchdog_period_s")
         if not period.allows(watchdog_s):
             raise ValueError(
-                f"watchdog_s = {watchdog_s:g}: the board takes {period.minimum:g} .. {period.maximum:g} s"
+                f"watchdog_s = {watchdog_s:g}: the board takes {period.minimum:g} .. "
+                f"{period.maximum:g} s"
             )
-        self._watchdog_s = period.to_value(period.to_raw(watchdog_s))  # as the board will read it back
-        # The same for every opening by this object, so that a claim whose answer was lost can be repeated. The name
-        # is public, the key is secret.
+        self._watchdog_s = period.to_value(
+            period.to_raw(watchdog_s)
+        )  # as the board will read it back
+        # The same for every opening by this object, so that a claim whose answer was lost can be
+        # repeated. The name is public, the key is secret.
         self._claim_id, self._claim_key = (1 + secrets.randbelow(_U32_MAX) for _ in range(2))
         self._armed = False  # by this object, since it last connected
         self._heartbeat = 0
@@ -63,11 +72,13 @@ class PumpBoard:
         self._link = link
 
     async def open(self) -> roles.BenchIdentity:
-        """Connect, check kind and map version, claim the board, arm its watchdog and read both back.
+        """Connect, check kind and map version, claim the board, arm its watchdog and read both
+        back.
 
-        The watchdog runs from here on: write within its period, pump 0 too. Raises LinkError (no connection or no
-        valid answer), DeviceBusyError (another program holds the board), DeviceRefusedError (another kind of device,
-        an unknown map version, or a watchdog that does not take its setting).
+        The watchdog runs from here on: write within its period, pump 0 too. Raises LinkError (no
+        connection or no valid answer), DeviceBusyError (another program holds the board),
+        DeviceRefusedError (another kind of device, an unknown map version, or a watchdog that does
+        not take its setting).
         """
         identity = await self.identify()
         try:
@@ -78,7 +89,8 @@ class PumpBoard:
         return replace(identity, watchdog_s=self._watchdog_s)
 
     async def identify(self) -> roles.BenchIdentity:
-        """Connect and check kind and map version; nothing is written. `read` then works, `write` does not.
+        """Connect and check kind and map version; nothing is written. `read` then works, `write`
+        does not.
 
         Raises as `open`; the identity's `watchdog_s` is NaN, as nothing was set.
         """
@@ -96,7 +108,8 @@ class PumpBoard:
         kind, version = await self._link.read_holding(identity.address, 2)
         if kind != register_map.default_map().device_kind:
             raise roles.DeviceRefusedError(
-                f"{self._link.name}: device kind {kind} is not a {_KIND} ({register_map.default_map().device_kind})"
+                f"{self._link.name}: device kind {kind} is not a {_KIND} "
+                f"({register_map.default_map().device_kind})"
             )
         if version not in register_map.known_maps():
             known = ", ".join(str(known) for known in register_map.known_maps())
@@ -130,8 +143,10 @@ class PumpBoard:
         set_s = settings["watchdog_period_s"]
         if (set_s, settings["watchdog_arm"]) != (self._watchdog_s, 1.0) or self._foreign(sensors):
             raise roles.DeviceRefusedError(
-                f"{self._link.name}: watchdog set to {self._watchdog_s:g} s and armed, read back as {set_s:g} s, "
-                f"armed {settings['watchdog_arm']:g}, claim {int(sensors.get('claim_in_force', 0)):#x}; "
+                f"{self._link.name}: watchdog set to {self._watchdog_s:g} s and armed, read "
+                f"back as {set_s:g} s, "
+                f"armed {settings['watchdog_arm']:g}, claim "
+                f"{int(sensors.get('claim_in_force', 0)):#x}; "
                 "not safe to run"
             )
         # continue from the heartbeat that last fed the board: the first write must differ from it
@@ -142,7 +157,8 @@ class PumpBoard:
         sensors = await self._sensors()
         period_s = sensors["period_in_force_s"]
         return roles.DeviceBusyError(
-            f"{self._link.name}: another program holds the board (claim {int(sensors['claim_in_force']):#x}, "
+            f"{self._link.name}: another program holds the board (claim "
+            f"{int(sensors['claim_in_force']):#x}, "
             f"watchdog {period_s:g} s); stop that one first",
             lapses_in_s=period_s,
         )
@@ -150,7 +166,8 @@ class PumpBoard:
     async def read(self) -> roles.BenchReading:
         """One sample of everything, in one transaction.
 
-        Raises LinkError (no valid answer), LinkDownError (no connection, or the board restarted and lost its
+        Raises LinkError (no valid answer), LinkDownError (no connection, or the board restarted and
+        lost its
         settings: call `open` again).
         """
         values = await self._sensors()
@@ -177,17 +194,22 @@ class PumpBoard:
         )
 
     def _foreign(self, sensors: Mapping[str, float]) -> int:
-        """Which of claim and period in force differ from what this object set; a board without claims cannot tell."""
+        """Which of claim and period in force differ from what this object set; a board without
+        claims cannot tell.
+        """
         if self._registers.map_version == 1:
             return 0
         taken = sensors["claim_in_force"] != self._claim_id or self._busy_writes >= _BUSY_WRITES_MAX
-        return roles.FOREIGN_CLAIM * taken | roles.FOREIGN_PERIOD * (sensors["period_in_force_s"] != self._watchdog_s)
+        return roles.FOREIGN_CLAIM * taken | roles.FOREIGN_PERIOD * (
+            sensors["period_in_force_s"] != self._watchdog_s
+        )
 
     async def write(self, command: roles.BenchCommand) -> None:
         """Write pump and vent with a new heartbeat, in one transaction, which feeds the watchdog.
 
-        Raises ValueError (a fraction that is not within 0..1, or NaN; nothing is sent), LinkError (no valid answer:
-        the board may or may not have it), DeviceBusyError (another program has the board by now).
+        Raises ValueError (a fraction that is not within 0..1, or NaN; nothing is sent), LinkError
+        (no valid answer: the board may or may not have it), DeviceBusyError (another program has
+        the board by now).
         """
         for name, fraction in (("pump", command.pump_fraction), ("vent", command.vent_fraction)):
             if not 0.0 <= fraction <= 1.0:
@@ -207,17 +229,23 @@ class PumpBoard:
         self._busy_writes = 0
 
     async def clear_faults(self, mask: int) -> None:
-        """Clear these latched faults of the board; the pump stays off until the next `write`. Raises LinkError."""
+        """Clear these latched faults of the board; the pump stays off until the next `write`.
+        Raises LinkError.
+        """
         await self._write("reset", {"clear_faults": mask, "clear_key": self._claim_key})
 
     async def stop(self) -> None:
-        """Stop the pump of a board that was identified, whoever holds it; the vent stays as it is. Raises LinkError.
+        """Stop the pump of a board that was identified, whoever holds it; the vent stays as it is.
+        Raises LinkError.
 
-        A board of map version 2 latches it as a fault. One of version 1 gets pump 0 without a heartbeat, which
-        neither feeds nor arms its watchdog: its holder may run the pump again with the next command.
+        A board of map version 2 latches it as a fault. One of version 1 gets pump 0 without a
+        heartbeat, which neither feeds nor arms its watchdog: its holder may run the pump again with
+        the next command.
         """
         if self._registers.map_version == 1:
-            await self._link.write_register(self._registers.register("pump_command_fraction").address, 0)
+            await self._link.write_register(
+                self._registers.register("pump_command_fraction").address, 0
+            )
         else:
             await self._write("stop", {"stop": 1.0})
 
@@ -228,7 +256,8 @@ class PumpBoard:
     async def close(self) -> None:
         """Disarm the watchdog, which gives the claim back, and close the link; never raises.
 
-        The board refuses to be disarmed while the pump is commanded: then the watchdog stays and turns it off.
+        The board refuses to be disarmed while the pump is commanded: then the watchdog stays and
+        turns it off.
         """
         if self._armed and self._link.connected:
             with contextlib.suppress(roles.LinkError):  # the watchdog then does what it is for
@@ -244,7 +273,9 @@ class PumpBoard:
 
     async def _write_settings(self, arm: float) -> None:
         claim = {"claim_id": self._claim_id, "claim_key": self._claim_key}
-        await self._write("settings", {"watchdog_period_s": self._watchdog_s, "watchdog_arm": arm, **claim})
+        await self._write(
+            "settings", {"watchdog_period_s": self._watchdog_s, "watchdog_arm": arm, **claim}
+        )
 
     async def _write(self, name: str, values: Mapping[str, float]) -> None:
         block = self._registers.block(name)

@@ -1,7 +1,8 @@
 """A display through pygame-ce (SDL): a `Display`.
 
-Source: pygame-ce documentation, `pygame.display`. SDL silently gives another size than the requested one, so every
-size is compared. `flip` returns when the picture is queued, not when it is lit.
+Source: pygame-ce documentation, `pygame.display`. SDL silently gives another size than the
+requested one, so every size is compared. `flip` returns when the picture is queued, not when it is
+lit.
 """
 
 import importlib
@@ -17,7 +18,9 @@ MISSING = "pygame-ce is not installed: pip install 'membrane-ctrl[screen]'"
 
 
 class PygameDisplay:
-    """The display, fullscreen, from `open` to `close`. For the main thread of a process only (SDL's rule)."""
+    """The display, fullscreen, from `open` to `close`. For the main thread of a process only (SDL's
+    rule).
+    """
 
     def __init__(self, config: PygameScreenConfig) -> None:
         self._config = config
@@ -26,7 +29,9 @@ class PygameDisplay:
         self._window: Any = None
 
     def open(self) -> DeviceIdentity:
-        """Take the display. Raises LinkError (no pygame, no display), DeviceRefusedError (another size)."""
+        """Take the display. Raises LinkError (no pygame, no display), DeviceRefusedError (another
+        size).
+        """
         self.close()
         config = self._config
         self._pygame = pygame = _pygame()
@@ -35,7 +40,9 @@ class PygameDisplay:
             pygame.display.init()
             desktops = pygame.display.get_desktop_sizes()
             if config.display >= len(desktops):
-                raise LinkError(f"{self._name}: there are {len(desktops)} displays; see `membrane-ctrl devices`")
+                raise LinkError(
+                    f"{self._name}: there are {len(desktops)} displays; see `membrane-ctrl devices`"
+                )
             self._must_be("desktop", desktops[config.display], size)
             flags = pygame.FULLSCREEN | pygame.NOFRAME
             self._window = pygame.display.set_mode(size, flags, display=config.display)
@@ -51,7 +58,9 @@ class PygameDisplay:
         except LinkError:
             self.close()
             raise
-        return DeviceIdentity(f"display {pygame.display.get_driver()}", "", "", f"{size[0]} x {size[1]}")
+        return DeviceIdentity(
+            f"display {pygame.display.get_driver()}", "", "", f"{size[0]} x {size[1]}"
+        )
 
     def prepare(self, levels: Levels) -> Any:
         """Convert a picture (height, width) to the display's own format."""
@@ -87,15 +96,20 @@ class PygameDisplay:
     def _must_be(self, name: str, found: tuple[int, int], wanted: tuple[int, int]) -> None:
         if tuple(found) != wanted:
             raise DeviceRefusedError(
-                f"{self._name}: {name} is {found[0]} x {found[1]}, [devices.screen] says {wanted[0]} x "
-                f"{wanted[1]}; set the panel's own resolution without scaling, or correct the configuration"
+                f"{self._name}: {name} is {found[0]} x {found[1]}, [devices.screen] says "
+                f"{wanted[0]} x "
+                f"{wanted[1]}; set the panel's own resolution without scaling, or correct "
+                "the configuration"
             )
 
 
 def _pygame() -> Any:
-    """The library, without its greeting and without a GPU. Raises LinkError with the remedy if not installed."""
+    """The library, without its greeting and without a GPU. Raises LinkError with the remedy if not
+    installed.
+    """
     os.environ.setdefault("PYGAME_HIDE_SUPPORT_PROMPT", "1")
-    # Straight into the display's memory: a detour over a software GPU takes 30 ms at 1920 x 1080, this 0.5
+    # Straight into the display's memory: a detour over a software GPU takes 30 ms at 1920 x 1080,
+    # this 0.5
     os.environ.setdefault("SDL_FRAMEBUFFER_ACCELERATION", "0")
     try:
         return importlib.import_module("pygame")

@@ -1,11 +1,11 @@
 """Vaisala PTB330 barometer on RS-232.
 
-Manual: PTB330 user's guide M210855EN; FORM and its modifiers pages 70-72, UNIT, ECHO page 83, `?` and ERRS pages
-87-88. Its factory setting is 4800 7E1.
+Manual: PTB330 user's guide M210855EN; FORM and its modifiers pages 70-72, UNIT, ECHO page 83, `?`
+and ERRS pages 87-88. Its factory setting is 4800 7E1.
 
-Each message is configured to carry pressure, unit, the modules' error flags, the running counter of measurements
-(which reveals a frozen value), the serial number (which reveals another instrument) and a checksum (sum of all bytes
-before it modulo 65536): `FORM 4.3 P U3 ERR MCTR SN CS4`.
+Each message is configured to carry pressure, unit, the modules' error flags, the running counter of
+measurements (which reveals a frozen value), the serial number (which reveals another instrument)
+and a checksum (sum of all bytes before it modulo 65536): `FORM 4.3 P U3 ERR MCTR SN CS4`.
 """
 
 import asyncio
@@ -20,7 +20,9 @@ FORMAT = '4.3 P " " U3 " " ERR " " MCTR " " SN " " CS4 #r #n'
 PA_PER_HPA = 100.0
 RANGE_PA = (50_000.0, 110_000.0)  # of the instrument
 _MESSAGE = re.compile(r"(( *\d{3,4}\.\d{3}|\*+) hPa ([01]{1,3}) * *(\d+) +(\w+) )([0-9A-F]{4})\r\n")
-_IDENTITY = re.compile(r".*?(PTB330) / (\S+).*?Serial number\s*: *(\S+).*?Module 4\s*:[^\r\n]*\r\n", re.DOTALL)
+_IDENTITY = re.compile(
+    r".*?(PTB330) / (\S+).*?Serial number\s*: *(\S+).*?Module 4\s*:[^\r\n]*\r\n", re.DOTALL
+)
 # the echo may still be on at the first question
 _VERSION = re.compile(r"(?:.*\r\n)?>? *\S+ / \S+ *\r\n>?", re.DOTALL)
 _UNIT = re.compile(r"P\s*: hPa *\r\n(?:[^\r\n]*\r\n)*")  # other quantities follow
@@ -31,7 +33,9 @@ _ERRORS = re.compile(r"(?:(?:PASS|FAIL)\s*\r\n)?([^\r\n]+)\r\n")
 
 @dataclass(frozen=True, slots=True)
 class BarometerMessage:
-    """One measurement: `pressure_pa` NaN when the instrument has none, `counter` its running number."""
+    """One measurement: `pressure_pa` NaN when the instrument has none, `counter` its running
+    number.
+    """
 
     pressure_pa: float
     counter: int
@@ -46,10 +50,14 @@ class VaisalaPtb330(exchange.LineDriver):
 
     manual = "PTB330 user's guide M210855EN, pages 70-88"
 
-    def __init__(self, config: settings.VaisalaPtb330Config, port: serial_port.SerialPort | None = None) -> None:
+    def __init__(
+        self, config: settings.VaisalaPtb330Config, port: serial_port.SerialPort | None = None
+    ) -> None:
         settings = serial_port.SerialSettings(config.baud, data_bits=7, parity="E")
         fence = exchange.LineFence("VERS", _VERSION)
-        super().__init__(port or serial_port.SerialPort(config.port, settings), "\r\n", config.timeout_s, fence)
+        super().__init__(
+            port or serial_port.SerialPort(config.port, settings), "\r\n", config.timeout_s, fence
+        )
         self._period_s, self._age_max_s = config.period_s, config.age_max_s
         self._task: asyncio.Task[None] | None = None
         self._newest = BarometerMessage(math.nan, -1, "")
@@ -58,13 +66,18 @@ class VaisalaPtb330(exchange.LineDriver):
         self._identity: roles.DeviceIdentity | None = None
 
     async def open(self) -> roles.DeviceIdentity:
-        """Open the port, stop its own output, check its identity, set unit and format, start to poll.
+        """Open the port, stop its own output, check its identity, set unit and format, start to
+        poll.
 
-        Raises LinkError (no valid answer; LinkDownError without a port), DeviceRefusedError (another instrument, or a
-        format that it does not take).
+        Raises LinkError (no valid answer; LinkDownError without a port), DeviceRefusedError
+        (another instrument, or a format that it does not take).
         """
         await self.close()
-        self._newest, self._newest_s, self._down = BarometerMessage(math.nan, -1, ""), -math.inf, None
+        self._newest, self._newest_s, self._down = (
+            BarometerMessage(math.nan, -1, ""),
+            -math.inf,
+            None,
+        )
         identity = await self._opened(self._begin, "\r\nS\r\nECHO OFF\r\n")
         self._task = asyncio.create_task(self._run(), name="barometer")
         return identity
@@ -79,7 +92,9 @@ class VaisalaPtb330(exchange.LineDriver):
         return identity
 
     async def _known_again(self) -> roles.DeviceIdentity | None:
-        """The known identity, if a message of the right form and serial number comes at once; this saves a second."""
+        """The known identity, if a message of the right form and serial number comes at once; this
+        saves a second.
+        """
         if self._identity is not None:
             try:
                 await self._refresh()
@@ -105,7 +120,9 @@ class VaisalaPtb330(exchange.LineDriver):
         found = (await self._link.query("FORM ?", _FORM, 200))[1]
         # it is shown with backslashes in place of hash signs
         if found.replace("\\", "#").casefold().split() != FORMAT.casefold().split():
-            raise roles.DeviceRefusedError(f"{self._link.name}: FORM set to {FORMAT!r}, read back {found.strip()!r}")
+            raise roles.DeviceRefusedError(
+                f"{self._link.name}: FORM set to {FORMAT!r}, read back {found.strip()!r}"
+            )
 
     async def _run(self) -> None:
         while True:
@@ -123,7 +140,9 @@ class VaisalaPtb330(exchange.LineDriver):
         message = decode_message(answer, self._link.name)
         if self._identity is not None and message.serial != self._identity.serial:
             wanted, self._identity = self._identity.serial, None
-            raise roles.LinkError(f"{self._link.name}: this is barometer {message.serial}, before it was {wanted}")
+            raise roles.LinkError(
+                f"{self._link.name}: this is barometer {message.serial}, before it was {wanted}"
+            )
         if message.counter == self._newest.counter:
             return
         self._newest, self._newest_s = message, asyncio.get_running_loop().time()
@@ -165,5 +184,7 @@ def decode_message(message: re.Match[str], name: str) -> BarometerMessage:
         return BarometerMessage(math.nan, int(counter), serial)
     pressure_pa = float(pressure) * PA_PER_HPA
     if not RANGE_PA[0] <= pressure_pa <= RANGE_PA[1]:
-        raise roles.LinkError(f"{name}: {pressure_pa:.0f} Pa is outside of {RANGE_PA[0]:.0f} .. {RANGE_PA[1]:.0f} Pa")
+        raise roles.LinkError(
+            f"{name}: {pressure_pa:.0f} Pa is outside of {RANGE_PA[0]:.0f} .. {RANGE_PA[1]:.0f} Pa"
+        )
     return BarometerMessage(pressure_pa, int(counter), serial)

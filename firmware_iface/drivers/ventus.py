@@ -1,10 +1,12 @@
 """Lee (TTP) Ventus disc pump with a GP driver or smart pump module, on a UART.
 
-Source: Technical Note TN003, Communications Guide (registers), and the vendor's python-control-Development-Kit.
-`#W<register>,<value>` LF writes and is not answered, `#R<register>` LF is answered `#R<register>,<value>`.
+Source: Technical Note TN003, Communications Guide (registers), and the vendor's
+python-control-Development-Kit. `#W<register>,<value>` LF writes and is not answered, `#R<register>`
+LF is answered `#R<register>,<value>`.
 
-The pump has no watchdog: it runs on at its last power when the host is gone, and after power-up it follows its
-analogue input until a host commands it. Where gas must stop by itself, another device must stop it.
+The pump has no watchdog: it runs on at its last power when the host is gone, and after power-up it
+follows its analogue input until a host commands it. Where gas must stop by itself, another device
+must stop it.
 """
 
 import contextlib
@@ -29,7 +31,9 @@ class Ventus(exchange.LineDriver):
 
     manual = "TN003 Communications Guide; no watchdog: the pump runs on when the host is gone"
 
-    def __init__(self, config: settings.VentusConfig, port: serial_port.SerialPort | None = None) -> None:
+    def __init__(
+        self, config: settings.VentusConfig, port: serial_port.SerialPort | None = None
+    ) -> None:
         self._power_max_mw = config.power_max_mw
         # streamed lines may be on their way when the stream is switched off
         answer = re.compile(rf"(?:#S[^\n]*\n)*#R{DEVICE_TYPE},({_NUMBER})\r?\n")
@@ -41,8 +45,8 @@ class Ventus(exchange.LineDriver):
     async def open(self) -> roles.DeviceIdentity:
         """Open the port, stop the pump, check its identity, apply the settings and read them back.
 
-        Raises LinkError (no valid answer; LinkDownError without a port), DeviceRefusedError (another device, or a
-        setting that it does not take).
+        Raises LinkError (no valid answer; LinkDownError without a port), DeviceRefusedError
+        (another device, or a setting that it does not take).
         """
         await self._link.close()
         # off at once, also when nothing else works; a stream would never leave the line quiet
@@ -52,11 +56,15 @@ class Ventus(exchange.LineDriver):
         about = await self._write_and_read({}, DEVICE_TYPE, FIRMWARE, FIRMWARE_MINOR)
         kind = int(about[DEVICE_TYPE])
         if kind not in DEVICE_TYPES:
-            raise roles.DeviceRefusedError(f"{self._link.name}: device type {kind} is not a Ventus driver (2 or 3)")
+            raise roles.DeviceRefusedError(
+                f"{self._link.name}: device type {kind} is not a Ventus driver (2 or 3)"
+            )
         wanted = self._settings_wanted()
         found = await self._write_and_read(wanted, *wanted)
         if found != wanted:
-            raise roles.DeviceRefusedError(f"{self._link.name}: registers set to {wanted}, read back {found}")
+            raise roles.DeviceRefusedError(
+                f"{self._link.name}: registers set to {wanted}, read back {found}"
+            )
         await self.set_pump(0.0)
         return roles.DeviceIdentity(
             f"Ventus {DEVICE_TYPES[kind]}", "", f"{about[FIRMWARE]:g}.{about[FIRMWARE_MINOR]:g}"
@@ -73,8 +81,9 @@ class Ventus(exchange.LineDriver):
     async def set_pump(self, fraction: float) -> None:
         """Command the pump and read it back.
 
-        Raises ValueError (not within 0..1; nothing is sent), LinkError (no valid answer: the pump may or may not have
-        it), LinkDownError (the port is gone, or the pump has another value than written: open it again).
+        Raises ValueError (not within 0..1; nothing is sent), LinkError (no valid answer: the pump
+        may or may not have it), LinkDownError (the port is gone, or the pump has another value than
+        written: open it again).
         """
         if not 0.0 <= fraction <= 1.0:
             raise ValueError(f"pump fraction = {fraction} is not within 0..1")
@@ -85,8 +94,8 @@ class Ventus(exchange.LineDriver):
     async def pump_fraction(self) -> float:
         """Read back the pump's setting.
 
-        Raises LinkError (no valid answer, or the pump reports an error), LinkDownError (the port is gone, or the pump
-        has a setting that nobody commanded: open it again).
+        Raises LinkError (no valid answer, or the pump reports an error), LinkDownError (the port is
+        gone, or the pump has a setting that nobody commanded: open it again).
         """
         return await self._check(await self._write_and_read({}, *_STATE)) / self._power_max_mw
 
@@ -97,12 +106,16 @@ class Ventus(exchange.LineDriver):
         if not self._as_commanded(state):
             await self._link.close()
             raise roles.LinkDownError(
-                f"{self._link.name}: commanded {self._commanded_mw:.3f} mW, the pump has {state[SET_VALUE]:g} mW "
-                f"(on: {state[ENABLE]:g}, mode: {state[MODE]:g}, source: {state[MANUAL_SOURCE]:g}, limit: "
+                f"{self._link.name}: commanded {self._commanded_mw:.3f} mW, the pump has "
+                f"{state[SET_VALUE]:g} mW "
+                f"(on: {state[ENABLE]:g}, mode: {state[MODE]:g}, source: "
+                f"{state[MANUAL_SOURCE]:g}, limit: "
                 f"{state[POWER_LIMIT_MW]:g} mW); noise on the line, or it restarted: open it again"
             )
         if error := state[ERROR]:
-            raise roles.LinkError(f"{self._link.name}: the pump reports error {error:g}; see its manual")
+            raise roles.LinkError(
+                f"{self._link.name}: the pump reports error {error:g}; see its manual"
+            )
         return state[SET_VALUE] if state[ENABLE] else 0.0
 
     def _as_commanded(self, state: dict[int, float]) -> bool:
@@ -117,13 +130,20 @@ class Ventus(exchange.LineDriver):
         """Write and read in one exchange: a write has no answer of its own."""
         lines = [f"#W{register},{_text(register, value)}" for register, value in writes.items()]
         lines += [f"#R{register}" for register in registers]
-        answer = await self._link.query("\n".join(lines), _registers(*registers), 24 * len(registers))
-        return {register: float(value) for register, value in zip(registers, answer.groups(), strict=True)}
+        answer = await self._link.query(
+            "\n".join(lines), _registers(*registers), 24 * len(registers)
+        )
+        return {
+            register: float(value)
+            for register, value in zip(registers, answer.groups(), strict=True)
+        }
 
     async def close(self) -> None:
         """Switch the pump off and close the port. Never raises."""
         if self._link.port.is_open:
-            with contextlib.suppress(roles.LinkError):  # out of reach: this program can no longer stop the gas
+            with contextlib.suppress(
+                roles.LinkError
+            ):  # out of reach: this program can no longer stop the gas
                 await self.set_pump(0.0)
         await self._link.close()
 

@@ -1,4 +1,6 @@
-"""A stand-in for the package `gpiod`: GPIO chips with contacts that a test opens, closes or cuts."""
+"""A stand-in for the package `gpiod`: GPIO chips with contacts that a test opens,
+closes or cuts.
+"""
 
 from collections.abc import Mapping
 from typing import Literal
@@ -41,7 +43,9 @@ class EmulatedGpio:
         self.failing: OSError | None = None
         self.requests = 0
 
-    def request_lines(self, chip: str, consumer: str, config: Mapping[int, LineSettings]) -> "EmulatedRequest":
+    def request_lines(
+        self, chip: str, consumer: str, config: Mapping[int, LineSettings]
+    ) -> "EmulatedRequest":
         """Request lines. Raises OSError, and ValueError for lines that the chip does not have."""
         self.check()
         if missing := [line for line in config if (chip, line) not in self.contacts]:
@@ -58,7 +62,9 @@ class EmulatedGpio:
 class EmulatedRequest:
     """Requested lines."""
 
-    def __init__(self, gpio: EmulatedGpio, chip: str, config: Mapping[int, EmulatedGpio.LineSettings]) -> None:
+    def __init__(
+        self, gpio: EmulatedGpio, chip: str, config: Mapping[int, EmulatedGpio.LineSettings]
+    ) -> None:
         self._gpio, self._chip, self._config = gpio, chip, config
         self.released = False
 
@@ -78,8 +84,14 @@ class EmulatedRequest:
         return EmulatedGpio.line.Value.ACTIVE if active else EmulatedGpio.line.Value.INACTIVE
 
     def _is_raised(self, line: int, settings: EmulatedGpio.LineSettings) -> bool:
-        """The electrical level: the contact's if it is closed, otherwise that of the pull resistor."""
+        """The electrical level: the contact's if it is closed,
+        otherwise that of the pull resistor.
+        """
         to_ground = settings.active_low
         if self._gpio.contacts[self._chip, line] == "closed":
             return not to_ground
-        return to_ground if settings.bias == "disabled" else settings.bias == EmulatedGpio.line.Bias.PULL_UP
+        return (
+            to_ground
+            if settings.bias == "disabled"
+            else settings.bias == EmulatedGpio.line.Bias.PULL_UP
+        )

@@ -1,4 +1,5 @@
-"""A Modbus module with discrete inputs and coils, such as one to which interlock circuits are wired.
+"""A Modbus module with discrete inputs and coils, such as one to which interlock circuits are
+wired.
 
 Source: Modbus application protocol 1.1b3, sections 6.1 (read coils) and 6.2 (read discrete inputs).
 """

@@ -1,7 +1,7 @@
 """Emulators of laser sensors on their serial lines.
 
-optoNCDT 1420, which answers commands and streams bytes: manual 7.5.2 and appendix A 3. Keyence DL-RS1A with
-amplifiers on it: manual of the IL edition, pages 7-16.
+optoNCDT 1420, which answers commands and streams bytes: manual 7.5.2 and appendix A 3. Keyence
+DL-RS1A with amplifiers on it: manual of the IL edition, pages 7-16.
 """
 
 import asyncio
@@ -31,10 +31,17 @@ _CHOICES = {
 
 
 class Optoncdt1420Emulator(LineDevice):
-    """Measures the mirror from behind, displacement 0 in the middle of its range (NaN: no target)."""
+    """Measures the mirror from behind, displacement 0 in the middle of its range (NaN:
+    no target).
+    """
 
     def __init__(
-        self, displacement_um: Sensor, range_mm: int = 50, direction: int = -1, baud: int = 921_600, name: str = ""
+        self,
+        displacement_um: Sensor,
+        range_mm: int = 50,
+        direction: int = -1,
+        baud: int = 921_600,
+        name: str = "",
     ) -> None:
         super().__init__(baud)
         self._displacement_um = displacement_um
@@ -87,8 +94,10 @@ class Optoncdt1420Emulator(LineDevice):
 
     def _about(self) -> str:
         return (
-            f"Name:             {self._name}\r\nSerial:           15030002\r\nOption:           000\r\n"
-            f"Article:          4120212\r\nCable head:       Wire\r\nMeasuring range:  {self._range_mm:.2f}mm\r\n"
+            f"Name:             {self._name}\r\nSerial:           15030002\r\nOption:        "
+            "   000\r\n"
+            "Article:          4120212\r\nCable head:       Wire\r\nMeasuring range:  "
+            f"{self._range_mm:.2f}mm\r\n"
             "Version:          001.010\r\nHardware-rev:     00\r\nBoot-version:     001.000\r\n"
         )
 
@@ -118,7 +127,9 @@ class Optoncdt1420Emulator(LineDevice):
         self.say(data)
 
     def digital(self, displacement_um: float) -> int:
-        """Page 65, without mastering: x = (d / range + 0.01) 65520 / 1.02; page 66 without a value."""
+        """Page 65, without mastering: x = (d / range + 0.01) 65520 / 1.02;
+        page 66 without a value.
+        """
         if math.isnan(displacement_um):
             return NO_PEAK
         distance_mm = self._range_mm / 2 + self._direction * displacement_um / 1000
@@ -147,7 +158,8 @@ _WRITABLE = ("001",)
 
 
 class KeyenceDlRs1aEmulator(LineDevice):
-    """One amplifier that measures the mirror (NaN: it is in error), and others that measure nothing of interest.
+    """One amplifier that measures the mirror (NaN: it is in error), and others that measure nothing
+    of interest.
 
     `error_state` is data number 033 of all amplifiers, `zero_shift_mm` that of the judgment value.
     """
@@ -155,7 +167,12 @@ class KeyenceDlRs1aEmulator(LineDevice):
     end = b"\r"
 
     def __init__(
-        self, displacement_um: Sensor, direction: int = -1, baud: int = 9600, parity: str = "N", amplifiers: int = 1
+        self,
+        displacement_um: Sensor,
+        direction: int = -1,
+        baud: int = 9600,
+        parity: str = "N",
+        amplifiers: int = 1,
     ) -> None:
         super().__init__(baud, parity=parity)
         self.error_state = 0
@@ -181,7 +198,11 @@ class KeyenceDlRs1aEmulator(LineDevice):
         amplifier, number = parameters[:2]
         if not amplifier.isdigit() or int(amplifier) >= self._amplifiers:
             return f"ER,{command},65"
-        return self._read(amplifier, number) if command == "SR" else self._write(amplifier, number, parameters[2])
+        return (
+            self._read(amplifier, number)
+            if command == "SR"
+            else self._write(amplifier, number, parameters[2])
+        )
 
     def _read(self, amplifier: str, number: str) -> str:
         values = {

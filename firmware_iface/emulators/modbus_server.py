@@ -1,7 +1,8 @@
 """A small Modbus TCP server for emulators, which can also answer wrongly on purpose.
 
-It does not use the client's library: two independent implementations check each other, and a library's server cannot
-be silent, late or short. Source: Modbus application protocol 1.1b3 and messaging guide 1.0b.
+It does not use the client's library: two independent implementations check each other, and a
+library's server cannot be silent, late or short. Source: Modbus application protocol 1.1b3 and
+messaging guide 1.0b.
 """
 
 import asyncio
@@ -69,7 +70,9 @@ def _respond(function_code: int, data: bytes, table: RegisterTable) -> bytes:
     if function_code == READ_WRITE:
         read_address, read_count = struct.unpack_from(">HH", data)
         address, words = _words_written(data[4:], _READ_WRITE_MAX)
-        _words_read(table, read_address, read_count)  # refused as a whole: a wrong read writes nothing
+        _words_read(
+            table, read_address, read_count
+        )  # refused as a whole: a wrong read writes nothing
         table.write(address, words)
         return _words_read(table, read_address, read_count)
     raise RegisterRefusal(ILLEGAL_FUNCTION)
@@ -93,7 +96,8 @@ class Answer:
     """The answer to a request."""
 
     pdu: bytes = b""  # empty: nothing is sent
-    delay_s: float = 0.0  # sent this much later; later requests of the connection are answered meanwhile
+    # sent this much later; later requests of the connection are answered meanwhile
+    delay_s: float = 0.0
     hang_up: bool = False  # the connection is dropped instead
     transaction_offset: int = 0  # added to the transaction id; other than 0 it is a wrong answer
 
@@ -103,7 +107,9 @@ Handler = Callable[[int, bytes], Answer]
 
 
 class ModbusTcpServer:
-    """Serves any number of clients, each request answered by `handler` as soon as it is complete."""
+    """Serves any number of clients, each request answered by
+    `handler` as soon as it is complete.
+    """
 
     def __init__(self, handler: Handler, host: str, port: int) -> None:
         self._handler = handler
@@ -198,11 +204,13 @@ class _Connection(asyncio.Protocol):
             self._transport.write(frame)
 
 
-# Any Modbus device as an RTU slave on an emulated serial line, alone or with others on the same bus.
+# Any Modbus device as an RTU slave on an emulated serial line, alone or with others on the same
+# bus.
 
 _SHORTEST = 4  # unit, function, CRC
 _LONGEST = 256  # of a frame; bytes without a silence between them never end otherwise
-_SILENCE_S = 0.005  # far above the 1.75 ms of the standard: a program's bytes may be held up between two reads
+# far above the 1.75 ms of the standard: a program's bytes may be held up between two reads
+_SILENCE_S = 0.005
 DIAGNOSTICS = 8
 
 PduHandler = Callable[[bytes], bytes]
@@ -215,7 +223,9 @@ class RtuBusEmulator(SerialDevice):
     Without `echo_test` function 8 ("return query data") is refused.
     """
 
-    def __init__(self, settings: SerialSettings, slaves: Mapping[int, PduHandler], echo_test: bool = True) -> None:
+    def __init__(
+        self, settings: SerialSettings, slaves: Mapping[int, PduHandler], echo_test: bool = True
+    ) -> None:
         super().__init__(settings)
         self._slaves = slaves
         self._echo_test = echo_test
@@ -243,7 +253,9 @@ class RtuBusEmulator(SerialDevice):
 
 
 def bitwise_crc(data: bytes) -> int:
-    """The CRC of Modbus, bit by bit as in the standard's figure: independent of the link's table."""
+    """The CRC of Modbus, bit by bit as in the standard's figure:
+    independent of the link's table.
+    """
     crc = 0xFFFF
     for byte in data:
         crc ^= byte

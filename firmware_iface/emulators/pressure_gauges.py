@@ -1,7 +1,7 @@
 """Emulators of pressure gauges on their serial lines.
 
-MKS 937B or 946 with a capacitance manometer on one channel: 937B manual page 86, 946 manual page 103. Vaisala PTB330:
-user's guide M210855EN, pages 70-103.
+MKS 937B or 946 with a capacitance manometer on one channel: 937B manual page 86, 946 manual page
+103. Vaisala PTB330: user's guide M210855EN, pages 70-103.
 """
 
 import asyncio
@@ -20,7 +20,12 @@ class Mks937bEmulator(LineDevice):
     end = b";FF"
 
     def __init__(
-        self, gauge_pa: Sensor, baud: int = 115_200, parity: str = "N", address: int = 253, channel: int = 1
+        self,
+        gauge_pa: Sensor,
+        baud: int = 115_200,
+        parity: str = "N",
+        address: int = 253,
+        channel: int = 1,
     ):
         super().__init__(baud, parity=parity)
         self.model, self.serial, self.unit = "937B", "0123456789", "TORR"
@@ -69,12 +74,18 @@ _DEFAULT_FORMAT = '"P= " 4.2 P " " U3 #r #n'
 
 
 class VaisalaPtb330Emulator(LineDevice):
-    """Measures the air (NaN: it cannot); `running`: it was left sending. `error_flags` are its three modules'."""
+    """Measures the air (NaN: it cannot); `running`: it was left sending. `error_flags` are its
+    three modules'.
+    """
 
     end = b"\r"
 
     def __init__(
-        self, ambient_pressure_pa: Sensor, baud: int = 4800, running: bool = False, model: str = "PTB330"
+        self,
+        ambient_pressure_pa: Sensor,
+        baud: int = 4800,
+        running: bool = False,
+        model: str = "PTB330",
     ) -> None:
         super().__init__(baud, data_bits=7, parity="E")
         self.error_flags = "000"
@@ -149,17 +160,23 @@ class VaisalaPtb330Emulator(LineDevice):
         return ""
 
     def _about(self) -> str:
-        modules = "".join(f"Module {n}       : {'BARO-1' if n < 4 else 'EMPTY'}\n" for n in range(1, 5))
+        modules = "".join(
+            f"Module {n}       : {'BARO-1' if n < 4 else 'EMPTY'}\n" for n in range(1, 5)
+        )
         return (
             f"{self._model} / 1.01\nSerial number  : {self.serial}\nBatch number   : B8901234\n"
-            f"Output format  : {self._format}\nAdjust. date   : 2007-05-03\nAdjust. info   : VAISALA\n"
+            f"Output format  : {self._format}\nAdjust. date   : 2007-05-03\nAdjust. info   : "
+            "VAISALA\n"
             "Date           : 2007-05-08\nTime           : 13:42:01\nStart mode     : STOP\n"
-            f"Baud P D S     : {self.settings.baud} E 7 1\nOutput interval: 1 s\nAddress        : 0\n"
+            f"Baud P D S     : {self.settings.baud} E 7 1\nOutput interval: 1 s\nAddress     "
+            "   : 0\n"
             f"Echo           : {'ON' if self._echo else 'OFF'}\n{modules}"
         )
 
     def _message(self) -> bytes:
-        """Table 12 (page 71): number format before a quantity, quoted text as it is, the rest by name."""
+        """Table 12 (page 71): number format before a quantity, quoted text as it is, the rest by
+        name.
+        """
         if not self.frozen:
             self._counter = int(asyncio.get_running_loop().time() / _PERIOD_S)
             self._pressure_pa = self._ambient_pressure_pa()

@@ -1,6 +1,7 @@
 """The membrane pump board as a Modbus TCP device over any plant.
 
-`BoardState` is what it does, without bytes, clock or asyncio: registers, watchdog, latches, its own limits.
+`BoardState` is what it does, without bytes, clock or asyncio: registers, watchdog, latches, its own
+limits.
 """
 
 import asyncio
@@ -11,7 +12,12 @@ from typing import Protocol
 
 from firmware_iface.board_settings import GAUGE_FROZEN_S, GAUGE_TIMEOUT_S
 from firmware_iface.emulators import modbus_server
-from firmware_iface.emulators.modbus_server import BUSY, ILLEGAL_ADDRESS, ILLEGAL_VALUE, RegisterRefusal
+from firmware_iface.emulators.modbus_server import (
+    BUSY,
+    ILLEGAL_ADDRESS,
+    ILLEGAL_VALUE,
+    RegisterRefusal,
+)
 from firmware_iface.register_map import Block, Register, RegisterMap, default_map, make_block
 
 FIRMWARE_VERSION = 0x00_01_01_00  # 1.1.0
@@ -20,14 +26,18 @@ GAUGE_PRESSURE_LIMIT_PA = 800.0
 PUMP_LIMIT_FRACTION = 1.0
 WATCHDOG_PERIOD_S = 1.0  # after power-up; the watchdog itself is then off, as on most devices
 _GAUGE_RANGE_PA = default_map().register("gauge_pressure_pa").to_value(2**31 - 1)
-_SECRETS = dict.fromkeys(("claim_key", "command_key", "clear_key", "stop"), 0.0)  # registers that read as 0
+_SECRETS = dict.fromkeys(
+    ("claim_key", "command_key", "clear_key", "stop"), 0.0
+)  # registers that read as 0
 # the register of a block that carries the claim's secret; a block without one needs no claim
 _KEYS = {"settings": "claim_key", "command": "command_key", "reset": "clear_key"}
 
 
 @dataclass(frozen=True, slots=True)
 class BoardSample:
-    """One sample of the board's sensors; NaN where there is no value (units as in `roles.BenchReading`)."""
+    """One sample of the board's sensors; NaN where there is no value (units as in
+    `roles.BenchReading`).
+    """
 
     displacement_um: float
     displacement_quality: int
@@ -47,19 +57,23 @@ class BoardSample:
 
 @dataclass(frozen=True, slots=True)
 class StoredSettings:
-    """Settings that a board keeps without power: which protections of its own are fitted (from map version 3)."""
+    """Settings that a board keeps without power: which protections of its own are fitted (from map
+    version 3).
+    """
 
     gauge_fitted: bool = True
     gauge_timeout_s: float = GAUGE_TIMEOUT_S  # of pumping without a value of the gauge
-    gauge_frozen_s: float = GAUGE_FROZEN_S  # of pumping with a gauge that repeats its value; 0: not judged
+    # of pumping with a gauge that repeats its value; 0: not judged
+    gauge_frozen_s: float = GAUGE_FROZEN_S
     interlocks_fitted: int = 0  # bit i: interlock input i stops the pump when it is open
 
 
 class BoardState:
     """The board between two requests, of the map version of `registers`; it reports `map_version`.
 
-    `advance` is called before every request and every few milliseconds: the watchdog, the pressure limit and the
-    guard of the gauge depend only on the time passed in. Boards of map versions 1 and 2 ignore `stored`.
+    `advance` is called before every request and every few milliseconds: the watchdog, the pressure
+    limit and the guard of the gauge depend only on the time passed in. Boards of map versions 1 and
+    2 ignore `stored`.
     """
 
     def __init__(
@@ -99,26 +113,38 @@ class BoardState:
         self._faults = 0
         self._gauge_seen_s = -math.inf  # when the gauge last had a value
         self._gauge_pa = math.nan  # that value
-        self._gauge_same_s = 0.0  # time of pumping since it changed, or since a person cleared `gauge_lost`
+        # time of pumping since it changed, or since a person cleared `gauge_lost`
+        self._gauge_same_s = 0.0
         self._watch_gauge(0.0)
         self._protect()
 
     @property
     def pump_fraction(self) -> float:
         """What the pump is given: 0 while any fault is latched."""
-        return 0.0 if self._faults else min(self._settable["pump_command_fraction"], PUMP_LIMIT_FRACTION)
+        return (
+            0.0
+            if self._faults
+            else min(self._settable["pump_command_fraction"], PUMP_LIMIT_FRACTION)
+        )
 
     @property
     def vent_fraction(self) -> float:
         """How far the vent is open: fully after over-pressure.
 
-        A watchdog trip leaves it as commanded: a controller that died while venting must not stop the venting, and
-        one that died while holding had it closed or at a small bleed, on which the mirror sinks slowly.
+        A watchdog trip leaves it as commanded: a controller that died while venting must not stop
+        the venting, and one that died while holding had it closed or at a small bleed, on which the
+        mirror sinks slowly.
         """
-        return 1.0 if self._faults & self._over_pressure_mask else self._settable["vent_command_fraction"]
+        return (
+            1.0
+            if self._faults & self._over_pressure_mask
+            else self._settable["vent_command_fraction"]
+        )
 
     def advance(self, now_s: float, sample: BoardSample) -> None:
-        """Take the newest sample at a time (on any axis), then let the board's own protections act."""
+        """Take the newest sample at a time (on any axis),
+        then let the board's own protections act.
+        """
         passed_s = now_s - self._now_s
         self._now_s = now_s
         self._sample = sample
@@ -126,7 +152,10 @@ class BoardState:
             self._latch(self._over_pressure_mask)
         self._watch_gauge(passed_s)
         self._protect()
-        if self._settable["watchdog_arm"] and now_s - self._fed_s > self._settable["watchdog_period_s"]:
+        if (
+            self._settable["watchdog_arm"]
+            and now_s - self._fed_s > self._settable["watchdog_period_s"]
+        ):
             self._latch(self._watchdog_mask)
 
     def _watch_gauge(self, passed_s: float) -> None:
@@ -150,9 +179,10 @@ class BoardState:
     def _protect(self) -> None:
         """Stop a pump whose gauge is lost, and latch an open interlock.
 
-        Judged with every sample and after every write, so that no command drives the pump even for a moment. The
-        gauge's age goes on while the fault is latched and when it is cleared: without a new value the pump does not
-        run again. An open circuit latches even if the pump is off: an emergency stop must not be forgotten.
+        Judged with every sample and after every write, so that no command drives the pump even for
+        a moment. The gauge's age goes on while the fault is latched and when it is cleared: without
+        a new value the pump does not run again. An open circuit latches even if the pump is off: an
+        emergency stop must not be forgotten.
         """
         if not self._guards:
             return
@@ -167,14 +197,20 @@ class BoardState:
 
         A latched fault does not matter: a program may claim and hold a latched board.
         """
-        return bool(self._claim_key) and self._now_s - self._fed_s <= self._settable["watchdog_period_s"]
+        return (
+            bool(self._claim_key)
+            and self._now_s - self._fed_s <= self._settable["watchdog_period_s"]
+        )
 
     def _latch(self, mask: int) -> None:
         self._faults |= mask
-        self._settable["pump_command_fraction"] = 0.0  # so that nothing moves when the fault is cleared
+        # so that nothing moves when the fault is cleared
+        self._settable["pump_command_fraction"] = 0.0
 
     def read(self, address: int, count: int) -> list[int]:
-        """Words of one instant. Raises RegisterRefusal (illegal address) if one of them does not exist."""
+        """Words of one instant. Raises RegisterRefusal (illegal address) if one of them does not
+        exist.
+        """
         values = self._values()
         whole = self._by_span.get((address, count))
         if whole is not None:
@@ -191,9 +227,10 @@ class BoardState:
     def write(self, address: int, words: Sequence[int]) -> None:
         """Write whole registers, all or none.
 
-        Raises RegisterRefusal: illegal address for a read-only or unknown register or for a part of one, illegal
-        value outside the limits and for disarming the watchdog while the pump is commanded. With claims, illegal
-        address for a part of a block, busy while another holds the board, illegal value without any claim.
+        Raises RegisterRefusal: illegal address for a read-only or unknown register or for a part of
+        one, illegal value outside the limits and for disarming the watchdog while the pump is
+        commanded. With claims, illegal address for a part of a block, busy while another holds the
+        board, illegal value without any claim.
         """
         target = self._written_block(address, len(words))
         written = target.decode(words)
@@ -218,7 +255,9 @@ class BoardState:
             raise RegisterRefusal(ILLEGAL_VALUE)
 
     def _claim(self, written: dict[str, float]) -> None:
-        """Arming claims the board, disarming gives it back; a new claim has a whole period from now on."""
+        """Arming claims the board, disarming gives it back; a new claim has a whole period from now
+        on.
+        """
         if not written["watchdog_arm"]:
             self._claim_id = self._claim_key = 0.0
             return
@@ -299,7 +338,8 @@ class BoardState:
         }
 
 
-_PERIOD_S = 0.01  # the board's own loop; the pump is off at most this and one wake-up after the watchdog period
+# the board's own loop; the pump is off at most this and one wake-up after the watchdog period
+_PERIOD_S = 0.01
 _GATEWAY_NO_RESPONSE = 11
 
 
@@ -316,9 +356,10 @@ class BoardPlant(Protocol):
 class PumpBoardEmulator:
     """Serves `plant` on Modbus TCP, from the event loop's thread.
 
-    Port 0 takes any free one (see `port` after `start`). The watchdog runs on `clock`, by default the event loop's.
-    Requests to other units get exception 11, as from a gateway. `registers` may be those of an earlier map version;
-    `stored` are the settings that the board keeps without power.
+    Port 0 takes any free one (see `port` after `start`). The watchdog runs on `clock`, by default
+    the event loop's. Requests to other units get exception 11, as from a gateway. `registers` may
+    be those of an earlier map version; `stored` are the settings that the board keeps without
+    power.
     """
 
     def __init__(
@@ -352,7 +393,9 @@ class PumpBoardEmulator:
         self._task = asyncio.create_task(self._run(), name="pump board emulator")
 
     async def stop(self) -> None:
-        """Switch the board off: connections dropped, pump off, vent as it was. Raises what the plant raised."""
+        """Switch the board off: connections dropped, pump off, vent as it was. Raises what the
+        plant raised.
+        """
         task, self._task = self._task, None
         if task is None:
             return
@@ -364,7 +407,9 @@ class PumpBoardEmulator:
             self._plant.actuate(0.0, self._actuated[1])
 
     def power_cycle(self) -> None:
-        """Restart the board; connections live on, as behind a gateway (see also `drop_connections`)."""
+        """Restart the board; connections live on, as behind a gateway (see also
+        `drop_connections`).
+        """
         self.state.restart()
         self._actuate()
 

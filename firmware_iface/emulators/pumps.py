@@ -1,7 +1,7 @@
 """Emulators of what drives gas, over any plant.
 
-Ventus disc pump's driver board on its UART: TN003 Communications Guide. Bronkhorst EL-FLOW and EL-PRESS, as Modbus
-registers or as a ProPar device on a serial line.
+Ventus disc pump's driver board on its UART: TN003 Communications Guide. Bronkhorst EL-FLOW and
+EL-PRESS, as Modbus registers or as a ProPar device on a serial line.
 """
 
 import asyncio
@@ -18,7 +18,19 @@ _COMMAND = re.compile(r"#(?:W(\d+),(-?\d+(?:\.\d+)?)|R(\d+))")
 _VENTUS_READ_ONLY = (31, 36, 37, 38, 39)
 _FLOATS = (23, 39)
 # the vendor's defaults: enabled, driven by an analogue input
-_DEFAULTS = {0: 1.0, 1: 1000.0, 2: 0.0, 10: 0.0, 11: 3.0, 23: 250.0, 31: 0.0, 36: 2.0, 37: 3.0, 38: 7.0, 39: 0.0}
+_DEFAULTS = {
+    0: 1.0,
+    1: 1000.0,
+    2: 0.0,
+    10: 0.0,
+    11: 3.0,
+    23: 250.0,
+    31: 0.0,
+    36: 2.0,
+    37: 3.0,
+    38: 7.0,
+    39: 0.0,
+}
 _STREAM_PERIOD_S = 0.02
 
 
@@ -81,14 +93,19 @@ class VentusEmulator(LineDevice):
             self._stream = asyncio.get_running_loop().call_later(_STREAM_PERIOD_S, self._say_state)
 
     def _power_mw(self) -> float:
-        # manual mode from SetVal is the only one with a known power; the analogue input is open, at zero
+        # manual mode from SetVal is the only one with a known power; the analogue input is open, at
+        # zero
         manual = self.registers[0] and not self.registers[10] and not self.registers[11]
         return min(self.registers[23], self.registers[1]) if manual else 0.0
 
     def _say_state(self) -> None:
         self._stream = None
         if self.registers[2]:
-            self.say(f"#S{self.registers[0]:.0f},0.000,0.000,21000,0.000,0.000,0.000,0.000\n".encode("ascii"))
+            self.say(
+                f"#S{self.registers[0]:.0f},0.000,0.000,21000,0.000,0.000,0.000,0.000\n".encode(
+                    "ascii"
+                )
+            )
             self._act()
 
 
@@ -104,8 +121,9 @@ _TYPES = {"u8": 0x00, "u16": 0x20, "f32": 0x40, "text": 0x60}
 class Instrument:
     """The instrument behind its interfaces: "DMFC" (EL-FLOW) or "DEPC" (EL-PRESS).
 
-    100 % is `capacity`, in `unit` ("mln/min", "mbar(g)"). `measured` gives the sensor's value in `unit`; without it a
-    flow controller measures its own setpoint. `actuate` gets the flowing fraction 0..1 whenever it changes.
+    100 % is `capacity`, in `unit` ("mln/min", "mbar(g)"). `measured` gives the sensor's value in
+    `unit`; without it a flow controller measures its own setpoint. `actuate` gets the flowing
+    fraction 0..1 whenever it changes.
     """
 
     def __init__(
@@ -160,7 +178,9 @@ class Instrument:
         return {
             bronkhorst.MEASURE: min(max(counts, _COUNTS_MAX - 0x10000 + 1), _COUNTS_MAX) % 0x10000,
             bronkhorst.FMEASURE: measured,
-            bronkhorst.FSETPOINT: self._settings[bronkhorst.SETPOINT] / bronkhorst.FULL_SCALE * self._capacity,
+            bronkhorst.FSETPOINT: self._settings[bronkhorst.SETPOINT]
+            / bronkhorst.FULL_SCALE
+            * self._capacity,
             bronkhorst.CAPACITY: self._capacity,
             bronkhorst.TEMPERATURE: 20.0,
         }[parameter]
@@ -211,7 +231,9 @@ class BronkhorstRegisters:
                 raw = struct.pack(f">{len(words)}H", *words)
                 if parameter.kind == "u8" and raw[0]:
                     raise modbus_server.RegisterRefusal(modbus_server.ILLEGAL_VALUE)
-                if not self._instrument.write(parameter, raw[1:] if parameter.kind == "u8" else raw):
+                if not self._instrument.write(
+                    parameter, raw[1:] if parameter.kind == "u8" else raw
+                ):
                     raise modbus_server.RegisterRefusal(modbus_server.ILLEGAL_VALUE)
                 return
         raise modbus_server.RegisterRefusal(modbus_server.ILLEGAL_ADDRESS)
@@ -248,7 +270,9 @@ class ProparDevice(serial_device.SerialDevice):
                 self._hear(ascii_message, bronkhorst_propar.ascii_frame)
 
     def _hear(
-        self, message: bronkhorst_propar.ProparMessage, frame: Callable[[bronkhorst_propar.ProparMessage], bytes]
+        self,
+        message: bronkhorst_propar.ProparMessage,
+        frame: Callable[[bronkhorst_propar.ProparMessage], bytes],
     ) -> None:
         if message.node not in (self._node, _NODE_ANY):
             return
@@ -264,7 +288,11 @@ class ProparDevice(serial_device.SerialDevice):
             return self._values(data)
         if data[0] in (bronkhorst_propar.WRITE, bronkhorst_propar.VALUES):
             status = self._written(data)
-            return bytes([bronkhorst_propar.STATUS, status, len(data)]) if data[0] == bronkhorst_propar.WRITE else b""
+            return (
+                bytes([bronkhorst_propar.STATUS, status, len(data)])
+                if data[0] == bronkhorst_propar.WRITE
+                else b""
+            )
         return bytes([bronkhorst_propar.STATUS, _COMMAND_ERROR, 0])
 
     def _written(self, data: bytes) -> int:

@@ -1,4 +1,6 @@
-"""The device end of a serial line, paced like the real wire, and the pseudo-terminal that it answers on."""
+"""The device end of a serial line, paced like the real wire, and the pseudo-terminal that it
+answers on.
+"""
 
 import asyncio
 import contextlib
@@ -16,7 +18,9 @@ Transmit = Callable[[bytes], None]
 
 
 class SerialDevice:
-    """Receives and sends bytes. A device overrides `received`, and `restart` if it can lose settings."""
+    """Receives and sends bytes. A device overrides `received`, and `restart` if it can lose
+    settings.
+    """
 
     frozen = False  # the measured value does not change
 
@@ -50,7 +54,9 @@ class SerialDevice:
 
     def hear(self, data: bytes) -> None:
         """Bytes begin to arrive; the device gets them when the last one is in."""
-        self._later(asyncio.get_running_loop().time() + len(data) * self.settings.char_s, self.arrived, data)
+        self._later(
+            asyncio.get_running_loop().time() + len(data) * self.settings.char_s, self.arrived, data
+        )
 
     def received(self, data: bytes) -> None:
         """Bytes arrived; the device answers with `say`."""
@@ -114,9 +120,9 @@ _SPEED = 4  # index of the input speed in tcgetattr's list; the output speed fol
 class PtyWire:
     """An emulated device behind a pseudo-terminal, to be opened at `path` like any serial port.
 
-    `path` is a link to the pseudo-terminal, to another one after every replug. A program that opens it with another
-    baud rate than the device's gets garbage and is not understood, as on a real line. A pseudo-terminal has no
-    character size or parity.
+    `path` is a link to the pseudo-terminal, to another one after every replug. A program that opens
+    it with another baud rate than the device's gets garbage and is not understood, as on a real
+    line. A pseudo-terminal has no character size or parity.
     """
 
     def __init__(self, device: SerialDevice, path: Path) -> None:
@@ -127,7 +133,10 @@ class PtyWire:
     def plug(self) -> None:
         """Plug in. Raises OSError, for example when the path is taken."""
         device_end, program_end = os.openpty()
-        self._ends = device_end, program_end  # the second is kept open, or the first would report a hang-up
+        self._ends = (
+            device_end,
+            program_end,
+        )  # the second is kept open, or the first would report a hang-up
         tty.setraw(program_end)
         line = termios.tcgetattr(program_end)
         line[_SPEED] = line[_SPEED + 1] = _speed(self._device)
@@ -156,7 +165,9 @@ class PtyWire:
 
     def _transmit(self, data: bytes) -> None:
         if self._ends is not None:
-            with contextlib.suppress(BlockingIOError):  # nobody reads: lost, as on a line without flow control
+            with contextlib.suppress(
+                BlockingIOError
+            ):  # nobody reads: lost, as on a line without flow control
                 os.write(self._ends[0], self._seen(data))
 
     def _seen(self, data: bytes) -> bytes:

@@ -1,7 +1,8 @@
 """The aravis library through ctypes: GenICam cameras with only the distribution's shared library.
 
-Source: headers of aravis 0.8 (`arvcamera.h`, `arvstream.h`, `arvbuffer.h`, `arvdevice.h`); the version in the
-library's name fixes the binary interface. ctypes releases the interpreter during every call.
+Source: headers of aravis 0.8 (`arvcamera.h`, `arvstream.h`, `arvbuffer.h`, `arvdevice.h`); the
+version in the library's name fixes the binary interface. ctypes releases the interpreter during
+every call.
 """
 
 import ctypes
@@ -131,11 +132,15 @@ class Aravis:
         for name, (result, arguments) in _SIGNATURES.items():
             function = getattr(library, name)  # glib's functions are found through it too
             function.restype = result
-            function.argtypes = [POINTER(POINTER(_GError)) if kind is _ERROR else kind for kind in arguments]
+            function.argtypes = [
+                POINTER(POINTER(_GError)) if kind is _ERROR else kind for kind in arguments
+            ]
             self._calls[name] = function
 
     def call(self, name: str, *arguments: Any) -> Any:
-        """Call a function without its GError argument. Raises AravisError (what it reported there)."""
+        """Call a function without its GError argument.
+        Raises AravisError (what it reported there).
+        """
         if _ERROR not in _SIGNATURES[name][1]:
             return self._calls[name](*arguments)
         error = POINTER(_GError)()
@@ -197,9 +202,14 @@ def aravis() -> Aravis:
 
 
 def find_cameras() -> Iterator[FoundCamera]:
-    """All GenICam cameras on USB and on the network (takes about a second). Raises LinkError without the library."""
+    """All GenICam cameras on USB and on the network (takes about a second). Raises LinkError
+    without the library.
+    """
     library = aravis()
     library.call("arv_update_device_list")
     for index in range(library.call("arv_get_n_devices")):
-        words = (library.text(f"arv_get_device_{word}", index) for word in ("id", "vendor", "model", "address"))
+        words = (
+            library.text(f"arv_get_device_{word}", index)
+            for word in ("id", "vendor", "model", "address")
+        )
         yield FoundCamera(*words)

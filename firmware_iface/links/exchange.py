@@ -1,14 +1,14 @@
 """Requests and answers over a line without transaction numbers, without ever mixing them up.
 
-The danger is a device that answers late: its answer to an abandoned question looks like the answer to the next one.
-Three rules keep them apart.
+The danger is a device that answers late: its answer to an abandoned question looks like the answer
+to the next one. Three rules keep them apart.
 
-1. One question is on the wire at a time and stays there until answered or timed out, whatever happens to the caller:
-   a cancelled caller leaves nothing behind.
-2. After any loss (no answer, a wrong one, unsolicited bytes) nothing is sent until the line has been quiet for
-   `quiet_s`.
-3. Then comes a *fence*: a harmless question with an unmistakable answer. Devices answer in order, so once the fence
-   is answered, any earlier answer has come (and was discarded) or never will.
+1. One question is on the wire at a time and stays there until answered or timed out, whatever
+   happens to the caller: a cancelled caller leaves nothing behind.
+2. After any loss (no answer, a wrong one, unsolicited bytes) nothing is sent until the line has
+   been quiet for `quiet_s`.
+3. Then comes a *fence*: a harmless question with an unmistakable answer. Devices answer in order,
+   so once the fence is answered, any earlier answer has come (and was discarded) or never will.
 """
 
 import asyncio
@@ -21,10 +21,11 @@ from firmware_iface.links.serial_port import SerialPort
 from firmware_iface.roles import DeviceIdentity, LinkDownError, LinkError
 
 _SHOWN_BYTES = 24
-# after this many questions without a valid answer the line is closed: its owner then reopens it, which also applies
-# the settings that a device loses with its power
+# after this many questions without a valid answer the line is closed: its owner then reopens it,
+# which also applies the settings that a device loses with its power
 _FAILURES_MAX = 5
-# bytes beyond the longest answer: noise before it; a device that sends without end must not fill the memory
+# bytes beyond the longest answer: noise before it; a device that sends without end must not fill
+# the memory
 _EXTRA_BYTES_MAX = 4096
 
 
@@ -35,16 +36,19 @@ class Question:
     data: bytes  # sent unchanged
     # from all bytes so far: the answer, None while incomplete. Raises LinkError for anything else
     take: Callable[[bytes], bytes | None]
-    answer_bytes: int  # length of the longest answer: its time on the wire is added to the device's own
+    answer_bytes: (
+        int  # length of the longest answer: its time on the wire is added to the device's own
+    )
     what: str  # for messages: device and request
 
 
 class SerialExchange:
-    """Questions and answers on one line, for one device or several that take turns; its port's only user.
+    """Questions and answers on one line, for one device or several that take turns; its port's only
+    user.
 
-    Devices need the silence `gap_s` between an answer and the next question. After a loss it is `quiet_s`, the usual
-    upper limit of late answers; the fence covers the rest. Bytes of `blank` mean nothing between answers, like the LF
-    after a CR that already ended one.
+    Devices need the silence `gap_s` between an answer and the next question. After a loss it is
+    `quiet_s`, the usual upper limit of late answers; the fence covers the rest. Bytes of `blank`
+    mean nothing between answers, like the LF after a CR that already ended one.
     """
 
     def __init__(self, port: SerialPort, gap_s: float, quiet_s: float, blank: bytes = b"") -> None:
@@ -53,7 +57,9 @@ class SerialExchange:
         self._quiet_s = quiet_s
         self._blank = blank
         self._key_turns: defaultdict[int, asyncio.Lock] = defaultdict(asyncio.Lock)
-        self._turn = asyncio.Lock()  # released when the question ends, whatever happens to its caller
+        self._turn = (
+            asyncio.Lock()
+        )  # released when the question ends, whatever happens to its caller
         self._in_flight: asyncio.Task[bytes] | None = None
         self._sure: set[int] = set()  # devices without outstanding answers
         self._failures = 0
@@ -67,8 +73,8 @@ class SerialExchange:
     def connect(self, greeting: bytes = b"") -> None:
         """Open the line; discard outstanding answers to an earlier user.
 
-        The greeting is sent at once and its answer discarded, for devices that send unasked until stopped. Raises
-        LinkDownError if the port does not open.
+        The greeting is sent at once and its answer discarded, for devices that send unasked until
+        stopped. Raises LinkDownError if the port does not open.
         """
         self.port.open(self)
         self._sure.clear()
@@ -85,12 +91,14 @@ class SerialExchange:
         if self._in_flight is not None:
             await asyncio.wait([self._in_flight])
 
-    async def ask(self, question: Question, timeout_s: float, fence: Question | None, key: int = 0) -> bytes:
+    async def ask(
+        self, question: Question, timeout_s: float, fence: Question | None, key: int = 0
+    ) -> bytes:
         """Ask a question once and return its answer; nothing is ever resent automatically.
 
-        Devices (`key`) that wait are served in turn, each with one question. The device has `timeout_s`, plus the
-        time on the wire. `quiet_s` alone protects a device that has no fence (None). Raises LinkError (no valid
-        answer), LinkDownError (the line is closed or went away).
+        Devices (`key`) that wait are served in turn, each with one question. The device has
+        `timeout_s`, plus the time on the wire. `quiet_s` alone protects a device that has no fence
+        (None). Raises LinkError (no valid answer), LinkDownError (the line is closed or went away).
         """
         async with self._key_turns[key]:
             await self._turn.acquire()  # cancelled while waiting here, a question is never sent
@@ -103,7 +111,9 @@ class SerialExchange:
         if not task.cancelled():
             task.exception()  # after a cancelled caller nobody else retrieves it
 
-    async def _transact(self, question: Question, timeout_s: float, fence: Question | None, key: int) -> bytes:
+    async def _transact(
+        self, question: Question, timeout_s: float, fence: Question | None, key: int
+    ) -> bytes:
         try:
             self._require_open(question.what)
             await self._settle(question.what, timeout_s)
@@ -121,7 +131,9 @@ class SerialExchange:
             if self._failures < _FAILURES_MAX:
                 raise
             self.port.close()
-            raise LinkDownError(f"{error}; the {_FAILURES_MAX}th failure in a row, connection given up") from error
+            raise LinkDownError(
+                f"{error}; the {_FAILURES_MAX}th failure in a row, connection given up"
+            ) from error
         self._failures = 0
         self._sure.add(key)
         self.port.succeeded()
@@ -137,7 +149,9 @@ class SerialExchange:
                 self._noisy = False
                 return
             if due_s > give_up_s:
-                raise LinkError(f"{what}: the line never goes quiet; wrong baud rate, or another talker")
+                raise LinkError(
+                    f"{what}: the line never goes quiet; wrong baud rate, or another talker"
+                )
             await asyncio.sleep(wait_s)
 
     async def _ask(self, question: Question, timeout_s: float) -> bytes:
@@ -149,7 +163,8 @@ class SerialExchange:
         self._answer = answer
         wire_s = (len(question.data) + question.answer_bytes) * self.port.settings.char_s
         try:
-            # not asyncio.timeout: it discards an answer that arrived while this process was suspended
+            # not asyncio.timeout: it discards an answer that arrived while this process was
+            # suspended
             await asyncio.wait([answer], timeout=timeout_s + wire_s)
         finally:
             self._answer = None
@@ -163,9 +178,15 @@ class SerialExchange:
 
     def _missing(self, timeout_s: float) -> str:
         if not self._heard:
-            return f"no answer within {timeout_s:g} s; is it on, wired and set to {self.port.settings}?"
+            return (
+                f"no answer within {timeout_s:g} s; is it on, wired and set to "
+                f"{self.port.settings}?"
+            )
         shown = self._heard[:_SHOWN_BYTES]
-        return f"incomplete answer within {timeout_s:g} s: {len(self._heard)} bytes ({shown!r}); wrong baud rate?"
+        return (
+            f"incomplete answer within {timeout_s:g} s: {len(self._heard)} bytes ({shown!r}); "
+            "wrong baud rate?"
+        )
 
     def received(self, data: bytes) -> None:
         """Bytes came (called by the port)."""
@@ -175,7 +196,9 @@ class SerialExchange:
             return
         self._heard += data
         if len(self._heard) > self._answer_bytes + _EXTRA_BYTES_MAX:
-            self._answer.set_exception(LinkError(f"{self.port.name}: {len(self._heard)} bytes without an answer"))
+            self._answer.set_exception(
+                LinkError(f"{self.port.name}: {len(self._heard)} bytes without an answer")
+            )
             return
         try:
             answer = self._take(self._heard)
@@ -212,7 +235,9 @@ class LineLink:
     A command ends in `end`. The device has `timeout_s`, plus the time on the wire.
     """
 
-    def __init__(self, port: SerialPort, end: str, timeout_s: float, fence: LineFence, quiet_s: float = 0.1) -> None:
+    def __init__(
+        self, port: SerialPort, end: str, timeout_s: float, fence: LineFence, quiet_s: float = 0.1
+    ) -> None:
         self.port = port
         self._exchange = SerialExchange(port, gap_s=0.0, quiet_s=quiet_s, blank=_LINE_ENDS)
         self._end = end
@@ -232,15 +257,20 @@ class LineLink:
         """Close the line; a question in flight fails at once."""
         await self._exchange.close()
 
-    async def query(self, command: str, answer: re.Pattern[str], longest: int = 80) -> re.Match[str]:
-        """The answer to a command (without its end), whose whole text has the given form, line ends included.
+    async def query(
+        self, command: str, answer: re.Pattern[str], longest: int = 80
+    ) -> re.Match[str]:
+        """The answer to a command (without its end), whose whole text has the given form, line ends
+        included.
 
-        The pattern must match all that comes, except line ends before it, and nothing that is still incomplete; more
-        than `longest` characters are no answer. Raises LinkError (no answer of this form in time), LinkDownError (the
-        line is gone).
+        The pattern must match all that comes, except line ends before it, and nothing that is still
+        incomplete; more than `longest` characters are no answer. Raises LinkError (no answer of
+        this form in time), LinkDownError (the line is gone).
         """
         fence = self._question(self._fence.command, self._fence.answer, self._fence.longest)
-        heard = await self._exchange.ask(self._question(command, answer, longest), self._timeout_s, fence)
+        heard = await self._exchange.ask(
+            self._question(command, answer, longest), self._timeout_s, fence
+        )
         found = answer.fullmatch(heard.decode("ascii"))
         assert found is not None  # `take` matched it
         return found
@@ -253,7 +283,9 @@ class LineLink:
             try:
                 text = heard.decode("ascii")
             except UnicodeDecodeError:
-                raise LinkError(f"{what}: not text ({heard[:24].hex(' ')}); noise, or wrong baud rate") from None
+                raise LinkError(
+                    f"{what}: not text ({heard[:24].hex(' ')}); noise, or wrong baud rate"
+                ) from None
             if answer.fullmatch(text):
                 return heard
             if len(text) > longest:
@@ -271,7 +303,9 @@ class LineDriver:
     def __init__(self, port: SerialPort, end: str, timeout_s: float, fence: LineFence) -> None:
         self._link = LineLink(port, end, timeout_s, fence)
 
-    async def _opened(self, begin: Callable[[], Awaitable[DeviceIdentity]], greeting: str = "") -> DeviceIdentity:
+    async def _opened(
+        self, begin: Callable[[], Awaitable[DeviceIdentity]], greeting: str = ""
+    ) -> DeviceIdentity:
         """Open the port and begin; the port is closed again when that fails."""
         self._link.connect(greeting)
         try:
@@ -301,8 +335,9 @@ class LineDriver:
 class StepGate:
     """Passes a value within `step` of either of the last two, passed or not.
 
-    A corrupted reading stands alone and is stopped; the good one after it still has the good one before. A true step
-    is stopped once and passes with its second reading. Nothing confirms the very first value, so it is stopped.
+    A corrupted reading stands alone and is stopped; the good one after it still has the good one
+    before. A true step is stopped once and passes with its second reading. Nothing confirms the
+    very first value, so it is stopped.
     """
 
     def __init__(self, step: float) -> None:

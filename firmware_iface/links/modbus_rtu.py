@@ -1,10 +1,12 @@
-"""Modbus RTU with checked answers: several devices on one serial bus, each with the interface of the TCP link.
+"""Modbus RTU with checked answers: several devices on one serial bus, each with the interface of
+the TCP link.
 
-RTU has no transaction numbers. `exchange` prevents a late answer from being taken for the next one; the fence
-is "return query data" (function 8, sub-function 0) with a number that counts up: it comes back as sent, or as an
-exception of function 8, and neither can be taken for anything else.
+RTU has no transaction numbers. `exchange` prevents a late answer from being taken for the next one;
+the fence is "return query data" (function 8, sub-function 0) with a number that counts up: it comes
+back as sent, or as an exception of function 8, and neither can be taken for anything else.
 
-Source: Modbus over serial line 1.02, sections 2.5.1 (RTU framing) and 6.2.2 (CRC); application protocol 1.1b3.
+Source: Modbus over serial line 1.02, sections 2.5.1 (RTU framing) and 6.2.2 (CRC); application
+protocol 1.1b3.
 """
 
 import struct
@@ -25,7 +27,9 @@ _TOKENS = 2**16
 
 
 def crc16(data: bytes) -> int:
-    """The CRC of Modbus: polynomial 0xA001 (reflected 0x8005), start 0xFFFF; sent low byte first."""
+    """The CRC of Modbus: polynomial 0xA001 (reflected 0x8005), start 0xFFFF;
+    sent low byte first.
+    """
     crc = 0xFFFF
     for byte in data:
         crc = (crc >> 8) ^ _CRC_TABLE[(crc ^ byte) & 0xFF]
@@ -50,12 +54,17 @@ def rtu_frame(unit_id: int, pdu: bytes) -> bytes:
 def parse_rtu_url(url: str) -> tuple[str, serial_port.SerialSettings]:
     """Port and settings of `rtu://PORT[?baud=..&parity=..&data_bits=..&stop_bits=..]`.
 
-    PORT is a path (`rtu:///dev/ttyUSB0`) or a USB identity (`rtu://usb:0403:6001:A50285BI`). Raises ValueError.
+    PORT is a path (`rtu:///dev/ttyUSB0`) or a USB identity (`rtu://usb:0403:6001:A50285BI`). Raises
+    ValueError.
     """
     parts = urlsplit(url)
     options = dict(parse_qsl(parts.query, strict_parsing=True)) if parts.query else {}
     port = parts.netloc + parts.path
-    if parts.scheme != "rtu" or not port or not options.keys() <= {"baud", "parity", "data_bits", "stop_bits"}:
+    if (
+        parts.scheme != "rtu"
+        or not port
+        or not options.keys() <= {"baud", "parity", "data_bits", "stop_bits"}
+    ):
         raise ValueError(f"{url}: expected rtu:///dev/ttyUSB0?baud=19200&parity=E")
     try:
         numbers = {key: int(value) for key, value in options.items() if key != "parity"}
@@ -94,10 +103,11 @@ class RtuBus:
 
 
 class GuardedModbusRtu:
-    """One Modbus RTU device of a bus: the first to connect opens the bus, any of them closes it for all.
+    """One Modbus RTU device of a bus: the first to connect opens the bus, any of them closes it for
+    all.
 
-    The device has `timeout_s`, plus the time on the wire. `fence` is False for a device that ignores function 8
-    instead of refusing it.
+    The device has `timeout_s`, plus the time on the wire. `fence` is False for a device that
+    ignores function 8 instead of refusing it.
     """
 
     def __init__(self, bus: RtuBus, unit_id: int, timeout_s: float, fence: bool = True) -> None:
@@ -128,7 +138,9 @@ class GuardedModbusRtu:
         await self._bus.exchange.close()
 
     async def read_holding(self, address: int, count: int) -> list[int]:
-        """Read holding registers (function code 3). Raises LinkError, LinkDownError, DeviceRefusedError."""
+        """Read holding registers (function code 3). Raises LinkError, LinkDownError,
+        DeviceRefusedError.
+        """
         return await self._read(modbus_tcp.READ_HOLDING, address, count)
 
     async def read_input(self, address: int, count: int) -> list[int]:
@@ -144,7 +156,9 @@ class GuardedModbusRtu:
         return await self._read_bits(modbus_tcp.READ_DISCRETE, address, count)
 
     async def write_register(self, address: int, word: int) -> None:
-        """Write one holding register (function code 6) and check the echo. Raises as `read_holding`."""
+        """Write one holding register (function code 6) and check the echo. Raises as
+        `read_holding`.
+        """
         what = f"{self.name}: writing {address}"
         pdu = struct.pack(">BHH", modbus_tcp.WRITE_SINGLE, address, word)
         if (await self._transact(pdu, _WRITE_BYTES, what)) != pdu:
@@ -153,12 +167,18 @@ class GuardedModbusRtu:
     async def write_registers(self, address: int, words: Sequence[int]) -> None:
         """Write holding registers (function code 16) and check the echo.
 
-        Raises LinkError (no valid reply in time: the device may or may not have executed it), LinkDownError (the
-        port is gone; the same holds), DeviceRefusedError (the device refused and changed nothing).
+        Raises LinkError (no valid reply in time: the device may or may not have executed it),
+        LinkDownError (the port is gone; the same holds), DeviceRefusedError (the device refused and
+        changed nothing).
         """
         what = f"{self.name}: writing {address}..{address + len(words) - 1}"
         pdu = struct.pack(
-            f">BHHB{len(words)}H", modbus_tcp.WRITE_MULTIPLE, address, len(words), 2 * len(words), *words
+            f">BHHB{len(words)}H",
+            modbus_tcp.WRITE_MULTIPLE,
+            address,
+            len(words),
+            2 * len(words),
+            *words,
         )
         reply = await self._transact(pdu, _WRITE_BYTES, what)
         if reply != pdu[:5]:
@@ -166,19 +186,27 @@ class GuardedModbusRtu:
 
     async def _read(self, function_code: int, address: int, count: int) -> list[int]:
         what = f"{self.name}: reading {address}..{address + count - 1}"
-        reply = await self._transact(struct.pack(">BHH", function_code, address, count), 5 + 2 * count, what)
+        reply = await self._transact(
+            struct.pack(">BHH", function_code, address, count), 5 + 2 * count, what
+        )
         return list(struct.unpack(f">{count}H", reply[2:]))
 
     async def _read_bits(self, function_code: int, address: int, count: int) -> list[bool]:
         what = f"{self.name}: reading bits {address}..{address + count - 1}"
         answer_bytes = 5 + modbus_tcp.bytes_of_bits(count)
-        reply = await self._transact(struct.pack(">BHH", function_code, address, count), answer_bytes, what)
-        packed = int.from_bytes(reply[2:], "little")  # the first coil is the lowest bit of the first byte
+        reply = await self._transact(
+            struct.pack(">BHH", function_code, address, count), answer_bytes, what
+        )
+        packed = int.from_bytes(
+            reply[2:], "little"
+        )  # the first coil is the lowest bit of the first byte
         return [bool(packed >> place & 1) for place in range(count)]
 
     async def _transact(self, pdu: bytes, answer_bytes: int, what: str) -> bytes:
         question = self._question(pdu, answer_bytes, what)
-        reply = await self._bus.exchange.ask(question, self._timeout_s, self._fence_question(), self._unit_id)
+        reply = await self._bus.exchange.ask(
+            question, self._timeout_s, self._fence_question(), self._unit_id
+        )
         if reply[0] & modbus_tcp.EXCEPTION_FLAG:
             raise modbus_tcp.exception_error(what, reply[1])
         return reply
@@ -187,12 +215,21 @@ class GuardedModbusRtu:
         if not self._fence:
             return None
         pdu = struct.pack(">BHH", modbus_tcp.DIAGNOSTICS, 0, self._bus.next_token())
-        return self._question(pdu, _WRITE_BYTES, f"{self.name}: echo test after a loss (function 8)", pdu)
+        return self._question(
+            pdu, _WRITE_BYTES, f"{self.name}: echo test after a loss (function 8)", pdu
+        )
 
-    def _question(self, pdu: bytes, answer_bytes: int, what: str, exactly: bytes = b"") -> exchange.Question:
+    def _question(
+        self, pdu: bytes, answer_bytes: int, what: str, exactly: bytes = b""
+    ) -> exchange.Question:
         def take(heard: bytes) -> bytes | None:
             reply = take_reply(heard, self._unit_id, pdu[0], answer_bytes, what)
-            if exactly and reply is not None and reply != exactly and not reply[0] & modbus_tcp.EXCEPTION_FLAG:
+            if (
+                exactly
+                and reply is not None
+                and reply != exactly
+                and not reply[0] & modbus_tcp.EXCEPTION_FLAG
+            ):
                 raise LinkError(f"{what}: the echo differs from what was sent")
             return reply
 
@@ -205,10 +242,14 @@ class ModbusLinks:
     def __init__(self) -> None:
         self._buses: dict[str, RtuBus] = {}
 
-    def link(self, url: str, unit_id: int, timeout_s: float, fence: bool = True) -> modbus_tcp.AnyModbusLink:
-        """The device `unit_id` at `tcp://HOST[:PORT]` or `rtu://PORT[?baud=..&parity=..]`, not yet connected.
+    def link(
+        self, url: str, unit_id: int, timeout_s: float, fence: bool = True
+    ) -> modbus_tcp.AnyModbusLink:
+        """The device `unit_id` at `tcp://HOST[:PORT]` or `rtu://PORT[?baud=..&parity=..]`, not yet
+        connected.
 
-        `fence`: see `links.exchange`; TCP does not use it. Raises ValueError for a URL that is neither.
+        `fence`: see `links.exchange`; TCP does not use it. Raises ValueError for a URL that is
+        neither.
         """
         if not url.startswith("rtu:"):
             host, port = parse_tcp_url(url)
@@ -225,16 +266,26 @@ def parse_tcp_url(url: str) -> tuple[str, int]:
         host, port = parts.hostname, parts.port
     except ValueError as error:  # a port that is no number, or above 65535
         raise ValueError(f"{url}: {error}") from error
-    if parts.scheme != "tcp" or not host or parts.path or parts.query or parts.fragment or parts.username:
+    if (
+        parts.scheme != "tcp"
+        or not host
+        or parts.path
+        or parts.query
+        or parts.fragment
+        or parts.username
+    ):
         raise ValueError(f"{url}: expected tcp://HOST:PORT")
     return host, DEFAULT_PORT if port is None else port
 
 
-def take_reply(heard: bytes, unit_id: int, function_code: int, answer_bytes: int, what: str) -> bytes | None:
+def take_reply(
+    heard: bytes, unit_id: int, function_code: int, answer_bytes: int, what: str
+) -> bytes | None:
     """The PDU of a whole reply, None while bytes are missing.
 
-    The length is known beforehand: silences between bytes, by which RTU frames are delimited on the wire, do not
-    survive the buffers of adapters and kernels. Raises LinkError (another unit, function, length or CRC).
+    The length is known beforehand: silences between bytes, by which RTU frames are delimited on the
+    wire, do not survive the buffers of adapters and kernels. Raises LinkError (another unit,
+    function, length or CRC).
     """
     if heard[0] != unit_id:
         raise LinkError(f"{what}: answer from unit {heard[0]}, expected unit {unit_id}")

@@ -1,8 +1,8 @@
 """Modbus TCP with checks and prompt errors that the library's client lacks.
 
-It closes these gaps of pymodbus 3.16: a reply with too few registers, of another function or with transaction id 0 is
-accepted; a connection lost in mid-request waits for the full timeout; a retry repeats a write; a server that accepts
-and hangs up is called ten times a second.
+It closes these gaps of pymodbus 3.16: a reply with too few registers, of another function or with
+transaction id 0 is accepted; a connection lost in mid-request waits for the full timeout; a retry
+repeats a write; a server that accepts and hangs up is called ten times a second.
 """
 
 import asyncio
@@ -16,7 +16,14 @@ from pymodbus.exceptions import ConnectionException, ModbusIOException
 from pymodbus.pdu import ExceptionResponse, ModbusPDU
 
 from firmware_iface.links import serial_port
-from firmware_iface.roles import Clock, DeviceBusyError, DeviceRefusedError, LinkDownError, LinkError, LinkWaitsError
+from firmware_iface.roles import (
+    Clock,
+    DeviceBusyError,
+    DeviceRefusedError,
+    LinkDownError,
+    LinkError,
+    LinkWaitsError,
+)
 
 # Modbus semantics, independent of the transport.
 
@@ -102,36 +109,46 @@ def bytes_of_bits(count: int) -> int:
 
 def exception_error(what: str, code: int) -> LinkError:
     """The error for an exception answer."""
-    kind = DeviceRefusedError if code in _REFUSALS else DeviceBusyError if code == _BUSY else LinkError
+    kind = (
+        DeviceRefusedError if code in _REFUSALS else DeviceBusyError if code == _BUSY else LinkError
+    )
     return kind(f"{what}: exception {code} ({EXCEPTIONS.get(code, 'unknown')})")
 
 
 # the library also logs what it raises; without a handler that would go to the console
 logging.getLogger("pymodbus").addHandler(logging.NullHandler())
 
-# a peer that lost its power does not close the connection: after this many unanswered requests in a row, and one more
-# that finds the count exhausted, the connection is abandoned (the count is the library's)
+# a peer that lost its power does not close the connection: after this many unanswered requests in a
+# row, and one more that finds the count exhausted, the connection is abandoned (the count is the
+# library's)
 _UNANSWERED_MAX = 3
-# Bytes from the device for one request: a reply has 260 at most, and late ones of earlier requests may precede it.
-# A peer that sends without end would keep the library, and so the control process, busy for seconds.
+# Bytes from the device for one request: a reply has 260 at most, and late ones of earlier requests
+# may precede it. A peer that sends without end would keep the library, and so the control process,
+# busy for
+# seconds.
 _REPLY_BYTES_MAX = 1024
 
 
 class GuardedModbusTcp:
     """One Modbus TCP device; `timeout_s` is for connecting and for each reply.
 
-    One request is in flight at a time. After its caller is cancelled, a sent request still runs to its reply or
-    timeout, so that nothing is abandoned on the wire. Nothing is sent twice or reconnects automatically: the owner
-    calls `connect`, which refuses to try before its back-off (0.1 s, doubling to 5 s) is over.
+    One request is in flight at a time. After its caller is cancelled, a sent request still runs to
+    its reply or timeout, so that nothing is abandoned on the wire. Nothing is sent twice or
+    reconnects automatically: the owner calls `connect`, which refuses to try before its back-off
+    (0.1 s, doubling to 5 s) is over.
     """
 
-    def __init__(self, host: str, port: int, unit_id: int, timeout_s: float, clock: Clock = time.monotonic) -> None:
+    def __init__(
+        self, host: str, port: int, unit_id: int, timeout_s: float, clock: Clock = time.monotonic
+    ) -> None:
         self._host, self._port = host, port
         self._unit_id = unit_id
         self._timeout_s = timeout_s
         self._clock = clock
         self._client: AsyncModbusTcpClient | None = None
-        self._turn = asyncio.Lock()  # released when the request ends, whatever happens to its caller
+        self._turn = (
+            asyncio.Lock()
+        )  # released when the request ends, whatever happens to its caller
         self._in_flight: asyncio.Task[ModbusPDU] | None = None
         self._back_off = serial_port.BackOff()
         self._received_bytes = 0  # since the last request was sent
@@ -152,7 +169,9 @@ class GuardedModbusTcp:
         return self._back_off.remaining_s(self._clock())
 
     async def connect(self) -> None:
-        """Connect again. Raises LinkDownError (no connection, or not yet time for the next attempt)."""
+        """Connect again. Raises LinkDownError (no connection, or not yet time for the next
+        attempt).
+        """
         if (wait_s := self.retry_in_s) > 0:
             raise LinkWaitsError(f"{self.name}: next attempt to connect in {wait_s:.1f} s")
         await self.close()
@@ -163,17 +182,26 @@ class GuardedModbusTcp:
                 _fail_in_flight(client, f"{self.name}: connection lost")
 
         client = AsyncModbusTcpClient(
-            self._host, port=self._port, timeout=self._timeout_s, retries=0, reconnect_delay=0, trace_connect=changed
+            self._host,
+            port=self._port,
+            timeout=self._timeout_s,
+            retries=0,
+            reconnect_delay=0,
+            trace_connect=changed,
         )
         client.set_max_no_responses(_UNANSWERED_MAX)
         if not await client.connect():
             client.close()
-            raise LinkDownError(f"{self.name}: no connection; is the device on, and is this its address?")
+            raise LinkDownError(
+                f"{self.name}: no connection; is the device on, and is this its address?"
+            )
         self._client = client
         self._bound_replies(client)
 
     def _bound_replies(self, client: AsyncModbusTcpClient) -> None:
-        """Give up the connection to a peer that sends more than a device does, before the library reads it."""
+        """Give up the connection to a peer that sends more than a device does, before the library
+        reads it.
+        """
         read = client.ctx.data_received
         self._received_bytes = 0
 
@@ -190,8 +218,8 @@ class GuardedModbusTcp:
     async def read_holding(self, address: int, count: int) -> list[int]:
         """Read `count` holding registers (function code 3).
 
-        Raises LinkError (no valid reply in time), LinkDownError (the connection is gone), DeviceRefusedError (the
-        device does not have these registers).
+        Raises LinkError (no valid reply in time), LinkDownError (the connection is gone),
+        DeviceRefusedError (the device does not have these registers).
         """
         return await self._read(READ_HOLDING, address, count)
 
@@ -208,34 +236,49 @@ class GuardedModbusTcp:
         return await self._read_bits(READ_DISCRETE, address, count)
 
     async def write_register(self, address: int, word: int) -> None:
-        """Write one holding register (function code 6) and check the echo. Raises as `write_registers`."""
+        """Write one holding register (function code 6) and check the echo. Raises as
+        `write_registers`.
+        """
         what = f"{self.name}: writing {address}"
         reply = await self._exchange(
-            lambda client: client.write_register(address, word, device_id=self._unit_id), WRITE_SINGLE, what
+            lambda client: client.write_register(address, word, device_id=self._unit_id),
+            WRITE_SINGLE,
+            what,
         )
         if (reply.address, list(reply.registers)) != (address, [word]):
-            raise LinkError(f"{what}: the reply confirms {list(reply.registers)} in {reply.address}")
+            raise LinkError(
+                f"{what}: the reply confirms {list(reply.registers)} in {reply.address}"
+            )
         self._back_off.succeeded()
 
     async def write_registers(self, address: int, words: Sequence[int]) -> None:
         """Write holding registers (function code 16) and check the echo.
 
-        Raises LinkError (no valid reply in time: the device may or may not have carried it out), LinkDownError (the
-        connection is gone; the same holds), DeviceRefusedError (the device refused and changed nothing).
+        Raises LinkError (no valid reply in time: the device may or may not have carried it out),
+        LinkDownError (the connection is gone; the same holds), DeviceRefusedError (the device
+        refused and changed nothing).
         """
         what = f"{self.name}: writing {address}..{address + len(words) - 1}"
         reply = await self._exchange(
-            lambda client: client.write_registers(address, list(words), device_id=self._unit_id), WRITE_MULTIPLE, what
+            lambda client: client.write_registers(address, list(words), device_id=self._unit_id),
+            WRITE_MULTIPLE,
+            what,
         )
         if (reply.address, reply.count) != (address, len(words)):
-            raise LinkError(f"{what}: the reply confirms {reply.count} registers from {reply.address}")
+            raise LinkError(
+                f"{what}: the reply confirms {reply.count} registers from {reply.address}"
+            )
         self._back_off.succeeded()
 
     async def _read(self, function_code: int, address: int, count: int) -> list[int]:
         what = f"{self.name}: reading {address}..{address + count - 1}"
 
         def send(client: AsyncModbusTcpClient) -> Awaitable[ModbusPDU]:
-            read = client.read_input_registers if function_code == READ_INPUT else client.read_holding_registers
+            read = (
+                client.read_input_registers
+                if function_code == READ_INPUT
+                else client.read_holding_registers
+            )
             return read(address, count=count, device_id=self._unit_id)
 
         reply = await self._exchange(send, function_code, what)
@@ -248,13 +291,17 @@ class GuardedModbusTcp:
         what = f"{self.name}: reading bits {address}..{address + count - 1}"
 
         def send(client: AsyncModbusTcpClient) -> Awaitable[ModbusPDU]:
-            read = client.read_discrete_inputs if function_code == READ_DISCRETE else client.read_coils
+            read = (
+                client.read_discrete_inputs if function_code == READ_DISCRETE else client.read_coils
+            )
             return read(address, count=count, device_id=self._unit_id)
 
         reply = await self._exchange(send, function_code, what)
         # the library gives all bits of the bytes that came
         if len(reply.bits) != 8 * bytes_of_bits(count):
-            raise LinkError(f"{what}: {len(reply.bits)} bits in the reply, expected {8 * bytes_of_bits(count)}")
+            raise LinkError(
+                f"{what}: {len(reply.bits)} bits in the reply, expected {8 * bytes_of_bits(count)}"
+            )
         self._back_off.succeeded()
         return [bool(bit) for bit in reply.bits[:count]]
 
@@ -269,7 +316,10 @@ class GuardedModbusTcp:
             await asyncio.wait([self._in_flight])
 
     async def _exchange(
-        self, send: Callable[[AsyncModbusTcpClient], Awaitable[ModbusPDU]], function_code: int, what: str
+        self,
+        send: Callable[[AsyncModbusTcpClient], Awaitable[ModbusPDU]],
+        function_code: int,
+        what: str,
     ) -> ModbusPDU:
         await self._turn.acquire()  # cancelled while waiting here, a request is never sent
         self._in_flight = asyncio.create_task(self._transact(send, function_code, what))
@@ -282,7 +332,10 @@ class GuardedModbusTcp:
             task.exception()  # for a cancelled caller nobody else retrieves it
 
     async def _transact(
-        self, send: Callable[[AsyncModbusTcpClient], Awaitable[ModbusPDU]], function_code: int, what: str
+        self,
+        send: Callable[[AsyncModbusTcpClient], Awaitable[ModbusPDU]],
+        function_code: int,
+        what: str,
     ) -> ModbusPDU:
         client = self._client
         if client is None or not client.connected:
@@ -294,7 +347,9 @@ class GuardedModbusTcp:
             raise LinkDownError(f"{what}: not connected") from error
         except ModbusIOException as error:
             if not client.connected:
-                raise LinkDownError(f"{what}: connection given up, no answer to several requests") from error
+                raise LinkDownError(
+                    f"{what}: connection given up, no answer to several requests"
+                ) from error
             raise LinkError(f"{what}: no valid answer within {self._timeout_s:g} s") from error
         _check(reply, function_code, client.ctx.request_transaction_id, what)
         return reply
@@ -303,9 +358,13 @@ class GuardedModbusTcp:
 def _check(reply: ModbusPDU, function_code: int, transaction_id: int, what: str) -> None:
     """Whether this is the answer to that request; raises LinkError or DeviceRefusedError."""
     if reply.transaction_id != transaction_id:
-        raise LinkError(f"{what}: answer to transaction {reply.transaction_id}, expected {transaction_id}")
+        raise LinkError(
+            f"{what}: answer to transaction {reply.transaction_id}, expected {transaction_id}"
+        )
     if reply.function_code & 0x7F != function_code:
-        raise LinkError(f"{what}: answer has function code {reply.function_code}, expected {function_code}")
+        raise LinkError(
+            f"{what}: answer has function code {reply.function_code}, expected {function_code}"
+        )
     if isinstance(reply, ExceptionResponse):
         raise exception_error(what, reply.exception_code)
 

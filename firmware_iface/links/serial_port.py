@@ -1,7 +1,7 @@
 """A serial port on the event loop: delivers bytes as they arrive, and reports a lost link at once.
 
-It uses `loop.add_reader` on the port's own descriptor: no thread, no polling, and a pulled plug makes the descriptor
-readable at once. pyserial only opens and configures the port.
+It uses `loop.add_reader` on the port's own descriptor: no thread, no polling, and a pulled plug
+makes the descriptor readable at once. pyserial only opens and configures the port.
 """
 
 import asyncio
@@ -32,8 +32,8 @@ LONGEST_S = 5.0
 class BackOff:
     """Doubling waits between attempts.
 
-    Every attempt counts as failed until `succeeded` is called, so a connection dropped before the first valid answer
-    is not a success.
+    Every attempt counts as failed until `succeeded` is called, so a connection dropped before the
+    first valid answer is not a success.
     """
 
     def __init__(self) -> None:
@@ -73,7 +73,9 @@ _REMEDIES = {
 
 @dataclass(frozen=True, slots=True)
 class SerialSettings:
-    """Line settings: `parity` is "N", "E" or "O"; with E or O, the kernel drops bytes of wrong parity."""
+    """Line settings: `parity` is "N", "E" or "O"; with E or O, the kernel drops bytes of wrong
+    parity.
+    """
 
     baud: int
     data_bits: int = 8
@@ -83,8 +85,14 @@ class SerialSettings:
     def __post_init__(self) -> None:
         if self.baud not in serial.Serial.BAUDRATES:
             raise ValueError(f"baud = {self.baud}: not a rate that serial ports have")
-        if self.data_bits not in (7, 8) or self.parity not in ("N", "E", "O") or self.stop_bits not in (1, 2):
-            raise ValueError(f"{self}: expected 7 or 8 data bits, parity N, E or O, 1 or 2 stop bits")
+        if (
+            self.data_bits not in (7, 8)
+            or self.parity not in ("N", "E", "O")
+            or self.stop_bits not in (1, 2)
+        ):
+            raise ValueError(
+                f"{self}: expected 7 or 8 data bits, parity N, E or O, 1 or 2 stop bits"
+            )
 
     @property
     def char_s(self) -> float:
@@ -108,8 +116,8 @@ class Receiver(Protocol):
 class SerialPort:
     """A serial port of this machine.
 
-    It is a path or `usb:VID:PID[:SERIAL]`, looked up at every `open`, so that a replug in another socket works.
-    Raises ValueError if the name is neither.
+    It is a path or `usb:VID:PID[:SERIAL]`, looked up at every `open`, so that a replug in another
+    socket works. Raises ValueError if the name is neither.
     """
 
     def __init__(self, port: str, settings: SerialSettings, clock: Clock = time.monotonic) -> None:
@@ -160,8 +168,8 @@ class SerialPort:
     def write(self, data: bytes) -> None:
         """Hand over bytes for sending.
 
-        Raises LinkDownError (the port is closed or just went away), LinkError (the kernel's buffer is full: nothing
-        is being sent).
+        Raises LinkDownError (the port is closed or just went away), LinkError (the kernel's buffer
+        is full: nothing is being sent).
         """
         if self._serial is None:
             raise LinkDownError(f"{self._port}: not open")
@@ -172,7 +180,10 @@ class SerialPort:
         except OSError as error:
             raise self._gone() from error
         if written != len(data):
-            raise LinkError(f"{self._port}: only {written} of {len(data)} bytes could be sent; is the line held?")
+            raise LinkError(
+                f"{self._port}: only {written} of {len(data)} bytes could be sent; is the "
+                "line held?"
+            )
 
     def succeeded(self) -> None:
         """Note a valid answer: the next `open` may follow at once."""
@@ -242,7 +253,9 @@ def _opened(path: str, name: str, settings: SerialSettings) -> Any:
             raise DeviceRefusedError(f"{name}: {remedy}") from error
         raise LinkDownError(f"{name}: {remedy}") from error
     with contextlib.suppress(ValueError, OSError):
-        port.set_low_latency_mode(True)  # FTDI adapters otherwise hold bytes back for 16 ms; others lack this mode
+        port.set_low_latency_mode(
+            True
+        )  # FTDI adapters otherwise hold bytes back for 16 ms; others lack this mode
     if settings.parity != "N":
         _drop_wrong_parity(port.fileno())
     return port
@@ -258,7 +271,9 @@ def _errno(error: BaseException) -> int:
 
 
 def _drop_wrong_parity(descriptor: int) -> None:
-    """Enable the kernel's parity check of input, which pyserial leaves off: a corrupted byte is then missing."""
+    """Enable the kernel's parity check of input, which pyserial leaves off: a corrupted byte is
+    then missing.
+    """
     attributes = termios.tcgetattr(descriptor)
     attributes[0] |= termios.INPCK | termios.IGNPAR
     termios.tcsetattr(descriptor, termios.TCSANOW, attributes)
@@ -271,7 +286,9 @@ _USB_NAME = re.compile(r"usb:([0-9A-Fa-f]{4}):([0-9A-Fa-f]{4})(?::(.+))?")
 
 @dataclass(frozen=True, slots=True)
 class PortInfo:
-    """A serial port of this machine: its path, the name that survives a replug, its own description."""
+    """A serial port of this machine: its path, the name that survives a replug, its own
+    description.
+    """
 
     path: str
     usb_name: str
@@ -279,7 +296,9 @@ class PortInfo:
 
 
 def serial_ports(comports: Callable[[], Iterable[Any]] = list_ports.comports) -> list[PortInfo]:
-    """The serial ports of this machine, by path; `usb_name` is empty when the port is not on USB."""
+    """The serial ports of this machine, by path; `usb_name` is empty
+    when the port is not on USB.
+    """
     return sorted((_info(port) for port in comports()), key=lambda port: port.path)
 
 
@@ -288,7 +307,8 @@ def check_port_name(name: str) -> str:
     if name.startswith("/") or _USB_NAME.fullmatch(name):
         return name
     raise ValueError(
-        f"port {name!r}: expected a path (/dev/ttyUSB0) or usb:VID:PID[:SERIAL] (usb:0403:6001:A50285BI)"
+        f"port {name!r}: expected a path (/dev/ttyUSB0) or usb:VID:PID[:SERIAL] "
+        "(usb:0403:6001:A50285BI)"
     )
 
 
@@ -310,12 +330,16 @@ def port_path(name: str, comports: Callable[[], Iterable[Any]] = list_ports.comp
         raise LinkDownError(f"{name}: no such USB adapter is plugged in")
     if len(found) > 1:
         choice = ", ".join(sorted(_info(port).usb_name for port in found))
-        raise DeviceRefusedError(f"{name}: {len(found)} adapters match; name one by its serial number: {choice}")
+        raise DeviceRefusedError(
+            f"{name}: {len(found)} adapters match; name one by its serial number: {choice}"
+        )
     return str(found[0].device)
 
 
 def _info(port: Any) -> PortInfo:
     usb_name = ""
     if port.vid is not None:
-        usb_name = f"usb:{port.vid:04X}:{port.pid:04X}" + (f":{port.serial_number}" if port.serial_number else "")
+        usb_name = f"usb:{port.vid:04X}:{port.pid:04X}" + (
+            f":{port.serial_number}" if port.serial_number else ""
+        )
     return PortInfo(str(port.device), usb_name, str(port.description))

@@ -1,8 +1,8 @@
 """Measurement cycles, one after the other: show, expose, reconstruct, and recover from failures.
 
-Synchronous and free of real clocks and devices: everything is an argument, so the same code runs with a camera, with
-the twin's renderer and with a fake in a test. `keep_cycling` takes a cycle at each deadline, publishes the estimates
-and reports the failures.
+Synchronous and free of real clocks and devices: everything is an argument, so the same code runs
+with a camera, with the twin's renderer and with a fake in a test. `keep_cycling` takes a cycle at
+each deadline, publishes the estimates and reports the failures.
 """
 
 import math
@@ -30,19 +30,25 @@ from membrane_ctrl.model.telemetry import TelemetryRow
 from membrane_ctrl.processes.frames import FrameWriter
 from membrane_ctrl.processes.ring import RingAddress, RingReader
 
-# A door or a moving mirror may spoil a full cycle: take two more at once. Three failures in a row mean that no mirror
-# is visible (flat, dark, covered), which a pause does not worsen.
+# A door or a moving mirror may spoil a full cycle: take two more at once. Three failures in a row
+# mean that no mirror is visible (flat, dark, covered), which a pause does not worsen.
 REJECTED_IN_A_ROW = 3
 
 
 class Reconstructor(Protocol):
     """Turns frames into the figure; keeps the last absolute phase between calls."""
 
-    def full(self, frames: Sequence[Pixels], time_s: FloatArray, displacement_um: FloatArray) -> ShapeEstimate:
+    def full(
+        self, frames: Sequence[Pixels], time_s: FloatArray, displacement_um: FloatArray
+    ) -> ShapeEstimate:
         """Figure from sinusoids, Gray codes, white and black, in the order of the full sequence."""
 
-    def fringes(self, frames: Sequence[Pixels], time_s: FloatArray, displacement_um: FloatArray) -> ShapeEstimate:
-        """Figure from the frames after a full cycle alone, tracked against the last absolute phase."""
+    def fringes(
+        self, frames: Sequence[Pixels], time_s: FloatArray, displacement_um: FloatArray
+    ) -> ShapeEstimate:
+        """Figure from the frames after a full cycle alone,
+        tracked against the last absolute phase.
+        """
 
     def prepare(self) -> None:
         """Do ahead what the next figure needs."""
@@ -52,7 +58,8 @@ class Reconstructor(Protocol):
 class CyclePlan:
     """The patterns of both kinds of cycle, in order, and the least time between exposures.
 
-    `standing` gives the crossed pattern of the moment where one frame of it takes the place of `fringes`.
+    `standing` gives the crossed pattern of the moment where one frame of it takes the place of
+    `fringes`.
     """
 
     full: Sequence[Pattern]
@@ -88,7 +95,8 @@ class CycleFailed:
 class ShapeCycle:
     """Takes cycles: a full one first and after losing the fringe orders, else fringes only.
 
-    `frames` must hold a full cycle. `stopping` is checked before each exposure: True ends the cycle without a result.
+    `frames` must hold a full cycle. `stopping` is checked before each exposure: True ends the cycle
+    without a result.
     """
 
     def __init__(
@@ -102,7 +110,9 @@ class ShapeCycle:
         laser: exposures.Laser,
         stopping: Callable[[], bool] = lambda: False,
     ) -> None:
-        self._exposures = exposures.Exposures(camera, screen, frames, clock, laser, plan.frame_interval_s)
+        self._exposures = exposures.Exposures(
+            camera, screen, frames, clock, laser, plan.frame_interval_s
+        )
         self._reconstructor = reconstructor
         self._plan = plan
         self._clock = clock
@@ -132,7 +142,9 @@ class ShapeCycle:
         return CycleDone(estimate, pause_s(self._full_rejected_in_a_row - REJECTED_IN_A_ROW + 1))
 
     def prepare(self) -> None:
-        """Do ahead what the next figure needs: not while it is waited for. That cycle tells of a failure."""
+        """Do ahead what the next figure needs: not while it is waited for. That cycle tells of a
+        failure.
+        """
         with suppress(exposures.StageError), exposures.during("reconstruction"):
             self._reconstructor.prepare()
 
@@ -151,18 +163,24 @@ class ShapeCycle:
         if frames is None:
             return None
         arrived_s = self._clock.now()
-        # asked again for all frames: when a frame arrives, half of the readings around it are still to come
+        # asked again for all frames: when a frame arrives, half of the readings around it are still
+        # to come
         displacement_um = np.array([self._laser.at(frame.time_s) for frame in frames])
         time_s = np.array([frame.time_s for frame in frames])
         with exposures.during("reconstruction"):
-            reconstruct = self._reconstructor.full if kind == "full" else self._reconstructor.fringes
+            reconstruct = (
+                self._reconstructor.full if kind == "full" else self._reconstructor.fringes
+            )
             estimate = reconstruct([frame.pixels for frame in frames], time_s, displacement_um)
-        return replace(estimate, latency_s=round(self._clock.now() - arrived_s, 5), cycle=self._cycle)
+        return replace(
+            estimate, latency_s=round(self._clock.now() - arrived_s, 5), cycle=self._cycle
+        )
 
 
-# One reading has 1 µm of noise, ten times the held centre's motion between frames: a frame gets the mean of the
-# readings around it. 0.2 s to each side are 20 readings at 50 Hz (0.22 µm), symmetric in time so that a steady motion
-# cancels; in these 0.4 s the held centre moves less than the remaining noise.
+# One reading has 1 µm of noise, ten times the held centre's motion between frames: a frame gets the
+# mean of the readings around it. 0.2 s to each side are 20 readings at 50 Hz (0.22 µm), symmetric
+# in time so that a steady motion cancels; in these 0.4 s the held centre moves less than the
+# remaining noise.
 HALF_WINDOW_S = 0.2
 HALF_WINDOW_TICKS = 2.0  # below 10 Hz there would be too few readings for a mean
 LEAST_READINGS = 3
@@ -184,10 +202,15 @@ class LaserHistory:
     def at(self, time_s: float) -> float:
         """Mean reading (µm) within `half_window_s` of a time on the run's clock.
 
-        NaN with fewer than `LEAST_READINGS` good ones; missing, flagged and repeated samples do not count.
+        NaN with fewer than `LEAST_READINGS` good ones; missing, flagged and repeated samples do not
+        count.
         """
         self._update()
-        near = [reading for mono_s, reading in self._readings if abs(mono_s - time_s) <= self.half_window_s]
+        near = [
+            reading
+            for mono_s, reading in self._readings
+            if abs(mono_s - time_s) <= self.half_window_s
+        ]
         return math.fsum(near) / len(near) if len(near) >= LEAST_READINGS else math.nan
 
     def close(self) -> None:
@@ -199,7 +222,11 @@ class LaserHistory:
             row = TelemetryRow.unpack(message)
             repeated = row.sample_counter == self._counter
             self._counter = row.sample_counter
-            if math.isfinite(row.displacement_um) and row.displacement_quality == 0 and not repeated:
+            if (
+                math.isfinite(row.displacement_um)
+                and row.displacement_quality == 0
+                and not repeated
+            ):
                 self._readings.append((row.mono_s, row.displacement_um))
         while self._readings and self._readings[0][0] < self._readings[-1][0] - _KEPT_S:
             self._readings.popleft()
@@ -215,9 +242,9 @@ def keep_cycling(
 ) -> None:
     """Take cycles until stopped.
 
-    A cycle must end early when `remote.interrupts()`; one longer than `period_s()` skips the deadlines it covers.
-    `publish` gets every estimate, whatever its verdict. `keep` writes the frames of a cycle and returns the set's
-    folder, or raises OSError with the reason.
+    A cycle must end early when `remote.interrupts()`; one longer than `period_s()` skips the
+    deadlines it covers. `publish` gets every estimate, whatever its verdict. `keep` writes the
+    frames of a cycle and returns the set's folder, or raises OSError with the reason.
     """
     due_s = clock.now()
     while not remote.stop:
@@ -278,7 +305,11 @@ def _tell(
         case CycleDone(estimate, pause_s):
             publish(estimate)
             later = f"; next in {pause_s:g} s" if pause_s else ""
-            verdict = f"{estimate.verdict}: {estimate.reason}{later}" if estimate.reason else estimate.verdict
+            verdict = (
+                f"{estimate.verdict}: {estimate.reason}{later}"
+                if estimate.reason
+                else estimate.verdict
+            )
             remote.report("running", verdict, cycle=estimate.cycle)
         case CycleFailed(number, stage, message, pause_s):
             remote.report("retrying", f"{stage}: {message}; again in {pause_s:g} s", cycle=number)
@@ -287,18 +318,26 @@ def _tell(
 def geometry_event(geometry: InForce) -> run_events.GeometryInForce:
     """The event that records the geometry."""
     origin = geometry.origin
-    return run_events.GeometryInForce(origin.hash, origin.file or None, origin.calibrated_utc or None, geometry.note)
+    return run_events.GeometryInForce(
+        origin.hash, origin.file or None, origin.calibrated_utc or None, geometry.note
+    )
 
 
 class LiveDrift:
-    """Compares residual and ring of each cycle with the calibrated ones; silent without a calibration."""
+    """Compares residual and ring of each cycle with the calibrated ones; silent without a
+    calibration.
+    """
 
     def __init__(self, geometry: InForce, bin_px: int) -> None:
         optics = geometry.optics
         self._geometry, self._radius_mm = Geometry.from_config(optics), optics.mirror.radius_mm
         shifts = phase.equal_shifts(optics.pattern.steps)
-        sigma_rad = phase.phase_sigma_rad(shifts, bins.pixel_sigma_adu(optics.camera.noise_adu), 1.0)
-        self._sigma_mm_adu = phase.mm_per_rad(optics.pattern) * sigma_rad / bin_px  # over the modulation
+        sigma_rad = phase.phase_sigma_rad(
+            shifts, bins.pixel_sigma_adu(optics.camera.noise_adu), 1.0
+        )
+        self._sigma_mm_adu = (
+            phase.mm_per_rad(optics.pattern) * sigma_rad / bin_px
+        )  # over the modulation
         known = geometry.calibration
         self._monitors: tuple[DriftMonitor, RingMonitor] | None = None
         if known is not None:
@@ -309,7 +348,9 @@ class LiveDrift:
     def noise_urad(self, estimate: shape_estimate.ShapeEstimate) -> float:
         """The camera noise's share of a cycle's residual."""
         return noise_urad(
-            self._geometry, self._surface(estimate), self._sigma_mm_adu / estimate.modulation_median_adu
+            self._geometry,
+            self._surface(estimate),
+            self._sigma_mm_adu / estimate.modulation_median_adu,
         )
 
     def after(self, estimate: shape_estimate.ShapeEstimate) -> events.Event | None:

@@ -1,7 +1,9 @@
-"""Checks a configured camera and screen before anything starts: drivers installed, settings accepted?
+"""Checks a configured camera and screen before anything starts: drivers installed, settings
+accepted?
 
-A package of a camera or screen is loaded by the acquisition process only. This check loads it in a short-lived
-process as well, so that a package that hangs, ends its process or starts threads never meets the control process.
+A package of a camera or screen is loaded by the acquisition process only. This check loads it in a
+short-lived process as well, so that a package that hangs, ends its process or starts threads never
+meets the control process.
 """
 
 from multiprocessing.connection import Connection
@@ -18,18 +20,25 @@ _PACKAGES = "devices.camera, devices.screen: the drivers' packages"
 
 
 def require_optics(devices: DevicesConfig) -> None:
-    """Refuse a camera or screen of another package that is missing, does not load or refuses its settings.
+    """Refuse a camera or screen of another package that is missing, does not load or refuses its
+    settings.
 
     Drivers of this program were checked with the configuration. Raises InputError with one line.
     """
-    if not any(isinstance(table, settings.ExternalSection) for table in (devices.camera, devices.screen)):
+    if not any(
+        isinstance(table, settings.ExternalSection) for table in (devices.camera, devices.screen)
+    ):
         return
     ours, theirs = child.pipe()
     loading = child.Child("driver check", f"{__name__}:report_problem", (devices, theirs), _NICE)
     loading.start()
     theirs.close()
     try:
-        problem = str(ours.recv()) if ours.poll(_LOADED_S) else f"{_PACKAGES} do not load within {_LOADED_S:g} s"
+        problem = (
+            str(ours.recv())
+            if ours.poll(_LOADED_S)
+            else f"{_PACKAGES} do not load within {_LOADED_S:g} s"
+        )
     except (EOFError, OSError):
         loading.join(1.0)
         problem = f"{_PACKAGES} ended the process that loads them ({loading.exit_code})"
@@ -41,7 +50,9 @@ def require_optics(devices: DevicesConfig) -> None:
 
 
 def report_problem(devices: DevicesConfig, control: Connection) -> None:
-    """Load the drivers, check their settings, and send the problem or an empty text: target of a child process."""
+    """Load the drivers, check their settings, and send the problem or an empty text: target of a
+    child process.
+    """
     tables = (
         (devices.camera, "devices.camera", drivers.CAMERAS),
         (devices.screen, "devices.screen", drivers.SCREENS),

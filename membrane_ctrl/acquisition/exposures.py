@@ -1,8 +1,8 @@
 """Takes the frames of a cycle with the greatest possible overlap.
 
-While a pattern settles on the screen, the previous frame is transferred and stored; while the first pattern of the
-next cycle settles, this cycle is reconstructed. The producer is the camera's own thread (aravis fills buffers outside
-Python), the consumer is the cycle.
+While a pattern settles on the screen, the previous frame is transferred and stored; while the first
+pattern of the next cycle settles, this cycle is reconstructed. The producer is the camera's own
+thread (aravis fills buffers outside Python), the consumer is the cycle.
 
     screen   | settle 1     | expose 1 | settle 2             | expose 2 | settle 1 (ahead)
     camera   |              |          | transfer 1 | store 1 |          | transfer 2 | store 2
@@ -13,10 +13,20 @@ from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from typing import Literal, Protocol, runtime_checkable
 
-from firmware_iface.roles import TRIES, Camera, ExposingCamera, Frame, FrameLostError, Pattern, Pixels, Screen
+from firmware_iface.roles import (
+    TRIES,
+    Camera,
+    ExposingCamera,
+    Frame,
+    FrameLostError,
+    Pattern,
+    Pixels,
+    Screen,
+)
 from membrane_ctrl.processes.frames import FrameSlot, FrameWriter
 
-# Where a cycle failed: every exception of a device or the numerics becomes one error that names the stage.
+# Where a cycle failed: every exception of a device or the numerics becomes one error that names the
+# stage.
 
 
 Stage = Literal["screen", "camera", "reconstruction"]
@@ -51,7 +61,9 @@ class CycleClock(Protocol):
 
 @runtime_checkable
 class SettlingScreen(Protocol):
-    """A screen that leaves its caller free while a pattern settles (`firmware_iface.drivers.screen_pygame`)."""
+    """A screen that leaves its caller free while a pattern settles
+    (`firmware_iface.drivers.screen_pygame`).
+    """
 
     def begin(self, pattern: Pattern) -> None:
         """Send the pattern to the display. Raises LinkError."""
@@ -68,22 +80,35 @@ class Laser(Protocol):
 
 
 class Exposures:
-    """Takes the frames of a cycle into the ring of frames, their starts at least `interval_s` apart.
+    """Takes the frames of a cycle into the ring of frames, their starts at least `interval_s`
+    apart.
 
     A camera or screen with only the plain role is used step by step.
     """
 
     def __init__(
-        self, camera: Camera, screen: Screen, frames: FrameWriter, clock: CycleClock, laser: Laser, interval_s: float
+        self,
+        camera: Camera,
+        screen: Screen,
+        frames: FrameWriter,
+        clock: CycleClock,
+        laser: Laser,
+        interval_s: float,
     ) -> None:
-        self._camera: ExposingCamera = camera if isinstance(camera, ExposingCamera) else _Grabbing(camera)
-        self._screen: SettlingScreen = screen if isinstance(screen, SettlingScreen) else _Showing(screen)
+        self._camera: ExposingCamera = (
+            camera if isinstance(camera, ExposingCamera) else _Grabbing(camera)
+        )
+        self._screen: SettlingScreen = (
+            screen if isinstance(screen, SettlingScreen) else _Showing(screen)
+        )
         self._looks_ahead = isinstance(screen, SettlingScreen)
         self._frames, self._clock, self._laser = frames, clock, laser
         self._interval_s = interval_s
         self._shown: Pattern | None = None
 
-    def take(self, patterns: Sequence[Pattern], cycle: int, stopping: Callable[[], bool]) -> list[Frame] | None:
+    def take(
+        self, patterns: Sequence[Pattern], cycle: int, stopping: Callable[[], bool]
+    ) -> list[Frame] | None:
         """Take frames of these patterns, in order; None if `stopping` before an exposure.
 
         Raises StageError ("screen" or "camera", and the failure).
@@ -97,7 +122,9 @@ class Exposures:
             if isinstance(self._camera, _Grabbing):  # frames left by a cycle that ended early
                 self._camera.forget()
 
-    def _take(self, patterns: Sequence[Pattern], cycle: int, stopping: Callable[[], bool]) -> list[Frame] | None:
+    def _take(
+        self, patterns: Sequence[Pattern], cycle: int, stopping: Callable[[], bool]
+    ) -> list[Frame] | None:
         taken: list[Frame] = []
         pending: tuple[Pattern, FrameSlot] | None = None
         exposed_s = -self._interval_s
@@ -116,7 +143,9 @@ class Exposures:
                 self._camera.expose(slot.pixels)
             pending = pattern, slot
         if pending is not None:
-            ahead = patterns[0] if self._looks_ahead else None  # both kinds of cycle start with the same pattern
+            ahead = (
+                patterns[0] if self._looks_ahead else None
+            )  # both kinds of cycle start with the same pattern
             if ahead is not None:
                 self._show(ahead)
             taken.append(self._store(*pending, cycle, then=ahead))
@@ -130,7 +159,9 @@ class Exposures:
             self._shown = pattern
 
     def _store(self, pattern: Pattern, slot: FrameSlot, cycle: int, then: Pattern | None) -> Frame:
-        """Fetch the exposure of `pattern` into its slot; the screen shows `then` before and after."""
+        """Fetch the exposure of `pattern` into its slot;
+        the screen shows `then` before and after.
+        """
         frame = self._fetch(pattern, slot, then)
         if frame.pixels is not slot.pixels:
             slot.pixels[...] = frame.pixels

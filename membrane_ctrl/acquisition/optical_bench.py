@@ -21,7 +21,8 @@ from membrane_ctrl.sim.optics.camera import TwinOptics
 _CAMERA, _SCREEN = "devices.camera", "devices.screen"  # for messages
 # Longer than any suitable display takes
 LONG_S = 0.5
-# Frame after frame for this long, three times per direction, as refresh and exposure are not synchronised
+# Frame after frame for this long, three times per direction, as refresh and exposure are not
+# synchronised
 _FOLLOWED_S = 0.35
 _TIMES = 3
 
@@ -33,7 +34,12 @@ class DisplayTest:
     """
 
     def __init__(
-        self, screen: PatternScreen, camera: roles.Camera, clock: CycleClock, width_px: int, height_px: int
+        self,
+        screen: PatternScreen,
+        camera: roles.Camera,
+        clock: CycleClock,
+        width_px: int,
+        height_px: int,
     ) -> None:
         self._screen, self._camera, self._clock = screen, camera, clock
         self._size = (height_px, width_px)
@@ -52,9 +58,11 @@ class DisplayTest:
         )
 
     def settling(self) -> display.Settling:
-        """Time from a command to the light, over steps both ways between black, white and two greys.
+        """Time from a command to the light, over steps both ways between black, white and two
+        greys.
 
-        Includes greys because panels are slowest between them. Raises ValueError if the display never settles.
+        Includes greys because panels are slowest between them. Raises ValueError if the display
+        never settles.
         """
         delays_s: list[float] = []
         left: list[float] = []
@@ -65,7 +73,9 @@ class DisplayTest:
             noise = max(noise, display.share_left(again, pictures[other], pictures[one]))
             for before, after in ((one, other), (other, one)) * _TIMES:
                 self._still(self._grey(before))
-                for delay_s, pixels in list(self._follow(self._grey(after))):  # evaluated afterwards
+                for delay_s, pixels in list(
+                    self._follow(self._grey(after))
+                ):  # evaluated afterwards
                     delays_s.append(delay_s)
                     left.append(display.share_left(pixels, pictures[before], pictures[after]))
         found = display.settling(delays_s, left, noise)
@@ -77,7 +87,9 @@ class DisplayTest:
         frames = [self._still(self._grey(level)) for level in display.RAMP_LEVELS]
         swing = frames[-1].astype(np.float64) - frames[0]
         lit = swing > 0.5 * np.quantile(swing, 0.99)
-        return display.measured_response(display.RAMP_LEVELS, [float(np.mean(frame[lit])) for frame in frames])
+        return display.measured_response(
+            display.RAMP_LEVELS, [float(np.mean(frame[lit])) for frame in frames]
+        )
 
     def _still(self, levels: roles.Levels) -> roles.Pixels:
         self._screen.show_levels(levels)
@@ -85,7 +97,9 @@ class DisplayTest:
         return self._camera.grab().pixels
 
     def _follow(self, levels: roles.Levels) -> Iterator[tuple[float, roles.Pixels]]:
-        """Frames one after the other, each with the time from the command to the start of its exposure."""
+        """Frames one after the other, each with the time from the command to the start of its
+        exposure.
+        """
         self._screen.show_levels(levels)
         begun_s = self._clock.now()
         while self._clock.now() - begun_s < _FOLLOWED_S:
@@ -126,12 +140,14 @@ class OpticalBench:
 def configured_bench(config: Config, clock: CycleClock) -> OpticalBench:
     """The drivers named in `[devices.camera]` and `[devices.screen]`, not yet open.
 
-    Raises LinkError if the configuration names none, or the patterns do not fit on the screen; InputError for a
-    driver that is not installed, does not load or refuses its settings.
+    Raises LinkError if the configuration names none, or the patterns do not fit on the screen;
+    InputError for a driver that is not installed, does not load or refuses its settings.
     """
     devices = config.devices
     if devices is None or devices.camera is None:
-        raise roles.LinkError("no camera: name one in [devices.camera], or set shape.enabled = false")
+        raise roles.LinkError(
+            "no camera: name one in [devices.camera], or set shape.enabled = false"
+        )
     camera = _camera(config, devices.camera, clock)
     if devices.screen is None:
         return OpticalBench(camera, camera.driver)  # its pictures are those of the patterns
@@ -139,7 +155,8 @@ def configured_bench(config: Config, clock: CycleClock) -> OpticalBench:
 
 
 def emulated_bench(config: Config, clock: CycleClock, optics: TwinOptics) -> OpticalBench:
-    """The twin's camera and screen; drivers of other packages that have an emulator take their places.
+    """The twin's camera and screen; drivers of other packages that have an emulator take their
+    places.
 
     Raises InputError for a driver or emulator that does not load or refuses its settings.
     """
@@ -153,7 +170,10 @@ def emulated_bench(config: Config, clock: CycleClock, optics: TwinOptics) -> Opt
     ):
         raster = _raster(config, devices.screen)
         panel = driver_loading.make_emulator(
-            devices.screen, _SCREEN, drivers.SCREENS, lambda levels: optics.screen.show_picture(levels, raster)
+            devices.screen,
+            _SCREEN,
+            drivers.SCREENS,
+            lambda levels: optics.screen.show_picture(levels, raster),
         )
         screen = _screen(config, devices.screen, clock, panel)
     if isinstance(devices.camera, ExternalCameraConfig) and drivers.has_emulator(
@@ -198,7 +218,12 @@ def _raster(config: Config, screen: ScreenSection) -> display.ScreenRaster:
     pattern = config.optics.pattern
     try:
         return display.ScreenRaster(
-            screen.width_px, screen.height_px, screen.pixel_mm, pattern.periods, pattern.period_mm, screen.centre_px
+            screen.width_px,
+            screen.height_px,
+            screen.pixel_mm,
+            pattern.periods,
+            pattern.period_mm,
+            screen.centre_px,
         )
     except ValueError as error:
         raise roles.LinkError(f"devices.screen: {error}") from None
@@ -206,7 +231,9 @@ def _raster(config: Config, screen: ScreenSection) -> display.ScreenRaster:
 
 @dataclass(frozen=True, slots=True)
 class BenchFindings:
-    """Findings from opening the bench: the camera's identity, the measurements, and the problems with remedies."""
+    """Findings from opening the bench: the camera's identity, the measurements, and the problems
+    with remedies.
+    """
 
     camera: str
     measured: tuple[str, ...] = ()
@@ -216,8 +243,8 @@ class BenchFindings:
 def open_bench(bench: OpticalBench, config: Config, clock: CycleClock) -> BenchFindings:
     """Connect the camera and screen, and measure the screen with the camera.
 
-    Problems found do not stop a run, as each cycle is judged. Raises LinkError if camera or screen is missing or
-    unusable.
+    Problems found do not stop a run, as each cycle is judged. Raises LinkError if camera or screen
+    is missing or unusable.
     """
     who = ""
     if isinstance(bench.camera, GuardedCamera):

@@ -1,7 +1,7 @@
 """The process that owns screen and camera and measures the shape.
 
-Imports nothing heavy: its parent imports it for the specification, and the limits on threads must be set before
-NumPy is loaded.
+Imports nothing heavy: its parent imports it for the specification, and the limits on threads must
+be set before NumPy is loaded.
 """
 
 import os
@@ -22,8 +22,8 @@ from membrane_ctrl.processes import child, ring
 # Limits this process's numerical threads: the control process's tick needs a core.
 
 
-# The kernels use two threads of their own (metrology.threads). Matrices are small here, terms x terms: more than one
-# thread would only spin.
+# The kernels use two threads of their own (metrology.threads). Matrices are small here, terms x
+# terms: more than one thread would only spin.
 _LIMITS = {
     "NUMBA_NUM_THREADS": "2",
     "OMP_NUM_THREADS": "1",
@@ -34,7 +34,9 @@ _LIMITS = {
 
 
 def limit_threads() -> None:
-    """Set the limits. Call before importing NumPy, OpenCV and numba, which read them only at import."""
+    """Set the limits. Call before importing NumPy, OpenCV and numba, which read them only at
+    import.
+    """
     os.environ.update(_LIMITS)
 
 
@@ -46,7 +48,8 @@ _PARENT_CHECK_S = 0.2  # interval of checking for a dead parent
 _ALIVE_EVERY_S = 1.0
 # Between two checks of the line: one exposure (up to 10 s), one reconstruction, reopening a camera
 _STEP_S = 60.0
-# Compiling kernels on a slow machine and the self-test of a real screen and camera do not check it at all
+# Compiling kernels on a slow machine and the self-test of a real screen and camera do not check it
+# at all
 _PREPARING_S = 900.0
 
 
@@ -98,9 +101,14 @@ class Remote:
         return wanted
 
     def report(
-        self, state: AcquisitionState, message: str = "", cycle: int | None = None, traceback: str | None = None
+        self,
+        state: AcquisitionState,
+        message: str = "",
+        cycle: int | None = None,
+        traceback: str | None = None,
     ) -> None:
-        """Send a report that differs from the last one: in weeks of recording, good cycles need no reports.
+        """Send a report that differs from the last one: in weeks of recording, good cycles need no
+        reports.
 
         It is dropped if the other end does not read: the cycle must never wait.
         """
@@ -144,7 +152,10 @@ class Remote:
             case "stop":
                 self.stop = True
             case _:
-                self.report("running", f"unknown command {command!r}: use pause, resume, full, capture or stop")
+                self.report(
+                    "running",
+                    f"unknown command {command!r}: use pause, resume, full, capture or stop",
+                )
 
 
 _NICENESS = 10  # behind the tick, the recorder and the screen
@@ -158,7 +169,9 @@ class AcquisitionSpec:
     clock: RunClock
     telemetry: ring.RingAddress  # source of the laser readings
     shapes: ring.RingAddress  # destination of the estimates (`estimate.pack_estimate`)
-    truth: ring.RingAddress | None  # the twin's truth, which its camera renders; None on a real bench
+    truth: (
+        ring.RingAddress | None
+    )  # the twin's truth, which its camera renders; None on a real bench
     frames: ring.FrameAddress
     run_dir: Path | None = None  # folder of the run, for kept frames
 
@@ -166,9 +179,9 @@ class AcquisitionSpec:
 def acquisition_main(spec: AcquisitionSpec, control: Connection) -> None:
     """Measure the shape until stopped: target of a `spawn`ed process.
 
-    Ends on "stop" over `control`, on `processes.STOP`, and when the parent has died. Reports go back over `control`
-    as lines of events (`run_events.AcquisitionState`). Raises SystemExit with 1 if it cannot work at all (after a
-    report of the reason).
+    Ends on "stop" over `control`, on `processes.STOP`, and when the parent has died. Reports go
+    back over `control` as lines of events (`run_events.AcquisitionState`). Raises SystemExit with 1
+    if it cannot work at all (after a report of the reason).
     """
     os.nice(max(0, _NICENESS - os.nice(0)))
     signal.signal(signal.SIGINT, signal.SIG_IGN)
@@ -179,6 +192,8 @@ def acquisition_main(spec: AcquisitionSpec, control: Connection) -> None:
 
         run(spec, remote)
     except Exception as error:
-        remote.report("failed", f"{type(error).__name__}: {error}", traceback=traceback.format_exc())
+        remote.report(
+            "failed", f"{type(error).__name__}: {error}", traceback=traceback.format_exc()
+        )
         raise SystemExit(1) from None
     remote.report("stopped")

@@ -1,8 +1,9 @@
-"""Keeps raw frames of every n-th cycle, and of the last cycles before a fault, as capture sets to remeasure.
+"""Keeps raw frames of every n-th cycle, and of the last cycles before a fault, as capture sets to
+remeasure.
 
-`raw/cycle-000017/` in the run's folder is a set like any other (docs/interfaces.md section 3). A set of fringes only
-refers to the full cycle that anchors it, so the newest accepted full cycle is kept too, until the next one replaces
-it or a set refers to it.
+`raw/cycle-000017/` in the run's folder is a set like any other (docs/interfaces.md section 3). A
+set of fringes only refers to the full cycle that anchors it, so the newest accepted full cycle is
+kept too, until the next one replaces it or a set refers to it.
 """
 
 import shutil
@@ -54,8 +55,8 @@ class _Write:
 class RawFrames:
     """Keeps frames in the run's folder `raw`, made for the first set; sees faults in the telemetry.
 
-    `tell` gets an event of kind "raw_frames" when the disk forces sets to be omitted: once per reason, until one is
-    kept again. `left_out` counts the sets omitted for lack of time or disk.
+    `tell` gets an event of kind "raw_frames" when the disk forces sets to be omitted: once per
+    reason, until one is kept again. `left_out` counts the sets omitted for lack of time or disk.
     """
 
     def __init__(
@@ -90,7 +91,10 @@ class RawFrames:
             return
         if not (self._recording.raw_every_cycles or self._recording.raw_before_fault_cycles):
             return
-        due = self._recording.raw_every_cycles and estimate.cycle % self._recording.raw_every_cycles == 0
+        due = (
+            self._recording.raw_every_cycles
+            and estimate.cycle % self._recording.raw_every_cycles == 0
+        )
         anchors = estimate.kind == "full" and estimate.verdict != "rejected"
         if not (due or anchors):
             return
@@ -106,7 +110,10 @@ class RawFrames:
         wait(write.done for write in self._writing)
         self._collect()
         if kept is None or not (kept / "capture.toml").exists():
-            raise OSError("the set could not be written completely: is the disk full, or slower than the cycles?")
+            raise OSError(
+                "the set could not be written completely: is the disk full, or slower than "
+                "the cycles?"
+            )
         if kept == self._reference:
             self._reference_needed = True  # the set now belongs to the user
         return kept
@@ -116,7 +123,9 @@ class RawFrames:
         message = self._telemetry.latest()
         fault = message is not None and telemetry.TelemetryRow.unpack(message).fault > 0
         if fault and not self._in_fault and self._recording.raw_before_fault_cycles:
-            cycles = sorted({head.cycle for head in self._frames.heads() if head.pattern in self._patterns})
+            cycles = sorted(
+                {head.cycle for head in self._frames.heads() if head.pattern in self._patterns}
+            )
             for cycle in cycles[-self._recording.raw_before_fault_cycles :]:
                 self._keep(cycle)
         self._in_fault = fault
@@ -157,7 +166,9 @@ class RawFrames:
         except OSError as error:
             return str(error)
         # count queued sets too: after writing them, the disk must still have room as for thumbnails
-        left_mb = (free_bytes - found.size_bytes - sum(write.size_bytes for write in self._writing)) / 1e6
+        left_mb = (
+            free_bytes - found.size_bytes - sum(write.size_bytes for write in self._writing)
+        ) / 1e6
         least_mb = PICTURES_FROM * self._recording.min_free_mb
         return "" if left_mb > least_mb else f"less than {least_mb:g} MB would stay free"
 
@@ -192,10 +203,14 @@ class RawFrames:
     def _copy(self, cycle: int) -> _Set | None:
         heads = [head for head in self._frames.heads() if head.cycle == cycle]
         copies = [self._frames.copy(head) for head in heads]
-        names = {head.pattern for head, pixels in zip(heads, copies, strict=True) if pixels is not None}
+        names = {
+            head.pattern for head, pixels in zip(heads, copies, strict=True) if pixels is not None
+        }
         for kind, wanted in (("full", self._plan.full), ("fringes", self._plan.fringes)):
             if names == {pattern.name for pattern in wanted} and len(heads) == len(wanted):
-                return _Set(kind, tuple(heads), tuple(pixels for pixels in copies if pixels is not None))
+                return _Set(
+                    kind, tuple(heads), tuple(pixels for pixels in copies if pixels is not None)
+                )
         return None  # a stopped or partly overwritten cycle
 
 
@@ -207,7 +222,9 @@ def _write(folder: Path, table: dict[str, Any], content: _Set) -> None:
             raise OSError(f"{folder.name}: the full cycle it refers to is missing")
         for head, pixels in zip(content.heads, content.pixels, strict=True):
             _, png = cv2.imencode(".png", pixels, _FASTEST)
-            (folder / f"{head.pattern}.png").write_bytes(png.tobytes())  # unlike OpenCV, this reports a full disk
+            (folder / f"{head.pattern}.png").write_bytes(
+                png.tobytes()
+            )  # unlike OpenCV, this reports a full disk
         # last, as it marks a complete set
         (folder / "capture.toml").write_text(tomli_w.dumps(table), encoding="utf-8")
     except Exception:

@@ -50,7 +50,8 @@ class TwinTruth:
         self._reader.close()
 
 
-# Runs every kernel of the cycle once, on a small sensor: a fresh machine compiles them here, for many seconds.
+# Runs every kernel of the cycle once, on a small sensor: a fresh machine compiles them here, for
+# many seconds.
 
 
 @dataclass(frozen=True, slots=True)
@@ -61,7 +62,8 @@ class _StandingFilm:
     sag_mm: float
 
 
-# A real film's sag is unknown before the measurement; a metre of film at the usual pressure has this one
+# A real film's sag is unknown before the measurement; a metre of film at the usual pressure has
+# this one
 TYPICAL_FILM: FilmPosition = _StandingFilm(0.0, 37.1)
 
 _SMALL_PX = 300  # still enough points for the fit of the terms, at a hundredth of the work
@@ -71,7 +73,9 @@ def small(optics: OpticsConfig) -> OpticsConfig:
     """The same view on a sensor with larger pixels."""
     camera = optics.camera
     larger = max(1, min(camera.width_px, camera.height_px) // _SMALL_PX)
-    column_px, row_px = ((p + 0.5) / larger - 0.5 for p in camera.principal)  # pixel centres are at integers
+    column_px, row_px = (
+        (p + 0.5) / larger - 0.5 for p in camera.principal
+    )  # pixel centres are at integers
     coarse = camera.model_copy(
         update={
             "width_px": camera.width_px // larger,
@@ -90,12 +94,14 @@ def warm_up(
     position: FilmPosition,
     clock: exposures.CycleClock,
 ) -> None:
-    """Run a full cycle and two fringes-only cycles, with and without known motion, of a film at rest.
+    """Run a full cycle and two fringes-only cycles, with and without known motion, of a film at
+    rest.
 
     `reconstructor` is a disposable one for `small(optics)`, and `optics` are those small ones.
     """
     bench = TwinOptics(optics, TwinConfig(), lambda: position, clock)
-    # displacements that differ by more than noise trigger the kernels that correct the film's motion
+    # displacements that differ by more than noise trigger the kernels that correct the film's
+    # motion
     still, moving = np.zeros(1), np.array([-10.0, 10.0])
     for full, reconstruct, motion_um in (
         (True, reconstructor.full, moving),
@@ -131,9 +137,9 @@ class WaitingClock:
 def run(spec: process.AcquisitionSpec, remote: process.Remote) -> None:
     """Prepare, then measure until stopped.
 
-    Before the first cycle `processes.STOP` simply ends the process, as no resource needs care and a compiling kernel
-    cannot check for it; afterwards it ends the cycle at its next exposure. Raises LinkError if no camera is
-    configured, or its patterns do not fit on the screen.
+    Before the first cycle `processes.STOP` simply ends the process, as no resource needs care and a
+    compiling kernel cannot check for it; afterwards it ends the cycle at its next exposure. Raises
+    LinkError if no camera is configured, or its patterns do not fit on the screen.
     """
     remote.listen()  # the first report, which allows silence until all this is done
     remote.report("preparing", "rendering the first picture, compiling")
@@ -153,14 +159,28 @@ def run(spec: process.AcquisitionSpec, remote: process.Remote) -> None:
         if remote.stop:
             return
         reconstructor, plan, period_s = _reconstructor(spec, geometry.optics, plan)
-        drift, hear = cycle.LiveDrift(geometry, config.shape.bin_px), listener(config, spec.clock, spec.run_dir)
+        drift, hear = (
+            cycle.LiveDrift(geometry, config.shape.bin_px),
+            listener(config, spec.clock, spec.run_dir),
+        )
         shapes = stack.enter_context(closing(ring.RingWriter(spec.shapes)))
         slots = stack.enter_context(closing(frames.FrameWriter(spec.frames)))
-        stack.callback(bench.close)  # before the frame ring: a running exposure holds the pixels of a slot
-        laser = stack.enter_context(closing(cycle.LaserHistory(spec.telemetry, config.loop.rate_hz)))
+        stack.callback(
+            bench.close
+        )  # before the frame ring: a running exposure holds the pixels of a slot
+        laser = stack.enter_context(
+            closing(cycle.LaserHistory(spec.telemetry, config.loop.rate_hz))
+        )
         raw = _raw_frames(spec, geometry.optics, plan, stack, remote)
         taking = cycle.ShapeCycle(
-            bench.camera, bench.screen, reconstructor, plan, slots, clock, laser, stopping=remote.interrupts
+            bench.camera,
+            bench.screen,
+            reconstructor,
+            plan,
+            slots,
+            clock,
+            laser,
+            stopping=remote.interrupts,
         )
 
         def publish(estimate: ShapeEstimate) -> None:
@@ -185,11 +205,14 @@ _HEARD = "vibrations.json"  # in the run's folder
 _HEARD_BYTES_MAX = 1 << 20  # usually 10 kB
 
 
-def listener(config: Config, clock: RunClock, run_dir: Path | None) -> Callable[[ShapeEstimate], list[Event]]:
+def listener(
+    config: Config, clock: RunClock, run_dir: Path | None
+) -> Callable[[ShapeEstimate], list[Event]]:
     """What takes the figures and tells the mirror's vibrations.
 
-    It goes on where the run's last acquisition ended, or that of the newest earlier run with the same devices in the
-    folder of runs: a film that moved meanwhile is told as well. What it has heard is kept in the run's folder.
+    It goes on where the run's last acquisition ended, or that of the newest earlier run with the
+    same devices in the folder of runs: a film that moved meanwhile is told as well. What it has
+    heard is kept in the run's folder.
     """
     known = None if run_dir is None else _heard_before(config, run_dir)
     stethoscope = Stethoscope(config.pump.stroke_hz, clock.origin_utc.timestamp(), known)
@@ -208,13 +231,17 @@ def listener(config: Config, clock: RunClock, run_dir: Path | None) -> Callable[
 def _heard_before(config: Config, run_dir: Path) -> Heard | None:
     for path in sorted(run_dir.parent.glob(f"*/{_HEARD}"), reverse=True):
         run = path.parent
-        if run.name > run_dir.name or _bench_name(run_folder.read_config(run, [])) != _bench_name(config):
+        if run.name > run_dir.name or _bench_name(run_folder.read_config(run, [])) != _bench_name(
+            config
+        ):
             continue
         with suppress(OSError, ValueError, RecursionError):  # damaged: take an older one
             table = plain_json.loads(files.read_text(path, _HEARD_BYTES_MAX))
             if isinstance(table, dict) and plain_json.take_checksum(table):
                 heard = decode_state(json.dumps(table).encode(), Heard, _HEARD_BYTES_MAX)
-                return heard if run == run_dir else replace(heard, said=[])  # those were another run's
+                return (
+                    heard if run == run_dir else replace(heard, said=[])
+                )  # those were another run's
     return None
 
 
@@ -233,7 +260,8 @@ def _plan(config: Config, optics: OpticsConfig) -> cycle.CyclePlan:
 def _reconstructor(
     spec: process.AcquisitionSpec, optics: OpticsConfig, plan: cycle.CyclePlan
 ) -> tuple[cycle.Reconstructor, cycle.CyclePlan, Callable[[], float]]:
-    """What makes figures of the frames, the patterns it needs, and the interval between its figures.
+    """What makes figures of the frames, the patterns it needs, and the interval between its
+    figures.
 
     The figures have their covariance if the uncertainty of the geometry is stated.
     """
@@ -245,7 +273,11 @@ def _reconstructor(
         return cycles, plan, lambda: shape.period_s
     exposure_s = optical_bench.exposure_s(spec.config) if spec.truth is None else 0.0
     tracker = LiveTracker(optics, cycles, shape.track_periods, shape.track_step_s, exposure_s)
-    return tracker, replace(plan, standing=lambda: tracker.pattern), lambda: tracker.slower / shape.track_rate_hz
+    return (
+        tracker,
+        replace(plan, standing=lambda: tracker.pattern),
+        lambda: tracker.slower / shape.track_rate_hz,
+    )
 
 
 def _twin_bench(
@@ -267,17 +299,23 @@ def _twin_bench(
     return optical_bench.emulated_bench(config, clock, optics)
 
 
-def _warm_up(config: Config, plan: cycle.CyclePlan, position: FilmPosition, clock: WaitingClock) -> None:
+def _warm_up(
+    config: Config, plan: cycle.CyclePlan, position: FilmPosition, clock: WaitingClock
+) -> None:
     coarse = small(config.optics)
     cycles = live.LiveReconstructor(coarse, config.shape.bin_px)
     warm_up(cycles, coarse, plan, position, clock)
     if config.shape.mode == "track":
-        tracker = LiveTracker(coarse, cycles, config.optics.pattern.periods, config.shape.track_step_s)
+        tracker = LiveTracker(
+            coarse, cycles, config.optics.pattern.periods, config.shape.track_step_s
+        )
         one = replace(plan, standing=lambda: tracker.pattern)
         warm_up(tracker, coarse, one, position, clock)
 
 
-def _open(bench: optical_bench.OpticalBench, config: Config, clock: WaitingClock, remote: process.Remote) -> None:
+def _open(
+    bench: optical_bench.OpticalBench, config: Config, clock: WaitingClock, remote: process.Remote
+) -> None:
     """Open camera and screen; retry until stopped if they are missing, while the hold continues."""
     failures = 0
     while not remote.stop:
@@ -306,5 +344,7 @@ def _raw_frames(
     if spec.run_dir is None:
         return None
     folder, recording = spec.run_dir / "raw", spec.config.recording
-    raw = raw_frames.RawFrames(folder, optics, plan, recording, spec.frames, spec.telemetry, remote.tell)
+    raw = raw_frames.RawFrames(
+        folder, optics, plan, recording, spec.frames, spec.telemetry, remote.tell
+    )
     return stack.enter_context(closing(raw))

@@ -1,9 +1,9 @@
 """The standing alarms and the messages about them. Time is an argument: no clock, no I/O.
 
-An alarm is raised when its condition has persisted, escalated to more people if nobody acknowledges it, repeated as
-a reminder, and cleared when the condition has stayed away. A condition that returns sooner is the same alarm; a
-latched fault is always a new one. Several conditions under one name are one alarm: a full disk affects
-all files.
+An alarm is raised when its condition has persisted, escalated to more people if nobody acknowledges
+it, repeated as a reminder, and cleared when the condition has stayed away. A condition that returns
+sooner is the same alarm; a latched fault is always a new one. Several conditions under one name are
+one alarm: a full disk affects all files.
 """
 
 import math
@@ -23,9 +23,11 @@ class Sign:
     severity: Severity = "warning"
     text: str = ""
     for_s: float = 0.0  # how long the condition must persist before a message
-    # which of several conditions under one name; the alarm stands until all clear. With `bad` False, "" means all
+    # which of several conditions under one name; the alarm stands until all clear. With `bad`
+    # False, "" means all
     about: str = ""
-    anew: bool = False  # once all conditions have cleared, the next one is a new alarm, however soon
+    # once all conditions have cleared, the next one is a new alarm, however soon
+    anew: bool = False
 
 
 def signs_of(changes: NoticeChanges) -> list[Sign]:
@@ -58,7 +60,8 @@ def sign_of_value(rule: AlarmRule, value: float, standing: bool) -> Sign | None:
     side = 1.0 if rule.raise_at > rule.clear_at else -1.0
     if not standing and side * value > side * rule.raise_at:
         text = (
-            f"{rule.field} = {value:.4g}, {'above' if side > 0 else 'below'} {rule.raise_at:g} for {rule.for_s:g} s"
+            f"{rule.field} = {value:.4g}, {'above' if side > 0 else 'below'} {rule.raise_at:g} "
+            f"for {rule.for_s:g} s"
         )
         return Sign(rule.name, True, rule.severity, text, rule.for_s)
     if standing and side * value < side * rule.clear_at:
@@ -157,7 +160,9 @@ class AlarmBook:
             else:
                 alarm.reminded_s = now_s
                 alarm.escalated |= kind == "escalated"
-            messages.append(AlarmMessage(kind, name, alarm.sign.severity, alarm.sign.text, alarm.escalated))
+            messages.append(
+                AlarmMessage(kind, name, alarm.sign.severity, alarm.sign.text, alarm.escalated)
+            )
         return messages
 
     def _due(self, alarm: _Alarm, now_s: float) -> MessageKind | None:

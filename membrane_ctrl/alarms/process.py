@@ -1,4 +1,5 @@
-"""The process that sends alarms: mail servers may take a minute, and the run does not wait for them.
+"""The process that sends alarms: mail servers may take a minute, and the run does not wait for
+them.
 
 Messages go through Apprise: mail, chat, web hook and many more, each a URL (https://appriseit.com).
 """
@@ -34,7 +35,8 @@ _KEPT = 50
 
 
 class Outbox:
-    """A queue of messages, each tried until it is sent; a full box drops the oldest, which `dropped` counts.
+    """A queue of messages, each tried until it is sent; a full box drops the oldest, which
+    `dropped` counts.
 
     `send` returns whether the message was sent; it may be slow but must not raise.
     """
@@ -76,7 +78,9 @@ _TYPES = {"raised": "", "escalated": "failure", "reminder": "", "cleared": "succ
 
 
 def read_urls(path: Path) -> list[str]:
-    """Read the URLs of a file, one per line, ignoring empty lines and comments (`#`). Raises InputError."""
+    """Read the URLs of a file, one per line, ignoring empty lines and comments (`#`). Raises
+    InputError.
+    """
     try:
         lines = files.read_text(path, follow=True).splitlines()
     except OSError as error:
@@ -85,7 +89,9 @@ def read_urls(path: Path) -> list[str]:
         raise errors.InputError(f"alarms: {path}: {error}") from None
     urls = [line.strip() for line in lines if line.strip() and not line.lstrip().startswith("#")]
     if not urls:
-        raise errors.InputError(f"{path}: no URL found; write one per line, e.g. mailto://user:password@example.org")
+        raise errors.InputError(
+            f"{path}: no URL found; write one per line, e.g. mailto://user:password@example.org"
+        )
     return urls
 
 
@@ -99,10 +105,11 @@ def require_sendable(config: AlarmsConfig) -> None:
 
 
 def apprise_senders(config: AlarmsConfig, run: str) -> list[Send]:
-    """One sender for `urls_file`, one for `escalation_urls_file` if it is set; every message names the run.
+    """One sender for `urls_file`, one for `escalation_urls_file` if it is set; every message names
+    the run.
 
-    Raises DeviceError without Apprise, InputError for a bad file or URL. The error gives only the URL's line: it may
-    hold a password.
+    Raises DeviceError without Apprise, InputError for a bad file or URL. The error gives only the
+    URL's line: it may hold a password.
     """
     apprise = _apprise()
     assert config.urls_file is not None
@@ -134,15 +141,20 @@ def _apprise() -> Any:
 
 
 def send_test_alarm(config: schema.Config, source: str, escalated: bool, as_json: bool) -> int:
-    """`alarm test`: send one message to the alarm addresses, and with `escalated` to the escalation addresses.
+    """`alarm test`: send one message to the alarm addresses, and with `escalated` to the escalation
+    addresses.
 
     Raises InputError without addresses, DeviceError if no service accepts it.
     """
     alarms = config.alarms
     if alarms.urls_file is None:
-        raise errors.InputError(f"{source}: alarms.urls_file: missing; name a file with one Apprise URL per line")
+        raise errors.InputError(
+            f"{source}: alarms.urls_file: missing; name a file with one Apprise URL per line"
+        )
     if escalated and alarms.escalation_urls_file is None:
-        raise errors.InputError(f"{source}: alarms.escalation_urls_file: missing; no escalation addresses")
+        raise errors.InputError(
+            f"{source}: alarms.escalation_urls_file: missing; no escalation addresses"
+        )
     message = AlarmMessage("raised", "test", "warning", "this is only a test", escalated)
     senders = apprise_senders(alarms, "none, a test")
     lists = [alarms.urls_file, alarms.escalation_urls_file][: 2 if escalated else 1]
@@ -152,7 +164,8 @@ def send_test_alarm(config: schema.Config, source: str, escalated: bool, as_json
         print(json.dumps({"sent": not deaf}))
     if deaf:
         raise errors.DeviceError(
-            f"{' and '.join(map(str, deaf))}: no service accepted the message; check addresses and network"
+            f"{' and '.join(map(str, deaf))}: no service accepted the message; check "
+            "addresses and network"
         )
     if not as_json:
         print("sent; check that it has arrived")
@@ -164,7 +177,9 @@ _STARTS_S = 30.0
 
 
 class Watcher:
-    """Turns rows and events into alarm messages; the first outbox gets all, the second only the escalated ones."""
+    """Turns rows and events into alarm messages; the first outbox gets all, the second only the
+    escalated ones.
+    """
 
     def __init__(self, config: AlarmsConfig, outboxes: Sequence[Outbox], now_s: float) -> None:
         self._config = config
@@ -189,7 +204,9 @@ class Watcher:
 
     def orphaned(self, now_s: float) -> None:
         """Report that the control process ended without an "end" event."""
-        text = "the control process ended without a report; the board's watchdog has stopped the pump"
+        text = (
+            "the control process ended without a report; the board's watchdog has stopped the pump"
+        )
         self._book.take(Sign("control_gone", True, "critical", text), now_s)
         self._send(now_s)
 
@@ -199,7 +216,8 @@ class Watcher:
         self._status = self._status.after_event(event)
         match event:
             case run_events.AlarmsAcknowledged() | CommandTaken(command="ack"):
-                self._book.acknowledge()  # whoever sends `ack` has seen the alarms, even if the hold refuses it
+                # whoever sends `ack` has seen the alarms, even if the hold refuses it
+                self._book.acknowledge()
         for sign in signs:
             self._book.take(sign, now_s)
 
@@ -257,15 +275,27 @@ def alarms_main(spec: AlarmsSpec, status: Any) -> None:
 
 
 def watch(
-    spec: AlarmsSpec, senders: Sequence[Send], report: Callable[[Event], None], parent_lives: Callable[[], bool]
+    spec: AlarmsSpec,
+    senders: Sequence[Send],
+    report: Callable[[Event], None],
+    parent_lives: Callable[[], bool],
 ) -> None:
-    """Run the process's loop; `senders` are the one for all messages and the one for escalated ones."""
+    """Run the process's loop; `senders` are the one for all messages and the one for escalated
+    ones.
+    """
     clock = spec.clock
-    outboxes = [Outbox(_reporting(send, to, report)) for send, to in zip(senders, _TO, strict=False)]
+    outboxes = [
+        Outbox(_reporting(send, to, report)) for send, to in zip(senders, _TO, strict=False)
+    ]
     watcher = Watcher(spec.config, outboxes, clock.now())
-    with closing(ring.RingReader(spec.telemetry)) as telemetry, closing(ring.RingReader(spec.events)) as events:
+    with (
+        closing(ring.RingReader(spec.telemetry)) as telemetry,
+        closing(ring.RingReader(spec.events)) as events,
+    ):
         while True:
-            lives = parent_lives()  # before the rings: a dying parent has written its last message first
+            lives = (
+                parent_lives()
+            )  # before the rings: a dying parent has written its last message first
             report(run_events.Alive(_SENDING_S))
             watcher.look(telemetry.drain(), events.drain(), clock.now())
             if watcher.ended or not lives:

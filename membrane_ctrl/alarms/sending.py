@@ -1,7 +1,8 @@
 """Sends a message through several services at once, in bounded time and memory.
 
-A mail or web server may answer without end, or a byte a minute; the libraries behind Apprise read all of it. So each
-service has a thread of its own, which is left behind after `SERVICE_S`, and the process has a limit of memory.
+A mail or web server may answer without end, or a byte a minute; the libraries behind Apprise read
+all of it. So each service has a thread of its own, which is left behind after `SERVICE_S`, and the
+process has a limit of memory.
 """
 
 from __future__ import annotations
@@ -38,7 +39,9 @@ class Service:
         self._thread.start()
 
     def accepted(self, until_s: float) -> bool:
-        """Whether the service has accepted the message of the last `begin`, by a time of the monotonic clock."""
+        """Whether the service has accepted the message of the last `begin`, by a time of the
+        monotonic clock.
+        """
         if self._thread is None or not self._begun:  # what still hangs is an earlier message
             return False
         self._thread.join(max(0.0, until_s - time.monotonic()))
@@ -48,15 +51,21 @@ class Service:
         try:
             self._accepted = bool(self._plugin.notify(title=title, body=body, notify_type=kind))
         except Exception as error:  # plug-ins raise anything, and MemoryError at the limit
-            logging.getLogger(__name__).warning("%s: %s", type(self._plugin).__name__, type(error).__name__)
+            logging.getLogger(__name__).warning(
+                "%s: %s", type(self._plugin).__name__, type(error).__name__
+            )
 
 
 def send_to_all(services: Sequence[Service], title: str, body: str, kind: str) -> bool:
-    """Send a message to every service; one success suffices: a dead chat server must not repeat the mail forever."""
+    """Send a message to every service; one success suffices: a dead chat server must not repeat the
+    mail forever.
+    """
     until_s = time.monotonic() + SERVICE_S
     for service in services:
         service.begin(title, body, kind)
-    accepted = [service.accepted(until_s) for service in services]  # wait for all: each gets every message
+    accepted = [
+        service.accepted(until_s) for service in services
+    ]  # wait for all: each gets every message
     return any(accepted)
 
 

@@ -1,1 +1,3 @@
-"""The command `calibrate --live`: sets at several pressures, taken from a running hold and solved."""
+"""The command `calibrate --live`: sets at several pressures,
+taken from a running hold and solved.
+"""

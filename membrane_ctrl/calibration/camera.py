@@ -1,4 +1,6 @@
-"""The commands that calibrate camera and screen alone: `calibrate-camera`, `calibrate-pose`, `calibrate-display`."""
+"""The commands that calibrate camera and screen alone: `calibrate-camera`, `calibrate-pose`,
+`calibrate-display`.
+"""
 
 import json
 import sys
@@ -34,7 +36,9 @@ _IMAGES = (".png", ".tif", ".tiff", ".bmp", ".jpg", ".jpeg")
 
 @dataclass(frozen=True)
 class CameraOptions:
-    """Options of the command: a folder of photographs, the board in them, the camera as configured."""
+    """Options of the command: a folder of photographs, the board in them,
+    the camera as configured.
+    """
 
     folder: Path
     board: str
@@ -44,7 +48,9 @@ class CameraOptions:
 
 
 def calibrate_camera(options: CameraOptions) -> int:
-    """Find the corners, fit the lens, write the prior and report the improvement. Raises CommandError."""
+    """Find the corners, fit the lens, write the prior and report the improvement. Raises
+    CommandError.
+    """
     board, camera = _board(options.board), options.config.optics.camera
     views = [_view(path, board, camera) for path in _images(options.folder)]
     try:
@@ -68,7 +74,9 @@ def calibrate_camera(options: CameraOptions) -> int:
 
 
 def draw_board(out: Path, board_text: str, square_px: int, width_px: int, height_px: int) -> int:
-    """Write the board as a picture for a screen of the given size in pixels. Raises errors.InputError."""
+    """Write the board as a picture for a screen of the given size in pixels. Raises
+    errors.InputError.
+    """
     try:
         levels = on_screen(_board(board_text), square_px, width_px, height_px)
     except ValueError as error:
@@ -82,7 +90,10 @@ def draw_board(out: Path, board_text: str, square_px: int, width_px: int, height
         written = False
     if not written:
         raise errors.InputError(f"{out}: cannot be written; give a .png in a writable folder")
-    print(f"{board_text} of {square_px} px squares written to {out}; display it pixel for pixel", file=sys.stderr)
+    print(
+        f"{board_text} of {square_px} px squares written to {out}; display it pixel for pixel",
+        file=sys.stderr,
+    )
     return int(errors.Exit.DONE)
 
 
@@ -104,13 +115,16 @@ def _images(folder: Path) -> list[Path]:
 
 def _view(path: Path, board: Board, camera: CameraConfig) -> BoardView:
     try:
-        image = decoded_image(files.read_bytes(path, IMAGE_BYTES_MAX), cv2.IMREAD_GRAYSCALE | cv2.IMREAD_ANYDEPTH)
+        image = decoded_image(
+            files.read_bytes(path, IMAGE_BYTES_MAX), cv2.IMREAD_GRAYSCALE | cv2.IMREAD_ANYDEPTH
+        )
     except (OSError, ValueError) as error:
         reason = (error.strerror if isinstance(error, OSError) else None) or error
         raise errors.InputError(f"{path}: {reason}") from None
     if image.shape != (camera.height_px, camera.width_px):
         raise errors.InputError(
-            f"{path}: {image.shape[1]} x {image.shape[0]} pixels, but the configuration's optics.camera has "
+            f"{path}: {image.shape[1]} x {image.shape[0]} pixels, but the configuration's "
+            "optics.camera has "
             f"{camera.width_px} x {camera.height_px}"
         )
     if image.dtype != np.uint8:  # the detectors take 8 bits only, which suffice for corners
@@ -147,7 +161,10 @@ def _lines(camera: CameraConfig, lens: Lens, out: Path) -> list[str]:
     if lens.left_out:
         lines.append(f"omitted, without a board or with a bad fit: {', '.join(lens.left_out)}")
     if lens.sigmas["focal_relative"] > usual_sigma("focal_relative"):
-        lines.append("the focal length is no better known than from its data sheet: tilt the board more, both ways")
+        lines.append(
+            "the focal length is no better known than from its data sheet: tilt the board "
+            "more, both ways"
+        )
     return [*lines, f"written: {out}; use it with calibrate --prior {out}"]
 
 
@@ -167,7 +184,9 @@ class PoseOptions:
 
 
 def calibrate_pose(options: PoseOptions) -> int:
-    """Measure the set, find the rim, fit the pose, write the prior and report. Raises CommandError."""
+    """Measure the set, find the rim, fit the pose, write the prior and report.
+    Raises CommandError.
+    """
     geometry = None if options.geometry is None else read_geometry(options.geometry)
     capture = capture_set.read_set(options.folder, geometry)
     optics = capture.head.optics
@@ -181,7 +200,9 @@ def calibrate_pose(options: PoseOptions) -> int:
     if outline is None:
         raise errors.RejectedError(f"{options.folder}: the rim is not in the picture")
     try:
-        pose = ring_pose.ring_pose(light, stated, outline.rim_px, radius_mm, rim_z, options.radius_sigma_mm)
+        pose = ring_pose.ring_pose(
+            light, stated, outline.rim_px, radius_mm, rim_z, options.radius_sigma_mm
+        )
     except ValueError as error:
         raise errors.RejectedError(f"{options.folder}: {error}") from None
     sigmas = dict(zip(ring_pose.POSE_NAMES, pose.sigmas.tolist(), strict=True))
@@ -207,17 +228,22 @@ def _light(capture: capture_set.CaptureSet) -> FloatArray:
     names = [pattern.name for pattern in capture.head.patterns]
     if "white" not in names:
         raise errors.InputError(
-            f"{capture.head.folder / 'capture.toml'}: kind: a full set is needed, for its white frame"
+            f"{capture.head.folder / 'capture.toml'}: kind: a full set is needed, for its "
+            "white frame"
         )
     for name in ("white", "black"):
         if (k := names.index(name)) in capture.unusable:
-            raise errors.RejectedError(f"{capture.head.folder}: {capture.head.files[k]}: {capture.unusable[k]}")
+            raise errors.RejectedError(
+                f"{capture.head.folder}: {capture.head.files[k]}: {capture.unusable[k]}"
+            )
     white, black = (capture.frames[names.index(name)].astype(float) for name in ("white", "black"))
     return np.asarray(white - black)
 
 
 def _rim(capture: capture_set.CaptureSet) -> tuple[reconstruct.HeightFunction, float]:
-    """Height of the film at the rim in world, and its mean. Raises RejectedError for a set without a figure."""
+    """Height of the film at the rim in world, and its mean. Raises RejectedError for a set without
+    a figure.
+    """
     optics = capture.head.optics
     try:
         checked = check(measurement.stack_of(capture), optics)
@@ -226,7 +252,9 @@ def _rim(capture: capture_set.CaptureSet) -> tuple[reconstruct.HeightFunction, f
     surface, vertex_mm = full.bin_figure(optics, checked).fit.surface, checked.tracer.vertex_z_mm
 
     def height(x: FloatArray, y: FloatArray) -> FloatArray:
-        share = surface.radius_mm / np.maximum(np.hypot(x, y), 1.0)  # the terms diverge beyond the rim
+        share = surface.radius_mm / np.maximum(
+            np.hypot(x, y), 1.0
+        )  # the terms diverge beyond the rim
         return np.asarray(vertex_mm + surface.height(x * share, y * share))
 
     return height, vertex_mm + surface.sag_mm
@@ -238,8 +266,14 @@ def _pose_lines(pose: ring_pose.RingPose, out: Path) -> list[str]:
         f"{name:<18}{value:>+13.4f}  {sigma:<9.4f} {usual_sigma(name):.3g}"
         for name, value, sigma in zip(ring_pose.POSE_NAMES, pose.values, pose.sigmas, strict=True)
     ]
-    better = max(usual_sigma(name) / sigma for name, sigma in zip(ring_pose.POSE_NAMES, pose.sigmas, strict=True))
-    lines.append(f"edges left {pose.rms_px:.3f} px RMS at {pose.points} points, at best {better:.0f} times better")
+    better = max(
+        usual_sigma(name) / sigma
+        for name, sigma in zip(ring_pose.POSE_NAMES, pose.sigmas, strict=True)
+    )
+    lines.append(
+        f"edges left {pose.rms_px:.3f} px RMS at {pose.points} points, at best {better:.0f} "
+        "times better"
+    )
     return [*lines, f"written: {out}; use it with calibrate --prior {out}"]
 
 
@@ -252,7 +286,9 @@ def calibrate_display(config: Config, source: str, as_json: bool) -> int:
     Call from the main thread only (because of the screen).
     """
     if config.devices is None or config.devices.camera is None or config.devices.screen is None:
-        raise errors.InputError(f"{source}: devices.camera and devices.screen are both needed to measure the screen")
+        raise errors.InputError(
+            f"{source}: devices.camera and devices.screen are both needed to measure the screen"
+        )
     section, clock = config.devices.screen, session.WaitingClock(RunClock.start())
     try:
         bench = optical_bench.configured_bench(config, clock)
@@ -272,14 +308,18 @@ def calibrate_display(config: Config, source: str, as_json: bool) -> int:
 def measured(
     bench: optical_bench.OpticalBench, clock: exposures.CycleClock, width_px: int, height_px: int
 ) -> tuple[Settling, DisplayResponse]:
-    """Open the bench and measure its screen. Raises LinkError, or ValueError if the camera cannot see the screen."""
+    """Open the bench and measure its screen. Raises LinkError, or ValueError if the camera cannot
+    see the screen.
+    """
     bench.camera.open()
     bench.screen.open()
     test = optical_bench.DisplayTest(bench.screen, bench.camera, clock, width_px, height_px)
     return test.settling(), test.response()
 
 
-def report_of(settling: Settling, response: DisplayResponse, pattern: PatternConfig) -> dict[str, object]:
+def report_of(
+    settling: Settling, response: DisplayResponse, pattern: PatternConfig
+) -> dict[str, object]:
     """The findings, schema membrane-calibrate-display/1."""
     bare, corrected = (fringe_error_mm(response, pattern, linear) for linear in (False, True))
     return {
@@ -308,7 +348,9 @@ def lines_of(report: dict[str, object]) -> list[str]:
 
 
 def fringe_error_mm(response: DisplayResponse, pattern: PatternConfig, corrected: bool) -> float:
-    """RMS error of a screen coordinate from this display's sinusoids, whose harmonics appear as phase."""
+    """RMS error of a screen coordinate from this display's sinusoids, whose harmonics appear as
+    phase.
+    """
     phase = 2 * np.pi * np.arange(_PHASES) / _PHASES
     shifts = 2 * np.pi * np.arange(pattern.steps) / pattern.steps
     wanted = (1 + np.cos(phase + shifts[:, None])) / 2

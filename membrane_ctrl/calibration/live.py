@@ -52,16 +52,22 @@ def calibrate_live(options: LiveOptions) -> int:
         session = sessions.resume(options.session)
     if session is None or session.missing:
         with live_hold(
-            options.where, options.take_over, "calibrate --live", session=f"calibrate {options.name}"
+            options.where,
+            options.take_over,
+            "calibrate --live",
+            session=f"calibrate {options.name}",
         ) as link:
             session = take_sets(link, session, options)
     return solve_and_adopt(session, options)
 
 
-def take_sets(link: CaptureLink, session: CalibrationSession | None, options: LiveOptions) -> CalibrationSession:
+def take_sets(
+    link: CaptureLink, session: CalibrationSession | None, options: LiveOptions
+) -> CalibrationSession:
     """Take the missing sets, if a person agrees, and move the mirror back.
 
-    Raises InputError, DeviceError, RejectedError or KeyboardInterrupt; the session's folder keeps the sets so far.
+    Raises InputError, DeviceError, RejectedError or KeyboardInterrupt; the session's folder keeps
+    the sets so far.
     """
     progress = Progress()
     sweep = Sweep(link, link.config.limits, progress)
@@ -74,7 +80,9 @@ def take_sets(link: CaptureLink, session: CalibrationSession | None, options: Li
         else:
             reach, sets = sessions.reach_of(held, link.config), options.sets or USUAL_SETS
             wanted = sessions.setpoints_um(held, reach, options.range_um, sets)
-            head = CalibrationHead(sessions.FORMAT, link.name, now_utc(), held.setpoint_um, held.shape_on, wanted)
+            head = CalibrationHead(
+                sessions.FORMAT, link.name, now_utc(), held.setpoint_um, held.shape_on, wanted
+            )
             missing = tuple(range(sets))
         procedure.check(head)
         minutes = sum(procedure.times_s(head, missing)) / 60
@@ -91,7 +99,9 @@ def take_sets(link: CaptureLink, session: CalibrationSession | None, options: Li
 
 
 def solve_and_adopt(session: CalibrationSession, options: LiveOptions) -> int:
-    """Solve a session's sets, show old and new geometry, and adopt the new one if a person agrees."""
+    """Solve a session's sets, show old and new geometry,
+    and adopt the new one if a person agrees.
+    """
     start_um = session.head.start_um
     code = calibrate_command(
         replace(options.solving, folders=session.sets, out=session.geometry, reference_um=start_um)
@@ -102,9 +112,15 @@ def solve_and_adopt(session: CalibrationSession, options: LiveOptions) -> int:
     for line in compared(optics, _origin(session, place), read_geometry(session.geometry)):
         _say(line)
     if place is None:
-        _say(f"not adopted: the configuration names no optics.geometry_file; the geometry is {session.geometry}")
+        _say(
+            "not adopted: the configuration names no optics.geometry_file; the geometry is "
+            f"{session.geometry}"
+        )
     elif not _asked(f"adopt it as {place}?", options.yes):
-        _say(f"not adopted; `membrane-ctrl calibrate --live --session {session.path} --yes` adopts it")
+        _say(
+            f"not adopted; `membrane-ctrl calibrate --live --session {session.path} --yes` "
+            "adopts it"
+        )
     else:
         kept = adopt(session.geometry, place)
         before = f"; the previous one is {kept}" if kept else ""
@@ -120,11 +136,16 @@ def _same_bench(link: CaptureLink, session: CalibrationSession) -> None:
             continue
         then = read_head(folder).optics
         if _written_out(then) != _written_out(now):
-            raise InputError(f"{folder}: camera or geometry differs from that of {link.name}; start a new session")
+            raise InputError(
+                f"{folder}: camera or geometry differs from that of {link.name}; start a new "
+                "session"
+            )
 
 
 def _written_out(optics: OpticsConfig) -> tuple[GeometryConfig, CameraConfig]:
-    """Spell out defaults that one file may omit; the reference is not compared, the principal point is."""
+    """Spell out defaults that one file may omit; the reference is not compared, the principal point
+    is.
+    """
     camera = optics.camera.model_copy(update={"principal_px": optics.camera.principal})
     return optics.geometry.model_copy(update={"reference_displacement_um": None}), camera
 
@@ -133,20 +154,30 @@ def _plan(head: CalibrationHead, missing: int, held: sessions.HeldMirror, minute
     low_um, high_um = min(head.setpoints_um), max(head.setpoints_um)
     return (
         f"{missing} of {len(head.setpoints_um)} sets from {low_um:g} to {high_um:g} µm "
-        f"(sag {held.sag_at_mm(low_um):.1f} to {held.sag_at_mm(high_um):.1f} mm; now {held.setpoint_um:g} µm, "
-        f"{held.pressure_pa:.0f} Pa, leak {held.leak_um_per_s:.1f} µm/s), then back to {head.start_um:g} µm: "
+        f"(sag {held.sag_at_mm(low_um):.1f} to {held.sag_at_mm(high_um):.1f} mm; now "
+        f"{held.setpoint_um:g} µm, "
+        f"{held.pressure_pa:.0f} Pa, leak {held.leak_um_per_s:.1f} µm/s), then back to "
+        f"{head.start_um:g} µm: "
         f"about {minutes:.0f} min"
     )
 
 
-def _worth(link: CaptureLink, head: CalibrationHead, held: sessions.HeldMirror, options: LiveOptions) -> str:
+def _worth(
+    link: CaptureLink, head: CalibrationHead, held: sessions.HeldMirror, options: LiveOptions
+) -> str:
     """How well the sets will determine the geometry, and how much better a wider range would."""
     here = _foreseen(link, held, head.setpoints_um, options)
-    line = f"a figure after these sets: sag +- {here.sag_um:.1f} µm, figure +- {here.figure_rms_um:.1f} µm RMS"
+    line = (
+        f"a figure after these sets: sag +- {here.sag_um:.1f} µm, figure +- "
+        f"{here.figure_rms_um:.1f} µm RMS"
+    )
     low_um, high_um = min(head.setpoints_um), max(head.setpoints_um)
     if high_um - low_um >= _NEARLY_ALL * verdict.GOOD_SPREAD_UM:
         return line
-    ends = (low_um + high_um - verdict.GOOD_SPREAD_UM) / 2, (low_um + high_um + verdict.GOOD_SPREAD_UM) / 2
+    ends = (
+        (low_um + high_um - verdict.GOOD_SPREAD_UM) / 2,
+        (low_um + high_um + verdict.GOOD_SPREAD_UM) / 2,
+    )
     best = _foreseen(link, held, np.linspace(*ends, len(head.setpoints_um)).tolist(), options)
     reach = sessions.reach_of(held, link.config)
     return (

@@ -1,4 +1,6 @@
-"""Results of a calibration, as a table for JSON, as lines for people, and as the geometry's file."""
+"""Results of a calibration, as a table for JSON, as lines for people,
+and as the geometry's file.
+"""
 
 from collections.abc import Sequence
 from dataclasses import asdict
@@ -14,7 +16,15 @@ from matplotlib.figure import Figure
 
 from membrane_ctrl.config.schema import OpticsConfig
 from membrane_ctrl.measure.results import write_figure
-from membrane_ctrl.metrology.calibrate import advice, diagnose, parameters, propagate, residuals, solve, verdict
+from membrane_ctrl.metrology.calibrate import (
+    advice,
+    diagnose,
+    parameters,
+    propagate,
+    residuals,
+    solve,
+    verdict,
+)
 from membrane_ctrl.model import errors, program
 from membrane_ctrl.model.arrays import FloatArray
 from membrane_ctrl.model.files import users, write_text_atomic
@@ -23,7 +33,9 @@ _SOME_LASER = 0.5  # sigma of the laser's scale without any reading: 1
 
 
 def report_of(
-    solution: solve.Solution | None, findings: Sequence[verdict.CalibrationFinding], analysis_radius_mm: float
+    solution: solve.Solution | None,
+    findings: Sequence[verdict.CalibrationFinding],
+    analysis_radius_mm: float,
 ) -> dict[str, Any]:
     """The report, schema membrane-calibration/1; without a solution only the findings."""
     table: dict[str, Any] = {
@@ -42,7 +54,12 @@ def report_of(
         "condition": propagate.condition_number(solution),
         "parameters": [_parameter(solution, name) for name in solution.free],
         "not_determined": [
-            {"sigma_left": each.left, "height_um": each.height_um, "figure_um": each.figure_um, "says": each.words}
+            {
+                "sigma_left": each.left,
+                "height_um": each.height_um,
+                "figure_um": each.figure_um,
+                "says": each.words,
+            }
             for each in propagate.weak_combinations(solution, middle, analysis_radius_mm)
         ],
         "uncertainty": {
@@ -72,12 +89,16 @@ def _parameter(solution: solve.Solution, name: str) -> dict[str, Any]:
 
 
 def _sets(solution: solve.Solution) -> list[dict[str, Any]]:
-    """Per set: its noise relative to the camera's, its residuals, and the test against the other sets."""
+    """Per set: its noise relative to the camera's, its residuals, and the test against the other
+    sets.
+    """
     return [
         {
             "name": phases.name,
             "surface": "film" if phases.artefact is None else phases.artefact.name,
-            "displacement_um": phases.displacement_um if np.isfinite(phases.displacement_um) else None,
+            "displacement_um": phases.displacement_um
+            if np.isfinite(phases.displacement_um)
+            else None,
             "sag_mm": state.surface.sag_mm,
             "noise_ratio": float(np.sqrt(linear.variance)),
             "screen_residual_um": 1e3 * linear.residual_rms_mm,
@@ -85,14 +106,19 @@ def _sets(solution: solve.Solution) -> list[dict[str, Any]]:
             "left_out_freedom": out.freedom,
         }
         for phases, state, linear, out in zip(
-            solution.problem.sets, solution.states, solution.equations, diagnose.left_out(solution), strict=True
+            solution.problem.sets,
+            solution.states,
+            solution.equations,
+            diagnose.left_out(solution),
+            strict=True,
         )
     ]
 
 
 _SCREENS = {
-    "screen": "stand the screen itself {:.0f} mm before the camera, tilted by {:.0f} degrees to two sides",
-    "screen_moved": "see a film again with the screen {:.0f} mm further from the mirror, known to {:g} mm",
+    "screen": "stand the screen itself {:.0f} mm before the camera, tilted by {:.0f} degrees to two "  # noqa: E501
+    "sides",
+    "screen_moved": "see a film again with the screen {:.0f} mm further from the mirror, known to {:g} mm",  # noqa: E501
 }
 _SCREEN_KNOWN = {"screen": advice.TILT_DEG, "screen_moved": advice.RAIL_SIGMA_MM}
 
@@ -100,49 +126,67 @@ _SCREEN_KNOWN = {"screen": advice.TILT_DEG, "screen_moved": advice.RAIL_SIGMA_MM
 def lines_of(report: dict[str, Any]) -> list[str]:
     """Format the report for a terminal."""
     lines = [f"verdict: {report['verdict']}"]
-    lines += [("  ! " if finding["fatal"] else "  note: ") + finding["says"] for finding in report["findings"]]
+    lines += [
+        ("  ! " if finding["fatal"] else "  note: ") + finding["says"]
+        for finding in report["findings"]
+    ]
     if "parameters" not in report:
         return lines
     lines.append("what           stated wrong by   +-        known before")
     for row in report["parameters"]:
         says = parameters.ALL[parameters.NAMES.index(row["name"])].says
         lines.append(
-            f"{row['name']:<18}{row['value']:>+11.4f}  {row['sigma']:<9.4f} {row['sigma_before']:<8.4g} {says}"
+            f"{row['name']:<18}{row['value']:>+11.4f}  {row['sigma']:<9.4f} "
+            f"{row['sigma_before']:<8.4g} {says}"
         )
-    lines.append("set                 reading µm   sag mm    noise  residual µm  against the others")
+    lines.append(
+        "set                 reading µm   sag mm    noise  residual µm  against the others"
+    )
     for row in report["sets"]:
         reading = "-" if row["displacement_um"] is None else f"{row['displacement_um']:.1f}"
         reading = reading if row["surface"] == "film" else row["surface"]
         lines.append(
             f"{row['name']:<18}{reading:>12}{row['sag_mm']:>10.4f}{row['noise_ratio']:>8.2f}"
-            f"{row['screen_residual_um']:>12.2f}  {row['left_out_fall']:.0f} of {row['left_out_freedom']} expected"
+            f"{row['screen_residual_um']:>12.2f}  {row['left_out_fall']:.0f} of "
+            f"{row['left_out_freedom']} expected"
         )
     claim = report["uncertainty"]
     lines.append(
-        f"figure with this geometry: sag +- {claim['sag_um']:.2f} µm, figure +- {claim['figure_rms_um']:.2f} µm RMS, "
+        f"figure with this geometry: sag +- {claim['sag_um']:.2f} µm, figure +- "
+        f"{claim['figure_rms_um']:.2f} µm RMS, "
         f"with its tilt +- {claim['height_rms_um']:.1f} µm RMS"
     )
     if (number := report["advice"]) is not None:
         unit = parameters.ALL[parameters.NAMES.index(number["name"])].unit
         known = f"{number['sigma']:.2g} {unit}".strip()
-        lines.append(f"best next: {number['name']} known to {known} would give sag +- {number['sag_um']:.2g} µm")
+        lines.append(
+            f"best next: {number['name']} known to {known} would give sag +- "
+            f"{number['sag_um']:.2g} µm"
+        )
     if (sphere := report["artefact_advice"]) is not None:
         together = " and ".join(sphere["together"][:2])
         lines.append(
             (f"not told apart here: {together}; put" if together else "better: put")
             + f" a sphere of about {sphere['curvature_radius_mm']:.0f} mm (known to "
-            f"{sphere['curvature_radius_sigma_mm']:.2g} mm, its vertex to {sphere['vertex_sigma_mm']:.2g} mm, "
-            f"{2 * sphere['radius_mm']:.0f} mm wide) in the mirror's place: sag +- {sphere['sag_um']:.2g} µm"
+            f"{sphere['curvature_radius_sigma_mm']:.2g} mm, its vertex to "
+            f"{sphere['vertex_sigma_mm']:.2g} mm, "
+            f"{2 * sphere['radius_mm']:.0f} mm wide) in the mirror's place: sag +- "
+            f"{sphere['sag_um']:.2g} µm"
         )
-    for where, each in zip(("with the screen alone", "and then"), report["screen_advice"], strict=False):
+    for where, each in zip(
+        ("with the screen alone", "and then"), report["screen_advice"], strict=False
+    ):
         do = _SCREENS[each["sets"]].format(abs(each["distance_mm"]), _SCREEN_KNOWN[each["sets"]])
         lines.append(f"{where}: {do}: sag +- {each['sag_um']:.2g} µm")
     if report["laser"]["sigma"] < _SOME_LASER:
-        lines.append(f"laser against optics: {report['laser']['scale']:.5f} +- {report['laser']['sigma']:.5f}")
+        lines.append(
+            f"laser against optics: {report['laser']['scale']:.5f} +- "
+            f"{report['laser']['sigma']:.5f}"
+        )
     lines.append(f"condition number {report['condition']:.2g}; not determined by the sets:")
-    lines += [f"  {each['sigma_left']:.0%} left: {each['says']}" for each in report["not_determined"]] or [
-        "  nothing"
-    ]
+    lines += [
+        f"  {each['sigma_left']:.0%} left: {each['says']}" for each in report["not_determined"]
+    ] or ["  nothing"]
     if report.get("out"):
         lines.append(f"written: {report['out']} (hash {report['hash']})")
     return lines
@@ -163,7 +207,9 @@ def draw_residuals(path: Path, solution: solve.Solution) -> None:
     count = len(solution.states)
     edges = _edges(solution)
     maps = [[_means(solution, k, axis, edges) for k in range(count)] for axis in range(2)]
-    reach = float(np.nanpercentile(np.abs(maps), 98)) or 1.0  # single cells at the edge must not set the scale
+    reach = (
+        float(np.nanpercentile(np.abs(maps), 98)) or 1.0
+    )  # single cells at the edge must not set the scale
     colours = ScalarMappable(Normalize(-reach, reach), "RdBu_r")
     figure = Figure(figsize=(_INCHES * count, 2 * _INCHES), layout="constrained")
     panels = figure.subplots(2, count, squeeze=False, sharex=True, sharey=True)
@@ -188,13 +234,17 @@ def _edges(solution: solve.Solution) -> tuple[FloatArray, FloatArray]:
     return across, down
 
 
-def _means(solution: solve.Solution, index: int, axis: int, edges: tuple[FloatArray, FloatArray]) -> FloatArray:
+def _means(
+    solution: solve.Solution, index: int, axis: int, edges: tuple[FloatArray, FloatArray]
+) -> FloatArray:
     """Weighted means over cells, (rows, columns); NaN in cells without points."""
     phases, linear = solution.problem.sets[index], solution.equations[index]
     weights = linear.trust.weights / phases.sigma_mm**2
     bins = (edges[1], edges[0])
     total = np.histogram2d(phases.row_px, phases.column_px, bins, weights=weights)[0]
-    summed = np.histogram2d(phases.row_px, phases.column_px, bins, weights=weights * linear.residual_mm[axis])[0]
+    summed = np.histogram2d(
+        phases.row_px, phases.column_px, bins, weights=weights * linear.residual_mm[axis]
+    )[0]
     return np.divide(1e3 * summed, total, out=np.full_like(total, np.nan), where=total > 0)
 
 
@@ -209,13 +259,16 @@ def write_geometry(
     films = [(solution.states[k], problem.sets[k]) for k in problem.films]
     slopes = [_slope_residual(solution, problem.sets[k], k) for k in problem.films]
     noises = [
-        verdict.noise_urad(solution.bench.geometry, state.surface, float(np.sqrt(np.mean(phases.sigma_mm**2))))
+        verdict.noise_urad(
+            solution.bench.geometry, state.surface, float(np.sqrt(np.mean(phases.sigma_mm**2)))
+        )
         for state, phases in films
     ]
     origin = solve.Origin(
         date_utc=datetime.now(UTC).isoformat(timespec="seconds"),
         sets=tuple(phases.name for phases in problem.sets),
-        screen_residual_um=1e3 * float(np.median([each.residual_rms_mm for each in solution.equations])),
+        screen_residual_um=1e3
+        * float(np.median([each.residual_rms_mm for each in solution.equations])),
         slope_residual_urad=1e6 * float(np.median(slopes)),
         slope_noise_urad=float(np.median(noises)),
         condition=propagate.condition_number(solution),
@@ -229,6 +282,10 @@ def write_geometry(
 
 
 def _slope_residual(solution: solve.Solution, phases: residuals.SetPhases, index: int) -> float:
-    """RMS of measured minus fitted slopes of one set's bins on the calibrated bench, as a live cycle states it."""
-    fit = solve.fit_on(solution.bench, phases, solution.problem.radius_mm, solution.states[index].vertex_z_mm)
+    """RMS of measured minus fitted slopes of one set's bins on the calibrated bench, as a live
+    cycle states it.
+    """
+    fit = solve.fit_on(
+        solution.bench, phases, solution.problem.radius_mm, solution.states[index].vertex_z_mm
+    )
     return float(np.hypot(fit.residual_x, fit.residual_y) / np.sqrt(2))

@@ -1,4 +1,6 @@
-"""A live calibration: its setpoints, and its folder `<logs>/calibration/<UTC>-<name>/` of plan, sets and geometry."""
+"""A live calibration: its setpoints, and its folder `<logs>/calibration/<UTC>-<name>/` of plan,
+sets and geometry.
+"""
 
 import math
 import shutil
@@ -44,7 +46,9 @@ class CalibrationSession:
     @property
     def sets(self) -> tuple[Path, ...]:
         """Folders of all sets, existing or not."""
-        return tuple(self.path / "sets" / f"set-{k + 1}" for k in range(len(self.head.setpoints_um)))
+        return tuple(
+            self.path / "sets" / f"set-{k + 1}" for k in range(len(self.head.setpoints_um))
+        )
 
     @property
     def missing(self) -> tuple[int, ...]:
@@ -66,11 +70,17 @@ class CalibrationSession:
             shutil.copytree(taken, part)
             part.replace(folder)
         except (OSError, shutil.Error) as error:
-            raise errors.DeviceError(f"{folder}: cannot copy the set {taken} here ({error})") from None
+            raise errors.DeviceError(
+                f"{folder}: cannot copy the set {taken} here ({error})"
+            ) from None
 
 
-def begin(logs: Path, name: str, head: CalibrationHead, config: schema.Config) -> CalibrationSession:
-    """Begin a session. Raises errors.InputError for a bad name, DeviceError if it cannot be written."""
+def begin(
+    logs: Path, name: str, head: CalibrationHead, config: schema.Config
+) -> CalibrationSession:
+    """Begin a session. Raises errors.InputError for a bad name, DeviceError if it cannot be
+    written.
+    """
     return CalibrationSession(begin_session(logs / "calibration", name, head, config), head, config)
 
 
@@ -83,13 +93,19 @@ def resume(path: Path) -> CalibrationSession:
 
 
 def compared(optics: schema.OpticsConfig, origin: GeometryOrigin, new: GeometryFile) -> list[str]:
-    """The geometry in force (`optics`, `origin`) beside the new one, in numbers that a tape measure can check."""
+    """The geometry in force (`optics`, `origin`) beside the new one, in numbers that a tape measure
+    can check.
+    """
     old = "by hand" if not origin.calibrated_utc else f"calibrated {origin.calibrated_utc}"
     lines = [
         f"in force: {old}, hash {origin.hash}; new: hash {new.origin.hash}",
         f"{'':<28}{'in force':>12}{'new':>12}",
     ]
-    rows = zip(_by_tape(Geometry.from_config(optics)), _by_tape(Geometry.from_config(new.over(optics))), strict=True)
+    rows = zip(
+        _by_tape(Geometry.from_config(optics)),
+        _by_tape(Geometry.from_config(new.over(optics))),
+        strict=True,
+    )
     lines += [f"{name:<28}{before:>12.3f}{after:>12.3f}" for (name, before), (_, after) in rows]
     return lines
 
@@ -101,7 +117,10 @@ def _by_tape(geometry: Geometry) -> list[tuple[str, float]]:
     return [
         ("a, vertex to pinhole, mm", float(np.linalg.norm(pinhole))),
         ("b, vertex to screen, mm", float(np.linalg.norm(screen))),
-        ("alpha of the camera, deg", float(np.degrees(np.arctan2(pinhole[2], np.hypot(pinhole[0], pinhole[1]))))),
+        (
+            "alpha of the camera, deg",
+            float(np.degrees(np.arctan2(pinhole[2], np.hypot(pinhole[0], pinhole[1])))),
+        ),
         ("the screen leans by, deg", float(leans)),
     ]
 
@@ -135,10 +154,11 @@ def _kept(place: Path) -> Path:
     raise OSError(f"a thousand files {stem} exist")
 
 
-# Of the limiting pressure: it gives the sag of a Hencky bowl to a per cent, and a sag gives the pressure to three;
-# a pretensioned film needs less extra pressure than this for more depth
+# Of the limiting pressure: it gives the sag of a Hencky bowl to a per cent, and a sag gives the
+# pressure to three; a pretensioned film needs less extra pressure than this for more depth
 _PRESSURE_SHARE = 0.95
-SETTLE_S = 15.0  # at a setpoint: the gas is back at the air's temperature (12 s), and the ramp has no more effect
+# at a setpoint: the gas is back at the air's temperature (12 s), and the ramp has no more effect
+SETTLE_S = 15.0
 # The current cycle ends first, then 18 frames, their reconstruction and writing
 _SET_S = 15.0
 _PIECES = 8  # to integrate a move's duration: the leak grows with the cube of the depth
@@ -160,7 +180,9 @@ class HeldMirror:
         return self.sag_mm + 1e-3 * (setpoint_um - self.setpoint_um)
 
     def leak_at_um_per_s(self, setpoint_um: float) -> float:
-        """Leak at another setpoint: like the pressure, it grows with the cube of the sag (Hencky)."""
+        """Leak at another setpoint: like the pressure,
+        it grows with the cube of the sag (Hencky).
+        """
         return self.leak_um_per_s * float(self.sag_at_mm(setpoint_um) / self.sag_mm) ** 3
 
 
@@ -175,7 +197,9 @@ class Reach:
 
 
 def reach_of(held: HeldMirror, config: schema.Config) -> Reach:
-    """The safety table's limits less a margin: a lagging mirror must not trip them during a move."""
+    """The safety table's limits less a margin: a lagging mirror must
+    not trip them during a move.
+    """
     limits, margin_um = config.limits, config.limits.following_error_max_um
     high_um, why = limits.displacement_max_um - margin_um, "limits.displacement_max_um"
     if held.pressure_pa > 0:
@@ -187,7 +211,9 @@ def reach_of(held: HeldMirror, config: schema.Config) -> Reach:
     return Reach(math.ceil(low_um), math.floor(high_um), "limits.displacement_min_um", why)
 
 
-def setpoints_um(held: HeldMirror, reach: Reach, range_um: float | None, sets: int) -> tuple[float, ...]:
+def setpoints_um(
+    held: HeldMirror, reach: Reach, range_um: float | None, sets: int
+) -> tuple[float, ...]:
     """Setpoints of the sets, evenly spaced about where the mirror is held, nearer end first.
 
     Raises errors.InputError if there is no room for what is asked, or for less than 1 mm.
@@ -220,7 +246,9 @@ def setpoints_um(held: HeldMirror, reach: Reach, range_um: float | None, sets: i
 
 
 def way_s(held: HeldMirror, from_um: float, to_um: float, config: schema.Config) -> float:
-    """Duration of the setpoint's ramp; inf if the mirror does not sink, or the pump has no reserve."""
+    """Duration of the setpoint's ramp; inf if the mirror does not sink,
+    or the pump has no reserve.
+    """
     loop, most_um_per_s = config.loop, config.loop.flow_most_um_per_s(config.pump)
     total_s = 0.0
     for a_um, b_um in pairwise(np.linspace(from_um, to_um, _PIECES + 1).tolist()):

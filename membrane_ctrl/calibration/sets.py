@@ -1,4 +1,6 @@
-"""The `calibrate` command: one geometry, with its covariance, from capture sets at several pressures."""
+"""The `calibrate` command: one geometry, with its covariance, from capture sets at several
+pressures.
+"""
 
 import json
 import math
@@ -32,21 +34,27 @@ from membrane_ctrl.model.arrays import FloatArray
 
 # A capture set's bins as screen points with their noise, for the calibration.
 
-_NO_FILM = "an artefact, as all sets are: a calibration needs a set of the film, whose figure it is for"
+_NO_FILM = (
+    "an artefact, as all sets are: a calibration needs a set of the film, whose figure it is for"
+)
 _SAME_FILM_UM = 20.0  # apart: a film's change of figure is then known to a tenth of a micrometre
 _MOTION_UNSEEN_UM = 100.0  # without a laser; the fringes find it to some micrometres
 
 
 def phases_of(name: str, checked: Checked, optics: OpticsConfig) -> residuals.SetPhases:
-    """The bins within the analysis radius that the set's own fit kept, corrected for the film's motion.
+    """The bins within the analysis radius that the set's own fit kept, corrected for the film's
+    motion.
 
-    The stated geometry only chooses the bins and corrects the averaging of a curved phase over a bin (some 1e-3 mm,
-    which no calibration changes).
+    The stated geometry only chooses the bins and corrects the averaging of a curved phase over a
+    bin (some 1e-3 mm, which no calibration changes).
     """
     film = FilmMotion.of(checked)
     x_um, y_um = film.told_um
-    # what the film moved from x to y is left to the solution: the stated lens makes of it 2 % too much or too little
-    figure = bin_figure(optics, checked, replace(film, told_um=(x_um - x_um.mean(), y_um - y_um.mean())))
+    # what the film moved from x to y is left to the solution: the stated lens makes of it 2 % too
+    # much or too little
+    figure = bin_figure(
+        optics, checked, replace(film, told_um=(x_um - x_um.mean(), y_um - y_um.mean()))
+    )
     grid = BinGrid(checked.tracer.geometry, optics.camera, checked.binned.bin_px)
     return residuals.SetPhases(
         name=name,
@@ -56,7 +64,9 @@ def phases_of(name: str, checked: Checked, optics: OpticsConfig) -> residuals.Se
         sigma_mm=np.sqrt(np.mean(np.square(figure.sigma_mm), axis=0)),
         displacement_um=checked.stack.mean_reading_um,
         motion_um=float(x_um.mean() - y_um.mean()),
-        motion_sigma_um=film.x_to_y_sigma_um if math.isfinite(film.x_to_y_sigma_um) else _MOTION_UNSEEN_UM,
+        motion_sigma_um=film.x_to_y_sigma_um
+        if math.isfinite(film.x_to_y_sigma_um)
+        else _MOTION_UNSEEN_UM,
         moved_um=film.moved_um,
         period_mm=optics.pattern.period_mm,
     )
@@ -85,7 +95,8 @@ class CalibrateOptions:
     laser_sigma_um: float  # sigma of a set's mean reading
     as_json: bool
     pictures: bool = True  # draw the residuals of the screen points next to the geometry
-    # Laser reading at which the manual measurements hold, if the sets do not state it; None: the first set's
+    # Laser reading at which the manual measurements hold, if the sets do not state it; None: the
+    # first set's
     reference_um: float | None = None
     priors: Sequence[Path] = ()  # results of auxiliary calibrations; the last one wins
     film: separable.FilmModel = "free"
@@ -94,7 +105,9 @@ class CalibrateOptions:
 
 @dataclass(frozen=True)
 class Bundle:
-    """The sets read: their phases, the bench that all of them state, and defects of single frames."""
+    """The sets read: their phases, the bench that all of them state,
+    and defects of single frames.
+    """
 
     sets: tuple[residuals.SetPhases, ...]
     optics: OpticsConfig
@@ -104,12 +117,18 @@ class Bundle:
     edges_px: tuple[FloatArray, ...] = ()  # of the rim, in the sets that show it
 
 
-def _judged(findings: Sequence[verdict.CalibrationFinding], bundle: Bundle) -> tuple[verdict.CalibrationFinding, ...]:
-    """The findings with the notes; a refusal of sets that may be of different benches says so first."""
+def _judged(
+    findings: Sequence[verdict.CalibrationFinding], bundle: Bundle
+) -> tuple[verdict.CalibrationFinding, ...]:
+    """The findings with the notes; a refusal of sets that may be of different benches says so
+    first.
+    """
     notes = bundle.notes
     if bundle.apart and any(finding.fatal for finding in findings):
         doubt = f"{bundle.apart}; if it was not: "
-        findings = [replace(each, says=doubt + each.says) if each.fatal else each for each in findings]
+        findings = [
+            replace(each, says=doubt + each.says) if each.fatal else each for each in findings
+        ]
     elif bundle.apart:
         notes = (bundle.apart, *notes)
     return (*findings, *(verdict.CalibrationFinding(False, note) for note in notes))
@@ -118,7 +137,9 @@ def _judged(findings: Sequence[verdict.CalibrationFinding], bundle: Bundle) -> t
 def calibrate_command(options: CalibrateOptions) -> int:
     """Read, solve, judge, write. Returns the exit code; raises CommandError for invalid sets."""
     priors = [spread_file.read_prior(path) for path in options.priors]
-    free = {name: sigma for prior in priors for name, sigma in prior.content.sigmas.items()} | freed(options.free)
+    free = {
+        name: sigma for prior in priors for name, sigma in prior.content.sigmas.items()
+    } | freed(options.free)
     begin = time.perf_counter()
     bundle = with_priors(read_sets(options.folders, options.geometry, options.reference_um), priors)
     read = time.perf_counter()
@@ -143,10 +164,17 @@ def calibrate_command(options: CalibrateOptions) -> int:
             path.parent.mkdir(parents=True, exist_ok=True)
             draw_residuals(path, solution)
     report = report_of(solution, findings, bundle.optics.mirror.analysis_radius_mm)
-    report |= {"out": str(options.out) if usable else None, "hash": written or None, "timing_s": timing}
+    report |= {
+        "out": str(options.out) if usable else None,
+        "hash": written or None,
+        "timing_s": timing,
+    }
     print(json.dumps(report) if options.as_json else "\n".join(lines_of(report)))
     if not usable:
-        print(f"calibrate: rejected; {options.out} is not written, the old geometry stays in force", file=sys.stderr)
+        print(
+            f"calibrate: rejected; {options.out} is not written, the old geometry stays in force",
+            file=sys.stderr,
+        )
     return errors.Exit.DONE if usable else errors.Exit.REJECTED
 
 
@@ -156,29 +184,36 @@ def freed(texts: Sequence[str]) -> dict[str, float]:
     for text in texts:
         name, _, amount = text.partition("=")
         if name not in NAMES:
-            raise errors.InputError(f"--free {text}: {name} is not a parameter; known: {', '.join(NAMES)}")
+            raise errors.InputError(
+                f"--free {text}: {name} is not a parameter; known: {', '.join(NAMES)}"
+            )
         try:
             out[name] = float(amount) if amount else usual_sigma(name)
         except ValueError:
             raise errors.InputError(f"--free {text}: {amount} is not a number") from None
         if not (math.isfinite(out[name]) and out[name] > 0):
             raise errors.InputError(
-                f"--free {text}: a sigma must be above 0, as nothing is exact: state how well {name} is known, "
+                f"--free {text}: a sigma must be above 0, as nothing is exact: state how "
+                f"well {name} is known, "
                 "or omit it, and the data sheet's sigma applies"
             )
     return out
 
 
-def read_sets(folders: Sequence[Path], geometry: Path | None, reference_um: float | None = None) -> Bundle:
+def read_sets(
+    folders: Sequence[Path], geometry: Path | None, reference_um: float | None = None
+) -> Bundle:
     """Read capture sets and their phases.
 
-    Raises InputError for an invalid set or one whose rig differs from that of the first; RejectedError for a
-    set without a figure.
+    Raises InputError for an invalid set or one whose rig differs from that of the first;
+    RejectedError for a set without a figure.
     """
     stated = None if geometry is None else file.read_geometry(geometry)
     figures = Figures(stated)
     if len(set(folders)) < len(folders):
-        raise errors.InputError(f"{next(f for f in folders if list(folders).count(f) > 1)}: given twice")
+        raise errors.InputError(
+            f"{next(f for f in folders if list(folders).count(f) > 1)}: given twice"
+        )
     sets: list[residuals.SetPhases] = []
     benches: list[OpticsConfig] = []
     used: list[Path] = []
@@ -187,15 +222,22 @@ def read_sets(folders: Sequence[Path], geometry: Path | None, reference_um: floa
     edges: list[FloatArray] = []
     heads = {folder: read_head(folder, stated) for folder in folders}
     # those with the screen in its place first: the others belong to them
-    for folder in terminal.counted(sorted(folders, key=lambda each: heads[each].screen_moved is not None), "sets"):
+    for folder in terminal.counted(
+        sorted(folders, key=lambda each: heads[each].screen_moved is not None), "sets"
+    ):
         head = heads[folder]
         if head.artefact == "screen":
             phases = phases_of_screen(read_set(folder, stated))
         else:
             figure = figures.of(folder)
             head = figure.head
-            phases = replace(phases_of(folder.name, figure.checked, head.optics), artefact=figure.artefact)
-            notes += [f"{folder.name}: {head.files[f.frame]} omitted: {f.reason}" for f in figure.checked.flags]
+            phases = replace(
+                phases_of(folder.name, figure.checked, head.optics), artefact=figure.artefact
+            )
+            notes += [
+                f"{folder.name}: {head.files[f.frame]} omitted: {f.reason}"
+                for f in figure.checked.flags
+            ]
             if head.artefact is None and (seen := edges_of(figure)) is not None:
                 edges.append(seen)
         bench = head.optics.model_copy(update={"geometry": head.before_move})
@@ -218,10 +260,13 @@ def read_sets(folders: Sequence[Path], geometry: Path | None, reference_um: floa
     apart = ""
     if reference_um is None and len(named) > 1:
         apart = (
-            f"the sets state reference_displacement_um from {named[0]:.0f} to {named[-1]:.0f} µm; the first set's is "
+            f"the sets state reference_displacement_um from {named[0]:.0f} to "
+            f"{named[-1]:.0f} µm; the first set's is "
             "used: if the geometry was measured anew for each set, they are not of one bench"
         )
-    reference_um = _reference_um([sets[k] for k in films], [benches[k] for k in films], reference_um)
+    reference_um = _reference_um(
+        [sets[k] for k in films], [benches[k] for k in films], reference_um
+    )
     if not any(math.isfinite(sets[k].displacement_um) for k in films):
         # no laser: the world's origin is the vertex of the first set
         sets[films[0]] = replace(sets[films[0]], displacement_um=reference_um)
@@ -239,7 +284,10 @@ def phases_of_screen(capture: CaptureSet) -> residuals.SetPhases:
         view = evidence.look(stack, binned, set(stack.unusable))
         phase_rad = absolute_phases(stack, binned, view, pattern)
         index = np.flatnonzero(np.isfinite(phase_rad).all(axis=0))
-        grid, screen_mm = BinGrid(geometry, head.optics.camera, binned.bin_px), phase.screen_mm(phase_rad, pattern)
+        grid, screen_mm = (
+            BinGrid(geometry, head.optics.camera, binned.bin_px),
+            phase.screen_mm(phase_rad, pattern),
+        )
         place = grid.column_px[index], grid.row_px[index], screen_mm.reshape(2, -1)[:, index]
         screen = lens.screen_seen(geometry, *place)
     except (ValueError, evidence.NoFigureError) as error:
@@ -247,21 +295,29 @@ def phases_of_screen(capture: CaptureSet) -> residuals.SetPhases:
     noise = pixel_sigma_adu(head.optics.camera.noise_adu) / binned.bin_px
     shares = [phase.phase_sigma_rad(stack.shifts_rad(used), noise, 1.0) for used in view.used]
     swing = view.swing_adu.reshape(2, -1)[:, index]
-    sigma_mm = phase.mm_per_rad(pattern) * np.hypot(*(np.array(shares)[:, None] / swing)) / math.sqrt(2)
+    sigma_mm = (
+        phase.mm_per_rad(pattern) * np.hypot(*(np.array(shares)[:, None] / swing)) / math.sqrt(2)
+    )
     name, where = head.folder.name, (residuals.ANYWHERE,)
     known: dict[str, Any] = {"artefact": screen, "elsewhere": where, "period_mm": pattern.period_mm}
     return residuals.SetPhases(name, *place, sigma_mm, math.nan, **known)
 
 
 def join(
-    sets: list[residuals.SetPhases], folder: Path, phases: residuals.SetPhases, moved: file.ScreenMovedTable
+    sets: list[residuals.SetPhases],
+    folder: Path,
+    phases: residuals.SetPhases,
+    moved: file.ScreenMovedTable,
 ) -> None:
-    """Add what was seen with the screen elsewhere to the set of the same film. Raises InputError if there is none."""
+    """Add what was seen with the screen elsewhere to the set of the same film. Raises InputError if
+    there is none.
+    """
     films = [k for k, each in enumerate(sets) if each.artefact is None and phases.artefact is None]
     apart_um = [abs(phases.displacement_um - sets[k].displacement_um) for k in films]
     if not any(apart <= _SAME_FILM_UM for apart in apart_um):
         raise errors.InputError(
-            f"{folder / 'capture.toml'}: screen_moved: needs a set of the film with the screen in its place, "
+            f"{folder / 'capture.toml'}: screen_moved: needs a set of the film with the "
+            "screen in its place, "
             f"the laser's readings within {_SAME_FILM_UM:.0f} µm"
         )
     k = films[int(np.nanargmin(apart_um))]
@@ -278,7 +334,9 @@ def join(
 
 
 def with_priors(bundle: Bundle, priors: Sequence[spread_file.Prior]) -> Bundle:
-    """The sets with the bench as found by auxiliary calibrations. Raises InputError for a different camera."""
+    """The sets with the bench as found by auxiliary calibrations. Raises InputError for a different
+    camera.
+    """
     optics = bundle.optics
     for prior in priors:
         optics = prior.over(optics)
@@ -288,7 +346,8 @@ def with_priors(bundle: Bundle, priors: Sequence[spread_file.Prior]) -> Bundle:
 def _reference_um(
     sets: Sequence[residuals.SetPhases], benches: Sequence[OpticsConfig], known_um: float | None
 ) -> float:
-    """Reading at which the vertex is the world's origin: as all sets state, else as given, else the first one.
+    """Reading at which the vertex is the world's origin: as all sets state, else as given, else the
+    first one.
 
     A set that states none uses its own first reading: then the sets differ.
     """
@@ -297,11 +356,17 @@ def _reference_um(
         return reference_um
     if known_um is not None:
         return known_um
-    return next((phases.displacement_um for phases in sets if math.isfinite(phases.displacement_um)), 0.0)
+    return next(
+        (phases.displacement_um for phases in sets if math.isfinite(phases.displacement_um)), 0.0
+    )
 
 
-def _same_rig(first: Path, optics: OpticsConfig, folder: Path, other: OpticsConfig, films: bool) -> None:
-    """Raises InputError for a set of another bench; an artefact has another size than the mirror."""
+def _same_rig(
+    first: Path, optics: OpticsConfig, folder: Path, other: OpticsConfig, films: bool
+) -> None:
+    """Raises InputError for a set of another bench; an artefact has
+    another size than the mirror.
+    """
     for section in ("camera", "pattern", "geometry", *(("mirror",) if films else ())):
         ours, theirs = getattr(optics, section), getattr(other, section)
         for field in type(ours).model_fields:
@@ -315,18 +380,27 @@ def _same_rig(first: Path, optics: OpticsConfig, folder: Path, other: OpticsConf
 
 
 def known_sigmas(optics: OpticsConfig, free: Mapping[str, float]) -> dict[str, float]:
-    """How well poses, lens, screen and laser are known: as freed, else as stated, else by rulers and data sheets.
+    """How well poses, lens, screen and laser are known: as freed, else as stated, else by rulers
+    and data sheets.
 
-    Nothing is exact: a stated 0 counts as unstated. A focal length that is held and off by 0.1 % puts the sag off by
-    34 µm, which the residuals hardly show.
+    Nothing is exact: a stated 0 counts as unstated. A focal length that is held and off by 0.1 %
+    puts the sag off by 34 µm, which the residuals hardly show.
     """
     stated = optics.geometry
-    given = {"a_mm": stated.a_sigma_mm, "b_mm": stated.b_sigma_mm, "alpha_deg": stated.alpha_sigma_deg}
+    given = {
+        "a_mm": stated.a_sigma_mm,
+        "b_mm": stated.b_sigma_mm,
+        "alpha_deg": stated.alpha_sigma_deg,
+    }
     if stated.sigmas is not None:
         given[LASER.name] = stated.sigmas.laser_relative
     unstated = optics.model_copy(update={"geometry": stated.model_copy(update={"sigmas": None})})
-    usual = spread_file.sigmas_of(unstated) | {name: usual_sigma(name) for name in (*given, LASER.name)}
-    return usual | {name: s for name, s in {**spread_file.sigmas_of(optics), **given, **free}.items() if s}
+    usual = spread_file.sigmas_of(unstated) | {
+        name: usual_sigma(name) for name in (*given, LASER.name)
+    }
+    return usual | {
+        name: s for name, s in {**spread_file.sigmas_of(optics), **given, **free}.items() if s
+    }
 
 
 def problem_of(bundle: Bundle, free: dict[str, float], options: CalibrateOptions) -> Problem:
@@ -336,7 +410,9 @@ def problem_of(bundle: Bundle, free: dict[str, float], options: CalibrateOptions
         geometry = Geometry.from_config(bundle.optics)
     except ValueError as error:
         raise errors.InputError(str(error)) from None
-    references = separable.References(bundle.reference_um, options.laser_sigma_um, film=options.film)
+    references = separable.References(
+        bundle.reference_um, options.laser_sigma_um, film=options.film
+    )
     radius_mm = bundle.optics.mirror.radius_mm
     if sum(math.isfinite(p.displacement_um) for p in bundle.sets if p.artefact is None) < 2:
         known[LASER.name] = 0.0  # no readings to scale

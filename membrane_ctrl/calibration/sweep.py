@@ -1,4 +1,6 @@
-"""A running hold controlled by a calibration: observe, move, settle, take a set. The supervisor stays in charge."""
+"""A running hold controlled by a calibration: observe, move, settle, take a set. The supervisor
+stays in charge.
+"""
 
 import contextlib
 import math
@@ -47,19 +49,25 @@ class Sweep:
     `progress` gets the elapsed seconds of the hold, and may raise KeyboardInterrupt.
     """
 
-    def __init__(self, link: CaptureLink, limits: LimitsConfig, progress: Callable[[float], None]) -> None:
+    def __init__(
+        self, link: CaptureLink, limits: LimitsConfig, progress: Callable[[float], None]
+    ) -> None:
         self._link, self._limits, self._progress = link, limits, progress
         self._last_s = math.nan
         self._why = ""
 
     def look(self) -> HeldMirror:
-        """Observe the held mirror for some seconds and a shape. Raises HoldError, or DeviceError without a camera."""
+        """Observe the held mirror for some seconds and a shape. Raises HoldError, or DeviceError
+        without a camera.
+        """
         rows: deque[telemetry.TelemetryRow] = deque()
         shape = None
         while shape is None or rows[-1].mono_s - rows[0].mono_s < _LOOK_S:
             news = self._news()
             rows.extend(news.rows)
-            shape = next((each for each in reversed(news.shapes) if each.verdict != "rejected"), shape)
+            shape = next(
+                (each for each in reversed(news.shapes) if each.verdict != "rejected"), shape
+            )
             if shape is None and rows and rows[-1].mono_s - rows[0].mono_s > _SHAPE_WITHIN_S:
                 raise errors.DeviceError(
                     f"{self._link.name}: no shape within {_SHAPE_WITHIN_S:.0f} s; "
@@ -84,7 +92,8 @@ class Sweep:
     def go(self, setpoint_um: float, expected_s: float) -> None:
         """Ramp to a setpoint and settle.
 
-        Raises HoldError if the mirror is no longer held or someone else moves it; DeviceError if it does not arrive.
+        Raises HoldError if the mirror is no longer held or someone else moves it; DeviceError if it
+        does not arrive.
         """
         self._ask("setpoint", setpoint_um)
         patience_s = _LATE[0] * expected_s + _LATE[1]
@@ -105,18 +114,22 @@ class Sweep:
                 return
             if self._last_s - begin_s > patience_s:
                 raise errors.DeviceError(
-                    f"the mirror does not settle at {setpoint_um:g} µm in {patience_s:.0f} s; paused, or too tight?"
+                    f"the mirror does not settle at {setpoint_um:g} µm in {patience_s:.0f} "
+                    "s; paused, or too tight?"
                 )
 
     def take(self) -> run_events.Capture:
         """Request a set; repeat a bad one once.
 
-        Raises HoldError if the hold refuses or the mirror is no longer held; RejectedError if both are bad.
+        Raises HoldError if the hold refuses or the mirror is no longer held; RejectedError if both
+        are bad.
         """
         first = self._capture()
         event = first if first.set else self._capture()
         if not event.set:
-            raise errors.RejectedError(f"no good set in two attempts: {first.failed}; {event.failed}")
+            raise errors.RejectedError(
+                f"no good set in two attempts: {first.failed}; {event.failed}"
+            )
         return event
 
     def shape_loop(self, on: bool) -> None:
@@ -149,7 +162,8 @@ class Sweep:
             if row.state != telemetry.State.HOLD:
                 name = telemetry.State(int(row.state)).name.lower()
                 raise HoldError(
-                    f"the mirror is not held, but in state {name}{self._why}; start or resume the hold first"
+                    f"the mirror is not held, but in state {name}{self._why}; start or "
+                    "resume the hold first"
                 )
         if news.rows:
             passed_s = news.rows[-1].mono_s - self._last_s
@@ -181,16 +195,21 @@ class Procedure:
         return [step_s(self.held, a, b, self.link.config) for a, b in pairwise(stops)]
 
     def check(self, head: CalibrationHead) -> None:
-        """Raises InputError if the setpoints are out of reach, or the mirror cannot be moved both ways."""
+        """Raises InputError if the setpoints are out of reach, or the mirror cannot be moved both
+        ways.
+        """
         held, config = self.held, self.link.config
         low_um, high_um = min(head.setpoints_um), max(head.setpoints_um)
         reach = reach_of(held, config)
         if low_um < reach.low_um or high_um > reach.high_um:
             raise errors.InputError(
-                f"the sets from {low_um:g} to {high_um:g} µm are beyond {reach.low_um:.0f} to {reach.high_um:.0f}, "
+                f"the sets from {low_um:g} to {high_um:g} µm are beyond {reach.low_um:.0f} "
+                f"to {reach.high_um:.0f}, "
                 f"which {reach.low_why} and {reach.high_why} allow"
             )
-        if way_s(held, low_um, high_um, config) + way_s(held, high_um, low_um, config) == float("inf"):
+        if way_s(held, low_um, high_um, config) + way_s(held, high_um, low_um, config) == float(
+            "inf"
+        ):
             raise errors.InputError(
                 f"the mirror loses {held.leak_um_per_s:.2f} µm/s: it cannot be moved both ways; "
                 "open the bleed (loop.bleed_fraction), or give the pump more reserve"
@@ -199,8 +218,8 @@ class Procedure:
     def take(self, session: CalibrationSession) -> None:
         """Take the missing sets and move the mirror back.
 
-        Raises HoldError if the mirror is no longer held or someone else moves it (it is then left alone);
-        DeviceError, RejectedError or KeyboardInterrupt after the mirror has moved back.
+        Raises HoldError if the mirror is no longer held or someone else moves it (it is then left
+        alone); DeviceError, RejectedError or KeyboardInterrupt after the mirror has moved back.
         """
         with self.progress.catching(), self._coming_back(session):
             self.sweep.shape_loop(False)
@@ -208,14 +227,18 @@ class Procedure:
             for number, index in enumerate(session.missing):
                 self._take(session, index, times_s[number], sum(times_s[number + 1 :]))
 
-    def _take(self, session: CalibrationSession, index: int, expected_s: float, after_s: float) -> None:
+    def _take(
+        self, session: CalibrationSession, index: int, expected_s: float, after_s: float
+    ) -> None:
         setpoint_um = session.head.setpoints_um[index]
         what = f"set {index + 1} of {len(session.sets)} at {setpoint_um:+g} µm"
         self.progress.begin(what, expected_s, after_s)
         self.sweep.go(setpoint_um, expected_s)
         event = self.sweep.take()
         session.keep(index, self.link.run_dir / str(event.set))
-        self.progress.say(f"{what}: {event.verdict}" + (f" ({event.reason})" if event.reason else ""))
+        self.progress.say(
+            f"{what}: {event.verdict}" + (f" ({event.reason})" if event.reason else "")
+        )
 
     @contextlib.contextmanager
     def _coming_back(self, session: CalibrationSession) -> Iterator[None]:
@@ -224,11 +247,17 @@ class Procedure:
             yield
         except HoldError:
             off = "; the shape loop is off (ctl shape on)" if session.head.shape_on else ""
-            say(f"the mirror is left to whoever has command{off}; continue with --session {session.path}")
+            say(
+                f"the mirror is left to whoever has command{off}; continue with --session "
+                f"{session.path}"
+            )
             raise
         except BaseException:
             self.progress.interrupted = False
-            say(f"stopped with {len(session.missing)} sets missing; continue with --session {session.path}")
+            say(
+                f"stopped with {len(session.missing)} sets missing; continue with --session "
+                f"{session.path}"
+            )
             with contextlib.suppress(HoldError, errors.DeviceError):
                 self._come_back(session)
             raise

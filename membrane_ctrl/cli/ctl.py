@@ -1,4 +1,6 @@
-"""The commands of `ctl`: one for each command of a running hold, with its own arguments and the common options."""
+"""The commands of `ctl`: one for each command of a running hold, with its own arguments and the
+common options.
+"""
 
 import inspect
 from collections.abc import Callable
@@ -13,13 +15,21 @@ from membrane_ctrl.model import clock
 from membrane_ctrl.model.numbers import parse_number
 
 WhyOption = Annotated[str, typer.Option(help="Reason, recorded with the command.")]
-TakeOverOption = Annotated[bool, typer.Option("--take-over", help="Take command from whoever has it.")]
+TakeOverOption = Annotated[
+    bool, typer.Option("--take-over", help="Take command from whoever has it.")
+]
 RunOption = Annotated[Path | None, typer.Option(help="The run's folder.")]
-SocketOption = Annotated[Path | None, typer.Option(help="The hold's socket; logs/control.sock by default.")]
-TlsOption = Annotated[str, typer.Option(metavar="HOST:PORT", help="Connect over TLS, with the certificate below.")]
+SocketOption = Annotated[
+    Path | None, typer.Option(help="The hold's socket; logs/control.sock by default.")
+]
+TlsOption = Annotated[
+    str, typer.Option(metavar="HOST:PORT", help="Connect over TLS, with the certificate below.")
+]
 CertificateOption = Annotated[Path | None, typer.Option(help="With --tls: your certificate.")]
 KeyOption = Annotated[Path | None, typer.Option(help="With --tls: its key.")]
-AuthorityOption = Annotated[Path | None, typer.Option(help="With --tls: the CA of the hold's certificate.")]
+AuthorityOption = Annotated[
+    Path | None, typer.Option(help="With --tls: the CA of the hold's certificate.")
+]
 
 
 def _number(text: str) -> float:
@@ -29,19 +39,32 @@ def _number(text: str) -> float:
         raise typer.BadParameter(str(error)) from None
 
 
-SetpointArgument = Annotated[float, typer.Argument(metavar="UM", help="Setpoint, µm.", parser=_number)]
-FlowArgument = Annotated[float, typer.Argument(metavar="FLOW", help="Flow, µm/s of the centre.", parser=_number)]
+SetpointArgument = Annotated[
+    float, typer.Argument(metavar="UM", help="Setpoint, µm.", parser=_number)
+]
+FlowArgument = Annotated[
+    float, typer.Argument(metavar="FLOW", help="Flow, µm/s of the centre.", parser=_number)
+]
 OnArgument = Annotated[bool, typer.Argument(metavar="on|off")]
 TextArgument = Annotated[str, typer.Argument(metavar="TEXT", help="The remark.")]
 ReasonArgument = Annotated[str, typer.Argument(metavar="TEXT", help="Why the mirror is locked.")]
 WordArgument = Annotated[
-    str, typer.Argument(metavar="WORD", help="The lock's word, as displayed; without it, your own lock.")
+    str,
+    typer.Argument(
+        metavar="WORD", help="The lock's word, as displayed; without it, your own lock."
+    ),
 ]
 GainsArgument = Annotated[
-    str, typer.Argument(metavar="FILE", help="TOML or JSON file with loop keys, or just the keys: 'kp_per_s = 0.5'.")
+    str,
+    typer.Argument(
+        metavar="FILE", help="TOML or JSON file with loop keys, or just the keys: 'kp_per_s = 0.5'."
+    ),
 ]
 TrialOption = Annotated[
-    str, typer.Option(help="Trial time, e.g. 2m; the old gains return afterwards unless kept by `ctl keep`.")
+    str,
+    typer.Option(
+        help="Trial time, e.g. 2m; the old gains return afterwards unless kept by `ctl keep`."
+    ),
 ]
 EveryOption = Annotated[str, typer.Option(help="Interval between lines, e.g. 0.5s.")]
 
@@ -57,7 +80,12 @@ class ActionFirst(TyperGroup):
         """Move the action to the front; an option's value does not count as one."""
         words = zip(["", *args], args, strict=False)
         at = next(
-            (n for n, (last, word) in enumerate(words) if word in self.commands and not _has_value_next(last)), 0
+            (
+                n
+                for n, (last, word) in enumerate(words)
+                if word in self.commands and not _has_value_next(last)
+            ),
+            0,
         )
         return super().parse_args(ctx, [*args[at : at + 1], *args[:at], *args[at + 1 :]])
 
@@ -81,14 +109,22 @@ def _common(
     authority: AuthorityOption = None,
     json: JsonOption = False,
 ) -> tuple[dict[str, Any], Any, bool]:
-    """Return the common request fields, the target hold, and whether to print the answer as JSON."""
+    """Return the common request fields, the target hold,
+    and whether to print the answer as JSON.
+    """
     from membrane_ctrl.control_port.ctl import Where
 
-    return {"why": why, "take_over": take_over}, Where(socket, run, tls, certificate, key, authority), json
+    return (
+        {"why": why, "take_over": take_over},
+        Where(socket, run, tls, certificate, key, authority),
+        json,
+    )
 
 
 def _add(action: str, does: str, own: Callable[..., dict[str, Any]]) -> None:
-    """Add a command with the common options and the parameters of `own`, which makes its part of the request."""
+    """Add a command with the common options and the parameters of `own`, which makes its part of
+    the request.
+    """
     parameters = inspect.signature(own).parameters
 
     def command(**given: Any) -> int:
@@ -158,7 +194,9 @@ _OWN: dict[str, Callable[..., dict[str, Any]]] = {
 
 
 def _fleet(
-    file: Annotated[Path, typer.Argument(metavar="FILE", help="TOML file with a table [[holds]] for each.")],
+    file: Annotated[
+        Path, typer.Argument(metavar="FILE", help="TOML file with a table [[holds]] for each.")
+    ],
     json: JsonOption = False,
 ) -> int:
     """Show the status of several holds, a line each."""
@@ -177,7 +215,9 @@ def add_actions() -> None:
     ctl_app.command("fleet")(_fleet)
     _add("watch", "Print a status line repeatedly until the run ends.", _watch)
     for kind, rule in TABLE.items():
-        if kind in _OWN or not (rule.needs or kind.startswith("shape_")):  # `tune` is a separate command
+        if kind in _OWN or not (
+            rule.needs or kind.startswith("shape_")
+        ):  # `tune` is a separate command
             _add(kind, rule.does, _OWN.get(kind, _plain))
     for name, kind in SAME_AS.items():
         _add(name, TABLE[kind].does, _OWN.get(kind, _plain))

@@ -1,4 +1,6 @@
-"""The commands that write a configuration, look at its devices, hold a mirror with them, or talk to a hold."""
+"""The commands that write a configuration, look at its devices, hold a mirror with them, or talk to
+a hold.
+"""
 
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -18,15 +20,22 @@ from json import dumps
 twin_app = typer.Typer(invoke_without_command=True, rich_markup_mode="markdown")
 devices_app = typer.Typer(invoke_without_command=True, rich_markup_mode="markdown")
 locks_app = typer.Typer(invoke_without_command=True, rich_markup_mode="markdown")
-alarm_app = typer.Typer(no_args_is_help=True, rich_markup_mode="markdown", help="Test the alarm messages.")
+alarm_app = typer.Typer(
+    no_args_is_help=True, rich_markup_mode="markdown", help="Test the alarm messages."
+)
 
 FlatOption = Annotated[
-    bool, typer.Option("--from-flat", help="Start with a flat simulated mirror; filling it takes two hours.")
+    bool,
+    typer.Option(
+        "--from-flat", help="Start with a flat simulated mirror; filling it takes two hours."
+    ),
 ]
 
 
 def add_commands(app: typer.Typer) -> None:
-    """Add `hold`, `twin`, `safe`, `check`, `devices`, `conformance`, `ctl`, `alarm`, `locks`, `config`."""
+    """Add `hold`, `twin`, `safe`, `check`, `devices`, `conformance`, `ctl`, `alarm`, `locks`,
+    `config`.
+    """
     for command in (hold, safe, check, conformance):
         app.command()(command)
     app.add_typer(devices_app, name="devices")
@@ -39,24 +48,39 @@ def add_commands(app: typer.Typer) -> None:
 
 def hold(
     config: ConfigOption = None,
-    twin: Annotated[bool, typer.Option("--twin", help="Hold the simulated bench instead of devices.")] = False,
+    twin: Annotated[
+        bool, typer.Option("--twin", help="Hold the simulated bench instead of devices.")
+    ] = False,
     devices: Annotated[
         Path | None,
-        typer.Option(help="With --twin: emulate the [devices] of this configuration, each with its own protocol."),
+        typer.Option(
+            help="With --twin: emulate the [devices] of this configuration, each with its own "
+            "protocol."
+        ),
     ] = None,
-    duration: Annotated[str | None, typer.Option(help="Stop after this long, e.g. 90s, 3m, 2h30m.")] = None,
+    duration: Annotated[
+        str | None, typer.Option(help="Stop after this long, e.g. 90s, 3m, 2h30m.")
+    ] = None,
     name: Annotated[str, typer.Option(help="Name of the run folder.")] = "hold",
-    logs: Annotated[Path | None, typer.Option(help="Folder of the runs; recording.logs_dir by default.")] = None,
+    logs: Annotated[
+        Path | None, typer.Option(help="Folder of the runs; recording.logs_dir by default.")
+    ] = None,
     clear_faults: Annotated[
         bool,
         typer.Option(
-            "--clear-faults", help="Clear faults latched by the board or an earlier run. Find their cause first."
+            "--clear-faults",
+            help="Clear faults latched by the board or an earlier run. Find their cause first.",
         ),
     ] = False,
-    standby: Annotated[bool, typer.Option("--standby", help="Start in standby and wait for `ctl hold`.")] = False,
+    standby: Annotated[
+        bool, typer.Option("--standby", help="Start in standby and wait for `ctl hold`.")
+    ] = False,
     from_flat: FlatOption = False,
     autotune: Annotated[
-        bool, typer.Option("--autotune", help="Tune the loop on trial once the mirror is held; ten minutes.")
+        bool,
+        typer.Option(
+            "--autotune", help="Tune the loop on trial once the mirror is held; ten minutes."
+        ),
     ] = False,
     json: JsonOption = False,
 ) -> int:
@@ -87,10 +111,14 @@ def hold(
 def twin(
     context: typer.Context,
     config: ConfigOption = None,
-    speed: Annotated[float, typer.Option(min=0.01, max=1000.0, help="Simulated seconds per second.")] = 1.0,
+    speed: Annotated[
+        float, typer.Option(min=0.01, max=1000.0, help="Simulated seconds per second.")
+    ] = 1.0,
     from_flat: FlatOption = False,
 ) -> int:
-    """Serve the simulated bench over Modbus TCP, for any client, until interrupted; or `play` a scenario on it."""
+    """Serve the simulated bench over Modbus TCP, for any client, until interrupted; or `play` a
+    scenario on it.
+    """
     if context.invoked_subcommand is not None:
         return errors.Exit.DONE
     from membrane_ctrl.sim.bench import serve_twin
@@ -101,10 +129,15 @@ def twin(
 @twin_app.command()
 def play(
     scenario: Annotated[
-        str | None, typer.Argument(metavar="SCENARIO", help="Name or file; without it, the names are listed.")
+        str | None,
+        typer.Argument(metavar="SCENARIO", help="Name or file; without it, the names are listed."),
     ] = None,
-    real_time: Annotated[bool, typer.Option("--real-time", help="Play in real time, with the console.")] = False,
-    name: Annotated[str | None, typer.Option(help="Name of the run folder; that of the scenario by default.")] = None,
+    real_time: Annotated[
+        bool, typer.Option("--real-time", help="Play in real time, with the console.")
+    ] = False,
+    name: Annotated[
+        str | None, typer.Option(help="Name of the run folder; that of the scenario by default.")
+    ] = None,
     logs: Annotated[Path, typer.Option(help="Folder of the runs.")] = Path("logs"),
 ) -> int:
     """Play a scenario with its faults on the simulated bench, and record it as a run."""
@@ -120,9 +153,15 @@ def play(
 
 def safe(
     config: ConfigArgument,
-    logs: Annotated[Path | None, typer.Option(help="Folder of the runs; recording.logs_dir by default.")] = None,
+    logs: Annotated[
+        Path | None, typer.Option(help="Folder of the runs; recording.logs_dir by default.")
+    ] = None,
     latch: Annotated[
-        bool, typer.Option(help="Lock the devices until a person unlocks them; --no-latch spares a running program.")
+        bool,
+        typer.Option(
+            help="Lock the devices until a person unlocks them; --no-latch spares a running "
+            "program."
+        ),
     ] = True,
 ) -> int:
     """Stop a configuration's pump, whichever program controls it; leave the vent as it is."""
@@ -143,7 +182,9 @@ def check(config: ConfigArgument, json: JsonOption = False) -> int:
 
 @devices_app.callback()
 def devices(context: typer.Context, json: JsonOption = False) -> int:
-    """List serial ports, cameras, displays and installed drivers, with the text to paste into a configuration."""
+    """List serial ports, cameras, displays and installed drivers, with the text to paste into a
+    configuration.
+    """
     if context.invoked_subcommand is not None:
         return errors.Exit.DONE
     from membrane_ctrl.commissioning.devices import list_devices
@@ -153,11 +194,16 @@ def devices(context: typer.Context, json: JsonOption = False) -> int:
 
 @devices_app.command()
 def new(
-    name: Annotated[str, typer.Argument(help="Name of the driver, such as acme_gauge: small letters, digits, _.")],
+    name: Annotated[
+        str,
+        typer.Argument(help="Name of the driver, such as acme_gauge: small letters, digits, _."),
+    ],
     role: Annotated[str, typer.Option(help="Role that the instrument fills.")] = "gauge_pressure",
     to: Annotated[Path, typer.Option(help="Folder in which NAME-driver is made.")] = Path(),
 ) -> int:
-    """Write a driver for an instrument of your own, with its emulator and tests, as a package to install."""
+    """Write a driver for an instrument of your own, with its emulator and tests, as a package to
+    install.
+    """
     from membrane_ctrl.commissioning.new_driver import write_package
 
     return write_package(name, role, to)
@@ -165,12 +211,17 @@ def new(
 
 def conformance(
     url: Annotated[
-        str, typer.Argument(metavar="URL", help="Pump board: tcp://HOST:PORT or rtu:///dev/ttyUSB0?baud=115200.")
+        str,
+        typer.Argument(
+            metavar="URL", help="Pump board: tcp://HOST:PORT or rtu:///dev/ttyUSB0?baud=115200."
+        ),
     ],
     unit_id: Annotated[int, typer.Option(min=1, max=247, help="Modbus unit identifier.")] = 1,
     json: JsonOption = False,
 ) -> int:
-    """Test a pump board against its specification. The pump runs at a few per cent: vent the mirror first."""
+    """Test a pump board against its specification. The pump runs at a few per cent: vent the mirror
+    first.
+    """
     from membrane_ctrl.commissioning.check import run_conformance
 
     return run_conformance(url, unit_id, json)
@@ -189,10 +240,15 @@ def locks(context: typer.Context, json: JsonOption = False) -> int:
 @locks_app.command()
 def remove(
     word: Annotated[
-        str, typer.Argument(metavar="WORD", help="The lock's word, as displayed; without it, your own lock.")
+        str,
+        typer.Argument(
+            metavar="WORD", help="The lock's word, as displayed; without it, your own lock."
+        ),
     ] = "",
 ) -> int:
-    """Remove your lock, or another person's by typing its word. While a hold runs, use `ctl unlock`."""
+    """Remove your lock, or another person's by typing its word. While a hold runs, use `ctl
+    unlock`.
+    """
     from membrane_ctrl.commissioning.locks import remove_lock
 
     return remove_lock(word)
@@ -201,7 +257,9 @@ def remove(
 @alarm_app.command("test")
 def alarm_test(
     config: ConfigOption = None,
-    escalated: Annotated[bool, typer.Option("--escalated", help="Include the escalation addresses.")] = False,
+    escalated: Annotated[
+        bool, typer.Option("--escalated", help="Include the escalation addresses.")
+    ] = False,
     json: JsonOption = False,
 ) -> int:
     """Send a test message to every address of the alarms."""
@@ -211,7 +269,9 @@ def alarm_test(
 
 
 def _with_devices(config: Path | None, devices: Path | None, twin: bool) -> "Config":
-    """Return the configuration with the [devices] of the `--devices` file, which can also be used alone."""
+    """Return the configuration with the [devices] of the `--devices` file, which can also be used
+    alone.
+    """
     if devices is None:
         return configured(config)
     lab = configured(devices)
@@ -229,7 +289,9 @@ def _started(config: "Config", from_flat: bool) -> "Config":
 
 
 config_app = typer.Typer(
-    no_args_is_help=True, rich_markup_mode="markdown", help="Explain the keys of a configuration; write a first one."
+    no_args_is_help=True,
+    rich_markup_mode="markdown",
+    help="Explain the keys of a configuration; write a first one.",
 )
 _WIDTH = 100
 
@@ -238,16 +300,25 @@ _WIDTH = 100
 def explain(
     key: Annotated[
         str,
-        typer.Argument(metavar="KEY", help="Key, table or driver: loop.kp_per_s, kp_per_s, devices.pump, ventus."),
+        typer.Argument(
+            metavar="KEY",
+            help="Key, table or driver: loop.kp_per_s, kp_per_s, devices.pump, ventus.",
+        ),
     ],
     json: JsonOption = False,
 ) -> int:
-    """Explain a key, or all keys of a table or driver: meaning, unit, range, default, when to change it."""
+    """Explain a key, or all keys of a table or driver: meaning, unit, range, default, when to
+    change it.
+    """
     from membrane_ctrl.config.reference import explained
 
     found = explained(key)
     if json:
-        print(dumps({"schema": "membrane-config-keys/1", "tables": [asdict(table) for table in found]}))
+        print(
+            dumps(
+                {"schema": "membrane-config-keys/1", "tables": [asdict(table) for table in found]}
+            )
+        )
         return 0
     for table in found:
         print(textwrap.fill(f"{table.title}: {table.meaning}", _WIDTH))
@@ -278,9 +349,9 @@ def schema() -> int:
 
 @config_app.command()
 def init(
-    file: Annotated[Path, typer.Argument(metavar="FILE", help="File to write; an existing one is kept.")] = Path(
-        "membrane-ctrl.toml"
-    ),
+    file: Annotated[
+        Path, typer.Argument(metavar="FILE", help="File to write; an existing one is kept.")
+    ] = Path("membrane-ctrl.toml"),
     twin: Annotated[
         bool, typer.Option("--twin", help="Ask nothing: a configuration for `membrane-ctrl twin`.")
     ] = False,

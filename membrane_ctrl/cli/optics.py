@@ -5,30 +5,46 @@ from typing import Annotated
 
 import typer
 
-from membrane_ctrl.cli.options import ConfigOption, JsonOption, SeedOption, SetArgument, TrialsOption, configured
+from membrane_ctrl.cli.options import (
+    ConfigOption,
+    JsonOption,
+    SeedOption,
+    SetArgument,
+    TrialsOption,
+    configured,
+)
 
 StatedOption = Annotated[
-    Path | None, typer.Option(help="Geometry to state in the set; the true one is the configuration's.")
+    Path | None,
+    typer.Option(help="Geometry to state in the set; the true one is the configuration's."),
 ]
 FaultOption = Annotated[
     list[str] | None,
-    typer.Option(help="Fault to add, kind:frame or kind:frame:amount, e.g. stale:x_sin_2; repeatable."),
+    typer.Option(
+        help="Fault to add, kind:frame or kind:frame:amount, e.g. stale:x_sin_2; repeatable."
+    ),
 ]
 CoarserOption = Annotated[
-    list[float] | None, typer.Option(help="Also fringes of this longer period, instead of Gray codes; repeatable.")
+    list[float] | None,
+    typer.Option(help="Also fringes of this longer period, instead of Gray codes; repeatable."),
 ]
 ArtefactOption = Annotated[
     str,
     typer.Option(
         metavar="FORM",
-        help="Show flat:RADIUS or sphere:CURVATURE_RADIUS:RADIUS in its place, or screen:DISTANCE itself, mm.",
+        help="Show flat:RADIUS or sphere:CURVATURE_RADIUS:RADIUS in its place, or screen:DISTANCE "
+        "itself, mm.",
     ),
 ]
-ScreenMovedOption = Annotated[float, typer.Option(help="Put the screen this much nearer to the mirror, mm.")]
+ScreenMovedOption = Annotated[
+    float, typer.Option(help="Put the screen this much nearer to the mirror, mm.")
+]
 
 
 def add_commands(app: typer.Typer) -> None:
-    """Add `measure`, `track`, `modes`, `export-figure`, `film`, `uncertainty`, `stability`, `simulate`."""
+    """Add `measure`, `track`, `modes`, `export-figure`, `film`, `uncertainty`, `stability`,
+    `simulate`.
+    """
     app.command()(measure)
     app.command()(track)
     app.command()(modes)
@@ -41,14 +57,21 @@ def add_commands(app: typer.Typer) -> None:
 
 def measure(
     capture_set: SetArgument,
-    geometry: Annotated[Path | None, typer.Option(help="Geometry to use instead of the set's own.")] = None,
+    geometry: Annotated[
+        Path | None, typer.Option(help="Geometry to use instead of the set's own.")
+    ] = None,
     out: Annotated[Path | None, typer.Option(help="Output folder; SET/result by default.")] = None,
     pictures: Annotated[bool, typer.Option(help="Draw pictures next to the result.")] = True,
-    rerun: Annotated[bool, typer.Option("--rerun", help="Write measurement.rrd next to the result.")] = False,
+    rerun: Annotated[
+        bool, typer.Option("--rerun", help="Write measurement.rrd next to the result.")
+    ] = False,
     nominal_radius_mm: Annotated[
-        float | None, typer.Option(help="Nominal radius of curvature, for the deviation of the power.")
+        float | None,
+        typer.Option(help="Nominal radius of curvature, for the deviation of the power."),
     ] = None,
-    report: Annotated[bool, typer.Option("--report", help="Write report.html and report.pdf.")] = False,
+    report: Annotated[
+        bool, typer.Option("--report", help="Write report.html and report.pdf.")
+    ] = False,
     json: JsonOption = False,
 ) -> int:
     """Measure one capture set: height, Zernike coefficients, quality."""
@@ -61,9 +84,13 @@ def measure(
 
 def track(
     capture_set: SetArgument,
-    geometry: Annotated[Path | None, typer.Option(help="Geometry to use instead of the reference's own.")] = None,
+    geometry: Annotated[
+        Path | None, typer.Option(help="Geometry to use instead of the reference's own.")
+    ] = None,
     out: Annotated[Path | None, typer.Option(help="Output folder; SET/result by default.")] = None,
-    pictures: Annotated[bool, typer.Option(help="Draw track.png and write track.rrd next to the result.")] = True,
+    pictures: Annotated[
+        bool, typer.Option(help="Draw track.png and write track.rrd next to the result.")
+    ] = True,
     json: JsonOption = False,
 ) -> int:
     """Track the figure through the frames of one crossed pattern: a figure for every frame."""
@@ -74,13 +101,20 @@ def track(
 
 def modes(
     folders: Annotated[
-        list[Path], typer.Argument(metavar="SET...|RUN...", help="Tracked sets, or runs that tracked.")
+        list[Path],
+        typer.Argument(metavar="SET...|RUN...", help="Tracked sets, or runs that tracked."),
     ],
-    out: Annotated[Path | None, typer.Option(help="Output folder; modes, in the last one, by default.")] = None,
-    pictures: Annotated[bool, typer.Option(help="Draw modes.png and write modes.rrd next to the result.")] = True,
+    out: Annotated[
+        Path | None, typer.Option(help="Output folder; modes, in the last one, by default.")
+    ] = None,
+    pictures: Annotated[
+        bool, typer.Option(help="Draw modes.png and write modes.rrd next to the result.")
+    ] = True,
     json: JsonOption = False,
 ) -> int:
-    """Find the mirror's vibrations in tracked figures: frequency, amplitude and shape; whether one moves."""
+    """Find the mirror's vibrations in tracked figures: frequency, amplitude and shape; whether one
+    moves.
+    """
     from membrane_ctrl.review.statistics.modes_run import modes_command
 
     return modes_command(folders, out, json, pictures)
@@ -88,12 +122,21 @@ def modes(
 
 def export_figure(
     result: Annotated[Path, typer.Argument(metavar="RESULT", help="Result folder of `measure`.")],
-    form: Annotated[str, typer.Option("--format", help="zygo-dat, zygo-xyz, codev-int, h5 or fits.")],
+    form: Annotated[
+        str, typer.Option("--format", help="zygo-dat, zygo-xyz, codev-int, h5 or fits.")
+    ],
     remove: Annotated[
-        str, typer.Option(metavar="LIST", help="Take off piston, tilt, power, sphere; separated by commas.")
+        str,
+        typer.Option(
+            metavar="LIST", help="Take off piston, tilt, power, sphere; separated by commas."
+        ),
     ] = "",
-    zernike: Annotated[str, typer.Option(help="Also write the terms of this set: noll, osa or fringe.")] = "",
-    out: Annotated[Path | None, typer.Option(help="File to write; RESULT/figure.* by default.")] = None,
+    zernike: Annotated[
+        str, typer.Option(help="Also write the terms of this set: noll, osa or fringe.")
+    ] = "",
+    out: Annotated[
+        Path | None, typer.Option(help="File to write; RESULT/figure.* by default.")
+    ] = None,
 ) -> int:
     """Write a measured height map in the format of another program."""
     from membrane_ctrl.measure.export_figure import export_command
@@ -103,19 +146,38 @@ def export_figure(
 
 def film(
     folders: Annotated[
-        list[Path], typer.Argument(metavar="SET...|RUN...", help="Capture sets at different pressures, or runs.")
+        list[Path],
+        typer.Argument(
+            metavar="SET...|RUN...", help="Capture sets at different pressures, or runs."
+        ),
     ],
-    geometry: Annotated[Path | None, typer.Option(help="Geometry to use instead of the sets' own.")] = None,
-    prestrain: Annotated[float, typer.Option(help="RUN: pre-strain of the film, 1e-3 is 0.1 %.")] = 0.0,
-    poisson: Annotated[float, typer.Option(min=0.0, max=0.5, help="RUN: its Poisson ratio.")] = 0.35,
-    gauge_offset_pa: Annotated[float, typer.Option(min=0.0, help="Standard uncertainty of the gauge's zero.")] = 1.0,
-    gauge_scale: Annotated[float, typer.Option(min=0.0, help="Standard uncertainty of its scale, relative.")] = 1e-3,
-    gauge_noise_pa: Annotated[float, typer.Option(min=0.01, help="Noise of a set's mean reading, Pa.")] = 0.3,
-    out: Annotated[Path | None, typer.Option(help="Output folder; film, beside the first set, by default.")] = None,
+    geometry: Annotated[
+        Path | None, typer.Option(help="Geometry to use instead of the sets' own.")
+    ] = None,
+    prestrain: Annotated[
+        float, typer.Option(help="RUN: pre-strain of the film, 1e-3 is 0.1 %.")
+    ] = 0.0,
+    poisson: Annotated[
+        float, typer.Option(min=0.0, max=0.5, help="RUN: its Poisson ratio.")
+    ] = 0.35,
+    gauge_offset_pa: Annotated[
+        float, typer.Option(min=0.0, help="Standard uncertainty of the gauge's zero.")
+    ] = 1.0,
+    gauge_scale: Annotated[
+        float, typer.Option(min=0.0, help="Standard uncertainty of its scale, relative.")
+    ] = 1e-3,
+    gauge_noise_pa: Annotated[
+        float, typer.Option(min=0.01, help="Noise of a set's mean reading, Pa.")
+    ] = 0.3,
+    out: Annotated[
+        Path | None, typer.Option(help="Output folder; film, beside the first set, by default.")
+    ] = None,
     pictures: Annotated[bool, typer.Option(help="Draw film.png next to the result.")] = True,
     json: JsonOption = False,
 ) -> int:
-    """Determine the film's pre-strain, Poisson ratio and stiffness from sets; from runs, its creep."""
+    """Determine the film's pre-strain, Poisson ratio and stiffness from sets; from runs,
+    its creep.
+    """
     from membrane_ctrl.run_files.run_folder import is_run
 
     if all(is_run(folder) for folder in folders):
@@ -132,20 +194,28 @@ def film(
 def uncertainty(
     capture_set: SetArgument,
     against: Annotated[
-        Path | None, typer.Option(metavar="SET", help="Estimate the change since this set instead of the height.")
+        Path | None,
+        typer.Option(
+            metavar="SET", help="Estimate the change since this set instead of the height."
+        ),
     ] = None,
     trials: TrialsOption = 100,
     seed: SeedOption = 1,
     geometry: Annotated[
-        Path | None, typer.Option(help="Geometry to use instead of the set's own, with its covariance.")
+        Path | None,
+        typer.Option(help="Geometry to use instead of the set's own, with its covariance."),
     ] = None,
     workers: Annotated[
-        int | None, typer.Option(min=1, help="Worker processes; by default according to the number of trials.")
+        int | None,
+        typer.Option(min=1, help="Worker processes; by default according to the number of trials."),
     ] = None,
     scheduler: Annotated[
-        str | None, typer.Option(metavar="ADDRESS", help="Run on this Dask scheduler, e.g. tcp://host:8786.")
+        str | None,
+        typer.Option(metavar="ADDRESS", help="Run on this Dask scheduler, e.g. tcp://host:8786."),
     ] = None,
-    out: Annotated[Path | None, typer.Option(help="Output folder; SET/uncertainty by default.")] = None,
+    out: Annotated[
+        Path | None, typer.Option(help="Output folder; SET/uncertainty by default.")
+    ] = None,
     json: JsonOption = False,
 ) -> int:
     """Estimate the RMSE of the height, or of the change between two sets, by Monte Carlo."""
@@ -166,56 +236,92 @@ def uncertainty(
 
 
 def stability(
-    run_of_sets: Annotated[Path, typer.Argument(metavar="RUN_OF_SETS", help="Folder of capture sets.")],
-    out: Annotated[Path | None, typer.Option(help="Output folder; RUN_OF_SETS/stability by default.")] = None,
+    run_of_sets: Annotated[
+        Path, typer.Argument(metavar="RUN_OF_SETS", help="Folder of capture sets.")
+    ],
+    out: Annotated[
+        Path | None, typer.Option(help="Output folder; RUN_OF_SETS/stability by default.")
+    ] = None,
     point: Annotated[
-        list[str] | None, typer.Option(help="Point to follow instead of A, B and C, as NAME=X,Y in mm; repeatable.")
+        list[str] | None,
+        typer.Option(help="Point to follow instead of A, B and C, as NAME=X,Y in mm; repeatable."),
     ] = None,
     geometry: Annotated[
-        Path | None, typer.Option(help="Geometry to use instead of the sets' own, with its covariance.")
+        Path | None,
+        typer.Option(help="Geometry to use instead of the sets' own, with its covariance."),
     ] = None,
     trials: Annotated[int, typer.Option(min=2, help="Monte Carlo trials per set.")] = 100,
     seed: SeedOption = 1,
-    rerun: Annotated[bool, typer.Option("--rerun", help="Write stability.rrd next to the result.")] = False,
+    rerun: Annotated[
+        bool, typer.Option("--rerun", help="Write stability.rrd next to the result.")
+    ] = False,
     json: JsonOption = False,
 ) -> int:
-    """Evaluate the stability of a run of sets: standard deviation, points over time, pairs and their uncertainty."""
+    """Evaluate the stability of a run of sets: standard deviation, points over time, pairs and
+    their uncertainty.
+    """
     from membrane_ctrl.measure.stability import StabilityOptions, stability_command
 
-    options = StabilityOptions(run_of_sets, out, tuple(point or ()), geometry, trials, seed, json, rerun)
+    options = StabilityOptions(
+        run_of_sets, out, tuple(point or ()), geometry, trials, seed, json, rerun
+    )
     return stability_command(options)
 
 
 def simulate(
-    set_dir: Annotated[Path, typer.Argument(metavar="SET_DIR", help="New folder for the set, or for the run.")],
+    set_dir: Annotated[
+        Path, typer.Argument(metavar="SET_DIR", help="New folder for the set, or for the run.")
+    ],
     config: ConfigOption = None,
     sag_mm: Annotated[float, typer.Option(help="Depth of the bowl, mm.")] = 37.1,
-    figure: Annotated[bool, typer.Option(help="Add the aberrations of a mounted film, e.g. astigmatism.")] = True,
+    figure: Annotated[
+        bool, typer.Option(help="Add the aberrations of a mounted film, e.g. astigmatism.")
+    ] = True,
     steps: Annotated[int | None, typer.Option(min=3, max=64, help="Phase steps.")] = None,
     bits: Annotated[int | None, typer.Option(min=8, max=16, help="Bits per pixel.")] = None,
-    noise_adu: Annotated[float | None, typer.Option(min=0.0, help="Noise of each pixel, counts.")] = None,
-    shrink: Annotated[int, typer.Option(min=1, max=16, help="Use larger and fewer pixels, by this factor.")] = 1,
+    noise_adu: Annotated[
+        float | None, typer.Option(min=0.0, help="Noise of each pixel, counts.")
+    ] = None,
+    shrink: Annotated[
+        int, typer.Option(min=1, max=16, help="Use larger and fewer pixels, by this factor.")
+    ] = 1,
     gamma: Annotated[float, typer.Option(help="Gamma of the display.")] = 1.0,
     motion_um: Annotated[float, typer.Option(help="Amplitude of the film's motion, µm.")] = 0.0,
     motion_hz: Annotated[float, typer.Option(help="Frequency of the motion, Hz.")] = 0.3,
     drift_um_per_s: Annotated[float, typer.Option(help="Drift of the film, µm/s.")] = 0.0,
-    displacement_um: Annotated[float, typer.Option(help="Initial displacement from that depth, µm.")] = 0.0,
-    laser_noise_um: Annotated[float, typer.Option(min=0.0, help="Noise of the laser readings, µm.")] = 0.0,
+    displacement_um: Annotated[
+        float, typer.Option(help="Initial displacement from that depth, µm.")
+    ] = 0.0,
+    laser_noise_um: Annotated[
+        float, typer.Option(min=0.0, help="Noise of the laser readings, µm.")
+    ] = 0.0,
     stated: StatedOption = None,
-    exact: Annotated[bool, typer.Option("--exact", help="Trace every pixel exactly (slow).")] = False,
+    exact: Annotated[
+        bool, typer.Option("--exact", help="Trace every pixel exactly (slow).")
+    ] = False,
     seed: SeedOption = 1,
     fault: FaultOption = None,
     sets: Annotated[
-        int, typer.Option(min=1, help="Number of sets; several make a run: 0000 full, the others fringes.")
+        int,
+        typer.Option(
+            min=1, help="Number of sets; several make a run: 0000 full, the others fringes."
+        ),
     ] = 1,
-    interval_s: Annotated[float, typer.Option(min=0.0, help="Interval between the sets of a run, s.")] = 4.0,
+    interval_s: Annotated[
+        float, typer.Option(min=0.0, help="Interval between the sets of a run, s.")
+    ] = 4.0,
     coarser_mm: CoarserOption = None,
     artefact: ArtefactOption = "",
     screen_moved_mm: ScreenMovedOption = 0.0,
     track: Annotated[
-        int, typer.Option(min=0, help="Frames of a tracking set, in SET_DIR/track; its reference is SET_DIR/full.")
+        int,
+        typer.Option(
+            min=0, help="Frames of a tracking set, in SET_DIR/track; its reference is SET_DIR/full."
+        ),
     ] = 0,
-    rate_hz: Annotated[float, typer.Option(min=0.01, help="Frames of a tracking set per second.")] = 20.0,
+    rate_hz: Annotated[
+        float, typer.Option(min=0.01, help="Frames of a tracking set per second.")
+    ] = 20.0,
 ) -> int:
     """Simulate a capture set, or a run of sets, with known truth."""
     from membrane_ctrl.measure.simulate import SimulateOptions, simulate_command

@@ -11,23 +11,34 @@ if TYPE_CHECKING:  # loading the configuration's tables takes longer than all co
 
 S = TypeVar("S", bound="Section")
 
-ConfigArgument = Annotated[Path, typer.Argument(help="Configuration, one TOML file.", metavar="CONFIG")]
+ConfigArgument = Annotated[
+    Path, typer.Argument(help="Configuration, one TOML file.", metavar="CONFIG")
+]
 ConfigOption = Annotated[
-    Path | None, typer.Option("--config", help="Configuration, one TOML file; defaults apply without it.")
+    Path | None,
+    typer.Option("--config", help="Configuration, one TOML file; defaults apply without it."),
 ]
 JsonOption = Annotated[bool, typer.Option("--json", help="Print the result as JSON.")]
 PriorOption = Annotated[
     list[Path] | None,
-    typer.Option(metavar="FILE", help="Result of calibrate-camera or calibrate-pose; repeatable, the last one wins."),
+    typer.Option(
+        metavar="FILE",
+        help="Result of calibrate-camera or calibrate-pose; repeatable, the last one wins.",
+    ),
 ]
 RunArgument = Annotated[
     Path, typer.Argument(metavar="RUN", help="Run folder, its name or part of the name, or `last`.")
 ]
 FromOption = Annotated[
-    str | None, typer.Option("--from", help="Start of the part: 03:12 (UTC), an ISO time, or +90m from the start.")
+    str | None,
+    typer.Option(
+        "--from", help="Start of the part: 03:12 (UTC), an ISO time, or +90m from the start."
+    ),
 ]
 ToOption = Annotated[str | None, typer.Option("--to", help="End of the part, as --from.")]
-SetArgument = Annotated[Path, typer.Argument(metavar="SET", help="Folder with capture.toml and its images.")]
+SetArgument = Annotated[
+    Path, typer.Argument(metavar="SET", help="Folder with capture.toml and its images.")
+]
 SeedOption = Annotated[int, typer.Option(min=0, help="Seed of the random numbers.")]
 TrialsOption = Annotated[int, typer.Option(min=2, help="Monte Carlo trials.")]
 
@@ -52,7 +63,9 @@ def configured(path: Path | None) -> "Config":
     alarms = _beside(alarms, folder, "urls_file", "escalation_urls_file")
     doors = config.doors
     if doors.mqtt is not None:
-        doors = doors.model_copy(update={"mqtt": _beside(doors.mqtt, folder, "password_file", "ca_file")})
+        doors = doors.model_copy(
+            update={"mqtt": _beside(doors.mqtt, folder, "password_file", "ca_file")}
+        )
     if doors.opcua is not None:
         opcua = _beside(doors.opcua, folder, "users_file", "certificate_file", "key_file")
         doors = doors.model_copy(update={"opcua": opcua})
@@ -64,5 +77,9 @@ def configured(path: Path | None) -> "Config":
 def _beside(section: S, folder: Path, *names: str) -> S:
     """Return the section with its file names relative to a folder; unset ones stay unset."""
     given = {name: getattr(section, name) for name in names}
-    made = {name: type(file)(folder / Path(file).expanduser()) for name, file in given.items() if file is not None}
+    made = {
+        name: type(file)(folder / Path(file).expanduser())
+        for name, file in given.items()
+        if file is not None
+    }
     return section.model_copy(update=made)

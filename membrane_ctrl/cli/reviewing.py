@@ -12,7 +12,9 @@ from membrane_ctrl.model import errors
 
 LogsOption = Annotated[Path, typer.Option("--logs", help="Folder of the runs.")]
 
-runs_app = typer.Typer(invoke_without_command=True, rich_markup_mode="markdown", help="List, show and prune runs.")
+runs_app = typer.Typer(
+    invoke_without_command=True, rich_markup_mode="markdown", help="List, show and prune runs."
+)
 
 
 def add_commands(app: typer.Typer) -> None:
@@ -31,20 +33,33 @@ def review(
     ] = None,
     every: Annotated[bool, typer.Option("--all", help="All runs of a folder, as a table.")] = False,
     logs: LogsOption = Path("logs"),
-    at: Annotated[str | None, typer.Option(help="Open at this time: 03:12 (UTC) or +90m from the start.")] = None,
-    around: Annotated[str | None, typer.Option(help="Open at the first event of this name, e.g. a fault.")] = None,
+    at: Annotated[
+        str | None, typer.Option(help="Open at this time: 03:12 (UTC) or +90m from the start.")
+    ] = None,
+    around: Annotated[
+        str | None, typer.Option(help="Open at the first event of this name, e.g. a fault.")
+    ] = None,
     start: FromOption = None,
     end: ToOption = None,
-    tab: Annotated[str, typer.Option(help="Tab to open: overview, loop, shape, faults or tuning.")] = "overview",
-    align: Annotated[str, typer.Option(help="Several runs: align them by hold, start or utc.")] = "hold",
+    tab: Annotated[
+        str, typer.Option(help="Tab to open: overview, loop, shape, faults or tuning.")
+    ] = "overview",
+    align: Annotated[
+        str, typer.Option(help="Several runs: align them by hold, start or utc.")
+    ] = "hold",
     live: Annotated[bool, typer.Option("--live", help="Follow a run in progress.")] = False,
     web: Annotated[bool, typer.Option("--web", help="Serve it to a browser.")] = False,
     bind: Annotated[str, typer.Option(help="With --web: address to listen on.")] = "127.0.0.1",
     port: Annotated[
-        int, typer.Option(min=0, max=65535, help="With --web: port of the page; 0 for any free one.")
+        int,
+        typer.Option(min=0, max=65535, help="With --web: port of the page; 0 for any free one."),
     ] = 0,
-    save: Annotated[Path | None, typer.Option(help="Write the review's recording instead of showing it.")] = None,
-    screenshot: Annotated[Path | None, typer.Option(help="Write a picture instead of showing it.")] = None,
+    save: Annotated[
+        Path | None, typer.Option(help="Write the review's recording instead of showing it.")
+    ] = None,
+    screenshot: Annotated[
+        Path | None, typer.Option(help="Write a picture instead of showing it.")
+    ] = None,
 ) -> int:
     """Open the timeline of one run, or of several overlaid, in the Rerun viewer.
 
@@ -80,26 +95,40 @@ def review(
 
 def report(
     runs: Annotated[
-        list[Path], typer.Argument(metavar="RUN...", help="Run folder, its name or part of the name, or `last`.")
+        list[Path],
+        typer.Argument(
+            metavar="RUN...", help="Run folder, its name or part of the name, or `last`."
+        ),
     ],
     out: Annotated[
         Path | None,
-        typer.Option(help="Output folder for report.html and report.json; RUN/report, or `fleet`, by default."),
+        typer.Option(
+            help="Output folder for report.html and report.json; RUN/report, or `fleet`, by "
+            "default."
+        ),
     ] = None,
     fleet: Annotated[
-        bool, typer.Option("--fleet", help="Several runs, or folders of runs: one page with a line for each.")
+        bool,
+        typer.Option(
+            "--fleet", help="Several runs, or folders of runs: one page with a line for each."
+        ),
     ] = False,
     workers: Annotated[
-        int | None, typer.Option(min=1, help="With --fleet: worker processes; one per core by default.")
+        int | None,
+        typer.Option(min=1, help="With --fleet: worker processes; one per core by default."),
     ] = None,
     scheduler: Annotated[
         str | None,
-        typer.Option(metavar="ADDRESS", help="With --fleet: run on this Dask scheduler, e.g. tcp://host:8786."),
+        typer.Option(
+            metavar="ADDRESS",
+            help="With --fleet: run on this Dask scheduler, e.g. tcp://host:8786.",
+        ),
     ] = None,
     compare: Annotated[
         Path | None,
         typer.Option(
-            "--compare", help="Another run to compare with: the same part if --from is +.., else all of it."
+            "--compare",
+            help="Another run to compare with: the same part if --from is +.., else all of it.",
         ),
     ] = None,
     start: FromOption = None,
@@ -112,7 +141,9 @@ def report(
             raise errors.InputError("--compare: compares two runs; leave out --fleet")
         from membrane_ctrl.review.report.fleet import FleetOptions, fleet_command
 
-        return fleet_command(FleetOptions(runs, out or Path("fleet"), start, end, workers, scheduler, json))
+        return fleet_command(
+            FleetOptions(runs, out or Path("fleet"), start, end, workers, scheduler, json)
+        )
     if len(runs) > 1:
         raise errors.InputError(f"{runs[1]}: one run at a time; --fleet makes one page of several")
     if workers is not None or scheduler is not None:
@@ -124,14 +155,20 @@ def report(
 
 def export_run(
     run: RunArgument,
-    form: Annotated[str, typer.Option("--format", help="Format: parquet, csv or hdf5.")] = "parquet",
+    form: Annotated[
+        str, typer.Option("--format", help="Format: parquet, csv or hdf5.")
+    ] = "parquet",
     out: Annotated[Path | None, typer.Option(help="Output folder; RUN/export by default.")] = None,
     streams: Annotated[
         list[str] | None,
-        typer.Option("--streams", help="Stream to write: a path, a field, shapes or events; repeatable."),
+        typer.Option(
+            "--streams", help="Stream to write: a path, a field, shapes or events; repeatable."
+        ),
     ] = None,
     start: FromOption = None,
-    end: Annotated[str | None, typer.Option("--to", help="End of the part, written as for --from.")] = None,
+    end: Annotated[
+        str | None, typer.Option("--to", help="End of the part, written as for --from.")
+    ] = None,
 ) -> int:
     """Export a run's columns for other programs."""
     from membrane_ctrl.review.runs import export_command
@@ -142,15 +179,27 @@ def export_run(
 @runs_app.callback()
 def list_runs(
     context: typer.Context,
-    logs: Annotated[list[Path] | None, typer.Option("--logs", help="Folder of the runs; repeatable.")] = None,
-    since: Annotated[str | None, typer.Option(help="Only runs started on this day (UTC) or later.")] = None,
-    until: Annotated[str | None, typer.Option(help="Only runs started before this day (UTC).")] = None,
-    longer: Annotated[str | None, typer.Option(help="Only runs at least this long, e.g. 2h.")] = None,
-    std_um: Annotated[float | None, typer.Option(min=0, help="Largest standard deviation, µm.")] = None,
+    logs: Annotated[
+        list[Path] | None, typer.Option("--logs", help="Folder of the runs; repeatable.")
+    ] = None,
+    since: Annotated[
+        str | None, typer.Option(help="Only runs started on this day (UTC) or later.")
+    ] = None,
+    until: Annotated[
+        str | None, typer.Option(help="Only runs started before this day (UTC).")
+    ] = None,
+    longer: Annotated[
+        str | None, typer.Option(help="Only runs at least this long, e.g. 2h.")
+    ] = None,
+    std_um: Annotated[
+        float | None, typer.Option(min=0, help="Largest standard deviation, µm.")
+    ] = None,
     faults: Annotated[
         bool | None, typer.Option("--faults/--no-faults", help="Only runs with or without faults.")
     ] = None,
-    configuration: Annotated[str | None, typer.Option(help="First characters of the configuration's hash.")] = None,
+    configuration: Annotated[
+        str | None, typer.Option(help="First characters of the configuration's hash.")
+    ] = None,
     name: Annotated[str | None, typer.Option(help="Part of the run's name.")] = None,
     json: JsonOption = False,
 ) -> int:
@@ -161,15 +210,25 @@ def list_runs(
 
     if context.invoked_subcommand is not None:
         sources = {name: context.get_parameter_source(name) for name in context.params}
-        given = [name for name, source in sources.items() if source is not None and source.name == "COMMANDLINE"]
+        given = [
+            name
+            for name, source in sources.items()
+            if source is not None and source.name == "COMMANDLINE"
+        ]
         if given:  # `--logs` in front of `prune` would leave it with another folder than was meant
             told = ", ".join(f"--{name.replace('_', '-')}" for name in given)
-            raise errors.InputError(f"{told} in front of `{context.invoked_subcommand}` belongs after it")
+            raise errors.InputError(
+                f"{told} in front of `{context.invoked_subcommand}` belongs after it"
+            )
         return 0
     least_s = None if longer is None else clock.parse_duration_s(longer)
     wanted = Filter(
-        least_s=least_s, most_std_um=std_um, with_faults=faults, configuration=configuration, text=name
-    )  # fmt: skip
+        least_s=least_s,
+        most_std_um=std_um,
+        with_faults=faults,
+        configuration=configuration,
+        text=name,
+    )
     return list_command(logs or [Path("logs")], wanted, since, until, json)
 
 
@@ -189,12 +248,18 @@ def prune_runs(
     ] = None,
     keep_gb: Annotated[
         float | None,
-        typer.Option(min=0, max=1e6, help="Then delete the oldest until the rest take at most this, GB."),
+        typer.Option(
+            min=0, max=1e6, help="Then delete the oldest until the rest take at most this, GB."
+        ),
     ] = None,
-    delete: Annotated[bool, typer.Option("--delete", help="Delete them; by default only list them.")] = False,
+    delete: Annotated[
+        bool, typer.Option("--delete", help="Delete them; by default only list them.")
+    ] = False,
     json: JsonOption = False,
 ) -> int:
-    """Delete old runs; --keep-days spares the newest three, and a run with a file `.keep` always stays."""
+    """Delete old runs; --keep-days spares the newest three, and a run with a file `.keep` always
+    stays.
+    """
     from membrane_ctrl.review.runs import prune_command
 
     return prune_command(logs, keep_days, keep_gb, delete, json)
@@ -204,9 +269,12 @@ def replay(
     run_dir: RunArgument,
     start: FromOption = None,
     end: ToOption = None,
-    to_test: Annotated[str | None, typer.Option(help="Write a regression test to tests/incidents/NAME.")] = None,
+    to_test: Annotated[
+        str | None, typer.Option(help="Write a regression test to tests/incidents/NAME.")
+    ] = None,
     state: Annotated[
-        bool, typer.Option("--state", help="Print what the controller remembers at the end of the part.")
+        bool,
+        typer.Option("--state", help="Print what the controller remembers at the end of the part."),
     ] = False,
     json: JsonOption = False,
 ) -> int:

@@ -53,7 +53,8 @@ class DeviceProbe:
 def check_config(config: Config, source: str, as_json: bool) -> int:
     """Check the configuration, probe the devices and report.
 
-    Raises InputError with one line per bad setting; after the report, DeviceError if a device cannot be used.
+    Raises InputError with one line per bad setting; after the report, DeviceError if a device
+    cannot be used.
     """
     findings = dict.fromkeys(require_sound(config, source))  # before touching any device
     if config.devices is not None:
@@ -66,7 +67,10 @@ def check_config(config: Config, source: str, as_json: bool) -> int:
     if config.interlocks:
         would["interlocks"] = interlock_check.describe_effect(circuits)
     if as_json:
-        listed = [{key: value for key, value in asdict(probe).items() if key != "facts"} for probe in probes]
+        listed = [
+            {key: value for key, value in asdict(probe).items() if key != "facts"}
+            for probe in probes
+        ]
         found = [asdict(finding) for finding in findings]
         report = {
             "schema": "membrane-check/1",
@@ -86,7 +90,8 @@ def check_config(config: Config, source: str, as_json: bool) -> int:
     wrong = [probe for probe in probes if probe.problem]
     if wrong:
         raise errors.DeviceError(
-            f"{len(wrong)} of {len(probes)} devices cannot be used; {wrong[0].role}: {wrong[0].problem}"
+            f"{len(wrong)} of {len(probes)} devices cannot be used; {wrong[0].role}: "
+            f"{wrong[0].problem}"
         )
     lost = [circuit for circuit in circuits if circuit.problem]
     if lost:
@@ -95,7 +100,9 @@ def check_config(config: Config, source: str, as_json: bool) -> int:
 
 
 def _probed(config: Config) -> tuple[list[DeviceProbe], list[interlock_check.InterlockProbe]]:
-    """Probe devices and interlocks, except those (including the screen) that another program uses."""
+    """Probe devices and interlocks, except those (including the
+    screen) that another program uses.
+    """
     devices = config.devices
     if devices is None:
         return probe_optics(config), []
@@ -103,7 +110,11 @@ def _probed(config: Config) -> tuple[list[DeviceProbe], list[interlock_check.Int
         try:
             stack.enter_context(bench.locked(bench.device_names(devices)))
         except errors.DeviceError as error:
-            return [DeviceProbe("board" if devices.board else "devices", devices.name, problem=str(error))], []
+            return [
+                DeviceProbe(
+                    "board" if devices.board else "devices", devices.name, problem=str(error)
+                )
+            ], []
         probes = asyncio.run(_probes(devices, not config.by_optics))
         circuits = asyncio.run(interlock_check.probe_interlocks(devices))
         return probes + probe_optics(config), circuits
@@ -126,8 +137,16 @@ def _show(
     if probes:
         table = Table("role", "device", "identity", "reading", "p50 / p99 ms")
         for probe in probes:
-            latency = f"{probe.latency_p50_ms:.1f} / {probe.latency_p99_ms:.1f}" if probe.reading else ""
-            words = (probe.role, probe.device, probe.identity or "not usable", probe.reading, latency)
+            latency = (
+                f"{probe.latency_p50_ms:.1f} / {probe.latency_p99_ms:.1f}" if probe.reading else ""
+            )
+            words = (
+                probe.role,
+                probe.device,
+                probe.identity or "not usable",
+                probe.reading,
+                latency,
+            )
             table.add_row(*words)
         console.print(table)
     for probe in probes:
@@ -152,14 +171,18 @@ def _what_would_happen(config: Config) -> dict[str, str]:
     loop, limits, shape = config.loop, config.limits, config.shape
     feedforward = [
         name
-        for name, on in (("barometer", loop.feedforward_barometer), ("thermometer", loop.feedforward_temperature))
+        for name, on in (
+            ("barometer", loop.feedforward_barometer),
+            ("thermometer", loop.feedforward_temperature),
+        )
         if on
     ]
     cycle = f"a cycle every {shape.period_s:g} s"
     figures = f"{shape.track_rate_hz:g} figures/s, tracked" if shape.mode == "track" else cycle
     return {
         "devices": config.devices.name if config.devices else "none: only `hold --twin` can run",
-        "hold": f"{loop.setpoint_um:g} µm at {loop.rate_hz:g} Hz, limits {limits.displacement_min_um:g} .. "
+        "hold": f"{loop.setpoint_um:g} µm at {loop.rate_hz:g} Hz, limits "
+        f"{limits.displacement_min_um:g} .. "
         f"{limits.displacement_max_um:g} µm and {limits.gauge_pressure_max_pa:g} Pa",
         "gains": run_status.gains_words(loop.model_dump(), None),
         "feed-forward": " and ".join(feedforward) or "off",
@@ -243,7 +266,11 @@ def _board_problem(reading: roles.BenchReading, laser: bool) -> str:
         return f"faults {reading.latched_faults:#x} are latched (docs/registers.md); find the cause"
     if laser and not math.isfinite(reading.displacement_um):
         return f"no laser reading (code {reading.displacement_quality}); check its aim"
-    return "" if math.isfinite(reading.gauge_pressure_pa) else "no gauge pressure reading; check the sensor"
+    return (
+        ""
+        if math.isfinite(reading.gauge_pressure_pa)
+        else "no gauge pressure reading; check the sensor"
+    )
 
 
 async def probe_roles(devices: role_bench.RoleDevices) -> list[DeviceProbe]:
@@ -257,7 +284,9 @@ async def probe_roles(devices: role_bench.RoleDevices) -> list[DeviceProbe]:
     return probes
 
 
-async def _probe(role: str, device: roles.Device, read: Callable[[], Awaitable[Any]], unit: str) -> DeviceProbe:
+async def _probe(
+    role: str, device: roles.Device, read: Callable[[], Awaitable[Any]], unit: str
+) -> DeviceProbe:
     where = device.describe()
     name, notes = where.get("port", ""), where.get("watchdog", "")
     try:
@@ -268,10 +297,16 @@ async def _probe(role: str, device: roles.Device, read: Callable[[], Awaitable[A
     finally:
         with contextlib.suppress(Exception):
             await device.close()
-    identity = " ".join(part for part in (found.kind, found.serial, found.firmware, found.detail) if part)
+    identity = " ".join(
+        part for part in (found.kind, found.serial, found.firmware, found.detail) if part
+    )
     problem = ""
     if isinstance(value, roles.DisplacementSample):
-        problem = "" if value.quality == 0 else f"no reading, error code {value.quality}; check aim and manual"
+        problem = (
+            ""
+            if value.quality == 0
+            else f"no reading, error code {value.quality}; check aim and manual"
+        )
         value = value.displacement_um
     if not problem and not math.isfinite(value):
         problem = "answers without a reading"
@@ -280,7 +315,9 @@ async def _probe(role: str, device: roles.Device, read: Callable[[], Awaitable[A
         facts = replace(facts, displacement_range_um=found.shows)
     elif role == "gauge_pressure":
         facts = replace(facts, gauge_range_pa=found.shows)
-    return DeviceProbe(role, name, identity, f"{value:.6g} {unit}", p50_ms, p99_ms, problem, notes, facts)
+    return DeviceProbe(
+        role, name, identity, f"{value:.6g} {unit}", p50_ms, p99_ms, problem, notes, facts
+    )
 
 
 async def _timed(read: Callable[[], Awaitable[Any]]) -> tuple[Any, float, float]:
@@ -299,7 +336,9 @@ _GRABS = 10
 
 
 def probe_optics(config: Config) -> list[DeviceProbe]:
-    """Probe camera and screen together; no probe without a camera. Call from the main thread only."""
+    """Probe camera and screen together; no probe without a camera.
+    Call from the main thread only.
+    """
     if config.devices is None or config.devices.camera is None:
         return []
     clock = session.WaitingClock(RunClock.start())
@@ -340,11 +379,14 @@ def _grab(optics: optical_bench.OpticalBench) -> tuple[float, float, float]:
 def run_conformance(url: str, unit_id: int, as_json: bool) -> int:
     """`conformance`: test a board and report; exits with REJECTED if it fails.
 
-    Raises InputError for a bad URL, DeviceError if the board is locked, does not answer, or another program uses it.
+    Raises InputError for a bad URL, DeviceError if the board is locked, does not answer, or another
+    program uses it.
     """
     try:
         with bench.locked(bench.modbus_names(url, unit_id)):
-            lock_store.require_unlocked(lock_store.LockStore.of_machine(), lock_store.modbus_keys(url, unit_id))
+            lock_store.require_unlocked(
+                lock_store.LockStore.of_machine(), lock_store.modbus_keys(url, unit_id)
+            )
             findings = asyncio.run(conformance.examine(url, unit_id))
     except ValueError as error:
         raise errors.InputError(str(error)) from None
@@ -353,11 +395,22 @@ def run_conformance(url: str, unit_id: int, as_json: bool) -> int:
     passed = not any(finding.problem for finding in findings)
     if as_json:
         checks = [asdict(finding) for finding in findings]
-        print(json.dumps({"schema": "membrane-conformance/1", "board": url, "passed": passed, "checks": checks}))
+        print(
+            json.dumps(
+                {
+                    "schema": "membrane-conformance/1",
+                    "board": url,
+                    "passed": passed,
+                    "checks": checks,
+                }
+            )
+        )
     else:
         table = Table("check", "result", "docs/firmware.md")
         for finding in findings:
             table.add_row(finding.check, finding.problem or "passed", finding.section)
         terminal.table_console().print(table)
-        terminal.table_console().print("conforms" if passed else "does not conform: do not use it to run a pump")
+        terminal.table_console().print(
+            "conforms" if passed else "does not conform: do not use it to run a pump"
+        )
     return errors.Exit.DONE if passed else errors.Exit.REJECTED

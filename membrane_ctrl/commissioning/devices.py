@@ -1,4 +1,6 @@
-"""`devices`: hardware and drivers on this machine; `config init`: a first configuration from them and answers."""
+"""`devices`: hardware and drivers on this machine; `config init`: a first configuration from them
+and answers.
+"""
 
 import json
 import tomllib
@@ -22,7 +24,7 @@ _DRM = Path("/sys/class/drm")
 _HEAD = """\
 # Configuration of membrane-ctrl. Omitted keys use their defaults; `membrane-ctrl config explain KEY` tells what a key
 # means, docs/configuration.md lists them all, and `membrane-ctrl check {name}` checks this file and its devices.
-"""
+"""  # noqa: E501
 _TWIN = "tcp://127.0.0.1:{port}"
 
 TomlTable = dict[str, Any]
@@ -32,7 +34,8 @@ TomlTable = dict[str, Any]
 class FoundDevice:
     """A port, camera or display, or a driver that another package provides."""
 
-    kind: str  # "port", "camera", "display", or a kind of driver: "driver", "camera driver", "screen driver"
+    # "port", "camera", "display", or a kind of driver: "driver", "camera driver", "screen driver"
+    kind: str
     name: str  # its own description
     paste: str = ""  # configuration line that names it; may be empty
 
@@ -58,7 +61,9 @@ def list_devices(as_json: bool) -> int:
 def find_ports() -> list[FoundDevice]:
     """Serial ports, by USB identity if they have one: it survives replugging."""
     return [
-        FoundDevice("port", f"{port.path}: {port.description}", f'port = "{port.usb_name or port.path}"')
+        FoundDevice(
+            "port", f"{port.path}: {port.description}", f'port = "{port.usb_name or port.path}"'
+        )
         for port in serial_ports()
     ]
 
@@ -85,7 +90,11 @@ def find_displays(root: Path = _DRM) -> list[FoundDevice]:
         modes = (status.parent / "modes").read_text(encoding="ascii").split()
         size = modes[0] if modes else "size unknown"
         width, _, height = size.partition("x")
-        paste = f"width_px = {width}\nheight_px = {height}" if width.isdigit() and height.isdigit() else ""
+        paste = (
+            f"width_px = {width}\nheight_px = {height}"
+            if width.isdigit() and height.isdigit()
+            else ""
+        )
         found.append(FoundDevice("display", f"{connector}, {size}", paste))
     return found
 
@@ -95,7 +104,9 @@ def find_drivers() -> list[FoundDevice]:
     return [
         FoundDevice(
             kind.name,
-            f"{entry.name}, of {entry.dist.name} {entry.dist.version}" if entry.dist else entry.name,
+            f"{entry.name}, of {entry.dist.name} {entry.dist.version}"
+            if entry.dist
+            else entry.name,
             f'driver = "external"\nname = "{entry.name}"',
         )
         for kind in drivers.KINDS
@@ -104,14 +115,20 @@ def find_drivers() -> list[FoundDevice]:
 
 
 def write_first(path: Path, twin: bool, ask: bool) -> int:
-    """Write the file: for the twin, from answers, or, with nobody to ask, for the twin with what is connected.
+    """Write the file: for the twin, from answers, or, with nobody to ask, for the twin with what is
+    connected.
 
-    Raises InputError for a file that exists or cannot be written, and for answers that contradict each other.
+    Raises InputError for a file that exists or cannot be written, and for answers that contradict
+    each other.
     """
     if path.exists() or path.is_symlink():
-        raise errors.InputError(f"{path}: exists already, and is not overwritten; name another file")
+        raise errors.InputError(
+            f"{path}: exists already, and is not overwritten; name another file"
+        )
     found = [] if twin else _connected()
-    tables = _answers(found) if ask else {"devices": {"board": _TWIN.format(port=Config().twin.port)}}
+    tables = (
+        _answers(found) if ask else {"devices": {"board": _TWIN.format(port=Config().twin.port)}}
+    )
     parsed = toml_file.parse(tables, Config, str(path))
     if parsed.devices is not None:
         bench.require_places(parsed.devices)
@@ -133,7 +150,8 @@ def _connected() -> list[FoundDevice]:
 def _listed(found: list[FoundDevice]) -> list[str]:
     """Return what is connected, as comments to paste from."""
     lines = [
-        f"# {found_one.kind} {found_one.name}: {' '.join(found_one.paste.split(chr(10)))}" for found_one in found
+        f"# {found_one.kind} {found_one.name}: {' '.join(found_one.paste.split(chr(10)))}"
+        for found_one in found
     ]
     return ["# Connected when this file was written:", *lines, ""] if lines else []
 
@@ -142,7 +160,9 @@ def _answers(found: list[FoundDevice]) -> TomlTable:
     """Ask for the devices; everything that follows from their absence is set as well."""
     for line in _listed(found):
         typer.echo(line, err=True)
-    board = _asked("pump board, tcp://HOST:PORT or rtu:///dev/ttyUSB0?baud=115200 (empty: single instruments)")
+    board = _asked(
+        "pump board, tcp://HOST:PORT or rtu:///dev/ttyUSB0?baud=115200 (empty: single instruments)"
+    )
     section: TomlTable = {"board": board} if board else {}
     for role in () if board else roles.ROLES.values():
         section |= _role(role.name, optional=not role.needed)
@@ -155,7 +175,9 @@ def _answers(found: list[FoundDevice]) -> TomlTable:
         missing = {key: False for key, role in sensors.items() if role not in section}
         tables |= {"loop": missing} if missing else {}
         if str(section["pump"]["driver"]).startswith("bronkhorst"):  # linear from 0
-            tables["pump"] = dict.fromkeys(("dead_fraction", "start_fraction", "stall_fraction"), 0.0)
+            tables["pump"] = dict.fromkeys(
+                ("dead_fraction", "start_fraction", "stall_fraction"), 0.0
+            )
     return tables if "camera" in section else tables | {"shape": {"enabled": False}}
 
 
@@ -179,7 +201,9 @@ def _role(role: str, optional: bool) -> TomlTable:
             continue
         table: TomlTable = {"driver": driver}
         for name, field in known[driver].model_fields.items():
-            if name == "raw" or (field.is_required() and name != "driver"):  # only a preset replaces `raw`
+            if name == "raw" or (
+                field.is_required() and name != "driver"
+            ):  # only a preset replaces `raw`
                 answer = _asked(f"  {name} ({_comment(f'{driver}.{name}').rstrip('.')})")
                 table[name] = answer if field.annotation is str else _value(answer)
         try:
@@ -191,11 +215,15 @@ def _role(role: str, optional: bool) -> TomlTable:
 
 
 def _asked(question: str) -> str:
-    return str(typer.prompt(question, default="", show_default=False, prompt_suffix=": ", err=True)).strip()
+    return str(
+        typer.prompt(question, default="", show_default=False, prompt_suffix=": ", err=True)
+    ).strip()
 
 
 def _value(answer: str) -> Any:
-    """Return an answer as TOML reads it, or as it is; the check of its table then names what is wrong."""
+    """Return an answer as TOML reads it, or as it is; the check of its table then names what is
+    wrong.
+    """
     try:
         return tomllib.loads(f"x = {answer}")["x"]
     except tomllib.TOMLDecodeError:

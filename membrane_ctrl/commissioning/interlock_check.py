@@ -12,7 +12,8 @@ from membrane_ctrl.config.schema import DevicesConfig
 from membrane_ctrl.instruments import bench, interlock_sources
 
 HOW_TO_TEST = (
-    "test each interlock: open its circuit and see that `membrane-ctrl check` lists it as open, unplug its signal "
+    "test each interlock: open its circuit and see that `membrane-ctrl check` lists it as "
+    "open, unplug its signal "
     "and see the same, then close it again (docs/operations.md, Interlocks)"
 )
 CLOSED, OPEN, NO_SIGNAL = "closed", "open", "no signal"
@@ -33,7 +34,8 @@ class InterlockProbe:
 async def probe_interlocks(devices: DevicesConfig) -> list[InterlockProbe]:
     """Read every circuit once, without writing to any device, in the order of the configuration.
 
-    Raises InputError for impossible settings, such as a GPIO line without the package that reads it.
+    Raises InputError for impossible settings, such as a GPIO line without the package that reads
+    it.
     """
     if not devices.interlocks:
         return []
@@ -77,7 +79,9 @@ async def _board_circuits(devices: DevicesConfig) -> dict[int, InterlockProbe]:
     return {bit: _probe(devices, bit, bool(open_mask >> bit & 1), problem) for bit in inputs}
 
 
-async def _polled_circuits(devices: DevicesConfig, polled: interlocks.PolledSource) -> dict[int, InterlockProbe]:
+async def _polled_circuits(
+    devices: DevicesConfig, polled: interlocks.PolledSource
+) -> dict[int, InterlockProbe]:
     """The circuits of one source, by bit."""
     source, problem = polled.source, ""
     closed: tuple[bool, ...] = (False,) * len(polled.bits)
@@ -92,7 +96,8 @@ async def _polled_circuits(devices: DevicesConfig, polled: interlocks.PolledSour
         problem = f"{len(closed)} circuits in the answer, expected {len(polled.bits)}"
         closed = (False,) * len(polled.bits)
     return {
-        bit: _probe(devices, bit, not is_closed, problem) for bit, is_closed in zip(polled.bits, closed, strict=True)
+        bit: _probe(devices, bit, not is_closed, problem)
+        for bit, is_closed in zip(polled.bits, closed, strict=True)
     }
 
 
@@ -102,4 +107,6 @@ def _probe(devices: DevicesConfig, bit: int, is_open: bool, problem: str) -> Int
     state = OPEN if is_open else CLOSED
     if problem:
         state = NO_SIGNAL
-    return InterlockProbe(interlock.name, source, state, interlock.safe_level, interlock.text, problem)
+    return InterlockProbe(
+        interlock.name, source, state, interlock.safe_level, interlock.text, problem
+    )

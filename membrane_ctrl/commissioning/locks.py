@@ -1,4 +1,6 @@
-"""`locks`: lists the locks on this machine's devices, and removes one while no program runs the devices."""
+"""`locks`: lists the locks on this machine's devices, and removes one while no program runs the
+devices.
+"""
 
 import contextlib
 import getpass
@@ -31,7 +33,11 @@ def list_locks(as_json: bool) -> int:
     found = lock_store.LockStore.of_machine().find_locks()
     if as_json:
         listed = [
-            {**asdict(each.lock), "devices": sorted(each.devices), "file": each.file and str(each.file)}
+            {
+                **asdict(each.lock),
+                "devices": sorted(each.devices),
+                "file": each.file and str(each.file),
+            }
             for each in found
         ]
         print(json.dumps({"schema": "membrane-locks/1", "locks": listed}))
@@ -80,16 +86,22 @@ def remove_lock(word: str) -> int:
             store.remove_lock(stored.file)
         except OSError as error:
             raise DeviceError(f"{stored.file}: cannot be removed ({os_reason(error)})") from None
-    print(f"removed: {describe_lock(stored.lock)}, by its {unlocking.reason.value}", file=sys.stderr)
+    print(
+        f"removed: {describe_lock(stored.lock)}, by its {unlocking.reason.value}", file=sys.stderr
+    )
     return Exit.DONE
 
 
 def _require_no_hold(stored: lock_store.StoredLock, stack: contextlib.ExitStack) -> None:
-    """Claim the devices of a lock: a running hold has it in memory, and removes it with `ctl unlock`."""
+    """Claim the devices of a lock: a running hold has it in memory, and removes it with `ctl
+    unlock`.
+    """
     try:
         stack.enter_context(bench.locked(stored.devices))
     except DeviceError as error:
-        raise DeviceError(f"{error}; or remove the lock there: `membrane-ctrl ctl unlock`") from None
+        raise DeviceError(
+            f"{error}; or remove the lock there: `membrane-ctrl ctl unlock`"
+        ) from None
 
 
 def _log_removal(stored: lock_store.StoredLock, remover: str, how: str) -> None:

@@ -1,4 +1,6 @@
-"""`devices new`: a driver for a device of one's own, its emulator and its tests, as a package to install."""
+"""`devices new`: a driver for a device of one's own, its emulator and its tests, as a package to
+install.
+"""
 
 import importlib.util
 import keyword
@@ -17,17 +19,43 @@ from membrane_ctrl.model import errors
 _TEMPLATES = Path(__file__).parent / "scaffold"
 _NAME = re.compile(r"[a-z][a-z0-9]*(_[a-z0-9]+)*")
 _LONGEST = 30  # the lines of the files stay within 118 characters
-# By what the driver is asked for (`roles.Role.reads`): what the instrument is, how the invented one answers, and two
-# values in the role's unit
+# By what the driver is asked for (`roles.Role.reads`): what the instrument is, how the invented one
+# answers, and two values in the role's unit
 _WORDS: dict[str, dict[str, Any]] = {
-    "displacement": {"what": "displacement sensor", "Role": "DisplacementSensor", "unit": "mm", "divisor": 1000.0},
-    "gauge_pressure_pa": {"what": "pressure gauge", "Role": "PressureSensor", "unit": "mbar", "divisor": 100.0},
-    "ambient_pressure_pa": {"what": "barometer", "Role": "Barometer", "unit": "hPa", "divisor": 100.0},
-    "air_temperature_c": {"what": "thermometer", "Role": "Thermometer", "unit": "degC", "divisor": 1.0},
+    "displacement": {
+        "what": "displacement sensor",
+        "Role": "DisplacementSensor",
+        "unit": "mm",
+        "divisor": 1000.0,
+    },
+    "gauge_pressure_pa": {
+        "what": "pressure gauge",
+        "Role": "PressureSensor",
+        "unit": "mbar",
+        "divisor": 100.0,
+    },
+    "ambient_pressure_pa": {
+        "what": "barometer",
+        "Role": "Barometer",
+        "unit": "hPa",
+        "divisor": 100.0,
+    },
+    "air_temperature_c": {
+        "what": "thermometer",
+        "Role": "Thermometer",
+        "unit": "degC",
+        "divisor": 1.0,
+    },
     "pump_fraction": {"what": "pump", "Role": "Pump", "unit": "percent", "divisor": 100.0},
     "vent_fraction": {"what": "valve", "Role": "Vent", "unit": "percent", "divisor": 100.0},
 }
-_SCALES = {"mm": "UM_PER_MM", "mbar": "PA_PER_MBAR", "hPa": "PA_PER_HPA", "degC": "DEGC", "percent": "PERCENT"}
+_SCALES = {
+    "mm": "UM_PER_MM",
+    "mbar": "PA_PER_MBAR",
+    "hPa": "PA_PER_HPA",
+    "degC": "DEGC",
+    "percent": "PERCENT",
+}
 _EXAMPLES = {
     "displacement": (12.0, 20.0),
     "gauge_pressure_pa": (600.0, 520.0),
@@ -35,8 +63,10 @@ _EXAMPLES = {
 }
 _OTHERS = {
     "displacement": 'driver = "optoncdt1420"\nport = "/dev/ttyUSB0"\nrange_mm = 50\nrate_khz = 2\n',
-    "pump": 'driver = "bronkhorst_modbus"\nlink = "rtu:///dev/ttyUSB1?baud=115200&parity=E"\nunit_id = 3\n',
-    "gauge_pressure": 'driver = "bronkhorst_modbus"\nlink = "rtu:///dev/ttyUSB1?baud=115200&parity=E"\nunit_id = 5\n',
+    "pump": 'driver = "bronkhorst_modbus"\nlink = "rtu:///dev/ttyUSB1?baud=115200&parity=E"\nunit_id '  # noqa: E501
+    "= 3\n",
+    "gauge_pressure": 'driver = "bronkhorst_modbus"\nlink = "rtu:///dev/ttyUSB1?baud=115200&parity=E"\nunit_id '  # noqa: E501
+    "= 5\n",
 }
 
 
@@ -48,16 +78,28 @@ ROLES_OF_DRIVERS = (*roles.ROLES, *_OPTICS)
 
 
 def write_package(name: str, role: str, folder: Path) -> int:
-    """Write the folder `<name>-driver` below another one, never over an existing one, and print what to do next.
+    """Write the folder `<name>-driver` below another one, never over an existing one, and print
+    what to do next.
 
-    Raises InputError for a name that is taken or is none, an unknown role, and a folder that cannot be written.
+    Raises InputError for a name that is taken or is none, an unknown role, and a folder that cannot
+    be written.
     """
     _require_free(name)
     if role not in ROLES_OF_DRIVERS:
-        raise errors.InputError(f"--role {role}: no such role; {toml_file.hint(role, list(ROLES_OF_DRIVERS))}")
+        raise errors.InputError(
+            f"--role {role}: no such role; {toml_file.hint(role, list(ROLES_OF_DRIVERS))}"
+        )
     words = _names(name, role) | (_optics(name, role) if role in _OPTICS else _instrument(role))
-    target = folder / f"{words['dashed']}-driver"  # with a dash, Python never takes the folder for the module
-    kind = "actuator" if role in roles.ACTUATORS else "displacement" if role == "displacement" else "value"
+    target = (
+        folder / f"{words['dashed']}-driver"
+    )  # with a dash, Python never takes the folder for the module
+    kind = (
+        "actuator"
+        if role in roles.ACTUATORS
+        else "displacement"
+        if role == "displacement"
+        else "value"
+    )
     prefix, lab = (f"{role}_", "optics_lab.toml.txt") if role in _OPTICS else ("", "lab.toml.txt")
     files = {
         "pyproject.toml": "pyproject.toml.txt",
@@ -68,7 +110,9 @@ def write_package(name: str, role: str, folder: Path) -> int:
     }
     with errors.writing(target):
         if target.exists() or target.is_symlink():
-            raise errors.InputError(f"{target}: exists already, and is not overwritten; choose another name")
+            raise errors.InputError(
+                f"{target}: exists already, and is not overwritten; choose another name"
+            )
         target.mkdir(parents=True)
         for file, template in files.items():
             text = _of_kind((_TEMPLATES / template).read_text(encoding="utf-8"), kind)
@@ -90,12 +134,18 @@ def _require_free(name: str) -> None:
         raise errors.InputError(f"{name}: not a name for a driver; {rule}")
     built_in = {tag for section in toml_file.sections(DevicesConfig) for tag in _drivers(section)}
     if name in built_in or keyword.iskeyword(name) or importlib.util.find_spec(name) is not None:
-        raise errors.InputError(f"{name}: taken by a driver or a Python module; choose another name")
+        raise errors.InputError(
+            f"{name}: taken by a driver or a Python module; choose another name"
+        )
 
 
 def _drivers(section: type[Any]) -> set[str]:
     """Return the names of all drivers in a table and the tables below it."""
-    inner = [each for field in section.model_fields.values() for each in toml_file.sections(field.annotation)]
+    inner = [
+        each
+        for field in section.model_fields.values()
+        for each in toml_file.sections(field.annotation)
+    ]
     return {str(tag) for tag in toml_file.tags(section)}.union(*(_drivers(each) for each in inner))
 
 
@@ -149,7 +199,9 @@ def _instrument(role: str) -> dict[str, Any]:
 
 
 def _of_kind(template: str, kind: str) -> str:
-    """Return a template's lines for a kind of instrument: those between `%kind ...` and `%end` are only for these."""
+    """Return a template's lines for a kind of instrument: those between `%kind ...` and `%end` are
+    only for these.
+    """
     kept: list[str] = []
     wanted = [True]
     for line in template.splitlines():

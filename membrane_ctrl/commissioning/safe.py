@@ -1,7 +1,8 @@
-"""`safe`: stops the pump, whichever program runs it, and locks its devices until a person removes the lock.
+"""`safe`: stops the pump, whichever program runs it, and locks its devices until a person removes
+the lock.
 
-For operators in doubt, and for `ExecStopPost`. It works even if the control process is dead or hangs. It claims no
-device, arms no watchdog and opens no sensor.
+For operators in doubt, and for `ExecStopPost`. It works even if the control process is dead or
+hangs. It claims no device, arms no watchdog and opens no sensor.
 """
 
 import asyncio
@@ -27,8 +28,8 @@ _LAPSE_S = 1.0  # beyond a watchdog period the board will not stop the pump any 
 def make_safe(config: Config, source: str, logs_dir: Path | None = None, latch: bool = True) -> int:
     """Stop the pump of a configuration from `source`; leave the vent as it is.
 
-    With `latch`, the board latches its stop and the devices are locked: nothing runs the pump until a person removes
-    the lock. Without it, a program that has the devices keeps running.
+    With `latch`, the board latches its stop and the devices are locked: nothing runs the pump until
+    a person removes the lock. Without it, a program that has the devices keeps running.
 
     Raises InputError without devices, DeviceError if the pump could not be stopped or locked.
     """
@@ -101,12 +102,14 @@ async def _stop_instrument(devices: DevicesConfig) -> _Stopped:
 
 def _words(devices: DevicesConfig, reading: BenchReading) -> str:
     latched = f", faults latched {reading.latched_faults:#x}" if reading.latched_faults else ""
-    return f"{devices.name}: pump {reading.pump_fraction:g}, vent {reading.vent_fraction:.2f}{latched}"
+    return (
+        f"{devices.name}: pump {reading.pump_fraction:g}, vent {reading.vent_fraction:.2f}{latched}"
+    )
 
 
 async def _after_a_run(devices: DevicesConfig) -> str:
-    """Make sure that the pump stands after a hold, without a latch; wait for the board's watchdog after a killed
-    hold.
+    """Make sure that the pump stands after a hold, without a latch; wait for the board's watchdog
+    after a killed hold.
 
     Raises DeviceError.
     """
@@ -125,7 +128,9 @@ async def _after_a_run(devices: DevicesConfig) -> str:
 
 
 async def _standing(board: PumpBoard, watchdog_s: float) -> BenchReading:
-    """Reading of a stopped pump; a pump still running after the watchdog period is stopped, which latches."""
+    """Reading of a stopped pump; a pump still running after the watchdog period is stopped, which
+    latches.
+    """
     for _ in range(math.ceil((watchdog_s + _LAPSE_S) / _LOOK_S)):
         if (reading := await board.read()).pump_fraction == 0.0:
             return reading
@@ -167,7 +172,9 @@ def _lock_hold(config: Config, folder: Path) -> _LockedByHold:
 
 
 def _store_lock(devices: DevicesConfig) -> None:
-    """Store a lock on the devices, which keeps every command down until a person removes it. Raises DeviceError."""
+    """Store a lock on the devices, which keeps every command down until a person removes it. Raises
+    DeviceError.
+    """
     store, keys = lock_store.LockStore.of_machine(), lock_store.device_keys(devices)
     account = f"unix:{getpass.getuser()}"
     word = lock_store.draw_word({each.lock.word for each in store.find_locks()})
@@ -177,6 +184,10 @@ def _store_lock(devices: DevicesConfig) -> None:
         file = store.write_lock(lock, keys)
     except OSError as error:
         raise DeviceError(
-            f"{error.filename or 'the locks'}: the pump is stopped, but not locked ({os_reason(error)})"
+            f"{error.filename or 'the locks'}: the pump is stopped, but not locked "
+            f"({os_reason(error)})"
         ) from None
-    print(f"{file}: nothing moves the mirror before `membrane-ctrl locks remove {word}`", file=sys.stderr)
+    print(
+        f"{file}: nothing moves the mirror before `membrane-ctrl locks remove {word}`",
+        file=sys.stderr,
+    )

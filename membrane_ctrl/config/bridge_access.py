@@ -29,7 +29,9 @@ def bridge_accesses(doors: DoorsConfig) -> list[BridgeAccess]:
         opcua = doors.opcua
         where = f"OPC UA on {opcua.host}:{opcua.port}" + (", encrypted" if opcua.encrypted else "")
         known = opcua.users_file is not None
-        who = f"the users in {opcua.users_file}, each by its role" if known else _anybody(opcua.host)
+        who = (
+            f"the users in {opcua.users_file}, each by its role" if known else _anybody(opcua.host)
+        )
         found.append(BridgeAccess("doors.opcua", where, who, not known))
     if doors.epics is not None:
         where = f"EPICS on {doors.epics.host}"
@@ -42,9 +44,15 @@ def describe_bridges(doors: DoorsConfig) -> str:
     accesses = bridge_accesses(doors)
     if not accesses:
         return "none"
-    may = "read, and nobody acts" if doors.role == "read" else f"read and act (role {doors.role} at most)"
+    may = (
+        "read, and nobody acts"
+        if doors.role == "read"
+        else f"read and act (role {doors.role} at most)"
+    )
     return "; ".join(f"{each.where}: {each.who} may {may}" for each in accesses)
 
 
 def _anybody(host: str) -> str:
-    return "every program on this machine" if host in LOCAL_HOSTS else "every program on the network"
+    return (
+        "every program on this machine" if host in LOCAL_HOSTS else "every program on the network"
+    )

@@ -1,5 +1,5 @@
-"""The tables of the loops and of safety: `[loop]`, `[pump]`, `[limits]`, `[states]`, `[resume]`, `[shape]`,
-`[estimator]`.
+"""The tables of the loops and of safety: `[loop]`, `[pump]`, `[limits]`, `[states]`, `[resume]`,
+`[shape]`, `[estimator]`.
 """
 
 from itertools import pairwise
@@ -11,21 +11,28 @@ from firmware_iface.settings import Fraction, Micrometres, Section
 
 
 class LoopConfig(Section):
-    """The inner loop. The manipulated value is the pump's flow as a speed of the mirror's centre."""
+    """The inner loop. The manipulated value is the pump's flow as a
+    speed of the mirror's centre.
+    """
 
     rate_hz: Annotated[float, Field(ge=1, le=200)] = 50.0
     """Ticks per second. Lower it for devices that answer slowly, and tune again."""
     setpoint_um: Micrometres = 0.0
-    """Displacement to hold. Change it to hold another depth; in a running hold use `ctl setpoint`."""
+    """Displacement to hold. Change it to hold another depth; in a running hold use `ctl setpoint`.
+    """
     kp_per_s: Annotated[float, Field(ge=0, le=20)] = 0.61
-    """Proportional gain; SIMC with the time constant of least predicted variance (docs/physics.md, inner loop).
-    Change it with `tune`: a larger gain follows gusts faster and passes more laser noise."""
+    """Proportional gain; SIMC with the time constant of least predicted variance (docs/physics.md,
+    inner loop). Change it with `tune`: a larger gain follows gusts faster and passes more laser
+    noise."""
     ti_s: Annotated[float, Field(gt=0.05, le=3600)] = 6.5
     """Integral time. Change it with `tune`, together with `kp_per_s`."""
     td_s: Annotated[float, Field(ge=0, le=10)] = 0.0
-    """Derivative time; 0 for none. Leave it at 0: the film is an integrator, and a derivative only adds noise."""
+    """Derivative time; 0 for none. Leave it at 0: the film is an integrator, and a derivative only
+    adds noise.
+    """
     setpoint_weight: Fraction = 1.0
-    """Share of the setpoint in the proportional term. Leave it at 1: the setpoint only ever ramps."""
+    """Share of the setpoint in the proportional term. Leave it at 1: the setpoint only ever ramps.
+    """
     measurement_filter_s: Annotated[float, Field(ge=0, le=10)] = 0.2
     """Time constant of the filter on the laser reading; 0 for none. Change it with `tune`."""
     flow_max_um_per_s: Annotated[float, Field(gt=0, le=100)] = 5.3
@@ -33,23 +40,36 @@ class LoopConfig(Section):
     Lower it to inflate or correct more gently."""
     flow_rate_limit_um_per_s2: Annotated[float, Field(gt=0, le=1000)] = 100.0
     """Fastest change of the flow; the default takes a third of the pump's lag from none to full.
-    Lower it for a drive that must not be stepped: 20 costs a fifth in gusts, and starts the pump half as often."""
+    Lower it for a drive that must not be stepped: 20 costs a fifth in gusts, and starts the pump
+    half as often."""
     setpoint_ramp_um_per_s: Annotated[float, Field(gt=0, le=100)] = 3.5
-    """Speed of the setpoint, upwards; downwards no faster than the leak. Lower it for a weaker pump."""
+    """Speed of the setpoint, upwards; downwards no faster than the leak. Lower it for a weaker
+    pump.
+    """
     feedforward_barometer: bool = True
     """Correct for the barometer's changes. Set it to false on a bench without a barometer."""
     feedforward_temperature: bool = True
-    """Correct for the air thermometer's changes. Set it to false on a bench without a thermometer."""
+    """Correct for the air thermometer's changes. Set it to false on a bench without a thermometer.
+    """
     barometer_gain_um_per_pa: Annotated[float, Field(ge=-10, le=10)] = -0.358
-    """Motion of the centre per pascal of ambient pressure. Change it if it was measured on another film."""
+    """Motion of the centre per pascal of ambient pressure. Change it if it was measured on another
+    film.
+    """
     temperature_gain_um_per_k: Annotated[float, Field(ge=-2000, le=2000)] = 123.0
-    """Motion of the centre per kelvin of gas temperature. Change it if it was measured on another film."""
+    """Motion of the centre per kelvin of gas temperature. Change it if it was measured on another
+    film.
+    """
     gas_follows_air_s: Annotated[float, Field(ge=0, le=3600)] = 12.0
-    """Time constant with which the gas follows the air's temperature. Change it for another depth or volume."""
+    """Time constant with which the gas follows the air's temperature. Change it for another depth
+    or volume.
+    """
     feedforward_filter_s: Annotated[float, Field(ge=0, le=60)] = 0.2
-    """Filter on the weather sensors. Raise it for noisy sensors, at the cost of a later correction."""
+    """Filter on the weather sensors. Raise it for noisy sensors, at the cost of a later correction.
+    """
     bleed_fraction: Fraction = 0.0
-    """Opening of the vent during a hold. Raise it for a mirror that is too tight (leak below 0.4 µm/s)."""
+    """Opening of the vent during a hold. Raise it for a mirror that is too tight (leak below 0.4
+    µm/s).
+    """
 
     def flow_most_um_per_s(self, pump: "PumpConfig") -> float:
         """The largest flow that the loop commands: within its own limit and the pump's."""
@@ -58,12 +78,16 @@ class LoopConfig(Section):
     @model_validator(mode="after")
     def _filter_slower_than_tick(self) -> "LoopConfig":
         if 0 < self.measurement_filter_s < 0.5 / self.rate_hz:
-            raise ValueError("measurement_filter_s is shorter than half a tick: use 0 to switch it off")
+            raise ValueError(
+                "measurement_filter_s is shorter than half a tick: use 0 to switch it off"
+            )
         return self
 
 
 class PumpConfig(Section):
-    """Flow of the pump against its command (docs/physics.md, film and gas); measure it with `tune pump`."""
+    """Flow of the pump against its command (docs/physics.md, film and gas); measure it with `tune
+    pump`.
+    """
 
     flow_full_um_per_s: Annotated[float, Field(gt=0, le=100)] = 5.3
     """Flow at full drive, as a speed of the centre. Change it to the measured one."""
@@ -74,20 +98,25 @@ class PumpConfig(Section):
     stall_fraction: Fraction = 0.15
     """Command below which a running pump stops. Set it to 0 for a flow controller."""
     curve_fraction: Annotated[tuple[Fraction, ...], Field(max_length=100)] = ()
-    """Commands of a measured curve, which replaces the straight line; none beyond the last one is given.
-    Set it with `tune pump` for a pump that is not straight."""
+    """Commands of a measured curve, which replaces the straight line; none beyond the last one is
+    given. Set it with `tune pump` for a pump that is not straight."""
     curve_um_per_s: tuple[Annotated[float, Field(ge=0, le=100)], ...] = ()
     """Flow of a running pump at each of these commands. Set it with `tune pump`."""
     curve_falling_um_per_s: tuple[Annotated[float, Field(ge=0, le=100)], ...] = ()
-    """Flow when a command is reached from a larger one. Set it with `tune pump` for a pump with hysteresis."""
+    """Flow when a command is reached from a larger one. Set it with `tune pump` for a pump with
+    hysteresis.
+    """
     probe_um: Annotated[float, Field(ge=0, le=1)] = 0.0
-    """Amplitude of a sine of 5 s by which a hold moves the centre to learn the pump's drift from its curve; 0: none.
-    Set it to half the centre's standard deviation: 0.1 gives 5 % after three hours at 1 µm of laser noise."""
+    """Amplitude of a sine of 5 s by which a hold moves the centre to learn the pump's drift from
+    its curve; 0: none. Set it to half the centre's standard deviation: 0.1 gives 5 % after three
+    hours at 1 µm of laser noise."""
     change_max: Annotated[float, Field(gt=0, le=1)] = 0.12
-    """Drift of the pump from its curve that causes the notice `pump_drift`. Raise it for a pump that varies."""
+    """Drift of the pump from its curve that causes the notice `pump_drift`. Raise it for a pump
+    that varies.
+    """
     stroke_hz: Annotated[float, Field(ge=0, le=100)] = 0.0
-    """Strokes a second in a usual hold; one that tracks tells when they meet a vibration of the mirror. 0: unknown.
-    Set it for a diaphragm pump."""
+    """Strokes a second in a usual hold; one that tracks tells when they meet a vibration of the
+    mirror. 0: unknown. Set it for a diaphragm pump."""
 
     @model_validator(mode="before")
     @classmethod
@@ -100,10 +129,18 @@ class PumpConfig(Section):
 
     @model_validator(mode="after")
     def _curve_rises(self) -> "PumpConfig":
-        commands, flows, falling = self.curve_fraction, self.curve_um_per_s, self.curve_falling_um_per_s
+        commands, flows, falling = (
+            self.curve_fraction,
+            self.curve_um_per_s,
+            self.curve_falling_um_per_s,
+        )
         if not (commands or flows or falling):
             return self
-        if len(commands) < 2 or len(commands) != len(flows) or (falling and len(falling) != len(flows)):
+        if (
+            len(commands) < 2
+            or len(commands) != len(flows)
+            or (falling and len(falling) != len(flows))
+        ):
             raise ValueError(
                 f"curve_fraction has {len(commands)} commands, curve_um_per_s {len(flows)} flows"
                 + (f", curve_falling_um_per_s {len(falling)}" if falling else "")
@@ -115,9 +152,13 @@ class PumpConfig(Section):
             if any(later < earlier for earlier, later in pairwise(branch)):
                 raise ValueError(f"{name} must not fall towards larger commands")
         if any(above < below for below, above in zip(flows, falling or flows, strict=True)):
-            raise ValueError("curve_falling_um_per_s must not be below curve_um_per_s at any command")
+            raise ValueError(
+                "curve_falling_um_per_s must not be below curve_um_per_s at any command"
+            )
         if self.flow_full_um_per_s != flows[-1]:
-            raise ValueError(f"flow_full_um_per_s must be the last flow of the curve ({flows[-1]:g}), or absent")
+            raise ValueError(
+                f"flow_full_um_per_s must be the last flow of the curve ({flows[-1]:g}), or absent"
+            )
         return self
 
 
@@ -125,42 +166,58 @@ class LimitsConfig(Section):
     """Limits the mirror must never exceed."""
 
     displacement_min_um: Micrometres = -2000.0
-    """Shallowest bowl while held (`under_displacement`). Change it to the laser's range and the optics' use."""
+    """Shallowest bowl while held (`under_displacement`). Change it to the laser's range and the
+    optics' use.
+    """
     displacement_max_um: Micrometres = 500.0
     """Deepest bowl (`over_displacement`). Change it to what the film and the laser can take."""
     gauge_pressure_max_pa: Annotated[float, Field(gt=0, le=5000)] = 750.0
-    """Highest gauge pressure; above it the mirror is vented. Change it for another film, below what tears it."""
+    """Highest gauge pressure; above it the mirror is vented. Change it for another film, below what
+    tears it.
+    """
     stale_s: Annotated[float, Field(gt=0, le=10)] = 0.3
-    """Time without a reading that counts as a loss. Raise it only for devices that answer that rarely."""
+    """Time without a reading that counts as a loss. Raise it only for devices that answer that
+    rarely.
+    """
     stuck_s: Annotated[float, Field(gt=0, le=600)] = 5.0
-    """Identical readings for this long mean a dead laser: no film is still. Raise it for a laser of coarse steps."""
+    """Identical readings for this long mean a dead laser: no film is still. Raise it for a laser of
+    coarse steps.
+    """
     lateness_max_ms: Annotated[float, Field(gt=0, le=10000)] = 100.0
-    """Lateness of a tick that counts as missed control. Leave it, and move other work off a late machine."""
+    """Lateness of a tick that counts as missed control. Leave it, and move other work off a late
+    machine.
+    """
     step_max_um: Annotated[float, Field(gt=0, le=10000)] = 50.0
-    """Largest jump of the laser reading in a tick; no film jumps that far. Raise it at low tick rates."""
+    """Largest jump of the laser reading in a tick; no film jumps that far. Raise it at low tick
+    rates.
+    """
     gauge_stuck_s: Annotated[float, Field(gt=0, le=1e5)] = 20.0
-    """Identical gauge readings for this long mean a dead gauge: noise of 0.5 Pa in steps of 0.001 Pa never repeats so
-    long, nor does a gauge that updates every second.
-    Raise it for a gauge that filters its noise below its own resolution, which repeats itself on a held mirror."""
+    """Identical gauge readings for this long mean a dead gauge: noise of 0.5 Pa in steps of 0.001
+    Pa never repeats so long, nor does a gauge that updates every second. Raise it for a gauge that
+    filters its noise below its own resolution, which repeats itself on a held mirror."""
     gauge_step_max_pa: Annotated[float, Field(gt=0, le=5000)] = 30.0
-    """Largest jump of the gauge: a slammed door (100 Pa) moves it by 2 Pa, a storm of 250 Pa by 5 Pa.
-    Raise it for a noisier gauge."""
+    """Largest jump of the gauge: a slammed door (100 Pa) moves it by 2 Pa, a storm of 250 Pa by 5
+    Pa. Raise it for a noisier gauge."""
     laser_gauge_apart_max_um: Annotated[float, Field(gt=0, le=10000)] = 20.0
-    """Largest contradiction of laser and gauge within minutes. 20 µm are 1 Pa: 30 sigma of a gauge's ten-second mean,
-    5 times the drift in two minutes of a mount at 2 µm/min. Raise it for a noisier gauge."""
+    """Largest contradiction of laser and gauge within minutes. 20 µm are 1 Pa: 30 sigma of a
+    gauge's ten-second mean, 5 times the drift in two minutes of a mount at 2 µm/min. Raise it for a
+    noisier gauge."""
     laser_gauge_drift_max_um: Annotated[float, Field(gt=0, le=10000)] = 120.0
-    """The same within an hour: a day of +-2 K and +-10 % relative humidity moves the film by up to 99 µm against an
-    hour before (control/film.py). Raise it for a room that changes faster."""
+    """The same within an hour: a day of +-2 K and +-10 % relative humidity moves the film by up to
+    99 µm against an hour before (control/film.py). Raise it for a room that changes faster."""
     laser_gauge_day_max_um: Annotated[float, Field(gt=0, le=10000)] = 700.0
-    """The same within a day: such a climate moves the film by up to 624 µm. The true centre may be off by as much.
-    Lower it for a room with a steady climate; a third of it raises the notice `slow_drift`."""
+    """The same within a day: such a climate moves the film by up to 624 µm. The true centre may be
+    off by as much. Lower it for a room with a steady climate; a third of it raises the notice
+    `slow_drift`."""
     leak_growth_max: Annotated[float, Field(gt=1, le=1000)] = 2.2
-    """Factor by which the gas taken may grow unseen by a camera: a doubled leak is a leak, more may be a runaway.
-    Raise it for a film whose leak varies."""
+    """Factor by which the gas taken may grow unseen by a camera: a doubled leak is a leak, more may
+    be a runaway. Raise it for a film whose leak varies."""
     following_error_max_um: Annotated[float, Field(gt=0, le=10000)] = 60.0
     """Largest distance from the setpoint. Raise it where gusts move the mirror farther."""
     band_um: Annotated[float, Field(gt=0, le=1e4)] = 2.0
-    """Distance from the setpoint within which the mirror counts as held. Change it to what your optics need."""
+    """Distance from the setpoint within which the mirror counts as held. Change it to what your
+    optics need.
+    """
 
 
 class StatesConfig(Section):
@@ -171,46 +228,64 @@ class StatesConfig(Section):
     check_timeout_s: Annotated[float, Field(gt=0, le=3600)] = 15.0
     """Longest wait for those readings. Raise it for sensors that warm up."""
     actuator_test: bool = True
-    """Pump up, pump off, vent, before a hold: does the film answer? Leave it on, except to debug a bench."""
+    """Pump up, pump off, vent, before a hold: does the film answer? Leave it on, except to debug a
+    bench.
+    """
     inflate_timeout_s: Annotated[float, Field(gt=0, le=1e6)] = 14_400.0
-    """Longest inflation; a fill from flat takes two hours. Change it to twice the fill time of your mirror."""
+    """Longest inflation; a fill from flat takes two hours. Change it to twice the fill time of your
+    mirror.
+    """
     inflate_pause_um: Annotated[float, Field(gt=0, le=1e4)] = 10.0
     """The ramp waits if the centre lags further. Raise it where gusts stop the ramp too often."""
     inflate_stall_s: Annotated[float, Field(gt=0, le=1e6)] = 300.0
-    """Time in which an inflation must lift the mirror by its band: a pump of 1.2 times the leak takes 40 s, one that
-    takes longer than this is dead or too weak. Raise it for a weaker pump."""
+    """Time in which an inflation must lift the mirror by its band: a pump of 1.2 times the leak
+    takes 40 s, one that takes longer than this is dead or too weak. Raise it for a weaker pump."""
     settle_s: Annotated[float, Field(ge=0.1, le=3600)] = 1.5
     """Time within the band before `hold` begins. Raise it where the mirror overshoots."""
     settle_timeout_s: Annotated[float, Field(gt=0, le=1e6)] = 600.0
     """Longest settling. Raise it for slow loops."""
     hold_flow_max_s: Annotated[float, Field(gt=0, le=600)] = 12.0
-    """Longest hold of the mean flow without a reading. 10 s cost 1.6 µm on average (docs/physics.md); longer is no
-    glitch. Raise it where a longer loss is known to be harmless."""
+    """Longest hold of the mean flow without a reading. 10 s cost 1.6 µm on average
+    (docs/physics.md); longer is no glitch. Raise it where a longer loss is known to be harmless."""
     ramp_down_s: Annotated[float, Field(gt=0, le=600)] = 10.0
-    """Time in which the flow then ramps down. Leave it, except for a film that must be lowered more slowly."""
+    """Time in which the flow then ramps down. Leave it, except for a film that must be lowered more
+    slowly.
+    """
     pump_off_max_s: Annotated[float, Field(gt=0, le=1e6)] = 3600.0
-    """Time with the pump off after which the mirror is vented. Lower it if it must be empty sooner after a fault."""
+    """Time with the pump off after which the mirror is vented. Lower it if it must be empty sooner
+    after a fault.
+    """
     lower_timeout_s: Annotated[float, Field(gt=0, le=600)] = 3.0
-    """Time by which a pump commanded off must have stopped. Raise it for a pump that runs down slowly."""
+    """Time by which a pump commanded off must have stopped. Raise it for a pump that runs down
+    slowly.
+    """
     pause_max_s: Annotated[float, Field(gt=0, le=1e5)] = 600.0
     """Longest `pause`; then the loop holds again. Raise it for longer work on the optics."""
     manual_max_s: Annotated[float, Field(gt=0, le=1e5)] = 600.0
     """Time after the last `manual` until the loop holds again. Raise it for longer experiments."""
     manual_range_um: Annotated[float, Field(gt=0, le=1e4)] = 50.0
-    """Distance from the setpoint at which `manual` and `pause` end. Raise it for larger experiments."""
+    """Distance from the setpoint at which `manual` and `pause` end. Raise it for larger
+    experiments.
+    """
     vented_pressure_pa: Annotated[float, Field(ge=0, le=5000)] = 100.0
     """Gauge pressure below which `vent` is done. Change it for a gauge whose zero is uncertain."""
     latch_twin_faults: bool = False
-    """Let a trip or a lock of the twin block the next run, as a real one does. Set it to practise recovery."""
+    """Let a trip or a lock of the twin block the next run, as a real one does. Set it to practise
+    recovery.
+    """
     stay_after_trip: bool = False
-    """Wait in `fault` for `ctl ack` instead of ending the run. Set it to true to acknowledge remotely."""
+    """Wait in `fault` for `ctl ack` instead of ending the run. Set it to true to acknowledge
+    remotely.
+    """
 
 
 class ResumeConfig(Section):
     """Which latched faults may clear automatically once their cause has gone."""
 
     faults: tuple[str, ...] = ()
-    """Names of those faults (docs/faults.md, "may resume"). Set it for known harmless causes, e.g. `link_lost`."""
+    """Names of those faults (docs/faults.md, "may resume"). Set it for known harmless causes, e.g.
+    `link_lost`.
+    """
     wait_s: Annotated[float, Field(ge=1, le=1e5)] = 30.0
     """Time without the cause before a resume. Raise it for causes that come and go."""
     most_per_day: Annotated[int, Field(ge=0, le=1000)] = 3
@@ -223,17 +298,20 @@ class ShapeConfig(Section):
     enabled: bool = True
     """Measure the shape and trim the setpoint. Set it to false on a bench without a camera."""
     mode: Literal["cycle", "track"] = "cycle"
-    """`cycle` takes the frames of a figure one pattern after the other; `track` lets crossed fringes stand still, so
-    that every frame is a figure. Set it to `track` for a figure at the camera's rate (docs/tracking.md)."""
+    """`cycle` takes the frames of a figure one pattern after the other; `track` lets crossed
+    fringes stand still, so that every frame is a figure. Set it to `track` for a figure at the
+    camera's rate (docs/tracking.md)."""
     period_s: Annotated[float, Field(ge=0.2, le=3600)] = 2.0
     """Interval between cycles. Raise it for a camera or machine that needs longer."""
     frame_interval_s: Annotated[float, Field(ge=0.0, le=10)] = 0.1
     """Interval between the frames of a cycle. Raise it for a display that settles slowly."""
     bin_px: Annotated[int, Field(ge=1, le=16)] = 4
-    """Side of the squares of camera pixels that are averaged. Lower it for more detail at more computing."""
+    """Side of the squares of camera pixels that are averaged. Lower it for more detail at more
+    computing.
+    """
     time_constant_s: Annotated[float, Field(ge=1, le=1e5)] = 40.0
-    """Memory of the trim's tracker: a mount that starts to drift at 2 µm/min is followed within 0.5 µm
-    (control/filters.py). Change it with `tune outer`; noisier frames need a longer one."""
+    """Memory of the trim's tracker: a mount that starts to drift at 2 µm/min is followed within 0.5
+    µm (control/filters.py). Change it with `tune outer`; noisier frames need a longer one."""
     trim_rate_max_um_per_s: Annotated[float, Field(gt=0, le=10)] = 0.1
     """Fastest trim. Raise it for a mount that moves faster."""
     trim_max_um: Annotated[float, Field(gt=0, le=1000)] = 100.0
@@ -243,51 +321,68 @@ class ShapeConfig(Section):
     disagreement_max_um: Annotated[float, Field(gt=0, le=1000)] = 10.0
     """Largest jump between camera and laser that the trim follows. Raise it for noisier shapes."""
     track_rate_hz: Annotated[float, Field(ge=0.1, le=200)] = 20.0
-    """Figures per second in `track`, if camera and machine give that many. Lower it to leave more of the machine to
-    others."""
+    """Figures per second in `track`, if camera and machine give that many. Lower it to leave more
+    of the machine to others."""
     track_periods: Annotated[int, Field(ge=2, le=1000)] = 32
-    """Periods of the crossed fringes over the pattern; the mirror must show nine at least. Lower it for a camera with
-    few pixels; raise it where the screen's light wanders over short distances."""
+    """Periods of the crossed fringes over the pattern; the mirror must show nine at least. Lower it
+    for a camera with few pixels; raise it where the screen's light wanders over short distances."""
     track_step_s: Annotated[float, Field(ge=1, le=3600)] = 10.0
-    """Interval between steps of the crossed fringes; five steps measure the light anew. Lower it for a screen whose
-    light wanders within a minute."""
+    """Interval between steps of the crossed fringes; five steps measure the light anew. Lower it
+    for a screen whose light wanders within a minute."""
 
 
 class EstimatorConfig(Section):
-    """The estimate of the centre from laser, optics, barometer and thermometer (docs/estimator.md)."""
+    """The estimate of the centre from laser, optics, barometer and
+    thermometer (docs/estimator.md).
+    """
 
     process_value: Literal["laser", "estimate", "optics"] = "laser"
-    """What the inner loop holds: the laser's reading, the estimate of the centre, or that without a laser: `optics`
-    uses none, fitted or not. Change it to hold with the optics, or by them alone."""
+    """What the inner loop holds: the laser's reading, the estimate of the centre, or that without a
+    laser: `optics` uses none, fitted or not. Change it to hold with the optics, or by them alone.
+    """
     gain_per_s: Annotated[float, Field(gt=0, le=20)] = 16.0
-    """Speed at which the loop removes an error of the estimate. Lower it for a pump whose delay is uncertain."""
+    """Speed at which the loop removes an error of the estimate. Lower it for a pump whose delay is
+    uncertain.
+    """
     pump_delay_s: Annotated[float, Field(ge=0, le=10)] = 0.08
     """Dead time from command to gas. Change it to what `tune` found."""
     pump_lag_s: Annotated[float, Field(ge=0, le=10)] = 0.15
     """Time constant of the pump. Change it to what `tune` found."""
     laser_noise_um: Annotated[float, Field(gt=0, le=100)] = 1.0
-    """Noise of a laser reading; a hold learns it within a factor of 5. Change it to your laser's."""
+    """Noise of a laser reading; a hold learns it within a factor of 5. Change it to your laser's.
+    """
     optics_noise_um: Annotated[float, Field(gt=0, le=100)] = 0.01
-    """Noise of a measured sag beyond the one that its message states. Raise it for optics that tremble."""
+    """Noise of a measured sag beyond the one that its message states. Raise it for optics that
+    tremble.
+    """
     barometer_noise_pa: Annotated[float, Field(gt=0, le=100)] = 0.05
-    """Noise of the barometer; a hold learns it within a factor of 5. Change it to your barometer's."""
+    """Noise of the barometer; a hold learns it within a factor of 5. Change it to your barometer's.
+    """
     thermometer_noise_k: Annotated[float, Field(gt=0, le=10)] = 0.002
-    """Noise of the air thermometer; a hold learns it within a factor of 5. Change it to your thermometer's."""
+    """Noise of the air thermometer; a hold learns it within a factor of 5. Change it to your
+    thermometer's.
+    """
     pressure_walk_pa_per_root_s: Annotated[float, Field(gt=0, le=100)] = 0.3
     """Unrest of the air pressure; learned from a barometer. Change it for a bench without one."""
     air_walk_k_per_root_s: Annotated[float, Field(gt=0, le=10)] = 0.004
-    """Unrest of the air's temperature; learned from a thermometer. Change it for a bench without one."""
+    """Unrest of the air's temperature; learned from a thermometer. Change it for a bench without
+    one.
+    """
     centre_walk_um_per_root_s: Annotated[float, Field(gt=0, le=100)] = 0.02
-    """Unrest of the centre that no weather explains; a hold learns it. Raise it for a shaken bench."""
+    """Unrest of the centre that no weather explains; a hold learns it. Raise it for a shaken bench.
+    """
     leak_walk_um_per_s_per_root_s: Annotated[float, Field(gt=0, le=10)] = 0.015
-    """Unrest of the leak between its sudden changes, which the filter finds. Raise it for a leak that changes slowly:
-    it then follows sooner and passes more noise."""
+    """Unrest of the leak between its sudden changes, which the filter finds. Raise it for a leak
+    that changes slowly: it then follows sooner and passes more noise."""
     stand_um_per_k: Annotated[float, Field(ge=-100, le=100)] = 0.0
-    """Sag that the optics see too much for each kelvin by which their stand is warmer; it is taken out.
-    Set it to the measured one: a steel stand is near 0.34 at 2.7 m, invar near 0.03."""
+    """Sag that the optics see too much for each kelvin by which their stand is warmer; it is taken
+    out. Set it to the measured one: a steel stand is near 0.34 at 2.7 m, invar near 0.03."""
     stand_sigma_um_per_k: Annotated[float, Field(ge=0, le=100)] = 0.4
-    """How far that may be wrong, 1 sigma; it is part of the estimate's. Lower it for a stand that was measured."""
+    """How far that may be wrong, 1 sigma; it is part of the estimate's. Lower it for a stand that
+    was measured.
+    """
     stand_follows_air_s: Annotated[float, Field(ge=0, le=1e5)] = 1800.0
-    """Time constant with which the stand follows the air. Change it for a lighter or heavier stand."""
+    """Time constant with which the stand follows the air. Change it for a lighter or heavier stand.
+    """
     mount_walk_um_per_root_s: Annotated[float, Field(ge=0, le=10)] = 0.0033
     """Walk of the laser's mount: 0.2 µm in an hour. Change it to your mount's."""

@@ -1,7 +1,8 @@
-"""Which register, channel, coil or line each role of a configuration uses, so that no two roles use the same one.
+"""Which register, channel, coil or line each role of a configuration uses, so that no two roles use
+the same one.
 
-A pump and a gauge on one register would feed the pump's command back as a pressure; a pump and a vent on one would
-open together. Devices may be shared, places in them may not.
+A pump and a gauge on one register would feed the pump's command back as a pressure; a pump and a
+vent on one would open together. Devices may be shared, places in them may not.
 """
 
 from collections.abc import Callable, Hashable, Iterator, Mapping, Sequence
@@ -14,8 +15,8 @@ from firmware_iface import settings
 _WORDS = {"u32": 2, "i32": 2, "f32": 2}  # registers of a type; the others have one
 _MODBUS_PORT = 502
 _THIS_MACHINE = frozenset({"localhost", "127.0.0.1", "::1", "0.0.0.0", "::"})
-# Registers that the driver of a Bronkhorst instrument uses (bronkhorst.register_of): measure 0x20, setpoint 0x21,
-# control mode 0x24, and fmeasure in eight registers from 0x8000 + 256 * 33
+# Registers that the driver of a Bronkhorst instrument uses (bronkhorst.register_of): measure 0x20,
+# setpoint 0x21, control mode 0x24, and fmeasure in eight registers from 0x8000 + 256 * 33
 _BRONKHORST_REGISTERS = (0x20, 0x21, 0x24, *range(0xA100, 0xA108))
 
 
@@ -23,8 +24,8 @@ _BRONKHORST_REGISTERS = (0x20, 0x21, 0x24, *range(0xA100, 0xA108))
 class DevicePlace:
     """One place that a role uses.
 
-    `key` is the configuration key that names it, `where` compares equal for one and the same place, and `words`
-    describe it for people.
+    `key` is the configuration key that names it, `where` compares equal for one and the same place,
+    and `words` describe it for people.
     """
 
     key: str
@@ -39,20 +40,25 @@ def find_shared(
 ) -> str:
     """One line on two roles that use the same place; empty if there are none.
 
-    `roles` has the settings of each role's device. `name_link` gives one and the same value for links that lead to
-    one device, however spelt; without it only the text of a link is compared, as far as it can be without asking the
-    machine.
+    `roles` has the settings of each role's device. `name_link` gives one and the same value for
+    links that lead to one device, however spelt; without it only the text of a link is compared, as
+    far as it can be without asking the machine.
     """
     seen: dict[Hashable, DevicePlace] = {}
     for place in list_places(roles, interlocks, name_link or plain_link):
         other = seen.setdefault(place.where, place)
         if other.key != place.key:
-            return f"{other.key} and {place.key} name the same {place.words}; give each a place of its own"
+            return (
+                f"{other.key} and {place.key} name the same {place.words}; give each a place of "
+                "its own"
+            )
     return ""
 
 
 def list_places(
-    roles: Mapping[str, object], interlocks: Sequence[settings.InterlockDriver], name_link: Callable[[str], Hashable]
+    roles: Mapping[str, object],
+    interlocks: Sequence[settings.InterlockDriver],
+    name_link: Callable[[str], Hashable],
 ) -> Iterator[DevicePlace]:
     """Yield every place that the roles and interlocks use, in the order of the configuration."""
     for role, section in roles.items():
@@ -65,7 +71,11 @@ def list_places(
                 device = (name_link(section.link), section.unit_id)
                 yield DevicePlace(f"{key}.unit_id", (device, "instrument"), f"instrument, {unit}")
                 for address in _BRONKHORST_REGISTERS:
-                    yield DevicePlace(f"{key}.unit_id", (device, "holding", address), f"register {address} of {unit}")
+                    yield DevicePlace(
+                        f"{key}.unit_id",
+                        (device, "holding", address),
+                        f"register {address} of {unit}",
+                    )
     for index, interlock in enumerate(interlocks):
         yield circuit_place(f"devices.interlocks.{index}", interlock, name_link)
 
@@ -79,14 +89,18 @@ def _registers(
     kind = section.type or defaults.get("type", "u16")
     for address in range(section.address, section.address + _WORDS.get(kind, 1)):
         where = ((name_link(section.link), section.unit_id), function, address)
-        yield DevicePlace(key, where, f"{function} register {address} of unit {section.unit_id} of {section.link}")
+        yield DevicePlace(
+            key, where, f"{function} register {address} of unit {section.unit_id} of {section.link}"
+        )
 
 
 def _preset(name: str) -> dict[str, Any]:
     """Defaults of a preset; none for an unknown one, which is refused when the devices are made."""
     if not name:
         return {}
-    from firmware_iface.drivers import modbus_map  # imports the links, which most readers of a configuration need not
+    from firmware_iface.drivers import (
+        modbus_map,
+    )  # imports the links, which most readers of a configuration need not
 
     try:
         return modbus_map.preset(name)
@@ -94,7 +108,9 @@ def _preset(name: str) -> dict[str, Any]:
         return {}
 
 
-def circuit_place(key: str, interlock: settings.InterlockDriver, name_link: Callable[[str], Hashable]) -> DevicePlace:
+def circuit_place(
+    key: str, interlock: settings.InterlockDriver, name_link: Callable[[str], Hashable]
+) -> DevicePlace:
     """The place of an interlock's circuit; `key` is that of its table."""
     match interlock:
         case settings.BoardInputConfig():
@@ -102,16 +118,24 @@ def circuit_place(key: str, interlock: settings.InterlockDriver, name_link: Call
             return DevicePlace(f"{key}.input", ("board input", interlock.input), words)
         case settings.GpioLineConfig():
             words = f"line {interlock.line} of {interlock.chip}"
-            return DevicePlace(f"{key}.line", ("line", name_link(interlock.chip), interlock.line), words)
+            return DevicePlace(
+                f"{key}.line", ("line", name_link(interlock.chip), interlock.line), words
+            )
         case _:
-            where = ((name_link(interlock.link), interlock.unit_id), interlock.function, interlock.address)
+            where = (
+                (name_link(interlock.link), interlock.unit_id),
+                interlock.function,
+                interlock.address,
+            )
             bit = "coil" if interlock.function == "coil" else "discrete input"
             words = f"{bit} {interlock.address} of unit {interlock.unit_id} of {interlock.link}"
             return DevicePlace(f"{key}.address", where, words)
 
 
 def plain_link(link: str) -> Hashable:
-    """A link by its text: host and port, or the serial port without its settings; of a file its path."""
+    """A link by its text: host and port, or the serial port without its settings; of a file its
+    path.
+    """
     if not link.startswith("tcp:"):
         return link.removeprefix("rtu://").partition("?")[0]
     try:

@@ -14,14 +14,19 @@ Sigma = Annotated[float, Field(ge=0, le=1e5)]  # of whatever unit; 0: exact
 Axis = Annotated[tuple[Length, ...], Field(min_length=2, max_length=500)]
 
 _EVEN = 1e-6  # of the node spacing: rounding of written decimals
-_UNIT, _SQUARE = 1.1e-5, 1e-6  # of the squared length, from rounding to five digits, and of the cosine
+_UNIT, _SQUARE = (
+    1.1e-5,
+    1e-6,
+)  # of the squared length, from rounding to five digits, and of the cosine
 
 
 class HeightMapConfig(Section):
-    """Heights of the screen's face towards the mirror, interpolated by a bicubic spline through an even grid.
+    """Heights of the screen's face towards the mirror, interpolated by a bicubic spline through an
+    even grid.
 
-    `heights_mm[r][c]` belongs to `s_y_mm[r]` and `s_x_mm[c]`. With three nodes along an axis the spline is quadratic
-    there, with two linear. In TOML, `file` may replace `heights_mm`: a text file of numbers, one row per line.
+    `heights_mm[r][c]` belongs to `s_y_mm[r]` and `s_x_mm[c]`. With three nodes along an axis the
+    spline is quadratic there, with two linear. In TOML, `file` may replace `heights_mm`: a text
+    file of numbers, one row per line.
     """
 
     model_config = ConfigDict(json_schema_extra=lambda schema: _or_file(schema))
@@ -31,7 +36,8 @@ class HeightMapConfig(Section):
     s_y_mm: Axis
     """Rows of the grid along s_y, from O'. Set it to a grid that covers the pattern."""
     heights_mm: tuple[Axis, ...]
-    """Height at each node, a row for each `s_y_mm`. Set it from a measurement of the screen's face."""
+    """Height at each node, a row for each `s_y_mm`. Set it from a measurement of the screen's face.
+    """
 
     @model_validator(mode="after")
     def _grid(self) -> "HeightMapConfig":
@@ -41,17 +47,27 @@ class HeightMapConfig(Section):
                 raise ValueError(f"{name} must rise in even steps")
         rows, columns = len(self.s_y_mm), len(self.s_x_mm)
         if len(self.heights_mm) != rows or any(len(row) != columns for row in self.heights_mm):
-            shape = f"{len(self.heights_mm)} rows of {', '.join(sorted({str(len(row)) for row in self.heights_mm}))}"
-            raise ValueError(f"heights_mm has {shape} numbers; s_y_mm and s_x_mm require {rows} rows of {columns}")
-        if max(abs(h) for row in self.heights_mm for h in row) > 100:  # no screen is that crooked: µm taken for mm?
+            shape = (
+                f"{len(self.heights_mm)} rows of "
+                f"{', '.join(sorted({str(len(row)) for row in self.heights_mm}))}"
+            )
+            raise ValueError(
+                f"heights_mm has {shape} numbers; s_y_mm and s_x_mm require {rows} rows of "
+                f"{columns}"
+            )
+        if (
+            max(abs(h) for row in self.heights_mm for h in row) > 100
+        ):  # no screen is that crooked: µm taken for mm?
             raise ValueError("heights_mm has a height beyond 100 mm")
         return self
 
 
 class ScreenPoseConfig(Section):
-    """Any screen pose (O' in world, unit vectors `s_x` and `s_y`) and its face; both may be omitted.
+    """Any screen pose (O' in world, unit vectors `s_x` and `s_y`) and its face; both may be
+    omitted.
 
-    The face departs from the plane along s_x x s_y, towards the mirror, by the bow plus the height map.
+    The face departs from the plane along s_x x s_y, towards the mirror, by the bow plus the height
+    map.
     """
 
     origin_mm: Vector3 | None = None
@@ -61,7 +77,9 @@ class ScreenPoseConfig(Section):
     s_y: Vector3 | None = None
     """Direction of the screen's rows, upwards. Set it from a calibration."""
     bow_mm: Annotated[float, Field(ge=-100, le=100)] = 0.0
-    """Paraboloid of the face: its height 200 mm from O', towards the mirror. Change it to the calibrated one."""
+    """Paraboloid of the face: its height 200 mm from O', towards the mirror. Change it to the
+    calibrated one.
+    """
     height_map: HeightMapConfig | None = None
 
     @property
@@ -94,9 +112,11 @@ class PatternConfig(Section):
     steps: Annotated[int, Field(ge=3, le=64)] = 4
     """Phase steps per axis. Raise it against harmonics of the display; each step takes a frame."""
     periods: Annotated[int, Field(ge=1, le=8)] = 8
-    """Fringes across the pattern. Change it with `period_mm`, so that the pattern fits the screen."""
+    """Fringes across the pattern. Change it with `period_mm`, so that the pattern fits the screen.
+    """
     period_mm: Annotated[float, Field(ge=1, le=2000)] = 49.82
-    """Width of a fringe on the screen. Change it so that the reflected pattern covers the mirror."""
+    """Width of a fringe on the screen. Change it so that the reflected pattern covers the mirror.
+    """
 
 
 class CameraPoseConfig(Section):
@@ -112,14 +132,18 @@ class CameraPoseConfig(Section):
         (a, b, c), (d, e, f), (g, h, i) = self.rotation
         determinant = a * (e * i - f * h) - b * (d * i - f * g) + c * (d * h - e * g)
         if not _orthonormal(self.rotation) or determinant < 0:
-            raise ValueError("rotation is not a rotation matrix (rows: right, down, forward in world)")
+            raise ValueError(
+                "rotation is not a rotation matrix (rows: right, down, forward in world)"
+            )
         return self
 
 
 class SigmasConfig(Section):
-    """Standard uncertainties of what is not calibrated; the defaults are those of rulers and data sheets.
+    """Standard uncertainties of what is not calibrated; the defaults are those of rulers and data
+    sheets.
 
-    Those of a, b and alpha are beside them. A calibrated geometry replaces those that its calibration freed.
+    Those of a, b and alpha are beside them. A calibrated geometry replaces those that its
+    calibration freed.
     """
 
     screen_x_mm: Sigma = 1.0
@@ -157,11 +181,15 @@ class SigmasConfig(Section):
     laser_relative: Sigma = 1e-3
     """Scale of the laser, of its value. Set it from the laser's data sheet."""
     glass_mm: Sigma = 1.0
-    """Thickness of the glass in front of the screen's pixels, which bends the rays. Lower it if b includes it."""
+    """Thickness of the glass in front of the screen's pixels, which bends the rays. Lower it if b
+    includes it.
+    """
     air_k_per_m: Sigma = 0.5
     """Vertical gradient of the air's temperature, which bends the rays. Change it to the room's."""
     temperature_k: Sigma = 2.0
-    """Change of temperature since the distances were measured: steel grows. Change it to the room's."""
+    """Change of temperature since the distances were measured: steel grows. Change it to the
+    room's.
+    """
 
 
 class GeometryConfig(Section):
@@ -171,9 +199,12 @@ class GeometryConfig(Section):
     """
 
     a_mm: Annotated[float, Field(ge=100, le=100_000)] | None = None
-    """Distance from the mirror's vertex to the camera's pinhole. Set it to the measured distance."""
+    """Distance from the mirror's vertex to the camera's pinhole. Set it to the measured distance.
+    """
     b_mm: Annotated[float, Field(ge=100, le=100_000)] | None = None
-    """Distance from the mirror's vertex to O', the pattern's centre. Set it to the measured distance."""
+    """Distance from the mirror's vertex to O', the pattern's centre. Set it to the measured
+    distance.
+    """
     alpha_deg: Annotated[float, Field(gt=0, lt=180)] | None = None
     """Angle of either line of sight above the mirror's plane. Set it to the measured angle."""
     a_sigma_mm: Annotated[float, Field(ge=0, le=1e5)] | None = None
@@ -184,7 +215,9 @@ class GeometryConfig(Section):
     """Standard uncertainty of `alpha_deg`. Set it to get the error bars of the height."""
     sigmas: SigmasConfig | None = None
     reference_displacement_um: Micrometres | None = None
-    """Displacement when measured; the first frame's when absent. Set it if the mirror stood elsewhere then."""
+    """Displacement when measured; the first frame's when absent. Set it if the mirror stood
+    elsewhere then.
+    """
     camera: CameraPoseConfig | None = None
     screen: ScreenPoseConfig | None = None
 
@@ -196,7 +229,9 @@ class GeometryConfig(Section):
             return self
         if all(v is None for v in short) and all(v is not None for v in general):
             return self
-        raise ValueError("give either a_mm, b_mm and alpha_deg, or both [camera] and [screen] poses")
+        raise ValueError(
+            "give either a_mm, b_mm and alpha_deg, or both [camera] and [screen] poses"
+        )
 
 
 class CameraConfig(Section):
@@ -211,7 +246,9 @@ class CameraConfig(Section):
     pixel_um: Annotated[float, Field(ge=0.5, le=500)] = 3.45
     """Pitch of the pixels. Set it from the camera's data sheet."""
     principal_px: tuple[Length, Length] | None = None
-    """Principal point (column, row); the sensor's middle when absent. Set it from `calibrate-camera`."""
+    """Principal point (column, row); the sensor's middle when absent. Set it from
+    `calibrate-camera`.
+    """
     distortion: tuple[Length, ...] = ()
     """OpenCV's k1, k2, p1, p2[, k3[, k4, k5, k6]]. Set it from `calibrate-camera`."""
     noise_adu: Annotated[float, Field(ge=0, le=65_535)] = 0.4
@@ -233,7 +270,9 @@ class MirrorConfig(Section):
     analysis_radius_mm: Annotated[float, Field(ge=10, le=50_000)] = 475.0
     """Radius of the part that is measured. Lower it to leave out a bad edge."""
     sag_mm: Annotated[float, Field(ge=0.1, le=10_000)] = 37.1
-    """Depth of the bowl at displacement 0. Set it for another film: laser and gauge are compared with it."""
+    """Depth of the bowl at displacement 0. Set it for another film: laser and gauge are compared
+    with it.
+    """
     pressure_pa: Annotated[float, Field(ge=0, le=5000)] = 600.0
     """Gauge reading at displacement 0; 0: unknown. Set it for another film."""
 
@@ -259,7 +298,8 @@ class OpticsConfig(Section):
         half_mm = self.pattern.periods * self.pattern.period_mm / 2
         if self.geometry.screen is not None and not self.geometry.screen.covers(half_mm):
             raise ValueError(
-                f"geometry.screen.height_map must reach over the pattern, {half_mm:g} mm from O' each way"
+                f"geometry.screen.height_map must reach over the pattern, {half_mm:g} mm "
+                "from O' each way"
             )
         return self
 
@@ -268,26 +308,41 @@ Share = Annotated[float, Field(ge=0, le=0.5)]
 
 
 class DisturbancesConfig(Section):
-    """What disturbs the twin's pictures, and those of `simulate`: amplitudes; 0 switches an effect off."""
+    """What disturbs the twin's pictures, and those of `simulate`: amplitudes; 0 switches an effect
+    off.
+    """
 
     brightness_fraction: Share = 0.0
-    """Wandering of the screen's light, RMS, in waves of 75 mm. Raise it to see changing light or colour."""
+    """Wandering of the screen's light, RMS, in waves of 75 mm. Raise it to see changing light or
+    colour.
+    """
     dimming_fraction_per_h: Share = 0.0
     """Share of the screen's light that is lost in an hour. Raise it to see an ageing backlight."""
     ambient_fraction: Share = 0.0
-    """Room light on the mirror, of full scale, with a slope and a swing. Raise it to see an unshaded bench."""
+    """Room light on the mirror, of full scale, with a slope and a swing. Raise it to see an
+    unshaded bench.
+    """
     backlight_hz: Annotated[float, Field(ge=0, le=1e5)] = 0.0
-    """Pulses of the screen's backlight; 0: steady. Set it to your screen's to see what an exposure of 20 ms sees."""
+    """Pulses of the screen's backlight; 0: steady. Set it to your screen's to see what an exposure
+    of 20 ms sees.
+    """
     sticking_fraction: Share = 0.0
-    """Light lost where the panel has shown white for hours. Raise it to see a picture that sticks."""
+    """Light lost where the panel has shown white for hours. Raise it to see a picture that sticks.
+    """
     dust: Annotated[int, Field(ge=0, le=1000)] = 0
     """Spots on the mirror, elsewhere every 25 s. Raise it to see a dusty room."""
     rolling_s: Annotated[float, Field(ge=0, le=1)] = 0.0
-    """Time from the first to the last row of a picture; 0: a global shutter. Set it to your camera's."""
+    """Time from the first to the last row of a picture; 0: a global shutter. Set it to your
+    camera's.
+    """
     stand_k: Annotated[float, Field(ge=0, le=20)] = 0.0
-    """Swing of the temperature of the camera's stand, which grows by 60 µm/K. Raise it to see the sag follow it."""
+    """Swing of the temperature of the camera's stand, which grows by 60 µm/K. Raise it to see the
+    sag follow it.
+    """
     seeing_um: Annotated[float, Field(ge=0, le=1000)] = 0.0
-    """Where rays meet the screen, wandering within half a second. Raise it to see warm air over the mirror."""
+    """Where rays meet the screen, wandering within half a second. Raise it to see warm air over the
+    mirror.
+    """
 
 
 def _or_file(schema: dict[str, Any]) -> None:

@@ -4,7 +4,9 @@ from firmware_iface.settings import Section
 
 
 class OriginSection(Section):
-    """A file whose first members are those of `model.program.file_origin`; files from elsewhere have none of them."""
+    """A file whose first members are those of `model.program.file_origin`; files from elsewhere
+    have none of them.
+    """
 
     program: str = ""
     commit: str = ""

@@ -15,7 +15,8 @@ SOCKET_NAME = "control.sock"
 LOCAL = "127.0.0.1"
 LOCAL_HOSTS = frozenset({LOCAL, "localhost", "::1"})
 _PUBLIC_URL = re.compile(
-    r"https?://(\[[0-9a-f:.]+\]|[a-z0-9.-]+)(:[0-9]{1,5})?(/[A-Za-z0-9_~-]+)*/?"  # no segment that a browser resolves
+    # no segment that a browser resolves
+    r"https?://(\[[0-9a-f:.]+\]|[a-z0-9.-]+)(:[0-9]{1,5})?(/[A-Za-z0-9_~-]+)*/?"
 )
 Seconds = Annotated[float, Field(ge=0, le=1e6)]
 Limit = Annotated[float, Field(ge=-1e12, le=1e12)]
@@ -42,16 +43,25 @@ class PortConfig(Section):
     enabled: bool = True
     """Listen for commands. Set it to false to take none but signals."""
     socket: str | None = None
-    """Socket file; control.sock beside the run folders when absent. Set it for a path that others expect."""
+    """Socket file; control.sock beside the run folders when absent. Set it for a path that others
+    expect.
+    """
     group: str | None = None
-    """Group that owns the socket file, whose members may connect. Set it to let others operate the mirror."""
+    """Group that owns the socket file, whose members may connect. Set it to let others operate the
+    mirror.
+    """
     group_role: Literal["read", "operate", "tune"] = "operate"
-    """Role of everyone but the owner and root, who have `tune`. Change it to restrict or trust the group."""
+    """Role of everyone but the owner and root, who have `tune`. Change it to restrict or trust the
+    group.
+    """
     commander_lapses_s: Annotated[float, Field(ge=1, le=1e6)] = 600.0
-    """Silence after which another may command without --take-over. Change it to the pace of your shifts."""
+    """Silence after which another may command without --take-over. Change it to the pace of your
+    shifts.
+    """
     tls: TlsConfig | None = None
     metrics_port: Annotated[int, Field(ge=1, le=65535)] | None = None
-    """Port of the Prometheus metrics, on 127.0.0.1 only; absent: none. Set it to monitor the hold."""
+    """Port of the Prometheus metrics, on 127.0.0.1 only; absent: none. Set it to monitor the hold.
+    """
 
     def socket_in(self, logs_dir: Path) -> Path:
         """The socket's file of a hold with its runs in `logs_dir`."""
@@ -106,9 +116,13 @@ class WebConfig(Section):
     names: tuple[str, ...] = ()
     """Host names by which browsers call it. Set them where it is not the host above."""
     public_url: str = ""
-    """Address that browsers open, such as https://lab.example/mirror/. Set it behind a reverse proxy."""
+    """Address that browsers open, such as https://lab.example/mirror/. Set it behind a reverse
+    proxy.
+    """
     trusted_proxies: tuple[str, ...] = ()
-    """Addresses of proxies whose X-Forwarded-For counts. Set them to limit logins by the clients' addresses."""
+    """Addresses of proxies whose X-Forwarded-For counts. Set them to limit logins by the clients'
+    addresses.
+    """
     users_file: str | None = None
     """Names, roles and passwords of `web add-user`. Set it for a login instead of a link."""
     certificate_file: str | None = None
@@ -133,7 +147,8 @@ class WebConfig(Section):
     def _plain_url(cls, text: str) -> str:
         if text and _PUBLIC_URL.fullmatch(text) is None:
             raise ValueError(
-                f"{text}: write it like https://lab.example/mirror/, without user, query or dots in the path"
+                f"{text}: write it like https://lab.example/mirror/, without user, query or "
+                "dots in the path"
             )
         return text
 
@@ -143,13 +158,15 @@ class WebConfig(Section):
             raise ValueError("certificate and key: give both files, or none")
         if self.host not in LOCAL_HOSTS and not (self.secure and self.users_file):
             raise ValueError(
-                f"host {self.host}: other machines need TLS and a login; give a certificate, its key and users"
+                f"host {self.host}: other machines need TLS and a login; give a certificate, "
+                "its key and users"
             )
         url = urlsplit(self.public_url)
         local = not self.public_url or url.hostname in LOCAL_HOSTS
         if not local and not (url.scheme == "https" and self.users_file):
             raise ValueError(
-                f"public_url {self.public_url}: other machines need TLS and a login; use https and give users"
+                f"public_url {self.public_url}: other machines need TLS and a login; use "
+                "https and give users"
             )
         return self
 
@@ -166,9 +183,13 @@ class MqttConfig(Section):
     password_file: str | None = None
     """File with the password alone, which no run copies. Set it with `username`."""
     ca_file: str | None = None
-    """CA of the broker's certificate; with it the connection is TLS. Set it for a broker on another machine."""
+    """CA of the broker's certificate; with it the connection is TLS. Set it for a broker on another
+    machine.
+    """
     discovery_prefix: str = "homeassistant"
-    """Prefix of Home Assistant's discovery; empty: none. Leave it, unless Home Assistant's was changed."""
+    """Prefix of Home Assistant's discovery; empty: none. Leave it, unless Home Assistant's was
+    changed.
+    """
 
 
 class OpcuaConfig(Section):
@@ -179,9 +200,13 @@ class OpcuaConfig(Section):
     port: Annotated[int, Field(ge=1, le=65535)] = 4840
     """TCP port. Change it if another program has it."""
     users_file: str | None = None
-    """Users and passwords, made with `membrane-ctrl web add-user`. Set it so that only they may read and act."""
+    """Users and passwords, made with `membrane-ctrl web add-user`. Set it so that only they may
+    read and act.
+    """
     certificate_file: str | None = None
-    """Certificate of this server (RSA, PEM); with it all sessions are encrypted. Set it with `key_file`."""
+    """Certificate of this server (RSA, PEM); with it all sessions are encrypted. Set it with
+    `key_file`.
+    """
     key_file: str | None = None
     """Private key of the certificate. Set it with `certificate_file`."""
 
@@ -195,7 +220,10 @@ class OpcuaConfig(Section):
         if (self.certificate_file is None) != (self.key_file is None):
             raise ValueError("certificate and key: give both files, or none")
         if self.host not in LOCAL_HOSTS and self.users_file is not None and not self.encrypted:
-            raise ValueError(f"host {self.host}: passwords would cross the network in plain text; give a certificate")
+            raise ValueError(
+                f"host {self.host}: passwords would cross the network in plain text; give a "
+                "certificate"
+            )
         return self
 
 
@@ -227,17 +255,24 @@ class DoorsConfig(Section):
     def _only_people_we_know_act(self) -> "DoorsConfig":
         for name, door in (("opcua", self.opcua), ("epics", self.epics)):
             known = isinstance(door, OpcuaConfig) and door.users_file is not None
-            if door is not None and door.host not in LOCAL_HOSTS and self.role != "read" and not known:
+            if (
+                door is not None
+                and door.host not in LOCAL_HOSTS
+                and self.role != "read"
+                and not known
+            ):
                 remedy = "give users_file, or keep" if name == "opcua" else "keep"
                 raise ValueError(
-                    f"{name}.host = {door.host!r}: this door cannot tell who acts from another machine; "
+                    f"{name}.host = {door.host!r}: this door cannot tell who acts from "
+                    "another machine; "
                     f"{remedy} role = 'read', or the host {LOCAL}"
                 )
         return self
 
 
 class AlarmRule(Section):
-    """An alarm on one telemetry field, raised beyond one limit and cleared only on the good side of the other.
+    """An alarm on one telemetry field, raised beyond one limit and cleared only on the good side of
+    the other.
 
     High values are bad if `raise_at` is above `clear_at`, low ones if it is below.
     """
@@ -260,7 +295,9 @@ class AlarmRule(Section):
     @model_validator(mode="after")
     def _sound(self) -> "AlarmRule":
         if self.field not in FIELDS:
-            raise ValueError(f"field: unknown telemetry field {self.field!r}; known: {', '.join(FIELDS)}")
+            raise ValueError(
+                f"field: unknown telemetry field {self.field!r}; known: {', '.join(FIELDS)}"
+            )
         if self.raise_at == self.clear_at:
             raise ValueError("raise_at and clear_at must differ, or the alarm would flap")
         return self
@@ -270,7 +307,9 @@ _RULES = (
     # the film's own motion is below 1 µm: ten times that for half a minute is not a gust
     AlarmRule(name="out_of_band", field="error_um", raise_at=10.0, clear_at=3.0, magnitude=True),
     # a leak that takes nearly all of the pump's flow will soon take more
-    AlarmRule(name="pump_near_limit", field="pump_fraction", raise_at=0.9, clear_at=0.7, for_s=120.0),
+    AlarmRule(
+        name="pump_near_limit", field="pump_fraction", raise_at=0.9, clear_at=0.7, for_s=120.0
+    ),
 )
 
 
@@ -278,17 +317,24 @@ class AlarmsConfig(Section):
     """Which alarms go to whom. Without `urls_file` none are sent."""
 
     urls_file: str | None = None
-    """File with one Apprise URL per line, which no run copies. Set it to send alarms; without it none are sent."""
+    """File with one Apprise URL per line, which no run copies. Set it to send alarms; without it
+    none are sent.
+    """
     escalation_urls_file: str | None = None
-    """The same for those who are notified when nobody acknowledges. Set it if there is a second person to tell."""
+    """The same for those who are notified when nobody acknowledges. Set it if there is a second
+    person to tell.
+    """
     escalate_after_s: Annotated[float, Field(ge=1, le=1e6)] = 900.0
     """Time without acknowledgement before that. Lower it where minutes count."""
     remind_every_s: Annotated[float, Field(ge=60, le=1e6)] = 3600.0
     """Interval of the reminders. Change it to what people will not silence."""
     clear_after_s: Seconds = 30.0
-    """Absence after which an alarm is cleared; back sooner, it is the same alarm. Raise it for what flickers."""
+    """Absence after which an alarm is cleared; back sooner, it is the same alarm. Raise it for what
+    flickers.
+    """
     silent_s: Annotated[float, Field(ge=1, le=3600)] = 5.0
-    """Time without a tick that is an alarm of its own. Leave it, except on a machine that pauses."""
+    """Time without a tick that is an alarm of its own. Leave it, except on a machine that pauses.
+    """
     rules: tuple[AlarmRule, ...] = _RULES
     """Alarms on telemetry. Change it to add your own; a list replaces the default rules."""
 

@@ -1,6 +1,8 @@
-"""What each key means: `docs/configuration.md`, the JSON schema and `config explain`, all made from the schema.
+"""What each key means: `docs/configuration.md`, the JSON schema and `config explain`, all made from
+the schema.
 
-Range and default come from pydantic, the unit from the key's name, meaning and advice from the text below the key.
+Range and default come from pydantic, the unit from the key's name, meaning and advice from the text
+below the key.
 """
 
 import ast
@@ -24,16 +26,42 @@ from membrane_ctrl.model.errors import InputError
 
 _ADVICE = re.compile(r"(?<=[.;?])\s+(?=(?:Change|Leave|Lower|Raise|Set)\b)")
 _UNITS = {
-    "adu": "counts", "baud": "Bd", "bits": "bits", "bytes": "bytes", "cycles": "cycles", "day": "day", "days": "days",
-    "db": "dB", "deg": "deg", "fraction": "1", "gb": "GB", "h": "h", "hz": "Hz", "k": "K", "khz": "kHz", "mb": "MB",
-    "m": "m", "min": "min", "mm": "mm", "ms": "ms", "mw": "mW", "n": "N", "nm": "nm", "pa": "Pa", "px": "px",
-    "s": "s", "s2": "s2", "um": "µm",
-}  # fmt: skip
+    "adu": "counts",
+    "baud": "Bd",
+    "bits": "bits",
+    "bytes": "bytes",
+    "cycles": "cycles",
+    "day": "day",
+    "days": "days",
+    "db": "dB",
+    "deg": "deg",
+    "fraction": "1",
+    "gb": "GB",
+    "h": "h",
+    "hz": "Hz",
+    "k": "K",
+    "khz": "kHz",
+    "mb": "MB",
+    "m": "m",
+    "min": "min",
+    "mm": "mm",
+    "ms": "ms",
+    "mw": "mW",
+    "n": "N",
+    "nm": "nm",
+    "pa": "Pa",
+    "px": "px",
+    "s": "s",
+    "s2": "s2",
+    "um": "µm",
+}
 
 
 @dataclass(frozen=True, slots=True)
 class Key:
-    """A key of a table, as text; `unit` is empty for what is no quantity, `advice` says when to change it."""
+    """A key of a table, as text; `unit` is empty for what is no quantity, `advice` says when to
+    change it.
+    """
 
     name: str
     unit: str
@@ -45,7 +73,9 @@ class Key:
 
 @dataclass(frozen=True, slots=True)
 class TableHelp:
-    """A table and where it may stand; one of a device has the name of its driver, and of several alike `many`."""
+    """A table and where it may stand; one of a device has the name of its driver, and of several
+    alike `many`.
+    """
 
     places: tuple[str, ...]
     driver: str
@@ -72,7 +102,9 @@ class _TomlSchema(GenerateJsonSchema):
 
 @cache
 def json_schema(root: type[BaseModel] = Config) -> dict[str, Any]:
-    """The JSON schema of a configuration file, or of a table's class, with texts. Treat it as constant."""
+    """The JSON schema of a configuration file, or of a table's class, with texts. Treat it as
+    constant.
+    """
     schema = root.model_json_schema(schema_generator=_TomlSchema)
     texts, chosen = _texts(root), set(re.findall(r'"\w+": "#/\$defs/(\w+)"', json.dumps(schema)))
     for name, table in [*schema.get("$defs", {}).items(), (root.__name__, schema)]:
@@ -81,14 +113,18 @@ def json_schema(root: type[BaseModel] = Config) -> dict[str, Any]:
                 field["description"] = text
             if field.get("default", 0) is None:
                 del field["default"]
-        if name in chosen:  # from a union, by the driver: the file must name it, although the class has a default
+        if (
+            name in chosen
+        ):  # from a union, by the driver: the file must name it, although the class has a default
             table["required"] = sorted({*table.get("required", ()), "driver"})
     return {"$schema": "https://json-schema.org/draft/2020-12/schema", **schema}
 
 
 @cache
 def tables() -> tuple[TableHelp, ...]:
-    """Every table of a configuration in the order of the schema, each once. Raises KeyError for an unknown unit."""
+    """Every table of a configuration in the order of the schema, each once. Raises KeyError for an
+    unknown unit.
+    """
     schema = json_schema()
     places: dict[str, list[tuple[str, Any]]] = {}
     for place, name, default in _places(schema, "", schema, Config().model_dump(mode="json")):
@@ -97,12 +133,16 @@ def tables() -> tuple[TableHelp, ...]:
 
 
 def _places(schema: Any, prefix: str, table: Any, defaults: Any) -> Iterator[tuple[str, str, Any]]:
-    """Yield each table below another, outermost first: its place, the name of its class, its defaults."""
+    """Yield each table below another, outermost first: its place, the name of its class, its
+    defaults.
+    """
     for key, field in table["properties"].items():
         place = f"{prefix}{key}"
         for name in re.findall(r'"\$ref": "#/\$defs/(\w+)"', json.dumps(field)):
             inner = defaults.get(key) if isinstance(defaults, dict) else None
-            if inner is None and field.get("type") == "array":  # below a table that is absent by default
+            if (
+                inner is None and field.get("type") == "array"
+            ):  # below a table that is absent by default
                 inner = []
             yield place, name, inner
             yield from _places(schema, f"{place}.", schema["$defs"][name], inner)
@@ -113,40 +153,60 @@ def _table(table: Any, found: list[tuple[str, Any]]) -> TableHelp:
     required = table.get("required", ())
     keys = []
     for name, field in table["properties"].items():
-        if "$ref" in json.dumps({**field, "items": None}) or (name == "driver" and "const" in field):
+        if "$ref" in json.dumps({**field, "items": None}) or (
+            name == "driver" and "const" in field
+        ):
             continue  # a table of its own, or the name of this one
         meaning, *advice = _ADVICE.split(" ".join(field.get("description", "").split()), maxsplit=1)
-        default = "required" if name in required else _shown(defaults.get(name, field.get("default")))
+        default = (
+            "required" if name in required else _shown(defaults.get(name, field.get("default")))
+        )
         keys.append(Key(name, unit_of(name), _range(field), default, meaning, "".join(advice)))
     driver = table["properties"].get("driver", {}).get("const", "")
     places = tuple(dict.fromkeys(place for place, _ in found))
     many = any(isinstance(default, list) for _, default in found)
-    return TableHelp(places, driver, many, " ".join(table.get("description", "").split()), tuple(keys))
+    return TableHelp(
+        places, driver, many, " ".join(table.get("description", "").split()), tuple(keys)
+    )
 
 
 def explained(word: str) -> tuple[TableHelp, ...]:
-    """The tables, or parts of them, that a word names: `loop`, `loop.kp_per_s`, `kp_per_s`, `devices.pump`, `ventus`.
+    """The tables, or parts of them, that a word names: `loop`, `loop.kp_per_s`, `kp_per_s`,
+    `devices.pump`, `ventus`.
 
     Raises InputError with the nearest names.
     """
     wanted, found, known = word.strip("[]` "), [], []
     for table in tables():
         prefixes = [name for name in (*table.places, table.driver) if name]
-        names = {key.name: {key.name, *(f"{prefix}.{key.name}" for prefix in prefixes)} for key in table.keys}
+        names = {
+            key.name: {key.name, *(f"{prefix}.{key.name}" for prefix in prefixes)}
+            for key in table.keys
+        }
         known += [*prefixes, *(name for key in names.values() for name in sorted(key))]
-        keys = table.keys if wanted in prefixes else tuple(key for key in table.keys if wanted in names[key.name])
+        keys = (
+            table.keys
+            if wanted in prefixes
+            else tuple(key for key in table.keys if wanted in names[key.name])
+        )
         if keys or wanted in prefixes:
             found.append(replace(table, keys=keys))
     found = found or _of_other_packages(wanted)
     if not found:
         inside = sorted({name for name in known if wanted and wanted in name}, key=len)[:3]
-        near = f"did you mean {' or '.join(inside)}?" if inside else hint(wanted, known, "see `config reference`")
+        near = (
+            f"did you mean {' or '.join(inside)}?"
+            if inside
+            else hint(wanted, known, "see `config reference`")
+        )
         raise InputError(f"{word}: no such key or table; {near}")
     return tuple(found)
 
 
 def _of_other_packages(word: str) -> list[TableHelp]:
-    """Return the table of each installed driver of this name, whose package is loaded. Raises InputError."""
+    """Return the table of each installed driver of this name, whose package is loaded. Raises
+    InputError.
+    """
     found = []
     for kind in drivers.KINDS:
         if all(entry.name != word for entry in drivers.list_installed(kind.group)):
@@ -159,7 +219,9 @@ def _of_other_packages(word: str) -> list[TableHelp]:
         try:
             table = _table(json_schema(driver.Settings), places)
         except Exception as error:  # whatever its settings are
-            raise InputError(f"{word}: its settings cannot be shown: {type(error).__name__}: {error}") from error
+            raise InputError(
+                f"{word}: its settings cannot be shown: {type(error).__name__}: {error}"
+            ) from error
         found.append(replace(table, driver="external"))
     return found
 
@@ -174,7 +236,9 @@ def _places_of_driver(driver: Any, kind: drivers.DriverKind) -> list[str]:
 
 
 def unit_of(name: str) -> str:
-    """Return the unit at the end of a key's name: `um/s` of `flow_max_um_per_s`, empty without one."""
+    """Return the unit at the end of a key's name: `um/s` of `flow_max_um_per_s`,
+    empty without one.
+    """
     words = name.split("_")
     if words[-1] not in _UNITS or (len(words) == 1 and words[0] not in ("baud", "bits")):
         return ""
@@ -192,12 +256,20 @@ def _range(field: Any) -> str:
         return _limits(field) + (", whole" if kind == "integer" else "")
     if kind == "array":
         parts = field.get("prefixItems")
-        return f"{len(parts)} x ({_range(parts[0])})" if parts else f"list of {_range(field['items'])}"
+        return (
+            f"{len(parts)} x ({_range(parts[0])})" if parts else f"list of {_range(field['items'])}"
+        )
     if kind == "boolean":
         return "true, false"
     if "pattern" in field:
         return f"text like {field['pattern']}"
-    return "a table" if "$ref" in field or "oneOf" in field else "a file" if field.get("format") == "path" else "text"
+    return (
+        "a table"
+        if "$ref" in field or "oneOf" in field
+        else "a file"
+        if field.get("format") == "path"
+        else "text"
+    )
 
 
 def _limits(field: Any) -> str:
@@ -219,7 +291,9 @@ def _shown(default: Any) -> str:
 
 
 def _texts(root: type[BaseModel]) -> dict[tuple[str, str], str]:
-    """Return the text below each key of the schema's classes, or of the class that defines the key for them."""
+    """Return the text below each key of the schema's classes, or of the class that defines the key
+    for them.
+    """
     found: dict[tuple[str, str], str] = {}
     for section in _classes(root):
         for base in reversed(section.__mro__):
@@ -264,7 +338,14 @@ def page() -> str:
                 "|---|---|---|---|---|---|",
             ]
         for key in table.keys:
-            cells = (f"`{key.name}`", key.unit, key.range, f"`{key.default}`", key.meaning, key.advice)
+            cells = (
+                f"`{key.name}`",
+                key.unit,
+                key.range,
+                f"`{key.default}`",
+                key.meaning,
+                key.advice,
+            )
             lines.append("| " + " | ".join(cell.replace("|", "\\|") for cell in cells) + " |")
     return "\n".join([*lines, ""])
 
@@ -294,4 +375,4 @@ first line (taplo, or Even Better TOML in VS Code). The schema knows each key by
 with each other and with the devices.
 
 Relative file names start at the configuration's folder. Numbers have a decimal point. The default `none` means that
-the key is absent."""
+the key is absent."""  # noqa: E501

@@ -1,10 +1,12 @@
 """The whole configuration: frozen, validated, unit-suffixed, one TOML file.
 
-Every field that holds a quantity ends in its unit. Values that no real bench could have are refused,
-so that a wrong unit (metres for millimetres) shows when the file is read and not at the mirror.
+Every field that holds a quantity ends in its unit. Values that no real bench could have are
+refused, so that a wrong unit (metres for millimetres) shows when the file is read and not at the
+mirror.
 
-The text below a key says what it means and, from its first imperative ("Change", "Leave", "Lower", "Raise", "Set"),
-when to change it. Everything that explains the configuration is made from these texts (`config/reference.py`).
+The text below a key says what it means and, from its first imperative ("Change", "Leave", "Lower",
+"Raise", "Set"), when to change it. Everything that explains the configuration is made from these
+texts (`config/reference.py`).
 """
 
 import math
@@ -37,10 +39,24 @@ from membrane_ctrl.config.optics import (
 from membrane_ctrl.config.port import AlarmsConfig, DoorsConfig, PortConfig, WebConfig
 
 __all__ = [
-    "CameraConfig", "Config", "DevicesConfig", "DisturbancesConfig", "EstimatorConfig", "GeometryConfig",
-    "LimitsConfig", "LoopConfig", "MirrorConfig", "OpticsConfig", "PatternConfig", "PumpConfig", "RecordingConfig",
-    "ResumeConfig", "ShapeConfig", "StatesConfig", "TwinConfig",
-]  # fmt: skip
+    "CameraConfig",
+    "Config",
+    "DevicesConfig",
+    "DisturbancesConfig",
+    "EstimatorConfig",
+    "GeometryConfig",
+    "LimitsConfig",
+    "LoopConfig",
+    "MirrorConfig",
+    "OpticsConfig",
+    "PatternConfig",
+    "PumpConfig",
+    "RecordingConfig",
+    "ResumeConfig",
+    "ShapeConfig",
+    "StatesConfig",
+    "TwinConfig",
+]
 
 INTERLOCKS_MAX = 32  # bits of a mask that telemetry carries as a double
 # required before any gas moves: the loop's two ends, and the limit that protects the film
@@ -52,7 +68,10 @@ else:
     SensorTables = create_model(
         "SensorTables",
         __base__=Section,
-        **{role.name: (settings.SENSOR_DRIVERS[role.reads] | None, None) for role in SENSORS.values()},
+        **{
+            role.name: (settings.SENSOR_DRIVERS[role.reads] | None, None)
+            for role in SENSORS.values()
+        },
     )
 
 
@@ -60,18 +79,26 @@ class DevicesConfig(SensorTables):
     """Which device fills which role: a board fills all, or one table per role."""
 
     board: settings.ModbusUrl | None = None
-    """The pump board, tcp://HOST:PORT or rtu:///dev/ttyUSB0?baud=115200. Set it, or one table per role."""
+    """The pump board, tcp://HOST:PORT or rtu:///dev/ttyUSB0?baud=115200. Set it, or one table per
+    role.
+    """
     unit_id: settings.UnitId = 1
     timeout_s: settings.Timeout = 0.2
     watchdog_s: Annotated[float, Field(ge=0.1, le=10)] = 0.5
-    """Time without commands after which the board stops the pump. Raise it for tick rates below 4 Hz."""
+    """Time without commands after which the board stops the pump. Raise it for tick rates below 4
+    Hz.
+    """
     displacement: settings.DisplacementDriver | None = None
     pump: settings.PumpDriver | None = None
     vent: settings.ValueDriver | None = None
     camera: settings.CameraConfig | None = None
     screen: settings.ScreenConfig | None = None
-    interlocks: Annotated[tuple[settings.InterlockDriver, ...], Field(max_length=INTERLOCKS_MAX)] = ()
-    """Circuits that must be closed for a hold, at most 32. Set it for emergency stop, door, oxygen monitor."""
+    interlocks: Annotated[
+        tuple[settings.InterlockDriver, ...], Field(max_length=INTERLOCKS_MAX)
+    ] = ()
+    """Circuits that must be closed for a hold, at most 32. Set it for emergency stop, door, oxygen
+    monitor.
+    """
 
     @model_validator(mode="after")
     def _board_or_roles(self) -> "DevicesConfig":
@@ -79,14 +106,23 @@ class DevicesConfig(SensorTables):
         if self.board is not None and filled:
             raise ValueError(f"give either board or one table per role, not board and {filled[0]}")
         if self.board is None and not filled:
-            raise ValueError('name the pump board (board = "tcp://HOST:PORT"), or give one table per role')
+            raise ValueError(
+                'name the pump board (board = "tcp://HOST:PORT"), or give one table per role'
+            )
         missing = [role for role in NEEDED if role not in filled]
-        if self.board is None and missing not in ([], ["displacement"]):  # a laser is `Config`'s affair
+        if self.board is None and missing not in (
+            [],
+            ["displacement"],
+        ):  # a laser is `Config`'s affair
             raise ValueError(f"no device for {missing[0]}; required: {', '.join(NEEDED)}")
         for role in ACTUATORS:
             section = getattr(self, role)
-            if isinstance(section, settings.ModbusMapConfig) and not _is_fraction(section.limits or section.value):
-                raise ValueError(f"{role}: value and limits of an actuator are fractions within 0..1")
+            if isinstance(section, settings.ModbusMapConfig) and not _is_fraction(
+                section.limits or section.value
+            ):
+                raise ValueError(
+                    f"{role}: value and limits of an actuator are fractions within 0..1"
+                )
         return self
 
     @model_validator(mode="after")
@@ -96,7 +132,8 @@ class DevicesConfig(SensorTables):
             other, other_link = owners.setdefault(port, (role, link))
             if other != role and not (link and link == other_link):
                 raise ValueError(
-                    f"{other} and {role} name the same port, {port}; only Modbus devices on one link may share it"
+                    f"{other} and {role} name the same port, {port}; only Modbus devices on "
+                    "one link may share it"
                 )
         return self
 
@@ -118,9 +155,14 @@ class DevicesConfig(SensorTables):
         names = [interlock.name for interlock in self.interlocks]
         for index, interlock in enumerate(self.interlocks):
             if interlock.name in names[:index]:
-                raise ValueError(f"interlocks.{index}.name: {interlock.name!r} is the name of two interlocks")
+                raise ValueError(
+                    f"interlocks.{index}.name: {interlock.name!r} is the name of two interlocks"
+                )
             if self.board is None and isinstance(interlock, settings.BoardInputConfig):
-                raise ValueError(f"interlocks.{index}.driver: an input of the pump board, but no board is configured")
+                raise ValueError(
+                    f"interlocks.{index}.driver: an input of the pump board, but no board is "
+                    "configured"
+                )
         return self
 
     @model_validator(mode="after")
@@ -128,12 +170,16 @@ class DevicesConfig(SensorTables):
         if self.camera is None and self.screen is not None:
             raise ValueError("[devices.screen] needs a [devices.camera]")
         if self.camera is not None and (self.screen is None) != self.camera.shows_patterns:
-            raise ValueError("a camera needs a [devices.screen]; a folder of frames must not have one")
+            raise ValueError(
+                "a camera needs a [devices.screen]; a folder of frames must not have one"
+            )
         return self
 
     @property
     def vent_fitted(self) -> bool:
-        """Whether there is a valve that lets gas out: a pump board drives one, single instruments may lack it."""
+        """Whether there is a valve that lets gas out: a pump board drives one, single instruments
+        may lack it.
+        """
         return self.board is not None or self.vent is not None
 
     def roles(self) -> dict[str, settings.AnyDriver]:
@@ -143,7 +189,9 @@ class DevicesConfig(SensorTables):
     @property
     def name(self) -> str:
         """For messages: the board's address, or each role's address."""
-        return self.board or ", ".join(f"{role} on {address_of(section)}" for role, section in self.roles().items())
+        return self.board or ", ".join(
+            f"{role} on {address_of(section)}" for role, section in self.roles().items()
+        )
 
 
 def _port_of(link: str) -> str:
@@ -172,11 +220,15 @@ class TwinConfig(Section):
     seed: Annotated[int, Field(ge=0, le=2**63 - 1)] = 1
     """Seed of everything random. Change it for another run of the same kind."""
     from_flat: bool = False
-    """Start with a flat mirror; filling it takes two hours. Set it to true to practise a first inflation."""
+    """Start with a flat mirror; filling it takes two hours. Set it to true to practise a first
+    inflation.
+    """
     start_error_um: Annotated[float, Field(ge=-500, le=500)] = -25.0
     """Distance from the setpoint at the start. Change it to see a longer or shorter approach."""
     laser: bool = True
-    """Whether there is one. Set it to false to practise a bench without a laser (estimator.process_value)."""
+    """Whether there is one. Set it to false to practise a bench without a laser
+    (estimator.process_value).
+    """
     laser_noise_um: Annotated[float, Field(ge=0, le=100)] = 1.0
     """Noise of a laser reading. Change it to your laser's."""
     laser_resolution_um: Annotated[float, Field(ge=0, le=100)] = 0.1
@@ -185,9 +237,9 @@ class TwinConfig(Section):
     """Drift of the laser's mount. Change it to see the shape loop work."""
     leak_time_constant_s: Annotated[float, Field(ge=10, le=1e8)] = 1.0e4
     """Time in which the leak would empty the mirror to a third. Change it to your mirror's."""
-    pump_shape: Literal["configured", "quadratic", "root", "s-shaped", "saturating", "hysteretic", "pwm"] = (
-        "configured"
-    )
+    pump_shape: Literal[
+        "configured", "quadratic", "root", "s-shaped", "saturating", "hysteretic", "pwm"
+    ] = "configured"
     """True curve of the pump, between the dead command and the full flow of `[pump]`.
     Change it to practise `tune pump`."""
     pump_delay_s: Annotated[float, Field(ge=0, le=10)] = 0.075
@@ -199,15 +251,22 @@ class TwinConfig(Section):
     thermometer_noise_k: Annotated[float, Field(ge=0, le=10)] = 0.002
     """Noise of the air thermometer. Change it to your thermometer's."""
     film_prestrain: Annotated[float, Field(ge=-0.01, le=0.1)] = 0.0
-    """Strain of the flat film before it was clamped, in its pictures. Change it to try `film` and `calibrate`."""
+    """Strain of the flat film before it was clamped, in its pictures. Change it to try `film` and
+    `calibrate`.
+    """
     film_poisson: Annotated[float, Field(ge=0, le=0.5)] = 0.3
     """Poisson ratio of the film, in its pictures. Change it to try `film` and `calibrate`."""
     film_stiffness_n_per_m: Annotated[float, Field(ge=1, le=1e9)] = 2.05e5
-    """Modulus times thickness of the film, for the pressure that `simulate` states. Change it to try `film`."""
+    """Modulus times thickness of the film, for the pressure that `simulate` states. Change it to
+    try `film`.
+    """
     drum_nm: Annotated[float, Field(ge=0, le=1e4)] = 0.0
-    """Amplitude of each vibration of the film, at 27, 48, 57 and 61 Hz, in its pictures. Change it to try `modes`."""
+    """Amplitude of each vibration of the film, at 27, 48, 57 and 61 Hz, in its pictures. Change it
+    to try `modes`.
+    """
     disturbances: DisturbancesConfig = DisturbancesConfig()
-    geometry: GeometryConfig | None = None  # true camera and screen poses; none: those of [optics.geometry]
+    # true camera and screen poses; none: those of [optics.geometry]
+    geometry: GeometryConfig | None = None
 
 
 class RecordingConfig(Section):
@@ -216,19 +275,30 @@ class RecordingConfig(Section):
     logs_dir: Annotated[str, Field(min_length=1)] = "logs"
     """Folder of the runs, relative to the working folder. Change it to a disk with room."""
     min_free_mb: Annotated[float, Field(ge=1, le=1e9)] = 500.0
-    """Free space below which the recorder reduces its data. Raise it on a disk that others use, too."""
+    """Free space below which the recorder reduces its data. Raise it on a disk that others use,
+    too.
+    """
     thumbnails: bool = True
     """Record small pictures of the frames. Set it to false to save space."""
     raw_every_cycles: Annotated[int, Field(ge=0, le=1_000_000)] = 0
-    """Keep the frames of every n-th cycle; 0: none. Raise it to examine the measurement afterwards."""
+    """Keep the frames of every n-th cycle; 0: none. Raise it to examine the measurement afterwards.
+    """
     raw_before_fault_cycles: Annotated[int, Field(ge=0, le=20)] = 2
-    """Always keep the frames of this many cycles before a fault. Raise it to see more of a fault's history."""
+    """Always keep the frames of this many cycles before a fault. Raise it to see more of a fault's
+    history.
+    """
     segment_s: Annotated[float, Field(ge=10, le=86_400)] = 3600.0
-    """Length of a file of the recording; a crash leaves at most this much unoptimised. Lower it for smaller files."""
+    """Length of a file of the recording; a crash leaves at most this much unoptimised. Lower it for
+    smaller files.
+    """
     quiet_hz: Annotated[float, Field(ge=0.1, le=200)] = 1.0
-    """Rows per second for the viewer while nothing happens. Raise it to see more, at the cost of space."""
+    """Rows per second for the viewer while nothing happens. Raise it to see more, at the cost of
+    space.
+    """
     keep_gb: Annotated[float, Field(ge=0.1, le=1e6)] | None = None
-    """Delete the oldest runs beyond this total; absent: never. Set it on a machine that nobody clears."""
+    """Delete the oldest runs beyond this total; absent: never. Set it on a machine that nobody
+    clears.
+    """
     keep_days: Annotated[float, Field(ge=0.1, le=1e5)] | None = None
     """Delete runs older than this; absent: never. Set it on a machine that nobody clears."""
 
@@ -266,16 +336,22 @@ class Config(Section):
             shared = device_places.find_shared(self.devices.roles(), self.devices.interlocks)
             if shared:
                 raise ValueError(shared)
-        if self.devices is not None and not (self.devices.board or self.devices.displacement or self.by_optics):
+        if self.devices is not None and not (
+            self.devices.board or self.devices.displacement or self.by_optics
+        ):
             raise ValueError(
-                'devices: no device for displacement; without a laser set estimator.process_value = "optics"'
+                "devices: no device for displacement; without a laser set "
+                'estimator.process_value = "optics"'
             )
         if self.web is not None and not self.port.enabled:
             raise ValueError("web: the page asks the control port: set port.enabled = true")
         if self.devices is not None and self.devices.camera is not None:
             bits = self.devices.camera.frame_bits
             if bits not in (None, self.optics.camera.bits):
-                raise ValueError(f"optics.camera.bits = {self.optics.camera.bits}, but devices.camera gives {bits}")
+                raise ValueError(
+                    f"optics.camera.bits = {self.optics.camera.bits}, but devices.camera "
+                    f"gives {bits}"
+                )
         return self
 
     @property
@@ -294,7 +370,9 @@ class Config(Section):
         return self.estimator.process_value == "optics"
 
     def with_gains(self, told: Mapping[str, Any] | None) -> "Config":
-        """This configuration with the gains, and the pump's curve, of an event; as it is if they do not fit."""
+        """This configuration with the gains, and the pump's curve, of an event; as it is if they do
+        not fit.
+        """
         told = told or {}
         loop_told = {key: told[key] for key in LoopConfig.model_fields if key in told}
         try:

@@ -1,4 +1,5 @@
-"""What the camera sees of the mirror and, reflected by it, of the pattern: is a stated geometry plausible?
+"""What the camera sees of the mirror and, reflected by it, of the pattern: is a stated geometry
+plausible?
 
 On a paraboloid and without the lens' distortion: enough to judge a bench, not to measure with it.
 """
@@ -22,7 +23,8 @@ class Sight:
 
     shown: float  # within the camera's image
     measured: float  # shown, with the camera's ray reflected onto the pattern
-    centre_off_mm: float  # from O' to where the ray by the vertex meets the screen's plane; infinite if it never does
+    # from O' to where the ray by the vertex meets the screen's plane; infinite if it never does
+    centre_off_mm: float
 
 
 @dataclass(frozen=True, slots=True)
@@ -35,8 +37,12 @@ class Doubt:
     remedy: str
 
 
-def poses(geometry: GeometryConfig) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray, FloatArray]:
-    """Pinhole (3,), rotation (3, 3), O', s_x and s_y (3,) in world, from either form (docs/interfaces.md)."""
+def poses(
+    geometry: GeometryConfig,
+) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray, FloatArray]:
+    """Pinhole (3,), rotation (3, 3), O', s_x and s_y (3,) in world, from either form
+    (docs/interfaces.md).
+    """
     screen = None if geometry.screen is None else geometry.screen.pose
     if geometry.camera is not None and screen is not None:
         general = (geometry.camera.position_mm, geometry.camera.rotation, *screen)
@@ -44,7 +50,10 @@ def poses(geometry: GeometryConfig) -> tuple[FloatArray, FloatArray, FloatArray,
         return pinhole, rotation, origin, s_x, s_y
     if geometry.a_mm is None or geometry.b_mm is None or geometry.alpha_deg is None:
         raise ValueError("geometry has neither a_mm, b_mm, alpha_deg nor both poses")
-    cosine, sine = math.cos(math.radians(geometry.alpha_deg)), math.sin(math.radians(geometry.alpha_deg))
+    cosine, sine = (
+        math.cos(math.radians(geometry.alpha_deg)),
+        math.sin(math.radians(geometry.alpha_deg)),
+    )
     return (
         geometry.a_mm * np.array([cosine, 0.0, sine]),
         np.array([[sine, 0.0, -cosine], [0.0, -1.0, 0.0], [-cosine, 0.0, -sine]]),
@@ -58,9 +67,14 @@ def sight(optics: OpticsConfig, sag_mm: float) -> Sight:
     """Follow the camera's rays to a bowl of this depth and on to the screen's plane."""
     pinhole, rotation, origin, s_x, s_y = poses(optics.geometry)
     camera, pattern, mirror = optics.camera, optics.pattern, optics.mirror
-    radius = np.sqrt((np.arange(_RINGS) + 0.5) / _RINGS) * mirror.analysis_radius_mm  # rings of equal area
+    radius = (
+        np.sqrt((np.arange(_RINGS) + 0.5) / _RINGS) * mirror.analysis_radius_mm
+    )  # rings of equal area
     spoke = 2 * np.pi * np.arange(_SPOKES) / _SPOKES
-    x, y = np.append(0.0, np.outer(radius, np.cos(spoke))), np.append(0.0, np.outer(radius, np.sin(spoke)))
+    x, y = (
+        np.append(0.0, np.outer(radius, np.cos(spoke))),
+        np.append(0.0, np.outer(radius, np.sin(spoke))),
+    )
     bend = sag_mm / mirror.radius_mm**2
     point = np.stack([x, y, bend * (x**2 + y**2)], axis=1)
     normal = np.stack([-2 * bend * x, -2 * bend * y, np.ones_like(x)], axis=1)
@@ -70,7 +84,10 @@ def sight(optics: OpticsConfig, sag_mm: float) -> Sight:
     reflected = ray - (2 * towards / np.sum(normal**2, axis=1))[:, None] * normal
     face = np.cross(s_x, s_y)  # points at the mirror
     with np.errstate(divide="ignore", invalid="ignore"):
-        pixel = camera.focal_mm / (1e-3 * camera.pixel_um) * seen[:, :2] / seen[:, 2:] + camera.principal
+        pixel = (
+            camera.focal_mm / (1e-3 * camera.pixel_um) * seen[:, :2] / seen[:, 2:]
+            + camera.principal
+        )
         place = point + ((origin - point) @ face / (reflected @ face))[:, None] * reflected - origin
     inside = (pixel >= -0.5) & (pixel <= np.array([camera.width_px, camera.height_px]) - 0.5)
     shown = (seen[:, 2] > 0) & inside.all(axis=1)
@@ -84,33 +101,50 @@ def sight(optics: OpticsConfig, sag_mm: float) -> Sight:
 def doubt(optics: OpticsConfig, depth_known: bool = True) -> Doubt | None:
     """What is not plausible about a geometry, if anything.
 
-    If the film's depth is not known, the geometry has the benefit of the doubt: that of the depth that suits it best.
+    If the film's depth is not known, the geometry has the benefit of the doubt: that of the depth
+    that suits it best.
     """
-    depths_mm = [optics.mirror.sag_mm] if depth_known else (_DEPTHS * optics.mirror.radius_mm).tolist()
-    best = max((sight(optics, depth_mm) for depth_mm in depths_mm), key=lambda found: found.measured)
+    depths_mm = (
+        [optics.mirror.sag_mm] if depth_known else (_DEPTHS * optics.mirror.radius_mm).tolist()
+    )
+    best = max(
+        (sight(optics, depth_mm) for depth_mm in depths_mm), key=lambda found: found.measured
+    )
     if best.measured >= _GOOD:
         return None
     hopeless, geometry = best.measured < _LEAST, optics.geometry
     if best.shown < _GOOD:
         key = "a_mm" if geometry.camera is None else "camera.position_mm"
         why = f"{best.shown:.0%} of the mirror is in the camera's image"
-        return Doubt(hopeless, key, why, "check the camera's pose, focal_mm, pixel_um and principal_px")
+        return Doubt(
+            hopeless, key, why, "check the camera's pose, focal_mm, pixel_um and principal_px"
+        )
     half_mm = optics.pattern.periods * optics.pattern.period_mm / 2
-    why = f"the pattern ({half_mm:.0f} mm each way from O') is seen in {best.measured:.0%} of the mirror"
+    why = (
+        f"the pattern ({half_mm:.0f} mm each way from O') is seen in {best.measured:.0%} of the "
+        "mirror"
+    )
     if geometry.alpha_deg is not None:
         return Doubt(hopeless, "alpha_deg", why, _angle_hint(optics, geometry.alpha_deg, depths_mm))
     if best.centre_off_mm > half_mm:
-        where = f"{best.centre_off_mm:.0f} mm from O'" if math.isfinite(best.centre_off_mm) else "never"
+        where = (
+            f"{best.centre_off_mm:.0f} mm from O'" if math.isfinite(best.centre_off_mm) else "never"
+        )
         why += f": the camera's ray by the vertex meets the screen {where}"
     return Doubt(hopeless, "screen.origin_mm", why, "check the poses, [pattern] and mirror.sag_mm")
 
 
 def _angle_hint(optics: OpticsConfig, alpha_deg: float, depths_mm: list[float]) -> str:
     """What the angle may be instead, if the bench is plausible with that."""
-    for word, meant_deg in (("as radians", math.degrees(alpha_deg)), ("from the mirror's axis", 90.0 - alpha_deg)):
+    for word, meant_deg in (
+        ("as radians", math.degrees(alpha_deg)),
+        ("from the mirror's axis", 90.0 - alpha_deg),
+    ):
         if 0.0 < meant_deg < 180.0:
             geometry = optics.geometry.model_copy(update={"alpha_deg": meant_deg})
             meant = optics.model_copy(update={"geometry": geometry})
             if max(sight(meant, depth_mm).measured for depth_mm in depths_mm) >= _GOOD:
                 return f"{word} it is {meant_deg:.1f} deg"
-    return "measure alpha_deg from the mirror's plane; check a_mm, b_mm, [pattern] and mirror.sag_mm"
+    return (
+        "measure alpha_deg from the mirror's plane; check a_mm, b_mm, [pattern] and mirror.sag_mm"
+    )

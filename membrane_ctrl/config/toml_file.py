@@ -1,4 +1,6 @@
-"""The configuration's TOML file: read with actionable errors, written with every default spelled out."""
+"""The configuration's TOML file: read with actionable errors, written with every default spelled
+out.
+"""
 
 import difflib
 import re
@@ -18,13 +20,15 @@ from membrane_ctrl.model.files import read_text
 Model = TypeVar("Model", bound=BaseModel)
 # A configuration with every default is 10 kB, a height map of 100 x 100 nodes 80 kB.
 _BYTES_MAX = 1_000_000
-# The parser's time and memory grow with the square of a dotted key's parts. Our keys have at most four.
+# The parser's time and memory grow with the square of a dotted key's parts. Our keys have at most
+# four.
 _PARTS_MAX = 50
 _QUOTED_PART = re.compile(r"""["']\s*\.""")
 
 
 def load(path: str | Path, model: type[Model], follow: bool = True) -> Model:
-    """Read a TOML file as `model`; `follow` is False in a folder from an untrusted source (`model.files`).
+    """Read a TOML file as `model`; `follow` is False in a folder from an untrusted source
+    (`model.files`).
 
     Raises InputError with one line that names the file, the field and a valid value.
     """
@@ -37,9 +41,13 @@ def load(path: str | Path, model: type[Model], follow: bool = True) -> Model:
 
 
 def read_toml(path: Path, follow: bool = True) -> dict[str, Any]:
-    """The tables of a TOML file. Raises InputError naming the file (and the line, if it is not TOML)."""
+    """The tables of a TOML file. Raises InputError naming the file (and the line, if it is not
+    TOML).
+    """
     try:
-        text = read_text(path, _BYTES_MAX, follow=follow).removeprefix("\ufeff")  # as some editors begin a file
+        text = read_text(path, _BYTES_MAX, follow=follow).removeprefix(
+            "\ufeff"
+        )  # as some editors begin a file
         if any(map(_too_many_parts, text.splitlines())):
             raise InputError(f"{path}: not valid TOML: a key of more than {_PARTS_MAX} parts")
         return tomllib.loads(text)
@@ -54,7 +62,9 @@ def read_toml(path: Path, follow: bool = True) -> dict[str, Any]:
     except RecursionError:
         raise InputError(f"{path}: not valid TOML: nested too deep") from None
     except UnicodeDecodeError:
-        raise InputError(f"{path}: not valid TOML: not UTF-8 text (UTF-16, perhaps); save it as UTF-8") from None
+        raise InputError(
+            f"{path}: not valid TOML: not UTF-8 text (UTF-16, perhaps); save it as UTF-8"
+        ) from None
     except ValueError as error:  # of TOML, of a number with thousands of digits
         raise InputError(f"{path}: not valid TOML: {_cause(str(error), text)}") from None
 
@@ -65,11 +75,17 @@ def _cause(message: str, text: str) -> str:
     line = text.split("\n")[int(found[1]) - 1].strip() if found else ""
     if number := re.search(r"=\s*([-+]?\d+),(\d+)\s*(#|$)", line):
         return f"{message}: a number has a decimal point; write {number[1]}.{number[2]}"
-    return f"{message}: {line} comes twice" if "overwrite" in message or "twice" in message else message
+    return (
+        f"{message}: {line} comes twice"
+        if "overwrite" in message or "twice" in message
+        else message
+    )
 
 
 def _too_many_parts(line: str) -> bool:
-    """Whether a line may hold such a key, i.e. too many dots between commas (only quoted keys contain commas)."""
+    """Whether a line may hold such a key, i.e. too many dots between commas (only quoted keys
+    contain commas).
+    """
     if line.count(".") <= _PARTS_MAX or line.lstrip().startswith("#"):
         return False
     dots = max(piece.count(".") for piece in line.split(","))
@@ -117,7 +133,11 @@ def prune(table: dict[str, Any], model: type[BaseModel], prefix: str = "") -> tu
             del table[key]
             ignored.append(prefix + key)
             continue
-        nested = [t for t in (known[key], *get_args(known[key])) if isinstance(t, type) and issubclass(t, BaseModel)]
+        nested = [
+            t
+            for t in (known[key], *get_args(known[key]))
+            if isinstance(t, type) and issubclass(t, BaseModel)
+        ]
         inner = table[key] if isinstance(table[key], list) else [table[key]]
         for item in inner:
             if nested and isinstance(item, dict):
@@ -142,19 +162,38 @@ def describe(error: ErrorDetails, model: type[BaseModel]) -> str:
     inner = sections(fields[path[-1]].annotation) if path and path[-1] in fields else []
     if kind.startswith("union_tag"):
         choices = _sections_at(model, path)
-        tag, known = str(error["ctx"].get("tag", "")), [str(tag) for section in choices for tag in tags(section)]
-        return f"{field}.driver: {f'{tag!r} is not known here' if tag else 'missing'}; {hint(tag, known)}"
+        tag, known = (
+            str(error["ctx"].get("tag", "")),
+            [str(tag) for section in choices for tag in tags(section)],
+        )
+        return (
+            f"{field}.driver: {f'{tag!r} is not known here' if tag else 'missing'}; "
+            f"{hint(tag, known)}"
+        )
     message = error["msg"].removeprefix("Value error, ").partition(" for <class")[0]
     if kind == "value_error":  # some begin with the key
-        return f"{field}{'.' if re.match(r'[a-z_0-9]+: ', message) else ': '}{message}" if field else message
+        return (
+            f"{field}{'.' if re.match(r'[a-z_0-9]+: ', message) else ': '}{message}"
+            if field
+            else message
+        )
     if kind == "missing":
         return f"{field}: missing; it has no default"
     if kind in ("dict_type", "model_type"):
-        return f"{field}: write a table, [{field}] and its keys below" if field else "input should be an object"
+        return (
+            f"{field}: write a table, [{field}] and its keys below"
+            if field
+            else "input should be an object"
+        )
     if kind == "tuple_type":
-        return f"{field}: write a list, " + (f"[[{field}]] and its keys below" if inner else "in square brackets")
+        return f"{field}: write a list, " + (
+            f"[[{field}]] and its keys below" if inner else "in square brackets"
+        )
     if kind == "string_pattern_mismatch" and error["ctx"]["pattern"] == MODBUS_URL_PATTERN:
-        return f"{field}: {error['input']!r}: expected tcp://HOST:PORT or rtu:///dev/ttyUSB0?baud=115200"
+        return (
+            f"{field}: {error['input']!r}: expected tcp://HOST:PORT or "
+            "rtu:///dev/ttyUSB0?baud=115200"
+        )
     value = error["input"]
     shown = f" (it is {value!r})" if isinstance(value, (int, float, str, bool)) else ""
     return f"{field}: {message[:1].lower()}{message[1:]}{shown}"
@@ -183,10 +222,13 @@ def _telling(errors: list[ErrorDetails]) -> ErrorDetails:
     return misspelt[0] if misspelt and errors[0]["type"] == "missing" else errors[0]
 
 
-def _walk(model: type[BaseModel], location: tuple[int | str, ...]) -> tuple[list[int | str], type[BaseModel] | None]:
+def _walk(
+    model: type[BaseModel], location: tuple[int | str, ...]
+) -> tuple[list[int | str], type[BaseModel] | None]:
     """Return the path of a key as in the file, and its section (None if unknown).
 
-    In `location`, the tag of a union's member (`driver = "ventus"`) stands between the table and its key.
+    In `location`, the tag of a union's member (`driver = "ventus"`) stands between the table and
+    its key.
     """
     path: list[int | str] = []
     inside: type[BaseModel] | None = model
@@ -206,7 +248,9 @@ def _walk(model: type[BaseModel], location: tuple[int | str, ...]) -> tuple[list
 
 
 def _sections_at(model: type[BaseModel], path: list[int | str]) -> list[type[BaseModel]]:
-    """Return the sections that may stand at a path as in the file; of a list those of its entries."""
+    """Return the sections that may stand at a path as in the file;
+    of a list those of its entries.
+    """
     found: list[type[BaseModel]] = [model]
     for name in path:
         if isinstance(name, int):

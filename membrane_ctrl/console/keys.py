@@ -1,7 +1,7 @@
 """The console's keys. Each becomes a request to the control port, as `membrane-ctrl ctl` sends it.
 
-The terminal belongs to the shell: keys are read only in the foreground, and modes that the shell has set meanwhile
-are left alone.
+The terminal belongs to the shell: keys are read only in the foreground, and modes that the shell
+has set meanwhile are left alone.
 """
 
 from __future__ import annotations
@@ -52,7 +52,9 @@ class Keyboard:
 
 
 class KeyReader:
-    """Reads a terminal key by key, without an echo, until `close`. Raises OSError if it cannot be opened."""
+    """Reads a terminal key by key, without an echo, until `close`. Raises OSError if it cannot be
+    opened.
+    """
 
     def __init__(self, keyboard: Keyboard) -> None:
         self._before = keyboard.modes
@@ -66,11 +68,15 @@ class KeyReader:
         with suppress(OSError, termios.error):  # nothing was typed, or the terminal has gone
             if not self._is_ours():  # also after the shell had the terminal
                 self._take()
-            return _ESCAPE_SEQUENCE.sub("", self._decoder.decode(os.read(self._handle, _READ_BYTES)))
+            return _ESCAPE_SEQUENCE.sub(
+                "", self._decoder.decode(os.read(self._handle, _READ_BYTES))
+            )
         return ""
 
     def close(self) -> None:
-        """Restore the terminal's modes, unless a shell has changed them after the death of the control process."""
+        """Restore the terminal's modes, unless a shell has changed them after the death of the
+        control process.
+        """
         with suppress(OSError, termios.error):
             if self._is_ours():
                 termios.tcsetattr(self._handle, termios.TCSANOW, self._before)
@@ -159,7 +165,9 @@ class Desk:
         return f"{self._said}   · {_FOOT}" if self._said else _FOOT
 
     def typed(self, text: str, paused: bool) -> None:
-        """Take what was typed. Of several characters at once only the first is a command: the rest may be a paste."""
+        """Take what was typed. Of several characters at once only the first is a command: the rest
+        may be a paste.
+        """
         if not text:
             return
         if self._prompt == "mark":

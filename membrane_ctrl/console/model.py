@@ -1,4 +1,6 @@
-"""Turns telemetry rows, events and shapes into the console's content. No I/O, no terminal, no clock."""
+"""Turns telemetry rows, events and shapes into the console's content. No I/O, no terminal, no
+clock.
+"""
 
 import math
 from collections import deque
@@ -36,8 +38,12 @@ class Trend:
         if not self._seconds:
             return (math.nan,) * TREND_S
         newest = self._seconds[-1][0]
-        known = {second: math.fsum(values) / len(values) for second, values in self._seconds if values}
-        return tuple(known.get(second, math.nan) for second in range(newest - TREND_S + 1, newest + 1))
+        known = {
+            second: math.fsum(values) / len(values) for second, values in self._seconds if values
+        }
+        return tuple(
+            known.get(second, math.nan) for second in range(newest - TREND_S + 1, newest + 1)
+        )
 
     def values(self) -> list[float]:
         """Every finite value of the last minute, oldest first."""
@@ -99,11 +105,16 @@ class ConsoleView:
 class ConsoleModel:
     """Remembers the rows, events and shapes that the console shows.
 
-    `ctl` is the beginning of a command for this run, as a person types it; `keys`: the console has keys.
+    `ctl` is the beginning of a command for this run, as a person types it; `keys`: the console has
+    keys.
     """
 
     def __init__(
-        self, config: Config, duration_s: float | None = None, ctl: str = "membrane-ctrl ctl", keys: bool = False
+        self,
+        config: Config,
+        duration_s: float | None = None,
+        ctl: str = "membrane-ctrl ctl",
+        keys: bool = False,
     ) -> None:
         self._ctl, self._keys = ctl, keys
         self._config = config
@@ -146,7 +157,9 @@ class ConsoleModel:
             self._rejected += 1
         elif row is not None and row.state == telemetry.State.HOLD:
             settled_s = self._status.since_s + telemetry.SETTLED_AFTER_S
-            if estimate.time_s >= settled_s and (self._reference is None or self._reference.time_s < settled_s):
+            if estimate.time_s >= settled_s and (
+                self._reference is None or self._reference.time_s < settled_s
+            ):
                 self._reference = estimate
 
     def view(self, now_s: float) -> ConsoleView:
@@ -160,7 +173,9 @@ class ConsoleModel:
             row=row,
             why=self._why(),
             locks=tuple(map(describe_lock, status.locks)),
-            go_on=go_on(row, status.paused, self._ctl, self._keys, status.locks, status.latched) if row else "",
+            go_on=go_on(row, status.paused, self._ctl, self._keys, status.locks, status.latched)
+            if row
+            else "",
             paused=status.paused,
             silent_s=age_s if age_s > SILENT_S else 0.0,
             state=telemetry.State(int(row.state)) if row else telemetry.State.STANDBY,
@@ -175,7 +190,8 @@ class ConsoleModel:
             fault=fault_words(status.fault),
             remedy=status.fault.remedy if status.fault else "",
             faults=status.faults,
-            last_fault=f"{fault_words(status.last_fault)} at {duration(status.last_fault_s)}" * bool(status.faults),
+            last_fault=f"{fault_words(status.last_fault)} at {duration(status.last_fault_s)}"
+            * bool(status.faults),
             too_tight=self._too_tight(now_s),
             gains=run_status.gains_words(vars(in_force.loop), status.trial_left_s),
             flow_most_um_per_s=in_force.loop.flow_most_um_per_s(in_force.pump),
@@ -186,7 +202,11 @@ class ConsoleModel:
 
     def _too_tight(self, now_s: float) -> bool:
         row = self._status.row
-        judged = row is not None and row.state == telemetry.State.HOLD and now_s - self._status.since_s >= JUDGE_S
+        judged = (
+            row is not None
+            and row.state == telemetry.State.HOLD
+            and now_s - self._status.since_s >= JUDGE_S
+        )
         return row is not None and judged and row.leak_um_per_s < TOO_TIGHT_UM_PER_S
 
     def _why(self) -> str:
@@ -196,16 +216,27 @@ class ConsoleModel:
         return why(status.row, status.why, fault_words(status.fault), self._config, status.paused)
 
     def _shape(self, now_s: float) -> ShapeView:
-        estimate, since, row, status = self._estimate, self._reference, self._status.row, self._status
+        estimate, since, row, status = (
+            self._estimate,
+            self._reference,
+            self._status.row,
+            self._status,
+        )
         state = telemetry.ShapeState(int(row.shape_state)) if row else telemetry.ShapeState.OFF
         reason = estimate.reason if estimate and estimate.verdict != "ok" else ""
-        loop = status.shape_reason if state in (telemetry.ShapeState.WAITING, telemetry.ShapeState.SUSPENDED) else ""
+        loop = (
+            status.shape_reason
+            if state in (telemetry.ShapeState.WAITING, telemetry.ShapeState.SUSPENDED)
+            else ""
+        )
         return ShapeView(
             state=state,
             estimate=estimate,
             age_s=now_s - estimate.time_s if estimate else math.nan,
             sag_change_um=estimate.sag_um - since.sag_um if estimate and since else math.nan,
-            change_sigma_um=math.hypot(estimate.sag_sigma_um, since.sag_sigma_um) if estimate and since else math.nan,
+            change_sigma_um=math.hypot(estimate.sag_sigma_um, since.sag_sigma_um)
+            if estimate and since
+            else math.nan,
             reference_s=since.time_s if since else math.nan,
             cycles=self._cycles,
             rejected=self._rejected,
@@ -214,7 +245,11 @@ class ConsoleModel:
 
 
 def _acquisition_words(said: run_events.AcquisitionState | None) -> str:
-    return "" if said is None or said.state == "running" else ": ".join(w for w in (said.state, said.message) if w)
+    return (
+        ""
+        if said is None or said.state == "running"
+        else ": ".join(w for w in (said.state, said.message) if w)
+    )
 
 
 def fault_words(fault: events.Fault | None) -> str:

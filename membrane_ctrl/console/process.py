@@ -76,17 +76,21 @@ class ConsoleSpec:
     config: Config
     duration_s: float | None = None
     socket: Path | None = None  # of the control port; None if it is off
-    keyboard: keys.Keyboard | None = None  # None unless stdin is the terminal that the console draws on
+    # None unless stdin is the terminal that the console draws on
+    keyboard: keys.Keyboard | None = None
     since_s: float = -math.inf  # an earlier console has shown the events before
 
 
 def console_main(spec: ConsoleSpec, status: Connection | None = None) -> None:
     """Show the run on stderr until its "end" event, `processes.STOP`, or the death of the parent.
 
-    Target of a `spawn`ed process; reports over `status` that it is alive. Always restores the terminal.
+    Target of a `spawn`ed process; reports over `status` that it is alive. Always restores the
+    terminal.
     """
     child.leave_at_stop()
-    signal.signal(signal.SIGTTOU, signal.SIG_IGN)  # it may restore a terminal that has passed to the shell
+    signal.signal(
+        signal.SIGTTOU, signal.SIG_IGN
+    )  # it may restore a terminal that has passed to the shell
     report = child.reporter(status)
     with closing(_Feed(spec)) as feed:
 
@@ -98,7 +102,9 @@ def console_main(spec: ConsoleSpec, status: Connection | None = None) -> None:
 
         try:
             _draw(spec, feed, rounds)
-        except OSError:  # no reader: `2>&1 | head`, a closed terminal; another console would not help
+        except (
+            OSError
+        ):  # no reader: `2>&1 | head`, a closed terminal; another console would not help
             rounds(feed.update)
 
 
@@ -115,7 +121,9 @@ def give_back_terminal(keyboard: keys.Keyboard | None = None) -> None:
     if keyboard is not None:
         keyboard.restore()
     with suppress(OSError):
-        terminal = getattr(sys.stderr, "rich_proxied_file", sys.stderr)  # these control bytes are intended
+        terminal = getattr(
+            sys.stderr, "rich_proxied_file", sys.stderr
+        )  # these control bytes are intended
         if terminal.isatty():
             terminal.write("\x1b[?1049l\x1b[?25h")
             terminal.flush()
@@ -125,8 +133,12 @@ class _Feed:
     """Feeds the rings into the model."""
 
     def __init__(self, spec: ConsoleSpec) -> None:
-        ctl = "membrane-ctrl ctl" + ("" if spec.socket in (None, _SOCKET) else f" --socket {spec.socket}")
-        self.model = model.ConsoleModel(spec.config, spec.duration_s, ctl, spec.keyboard is not None)
+        ctl = "membrane-ctrl ctl" + (
+            "" if spec.socket in (None, _SOCKET) else f" --socket {spec.socket}"
+        )
+        self.model = model.ConsoleModel(
+            spec.config, spec.duration_s, ctl, spec.keyboard is not None
+        )
         self._telemetry = ring.RingReader(spec.telemetry)
         self._events = ring.RingReader(spec.events)
         self._shapes = ring.RingReader(spec.shapes) if spec.shapes else None
@@ -150,9 +162,17 @@ class _Feed:
 
 @contextmanager
 def _live(console: Console, spec: ConsoleSpec, feed: _Feed) -> Iterator[Callable[[], None]]:
-    """Show the console on the terminal's alternate page while in the foreground; restore the main page afterwards."""
+    """Show the console on the terminal's alternate page while in the foreground; restore the main
+    page afterwards.
+    """
     run, handle = str(spec.run_dir), 2
-    live = Live(console=console, screen=True, auto_refresh=False, redirect_stdout=False, redirect_stderr=False)
+    live = Live(
+        console=console,
+        screen=True,
+        auto_refresh=False,
+        redirect_stdout=False,
+        redirect_stderr=False,
+    )
     with _keys(spec) as (reader, desk):
 
         def show() -> None:

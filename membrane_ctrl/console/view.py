@@ -1,4 +1,6 @@
-"""The console on a terminal, from 60 x 15 characters: a higher one gets more items, a wider one a longer trend."""
+"""The console on a terminal, from 60 x 15 characters: a higher one gets more items, a wider one a
+longer trend.
+"""
 
 import math
 from collections.abc import Sequence
@@ -31,15 +33,20 @@ def level_bar(fraction: float, width: int, style: str = "cyan") -> Text:
 
 
 def signed_bars(values: Sequence[float], full: float, band: float, rows: int = 1) -> list[Text]:
-    """Draw a history as bars above and below a common zero: `rows` lines for either side, from the top.
+    """Draw a history as bars above and below a common zero: `rows` lines for either side, from the
+    top.
 
-    `full` is the value of a full-height bar; bars beyond `band` are red, the others green. NaN is a gap, zero the
-    thinnest upward bar.
+    `full` is the value of a full-height bar; bars beyond `band` are red, the others green. NaN is a
+    gap, zero the thinnest upward bar.
     """
     lines = [Text() for _ in range(2 * rows)]
     for value in values:
         colour = "green" if abs(value) <= band else "red"
-        eighths = min(8 * rows, max(1, math.ceil(8 * rows * abs(value) / full))) if math.isfinite(value) else 0
+        eighths = (
+            min(8 * rows, max(1, math.ceil(8 * rows * abs(value) / full)))
+            if math.isfinite(value)
+            else 0
+        )
         for row, line in enumerate(lines):
             up = row < rows
             in_row = min(8, max(0, eighths - 8 * (rows - 1 - row if up else row - rows)))
@@ -48,7 +55,8 @@ def signed_bars(values: Sequence[float], full: float, band: float, rows: int = 1
             elif up:
                 line.append(_EIGHTHS[in_row], colour)
             else:
-                # there are no hanging block characters: draw the rest of the cell in the background colour
+                # there are no hanging block characters: draw the rest of the cell in the background
+                # colour
                 line.append(_EIGHTHS[8 - in_row], Style(color=colour, reverse=True))
     return lines
 
@@ -59,7 +67,9 @@ def full_scale(values: Sequence[float], least: float) -> float:
     if largest <= least:
         return least
     decade = 10.0 ** math.floor(math.log10(largest))
-    return next(step * decade for step in (1.0, 2.0, 5.0, 10.0) if largest <= step * decade * (1 + 1e-9))
+    return next(
+        step * decade for step in (1.0, 2.0, 5.0, 10.0) if largest <= step * decade * (1 + 1e-9)
+    )
 
 
 _STATE_STYLES = {
@@ -98,7 +108,13 @@ class ConsolePage:
     """
 
     def __init__(
-        self, view: ConsoleView, config: Config, run: str, foot: str = "", asks: bool = False, help_: bool = False
+        self,
+        view: ConsoleView,
+        config: Config,
+        run: str,
+        foot: str = "",
+        asks: bool = False,
+        help_: bool = False,
     ) -> None:
         self._view, self._config, self._run = view, config, run
         self._foot, self._asks, self._help = foot, asks, help_
@@ -120,14 +136,22 @@ class ConsolePage:
         yield self._panel(trend_s, _DISPENSABLE[:omitted], rows, below - 2 * (rows - 1))
 
     def _panel(self, trend_s: int, omitted: Sequence[str], rows: int, below: int) -> Panel:
-        """The console without some items, `rows` lines on either side of the trend's zero, and `below` more."""
+        """The console without some items, `rows` lines on either side of the trend's zero, and
+        `below` more.
+        """
         view = self._view
-        time_left = f"{duration(view.left_s)} left" if math.isfinite(view.left_s) else "until stopped"
+        time_left = (
+            f"{duration(view.left_s)} left" if math.isfinite(view.left_s) else "until stopped"
+        )
         title = Text.assemble(" ", (view.state.name.lower(), _STATE_STYLES.get(view.state, "bold")))
         title.append(f" for {duration(view.state_age_s)} ")
         trend = () if "trend" in omitted else _trend(view, self._config, trend_s, rows)
         figures = _figures(view, self._config, trend, omitted)
-        parts: list[RenderableType] = [_headline(view, self._config), *([] if "" in omitted else [Text()]), figures]
+        parts: list[RenderableType] = [
+            _headline(view, self._config),
+            *([] if "" in omitted else [Text()]),
+            figures,
+        ]
         parts += _help(below) if self._help else _events(view, below)
         if self._foot:
             style = "bold yellow" if self._asks else "dim"
@@ -138,7 +162,9 @@ class ConsolePage:
             title=title,
             title_align="left",
             subtitle=Text(
-                f" run {duration(view.elapsed_s)}, {time_left} · {self._run} ", style="dim", overflow="ellipsis"
+                f" run {duration(view.elapsed_s)}, {time_left} · {self._run} ",
+                style="dim",
+                overflow="ellipsis",
             ),
             subtitle_align="left",
             border_style="red" if view.fault or view.silent_s else "green" if held else "blue",
@@ -152,7 +178,12 @@ def _events(view: ConsoleView, lines: int) -> list[RenderableType]:
     made: list[RenderableType] = [Text("events, in UTC", style="dim")]
     for event_line in view.events[1 - lines :]:
         event = from_dict(event_line)
-        line = Text(str(event_line.get("time_utc", ""))[11:19] + "  ", style="dim", no_wrap=True, overflow="ellipsis")
+        line = Text(
+            str(event_line.get("time_utc", ""))[11:19] + "  ",
+            style="dim",
+            no_wrap=True,
+            overflow="ellipsis",
+        )
         made.append(line.append(event.sentence, style=_style_event(event)))
     return [*made, *[Text()] * lines][:lines]
 
@@ -170,8 +201,12 @@ def _help(lines: int) -> list[RenderableType]:
     """The keys, and the commands that do the same from elsewhere, as far as the lines go."""
     made: list[RenderableType] = [Text()]
     for key, does, command in HELP:
-        line = Text(f"{key:>3}  ", style="bold", no_wrap=True, overflow="ellipsis").append(does, style="default")
-        made.append(line.append(f"   (membrane-ctrl ctl {command})" if command else "", style="dim"))
+        line = Text(f"{key:>3}  ", style="bold", no_wrap=True, overflow="ellipsis").append(
+            does, style="default"
+        )
+        made.append(
+            line.append(f"   (membrane-ctrl ctl {command})" if command else "", style="dim")
+        )
     return [*made, *[Text()] * lines][:lines]
 
 
@@ -185,7 +220,9 @@ def _headline(view: ConsoleView, config: Config) -> Text:
     for lock in view.locks[:_LOCKS_SHOWN]:
         line.append(f"LOCKED {lock}\n", style="bold white on red")
     if len(view.locks) > _LOCKS_SHOWN:
-        line.append(f"LOCKED by {len(view.locks) - _LOCKS_SHOWN} more locks\n", style="bold white on red")
+        line.append(
+            f"LOCKED by {len(view.locks) - _LOCKS_SHOWN} more locks\n", style="bold white on red"
+        )
     line.append(view.why, style=style)
     return line.append(f"\n{view.go_on}", style="default") if view.go_on else line
 
@@ -194,7 +231,9 @@ def _headline(view: ConsoleView, config: Config) -> Text:
 _DISPENSABLE = ("", "gains", "flow", "lateness", "cycle", "gas", "mirror", "trend", "shape", "pump")
 
 
-def _figures(view: ConsoleView, config: Config, trend: Sequence[tuple[str, Text]], omitted: Sequence[str]) -> Table:
+def _figures(
+    view: ConsoleView, config: Config, trend: Sequence[tuple[str, Text]], omitted: Sequence[str]
+) -> Table:
     table = Table.grid(padding=(0, 1))
     table.add_column(style="dim", justify="right", min_width=_LABELS, no_wrap=True)
     table.add_column(ratio=1)
@@ -232,40 +271,64 @@ def _error(view: ConsoleView, config: Config) -> Text:
     style = "bold green" if inside else "bold red" if math.isfinite(row.error_um) else "dim"
     error = COLUMNS["error_um"]
     text = Text(f"{row.quantity('error_um', sign=True):>10}", style=style)
-    mean, std = error.format_value(view.error_mean_um, sign=True), error.format_value(view.error_std_um)
+    mean, std = (
+        error.format_value(view.error_mean_um, sign=True),
+        error.format_value(view.error_std_um),
+    )
     text.append(f"   last minute: mean {mean}, std {std} {error.unit}, ", style="default")
-    text.append(f"{percent(view.in_band_fraction)} within ±{config.limits.band_um:g}", style="default")
+    text.append(
+        f"{percent(view.in_band_fraction)} within ±{config.limits.band_um:g}", style="default"
+    )
     return text
 
 
 def _trend(view: ConsoleView, config: Config, seconds: int, rows: int) -> list[tuple[str, Text]]:
-    """The bars of the last seconds with their labels; a blank label is not an item that can be omitted."""
+    """The bars of the last seconds with their labels; a blank label is not an item that can be
+    omitted.
+    """
     shown = view.trend_um[-max(1, seconds) :]
     full_um = full_scale(shown, config.limits.band_um * _CALM)
     labels = [f"+{full_um:g} µm", *[" "] * (2 * rows - 2), f"-{full_um:g} µm"]
     return list(zip(labels, signed_bars(shown, full_um, config.limits.band_um, rows), strict=True))
 
 
-# Published columns that the lines below show each in its own way; a line shows the others of its group behind them.
-_PLACED = frozenset({
-    "error_um", "displacement_um", "setpoint_um", "target_um", "pump_fraction", "vent_fraction", "flow_um_per_s",
-    "leak_um_per_s", "trim_um", "lateness_ms", "missed_ticks",
-})  # fmt: skip
+# Published columns that the lines below show each in its own way; a line shows the others of its
+# group behind them.
+_PLACED = frozenset(
+    {
+        "error_um",
+        "displacement_um",
+        "setpoint_um",
+        "target_um",
+        "pump_fraction",
+        "vent_fraction",
+        "flow_um_per_s",
+        "leak_um_per_s",
+        "trim_um",
+        "lateness_ms",
+        "missed_ticks",
+    }
+)
 
 
 def _others(row: telemetry.TelemetryRow, *groups: columns.Group) -> str:
     """Known values of the published columns of some groups that have no place of their own."""
-    shown = [each.name for each in PUBLISHED if each.plot.group in groups and each.name not in _PLACED]
+    shown = [
+        each.name for each in PUBLISHED if each.plot.group in groups and each.name not in _PLACED
+    ]
     return "".join(f"  {row.labelled(name)}" for name in shown if math.isfinite(getattr(row, name)))
 
 
 def _mirror(row: telemetry.TelemetryRow) -> Text:
     text = Text.assemble("reading ", (row.quantity("displacement_um", sign=True), "bold"))
     text.append(
-        f"  {row.labelled('setpoint_um', sign=True)}{_others(row, columns.Group.LOOP, columns.Group.ESTIMATE)}"
+        "  "
+        f"{row.labelled('setpoint_um', sign=True)}{_others(row, columns.Group.LOOP, columns.Group.ESTIMATE)}"  # noqa: E501
     )
     if math.isfinite(row.estimate_sigma_um):
-        text.append(f"  centre ± {row.quantity('estimate_sigma_um')} by {holders(row)}", style="green")
+        text.append(
+            f"  centre ± {row.quantity('estimate_sigma_um')} by {holders(row)}", style="green"
+        )
     if math.isfinite(row.truth_displacement_um):
         text.append(f"  truth {row.quantity('truth_displacement_um', sign=True)}", style="cyan")
         text.append(f" (laser {row.quantity('truth_laser_bias_um', sign=True)})", style="dim")
@@ -275,7 +338,10 @@ def _mirror(row: telemetry.TelemetryRow) -> Text:
 def _pump(row: telemetry.TelemetryRow, most_um_per_s: float) -> Text:
     flow = COLUMNS["flow_um_per_s"]
     text = level_bar(row.pump_fraction, _BAR_WIDTH)
-    text.append(f" {percent(row.pump_fraction)}, {flow.format_value(row.flow_um_per_s)} of ", style="default")
+    text.append(
+        f" {percent(row.pump_fraction)}, {flow.format_value(row.flow_um_per_s)} of ",
+        style="default",
+    )
     text.append(f"{most_um_per_s:g} {flow.unit}{_others(row, columns.Group.PUMP)}", style="default")
     if row.vent_fraction > 0:
         text.append(f"  vent {percent(row.vent_fraction)} open", style="yellow")
@@ -284,7 +350,9 @@ def _pump(row: telemetry.TelemetryRow, most_um_per_s: float) -> Text:
 
 def _flow(row: telemetry.TelemetryRow) -> Text:
     terms = columns_of(TERMS)
-    parts = [f"{each.label} {each.format_value(getattr(row, each.name), sign=True)}" for each in terms]
+    parts = [
+        f"{each.label} {each.format_value(getattr(row, each.name), sign=True)}" for each in terms
+    ]
     return Text(f"{'  '.join(parts)} {terms[0].unit}")
 
 
@@ -297,12 +365,17 @@ def _gas(view: ConsoleView, row: telemetry.TelemetryRow) -> Text:
 
 def _shape(shape: ShapeView, row: telemetry.TelemetryRow) -> list[tuple[str, RenderableType]]:
     state = Text(shape.state.name.lower(), style=_SHAPE_STYLES.get(shape.state, "default"))
-    state.append(f"  {row.labelled('trim_um', sign=True)}{_others(row, columns.Group.SHAPE)}", style="default")
+    state.append(
+        f"  {row.labelled('trim_um', sign=True)}{_others(row, columns.Group.SHAPE)}",
+        style="default",
+    )
     estimate = shape.estimate
     change = number(shape.sag_change_um, 3, sign=True)
     if change != MISSING:
         sigma = number(shape.change_sigma_um, 3)
-        state.append(f"  sag {change} ± {sigma} µm since {duration(shape.reference_s)}", style="default")
+        state.append(
+            f"  sag {change} ± {sigma} µm since {duration(shape.reference_s)}", style="default"
+        )
     if shape.note:
         state.append(f"  {shape.note}", style="yellow")
     if estimate is None:
@@ -311,16 +384,24 @@ def _shape(shape: ShapeView, row: telemetry.TelemetryRow) -> list[tuple[str, Ren
     cycle.append(f"  {duration(shape.age_s)} ago, {estimate.kind}, ", style="default")
     cycle.append(f"residual {number(estimate.slope_residual_urad, 1, 'µrad')}, ", style="default")
     cycle.append(f"in {number(1e3 * estimate.latency_s, 0, 'ms')}", style="default")
-    cycle.append(f"  {shape.rejected}/{shape.cycles} rejected", style="yellow" if shape.rejected else "dim")
+    cycle.append(
+        f"  {shape.rejected}/{shape.cycles} rejected", style="yellow" if shape.rejected else "dim"
+    )
     return [("shape", state), ("cycle", cycle)]
 
 
 def _lateness(view: ConsoleView, row: telemetry.TelemetryRow) -> Text:
     late = COLUMNS["lateness_ms"]
-    text = Text(f"{row.quantity('lateness_ms')}, worst of the minute {late.format_value(view.lateness_max_ms)}")
+    text = Text(
+        f"{row.quantity('lateness_ms')}, worst of the minute "
+        f"{late.format_value(view.lateness_max_ms)}"
+    )
     text.append(f" {late.unit}{_others(row, columns.Group.TIMING)}")
     missed = int(row.missed_ticks)
-    text.append(f", {missed} of {int(row.tick) + missed} ticks missed", style="yellow" if missed else "default")
+    text.append(
+        f", {missed} of {int(row.tick) + missed} ticks missed",
+        style="yellow" if missed else "default",
+    )
     return text
 
 

@@ -25,12 +25,18 @@ _STATES = {
     State.FAULT: "pump is off: a person must clear the latched fault",
 }
 # the command that ends a state in which somebody is waited for, and its key
-_GO_ON = {State.STANDBY: ("hold", " or key h"), State.MANUAL: ("hold", " or key h"), State.FAULT: ("ack", "")}
+_GO_ON = {
+    State.STANDBY: ("hold", " or key h"),
+    State.MANUAL: ("hold", " or key h"),
+    State.FAULT: ("ack", ""),
+}
 _WORTH_NAMING = 0.03  # of the flow: smaller contributions are not named
 
 
 def holders(row: TelemetryRow) -> str:
-    """The sensors that the estimate of the centre follows: laser and optics with their shares of its corrections."""
+    """The sensors that the estimate of the centre follows: laser and optics with their shares of
+    its corrections.
+    """
     seeing = {
         f"laser {percent(1.0 - row.optics_share)}": row.laser_innovation,
         f"optics {percent(row.optics_share)}": row.optics_innovation,
@@ -42,7 +48,9 @@ def holders(row: TelemetryRow) -> str:
 
 
 def why(row: TelemetryRow, told: str, fault: str, config: Config, paused: bool = False) -> str:
-    """The line; `told` is the controller's last reason, `fault` describes the standing fault or is empty."""
+    """The line; `told` is the controller's last reason, `fault` describes the standing fault or is
+    empty.
+    """
     state, safe_level = State(int(row.state)), SafeLevel(int(row.safe_level))
     if safe_level != SafeLevel.NONE:
         return f"{_level_words(safe_level, row, config)}: {fault or told or 'unknown fault'}"
@@ -55,7 +63,10 @@ def why(row: TelemetryRow, told: str, fault: str, config: Config, paused: bool =
         return told
     if state == State.INFLATE:
         to_go_um = row.target_um - row.filtered_um
-        return f"{_flow(row)}: {'filling' if to_go_um > 0 else 'waiting for the leak'}, {abs(to_go_um):.1f} µm to go"
+        return (
+            f"{_flow(row)}: {'filling' if to_go_um > 0 else 'waiting for the leak'}, "
+            f"{abs(to_go_um):.1f} µm to go"
+        )
     if abs(row.error_um) > config.limits.band_um:
         return f"outside the band: {_outside(row)}"
     return _balance(row) if state == State.HOLD else f"settling: {_balance(row)}"
@@ -68,14 +79,24 @@ def _level_words(safe_level: SafeLevel, row: TelemetryRow, config: Config) -> st
     if not config.vent_fitted:
         return _NO_VENT
     if row.vent_readback_fraction < _VENT_SHUT * row.vent_fraction:
-        return f"pump is off; the vent is commanded open, but its read-back is {percent(row.vent_readback_fraction)}"
+        return (
+            "pump is off; the vent is commanded open, but its read-back is "
+            f"{percent(row.vent_readback_fraction)}"
+        )
     return _LEVELS[safe_level]
 
 
 def go_on(
-    row: TelemetryRow, paused: bool, ctl: str, keys: bool, locks: Sequence[Lock] = (), latched: str = ""
+    row: TelemetryRow,
+    paused: bool,
+    ctl: str,
+    keys: bool,
+    locks: Sequence[Lock] = (),
+    latched: str = "",
 ) -> str:
-    """How to go on from a state that waits for a person, empty in others; `ctl` begins a command for this run."""
+    """How to go on from a state that waits for a person, empty in others; `ctl` begins a command
+    for this run.
+    """
     state = State(int(row.state))
     if locks:
         return f"go on: ask {locks[0].author}, then `{ctl} unlock {locks[0].word}`"
@@ -89,9 +110,15 @@ def _outside(row: TelemetryRow) -> str:
     """Direction of the deviation, and the pump's response to it (error = setpoint - reading)."""
     if row.error_um > 0:
         at_limit = row.flow_wanted_um_per_s > row.flow_um_per_s + 1e-6
-        return f"bowl {row.error_um:.1f} µm too shallow, {_flow(row)}{', its limit' if at_limit else ''}"
+        return (
+            f"bowl {row.error_um:.1f} µm too shallow, "
+            f"{_flow(row)}{', its limit' if at_limit else ''}"
+        )
     waits = row.flow_um_per_s <= 0
-    return f"bowl {-row.error_um:.1f} µm too deep, {_flow(row)}{', only the leak can lower it' if waits else ''}"
+    return (
+        f"bowl {-row.error_um:.1f} µm too deep, "
+        f"{_flow(row)}{', only the leak can lower it' if waits else ''}"
+    )
 
 
 def _balance(row: TelemetryRow) -> str:
@@ -103,7 +130,9 @@ def _balance(row: TelemetryRow) -> str:
         "feed-forward": row.feedforward_um_per_s,
     }
     least = _WORTH_NAMING * max(abs(row.flow_um_per_s), abs(row.i_um_per_s))
-    named = sorted(((v, k) for k, v in parts.items() if abs(v) > least), key=lambda part: -abs(part[0]))
+    named = sorted(
+        ((v, k) for k, v in parts.items() if abs(v) > least), key=lambda part: -abs(part[0])
+    )
     return f"{_flow(row)}: " + ", ".join(f"{value:+.2f} {name}" for value, name in named)
 
 

@@ -1,13 +1,14 @@
-"""One estimate of the mirror's centre from everything that sees it: a Kalman filter with a memory. Pure.
+"""One estimate of the mirror's centre from everything that sees it: a Kalman filter with a memory.
+Pure.
 
     centre  c = z + g_p p + g_T T_gas           z: the gas in the mirror, as height of the centre
     dz/dt   = q - leak                          q: the pump's flow, after dead time and lag
     dT_gas/dt = (T_air - T_gas) / T_g
     laser   = c + mount      optics = c - stand      barometer = p      thermometer = T_air
 
-z, leak, p, T_air and mount are random walks; `stand` is what the optics' zero differs from the laser's at lock. A
-frame shows the centre of some time ago: the centre at each of the last ticks is a state of its own (a clone), so a
-late reading is exact, whenever it comes.
+z, leak, p, T_air and mount are random walks; `stand` is what the optics' zero differs from the
+laser's at lock. A frame shows the centre of some time ago: the centre at each of the last ticks is
+a state of its own (a clone), so a late reading is exact, whenever it comes.
 """
 
 import math
@@ -19,8 +20,21 @@ from pydantic import Field
 
 from membrane_ctrl.config.control import EstimatorConfig, LoopConfig
 from membrane_ctrl.control import centre_estimate
-from membrane_ctrl.control.centre_estimate import FRESH_S, CentreEstimate, CentreReadings, Sensor, SensorView, Transit
-from membrane_ctrl.control.filters import LearnedFactor, Ramp, ReadingNoise, configured_walk, smoothing
+from membrane_ctrl.control.centre_estimate import (
+    FRESH_S,
+    CentreEstimate,
+    CentreReadings,
+    Sensor,
+    SensorView,
+    Transit,
+)
+from membrane_ctrl.control.filters import (
+    LearnedFactor,
+    Ramp,
+    ReadingNoise,
+    configured_walk,
+    smoothing,
+)
 from membrane_ctrl.control.gas import believed_weather
 from membrane_ctrl.model.arrays import FloatArray
 from membrane_ctrl.model.state_tree import ArrayShape, Count, StateNode
@@ -30,7 +44,11 @@ _PLANT = 7  # states before the clones
 CLONES = 64  # 1.3 s at 50 Hz
 _CLONE_S = 0.02  # least time between clones
 _GAIN_ERROR = 0.2  # share of the barometer's effect that its configured gain may miss
-_HUBER2, _FAR2, _FAR_COUNT = 9.0, 25.0, 3  # squared sigmas: weighed less beyond the first, dropped beyond the second
+_HUBER2, _FAR2, _FAR_COUNT = (
+    9.0,
+    25.0,
+    3,
+)  # squared sigmas: weighed less beyond the first, dropped beyond the second
 LOCK_FRAMES = 5
 _FRAMES_LOST = 3  # after this many missing frames the optics are gone
 _INTERVAL_SHARE = 0.2  # of a new interval in their mean
@@ -38,10 +56,14 @@ _IMPOSSIBLE = 1e4  # µm, Pa or K: no film, weather or mount moves that far in a
 _UNKNOWN_UM2 = 1e6  # variance of the optics' zero before lock
 _LEAK_STD_UM_PER_S, _WARMTH_STD_K, _AMBIENT_STD_PA = 0.3, 0.02, 1.0  # at the start
 _SHARE_S = 2.0  # memory of the sensors' weights
-# Of a leak's ramp in laser or optics, in standard deviations: seldom by chance where the noise is large
+# Of a leak's ramp in laser or optics, in standard deviations: seldom by chance where the noise is
+# large
 _RUN = 14.0, 8.0
-_OPTICS_JUMP_SHARE = 0.3  # a jump that the optics see and the laser's noise hides is the film's, most likely
-_ONE: FloatArray = np.eye(_PLANT + CLONES)  # a reading's expectation is a sum of states: one of them, as a row
+# a jump that the optics see and the laser's noise hides is the film's, most likely
+_OPTICS_JUMP_SHARE = 0.3
+_ONE: FloatArray = np.eye(
+    _PLANT + CLONES
+)  # a reading's expectation is a sum of states: one of them, as a row
 
 
 @dataclass(slots=True)
@@ -72,20 +94,28 @@ class CentreOrigin(StateNode):
 class CentreState(StateNode):
     """The filter's memory: the states, their covariance, and what was learned of the noise."""
 
-    x: Annotated[FloatArray, ArrayShape((_STATES,))] = field(default_factory=lambda: np.zeros(_STATES))
+    x: Annotated[FloatArray, ArrayShape((_STATES,))] = field(
+        default_factory=lambda: np.zeros(_STATES)
+    )
     p: Annotated[FloatArray, ArrayShape((_STATES, _STATES))] = field(
         default_factory=lambda: np.zeros((_STATES, _STATES))
     )
     # when each clone was made
-    times: Annotated[FloatArray, ArrayShape((CLONES,))] = field(default_factory=lambda: np.full(CLONES, -np.inf))
+    times: Annotated[FloatArray, ArrayShape((CLONES,))] = field(
+        default_factory=lambda: np.full(CLONES, -np.inf)
+    )
     count: Count = 0  # ticks
     origin: CentreOrigin = field(default_factory=CentreOrigin)
     # by sensor
-    watches: Annotated[list[SensorWatch], Field(min_length=len(Sensor), max_length=len(Sensor))] = field(
-        default_factory=lambda: [SensorWatch() for _ in Sensor]
+    watches: Annotated[list[SensorWatch], Field(min_length=len(Sensor), max_length=len(Sensor))] = (
+        field(default_factory=lambda: [SensorWatch() for _ in Sensor])
     )
-    noises: Annotated[list[ReadingNoise], Field(min_length=len(Sensor), max_length=len(Sensor))] = field(
-        default_factory=lambda: [ReadingNoise.of_reading(stated=sensor == Sensor.OPTICS) for sensor in Sensor]
+    noises: Annotated[list[ReadingNoise], Field(min_length=len(Sensor), max_length=len(Sensor))] = (
+        field(
+            default_factory=lambda: [
+                ReadingNoise.of_reading(stated=sensor == Sensor.OPTICS) for sensor in Sensor
+            ]
+        )
     )
     # of centre, pressure, air, and the laser's mount
     walks: Annotated[list[LearnedFactor], Field(min_length=4, max_length=4)] = field(
@@ -104,7 +134,9 @@ class CentreState(StateNode):
 class CentreFilter:
     """Estimates the centre; `start` it, then call `step` on every tick."""
 
-    def __init__(self, config: EstimatorConfig, loop: LoopConfig, memory: CentreState | None = None) -> None:
+    def __init__(
+        self, config: EstimatorConfig, loop: LoopConfig, memory: CentreState | None = None
+    ) -> None:
         self._config, self._rate_hz = config, loop.rate_hz
         self.set_gains(loop)
         self._every = max(1, round(_CLONE_S * loop.rate_hz))
@@ -116,7 +148,9 @@ class CentreFilter:
 
     def _make_transit(self) -> Transit:
         config = self._config
-        return Transit(config.pump_delay_s, config.pump_lag_s, 1 / self._rate_hz, self.memory.transit)
+        return Transit(
+            config.pump_delay_s, config.pump_lag_s, 1 / self._rate_hz, self.memory.transit
+        )
 
     @property
     def frames(self) -> int:
@@ -128,24 +162,41 @@ class CentreFilter:
         self._pressure_gain = loop.barometer_gain_um_per_pa
         self._warmth_gain = loop.temperature_gain_um_per_k
         self._gas_follows_air_s = loop.gas_follows_air_s
-        weather: FloatArray = self._pressure_gain * _ONE[_AMBIENT] + self._warmth_gain * _ONE[_WARMTH]
+        weather: FloatArray = (
+            self._pressure_gain * _ONE[_AMBIENT] + self._warmth_gain * _ONE[_WARMTH]
+        )
         self._centre: FloatArray = _ONE[_GAS] + weather
         self._uses = (loop.feedforward_barometer, loop.feedforward_temperature)
 
     def start(
-        self, displacement_um: float, flow_um_per_s: float, mount_um: float, sag_zero_um: float = math.nan
+        self,
+        displacement_um: float,
+        flow_um_per_s: float,
+        mount_um: float,
+        sag_zero_um: float = math.nan,
     ) -> None:
-        """Begin at a displacement, a flow that balances the leak, and a known displacement of the laser's mount.
+        """Begin at a displacement, a flow that balances the leak, and a known displacement of the
+        laser's mount.
 
-        `sag_zero_um`: the sag at displacement 0, of a bench without a laser; otherwise the first frames lock it.
+        `sag_zero_um`: the sag at displacement 0, of a bench without a laser; otherwise the first
+        frames lock it.
         """
         config, memory = self._config, self.memory
         memory.start_afresh()
-        memory.x[_GAS], memory.x[_LEAK], memory.x[_MOUNT] = displacement_um - mount_um, flow_um_per_s, mount_um
+        memory.x[_GAS], memory.x[_LEAK], memory.x[_MOUNT] = (
+            displacement_um - mount_um,
+            flow_um_per_s,
+            mount_um,
+        )
         variances = (
-            config.laser_noise_um**2, _LEAK_STD_UM_PER_S**2, _AMBIENT_STD_PA**2, _WARMTH_STD_K**2, _WARMTH_STD_K**2,
-            0.0, _UNKNOWN_UM2,
-        )  # fmt: skip
+            config.laser_noise_um**2,
+            _LEAK_STD_UM_PER_S**2,
+            _AMBIENT_STD_PA**2,
+            _WARMTH_STD_K**2,
+            _WARMTH_STD_K**2,
+            0.0,
+            _UNKNOWN_UM2,
+        )
         for i, variance in enumerate(variances):
             memory.p[i, i] = variance
         self._transit = self._make_transit()
@@ -165,7 +216,9 @@ class CentreFilter:
         memory.watches[Sensor.OPTICS] = SensorWatch()
 
     def blame_optics(self, mount_um: float) -> None:
-        """The optics were wrong: what the mount has moved from there was the centre's motion. They lock anew."""
+        """The optics were wrong: what the mount has moved from there was the centre's motion. They
+        lock anew.
+        """
         x = self.memory.x
         x += (x[_MOUNT] - mount_um) * (_ONE[_GAS] + self._centre_since(-math.inf) - _ONE[_MOUNT])
         self.relock()
@@ -183,7 +236,10 @@ class CentreFilter:
         if uses_pressure and math.isfinite(pressure_pa):
             if math.isnan(origin.ambient_pressure_pa):
                 origin.ambient_pressure_pa = pressure_pa
-            change_pa, variance = pressure_pa - origin.ambient_pressure_pa, config.barometer_noise_pa**2
+            change_pa, variance = (
+                pressure_pa - origin.ambient_pressure_pa,
+                config.barometer_noise_pa**2,
+            )
             self._take(Sensor.BAROMETER, _ONE[_AMBIENT], change_pa, variance, given.now_s)
         if uses_air and math.isfinite(air_c):
             if math.isnan(origin.air_temperature_c):
@@ -209,7 +265,8 @@ class CentreFilter:
         p[_LEAK, _LEAK] += dt_s * config.leak_walk_um_per_s_per_root_s**2
         p[_AMBIENT, _AMBIENT] += dt_s * self._pressure_walk()
         p[_AIR, _AIR] += dt_s * self._air_walk()
-        # without optics no reading tells mount from film, and what was learned of a drift would let the film drift
+        # without optics no reading tells mount from film, and what was learned of a drift would let
+        # the film drift
         drifts = self.memory.walks[3].factor if self._fresh(Sensor.OPTICS, given.now_s) else 1.0
         p[_MOUNT, _MOUNT] += dt_s * drifts * config.mount_walk_um_per_root_s**2
 
@@ -229,7 +286,10 @@ class CentreFilter:
     def _take_frame(self, given: CentreReadings) -> None:
         memory = self.memory
         times, time_s = memory.times, given.sag_time_s
-        before, after = np.where(times <= time_s, times, -np.inf), np.where(times > time_s, times, np.inf)
+        before, after = (
+            np.where(times <= time_s, times, -np.inf),
+            np.where(times > time_s, times, np.inf),
+        )
         early, late = int(before.argmax()), int(after.argmin())
         if not math.isfinite(before[early]) or time_s > given.now_s:
             return  # older than the memory, or from the future
@@ -251,10 +311,11 @@ class CentreFilter:
             self._lock()
 
     def _lock(self) -> None:
-        """Declare the figure seen so far the one to hold: what was uncertain of it is the laser's from now on.
+        """Declare the figure seen so far the one to hold: what was uncertain of it is the laser's
+        from now on.
 
-        A change of coordinates: with e the error of `stand`, the centre becomes c - e, the mount's displacement
-        mount + e.
+        A change of coordinates: with e the error of `stand`, the centre becomes c - e, the mount's
+        displacement mount + e.
         """
         for matrix in (self.memory.p, self.memory.p.T):
             matrix[_GAS] -= matrix[_STAND]
@@ -263,7 +324,13 @@ class CentreFilter:
             matrix[_STAND] = 0.0
 
     def _take(
-        self, sensor: Sensor, row: FloatArray, value: float, variance: float, now_s: float, taken_s: float = math.nan
+        self,
+        sensor: Sensor,
+        row: FloatArray,
+        value: float,
+        variance: float,
+        now_s: float,
+        taken_s: float = math.nan,
     ) -> None:
         """Use one reading, whose expectation is a row times the states, by how well it fits."""
         taken_s = now_s if math.isnan(taken_s) else taken_s
@@ -284,7 +351,9 @@ class CentreFilter:
         if watch.far >= _FAR_COUNT:
             self._open(sensor, innovation, now_s)
         elif not watch.far:
-            self._learn(sensor, 1 - variance / spread, min(now_s - watch.seen_s, FRESH_S[sensor]), leads)
+            self._learn(
+                sensor, 1 - variance / spread, min(now_s - watch.seen_s, FRESH_S[sensor]), leads
+            )
         if ramp is not None and runs:
             self._widen_leak(ramp, now_s, math.sqrt(spread))
         if watch.far or runs:
@@ -300,15 +369,22 @@ class CentreFilter:
             watch.pull += abs(float(self._centre @ gain))
 
     def _learn(self, sensor: Sensor, share: float, dt_s: float, leads: bool) -> None:
-        """Let a good reading correct the noise levels; the centre walks by itself, and by what warms the gas."""
+        """Let a good reading correct the noise levels; the centre walks by itself, and by what
+        warms the gas.
+        """
         walks: tuple[tuple[LearnedFactor, float], ...] = ()
         if sensor > Sensor.OPTICS:
             walks = ((self.memory.walks[sensor - 1], 1.0),)
         elif leads:
-            by_air = self._air_walk() * (self._warmth_gain * smoothing(dt_s, self._gas_follows_air_s)) ** 2
+            by_air = (
+                self._air_walk()
+                * (self._warmth_gain * smoothing(dt_s, self._gas_follows_air_s)) ** 2
+            )
             own = (centre := self._centre_walk()) / (centre + by_air)
             walks = ((self.memory.walks[0], own), (self.memory.walks[2], 1 - own))
-        else:  # a laser beside the optics shows its mount: drift that is not its walk would count as its noise
+        else:
+            # a laser beside the optics shows its mount: drift that is not its walk would count as
+            # its noise
             walks = ((self.memory.walks[3], 1.0),)
         self.memory.noises[sensor].learn(self.memory.watches[sensor].innovation, share, dt_s, walks)
 
@@ -323,12 +399,15 @@ class CentreFilter:
         return self.memory.walks[0].factor * (self._config.centre_walk_um_per_root_s**2 + missed)
 
     def _spread(self, row: FloatArray, variance: float) -> tuple[FloatArray, float]:
-        """Covariance of all states with a reading's expectation, and the variance of its innovation."""
+        """Covariance of all states with a reading's expectation, and the variance of its
+        innovation.
+        """
         ph: FloatArray = self.memory.p @ row
         return ph, float(row @ ph) + variance
 
     def _doubted(self, sensor: Sensor, squared: float, taken_s: float, now_s: float) -> bool:
-        """Whether a reading this far off, in squared sigmas, is not to be used yet: it may be a single bad one.
+        """Whether a reading this far off, in squared sigmas, is not to be used yet: it may be a
+        single bad one.
 
         A laser far off waits for a frame that shows whether film or mount has moved.
         """
@@ -339,10 +418,14 @@ class CentreFilter:
         watch.far_since_s = watch.far_since_s if watch.far else taken_s
         watch.far += 1
         waits = sensor == Sensor.LASER and self._fresh(Sensor.OPTICS, now_s)
-        return watch.far < _FAR_COUNT or (waits and self.memory.watches[Sensor.OPTICS].taken_s <= watch.far_since_s)
+        return watch.far < _FAR_COUNT or (
+            waits and self.memory.watches[Sensor.OPTICS].taken_s <= watch.far_since_s
+        )
 
     def _open(self, sensor: Sensor, innovation: float, now_s: float) -> None:
-        """A sensor has moved and stays there: let the others say whether it moved, or what it sees."""
+        """A sensor has moved and stays there: let the others say whether it moved,
+        or what it sees.
+        """
         since_s = self.memory.watches[sensor].far_since_s
         self._jumped.append(f"{sensor.name.lower()} {innovation:+.3g}")
         self._jumped_sensors.append(sensor)
@@ -352,9 +435,15 @@ class CentreFilter:
         elif sensor == Sensor.LASER and self._judged and self._fresh(Sensor.OPTICS, now_s):
             self._widen(innovation * _ONE[_MOUNT])
         elif sensor == Sensor.BAROMETER:
-            self._widen(innovation * (_ONE[_AMBIENT] + self._pressure_gain * self._centre_since(since_s)))
+            self._widen(
+                innovation * (_ONE[_AMBIENT] + self._pressure_gain * self._centre_since(since_s))
+            )
             self._widen(self._pressure_gain * innovation * moved)
-        elif sensor == Sensor.OPTICS and self._laser_agrees(now_s) and not self._fresh(sensor, since_s):
+        elif (
+            sensor == Sensor.OPTICS
+            and self._laser_agrees(now_s)
+            and not self._fresh(sensor, since_s)
+        ):
             # they are back, and the mirror has followed the laser's mount meanwhile
             self._widen(innovation * (_ONE[_GAS] + self._centre_since(-math.inf) - _ONE[_MOUNT]))
         else:
@@ -383,7 +472,9 @@ class CentreFilter:
     def _fresh(self, sensor: Sensor, now_s: float) -> bool:
         limit_s = FRESH_S[sensor]
         if sensor == Sensor.OPTICS:
-            limit_s = min(limit_s, max(FRESH_S[Sensor.LASER], _FRAMES_LOST * self.memory.frame_interval_s))
+            limit_s = min(
+                limit_s, max(FRESH_S[Sensor.LASER], _FRAMES_LOST * self.memory.frame_interval_s)
+            )
         return now_s - self.memory.watches[sensor].seen_s <= limit_s
 
     def _estimate(self, now_s: float) -> CentreEstimate:
@@ -402,7 +493,11 @@ class CentreFilter:
             leak_um_per_s=float(x[_LEAK]),
             drift_um_per_s=drift,
             sensors=tuple(
-                SensorView(self._fresh(sensor, now_s), watch.innovation, watch.pull / pulls if pulls > 0 else 0.0)
+                SensorView(
+                    self._fresh(sensor, now_s),
+                    watch.innovation,
+                    watch.pull / pulls if pulls > 0 else 0.0,
+                )
                 for sensor, watch in zip(Sensor, self.memory.watches, strict=True)
             ),
             jumped=tuple(self._jumped),

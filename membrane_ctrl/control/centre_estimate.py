@@ -1,4 +1,6 @@
-"""What the filter of the mirror's centre takes and gives; the gas between pump and mirror; the optics' stand."""
+"""What the filter of the mirror's centre takes and gives; the gas between pump and mirror; the
+optics' stand.
+"""
 
 import math
 from collections import deque
@@ -36,7 +38,8 @@ class CentreReadings:
     sag_um: float = math.nan
     sag_sigma_um: float = math.nan
     sag_time_s: float = math.nan
-    judged: bool = True  # a third witness will tell whether a jump of the laser was its mount's or the film's
+    # a third witness will tell whether a jump of the laser was its mount's or the film's
+    judged: bool = True
 
 
 @dataclass(frozen=True, slots=True)
@@ -44,7 +47,9 @@ class SensorView(StateNode):
     """One sensor's part in the estimate."""
 
     fresh: bool  # the estimate follows it
-    innovation: float  # last reading minus expectation, in standard deviations; NaN before the first
+    innovation: (
+        float  # last reading minus expectation, in standard deviations; NaN before the first
+    )
     share: float  # of the corrections of the centre, 0..1
 
 
@@ -88,7 +93,11 @@ class CentreEstimate(StateNode):
             for sensor, view in zip(Sensor, self.sensors, strict=True)
             if view.fresh
         }
-        return {"estimate_sigma_um": self.sigma_um, "optics_share": self.sensors[Sensor.OPTICS].share, **told}
+        return {
+            "estimate_sigma_um": self.sigma_um,
+            "optics_share": self.sensors[Sensor.OPTICS].share,
+            **told,
+        }
 
 
 @dataclass(slots=True)
@@ -102,8 +111,9 @@ class StandGrowthState(StateNode):
 class StandGrowth:
     """The sag that the optics see too much because their stand has become warmer since the lock.
 
-    Nothing on the bench sees it: laser and optics differ by the laser's mount, too, and a gauge's zero drifts more.
-    What is known of it comes from the air's temperature, which the stand follows late.
+    Nothing on the bench sees it: laser and optics differ by the laser's mount, too, and a gauge's
+    zero drifts more. What is known of it comes from the air's temperature, which the stand follows
+    late.
     """
 
     def __init__(self, config: EstimatorConfig, memory: StandGrowthState | None = None) -> None:
@@ -150,7 +160,9 @@ class TransitState(StateNode):
 class Transit:
     """Gas between pump and mirror: a dead time, then a lag, in ticks of `period_s`."""
 
-    def __init__(self, delay_s: float, lag_s: float, period_s: float, memory: TransitState | None = None) -> None:
+    def __init__(
+        self, delay_s: float, lag_s: float, period_s: float, memory: TransitState | None = None
+    ) -> None:
         self._ticks = int(delay_s / period_s + 1e-9)
         self._rest = max(0.0, delay_s / period_s - self._ticks)
         self._delay_s, self._lag_s, self._period_s = delay_s, lag_s, period_s
@@ -170,7 +182,9 @@ class Transit:
         for _ in range(max(1, round(dt_s / self._period_s))):
             memory.flows.appendleft(flow_um_per_s)
             memory.flows.pop()
-        late = (1 - self._rest) * memory.flows[self._ticks] + self._rest * memory.flows[self._ticks + 1]
+        late = (1 - self._rest) * memory.flows[self._ticks] + self._rest * memory.flows[
+            self._ticks + 1
+        ]
         moved = smoothing(dt_s, self._lag_s) * (late - memory.arriving)
         memory.arriving += moved
         return late * dt_s - self._lag_s * moved
@@ -178,8 +192,14 @@ class Transit:
     def coming_um(self, drift_um_per_s: float) -> float:
         """Rise still to come, if from now on the pump gives the drift."""
         flows = self.memory.flows
-        pending = self._period_s * (sum(islice(flows, self._ticks)) + self._rest * flows[self._ticks])
-        return pending - drift_um_per_s * self._delay_s + self._lag_s * (self.memory.arriving - drift_um_per_s)
+        pending = self._period_s * (
+            sum(islice(flows, self._ticks)) + self._rest * flows[self._ticks]
+        )
+        return (
+            pending
+            - drift_um_per_s * self._delay_s
+            + self._lag_s * (self.memory.arriving - drift_um_per_s)
+        )
 
     def due_um_per_s(self) -> float:
         """Flow at the end of the dead time: what the pump now receives comes on top of it."""

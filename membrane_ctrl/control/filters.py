@@ -1,4 +1,6 @@
-"""Filters of single signals: first-order for unequal steps, drift; noise levels and ramps in innovations. Pure."""
+"""Filters of single signals: first-order for unequal steps, drift; noise levels and ramps in
+innovations. Pure.
+"""
 
 import math
 from dataclasses import dataclass, field
@@ -13,14 +15,18 @@ def smoothing(dt_s: float, time_constant_s: float) -> float:
 
 @dataclass(slots=True)
 class LowPass(StateNode):
-    """First-order lag that starts at its first input; a time constant of 0 passes the input through."""
+    """First-order lag that starts at its first input; a time constant of 0 passes the input
+    through.
+    """
 
     value: float = math.nan
     age_s: float = math.inf  # of a mean of all inputs; infinite without one
 
     @classmethod
     def with_early_mean(cls) -> "LowPass":
-        """A lag that is the plain mean of its inputs at first, of which none weighs more than the others."""
+        """A lag that is the plain mean of its inputs at first, of which none weighs more than the
+        others.
+        """
         return cls(age_s=0.0)
 
     def reset(self, value: float) -> None:
@@ -39,12 +45,14 @@ class LowPass(StateNode):
 
 @dataclass(slots=True)
 class LagRate(StateNode):
-    """Rate of change of a signal behind a first-order lag, (x - lag(x)) / T, that survives the signal's absence.
+    """Rate of change of a signal behind a first-order lag, (x - lag(x)) / T, that survives the
+    signal's absence.
 
-    The mean rate over a step is the lag's change divided by the step, so that the rate integrates exactly to the
-    lag's own movement; T = 0 gives the plain difference quotient. While the signal is absent (NaN) the last value
-    stands and the rate decays; on its return the lag is placed so that the rate continues from its present value:
-    neither makes a bump. A step of more than `step_max` counts as an absence.
+    The mean rate over a step is the lag's change divided by the step, so that the rate integrates
+    exactly to the lag's own movement; T = 0 gives the plain difference quotient. While the signal
+    is absent (NaN) the last value stands and the rate decays; on its return the lag is placed so
+    that the rate continues from its present value: neither makes a bump. A step of more than
+    `step_max` counts as an absence.
     """
 
     rate_per_s: float = 0.0
@@ -52,7 +60,9 @@ class LagRate(StateNode):
     lag: float = math.nan
     absent: bool = True
 
-    def update(self, given: float, dt_s: float, time_constant_s: float, step_max: float = math.inf) -> float:
+    def update(
+        self, given: float, dt_s: float, time_constant_s: float, step_max: float = math.inf
+    ) -> float:
         """Mean rate per second over the step; `given` may be NaN."""
         share = smoothing(dt_s, time_constant_s)
         if math.isfinite(given):
@@ -74,7 +84,8 @@ class LagRate(StateNode):
 class Slope(StateNode):
     """Least-squares slope of y over t, from running sums; times are counted from the first sample.
 
-    With n evenly spread samples of noise sigma over a span T its standard deviation is sigma sqrt(12 / n) / T:
+    With n evenly spread samples of noise sigma over a span T its standard deviation is sigma
+    sqrt(12 / n) / T:
     0.25 µm/s for 1 µm, 50 Hz and 1.5 s.
     """
 
@@ -107,15 +118,16 @@ class Slope(StateNode):
 
 # Tracker of a slow drift in noisy readings: value and rate, with fading memory.
 #
-# Least squares of a straight line through all readings, each weighted by exp(-age / T). For readings a step dt apart,
-# with beta = exp(-dt / T) and r = reading - prediction (Morrison, Introduction to Sequential Smoothing and
-# Prediction, 1969, degree-1 polynomial with fading memory):
+# Least squares of a straight line through all readings, each weighted by exp(-age / T). For
+# readings a step dt apart, with beta = exp(-dt / T) and r = reading - prediction (Morrison,
+# Introduction to Sequential Smoothing and Prediction, 1969, degree-1 polynomial with fading
+# memory):
 #
 #     value += (1 - beta^2) r,    rate += (1 - beta)^2 r / dt
 #
-# Both poles lie at beta: critically damped. A steady drift is tracked without error (a single lag would trail
-# by rate x T). After a sudden onset of a drift v the tracker trails by v t exp(-t / T): at most v T / e. Noise of
-# standard deviation sigma per reading becomes sigma sqrt(1.25 dt / T).
+# Both poles lie at beta: critically damped. A steady drift is tracked without error (a single lag
+# would trail by rate x T). After a sudden onset of a drift v the tracker trails by v t exp(-t / T):
+# at most v T / e. Noise of standard deviation sigma per reading becomes sigma sqrt(1.25 dt / T).
 
 
 @dataclass(slots=True)
@@ -129,14 +141,17 @@ class DriftTracker(StateNode):
     def begin(self, time_s: float) -> None:
         """Set drift and rate to 0 at this time.
 
-        An initially short memory would find an old drift sooner, but its noise would move a still mirror.
+        An initially short memory would find an old drift sooner, but its noise would move a still
+        mirror.
         """
         self.time_s = time_s
         self.value_um = 0.0
         self.rate_um_per_s = 0.0
 
     def at(self, time_s: float, memory_s: float) -> float:
-        """Value in µm expected at a time (not before the last reading's); a rate is believed for one memory."""
+        """Value in µm expected at a time (not before the last reading's); a rate is believed for
+        one memory.
+        """
         return self.value_um + self.rate_um_per_s * min(time_s - self.time_s, memory_s)
 
     def take(self, reading_um: float, time_s: float, memory_s: float) -> None:
@@ -160,7 +175,9 @@ _STATED, _CONFIGURED, _UNREST = 250.0, 25.0, 4.0
 
 @dataclass(slots=True)
 class LearnedFactor(StateNode):
-    """A factor on a variance; its logarithm follows the likelihood's slope over the information so far."""
+    """A factor on a variance; its logarithm follows the likelihood's slope over the information so
+    far.
+    """
 
     information: float
     log: float = 0.0
@@ -187,10 +204,13 @@ def configured_walk() -> LearnedFactor:
 
 @dataclass(slots=True)
 class ReadingNoise(StateNode):
-    """The factor on the variance of a sensor's readings; corrects the walks that the sensor sees, too.
+    """The factor on the variance of a sensor's readings; corrects the walks that the sensor sees,
+    too.
 
-    The innovations are to be of unit variance, which sets the scale of noise and walks, and white, which sets their
-    ratio: they correlate positively where the filter follows too slowly, negatively where it follows noise.
+    The innovations are to be of unit variance, which sets the scale of noise and walks, and white,
+    which sets their
+    ratio: they correlate positively where the filter follows too slowly, negatively where it
+    follows noise.
     """
 
     level: LearnedFactor
@@ -207,16 +227,23 @@ class ReadingNoise(StateNode):
         return self.level.factor
 
     def learn(
-        self, innovation: float, share: float, dt_s: float, walks: tuple[tuple[LearnedFactor, float], ...]
+        self,
+        innovation: float,
+        share: float,
+        dt_s: float,
+        walks: tuple[tuple[LearnedFactor, float], ...],
     ) -> None:
-        """Take an innovation in standard deviations, and the share of its variance that is the state's.
+        """Take an innovation in standard deviations, and the share of its variance that is the
+        state's.
 
         `walks`: what moves the state, and its part in that; none for a sensor that does not lead.
         """
         forget = min(1.0, dt_s / _MEMORY_S)
         innovation, known = min(max(innovation, -_LIMIT), _LIMIT), share / 8
         size, runs = (innovation**2 - 1) / 2, math.sqrt(known) * innovation * self.past
-        by_noise = 1 - share / 2  # change of the innovations' variance with the noise, both as logarithms
+        by_noise = (
+            1 - share / 2
+        )  # change of the innovations' variance with the noise, both as logarithms
         leads = bool(walks)
         information = by_noise**2 / 2 + leads * known
         self.level.learn(by_noise * size - leads * runs, information, forget, _READING_BOUND)

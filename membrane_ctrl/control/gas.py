@@ -2,13 +2,14 @@
 
     q = q_full (d - dead) / (1 - dead)   while it runs; starts at `start`, stalls below `stall`   (docs/physics.md)
 
-or a measured curve through any number of points, with a second branch for falling commands if there is hysteresis.
+or a measured curve through any number of points, with a second branch for falling commands if there
+is hysteresis.
 
-There is no flow between rest and the least running flow: a wanted flow in that gap goes to the nearer end, so that
-the error of the gap has no fixed sign. (Always running would add gas that nothing removes, always stopping would lose
-the least flow: each is a bias.) The rest is left to the integrator, which does not know about the gap, but sees
-the resulting error.
-"""
+There is no flow between rest and the least running flow: a wanted flow in that gap goes to the
+nearer end, so that the error of the gap has no fixed sign. (Always running would add gas that
+nothing removes, always stopping would lose the least flow: each is a bias.) The rest is left to the
+integrator, which does not know about the gap, but sees the resulting error.
+"""  # noqa: E501
 
 import math
 from bisect import bisect_right
@@ -23,7 +24,8 @@ from membrane_ctrl.model.state_tree import StateNode
 # Margin above the stall command, so that a rounded register or a cold pump does not stall.
 STALL_MARGIN = 0.005
 
-# A stopped pump gets the start command for this long: about its lag (0.15 s), in which it adds less than 0.1 µm.
+# A stopped pump gets the start command for this long: about its lag (0.15 s), in which it adds less
+# than 0.1 µm.
 KICK_S = 0.1
 
 VENT_FULL_UM_PER_S = 100.0  # of an open vent at the nominal pressure
@@ -47,7 +49,8 @@ class _StraightLine:
 
 
 class _Measured:
-    """A monotone cubic (PCHIP) through measured points, tabulated, so that curve and inverse agree and cost the same.
+    """A monotone cubic (PCHIP) through measured points, tabulated, so that curve and inverse agree
+    and cost the same.
 
     There is no flow below the first command, and none beyond the last one is known.
     """
@@ -57,7 +60,11 @@ class _Measured:
         self.lowest_fraction, self.highest_fraction = fractions[0], fractions[-1]
 
     def flow(self, fraction: float) -> float:
-        return _between(self._fractions, self._flows, fraction) if fraction >= self._fractions[0] else 0.0
+        return (
+            _between(self._fractions, self._flows, fraction)
+            if fraction >= self._fractions[0]
+            else 0.0
+        )
 
     def fraction(self, flow_um_per_s: float) -> float:
         return _between(self._flows, self._fractions, flow_um_per_s)
@@ -77,7 +84,9 @@ def _between(xs: Sequence[float], ys: Sequence[float], x: float) -> float:
 
 
 def _monotone_cubic(xs: Sequence[float], ys: Sequence[float]) -> tuple[list[float], list[float]]:
-    """Points along the cubic of Fritsch and Butland (SIAM J. Sci. Stat. Comput. 5, 1984, 300): no new extrema."""
+    """Points along the cubic of Fritsch and Butland (SIAM J. Sci. Stat. Comput. 5, 1984, 300): no
+    new extrema.
+    """
     widths = [b - a for a, b in pairwise(xs)]
     chords = [(b - a) / width for (a, b), width in zip(pairwise(ys), widths, strict=True)]
     slopes = [_end_slope(widths, chords)]
@@ -103,7 +112,9 @@ def _end_slope(widths: Sequence[float], chords: Sequence[float]) -> float:
     """Three-point slope at the first point, limited so that the first interval stays monotone."""
     if len(chords) == 1:
         return chords[0]
-    slope = ((2 * widths[0] + widths[1]) * chords[0] - widths[0] * chords[1]) / (widths[0] + widths[1])
+    slope = ((2 * widths[0] + widths[1]) * chords[0] - widths[0] * chords[1]) / (
+        widths[0] + widths[1]
+    )
     return min(max(slope, 0.0), 3 * chords[0])
 
 
@@ -116,9 +127,11 @@ class PumpCurveState(StateNode):
 
 
 class PumpCurve:
-    """The inverse of the pump, which remembers whether the pump runs, and between two branches how much it gives.
+    """The inverse of the pump, which remembers whether the pump runs, and between two branches how
+    much it gives.
 
-    Hysteresis is play: the flow stays while it lies between the branches at the command, and else moves along one.
+    Hysteresis is play: the flow stays while it lies between the branches at the command, and else
+    moves along one.
     """
 
     def __init__(self, pump: PumpConfig, memory: PumpCurveState | None = None) -> None:
@@ -126,8 +139,11 @@ class PumpCurve:
         self._start_fraction = pump.start_fraction
         self._rising = branch(pump, pump.curve_um_per_s)
         self._falling = branch(pump, pump.curve_falling_um_per_s or pump.curve_um_per_s)
-        # Below its first command a measured curve knows no running pump, on its falling branch either
-        self._least_fraction = max(pump.stall_fraction + STALL_MARGIN, self._falling.lowest_fraction)
+        # Below its first command a measured curve knows no running pump, on its falling branch
+        # either
+        self._least_fraction = max(
+            pump.stall_fraction + STALL_MARGIN, self._falling.lowest_fraction
+        )
 
     @property
     def least_flow_um_per_s(self) -> float:
@@ -141,7 +157,10 @@ class PumpCurve:
 
     def flow(self, fraction: float) -> float:
         """Flow in µm/s that a running pump gives for a command."""
-        return min(max(self.memory.flow_um_per_s, self._rising.flow(fraction)), self._falling.flow(fraction))
+        return min(
+            max(self.memory.flow_um_per_s, self._rising.flow(fraction)),
+            self._falling.flow(fraction),
+        )
 
     def fraction(self, flow_um_per_s: float) -> float:
         """Command at which a running pump, from lower commands, gives a flow."""
@@ -154,7 +173,9 @@ class PumpCurve:
             return 0.0
         memory = self.memory
         branch = self._rising if flow_um_per_s > memory.flow_um_per_s else self._falling
-        fraction = min(max(branch.fraction(flow_um_per_s), self._least_fraction), branch.highest_fraction)
+        fraction = min(
+            max(branch.fraction(flow_um_per_s), self._least_fraction), branch.highest_fraction
+        )
         if memory.kick_left_s > 0.0:
             memory.kick_left_s -= dt_s
             fraction = max(fraction, self._start_fraction)
@@ -164,16 +185,16 @@ class PumpCurve:
 
 # Flow that answers the weather before the laser sees it.
 #
-# Ambient pressure moves the centre by g_p (µm/Pa) at once, gas temperature by g_T (µm/K), and the gas follows the air
-# with a lag T_g. The speed that cancels them is
+# Ambient pressure moves the centre by g_p (µm/Pa) at once, gas temperature by g_T (µm/K), and the
+# gas follows the air with a lag T_g. The speed that cancels them is
 #
 #     v = -g_p d/dt lag(p, T_f) - g_T d/dt lag(T_air, T_g)
 #
 # T_f only keeps the barometer's noise from the pump; T_g is physical and needs no further filter.
 
 
-# Neither weather nor a door (slammed: 100 Pa) changes this much between ticks, but a failed sensor does, such as one
-# that reads 85 or -127 C
+# Neither weather nor a door (slammed: 100 Pa) changes this much between ticks, but a failed sensor
+# does, such as one that reads 85 or -127 C
 _STEP_MAX_PA, _STEP_MAX_K = 500.0, 2.0
 # Any workplace from 5000 m to a mine; hPa, mmHg and psi are far outside, and so are K for C
 _PRESSURE_PA = (50e3, 110e3)
@@ -183,9 +204,15 @@ _TEMPERATURE_C = (-20.0, 60.0)
 def weather_fault(ambient_pressure_pa: float, air_temperature_c: float) -> str:
     """Name the sensor with an impossible reading; absent ones (NaN) do not count."""
     if not _believed(ambient_pressure_pa, _PRESSURE_PA):
-        return f"the barometer reads {ambient_pressure_pa:g} Pa: check its unit; the feed-forward does without it"
+        return (
+            f"the barometer reads {ambient_pressure_pa:g} Pa: check its unit; the feed-forward "
+            "does without it"
+        )
     if not _believed(air_temperature_c, _TEMPERATURE_C):
-        return f"the air thermometer reads {air_temperature_c:g} C: check its unit; the feed-forward does without it"
+        return (
+            f"the air thermometer reads {air_temperature_c:g} C: check its unit; the "
+            "feed-forward does without it"
+        )
     return ""
 
 
@@ -210,10 +237,11 @@ class FeedForwardState(StateNode):
 
 
 class FeedForward:
-    """Feed-forward from barometer and air thermometer; either may be switched off, or drop out (NaN), at any time.
+    """Feed-forward from barometer and air thermometer; either may be switched off, or drop out
+    (NaN), at any time.
 
-    A value that jumps further than weather can, or is outside the range of any workplace, is a sensor fault and has
-    no effect.
+    A value that jumps further than weather can, or is outside the range of any workplace, is a
+    sensor fault and has no effect.
     """
 
     def __init__(self, loop: LoopConfig, memory: FeedForwardState | None = None) -> None:
@@ -221,7 +249,9 @@ class FeedForward:
         self.memory = memory or FeedForwardState()
 
     def set_gains(self, loop: LoopConfig) -> None:
-        """Set gains, switches and time constants; a channel switched off decays like a lost sensor."""
+        """Set gains, switches and time constants; a channel switched
+        off decays like a lost sensor.
+        """
         self._loop = loop
 
     def update(self, ambient_pressure_pa: float, air_temperature_c: float, dt_s: float) -> float:
@@ -230,8 +260,12 @@ class FeedForward:
         pressure_pa, temperature_c = believed_weather(ambient_pressure_pa, air_temperature_c)
         pressure_pa = pressure_pa if loop.feedforward_barometer else math.nan
         temperature_c = temperature_c if loop.feedforward_temperature else math.nan
-        pa_per_s = self.memory.pressure.update(pressure_pa, dt_s, loop.feedforward_filter_s, _STEP_MAX_PA)
-        k_per_s = self.memory.temperature.update(temperature_c, dt_s, loop.gas_follows_air_s, _STEP_MAX_K)
+        pa_per_s = self.memory.pressure.update(
+            pressure_pa, dt_s, loop.feedforward_filter_s, _STEP_MAX_PA
+        )
+        k_per_s = self.memory.temperature.update(
+            temperature_c, dt_s, loop.gas_follows_air_s, _STEP_MAX_K
+        )
         pressure_um_per_s = loop.barometer_gain_um_per_pa * pa_per_s
         temperature_um_per_s = loop.temperature_gain_um_per_k * k_per_s
         return -(pressure_um_per_s + temperature_um_per_s)

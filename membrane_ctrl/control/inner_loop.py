@@ -1,7 +1,10 @@
-"""The inner loop: holds the laser reading at the setpoint with the pump's flow. Pure: no I/O, no clock.
+"""The inner loop: holds the laser reading at the setpoint with the pump's flow. Pure: no I/O, no
+clock.
 
-Order of a tick: setpoint ramp and trim -> measurement filter -> P, I, D -> feed-forward -> limits -> back-calculation
--> pump curve. The measurement filter stands before the limits: noise that meets a one-sided limit becomes a bias.
+Order of a tick: setpoint ramp and trim -> measurement filter -> P, I, D -> feed-forward -> limits
+-> back-calculation
+-> pump curve. The measurement filter stands before the limits: noise that meets a one-sided limit
+becomes a bias.
 """
 
 import math
@@ -18,7 +21,8 @@ class LoopInput:
     """Inputs of one tick."""
 
     target_um: float  # end of the setpoint's ramp, without the trim
-    trim_um: float  # the shape loop's share of the setpoint; it changes slowly and is added behind the ramp
+    # the shape loop's share of the setpoint; it changes slowly and is added behind the ramp
+    trim_um: float
     displacement_um: float  # laser reading, as read
     ambient_pressure_pa: float  # NaN without a sensor
     air_temperature_c: float
@@ -31,7 +35,9 @@ class LoopOutput(StateNode):
 
     setpoint_um: float = math.nan  # ramp and trim
     filtered_um: float = math.nan  # NaN in a tick without a reading
-    error_um: float = math.nan  # setpoint minus filtered reading; NaN without one, and while another sets the flow
+    error_um: float = (
+        math.nan
+    )  # setpoint minus filtered reading; NaN without one, and while another sets the flow
     p_um_per_s: float = math.nan
     i_um_per_s: float = math.nan
     d_um_per_s: float = math.nan
@@ -71,8 +77,8 @@ class InnerLoopState(StateNode):
 class InnerLoop:
     """Two-degree-of-freedom PI(D) with feed-forward, on flow as a speed of the mirror's centre.
 
-    Call exactly one of `step`, `stale`, `follow` and `resume` per tick; the first three may follow each other without
-    a bump.
+    Call exactly one of `step`, `stale`, `follow` and `resume` per tick; the first three may follow
+    each other without a bump.
     """
 
     def __init__(
@@ -85,9 +91,14 @@ class InnerLoop:
         self.memory = memory = memory or InnerLoopState()
         self._loop = loop
         lag_s, tick_s = estimator.pump_lag_s, 1 / loop.rate_hz
-        own_s = max(1 / estimator.gain_per_s, lag_s / 3)  # a faster one drives a slow pump from limit to limit
-        # both poles of the loop, its own and the pump's or a faster one, by what a tick leaves (docs/estimator.md)
-        slow_per_s, fast_per_s = (filters.smoothing(tick_s, s) / tick_s for s in (own_s, min(own_s, lag_s)))
+        own_s = max(
+            1 / estimator.gain_per_s, lag_s / 3
+        )  # a faster one drives a slow pump from limit to limit
+        # both poles of the loop, its own and the pump's or a faster one, by what a tick leaves
+        # (docs/estimator.md)
+        slow_per_s, fast_per_s = (
+            filters.smoothing(tick_s, s) / tick_s for s in (own_s, min(own_s, lag_s))
+        )
         self._error_gain_per_s = lag_s * slow_per_s * fast_per_s if lag_s > 0 else slow_per_s
         self._due_gain = (1 - lag_s * slow_per_s) * (1 - lag_s * fast_per_s)
         self._flow_full_um_per_s = pump.flow_full_um_per_s
@@ -96,7 +107,9 @@ class InnerLoop:
         self._weight = pid.SetpointWeight(loop.setpoint_weight, loop.ti_s, memory.weight)
         self._pid = pid.Pid(_gains(loop), flow_max_um_per_s, memory.integrator)
         self._feedforward = gas.FeedForward(loop, memory.feedforward)
-        self._limiter = pid.FlowLimiter(flow_max_um_per_s, loop.flow_rate_limit_um_per_s2, memory.limiter)
+        self._limiter = pid.FlowLimiter(
+            flow_max_um_per_s, loop.flow_rate_limit_um_per_s2, memory.limiter
+        )
         self._curve = gas.PumpCurve(pump, memory.curve)
         self._probe_um = pump.probe_um
         self._drift = pump_drift.PumpDrift(pid.DEAD_S, pid.PUMP_LAG_S, memory.drift)
@@ -152,7 +165,9 @@ class InnerLoop:
         self.memory.learned = False
         if given.estimate is None and not math.isfinite(given.displacement_um):
             return self.stale(given, dt_s)
-        weather_um_per_s = self._feedforward.update(given.ambient_pressure_pa, given.air_temperature_c, dt_s)
+        weather_um_per_s = self._feedforward.update(
+            given.ambient_pressure_pa, given.air_temperature_c, dt_s
+        )
         known_um_per_s = weather_um_per_s
         if given.estimate is None:
             terms, ramp_um_per_s = self._on_laser(given, dt_s)
@@ -162,7 +177,9 @@ class InnerLoop:
         filtered_um = self.memory.measured.value
         wanted_um_per_s = terms.sum_um_per_s + known_um_per_s + ramp_um_per_s
         probing = (
-            self.may_probe and self._probe_um > 0.0 and abs(given.target_um - self._ramp.value_um) < _AT_TARGET_UM
+            self.may_probe
+            and self._probe_um > 0.0
+            and abs(given.target_um - self._ramp.value_um) < _AT_TARGET_UM
         )
         probe_um_per_s = self._drift.flow_um_per_s(self._probe_um) if probing else 0.0
         limited_um_per_s = self._limiter.limit(wanted_um_per_s + probe_um_per_s, dt_s)
@@ -170,14 +187,20 @@ class InnerLoop:
             self._pid.integrate(dt_s)
         fraction = self._command(limited_um_per_s, dt_s)
         if probing and math.isfinite(given.displacement_um):
-            self.memory.learned = self._drift.step(given.displacement_um, self._curve.flow(fraction), dt_s)
+            self.memory.learned = self._drift.step(
+                given.displacement_um, self._curve.flow(fraction), dt_s
+            )
         else:
             self._drift.spoil()
         if given.estimate is None:
-            self.memory.leak.update(self._flow(fraction) - weather_um_per_s, given.displacement_um, filtered_um, dt_s)
+            self.memory.leak.update(
+                self._flow(fraction) - weather_um_per_s, given.displacement_um, filtered_um, dt_s
+            )
         else:
             self.memory.leak.take(given.estimate.leak_um_per_s, filtered_um, dt_s)
-        return self._output(terms, known_um_per_s + ramp_um_per_s, wanted_um_per_s, fraction, filtered_um)
+        return self._output(
+            terms, known_um_per_s + ramp_um_per_s, wanted_um_per_s, fraction, filtered_um
+        )
 
     def _on_laser(self, given: LoopInput, dt_s: float) -> tuple[pid.PidTerms, float]:
         """PI(D) on the filtered reading: its terms, and the ramp's own speed."""
@@ -189,25 +212,33 @@ class InnerLoop:
         rate_um_per_s = 0.0 if math.isnan(before_um) else (filtered_um - before_um) / dt_s
         return self._pid.terms(error_um, rate_um_per_s), ramp_um_per_s
 
-    def _on_estimate(self, given: LoopInput, estimate: CentreEstimate, dt_s: float) -> tuple[pid.PidTerms, float]:
-        """P on the centre that the gas in transit leads to, and the ramp's own speed; the leak is the integrator.
+    def _on_estimate(
+        self, given: LoopInput, estimate: CentreEstimate, dt_s: float
+    ) -> tuple[pid.PidTerms, float]:
+        """P on the centre that the gas in transit leads to, and the ramp's own speed; the leak is
+        the integrator.
 
-        The prediction takes dead time and lag out of the loop, and the filter, which knows the flow after its limits,
-        cannot wind up. Everything that `_on_laser` needs follows, so that either may take over at any tick.
+        The prediction takes dead time and lag out of the loop, and the filter, which knows the flow
+        after its limits, cannot wind up. Everything that `_on_laser` needs follows, so that either
+        may take over at any tick.
         """
         self.memory.measured.reset(estimate.um)
         shaped_um, ramp_um_per_s = self._shape_setpoint(given, estimate.um, dt_s)
         self.memory.matched.reset(shaped_um)
         self._pid.place(estimate.leak_um_per_s)
-        p_um_per_s = self._error_gain_per_s * (shaped_um - estimate.ahead_um) + self._due_gain * estimate.due_um_per_s
+        p_um_per_s = (
+            self._error_gain_per_s * (shaped_um - estimate.ahead_um)
+            + self._due_gain * estimate.due_um_per_s
+        )
         terms = pid.PidTerms(p_um_per_s, self._pid.integral_um_per_s, 0.0)
         return terms, ramp_um_per_s
 
     def stale(self, given: LoopInput, dt_s: float) -> LoopOutput:
         """One tick without control: the integrator is frozen and put out, for it is the mean flow.
 
-        Repeating the last reading instead would integrate its error: 5 times the excursion (docs/physics.md). A
-        reading that is there (a pause) is filtered all the same, so that the error is the present one.
+        Repeating the last reading instead would integrate its error: 5 times the excursion
+        (docs/physics.md). A reading that is there (a pause) is filtered all the same, so that the
+        error is the present one.
         """
         seen = math.isfinite(given.displacement_um)
         filtered_um = self._filter_reading(given.displacement_um, dt_s) if seen else math.nan
@@ -219,13 +250,15 @@ class InnerLoop:
         mean_um_per_s = self._pid.integral_um_per_s
         self._limiter.limit(mean_um_per_s, dt_s)
         fraction = self._command(self._limiter.flow_um_per_s, dt_s)
-        return self._output(pid.PidTerms(0.0, mean_um_per_s, 0.0), 0.0, mean_um_per_s, fraction, filtered_um)
+        return self._output(
+            pid.PidTerms(0.0, mean_um_per_s, 0.0), 0.0, mean_um_per_s, fraction, filtered_um
+        )
 
     def follow(self, given: LoopInput, flow_um_per_s: float, dt_s: float) -> LoopOutput:
         """Run one tick with an external flow (manual, tuning, ramp-down), within the pump's range.
 
-        The setpoint stands at the last finite reading and the integrator at the flow, so that `step` continues from
-        there; the target is not used.
+        The setpoint stands at the last finite reading and the integrator at the flow, so that
+        `step` continues from there; the target is not used.
         """
         seen = math.isfinite(given.displacement_um)
         if seen:
@@ -233,32 +266,42 @@ class InnerLoop:
         if not math.isnan(self.memory.measured.value):
             self._stand_at(self.memory.measured.value)
             self._ramp.place(self.memory.measured.value - given.trim_um)
-        weather_um_per_s = self._feedforward.update(given.ambient_pressure_pa, given.air_temperature_c, dt_s)
+        weather_um_per_s = self._feedforward.update(
+            given.ambient_pressure_pa, given.air_temperature_c, dt_s
+        )
         placed_um_per_s = self._limiter.place(flow_um_per_s)
         self._pid.place(placed_um_per_s - weather_um_per_s)
         self._spoil()
         fraction = self._command(placed_um_per_s, dt_s)
         if seen:
             pumped_um_per_s = self._flow(fraction) - weather_um_per_s
-            self.memory.leak.update(pumped_um_per_s, given.displacement_um, self.memory.measured.value, dt_s)
+            self.memory.leak.update(
+                pumped_um_per_s, given.displacement_um, self.memory.measured.value, dt_s
+            )
         else:
             self.memory.leak.pause()
         terms = pid.PidTerms(0.0, self._pid.integral_um_per_s, 0.0)
         filtered_um = self.memory.measured.value if seen else math.nan
-        return replace(self._output(terms, weather_um_per_s, flow_um_per_s, fraction, filtered_um), error_um=math.nan)
+        return replace(
+            self._output(terms, weather_um_per_s, flow_um_per_s, fraction, filtered_um),
+            error_um=math.nan,
+        )
 
     def resume(self, given: LoopInput, mean_um_per_s: float, dt_s: float) -> LoopOutput:
-        """`follow` with the flow that holds the mirror on average: what answers the weather then comes on top.
+        """`follow` with the flow that holds the mirror on average: what answers the weather then
+        comes on top.
 
-        Were the weather's present share taken out of the mean, as `follow` does for a flow that a person has set, the
-        integrator would stand wrong by a gust's worth.
+        Were the weather's present share taken out of the mean, as `follow` does for a flow that a
+        person has set, the integrator would stand wrong by a gust's worth.
         """
         output = self.follow(given, mean_um_per_s, dt_s)
         self._pid.place(self._limiter.flow_um_per_s)
         return output
 
     def follow_raw(self, given: LoopInput, fraction: float, dt_s: float) -> LoopOutput:
-        """`follow` with a raw pump command, which is output unchanged; whether the pump runs is unknown."""
+        """`follow` with a raw pump command, which is output unchanged; whether the pump runs is
+        unknown.
+        """
         flow_um_per_s = self._flow(fraction)
         output = self.follow(given, flow_um_per_s, dt_s)
         self._curve.stopped()
@@ -270,7 +313,10 @@ class InnerLoop:
         """Take new settings without a bump in the flow."""
         flow_max_um_per_s = min(loop.flow_max_um_per_s, self._flow_full_um_per_s)
         self._loop = loop
-        self._ramp.rate_um_per_s, self._ramp.flow_max_um_per_s = loop.setpoint_ramp_um_per_s, flow_max_um_per_s
+        self._ramp.rate_um_per_s, self._ramp.flow_max_um_per_s = (
+            loop.setpoint_ramp_um_per_s,
+            flow_max_um_per_s,
+        )
         self._weight.weight = loop.setpoint_weight
         self._weight.ti_s = loop.ti_s
         self._weight.reset(self.memory.shaped_um)
@@ -294,7 +340,9 @@ class InnerLoop:
         self._drift.spoil()
 
     def set_pump(self, pump: PumpConfig) -> None:
-        """Take another curve of the pump: the mean flow becomes what that says of the mean command."""
+        """Take another curve of the pump: the mean flow becomes what
+        that says of the mean command.
+        """
         mean_fraction = self._curve.fraction(self._pid.integral_um_per_s / self._drift.correction)
         self._flow_full_um_per_s = pump.flow_full_um_per_s
         self._probe_um = pump.probe_um
@@ -313,7 +361,9 @@ class InnerLoop:
         self._weight.reset(setpoint_um)
         self.memory.matched.reset(setpoint_um)
 
-    def _shape_setpoint(self, given: LoopInput, filtered_um: float, dt_s: float) -> tuple[float, float]:
+    def _shape_setpoint(
+        self, given: LoopInput, filtered_um: float, dt_s: float
+    ) -> tuple[float, float]:
         """Advance the setpoint; return it as the loop sees it, and its speed in µm/s."""
         if math.isnan(self.memory.setpoint_um):
             self._stand_at(filtered_um)
@@ -322,15 +372,22 @@ class InnerLoop:
         base_um = self._ramp.advance(given.target_um, self._pid.integral_um_per_s, dt_s)
         self.memory.setpoint_um = base_um + given.trim_um
         shaped_um = self._weight.update(self.memory.setpoint_um, dt_s)
-        # An integrating mirror follows a ramp with a flow equal to the ramp's speed. Bounded, as it includes the
-        # trim's steps.
+        # An integrating mirror follows a ramp with a flow equal to the ramp's speed. Bounded, as it
+        # includes the trim's steps.
         limit_um_per_s = self._loop.setpoint_ramp_um_per_s
-        speed_um_per_s = min(max((shaped_um - self.memory.shaped_um) / dt_s, -limit_um_per_s), limit_um_per_s)
+        speed_um_per_s = min(
+            max((shaped_um - self.memory.shaped_um) / dt_s, -limit_um_per_s), limit_um_per_s
+        )
         self.memory.shaped_um = shaped_um
         return shaped_um, speed_um_per_s
 
     def _output(
-        self, terms: pid.PidTerms, feedforward: float, wanted: float, fraction: float, filtered_um: float
+        self,
+        terms: pid.PidTerms,
+        feedforward: float,
+        wanted: float,
+        fraction: float,
+        filtered_um: float,
     ) -> LoopOutput:
         """The outputs of the tick; flows in µm/s."""
         return LoopOutput(

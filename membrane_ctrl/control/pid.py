@@ -1,4 +1,5 @@
-"""PI(D) on a filtered measurement, with back-calculation and a clamped integrator; margins of the loop with it.
+"""PI(D) on a filtered measurement, with back-calculation and a clamped integrator; margins of the
+loop with it.
 
     P = K (r - y)          D = -K Td dy/dt          u = P + I + D
     dI/dt = K / Ti (r - y) + (v - u) / Tt,    Tt = Ti,    0 <= I <= v_max
@@ -6,9 +7,10 @@
 v is u within the pump's range [0, v_max].
 Source: Astrom and Hagglund, Advanced PID Control (2006), sections 3.4 and 3.5.
 
-The feed-forward is added afterwards, and the integrator ignores what the limits cut from it. Gusts are cut on one
-side only, as the pump removes no gas. In the steady state dI/dt = 0, so back-calculation would turn a mean cut
-(v - u) into a mean error -(v - u) / K: measured with gusts, 0.18 µm, and 0.00 without it.
+The feed-forward is added afterwards, and the integrator ignores what the limits cut from it. Gusts
+are cut on one side only, as the pump removes no gas. In the steady state dI/dt = 0, so
+back-calculation would turn a mean cut (v - u) into a mean error -(v - u) / K: measured with gusts,
+0.18 µm, and 0.00 without it.
 """
 
 import math
@@ -60,7 +62,9 @@ class Pid:
     The integrator stays between 0, as the pump removes no gas, and `flow_max_um_per_s`.
     """
 
-    def __init__(self, gains: PidGains, flow_max_um_per_s: float, memory: PidState | None = None) -> None:
+    def __init__(
+        self, gains: PidGains, flow_max_um_per_s: float, memory: PidState | None = None
+    ) -> None:
         self.gains = gains
         self.flow_max_um_per_s = flow_max_um_per_s
         self.memory = memory or PidState()
@@ -83,7 +87,9 @@ class Pid:
         return self._terms()
 
     def integrate(self, dt_s: float) -> None:
-        """Advance the integrator by the last error, back-calculated where the terms leave the pump's range."""
+        """Advance the integrator by the last error, back-calculated where the terms leave the
+        pump's range.
+        """
         wanted_um_per_s = self._terms().sum_um_per_s
         back_um_per_s = self._clamped(wanted_um_per_s) - wanted_um_per_s
         drive_um_per_s = self.gains.kp_per_s * self.memory.error_um + back_um_per_s
@@ -91,7 +97,9 @@ class Pid:
         self.memory.integral_um_per_s = self._clamped(integral_um_per_s)
 
     def set_gains(self, gains: PidGains) -> None:
-        """Change the gains and let the integrator take up the difference, so that the sum does not jump."""
+        """Change the gains and let the integrator take up the difference, so that the sum does not
+        jump.
+        """
         before = self._terms()
         self.gains = gains
         self.memory.integral_um_per_s = self._clamped(
@@ -101,7 +109,9 @@ class Pid:
     def _terms(self) -> PidTerms:
         kp, td_s = self.gains.kp_per_s, self.gains.td_s
         memory = self.memory
-        return PidTerms(kp * memory.error_um, memory.integral_um_per_s, -kp * td_s * memory.rate_um_per_s)
+        return PidTerms(
+            kp * memory.error_um, memory.integral_um_per_s, -kp * td_s * memory.rate_um_per_s
+        )
 
     def _clamped(self, flow_um_per_s: float) -> float:
         return min(max(flow_um_per_s, 0.0), self.flow_max_um_per_s)
@@ -120,7 +130,9 @@ class FlowState(StateNode):
 class FlowLimiter:
     """Keeps a flow within [0, max] and its change, either way, within a rate."""
 
-    def __init__(self, flow_max_um_per_s: float, rate_um_per_s2: float, memory: FlowState | None = None) -> None:
+    def __init__(
+        self, flow_max_um_per_s: float, rate_um_per_s2: float, memory: FlowState | None = None
+    ) -> None:
         self.flow_max_um_per_s = flow_max_um_per_s
         self.rate_um_per_s2 = rate_um_per_s2
         self.memory = memory or FlowState()
@@ -143,7 +155,8 @@ class FlowLimiter:
         return self.place(min(max(wanted_um_per_s, low), high))
 
 
-# The setpoint's path to its target: a ramp the pump can follow, and the weight of the second degree of freedom.
+# The setpoint's path to its target: a ramp the pump can follow, and the weight of the second degree
+# of freedom.
 
 
 # The ramp's last part is exponential with this time constant, to avoid a kink that the pump's lag
@@ -162,10 +175,15 @@ class SetpointRampState(StateNode):
 
 
 class SetpointRamp:
-    """Setpoint that moves to its target no faster than allowed, and no faster than the pump can take the mirror."""
+    """Setpoint that moves to its target no faster than allowed, and no faster than the pump can
+    take the mirror.
+    """
 
     def __init__(
-        self, rate_um_per_s: float, flow_max_um_per_s: float, memory: SetpointRampState | None = None
+        self,
+        rate_um_per_s: float,
+        flow_max_um_per_s: float,
+        memory: SetpointRampState | None = None,
     ) -> None:
         self.rate_um_per_s = rate_um_per_s
         self.flow_max_um_per_s = flow_max_um_per_s
@@ -183,8 +201,9 @@ class SetpointRamp:
     def advance(self, target_um: float, mean_flow_um_per_s: float, dt_s: float) -> float:
         """Setpoint after one step towards `target_um`.
 
-        The pump only adds gas: the mirror falls no faster than it leaks, and the mean flow balances the leak. So a
-        fall is limited to a share of the mean flow, a rise to a share of the flow above it.
+        The pump only adds gas: the mirror falls no faster than it leaks, and the mean flow balances
+        the leak. So a fall is limited to a share of the mean flow, a rise to a share of the flow
+        above it.
         """
         down = min(self.rate_um_per_s, RAMP_SHARE * mean_flow_um_per_s)
         up = min(self.rate_um_per_s, RAMP_SHARE * (self.flow_max_um_per_s - mean_flow_um_per_s))
@@ -203,12 +222,15 @@ class SetpointWeightState(StateNode):
 class SetpointWeight:
     """Proportional setpoint weight b as a filter before the loop, (1 + b Ti s) / (1 + Ti s).
 
-    PI with weight b on the setpoint is the same as PI on the error of the setpoint so filtered (K (b r - y) + K / (Ti
-    s) (r - y) = K (1 + 1 / (Ti s)) (F r - y)). In this form the integrator is the mean flow at any setpoint, so it
-    can be clamped to what the pump can do. b = 1 follows the ramp, 0 leaves the setpoint to the integrator alone.
+    PI with weight b on the setpoint is the same as PI on the error of the setpoint so filtered (K
+    (b r - y) + K / (Ti s) (r - y) = K (1 + 1 / (Ti s)) (F r - y)). In this form the integrator is
+    the mean flow at any setpoint, so it can be clamped to what the pump can do. b = 1 follows the
+    ramp, 0 leaves the setpoint to the integrator alone.
     """
 
-    def __init__(self, weight: float, ti_s: float, memory: SetpointWeightState | None = None) -> None:
+    def __init__(
+        self, weight: float, ti_s: float, memory: SetpointWeightState | None = None
+    ) -> None:
         self.weight = weight
         self.ti_s = ti_s
         self.memory = memory or SetpointWeightState()
@@ -223,7 +245,8 @@ class SetpointWeight:
         return slow_um + self.weight * (setpoint_um - slow_um)
 
 
-# Margins of the linear inner loop: the sampled loop as it runs, its dead times exact, at every frequency.
+# Margins of the linear inner loop: the sampled loop as it runs, its dead times exact, at every
+# frequency.
 
 
 # docs/physics.md, inner loop; the tick itself takes 5 ms from sample to write
@@ -236,13 +259,17 @@ _ALIASES = 3  # they fall with the third power of the frequency
 
 
 def open_loop(loop: LoopConfig, omega: FloatArray) -> ComplexArray:
-    """Return L of the sampled loop: PID and filter as difference equations, hold, dead time, pump lag, mirror."""
+    """Return L of the sampled loop: PID and filter as difference equations, hold, dead time, pump
+    lag, mirror.
+    """
     dt_s = 1 / loop.rate_hz
     z = np.exp(1j * omega * dt_s)
     share = smoothing(dt_s, loop.measurement_filter_s)
     measurement_filter = share / (1 - (1 - share) / z)
     derivative = loop.td_s * (1 - 1 / z) / dt_s
-    pi = loop.kp_per_s * (1 + dt_s / loop.ti_s / (z - 1) + derivative)  # the integrator moves after the output
+    pi = loop.kp_per_s * (
+        1 + dt_s / loop.ti_s / (z - 1) + derivative
+    )  # the integrator moves after the output
     mirror = np.zeros_like(z)
     for k in range(-_ALIASES, _ALIASES + 1):  # what the samples fold back; at 1 Hz it decides
         s = 1j * (omega + 2 * math.pi * k / dt_s)
@@ -251,7 +278,8 @@ def open_loop(loop: LoopConfig, omega: FloatArray) -> ComplexArray:
 
 
 def peak_sensitivity(loop: LoopConfig) -> float:
-    """Return the largest amplification of a disturbance at any frequency; infinity for an unstable loop.
+    """Return the largest amplification of a disturbance at any frequency; infinity for an unstable
+    loop.
 
     The defaults stay below 1.4. NaN for a loop with `kp_per_s` 0.
     """
@@ -260,8 +288,9 @@ def peak_sensitivity(loop: LoopConfig) -> float:
     low = _FAR_BELOW * min(loop.kp_per_s, 1 / loop.ti_s)
     omega = np.geomspace(low, math.pi * loop.rate_hz * 0.999, _POINTS)
     difference = 1 + open_loop(loop, omega)
-    # Nyquist: L has two poles at the origin and none outside, so 1 + L must turn by half a turn from far below to
-    # the sampling limit; each further encirclement of -1 is a pair of unstable poles.
+    # Nyquist: L has two poles at the origin and none outside, so 1 + L must turn by half a turn
+    # from far below to the sampling limit; each further encirclement of -1 is a pair of unstable
+    # poles.
     turned = float(np.unwrap(np.angle(difference))[-1] - np.angle(difference)[0])
     if abs(turned - math.pi) > math.pi / 2:
         return math.inf

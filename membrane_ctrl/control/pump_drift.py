@@ -1,19 +1,22 @@
 """The pump's flow relative to its configured curve, learned while the mirror is held. Pure.
 
-While a loop holds, weather and laser noise move the flow, and the flow moves the mirror. What such readings tell of
-the pump depends on the model of the noise, and may be wrong by a factor of two. A probe does not: a small sine on the
-flow whose sign alternates at random from segment to segment, independent of everything else. The centre is the
-integral of the flow, so at the probe's frequency w, with the flow that the loop really gave (its answer included),
+While a loop holds, weather and laser noise move the flow, and the flow moves the mirror. What such
+readings tell of the pump depends on the model of the noise, and may be wrong by a factor of two. A
+probe does not: a small sine on the flow whose sign alternates at random from segment to segment,
+independent of everything else. The centre is the integral of the flow, so at the probe's frequency
+w, with the flow that the loop really gave (its answer included),
 
     Y = s U exp(-j w d) / (j w (1 + j w T)),    Y, U: correlations of centre and flow with the probe,
 
-and s is the scale sought, whatever loop, weather and noise are. Doors and lifts do not know the signs. The delay d is
-assumed for an hour, then seen in the phase; the lag T is assumed: 0.15 s more of it read as 5 % less of s.
+and s is the scale sought, whatever loop, weather and noise are. Doors and lifts do not know the
+signs. The delay d is assumed for an hour, then seen in the phase; the lag T is assumed: 0.15 s more
+of it read as 5 % less of s.
 
-s changes at a rate that wanders (without it the estimate trails a wearing pump by hours). The error bar comes from
-the scatter of the segments. An offset of the curve and the film's leak are a constant flow each and cannot be told
+s changes at a rate that wanders (without it the estimate trails a wearing pump by hours). The error
+bar comes from the scatter of the segments. An offset of the curve and the film's leak are a
+constant flow each and cannot be told
 apart: the leak that is reported is their sum.
-"""
+"""  # noqa: E501
 
 import cmath
 import math
@@ -48,7 +51,9 @@ _SIGN_SEED = 0b1010_0110_1011_1001
 
 @dataclass(frozen=True, slots=True)
 class PumpScale(StateNode):
-    """What is known of the pump: its flow relative to the configured curve, and one standard error."""
+    """What is known of the pump: its flow relative to the configured curve,
+    and one standard error.
+    """
 
     scale: float = 1.0
     sigma: float = SIGMA_FIRST
@@ -62,15 +67,20 @@ class PumpDriftState(StateNode):
     """The open segment, and what the earlier ones have taught."""
 
     known: PumpScale = PumpScale()  # estimate after the last segment
-    correction: float = 1.0  # scale that the loop may use: follows the estimate slowly, not within its error bar
+    # scale that the loop may use: follows the estimate slowly, not within its error bar
+    correction: float = 1.0
     signs: Count = _SIGN_SEED
     sign: float = 1.0
     time_s: float = 0.0  # in the segment
     whole: bool = True  # no tick of the segment is missing
     mean_um: LowPass = field(default_factory=LowPass)
     mean_flow: LowPass = field(default_factory=LowPass)
-    sums: _Pair = field(default_factory=lambda: np.zeros(2, complex))  # of the segment: centre and flow
-    means: _Pair = field(default_factory=lambda: np.zeros(2, complex))  # of the segments: motion seen, and expected
+    sums: _Pair = field(
+        default_factory=lambda: np.zeros(2, complex)
+    )  # of the segment: centre and flow
+    means: _Pair = field(
+        default_factory=lambda: np.zeros(2, complex)
+    )  # of the segments: motion seen, and expected
     rate_per_s: float = 0.0  # of the scale
     # covariance of scale and rate
     spread: Annotated[FloatArray, ArrayShape((2, 2))] = field(
@@ -86,7 +96,9 @@ class PumpDrift:
     def __init__(self, delay_s: float, lag_s: float, memory: PumpDriftState | None = None) -> None:
         self.memory = memory or PumpDriftState()
         w = PROBE_RAD_PER_S
-        self._path: ComplexArray = np.array([cmath.exp(-1j * w * delay_s) / (1j * w * (1 + 1j * w * lag_s))])
+        self._path: ComplexArray = np.array(
+            [cmath.exp(-1j * w * delay_s) / (1j * w * (1 + 1j * w * lag_s))]
+        )
 
     @property
     def known(self) -> PumpScale:
@@ -99,16 +111,22 @@ class PumpDrift:
         return self.memory.correction
 
     def flow_um_per_s(self, amplitude_um: float) -> float:
-        """The probe now; `amplitude_um` is that of the centre's motion without the loop's answer."""
+        """The probe now; `amplitude_um` is that of the centre's
+        motion without the loop's answer.
+        """
         memory = self.memory
-        return memory.sign * amplitude_um * PROBE_RAD_PER_S * math.sin(PROBE_RAD_PER_S * memory.time_s)
+        return (
+            memory.sign * amplitude_um * PROBE_RAD_PER_S * math.sin(PROBE_RAD_PER_S * memory.time_s)
+        )
 
     def spoil(self) -> None:
         """The segment cannot be used: no reading, or the flow was not the loop's."""
         self.memory.whole = False
 
     def step(self, displacement_um: float, flow_um_per_s: float, dt_s: float) -> bool:
-        """Take a tick: the reading, and the flow by the configured curve from then on. True if it ends a segment."""
+        """Take a tick: the reading, and the flow by the configured curve from then on. True if it
+        ends a segment.
+        """
         memory = self.memory
         if memory.time_s >= _SETTLE_S:
             turn = memory.sign * cmath.exp(-1j * PROBE_RAD_PER_S * memory.time_s) * dt_s
@@ -142,7 +160,9 @@ class PumpDrift:
         if not size * abs(along):
             return
         scale = memory.known.scale + memory.rate_per_s * SEGMENT_S
-        off = (centre * along.conjugate()).real / abs(along) - scale * (expected * usual.conjugate()).real / size
+        off = (centre * along.conjugate()).real / abs(along) - scale * (
+            expected * usual.conjugate()
+        ).real / size
         if memory.count <= _LEARNED:
             memory.scatter += share * (off**2 - memory.scatter)
             return
@@ -165,7 +185,9 @@ class PumpDrift:
             memory.correction += min(max(goal - memory.correction, -step), step)
 
     def _next_segment(self) -> None:
-        """Alternate the sign by a shift register of 16 bits: the same in every run, and like nothing else."""
+        """Alternate the sign by a shift register of 16 bits: the same in every run, and like
+        nothing else.
+        """
         memory = self.memory
         bits = memory.signs
         bit = (bits ^ (bits >> 2) ^ (bits >> 3) ^ (bits >> 5)) & 1

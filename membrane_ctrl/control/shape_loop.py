@@ -1,13 +1,15 @@
-"""The shape loop: moves the setpoint so that the figure stays although the laser's mount drifts. Pure.
+"""The shape loop: moves the setpoint so that the figure stays although the laser's mount drifts.
+Pure.
 
-The laser reads y = d + b: the mirror's centre d and the drift b of its mount. The camera sees the sag, and the ring
-stays where it is, so the change of sag is the change of d. Against a reference taken at lock
+The laser reads y = d + b: the mirror's centre d and the drift b of its mount. The camera sees the
+sag, and the ring stays where it is, so the change of sag is the change of d. Against a reference
+taken at lock
 
     b = (change of the laser) - (change of sag),    both at the time of the exposures.
 
-With the trim at b the inner loop holds y = target + b, that is d = target. b does not depend on the setpoint, so a
-user's setpoint change never counts as drift, and the trim closes no feedback loop that could become unstable: there
-is only a tracker to tune.
+With the trim at b the inner loop holds y = target + b, that is d = target. b does not depend on the
+setpoint, so a user's setpoint change never counts as drift, and the trim closes no feedback loop
+that could become unstable: there is only a tracker to tune.
 """
 
 import math
@@ -28,10 +30,11 @@ from membrane_ctrl.model.zernike_terms import ZERNIKE_TERMS
 # The reference of the shape loop: the mean of the first shapes.
 
 
-# An error of the reference remains as an offset of the figure: the mean has less than half the scatter of one shape,
-# at the price of a few cycles without the trim.
+# An error of the reference remains as an offset of the figure: the mean has less than half the
+# scatter of one shape, at the price of a few cycles without the trim.
 SHAPES = 5
-# Figures of single frames come faster than the laser's noise averages out: as many readings as five cycles have.
+# Figures of single frames come faster than the laser's noise averages out: as many readings as five
+# cycles have.
 TRACKED_SHAPES, TRACKED_EVERY_S = 25, 0.4
 
 
@@ -78,7 +81,9 @@ class ReferenceMean(StateNode):
         if self.taken and of_frame and estimate.time_s < self.taken[-1].time_s + TRACKED_EVERY_S:
             return
         coeffs_um = np.array(estimate.coeffs_um, dtype=float)
-        self.taken.append(ReferenceShape(estimate.time_s, estimate.displacement_um, coeffs_um, of_frame))
+        self.taken.append(
+            ReferenceShape(estimate.time_s, estimate.displacement_um, coeffs_um, of_frame)
+        )
         self.coeffs_um = np.mean([shape.coeffs_um for shape in self.taken], axis=0)
         self.displacement_um = float(np.mean([shape.displacement_um for shape in self.taken]))
         self.time_s = float(np.mean([shape.time_s for shape in self.taken]))
@@ -86,18 +91,20 @@ class ReferenceMean(StateNode):
 
 # Change of sag from the change of a Zernike vector.
 #
-# A change of sag moves the coefficients along a known direction s (the sensitivity, µm per µm). With the change
-# dc = c - c_ref and its covariance C the best linear unbiased estimate and its variance are (Gauss-Markov)
+# A change of sag moves the coefficients along a known direction s (the sensitivity, µm per µm).
+# With the change dc = c - c_ref and its covariance C the best linear unbiased estimate and its
+# variance are (Gauss-Markov)
 #
 #     d = (s' W dc) / (s' W s),    var d = 1 / (s' W s),    W = (C + f^2 I)^-1
 #
-# C comes from pixel noise: nanometres, and nearly singular where terms are hard to separate. Alone it would put all
-# weight on a few terms whose *model* error (the film's motion between frames, geometry, gamma) is far
-# larger. f stands for that: it is the same for every term, and bounds the condition of W.
+# C comes from pixel noise: nanometres, and nearly singular where terms are hard to separate. Alone
+# it would put all weight on a few terms whose *model* error (the film's motion between frames,
+# geometry, gamma) is far larger. f stands for that: it is the same for every term, and bounds the
+# condition of W.
 
 
-# Standard deviation of a coefficient's model error (assumed; a bench shows it as the scatter of the estimates):
-# 0.05 µm RMS over the disc is 0.17 µm of sag, which is what a cycle gives.
+# Standard deviation of a coefficient's model error (assumed; a bench shows it as the scatter of the
+# estimates): 0.05 µm RMS over the disc is 0.17 µm of sag, which is what a cycle gives.
 MODEL_FLOOR_UM = 0.05
 
 MEASURED = slice(1, None)  # all but piston, which is set by the surface being 0 at the vertex
@@ -112,12 +119,16 @@ class SagChange(StateNode):
 
 
 def sag_change(
-    coeffs_um: FloatArray, reference_um: FloatArray, covariance_um2: FloatArray, sensitivity: FloatArray
+    coeffs_um: FloatArray,
+    reference_um: FloatArray,
+    covariance_um2: FloatArray,
+    sensitivity: FloatArray,
 ) -> SagChange:
-    """Sag now minus sag at the reference, from coefficients (terms,) and their covariance (terms, terms).
+    """Sag now minus sag at the reference, from coefficients (terms,) and their covariance (terms,
+    terms).
 
-    The reference is constant, hence no noise of the change. `sensitivity` (terms,) is the coefficients' change per µm
-    of sag.
+    The reference is constant, hence no noise of the change. `sensitivity` (terms,) is the
+    coefficients' change per µm of sag.
     """
     s = sensitivity[MEASURED]
     covariance = covariance_um2[MEASURED, MEASURED] + MODEL_FLOOR_UM**2 * np.eye(s.size)
@@ -183,7 +194,9 @@ class ShapeLoopMemory(StateNode):
 class ShapeLoop:
     """Trim from shape estimates; off until switched on. `sensitivity` as for `sag_change`."""
 
-    def __init__(self, config: ShapeConfig, sensitivity: FloatArray, memory: ShapeLoopMemory | None = None) -> None:
+    def __init__(
+        self, config: ShapeConfig, sensitivity: FloatArray, memory: ShapeLoopMemory | None = None
+    ) -> None:
         self._config = config
         self._sensitivity = sensitivity
         self._time_constant_s = config.time_constant_s
@@ -227,8 +240,8 @@ class ShapeLoop:
     ) -> ShapeOutput:
         """One tick.
 
-        The estimate is given only when new; `settled`: the inner loop holds its setpoint; `distrust`: why the
-        camera must not be believed, if so.
+        The estimate is given only when new; `settled`: the inner loop holds its setpoint;
+        `distrust`: why the camera must not be believed, if so.
         """
         if not settled:
             self.memory.settled_since_s = math.inf
@@ -260,7 +273,11 @@ class ShapeLoop:
         )
 
     def _refusal(
-        self, now_s: float, estimate: shape_estimate.ShapeEstimate | None, displacement_um: float, settled: bool
+        self,
+        now_s: float,
+        estimate: shape_estimate.ShapeEstimate | None,
+        displacement_um: float,
+        settled: bool,
     ) -> Reason:
         """Why this tick's estimate must not be used; `NO_REASON` if it may be."""
         config = self._config
@@ -277,7 +294,10 @@ class ShapeLoop:
             return make_reason(ShapeCode.MOVED_MEANWHILE, meanwhile)
         if estimate.time_s <= self.memory.admitted_s:
             return make_reason(ShapeCode.NOT_NEWER, "the shape is not newer than the last one")
-        if not np.isfinite(estimate.coeffs_um).all() or not np.isfinite(estimate.covariance_um2).all():
+        if (
+            not np.isfinite(estimate.coeffs_um).all()
+            or not np.isfinite(estimate.covariance_um2).all()
+        ):
             return make_reason(ShapeCode.NOT_FINITE, "the shape is not finite")
         moved_um = abs(displacement_um - estimate.displacement_um)
         if math.isnan(moved_um):
@@ -294,7 +314,9 @@ class ShapeLoop:
         self.memory.reason = reason
 
     def _admit(self, estimate: shape_estimate.ShapeEstimate) -> None:
-        """Use an estimate: for the reference first, then for the drift, unless camera and laser disagree."""
+        """Use an estimate: for the reference first, then for the drift, unless camera and laser
+        disagree.
+        """
         memory, reference = self.memory, self.memory.reference
         if memory.state == telemetry.ShapeState.WAITING:
             memory.admitted_s = estimate.time_s
@@ -308,11 +330,16 @@ class ShapeLoop:
                 memory.drift.begin(reference.time_s)
                 reference.taken.clear()  # their mean is all that is needed
             return
-        change = sag_change(estimate.coeffs_um, reference.coeffs_um, estimate.covariance_um2, self._sensitivity)
+        change = sag_change(
+            estimate.coeffs_um, reference.coeffs_um, estimate.covariance_um2, self._sensitivity
+        )
         drift_um = estimate.displacement_um - reference.displacement_um - change.change_um
         apart_um = drift_um - memory.drift.at(estimate.time_s, self._time_constant_s)
         if abs(apart_um) > self._config.disagreement_max_um:
-            apart = f"camera and laser disagree by {apart_um:+.1f} µm: check the laser's mount, or lock again"
+            apart = (
+                f"camera and laser disagree by {apart_um:+.1f} µm: check the laser's mount, or "
+                "lock again"
+            )
             self._refuse(make_reason(ShapeCode.DISAGREE, apart))
             return
         memory.admitted_s = estimate.time_s

@@ -1,9 +1,9 @@
 """What a hold may send to its clients, as schemas: greeting, answers, notices, status and events.
 
-A client talks to whatever listens at an address, which may be another program, a damaged hold or a hostile one. So
-every message is checked before any part of it is used: the syntax (`decode`), sizes, numbers and texts whatever their
-meaning (`_clean`), then the fields that clients read (the models). A hold of a later version may send further fields;
-they pass if they are plain.
+A client talks to whatever listens at an address, which may be another program, a damaged hold or a
+hostile one. So every message is checked before any part of it is used: the syntax (`decode`),
+sizes, numbers and texts whatever their meaning (`_clean`), then the fields that clients read (the
+models). A hold of a later version may send further fields; they pass if they are plain.
 
 Messages stay dictionaries with the keys that were sent.
 """
@@ -60,7 +60,10 @@ def _clean(value: object, field: str, depth: int, budget: list[int]) -> object:
             for key, item in value.items()
         }
     if isinstance(value, list):
-        return [_clean(item, _joined(field, str(place)), depth + 1, budget) for place, item in enumerate(value)]
+        return [
+            _clean(item, _joined(field, str(place)), depth + 1, budget)
+            for place, item in enumerate(value)
+        ]
     if isinstance(value, str):
         return _clean_text(value, field)
     if isinstance(value, (int, float)) and not isinstance(value, bool):
@@ -89,7 +92,9 @@ def _checked_number(value: int | float, field: str) -> int | float:
 
 
 def _joined(field: str, key: str) -> str:
-    """The name of an inner field; a peer's own keys may appear in it, so it is kept short and plain."""
+    """The name of an inner field; a peer's own keys may appear in it, so it is kept short and
+    plain.
+    """
     name = f"{field}.{key}" if field else key
     return terminal.one_line(name[:_QUOTED_MAX])
 
@@ -256,7 +261,9 @@ def check_greeting(message: Message) -> Message:
 
 
 def check(message: Message, model: type[BaseModel]) -> Message:
-    """Return a decoded message if it fits a model. Raises AnswerError naming the first field that does not."""
+    """Return a decoded message if it fits a model. Raises AnswerError naming the first field that
+    does not.
+    """
     try:
         model.model_validate(message)
     except ValidationError as error:

@@ -1,7 +1,8 @@
 """The client of the port: plain blocking sockets, for the command line and for programs.
 
-Every program that talks to a hold uses this client. What it returns is checked (`answers`), and reading is bounded in
-length, number and time (`lines`): a peer that is not a hold ends in one `DeviceError`.
+Every program that talks to a hold uses this client. What it returns is checked (`answers`), and
+reading is bounded in length, number and time (`lines`): a peer that is not a hold ends in one
+`DeviceError`.
 """
 
 from __future__ import annotations
@@ -48,7 +49,11 @@ class PortClient:
     """
 
     def __init__(
-        self, connection: socket.socket, where: str, notice: Callable[[str], None], until_s: float | None = None
+        self,
+        connection: socket.socket,
+        where: str,
+        notice: Callable[[str], None],
+        until_s: float | None = None,
     ) -> None:
         self._connection, self._where, self._notice = connection, where, notice
         self._lines = lines.LineReader(connection)
@@ -65,18 +70,21 @@ class PortClient:
             raise
 
     @classmethod
-    def unix(cls, path: str | Path, notice: Callable[[str], None], answer_s: float = ANSWER_S) -> PortClient:
+    def unix(
+        cls, path: str | Path, notice: Callable[[str], None], answer_s: float = ANSWER_S
+    ) -> PortClient:
         """Connect to a socket file; connection and greeting take `answer_s` at most."""
         path = Path(path)
         until_s = time.monotonic() + answer_s
         connection = socket.socket(socket.AF_UNIX)
         try:
-            # While others crowd the endpoint, only a blocking connect waits its turn; with Python's own time-out it
-            # would be refused at once.
+            # While others crowd the endpoint, only a blocking connect waits its turn; with Python's
+            # own time-out it would be refused at once.
             connection.setsockopt(socket.SOL_SOCKET, socket.SO_SNDTIMEO, _kernel_time(answer_s))
             with sockets.short(path) as address:
                 connection.connect(address)
-            connection.getpeername()  # after a signal during the wait, Python wrongly assumes a connection
+            # after a signal during the wait, Python wrongly assumes a connection
+            connection.getpeername()
         except (FileNotFoundError, ConnectionRefusedError):
             connection.close()
             raise DeviceError(f"{path}: no hold is listening") from None
@@ -93,9 +101,16 @@ class PortClient:
 
     @classmethod
     def tls(
-        cls, host: str, port: int, context: ssl.SSLContext, notice: Callable[[str], None], answer_s: float = ANSWER_S
+        cls,
+        host: str,
+        port: int,
+        context: ssl.SSLContext,
+        notice: Callable[[str], None],
+        answer_s: float = ANSWER_S,
     ) -> PortClient:
-        """Connect over TCP; the context holds our certificate (`sockets.client_context`). Times as for `unix`."""
+        """Connect over TCP; the context holds our certificate (`sockets.client_context`). Times as
+        for `unix`.
+        """
         where = f"{host}:{port}"
         until_s = time.monotonic() + answer_s
         try:
@@ -111,12 +126,16 @@ class PortClient:
         return cls(secured, where, notice, until_s)
 
     def ask(self, **request: Any) -> Message:
-        """Send a request (`protocol.Request`) and return its answer. Raises DeviceError if none comes in time."""
+        """Send a request (`protocol.Request`) and return its answer. Raises DeviceError if none
+        comes in time.
+        """
         self._number += 1
         until_s = time.monotonic() + self._patience_s
         try:
             self._connection.settimeout(self._patience_s)
-            self._connection.sendall(protocol.encode({**self._expiry(), **request, "number": self._number}))
+            self._connection.sendall(
+                protocol.encode({**self._expiry(), **request, "number": self._number})
+            )
         except OSError as error:
             raise DeviceError(f"{self._where}: {os_reason(error)}") from None
         while (message := self._next(until_s)) is not None:
@@ -126,7 +145,8 @@ class PortClient:
         raise DeviceError(f"{self._where}: the hold closed the connection without an answer")
 
     def _expiry(self) -> Message:
-        """The time after which nobody waits for the answer, on the hold's clock; none if the hold sends no clock.
+        """The time after which nobody waits for the answer, on the hold's clock; none if the hold
+        sends no clock.
 
         A hold that hangs for longer must not obey the request afterwards.
         """
@@ -142,17 +162,23 @@ class PortClient:
                 yield message
 
     def status(self) -> Message:
-        """Ask for the status: the whole answer. Raises DeviceError without one, also if it is refused."""
+        """Ask for the status: the whole answer. Raises DeviceError without one, also if it is
+        refused.
+        """
         answer = self.ask(do="status")
         if not answer["ok"]:
             raise DeviceError(f"{self._where}: status refused: {answer['refused']}")
         return answer
 
     def poll(self) -> None:
-        """Take the notices that have arrived, without waiting. Raises DeviceError if the hold has hung up."""
+        """Take the notices that have arrived, without waiting. Raises DeviceError if the hold has
+        hung up.
+        """
         while self._lines.waiting():
             if self._any_message(time.monotonic() + self._patience_s) is None:
-                raise DeviceError(f"{self._where}: the hold has closed the connection; has it ended?")
+                raise DeviceError(
+                    f"{self._where}: the hold has closed the connection; has it ended?"
+                )
 
     def patience(self, seconds: float) -> None:
         """Set how long the next message may take."""
@@ -172,7 +198,9 @@ class PortClient:
 
     def _read_greeting(self, until_s: float) -> Message:
         line = self._read_line(until_s)
-        if line is None:  # the hold records the reason; with TLS it is usually a refused certificate
+        if (
+            line is None
+        ):  # the hold records the reason; with TLS it is usually a refused certificate
             raise DeviceError(f"{self._where}: no greeting; with TLS, check the certificate")
         try:
             return answers.check_greeting(answers.decode(line))
@@ -187,7 +215,9 @@ class PortClient:
         return None
 
     def _any_message(self, until_s: float) -> Message | None:
-        """The next checked message, after it was passed on if it is a notice; None if the hold has hung up."""
+        """The next checked message, after it was passed on if it is a notice; None if the hold has
+        hung up.
+        """
         line = self._read_line(until_s)
         if line is None:
             return None
@@ -220,7 +250,9 @@ class PortClient:
         except ConnectionResetError:
             return None
         except TimeoutError:
-            raise DeviceError(f"{self._where}: the hold does not answer; is it stopped or overloaded?") from None
+            raise DeviceError(
+                f"{self._where}: the hold does not answer; is it stopped or overloaded?"
+            ) from None
         except OSError as error:  # TLS: a refused certificate shows only when reading
             refused = isinstance(error, ssl.SSLError)
             reason = f"{_tls_reason(error)}; check the certificate" if refused else os_reason(error)

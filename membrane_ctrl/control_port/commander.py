@@ -1,9 +1,11 @@
-"""Who has command of a hold: a client's name for single commands, or one session for as long as it lives.
+"""Who has command of a hold: a client's name for single commands, or one session for as long as it
+lives.
 
-Single commands (`ctl`, the console, the page) come on connections of their own, so command belongs to the client's
-name and lapses some minutes after the last one. A session (tuning, calibration) sends its commands over minutes to
-hours on one connection, which it claims: then command belongs to that connection alone, not to its user. A session
-that ends, or whose process dies, closes its connection, and with it gives up command.
+Single commands (`ctl`, the console, the page) come on connections of their own, so command belongs
+to the client's name and lapses some minutes after the last one. A session (tuning, calibration)
+sends its commands over minutes to hours on one connection, which it claims: then command belongs to
+that connection alone, not to its user. A session that ends, or whose process dies, closes its
+connection, and with it gives up command.
 """
 
 from __future__ import annotations
@@ -29,11 +31,19 @@ class CommandSession:
 
     def to_dict(self) -> dict[str, str | int | None]:
         """The session as a part of the status."""
-        return {"id": self.id, "who": self.who, "what": self.what, "pid": self.pid, "since_utc": self.since_utc}
+        return {
+            "id": self.id,
+            "who": self.who,
+            "what": self.what,
+            "pid": self.pid,
+            "since_utc": self.since_utc,
+        }
 
 
 class Commander:
-    """One commander at a time: the first to command, until it releases or loses command or idles too long."""
+    """One commander at a time: the first to command, until it releases or loses command or idles
+    too long.
+    """
 
     def __init__(self, lapses_s: float) -> None:
         self._lapses_s = lapses_s
@@ -102,7 +112,10 @@ class Commander:
     def _refusal(self, who: str, now_s: float) -> str:
         """Why a client may not command; empty if it may."""
         if self.session is not None:
-            return f"{self.session.describe()} has command; wait for its end, or take over with --take-over"
+            return (
+                f"{self.session.describe()} has command; wait for its end, or take over with "
+                "--take-over"
+            )
         holder = self.holder(now_s)
         if holder in ("", who):
             return ""

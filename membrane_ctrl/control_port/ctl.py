@@ -38,7 +38,9 @@ class Where:
 
 
 def ctl(request: dict[str, Any], where: Where, as_json: bool) -> int:
-    """Send a request to a running hold. Raises InputError for a refusal, DeviceError without an answer."""
+    """Send a request to a running hold. Raises InputError for a refusal, DeviceError without an
+    answer.
+    """
     action = request["do"]
     with connected(where) as client:
         answer = client.ask(**request)
@@ -63,7 +65,9 @@ def ctl(request: dict[str, Any], where: Where, as_json: bool) -> int:
 
 
 def fleet(file: Path) -> dict[str, Where]:
-    """The holds of a fleet file by name; file names are relative to its folder. Raises InputError."""
+    """The holds of a fleet file by name; file names are relative to its folder.
+    Raises InputError.
+    """
 
     def beside(name: str | None) -> Path | None:
         return None if name is None else file.resolve().parent / Path(name).expanduser()
@@ -72,12 +76,16 @@ def fleet(file: Path) -> dict[str, Where]:
     for hold in load(file, FleetConfig).holds:
         socket = beside(hold.socket)
         files = (beside(hold.certificate_file), beside(hold.key_file), beside(hold.authority_file))
-        found[hold.name] = Where(socket, None, hold.tls, *files, logs=socket.parent if socket else Path("logs"))
+        found[hold.name] = Where(
+            socket, None, hold.tls, *files, logs=socket.parent if socket else Path("logs")
+        )
     return found
 
 
 def fleet_status(file: Path, as_json: bool) -> int:
-    """Ask all holds of a fleet file at once, and print a line of each; `DEVICE_FAILED` if one does not answer."""
+    """Ask all holds of a fleet file at once, and print a line of each; `DEVICE_FAILED` if one does
+    not answer.
+    """
     places = fleet(file)
     with ThreadPoolExecutor(len(places)) as pool:
         answers = dict(zip(places, pool.map(_status_of, places.values()), strict=True))
@@ -121,11 +129,17 @@ def status_lines(status: dict[str, Any]) -> list[str]:
     lines += alarm_lines(status)
     if row:
         lines += [
-            f"  {each.label:{_LABEL_WIDTH}}{each.format_value(row.get(each.name)):>10} {each.unit}".rstrip()
+            (
+                f"  {each.label:{_LABEL_WIDTH}}{each.format_value(row.get(each.name)):>10} "
+                f"{each.unit}"
+            ).rstrip()
             for each in PUBLISHED
         ]
         if gains := status.get("gains"):
-            lines.append(f"  {'gains':{_LABEL_WIDTH}}{run_status.gains_words(gains, status.get('trial_left_s'))}")
+            lines.append(
+                "  "
+                f"{'gains':{_LABEL_WIDTH}}{run_status.gains_words(gains, status.get('trial_left_s'))}"  # noqa: E501
+            )
         shape = f"{status.get('shape') or '?'} {status.get('shape_reason', '')}"
         lines.append(f"  {'shape loop':{_LABEL_WIDTH}}{shape}".rstrip())
         lines.append(f"  {'geometry':{_LABEL_WIDTH}}{_geometry(status.get('geometry'))}")
@@ -172,13 +186,17 @@ def _print_watched(status: dict[str, Any], as_json: bool) -> None:
 
 
 def _quantity(row: Mapping[str, Any], name: str) -> str:
-    """A value of a row with its label and unit, in a width that stays the same from line to line."""
+    """A value of a row with its label and unit, in a width that stays
+    the same from line to line.
+    """
     column = COLUMNS[name]
     return f"{column.label} {column.format_value(row.get(name)):>9} {column.unit}".rstrip()
 
 
 def loop_keys(argument: str) -> dict[str, Any]:
-    """Loop keys, or their [loop] table, of a TOML or JSON file or of the text itself. Raises InputError."""
+    """Loop keys, or their [loop] table, of a TOML or JSON file or of the text itself. Raises
+    InputError.
+    """
     path = Path(argument)
     if path.suffix == ".json":
         try:
@@ -191,10 +209,14 @@ def loop_keys(argument: str) -> dict[str, Any]:
         try:
             tables = tomllib.loads(argument)
         except tomllib.TOMLDecodeError as error:
-            raise errors.InputError(f"ctl gains: give a .toml or .json file, or loop keys: {error}") from None
+            raise errors.InputError(
+                f"ctl gains: give a .toml or .json file, or loop keys: {error}"
+            ) from None
     if isinstance(tables, dict) and isinstance(tables.get("loop"), dict):
         tables = tables["loop"]
-    if not isinstance(tables, dict) or not all(isinstance(value, (bool, int, float)) for value in tables.values()):
+    if not isinstance(tables, dict) or not all(
+        isinstance(value, (bool, int, float)) for value in tables.values()
+    ):
         raise errors.InputError(f"{argument}: expected a table of loop keys with numbers")
     return tables
 
@@ -203,8 +225,11 @@ def _printed(text: str) -> None:
     print(f"notice: {text}", file=sys.stderr)
 
 
-def connected(where: Where, notice: Callable[[str], None] = _printed, answer_s: float = ANSWER_S) -> PortClient:
-    """Connect to the hold that `where` names. Raises InputError for another run, DeviceError if no hold answers.
+def connected(
+    where: Where, notice: Callable[[str], None] = _printed, answer_s: float = ANSWER_S
+) -> PortClient:
+    """Connect to the hold that `where` names. Raises InputError for another run, DeviceError if no
+    hold answers.
 
     Connection and greeting take `answer_s` at most.
     """
@@ -212,7 +237,9 @@ def connected(where: Where, notice: Callable[[str], None] = _printed, answer_s: 
         return _connect_tls(where, notice, answer_s)
     path = socket_path(where)
     if where.socket is None and where.run is None and not path.exists():
-        raise errors.DeviceError(f"{path}: no hold is listening; name its run with --run or --socket")
+        raise errors.DeviceError(
+            f"{path}: no hold is listening; name its run with --run or --socket"
+        )
     client = PortClient.unix(path, notice, answer_s)
     if where.run is not None and client.greeting["run"] != where.run.resolve().name:
         client.close()
@@ -231,7 +258,9 @@ def _connect_tls(where: Where, notice: Callable[[str], None], answer_s: float) -
 
 
 def socket_path(where: Where) -> Path:
-    """The socket file: as told, of the run's own configuration, beside the run's folder, or among the runs."""
+    """The socket file: as told, of the run's own configuration, beside the run's folder, or among
+    the runs.
+    """
     if where.socket is not None:
         return where.socket
     if where.run is None:

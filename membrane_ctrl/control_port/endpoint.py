@@ -1,11 +1,12 @@
-"""A listening socket in the control process that admits few clients at a time and reopens after a failure.
+"""A listening socket in the control process that admits few clients at a time and reopens after a
+failure.
 
-`asyncio.start_server` would accept all connections at once; here each waits for the one before, so that a flood costs
-the ticks at most twenty handshakes a second.
+`asyncio.start_server` would accept all connections at once; here each waits for the one before, so
+that a flood costs the ticks at most twenty handshakes a second.
 
-A peer that has not identified itself (no handshake, no request) is a stranger. The number of strangers is limited, in
-total and per address: the longest waiting one makes room for a newcomer, so that nobody can block the queue. An
-address that connects too often is refused at once.
+A peer that has not identified itself (no handshake, no request) is a stranger. The number of
+strangers is limited, in total and per address: the longest waiting one makes room for a newcomer,
+so that nobody can block the queue. An address that connects too often is refused at once.
 """
 
 import asyncio
@@ -26,7 +27,9 @@ _TURN_AWAY_S = 0.005  # each costs 50 us: a hundredth of a processor
 _ADDRESSES_MOST = 1024  # addresses remembered
 _LEAVE_S = 2.0  # then the run ends without waiting for clients
 _AGAIN_S = 1.0
-_RESET = struct.pack("ii", 1, 0)  # SO_LINGER: a refused connection leaves nothing behind in the kernel
+_RESET = struct.pack(
+    "ii", 1, 0
+)  # SO_LINGER: a refused connection leaves nothing behind in the kernel
 
 LetIn = Callable[[], object]
 Welcome = Callable[[socket.socket, LetIn], Awaitable[None]]
@@ -118,7 +121,9 @@ class Endpoint:
 
     async def _accept(self, turns: Turns) -> bool:
         connection, peer = await asyncio.get_running_loop().sock_accept(self._listener)
-        address = str(peer[0]) if isinstance(peer, tuple) else ""  # clients of a socket file have none
+        address = (
+            str(peer[0]) if isinstance(peer, tuple) else ""
+        )  # clients of a socket file have none
         if address and not turns.take(address):
             self._turn_away(connection, address, "connects too often")
             return False
@@ -138,7 +143,9 @@ class Endpoint:
         self._refused(f"{self._name}:{address}", reason)
 
     def _room_for(self, address: str) -> bool:
-        """Whether a newcomer may enter; drops the longest waiting stranger of a crowded address if needed."""
+        """Whether a newcomer may enter; drops the longest waiting stranger of a crowded address if
+        needed.
+        """
         each = Counter(self._strangers.values())
         crowded = each[address] >= _STRANGERS_EACH
         if not crowded and len(self._strangers) < _STRANGERS_MOST:
@@ -165,8 +172,8 @@ class Endpoint:
             connection.close()
 
 
-# Refusals are recorded, but cannot fill the record: ten mistakes all appear; of a flood, one in ten seconds, with the
-# count of the others
+# Refusals are recorded, but cannot fill the record: ten mistakes all appear; of a flood, one in ten
+# seconds, with the count of the others
 _REFUSAL_BURST = 10.0
 _REFUSALS_PER_S = 0.1
 
@@ -190,5 +197,7 @@ class Refusals:
             self._unsaid += 1
             return
         self._left -= 1.0
-        self._tell(run_events.Refused(who, command, why, reason, and_unrecorded=self._unsaid or None))
+        self._tell(
+            run_events.Refused(who, command, why, reason, and_unrecorded=self._unsaid or None)
+        )
         self._unsaid = 0

@@ -1,4 +1,6 @@
-"""A bounded queue that serves its kinds of items in turn, so that a flood of one kind delays no other kind."""
+"""A bounded queue that serves its kinds of items in turn, so that a flood of one kind delays no
+other kind.
+"""
 
 from __future__ import annotations
 

@@ -1,7 +1,7 @@
 """Lines from a peer that is not trusted: bounded in length, in time and in number.
 
-A peer may send a line that never ends, a byte a minute, or thousands of lines a second. Each of them would otherwise
-cost the reader its memory or its time.
+A peer may send a line that never ends, a byte a minute, or thousands of lines a second. Each of
+them would otherwise cost the reader its memory or its time.
 """
 
 from __future__ import annotations
@@ -11,11 +11,13 @@ import socket
 import ssl
 import time
 
-# The longest line of a hold is the answer to `status`: some 5 kB, and at most 16 kB with every notice there is.
+# The longest line of a hold is the answer to `status`: some 5 kB, and at most 16 kB with every
+# notice there is.
 LINE_BYTES_MAX = 65_536
 
 _READ_BYTES = 16_384
-# Lines a second, as a token bucket. An honest hold sends ten states a second, and after a fault some tens of events.
+# Lines a second, as a token bucket. An honest hold sends ten states a second, and after a fault
+# some tens of events.
 _BURST = 1000.0
 _PER_S = 200.0
 

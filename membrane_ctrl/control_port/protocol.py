@@ -1,7 +1,8 @@
 """One JSON object per line in either direction, and limits so that no message costs a tick.
 
-A request carries a number; its answer carries the same. Messages without a number are unsolicited: the greeting,
-notices, and the stream of `watch`. `session.PortSession` is one client from greeting to goodbye.
+A request carries a number; its answer carries the same. Messages without a number are unsolicited:
+the greeting, notices, and the stream of `watch`. `session.PortSession` is one client from greeting
+to goodbye.
 """
 
 from __future__ import annotations
@@ -22,10 +23,12 @@ from membrane_ctrl.controller.commands import SAME_AS, TABLE, Kind, Role
 
 VERSION = 1
 
-# The longest honest message is `gains` with every key of the loop: 900 bytes. 8 kB are parsed in 0.1 ms.
+# The longest honest message is `gains` with every key of the loop: 900 bytes. 8 kB are parsed in
+# 0.1 ms.
 MESSAGE_BYTES = 8192
 
-# who, why and text go into one event, and JSON makes up to 3 bytes of one in UTF-8: together they fit its slot
+# who, why and text go into one event, and JSON makes up to 3 bytes of one in UTF-8: together they
+# fit its slot
 WHO_BYTES, WHY_BYTES, TEXT_BYTES = 64, 300, 500
 
 Errand = Literal["status", "watch", "release", "quiet", "claim"]
@@ -54,14 +57,13 @@ def _words(most_bytes: int) -> AfterValidator:
 class OnBehalf(Section):
     """For whom a program sends a request: the page for its viewers, a bridge for other systems.
 
-    The hold accepts the account only from a process of its own user on the socket file. From anybody the role only
-    lowers the sender's own.
+    The hold accepts the account only from a process of its own user on the socket file. From
+    anybody the role only lowers the sender's own.
     """
 
     via: Literal["page", "bridge"]
-    account: Annotated[str, _words(WHO_BYTES - 8)] = (
-        ""  # name with which the person logged in; empty: without a login
-    )
+    # name with which the person logged in; empty: without a login
+    account: Annotated[str, _words(WHO_BYTES - 8)] = ""
     name: Annotated[str, _words(WHO_BYTES - 8)] = ""  # who it is, for people, if there is no login
     session: Annotated[str, _words(WHO_BYTES)] = ""  # of that person
     role: Role
@@ -73,24 +75,28 @@ _ERRAND_NEEDS: dict[str, tuple[str, ...]] = {"claim": ("text",)}
 class Request(Section):
     """A client's request."""
 
-    number: Annotated[int, Field(ge=0, lt=2**53)] = 0  # chosen by the client, returned with the answer
-    # a command of `commands.TABLE`, or `status` (once), `watch` (repeated status), `claim` (command for a session,
-    # this connection), `release` (give up command), `quiet` (acknowledge the alarms)
+    # chosen by the client, returned with the answer
+    number: Annotated[int, Field(ge=0, lt=2**53)] = 0
+    # a command of `commands.TABLE`, or `status` (once), `watch` (repeated status), `claim` (command
+    # for a session, this connection), `release` (give up command), `quiet` (acknowledge the alarms)
     do: Action
     why: Annotated[str, _words(WHY_BYTES)] = ""  # recorded with the command
     value: float | None = None  # `setpoint`: µm. `manual`: µm/s. `gains`: trial time, s
-    # `mark`: the remark. `latch`: why the mirror is locked. `unlock`: the lock's word, which a person typed. `claim`:
-    # the session's name
+    # `mark`: the remark. `latch`: why the mirror is locked. `unlock`: the lock's word, which a
+    # person typed. `claim`: the session's name
     text: Annotated[str, _words(TEXT_BYTES)] = ""
     loop: dict[str, bool | float] | None = None  # `gains`: the keys of `[loop]` that change
     pump: dict[str, Any] | None = None  # `gains`: the table `[pump]`, if it changes
-    experiment: dict[str, Any] | None = None  # `tune`: an `ExperimentSpec`, which says what it takes
+    # `tune`: an `ExperimentSpec`, which says what it takes
+    experiment: dict[str, Any] | None = None
     shape_time_constant_s: float | None = None  # `gains`: of the shape loop
-    setpoint_step_um: Annotated[float, Field(ge=-30, le=30)] | None = None  # `gains`: of the setpoint, on trial
+    # `gains`: of the setpoint, on trial
+    setpoint_step_um: Annotated[float, Field(ge=-30, le=30)] | None = None
     take_over: bool = False  # take command from whoever has it
     period_s: Annotated[float, Field(ge=0.1, le=3600)] = 1.0  # `watch`: interval
     on_behalf: OnBehalf | None = None  # None: the peer of the connection itself
-    # time limit on the clock of the greeting's `now_s`; later the request is refused, unless it is a safety command
+    # time limit on the clock of the greeting's `now_s`; later the request is refused, unless it is
+    # a safety command
     expires_s: float | None = None
 
     @field_validator("do", mode="before")
@@ -102,7 +108,15 @@ class Request(Section):
     def _complete(self) -> Request:
         rule = TABLE.get(self.do)  # type: ignore[arg-type]
         needs, takes = (rule.needs, rule.takes) if rule else (_ERRAND_NEEDS.get(self.do, ()), ())
-        for name in ("value", "text", "loop", "pump", "experiment", "shape_time_constant_s", "setpoint_step_um"):
+        for name in (
+            "value",
+            "text",
+            "loop",
+            "pump",
+            "experiment",
+            "shape_time_constant_s",
+            "setpoint_step_um",
+        ):
             given = getattr(self, name) not in (None, "")
             if given and name not in (*needs, *takes):
                 raise ValueError(f"{self.do} takes no {name}")
@@ -160,7 +174,9 @@ class Wire:
 
     @classmethod
     async def on(cls, connection: socket.socket, context: ssl.SSLContext | None = None) -> Wire:
-        """Take over an accepted connection. Raises OSError (ssl.SSLError among them) if the handshake fails."""
+        """Take over an accepted connection. Raises OSError (ssl.SSLError among them) if the
+        handshake fails.
+        """
         loop = asyncio.get_running_loop()
         reader = asyncio.StreamReader(limit=MESSAGE_BYTES, loop=loop)
         protocol = asyncio.StreamReaderProtocol(reader, loop=loop)
@@ -209,7 +225,9 @@ class Wire:
         return self._writer.transport.get_write_buffer_size()
 
     def send(self, message: dict[str, Any]) -> None:
-        """Send without waiting. Raises SlowReaderError (and ends the connection) if too much is unread."""
+        """Send without waiting. Raises SlowReaderError (and ends the connection) if too much is
+        unread.
+        """
         transport = self._writer.transport
         if transport.is_closing():
             return
@@ -242,8 +260,12 @@ class Wire:
 
 _RANK: dict[Role, int] = {"read": 0, "operate": 1, "tune": 2}
 _ERRANDS: dict[str, Role] = {
-    "status": "read", "watch": "read", "claim": "operate", "release": "operate", "quiet": "operate",
-}  # fmt: skip
+    "status": "read",
+    "watch": "read",
+    "claim": "operate",
+    "release": "operate",
+    "quiet": "operate",
+}
 
 # These need no command: what makes the mirror safe is always accepted, and the others move nothing
 FREE = frozenset({"status", "watch", "unlock", "mark", "release", "quiet"}) | SAFETY
@@ -251,7 +273,9 @@ FREE = frozenset({"status", "watch", "unlock", "mark", "release", "quiet"}) | SA
 
 @dataclass(frozen=True, slots=True)
 class Peer:
-    """The peer of a connection: `unix:NAME` or `tls:NAME`, as given by the system or a certificate."""
+    """The peer of a connection: `unix:NAME` or `tls:NAME`,
+    as given by the system or a certificate.
+    """
 
     who: str
     role: Role
@@ -260,7 +284,9 @@ class Peer:
 
     @property
     def session(self) -> str:
-        """What identifies the sender of a lock for people: its process; empty if that is unknown."""
+        """What identifies the sender of a lock for people: its process;
+        empty if that is unknown.
+        """
         return "" if self.pid is None else f"process {self.pid}"
 
 
@@ -293,7 +319,9 @@ def sender_of(peer: Peer, on_behalf: OnBehalf | None) -> Sender:
         return Sender(peer.who, peer.role, account=peer.who, session=peer.session)
     role = min(peer.role, on_behalf.role, key=_RANK.__getitem__)
     from_person = on_behalf.via == "page"
-    if not peer.is_own_user:  # anybody could state this: it proves no login, and the peer sends it for somebody else
+    if (
+        not peer.is_own_user
+    ):  # anybody could state this: it proves no login, and the peer sends it for somebody else
         return Sender(peer.who, role, session=peer.session, from_person=from_person)
     who = f"{on_behalf.via}:{on_behalf.account or on_behalf.name}"
     account = who if from_person and on_behalf.account else ""

@@ -1,13 +1,17 @@
-"""The requests of one connection from their arrival to their answers: safety commands overtake all others.
+"""The requests of one connection from their arrival to their answers: safety commands overtake all
+others.
 
-A client may send faster than the run can obey. All lines are read as they arrive, because a safety command may stand
-behind any number of others. Then
+A client may send faster than the run can obey. All lines are read as they arrive, because a safety
+command may stand behind any number of others. Then
 
-1. a safety command is executed at once; the same command twice waits once, and both senders get its answer;
-2. the others are executed one after the other, ten a second, and at most `_ORDINARY_MOST` of them wait;
+1. a safety command is executed at once; the same command twice waits once, and both senders get its
+   answer;
+2. the others are executed one after the other, ten a second, and at most `_ORDINARY_MOST` of them
+   wait;
 3. a request for which there is no room is refused at once, so its sender knows.
 
-Reading costs the ticks time. The connections read in turn (`ReadingTurns`), a bounded number of lines in each turn.
+Reading costs the ticks time. The connections read in turn (`ReadingTurns`), a bounded number of
+lines in each turn.
 """
 
 from __future__ import annotations
@@ -24,7 +28,8 @@ from membrane_ctrl.control_port.protocol import Request, RequestError, Wire, par
 from membrane_ctrl.control_port.safety_commands import is_safety_command, may_hold_safety_command
 
 _PAUSE_S = 0.1  # after an ordinary request: all requests together cost less than a tick in fifty
-_SAFETY_PAUSE_S = 0.05  # after a safety command: with five kinds of them, each is executed within 0.4 s
+# after a safety command: with five kinds of them, each is executed within 0.4 s
+_SAFETY_PAUSE_S = 0.05
 _ORDINARY_MOST = 16  # requests that wait, for at most 1.6 s
 _SAFETY_MOST_EACH = 4  # different requests of one kind that wait, e.g. with different texts
 # A program that sends this many invalid requests in a row will not stop
@@ -66,7 +71,9 @@ class RequestIntake:
         Common to all connections of the port.
     """
 
-    def __init__(self, wire: Wire, answer: AnswerRequest, record_refusal: RecordRefusal, turns: ReadingTurns) -> None:
+    def __init__(
+        self, wire: Wire, answer: AnswerRequest, record_refusal: RecordRefusal, turns: ReadingTurns
+    ) -> None:
         self._wire = wire
         self._answer = answer
         self._record_refusal = record_refusal
@@ -92,7 +99,8 @@ class RequestIntake:
         try:
             await asyncio.wait({reading, *workers}, return_when=asyncio.FIRST_COMPLETED)
             if reading.done():
-                # The peer has gone, or sends nonsense: then only its safety commands are still executed.
+                # The peer has gone, or sends nonsense: then only its safety commands are still
+                # executed.
                 if reading.exception() is not None:
                     self._ordinary.clear()
                 self._ending = True
@@ -109,13 +117,19 @@ class RequestIntake:
             await asyncio.gather(reading, *workers, return_exceptions=True)
 
     def refuse_waiting(self, winner: str) -> None:
-        """Refuse the waiting commands that could undo the safety command `winner`, which came after them."""
+        """Refuse the waiting commands that could undo the safety command `winner`, which came after
+        them.
+        """
         kept = [request for request in self._ordinary if not _can_undo(request)]
         refused = [request for request in self._ordinary if _can_undo(request)]
         self._ordinary.clear()
         self._ordinary.extend(kept)
         for request in refused:
-            self._refuse(request.do, request.number, f"{winner} came meanwhile and takes precedence; send again")
+            self._refuse(
+                request.do,
+                request.number,
+                f"{winner} came meanwhile and takes precedence; send again",
+            )
 
     async def _read(self, read_lines: ReadLines) -> None:
         while (arrived := await read_lines()) is not None:
@@ -159,13 +173,20 @@ class RequestIntake:
     def _accept_safety(self, request: Request) -> None:
         # The same command may already wait: one execution answers both.
         for waiting in self._safety.waiting_of(request.do):
-            if (waiting.request.text, waiting.request.take_over) == (request.text, request.take_over):
+            if (waiting.request.text, waiting.request.take_over) == (
+                request.text,
+                request.take_over,
+            ):
                 waiting.numbers.append(request.number)
                 return
         if self._safety.put(request.do, WaitingSafetyCommand(request, [request.number])):
             self._safety_arrived.set()
         else:
-            self._refuse(request.do, request.number, f"{_SAFETY_MOST_EACH} of its kind wait already; send again")
+            self._refuse(
+                request.do,
+                request.number,
+                f"{_SAFETY_MOST_EACH} of its kind wait already; send again",
+            )
 
     async def _serve_ordinary(self) -> None:
         while True:
@@ -202,7 +223,8 @@ class RequestIntake:
 
     def _refuse(self, command: str, number: int, reason: str) -> None:
         self._record_refusal(command, reason)
-        # A client that sends a flood without reading must not lose its connection by the answers to it.
+        # A client that sends a flood without reading must not lose its connection by the answers to
+        # it.
         if self._wire.unread_bytes > _UNREAD_MOST:
             self._unreported += 1
             return

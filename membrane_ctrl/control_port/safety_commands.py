@@ -1,4 +1,6 @@
-"""The commands that make the mirror safe: they overtake all others on every interface, and none is dropped."""
+"""The commands that make the mirror safe: they overtake all others on every interface, and none is
+dropped.
+"""
 
 from __future__ import annotations
 
@@ -20,7 +22,8 @@ def is_safety_command(kind: str) -> bool:
 def may_hold_safety_command(line: bytes) -> bool:
     r"""Whether a line of the protocol may hold a safety command.
 
-    A fast test for the lines of a flood: it reads no JSON, so it also accepts a line that only quotes such a name. A
-    line with an escape sequence (`"st\u006fp"`) is accepted as well, because the escape may spell the name.
+    A fast test for the lines of a flood: it reads no JSON, so it also accepts a line that only
+    quotes such a name. A line with an escape sequence (`"st\u006fp"`) is accepted as well, because
+    the escape may spell the name.
     """
     return _NAMED.search(line) is not None or b"\\" in line

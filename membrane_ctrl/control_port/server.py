@@ -1,7 +1,8 @@
 """The port as the run sees it: receives every tick's outputs, and hands commands to the next tick.
 
-It shares one thread and one event loop with the ticks, so everything is bounded: connections, messages, their rate,
-unsent data. A failed endpoint reopens (`endpoint.Endpoint`): the hold continues, and signals still stop it.
+It shares one thread and one event loop with the ticks, so everything is bounded: connections,
+messages, their rate, unsent data. A failed endpoint reopens (`endpoint.Endpoint`): the hold
+continues, and signals still stop it.
 """
 
 import asyncio
@@ -32,7 +33,8 @@ from membrane_ctrl.model.columns import COLUMNS
 from membrane_ctrl.model.lock import Lock
 from membrane_ctrl.model.run_status import RunStatus
 
-# Beyond these, the longest silent connection is dropped: one user's terminals cannot lock out another's `stop`
+# Beyond these, the longest silent connection is dropped: one user's terminals cannot lock out
+# another's `stop`
 _SESSIONS_MOST, _SESSIONS_EACH = 16, 4
 _ANSWER_S = 5.0
 _STORE_S = 0.7  # for the disk to confirm a lock: a safety command is answered within a second
@@ -49,14 +51,17 @@ class RunHooks:
     now: Callable[[], float]  # the run's clock
     loop: Callable[[], schema.LoopConfig]  # present loop settings
     pump: Callable[[], schema.PumpConfig]  # likewise
-    # of a request that set or removed a lock: why it is not on the disk, empty if it is; None: it changed no lock
+    # of a request that set or removed a lock: why it is not on the disk, empty if it is; None: it
+    # changed no lock
     lock_outcome: Callable[[int], Future[str] | None] = lambda number: None
 
 
 class Port:
     """Takes commands, sends answers and status; `run` is the name of the run folder."""
 
-    def __init__(self, config: port.PortConfig, listeners: sockets.Listeners, run: str, hooks: RunHooks) -> None:
+    def __init__(
+        self, config: port.PortConfig, listeners: sockets.Listeners, run: str, hooks: RunHooks
+    ) -> None:
         self._listeners, self._run, self._hooks = listeners, run, hooks
         self._tell, self._now = hooks.tell, hooks.now
         self._commander = Commander(config.commander_lapses_s)
@@ -64,7 +69,9 @@ class Port:
         self._status = RunStatus()
         self._numbers = itertools.count(1)
         self._waiting: dict[int, asyncio.Future[str]] = {}
-        self._changed: dict[int, dict[str, str]] = {}  # by number of the request: the lock that it set or removed
+        self._changed: dict[
+            int, dict[str, str]
+        ] = {}  # by number of the request: the lock that it set or removed
         self._sessions: list[PortSession] = []
         self._turns = ReadingTurns()
         self._over = False
@@ -74,8 +81,15 @@ class Port:
         self._status = self._status.after_row(outputs.row)
         for event in outputs.events:
             self._status = self._status.after_event(event, outputs.row.mono_s)
-            if isinstance(event, events.LockSet | events.LockRemoved) and event.number in self._waiting:
-                self._changed[event.number] = {"word": event.word, "text": event.text, "author": event.author}
+            if (
+                isinstance(event, events.LockSet | events.LockRemoved)
+                and event.number in self._waiting
+            ):
+                self._changed[event.number] = {
+                    "word": event.word,
+                    "text": event.text,
+                    "author": event.author,
+                }
             for session in self._sessions:
                 session.event(event)
         for number, refusal in outputs.answers:
@@ -160,7 +174,9 @@ class Port:
         session = PortSession(wire, peer, self.status, self._turns)
         self._sessions.append(session)
         loop = asyncio.get_running_loop()
-        expiry = None if lasts_s is None else loop.call_later(lasts_s, self._turn_out, session, _EXPIRED)
+        expiry = (
+            None if lasts_s is None else loop.call_later(lasts_s, self._turn_out, session, _EXPIRED)
+        )
         greeting = {
             "membrane_ctrl": protocol.VERSION,
             "run": self._run,
@@ -174,7 +190,9 @@ class Port:
         finally:
             self._sessions.remove(session)
             if (ended := self._commander.end_session(session.id)) is not None:
-                self._tell(run_events.CommanderChanged(None, ended.describe(), "its connection is closed"))
+                self._tell(
+                    run_events.CommanderChanged(None, ended.describe(), "its connection is closed")
+                )
             if expiry is not None:
                 expiry.cancel()
 
@@ -184,18 +202,31 @@ class Port:
 
     def _make_room(self, peer: Peer) -> None:
         own = [session for session in self._sessions if session.peer.who == peer.who]
-        crowd = own if len(own) >= _SESSIONS_EACH else self._sessions if len(self._sessions) >= _SESSIONS_MOST else []
+        crowd = (
+            own
+            if len(own) >= _SESSIONS_EACH
+            else self._sessions
+            if len(self._sessions) >= _SESSIONS_MOST
+            else []
+        )
         # a session that has command is silent while its experiment runs; there is one at most
         in_command = self._commander.session
         idle = [each for each in crowd if in_command is None or each.id != in_command.id]
         if idle:
-            self._turn_out(min(idle, key=lambda session: session.heard_s), "too many connections: silent longest")
+            self._turn_out(
+                min(idle, key=lambda session: session.heard_s),
+                "too many connections: silent longest",
+            )
 
     async def _answer(self, session: PortSession, request: protocol.Request) -> dict[str, Any]:
         """Execute a request or answer why not; the controller records its own refusals."""
         peer = session.peer
         sender = protocol.sender_of(peer, request.on_behalf)
-        refusal = may_not(sender, request.do) or self._expired(request) or self._claim_command(session, request)
+        refusal = (
+            may_not(sender, request.do)
+            or self._expired(request)
+            or self._claim_command(session, request)
+        )
         if not refusal and is_safety_command(request.do):
             for other in self._sessions:
                 other.refuse_waiting(request.do)
@@ -217,7 +248,9 @@ class Port:
         return answer
 
     async def _lock_answer(self, command: commands.Command) -> dict[str, Any]:
-        """The part of the answer that confirms a lock or its removal: only what is synced to the disk is stored."""
+        """The part of the answer that confirms a lock or its removal: only what is synced to the
+        disk is stored.
+        """
         changed = self._changed.pop(command.number, None)
         found = {} if changed is None else {"lock": changed}
         future = self._hooks.lock_outcome(command.number)
@@ -231,10 +264,19 @@ class Port:
         return found | {"stored": not problem, "problem": problem}
 
     def _expired(self, request: protocol.Request) -> str:
-        """Why the request is too old to be obeyed; empty if it is not. Safety commands never are."""
-        if request.expires_s is None or is_safety_command(request.do) or self._now() <= request.expires_s:
+        """Why the request is too old to be obeyed; empty if it is not.
+        Safety commands never are.
+        """
+        if (
+            request.expires_s is None
+            or is_safety_command(request.do)
+            or self._now() <= request.expires_s
+        ):
             return ""
-        return f"{request.do} came {self._now() - request.expires_s:.1f} s after its time limit; send again"
+        return (
+            f"{request.do} came {self._now() - request.expires_s:.1f} s after its time limit; "
+            "send again"
+        )
 
     def _claim_command(self, session: PortSession, request: protocol.Request) -> str:
         """Give command to a client that needs it; returns why not, or an empty text."""
@@ -263,7 +305,9 @@ class Port:
                 other.command_taken(f"{name} has taken over command{reason}")
         return ""
 
-    def _run_errand(self, session: PortSession, sender: Sender, request: protocol.Request) -> dict[str, Any]:
+    def _run_errand(
+        self, session: PortSession, sender: Sender, request: protocol.Request
+    ) -> dict[str, Any]:
         match request.do:
             case "watch":
                 session.watch(request.period_s)
@@ -287,13 +331,21 @@ class Port:
         self._tell(run_events.CommanderChanged(None, former, why))
 
     def _command(self, sender: Sender, request: protocol.Request) -> commands.Command:
-        """The command of a request. Raises InputError for invalid gains or an invalid experiment."""
+        """The command of a request. Raises InputError for invalid
+        gains or an invalid experiment.
+        """
         kind = next(kind for kind in commands.TABLE if kind == request.do)
         loop = None if request.loop is None else self._new_loop(request.loop)
         experiment = (
-            None if request.experiment is None else toml_file.parse(request.experiment, ExperimentSpec, "tune")
+            None
+            if request.experiment is None
+            else toml_file.parse(request.experiment, ExperimentSpec, "tune")
         )
-        pump = None if request.pump is None else toml_file.parse(request.pump, schema.PumpConfig, "gains: pump")
+        pump = (
+            None
+            if request.pump is None
+            else toml_file.parse(request.pump, schema.PumpConfig, "gains: pump")
+        )
         value, shape_s, step_um = (
             math.nan if number is None else number
             for number in (request.value, request.shape_time_constant_s, request.setpoint_step_um)
@@ -316,7 +368,9 @@ class Port:
         )
 
     def _new_lock(self, sender: Sender, request: protocol.Request) -> Lock:
-        """The lock that a request sets. Word and time are drawn here, so that the tick gets them as inputs."""
+        """The lock that a request sets. Word and time are drawn here, so that the tick gets them as
+        inputs.
+        """
         word = draw_word({lock.word for lock in self._status.locks})
         set_utc = datetime.now(UTC).isoformat(timespec="seconds")
         return Lock(word, request.text, sender.who, sender.account, sender.session, set_utc)
@@ -324,7 +378,9 @@ class Port:
     def _new_loop(self, changes: dict[str, bool | float]) -> schema.LoopConfig:
         if "setpoint_um" in changes:
             raise errors.InputError("gains: setpoint_um: use the command setpoint")
-        loop = toml_file.parse({**self._hooks.loop().model_dump(), **changes}, schema.LoopConfig, "gains")
+        loop = toml_file.parse(
+            {**self._hooks.loop().model_dump(), **changes}, schema.LoopConfig, "gains"
+        )
         weak = cross_check_plant.weak_gains(loop)
         if weak is not None and weak[0] == "error":
             raise errors.InputError(f"gains: kp_per_s = {loop.kp_per_s:g}: {weak[1]}")
@@ -346,15 +402,19 @@ class Port:
             self._waiting.pop(command.number, None)
 
 
-# Prometheus text on localhost: every field of the newest tick as a gauge, and a few counts. Names carry the units
-# (`membrane_error_um`), as in alarms and telemetry. Counts that only grow have other names, as Prometheus wants it.
+# Prometheus text on localhost: every field of the newest tick as a gauge, and a few counts. Names
+# carry the units (`membrane_error_um`), as in alarms and telemetry. Counts that only grow have
+# other names, as
+# Prometheus wants it.
 
 _REQUEST_S = 2.0
 COUNTERS = {"tick": "ticks_total", "missed_ticks": "missed_ticks_total"}
 
 
 def metrics_text(status: RunStatus, clients: int, refused: int) -> str:
-    """The status in Prometheus' text format, version 0.0.4; `clients` and `refused` count those of the port."""
+    """The status in Prometheus' text format, version 0.0.4; `clients` and `refused` count those of
+    the port.
+    """
     lines: list[str] = []
 
     def add(name: str, kind: str, *samples: tuple[str, float], about: str = "") -> None:
@@ -369,7 +429,11 @@ def metrics_text(status: RunStatus, clients: int, refused: int) -> str:
     add("recording_ok", "gauge", ("", not status.recording_problems))
     row = status.row
     if row is not None:
-        add("in_state", "gauge", *((f'{{state="{s.name.lower()}"}}', float(row.state == s)) for s in telemetry.State))
+        add(
+            "in_state",
+            "gauge",
+            *((f'{{state="{s.name.lower()}"}}', float(row.state == s)) for s in telemetry.State),
+        )
         for each in COLUMNS.values():
             counter = COUNTERS.get(each.name)
             about = f"{each.title}: {each.description}"
@@ -386,7 +450,9 @@ async def serve_metrics(connection: socket.socket, text: Callable[[], str]) -> N
     """Answer one HTTP request: `GET /metrics`, or 404."""
     wire = await protocol.Wire.on(connection)
     try:
-        with contextlib.suppress(TimeoutError, asyncio.IncompleteReadError, asyncio.LimitOverrunError, OSError):
+        with contextlib.suppress(
+            TimeoutError, asyncio.IncompleteReadError, asyncio.LimitOverrunError, OSError
+        ):
             async with asyncio.timeout(_REQUEST_S):
                 head = await wire.until(b"\r\n\r\n")
             found = head.split(b"\r\n")[0].split(b" ")[:2] == [b"GET", b"/metrics"]

@@ -20,7 +20,9 @@ Refused = Callable[[str, str, str], None]
 class PortSession:
     """A connection whose peer is known; `watch` streams `status`."""
 
-    def __init__(self, wire: Wire, peer: Peer, status: Callable[[], dict[str, Any]], turns: ReadingTurns) -> None:
+    def __init__(
+        self, wire: Wire, peer: Peer, status: Callable[[], dict[str, Any]], turns: ReadingTurns
+    ) -> None:
         self.peer = peer
         self.id = secrets.token_hex(4)  # of the connection
         self.heard_s = asyncio.get_running_loop().time()  # time of the peer's last request
@@ -86,7 +88,11 @@ class PortSession:
         """Stream the status from now on; None ends it."""
         if self._watch is not None:
             self._watch.cancel()
-        self._watch = None if period_s is None else asyncio.create_task(self._stream(period_s), name="port watch")
+        self._watch = (
+            None
+            if period_s is None
+            else asyncio.create_task(self._stream(period_s), name="port watch")
+        )
 
     async def _stream(self, period_s: float) -> None:
         with contextlib.suppress(SlowReaderError):

@@ -1,8 +1,10 @@
-"""The sockets of the port: a socket file, TLS on TCP, metrics; bound before anything else of the run exists.
+"""The sockets of the port: a socket file, TLS on TCP, metrics; bound before anything else of the
+run exists.
 
-File permissions decide who may use the socket file; its owner may tune. On TCP every client needs a certificate
-signed by the configured authority: its common name (CN) is the peer's name, its organisational unit (OU) the role
-(read, operate or tune); if one of them is missing, the peer may only read.
+File permissions decide who may use the socket file; its owner may tune. On TCP every client needs a
+certificate signed by the configured authority: its common name (CN) is the peer's name, its
+organisational unit (OU) the role (read, operate or tune); if one of them is missing, the peer may
+only read.
 """
 
 import contextlib
@@ -33,7 +35,8 @@ _SOMEBODY_THERE_S = 1.0
 class UnixListener:
     """A listening socket file, until `close`; all but its owner and root get `group_role`.
 
-    Raises InputError or DeviceError if the path is in use, the group does not exist, or permission is missing.
+    Raises InputError or DeviceError if the path is in use, the group does not exist, or permission
+    is missing.
     """
 
     def __init__(self, path: Path, group: str | None, group_role: Role) -> None:
@@ -47,8 +50,10 @@ class UnixListener:
             self.socket = _bound(path, group)
         except OSError as error:
             raise DeviceError(
-                f"{path.parent}: cannot be written, and there is no control port in it ({os_reason(error)}); choose "
-                "another folder for the runs with --logs or recording.logs_dir, or for the socket with port.socket"
+                f"{path.parent}: cannot be written, and there is no control port in it "
+                f"({os_reason(error)}); choose "
+                "another folder for the runs with --logs or recording.logs_dir, or for the "
+                "socket with port.socket"
             ) from None
         self._inode = path.stat().st_ino
 
@@ -58,10 +63,14 @@ class UnixListener:
         pid, uid, _ = _CREDENTIALS.unpack(raw)
         role: Role = "tune" if uid in (0, os.getuid()) else self._group_role
         who = f"unix:{self._names.get(uid, uid)}"
-        return protocol.Peer(who, role, pid or None, is_own_user=uid == os.getuid())  # pid 0: in another container
+        return protocol.Peer(
+            who, role, pid or None, is_own_user=uid == os.getuid()
+        )  # pid 0: in another container
 
     def close(self) -> None:
-        """Close it and remove the file, unless replaced by another; remove an empty folder made for it."""
+        """Close it and remove the file, unless replaced by another; remove an empty folder made for
+        it.
+        """
         self.socket.close()
         with contextlib.suppress(OSError):
             if self._path.stat().st_ino == self._inode:
@@ -77,7 +86,10 @@ def _remove_stale(path: Path) -> None:
     except FileNotFoundError:
         return
     if not stat.S_ISSOCK(mode):
-        raise InputError(f"{path}: exists and is not a socket; remove it, or choose another path with port.socket")
+        raise InputError(
+            f"{path}: exists and is not a socket; remove it, or choose another path with "
+            "port.socket"
+        )
     with socket.socket(socket.AF_UNIX) as probe, short(path) as address:
         probe.settimeout(_SOMEBODY_THERE_S)  # a hung listener's queue may be full
         try:
@@ -89,7 +101,9 @@ def _remove_stale(path: Path) -> None:
             return
         except (TimeoutError, BlockingIOError):
             pass
-    raise DeviceError(f"{path}: another hold is listening there; stop it, or choose another path with port.socket")
+    raise DeviceError(
+        f"{path}: another hold is listening there; stop it, or choose another path with port.socket"
+    )
 
 
 def group_id(name: str) -> int:
@@ -98,7 +112,8 @@ def group_id(name: str) -> int:
         return grp.getgrnam(name).gr_gid
     except KeyError:
         raise InputError(
-            f"port.group: no group {name!r} on this machine; create it (sudo groupadd {name}), or omit the key"
+            f"port.group: no group {name!r} on this machine; create it (sudo groupadd "
+            f"{name}), or omit the key"
         ) from None
 
 
@@ -147,7 +162,9 @@ class TlsListener:
         self.socket = listen_tcp(config.host, config.port, "port.tls")
 
     def peer(self, certificate: dict[str, Any]) -> protocol.Peer:
-        """Name and role in a certificate (from `getpeercert`); without a name, which commands record, read only."""
+        """Name and role in a certificate (from `getpeercert`); without a name, which commands
+        record, read only.
+        """
         subject = {key: value for part in certificate.get("subject", ()) for key, value in part}
         name = "".join(c for c in subject.get("commonName", "") if c.isprintable()).strip()
         if not name:
@@ -191,7 +208,9 @@ def load_pair(context: ssl.SSLContext, certificate: Path, key: Path) -> None:
     try:
         context.load_cert_chain(certificate, key, password=lambda: "")
     except (OSError, ValueError) as error:  # ssl.SSLError is an OSError
-        raise InputError(f"{certificate}, {key}: not a certificate and its unencrypted key ({error})") from None
+        raise InputError(
+            f"{certificate}, {key}: not a certificate and its unencrypted key ({error})"
+        ) from None
 
 
 def load_authority(context: ssl.SSLContext, authority: Path) -> None:
@@ -224,7 +243,9 @@ def _require_readable(path: Path) -> None:
 
 @dataclass(frozen=True, slots=True)
 class Listeners:
-    """All sockets of the port, bound before anything else of the run exists; None for those not configured."""
+    """All sockets of the port, bound before anything else of the run exists; None for those not
+    configured.
+    """
 
     unix: UnixListener | None = None
     tls: TlsListener | None = None

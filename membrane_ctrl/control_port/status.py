@@ -24,15 +24,21 @@ def status_table(status: RunStatus) -> dict[str, Any]:
         "state_age_s": round(row.mono_s - status.since_s, 3),
         "why": status.why,
         "paused": status.paused,
-        "locks": [{**asdict(lock), "problem": status.unstored.get(lock.word, "")} for lock in status.locks],
+        "locks": [
+            {**asdict(lock), "problem": status.unstored.get(lock.word, "")} for lock in status.locks
+        ],
         "latched": status.latched,
-        "fault": {key: getattr(fault, key) for key in ("code", "name", "cause", "remedy")} if fault else None,
+        "fault": {key: getattr(fault, key) for key in ("code", "name", "cause", "remedy")}
+        if fault
+        else None,
         "notices": [_notice_table(notice) for notice in status.other_notices],
         "recording_ok": not status.recording_problems,
         "safe_level": telemetry.SafeLevel(int(row.safe_level)).name.lower(),
         "shape": telemetry.ShapeState(int(row.shape_state)).name.lower(),
         "shape_reason": status.shape_reason,
-        "trial_left_s": round(status.trial_left_s, 1) if math.isfinite(status.trial_left_s) else None,
+        "trial_left_s": round(status.trial_left_s, 1)
+        if math.isfinite(status.trial_left_s)
+        else None,
         "geometry": asdict(geometry) if geometry else None,
         "row": {key: value if math.isfinite(value) else None for key, value in asdict(row).items()},
     }
@@ -48,7 +54,8 @@ def _notice_table(notice: Notice) -> dict[str, str]:
 
 
 def lock_lines(status: Mapping[str, Any]) -> list[str]:
-    """Return a line for each lock of a status: text, author, time, word, and whether it is not stored.
+    """Return a line for each lock of a status: text, author, time, word, and whether it is not
+    stored.
 
     Parameters
     ----------
@@ -77,12 +84,18 @@ def fault_line(status: Mapping[str, Any]) -> str:
 
 
 def notice_lines(status: Mapping[str, Any], topic: str | None = None) -> list[str]:
-    """Return the sentences of a status's notices on neither faults nor locks, of one topic or of all."""
-    return [str(each["text"]) for each in status.get("notices", ()) if topic in (None, each["topic"])]
+    """Return the sentences of a status's notices on neither faults nor locks, of one topic or of
+    all.
+    """
+    return [
+        str(each["text"]) for each in status.get("notices", ()) if topic in (None, each["topic"])
+    ]
 
 
 def alarm_lines(status: Mapping[str, Any]) -> list[str]:
-    """Return everything in a status that needs attention, a line each: locks, the fault, other notices."""
+    """Return everything in a status that needs attention, a line each: locks, the fault, other
+    notices.
+    """
     fault = fault_line(status)
     return [
         *(f"LOCKED {line}" for line in lock_lines(status)),

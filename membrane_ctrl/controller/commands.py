@@ -1,4 +1,6 @@
-"""The commands of a running hold, who may send them and in which states: one table for every user."""
+"""The commands of a running hold, who may send them and in which states:
+one table for every user.
+"""
 
 import math
 from collections.abc import Collection, Iterable
@@ -14,9 +16,25 @@ from membrane_ctrl.model.state_tree import StateNode
 from membrane_ctrl.model.telemetry import State
 
 Kind = Literal[
-    "hold", "stop", "pause", "resume", "manual", "setpoint", "gains",
-    "shape_on", "shape_off", "mark", "ack", "lower", "vent", "tune", "keep", "latch", "unlock", "capture",
-]  # fmt: skip
+    "hold",
+    "stop",
+    "pause",
+    "resume",
+    "manual",
+    "setpoint",
+    "gains",
+    "shape_on",
+    "shape_off",
+    "mark",
+    "ack",
+    "lower",
+    "vent",
+    "tune",
+    "keep",
+    "latch",
+    "unlock",
+    "capture",
+]
 Role = Literal["read", "operate", "tune"]
 
 AT_START = "command line"  # sender of the first commands
@@ -24,8 +42,8 @@ AT_END = "duration"  # sender of the last `stop`
 TRIAL_MAX_S = 7200.0  # nobody watches a trial for longer
 MEMORY_MAX_S = 1e5  # of the shape loop, as in the configuration
 
-# People lock the mirror with `lock`; `latch` is the name of that command in the protocol, in the bridges and in the
-# recorded inputs. Either name is accepted wherever a command is named.
+# People lock the mirror with `lock`; `latch` is the name of that command in the protocol, in the
+# bridges and in the recorded inputs. Either name is accepted wherever a command is named.
 SAME_AS: dict[str, Kind] = {"lock": "latch"}
 
 # Within one tick these come first, in this order: the safest wins
@@ -41,23 +59,27 @@ RUNNING = MOVING | {State.STANDBY, State.CHECK}
 class Command:
     """A request of a person or program."""
 
-    # of `TABLE`, or what only the start of a run reports: an earlier run resumed within the last day, or a fault is
-    # still latched
+    # of `TABLE`, or what only the start of a run reports: an earlier run resumed within the last
+    # day, or a fault is still latched
     kind: Kind | Literal["resumed", "latched"]
     who: str  # recorded, as is `why`
     why: str = ""
-    # `setpoint`: µm. `manual`: flow, µm/s of the centre. `gains`: trial time, s; NaN: no trial. `resumed`: age of the
-    # resume, s
+    # `setpoint`: µm. `manual`: flow, µm/s of the centre. `gains`: trial time, s; NaN: no trial.
+    # `resumed`: age of the resume, s
     value: float = math.nan
-    # `mark`: text for the timeline. `latch`: why the mirror is locked. `unlock`: the typed word. `latched`: the fault
+    # `mark`: text for the timeline. `latch`: why the mirror is locked. `unlock`: the typed word.
+    # `latched`: the fault
     text: str = ""
     loop: LoopConfig | None = None  # `gains`: all new loop settings
     experiment: ExperimentSpec | None = None  # `tune`: the experiment
     number: int = 0  # chosen by the client, returned with the answer
     shape_time_constant_s: float = math.nan  # `gains`: of the shape loop; NaN: as it is
     pump: PumpConfig | None = None  # `gains`: the pump's curve, if it changes
-    setpoint_step_um: float = math.nan  # `gains` on trial: moves the setpoint, the shape loop off; NaN: neither
-    lock: Lock | None = None  # `latch`: the lock, with author, word and time; None: made of the other fields
+    setpoint_step_um: float = (
+        math.nan
+    )  # `gains` on trial: moves the setpoint, the shape loop off; NaN: neither
+    # `latch`: the lock, with author, word and time; None: made of the other fields
+    lock: Lock | None = None
     account: str = ""  # login of the sender; empty: none, or not proven
     from_person: bool = True  # False: sent by a bridge, which speaks for nobody
 
@@ -80,11 +102,15 @@ _HOLD, _PARKED, _FLOW = (
 )
 
 TABLE: dict[Kind, CommandRule] = {
-    "setpoint": CommandRule("operate", RUNNING, "Ramp to a laser setpoint, in µm.", needs=("value",)),
+    "setpoint": CommandRule(
+        "operate", RUNNING, "Ramp to a laser setpoint, in µm.", needs=("value",)
+    ),
     "hold": CommandRule("operate", _PARKED, "Hold the mirror, or return to holding it."),
     "pause": CommandRule("operate", _HOLD, "Pause the loop; the pump keeps its mean flow."),
     "resume": CommandRule("operate", _HOLD, "Resume the loop after a pause."),
-    "manual": CommandRule("operate", _FLOW, "Set the pump's flow by hand, in µm/s of the centre.", needs=("value",)),
+    "manual": CommandRule(
+        "operate", _FLOW, "Set the pump's flow by hand, in µm/s of the centre.", needs=("value",)
+    ),
     "gains": CommandRule(
         "tune",
         RUNNING,
@@ -99,12 +125,16 @@ TABLE: dict[Kind, CommandRule] = {
     "mark": CommandRule("operate", ANY, "Add a remark to the timeline.", needs=("text",)),
     "capture": CommandRule("operate", _HOLD, "Save a full capture set to the run's raw/ folder."),
     "ack": CommandRule(
-        "operate", {State.STANDBY, State.FAULT}, "Clear a latched fault and acknowledge the alarms; locks stay."
+        "operate",
+        {State.STANDBY, State.FAULT},
+        "Clear a latched fault and acknowledge the alarms; locks stay.",
     ),
     "lower": CommandRule("operate", RUNNING, "Stop the pump; the leak lowers the mirror."),
     "vent": CommandRule("operate", ANY, "Open the vent."),
     "stop": CommandRule("operate", ANY, "End the run safely; never refused."),
-    "latch": CommandRule("operate", ANY, "Lock the mirror: pump off, no hold until `unlock`.", takes=("text",)),
+    "latch": CommandRule(
+        "operate", ANY, "Lock the mirror: pump off, no hold until `unlock`.", takes=("text",)
+    ),
     "unlock": CommandRule(
         "operate", ANY, "Remove your lock, or another person's by typing its word.", takes=("text",)
     ),
@@ -113,7 +143,10 @@ TABLE: dict[Kind, CommandRule] = {
 
 def in_order(commands: Iterable[Command]) -> list[Command]:
     """Commands of a tick, safest first, the others in order of arrival."""
-    return sorted(commands, key=lambda command: DOWN.index(command.kind) if command.kind in DOWN else len(DOWN))
+    return sorted(
+        commands,
+        key=lambda command: DOWN.index(command.kind) if command.kind in DOWN else len(DOWN),
+    )
 
 
 def overruled(command: Command, obeyed: Collection[str]) -> str:
@@ -127,7 +160,11 @@ def overruled(command: Command, obeyed: Collection[str]) -> str:
 def refusal(command: Command, state: State, config: Config) -> str:
     """Why a command cannot be executed now; empty if it can."""
     if command.kind == "resumed" or command.kind == "latched":
-        return "" if command.who == AT_START else "only the start of a run may report earlier resumes and faults"
+        return (
+            ""
+            if command.who == AT_START
+            else "only the start of a run may report earlier resumes and faults"
+        )
     rule = TABLE[command.kind]
     if state not in rule.states:
         where = ", ".join(sorted(s.name.lower() for s in rule.states))
@@ -145,14 +182,20 @@ def refusal(command: Command, state: State, config: Config) -> str:
         return "tune: experiment missing"
     if command.kind == "gains" and command.loop is None:
         return "gains: missing"
-    if command.kind == "gains" and not (math.isnan(command.value) or 1.0 <= command.value <= TRIAL_MAX_S):
+    if command.kind == "gains" and not (
+        math.isnan(command.value) or 1.0 <= command.value <= TRIAL_MAX_S
+    ):
         return f"gains on trial for {command.value:g} s: a trial takes 1 .. {TRIAL_MAX_S:g} s"
     memory_s = command.shape_time_constant_s
     if not (math.isnan(memory_s) or 1.0 <= memory_s <= MEMORY_MAX_S):
         return f"shape.time_constant_s = {memory_s:g} s is outside 1 .. {MEMORY_MAX_S:g} s"
     if math.isfinite(command.setpoint_step_um) and math.isnan(command.value):
         return "setpoint_step_um is for a trial: give its time as value"
-    if command.kind == "gains" and command.loop is not None and command.loop.rate_hz != config.loop.rate_hz:
+    if (
+        command.kind == "gains"
+        and command.loop is not None
+        and command.loop.rate_hz != config.loop.rate_hz
+    ):
         return "the tick rate cannot be changed during a run"
     if command.kind == "capture" and not config.shape.enabled:
         return "no shape measurement in this run: [shape] enabled = false"
@@ -160,7 +203,9 @@ def refusal(command: Command, state: State, config: Config) -> str:
 
 
 def taken(command: Command, refused: str) -> CommandTaken:
-    """The event of a command: its sender, reason and settings, and why it was refused (empty: it was not)."""
+    """The event of a command: its sender, reason and settings, and why it was refused (empty: it
+    was not).
+    """
     spec = command.experiment
     return CommandTaken(
         command=command.kind,
@@ -169,7 +214,9 @@ def taken(command: Command, refused: str) -> CommandTaken:
         value=_or_none(command.value),
         text=command.text or None,
         loop=_settings(command),
-        experiment=None if spec is None else spec.model_dump(exclude=None if spec.steps else {"steps"}),
+        experiment=None
+        if spec is None
+        else spec.model_dump(exclude=None if spec.steps else {"steps"}),
         shape_time_constant_s=_or_none(command.shape_time_constant_s),
         setpoint_step_um=_or_none(command.setpoint_step_um),
         refused=refused or None,
@@ -184,7 +231,9 @@ def _settings(command: Command) -> dict[str, object] | None:
     """What a `gains` sets, for its event: the loop's keys, and the pump's table if that changes."""
     if command.loop is None:
         return None
-    return command.loop.model_dump() | ({} if command.pump is None else {"pump": command.pump.model_dump()})
+    return command.loop.model_dump() | (
+        {} if command.pump is None else {"pump": command.pump.model_dump()}
+    )
 
 
 @dataclass(frozen=True, slots=True)
@@ -203,14 +252,17 @@ class GainsState(StateNode):
     good: GainsInForce
     tried: GainsInForce
     until_s: float = math.nan  # end of the trial; NaN: there is none
-    setpoint_step_um: float = math.nan  # part of the trial; NaN: the setpoint and the shape loop are not
+    setpoint_step_um: float = (
+        math.nan
+    )  # part of the trial; NaN: the setpoint and the shape loop are not
 
 
 class GainsTrial:
-    """Gains, and the pump's curve, on trial revert to the last good ones unless kept in time; a run's first are good.
+    """Gains, and the pump's curve, on trial revert to the last good ones unless kept in time; a
+    run's first are good.
 
-    The client that tries them may lose its connection or be killed: the loop must not keep unverified gains
-    (docs/decisions/78-gains-on-trial.md).
+    The client that tries them may lose its connection or be killed: the loop must not keep
+    unverified gains (docs/decisions/78-gains-on-trial.md).
     """
 
     def __init__(self, memory: GainsState) -> None:
@@ -242,7 +294,9 @@ class GainsTrial:
 
     @property
     def setpoint_step_um(self) -> float:
-        """The trial's step of the setpoint; NaN: the setpoint and the shape loop are no part of it."""
+        """The trial's step of the setpoint; NaN: the setpoint and the
+        shape loop are no part of it.
+        """
         return self.memory.setpoint_step_um
 
     def keep(self) -> None:

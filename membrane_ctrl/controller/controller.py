@@ -1,7 +1,9 @@
-"""One tick of control: observe, judge, act. Without I/O and clock, so that a run, a replay and a test are alike.
+"""One tick of control: observe, judge, act. Without I/O and clock, so that a run, a replay and a
+test are alike.
 
-The order is fixed: the inputs become an observation; the safety table judges it; only then the state's handler runs,
-and a safe level in force overrules its output. Every path through a tick ends here.
+The order is fixed: the inputs become an observation; the safety table judges it; only then the
+state's handler runs, and a safe level in force overrules its output. Every path through a tick ends
+here.
 """
 
 import math
@@ -34,11 +36,13 @@ from membrane_ctrl.model.lock import describe_locks
 from membrane_ctrl.model.reason import NO_REASON, make_reason
 from membrane_ctrl.model.telemetry import SafeLevel, State
 
-# range of the loop's time step relative to the nominal one; beyond it a tick is missed, which the safety table sees
+# range of the loop's time step relative to the nominal one; beyond it a tick is missed, which the
+# safety table sees
 _DT_RANGE = (0.2, 5.0)
 _WHY_STANDS_S = 1.0  # shorter-lived reasons (a pump that touches its limit) are not reported
 _WITHOUT_LASER = make_reason(
-    shape_loop.ShapeCode.NO_MOUNT, "there is no laser whose mount could drift: the optics themselves are held"
+    shape_loop.ShapeCode.NO_MOUNT,
+    "there is no laser whose mount could drift: the optics themselves are held",
 )
 _LOCKS_SHOWN = 3  # in the fault's text; the status has all of them
 
@@ -46,12 +50,15 @@ _LOCKS_SHOWN = 3  # in the fault's text; the status has all of them
 class Controller:
     """Owns the state machine, the safety table and both loops.
 
-    `sag_sensitivity` (terms,) are the Zernike coefficients of a Hencky bowl per sag, in µm per µm, for the shape
-    loop.
+    `sag_sensitivity` (terms,) are the Zernike coefficients of a Hencky bowl per sag, in µm per µm,
+    for the shape loop.
     """
 
     def __init__(
-        self, config: Config, sag_sensitivity: arrays.FloatArray, memory: ControllerState | None = None
+        self,
+        config: Config,
+        sag_sensitivity: arrays.FloatArray,
+        memory: ControllerState | None = None,
     ) -> None:
         self._config = config
         self.memory = memory = memory or first_state(config)
@@ -112,12 +119,16 @@ class Controller:
         return self._config.model_copy(update={"loop": gains.loop, "pump": gains.pump})
 
     def tick(self, inputs: TickInputs) -> TickOutputs:
-        """Run one tick. Never raises: an exception in a handler becomes a fault in the next tick."""
+        """Run one tick. Never raises: an exception in a handler
+        becomes a fault in the next tick.
+        """
         scene = self._scene
         events: list[told.Event] = []
         self._begin(inputs, events)
         last = scene.output or inner_loop.NO_OUTPUT
-        judged = self.state in safety.MOVING and not scene.paused  # nothing follows a setpoint in a pause
+        judged = (
+            self.state in safety.MOVING and not scene.paused
+        )  # nothing follows a setpoint in a pause
         error_um = last.error_um if judged else math.nan
         scene.observer.look(inputs, self._may_follow_optics())
         consistency = self._consistency
@@ -125,7 +136,9 @@ class Controller:
             inputs,
             self.state,
             scene.dt_s,
-            sensor_consistency.hold_status(scene, last, self._holders.optics_hold, self._may_follow_optics()),
+            sensor_consistency.hold_status(
+                scene, last, self._holders.optics_hold, self._may_follow_optics()
+            ),
         )
         stand = scene.standstill
         stand.look(inputs.now_s, inputs.reading, scene.observer.commanded, inputs.link_up)
@@ -168,7 +181,9 @@ class Controller:
         fault = self.fault.code if self.fault else 0
         return TickOutputs(
             command=command,
-            row=telemetry_row(scene, self.state, fault, self.memory.ticks, inputs, observation, shape),
+            row=telemetry_row(
+                scene, self.state, fault, self.memory.ticks, inputs, observation, shape
+            ),
             events=tuple(events),
             finished=scene.finished,
             answers=tuple(self._answers),
@@ -176,16 +191,23 @@ class Controller:
         )
 
     def _may_follow_optics(self) -> bool:
-        """Whether the estimate uses the figures: what it leaves out must not replace a lost laser."""
+        """Whether the estimate uses the figures: what it leaves out
+        must not replace a lost laser.
+        """
         if self._config.by_optics:
             return True
-        return self._shape.on and not self._consistency.camera_lies and not self._holders.optics_left_out
+        return (
+            self._shape.on
+            and not self._consistency.camera_lies
+            and not self._holders.optics_left_out
+        )
 
     def _displacement_suffices(self) -> bool:
         """Whether the displacement is known as well as the present state needs it.
 
-        A loop needs a new reading or figure, or the estimate while that follows the optics. A flow that a person has
-        set, and a pause, need only what their range is judged by. An experiment measures with the laser.
+        A loop needs a new reading or figure, or the estimate while that follows the optics. A flow
+        that a person has set, and a pause, need only what their range is judged by. An experiment
+        measures with the laser.
         """
         scene, observer = self._scene, self._scene.observer
         if self.state == State.TUNE and not self._config.by_optics:
@@ -216,7 +238,9 @@ class Controller:
             self._revert_gains("nobody kept them in time", events)
         scene.loop.may_probe = not self._gains.on_trial
 
-    def _obey(self, command: commands.Command, obeyed: Collection[str], events: list[told.Event]) -> bool:
+    def _obey(
+        self, command: commands.Command, obeyed: Collection[str], events: list[told.Event]
+    ) -> bool:
         """Execute or refuse a command; either way, record its sender and reason."""
         refused = (
             commands.overruled(command, obeyed)
@@ -279,7 +303,9 @@ class Controller:
         events.append(event)
 
     def _prepare(self, command: commands.Command) -> str:
-        """Prepare the experiment of a `tune`; returns why the command is refused, or an empty text."""
+        """Prepare the experiment of a `tune`; returns why the command is refused,
+        or an empty text.
+        """
         scene, spec = self._scene, command.experiment
         if command.kind == "hold" and scene.latched:
             return f"a fault is latched: {scene.latched}; acknowledge it first"
@@ -289,7 +315,9 @@ class Controller:
             return "the safety table holds the mean flow"
         if math.isfinite(command.setpoint_step_um):
             now_um = (
-                self.memory.setpoint_back_um if math.isfinite(self.memory.setpoint_back_um) else scene.setpoint_um
+                self.memory.setpoint_back_um
+                if math.isfinite(self.memory.setpoint_back_um)
+                else scene.setpoint_um
             )
             stepped = replace(command, kind="setpoint", value=now_um + command.setpoint_step_um)
             return commands.refusal(stepped, self.state, self._in_force)
@@ -316,7 +344,9 @@ class Controller:
         self._step_setpoint()
 
     def _step_setpoint(self) -> None:
-        """Step the setpoint as the trial asks, with the shape loop off; after the trial both are as before it."""
+        """Step the setpoint as the trial asks, with the shape loop off; after the trial both are as
+        before it.
+        """
         scene, step_um = self._scene, self._gains.setpoint_step_um
         stepped = math.isfinite(self.memory.setpoint_back_um)
         if math.isfinite(step_um):
@@ -373,7 +403,12 @@ class Controller:
             distrust = _WITHOUT_LASER
         try:
             shape = self._shape.step(
-                inputs.now_s, scene.dt_s, inputs.estimate, scene.observer.displacement_um, settled, distrust
+                inputs.now_s,
+                scene.dt_s,
+                inputs.estimate,
+                scene.observer.displacement_um,
+                settled,
+                distrust,
             )
         except (ValueError, ArithmeticError, LinAlgError) as error:
             self.memory.tick_error = f"shape loop: {type(error).__name__}: {error}"
@@ -382,7 +417,9 @@ class Controller:
         reported = ReportedShape(shape.state, shape.reason.code)
         if reported != self.memory.reported_shape:
             self.memory.reported_shape = reported
-            events.append(told.ShapeLoopState(shape.state.name.lower(), shape.reason.text, shape.reason.code))
+            events.append(
+                told.ShapeLoopState(shape.state.name.lower(), shape.reason.text, shape.reason.code)
+            )
         return shape
 
     def _act(self, events: list[told.Event]) -> None:
@@ -401,7 +438,9 @@ class Controller:
             return
         for name, fraction in (("pump", scene.pump_fraction), ("vent", scene.vent_fraction)):
             if not 0.0 <= fraction <= 1.0:
-                self.memory.tick_error = f"{name} command {fraction} from state {self.state.name.lower()}"
+                self.memory.tick_error = (
+                    f"{name} command {fraction} from state {self.state.name.lower()}"
+                )
                 scene.pump_fraction, scene.vent_fraction = 0.0, 0.0
         if wanted != self.state:
             self._go(wanted, scene.why.text, events)
@@ -437,7 +476,11 @@ class Controller:
         experiment = self._scene.trial
         assert experiment is not None
         ended = self._scene.trial_ended or machine.Finished(machine.ExperimentEnd.INTERRUPTED, why)
-        events.append(told.ExperimentEnded(experiment.spec.kind, ended.completed, ended.reason, ended.end.value))
+        events.append(
+            told.ExperimentEnded(
+                experiment.spec.kind, ended.completed, ended.reason, ended.end.value
+            )
+        )
 
     def _tell_why(self, events: list[told.Event]) -> None:
         """Report the operator's line once its reason (not its numbers) has changed durably."""

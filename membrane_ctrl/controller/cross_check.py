@@ -1,7 +1,8 @@
-"""Checks the configuration against itself and against the board's limits, for `check` and `hold`. Pure.
+"""Checks the configuration against itself and against the board's limits, for `check` and `hold`.
+Pure.
 
-The range of a field (`config`) catches a wrong unit. This module judges combinations: settings that let the pump run
-when it must not, guards that never or always trip, and contradictory numbers.
+The range of a field (`config`) catches a wrong unit. This module judges combinations: settings that
+let the pump run when it must not, guards that never or always trip, and contradictory numbers.
 """
 
 import difflib
@@ -26,9 +27,10 @@ from membrane_ctrl.controller import (
 )
 from membrane_ctrl.model.errors import FindingsError
 
-_RESUMES_MOST = 24  # a day: the cause of a fault that recurs more than once an hour is not temporary
-# How long the pump may run without control, and how long at an uncorrected flow. At 5 µm/s and at the 1.2 µm/s of a
-# doubled leak that is 10 µm and 70 µm, well within the default limits.
+# a day: the cause of a fault that recurs more than once an hour is not temporary
+_RESUMES_MOST = 24
+# How long the pump may run without control, and how long at an uncorrected flow. At 5 µm/s and at
+# the 1.2 µm/s of a doubled leak that is 10 µm and 70 µm, well within the default limits.
 _UNATTENDED_S, _BLIND_S = 2.0, 60.0
 _PAUSE_S = 3600.0  # the laser still guards the limits, but no loop holds the mirror
 _PUMP_STANDS_S = 0.5  # lag and transport
@@ -39,7 +41,9 @@ _UNKNOWN = BenchIdentity("", 0, "", math.nan)
 _TWIN_BOARD = DevicesConfig(board="tcp://twin")  # the device of `--twin` if none are named
 
 
-def cross_check(config: Config, board: BenchIdentity | None = None) -> tuple[cross_check_plant.ConfigFinding, ...]:
+def cross_check(
+    config: Config, board: BenchIdentity | None = None
+) -> tuple[cross_check_plant.ConfigFinding, ...]:
     """Findings on a configuration and, if given, on its board's limits; errors first."""
     say = cross_check_plant.ConfigFindings(config)
     _finite(config, say)
@@ -74,7 +78,9 @@ def _finite(config: Config, say: cross_check_plant.ConfigFindings) -> None:
 
 def _numbers(value: Any, field: str) -> Iterator[tuple[str, float]]:
     if isinstance(value, BaseModel):
-        inner: Iterable[tuple[Any, Any]] = ((name, getattr(value, name)) for name in type(value).model_fields)
+        inner: Iterable[tuple[Any, Any]] = (
+            (name, getattr(value, name)) for name in type(value).model_fields
+        )
     elif isinstance(value, tuple | list):
         inner = enumerate(value)
     else:
@@ -94,16 +100,27 @@ def _resume(config: Config, say: cross_check_plant.ConfigFindings) -> None:
         near = difflib.get_close_matches(name, known, n=1, cutoff=0.5)
         hint = f"did you mean {near[0]}?" if near else f"may resume: {', '.join(may)}"
         say.error(name not in known, field, "no fault has this name", hint)
-        why, remedy = "only a person may clear this fault", f"remove it; may resume: {', '.join(may)}"
+        why, remedy = (
+            "only a person may clear this fault",
+            f"remove it; may resume: {', '.join(may)}",
+        )
         say.error(name in known and name not in may, field, why, remedy)
     why = "a fault that recurs this often has a lasting cause"
-    say.error(resume.most_per_day > _RESUMES_MOST, "resume.most_per_day", why, f"set at most {_RESUMES_MOST}")
+    say.error(
+        resume.most_per_day > _RESUMES_MOST,
+        "resume.most_per_day",
+        why,
+        f"set at most {_RESUMES_MOST}",
+    )
     if resume.faults:
         never, remedy = "nothing would ever resume", "set at least 1, or empty resume.faults"
         say.warn(resume.most_per_day == 0, "resume.most_per_day", never, remedy)
         waits = resume.wait_s >= config.states.pump_off_max_s
         say.warn(
-            waits, "resume.wait_s", f"the mirror is vented earlier: {never}", "keep it below states.pump_off_max_s"
+            waits,
+            "resume.wait_s",
+            f"the mirror is vented earlier: {never}",
+            "keep it below states.pump_off_max_s",
         )
 
 
@@ -111,20 +128,38 @@ def _watchdog(config: Config, say: cross_check_plant.ConfigFindings) -> None:
     devices, limits = config.devices or _TWIN_BOARD, config.limits
     tick_s, watchdog_s = 1.0 / config.loop.rate_hz, devices.watchdog_s
     if config.devices is not None:
-        why, most = "the pump would run this long without a control process", f"set at most {_UNATTENDED_S:g} s"
+        why, most = (
+            "the pump would run this long without a control process",
+            f"set at most {_UNATTENDED_S:g} s",
+        )
         say.error(watchdog_s > _UNATTENDED_S, "devices.watchdog_s", why, most)
         for field, timeout_s in _slowest_answers(devices):
             lost_s = timeout_s + tick_s
             waits = f"one lost answer ({timeout_s:g} s on its line) and a tick of {tick_s:g} s"
             why = f"{waits} take longer than the watchdog ({watchdog_s:g} s)"
-            say.error(lost_s >= watchdog_s, field, why, "shorten it, or lengthen devices.watchdog_s")
+            say.error(
+                lost_s >= watchdog_s, field, why, "shorten it, or lengthen devices.watchdog_s"
+            )
             ends = lost_s >= limits.stale_s and len(devices.roles()) == 0
-            say.warn(ends, "limits.stale_s", "one lost answer ends the run", f"set more than {lost_s:g} s")
-    why = f"the watchdog ({watchdog_s:g} s) trips between two ticks of {tick_s:g} s, or at the first late one"
+            say.warn(
+                ends,
+                "limits.stale_s",
+                "one lost answer ends the run",
+                f"set more than {lost_s:g} s",
+            )
+    why = (
+        f"the watchdog ({watchdog_s:g} s) trips between two ticks of {tick_s:g} s, or at the "
+        "first late one"
+    )
     remedy = f"set at least {2.0 / watchdog_s:g} Hz, or lengthen devices.watchdog_s"
     say.error(2.0 * tick_s > watchdog_s, "loop.rate_hz", why, remedy)
-    late, why = "limits.lateness_max_ms", f"can never trip: the watchdog ({watchdog_s:g} s) trips first"
-    say.error(1e-3 * limits.lateness_max_ms >= watchdog_s, late, why, "keep it below devices.watchdog_s")
+    late, why = (
+        "limits.lateness_max_ms",
+        f"can never trip: the watchdog ({watchdog_s:g} s) trips first",
+    )
+    say.error(
+        1e-3 * limits.lateness_max_ms >= watchdog_s, late, why, "keep it below devices.watchdog_s"
+    )
     say.warn(limits.lateness_max_ms < 5.0, late, "a healthy machine can be that late", "set 100 ms")
 
 
@@ -144,7 +179,9 @@ def _stale(config: Config, say: cross_check_plant.ConfigFindings) -> None:
 
 
 def _slowest_answers(devices: DevicesConfig) -> Iterator[tuple[str, float]]:
-    """Longest wait of a tick for answers: devices on one line take turns, lines work in parallel."""
+    """Longest wait of a tick for answers: devices on one line take turns,
+    lines work in parallel.
+    """
     if devices.board is not None:
         yield "devices.timeout_s", devices.timeout_s
         return
@@ -153,29 +190,59 @@ def _slowest_answers(devices: DevicesConfig) -> Iterator[tuple[str, float]]:
         if not isinstance(section, VaisalaPtb330Config):  # read in the background
             line = str(getattr(section, "link", None) or getattr(section, "port", ""))
             lines[line].append((f"devices.{role}.timeout_s", section.timeout_s))
-    for index, interlock in enumerate(devices.interlocks):  # read in the background, but a serial line has one turn
-        if isinstance(interlock, ModbusInputConfig) and interlock.link.startswith("rtu:") and interlock.link in lines:
-            lines[interlock.link].append((f"devices.interlocks.{index}.timeout_s", interlock.timeout_s))
+    for index, interlock in enumerate(
+        devices.interlocks
+    ):  # read in the background, but a serial line has one turn
+        if (
+            isinstance(interlock, ModbusInputConfig)
+            and interlock.link.startswith("rtu:")
+            and interlock.link in lines
+        ):
+            lines[interlock.link].append(
+                (f"devices.interlocks.{index}.timeout_s", interlock.timeout_s)
+            )
     slowest = max(lines.values(), key=lambda line: sum(timeout_s for _, timeout_s in line))
     yield slowest[0][0], sum(timeout_s for _, timeout_s in slowest)
 
 
 def _states(config: Config, say: cross_check_plant.ConfigFindings) -> None:
     states, limits = config.states, config.limits
-    for name, most_s in (("hold_flow_max_s", _BLIND_S), ("ramp_down_s", _BLIND_S), ("pause_max_s", _PAUSE_S)):
+    for name, most_s in (
+        ("hold_flow_max_s", _BLIND_S),
+        ("ramp_down_s", _BLIND_S),
+        ("pause_max_s", _PAUSE_S),
+    ):
         too_long = getattr(states, name) > most_s
-        say.error(too_long, f"states.{name}", "the flow would be uncontrolled this long", f"set at most {most_s:g} s")
+        say.error(
+            too_long,
+            f"states.{name}",
+            "the flow would be uncontrolled this long",
+            f"set at most {most_s:g} s",
+        )
     needed_s = states.check_s
     if states.actuator_test:
         needed_s = pump_obeys.ActuatorTest(config.pump, True, config.loop.rate_hz).duration_s
-    why, least = f"too short: the check takes {needed_s:.1f} s", f"set at least {2.0 * needed_s:.0f} s"
+    why, least = (
+        f"too short: the check takes {needed_s:.1f} s",
+        f"set at least {2.0 * needed_s:.0f} s",
+    )
     say.error(states.check_timeout_s <= needed_s, "states.check_timeout_s", why, least)
     why = f"too short: states.settle_s is {states.settle_s:g} s"
-    say.error(states.settle_timeout_s <= states.settle_s, "states.settle_timeout_s", why, "set some minutes")
+    say.error(
+        states.settle_timeout_s <= states.settle_s,
+        "states.settle_timeout_s",
+        why,
+        "set some minutes",
+    )
     seen_s = _PUMP_STANDS_S + 2.0 / config.loop.rate_hz
-    why = f"too short: a pump stops {_PUMP_STANDS_S:g} s after its command, and its read-back shows it a tick later"
+    why = (
+        f"too short: a pump stops {_PUMP_STANDS_S:g} s after its command, and its read-back "
+        "shows it a tick later"
+    )
     say.error(states.lower_timeout_s < seen_s, "states.lower_timeout_s", why, "set 3 s")
-    speed_um_per_s = min(config.loop.setpoint_ramp_um_per_s, cross_check_plant.flow_um_per_s(config))
+    speed_um_per_s = min(
+        config.loop.setpoint_ramp_um_per_s, cross_check_plant.flow_um_per_s(config)
+    )
     way_s = (config.loop.setpoint_um - limits.displacement_min_um) / speed_um_per_s
     why = f"too short: inflating from limits.displacement_min_um takes at least {way_s:.0f} s"
     say.warn(states.inflate_timeout_s < way_s, "states.inflate_timeout_s", why, "lengthen it")
@@ -196,20 +263,36 @@ def _states(config: Config, say: cross_check_plant.ConfigFindings) -> None:
 def _limits(config: Config, say: cross_check_plant.ConfigFindings) -> None:
     limits, setpoint_um = config.limits, config.loop.setpoint_um
     trim_um = config.shape.trim_max_um if config.shape.enabled else 0.0
-    above_um, below_um = limits.displacement_max_um - setpoint_um, setpoint_um - limits.displacement_min_um
+    above_um, below_um = (
+        limits.displacement_max_um - setpoint_um,
+        setpoint_um - limits.displacement_min_um,
+    )
     field = "shape.trim_max_um" if trim_um >= limits.band_um else "limits.band_um"
     for room_um, side in ((above_um, "above"), (below_um, "below")):
-        why = f"trim and band reach the limit, {room_um:g} µm {side} the setpoint ({setpoint_um:g} µm)"
+        why = (
+            f"trim and band reach the limit, {room_um:g} µm {side} the setpoint ({setpoint_um:g} "
+            "µm)"
+        )
         remedy = "lower it, or move the setpoint or the limits"
         say.error(trim_um + limits.band_um >= room_um, field, why, remedy)
     following_um, room_um = limits.following_error_max_um, min(above_um, below_um)
     why, less = "can never trip: a displacement limit trips first", f"set less than {room_um:g} µm"
     say.warn(following_um >= room_um, "limits.following_error_max_um", why, less)
     why = f"a mirror inside the band would be a following error ({following_um:g} µm)"
-    say.error(limits.band_um >= following_um, "limits.band_um", why, "keep it below limits.following_error_max_um")
+    say.error(
+        limits.band_um >= following_um,
+        "limits.band_um",
+        why,
+        "keep it below limits.following_error_max_um",
+    )
     step_um = cross_check_plant.flow_um_per_s(config) / config.loop.rate_hz
     why = f"a moving film ({step_um:.2f} µm a tick) and the laser's noise (1 µm) reach it"
-    say.error(limits.step_max_um < 4.0 + step_um, "limits.step_max_um", why, f"set at least {4.0 + step_um:.0f} µm")
+    say.error(
+        limits.step_max_um < 4.0 + step_um,
+        "limits.step_max_um",
+        why,
+        f"set at least {4.0 + step_um:.0f} µm",
+    )
     why = f"can never trip: the limit is {above_um:g} µm above the setpoint"
     say.error(limits.step_max_um >= above_um, "limits.step_max_um", why, "lower it")
 
@@ -218,31 +301,54 @@ def _board(config: Config, board: BenchIdentity, say: cross_check_plant.ConfigFi
     """Check the limits that the board enforces itself."""
     own_pa = board.gauge_pressure_limit_pa
     above = config.limits.gauge_pressure_max_pa > own_pa
-    say.error(above, "limits.gauge_pressure_max_pa", f"the board itself vents at {own_pa:g} Pa", "lower it to that")
+    say.error(
+        above,
+        "limits.gauge_pressure_max_pa",
+        f"the board itself vents at {own_pa:g} Pa",
+        "lower it to that",
+    )
     limit = board.pump_limit_fraction
     needed = gas.PumpCurve(config.pump).fraction(cross_check_plant.flow_um_per_s(config))
     most = f"and the board limits the pump to {limit:g}"
     remedy = "lower it, or raise the board's limit"
-    say.error(needed > limit + 1e-9, "loop.flow_max_um_per_s", f"takes a command of {needed:.2f}, {most}", remedy)
+    say.error(
+        needed > limit + 1e-9,
+        "loop.flow_max_um_per_s",
+        f"takes a command of {needed:.2f}, {most}",
+        remedy,
+    )
     test = max(part.pump_fraction for part in pump_obeys.PARTS)
     refused = config.states.actuator_test and test > limit + 1e-9
     remedy = "raise the board's limit, or omit the test"
     say.error(refused, "states.actuator_test", f"commands {test:g}, {most}", remedy)
 
 
-def _board_guards(config: Config, board: BenchIdentity, say: cross_check_plant.ConfigFindings) -> None:
+def _board_guards(
+    config: Config, board: BenchIdentity, say: cross_check_plant.ConfigFindings
+) -> None:
     """Check whether the board itself protects the mirror when its gauge fails."""
     if config.devices is None or config.devices.board is None or board.map_version == 0:
         return
     guarded = board.map_version >= _GUARDED_SINCE
     why = "this board's firmware does not stop the pump when its gauge fails"
     say.warn(not guarded, "devices.board", why, f"update to map version {_GUARDED_SINCE}")
-    why = "no gauge is fitted according to the board's settings, so it has no over-pressure protection of its own"
-    say.warn(guarded and not board.gauge_fitted, "devices.board", why, "store gauge_fitted = true in the board")
+    why = (
+        "no gauge is fitted according to the board's settings, so it has no over-pressure "
+        "protection of its own"
+    )
+    say.warn(
+        guarded and not board.gauge_fitted,
+        "devices.board",
+        why,
+        "store gauge_fitted = true in the board",
+    )
     noticed_s = _PRESSURE_MISSING.window / config.loop.rate_hz
     ramp_s = noticed_s + config.states.ramp_down_s
     cut = guarded and board.gauge_fitted and ramp_s >= board.gauge_timeout_s
-    why = f"the board itself stops the pump and latches {board.gauge_timeout_s:g} s after its gauge fails"
+    why = (
+        f"the board itself stops the pump and latches {board.gauge_timeout_s:g} s after its "
+        "gauge fails"
+    )
     say.warn(cut, "states.ramp_down_s", why, "shorten it, or lengthen gauge_timeout_s in the board")
 
 

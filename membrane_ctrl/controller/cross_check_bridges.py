@@ -15,4 +15,6 @@ def judge_bridges(config: Config, say: ConfigFindings) -> None:
     """Warn of bridges through which clients may act whom nobody knows."""
     for bridge in bridge_accesses(config.doors):
         acts = bridge.unknown and config.doors.role != "read"
-        say.warn(acts, "doors.role", f"{bridge.where}: {bridge.who} may act", _REMEDIES[bridge.field])
+        say.warn(
+            acts, "doors.role", f"{bridge.where}: {bridge.who} may act", _REMEDIES[bridge.field]
+        )

@@ -1,4 +1,6 @@
-"""Findings on the interlocks: sources that react too late, that cannot react, or that the board does not have."""
+"""Findings on the interlocks: sources that react too late, that cannot react, or that the board
+does not have.
+"""
 
 import math
 
@@ -20,21 +22,34 @@ def judge_interlocks(config: Config, say: ConfigFindings) -> None:
             _polled(field, interlock, say)
         if isinstance(interlock, ModbusInputConfig):
             _modbus(field, interlock, config, say)
-        why = "no vent is fitted: an open circuit only stops the pump, and the leak lowers the mirror"
+        why = (
+            "no vent is fitted: an open circuit only stops the pump, and the leak lowers the mirror"
+        )
         without_vent = interlock.safe_level == "vent" and not config.vent_fitted
         say.warn(without_vent, f"{field}.safe_level", why, "fit a vent (devices.vent)")
 
 
 def _polled(field: str, interlock: PolledInterlockConfig, say: ConfigFindings) -> None:
     period_s, age_max_s = interlock.period_s, interlock.age_max_s
-    slowest_s = period_s + (interlock.timeout_s if isinstance(interlock, ModbusInputConfig) else 0.0)
-    why = f"a source asked every {period_s:g} s may take {slowest_s:g} s to answer: each late answer would be a fault"
+    slowest_s = period_s + (
+        interlock.timeout_s if isinstance(interlock, ModbusInputConfig) else 0.0
+    )
+    why = (
+        f"a source asked every {period_s:g} s may take {slowest_s:g} s to answer: each late "
+        "answer would be a fault"
+    )
     say.error(slowest_s >= age_max_s, f"{field}.age_max_s", why, f"set more than {slowest_s:g} s")
     why = "the pump would run this long after the signal is lost"
     say.error(age_max_s > _BLIND_S, f"{field}.age_max_s", why, f"set at most {_BLIND_S:g} s")
-    why = f"nothing detects a circuit that opens and closes again within {period_s:g} s, as a pushed button does"
+    why = (
+        f"nothing detects a circuit that opens and closes again within {period_s:g} s, as a "
+        "pushed button does"
+    )
     say.warn(
-        period_s > _MOMENT_S, f"{field}.period_s", why, f"set at most {_MOMENT_S:g} s, or use a latching contact"
+        period_s > _MOMENT_S,
+        f"{field}.period_s",
+        why,
+        f"set at most {_MOMENT_S:g} s, or use a latching contact",
     )
 
 
@@ -46,7 +61,9 @@ def _modbus(field: str, interlock: ModbusInputConfig, config: Config, say: Confi
         return
     pump = getattr(config.devices.pump, "link", None) or config.devices.board
     why = "on the pump's line: a module that does not answer also delays the pump's commands"
-    say.warn(interlock.link == pump, f"{field}.link", why, "give the interlocks a line of their own")
+    say.warn(
+        interlock.link == pump, f"{field}.link", why, "give the interlocks a line of their own"
+    )
 
 
 def judge_interlock_board(config: Config, board: BenchIdentity, say: ConfigFindings) -> None:
@@ -62,4 +79,9 @@ def judge_interlock_board(config: Config, board: BenchIdentity, say: ConfigFindi
         say.error(old, field, why, "update the board's firmware, or use another source")
         stops = board.interlocks_fitted >> interlock.input & 1
         why = "the board reports this circuit, but does not stop the pump by itself when it opens"
-        say.warn(not old and not stops, field, why, "set the input as fitted in the board's settings (docs/board.md)")
+        say.warn(
+            not old and not stops,
+            field,
+            why,
+            "set the input as fitted in the board's settings (docs/board.md)",
+        )

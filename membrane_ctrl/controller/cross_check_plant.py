@@ -1,4 +1,6 @@
-"""Findings on pump, sensors, loops, optics and alarms. `cross_check` has those on guards and limits."""
+"""Findings on pump, sensors, loops, optics and alarms. `cross_check` has those on guards and
+limits.
+"""
 
 import math
 from dataclasses import dataclass
@@ -18,10 +20,12 @@ _BAROMETER_UM_PER_PA, _TEMPERATURE_UM_PER_K = -0.358, 123.0  # docs/physics.md
 _FEEDFORWARD_MOST = 2.0  # times the physical gain: beyond, feed-forward is worse than none
 _GAUGE_BLIND_S = 600.0  # a slow, filtered gauge on a calm mirror repeats itself for minutes
 _STORM_PA = 5.0  # effect on the gauge of 250 Pa of weather at once
-# Figures a second to inflate by without a laser: the loop then has 0.3 s of delay and keeps its margins
+# Figures a second to inflate by without a laser: the loop then has 0.3 s of delay and keeps its
+# margins
 _TRACK_LEAST_HZ = 5.0
-# Differences between a sound laser and gauge: the gauge's noise at 1 Hz and a mount that warms up; the creep of a
-# fresh film within hours, and with a day of +-1 K and +-5 % of relative humidity (control/film.py)
+# Differences between a sound laser and gauge: the gauge's noise at 1 Hz and a mount that warms up;
+# the creep of a fresh film within hours, and with a day of +-1 K and +-5 % of relative humidity
+# (control/film.py)
 _APART_UM, _CREEP_UM, _CLIMATE_UM = 7.0, 31.0, 220.0
 
 
@@ -78,13 +82,28 @@ def judge_pump(config: Config, say: ConfigFindings) -> None:
     test_fraction = max(part.pump_fraction for part in pump_obeys.PARTS)
     if pump.start_fraction >= test_fraction:
         why = f"the actuator test commands {test_fraction:g}, which would not start the pump"
-        say.error(config.states.actuator_test, "pump.start_fraction", why, "measure it; no pump starts that late")
-        say.warn(not config.states.actuator_test, "pump.start_fraction", "no pump starts that late", "measure it")
+        say.error(
+            config.states.actuator_test,
+            "pump.start_fraction",
+            why,
+            "measure it; no pump starts that late",
+        )
+        say.warn(
+            not config.states.actuator_test,
+            "pump.start_fraction",
+            "no pump starts that late",
+            "measure it",
+        )
     else:
         least_um_per_s = gas.PumpCurve(pump).least_flow_um_per_s
-        why = f"a running pump gives at least {least_um_per_s:.2f} µm/s: it would only switch on and off"
+        why = (
+            f"a running pump gives at least {least_um_per_s:.2f} µm/s: it would only switch on "
+            "and off"
+        )
         remedy = "set several times as much, or measure pump.stall_fraction"
-        say.error(loop.flow_max_um_per_s <= 2.0 * least_um_per_s, "loop.flow_max_um_per_s", why, remedy)
+        say.error(
+            loop.flow_max_um_per_s <= 2.0 * least_um_per_s, "loop.flow_max_um_per_s", why, remedy
+        )
     more = loop.flow_max_um_per_s > pump.flow_full_um_per_s + 1e-9
     why = f"the pump gives {pump.flow_full_um_per_s:g} µm/s (pump.flow_full_um_per_s)"
     say.warn(more, "loop.flow_max_um_per_s", why, "measure the pump, or lower it")
@@ -95,9 +114,15 @@ def judge_pump(config: Config, say: ConfigFindings) -> None:
         if isinstance(section, ModbusMapConfig):
             name = "limits" if section.limits is not None else "value"
             low, high = min(section.limits or section.value), max(section.limits or section.value)
-            never = "does not contain 0, so it can never be shut" if role == "pump" else "does not contain 0"
+            never = (
+                "does not contain 0, so it can never be shut"
+                if role == "pump"
+                else "does not contain 0"
+            )
             say.error(low > 0.0, f"devices.{role}.{name}", never, "begin at 0")
-            say.error(high < 1.0, f"devices.{role}.{name}", "a command of 1 would be refused", "end at 1")
+            say.error(
+                high < 1.0, f"devices.{role}.{name}", "a command of 1 would be refused", "end at 1"
+            )
 
 
 def judge_vent(config: Config, say: ConfigFindings) -> None:
@@ -106,14 +131,20 @@ def judge_vent(config: Config, say: ConfigFindings) -> None:
         return
     why = "no vent is fitted: the safe level vent, and `ctl vent`, only stop the pump"
     remedy = "fit a vent; for a better estimate set twin.leak_time_constant_s to your mirror's"
-    say.warn(True, "devices.vent", f"{why}, and the leak alone lowers the mirror{_leak_estimate(config)}", remedy)
+    say.warn(
+        True,
+        "devices.vent",
+        f"{why}, and the leak alone lowers the mirror{_leak_estimate(config)}",
+        remedy,
+    )
 
 
 def _leak_estimate(config: Config) -> str:
-    """How long the leak takes to lower the mirror, and on what basis; empty for a film that is slack already.
+    """How long the leak takes to lower the mirror, and on what basis; empty for a film that is
+    slack already.
 
-    The outflow is proportional to the pressure p, and the volume to its cube root (a Hencky bowl). So
-    dp/dt = -(p / T) (p / p0)^(2/3), with the time constant T at p0, and p reaches p1 after
+    The outflow is proportional to the pressure p, and the volume to its cube root (a Hencky bowl).
+    So dp/dt = -(p / T) (p / p0)^(2/3), with the time constant T at p0, and p reaches p1 after
     1.5 T ((p0 / p1)^(2/3) - 1).
     """
     mirror, end_pa, time_constant_s = (
@@ -126,21 +157,32 @@ def _leak_estimate(config: Config) -> str:
     takes_s = 1.5 * time_constant_s * ((mirror.pressure_pa / end_pa) ** (2 / 3) - 1.0)
     speed_um_per_s = 1e3 * mirror.sag_mm / (3.0 * time_constant_s)
     return (
-        f", from {mirror.pressure_pa:g} to {end_pa:g} Pa in about {takes_s / 3600.0:.2g} h (estimated with "
-        f"twin.leak_time_constant_s = {time_constant_s:g} s, which is a leak of {speed_um_per_s:.2g} µm/s)"
+        f", from {mirror.pressure_pa:g} to {end_pa:g} Pa in about {takes_s / 3600.0:.2g} h "
+        "(estimated with "
+        f"twin.leak_time_constant_s = {time_constant_s:g} s, which is a leak of "
+        f"{speed_um_per_s:.2g} µm/s)"
     )
 
 
 def weak_gains(loop: LoopConfig) -> tuple[Severity, str] | None:
     """What is wrong with the gains of a loop on the nominal pump, if anything."""
     sensitivity = pid.peak_sensitivity(loop)
-    gains = f"with Ti {loop.ti_s:g} s, Td {loop.td_s:g} s, a filter of {loop.measurement_filter_s:g} s"
+    gains = (
+        f"with Ti {loop.ti_s:g} s, Td {loop.td_s:g} s, a filter of {loop.measurement_filter_s:g} s"
+    )
     if loop.kp_per_s == 0.0:
         return "error", "nothing would hold the mirror"
     if math.isinf(sensitivity):
         return "error", f"{gains} the loop is unstable on the nominal pump"
-    close = f"{gains} the loop is close to unstable (peak sensitivity {sensitivity:.1f}, the defaults have 1.3)"
-    return ("error" if sensitivity > _MS_MOST else "warning", close) if sensitivity > _MS_WARN else None
+    close = (
+        f"{gains} the loop is close to unstable (peak sensitivity {sensitivity:.1f}, the "
+        "defaults have 1.3)"
+    )
+    return (
+        ("error" if sensitivity > _MS_MOST else "warning", close)
+        if sensitivity > _MS_WARN
+        else None
+    )
 
 
 def judge_loop(config: Config, say: ConfigFindings) -> None:
@@ -153,12 +195,22 @@ def judge_loop(config: Config, say: ConfigFindings) -> None:
         (loop.feedforward_barometer, "barometer_gain_um_per_pa", _BAROMETER_UM_PER_PA),
         (loop.feedforward_temperature, "temperature_gain_um_per_k", _TEMPERATURE_UM_PER_K),
     ):
-        share, remedy = getattr(loop, name) / nominal, f"physics gives {nominal:g}, see docs/physics.md"
-        say.error(on and share < 0.0, f"loop.{name}", "wrong sign: it would double the weather's effect", remedy)
+        share, remedy = (
+            getattr(loop, name) / nominal,
+            f"physics gives {nominal:g}, see docs/physics.md",
+        )
+        say.error(
+            on and share < 0.0,
+            f"loop.{name}",
+            "wrong sign: it would double the weather's effect",
+            remedy,
+        )
         why = "more than twice the physical value: worse than no feed-forward"
         say.error(on and share > _FEEDFORWARD_MOST, f"loop.{name}", why, remedy)
     why = f"faster than the pump's {full_um_per_s:g} µm/s"
-    say.warn(loop.setpoint_ramp_um_per_s > full_um_per_s, "loop.setpoint_ramp_um_per_s", why, "lower it")
+    say.warn(
+        loop.setpoint_ramp_um_per_s > full_um_per_s, "loop.setpoint_ramp_um_per_s", why, "lower it"
+    )
     bleed_um_per_s = loop.bleed_fraction * gas.VENT_FULL_UM_PER_S
     why = f"the vent would take about {bleed_um_per_s:.0f} µm/s, half of the pump's flow or more"
     remedy = f"set less than {0.5 * full_um_per_s / gas.VENT_FULL_UM_PER_S:.3f}"
@@ -176,7 +228,9 @@ def judge_shape(config: Config, say: ConfigFindings) -> None:
     why = f"a shape comes every {shape.period_s:g} s: the last one is never fresh"
     say.error(shape.fresh_s < shape.period_s, "shape.fresh_s", why, "set several periods")
     why = f"shorter than two periods of {shape.period_s:g} s: the trim would follow the noise"
-    say.error(shape.time_constant_s < 2.0 * shape.period_s, "shape.time_constant_s", why, "set 20 periods")
+    say.error(
+        shape.time_constant_s < 2.0 * shape.period_s, "shape.time_constant_s", why, "set 20 periods"
+    )
     outruns = shape.trim_rate_max_um_per_s > 0.5 * config.loop.setpoint_ramp_um_per_s
     why = "the trim may outrun the setpoint's ramp (loop.setpoint_ramp_um_per_s)"
     say.error(outruns, "shape.trim_rate_max_um_per_s", why, "set 0.1 µm/s")
@@ -184,7 +238,9 @@ def judge_shape(config: Config, say: ConfigFindings) -> None:
     why = "can never trip: limits.displacement_max_um trips first"
     say.error(never, "shape.disagreement_max_um", why, "set 10 µm")
     why = f"a cycle of 8 frames does not fit into shape.period_s ({shape.period_s:g} s)"
-    say.warn(8.0 * shape.frame_interval_s > shape.period_s, "shape.frame_interval_s", why, "shorten it")
+    say.warn(
+        8.0 * shape.frame_interval_s > shape.period_s, "shape.frame_interval_s", why, "shorten it"
+    )
 
 
 def judge_optics(config: Config, say: ConfigFindings) -> None:
@@ -217,7 +273,12 @@ def _geometry(field: str, optics: OpticsConfig, used: bool, say: ConfigFindings)
 
 def judge_alarms(config: Config, say: ConfigFindings) -> None:
     alarms, tick_s = config.alarms, 1.0 / config.loop.rate_hz
-    say.error(alarms.silent_s < 2.0 * tick_s, "alarms.silent_s", "a tick takes that long", f"set {4.0 * tick_s:g} s")
+    say.error(
+        alarms.silent_s < 2.0 * tick_s,
+        "alarms.silent_s",
+        "a tick takes that long",
+        f"set {4.0 * tick_s:g} s",
+    )
     most = {
         "fault": max(rule.code for rule in safety.TABLE),
         "pump_fraction": 1.0,
@@ -229,7 +290,9 @@ def judge_alarms(config: Config, say: ConfigFindings) -> None:
     for index, rule in enumerate(alarms.rules):
         if rule.raise_at > rule.clear_at and rule.field in most:
             why = f"{rule.name} can never be raised: {rule.field} is at most {most[rule.field]:g}"
-            say.error(rule.raise_at >= most[rule.field], f"alarms.rules.{index}.raise_at", why, "lower it")
+            say.error(
+                rule.raise_at >= most[rule.field], f"alarms.rules.{index}.raise_at", why, "lower it"
+            )
     port = config.port
     if port.tls is not None and port.metrics_port is not None:
         why = "port.tls.port is the same"
@@ -238,19 +301,37 @@ def judge_alarms(config: Config, say: ConfigFindings) -> None:
 
 def judge_gauge(config: Config, say: ConfigFindings) -> None:
     """Judge the gauge as a guard and as a check of the laser."""
-    limits, pressure_pa, tick_s = config.limits, config.optics.mirror.pressure_pa, 1.0 / config.loop.rate_hz
+    limits, pressure_pa, tick_s = (
+        config.limits,
+        config.optics.mirror.pressure_pa,
+        1.0 / config.loop.rate_hz,
+    )
     above_um = limits.displacement_max_um - config.loop.setpoint_um
     room_pa = limits.gauge_pressure_max_pa - pressure_pa
     why = f"the mirror has {pressure_pa:g} Pa at displacement 0 (optics.mirror.pressure_pa)"
-    say.error(room_pa <= 0.0, "limits.gauge_pressure_max_pa", why, "measure that, or raise the limit")
+    say.error(
+        room_pa <= 0.0, "limits.gauge_pressure_max_pa", why, "measure that, or raise the limit"
+    )
     step, why = "limits.gauge_step_max_pa", "can never trip: the pressure limit trips first"
     say.error(0.0 < room_pa <= limits.gauge_step_max_pa, step, why, f"set less than {room_pa:g} Pa")
     least = f"set at least {_STORM_PA:g} Pa"
-    say.error(limits.gauge_step_max_pa < _STORM_PA, step, "a storm alone moves the gauge this far", least)
+    say.error(
+        limits.gauge_step_max_pa < _STORM_PA, step, "a storm alone moves the gauge this far", least
+    )
     stuck, most = "limits.gauge_stuck_s", f"set at most {_GAUGE_BLIND_S:g} s"
-    say.error(limits.gauge_stuck_s > _GAUGE_BLIND_S, stuck, "a stopped gauge would guard nothing this long", most)
+    say.error(
+        limits.gauge_stuck_s > _GAUGE_BLIND_S,
+        stuck,
+        "a stopped gauge would guard nothing this long",
+        most,
+    )
     least = f"set at least {3.0 * tick_s:g} s"
-    say.error(limits.gauge_stuck_s < 3.0 * tick_s, stuck, "two readings equal by chance would be a fault", least)
+    say.error(
+        limits.gauge_stuck_s < 3.0 * tick_s,
+        stuck,
+        "two readings equal by chance would be a fault",
+        least,
+    )
     for name, least_um, by in (
         ("laser_gauge_apart_max_um", _APART_UM, "the gauge's noise and a mount that warms up"),
         ("laser_gauge_drift_max_um", _CREEP_UM, "the creep of a fresh film"),
@@ -258,27 +339,55 @@ def judge_gauge(config: Config, say: ConfigFindings) -> None:
         why = f"can never trip: limits.displacement_max_um is {above_um:g} µm above the setpoint"
         say.error(getattr(limits, name) >= above_um, f"limits.{name}", why, "lower it")
         why = f"{by} alone reach it"
-        say.error(getattr(limits, name) < least_um, f"limits.{name}", why, f"set at least {least_um:g} µm")
-    why, least = "a day's temperature and humidity alone reach it", f"set at least {_CLIMATE_UM:g} µm"
-    say.error(limits.laser_gauge_day_max_um < _CLIMATE_UM, "limits.laser_gauge_day_max_um", why, least)
+        say.error(
+            getattr(limits, name) < least_um, f"limits.{name}", why, f"set at least {least_um:g} µm"
+        )
+    why, least = (
+        "a day's temperature and humidity alone reach it",
+        f"set at least {_CLIMATE_UM:g} µm",
+    )
+    say.error(
+        limits.laser_gauge_day_max_um < _CLIMATE_UM, "limits.laser_gauge_day_max_um", why, least
+    )
 
 
 def judge_film(config: Config, say: ConfigFindings) -> None:
     """Judge the film's data, which serve to judge gas, laser and gauge."""
     limits, mirror = config.limits, config.optics.mirror
     most = 1.0 + flow_um_per_s(config) / film.LEAK_LEAST_UM_PER_S
-    growth, why = "limits.leak_growth_max", f"can never trip: the pump gives {flow_um_per_s(config):g} µm/s"
+    growth, why = (
+        "limits.leak_growth_max",
+        f"can never trip: the pump gives {flow_um_per_s(config):g} µm/s",
+    )
     say.error(limits.leak_growth_max >= most, growth, why, f"set less than {most:.1f}")
     least = f"set at least {film.CONTRADICTED_MOST:g}"
     say.error(
-        limits.leak_growth_max < film.CONTRADICTED_MOST, growth, "the weather's effect on a leak trips it", least
+        limits.leak_growth_max < film.CONTRADICTED_MOST,
+        growth,
+        "the weather's effect on a leak trips it",
+        least,
     )
     why = f"no film of {mirror.radius_mm:g} mm radius is this deep"
-    say.error(mirror.sag_mm >= 0.5 * mirror.radius_mm, "optics.mirror.sag_mm", why, "set the bowl's depth in mm")
+    say.error(
+        mirror.sag_mm >= 0.5 * mirror.radius_mm,
+        "optics.mirror.sag_mm",
+        why,
+        "set the bowl's depth in mm",
+    )
     why = f"can never trip: the bowl is only {mirror.sag_mm:g} mm deep (optics.mirror.sag_mm)"
-    say.error(limits.displacement_min_um <= -1e3 * mirror.sag_mm, "limits.displacement_min_um", why, "raise it")
-    pressure, why = "optics.mirror.pressure_pa", f"laser and gauge are not compared below {film.TAUT_PA:g} Pa"
-    say.warn(0.0 < mirror.pressure_pa <= film.TAUT_PA, pressure, why, "measure it with the film taut")
+    say.error(
+        limits.displacement_min_um <= -1e3 * mirror.sag_mm,
+        "limits.displacement_min_um",
+        why,
+        "raise it",
+    )
+    pressure, why = (
+        "optics.mirror.pressure_pa",
+        f"laser and gauge are not compared below {film.TAUT_PA:g} Pa",
+    )
+    say.warn(
+        0.0 < mirror.pressure_pa <= film.TAUT_PA, pressure, why, "measure it with the film taut"
+    )
     why = "unknown: a gauge in the wrong unit would go unnoticed"
     say.warn(mirror.pressure_pa == 0.0, pressure, why, "set the gauge's reading at displacement 0")
 
@@ -293,14 +402,25 @@ def judge_ranges(config: Config, board: BenchIdentity, say: ConfigFindings) -> N
         stated_um = laser.limits or laser.value
     elif isinstance(laser, Optoncdt1420Config) and laser.range_mm is not None:
         zero_mm = laser.range_mm / 2 if laser.zero_mm is None else laser.zero_mm
-        stated_um = (-1e3 * laser.direction * zero_mm, 1e3 * laser.direction * (laser.range_mm - zero_mm))
+        stated_um = (
+            -1e3 * laser.direction * zero_mm,
+            1e3 * laser.direction * (laser.range_mm - zero_mm),
+        )
     if isinstance(gauge, ModbusMapConfig):
         stated_pa = gauge.limits or gauge.value
     low_um = max(min(stated_um), board.displacement_range_um[0])
     high_um = min(max(stated_um), board.displacement_range_um[1])
     full_pa = min(max(stated_pa), board.gauge_range_pa[1])
-    why, remedy = f"can never trip: the laser's range is {low_um:g} .. {high_um:g} µm", "change it, or move the laser"
+    why, remedy = (
+        f"can never trip: the laser's range is {low_um:g} .. {high_um:g} µm",
+        "change it, or move the laser",
+    )
     say.error(limits.displacement_max_um > high_um, "limits.displacement_max_um", why, remedy)
     say.error(limits.displacement_min_um < low_um, "limits.displacement_min_um", why, remedy)
-    pressure, why = "limits.gauge_pressure_max_pa", f"can never trip: the gauge shows at most {full_pa:g} Pa"
-    say.error(limits.gauge_pressure_max_pa >= full_pa, pressure, why, "lower it, or use another gauge")
+    pressure, why = (
+        "limits.gauge_pressure_max_pa",
+        f"can never trip: the gauge shows at most {full_pa:g} Pa",
+    )
+    say.error(
+        limits.gauge_pressure_max_pa >= full_pa, pressure, why, "lower it, or use another gauge"
+    )

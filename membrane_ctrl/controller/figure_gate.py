@@ -1,6 +1,8 @@
-"""Which measured figures show the film now, and the displacement of the centre that they give. Pure.
+"""Which measured figures show the film now, and the displacement of the centre that they give.
+Pure.
 
-Loop, estimator and protections use the same figures: one that cannot be used counts as missing for all of them.
+Loop, estimator and protections use the same figures: one that cannot be used counts as missing for
+all of them.
 """
 
 import math
@@ -16,7 +18,8 @@ from membrane_ctrl.model.state_tree import Count, StateNode
 
 # The loop needs a figure younger than this, or than so many intervals of the tracking.
 _LOOP_AGE_S, _LOOP_INTERVALS = 1.0, 5
-# Range and limits may be judged by an older one: two cycles, in which the pump lifts the film by at most 26 µm.
+# Range and limits may be judged by an older one: two cycles, in which the pump lifts the film by at
+# most 26 µm.
 _GUARD_AGE_S = 5.0
 _JUMPED = 5  # figures in a row that no film can show; one or two are bad figures
 _REPEATS = 3  # no two figures have the same noise
@@ -24,7 +27,8 @@ _REPEATS = 3  # no two figures have the same noise
 _CAMERA_STARTS_S = 900.0
 # The configured sag is known within this factor; a wrong unit or sign is further off.
 _SAG_FACTOR = 2.0
-# The optics' zero against the laser's reading is a mean over this: a mount at 2 µm/min is 2 µm ahead of it.
+# The optics' zero against the laser's reading is a mean over this: a mount at 2 µm/min is 2 µm
+# ahead of it.
 _ALIGN_S = 60.0
 
 
@@ -68,8 +72,9 @@ class FigureGateState(StateNode):
 class FigureGate:
     """Accepts figures, and derives the displacement that the laser would read.
 
-    Without a laser displacement 0 is a sag of `optics.mirror.sag_mm`. With one the difference of sag and laser is
-    followed while both are there, so that the optics continue at the laser's last reading when it is lost.
+    Without a laser displacement 0 is a sag of `optics.mirror.sag_mm`. With one the difference of
+    sag and laser is followed while both are there, so that the optics continue at the laser's last
+    reading when it is lost.
 
     Attributes
     ----------
@@ -86,7 +91,9 @@ class FigureGate:
         self._tracks = config.shape.mode == "track"
         self._by_optics = config.by_optics
         self._sag_um = 1e3 * config.optics.mirror.sag_mm
-        self._loop_age_s = max(_LOOP_AGE_S, _LOOP_INTERVALS / config.shape.track_rate_hz) if self._tracks else 0.0
+        self._loop_age_s = (
+            max(_LOOP_AGE_S, _LOOP_INTERVALS / config.shape.track_rate_hz) if self._tracks else 0.0
+        )
         self._guard_age_s = self._loop_age_s if config.by_optics else _GUARD_AGE_S
         # A figure less certain than the band cannot hold the mirror within it.
         self._sigma_max_um = config.limits.band_um
@@ -109,7 +116,9 @@ class FigureGate:
         if self.memory.defect is None:
             self._accept(figure, laser_um)
 
-    def _find_defect(self, figure: ShapeEstimate, now_s: float, laser_um: float) -> FigureDefect | None:
+    def _find_defect(
+        self, figure: ShapeEstimate, now_s: float, laser_um: float
+    ) -> FigureDefect | None:
         self.memory.defect_detail = ""
         if figure.verdict == "rejected":
             self.memory.defect_detail = figure.reason
@@ -133,13 +142,17 @@ class FigureGate:
 
     def _accept(self, figure: ShapeEstimate, laser_um: float) -> None:
         self.accepted = figure
-        self.memory.repeats = self.memory.repeats + 1 if figure.sag_um == self.memory.newest_sag_um else 0
+        self.memory.repeats = (
+            self.memory.repeats + 1 if figure.sag_um == self.memory.newest_sag_um else 0
+        )
         interval_s = figure.time_s - self.memory.newest_s
         self.memory.newest_sag_um = figure.sag_um
         self.memory.newest_s = figure.time_s
         if self._by_optics or self.memory.repeats >= _REPEATS or not math.isfinite(laser_um):
             return
-        at_exposure_um = figure.displacement_um if math.isfinite(figure.displacement_um) else laser_um
+        at_exposure_um = (
+            figure.displacement_um if math.isfinite(figure.displacement_um) else laser_um
+        )
         over_s = interval_s if math.isfinite(interval_s) else 0.0
         self.memory.zero_um.update(figure.sag_um - at_exposure_um, over_s, _ALIGN_S)
 
@@ -159,8 +172,14 @@ class FigureGate:
 
     @property
     def sag_um(self) -> float:
-        """Sag by the newest figure, µm; NaN if it is too old for range and limits, or repeats itself."""
-        return self.memory.newest_sag_um if self._sound and self.newest_age_s <= self._guard_age_s else math.nan
+        """Sag by the newest figure, µm; NaN if it is too old for range and limits, or repeats
+        itself.
+        """
+        return (
+            self.memory.newest_sag_um
+            if self._sound and self.newest_age_s <= self._guard_age_s
+            else math.nan
+        )
 
     @property
     def zero_um(self) -> float:
@@ -186,7 +205,11 @@ class FigureGate:
             return FilmUnseen.REPEATS
         if math.isnan(self.memory.newest_s):
             return FilmUnseen.NO_FIGURE_YET
-        return FilmUnseen.NOT_ALIGNED if math.isnan(self.memory.zero_um.value) else FilmUnseen.NO_FIGURE
+        return (
+            FilmUnseen.NOT_ALIGNED
+            if math.isnan(self.memory.zero_um.value)
+            else FilmUnseen.NO_FIGURE
+        )
 
     def explain_unseen(self) -> Reason:
         """Why `loop_um` is NaN; `NO_REASON` if it is not."""
@@ -194,14 +217,18 @@ class FigureGate:
         if unseen is None:
             return NO_REASON
         defect_name = "" if defect is None else defect.name.lower()
-        return make_reason(WhyCode.NO_READING, self._describe_unseen(unseen), unseen.name.lower(), defect_name)
+        return make_reason(
+            WhyCode.NO_READING, self._describe_unseen(unseen), unseen.name.lower(), defect_name
+        )
 
     def _describe_unseen(self, unseen: FilmUnseen) -> str:
         age = f" for {self.newest_age_s:.1f} s" if unseen is FilmUnseen.NO_FIGURE else ""
         if self.memory.defect is None or unseen in (FilmUnseen.REPEATS, FilmUnseen.NOT_ALIGNED):
             return f"{unseen.value}{age}"
         phrase = (
-            self.memory.defect_detail if self.memory.defect is FigureDefect.REJECTED else self.memory.defect.value
+            self.memory.defect_detail
+            if self.memory.defect is FigureDefect.REJECTED
+            else self.memory.defect.value
         )
         detail = f" {self.memory.defect_detail}" if self.memory.defect is FigureDefect.JUMP else ""
         return f"{unseen.value}{age}: {phrase}{detail}"

@@ -1,10 +1,11 @@
 """Which interlocks are open in a tick, and which safe level that demands. No I/O, no clock.
 
-A tick without an answer of the bench shows no interlock: the rules `link_lost` and `device_silent` judge that. A lost
-signal of a single interlock is a set bit of the reading, as an open circuit is.
+A tick without an answer of the bench shows no interlock: the rules `link_lost` and `device_silent`
+judge that. A lost signal of a single interlock is a set bit of the reading, as an open circuit is.
 
-In standby the pump is off and an open interlock is no fault: people work at the mirror then. It prevents a hold. On
-the way down from standby it stays none, so that a program can be ended while a door is open.
+In standby the pump is off and an open interlock is no fault: people work at the mirror then. It
+prevents a hold. On the way down from standby it stays none, so that a program can be ended while a
+door is open.
 """
 
 from collections.abc import Iterator
@@ -38,7 +39,9 @@ class Interlocks:
         This tick has a reading.
     """
 
-    def __init__(self, configured: tuple[InterlockConfig, ...], memory: InterlocksState | None = None) -> None:
+    def __init__(
+        self, configured: tuple[InterlockConfig, ...], memory: InterlocksState | None = None
+    ) -> None:
         self.memory = memory or InterlocksState()
         self._names: tuple[str, ...] = tuple(interlock.name for interlock in configured)
         self._texts: tuple[str, ...] = tuple(interlock.text for interlock in configured)
@@ -54,7 +57,9 @@ class Interlocks:
         return self.memory.last_mask
 
     def look(self, reading: BenchReading | None, state: State) -> list[Event]:
-        """Take the reading of a tick in a state; returns the events of circuits that have opened or closed."""
+        """Take the reading of a tick in a state; returns the events of circuits that have opened or
+        closed.
+        """
         self.seen = reading is not None
         if reading is None:
             self.open_mask = 0
@@ -75,7 +80,9 @@ class Interlocks:
     def _event(self, place: int) -> Event:
         if not self.open_mask >> place & 1:
             return InterlockClosed(self._names[place])
-        return InterlockOpened(self._names[place], self._texts[place], self._levels[place].name.lower())
+        return InterlockOpened(
+            self._names[place], self._texts[place], self._levels[place].name.lower()
+        )
 
     @property
     def any_configured(self) -> bool:
@@ -85,11 +92,16 @@ class Interlocks:
     @property
     def safe_level(self) -> SafeLevel:
         """The deepest level that the judged interlocks demand."""
-        return max((self._levels[place] for place in _places(self.judged_mask)), default=SafeLevel.NONE)
+        return max(
+            (self._levels[place] for place in _places(self.judged_mask)), default=SafeLevel.NONE
+        )
 
     def describe_open(self, mask: int) -> str:
         """Names and texts of the interlocks of a mask, for people; empty for none."""
-        return "; ".join(f"interlock {self._names[place]} is open: {self._texts[place]}" for place in _places(mask))
+        return "; ".join(
+            f"interlock {self._names[place]} is open: {self._texts[place]}"
+            for place in _places(mask)
+        )
 
 
 def _places(mask: int) -> Iterator[int]:

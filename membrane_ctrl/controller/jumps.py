@@ -11,7 +11,9 @@ _REFUSED_MAX = 10
 
 @dataclass(slots=True)
 class JumpGate(StateNode):
-    """Refuses values further from the last good one than a film can move, but no more than ten in a row."""
+    """Refuses values further from the last good one than a film can move, but no more than ten in a
+    row.
+    """
 
     good: float = math.nan
     count: Count = 0  # refused in a row

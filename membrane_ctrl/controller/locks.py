@@ -1,4 +1,5 @@
-"""Decisions on locks: what `latch` adds, who may `unlock`, and what a lock forbids. No I/O, no clock, no randomness.
+"""Decisions on locks: what `latch` adds, who may `unlock`, and what a lock forbids. No I/O, no
+clock, no randomness.
 
 Word, author and time of a lock are part of its command, so that a replay decides the same.
 """
@@ -45,11 +46,14 @@ def make_lock(command: Command, locks: Sequence[Lock]) -> Lock | None:
     Returns
     -------
     Lock or None
-        None for a program that repeats itself: one lock of its text is enough. People's locks are never merged.
+        None for a program that repeats itself: one lock of its text is enough. People's locks are
+        never merged.
     """
     lock = command.lock or Lock("", command.text, command.who, command.account)
     text = lock.text or _DEFAULT_TEXT
-    if not command.from_person and any((each.author, each.text) == (lock.author, text) for each in locks):
+    if not command.from_person and any(
+        (each.author, each.text) == (lock.author, text) for each in locks
+    ):
         return None
     taken = {each.word for each in locks}
     return replace(lock, text=text, word=distinct_word(lock.word, taken))
@@ -80,8 +84,8 @@ def refuse_while_locked(command: Command, locks: Sequence[Lock]) -> str:
 def decide_unlock(command: Command, locks: Sequence[Lock]) -> Unlocking:
     """Decide on an `unlock`.
 
-    Without a word it removes the sender's own lock, if there is exactly one. With a word it removes the lock of that
-    word, whoever set it. A bridge removes none: nobody has read the word.
+    Without a word it removes the sender's own lock, if there is exactly one. With a word it removes
+    the lock of that word, whoever set it. A bridge removes none: nobody has read the word.
 
     Parameters
     ----------
@@ -95,7 +99,9 @@ def decide_unlock(command: Command, locks: Sequence[Lock]) -> Unlocking:
     Unlocking
     """
     if not command.from_person:
-        return Unlocking(refused="only a person removes a lock: use the page, or `membrane-ctrl ctl unlock`")
+        return Unlocking(
+            refused="only a person removes a lock: use the page, or `membrane-ctrl ctl unlock`"
+        )
     if not locks:
         return Unlocking(refused="no lock is set")
     own = [lock for lock in locks if is_author(command, lock)]
@@ -103,7 +109,11 @@ def decide_unlock(command: Command, locks: Sequence[Lock]) -> Unlocking:
     if not word:
         if len(own) == 1:
             return Unlocking(own[0], UnlockReason.AUTHOR)
-        whose = "you have several locks" if own else f"none of the locks is set by the login of {command.who}"
+        whose = (
+            "you have several locks"
+            if own
+            else f"none of the locks is set by the login of {command.who}"
+        )
         return Unlocking(refused=f"{whose}: give the word of one: {describe_locks(locks)}")
     found = next((lock for lock in locks if lock.word == word), None)
     if found is None:

@@ -1,4 +1,6 @@
-"""Turns a tick's inputs into the observation that safety judges and the reading that the loop may use."""
+"""Turns a tick's inputs into the observation that safety judges and the reading that the loop may
+use.
+"""
 
 import math
 from dataclasses import dataclass, field
@@ -52,13 +54,14 @@ class Observer:
     reading : BenchReading or None
         This tick's reading.
     laser_um : float
-        The laser's reading, if it is new, of good quality and no jump; NaN without one, or on a bench that uses none.
+        The laser's reading, if it is new, of good quality and no jump; NaN without one, or on a
+        bench that uses none.
     displacement_um : float
-        The displacement that the loop may use: the laser's, or that of the figures if the loop may follow the optics
-        and the laser has none; NaN without either.
+        The displacement that the loop may use: the laser's, or that of the figures if the loop may
+        follow the optics and the laser has none; NaN without either.
     guard_um : float
-        The displacement by which range and limits are judged: like `displacement_um`, with figures of a few seconds
-        ago as well.
+        The displacement by which range and limits are judged: like `displacement_um`, with figures
+        of a few seconds ago as well.
     gauge_pressure_pa : float
         The gauge reading; NaN without one or for a jump. The limits judge jumps too.
     optics_replace_laser : bool
@@ -104,7 +107,9 @@ class Observer:
         if reading is not None:
             memory.last_read_s = now_s
             stamp = (reading.sample_counter, reading.device_time_s)
-            if memory.stamp is None or (stamp[0] != memory.stamp[0] and stamp[1] != memory.stamp[1]):
+            if memory.stamp is None or (
+                stamp[0] != memory.stamp[0] and stamp[1] != memory.stamp[1]
+            ):
                 memory.last_advance_s = now_s
                 memory.stamp = stamp
         uses_laser = not self._by_optics
@@ -151,11 +156,15 @@ class Observer:
 
     @property
     def waited_s(self) -> float:
-        """How long a camera that is needed took to give its first figure, so far; 0 with a laser."""
+        """How long a camera that is needed took to give its first figure, so far;
+        0 with a laser.
+        """
         return self.figures.waited_s if self._by_optics else 0.0
 
     def observe(self, inputs: tick.TickInputs, error_um: float) -> safety.Observation:
-        """Return what the inputs show, after `look`; the control code fills in what it knows itself."""
+        """Return what the inputs show, after `look`; the control code fills in what it knows
+        itself.
+        """
         reading, now_s = self.reading, inputs.now_s
         gauge_pa = reading.gauge_pressure_pa if reading else math.nan
         return safety.Observation(
@@ -183,9 +192,15 @@ class Observer:
         )
 
     def _gate(self, reading: BenchReading | None, fresh: bool) -> float:
-        """The displacement if it is finite, good, new, and within reach of the last good one; else NaN."""
+        """The displacement if it is finite, good, new, and within reach of the last good one; else
+        NaN.
+        """
         value_um = _good_quality_um(reading)
-        if not fresh or not math.isfinite(value_um) or self.memory.laser_jumps.refuse(value_um, self._step_max_um):
+        if (
+            not fresh
+            or not math.isfinite(value_um)
+            or self.memory.laser_jumps.refuse(value_um, self._step_max_um)
+        ):
             return math.nan
         return value_um
 
@@ -195,7 +210,9 @@ class Observer:
         return same_s if abs(gauge_pa) > _SLACK_PA else 0.0
 
     def _mismatch(self, reading: BenchReading | None) -> float:
-        """Distance of the read-back from the nearer of the last two commands: a tick of transport is no mismatch."""
+        """Distance of the read-back from the nearer of the last two commands: a tick of transport
+        is no mismatch.
+        """
         if reading is None:
             return 0.0  # missing readings have rules of their own
         if not math.isfinite(reading.pump_fraction):

@@ -1,8 +1,9 @@
-"""What protects the mirror in each process value and state in which the pump may run: a table for review and tests.
+"""What protects the mirror in each process value and state in which the pump may run: a table for
+review and tests.
 
-The rules are in `safety.TABLE`. Whichever sensor the loop follows, for each `Duty` and `Activity` at least one rule
-or guard exists; tests check that. `docs/faults.md` shows the table, and the campaign measures the bounds
-(`docs/protection.md`).
+The rules are in `safety.TABLE`. Whichever sensor the loop follows, for each `Duty` and `Activity`
+at least one rule or guard exists; tests check that. `docs/faults.md` shows the table, and the
+campaign measures the bounds (`docs/protection.md`).
 """
 
 from collections.abc import Mapping
@@ -32,9 +33,10 @@ class ProcessValue(Enum):
 class Activity(Enum):
     """What a hold does while gas can move; the value is its name for people.
 
-    Gains and a pump curve on trial change the numbers of the loop, not its activity. In `check` the actuator test
-    runs the pump for less than two seconds, and only while all sensors are good. In `lower` and `fault` the pump is
-    off or ramps down; `pump_runs_on` and `gas_comes_in` watch it there.
+    Gains and a pump curve on trial change the numbers of the loop, not its activity. In `check` the
+    actuator test runs the pump for less than two seconds, and only while all sensors are good. In
+    `lower` and `fault` the pump is off or ramps down; `pump_runs_on` and `gas_comes_in` watch it
+    there.
     """
 
     INFLATE = "inflate"
@@ -70,14 +72,26 @@ class Guard(Enum):
     """Protections beside the rules of the safety table; the value is a sentence for people."""
 
     MANUAL_RANGE = "a pause or manual flow ends beyond `states.manual_range_um` (`scene.py`)"
-    EXPERIMENT = "an experiment ends near its limit, and brings the mirror back (`experiments/machine.py`)"
-    RAMP_WAITS = "the setpoint's ramp waits for a mirror that lags by `states.inflate_pause_um` (`states.py`)"
+    EXPERIMENT = (
+        "an experiment ends near its limit, and brings the mirror back (`experiments/machine.py`)"
+    )
+    RAMP_WAITS = (
+        "the setpoint's ramp waits for a mirror that lags by `states.inflate_pause_um` "
+        "(`states.py`)"
+    )
     FIGURE_GATE = "a figure that cannot be used counts as missing (`figure_gate.py`)"
     ESTIMATE_ROBUST = "the estimate does not use a reading far from what it expects (`centre.py`)"
-    TRIM_LIMIT = "beyond `shape.trim_max_um` the optics are left out; notice `trim_limit` (`sensor_consistency.py`)"
-    SENSOR_NOTICE = "a notice `laser_lost`, `optics_lost` or `gauge_lost` calls the operator (`redundancy.py`)"
+    TRIM_LIMIT = (
+        "beyond `shape.trim_max_um` the optics are left out; notice `trim_limit` "
+        "(`sensor_consistency.py`)"
+    )
+    SENSOR_NOTICE = (
+        "a notice `laser_lost`, `optics_lost` or `gauge_lost` calls the operator (`redundancy.py`)"
+    )
     DRIFT_NOTICE = "the notice `slow_drift` calls the operator (`sensor_consistency.py`)"
-    PLAUSIBILITY = "laser, optics and gauge are compared, and the outvoted one is not used (`film.py`)"
+    PLAUSIBILITY = (
+        "laser, optics and gauge are compared, and the outvoted one is not used (`film.py`)"
+    )
     PAUSE_TIME = "a pause ends after `states.pause_max_s` (`states.py`)"
     MANUAL_TIME = "manual flow ends after `states.manual_max_s` (`states.py`)"
     EXPERIMENT_TIME = "an experiment ends after its duration (`experiments/trial.py`)"
@@ -118,8 +132,8 @@ def find_keepers(process_value: ProcessValue, activity: Activity, duty: Duty) ->
     Returns
     -------
     tuple of str or Guard
-        Empty only for `MAJORITY`, which needs a third sensor and a mirror that is not far from its setpoint, and for
-        `GAS`, which needs a mirror that is held.
+        Empty only for `MAJORITY`, which needs a third sensor and a mirror that is not far from its
+        setpoint, and for `GAS`, which needs a mirror that is held.
     """
     uses_laser = process_value is not ProcessValue.OPTICS
     uses_optics = process_value is not ProcessValue.LASER
@@ -135,9 +149,15 @@ def find_keepers(process_value: ProcessValue, activity: Activity, duty: Duty) ->
         case Duty.TIME:
             return _TIMES[activity]
         case Duty.MISSING:
-            return ("displacement_missing",) if uses_laser else ("displacement_missing", "film_unseen")
+            return (
+                ("displacement_missing",) if uses_laser else ("displacement_missing", "film_unseen")
+            )
         case Duty.FROZEN:
-            by_laser = ("displacement_frozen", "displacement_stuck") if uses_laser else ("displacement_frozen",)
+            by_laser = (
+                ("displacement_frozen", "displacement_stuck")
+                if uses_laser
+                else ("displacement_frozen",)
+            )
             return (*by_laser, *by_figures, "laser_gauge_apart")
         case Duty.JUMP:
             by_laser = ("displacement_jump",) if uses_laser else ()
@@ -159,7 +179,9 @@ def find_keepers(process_value: ProcessValue, activity: Activity, duty: Duty) ->
 
 
 class Failure(Enum):
-    """How a sensor of the film fails, in classes of equal bounds; the value is a phrase for people."""
+    """How a sensor of the film fails, in classes of equal bounds;
+    the value is a phrase for people.
+    """
 
     LOST = "lost, frozen to the last bit, of bad quality, or with wrong times"
     STEP = "a step, or a drift of 1 µm/s or more"
@@ -175,12 +197,12 @@ class Bound:
     distance_um: float
 
 
-# The pump moves the film by 5.3 µm/s at most: means over ten seconds find that after 53 µm, and some µm more are gone
-# until the pump is off.
+# The pump moves the film by 5.3 µm/s at most: means over ten seconds find that after 53 µm, and
+# some µm more are gone until the pump is off.
 _FAST_MOTION_UM = 65.0
-# The hour's limit is judged by a lagging mean, and a stretched film hides a part of a drift: if 30 % of its pressure
-# is linear in the sag, the gauge shows 80 %. A drift of 0.05 µm/s then passes the limit by little and late: the
-# protection campaign measured 313 µm after 1.7 h.
+# The hour's limit is judged by a lagging mean, and a stretched film hides a part of a drift: if 30
+# % of its pressure is linear in the sag, the gauge shows 80 %. A drift of 0.05 µm/s then passes the
+# limit by little and late: the protection campaign measured 313 µm after 1.7 h.
 _DRIFT_FACTOR = 3.0
 # As much further goes a drift while the day's reference follows it.
 _DAY_FACTOR = 1.3
@@ -189,7 +211,11 @@ _TRIM_FACTOR = 1.1
 
 
 def find_bound(
-    process_value: ProcessValue, failed: FilmSensor, failure: Failure, config: Config, laser_and_optics: bool = True
+    process_value: ProcessValue,
+    failed: FilmSensor,
+    failure: Failure,
+    config: Config,
+    laser_and_optics: bool = True,
 ) -> Bound:
     """What bounds the true displacement when one sensor fails, in every activity.
 

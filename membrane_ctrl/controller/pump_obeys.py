@@ -1,7 +1,8 @@
 """Does the pump obey? Its standstill when commanded off, and the actuator test before a hold. Pure.
 
-A pump that still runs shows in its read-back or, if that is wrong, in a mirror that rises although gas can only leak
-out. Warmer gas and a falling barometer lift the mirror too; both are measured and allowed for.
+A pump that still runs shows in its read-back or, if that is wrong, in a mirror that rises although
+gas can only leak out. Warmer gas and a falling barometer lift the mirror too; both are measured and
+allowed for.
 """
 
 import math
@@ -19,14 +20,18 @@ from membrane_ctrl.model.state_tree import Count, StateNode
 OFF_FRACTION = 0.02
 # Readings are averaged over blocks, which leaves 0.2 µm and 0.1 Pa of noise at 50 Hz
 _BLOCK_S = 0.5
-# A block is compared with the one 20 s before. In 12 h of the twin with the pump off, gusty weather and films that
-# lose no gas, the mirror rose by at most 11.4 µm (0.74 Pa); a pump at half of its range lifts it by 44 µm (3.6 Pa)
+# A block is compared with the one 20 s before. In 12 h of the twin with the pump off, gusty weather
+# and films that lose no gas, the mirror rose by at most 11.4 µm (0.74 Pa); a pump at half of its
+# range lifts it by
+# 44 µm (3.6 Pa)
 _WINDOW_S = 20.0
 _RISE_MAX_UM = 30.0
 _PA_PER_UM = 0.05  # 3p/s is 0.065 Pa/um at the working point; less makes the gauge the slower check
-# The gas follows the air within 12 s: a change up to 40 s before the window still moves the mirror in it
+# The gas follows the air within 12 s: a change up to 40 s before the window still moves the mirror
+# in it
 _WEATHER_BLOCKS = 120
-# The end of a run waits for this many blocks without a rise as steep as a pump's: 3 µm/s (weather: 2.2 µm/s)
+# The end of a run waits for this many blocks without a rise as steep as a pump's: 3 µm/s (weather:
+# 2.2 µm/s)
 _REST_BLOCKS = 5
 _REST_RISE_MAX_UM = 6.0
 
@@ -89,7 +94,9 @@ class StandstillState(StateNode):
 class Standstill:
     """Observations of the pump since it was commanded off."""
 
-    def __init__(self, loop: LoopConfig, states: StatesConfig, memory: StandstillState | None = None) -> None:
+    def __init__(
+        self, loop: LoopConfig, states: StatesConfig, memory: StandstillState | None = None
+    ) -> None:
         self._loop, self._states = loop, states
         self.memory = memory or StandstillState()
 
@@ -115,14 +122,22 @@ class Standstill:
 
     @property
     def at_rest(self) -> bool:
-        """The read-back shows the pump at rest, and for two seconds the mirror has not risen as if pumped."""
+        """The read-back shows the pump at rest, and for two seconds the mirror has not risen as if
+        pumped.
+        """
         blocks = self.memory.blocks
         if not self.memory.seen_off or len(blocks) < _REST_BLOCKS:
             return False
         rise_um = blocks[-1].displacement_um - blocks[-_REST_BLOCKS].displacement_um
         return not rise_um > _REST_RISE_MAX_UM  # without a laser the read-back alone decides
 
-    def look(self, now_s: float, reading: BenchReading | None, commanded: tuple[float, float], link_up: bool) -> None:
+    def look(
+        self,
+        now_s: float,
+        reading: BenchReading | None,
+        commanded: tuple[float, float],
+        link_up: bool,
+    ) -> None:
         """Note a tick's reading, and the last two pump commands before it."""
         memory = self.memory
         if reading is not None or math.isnan(memory.read_s):
@@ -167,7 +182,9 @@ class Standstill:
         memory, block = self.memory, self.memory.open_block
         if math.isnan(block.ends_s):
             block.ends_s = now_s + _BLOCK_S
-        block.displacement_um.add(reading.displacement_um if reading.displacement_quality == 0 else math.nan)
+        block.displacement_um.add(
+            reading.displacement_um if reading.displacement_quality == 0 else math.nan
+        )
         block.gauge_pressure_pa.add(reading.gauge_pressure_pa)
         block.ambient_pressure_pa.add(reading.ambient_pressure_pa)
         block.air_temperature_c.add(reading.air_temperature_c)
@@ -186,10 +203,14 @@ class Standstill:
         memory.inflow = self._rise()
 
     def _rise(self) -> str:
-        """Rise beyond the weather's in both laser and gauge; if one is missing, the other decides."""
+        """Rise beyond the weather's in both laser and gauge; if one is missing,
+        the other decides.
+        """
         blocks = self.memory.blocks
         last = blocks[-1]
-        first = next((block for block in reversed(blocks) if last.end_s - block.end_s >= _WINDOW_S), None)
+        first = next(
+            (block for block in reversed(blocks) if last.end_s - block.end_s >= _WINDOW_S), None
+        )
         if first is None:
             return ""
         over_s = last.end_s - first.end_s
@@ -197,8 +218,10 @@ class Standstill:
         rise_pa = last.gauge_pressure_pa - first.gauge_pressure_pa
         most_um = (
             _RISE_MAX_UM
-            + abs(self._loop.barometer_gain_um_per_pa) * _range(block.ambient_pressure_pa for block in blocks)
-            + abs(self._loop.temperature_gain_um_per_k) * _range(block.air_temperature_c for block in blocks)
+            + abs(self._loop.barometer_gain_um_per_pa)
+            * _range(block.ambient_pressure_pa for block in blocks)
+            + abs(self._loop.temperature_gain_um_per_k)
+            * _range(block.air_temperature_c for block in blocks)
         )
         checks = ((rise_um, most_um), (rise_pa, _PA_PER_UM * most_um))
         rises = [rise > most for rise, most in checks if math.isfinite(rise)]
@@ -215,7 +238,9 @@ def _range(values: Iterable[float]) -> float:
 
 @dataclass(frozen=True, slots=True)
 class Part:
-    """A part of the actuator test: commands, response time (lag 0.15 s, transport 0.1 s), measuring time."""
+    """A part of the actuator test: commands, response time (lag 0.15 s, transport 0.1 s), measuring
+    time.
+    """
 
     name: str
     pump_fraction: float
@@ -224,12 +249,17 @@ class Part:
     measure_s: float
 
 
-# The vent costs 7 µm of height, which the pump must restore. The pump comes last, at 0.8: its gas is needed on the
-# way to the setpoint anyway.
-PARTS = (Part("off", 0.0, 0.0, 0.0, 1.2), Part("vent", 0.0, 0.08, 0.35, 0.5), Part("pump", 0.8, 0.0, 0.5, 1.0))
+# The vent costs 7 µm of height, which the pump must restore. The pump comes last, at 0.8: its gas
+# is needed on the way to the setpoint anyway.
+PARTS = (
+    Part("off", 0.0, 0.0, 0.0, 1.2),
+    Part("vent", 0.0, 0.08, 0.35, 0.5),
+    Part("pump", 0.8, 0.0, 0.5, 1.0),
+)
 _RATE_HZ = 50.0  # tick rate of the parts' times
-# At 50 Hz and with 1 µm of noise the vent's speed has a standard deviation of 1.4 µm/s, the pump's 0.6 µm/s, and the
-# means of two 1.0 and 0.4 µm/s. Three of them are clear; two and a half decide in the end.
+# At 50 Hz and with 1 µm of noise the vent's speed has a standard deviation of 1.4 µm/s, the pump's
+# 0.6 µm/s, and the means of two 1.0 and 0.4 µm/s. Three of them are clear; two and a half decide in
+# the end.
 _VENT_CLEAR_UM_PER_S, _VENT_LEAST_UM_PER_S = 4.5, 2.5
 _PUMP_CLEAR_SHARE, _PUMP_LEAST_SHARE, _PUMP_MOST_SHARE = 0.5, 0.3, 3.0
 
@@ -246,12 +276,15 @@ class ActuatorTestState(StateNode):
 
 
 class ActuatorTest:
-    """Does the film respond to vent and pump? Each tick executes the commands of `part` and gives `step` its reading.
+    """Does the film respond to vent and pump? Each tick executes the commands of `part` and gives
+    `step` its reading.
 
-    The speed of the centre in each part is the slope of the laser readings. The test checks sign and size within a
-    factor: it finds a disconnected hose, a stuck valve or a laser on the wrong spot, not a pump 30 % too weak. After
-    an unclear response it runs again; then a clear response suffices, otherwise the mean of both decides. With 1 µm
-    of noise a good bench needs the second run in one start of a hundred.
+    The speed of the centre in each part is the slope of the laser readings. The test checks sign
+    and size within a
+    factor: it finds a disconnected hose, a stuck valve or a laser on the wrong spot, not a pump 30
+    % too weak. After an unclear response it runs again; then a clear response suffices, otherwise
+    the mean of both decides. With 1 µm of noise a good bench needs the second run in one start of a
+    hundred.
 
     Parameters
     ----------
@@ -265,12 +298,18 @@ class ActuatorTest:
     """
 
     def __init__(
-        self, pump: PumpConfig, test_vent: bool, rate_hz: float, memory: ActuatorTestState | None = None
+        self,
+        pump: PumpConfig,
+        test_vent: bool,
+        rate_hz: float,
+        memory: ActuatorTestState | None = None,
     ) -> None:
         # the slope's standard deviation goes with rate^(-1/2) T^(-3/2): this T keeps it
         longer = (_RATE_HZ / min(rate_hz, _RATE_HZ)) ** (1 / 3)
         self._parts = [
-            replace(part, measure_s=part.measure_s * longer) for part in PARTS if test_vent or part.name != "vent"
+            replace(part, measure_s=part.measure_s * longer)
+            for part in PARTS
+            if test_vent or part.name != "vent"
         ]
         self.memory = memory or ActuatorTestState(pump, test_vent, self._fresh_slopes())
 
@@ -328,7 +367,9 @@ class ActuatorTest:
         means = {name: (speed + self.memory.before[name]) / 2 for name, speed in speeds.items()}
         return self._judged(means, _VENT_LEAST_UM_PER_S, _PUMP_LEAST_SHARE)
 
-    def _judged(self, speeds: dict[str, float], vent_least_um_per_s: float, pump_least_share: float) -> str:
+    def _judged(
+        self, speeds: dict[str, float], vent_least_um_per_s: float, pump_least_share: float
+    ) -> str:
         if "vent" in speeds:
             vent_um_per_s = speeds["off"] - speeds["vent"]
             if vent_um_per_s < vent_least_um_per_s:
@@ -336,5 +377,8 @@ class ActuatorTest:
         expected_um_per_s = gas.PumpCurve(self.memory.pump).flow(PARTS[-1].pump_fraction)
         rise_um_per_s = speeds["pump"] - speeds["off"]
         if not pump_least_share <= rise_um_per_s / expected_um_per_s <= _PUMP_MOST_SHARE:
-            return f"the pump lifts the mirror by {rise_um_per_s:.1f} µm/s, not by about {expected_um_per_s:.1f} µm/s"
+            return (
+                f"the pump lifts the mirror by {rise_um_per_s:.1f} µm/s, not by about "
+                f"{expected_um_per_s:.1f} µm/s"
+            )
         return ""

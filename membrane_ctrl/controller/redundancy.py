@@ -39,9 +39,15 @@ class RedundancyWatch:
         if self._process_value is ProcessValue.LASER:
             # A rejected cycle must not raise a notice: as long as the shape loop uses the last one.
             optics_lost_s += config.shape.fresh_s
-        self._lost_s = {FilmSensor.LASER: LOST_S, FilmSensor.OPTICS: optics_lost_s, FilmSensor.GAUGE: LOST_S}
+        self._lost_s = {
+            FilmSensor.LASER: LOST_S,
+            FilmSensor.OPTICS: optics_lost_s,
+            FilmSensor.GAUGE: LOST_S,
+        }
 
-    def step(self, now_s: float, pump_may_run: bool, present: Mapping[FilmSensor, bool]) -> list[Event]:
+    def step(
+        self, now_s: float, pump_may_run: bool, present: Mapping[FilmSensor, bool]
+    ) -> list[Event]:
         """One tick.
 
         Parameters
@@ -55,7 +61,8 @@ class RedundancyWatch:
         Returns
         -------
         list of Event
-            A maintenance notice `laser_lost`, `optics_lost` or `gauge_lost` once for each loss, and its end.
+            A maintenance notice `laser_lost`, `optics_lost` or `gauge_lost` once for each loss, and
+            its end.
         """
         events: list[Event] = []
         if not pump_may_run:
@@ -71,7 +78,9 @@ class RedundancyWatch:
                 events += self._report_loss(sensor, now_s, present)
         return events
 
-    def _report_loss(self, sensor: FilmSensor, now_s: float, present: Mapping[FilmSensor, bool]) -> list[Event]:
+    def _report_loss(
+        self, sensor: FilmSensor, now_s: float, present: Mapping[FilmSensor, bool]
+    ) -> list[Event]:
         missing_s = now_s - self.memory.last_present_s.get(sensor, math.nan)
         if sensor in self.memory.reported or not missing_s > self._lost_s[sensor]:
             return []
@@ -105,12 +114,16 @@ class RedundancyWatch:
             return "laser, optics and gauge are left"
         (sensor,) = followed
         bounds = [
-            find_bound(self._process_value, sensor, failure, self._config, laser_and_optics=False).distance_um
+            find_bound(
+                self._process_value, sensor, failure, self._config, laser_and_optics=False
+            ).distance_um
             for failure in (Failure.STEP, Failure.DRIFT, Failure.DRIFT_WITHIN_CLIMATE)
         ]
         return (
-            f"{sensor.value} and gauge are left, and the gauge bounds an error of the {sensor.value} to "
-            f"{bounds[0]:.0f} µm within minutes, {bounds[1]:.0f} µm within hours, {bounds[2]:.0f} µm within days"
+            f"{sensor.value} and gauge are left, and the gauge bounds an error of the "
+            f"{sensor.value} to "
+            f"{bounds[0]:.0f} µm within minutes, {bounds[1]:.0f} µm within hours, "
+            f"{bounds[2]:.0f} µm within days"
         )
 
 

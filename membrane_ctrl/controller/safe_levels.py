@@ -1,8 +1,8 @@
 """The safe levels: hold the last mean flow -> ramp down -> pump off -> vent.
 
-A fault chooses the level to enter; each level times out into the next; only a clear observation on the first level
-leads back up. The first level's time recovers only as fast as it is used, so a cause present more than half of the
-time also times out.
+A fault chooses the level to enter; each level times out into the next; only a clear observation on
+the first level leads back up. The first level's time recovers only as fast as it is used, so a
+cause present more than half of the time also times out.
 """
 
 import math
@@ -78,7 +78,8 @@ class SafeLevels:
 
 DAY_S = 86_400.0
 WATCHDOG_MASK = default_map().fault_mask("watchdog")
-# A bleed, the actuator test and `lower` open the vent at most this far; a board that vents by itself opens it fully
+# A bleed, the actuator test and `lower` open the vent at most this far; a board that vents by
+# itself opens it fully
 VENTED_FRACTION = 0.5
 
 
@@ -92,13 +93,17 @@ class ResumeState(StateNode):
 
 
 class ResumeRule:
-    """Whether a latched fault may clear automatically: only a listed one, its cause absent, a limited number a day.
+    """Whether a latched fault may clear automatically: only a listed one, its cause absent, a
+    limited number a day.
 
-    Never after a vent, a board latch other than the watchdog's, a board taken by another program, a person's lock, or
-    an open interlock: any of these during the fault decides, whatever the first cause.
+    Never after a vent, a board latch other than the watchdog's, a board taken by another program, a
+    person's lock, or an open interlock: any of these during the fault decides, whatever the first
+    cause.
     """
 
-    def __init__(self, config: ResumeConfig, limits: LimitsConfig, memory: ResumeState | None = None) -> None:
+    def __init__(
+        self, config: ResumeConfig, limits: LimitsConfig, memory: ResumeState | None = None
+    ) -> None:
         self._config, self._limits = config, limits
         self.memory = memory or ResumeState()
         self.possible = False
@@ -118,7 +123,8 @@ class ResumeRule:
     def due(self, fault: Rule, levels: SafeLevels, observation: Observation, now_s: float) -> bool:
         """Observe a tick of a fault; True once its cause has been absent for long enough.
 
-        Sets `possible` (the fault may still clear automatically) and `clear_mask` (the board's latches to clear for
+        Sets `possible` (the fault may still clear automatically) and `clear_mask` (the board's
+        latches to clear for
         that: the watchdog's, or none).
         """
         self.memory.never |= _decides(levels, observation)

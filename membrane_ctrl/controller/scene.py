@@ -1,4 +1,6 @@
-"""Data that the states' handlers share: filled by commands and the tick, told as the tick's telemetry row."""
+"""Data that the states' handlers share: filled by commands and the tick, told as the tick's
+telemetry row.
+"""
 
 import math
 from dataclasses import dataclass, field, fields
@@ -45,7 +47,9 @@ class SceneState(StateNode):
     last_good_s: float = math.nan  # in `check`
     highest_um: float = math.nan  # filtered reading, in `inflate`
     highest_s: float = math.nan  # when the mirror was last rising
-    sinking: filters.Slope = field(default_factory=filters.Slope)  # of the mirror with the pump off, in `check`
+    sinking: filters.Slope = field(
+        default_factory=filters.Slope
+    )  # of the mirror with the pump off, in `check`
     test_memory: pump_obeys.ActuatorTestState | None = None  # of the actuator test, in `check`
     ramp_from_fraction: float = 0.0
     # of the last tick
@@ -62,7 +66,9 @@ class SceneState(StateNode):
 
 @dataclass(slots=True, kw_only=True)
 class Scene(SceneState):
-    """Data that the handlers share: their memory, the loop, the facts of this tick, and the decisions."""
+    """Data that the handlers share: their memory, the loop, the facts of this tick, and the
+    decisions.
+    """
 
     config: Config
     loop_config: LoopConfig  # present settings, after `gains`
@@ -152,7 +158,9 @@ def obey(scene: Scene, command: commands.Command, state: telemetry.State) -> Non
             scene.acknowledged = state == telemetry.State.FAULT
         case "stop":
             scene.way_down = "stop"
-            scene.stop_exit = errors.Exit.DONE if command.who == commands.AT_END else errors.Exit.INTERRUPTED
+            scene.stop_exit = (
+                errors.Exit.DONE if command.who == commands.AT_END else errors.Exit.INTERRUPTED
+            )
         case "vent" if state == telemetry.State.FAULT:
             scene.levels.enter(telemetry.SafeLevel.VENT, scene.now_s)
         case "lower" | "vent":

@@ -1,4 +1,6 @@
-"""The sensors of a held mirror: which one is wrong by the others and the film, what wears out, which ones hold it."""
+"""The sensors of a held mirror: which one is wrong by the others and the film, what wears out,
+which ones hold it.
+"""
 
 import math
 from collections import deque
@@ -8,7 +10,12 @@ from dataclasses import dataclass, field, replace
 from membrane_ctrl.config.schema import Config, LoopConfig, PumpConfig, ShapeConfig
 from membrane_ctrl.control import centre_estimate, film, film_health, gas, inner_loop
 from membrane_ctrl.control.centre import LOCK_FRAMES, CentreFilter, CentreState
-from membrane_ctrl.control.centre_estimate import CentreEstimate, CentreReadings, Sensor, StandGrowth
+from membrane_ctrl.control.centre_estimate import (
+    CentreEstimate,
+    CentreReadings,
+    Sensor,
+    StandGrowth,
+)
 from membrane_ctrl.control.filters import LowPass
 from membrane_ctrl.control.shape_loop import ShapeCode
 from membrane_ctrl.controller import safety
@@ -45,18 +52,20 @@ _FAULTY = {
 class HoldStatus:
     """State of the held mirror."""
 
-    # NaN for old, bad or stuck readings and jumps: a mean over ten seconds must not include a bit error
+    # NaN for old, bad or stuck readings and jumps: a mean over ten seconds must not include a bit
+    # error
     laser_um: float
     gauge_pressure_pa: float
     setpoint_um: float  # as commanded
     trim_um: float  # by the shape loop
-    # the rest of the setpoint's ramp. The camera lags by a cycle, and the gauge is linear only near its reference: on
-    # a long ramp they would contradict a correct laser
+    # the rest of the setpoint's ramp. The camera lags by a cycle, and the gauge is linear only near
+    # its reference: on a long ramp they would contradict a correct laser
     ramp_left_um: float
     leak_um_per_s: float  # as the inner loop estimates it; NaN without
     flow_um_per_s: float  # of the pump; NaN without
     bleed_fraction: float  # of the vent, held open on purpose
-    optics_hold: bool = False  # they see the centre, and its estimate is held: a laser that moved is known
+    # they see the centre, and its estimate is held: a laser that moved is known
+    optics_hold: bool = False
     sag_um: float = math.nan  # by the newest figure; NaN without a usable one
     optics_usable: bool = True  # the estimate, or the shape loop, uses the figures
     figure: ShapeEstimate | None = None  # that arrived in this tick and may be used
@@ -65,7 +74,9 @@ class HoldStatus:
 def hold_status(
     scene: Scene, last: inner_loop.LoopOutput, optics_hold: bool, optics_usable: bool = True
 ) -> HoldStatus:
-    """The mirror after the tick's reading was taken; `last` is what the loop gave in the tick before."""
+    """The mirror after the tick's reading was taken; `last` is what the loop gave in the tick
+    before.
+    """
     return HoldStatus(
         laser_um=scene.observer.moving_laser_um,
         gauge_pressure_pa=scene.observer.gauge_pressure_pa,
@@ -164,7 +175,9 @@ class SensorConsistency:
     """
 
     def __init__(self, config: Config, memory: SensorConsistencyState | None = None) -> None:
-        self.memory = memory or SensorConsistencyState(config.loop.setpoint_um, config.loop.bleed_fraction)
+        self.memory = memory or SensorConsistencyState(
+            config.loop.setpoint_um, config.loop.bleed_fraction
+        )
         memory = self.memory
         self._plausibility = film.PlausibilityCheck(
             config.shape.disagreement_max_um,
@@ -173,7 +186,9 @@ class SensorConsistency:
             memory.plausibility,
         )
         self._far_um = config.shape.disagreement_max_um
-        self._health = film_health.FilmHealth(config.loop.flow_most_um_per_s(config.pump), memory.health)
+        self._health = film_health.FilmHealth(
+            config.loop.flow_most_um_per_s(config.pump), memory.health
+        )
         self._pump = film_health.PumpHealth(config.pump.change_max, memory.pump)
         limits, mirror = config.limits, config.optics.mirror
         self._laser_film = film.FilmMonitor(limits, mirror, "laser", memory.laser_film)
@@ -211,7 +226,9 @@ class SensorConsistency:
         """Why the shape loop must not follow the camera; `NO_REASON` if it may."""
         if not self.camera_lies:
             return NO_REASON
-        code = ShapeCode.CAMERA_REPEATS if self.memory.repeats >= _REPEATS else ShapeCode.CAMERA_WRONG
+        code = (
+            ShapeCode.CAMERA_REPEATS if self.memory.repeats >= _REPEATS else ShapeCode.CAMERA_WRONG
+        )
         return make_reason(code, self.camera_lies)
 
     def ask(self, inputs: TickInputs, state: State, dt_s: float, held: HoldStatus) -> list[Event]:
@@ -223,9 +240,12 @@ class SensorConsistency:
         if state != State.HOLD or held.bleed_fraction != self.memory.bleed_fraction:
             self.memory.bleed_fraction = held.bleed_fraction
             self.memory.growth.reset()
-        # A laser that answers now and then counts as missing; one that misses a reading now and then does not.
+        # A laser that answers now and then counts as missing; one that misses a reading now and
+        # then does not.
         change_s = -_ANSWER_COUNTS * dt_s if math.isfinite(laser_um) else dt_s
-        self.memory.laser_missing_s = min(max(self.memory.laser_missing_s + change_s, 0.0), _MISSING_MAX_S)
+        self.memory.laser_missing_s = min(
+            max(self.memory.laser_missing_s + change_s, 0.0), _MISSING_MAX_S
+        )
         self._compare_with_gauge(state, dt_s, held)
         events = self._doubt_sag(state) + self._notice_drift(state)
         events += self._watch_redundancy(inputs.now_s, state, held)
@@ -239,10 +259,14 @@ class SensorConsistency:
         events += self._judge_weather(inputs, dt_s)
         blind = not inputs.now_s - self.memory.camera_s <= self._fresh_s
         liar = self._plausibility.step(dt_s, laser_um, gauge_pa, held.figure, blind)
-        self.memory.lies_s = self.memory.lies_s + dt_s if liar == film.Liar.LASER and held.optics_hold else 0.0
-        # A knock is over: the estimate knows the laser's new place. A laser that is knocked again and again is not.
-        self.laser_moved = self.memory.lies_s > film.WARM_S and not self.memory.laser_verdicts.too_many(
-            inputs.now_s, _VERDICTS_MAX
+        self.memory.lies_s = (
+            self.memory.lies_s + dt_s if liar == film.Liar.LASER and held.optics_hold else 0.0
+        )
+        # A knock is over: the estimate knows the laser's new place. A laser that is knocked again
+        # and again is not.
+        self.laser_moved = (
+            self.memory.lies_s > film.WARM_S
+            and not self.memory.laser_verdicts.too_many(inputs.now_s, _VERDICTS_MAX)
         )
         if self.laser_moved:
             self._plausibility.rebase()
@@ -255,7 +279,9 @@ class SensorConsistency:
         self.memory.gas_excess = self.memory.growth.step(
             held.leak_um_per_s, held.flow_um_per_s, self._most_growth(inputs), dt_s
         )
-        events += [_of_warning(each) for each in self._health.step(dt_s, held.leak_um_per_s, gauge_pa)]
+        events += [
+            _of_warning(each) for each in self._health.step(dt_s, held.leak_um_per_s, gauge_pa)
+        ]
         return events
 
     @property
@@ -304,9 +330,11 @@ class SensorConsistency:
         return self._by_optics or (self._follows_optics and missing)
 
     def _compare_with_gauge(self, state: State, dt_s: float, held: HoldStatus) -> None:
-        """Compare laser and optics with the gauge, each by itself; the one that shows the film decides.
+        """Compare laser and optics with the gauge, each by itself; the one that shows the film
+        decides.
 
-        Both comparisons run all the time, so that the optics have a reference when the laser is lost.
+        Both comparisons run all the time, so that the optics have a reference when the laser is
+        lost.
         """
         if state not in safety.CONNECTED:
             self._laser_film.reset()
@@ -323,7 +351,9 @@ class SensorConsistency:
         return self._optics_film if self._optics_alone else self._laser_film
 
     def _notice_drift(self, state: State) -> list[Event]:
-        """Report once that the displacement and the gauge drift apart, which climate may hide a sensor's drift in."""
+        """Report once that the displacement and the gauge drift apart, which climate may hide a
+        sensor's drift in.
+        """
         monitor = self._film_in_use
         noticed = state in safety.CONNECTED and monitor.drifting
         if noticed == self.memory.drift_noticed:
@@ -333,8 +363,10 @@ class SensorConsistency:
         if not noticed:
             return [MaintenanceOver("slow_drift", "the two are near each other again")]
         message = (
-            f"{sensor} and gauge have moved {monitor.drift_um:.0f} µm apart within a day: humidity and "
-            "temperature of the film do this, and so does a sensor that drifts. Compare the laser with a ruler"
+            f"{sensor} and gauge have moved {monitor.drift_um:.0f} µm apart within a day: "
+            "humidity and "
+            "temperature of the film do this, and so does a sensor that drifts. Compare the "
+            "laser with a ruler"
         )
         return [Maintenance("slow_drift", message)]
 
@@ -342,13 +374,16 @@ class SensorConsistency:
         """Report a lost sensor of the film while the pump is driven."""
         present = {
             FilmSensor.LASER: math.isfinite(held.laser_um),
-            FilmSensor.OPTICS: held.optics_hold or (held.optics_usable and math.isfinite(held.sag_um)),
+            FilmSensor.OPTICS: held.optics_hold
+            or (held.optics_usable and math.isfinite(held.sag_um)),
             FilmSensor.GAUGE: math.isfinite(held.gauge_pressure_pa),
         }
         return self._redundancy.step(now_s, state in safety.MOVING, present)
 
     def _doubt_sag(self, state: State) -> list[Event]:
-        """Report once that optics without a laser may have missed a jump of the film, until the next start."""
+        """Report once that optics without a laser may have missed a jump of the film, until the
+        next start.
+        """
         doubted_now = self._optics_alone and self._optics_film.doubted
         doubted = state in safety.CONNECTED and (self.memory.doubted or doubted_now)
         if doubted == self.memory.doubted:
@@ -357,19 +392,28 @@ class SensorConsistency:
         if not doubted:
             return [MaintenanceOver("sag_doubted", "the comparison begins again")]
         return [
-            Maintenance("sag_doubted", "the gauge shows a jump of the film that the camera missed: restart the hold")
+            Maintenance(
+                "sag_doubted",
+                "the gauge shows a jump of the film that the camera missed: restart the hold",
+            )
         ]
 
     def _look_at_camera(self, estimate: ShapeEstimate | None) -> None:
-        """Note when the camera last showed the film, and how often it repeated one shape bit by bit."""
+        """Note when the camera last showed the film, and how often it repeated one shape bit by
+        bit.
+        """
         if estimate is None:
             return
         self.memory.camera_s = estimate.time_s
-        self.memory.repeats = self.memory.repeats + 1 if estimate.sag_um == self.memory.sag_um else 0
+        self.memory.repeats = (
+            self.memory.repeats + 1 if estimate.sag_um == self.memory.sag_um else 0
+        )
         self.memory.sag_um = estimate.sag_um
 
     def _most_growth(self, inputs: TickInputs) -> float:
-        """Allowed growth of the leak: unlimited while the camera agrees with a laser that is there."""
+        """Allowed growth of the leak: unlimited while the camera
+        agrees with a laser that is there.
+        """
         if self._optics_alone or self.memory.repeats >= _REPEATS:
             return self._leak_growth_max
         if not inputs.now_s - self.memory.camera_s <= self._fresh_s:
@@ -382,16 +426,24 @@ class SensorConsistency:
         if reading is None:
             return []
         failure = gas.weather_fault(reading.ambient_pressure_pa, reading.air_temperature_c)
-        self.memory.weather_s = self.memory.weather_s + dt_s if bool(failure) != self.memory.weather_told else 0.0
+        self.memory.weather_s = (
+            self.memory.weather_s + dt_s if bool(failure) != self.memory.weather_told else 0.0
+        )
         if self.memory.weather_s < _WEATHER_STANDS_S:
             return []
         self.memory.weather_told = bool(failure)
         self.memory.weather_s = 0.0
-        return [(Maintenance if failure else MaintenanceOver)("weather_sensor", failure or "the sensor is back")]
+        return [
+            (Maintenance if failure else MaintenanceOver)(
+                "weather_sensor", failure or "the sensor is back"
+            )
+        ]
 
     def _judge(self, liar: film.Liar) -> list[Event]:
         repeats = self.memory.repeats >= _REPEATS
-        seen = str(self._plausibility.changes) if liar in (film.Liar.LASER, film.Liar.OPTICS) else ""
+        seen = (
+            str(self._plausibility.changes) if liar in (film.Liar.LASER, film.Liar.OPTICS) else ""
+        )
         self.memory.laser_lies = seen if liar == film.Liar.LASER else ""
         if repeats:
             self.memory.camera_lies = "the camera repeats one shape to the last bit: restart it"
@@ -402,7 +454,11 @@ class SensorConsistency:
         if liar == self.memory.liar:
             return []
         self.memory.liar = liar
-        seen = str(self._plausibility.changes) if self._plausibility.watching else "compared anew from here on"
+        seen = (
+            str(self._plausibility.changes)
+            if self._plausibility.watching
+            else "compared anew from here on"
+        )
         return [Plausibility(_FAULTY[liar], seen)]
 
 
@@ -411,12 +467,15 @@ def _of_warning(warning: film_health.FilmWarning) -> Event:
 
 
 _STAND_SHARE = 0.25  # of the band: a growth of the optics' stand that may be this large is told
-_STANDS_S = 1.5  # a sensor that comes and goes within this, as a slower camera does at first, is not reported
+# a sensor that comes and goes within this, as a slower camera does at first, is not reported
+_STANDS_S = 1.5
 
 
 _UNSTEADY_MESSAGE = (
-    "the optics have jumped against the laser again and again; they are left out, and the mirror follows the laser. "
-    "Look for vibration, reflections or a loose camera, then `ctl shape off` and `on` use them again"
+    "the optics have jumped against the laser again and again; they are left out, and the "
+    "mirror follows the laser. "
+    "Look for vibration, reflections or a loose camera, then `ctl shape off` and `on` use "
+    "them again"
 )
 _JUMP_TAKES_S = 2.0  # until the estimate has followed a jump of the laser
 
@@ -433,10 +492,12 @@ class MountDriftState(StateNode):
 
 
 class MountDrift:
-    """How far the estimate lets the laser's mount drift: as far as the shape loop's trim, `shape.trim_max_um`.
+    """How far the estimate lets the laser's mount drift: as far as the shape loop's trim,
+    `shape.trim_max_um`.
 
-    Laser and optics that drift apart do not show which of them drifts. Beyond the limit the optics are left out, the
-    mirror follows the laser, and a person decides. A jump that the estimate found to be the laser's is no drift.
+    Laser and optics that drift apart do not show which of them drifts. Beyond the limit the optics
+    are left out, the mirror follows the laser, and a person decides. A jump that the estimate found
+    to be the laser's is no drift.
     """
 
     def __init__(self, shape: ShapeConfig, memory: MountDriftState | None = None) -> None:
@@ -453,11 +514,15 @@ class MountDrift:
         """The limit is passed."""
         return self.memory.beyond_limit
 
-    def step(self, mount_um: float, jumped: Collection[Sensor], now_s: float, dt_s: float) -> list[Event]:
-        """Follow the mount; returns the notice once the limit is passed, which only `start` takes back.
+    def step(
+        self, mount_um: float, jumped: Collection[Sensor], now_s: float, dt_s: float
+    ) -> list[Event]:
+        """Follow the mount; returns the notice once the limit is passed, which only `start` takes
+        back.
 
-        `jumped`: the sensors of which the estimate has found a jump in this tick. Optics that jump again and again
-        lead the estimate away in steps that each look like a knock; they are left out as well.
+        `jumped`: the sensors of which the estimate has found a jump in this tick. Optics that jump
+        again and again lead the estimate away in steps that each look like a knock; they are left
+        out as well.
         """
         memory = self.memory
         moved_um = mount_um - memory.last_um
@@ -477,8 +542,10 @@ class MountDrift:
         if not memory.beyond_limit:
             return []
         message = (
-            f"laser and optics have drifted {self._most_um:g} µm apart; which of them is not known, and the mirror "
-            "follows the laser. Check its mount and the optics, then `ctl shape off` and `on` accept the figure"
+            f"laser and optics have drifted {self._most_um:g} µm apart; which of them is not "
+            "known, and the mirror "
+            "follows the laser. Check its mount and the optics, then `ctl shape off` and "
+            "`on` accept the figure"
         )
         return [Maintenance("trim_limit", message)]
 
@@ -489,12 +556,14 @@ class HoldersState(StateNode):
 
     centre: CentreState | None = None  # None while the estimate does not run
     locking: bool = False
-    # Means of the mount while laser and camera agree: what the filter gave to the mount after that was the film's.
-    # The slow one serves if a slow drift of the camera is to be undone.
+    # Means of the mount while laser and camera agree: what the filter gave to the mount after that
+    # was the film's. The slow one serves if a slow drift of the camera is to be undone.
     agreed_mount: LowPass = field(default_factory=LowPass)
     slowly_agreed_mount: LowPass = field(default_factory=LowPass)
     mount_drift: MountDriftState = field(default_factory=MountDriftState)
-    stand: centre_estimate.StandGrowthState = field(default_factory=centre_estimate.StandGrowthState)
+    stand: centre_estimate.StandGrowthState = field(
+        default_factory=centre_estimate.StandGrowthState
+    )
     stand_told: bool = False
     told: tuple[int, ...] | None = None  # the sensors, as reported
     news_s: float = math.nan
@@ -512,7 +581,9 @@ class Holders:
         self._by_optics = config.by_optics
         self._sag_zero_um = 1e3 * config.optics.mirror.sag_mm if config.by_optics else math.nan
         centre = self.memory.centre
-        self._filter = None if centre is None else CentreFilter(config.estimator, config.loop, centre)
+        self._filter = (
+            None if centre is None else CentreFilter(config.estimator, config.loop, centre)
+        )
         self._tracks = config.shape.mode == "track"
         self._mount_drift = MountDrift(config.shape, self.memory.mount_drift)
         self._stand = StandGrowth(config.estimator, self.memory.stand)
@@ -563,11 +634,13 @@ class Holders:
                 return []
             self._filter = self._start(start_um, scene)
         if self._is_anchor(inputs.estimate):
-            self._filter.relock()  # another anchor shows the same film up to a micrometre higher or lower
+            # another anchor shows the same film up to a micrometre higher or lower
+            self._filter.relock()
         figure = self._select_figure(self._filter, figures.accepted, scene.dt_s, shape, consistency)
         reading = inputs.reading
         self._stand.step(
-            gas.believed_weather(math.nan, reading.air_temperature_c)[1] if reading else math.nan, scene.dt_s
+            gas.believed_weather(math.nan, reading.air_temperature_c)[1] if reading else math.nan,
+            scene.dt_s,
         )
         if self._filter.frames < LOCK_FRAMES:
             self._stand.lock()
@@ -585,7 +658,9 @@ class Holders:
         self.memory.estimate = estimate = self._filter.step(readings, scene.dt_s)
         scene.trim_um = estimate.mount_um
         news = [*self._news(inputs.now_s, estimate.jumped), *self._told_of_stand()]
-        news += self._mount_drift.step(estimate.mount_um, estimate.jumped_sensors, inputs.now_s, scene.dt_s)
+        news += self._mount_drift.step(
+            estimate.mount_um, estimate.jumped_sensors, inputs.now_s, scene.dt_s
+        )
         if self._sees(Sensor.OPTICS):
             sigma_um = math.hypot(estimate.sigma_um, self._stand.sigma_um)
             self.memory.estimate = replace(estimate, sigma_um=sigma_um)
@@ -602,7 +677,9 @@ class Holders:
         memory = self.memory
         memory.centre = CentreState()
         begun = CentreFilter(self._config, self._loop, memory.centre)
-        begun.start(start_um, scene.loop.mean_flow_um_per_s, scene.trim_um, self._find_sag_zero_um(scene))
+        begun.start(
+            start_um, scene.loop.mean_flow_um_per_s, scene.trim_um, self._find_sag_zero_um(scene)
+        )
         memory.agreed_mount.reset(scene.trim_um)
         memory.slowly_agreed_mount.reset(scene.trim_um)
         self._mount_drift.start(scene.trim_um)
@@ -610,15 +687,24 @@ class Holders:
         return begun
 
     def _find_sag_zero_um(self, scene: Scene) -> float:
-        """Sag at true centre 0, where the optics replace the laser; NaN where they are to be locked."""
+        """Sag at true centre 0, where the optics replace the laser; NaN where they are to be
+        locked.
+        """
         if self._by_optics:
             return self._sag_zero_um
         observer = scene.observer
-        return observer.figures.zero_um + scene.trim_um if observer.optics_replace_laser else math.nan
+        return (
+            observer.figures.zero_um + scene.trim_um if observer.optics_replace_laser else math.nan
+        )
 
     def _is_anchor(self, figure: ShapeEstimate | None) -> bool:
         """Whether a figure is a full set that the tracking's next frames count from."""
-        return figure is not None and self._tracks and figure.kind == "full" and figure.verdict != "rejected"
+        return (
+            figure is not None
+            and self._tracks
+            and figure.kind == "full"
+            and figure.verdict != "rejected"
+        )
 
     def _select_figure(
         self,
@@ -628,7 +714,9 @@ class Holders:
         shape: ShapeState,
         consistency: SensorConsistency,
     ) -> ShapeEstimate | None:
-        """The tick's figure if the filter may use it; locks the filter again where its reference ended."""
+        """The tick's figure if the filter may use it; locks the filter again where its reference
+        ended.
+        """
         memory = self.memory
         off = shape == ShapeState.OFF and not self._by_optics
         if memory.locking and not off:
@@ -639,13 +727,17 @@ class Holders:
             memory.agreed_mount.update(memory.estimate.mount_um, dt_s, film.REFERENCE_S)
             memory.slowly_agreed_mount.update(memory.estimate.mount_um, dt_s, film.SLOW_REFERENCE_S)
         elif consistency.camera_lies and centre.frames and not self._by_optics:
-            agreed = memory.slowly_agreed_mount if consistency.camera_drifts else memory.agreed_mount
+            agreed = (
+                memory.slowly_agreed_mount if consistency.camera_drifts else memory.agreed_mount
+            )
             centre.blame_optics(agreed.value)
         unusable = off or bool(consistency.camera_lies) or self._mount_drift.beyond_limit
         return None if unusable else figure
 
     def _told_of_stand(self) -> list[Event]:
-        """Report once that the optics may be off by the growth of their stand, and once that a new lock ended it."""
+        """Report once that the optics may be off by the growth of their stand, and once that a new
+        lock ended it.
+        """
         sigma_um, warmed_k = self._stand.sigma_um, self._stand.warmed_k
         memory = self.memory
         far = sigma_um > self._stand_most_um / (2 if memory.stand_told else 1)
@@ -655,8 +747,14 @@ class Holders:
         stands = f"the optics' stand is {warmed_k:+.1f} K from the reference"
         if not far:
             return [MaintenanceOver("stand_growth", stands)]
-        anew = "calibrate the optics anew" if self._by_optics else "`ctl shape off` and `on` accept it"
-        return [Maintenance("stand_growth", f"{stands}: the figure may be off by {sigma_um:.1f} µm; {anew}")]
+        anew = (
+            "calibrate the optics anew" if self._by_optics else "`ctl shape off` and `on` accept it"
+        )
+        return [
+            Maintenance(
+                "stand_growth", f"{stands}: the figure may be off by {sigma_um:.1f} µm; {anew}"
+            )
+        ]
 
     def _sees(self, sensor: Sensor) -> bool:
         estimate = self.memory.estimate

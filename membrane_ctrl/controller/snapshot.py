@@ -1,7 +1,8 @@
-"""Snapshots of what the controller remembers, so that a bit-exact replay can start in the middle of a run.
+"""Snapshots of what the controller remembers, so that a bit-exact replay can start in the middle of
+a run.
 
-A snapshot is `ControllerState` as JSON. A run folder may come from anywhere: every value is checked against its
-declared type, and a snapshot of another layout is refused.
+A snapshot is `ControllerState` as JSON. A run folder may come from anywhere: every value is checked
+against its declared type, and a snapshot of another layout is refused.
 """
 
 from membrane_ctrl.config.schema import Config
@@ -52,7 +53,8 @@ def _require_fit(memory: ControllerState, config: Config) -> None:
     rates_hz = {memory.gains.good.loop.rate_hz, memory.gains.tried.loop.rate_hz}
     if rates_hz != {config.loop.rate_hz}:
         raise ValueError(
-            f"a tick rate of {max(rates_hz):g} Hz, and of {config.loop.rate_hz:g} Hz in the configuration"
+            f"a tick rate of {max(rates_hz):g} Hz, and of {config.loop.rate_hz:g} Hz in the "
+            "configuration"
         )
     codes = {*memory.safety.history, *(() if memory.fault is None else (memory.fault,))}
     if unknown := codes - safety.RULES.keys():

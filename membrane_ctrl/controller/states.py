@@ -22,13 +22,15 @@ _LOCKS_SHOWN = 3  # in the operator's line; the status has all of them
 _PUMP_STANDS_S = 0.5
 _NO_VENT = "no vent is fitted, the leak lowers the mirror"
 _VENTED_S = 900.0  # twice the twin's time from 600 Pa; longer means a shut vent or a wrong gauge
-# A `stop` with a pump that does not obey: after this long with the vent open and the pump commanded off, report that
-# the pump still runs. Shorter than the 30 s that the service manager allows.
+# A `stop` with a pump that does not obey: after this long with the vent open and the pump commanded
+# off, report that the pump still runs. Shorter than the 30 s that the service manager allows.
 _STOP_GIVES_UP_S = 10.0
 
 
 def standby(scene: Scene) -> State:
-    """Keep the pump off until someone requests a hold; a lock or an open interlock cancels the request."""
+    """Keep the pump off until someone requests a hold; a lock or an open interlock cancels the
+    request.
+    """
     interlock = scene.interlocks.describe_open(scene.interlocks.last_mask)
     if scene.locks:
         scene.hold_wanted = False
@@ -59,7 +61,9 @@ def check(scene: Scene) -> State:
     good_s = scene.stay_good(not gone)
     if scene.state_age_s > scene.config.states.check_timeout_s + scene.observer.waited_s:
         why = missing.text or "readings come and go, or the actuator test is not done"
-        scene.overdue = f"sensors still not good after {scene.config.states.check_timeout_s:g} s: {why}"
+        scene.overdue = (
+            f"sensors still not good after {scene.config.states.check_timeout_s:g} s: {why}"
+        )
     if gone:
         scene.test_memory = None  # repeat a measurement with a gap
         scene.explain(WhyCode.CHECKING, f"checking the sensors: {missing.text}", missing.code)
@@ -75,7 +79,9 @@ def check(scene: Scene) -> State:
 
 
 def inflate(scene: Scene) -> State:
-    """Ramp from where the mirror is to the setpoint; the ramp waits for a mirror that lags behind."""
+    """Ramp from where the mirror is to the setpoint; the ramp waits
+    for a mirror that lags behind.
+    """
     states = scene.config.states
     lag = abs(scene.loop.lag_um) / states.inflate_pause_um
     output = _drive(scene, scene.loop.ramp_um if lag > 1.0 else scene.setpoint_um)
@@ -87,13 +93,20 @@ def inflate(scene: Scene) -> State:
     inflating = f"inflating: {to_go}{', the ramp waits for the mirror' if waits else ''}"
     scene.explain(WhyCode.INFLATING, inflating, unseen.code, waits)
     ramp_left_um = scene.setpoint_um + scene.trim_um - output.setpoint_um
-    if abs(ramp_left_um) < scene.config.limits.band_um and abs(to_go_um) < scene.config.limits.band_um:
+    if (
+        abs(ramp_left_um) < scene.config.limits.band_um
+        and abs(to_go_um) < scene.config.limits.band_um
+    ):
         return State.SETTLE
     rises = not output.filtered_um <= scene.highest_um + scene.config.limits.band_um
-    if math.isfinite(to_go_um) and (rises or to_go_um <= 0.0):  # from above the leak lowers it, however slowly
+    if math.isfinite(to_go_um) and (
+        rises or to_go_um <= 0.0
+    ):  # from above the leak lowers it, however slowly
         scene.highest_um, scene.highest_s = output.filtered_um, scene.now_s
     if scene.now_s - scene.highest_s > states.inflate_stall_s:
-        scene.overdue = f"no rise in {states.inflate_stall_s:g} s, {to_go_um:.0f} µm below the setpoint"
+        scene.overdue = (
+            f"no rise in {states.inflate_stall_s:g} s, {to_go_um:.0f} µm below the setpoint"
+        )
     elif scene.state_age_s > states.inflate_timeout_s:
         scene.overdue = f"still {to_go_um:.0f} µm from the setpoint"
     return State.INFLATE
@@ -110,7 +123,9 @@ def settle(scene: Scene) -> State:
         return State.HOLD
     if scene.state_age_s > scene.config.states.settle_timeout_s:
         swings = "if it swings, halve loop.kp_per_s and double loop.ti_s"
-        scene.overdue = f"not inside +-{band_um:g} µm for {scene.config.states.settle_s:g} s: {swings}"
+        scene.overdue = (
+            f"not inside +-{band_um:g} µm for {scene.config.states.settle_s:g} s: {swings}"
+        )
     return State.SETTLE
 
 
@@ -128,7 +143,9 @@ def hold(scene: Scene) -> State:
 
 
 def manual(scene: Scene) -> State:
-    """Give the flow a person has requested; the loop tracks it, so that `hold` takes over without a bump."""
+    """Give the flow a person has requested; the loop tracks it, so that `hold` takes over without a
+    bump.
+    """
     if scene.hold_wanted:
         scene.explain(WhyCode.HOLD_REQUESTED, f"{scene.asked_by} requested a hold again")
         scene.keep_flowing()
@@ -167,7 +184,9 @@ def tune(scene: Scene) -> State:
         ended = f"{trial.spec.kind} {'done' if wanted.completed else 'stopped'}: {wanted.reason}"
         scene.explain(WhyCode.EXPERIMENT_ENDED, ended, trial.spec.kind, wanted.completed)
         return State.HOLD
-    scene.give((scene.loop.follow_raw if trial.raw else scene.loop.follow)(given, wanted, scene.dt_s))
+    scene.give(
+        (scene.loop.follow_raw if trial.raw else scene.loop.follow)(given, wanted, scene.dt_s)
+    )
     tuning = f"tuning: {trial.spec.kind} requested by {scene.asked_by}"
     scene.explain(WhyCode.EXPERIMENT, tuning, trial.spec.kind, scene.asked_by)
     return State.TUNE
@@ -176,7 +195,8 @@ def tune(scene: Scene) -> State:
 def lower(scene: Scene) -> State:
     """Lower the mirror: pump off, confirmed by its read-back; the leak or the vent lowers the film.
 
-    Read-back and pressure end it, never a time-out: a pump that still runs is a fault (`pump_runs_on`).
+    Read-back and pressure end it, never a time-out: a pump that still runs is a fault
+    (`pump_runs_on`).
     """
     scene.hold_wanted = False
     scene.vent_fraction = float(scene.venting)
@@ -206,9 +226,13 @@ def lower(scene: Scene) -> State:
 
 
 def fault(scene: Scene) -> State:
-    """Descend the safe levels, latched; a person clears the fault, or the resume rule once its cause has gone."""
+    """Descend the safe levels, latched; a person clears the fault, or the resume rule once its
+    cause has gone.
+    """
     safe_level = scene.levels.step(scene.now_s)
-    scene.explain(WhyCode.FAULT, f"fault: {_level_words(safe_level, scene)}", safe_level.name.lower())
+    scene.explain(
+        WhyCode.FAULT, f"fault: {_level_words(safe_level, scene)}", safe_level.name.lower()
+    )
     scene.hold_wanted = False
     scene.vent_fraction = float(scene.venting or safe_level == SafeLevel.VENT)
     if safe_level == SafeLevel.RAMP_DOWN:
@@ -241,14 +265,17 @@ def _level_words(safe_level: SafeLevel, scene: Scene) -> str:
 
 
 def _nothing_left_to_do(scene: Scene, safe_level: SafeLevel) -> bool:
-    """Whether, with a pump that does not obey, the vent is open and the mirror empty or given time to empty.
+    """Whether, with a pump that does not obey, the vent is open and the mirror empty or given time
+    to empty.
 
     Until then the run continues, so that it keeps commanding the pump to stop.
     """
     if safe_level != SafeLevel.VENT:
         return False
     reading, vented_s = scene.observer.reading, scene.levels.age_s(scene.now_s)
-    empty = reading is not None and reading.gauge_pressure_pa < scene.config.states.vented_pressure_pa
+    empty = (
+        reading is not None and reading.gauge_pressure_pa < scene.config.states.vented_pressure_pa
+    )
     return vented_s > (_STOP_GIVES_UP_S if empty or scene.way_down == "stop" else _VENTED_S)
 
 
@@ -266,18 +293,27 @@ HANDLERS: dict[State, Callable[[Scene], State]] = {
 
 
 def run_state(state: State, scene: Scene) -> State:
-    """Run the state's handler and return the next state; a request for another state takes precedence."""
+    """Run the state's handler and return the next state; a request for another state takes
+    precedence.
+    """
     if scene.way_down is not None and state not in (State.LOWER, State.FAULT):
         _explain_way_down(scene)
         return State.LOWER
-    if state in (State.INFLATE, State.SETTLE, State.HOLD) and (elsewhere := _asked_elsewhere(scene)) is not None:
+    if (
+        state in (State.INFLATE, State.SETTLE, State.HOLD)
+        and (elsewhere := _asked_elsewhere(scene)) is not None
+    ):
         return elsewhere
     return HANDLERS[state](scene)
 
 
 def _explain_way_down(scene: Scene, more: str = "") -> None:
     way = "vent" if scene.venting and scene.way_down == "lower" else str(scene.way_down)
-    who = "the duration is over" if scene.asked_by == commands.AT_END else f"{way} requested by {scene.asked_by}"
+    who = (
+        "the duration is over"
+        if scene.asked_by == commands.AT_END
+        else f"{way} requested by {scene.asked_by}"
+    )
     scene.explain(WhyCode.GOING_DOWN, f"{who}{more}", way, scene.asked_by, bool(more))
 
 
@@ -296,7 +332,9 @@ def _manual_over(scene: Scene) -> str:
 def _asked_elsewhere(scene: Scene) -> State | None:
     """The requested state, if it is not a hold."""
     if scene.trial is not None:
-        _drive(scene, scene.setpoint_um)  # the loop runs this tick: otherwise the pump would be off for 20 ms
+        _drive(
+            scene, scene.setpoint_um
+        )  # the loop runs this tick: otherwise the pump would be off for 20 ms
         requested = f"{scene.asked_by} requested the experiment {scene.trial.spec.kind}"
         scene.explain(WhyCode.EXPERIMENT_REQUESTED, requested)
         return State.TUNE
@@ -337,16 +375,23 @@ def _running_test(scene: Scene) -> pump_obeys.ActuatorTest:
         return pump_obeys.ActuatorTest(memory.pump, memory.test_vent, rate_hz, memory)
     reading = scene.observer.reading
     vents = reading is not None and math.isfinite(reading.vent_fraction)
-    tense = reading is not None and reading.gauge_pressure_pa > scene.config.states.vented_pressure_pa
+    tense = (
+        reading is not None and reading.gauge_pressure_pa > scene.config.states.vented_pressure_pa
+    )
     test = pump_obeys.ActuatorTest(scene.pump_config, vents and tense, rate_hz)
     scene.test_memory = test.memory
     return test
 
 
 def _begin(scene: Scene, leak_um_per_s: float) -> State:
-    """Hand over to the loop at the flow that balances the leak, so that the integrator need not find it."""
+    """Hand over to the loop at the flow that balances the leak, so that the integrator need not
+    find it.
+    """
     scene.loop.start(scene.observer.displacement_um, leak_um_per_s)
-    scene.explain(WhyCode.CHECKED, f"all sensors good, the film responds and sinks by {leak_um_per_s:.2f} µm/s")
+    scene.explain(
+        WhyCode.CHECKED,
+        f"all sensors good, the film responds and sinks by {leak_um_per_s:.2f} µm/s",
+    )
     scene.pump_fraction = scene.last_pump_fraction
     return State.INFLATE
 
@@ -385,7 +430,11 @@ def _missing(scene: Scene) -> Reason:
         faults = f"the board has latched faults {reading.latched_faults:#x}"
         return make_reason(WhyCode.BOARD_FAULTS, faults, reading.latched_faults)
     mask = scene.interlocks.open_mask
-    return make_reason(WhyCode.INTERLOCK_OPEN, scene.interlocks.describe_open(mask), mask) if mask else NO_REASON
+    return (
+        make_reason(WhyCode.INTERLOCK_OPEN, scene.interlocks.describe_open(mask), mask)
+        if mask
+        else NO_REASON
+    )
 
 
 def _explain_hold(scene: Scene, output: inner_loop.LoopOutput) -> None:

@@ -1,7 +1,7 @@
 """Inputs and outputs of a tick: the whole interface between the control code and the world.
 
-A tick is a plain function of these, with no I/O and no clock: the asyncio supervisor, the virtual-time runs and
-a replay call the same code.
+A tick is a plain function of these, with no I/O and no clock: the asyncio supervisor, the
+virtual-time runs and a replay call the same code.
 """
 
 import json
@@ -34,7 +34,8 @@ class TickInputs:
     lateness_ms: float = 0.0  # start after the deadline
     missed_ticks: int = 0  # running count of skipped deadlines
     link_up: bool = True  # the device link is connected
-    estimate: shape_estimate.ShapeEstimate | None = None  # the newest shape, only in the tick in which it arrives
+    # the newest shape, only in the tick in which it arrives
+    estimate: shape_estimate.ShapeEstimate | None = None
     commands: tuple[Command, ...] = ()  # since the last tick
     dead_tasks: tuple[str, ...] = ()  # supervised tasks that ended
     # the twin's truth, for the record only; NaN on a real bench
@@ -50,15 +51,18 @@ class TickOutputs:
     row: telemetry.TelemetryRow
     events: tuple[Event, ...]
     finished: errors.Exit | None  # exit code if the run is over
-    answers: tuple[tuple[int, str], ...] = ()  # number of each command, and why it was refused (empty: executed)
-    clear_mask: int = 0  # the board's latches to clear: all after `ack`, the watchdog's by the resume rule
+    answers: tuple[
+        tuple[int, str], ...
+    ] = ()  # number of each command, and why it was refused (empty: executed)
+    # the board's latches to clear: all after `ack`, the watchdog's by the resume rule
+    clear_mask: int = 0
 
 
 # The exact inputs of a tick as bytes, so that a replay gives the same tick (docs/replay.md).
 #
-# A tick is one fixed record and its telemetry row; rare data (commands, ended tasks) precede it as JSON, in pieces. A
-# shape estimate is referred to by its time: the recorder has it from its own ring. A checksum of all outputs tells
-# whether a replay is identical.
+# A tick is one fixed record and its telemetry row; rare data (commands, ended tasks) precede it as
+# JSON, in pieces. A shape estimate is referred to by its time: the recorder has it from its own
+# ring. A checksum of all outputs tells whether a replay is identical.
 
 # First bytes of the inputs ring's messages.
 TICK, PIECE = b"T", b"P"
@@ -68,24 +72,43 @@ _READING = {name: _FORMATS[kind] for name, kind in get_type_hints(BenchReading).
 _LINK_UP, _HAS_READING = 1, 2
 RECORD = np.dtype(
     [
-        ("tick", "<i8"), ("now_s", "<f8"), ("dt_s", "<f8"), ("lateness_ms", "<f8"), ("missed_ticks", "<i8"),
+        ("tick", "<i8"),
+        ("now_s", "<f8"),
+        ("dt_s", "<f8"),
+        ("lateness_ms", "<f8"),
+        ("missed_ticks", "<i8"),
         ("flags", "u1"),
         *((name, f"<{code}") for name, code in _READING.items()),
-        ("estimate_time_s", "<f8"), ("truth_displacement_um", "<f8"), ("truth_laser_bias_um", "<f8"),
-        ("output_crc", "<u4"), ("tail_bytes", "<u4"),
+        ("estimate_time_s", "<f8"),
+        ("truth_displacement_um", "<f8"),
+        ("truth_laser_bias_um", "<f8"),
+        ("output_crc", "<u4"),
+        ("tail_bytes", "<u4"),
     ]
-)  # fmt: skip
+)
 Records = NDArray[np.void]
-# Readings of sensors that the telemetry row repeats as they are; that of the gauge it has without jumps.
+# Readings of sensors that the telemetry row repeats as they are; that of the gauge it has without
+# jumps.
 AS_READ = tuple(name for name in SENSORS if name in COLUMNS and name != "gauge_pressure_pa")
 # Fields of a record that the tick's telemetry row repeats.
 SAME = {
-    "now_s": "mono_s", "pump_fraction": "pump_readback_fraction", "vent_fraction": "vent_readback_fraction",
-    **{name: name for name in (
-        "tick", "lateness_ms", "missed_ticks", *AS_READ, "gas_temperature_c", "device_time_s",
-        "truth_displacement_um", "truth_laser_bias_um",
-    )},
-}  # fmt: skip
+    "now_s": "mono_s",
+    "pump_fraction": "pump_readback_fraction",
+    "vent_fraction": "vent_readback_fraction",
+    **{
+        name: name
+        for name in (
+            "tick",
+            "lateness_ms",
+            "missed_ticks",
+            *AS_READ,
+            "gas_temperature_c",
+            "device_time_s",
+            "truth_displacement_um",
+            "truth_laser_bias_um",
+        )
+    },
+}
 _TAIL_LOST = 2**32 - 1  # no tail is that long
 
 # `struct` packs in 2 us what a NumPy record takes 10 us to fill
@@ -204,11 +227,13 @@ def _tail(inputs: TickInputs) -> bytes:
     return json.dumps({"commands": commands, "dead_tasks": inputs.dead_tasks}).encode()
 
 
-def unpack_tick(record: np.void, tail: bytes, estimates: Mapping[float, shape_estimate.ShapeEstimate]) -> TickInputs:
+def unpack_tick(
+    record: np.void, tail: bytes, estimates: Mapping[float, shape_estimate.ShapeEstimate]
+) -> TickInputs:
     """Return the bit-exact inputs of a tick; `tail` are its commands and ended tasks as JSON.
 
-    `estimates` are the run's shape estimates by time. Raises LookupError if an estimate or a tail is
-    missing.
+    `estimates` are the run's shape estimates by time. Raises LookupError if an estimate or a tail
+    is missing.
     """
     values: dict[str, Any] = dict(zip(RECORD.names or (), record.item(), strict=True))
     if len(tail) != values["tail_bytes"]:
@@ -217,7 +242,9 @@ def unpack_tick(record: np.void, tail: bytes, estimates: Mapping[float, shape_es
     estimate_time_s = values["estimate_time_s"]
     if not math.isnan(estimate_time_s) and estimate_time_s not in estimates:
         raise LookupError(f"the shape of {estimate_time_s:.3f} s is missing")
-    reading = {name: values[name] for name in _READING} | {"watchdog_tripped": bool(values["watchdog_tripped"])}
+    reading = {name: values[name] for name in _READING} | {
+        "watchdog_tripped": bool(values["watchdog_tripped"])
+    }
     return TickInputs(
         now_s=values["now_s"],
         dt_s=values["dt_s"],
@@ -244,14 +271,18 @@ class TickBatch:
 
 
 class TickAssembler:
-    """Assembles the pieces in the inputs ring; a tick whose pieces were overwritten gets an empty tail."""
+    """Assembles the pieces in the inputs ring; a tick whose pieces were overwritten gets an empty
+    tail.
+    """
 
     def __init__(self) -> None:
         self._pieces: list[bytes] = []
         self._snapshots: dict[int, bytes] = {}
 
     def add_snapshots(self, messages: list[bytes]) -> None:
-        """Add messages of the ring of snapshots, for the ticks of this or a later call of `take`."""
+        """Add messages of the ring of snapshots, for the ticks of
+        this or a later call of `take`.
+        """
         for message in messages:
             (tick,) = _SNAPSHOT_HEAD.unpack_from(message)
             self._snapshots[tick] = message[_SNAPSHOT_HEAD.size :]
@@ -274,4 +305,6 @@ class TickAssembler:
                     snapshots[tick] = self._snapshots.pop(tick)
             else:
                 self._pieces.append(message[1:])
-        return TickBatch(np.frombuffer(b"".join(records), dtype=RECORD), telemetry.unpack(rows), tails, snapshots)
+        return TickBatch(
+            np.frombuffer(b"".join(records), dtype=RECORD), telemetry.unpack(rows), tails, snapshots
+        )

@@ -1,4 +1,6 @@
-"""`membrane-ctrl doors`: one process that follows a hold and serves it to the lab's other systems."""
+"""`membrane-ctrl doors`: one process that follows a hold and serves
+it to the lab's other systems.
+"""
 
 from __future__ import annotations
 
@@ -15,21 +17,30 @@ from membrane_ctrl.model import errors
 if TYPE_CHECKING:
     from membrane_ctrl.doors.names import Door
 
-_LIBRARIES = {"opcua": "asyncua", "epics": "softioc", "mqtt": "aiomqtt"}  # each door's module, and what it needs
+_LIBRARIES = {
+    "opcua": "asyncua",
+    "epics": "softioc",
+    "mqtt": "aiomqtt",
+}  # each door's module, and what it needs
 
 app = typer.Typer(
     invoke_without_command=True,
     rich_markup_mode="markdown",
-    help="Open the doors of `[doors]`: the hold's values by MQTT, OPC UA and EPICS, and commands by role.",
+    help="Open the doors of `[doors]`: the hold's values by MQTT, OPC UA and EPICS, and commands "
+    "by role.",
 )
 
 
 @app.callback()
 def doors(
     context: typer.Context,
-    config: Annotated[Path | None, typer.Option("--config", help="Configuration with the table `[doors]`.")] = None,
+    config: Annotated[
+        Path | None, typer.Option("--config", help="Configuration with the table `[doors]`.")
+    ] = None,
     logs: Annotated[Path | None, typer.Option("--logs", help="Folder of the runs.")] = None,
-    socket: Annotated[Path | None, typer.Option("--socket", help="Control port of the hold.")] = None,
+    socket: Annotated[
+        Path | None, typer.Option("--socket", help="Control port of the hold.")
+    ] = None,
 ) -> None:
     """Serve until interrupted."""
     if context.invoked_subcommand is not None:
@@ -41,7 +52,9 @@ def doors(
 
     settings = configured(config)
     if not any(getattr(settings.doors, name) for name in _LIBRARIES):
-        raise errors.InputError("no door to open: add [doors.mqtt], [doors.opcua] or [doors.epics] (docs/doors.md)")
+        raise errors.InputError(
+            "no door to open: add [doors.mqtt], [doors.opcua] or [doors.epics] (docs/doors.md)"
+        )
     asyncio.run(_serve(Door.to(settings, logs, socket)))
 
 
@@ -84,13 +97,17 @@ def _first_error(group: BaseExceptionGroup[errors.CommandError]) -> errors.Comma
 
 
 def _opened(door: Door) -> list[Any]:
-    """The doors of the settings, to be awaited. Raises InputError for one whose library is missing."""
+    """The doors of the settings, to be awaited. Raises InputError for
+    one whose library is missing.
+    """
     opened = []
     for name, library in _LIBRARIES.items():
         settings = getattr(door.settings, name)
         if settings is None:
             continue
         if importlib.util.find_spec(library) is None:
-            raise errors.InputError(f"doors.{name} needs {library}: pip install 'membrane-ctrl[{name}]'")
+            raise errors.InputError(
+                f"doors.{name} needs {library}: pip install 'membrane-ctrl[{name}]'"
+            )
         opened.append(importlib.import_module(f"membrane_ctrl.doors.{name}").serve(settings, door))
     return opened

@@ -1,12 +1,12 @@
 """The commands of all bridges on their way to the hold: two lanes, bounded in number and in time.
 
-Safety commands have a lane of their own. They are sent at once, the kinds in turn, and the same command that comes
-again while it waits shares the answer. Their answer comes within `SAFETY_ANSWER_S`; a hold that has not answered by
-then gets the command as soon as it can.
+Safety commands have a lane of their own. They are sent at once, the kinds in turn, and the same
+command that comes again while it waits shares the answer. Their answer comes within
+`SAFETY_ANSWER_S`; a hold that has not answered by then gets the command as soon as it can.
 
-All other commands wait in one queue of at most `ORDINARY_MOST`, and are refused `TIME_LIMIT_S` after their arrival:
-a `hold` that is obeyed a minute later is dangerous. A safety command also refuses those that wait, because they came
-before it and would undo it.
+All other commands wait in one queue of at most `ORDINARY_MOST`, and are refused `TIME_LIMIT_S`
+after their arrival: a `hold` that is obeyed a minute later is dangerous. A safety command also
+refuses those that wait, because they came before it and would undo it.
 
 There is one connection a lane: the control port drops connections of a user that has too many.
 """
@@ -107,14 +107,20 @@ class CommandLanes:
     def _submit_ordinary(self, request: Message, outcome: asyncio.Future[Outcome]) -> None:
         kind = str(request["do"])
         if len(self._ordinary) >= ORDINARY_MOST:
-            outcome.set_result(Outcome.refused(kind, f"too many commands at once: {ORDINARY_MOST} wait already"))
+            outcome.set_result(
+                Outcome.refused(kind, f"too many commands at once: {ORDINARY_MOST} wait already")
+            )
             return
         waiting = WaitingCommand(request, time.monotonic() + TIME_LIMIT_S, [outcome])
-        late = Outcome.refused(kind, f"not obeyed within {TIME_LIMIT_S:g} s, and will not be later; send again")
+        late = Outcome.refused(
+            kind, f"not obeyed within {TIME_LIMIT_S:g} s, and will not be later; send again"
+        )
         asyncio.get_running_loop().call_later(TIME_LIMIT_S, waiting.answer, late)
         self._ordinary.append(waiting)
         if self._ordinary_task is None or self._ordinary_task.done():
-            self._ordinary_task = asyncio.create_task(self._serve_ordinary(), name="bridge commands")
+            self._ordinary_task = asyncio.create_task(
+                self._serve_ordinary(), name="bridge commands"
+            )
 
     def _submit_safety(self, request: Message, outcome: asyncio.Future[Outcome]) -> None:
         kind = str(request["do"])
@@ -135,7 +141,9 @@ class CommandLanes:
             outcome.set_result(Outcome.refused(kind, full))
             return
         if self._safety_task is None or self._safety_task.done():
-            self._safety_task = asyncio.create_task(self._serve_safety(), name="bridge safety commands")
+            self._safety_task = asyncio.create_task(
+                self._serve_safety(), name="bridge safety commands"
+            )
 
     def _refuse_waiting(self, winner: str) -> None:
         """Refuse the waiting commands that came before a safety command and could undo it."""
@@ -166,13 +174,17 @@ class CommandLanes:
 
     async def _serve_safety(self) -> None:
         while (waiting := self._safety.take()) is not None:
-            outcome = await self._send_on_thread(waiting.request, SendLimits(float("inf"), _no_refusal))
+            outcome = await self._send_on_thread(
+                waiting.request, SendLimits(float("inf"), _no_refusal)
+            )
             if waiting.answered:
                 self._report_late(outcome)
             waiting.answer(outcome)
 
     async def _send_on_thread(self, request: Message, limits: SendLimits) -> Outcome:
-        """Send on a thread of its own, which ends with the process: a hold that hangs must not delay the exit."""
+        """Send on a thread of its own, which ends with the process: a hold that hangs must not
+        delay the exit.
+        """
         loop = asyncio.get_running_loop()
         outcome: asyncio.Future[Outcome] = loop.create_future()
 
@@ -184,7 +196,9 @@ class CommandLanes:
             try:
                 result = self._send(request, limits)
             except Exception as error:  # nothing else would see an exception of this thread
-                result = Outcome.failed(str(request["do"]), f"not sent: {type(error).__name__}: {error}")
+                result = Outcome.failed(
+                    str(request["do"]), f"not sent: {type(error).__name__}: {error}"
+                )
             with contextlib.suppress(RuntimeError):  # the loop is closed: nobody waits any more
                 loop.call_soon_threadsafe(set_outcome, result)
 

@@ -1,7 +1,9 @@
-"""The door to EPICS: one IOC for Channel Access and PV Access; a record for each published value and each command.
+"""The door to EPICS: one IOC for Channel Access and PV Access; a record for each published value
+and each command.
 
-Numbers without contact to the hold keep their last value with the severity INVALID and the status COMM, as EPICS
-has no empty number. EPICS libraries keep their state in the process: one IOC in each.
+Numbers without contact to the hold keep their last value with the severity INVALID and the status
+COMM, as EPICS has no empty number. EPICS libraries keep their state in the process: one IOC in
+each.
 """
 
 import asyncio
@@ -19,15 +21,18 @@ from membrane_ctrl.instruments import bench
 from membrane_ctrl.model import errors, files
 from membrane_ctrl.web.access import Action
 
-# Clients may write the value of a command (level 0) only. EPICS by itself lets them write everything, and the other
-# fields (FLNK, SCAN, ASG) would send commands in chains, again and again, or shut them.
+# Clients may write the value of a command (level 0) only. EPICS by itself lets them write
+# everything, and the other fields (FLNK, SCAN, ASG) would send commands in chains, again and again,
+# or shut them.
 _RULES = "ASG(DEFAULT) { RULE(1, READ) }\nASG(COMMAND) { RULE(1, READ) RULE(0, WRITE) }\n"
 _TEXT_BYTES = 512
 _DIGITS = 4
 
 
 async def serve(config: EpicsConfig, door: Door) -> None:
-    """Serve until cancelled. Raises DeviceError if the address is taken, or another server has these records."""
+    """Serve until cancelled. Raises DeviceError if the address is taken, or another server has
+    these records.
+    """
     with bench.locked([f"EPICS records {door.settings.name}:*"]):
         await _serve_records(config, door)
 
@@ -36,7 +41,11 @@ async def _serve_records(config: EpicsConfig, door: Door) -> None:
     async with door.opening:
         await asyncio.to_thread(require_unserved, f"{door.settings.name}:state", config.ca_port)
         records = _opened(config, door)
-    print(f"epics: {config.host}, CA {config.ca_port}, PVA {config.pva_port}", file=sys.stderr, flush=True)
+    print(
+        f"epics: {config.host}, CA {config.ca_port}, PVA {config.pva_port}",
+        file=sys.stderr,
+        flush=True,
+    )
     from softioc import alarm
 
     while True:
@@ -46,7 +55,9 @@ async def _serve_records(config: EpicsConfig, door: Door) -> None:
             if value is not None:
                 record.set(_fitting(value))
             else:
-                record.set_alarm(alarm.INVALID_ALARM, alarm.COMM_ALARM if not live else alarm.UDF_ALARM)
+                record.set_alarm(
+                    alarm.INVALID_ALARM, alarm.COMM_ALARM if not live else alarm.UDF_ALARM
+                )
         await asyncio.sleep(door.settings.period_s)
 
 
@@ -54,10 +65,18 @@ def _opened(config: EpicsConfig, door: Door) -> dict[str, Any]:
     """Start the IOC, which takes seconds; returns the records of the published values."""
     _require_free(config)
     addresses = {"EPICS_CAS_INTF_ADDR_LIST": config.host, "EPICS_PVAS_INTF_ADDR_LIST": config.host}
-    addresses |= {"EPICS_CAS_BEACON_ADDR_LIST": config.host, "EPICS_CAS_AUTO_BEACON_ADDR_LIST": "NO"}
-    addresses |= {"EPICS_PVAS_BEACON_ADDR_LIST": config.host, "EPICS_PVAS_AUTO_BEACON_ADDR_LIST": "NO"}
+    addresses |= {
+        "EPICS_CAS_BEACON_ADDR_LIST": config.host,
+        "EPICS_CAS_AUTO_BEACON_ADDR_LIST": "NO",
+    }
+    addresses |= {
+        "EPICS_PVAS_BEACON_ADDR_LIST": config.host,
+        "EPICS_PVAS_AUTO_BEACON_ADDR_LIST": "NO",
+    }
     os.environ.update(addresses)
-    os.environ.update(EPICS_CA_SERVER_PORT=str(config.ca_port), EPICS_PVAS_SERVER_PORT=str(config.pva_port))
+    os.environ.update(
+        EPICS_CA_SERVER_PORT=str(config.ca_port), EPICS_PVAS_SERVER_PORT=str(config.pva_port)
+    )
     from softioc import asyncio_dispatcher, builder, imports, softioc  # they read the environment
 
     builder.SetDeviceName(door.settings.name)
@@ -80,7 +99,9 @@ def _require_free(config: EpicsConfig) -> None:
             socket.create_server((config.host, port)).close()
         except OSError as error:
             where = f"{config.host}:{port}"
-            raise errors.DeviceError(f"epics: {where}: {errors.os_reason(error)}; choose another port") from None
+            raise errors.DeviceError(
+                f"epics: {where}: {errors.os_reason(error)}; choose another port"
+            ) from None
 
 
 def _fitting(value: Value) -> Value:
@@ -98,7 +119,9 @@ def _record(builder: Any, published: Published) -> Any:
 
 
 def _command(builder: Any, door: Door, do: str, action: Action, answer: Any) -> None:
-    """The record `do:COMMAND`: a number, a text, or any write at all; a put ends once the answer is there."""
+    """The record `do:COMMAND`: a number, a text, or any write at all; a put ends once the answer is
+    there.
+    """
 
     async def obey(value: object) -> None:
         answer.set(_fitting(await door.ask("epics", do, value if action.asks else "")))
@@ -106,7 +129,9 @@ def _command(builder: Any, door: Door, do: str, action: Action, answer: Any) -> 
     common = {"on_update": obey, "always_update": True, "ASG": "COMMAND", "DESC": action.label}
     if action.asks == "number":
         low, high = door.bounds[do]
-        builder.aOut(f"do:{do}", EGU=action.unit, PREC=_DIGITS, LOPR=low, HOPR=high, blocking=True, **common)
+        builder.aOut(
+            f"do:{do}", EGU=action.unit, PREC=_DIGITS, LOPR=low, HOPR=high, blocking=True, **common
+        )
     elif action.asks == "text":
         builder.longStringOut(f"do:{do}", length=_TEXT_BYTES, blocking=True, **common)
     else:

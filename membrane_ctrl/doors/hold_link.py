@@ -1,4 +1,6 @@
-"""One command from a bridge to the hold, on a connection of its own. Blocking: it runs on a thread of the lanes."""
+"""One command from a bridge to the hold, on a connection of its own. Blocking: it runs on a thread
+of the lanes.
+"""
 
 from __future__ import annotations
 
@@ -26,8 +28,9 @@ class SendLimits:
 def send_command(where: Where, run: str, request: Message, limits: SendLimits) -> Outcome:
     """Send a command to the run named `run`; returns what became of it.
 
-    A hold that hangs does not greet, so nothing is sent to it that it could obey a minute later. If it hangs between
-    greeting and tick, it refuses the command by its time limit. Safety commands have none of these conditions.
+    A hold that hangs does not greet, so nothing is sent to it that it could obey a minute later. If
+    it hangs between greeting and tick, it refuses the command by its time limit. Safety commands
+    have none of these conditions.
     """
     kind = str(request["do"])
     what = kind.replace("_", " ")
@@ -35,7 +38,9 @@ def send_command(where: Where, run: str, request: Message, limits: SendLimits) -
         with connected(where, notice=_ignore_notice) as client:
             if not is_safety_command(kind):
                 if client.greeting.get("run") != run:
-                    return Outcome.failed(what, "not sent: another run is listening now; look again")
+                    return Outcome.failed(
+                        what, "not sent: another run is listening now; look again"
+                    )
                 if reason := _late_reason(limits):
                     return Outcome.refused(what, reason)
                 request = request | _expiry(client.greeting, limits.deadline_s)
@@ -52,7 +57,9 @@ def _late_reason(limits: SendLimits) -> str:
 
 
 def _expiry(greeting: Message, deadline_s: float) -> Message:
-    """The request's time limit on the hold's clock; none for a hold that does not send its clock."""
+    """The request's time limit on the hold's clock; none for a hold
+    that does not send its clock.
+    """
     now_s = greeting.get("now_s")
     if not isinstance(now_s, int | float):
         return {}

@@ -1,11 +1,13 @@
-"""The door to MQTT: one JSON object of all values, a retained availability, commands, Home Assistant's discovery.
+"""The door to MQTT: one JSON object of all values, a retained availability, commands, Home
+Assistant's discovery.
 
-Topics, below `membrane/<name>/`: `values`, `availability` (`online`, `offline`; retained, also the last will),
-`do/<command>`, `answer`, `owner` (`mqtt_owner`), `order` (`mqtt_barrier`).
+Topics, below `membrane/<name>/`: `values`, `availability` (`online`, `offline`; retained, also the
+last will), `do/<command>`, `answer`, `owner` (`mqtt_owner`), `order` (`mqtt_barrier`).
 
-There are two connections. The first one has the safety commands and the claim to the name. A broker queues messages
-for each connection apart and drops what a slow one does not take, so no flood of other commands can drop a `latch`.
-The second one publishes the values and has all other commands; only its will says that the bridge has gone.
+There are two connections. The first one has the safety commands and the claim to the name. A broker
+queues messages for each connection apart and drops what a slow one does not take, so no flood of
+other commands can drop a `latch`. The second one publishes the values and has all other commands;
+only its will says that the bridge has gone.
 """
 
 import asyncio
@@ -37,7 +39,8 @@ from membrane_ctrl.model.columns import QUANTITY_OF_UNIT
 _LEAVES_S = 2.0
 _ANSWER_S = 5.0  # of the broker to each message
 _AGAIN_S = 1.0  # a returned broker has values within two seconds, however long it was away
-_STEADY_S = 10.0  # a connection that lasted so long worked: the next failure is a new one, and is printed
+# a connection that lasted so long worked: the next failure is a new one, and is printed
+_STEADY_S = 10.0
 _KEEPALIVE_S = 10  # the broker notices a cut line after one and a half of these
 _PACKET_BYTES_MAX = 1 << 20  # a broker of MQTT 5 delivers no larger message
 _LOOK_S = 0.5  # how often the availability is compared with the hold
@@ -58,7 +61,9 @@ async def serve(config: MqttConfig, door: Door) -> None:
         pass  # a connection would time out meanwhile
     while True:
         began_s = time.monotonic()
-        connection = asyncio.create_task(_serve_connection(broker, config, door, ownership), name="mqtt connection")
+        connection = asyncio.create_task(
+            _serve_connection(broker, config, door, ownership), name="mqtt connection"
+        )
         await _wait_for_end(connection)
         try:
             connection.result()
@@ -74,7 +79,9 @@ async def serve(config: MqttConfig, door: Door) -> None:
 
 
 async def _wait_for_end(connection: asyncio.Task[None]) -> None:
-    """Wait for the end of a connection; a cancellation ends it, whatever errors its closing brings about."""
+    """Wait for the end of a connection; a cancellation ends it, whatever errors its closing brings
+    about.
+    """
     try:
         await asyncio.wait({connection})
     except asyncio.CancelledError:
@@ -106,10 +113,13 @@ class Broker:
         self.where = f"{config.host}:{config.port}"
         self.base = f"membrane/{name}"
 
-    def client(self, purpose: str, handle: HandleMessage, will: aiomqtt.Will | None = None) -> aiomqtt.Client:
+    def client(
+        self, purpose: str, handle: HandleMessage, will: aiomqtt.Will | None = None
+    ) -> aiomqtt.Client:
         """A connection for a purpose, a context manager.
 
-        Its identifier stays the same for this process: at a reconnection the broker ends the former connection.
+        Its identifier stays the same for this process: at a reconnection the broker ends the former
+        connection.
         """
         inbox = Inbox(handle)
 
@@ -158,7 +168,9 @@ def _context(config: MqttConfig) -> ssl.SSLContext | None:
         raise errors.InputError(f"doors.mqtt.ca_file: {config.ca_file}: {error}") from None
 
 
-async def _serve_connection(broker: Broker, config: MqttConfig, door: Door, ownership: NameOwnership) -> None:
+async def _serve_connection(
+    broker: Broker, config: MqttConfig, door: Door, ownership: NameOwnership
+) -> None:
     """Connect, claim the name, publish and obey until a connection fails."""
     base = broker.base
     owner_topic = f"{base}/owner"
@@ -188,13 +200,17 @@ async def _serve_connection(broker: Broker, config: MqttConfig, door: Door, owne
         await guard.subscribe(owner_topic, qos=1)
         await ownership.establish(publish_claim)
         keeping = tasks.create_task(ownership.keep(publish_claim))
-        others = (tasks.create_task(safety_reports.run()), tasks.create_task(barrier.run(publish_marker)))
+        others = (
+            tasks.create_task(safety_reports.run()),
+            tasks.create_task(barrier.run(publish_marker)),
+        )
         await guard.subscribe([(f"{base}/do/{name}", 1) for name in sorted(SAFETY)])
         door.late_listeners.append(safety_reports.add)
         try:
             await _publish_and_obey(broker, config, door, barrier)
         except asyncio.CancelledError:
-            # The program ends, unless it was another task that failed: the name is free for the next bridge.
+            # The program ends, unless it was another task that failed: the name is free for the
+            # next bridge.
             failed = any(task.done() for task in (watching, keeping, *others))
             keeping.cancel()
             if not failed:
@@ -212,8 +228,12 @@ async def _wait_for_disconnect(client: aiomqtt.Client) -> None:
         pass
 
 
-async def _publish_and_obey(broker: Broker, config: MqttConfig, door: Door, barrier: OrderBarrier) -> None:
-    """Publish the values, and obey the commands that are no safety commands, on a connection of their own."""
+async def _publish_and_obey(
+    broker: Broker, config: MqttConfig, door: Door, barrier: OrderBarrier
+) -> None:
+    """Publish the values, and obey the commands that are no safety commands, on a connection of
+    their own.
+    """
     base = broker.base
 
     async def publish_answer(answer: str) -> None:
@@ -237,7 +257,9 @@ async def _publish_and_obey(broker: Broker, config: MqttConfig, door: Door, barr
     will = aiomqtt.Will(f"{base}/availability", "offline", qos=1, retain=True)
     async with broker.client("values", handle, will) as client:
         print(f"mqtt: connected to {broker.where}", file=sys.stderr, flush=True)
-        await client.subscribe([(f"{base}/{topic}", 1) for topic in ("do/+", "availability", "order")])
+        await client.subscribe(
+            [(f"{base}/{topic}", 1) for topic in ("do/+", "availability", "order")]
+        )
         if config.discovery_prefix:
             topic = f"{config.discovery_prefix}/device/membrane_{door.settings.name}/config"
             await client.publish(topic, json.dumps(discovery(door, base)), qos=1, retain=True)
@@ -256,8 +278,8 @@ async def _publish_and_obey(broker: Broker, config: MqttConfig, door: Door, barr
 class Availability:
     """What the broker holds as availability.
 
-    A broker that has not noticed the end of a former connection publishes its will later, while values flow. So the
-    topic is watched, and published again when it is wrong.
+    A broker that has not noticed the end of a former connection publishes its will later, while
+    values flow. So the topic is watched, and published again when it is wrong.
     """
 
     def __init__(self) -> None:
@@ -279,7 +301,9 @@ class Availability:
         self._wrong = False
 
 
-async def _publish(client: aiomqtt.Client, door: Door, base: str, availability: Availability) -> None:
+async def _publish(
+    client: aiomqtt.Client, door: Door, base: str, availability: Availability
+) -> None:
     """Publish the values every period, and the availability when it changes or is wrong."""
     next_s = time.monotonic()
     while True:
@@ -287,7 +311,10 @@ async def _publish(client: aiomqtt.Client, door: Door, base: str, availability: 
         due = availability.is_due(now)
         if due or time.monotonic() >= next_s:
             next_s = time.monotonic() + door.settings.period_s
-            message = {"time_utc": datetime.now(UTC).isoformat(timespec="milliseconds"), **door.values()}
+            message = {
+                "time_utc": datetime.now(UTC).isoformat(timespec="milliseconds"),
+                **door.values(),
+            }
             await client.publish(f"{base}/values", json.dumps(message))
         if due:  # after the values: whoever sees `online` has them
             availability.note_published(now)
@@ -317,17 +344,25 @@ def _payload(message: aiomqtt.Message) -> bytes:
 
 
 def discovery(door: Door, base: str) -> dict[str, Any]:
-    """The device with its entities, as Home Assistant takes it (device discovery, 2024.11 and later)."""
+    """The device with its entities, as Home Assistant takes it (device discovery, 2024.11 and
+    later).
+    """
     name = door.settings.name
     found = {each.name: _sensor(each, name) for each in TABLE}
     for do, action in door.commands.items():
-        entity: dict[str, Any] = {"unique_id": f"membrane_{name}_do_{do}", "command_topic": f"{base}/do/{do}"}
+        entity: dict[str, Any] = {
+            "unique_id": f"membrane_{name}_do_{do}",
+            "command_topic": f"{base}/do/{do}",
+        }
         entity |= {"name": action.label, "icon": "mdi:gesture-tap-button"}
         if action.asks == "number":
             low, high = door.bounds[do]
             shown = "target_um" if do == "setpoint" else "flow_um_per_s"
             entity |= {"platform": "number", "min": low, "max": high, "step": 0.01, "mode": "box"}
-            entity |= {"unit_of_measurement": action.unit, "value_template": f"{{{{ value_json.{shown} }}}}"}
+            entity |= {
+                "unit_of_measurement": action.unit,
+                "value_template": f"{{{{ value_json.{shown} }}}}",
+            }
             entity |= {"state_topic": f"{base}/values"}
         else:
             entity |= {"platform": "text" if action.asks else "button"}
@@ -342,7 +377,11 @@ def discovery(door: Door, base: str) -> dict[str, Any]:
 
 
 def _sensor(each: Published, name: str) -> dict[str, Any]:
-    found: dict[str, Any] = {"platform": "sensor", "unique_id": f"membrane_{name}_{each.name}", "name": each.name}
+    found: dict[str, Any] = {
+        "platform": "sensor",
+        "unique_id": f"membrane_{name}_{each.name}",
+        "name": each.name,
+    }
     if each.is_text:
         found["value_template"] = f"{{{{ (value_json.{each.name} or '')[:{_STATE_LETTERS}] }}}}"
         return found

@@ -1,8 +1,10 @@
-"""Keeps the order of a safety command and the commands that were published before it, over two connections.
+"""Keeps the order of a safety command and the commands that were published before it, over two
+connections.
 
-A `hold` that was published before a `lower` may arrive after it, because it is another connection's, behind the rest
-of a flood. So each safety command publishes a marker that the connection of the other commands receives behind all
-that was published earlier. Until the marker is back, commands that could undo the safety command are refused.
+A `hold` that was published before a `lower` may arrive after it, because it is another
+connection's, behind the rest of a flood. So each safety command publishes a marker that the
+connection of the other commands receives behind all that was published earlier. Until the marker is
+back, commands that could undo the safety command are refused.
 """
 
 from __future__ import annotations
@@ -16,7 +18,9 @@ PublishMarker = Callable[[str], Awaitable[None]]
 
 
 class OrderBarrier:
-    """The markers of one pair of connections; `instance` tells them from those of other processes."""
+    """The markers of one pair of connections; `instance` tells them
+    from those of other processes.
+    """
 
     def __init__(self, instance: str) -> None:
         self._instance = instance
@@ -39,7 +43,9 @@ class OrderBarrier:
 
     @property
     def newest(self) -> str:
-        """The safety command behind which commands that are received now may have been published; usually empty."""
+        """The safety command behind which commands that are received now may have been published;
+        usually empty.
+        """
         return self._newest if self._returned < self._sent else ""
 
     async def run(self, publish: PublishMarker) -> None:

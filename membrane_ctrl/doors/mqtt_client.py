@@ -11,8 +11,9 @@ import aiomqtt
 class CancellableClient(aiomqtt.Client):
     """Raises a cancellation that arrives in the moment in which the broker confirms a call.
 
-    aiomqtt awaits confirmations with `asyncio.wait_for`, which loses such a cancellation in Python 3.11
-    (https://github.com/python/cpython/issues/86296): the task would go on, and nothing would end it.
+    aiomqtt awaits confirmations with `asyncio.wait_for`, which loses such a cancellation in Python
+    3.11 (https://github.com/python/cpython/issues/86296): the task would go on, and nothing would
+    end it.
     """
 
     async def publish(self, *args: Any, **kwargs: Any) -> None:

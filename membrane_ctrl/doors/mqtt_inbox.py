@@ -26,7 +26,8 @@ class Inbox(asyncio.Queue[aiomqtt.Message]):
 
 
 class Reports:
-    """Answers to commands, published in order. Of a flood of refusals, those for which there is no room are counted.
+    """Answers to commands, published in order. Of a flood of refusals, those for which there is no
+    room are counted.
 
     Parameters
     ----------

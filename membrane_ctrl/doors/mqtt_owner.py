@@ -1,15 +1,18 @@
-"""Who publishes under a name at an MQTT broker: one bridge, by a claim that all bridges of that name can see.
+"""Who publishes under a name at an MQTT broker: one bridge, by a claim that all bridges of that
+name can see.
 
-The claim is a retained message on `membrane/NAME/owner`. Its owner publishes it again every `BEAT_S`, and at once
-when it hears another bridge, so a claim without an owner is recognised by its silence. A bridge that starts
+The claim is a retained message on `membrane/NAME/owner`. Its owner publishes it again every
+`BEAT_S`, and at once when it hears another bridge, so a claim without an owner is recognised by its
+silence. A bridge that starts
 
 1. reads the retained claim, and publishes its own, not retained;
 2. listens: `SETTLE_S` if there is no other claim, `SILENT_S` if there is one;
 3. ends with an error as soon as it hears a live claim that outranks its own; else it is the owner.
 
-Two claims are compared by the time since which they are owned; a bridge that is not an owner yet ranks behind every
-owner, and equal ones are ordered by their random identifiers. So of two bridges that start together, one goes on; an
-owner is not displaced by a newcomer; and an owner whose connection was interrupted gets its name back.
+Two claims are compared by the time since which they are owned; a bridge that is not an owner yet
+ranks behind every owner, and equal ones are ordered by their random identifiers. So of two bridges
+that start together, one goes on; an owner is not displaced by a newcomer; and an owner whose
+connection was interrupted gets its name back.
 """
 
 from __future__ import annotations
@@ -29,7 +32,8 @@ from dataclasses import asdict, dataclass, replace
 from membrane_ctrl.model import errors
 
 BEAT_S = 2.0
-SETTLE_S = 1.0  # several times the way through a broker and the start of a process on a busy machine
+# several times the way through a broker and the start of a process on a busy machine
+SETTLE_S = 1.0
 SILENT_S = 5.0  # more than two beats
 _RETAINED_S = 0.3  # a broker delivers the retained claim right after the subscription
 _BETWEEN_ANSWERS_S = 0.2  # a flood of claims is not answered by a flood
@@ -74,7 +78,9 @@ def parse_claim(payload: bytes) -> OwnerClaim | None:
     with suppress(ValueError, TypeError, RecursionError):
         claim = OwnerClaim(**json.loads(payload))
         since_s = claim.since_s
-        owned = since_s is None or (type(since_s) in (int, float) and math.isfinite(since_s) and since_s >= 0.0)
+        owned = since_s is None or (
+            type(since_s) in (int, float) and math.isfinite(since_s) and since_s >= 0.0
+        )
         if (
             owned
             and _INSTANCE.fullmatch(claim.instance)
@@ -121,7 +127,9 @@ class NameOwnership:
         self._heard.set()
 
     async def establish(self, publish: Publish) -> None:
-        """Become the owner; call it after each connection. Raises DeviceError if another bridge has the name."""
+        """Become the owner; call it after each connection. Raises DeviceError if another bridge has
+        the name.
+        """
         await asyncio.sleep(_RETAINED_S)
         await publish(self.claim.encode(), False)
         deadline_s = time.monotonic() + self._listening_s()
@@ -138,7 +146,9 @@ class NameOwnership:
         await publish(self.claim.encode(), True)
 
     async def keep(self, publish: Publish) -> None:
-        """Renew the claim until cancelled. Raises DeviceError if a bridge with an older claim has come back."""
+        """Renew the claim until cancelled. Raises DeviceError if a bridge with an older claim has
+        come back.
+        """
         while True:
             await self._rival_heard(BEAT_S)
             await publish(self.claim.encode(), True)
@@ -158,7 +168,8 @@ class NameOwnership:
         return SETTLE_S if other is None else SILENT_S
 
     async def _rival_heard(self, timeout_s: float) -> bool:
-        """Wait for a live claim of another process; returns whether there was one, which ranks behind this one.
+        """Wait for a live claim of another process; returns whether there was one, which ranks
+        behind this one.
 
         Raises DeviceError if it ranks before this one.
         """
@@ -172,6 +183,7 @@ class NameOwnership:
         if not rival.outranks(self.claim):
             return True
         raise errors.DeviceError(
-            f"mqtt: {self._what} is in use by another bridge (process {rival.pid} on {rival.host}); "
+            f"mqtt: {self._what} is in use by another bridge (process {rival.pid} on "
+            f"{rival.host}); "
             "stop that one, or choose another doors.name"
         )

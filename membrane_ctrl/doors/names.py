@@ -1,4 +1,6 @@
-"""What every door publishes: one table of names with units, their values, and who may act through a door."""
+"""What every door publishes: one table of names with units, their values, and who may act through a
+door.
+"""
 
 import asyncio
 import math
@@ -28,7 +30,8 @@ Value = float | str | None  # None: not known
 # Who removes a lock must be known; the clients of a bridge are not.
 _NEVER = frozenset({"unlock"})
 COMMANDS = {str(action.do): action for action in (*ACTIONS, STOP) if str(action.do) not in _NEVER}
-_SAFETY_SHOWN_S = 5.0  # the answer to a safety command stays for so long, whatever else is refused meanwhile
+# the answer to a safety command stays for so long, whatever else is refused meanwhile
+_SAFETY_SHOWN_S = 5.0
 
 
 @dataclass(frozen=True, slots=True)
@@ -58,9 +61,17 @@ _TEXTS = (
     Published("why", "the one-line reason", is_text=True),
     Published("run", "name of the run", is_text=True),
     Published("fault", "the fault with its cause and remedy; empty without one", is_text=True),
-    Published("locks", "the locks: text, author, time and word of each; empty without one", is_text=True),
-    Published("interlocks", "the open interlocks with their texts; empty without one", is_text=True),
-    Published("notices", "all notices: open interlocks, maintenance, recording, link, processes", is_text=True),
+    Published(
+        "locks", "the locks: text, author, time and word of each; empty without one", is_text=True
+    ),
+    Published(
+        "interlocks", "the open interlocks with their texts; empty without one", is_text=True
+    ),
+    Published(
+        "notices",
+        "all notices: open interlocks, maintenance, recording, link, processes",
+        is_text=True,
+    ),
     Published("figure_verdict", "verdict on the newest figure", is_text=True),
     Published("answer", "what became of the last command of any door", is_text=True),
 )
@@ -97,11 +108,16 @@ def values(seen: HoldSeen) -> dict[str, Value]:
         found |= {"figure_verdict": seen.figure.verdict, "figure_age_s": age_s}
         found |= {"sag_um": seen.figure.sag_um, "sag_sigma_um": seen.figure.sag_sigma_um}
         found |= {f"z{j}_um": float(seen.figure.coeffs_um[j - 1]) for j in _TERMS}
-    return {name: None if isinstance(v, float) and not math.isfinite(v) else v for name, v in found.items()}
+    return {
+        name: None if isinstance(v, float) and not math.isfinite(v) else v
+        for name, v in found.items()
+    }
 
 
 class Door:
-    """What a door knows and may do: the values, and commands by role; shared by all doors of the process."""
+    """What a door knows and may do: the values, and commands by role; shared by all doors of the
+    process.
+    """
 
     def __init__(self, feed: HoldFeed, config: Config, where: Where | None = None) -> None:
         self.feed = feed
@@ -116,8 +132,12 @@ class Door:
         self._answer = ""
         self._safety_answered_s = -math.inf
         self._lanes = CommandLanes(self._send, self._report_late)
-        self.late_listeners: list[Callable[[str], None]] = []  # get the late outcomes of safety commands
-        self.opening = asyncio.Lock()  # one door after the other: a server blocks the event loop while it opens
+        self.late_listeners: list[
+            Callable[[str], None]
+        ] = []  # get the late outcomes of safety commands
+        self.opening = (
+            asyncio.Lock()
+        )  # one door after the other: a server blocks the event loop while it opens
 
     @classmethod
     def to(cls, config: Config, logs: Path | None, socket: Path | None) -> "Door":
@@ -141,7 +161,9 @@ class Door:
         user = WebUser("", self.settings.role)
         return {name: action for name, action in COMMANDS.items() if may(user, "tune", action)}
 
-    async def ask(self, by: str, name: str, given: Any = "", role: Role | None = None, who: str = "") -> str:
+    async def ask(
+        self, by: str, name: str, given: Any = "", role: Role | None = None, who: str = ""
+    ) -> str:
         """Send a command, as `submit`, and wait for what became of it."""
         return await self.submit(by, name, given, role, who)
 
@@ -159,7 +181,8 @@ class Door:
         given : object
             Its number or text, as the client sent it.
         role, who : str
-            Role and name of the client, where the bridge knows them; the configured role limits both.
+            Role and name of the client, where the bridge knows them; the configured role limits
+            both.
 
         Returns
         -------
@@ -190,7 +213,9 @@ class Door:
         await self._lanes.close()
 
     def _noted(self, by: str, name: str, outcome: Outcome) -> str:
-        """Note an outcome as the value `answer`; refusals of a flood do not replace a safety command's answer."""
+        """Note an outcome as the value `answer`; refusals of a flood do not replace a safety
+        command's answer.
+        """
         answer = f"{time.strftime('%H:%M:%S', time.gmtime())} UTC, {by}: {outcome.text}"
         safety = is_safety_command(name)
         now_s = time.monotonic()
@@ -213,9 +238,12 @@ class Door:
         action = COMMANDS.get(name)
         if action is None:
             raise ValueError("no such command")
-        # The role at the port is known only after the first contact: it must not refuse a safety command.
+        # The role at the port is known only after the first contact: it must not refuse a safety
+        # command.
         port_role = "tune" if is_safety_command(name) else self.feed.seen.role
-        allowed = may(WebUser(by, self.settings.role), port_role, action) and outranks(role, action.role)
+        allowed = may(WebUser(by, self.settings.role), port_role, action) and outranks(
+            role, action.role
+        )
         if not allowed:
             raise ValueError(f"{name} refused: needs the role {action.role}")
         why = f"door: {by}, {who}" if who else f"door: {by}"
@@ -234,13 +262,17 @@ class Door:
         text = str(given)
         if is_safety_command(name):
             return _cleaned(text)
-        if len(text.encode("utf-8", "replace")) > TEXT_BYTES:  # the port would drop a client that sends too much
+        if (
+            len(text.encode("utf-8", "replace")) > TEXT_BYTES
+        ):  # the port would drop a client that sends too much
             raise ValueError(f"{name} refused: longer than {TEXT_BYTES} bytes")
         return text
 
 
 def _number_text(action: Action, given: Any) -> str:
-    """A number in the notation of `request`. Raises ValueError for whatever is not exactly one finite number."""
+    """A number in the notation of `request`. Raises ValueError for whatever is not exactly one
+    finite number.
+    """
     if isinstance(given, bytes):
         given = _decoded(given[: TEXT_BYTES + 1], str(action.do))
     if isinstance(given, str):
@@ -262,7 +294,9 @@ def _number_text(action: Action, given: Any) -> str:
 
 
 def _decoded(payload: bytes, name: str) -> str:
-    """A payload as text. Raises ValueError for one that is no UTF-8, unless the command makes the mirror safe."""
+    """A payload as text. Raises ValueError for one that is no UTF-8, unless the command makes the
+    mirror safe.
+    """
     if is_safety_command(name):
         return payload.decode("utf-8", "replace")
     try:

@@ -1,7 +1,8 @@
-"""The door to OPC UA: a server with one object; its variables are the published values, its methods the commands.
+"""The door to OPC UA: a server with one object; its variables are the published values, its methods
+the commands.
 
-Without contact to the hold a variable has the status `BadNoCommunication` and no value. Sessions are anonymous, or of
-the users of a file; without a certificate they are not encrypted.
+Without contact to the hold a variable has the status `BadNoCommunication` and no value. Sessions
+are anonymous, or of the users of a file; without a certificate they are not encrypted.
 """
 
 import asyncio
@@ -32,7 +33,8 @@ _ENCRYPTED = [
 async def serve(config: OpcuaConfig, door: Door) -> None:
     """Serve until cancelled.
 
-    Raises InputError for a bad file of users, certificate or key, DeviceError if the address is taken.
+    Raises InputError for a bad file of users, certificate or key, DeviceError if the address is
+    taken.
     """
     where = f"opc.tcp://{config.host}:{config.port}/membrane_ctrl"
     users = _read_users(config)
@@ -44,11 +46,15 @@ async def serve(config: OpcuaConfig, door: Door) -> None:
         await _secure(server, config, door.settings.name)
         space = await server.register_namespace(f"urn:membrane-ctrl:{door.settings.name}")
         nodes = await _nodes(server, space, door, users)
-        await _show(server, nodes, door)  # nobody may see the zeros that the variables were made with
+        await _show(
+            server, nodes, door
+        )  # nobody may see the zeros that the variables were made with
         try:
             await server.start()
         except OSError as error:
-            raise errors.DeviceError(f"opcua: {where}: {errors.os_reason(error)}; choose another port") from None
+            raise errors.DeviceError(
+                f"opcua: {where}: {errors.os_reason(error)}; choose another port"
+            ) from None
     print(f"opcua: {where}", file=sys.stderr, flush=True)
     try:
         while True:
@@ -76,7 +82,9 @@ def _read_users(config: OpcuaConfig) -> dict[str, KnownUser] | None:
 
 async def _secure(server: BridgeServer, config: OpcuaConfig, name: str) -> None:
     """Set how sessions are encrypted and who they may belong to. Raises InputError."""
-    server.set_identity_tokens([ua.AnonymousIdentityToken if config.users_file is None else ua.UserNameIdentityToken])
+    server.set_identity_tokens(
+        [ua.AnonymousIdentityToken if config.users_file is None else ua.UserNameIdentityToken]
+    )
     server.set_security_policy(_ENCRYPTED if config.encrypted else _OPEN)
     if not config.encrypted:
         return
@@ -92,7 +100,9 @@ async def _secure(server: BridgeServer, config: OpcuaConfig, name: str) -> None:
         except (OSError, ValueError, TypeError) as error:
             raise errors.InputError(f"doors.opcua.{key}: {file}: {error}") from None
     if not isinstance(server.iserver.certificate.public_key(), rsa.RSAPublicKey):
-        raise errors.InputError(f"doors.opcua.certificate_file: {config.certificate_file}: OPC UA needs an RSA key")
+        raise errors.InputError(
+            f"doors.opcua.certificate_file: {config.certificate_file}: OPC UA needs an RSA key"
+        )
     if not isinstance(server.iserver.private_key, rsa.RSAPrivateKey):
         raise errors.InputError(f"doors.opcua.key_file: {config.key_file}: OPC UA needs an RSA key")
 
@@ -102,21 +112,32 @@ async def _show(server: Server, nodes: dict[str, Node], door: Door) -> None:
         await server.write_attribute_value(nodes[name].nodeid, _data(value, door.live))
 
 
-async def _nodes(server: Server, space: int, door: Door, users: dict[str, KnownUser] | None) -> dict[str, Node]:
+async def _nodes(
+    server: Server, space: int, door: Door, users: dict[str, KnownUser] | None
+) -> dict[str, Node]:
     """Make the object with its variables and methods; returns the variables by name."""
     name = door.settings.name
-    mirror = await server.nodes.objects.add_object(ua.NodeId(name, space), ua.QualifiedName(name, space))
+    mirror = await server.nodes.objects.add_object(
+        ua.NodeId(name, space), ua.QualifiedName(name, space)
+    )
     found = {}
     for each in TABLE:
         node = await mirror.add_variable(
-            ua.NodeId(f"{name}.{each.name}", space), ua.QualifiedName(each.name, space), "" if each.is_text else 0.0
+            ua.NodeId(f"{name}.{each.name}", space),
+            ua.QualifiedName(each.name, space),
+            "" if each.is_text else 0.0,
         )
         await node.write_attribute(
-            ua.AttributeIds.Description, ua.DataValue(ua.Variant(ua.LocalizedText(each.description)))
+            ua.AttributeIds.Description,
+            ua.DataValue(ua.Variant(ua.LocalizedText(each.description))),
         )
         if each.unit:
-            unit = ua.EUInformation(_UNITS, -1, ua.LocalizedText(each.unit), ua.LocalizedText(each.description))
-            await node.add_property(ua.NodeId(f"{name}.{each.name}.unit", space), "0:EngineeringUnits", unit)
+            unit = ua.EUInformation(
+                _UNITS, -1, ua.LocalizedText(each.unit), ua.LocalizedText(each.description)
+            )
+            await node.add_property(
+                ua.NodeId(f"{name}.{each.name}.unit", space), "0:EngineeringUnits", unit
+            )
         found[each.name] = node
     for do, action in door.commands.items():
         given = [_argument(action)] if action.asks else []
@@ -130,7 +151,9 @@ def _argument(action: Action) -> ua.Argument:
     number = action.asks == "number"
     kind = ua.ObjectIds.Double if number else ua.ObjectIds.String
     return ua.Argument(
-        Name=action.unit or "text", DataType=ua.NodeId(kind), Description=ua.LocalizedText(action.does)
+        Name=action.unit or "text",
+        DataType=ua.NodeId(kind),
+        Description=ua.LocalizedText(action.does),
     )
 
 

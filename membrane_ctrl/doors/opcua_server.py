@@ -1,11 +1,12 @@
-"""An OPC UA server whose method calls do not wait for each other, and whose clients may have to log in.
+"""An OPC UA server whose method calls do not wait for each other, and whose clients may have to log
+in.
 
-asyncua answers the messages of a connection one after the other, and the calls within one message as well. A `latch`
-would wait for the commands that the same client sent before. Here each call is a task of its own; reads, writes and
-everything else stay in order.
+asyncua answers the messages of a connection one after the other, and the calls within one message
+as well. A `latch` would wait for the commands that the same client sent before. Here each call is a
+task of its own; reads, writes and everything else stay in order.
 
-Passwords are verified on a thread before asyncua asks for the user, because the hash takes 50 ms, in which this
-process could not obey a `stop`.
+Passwords are verified on a thread before asyncua asks for the user, because the hash takes 50 ms,
+in which this process could not obey a `stop`.
 """
 
 from __future__ import annotations
@@ -38,11 +39,15 @@ _MESSAGE_BYTES_MAX = 1 << 20
 _PASSWORD_LENGTH = 256
 _VERIFYING_MOST = 8  # log-ins that wait for the hash of another
 
-caller: contextvars.ContextVar[str] = contextvars.ContextVar("caller", default="")  # name of a method's client
+caller: contextvars.ContextVar[str] = contextvars.ContextVar(
+    "caller", default=""
+)  # name of a method's client
 
 
 class AnonymousClients:
-    """Every client is a plain user: asyncua's own manager makes an administrator of whoever says `admin`."""
+    """Every client is a plain user: asyncua's own manager makes an administrator of whoever says
+    `admin`.
+    """
 
     def get_user(self, *_: Any, **__: Any) -> User:
         """Return the user of a session."""
@@ -65,7 +70,9 @@ class NamedClients:
         self._users = users
         self._nobody = known_user("nobody", "read", secrets.token_hex(8))
         self._secret = secrets.token_bytes(32)
-        self._verified: dict[str, bytes] = {}  # a digest of name and password of each user who has logged in
+        self._verified: dict[
+            str, bytes
+        ] = {}  # a digest of name and password of each user who has logged in
         self._turns = Turns(time.monotonic)
         self._one_at_a_time = asyncio.Lock()
         self._verifying = 0
@@ -73,7 +80,8 @@ class NamedClients:
     async def verify(self, name: str, password: str, address: str) -> None:
         """Verify a password for the `get_user` that follows.
 
-        A password that was right before takes no time, so guesses of others cannot keep its owner out.
+        A password that was right before takes no time, so guesses of others cannot keep its owner
+        out.
         """
         if self._is_verified(name, password) or len(password) > _PASSWORD_LENGTH:
             return
@@ -88,7 +96,11 @@ class NamedClients:
             self._verifying -= 1
 
     def get_user(
-        self, iserver: object, username: str | None = None, password: str | None = None, certificate: object = None
+        self,
+        iserver: object,
+        username: str | None = None,
+        password: str | None = None,
+        certificate: object = None,
     ) -> User | None:
         """Return the user of a session; None if the password was not verified."""
         if username is None or password is None or not self._is_verified(username, password):
@@ -142,7 +154,9 @@ class _ConcurrentMethods(MethodService):  # type: ignore[misc]  # asyncua has no
 
 class _BridgeListener(BinaryServer):  # type: ignore[misc]  # asyncua has no types for others
     def _make_protocol(self) -> OPCUAProtocol:
-        return _BridgeProtocol(self.iserver, self._policies, self.clients, self.closing_tasks, self.limits)
+        return _BridgeProtocol(
+            self.iserver, self._policies, self.clients, self.closing_tasks, self.limits
+        )
 
 
 class _BridgeProtocol(OPCUAProtocol):  # type: ignore[misc]  # asyncua has no types for others
@@ -178,7 +192,9 @@ class _BridgeProcessor(UaProcessor):  # type: ignore[misc]  # asyncua has no typ
             self._transport.close()
 
     async def _verify_password(self, body: Buffer) -> None:
-        """Verify the password of an ActivateSession message; whatever is wrong with it is for asyncua to refuse."""
+        """Verify the password of an ActivateSession message; whatever is wrong with it is for
+        asyncua to refuse.
+        """
         with suppress(Exception):
             nodeid_from_binary(body)
             struct_from_binary(ua.RequestHeader, body)

@@ -1,7 +1,7 @@
 """A geometry in a file: by hand, of another set, or the `geometry.toml` that `calibrate` writes.
 
-The latter also gives the lens and the screen's pitch, if calibrated. Its `[calibration]` carries a hash of its
-numbers, which results and runs name; a file with edited numbers is refused.
+The latter also gives the lens and the screen's pitch, if calibrated. Its `[calibration]` carries a
+hash of its numbers, which results and runs name; a file with edited numbers is refused.
 """
 
 from dataclasses import dataclass
@@ -70,7 +70,11 @@ class GeometryOrigin:
 
     def table(self) -> dict[str, str | None]:
         """The origin as a table for JSON."""
-        return {"hash": self.hash, "file": self.file or None, "calibrated_utc": self.calibrated_utc or None}
+        return {
+            "hash": self.hash,
+            "file": self.file or None,
+            "calibrated_utc": self.calibrated_utc or None,
+        }
 
 
 @dataclass(frozen=True)
@@ -86,7 +90,9 @@ class GeometryFile:
     text: str  # content of the file, with the screen's height map included
 
     def over(self, optics: OpticsConfig) -> OpticsConfig:
-        """The bench with this geometry instead of its own. Raises InputError for a different camera."""
+        """The bench with this geometry instead of its own. Raises InputError for a different
+        camera.
+        """
         camera, pattern = optics.camera, optics.pattern
         if self.lens is not None:
             camera = self.lens.over(camera, self.path)
@@ -97,7 +103,8 @@ class GeometryFile:
 
 
 def read_geometry(path: str | Path) -> GeometryFile:
-    """Read a geometry file: a `[geometry]` table as in `capture.toml`, its keys alone, or a file from `calibrate`.
+    """Read a geometry file: a `[geometry]` table as in `capture.toml`, its keys alone, or a file
+    from `calibrate`.
 
     Raises InputError, also for calibrated numbers edited by hand.
     """
@@ -112,15 +119,22 @@ def read_geometry(path: str | Path) -> GeometryFile:
         toml_file.prune(table, GeometryConfig)
     geometry = toml_file.parse(table, GeometryConfig, str(path))
     if not calibrated:
-        return GeometryFile(path, geometry, None, None, None, GeometryOrigin(hashed, str(path)), text)
+        return GeometryFile(
+            path, geometry, None, None, None, GeometryOrigin(hashed, str(path)), text
+        )
     calibration = _part(tables, "calibration", CalibrationTable, path)
     if calibration is not None and calibration.hash != hashed:
         raise errors.InputError(
-            f"{path}: calibration.hash = {calibration.hash}, but the numbers have {hashed}: they were edited "
-            "after the calibration; calibrate again, or remove [calibration] and schema to use them anyway"
+            f"{path}: calibration.hash = {calibration.hash}, but the numbers have {hashed}: "
+            "they were edited "
+            "after the calibration; calibrate again, or remove [calibration] and schema to "
+            "use them anyway"
         )
     origin = GeometryOrigin(hashed, str(path), "" if calibration is None else calibration.date_utc)
-    lens, pitch = _part(tables, "camera", LensTable, path), _part(tables, "pattern", PitchTable, path)
+    lens, pitch = (
+        _part(tables, "camera", LensTable, path),
+        _part(tables, "pattern", PitchTable, path),
+    )
     return GeometryFile(path, geometry, lens, pitch, calibration, origin, text)
 
 
@@ -128,7 +142,9 @@ def origin_of(optics: OpticsConfig) -> GeometryOrigin:
     """Origin of a bench's own stated geometry."""
     lens = {key: getattr(optics.camera, key) for key in ("focal_mm", "distortion")}
     tables = {
-        "geometry": optics.geometry.model_dump(exclude_none=True, exclude={"reference_displacement_um"}),
+        "geometry": optics.geometry.model_dump(
+            exclude_none=True, exclude={"reference_displacement_um"}
+        ),
         "camera": {**lens, "principal_px": optics.camera.principal},
         "pattern": {"period_mm": optics.pattern.period_mm},
     }
@@ -158,7 +174,9 @@ class InForce:
     note: str = ""  # why the stated geometry is used although the configuration names a file
 
     def keep(self, run_dir: Path) -> None:
-        """Copy the file to the run's folder, for its cycles and later reviews. Raises InputError."""
+        """Copy the file to the run's folder, for its cycles and later reviews.
+        Raises InputError.
+        """
         if not self.text:
             return
         with errors.writing(run_dir / KEPT):
@@ -168,8 +186,8 @@ class InForce:
 def geometry_in_force(config: Config) -> InForce:
     """Read the file named in the configuration.
 
-    A missing file is not an error: the first calibration of a bench has to use the geometry measured by hand. The
-    note says so.
+    A missing file is not an error: the first calibration of a bench has to use the geometry
+    measured by hand. The note says so.
 
     Raises InputError if the file exists but cannot be used.
     """
@@ -188,14 +206,20 @@ def _read(path: Path | None, config: Config) -> InForce:
     optics = config.optics
     if path is None or not path.exists():
         wanted = optics.geometry_file
-        note = f"{wanted} does not exist yet: [optics.geometry] is used, as measured by hand" if wanted else ""
+        note = (
+            f"{wanted} does not exist yet: [optics.geometry] is used, as measured by hand"
+            if wanted
+            else ""
+        )
         return InForce(optics, origin_of(optics), note=note)
     file = read_geometry(path)
     return InForce(file.over(optics), file.origin, file.calibration, file.text)
 
 
 def require_plausible(optics: OpticsConfig, where: Path, depth_known: bool = True) -> None:
-    """Raises InputError for a geometry from `where` with which less than half of the mirror can be measured."""
+    """Raises InputError for a geometry from `where` with which less than half of the mirror can be
+    measured.
+    """
     found = sight.doubt(optics, depth_known)
     if found is not None and found.hopeless:
         raise errors.InputError(f"{where}: geometry.{found.key}: {found.why}; {found.remedy}")
@@ -213,17 +237,23 @@ class ArtefactTable(Section):
     curvature_radius_mm: _Length | None = None  # of a concave sphere
     curvature_radius_sigma_mm: _Length | None = None
     form_sigma_um: Annotated[float, Field(ge=1e-3, le=1e3)] = 0.1  # of each Zernike term
-    vertex_mm: Annotated[float, Field(ge=-1e3, le=1e3)] = 0.0  # above the film's vertex at the reference displacement
+    # above the film's vertex at the reference displacement
+    vertex_mm: Annotated[float, Field(ge=-1e3, le=1e3)] = 0.0
     vertex_sigma_mm: _Length = 1.0
 
     def artefact(self, radius_mm: float, path: Path) -> Artefact | Literal["screen"]:
         """The surface, over its disc, or the screen itself. Raises InputError."""
         if self.form == "screen":
             if len(self.model_fields_set) > 1:
-                raise errors.InputError(f"{path}: artefact: the screen itself needs nothing but its form")
+                raise errors.InputError(
+                    f"{path}: artefact: the screen itself needs nothing but its form"
+                )
             return self.form
         curvature, spread = self.curvature_radius_mm, self.curvature_radius_sigma_mm
-        for name, value in (("curvature_radius_mm", curvature), ("curvature_radius_sigma_mm", spread)):
+        for name, value in (
+            ("curvature_radius_mm", curvature),
+            ("curvature_radius_sigma_mm", spread),
+        ):
             if (value is None) != (self.form == "flat"):
                 says = "a sphere needs it" if value is None else "a flat has none"
                 raise errors.InputError(f"{path}: artefact.{name}: {says}")
@@ -243,13 +273,16 @@ class ScreenMovedTable(Section):
 
     shift_mm: tuple[float, float, float]  # along s_x, along s_y, towards the mirror, as measured
     shift_sigma_mm: _Length = 1.0  # of its length
-    turn_sigma_deg: Annotated[float, Field(gt=0, le=30)] = 0.5  # of its direction; and how parallel the screen stayed
+    # of its direction; and how parallel the screen stayed
+    turn_sigma_deg: Annotated[float, Field(gt=0, le=30)] = 0.5
 
 
 def screen_elsewhere(
     geometry: GeometryConfig, shift_mm: tuple[float, float, float], turn: FloatArray | None = None
 ) -> GeometryConfig:
-    """The bench with its screen shifted in its own axes, and then turned by a matrix (3, 3) from world to world."""
+    """The bench with its screen shifted in its own axes, and then turned by a matrix (3, 3) from
+    world to world.
+    """
     pinhole, rotation, origin, s_x, s_y = sight.poses(geometry)
     origin = origin + np.array(shift_mm) @ np.stack([s_x, s_y, np.cross(s_x, s_y)])
     if turn is not None:

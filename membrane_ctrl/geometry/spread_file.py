@@ -1,8 +1,10 @@
-"""Files that state how well a geometry is known: its covariance, and the results of auxiliary calibrations.
+"""Files that state how well a geometry is known: its covariance, and the results of auxiliary
+calibrations.
 
-A geometry file carries a `[covariance]` table beside `[geometry]`: names = ["a_mm", "b_mm", "alpha_deg"], or of the
-twelve of the general form (see `metrology.uncertainty.geometry_spread`), and matrix = rows of their covariance. A
-prior (`calibrate --prior`) is a camera or a geometry with the sigmas of `calibrate`'s parameters.
+A geometry file carries a `[covariance]` table beside `[geometry]`: names = ["a_mm", "b_mm",
+"alpha_deg"], or of the twelve of the general form (see `metrology.uncertainty.geometry_spread`),
+and matrix = rows of their covariance. A prior (`calibrate --prior`) is a camera or a geometry with
+the sigmas of `calibrate`'s parameters.
 """
 
 from collections.abc import Sequence
@@ -48,8 +50,12 @@ def read_spread(path: Path) -> GeometrySpread | None:
     if table is None:
         return None
     content = toml_file.parse(table, CovarianceTable, f"{path}: covariance")
-    if any(len(row) != len(content.names) for row in content.matrix) or len(content.matrix) != len(content.names):
-        raise InputError(f"{path}: covariance.matrix: needs {len(content.names)} rows and columns, one per name")
+    if any(len(row) != len(content.names) for row in content.matrix) or len(content.matrix) != len(
+        content.names
+    ):
+        raise InputError(
+            f"{path}: covariance.matrix: needs {len(content.names)} rows and columns, one per name"
+        )
     try:
         return GeometrySpread(content.names, np.array(content.matrix, float))
     except ValueError as error:
@@ -59,8 +65,9 @@ def read_spread(path: Path) -> GeometrySpread | None:
 def spread_of(optics: schema.OpticsConfig, file: Path | None) -> tuple[GeometrySpread, str]:
     """How well poses, lens and screen are known, and the source of that.
 
-    The file's covariance, else the geometry's own sigmas of a, b and alpha, else those of the paper's instruments.
-    What these do not name has the sigma of `[geometry.sigmas]`; of the poses, only where no file has a covariance.
+    The file's covariance, else the geometry's own sigmas of a, b and alpha, else those of the
+    paper's instruments. What these do not name has the sigma of `[geometry.sigmas]`; of the poses,
+    only where no file has a covariance.
 
     Raises InputError if the file's covariance is for the other form.
     """
@@ -74,18 +81,27 @@ def spread_of(optics: schema.OpticsConfig, file: Path | None) -> tuple[GeometryS
         optional = {name: sigma for name, sigma in others.items() if name in OPTIONAL_NAMES}
         return given.with_others(optional), f"covariance in {file}"
     stated = stated_spread(geometry)
-    return (PAPER_SPREAD if stated is None else stated).with_others(others), _stated(geometry, stated is not None)
+    return (PAPER_SPREAD if stated is None else stated).with_others(others), _stated(
+        geometry, stated is not None
+    )
 
 
 def _stated(geometry: schema.GeometryConfig, poses: bool) -> str:
-    """Where the sigmas are from: what the geometry does not state has the defaults of `SigmasConfig`."""
+    """Where the sigmas are from: what the geometry does not state has the defaults of
+    `SigmasConfig`.
+    """
     given = geometry.sigmas.model_fields_set if geometry.sigmas else set()
     missing = [] if poses else ["a", "b", "alpha"]
     missing += [name for name in SigmasConfig.model_fields if name not in given]
     if not missing:
         return "sigmas stated with the geometry"
-    named = ", ".join(missing[:_NAMED]) + (f" and {len(missing) - _NAMED} others" if len(missing) > _NAMED else "")
-    return f"no sigma is stated for {named if given or poses else 'any input'}; data-sheet defaults apply"
+    named = ", ".join(missing[:_NAMED]) + (
+        f" and {len(missing) - _NAMED} others" if len(missing) > _NAMED else ""
+    )
+    return (
+        f"no sigma is stated for {named if given or poses else 'any input'}; data-sheet defaults "
+        "apply"
+    )
 
 
 def sigmas_of(optics: schema.OpticsConfig) -> dict[str, float]:
@@ -102,7 +118,8 @@ SCHEMA = "membrane-prior/1"
 class PriorFile(OriginSection):
     """The file of a prior.
 
-    `camera` and `geometry` replace those stated in the sets; `sigmas` are those of `calibrate`'s parameters.
+    `camera` and `geometry` replace those stated in the sets; `sigmas` are those of `calibrate`'s
+    parameters.
     """
 
     schema_: Annotated[str, Field(alias="schema")]
@@ -122,14 +139,18 @@ class Prior:
     def over(self, optics: schema.OpticsConfig) -> schema.OpticsConfig:
         """The bench with this prior. Raises InputError for a different camera."""
         if self.content.camera is not None:
-            optics = optics.model_copy(update={"camera": self.content.camera.over(optics.camera, self.path)})
+            optics = optics.model_copy(
+                update={"camera": self.content.camera.over(optics.camera, self.path)}
+            )
         if self.content.geometry is None:
             return optics
         geometry = self.content.geometry
         if geometry.reference_displacement_um is None:
             known = {"reference_displacement_um": optics.geometry.reference_displacement_um}
             geometry = geometry.model_copy(update=known)
-        return toml_file.parse({**dict(optics), "geometry": geometry}, schema.OpticsConfig, str(self.path))
+        return toml_file.parse(
+            {**dict(optics), "geometry": geometry}, schema.OpticsConfig, str(self.path)
+        )
 
 
 def read_prior(path: Path) -> Prior:
@@ -137,14 +158,19 @@ def read_prior(path: Path) -> Prior:
     content = toml_file.load(path, PriorFile)
     if content.schema_ != SCHEMA:
         raise errors.InputError(
-            f"{path}: schema = {content.schema_}: a prior has {SCHEMA}; pass a geometry with --geometry"
+            f"{path}: schema = {content.schema_}: a prior has {SCHEMA}; pass a geometry with "
+            "--geometry"
         )
     if unknown := set(content.sigmas) - set(NAMES):
-        raise errors.InputError(f"{path}: sigmas.{min(unknown)}: not a parameter; known: {', '.join(NAMES)}")
+        raise errors.InputError(
+            f"{path}: sigmas.{min(unknown)}: not a parameter; known: {', '.join(NAMES)}"
+        )
     return Prior(path, content)
 
 
-def write_prior(path: Path, tables: dict[str, Any], made_by: str, made_of: Sequence[str], rms_px: float) -> None:
+def write_prior(
+    path: Path, tables: dict[str, Any], made_by: str, made_of: Sequence[str], rms_px: float
+) -> None:
     """Write `camera`, `geometry` or `sigmas` with their origin. Raises InputError."""
     made = {
         "by": made_by,
@@ -155,5 +181,6 @@ def write_prior(path: Path, tables: dict[str, Any], made_by: str, made_of: Seque
     with errors.writing(path):
         path.parent.mkdir(parents=True, exist_ok=True)
         files.write_text_atomic(
-            files.users(path), tomli_w.dumps({**program.file_origin(SCHEMA), **tables, "made": made})
+            files.users(path),
+            tomli_w.dumps({**program.file_origin(SCHEMA), **tables, "made": made}),
         )

@@ -29,10 +29,10 @@ Make = Callable[[int], tuple[Child | Program, Connection]]
 class ManagedChild:
     """A child process that is replaced when it ends or falls silent; `child` is the current one.
 
-    A child reports about once a second that it is alive, and how long it may now be silent (`run_events.Alive`). A
-    stopped or hung child breaks that promise and is killed. `make` gets the number of earlier children and returns
-    the next one, not yet started, with our end of its pipe. A program reports nothing (`reports` is false): only its
-    end is noticed.
+    A child reports about once a second that it is alive, and how long it may now be silent
+    (`run_events.Alive`). A stopped or hung child breaks that promise and is killed. `make` gets the
+    number of earlier children and returns the next one, not yet started, with our end of its pipe.
+    A program reports nothing (`reports` is false): only its end is noticed.
     """
 
     def __init__(self, make: Make, reports: bool = True) -> None:
@@ -62,7 +62,9 @@ class ManagedChild:
         return True
 
     def look(self, now_s: float) -> list[events.Event]:
-        """Return reports and fate of the child since the last call; start the next one when due (some ms)."""
+        """Return reports and fate of the child since the last call; start the next one when due
+        (some ms).
+        """
         said = self._said(now_s)
         if self.child.alive:
             if now_s > self._expected_s and not self._silent:
@@ -77,7 +79,8 @@ class ManagedChild:
                 self._given_up = True
                 said.append(run_events.ChildGivenUp(name, len(self._replaced_s)))
             return said
-        # at once, then at growing intervals: a child that dies at its start must not keep the machine busy
+        # at once, then at growing intervals: a child that dies at its start must not keep the
+        # machine busy
         if now_s - self._ended_s >= clock.pause_s(len(self._replaced_s)):
             self.replace(now_s)
             said.append(run_events.ChildRestarted(name, self._count))
@@ -94,7 +97,9 @@ class ManagedChild:
         self.child.start()
 
     def _fell_silent(self, now_s: float) -> events.Event:
-        """Kill a silent child, unless it may not be replaced: a slow recorder is better than none."""
+        """Kill a silent child, unless it may not be replaced:
+        a slow recorder is better than none.
+        """
         self._silent = True
         late_s = round(now_s - self._expected_s, 1)
         killed = not self._used_up(now_s)
@@ -167,7 +172,9 @@ def _frames(config: Config, stack: ExitStack) -> FrameAddress:
 
 
 class ChildProcesses:
-    """Recorder, console, acquisition, alarms and page of one run. The hold continues without them and reports it."""
+    """Recorder, console, acquisition, alarms and page of one run. The hold continues without them
+    and reports it.
+    """
 
     def __init__(
         self,
@@ -187,7 +194,15 @@ class ChildProcesses:
         self._summary = run_dir / "summary.json"
         self._keyboard = Keyboard.of_stdin()
         console = ConsoleSpec(
-            clock, rings.telemetry, rings.events, rings.shapes, run_dir, config, duration_s, socket, self._keyboard
+            clock,
+            rings.telemetry,
+            rings.events,
+            rings.shapes,
+            run_dir,
+            config,
+            duration_s,
+            socket,
+            self._keyboard,
         )
         recorder = RecorderSpec(
             run_dir,
@@ -201,15 +216,26 @@ class ChildProcesses:
             snapshots=rings.snapshots,
         )
         self._console = ManagedChild(
-            _makes("screen", "console", 5, lambda n: replace(console, since_s=clock.now()) if n else console)
+            _makes(
+                "screen",
+                "console",
+                5,
+                lambda n: replace(console, since_s=clock.now()) if n else console,
+            )
         )
-        self._recorder = ManagedChild(_makes("recorder", "recorder", 5, lambda n: replace(recorder, resumes=n)))
+        self._recorder = ManagedChild(
+            _makes("recorder", "recorder", 5, lambda n: replace(recorder, resumes=n))
+        )
         self._acquisition = self._alarms = None
         if rings.shapes is not None and rings.frames is not None:
             from membrane_ctrl.acquisition.process import AcquisitionSpec
 
-            cycles = AcquisitionSpec(config, clock, rings.telemetry, rings.shapes, rings.truth, rings.frames, run_dir)
-            self._acquisition = ManagedChild(_makes("acquisition", "acquisition", 10, lambda n: cycles))
+            cycles = AcquisitionSpec(
+                config, clock, rings.telemetry, rings.shapes, rings.truth, rings.frames, run_dir
+            )
+            self._acquisition = ManagedChild(
+                _makes("acquisition", "acquisition", 10, lambda n: cycles)
+            )
         if config.alarms.urls_file:
             from membrane_ctrl.alarms.process import AlarmsSpec
 
@@ -218,7 +244,9 @@ class ChildProcesses:
         self._page = None
         if config.web is not None and socket is not None:
             words = _page_words(config.web, run_dir, socket)
-            self._page = ManagedChild(lambda _: (Program("page", words, run_dir / "web.log", 10), pipe()[0]), False)
+            self._page = ManagedChild(
+                lambda _: (Program("page", words, run_dir / "web.log", 10), pipe()[0]), False
+            )
 
     @property
     def _managed(self) -> list[ManagedChild]:
@@ -245,15 +273,21 @@ class ChildProcesses:
         return [event for managed in self._managed for event in managed.look(self._clock.now())]
 
     def capture(self) -> events.Event | None:
-        """Ask the acquisition to save and report a full set; returns an event if that is impossible."""
+        """Ask the acquisition to save and report a full set; returns an event if that is
+        impossible.
+        """
         if self._acquisition is None:
             return run_events.Capture(failed="no shape measurement in this run")
         if not self._acquisition.send("capture"):
-            return run_events.Capture(failed="the acquisition does not answer; it may be restarting")
+            return run_events.Capture(
+                failed="the acquisition does not answer; it may be restarting"
+            )
         return None
 
     def take_down(self) -> None:
-        """Stop the acquisition, then wait for recorder and console, which end with the "end" event."""
+        """Stop the acquisition, then wait for recorder and console,
+        which end with the "end" event.
+        """
         if self._acquisition is not None:
             self._acquisition.child.stop(_CHILD_STOPS_S)
         recorder = self._recorder.child
@@ -279,20 +313,39 @@ class ChildProcesses:
 
 def _page_words(page: WebConfig, run_dir: Path, socket: Path) -> list[str]:
     """The command line of the page."""
-    options = {"--users": page.users_file, "--certificate": page.certificate_file, "--key": page.key_file}
-    given = [word for option, file in options.items() if file is not None for word in (option, file)]
+    options = {
+        "--users": page.users_file,
+        "--certificate": page.certificate_file,
+        "--key": page.key_file,
+    }
+    given = [
+        word for option, file in options.items() if file is not None for word in (option, file)
+    ]
     given += [word for name in page.names for word in ("--name", name)]
     given += [word for proxy in page.trusted_proxies for word in ("--trusted-proxy", proxy)]
     given += ["--public-url", page.public_url] if page.public_url else []
-    where = ["--logs", str(run_dir.parent), "--socket", str(socket), "--host", page.host, "--port", str(page.port)]
+    where = [
+        "--logs",
+        str(run_dir.parent),
+        "--socket",
+        str(socket),
+        "--host",
+        page.host,
+        "--port",
+        str(page.port),
+    ]
     return ["web", "--with-hold", *where, *given]
 
 
 def _makes(name: str, room: str, nice: int, spec: Callable[[int], object]) -> Make:
-    """Return a maker of a room's children; `spec` maps the number of earlier children to the next one's argument."""
+    """Return a maker of a room's children; `spec` maps the number of earlier children to the next
+    one's argument.
+    """
 
     def make(count: int) -> tuple[Child, Connection]:
         ours, theirs = pipe()
-        return Child(name, f"membrane_ctrl.{room}.process:{room}_main", (spec(count), theirs), nice), ours
+        return Child(
+            name, f"membrane_ctrl.{room}.process:{room}_main", (spec(count), theirs), nice
+        ), ours
 
     return make

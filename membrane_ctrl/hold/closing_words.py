@@ -16,8 +16,10 @@ from membrane_ctrl.model import errors, events
 from membrane_ctrl.model.standing_fault import standing_fault_after
 
 _UNKNOWN_PUMP = (
-    "DEVICE FAILED: the board did not answer while the run stopped, so that the state of the pump is unknown",
-    "  to do:    look whether the pump runs, and switch off its supply; then find out why the link failed",
+    "DEVICE FAILED: the board did not answer while the run stopped, so that the state of the "
+    "pump is unknown",
+    "  to do:    look whether the pump runs, and switch off its supply; then find out why "
+    "the link failed",
 )
 _NO_FAULT = (
     "SAFETY TRIP: the control program failed in the fault state",
@@ -52,7 +54,9 @@ class Closing:
 
 
 def closing_lines(closing: Closing) -> list[str]:
-    """The lines about a fault: code and name, what was seen, what to do; nothing for a run that ended well."""
+    """The lines about a fault: code and name, what was seen, what to do; nothing for a run that
+    ended well.
+    """
     if closing.exit not in (errors.Exit.SAFETY_TRIP, errors.Exit.DEVICE_FAILED):
         return []
     fault = closing.fault
@@ -83,13 +87,21 @@ def report(run_dir: Path, as_json: bool, closing: Closing | None = None) -> None
             print(line, file=sys.stderr)
         anew_s = summary["recorder"].get("folder_anew_s")
         if anew_s is not None:
-            print(f"the run folder was removed or moved; the new one starts at {anew_s:.1f} s", file=sys.stderr)
+            print(
+                f"the run folder was removed or moved; the new one starts at {anew_s:.1f} s",
+                file=sys.stderr,
+            )
     else:
         print("summary.json is missing; the recorded data are readable", file=sys.stderr)
     print(f"run folder: {run_dir}", file=sys.stderr)
     if any(run_dir.glob("ticks/*")):
-        newest = run_dir.parent == Path(RecordingConfig().logs_dir)  # where `review` looks for `last`
-        print(f"open it:    membrane-ctrl review {'last' if newest else shlex.quote(str(run_dir))}", file=sys.stderr)
+        newest = run_dir.parent == Path(
+            RecordingConfig().logs_dir
+        )  # where `review` looks for `last`
+        print(
+            f"open it:    membrane-ctrl review {'last' if newest else shlex.quote(str(run_dir))}",
+            file=sys.stderr,
+        )
 
 
 def _headline(summary: dict[str, object]) -> Iterator[str]:

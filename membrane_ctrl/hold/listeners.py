@@ -1,4 +1,6 @@
-"""Listeners to the ticks of a hold: the latched-fault file and systemd. No tick waits for either."""
+"""Listeners to the ticks of a hold: the latched-fault file and systemd.
+No tick waits for either.
+"""
 
 from __future__ import annotations
 
@@ -19,7 +21,8 @@ from membrane_ctrl.run_files.latched_fault import LatchedFault, LatchedFile, Res
 
 
 class FaultLatch:
-    """Keeps the latched-fault file in step with the controller; waits for the disk only on exit, with the pump off.
+    """Keeps the latched-fault file in step with the controller; waits for the disk only on exit,
+    with the pump off.
 
     Parameters
     ----------
@@ -44,7 +47,8 @@ class FaultLatch:
         tell: Callable[[events.Event], None],
     ) -> None:
         self._file, self._resumes, self._run, self._utc, self._tell = file, resumes, run, utc, tell
-        # one thread, so that a fault and its acknowledgement stay in order; started by the first fault
+        # one thread, so that a fault and its acknowledgement stay in order; started by the first
+        # fault
         self._disk = ThreadPoolExecutor(1, thread_name_prefix="latched-fault")
         self._news: deque[events.Event] = deque()  # from the disk thread
         self._failing = False
@@ -84,10 +88,13 @@ class FaultLatch:
                 case events.StateEntered(state="fault"):
                     self._latch(outputs.row.mono_s)
                 case events.Resumed() if self._resumes is not None:
-                    self._disk.submit(self._try, partial(self._resumes.add, self._utc(outputs.row.mono_s)))
-                case events.StateEntered(from_="fault") | events.CommandTaken(command="ack", refused=None) if (
-                    self._file is not None
-                ):
+                    self._disk.submit(
+                        self._try, partial(self._resumes.add, self._utc(outputs.row.mono_s))
+                    )
+                case (
+                    events.StateEntered(from_="fault")
+                    | events.CommandTaken(command="ack", refused=None)
+                ) if self._file is not None:
                     self._disk.submit(self._try, self._file.clear)
 
     def _latch(self, now_s: float) -> None:
@@ -96,7 +103,9 @@ class FaultLatch:
             self._write(partial(self._file.write, self._dated(words, now_s)))
 
     def _dated(self, words: dict[str, str], now_s: float) -> LatchedFault:
-        return LatchedFault(**words, time_utc=self._utc(now_s).isoformat(timespec="seconds"), run=self._run)
+        return LatchedFault(
+            **words, time_utc=self._utc(now_s).isoformat(timespec="seconds"), run=self._run
+        )
 
     def _write(self, act: Callable[[], None]) -> None:
         self._last = act
@@ -131,10 +140,12 @@ _NOTIFY_S = 0.5  # far below any sensible WatchdogSec=, and cheap
 
 
 class SystemdNotify:
-    """Tells systemd that ticks continue (`Type=notify`, `WatchdogSec=`), with a status line, and when they end.
+    """Tells systemd that ticks continue (`Type=notify`, `WatchdogSec=`), with a status line, and
+    when they end.
 
-    The protocol is a datagram of KEY=VALUE lines to the socket in NOTIFY_SOCKET (sd_notify(3)); "@name" means an
-    abstract one. Without a socket nothing is sent. systemd restarts a loop that hangs and so sends nothing.
+    The protocol is a datagram of KEY=VALUE lines to the socket in NOTIFY_SOCKET (sd_notify(3));
+    "@name" means an abstract one. Without a socket nothing is sent. systemd restarts a loop that
+    hangs and so sends nothing.
     """
 
     def __init__(self, address: str | None = None) -> None:
@@ -176,4 +187,6 @@ class SystemdNotify:
     def _send(self, message: str) -> None:
         if self._address:
             with contextlib.suppress(OSError):
-                self._socket.sendto(message.encode(errors="replace"), self._address)  # a path need not be valid text
+                self._socket.sendto(
+                    message.encode(errors="replace"), self._address
+                )  # a path need not be valid text

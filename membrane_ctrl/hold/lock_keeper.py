@@ -1,6 +1,8 @@
-"""Keeps the locks on disk in step with the controller. No tick waits for the disk; the answer to `lock` does.
+"""Keeps the locks on disk in step with the controller. No tick waits for the disk; the answer to
+`lock` does.
 
-Another program may store a lock meanwhile (`safe` that does not find the hold): it becomes a command of a tick.
+Another program may store a lock meanwhile (`safe` that does not find the hold): it becomes a
+command of a tick.
 """
 
 from __future__ import annotations
@@ -27,7 +29,9 @@ _OUTCOMES_MOST = 256  # remembered for the port, which asks at once
 
 @dataclass(frozen=True, slots=True)
 class LockStorage:
-    """Where a hold keeps its locks: the store, the keys of its devices, and the locks at the start."""
+    """Where a hold keeps its locks: the store, the keys of its devices,
+    and the locks at the start.
+    """
 
     store: LockStore
     devices: frozenset[str]
@@ -35,7 +39,8 @@ class LockStorage:
 
 
 class LockKeeper:
-    """Stores each new lock, removes the file of each removed one, and looks for locks that others store.
+    """Stores each new lock, removes the file of each removed one, and looks for locks that others
+    store.
 
     Parameters
     ----------
@@ -59,7 +64,9 @@ class LockKeeper:
         self._files: dict[str, Path | None] = {}  # by word; of the disk thread after the start
         if storage is not None:
             self._files = {each.lock.word: each.file for each in storage.locks}
-        self._failed: dict[str, Callable[[], None]] = {}  # by word: what to try again; of the disk thread
+        self._failed: dict[
+            str, Callable[[], None]
+        ] = {}  # by word: what to try again; of the disk thread
         self._news: deque[events.Event] = deque()  # from the disk thread, as the next one
         self._asked: deque[Command] = deque()
         self._looking: Future[None] | None = None
@@ -116,7 +123,8 @@ class LockKeeper:
         Returns
         -------
         Future of str, or None
-            Why it is not on the disk; empty: it is. None if the request changed no lock, or locks are not stored.
+            Why it is not on the disk; empty: it is. None if the request changed no lock, or locks
+            are not stored.
         """
         return self._outcomes.pop(number, None)
 
@@ -141,7 +149,11 @@ class LockKeeper:
         try:
             act()
         except Exception as error:  # nothing else would see an exception of this thread
-            reason = f"{error.filename}: {os_reason(error)}" if isinstance(error, OSError) else str(error)
+            reason = (
+                f"{error.filename}: {os_reason(error)}"
+                if isinstance(error, OSError)
+                else str(error)
+            )
             if word not in self._failed:
                 self._news.append(run_events.LockNotStored(word, reason))
             self._failed[word] = act
@@ -153,7 +165,8 @@ class LockKeeper:
     def _find_new(self, storage: LockStorage) -> None:
         """Ask for each lock on our devices that another program has stored.
 
-        What cannot be read is no lock here, as it is at the start: a disk that fails must not end a hold of weeks.
+        What cannot be read is no lock here, as it is at the start: a disk that fails must not end a
+        hold of weeks.
         """
         known = set(self._files.values())
         for each in storage.store.find_locks(storage.devices):

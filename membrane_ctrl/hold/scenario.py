@@ -1,4 +1,6 @@
-"""Scenarios: what happens to a simulated bench and when, one TOML file each (docs/scenarios.md); `twin play`."""
+"""Scenarios: what happens to a simulated bench and when, one TOML file each (docs/scenarios.md);
+`twin play`.
+"""
 
 from __future__ import annotations
 
@@ -35,13 +37,23 @@ _INTERLOCK_SWITCHES: dict[str, Callable[[virtual_interlocks.VirtualInterlocks], 
     "interlock_open": lambda interlocks: interlocks.open_names,
     "interlock_lost": lambda interlocks: interlocks.lost_names,
 }
-_FRACTIONS = ("pump_share", "pump_stuck_fraction", "vent_stuck_fraction")  # the plant refuses values beyond
+_FRACTIONS = (
+    "pump_share",
+    "pump_stuck_fraction",
+    "vent_stuck_fraction",
+)  # the plant refuses values beyond
 _REPEATS_MAX = 100_000
 _AFTERMATH_S = 60.0  # a run whose process stands still never ends by itself
 Happening = Literal[
-    "ambient", "air_temperature", "leak", "laser_dropout", "laser_drift",
-    "daily_temperature", "pressure_weather", "power_cycle",
-]  # fmt: skip
+    "ambient",
+    "air_temperature",
+    "leak",
+    "laser_dropout",
+    "laser_drift",
+    "daily_temperature",
+    "pressure_weather",
+    "power_cycle",
+]
 _MAKE: dict[str, Callable[[At], surroundings.BenchEvent]] = {
     "ambient": lambda at: surroundings.AmbientChange(at.time_s, at.value, at.over_s),
     "air_temperature": lambda at: surroundings.AirTemperatureChange(at.time_s, at.value, at.over_s),
@@ -71,21 +83,33 @@ class At(Section):
     def _one_thing(self) -> At:
         if sum(thing is not None for thing in (self.wrong, self.event, self.command)) != 1:
             raise ValueError("give exactly one of wrong, event and command")
-        if self.wrong is not None and self.wrong not in _SWITCHES and self.wrong not in _INTERLOCK_SWITCHES:
+        if (
+            self.wrong is not None
+            and self.wrong not in _SWITCHES
+            and self.wrong not in _INTERLOCK_SWITCHES
+        ):
             known = ", ".join((*_SWITCHES, *_INTERLOCK_SWITCHES))
             raise ValueError(f"wrong = {self.wrong!r} is unknown; known are {known}")
         if (self.wrong in _INTERLOCK_SWITCHES) != (self.interlock is not None):
-            raise ValueError(f"interlock goes with {' and '.join(_INTERLOCK_SWITCHES)}: the name of one")
+            raise ValueError(
+                f"interlock goes with {' and '.join(_INTERLOCK_SWITCHES)}: the name of one"
+            )
         if self.wrong in _FRACTIONS and not 0 <= self.value <= 1:
-            raise ValueError(f"wrong = {self.wrong!r} with value = {self.value:g}: a fraction, 0 to 1")
+            raise ValueError(
+                f"wrong = {self.wrong!r} with value = {self.value:g}: a fraction, 0 to 1"
+            )
         if self.for_s is not None and self.wrong is None:
             raise ValueError("for_s goes with wrong; an event has over_s")
         if self.over_s and self.event is None:
             raise ValueError("over_s goes with event; what is wrong has for_s")
-        if self.every_s is not None and (self.wrong is None or self.for_s is None or self.for_s >= self.every_s):
+        if self.every_s is not None and (
+            self.wrong is None or self.for_s is None or self.for_s >= self.every_s
+        ):
             raise ValueError("every_s goes with wrong and with a for_s shorter than it")
         if self.command is not None and self.command not in get_args(Kind):
-            raise ValueError(f"command = {self.command!r} is unknown; known are {', '.join(get_args(Kind))}")
+            raise ValueError(
+                f"command = {self.command!r} is unknown; known are {', '.join(get_args(Kind))}"
+            )
         return self
 
 
@@ -105,13 +129,18 @@ class Scenario(Section):
         for number, at in enumerate(self.at):
             if at.interlock is not None and at.interlock not in names:
                 known = ", ".join(names) or "none: add [[config.devices.interlocks]]"
-                raise ValueError(f"at.{number}: interlock = {at.interlock!r} is not configured; known: {known}")
+                raise ValueError(
+                    f"at.{number}: interlock = {at.interlock!r} is not configured; known: {known}"
+                )
             if at.time_s >= self.duration_s:
                 raise ValueError(
-                    f"at.{number}: time_s = {at.time_s:g} is not before duration_s = {self.duration_s:g}"
+                    f"at.{number}: time_s = {at.time_s:g} is not before duration_s = "
+                    f"{self.duration_s:g}"
                 )
             if at.every_s is not None and self.duration_s / at.every_s > _REPEATS_MAX:
-                raise ValueError(f"at.{number}: every_s = {at.every_s:g} repeats more than {_REPEATS_MAX} times")
+                raise ValueError(
+                    f"at.{number}: every_s = {at.every_s:g} repeats more than {_REPEATS_MAX} times"
+                )
         return self
 
 
@@ -119,7 +148,9 @@ S = TypeVar("S", bound=Scenario)
 
 
 def load_scenario(path: Path, model: type[S]) -> S:
-    """Read a scenario. Raises InputError: one line that names the file, the field and what would be right."""
+    """Read a scenario. Raises InputError: one line that names the file, the field and what would be
+    right.
+    """
     return toml_file.load(path, model)
 
 
@@ -128,14 +159,18 @@ Ticks = Iterable[VirtualTick | None]  # None: the control process misses one
 
 
 class ScenarioRun:
-    """A scenario in virtual time, from the request to hold until its end; `rings` as in `VirtualRun`."""
+    """A scenario in virtual time, from the request to hold until its end; `rings` as in
+    `VirtualRun`.
+    """
 
     def __init__(self, scenario: Scenario, rings: Rings | None = None) -> None:
         self.config = config = scenario.config
         self.closing = Closing()
         steps = sorted(scenario.at, key=lambda at: at.time_s)
         mirror = plant.Plant(
-            config.twin, config.pump, tuple(_MAKE[at.event](at) for at in steps if at.event in _MAKE)
+            config.twin,
+            config.pump,
+            tuple(_MAKE[at.event](at) for at in steps if at.event in _MAKE),
         )
         self.bench = virtual_bench.VirtualBench(
             mirror,
@@ -145,7 +180,10 @@ class ScenarioRun:
         shape = TruthShape(self.bench, config, config.twin.seed) if scenario.shapes else None
         self.virtual = VirtualRun(config, self.bench, zernike_projection(), shape, rings=rings)
         self._ends_s = scenario.duration_s
-        begin, end = (0.0, Command("hold", "scenario")), (scenario.duration_s, Command("stop", "duration"))
+        begin, end = (
+            (0.0, Command("hold", "scenario")),
+            (scenario.duration_s, Command("stop", "duration")),
+        )
         agenda: list[tuple[float, Due]] = [begin, *_agenda(steps, scenario.duration_s), end]
         self._agenda = deque(sorted(agenda, key=lambda entry: entry[0]))
 
@@ -181,7 +219,9 @@ def _agenda(steps: list[At], end_s: float) -> Iterator[tuple[float, Due]]:
         elif at.wrong is not None:
             times = 1 if at.every_s is None else max(1, math.ceil((end_s - at.time_s) / at.every_s))
             if at.interlock is not None:
-                wrong, right = (_switch_interlock(at.wrong, at.interlock, on) for on in (at.value != 0, False))
+                wrong, right = (
+                    _switch_interlock(at.wrong, at.interlock, on) for on in (at.value != 0, False)
+                )
             else:
                 wrong, right = _switch(at.wrong, at.value), _switch(at.wrong, _SWITCHES[at.wrong])
             for begin_s in (at.time_s + k * (at.every_s or 0.0) for k in range(times)):
@@ -197,7 +237,9 @@ def _switch(name: str, value: Any) -> Callable[[virtual_bench.VirtualBench], Non
     return lambda bench: setattr(bench.wrong, name, kind(value))
 
 
-def _switch_interlock(switch: str, name: str, on: bool) -> Callable[[virtual_bench.VirtualBench], None]:
+def _switch_interlock(
+    switch: str, name: str, on: bool
+) -> Callable[[virtual_bench.VirtualBench], None]:
     def act(bench: virtual_bench.VirtualBench) -> None:
         names = _INTERLOCK_SWITCHES[switch](bench.interlocks)
         if on:
@@ -217,7 +259,8 @@ _CONSOLE_STOPS_S = 3.0
 def play_scenario(word: str, logs_dir: Path, name: str | None, real_time: bool) -> int:
     """Play a scenario, given its name or its file, and record it as a run in `logs_dir`.
 
-    Raises InputError for an unknown or invalid scenario, DeviceError if the folder cannot be written.
+    Raises InputError for an unknown or invalid scenario, DeviceError if the folder cannot be
+    written.
     """
     path = scenarios.find_scenario(word)
     played = scenario.load_scenario(path, scenario.Scenario)
@@ -226,7 +269,10 @@ def play_scenario(word: str, logs_dir: Path, name: str | None, real_time: bool) 
     config = played.config.model_copy(update={"recording": schema.RecordingConfig()})
     with contextlib.ExitStack() as stack:
         addresses = {n: stack.enter_context(ring.ring(*size)) for n, size in _sizes(config).items()}
-        writers = {n: stack.enter_context(contextlib.closing(ring.RingWriter(a))) for n, a in addresses.items()}
+        writers = {
+            n: stack.enter_context(contextlib.closing(ring.RingWriter(a)))
+            for n, a in addresses.items()
+        }
         run = scenario.ScenarioRun(played.model_copy(update={"config": config}), writers)
         run_dir = create_run_folder(logs_dir, name, run.virtual.clock.origin_utc, config)
         terminal.progress(f"playing {why.duration(played.duration_s)} of: {played.title}")
@@ -235,9 +281,14 @@ def play_scenario(word: str, logs_dir: Path, name: str | None, real_time: bool) 
             real = clock.RunClock.start()
             ticks = _paced(run, ticks, real)
             rows, events, shapes = (addresses[n] for n in ("telemetry", "events", "shapes"))
-            _show(process.ConsoleSpec(real, rows, events, shapes, run_dir, config, played.duration_s), stack)
+            _show(
+                process.ConsoleSpec(real, rows, events, shapes, run_dir, config, played.duration_s),
+                stack,
+            )
         else:
-            ticks = terminal.counted(ticks, "playing", round(played.duration_s * config.loop.rate_hz))
+            ticks = terminal.counted(
+                ticks, "playing", round(played.duration_s * config.loop.rate_hz)
+            )
         with _stopped_by_signals(run):
             _record(run, ticks, run_dir, name, addresses, _LIVE_ROUND_S if real_time else _ROUND_S)
     report(run_dir, as_json=False, closing=run.closing)
@@ -271,10 +322,19 @@ def _record(
     virtual, config = run.virtual, run.config
     recorded = ("inputs", "snapshots", "events", "shapes")
     with contextlib.ExitStack() as stack:
-        readers = {n: stack.enter_context(contextlib.closing(ring.RingReader(addresses[n]))) for n in recorded}
+        readers = {
+            n: stack.enter_context(contextlib.closing(ring.RingReader(addresses[n])))
+            for n in recorded
+        }
         recording = sink.Recording(run_dir, name, virtual.clock, config)
-        files = recorder.Recorder(run_dir, virtual.clock, config, readers, recording, None, virtual.tell)
-        virtual.tell(run_events.Started("the twin in virtual time", "ordinary", "", program.program_identity()))
+        files = recorder.Recorder(
+            run_dir, virtual.clock, config, readers, recording, None, virtual.tell
+        )
+        virtual.tell(
+            run_events.Started(
+                "the twin in virtual time", "ordinary", "", program.program_identity()
+            )
+        )
         due_s = round_s
         for _ in ticks:
             if virtual.now_s >= due_s:
@@ -285,7 +345,9 @@ def _record(
         files.finish()
 
 
-def _paced(run: scenario.ScenarioRun, ticks: scenario.Ticks, real: clock.RunClock) -> scenario.Ticks:
+def _paced(
+    run: scenario.ScenarioRun, ticks: scenario.Ticks, real: clock.RunClock
+) -> scenario.Ticks:
     """The ticks, each at its time; late ones follow at once."""
     for each in ticks:
         time.sleep(max(0.0, run.virtual.now_s - real.now()))
@@ -303,7 +365,10 @@ def _show(spec: process.ConsoleSpec, stack: contextlib.ExitStack) -> None:
 @contextlib.contextmanager
 def _stopped_by_signals(run: scenario.ScenarioRun) -> Iterator[None]:
     """Within this context, Ctrl-C, SIGTERM and a closed terminal end the run at its next tick."""
-    before = {number: signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)}
+    before = {
+        number: signal.getsignal(number)
+        for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
+    }
     for number, handler in before.items():
         if handler != signal.SIG_IGN:
             signal.signal(number, lambda found, frame: run.stop(signal.Signals(found).name))

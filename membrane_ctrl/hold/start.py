@@ -1,7 +1,8 @@
-"""`hold`: everything around the ticks. Starts the processes, wires them, and stops them in the right order.
+"""`hold`: everything around the ticks. Starts the processes, wires them, and stops them in the
+right order.
 
-At the start, configuration, port, devices and folder are checked before anything is created. At the end, the safe
-state comes first, then the recording, then the rest.
+At the start, configuration, port, devices and folder are checked before anything is created. At the
+end, the safe state comes first, then the recording, then the rest.
 """
 
 import asyncio
@@ -31,7 +32,13 @@ from membrane_ctrl.hold.closing_words import Closing, report
 from membrane_ctrl.hold.listeners import FaultLatch, SystemdNotify
 from membrane_ctrl.hold.lock_keeper import LockKeeper, LockStorage
 from membrane_ctrl.hold.supervisor import Supervisor, Wiring, newest_of
-from membrane_ctrl.instruments.bench import connect, device_names, locked, open_bench, require_places
+from membrane_ctrl.instruments.bench import (
+    connect,
+    device_names,
+    locked,
+    open_bench,
+    require_places,
+)
 from membrane_ctrl.instruments.lock_store import LockStore, device_keys, require_unlocked
 from membrane_ctrl.model import errors, events, run_events, telemetry, terminal
 from membrane_ctrl.model.clock import RunClock
@@ -41,7 +48,10 @@ from membrane_ctrl.processes import child, ring
 from membrane_ctrl.run_files import latched_fault, run_folder
 from membrane_ctrl.sim.bench import TwinProcess
 
-_UNLOCKS = "start with --standby, then `membrane-ctrl ctl unlock WORD`; or `membrane-ctrl locks remove WORD`"
+_UNLOCKS = (
+    "start with --standby, then `membrane-ctrl ctl unlock WORD`; or `membrane-ctrl locks remove "
+    "WORD`"
+)
 _NICE, _ENDS_S = 10, 10.0  # of the tuning session
 
 
@@ -62,13 +72,15 @@ class HoldOptions:
     json: bool
     standby: bool = False  # wait for `ctl hold`
     autotune: bool = False  # a short tuning session once the mirror is held
-    lab: bool = False  # the twin answers as the instruments of the configuration, not as the pump board
+    # the twin answers as the instruments of the configuration, not as the pump board
+    lab: bool = False
 
 
 def hold_mirror(options: HoldOptions) -> int:
     """Hold the mirror until the duration is over, a signal arrives, or a safety trip ends the run.
 
-    Returns the exit code. Raises InputError or DeviceError (one line) for failures before the first tick.
+    Returns the exit code. Raises InputError or DeviceError (one line) for failures before the first
+    tick.
     """
     if options.config.devices is None and not options.twin:
         raise errors.InputError(
@@ -90,10 +102,14 @@ def hold_mirror(options: HoldOptions) -> int:
         logs_dir = options.logs_dir or Path(options.config.recording.logs_dir)
         # a second hold ends here, devices untouched
         listeners = sockets.listeners_for(options.config.port, logs_dir, stack)
-        twin = TwinProcess.started(options.config, clock, stack, options.lab) if options.twin else None
+        twin = (
+            TwinProcess.started(options.config, clock, stack, options.lab) if options.twin else None
+        )
         config = twin.config if twin else options.config
         assert config.devices is not None
-        stack.enter_context(locked(device_names(config.devices)))  # one with other folders ends here
+        stack.enter_context(
+            locked(device_names(config.devices))
+        )  # one with other folders ends here
         lock_storage = _find_locks(config, options)  # before anything is cleared
         latched = _latched(config, logs_dir, options)
         resumes = None if latched is None else latched_fault.ResumeLog(logs_dir)
@@ -102,7 +118,9 @@ def hold_mirror(options: HoldOptions) -> int:
         run_dir = run_folder.create_run_folder(logs_dir, options.name, clock.origin_utc, config)
         geometry.keep(run_dir)
         rings = child_processes.rings_for(config, twin.truth if twin else None, stack)
-        ring.publish(run_dir, {"telemetry": rings.telemetry, "events": rings.events, "shapes": rings.shapes})
+        ring.publish(
+            run_dir, {"telemetry": rings.telemetry, "events": rings.events, "shapes": rings.shapes}
+        )
         children = child_processes.ChildProcesses(
             config, clock, rings, run_dir, options.name, options.duration_s, listeners.path
         )
@@ -117,7 +135,20 @@ def hold_mirror(options: HoldOptions) -> int:
         closing = Closing()
         try:
             asyncio.run(
-                _run(bench, config, options, clock, rings, children, twin, port, latch, board, closing, keeper)
+                _run(
+                    bench,
+                    config,
+                    options,
+                    clock,
+                    rings,
+                    children,
+                    twin,
+                    port,
+                    latch,
+                    board,
+                    closing,
+                    keeper,
+                )
             )
             children.take_down()
         except KeyboardInterrupt:
@@ -136,7 +167,11 @@ def _require_possible(devices: DevicesConfig, lab: bool) -> None:
     An emulated lab needs no package for GPIO: it stands for these lines by a Modbus module.
     """
     gpio = tuple(found for found in devices.interlocks if isinstance(found, GpioLineConfig))
-    emulated = tuple(found for found in devices.interlocks if found not in gpio) if lab else devices.interlocks
+    emulated = (
+        tuple(found for found in devices.interlocks if found not in gpio)
+        if lab
+        else devices.interlocks
+    )
     require_places(devices)
     open_bench(devices.model_copy(update={"interlocks": emulated}))
 
@@ -146,17 +181,31 @@ def _autotune(socket: Path | None, run_dir: Path) -> Callable[[], None]:
 
     It is another program, as if a person had started it: a hold needs no tuner, and outlives it.
     """
-    words = ["--short", "--wait", "--choose", "same-load", "--name", "autotune", "--reason", "hold --autotune"]
+    words = [
+        "--short",
+        "--wait",
+        "--choose",
+        "same-load",
+        "--name",
+        "autotune",
+        "--reason",
+        "hold --autotune",
+    ]
     where = ["--socket", str(socket), "--run", str(run_dir), "--logs", str(run_dir.parent)]
-    session = child.Program("autotune", ["tune", "run", *words, *where], run_dir / "autotune.log", _NICE)
+    session = child.Program(
+        "autotune", ["tune", "run", *words, *where], run_dir / "autotune.log", _NICE
+    )
     session.start()
     return partial(session.stop, _ENDS_S)
 
 
-def _latched(config: Config, logs_dir: Path, options: HoldOptions) -> latched_fault.LatchedFile | None:
+def _latched(
+    config: Config, logs_dir: Path, options: HoldOptions
+) -> latched_fault.LatchedFile | None:
     """The file of a latched fault, which outlives a run; the twin has one only if configured.
 
-    Raises DeviceError if a fault is latched, unless it is to be cleared or the run starts in standby.
+    Raises DeviceError if a fault is latched, unless it is to be cleared or the run starts in
+    standby.
     """
     if options.twin and not config.states.latch_twin_faults:
         return None
@@ -167,23 +216,33 @@ def _latched(config: Config, logs_dir: Path, options: HoldOptions) -> latched_fa
             file.clear()
         except OSError as error:
             reason = errors.os_reason(error)
-            raise errors.DeviceError(f"{file.path}: cannot be cleared ({reason}); remove it by hand") from None
+            raise errors.DeviceError(
+                f"{file.path}: cannot be cleared ({reason}); remove it by hand"
+            ) from None
     elif fault is not None and not options.standby:
-        raise errors.DeviceError(f"a fault is latched: {fault}; {fault.remedy}, then start with --clear-faults")
+        raise errors.DeviceError(
+            f"a fault is latched: {fault}; {fault.remedy}, then start with --clear-faults"
+        )
     return file
 
 
 def _find_locks(config: Config, options: HoldOptions) -> LockStorage | None:
-    """Return where the run keeps its locks, with those that are set; the twin keeps them only if configured.
+    """Return where the run keeps its locks, with those that are set; the twin keeps them only if
+    configured.
 
-    Raises DeviceError if there are any, unless the run starts in standby, where a person can remove them.
+    Raises DeviceError if there are any, unless the run starts in standby, where a person can remove
+    them.
     """
     if options.twin and not config.states.latch_twin_faults:
         return None
     assert config.devices is not None
     store = LockStore.of_machine()
     # the twin's own port may be another one at each start
-    devices = frozenset({f"twin port {options.config.twin.port}"}) if options.twin else device_keys(config.devices)
+    devices = (
+        frozenset({f"twin port {options.config.twin.port}"})
+        if options.twin
+        else device_keys(config.devices)
+    )
     if not options.standby:
         require_unlocked(store, devices, _UNLOCKS)
     return LockStorage(store, devices, tuple(store.find_locks(devices)))
@@ -198,9 +257,14 @@ class BoardAtStart:
 
 
 async def _identify(
-    bench: Bench, config: Config, options: HoldOptions, resumes: latched_fault.ResumeLog | None = None
+    bench: Bench,
+    config: Config,
+    options: HoldOptions,
+    resumes: latched_fault.ResumeLog | None = None,
 ) -> BoardAtStart:
-    """Identify the devices and check their fitness before making a run folder. Raises DeviceError or InputError."""
+    """Identify the devices and check their fitness before making a run folder. Raises DeviceError
+    or InputError.
+    """
     devices = config.devices
     assert devices is not None
     try:
@@ -215,11 +279,18 @@ async def _identify(
         if not faults:
             return BoardAtStart()
         what = f"{devices.name}: the board has latched faults {faults:#x} (docs/registers.md)"
-        # the last controller was killed, and nothing else happened if no other fault is latched and nobody vented
+        # the last controller was killed, and nothing else happened if no other fault is latched and
+        # nobody vented
         vented = reading.vent_fraction > safe_levels.VENTED_FRACTION
-        if faults == safe_levels.WATCHDOG_MASK and not vented and _may_resume("watchdog_tripped", config, resumes):
+        if (
+            faults == safe_levels.WATCHDOG_MASK
+            and not vented
+            and _may_resume("watchdog_tripped", config, resumes)
+        ):
             await bench.clear_faults(safe_levels.WATCHDOG_MASK)
-            return BoardAtStart(cleared="its watchdog had stopped the pump; cleared under resume.faults")
+            return BoardAtStart(
+                cleared="its watchdog had stopped the pump; cleared under resume.faults"
+            )
     except LinkError as error:
         raise errors.DeviceError(f"{devices.name}: {error}") from None
     finally:
@@ -235,7 +306,8 @@ def _require_closed(config: Config, reading: BenchReading) -> None:
     circuits.look(reading, telemetry.State.STANDBY)
     if circuits.open_mask:
         raise errors.DeviceError(
-            f"{circuits.describe_open(circuits.open_mask)}; close it, or start with --standby and hold later"
+            f"{circuits.describe_open(circuits.open_mask)}; close it, or start with "
+            "--standby and hold later"
         )
 
 
@@ -267,9 +339,9 @@ async def _run(
     latch_for: Callable[[Callable[[events.Event], None]], FaultLatch],
     board: BoardAtStart,
     closing: Closing,
-    keeper_for: Callable[[Callable[[events.Event], None], Callable[[commands.Command], None]], LockKeeper] = (
-        _STORES_NONE
-    ),
+    keeper_for: Callable[
+        [Callable[[events.Event], None], Callable[[commands.Command], None]], LockKeeper
+    ] = (_STORES_NONE),
 ) -> None:
     """Run the ticks; `closing` gets the exit code and the fault in which the run ends."""
     from membrane_ctrl.metrology.optics.film_law import zernike_projection
@@ -281,7 +353,9 @@ async def _run(
         supervisor = Supervisor(controller, wiring, clock, config.loop.rate_hz)
         settings = (lambda: controller.loop_config, lambda: controller.pump_config)
         keeper = keeper_for(lambda event: _tell_all(event, supervisor, wiring), supervisor.ask)
-        hooks = server.RunHooks(supervisor.ask, supervisor.tell, clock.now, *settings, keeper.outcome)
+        hooks = server.RunHooks(
+            supervisor.ask, supervisor.tell, clock.now, *settings, keeper.outcome
+        )
         port = port_for(hooks)
         latch, systemd = latch_for(supervisor.tell), SystemdNotify()
         wiring.heard = {
@@ -315,7 +389,9 @@ async def _run(
         finally:
             await bench.close()
             ticks, missed_ticks = supervisor.ticks, supervisor.missed_ticks
-            supervisor.tell(run_events.Ended(exit_code.name.lower(), int(exit_code), ticks, missed_ticks))
+            supervisor.tell(
+                run_events.Ended(exit_code.name.lower(), int(exit_code), ticks, missed_ticks)
+            )
 
 
 def _tell_all(event: events.Event, supervisor: Supervisor, wiring: Wiring) -> None:
@@ -337,16 +413,26 @@ def _wiring(
         stack.enter_context(contextlib.closing(ring.RingWriter(address)))
         for address in (rings.telemetry, rings.events, rings.inputs, rings.snapshots)
     )
-    shapes = stack.enter_context(contextlib.closing(ring.RingReader(rings.shapes))) if rings.shapes else None
+    shapes = (
+        stack.enter_context(contextlib.closing(ring.RingReader(rings.shapes)))
+        if rings.shapes
+        else None
+    )
     truth = twin.truth_reader() if twin else None
     newest_shape = newest_of(shapes) if shapes else None
     return Wiring(bench, rows, events, inputs, snapshots, newest_shape, truth, children.reports)
 
 
 def _ask_first(
-    supervisor: Supervisor, standby: bool, latch: FaultLatch, board: BoardAtStart, locks: Sequence[Lock] = ()
+    supervisor: Supervisor,
+    standby: bool,
+    latch: FaultLatch,
+    board: BoardAtStart,
+    locks: Sequence[Lock] = (),
 ) -> None:
-    """The first tick's commands: hold, unless the run starts in standby; locks, faults, resumes of earlier runs."""
+    """The first tick's commands: hold, unless the run starts in standby; locks, faults, resumes of
+    earlier runs.
+    """
     for lock in locks:
         supervisor.ask(commands.Command("latch", commands.AT_START, text=lock.text, lock=lock))
     if not standby:
@@ -358,18 +444,24 @@ def _ask_first(
 
 
 def _capture(
-    children: child_processes.ChildProcesses, tell: Callable[[events.Event], None], outputs: tick.TickOutputs
+    children: child_processes.ChildProcesses,
+    tell: Callable[[events.Event], None],
+    outputs: tick.TickOutputs,
 ) -> None:
     """Pass accepted requests for a capture set to the acquisition."""
     for event in outputs.events:
         match event:
-            case events.CommandTaken(command="capture", refused=None) if (failed := children.capture()) is not None:
+            case events.CommandTaken(command="capture", refused=None) if (
+                failed := children.capture()
+            ) is not None:
                 tell(failed)
 
 
 @contextlib.contextmanager
 def _signals(supervisor: Supervisor) -> Iterator[None]:
-    """Turn SIGINT, SIGTERM and a closed terminal into a clean stop, which begins with the safe state; no Ctrl-Z."""
+    """Turn SIGINT, SIGTERM and a closed terminal into a clean stop, which begins with the safe
+    state; no Ctrl-Z.
+    """
     loop = asyncio.get_running_loop()
     numbers = [signal.SIGINT, signal.SIGTERM]
     if signal.getsignal(signal.SIGHUP) != signal.SIG_IGN:  # `nohup`: continue without the terminal
@@ -377,7 +469,9 @@ def _signals(supervisor: Supervisor) -> Iterator[None]:
     before = {number: signal.getsignal(number) for number in [*numbers, signal.SIGTSTP]}
     for number in numbers:
         loop.add_signal_handler(number, supervisor.ask, commands.Command("stop", number.name))
-    signal.signal(signal.SIGTSTP, signal.SIG_IGN)  # Ctrl-Z: without ticks the board's watchdog stops the pump
+    signal.signal(
+        signal.SIGTSTP, signal.SIG_IGN
+    )  # Ctrl-Z: without ticks the board's watchdog stops the pump
     try:
         yield
     finally:

@@ -1,7 +1,7 @@
 """The tick: asyncio, absolute deadlines, one device exchange, one pure function, one write.
 
-Nothing here may take longer than a tick: no image, no Rerun, no file; records go into shared-memory rings, which
-never block. A missed deadline is skipped and counted, never made up in a burst.
+Nothing here may take longer than a tick: no image, no Rerun, no file; records go into shared-memory
+rings, which never block. A missed deadline is skipped and counted, never made up in a burst.
 """
 
 import asyncio
@@ -12,11 +12,24 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from functools import partial
 
-from firmware_iface.roles import Bench, BenchCommand, BenchReading, LinkDownError, LinkError, LinkWaitsError
+from firmware_iface.roles import (
+    Bench,
+    BenchCommand,
+    BenchReading,
+    LinkDownError,
+    LinkError,
+    LinkWaitsError,
+)
 from membrane_ctrl.controller.commands import AT_END, Command
 from membrane_ctrl.controller.controller import Controller
 from membrane_ctrl.controller.snapshot import take_snapshot
-from membrane_ctrl.controller.tick import TickInputs, TickOutputs, pack_row, pack_snapshot, pack_tick
+from membrane_ctrl.controller.tick import (
+    TickInputs,
+    TickOutputs,
+    pack_row,
+    pack_snapshot,
+    pack_tick,
+)
 from membrane_ctrl.model import clock, errors, run_events, shape_estimate
 from membrane_ctrl.model.events import Event, EventLine
 from membrane_ctrl.processes.ring import RingReader, RingWriter
@@ -24,7 +37,10 @@ from membrane_ctrl.processes.ring import RingReader, RingWriter
 _CHILD_WATCH_S = 0.5  # checking on a child costs a system call
 # On average a replay runs through half of this to reach its part
 SNAPSHOT_EVERY_S = 300.0
-_TEXT_CUTS = (200, 20)  # characters to keep if the event exceeds its slot; each takes up to 12 bytes in JSON
+_TEXT_CUTS = (
+    200,
+    20,
+)  # characters to keep if the event exceeds its slot; each takes up to 12 bytes in JSON
 
 
 @dataclass(slots=True)
@@ -36,8 +52,10 @@ class Wiring:
     events: RingWriter | None = None
     inputs: RingWriter | None = None  # inputs of the ticks, for a replay
     snapshots: RingWriter | None = None  # of the controller, where a replay may start
-    shapes: Callable[[], shape_estimate.ShapeEstimate | None] | None = None  # the newest since the last call
-    truth: Callable[[], tuple[float, float]] | None = None  # (displacement_um, laser_bias_um) of the twin
+    # the newest since the last call
+    shapes: Callable[[], shape_estimate.ShapeEstimate | None] | None = None
+    # (displacement_um, laser_bias_um) of the twin
+    truth: Callable[[], tuple[float, float]] | None = None
     reports: Callable[[], list[Event]] = list  # of the children since the last call
     # listeners to each tick's outputs and the children's reports; an exception in one is a fault
     heard: Mapping[str, Callable[[TickOutputs], None]] = field(default_factory=dict)
@@ -47,7 +65,9 @@ class Wiring:
 class Supervisor:
     """Runs the ticks of one run, from the first one to the exit code."""
 
-    def __init__(self, controller: Controller, wiring: Wiring, clock: clock.RunClock, rate_hz: float) -> None:
+    def __init__(
+        self, controller: Controller, wiring: Wiring, clock: clock.RunClock, rate_hz: float
+    ) -> None:
         self._controller = controller
         self._wiring = wiring
         self._clock = clock
@@ -102,8 +122,12 @@ class Supervisor:
         """Write the pump off; leave an open vent open."""
         await self._write(BenchCommand(0.0, self._vent_fraction))
 
-    async def tick(self, now_s: float, dt_s: float, late_s: float) -> tuple[TickInputs, TickOutputs]:
-        """Run one tick: read, decide, write, record. It starts at `now_s`, `late_s` after its deadline."""
+    async def tick(
+        self, now_s: float, dt_s: float, late_s: float
+    ) -> tuple[TickInputs, TickOutputs]:
+        """Run one tick: read, decide, write, record. It starts at `now_s`, `late_s` after its
+        deadline.
+        """
         wiring = self._wiring
         self.ticks += 1
         if not self._link_up:
@@ -149,12 +173,16 @@ class Supervisor:
             return
         self._next_snapshot_s = now_s + SNAPSHOT_EVERY_S
         try:
-            self._wiring.snapshots.put(pack_snapshot(self.ticks + 1, take_snapshot(self._controller)))
+            self._wiring.snapshots.put(
+                pack_snapshot(self.ticks + 1, take_snapshot(self._controller))
+            )
         except ValueError as error:  # a value of a wrong type, or too long
             self.tell(run_events.SnapshotNotRecorded(str(error)))
 
     def _record(self, inputs: TickInputs, outputs: TickOutputs) -> None:
-        """Record the row, and the inputs for a replay; a value of the wrong type loses the inputs, not the row."""
+        """Record the row, and the inputs for a replay; a value of the wrong type loses the inputs,
+        not the row.
+        """
         if self._wiring.telemetry is None:
             return
         row = outputs.row.pack()
@@ -240,7 +268,9 @@ class Supervisor:
 
 
 def newest_of(reader: RingReader) -> Callable[[], shape_estimate.ShapeEstimate | None]:
-    """Return a function that takes the newest estimate from the shape ring; it raises ValueError for a bad one."""
+    """Return a function that takes the newest estimate from the shape ring; it raises ValueError
+    for a bad one.
+    """
 
     def newest() -> shape_estimate.ShapeEstimate | None:
         messages = reader.drain()
@@ -255,6 +285,8 @@ def _line(event: EventLine, most_bytes: int) -> bytes:
     for most in _TEXT_CUTS:
         if len(line) <= most_bytes:
             break
-        cut = {key: value[:most] if isinstance(value, str) else value for key, value in event.items()}
+        cut = {
+            key: value[:most] if isinstance(value, str) else value for key, value in event.items()
+        }
         line = json.dumps(cut, allow_nan=False, default=str).encode()
     return line

@@ -1,8 +1,9 @@
-"""A run in virtual time: the supervisor's own ticks on the twin behind its board, without processes or waiting.
+"""A run in virtual time: the supervisor's own ticks on the twin behind its board, without processes
+or waiting.
 
-It lacks the latency of the link (a read is the plant's state at the tick, a write takes effect at once), the
-processes and the deadlines. The board is the emulator's, with its watchdog, latches and limits, on the plant's time.
-Its shapes come from the twin's truth, without frames.
+It lacks the latency of the link (a read is the plant's state at the tick, a write takes effect at
+once), the processes and the deadlines. The board is the emulator's, with its watchdog, latches and
+limits, on the plant's time. Its shapes come from the twin's truth, without frames.
 """
 
 import math
@@ -24,7 +25,8 @@ from membrane_ctrl.sim import virtual_bench
 Rings = Mapping[str, ring.RingWriter]
 Alter = Callable[[float, roles.BenchReading], roles.BenchReading | None]
 ShapeSource = Callable[[float], shape_estimate.ShapeEstimate | None]
-# Change of sag of a cycle of rendered full-size frames at 50 Hz in typical weather: 0.007 µm (docs/control.md).
+# Change of sag of a cycle of rendered full-size frames at 50 Hz in typical weather: 0.007 µm
+# (docs/control.md).
 SAG_SIGMA_UM = 0.01
 EXPOSURES_S = 0.9  # first to last frame of that cycle, over which the laser's readings are averaged
 
@@ -145,7 +147,11 @@ class VirtualRun:
     def end(self) -> None:
         """Record the end of the run."""
         supervisor = self._supervisor
-        self.tell(run_events.Ended(self.exit.name.lower(), int(self.exit), supervisor.ticks, supervisor.missed_ticks))
+        self.tell(
+            run_events.Ended(
+                self.exit.name.lower(), int(self.exit), supervisor.ticks, supervisor.missed_ticks
+            )
+        )
 
     def _newest_shape(self) -> shape_estimate.ShapeEstimate | None:
         if self._shape is None or self.now_s < self._shape_due_s:
@@ -172,7 +178,9 @@ class _AtOnce:
     """A virtual bench as the supervisor's `Bench`, which answers without waiting."""
 
     def __init__(
-        self, bench: virtual_bench.VirtualBench, altered: Callable[[roles.BenchReading], roles.BenchReading]
+        self,
+        bench: virtual_bench.VirtualBench,
+        altered: Callable[[roles.BenchReading], roles.BenchReading],
     ) -> None:
         self._bench, self._altered = bench, altered
 
@@ -200,18 +208,24 @@ class TruthShape:
 
     Equal seeds give equal shapes.
 
-    `sag_sigma_um` is the standard deviation of a cycle's sag, larger for a bench whose frames are worse than
-    rendered ones.
+    `sag_sigma_um` is the standard deviation of a cycle's sag, larger for a bench whose frames are
+    worse than rendered ones.
     """
 
     def __init__(
-        self, bench: virtual_bench.VirtualBench, config: Config, seed: int, sag_sigma_um: float = SAG_SIGMA_UM
+        self,
+        bench: virtual_bench.VirtualBench,
+        config: Config,
+        seed: int,
+        sag_sigma_um: float = SAG_SIGMA_UM,
     ) -> None:
         self._bench = bench
         self._rng = np.random.default_rng(seed)
         self._projection = zernike_projection()
         self._sag_sigma_um = sag_sigma_um
-        self._laser_sigma_um = config.twin.laser_noise_um / math.sqrt(max(1.0, EXPOSURES_S * config.loop.rate_hz))
+        self._laser_sigma_um = config.twin.laser_noise_um / math.sqrt(
+            max(1.0, EXPOSURES_S * config.loop.rate_hz)
+        )
         self._covariance = sag_sigma_um**2 * np.outer(self._projection, self._projection)
         self._cycle = 0
 

@@ -24,7 +24,9 @@ from membrane_ctrl.model.terminal import one_line
 # Makes the driver of a role from its `[devices.<role>]` table.
 
 
-def role_devices(devices: DevicesConfig, links: modbus_rtu.ModbusLinks | None = None) -> role_bench.RoleDevices:
+def role_devices(
+    devices: DevicesConfig, links: modbus_rtu.ModbusLinks | None = None
+) -> role_bench.RoleDevices:
     """The drivers named in the tables, not yet connected; those on one serial bus share it.
 
     Raises InputError for a port, URL, preset or setting that the driver does not accept.
@@ -38,7 +40,9 @@ def role_devices(devices: DevicesConfig, links: modbus_rtu.ModbusLinks | None = 
             raise InputError(f"devices.{role}: {error}") from None
     displacement = made.pop("displacement", None)  # a bench held by its optics may have none
     vent = made.pop("vent", None)
-    return role_bench.RoleDevices(displacement, made.pop("pump"), made.pop("gauge_pressure"), vent, made)
+    return role_bench.RoleDevices(
+        displacement, made.pop("pump"), made.pop("gauge_pressure"), vent, made
+    )
 
 
 def _driver(role: str, section: settings.AnyDriver, links: modbus_rtu.ModbusLinks) -> Any:
@@ -51,20 +55,28 @@ def _driver(role: str, section: settings.AnyDriver, links: modbus_rtu.ModbusLink
         case settings.BronkhorstProparConfig():
             port = serial_port.SerialPort(section.port, serial_port.SerialSettings(section.baud))
             return _bronkhorst(
-                role, bronkhorst_propar.ProparParameters(port, section.node, section.timeout_s), section.serial
+                role,
+                bronkhorst_propar.ProparParameters(port, section.node, section.timeout_s),
+                section.serial,
             )
         case _:
             device = driver_loading.make_driver(section, f"devices.{role}", drivers.SENSORS)
             if not hasattr(device, roles.ROLES[role].reads):
                 name = driver_loading.name_of(section)
-                raise ValueError(f"the driver {name} has no {roles.ROLES[role].reads}, so it is no {role}")
+                raise ValueError(
+                    f"the driver {name} has no {roles.ROLES[role].reads}, so it is no {role}"
+                )
             return device
 
 
 def _bronkhorst(
     role: str, port: bronkhorst.ParameterPort, serial: str
 ) -> bronkhorst.BronkhorstFlow | bronkhorst.BronkhorstPressure:
-    return bronkhorst.BronkhorstFlow(port, serial) if role == "pump" else bronkhorst.BronkhorstPressure(port, serial)
+    return (
+        bronkhorst.BronkhorstFlow(port, serial)
+        if role == "pump"
+        else bronkhorst.BronkhorstPressure(port, serial)
+    )
 
 
 def _modbus_value(
@@ -77,7 +89,9 @@ def _modbus_value(
 
 def map_keys(section: settings.ModbusMapConfig) -> dict[str, Any]:
     """The keys of a map, in the terms of `drivers.modbus_map`."""
-    keys = section.model_dump(include={"function", "type", "word_order", "address", "raw", "value", "limits"})
+    keys = section.model_dump(
+        include={"function", "type", "word_order", "address", "raw", "value", "limits"}
+    )
     if section.identity_address is not None and section.identity_equals is not None:
         keys["identity"] = (section.identity_address, section.identity_equals)
     return keys
@@ -102,10 +116,14 @@ def open_bench(devices: DevicesConfig) -> roles.Bench:
         made = pump_board(devices, devices.board, links)
     if not devices.interlocks:
         return made
-    return interlocks.InterlockBench(made, board_inputs(devices), interlock_sources.polled_sources(devices, links))
+    return interlocks.InterlockBench(
+        made, board_inputs(devices), interlock_sources.polled_sources(devices, links)
+    )
 
 
-def pump_board(devices: DevicesConfig, url: str, links: modbus_rtu.ModbusLinks | None = None) -> PumpBoard:
+def pump_board(
+    devices: DevicesConfig, url: str, links: modbus_rtu.ModbusLinks | None = None
+) -> PumpBoard:
     """The board at this URL, not yet connected. Raises InputError."""
     try:
         link = (links or modbus_rtu.ModbusLinks()).link(url, devices.unit_id, devices.timeout_s)
@@ -124,7 +142,9 @@ def board_inputs(devices: DevicesConfig) -> dict[int, int]:
 
 
 def require_places(devices: DevicesConfig) -> None:
-    """Refuse two roles on one place, also if their links are spelt differently. Raises InputError."""
+    """Refuse two roles on one place, also if their links are spelt differently.
+    Raises InputError.
+    """
     shared = device_places.find_shared(devices.roles(), devices.interlocks, _device_of_link)
     if shared:
         raise InputError(shared)
@@ -133,13 +153,16 @@ def require_places(devices: DevicesConfig) -> None:
         other, other_link = ports.setdefault(_serial_name(port), (role, link))
         if other != role and not (link and link == other_link):
             raise InputError(
-                f"devices.{other} and devices.{role} name the same port, {port}; only Modbus devices on one link may "
+                f"devices.{other} and devices.{role} name the same port, {port}; only Modbus "
+                "devices on one link may "
                 "share it"
             )
 
 
 def _device_of_link(link: str) -> Hashable:
-    """One value for all spellings of a link: of a TCP link the host's addresses, else the serial port or file."""
+    """One value for all spellings of a link: of a TCP link the host's addresses, else the serial
+    port or file.
+    """
     plain = device_places.plain_link(link)
     if isinstance(plain, tuple):
         host, port = plain
@@ -152,7 +175,9 @@ async def connect(bench: roles.Bench, devices: DevicesConfig) -> roles.BenchIden
 
     Raises DeviceError, naming the device and the problem in one line.
     """
-    return await patiently(bench.open, devices.board or "devices")  # a bench of roles names the role itself
+    return await patiently(
+        bench.open, devices.board or "devices"
+    )  # a bench of roles names the role itself
 
 
 async def patiently(attempt: Callable[[], Awaitable[T]], where: str) -> T:
@@ -166,7 +191,9 @@ async def patiently(attempt: Callable[[], Awaitable[T]], where: str) -> T:
         except roles.LinkError as error:
             if not (isinstance(error, roles.LinkWaitsError) and failure):
                 failure = str(error).removeprefix(f"{where}: ")
-            if isinstance(error, roles.DeviceBusyError):  # a killed program's claim lapses with its watchdog
+            if isinstance(
+                error, roles.DeviceBusyError
+            ):  # a killed program's claim lapses with its watchdog
                 patience_s = max(patience_s, error.lapses_in_s + _LAPSE_S)
             if isinstance(error, roles.DeviceRefusedError) or loop.time() > begin_s + patience_s:
                 raise DeviceError(f"{where}: {failure}") from None
@@ -175,19 +202,23 @@ async def patiently(attempt: Callable[[], Awaitable[T]], where: str) -> T:
 
 # One program per device on this machine, whatever its folder or user.
 #
-# A lock is a name in the kernel's table of abstract sockets (unix(7)): not a file, which a link could redirect, a
-# sandbox hide, another user own or a killed process leave behind. The kernel identifies the listener that holds it.
+# A lock is a name in the kernel's table of abstract sockets (unix(7)): not a file, which a link
+# could redirect, a sandbox hide, another user own or a killed process leave behind. The kernel
+# identifies the
+# listener that holds it.
 
 # of SO_PEERCRED: pid, uid, gid
 _CREDENTIALS = struct.Struct("3i")
-# Each refused program connects to the holder's socket once to identify it; the kernel queues this many
+# Each refused program connects to the holder's socket once to identify it; the kernel queues this
+# many
 _ASKERS = 4096
 _SHOWN = 100  # characters of the holder's command line
 
 
 @contextlib.contextmanager
 def locked(devices: Iterable[str]) -> Iterator[None]:
-    """Claim these devices (`device_names`, `modbus_names`) until the end of the block or of the process.
+    """Claim these devices (`device_names`, `modbus_names`) until the end of the block or of the
+    process.
 
     Raises DeviceError, naming the device, the program that uses it and the remedy in one line.
     """
@@ -199,7 +230,8 @@ def locked(devices: Iterable[str]) -> Iterator[None]:
                 held.bind(address)
             except OSError:
                 raise DeviceError(
-                    f"{device}: in use by {_holder(address)}; stop that first (`membrane-ctrl ctl stop`, or Ctrl-C)"
+                    f"{device}: in use by {_holder(address)}; stop that first "
+                    "(`membrane-ctrl ctl stop`, or Ctrl-C)"
                 ) from None
             held.listen(_ASKERS)
         yield
@@ -219,7 +251,9 @@ def device_names(devices: DevicesConfig) -> set[str]:
 
 
 def _interlock_ports(devices: DevicesConfig) -> Iterator[str]:
-    """Yield the serial ports of interlocks. An input module in the network may serve several benches."""
+    """Yield the serial ports of interlocks. An input module in the network may serve several
+    benches.
+    """
     for interlock in devices.interlocks:
         if isinstance(interlock, settings.ModbusInputConfig) and interlock.link.startswith("rtu:"):
             port, _ = modbus_rtu.parse_rtu_url(interlock.link)
@@ -227,7 +261,9 @@ def _interlock_ports(devices: DevicesConfig) -> Iterator[str]:
 
 
 def modbus_names(url: str, unit_id: int) -> set[str]:
-    """A Modbus device's names: that of its serial line, which has one owner, or those of its host's addresses."""
+    """A Modbus device's names: that of its serial line, which has one owner, or those of its host's
+    addresses.
+    """
     if url.startswith("rtu:"):
         return {_serial_name(url.removeprefix("rtu://").partition("?")[0])}
     try:
@@ -247,7 +283,9 @@ def _serial_name(port: str) -> str:
 def _addresses(host: str) -> set[str]:
     """Addresses of a host; all addresses of this machine count as one."""
     try:
-        found = {str(entry[4][0]) for entry in socket.getaddrinfo(host, None, type=socket.SOCK_STREAM)}
+        found = {
+            str(entry[4][0]) for entry in socket.getaddrinfo(host, None, type=socket.SOCK_STREAM)
+        }
     except (OSError, UnicodeError):
         return {host.lower()}
     return {_plain_address(address) for address in found}
@@ -274,7 +312,13 @@ def _holder(address: bytes) -> str:
             return "another program"
     pid = int(_CREDENTIALS.unpack(raw)[0])
     try:
-        words = Path(f"/proc/{pid}/cmdline").read_bytes().decode(errors="replace").rstrip("\0").split("\0")
+        words = (
+            Path(f"/proc/{pid}/cmdline")
+            .read_bytes()
+            .decode(errors="replace")
+            .rstrip("\0")
+            .split("\0")
+        )
     except OSError:  # it has just ended, or the process table is hidden
         return f"process {pid}"
     return f"process {pid} ({one_line(' '.join(words))[:_SHOWN]})"

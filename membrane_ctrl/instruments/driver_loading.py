@@ -1,6 +1,8 @@
-"""Makes drivers and emulators of devices from their tables in the configuration; loads packages that these name.
+"""Makes drivers and emulators of devices from their tables in the configuration; loads packages
+that these name.
 
-Only what opens or emulates devices imports this: reading a configuration loads no driver (decision 37).
+Only what opens or emulates devices imports this: reading a configuration loads no driver (decision
+37).
 """
 
 from typing import Any
@@ -25,15 +27,17 @@ def check_settings(section: Any, where: str, kind: drivers.DriverKind) -> settin
         return checked
     expected = getattr(_load_driver(section, where, kind), "Settings", None)
     if not (isinstance(expected, type) and issubclass(expected, settings.Section)):
-        raise InputError(f"{where}: the {kind.name} {section.name} has no class Settings (docs/new-device.md)")
+        raise InputError(
+            f"{where}: the {kind.name} {section.name} has no class Settings (docs/new-device.md)"
+        )
     return toml_file.parse(section.keys, expected, where)
 
 
 def make_driver(section: Any, where: str, kind: drivers.DriverKind, *more: Any) -> Any:
     """Make the driver of a table, not yet connected.
 
-    Raises InputError for a driver that is not installed, does not load or cannot be made, and for a key that it
-    refuses.
+    Raises InputError for a driver that is not installed, does not load or cannot be made, and for a
+    key that it refuses.
 
     Parameters
     ----------
@@ -49,7 +53,9 @@ def make_driver(section: Any, where: str, kind: drivers.DriverKind, *more: Any) 
     return _construct(make, check_settings(section, where, kind), where, more)
 
 
-def make_emulator(section: settings.ExternalSection, where: str, kind: drivers.DriverKind, *more: Any) -> Any:
+def make_emulator(
+    section: settings.ExternalSection, where: str, kind: drivers.DriverKind, *more: Any
+) -> Any:
     """Make the emulator of a table's device. Raises InputError as `make_driver`."""
     try:
         make = drivers.load_emulator(section.name, kind)
@@ -73,4 +79,6 @@ def _construct(make: Any, checked: settings.Section, where: str, more: tuple[Any
     except ValueError as error:  # a setting that it refuses
         raise InputError(f"{where}: {error}") from error
     except (Exception, SystemExit) as error:  # whatever its code does
-        raise InputError(f"{where}: {make.__name__} cannot be made: {type(error).__name__}: {error}") from error
+        raise InputError(
+            f"{where}: {make.__name__} cannot be made: {type(error).__name__}: {error}"
+        ) from error

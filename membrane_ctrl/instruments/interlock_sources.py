@@ -1,7 +1,7 @@
 """Makes the sources of the configured interlocks that are not inputs of the pump board.
 
-Interlocks at one Modbus device, or at one GPIO chip, are read by one source, as often as the fastest of them asks for
-and with the strictest age of an answer.
+Interlocks at one Modbus device, or at one GPIO chip, are read by one source, as often as the
+fastest of them asks for and with the strictest age of an answer.
 """
 
 from collections import defaultdict
@@ -51,7 +51,9 @@ def _source(members: list[Member], links: ModbusLinks) -> PolledSource:
             first_s = _OPENING_TIMEOUTS * timeout_s
         else:
             lines = [found for _, found in members if isinstance(found, settings.GpioLineConfig)]
-            source = GpioLines(lines[0].chip, [GpioCircuit(f.line, f.wiring, f.pull) for f in lines])
+            source = GpioLines(
+                lines[0].chip, [GpioCircuit(f.line, f.wiring, f.pull) for f in lines]
+            )
     except ValueError as error:
         raise InputError(f"devices.interlocks.{bits[0]}: {error}") from None
     return PolledSource(

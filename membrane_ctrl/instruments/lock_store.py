@@ -1,11 +1,12 @@
 """The locks of this machine's devices on disk: one file a lock, in a folder that belongs to no run.
 
-A lock counts for every program that uses one of its devices, whatever its configuration or folder of runs. A file is
-complete and synced before the lock is confirmed. Doubt locks: a file or folder that cannot be read is a lock on all
-devices.
+A lock counts for every program that uses one of its devices, whatever its configuration or folder
+of runs. A file is complete and synced before the lock is confirmed. Doubt locks: a file or folder
+that cannot be read is a lock on all devices.
 
-The folder is `$MEMBRANE_CTRL_LOCKS`, else `/var/lib/membrane-ctrl/locks`, and for a user who may not write there also
-`$XDG_STATE_HOME/membrane-ctrl/locks`. It is no key of the configuration: another configuration must not hide a lock.
+The folder is `$MEMBRANE_CTRL_LOCKS`, else `/var/lib/membrane-ctrl/locks`, and for a user who may
+not write there also `$XDG_STATE_HOME/membrane-ctrl/locks`. It is no key of the configuration:
+another configuration must not hide a lock.
 """
 
 import contextlib
@@ -49,7 +50,8 @@ class StoredLock:
 
 
 class LockStore:
-    """The locks in the folders of this machine: read from all of them, written to the first that allows it.
+    """The locks in the folders of this machine: read from all of them, written to the first that
+    allows it.
 
     Parameters
     ----------
@@ -163,8 +165,9 @@ class LockStore:
 def device_keys(devices: DevicesConfig) -> frozenset[str]:
     """Return the names by which a bench's devices are known to the lock store.
 
-    Besides the present names (`bench.device_names`), by which programs exclude each other, these are the configured
-    ones and those of `/dev/serial/by-id`: a USB adapter or an address may get another name while a lock is set.
+    Besides the present names (`bench.device_names`), by which programs exclude each other, these
+    are the configured ones and those of `/dev/serial/by-id`: a USB adapter or an address may get
+    another name while a lock is set.
 
     Parameters
     ----------
@@ -207,7 +210,8 @@ def modbus_keys(url: str, unit_id: int) -> frozenset[str]:
 
 
 def require_unlocked(store: LockStore, devices: Collection[str], remedy: str = "") -> None:
-    """Refuse to go on if a device is locked. Every command that can move gas calls this after it has the devices.
+    """Refuse to go on if a device is locked. Every command that can move gas calls this after it
+    has the devices.
 
     Parameters
     ----------
@@ -241,7 +245,10 @@ def locked_line(locks: Sequence[Lock], remedy: str = "") -> str:
     str
     """
     how = remedy or "`membrane-ctrl locks remove WORD`"
-    return f"locked: {describe_locks(locks)}; ask its author whether the mirror may move, then remove it: {how}"
+    return (
+        f"locked: {describe_locks(locks)}; ask its author whether the mirror may move, then "
+        f"remove it: {how}"
+    )
 
 
 def draw_word(taken: Collection[str]) -> str:
@@ -292,7 +299,9 @@ def _check_folder(folder: Path) -> None:
         raise OSError(0, f"everybody may remove locks from it; chmod o-w {folder}")
     trusted = {0, os.geteuid(), folder.parent.stat().st_uid}
     if found.st_uid not in trusted:
-        raise OSError(0, f"belongs to user {found.st_uid}; chown it to root or to its users' service")
+        raise OSError(
+            0, f"belongs to user {found.st_uid}; chown it to root or to its users' service"
+        )
 
 
 def _write_file(folder: Path, name: str, data: bytes) -> Path:
@@ -313,7 +322,9 @@ def _write_file(folder: Path, name: str, data: bytes) -> Path:
 
 
 def _read_file(file: Path) -> StoredLock:
-    """Return a file's lock; a damaged one is a lock on all devices. Raises FileNotFoundError if it is gone."""
+    """Return a file's lock; a damaged one is a lock on all devices. Raises FileNotFoundError if it
+    is gone.
+    """
     try:
         table = json.loads(files.read_text(file, _FILE_BYTES_MOST))
         if table["schema"] != SCHEMA:

@@ -1,7 +1,9 @@
-"""Capture sets on disk (docs/interfaces.md, section 3): `capture.toml` and one image per frame, read and checked.
+"""Capture sets on disk (docs/interfaces.md, section 3): `capture.toml` and one image per frame,
+read and checked.
 
-An invalid description of a set is an InputError. Defects of single frames (missing, unreadable, different size or
-depth) are kept beside the frames: the measurement decides whether it can do without.
+An invalid description of a set is an InputError. Defects of single frames (missing, unreadable,
+different size or depth) are kept beside the frames: the measurement decides whether it can do
+without.
 """
 
 import math
@@ -77,17 +79,22 @@ class CaptureHead:
     folder: Path  # of the set
     kind: Literal["full", "fringes", "frequencies"]
     reference: Path | None  # of a fringes set: the full set that anchors it
-    optics: schema.OpticsConfig  # geometry, camera, pattern and mirror; `camera.bits` is valid only if `bits_stated`
+    optics: (
+        schema.OpticsConfig
+    )  # geometry, camera, pattern and mirror; `camera.bits` is valid only if `bits_stated`
     bits_stated: bool  # whether the set states its bit depth
     files: tuple[str, ...]  # in the order of the patterns
-    patterns: tuple[Pattern, ...]  # x sinusoids, x Gray bits, y sinusoids, y Gray bits, white, black (of a full set)
+    patterns: tuple[
+        Pattern, ...
+    ]  # x sinusoids, x Gray bits, y sinusoids, y Gray bits, white, black (of a full set)
     time_s: FloatArray  # (frames,): NaN where not stated
     displacement_um: FloatArray  # (frames,)
     pressure_pa: float  # gauge pressure during the set; NaN where not stated
     ignored: tuple[str, ...]  # unknown keys of the file
     geometry: GeometryOrigin  # origin of the geometry in `optics`
     artefact: Artefact | Literal["screen"] | None = None  # what is seen instead of the film
-    screen_moved: ScreenMovedTable | None = None  # by how much the screen stood elsewhere; `optics` has it there
+    # by how much the screen stood elsewhere; `optics` has it there
+    screen_moved: ScreenMovedTable | None = None
     before_move: schema.GeometryConfig | None = None  # the geometry without that
 
     @property
@@ -148,11 +155,17 @@ def read_head(folder: str | Path, geometry: GeometryFile | None = None) -> Captu
             raise InputError(f"{path}: reference: a fringes set names the full set that anchors it")
         reference = reference_of(content.reference, folder, path)
     sections = ("geometry", "camera", "pattern", "mirror")
-    blamed = path if geometry is None else geometry.path  # the screen and the pattern may be incompatible
-    optics = toml_file.parse({name: getattr(content, name) for name in sections}, schema.OpticsConfig, str(blamed))
+    blamed = (
+        path if geometry is None else geometry.path
+    )  # the screen and the pattern may be incompatible
+    optics = toml_file.parse(
+        {name: getattr(content, name) for name in sections}, schema.OpticsConfig, str(blamed)
+    )
     if geometry is not None:
         optics = geometry.over(optics)
-    optics = _with_reference_displacement(optics, content.frames[0].displacement_um if reference is None else None)
+    optics = _with_reference_displacement(
+        optics, content.frames[0].displacement_um if reference is None else None
+    )
     before, moved = optics.geometry, content.screen_moved
     if moved is not None:
         optics = optics.model_copy(update={"geometry": screen_elsewhere(before, moved.shift_mm)})
@@ -169,20 +182,26 @@ def read_head(folder: str | Path, geometry: GeometryFile | None = None) -> Captu
         pressure_pa=math.nan if content.pressure_pa is None else content.pressure_pa,
         ignored=ignored,
         geometry=origin_of(optics) if geometry is None else geometry.origin,
-        artefact=None if content.artefact is None else content.artefact.artefact(content.mirror.radius_mm, path),
+        artefact=None
+        if content.artefact is None
+        else content.artefact.artefact(content.mirror.radius_mm, path),
         screen_moved=moved,
         before_move=before,
     )
 
 
 def read_set(folder: str | Path, geometry: GeometryFile | None = None) -> CaptureSet:
-    """Read a capture set with its images. Raises InputError as `read_head`, and if no frame is usable."""
+    """Read a capture set with its images. Raises InputError as `read_head`, and if no frame is
+    usable.
+    """
     head = read_head(folder, geometry)
     camera = head.optics.camera
     if len(head.files) * camera.width_px * camera.height_px > _PIXELS_MAX:
         raise InputError(
-            f"{head.folder / 'capture.toml'}: camera.width_px, height_px: {len(head.files)} frames of "
-            f"{camera.width_px} x {camera.height_px} pixels exceed the limit of {_PIXELS_MAX / 1e6:.0f} million "
+            f"{head.folder / 'capture.toml'}: camera.width_px, height_px: {len(head.files)} "
+            "frames of "
+            f"{camera.width_px} x {camera.height_px} pixels exceed the limit of "
+            f"{_PIXELS_MAX / 1e6:.0f} million "
             "for a set"
         )
     with ThreadPoolExecutor(_READERS) as pool:
@@ -191,14 +210,17 @@ def read_set(folder: str | Path, geometry: GeometryFile | None = None) -> Captur
 
 
 def assemble(head: CaptureHead, images: Sequence[Image | str]) -> CaptureSet:
-    """Collect frames of one size and depth in one array; a text in place of an image is the reason for its absence.
+    """Collect frames of one size and depth in one array; a text in place of an image is the reason
+    for its absence.
 
     Raises InputError if no frame is readable, or if most contradict the camera in the file.
     """
     path = head.folder / "capture.toml"
     good = [image for image in images if not isinstance(image, str)]
     if not good:
-        raise InputError(f"{path}: frames: none of the {len(images)} images is readable ({images[0]})")
+        raise InputError(
+            f"{path}: frames: none of the {len(images)} images is readable ({images[0]})"
+        )
     camera = head.optics.camera
     size, depth = (camera.height_px, camera.width_px), _most([image.dtype for image in good])
     seen = _most([image.shape for image in good])
@@ -211,9 +233,14 @@ def assemble(head: CaptureHead, images: Sequence[Image | str]) -> CaptureSet:
         if isinstance(image, str):
             unusable[k] = image
         elif image.shape != size:
-            unusable[k] = f"wrong size: {image.shape[1]} x {image.shape[0]} pixels, the others {size[1]} x {size[0]}"
+            unusable[k] = (
+                f"wrong size: {image.shape[1]} x {image.shape[0]} pixels, the others "
+                f"{size[1]} x {size[0]}"
+            )
         elif image.dtype != depth:
-            unusable[k] = f"wrong bit depth: {8 * image.itemsize} bit, the others {8 * depth.itemsize} bit"
+            unusable[k] = (
+                f"wrong bit depth: {8 * image.itemsize} bit, the others {8 * depth.itemsize} bit"
+            )
         else:
             frames[k] = image
     bits = _depth(head, frames, path)
@@ -223,7 +250,8 @@ def assemble(head: CaptureHead, images: Sequence[Image | str]) -> CaptureSet:
 
 
 def anchored(head: CaptureHead, reference: CaptureHead) -> CaptureHead:
-    """Head of a fringes set; its geometry holds for the stated displacement, else for its reference's.
+    """Head of a fringes set; its geometry holds for the stated displacement, else for its
+    reference's.
 
     Raises InputError if the two cannot belong together.
     """
@@ -235,11 +263,18 @@ def anchored(head: CaptureHead, reference: CaptureHead) -> CaptureHead:
         a, b = getattr(ours, section), getattr(theirs, section)
         for key in ("width_px", "height_px", "periods", "period_mm"):
             if getattr(a, key, None) != getattr(b, key, None):
-                raise InputError(f"{where}: {section}.{key} = {getattr(a, key)}, the reference has {getattr(b, key)}")
-    return replace(head, optics=_with_reference_displacement(ours, theirs.geometry.reference_displacement_um))
+                raise InputError(
+                    f"{where}: {section}.{key} = {getattr(a, key)}, the reference has "
+                    f"{getattr(b, key)}"
+                )
+    return replace(
+        head, optics=_with_reference_displacement(ours, theirs.geometry.reference_displacement_um)
+    )
 
 
-def _with_reference_displacement(optics: schema.OpticsConfig, displacement_um: float | None) -> schema.OpticsConfig:
+def _with_reference_displacement(
+    optics: schema.OpticsConfig, displacement_um: float | None
+) -> schema.OpticsConfig:
     """The head with the displacement for which its geometry holds, unless it states one."""
     geometry = optics.geometry
     if geometry.reference_displacement_um is not None or displacement_um is None:
@@ -264,12 +299,18 @@ def read_image(path: Path) -> Image | str:
 
 
 def _depth(head: CaptureHead, frames: Image, path: Path) -> int:
-    """Bits of the sensor: as stated, else the smallest usual depth that holds the brightest pixel."""
+    """Bits of the sensor: as stated, else the smallest usual depth
+    that holds the brightest pixel.
+    """
     bits = head.optics.camera.bits
     if not head.bits_stated:
-        return 8 if frames.dtype == np.uint8 else next(b for b in _DEPTHS if int(frames.max()) < 2**b)
+        return (
+            8 if frames.dtype == np.uint8 else next(b for b in _DEPTHS if int(frames.max()) < 2**b)
+        )
     if (bits == 8) != (frames.dtype == np.uint8):
-        raise InputError(f"{path}: camera.bits = {bits}, but the images have {8 * frames.itemsize} bit pixels")
+        raise InputError(
+            f"{path}: camera.bits = {bits}, but the images have {8 * frames.itemsize} bit pixels"
+        )
     if int(frames.max()) >= 2**bits:
         raise InputError(f"{path}: camera.bits = {bits}, but pixels reach {int(frames.max())}")
     return bits
@@ -286,7 +327,9 @@ def require_inside(name: str, folder: Path, path: Path) -> None:
 
 
 def reference_of(name: str, folder: Path, path: Path) -> Path:
-    """The folder of the set that anchors this one. Raises InputError for a name that cannot be one."""
+    """The folder of the set that anchors this one. Raises InputError
+    for a name that cannot be one.
+    """
     try:
         return (folder / name).resolve()
     except (OSError, ValueError, RuntimeError):  # a NUL, too long a name, circular links
@@ -294,29 +337,46 @@ def reference_of(name: str, folder: Path, path: Path) -> Path:
 
 
 def _ordered(content: CaptureFile, path: Path) -> list[tuple[FrameRow, Pattern]]:
-    """Rows with their patterns in the order of the sequence. Raises InputError for missing or duplicate ones."""
+    """Rows with their patterns in the order of the sequence. Raises InputError for missing or
+    duplicate ones.
+    """
     found: dict[str, tuple[FrameRow, Pattern]] = {}
     for row in content.frames:
         if row.role in ("sin", "gray") and row.axis is None:
             raise InputError(f"{path}: frames: {row.file} has role {row.role} and no axis")
         pattern = Pattern(row.role, row.axis or "", row.index if row.axis else 0)
         if row.role == "sin":
-            shift = 2 * math.pi * row.index / content.pattern.steps if row.shift_rad is None else row.shift_rad
-            pattern = Pattern(row.role, row.axis or "", row.index, shift, _coarser_mm(row, content, path))
+            shift = (
+                2 * math.pi * row.index / content.pattern.steps
+                if row.shift_rad is None
+                else row.shift_rad
+            )
+            pattern = Pattern(
+                row.role, row.axis or "", row.index, shift, _coarser_mm(row, content, path)
+            )
         if pattern.name in found:
             raise InputError(
-                f"{path}: frames: {pattern.name} appears twice ({found[pattern.name][0].file}, {row.file})"
+                f"{path}: frames: {pattern.name} appears twice "
+                f"({found[pattern.name][0].file}, {row.file})"
             )
         found[pattern.name] = (row, pattern)
-    names = [p.name for p in (full_sequence if content.kind == "full" else fringe_sequence)(content.pattern)]
+    names = [
+        p.name
+        for p in (full_sequence if content.kind == "full" else fringe_sequence)(content.pattern)
+    ]
     if content.kind == "frequencies":
         coarser = sorted({pattern.period_mm for _, pattern in found.values()} - {0.0})
         if not coarser:
-            raise InputError(f"{path}: frames: a set of kind frequencies needs frames of another period_mm")
+            raise InputError(
+                f"{path}: frames: a set of kind frequencies needs frames of another period_mm"
+            )
         fringes = fringe_sequence(content.pattern)
         names += [replace(p, period_mm=period).name for period in coarser for p in fringes]
     if missing := [name for name in names if name not in found]:
-        raise InputError(f"{path}: frames: a {content.kind} set of {content.pattern.steps} steps needs {missing[0]}")
+        raise InputError(
+            f"{path}: frames: a {content.kind} set of {content.pattern.steps} steps needs "
+            f"{missing[0]}"
+        )
     if extra := [name for name in found if name not in names]:
         raise InputError(f"{path}: frames: {extra[0]} does not belong to a {content.kind} set")
     for name, times in Counter(row.file for row in content.frames).items():
@@ -330,9 +390,15 @@ def _coarser_mm(row: FrameRow, content: CaptureFile, path: Path) -> float:
     if row.period_mm is None or row.period_mm == content.pattern.period_mm:
         return 0.0
     if content.kind != "frequencies":
-        raise InputError(f"{path}: frames: {row.file} has its own period_mm: the kind of such a set is frequencies")
+        raise InputError(
+            f"{path}: frames: {row.file} has its own period_mm: the kind of such a set is "
+            "frequencies"
+        )
     if row.period_mm < content.pattern.period_mm:
-        raise InputError(f"{path}: frames: {row.file}: period_mm = {row.period_mm:g} is finer than pattern.period_mm")
+        raise InputError(
+            f"{path}: frames: {row.file}: period_mm = {row.period_mm:g} is finer than "
+            "pattern.period_mm"
+        )
     return row.period_mm
 
 

@@ -1,6 +1,8 @@
-"""The command `export-figure`: a measured height map in the formats of other programs (docs/figure.md).
+"""The command `export-figure`: a measured height map in the formats of other programs
+(docs/figure.md).
 
-Rows of these formats start at the top, +y; a viewer in front of the mirror sees +x on the right. High is towards +z.
+Rows of these formats start at the top, +y; a viewer in front of the mirror sees +x on the right.
+High is towards +z.
 """
 
 import io
@@ -38,7 +40,8 @@ class ExportedMap:
     height_mm : (H, W) array
         Rows along y; NaN where not measured.
     radius_mm : float
-        Radius of the Fringe terms' disc: about the vertex, the smallest that holds every measured cell.
+        Radius of the Fringe terms' disc: about the vertex, the smallest that holds every measured
+        cell.
     removed : str
         What was taken off, for people.
     """
@@ -61,12 +64,18 @@ class ExportedMap:
 
     def top_down(self, counts_per_mm: float, missing: int) -> IntArray:
         """Heights as whole numbers, first row at +y."""
-        whole = np.where(self.measured, np.rint(np.nan_to_num(self.height_mm) * counts_per_mm), missing)
+        whole = np.where(
+            self.measured, np.rint(np.nan_to_num(self.height_mm) * counts_per_mm), missing
+        )
         return whole[::-1].astype(np.int64)
 
 
-def export_command(result: Path, form: str, remove: str = "", terms: str = "", out: Path | None = None) -> int:
-    """Write a result's height map, and a table of its Zernike terms if `terms` names a set. Raises InputError."""
+def export_command(
+    result: Path, form: str, remove: str = "", terms: str = "", out: Path | None = None
+) -> int:
+    """Write a result's height map, and a table of its Zernike terms if `terms` names a set. Raises
+    InputError.
+    """
     if form not in _WRITERS:
         raise errors.InputError(f"--format {form}: give one of {', '.join(_WRITERS)}")
     if terms and terms not in ("noll", "osa", "fringe"):
@@ -74,7 +83,9 @@ def export_command(result: Path, form: str, remove: str = "", terms: str = "", o
     seen, table = read_result(result)
     names = [name for name in remove.split(",") if name]
     if unknown := [name for name in names if name not in (*_REMOVABLE, "sphere")]:
-        raise errors.InputError(f"--remove {unknown[0]}: give piston, tilt, power or sphere, separated by commas")
+        raise errors.InputError(
+            f"--remove {unknown[0]}: give piston, tilt, power or sphere, separated by commas"
+        )
     zernike_table = _zernike_table(terms, seen, table, result) if terms else None
     seen = removed(seen, names)
     suffix, write = _WRITERS[form]
@@ -88,7 +99,10 @@ def export_command(result: Path, form: str, remove: str = "", terms: str = "", o
             )
     step = f", heights in steps of {1e6 * step_mm:.3g} nm" if step_mm else ""
     rows, columns = seen.height_mm.shape
-    print(f"{target}: {columns} x {rows} cells of {seen.pitch_mm:.4g} mm, {seen.removed} removed{step}")
+    print(
+        f"{target}: {columns} x {rows} cells of {seen.pitch_mm:.4g} mm, {seen.removed} "
+        f"removed{step}"
+    )
     return 0
 
 
@@ -98,19 +112,32 @@ def read_result(folder: Path) -> tuple[ExportedMap, dict[str, Any]]:
         arrays = read_arrays(folder / "height.npz", ("x_mm", "y_mm", "h_mm"), _CELLS_MAX)
         table = plain_json.loads(files.read_text(folder / "result.json"))
     except OSError as error:
-        raise errors.InputError(f"{error.filename or folder}: {errors.os_reason(error)}: is it a result?") from None
+        raise errors.InputError(
+            f"{error.filename or folder}: {errors.os_reason(error)}: is it a result?"
+        ) from None
     except ValueError as error:
         raise errors.InputError(f"{folder}: not a usable result: {error}") from None
     where, (x, y, height) = folder / "height.npz", arrays
-    if height.ndim != 2 or height.shape != (y.size, x.size) or x.ndim != 1 or y.ndim != 1 or min(height.shape) < 2:
+    if (
+        height.ndim != 2
+        or height.shape != (y.size, x.size)
+        or x.ndim != 1
+        or y.ndim != 1
+        or min(height.shape) < 2
+    ):
         raise errors.InputError(f"{where}: h_mm has not the shape of y_mm and x_mm, at least 2 x 2")
     steps = np.concatenate([np.diff(x), np.diff(y)])
     if not np.isfinite(steps).all() or steps.min() <= 0 or np.ptp(steps) > 1e-6 * steps.max():
         raise errors.InputError(f"{where}: x_mm and y_mm must rise in even steps of one size")
     measured = np.isfinite(height)
     if np.count_nonzero(measured) < LEAST_CELLS:
-        raise errors.InputError(f"{where}: has {np.count_nonzero(measured)} measured cells, too few for a figure")
-    if not np.nanmax(np.abs(np.where(measured, height, 0))) <= _HEIGHT_MAX_MM or np.isinf(height).any():
+        raise errors.InputError(
+            f"{where}: has {np.count_nonzero(measured)} measured cells, too few for a figure"
+        )
+    if (
+        not np.nanmax(np.abs(np.where(measured, height, 0))) <= _HEIGHT_MAX_MM
+        or np.isinf(height).any()
+    ):
         raise errors.InputError(f"{where}: h_mm has heights beyond {_HEIGHT_MAX_MM:g} mm")
     radius = float(np.max(np.where(measured, np.hypot(x, y[:, None]), 0)))
     return ExportedMap(x, y, height, radius), table if isinstance(table, dict) else {}
@@ -118,14 +145,16 @@ def read_result(folder: Path) -> tuple[ExportedMap, dict[str, Any]]:
 
 def _fit(seen: ExportedMap, terms: int) -> zernike.GridFit:
     axes = seen.x_mm / seen.radius_mm, seen.y_mm / seen.radius_mm
-    return zernike.GridFit(axes[0], seen.measured, [zernike.fringe(j + 1) for j in range(terms)], axes[1])
+    return zernike.GridFit(
+        axes[0], seen.measured, [zernike.fringe(j + 1) for j in range(terms)], axes[1]
+    )
 
 
 def removed(seen: ExportedMap, names: list[str]) -> ExportedMap:
     """The map without the named parts.
 
-    Piston, tilt and power are fitted together; what is not named stays. `sphere` leaves the deviation along the best
-    sphere's normal, and then the other parts of that.
+    Piston, tilt and power are fitted together; what is not named stays. `sphere` leaves the
+    deviation along the best sphere's normal, and then the other parts of that.
     """
     height, measured = seen.height_mm, seen.measured
     if "sphere" in names:
@@ -142,8 +171,12 @@ def removed(seen: ExportedMap, names: list[str]) -> ExportedMap:
     return ExportedMap(seen.x_mm, seen.y_mm, height, seen.radius_mm, ", ".join(names) or "nothing")
 
 
-def _zernike_table(index: str, seen: ExportedMap, table: dict[str, Any], where: Path) -> dict[str, Any]:
-    """Terms of the whole height in one set; Noll's are the result's own, Fringe's are fitted to the map."""
+def _zernike_table(
+    index: str, seen: ExportedMap, table: dict[str, Any], where: Path
+) -> dict[str, Any]:
+    """Terms of the whole height in one set; Noll's are the result's own, Fringe's are fitted to the
+    map.
+    """
     if index == "fringe":
         coeffs = 1e3 * _fit(seen, zernike.FRINGE_TERMS).coefficients(seen.height_mm)
         orders = [zernike.fringe(j + 1) for j in range(zernike.FRINGE_TERMS)]
@@ -152,7 +185,10 @@ def _zernike_table(index: str, seen: ExportedMap, table: dict[str, Any], where: 
         own = table.get("zernike")
         own = own if isinstance(own, dict) else {}
         try:
-            coeffs, radius = np.array(own.get("coeffs_um"), float), float(own.get("radius_mm", math.nan))
+            coeffs, radius = (
+                np.array(own.get("coeffs_um"), float),
+                float(own.get("radius_mm", math.nan)),
+            )
         except (TypeError, ValueError):
             coeffs, radius = np.zeros(0), math.nan
         if coeffs.shape != (ZERNIKE_TERMS,) or not (np.isfinite(coeffs).all() and radius > 0):
@@ -173,9 +209,13 @@ def _zernike_table(index: str, seen: ExportedMap, table: dict[str, Any], where: 
     }
 
 
-Written = tuple[bytes, float | None]  # a file's content, and the step of its heights in mm if they are whole numbers
+Written = tuple[
+    bytes, float | None
+]  # a file's content, and the step of its heights in mm if they are whole numbers
 
-_WAVELENGTH_M = float(np.float32(632.8e-9))  # a scale, which the formats require: no light was measured
+_WAVELENGTH_M = float(
+    np.float32(632.8e-9)
+)  # a scale, which the formats require: no light was measured
 _NO_DATA = 2147483640
 _RESOLUTIONS = {1: 32768, 0: 4096}  # code in the file, counts per wavelength
 
@@ -183,10 +223,14 @@ _RESOLUTIONS = {1: 32768, 0: 4096}  # code in the file, counts per wavelength
 def _zygo_dat(seen: ExportedMap, _: object) -> Written:
     """MetroPro's binary file, version 1: a header of 834 bytes and big-endian counts."""
     largest_mm = float(np.nanmax(np.abs(seen.height_mm)))
-    counts = {code: per_wave / (_WAVELENGTH_M * 1e3 * 0.5) for code, per_wave in _RESOLUTIONS.items()}
+    counts = {
+        code: per_wave / (_WAVELENGTH_M * 1e3 * 0.5) for code, per_wave in _RESOLUTIONS.items()
+    }
     code = next((code for code, per_mm in counts.items() if largest_mm * per_mm < _NO_DATA), None)
     if code is None:
-        raise errors.InputError(f"--format zygo-dat: holds heights up to 166 mm, not {largest_mm:.0f} mm")
+        raise errors.InputError(
+            f"--format zygo-dat: holds heights up to 166 mm, not {largest_mm:.0f} mm"
+        )
     rows, columns = seen.height_mm.shape
     header = bytearray(834)
     fields: tuple[tuple[int, str, Any], ...] = (
@@ -245,7 +289,9 @@ _CODEV_MOST, _CODEV_MISSING = 32767, -32768
 
 
 def _codev_int(seen: ExportedMap, _: object) -> Written:
-    """Code V's grid interferogram of a surface: whole numbers of 16 bits, SSZ of them a wavelength of 1 µm."""
+    """Code V's grid interferogram of a surface: whole numbers of 16 bits, SSZ of them a wavelength
+    of 1 µm.
+    """
     per_um = _CODEV_MOST / max(1e3 * float(np.nanmax(np.abs(seen.height_mm))), 1e-6)
     scale = float(f"{per_um:.9g}")  # as the file states it
     rows, columns = seen.height_mm.shape
@@ -265,10 +311,16 @@ def _h5(seen: ExportedMap, table: dict[str, Any] | None) -> Written:
         raise errors.InputError("--format h5 needs h5py: pip install 'membrane-ctrl[h5]'") from None
     memory = io.BytesIO()
     with h5py.File(memory, "w") as file:
-        for name, values in (("x_mm", seen.x_mm), ("y_mm", seen.y_mm), ("height_mm", seen.height_mm)):
+        for name, values in (
+            ("x_mm", seen.x_mm),
+            ("y_mm", seen.y_mm),
+            ("height_mm", seen.height_mm),
+        ):
             file.create_dataset(name, data=values, compression="gzip" if values.ndim > 1 else None)
         file.attrs["removed"] = seen.removed
-        file["height_mm"].attrs["axes"] = "rows along y_mm, columns along x_mm; NaN where not measured"
+        file["height_mm"].attrs["axes"] = (
+            "rows along y_mm, columns along x_mm; NaN where not measured"
+        )
         for name, value in (table or {}).items():
             file.require_group("zernike").attrs[name] = value
     return memory.getvalue(), None

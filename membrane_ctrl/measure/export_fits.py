@@ -1,4 +1,5 @@
-"""A height map as FITS for programs of physical optics, such as POPPY: path difference, mask and height.
+"""A height map as FITS for programs of physical optics, such as POPPY: path difference, mask and
+height.
 
 Source: FITS Standard 4.0 (World Coordinate System: section 8); POPPY 1.1, `FITSOpticalElement`.
 """
@@ -12,8 +13,8 @@ from membrane_ctrl.model.arrays import FloatArray
 from membrane_ctrl.model.optional import import_optional
 from membrane_ctrl.model.program import file_origin
 
-# Where the mirror is high, the light turns back earlier: the reflected wavefront leads by twice the height. POPPY has
-# this sign: a mirror that rises towards +x sends the light to -x.
+# Where the mirror is high, the light turns back earlier: the reflected wavefront leads by twice the
+# height. POPPY has this sign: a mirror that rises towards +x sends the light to -x.
 _LEAD_PER_HEIGHT = 2.0
 _M_PER_MM = 1e-3
 
@@ -62,7 +63,9 @@ def fits_bytes(x_mm: FloatArray, y_mm: FloatArray, height_mm: FloatArray, remove
     return memory.getvalue()
 
 
-def _squared(x_mm: FloatArray, y_mm: FloatArray, height_mm: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
+def _squared(
+    x_mm: FloatArray, y_mm: FloatArray, height_mm: FloatArray
+) -> tuple[FloatArray, FloatArray, FloatArray]:
     """The map with NaN appended in rows or columns until it is square."""
     rows, columns = height_mm.shape
     side = max(rows, columns)

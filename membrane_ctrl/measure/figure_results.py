@@ -1,4 +1,6 @@
-"""The metrologist's figure of a measurement: numbers with error bars, their block in `result.json`, maps, report."""
+"""The metrologist's figure of a measurement: numbers with error bars, their block in `result.json`,
+maps, report.
+"""
 
 import io
 import math
@@ -47,11 +49,15 @@ class MeasuredFigure:
 
     @property
     def power_um(self) -> tuple[float, float, float] | None:
-        """Depth of the best sphere less that of the nominal one, with its two bars; None without a nominal radius."""
+        """Depth of the best sphere less that of the nominal one, with its two bars; None without a
+        nominal radius.
+        """
         if self.nominal_radius_mm is None:
             return None
         nominal = surface.Sphere(0.0, 0.0, 0.0, 1 / self.nominal_radius_mm).sag_mm(self.aperture_mm)
-        found, *bars = (one.numbers.sphere_sag_mm for one in (self.figure, self.noise, self.geometry))
+        found, *bars = (
+            one.numbers.sphere_sag_mm for one in (self.figure, self.noise, self.geometry)
+        )
         return 1e3 * (found - nominal), 1e3 * bars[0], 1e3 * bars[1]
 
 
@@ -60,7 +66,8 @@ def measured_figure(
 ) -> MeasuredFigure | None:
     """Evaluate the figure of a measurement; None if it has no usable one, or hardly a cell.
 
-    Raises InputError for a nominal radius that no sphere over the aperture has; negative ones are convex.
+    Raises InputError for a nominal radius that no sphere over the aperture has; negative ones are
+    convex.
     """
     full, mirror = measurement.full, measurement.head.optics.mirror
     if nominal_radius_mm is not None and not abs(nominal_radius_mm) > mirror.analysis_radius_mm:
@@ -80,13 +87,23 @@ def measured_figure(
     return MeasuredFigure(found, of_noise, of_geometry, spectrum, seen, aperture, nominal_radius_mm)
 
 
-def figure_table(measurement: Measurement, found: MeasuredFigure, bars: ErrorBars) -> dict[str, Any]:
-    """The block `figure`: every number with 1 sigma from noise and from the geometry (docs/figure.md)."""
+def figure_table(
+    measurement: Measurement, found: MeasuredFigure, bars: ErrorBars
+) -> dict[str, Any]:
+    """The block `figure`: every number with 1 sigma from noise and from the geometry
+    (docs/figure.md).
+    """
     numbers = {
-        name: quantity(value, getattr(found.noise.numbers, name), getattr(found.geometry.numbers, name))
+        name: quantity(
+            value, getattr(found.noise.numbers, name), getattr(found.geometry.numbers, name)
+        )
         for name, value in vars(found.figure.numbers).items()
     }
-    missing = {name: "a surface that is nearly flat has none" for name, item in numbers.items() if item is None}
+    missing = {
+        name: "a surface that is nearly flat has none"
+        for name, item in numbers.items()
+        if item is None
+    }
     if found.figure.numbers.best_focus_mm <= 0:  # behind the mirror
         for name in [name for name in numbers if name.startswith(("best_focus", "spot"))]:
             numbers[name], missing[name] = None, "the mirror has no real focus"
@@ -109,16 +126,29 @@ def quantity(value: float, of_noise: float, of_geometry: float) -> dict[str, flo
     """A number with its error bars, null where there is none; None if the number does not exist."""
     if not math.isfinite(value):
         return None
-    return {"value": value, "sigma_noise": number_or_null(of_noise), "sigma_geometry": number_or_null(of_geometry)}
+    return {
+        "value": value,
+        "sigma_noise": number_or_null(of_noise),
+        "sigma_geometry": number_or_null(of_geometry),
+    }
 
 
-def _zernike_tables(measurement: Measurement, found: MeasuredFigure, bars: ErrorBars) -> list[dict[str, Any]]:
-    """The height in three sets of terms; Noll's and OSA's are the same terms, Fringe's are fitted to the map."""
+def _zernike_tables(
+    measurement: Measurement, found: MeasuredFigure, bars: ErrorBars
+) -> list[dict[str, Any]]:
+    """The height in three sets of terms; Noll's and OSA's are the same terms, Fringe's are fitted
+    to the map.
+    """
     radius_mm = measurement.head.optics.mirror.radius_mm
     to_coeffs = surface.parameter_to_coeffs()
-    coeffs = 1e3 * measurement.full.surface.coeffs_mm if measurement.full else np.full(ZERNIKE_TERMS, np.nan)
+    coeffs = (
+        1e3 * measurement.full.surface.coeffs_mm
+        if measurement.full
+        else np.full(ZERNIKE_TERMS, np.nan)
+    )
     of_noise, of_geometry = (
-        1e3 * np.sqrt(np.maximum(np.diag(to_coeffs @ c @ to_coeffs.T), 0.0)) for c in (bars.noise, bars.geometry)
+        1e3 * np.sqrt(np.maximum(np.diag(to_coeffs @ c @ to_coeffs.T), 0.0))
+        for c in (bars.noise, bars.geometry)
     )
     osa = [zernike.osa_from_noll(row) for row in (coeffs, of_noise, of_geometry)]
     fringe = found.figure.fringe_um, found.noise.fringe_um, found.geometry.fringe_um
@@ -142,7 +172,9 @@ def _zernike_tables(measurement: Measurement, found: MeasuredFigure, bars: Error
 
 
 def write_figure_maps(path: Path, found: MeasuredFigure) -> None:
-    """Write the deviation from the best sphere, its spectrum, and the encircled energy. Raises OSError."""
+    """Write the deviation from the best sphere, its spectrum, and the encircled energy. Raises
+    OSError.
+    """
     write_arrays(
         path,
         x_mm=found.seen.axis_mm,
@@ -166,8 +198,10 @@ def figure_lines(found: MeasuredFigure) -> list[str]:
         return f"{with_bar(scale * getattr(numbers, name), scale * math.hypot(*bars))} {unit}"
 
     lines = [
-        f"sphere    radius {told('radius_of_curvature_mm', 'mm')}, focal length {told('focal_length_mm', 'mm')}",
-        f"irregular PV {told('irregularity_pv_um', 'µm')}, RMS {told('irregularity_rms_um', 'µm')}, "
+        f"sphere    radius {told('radius_of_curvature_mm', 'mm')}, focal length "
+        f"{told('focal_length_mm', 'mm')}",
+        f"irregular PV {told('irregularity_pv_um', 'µm')}, RMS "
+        f"{told('irregularity_rms_um', 'µm')}, "
         f"PVr {told('pvr_um', 'µm')}; slope {told('slope_rms_urad', 'µrad')} RMS",
         f"          rotationally invariant PV {told('rotational_pv_um', 'µm')}, "
         f"the rest {told('asymmetry_rms_um', 'µm')} RMS",
@@ -175,7 +209,8 @@ def figure_lines(found: MeasuredFigure) -> list[str]:
     if numbers.best_focus_mm > 0:
         lines.append(
             f"spot      {told('best_focus_mm', 'mm')} from the vertex: 80 % of the rays within "
-            f"{told('spot_80_mm', 'mm')}, 50 % {told('spot_50_mm', 'mm')}, 95 % {told('spot_95_mm', 'mm')} (radius)"
+            f"{told('spot_80_mm', 'mm')}, 50 % {told('spot_50_mm', 'mm')}, 95 % "
+            f"{told('spot_95_mm', 'mm')} (radius)"
         )
     return lines
 
@@ -198,22 +233,30 @@ h1,h2{overflow-wrap:anywhere}h2{font-size:17px;margin-top:28px;border-bottom:1px
 table{border-collapse:collapse;font-variant-numeric:tabular-nums}th{text-align:left;color:#667}
 td,th{border-bottom:1px solid #eef0f4;padding:3px 18px 3px 0}pre{white-space:pre-wrap;overflow-wrap:anywhere}
 img{max-width:100%}@media print{figure,tr{break-inside:avoid}}
-"""
+"""  # noqa: E501
 _POLICY = "default-src 'none'; img-src data:; style-src 'unsafe-inline'"
 _PAGE = (8.27, 11.69)  # A4, inches
 _LINES_A_PAGE = 64
 
 
-def write_report(out: Path, name: str, lines: Sequence[str], result: dict[str, Any], drawn: Sequence[Path]) -> None:
-    """Write `report.html` and `report.pdf` of a measurement: its lines, numbers, terms and pictures. Raises OSError.
+def write_report(
+    out: Path, name: str, lines: Sequence[str], result: dict[str, Any], drawn: Sequence[Path]
+) -> None:
+    """Write `report.html` and `report.pdf` of a measurement: its lines, numbers, terms and
+    pictures. Raises OSError.
 
-    `name` is for the title; `result` is the content of `result.json`; `drawn` are the pictures' files.
+    `name` is for the title; `result` is the content of `result.json`; `drawn` are the pictures'
+    files.
     """
     title = plain(f"Measurement of {name}")
     tables = [] if result["figure"] is None else _report_tables(result["figure"])
     images = [(file.stem, file.read_bytes()) for file in drawn]
-    write_text_atomic(out / "report.html", _page(title, [plain(line) for line in lines], tables, images))
-    write_bytes_atomic(out / "report.pdf", _pdf(title, [plain(line) for line in lines], tables, images))
+    write_text_atomic(
+        out / "report.html", _page(title, [plain(line) for line in lines], tables, images)
+    )
+    write_bytes_atomic(
+        out / "report.pdf", _pdf(title, [plain(line) for line in lines], tables, images)
+    )
 
 
 ReportTable = tuple[str, list[tuple[str, ...]]]  # heading, rows; the first names the columns
@@ -228,7 +271,8 @@ def _report_tables(figure: dict[str, Any]) -> list[ReportTable]:
     rows: list[tuple[str, ...]] = [("number", "value", "1 sigma, noise", "1 sigma, geometry")]
     rows += [(key, *(cell(item[part]) for part in item)) for key, item in figure["numbers"].items()]
     where = (
-        f"aperture: radius {figure['aperture_radius_mm']:g} mm about the vertex; cells of {figure['cell_mm']:.3g} mm"
+        f"aperture: radius {figure['aperture_radius_mm']:g} mm about the vertex; cells of "
+        f"{figure['cell_mm']:.3g} mm"
     )
     tables: list[ReportTable] = [(f"Figure ({where})", rows)]
     if figure["not_given"]:
@@ -236,14 +280,23 @@ def _report_tables(figure: dict[str, Any]) -> list[ReportTable]:
     for terms in figure["zernike"]:
         rows = [("j", "coefficient, µm", "1 sigma, noise", "1 sigma, geometry")]
         columns = (terms[key] for key in ("coeffs_um", "sigma_noise_um", "sigma_geometry_um"))
-        rows += [(str(j), *map(cell, row)) for j, row in enumerate(zip(*columns, strict=True), terms["first"])]
-        heading = f"Zernike terms, {terms['index']}, {terms['normalisation']} 1 over {terms['radius_mm']:g} mm"
+        rows += [
+            (str(j), *map(cell, row))
+            for j, row in enumerate(zip(*columns, strict=True), terms["first"])
+        ]
+        heading = (
+            f"Zernike terms, {terms['index']}, {terms['normalisation']} 1 over "
+            f"{terms['radius_mm']:g} mm"
+        )
         tables.append((heading, rows))
     return tables
 
 
 def _page(
-    title: str, lines: Sequence[str], tables: Sequence[ReportTable], images: Sequence[tuple[str, bytes]]
+    title: str,
+    lines: Sequence[str],
+    tables: Sequence[ReportTable],
+    images: Sequence[tuple[str, bytes]],
 ) -> str:
     parts = [
         "<!doctype html><html lang='en'><meta charset='utf-8'>",
@@ -255,7 +308,9 @@ def _page(
         parts.append(_html_table(heading, rows))
     for name, data in images:
         text = b64encode(data).decode()
-        parts.append(f"<h2>{name}</h2><figure><img alt='{name}' src='data:image/png;base64,{text}'></figure>")
+        parts.append(
+            f"<h2>{name}</h2><figure><img alt='{name}' src='data:image/png;base64,{text}'></figure>"
+        )
     parts += [_html_table(heading, rows) for heading, rows in tables[2:]]
     return "\n".join(parts) + "</html>\n"
 
@@ -263,11 +318,18 @@ def _page(
 def _html_table(heading: str, rows: Sequence[tuple[str, ...]]) -> str:
     head, *body = [[escape(text) for text in row] for row in rows]
     marked = ["<th>" + "<th>".join(head), *("<td>" + "<td>".join(row) for row in body)]
-    return f"<h2>{escape(heading)}</h2><table>" + "\n".join(f"<tr>{row}" for row in marked) + "</table>"
+    return (
+        f"<h2>{escape(heading)}</h2><table>"
+        + "\n".join(f"<tr>{row}" for row in marked)
+        + "</table>"
+    )
 
 
 def _pdf(
-    title: str, lines: Sequence[str], tables: Sequence[ReportTable], images: Sequence[tuple[str, bytes]]
+    title: str,
+    lines: Sequence[str],
+    tables: Sequence[ReportTable],
+    images: Sequence[tuple[str, bytes]],
 ) -> bytes:
     """Pages of text, then two pictures on each."""
     from matplotlib import figure, image
@@ -282,7 +344,16 @@ def _pdf(
         for first in range(0, len(text), _LINES_A_PAGE):
             page = figure.Figure(figsize=_PAGE)
             part = "\n".join(text[first : first + _LINES_A_PAGE])
-            page.text(0.07, 0.96, part, va="top", family="monospace", fontsize=7.5, linespacing=1.5, parse_math=False)
+            page.text(
+                0.07,
+                0.96,
+                part,
+                va="top",
+                family="monospace",
+                fontsize=7.5,
+                linespacing=1.5,
+                parse_math=False,
+            )
             pages.savefig(page)
         for first in range(0, len(images), 2):
             page = figure.Figure(figsize=_PAGE)

@@ -38,7 +38,9 @@ class FilmOptions:
 
 @dataclass(frozen=True)
 class _Departure:
-    """Profiles (n, points) of the sets less those of the paper's film without pre-strain, mm; `left` by the law."""
+    """Profiles (n, points) of the sets less those of the paper's film without pre-strain, mm;
+    `left` by the law.
+    """
 
     radius_mm: FloatArray
     seen_mm: FloatArray
@@ -48,7 +50,9 @@ class _Departure:
     def explained(self) -> float:
         """Share of the departure that the law explains, RMS over the area."""
         weight = self.radius_mm
-        return float(1 - np.sqrt(np.sum(weight * self.left_mm**2) / np.sum(weight * self.seen_mm**2)))
+        return float(
+            1 - np.sqrt(np.sum(weight * self.left_mm**2) / np.sum(weight * self.seen_mm**2))
+        )
 
 
 def film_command(options: FilmOptions) -> int:
@@ -58,7 +62,9 @@ def film_command(options: FilmOptions) -> int:
     mirror = sets[0].head.optics.mirror
     for one in sets:
         if one.head.artefact is not None:
-            raise errors.InputError(f"{one.head.folder / 'capture.toml'}: artefact: a set of no film")
+            raise errors.InputError(
+                f"{one.head.folder / 'capture.toml'}: artefact: a set of no film"
+            )
         if one.head.optics.mirror.radius_mm != mirror.radius_mm:
             raise errors.InputError(
                 f"{one.head.folder / 'capture.toml'}: mirror.radius_mm: not that of the first set"
@@ -93,11 +99,17 @@ def _figures(sets: list[SetFigure], geometry: Path | None) -> tuple[list[film_fi
             monte_carlo.geometry_jacobian(bench, spread) @ spread.root(),
         )
         name, pressure = one.head.folder.name, one.head.pressure_pa
-        out.append(film_fit.FilmFigure(name, surface.parameters, noise, geometric, pressure, surface.sag_mm))
+        out.append(
+            film_fit.FilmFigure(
+                name, surface.parameters, noise, geometric, pressure, surface.sag_mm
+            )
+        )
     return out, source
 
 
-def _departure(figures: list[film_fit.FilmFigure], fit: film_fit.FilmFit, reach_mm: float) -> _Departure:
+def _departure(
+    figures: list[film_fit.FilmFigure], fit: film_fit.FilmFit, reach_mm: float
+) -> _Departure:
     radius = np.linspace(0.0, reach_mm, 96)
     seen, left = [], []
     for k, figure in enumerate(figures):
@@ -120,33 +132,45 @@ def _profile_mm(parameters_mm: FloatArray, radius_mm: float, at_mm: FloatArray) 
     return np.asarray(surface.height(at_mm * np.cos(angle), at_mm * np.sin(angle)).mean(axis=0))
 
 
-def _notes(figures: list[film_fit.FilmFigure], fit: film_fit.FilmFit, departure: _Departure) -> list[str]:
+def _notes(
+    figures: list[film_fit.FilmFigure], fit: film_fit.FilmFit, departure: _Departure
+) -> list[str]:
     """What these sets cannot tell, in words."""
     gauged = [figure.pressure_pa for figure in figures if np.isfinite(figure.pressure_pa)]
     notes = []
     if not gauged:
-        notes.append("E t is not determined: no set states pressure_pa; pre-strain and nu need none")
+        notes.append(
+            "E t is not determined: no set states pressure_pa; pre-strain and nu need none"
+        )
     strain, poisson, _ = fit.sigmas
     if strain > film_fit.PRESTRAIN_SIGMA / 2:
         notes.append("the pre-strain is not determined: its bar is what was known before")
     if poisson > film_fit.POISSON_SIGMA / 2:
-        notes.append("nu is not determined: its bar is what was known before; take sets at other pressures")
+        notes.append(
+            "nu is not determined: its bar is what was known before; take sets at other pressures"
+        )
     together = fit.covariance[0, 1] / (strain * poisson)
     if abs(together) > _TOGETHER:
         sags = [figure.sag_mm for figure in figures]
         notes.append(
-            f"pre-strain and nu are known only together (correlation {together:+.3f}): the sags, {min(sags):.1f} to "
+            f"pre-strain and nu are known only together (correlation {together:+.3f}): the "
+            f"sags, {min(sags):.1f} to "
             f"{max(sags):.1f} mm, are too close"
         )
     if departure.explained < 1 - _UNLIKE_LAW and np.abs(departure.seen_mm).max() > 0.1:
         notes.append(
-            "the film departs from this law: it crept between the sets, its ring moved, or it is not elastic"
+            "the film departs from this law: it crept between the sets, its ring moved, or "
+            "it is not elastic"
         )
     return notes
 
 
 def _table(
-    figures: list[film_fit.FilmFigure], fit: film_fit.FilmFit, departure: _Departure, source: str, notes: list[str]
+    figures: list[film_fit.FilmFigure],
+    fit: film_fit.FilmFit,
+    departure: _Departure,
+    source: str,
+    notes: list[str],
 ) -> dict[str, Any]:
     law, (strain, poisson, relative) = fit.law, fit.sigmas
     gauged = any(np.isfinite(figure.pressure_pa) for figure in figures)
@@ -166,7 +190,10 @@ def _table(
         "prestrain": {"value": law.prestrain, "sigma": float(strain)},
         "poisson": {"value": law.poisson, "sigma": float(poisson)},
         "stiffness_n_per_m": (
-            {"value": law.stiffness_n_per_m, "sigma": float(relative) * float(law.stiffness_n_per_m)}
+            {
+                "value": law.stiffness_n_per_m,
+                "sigma": float(relative) * float(law.stiffness_n_per_m),
+            }
             if gauged
             else None
         ),
@@ -203,29 +230,40 @@ def _lines(table: dict[str, Any], figures: list[film_fit.FilmFigure]) -> list[st
     strain, poisson, stiffness = table["prestrain"], table["poisson"], table["stiffness_n_per_m"]
     sags = [figure.sag_mm for figure in figures]
     lines = [
-        f"sets       {len(figures)}, sag {min(sags):.2f} to {max(sags):.2f} mm; geometry: {table['geometry']}",
+        f"sets       {len(figures)}, sag {min(sags):.2f} to {max(sags):.2f} mm; geometry: "
+        f"{table['geometry']}",
         f"pre-strain {1e6 * strain['value']:.1f} +- {1e6 * strain['sigma']:.2g} µm/m",
         f"nu         {poisson['value']:.4f} +- {poisson['sigma']:.2g}",
     ]
     if stiffness is not None:
-        lines.append(f"E t        {stiffness['value'] / 1e3:.2f} +- {stiffness['sigma'] / 1e3:.2g} kN/m")
+        lines.append(
+            f"E t        {stiffness['value'] / 1e3:.2f} +- {stiffness['sigma'] / 1e3:.2g} kN/m"
+        )
     for wave in table["ring"]:
         unit, scale = ("um/m", 1e6) if wave["cause"] == "prestrain" else ("mm", 1.0)
-        what = {"prestrain": "pre-strain varies", "flat": "not flat", "round": "not round"}[wave["cause"]]
+        what = {"prestrain": "pre-strain varies", "flat": "not flat", "round": "not round"}[
+            wave["cause"]
+        ]
         amount, sigma = scale * np.hypot(*wave["cos_sin"]), scale * max(wave["sigmas"])
-        lines.append(f"ring       {what}, {wave['order']} waves: {amount:.3g} +- {sigma:.2g} {unit}")
+        lines.append(
+            f"ring       {what}, {wave['order']} waves: {amount:.3g} +- {sigma:.2g} {unit}"
+        )
     edges = [one["edge_from_hencky_mm"] for one in table["sets"]]
     return [
         *lines,
-        f"Hencky     the measured edge is {min(edges):+.3f} to {max(edges):+.3f} mm from Hencky's film of 205 kN/m, "
+        f"Hencky     the measured edge is {min(edges):+.3f} to {max(edges):+.3f} mm from "
+        "Hencky's film of 205 kN/m, "
         f"nu 0.3; the law explains {100 * table['explained']:.1f} %",
         f"misfit     {table['misfit_um']:.3g} µm a term that no law explains; it is in the bars",
-        f"paper      its 3 mm would be a pre-strain of {1e6 * table['paper_prestrain']:.0f} µm/m in this film",
+        f"paper      its 3 mm would be a pre-strain of {1e6 * table['paper_prestrain']:.0f} "
+        "µm/m in this film",
         *(f"note       {note}" for note in table["notes"]),
     ]
 
 
-def _draw(path: Path, figures: list[film_fit.FilmFigure], fit: film_fit.FilmFit, departure: _Departure) -> None:
+def _draw(
+    path: Path, figures: list[film_fit.FilmFigure], fit: film_fit.FilmFit, departure: _Departure
+) -> None:
     from matplotlib.figure import Figure
 
     drawing = Figure(figsize=(13, 4.2), layout="constrained")
@@ -234,7 +272,11 @@ def _draw(path: Path, figures: list[film_fit.FilmFigure], fit: film_fit.FilmFit,
         seen.plot(departure.radius_mm, profile, label=f"{figure.name}, {figure.sag_mm:.1f} mm")
         left.plot(departure.radius_mm, 1e3 * rest)
     seen.set(title="less Hencky's film of the paper", xlabel="radius (mm)", ylabel="mm")
-    left.set(title=f"less the law ({100 * departure.explained:.1f} % explained)", xlabel="radius (mm)", ylabel="µm")
+    left.set(
+        title=f"less the law ({100 * departure.explained:.1f} % explained)",
+        xlabel="radius (mm)",
+        ylabel="µm",
+    )
     seen.legend(fontsize=8)
     angle = np.linspace(0, 2 * np.pi, 181)
     root = np.linalg.cholesky(fit.covariance[:2, :2])

@@ -1,4 +1,6 @@
-"""Decodes untrusted images: reads a picture's size from its header before allocating memory for it."""
+"""Decodes untrusted images: reads a picture's size from its header
+before allocating memory for it.
+"""
 
 import struct
 
@@ -20,8 +22,8 @@ _SHORT = 3  # the type of a 16-bit number in a TIFF
 def decoded_image(data: bytes, flags: int) -> AnyArray:
     """The pixels of an image file.
 
-    Raises ValueError if it is not an image, is cut short, or has more than `PIXELS_MAX` pixels. `data` is the
-    file's content: PNG, TIFF, BMP or JPEG; `flags` are those of `cv2.imdecode`.
+    Raises ValueError if it is not an image, is cut short, or has more than `PIXELS_MAX` pixels.
+    `data` is the file's content: PNG, TIFF, BMP or JPEG; `flags` are those of `cv2.imdecode`.
     """
     if data.startswith(_PNG) and b"IEND" not in data[-12:]:
         # the decoder would write to the terminal, and might fill the rest with black
@@ -33,7 +35,9 @@ def decoded_image(data: bytes, flags: int) -> AnyArray:
     if size is None or min(size) < 1:
         raise ValueError("not an image")
     if size[0] * size[1] > PIXELS_MAX:
-        raise ValueError(f"{size[0]} x {size[1]} pixels exceed the limit of {PIXELS_MAX / 1e6:.0f} million")
+        raise ValueError(
+            f"{size[0]} x {size[1]} pixels exceed the limit of {PIXELS_MAX / 1e6:.0f} million"
+        )
     try:
         image = cv2.imdecode(np.frombuffer(data, np.uint8), flags)
     except cv2.error:
@@ -61,7 +65,9 @@ def _tiff_size(data: bytes, order: str) -> tuple[int, int] | None:
     found: dict[int, int] = {}
     for entry in range(place + 2, place + 2 + 12 * count, 12):
         tag, kind = struct.unpack_from(order + "HH", data, entry)
-        (found[tag],) = struct.unpack_from(order + ("H" if kind == _SHORT else "I"), data, entry + 8)
+        (found[tag],) = struct.unpack_from(
+            order + ("H" if kind == _SHORT else "I"), data, entry + 8
+        )
     return (found[_WIDTH], found[_HEIGHT]) if {_WIDTH, _HEIGHT} <= found.keys() else None
 
 

@@ -45,7 +45,9 @@ def measure_command(options: MeasureOptions) -> int:
     measurement = measure_set(folder, None if geometry is None else read_geometry(geometry))
     for key in measurement.head.ignored:
         print(f"{folder / 'capture.toml'}: {key}: unknown key, ignored", file=sys.stderr)
-    target = options.out.resolve() if options.out else folder / "result"  # follow a link that the user names
+    target = (
+        options.out.resolve() if options.out else folder / "result"
+    )  # follow a link that the user names
     light, outline = light_and_rim(measurement)
     profile = _profile(measurement)
     bars = results.error_bars(measurement, geometry, outline)
@@ -83,7 +85,11 @@ def light_and_rim(measurement: Measurement) -> tuple[FloatArray, Outline | None]
     checked, optics = measurement.checked, measurement.head.optics
     if checked is None or measurement.full is None:
         return np.zeros((2, 2)), None
-    light = checked.binned.means[[k for used in checked.view.used for k in used]].mean(axis=0).astype(float)
+    light = (
+        checked.binned.means[[k for used in checked.view.used for k in used]]
+        .mean(axis=0)
+        .astype(float)
+    )
     bin_px = checked.binned.bin_px
     fine = np.repeat(np.repeat(light, bin_px, axis=0), bin_px, axis=1)
     rim_z = checked.tracer.vertex_z_mm + measurement.full.surface.sag_mm
@@ -94,15 +100,22 @@ def _profile(measurement: Measurement) -> RadialProfile | None:
     full = measurement.full
     if full is None:
         return None
-    return radial_profile(full.grid.axis_mm, full.height_mm(), measurement.head.optics.mirror.radius_mm)
+    return radial_profile(
+        full.grid.axis_mm, full.height_mm(), measurement.head.optics.mirror.radius_mm
+    )
 
 
 def _lines(
-    measurement: Measurement, profile: RadialProfile | None, outline: Outline | None, bars: results.ErrorBars | None
+    measurement: Measurement,
+    profile: RadialProfile | None,
+    outline: Outline | None,
+    bars: results.ErrorBars | None,
 ) -> list[str]:
     """The result as lines of text."""
     full = measurement.full
-    lines = [f"verdict   {measurement.verdict}{': ' + measurement.reason if measurement.reason else ''}"]
+    lines = [
+        f"verdict   {measurement.verdict}{': ' + measurement.reason if measurement.reason else ''}"
+    ]
     lines += [f"flagged   {item['file']}: {item['reason']}" for item in measurement.flagged_files()]
     if full is None or profile is None or bars is None:
         return lines
@@ -112,26 +125,32 @@ def _lines(
     residual_um = 1e3 * full.residual_mm[np.isfinite(full.residual_mm)]
     coeffs = 1e3 * full.surface.coeffs_mm
     lines += [
-        f"sag       {full.surface.sag_mm:.4f} mm, 1 sigma {of_noise:.2g} µm from noise and the film, "
+        f"sag       {full.surface.sag_mm:.4f} mm, 1 sigma {of_noise:.2g} µm from noise and "
+        "the film, "
         f"{of_geometry:.3g} µm from the geometry",
         f"geometry  {bars.source}",
         f"budget    1 sigma of height {total['height_rms_um']:.3g} µm RMS, without its plane "
         f"{total['figure_rms_um']:.3g} µm; largest: {largest}",
         f"Hencky    {profile.sag_mm:.4f} mm, {profile.pressure_pa:.0f} Pa under the paper's film",
-        f"figure    astigmatism {np.hypot(*coeffs[4:6]):.2f} µm, coma {np.hypot(*coeffs[6:8]):.2f} µm, "
+        f"figure    astigmatism {np.hypot(*coeffs[4:6]):.2f} µm, coma "
+        f"{np.hypot(*coeffs[6:8]):.2f} µm, "
         f"trefoil {np.hypot(*coeffs[8:10]):.2f} µm (RMS)",
-        f"residual  {full.quality.residual_urad:.2f} µrad of slope, {residual_um.std():.3f} µm RMS of height",
-        f"fit       {len(full.fit.changes_mm)} iterations, last change {full.fit.changes_mm[-1]:.1e} mm, "
+        f"residual  {full.quality.residual_urad:.2f} µrad of slope, {residual_um.std():.3f} "
+        "µm RMS of height",
+        f"fit       {len(full.fit.changes_mm)} iterations, last change "
+        f"{full.fit.changes_mm[-1]:.1e} mm, "
         f"{np.count_nonzero(full.weights)} pixels",
     ]
     if outline is not None:
         lines.append(
-            f"rim       {outline.offset_mm:.1f} mm off the prediction, {outline.size_ratio:.4f} of the predicted size"
+            f"rim       {outline.offset_mm:.1f} mm off the prediction, "
+            f"{outline.size_ratio:.4f} of the predicted size"
         )
     return lines
 
 
-# Frames of a measurement by SOFAST (OpenCSP, Sandia), from its HDF5 file, with lengths converted to mm.
+# Frames of a measurement by SOFAST (OpenCSP, Sandia), from its HDF5 file, with lengths converted to
+# mm.
 #
 # `measure` of a SOFAST file checks its frames only: slopes need the poses that SOFAST itself finds.
 
@@ -144,7 +163,8 @@ _ELEMENTS_MAX = 100_000_000  # 24 frames of 4 megapixels; each pixel takes eight
 class SofastMeasurement:
     """Frames of a measurement."""
 
-    frames_x: FloatArray  # (F, 4, H, W): fringes that vary along the screen's x and y: frequency, step, row, column
+    # (F, 4, H, W): fringes that vary along the screen's x and y: frequency, step, row, column
+    frames_x: FloatArray
     frames_y: FloatArray  # (F, 4, H, W)
     periods_x: FloatArray  # (F,): periods per screen
     periods_y: FloatArray  # (F,)
@@ -154,7 +174,9 @@ class SofastMeasurement:
 
 
 def read_measurement(path: Path) -> SofastMeasurement:
-    """Read frames and their data. Raises ValueError, FileNotFoundError or ImportError with one line."""
+    """Read frames and their data. Raises ValueError, FileNotFoundError or ImportError with one
+    line.
+    """
     with open_file(path) as file:
         group = "MeasurementSofastFringe"
         frames = np.moveaxis(floats(file, f"{group}/fringe_images"), 2, 0)
@@ -164,7 +186,8 @@ def read_measurement(path: Path) -> SofastMeasurement:
     count_y = SOFAST_STEPS * len(periods_y)
     if len(frames) != count_y + SOFAST_STEPS * len(periods_x):
         raise ValueError(
-            f"{path}: {group}/fringe_images has {len(frames)} frames, not {SOFAST_STEPS} for each of "
+            f"{path}: {group}/fringe_images has {len(frames)} frames, not {SOFAST_STEPS} for "
+            "each of "
             f"{len(periods_y)} + {len(periods_x)} frequencies"
         )
     size = black.shape
@@ -205,14 +228,23 @@ def item(file: Any, name: str) -> Any:
             if link is None:
                 raise ValueError(f"{file.filename}: {name} is missing")
             if not isinstance(link, h5py.HardLink):
-                raise ValueError(f"{file.filename}: {name} is a link, and links are not followed here")
+                raise ValueError(
+                    f"{file.filename}: {name} is a link, and links are not followed here"
+                )
         found = file[name]
         if not isinstance(found, h5py.Dataset) or found.is_virtual or found.external:
             raise ValueError(f"{file.filename}: {name} is not a data set of this file")
         if found.size is None or found.size > _ELEMENTS_MAX:
-            raise ValueError(f"{file.filename}: {name} has {found.shape} elements, too many to read")
+            raise ValueError(
+                f"{file.filename}: {name} has {found.shape} elements, too many to read"
+            )
         return found[()]
-    except (OSError, RuntimeError, KeyError, TypeError) as error:  # HDF5's errors for a damaged file
+    except (
+        OSError,
+        RuntimeError,
+        KeyError,
+        TypeError,
+    ) as error:  # HDF5's errors for a damaged file
         raise ValueError(f"{file.filename}: {name} cannot be read ({error})") from None
 
 
@@ -223,14 +255,17 @@ def floats(file: Any, name: str) -> FloatArray:
         raise ValueError(f"{file.filename}: {name} holds no numbers") from None
 
 
-# SOFAST shows cos(2 pi p s - k pi / 2), s from 1 at column 0 to 0 at the last column, and from 1 at row 0 to 0 at the
-# last row; its screen coordinates have y the other way round, so the y fraction is 1 - s.
+# SOFAST shows cos(2 pi p s - k pi / 2), s from 1 at column 0 to 0 at the last column, and from 1 at
+# row 0 to 0 at the last row; its screen coordinates have y the other way round, so the y fraction
+# is 1 - s.
 SHIFTS_RAD = -equal_shifts(SOFAST_STEPS)
 _LIT_SHARE = 0.3  # of the bright pixels' swing
 
 
 def lit_pixels(measurement: SofastMeasurement) -> BoolArray:
-    """Pixels (H, W) that see fringes: thresholds the median swing over the series, robust to single bad frames."""
+    """Pixels (H, W) that see fringes: thresholds the median swing over the series, robust to single
+    bad frames.
+    """
     series = (*measurement.frames_y, *measurement.frames_x)
     swing = np.median([np.abs(phasors(steps, SHIFTS_RAD)) for steps in series], axis=0)
     return np.asarray(swing > _LIT_SHARE * np.percentile(swing, 95))
@@ -248,7 +283,9 @@ _LEAST_PIXELS = 200  # fewer cannot judge a frame
 
 
 def facet_command(path: Path, as_json: bool) -> int:
-    """Check the frames and report. Returns the exit code; raises InputError if it is not a SOFAST file."""
+    """Check the frames and report. Returns the exit code; raises InputError if it is not a SOFAST
+    file.
+    """
     try:
         measurement = read_measurement(path)
     except (ValueError, OSError, ImportError) as error:
@@ -256,7 +293,9 @@ def facet_command(path: Path, as_json: bool) -> int:
     mask = lit_pixels(measurement)
     if np.count_nonzero(mask) < _LEAST_PIXELS:
         raise errors.InputError(f"{path}: only {np.count_nonzero(mask)} pixels see fringes")
-    found = check_series(series_of(measurement, mask), measurement.black[mask], measurement.white[mask])
+    found = check_series(
+        series_of(measurement, mask), measurement.black[mask], measurement.white[mask]
+    )
     flagged = [{"file": _name(measurement, flag), "reason": flag.reason} for flag in found.flags]
     table = {
         "schema": "membrane-frames/1",

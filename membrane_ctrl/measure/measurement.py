@@ -11,7 +11,13 @@ from membrane_ctrl.measure.capture_set import CaptureHead, CaptureSet, anchored,
 from membrane_ctrl.metrology.checked import Anchor, Checked, RejectedSetError, check
 from membrane_ctrl.metrology.frames import frame_stack, integrity
 from membrane_ctrl.metrology.frequencies import check_frequencies
-from membrane_ctrl.metrology.full import BinFigure, FullResult, bin_figure, measure_pixels, reconstruct_full
+from membrane_ctrl.metrology.full import (
+    BinFigure,
+    FullResult,
+    bin_figure,
+    measure_pixels,
+    reconstruct_full,
+)
 from membrane_ctrl.metrology.optics.surface import Artefact
 from membrane_ctrl.metrology.uncertainty.monte_carlo import TrialBench
 from membrane_ctrl.model import errors, shape_estimate
@@ -59,7 +65,9 @@ def measure_set(folder: str | Path, geometry: GeometryFile | None = None) -> Mea
     begin = time.perf_counter()
     capture, anchor = read_set(folder, geometry), None
     where = capture.head.folder / "capture.toml" if geometry is None else geometry.path
-    require_plausible(capture.head.optics, where, depth_known=False)  # the set need not know its film's depth
+    require_plausible(
+        capture.head.optics, where, depth_known=False
+    )  # the set need not know its film's depth
     if capture.head.reference is not None:
         reference, anchor = read_anchor(capture.head.reference, geometry)
         capture = replace(capture, head=anchored(capture.head, reference))
@@ -69,7 +77,9 @@ def measure_set(folder: str | Path, geometry: GeometryFile | None = None) -> Mea
     except RejectedSetError as error:
         timing = {"load": loaded - begin, "phase": time.perf_counter() - loaded, "reconstruct": 0.0}
         mean_um = capture.head.mean_reading_um
-        return Measurement(capture.head, "rejected", str(error), error.flags, None, None, mean_um, timing)
+        return Measurement(
+            capture.head, "rejected", str(error), error.flags, None, None, mean_um, timing
+        )
     pixels = measure_pixels(optics, checked)
     middle = time.perf_counter()
     full = reconstruct_full(optics, checked, pixels)
@@ -79,17 +89,25 @@ def measure_set(folder: str | Path, geometry: GeometryFile | None = None) -> Mea
         verdict, reason = checked.verdict
     timing = {"load": loaded - begin, "phase": middle - loaded, "reconstruct": end - middle}
     stack = checked.stack
-    none = np.empty((len(stack.patterns), 0, 0), stack.frames.dtype)  # what follows needs no frames: they are large
+    none = np.empty(
+        (len(stack.patterns), 0, 0), stack.frames.dtype
+    )  # what follows needs no frames: they are large
     checked = replace(checked, stack=replace(stack, frames=none))
-    return Measurement(capture.head, verdict, reason, checked.flags, checked, full, stack.mean_reading_um, timing)
+    return Measurement(
+        capture.head, verdict, reason, checked.flags, checked, full, stack.mean_reading_um, timing
+    )
 
 
-def read_anchor(folder: str | Path, geometry: GeometryFile | None = None) -> tuple[CaptureHead, Anchor]:
+def read_anchor(
+    folder: str | Path, geometry: GeometryFile | None = None
+) -> tuple[CaptureHead, Anchor]:
     """Read the reference of fringes sets. Raises InputError if it gives no figure."""
     capture = read_set(folder, geometry)
     if capture.head.kind == "fringes":
         where = capture.head.folder / "capture.toml"
-        raise errors.InputError(f"{where}: kind: a reference must be a full set or one of several frequencies")
+        raise errors.InputError(
+            f"{where}: kind: a reference must be a full set or one of several frequencies"
+        )
     try:
         return capture.head, checked_set(capture, None).anchor()
     except RejectedSetError as error:
@@ -99,8 +117,8 @@ def read_anchor(folder: str | Path, geometry: GeometryFile | None = None) -> tup
 def stack_of(capture: CaptureSet) -> frame_stack.FrameStack:
     """The frames for the metrology.
 
-    Raises RejectedSetError if a picture is missing or unreadable. The rest would often suffice, but an incomplete set
-    deserves no trust.
+    Raises RejectedSetError if a picture is missing or unreadable. The rest would often suffice, but
+    an incomplete set deserves no trust.
     """
     if capture.lost:
         flags = tuple(integrity.flag_unreadable(k, capture.unusable[k]) for k in capture.lost)
@@ -114,7 +132,11 @@ def stack_of(capture: CaptureSet) -> frame_stack.FrameStack:
 def checked_set(capture: CaptureSet, anchor: Anchor | None) -> Checked:
     """Check the frames and fit the bins. Raises RejectedSetError if they give no figure."""
     stack, optics = stack_of(capture), capture.head.optics
-    return check_frequencies(stack, optics) if capture.head.kind == "frequencies" else check(stack, optics, anchor)
+    return (
+        check_frequencies(stack, optics)
+        if capture.head.kind == "frequencies"
+        else check(stack, optics, anchor)
+    )
 
 
 def noise_seen_adu(measurement: Measurement) -> float:
@@ -122,7 +144,11 @@ def noise_seen_adu(measurement: Measurement) -> float:
     if measurement.checked is None or measurement.full is None:
         return float("nan")
     free = sum(len(used) - 3 for used in measurement.checked.view.used)
-    return float(np.sqrt(np.median(np.square(measurement.full.rest_adu)) / free)) if free else float("nan")
+    return (
+        float(np.sqrt(np.median(np.square(measurement.full.rest_adu)) / free))
+        if free
+        else float("nan")
+    )
 
 
 @dataclass(frozen=True)
@@ -168,12 +194,15 @@ class Figures:
     def __init__(self, geometry: GeometryFile | None = None) -> None:
         self._geometry = geometry
         self._reference: Path | None = None
-        self._anchor: tuple[CaptureHead, Anchor] | errors.CommandError = errors.CommandError("no reference read yet")
+        self._anchor: tuple[CaptureHead, Anchor] | errors.CommandError = errors.CommandError(
+            "no reference read yet"
+        )
 
     def of(self, folder: str | Path) -> SetFigure:
         """Read and measure a set.
 
-        Raises InputError if the set or its reference is invalid; RejectedError if its frames give no usable figure.
+        Raises InputError if the set or its reference is invalid; RejectedError if its frames give
+        no usable figure.
         """
         capture = read_set(folder, self._geometry)
         anchor = None

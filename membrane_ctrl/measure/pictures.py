@@ -28,7 +28,8 @@ if TYPE_CHECKING:  # half a second to load, and most measurements make no record
 
 _SHOWN_PX = 600  # side of pixel maps
 _MAP_CELLS = 450
-_STEEP = 3.0  # largest value over what 99 % of a map need: beyond it a linear scale would hide the rest
+# largest value over what 99 % of a map need: beyond it a linear scale would hide the rest
+_STEEP = 3.0
 _SHOWN_ROWS = 16  # of the budget: the rest adds nothing
 
 
@@ -41,7 +42,9 @@ def draw_all(
     bars: ErrorBars | None,
     figure: MeasuredFigure | None,
 ) -> list[Path]:
-    """Draw all pictures; returns the files. `light` (H, W), of any size, is the white frame or the fringes' mean."""
+    """Draw all pictures; returns the files. `light` (H, W), of any size, is the white frame or the
+    fringes' mean.
+    """
     files = [write_figure(out / "frames.png", _frames(measurement))]
     full = measurement.full
     if full is None or profile is None:
@@ -50,8 +53,13 @@ def draw_all(
     residual_um = 1e3 * full.residual_mm
     files += [
         write_figure(out / "sag.png", _map("height (mm)", axis, height, "viridis")),
-        write_figure(out / "residual.png", _map("height over the fit (µm)", axis, residual_um, "RdBu_r", even=True)),
-        write_figure(out / "slopes.png", _slopes(full, full.map() if figure is None else figure.seen)),
+        write_figure(
+            out / "residual.png",
+            _map("height over the fit (µm)", axis, residual_um, "RdBu_r", even=True),
+        ),
+        write_figure(
+            out / "slopes.png", _slopes(full, full.map() if figure is None else figure.seen)
+        ),
         write_figure(out / "modulation.png", _modulation(measurement, full, light, outline)),
         write_figure(out / "profile.png", _profile(profile)),
         write_figure(out / "convergence.png", _convergence(full)),
@@ -64,7 +72,9 @@ def draw_all(
 
 
 def sheet(width: float, height: float, rows: int = 1, columns: int = 1) -> tuple[Figure, Any]:
-    """A figure of so many inches and its axes, with fixed margins: fitted ones double the time of a picture."""
+    """A figure of so many inches and its axes, with fixed margins: fitted ones double the time of a
+    picture.
+    """
     figure = Figure(figsize=(width, height))
     axes = figure.subplots(rows, columns)
     left, right, low, high = 0.8 / width, 1 - 0.35 / width, 0.6 / height, 1 - 0.4 / height
@@ -84,22 +94,44 @@ def _figure(found: MeasuredFigure) -> Figure:
     figure, ((whole, rest), (spectrum, energy)) = sheet(12, 10, 2, 2)
     axis, deviation_um = found.seen.axis_mm, found.figure.deviation_um
     radius_mm = found.figure.numbers.radius_of_curvature_mm
-    show_map(whole, f"less the best sphere, R = {radius_mm:.1f} mm (µm)", axis, deviation_um, "RdBu_r", even=True)
+    show_map(
+        whole,
+        f"less the best sphere, R = {radius_mm:.1f} mm (µm)",
+        axis,
+        deviation_um,
+        "RdBu_r",
+        even=True,
+    )
     asymmetry_um = deviation_um - found.figure.rotational_um
-    show_map(rest, "and less its rotationally invariant part (µm)", axis, asymmetry_um, "RdBu_r", even=True)
+    show_map(
+        rest,
+        "and less its rotationally invariant part (µm)",
+        axis,
+        asymmetry_um,
+        "RdBu_r",
+        even=True,
+    )
     psd = found.spectrum
     low = np.maximum(psd.density_um2_mm2 - psd.sigma_um2_mm2, psd.density_um2_mm2 / 10)
-    spectrum.fill_between(psd.frequency_per_mm, low, psd.density_um2_mm2 + psd.sigma_um2_mm2, alpha=0.3)
+    spectrum.fill_between(
+        psd.frequency_per_mm, low, psd.density_um2_mm2 + psd.sigma_um2_mm2, alpha=0.3
+    )
     spectrum.loglog(psd.frequency_per_mm, psd.density_um2_mm2)
     spectrum.set(title="spectral density", xlabel="spatial frequency (1/mm)", ylabel="um^2 mm^2")
     _plain_powers(spectrum.xaxis, spectrum.yaxis)
     if found.figure.numbers.best_focus_mm > 0:
         energy.plot(np.quantile(found.figure.spot_mm, ENERGY_SHARES), 100 * ENERGY_SHARES)
-        numbers, noise, geometry_part = found.figure.numbers, found.noise.numbers, found.geometry.numbers
+        numbers, noise, geometry_part = (
+            found.figure.numbers,
+            found.noise.numbers,
+            found.geometry.numbers,
+        )
         for name in ("spot_50_mm", "spot_80_mm", "spot_95_mm"):
             bar = np.nan_to_num(np.hypot(getattr(noise, name), getattr(geometry_part, name)))
             share = float(name.split("_")[1])
-            energy.errorbar(getattr(numbers, name), share, xerr=bar, fmt="o", capsize=4, color="tab:red")
+            energy.errorbar(
+                getattr(numbers, name), share, xerr=bar, fmt="o", capsize=4, color="tab:red"
+            )
         energy.set(title=f"encircled energy, {numbers.best_focus_mm:.1f} mm from the vertex")
     energy.set(xlabel="radius (mm)", ylabel="% of the rays", ylim=(0, 101))
     return figure
@@ -109,12 +141,19 @@ def _uncertainty(bars: ErrorBars) -> Figure:
     """Draw 1 sigma from the set itself and from the geometry, and the budget."""
     figure, (left, middle, right) = sheet(17, 4.8, 1, 3)
     of_noise, of_geometry = bars.maps_um()
-    show_map(left, "1 sigma from this set: noise, film, light (µm)", bars.grid.axis_mm, of_noise, "magma")
+    show_map(
+        left, "1 sigma from this set: noise, film, light (µm)", bars.grid.axis_mm, of_noise, "magma"
+    )
     show_map(middle, "1 sigma from the geometry (µm)", bars.grid.axis_mm, of_geometry, "magma")
     rows = [row for row in bars.budget.rows() if row["height_rms_um"] > 0][:_SHOWN_ROWS][::-1]
     places = np.arange(len(rows))
     right.barh(places + 0.2, [row["height_rms_um"] for row in rows], 0.4, label="height")
-    right.barh(places - 0.2, [row["figure_rms_um"] for row in rows], 0.4, label="figure (without its plane)")
+    right.barh(
+        places - 0.2,
+        [row["figure_rms_um"] for row in rows],
+        0.4,
+        label="figure (without its plane)",
+    )
     right.set_yticks(places, [row["name"] for row in rows], fontsize=8)
     right.set(xscale="log", xlabel="um RMS", title="budget: contribution of each input, 1 sigma")
     right.legend(loc="lower right")
@@ -122,29 +161,45 @@ def _uncertainty(bars: ErrorBars) -> Figure:
     return figure
 
 
-def _map(title: str, axis: FloatArray, values: FloatArray, colours: str, even: bool = False) -> Figure:
+def _map(
+    title: str, axis: FloatArray, values: FloatArray, colours: str, even: bool = False
+) -> Figure:
     figure, axes = sheet(6.4, 5.4)
     show_map(axes, title, axis, values, colours, even)
     return figure
 
 
-def show_map(axes: Any, title: str, axis: FloatArray, values: FloatArray, colours: str, even: bool = False) -> None:
+def show_map(
+    axes: Any, title: str, axis: FloatArray, values: FloatArray, colours: str, even: bool = False
+) -> None:
     """Draw a map with its colour scale.
 
-    `even` centres the scale on 0; a dent far beyond what the rest of the map needs makes it logarithmic out there.
+    `even` centres the scale on 0; a dent far beyond what the rest of the map needs makes it
+    logarithmic out there.
     """
-    every = max(1, values.shape[0] // _MAP_CELLS)  # no panel has more pixels, and each cell costs time
+    every = max(
+        1, values.shape[0] // _MAP_CELLS
+    )  # no panel has more pixels, and each cell costs time
     low, high = np.nanpercentile(values[::every, ::every], [0.5, 99.5])
     scale: dict[str, Any] = {"vmin": low, "vmax": high}
     if even:
         high = max(abs(low), abs(high), 1e-12)
         most = max(high, float(np.nanmax(np.abs(_local_mean(values)))))
         steep = most > _STEEP * high
-        scale = {"norm": SymLogNorm(high, vmin=-most, vmax=most)} if steep else {"vmin": -most, "vmax": most}
+        scale = (
+            {"norm": SymLogNorm(high, vmin=-most, vmax=most)}
+            if steep
+            else {"vmin": -most, "vmax": most}
+        )
         title += f", linear to +-{high:.2g}" if steep else ""
     extent = (axis[0], axis[-1], axis[0], axis[-1])
     shown = axes.imshow(
-        values[::every, ::every], origin="lower", extent=extent, cmap=colours, interpolation="nearest", **scale
+        values[::every, ::every],
+        origin="lower",
+        extent=extent,
+        cmap=colours,
+        interpolation="nearest",
+        **scale,
     )
     axes.set(title=title, xlabel="x (mm)", ylabel="y (mm)")
     axes.figure.colorbar(shown, ax=axes, shrink=0.85)
@@ -161,10 +216,16 @@ def _slopes(full: FullResult, seen: SurfaceMap) -> Figure:
     """Draw the measured slopes and the residuals of the fit."""
     figure, axes = sheet(11, 9, 2, 2)
     grid = full.grid
-    for place, slope, name in ((axes[0, 0], seen.slope_x, "dh/dx"), (axes[0, 1], seen.slope_y, "dh/dy")):
+    for place, slope, name in (
+        (axes[0, 0], seen.slope_x, "dh/dx"),
+        (axes[0, 1], seen.slope_y, "dh/dy"),
+    ):
         milli = np.where(grid.count > 0, 1e3 * slope, np.nan)
         show_map(place, f"{name} measured (mrad)", grid.axis_mm, milli, "RdBu_r", even=True)
-    for place, slope, name in ((axes[1, 0], grid.slope_x, "dh/dx"), (axes[1, 1], grid.slope_y, "dh/dy")):
+    for place, slope, name in (
+        (axes[1, 0], grid.slope_x, "dh/dx"),
+        (axes[1, 1], grid.slope_y, "dh/dy"),
+    ):
         left = np.where(grid.count > 0, 1e6 * slope, np.nan)
         show_map(place, f"{name} less the fit (µrad)", grid.axis_mm, left, "RdBu_r", even=True)
     return figure
@@ -198,7 +259,9 @@ def _frames(measurement: Measurement) -> Figure:
     colours = ["tab:red" if k in reasons else "tab:green" for k in range(len(names))]
     axes.barh(range(len(names)), 1.0, color=colours, alpha=0.5)
     for k in range(len(names)):
-        axes.text(0.02, k, reasons.get(k, "as predicted"), va="center", fontsize=8, parse_math=False)
+        axes.text(
+            0.02, k, reasons.get(k, "as predicted"), va="center", fontsize=8, parse_math=False
+        )
     axes.set_yticks(range(len(names)), names)
     axes.invert_yaxis()
     axes.set(xticks=[], xlim=(0, 1))
@@ -208,12 +271,22 @@ def _frames(measurement: Measurement) -> Figure:
 
 def _profile(profile: surface.RadialProfile) -> Figure:
     figure, (upper, lower) = sheet(7, 6, 2, 1)
-    upper.fill_between(profile.radius_mm, profile.low_mm, profile.high_mm, alpha=0.4, label="95 % of the ring")
+    upper.fill_between(
+        profile.radius_mm, profile.low_mm, profile.high_mm, alpha=0.4, label="95 % of the ring"
+    )
     upper.plot(profile.radius_mm, profile.mean_mm, label="measured, mean over azimuth")
-    upper.plot(profile.radius_mm, profile.hencky_mm, "--", label=f"Hencky, sag {profile.sag_mm:.3f} mm")
-    upper.set(ylabel="height (mm)", title=f"radial profile; pressure equivalent {profile.pressure_pa:.0f} Pa")
+    upper.plot(
+        profile.radius_mm, profile.hencky_mm, "--", label=f"Hencky, sag {profile.sag_mm:.3f} mm"
+    )
+    upper.set(
+        ylabel="height (mm)",
+        title=f"radial profile; pressure equivalent {profile.pressure_pa:.0f} Pa",
+    )
     upper.legend(loc="best")
-    low, mean, high = (1e3 * (row - profile.hencky_mm) for row in (profile.low_mm, profile.mean_mm, profile.high_mm))
+    low, mean, high = (
+        1e3 * (row - profile.hencky_mm)
+        for row in (profile.low_mm, profile.mean_mm, profile.high_mm)
+    )
     lower.fill_between(profile.radius_mm, low, high, alpha=0.4)
     lower.plot(profile.radius_mm, mean)
     lower.set(xlabel="radius (mm)", ylabel="less Hencky (µm)")
@@ -225,7 +298,11 @@ def _convergence(full: FullResult) -> Figure:
     changes = full.fit.changes_mm
     axes.semilogy(range(1, len(changes) + 1), np.maximum(changes, 1e-16), "o-")
     axes.axhline(1e-6, linestyle="--", color="tab:red")
-    axes.set(xlabel="iteration", ylabel="largest change of height (mm)", title="bins first, then every pixel")
+    axes.set(
+        xlabel="iteration",
+        ylabel="largest change of height (mm)",
+        title="bins first, then every pixel",
+    )
     _plain_powers(axes.yaxis)
     return figure
 
@@ -234,7 +311,9 @@ def _convergence(full: FullResult) -> Figure:
 def result_recording(
     path: Path, application: str, blueprint: rrb.Blueprint | None = None
 ) -> Iterator[rr.RecordingStream]:
-    """Write a Rerun recording to a file `path` (.rrd), overwriting it. Raises OSError if that fails."""
+    """Write a Rerun recording to a file `path` (.rrd), overwriting it. Raises OSError if that
+    fails.
+    """
     import rerun as rr
 
     recording = rr.RecordingStream(application)
@@ -262,7 +341,9 @@ def log_pictures(recording: rr.RecordingStream, entity: str, pictures: Sequence[
 
 
 def log_measurement(path: Path, measurement: Measurement, pictures: Sequence[Path]) -> None:
-    """Write maps, coefficients, verdict and pictures as a recording `path` (.rrd). Raises OSError."""
+    """Write maps, coefficients, verdict and pictures as a recording `path` (.rrd).
+    Raises OSError.
+    """
     import rerun as rr
 
     words = [f"verdict: {measurement.verdict} {measurement.reason}"]
@@ -272,10 +353,16 @@ def log_measurement(path: Path, measurement: Measurement, pictures: Sequence[Pat
         recording.log("measure/verdict", rr.TextDocument("\n".join(words)), static=True)
         if full is not None:
             coeffs_um = 1e3 * full.surface.coeffs_mm
-            recording.log("measure/zernike_um", rr.BarChart(coeffs_um[1:], abscissa=NOLL_INDICES[1:]), static=True)
+            recording.log(
+                "measure/zernike_um",
+                rr.BarChart(coeffs_um[1:], abscissa=NOLL_INDICES[1:]),
+                static=True,
+            )
             # row 0 of a picture is at the top, i.e. at +y
             height = full.height_mm()[::-1].astype(np.float32)
             residual = (1e3 * full.residual_mm)[::-1].astype(np.float32)
             recording.log("measure/height_mm", rr.Tensor(height, dim_names=["y", "x"]), static=True)
-            recording.log("measure/residual_um", rr.Tensor(residual, dim_names=["y", "x"]), static=True)
+            recording.log(
+                "measure/residual_um", rr.Tensor(residual, dim_names=["y", "x"]), static=True
+            )
         log_pictures(recording, "measure/pictures", pictures)

@@ -57,20 +57,43 @@ class MeasuredResult:
     def to_pandas(self) -> pd.DataFrame:
         """Zernike terms: `n`, `m`, `coeffs_um` and `sigma_um` by Noll's index."""
         orders = np.array([zernike.noll(j) for j in NOLL_INDICES])
-        columns = {"n": orders[:, 0], "m": orders[:, 1], "coeffs_um": self._coeffs_um(), "sigma_um": self._sigma_um()}
+        columns = {
+            "n": orders[:, 0],
+            "m": orders[:, 1],
+            "coeffs_um": self._coeffs_um(),
+            "sigma_um": self._sigma_um(),
+        }
         pandas = import_optional("pandas", "data")
         return pandas.DataFrame(columns, index=pandas.Index(NOLL_INDICES, name="noll"))
 
     def to_xarray(self) -> xr.Dataset:
-        """Height along `y_mm` and `x_mm`, its standard deviations on their own grid, coefficients along `noll`."""
+        """Height along `y_mm` and `x_mm`, its standard deviations on their own grid, coefficients
+        along `noll`.
+        """
         variables: dict[str, Any] = {
-            "height_mm": (("y_mm", "x_mm"), self.height.height_mm, _labels("mm", "height above the vertex")),
-            "coeffs_um": ("noll", self._coeffs_um(), _labels("µm", "Zernike coefficients, orthonormal")),
-            "coeffs_sigma_um": ("noll", self._sigma_um(), _labels("µm", "1 sigma of the coefficients")),
+            "height_mm": (
+                ("y_mm", "x_mm"),
+                self.height.height_mm,
+                _labels("mm", "height above the vertex"),
+            ),
+            "coeffs_um": (
+                "noll",
+                self._coeffs_um(),
+                _labels("µm", "Zernike coefficients, orthonormal"),
+            ),
+            "coeffs_sigma_um": (
+                "noll",
+                self._sigma_um(),
+                _labels("µm", "1 sigma of the coefficients"),
+            ),
         }
         for name, values in self.sigmas_um.items():
             variables[name] = (("sigma_y_mm", "sigma_x_mm"), values, _labels("µm", _SIGMAS[name]))
-        coordinates: dict[str, Any] = {"x_mm": self.height.x_mm, "y_mm": self.height.y_mm, "noll": NOLL_INDICES}
+        coordinates: dict[str, Any] = {
+            "x_mm": self.height.x_mm,
+            "y_mm": self.height.y_mm,
+            "noll": NOLL_INDICES,
+        }
         if self.sigmas_um:
             coordinates |= {"sigma_x_mm": self.sigma_mm[0], "sigma_y_mm": self.sigma_mm[1]}
         xarray = import_optional("xarray", "data")
@@ -85,9 +108,16 @@ class MeasuredResult:
     def _about(self) -> dict[str, str | float]:
         quality, terms = (_table(self.table, name) for name in ("quality", "zernike"))
         texts = {key: str(self.table.get(key, "")) for key in ("schema", "program", "commit")}
-        about = {"verdict": str(quality.get("verdict", "")), "reason": str(quality.get("reason", ""))}
+        about = {
+            "verdict": str(quality.get("verdict", "")),
+            "reason": str(quality.get("reason", "")),
+        }
         radius_mm = terms.get("radius_mm")
-        return texts | about | {"zernike_radius_mm": radius_mm if isinstance(radius_mm, float) else math.nan}
+        return (
+            texts
+            | about
+            | {"zernike_radius_mm": radius_mm if isinstance(radius_mm, float) else math.nan}
+        )
 
 
 def open_result(folder: str | Path) -> MeasuredResult:
@@ -103,7 +133,9 @@ def open_result(folder: str | Path) -> MeasuredResult:
         raise errors.InputError(f"{path}: {error}") from None
     if any(values.shape != (y_mm.size, x_mm.size) for values in maps) or x_mm.size != y_mm.size:
         raise errors.InputError(f"{path}: its maps have not the shape of y_mm and x_mm")
-    return MeasuredResult(folder, table, height, np.stack([x_mm, y_mm]), dict(zip(_SIGMAS, maps, strict=True)))
+    return MeasuredResult(
+        folder, table, height, np.stack([x_mm, y_mm]), dict(zip(_SIGMAS, maps, strict=True))
+    )
 
 
 @dataclass(frozen=True)
@@ -121,26 +153,36 @@ class StabilityResult:
     table: dict[str, Any]
 
     def to_pandas(self, table: Literal["series", "pairs"] = "series") -> pd.DataFrame:
-        """One row a set by its name (`series`), or one row a pair of sets (`pairs`). Raises InputError."""
+        """One row a set by its name (`series`), or one row a pair of sets (`pairs`). Raises
+        InputError.
+        """
         pandas = import_optional("pandas", "data")
         path = self.folder / f"{table}.csv"
         names = ["set"] if table == "series" else ["earlier", "later"]
         try:
             data = files.read_bytes(path, _SERIES_BYTES_MAX)
-            frame = pandas.read_csv(io.BytesIO(data), dtype=dict.fromkeys([*names, "verdict", "reason"], str))
+            frame = pandas.read_csv(
+                io.BytesIO(data), dtype=dict.fromkeys([*names, "verdict", "reason"], str)
+            )
             return frame.set_index("set") if table == "series" else frame
         except (OSError, ValueError, KeyError) as error:
             raise errors.InputError(f"{path}: {error}") from None
 
     def to_xarray(self) -> xr.Dataset:
-        """Numbers along `set`, coefficients also along `noll`, and the map `sd_um` of standard deviations."""
+        """Numbers along `set`, coefficients also along `noll`, and the map `sd_um` of standard
+        deviations.
+        """
         xarray = import_optional("xarray", "data")
         series = self.to_pandas()
         terms = [name for name in zernike_columns() if name in series]
         variables: dict[str, Any] = {
-            name: ("set", series[name].to_numpy()) for name in series.columns if name not in zernike_columns()
+            name: ("set", series[name].to_numpy())
+            for name in series.columns
+            if name not in zernike_columns()
         }
-        variables |= {name: ("set", series[name].fillna("").to_numpy(str)) for name in ("verdict", "reason")}
+        variables |= {
+            name: ("set", series[name].fillna("").to_numpy(str)) for name in ("verdict", "reason")
+        }
         coordinates: dict[str, Any] = {"set": series.index.to_numpy(str)}
         if len(terms) == ZERNIKE_TERMS:
             variables["coeffs_um"] = (("set", "noll"), series[terms].to_numpy())
@@ -151,7 +193,11 @@ class StabilityResult:
                 x_mm, y_mm, sd_um = read_arrays(path, ("x_mm", "y_mm", "sd_um"), _CELLS_MAX)
             except (OSError, ValueError) as error:
                 raise errors.InputError(f"{path}: {error}") from None
-            variables["sd_um"] = (("y_mm", "x_mm"), sd_um, _labels("µm", "standard deviation of the height"))
+            variables["sd_um"] = (
+                ("y_mm", "x_mm"),
+                sd_um,
+                _labels("µm", "standard deviation of the height"),
+            )
             coordinates |= {"x_mm": x_mm, "y_mm": y_mm}
         about = {key: str(self.table.get(key, "")) for key in ("schema", "program", "commit")}
         try:

@@ -1,4 +1,6 @@
-"""The files written by `measure`: `result.json` and `height.npz` (docs/interfaces.md), and `details.json`."""
+"""The files written by `measure`: `result.json` and `height.npz` (docs/interfaces.md), and
+`details.json`.
+"""
 
 from __future__ import annotations
 
@@ -30,19 +32,23 @@ if TYPE_CHECKING:  # matplotlib takes a second to load
     from matplotlib.figure import Figure
 
 
-# Uncertainty of a measured height without trials: every part is linear (`metrology.uncertainty.budget`), some hundred
-# solutions of thinned points. The Monte Carlo of the `uncertainty` command agrees within 10 %.
+# Uncertainty of a measured height without trials: every part is linear
+# (`metrology.uncertainty.budget`), some hundred solutions of thinned points. The Monte Carlo of the
+# `uncertainty` command agrees within 10 %.
 
 
 @dataclass(frozen=True)
 class ErrorBars:
-    """The budget of a measurement; covariances (parameters, parameters) of the fit's parameters, mm^2."""
+    """The budget of a measurement; covariances (parameters, parameters) of the fit's parameters,
+    mm^2.
+    """
 
     budget: Budget
     source: str  # source of the geometry's covariance
     doubts: tuple[str, ...]  # what the set says of its own errors, and what to do
     grid: monte_carlo.HeightMap  # grid of `maps_um`
-    cell_slope: float = 0.0  # 1 sigma of the mean slope of a cell of the height map, from pixel noise
+    # 1 sigma of the mean slope of a cell of the height map, from pixel noise
+    cell_slope: float = 0.0
     zonal_um: float = 0.0  # and of the map's height over the fit
 
     @property
@@ -59,34 +65,49 @@ class ErrorBars:
     def sag_um(self) -> tuple[float, float]:
         """1 sigma of the sag: noise, geometry."""
         gradient = surface.sag_gradient()
-        of_noise, of_geometry = (1e3 * float(np.sqrt(gradient @ c @ gradient)) for c in (self.noise, self.geometry))
+        of_noise, of_geometry = (
+            1e3 * float(np.sqrt(gradient @ c @ gradient)) for c in (self.noise, self.geometry)
+        )
         return of_noise, of_geometry
 
     def maps_um(self) -> tuple[FloatArray, FloatArray]:
-        """1 sigma (n, n) of the height on `grid.axis_mm`: noise, geometry; NaN outside the analysis radius."""
-        of_noise, of_geometry = (self.grid.picture(1e3 * self.grid.sigma(c)) for c in (self.noise, self.geometry))
+        """1 sigma (n, n) of the height on `grid.axis_mm`: noise, geometry; NaN outside the analysis
+        radius.
+        """
+        of_noise, of_geometry = (
+            self.grid.picture(1e3 * self.grid.sigma(c)) for c in (self.noise, self.geometry)
+        )
         return np.hypot(of_noise, self.zonal_um), of_geometry
 
 
-def error_bars(measurement: Measurement, geometry: Path | None, outline: Outline | None = None) -> ErrorBars | None:
+def error_bars(
+    measurement: Measurement, geometry: Path | None, outline: Outline | None = None
+) -> ErrorBars | None:
     """Error bars of a measurement; None if it has no figure.
 
-    Raises InputError if the covariance is invalid or for the other form of geometry, or too wide to propagate.
-    `geometry` is the file with the covariance, `outline` the rim in the picture, which checks the geometry.
+    Raises InputError if the covariance is invalid or for the other form of geometry, or too wide to
+    propagate. `geometry` is the file with the covariance, `outline` the rim in the picture, which
+    checks the geometry.
     """
     full, checked, optics = measurement.full, measurement.checked, measurement.head.optics
     if full is None or checked is None:
         return None
     spread, source = spread_of(optics, geometry)
-    noise_adu = float(np.nanmax([bins.pixel_sigma_adu(optics.camera.noise_adu), noise_seen_adu(measurement)]))
+    noise_adu = float(
+        np.nanmax([bins.pixel_sigma_adu(optics.camera.noise_adu), noise_seen_adu(measurement)])
+    )
     try:
         seen = consistency.examine(optics, checked, full, spread, noise_adu, outline)
     except ArithmeticError:
-        raise errors.InputError(f"{source}: too wide: the figure does not follow from such a geometry") from None
+        raise errors.InputError(
+            f"{source}: too wide: the figure does not follow from such a geometry"
+        ) from None
     grid = monte_carlo.HeightMap.over(optics.mirror.analysis_radius_mm, optics.mirror.radius_mm)
     shifts_rad = [checked.stack.shifts_rad(used) for used in checked.view.used]
     variance = full.slope_variance(optics, shifts_rad, noise_adu)
-    cell_slope = math.sqrt(float(variance.mean()) / float(np.median(full.grid.count[full.grid.count > 0])))
+    cell_slope = math.sqrt(
+        float(variance.mean()) / float(np.median(full.grid.count[full.grid.count > 0]))
+    )
     zonal_um = 1e3 * full.grid.noise_mm(cell_slope)
     return ErrorBars(seen.budget, source, seen.doubts, grid, cell_slope, zonal_um)
 
@@ -99,26 +120,40 @@ def with_doubts(measurement: Measurement, bars: ErrorBars | None) -> Measurement
     return replace(measurement, verdict="degraded", reason="; ".join([*known, *bars.doubts]))
 
 
-def result_table(measurement: Measurement, bars: ErrorBars | None, figure: dict[str, Any] | None) -> dict[str, Any]:
+def result_table(
+    measurement: Measurement, bars: ErrorBars | None, figure: dict[str, Any] | None
+) -> dict[str, Any]:
     """The content of `result.json` (schema membrane-result/1); numbers that do not exist are null.
 
     `figure` is its block of that name (`figure_results.figure_table`).
     """
     full = measurement.full
     radius_mm = measurement.head.optics.mirror.radius_mm
-    coeffs = [None] * zernike_terms.ZERNIKE_TERMS if full is None else (1e3 * full.surface.coeffs_mm).tolist()
+    coeffs = (
+        [None] * zernike_terms.ZERNIKE_TERMS
+        if full is None
+        else (1e3 * full.surface.coeffs_mm).tolist()
+    )
     full_scale = 2**measurement.head.optics.camera.bits - 1
     quality: dict[str, Any] = {
         "verdict": measurement.verdict,
         "reason": measurement.reason,
         "valid_fraction": 0.0 if full is None else full.quality.valid_fraction,
-        "modulation_median_adu": None if full is None else full.quality.modulation_share * full_scale,
+        "modulation_median_adu": None
+        if full is None
+        else full.quality.modulation_share * full_scale,
         "saturated_fraction": None if full is None else full.quality.saturated_fraction,
         "flagged_frames": measurement.flagged_files(),
     }
     return {
         **program.file_origin("membrane-result/1"),
-        "zernike": {"index": "noll", "first": 1, "normalisation": "rms", "radius_mm": radius_mm, "coeffs_um": coeffs},
+        "zernike": {
+            "index": "noll",
+            "first": 1,
+            "normalisation": "rms",
+            "radius_mm": radius_mm,
+            "coeffs_um": coeffs,
+        },
         "fit": _fit_table(full),
         "quality": quality,
         "uncertainty": None if bars is None else bars.budget.total() | {"coverage_factor": 1},
@@ -131,7 +166,13 @@ def result_table(measurement: Measurement, bars: ErrorBars | None, figure: dict[
 
 def _fit_table(full: FullResult | None) -> dict[str, Any]:
     if full is None:
-        return {"iterations": 0, "converged": False, "last_change_mm": None, "slope_residual_urad": None, "points": 0}
+        return {
+            "iterations": 0,
+            "converged": False,
+            "last_change_mm": None,
+            "slope_residual_urad": None,
+            "points": 0,
+        }
     return {
         "iterations": len(full.fit.changes_mm),
         "converged": full.fit.converged,
@@ -142,7 +183,10 @@ def _fit_table(full: FullResult | None) -> dict[str, Any]:
 
 
 def details_table(
-    measurement: Measurement, profile: surface.RadialProfile | None, outline: Outline | None, bars: ErrorBars | None
+    measurement: Measurement,
+    profile: surface.RadialProfile | None,
+    outline: Outline | None,
+    bars: ErrorBars | None,
 ) -> dict[str, Any]:
     """Further results: sag, pressure, zonal residual, noise, the rim in the picture."""
     full = measurement.full
@@ -182,7 +226,11 @@ def details_table(
 
 
 def write_result(
-    out: Path, measurement: Measurement, result: dict[str, Any], details: dict[str, Any], bars: ErrorBars | None
+    out: Path,
+    measurement: Measurement,
+    result: dict[str, Any],
+    details: dict[str, Any],
+    bars: ErrorBars | None,
 ) -> None:
     """Write `result.json`, `details.json` and, with a usable figure, two maps. Raises OSError."""
     make_folder(out)
@@ -195,7 +243,9 @@ def write_result(
             axis, (of_noise, of_geometry) = bars.grid.axis_mm, bars.maps_um()
             file = out / "sigma.npz"
             maps = {"sigma_noise_um": of_noise, "sigma_geometry_um": of_geometry}
-            write_arrays(file, x_mm=axis, y_mm=axis, sigma_um=np.hypot(of_noise, of_geometry), **maps)
+            write_arrays(
+                file, x_mm=axis, y_mm=axis, sigma_um=np.hypot(of_noise, of_geometry), **maps
+            )
 
 
 def write_json(path: Path, table: dict[str, Any]) -> None:
@@ -221,7 +271,14 @@ def read_arrays(path: Path, names: tuple[str, ...], most: int) -> list[FloatArra
     try:
         with zipfile.ZipFile(io.BytesIO(read_bytes(path, _ARRAYS_BYTES))) as archive:
             return [_array(archive, name, most) for name in names]
-    except (zipfile.BadZipFile, zlib.error, KeyError, NotImplementedError, RuntimeError, EOFError) as error:
+    except (
+        zipfile.BadZipFile,
+        zlib.error,
+        KeyError,
+        NotImplementedError,
+        RuntimeError,
+        EOFError,
+    ) as error:
         raise ValueError(f"{path.name} is damaged or lacks an array ({error})") from None
 
 
@@ -229,7 +286,11 @@ def _array(archive: zipfile.ZipFile, name: str, most: int) -> FloatArray:
     with archive.open(f"{name}.npy") as packed:
         data = io.BytesIO(packed.read(8 * most + 1024))  # whatever size the archive claims
     version = np.lib.format.read_magic(data)
-    read_header = np.lib.format.read_array_header_1_0 if version == (1, 0) else np.lib.format.read_array_header_2_0
+    read_header = (
+        np.lib.format.read_array_header_1_0
+        if version == (1, 0)
+        else np.lib.format.read_array_header_2_0
+    )
     shape, by_columns, kind = read_header(data)
     left = data.getbuffer().nbytes - data.tell()
     if kind != np.dtype("<f8") or math.prod(shape) * kind.itemsize != left:
@@ -242,7 +303,9 @@ def write_figure(path: Path, figure: Figure, dpi: int = 110) -> Path:
     from matplotlib.backends.backend_agg import FigureCanvasAgg
 
     picture = io.BytesIO()
-    FigureCanvasAgg(figure).print_figure(picture, format="png", dpi=dpi, pil_kwargs={"compress_level": 3})
+    FigureCanvasAgg(figure).print_figure(
+        picture, format="png", dpi=dpi, pil_kwargs={"compress_level": 3}
+    )
     write_bytes_atomic(path, picture.getvalue())
     return path
 

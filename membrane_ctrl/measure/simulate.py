@@ -49,7 +49,9 @@ class SimulateOptions:
 def simulate_command(options: SimulateOptions) -> int:
     """Write a set, or a run of sets. Raises InputError."""
     if options.folder.exists() and any(options.folder.iterdir()):
-        raise errors.InputError(f"{options.folder}: is not empty; simulate needs a new or empty folder")
+        raise errors.InputError(
+            f"{options.folder}: is not empty; simulate needs a new or empty folder"
+        )
     try:
         spec = specification(options)
         with errors.writing(options.folder):
@@ -60,10 +62,14 @@ def simulate_command(options: SimulateOptions) -> int:
             elif options.sets == 1:
                 simulate.simulate_set(options.folder, spec)
             else:
-                simulate.simulate_run(options.folder, spec, options.sets, options.interval_s, _progress(options.sets))
+                simulate.simulate_run(
+                    options.folder, spec, options.sets, options.interval_s, _progress(options.sets)
+                )
     except ValueError as error:
         raise errors.InputError(f"simulate: {error}") from None
-    written = f"{options.track} frames and their reference" if options.track else f"{options.sets} set(s)"
+    written = (
+        f"{options.track} frames and their reference" if options.track else f"{options.sets} set(s)"
+    )
     print(f"{written} written to {options.folder}", file=sys.stderr)
     return 0
 
@@ -86,7 +92,9 @@ def _of_film(options: SimulateOptions, optics: OpticsConfig) -> simulation_spec.
     """A set of the film, or the first of a run."""
     radius_mm = optics.mirror.radius_mm
     twin = options.config.twin
-    mounted = film_shape.typical_film(options.sag_mm, radius_mm, options.seed, twin.film_prestrain, twin.film_poisson)
+    mounted = film_shape.typical_film(
+        options.sag_mm, radius_mm, options.seed, twin.film_prestrain, twin.film_poisson
+    )
     return replace(
         _bare(options, optics, mounted if options.figure else replace(mounted, zernike_um=())),
         stiffness_n_per_m=twin.film_stiffness_n_per_m,
@@ -130,14 +138,19 @@ def _of_artefact(options: SimulateOptions, optics: OpticsConfig) -> simulation_s
     except ValueError:
         raise ValueError(f"--artefact {options.artefact}: sizes are numbers, mm") from None
     if len(sizes) != {"flat": 1, "sphere": 2}.get(form) or not 0 < radius_mm < curvature_mm:
-        raise ValueError(f"--artefact {options.artefact}: flat:RADIUS or sphere:CURVATURE_RADIUS:RADIUS, mm")
+        raise ValueError(
+            f"--artefact {options.artefact}: flat:RADIUS or sphere:CURVATURE_RADIUS:RADIUS, mm"
+        )
     table: dict[str, str | float] = {
         "form": form,
         "vertex_sigma_mm": _VERTEX_KNOWN_MM,
         "form_sigma_um": _FORM_KNOWN_UM,
     }
     if form == "sphere":
-        table |= {"curvature_radius_mm": curvature_mm, "curvature_radius_sigma_mm": _RADIUS_KNOWN * curvature_mm}
+        table |= {
+            "curvature_radius_mm": curvature_mm,
+            "curvature_radius_sigma_mm": _RADIUS_KNOWN * curvature_mm,
+        }
     lean_x, lean_y = np.random.default_rng(options.seed).uniform(-_LEANS, _LEANS, 2).tolist()
     shape = simulation_spec.leaning(curvature_mm, radius_mm, lean_x, lean_y)
     mirror = type(optics.mirror)(radius_mm=radius_mm, analysis_radius_mm=_USED * radius_mm)
@@ -148,32 +161,48 @@ def _of_artefact(options: SimulateOptions, optics: OpticsConfig) -> simulation_s
 _SHIFT_KNOWN_MM, _TURN_KNOWN_DEG = 0.05, 0.5  # of a screen on a rail
 
 
-def _with_screen_moved(options: SimulateOptions, optics: OpticsConfig) -> simulation_spec.SimulationSpec:
+def _with_screen_moved(
+    options: SimulateOptions, optics: OpticsConfig
+) -> simulation_spec.SimulationSpec:
     """The film with the screen elsewhere than stated, which is known as the file states it."""
     shift_mm = np.array([0.0, 0.0, options.screen_moved_mm])
-    table = {"shift_mm": shift_mm.tolist(), "shift_sigma_mm": _SHIFT_KNOWN_MM, "turn_sigma_deg": _TURN_KNOWN_DEG}
+    table = {
+        "shift_mm": shift_mm.tolist(),
+        "shift_sigma_mm": _SHIFT_KNOWN_MM,
+        "turn_sigma_deg": _TURN_KNOWN_DEG,
+    }
     # one move of one bench, whatever the set's own seed
     rng = np.random.default_rng(int(abs(options.screen_moved_mm)))
     rail, turn = (_turn(np.radians(_TURN_KNOWN_DEG) * rng.normal(size=3)) for _ in range(2))
     x, y, z = rail @ shift_mm + _SHIFT_KNOWN_MM * rng.normal(size=3)
     there = screen_elsewhere(optics.geometry, (x, y, z), turn)
     spec = _of_film(options, optics.model_copy(update={"geometry": there}))
-    return replace(spec, screen_moved=table, stated_geometry=spec.stated_geometry or optics.geometry)
+    return replace(
+        spec, screen_moved=table, stated_geometry=spec.stated_geometry or optics.geometry
+    )
 
 
 _TILTED_RAD = np.radians(25.0)
 
 
 def _of_screen(options: SimulateOptions, optics: OpticsConfig) -> simulation_spec.SimulationSpec:
-    """The screen itself before the camera, tilted to any side. Raises ValueError for another text."""
+    """The screen itself before the camera, tilted to any side.
+    Raises ValueError for another text.
+    """
     try:
         distance_mm = float(options.artefact.removeprefix("screen:"))
     except ValueError:
         raise ValueError(f"--artefact {options.artefact}: screen:DISTANCE, mm") from None
     pinhole, (right, down, forward), *_ = sight.poses(optics.geometry)
     side, roll = np.random.default_rng(options.seed).uniform(0, 2 * math.pi, 2)
-    turn = _turn(_TILTED_RAD * (math.cos(side) * right + math.sin(side) * down)) @ _turn(roll * forward)
-    before = {"origin_mm": pinhole + distance_mm * forward, "s_x": turn @ right, "s_y": -turn @ down}
+    turn = _turn(_TILTED_RAD * (math.cos(side) * right + math.sin(side) * down)) @ _turn(
+        roll * forward
+    )
+    before = {
+        "origin_mm": pinhole + distance_mm * forward,
+        "s_x": turn @ right,
+        "s_y": -turn @ down,
+    }
     screen = (optics.geometry.screen or ScreenPoseConfig()).model_copy(
         update={name: tuple(value.tolist()) for name, value in before.items()}
     )
@@ -201,7 +230,9 @@ def _optics(options: SimulateOptions) -> OpticsConfig:
             "height_px": camera.height_px // options.shrink,
             "pixel_um": camera.pixel_um * options.shrink,
             # pixel centres are integers: the middle of the first large pixel is (shrink - 1) / 2
-            "principal_px": tuple((p - (options.shrink - 1) / 2) / options.shrink for p in (column, row)),
+            "principal_px": tuple(
+                (p - (options.shrink - 1) / 2) / options.shrink for p in (column, row)
+            ),
         }
     if options.bits is not None:
         changes["bits"] = options.bits

@@ -1,4 +1,6 @@
-"""The `stability` command: the paper's stability analysis over a run of many sets, one set in memory at a time."""
+"""The `stability` command: the paper's stability analysis over a run of many sets, one set in
+memory at a time.
+"""
 
 import contextlib
 import csv
@@ -23,14 +25,23 @@ from membrane_ctrl.model.arrays import FloatArray
 
 SERIES = "series.csv"  # its presence also distinguishes a result folder from a set
 _NAMED_BAD = 100  # bad sets listed in the table; all of them are in series.csv
-_PAIR_HEAD = ("lag_s", "earlier", "later", "seconds", "change_rms_um", "rmse_mean_um", "rmse_max_um")
+_PAIR_HEAD = (
+    "lag_s",
+    "earlier",
+    "later",
+    "seconds",
+    "change_rms_um",
+    "rmse_mean_um",
+    "rmse_max_um",
+)
 
 
 class StabilityRun:
     """Statistics over the sets of a run.
 
-    `out` is an existing folder for `series.csv`, `pairs.csv`, the SD map and the pictures; `points_mm` are the
-    tracked points; `geometry` is the file of the sets' geometry, with its covariance.
+    `out` is an existing folder for `series.csv`, `pairs.csv`, the SD map and the pictures;
+    `points_mm` are the tracked points; `geometry` is the file of the sets' geometry, with its
+    covariance.
     """
 
     def __init__(
@@ -56,7 +67,9 @@ class StabilityRun:
         self._heights = {name: stability.Tally() for name in points_mm}
         self._rmse, self._time = stability.Tally(), stability.Tally()
         self._finder = stability.PairFinder()
-        self._pairs = {lag: (stability.Tally(), stability.Tally()) for lag in stability.LAGS_S}  # change, RMSE
+        self._pairs = {
+            lag: (stability.Tally(), stability.Tally()) for lag in stability.LAGS_S
+        }  # change, RMSE
         self._shown: dict[float, stability.FigurePair] = {}
         self._bad: list[dict[str, str]] = []
         self._bad_count = 0
@@ -66,12 +79,17 @@ class StabilityRun:
         return self
 
     def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, at: TracebackType | None
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        at: TracebackType | None,
     ) -> None:
         self._open.close()
 
     def _table(self, name: str, head: Sequence[str]) -> Any:
-        rows = csv.writer(self._open.enter_context(files.fresh_text(self._out / name)), lineterminator="\n")
+        rows = csv.writer(
+            self._open.enter_context(files.fresh_text(self._out / name)), lineterminator="\n"
+        )
         rows.writerow(head)
         return rows
 
@@ -99,7 +117,9 @@ class StabilityRun:
         parameters = surface.parameters
         bench = one.bench()
         try:
-            trials = monte_carlo.run_trials([bench], spread, self._seed, range(self._trials), number)[:, 0]
+            trials = monte_carlo.run_trials(
+                [bench], spread, self._seed, range(self._trials), number
+            )[:, 0]
         except ArithmeticError as error:
             raise errors.InputError(f"{one.head.folder}: uncertainty: {error}") from None
         rmse_um = float(1e3 * grid.sigma(monte_carlo.trial_covariance(trials)).mean())
@@ -111,7 +131,13 @@ class StabilityRun:
         heights_um: list[float] = (1e3 * self._point_matrix @ parameters).tolist()
         for tally, height in zip(self._heights.values(), heights_um, strict=True):
             tally.add(height)
-        numbers = (one.time_s, one.displacement_um, 1e3 * surface.sag_mm, one.figure.quality.residual_urad, rmse_um)
+        numbers = (
+            one.time_s,
+            one.displacement_um,
+            1e3 * surface.sag_mm,
+            one.figure.quality.residual_urad,
+            rmse_um,
+        )
         cells = (f"{value:.12g}" for value in (*numbers, *heights_um, *(1e3 * surface.coeffs_mm)))
         self._series.writerow((name, one.verdict, one.reason, *cells))
         for pair in self._finder.add(stability.Moment(name, one.time_s, parameters, trials)):
@@ -156,7 +182,9 @@ class StabilityRun:
         return stability_results.lines_of(self.table())
 
     def draw(self) -> list[Path]:
-        """Write the SD map and the pictures and return the latter; the series must be closed. Raises OSError."""
+        """Write the SD map and the pictures and return the latter; the series must be closed.
+        Raises OSError.
+        """
         grid = self._grid
         if grid is None:
             return []
@@ -169,7 +197,10 @@ class StabilityRun:
         if not self._shown:
             return drawn[:2]
         maps = {
-            lag: (grid.picture(1e3 * grid.matrix @ pair.change), grid.picture(1e3 * grid.sigma(pair.covariance)))
+            lag: (
+                grid.picture(1e3 * grid.matrix @ pair.change),
+                grid.picture(1e3 * grid.sigma(pair.covariance)),
+            )
             for lag, pair in self._shown.items()
         }
         stability_results.draw_pairs(drawn[2], axis, maps)
@@ -181,11 +212,15 @@ class StabilityRun:
             return
         sd_um = self._grid.picture(self._sd_um())
         followed = (list(self._points_mm), *self._followed())
-        stability_results.log_stability(self._out / "stability.rrd", *followed, sd_um, self.lines(), pictures)
+        stability_results.log_stability(
+            self._out / "stability.rrd", *followed, sd_um, self.lines(), pictures
+        )
 
     def _followed(self) -> tuple[FloatArray, FloatArray, FloatArray]:
         """Times, point heights and terms of the sets with a figure."""
-        times, heights, coeffs = stability_results.read_series(self._out / SERIES, len(self._points_mm))
+        times, heights, coeffs = stability_results.read_series(
+            self._out / SERIES, len(self._points_mm)
+        )
         if not np.isfinite(times).all():  # sets without times: use their numbers
             times = np.arange(len(times), dtype=float)
         return times, heights, coeffs
@@ -213,7 +248,9 @@ class StabilityRun:
     def _add_pair(self, grid: monte_carlo.HeightMap, pair: stability.FigurePair) -> None:
         rmse_um = 1e3 * grid.sigma(pair.covariance)
         change_um = float(1e3 * np.sqrt(np.mean(np.square(grid.matrix @ pair.change))))
-        for tally, value in zip(self._pairs[pair.lag_s], (change_um, float(rmse_um.mean())), strict=True):
+        for tally, value in zip(
+            self._pairs[pair.lag_s], (change_um, float(rmse_um.mean())), strict=True
+        ):
             tally.add(value)
         self._shown.setdefault(pair.lag_s, pair)
         seconds = pair.later.time_s - pair.earlier.time_s
@@ -226,7 +263,11 @@ class StabilityRun:
         for row, (name, (x, y)) in zip(self._point_matrix, self._points_mm.items(), strict=True):
             tally = self._heights[name]
             sd_um = 1e3 * math.sqrt(row @ self._parameters.covariance @ row)
-            moved = {"mean_um": tally.mean, "sd_um": sd_um, "peak_to_peak_um": tally.high - tally.low}
+            moved = {
+                "mean_um": tally.mean,
+                "sd_um": sd_um,
+                "peak_to_peak_um": tally.high - tally.low,
+            }
             table[name] = {"x_mm": x, "y_mm": y} | moved
         return table
 
@@ -255,7 +296,9 @@ class StabilityOptions:
 def stability_command(options: StabilityOptions) -> int:
     """Analyse a run, write tables and pictures, and report. Raises CommandError."""
     out = options.out.resolve() if options.out else options.folder / "stability"
-    figures = measurement.Figures(None if options.geometry is None else read_geometry(options.geometry))
+    figures = measurement.Figures(
+        None if options.geometry is None else read_geometry(options.geometry)
+    )
     folders = set_folders(options.folder, out)
     size_px, analysis_radius_mm = common_size(folders)
     points = points_mm(options.points, analysis_radius_mm)
@@ -265,7 +308,8 @@ def stability_command(options: StabilityOptions) -> int:
             _analyse(folders, figures, run)
         if run.used == 0:
             raise errors.RejectedError(
-                f"{options.folder}: none of the {len(folders)} sets gave a figure ({run.first_reason})"
+                f"{options.folder}: none of the {len(folders)} sets gave a figure "
+                f"({run.first_reason})"
             )
         table = {
             **program.file_origin("membrane-stability/1"),
@@ -282,12 +326,16 @@ def stability_command(options: StabilityOptions) -> int:
 
 
 def set_folders(run: Path, out: Path) -> list[Path]:
-    """The sets of a run, sorted by name, without results of earlier analyses. Raises InputError if there are none."""
+    """The sets of a run, sorted by name, without results of earlier analyses. Raises InputError if
+    there are none.
+    """
     if not run.is_dir():
         raise errors.InputError(f"{run}: no such run of sets")
     if (run / "capture.toml").is_file():
         raise errors.InputError(f"{run}: is itself a capture set; name the folder above it")
-    found = sorted(path for path in run.iterdir() if path.is_dir() and path.resolve() != out.resolve())
+    found = sorted(
+        path for path in run.iterdir() if path.is_dir() and path.resolve() != out.resolve()
+    )
     folders = [path for path in found if not (path / SERIES).is_file()]
     if not folders:
         raise errors.InputError(f"{run}: holds no capture sets")
@@ -299,7 +347,8 @@ def common_size(folders: Iterable[Path]) -> tuple[tuple[int, int], float]:
 
     Skips sets with unreadable descriptions; the analysis counts them.
 
-    Raises InputError for two sizes in one run, naming a set of each; RejectedError if no description is readable.
+    Raises InputError for two sizes in one run, naming a set of each; RejectedError if no
+    description is readable.
     """
     first: tuple[Path, tuple[int, int], float] | None = None
     reason = ""
@@ -314,7 +363,8 @@ def common_size(folders: Iterable[Path]) -> tuple[tuple[int, int], float]:
             first = (folder, size, optics.mirror.analysis_radius_mm)
         elif size != first[1]:
             raise errors.InputError(
-                f"{folder / 'capture.toml'}: camera: {size[0]} x {size[1]} pixels, but {first[0].name} has "
+                f"{folder / 'capture.toml'}: camera: {size[0]} x {size[1]} pixels, but "
+                f"{first[0].name} has "
                 f"{first[1][0]} x {first[1][1]}; a run must have one size"
             )
     if first is None:
@@ -330,7 +380,9 @@ def points_mm(given: tuple[str, ...], analysis_radius_mm: float) -> dict[str, tu
         try:
             x, y = (float(part) for part in place.split(","))
         except ValueError:
-            raise errors.InputError(f"--point {text}: give NAME=X,Y in mm, e.g. A=100,-200") from None
+            raise errors.InputError(
+                f"--point {text}: give NAME=X,Y in mm, e.g. A=100,-200"
+            ) from None
         if not name or not math.hypot(x, y) <= analysis_radius_mm:
             within = f"within {analysis_radius_mm:g} mm of the vertex"
             raise errors.InputError(f"--point {text}: needs a name and a place {within}")

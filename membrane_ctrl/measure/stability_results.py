@@ -1,4 +1,6 @@
-"""The table of a stability run, one line per set, read back thinned for pictures; its pictures and recording."""
+"""The table of a stability run, one line per set, read back thinned for pictures; its pictures and
+recording.
+"""
 
 import csv
 from collections.abc import Iterable, Mapping, Sequence
@@ -21,12 +23,17 @@ _ZERNIKE = tuple(zernike_columns())
 
 
 def series_head(points: Iterable[str]) -> tuple[str, ...]:
-    """Columns of `series.csv`, including the tracked points; a bad set fills only the first three."""
+    """Columns of `series.csv`, including the tracked points;
+    a bad set fills only the first three.
+    """
     return (*_HEAD, *_NUMBERS, *(f"{name}_um" for name in points), *_ZERNIKE)
 
 
-def read_series(path: Path, points: int, most: int = 4000) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Read times (n,), point heights (n, points) and coefficients (n, terms) of the sets with a figure.
+def read_series(
+    path: Path, points: int, most: int = 4000
+) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Read times (n,), point heights (n, points) and coefficients (n, terms) of the sets with a
+    figure.
 
     At most about `most` of them, evenly spaced, however long the run.
     """
@@ -36,13 +43,19 @@ def read_series(path: Path, points: int, most: int = 4000) -> tuple[FloatArray, 
         rows = csv.reader(file)
         next(rows)
         good = (row for row in rows if len(row) > len(_HEAD))
-        kept = [[float(cell) for cell in row[len(_HEAD) :]] for k, row in enumerate(good) if k % stride == 0]
+        kept = [
+            [float(cell) for cell in row[len(_HEAD) :]]
+            for k, row in enumerate(good)
+            if k % stride == 0
+        ]
     table = np.array(kept).reshape(len(kept), len(_NUMBERS) + points + len(_ZERNIKE))
     first = len(_NUMBERS)
     return table[:, 0], table[:, first : first + points], table[:, first + points :]
 
 
-def draw_uncertainty(path: Path, axis_mm: FloatArray, height_um: FloatArray, rmse_um: FloatArray, pair: bool) -> None:
+def draw_uncertainty(
+    path: Path, axis_mm: FloatArray, height_um: FloatArray, rmse_um: FloatArray, pair: bool
+) -> None:
     """Draw the height, or its change, beside its RMSE; (n, n) maps."""
     figure = Figure(figsize=(11, 4.8), layout="constrained")
     left, right = figure.subplots(1, 2)
@@ -62,7 +75,9 @@ def draw_stability(
     points: Mapping[str, tuple[float, float]],
     heights_um: FloatArray,
 ) -> None:
-    """Draw the paper's figure: point heights (sets, points) over time, and the map of standard deviations."""
+    """Draw the paper's figure: point heights (sets, points) over time, and the map of standard
+    deviations.
+    """
     figure = Figure(figsize=(12, 2.2 * max(2, len(points))), layout="constrained")
     grid = figure.add_gridspec(len(points), 2, width_ratios=(1.4, 1))
     for k, name in enumerate(points):
@@ -74,13 +89,21 @@ def draw_stability(
     show_map(shown, f"SD (µm), mean {np.nanmean(sd_um):.3g}", axis_mm, sd_um, "magma")
     for name, (x, y) in points.items():
         shown.plot(x, y, "o", color="white", markeredgecolor="black")
-        frame = {"boxstyle": "round,pad=0.15", "facecolor": "black", "alpha": 0.6}  # readable on any colour
-        shown.annotate(name, (x, y), xytext=(7, 7), textcoords="offset points", color="white", bbox=frame)
+        frame = {
+            "boxstyle": "round,pad=0.15",
+            "facecolor": "black",
+            "alpha": 0.6,
+        }  # readable on any colour
+        shown.annotate(
+            name, (x, y), xytext=(7, 7), textcoords="offset points", color="white", bbox=frame
+        )
     write_figure(path, figure)
 
 
 def draw_zernike(path: Path, time_s: FloatArray, coeffs_um: FloatArray) -> None:
-    """Draw the terms' changes (sets, terms) from their means: the eight that move most, by Noll index."""
+    """Draw the terms' changes (sets, terms) from their means: the eight that move most, by Noll
+    index.
+    """
     change = coeffs_um - coeffs_um.mean(axis=0)
     figure = Figure(figsize=(10, 5), layout="constrained")
     axes = figure.subplots()
@@ -91,12 +114,16 @@ def draw_zernike(path: Path, time_s: FloatArray, coeffs_um: FloatArray) -> None:
     write_figure(path, figure)
 
 
-def draw_pairs(path: Path, axis_mm: FloatArray, maps: Mapping[float, tuple[FloatArray, FloatArray]]) -> None:
+def draw_pairs(
+    path: Path, axis_mm: FloatArray, maps: Mapping[float, tuple[FloatArray, FloatArray]]
+) -> None:
     """Draw, for each lag in s, a pair's change of height beside its RMSE, in µm."""
     figure = Figure(figsize=(11, 4.6 * len(maps)), layout="constrained")
     axes = figure.subplots(len(maps), 2, squeeze=False)
     for row, (lag_s, (change_um, rmse_um)) in zip(axes, maps.items(), strict=True):
-        show_map(row[0], f"change over {lag_s / 60:g} min (µm)", axis_mm, change_um, "RdBu_r", even=True)
+        show_map(
+            row[0], f"change over {lag_s / 60:g} min (µm)", axis_mm, change_um, "RdBu_r", even=True
+        )
         show_map(row[1], f"RMSE (µm), mean {np.nanmean(rmse_um):.3g}", axis_mm, rmse_um, "magma")
     write_figure(path, figure)
 
@@ -111,7 +138,8 @@ def log_stability(
     lines: Sequence[str],
     pictures: Sequence[Path],
 ) -> None:
-    """Write a stability run to a recording `path` (.rrd), overwriting it. Raises OSError if it cannot be written.
+    """Write a stability run to a recording `path` (.rrd), overwriting it. Raises OSError if it
+    cannot be written.
 
     Parameters
     ----------
@@ -126,10 +154,15 @@ def log_stability(
         # row 0 of a picture is at the top, i.e. at +y
         sd = rr.Tensor(sd_um[::-1].astype(np.float32), dim_names=["y", "x"])
         recording.log("stability/sd_um", sd, static=True)
-        for entity, names, values in (("points_um", points, heights_um), ("zernike_um", terms, coeffs_um[:, 1:])):
+        for entity, names, values in (
+            ("points_um", points, heights_um),
+            ("zernike_um", terms, coeffs_um[:, 1:]),
+        ):
             recording.log(f"stability/{entity}", rr.SeriesLines(names=list(names)), static=True)
             change = rr.Scalars.columns(scalars=values - values.mean(axis=0))
-            recording.send_columns(f"stability/{entity}", [rr.TimeColumn("run_time", duration=time_s)], change)
+            recording.send_columns(
+                f"stability/{entity}", [rr.TimeColumn("run_time", duration=time_s)], change
+            )
         log_pictures(recording, "stability/pictures", pictures)
 
 
@@ -139,10 +172,19 @@ def _blueprint(pictures: Sequence[Path]) -> rrb.Blueprint:
     axis = rrb.TimeAxis(view_range=rr.TimeRange(start=always, end=always))
     plots = (
         rrb.TimeSeriesView(origin=f"stability/{name}", name=title, axis_x=axis)
-        for name, title in (("points_um", "height at the points (µm)"), ("zernike_um", "Zernike terms (µm RMS)"))
+        for name, title in (
+            ("points_um", "height at the points (µm)"),
+            ("zernike_um", "Zernike terms (µm RMS)"),
+        )
     )
-    maps = (rrb.TensorView(origin="stability/sd_um", name="SD (µm)"), rrb.TextDocumentView(origin="stability/report"))
-    drawn = [rrb.Spatial2DView(origin=f"stability/pictures/{file.stem}", name=file.stem) for file in pictures]
+    maps = (
+        rrb.TensorView(origin="stability/sd_um", name="SD (µm)"),
+        rrb.TextDocumentView(origin="stability/report"),
+    )
+    drawn = [
+        rrb.Spatial2DView(origin=f"stability/pictures/{file.stem}", name=file.stem)
+        for file in pictures
+    ]
     columns = (rrb.Vertical(*plots), rrb.Vertical(*maps), rrb.Tabs(*drawn))
     return rrb.Blueprint(rrb.Horizontal(*columns), collapse_panels=True)
 
@@ -151,7 +193,8 @@ def lines_of(table: Mapping[str, Any]) -> list[str]:
     """The table of `stability.json` as lines of text."""
     sets, sd_um, rmse_um = table["sets"], table["sd_um"], table["rmse_um"]
     out = [
-        f"sets      {sets['used']} of {sets['found']} used, {sets['degraded']} degraded, {sets['bad']} bad",
+        f"sets      {sets['used']} of {sets['found']} used, {sets['degraded']} degraded, "
+        f"{sets['bad']} bad",
         f"SD        mean {sd_um['mean']:.4g} µm, largest {sd_um['max']:.4g} µm",
     ]
     out += [
@@ -160,7 +203,11 @@ def lines_of(table: Mapping[str, Any]) -> list[str]:
         for name, p in table["points"].items()
     ]
     out += [_pair_line(pair) for pair in table["pairs"]]
-    return [*out, f"height    RMSE {rmse_um['mean']:.4g} µm, shared by all sets ({table['geometry']['source']})"]
+    return [
+        *out,
+        f"height    RMSE {rmse_um['mean']:.4g} µm, shared by all sets "
+        f"({table['geometry']['source']})",
+    ]
 
 
 def _pair_line(pair: dict[str, Any]) -> str:
@@ -168,4 +215,6 @@ def _pair_line(pair: dict[str, Any]) -> str:
     if not pair["count"]:
         return f"{lag:9s} no pairs"
     change, rmse = pair["change_rms_um"]["mean"], pair["rmse_um"]["mean"]
-    return f"{lag:9s} {pair['count']} pairs: change {change:.4g} µm RMS, RMSE {rmse:.4g} µm on average"
+    return (
+        f"{lag:9s} {pair['count']} pairs: change {change:.4g} µm RMS, RMSE {rmse:.4g} µm on average"
+    )

@@ -1,4 +1,6 @@
-"""The `track` command: the figure of every frame of a crossed pattern (docs/interfaces.md, section 3b)."""
+"""The `track` command: the figure of every frame of a crossed pattern (docs/interfaces.md, section
+3b).
+"""
 
 import json
 import math
@@ -76,16 +78,23 @@ class Track:
 
     frames: tuple[TrackedFrame, ...]
     stepped: bool  # whether it began with five steps that could be used
-    residual_adu: FloatArray  # (rows, columns): mean of what the fits left, over the bins; NaN outside
+    residual_adu: (
+        FloatArray  # (rows, columns): mean of what the fits left, over the bins; NaN outside
+    )
 
     def columns(self) -> dict[str, Any]:
         """The arrays of `track.npz`."""
         numbers = ("time_s", "coeffs_um", "sigma_um", "hencky_um", "sag_um", "sag_sigma_um")
         words = ("verdict", "reason")
-        return {name: np.array([getattr(frame, name) for frame in self.frames]) for name in (*numbers, *words)}
+        return {
+            name: np.array([getattr(frame, name) for frame in self.frames])
+            for name in (*numbers, *words)
+        }
 
 
-def track_command(folder: Path, geometry: Path | None, out: Path | None, as_json: bool, pictures: bool) -> int:
+def track_command(
+    folder: Path, geometry: Path | None, out: Path | None, as_json: bool, pictures: bool
+) -> int:
     """Track a set, write the result and report it. Returns the exit code; raises CommandError."""
     begin = time.perf_counter()
     track = track_set(folder, None if geometry is None else read_geometry(geometry))
@@ -112,14 +121,26 @@ def track_set(folder: Path, geometry: GeometryFile | None = None) -> Track:
     crossed, optics = content.pattern.crossed, reference.head.optics
     size = (optics.camera.height_px, optics.camera.width_px)
     try:
-        scene = scene_of(optics, reference.checked, _measured(reference), crossed.period_mm, crossed.contrast)
-        tracker = Tracker(scene, size, 2**optics.camera.bits - 1, optics.camera.noise_adu, reference.displacement_um)
+        scene = scene_of(
+            optics, reference.checked, _measured(reference), crossed.period_mm, crossed.contrast
+        )
+        tracker = Tracker(
+            scene,
+            size,
+            2**optics.camera.bits - 1,
+            optics.camera.noise_adu,
+            reference.displacement_um,
+        )
     except ValueError as error:
         raise errors.InputError(f"{path}: pattern.crossed.period_mm: {error}") from None
     shifts = np.array([(row.shift_x_rad, row.shift_y_rad) for row in content.frames])
-    pictures = _pictures(content, folder, size, np.dtype(np.uint8 if optics.camera.bits == 8 else np.uint16))
+    pictures = _pictures(
+        content, folder, size, np.dtype(np.uint8 if optics.camera.bits == 8 else np.uint16)
+    )
     times = np.array([row.time_s for row in content.frames])
-    readings = np.array([math.nan if row.displacement_um is None else row.displacement_um for row in content.frames])
+    readings = np.array(
+        [math.nan if row.displacement_um is None else row.displacement_um for row in content.frames]
+    )
     found: list[TrackedFrame] = []
     first = list(islice(pictures, ENOUGH_STEPS if separable(shifts[:ENOUGH_STEPS]) else 0))
     good = [picture for picture in first if not isinstance(picture, str)]
@@ -141,7 +162,8 @@ def track_set(folder: Path, geometry: GeometryFile | None = None) -> Track:
 
 
 def _measured(reference: SetFigure) -> BinFigure:
-    """The reference's bins on the surface that `measure` gives: its weights differ from those of the bins' own fit.
+    """The reference's bins on the surface that `measure` gives: its weights differ from those of
+    the bins' own fit.
 
     Where the terms cannot represent the film, the two differ by more than the error bar of a frame.
     """
@@ -158,7 +180,9 @@ def read_track(folder: Path) -> TrackFile:
         raise errors.InputError(f"{folder}: no such tracking set")
     tables = toml_file.read_toml(path, follow=False)
     if tables.get("kind") in ("full", "fringes"):
-        raise errors.InputError(f"{path}: kind: a {tables['kind']} set; use `membrane-ctrl measure`")
+        raise errors.InputError(
+            f"{path}: kind: a {tables['kind']} set; use `membrane-ctrl measure`"
+        )
     for key in toml_file.prune(tables, TrackFile):
         print(f"{path}: {key}: unknown key, ignored", file=sys.stderr)
     content = toml_file.parse(tables, TrackFile, str(path))
@@ -167,7 +191,8 @@ def read_track(folder: Path) -> TrackFile:
     for before, after in pairwise(content.frames):
         if not after.time_s > before.time_s:
             raise errors.InputError(
-                f"{path}: frames: time_s of {after.file} is {after.time_s:g}, not after {before.time_s:g} of the "
+                f"{path}: frames: time_s of {after.file} is {after.time_s:g}, not after "
+                f"{before.time_s:g} of the "
                 "frame before"
             )
     for name, times in Counter(row.file for row in content.frames).items():
@@ -188,13 +213,18 @@ def _require_reference(content: TrackFile, reference: SetFigure, path: Path) -> 
     sides = [pattern.periods * pattern.period_mm for pattern in (ours.crossed, theirs)]
     if abs(sides[0] - sides[1]) > _SAME_REGION * sides[1]:
         raise errors.InputError(
-            f"{path}: pattern.crossed: periods * period_mm = {sides[0]:g} mm; it covers the reference's region, "
+            f"{path}: pattern.crossed: periods * period_mm = {sides[0]:g} mm; it covers the "
+            "reference's region, "
             f"{sides[1]:g} mm"
         )
 
 
-def _pictures(content: TrackFile, folder: Path, size: tuple[int, int], depth: np.dtype[Any]) -> Iterator[Image | str]:
-    """The frames one after the other; a text where there is none. Raises InputError for another size or depth."""
+def _pictures(
+    content: TrackFile, folder: Path, size: tuple[int, int], depth: np.dtype[Any]
+) -> Iterator[Image | str]:
+    """The frames one after the other; a text where there is none. Raises InputError for another
+    size or depth.
+    """
     for row in content.frames:
         picture = read_image(folder / row.file)
         if not isinstance(picture, str):
@@ -212,7 +242,9 @@ def _pictures(content: TrackFile, folder: Path, size: tuple[int, int], depth: np
 def _table(track: Track) -> dict[str, Any]:
     """The result in numbers."""
     used = [frame for frame in track.frames if frame.verdict != "rejected"]
-    sag, sigma = (np.array([getattr(frame, name) for frame in used]) for name in ("sag_um", "sag_sigma_um"))
+    sag, sigma = (
+        np.array([getattr(frame, name) for frame in used]) for name in ("sag_um", "sag_sigma_um")
+    )
     reasons = Counter(f"{frame.verdict}: {frame.reason}" for frame in track.frames if frame.reason)
     counts = Counter(frame.verdict for frame in track.frames)
     return {
@@ -232,14 +264,19 @@ def _table(track: Track) -> dict[str, Any]:
 
 def _lines(table: dict[str, Any]) -> list[str]:
     """The result as lines of text."""
-    verdicts = ", ".join(f"{count} {verdict}" for verdict, count in table["verdicts"].items() if count)
+    verdicts = ", ".join(
+        f"{count} {verdict}" for verdict, count in table["verdicts"].items() if count
+    )
     lines = [f"frames    {table['frames']} in {table['seconds']:.1f} s: {verdicts}"]
-    lines += [f"          {count} x {reason}" for reason, count in list(table["reasons"].items())[:_NAMED]]
+    lines += [
+        f"          {count} x {reason}" for reason, count in list(table["reasons"].items())[:_NAMED]
+    ]
     light = "five steps of the first frames" if table["stepped"] else "the reference"
     lines.append(f"anchor    light and phases of the bins from {light}")
     if table["usable"]:
         lines.append(
-            f"sag       {table['sag_mean_um'] / 1e3:.5f} mm, standard deviation {table['sag_sd_um']:.3f} µm, "
+            f"sag       {table['sag_mean_um'] / 1e3:.5f} mm, standard deviation "
+            f"{table['sag_sd_um']:.3f} µm, "
             f"1 sigma of a frame {table['sag_sigma_um']:.3f} µm"
         )
         lines.append(f"fit       leaves {table['rest_share']:.2%} of the fringes' swing")
@@ -254,16 +291,24 @@ def _show(out: Path, track: Track, lines: Sequence[str]) -> None:
 
     columns = track.columns()
     time_s, sag_um, sigma_um = columns["time_s"], columns["sag_um"], columns["sag_sigma_um"]
-    change_um = columns["coeffs_um"] - np.nanmean(columns["coeffs_um"], axis=0) if np.isfinite(sag_um).any() else None
+    change_um = (
+        columns["coeffs_um"] - np.nanmean(columns["coeffs_um"], axis=0)
+        if np.isfinite(sag_um).any()
+        else None
+    )
     drawn = [_draw(out / "track.png", columns, change_um, track.residual_adu)]
     with result_recording(out / "track.rrd", "membrane_ctrl_track") as recording:
         recording.log("track/report", rr.TextDocument("\n".join(lines)), static=True)
         at = [rr.TimeColumn("run_time", duration=time_s)]
-        recording.send_columns("track/sag_um", at, rr.Measurements.columns(values=sag_um, variances=sigma_um**2))
+        recording.send_columns(
+            "track/sag_um", at, rr.Measurements.columns(values=sag_um, variances=sigma_um**2)
+        )
         if change_um is not None:
             names = zernike_labels(first=2)
             recording.log("track/terms_um", rr.SeriesLines(names=names), static=True)
-            recording.send_columns("track/terms_um", at, rr.Scalars.columns(scalars=change_um[:, 1:]))
+            recording.send_columns(
+                "track/terms_um", at, rr.Scalars.columns(scalars=change_um[:, 1:])
+            )
         states = [f"{frame.verdict} {frame.reason}".strip() for frame in track.frames]
         for k, (frame, state) in enumerate(zip(track.frames, states, strict=True)):
             if k == 0 or state != states[k - 1]:
@@ -272,18 +317,27 @@ def _show(out: Path, track: Track, lines: Sequence[str]) -> None:
         log_pictures(recording, "track/pictures", drawn)
 
 
-def _draw(path: Path, columns: dict[str, Any], change_um: FloatArray | None, residual_adu: FloatArray) -> Path:
+def _draw(
+    path: Path, columns: dict[str, Any], change_um: FloatArray | None, residual_adu: FloatArray
+) -> Path:
     """Draw the terms over time, the sag with its band, and what the fits left."""
     from membrane_ctrl.measure.pictures import sheet
 
     figure, (terms, sag, left) = sheet(9, 13, 3, 1)
     every = max(1, len(columns["time_s"]) // _SHOWN_FRAMES)
-    time_s, sag_um, sigma_um = (columns[name][::every] for name in ("time_s", "sag_um", "sag_sigma_um"))
+    time_s, sag_um, sigma_um = (
+        columns[name][::every] for name in ("time_s", "sag_um", "sag_sigma_um")
+    )
     if change_um is not None:
         shown = change_um[::every, FIRST_FIGURE_INDEX - 1 :].T
         most = float(np.nanquantile(np.abs(shown), 0.995)) or 1.0
         extent = (time_s[0], time_s[-1] + 1e-9, ZERNIKE_TERMS + 0.5, FIRST_FIGURE_INDEX - 0.5)
-        style: dict[str, Any] = {"cmap": "RdBu_r", "vmin": -most, "vmax": most, "interpolation": "nearest"}
+        style: dict[str, Any] = {
+            "cmap": "RdBu_r",
+            "vmin": -most,
+            "vmax": most,
+            "interpolation": "nearest",
+        }
         bar = terms.imshow(shown, aspect="auto", extent=extent, **style)
         figure.colorbar(bar, ax=terms)
         middle = np.nanmean(sag_um)
@@ -294,5 +348,7 @@ def _draw(path: Path, columns: dict[str, Any], change_um: FloatArray | None, res
     sag.set(xlabel="time (s)", ylabel="µm")
     most = float(np.nanquantile(np.abs(residual_adu), 0.995)) or 1.0
     figure.colorbar(left.imshow(residual_adu, cmap="RdBu_r", vmin=-most, vmax=most), ax=left)
-    left.set(title="mean light that the fits leave (ADU)", xlabel="column of bins", ylabel="row of bins")
+    left.set(
+        title="mean light that the fits leave (ADU)", xlabel="column of bins", ylabel="row of bins"
+    )
     return write_figure(path, figure)

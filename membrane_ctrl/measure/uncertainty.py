@@ -1,4 +1,6 @@
-"""The `uncertainty` command: Monte Carlo over geometry and pixel noise, of a set or of the change between two."""
+"""The `uncertainty` command: Monte Carlo over geometry and pixel noise, of a set or of the change
+between two.
+"""
 
 import json
 import os
@@ -22,10 +24,13 @@ from membrane_ctrl.model import errors, files, program, terminal
 from membrane_ctrl.model.arrays import FloatArray
 from membrane_ctrl.processes.child import results_of
 
-# Runs Monte Carlo trials: in this process, on all cores, or on a Dask cluster: the same numbers to twelve digits.
+# Runs Monte Carlo trials: in this process, on all cores, or on a Dask cluster: the same numbers to
+# twelve digits.
 
-_BATCH = 100  # trials per job: a tenth of a second, so that the bar moves and no worker waits for long
-# A process takes about two seconds to start (imports, compiled loops): less work than this stays in this process.
+# trials per job: a tenth of a second, so that the bar moves and no worker waits for long
+_BATCH = 100
+# A process takes about two seconds to start (imports, compiled loops): less work than this stays in
+# this process.
 _WORTH_PROCESSES = 5000
 
 
@@ -38,11 +43,13 @@ def run_everywhere(
     workers: int | None = None,
     scheduler: str | None = None,
 ) -> FloatArray:
-    """Parameters (trials, sets, parameters) in mm as `monte_carlo.run_trials`, with a progress bar on a terminal.
+    """Parameters (trials, sets, parameters) in mm as `monte_carlo.run_trials`, with a progress bar
+    on a terminal.
 
-    `workers` is the number of processes, by default according to the work; `scheduler` the address of a Dask
-    scheduler to use instead, e.g. tcp://host:8786. Raises InputError if Dask is not installed or the spread is too
-    wide for the fit to converge; DeviceError if the scheduler does not answer.
+    `workers` is the number of processes, by default according to the work; `scheduler` the address
+    of a Dask scheduler to use instead, e.g. tcp://host:8786. Raises InputError if Dask is not
+    installed or the spread is too wide for the fit to converge; DeviceError if the scheduler does
+    not answer.
     """
     batches = [range(first, min(first + _BATCH, trials)) for first in range(0, trials, _BATCH)]
     job = partial(monte_carlo.run_trials, benches, spread, seed)
@@ -74,27 +81,38 @@ class UncertaintyOptions:
 class Spread:
     """Spread of the height of a set, or of its change since another."""
 
-    # (parameters, parameters) each, of the parameters in mm^2: over the trials, from the Jacobian and the noise, from
-    # the noise alone
+    # (parameters, parameters) each, of the parameters in mm^2: over the trials, from the Jacobian
+    # and the noise, from the noise alone
     covariance: FloatArray
     linear: FloatArray
     noise: FloatArray
-    budget: FloatArray  # of the budgets of `measure`: with film, light, blur and the slopes left of each set
+    # of the budgets of `measure`: with film, light, blur and the slopes left of each set
+    budget: FloatArray
 
 
 def uncertainty_command(options: UncertaintyOptions) -> int:
     """Run the trials, write map, table and picture, and report. Raises CommandError."""
     given = None if options.geometry is None else file.read_geometry(options.geometry)
-    figures, folders = Figures(given), [folder for folder in (options.folder, options.against) if folder is not None]
+    figures, folders = (
+        Figures(given),
+        [folder for folder in (options.folder, options.against) if folder is not None],
+    )
     sets = [figures.of(folder) for folder in folders]
     spread, source = spread_file.spread_of(sets[0].head.optics, options.geometry)
     print(f"geometry: {source}", file=sys.stderr)
     benches = [one.bench() for one in sets]
     if len({bench.optics.geometry for bench in benches}) > 1:
-        raise errors.InputError(f"{options.against}: geometry: differs from {options.folder}; a pair needs one bench")
+        raise errors.InputError(
+            f"{options.against}: geometry: differs from {options.folder}; a pair needs one bench"
+        )
     begin = time.perf_counter()
     parameters = run_everywhere(
-        benches, spread, options.seed, options.trials, workers=options.workers, scheduler=options.scheduler
+        benches,
+        spread,
+        options.seed,
+        options.trials,
+        workers=options.workers,
+        scheduler=options.scheduler,
     )
     seconds = time.perf_counter() - begin
     result = _spread(benches, spread, parameters, _budget(folders, given, options.geometry))
@@ -108,8 +126,12 @@ def uncertainty_command(options: UncertaintyOptions) -> int:
     return 0
 
 
-def _budget(folders: Sequence[Path], given: file.GeometryFile | None, geometry: Path | None) -> FloatArray:
-    """Covariance (parameters, parameters), mm^2, of the only set by its budget, or of its change since the second."""
+def _budget(
+    folders: Sequence[Path], given: file.GeometryFile | None, geometry: Path | None
+) -> FloatArray:
+    """Covariance (parameters, parameters), mm^2, of the only set by its budget, or of its change
+    since the second.
+    """
     budgets = []
     for folder in folders:
         measured = measure_set(folder, given)
@@ -118,7 +140,11 @@ def _budget(folders: Sequence[Path], given: file.GeometryFile | None, geometry: 
             raise errors.RejectedError(f"{folder}: rejected: {measured.reason}")
         budgets.append(bars.budget)
     own, *earlier = budgets
-    return own.change_covariance(earlier[0]) if earlier else own.covariance(True) + own.covariance(False)
+    return (
+        own.change_covariance(earlier[0])
+        if earlier
+        else own.covariance(True) + own.covariance(False)
+    )
 
 
 def _spread(
@@ -130,7 +156,12 @@ def _spread(
     """Spread of the only set, or of the first minus the second, trial by trial."""
     own = parameters[:, 0] if len(benches) == 1 else parameters[:, 0] - parameters[:, 1]
     noise = np.sum([monte_carlo.noise_covariance(bench) for bench in benches], axis=0)
-    return Spread(monte_carlo.trial_covariance(own), monte_carlo.linear_covariance(benches, spread), noise, budget)
+    return Spread(
+        monte_carlo.trial_covariance(own),
+        monte_carlo.linear_covariance(benches, spread),
+        noise,
+        budget,
+    )
 
 
 def _table(
@@ -149,7 +180,10 @@ def _table(
         **program.file_origin("membrane-uncertainty/1"),
         "set": str(options.folder),
         "against": None if options.against is None else str(options.against),
-        "verdicts": [{"set": str(one.head.folder), "verdict": one.verdict, "reason": one.reason} for one in sets],
+        "verdicts": [
+            {"set": str(one.head.folder), "verdict": one.verdict, "reason": one.reason}
+            for one in sets
+        ],
         "trials": options.trials,
         "seed": options.seed,
         "geometry": sets[0].head.geometry.table()
@@ -164,28 +198,42 @@ def _table(
 
 
 def _write(
-    out: Path, grid: monte_carlo.HeightMap, result: Spread, height_um: FloatArray, table: dict[str, Any]
+    out: Path,
+    grid: monte_carlo.HeightMap,
+    result: Spread,
+    height_um: FloatArray,
+    table: dict[str, Any],
 ) -> None:
-    from membrane_ctrl.measure.stability_results import draw_uncertainty  # matplotlib takes a second to load
+    from membrane_ctrl.measure.stability_results import (
+        draw_uncertainty,
+    )  # matplotlib takes a second to load
 
     rmse, whole = (grid.picture(1e3 * grid.sigma(c)) for c in (result.covariance, result.budget))
     with errors.writing(out):
         files.make_folder(out)
         write_json(out / "uncertainty.json", table)
-        write_arrays(out / "rmse.npz", x_mm=grid.axis_mm, y_mm=grid.axis_mm, rmse_um=rmse, budget_um=whole)
+        write_arrays(
+            out / "rmse.npz", x_mm=grid.axis_mm, y_mm=grid.axis_mm, rmse_um=rmse, budget_um=whole
+        )
         height = grid.picture(height_um)
-        draw_uncertainty(out / "uncertainty.png", grid.axis_mm, height, rmse, table["against"] is not None)
+        draw_uncertainty(
+            out / "uncertainty.png", grid.axis_mm, height, rmse, table["against"] is not None
+        )
     print(f"written to {out}", file=sys.stderr)
 
 
 def _lines(table: dict[str, Any]) -> list[str]:
     what = "height" if table["against"] is None else "change of height"
     return [
-        f"{what}: mean RMSE {table['rmse_um']['mean']:.4g} µm, largest {table['rmse_um']['max']:.4g} µm "
+        f"{what}: mean RMSE {table['rmse_um']['mean']:.4g} µm, largest "
+        f"{table['rmse_um']['max']:.4g} µm "
         f"({table['trials']} trials, seed {table['seed']})",
-        f"linear      mean {table['linear_um']['mean']:.4g} µm, largest {table['linear_um']['max']:.4g} µm",
-        f"noise alone mean {table['noise_um']['mean']:.4g} µm, largest {table['noise_um']['max']:.4g} µm",
+        f"linear      mean {table['linear_um']['mean']:.4g} µm, largest "
+        f"{table['linear_um']['max']:.4g} µm",
+        f"noise alone mean {table['noise_um']['mean']:.4g} µm, largest "
+        f"{table['noise_um']['max']:.4g} µm",
         f"sag         1 sigma {table['sag_sigma_um']:.4g} µm",
-        f"budget      mean {table['budget_um']['mean']:.4g} µm, largest {table['budget_um']['max']:.4g} µm: "
+        f"budget      mean {table['budget_um']['mean']:.4g} µm, largest "
+        f"{table['budget_um']['max']:.4g} µm: "
         "also film, light, blur and slopes left of each set",
     ]

@@ -1,1 +1,3 @@
-"""Phase-measuring deflectometry: pure numerics from frames to Zernike terms, no I/O and no clock."""
+"""Phase-measuring deflectometry: pure numerics from frames to Zernike terms,
+no I/O and no clock.
+"""

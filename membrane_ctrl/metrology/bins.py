@@ -1,5 +1,5 @@
-"""The sensor as a grid of bins: their rays, the effect of averaging a curved phase over a bin, and cells of bins over
-which what changes slowly over the mirror is a plane."""
+"""The sensor as a grid of bins: their rays, the effect of averaging a curved phase over a bin, and
+cells of bins over which what changes slowly over the mirror is a plane."""
 
 import math
 from dataclasses import dataclass
@@ -15,7 +15,10 @@ from membrane_ctrl.metrology.reconstruct import NormalMatrix, Points, Tracer
 from membrane_ctrl.model.arrays import AnyArray, BoolArray, FloatArray, IntArray, Singles
 
 _SIDE = 4  # bins along a cell's side: planes are 1 % off for the highest terms at the rim
-CELL_BINS, BLOCK_CELLS = _SIDE**2, 64  # a block of cells has 1024 bins: nine rows of them fit the first cache
+CELL_BINS, BLOCK_CELLS = (
+    _SIDE**2,
+    64,
+)  # a block of cells has 1024 bins: nine rows of them fit the first cache
 BLOCK_BINS = CELL_BINS * BLOCK_CELLS
 
 
@@ -41,31 +44,40 @@ class BinGrid:
         self.rays = geometry.rays(self.column_px, self.row_px)
         h = math.sqrt((bin_px**2 - 1) / 6)  # see `averaging_bias_mm`
         offsets = ((h, 0.0), (-h, 0.0), (0.0, h), (0.0, -h)) if bin_px > 1 else ()
-        self._around = [geometry.rays(self.column_px + right, self.row_px + down) for right, down in offsets]
+        self._around = [
+            geometry.rays(self.column_px + right, self.row_px + down) for right, down in offsets
+        ]
 
     def near_mirror(self, radius_mm: float) -> BoolArray:
         """Bins whose ray meets the plane z = 0 within a radius."""
         f = self._geometry.pinhole_mm
         t = -f[2] / self.rays[2]
-        return np.asarray((f[0] + t * self.rays[0]) ** 2 + (f[1] + t * self.rays[1]) ** 2 <= radius_mm**2)
+        return np.asarray(
+            (f[0] + t * self.rays[0]) ** 2 + (f[1] + t * self.rays[1]) ** 2 <= radius_mm**2
+        )
 
     def solid_angle(self, index: IntArray) -> FloatArray:
         """Solid angle of bins: (side / focal length)^2 cos^3 of the angle to the axis."""
         cosine = self._geometry.rotation[2] @ self.rays[:, index]
         return np.asarray((self._bin_px / self._geometry.focal_px) ** 2 * cosine**3)
 
-    def averaging_bias_mm(self, tracer: Tracer, points: Points, surface: Surface, index: IntArray) -> FloatArray:
+    def averaging_bias_mm(
+        self, tracer: Tracer, points: Points, surface: Surface, index: IntArray
+    ) -> FloatArray:
         """Mean of s over a bin's pixels minus s at its centre, (2, n).
 
-        A bin's phase is the mean over its pixels: s + sigma^2 / 2 (s_uu + s_vv), sigma^2 = (m^2 - 1) / 12. That is
-        the mean of the four values at a distance h with h^2 = 2 sigma^2, so four traces of the model give it.
+        A bin's phase is the mean over its pixels: s + sigma^2 / 2 (s_uu + s_vv), sigma^2 = (m^2 -
+        1) / 12. That is the mean of the four values at a distance h with h^2 = 2 sigma^2, so four
+        traces of the model give it.
         """
         centre = tracer.predict_screen(points, surface)
         if not self._around:  # a bin is a pixel
             return np.zeros_like(centre)
         total = np.zeros_like(centre)
         for around in self._around:
-            moved = Points(np.ascontiguousarray(around[:, index]), centre, points.weights, points.t_mm.copy())
+            moved = Points(
+                np.ascontiguousarray(around[:, index]), centre, points.weights, points.t_mm.copy()
+            )
             tracer.intersect(moved, surface, newton=3)
             total += tracer.predict_screen(moved, surface)
         return total / len(self._around) - centre
@@ -84,11 +96,12 @@ def pixel_sigma_adu(noise_adu: float) -> float:
 
 
 def slope_per_screen(geometry: Geometry, radius_mm: float, sag_mm: float) -> FloatArray:
-    """Mean over the mirror of (d g_i / d s_k)^2 in 1/mm^2, (2, 2): rows the slopes x and y, columns s_x and s_y.
+    """Mean over the mirror of (d g_i / d s_k)^2 in 1/mm^2, (2, 2): rows the slopes x and y, columns
+    s_x and s_y.
 
-    The normal is n = u - d with u the unit vector to the screen point, so d n = (e - u (u e)) / |q| d s and
-    g = -n_xy / n_z gives d g = -(d n_xy + g d n_z) / n_z. Taken on a bowl of the given sag, each point towards the
-    screen point that it really reflects (its normal is then the bowl's own).
+    The normal is n = u - d with u the unit vector to the screen point, so d n = (e - u (u e)) / |q|
+    d s and g = -n_xy / n_z gives d g = -(d n_xy + g d n_z) / n_z. Taken on a bowl of the given sag,
+    each point towards the screen point that it really reflects (its normal is then the bowl's own).
     """
     x, y = (a.ravel() for a in np.meshgrid(*[np.linspace(-0.9, 0.9, 15) * radius_mm] * 2))
     inside = np.hypot(x, y) <= 0.95 * radius_mm
@@ -110,18 +123,22 @@ def slope_per_screen(geometry: Geometry, radius_mm: float, sag_mm: float) -> Flo
 
 
 def parameter_covariance(normal: NormalMatrix, slope_variance: FloatArray) -> FloatArray:
-    """Covariance (parameters, parameters) in mm^2 of the fit, for the variance (2,) of an x and of a y slope."""
+    """Covariance (parameters, parameters) in mm^2 of the fit, for the variance (2,) of an x and of
+    a y slope.
+    """
     variance_x, variance_y = slope_variance
-    return np.asarray(normal.inverse @ (variance_x * normal.x + variance_y * normal.y) @ normal.inverse)
+    return np.asarray(
+        normal.inverse @ (variance_x * normal.x + variance_y * normal.y) @ normal.inverse
+    )
 
 
 @dataclass(frozen=True)
 class Cells:
     """Squares of bins, N of them, over each of which what changes slowly is a plane.
 
-    64 cells are a block: their first bins, then their second ones, and so on, so that loops over a block use vector
-    units. A cell with fewer bins repeats one, as the last block repeats a cell; what is repeated counts once, because
-    its weight is 0 (`of`).
+    64 cells are a block: their first bins, then their second ones, and so on, so that loops over a
+    block use vector units. A cell with fewer bins repeats one, as the last block repeats a cell;
+    what is repeated counts once, because its weight is 0 (`of`).
     """
 
     offset: Singles  # (N / 64, 2, 16, 64): of the bins, from the mean of their cell's
@@ -136,7 +153,9 @@ class Cells:
         first = starts[:, None] + np.arange(CELL_BINS) * counted
         more = (0, -len(starts) % BLOCK_CELLS), (0, 0)
         padded = np.pad(first, more, "edge"), np.pad(counted, more)
-        blocks, counted = (each.reshape(-1, BLOCK_CELLS, CELL_BINS).swapaxes(1, 2) for each in padded)
+        blocks, counted = (
+            each.reshape(-1, BLOCK_CELLS, CELL_BINS).swapaxes(1, 2) for each in padded
+        )
         index = index[order][blocks]
         at = np.stack([index % columns, index // columns], axis=1)
         offset = (at - at.mean(axis=2, keepdims=True)).astype(np.float32, order="C")
@@ -151,12 +170,16 @@ class Cells:
         """Of the cells (..., N) of bins (..., n)."""
         lead, blocks = values.shape[:-1], len(self.offset)
         return np.asarray(
-            values.reshape(*lead, blocks, CELL_BINS, BLOCK_CELLS).sum(axis=-2).reshape(*lead, blocks * BLOCK_CELLS)
+            values.reshape(*lead, blocks, CELL_BINS, BLOCK_CELLS)
+            .sum(axis=-2)
+            .reshape(*lead, blocks * BLOCK_CELLS)
         )
 
     def moments(self, values: AnyArray) -> AnyArray:
         """Sums (..., 3, N) of values of bins (..., n) times 1 and their offsets."""
-        return np.stack([self.sums(values), *(self.sums(values * one) for one in self._offsets)], axis=-2)
+        return np.stack(
+            [self.sums(values), *(self.sums(values * one) for one in self._offsets)], axis=-2
+        )
 
     def each(self, values: AnyArray) -> AnyArray:
         """Of the bins (..., n) those of their cells (..., N)."""
@@ -175,21 +198,29 @@ class Cells:
         weights = self.moments(np.stack([np.ones_like(self._offsets[0]), *self._offsets]))
         weights[[1, 2], [1, 2]] += np.float32(1e-3)  # bins in a row
         inverse = np.linalg.inv(weights.transpose(2, 0, 1))
-        return np.asarray(np.einsum("qij,...jq->...iq", inverse, self.moments(values)), np.float32, order="C")
+        return np.asarray(
+            np.einsum("qij,...jq->...iq", inverse, self.moments(values)), np.float32, order="C"
+        )
 
     def blocks(self, *planes: Singles) -> Singles:
         """Planes, each (k, 3, N), block by block (N / 64, sum of k, 3 x 64)."""
         every = np.concatenate(planes).reshape(-1, 3, len(self.offset), BLOCK_CELLS)
-        return np.ascontiguousarray(every.transpose(2, 0, 1, 3)).reshape(len(self.offset), -1, 3 * BLOCK_CELLS)
+        return np.ascontiguousarray(every.transpose(2, 0, 1, 3)).reshape(
+            len(self.offset), -1, 3 * BLOCK_CELLS
+        )
 
 
-# The same for one block, compiled. One small loop a function, and a block's rows in one array: so the compiler can
-# tell that nothing overlaps, and finds vector instructions on any processor. A block's planes fit the second cache.
+# The same for one block, compiled. One small loop a function, and a block's rows in one array: so
+# the compiler can tell that nothing overlaps, and finds vector instructions on any processor. A
+# block's planes fit
+# the second cache.
 
 
 @kernel
 def combine(slow, factors, start, planes):  # type: ignore[no-untyped-def]
-    """Planes (3 x 64) of a block's cells: of level `start`, plus (k, 3 x 64) times their factors (k,)."""
+    """Planes (3 x 64) of a block's cells: of level `start`, plus (k, 3 x 64) times their factors
+    (k,).
+    """
     planes[:BLOCK_CELLS], planes[BLOCK_CELLS:] = start, 0
     for k in range(factors.size):
         for q in range(planes.size):
@@ -212,7 +243,9 @@ def spread(planes, offset, out):  # type: ignore[no-untyped-def]
     for j in range(CELL_BINS):
         for q in range(BLOCK_CELLS):
             out[j, q] = (
-                planes[q] + planes[BLOCK_CELLS + q] * offset[0, j, q] + planes[2 * BLOCK_CELLS + q] * offset[1, j, q]
+                planes[q]
+                + planes[BLOCK_CELLS + q] * offset[0, j, q]
+                + planes[2 * BLOCK_CELLS + q] * offset[1, j, q]
             )
 
 

@@ -1,8 +1,9 @@
-"""The full result of a capture set: frames checked, every pixel's phase and slopes, the fit, and the zonal map.
+"""The full result of a capture set: frames checked, every pixel's phase and slopes, the fit, and
+the zonal map.
 
-Bins come first: they give the fringe orders, a surface, and what each frame should have shown. Frames that do not
-belong are left out, one at a time since one bad frame spoils the prediction of the others, until the rest agree. Then
-every pixel is measured, its period taken from its bin.
+Bins come first: they give the fringe orders, a surface, and what each frame should have shown.
+Frames that do not belong are left out, one at a time since one bad frame spoils the prediction of
+the others, until the rest agree. Then every pixel is measured, its period taken from its bin.
 """
 
 import math
@@ -22,11 +23,14 @@ from membrane_ctrl.model.shape_estimate import RESIDUAL_REJECTED_URAD, Verdict
 
 _ROUNDS = 8
 _MANY_BLAMED = 3
-# Below, the light is called even: it leaves 0.02 µm in the figure, and a blurred set seems to differ by as much.
+# Below, the light is called even: it leaves 0.02 µm in the figure, and a blurred set seems to
+# differ by as much.
 _UNEVEN = 2e-3
-_BLURRED_RAD = 2.0  # from the pattern's edge: a blurred picture of it says nothing of a frame's light
+# from the pattern's edge: a blurred picture of it says nothing of a frame's light
+_BLURRED_RAD = 2.0
 _LIGHT_KNOWN = 3e-4  # what another round would change, once it is not even
-# A point whose phase moved further than this between two sets may have been taken for its neighbour a period away
+# A point whose phase moved further than this between two sets may have been taken for its neighbour
+# a period away
 _GUARD_RAD = 0.9 * math.pi
 _LOST_SHARE = 0.01
 # the ring's plane is crossed this far at most from where the ray meets the film
@@ -55,7 +59,8 @@ class Checked:
     tracer: reconstruct.Tracer  # the bench, with the vertex where the laser saw it
     state: motion.TrackedPoints  # the bins' points with their surface
     flags: tuple[integrity.Flag, ...]  # frames that do not belong
-    film_um: FloatArray  # (n,): of the used sinusoids, x and then y: where the fringes put the film, about its mean
+    # (n,): of the used sinusoids, x and then y: where the fringes put the film, about its mean
+    film_um: FloatArray
     film_noise_um: float  # 1 sigma of each of these places
     light_left: float  # RMS of their light, relative, that the phases do not know of
 
@@ -63,7 +68,10 @@ class Checked:
     def verdict(self) -> tuple[Verdict, str]:
         """Verdict from the frames alone: "ok", or "degraded" with the reason."""
         if self.flags:
-            return "degraded", f"{len(self.flags)} frame(s) flagged; the figure excludes the affected data"
+            return (
+                "degraded",
+                f"{len(self.flags)} frame(s) flagged; the figure excludes the affected data",
+            )
         doubt = bands.doubt(self.stack.gain)
         return ("degraded", doubt) if doubt else ("ok", "")
 
@@ -88,15 +96,25 @@ class RejectedSetError(evidence.NoFigureError):
 def vertex_z_mm(optics: OpticsConfig, displacement_um: float) -> float:
     """Position of the vertex at a displacement: z = -(d - reference)."""
     reference = optics.geometry.reference_displacement_um
-    return 0.0 if reference is None or not math.isfinite(displacement_um) else -(displacement_um - reference) * 1e-3
+    return (
+        0.0
+        if reference is None or not math.isfinite(displacement_um)
+        else -(displacement_um - reference) * 1e-3
+    )
 
 
-def check(stack: frame_stack.FrameStack, optics: OpticsConfig, anchor: Anchor | None = None) -> Checked:
-    """Check the frames and fit the bins. Raises RejectedSetError if the frames do not give a figure.
+def check(
+    stack: frame_stack.FrameStack, optics: OpticsConfig, anchor: Anchor | None = None
+) -> Checked:
+    """Check the frames and fit the bins. Raises RejectedSetError if the frames do not give a
+    figure.
 
-    `anchor` gives a set without Gray code its fringe orders; `camera.bits` of the optics sets saturation.
+    `anchor` gives a set without Gray code its fringe orders; `camera.bits` of the optics sets
+    saturation.
     """
-    stack, binned, _ = bands.without_bands(stack, frame_stack.bin_frames(stack, 2**optics.camera.bits - 1))
+    stack, binned, _ = bands.without_bands(
+        stack, frame_stack.bin_frames(stack, 2**optics.camera.bits - 1)
+    )
     try:
         found = _check(stack, binned, optics, anchor)
     except RejectedSetError as error:
@@ -104,11 +122,14 @@ def check(stack: frame_stack.FrameStack, optics: OpticsConfig, anchor: Anchor | 
         if put_back is None:
             raise RejectedSetError(str(error) + _doubt(stack, error.flags), error.flags) from None
         return put_back
-    return found if _believable_surface(found) else _put_back(stack, binned, optics, anchor) or found
+    return (
+        found if _believable_surface(found) else _put_back(stack, binned, optics, anchor) or found
+    )
 
 
 def _doubt(stack: frame_stack.FrameStack, flags: tuple[integrity.Flag, ...]) -> str:
-    """Where many frames differ from the prediction, the doubt that the prediction, that is the geometry, is wrong.
+    """Where many frames differ from the prediction, the doubt that the prediction, that is the
+    geometry, is wrong.
 
     Pictures that are the same, unreadable or dark need no prediction.
     """
@@ -120,20 +141,31 @@ def _doubt(stack: frame_stack.FrameStack, flags: tuple[integrity.Flag, ...]) -> 
 
 
 def _believable_surface(checked: Checked) -> bool:
-    """Whether the slopes are those of one surface: steps that run backwards agree with every frame, not with it."""
+    """Whether the slopes are those of one surface: steps that run backwards agree with every frame,
+    not with it.
+    """
     field = checked.tracer.slope_field(checked.state.points, checked.state.surface)
-    return 1e6 * float(np.sqrt(np.mean(np.square(field[2:4] - field[4:6])))) <= RESIDUAL_REJECTED_URAD
+    return (
+        1e6 * float(np.sqrt(np.mean(np.square(field[2:4] - field[4:6])))) <= RESIDUAL_REJECTED_URAD
+    )
 
 
 def _put_back(
-    stack: frame_stack.FrameStack, binned: frame_stack.Binned, optics: OpticsConfig, anchor: Anchor | None
+    stack: frame_stack.FrameStack,
+    binned: frame_stack.Binned,
+    optics: OpticsConfig,
+    anchor: Anchor | None,
 ) -> Checked | None:
-    """The set with two sinusoids of an axis exchanged, if one exchange alone makes all frames agree.
+    """The set with two sinusoids of an axis exchanged, if one exchange alone makes all frames
+    agree.
 
-    Three steps that run backwards predict every frame wrongly, so no frame can be blamed for what it shows. The Gray
-    code and the surface decide: of all exchanges only the right one leaves no frame to be flagged.
+    Three steps that run backwards predict every frame wrongly, so no frame can be blamed for what
+    it shows. The Gray code and the surface decide: of all exchanges only the right one leaves no
+    frame to be flagged.
     """
-    if stack.unusable or len(stack.sinusoids(AXES[0])) > 3:  # the good ones of four steps name a swapped pair
+    if (
+        stack.unusable or len(stack.sinusoids(AXES[0])) > 3
+    ):  # the good ones of four steps name a swapped pair
         return None
     found: list[Checked] = []
     for axis in AXES:
@@ -141,7 +173,9 @@ def _put_back(
             order = list(range(len(stack.patterns)))
             order[a], order[b] = b, a
             try:
-                checked = _check(stack.reordered(order), binned.reordered(order), optics, anchor, rounds=2)
+                checked = _check(
+                    stack.reordered(order), binned.reordered(order), optics, anchor, rounds=2
+                )
             except RejectedSetError:
                 continue
             if not checked.flags and _believable_surface(checked):
@@ -152,7 +186,9 @@ def _put_back(
 
 
 def _flag_swapped(frame: int, shown: str, swapped_with: int) -> integrity.Flag:
-    return integrity.Flag(frame, integrity.FrameDefect.SWAPPED, f"swapped with {shown}", math.inf, swapped_with)
+    return integrity.Flag(
+        frame, integrity.FrameDefect.SWAPPED, f"swapped with {shown}", math.inf, swapped_with
+    )
 
 
 def _check(
@@ -162,11 +198,15 @@ def _check(
     anchor: Anchor | None,
     rounds: int = _ROUNDS,
 ) -> Checked:
-    """The set as it is, without frames that do not belong, in a limited number of rounds. Raises RejectedSetError."""
+    """The set as it is, without frames that do not belong, in a limited number of rounds. Raises
+    RejectedSetError.
+    """
     geometry = Geometry.from_config(optics)
     grid = bins.BinGrid(geometry, optics.camera, binned.bin_px)
     near = grid.near_mirror(optics.mirror.analysis_radius_mm + _FILM_BESIDE_PLANE_MM)
-    known = {frame: integrity.flag_unreadable(frame, reason) for frame, reason in stack.unusable.items()}
+    known = {
+        frame: integrity.flag_unreadable(frame, reason) for frame, reason in stack.unusable.items()
+    }
     known |= {flag.frame: flag for flag in integrity.obvious(stack, binned)}
     excluded = set(known)
     flags: list[integrity.Flag] = []
@@ -180,25 +220,52 @@ def _check(
         flags = integrity.inspect(stack, seen, excluded)
         fresh = [flag for flag in flags if flag.frame not in excluded]
         if not fresh:
-            inner = np.all(inside_pattern(attempt.scene.phase_rad, optics.pattern, _BLURRED_RAD), axis=0)
+            inner = np.all(
+                inside_pattern(attempt.scene.phase_rad, optics.pattern, _BLURRED_RAD), axis=0
+            )
             scene = attempt.scene.part(inner) if np.mean(inner) > 1 / 2 else attempt.scene
             flat = attempt.phase_rad.reshape(2, -1)
-            light, film_um, noise_um = evidence.light_and_film(stack, binned, scene, attempt.view.used, flat)
+            light, film_um, noise_um = evidence.light_and_film(
+                stack, binned, scene, attempt.view.used, flat
+            )
             left = light - (1.0 if stack.light is None else stack.light)
-            if np.abs(left).max() > (_UNEVEN if stack.light is None else _LIGHT_KNOWN) and done < rounds:
+            if (
+                np.abs(left).max() > (_UNEVEN if stack.light is None else _LIGHT_KNOWN)
+                and done < rounds
+            ):
                 stack = replace(stack, light=light)  # a round with the light that each frame had
                 continue
-            _confirm_orders(stack, attempt.phase_rad, binned, attempt.view, excluded, _merged(flags, known))
+            _confirm_orders(
+                stack, attempt.phase_rad, binned, attempt.view, excluded, _merged(flags, known)
+            )
             shape = attempt.view.mask.shape
-            fitted = (attempt.view, attempt.phase_rad, near.reshape(shape), attempt.tracer, attempt.state)
-            light_left = float(np.sqrt(np.mean(np.square(left[:, [k for axis in attempt.view.used for k in axis]]))))
-            return Checked(stack, binned, *fitted, _merged(flags, known), film_um, noise_um, light_left)
+            fitted = (
+                attempt.view,
+                attempt.phase_rad,
+                near.reshape(shape),
+                attempt.tracer,
+                attempt.state,
+            )
+            light_left = float(
+                np.sqrt(
+                    np.mean(np.square(left[:, [k for axis in attempt.view.used for k in axis]]))
+                )
+            )
+            return Checked(
+                stack, binned, *fitted, _merged(flags, known), film_um, noise_um, light_left
+            )
         pair = next((flag for flag in fresh if flag.swapped_with is not None), None)
-        if pair is not None and pair.swapped_with is not None and not {pair.frame, pair.swapped_with} & set(known):
+        if (
+            pair is not None
+            and pair.swapped_with is not None
+            and not {pair.frame, pair.swapped_with} & set(known)
+        ):
             order = list(range(len(stack.patterns)))
             order[pair.frame], order[pair.swapped_with] = pair.swapped_with, pair.frame
             stack, binned = stack.reordered(order), binned.reordered(order)
-            known |= {flag.frame: flag for flag in flags if flag.frame in (pair.frame, pair.swapped_with)}
+            known |= {
+                flag.frame: flag for flag in flags if flag.frame in (pair.frame, pair.swapped_with)
+            }
             continue
         # the worst sinusoid alone may spoil the predictions of the others
         chosen = {flag.frame: flag for flag in _of_sinusoids(stack, fresh)[:1] or fresh}
@@ -227,13 +294,19 @@ def _attempt(
     excluded: set[int],
     anchor: Anchor | None,
 ) -> _Attempt:
-    """Fit the bins without the excluded frames. Raises NoFigureError or ValueError if that fails."""
-    tracer = reconstruct.Tracer(geometry, optics.mirror.radius_mm, vertex_z_mm(optics, stack.mean_reading_um))
+    """Fit the bins without the excluded frames. Raises NoFigureError
+    or ValueError if that fails.
+    """
+    tracer = reconstruct.Tracer(
+        geometry, optics.mirror.radius_mm, vertex_z_mm(optics, stack.mean_reading_um)
+    )
     view = evidence.look(stack, binned, excluded, None if anchor is None else anchor.light)
     phase = _absolute(stack, binned, view, anchor, optics)
     candidates = np.flatnonzero(near)
     flat = phase.reshape(2, -1)[:, candidates]
-    state = motion.establish(grid, tracer, candidates, flat, optics.pattern, optics.mirror.analysis_radius_mm)
+    state = motion.establish(
+        grid, tracer, candidates, flat, optics.pattern, optics.mirror.analysis_radius_mm
+    )
     predicted = tracer.predict_screen(state.points, state.surface) / mm_per_rad(optics.pattern)
     light = view.light.reshape(-1)[state.index]
     at = predicted + centre_phase_rad(optics.pattern)
@@ -241,7 +314,9 @@ def _attempt(
     return _Attempt(view, phase, tracer, state, scene)
 
 
-def _of_sinusoids(stack: frame_stack.FrameStack, flags: list[integrity.Flag]) -> list[integrity.Flag]:
+def _of_sinusoids(
+    stack: frame_stack.FrameStack, flags: list[integrity.Flag]
+) -> list[integrity.Flag]:
     return [flag for flag in flags if stack.patterns[flag.frame].role == "sin"]
 
 
@@ -250,9 +325,16 @@ def _believable(stack: frame_stack.FrameStack, flags: list[integrity.Flag]) -> l
     return _of_sinusoids(stack, flags) or flags
 
 
-def _merged(flags: list[integrity.Flag], known: dict[int, integrity.Flag]) -> tuple[integrity.Flag, ...]:
-    """All flags in the order of the frames; the latest inspection takes precedence, earlier findings remain."""
-    named = {**known, **{flag.frame: flag for flag in flags if known.get(flag.frame, flag).swapped_with is None}}
+def _merged(
+    flags: list[integrity.Flag], known: dict[int, integrity.Flag]
+) -> tuple[integrity.Flag, ...]:
+    """All flags in the order of the frames; the latest inspection takes precedence, earlier
+    findings remain.
+    """
+    named = {
+        **known,
+        **{flag.frame: flag for flag in flags if known.get(flag.frame, flag).swapped_with is None},
+    }
     return tuple(named[frame] for frame in sorted(named))
 
 
@@ -270,7 +352,10 @@ def _absolute(
 
 
 def absolute_phases(
-    stack: frame_stack.FrameStack, binned: frame_stack.Binned, view: evidence.BinView, pattern: PatternConfig
+    stack: frame_stack.FrameStack,
+    binned: frame_stack.Binned,
+    view: evidence.BinView,
+    pattern: PatternConfig,
 ) -> FloatArray:
     """Those of a set with Gray code, by that alone."""
     out = np.empty_like(view.phase_rad)
@@ -311,9 +396,13 @@ def _confirm_orders(
         seen = np.isfinite(phase_rad[k])
         phase = phase_rad[k][seen]
         bits = {bit: (binned.means[gray[bit - 1]] > view.light)[seen] for bit in good}
-        explained = [shift for shift in range(-7, 8) if _explains(phase + 2 * math.pi * shift, bits)]
+        explained = [
+            shift for shift in range(-7, 8) if _explains(phase + 2 * math.pi * shift, bits)
+        ]
         if explained != [0]:
-            raise RejectedSetError(f"the {axis} fringe orders are not certain without all Gray frames", flags)
+            raise RejectedSetError(
+                f"the {axis} fringe orders are not certain without all Gray frames", flags
+            )
 
 
 def _explains(phase_rad: FloatArray, bits: dict[int, BoolArray]) -> bool:

@@ -1,9 +1,12 @@
-"""The metrologist's figure of a height map: best sphere, what deviates from it, and the light at its focus.
+"""The metrologist's figure of a height map: best sphere, what deviates from it, and the light at
+its focus.
 
-A deviation is counted along the best sphere's normal, positive on the side of its centre for a concave mirror.
+A deviation is counted along the best sphere's normal, positive on the side of its centre for a
+concave mirror.
 
-Definitions: ISO 10110-5 and ISO 14999-4 for irregularity, its rotationally invariant part and the rest; C. Evans,
-Opt. Eng. 48, 043605 (2009) for PVr. They are applied to the surface, not to a wavefront.
+Definitions: ISO 10110-5 and ISO 14999-4 for irregularity, its rotationally invariant part and the
+rest; C. Evans, Opt. Eng. 48, 043605 (2009) for PVr. They are applied to the surface, not to a
+wavefront.
 """
 
 from collections.abc import Iterator
@@ -76,11 +79,15 @@ class Figure:
 
     numbers: Quantities
     sphere: surface.Sphere
-    deviation_um: FloatArray  # (n, n): from the best sphere, along its normal; NaN where not measured
+    deviation_um: (
+        FloatArray  # (n, n): from the best sphere, along its normal; NaN where not measured
+    )
     rotational_um: FloatArray  # (n, n): its rotationally invariant part
     smooth_um: FloatArray  # (n, n): its fit of 36 Fringe terms, everywhere
     fringe_um: FloatArray  # (37,): Fringe terms of the height, peak 1 on the rim of the aperture
-    spot_mm: FloatArray  # (rays,): distance of the reflected rays from their middle in the best focus
+    spot_mm: (
+        FloatArray  # (rays,): distance of the reflected rays from their middle in the best focus
+    )
 
 
 class FigureOf:
@@ -89,7 +96,8 @@ class FigureOf:
     Parameters
     ----------
     seen : SurfaceMap
-        A surface with at least `LEAST_CELLS`; any other has the same grid and the same measured cells.
+        A surface with at least `LEAST_CELLS`; any other has the same grid and the same measured
+        cells.
     aperture_mm : float
         Radius of the aperture, by which the Fringe terms are counted.
     """
@@ -147,7 +155,9 @@ def _rms(values: FloatArray) -> float:
 
 
 class _Rings:
-    """Rotationally invariant part of values at radii (cells,): the piecewise linear function of r that fits best."""
+    """Rotationally invariant part of values at radii (cells,): the piecewise linear function of r
+    that fits best.
+    """
 
     def __init__(self, r: FloatArray, knots: int) -> None:
         self._knots = knots
@@ -170,11 +180,15 @@ class _Rings:
         return np.asarray((1 - self._share) * knots[self._low] + self._share * knots[self._low + 1])
 
 
-def _spot(sphere: surface.Sphere, points_mm: FloatArray, normals: FloatArray) -> tuple[float, FloatArray]:
-    """Best focus above the origin in mm, and the distances (n,) of the rays from their middle there.
+def _spot(
+    sphere: surface.Sphere, points_mm: FloatArray, normals: FloatArray
+) -> tuple[float, FloatArray]:
+    """Best focus above the origin in mm, and the distances (n,) of the rays from their middle
+    there.
 
-    Rays come along the sphere's normal at the vertex, one for each cell, and are reflected by `normals` (3, n).
-    Across that axis a ray is at A + B f in the plane at f; the best focus makes the sum of squares least.
+    Rays come along the sphere's normal at the vertex, one for each cell, and are reflected by
+    `normals` (3, n). Across that axis a ray is at A + B f in the plane at f; the best focus makes
+    the sum of squares least.
     """
     axis = sphere.normal
     aside = np.cross([0.0, 1.0, 0.0], axis)
@@ -189,9 +203,12 @@ def _spot(sphere: surface.Sphere, points_mm: FloatArray, normals: FloatArray) ->
     return focus_mm, np.hypot(*(start + rate * focus_mm))
 
 
-# Error bars. The fit's parameters have two covariances, from noise and from the geometry; the cells have their own
-# noise besides. Figures of disturbed surfaces differ from the measured one: the RMS of these differences is 1 sigma.
-# It holds also where a quantity is not linear, such as an RMS near zero, which any disturbance raises.
+# Error bars. The fit's parameters have two covariances, from noise and from the geometry; the cells
+# have their own noise besides. Figures of disturbed surfaces differ from the measured one: the RMS
+# of these differences is 1 sigma. It holds also where a quantity is not linear, such as an RMS near
+# zero,
+# which any disturbance
+# raises.
 
 _TRIALS = 32  # 1 sigma to 12 %
 _TRIAL_CELLS = 96  # a side, at least
@@ -228,7 +245,9 @@ def figure_bars(
         1 sigma of the mean slope of a cell by white noise.
     """
     thin = seen.part(max(1, seen.axis_mm.size // _TRIAL_CELLS))
-    if np.count_nonzero(np.isfinite(thin.height_mm)) < LEAST_CELLS:  # a map with few cells, here and there
+    if (
+        np.count_nonzero(np.isfinite(thin.height_mm)) < LEAST_CELLS
+    ):  # a map with few cells, here and there
         thin = seen
     if not np.isfinite(covariance_mm2).all():
         nothing = Quantities(*[np.nan] * len(fields(Quantities)))
@@ -237,7 +256,9 @@ def figure_bars(
     random = np.random.default_rng(1)  # the same set has the same error bars
     values, vectors = np.linalg.eigh(covariance_mm2)
     root = vectors * np.sqrt(np.maximum(values, 0.0))
-    modes = np.stack([surface.Surface.from_parameters(k, disc_mm).on_grid(thin.axis_mm) for k in root.T])
+    modes = np.stack(
+        [surface.Surface.from_parameters(k, disc_mm).on_grid(thin.axis_mm) for k in root.T]
+    )
     nominal = rough(thin)
     squares = np.zeros(len(fields(Quantities)))
     for _ in range(_TRIALS):
@@ -251,11 +272,15 @@ def figure_bars(
 
 
 def _change(nominal: Figure, moved: Figure) -> FloatArray:
-    """Change of all numbers; of an encircled share, the mean over its neighbours, since few rays make it jump."""
+    """Change of all numbers; of an encircled share, the mean over its neighbours, since few rays
+    make it jump.
+    """
     change = np.subtract(astuple(moved.numbers), astuple(nominal.numbers))
     farther = np.sort(moved.spot_mm) - np.sort(nominal.spot_mm)
     for place, share in zip(range(-len(_SHARES), 0), _SHARES, strict=True):
-        change[place] = farther[int((share - _EDGE) * farther.size) : int((share + _EDGE) * farther.size) + 1].mean()
+        change[place] = farther[
+            int((share - _EDGE) * farther.size) : int((share + _EDGE) * farther.size) + 1
+        ].mean()
     return np.asarray(change)
 
 
@@ -273,7 +298,9 @@ def _white(
     slopes = random.normal(0, cell_slope, (2, _TILE, _TILE))
     spectrum = np.fft.fft2(slopes)
     fast = square > (np.pi * zonal.FIT_CYCLES / aperture_mm) ** 2
-    height = np.where(fast, -1j * (k_x * spectrum[0] + k_y * spectrum[1]) / np.where(fast, square, 1.0), 0)
+    height = np.where(
+        fast, -1j * (k_x * spectrum[0] + k_y * spectrum[1]) / np.where(fast, square, 1.0), 0
+    )
     tiles = np.stack([np.fft.ifft2(height).real, *slopes])
     for _ in range(_WHITE_TRIALS):
         down, right = np.arange(seen.axis_mm.size) + random.integers(_TILE, size=(2, 1))
@@ -282,7 +309,9 @@ def _white(
 
 @dataclass(frozen=True)
 class PowerSpectrum:
-    """Power spectral density of a deviation, mean over the directions; its sum over the plane is the mean square."""
+    """Power spectral density of a deviation, mean over the directions; its sum over the plane is
+    the mean square.
+    """
 
     frequency_per_mm: FloatArray  # (m,)
     density_um2_mm2: FloatArray  # (m,)
@@ -300,7 +329,9 @@ def power_spectrum(found: Figure, axis_mm: FloatArray, aperture_mm: float) -> Po
     values = np.where(np.isfinite(found.deviation_um), found.deviation_um, found.smooth_um)
     values = window * (values - np.sum(window * values) / np.sum(window))
     density = np.abs(np.fft.rfft2(values)) ** 2 * step**2 / np.sum(window**2)
-    f = np.hypot(*np.meshgrid(np.fft.rfftfreq(axis_mm.size, step), np.fft.fftfreq(axis_mm.size, step)))
+    f = np.hypot(
+        *np.meshgrid(np.fft.rfftfreq(axis_mm.size, step), np.fft.fftfreq(axis_mm.size, step))
+    )
     width = 1 / (2 * aperture_mm)
     ring = np.round(f / width).astype(np.int64).ravel()
     count = np.bincount(ring)

@@ -1,13 +1,15 @@
-"""The film's material from figures at several pressures: pre-strain, Poisson ratio, stiffness, and the ring's form.
+"""The film's material from figures at several pressures: pre-strain, Poisson ratio, stiffness, and
+the ring's form.
 
-Each figure gives its rotationally symmetric numbers: with 36 terms Noll 4, 11, 22 and the excess. The law
-(`film_law`) predicts them from the pre-strain, the Poisson ratio and the set's own load q; the gauge says q = p a /
-(E t). Terms with azimuthal order 1 to 3 belong to the ring: a pre-strain that varies, a ring that is not flat or not
-round.
+Each figure gives its rotationally symmetric numbers: with 36 terms Noll 4, 11, 22 and the excess.
+The law (`film_law`) predicts them from the pre-strain, the Poisson ratio and the set's own load q;
+the gauge says q = p a / (E t). Terms with azimuthal order 1 to 3 belong to the ring: a pre-strain
+that varies, a ring that is not flat or not round.
 
-No film obeys a law exactly. Its misfit is a random figure of unknown size that stays, or grows with a power of the
-sag; both are taken from what the law leaves, here and in the terms that it says nothing about, and all results are
-averaged over what the figures allow. So a wrong law widens the error bars instead of moving the numbers.
+No film obeys a law exactly. Its misfit is a random figure of unknown size that stays, or grows with
+a power of the sag; both are taken from what the law leaves, here and in the terms that it says
+nothing about, and all results are averaged over what the figures allow. So a wrong law widens the
+error bars instead of moving the numbers.
 """
 
 from collections.abc import Callable, Sequence
@@ -23,19 +25,29 @@ from membrane_ctrl.metrology.optics.surface import PARAMETERS
 from membrane_ctrl.model.arrays import FloatArray, IntArray
 from membrane_ctrl.model.zernike_terms import ZERNIKE_DEGREE, ZERNIKE_TERMS
 
-# What is known without the sets: films are stretched by some 0.1 %, and a polymer's Poisson ratio is 0.25 to 0.45
+# What is known without the sets: films are stretched by some 0.1 %, and a polymer's Poisson ratio
+# is 0.25 to 0.45
 PRESTRAIN_SIGMA, POISSON, POISSON_SIGMA = 3e-3, 0.35, 0.1
 _RING_SIGMAS: dict[HarmonicCause, float] = {"prestrain": 1e-3, "flat": 1.0, "round": 2.0}  # mm
-_ROUND = np.array([*(j - 2 for j in film_law.ROUND_NOLL[1:]), PARAMETERS - 1])  # places among a figure's parameters
-_FREEDOM = np.append(np.ones(_ROUND.size - 1), 0.1)  # of a misfit: the excess has a tenth of a term's
-# Of the misfit that differs between the sets: what does not follow the sag, and what does but is another figure
+_ROUND = np.array(
+    [*(j - 2 for j in film_law.ROUND_NOLL[1:]), PARAMETERS - 1]
+)  # places among a figure's parameters
+_FREEDOM = np.append(
+    np.ones(_ROUND.size - 1), 0.1
+)  # of a misfit: the excess has a tenth of a term's
+# Of the misfit that differs between the sets: what does not follow the sag, and what does but is
+# another figure
 _DIFFERS, _UNRELATED = 0.1, 0.5
 _LEAST_MM = 2e-4  # no film is trusted to follow the law more closely
-_TIMES_SEEN = np.logspace(0, 2.5, 12)  # sizes of the common misfit: never below that of the terms without a law
-# Powers of the sag with which a misfit grows: a ring's figure stays, what a law leaves of large strains grows by 3
+_TIMES_SEEN = np.logspace(
+    0, 2.5, 12
+)  # sizes of the common misfit: never below that of the terms without a law
+# Powers of the sag with which a misfit grows: a ring's figure stays, what a law leaves of large
+# strains grows by 3
 _GROWTHS = np.array([0.0, 1.0, 2.0, 3.0, 4.0, 6.0])
 _NEGLECTED = 0.005  # what Hooke's law misses of a film, of sag^3 / radius^2: 1 µm at 37 mm
-_UNLIKE = 1.0  # misfit over that of the terms without a law: natural logarithm, of a Cauchy distribution
+# misfit over that of the terms without a law: natural logarithm, of a Cauchy distribution
+_UNLIKE = 1.0
 _SURE = 4.0  # sigmas
 _NODES = _ITERATIONS = 40
 
@@ -47,7 +59,8 @@ class FilmFigure:
     name: str
     parameters_mm: FloatArray  # (parameters,), as of `Surface.parameters`
     noise_mm2: FloatArray  # (parameters, parameters): covariance from the pixels' noise
-    geometry_mm: FloatArray  # (parameters, k): change with each independent error of the geometry by its sigma
+    # (parameters, k): change with each independent error of the geometry by its sigma
+    geometry_mm: FloatArray
     pressure_pa: float  # NaN without a gauge
     sag_mm: float
 
@@ -82,7 +95,8 @@ class FilmFit:
 
     law: FilmLaw  # its stiffness is meaningless without pressures
     covariance: FloatArray  # (3, 3): of pre-strain, Poisson ratio, relative stiffness
-    left_mm: FloatArray  # (n, parameters): what it leaves; 0 where it says nothing (tilt, orders above 3)
+    # (n, parameters): what it leaves; 0 where it says nothing (tilt, orders above 3)
+    left_mm: FloatArray
     waves: tuple[RingWave, ...]
     misfit_um: float  # 1 sigma of a term
 
@@ -92,13 +106,17 @@ class FilmFit:
         return np.asarray(np.sqrt(np.diag(self.covariance)))
 
 
-def fit_film(figures: Sequence[FilmFigure], radius_mm: float, analysis_mm: float, gauge: Gauge) -> FilmFit:
+def fit_film(
+    figures: Sequence[FilmFigure], radius_mm: float, analysis_mm: float, gauge: Gauge
+) -> FilmFit:
     """Fit the law to the figures of one film.
 
     Raises ValueError if there are fewer than two figures, or no film of the law is like them.
     """
     if len(figures) < 2:
-        raise ValueError("one set cannot tell pre-strain from Poisson ratio: two or more pressures are needed")
+        raise ValueError(
+            "one set cannot tell pre-strain from Poisson ratio: two or more pressures are needed"
+        )
     reach = analysis_mm / radius_mm
     seen_mm = _seen_mm(figures)
     unknowns, covariance, size_mm = _fit_round(figures, radius_mm, reach, gauge, seen_mm)
@@ -115,20 +133,28 @@ def fit_film(figures: Sequence[FilmFigure], radius_mm: float, analysis_mm: float
 
 
 def _seen_mm(figures: Sequence[FilmFigure]) -> float:
-    """Size of a term that no law of this module has, from those with azimuthal orders of 4 and more."""
+    """Size of a term that no law of this module has, from those with azimuthal orders of 4 and
+    more.
+    """
     others = np.concatenate([_terms(order).ravel() for order in range(4, ZERNIKE_DEGREE + 1)])
-    squares = [each.parameters_mm[others] ** 2 - np.diag(each.noise_mm2)[others] for each in figures]
+    squares = [
+        each.parameters_mm[others] ** 2 - np.diag(each.noise_mm2)[others] for each in figures
+    ]
     return float(np.sqrt(max(np.mean(squares), _LEAST_MM**2)))
 
 
 def round_terms_mm(bowls: Bowl, reach: float) -> FloatArray:
-    """The round terms and the excess (n, k) that a fit of slopes inside `reach` radii finds in bowls (n, 1)."""
+    """The round terms and the excess (n, k) that a fit of slopes inside `reach` radii finds in
+    bowls (n, 1).
+    """
     rho, weight, onto = _round_projection(reach)
     return np.asarray(bowls.rise_mm(rho) * weight @ onto.T)
 
 
 def _finite_terms_mm(law: FilmLaw, bowls: Bowl, reach: float) -> FloatArray:
-    """What finite slopes add to `round_terms_mm`: a hundredth, which hardly changes with the law's numbers."""
+    """What finite slopes add to `round_terms_mm`: a hundredth, which hardly changes with the law's
+    numbers.
+    """
     rho, weight, onto = _round_projection(reach)
     rises = [film_law.finite_rise_mm(law, float(load), rho) for load in bowls.load.ravel()]
     return np.asarray((rises - bowls.rise_mm(rho)) * weight @ onto.T)
@@ -140,8 +166,16 @@ def _round_projection(reach: float) -> tuple[FloatArray, FloatArray, FloatArray]
     rho, weight = _radii(reach)
     x = 2 * rho**2 - 1
     round_degrees = [*enumerate(np.eye(film_law.EXCESS_DEGREE))][1:]
-    slopes = [np.sqrt(2 * k + 1) * 4 * rho * legendre.legval(x, legendre.legder(unit)) for k, unit in round_degrees]
-    excess = 2 * rho * polynomial.polyval(rho**2, polynomial.polyder(film_law.excess())) / film_law.excess_rms()
+    slopes = [
+        np.sqrt(2 * k + 1) * 4 * rho * legendre.legval(x, legendre.legder(unit))
+        for k, unit in round_degrees
+    ]
+    excess = (
+        2
+        * rho
+        * polynomial.polyval(rho**2, polynomial.polyder(film_law.excess()))
+        / film_law.excess_rms()
+    )
     return rho, weight, np.asarray(np.linalg.pinv((np.stack([*slopes, excess]) * weight).T))
 
 
@@ -173,38 +207,61 @@ def _fit_round(
         return np.append((round_terms_mm(bent(x)[1], reach) + finite).ravel(), x[3:][gauged] + x[2])
 
     offset = gauge.offset_pa / pressure[gauged]
-    of_gauge = np.outer(offset, offset) + gauge.scale**2 + np.diag((gauge.noise_pa / pressure[gauged]) ** 2)
+    of_gauge = (
+        np.outer(offset, offset)
+        + gauge.scale**2
+        + np.diag((gauge.noise_pa / pressure[gauged]) ** 2)
+    )
     shared = _shared(figures, _ROUND)
     noise = np.zeros((len(data) + len(log_q),) * 2)
     noise[: len(data), : len(data)], noise[len(data) :, len(data) :] = shared, of_gauge
     misfits = np.zeros((_GROWTHS.size, *noise.shape))
-    misfits[:, : len(data), : len(data)] = [np.kron(part, np.diag(_FREEDOM**2)) for part in _alike(figures)]
+    misfits[:, : len(data), : len(data)] = [
+        np.kron(part, np.diag(_FREEDOM**2)) for part in _alike(figures)
+    ]
     known = np.append([0.0, POISSON, 12.0], np.zeros(count))
     precision = np.append([PRESTRAIN_SIGMA**-2, POISSON_SIGMA**-2, 1e-4], np.full(count, 1e-6))
-    start = FilmLaw(0.0, POISSON, 1.0, radius_mm).with_sag(np.array([each.sag_mm for each in figures]))
+    start = FilmLaw(0.0, POISSON, 1.0, radius_mm).with_sag(
+        np.array([each.sag_mm for each in figures])
+    )
     x = np.append([0.0, POISSON, 12.0], np.log(start.load))
-    x[2], target = float(np.mean(log_q - x[3:][gauged])) if gauged.any() else x[2], np.append(data, log_q)
+    x[2], target = (
+        float(np.mean(log_q - x[3:][gauged])) if gauged.any() else x[2],
+        np.append(data, log_q),
+    )
     far = True
     for _ in range(_ITERATIONS):
         finite[:] = _finite_terms_mm(*bent(x), reach)
         slopes, rest = _slopes(predict, x), target - predict(x)
-        tried = _averaged(slopes, rest, noise, misfits[-far:], known - x, precision, seen_mm)  # far: one will do
+        tried = _averaged(
+            slopes, rest, noise, misfits[-far:], known - x, precision, seen_mm
+        )  # far: one will do
         step = tried.mean * _inside(x, tried.mean)
         x = x + step
         near = np.all(np.abs(step[:3]) < 0.05 * np.sqrt(np.diag(tried.covariance)[:3]))
         if near and not far:
             return x, tried.covariance[:3, :3], tried.size_mm
         far = far and not near
-    raise ValueError("no film of the law is like these figures: they are of different films, or of a wrong geometry")
+    raise ValueError(
+        "no film of the law is like these figures: they are of different films, or of a "
+        "wrong geometry"
+    )
 
 
 def _inside(x: FloatArray, step: FloatArray) -> float:
-    """The part of a step that stays among films: Poisson ratio in 0 .. 0.5, loads by less than a factor of two."""
-    scale = min(1.0, 0.5 / max(float(np.max(np.abs(step[3:]))), 1e-9), 2e-3 / max(abs(float(step[0])), 1e-9))
+    """The part of a step that stays among films: Poisson ratio in 0 .. 0.5, loads by less than a
+    factor of two.
+    """
+    scale = min(
+        1.0, 0.5 / max(float(np.max(np.abs(step[3:]))), 1e-9), 2e-3 / max(abs(float(step[0])), 1e-9)
+    )
     while not 0 <= x[1] + scale * step[1] <= 0.5:
         scale /= 2
         if scale < 1e-4:
-            raise ValueError("the figures ask for a Poisson ratio outside 0 .. 0.5: the geometry or the law is wrong")
+            raise ValueError(
+                "the figures ask for a Poisson ratio outside 0 .. 0.5: the geometry or the "
+                "law is wrong"
+            )
     return scale
 
 
@@ -218,7 +275,9 @@ def _slopes(predict: Callable[[FloatArray], FloatArray], x: FloatArray) -> Float
 
 
 def _shared(figures: Sequence[FilmFigure], terms: IntArray) -> FloatArray:
-    """Covariance of some terms of all sets: each its noise, the geometry's error the same for all."""
+    """Covariance of some terms of all sets: each its noise,
+    the geometry's error the same for all.
+    """
     errors = np.vstack([each.geometry_mm[terms] for each in figures])
     out = errors @ errors.T
     for k, each in enumerate(figures):
@@ -228,12 +287,16 @@ def _shared(figures: Sequence[FilmFigure], terms: IntArray) -> FloatArray:
 
 
 def _alike(figures: Sequence[FilmFigure]) -> FloatArray:
-    """Covariance (growths, n, n) over the sets of a misfit of size 1 that grows with these powers of the sag."""
+    """Covariance (growths, n, n) over the sets of a misfit of size 1 that grows with these powers
+    of the sag.
+    """
     sags = np.array([each.sag_mm for each in figures])
     deeper = sags / sags.mean()
     grows, off = deeper[:, None] ** _GROWTHS, deeper - 1
     differs = _UNRELATED**2 * np.outer(off, off) + _DIFFERS**2 * np.var(deeper) * np.eye(sags.size)
-    return np.asarray(np.einsum("ig,jg->gij", grows, grows) + np.multiply.outer(_GROWTHS**2, differs))
+    return np.asarray(
+        np.einsum("ig,jg->gij", grows, grows) + np.multiply.outer(_GROWTHS**2, differs)
+    )
 
 
 @dataclass(frozen=True)
@@ -247,12 +310,19 @@ class _Solved:
 
 
 def _solved(
-    design: FloatArray, residual: FloatArray, noise: FloatArray, known: FloatArray, precision: FloatArray
+    design: FloatArray,
+    residual: FloatArray,
+    noise: FloatArray,
+    known: FloatArray,
+    precision: FloatArray,
 ) -> _Solved:
     """Least squares; `known` with its `precision` is the prior."""
     root = np.linalg.cholesky(noise)
     a, b = np.linalg.solve(root, design), np.linalg.solve(root, residual)
-    rows, right = np.vstack([a, np.diag(np.sqrt(precision))]), np.append(b, np.sqrt(precision) * known)
+    rows, right = (
+        np.vstack([a, np.diag(np.sqrt(precision))]),
+        np.append(b, np.sqrt(precision) * known),
+    )
     scale = np.sqrt(np.sum(rows**2, axis=0))
     q, r = np.linalg.qr(rows / scale)
     inverse = np.linalg.solve(r, np.eye(scale.size)) / scale[:, None]
@@ -271,7 +341,9 @@ def _averaged(
     precision: FloatArray,
     seen_mm: float,
 ) -> _Solved:
-    """The unknowns averaged over the misfit's size, about `seen_mm`, and over the ways in which it grows."""
+    """The unknowns averaged over the misfit's size, about `seen_mm`, and over the ways in which it
+    grows.
+    """
     found, logs, sizes = [], [], []
     for size in seen_mm * _TIMES_SEEN:
         for misfit in misfits:
@@ -289,7 +361,9 @@ def _averaged(
 
 
 def _terms(order: int) -> IntArray:
-    """Places among the parameters of the cosine and the sine terms of an azimuthal order, without tilt, (2, 3)."""
+    """Places among the parameters of the cosine and the sine terms of an azimuthal order, without
+    tilt, (2, 3).
+    """
     found: dict[int, list[int]] = {0: [], 1: []}
     j = 1
     for n in range(ZERNIKE_DEGREE + 1):
@@ -309,9 +383,13 @@ def _fit_ring(
     waves = []
     alike = _alike(figures)
     for order in (1, 2, 3):
-        causes: list[HarmonicCause] = ["prestrain", "flat", "round"] if order > 1 else ["prestrain", "round"]
+        causes: list[HarmonicCause] = (
+            ["prestrain", "flat", "round"] if order > 1 else ["prestrain", "round"]
+        )
         terms = _terms(order)
-        response = np.stack([_wave_terms_mm(bowls, order, cause, reach) for cause in causes], axis=-1)
+        response = np.stack(
+            [_wave_terms_mm(bowls, order, cause, reach) for cause in causes], axis=-1
+        )
         design = response.reshape(-1, len(causes))
         precision = np.array([_RING_SIGMAS[cause] ** -2 for cause in causes])
         found = []
@@ -319,7 +397,9 @@ def _fit_ring(
             data = np.array([each.parameters_mm[terms[parity]] for each in figures]).ravel()
             noise = _shared(figures, terms[parity]) + 1e-14 * np.eye(data.size)
             spread = np.stack([np.kron(part, np.eye(terms.shape[1])) for part in alike])
-            allowed = _averaged(design, data, noise, spread, np.zeros(len(causes)), precision, seen_mm)
+            allowed = _averaged(
+                design, data, noise, spread, np.zeros(len(causes)), precision, seen_mm
+            )
             found.append(allowed)
             added[:, terms[parity]] = (response @ allowed.mean).reshape(len(figures), -1)
         for k, cause in enumerate(causes):
@@ -330,7 +410,9 @@ def _fit_ring(
 
 
 def _wave_terms_mm(bowls: Bowl, order: int, cause: HarmonicCause, reach: float) -> FloatArray:
-    """Zernike terms (n, 3) of one unit of a ring's wave, as a fit of slopes inside `reach` finds them."""
+    """Zernike terms (n, 3) of one unit of a ring's wave, as a fit of slopes inside `reach` finds
+    them.
+    """
     from scipy.special import eval_jacobi
 
     rho, weight = _radii(reach)
@@ -342,7 +424,8 @@ def _wave_terms_mm(bowls: Bowl, order: int, cause: HarmonicCause, reach: float) 
 
     terms = []
     for n in range(order, ZERNIKE_DEGREE + 1, 2):
-        # R_n^m / rho^m is the Jacobi polynomial P_k^(0, m)(2 v - 1), here by Legendre's least squares (exact)
+        # R_n^m / rho^m is the Jacobi polynomial P_k^(0, m)(2 v - 1), here by Legendre's least
+        # squares (exact)
         jacobi = eval_jacobi((n - order) // 2, 0, order, 2 * rho**2 - 1)
         radial = legendre.Legendre.fit(rho**2, jacobi, ZERNIKE_DEGREE // 2, domain=[0, 1])
         terms.append(np.sqrt(2 * (n + 1)) * slopes(radial))

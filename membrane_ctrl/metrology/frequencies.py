@@ -1,8 +1,10 @@
-"""Sets of several fringe periods: the coarser fringes give the orders of the finest, whose phase is measured.
+"""Sets of several fringe periods: the coarser fringes give the orders of the finest, whose phase is
+measured.
 
-The periods may have any ratio. Each bin votes for the place on the screen that explains all its phases
-(`phase.places_mm`), and continuity of the finest phase decides (`orders.by_votes`). What follows measures the finest
-fringes like any set that refers to a full one, so that its noise is theirs.
+The periods may have any ratio. Each bin votes for the place on the screen that explains all its
+phases (`phase.places_mm`), and continuity of the finest phase decides (`orders.by_votes`). What
+follows measures the finest fringes like any set that refers to a full one, so that its noise is
+theirs.
 """
 
 from collections.abc import Collection, Iterator
@@ -19,7 +21,8 @@ from membrane_ctrl.metrology.frames.integrity import Flag, FrameDefect
 from membrane_ctrl.metrology.frames.series_integrity import CLOSURE_SHARE, CLOSURE_TIMES, GAIN
 from membrane_ctrl.model.arrays import BoolArray, FloatArray
 
-# 1 sigma of a phase, noise and harmonics together: the largest with which most bins know their place
+# 1 sigma of a phase, noise and harmonics together: the largest with which most bins know their
+# place
 _SIGMAS_RAD = (0.2, 0.1, 0.05, 0.02)
 _MOST = 0.5
 _LEAST_KNOWN = 0.02  # of the bins with fringes: fewer places are chance
@@ -41,7 +44,9 @@ class _Series:
         return np.asarray(phase.phasors(self.seen, self.shifts_rad))
 
     def share(self) -> float:
-        """What a sinusoid leaves of the frames, over its amplitude; NaN for three steps, which always agree."""
+        """What a sinusoid leaves of the frames, over its amplitude; NaN for three steps, which
+        always agree.
+        """
         return (
             self._over_amplitude(integrity.closure(self.seen, self.shifts_rad).rms_adu)
             if len(self.frames) > 3
@@ -52,7 +57,9 @@ class _Series:
         return rms_adu / max(float(np.median(np.abs(self.phasor))), 1e-9)
 
     def blamed(self, place_mm: FloatArray) -> integrity.Closure:
-        """The closure that can name a frame: of five steps, or with the phase by the other periods' place."""
+        """The closure that can name a frame: of five steps, or with the phase by the other periods'
+        place.
+        """
         if len(self.frames) > 4:
             return integrity.closure(self.seen, self.shifts_rad)
         known = np.isfinite(place_mm)
@@ -61,7 +68,9 @@ class _Series:
 
 
 def check_frequencies(stack: FrameStack, optics: OpticsConfig) -> Checked:
-    """Check a set of several periods, the finest first, and fit its bins. Raises RejectedSetError."""
+    """Check a set of several periods, the finest first, and fit its bins.
+    Raises RejectedSetError.
+    """
     binned, flags = bin_frames(stack, 2**optics.camera.bits - 1), dict[int, Flag]()
     finest = [k for k, pattern in enumerate(stack.patterns) if not pattern.period_mm]
     count = len(finest)
@@ -76,7 +85,9 @@ def check_frequencies(stack: FrameStack, optics: OpticsConfig) -> Checked:
             break
         flags[bad.frame] = bad
     named = tuple(flags[k] for k in sorted(flags))
-    absolute = np.stack([_absolute(series, axis, places[axis], optics, mask, named) for axis in range(2)])
+    absolute = np.stack(
+        [_absolute(series, axis, places[axis], optics, mask, named) for axis in range(2)]
+    )
     light = binned.means[finest].mean(axis=0).astype(float)
     fine = FrameStack(
         stack.frames[:count],
@@ -100,19 +111,29 @@ def _fringes(stack: FrameStack, binned: Binned) -> BoolArray:
             shifts = stack.shifts_rad(frames)
             swings.append(np.abs(phase.phasors(binned.means[frames], shifts)))
     swing = np.median(swings, axis=0)
-    return np.asarray((swing > phase.CONTRAST_SHARE * np.percentile(swing, 95)) & ~binned.saturated.any(axis=0))
+    return np.asarray(
+        (swing > phase.CONTRAST_SHARE * np.percentile(swing, 95)) & ~binned.saturated.any(axis=0)
+    )
 
 
 def _steps(stack: FrameStack, axis: str, period_mm: float, left_out: Collection[int]) -> list[int]:
     return [
-        k for k, p in enumerate(stack.patterns) if (p.axis, p.period_mm) == (axis, period_mm) and k not in left_out
+        k
+        for k, p in enumerate(stack.patterns)
+        if (p.axis, p.period_mm) == (axis, period_mm) and k not in left_out
     ]
 
 
 def _all_series(
-    stack: FrameStack, binned: Binned, optics: OpticsConfig, mask: BoolArray, left_out: Collection[int]
+    stack: FrameStack,
+    binned: Binned,
+    optics: OpticsConfig,
+    mask: BoolArray,
+    left_out: Collection[int],
 ) -> Iterator[_Series]:
-    """All series, without the frames left out. Raises RejectedSetError if too few steps remain of one."""
+    """All series, without the frames left out. Raises RejectedSetError if too few steps remain of
+    one.
+    """
     for k, axis in enumerate(phase.AXES):
         for period in sorted({pattern.period_mm for pattern in stack.patterns}):
             frames = _steps(stack, axis, period, left_out)
@@ -120,7 +141,10 @@ def _all_series(
             try:
                 phase.step_weights(shifts)
             except ValueError:
-                said = f"{len(frames)} {axis} phase steps of {period_mm:g} mm are usable: too few for a phase"
+                said = (
+                    f"{len(frames)} {axis} phase steps of {period_mm:g} mm are usable: too few "
+                    "for a phase"
+                )
                 named = tuple(Flag(n, FrameDefect.LEFT_OUT, "left out", np.inf) for n in left_out)
                 raise RejectedSetError(said, named) from None
             yield _Series(k, period_mm, frames, shifts, binned.means[frames][:, mask].astype(float))
@@ -130,7 +154,10 @@ def _places(series: list[_Series], axis: int, optics: OpticsConfig) -> FloatArra
     """Places (bins,) from the pattern's low edge; NaN where the periods do not tell."""
     own = [one for one in series if one.axis == axis]
     wrapped = np.stack([np.angle(one.phasor) + np.pi for one in own])
-    periods_mm, side_mm = [one.period_mm for one in own], optics.pattern.periods * optics.pattern.period_mm
+    periods_mm, side_mm = (
+        [one.period_mm for one in own],
+        optics.pattern.periods * optics.pattern.period_mm,
+    )
     found = []
     for sigma_rad in _SIGMAS_RAD:
         found.append(phase.places_mm(wrapped, periods_mm, (0.0, side_mm), sigma_rad).place_mm)
@@ -140,19 +167,28 @@ def _places(series: list[_Series], axis: int, optics: OpticsConfig) -> FloatArra
 
 
 def _bad_frame(stack: FrameStack, series: list[_Series], places: list[FloatArray]) -> Flag | None:
-    """The frame of the coarser periods that disagrees most, if one does. `check` judges the finest."""
+    """The frame of the coarser periods that disagrees most, if one does.
+    `check` judges the finest.
+    """
     shares = [one.share() for one in series]
     found = []
     for k, one in enumerate(series):
         others = [share for j, share in enumerate(shares) if j != k and np.isfinite(share)]
-        limit = max(CLOSURE_SHARE, CLOSURE_TIMES * float(np.median(others))) if others else CLOSURE_SHARE
+        limit = (
+            max(CLOSURE_SHARE, CLOSURE_TIMES * float(np.median(others)))
+            if others
+            else CLOSURE_SHARE
+        )
         if not stack.patterns[one.frames[0]].period_mm or not shares[k] > limit:
             continue
         if not np.isfinite(places[one.axis]).any():
             continue
         blamed = one.blamed(places[one.axis])
         if blamed.suspect is not None and blamed.gain > GAIN:
-            said = f"does not agree with the other steps: {shares[k]:.0%} of the fringes' amplitude is left"
+            said = (
+                f"does not agree with the other steps: {shares[k]:.0%} of the fringes' amplitude "
+                "is left"
+            )
             frame = one.frames[blamed.suspect]
             found.append(Flag(frame, FrameDefect.INCONSISTENT, said, shares[k] / limit))
     return max(found, key=lambda flag: flag.severity, default=None)
@@ -166,7 +202,9 @@ def _absolute(
     mask: BoolArray,
     flags: tuple[Flag, ...],
 ) -> FloatArray:
-    """Absolute phase (rows, columns) of the finest fringes; NaN where not known. Raises RejectedSetError."""
+    """Absolute phase (rows, columns) of the finest fringes; NaN where not known. Raises
+    RejectedSetError.
+    """
     finest = next(one for one in series if one.axis == axis)
     wrapped, coded = np.full((2, *mask.shape), np.nan)
     wrapped[mask] = np.angle(finest.phasor)

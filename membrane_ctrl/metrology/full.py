@@ -1,4 +1,6 @@
-"""The full result of a checked set: slopes at every pixel, robust fit, and the zonal map of the residual."""
+"""The full result of a checked set: slopes at every pixel, robust fit, and the zonal map of the
+residual.
+"""
 
 import math
 from dataclasses import dataclass, replace
@@ -16,13 +18,16 @@ from membrane_ctrl.model.arrays import FloatArray, IntArray, Singles
 from membrane_ctrl.model.shape_estimate import Quality
 
 LASER_NOISE_UM = 1.0  # repeatability of the bench's laser
-_STILL_UM = 0.2  # standard deviation of the film's place: less is hardly seen, and leaves 0.06 µm in the figure
-# motion from x to y over its RMS among the frames of an axis: 3.3 for a random walk, 7.2 for a drift, of four steps
+# standard deviation of the film's place: less is hardly seen, and leaves 0.06 µm in the figure
+_STILL_UM = 0.2
+# motion from x to y over its RMS among the frames of an axis: 3.3 for a random walk, 7.2 for a
+# drift, of four steps
 X_TO_Y = 5.0
 _START_SAG_MM = 40.0  # the paper's starting parabola
 # Solutions from different starts agree to a hundredth of the last change: 1e-9 mm
 _LAST_CHANGE_MM = 1e-7
-# Tukey's weight reaches 0 here: noise (5 sigma in millions of pixels) keeps its weight, dust and glints have none
+# Tukey's weight reaches 0 here: noise (5 sigma in millions of pixels) keeps its weight, dust and
+# glints have none
 _TUKEY_SIGMAS = 8.0
 _PART = 1 << 18  # pixels worked on at a time where memory would grow with them
 # A slope this far off is not the film's but a wrong fringe order (4.3 mrad) or a glint
@@ -41,7 +46,9 @@ class FullResult:
     # (n,): residual of the frames after the sinusoids: noise, motion, the display's harmonics
     rest_adu: Singles
     grid: zonal.ResidualGrid  # mean slope residuals in cells
-    residual_mm: FloatArray  # (m, m): height over the fit, 0 at the vertex; NaN where nothing was measured
+    residual_mm: (
+        FloatArray  # (m, m): height over the fit, 0 at the vertex; NaN where nothing was measured
+    )
     quality: Quality  # for the verdict
     moved: bool  # whether the film's motion was corrected
 
@@ -50,26 +57,41 @@ class FullResult:
         """The fitted surface."""
         return self.fit.surface
 
-    def slope_variance(self, optics: OpticsConfig, shifts_rad: list[FloatArray], noise_adu: float) -> FloatArray:
-        """(2,) variance of an x and of a y slope of one pixel, from the noise of a pixel in a frame."""
+    def slope_variance(
+        self, optics: OpticsConfig, shifts_rad: list[FloatArray], noise_adu: float
+    ) -> FloatArray:
+        """(2,) variance of an x and of a y slope of one pixel, from the noise of a pixel in a
+        frame.
+        """
         swing = self.quality.modulation_share * (2**optics.camera.bits - 1)
-        sigma_mm = [phase.mm_per_rad(optics.pattern) * phase.phase_sigma_rad(d, noise_adu, swing) for d in shifts_rad]
-        gain = bins.slope_per_screen(Geometry.from_config(optics), self.surface.radius_mm, self.surface.sag_mm)
+        sigma_mm = [
+            phase.mm_per_rad(optics.pattern) * phase.phase_sigma_rad(d, noise_adu, swing)
+            for d in shifts_rad
+        ]
+        gain = bins.slope_per_screen(
+            Geometry.from_config(optics), self.surface.radius_mm, self.surface.sag_mm
+        )
         return np.asarray(gain @ np.square(sigma_mm))
 
     def height_mm(self) -> FloatArray:
-        """Height above the vertex (m, m) on `grid.axis_mm`: the fit plus its residual; NaN where not measured."""
+        """Height above the vertex (m, m) on `grid.axis_mm`: the fit plus its residual; NaN where
+        not measured.
+        """
         return np.asarray(self.surface.on_grid(self.grid.axis_mm)[0] + self.residual_mm)
 
     def map(self) -> SurfaceMap:
         """The height with the slopes that were measured, as means over the cells."""
         height, slope_x, slope_y = self.surface.on_grid(self.grid.axis_mm)
         grid = self.grid
-        return SurfaceMap(grid.axis_mm, height + self.residual_mm, slope_x + grid.slope_x, slope_y + grid.slope_y)
+        return SurfaceMap(
+            grid.axis_mm, height + self.residual_mm, slope_x + grid.slope_x, slope_y + grid.slope_y
+        )
 
 
 def motion_share(within_um: float, noise_um: float) -> float:
-    """Share of what a laser tells of the motion from x to y that is motion, if it is so large within an axis."""
+    """Share of what a laser tells of the motion from x to y that is motion, if it is so large
+    within an axis.
+    """
     return (X_TO_Y * within_um) ** 2 / ((X_TO_Y * within_um) ** 2 + noise_um**2)
 
 
@@ -77,32 +99,46 @@ def motion_share(within_um: float, noise_um: float) -> float:
 class FilmMotion:
     """The film during a set, as laser and fringes tell it."""
 
-    told_um: tuple[FloatArray, FloatArray]  # at the used sinusoids of x and of y, about the mean of both
-    x_to_y_sigma_um: float  # 1 sigma of the difference between the means of x and of y; NaN without a laser
+    told_um: tuple[
+        FloatArray, FloatArray
+    ]  # at the used sinusoids of x and of y, about the mean of both
+    x_to_y_sigma_um: (
+        float  # 1 sigma of the difference between the means of x and of y; NaN without a laser
+    )
     noise_um: float  # 1 sigma of the fringes' part in each of these places
 
     @classmethod
     def of(cls, checked: Checked) -> "FilmMotion":
         """Of a checked set.
 
-        The fringes see the motion from frame to frame of one axis, to a tenth of a micrometre, where the laser's
-        noise is one. Of a difference between the axes they make a figure: there the laser counts, as far as a film
-        that moves so much from frame to frame moves from one axis to the other. What the fringes tell is in part
+        The fringes see the motion from frame to frame of one axis, to a tenth of a micrometre,
+        where the laser's noise is one. Of a difference between the axes they make a figure: there
+        the laser counts, as far as a film that moves so much from frame to frame moves from one
+        axis to the other. What the fringes tell is in part
         noise: only what their scatter has beyond it is motion.
         """
         x, y = checked.view.used
         seen = [axis - axis.mean() for axis in np.split(checked.film_um, [len(x)])]
         within_um2 = float(np.var(np.concatenate(seen)))
-        noise_um2 = checked.film_noise_um**2 * (1 - 2 / (len(x) + len(y)))  # the means of both axes are taken off
+        noise_um2 = checked.film_noise_um**2 * (
+            1 - 2 / (len(x) + len(y))
+        )  # the means of both axes are taken off
         moving = max(1 - noise_um2 / max(within_um2, 1e-12), 0.0)
-        readings_um, laser_um = checked.stack.displacement_um, LASER_NOISE_UM * math.sqrt(1 / len(x) + 1 / len(y))
+        readings_um, laser_um = (
+            checked.stack.displacement_um,
+            LASER_NOISE_UM * math.sqrt(1 / len(x) + 1 / len(y)),
+        )
         x_to_y_um = float(readings_um[x].mean() - readings_um[y].mean())
-        least, most = (motion_share(math.sqrt(part * within_um2), laser_um) for part in (moving, 1.0))
+        least, most = (
+            motion_share(math.sqrt(part * within_um2), laser_um) for part in (moving, 1.0)
+        )
         # noise may hide a motion, which the laser tells by itself where it is beyond 2 sigma
         share = float(np.clip(1 - (2 * laser_um) ** 2 / max(x_to_y_um**2, 1e-12), least, most))
         # the figure is that of all readings' mean, also where a frame is left out
         about_um = readings_um[[*x, *y]].mean() - checked.stack.mean_reading_um
-        parts = np.nan_to_num(about_um + share * x_to_y_um * np.array([len(y), -len(x)]) / (len(x) + len(y)))
+        parts = np.nan_to_num(
+            about_um + share * x_to_y_um * np.array([len(y), -len(x)]) / (len(x) + len(y))
+        )
         told_um = (moving * seen[0] + parts[0], moving * seen[1] + parts[1])
         sigma_um = math.hypot(math.sqrt(most) * laser_um, (most - share) * x_to_y_um)
         return cls(told_um, sigma_um, checked.film_noise_um)
@@ -130,7 +166,9 @@ class PixelPoints:
 
 
 def measure_pixels(optics: OpticsConfig, checked: Checked) -> PixelPoints:
-    """Phases of all pixels in bins that have one, corrected for the film's motion between the frames."""
+    """Phases of all pixels in bins that have one, corrected for the film's motion between the
+    frames.
+    """
     stack = checked.stack
     bin_px, columns = checked.binned.bin_px, checked.phase_rad.shape[2]
     known = np.isfinite(checked.phase_rad).all(axis=0) & checked.near
@@ -145,17 +183,30 @@ def measure_pixels(optics: OpticsConfig, checked: Checked) -> PixelPoints:
     film = FilmMotion.of(checked)
     moved, sensitivity = film.worth_correcting, np.zeros((2, index.size))
     if moved:
-        sensitivity = motion.sensitivity_mm_per_um(tracer, points, surface) / phase.mm_per_rad(optics.pattern)
+        sensitivity = motion.sensitivity_mm_per_um(tracer, points, surface) / phase.mm_per_rad(
+            optics.pattern
+        )
     told_um = film.told_um if moved else (None, None)
-    axes = [_axis_phases(optics, checked, k, index, in_bin, sensitivity[k], told_um[k]) for k in range(2)]
+    axes = [
+        _axis_phases(optics, checked, k, index, in_bin, sensitivity[k], told_um[k])
+        for k in range(2)
+    ]
     points.screen_mm[:] = phase.screen_mm(np.stack([a.phase_rad for a in axes]), optics.pattern)
     swing = np.minimum(axes[0].swing_adu, axes[1].swing_adu)
     x, y = tracer.position_mm(points)
-    keep = (x**2 + y**2 <= optics.mirror.analysis_radius_mm**2) & ~(axes[0].saturated | axes[1].saturated)
+    keep = (x**2 + y**2 <= optics.mirror.analysis_radius_mm**2) & ~(
+        axes[0].saturated | axes[1].saturated
+    )
     keep &= swing > phase.FRINGE_SHARE * checked.view.light.reshape(-1)[in_bin]
     rest = np.hypot(axes[0].rest_adu, axes[1].rest_adu)[keep]
     index, swing = index[keep], swing[keep]
-    del axes, x, y, in_bin, sensitivity  # the copies of the points follow, the most memory of a measurement
+    del (
+        axes,
+        x,
+        y,
+        in_bin,
+        sensitivity,
+    )  # the copies of the points follow, the most memory of a measurement
     return PixelPoints(index, points.subset(keep), swing, rest, moved)
 
 
@@ -185,12 +236,22 @@ def _axis_phases(
     reference = checked.phase_rad[axis].reshape(-1)[in_bin]
     gain = None if stack.gain is None else stack.gain[used]
     return pixel_phases(
-        frames, stack.design(used), combined, index, sensitivity, reference, 2**optics.camera.bits - 1, gain
+        frames,
+        stack.design(used),
+        combined,
+        index,
+        sensitivity,
+        reference,
+        2**optics.camera.bits - 1,
+        gain,
     )
 
 
 def reconstruct_full(
-    optics: OpticsConfig, checked: Checked, pixels: PixelPoints, start: reconstruct.HeightFunction | None = None
+    optics: OpticsConfig,
+    checked: Checked,
+    pixels: PixelPoints,
+    start: reconstruct.HeightFunction | None = None,
 ) -> FullResult:
     """Fit the pixels and integrate the residual.
 
@@ -209,7 +270,9 @@ def reconstruct_full(
     )
     tracer.intersect(points, fit.surface)
     field, left = _slopes_left(tracer, points, fit.surface)
-    grid = zonal.residual_grid(field, (left < _NO_SLOPE).astype(float), optics.mirror.analysis_radius_mm)
+    grid = zonal.residual_grid(
+        field, (left < _NO_SLOPE).astype(float), optics.mirror.analysis_radius_mm
+    )
     return FullResult(
         fit=replace(fit, changes_mm=(*rough.changes_mm, *fit.changes_mm)),
         index=pixels.index,
@@ -226,19 +289,26 @@ def reconstruct_full(
 def _slopes_left(
     tracer: reconstruct.Tracer, points: reconstruct.Points, surface: Surface
 ) -> tuple[FloatArray, FloatArray]:
-    """Slopes (6, n) of `Tracer.slope_field`, and how far (n,) the measured ones are from the surface's."""
+    """Slopes (6, n) of `Tracer.slope_field`, and how far (n,) the measured ones are from the
+    surface's.
+    """
     field = tracer.slope_field(points, surface)
     return field, np.hypot(field[2] - field[4], field[3] - field[5])
 
 
 def tukey(residual: FloatArray) -> FloatArray:
-    """Tukey's weights (1 - (r / c)^2)^2, with c in robust sigmas (median of a Rayleigh distribution: 1.177 sigma)."""
-    # every 7th gives the median of millions well enough; the floor is the rounding of a noise-free set
+    """Tukey's weights (1 - (r / c)^2)^2, with c in robust sigmas (median of a Rayleigh
+    distribution: 1.177 sigma).
+    """
+    # every 7th gives the median of millions well enough; the floor is the rounding of a noise-free
+    # set
     reach = _TUKEY_SIGMAS * max(float(np.median(residual[::7])) / 1.177, 1e-9)
     return np.asarray(np.square(np.maximum(1 - np.square(residual / reach), 0.0)))
 
 
-def _quality(optics: OpticsConfig, checked: Checked, fit: reconstruct.Fit, swing_adu: float) -> Quality:
+def _quality(
+    optics: OpticsConfig, checked: Checked, fit: reconstruct.Fit, swing_adu: float
+) -> Quality:
     area = math.pi * optics.mirror.analysis_radius_mm**2
     used = [k for axis in checked.view.used for k in axis]
     saturated = checked.binned.saturated[used].any(axis=0) & checked.near
@@ -252,8 +322,8 @@ def _quality(optics: OpticsConfig, checked: Checked, fit: reconstruct.Fit, swing
     )
 
 
-# The figure of a checked set from its bins, for the analysis of many sets: for Zernike terms the bins carry as much
-# as the pixels, at a sixteenth of the cost (decision 41).
+# The figure of a checked set from its bins, for the analysis of many sets: for Zernike terms the
+# bins carry as much as the pixels, at a sixteenth of the cost (decision 41).
 
 
 @dataclass(frozen=True)
@@ -274,7 +344,8 @@ def bin_figure(optics: OpticsConfig, checked: Checked, film: FilmMotion | None =
     told_um = film.told_um if film.worth_correcting else (None, None)
     steps = [_combination(checked, axis, told) for axis, told in enumerate(told_um)]
     followed = np.empty_like(state.accepted)
-    # the loop takes any numbers: here means over the bins, hence a bin side of 1 in the combinations
+    # the loop takes any numbers: here means over the bins, hence a bin side of 1 in the
+    # combinations
     phasor.track(sums, state.index, steps, state.sensitivity_rad_per_um, state.accepted, followed)
     scale = phase.mm_per_rad(optics.pattern)
     points = state.points.subset(np.ones(state.index.size, bool))
@@ -284,12 +355,16 @@ def bin_figure(optics: OpticsConfig, checked: Checked, film: FilmMotion | None =
     swing = followed[:, 4]
     noise = bins.pixel_sigma_adu(optics.camera.noise_adu) / checked.binned.bin_px
     shifts = [stack.shifts_rad(used) for used in checked.view.used]
-    sigma = np.stack([phase.phase_sigma_rad(d, noise, 1.0) / b for d, b in zip(shifts, swing, strict=True)])
+    sigma = np.stack(
+        [phase.phase_sigma_rad(d, noise, 1.0) / b for d, b in zip(shifts, swing, strict=True)]
+    )
     quality = _quality(optics, checked, fit, float(np.median(swing.min(axis=0))))
     return BinFigure(fit, points, state.index, scale * sigma, quality)
 
 
-def _combination(checked: Checked, axis: int, motion_um: FloatArray | None) -> phasor.StepCombination:
+def _combination(
+    checked: Checked, axis: int, motion_um: FloatArray | None
+) -> phasor.StepCombination:
     """How the means of the usable frames of an axis combine, whose film moved so."""
     used = checked.view.used[axis]
     shifts = checked.stack.shifts_rad(used)

@@ -1,8 +1,10 @@
-"""The live cycle: frames in memory to the figure with its covariance, the last cycle's solution as the start.
+"""The live cycle: frames in memory to the figure with its covariance, the last cycle's solution as
+the start.
 
-A full cycle finds the fringe orders and the points that see the pattern. A fringes-only cycle follows each point's
-phase from the last accepted one, which is unambiguous while no phase moved by half a period (4.34 mrad of slope),
-and needs one or two Gauss-Newton steps with the normal matrix of the full cycle.
+A full cycle finds the fringe orders and the points that see the pattern. A fringes-only cycle
+follows each point's phase from the last accepted one, which is unambiguous while no phase moved by
+half a period (4.34 mrad of slope), and needs one or two Gauss-Newton steps with the normal matrix
+of the full cycle.
 """
 
 import math
@@ -21,12 +23,14 @@ from membrane_ctrl.model.arrays import AnyArray, ArrayLike, BoolArray, FloatArra
 from membrane_ctrl.model.shape_estimate import Kind, Quality, ShapeEstimate, judge
 from membrane_ctrl.model.zernike_terms import ZERNIKE_TERMS
 
-# Beyond this change of phase a point may have been taken for its neighbour a period away. 0.9 of half a period, so
-# that a field which passes half a period anywhere shows points in the band before it.
+# Beyond this change of phase a point may have been taken for its neighbour a period away. 0.9 of
+# half a period, so that a field which passes half a period anywhere shows points in the band before
+# it.
 GUARD_RAD = 0.9 * math.pi
 LOST_SHARE = 0.002  # more points than dust and glints beyond the guard
-# A film that changes its shape moves as many phases up as down. If all of them move one way, the mount was knocked,
-# perhaps by a whole period: phase alone cannot tell a tilt of 7 mrad from one of -1.7.
+# A film that changes its shape moves as many phases up as down. If all of them move one way, the
+# mount was knocked, perhaps by a whole period: phase alone cannot tell a tilt of 7 mrad from one of
+# -1.7.
 TILT_GUARD_RAD = 0.3 * math.pi
 NOTHING_TO_FOLLOW = "tracking lost: no accepted full cycle to follow"
 # With this share of its points the full cycle's normal matrix still contracts a hundredfold a step.
@@ -46,14 +50,16 @@ class LiveReconstructor:
     bin_px : int
         Side of the bins whose phasors are used.
     laser_noise_um : float
-        Noise of one displacement as given (an average over an exposure has less than a sample); motion is corrected
-        only if it is clearly above this.
+        Noise of one displacement as given (an average over an exposure has less than a sample);
+        motion is corrected only if it is clearly above this.
     shifts_rad : (N,) or (2, N) array, optional
         Phase steps, of x and y if they differ; equal ones if not given.
     spread : GeometrySpread, optional
-        How well the geometry is known; with it the first full cycle computes `common_covariance_um2`.
+        How well the geometry is known; with it the first full cycle computes
+        `common_covariance_um2`.
 
-    Raises ValueError if the phase steps do not determine a phase, or are not the pattern's in number.
+    Raises ValueError if the phase steps do not determine a phase, or are not the pattern's in
+    number.
     """
 
     def __init__(
@@ -69,7 +75,11 @@ class LiveReconstructor:
         self._geometry = geometry.Geometry.from_config(optics)
         self._bin_px = bin_px
         self._laser_noise_um = laser_noise_um
-        given = phase.equal_shifts(optics.pattern.steps) if shifts_rad is None else np.asarray(shifts_rad, float)
+        given = (
+            phase.equal_shifts(optics.pattern.steps)
+            if shifts_rad is None
+            else np.asarray(shifts_rad, float)
+        )
         self._shifts_rad = np.broadcast_to(given, (2, optics.pattern.steps))
         self._weights = [phase.step_weights(shifts) for shifts in self._shifts_rad]
         self._slots = phase.FullSlots(optics.pattern.steps)
@@ -80,7 +90,9 @@ class LiveReconstructor:
         size = (optics.camera.height_px, optics.camera.width_px)
         self._binner = phasor.Binner(*size, bin_px, self._full_scale_adu, self._slots.count)
         self._grid = bins.BinGrid(self._geometry, optics.camera, bin_px)
-        self._near = np.flatnonzero(self._grid.near_mirror(optics.mirror.analysis_radius_mm + _FILM_BESIDE_PLANE_MM))
+        self._near = np.flatnonzero(
+            self._grid.near_mirror(optics.mirror.analysis_radius_mm + _FILM_BESIDE_PLANE_MM)
+        )
         self._reference_um = optics.geometry.reference_displacement_um
         self._mm_per_rad = phase.mm_per_rad(optics.pattern)
         self._pixel_sigma_adu = bins.pixel_sigma_adu(optics.camera.noise_adu)
@@ -88,7 +100,9 @@ class LiveReconstructor:
         bench = (optics, self._grid, self._binner.saturated.shape, bin_px)
         self._watch = live_errors.ErrorWatch(*bench, self._shifts_rad, laser_noise_um, spread)
 
-    def full(self, frames: Sequence[Image], time_s: ArrayLike, displacement_um: ArrayLike) -> ShapeEstimate:
+    def full(
+        self, frames: Sequence[Image], time_s: ArrayLike, displacement_um: ArrayLike
+    ) -> ShapeEstimate:
         """One full cycle. Raises ValueError for a wrong number, size or type of frames.
 
         Parameters
@@ -118,18 +132,25 @@ class LiveReconstructor:
         self._tracked = None  # until this cycle is accepted
         tracer, analysis_mm = self._tracer(readings), optics.mirror.analysis_radius_mm
         try:
-            state = motion.establish(self._grid, tracer, self._near, phase_rad, optics.pattern, analysis_mm)
+            state = motion.establish(
+                self._grid, tracer, self._near, phase_rad, optics.pattern, analysis_mm
+            )
         except ValueError as error:
             return rejected("full", times, readings, str(error))
         self._watch.begin(state)
         return self._follow("full", state, times, readings)
 
-    def fringes(self, frames: Sequence[Image], time_s: ArrayLike, displacement_um: ArrayLike) -> ShapeEstimate:
-        """One fringes-only cycle of 2 N frames, in the order of `phase.fringe_sequence`; else as `full`.
+    def fringes(
+        self, frames: Sequence[Image], time_s: ArrayLike, displacement_um: ArrayLike
+    ) -> ShapeEstimate:
+        """One fringes-only cycle of 2 N frames, in the order of `phase.fringe_sequence`; else as
+        `full`.
 
         An estimate with `tracking_lost` asks for a full cycle.
         """
-        times, readings = _per_frame(frames, time_s, displacement_um, 2 * self._slots.steps, "fringes")
+        times, readings = _per_frame(
+            frames, time_s, displacement_um, 2 * self._slots.steps, "fringes"
+        )
         if self._tracked is None:
             return rejected("fringes", times, readings, NOTHING_TO_FOLLOW, tracking_lost=True)
         self._binner.clear()
@@ -144,20 +165,25 @@ class LiveReconstructor:
     def height_map(
         self, coeffs_um: FloatArray, hencky_um: float, n: int = 256
     ) -> tuple[FloatArray, FloatArray, FloatArray]:
-        """A figure as a picture: x_mm (n,), y_mm (n,), h_mm (n, n) with rows along y; NaN outside the analysis."""
+        """A figure as a picture: x_mm (n,), y_mm (n,), h_mm (n, n) with rows along y; NaN outside
+        the analysis.
+        """
         mirror = self._optics.mirror
         axis = np.linspace(-mirror.radius_mm, mirror.radius_mm, n)
         x, y = np.meshgrid(axis, axis)
-        h = surface.Surface(np.asarray(coeffs_um) / 1e3, hencky_um / 1e3, mirror.radius_mm).height(x, y)
+        h = surface.Surface(np.asarray(coeffs_um) / 1e3, hencky_um / 1e3, mirror.radius_mm).height(
+            x, y
+        )
         h[x**2 + y**2 > mirror.analysis_radius_mm**2] = np.nan
         return axis, axis.copy(), h
 
     @property
     def common_covariance_um2(self) -> FloatArray:
-        """Covariance (terms, terms) of the coefficients that all cycles share: geometry, lens, screen, air, blur.
+        """Covariance (terms, terms) of the coefficients that all cycles share: geometry, lens,
+        screen, air, blur.
 
-        Add it to a cycle's own for a single figure, not for changes. NaN before the first full cycle and without a
-        spread.
+        Add it to a cycle's own for a single figure, not for changes. NaN before the first full
+        cycle and without a spread.
         """
         to_coeffs = surface.parameter_to_coeffs()
         return np.asarray(1e6 * to_coeffs @ self._watch.common_mm2 @ to_coeffs.T)
@@ -199,29 +225,42 @@ class LiveReconstructor:
         )
         estimate = self._estimate(kind, fit, errors, quality, times, readings)
         if estimate.verdict == "rejected":
-            self._tracer(readings).start(state.points, state.surface.height)  # back onto the last good surface
+            self._tracer(readings).start(
+                state.points, state.surface.height
+            )  # back onto the last good surface
         else:
             state.accept(fit.surface, usable)
             self._tracked = state
         return estimate
 
     def _take_bands(self, known: FloatArray) -> None:
-        """Take bands of the backlight out of the sums; fringes-only cycles have those of the full one."""
+        """Take bands of the backlight out of the sums; fringes-only cycles have those of the full
+        one.
+        """
         slots = np.r_[self._slots.sinusoids]
         means = (self._binner.sums[slots] / self._bin_px**2).astype(np.float32)
-        binned = Binned(self._bin_px, means, np.broadcast_to(self._binner.saturated > 0, means.shape))
-        none = np.empty((len(slots), self._optics.camera.height_px, 0), np.uint8)  # the bins are enough
+        binned = Binned(
+            self._bin_px, means, np.broadcast_to(self._binner.saturated > 0, means.shape)
+        )
+        none = np.empty(
+            (len(slots), self._optics.camera.height_px, 0), np.uint8
+        )  # the bins are enough
         stack = FrameStack(none, self._patterns, np.full(len(slots), math.nan), {})
         stack, binned, found = bands.without_bands(stack, binned, known)
         self._bands_rad, self._doubt = found if not known.size else known, bands.doubt(stack.gain)
         if known.size and not found.size:
-            self._doubt = "bands of the backlight could not be told from what else changed in this cycle"
+            self._doubt = (
+                "bands of the backlight could not be told from what else changed in this cycle"
+            )
         elif found.size:
             self._binner.sums[slots] = np.rint(binned.means * self._bin_px**2)
 
     def _sums(self) -> list[AnyArray]:
         """Bin sums (N, bins) of the sinusoids of x and of y."""
-        return [self._binner.sums[slots].reshape(self._slots.steps, -1) for slots in self._slots.sinusoids]
+        return [
+            self._binner.sums[slots].reshape(self._slots.steps, -1)
+            for slots in self._slots.sinusoids
+        ]
 
     def _track_phases(self, state: motion.TrackedPoints, readings: FloatArray) -> None:
         """Fresh phases from the bin sums, corrected for the film's motion between the frames."""
@@ -230,11 +269,26 @@ class LiveReconstructor:
         combined = []
         for axis in range(2):
             part = None if motion_um is None else motion_um[axis]
-            combined.append(motion.combine_steps(self._weights[axis], self._shifts_rad[axis], self._bin_px, part))
-        phasor.track(self._sums(), state.index, combined, state.sensitivity_rad_per_um, state.accepted, state.fresh)
+            combined.append(
+                motion.combine_steps(
+                    self._weights[axis], self._shifts_rad[axis], self._bin_px, part
+                )
+            )
+        phasor.track(
+            self._sums(),
+            state.index,
+            combined,
+            state.sensitivity_rad_per_um,
+            state.accepted,
+            state.fresh,
+        )
 
-    def _fit(self, state: motion.TrackedPoints, usable: BoolArray, readings: FloatArray) -> reconstruct.Fit:
-        """One or two steps from the last surface; the full cycle's normal matrix while its points are there."""
+    def _fit(
+        self, state: motion.TrackedPoints, usable: BoolArray, readings: FloatArray
+    ) -> reconstruct.Fit:
+        """One or two steps from the last surface; the full cycle's normal matrix while its points
+        are there.
+        """
         state.points.weights[:] = usable
         np.multiply(state.fresh[:, 0], self._mm_per_rad, out=state.points.screen_mm)
         state.points.screen_mm -= state.offset_mm
@@ -253,7 +307,10 @@ class LiveReconstructor:
     ) -> ShapeEstimate:
         """The result in micrometres, with its covariance and verdict."""
         modulation_adu = quality.modulation_share * self._full_scale_adu
-        sigmas_rad = [phase.phase_sigma_rad(d, self._pixel_sigma_adu, modulation_adu) for d in self._shifts_rad]
+        sigmas_rad = [
+            phase.phase_sigma_rad(d, self._pixel_sigma_adu, modulation_adu)
+            for d in self._shifts_rad
+        ]
         noise_rad2 = np.square(sigmas_rad) / self._bin_px**2
         # slopes that changed by more than noise: one error for each point that was asked
         changed_rad2 = np.maximum(errors.changed_rad2 - _SURELY * 2 * noise_rad2, 0.0)
@@ -288,11 +345,15 @@ class LiveReconstructor:
 def _per_frame(
     frames: Sequence[Image], time_s: ArrayLike, displacement_um: ArrayLike, count: int, kind: Kind
 ) -> tuple[FloatArray, FloatArray]:
-    """Times and readings as arrays. Raises ValueError unless there is one of each for each of `count` frames."""
+    """Times and readings as arrays. Raises ValueError unless there is one of each for each of
+    `count` frames.
+    """
     times, readings = np.asarray(time_s, float), np.asarray(displacement_um, float)
     if not len(frames) == times.size == readings.size == count:
         found = f"{len(frames)} frames, {times.size} times and {readings.size} displacements"
-        raise ValueError(f"a {kind} cycle has {count} frames with a time and a displacement each; got {found}")
+        raise ValueError(
+            f"a {kind} cycle has {count} frames with a time and a displacement each; got {found}"
+        )
     return times, readings
 
 
@@ -301,7 +362,9 @@ def _lost(change_rad: FloatArray, usable: BoolArray) -> str:
     seen = max(1, int(np.count_nonzero(usable)))
     beyond = int(np.count_nonzero(usable & (np.abs(change_rad).max(axis=0) > GUARD_RAD)))
     if beyond > LOST_SHARE * seen:
-        return f"tracking lost: the phase moved by half a period at {beyond / seen:.1%} of the points"
+        return (
+            f"tracking lost: the phase moved by half a period at {beyond / seen:.1%} of the points"
+        )
     if np.abs(np.median(change_rad[:, ::16], axis=1)).max() > TILT_GUARD_RAD:
         return "tracking lost: the whole mirror tilted"
     return ""

@@ -1,16 +1,17 @@
 """Correction of the phase for the film's known motion between the frames.
 
-A point's phase at displacement d is phi + q (d - d0), with q = d phi / d d known from the model (a Hencky bowl whose
-sag grows by one micrometre while the ring stays). Frame k then shows A + Re(z exp(i d_k) exp(i q e_k)) with
-e_k = d(t_k) - d0, where z = B exp(i phi) and d_k is the phase step. With the complex weights
-w_k = cosine_k + i sine_k of the phase steps (sum w = 0, sum w cos d_k = 1, sum w sin d_k = -i) the estimate is
+A point's phase at displacement d is phi + q (d - d0), with q = d phi / d d known from the model (a
+Hencky bowl whose sag grows by one micrometre while the ring stays). Frame k then shows A + Re(z
+exp(i d_k) exp(i q e_k)) with e_k = d(t_k) - d0, where z = B exp(i phi) and d_k is the phase step.
+With the complex weights w_k = cosine_k + i sine_k of the phase steps (sum w = 0, sum w cos d_k = 1,
+sum w sin d_k = -i) the estimate is
 
     z' = T z + M conj z,   T = 1 + i q turn - q^2 turn_2 / 2,   M = -i q mirror - q^2 mirror_2 / 2,
     turn_n = 1/2 sum w_k e_k^n exp(i d_k),   mirror_n = 1/2 sum w_k e_k^n exp(-i d_k),
 
-to second order, so z = (conj T z' - M conj z') / (|T|^2 - |M|^2). A constant e gives turn = e and mirror = 0: a plain
-shift of phase. Counting e from one d0 for both axes therefore also brings x and y, taken at different times, to one
-moment.
+to second order, so z = (conj T z' - M conj z') / (|T|^2 - |M|^2). A constant e gives turn = e and
+mirror = 0: a plain shift of phase. Counting e from one d0 for both axes therefore also brings x and
+y, taken at different times, to one moment.
 """
 
 from dataclasses import dataclass
@@ -40,14 +41,17 @@ def combine_steps(
         return phasor.StepCombination(cosine, sine)
     # of a phasor per pixel: the bin's area cancels
     moved = (weights[1] + 1j * weights[2]) / 2 * motion_um ** np.array([[1], [2]])
-    return phasor.StepCombination(cosine, sine, *(moved @ np.exp(sign * 1j * shifts_rad) for sign in (1, -1)))
+    return phasor.StepCombination(
+        cosine, sine, *(moved @ np.exp(sign * 1j * shifts_rad) for sign in (1, -1))
+    )
 
 
 def worth_correcting(displacement_um: FloatArray, noise_um: float) -> bool:
     """Whether the readings show motion beyond the laser's noise.
 
-    A swing of 1 µm standard deviation left in the frames costs 0.3 µm RMS of figure; correcting with 1 µm of pure
-    noise costs 0.12 µm (both measured on the twin). Above 1.5 times the noise nearly all of it is motion.
+    A swing of 1 µm standard deviation left in the frames costs 0.3 µm RMS of figure; correcting
+    with 1 µm of pure noise costs 0.12 µm (both measured on the twin). Above 1.5 times the noise
+    nearly all of it is motion.
     """
     return bool(np.all(np.isfinite(displacement_um)) and np.std(displacement_um) > 1.5 * noise_um)
 
@@ -55,17 +59,23 @@ def worth_correcting(displacement_um: FloatArray, noise_um: float) -> bool:
 def sensitivity_mm_per_um(
     tracer: reconstruct.Tracer, points: reconstruct.Points, surface: Surface, step_um: float = 10.0
 ) -> FloatArray:
-    """Change (2, n) of the screen points per µm of displacement, by a central difference of the traced model.
+    """Change (2, n) of the screen points per µm of displacement, by a central difference of the
+    traced model.
 
-    The bowl's sag grows by the displacement and its vertex moves towards -z, so that the ring stays where it is.
+    The bowl's sag grows by the displacement and its vertex moves towards -z, so that the ring stays
+    where it is.
     """
     traced = []
     for sign in (1.0, -1.0):
         deeper_mm = sign * step_um * 1e-3
         bowl = Surface.hencky_bowl(deeper_mm, surface.radius_mm)
         moved = Surface.from_parameters(surface.parameters + bowl.parameters, surface.radius_mm)
-        bench = reconstruct.Tracer(tracer.geometry, tracer.radius_mm, tracer.vertex_z_mm - deeper_mm)
-        there = reconstruct.Points(points.rays, points.screen_mm, points.weights, points.t_mm.copy())
+        bench = reconstruct.Tracer(
+            tracer.geometry, tracer.radius_mm, tracer.vertex_z_mm - deeper_mm
+        )
+        there = reconstruct.Points(
+            points.rays, points.screen_mm, points.weights, points.t_mm.copy()
+        )
         bench.intersect(there, moved, newton=3)
         traced.append(bench.predict_screen(there, moved))
     return (traced[0] - traced[1]) / (2 * step_um)
@@ -135,7 +145,8 @@ def establish(
         fit = reconstruct.solve(tracer, points, fit.surface)
     tracer.intersect(points, fit.surface)
     field = tracer.slope_field(points, fit.surface)
-    # area of the mirror, seen from above, in a bundle of rays: solid angle t^2 / |d . (-h_x, -h_y, 1)|
+    # area of the mirror, seen from above, in a bundle of rays: solid angle t^2 / |d . (-h_x, -h_y,
+    # 1)|
     facing = np.abs(points.rays[2] - field[4] * points.rays[0] - field[5] * points.rays[1])
     scale = phase.mm_per_rad(pattern)
     accepted = np.zeros((2, phasor.FOLLOWED_ROWS, index.size))

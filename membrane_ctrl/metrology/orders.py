@@ -1,8 +1,9 @@
 """Fringe orders from the Gray code and from the phase's own continuity, each checked by the other.
 
-The paper's eq. 2 trusts every Gray bit of every pixel. Continuity gives the orders of a connected region up to one
-number, which all of its pixels vote for: one wrong Gray frame scatters its votes and is outvoted, and the result
-shows which frame contradicts it. Where the phase itself is torn (a wrong sinusoid) eq. 2 remains.
+The paper's eq. 2 trusts every Gray bit of every pixel. Continuity gives the orders of a connected
+region up to one number, which all of its pixels vote for: one wrong Gray frame scatters its votes
+and is outvoted, and the result shows which frame contradicts it. Where the phase itself is torn (a
+wrong sinusoid) eq. 2 remains.
 """
 
 import math
@@ -19,7 +20,9 @@ from membrane_ctrl.model.arrays import BoolArray, FloatArray, IntArray
 
 @kernel
 def _flood(phase, mask, out, region, queue):  # type: ignore[no-untyped-def]
-    """Breadth-first: each pixel takes the period nearest to the neighbour that reached it. Returns the regions."""
+    """Breadth-first: each pixel takes the period nearest to the neighbour that reached it. Returns
+    the regions.
+    """
     height, width = phase.shape
     count = 0
     for seed in range(height * width):
@@ -35,7 +38,14 @@ def _flood(phase, mask, out, region, queue):  # type: ignore[no-untyped-def]
             for k in range(4):
                 r = row + (k == 0) - (k == 1)
                 c = column + (k == 2) - (k == 3)
-                if r < 0 or c < 0 or r >= height or c >= width or not mask[r, c] or region[r, c] >= 0:
+                if (
+                    r < 0
+                    or c < 0
+                    or r >= height
+                    or c >= width
+                    or not mask[r, c]
+                    or region[r, c] >= 0
+                ):
                     continue
                 step = phase[r, c] - out[row, column]
                 out[r, c] = phase[r, c] - 2 * math.pi * math.floor(step / (2 * math.pi) + 0.5)
@@ -47,10 +57,11 @@ def _flood(phase, mask, out, region, queue):  # type: ignore[no-untyped-def]
 
 
 def unwrap_regions(wrapped_rad: FloatArray, mask: BoolArray) -> tuple[FloatArray, IntArray]:
-    """Continuous phase (H, W) of each connected region, up to whole periods, and the number (H, W) of the region.
+    """Continuous phase (H, W) of each connected region, up to whole periods, and the number (H, W)
+    of the region.
 
-    `mask` (H, W) is where the phase is trusted; outside they are NaN and -1. Neighbours must differ by less than half
-    a period.
+    `mask` (H, W) is where the phase is trusted; outside they are NaN and -1. Neighbours must differ
+    by less than half a period.
     """
     out = np.full(wrapped_rad.shape, np.nan)
     region = np.full(wrapped_rad.shape, -1, np.int64)
@@ -59,7 +70,8 @@ def unwrap_regions(wrapped_rad: FloatArray, mask: BoolArray) -> tuple[FloatArray
 
 
 def tear_share(phase_rad: FloatArray) -> float:
-    """Share of neighbours whose continuous phases differ by more than half a period; NaN is left out.
+    """Share of neighbours whose continuous phases differ by more than half a period; NaN is left
+    out.
 
     0 if the phase is the same whichever way the walk went.
     """
@@ -70,7 +82,8 @@ def tear_share(phase_rad: FloatArray) -> float:
 
 # A good phase has no tears but for dust; one stale frame of three tears it at every quarter period.
 _TORN_SHARE = 0.003
-# One wrong Gray frame leaves half of the votes or more on the right order; fewer agree only if the phase is wrong.
+# One wrong Gray frame leaves half of the votes or more on the right order; fewer agree only if the
+# phase is wrong.
 _LEAST_AGREEMENT = 0.35
 _LEAST_VOTES = 30  # a smaller island cannot outvote its own noise
 
@@ -81,7 +94,9 @@ class Orders:
 
     phase_rad: FloatArray  # (H, W): counted from the low edge's -pi; NaN where not known
     agreement: float  # share of the pixels whose own Gray bits give the same order
-    torn: bool  # the phase is not continuous, or hardly any code agrees with it: the orders are the Gray code's alone
+    # the phase is not continuous, or hardly any code agrees with it: the orders are the Gray code's
+    # alone
+    torn: bool
 
 
 def orders(wrapped_rad: FloatArray, bits: BoolArray, mask: BoolArray) -> Orders:
@@ -100,12 +115,16 @@ def orders(wrapped_rad: FloatArray, bits: BoolArray, mask: BoolArray) -> Orders:
 
 
 def by_votes(wrapped_rad: FloatArray, coded: FloatArray, mask: BoolArray) -> Orders:
-    """As `orders`, from absolute phases (H, W) that each pixel has by itself; NaN where it has none."""
+    """As `orders`, from absolute phases (H, W) that each pixel has by itself; NaN where it has
+    none.
+    """
     smooth, region = unwrap_regions(wrapped_rad, mask)
     if tear_share(smooth) > _TORN_SHARE:
         return Orders(np.where(mask, coded, np.nan), 1.0, torn=True)
     offset = np.round((coded - smooth) / (2 * math.pi))
-    votes = np.zeros((region.max() + 1 if mask.any() else 0, 65), np.int64)  # orders differ by 32 at most
+    votes = np.zeros(
+        (region.max() + 1 if mask.any() else 0, 65), np.int64
+    )  # orders differ by 32 at most
     voting = mask & np.isfinite(coded)
     place = np.clip(offset[voting], -32, 32).astype(np.int64) + 32
     np.add.at(votes, (region[voting], place), 1)
@@ -122,9 +141,11 @@ def by_votes(wrapped_rad: FloatArray, coded: FloatArray, mask: BoolArray) -> Ord
 
 
 def gray_bit(phase_rad: FloatArray, bit: int) -> tuple[BoolArray, FloatArray]:
-    """What Gray frame `bit` (1..4) shows at an absolute phase, and the distance in rad to where that bit changes.
+    """What Gray frame `bit` (1..4) shows at an absolute phase, and the distance in rad to where
+    that bit changes.
 
-    V2 = floor(2 s / T) with s / T = (phase + pi) / (2 pi). Bit b of the code changes at V2 = 2^(4-b) (odd number).
+    V2 = floor(2 s / T) with s / T = (phase + pi) / (2 pi). Bit b of the code changes at V2 =
+    2^(4-b) (odd number).
     """
     half_periods = (phase_rad + math.pi) / math.pi
     v2 = np.floor(np.nan_to_num(half_periods)).astype(np.int64)

@@ -1,8 +1,10 @@
-"""Sums of pixels over square bins, and the phase of the bins against a reference: the fast path of a cycle.
+"""Sums of pixels over square bins, and the phase of the bins against a reference: the fast path of
+a cycle.
 
-The phasor of a bin is linear in the frames, so the frames are summed over each bin first, each read once and in
-the order of its memory; the phase steps are then combined on 1/16 of the numbers. For surfaces of Zernike terms
-nothing is lost by 4 x 4 bins. Colour filters do no harm: a pixel's gain scales its phasor and leaves its phase.
+The phasor of a bin is linear in the frames, so the frames are summed over each bin first, each read
+once and in the order of its memory; the phase steps are then combined on 1/16 of the numbers. For
+surfaces of Zernike terms nothing is lost by 4 x 4 bins. Colour filters do no harm: a pixel's gain
+scales its phasor and leaves its phase.
 """
 
 import math
@@ -19,7 +21,8 @@ _NEVER = np.uint32(2**32 - 1)  # above any pixel
 FOLLOWED_ROWS = 5  # of `track`: absolute phase, its cosine and sine, change (rad), modulation (ADU)
 
 
-# One small loop a function: the compiler finds vector instructions for each of these, and for none of their union.
+# One small loop a function: the compiler finds vector instructions for each of these, and for none
+# of their union.
 
 
 @kernel
@@ -67,7 +70,8 @@ def _count_saturated(frame, first, last, bin_px, full_scale, out):  # type: igno
 
 @kernel
 def _bin_rows(frame, bin_px, full_scale, line, sums, saturated, start, stop):  # type: ignore[no-untyped-def]
-    """Sums of the bin rows [start, stop) into `sums`; their saturated pixels are added to `saturated`.
+    """Sums of the bin rows [start, stop) into `sums`; their saturated pixels are added to
+    `saturated`.
 
     `line` (2, width) is memory of a type that holds the sum of a bin's pixels.
     """
@@ -110,7 +114,9 @@ class Binner:
         Saturated pixels of each bin over the frames since `clear`.
     """
 
-    def __init__(self, height_px: int, width_px: int, bin_px: int, full_scale_adu: int, slots: int) -> None:
+    def __init__(
+        self, height_px: int, width_px: int, bin_px: int, full_scale_adu: int, slots: int
+    ) -> None:
         self._size = (height_px, width_px)
         self.bin_px = bin_px
         self._full_scale = np.uint32(full_scale_adu)
@@ -122,26 +128,37 @@ class Binner:
         """Forget the saturation counts, at the start of a cycle."""
         self.saturated[:] = 0
 
-    def add(self, frames: Sequence[Image], slots: Sequence[int], watched: Container[int] | None = None) -> None:
+    def add(
+        self, frames: Sequence[Image], slots: Sequence[int], watched: Container[int] | None = None
+    ) -> None:
         """Sum frames into slots.
 
-        Raises ValueError for a frame of wrong size or type of pixel; nothing is summed then. Frame k goes to
-        slots[k]. Only `watched` slots, by default all, are checked for saturation: it does not harm white or Gray.
+        Raises ValueError for a frame of wrong size or type of pixel; nothing is summed then. Frame
+        k goes to slots[k]. Only `watched` slots, by default all, are checked for saturation: it
+        does not harm white or Gray.
         """
         for frame in frames:
             if frame.shape != self._size:
-                raise ValueError(f"frame is {frame.shape[::-1]} pixels (width, height), not {self._size[::-1]}")
+                raise ValueError(
+                    f"frame is {frame.shape[::-1]} pixels (width, height), not {self._size[::-1]}"
+                )
             if frame.dtype not in (np.uint8, np.uint16):
                 raise ValueError(f"frame has {frame.dtype} pixels, not uint8 or uint16")
-        limits = [self._full_scale if watched is None or slot in watched else _NEVER for slot in slots]
+        limits = [
+            self._full_scale if watched is None or slot in watched else _NEVER for slot in slots
+        ]
         width = self.sums.shape[2] * self.bin_px
 
         def run(start: int, stop: int) -> None:
             for frame, slot, limit in zip(frames, slots, limits, strict=True):
-                fits = frame.dtype == np.uint8 and self.bin_px <= 16  # 256 pixels of 8 bits fit 16 bits
+                fits = (
+                    frame.dtype == np.uint8 and self.bin_px <= 16
+                )  # 256 pixels of 8 bits fit 16 bits
                 line = np.empty((2, width), np.uint16 if fits else np.uint32)
                 pixels = np.ascontiguousarray(frame)
-                _bin_rows(pixels, self.bin_px, limit, line, self.sums[slot], self.saturated, start, stop)
+                _bin_rows(
+                    pixels, self.bin_px, limit, line, self.sums[slot], self.saturated, start, stop
+                )
 
         # waking a thread costs more than half a frame
         split(run, self.sums.shape[1], self._size[0] + 1 if len(frames) == 1 else 0)
@@ -151,7 +168,8 @@ class Binner:
 class StepCombination:
     """How the frames of one axis become a phasor."""
 
-    cosine: FloatArray  # (N,): weights of the frames' bin sums for C and S (per pixel: divided by the bin's area)
+    # (N,): weights of the frames' bin sums for C and S (per pixel: divided by the bin's area)
+    cosine: FloatArray
     sine: FloatArray  # (N,)
     # (2,) first and second moment of the film's motion (see `motion`); 0 without
     turn: ComplexArray = field(default_factory=lambda: np.zeros(2, complex))
@@ -162,7 +180,8 @@ class StepCombination:
 def arctan2(y, x):  # type: ignore[no-untyped-def]
     """Angle in [-pi, pi] without a branch, so that loops over it use vector units; (0, 0) gives 0.
 
-    The ratio of the smaller to the larger is halved in angle once, tan(a/2) = t / (1 + sqrt(1 + t^2)), which leaves
+    The ratio of the smaller to the larger is halved in angle once, tan(a/2) = t / (1 + sqrt(1 +
+    t^2)), which leaves
     |t| <= tan(pi/8), where 15 terms of the series of arctan leave less than 1e-13.
     """
     ax, ay = abs(x), abs(y)
@@ -195,9 +214,14 @@ def still(c, s, q, turn, mirror):  # type: ignore[no-untyped-def]
     """The phasor c + i s without the film's motion, to second order (see `motion`)."""
     half = q * q / 2
     t_re, t_im = 1 - q * turn[0].imag - half * turn[1].real, q * turn[0].real - half * turn[1].imag
-    m_re, m_im = q * mirror[0].imag - half * mirror[1].real, -q * mirror[0].real - half * mirror[1].imag
+    m_re, m_im = (
+        q * mirror[0].imag - half * mirror[1].real,
+        -q * mirror[0].real - half * mirror[1].imag,
+    )
     scale = 1 / (t_re * t_re + t_im * t_im - m_re * m_re - m_im * m_im)
-    return scale * ((t_re - m_re) * c + (t_im - m_im) * s), scale * ((t_re + m_re) * s - (t_im + m_im) * c)
+    return scale * ((t_re - m_re) * c + (t_im - m_im) * s), scale * (
+        (t_re + m_re) * s - (t_im + m_im) * c
+    )
 
 
 @kernel
@@ -208,7 +232,9 @@ def _still(c, s, slope, turn, mirror):  # type: ignore[no-untyped-def]
 
 @kernel
 def _angle(c, s, last_cos, last_sin, change, size):  # type: ignore[no-untyped-def]
-    """Angle of c + i s relative to the last phase, and its length; normalises c + i s to length 1."""
+    """Angle of c + i s relative to the last phase, and its length;
+    normalises c + i s to length 1.
+    """
     for p in range(c.size):
         length = math.sqrt(c[p] * c[p] + s[p] * s[p])
         scale = 1 / (length + 1e-300)
@@ -221,7 +247,9 @@ def _angle(c, s, last_cos, last_sin, change, size):  # type: ignore[no-untyped-d
 
 @kernel
 def _track(sums, index, cosine, sine, turn, mirror, slope, last, out, start, stop):  # type: ignore[no-untyped-def]
-    """Phase of each point, counted from the last one, in blocks that stay in the first-level cache."""
+    """Phase of each point, counted from the last one, in blocks that
+    stay in the first-level cache.
+    """
     for first in range(start, stop, _BLOCK):
         end = min(first + _BLOCK, stop)
         c, s = out[1, first:end], out[2, first:end]
@@ -255,12 +283,15 @@ def track(
     sensitivity_rad_per_um : (2, n) array
         Change of phase per µm of displacement.
     last, out : (2, FOLLOWED_ROWS, n) arrays
-        Rows of the cycle before, from which the change is counted (unambiguous below pi), and of this one.
+        Rows of the cycle before, from which the change is counted (unambiguous below pi), and of
+        this one.
     """
 
     def run(start: int, stop: int) -> None:
         for k, steps in enumerate(combined):
             weights = (steps.cosine, steps.sine, steps.turn, steps.mirror)
-            _track(sums[k], index, *weights, sensitivity_rad_per_um[k], last[k], out[k], start, stop)
+            _track(
+                sums[k], index, *weights, sensitivity_rad_per_um[k], last[k], out[k], start, stop
+            )
 
     split(run, index.size)

@@ -1,11 +1,13 @@
-"""From rays and screen points to the surface: ray-traced slopes, least squares, iterated (the paper's section 2.4).
+"""From rays and screen points to the surface: ray-traced slopes, least squares, iterated (the
+paper's section 2.4).
 
-Slope and height need each other: the slope at a pixel is the bisector at the point where its ray meets the film,
-and where that is depends on the height. The iteration starts from any shape and contracts by about 300 a step.
+Slope and height need each other: the slope at a pixel is the bisector at the point where its ray
+meets the film, and where that is depends on the height. The iteration starts from any shape and
+contracts by about 300 a step.
 
-Each step solves (D^T W D) delta = D^T W (g - D a) and adds delta to a. Where delta vanishes, a is the least-squares
-solution on its own surface, whatever matrix is on the left: a matrix of an earlier step, or cycle, may be kept
-without changing the solution.
+Each step solves (D^T W D) delta = D^T W (g - D a) and adds delta to a. Where delta vanishes, a is
+the least-squares solution on its own surface, whatever matrix is on the left: a matrix of an
+earlier step, or cycle, may be kept without changing the solution.
 """
 
 from collections.abc import Callable
@@ -22,22 +24,31 @@ from membrane_ctrl.model.zernike_terms import ZERNIKE_DEGREE
 
 # Normal equations of the slope fit, made from moments (the paper's eqs. for D, G and A).
 #
-# With D the derivatives of the basis at the points and g the measured slopes, A = (D^T D)^-1 D^T g. All derivatives
-# of the Zernike terms are polynomials of one degree less in x and y, so D^T g and D^T D follow exactly from sums of
-# monomials over the points; no matrix of 2N rows is ever built. As printed, D^T D is singular: piston has no slope.
-# Here the Hencky excess replaces piston's column, scaled to unit RMS like the others.
+# With D the derivatives of the basis at the points and g the measured slopes, A = (D^T D)^-1 D^T g.
+# All derivatives of the Zernike terms are polynomials of one degree less in x and y, so D^T g and
+# D^T D follow exactly from sums of monomials over the points; no matrix of 2N rows is ever built.
+# As printed, D^T D is singular: piston has no slope. Here the Hencky excess replaces piston's
+# column, scaled to
+# unit RMS like the
+# others.
 
 _M = kernels.SLOPE_MONOMIALS
-_POWERS = [(p, q) for p in range(ZERNIKE_DEGREE) for q in range(ZERNIKE_DEGREE - p)]  # in the kernels' order
-_PRODUCT_POWERS = [(p, q) for p in range(kernels.PRODUCT_DEGREE + 1) for q in range(kernels.PRODUCT_DEGREE + 1 - p)]
+_POWERS = [
+    (p, q) for p in range(ZERNIKE_DEGREE) for q in range(ZERNIKE_DEGREE - p)
+]  # in the kernels' order
+_PRODUCT_POWERS = [
+    (p, q) for p in range(kernels.PRODUCT_DEGREE + 1) for q in range(kernels.PRODUCT_DEGREE + 1 - p)
+]
 
 
 @cache
 def slope_tables() -> tuple[FloatArray, FloatArray]:
-    """dZ_j/dx and dZ_j/dy for j = 2, 3, ... as monomial coefficients, (terms - 1, SLOPE_MONOMIALS) each, on the unit
-    disc."""
+    """dZ_j/dx and dZ_j/dy for j = 2, 3, ... as monomial coefficients, (terms - 1, SLOPE_MONOMIALS)
+    each, on the unit disc."""
     rows, columns = np.array(_POWERS).T
-    tables = [zernike.differentiate(zernike.monomial_table(), axis)[1:, rows, columns] for axis in (1, 2)]
+    tables = [
+        zernike.differentiate(zernike.monomial_table(), axis)[1:, rows, columns] for axis in (1, 2)
+    ]
     return tables[0], tables[1]
 
 
@@ -52,19 +63,24 @@ def _product_index() -> IntArray:
 class NormalMatrix:
     """D^T W D, apart for x and y slopes, and its inverse."""
 
-    x: FloatArray  # (parameters, parameters): shares of the x and of the y slopes, in 1/mm^2 times weight
+    # (parameters, parameters): shares of the x and of the y slopes, in 1/mm^2 times weight
+    x: FloatArray
     y: FloatArray  # (parameters, parameters)
-    # (parameters, parameters), of their sum; the condition number is below 1000, and the next step corrects what
-    # rounding leaves
+    # (parameters, parameters), of their sum; the condition number is below 1000, and the next step
+    # corrects what rounding leaves
     inverse: FloatArray
 
     @classmethod
     def from_products(cls, products: FloatArray, radius_mm: float) -> "NormalMatrix":
-        """From the moments of `kernels.product_sums`. Raises ValueError if the points do not determine a surface."""
+        """From the moments of `kernels.product_sums`. Raises ValueError if the points do not
+        determine a surface.
+        """
         x, y = _assemble(products, radius_mm)
         inverse = x + y
         if not kernels.invert(inverse):
-            raise ValueError(f"the measured points do not determine the {PARAMETERS} parameters of the surface")
+            raise ValueError(
+                f"the measured points do not determine the {PARAMETERS} parameters of the surface"
+            )
         return cls(x, y, inverse)
 
     def solve(self, right: FloatArray) -> FloatArray:
@@ -88,7 +104,9 @@ def _assemble(products: FloatArray, radius_mm: float) -> tuple[FloatArray, Float
 
 
 def right_side(sums: FloatArray, radius_mm: float) -> FloatArray:
-    """D^T W r of the x and of the y slopes, (2, parameters), from the moments of `kernels.residual_sums`."""
+    """D^T W r of the x and of the y slopes, (2, parameters), from the moments of
+    `kernels.residual_sums`.
+    """
     out = np.empty((2, PARAMETERS))
     for axis, table in enumerate(slope_tables()):
         out[axis, :-1] = table @ sums[axis * _M : (axis + 1) * _M]
@@ -96,8 +114,11 @@ def right_side(sums: FloatArray, radius_mm: float) -> FloatArray:
     return out / radius_mm
 
 
-def residual_rms(sums: FloatArray, right: FloatArray, normal: NormalMatrix, delta: FloatArray) -> tuple[float, float]:
-    """RMS of the x and of the y slopes' residual after the step `delta`, without another pass over the points.
+def residual_rms(
+    sums: FloatArray, right: FloatArray, normal: NormalMatrix, delta: FloatArray
+) -> tuple[float, float]:
+    """RMS of the x and of the y slopes' residual after the step `delta`, without another pass over
+    the points.
 
     |r - D delta|^2 = |r|^2 - 2 delta D^T r + delta D^T D delta, each sum weighted.
     """
@@ -127,14 +148,19 @@ class Points:
     rays: FloatArray  # (3, n): unit vectors in world, from the pinhole
     screen_mm: FloatArray  # (2, n): s_x, s_y seen there, from O'
     weights: FloatArray  # (n,): of both slopes of a point; 0 leaves it out
-    t_mm: FloatArray  # (n,): length of each ray to the surface; kept between solutions as the start of the next
+    # (n,): length of each ray to the surface; kept between solutions as the start of the next
+    t_mm: FloatArray
 
     @classmethod
-    def of(cls, rays: FloatArray, screen_mm: FloatArray, weights: FloatArray | None = None) -> "Points":
+    def of(
+        cls, rays: FloatArray, screen_mm: FloatArray, weights: FloatArray | None = None
+    ) -> "Points":
         """Points with unit weights unless given."""
         count = rays.shape[1]
         weights = np.ones(count) if weights is None else weights
-        return cls(np.ascontiguousarray(rays), np.ascontiguousarray(screen_mm), weights, np.zeros(count))
+        return cls(
+            np.ascontiguousarray(rays), np.ascontiguousarray(screen_mm), weights, np.zeros(count)
+        )
 
     def subset(self, keep: BoolArray | IntArray) -> "Points":
         """Those points where `keep` is set, or those at these places."""
@@ -173,7 +199,8 @@ class Tracer:
     def start(self, points: Points, height: HeightFunction) -> None:
         """Put the points on a starting shape, by t <- (vertex_z + h - F_z) / d_z.
 
-        Contracts by slope times inclination of the ray (below 0.1), so that kinks of a cone do no harm.
+        Contracts by slope times inclination of the ray (below 0.1), so that kinks of a cone do no
+        harm.
         """
         f, d = self._pinhole, points.rays
         points.t_mm[:] = (self.vertex_z_mm - f[2]) / d[2]
@@ -186,18 +213,37 @@ class Tracer:
         shape = surface.polynomial, surface.excess, 1.0, self.radius_mm
 
         def run(start: int, stop: int) -> None:
-            kernels.intersect(points.rays, points.t_mm, self._pinhole, *shape, self.vertex_z_mm, newton, start, stop)
+            kernels.intersect(
+                points.rays,
+                points.t_mm,
+                self._pinhole,
+                *shape,
+                self.vertex_z_mm,
+                newton,
+                start,
+                stop,
+            )
 
         compiled.split(run, points.t_mm.size, compiled.FEW)
 
     def residual_sums(self, points: Points, surface: Surface, newton: int = 0) -> FloatArray:
-        """Moments of the slope residual (see `kernels.residual_sums`), after Newton steps towards the surface."""
+        """Moments of the slope residual (see `kernels.residual_sums`), after Newton steps towards
+        the surface.
+        """
         shape = self._shape(surface)
 
         def run(start: int, stop: int) -> FloatArray:
             rays, t = points.rays, points.t_mm
             kernels.intersect(rays, t, self._pinhole, *shape, self.vertex_z_mm, newton, start, stop)
-            fixed = (rays, t, points.screen_mm, points.weights, self._pinhole, self._plane, self._face)
+            fixed = (
+                rays,
+                t,
+                points.screen_mm,
+                points.weights,
+                self._pinhole,
+                self._plane,
+                self._face,
+            )
             return np.asarray(kernels.residual_sums(*fixed, *shape, start, stop))
 
         return np.asarray(np.sum(compiled.split(run, points.t_mm.size, compiled.FEW), axis=0))
@@ -206,7 +252,14 @@ class Tracer:
         """D^T W D at the points' present places."""
 
         def run(start: int, stop: int) -> FloatArray:
-            fixed = (points.rays, points.t_mm, points.weights, self._pinhole, _EXCESS, self.radius_mm)
+            fixed = (
+                points.rays,
+                points.t_mm,
+                points.weights,
+                self._pinhole,
+                _EXCESS,
+                self.radius_mm,
+            )
             return np.asarray(kernels.product_sums(*fixed, start, stop))
 
         return NormalMatrix.from_products(
@@ -219,14 +272,23 @@ class Tracer:
         out = np.empty((6, points.t_mm.size))
 
         def run(start: int, stop: int) -> None:
-            fixed = (points.rays, points.t_mm, points.screen_mm, self._pinhole, self._plane, self._face)
+            fixed = (
+                points.rays,
+                points.t_mm,
+                points.screen_mm,
+                self._pinhole,
+                self._plane,
+                self._face,
+            )
             kernels.slope_field(*fixed, *shape, out, start, stop)
 
         compiled.split(run, points.t_mm.size, compiled.FEW)
         return out
 
     def predict_screen(self, points: Points, surface: Surface) -> FloatArray:
-        """Screen points (2, n) in mm that the surface would send the rays to; the points must be on it."""
+        """Screen points (2, n) in mm that the surface would send the rays to; the points must be on
+        it.
+        """
         shape = self._shape(surface)
         out = np.empty((2, points.t_mm.size))
 
@@ -242,7 +304,12 @@ class Tracer:
         return np.asarray(self._pinhole[:2, None] + points.t_mm * points.rays[:2])
 
     def _shape(self, surface: Surface) -> tuple[FloatArray, FloatArray, float, float]:
-        return surface.polynomial, _EXCESS, surface.hencky_mm * film_law.excess_rms(), self.radius_mm
+        return (
+            surface.polynomial,
+            _EXCESS,
+            surface.hencky_mm * film_law.excess_rms(),
+            self.radius_mm,
+        )
 
 
 def parabola(sag_mm: float, radius_mm: float) -> HeightFunction:
@@ -264,8 +331,8 @@ def solve(
     Parameters
     ----------
     start : height function or Surface
-        A height function places the points once. A Surface is the last solution: the points must then be on it, and
-        one or two steps are enough.
+        A height function places the points once. A Surface is the last solution: the points must
+        then be on it, and one or two steps are enough.
     normal : NormalMatrix, optional
         A matrix to keep instead of recomputing it each step (the solution is the same).
     tolerance_mm : float
@@ -295,7 +362,15 @@ def solve(
         raise ValueError("max_iterations must be at least 1")
     residual_x, residual_y = residual_rms(step.sums, step.right, step.normal, step.delta)
     converged = changes[-1] * CONTRACTION <= tolerance_mm
-    return Fit(surface, step.normal, tuple(changes), converged, residual_x, residual_y, float(step.sums[-1]))
+    return Fit(
+        surface,
+        step.normal,
+        tuple(changes),
+        converged,
+        residual_x,
+        residual_y,
+        float(step.sums[-1]),
+    )
 
 
 @dataclass(frozen=True)
@@ -306,8 +381,12 @@ class _Step:
     delta: FloatArray
 
 
-def _step(tracer: Tracer, points: Points, surface: Surface, normal: NormalMatrix | None, newton: int) -> _Step:
-    """One Gauss-Newton step, after moving the points onto the surface by Newton steps (0: they stay)."""
+def _step(
+    tracer: Tracer, points: Points, surface: Surface, normal: NormalMatrix | None, newton: int
+) -> _Step:
+    """One Gauss-Newton step, after moving the points onto the surface by Newton steps (0: they
+    stay).
+    """
     sums = tracer.residual_sums(points, surface, newton)
     matrix = normal or tracer.normal_matrix(points)
     right = right_side(sums, tracer.radius_mm)

@@ -1,8 +1,9 @@
 """The zonal map: what the terms cannot represent, integrated from the slopes' residual to the fit.
 
-Only the residual is integrated, so that neither the grid's step nor its interpolation touches the millimetres of the
-bowl. Slopes scattered over the mirror are averaged in cells; two neighbouring cells see the height change by the mean
-of their slopes (Southwell's model); least squares over all pairs of neighbours give the height.
+Only the residual is integrated, so that neither the grid's step nor its interpolation touches the
+millimetres of the bowl. Slopes scattered over the mirror are averaged in cells; two neighbouring
+cells see the height change by the mean of their slopes (Southwell's model); least squares over all
+pairs of neighbours give the height.
 """
 
 import math
@@ -14,23 +15,29 @@ import numpy as np
 from membrane_ctrl.metrology.optics.compiled import kernel, split
 from membrane_ctrl.model.arrays import FloatArray
 
-# Height from differences between neighbours on a masked grid: least squares by conjugate gradients and multigrid.
+# Height from differences between neighbours on a masked grid: least squares by conjugate gradients
+# and multigrid.
 #
-# Minimise sum over neighbours (h_b - h_a - d_ab)^2 over pairs that are both inside the mask. The normal equations are
-# the grid's Laplacian with the mask's own (Neumann) edge. Cells are joined 2 x 2 into a coarser grid whose links are
-# sums of the finer ones (Galerkin with constants), down to a few cells; one symmetric V-cycle of that is the
-# preconditioner. The cost is linear in the number of cells.
+# Minimise sum over neighbours (h_b - h_a - d_ab)^2 over pairs that are both inside the mask. The
+# normal equations are the grid's Laplacian with the mask's own (Neumann) edge. Cells are joined 2 x
+# 2 into a coarser grid whose links are sums of the finer ones (Galerkin with constants), down to a
+# few cells; one symmetric V-cycle of that is the preconditioner. The cost is linear in the number
+# of cells.
 #
-# Source: R. Southwell's model of slopes, J. Opt. Soc. Am. 70, 998 (1980); A. Brandt, Math. Comp. 31, 333 (1977).
+# Source: R. Southwell's model of slopes, J. Opt. Soc. Am. 70, 998 (1980); A. Brandt, Math. Comp.
+# 31, 333 (1977).
 
 _COARSEST = 8
-# Constants joined 2 x 2 interpolate a slope as a staircase, which makes the coarse correction too small by about half
+# Constants joined 2 x 2 interpolate a slope as a staircase, which makes the coarse correction too
+# small by about half
 _OVER_CORRECTION = 1.8
 
 
 @kernel
 def _smooth(right, down, rhs, h, forward):  # type: ignore[no-untyped-def]
-    """One Gauss-Seidel sweep; `right[i, j]` links (i, j) to (i, j + 1), `down[i, j]` to (i + 1, j)."""
+    """One Gauss-Seidel sweep; `right[i, j]` links (i, j) to (i, j + 1), `down[i, j]` to (i + 1,
+    j).
+    """
     rows, columns = h.shape
     for a in range(rows):
         i = a if forward else rows - 1 - a
@@ -103,8 +110,8 @@ def _coarser_links(right, down, coarse_right, coarse_down):  # type: ignore[no-u
 class MaskedLaplacian:
     """Links of a grid and of its coarser ones.
 
-    `right` and `down` (rows, columns) are the weights of each cell's links to its right and to its lower neighbour, 0
-    where there is none.
+    `right` and `down` (rows, columns) are the weights of each cell's links to its right and to its
+    lower neighbour, 0 where there is none.
     """
 
     def __init__(self, right: FloatArray, down: FloatArray) -> None:
@@ -117,7 +124,9 @@ class MaskedLaplacian:
             self._links.append(coarse)
         self._memory = [np.empty((3, *links[0].shape)) for links in self._links]
 
-    def solve(self, rhs: FloatArray, tolerance: float = 1e-4, max_iterations: int = 60) -> FloatArray:
+    def solve(
+        self, rhs: FloatArray, tolerance: float = 1e-4, max_iterations: int = 60
+    ) -> FloatArray:
         """h with Laplacian(h) = rhs; each connected part up to its own constant.
 
         Stops when the residual has fallen by `tolerance`.
@@ -182,11 +191,18 @@ class ResidualGrid:
     def noise_mm(self, cell_slope: float) -> float:
         """1 sigma of the integrated height when the cells' slopes have this white noise.
 
-        The height's density over the plane of waves k is (slope step / k)^2, from the fastest that the grid holds to
-        the slowest that the fit of the terms leaves.
+        The height's density over the plane of waves k is (slope step / k)^2, from the fastest that
+        the grid holds to the slowest that the fit of the terms leaves.
         """
-        fastest, slowest = 2 * math.sqrt(math.pi) / self.step_mm, math.pi * FIT_CYCLES / float(self.axis_mm[-1])
-        return cell_slope * self.step_mm * math.sqrt(max(math.log(fastest / slowest), 0.0) / (2 * math.pi))
+        fastest, slowest = (
+            2 * math.sqrt(math.pi) / self.step_mm,
+            math.pi * FIT_CYCLES / float(self.axis_mm[-1]),
+        )
+        return (
+            cell_slope
+            * self.step_mm
+            * math.sqrt(max(math.log(fastest / slowest), 0.0) / (2 * math.pi))
+        )
 
 
 @kernel
@@ -215,7 +231,10 @@ def residual_grid(field: FloatArray, weights: FloatArray, radius_mm: float) -> R
     weights : (n,) array
         0 leaves a pixel out.
     """
-    half = min(_CELLS_A_SIDE, int(math.sqrt(4 / math.pi * max(field.shape[1], 1) / _PIXELS_A_CELL))) // 2
+    half = (
+        min(_CELLS_A_SIDE, int(math.sqrt(4 / math.pi * max(field.shape[1], 1) / _PIXELS_A_CELL)))
+        // 2
+    )
     half = max(half, 2)
     axis: FloatArray = radius_mm / half * np.arange(-half, half + 1, dtype=np.float64)
 
@@ -235,8 +254,8 @@ def residual_grid(field: FloatArray, weights: FloatArray, radius_mm: float) -> R
 def integrate(grid: ResidualGrid) -> FloatArray:
     """Height (n, n) in mm of the residual, 0 at the vertex; NaN where nothing was measured.
 
-    Slopes cannot tell the relative height of parts that are not connected (a hair across the mirror): each is put on
-    the fitted surface, mean 0.
+    Slopes cannot tell the relative height of parts that are not connected (a hair across the
+    mirror): each is put on the fitted surface, mean 0.
     """
     seen = grid.count > 0
     right = np.zeros(seen.shape)

@@ -1,4 +1,6 @@
-"""Colours of quantities in every plot: the palette of Okabe and Ito, which colour-blind readers can tell apart."""
+"""Colours of quantities in every plot: the palette of Okabe and Ito, which colour-blind readers can
+tell apart.
+"""
 
 Colour = tuple[int, int, int]  # red, green, blue: 0 to 255
 

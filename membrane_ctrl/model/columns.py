@@ -1,11 +1,13 @@
-"""The table of telemetry columns: the one place for their names, units, labels, decimals, plots and descriptions.
+"""The table of telemetry columns: the one place for their names, units, labels, decimals, plots and
+descriptions.
 
-Each field of `ColumnValues` is a column, and its `column(...)` is the column's row of the table. To add a column, add
-a field here, and its value where the controller makes the row (`controller/scene.py`). The recording, the run's
-tables, the viewer's plots, page, console, `ctl status`, bridges, report, Grafana dashboard and docs/telemetry.md are
-made from this table.
+Each field of `ColumnValues` is a column, and its `column(...)` is the column's row of the table. To
+add a column, add a field here, and its value where the controller makes the row
+(`controller/scene.py`). The recording, the run's tables, the viewer's plots, page, console, `ctl
+status`, bridges, report, Grafana dashboard and docs/telemetry.md are made from this table.
 
-An identifier ends in its unit (`error_um`), people read the unit as usual (µm): `unit_of` gives one for the other.
+An identifier ends in its unit (`error_um`), people read the unit as usual (µm): `unit_of` gives one
+for the other.
 """
 
 import math
@@ -13,7 +15,17 @@ from dataclasses import dataclass, field, fields
 from enum import Enum
 from typing import Any
 
-from membrane_ctrl.model.colours import BLUE, GREEN, GREY, ORANGE, RED, VIOLET, WHITE, YELLOW, Colour
+from membrane_ctrl.model.colours import (
+    BLUE,
+    GREEN,
+    GREY,
+    ORANGE,
+    RED,
+    VIOLET,
+    WHITE,
+    YELLOW,
+    Colour,
+)
 
 MISSING = "–"  # shown for a value that is not known
 
@@ -131,8 +143,8 @@ class TelemetryColumn:
     plot : Plot
         Where it is drawn, which also says to which group it belongs.
     entity : str
-        Rerun entity. Columns that are known together share one: m scalars of one entity cost the writer and the
-        viewer far less than m entities. Empty: a time axis.
+        Rerun entity. Columns that are known together share one: m scalars of one entity cost the
+        writer and the viewer far less than m entities. Empty: a time axis.
     colour : tuple of int
         Red, green, blue.
     width : float
@@ -143,7 +155,8 @@ class TelemetryColumn:
     aggregation : Aggregation
         What overview levels keep.
     published : bool
-        Whether page, console, `ctl status`, bridges and dashboard show it; such a column is aggregated.
+        Whether page, console, `ctl status`, bridges and dashboard show it; such a column is
+        aggregated.
     """
 
     name: str
@@ -208,10 +221,12 @@ def column(
     aggregation: Aggregation | None = None,
     published: bool = False,
 ) -> Any:
-    """Return a dataclass field whose metadata is a row of the table. Parameters: see `TelemetryColumn`.
+    """Return a dataclass field whose metadata is a row of the table. Parameters: see
+    `TelemetryColumn`.
 
-    A value that nothing sets is missing: NaN. Unless they are given, a quantity has two decimals, and overview levels
-    keep the last value of a code, and minimum, mean and maximum of a published column.
+    A value that nothing sets is missing: NaN. Unless they are given, a quantity has two decimals,
+    and overview levels keep the last value of a code, and minimum, mean and maximum of a published
+    column.
     """
     if decimals is None:
         decimals = 2 if kind is Kind.QUANTITY else 0
@@ -243,15 +258,30 @@ _EXTREMES = Aggregation.EXTREMES
 
 @dataclass(frozen=True, slots=True)
 class ColumnValues:
-    """What one tick read, decided and wrote; NaN for missing values. Its fields are the table of columns."""
+    """What one tick read, decided and wrote; NaN for missing values. Its fields are the table of
+    columns.
+    """
 
-    mono_s: float = column("time", "the run's clock at the start of the tick", RECORD, "", decimals=3)
-    tick: float = column("tick", "number of the tick, from 1", RECORD, "/tick/record", colour=GREY, kind=Kind.COUNT)
+    mono_s: float = column(
+        "time", "the run's clock at the start of the tick", RECORD, "", decimals=3
+    )
+    tick: float = column(
+        "tick", "number of the tick, from 1", RECORD, "/tick/record", colour=GREY, kind=Kind.COUNT
+    )
     dt_s: float = column(
-        "time between ticks", "true time since the last tick, clamped", INTERVAL, "/tick/dt", decimals=4
+        "time between ticks",
+        "true time since the last tick, clamped",
+        INTERVAL,
+        "/tick/dt",
+        decimals=4,
     )
     lateness_ms: float = column(
-        "lateness", "start of the tick after its deadline", LATENESS, "/tick/lateness", decimals=1, published=True
+        "lateness",
+        "start of the tick after its deadline",
+        LATENESS,
+        "/tick/lateness",
+        decimals=1,
+        published=True,
     )
     missed_ticks: float = column(
         "missed ticks",
@@ -263,9 +293,16 @@ class ColumnValues:
         kind=Kind.COUNT,
         published=True,
     )
-    state: float = column("state", "state of the controller", CODES, "/tick/record", colour=GREEN, kind=Kind.CODE)
+    state: float = column(
+        "state", "state of the controller", CODES, "/tick/record", colour=GREEN, kind=Kind.CODE
+    )
     shape_state: float = column(
-        "shape loop", "state of the shape loop", CODES, "/tick/record", colour=VIOLET, kind=Kind.CODE
+        "shape loop",
+        "state of the shape loop",
+        CODES,
+        "/tick/record",
+        colour=VIOLET,
+        kind=Kind.CODE,
     )
     safe_level: float = column(
         "safe level", "safe level in force", CODES, "/tick/record", colour=YELLOW, kind=Kind.CODE
@@ -280,10 +317,21 @@ class ColumnValues:
         aggregation=Aggregation.LARGEST,
     )
     target_um: float = column(
-        "target", "end of the setpoint's ramp", POSITION, "/loop/position", colour=WHITE, width=1.0, published=True
+        "target",
+        "end of the setpoint's ramp",
+        POSITION,
+        "/loop/position",
+        colour=WHITE,
+        width=1.0,
+        published=True,
     )
     setpoint_um: float = column(
-        "setpoint", "setpoint of the loop, with the trim", POSITION, "/loop/position", colour=ORANGE, published=True
+        "setpoint",
+        "setpoint of the loop, with the trim",
+        POSITION,
+        "/loop/position",
+        colour=ORANGE,
+        published=True,
     )
     displacement_um: float = column(
         "reading",
@@ -300,10 +348,16 @@ class ColumnValues:
         POSITION,
         "/loop/position",
     )
-    error_um: float = column("error", "setpoint minus process value", ERROR, "/loop/error", published=True)
+    error_um: float = column(
+        "error", "setpoint minus process value", ERROR, "/loop/error", published=True
+    )
     p_um_per_s: float = column("P", "proportional term", TERMS, "/loop/terms", decimals=3)
-    i_um_per_s: float = column("I", "integral term", TERMS, "/loop/terms", colour=ORANGE, decimals=3)
-    d_um_per_s: float = column("D", "derivative term", TERMS, "/loop/terms", colour=VIOLET, decimals=3)
+    i_um_per_s: float = column(
+        "I", "integral term", TERMS, "/loop/terms", colour=ORANGE, decimals=3
+    )
+    d_um_per_s: float = column(
+        "D", "derivative term", TERMS, "/loop/terms", colour=VIOLET, decimals=3
+    )
     feedforward_um_per_s: float = column(
         "feed-forward",
         "flow for known disturbances and the setpoint's ramp",
@@ -322,13 +376,29 @@ class ColumnValues:
         decimals=3,
     )
     flow_um_per_s: float = column(
-        "flow", "the pump's flow, as motion of the centre", FLOW, "/loop/flow", decimals=3, published=True
+        "flow",
+        "the pump's flow, as motion of the centre",
+        FLOW,
+        "/loop/flow",
+        decimals=3,
+        published=True,
     )
     pump_fraction: float = column(
-        "pump", "pump command, share of full scale", DRIVE, "/pump/drive", decimals=3, published=True
+        "pump",
+        "pump command, share of full scale",
+        DRIVE,
+        "/pump/drive",
+        decimals=3,
+        published=True,
     )
     vent_fraction: float = column(
-        "vent", "vent command, share of full scale", DRIVE, "/pump/drive", colour=RED, decimals=3, published=True
+        "vent",
+        "vent command, share of full scale",
+        DRIVE,
+        "/pump/drive",
+        colour=RED,
+        decimals=3,
+        published=True,
     )
     pump_readback_fraction: float = column(
         "pump read-back",
@@ -349,7 +419,12 @@ class ColumnValues:
         decimals=3,
     )
     gauge_pressure_pa: float = column(
-        "gauge pressure", "pressure in the mirror above ambient", GAUGE, "/gas/pressure", decimals=1, published=True
+        "gauge pressure",
+        "pressure in the mirror above ambient",
+        GAUGE,
+        "/gas/pressure",
+        decimals=1,
+        published=True,
     )
     ambient_pressure_pa: float = column(
         "ambient pressure",
@@ -369,11 +444,16 @@ class ColumnValues:
         published=True,
     )
     gas_temperature_c: float = column(
-        "gas temperature", "temperature of the gas in the mirror", TEMPERATURES, "/gas/temperature", published=True
+        "gas temperature",
+        "temperature of the gas in the mirror",
+        TEMPERATURES,
+        "/gas/temperature",
+        published=True,
     )
     displacement_quality: float = column(
         "displacement quality",
-        "quality code of the laser's reading; 0 is good, missing where the optics hold without a laser",
+        "quality code of the laser's reading; 0 is good, missing where the optics hold "
+        "without a laser",
         RECORD,
         "/tick/record",
         colour=RED,
@@ -381,10 +461,19 @@ class ColumnValues:
         aggregation=_EXTREMES,
     )
     sample_counter: float = column(
-        "sample counter", "the board's count of its samples", RECORD, "/tick/record", kind=Kind.COUNT
+        "sample counter",
+        "the board's count of its samples",
+        RECORD,
+        "/tick/record",
+        kind=Kind.COUNT,
     )
     device_time_s: float = column(
-        "device time", "the board's clock at its sample", RECORD, "/tick/record", colour=ORANGE, decimals=3
+        "device time",
+        "the board's clock at its sample",
+        RECORD,
+        "/tick/record",
+        colour=ORANGE,
+        decimals=3,
     )
     leak_um_per_s: float = column(
         "leak",
@@ -397,7 +486,13 @@ class ColumnValues:
         published=True,
     )
     trim_um: float = column(
-        "trim", "the shape loop's part of the setpoint", TRIM, "/shape/trim", colour=VIOLET, width=2.0, published=True
+        "trim",
+        "the shape loop's part of the setpoint",
+        TRIM,
+        "/shape/trim",
+        colour=VIOLET,
+        width=2.0,
+        published=True,
     )
     truth_displacement_um: float = column(
         "true centre",
@@ -437,16 +532,29 @@ class ColumnValues:
         colour=GREY,
         width=1.0,
     )
-    optics_innovation: float = column("optics innovation", "as the laser's", INNOVATIONS, "/estimate/innovations")
+    optics_innovation: float = column(
+        "optics innovation", "as the laser's", INNOVATIONS, "/estimate/innovations"
+    )
     barometer_innovation: float = column(
-        "barometer innovation", "as the laser's", INNOVATIONS, "/estimate/innovations", colour=ORANGE, width=1.0
+        "barometer innovation",
+        "as the laser's",
+        INNOVATIONS,
+        "/estimate/innovations",
+        colour=ORANGE,
+        width=1.0,
     )
     thermometer_innovation: float = column(
-        "thermometer innovation", "as the laser's", INNOVATIONS, "/estimate/innovations", colour=RED, width=1.0
+        "thermometer innovation",
+        "as the laser's",
+        INNOVATIONS,
+        "/estimate/innovations",
+        colour=RED,
+        width=1.0,
     )
     interlocks_open: float = column(
         "open interlocks",
-        "bit i: interlock i of the configuration is open or lost; missing without interlocks or without a reading",
+        "bit i: interlock i of the configuration is open or lost; missing without interlocks "
+        "or without a reading",
         RECORD,
         "/interlocks/open",
         colour=RED,
@@ -455,7 +563,8 @@ class ColumnValues:
 
 
 COLUMNS: dict[str, TelemetryColumn] = {
-    each.name: TelemetryColumn(each.name, **each.metadata[_TABLE_KEY]) for each in fields(ColumnValues)
+    each.name: TelemetryColumn(each.name, **each.metadata[_TABLE_KEY])
+    for each in fields(ColumnValues)
 }
 
 # Group by group: the order for people.

@@ -58,13 +58,19 @@ class DeviceError(CommandError):
 
 def os_reason(error: OSError) -> str:
     """The operating system's reason, for use within a sentence."""
-    text = (error.strerror or str(error)).partition(" (while attempting")[0]  # what the socket module adds
+    text = (error.strerror or str(error)).partition(" (while attempting")[
+        0
+    ]  # what the socket module adds
     return text[:1].lower() + text[1:]
 
 
 @contextmanager
-def writing(target: Path, kind: type[CommandError] = InputError, remedy: str = "") -> Iterator[None]:
-    """Turn an OSError of the block, which writes `target`, into a command's error with the reason and a remedy."""
+def writing(
+    target: Path, kind: type[CommandError] = InputError, remedy: str = ""
+) -> Iterator[None]:
+    """Turn an OSError of the block, which writes `target`, into a command's error with the reason
+    and a remedy.
+    """
     try:
         yield
     except OSError as error:
@@ -73,7 +79,9 @@ def writing(target: Path, kind: type[CommandError] = InputError, remedy: str = "
 
 @contextmanager
 def named(source: Path | None) -> Iterator[None]:
-    """Put the file before an error of the block that begins with a key of it, such as `devices.pump: ...`."""
+    """Put the file before an error of the block that begins with a key of it, such as
+    `devices.pump: ...`.
+    """
     try:
         yield
     except InputError as error:

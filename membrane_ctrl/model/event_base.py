@@ -1,8 +1,9 @@
-"""What an event is: one class with its fields, level, sentence, and the notices that it opens or closes.
+"""What an event is: one class with its fields, level, sentence, and the notices that it opens or
+closes.
 
-Recorder, summary, alarms, page, console, report and bridges read the class. As JSON, events are the lines of
-`events.jsonl`, without their times. A field is a key of the line (`from_` is "from", a Python keyword). Keys with
-None as default are omitted if None.
+Recorder, summary, alarms, page, console, report and bridges read the class. As JSON, events are the
+lines of `events.jsonl`, without their times. A field is a key of the line (`from_` is "from", a
+Python keyword). Keys with None as default are omitted if None.
 """
 
 from collections.abc import Iterator, Mapping
@@ -39,7 +40,8 @@ class Event:
     kind : str
         Kind of the lines.
     sentence : str
-        Template of the sentence (`prose.fill`) over the keys of the line and properties of the class.
+        Template of the sentence (`prose.fill`) over the keys of the line and properties of the
+        class.
     level : LogLevel
     opens, closes : tuple of Topic
         Topics of the notices that it may open or close.
@@ -53,7 +55,8 @@ class Event:
         It is synced to the disk at once: a power cut may follow.
     """
 
-    line_kind: ClassVar[str] = ""  # of the lines; `kind` of an instance is the same, unless it is unknown
+    # of the lines; `kind` of an instance is the same, unless it is unknown
+    line_kind: ClassVar[str] = ""
     _template: ClassVar[str] = "{message}"
     _level: ClassVar[LogLevel] = LogLevel.INFO
     _subject: ClassVar[str] = ""
@@ -63,7 +66,9 @@ class Event:
     urgent: ClassVar[bool] = False
     opens: ClassVar[tuple[Topic, ...]] = ()
     closes: ClassVar[tuple[Topic, ...]] = ()
-    keys: ClassVar[tuple[tuple[Field[Any], str], ...]] = ()  # the fields, each with its key in the line
+    keys: ClassVar[
+        tuple[tuple[Field[Any], str], ...]
+    ] = ()  # the fields, each with its key in the line
 
     def __init_subclass__(
         cls,
@@ -100,11 +105,18 @@ class Event:
 
     @property
     def sentence(self) -> str:
-        """One sentence on the event for people, with the remedy if there is one; else its fields."""
+        """One sentence on the event for people, with the remedy if there is one;
+        else its fields.
+        """
         template = self._choose_template()
         line = self.to_dict()
-        values = {name: getattr(self, name) for name in prose.fields_of(template) if hasattr(self, name)} | line
-        shown = {name: ", ".join(map(str, v)) if isinstance(v, tuple | list) else v for name, v in values.items()}
+        values = {
+            name: getattr(self, name) for name in prose.fields_of(template) if hasattr(self, name)
+        } | line
+        shown = {
+            name: ", ".join(map(str, v)) if isinstance(v, tuple | list) else v
+            for name, v in values.items()
+        }
         try:
             filled = prose.fill(template, shown)
         except (ValueError, TypeError):  # a number that is none
@@ -119,7 +131,12 @@ class Event:
     @property
     def notable(self) -> bool:
         """Whether logs and reports show it."""
-        return self._notable or self.level is not LogLevel.INFO or bool(self.opens) or bool(self.closes)
+        return (
+            self._notable
+            or self.level is not LogLevel.INFO
+            or bool(self.opens)
+            or bool(self.closes)
+        )
 
     @property
     def plot_mark(self) -> str:
@@ -141,18 +158,23 @@ class Event:
 
     def to_dict(self) -> EventLine:
         """The line, without its times."""
-        values = ((key, getattr(self, field.name), field.default is MISSING) for field, key in self.keys)
+        values = (
+            (key, getattr(self, field.name), field.default is MISSING) for field, key in self.keys
+        )
         return {"kind": self.kind} | {
             key: value for key, value, is_required in values if is_required or value is not None
         }
 
     def numbers(self) -> tuple[float, ...]:
-        """Numbers and codes of the event, in the order of its fields; texts and missing values are left out.
+        """Numbers and codes of the event, in the order of its fields; texts and missing values are
+        left out.
 
-        Together with `kind` they identify what happened, independently of the wording: the checksum of a tick covers
-        them. A table counts with its numbers, in the order of its keys.
+        Together with `kind` they identify what happened, independently of the wording: the checksum
+        of a tick covers them. A table counts with its numbers, in the order of its keys.
         """
-        return tuple(number for field, _ in self.keys for number in _numbers_in(getattr(self, field.name)))
+        return tuple(
+            number for field, _ in self.keys for number in _numbers_in(getattr(self, field.name))
+        )
 
 
 def _numbers_in(value: object) -> Iterator[float]:
@@ -171,8 +193,15 @@ def _numbers_in(value: object) -> Iterator[float]:
 def list_fields(line: EventLine) -> str:
     """Return the kind and the fields of a line in words, for an event without a sentence."""
     kind = str(line.get("kind", "?"))
-    shown = {key: value for key, value in line.items() if key not in _ENVELOPE and value not in (None, "")}
-    details = [f"{key} {value:.6g}" if isinstance(value, float) else f"{key} {value}" for key, value in shown.items()]
+    shown = {
+        key: value
+        for key, value in line.items()
+        if key not in _ENVELOPE and value not in (None, "")
+    }
+    details = [
+        f"{key} {value:.6g}" if isinstance(value, float) else f"{key} {value}"
+        for key, value in shown.items()
+    ]
     return prose.for_people(f"{kind}: {', '.join(details)}" if details else kind)
 
 

@@ -9,7 +9,12 @@ from membrane_ctrl.model.event_base import LogLevel
 from membrane_ctrl.model.notices import GLITCH_S, Notice, NoticeChanges, NoticeKey, Notices, Topic
 
 _COMMAND_UNITS = {"setpoint": "µm", "manual": "µm/s", "gains": "s on trial"}  # of a command's value
-_COMMAND_MARKS = {"setpoint": "setpoint", "pause": "pause", "resume": "pause", "mark": "mark"}  # others: "command"
+_COMMAND_MARKS = {
+    "setpoint": "setpoint",
+    "pause": "pause",
+    "resume": "pause",
+    "mark": "mark",
+}  # others: "command"
 
 
 class StateEntered(
@@ -27,7 +32,9 @@ class StateEntered(
     why: str
 
     def notice_changes(self, standing: Notices) -> NoticeChanges:
-        """Latch a fault that has held the flow for too long; end all faults with the state `fault`."""
+        """Latch a fault that has held the flow for too long;
+        end all faults with the state `fault`.
+        """
         if self.from_ == "fault":
             return NoticeChanges(closed=tuple(NoticeKey(topic) for topic in self.closes))
         glitch = standing.get(NoticeKey(Topic.GLITCH))
@@ -46,7 +53,8 @@ class Why(Event, kind="why", sentence="{why}"):
 class Fault(
     Event,
     kind="fault",
-    sentence="Fault {name}[: {cause}][ ({seen})][. Do: {remedy}][. Limit: {limit}][; safe level {safe_level}]",
+    sentence="Fault {name}[: {cause}][ ({seen})][. Do: {remedy}][. Limit: {limit}][; safe level "
+    "{safe_level}]",
     level=LogLevel.ERROR,
     opens=(Topic.FAULT, Topic.GLITCH),
     delay_s=GLITCH_S,
@@ -80,13 +88,20 @@ def latched_notice(text: str) -> Notice:
     return Notice(NoticeKey(Topic.FAULT), text, severity="critical", always_new=True)
 
 
-class Cleared(Event, kind="cleared", sentence="Fault[ {name}] is over: its cause has gone", closes=(Topic.GLITCH,)):
+class Cleared(
+    Event,
+    kind="cleared",
+    sentence="Fault[ {name}] is over: its cause has gone",
+    closes=(Topic.GLITCH,),
+):
     """The cause of a fault that only held the flow has gone."""
 
     name: str
 
 
-class Resumed(Event, kind="resumed", sentence="Fault {name} is cleared by the resume rule", notable=True):
+class Resumed(
+    Event, kind="resumed", sentence="Fault {name} is cleared by the resume rule", notable=True
+):
     """A latched fault was cleared by the resume rule."""
 
     name: str
@@ -103,7 +118,8 @@ class ShapeLoopState(Event, kind="shape", sentence="Shape loop {state}[: {reason
 class CommandTaken(
     Event,
     kind="command",
-    sentence='Command {command}[ {value:g} {unit}][ "{text}"][ by {who}][: {why}][. Refused: {refused}]',
+    sentence='Command {command}[ {value:g} {unit}][ "{text}"][ by {who}][: {why}][. Refused: '
+    "{refused}]",
     notable=True,
 ):
     """A tick executed or refused a command."""
@@ -173,14 +189,19 @@ class LockRemoved(
 
 
 class GainsReverted(
-    Event, kind="gains_reverted", sentence="Gains on trial are reverted: {why}", level=LogLevel.WARNING
+    Event,
+    kind="gains_reverted",
+    sentence="Gains on trial are reverted: {why}",
+    level=LogLevel.WARNING,
 ):
     """Gains on trial were reverted."""
 
     why: str
 
 
-class ExperimentEnded(Event, kind="experiment", sentence="Experiment {experiment} ended[: {reason}]", notable=True):
+class ExperimentEnded(
+    Event, kind="experiment", sentence="Experiment {experiment} ended[: {reason}]", notable=True
+):
     """An experiment is over; `end` is how (`machine.ExperimentEnd`)."""
 
     experiment: str
@@ -201,7 +222,8 @@ class FaultySensor(StrEnum):
 class Plausibility(
     Event,
     kind="plausibility",
-    sentence="Laser and camera disagree[, {culprit} is wrong][ ({readings})]. Do: check the laser's mount, the "
+    sentence="Laser and camera disagree[, {culprit} is wrong][ ({readings})]. Do: check the laser's "  # noqa: E501
+    "mount, the "
     "camera and the screen",
     level=LogLevel.WARNING,
     opens=(Topic.PLAUSIBILITY,),
@@ -220,7 +242,9 @@ class Plausibility(
     @property
     def culprit(self) -> str:
         """The wrong one; empty if that is not known."""
-        return {FaultySensor.LASER: "the laser", FaultySensor.OPTICS: "the camera"}.get(self.faulty, "")
+        return {FaultySensor.LASER: "the laser", FaultySensor.OPTICS: "the camera"}.get(
+            self.faulty, ""
+        )
 
     @property
     def level(self) -> LogLevel:
@@ -232,7 +256,9 @@ class Plausibility(
 
 
 class HeldBy(Event, kind="held_by", sentence="The mirror is held by {sensors}[; jumped: {jumped}]"):
-    """Which sensors the estimate of the centre follows now, and which of them have jumped, with the distance."""
+    """Which sensors the estimate of the centre follows now, and which of them have jumped, with the
+    distance.
+    """
 
     sensors: tuple[str, ...]
     jumped: tuple[str, ...]
@@ -268,9 +294,11 @@ class MaintenanceOver(
 class PumpLearned(
     Event,
     kind="pump",
-    sentence="The pump gives {scale:.3f} of its curve, +- {sigma:.3f}; the loop uses {correction:.3f}",
+    sentence="The pump gives {scale:.3f} of its curve, +- {sigma:.3f}; the loop uses {correction:.3f}",  # noqa: E501
 ):
-    """What is known of the pump: its flow relative to the configured curve, one standard error, the scale in use."""
+    """What is known of the pump: its flow relative to the configured curve, one standard error, the
+    scale in use.
+    """
 
     scale: float
     sigma: float
@@ -285,7 +313,9 @@ class InterlockOpened(
     opens=(Topic.INTERLOCK,),
     subject="name",
 ):
-    """The circuit of an interlock opened, or its signal was lost; `text` is the configuration's, for people."""
+    """The circuit of an interlock opened, or its signal was lost; `text` is the configuration's,
+    for people.
+    """
 
     name: str
     text: str
@@ -293,7 +323,11 @@ class InterlockOpened(
 
 
 class InterlockClosed(
-    Event, kind="interlock_closed", sentence="Interlock {name} is closed", closes=(Topic.INTERLOCK,), subject="name"
+    Event,
+    kind="interlock_closed",
+    sentence="Interlock {name} is closed",
+    closes=(Topic.INTERLOCK,),
+    subject="name",
 ):
     """The circuit of an interlock is closed again."""
 

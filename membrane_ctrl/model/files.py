@@ -1,9 +1,11 @@
 """Files in untrusted folders: regular files only, no link followed, every read bounded.
 
-A run folder or a capture set may come by mail or in an archive. Its files are opened through a handle of the folder,
-without following links. A write leaves either the old or the complete new file, even after a power cut.
+A run folder or a capture set may come by mail or in an archive. Its files are opened through a
+handle of the folder, without following links. A write leaves either the old or the complete new
+file, even after a power cut.
 
-The folder itself is trusted (a command resolves the path that the user named); its subfolders and files are not.
+The folder itself is trusted (a command resolves the path that the user named); its subfolders and
+files are not.
 """
 
 import contextlib
@@ -16,13 +18,22 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import BinaryIO, TextIO
 
-# A summary or a configuration is a few kilobytes; parsed JSON and TOML take fifty times the memory of their text.
+# A summary or a configuration is a few kilobytes; parsed JSON and TOML take fifty times the memory
+# of their text.
 SMALL_BYTES = 4_000_000
 _FOLDER = os.O_RDONLY | os.O_DIRECTORY | os.O_NOFOLLOW | os.O_CLOEXEC
 # non-blocking: opening a pipe without a writer would block
 _READ = os.O_RDONLY | os.O_NOFOLLOW | os.O_NONBLOCK | os.O_NOCTTY | os.O_CLOEXEC
 _NEW = os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_NOFOLLOW | os.O_CLOEXEC
-_APPEND = os.O_WRONLY | os.O_CREAT | os.O_APPEND | os.O_NOFOLLOW | os.O_NONBLOCK | os.O_NOCTTY | os.O_CLOEXEC
+_APPEND = (
+    os.O_WRONLY
+    | os.O_CREAT
+    | os.O_APPEND
+    | os.O_NOFOLLOW
+    | os.O_NONBLOCK
+    | os.O_NOCTTY
+    | os.O_CLOEXEC
+)
 
 
 @contextlib.contextmanager
@@ -41,7 +52,8 @@ def folder_handle(folder: Path) -> Iterator[int]:
 def open_plain(path: Path, follow: bool = False) -> BinaryIO:
     """A plain file, opened for reading; `follow` links of a path that the user named.
 
-    Raises OSError if it is missing, a link, in a linked folder, or no plain file; `strerror` says which.
+    Raises OSError if it is missing, a link, in a linked folder, or no plain file; `strerror` says
+    which.
     """
     with contextlib.ExitStack() as stack:
         if follow:
@@ -53,22 +65,32 @@ def open_plain(path: Path, follow: bool = False) -> BinaryIO:
 
 
 def read_bytes(path: Path, most_bytes: int, follow: bool = False) -> bytes:
-    """The content of a plain file. Raises OSError as `open_plain`, and for more than `most_bytes`."""
+    """The content of a plain file. Raises OSError as `open_plain`,
+    and for more than `most_bytes`.
+    """
     with open_plain(path, follow) as file:
         size = os.fstat(file.fileno()).st_size
         data = file.read(size) if size <= most_bytes else b""  # of a growing file, the part so far
     if size > most_bytes:
-        raise OSError(errno.EFBIG, f"{size / 1e6:.0f} MB, above the limit of {most_bytes / 1e6:.0f} MB", str(path))
+        raise OSError(
+            errno.EFBIG,
+            f"{size / 1e6:.0f} MB, above the limit of {most_bytes / 1e6:.0f} MB",
+            str(path),
+        )
     return data
 
 
-def read_text(path: Path, most_bytes: int = SMALL_BYTES, errors: str = "strict", follow: bool = False) -> str:
+def read_text(
+    path: Path, most_bytes: int = SMALL_BYTES, errors: str = "strict", follow: bool = False
+) -> str:
     """As `read_bytes`, decoded. Raises also UnicodeDecodeError, depending on `errors`."""
     return read_bytes(path, most_bytes, follow).decode("utf-8", errors)
 
 
 def users(path: Path) -> Path:
-    """A path named by the user, with its folder's links resolved; writing replaces the file itself, link or not."""
+    """A path named by the user, with its folder's links resolved; writing replaces the file itself,
+    link or not.
+    """
     return path.parent.resolve() / path.name
 
 
@@ -114,7 +136,9 @@ def append_text(path: Path, text: str) -> None:
         with os.fdopen(descriptor, "ab") as file:
             # a second name may belong to a file elsewhere
             if os.fstat(file.fileno()).st_nlink > 1:
-                raise OSError(errno.EMLINK, "has a hard link elsewhere, and is not written", str(path))
+                raise OSError(
+                    errno.EMLINK, "has a hard link elsewhere, and is not written", str(path)
+                )
             file.write(text.encode("utf-8", "backslashreplace"))
 
 
@@ -144,7 +168,9 @@ def make_folder(path: Path) -> Path:
 
 @contextlib.contextmanager
 def scratch_folder(folder: Path, prefix: str) -> Iterator[Path]:
-    """A private temporary folder within a folder, for programs that write by name. Raises OSError."""
+    """A private temporary folder within a folder, for programs that write by name.
+    Raises OSError.
+    """
     with folder_handle(folder), tempfile.TemporaryDirectory(prefix=prefix, dir=folder) as scratch:
         yield Path(scratch)
 

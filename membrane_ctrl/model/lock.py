@@ -1,7 +1,7 @@
 """A lock: a person's order that the mirror must not be moved (lock-out, tag-out). Plain data.
 
-Locks are separate from faults. Each has its author and a word. The author removes it, or a person who types the
-displayed word: that is a deliberate act, which a click or a program's routine is not.
+Locks are separate from faults. Each has its author and a word. The author removes it, or a person
+who types the displayed word: that is a deliberate act, which a click or a program's routine is not.
 """
 
 from collections.abc import Collection, Sequence
@@ -20,7 +20,8 @@ class Lock:
     word: str  # names the lock; typing it removes another person's lock
     text: str  # why the mirror must not move
     author: str  # who set it, for people
-    account: str = ""  # login of its author; empty: set without a login, so that nobody is its author
+    # login of its author; empty: set without a login, so that nobody is its author
+    account: str = ""
     session: str = ""  # connection of its author
     set_utc: str = ""  # when, ISO 8601
 

@@ -1,4 +1,6 @@
-"""Notices: conditions that stand from one event to another. Displays list them, and alarms are sent about them."""
+"""Notices: conditions that stand from one event to another. Displays list them, and alarms are sent
+about them.
+"""
 
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -30,7 +32,8 @@ class Topic(StrEnum):
     RUN_END = "run_ended"
 
 
-# Displays show these with more details than the notice has: the fault with its remedy, locks with author and word.
+# Displays show these with more details than the notice has: the fault with its remedy, locks with
+# author and word.
 SHOWN_WITH_DETAILS = frozenset({Topic.FAULT, Topic.GLITCH, Topic.LOCK, Topic.LOCK_STORAGE})
 
 
@@ -42,7 +45,9 @@ class NoticeKey(NamedTuple):
 
     @property
     def alarm(self) -> str:
-        """Name of the alarm about it; several notices may be one alarm, as all files on a full disk are."""
+        """Name of the alarm about it; several notices may be one alarm, as all files on a full disk
+        are.
+        """
         if self.topic is Topic.MAINTENANCE:
             return f"maintenance_{self.subject}"
         if self.topic is Topic.CHILD:
@@ -58,7 +63,8 @@ class Notice:
     text: str  # one sentence
     severity: Severity = "warning"
     delay_s: float = 0.0  # an alarm is sent once it has stood for so long
-    # Once it is over, the next one is a new alarm, however soon; otherwise a condition that soon returns is the same.
+    # Once it is over, the next one is a new alarm, however soon; otherwise a condition that soon
+    # returns is the same.
     always_new: bool = False
 
     @property

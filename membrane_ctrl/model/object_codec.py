@@ -1,8 +1,9 @@
 """Converts objects of our classes to plain data for JSON and back, bit by bit.
 
-The reader makes only what the classes declare: the fields of a dataclass; of another class the attributes of an
-example, by the types that its methods annotate (`self.x: T = ...`) or else by those of the example's values. It calls
-no constructor, and refuses an attribute that is missing, unknown or of another type.
+The reader makes only what the classes declare: the fields of a dataclass; of another class the
+attributes of an example, by the types that its methods annotate (`self.x: T = ...`) or else by
+those of the example's values. It calls no constructor, and refuses an attribute that is missing,
+unknown or of another type.
 """
 
 import ast
@@ -37,7 +38,9 @@ class CodecError(ValueError):
 
 
 class Special(NamedTuple):
-    """A custom encoding for a class and its subclasses; raises TypeError for objects that cannot be encoded."""
+    """A custom encoding for a class and its subclasses; raises TypeError for objects that cannot be
+    encoded.
+    """
 
     encode: Callable[[Any], Any]
     decode: Callable[[Any, type], Any]
@@ -56,7 +59,9 @@ ESTIMATE = Special(lambda estimate: base64.b64encode(pack_estimate(estimate)).de
 
 
 def encode(value: object, specials: Specials) -> Any:
-    """Encode an object. Raises TypeError for unsupported types, and for objects reachable by two ways."""
+    """Encode an object. Raises TypeError for unsupported types, and for objects reachable by two
+    ways.
+    """
     return _encoded(value, specials, set())
 
 
@@ -73,7 +78,10 @@ def _encoded(value: Any, specials: Specials, seen: set[int]) -> Any:
     if kind is dict:
         if all(type(key) is str for key in value):
             return {key: _encoded(item, specials, seen) for key, item in value.items()}
-        return [[_encoded(key, specials, seen), _encoded(item, specials, seen)] for key, item in value.items()]
+        return [
+            [_encoded(key, specials, seen), _encoded(item, specials, seen)]
+            for key, item in value.items()
+        ]
     if isinstance(value, (np.ndarray, np.generic)):
         data = base64.b64encode(np.ascontiguousarray(value).tobytes()).decode()
         return {"dtype": value.dtype.str, "shape": value.shape, "data": data}
@@ -100,7 +108,8 @@ def _special(kind: type, specials: Specials) -> Special | None:
 
 
 class Decoder:
-    """Makes objects from `encode`'s data; `examples` has an object of every class that is not a dataclass.
+    """Makes objects from `encode`'s data; `examples` has an object of every class that is not a
+    dataclass.
 
     Raises TypeError for an attribute whose type the examples do not reveal.
     """
@@ -119,21 +128,34 @@ class Decoder:
         if kind in (*_SEQUENCES, deque, dict):
             for item in example.values() if kind is dict else example:
                 self._learn(item)
-        elif kind not in self._classes and kind.__module__.startswith(_OURS) and not self._is_leaf(kind):
+        elif (
+            kind not in self._classes
+            and kind.__module__.startswith(_OURS)
+            and not self._is_leaf(kind)
+        ):
             declared = _declared(kind)
             values = {name: getattr(example, name) for name in _attributes(example)}
             self._classes[kind] = {
-                name: declared[name] if name in declared else _type_of(value, f"{kind.__name__}.{name}")
+                name: declared[name]
+                if name in declared
+                else _type_of(value, f"{kind.__name__}.{name}")
                 for name, value in values.items()
             }
             for value in values.values():
                 self._learn(value)
 
     def _learn_hint(self, hint: Any) -> None:
-        """Learn dataclasses absent from the examples, such as the result of a test that has not run."""
+        """Learn dataclasses absent from the examples, such as the result of a test that has not
+        run.
+        """
         for part in get_args(hint):
             self._learn_hint(part)
-        if not isinstance(hint, type) or hint in self._classes or self._is_leaf(hint) or not is_dataclass(hint):
+        if (
+            not isinstance(hint, type)
+            or hint in self._classes
+            or self._is_leaf(hint)
+            or not is_dataclass(hint)
+        ):
             return
         self._classes[hint] = _declared(hint)
         for part in self._classes[hint].values():
@@ -165,7 +187,9 @@ class Decoder:
             return self._sequence(data, origin, parts, where)
         if isinstance(hint, type) and issubclass(hint, Enum):
             return _enum(data, hint, where)
-        if (special := _special(hint, self._specials) if isinstance(hint, type) else None) is not None:
+        if (
+            special := _special(hint, self._specials) if isinstance(hint, type) else None
+        ) is not None:
             return special.decode(data, hint)
         return self._object(data, hint, where)
 
@@ -184,8 +208,12 @@ class Decoder:
     def _dict(self, data: Any, key: Any, item: Any, where: str) -> dict[Any, Any]:
         pairs = list(data.items()) if isinstance(data, dict) else data
         _must(isinstance(pairs, list), where, data)
-        _must(all(isinstance(pair, (list, tuple)) and len(pair) == 2 for pair in pairs), where, data)
-        return {self.decode(name, key, where): self.decode(value, item, where) for name, value in pairs}
+        _must(
+            all(isinstance(pair, (list, tuple)) and len(pair) == 2 for pair in pairs), where, data
+        )
+        return {
+            self.decode(name, key, where): self.decode(value, item, where) for name, value in pairs
+        }
 
     def _deque(self, data: Any, hint: Any, where: str) -> deque[Any]:
         _must(isinstance(data, dict) and set(data) == {"maxlen", "items"}, where, data)
@@ -207,10 +235,14 @@ class Decoder:
         _must(isinstance(data, dict) and data.get(_CLASS) == kind.__qualname__, where, data)
         types = self._classes[kind]
         if changed := (data.keys() - {_CLASS}) ^ types.keys():
-            raise CodecError(f"another layout of {kind.__qualname__} ({', '.join(sorted(changed))})")
+            raise CodecError(
+                f"another layout of {kind.__qualname__} ({', '.join(sorted(changed))})"
+            )
         made = object.__new__(kind)
         for name, hint in types.items():
-            object.__setattr__(made, name, self.decode(data[name], hint, f"{kind.__qualname__}.{name}"))
+            object.__setattr__(
+                made, name, self.decode(data[name], hint, f"{kind.__qualname__}.{name}")
+            )
         return made
 
 
@@ -223,9 +255,13 @@ def _declared(kind: type) -> dict[str, Any]:
     found: dict[str, str] = {}
     for node in ast.walk(ast.parse(textwrap.dedent(inspect.getsource(kind)))):
         match node:
-            case ast.AnnAssign(target=ast.Attribute(value=ast.Name(id="self"), attr=name), annotation=annotation):
+            case ast.AnnAssign(
+                target=ast.Attribute(value=ast.Name(id="self"), attr=name), annotation=annotation
+            ):
                 found[name] = ast.unparse(annotation)
-    return get_type_hints(SimpleNamespace(__annotations__=found), vars(sys.modules[kind.__module__]))
+    return get_type_hints(
+        SimpleNamespace(__annotations__=found), vars(sys.modules[kind.__module__])
+    )
 
 
 def _type_of(value: Any, where: str) -> Any:
@@ -252,7 +288,11 @@ def _scalar(data: Any, hint: type, where: str) -> Any:
     """A number, word, bool or None; a NumPy scalar stays one."""
     if isinstance(data, dict):
         value = _array(data, where)
-        _must(value.shape == () and value.dtype.kind == {float: "f", int: "i", bool: "b"}.get(hint), where, data)
+        _must(
+            value.shape == () and value.dtype.kind == {float: "f", int: "i", bool: "b"}.get(hint),
+            where,
+            data,
+        )
         return value[()]
     if hint is float and type(data) is int:  # an attribute of type float may hold a whole number
         _must(abs(data) < _INT_MAX, where, "a number this large")
@@ -274,7 +314,11 @@ def _array(data: Any, where: str) -> NDArray[Any]:
     _must(isinstance(data, dict) and set(data) == {"dtype", "shape", "data"}, where, data)
     dtype, shape, text = data["dtype"], data["shape"], data["data"]
     _must(type(dtype) is str and dtype in _DTYPES and type(text) is str, where, dtype)
-    _must(type(shape) is list and len(shape) <= 2 and all(type(n) is int and n >= 0 for n in shape), where, shape)
+    _must(
+        type(shape) is list and len(shape) <= 2 and all(type(n) is int and n >= 0 for n in shape),
+        where,
+        shape,
+    )
     try:
         return np.frombuffer(base64.b64decode(text, validate=True), dtype).reshape(shape).copy()
     except ValueError:

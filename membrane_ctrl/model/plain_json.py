@@ -1,7 +1,7 @@
 """JSON for every reader, and safe reading of foreign JSON.
 
-NaN and infinity are written as null. Text deeper or longer than any of ours is refused before it exhausts memory or
-the stack.
+NaN and infinity are written as null. Text deeper or longer than any of ours is refused before it
+exhausts memory or the stack.
 """
 
 import hashlib
@@ -12,7 +12,8 @@ import zlib
 from collections.abc import Mapping
 from typing import Any
 
-# Limit on the values in a file: a value of two characters takes 64 bytes of memory, this many at most 200 MB.
+# Limit on the values in a file: a value of two characters takes 64 bytes of memory, this many at
+# most 200 MB.
 ELEMENTS_MAX = 6_000_000
 _DEPTH_MAX = 32
 _DIGITS_MAX = 19  # enough for a 64-bit counter; longer numbers are floats
@@ -20,7 +21,9 @@ _DIGITS_MAX = 19  # enough for a 64-bit counter; longer numbers are floats
 
 def dumps(value: Any, indent: int | None = None) -> str:
     """JSON text; NaN and infinity become null, unsupported types become their `str`."""
-    return json.dumps(_finite(value), ensure_ascii=False, default=str, allow_nan=False, indent=indent)
+    return json.dumps(
+        _finite(value), ensure_ascii=False, default=str, allow_nan=False, indent=indent
+    )
 
 
 def loads(text: str) -> Any:
@@ -33,7 +36,11 @@ def loads(text: str) -> Any:
     for _ in range(_DEPTH_MAX):
         if not inside:
             return value
-        items = (item for outer in inside for item in (outer.values() if isinstance(outer, dict) else outer))
+        items = (
+            item
+            for outer in inside
+            for item in (outer.values() if isinstance(outer, dict) else outer)
+        )
         inside = [item for item in items if isinstance(item, (dict, list))]
     raise ValueError("nested too deep")
 
@@ -57,9 +64,11 @@ def _finite(value: Any) -> Any:
     return value
 
 
-# Checksums of a run's small files. A JSON object gets a last member `crc32` over its values, not their spelling:
-# other programs may rewrite it. The configuration gets a comment as its first line, with the checksum of its text.
-# Files without a checksum (annotations, files edited by a person) are accepted.
+# Checksums of a run's small files. A JSON object gets a last member `crc32` over its values, not
+# their spelling: other programs may rewrite it. The configuration gets a comment as its first line,
+# with the checksum of its text. Files without a checksum (annotations, files edited by a person)
+# are
+# accepted.
 
 KEY = "crc32"
 _COMMENT = "# as run; CRC-32 of the text below: "
@@ -100,7 +109,9 @@ _HASHED = ("geometry", "covariance", "parameters", "camera", "pattern")
 
 
 def content_hash(tables: Mapping[str, Any]) -> str:
-    """Sixteen digits that identify a geometry in results and runs, whatever the order or layout of its tables."""
+    """Sixteen digits that identify a geometry in results and runs, whatever the order or layout of
+    its tables.
+    """
     content = {key: tables[key] for key in _HASHED if key in tables}
     text = json.dumps(content, sort_keys=True, default=list)
     return hashlib.sha256(text.encode()).hexdigest()[:16]

@@ -1,8 +1,8 @@
 """Which program wrote a file: its version and the commit of its source.
 
 All commits before a release have the same version, so the commit is stated beside it. A wheel or a
-source archive carries the commit in `BUILD_FILE`, which the build writes (`setup.py`). In a checkout,
-git describes it. The commit of any other folder is empty.
+source archive carries the commit in `BUILD_FILE`, which the build writes (`setup.py`). In a
+checkout, git describes it. The commit of any other folder is empty.
 """
 
 import os
@@ -26,9 +26,11 @@ _REFERENCE_BYTES_MAX = 4096
 
 @cache
 def program_commit() -> str:
-    """Commit of the running source: 12 hexadecimal digits, then `-dirty` if files were changed; empty if unknown.
+    """Commit of the running source: 12 hexadecimal digits, then `-dirty` if files were changed;
+    empty if unknown.
 
-    The first call of a process may start git, which takes some 20 ms. So call it before the first tick.
+    The first call of a process may start git, which takes some 20 ms. So call it before the first
+    tick.
     """
     built = _matching(_read_line(PACKAGE / BUILD_FILE))
     return built or find_commit(PACKAGE.parent)
@@ -40,12 +42,16 @@ def program_identity() -> str:
 
 
 def file_origin(schema: str) -> dict[str, str]:
-    """First members of a JSON or TOML file: its format with version, and the program and commit that wrote it."""
+    """First members of a JSON or TOML file: its format with version, and the program and commit
+    that wrote it.
+    """
     return {"schema": schema, "program": f"{NAME} {__version__}", "commit": program_commit()}
 
 
 def stated_program(table: Mapping[str, Any]) -> str:
-    """Program and commit stated in a file's members, as `program_identity`; empty if none is stated."""
+    """Program and commit stated in a file's members, as `program_identity`; empty if none is
+    stated.
+    """
     program, commit = table.get("program"), table.get("commit")
     if not isinstance(program, str) or not program:
         return ""
@@ -55,7 +61,8 @@ def stated_program(table: Mapping[str, Any]) -> str:
 def find_commit(checkout: Path) -> str:
     """Commit of a checkout's source, as `program_commit`; empty if the folder is no checkout.
 
-    Without git, or where git refuses the folder, the commit is read from `.git`, and changed files go unnoticed.
+    Without git, or where git refuses the folder, the commit is read from `.git`, and changed files
+    go unnoticed.
     """
     if not (checkout / ".git").exists():  # a checkout above this folder is another project's
         return ""
@@ -64,7 +71,9 @@ def find_commit(checkout: Path) -> str:
 
 def _describe_with_git(checkout: Path) -> str:
     words = ["git", "describe", "--always", "--dirty", "--exclude=*", f"--abbrev={_COMMIT_DIGITS}"]
-    environment = os.environ | {"GIT_OPTIONAL_LOCKS": "0"}  # writes nothing, not even a refreshed index
+    environment = os.environ | {
+        "GIT_OPTIONAL_LOCKS": "0"
+    }  # writes nothing, not even a refreshed index
     try:
         done = subprocess.run(
             words,

@@ -1,4 +1,6 @@
-"""Texts for people, made where they are shown: templates with optional parts, and units as people read them."""
+"""Texts for people, made where they are shown: templates with optional parts, and units as people
+read them.
+"""
 
 import re
 from collections.abc import Mapping

@@ -1,4 +1,6 @@
-"""Reasons of the controller: a code that decides, and a text for people that may be improved at any time."""
+"""Reasons of the controller: a code that decides, and a text for people that may be improved at any
+time.
+"""
 
 from dataclasses import dataclass
 from enum import StrEnum
@@ -48,7 +50,8 @@ class Reason(StateNode):
     Attributes
     ----------
     code : str
-        What decides whether it is another reason: a code, and what else distinguishes it, after points.
+        What decides whether it is another reason: a code, and what else distinguishes it, after
+        points.
     text : str
         For people, with numbers; empty if there is nothing to say.
     """
@@ -62,7 +65,9 @@ class Reason(StateNode):
 
 
 def make_reason(code: str, text: str, *details: object) -> Reason:
-    """Return a reason whose code is followed by details that make it another one, such as who asked."""
+    """Return a reason whose code is followed by details that make it another one, such as who
+    asked.
+    """
     return Reason(".".join(map(str, (code, *details))), text)
 
 

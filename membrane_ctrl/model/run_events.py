@@ -108,7 +108,8 @@ class UnreadableEvent(Event, kind="unreadable_event", level=LogLevel.ERROR):
 class LatchFailed(
     Event,
     kind="latch_failed",
-    sentence="The latched fault is not on the disk: {message}. Do: mend the disk; until then the next start would "
+    sentence="The latched fault is not on the disk: {message}. Do: mend the disk; until then the next "  # noqa: E501
+    "start would "
     "not see the fault",
     level=LogLevel.ERROR,
     opens=(Topic.LATCH,),
@@ -120,7 +121,10 @@ class LatchFailed(
 
 
 class LatchWritten(
-    Event, kind="latch_written", sentence="The latched fault's file is written again", closes=(Topic.LATCH,)
+    Event,
+    kind="latch_written",
+    sentence="The latched fault's file is written again",
+    closes=(Topic.LATCH,),
 ):
     """The latched fault's file is written again."""
 
@@ -128,7 +132,8 @@ class LatchWritten(
 class LockNotStored(
     Event,
     kind="lock_not_stored",
-    sentence="The lock {word} is not stored: {message}. Do: mend the disk; until then only this run knows the lock",
+    sentence="The lock {word} is not stored: {message}. Do: mend the disk; until then only this run "  # noqa: E501
+    "knows the lock",
     level=LogLevel.ERROR,
     opens=(Topic.LOCK_STORAGE,),
     subject="word",
@@ -141,7 +146,11 @@ class LockNotStored(
 
 
 class LockStored(
-    Event, kind="lock_stored", sentence="The lock {word} is stored", closes=(Topic.LOCK_STORAGE,), subject="word"
+    Event,
+    kind="lock_stored",
+    sentence="The lock {word} is stored",
+    closes=(Topic.LOCK_STORAGE,),
+    subject="word",
 ):
     """A lock, or its removal, that had failed is on the disk."""
 
@@ -201,7 +210,9 @@ class ChildRestarted(
     restarts: int
 
     def notice_changes(self, standing: Notices) -> NoticeChanges:
-        """End the notice of the child; a new recorder reports again what fails, so end those of the former one."""
+        """End the notice of the child; a new recorder reports again what fails, so end those of the
+        former one.
+        """
         closed = [NoticeKey(Topic.CHILD, self.child)]
         if self.child == RECORDER:
             closed += [key for key in standing if key.topic is Topic.RECORDING]
@@ -211,7 +222,7 @@ class ChildRestarted(
 class ChildGivenUp(
     Event,
     kind="child_given_up",
-    sentence="The {child} process ended too often and is not replaced for an hour. Do: check the run",
+    sentence="The {child} process ended too often and is not replaced for an hour. Do: check the run",  # noqa: E501
     level=LogLevel.ERROR,
     opens=(Topic.CHILD,),
     subject="child",
@@ -236,7 +247,9 @@ class AcquisitionState(Event, kind="acquisition", sentence="Acquisition {state}[
     @property
     def level(self) -> LogLevel:
         """A failure is an error; a camera that does not answer yet is a warning."""
-        return {"failed": LogLevel.ERROR, "retrying": LogLevel.WARNING}.get(self.state, LogLevel.INFO)
+        return {"failed": LogLevel.ERROR, "retrying": LogLevel.WARNING}.get(
+            self.state, LogLevel.INFO
+        )
 
     @property
     def notable(self) -> bool:
@@ -275,7 +288,9 @@ class Capture(
 
 
 class Vibrations(Event, kind="vibrations", sentence="Vibrations of the mirror: {message}"):
-    """The mirror's vibrations in a minute of tracked frames; a mode keeps its place, None where it was not heard."""
+    """The mirror's vibrations in a minute of tracked frames; a mode keeps its place, None where it
+    was not heard.
+    """
 
     frequency_hz: Any  # list of numbers and None
     amplitude_nm: Any  # as above, RMS over the mirror
@@ -322,7 +337,9 @@ class DiskLow(
     message: str
 
 
-class RecorderRecovered(Event, kind="recorder_recovered", closes=(Topic.RECORDING,), subject="what"):
+class RecorderRecovered(
+    Event, kind="recorder_recovered", closes=(Topic.RECORDING,), subject="what"
+):
     """`what` works again."""
 
     what: str
@@ -355,7 +372,9 @@ class RecorderDone(Event, kind="recorder_done", sentence="Recorder done"):
 # Control port and alarms.
 
 
-class PortAddresses(Event, kind="port", sentence="Control port open[ on {socket}][, TLS {tls}][, metrics {metrics}]"):
+class PortAddresses(
+    Event, kind="port", sentence="Control port open[ on {socket}][, TLS {tls}][, metrics {metrics}]"
+):
     """Where the control port listens."""
 
     socket: str | None = None
@@ -385,14 +404,20 @@ class PortFailed(
 
 
 class PortOpen(
-    Event, kind="port_open", sentence="Control port {port} works again", closes=(Topic.PORT,), subject="port"
+    Event,
+    kind="port_open",
+    sentence="Control port {port} works again",
+    closes=(Topic.PORT,),
+    subject="port",
 ):
     """The listener works again."""
 
     port: str
 
 
-class CommanderChanged(Event, kind="commander", sentence="Control taken by {who}[ (previously {former})][: {why}]"):
+class CommanderChanged(
+    Event, kind="commander", sentence="Control taken by {who}[ (previously {former})][: {why}]"
+):
     """Who has command now, and who had it before."""
 
     who: str | None
@@ -403,7 +428,9 @@ class CommanderChanged(Event, kind="commander", sentence="Control taken by {who}
         return self._template if self.who else "Control released[ by {former}][: {why}]"
 
 
-class Refused(Event, kind="refused", sentence="Refused {command} of {who}: {reason}", level=LogLevel.WARNING):
+class Refused(
+    Event, kind="refused", sentence="Refused {command} of {who}: {reason}", level=LogLevel.WARNING
+):
     """The port refused a request, and perhaps others not recorded."""
 
     who: str
@@ -414,7 +441,10 @@ class Refused(Event, kind="refused", sentence="Refused {command} of {who}: {reas
 
 
 class AlarmsAcknowledged(
-    Event, kind="alarms_acknowledged", sentence="Alarms acknowledged by {who}[: {why}]", notable=True
+    Event,
+    kind="alarms_acknowledged",
+    sentence="Alarms acknowledged by {who}[: {why}]",
+    notable=True,
 ):
     """Somebody acknowledged all alarms."""
 

@@ -7,7 +7,14 @@ from typing import Any
 
 from membrane_ctrl.model import events, run_events
 from membrane_ctrl.model.lock import Lock
-from membrane_ctrl.model.notices import SHOWN_WITH_DETAILS, Notice, NoticeKey, Notices, Topic, apply_changes
+from membrane_ctrl.model.notices import (
+    SHOWN_WITH_DETAILS,
+    Notice,
+    NoticeKey,
+    Notices,
+    Topic,
+    apply_changes,
+)
 from membrane_ctrl.model.reason import WhyCode
 from membrane_ctrl.model.telemetry import TelemetryRow
 
@@ -28,10 +35,13 @@ class RunStatus:
     shape_reason: str = ""  # of the shape loop
     acquisition: run_events.AcquisitionState | None = None  # the acquisition's last report
     geometry: run_events.GeometryInForce | None = None  # used by the cycles
-    loop: Mapping[str, Any] | None = None  # gains set during the run; None: those of the configuration
+    # gains set during the run; None: those of the configuration
+    loop: Mapping[str, Any] | None = None
     kept_loop: Mapping[str, Any] | None = None  # what a trial goes back to
     locks: tuple[Lock, ...] = ()  # set by people, oldest first
-    unstored: Mapping[str, str] = field(default_factory=dict)  # by a lock's word: why it is not on the disk
+    unstored: Mapping[str, str] = field(
+        default_factory=dict
+    )  # by a lock's word: why it is not on the disk
     latched: str = ""  # a fault of an earlier run that waits for `ack`
     trial_ends_s: float = math.nan  # when gains on trial are reverted; NaN: none are
     ended: bool = False
@@ -48,13 +58,19 @@ class RunStatus:
 
     @property
     def other_notices(self) -> tuple[Notice, ...]:
-        """Notices of which this status has no more than their text: those on neither faults nor locks."""
-        return tuple(notice for key, notice in self.notices.items() if key.topic not in SHOWN_WITH_DETAILS)
+        """Notices of which this status has no more than their text: those on neither faults nor
+        locks.
+        """
+        return tuple(
+            notice for key, notice in self.notices.items() if key.topic not in SHOWN_WITH_DETAILS
+        )
 
     @property
     def recording_problems(self) -> tuple[str, ...]:
         """What fails in the recording, a sentence each."""
-        return tuple(notice.short_text for key, notice in self.notices.items() if _concerns_recording(key))
+        return tuple(
+            notice.short_text for key, notice in self.notices.items() if _concerns_recording(key)
+        )
 
     def after_row(self, row: TelemetryRow) -> "RunStatus":
         """The status after a tick."""
@@ -77,7 +93,9 @@ class RunStatus:
                 fault = None if event.from_ == "fault" else self.fault
                 return replace(self, why=event.why, why_code="", fault=fault)
             case events.Fault():
-                return replace(self, fault=event, last_fault=event, last_fault_s=mono_s, faults=self.faults + 1)
+                return replace(
+                    self, fault=event, last_fault=event, last_fault_s=mono_s, faults=self.faults + 1
+                )
             case events.Cleared():
                 return replace(self, fault=None)
             case events.ShapeLoopState():
@@ -85,7 +103,14 @@ class RunStatus:
             case events.CommandTaken(refused=None):
                 return self._after_command(event, mono_s)
             case events.LockSet():
-                lock = Lock(event.word, event.text, event.author, event.account, event.session, event.set_utc)
+                lock = Lock(
+                    event.word,
+                    event.text,
+                    event.author,
+                    event.account,
+                    event.session,
+                    event.set_utc,
+                )
                 return replace(self, locks=(*self.locks, lock))
             case events.LockRemoved(word=word):
                 kept_locks = tuple(lock for lock in self.locks if lock.word != word)
@@ -124,7 +149,11 @@ class RunStatus:
 def gains_words(loop: Mapping[str, Any], trial_left_s: float | None) -> str:
     """Gains for a person, with the countdown of a trial."""
     on_trial = trial_left_s is not None and math.isfinite(trial_left_s)
-    trial = f"; on trial, reverted in {max(trial_left_s or 0.0, 0.0):.0f} s unless kept" if on_trial else ""
+    trial = (
+        f"; on trial, reverted in {max(trial_left_s or 0.0, 0.0):.0f} s unless kept"
+        if on_trial
+        else ""
+    )
     return f"Kp {loop['kp_per_s']:g} 1/s, Ti {loop['ti_s']:g} s, Td {loop['td_s']:g} s{trial}"
 
 

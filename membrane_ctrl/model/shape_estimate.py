@@ -1,9 +1,10 @@
 """The result of a measurement cycle, and its bytes for control, recorder and sessions.
 
-One line of JSON with the numbers and words, then the coefficients, then the upper half of the covariance in single
-precision: a variance to 1e-7 is more precise than its noise model, and the controller's inputs must be recorded
-exactly. A reader checks every length, type and range first,
-because a run folder may come from anywhere.
+One line of JSON with the numbers and words, then the coefficients, then the upper half of the
+covariance in single
+precision: a variance to 1e-7 is more precise than its noise model, and the controller's inputs must
+be recorded exactly. A reader checks every length, type and range first, because a run folder may
+come from anywhere.
 """
 
 import json
@@ -27,19 +28,23 @@ class ShapeEstimate:
     """Figure of the mirror from one cycle."""
 
     time_s: float  # middle of the exposures on the run's clock
-    # "full" (Gray codes taken), "fringes" (fringe orders carried over from the last absolute phase) or "track" (one
-    # frame of crossed fringes)
+    # "full" (Gray codes taken), "fringes" (fringe orders carried over from the last absolute phase)
+    # or "track" (one frame of crossed fringes)
     kind: Kind
-    # (terms,) in Noll's order, orthonormal over `mirror.radius_mm`, of the height; piston makes it 0 at the vertex
+    # (terms,) in Noll's order, orthonormal over `mirror.radius_mm`, of the height; piston makes it
+    # 0 at the vertex
     coeffs_um: FloatArray
-    # amplitude of the part of a Hencky bowl that the terms cannot represent, as the sag of that bowl
+    # amplitude of the part of a Hencky bowl that the terms cannot represent, as the sag of that
+    # bowl
     hencky_um: float
-    # (terms, terms) of `coeffs_um`, for changes: what this cycle does not share with others near its displacement
+    # (terms, terms) of `coeffs_um`, for changes: what this cycle does not share with others near
+    # its displacement
     covariance_um2: FloatArray
     sag_um: float  # height at `mirror.radius_mm`, mean over azimuth, above the vertex
     sag_sigma_um: float  # its standard deviation from `covariance_um2`
     displacement_um: float  # mean laser reading during the exposures (NaN without a laser)
-    # RMS of measured minus fitted slopes; of "track" the slopes that would leave as much light as the fit does
+    # RMS of measured minus fitted slopes; of "track" the slopes that would leave as much light as
+    # the fit does
     slope_residual_urad: float
     valid_fraction: float  # share of the analysis area with a slope
     modulation_median_adu: float  # fringe quality
@@ -48,39 +53,58 @@ class ShapeEstimate:
     reason: str = ""
     latency_s: float = float("nan")  # last frame to this result (filled by the acquisition)
     cycle: int = 0  # number of the cycle in the run (filled by the acquisition)
-    # standard deviation of the sag from what all cycles share (geometry, lens, screen, air, blur): a part of the
-    # sag's own beside `sag_sigma_um`, none of a change's; NaN if not stated
+    # standard deviation of the sag from what all cycles share (geometry, lens, screen, air, blur):
+    # a part of the sag's own beside `sag_sigma_um`, none of a change's; NaN if not stated
     geometry_sag_sigma_um: float = float("nan")
-    tracking_lost: bool = False  # the phases cannot be tracked from the last cycle: a full one is needed
+    # the phases cannot be tracked from the last cycle: a full one is needed
+    tracking_lost: bool = False
 
 
 _WORDS = {"kind": get_args(Kind), "verdict": get_args(Verdict)}
 _ARRAYS = ("coeffs_um", "covariance_um2")
 _OTHERS = {"reason", "cycle", "tracking_lost"}
-NUMBERS = tuple(field.name for field in fields(ShapeEstimate) if field.name not in {*_WORDS, *_ARRAYS, *_OTHERS})
+NUMBERS = tuple(
+    field.name for field in fields(ShapeEstimate) if field.name not in {*_WORDS, *_ARRAYS, *_OTHERS}
+)
 _KEYS = {*NUMBERS, *_WORDS, *_OTHERS, "terms"}
 _UPPER = np.triu_indices(ZERNIKE_TERMS)
 _LINE_BYTES_MAX = 8192  # the numbers take 0.5 kB; the rest is room for a reason
 _COEFFS_BYTES = 8 * ZERNIKE_TERMS
-ESTIMATE_BYTES_MAX = _LINE_BYTES_MAX + 1 + _COEFFS_BYTES + 4 * COVARIANCE_UPPER_SIZE  # of `pack_estimate`
+ESTIMATE_BYTES_MAX = (
+    _LINE_BYTES_MAX + 1 + _COEFFS_BYTES + 4 * COVARIANCE_UPPER_SIZE
+)  # of `pack_estimate`
 _LARGEST = 1e300  # excludes infinity, and integers that a float cannot hold
 
 
 def pack_estimate(estimate: ShapeEstimate) -> bytes:
-    """A shape estimate as bytes, bit-exact except for the covariance, which is rounded to single precision."""
-    head = {field.name: getattr(estimate, field.name) for field in fields(ShapeEstimate) if field.name not in _ARRAYS}
+    """A shape estimate as bytes, bit-exact except for the covariance, which is rounded to single
+    precision.
+    """
+    head = {
+        field.name: getattr(estimate, field.name)
+        for field in fields(ShapeEstimate)
+        if field.name not in _ARRAYS
+    }
     return packed_parts(head, estimate.coeffs_um, upper_half(estimate.covariance_um2))
 
 
 def upper_half(covariance_um2: FloatArray) -> NDArray[np.float32]:
-    """(COVARIANCE_UPPER_SIZE,) float32: the upper half of a symmetric (terms, terms) matrix, row by row."""
+    """(COVARIANCE_UPPER_SIZE,) float32: the upper half of a symmetric (terms, terms) matrix, row by
+    row.
+    """
     return ((covariance_um2 + covariance_um2.T) / 2)[_UPPER].astype("<f4")
 
 
-def packed_parts(head: Mapping[str, Any], coeffs_um: FloatArray, upper_um2: NDArray[np.float32]) -> bytes:
-    """Bytes of an estimate's numbers and words, coefficients (terms,) and upper half (COVARIANCE_UPPER_SIZE,)."""
+def packed_parts(
+    head: Mapping[str, Any], coeffs_um: FloatArray, upper_um2: NDArray[np.float32]
+) -> bytes:
+    """Bytes of an estimate's numbers and words, coefficients (terms,) and upper half
+    (COVARIANCE_UPPER_SIZE,).
+    """
     line = json.dumps({**head, "terms": ZERNIKE_TERMS}, default=float)
-    arrays = np.asarray(coeffs_um, dtype="<f8").tobytes() + np.asarray(upper_um2, dtype="<f4").tobytes()
+    arrays = (
+        np.asarray(coeffs_um, dtype="<f8").tobytes() + np.asarray(upper_um2, dtype="<f4").tobytes()
+    )
     return line.encode() + b"\n" + arrays
 
 
@@ -88,7 +112,9 @@ def unpack_estimate(data: bytes) -> ShapeEstimate:
     """Decode the bytes of `pack_estimate`. Raises ValueError for anything else."""
     line, _, arrays = data.partition(b"\n")
     if len(line) > _LINE_BYTES_MAX:
-        raise ValueError(f"shape estimate: {len(line)} bytes where at most {_LINE_BYTES_MAX} are expected")
+        raise ValueError(
+            f"shape estimate: {len(line)} bytes where at most {_LINE_BYTES_MAX} are expected"
+        )
     try:
         head = json.loads(line)
     except RecursionError:
@@ -107,12 +133,16 @@ def unpack_estimate(data: bytes) -> ShapeEstimate:
 
 
 def _require_valid(head: Any) -> None:
-    """Reduce `head` to the estimate's fields. Raises ValueError if one is missing, unknown or of a wrong type."""
+    """Reduce `head` to the estimate's fields. Raises ValueError if one is missing, unknown or of a
+    wrong type.
+    """
     if not isinstance(head, dict) or set(head) != _KEYS:
         raise ValueError("shape estimate: missing or unknown fields in the first line")
     terms = head.pop("terms")
     if terms != ZERNIKE_TERMS:
-        raise ValueError(f"shape estimate of {str(terms)[:12]} Zernike terms; this program has {ZERNIKE_TERMS}")
+        raise ValueError(
+            f"shape estimate of {str(terms)[:12]} Zernike terms; this program has {ZERNIKE_TERMS}"
+        )
     for name in NUMBERS:
         value = head[name]
         if type(value) not in (float, int) or abs(value) > _LARGEST:
@@ -130,11 +160,13 @@ def _require_valid(head: Any) -> None:
         raise ValueError("shape estimate: tracking_lost is neither true nor false")
 
 
-# Fringes weaker than this share of the sensor's range: at 2 % (5 of 255) the phase noise exceeds 0.06 rad per pixel
-# and rounding no longer averages out; at 6 % something is wrong with exposure, focus or screen.
+# Fringes weaker than this share of the sensor's range: at 2 % (5 of 255) the phase noise exceeds
+# 0.06 rad per pixel and rounding no longer averages out; at 6 % something is wrong with exposure,
+# focus or screen.
 MODULATION_REJECTED_SHARE = 0.02
 MODULATION_DEGRADED_SHARE = 0.06
-# Saturated pixels bend the phase by harmonics; their bins are omitted, so a few (glints) do no harm.
+# Saturated pixels bend the phase by harmonics; their bins are omitted, so a few (glints) do no
+# harm.
 SATURATED_REJECTED_FRACTION = 0.20
 SATURATED_DEGRADED_FRACTION = 0.005
 # Terms over a disc with a quarter missing are extrapolated there.
@@ -164,8 +196,14 @@ def judge(quality: Quality) -> tuple[Verdict, str]:
             q.modulation_share >= MODULATION_REJECTED_SHARE,
             f"fringe modulation {q.modulation_share:.1%} of full scale",
         ),
-        (q.saturated_fraction <= SATURATED_REJECTED_FRACTION, f"{q.saturated_fraction:.1%} of the points saturated"),
-        (q.valid_fraction >= VALID_REJECTED_FRACTION, f"only {q.valid_fraction:.0%} of the area gave a slope"),
+        (
+            q.saturated_fraction <= SATURATED_REJECTED_FRACTION,
+            f"{q.saturated_fraction:.1%} of the points saturated",
+        ),
+        (
+            q.valid_fraction >= VALID_REJECTED_FRACTION,
+            f"only {q.valid_fraction:.0%} of the area gave a slope",
+        ),
         (q.converged, "the fit did not converge"),
         (q.residual_urad <= RESIDUAL_REJECTED_URAD, f"slope residual {q.residual_urad:.0f} µrad"),
     )

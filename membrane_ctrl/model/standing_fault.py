@@ -1,4 +1,6 @@
-"""The fault in which a run is, or ends: one rule for the summary, the catalogue and the closing words."""
+"""The fault in which a run is, or ends: one rule for the summary, the catalogue and the closing
+words.
+"""
 
 from __future__ import annotations
 
@@ -32,14 +34,16 @@ def standing_fault_after(fault: Fault | None, event: Event) -> Fault | None:
 
 
 def fault_of_end(fault: Fault | None, exit_: str | None) -> Fault | None:
-    """The fault in which a run ended: the standing one, unless the run was ended well while its cause was there.
+    """The fault in which a run ended: the standing one, unless the run was ended well while its
+    cause was there.
 
     Parameters
     ----------
     fault : Fault or None
         The standing fault after the last event.
     exit_ : str or None
-        How the run ended, in lower case as in its end event; None if it has not, or if that is unknown.
+        How the run ended, in lower case as in its end event; None if it has not, or if that is
+        unknown.
     """
     ended_well = exit_ in (Exit.DONE.name.lower(), Exit.INTERRUPTED.name.lower())
     return None if ended_well else fault

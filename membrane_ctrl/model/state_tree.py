@@ -1,11 +1,13 @@
-"""What a program remembers, as a tree of dataclasses: encoded to JSON, decoded with every value checked, compared.
+"""What a program remembers, as a tree of dataclasses: encoded to JSON, decoded with every value
+checked, compared.
 
-A node is a dataclass that derives from `StateNode` and declares its fields with exact types: numbers, bools, texts,
-enums, arrays of a shape (`ArrayShape`), sections of the configuration, other nodes, and lists, tuples and dicts of
-these. Sets are no fields: their order differs from process to process.
+A node is a dataclass that derives from `StateNode` and declares its fields with exact types:
+numbers, bools, texts, enums, arrays of a shape (`ArrayShape`), sections of the configuration, other
+nodes, and lists, tuples and dicts of these. Sets are no fields: their order differs from process to
+process.
 
-Numbers survive to the last bit; of a NaN only that it is one. Arrays are base64 of their bytes, which is cheap to
-write and exact.
+Numbers survive to the last bit; of a NaN only that it is one. Arrays are base64 of their bytes,
+which is cheap to write and exact.
 """
 
 import base64
@@ -63,7 +65,9 @@ class ArrayShape:
     shape: tuple[int, ...]
     dtype: str = "<f8"
 
-    def __get_pydantic_core_schema__(self, source: object, handler: GetCoreSchemaHandler) -> CoreSchema:
+    def __get_pydantic_core_schema__(
+        self, source: object, handler: GetCoreSchemaHandler
+    ) -> CoreSchema:
         """Schema of the array as base64 text."""
         encoder = core_schema.plain_serializer_function_ser_schema(
             self._encode, return_schema=core_schema.str_schema(), when_used="json"
@@ -72,7 +76,10 @@ class ArrayShape:
 
     def _encode(self, array: NDArray[Any]) -> str:
         if array.shape != self.shape or array.dtype != self.dtype:
-            raise ValueError(f"an array {array.dtype.str}{array.shape} where {self.dtype}{self.shape} is declared")
+            raise ValueError(
+                f"an array {array.dtype.str}{array.shape} where {self.dtype}{self.shape} is "
+                "declared"
+            )
         return base64.b64encode(np.ascontiguousarray(array).data).decode()
 
     def _decode(self, data: object) -> NDArray[Any]:
@@ -170,7 +177,9 @@ def _missing(found: Any, expected: Any, place: str) -> Iterator[str]:
 
 
 def to_plain(node: StateNode) -> dict[str, Any]:
-    """The tree as dicts, lists and numbers, for people and for tests; arrays are lists of numbers."""
+    """The tree as dicts, lists and numbers, for people and for tests;
+    arrays are lists of numbers.
+    """
     plain: dict[str, Any] = _adapter(type(node)).dump_python(node)
     return {name: _with_lists(value) for name, value in plain.items()}
 
@@ -186,8 +195,12 @@ def _with_lists(value: Any) -> Any:
 
 
 def describe(node: StateNode) -> list[str]:
-    """The tree for people: a line `place  value` for each value; a large array is one line with its range."""
-    return [f"{place:<48} {text}" for place, text in _leaves(_adapter(type(node)).dump_python(node), "")]
+    """The tree for people: a line `place  value` for each value; a large array is one line with its
+    range.
+    """
+    return [
+        f"{place:<48} {text}" for place, text in _leaves(_adapter(type(node)).dump_python(node), "")
+    ]
 
 
 _SHOWN_NUMBERS = 8  # of an array
@@ -216,8 +229,8 @@ def find_differences(one: StateNode, other: StateNode, within: float = 0.0) -> l
     ----------
     one, other : StateNode
     within : float
-        Numbers are the same that differ by no more than this share of their size, at least of 1. Texts, which may
-        contain such numbers, are then not compared.
+        Numbers are the same that differ by no more than this share of their size, at least of 1.
+        Texts, which may contain such numbers, are then not compared.
 
     Returns
     -------

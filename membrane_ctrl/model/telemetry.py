@@ -1,8 +1,8 @@
 """One row of telemetry per tick, and the names of its codes.
 
-`columns` has the table of a row's columns. A row crosses to the other processes as plain doubles, so that writing it
-costs the tick a few microseconds. Codes (state, shape state, fault, safe level) are small integers; the order of the
-names gives them.
+`columns` has the table of a row's columns. A row crosses to the other processes as plain doubles,
+so that writing it costs the tick a few microseconds. Codes (state, shape state, fault, safe level)
+are small integers; the order of the names gives them.
 """
 
 import struct
@@ -74,7 +74,9 @@ class TelemetryRow(ColumnValues):
         return f"{column.format_value(getattr(self, name), sign):>{width}} {column.unit}".rstrip()
 
     def labelled(self, name: str, sign: bool = False, width: int = 0) -> str:
-        """Return a value with label and unit, `error +0.25 µm`; parameters as those of `quantity`."""
+        """Return a value with label and unit, `error +0.25 µm`;
+        parameters as those of `quantity`.
+        """
         return f"{COLUMNS[name].short_label} {self.quantity(name, sign, width)}"
 
     def pack(self) -> bytes:
@@ -93,8 +95,10 @@ _STRUCT = struct.Struct(f"<{len(FIELDS)}d")
 ROW_BYTES = _STRUCT.size
 
 
-# A mirror counts as settled this long after hold began and after each setpoint ramp: three closed-loop time constants
-# of 1.45 s (docs/physics.md, inner loop) leave 5 % of a step, of which the `settle` state has already taken most.
+# A mirror counts as settled this long after hold began and after each setpoint ramp: three
+# closed-loop time constants of 1.45 s (docs/physics.md, inner loop) leave 5 % of a step, of which
+# the `settle` state has
+# already taken most.
 SETTLED_AFTER_S = 5.0
 
 Rows = FloatArray
@@ -117,11 +121,18 @@ def columns(rows: Rows) -> dict[str, Column]:
 
 
 def true_error_um(ticks: Mapping[str, Column]) -> Column:
-    """Target minus true centre, with the sign of `error_um` (setpoint minus value); NaN on a real bench."""
+    """Target minus true centre, with the sign of `error_um` (setpoint minus value); NaN on a real
+    bench.
+    """
     return ticks["target_um"] - ticks["truth_displacement_um"]
 
 
 def changes(codes: FloatArray, before: float) -> list[tuple[int, int]]:
-    """Changes of a code: (row, new code) for each, comparing the first row with `before` (NaN: none)."""
+    """Changes of a code: (row, new code) for each, comparing the first row with `before` (NaN:
+    none).
+    """
     previous = np.concatenate(([before], codes[:-1]))
-    return [(int(row), int(codes[row])) for row in np.flatnonzero((codes != previous) & np.isfinite(codes))]
+    return [
+        (int(row), int(codes[row]))
+        for row in np.flatnonzero((codes != previous) & np.isfinite(codes))
+    ]

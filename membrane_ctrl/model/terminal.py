@@ -1,7 +1,8 @@
 """Lets only text and line ends reach a terminal. Every command prints through this module.
 
-Text from files and the network may contain control bytes, which a terminal executes, and bidirectional marks, which
-reorder a line. Each such character becomes its JSON escape, so that JSON stays JSON and keeps its meaning.
+Text from files and the network may contain control bytes, which a terminal executes, and
+bidirectional marks, which reorder a line. Each such character becomes its JSON escape, so that JSON
+stays JSON and keeps its meaning.
 """
 
 from __future__ import annotations
@@ -15,7 +16,13 @@ from collections.abc import Iterable, Iterator
 from typing import TYPE_CHECKING, Any, TextIO, TypeVar, cast
 
 if TYPE_CHECKING:  # commands without a table need not load it
-    from rich.console import Console, ConsoleOptions, ConsoleRenderable, RenderableType, RenderResult
+    from rich.console import (
+        Console,
+        ConsoleOptions,
+        ConsoleRenderable,
+        RenderableType,
+        RenderResult,
+    )
 
 
 _T = TypeVar("_T")
@@ -47,17 +54,23 @@ def only_text() -> Iterator[None]:
 
 
 def table_console(stderr: bool = False, width: int | None = None) -> Console:
-    """A Rich console for tables that passes Rich's own colours, but no control characters in the cells."""
+    """A Rich console for tables that passes Rich's own colours, but no control characters in the
+    cells.
+    """
     from rich.console import Console
 
-    made = Console(stderr=stderr, width=width, markup=False, emoji=False)  # texts have [square brackets]
+    made = Console(
+        stderr=stderr, width=width, markup=False, emoji=False
+    )  # texts have [square brackets]
     made.push_render_hook(_Cells())  # type: ignore[arg-type]  # its base class is Rich's, loaded here only
     return made
 
 
 def live_line(text: str, end: str = "") -> None:
     """Replace the last line of stderr, a terminal, by a text."""
-    stream = getattr(sys.stderr, "rich_proxied_file", sys.stderr)  # `_Text` would escape what moves the cursor
+    stream = getattr(
+        sys.stderr, "rich_proxied_file", sys.stderr
+    )  # `_Text` would escape what moves the cursor
     stream.write(f"\r\033[K{one_line(text)}{end}")
     stream.flush()
 
@@ -67,12 +80,16 @@ def counted(items: Iterable[_T], what: str, total: int | None = None) -> Iterabl
     from rich.progress import track
 
     rich, on = table_console(stderr=True), sys.stderr.isatty()
-    rich.file = getattr(sys.stderr, "rich_proxied_file", sys.stderr)  # while it draws, Rich replaces `_Text`
+    rich.file = getattr(
+        sys.stderr, "rich_proxied_file", sys.stderr
+    )  # while it draws, Rich replaces `_Text`
     return track(items, what, total, console=rich, transient=True, disable=not on)
 
 
 class Plain:
-    """Removes control characters from what Rich draws, for a `Live`, which bypasses a console's hooks."""
+    """Removes control characters from what Rich draws, for a `Live`, which bypasses a console's
+    hooks.
+    """
 
     def __init__(self, inner: RenderableType) -> None:
         self._inner = inner
@@ -121,7 +138,9 @@ def _escape(letter: str) -> str:
 
 
 def in_foreground(handle: int) -> bool:
-    """Whether this process may use an open terminal now; job control covers only the controlling one."""
+    """Whether this process may use an open terminal now; job control covers only the controlling
+    one.
+    """
     try:
         return os.tcgetpgrp(handle) == os.getpgrp()
     except OSError:

@@ -1,12 +1,15 @@
 """The number of Zernike terms that describe the mirror's figure.
 
-`ZERNIKE_TERMS` is the only place that states it: fits, messages, tables, plots and texts follow from it. Files and
-messages carry the number with which they were written, and those of another number are refused.
+`ZERNIKE_TERMS` is the only place that states it: fits, messages, tables, plots and texts follow
+from it. Files and messages carry the number with which they were written, and those of another
+number are refused.
 """
 
-# The published method's number: every term of radial order 7 or less, in Noll's order, orthonormal over the whole
-# mirror. They cover what clamping by hand does to a film; shorter errors (ripple, wrinkles) are in the zonal map. The
-# time of a fit grows with the square of the number, that of its solution with the cube.
+# The published method's number: every term of radial order 7 or less, in Noll's order, orthonormal
+# over the whole mirror. They cover what clamping by hand does to a film; shorter errors (ripple,
+# wrinkles) are in the zonal map. The time of a fit grows with the square of the number, that of its
+# solution with
+# the cube.
 ZERNIKE_TERMS = 36
 
 _SUPPORTED_DEGREES = range(5, 11)  # 21 to 66 terms; a campaign test sets both ends
@@ -20,14 +23,19 @@ def degree_of(terms: int) -> int:
     complete = {(degree + 1) * (degree + 2) // 2: degree for degree in _SUPPORTED_DEGREES}
     if terms not in complete:
         numbers = ", ".join(str(number) for number in complete)
-        raise ValueError(f"{terms} Zernike terms end within a radial order or are not supported; possible: {numbers}")
+        raise ValueError(
+            f"{terms} Zernike terms end within a radial order or are not supported; "
+            f"possible: {numbers}"
+        )
     return complete[terms]
 
 
 ZERNIKE_DEGREE = degree_of(ZERNIKE_TERMS)
 NOLL_INDICES = range(1, ZERNIKE_TERMS + 1)
 FIRST_FIGURE_INDEX = 4  # Noll 1 to 3 are piston and tilts
-COVARIANCE_UPPER_SIZE = ZERNIKE_TERMS * (ZERNIKE_TERMS + 1) // 2  # numbers in the upper half of a covariance
+COVARIANCE_UPPER_SIZE = (
+    ZERNIKE_TERMS * (ZERNIKE_TERMS + 1) // 2
+)  # numbers in the upper half of a covariance
 
 
 def zernike_labels(first: int = 1) -> list[str]:

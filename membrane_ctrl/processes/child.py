@@ -1,9 +1,9 @@
 """Child processes: started with `spawn`, shielded from the terminal, and never left behind.
 
-Ctrl-C, Ctrl-Z, Ctrl-\\, a closed terminal and the SIGTERM of `timeout` or a shutdown reach every process of the
-group. Only the control process may act on them: the safe state comes before the end of recording and alarms. So the
-children block these signals from their first instruction on, and end on a different one;
-examples/membrane-ctrl.service relies on this.
+Ctrl-C, Ctrl-Z, Ctrl-\\, a closed terminal and the SIGTERM of `timeout` or a shutdown reach every
+process of the group. Only the control process may act on them: the safe state comes before the end
+of recording and alarms. So the children block these signals from their first instruction on, and
+end on a different one; examples/membrane-ctrl.service relies on this.
 """
 
 import contextlib
@@ -40,8 +40,8 @@ class Child:
     name : str
         For messages and the process list.
     target : str
-        "package.module:function". The child imports it after setting its priority, so that heavy imports do not
-        compete with the tick.
+        "package.module:function". The child imports it after setting its priority, so that heavy
+        imports do not compete with the tick.
     args : tuple
         Picklable arguments of the function.
     nice : int
@@ -49,7 +49,9 @@ class Child:
 
     def __init__(self, name: str, target: str, args: tuple[Any, ...], nice: int) -> None:
         self.name = name
-        self._process = _CONTEXT.Process(target=_main, args=(target, args, nice), name=name, daemon=True)
+        self._process = _CONTEXT.Process(
+            target=_main, args=(target, args, nice), name=name, daemon=True
+        )
 
     def start(self) -> None:
         """Start the child without waiting."""
@@ -97,10 +99,11 @@ class Child:
 
 
 class Program:
-    """One of our commands as a child: in a process group of its own, its output appended to a file of its user.
+    """One of our commands as a child: in a process group of its own, its output appended to a file
+    of its user.
 
-    With the option `--with-hold` it ends when this process dies (`end_with_parent`). A command that cannot be started
-    counts as one that has ended.
+    With the option `--with-hold` it ends when this process dies (`end_with_parent`). A command that
+    cannot be started counts as one that has ended.
     """
 
     def __init__(self, name: str, arguments: Sequence[str], log: Path, nice: int) -> None:
@@ -113,7 +116,9 @@ class Program:
         program = [sys.executable, "-m", "membrane_ctrl", *self._arguments]
         stdin = subprocess.PIPE if "--with-hold" in self._arguments else subprocess.DEVNULL
         with contextlib.suppress(OSError), _appending(self._log) as log:
-            self._process = subprocess.Popen(program, stdin=stdin, stdout=log, stderr=log, process_group=0)
+            self._process = subprocess.Popen(
+                program, stdin=stdin, stdout=log, stderr=log, process_group=0
+            )
             os.setpriority(os.PRIO_PROCESS, self._process.pid, self._nice)
 
     @property
@@ -153,7 +158,9 @@ class Program:
 
 @contextlib.contextmanager
 def _appending(log: Path) -> Iterator[int]:
-    """A file that only its user may read: the output may hold the link that lets in; or nothing if it cannot be."""
+    """A file that only its user may read: the output may hold the link that lets in; or nothing if
+    it cannot be.
+    """
     try:
         handle = os.open(log, os.O_WRONLY | os.O_CREAT | os.O_APPEND, 0o600)
     except OSError:
@@ -165,7 +172,9 @@ def _appending(log: Path) -> Iterator[int]:
 
 
 def end_with_parent() -> None:
-    """End this program with SIGTERM when its standard input closes: the `Program` that started it has died."""
+    """End this program with SIGTERM when its standard input closes: the `Program` that started it
+    has died.
+    """
 
     def wait() -> None:
         while os.read(0, 1024):  # not `sys.stdin`: its lock would abort the interpreter's end
@@ -176,7 +185,9 @@ def end_with_parent() -> None:
 
 
 def leave_at_stop() -> None:
-    """Within a child: end on `STOP`, running its context managers, and leave SIGINT to the control process."""
+    """Within a child: end on `STOP`, running its context managers, and leave SIGINT to the control
+    process.
+    """
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     signal.signal(STOP, lambda number, frame: sys.exit(0))
 
@@ -188,7 +199,9 @@ def parent_lives() -> bool:
 
 
 def _main(target: str, args: tuple[Any, ...], nice: int) -> None:
-    """Run the target, then exit at once: the interpreter's shutdown would complain about arrays in shared memory."""
+    """Run the target, then exit at once: the interpreter's shutdown would complain about arrays in
+    shared memory.
+    """
     os.nice(nice)
     module, function = target.split(":")
     code = 0
@@ -204,7 +217,9 @@ def _main(target: str, args: tuple[Any, ...], nice: int) -> None:
 
 @contextlib.contextmanager
 def _group_blocked() -> Iterator[None]:
-    """Block the group's signals while a child starts, which inherits the block; this process gets them afterwards."""
+    """Block the group's signals while a child starts, which inherits the block; this process gets
+    them afterwards.
+    """
     before = signal.pthread_sigmask(signal.SIG_BLOCK, _OF_THE_GROUP)
     try:
         yield
@@ -218,7 +233,9 @@ def pipe() -> Any:
 
 
 def reporter(status: Connection | None) -> Callable[[events.Event], None]:
-    """Return a function that sends an event over `status`, or drops it if the pipe is full; it never waits."""
+    """Return a function that sends an event over `status`, or drops it if the pipe is full; it
+    never waits.
+    """
     if status is None:
         return lambda event: None
     os.set_blocking(status.fileno(), False)
@@ -238,13 +255,16 @@ def _short(value: Any) -> Any:
 
 
 def raise_priority() -> str:
-    """Give this process, but not its children, a real-time class; returns "real-time" or "ordinary".
+    """Give this process, but not its children, a real-time class; returns "real-time" or
+    "ordinary".
 
-    A tick takes about 2 % of a core, and the kernel reserves 5 % of each second for ordinary processes. Without
-    permission (root, CAP_SYS_NICE, or `LimitRTPRIO=` of the service) nothing changes.
+    A tick takes about 2 % of a core, and the kernel reserves 5 % of each second for ordinary
+    processes. Without permission (root, CAP_SYS_NICE, or `LimitRTPRIO=` of the service) nothing
+    changes.
     """
     try:
-        # the lowest real-time priority: above every ordinary process, below the kernel's own threads
+        # the lowest real-time priority: above every ordinary process, below the kernel's own
+        # threads
         os.sched_setscheduler(0, os.SCHED_RR | os.SCHED_RESET_ON_FORK, os.sched_param(1))
     except (OSError, AttributeError):  # not permitted, or not Linux
         return "ordinary"
@@ -253,12 +273,16 @@ def raise_priority() -> str:
 
 @contextlib.contextmanager
 def results_of(
-    job: Callable[[_Item], _Result], items: Sequence[_Item], workers: int = 1, scheduler: str | None = None
+    job: Callable[[_Item], _Result],
+    items: Sequence[_Item],
+    workers: int = 1,
+    scheduler: str | None = None,
 ) -> Iterator[Iterable[_Result]]:
-    """Results of a job for each item, in order: in this process, on processes, or on a Dask cluster instead.
+    """Results of a job for each item, in order: in this process, on processes, or on a Dask cluster
+    instead.
 
-    Raises InputError if Dask is not installed or its address is wrong, DeviceError if it does not answer or a worker
-    was killed.
+    Raises InputError if Dask is not installed or its address is wrong, DeviceError if it does not
+    answer or a worker was killed.
     """
     if scheduler is not None:
         with _dask_client(scheduler) as client:
@@ -270,7 +294,9 @@ def results_of(
             with ProcessPoolExecutor(workers, mp_context=_CONTEXT) as pool:
                 yield pool.map(job, items)
         except BrokenProcessPool:
-            raise errors.DeviceError("a worker was killed, perhaps for want of memory; use fewer --workers") from None
+            raise errors.DeviceError(
+                "a worker was killed, perhaps for want of memory; use fewer --workers"
+            ) from None
     else:
         yield map(job, items)
 
@@ -279,7 +305,10 @@ def _dask_client(address: str) -> Any:
     try:
         distributed = importlib.import_module("distributed")
     except ImportError:
-        text = "--scheduler: Dask is not installed; install the extra `dask` (pip install 'membrane-ctrl[dask]')"
+        text = (
+            "--scheduler: Dask is not installed; install the extra `dask` (pip install "
+            "'membrane-ctrl[dask]')"
+        )
         raise errors.InputError(text) from None
     try:
         return distributed.Client(address, timeout=_CONNECT_S)

@@ -1,8 +1,10 @@
-"""Camera frames in shared memory: the camera writes the pixels in place, any number of readers copy them.
+"""Camera frames in shared memory: the camera writes the pixels in place, any number of readers copy
+them.
 
-As in `membrane_ctrl.processes.ring`, one writer never waits, and each slot has its sequence number before and after
-the pixels. The first number changes before the camera touches the pixels, the second when the frame is whole; a
-reader keeps a copy only if the second was correct before copying and the first afterwards.
+As in `membrane_ctrl.processes.ring`, one writer never waits, and each slot has its sequence number
+before and after the pixels. The first number changes before the camera touches the pixels, the
+second when the frame is whole; a reader keeps a copy only if the second was correct before copying
+and the first afterwards.
 """
 
 from __future__ import annotations
@@ -29,7 +31,8 @@ _SHARED_MEMORY_FOLDER = Path("/dev/shm")
 class FrameHead:
     """Description of a stored frame."""
 
-    index: int  # number of frames stored earlier in the run; identifies the frame for `FrameReader.copy`
+    # number of frames stored earlier in the run; identifies the frame for `FrameReader.copy`
+    index: int
     pattern: str  # pattern on the screen (`firmware_iface.roles.Pattern.name`)
     time_s: float  # start of exposure on the run's clock
     displacement_um: float  # laser reading then, if known when the frame arrived; else NaN
@@ -37,9 +40,11 @@ class FrameHead:
 
 
 class FrameRing:
-    """Owns the shared memory of the last `slots` frames; create it in the process that outlives writer and readers.
+    """Owns the shared memory of the last `slots` frames; create it in the process that outlives
+    writer and readers.
 
-    Raises OSError without room in shared memory. Reserves the memory, as otherwise SIGBUS could kill the writer.
+    Raises OSError without room in shared memory. Reserves the memory, as otherwise SIGBUS could
+    kill the writer.
     """
 
     def __init__(self, slots: int, height_px: int, width_px: int, dtype: str = "uint8") -> None:
@@ -59,10 +64,14 @@ class FrameRing:
 
     @classmethod
     def for_optics(cls, optics: OpticsConfig, kept_cycles: int = 1) -> FrameRing:
-        """A ring for a full cycle (2 x (N sinusoids + 4 Gray) + white + black) or `kept_cycles` fringes, plus one."""
+        """A ring for a full cycle (2 x (N sinusoids + 4 Gray) + white + black) or `kept_cycles`
+        fringes, plus one.
+        """
         camera = optics.camera
         slots = max(2 * (optics.pattern.steps + 4) + 2, kept_cycles * 2 * optics.pattern.steps) + 1
-        return cls(slots, camera.height_px, camera.width_px, "uint8" if camera.bits == 8 else "uint16")
+        return cls(
+            slots, camera.height_px, camera.width_px, "uint8" if camera.bits == 8 else "uint16"
+        )
 
     def close(self) -> None:
         """Free the memory; attached processes keep theirs."""
@@ -122,7 +131,9 @@ class FrameReader:
         return [head for head in heads if head is not None]
 
     def copy(self, head: FrameHead, step: int = 1) -> Pixels | None:
-        """Copy of a frame's pixels, every `step`-th in both directions; None once they are overwritten."""
+        """Copy of a frame's pixels, every `step`-th in both directions; None once they are
+        overwritten.
+        """
         slots = self._slots
         if slots.after(head.index) != head.index + 1:
             return None
@@ -136,18 +147,25 @@ class FrameReader:
 
 
 class _FrameSlots:
-    """The layout: write counter; for each slot a head with the sequence number, the pixels, the number again."""
+    """The layout: write counter; for each slot a head with the sequence number, the pixels, the
+    number again.
+    """
 
     def __init__(self, memory: SharedMemory, address: FrameAddress) -> None:
         assert memory.buf is not None  # None only after close()
         self._buffer = memory.buf
-        self._words = memory.buf.cast("Q")  # each assignment is one store (`membrane_ctrl.processes.ring`)
+        self._words = memory.buf.cast(
+            "Q"
+        )  # each assignment is one store (`membrane_ctrl.processes.ring`)
         self._stride = _stride(address)
         shape = (address.height_px, address.width_px)
-        # frombuffer holds the memory, so that closing it under a live view raises; ndarray(buffer=...) would let
-        # it be unmapped, and the next access to a pixel would crash the process
+        # frombuffer holds the memory, so that closing it under a live view raises;
+        # ndarray(buffer=...) would let it be unmapped, and the next access to a pixel would crash
+        # the process
         self._pixels: list[Pixels] = [
-            np.frombuffer(memory.buf, address.dtype, prod(shape), _ALIGN_BYTES * 2 + k * self._stride).reshape(shape)
+            np.frombuffer(
+                memory.buf, address.dtype, prod(shape), _ALIGN_BYTES * 2 + k * self._stride
+            ).reshape(shape)
             for k in range(address.slots)
         ]
 
@@ -159,7 +177,9 @@ class _FrameSlots:
         sequence, time_s, displacement_um, cycle, pattern = fields
         if not sequence == self.after(index) == self.before(index) == index + 1:
             return None
-        return FrameHead(index, pattern.rstrip(b"\0").decode("ascii"), time_s, displacement_um, cycle)
+        return FrameHead(
+            index, pattern.rstrip(b"\0").decode("ascii"), time_s, displacement_um, cycle
+        )
 
     def set_head(self, head: FrameHead) -> None:
         pattern = head.pattern.encode("ascii")

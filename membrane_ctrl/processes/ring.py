@@ -1,14 +1,16 @@
 """A ring of messages in shared memory: one writer that never waits, any number of readers.
 
-The writer overwrites the oldest slot; a reader that was too slow counts the gap in the sequence numbers. A killed
-writer's messages stay readable.
+The writer overwrites the oldest slot; a reader that was too slow counts the gap in the sequence
+numbers. A killed writer's messages stay readable.
 
-Counter and sequence numbers are 8-byte aligned and written through a memoryview of 8-byte words, which makes one
-store of each assignment. (`struct.pack_into` clears the bytes first, and a racing reader sees the counter as 0.)
-Each slot carries its sequence number before and after the message. A reader takes a message only if both are as
-expected: it reads the last before copying and the first afterwards. On x86-64 that suffices, because stores become
-visible in order. On ARM64 they may not, so each slot also has a CRC-32 of its message, seeded with its number: an
-incomplete message does not match, and the reader retries at its next call.
+Counter and sequence numbers are 8-byte aligned and written through a memoryview of 8-byte words,
+which makes one store of each assignment. (`struct.pack_into` clears the bytes first, and a racing
+reader sees the counter as 0.) Each slot carries its sequence number before and after the message. A
+reader takes a message only if both are as
+expected: it reads the last before copying and the first afterwards. On x86-64 that suffices,
+because stores become visible in order. On ARM64 they may not, so each slot also has a CRC-32 of its
+message, seeded with its number: an incomplete message does not match, and the reader retries at its
+next call.
 """
 
 import json
@@ -31,7 +33,8 @@ _HEADER_BYTES = 64  # a cache line of its own for the write counter
 _SLOT_OVERHEAD = 3 * 8  # sequence; length and CRC-32; sequence again
 # The largest ring of a run, a minute of inputs at 1 kHz, is 32 MB
 _RING_BYTES_MAX = 1 << 27
-# A writer that overtakes costs a few tries; a newest slot that never matches is damaged and must end `latest`
+# A writer that overtakes costs a few tries; a newest slot that never matches is damaged and must
+# end `latest`
 _TRIES = 100
 
 
@@ -57,7 +60,9 @@ class RingAddress:
 
 
 class Ring:
-    """Owns the shared memory of `slots` messages of at most `slot_bytes`; create it in the longest-lived process."""
+    """Owns the shared memory of `slots` messages of at most `slot_bytes`; create it in the
+    longest-lived process.
+    """
 
     def __init__(self, slots: int, slot_bytes: int) -> None:
         size_bytes = RingAddress("", slots, slot_bytes).size_bytes
@@ -82,7 +87,9 @@ class _Slots:
         self._memory, self._views = memory, [whole]
         size_bytes = address.size_bytes
         if whole.nbytes < size_bytes:
-            raise RingError(f"{address.name}: {whole.nbytes} bytes where a ring of {size_bytes} is expected")
+            raise RingError(
+                f"{address.name}: {whole.nbytes} bytes where a ring of {size_bytes} is expected"
+            )
         self.bytes = whole[:size_bytes]
         self.words = self.bytes.cast("Q")
         self._views[:0] = self.words, self.bytes
@@ -139,7 +146,8 @@ class RingWriter:
 
 
 class RingReader:
-    """One reader; it starts at the oldest message in the ring, and counts lost messages in `dropped`.
+    """One reader; it starts at the oldest message in the ring, and counts lost messages in
+    `dropped`.
 
     `memory` is the ring's, if the caller has already mapped it. Raises RingError.
     """
@@ -152,7 +160,9 @@ class RingReader:
         self.dropped = 0
 
     def drain(self, limit: int | None = None) -> list[bytes]:
-        """Messages since the last call (at most `limit`, and one round of the ring), oldest first."""
+        """Messages since the last call (at most `limit`, and one round of the ring),
+        oldest first.
+        """
         messages: list[bytes] = []
         for _ in range(self._slots.count):
             written = self._slots.written
@@ -173,7 +183,9 @@ class RingReader:
         return messages
 
     def latest(self) -> bytes | None:
-        """The newest message, or None if there is none yet; skips older ones without counting them."""
+        """The newest message, or None if there is none yet;
+        skips older ones without counting them.
+        """
         for _ in range(_TRIES):
             written = self._slots.written
             if not written:
@@ -184,8 +196,12 @@ class RingReader:
         return None
 
     def _not_there_yet(self) -> bool:
-        """Whether the message, not overwritten, has yet to become visible; True once per message."""
-        again = self._looked_at != self._read and self._read > self._slots.written - self._slots.count
+        """Whether the message, not overwritten, has yet to become visible;
+        True once per message.
+        """
+        again = (
+            self._looked_at != self._read and self._read > self._slots.written - self._slots.count
+        )
         self._looked_at = self._read
         return again
 
@@ -197,7 +213,9 @@ class RingReader:
         length = min(seal & 0xFFFFFFFF, self._slot_bytes)
         message = bytes(slots.bytes[8 * first + 16 : 8 * first + 16 + length])
         before = slots.words[first]
-        return message if before == after == index + 1 and seal == _seal(message, index + 1) else None
+        return (
+            message if before == after == index + 1 and seal == _seal(message, index + 1) else None
+        )
 
     def close(self) -> None:
         """Detach."""
@@ -223,11 +241,12 @@ def _stride(slot_bytes: int) -> int:
     return (slot_bytes + _SLOT_OVERHEAD + 7) // 8 * 8
 
 
-# The rings of a run for programs that the run did not start: `rings.json` in its folder has their addresses.
+# The rings of a run for programs that the run did not start: `rings.json` in its folder has their
+# addresses.
 #
-# Reading them costs the control process nothing, and they hold every tick of the last minute, which a session needs
-# (docs/decisions/79-tuning-sessions.md). The folder may be forged: only this user's shared memory that is the ring it
-# claims to be is opened, read-only.
+# Reading them costs the control process nothing, and they hold every tick of the last minute, which
+# a session needs (docs/decisions/79-tuning-sessions.md). The folder may be forged: only this user's
+# shared memory that is the ring it claims to be is opened, read-only.
 
 _FILE = "rings.json"
 _FILE_BYTES_MAX = 4096  # three rings take 250
@@ -245,7 +264,8 @@ def publish(run_dir: Path, rings: Mapping[str, RingAddress | None]) -> None:
 def attach(run_dir: Path) -> dict[str, RingReader]:
     """Return readers of a run's rings, each at its newest message.
 
-    Raises FileNotFoundError if the run has published none or is over; OSError or RingError for foreign rings.
+    Raises FileNotFoundError if the run has published none or is over; OSError or RingError for
+    foreign rings.
     """
     readers: dict[str, RingReader] = {}
     with ExitStack() as stack:
@@ -267,7 +287,12 @@ def _addresses(path: Path) -> dict[str, RingAddress]:
 
 def _address(ring: str, values: dict[str, Any]) -> RingAddress:
     name, slots, slot_bytes = values["name"], values["slots"], values["slot_bytes"]
-    if ring not in _RINGS or not _NAME.fullmatch(name) or type(slots) is not int or type(slot_bytes) is not int:
+    if (
+        ring not in _RINGS
+        or not _NAME.fullmatch(name)
+        or type(slots) is not int
+        or type(slot_bytes) is not int
+    ):
         raise RingError(f"{ring!r:.40} is not the address of a ring")
     return RingAddress(name, slots, slot_bytes)
 
@@ -279,7 +304,9 @@ def _mapped(address: RingAddress) -> mmap:
         if found.st_uid != os.geteuid():
             raise RingError(f"{address.name} belongs to user {found.st_uid}: run as that user")
         if found.st_size != size_bytes:
-            raise RingError(f"{address.name} has {found.st_size} bytes, not the {size_bytes} of the ring")
+            raise RingError(
+                f"{address.name} has {found.st_size} bytes, not the {size_bytes} of the ring"
+            )
         return mmap(file.fileno(), size_bytes, prot=PROT_READ)
 
 

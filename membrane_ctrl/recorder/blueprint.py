@@ -37,13 +37,21 @@ def run_blueprint(config: Config) -> rrb.Blueprint:
 
 
 def _whole_run() -> rrb.TimeAxis:
-    """Show the whole run; the default, and plots linked to one axis, show half a minute around the cursor."""
-    everything = rr.TimeRange(start=rr.TimeRangeBoundary.infinite(), end=rr.TimeRangeBoundary.infinite())
+    """Show the whole run; the default, and plots linked to one axis, show half a minute around the
+    cursor.
+    """
+    everything = rr.TimeRange(
+        start=rr.TimeRangeBoundary.infinite(), end=rr.TimeRangeBoundary.infinite()
+    )
     return rrb.TimeAxis(view_range=everything)
 
 
-def _plot(name: str, *paths: str, span: tuple[float, float] | None = None, marks: bool = False) -> rrb.TimeSeriesView:
-    """Plot entities; lines of commands and faults only with a span, as they would stretch any other axis."""
+def _plot(
+    name: str, *paths: str, span: tuple[float, float] | None = None, marks: bool = False
+) -> rrb.TimeSeriesView:
+    """Plot entities; lines of commands and faults only with a span, as they would stretch any other
+    axis.
+    """
     lines = [stream.path for stream in streams.MARKS] if marks else []
     return rrb.TimeSeriesView(
         name=name,
@@ -62,12 +70,17 @@ def _ticks(plot: Plot, detail: str = "") -> rrb.TimeSeriesView:
 
 def _means(plot: Plot) -> rrb.TimeSeriesView:
     """Plot the mean of each second."""
-    return _plot(plot_title(plot, "mean of each second"), *map(streams.mean_path, streams.entities_of(plot)))
+    return _plot(
+        plot_title(plot, "mean of each second"), *map(streams.mean_path, streams.entities_of(plot))
+    )
 
 
 def _error(config: Config) -> rrb.TimeSeriesView:
     return _around_band(
-        config, "Error of each second: least, mean, greatest, µm", streams.OVERVIEW.path, streams.TRUE_MEAN.path
+        config,
+        "Error of each second: least, mean, greatest, µm",
+        streams.OVERVIEW.path,
+        streams.TRUE_MEAN.path,
     )
 
 
@@ -85,7 +98,9 @@ def _lanes() -> rrb.StateTimelineView:
         "+ /state/safe_level",
         "+ /state/fault",
     ]
-    return rrb.StateTimelineView(name="States", origin="/state", contents=contents, time_view=_whole_run())
+    return rrb.StateTimelineView(
+        name="States", origin="/state", contents=contents, time_view=_whole_run()
+    )
 
 
 _NO_TIME = TimelineColumn("utc", visible=False)  # too narrow to read: the lines begin with it
@@ -95,7 +110,9 @@ def _text_log() -> rrb.TextLogView:
     return rrb.TextLogView(
         name="Events, UTC",
         origin="/events",
-        columns=rrb.TextLogColumns(timeline_columns=[_NO_TIME], text_log_columns=["loglevel", "body"]),
+        columns=rrb.TextLogColumns(
+            timeline_columns=[_NO_TIME], text_log_columns=["loglevel", "body"]
+        ),
         format_options=rrb.TextLogFormat(monospace_body=False),
     )
 
@@ -110,7 +127,10 @@ def _overview(config: Config) -> rrb.Vertical:
     )
     page = rrb.TextDocumentView(name="Summary", origin=SUMMARY_PATH)
     return rrb.Vertical(
-        rrb.Horizontal(plots, page, column_shares=[3.2, 1]), _text_log(), row_shares=[4.4, 1], name="Overview"
+        rrb.Horizontal(plots, page, column_shares=[3.2, 1]),
+        _text_log(),
+        row_shares=[4.4, 1],
+        name="Overview",
     )
 
 
@@ -135,7 +155,9 @@ def _loop(config: Config) -> rrb.Vertical:
     plots = [*map(_ticks, LOOP_PLOTS), *further]
     return rrb.Vertical(
         _around_band(
-            config, plot_title(columns.ERROR, f"with the band, {_TICKS}"), *streams.entities_of(columns.ERROR)
+            config,
+            plot_title(columns.ERROR, f"with the band, {_TICKS}"),
+            *streams.entities_of(columns.ERROR),
         ),
         *plots,
         row_shares=[3, *(2 for _ in plots)],
@@ -144,7 +166,9 @@ def _loop(config: Config) -> rrb.Vertical:
 
 
 def _environment(config: Config) -> rrb.Vertical:
-    return rrb.Vertical(*map(_means, plots_of(Group.ENVIRONMENT)), _error(config), name="Environment")
+    return rrb.Vertical(
+        *map(_means, plots_of(Group.ENVIRONMENT)), _error(config), name="Environment"
+    )
 
 
 def _map(kind: str, name: str) -> rrb.Spatial2DView:
@@ -168,9 +192,18 @@ def _shape(config: Config) -> rrb.Vertical:
     rows = [
         maps,
         rrb.Horizontal(
-            _plot("Sag change by camera and laser, trim, µm", "/shape/sag_change", *streams.entities_of(columns.TRIM),
-                  span=(-band_um, band_um), marks=True),
-            _plot("Low orders, change since hold began ± 1σ, µm", "/shape/change", span=(-band_um / 4, band_um / 4)),
+            _plot(
+                "Sag change by camera and laser, trim, µm",
+                "/shape/sag_change",
+                *streams.entities_of(columns.TRIM),
+                span=(-band_um, band_um),
+                marks=True,
+            ),
+            _plot(
+                "Low orders, change since hold began ± 1σ, µm",
+                "/shape/change",
+                span=(-band_um / 4, band_um / 4),
+            ),
             rrb.BarChartView(
                 name=f"Change of Z2..Z{zernike_terms.ZERNIKE_TERMS}, µm",
                 origin=shapes.BARS_PATH,
@@ -183,16 +216,22 @@ def _shape(config: Config) -> rrb.Vertical:
             _plot("Last frame to result, ms", "/shape/latency"),
             *(_ticks(plot) for plot in plots_of(Group.SHAPE) if plot != columns.TRIM),
         ),
-    ]  # fmt: skip
+    ]
     if config.shape.mode == "track":
         terms = f"Z{zernike_terms.FIRST_FIGURE_INDEX} (top) to Z{zernike_terms.ZERNIKE_TERMS}"
         fall = f"{terms}, change since hold began; a column a second, now on the right"
         heard = _plot("Vibrations heard in each minute, Hz", streams.VIBRATIONS.path)
-        rows.insert(2, rrb.Horizontal(rrb.Spatial2DView(name=fall, origin=shapes.WATERFALL_PATH), heard))
+        rows.insert(
+            2, rrb.Horizontal(rrb.Spatial2DView(name=fall, origin=shapes.WATERFALL_PATH), heard)
+        )
     if config.recording.thumbnails:
         names = [f"{axis}_sin_{k}" for axis in "xy" for k in (0, 1)]
         names = ["crossed"] if config.shape.mode == "track" else names
-        rows.append(rrb.Horizontal(*(rrb.Spatial2DView(name=name, origin=f"/frames/{name}") for name in names)))
+        rows.append(
+            rrb.Horizontal(
+                *(rrb.Spatial2DView(name=name, origin=f"/frames/{name}") for name in names)
+            )
+        )
     return rrb.Vertical(*rows, row_shares=[4, 3, 2, 3, 3][: len(rows)], name="Shape")
 
 
@@ -238,10 +277,17 @@ STATE = Lane(
     "state",
     streams.WORDS["state"],
     {
-        "standby": _CALM, "check": _BUSY, "inflate": _BUSY, "settle": _WARN, "hold": _GOOD,
-        "manual": 0xCC79A7FF, "tune": 0xF0E442FF, "lower": _WARN, "fault": _BAD,
+        "standby": _CALM,
+        "check": _BUSY,
+        "inflate": _BUSY,
+        "settle": _WARN,
+        "hold": _GOOD,
+        "manual": 0xCC79A7FF,
+        "tune": 0xF0E442FF,
+        "lower": _WARN,
+        "fault": _BAD,
     },
-)  # fmt: skip
+)
 SHAPE = Lane(
     "/state/shape_loop",
     "shape_state",
@@ -255,7 +301,9 @@ SAFE_LEVEL = Lane(
     {"none": _CALM, "hold_flow": _WARN, "ramp_down": _WARN, "pump_off": _BAD, "vent": _BAD},
 )
 _FAULTS = streams.WORDS["fault"]
-FAULT = Lane("/state/fault", "fault", _FAULTS, dict.fromkeys(_FAULTS.values(), _BAD) | {"none": _CALM})
+FAULT = Lane(
+    "/state/fault", "fault", _FAULTS, dict.fromkeys(_FAULTS.values(), _BAD) | {"none": _CALM}
+)
 VERDICT = Lane("/state/verdict", "", {}, {"ok": _GOOD, "degraded": _WARN, "rejected": _BAD})
 
 TELEMETRY_LANES: tuple[Lane, ...] = (STATE, SHAPE, SAFE_LEVEL, FAULT)
@@ -278,7 +326,9 @@ def summary_page(summary: Mapping[str, Any], status: RunStatus, config: Config) 
     faults_s, whole_s = held["faults_s"], max(summary["duration_s"], 1e-9)
     rows = {
         "held": _span(held["held_s"]),
-        f"std of 1 s means, {'true centre' if held['of'] == 'true' else 'reading'}": _um(held["std_um"]),
+        f"std of 1 s means, {'true centre' if held['of'] == 'true' else 'reading'}": _um(
+            held["std_um"]
+        ),
         "mean error": _um(held["mean_um"], "+"),
         f"1 s means within ±{config.limits.band_um:g} µm": _share(held["in_band"]),
         "faults": str(summary["fault_count"] or "none"),
@@ -286,9 +336,13 @@ def summary_page(summary: Mapping[str, Any], status: RunStatus, config: Config) 
         "time in faults": f"{_span(faults_s)} ({_share(faults_s / whole_s)})" if faults_s else "",
         "paused": _span(held["paused_s"]) if held["paused_s"] >= 1.0 else "",
         "leak": _um(summary["leak_um_per_s"], unit="µm/s"),
-        "shape cycles": f"{summary['cycles']}, {summary['cycles_rejected']} rejected" if summary["cycles"] else "",
+        "shape cycles": f"{summary['cycles']}, {summary['cycles_rejected']} rejected"
+        if summary["cycles"]
+        else "",
         "geometry": _geometry(summary["geometry"]),
-        "gains": gains_words(status.loop or vars(config.loop), status.trial_ends_s - summary["duration_s"]),
+        "gains": gains_words(
+            status.loop or vars(config.loop), status.trial_ends_s - summary["duration_s"]
+        ),
         "ticks missed": f"{summary['missed_ticks']} of {summary['ticks']}",
         "not recorded": "; ".join(status.recording_problems),
     }

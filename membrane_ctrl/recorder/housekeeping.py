@@ -28,8 +28,12 @@ class FolderWatch:
         self._has_config = (run_dir / run_folder.CONFIG).exists()
 
     def gone(self) -> bool:
-        """Whether the folder or its content was removed or moved. Raises OSError (not if it is missing)."""
-        if self._descriptor is None or (self._has_config and not (self._run_dir / run_folder.CONFIG).exists()):
+        """Whether the folder or its content was removed or moved. Raises OSError (not if it is
+        missing).
+        """
+        if self._descriptor is None or (
+            self._has_config and not (self._run_dir / run_folder.CONFIG).exists()
+        ):
             return True
         try:
             found = self._run_dir.stat()
@@ -38,7 +42,9 @@ class FolderWatch:
         return not os.path.samestat(found, os.fstat(self._descriptor))
 
     def begin_anew(self, config: Config) -> None:
-        """Make the folder again, with its configuration. Raises OSError; the folder is then still `gone`."""
+        """Make the folder again, with its configuration. Raises OSError; the folder is then still
+        `gone`.
+        """
         self._run_dir.mkdir(parents=True, exist_ok=True)
         run_folder.write_heads(self._run_dir, config)
         self.close()
@@ -61,8 +67,8 @@ def _opened(folder: Path) -> int | None:
 
 # Runs closed segments through `rerun rrd optimize`, one at a time, in a process of lowest priority.
 #
-# That shrinks a segment by a third and makes it open at once. The original is replaced atomically, and only by a file
-# that has its footer and was made without an error.
+# That shrinks a segment by a third and makes it open at once. The original is replaced atomically,
+# and only by a file that has its footer and was made without an error.
 
 
 _PACKAGE = importlib.util.find_spec("rerun_cli")
@@ -72,11 +78,23 @@ _RERUN = Path(_PACKAGE.origin).parent / "rerun"
 
 
 def optimize_command(source: Path, target: Path, *options: str) -> list[str]:
-    """The command that writes `target` from `source`; it names the binary, as its Python wrapper survives a kill.
+    """The command that writes `target` from `source`; it names the binary, as its Python wrapper
+    survives a kill.
 
     Options may include another source.
     """
-    return ["nice", "-n", "19", str(_RERUN), "rrd", "optimize", *options, str(source), "-o", str(target)]
+    return [
+        "nice",
+        "-n",
+        "19",
+        str(_RERUN),
+        "rrd",
+        "optimize",
+        *options,
+        str(source),
+        "-o",
+        str(target),
+    ]
 
 
 def quiet_environment() -> dict[str, str]:
@@ -102,7 +120,9 @@ class Optimizer:
         self._waiting.append(path)
 
     def poll(self) -> None:
-        """Put a finished file in place and start the next. Raises OSError, also for a failed optimisation."""
+        """Put a finished file in place and start the next. Raises OSError, also for a failed
+        optimisation.
+        """
         if self._process is not None:
             code = self._process.poll()
             if code is None:
@@ -146,8 +166,8 @@ class Optimizer:
 
 # Counting the bytes of a hundred runs keeps the disk busy for a second.
 RETENTION_INTERVAL_S = 3600.0
-# At the run's end a person waits for the prompt, and a service manager is about to kill remaining processes. A
-# one-hour segment takes longer only on a very busy machine (docs/recording.md).
+# At the run's end a person waits for the prompt, and a service manager is about to kill remaining
+# processes. A one-hour segment takes longer only on a very busy machine (docs/recording.md).
 _OPTIMISE_LAST_S = 20.0
 _LOOK_S = 0.05
 _RUN = "retention: "  # followed by the run that cannot be deleted
@@ -156,7 +176,9 @@ _RUN = "retention: "  # followed by the run that cannot be deleted
 class Housekeeping:
     """Works once a second; `detail` says what to omit."""
 
-    def __init__(self, run_dir: Path, clock: RunClock, config: RecordingConfig, errors: RecorderErrors) -> None:
+    def __init__(
+        self, run_dir: Path, clock: RunClock, config: RecordingConfig, errors: RecorderErrors
+    ) -> None:
         self._run_dir = run_dir
         self._clock = clock
         self._config = config
@@ -194,7 +216,9 @@ class Housekeeping:
         self.detail = disk_budget.detail_level(left_mb, least_mb, self.detail)
         if left_mb < least_mb:
             limit = f"less than recording.min_free_mb = {least_mb:g} MB free"
-            self._errors.report_error("disk", f"{self._run_dir}: {limit}; delete old runs", run_events.DiskLow)
+            self._errors.report_error(
+                "disk", f"{self._run_dir}: {limit}; delete old runs", run_events.DiskLow
+            )
         else:
             self._errors.recovered("disk")
 
@@ -211,7 +235,10 @@ class Housekeeping:
         )
         # a folder that a person has moved away is no longer an error
         self._errors.forget(_RUN, but={_RUN + run.folder.name for run, _ in gone})
-        for run, why in gone:  # one by one: a folder that cannot be deleted must not block the others
+        for (
+            run,
+            why,
+        ) in gone:  # one by one: a folder that cannot be deleted must not block the others
             self._errors.guarded(_RUN + run.folder.name, partial(self._delete, run, why))
 
     def _delete(self, run: disk_budget.OldRun, why: str) -> None:

@@ -1,7 +1,7 @@
 """The recorder's process: started with `spawn`, fed by rings, ended by the run's "end" event.
 
-Rerun is imported here only after the process has started: the control process must not load it, and a stream
-inherited by a forked child loses what the child logs.
+Rerun is imported here only after the process has started: the control process must not load it, and
+a stream inherited by a forked child loses what the child logs.
 """
 
 import os
@@ -27,8 +27,8 @@ from membrane_ctrl.processes.ring import FrameAddress, RingAddress, RingReader
 
 # Rings are emptied this often; the ring of ticks must hold a few intervals.
 POLL_S = 0.25
-# A recorder silent for this long is replaced: half of the rings' capacity, so that the next one still finds
-# everything. A disk that needs longer for one second of a run is as good as gone.
+# A recorder silent for this long is replaced: half of the rings' capacity, so that the next one
+# still finds everything. A disk that needs longer for one second of a run is as good as gone.
 _ROUND_S = 30.0
 
 
@@ -45,19 +45,22 @@ class RecorderSpec:
     shapes: RingAddress | None = None
     frames: FrameAddress | None = None  # for thumbnails
     snapshots: RingAddress | None = None  # of the controller (`tick.pack_snapshot`)
-    resumes: int = 0  # earlier recorders of this run that died; this one continues where they stopped
+    # earlier recorders of this run that died; this one continues where they stopped
+    resumes: int = 0
     flush_s: float = 1.0 - POLL_S  # between writes; a power cut may lose this plus one poll
 
 
 def recorder_main(spec: RecorderSpec, status: Connection | None = None) -> None:
-    """Record until the "end" event, `processes.STOP` or the parent's death; then close and summarise.
+    """Record until the "end" event, `processes.STOP` or the parent's death; then close and
+    summarise.
 
     Parameters
     ----------
     spec : RecorderSpec
         What to record and where.
     status : Connection or None
-        Gets the recorder's events, and a sign of life each second; drops those that cannot be sent at once.
+        Gets the recorder's events, and a sign of life each second; drops those that cannot be sent
+        at once.
     """
     asked = Flag()
     # Ctrl-C reaches the whole terminal group, but the supervisor ends the run, with the "end" event
@@ -70,25 +73,38 @@ def recorder_main(spec: RecorderSpec, status: Connection | None = None) -> None:
 
 def prepare_rerun() -> None:
     """Set what Rerun reads when it is imported."""
-    os.environ["RUST_LOG"] = "off"  # its own log would spoil the console; its errors come as exceptions
+    # its own log would spoil the console; its errors come as exceptions
+    os.environ["RUST_LOG"] = "off"
     # makes its allocator free a closed segment's memory at once, else 30 MB would stay
     os.environ["MIMALLOC_PURGE_DELAY"] = "0"
 
 
 def _record(
-    spec: RecorderSpec, report: Callable[[Event], None], asked: Callable[[], bool], orphan: Callable[[], bool]
+    spec: RecorderSpec,
+    report: Callable[[Event], None],
+    asked: Callable[[], bool],
+    orphan: Callable[[], bool],
 ) -> bool:
     """Record until the end; returns whether the process may exit normally."""
     from membrane_ctrl.recorder.recorder import Recorder
     from membrane_ctrl.recorder.sink import Recording
 
-    addresses = {"inputs": spec.inputs, "events": spec.events, "shapes": spec.shapes, "snapshots": spec.snapshots}
-    rings = {name: RingReader(address) for name, address in addresses.items() if address is not None}
+    addresses = {
+        "inputs": spec.inputs,
+        "events": spec.events,
+        "shapes": spec.shapes,
+        "snapshots": spec.snapshots,
+    }
+    rings = {
+        name: RingReader(address) for name, address in addresses.items() if address is not None
+    }
     first = sum(1 for _ in spec.run_dir.glob(f"{spec.run_name}-*.rrd")) if spec.resumes else 0
     recording = Recording(spec.run_dir, spec.run_name, spec.clock, spec.config, first)
     wanted = spec.frames is not None and spec.config.recording.thumbnails
     thumbnails = Thumbnails(spec.frames) if wanted and spec.frames is not None else None
-    recorder = Recorder(spec.run_dir, spec.clock, spec.config, rings, recording, thumbnails, report, spec.resumes)
+    recorder = Recorder(
+        spec.run_dir, spec.clock, spec.config, rings, recording, thumbnails, report, spec.resumes
+    )
     next_write_s = 0.0
     while not recorder.ended:
         # asked before draining, so that this round still sees a dying parent's last messages
@@ -135,7 +151,9 @@ _JPEG_QUALITY = 80
 
 
 class Thumbnails:
-    """Makes pictures of the newest shared frame of each pattern, at most one set per `THUMBNAIL_INTERVAL_S`."""
+    """Makes pictures of the newest shared frame of each pattern, at most one set per
+    `THUMBNAIL_INTERVAL_S`.
+    """
 
     def __init__(self, address: FrameAddress) -> None:
         self._reader = FrameReader(address)
@@ -159,7 +177,9 @@ class Thumbnails:
         for head in fresh:
             pixels = self._reader.copy(head, self._step)
             if pixels is not None:
-                picture = rr.Image(_eight_bit(pixels), color_model="L").compress(jpeg_quality=_JPEG_QUALITY)
+                picture = rr.Image(_eight_bit(pixels), color_model="L").compress(
+                    jpeg_quality=_JPEG_QUALITY
+                )
                 assert isinstance(picture, rr.EncodedImage)
                 assert picture.blob is not None
                 jpeg = bytes(picture.blob.as_arrow_array()[0].as_py())

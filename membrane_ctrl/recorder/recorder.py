@@ -1,4 +1,6 @@
-"""The recorder: turns ring messages into files, Rerun data and the summary. Nothing here may end it silently."""
+"""The recorder: turns ring messages into files, Rerun data and the summary. Nothing here may end it
+silently.
+"""
 
 import contextlib
 import json
@@ -21,14 +23,16 @@ from membrane_ctrl.run_files.disk_budget import DetailLevel
 from membrane_ctrl.run_files.run_tables import RunTables
 from membrane_ctrl.run_files.summary import Summary
 
-# A ring as the recorder reads it: each message once, even when a new recorder continues after a killed one.
+# A ring as the recorder reads it: each message once, even when a new recorder continues after a
+# killed one.
 
 
 class Feed:
-    """Counts messages from the ring's first one, and skips those that an earlier recorder has written to disk.
+    """Counts messages from the ring's first one, and skips those that an earlier recorder has
+    written to disk.
 
-    The reader is fresh: it starts at the oldest message still in the ring. `position` messages are recorded or lost,
-    `dropped` of them overwritten before any recorder got to them.
+    The reader is fresh: it starts at the oldest message still in the ring. `position` messages are
+    recorded or lost, `dropped` of them overwritten before any recorder got to them.
     """
 
     def __init__(self, reader: RingReader, position: int = 0, dropped: int = 0) -> None:
@@ -57,7 +61,8 @@ class Feed:
 
 
 _NAME = ".recorder-state"
-_BYTES_MAX = 16_000_000  # usually 0.2 MB; 0.5 MB with all the transitions and faults that a summary lists
+# usually 0.2 MB; 0.5 MB with all the transitions and faults that a summary lists
+_BYTES_MAX = 16_000_000
 _SPECIALS: object_codec.Specials = {shape_estimate.ShapeEstimate: object_codec.ESTIMATE}
 
 
@@ -81,7 +86,8 @@ class RecorderState:
 def save_state(run_dir: Path, state: RecorderState) -> None:
     """Write the state atomically. Raises OSError.
 
-    Not synced: it serves after a killed recorder, not after a power cut, which also loses the rings.
+    Not synced: it serves after a killed recorder, not after a power cut, which also loses the
+    rings.
     """
     part = run_dir / f"{_NAME}.part"
     with files.fresh_file(part) as file:
@@ -93,7 +99,9 @@ def load_state(run_dir: Path) -> RecorderState | None:
     """Read the state left behind; None if there is none or it is unreadable."""
     decoder = object_codec.Decoder((RecorderState(Summary(Config())),), _SPECIALS)
     try:
-        state = decoder.decode(json.loads(files.read_bytes(run_dir / _NAME, _BYTES_MAX)), RecorderState)
+        state = decoder.decode(
+            json.loads(files.read_bytes(run_dir / _NAME, _BYTES_MAX)), RecorderState
+        )
     except (OSError, ValueError, RecursionError):  # the recorder starts afresh and reports that
         return None
     assert isinstance(state, RecorderState)
@@ -112,8 +120,8 @@ class Recorder:
     Parameters
     ----------
     rings : dict
-        Readers by name: "inputs" (the ticks), "events", "snapshots" if there are any, and "shapes" if the shape is
-        measured.
+        Readers by name: "inputs" (the ticks), "events", "snapshots" if there are any, and "shapes"
+        if the shape is measured.
     recording : Recording
         The Rerun file, without a segment yet.
     report : callable
@@ -152,7 +160,9 @@ class Recorder:
             for name, ring in rings.items()
         }
         self._errors = sink.RecorderErrors(report, before.errors)
-        self._housekeeping = housekeeping.Housekeeping(run_dir, clock, config.recording, self._errors)
+        self._housekeeping = housekeeping.Housekeeping(
+            run_dir, clock, config.recording, self._errors
+        )
         self._rerun = rerun_output.RerunOutput(recording, config, self._errors, self._summary_page)
         self._rerun.shapes.reference, self._rerun.state = before.reference, before.state
         self._events_file = sink.EventsFile(run_dir / "events.jsonl", resumed=resumes > 0)
@@ -177,7 +187,9 @@ class Recorder:
     def drain(self) -> None:
         """Take all ring messages; events go to `events.jsonl` at once."""
         self._messages += self._feeds["inputs"].drain()
-        if "snapshots" in self._feeds:  # behind the ticks: then those of all drained ticks are there
+        if (
+            "snapshots" in self._feeds
+        ):  # behind the ticks: then those of all drained ticks are there
             self._assembler.add_snapshots(self._feeds["snapshots"].drain())
         if "shapes" in self._feeds:
             for message in self._feeds["shapes"].drain():
@@ -189,11 +201,15 @@ class Recorder:
         for line in new:
             event = run_events.from_dict(line)
             self._summary.add_event(line)
-            self._errors.guarded("status", partial(self._follow, event, float(line.get("mono_s") or 0.0)))
+            self._errors.guarded(
+                "status", partial(self._follow, event, float(line.get("mono_s") or 0.0))
+            )
             self.urgent |= event.urgent
             self.ended |= isinstance(event, run_events.Ended)
         self._events += new
-        self._errors.guarded("table of events", lambda: self._tables.add_events(self._events_file.unwritten(new)))
+        self._errors.guarded(
+            "table of events", lambda: self._tables.add_events(self._events_file.unwritten(new))
+        )
         self._errors.guarded("events.jsonl", lambda: self._events_file.append(new))
 
     def _follow(self, event: Event, mono_s: float) -> None:
@@ -221,7 +237,9 @@ class Recorder:
         guarded("parts of tables", self._tables.seal)
         closed, self._rerun.closed = self._rerun.closed, []
         self._housekeeping.look(now_s, closed)
-        if not self._rerun.send(now_s, rows, new_events, shapes, self._thumbnails, self._housekeeping.detail):
+        if not self._rerun.send(
+            now_s, rows, new_events, shapes, self._thumbnails, self._housekeeping.detail
+        ):
             self._rows_lost += len(rows)
         guarded("state file", self._hand_on)
 
@@ -234,10 +252,14 @@ class Recorder:
             self._tables.add_thumbnail(each.time_s, each.pattern, each.jpeg)
 
     def _summary_page(self) -> str:
-        return blueprint.summary_page(self._summary.as_dict(self._dropped(), {}), self._status, self._config)
+        return blueprint.summary_page(
+            self._summary.as_dict(self._dropped(), {}), self._status, self._config
+        )
 
     def _see_folder(self, now_s: float) -> None:
-        """Continue in a new folder if the run's was removed: writing to a deleted file raises no error."""
+        """Continue in a new folder if the run's was removed: writing to a deleted file raises no
+        error.
+        """
         if not self._folder.gone():
             return
         self._folder.begin_anew(self._config)
@@ -270,7 +292,9 @@ class Recorder:
         return {name: feed.dropped for name, feed in self._feeds.items()}
 
     def finish(self, in_haste: bool = False) -> None:
-        """Drain once more, close the recording with its footer, write `summary.json`, optimise unless `in_haste`."""
+        """Drain once more, close the recording with its footer, write `summary.json`, optimise
+        unless `in_haste`.
+        """
         self.drain()
         self.write()
         guarded = self._errors.guarded
@@ -286,11 +310,17 @@ class Recorder:
             "input_ticks_lost": self._input_ticks_lost + self._tables.lost_ticks,
             "restarts": self._resumes,
             "folder_anew_s": self._folder_anew_s,  # None: it is still the original
-            # without its predecessor's state, the statistics start with the oldest message in the ring
+            # without its predecessor's state, the statistics start with the oldest message in the
+            # ring
             "partial": self._began_anew and self._feeds["inputs"].dropped > 0,
         }
-        text = plain_json.dumps_checked(self._summary.as_dict(self._dropped(), account), indent=2) + "\n"
-        guarded("summary.json", lambda: files.write_text_atomic(self._run_dir / "summary.json", text))
+        text = (
+            plain_json.dumps_checked(self._summary.as_dict(self._dropped(), account), indent=2)
+            + "\n"
+        )
+        guarded(
+            "summary.json", lambda: files.write_text_atomic(self._run_dir / "summary.json", text)
+        )
         self._events_file.close()
         self._folder.close()
         remove_state(self._run_dir)

@@ -19,10 +19,16 @@ RETRY_S = 10.0
 
 
 class RerunOutput:
-    """Streams and segments; the recording has no segment yet. `summary` makes the page of figures so far."""
+    """Streams and segments; the recording has no segment yet. `summary` makes the page of figures
+    so far.
+    """
 
     def __init__(
-        self, recording: sink.Recording, config: Config, errors: sink.RecorderErrors, summary: Callable[[], str]
+        self,
+        recording: sink.Recording,
+        config: Config,
+        errors: sink.RecorderErrors,
+        summary: Callable[[], str],
     ) -> None:
         self._recording = recording
         self._segment_s = config.recording.segment_s
@@ -58,10 +64,14 @@ class RerunOutput:
             return False
         self.shapes.pictures = detail == DetailLevel.ALL
         for _ in range(2):
-            if (not self._alive or now_s >= self._segment_until_s) and not self._begin_segment(now_s):
+            if (not self._alive or now_s >= self._segment_until_s) and not self._begin_segment(
+                now_s
+            ):
                 return False
             self._errors.guarded("telemetry streams", lambda: self._telemetry.send(rows))
-            self._errors.guarded("event streams", lambda: rerun_streams.send_events(self._recording, events))
+            self._errors.guarded(
+                "event streams", lambda: rerun_streams.send_events(self._recording, events)
+            )
             self._errors.guarded("shape streams", lambda: self._send_shapes(shapes))
             self._errors.guarded("thumbnails", lambda: self._send_thumbnails(thumbnails))
             self._errors.guarded("summary page", lambda: self._send_summary(now_s, events))
@@ -97,7 +107,9 @@ class RerunOutput:
         if now_s < self._next_summary_s and not any(from_dict(event).notable for event in events):
             return
         early = now_s < blueprint.SUMMARY_EARLY_S
-        self._next_summary_s = now_s + (blueprint.SUMMARY_EARLY_INTERVAL_S if early else blueprint.SUMMARY_INTERVAL_S)
+        self._next_summary_s = now_s + (
+            blueprint.SUMMARY_EARLY_INTERVAL_S if early else blueprint.SUMMARY_INTERVAL_S
+        )
         self._recording.page(blueprint.SUMMARY_PATH, now_s, self._summary())
 
     def _begin_segment(self, now_s: float) -> bool:
@@ -121,7 +133,9 @@ class RerunOutput:
         return True
 
     def _stop(self) -> None:
-        """Close the file while there is room for its footer; a new one starts when there is room again."""
+        """Close the file while there is room for its footer; a new one starts when there is room
+        again.
+        """
         if self._alive:
             self._alive = False
             self._errors.guarded("recording", self._recording.pause)
@@ -134,13 +148,17 @@ class RerunOutput:
         self._recording.lay_out_again()
 
     def _watch_hold(self, rows: telemetry.Rows) -> None:
-        """Changes of the figure are against the first of the settled hold: before it they only show the way there."""
+        """Changes of the figure are against the first of the settled hold: before it they only show
+        the way there.
+        """
         if not len(rows):
             return
         state = telemetry.column(rows, "state")
         for row, code in telemetry.changes(state, self.state):
             if code == telemetry.State.HOLD:
-                self.shapes.rebase(float(telemetry.column(rows, "mono_s")[row]) + telemetry.SETTLED_AFTER_S)
+                self.shapes.rebase(
+                    float(telemetry.column(rows, "mono_s")[row]) + telemetry.SETTLED_AFTER_S
+                )
         self.state = float(state[-1])
 
     def close(self) -> None:

@@ -2,13 +2,14 @@
 
 The Rerun file has segments, time axes, statics, and a flush that reports a dead writer.
 
-Rerun facts behind this module (0.41, all reproduced): on a full disk `log` and `send_columns` continue silently, only
-`flush` raises; `save` on a healthy stream starts a new file at once and loses no row; statics and properties must be
-sent again after each `save`, as must the blueprint, but sending one leaks 3 MB (0.5 GB in a week of hourly segments):
-it goes into the first file, and into the others when they are optimised (`housekeeping`); segments with the same
-recording id are one recording in the viewer. If the writer dies between taking a flush and answering it, `flush`
-times out, and then `save`, `disconnect`, the stream's destructor and Rerun's own exit handler wait forever: such a
-stream is kept untouched, and the process must end without exit handlers.
+Rerun facts behind this module (0.41, all reproduced): on a full disk `log` and `send_columns`
+continue silently, only `flush` raises; `save` on a healthy stream starts a new file at once and
+loses no row; statics and properties must be sent again after each `save`, as must the blueprint,
+but sending one leaks 3 MB (0.5 GB in a week of hourly segments): it goes into the first file, and
+into the others when they are optimised (`housekeeping`); segments with the same recording id are
+one recording in the viewer. If the writer dies between taking a flush and answering it, `flush`
+times out, and then `save`, `disconnect`, the stream's destructor and Rerun's own exit handler wait
+forever: such a stream is kept untouched, and the process must end without exit handlers.
 """
 
 import contextlib
@@ -57,11 +58,13 @@ class RecordingError(Exception):
 class Recording:
     """One Rerun recording in segments `<name>-000.rrd`, `-001.rrd`, ...
 
-    The folder's name is the recording's id, so that all segments are one recording. `first_segment` is not 0 if
-    an earlier recorder started the run.
+    The folder's name is the recording's id, so that all segments are one recording. `first_segment`
+    is not 0 if an earlier recorder started the run.
     """
 
-    def __init__(self, run_dir: Path, run_name: str, clock: RunClock, config: Config, first_segment: int = 0) -> None:
+    def __init__(
+        self, run_dir: Path, run_name: str, clock: RunClock, config: Config, first_segment: int = 0
+    ) -> None:
         self._run_dir = run_dir
         self._run_name = run_name
         self._origin = np.datetime64(clock.origin_utc.replace(tzinfo=None), "ns")
@@ -73,7 +76,9 @@ class Recording:
         self._laid_out = False
 
     def next_segment(self) -> None:
-        """Close the present file and start a new one. Raises RecordingError; then call again later."""
+        """Close the present file and start a new one. Raises RecordingError;
+        then call again later.
+        """
         path = self._run_dir / f"{self._run_name}-{self.segments:03d}.rrd"
         try:
             self._stream.save(path)
@@ -90,7 +95,9 @@ class Recording:
         return rr.RecordingStream(APPLICATION, recording_id=self._run_dir.name)
 
     def _abandon(self) -> None:
-        """Continue with another stream and never touch the old one again (see the module's facts)."""
+        """Continue with another stream and never touch the old one
+        again (see the module's facts).
+        """
         _abandoned.append(self._stream)
         self.stuck = True
         self._stream = self._new_stream()
@@ -107,25 +114,47 @@ class Recording:
         origin: dict[str, Any] = {"name": self._run_name, "started_utc": str(self._origin)}
         origin |= file_origin("membrane-recording/1")
         stream.send_property("run", rr.AnyValues(**origin))
-        for block in (*streams.STREAMS, *streams.DERIVED, *streams.SHAPE_STREAMS, streams.VIBRATIONS):
+        for block in (
+            *streams.STREAMS,
+            *streams.DERIVED,
+            *streams.SHAPE_STREAMS,
+            streams.VIBRATIONS,
+        ):
             stream.log(block.path, _styled(rr.SeriesLines, block), static=True)
-        for block in (streams.band(self._config.limits.band_um), streams.CHANGE, streams.SAG, streams.PUMP):
+        for block in (
+            streams.band(self._config.limits.band_um),
+            streams.CHANGE,
+            streams.SAG,
+            streams.PUMP,
+        ):
             stream.log(block.path, _styled(rr.Measurements.from_fields, block), static=True)
         for block in streams.MARKS:  # the average of the lines in a pixel would be none
-            stream.log(block.path, _styled(rr.SeriesLines, block, aggregation_policy="Off"), static=True)
-        bars = rr.BarChart(np.zeros(ZERNIKE_TERMS - 1), abscissa=NOLL_INDICES[1:]).as_component_batches()
-        abscissa = [part for part in bars if part.component_descriptor().component == "BarChart:abscissa"]
+            stream.log(
+                block.path, _styled(rr.SeriesLines, block, aggregation_policy="Off"), static=True
+            )
+        bars = rr.BarChart(
+            np.zeros(ZERNIKE_TERMS - 1), abscissa=NOLL_INDICES[1:]
+        ).as_component_batches()
+        abscissa = [
+            part for part in bars if part.component_descriptor().component == "BarChart:abscissa"
+        ]
         stream.log(shapes.BARS_PATH, abscissa, static=True)
         for lane in LANES:
             words = list(lane.colours)
             colours = np.array([lane.colours[word] for word in words], dtype=np.uint32)
-            stream.log(lane.path, rr.StateConfiguration(values=words, labels=words, colors=colours), static=True)
+            stream.log(
+                lane.path,
+                rr.StateConfiguration(values=words, labels=words, colors=colours),
+                static=True,
+            )
         stream.log(
             "/shape",
             rr.AnnotationContext([(0, "", (0, 0, 0, 0)), (OUTSIDE_CLASS, "", (24, 24, 24, 255))]),
             static=True,
         )
-        outside = rr.SegmentationImage(shapes.outside_disc() * OUTSIDE_CLASS, opacity=1.0, draw_order=1.0)
+        outside = rr.SegmentationImage(
+            shapes.outside_disc() * OUTSIDE_CLASS, opacity=1.0, draw_order=1.0
+        )
         for kind in shapes.MAPS:
             stream.log(f"/shape/map/{kind}/outside", outside, static=True)
 
@@ -142,7 +171,9 @@ class Recording:
         """Send (n, m) values of one entity at (n,) times of the run."""
         self.columns(path, time_s, rr.Scalars.columns(scalars=values))
 
-    def measurements(self, path: str, time_s: FloatArray, values: FloatArray, variances: FloatArray) -> None:
+    def measurements(
+        self, path: str, time_s: FloatArray, values: FloatArray, variances: FloatArray
+    ) -> None:
         """Send (n, m) values of one entity with their variances at (n,) times of the run."""
         self.columns(path, time_s, rr.Measurements.columns(values=values, variances=variances))
 
@@ -162,7 +193,9 @@ class Recording:
         self._laid_out = False
 
     def flush(self) -> None:
-        """Write everything sent to the file. Raises RecordingError if the writer has died since the last call."""
+        """Write everything sent to the file. Raises RecordingError if the writer has died since the
+        last call.
+        """
         try:
             self._stream.flush(timeout_sec=_FLUSH_TIMEOUT_S)
         except (RuntimeError, OSError) as error:
@@ -170,7 +203,9 @@ class Recording:
             raise RecordingError(str(error)) from None
 
     def pause(self) -> None:
-        """Close the file without a new one; `next_segment` continues. Raises RecordingError as `close`."""
+        """Close the file without a new one; `next_segment` continues. Raises RecordingError as
+        `close`.
+        """
         self.close()
         self._stream = self._new_stream()
 
@@ -182,7 +217,8 @@ class Recording:
     def close(self) -> None:
         """Write the footer and close the file.
 
-        Raises RecordingError if the file has no footer: it then opens slowly, and may lack its last second.
+        Raises RecordingError if the file has no footer: it then opens slowly, and may lack its last
+        second.
         """
         self.flush()
         self._stream.disconnect()
@@ -205,7 +241,9 @@ def is_whole(path: Path) -> bool:
 
 @contextlib.contextmanager
 def _panics_are_errors() -> Iterator[None]:
-    """Turn a panic in Rerun's code, which is not an `Exception` in Python, into a `RuntimeError`."""
+    """Turn a panic in Rerun's code, which is not an `Exception` in Python,
+    into a `RuntimeError`.
+    """
     try:
         yield
     except BaseException as error:
@@ -214,9 +252,13 @@ def _panics_are_errors() -> Iterator[None]:
         raise RuntimeError(f"Rerun failed on it ({str(error)[:80]})") from None
 
 
-def _styled(archetype: Callable[..., rr.AsComponents], stream: streams.Stream, **more: object) -> rr.AsComponents:
+def _styled(
+    archetype: Callable[..., rr.AsComponents], stream: streams.Stream, **more: object
+) -> rr.AsComponents:
     """Names, colours and widths of a stream's lines."""
-    names, colours, widths = zip(*((line.name, line.colour, line.width) for line in stream.lines), strict=True)
+    names, colours, widths = zip(
+        *((line.name, line.colour, line.width) for line in stream.lines), strict=True
+    )
     return archetype(names=names, colors=colours, widths=widths, **more)
 
 
@@ -227,7 +269,9 @@ Report = Callable[[Event], None]
 
 
 class RecorderErrors:
-    """Runs calls that may fail and reports failures; `errors` counts all `RecorderError`s, also predecessors'."""
+    """Runs calls that may fail and reports failures; `errors` counts all `RecorderError`s, also
+    predecessors'.
+    """
 
     def __init__(self, report: Report, errors: int = 0) -> None:
         self.report = report
@@ -243,12 +287,16 @@ class RecorderErrors:
         except Exception as error:
             place = traceback.extract_tb(error.__traceback__)[-1]
             self.report_error(
-                what, f"{what}: {type(error).__name__}: {error} ({Path(place.filename).name}:{place.lineno})"
+                what,
+                f"{what}: {type(error).__name__}: {error} "
+                f"({Path(place.filename).name}:{place.lineno})",
             )
         else:
             self.recovered(what)
 
-    def report_error(self, what: str, message: str, as_: type[RecorderError | DiskLow] = RecorderError) -> None:
+    def report_error(
+        self, what: str, message: str, as_: type[RecorderError | DiskLow] = RecorderError
+    ) -> None:
         """Report an error once until it changes; `what` identifies it for `recovered`."""
         if self._trouble.get(what) != message:
             self._trouble[what] = message
@@ -261,7 +309,9 @@ class RecorderErrors:
             self.report(RecorderRecovered(what, f"{what} works again"))
 
     def forget(self, prefix: str, but: set[str]) -> None:
-        """Report as over all errors that start with `prefix` and are not in `but`: their cause has gone."""
+        """Report as over all errors that start with `prefix` and are not in `but`: their cause has
+        gone.
+        """
         for what in [what for what in self._trouble if what.startswith(prefix) and what not in but]:
             self.recovered(what)
 
@@ -295,7 +345,9 @@ class EventsFile:
 
     def unwritten(self, events: Sequence[EventLine]) -> list[EventLine]:
         """The events that no earlier recorder of the run has written."""
-        return [event for event in events if dumps_checked(event).encode() + b"\n" not in self._written]
+        return [
+            event for event in events if dumps_checked(event).encode() + b"\n" not in self._written
+        ]
 
     def append(self, events: Sequence[EventLine]) -> None:
         """Write events, after those still waiting. Raises OSError (full disk)."""
@@ -326,7 +378,9 @@ class EventsFile:
             self._sync = False
 
     def begin_anew(self, recent: Sequence[EventLine]) -> None:
-        """Start a new file after the old one's removal, with the events written to it meanwhile. Raises OSError."""
+        """Start a new file after the old one's removal, with the events written to it meanwhile.
+        Raises OSError.
+        """
         gone = self._descriptor is not None  # not opened yet: nothing was lost
         self.close()
         self.append(recent if gone else [])
@@ -338,7 +392,8 @@ class EventsFile:
             self._descriptor = None
 
 
-# A killed recorder saved its progress up to a second earlier: at most this many events may come twice.
+# A killed recorder saved its progress up to a second earlier: at most this many events may come
+# twice.
 _TAIL_BYTES = 1_000_000
 
 

@@ -1,8 +1,8 @@
 """`replay RUN`: runs the recorded inputs through today's control code and reports the differences.
 
-`--to-test` turns a part of the run into an incident: `tests/incidents/<name>/` holds the run's configuration and
-inputs, and `incident.toml` the expected decisions. If the controller decided wrongly, edit those to the decisions it
-should have made: the test then fails until it makes them.
+`--to-test` turns a part of the run into an incident: `tests/incidents/<name>/` holds the run's
+configuration and inputs, and `incident.toml` the expected decisions. If the controller decided
+wrongly, edit those to the decisions it should have made: the test then fails until it makes them.
 """
 
 import math
@@ -34,7 +34,8 @@ from membrane_ctrl.run_files import inputs_file, run_folder, table_specs
 from membrane_ctrl.run_files.run import open_run
 from membrane_ctrl.run_files.run_tables import RunTables, as_recorded
 
-# The parts of a run folder that a replay needs: configuration, inputs, recorded decisions, recorded rows.
+# The parts of a run folder that a replay needs: configuration, inputs, recorded decisions, recorded
+# rows.
 
 
 @dataclass(frozen=True, slots=True)
@@ -50,24 +51,34 @@ class RecordedRun:
 
     @property
     def elsewhere(self) -> str:
-        """Where its outputs were computed, if not on this processor with these libraries; else empty."""
+        """Where its outputs were computed, if not on this processor with these libraries; else
+        empty.
+        """
         recorded = self.inputs.arithmetic
         return "" if recorded == describe_arithmetic() else recorded or "an unknown processor"
 
     def recorded_rows(self, from_s: float) -> RecordedRows | None:
-        """Its rows, if those of this program can have other bits without being others; else None."""
+        """Its rows, if those of this program can have other bits without being others;
+        else None.
+        """
         names = [name for name in self.inputs.columns if name in telemetry.COLUMN]
         if not self.elsewhere and len(names) == len(self.inputs.columns):
             return None
         return RecordedRows(open_run(self.folder).tick_blocks(["tick", *names], from_s))
 
-    def differences(self, rows: Sequence[telemetry.TelemetryRow]) -> list[dict[str, tuple[float, float]] | None]:
-        """Fields in which each row differs from the recorded one; None where the recording has none."""
+    def differences(
+        self, rows: Sequence[telemetry.TelemetryRow]
+    ) -> list[dict[str, tuple[float, float]] | None]:
+        """Fields in which each row differs from the recorded one; None where the recording has
+        none.
+        """
         return [self._differences(row) for row in rows]
 
     def _differences(self, row: telemetry.TelemetryRow) -> dict[str, tuple[float, float]] | None:
         after_s = math.nextafter(row.mono_s, math.inf)
-        recorded = next(open_run(self.folder).tick_blocks(telemetry.FIELDS, row.mono_s, after_s), None)
+        recorded = next(
+            open_run(self.folder).tick_blocks(telemetry.FIELDS, row.mono_s, after_s), None
+        )
         if recorded is None:
             return None
         then = telemetry.TelemetryRow(*(float(recorded[name][0]) for name in telemetry.FIELDS))
@@ -97,13 +108,19 @@ DECISION_SLACK_S = 0.5
 
 
 def replay_command(
-    folder: Path, from_s: float, to_s: float, to_test: str | None, as_json: bool, state: bool = False
+    folder: Path,
+    from_s: float,
+    to_s: float,
+    to_test: str | None,
+    as_json: bool,
+    state: bool = False,
 ) -> int:
     """Replay and report; exit 3 if a row or a decision differs, else 0.
 
     `state`: print what the controller remembers at the end of the part, too.
 
-    Raises InputError if the run cannot be replayed, has no such part, or (with `to_test`) the name is taken.
+    Raises InputError if the run cannot be replayed, has no such part, or (with `to_test`) the name
+    is taken.
     """
     if from_s >= to_s:
         raise InputError(f"--from {from_s:g}s is not before --to {to_s:g}s")
@@ -120,17 +137,26 @@ def replay_command(
     report = _report(run, found, begin, to_s)
     remembered = found.state if state else None
     if as_json:
-        print(plain_json.dumps(report if remembered is None else report | {"state": to_plain(remembered)}))
+        print(
+            plain_json.dumps(
+                report if remembered is None else report | {"state": to_plain(remembered)}
+            )
+        )
     else:
         print("\n".join(_lines(report)))
         if remembered is not None:
-            print(f"state      after the tick at {found.last_s:.3f} s:", *describe(remembered), sep="\n")
+            print(
+                f"state      after the tick at {found.last_s:.3f} s:",
+                *describe(remembered),
+                sep="\n",
+            )
     rate = found.ticks / took_s if took_s else math.inf
     print(f"{found.ticks} ticks in {took_s:.1f} s ({rate:.0f} a second)", file=sys.stderr)
     if to_test is not None:
         if found.gaps:
             raise InputError(
-                f"--to-test: ticks are missing at {found.gaps[0].time_s:.1f} s, so the right decisions are "
+                f"--to-test: ticks are missing at {found.gaps[0].time_s:.1f} s, so the right "
+                "decisions are "
                 "unknown; choose a part without a gap with --from and --to"
             )
         target = write_incident(run, found, to_test, begin, to_s)
@@ -139,7 +165,9 @@ def replay_command(
 
 
 def _replayed(run: RecordedRun, from_s: float, to_s: float) -> tuple[int, replays.Replay]:
-    """Start at the last snapshot before `from_s`, or at the run's start without a snapshot of today's layout."""
+    """Start at the last snapshot before `from_s`, or at the run's start without a snapshot of
+    today's layout.
+    """
     inputs = run.inputs.since(from_s)
     begin = replays.tick_to_begin_with(inputs, from_s)
     if begin > 1:
@@ -156,7 +184,10 @@ def _replayed(run: RecordedRun, from_s: float, to_s: float) -> tuple[int, replay
 
 
 def _replay(
-    run: RecordedRun, ticks: Iterator[replays.RecordedTick | replays.Gap], from_s: float, to_s: float
+    run: RecordedRun,
+    ticks: Iterator[replays.RecordedTick | replays.Gap],
+    from_s: float,
+    to_s: float,
 ) -> replays.Replay:
     comparison = replays.Comparison(ColumnChoice(run.inputs.columns), run.recorded_rows(from_s))
     return replays.replay(run.config, ticks, zernike_projection(), from_s, to_s, comparison)
@@ -182,19 +213,26 @@ def _report(run: RecordedRun, found: replays.Replay, begin: int, to_s: float) ->
         "unknown_columns": list(ColumnChoice(run.inputs.columns).unknown),
         "near": found.near,
         "different": found.different,
-        "first_different": None if first is None else {"tick": int(first.tick), "time_s": first.mono_s},
+        "first_different": None
+        if first is None
+        else {"tick": int(first.tick), "time_s": first.mono_s},
         "fields": differences[0] if differences else None,
         "decisions": decisions,
-        "state_differences": None if found.state_differences is None else asdict(found.state_differences),
+        "state_differences": None
+        if found.state_differences is None
+        else asdict(found.state_differences),
         "gaps": [
-            {"after_tick": g.after_tick, "time_s": g.time_s, "ticks": g.ticks, "why": g.reason} for g in found.gaps
+            {"after_tick": g.after_tick, "time_s": g.time_s, "ticks": g.ticks, "why": g.reason}
+            for g in found.gaps
         ],
         "damage": [*filter(None, (run.config_damage,)), *run.inputs.damage],
     }
 
 
 def _verdict(found: replays.Replay, decisions_differ: bool, damaged: bool) -> str:
-    """The verdict: identical only if all was compared; decisions after a gap prove nothing about the code."""
+    """The verdict: identical only if all was compared; decisions after a gap prove nothing about
+    the code.
+    """
     other_numbers = found.near and found.state_differences is not None
     if found.different or other_numbers or (decisions_differ and not found.gaps):
         return "different"
@@ -205,17 +243,24 @@ def _verdict(found: replays.Replay, decisions_differ: bool, damaged: bool) -> st
 
 def _lines(report: dict[str, Any]) -> list[str]:
     """The report as lines of text."""
-    lines = [f"verdict    {report['verdict']}: {report['compared']} of {report['ticks']} ticks compared bit by bit"]
+    lines = [
+        f"verdict    {report['verdict']}: {report['compared']} of {report['ticks']} ticks "
+        "compared bit by bit"
+    ]
     lines.append(f"recorded   by {report['recorded_by'] or 'an unknown program'}")
     if report["computed_on"]:
-        lines.append(f"           on another processor, or with other libraries: {report['computed_on']}")
+        lines.append(
+            f"           on another processor, or with other libraries: {report['computed_on']}"
+        )
     if report["unknown_columns"]:
         lines.append(
-            f"           with columns that this program does not have: {', '.join(report['unknown_columns'])}"
+            "           with columns that this program does not have: "
+            f"{', '.join(report['unknown_columns'])}"
         )
     if report["near"]:
         lines.append(
-            f"numbers    {report['near']} ticks have other last bits; decisions are the same, and numbers within "
+            f"numbers    {report['near']} ticks have other last bits; decisions are the "
+            "same, and numbers within "
             f"{NUMBERS_WITHIN:g}, or the single precision of the record"
         )
     if report["from_snapshot"]:
@@ -223,25 +268,29 @@ def _lines(report: dict[str, Any]) -> list[str]:
     first = report["first_different"]
     if first is not None:
         lines.append(
-            f"different  {report['different']} ticks, the first is tick {first['tick']} at {first['time_s']:.3f} s"
+            f"different  {report['different']} ticks, the first is tick {first['tick']} at "
+            f"{first['time_s']:.3f} s"
         )
         if report["fields"] is None:
             lines.append("           the recorded values there cannot be read")
         elif not report["fields"]:
             lines.append(
-                "           its row is as recorded: a smaller difference, an event, or an answer to a command"
+                "           its row is as recorded: a smaller difference, an event, or an "
+                "answer to a command"
             )
         for name, (then, now) in (report["fields"] or {}).items():
             lines.append(f"           {name}: recorded {then!r}, today {now!r}")
     lines += [f"decision   {sentence}" for sentence in report["decisions"]]
     if (state := report["state_differences"]) is not None:
         lines.append(
-            f"state      differs from the snapshot at {state['time_s']:.2f} s in {len(state['fields'])} fields:"
+            f"state      differs from the snapshot at {state['time_s']:.2f} s in "
+            f"{len(state['fields'])} fields:"
         )
         lines += [f"           {each}" for each in state["fields"][:_FIELDS_SHOWN]]
     for gap in report["gaps"]:
         lines.append(
-            f"gap        {gap['ticks']} ticks after tick {gap['after_tick']} at {gap['time_s']:.2f} s: {gap['why']}; "
+            f"gap        {gap['ticks']} ticks after tick {gap['after_tick']} at "
+            f"{gap['time_s']:.2f} s: {gap['why']}; "
             "decisions only up to the next snapshot"
         )
     lines += [f"damage     {sentence}" for sentence in report["damage"]]
@@ -256,14 +305,20 @@ _BYTES_MAX = 4_000_000
 
 
 def write_incident(
-    run: RecordedRun, found: replays.Replay, name: str, begin: int, to_s: float, incidents: Path = INCIDENTS
+    run: RecordedRun,
+    found: replays.Replay,
+    name: str,
+    begin: int,
+    to_s: float,
+    incidents: Path = INCIDENTS,
 ) -> Path:
-    """Make a test from a replay: the run's inputs up to `to_s`, and the decisions found as expectations.
+    """Make a test from a replay: the run's inputs up to `to_s`, and the decisions found as
+    expectations.
 
     It starts at the tick `begin`: the run's first, or one with a snapshot of the controller.
 
-    Raises InputError if the name is invalid or taken, the folder is missing, or the test is too large for a
-    repository.
+    Raises InputError if the name is invalid or taken, the folder is missing, or the test is too
+    large for a repository.
     """
     if not _NAME.fullmatch(name):
         raise InputError(f"--to-test {name!r}: use small letters, digits, '-' and '_'")
@@ -285,7 +340,8 @@ def write_incident(
         "what": f"replay of {run.folder.resolve().name}",
         "recorded_by": run.inputs.program,
         "decisions": [
-            {"time_s": round(d.time_s, 3), "what": d.what} for d in replays.without_repeats(found.decisions)
+            {"time_s": round(d.time_s, 3), "what": d.what}
+            for d in replays.without_repeats(found.decisions)
         ],
     }
     (folder / "incident.toml").write_text(tomli_w.dumps(about), encoding="utf-8")
@@ -293,7 +349,10 @@ def write_incident(
     size = sum(path.stat().st_size for path in folder.rglob("*") if path.is_file())
     if size > _BYTES_MAX:
         shutil.rmtree(folder)
-        raise InputError(f"--to-test: {size / 1e6:.0f} MB is too large for a test; narrow it with --from and --to")
+        raise InputError(
+            f"--to-test: {size / 1e6:.0f} MB is too large for a test; narrow it with --from "
+            "and --to"
+        )
     return folder
 
 
@@ -305,8 +364,12 @@ def _rows(records: Records) -> telemetry.Rows:
     return rows
 
 
-def _between(frames: inputs_file.InputsReader, begin: int, to_s: float) -> Iterator[inputs_file.InputsFrame]:
-    before: dict[float, shape_estimate.ShapeEstimate] = {}  # a shape may arrive a frame before the tick that used it
+def _between(
+    frames: inputs_file.InputsReader, begin: int, to_s: float
+) -> Iterator[inputs_file.InputsFrame]:
+    before: dict[
+        float, shape_estimate.ShapeEstimate
+    ] = {}  # a shape may arrive a frame before the tick that used it
     for frame in frames:
         if len(frame.records) and frame.records["now_s"][0] > to_s:
             return
@@ -315,5 +378,7 @@ def _between(frames: inputs_file.InputsReader, begin: int, to_s: float) -> Itera
         tails = {tick: tail for tick, tail in frame.tails.items() if tick in ticks}
         snapshots = {tick: snapshot for tick, snapshot in frame.snapshots.items() if tick == begin}
         if ticks:
-            yield inputs_file.InputsFrame(frame.records[wanted], tails, snapshots, before | frame.estimates)
+            yield inputs_file.InputsFrame(
+                frame.records[wanted], tails, snapshots, before | frame.estimates
+            )
         before = {} if ticks else frame.estimates

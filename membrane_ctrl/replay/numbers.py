@@ -1,8 +1,9 @@
 """Compares replayed rows with recorded ones by their numbers, where the last bits may differ.
 
-On another processor, or with other libraries, the last bits of a sum or of a sine may differ. Codes (states, faults)
-must then be the same, and numbers within `NUMBERS_WITHIN` of their size. The table of ticks holds computed columns in
-single precision; their later digits are compared in the snapshots.
+On another processor, or with other libraries, the last bits of a sum or of a sine may differ. Codes
+(states, faults) must then be the same, and numbers within `NUMBERS_WITHIN` of their size. The table
+of ticks holds computed columns in single precision; their later digits are compared in the
+snapshots.
 """
 
 from collections.abc import Iterator, Mapping
@@ -24,7 +25,8 @@ class RecordedRows:
     Parameters
     ----------
     blocks : iterator of dict
-        Columns of consecutive ticks, among them `tick`; a column that the run lacks is not compared.
+        Columns of consecutive ticks, among them `tick`; a column that the run lacks is not
+        compared.
     """
 
     def __init__(self, blocks: Iterator[Mapping[str, Column]]) -> None:
@@ -34,7 +36,8 @@ class RecordedRows:
         self._known: BoolArray = np.ones(len(telemetry.FIELDS), dtype=bool)
 
     def find_differing(self, row: telemetry.TelemetryRow) -> tuple[str, ...] | None:
-        """Columns in which a row differs from the recorded one by more than rounding; None without a recorded one.
+        """Columns in which a row differs from the recorded one by more than rounding; None without
+        a recorded one.
 
         Rows are asked for in order of their ticks.
         """
@@ -45,7 +48,9 @@ class RecordedRows:
         with np.errstate(invalid="ignore"):
             near = np.isfinite(today) & (np.abs(today - recorded) <= _tolerances(today))
         same = near | (today == recorded) | (np.isnan(today) & np.isnan(recorded)) | ~self._known
-        return tuple(name for name, is_same in zip(telemetry.FIELDS, same, strict=True) if not is_same)
+        return tuple(
+            name for name, is_same in zip(telemetry.FIELDS, same, strict=True) if not is_same
+        )
 
     def _find(self, tick: float) -> FloatArray | None:
         while not self._ticks.size or self._ticks[-1] < tick:

@@ -1,4 +1,6 @@
-"""`repair RUN`: repairs a run after a crash. Originals stay untouched unless a person asks otherwise."""
+"""`repair RUN`: repairs a run after a crash. Originals stay untouched unless a person asks
+otherwise.
+"""
 
 import json
 import os
@@ -42,17 +44,22 @@ def repair_command(run_dir: Path, in_place: bool, as_json: bool) -> int:
         print(json.dumps({"run": run_dir.resolve().name, "files": rows}))
     else:
         for finding in findings:
-            print(f"{finding.file:28} {finding.state}{': ' if finding.action else ''}{finding.action}")
+            print(
+                f"{finding.file:28} {finding.state}{': ' if finding.action else ''}{finding.action}"
+            )
     if not in_place and (run_dir / REPAIRED).exists():
-        print(f"repaired files: {run_dir / REPAIRED}; --in-place replaces the originals", file=sys.stderr)
+        print(
+            f"repaired files: {run_dir / REPAIRED}; --in-place replaces the originals",
+            file=sys.stderr,
+        )
     return int(errors.Exit.DONE)
 
 
 def repair(run_dir: Path, in_place: bool = False) -> list[FileFinding]:
     """Repair every file of a run that a crash may have torn.
 
-    Repaired files go to `repaired/` or replace the originals; the part cut off the event log stays beside it as
-    `.torn`. A missing summary is always written in place.
+    Repaired files go to `repaired/` or replace the originals; the part cut off the event log stays
+    beside it as `.torn`. A missing summary is always written in place.
     """
     if not (run_dir / "config.toml").is_file():
         raise errors.InputError(f"{run_dir}: not a run folder (no config.toml)")
@@ -81,7 +88,9 @@ def _now_s(folder: Path) -> float:
             now_s = os.fstat(file.fileno()).st_mtime
         files.remove(probe)
     except OSError as error:
-        raise errors.InputError(f"{folder}: cannot be written ({error.strerror}); copy the run first") from None
+        raise errors.InputError(
+            f"{folder}: cannot be written ({error.strerror}); copy the run first"
+        ) from None
     return now_s
 
 
@@ -103,7 +112,11 @@ def _repair_events(run_dir: Path, in_place: bool) -> list[FileFinding]:
     files.write_bytes_atomic(target.with_name(f"{path.name}.torn"), torn)
     files.write_bytes_atomic(target, good)
     where = target.relative_to(run_dir)
-    return [FileFinding(path.name, "torn", f"{len(torn)} bytes cut to {where}.torn, the rest in {where}")]
+    return [
+        FileFinding(
+            path.name, "torn", f"{len(torn)} bytes cut to {where}.torn, the rest in {where}"
+        )
+    ]
 
 
 def _split_events(data: bytes) -> tuple[bytes, bytes]:
@@ -111,7 +124,9 @@ def _split_events(data: bytes) -> tuple[bytes, bytes]:
     good: list[bytes] = []
     torn: list[bytes] = []
     for line in data.splitlines(keepends=True):
-        whole = line.endswith(b"\n") and run_folder.event_of(line.decode(errors="replace")) is not None
+        whole = (
+            line.endswith(b"\n") and run_folder.event_of(line.decode(errors="replace")) is not None
+        )
         (good if whole else torn).append(line)
     return b"".join(good), b"".join(torn)
 
@@ -125,14 +140,18 @@ def _is_whole_object(data: bytes) -> bool:
 
 
 def _seal_journals(run_dir: Path, in_place: bool) -> list[FileFinding]:
-    """Make parts of the journals that a dead recorder left; only in place, as sealing removes the journal."""
+    """Make parts of the journals that a dead recorder left; only in place, as sealing removes the
+    journal.
+    """
     findings = []
     for spec in table_specs.ALL:
         left = sorted((run_dir / spec.name).glob(f"*{JOURNAL_SUFFIX}"))
         if left and in_place:
             TableWriter(run_dir, table_specs.with_origin(spec), resumed=True).close()
         action = (
-            "made parts of them" if in_place else "readable by `open_run`; --in-place makes parts for other programs"
+            "made parts of them"
+            if in_place
+            else "readable by `open_run`; --in-place makes parts for other programs"
         )
         if left:
             findings.append(FileFinding(f"{spec.name} ({len(left)} journals)", "open", action))
@@ -178,7 +197,9 @@ def _repair_summary(run_dir: Path, in_place: bool) -> FileFinding:
     target = _target(path, in_place or not there)
     files.write_text_atomic(target, plain_json.dumps(table, indent=2) + "\n")
     state = "unreadable" if there else "missing"
-    return FileFinding(path.name, state, f"rebuilt from {table['ticks']} ticks: {target.relative_to(run_dir)}")
+    return FileFinding(
+        path.name, state, f"rebuilt from {table['ticks']} ticks: {target.relative_to(run_dir)}"
+    )
 
 
 def rebuild_summary(run_dir: Path) -> dict[str, Any]:
@@ -196,7 +217,11 @@ def rebuild_summary(run_dir: Path) -> dict[str, Any]:
         ticks += len(frame.records)
         for estimate in frame.estimates.values():
             summary.add_shape(estimate)
-    good, _ = _split_events(files.read_bytes(path, run_folder.EVENTS_BYTES_MAX)) if path.exists() else (b"", b"")
+    good, _ = (
+        _split_events(files.read_bytes(path, run_folder.EVENTS_BYTES_MAX))
+        if path.exists()
+        else (b"", b"")
+    )
     for line in good.splitlines():
         summary.add_event(run_folder.event_of(line.decode()) or {})
     table = summary.as_dict({}, {})

@@ -1,10 +1,10 @@
 """Replay: runs the recorded inputs of a run through today's control code, on the run's own clock.
 
-A tick is a pure function of its inputs and of the ticks before it, so the same code gives identical outputs, and any
-difference is a change of the code. A replay starts with the run, or in the middle of it from a snapshot of
-what the controller remembered (`controller/snapshot.py`). Each tick's outputs are compared by checksum. Where the
-record lacks ticks, the replayed controller misses them too: until the next snapshot, only decisions (states, faults)
-are compared.
+A tick is a pure function of its inputs and of the ticks before it, so the same code gives identical
+outputs, and any difference is a change of the code. A replay starts with the run, or in the middle
+of it from a snapshot of what the controller remembered (`controller/snapshot.py`). Each tick's
+outputs are compared by checksum. Where the record lacks ticks, the replayed controller misses them
+too: until the next snapshot, only decisions (states, faults) are compared.
 """
 
 import math
@@ -18,7 +18,13 @@ from membrane_ctrl.config.schema import Config
 from membrane_ctrl.controller.controller import Controller
 from membrane_ctrl.controller.snapshot import UnknownSnapshotError, continue_from, decode_snapshot
 from membrane_ctrl.controller.state import ControllerState
-from membrane_ctrl.controller.tick import ColumnChoice, TickInputs, TickOutputs, output_crc, unpack_tick
+from membrane_ctrl.controller.tick import (
+    ColumnChoice,
+    TickInputs,
+    TickOutputs,
+    output_crc,
+    unpack_tick,
+)
 from membrane_ctrl.model import errors, shape_estimate, telemetry
 from membrane_ctrl.model.arrays import FloatArray
 from membrane_ctrl.model.events import Cleared, Event, Fault, ShapeLoopState, StateEntered
@@ -83,12 +89,15 @@ class Replay:
     compared: int = 0  # of these, bit by bit
     near: int = 0  # of these, with other last bits
     different: int = 0  # of these
-    different_rows: list[telemetry.TelemetryRow] = field(default_factory=list)  # today's, of the first of them
+    different_rows: list[telemetry.TelemetryRow] = field(
+        default_factory=list
+    )  # today's, of the first of them
     gaps: list[Gap] = field(default_factory=list)
     decisions: list[Decision] = field(default_factory=list)
     last_s: float = -math.inf
     finished: errors.Exit | None = None
-    # fields in which the state differs from the first recorded snapshot that is not the replayed state
+    # fields in which the state differs from the first recorded snapshot that is not the replayed
+    # state
     state_differences: StateDifferences | None = None
     state: ControllerState | None = None  # after the last replayed tick
 
@@ -102,8 +111,8 @@ class Comparison:
     columns : ColumnChoice
         Those that the checksums of the run cover.
     rows : RecordedRows or None
-        Given if the record was made on another processor, with other libraries or with columns that this program does
-        not have: a tick with another checksum is then compared by its numbers.
+        Given if the record was made on another processor, with other libraries or with columns that
+        this program does not have: a tick with another checksum is then compared by its numbers.
     """
 
     columns: ColumnChoice = field(default_factory=lambda: ColumnChoice(telemetry.FIELDS))
@@ -118,12 +127,14 @@ def replay(
     to_s: float = math.inf,
     comparison: Comparison | None = None,
 ) -> Replay:
-    """Run recorded ticks through a new controller, from the run's first or from one with a snapshot.
+    """Run recorded ticks through a new controller, from the run's first or from one with a
+    snapshot.
 
-    The part between `from_s` and `to_s` is compared bit by bit; earlier ticks run, but are not compared.
+    The part between `from_s` and `to_s` is compared bit by bit; earlier ticks run, but are not
+    compared.
 
-    Raises UnknownSnapshotError if today's code cannot use the record's first snapshot, or a tick raises after
-    using one.
+    Raises UnknownSnapshotError if today's code cannot use the record's first snapshot, or a tick
+    raises after using one.
     """
     controller = Controller(config, sag_sensitivity)
     comparison = comparison or Comparison()
@@ -158,18 +169,26 @@ def replay(
     return found
 
 
-def _compare_state(item: RecordedTick, controller: Controller, comparison: Comparison) -> StateDifferences | None:
-    """Where a recorded snapshot differs from the replayed state; None if nowhere, or if it has another layout."""
+def _compare_state(
+    item: RecordedTick, controller: Controller, comparison: Comparison
+) -> StateDifferences | None:
+    """Where a recorded snapshot differs from the replayed state; None if nowhere, or if it has
+    another layout.
+    """
     try:
         recorded = decode_snapshot(item.snapshot)
     except UnknownSnapshotError:
         return None
-    fields = find_differences(recorded, controller.memory, NUMBERS_WITHIN if comparison.rows else 0.0)
+    fields = find_differences(
+        recorded, controller.memory, NUMBERS_WITHIN if comparison.rows else 0.0
+    )
     return StateDifferences(item.inputs.now_s, fields) if fields else None
 
 
 def _ticked(controller: Controller, item: RecordedTick, remembered: bool) -> TickOutputs:
-    """Run a tick. Ticks never raise by themselves: one that does after a snapshot proves that it was forged."""
+    """Run a tick. Ticks never raise by themselves: one that does after a snapshot proves that it
+    was forged.
+    """
     try:
         return controller.tick(item.inputs)
     except Exception as error:
@@ -179,7 +198,9 @@ def _ticked(controller: Controller, item: RecordedTick, remembered: bool) -> Tic
         raise UnknownSnapshotError(f"the snapshot cannot be used: {what}") from None
 
 
-def _compare(item: RecordedTick, outputs: TickOutputs, found: Replay, comparison: Comparison) -> None:
+def _compare(
+    item: RecordedTick, outputs: TickOutputs, found: Replay, comparison: Comparison
+) -> None:
     found.compared += 1
     if output_crc(outputs, comparison.columns.pack(outputs.row)) == item.output_crc:
         return
@@ -196,7 +217,12 @@ def decisions_of(told: Iterable[tuple[float, Event]]) -> list[Decision]:
     found: list[Decision] = []
     for time_s, event in told:
         match event:
-            case StateEntered(state=name) | Fault(name=name) | Cleared(name=name) | ShapeLoopState(state=name):
+            case (
+                StateEntered(state=name)
+                | Fault(name=name)
+                | Cleared(name=name)
+                | ShapeLoopState(state=name)
+            ):
                 found.append(Decision(time_s, event.kind, name))
     return found
 
@@ -216,7 +242,9 @@ def tick_to_begin_with(frames: Iterable[InputsFrame], from_s: float) -> int:
 def recorded_ticks(
     frames: Iterable[InputsFrame], begin: int = 1, snapshots: bool = True
 ) -> Iterator[RecordedTick | Gap]:
-    """Yield the ticks of a record in order from `begin` on, with a `Gap` wherever some are missing."""
+    """Yield the ticks of a record in order from `begin` on,
+    with a `Gap` wherever some are missing.
+    """
     estimates: dict[float, shape_estimate.ShapeEstimate] = {}
     last, last_s = begin - 1, 0.0
     for frame in frames:
@@ -269,7 +297,12 @@ def unmatched(recorded: list[Decision], today: list[Decision], slack_s: float) -
     for place in range(max(len(recorded), len(today))):
         then = recorded[place] if place < len(recorded) else None
         now = today[place] if place < len(today) else None
-        if then is None or now is None or then.what != now.what or abs(then.time_s - now.time_s) > slack_s:
+        if (
+            then is None
+            or now is None
+            or then.what != now.what
+            or abs(then.time_s - now.time_s) > slack_s
+        ):
             said.append(f"recorded: {_told(then)}; today: {_told(now)}")
             if then is None or now is None or then.what != now.what:
                 break  # all later ones are shifted against each other

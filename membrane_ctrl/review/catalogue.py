@@ -1,4 +1,6 @@
-"""The catalogue of runs: list, filter, show, prune; a run, and a time of it, as people write and read them."""
+"""The catalogue of runs: list, filter, show, prune; a run, and a time of it, as people write and
+read them.
+"""
 
 import contextlib
 import hashlib
@@ -32,8 +34,10 @@ class RunEntry:
 
     folder: Path
     started_utc: datetime
-    duration_s: float  # up to the end of its tables if in progress or if its recorder was killed; NaN without tables
-    std_um: float  # of 1 s means of the settled hold: of the true centre on the twin, else of the reading
+    # up to the end of its tables if in progress or if its recorder was killed; NaN without tables
+    duration_s: float
+    # of 1 s means of the settled hold: of the true centre on the twin, else of the reading
+    std_um: float
     in_band: float  # share of these within the band
     faults: int
     exit: str  # "done", "trip", ...; "open" without a summary
@@ -48,7 +52,9 @@ class RunEntry:
     faults_s: float = math.nan
     paused_s: float = math.nan
     moving_s: float = math.nan
-    pump_scale: float = math.nan  # flow against its configured curve as last learned, and one standard error
+    pump_scale: float = (
+        math.nan
+    )  # flow against its configured curve as last learned, and one standard error
     pump_sigma: float = math.nan
     ended_in: str = ""  # name of the fault in which the run ended, or is; empty without one
 
@@ -78,7 +84,10 @@ class Filter:
             and (self.least_s is None or entry.duration_s >= self.least_s)
             and (self.most_std_um is None or entry.std_um <= self.most_std_um)
             and (self.with_faults is None or (entry.faults > 0) == self.with_faults)
-            and (self.configuration is None or entry.configuration.startswith(self.configuration.lower()))
+            and (
+                self.configuration is None
+                or entry.configuration.startswith(self.configuration.lower())
+            )
             and (self.text is None or self.text in entry.name)
         )
 
@@ -92,7 +101,9 @@ def entries(logs_dir: Path, wanted: Filter | None = None) -> list[RunEntry]:
 
 def _require_folder(logs_dir: Path) -> None:
     if not logs_dir.is_dir():
-        raise errors.InputError(f"{logs_dir}: no such folder; give the folder of the runs with --logs")
+        raise errors.InputError(
+            f"{logs_dir}: no such folder; give the folder of the runs with --logs"
+        )
 
 
 def _entry_or_why(folder: Path) -> RunEntry:
@@ -106,14 +117,18 @@ def _entry_or_why(folder: Path) -> RunEntry:
 
 
 def entry(folder: Path) -> RunEntry:
-    """One run's line, from its small files only; without a summary, also from the end of its 1 s level."""
+    """One run's line, from its small files only; without a summary, also from the end of its 1 s
+    level.
+    """
     notes: list[str] = []
     log = run_folder.read_events(folder, notes)
     summary: dict[str, Any] = run_folder.read_summary(folder, notes) or {}
     config = run_folder.read_config(folder, notes)
     told, duration_s = summary.get("held"), _number(summary.get("duration_s"))
     held = told if isinstance(told, dict) else {}
-    pump = next((each.event for each in reversed(log) if isinstance(each.event, events.PumpLearned)), None)
+    pump = next(
+        (each.event for each in reversed(log) if isinstance(each.event, events.PumpLearned)), None
+    )
     return RunEntry(
         folder=folder,
         started_utc=origin_of(folder, log),
@@ -128,8 +143,17 @@ def entry(folder: Path) -> RunEntry:
         size_mb=disk_budget.size_bytes(folder) / 1e6,
         marks=sum(isinstance(each.event, run_events.Mark) for each in log),
         kept=(folder / KEPT_FILE).exists(),
-        geometry=next((e.event.hash for e in reversed(log) if isinstance(e.event, run_events.GeometryInForce)), ""),
-        **{name: _number(held.get(name)) for name in ("held_s", "faults_s", "paused_s", "moving_s")},
+        geometry=next(
+            (
+                e.event.hash
+                for e in reversed(log)
+                if isinstance(e.event, run_events.GeometryInForce)
+            ),
+            "",
+        ),
+        **{
+            name: _number(held.get(name)) for name in ("held_s", "faults_s", "paused_s", "moving_s")
+        },
         pump_scale=math.nan if pump is None else _number(pump.scale),
         pump_sigma=math.nan if pump is None else _number(pump.sigma),
         ended_in=_fault_of_end(log, summary.get("exit")),
@@ -150,13 +174,19 @@ def resolve(run: str | Path, logs_dir: str | Path = "logs") -> Path:
     near = [folder for folder in known if folder.name == str(run)]
     near = near or [folder for folder in known if str(run) in folder.name]
     if len(near) > 1:
-        raise errors.InputError(f"{run}: several runs match: {', '.join(folder.name for folder in near[:4])}")
+        raise errors.InputError(
+            f"{run}: several runs match: {', '.join(folder.name for folder in near[:4])}"
+        )
     return near[0] if near else run
 
 
 def folders(logs_dir: Path) -> list[Path]:
     """The folders of runs, by name; hidden ones are remains of deleted runs."""
-    return [folder for folder in sorted(logs_dir.iterdir()) if not folder.name.startswith(".") and may_be_run(folder)]
+    return [
+        folder
+        for folder in sorted(logs_dir.iterdir())
+        if not folder.name.startswith(".") and may_be_run(folder)
+    ]
 
 
 def may_be_run(folder: Path) -> bool:
@@ -170,7 +200,9 @@ def may_be_run(folder: Path) -> bool:
 def to_prune(
     logs_dir: Path, now_utc: datetime, keep_days: float | None, keep_gb: float | None
 ) -> list[tuple[disk_budget.OldRun, str]]:
-    """The runs that the recorder's retention rule (`disk_budget`) would delete, and why; oldest first."""
+    """The runs that the recorder's retention rule (`disk_budget`) would delete, and why; oldest
+    first.
+    """
     _require_folder(logs_dir)
     if keep_days is None and keep_gb is None:
         raise errors.InputError("runs prune: give --keep-days, --keep-gb or both")
@@ -229,7 +261,11 @@ def span(seconds: float) -> str:
     if not math.isfinite(seconds):
         return "?"
     whole = round(seconds)
-    for large, small, unit, part in ((86400, 3600, "d", "h"), (3600, 60, "h", "min"), (60, 1, "min", "s")):
+    for large, small, unit, part in (
+        (86400, 3600, "d", "h"),
+        (3600, 60, "h", "min"),
+        (60, 1, "min", "s"),
+    ):
         if whole >= large:
             rest = whole % large // small
             return f"{whole // large} {unit}" + (f" {rest} {part}" if rest else "")
@@ -249,9 +285,11 @@ def one_line(text: str) -> str:
 
 
 def moment_s(text: str, origin_utc: datetime) -> float:
-    """Seconds of the run for a written time: `03:12[:30]` (UTC), ISO 8601, or `+90s`, `+1h5m` from its start.
+    """Seconds of the run for a written time: `03:12[:30]` (UTC), ISO 8601, or `+90s`, `+1h5m` from
+    its start.
 
-    A time of day means its first occurrence after the start of the run. The plus sign may be omitted.
+    A time of day means its first occurrence after the start of the run. The plus sign may be
+    omitted.
 
     Raises InputError if it is none of these.
     """
@@ -263,7 +301,9 @@ def moment_s(text: str, origin_utc: datetime) -> float:
     clock = re.fullmatch(r"(\d{1,2}):(\d{2})(?::([0-5]\d(?:\.\d+)?))?", text)
     try:
         if clock:
-            day = origin_utc.replace(hour=int(clock[1]), minute=int(clock[2]), second=0, microsecond=0)
+            day = origin_utc.replace(
+                hour=int(clock[1]), minute=int(clock[2]), second=0, microsecond=0
+            )
             moment = day + timedelta(seconds=float(clock[3] or 0))
             # this means the minute in which the run began, not the one of the next day
             if moment < origin_utc - timedelta(seconds=60):
@@ -290,7 +330,9 @@ def part_s(origin_utc: datetime, start: str | None, end: str | None) -> tuple[fl
 
 
 def end_s(run: Run) -> float:
-    """End of a run's data, in seconds from its start, rounded up to whole minutes; 0 without data."""
+    """End of a run's data, in seconds from its start, rounded up to whole minutes;
+    0 without data.
+    """
     time_s = run.level(_END_LEVEL_S, names=("rows",))["time_s"]
     return float(time_s[-1]) + _END_LEVEL_S if time_s.size else 0.0
 
@@ -306,10 +348,19 @@ _MOVING_LEAST_S = 60.0
 
 
 def beside(faults_s: float, paused_s: float, moving_s: float, whole_s: float) -> list[str]:
-    """What there was beside the hold, with its share of the whole time; NaN where that is not known."""
-    parts = (("faults", faults_s, 0.0), ("paused", paused_s, 0.0), ("moving or settling", moving_s, _MOVING_LEAST_S))
+    """What there was beside the hold, with its share of the whole time; NaN where that is not
+    known.
+    """
+    parts = (
+        ("faults", faults_s, 0.0),
+        ("paused", paused_s, 0.0),
+        ("moving or settling", moving_s, _MOVING_LEAST_S),
+    )
     told = [(name, time_s) for name, time_s, least_s in parts if time_s > least_s]
-    return [f"{name} {span(time_s)} ({100 * time_s / max(whole_s, time_s):.3g} %)" for name, time_s in told]
+    return [
+        f"{name} {span(time_s)} ({100 * time_s / max(whole_s, time_s):.3g} %)"
+        for name, time_s in told
+    ]
 
 
 def sparkline(values: Sequence[float] | Column, width: int = 160, height: int = 28) -> str:

@@ -1,4 +1,6 @@
-"""`membrane-ctrl runs`: list, show, prune; `export` for other programs: Parquet, CSV or HDF5; `mark`."""
+"""`membrane-ctrl runs`: list, show, prune; `export` for other programs: Parquet, CSV or HDF5;
+`mark`.
+"""
 
 import json
 import math
@@ -20,7 +22,16 @@ from membrane_ctrl.model.files import make_folder, move, scratch_folder, write_t
 from membrane_ctrl.model.run_events import Ended, Mark
 from membrane_ctrl.model.telemetry import FIELDS
 from membrane_ctrl.review import catalogue
-from membrane_ctrl.review.catalogue import beside, end_s, moment_s, not_in, number, one_line, part_s, span
+from membrane_ctrl.review.catalogue import (
+    beside,
+    end_s,
+    moment_s,
+    not_in,
+    number,
+    one_line,
+    part_s,
+    span,
+)
 from membrane_ctrl.run_files import table_specs
 from membrane_ctrl.run_files.run import Run, open_run
 from membrane_ctrl.run_files.run_folder import add_mark
@@ -35,7 +46,9 @@ def refuse_originals(folder: Path) -> None:
     folder = folder.resolve()
     at = folder.parent if any(folder.name == spec.name for spec in table_specs.ALL) else folder
     if (at / "config.toml").exists() or any(at.glob("*.rrd")) or any(at.glob("ticks/ticks-*")):
-        raise errors.InputError(f"{folder}: this folder contains the recorder's files; choose another folder")
+        raise errors.InputError(
+            f"{folder}: this folder contains the recorder's files; choose another folder"
+        )
 
 
 FORMATS = ("parquet", "csv", "hdf5")
@@ -54,17 +67,19 @@ def export(
 ) -> list[Path]:
     """Write a run's columns.
 
-    Raises InputError if the format or a stream is unknown, h5py is missing, the run has none of the requested data,
-    or the folder belongs to a run; DeviceError if the folder cannot be written.
+    Raises InputError if the format or a stream is unknown, h5py is missing, the run has none of the
+    requested data, or the folder belongs to a run; DeviceError if the folder cannot be written.
 
     Parameters
     ----------
     to : str
         One of `FORMATS`.
     out : str or Path
-        Folder for the files: `ticks.<format>`, `shapes.<format>`, `events.jsonl`; HDF5 is one file `run.h5`.
+        Folder for the files: `ticks.<format>`, `shapes.<format>`, `events.jsonl`; HDF5 is one file
+        `run.h5`.
     streams : sequence of str
-        Rerun paths (`/loop/error`), fields (`error_um`), `shapes` or `events`; everything by default.
+        Rerun paths (`/loop/error`), fields (`error_um`), `shapes` or `events`; everything by
+        default.
     start_s, end_s : float
         Part of the run.
     """
@@ -77,18 +92,28 @@ def export(
         make_folder(out)
         # beside existing files, so that a failed export leaves those unchanged
         with scratch_folder(out, ".export-") as folder:
-            files = (_hdf5 if to == "hdf5" else _files)(run, to, folder, fields, extras, start_s, end_s)
+            files = (_hdf5 if to == "hdf5" else _files)(
+                run, to, folder, fields, extras, start_s, end_s
+            )
             for path in files:
                 move(path, out / path.name)
             return [out / path.name for path in files]
 
 
 def _files(
-    run: Run, to: str, out: Path, fields: Sequence[str], extras: set[str], start_s: float, end_s: float
+    run: Run,
+    to: str,
+    out: Path,
+    fields: Sequence[str],
+    extras: set[str],
+    start_s: float,
+    end_s: float,
 ) -> list[Path]:
     written = []
     if fields:
-        blocks = (named_table(block, run.origin_utc) for block in run.tick_blocks(fields, start_s, end_s))
+        blocks = (
+            named_table(block, run.origin_utc) for block in run.tick_blocks(fields, start_s, end_s)
+        )
         written += _tables(blocks, out / f"ticks.{to}", to, _origin(run))
         _say_if_missing(run, bool(written))
     if SHAPES in extras and (shapes := run.cycles(start_s, end_s)).num_rows:
@@ -112,7 +137,9 @@ def _say_if_missing(run: Run, telemetry: bool) -> None:
 
 
 def _nothing(run: Run) -> errors.InputError:
-    return errors.InputError("; ".join((f"{run.folder}: nothing to export of the requested data", *run.notes)))
+    return errors.InputError(
+        "; ".join((f"{run.folder}: nothing to export of the requested data", *run.notes))
+    )
 
 
 def _selected(streams: Sequence[str]) -> tuple[tuple[str, ...], set[str]]:
@@ -131,14 +158,19 @@ def _selected(streams: Sequence[str]) -> tuple[tuple[str, ...], set[str]]:
             fields += by_path[name]
         else:
             raise errors.InputError(
-                f"--streams {name}: known: {', '.join([*by_path, SHAPES, EVENTS])} and telemetry fields"
+                f"--streams {name}: known: {', '.join([*by_path, SHAPES, EVENTS])} and "
+                "telemetry fields"
             )
     return (tuple(dict.fromkeys(["mono_s", *fields])) if fields else ()), extras
 
 
 def _origin(run: Run) -> dict[str, str]:
     """Metadata of an exported file; CSV has none."""
-    times = {"run": run.name, "started_utc": run.origin_utc.isoformat(), "recorded_by": run.recorded_by}
+    times = {
+        "run": run.name,
+        "started_utc": run.origin_utc.isoformat(),
+        "recorded_by": run.recorded_by,
+    }
     return program.file_origin("membrane-export/1") | times
 
 
@@ -158,13 +190,21 @@ def _tables(tables: Iterator[pa.Table], path: Path, to: str, origin: dict[str, s
 
 
 def _hdf5(
-    run: Run, to: str, out: Path, fields: Sequence[str], extras: set[str], start_s: float, end_s: float
+    run: Run,
+    to: str,
+    out: Path,
+    fields: Sequence[str],
+    extras: set[str],
+    start_s: float,
+    end_s: float,
 ) -> list[Path]:
     path = out / "run.h5"
     try:
         import h5py
     except ImportError:
-        raise errors.InputError(f"--format {to} needs h5py: pip install 'membrane-ctrl[sofast]'") from None
+        raise errors.InputError(
+            f"--format {to} needs h5py: pip install 'membrane-ctrl[sofast]'"
+        ) from None
     with h5py.File(path, "w") as file:
         file.attrs.update(_origin(run))
         for block in run.tick_blocks(fields, start_s, end_s) if fields else ():
@@ -172,7 +212,12 @@ def _hdf5(
                 place = f"ticks/{name}"
                 if place not in file:
                     file.create_dataset(
-                        place, data=values, maxshape=(None,), chunks=True, compression="gzip", shuffle=True
+                        place,
+                        data=values,
+                        maxshape=(None,),
+                        chunks=True,
+                        compression="gzip",
+                        shuffle=True,
                     )
                     continue
                 data = file[place]
@@ -228,28 +273,41 @@ def show_command(run: Path, json: bool) -> int:
         print(f"  recorded by {one_line(opened.recorded_by)}")
     for each in opened.log:
         match each.event:
-            case events.StateEntered(state=said) | events.Fault(name=said) | Mark(text=said) | Ended(exit=said):
+            case (
+                events.StateEntered(state=said)
+                | events.Fault(name=said)
+                | Mark(text=said)
+                | Ended(exit=said)
+            ):
                 print(f"  {opened.utc(each.mono_s):%H:%M:%S}  {each.event.kind:6} {one_line(said)}")
     for note in opened.notes:
         print(f"  note: {note}")
     return 0
 
 
-def prune_command(logs: Path, keep_days: float | None, keep_gb: float | None, delete: bool, json: bool) -> int:
+def prune_command(
+    logs: Path, keep_days: float | None, keep_gb: float | None, delete: bool, json: bool
+) -> int:
     """List the runs that the retention rule would delete; delete them only with `delete`."""
     gone = catalogue.to_prune(logs, datetime.now(UTC), keep_days, keep_gb)
     stay = catalogue.prune([run for run, _ in gone]) if delete else {}
     gone = [(run, why) for run, why in gone if run.folder not in stay]
     if json:
-        table = [{"name": run.folder.name, "size_bytes": run.size_bytes, "why": why} for run, why in gone]
+        table = [
+            {"name": run.folder.name, "size_bytes": run.size_bytes, "why": why} for run, why in gone
+        ]
         print(plain_json.dumps({"deleted": delete, "runs": table}, indent=1))
     else:
         for run, why in gone:
             print(
-                f"{'deleted' if delete else 'would delete'} {run.folder.name}, {run.size_bytes / 1e6:.0f} MB: {why}"
+                f"{'deleted' if delete else 'would delete'} {run.folder.name}, "
+                f"{run.size_bytes / 1e6:.0f} MB: {why}"
             )
         freed_mb = sum(run.size_bytes for run, _ in gone) / 1e6
-        print(f"{len(gone)} runs, {freed_mb:.0f} MB" + ("" if delete or not gone else "; --delete deletes them"))
+        print(
+            f"{len(gone)} runs, {freed_mb:.0f} MB"
+            + ("" if delete or not gone else "; --delete deletes them")
+        )
     for folder, why in stay.items():
         print(f"{folder}: cannot be deleted ({why}); check its permissions", file=sys.stderr)
     return errors.Exit.DEVICE_FAILED if stay else 0
@@ -258,9 +316,13 @@ def prune_command(logs: Path, keep_days: float | None, keep_gb: float | None, de
 def mark_command(words: Sequence[str], at: str | None) -> int:
     """Add a mark to a run's timeline; the words are the run and the text."""
     if len(words) != 2 or at is None:
-        raise errors.InputError("review mark: write `review mark RUN TEXT --at 03:12` (TEXT in quotes)")
+        raise errors.InputError(
+            "review mark: write `review mark RUN TEXT --at 03:12` (TEXT in quotes)"
+        )
     if not words[1].strip():
-        raise errors.InputError("review mark: TEXT is empty: write `review mark RUN TEXT --at 03:12`")
+        raise errors.InputError(
+            "review mark: TEXT is empty: write `review mark RUN TEXT --at 03:12`"
+        )
     opened = open_run(catalogue.resolve(Path(words[0])))
     at_s = moment_s(at, opened.origin_utc)
     if not 0 <= at_s <= end_s(opened):

@@ -1,4 +1,6 @@
-"""Deletes runs that are too old or too large in total, but never the present one or one that a person keeps."""
+"""Deletes runs that are too old or too large in total, but never the present one or one that a
+person keeps.
+"""
 
 import os
 import re
@@ -30,10 +32,11 @@ class OldRun:
 
 
 def deletable_runs(logs_dir: Path, present: Path, now_utc: datetime) -> list[OldRun]:
-    """Runs in `logs_dir`, oldest first, except the present one, those that may still run, and those with a `.keep`.
+    """Runs in `logs_dir`, oldest first, except the present one, those that may still run, and those
+    with a `.keep`.
 
-    Considers only folders that look like a run: a name that begins with a time, and `config.toml`. Symbolic links do
-    not count: their targets are elsewhere.
+    Considers only folders that look like a run: a name that begins with a time, and `config.toml`.
+    Symbolic links do not count: their targets are elsewhere.
     """
     found = []
     for folder in sorted(logs_dir.iterdir()):
@@ -74,7 +77,11 @@ def _may_run(folder: Path, now_utc: datetime) -> bool:
 
 
 def expired(
-    runs: Sequence[OldRun], present_bytes: int, keep_gb: float | None, keep_days: float | None, now_utc: datetime
+    runs: Sequence[OldRun],
+    present_bytes: int,
+    keep_gb: float | None,
+    keep_days: float | None,
+    now_utc: datetime,
 ) -> list[tuple[OldRun, str]]:
     """Which of the runs (oldest first) to delete, and why; the newest three are never too old.
 
@@ -84,7 +91,11 @@ def expired(
     gone: list[tuple[OldRun, str]] = []
     for place, run in enumerate(runs):
         old_enough = place < len(runs) - _NEVER_TOO_OLD
-        if keep_days is not None and old_enough and now_utc - run.started_utc > timedelta(days=keep_days):
+        if (
+            keep_days is not None
+            and old_enough
+            and now_utc - run.started_utc > timedelta(days=keep_days)
+        ):
             gone.append((run, f"older than recording.keep_days = {keep_days:g}"))
         elif keep_gb is not None and total > keep_gb * 1e9:
             gone.append((run, f"all runs exceed recording.keep_gb = {keep_gb:g}"))
@@ -95,7 +106,9 @@ def expired(
 
 
 def delete_run(run: OldRun) -> None:
-    """Delete a run; rename it first, so that a crash leaves nothing that looks like a run. Raises OSError."""
+    """Delete a run; rename it first, so that a crash leaves nothing that looks like a run. Raises
+    OSError.
+    """
     doomed = f"{_DOOMED}{run.folder.name}"
     with folder_handle(run.folder.parent.resolve()) as logs:
         os.rename(run.folder.name, doomed, src_dir_fd=logs, dst_dir_fd=logs)
@@ -119,7 +132,8 @@ class DetailLevel(IntEnum):
     ESSENTIAL = 2  # events, tick inputs, summary: a few kB/s, enough to replay the run
 
 
-# In units of `recording.min_free_mb`, below which an alarm is raised and the rest is reserved for the essential.
+# In units of `recording.min_free_mb`, below which an alarm is raised and the rest is reserved for
+# the essential.
 PICTURES_FROM, _RERUN_FROM = 2.0, 0.2
 # Hysteresis, or a level would come and go with every file.
 _HYSTERESIS = 1.1

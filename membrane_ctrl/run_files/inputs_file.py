@@ -67,7 +67,9 @@ class InputsReader:
 
     @property
     def columns(self) -> list[str]:
-        """The columns of telemetry that the run recorded, in their order; all of today's if unreadable."""
+        """The columns of telemetry that the run recorded, in their order; all of today's if
+        unreadable.
+        """
         return self._reader(table_specs.TICKS).column_names() or list(telemetry.FIELDS)
 
     def __iter__(self) -> Iterator[InputsFrame]:
@@ -75,8 +77,12 @@ class InputsReader:
         last = 0
         rare = _Ahead((row.time_s, row) for row in self._texts(table_specs.RARE))
         kept = _Ahead((row.time_s, row) for row in self._texts(table_specs.SNAPSHOTS))
-        cycles = _Ahead((estimate.time_s, estimate) for estimate in self._estimates(table_specs.SHAPES))
-        tracked = _Ahead((estimate.time_s, estimate) for estimate in self._estimates(table_specs.TRACKED))
+        cycles = _Ahead(
+            (estimate.time_s, estimate) for estimate in self._estimates(table_specs.SHAPES)
+        )
+        tracked = _Ahead(
+            (estimate.time_s, estimate) for estimate in self._estimates(table_specs.TRACKED)
+        )
         for block in self._records():
             records = block[(block["tick"] > last) & (block["now_s"] >= self._from_s)]
             if not len(records):
@@ -85,10 +91,14 @@ class InputsReader:
             tails = {row.tick: row.json.encode() for row in rare.until(until_s)}
             snapshots = {row.tick: row.json.encode() for row in kept.until(until_s)}
             estimates = [*cycles.until(until_s), *tracked.until(until_s)]
-            yield InputsFrame(records, tails, snapshots, {found.time_s: found for found in estimates})
+            yield InputsFrame(
+                records, tails, snapshots, {found.time_s: found for found in estimates}
+            )
 
     def since(self, time_s: float) -> InputsReader:
-        """A reader that starts at the last snapshot before this time of the run, or at the run's start."""
+        """A reader that starts at the last snapshot before this time of the run, or at the run's
+        start.
+        """
         found = InputsReader(self._folder)
         times_s = [found_s for found_s in found._snapshot_times_s() if found_s <= time_s]
         found.damage.clear()  # reported again when the table is read
@@ -99,8 +109,12 @@ class InputsReader:
         return TableReader(self._folder, spec, self.damage)
 
     def _records(self) -> Iterator[Records]:
-        """Records of ticks, from the table of inputs and from their telemetry rows; of ticks that both have."""
-        rows = _TickRows(self._reader(table_specs.TICKS).tables(["tick", *_ROW_COLUMNS.values()], self._from_s))
+        """Records of ticks, from the table of inputs and from their telemetry rows; of ticks that
+        both have.
+        """
+        rows = _TickRows(
+            self._reader(table_specs.TICKS).tables(["tick", *_ROW_COLUMNS.values()], self._from_s)
+        )
         names = table_specs.INPUTS.schema.names
         for inputs in self._reader(table_specs.INPUTS).tables(names, self._from_s):
             if inputs.column_names != names:

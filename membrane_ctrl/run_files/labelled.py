@@ -1,4 +1,6 @@
-"""Tables of a run as labelled data: a pandas frame, or an xarray dataset with units and descriptions."""
+"""Tables of a run as labelled data: a pandas frame, or an xarray dataset with units and
+descriptions.
+"""
 
 from __future__ import annotations
 
@@ -27,13 +29,19 @@ def labels_of(spec: TableSpec) -> Labels:
     """Unit and description of each column of a table, by the names that xarray shows."""
     keys = {b"unit": "units", b"description": "long_name"}
     return {
-        field.name: {keys[key]: text.decode() for key, text in (field.metadata or {}).items() if key in keys and text}
+        field.name: {
+            keys[key]: text.decode()
+            for key, text in (field.metadata or {}).items()
+            if key in keys and text
+        }
         for field in spec.schema
     }
 
 
 def make_frame(table: pa.Table) -> pd.DataFrame:
-    """A table for people (`streams.named_table`) with its UTC as index; names of codes are categories."""
+    """A table for people (`streams.named_table`) with its UTC as index; names of codes are
+    categories.
+    """
     import_optional("pandas", "data")
     return table.to_pandas().set_index("time_utc")
 
@@ -59,14 +67,20 @@ def make_dataset(table: pa.Table, labels: Labels, about: Mapping[str, str]) -> x
     times = _naive_utc(table.column("time_utc"))
     coordinates = {_TIME: times, "time_s": (_TIME, _values(table.column("time_s")), {"units": "s"})}
     names = [name for name in table.column_names if name not in streams.TIMES]
-    variables = {name: (_TIME, _values(table.column(name)), dict(labels.get(name, {}))) for name in names}
+    variables = {
+        name: (_TIME, _values(table.column(name)), dict(labels.get(name, {}))) for name in names
+    }
     return xarray.Dataset(variables, coords=coordinates, attrs=dict(about))
 
 
 def make_cycles_dataset(
-    found: shapes.Shapes, part_s: tuple[float, float], origin_utc: datetime, about: Mapping[str, str]
+    found: shapes.Shapes,
+    part_s: tuple[float, float],
+    origin_utc: datetime,
+    about: Mapping[str, str],
 ) -> xr.Dataset:
-    """Measured figures along `time`, their coefficients also along `noll`, covariances along `covariance_time`.
+    """Measured figures along `time`, their coefficients also along `noll`, covariances along
+    `covariance_time`.
 
     Parameters
     ----------
@@ -83,11 +97,17 @@ def make_cycles_dataset(
     kept = (found.covariance_time_s >= part_s[0]) & (found.covariance_time_s < part_s[1])
     labels = labels_of(table_specs.SHAPES) | labels_of(table_specs.COVARIANCES)
     numbers = [name for name in shapes.NUMBERS if name != "time_s"]
-    variables: dict[str, Any] = {name: (_TIME, getattr(found, name), dict(labels[name])) for name in numbers}
+    variables: dict[str, Any] = {
+        name: (_TIME, getattr(found, name), dict(labels[name])) for name in numbers
+    }
     variables["verdict"] = (_TIME, np.asarray(found.verdict, dtype=str))
     variables["coeffs_um"] = ((_TIME, "noll"), found.coeffs_um, dict(labels["coeffs_um"]))
     dimensions = ("covariance_time", "noll", "noll_other")
-    variables["covariance_um2"] = (dimensions, found.covariance_um2[kept], dict(labels["covariance_um2"]))
+    variables["covariance_um2"] = (
+        dimensions,
+        found.covariance_um2[kept],
+        dict(labels["covariance_um2"]),
+    )
     origin = np.datetime64(origin_utc.replace(tzinfo=None), "us")
     coordinates = {
         _TIME: origin + _microseconds(found.time_s),

@@ -1,7 +1,9 @@
-"""A fault that outlives its run: written at a trip, respected at the next start, cleared by a person.
+"""A fault that outlives its run: written at a trip, respected at the next start, cleared by a
+person.
 
-One file beside the run folders. It is written without waiting for the disk (a tick has no time for that) and replaced
-atomically, so that a reader sees the old or the new one; an unreadable file counts as a fault.
+One file beside the run folders. It is written without waiting for the disk (a tick has no time for
+that) and replaced atomically, so that a reader sees the old or the new one; an unreadable file
+counts as a fault.
 """
 
 import contextlib
@@ -48,13 +50,17 @@ class LatchedFile:
         self._reserve = logs_dir / f".{NAME}.reserve"
 
     def read(self) -> LatchedFault | None:
-        """Read the latched fault, None if there is none. Never raises: an unreadable file counts as latched."""
+        """Read the latched fault, None if there is none. Never raises: an unreadable file counts as
+        latched.
+        """
         try:
             content = _content(self.path)
             if content is None:
                 return None
             table = json.loads(content)
-            if table.pop("schema") != SCHEMA or not all(isinstance(value, str) for value in table.values()):
+            if table.pop("schema") != SCHEMA or not all(
+                isinstance(value, str) for value in table.values()
+            ):
                 raise ValueError("another schema")
             return LatchedFault(**table)
         except (OSError, ValueError, KeyError, TypeError, AttributeError, RecursionError) as error:
@@ -69,11 +75,15 @@ class LatchedFile:
             self.reserve()
 
     def reserve(self) -> None:
-        """Reserve disk space for a fault, so that one on a full disk latches too. Raises OSError."""
+        """Reserve disk space for a fault, so that one on a full disk latches too.
+        Raises OSError.
+        """
         self._fill(bytes(_RESERVE_BYTES))
 
     def _fill(self, content: bytes) -> None:
-        """Write to the reserved file, in its space. Removes anything in its place that is not a file."""
+        """Write to the reserved file, in its space. Removes anything in its place that is not a
+        file.
+        """
         try:
             number = os.open(self._reserve, _IN_PLACE, 0o644)
         except OSError:
@@ -105,18 +115,27 @@ class LatchedFile:
 
     def _unreadable(self, why: str) -> LatchedFault:
         return LatchedFault(
-            "unreadable", f"{self.path} cannot be read", why, "look at the last run", "unknown time", "unknown"
+            "unreadable",
+            f"{self.path} cannot be read",
+            why,
+            "look at the last run",
+            "unknown time",
+            "unknown",
         )
 
 
 class ResumeLog:
-    """When faults cleared automatically, so that a restart does not reset the day's count; beside the runs."""
+    """When faults cleared automatically, so that a restart does not reset the day's count; beside
+    the runs.
+    """
 
     def __init__(self, logs_dir: Path) -> None:
         self.path = logs_dir / RESUMES_NAME
 
     def ages_s(self, now: datetime) -> tuple[float, ...]:
-        """Ages of the last day's resumes, oldest first. Never raises: an unreadable file counts as full."""
+        """Ages of the last day's resumes, oldest first. Never raises: an unreadable file counts as
+        full.
+        """
         try:
             content = _content(self.path)
             stamps = [] if content is None else json.loads(content)
@@ -130,12 +149,16 @@ class ResumeLog:
         """Add one and drop those older than a day. Raises OSError."""
         kept = [when - timedelta(seconds=age_s) for age_s in self.ages_s(when)][-_RESUMES_MOST:]
         scratch = self.path.with_name(f".{self.path.name}.new")
-        scratch.write_text(json.dumps([stamp.isoformat() for stamp in (*kept, when)]) + "\n", encoding="utf-8")
+        scratch.write_text(
+            json.dumps([stamp.isoformat() for stamp in (*kept, when)]) + "\n", encoding="utf-8"
+        )
         scratch.replace(self.path)
 
 
 def _content(path: Path) -> bytes | None:
-    """The content; None if there is nothing, not even a dangling link. Raises OSError or ValueError."""
+    """The content; None if there is nothing, not even a dangling link. Raises OSError or
+    ValueError.
+    """
     try:
         path.lstat()
     except FileNotFoundError:

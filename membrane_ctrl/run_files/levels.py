@@ -1,7 +1,9 @@
-"""Overview levels: minimum, mean and maximum of each signal per 1, 10 and 60 s, so that a month opens in seconds.
+"""Overview levels: minimum, mean and maximum of each signal per 1, 10 and 60 s, so that a month
+opens in seconds.
 
-A level is a dict of columns: `time_s` (start of the window, a multiple of its length), `rows` (ticks in it), the
-codes at its end (of some the largest) and `min_<signal>`, `mean_<signal>`, `max_<signal>`.
+A level is a dict of columns: `time_s` (start of the window, a multiple of its length), `rows`
+(ticks in it), the codes at its end (of some the largest) and `min_<signal>`, `mean_<signal>`,
+`max_<signal>`.
 """
 
 from collections.abc import Iterator, Mapping
@@ -30,7 +32,9 @@ NAMES: tuple[str, ...] = (
 # The telemetry fields from which levels are computed.
 _OF_TRUE_ERROR = ("target_um", "truth_displacement_um")
 TICK_FIELDS: tuple[str, ...] = tuple(
-    dict.fromkeys(("mono_s", *CODES, *(name for name in SIGNALS if name in COLUMNS), *_OF_TRUE_ERROR))
+    dict.fromkeys(
+        ("mono_s", *CODES, *(name for name in SIGNALS if name in COLUMNS), *_OF_TRUE_ERROR)
+    )
 )
 
 
@@ -64,7 +68,9 @@ def coarser_level(level: Mapping[str, Column], window_s: float) -> Columns:
         if name.startswith("mean_"):
             coarse[name] = _mean(values, level["rows"], starts)
         elif name.startswith(("min_", "max_")):
-            coarse[name] = (np.fmin if name.startswith("min_") else np.fmax).reduceat(values, starts)
+            coarse[name] = (np.fmin if name.startswith("min_") else np.fmax).reduceat(
+                values, starts
+            )
     return coarse
 
 
@@ -83,8 +89,12 @@ def _counts(starts: NDArray[np.intp], size: int) -> Column:
 def _codes(table: Mapping[str, Column], starts: NDArray[np.intp]) -> Columns:
     size = next(iter(table.values())).size
     last = np.append(starts[1:], size) - 1
-    codes = {name: np.asarray(table[name], dtype=np.float64)[last] for name in CODES if name in table}
-    return codes | {name: np.fmax.reduceat(table[name], starts) for name in _LARGEST if name in table}
+    codes = {
+        name: np.asarray(table[name], dtype=np.float64)[last] for name in CODES if name in table
+    }
+    return codes | {
+        name: np.fmax.reduceat(table[name], starts) for name in _LARGEST if name in table
+    }
 
 
 def _mean(values: Column, weights: Column, starts: NDArray[np.intp]) -> Column:
@@ -107,14 +117,17 @@ class OpenWindows:
     levels: dict[float, Columns] = field(default_factory=dict)
 
     def finished_rows(self, new: Columns | None) -> Iterator[tuple[float, Columns]]:
-        """Take the `TICK_FIELDS` of ticks, and yield the rows of each level, by its window in s, that are finished.
+        """Take the `TICK_FIELDS` of ticks, and yield the rows of each level, by its window in s,
+        that are finished.
 
         None: the run is over, all are finished.
         """
         ticks = self.ticks
         if new is not None:
             ticks = {name: np.concatenate((ticks[name], new[name])) for name in TICK_FIELDS}
-        done = ticks["mono_s"].size if new is None else _first_of_last(ticks["mono_s"], WINDOWS_S[0])
+        done = (
+            ticks["mono_s"].size if new is None else _first_of_last(ticks["mono_s"], WINDOWS_S[0])
+        )
         self.ticks = {name: values[done:] for name, values in ticks.items()}
         level = first_level({name: values[:done] for name, values in ticks.items()})
         yield WINDOWS_S[0], level
@@ -122,7 +135,9 @@ class OpenWindows:
             waiting = self.levels.get(coarse_s)
             if waiting is not None:
                 level = {name: np.concatenate((waiting[name], level[name])) for name in NAMES}
-            done = level["time_s"].size if new is None else _first_of_last(level["time_s"], coarse_s)
+            done = (
+                level["time_s"].size if new is None else _first_of_last(level["time_s"], coarse_s)
+            )
             self.levels[coarse_s] = {name: values[done:] for name, values in level.items()}
             level = coarser_level({name: values[:done] for name, values in level.items()}, coarse_s)
             yield coarse_s, level

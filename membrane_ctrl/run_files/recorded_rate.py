@@ -23,7 +23,8 @@ def at_recorded_rate(config: Config, folder: Path, notes: list[str]) -> Config:
     if found_hz is None or abs(found_hz / configured_hz - 1) <= _DIFFERS:
         return config
     notes.append(
-        f"config.toml: loop.rate_hz is {configured_hz:g} Hz (or missing), but the record has ticks at "
+        f"config.toml: loop.rate_hz is {configured_hz:g} Hz (or missing), but the record has "
+        "ticks at "
         f"{found_hz:.4g} Hz, which is used"
     )
     return config.model_copy(update={"loop": config.loop.model_copy(update={"rate_hz": found_hz})})

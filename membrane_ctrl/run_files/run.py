@@ -1,4 +1,6 @@
-"""A run folder as data: `open_run(path)`, then columns, levels, shapes, events. Nothing here writes."""
+"""A run folder as data: `open_run(path)`, then columns, levels, shapes, events. Nothing here
+writes.
+"""
 
 import json
 from collections.abc import Iterator, Sequence
@@ -15,7 +17,15 @@ from membrane_ctrl.config.schema import Config
 from membrane_ctrl.model import events, run_events
 from membrane_ctrl.model.arrays import Column
 from membrane_ctrl.model.telemetry import FIELDS
-from membrane_ctrl.run_files import labelled, levels, run_folder, run_head, shapes, streams, table_specs
+from membrane_ctrl.run_files import (
+    labelled,
+    levels,
+    run_folder,
+    run_head,
+    shapes,
+    streams,
+    table_specs,
+)
 from membrane_ctrl.run_files.recorded_rate import at_recorded_rate
 from membrane_ctrl.run_files.shapes import Shapes
 from membrane_ctrl.run_files.table_store.reader import TableReader
@@ -83,7 +93,9 @@ class Run:
         """The log of a part of the run."""
         return tuple(each for each in self.log if start_s <= each.mono_s < end_s)
 
-    def ticks(self, names: Sequence[str] | None = None, start_s: float = -np.inf, end_s: float = np.inf) -> pa.Table:
+    def ticks(
+        self, names: Sequence[str] | None = None, start_s: float = -np.inf, end_s: float = np.inf
+    ) -> pa.Table:
         """Telemetry, one row per tick.
 
         Parameters
@@ -96,26 +108,36 @@ class Run:
         Returns
         -------
         pyarrow.Table
-            `time_s` (seconds of the run), `time_utc` and the fields; codes are names, absent values null.
+            `time_s` (seconds of the run), `time_utc` and the fields; codes are names, absent values
+            null.
         """
         wanted = _with_time([name for name in names or FIELDS if name not in streams.TIMES])
-        blocks = list(self.tick_blocks(wanted, start_s, end_s)) or [{name: np.empty(0) for name in wanted}]
+        blocks = list(self.tick_blocks(wanted, start_s, end_s)) or [
+            {name: np.empty(0) for name in wanted}
+        ]
         parts = [streams.named_table(block, self.origin_utc) for block in blocks]
         return pa.concat_tables(parts, promote_options="permissive").unify_dictionaries()
 
     def overview(
-        self, window_s: float = 10.0, start_s: float = -np.inf, end_s: float = np.inf, names: Sequence[str] = ()
+        self,
+        window_s: float = 10.0,
+        start_s: float = -np.inf,
+        end_s: float = np.inf,
+        names: Sequence[str] = (),
     ) -> pa.Table:
-        """Minimum, mean and maximum of each signal in windows of 1, 10 or 60 s, all by default: quick for a month.
+        """Minimum, mean and maximum of each signal in windows of 1, 10 or 60 s, all by default:
+        quick for a month.
 
-        A table like that of `ticks`: `time_s` is the start of a window, `rows` the number of its ticks, `state` the
-        state at its end, `mean_error_um` the mean of a signal.
+        A table like that of `ticks`: `time_s` is the start of a window, `rows` the number of its
+        ticks, `state` the state at its end, `mean_error_um` the mean of a signal.
         """
         level = self.level(window_s, start_s, end_s, names or levels.NAMES)
         return streams.named_table(level, self.origin_utc)
 
     def cycles(self, start_s: float = -np.inf, end_s: float = np.inf) -> pa.Table:
-        """The measured figure, one row per cycle: times, `z1_um` and all other terms, sag, quality, verdict."""
+        """The measured figure, one row per cycle: times, `z1_um` and all other terms, sag, quality,
+        verdict.
+        """
         found = self.shapes()
         wanted = (found.time_s >= start_s) & (found.time_s < end_s)
         return streams.named_table(found.select(wanted).columns(), self.origin_utc)
@@ -128,7 +150,8 @@ class Run:
         end_s: float = np.inf,
         window_s: float = 10.0,
     ) -> "pd.DataFrame":
-        """A table as a frame with its UTC as index; codes are categories of names, a missing number is NaN.
+        """A table as a frame with its UTC as index; codes are categories of names, a missing number
+        is NaN.
 
         Parameters
         ----------
@@ -153,15 +176,23 @@ class Run:
         end_s: float = np.inf,
         window_s: float = 10.0,
     ) -> "xr.Dataset":
-        """A table as a dataset along `time` (UTC), each variable with `units` and `long_name`; as `to_pandas`.
+        """A table as a dataset along `time` (UTC), each variable with `units` and `long_name`; as
+        `to_pandas`.
 
-        Of `cycles`, `coeffs_um` is an array along `time` and `noll`, and there are the recorded covariances.
+        Of `cycles`, `coeffs_um` is an array along `time` and `noll`, and there are the recorded
+        covariances.
 
         Raises InputError if xarray is missing.
         """
-        about = {"run": self.name, "started_utc": self.origin_utc.isoformat(), "recorded_by": self.recorded_by}
+        about = {
+            "run": self.name,
+            "started_utc": self.origin_utc.isoformat(),
+            "recorded_by": self.recorded_by,
+        }
         if table == "cycles":
-            return labelled.make_cycles_dataset(self.shapes(), (start_s, end_s), self.origin_utc, about)
+            return labelled.make_cycles_dataset(
+                self.shapes(), (start_s, end_s), self.origin_utc, about
+            )
         spec = table_specs.TICKS if table == "ticks" else table_specs.LEVELS[window_s]
         named = self._named(table, names, start_s, end_s, window_s)
         return labelled.make_dataset(named, labelled.labels_of(spec), about)
@@ -184,12 +215,18 @@ class Run:
                 return self.cycles(start_s, end_s)
         raise ValueError(f"no such table: {table}; known: ticks, overview, cycles")
 
-    def tick_blocks(self, names: Sequence[str], start_s: float = -np.inf, end_s: float = np.inf) -> Iterator[Block]:
-        """Telemetry as arrays, codes as numbers, in blocks: a month needs no more memory than a night."""
+    def tick_blocks(
+        self, names: Sequence[str], start_s: float = -np.inf, end_s: float = np.inf
+    ) -> Iterator[Block]:
+        """Telemetry as arrays, codes as numbers, in blocks: a month needs no more memory than a
+        night.
+        """
         wanted = _with_time(names)
         return self._blocks(table_specs.TICKS, wanted, start_s, end_s)
 
-    def _blocks(self, spec: TableSpec, names: Sequence[str], start_s: float, end_s: float) -> Iterator[Block]:
+    def _blocks(
+        self, spec: TableSpec, names: Sequence[str], start_s: float, end_s: float
+    ) -> Iterator[Block]:
         for table in self._table(spec).tables(names, start_s, end_s):
             yield {name: _array(table, name) for name in names}
 
@@ -204,37 +241,55 @@ class Run:
         return not isinstance(duration_s, (int, float)) or until_s > duration_s - _WAY_DOWN_S
 
     def level(
-        self, window_s: float, start_s: float = -np.inf, end_s: float = np.inf, names: Sequence[str] = levels.NAMES
+        self,
+        window_s: float,
+        start_s: float = -np.inf,
+        end_s: float = np.inf,
+        names: Sequence[str] = levels.NAMES,
     ) -> Block:
         """What `overview` shows, as arrays for computing: codes are numbers, absent values NaN.
 
-        Windows missing from the level's table are computed from the next finer one, ultimately from the ticks.
+        Windows missing from the level's table are computed from the next finer one, ultimately from
+        the ticks.
         """
         names = tuple(dict.fromkeys(("time_s", "rows", *names)))
         if window_s not in table_specs.LEVELS:
-            raise ValueError(f"levels are {', '.join(f'{w:g}' for w in levels.WINDOWS_S)} s, not {window_s:g}")
+            raise ValueError(
+                f"levels are {', '.join(f'{w:g}' for w in levels.WINDOWS_S)} s, not {window_s:g}"
+            )
         spec = table_specs.LEVELS[window_s]
         blocks = list(self._blocks(spec, names, start_s, end_s))
         time_s = np.concatenate([block["time_s"] for block in blocks] or [np.empty(0)])
         missing = _holes(time_s, window_s, start_s)
         until_s = float(time_s[-1]) + window_s if time_s.size else start_s
         continues = self._table(spec).known_until_s >= end_s
-        if not time_s.size or (end_s - until_s > _HOLE_S if continues else not self._reaches_end(until_s)):
+        if not time_s.size or (
+            end_s - until_s > _HOLE_S if continues else not self._reaches_end(until_s)
+        ):
             missing.append((until_s, end_s))
         for begins_s, ends_s in missing:
-            blocks += self._made_level(window_s, begins_s, ends_s, names) if begins_s < ends_s else []
+            blocks += (
+                self._made_level(window_s, begins_s, ends_s, names) if begins_s < ends_s else []
+            )
         if not blocks:
             return {name: np.empty(0) for name in names}
         level = {name: np.concatenate([block[name] for block in blocks]) for name in names}
         order = np.argsort(level["time_s"], kind="stable") if missing else slice(None)
         return {name: values[order] for name, values in level.items()}
 
-    def _made_level(self, window_s: float, start_s: float, end_s: float, names: Sequence[str]) -> list[Block]:
+    def _made_level(
+        self, window_s: float, start_s: float, end_s: float, names: Sequence[str]
+    ) -> list[Block]:
         """Compute a part of a level from the next finer one or from the ticks."""
         finer = {coarse: fine for fine, coarse in pairwise(levels.WINDOWS_S)}
         if window_s in finer:
-            return [levels.coarser_level(self.level(finer[window_s], start_s, end_s, names), window_s)]
-        parts = [levels.first_level(block) for block in self.tick_blocks(levels.TICK_FIELDS, start_s, end_s)]
+            return [
+                levels.coarser_level(self.level(finer[window_s], start_s, end_s, names), window_s)
+            ]
+        parts = [
+            levels.first_level(block)
+            for block in self.tick_blocks(levels.TICK_FIELDS, start_s, end_s)
+        ]
         if not parts:
             return []
         joined = {name: np.concatenate([part[name] for part in parts]) for name in levels.NAMES}
@@ -244,7 +299,8 @@ class Run:
     def shapes(self) -> Shapes:
         """Every shape estimate of the run, cycles and tracked frames, as arrays."""
         figures = chain.from_iterable(
-            self._table(spec).tables(shapes.TABLE_COLUMNS) for spec in (table_specs.SHAPES, table_specs.TRACKED)
+            self._table(spec).tables(shapes.TABLE_COLUMNS)
+            for spec in (table_specs.SHAPES, table_specs.TRACKED)
         )
         return shapes.from_tables(figures, self._table(table_specs.COVARIANCES).tables())
 
@@ -258,7 +314,8 @@ class Run:
 
 
 def open_run(path: str | Path) -> Run:
-    """Open a run folder, or that of a file in it, even of a run that is in progress, was killed, or lacks parts.
+    """Open a run folder, or that of a file in it, even of a run that is in progress, was killed, or
+    lacks parts.
 
     Raises InputError if there is no such folder, or it contains nothing of a run.
     """
@@ -267,8 +324,15 @@ def open_run(path: str | Path) -> Run:
     head = run_head.read_run_head(folder, notes)
     log = run_folder.read_events(folder, notes)
     summary = run_folder.read_summary(folder, notes)
-    if summary and summary.get("exit") and not any(isinstance(each.event, run_events.Ended) for each in log):
-        notes.append("events.jsonl: at least the last line is missing: the run has ended without an end event")
+    if (
+        summary
+        and summary.get("exit")
+        and not any(isinstance(each.event, run_events.Ended) for each in log)
+    ):
+        notes.append(
+            "events.jsonl: at least the last line is missing: the run has ended without an "
+            "end event"
+        )
     notes += _missing(folder, summary)
     config = at_recorded_rate(run_folder.read_config(folder, notes), folder, notes)
     return Run(folder, config, log, summary, origin_of(folder, log), notes, head.recorded_by)
@@ -293,7 +357,9 @@ def _count(value: object) -> int:
 
 
 def origin_of(folder: Path, log: Sequence[run_folder.LoggedEvent]) -> datetime:
-    """UTC at 0 s of a run: from its first event with both times, else from the folder's name or age."""
+    """UTC at 0 s of a run: from its first event with both times, else from the folder's name or
+    age.
+    """
     for each in log:
         try:
             moment = datetime.fromisoformat(each.line["time_utc"])

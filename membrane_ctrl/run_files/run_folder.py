@@ -18,7 +18,8 @@ from membrane_ctrl.config.schema import Config
 from membrane_ctrl.model import errors, events, files, plain_json, program, run_events
 from membrane_ctrl.run_files import run_head
 
-# The folder of a run: `logs/<UTC time>-<name>/` with the configuration as it ran (docs/interfaces.md).
+# The folder of a run: `logs/<UTC time>-<name>/` with the configuration as it ran
+# (docs/interfaces.md).
 
 
 CONFIG = "config.toml"
@@ -26,17 +27,19 @@ _NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]{0,63}")
 
 
 def create_run_folder(logs_dir: Path, name: str, started_utc: datetime, config: Config) -> Path:
-    """Make `<logs_dir>/20261121T012345Z-<name>` with `run.json`, and `config.toml` including every default.
+    """Make `<logs_dir>/20261121T012345Z-<name>` with `run.json`, and `config.toml` including every
+    default.
 
     A second run in the same second gets the suffix `-2`.
 
-    Raises InputError if the name has characters other than letters, digits, dot, dash and underscore. Raises
-    DeviceError, and leaves nothing behind, if the folder cannot be written or the disk has less than
-    `recording.min_free_mb` free.
+    Raises InputError if the name has characters other than letters, digits, dot, dash and
+    underscore. Raises DeviceError, and leaves nothing behind, if the folder cannot be written or
+    the disk has less than `recording.min_free_mb` free.
     """
     if not _NAME.fullmatch(name):
         raise errors.InputError(
-            f"run name {name!r}: use letters, digits, '.', '-' and '_' (at most 64, no '.' in front)"
+            f"run name {name!r}: use letters, digits, '.', '-' and '_' (at most 64, no '.' "
+            "in front)"
         )
     try:
         logs_dir.mkdir(parents=True, exist_ok=True)
@@ -86,7 +89,9 @@ def _make_unique(logs_dir: Path, name: str) -> Path:
 
 def _unwritable(folder: Path, error: OSError) -> errors.DeviceError:
     reason = errors.os_reason(error)
-    return errors.DeviceError(f"{folder}: cannot be written ({reason}); give a writable folder with --logs DIR")
+    return errors.DeviceError(
+        f"{folder}: cannot be written ({reason}); give a writable folder with --logs DIR"
+    )
 
 
 # The parts that this version understands of a damaged configuration, or one of another version.
@@ -165,7 +170,9 @@ def add_mark(folder: Path, origin_utc: datetime, mono_s: float, text: str) -> ev
         files.append_text(folder / ANNOTATIONS_FILE, json.dumps(line, ensure_ascii=False) + "\n")
     except OSError as error:
         reason = errors.os_reason(error)
-        raise errors.DeviceError(f"{folder / ANNOTATIONS_FILE}: cannot be written ({reason})") from None
+        raise errors.DeviceError(
+            f"{folder / ANNOTATIONS_FILE}: cannot be written ({reason})"
+        ) from None
     return line
 
 
@@ -189,13 +196,17 @@ def find_folder(path: Path) -> Path:
     if not folder.exists():
         raise errors.InputError(f"{path}: no such run; `membrane-ctrl runs` lists the runs")
     if not is_run(folder):
-        raise errors.InputError(f"{path}: not a run: it contains neither events.jsonl nor a table of ticks")
+        raise errors.InputError(
+            f"{path}: not a run: it contains neither events.jsonl nor a table of ticks"
+        )
     return folder.resolve()
 
 
 def is_run(folder: Path) -> bool:
     """Whether a folder contains anything of a run."""
-    return folder.is_dir() and ((folder / "events.jsonl").exists() or any(folder.glob("ticks/ticks-*")))
+    return folder.is_dir() and (
+        (folder / "events.jsonl").exists() or any(folder.glob("ticks/ticks-*"))
+    )
 
 
 @dataclass(frozen=True, slots=True)
@@ -208,7 +219,9 @@ class LoggedEvent:
 
 
 def logged(line: events.EventLine) -> LoggedEvent:
-    """What a line means; a mark made while the run went on (`ctl mark`) is recorded as a command."""
+    """What a line means; a mark made while the run went on (`ctl
+    mark`) is recorded as a command.
+    """
     event = run_events.from_dict(line)
     if isinstance(event, events.CommandTaken) and event.command == "mark":
         line = line | {"kind": "mark", "text": event.text or event.why}
@@ -249,7 +262,9 @@ def read_summary(folder: Path, notes: list[str]) -> dict[str, Any] | None:
 
 
 def exact_config(folder: Path) -> Config:
-    """`config.toml` as it was in force. Raises InputError if this version does not understand all of it."""
+    """`config.toml` as it was in force. Raises InputError if this version does not understand all
+    of it.
+    """
     return toml_file.load(folder / "config.toml", Config, follow=False)
 
 
@@ -281,7 +296,11 @@ def _config_damage(path: Path) -> list[str]:
     if not text:
         return ["config.toml: empty; all defaults are used"]
     right = plain_json.comment_is_right(text)
-    return [] if right else ["config.toml: checksum mismatch (damaged or edited); its values are doubtful"]
+    return (
+        []
+        if right
+        else ["config.toml: checksum mismatch (damaged or edited); its values are doubtful"]
+    )
 
 
 def _json_lines(path: Path, notes: list[str]) -> list[events.EventLine]:
@@ -296,12 +315,16 @@ def _json_lines(path: Path, notes: list[str]) -> list[events.EventLine]:
         return []
     lines = [event_of(line) for line in text.splitlines()]
     if broken := lines.count(None):
-        notes.append(f"{path.name}: {broken} line{'s' * (broken > 1)} unreadable or untrustworthy: left out")
+        notes.append(
+            f"{path.name}: {broken} line{'s' * (broken > 1)} unreadable or untrustworthy: left out"
+        )
     return [line for line in lines if line is not None]
 
 
 def event_of(line: str) -> events.EventLine | None:
-    """The event in a line, if valid: an object of a known form with a correct checksum and a possible time."""
+    """The event in a line, if valid: an object of a known form with a correct checksum and a
+    possible time.
+    """
     try:
         event = plain_json.loads(line)
     except ValueError:
@@ -315,4 +338,6 @@ def event_of(line: str) -> events.EventLine | None:
 
 def is_moment(value: object) -> bool:
     """Whether a value is a possible time of a run; damaged and forged files may hold anything."""
-    return isinstance(value, (int, float)) and not isinstance(value, bool) and abs(value) < _RUN_MAX_S
+    return (
+        isinstance(value, (int, float)) and not isinstance(value, bool) and abs(value) < _RUN_MAX_S
+    )

@@ -1,7 +1,7 @@
 """`run.json`: the format of a run folder, and the program that recorded it.
 
-The format counts the layout of the whole folder: from 1.0.0 on, each release reads those of the former releases
-(decision 68).
+The format counts the layout of the whole folder: from 1.0.0 on, each release reads those of the
+former releases (decision 68).
 """
 
 import re
@@ -19,7 +19,9 @@ _BYTES_MAX = 65_536
 
 @dataclass(frozen=True, slots=True)
 class RunHead:
-    """Content of `run.json`: number of the format, and the program with its commit; 0 and empty if unknown."""
+    """Content of `run.json`: number of the format, and the program with its commit; 0 and empty if
+    unknown.
+    """
 
     format: int = 0
     recorded_by: str = ""
@@ -47,7 +49,8 @@ def read_run_head(folder: Path, notes: list[str]) -> RunHead:
     head = RunHead(int(found[1]), stated_program(table))
     if head.format > FORMAT:
         notes.append(
-            f"{HEAD_FILE}: membrane-run/{head.format}, recorded by {head.recorded_by or 'a later version'}; "
+            f"{HEAD_FILE}: membrane-run/{head.format}, recorded by "
+            f"{head.recorded_by or 'a later version'}; "
             f"this version reads membrane-run/{FORMAT}, and what it does not understand is left out"
         )
     return head

@@ -36,11 +36,16 @@ class RunTables:
     """
 
     def __init__(
-        self, run_dir: Path, origin_utc: datetime | None = None, resumed: levels.OpenWindows | None = None
+        self,
+        run_dir: Path,
+        origin_utc: datetime | None = None,
+        resumed: levels.OpenWindows | None = None,
     ) -> None:
         self._origin_utc = origin_utc
         specs = map(table_specs.with_origin, table_specs.ALL)
-        self._writers = {spec.name: TableWriter(run_dir, spec, resumed is not None) for spec in specs}
+        self._writers = {
+            spec.name: TableWriter(run_dir, spec, resumed is not None) for spec in specs
+        }
         self._windows = resumed or levels.OpenWindows()
         self._covariance_due_s = -math.inf
 
@@ -55,10 +60,16 @@ class RunTables:
         self._add_levels({name: row[name] for name in levels.TICK_FIELDS})
 
     def _add_rare(self, batch: TickBatch) -> None:
-        times_s = dict(zip(batch.records["tick"].tolist(), batch.records["now_s"].tolist(), strict=True))
-        for spec, parts in ((table_specs.RARE, batch.tails), (table_specs.SNAPSHOTS, batch.snapshots)):
+        times_s = dict(
+            zip(batch.records["tick"].tolist(), batch.records["now_s"].tolist(), strict=True)
+        )
+        for spec, parts in (
+            (table_specs.RARE, batch.tails),
+            (table_specs.SNAPSHOTS, batch.snapshots),
+        ):
             rows = [
-                {"time_s": times_s[tick], "tick": tick, "json": text.decode()} for tick, text in sorted(parts.items())
+                {"time_s": times_s[tick], "tick": tick, "json": text.decode()}
+                for tick, text in sorted(parts.items())
             ]
             self._add_dicts(spec, rows)
 
@@ -71,7 +82,9 @@ class RunTables:
     def add_shape(self, estimate: shape_estimate.ShapeEstimate) -> None:
         """Add the result of a measurement cycle, or of a tracked frame."""
         spec = table_specs.TRACKED if estimate.kind == "track" else table_specs.SHAPES
-        row = {name: getattr(estimate, name) for name in spec.schema.names if hasattr(estimate, name)}
+        row = {
+            name: getattr(estimate, name) for name in spec.schema.names if hasattr(estimate, name)
+        }
         numbers = {name: _or_none(row[name]) for name in shape_estimate.NUMBERS}
         variances_um2 = np.maximum(np.diag(estimate.covariance_um2), 0.0)
         arrays = {
@@ -83,14 +96,20 @@ class RunTables:
         if estimate.verdict != "rejected" and estimate.time_s >= self._covariance_due_s:
             self._covariance_due_s = estimate.time_s + table_specs.COVARIANCE_INTERVAL_S
             covariance = np.asarray(estimate.covariance_um2, dtype=np.float32).ravel()
-            self._add_dicts(table_specs.COVARIANCES, [{"time_s": estimate.time_s, "covariance_um2": covariance}])
+            self._add_dicts(
+                table_specs.COVARIANCES, [{"time_s": estimate.time_s, "covariance_um2": covariance}]
+            )
 
     def add_events(self, lines: Sequence[EventLine]) -> None:
         """Add new lines of the event log; marks are also in a table of their own."""
         first = self._next_number(table_specs.EVENTS)
         rows = [self._event_row(number, line) for number, line in enumerate(lines, start=first)]
         self._add_dicts(table_specs.EVENTS, rows)
-        marks = [row for row, line in zip(rows, lines, strict=True) if run_folder.logged(line).line["kind"] == "mark"]
+        marks = [
+            row
+            for row, line in zip(rows, lines, strict=True)
+            if run_folder.logged(line).line["kind"] == "mark"
+        ]
         self._add_dicts(table_specs.MARKS, marks)
 
     def _event_row(self, number: int, line: EventLine) -> dict[str, Any]:
@@ -116,7 +135,9 @@ class RunTables:
 
     def _add_dicts(self, spec: TableSpec, rows: list[dict[str, Any]]) -> None:
         if rows:
-            columns = [pa.array([row[field.name] for row in rows], field.type) for field in spec.schema]
+            columns = [
+                pa.array([row[field.name] for row in rows], field.type) for field in spec.schema
+            ]
             self._writer(spec).add(pa.record_batch(columns, schema=spec.schema))
 
     def _writer(self, spec: TableSpec) -> TableWriter:
@@ -128,7 +149,9 @@ class RunTables:
         return self._windows
 
     def sync(self) -> None:
-        """Bring all rows to the disk. Raises OSError (full disk), after all tables were tried: they wait."""
+        """Bring all rows to the disk. Raises OSError (full disk), after all tables were tried: they
+        wait.
+        """
         self._for_each(TableWriter.sync)
 
     def seal(self) -> None:
@@ -169,12 +192,16 @@ class RunTables:
 
     @property
     def parts(self) -> dict[str, int]:
-        """Number of parts per table: a reader that finds fewer knows that the last ones are missing."""
+        """Number of parts per table: a reader that finds fewer knows that the last ones are
+        missing.
+        """
         return {name: writer.parts for name, writer in self._writers.items()}
 
 
 def _tick_rows(row: Mapping[str, Column]) -> pa.RecordBatch:
-    """Telemetry as the table of ticks has it: missing values null, computed numbers with seven digits."""
+    """Telemetry as the table of ticks has it: missing values null, computed numbers with seven
+    digits.
+    """
     arrays = []
     for field in table_specs.TICKS.schema:
         values = np.ascontiguousarray(row[field.name], dtype=np.float64)
@@ -182,7 +209,9 @@ def _tick_rows(row: Mapping[str, Column]) -> pa.RecordBatch:
             arrays.append(_whole_numbers(values))
         elif table_specs.is_exact(field.name):
             # a reading that is another NaN than the missing value keeps its bits, for replays
-            arrays.append(pa.array(values, mask=values.view(np.uint64) == _MISSING_BITS, from_pandas=False))
+            arrays.append(
+                pa.array(values, mask=values.view(np.uint64) == _MISSING_BITS, from_pandas=False)
+            )
         else:
             arrays.append(pa.array(values.astype(np.float32), mask=np.isnan(values)))
     return pa.record_batch(arrays, schema=table_specs.TICKS.schema)
@@ -212,7 +241,9 @@ def _nullable_rows(spec: TableSpec, columns: Mapping[str, Column]) -> pa.RecordB
         if pa.types.is_integer(field.type):
             arrays.append(_whole_numbers(values))
         else:
-            arrays.append(pa.array(values.astype(field.type.to_pandas_dtype()), mask=np.isnan(values)))
+            arrays.append(
+                pa.array(values.astype(field.type.to_pandas_dtype()), mask=np.isnan(values))
+            )
     return pa.record_batch(arrays, schema=spec.schema)
 
 

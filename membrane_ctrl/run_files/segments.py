@@ -1,7 +1,7 @@
 """Finds the messages of a Rerun segment, so that a live view may skip a part of it.
 
-A file has a header of 12 bytes (`RRF2`, version, options) and messages: kind and length (64-bit little endian each),
-then that many bytes (rerun's `re_log_encoding`, file format 2).
+A file has a header of 12 bytes (`RRF2`, version, options) and messages: kind and length (64-bit
+little endian each), then that many bytes (rerun's `re_log_encoding`, file format 2).
 """
 
 import struct
@@ -34,7 +34,9 @@ def segments(folder: Path) -> list[Path]:
 
 
 def first_message_after(path: Path, place: int) -> int:
-    """Start of the first message at or after `place`, at most the last one's end; 0 for another kind of file."""
+    """Start of the first message at or after `place`, at most the last one's end; 0 for another
+    kind of file.
+    """
     at = _HEAD_BYTES
     with open_plain(path) as file:
         if file.read(len(_MAGIC)) != _MAGIC:

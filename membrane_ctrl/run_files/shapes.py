@@ -1,4 +1,6 @@
-"""The measured figure over a run: coefficients, their covariance, heights anywhere on the mirror."""
+"""The measured figure over a run: coefficients, their covariance,
+heights anywhere on the mirror.
+"""
 
 from __future__ import annotations
 
@@ -25,7 +27,8 @@ class Shapes:
 
     Attributes
     ----------
-    time_s, sag_um, sag_sigma_um, displacement_um, slope_residual_urad, valid_fraction, latency_s, hencky_um : array
+    time_s, sag_um, sag_sigma_um, displacement_um, slope_residual_urad, valid_fraction, latency_s,
+    hencky_um : array
         As in `ShapeEstimate`.
     coeffs_um : (n, terms) array
     verdict : (n,) array of str
@@ -55,7 +58,9 @@ class Shapes:
         if wanted.all():
             return self  # a month of 36 coefficients is 190 MB
         parts = {name: getattr(self, name)[wanted] for name in (*NUMBERS, "coeffs_um", "verdict")}
-        return Shapes(**parts, covariance_time_s=self.covariance_time_s, covariance_um2=self.covariance_um2)
+        return Shapes(
+            **parts, covariance_time_s=self.covariance_time_s, covariance_um2=self.covariance_um2
+        )
 
     def columns(self) -> dict[str, Column | NDArray[np.str_]]:
         """Columns of a table with one row per cycle: time, terms from Z1, sag, quality, verdict."""
@@ -79,9 +84,15 @@ class Shapes:
 
 
 NUMBERS = (
-    "time_s", "hencky_um", "sag_um", "sag_sigma_um", "displacement_um", "slope_residual_urad", "valid_fraction",
+    "time_s",
+    "hencky_um",
+    "sag_um",
+    "sag_sigma_um",
+    "displacement_um",
+    "slope_residual_urad",
+    "valid_fraction",
     "latency_s",
-)  # fmt: skip
+)
 
 
 def height_basis(x: Column, y: Column) -> Column:
@@ -95,17 +106,27 @@ TABLE_COLUMNS = (*NUMBERS, "verdict", "coeffs_um")
 
 
 def from_tables(figures: Iterable[pa.Table], covariances: Iterable[pa.Table]) -> Shapes:
-    """Shapes from the recorder's tables of figures and of covariances, whatever columns they have; by time."""
-    parts = [_figures(table) for table in figures if {"time_s", "coeffs_um"} <= set(table.column_names)]
+    """Shapes from the recorder's tables of figures and of covariances, whatever columns they have;
+    by time.
+    """
+    parts = [
+        _figures(table) for table in figures if {"time_s", "coeffs_um"} <= set(table.column_names)
+    ]
     kept = [table for table in covariances if table.num_columns == 2]
     names = (*NUMBERS, "coeffs_um", "verdict")
-    empty: dict[str, Any] = {name: np.empty((0, ZERNIKE_TERMS) if name == "coeffs_um" else 0) for name in names}
-    joined = {name: np.concatenate([part[name] for part in parts]) for name in names} if parts else empty
+    empty: dict[str, Any] = {
+        name: np.empty((0, ZERNIKE_TERMS) if name == "coeffs_um" else 0) for name in names
+    }
+    joined = (
+        {name: np.concatenate([part[name] for part in parts]) for name in names} if parts else empty
+    )
     order = np.argsort(joined["time_s"], kind="stable")
     matrices = [_matrix(table.column("covariance_um2"), ZERNIKE_TERMS**2) for table in kept]
     return Shapes(
         **{name: values[order] for name, values in joined.items()},
-        covariance_time_s=np.concatenate([np.empty(0), *(_numbers(table, "time_s") for table in kept)]),
+        covariance_time_s=np.concatenate(
+            [np.empty(0), *(_numbers(table, "time_s") for table in kept)]
+        ),
         covariance_um2=np.concatenate([np.empty((0, ZERNIKE_TERMS**2)), *matrices]).reshape(
             -1, ZERNIKE_TERMS, ZERNIKE_TERMS
         ),
@@ -114,7 +135,9 @@ def from_tables(figures: Iterable[pa.Table], covariances: Iterable[pa.Table]) ->
 
 def _figures(table: pa.Table) -> dict[str, AnyArray]:
     count = table.num_rows
-    verdicts = table.column("verdict").to_pylist() if "verdict" in table.column_names else ["ok"] * count
+    verdicts = (
+        table.column("verdict").to_pylist() if "verdict" in table.column_names else ["ok"] * count
+    )
     figures: dict[str, AnyArray] = {name: _numbers(table, name) for name in NUMBERS}
     return figures | {
         "coeffs_um": _matrix(table.column("coeffs_um"), ZERNIKE_TERMS),
@@ -136,11 +159,15 @@ ESTIMATE_COLUMNS = (
 
 
 def estimates(table: pa.Table) -> Iterator[shape_estimate.ShapeEstimate]:
-    """The estimates in the recorder's table, as given to the controller. Raises ValueError if they are invalid."""
+    """The estimates in the recorder's table, as given to the controller. Raises ValueError if they
+    are invalid.
+    """
     names = ESTIMATE_COLUMNS[:-2]
     heads = zip(*(table.column(name).to_pylist() for name in names), strict=True)
     coeffs = _matrix(table.column("coeffs_um"), ZERNIKE_TERMS)
-    uppers = _matrix(table.column("upper_um2"), table.schema.field("upper_um2").type.list_size).astype(np.float32)
+    uppers = _matrix(
+        table.column("upper_um2"), table.schema.field("upper_um2").type.list_size
+    ).astype(np.float32)
     for head, row, upper in zip(heads, coeffs, uppers, strict=True):
         named = dict(zip(names, head, strict=True))
         named |= {name: math.nan for name in shape_estimate.NUMBERS if named[name] is None}
@@ -155,8 +182,14 @@ def _numbers(table: pa.Table, name: str) -> Column:
 
 def _matrix(cells: pa.ChunkedArray, width: int) -> Column:
     """A column of fixed-size lists as (n, width) numbers; a missing list is a row of NaN."""
-    rows = cells.combine_chunks().fill_null([math.nan] * width) if cells.null_count else cells.combine_chunks()
-    return np.asarray(rows.flatten().to_numpy(zero_copy_only=False), dtype=np.float64).reshape(-1, width)
+    rows = (
+        cells.combine_chunks().fill_null([math.nan] * width)
+        if cells.null_count
+        else cells.combine_chunks()
+    )
+    return np.asarray(rows.flatten().to_numpy(zero_copy_only=False), dtype=np.float64).reshape(
+        -1, width
+    )
 
 
 BARS_PATH = "/shape/change_bars"
@@ -188,7 +221,9 @@ def height_map_mm(estimate: shape_estimate.ShapeEstimate) -> Map:
     return _spread(_surface(estimate).height(*_points()))
 
 
-def difference_map_um(estimate: shape_estimate.ShapeEstimate, reference: shape_estimate.ShapeEstimate) -> Map:
+def difference_map_um(
+    estimate: shape_estimate.ShapeEstimate, reference: shape_estimate.ShapeEstimate
+) -> Map:
     """Height minus that of the reference, each above its own vertex; µm, as `height_map_mm`."""
     change_um = estimate.coeffs_um - reference.coeffs_um
     return change_map_um(np.append(change_um, estimate.hencky_um - reference.hencky_um))
@@ -200,13 +235,16 @@ def change_map_um(parameters_um: Column) -> Map:
 
 
 def deviation_map_um(parameters_um: Column) -> Map:
-    """Standard deviation of the height over at least two cycles with (n, terms + 1) parameters, µm."""
+    """Standard deviation of the height over at least two cycles with (n, terms + 1) parameters,
+    µm.
+    """
     variance = np.einsum("jp,jp->p", _basis(), np.cov(parameters_um.T) @ _basis())
     return _spread(np.sqrt(np.maximum(variance, 0.0)))
 
 
 def without_terms(height: AnyArray, terms: int) -> AnyArray:
-    """A square map of the unit disc less the best fit of the first terms, at most 4, to its finite pixels.
+    """A square map of the unit disc less the best fit of the first terms, at most 4, to its finite
+    pixels.
 
     3 terms are piston and tilt, 4 defocus as well.
     """
@@ -219,7 +257,9 @@ def without_terms(height: AnyArray, terms: int) -> AnyArray:
 
 
 def uncertainty_map_um(covariance_um2: NDArray[np.float64]) -> Map:
-    """Standard deviation of the height, µm: sqrt of z C z' with the row z of the terms at each point."""
+    """Standard deviation of the height, µm: sqrt of z C z' with the row z of the terms at each
+    point.
+    """
     variance = np.einsum("jp,jp->p", _terms(), covariance_um2 @ _terms())
     return _spread(np.sqrt(np.maximum(variance, 0.0)))
 

@@ -1,7 +1,8 @@
-"""Telemetry as the viewer gets it: the Rerun entities of the table of columns, lines for events, tables with UTC.
+"""Telemetry as the viewer gets it: the Rerun entities of the table of columns, lines for events,
+tables with UTC.
 
-The signals of one plot share one entity: m scalars of one cost the writer and the viewer far less than m entities of
-one. `SeriesLines` sets the names of the lines once.
+The signals of one plot share one entity: m scalars of one cost the writer and the viewer far less
+than m entities of one. `SeriesLines` sets the names of the lines once.
 """
 
 from collections.abc import Iterator, Mapping, Sequence
@@ -17,7 +18,17 @@ from numpy.typing import NDArray
 from membrane_ctrl.controller import safety
 from membrane_ctrl.model import telemetry, zernike_terms
 from membrane_ctrl.model.arrays import Column, FloatArray
-from membrane_ctrl.model.colours import BLUE, GREEN, GREY, ORANGE, RED, VIOLET, WHITE, YELLOW, Colour
+from membrane_ctrl.model.colours import (
+    BLUE,
+    GREEN,
+    GREY,
+    ORANGE,
+    RED,
+    VIOLET,
+    WHITE,
+    YELLOW,
+    Colour,
+)
 from membrane_ctrl.model.columns import (
     BY_GROUP,
     COLUMNS,
@@ -36,7 +47,9 @@ from membrane_ctrl.model.telemetry import Rows, column
 
 @dataclass(frozen=True, slots=True)
 class Line:
-    """One signal of a stream: the telemetry field, its name in the legend, its colour and width in points."""
+    """One signal of a stream: the telemetry field, its name in the legend, its colour and width in
+    points.
+    """
 
     field: str
     name: str
@@ -92,11 +105,13 @@ OVERVIEW = Stream(
         Line("", "error, greatest of a second µm", GREY, 1.0),
     ),
 )
-# A point per second all over the run: the others have every tick around events and one per second in quiet times, and
-# a line that changes its density looks as if the mirror had changed.
+# A point per second all over the run: the others have every tick around events and one per second
+# in quiet times, and a line that changes its density looks as if the mirror had changed.
 _MEAN_PLOTS = (POSITION, *plots_of(Group.PUMP, Group.ENVIRONMENT))
 _MEANS = frozenset(each.entity for plot in _MEAN_PLOTS for each in columns_of(plot))
-MEANS = tuple(replace(stream, path=mean_path(stream.path)) for stream in STREAMS if stream.path in _MEANS)
+MEANS = tuple(
+    replace(stream, path=mean_path(stream.path)) for stream in STREAMS if stream.path in _MEANS
+)
 TRUE_MEAN = replace(TRUE_ERROR, path=mean_path(TRUE_ERROR.path))
 DERIVED: tuple[Stream, ...] = (TRUE_ERROR, OVERVIEW, *MEANS, TRUE_MEAN)
 
@@ -118,20 +133,33 @@ LOW_ORDERS = {
     11: ("spherical Z11 µm", RED),
 }
 
-ZERNIKE = Stream("/shape/zernike", tuple(Line("", f"{label} µm", GREY) for label in zernike_terms.zernike_labels()))
-CHANGE = Stream("/shape/change", tuple(Line("", name, colour) for name, colour in LOW_ORDERS.values()))
-PUMP = Stream("/pump/scale", (Line("", "flow against its curve ± 1σ", BLUE, 2.0), Line("", "scale in use", ORANGE)))
+ZERNIKE = Stream(
+    "/shape/zernike",
+    tuple(Line("", f"{label} µm", GREY) for label in zernike_terms.zernike_labels()),
+)
+CHANGE = Stream(
+    "/shape/change", tuple(Line("", name, colour) for name, colour in LOW_ORDERS.values())
+)
+PUMP = Stream(
+    "/pump/scale",
+    (Line("", "flow against its curve ± 1σ", BLUE, 2.0), Line("", "scale in use", ORANGE)),
+)
 VIBRATIONS = Stream("/shape/vibrations", tuple(Line("", f"mode {k} Hz", GREY) for k in range(1, 9)))
-SAG = Stream("/shape/sag_change", (Line("", "sag change ± 1σ µm", BLUE, 2.0), Line("", "laser change µm", ORANGE)))
+SAG = Stream(
+    "/shape/sag_change",
+    (Line("", "sag change ± 1σ µm", BLUE, 2.0), Line("", "laser change µm", ORANGE)),
+)
 RESIDUAL = Stream("/shape/residual", (Line("", "slope residual µrad", BLUE),))
-QUALITY = Stream("/shape/quality", (Line("", "valid fraction", GREEN, 2.0), Line("", "saturated fraction", RED)))
+QUALITY = Stream(
+    "/shape/quality", (Line("", "valid fraction", GREEN, 2.0), Line("", "saturated fraction", RED))
+)
 MODULATION = Stream("/shape/modulation", (Line("", "modulation ADU", BLUE),))
 LATENCY = Stream("/shape/latency", (Line("", "last frame to result ms", BLUE),))
 SHAPE_STREAMS: tuple[Stream, ...] = (ZERNIKE, RESIDUAL, QUALITY, MODULATION, LATENCY)
 
 
-# Vertical lines across plots of a fixed height, interrupted by NaN; an entity each, as a legend lists only those with
-# data.
+# Vertical lines across plots of a fixed height, interrupted by NaN; an entity each, as a legend
+# lists only those with data.
 MARKS: tuple[Stream, ...] = (
     Stream("/marks/fault", (Line("fault", "fault", RED, 2.0),)),
     Stream("/marks/pause", (Line("pause", "pause, resume", YELLOW),)),
@@ -142,8 +170,11 @@ MARKS: tuple[Stream, ...] = (
 _MARK_HALF_HEIGHT = 1e3  # in the units of any plot that has them
 
 
-def mark_lines(events: Sequence[tuple[float, Event]]) -> Iterator[tuple[Stream, Column, FloatArray]]:
-    """Each stream of `MARKS` with events, times (3 n,) and values (3 n, 1) that draw a vertical line for each.
+def mark_lines(
+    events: Sequence[tuple[float, Event]],
+) -> Iterator[tuple[Stream, Column, FloatArray]]:
+    """Each stream of `MARKS` with events, times (3 n,) and values (3 n, 1) that draw a vertical
+    line for each.
 
     `events` are those of a run with their times.
     """
@@ -172,7 +203,9 @@ def mean_row(rows: Rows) -> Rows:
     """(1, fields) mean of each field over the rows that have it; NaN where none has."""
     there = np.isfinite(rows)
     with np.errstate(invalid="ignore"):
-        mean: Rows = np.where(there, rows, 0.0).sum(axis=0, keepdims=True) / there.sum(axis=0, keepdims=True)
+        mean: Rows = np.where(there, rows, 0.0).sum(axis=0, keepdims=True) / there.sum(
+            axis=0, keepdims=True
+        )
     return mean
 
 
@@ -210,16 +243,23 @@ def named_table(columns: Mapping[str, NDArray[Any]], origin_utc: datetime) -> pa
     Returns
     -------
     pyarrow.Table
-        `time_s` and `time_utc` (timestamps to the microsecond), then the other columns: numbers, counts as integers,
-        the codes of `WORDS` as dictionary-encoded names. An absent value is null.
+        `time_s` and `time_utc` (timestamps to the microsecond), then the other columns: numbers,
+        counts as integers, the codes of `WORDS` as dictionary-encoded names. An absent value is
+        null.
     """
-    time_s = np.asarray(columns["mono_s"] if "mono_s" in columns else columns["time_s"], dtype=np.float64)
+    time_s = np.asarray(
+        columns["mono_s"] if "mono_s" in columns else columns["time_s"], dtype=np.float64
+    )
     table = {"time_s": _nullable(time_s), "time_utc": _utc(time_s, origin_utc)}
     for name, values in columns.items():
         if name in WORDS:
             table[name] = _named(values, WORDS[name])
         elif name not in TIMES:
-            table[name] = _nullable(values).cast(pa.int64(), safe=False) if name in _COUNTS else _nullable(values)
+            table[name] = (
+                _nullable(values).cast(pa.int64(), safe=False)
+                if name in _COUNTS
+                else _nullable(values)
+            )
     return pa.table(table)
 
 

@@ -22,8 +22,8 @@ Values = FloatArray
 class Moments:
     """Mean and standard deviation of values that arrive in batches.
 
-    Batches are merged by the pairwise update of Chan, Golub and LeVeque (1979): with n, m the counts, d the
-    difference of the means and S the sums of squared deviations,
+    Batches are merged by the pairwise update of Chan, Golub and LeVeque (1979): with n, m the
+    counts, d the difference of the means and S the sums of squared deviations,
 
         mean = mean_n + d m / (n + m),    S = S_n + S_m + d^2 n m / (n + m),
 
@@ -43,7 +43,9 @@ class Moments:
         mean = float(values.mean())
         delta = mean - self.mean
         total = self.count + values.size
-        self._squares += float(((values - mean) ** 2).sum()) + delta**2 * self.count * values.size / total
+        self._squares += (
+            float(((values - mean) ** 2).sum()) + delta**2 * self.count * values.size / total
+        )
         self.mean += delta * values.size / total
         self.count = total
 
@@ -54,10 +56,11 @@ class Moments:
 
 
 class LogHistogram:
-    """Quantiles of positive values from bins of equal ratio between `low` and `high`, with one more bin beyond each.
+    """Quantiles of positive values from bins of equal ratio between `low` and `high`, with one more
+    bin beyond each.
 
-    A quantile is its bin's geometric middle, so its relative error is at most sqrt(ratio) - 1; `largest` is
-    exact.
+    A quantile is its bin's geometric middle, so its relative error is at most sqrt(ratio) - 1;
+    `largest` is exact.
     """
 
     def __init__(self, low: float = 1e-3, high: float = 1e5, ratio: float = 1.02) -> None:
@@ -91,13 +94,17 @@ _LEAST_SHARE = 0.9
 
 
 def least_ticks(window_s: float, rate_hz: float) -> float:
-    """Ticks that a window must have: nine tenths, or all but one, which may have come just behind its end."""
+    """Ticks that a window must have: nine tenths, or all but one, which may have come just behind
+    its end.
+    """
     ticks = window_s * rate_hz
     return min(_LEAST_SHARE * ticks, ticks - 1)
 
 
 class SecondMeans:
-    """Means of the seconds of the run that have at least `least` values; `result` is that of all until now."""
+    """Means of the seconds of the run that have at least `least` values; `result` is that of all
+    until now.
+    """
 
     def __init__(self, band: float, least: float) -> None:
         self._band = band
@@ -108,7 +115,9 @@ class SecondMeans:
         self._first = self._last = math.nan
 
     def add(self, time_s: Column, values: Column) -> None:
-        """Take in (n,) values at their times, which rise; those that are not finite are left out."""
+        """Take in (n,) values at their times, which rise;
+        those that are not finite are left out.
+        """
         there = np.isfinite(values)
         second = np.append(self._second, np.floor(time_s[there] + 1e-9))
         starts = np.flatnonzero(np.diff(second, prepend=np.nan))
@@ -123,10 +132,15 @@ class SecondMeans:
         self._means.add(means)
         self._inside += int((np.abs(means) <= self._band).sum())
         if means.size:
-            self._first, self._last = float(means[0]) if math.isnan(self._first) else self._first, float(means[-1])
+            self._first, self._last = (
+                float(means[0]) if math.isnan(self._first) else self._first,
+                float(means[-1]),
+            )
 
     def result(self) -> dict[str, float]:
-        """Number of seconds; mean, standard deviation, first and last of their means; share within the band."""
+        """Number of seconds; mean, standard deviation, first and last of their means; share within
+        the band.
+        """
         all_of = copy.deepcopy(self)
         all_of._take(np.array([self._count]), np.array([self._sum]))
         count = all_of._means.count
@@ -142,22 +156,27 @@ class SecondMeans:
 
 SCHEMA = "membrane-summary/2"
 
-# The ramp has ended when setpoint minus trim is this near the target; far below the laser's 0.1 µm steps.
+# The ramp has ended when setpoint minus trim is this near the target; far below the laser's 0.1 µm
+# steps.
 ARRIVED_UM = 0.01
-# Limits on listed transitions and faults; their counters continue (a device may flicker for a week).
+# Limits on listed transitions and faults; their counters continue (a device may flicker for a
+# week).
 _LISTED_MAX = 1000
 
 
 class Summary:
     """Accumulates everything the recorder sees; `as_dict` gives `summary.json` at any time.
 
-    "True" is the target minus what the twin knows of the mirror's centre: on a real bench those keys are null.
+    "True" is the target minus what the twin knows of the mirror's centre: on a real bench those
+    keys are null.
     """
 
     def __init__(self, config: Config) -> None:
         self._true_um = Moments()
         least = least_ticks(1.0, config.loop.rate_hz)
-        self._true_1s_um, self._reading_1s_um = (SecondMeans(config.limits.band_um, least) for _ in range(2))
+        self._true_1s_um, self._reading_1s_um = (
+            SecondMeans(config.limits.band_um, least) for _ in range(2)
+        )
         self._reading_um = Moments()
         self._lateness_ms = LogHistogram()
         self._latency_ms = LogHistogram()
@@ -173,7 +192,9 @@ class Summary:
         self._states: list[dict[str, Any]] = []
         self._transitions = 0
         self._faults: list[EventLine] = []
-        self._standing: list[EventLine] = []  # the fault that stands, if one does; plain data, for the state file
+        self._standing: list[
+            EventLine
+        ] = []  # the fault that stands, if one does; plain data, for the state file
         self._fault_count = 0
         self._geometry: EventLine = {}
         self._end: EventLine = {}
@@ -186,7 +207,9 @@ class Summary:
         for row, code in telemetry.changes(telemetry.column(rows, "state"), self._state):
             self._transitions += 1
             if len(self._states) < _LISTED_MAX:
-                self._states.append({"state": telemetry.State(code).name.lower(), "mono_s": float(time_s[row])})
+                self._states.append(
+                    {"state": telemetry.State(code).name.lower(), "mono_s": float(time_s[row])}
+                )
         parts = self._parts.of(telemetry.columns(rows))
         for name, part in parts.items():
             self._parts_s[name] += float(telemetry.column(rows, "dt_s")[part].sum())
@@ -207,7 +230,9 @@ class Summary:
         self._leak_um_per_s = float(leak[-1]) if leak.size else self._leak_um_per_s
 
     def add_event(self, line: EventLine) -> None:
-        """Add one event; only those of faults and states, the geometry and the end of the run matter."""
+        """Add one event; only those of faults and states, the geometry and the end of the run
+        matter.
+        """
         event = run_events.from_dict(line)
         standing = standing_fault_after(self._standing_fault(), event)
         self._standing = [] if standing is None else [standing.to_dict()]
@@ -284,15 +309,23 @@ def _quantiles(histogram: LogHistogram) -> dict[str, float]:
     return {"p50": histogram.quantile(0.50), "p99": histogram.quantile(0.99)}
 
 
-# What counts as held: in `hold`, the setpoint ramp at its target, no pause, no fault, and that for some seconds.
+# What counts as held: in `hold`, the setpoint ramp at its target, no pause, no fault, and that for
+# some seconds.
 
 FIELDS = (
-    "mono_s", "state", "safe_level", "setpoint_um", "trim_um", "target_um", "displacement_um", "error_um",
+    "mono_s",
+    "state",
+    "safe_level",
+    "setpoint_um",
+    "trim_um",
+    "target_um",
+    "displacement_um",
+    "error_um",
     "p_um_per_s",
-)  # fmt: skip
+)
 PARTS = ("held", "faults", "paused", "moving")
-# A mirror that was let go (a pause, a fault's mean flow) may have strayed: it counts again once it has stayed
-# in the band, and after this time in any case.
+# A mirror that was let go (a pause, a fault's mean flow) may have strayed: it counts again once it
+# has stayed in the band, and after this time in any case.
 _BACK_WITHIN_S = 60.0
 
 
@@ -314,7 +347,11 @@ class HoldParts:
         time_s, hold = block["mono_s"], block["state"] == telemetry.State.HOLD
         faults = block["safe_level"] > 0
         # a loop that follows its error has a proportional part; a lost reading alone is no pause
-        open_loop = (block["p_um_per_s"] == 0) & (block["error_um"] != 0) & np.isfinite(block["displacement_um"])
+        open_loop = (
+            (block["p_um_per_s"] == 0)
+            & (block["error_um"] != 0)
+            & np.isfinite(block["displacement_um"])
+        )
         paused = hold & ~faults & open_loop
         ramp_um = block["setpoint_um"] - np.nan_to_num(block["trim_um"]) - block["target_um"]
         began = hold & ~np.concatenate(([not math.isnan(self._since_s)], hold[:-1]))
@@ -326,28 +363,43 @@ class HoldParts:
         held = hold & (time_s - since_s >= telemetry.SETTLED_AFTER_S)
         if time_s.size:
             self._since_s = float(since_s[-1]) if hold[-1] else math.nan
-        return {"held": held, "faults": faults, "paused": paused, "moving": hold & ~(held | paused | faults)}
+        return {
+            "held": held,
+            "faults": faults,
+            "paused": paused,
+            "moving": hold & ~(held | paused | faults),
+        }
 
     def _straying(self, block: Mapping[str, Column], let_go: BoolArray) -> BoolArray:
-        """(n,) the ticks outside the band from the moment that it is held again until it has stayed inside."""
+        """(n,) the ticks outside the band from the moment that it is held again until it has stayed
+        inside.
+        """
         time_s, outside = block["mono_s"], ~(np.abs(block["error_um"]) <= self._band_um)
         straying = np.zeros(time_s.size, dtype=bool)
-        for first in np.flatnonzero(~let_go & np.concatenate(([not math.isnan(self._let_go_s)], let_go[:-1]))):
-            gone_s, away_s = (time_s[first - 1], time_s[first - 1]) if first else (self._let_go_s, self._away_s)
+        for first in np.flatnonzero(
+            ~let_go & np.concatenate(([not math.isnan(self._let_go_s)], let_go[:-1]))
+        ):
+            gone_s, away_s = (
+                (time_s[first - 1], time_s[first - 1]) if first else (self._let_go_s, self._away_s)
+            )
             rows = first + np.flatnonzero((outside & (time_s <= gone_s + _BACK_WITHIN_S))[first:])
             away = np.append(away_s, time_s[rows])
             stayed = np.flatnonzero(np.diff(away, append=time_s[-1]) >= telemetry.SETTLED_AFTER_S)
             count = int(stayed[0]) if stayed.size else rows.size
             straying[rows[:count]] = True
             over = stayed.size or time_s[-1] > gone_s + _BACK_WITHIN_S
-            self._let_go_s, self._away_s = (math.nan, math.nan) if over else (float(gone_s), float(away[count]))
+            self._let_go_s, self._away_s = (
+                (math.nan, math.nan) if over else (float(gone_s), float(away[count]))
+            )
         if let_go.size and let_go[-1]:
             self._let_go_s = self._away_s = float(time_s[-1])
         return straying
 
 
 def held_at(level: Mapping[str, Column], time_s: Column) -> BoolArray:
-    """(n,) whether the mirror was settled in `hold` at each time, as far as the windows of a level tell."""
+    """(n,) whether the mirror was settled in `hold` at each time, as far as the windows of a level
+    tell.
+    """
     if not level["time_s"].size:
         return np.zeros(time_s.size, dtype=bool)
     place = np.clip(np.searchsorted(level["time_s"], time_s, side="right") - 1, 0, None)

@@ -1,4 +1,6 @@
-"""The tables of a run: their names and columns, with unit and description in the metadata of each field."""
+"""The tables of a run: their names and columns, with unit and description in the metadata of each
+field.
+"""
 
 from dataclasses import replace
 
@@ -14,9 +16,13 @@ from membrane_ctrl.run_files import levels
 from membrane_ctrl.run_files.table_store.spec import TableSpec
 
 FORMAT = "membrane-table/1"
-# Fields of a tick's record that are no column of its telemetry row, and are not repeated in it: the table of inputs.
-INPUT_FIELDS: tuple[str, ...] = tuple(name for name in RECORD.names or () if name not in SAME or name == "now_s")
-# By the field of a record: the column of the telemetry row with that reading or time, exact or derived.
+# Fields of a tick's record that are no column of its telemetry row, and are not repeated in it: the
+# table of inputs.
+INPUT_FIELDS: tuple[str, ...] = tuple(
+    name for name in RECORD.names or () if name not in SAME or name == "now_s"
+)
+# By the field of a record: the column of the telemetry row with that reading or time, exact or
+# derived.
 ROW_COLUMNS: dict[str, str] = {
     name: SAME.get(name, name) for name in RECORD.names or () if SAME.get(name, name) in COLUMNS
 }
@@ -29,7 +35,9 @@ _SNAPSHOT_GROUP_ROWS = 50
 _THUMBNAIL_GROUP_ROWS = 500
 
 
-def _field(name: str, kind: pa.DataType, description: str, unit: str | None = None, **more: str) -> pa.Field:
+def _field(
+    name: str, kind: pa.DataType, description: str, unit: str | None = None, **more: str
+) -> pa.Field:
     about = {"description": description, "unit": unit_of(name) if unit is None else unit, **more}
     return pa.field(name, kind, metadata={key: text for key, text in about.items() if text})
 
@@ -47,7 +55,12 @@ def _spec(
 
 def with_origin(spec: TableSpec) -> TableSpec:
     """A table whose files state the running program and its commit."""
-    about = {**file_origin(FORMAT), "table": spec.name, "arithmetic": describe_arithmetic(), **dict(spec.layout)}
+    about = {
+        **file_origin(FORMAT),
+        "table": spec.name,
+        "arithmetic": describe_arithmetic(),
+        **dict(spec.layout),
+    }
     return replace(spec, schema=spec.schema.with_metadata(about))
 
 
@@ -70,7 +83,9 @@ def _input_field(name: str) -> pa.Field:
         return _field("time_s", kind, COLUMNS["mono_s"].description)
     if name in COLUMNS:
         return _field(name, kind, f"{COLUMNS[name].description}, as it was read")
-    return _field(name, kind, _INPUT_TEXTS.get(name, f"{name.replace('_', ' ')} of the tick's reading"))
+    return _field(
+        name, kind, _INPUT_TEXTS.get(name, f"{name.replace('_', ' ')} of the tick's reading")
+    )
 
 
 _INPUT_TEXTS = {
@@ -81,7 +96,9 @@ _INPUT_TEXTS = {
 }
 
 TICKS = _spec("ticks", [_tick_field(column) for column in COLUMNS.values()], "mono_s")
-INPUTS = _spec("inputs", [_field("tick", pa.int64(), "number of the tick"), *map(_input_field, INPUT_FIELDS)])
+INPUTS = _spec(
+    "inputs", [_field("tick", pa.int64(), "number of the tick"), *map(_input_field, INPUT_FIELDS)]
+)
 RARE = _spec(
     "rare",
     [
@@ -117,15 +134,26 @@ _SHAPE_TEXTS = {
 
 def _shape_fields() -> list[pa.Field]:
     return [
-        *(_field(name, pa.float64(), _SHAPE_TEXTS.get(name, "")) for name in shape_estimate.NUMBERS),
+        *(
+            _field(name, pa.float64(), _SHAPE_TEXTS.get(name, ""))
+            for name in shape_estimate.NUMBERS
+        ),
         _field("cycle", pa.int64(), "number of the cycle or frame"),
-        _field("tracking_lost", pa.bool_(), "phases cannot be tracked from here: a full cycle is needed"),
+        _field(
+            "tracking_lost",
+            pa.bool_(),
+            "phases cannot be tracked from here: a full cycle is needed",
+        ),
         _field("kind", pa.string(), "full, fringes or track"),
         _field("verdict", pa.string(), "ok, degraded or rejected"),
         _field("reason", pa.string(), "why it is not ok"),
-        _field("coeffs_um", pa.list_(pa.float64(), ZERNIKE_TERMS), "Zernike coefficients, Noll 1..."),
         _field(
-            "sigma_um", pa.list_(pa.float32(), ZERNIKE_TERMS), "standard deviation of changes of the coefficients"
+            "coeffs_um", pa.list_(pa.float64(), ZERNIKE_TERMS), "Zernike coefficients, Noll 1..."
+        ),
+        _field(
+            "sigma_um",
+            pa.list_(pa.float32(), ZERNIKE_TERMS),
+            "standard deviation of changes of the coefficients",
         ),
         _field(
             "upper_um2",
@@ -146,7 +174,8 @@ COVARIANCES = _spec(
         _field(
             "covariance_um2",
             pa.list_(pa.float32(), ZERNIKE_TERMS**2),
-            f"covariance of the coefficients, row by row; of a cycle in {COVARIANCE_INTERVAL_S:.0f} s",
+            "covariance of the coefficients, row by row; of a cycle in "
+            f"{COVARIANCE_INTERVAL_S:.0f} s",
             "µm²",
         ),
     ],
@@ -164,7 +193,12 @@ def _level_field(name: str) -> pa.Field:
     how, _, signal = name.partition("_")
     column = COLUMNS.get(signal, TRUE_ERROR_COLUMN)
     wide = column.unit == "Pa"
-    return _field(name, pa.float64() if wide else pa.float32(), f"{_HOW[how]} of: {column.description}", column.unit)
+    return _field(
+        name,
+        pa.float64() if wide else pa.float32(),
+        f"{_HOW[how]} of: {column.description}",
+        column.unit,
+    )
 
 
 _HOW = {"min": "least value", "mean": "mean", "max": "greatest value"}
@@ -204,5 +238,15 @@ THUMBNAILS = _spec(
 )
 
 ALL: tuple[TableSpec, ...] = (
-    TICKS, INPUTS, RARE, SNAPSHOTS, SHAPES, TRACKED, COVARIANCES, *LEVELS.values(), EVENTS, MARKS, THUMBNAILS
-)  # fmt: skip
+    TICKS,
+    INPUTS,
+    RARE,
+    SNAPSHOTS,
+    SHAPES,
+    TRACKED,
+    COVARIANCES,
+    *LEVELS.values(),
+    EVENTS,
+    MARKS,
+    THUMBNAILS,
+)

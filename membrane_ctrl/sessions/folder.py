@@ -1,4 +1,6 @@
-"""The folder of a session, `<logs>/tuning/<UTC>-<name>/`: the results of its steps, and which steps are done."""
+"""The folder of a session, `<logs>/tuning/<UTC>-<name>/`: the results of its steps, and which steps
+are done.
+"""
 
 import json
 import math
@@ -7,7 +9,17 @@ import types
 from dataclasses import dataclass, fields, is_dataclass, replace
 from datetime import UTC, datetime
 from pathlib import Path
-from typing import Any, Literal, Protocol, TypeVar, Union, cast, get_args, get_origin, get_type_hints
+from typing import (
+    Any,
+    Literal,
+    Protocol,
+    TypeVar,
+    Union,
+    cast,
+    get_args,
+    get_origin,
+    get_type_hints,
+)
 
 import numpy as np
 from pydantic import BaseModel, ValidationError
@@ -38,14 +50,20 @@ def plain(value: Any) -> Any:
 
 
 def built(kind: type[T], data: Any) -> T:
-    """Build a value of a type from its plain form. Raises TypeError, ValueError or KeyError if it is invalid."""
+    """Build a value of a type from its plain form. Raises TypeError, ValueError or KeyError if it
+    is invalid.
+    """
     return cast(T, _built(kind, data))
 
 
 def _built(kind: Any, data: Any) -> Any:
     origin, arguments = get_origin(kind), get_args(kind)
     if origin in (Union, types.UnionType):
-        return None if data is None else _built(next(a for a in arguments if a is not type(None)), data)
+        return (
+            None
+            if data is None
+            else _built(next(a for a in arguments if a is not type(None)), data)
+        )
     if origin is Literal:
         if data not in arguments:
             raise ValueError(f"{data!r} is not one of {arguments}")
@@ -59,7 +77,9 @@ def _built(kind: Any, data: Any) -> Any:
         return kind.model_validate(data)
     if is_dataclass(kind):
         hints = get_type_hints(kind)
-        return cast(Any, kind)(**{f.name: _built(hints[f.name], data[f.name]) for f in fields(kind)})
+        return cast(Any, kind)(
+            **{f.name: _built(hints[f.name], data[f.name]) for f in fields(kind)}
+        )
     value = kind(data)
     if isinstance(value, float) and _LARGEST < abs(value) < math.inf:
         raise ValueError(f"{value:g} is not a plausible quantity")
@@ -68,7 +88,9 @@ def _built(kind: Any, data: Any) -> Any:
 
 def write(path: Path, value: Any) -> None:
     """Write a result atomically."""
-    files.write_text_atomic(files.users(path), json.dumps(plain(value), indent=1, allow_nan=False) + "\n")
+    files.write_text_atomic(
+        files.users(path), json.dumps(plain(value), indent=1, allow_nan=False) + "\n"
+    )
 
 
 def read(path: Path, kind: type[T]) -> T:
@@ -132,14 +154,20 @@ class SessionFolder:
             raise errors.InputError(f"{path}: {errors.os_reason(error)}") from None
 
     def candidates(self) -> str:
-        """The table of candidates, Markdown with at least a head, a rule and a row. Raises InputError."""
+        """The table of candidates, Markdown with at least a head, a rule and a row. Raises
+        InputError.
+        """
         text = self.content("candidates.md").decode("utf-8", "replace")
         if len(text.splitlines()) < 3:
-            raise errors.InputError(f"{self.file('candidates.md')}: damaged; repeat the step design")
+            raise errors.InputError(
+                f"{self.file('candidates.md')}: damaged; repeat the step design"
+            )
         return text
 
     def result(self, step: str, name: str, kind: type[T]) -> T:
-        """Read a step's result. Raises InputError if the step is not done, or the file is damaged."""
+        """Read a step's result. Raises InputError if the step is not done,
+        or the file is damaged.
+        """
         self.require(step)
         return read(self.file(name), kind)
 
@@ -151,7 +179,9 @@ class SessionFolder:
         """Raises InputError naming the first step that is not done."""
         for step in steps:
             if not self.done(step):
-                raise errors.InputError(f"{self.path}: {step} is missing; run `membrane-ctrl tune {step}` first")
+                raise errors.InputError(
+                    f"{self.path}: {step} is missing; run `membrane-ctrl tune {step}` first"
+                )
 
     def begin(self, step: str) -> None:
         """Prepare a step, possibly again: remove its results and those of later steps."""
@@ -165,7 +195,9 @@ class SessionFolder:
                     ) from None
 
 
-def based_on(session: SessionFolder, before: schema.LoopConfig, pump: schema.PumpConfig) -> SessionFolder:
+def based_on(
+    session: SessionFolder, before: schema.LoopConfig, pump: schema.PumpConfig
+) -> SessionFolder:
     """The session, begun anew on other gains and another curve of the pump, which are in force."""
     session.begin(STEPS[0])
     head = replace(session.head, before=before)
@@ -179,7 +211,8 @@ def fresh_folder(parent: Path, name: str, now: datetime) -> Path:
     """Make `<UTC>-<name>` in a folder; raises like `begin_session`."""
     if not _NAME.fullmatch(name):
         raise errors.InputError(
-            f"session name {name!r}: use letters, digits, '.', '-' and '_' (at most 64, no '.' in front)"
+            f"session name {name!r}: use letters, digits, '.', '-' and '_' (at most 64, no "
+            "'.' in front)"
         )
     stem = f"{now:%Y%m%dT%H%M%SZ}-{name}"
     for number in range(1, 1000):
@@ -189,7 +222,9 @@ def fresh_folder(parent: Path, name: str, now: datetime) -> Path:
         except FileExistsError:
             continue
         except OSError as error:
-            raise errors.DeviceError(f"{parent}: cannot be written ({errors.os_reason(error)})") from None
+            raise errors.DeviceError(
+                f"{parent}: cannot be written ({errors.os_reason(error)})"
+            ) from None
         return path
     raise errors.DeviceError(f"{parent}: already has a thousand sessions {stem}")
 
@@ -212,7 +247,9 @@ H = TypeVar("H", bound=Head)
 
 
 def begin_session(parent: Path, name: str, head: Head, config: schema.Config) -> Path:
-    """Make the folder of a session. Raises InputError for a bad name, DeviceError if it cannot be written."""
+    """Make the folder of a session. Raises InputError for a bad name, DeviceError if it cannot be
+    written.
+    """
     path = fresh_folder(parent, name, datetime.fromisoformat(head.created_utc))
     with errors.writing(path, errors.DeviceError):
         files.write_text_atomic(path / "config.toml", toml_file.dump(config))
@@ -221,7 +258,9 @@ def begin_session(parent: Path, name: str, head: Head, config: schema.Config) ->
 
 
 def read_session(path: Path, kind: type[H], known: str) -> tuple[H, schema.Config]:
-    """Read head and configuration of a session of the `known` format. Raises InputError if it is not one."""
+    """Read head and configuration of a session of the `known` format. Raises InputError if it is
+    not one.
+    """
     head = read(path / "session.json", kind)
     if head.format != known:
         raise errors.InputError(f"{path}/session.json: format {head.format!r}, expected {known!r}")
@@ -234,7 +273,12 @@ def now_utc() -> str:
 
 
 def create_session(
-    logs: Path, name: str, author: str, source: str, config: schema.Config, before: schema.LoopConfig
+    logs: Path,
+    name: str,
+    author: str,
+    source: str,
+    config: schema.Config,
+    before: schema.LoopConfig,
 ) -> SessionFolder:
     """Start a tuning session; raises like `begin_session`."""
     head = SessionHead(FORMAT, name, author, source, now_utc(), before)
@@ -250,5 +294,7 @@ def newest_session(logs: Path) -> SessionFolder:
     """The newest session, to continue. Raises InputError if there is none."""
     found = max((logs / "tuning").glob("*/session.json"), default=None)
     if found is None:
-        raise errors.InputError(f"{logs / 'tuning'}: no session yet; start with `membrane-ctrl tune characterise`")
+        raise errors.InputError(
+            f"{logs / 'tuning'}: no session yet; start with `membrane-ctrl tune characterise`"
+        )
     return open_session(found.parent)

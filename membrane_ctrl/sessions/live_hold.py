@@ -1,4 +1,6 @@
-"""A session's access to a running hold: commands through its control port; ticks, events, shapes from its rings."""
+"""A session's access to a running hold: commands through its control port; ticks, events, shapes
+from its rings.
+"""
 
 import contextlib
 import math
@@ -43,7 +45,9 @@ class News:
 
 
 class HoldLink(Protocol):
-    """A session's view of a hold: commands in, ticks and events out. Twin and control port each provide one."""
+    """A session's view of a hold: commands in, ticks and events out. Twin and control port each
+    provide one.
+    """
 
     @property
     def config(self) -> schema.Config:
@@ -86,13 +90,16 @@ class LiveHold:
     take_over : bool
         Take command from whoever has it: at once with a `session`, else with the first command.
     session : str
-        Claim command for a session of this name, until `close`; empty: only watch, or command like any client.
+        Claim command for a session of this name, until `close`; empty: only watch, or command like
+        any client.
 
-    Raises InputError if `run_dir` is not the folder of the client's run or has no rings, or if another session or
-    client has command; DeviceError if the peer is not a hold.
+    Raises InputError if `run_dir` is not the folder of the client's run or has no rings, or if
+    another session or client has command; DeviceError if the peer is not a hold.
     """
 
-    def __init__(self, client: PortClient, run_dir: str | Path, take_over: bool = False, session: str = "") -> None:
+    def __init__(
+        self, client: PortClient, run_dir: str | Path, take_over: bool = False, session: str = ""
+    ) -> None:
         run_dir = Path(run_dir)
         self._client, self._take_over = client, take_over
         if client.greeting["run"] != run_dir.resolve().name:
@@ -114,14 +121,20 @@ class LiveHold:
         self._heard_s = time.monotonic()
 
     def _claim(self, session: str) -> None:
-        answer = self._client.ask(do="claim", text=session, why="session", take_over=self._take_over)
+        answer = self._client.ask(
+            do="claim", text=session, why="session", take_over=self._take_over
+        )
         self._take_over = False
         if not answer["ok"]:
             raise errors.InputError(f"{session}: refused: {answer['refused']}")
 
     def ask(self, command: Command) -> None:
         """Send a command through the port, which determines our name."""
-        request: dict[str, object] = {"do": command.kind, "why": command.why, "take_over": self._take_over}
+        request: dict[str, object] = {
+            "do": command.kind,
+            "why": command.why,
+            "take_over": self._take_over,
+        }
         if math.isfinite(command.value):
             request["value"] = command.value
         for key in ("shape_time_constant_s", "setpoint_step_um"):
@@ -168,9 +181,16 @@ class LiveHold:
     def _read_rings(self) -> News:
         messages = {name: reader.drain() for name, reader in self._readers.items()}
         return News(
-            rows=tuple(telemetry.TelemetryRow.unpack(message) for message in messages.get("telemetry", ())),
-            events=tuple(run_events.from_dict(run_events.parse(message)) for message in messages.get("events", ())),
-            shapes=tuple(shape_estimate.unpack_estimate(message) for message in messages.get("shapes", ())),
+            rows=tuple(
+                telemetry.TelemetryRow.unpack(message) for message in messages.get("telemetry", ())
+            ),
+            events=tuple(
+                run_events.from_dict(run_events.parse(message))
+                for message in messages.get("events", ())
+            ),
+            shapes=tuple(
+                shape_estimate.unpack_estimate(message) for message in messages.get("shapes", ())
+            ),
         )
 
     def close(self) -> None:
@@ -195,10 +215,11 @@ def _settings(kind: type[_S], answer: Message, key: str) -> _S:
 def live_hold(
     where: Where, take_over: bool, needs_operate: str = "", wait: bool = False, session: str = ""
 ) -> Iterator[LiveHold]:
-    """Yield a link to the selected hold; InputError if `needs_operate` names a command and the role is read.
+    """Yield a link to the selected hold; InputError if `needs_operate` names a command and the role
+    is read.
 
-    `wait` for a run that starts, until its mirror is held; DeviceError if it ends before. With `session`, command is
-    claimed under this name.
+    `wait` for a run that starts, until its mirror is held; DeviceError if it ends before. With
+    `session`, command is claimed under this name.
     """
     socket = socket_path(where)
     until_s = time.monotonic() + (_STARTS_S if wait else 0.0)
@@ -211,8 +232,12 @@ def live_hold(
             time.sleep(_POLL_S)
         _require_unlocked(client)
         if needs_operate and client.greeting["role"] == "read":
-            raise errors.InputError(f"{needs_operate} needs the role operate; {client.greeting['you']} has read")
-        link = LiveHold(client, where.run or socket.parent / str(client.greeting["run"]), take_over, session)
+            raise errors.InputError(
+                f"{needs_operate} needs the role operate; {client.greeting['you']} has read"
+            )
+        link = LiveHold(
+            client, where.run or socket.parent / str(client.greeting["run"]), take_over, session
+        )
     except BaseException:
         client.close()
         raise
@@ -224,16 +249,21 @@ def _require_unlocked(client: PortClient) -> None:
     """Raise DeviceError if the mirror is locked: the hold would refuse every experiment."""
     lines = lock_lines(client.status()["status"])
     if lines:
-        raise errors.DeviceError(f"locked: {'; '.join(lines)}; ask its author, then `membrane-ctrl ctl unlock WORD`")
+        raise errors.DeviceError(
+            f"locked: {'; '.join(lines)}; ask its author, then `membrane-ctrl ctl unlock WORD`"
+        )
 
 
-# Progress of a step and the time left, on stderr: a live line on a terminal, otherwise a line per minute.
+# Progress of a step and the time left, on stderr: a live line on a terminal, otherwise a line per
+# minute.
 
 _EVERY_S = {True: 1.0, False: 60.0}
 
 
 class Progress:
-    """Counts the recorded seconds of a session; raises a requested KeyboardInterrupt at a safe place."""
+    """Counts the recorded seconds of a session; raises a requested KeyboardInterrupt at a safe
+    place.
+    """
 
     def __init__(self) -> None:
         self.log: LiveLog | None = None  # of the session, once it is known
@@ -261,7 +291,8 @@ class Progress:
         self._shown_s = self._done_s
         left_s = max(0.0, self._planned_s - self._done_s)
         line = (
-            f"{self._step}: {_clock(self._done_s)}, {_clock(left_s)} left, session {_clock(left_s + self._after_s)}"
+            f"{self._step}: {_clock(self._done_s)}, {_clock(left_s)} left, session "
+            f"{_clock(left_s + self._after_s)}"
         )
         terminal.live_line(line) if self._live else self._print(line)
 
@@ -279,7 +310,8 @@ class Progress:
         terminal.live_line(line, "\n") if self._live else print(line, file=sys.stderr, flush=True)
 
     def ask(self, question: str, among: Sequence[str] = ()) -> str:
-        """Ask on the terminal, and on the page too if the answers are `among` some; the first answer counts.
+        """Ask on the terminal, and on the page too if the answers are `among` some; the first
+        answer counts.
 
         It is empty at the end of the input, and for none of them. Ctrl-C interrupts at once.
         """
@@ -299,7 +331,9 @@ class Progress:
 
     @contextlib.contextmanager
     def catching(self) -> Iterator[None]:
-        """Note Ctrl-C and SIGTERM, and raise them at the next tick, not in the middle of a command."""
+        """Note Ctrl-C and SIGTERM, and raise them at the next tick,
+        not in the middle of a command.
+        """
 
         def note(number: int, frame: FrameType | None) -> None:
             if self._asking:

@@ -1,8 +1,9 @@
-"""`live.jsonl` of a session: what it does, what it has found, and the centre as it moves, for the page that shows it.
+"""`live.jsonl` of a session: what it does, what it has found, and the centre as it moves, for the
+page that shows it.
 
-One JSON object per line, appended as things happen, so that nothing is lost if the session is killed. A reader may
-follow the file while it grows; a torn or foreign line is skipped. `answer.json` beside it is what a viewer of the
-page answers to the question that waits.
+One JSON object per line, appended as things happen, so that nothing is lost if the session is
+killed. A reader may follow the file while it grows; a torn or foreign line is skipped.
+`answer.json` beside it is what a viewer of the page answers to the question that waits.
 """
 
 import contextlib
@@ -49,18 +50,27 @@ class LiveLog:
     def flush(self) -> None:
         """Write the means of the ticks so far."""
         rows, self._rows = self._rows, []
-        groups = [rows[at : at + self._ticks_a_point] for at in range(0, len(rows), self._ticks_a_point)]
+        groups = [
+            rows[at : at + self._ticks_a_point] for at in range(0, len(rows), self._ticks_a_point)
+        ]
         if groups:
-            points = {name: [_mean([getattr(row, name) for row in group]) for group in groups] for name in _COLUMNS}
+            points = {
+                name: [_mean([getattr(row, name) for row in group]) for group in groups]
+                for name in _COLUMNS
+            }
             self._append({"every_s": self._every_s, **points})
 
     def note(self, what: str, line: str, **more: float | Sequence[str]) -> None:
-        """Note what happens: `step` (name, `planned_s`, `after_s`), `said`, `asks` (`among`), or `ended` (why)."""
+        """Note what happens: `step` (name, `planned_s`, `after_s`), `said`, `asks` (`among`), or
+        `ended` (why).
+        """
         self.flush()
         self._append({what: line, "utc": folder.now_utc(), **more})
 
     def answer(self, question: str, among: Sequence[str]) -> "PageAnswer | None":
-        """Take the answer to a question from the page; None if there is none, or it is to another, or not `among`."""
+        """Take the answer to a question from the page; None if there is none, or it is to another,
+        or not `among`.
+        """
         path = self._path.with_name(ANSWER)
         try:
             text = files.read_text(path, _ANSWER_BYTES_MAX, "replace")
@@ -71,7 +81,9 @@ class LiveLog:
         try:
             given = plain_json.loads(text)
             fits = given["to"] == question and given["said"] in ("", *among)
-            return PageAnswer(given["said"], terminal.one_line(_line(given["by"]))) if fits else None
+            return (
+                PageAnswer(given["said"], terminal.one_line(_line(given["by"]))) if fits else None
+            )
         except (ValueError, TypeError, KeyError):
             return None
 
@@ -83,7 +95,10 @@ class LiveLog:
             self._end = ""
         except OSError as error:
             self._good = False
-            self._told(f"{self._path}: {errors.os_reason(error)}; the page does not show the rest of this session")
+            self._told(
+                f"{self._path}: {errors.os_reason(error)}; the page does not show the rest "
+                "of this session"
+            )
 
 
 @dataclass(frozen=True, slots=True)
@@ -138,7 +153,9 @@ class LiveReader:
     _offset: int = 0
 
     def read(self) -> dict[str, list[float]]:
-        """New points: `time_s` and the columns, NaN for missing values. Nothing if there is no log."""
+        """New points: `time_s` and the columns, NaN for missing values.
+        Nothing if there is no log.
+        """
         points: dict[str, list[float]] = {name: [] for name in ("time_s", *_COLUMNS)}
         try:
             data = files.read_bytes(files.users(self.session / NAME), _BYTES_MAX)
@@ -161,9 +178,13 @@ class LiveReader:
         if "step" in entry:
             planned_s, after_s = float(entry["planned_s"]), float(entry["after_s"])
             begun = (*now.begun_s, (self.time_s, _line(entry["step"])))[-_LINES_MAX:]
-            self.progress = Progressed(begun[-1][1], planned_s, after_s, said=now.said, begun_s=begun)
+            self.progress = Progressed(
+                begun[-1][1], planned_s, after_s, said=now.said, begun_s=begun
+            )
         elif "said" in entry:
-            self.progress = replace(now, said=(*now.said, _line(entry["said"]))[-_LINES_MAX:], asks="", among=())
+            self.progress = replace(
+                now, said=(*now.said, _line(entry["said"]))[-_LINES_MAX:], asks="", among=()
+            )
         elif "asks" in entry:
             among = tuple(_line(name) for name in entry.get("among", ())[:_ANSWERS_MAX])
             self.progress = replace(now, asks=_line(entry["asks"]), among=among)
@@ -172,9 +193,15 @@ class LiveReader:
 
     def _draw(self, entry: dict[str, Any], points: dict[str, list[float]]) -> None:
         every_s = float(entry["every_s"])
-        columns = {name: [math.nan if v is None else float(v) for v in entry[name]] for name in _COLUMNS}
+        columns = {
+            name: [math.nan if v is None else float(v) for v in entry[name]] for name in _COLUMNS
+        }
         count = len(columns[_COLUMNS[0]])
-        if not 0 < every_s <= 60 or {len(column) for column in columns.values()} != {count} or count > _POINTS_MAX:
+        if (
+            not 0 < every_s <= 60
+            or {len(column) for column in columns.values()} != {count}
+            or count > _POINTS_MAX
+        ):
             raise ValueError("not a row of points")
         for name, column in columns.items():
             points[name] += column

@@ -1,1 +1,3 @@
-"""The twin: film, gas, pump, sensors and optics, simulated without the code of the reconstruction."""
+"""The twin: film, gas, pump, sensors and optics, simulated without
+the code of the reconstruction.
+"""

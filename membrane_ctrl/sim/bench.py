@@ -18,7 +18,8 @@ from membrane_ctrl.processes import child, ring
 from membrane_ctrl.sim import lab, plant, surroundings
 
 _PERIOD_S = 0.004  # below the sensors' 5 ms, so that each sample is on time
-_STEPS_AT_ONCE = 4000  # some 10 ms of work: after a stall, clients are answered while the plant catches up
+# some 10 ms of work: after a stall, clients are answered while the plant catches up
+_STEPS_AT_ONCE = 4000
 
 
 @dataclass(frozen=True, slots=True)
@@ -33,7 +34,8 @@ class BenchSpec:
     host: str = "127.0.0.1"
     speed: float = 1.0  # plant seconds a second
     truth: ring.RingAddress | None = None  # where to publish `Truth.pack()` with every sample
-    # how long the bench outlives the process that started it, so that the tripped watchdog can be observed
+    # how long the bench outlives the process that started it, so that the tripped watchdog can be
+    # observed
     linger_s: float = 5.0
     events: tuple[surroundings.BenchEvent, ...] = ()  # events in plant time (0 at the start)
     lab: DevicesConfig | None = None  # serve these instruments instead of the pump board
@@ -54,14 +56,18 @@ class BenchReport:
 
 
 def serve(spec: BenchSpec, ready: Connection) -> None:
-    """Serve the bench in a spawned process until `processes.STOP`, or until `linger_s` after the parent's end.
+    """Serve the bench in a spawned process until `processes.STOP`, or until `linger_s` after the
+    parent's end.
 
-    `ready` gets one BenchReport; a bench that cannot be built or cannot listen reports that and ends. SIGINT is
-    ignored: Ctrl-C goes to the whole terminal, and the bench must outlive the controller's safe stop.
+    `ready` gets one BenchReport; a bench that cannot be built or cannot listen reports that and
+    ends. SIGINT is
+    ignored: Ctrl-C goes to the whole terminal, and the bench must outlive the controller's safe
+    stop.
     """
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     if spec.speed <= 1.0:
-        child.raise_priority()  # it stands for devices with processors of their own; faster, it may use a whole core
+        # it stands for devices with processors of their own; faster, it may use a whole core
+        child.raise_priority()
     asyncio.run(_serve(spec, ready))
 
 
@@ -77,11 +83,18 @@ async def _serve(spec: BenchSpec, ready: Connection) -> None:
             return
         except OSError as error:
             reason = os.strerror(error.errno) if error.errno else str(error)
-            ready.send(BenchReport(error=f"twin.port = {spec.port} on {spec.host}: {reason}; 0 takes any free port"))
+            ready.send(
+                BenchReport(
+                    error=f"twin.port = {spec.port} on {spec.host}: {reason}; 0 takes any free port"
+                )
+            )
             return
         try:
             ready.send(
-                BenchReport(served.port if isinstance(served, pump_board.PumpBoardEmulator) else 0, lab=started)
+                BenchReport(
+                    served.port if isinstance(served, pump_board.PumpBoardEmulator) else 0,
+                    lab=started,
+                )
             )
             await _keep_running(bench, spec, stop)
         finally:
@@ -117,7 +130,9 @@ async def _keep_running(bench: "LiveBench", spec: BenchSpec, stop: asyncio.Event
             orphaned_s = now_s
         if orphaned_s is not None and now_s - orphaned_s > spec.linger_s:
             return
-        deadline_s = max(deadline_s + _PERIOD_S, now_s)  # a missed deadline needs no extra round: catch_up covers it
+        deadline_s = max(
+            deadline_s + _PERIOD_S, now_s
+        )  # a missed deadline needs no extra round: catch_up covers it
         await asyncio.sleep(deadline_s - now_s)
 
 
@@ -134,7 +149,9 @@ def _truth_writer(address: ring.RingAddress | None) -> Iterator[ring.RingWriter 
 
 
 class LiveBench:
-    """The plant on the run's clock, sampled by its device every 5 ms of plant time; publishes the truth with each."""
+    """The plant on the run's clock, sampled by its device every 5 ms of plant time; publishes the
+    truth with each.
+    """
 
     def __init__(self, spec: BenchSpec, truth: ring.RingWriter | None) -> None:
         self._plant = plant.Plant(spec.twin, spec.pump, spec.events)
@@ -167,7 +184,9 @@ class LiveBench:
         mirror = self._plant
         if self._truth is not None:
             truth = mirror.truth()
-            self._truth.put(replace(truth, time_s=self._start_s + truth.time_s / self._speed).pack())
+            self._truth.put(
+                replace(truth, time_s=self._start_s + truth.time_s / self._speed).pack()
+            )
         sample = mirror.sample()
         return replace(sample, sample_counter=round(sample.device_time_s / plant.STEP_S) + 1)
 
@@ -179,13 +198,17 @@ _READY_S = 60.0  # importing on a busy machine; a fresh one compiles first
 
 
 def _started(spec: BenchSpec, stack: contextlib.ExitStack) -> BenchReport:
-    """Start the bench process, which the stack ends, and wait until it listens; print where. Raises DeviceError."""
+    """Start the bench process, which the stack ends, and wait until it listens; print where. Raises
+    DeviceError.
+    """
     terminal.progress(f"starting the twin: waiting until it listens, at most {_READY_S:g} s")
     ours, theirs = child.pipe()
     process = child.Child("twin", "membrane_ctrl.sim.bench:serve", (spec, theirs), nice=0)
     stack.callback(process.stop, 2.0)
     process.start()
-    report: BenchReport = ours.recv() if ours.poll(_READY_S) else BenchReport(error="the twin did not start")
+    report: BenchReport = (
+        ours.recv() if ours.poll(_READY_S) else BenchReport(error="the twin did not start")
+    )
     if report.error:
         raise errors.DeviceError(report.error)
     if spec.lab is None:
@@ -195,9 +218,13 @@ def _started(spec: BenchSpec, stack: contextlib.ExitStack) -> BenchReport:
 
 
 def _spec(config: Config, clock: clock.RunClock) -> BenchSpec:
-    """The bench of a configuration; the default port may be another twin's, a configured one is meant."""
+    """The bench of a configuration; the default port may be another twin's, a configured one is
+    meant.
+    """
     twin = config.twin
-    return BenchSpec(twin, config.pump, clock, twin.port, only_there="port" in twin.model_fields_set)
+    return BenchSpec(
+        twin, config.pump, clock, twin.port, only_there="port" in twin.model_fields_set
+    )
 
 
 @dataclass(frozen=True, slots=True)
@@ -211,7 +238,8 @@ class TwinProcess:
     def started(
         cls, config: Config, clock: clock.RunClock, stack: contextlib.ExitStack, lab: bool = False
     ) -> "TwinProcess":
-        """Start the twin and wait until it listens; the stack ends it. Raises DeviceError, e.g. for a busy port.
+        """Start the twin and wait until it listens; the stack ends it. Raises DeviceError, e.g. for
+        a busy port.
 
         With `lab` it answers as the configured instruments, else as the pump board.
         """
@@ -223,7 +251,11 @@ class TwinProcess:
         truth = stack.enter_context(ring.ring(_TRUTHS_KEPT, plant.TRUTH_BYTES))
         spec = replace(_spec(config, clock), truth=truth, lab=config.devices if lab else None)
         report = _started(spec, stack)
-        watchdog = {} if config.devices is None else config.devices.model_dump(include={"timeout_s", "watchdog_s"})
+        watchdog = (
+            {}
+            if config.devices is None
+            else config.devices.model_dump(include={"timeout_s", "watchdog_s"})
+        )
         devices = report.lab or DevicesConfig(
             board=report.url, interlocks=_at_board_inputs(config.interlocks), **watchdog
         )
@@ -243,7 +275,9 @@ class TwinProcess:
         return newest
 
 
-def _at_board_inputs(interlocks: tuple[settings.InterlockDriver, ...]) -> tuple[settings.InterlockDriver, ...]:
+def _at_board_inputs(
+    interlocks: tuple[settings.InterlockDriver, ...],
+) -> tuple[settings.InterlockDriver, ...]:
     """The interlocks with the inputs of the twin's board in place of their sources, in order."""
     return tuple(
         settings.BoardInputConfig(
@@ -263,7 +297,9 @@ _STOPS = {signal.SIGINT, signal.SIGTERM}
 
 
 def serve_twin(config: Config, speed: float) -> int:
-    """Serve until SIGINT or SIGTERM; print the address on stderr. Raises DeviceError, e.g. for a busy port."""
+    """Serve until SIGINT or SIGTERM; print the address on stderr. Raises DeviceError, e.g. for a
+    busy port.
+    """
     with contextlib.ExitStack() as stack:
         _started(replace(_spec(config, clock.RunClock.start()), speed=speed, linger_s=0.0), stack)
         terminal.progress("stop it with Ctrl-C")

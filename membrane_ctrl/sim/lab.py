@@ -1,7 +1,7 @@
 """Emulates a configuration's instruments byte by byte over one plant: a lab without a pump board.
 
-Each serial port of the configuration becomes a pseudo-terminal, each Modbus TCP address a port of this machine; the
-drivers are given these in place of the real ones.
+Each serial port of the configuration becomes a pseudo-terminal, each Modbus TCP address a port of
+this machine; the drivers are given these in place of the real ones.
 """
 
 import tempfile
@@ -34,7 +34,9 @@ _READ_INPUT = 4
 
 
 class Lab:
-    """Emulated instruments over a plant; `serial` and `wires`: devices and pseudo-terminals by configured port."""
+    """Emulated instruments over a plant; `serial` and `wires`: devices and pseudo-terminals by
+    configured port.
+    """
 
     def __init__(self, plant: pump_board.BoardPlant, devices: DevicesConfig) -> None:
         self.serial: dict[str, serial_device.SerialDevice] = {}
@@ -66,16 +68,24 @@ class Lab:
                 self.serial[url] = modbus_server.RtuBusEmulator(line, handlers)
 
     async def start(self) -> DevicesConfig:
-        """Plug everything in; returns the configuration with the emulators' addresses. Raises OSError."""
+        """Plug everything in; returns the configuration with the emulators' addresses. Raises
+        OSError.
+        """
         self._folder = tempfile.TemporaryDirectory(prefix="membrane-lab-")
         for number, (port, device) in enumerate(self.serial.items()):
-            self.wires[port] = serial_device.PtyWire(device, Path(self._folder.name, f"tty{number}"))
+            self.wires[port] = serial_device.PtyWire(
+                device, Path(self._folder.name, f"tty{number}")
+            )
             self.wires[port].plug()
         for url in self._urls:
             if url.startswith("tcp:"):
-                self._servers[url] = modbus_server.ModbusTcpServer(partial(self._answer, url), "127.0.0.1", 0)
+                self._servers[url] = modbus_server.ModbusTcpServer(
+                    partial(self._answer, url), "127.0.0.1", 0
+                )
                 await self._servers[url].start()
-        interlocks = tuple(self._moved_interlock(interlock) for interlock in self._devices.interlocks)
+        interlocks = tuple(
+            self._moved_interlock(interlock) for interlock in self._devices.interlocks
+        )
         moved: dict[str, object] = {"interlocks": interlocks}
         if self._board is not None:
             await self._board.start()
@@ -101,14 +111,20 @@ class Lab:
         return section.model_copy(update={"link": self._address(section.link)})
 
     def _moved_interlock(self, interlock: settings.InterlockDriver) -> settings.InterlockDriver:
-        """The interlock's table with the emulator's address; a GPIO line becomes an input of an emulated module."""
+        """The interlock's table with the emulator's address; a GPIO line becomes an input of an
+        emulated module.
+        """
         match interlock:
             case settings.ModbusInputConfig():
                 return interlock.model_copy(update={"link": self._address(interlock.link)})
             case settings.GpioLineConfig():
-                common = interlock.model_dump(include=set(settings.PolledInterlockConfig.model_fields))
+                common = interlock.model_dump(
+                    include=set(settings.PolledInterlockConfig.model_fields)
+                )
                 link = self._address(_gpio_url(interlock.chip))
-                return settings.ModbusInputConfig(driver="modbus_input", link=link, address=interlock.line, **common)
+                return settings.ModbusInputConfig(
+                    driver="modbus_input", link=link, address=interlock.line, **common
+                )
             case _:
                 return interlock
 
@@ -137,14 +153,18 @@ class Lab:
         return modbus_server.Answer(self._respond(url, unit, pdu))
 
     def _add_modules(self) -> None:
-        """One module for all interlocks at the same unit, and one for each GPIO chip; every circuit is closed."""
+        """One module for all interlocks at the same unit, and one for each GPIO chip; every circuit
+        is closed.
+        """
         bits: defaultdict[tuple[str, int], dict[str, dict[int, Callable[[], bool]]]] = defaultdict(
             lambda: {"discrete": {}, "coil": {}}
         )
         for interlock in self._devices.interlocks:
             match interlock:
                 case settings.ModbusInputConfig():
-                    bits[interlock.link, interlock.unit_id][interlock.function][interlock.address] = _closed
+                    bits[interlock.link, interlock.unit_id][interlock.function][
+                        interlock.address
+                    ] = _closed
                 case settings.GpioLineConfig():
                     bits[_gpio_url(interlock.chip), 1]["discrete"][interlock.line] = _closed
         for (url, unit), tables in bits.items():
@@ -161,17 +181,28 @@ class Lab:
         match section:
             case settings.Optoncdt1420Config():
                 return lasers.Optoncdt1420Emulator(
-                    self._sensor(role), round(section.range_mm or 50), section.direction, section.baud
+                    self._sensor(role),
+                    round(section.range_mm or 50),
+                    section.direction,
+                    section.baud,
                 )
             case settings.KeyenceDlRs1aConfig():
                 return lasers.KeyenceDlRs1aEmulator(
-                    self._sensor(role), section.direction, section.baud, section.parity, section.amplifier + 1
+                    self._sensor(role),
+                    section.direction,
+                    section.baud,
+                    section.parity,
+                    section.amplifier + 1,
                 )
             case settings.VaisalaPtb330Config():
                 return pressure_gauges.VaisalaPtb330Emulator(self._sensor(role), section.baud)
             case settings.Mks937bConfig():
                 return pressure_gauges.Mks937bEmulator(
-                    self._sensor(role), section.baud, section.parity, section.address, section.channel
+                    self._sensor(role),
+                    section.baud,
+                    section.parity,
+                    section.address,
+                    section.channel,
                 )
             case settings.VentusConfig():
                 return pumps.VentusEmulator(self._actuator("pump"), section.power_max_mw)
@@ -190,7 +221,9 @@ class Lab:
 
     def _map_devices(self) -> None:
         """One device for all maps that name the same unit of the same link."""
-        units: defaultdict[tuple[str, int], list[tuple[str, settings.ModbusMapConfig]]] = defaultdict(list)
+        units: defaultdict[tuple[str, int], list[tuple[str, settings.ModbusMapConfig]]] = (
+            defaultdict(list)
+        )
         for role, section in self._devices.roles().items():
             if isinstance(section, settings.ModbusMapConfig):
                 units[section.link, section.unit_id].append((role, section))
@@ -217,7 +250,12 @@ class Lab:
     def _bronkhorst(self, role: str, serial: str) -> pumps.Instrument:
         if role == "pump":
             return pumps.Instrument(
-                "DMFC", serial or "M20000001A", _FLOW_FULL_MLN_MIN, "mln/min", None, self._actuator(role)
+                "DMFC",
+                serial or "M20000001A",
+                _FLOW_FULL_MLN_MIN,
+                "mln/min",
+                None,
+                self._actuator(role),
             )
         gauge_pa = self._sensor(role)
         return pumps.Instrument(
@@ -248,9 +286,11 @@ def _gpio_url(chip: str) -> str:
 
 
 class MapDevice:
-    """A `RegisterTable` for any server: maps that are read, each with the value's source, and maps that are written.
+    """A `RegisterTable` for any server: maps that are read, each with the value's source, and maps
+    that are written.
 
-    `constants` are words by address, for identity and version; words outside `raw_limits` are refused with exception
+    `constants` are words by address, for identity and version; words outside `raw_limits` are
+    refused with exception
     3.
     """
 
@@ -269,7 +309,9 @@ class MapDevice:
 
     def restart(self) -> None:
         """Power-up: every output at the raw value 0, with its effect on the plant, if any."""
-        self._written = {found.address + n: 0 for found in self._outputs for n in range(found.words)}
+        self._written = {
+            found.address + n: 0 for found in self._outputs for n in range(found.words)
+        }
         for found, tell in self._outputs.items():
             self._tell(found, tell)
 

@@ -1,8 +1,10 @@
-"""The simulated bench: films, gas, pump, vent, leak, surroundings and sensors, advanced in fixed steps.
+"""The simulated bench: films, gas, pump, vent, leak, surroundings and sensors, advanced in fixed
+steps.
 
-Plain floats in a plain loop: a step is some 30 operations, which NumPy would make slower, and a compiled kernel
-would add its start-up to every process for a plant that is already 1000 times faster than real time.
-NumPy computes what does not depend on the state (surroundings, creep) for a block of steps ahead.
+Plain floats in a plain loop: a step is some 30 operations, which NumPy would make slower, and a
+compiled kernel would add its start-up to every process for a plant that is already 1000 times
+faster than real time. NumPy computes what does not depend on the state (surroundings, creep) for a
+block of steps ahead.
 """
 
 import math
@@ -28,7 +30,8 @@ class Truth:
     """State of the simulated bench at one moment."""
 
     time_s: float  # plant time; on the run's clock once the bench process has published it
-    displacement_um: float  # mirror centre from its nominal sag (600 Pa, settled), positive when the bowl deepens
+    # mirror centre from its nominal sag (600 Pa, settled), positive when the bowl deepens
+    displacement_um: float
     sag_mm: float  # depth of the mirror film
     back_sag_mm: float  # depth of the other film
     gauge_pressure_pa: float
@@ -69,14 +72,18 @@ class Sensors:
         self._counter = 0
 
     def read(self, truth: Truth) -> BoardSample:
-        """A new sample; the counter advances by one. Without light the displacement is NaN, its quality not 0."""
+        """A new sample; the counter advances by one. Without light the displacement is NaN, its
+        quality not 0.
+        """
         config = self._config
         laser, gauge, ambient, air, gas = self._rng.standard_normal(5).tolist()
         lost = truth.laser_lost > 0 or not config.laser
         reading_um = truth.displacement_um + truth.laser_bias_um + config.laser_noise_um * laser
         self._counter += 1
         return BoardSample(
-            displacement_um=float("nan") if lost else _quantised(reading_um, config.laser_resolution_um),
+            displacement_um=float("nan")
+            if lost
+            else _quantised(reading_um, config.laser_resolution_um),
             displacement_quality=LASER_NO_LIGHT if lost else LASER_GOOD,
             gauge_pressure_pa=truth.gauge_pressure_pa + GAUGE_NOISE_PA * gauge,
             ambient_pressure_pa=truth.ambient_pressure_pa + config.barometer_noise_pa * ambient,
@@ -98,17 +105,24 @@ _LEVELS = 4096  # of a tabulated curve: 12 bits
 
 
 class PumpModel:
-    """q = q_full (d - dead) / (1 - dead) once running; starts at `start_fraction`, stalls below `stall_fraction`.
+    """q = q_full (d - dead) / (1 - dead) once running; starts at `start_fraction`, stalls below
+    `stall_fraction`.
 
-    Or a curve through the configuration's points, or of `twin.pump_shape`; two branches give the flow play.
-    Raises ValueError if the pump delivers nothing at any command.
+    Or a curve through the configuration's points, or of `twin.pump_shape`; two branches give the
+    flow play. Raises ValueError if the pump delivers nothing at any command.
     """
 
     def __init__(
-        self, config: PumpConfig, flow_full_ml_per_s: float, step_s: float, twin: TwinConfig | None = None
+        self,
+        config: PumpConfig,
+        flow_full_ml_per_s: float,
+        step_s: float,
+        twin: TwinConfig | None = None,
     ) -> None:
         if config.dead_fraction >= 1:
-            raise ValueError("pump.dead_fraction = 1: a pump that never delivers; it must be below 1")
+            raise ValueError(
+                "pump.dead_fraction = 1: a pump that never delivers; it must be below 1"
+            )
         twin = twin or TwinConfig()
         self._dead = config.dead_fraction
         self._start = config.start_fraction
@@ -144,7 +158,11 @@ class PumpModel:
         else:
             rising, falling = self._branches
             level = round(command * _LEVELS)
-            target = min(max(self._play_ml_per_s, rising[level]), falling[level]) if self._running else 0.0
+            target = (
+                min(max(self._play_ml_per_s, rising[level]), falling[level])
+                if self._running
+                else 0.0
+            )
             self._play_ml_per_s = target
         self._flow_ml_per_s += (target - self._flow_ml_per_s) * self._follow
         self._tube.append(self._flow_ml_per_s)
@@ -163,13 +181,20 @@ _SHAPES: dict[str, Callable[[FloatArray], FloatArray]] = {
 }
 
 
-def _branches(config: PumpConfig, shape: str, full_ml_per_s: float) -> tuple[list[float], list[float]] | None:
+def _branches(
+    config: PumpConfig, shape: str, full_ml_per_s: float
+) -> tuple[list[float], list[float]] | None:
     """Flow in mL/s at each level of the command, rising and falling; None for the straight line."""
     command = np.arange(_LEVELS + 1) / _LEVELS
     if shape != "configured":
         play = _PLAY_FRACTION if shape == "hysteretic" else 0.0
-        shares = [(command + shift - config.dead_fraction) / (1 - config.dead_fraction) for shift in (-play, play)]
-        rising, falling = (full_ml_per_s * _SHAPES[shape](np.clip(share, 0.0, 1.0)) for share in shares)
+        shares = [
+            (command + shift - config.dead_fraction) / (1 - config.dead_fraction)
+            for shift in (-play, play)
+        ]
+        rising, falling = (
+            full_ml_per_s * _SHAPES[shape](np.clip(share, 0.0, 1.0)) for share in shares
+        )
         falling[0] = 0.0
         return rising.tolist(), falling.tolist()
     if not config.curve_fraction:
@@ -180,7 +205,9 @@ def _branches(config: PumpConfig, shape: str, full_ml_per_s: float) -> tuple[lis
     scale = full_ml_per_s / config.flow_full_um_per_s
     within = np.clip(command, points[0], points[-1])
     rising, falling = (
-        np.where(command < points[0], 0.0, scale * PchipInterpolator(points, np.array(flows))(within))
+        np.where(
+            command < points[0], 0.0, scale * PchipInterpolator(points, np.array(flows))(within)
+        )
         for flows in (config.curve_um_per_s, config.curve_falling_um_per_s or config.curve_um_per_s)
     )
     return rising.tolist(), falling.tolist()
@@ -188,13 +215,17 @@ def _branches(config: PumpConfig, shape: str, full_ml_per_s: float) -> tuple[lis
 
 STEP_S = 0.005  # a thirtieth of the pump's lag, a fifteenth of its transport
 ZERO_C_K = 273.15
-VENT_OPEN_UM_PER_S = 100.0  # fully open at the nominal pressure (assumed): down by the whole sag within minutes
+# fully open at the nominal pressure (assumed): down by the whole sag within minutes
+VENT_OPEN_UM_PER_S = 100.0
 _BLOCK_STEPS = 2000
 
 _NOMINAL_VOLUME = float(
-    film.MIRROR_FILM.volume_m3_per_root_pa(film.SETTLED_S) + film.BACK_FILM.volume_m3_per_root_pa(film.SETTLED_S)
+    film.MIRROR_FILM.volume_m3_per_root_pa(film.SETTLED_S)
+    + film.BACK_FILM.volume_m3_per_root_pa(film.SETTLED_S)
 )
-_NOMINAL_GAS = film.filled(film.NOMINAL_PRESSURE_PA, film.REFERENCE_K, film.STANDARD_AMBIENT_PA, _NOMINAL_VOLUME)
+_NOMINAL_GAS = film.filled(
+    film.NOMINAL_PRESSURE_PA, film.REFERENCE_K, film.STANDARD_AMBIENT_PA, _NOMINAL_VOLUME
+)
 NOMINAL_UM_PER_ML = (
     1e3
     * float(film.MIRROR_FILM.sag_mm_per_root_pa(film.SETTLED_S))
@@ -213,17 +244,22 @@ def gas_compliance_ml_per_pa() -> float:
 class Plant:
     """The bench without its protocol; equal seeds and equal calls give equal samples.
 
-    It starts inflated, `start_error_um` off its nominal sag, films settled for a day and the pump just holding; or
-    flat and fresh, the pump off (`from_flat`). Events are in plant time. Commands hold until the next `actuate`.
-    Truth does not depend on how often it is sampled, nor on how time is cut into calls of `advance`.
+    It starts inflated, `start_error_um` off its nominal sag, films settled for a day and the pump
+    just holding; or flat and fresh, the pump off (`from_flat`). Events are in plant time. Commands
+    hold until the next `actuate`. Truth does not depend on how often it is sampled, nor on how time
+    is cut into calls of `advance`.
     """
 
-    def __init__(self, twin: TwinConfig, pump: PumpConfig, events: Sequence[BenchEvent] = ()) -> None:
+    def __init__(
+        self, twin: TwinConfig, pump: PumpConfig, events: Sequence[BenchEvent] = ()
+    ) -> None:
         chance, noise = np.random.default_rng(twin.seed).spawn(2)
         self._sensors = Sensors(twin, noise)
         self._disturbance = Disturbance(twin, events, STEP_S, chance)
         self._leak_ml_per_s_per_pa = gas_compliance_ml_per_pa() / twin.leak_time_constant_s
-        self._vent_ml_per_s_per_pa = VENT_OPEN_UM_PER_S / NOMINAL_UM_PER_ML / film.NOMINAL_PRESSURE_PA
+        self._vent_ml_per_s_per_pa = (
+            VENT_OPEN_UM_PER_S / NOMINAL_UM_PER_ML / film.NOMINAL_PRESSURE_PA
+        )
         self._pump = PumpModel(pump, pump.flow_full_um_per_s / NOMINAL_UM_PER_ML, STEP_S, twin)
         self._loaded_s = 0.0 if twin.from_flat else film.SETTLED_S
         self._steps = 0
@@ -247,7 +283,9 @@ class Plant:
     def actuate(self, pump_fraction: float, vent_fraction: float) -> None:
         """Set the commands. Raises ValueError unless both are 0..1."""
         if not (0 <= pump_fraction <= 1 and 0 <= vent_fraction <= 1):
-            raise ValueError(f"pump {pump_fraction:g} and vent {vent_fraction:g} must be fractions 0..1")
+            raise ValueError(
+                f"pump {pump_fraction:g} and vent {vent_fraction:g} must be fractions 0..1"
+            )
         self._pump_fraction = pump_fraction
         self._vent_fraction = vent_fraction
 
@@ -296,14 +334,25 @@ class Plant:
 
     def _run(self, start: int, stop: int) -> None:
         """Steps `start` to `stop` of the block."""
-        gas_step, gas, pump_step, pump = self._gas.step, self._gas, self._pump.step, self._pump_fraction
+        gas_step, gas, pump_step, pump = (
+            self._gas.step,
+            self._gas,
+            self._pump.step,
+            self._pump_fraction,
+        )
         leak, vent = self._leak_ml_per_s_per_pa, self._vent_ml_per_s_per_pa * self._vent_fraction
         follow = -math.expm1(-STEP_S / film.GAS_FOLLOWS_AIR_S)
         inflow = self._inflow_ml_per_s
         for i in range(start, stop):
             inflow = pump_step(pump)
             outflow = (leak * self._leak[i] + vent) * gas.root_pa**3
-            gas_step((inflow - outflow) * STEP_S, follow, self._ambient_pa[i], self._air_k[i], self._volume[i])
+            gas_step(
+                (inflow - outflow) * STEP_S,
+                follow,
+                self._ambient_pa[i],
+                self._air_k[i],
+                self._volume[i],
+            )
         self._inflow_ml_per_s = inflow
         self._steps += stop - start
         self._index = stop - 1
@@ -319,6 +368,8 @@ class Plant:
         self._laser_lost: list[float] = block.laser_lost.tolist()
         self._sag: list[float] = film.MIRROR_FILM.sag_mm_per_root_pa(age_s).tolist()
         self._back_sag: list[float] = film.BACK_FILM.sag_mm_per_root_pa(age_s).tolist()
-        volume = film.MIRROR_FILM.volume_m3_per_root_pa(age_s) + film.BACK_FILM.volume_m3_per_root_pa(age_s)
+        volume = film.MIRROR_FILM.volume_m3_per_root_pa(
+            age_s
+        ) + film.BACK_FILM.volume_m3_per_root_pa(age_s)
         self._volume: list[float] = volume.tolist()
         self._index = -1

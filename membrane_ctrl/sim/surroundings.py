@@ -1,4 +1,6 @@
-"""Surroundings of the simulated bench: the weather of a scenario, and events at a time, which add their effect."""
+"""Surroundings of the simulated bench: the weather of a scenario, and events at a time, which add
+their effect.
+"""
 
 import math
 from collections.abc import Sequence
@@ -47,7 +49,9 @@ class OrnsteinUhlenbeck:
     x' = x exp(-dt/tau) + std sqrt(1 - exp(-2 dt/tau)) N(0, 1).
     """
 
-    def __init__(self, std: float, correlation_s: float, step_s: float, rng: np.random.Generator) -> None:
+    def __init__(
+        self, std: float, correlation_s: float, step_s: float, rng: np.random.Generator
+    ) -> None:
         self._decay = math.exp(-step_s / correlation_s)
         self._kick = std * math.sqrt(-math.expm1(-2 * step_s / correlation_s))
         self._rng = rng
@@ -63,10 +67,16 @@ class OrnsteinUhlenbeck:
 
 
 class Disturbance:
-    """The surroundings in blocks of consecutive steps: scenario, drift of the laser's mount, events."""
+    """The surroundings in blocks of consecutive steps: scenario, drift of the laser's mount,
+    events.
+    """
 
     def __init__(
-        self, config: TwinConfig, events: Sequence[BenchEvent], step_s: float, rng: np.random.Generator
+        self,
+        config: TwinConfig,
+        events: Sequence[BenchEvent],
+        step_s: float,
+        rng: np.random.Generator,
     ) -> None:
         pressure, temperature = SCENARIOS[config.scenario]
         pressure_rng, temperature_rng = rng.spawn(2)
@@ -160,7 +170,9 @@ class LaserDrift:
 
     def apply(self, on: Surroundings) -> None:
         """Add the motion so far."""
-        on.laser_bias_um[:] += self.rate_um_per_min / 60 * np.clip(on.time_s - self.at_s, 0, self.duration_s)
+        on.laser_bias_um[:] += (
+            self.rate_um_per_min / 60 * np.clip(on.time_s - self.at_s, 0, self.duration_s)
+        )
 
 
 @dataclass(frozen=True, slots=True)
@@ -177,10 +189,11 @@ class DailyTemperature:
 
 @dataclass(frozen=True, slots=True)
 class PressureWeather:
-    """Highs and lows: a sum of sines with periods of 12 h to 10 days and random phases, starting at 0.
+    """Highs and lows: a sum of sines with periods of 12 h to 10 days and random phases, starting at
+    0.
 
-    Stateless, so that blocks can be made in any order; equal amplitudes give the slow ones the largest changes and
-    the fast ones the steepest: with 700 Pa (a lively month) some 50 Pa an hour.
+    Stateless, so that blocks can be made in any order; equal amplitudes give the slow ones the
+    largest changes and the fast ones the steepest: with 700 Pa (a lively month) some 50 Pa an hour.
     """
 
     std_pa: float

@@ -1,7 +1,8 @@
-"""The pump board in virtual time: its registers, its watchdog and its latches around the twin's plant, no wire.
+"""The pump board in virtual time: its registers, its watchdog and its latches around the twin's
+plant, no wire.
 
-The driver is that of a real bench; only its link ends in memory. Failures of sensors, link, board and actuators are
-switches (`Wrong`), which a scenario or a campaign changes at run time.
+The driver is that of a real bench; only its link ends in memory. Failures of sensors, link, board
+and actuators are switches (`Wrong`), which a scenario or a campaign changes at run time.
 """
 
 import contextlib
@@ -52,8 +53,9 @@ class Wrong:
 class VirtualBench:
     """Plant and board, advanced together; the methods of `roles.Bench`, without waiting.
 
-    `stored` are the settings that the board keeps without power, `interlocks` the configured circuits. `wrong` are
-    its switches, `truth` is the true state when the board last took its sample, or would have.
+    `stored` are the settings that the board keeps without power, `interlocks` the configured
+    circuits. `wrong` are its switches, `truth` is the true state when the board last took its
+    sample, or would have.
     """
 
     def __init__(
@@ -138,7 +140,9 @@ class VirtualBench:
             gauge_pressure_pa=math.nan if wrong.gauge_lost else gauge_pa,
             ambient_pressure_pa=math.nan if wrong.barometer_lost else sample.ambient_pressure_pa,
             air_temperature_c=math.nan if wrong.thermometer_lost else sample.air_temperature_c,
-            interlock_inputs=self.interlocks.board_word(sample.interlock_inputs & ~int(wrong.open_interlocks)),
+            interlock_inputs=self.interlocks.board_word(
+                sample.interlock_inputs & ~int(wrong.open_interlocks)
+            ),
         )
 
 

@@ -1,8 +1,9 @@
-"""The circuits of the configured interlocks in virtual time: what opens them, and what cuts their signals off.
+"""The circuits of the configured interlocks in virtual time: what opens them, and what cuts their
+signals off.
 
-A circuit at an input of the board is a bit of the board's sample, and a lost signal there is an open circuit. A
-circuit behind a polled device answers as long as its signal is there; without it the last answer grows old, by the
-same rule as on a real bench (`CircuitMemory`).
+A circuit at an input of the board is a bit of the board's sample, and a lost signal there is an
+open circuit. A circuit behind a polled device answers as long as its signal is there; without it
+the last answer grows old, by the same rule as on a real bench (`CircuitMemory`).
 """
 
 from firmware_iface.interlocks import CircuitMemory
@@ -38,7 +39,10 @@ class VirtualInterlocks:
     def board_word(self, inputs: int) -> int:
         """The board's inputs with those of open circuits cleared."""
         for interlock in self._configured:
-            if isinstance(interlock, BoardInputConfig) and interlock.name in self.open_names | self.lost_names:
+            if (
+                isinstance(interlock, BoardInputConfig)
+                and interlock.name in self.open_names | self.lost_names
+            ):
                 inputs &= ~(1 << interlock.input)
         return inputs
 

@@ -1,4 +1,6 @@
-"""Who may see the page, and what a viewer may ask of a hold (`login` asks each request for its session)."""
+"""Who may see the page, and what a viewer may ask of a hold (`login` asks each request for its
+session).
+"""
 
 from __future__ import annotations
 
@@ -20,7 +22,8 @@ COOKIE = "membrane_ctrl"
 SESSION_S = 12 * 3600.0  # a shift; then log in again
 DEVICE_COOKIE = "membrane_ctrl_device"
 _DEVICE_S = 180 * 86400.0
-# scrypt with these parameters takes 16 MB and some 50 ms: a guesser gets few tries, a person does not notice
+# scrypt with these parameters takes 16 MB and some 50 ms: a guesser gets few tries, a person does
+# not notice
 _SCRYPT = {"n": 2**14, "r": 8, "p": 1}
 _SESSIONS_MAX, _SESSIONS_OF_USER_MAX = 1000, 100
 
@@ -65,7 +68,9 @@ def known_user(name: str, role: str, password: str) -> KnownUser:
 
 
 def known_users(text: str, source: str) -> dict[str, KnownUser]:
-    """Users by name, from the text of a users file. Raises InputError with the line that is wrong."""
+    """Users by name, from the text of a users file. Raises InputError
+    with the line that is wrong.
+    """
     found = {}
     for number, line in enumerate(text.splitlines(), 1):
         if not line.strip() or line.startswith("#"):
@@ -74,9 +79,13 @@ def known_users(text: str, source: str) -> dict[str, KnownUser]:
             name, role, salt, digest = line.strip().split(":")
             if role not in get_args(Role):
                 raise ValueError
-            found[name] = KnownUser(name, cast(Role, role), bytes.fromhex(salt), bytes.fromhex(digest))
+            found[name] = KnownUser(
+                name, cast(Role, role), bytes.fromhex(salt), bytes.fromhex(digest)
+            )
         except ValueError:
-            raise errors.InputError(f"{source}, line {number}: expected NAME:ROLE:SALT:HASH") from None
+            raise errors.InputError(
+                f"{source}, line {number}: expected NAME:ROLE:SALT:HASH"
+            ) from None
     return found
 
 
@@ -90,7 +99,8 @@ class Accounts:
 
     users: dict[str, KnownUser]
     link_role: Role = "tune"  # of whoever has the link; what the port grants limits it further
-    attributes: str = "HttpOnly; SameSite=Strict; Path=/"  # of the cookies (`PublicAddress.cookie_attributes`)
+    # of the cookies (`PublicAddress.cookie_attributes`)
+    attributes: str = "HttpOnly; SameSite=Strict; Path=/"
     secret: str = field(default_factory=lambda: secrets.token_urlsafe(24))
     throttle: LoginThrottle = field(default_factory=LoginThrottle)
     _sessions: dict[str, tuple[WebUser, float]] = field(default_factory=dict)
@@ -98,9 +108,13 @@ class Accounts:
     def session(self, user: WebUser) -> str:
         """Begin a session; returns its cookie's value."""
         now_s = time.monotonic()
-        self._sessions = {key: (who, end_s) for key, (who, end_s) in self._sessions.items() if end_s > now_s}
+        self._sessions = {
+            key: (who, end_s) for key, (who, end_s) in self._sessions.items() if end_s > now_s
+        }
         own = [key for key, (who, _) in self._sessions.items() if who.name == user.name]
-        if len(own) >= _SESSIONS_OF_USER_MAX:  # who logs in again and again ends no sessions of others
+        if (
+            len(own) >= _SESSIONS_OF_USER_MAX
+        ):  # who logs in again and again ends no sessions of others
             del self._sessions[own[0]]
         while len(self._sessions) >= _SESSIONS_MAX:
             del self._sessions[next(iter(self._sessions))]
@@ -118,8 +132,11 @@ class Accounts:
         fits = not self.users and hmac.compare_digest(secret.encode(), self.secret.encode())
         return WebUser("link", self.link_role) if fits else None
 
-    def by_password(self, name: str, password: str, source: str = "", device: str = "") -> WebUser | None:
-        """Who logs in with this password from a network address; None if nobody, or after too many wrong ones.
+    def by_password(
+        self, name: str, password: str, source: str = "", device: str = ""
+    ) -> WebUser | None:
+        """Who logs in with this password from a network address; None if nobody, or after too many
+        wrong ones.
 
         `device` is the value of a device's cookie.
         """
@@ -135,7 +152,9 @@ class Accounts:
         return Guess(name, source)
 
     def evaluate(self, guess: Guess, password: str, admission: Admission) -> WebUser | None:
-        """Compare the password of an admitted guess; slow. Returns None if it is wrong or the account is unknown."""
+        """Compare the password of an admitted guess; slow. Returns None if it is wrong or the
+        account is unknown.
+        """
         known = self.users.get(guess.account)
         if known is None:
             _digest(password, b"\0" * 16)  # as slow as for a name that exists
@@ -146,17 +165,22 @@ class Accounts:
         return WebUser(known.name, known.role, has_login=True)
 
     def cookies(self, user: WebUser, device: str) -> list[str]:
-        """The headers that give a user a session and, with a login by name, remember the device if it is new."""
+        """The headers that give a user a session and, with a login by name, remember the device if
+        it is new.
+        """
         session = f"{COOKIE}={self.session(user)}; {self.attributes}; Max-Age={SESSION_S:.0f}"
         known = self.users.get(user.name)
         if known is None or _is_device_of(known, device):
             return [session]
-        return [session, f"{DEVICE_COOKIE}={_new_device(known)}; {self.attributes}; Max-Age={_DEVICE_S:.0f}"]
+        return [
+            session,
+            f"{DEVICE_COOKIE}={_new_device(known)}; {self.attributes}; Max-Age={_DEVICE_S:.0f}",
+        ]
 
 
-# A device that has logged in before has its own budget of password guesses (`login_throttle`). Its cookie is a random
-# number with a signature. The key of the signature is made of the account's salt and hash: it needs no storage,
-# survives a restart, and ends with the password.
+# A device that has logged in before has its own budget of password guesses (`login_throttle`). Its
+# cookie is a random number with a signature. The key of the signature is made of the account's salt
+# and hash: it needs no storage, survives a restart, and ends with the password.
 
 
 def _new_device(known: KnownUser) -> str:
@@ -202,7 +226,9 @@ class Action:
     @property
     def does(self) -> str:
         """What it does, in a sentence."""
-        return "Acknowledge the alarms: no reminders." if self.do == "quiet" else TABLE[self.do].does
+        return (
+            "Acknowledge the alarms: no reminders." if self.do == "quiet" else TABLE[self.do].does
+        )
 
     @property
     def states(self) -> frozenset[str]:
@@ -212,11 +238,15 @@ class Action:
 
 @cache  # asked for each button of each viewer
 def _states(do: str) -> frozenset[str]:
-    return frozenset(state.name.lower() for state in (ANY if do == "quiet" else TABLE[cast(Kind, do)].states))
+    return frozenset(
+        state.name.lower() for state in (ANY if do == "quiet" else TABLE[cast(Kind, do)].states)
+    )
 
 
 STOP = Action("stop", "STOP", "stop_circle")
-UNLOCK = Action("unlock", "Unlock", "lock_open", "text")  # none of `ACTIONS`, which the bridges offer as well
+UNLOCK = Action(
+    "unlock", "Unlock", "lock_open", "text"
+)  # none of `ACTIONS`, which the bridges offer as well
 ACTIONS = (
     Action("hold", "Hold", "play_arrow"),
     Action("pause", "Pause", "pause"),
@@ -260,11 +290,19 @@ def on_behalf(user: WebUser, session: str) -> dict[str, str]:
     dict
     """
     account = user.name if user.has_login else ""
-    return {"via": "page", "account": account, "name": user.name, "session": session, "role": user.role}
+    return {
+        "via": "page",
+        "account": account,
+        "name": user.name,
+        "session": session,
+        "role": user.role,
+    }
 
 
 def request(action: Action, why: str, given: str, take_over: bool = False) -> dict[str, Any]:
-    """The request to send, for the reason `why`. Raises ValueError with what is wrong with the input."""
+    """The request to send, for the reason `why`. Raises ValueError with what is wrong with the
+    input.
+    """
     asked: dict[str, Any] = {"do": action.do, "why": why, "take_over": take_over}
     if action.asks == "number":
         try:

@@ -21,20 +21,36 @@ app = typer.Typer(
 def web(
     context: typer.Context,
     logs: Annotated[Path, typer.Option("--logs", help="Folder of the runs.")] = Path("logs"),
-    socket: Annotated[Path | None, typer.Option("--socket", help="Control port of the hold.")] = None,
+    socket: Annotated[
+        Path | None, typer.Option("--socket", help="Control port of the hold.")
+    ] = None,
     run: Annotated[Path | None, typer.Option("--run", help="Run folder of the hold.")] = None,
-    fleet: Annotated[Path | None, typer.Option("--fleet", help="File with several holds; see `ctl fleet`.")] = None,
+    fleet: Annotated[
+        Path | None, typer.Option("--fleet", help="File with several holds; see `ctl fleet`.")
+    ] = None,
     host: Annotated[str, typer.Option("--host", help="Address to listen on.")] = "127.0.0.1",
     port: Annotated[int, typer.Option("--port", min=1, max=65535, help="TCP port.")] = 7480,
-    name: Annotated[list[str] | None, typer.Option("--name", help="Host name of the page; repeatable.")] = None,
+    name: Annotated[
+        list[str] | None, typer.Option("--name", help="Host name of the page; repeatable.")
+    ] = None,
     public_url: Annotated[
-        str, typer.Option("--public-url", metavar="URL", help="Address that browsers open, behind a reverse proxy.")
+        str,
+        typer.Option(
+            "--public-url",
+            metavar="URL",
+            help="Address that browsers open, behind a reverse proxy.",
+        ),
     ] = "",
     trusted_proxy: Annotated[
-        list[str] | None, typer.Option(metavar="ADDRESS", help="Proxy whose X-Forwarded-For counts; repeatable.")
+        list[str] | None,
+        typer.Option(metavar="ADDRESS", help="Proxy whose X-Forwarded-For counts; repeatable."),
     ] = None,
-    users: Annotated[Path | None, typer.Option("--users", help="Names and passwords; see `web add-user`.")] = None,
-    certificate: Annotated[Path | None, typer.Option("--certificate", help="TLS certificate of the page.")] = None,
+    users: Annotated[
+        Path | None, typer.Option("--users", help="Names and passwords; see `web add-user`.")
+    ] = None,
+    certificate: Annotated[
+        Path | None, typer.Option("--certificate", help="TLS certificate of the page.")
+    ] = None,
     key: Annotated[Path | None, typer.Option("--key", help="Key of that certificate.")] = None,
     with_hold: Annotated[bool, typer.Option("--with-hold", hidden=True)] = False,
 ) -> None:

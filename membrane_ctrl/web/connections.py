@@ -1,10 +1,10 @@
 """Bounds on what a connection may cost before its sender has shown a session.
 
-Anybody who reaches the port can open connections and leave them, send a request byte by byte, or send headers without
-end. Each of these is cheap for the sender and keeps memory or a file descriptor of the page. So a stranger's
-connection has a deadline for each request, a bound on its bytes, and one of a fixed number of places; when all places
-are taken, the stranger that was active longest ago is disconnected. A connection that has carried a valid session
-needs no place.
+Anybody who reaches the port can open connections and leave them, send a request byte by byte, or
+send headers without end. Each of these is cheap for the sender and keeps memory or a file
+descriptor of the page. So a stranger's connection has a deadline for each request, a bound on its
+bytes, and one of a fixed number of places; when all places are taken, the stranger that was active
+longest ago is disconnected. A connection that has carried a valid session needs no place.
 """
 
 from __future__ import annotations
@@ -18,14 +18,18 @@ from uvicorn.protocols.http.httptools_impl import HttpToolsProtocol
 
 Client = tuple[str, int]
 
-# More than the kernel hands over at once (uvicorn's backlog of 2048), so that a viewer's new connection is not ended
-# by others of the same moment, before its request is read. Each takes some 20 kB.
+# More than the kernel hands over at once (uvicorn's backlog of 2048), so that a viewer's new
+# connection is not ended by others of the same moment, before its request is read. Each takes some
+# 20 kB.
 STRANGERS_MAX = 2500
 REQUEST_S = 10.0  # from the first byte of a request, or from the connection, to its last byte
 HEAD_BYTES_MAX = 32_768
 _FILES_WANTED = 65_536
 _HANDSHAKE_S = 5.0
-_TOO_LARGE = b"HTTP/1.1 431 Request Header Fields Too Large\r\nconnection: close\r\ncontent-length: 0\r\n\r\n"
+_TOO_LARGE = (
+    b"HTTP/1.1 431 Request Header Fields Too Large\r\nconnection: close\r\ncontent-length: "
+    b"0\r\n\r\n"
+)
 _TIMED_OUT = b"HTTP/1.1 408 Request Timeout\r\nconnection: close\r\ncontent-length: 0\r\n\r\n"
 
 
@@ -40,7 +44,9 @@ class ConnectionGuard:
         return len(self._strangers)
 
     def add(self, client: Client, transport: asyncio.Transport) -> None:
-        """Give a new connection a place; disconnect the stranger that was active longest ago if there is none."""
+        """Give a new connection a place; disconnect the stranger that was active longest ago if
+        there is none.
+        """
         self._strangers[client] = transport
         if len(self._strangers) > self._strangers_max:
             _, oldest = self._strangers.popitem(last=False)
@@ -90,7 +96,8 @@ class GuardedHttp(HttpToolsProtocol):
         if self.transport.is_closing():
             return
         if self._in_head:
-            # a chunk may hold the end of a head and a body, so only the bytes before it certainly belong to the head
+            # a chunk may hold the end of a head and a body, so only the bytes before it certainly
+            # belong to the head
             if self._head_bytes > HEAD_BYTES_MAX:
                 self._refuse(_TOO_LARGE)
                 return
@@ -140,7 +147,9 @@ class GuardedHttp(HttpToolsProtocol):
 
 
 def raise_file_limit() -> int:
-    """Let the process open as many files as its hard limit admits; returns the places for half of them."""
+    """Let the process open as many files as its hard limit admits; returns the places for half of
+    them.
+    """
     soft, hard = resource.getrlimit(resource.RLIMIT_NOFILE)
     wanted = _FILES_WANTED if hard == resource.RLIM_INFINITY else min(hard, _FILES_WANTED)
     if soft != resource.RLIM_INFINITY and soft < wanted:
@@ -149,7 +158,9 @@ def raise_file_limit() -> int:
 
 
 class PageLoop(asyncio.SelectorEventLoop):
-    """An event loop whose TLS handshakes end within seconds: the page's server has no setting for that."""
+    """An event loop whose TLS handshakes end within seconds: the page's server has no setting for
+    that.
+    """
 
     async def create_server(self, *given: Any, **options: Any) -> Any:
         """Create a server; see `asyncio.loop.create_server`."""

@@ -1,7 +1,8 @@
-"""Follows one hold for all viewers: status from the control port, ticks and figures from the rings; their history.
+"""Follows one hold for all viewers: status from the control port, ticks and figures from the rings;
+their history.
 
-One connection and one reader serve any number of viewers. The hold never waits for this process: the port drops a
-client that does not read, and a ring overwrites what nobody has taken.
+One connection and one reader serve any number of viewers. The hold never waits for this process:
+the port drops a client that does not read, and a ring overwrites what nobody has taken.
 """
 
 import math
@@ -89,7 +90,9 @@ class Seconds:
 
     def _close(self) -> None:
         if self._open:
-            found = {name: (min(v), math.fsum(v) / len(v), max(v)) for name, v in self._open.items()}
+            found = {
+                name: (min(v), math.fsum(v) / len(v), max(v)) for name, v in self._open.items()
+            }
             self._done.append(Second(float(self._at), found))
         self._open = {}
 
@@ -99,13 +102,17 @@ class Seconds:
 
 
 class HoldFeed:
-    """Follows the hold that `where` names, on a thread of its own, until closed; connects again by itself."""
+    """Follows the hold that `where` names, on a thread of its own, until closed; connects again by
+    itself.
+    """
 
     def __init__(self, where: Where) -> None:
         self._where = where
         self.seen = HoldSeen("")
         self.seconds = Seconds()
-        self.marks: deque[tuple[float, str]] = deque(maxlen=_EVENTS_KEPT)  # UTC seconds and text, since `met_s`
+        self.marks: deque[tuple[float, str]] = deque(
+            maxlen=_EVENTS_KEPT
+        )  # UTC seconds and text, since `met_s`
         self.met_s = math.inf  # UTC of the present contact's begin
         self._events: deque[str] = deque(maxlen=_EVENTS_KEPT)
         self._ending = threading.Event()
@@ -141,7 +148,9 @@ class HoldFeed:
         try:
             with connected(self._where, notice=lambda _: None) as client:
                 if client.greeting["run"] != self.seen.name:
-                    return Outcome.failed(what, "not sent: another run is listening now; look again")
+                    return Outcome.failed(
+                        what, "not sent: another run is listening now; look again"
+                    )
                 answer = client.ask(**request)
         except errors.CommandError as error:
             return Outcome.failed(what, "; ".join(error.lines))
@@ -153,10 +162,14 @@ class HoldFeed:
                 with connected(self._where, self._events.append, ANSWER_S) as client:
                     self._client = client
                     self._watch(client)
-                    problem = "the run has ended" if self.seen.status else "the connection was closed"
+                    problem = (
+                        "the run has ended" if self.seen.status else "the connection was closed"
+                    )
             except errors.CommandError as error:
                 problem = "; ".join(error.lines)
-            except Exception as error:  # whatever this hold causes, its feed tries again and the others continue
+            except (
+                Exception
+            ) as error:  # whatever this hold causes, its feed tries again and the others continue
                 problem = f"{type(error).__name__}: {error}"
             self.seen = replace(self.seen, problem=problem, role="read")
             self._ending.wait(_AGAIN_S)
@@ -201,7 +214,11 @@ class HoldFeed:
                 self.marks.append((utc.timestamp(), event.text))
         if "status" in message:
             self.seen = replace(
-                self.seen, role=str(greeting["role"]), status=message["status"], seen_s=time.monotonic(), problem=""
+                self.seen,
+                role=str(greeting["role"]),
+                status=message["status"],
+                seen_s=time.monotonic(),
+                problem="",
             )
             self._take_ticks(message["status"].get("row") or {}, rings.get("telemetry"))
             self._take_figures(rings.get("shapes"))
@@ -218,13 +235,17 @@ class HoldFeed:
             ticks = telemetry.columns(rows)
             at_s = utc_s + ticks["mono_s"] - ticks["mono_s"][-1]
             for place, tick_s in enumerate(at_s):
-                self.seconds.add(float(tick_s), {name: float(ticks[name][place]) for name in SIGNALS})
+                self.seconds.add(
+                    float(tick_s), {name: float(ticks[name][place]) for name in SIGNALS}
+                )
 
     def _take_figures(self, reader: ring.RingReader | None) -> None:
         for message in reader.drain() if reader else ():
             figure = shape_estimate.unpack_estimate(message)
             first = self.seen.reference is None and figure.verdict != "rejected"
-            self.seen = replace(self.seen, figure=figure, reference=figure if first else self.seen.reference)
+            self.seen = replace(
+                self.seen, figure=figure, reference=figure if first else self.seen.reference
+            )
 
 
 def _number(value: object) -> float:
@@ -232,9 +253,14 @@ def _number(value: object) -> float:
 
 
 SPANS_S = {
-    "1 min": 60.0, "10 min": 600.0, "1 h": 3600.0, "8 h": 28_800.0, "1 day": 86_400.0, "1 week": 604_800.0,
+    ("1 min"): 60.0,
+    ("10 min"): 600.0,
+    ("1 h"): 3600.0,
+    ("8 h"): 28_800.0,
+    ("1 day"): 86_400.0,
+    ("1 week"): 604_800.0,
     "1 month": 2_678_400.0,
-}  # fmt: skip
+}
 _LIVE_S = 3600.0  # the feed remembers this much; a longer span is read from the tables
 _POINTS_MAX = 1200  # as many as a wide screen shows
 _LISTED_S = 10.0  # the runs of a folder are listed anew so often
@@ -243,7 +269,9 @@ _GAP = 3.0  # windows without data interrupt the line
 
 @dataclass(frozen=True, slots=True)
 class Series:
-    """A signal over time: (n,) UTC seconds, and least, mean and largest value; NaN rows interrupt the line."""
+    """A signal over time: (n,) UTC seconds, and least, mean and largest value; NaN rows interrupt
+    the line.
+    """
 
     utc_s: Column
     low: Column
@@ -251,10 +279,13 @@ class Series:
     high: Column
 
 
-def history(feed: HoldFeed, logs: Path | None, signal: str, span_s: float, now_s: float | None = None) -> Series:
+def history(
+    feed: HoldFeed, logs: Path | None, signal: str, span_s: float, now_s: float | None = None
+) -> Series:
     """The last `span_s` seconds of a signal of `SIGNALS`, in at most `_POINTS_MAX` windows.
 
-    `logs` is the folder of the runs, None if it is on another machine: then only the last hour is known.
+    `logs` is the folder of the runs, None if it is on another machine: then only the last hour is
+    known.
     """
     if signal not in SIGNALS:
         raise ValueError(f"{signal}: none of {', '.join(SIGNALS)}")
@@ -263,7 +294,11 @@ def history(feed: HoldFeed, logs: Path | None, signal: str, span_s: float, now_s
     if span_s <= _LIVE_S and live.utc_s.size and live.utc_s[0] <= begin_s + 2.0:
         return thinned(live, span_s)
     before_s = live.utc_s[0] if live.utc_s.size else math.inf
-    parts = [] if logs is None or not logs.is_dir() else _of_runs(logs, signal, begin_s, float(before_s), span_s)
+    parts = (
+        []
+        if logs is None or not logs.is_dir()
+        else _of_runs(logs, signal, begin_s, float(before_s), span_s)
+    )
     return thinned(_joined([*parts, live]), span_s)
 
 
@@ -272,8 +307,12 @@ def _entries(logs: Path, _turn: float) -> list[catalogue.RunEntry]:
     return catalogue.entries(logs)
 
 
-def marks(feed: HoldFeed, logs: Path | None, span_s: float, now_s: float | None = None) -> list[tuple[float, str]]:
-    """UTC seconds and texts of the marks in the last `span_s` seconds, oldest first; `logs` as for `history`."""
+def marks(
+    feed: HoldFeed, logs: Path | None, span_s: float, now_s: float | None = None
+) -> list[tuple[float, str]]:
+    """UTC seconds and texts of the marks in the last `span_s` seconds, oldest first; `logs` as for
+    `history`.
+    """
     begin_s = (time.time() if now_s is None else now_s) - span_s
     found = list(feed.marks)
     if logs is not None and logs.is_dir() and begin_s < feed.met_s:
@@ -307,7 +346,9 @@ def _of_runs(logs: Path, signal: str, begin_s: float, end_s: float, span_s: floa
         if start_s > end_s or start_s + duration_s < begin_s:
             continue
         try:
-            level = open_run(entry.folder).level(window_s, begin_s - start_s, end_s - start_s, names)
+            level = open_run(entry.folder).level(
+                window_s, begin_s - start_s, end_s - start_s, names
+            )
         except (OSError, ValueError):  # one damaged run must not empty the chart
             continue
         if level["time_s"].size:
@@ -320,7 +361,10 @@ def _joined(parts: Sequence[Series]) -> Series:
     if not parts:
         return Series(*(np.empty(0) for _ in range(4)))
     return Series(
-        *(np.concatenate([getattr(part, name) for part in parts]) for name in ("utc_s", "low", "mean", "high"))
+        *(
+            np.concatenate([getattr(part, name) for part in parts])
+            for name in ("utc_s", "low", "mean", "high")
+        )
     )
 
 

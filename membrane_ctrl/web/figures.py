@@ -25,9 +25,13 @@ _MARKS_MOST, _MARK_LETTERS = 20, 24  # newest marks on a chart, and what fits be
 
 REMOVED = {"nothing": 0, "piston, tilt": 3, "piston, tilt, defocus": 4}
 _BAND = {
-    "type": "line", "symbol": "none", "lineStyle": {"opacity": 0}, "silent": True,
-    "stack": "band", "stackStrategy": "all",  # also where its lower edge is negative
-}  # fmt: skip
+    "type": "line",
+    "symbol": "none",
+    "lineStyle": {"opacity": 0},
+    "silent": True,
+    "stack": "band",
+    "stackStrategy": "all",  # also where its lower edge is negative
+}
 
 
 @dataclass(frozen=True, slots=True)
@@ -39,16 +43,24 @@ class MapPicture:
     terms: dict[str, Any]  # options of their chart
 
 
-def chart(signal: str, series: Series, utc: bool, marks: Sequence[tuple[float, str]] = ()) -> dict[str, Any]:
-    """Options of the history chart (ECharts): the mean, the band between least and largest value, and the marks.
+def chart(
+    signal: str, series: Series, utc: bool, marks: Sequence[tuple[float, str]] = ()
+) -> dict[str, Any]:
+    """Options of the history chart (ECharts): the mean, the band between least and largest value,
+    and the marks.
 
     `marks` are UTC seconds and texts, oldest first.
     """
     name = COLUMNS[signal].title
     shift_ms = 0.0 if utc else _offset_s(series) * 1e3
     at_ms = series.utc_s * 1e3 + shift_ms
-    lines = [{"xAxis": at_s * 1e3 + shift_ms, "name": text[:_MARK_LETTERS]} for at_s, text in marks[-_MARKS_MOST:]]
-    low, mean, high = ([[t, _plain(v)] for t, v in zip(at_ms, y, strict=True)] for y in _stacked(series))
+    lines = [
+        {"xAxis": at_s * 1e3 + shift_ms, "name": text[:_MARK_LETTERS]}
+        for at_s, text in marks[-_MARKS_MOST:]
+    ]
+    low, mean, high = (
+        [[t, _plain(v)] for t, v in zip(at_ms, y, strict=True)] for y in _stacked(series)
+    )
     options: dict[str, Any] = {
         "animation": False,
         "useUTC": True,  # the local time is in the values: ECharts knows no time zone of the bench
@@ -60,22 +72,40 @@ def chart(signal: str, series: Series, utc: bool, marks: Sequence[tuple[float, s
         "series": [
             {**_BAND, "data": low},
             {**_BAND, "data": high, "areaStyle": {"color": "#1f77b4", "opacity": 0.25}},
-            {"type": "line", "name": name, "symbol": "none", "data": mean, "lineStyle": {"width": 1.5},
-             "itemStyle": {"color": "#1f77b4"}, "markLine": _mark_lines(lines)},
+            {
+                "type": "line",
+                "name": name,
+                "symbol": "none",
+                "data": mean,
+                "lineStyle": {"width": 1.5},
+                "itemStyle": {"color": "#1f77b4"},
+                "markLine": _mark_lines(lines),
+            },
         ],
-    }  # fmt: skip
+    }
     return options
 
 
 def _axis(name: str, gap_px: int) -> dict[str, Any]:
     label = {"color": _GREY, "hideOverlap": True}
-    place = {"name": name, "nameGap": gap_px, "nameLocation": "middle", "nameTextStyle": {"color": _GREY}}
+    place = {
+        "name": name,
+        "nameGap": gap_px,
+        "nameLocation": "middle",
+        "nameTextStyle": {"color": _GREY},
+    }
     return {**place, "axisLabel": label, "splitLine": {"lineStyle": {"color": _RULE}}}
 
 
 def _mark_lines(lines: list[dict[str, Any]]) -> dict[str, Any]:
     label = {"formatter": "{b}", "color": _GREY, "position": "insideEndTop", "fontSize": 10}
-    return {"symbol": "none", "animation": False, "lineStyle": {"color": _GREY}, "label": label, "data": lines}
+    return {
+        "symbol": "none",
+        "animation": False,
+        "lineStyle": {"color": _GREY},
+        "label": label,
+        "data": lines,
+    }
 
 
 def _stacked(series: Series) -> tuple[Column, Column, Column]:
@@ -94,9 +124,13 @@ def _plain(value: float) -> float | None:
 
 
 def terms_chart(figure: ShapeEstimate, reference: ShapeEstimate | None) -> dict[str, Any]:
-    """Options of the bar chart of the terms from Z4: change since the reference, µm, with its standard deviation."""
+    """Options of the bar chart of the terms from Z4: change since the reference, µm, with its
+    standard deviation.
+    """
     shown = slice(FIRST_FIGURE_INDEX - 1, None)
-    change_um = figure.coeffs_um - reference.coeffs_um if reference is not None else figure.coeffs_um
+    change_um = (
+        figure.coeffs_um - reference.coeffs_um if reference is not None else figure.coeffs_um
+    )
     sigma_um = np.sqrt(np.diag(figure.covariance_um2))
     return {
         "animation": False,
@@ -106,13 +140,20 @@ def terms_chart(figure: ShapeEstimate, reference: ShapeEstimate | None) -> dict[
         "yAxis": {**_axis("µm", 40), "type": "value"},
         "series": [
             {"type": "bar", "name": "change, µm", "data": [_plain(v) for v in change_um[shown]]},
-            {"type": "scatter", "name": "sigma, µm", "symbolSize": 4, "data": [_plain(v) for v in sigma_um[shown]]},
+            {
+                "type": "scatter",
+                "name": "sigma, µm",
+                "symbolSize": 4,
+                "data": [_plain(v) for v in sigma_um[shown]],
+            },
         ],
     }
 
 
 def map_picture(figure: ShapeEstimate, reference: ShapeEstimate | None, removed: int) -> MapPicture:
-    """The figure less `removed` terms: its change since the reference in µm, without one its height in µm."""
+    """The figure less `removed` terms: its change since the reference in µm, without one its height
+    in µm.
+    """
     from matplotlib import colormaps
     from PIL import Image
 
@@ -129,7 +170,10 @@ def map_picture(figure: ShapeEstimate, reference: ShapeEstimate | None, removed:
     file = io.BytesIO()
     Image.fromarray(picture).resize((384, 384), Image.Resampling.NEAREST).save(file, "PNG")
     of = "change since the reference" if change else "height above the vertex"
-    words = f"{of}: {values.max() - values.min():.3g} µm PV, {values.std():.3g} µm rms, scale ±{scale_um:.3g} µm"
+    words = (
+        f"{of}: {values.max() - values.min():.3g} µm PV, {values.std():.3g} µm rms, scale "
+        f"±{scale_um:.3g} µm"
+    )
     return MapPicture(file.getvalue(), f"{figure.verdict}; {words}", terms_chart(figure, reference))
 
 
@@ -145,7 +189,10 @@ class Shared(Generic[T]):
         now_s = time.monotonic()
         self._made = {k: made for k, made in self._made.items() if _is_current(*made, now_s)}
         if key not in self._made:
-            self._made[key] = asyncio.create_task(self._pool.run(self._make, *key)), now_s + self._life_s
+            self._made[key] = (
+                asyncio.create_task(self._pool.run(self._make, *key)),
+                now_s + self._life_s,
+            )
         return await asyncio.shield(self._made[key][0])  # a viewer who leaves takes it from nobody
 
 

@@ -1,13 +1,14 @@
 """Asks each request for its session, and refuses what is malformed or comes from elsewhere.
 
-The address bar is not enough: any program on this machine, and any page in a browser on it, can reach a port of
-localhost. So every request needs a session cookie, which a link with a secret or a password gives; requests with a
-foreign `Host` (DNS rebinding) or `Origin` (another page, also over web sockets) are refused, and the cookie is never
-sent by other sites (`SameSite=Strict`).
+The address bar is not enough: any program on this machine, and any page in a browser on it, can
+reach a port of localhost. So every request needs a session cookie, which a link with a secret or a
+password gives; requests with a foreign `Host` (DNS rebinding) or `Origin` (another page, also over
+web sockets) are refused, and the cookie is never sent by other sites (`SameSite=Strict`).
 
-Strangers share the event loop with viewers, so what they may cause is bounded: a request of a stranger costs a few
-comparisons, the body of a login is short and in time, and passwords are evaluated in pools of their own after the
-throttle has admitted them (429), or not at all while too many wait (503).
+Strangers share the event loop with viewers, so what they may cause is bounded: a request of a
+stranger costs a few comparisons, the body of a login is short and in time, and passwords are
+evaluated in pools of their own after the throttle has admitted them (429), or not at all while too
+many wait (503).
 """
 
 from __future__ import annotations
@@ -44,7 +45,7 @@ _LOGIN = """<!doctype html><html lang="en"><meta charset="utf-8"><title>membrane
 <meta name="viewport" content="width=device-width,initial-scale=1">
 <style>:root{{color-scheme:light dark}}body{{font:16px sans-serif;max-width:22em;margin:15vh auto;padding:0 1em}}
 input,button{{font:inherit;width:100%;padding:.5em;margin:.3em 0;box-sizing:border-box}}</style>
-<h1>membrane_ctrl</h1><p>{said}</p>{form}</html>"""
+<h1>membrane_ctrl</h1><p>{said}</p>{form}</html>"""  # noqa: E501
 _FORM = """<form method="post" action="{action}">
 <label>Name<input name="name" autocomplete="username" autofocus></label>
 <label>Password<input name="password" type="password" autocomplete="current-password"></label>
@@ -54,7 +55,8 @@ _FORM = """<form method="post" action="{action}">
 _HEADERS: tuple[Header, ...] = (
     (b"x-frame-options", b"DENY"),  # no other page may lay itself over the stop button
     (b"x-content-type-options", b"nosniff"),
-    # the link's secret stays here; with `no-referrer` a browser would send the login form with the origin `null`
+    # the link's secret stays here; with `no-referrer` a browser would send the login form with the
+    # origin `null`
     (b"referrer-policy", b"same-origin"),
 )
 _CLOSE: Header = (b"connection", b"close")
@@ -69,7 +71,8 @@ class Refusal:
 
 
 class LoginMiddleware:
-    """ASGI middleware: lets in whoever has a session, and asks the others for the link or a password.
+    """ASGI middleware: lets in whoever has a session, and asks the others for the link or a
+    password.
 
     `scope["membrane_user"]` holds the `WebUser` of a request that was let in.
 
@@ -133,7 +136,9 @@ class LoginMiddleware:
         if host and name is None:
             return Refusal(HTTPStatus.BAD_REQUEST, "malformed Host header")
         if name not in self._address.hosts:
-            hint = "unknown host name: open the page by the address that `membrane-ctrl web` printed"
+            hint = (
+                "unknown host name: open the page by the address that `membrane-ctrl web` printed"
+            )
             return Refusal(HTTPStatus.FORBIDDEN, hint)
         origin = headers.get("origin")
         if origin is not None and not self._address.admits_origin(origin, host):
@@ -141,20 +146,31 @@ class LoginMiddleware:
         return None
 
     def _inside(self, scope: Scope, user: WebUser) -> Scope:
-        """Return the request as the page sees it: its path without the prefix, and the prefix from the settings."""
+        """Return the request as the page sees it: its path without the prefix, and the prefix from
+        the settings.
+        """
         path = self._address.path_inside(scope["path"])
         raw_path = self._address.path_inside(scope.get("raw_path", b"").decode("latin-1"))
         headers = [each for each in scope["headers"] if each[0] != b"x-forwarded-prefix"]
         if self._address.prefix:  # NiceGUI puts the prefix of this header into its links
             headers.append((b"x-forwarded-prefix", self._address.prefix.encode()))
-        changed = {"path": path, "raw_path": raw_path.encode("latin-1"), "headers": headers, "membrane_user": user}
+        changed = {
+            "path": path,
+            "raw_path": raw_path.encode("latin-1"),
+            "headers": headers,
+            "membrane_user": user,
+        }
         return {**scope, **changed}
 
     async def _serve(self, scope: Scope, receive: Receive, send: Send) -> None:
         """Answer a viewer."""
-        if scope["path"] == "":  # the address without its last slash: links of the page are relative to it
+        if (
+            scope["path"] == ""
+        ):  # the address without its last slash: links of the page are relative to it
             await _answer(scope, send, HTTPStatus.PERMANENT_REDIRECT, "", [self._location()])
-        elif self._stop is not None and scope["path"] == STOP_PATH and scope.get("method") == "POST":
+        elif (
+            self._stop is not None and scope["path"] == STOP_PATH and scope.get("method") == "POST"
+        ):
             query = parse_qs(scope["query_string"].decode("latin-1"))
             status, text = await self._stop(scope["membrane_user"], query.get("hold", [""])[0])
             await _answer(scope, send, status, f"{text}\n", [_text_type("plain")])
@@ -184,7 +200,9 @@ class LoginMiddleware:
             await self._show_form(scope, send, HTTPStatus.SERVICE_UNAVAILABLE, text, _BUSY_S)
             return
         if user is None:
-            await self._show_form(scope, send, HTTPStatus.UNAUTHORIZED, "Name or password is wrong.")
+            await self._show_form(
+                scope, send, HTTPStatus.UNAUTHORIZED, "Name or password is wrong."
+            )
             return
         await self._admit(scope, send, user, device)
 
@@ -195,7 +213,9 @@ class LoginMiddleware:
         if user is not None:
             await self._admit(scope, send, user, "")
             return
-        text = "Log in." if self._accounts.users else "Open the link that `membrane-ctrl web` printed."
+        text = (
+            "Log in." if self._accounts.users else "Open the link that `membrane-ctrl web` printed."
+        )
         if secret and not self._accounts.users:
             text = f"This link is wrong, or of an earlier start. {text}"
         await self._show_form(scope, send, HTTPStatus.UNAUTHORIZED, text)
@@ -225,7 +245,11 @@ class LoginMiddleware:
     def _source(self, scope: Scope) -> str:
         """Return the network address of the client."""
         peer = (scope.get("client") or ("", 0))[0]
-        forwarded = [value.decode("latin-1") for name, value in scope["headers"] if name == b"x-forwarded-for"]
+        forwarded = [
+            value.decode("latin-1")
+            for name, value in scope["headers"]
+            if name == b"x-forwarded-for"
+        ]
         return self._address.source_of(peer, forwarded)
 
 
@@ -302,5 +326,9 @@ async def _answer(
     content = text.encode()
     start: Literal["http.response.start"] = "http.response.start"
     length = (b"content-length", str(len(content)).encode())
-    await send({"type": start, "status": int(status), "headers": [*(headers or []), length, *_HEADERS]})
-    await send({"type": "http.response.body", "body": b"" if scope["method"] == "HEAD" else content})
+    await send(
+        {"type": start, "status": int(status), "headers": [*(headers or []), length, *_HEADERS]}
+    )
+    await send(
+        {"type": "http.response.body", "body": b"" if scope["method"] == "HEAD" else content}
+    )

@@ -1,12 +1,14 @@
 """Limits on password guesses that never lock a name for its owner.
 
-A guess is counted before it is evaluated, under one lock, so that parallel guesses cannot pass the limit together.
-The budgets refill with time; nothing is ever locked for a fixed time after the last guess, because then a stranger
-could keep the owner out with one guess a minute.
+A guess is counted before it is evaluated, under one lock, so that parallel guesses cannot pass the
+limit together. The budgets refill with time; nothing is ever locked for a fixed time after the last
+guess, because then a stranger could keep the owner out with one guess a minute.
 
 - A device that has logged in as this account before has a budget of its own.
-- All others share the budget of their network address, for this account and for all accounts together.
-- Guesses at one account from many addresses also share the budget of the account. The first tries of each address are
+- All others share the budget of their network address, for this account and for all accounts
+  together.
+- Guesses at one account from many addresses also share the budget of the account. The first tries
+  of each address are
   exempt: an owner at a new address competes with nobody.
 """
 
@@ -17,12 +19,15 @@ import time
 from collections import OrderedDict
 from dataclasses import dataclass, field
 
-_KEYS_MAX = 20_000  # remembered keys of each budget; beyond, the one that was used longest ago is forgotten
+# remembered keys of each budget; beyond, the one that was used longest ago is forgotten
+_KEYS_MAX = 20_000
 
 
 @dataclass(slots=True)
 class Budgets:
-    """A token bucket for each key: `burst` tokens, one more every `refill_s` seconds. Not thread-safe."""
+    """A token bucket for each key: `burst` tokens, one more every `refill_s` seconds. Not
+    thread-safe.
+    """
 
     burst: int
     refill_s: float
@@ -59,8 +64,8 @@ class Budgets:
 class Guess:
     """Who tries a password for which account.
 
-    `source` is the network address, `device` the identifier of a device that has logged in as this account before,
-    empty for all others.
+    `source` is the network address, `device` the identifier of a device that has logged in as this
+    account before, empty for all others.
     """
 
     account: str

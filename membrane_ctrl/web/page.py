@@ -1,4 +1,6 @@
-"""The page of one viewer: the hold now, its history, its figure, what it may be told, and the runs before it."""
+"""The page of one viewer: the hold now, its history, its figure, what it may be told, and the runs
+before it.
+"""
 
 import contextlib
 import gzip
@@ -14,10 +16,35 @@ from membrane_ctrl.control_port.outcome import Outcome
 from membrane_ctrl.control_port.status import alarm_lines, lock_lines
 from membrane_ctrl.model.columns import MISSING, PUBLISHED
 from membrane_ctrl.web import figures
-from membrane_ctrl.web.access import ACTIONS, STOP, UNLOCK, Action, WebUser, may, on_behalf, outranks, request
+from membrane_ctrl.web.access import (
+    ACTIONS,
+    STOP,
+    UNLOCK,
+    Action,
+    WebUser,
+    may,
+    on_behalf,
+    outranks,
+    request,
+)
 from membrane_ctrl.web.feed import SPANS_S, HoldFeed, history, marks
-from membrane_ctrl.web.panels import CHOOSES, SessionWatch, TuningPanel, fleet_panel, fresh, runs_panel, tell
-from membrane_ctrl.web.work_pools import FIGURES, LIVE_CHARTS, LONG_CHARTS, SESSIONS, PoolFullError, pool_of_command
+from membrane_ctrl.web.panels import (
+    CHOOSES,
+    SessionWatch,
+    TuningPanel,
+    fleet_panel,
+    fresh,
+    runs_panel,
+    tell,
+)
+from membrane_ctrl.web.work_pools import (
+    FIGURES,
+    LIVE_CHARTS,
+    LONG_CHARTS,
+    SESSIONS,
+    PoolFullError,
+    pool_of_command,
+)
 
 _LOOK_S = 1.0
 _SESSION_DIGITS = 8
@@ -25,9 +52,16 @@ _FETCH_S = 30.0  # for a browser to fetch a chart
 _CHART_EVERY_S = {60.0: 1.0, 600.0: 2.0, 3600.0: 5.0}  # longer spans: once a minute
 _LONG_CHART_LIFE_S = 30.0
 _FIRST_SIGNAL = "error_um"  # of the chart
-_CSS = ".nicegui-log .q-scrollarea__content { white-space: pre-wrap; overflow-wrap: anywhere }"  # a phone is narrow
+# a phone is narrow
+_CSS = ".nicegui-log .q-scrollarea__content { white-space: pre-wrap; overflow-wrap: anywhere }"
 _PRIMARY = "#3276bb"  # white on it is legible (4.7 : 1); on NiceGUI's own blue it is not
-_COLOURS = {"hold": "positive", "fault": "negative", "settle": "info", "inflate": "info", "tune": "warning"}
+_COLOURS = {
+    "hold": "positive",
+    "fault": "negative",
+    "settle": "info",
+    "inflate": "info",
+    "tune": "warning",
+}
 
 
 class SharedViews:
@@ -41,11 +75,15 @@ class SharedViews:
         self._live_charts = figures.Shared(self._chart, LIVE_CHARTS, life_s=_LOOK_S)
         self._long_charts = figures.Shared(self._chart, LONG_CHARTS, life_s=_LONG_CHART_LIFE_S)
         self.maps = figures.Shared(self._map, FIGURES, life_s=60.0)
-        watches = {name: SessionWatch(feed.logs) for name, feed in feeds.items() if feed.logs is not None}
+        watches = {
+            name: SessionWatch(feed.logs) for name, feed in feeds.items() if feed.logs is not None
+        }
         self.sessions = figures.Shared(lambda hold: watches[hold].look(), SESSIONS, life_s=_LOOK_S)
 
     async def chart(self, hold: str, signal: str, span: str, utc: bool) -> bytes:
-        """Options of the history chart, as JSON in gzip. Raises PoolFullError if too many are asked for."""
+        """Options of the history chart, as JSON in gzip. Raises PoolFullError if too many are asked
+        for.
+        """
         charts = self._live_charts if SPANS_S[span] in _CHART_EVERY_S else self._long_charts
         return await charts.get(hold, signal, span, utc)
 
@@ -65,7 +103,9 @@ class SharedViews:
 class WebPage:
     """The elements of a viewer's page, and what it is set to show."""
 
-    def __init__(self, feeds: Mapping[str, HoldFeed], hold: str, user: WebUser, views: SharedViews) -> None:
+    def __init__(
+        self, feeds: Mapping[str, HoldFeed], hold: str, user: WebUser, views: SharedViews
+    ) -> None:
         self._feeds, self._hold, self._user, self._views = feeds, hold, user, views
         self._feed = feeds[hold]
         self._logs = self._feed.logs
@@ -77,7 +117,8 @@ class WebPage:
         self._coloured = ""
         self._buttons: list[tuple[ui.button, Action]] = []
         self._asking = False
-        self._session = f"page {ui.context.client.id[:_SESSION_DIGITS]}"  # of this viewer, in records
+        # of this viewer, in records
+        self._session = f"page {ui.context.client.id[:_SESSION_DIGITS]}"
 
     def build(self) -> None:
         """Put the page together."""
@@ -107,11 +148,19 @@ class WebPage:
             if self._logs is not None:
                 with ui.tab_panel(look_back):
                     load = runs_panel(self._logs, self._hold, self._user, lambda: self._utc)
-                    tabs.on_value_change(lambda event: load() if event.value == look_back.props["name"] else None)
+                    tabs.on_value_change(
+                        lambda event: load() if event.value == look_back.props["name"] else None
+                    )
                 with ui.tab_panel(tune):
-                    TuningPanel(lambda: self._views.sessions.get(self._hold), self._user, self._may_choose)
-        with ui.footer().classes("justify-center q-pa-xs !bg-white dark:!bg-[#121212]"):  # always on the screen
-            stop = ui.button(STOP.label, icon=STOP.icon, color="negative", on_click=lambda: self._confirm(STOP))
+                    TuningPanel(
+                        lambda: self._views.sessions.get(self._hold), self._user, self._may_choose
+                    )
+        with ui.footer().classes(
+            "justify-center q-pa-xs !bg-white dark:!bg-[#121212]"
+        ):  # always on the screen
+            stop = ui.button(
+                STOP.label, icon=STOP.icon, color="negative", on_click=lambda: self._confirm(STOP)
+            )
             stop.classes("text-h6").style("width: min(100%, 24rem)").tooltip(STOP.does)
             self._buttons.append((stop, STOP))
         # a button that was clicked keeps the focus: the keys work there, too
@@ -138,26 +187,37 @@ class WebPage:
 
     def _build_numbers(self) -> dict[str, ui.label]:
         found = {}
-        with ui.grid().classes("w-full gap-2").style("grid-template-columns: repeat(auto-fill, minmax(8.5rem, 1fr))"):
+        with (
+            ui.grid()
+            .classes("w-full gap-2")
+            .style("grid-template-columns: repeat(auto-fill, minmax(8.5rem, 1fr))")
+        ):
             for column in PUBLISHED:
                 with ui.card().classes("q-pa-sm gap-0"):
                     ui.label(column.title).classes("text-caption")
-                    found[column.name] = ui.label(MISSING).classes("text-h6").props(f'data-field="{column.name}"')
+                    found[column.name] = (
+                        ui.label(MISSING).classes("text-h6").props(f'data-field="{column.name}"')
+                    )
         return found
 
     def _build_chart(self) -> None:
         with ui.row().classes("items-center"):
-            ui.toggle(list(SPANS_S), value=self._span, on_change=lambda e: self._set("_span", e.value)).props("dense")
+            ui.toggle(
+                list(SPANS_S), value=self._span, on_change=lambda e: self._set("_span", e.value)
+            ).props("dense")
             ui.select(
-                {column.name: column.title for column in PUBLISHED}, value=self._signal,
+                {column.name: column.title for column in PUBLISHED},
+                value=self._signal,
                 on_change=lambda e: self._set("_signal", e.value),
-            ).props('dense aria-label="signal"')  # fmt: skip
+            ).props('dense aria-label="signal"')
         self._chart = ui.echart({"series": []}).classes("w-full").style("height: 22rem")
 
     def _build_actions(self) -> None:
         with ui.grid(columns=3).classes("w-full gap-1"):
             for action in (*ACTIONS, UNLOCK):
-                button = ui.button(action.label, icon=action.icon, on_click=lambda _, a=action: self._confirm(a))
+                button = ui.button(
+                    action.label, icon=action.icon, on_click=lambda _, a=action: self._confirm(a)
+                )
                 button.props("dense no-caps stack").tooltip(action.does)
                 self._buttons.append((button, action))
 
@@ -165,9 +225,16 @@ class WebPage:
         with ui.row().classes("items-center"):
             ui.label("figure without")
             ui.select(
-                list(figures.REMOVED), value=self._removed, on_change=lambda e: self._set("_removed", e.value)
+                list(figures.REMOVED),
+                value=self._removed,
+                on_change=lambda e: self._set("_removed", e.value),
             ).props('dense aria-label="terms to remove"')
-        self._map = ui.image().classes("w-full").style("max-width: 24rem; aspect-ratio: 1").props('alt="figure"')
+        self._map = (
+            ui.image()
+            .classes("w-full")
+            .style("max-width: 24rem; aspect-ratio: 1")
+            .props('alt="figure"')
+        )
         self._map_words = ui.label("no figure yet").classes("text-caption")
         self._terms = ui.echart({"series": []}).classes("w-full").style("height: 12rem")
 
@@ -202,10 +269,21 @@ class WebPage:
         span_s = SPANS_S[self._span]
         if time.monotonic() - self._charted_s > _CHART_EVERY_S.get(span_s, 60.0):
             self._charted_s = time.monotonic()
-            query = {"hold": self._hold, "signal": self._signal, "span": self._span, "utc": self._utc}
+            query = {
+                "hold": self._hold,
+                "signal": self._signal,
+                "span": self._span,
+                "utc": self._utc,
+            }
             # the prefix of the public address, which NiceGUI puts into the page
-            fetched = f"const answer = await fetch(window.path_prefix + '/chart?{urlencode(query)}'); if (answer.ok)"
-            drawn = f"runMethod({self._chart.id}, 'run_chart_method', ['setOption', await answer.json()])"
+            fetched = (
+                f"const answer = await fetch(window.path_prefix + '/chart?{urlencode(query)}'); "
+                "if (answer.ok)"
+            )
+            drawn = (
+                f"runMethod({self._chart.id}, 'run_chart_method', ['setOption', await "
+                "answer.json()])"
+            )
             with contextlib.suppress(TimeoutError):
                 await ui.run_javascript(f"{fetched} {drawn}", timeout=_FETCH_S)
 
@@ -219,7 +297,9 @@ class WebPage:
         colour = "grey" if silent else _COLOURS.get(state, "warning")
         if colour != self._coloured:
             self._coloured = colour
-            self._state.props(f"color={colour} text-color={'white' if colour == 'negative' else 'black'}")
+            self._state.props(
+                f"color={colour} text-color={'white' if colour == 'negative' else 'black'}"
+            )
         self._why.set_text(silent or str(status.get("why") or "as it should be"))
         self._alarm.set_text("; ".join(alarm_lines(status)))
         for column in PUBLISHED:
@@ -232,7 +312,12 @@ class WebPage:
 
     async def _key(self, event: Any) -> None:
         """The console's keys: h, p, m, s."""
-        if not event.action.keydown or event.modifiers.ctrl or event.modifiers.alt or event.modifiers.meta:
+        if (
+            not event.action.keydown
+            or event.modifiers.ctrl
+            or event.modifiers.alt
+            or event.modifiers.meta
+        ):
             return
         paused = bool(self._feed.seen.status.get("paused"))
         wanted = {"h": "hold", "p": "resume" if paused else "pause", "m": "mark", "s": "stop"}
@@ -253,8 +338,12 @@ class WebPage:
                     ui.label(line).classes("text-negative text-bold")
             given = None
             if action.asks:  # a hidden one would take the focus, and Enter with it
-                given = ui.input(f"{action.asks}{f', {action.unit}' if action.unit else ''}").classes("w-full")
-                given.props('autofocus inputmode="text"')  # a phone's decimal keys may lack the minus or the point
+                given = ui.input(
+                    f"{action.asks}{f', {action.unit}' if action.unit else ''}"
+                ).classes("w-full")
+                given.props(
+                    'autofocus inputmode="text"'
+                )  # a phone's decimal keys may lack the minus or the point
                 given.on("keydown.enter", lambda: dialog.submit("yes"))
             take_over = ui.checkbox("take command from whoever has it")
             with ui.row():
@@ -270,12 +359,17 @@ class WebPage:
             dialog.delete()
         if not answer:
             return
-        if not may(self._user, self._feed.seen.role, action):  # the role may have changed while the dialog was open
+        if not may(
+            self._user, self._feed.seen.role, action
+        ):  # the role may have changed while the dialog was open
             tell(f"{action.label}: needs the role {action.role}", good=False)
             return
         try:
             asked = request(
-                action, f"web: {self._user.name}", str(given.value or "") if given else "", bool(take_over.value)
+                action,
+                f"web: {self._user.name}",
+                str(given.value or "") if given else "",
+                bool(take_over.value),
             )
         except ValueError as error:
             tell(str(error), good=False)

@@ -1,4 +1,4 @@
-"""Parts of the page: the holds of a fleet, the runs with their reports and timelines, the newest tuning session."""
+"""Parts of the page: the holds of a fleet, the runs with their reports and timelines, the newest tuning session."""  # noqa: E501
 
 import math
 import subprocess
@@ -36,13 +36,15 @@ _CARD = """<div class="q-pa-xs col-12"><q-card flat bordered class="q-pa-sm">
 <div class="row justify-between q-mt-xs">
 <span v-for="col in props.cols.filter(c => !['run', 'error'].includes(c.name))">
 <span class="text-caption">{{ col.label }}</span> {{ col.value ?? '-' }}</span></div>
-<span v-html="props.row.error"></span></q-card></div>"""  # a run on a phone, which has no room for the table
+<span v-html="props.row.error"></span></q-card></div>"""  # a run on a phone, which has no room for the table  # noqa: E501
 CHOOSES: Role = "tune"  # as for `ctl gains`
 
 
 def tell(text: str, good: bool | None = None) -> None:
     """Show the viewer a message for some seconds, away from the stop button."""
-    kind: Literal["positive", "negative"] | None = None if good is None else "positive" if good else "negative"
+    kind: Literal["positive", "negative"] | None = (
+        None if good is None else "positive" if good else "negative"
+    )
     ui.notify(text, type=kind, position="top", timeout=5000 if good is None else 8000)
 
 
@@ -63,10 +65,22 @@ def fleet_rows(feeds: Mapping[str, HoldFeed]) -> list[dict[str, object]]:
 
 def fleet_panel(feeds: Mapping[str, HoldFeed]) -> None:
     """The table of all holds; a click on a name opens its page."""
-    labels = {"hold": "mirror", "state": "state", "error": COLUMNS["error_um"].title, "says": "alarms, or why"}
-    columns = [{"name": key, "label": label, "field": key, "align": "left"} for key, label in labels.items()]
-    table = ui.table(columns=columns, rows=fleet_rows(feeds), row_key="hold").classes("w-full").props("dense")
-    link = '<a class="underline" :href="\'?hold=\' + encodeURIComponent(props.value)">{{ props.value }}</a>'
+    labels = {
+        "hold": "mirror",
+        "state": "state",
+        "error": COLUMNS["error_um"].title,
+        "says": "alarms, or why",
+    }
+    columns = [
+        {"name": key, "label": label, "field": key, "align": "left"}
+        for key, label in labels.items()
+    ]
+    table = (
+        ui.table(columns=columns, rows=fleet_rows(feeds), row_key="hold")
+        .classes("w-full")
+        .props("dense")
+    )
+    link = '<a class="underline" :href="\'?hold=\' + encodeURIComponent(props.value)">{{ props.value }}</a>'  # noqa: E501
     table.add_slot("body-cell-hold", f'<q-td :props="props">{link}</q-td>')
 
     def look() -> None:
@@ -90,8 +104,13 @@ def run_lines(logs: Path) -> list[RunLine]:
     """The runs of a folder, newest first."""
     if not logs.is_dir():
         return []
-    entries = sorted(catalogue.entries(logs), key=lambda entry: entry.started_utc, reverse=True)[:_MOST]
-    return [RunLine(entry, _picture(entry.folder, entry.exit != "open" and entry.duration_s)) for entry in entries]
+    entries = sorted(catalogue.entries(logs), key=lambda entry: entry.started_utc, reverse=True)[
+        :_MOST
+    ]
+    return [
+        RunLine(entry, _picture(entry.folder, entry.exit != "open" and entry.duration_s))
+        for entry in entries
+    ]
 
 
 @lru_cache(maxsize=4 * _MOST)
@@ -116,18 +135,30 @@ def report_problem(folder: Path, user: WebUser) -> str:
     return _command("report", str(folder))
 
 
-def runs_panel(logs: Path, hold: str, user: WebUser, utc: Callable[[], bool]) -> Callable[[], Awaitable[None]]:
+def runs_panel(
+    logs: Path, hold: str, user: WebUser, utc: Callable[[], bool]
+) -> Callable[[], Awaitable[None]]:
     """Fill the tab; returns what reads the runs anew."""
     columns = [
         {"name": name, "label": label, "field": name, "sortable": True, "align": "left"}
         for name, label in (
-            ("run", "run"), ("started", "started"), ("hours", "h"), ("std", "std, µm"), ("faults", "faults"),
-            ("exit", "end"), ("marks", "marks"), ("error", "error"),
+            ("run", "run"),
+            ("started", "started"),
+            ("hours", "h"),
+            ("std", "std, µm"),
+            ("faults", "faults"),
+            ("exit", "end"),
+            ("marks", "marks"),
+            ("error", "error"),
         )
-    ]  # fmt: skip
-    table = ui.table(columns=columns, rows=[], row_key="run", selection="single", pagination=20).classes("w-full")
+    ]
+    table = ui.table(
+        columns=columns, rows=[], row_key="run", selection="single", pagination=20
+    ).classes("w-full")
     table.props(':grid="window.innerWidth < 700" no-data-label="reading the runs"')
-    table.add_slot("body-cell-error", '<q-td :props="props"><span v-html="props.value"></span></q-td>')
+    table.add_slot(
+        "body-cell-error", '<q-td :props="props"><span v-html="props.value"></span></q-td>'
+    )
     table.add_slot("item", _CARD)
     table.add_slot("no-data", '<span class="q-pa-sm">{{ props.message }}</span>')
 
@@ -192,7 +223,10 @@ def _rounded(value: float, digits: int) -> float | None:
 def _command(*arguments: str) -> str:
     """Run one of our own commands; returns its last line if it failed."""
     done = subprocess.run(
-        [sys.executable, "-m", "membrane_ctrl", *arguments], capture_output=True, text=True, check=False
+        [sys.executable, "-m", "membrane_ctrl", *arguments],
+        capture_output=True,
+        text=True,
+        check=False,
     )
     return "" if done.returncode == 0 else (done.stderr.strip().splitlines() or ["it failed"])[-1]
 
@@ -204,7 +238,9 @@ class SessionSeen:
     path: Path
     done: frozenset[str]  # its steps
     progress: Progressed
-    candidates: tuple[tuple[str, ...], ...] = ()  # their table, its head first, while the session waits for a choice
+    candidates: tuple[
+        tuple[str, ...], ...
+    ] = ()  # their table, its head first, while the session waits for a choice
 
     @property
     def head(self) -> str:
@@ -240,7 +276,9 @@ class SessionWatch:
 
 def _table(markdown: str) -> tuple[tuple[str, ...], ...]:
     """The cells of a Markdown table, without its rule."""
-    head, _, *rows = (tuple(map(str.strip, line.strip("| ").split("|"))) for line in markdown.splitlines())
+    head, _, *rows = (
+        tuple(map(str.strip, line.strip("| ").split("|"))) for line in markdown.splitlines()
+    )
     return head, *(row for row in rows if len(row) == len(head))
 
 
@@ -261,8 +299,12 @@ def answered(session: Path, question: str, given: PageAnswer) -> Outcome:
 
 
 def fresh(old: tuple[str, ...], new: tuple[str, ...]) -> tuple[str, ...]:
-    """The lines of `new` after those of `old`, the first of which may have been dropped meanwhile."""
-    return next(new[len(old) - gone :] for gone in range(len(old) + 1) if old[gone:] == new[: len(old) - gone])
+    """The lines of `new` after those of `old`, the first of which may have been dropped meanwhile."""  # noqa: E501
+    return next(
+        new[len(old) - gone :]
+        for gone in range(len(old) + 1)
+        if old[gone:] == new[: len(old) - gone]
+    )
 
 
 class TuningPanel:
@@ -272,10 +314,17 @@ class TuningPanel:
     """
 
     def __init__(
-        self, look: Callable[[], Awaitable[SessionSeen | None]], user: WebUser, may: Callable[[], bool]
+        self,
+        look: Callable[[], Awaitable[SessionSeen | None]],
+        user: WebUser,
+        may: Callable[[], bool],
     ) -> None:
         self._look, self._user, self._may = look, user, may
-        self._head = ui.label("No tuning session in this folder.").classes("text-subtitle1").props('role="status"')
+        self._head = (
+            ui.label("No tuning session in this folder.")
+            .classes("text-subtitle1")
+            .props('role="status"')
+        )
         self._steps = ui.row()
         self._choice = ui.column().classes("w-full")
         self._said = ui.log(max_lines=200).classes("w-full h-64").props('aria-label="results"')
@@ -302,14 +351,23 @@ class TuningPanel:
             self._said.push(line)
         if (before.done, before.progress.step) != (seen.done, seen.progress.step):
             self._show_steps(seen)
-        if (before.progress.asks, before.progress.among) != (seen.progress.asks, seen.progress.among):
+        if (before.progress.asks, before.progress.among) != (
+            seen.progress.asks,
+            seen.progress.among,
+        ):
             self._show_choice(seen)
 
     def _show_steps(self, seen: SessionSeen) -> None:
         self._steps.clear()
         with self._steps:
             for step in folders.STEPS:
-                colour = "positive" if step in seen.done else "info" if step == seen.progress.step else "grey"
+                colour = (
+                    "positive"
+                    if step in seen.done
+                    else "info"
+                    if step == seen.progress.step
+                    else "grey"
+                )
                 ui.badge(step, color=colour)
 
     def _show_choice(self, seen: SessionSeen) -> None:
@@ -318,16 +376,26 @@ class TuningPanel:
         if not seen.progress.among:
             return
         with self._choice:
-            ui.label(f"The session waits, here and on its terminal: {seen.progress.asks}").classes("text-bold")
+            ui.label(f"The session waits, here and on its terminal: {seen.progress.asks}").classes(
+                "text-bold"
+            )
             if seen.candidates:
                 head, *rows = seen.candidates
-                columns = [{"name": name, "label": name, "field": name, "align": "left"} for name in head]
+                columns = [
+                    {"name": name, "label": name, "field": name, "align": "left"} for name in head
+                ]
                 cells = [dict(zip(head, row, strict=True)) for row in rows]
-                ui.table(columns=columns, rows=cells, row_key=head[0]).classes("w-full").props("dense")
+                ui.table(columns=columns, rows=cells, row_key=head[0]).classes("w-full").props(
+                    "dense"
+                )
             with ui.row():
                 for name in (*seen.progress.among, ""):
-                    button = ui.button(name or "none", on_click=lambda _, said=name: self._answer(seen, said))
-                    button.props("no-caps" if name else "no-caps flat").tooltip(f"needs the role {CHOOSES}")
+                    button = ui.button(
+                        name or "none", on_click=lambda _, said=name: self._answer(seen, said)
+                    )
+                    button.props("no-caps" if name else "no-caps flat").tooltip(
+                        f"needs the role {CHOOSES}"
+                    )
                     button.set_enabled(self._may())
                     self._buttons.append(button)
 
@@ -336,7 +404,9 @@ class TuningPanel:
         with ui.dialog() as dialog, ui.card():
             ui.label(f"{seen.progress.asks} {said or 'none'}").classes("text-h6")
             with ui.row():
-                ui.button("Do it", on_click=lambda: dialog.submit("yes")).props("color=primary autofocus")
+                ui.button("Do it", on_click=lambda: dialog.submit("yes")).props(
+                    "color=primary autofocus"
+                )
                 ui.button("Cancel", on_click=lambda: dialog.submit(""), color=None).props("flat")
         sure = await dialog
         if not dialog.is_deleted:  # with the viewer

@@ -1,8 +1,9 @@
 """The address by which browsers open the page, and what follows from it.
 
-Behind a reverse proxy the page cannot know its own address: the proxy may take off a prefix of the path, put its own
-name into `Host`, and end TLS. Headers such as `X-Forwarded-Prefix` may come from anybody. So the address is one
-setting (`web.public_url`), from which links, redirects, the cookie and the allowed origins are made.
+Behind a reverse proxy the page cannot know its own address: the proxy may take off a prefix of the
+path, put its own name into `Host`, and end TLS. Headers such as `X-Forwarded-Prefix` may come from
+anybody. So the address is one setting (`web.public_url`), from which links, redirects, the cookie
+and the allowed origins are made.
 """
 
 from __future__ import annotations
@@ -25,8 +26,9 @@ _IPV6_PREFIX_BITS = 64  # one customer has at least this network, and each of it
 class PublicAddress:
     """Where browsers find the page.
 
-    `hosts` are the names by which requests may call it, `origin` the origin of a configured public address (empty
-    without one), `prefix` its path without the last slash, `proxies` the networks of the trusted reverse proxies.
+    `hosts` are the names by which requests may call it, `origin` the origin of a configured public
+    address (empty without one), `prefix` its path without the last slash, `proxies` the networks of
+    the trusted reverse proxies.
     """
 
     hosts: frozenset[str]
@@ -43,7 +45,9 @@ class PublicAddress:
 
     @property
     def cookie_attributes(self) -> str:
-        """Attributes of every cookie: sent to this page only, by this page only, and over TLS if it has TLS."""
+        """Attributes of every cookie: sent to this page only, by this page only, and over TLS if it
+        has TLS.
+        """
         secure = "; Secure" if self.secure else ""
         return f"HttpOnly; SameSite=Strict; Path={self.prefix or '/'}{secure}"
 
@@ -67,13 +71,15 @@ class PublicAddress:
         peer
             Address of the other end of the connection.
         forwarded
-            Values of all `X-Forwarded-For` headers, in their order. They count only if the connection comes from a
-            trusted proxy; each proxy appends the address it was called from, so they are read from the right.
+            Values of all `X-Forwarded-For` headers, in their order. They count only if the
+            connection comes from a trusted proxy; each proxy appends the address it was called
+            from, so they are read from the right.
 
         Returns
         -------
         str
-            An IPv4 address, the /64 network of an IPv6 address, or the text of a peer that is neither.
+            An IPv4 address, the /64 network of an IPv6 address, or the text of a peer that is
+            neither.
         """
         source = _address(peer)
         hops = [hop.strip() for value in forwarded for hop in value.split(",")]
@@ -113,7 +119,9 @@ def public_address(page: WebConfig) -> PublicAddress:
 
 
 def host_name(header: str) -> str | None:
-    """Return the lower-case name in a `Host` header, an IPv6 address without brackets; None if it is malformed."""
+    """Return the lower-case name in a `Host` header, an IPv6 address without brackets; None if it
+    is malformed.
+    """
     match = _HOST.fullmatch(header)
     if match is None or int(match["port"] or 0) > 65535:
         return None

@@ -28,7 +28,8 @@ from membrane_ctrl.web.stop_route import stop_handler
 from membrane_ctrl.web.work_pools import REPORT_FILES, PoolFullError
 
 _NICE = 5  # the hold comes first, also when the page was not started by one
-_AWAY_S = 20.0  # a viewer may be silent for so long: a phone that changes cells, a machine that builds fifty pages
+# a viewer may be silent for so long: a phone that changes cells, a machine that builds fifty pages
+_AWAY_S = 20.0
 _STUCK_S = 20.0  # for a message to leave
 _REPORT_BYTES_MAX = 64_000_000
 _MESSAGE_BYTES_MAX = 1_000_000  # of a browser over its web socket; the page has no uploads
@@ -44,12 +45,16 @@ def accounts_of(page: WebConfig) -> Accounts:
         except (OSError, ValueError) as error:
             raise errors.InputError(f"{page.users_file}: {error}") from None
         if not users:
-            raise errors.InputError(f"{page.users_file}: no users; add one with `membrane-ctrl web add-user`")
+            raise errors.InputError(
+                f"{page.users_file}: no users; add one with `membrane-ctrl web add-user`"
+            )
     return Accounts(users, attributes=public_address(page).cookie_attributes)
 
 
 def require_servable(page: WebConfig) -> None:
-    """Raise InputError for files that are no certificate and its key, DeviceError for an address that is taken."""
+    """Raise InputError for files that are no certificate and its key, DeviceError for an address
+    that is taken.
+    """
     if page.certificate_file is not None and page.key_file is not None:
         context = ssl.SSLContext(ssl.PROTOCOL_TLS_SERVER)
         sockets.load_pair(context, Path(page.certificate_file), Path(page.key_file))
@@ -57,7 +62,9 @@ def require_servable(page: WebConfig) -> None:
 
 
 def serve(holds: dict[str, Where], page: WebConfig) -> None:
-    """Serve the page of holds, by name, until interrupted. Raises as `accounts_of` and `require_servable`."""
+    """Serve the page of holds, by name, until interrupted. Raises as `accounts_of` and
+    `require_servable`.
+    """
     accounts = accounts_of(page)
     require_servable(page)
     os.nice(max(0, _NICE - os.nice(0)))
@@ -67,7 +74,9 @@ def serve(holds: dict[str, Where], page: WebConfig) -> None:
     build_inside = app.build_middleware_stack
 
     def build_middleware_stack() -> ASGIApp:
-        """Put the login outside of everything: NiceGUI adds middlewares later than we could with `add_middleware`."""
+        """Put the login outside of everything: NiceGUI adds middlewares later than we could with
+        `add_middleware`.
+        """
         inside = HangUp(build_inside())
         return LoginMiddleware(inside, accounts, address, stop_handler(feeds), guard)
 
@@ -91,7 +100,9 @@ def serve(holds: dict[str, Where], page: WebConfig) -> None:
             packed = await views.chart(hold, signal, span, utc)
         except PoolFullError as error:
             return PlainTextResponse(str(error), 503)
-        return Response(packed, media_type="application/json", headers={**_FRESH, "content-encoding": "gzip"})
+        return Response(
+            packed, media_type="application/json", headers={**_FRESH, "content-encoding": "gzip"}
+        )
 
     @app.get("/map")
     async def picture(hold: str, removed: str) -> Response:
@@ -133,8 +144,8 @@ def serve(holds: dict[str, Where], page: WebConfig) -> None:
 class HangUp:
     """ASGI middleware: hangs up on a viewer who does not read, and says so.
 
-    Engine.io notices a viewer who does not answer its pings, within 24 s; a viewer who answers but cannot be written
-    to is noticed here.
+    Engine.io notices a viewer who does not answer its pings, within 24 s; a viewer who answers but
+    cannot be written to is noticed here.
     """
 
     def __init__(self, app: ASGIApp) -> None:
@@ -156,7 +167,11 @@ class HangUp:
         await self._app(scope, hear, tell)
         if not left:
             user: WebUser = scope["membrane_user"]
-            print(f"membrane-ctrl web: viewer {user.name} does not read: hung up", file=sys.stderr, flush=True)
+            print(
+                f"membrane-ctrl web: viewer {user.name} does not read: hung up",
+                file=sys.stderr,
+                flush=True,
+            )
 
 
 def report_page(logs: Path | None, name: str) -> HTMLResponse:

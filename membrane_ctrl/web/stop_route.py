@@ -1,7 +1,8 @@
-"""`POST /stop?hold=NAME`: the stop command on a path that shares nothing slow with the rest of the page.
+"""`POST /stop?hold=NAME`: the stop command on a path that shares nothing slow with the rest of the
+page.
 
-The login answers it before the page's routes, a thread of the pool of safety commands sends it, and the connection to
-the hold serves this command only.
+The login answers it before the page's routes, a thread of the pool of safety commands sends it, and
+the connection to the hold serves this command only.
 """
 
 from __future__ import annotations
@@ -23,7 +24,10 @@ def stop_handler(feeds: Mapping[str, HoldFeed]) -> StopHandler:
         if feed is None:
             return HTTPStatus.NOT_FOUND, f"stop: no hold {hold!r}; known: {', '.join(feeds)}"
         if not may(user, feed.seen.role, STOP):
-            return HTTPStatus.FORBIDDEN, f"stop: needs the role {STOP.role}, of the viewer and of the page"
+            return (
+                HTTPStatus.FORBIDDEN,
+                f"stop: needs the role {STOP.role}, of the viewer and of the page",
+            )
         asked = request(STOP, f"web: {user.name}", "", take_over=True)
         asked["on_behalf"] = on_behalf(user, "stop")
         try:

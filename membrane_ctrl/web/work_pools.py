@@ -1,8 +1,9 @@
 """Bounded pools of threads: one kind of work never waits behind another kind.
 
-The page does its slow work on threads: password hashes, charts, reports, commands to a hold. In one common pool, a
-few slow tasks of one kind would delay all others. So each kind has its own pool, with a bound on the tasks that wait;
-a task beyond that bound is refused at once. Commands that end in the safe state have a pool for themselves.
+The page does its slow work on threads: password hashes, charts, reports, commands to a hold. In one
+common pool, a few slow tasks of one kind would delay all others. So each kind has its own pool,
+with a bound on the tasks that wait; a task beyond that bound is refused at once. Commands that end
+in the safe state have a pool for themselves.
 """
 
 from __future__ import annotations
@@ -42,10 +43,14 @@ class WorkPool:
         self._tasks = 0
         self._lock = threading.Lock()
         # on Linux, `os.nice` changes the calling thread only
-        self._threads = ThreadPoolExecutor(workers, f"page {name}", initializer=os.nice, initargs=(niceness,))
+        self._threads = ThreadPoolExecutor(
+            workers, f"page {name}", initializer=os.nice, initargs=(niceness,)
+        )
 
     async def run(self, function: Callable[..., T], *arguments: Any) -> T:
-        """Return what the function returns, or raise what it raises. Raises PoolFullError if too many tasks wait."""
+        """Return what the function returns, or raise what it raises. Raises PoolFullError if too
+        many tasks wait.
+        """
         with self._lock:
             if self._tasks >= self._tasks_max:
                 raise PoolFullError(f"{self.name}: too many requests are waiting; try again")
@@ -63,7 +68,8 @@ class WorkPool:
             self._tasks -= 1
 
 
-# A password hash takes 16 MB and 50 ms of a core. Devices that have logged in before do not queue behind strangers.
+# A password hash takes 16 MB and 50 ms of a core. Devices that have logged in before do not queue
+# behind strangers.
 STRANGERS_PASSWORDS = WorkPool("strangers' passwords", workers=1, waiting_max=8, niceness=5)
 KNOWN_PASSWORDS = WorkPool("known devices' passwords", workers=1, waiting_max=8, niceness=5)
 # Charts of the last hour come from memory, longer ones from the files of many runs.
@@ -82,5 +88,7 @@ _SAFETY = frozenset({"stop", "vent", "lower", "latch"})
 
 
 def pool_of_command(do: str) -> WorkPool:
-    """Return the pool for a command to a hold; commands that end in the safe state have their own."""
+    """Return the pool for a command to a hold; commands that end in
+    the safe state have their own.
+    """
     return SAFETY_COMMANDS if do in _SAFETY else COMMANDS

@@ -104,12 +104,18 @@ class FakeReconstructor:
             raise np.linalg.LinAlgError("singular matrix")
 
     def full(
-        self, frames: Sequence[Pixels], time_s: NDArray[np.float64], displacement_um: NDArray[np.float64]
+        self,
+        frames: Sequence[Pixels],
+        time_s: NDArray[np.float64],
+        displacement_um: NDArray[np.float64],
     ) -> ShapeEstimate:
         return self._answer("full", frames, time_s, displacement_um)
 
     def fringes(
-        self, frames: Sequence[Pixels], time_s: NDArray[np.float64], displacement_um: NDArray[np.float64]
+        self,
+        frames: Sequence[Pixels],
+        time_s: NDArray[np.float64],
+        displacement_um: NDArray[np.float64],
     ) -> ShapeEstimate:
         return self._answer("fringes", frames, time_s, displacement_um)
 
@@ -120,7 +126,9 @@ class FakeReconstructor:
         time_s: NDArray[np.float64],
         displacement_um: NDArray[np.float64],
     ) -> ShapeEstimate:
-        self.calls.append(Call(kind, [int(frame[0, 0]) for frame in frames], time_s, displacement_um))
+        self.calls.append(
+            Call(kind, [int(frame[0, 0]) for frame in frames], time_s, displacement_um)
+        )
         self.clock.sleep(0.05)
         if self.singular:
             raise np.linalg.LinAlgError("singular matrix")

@@ -38,22 +38,31 @@ def test_a_panel_is_measured_and_its_worth_said() -> None:
 
 
 def test_four_steps_take_the_third_harmonic_for_phase() -> None:
-    # light ((1 + cos) / 2)^2 = 3/8 + cos / 2 + cos(2 phi) / 8: of its harmonics four steps are blind to the second
+    # light ((1 + cos) / 2)^2 = 3/8 + cos / 2 + cos(2 phi) / 8: of its harmonics four steps are
+    # blind to the second
     square = measured_response(RAMP_LEVELS, power_law(2.0))
     assert fringe_error_mm(square, PatternConfig(steps=4), corrected=False) < 0.05
     # to three steps it is a phase error of sin(3 phi) / 4
     expected_mm = mm_per_rad(PatternConfig(steps=3)) / 4 / np.sqrt(2)
-    assert fringe_error_mm(square, PatternConfig(steps=3), False) == pytest.approx(expected_mm, rel=0.05)
+    assert fringe_error_mm(square, PatternConfig(steps=3), False) == pytest.approx(
+        expected_mm, rel=0.05
+    )
 
 
 def test_the_correction_leaves_the_rounding_of_levels() -> None:
     response = measured_response(RAMP_LEVELS, power_law(2.2))
-    bare, corrected = (fringe_error_mm(response, PatternConfig(), linear) for linear in (False, True))
+    bare, corrected = (
+        fringe_error_mm(response, PatternConfig(), linear) for linear in (False, True)
+    )
     assert corrected < 0.5 * bare
-    assert 1e3 * corrected == pytest.approx(20, abs=2)  # µm: the rounding to 256 levels, which bins average away
+    assert 1e3 * corrected == pytest.approx(
+        20, abs=2
+    )  # µm: the rounding to 256 levels, which bins average away
 
 
-def test_a_configuration_without_a_screen_is_refused(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_configuration_without_a_screen_is_refused(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     (tmp_path / "lab.toml").write_text("")
     assert run(["calibrate-display", str(tmp_path / "lab.toml")]) == 2
     assert "devices.camera and devices.screen are both needed" in capsys.readouterr().err

@@ -37,7 +37,14 @@ class Bench:
         self.reader = reader
         self.exposures_left = 10**6
         self.cycle = ShapeCycle(
-            self.camera, self.screen, self.reconstructor, PLAN, frames, self.clock, FakeLaser(), self._stopping
+            self.camera,
+            self.screen,
+            self.reconstructor,
+            PLAN,
+            frames,
+            self.clock,
+            FakeLaser(),
+            self._stopping,
         )
 
     def done(self) -> CycleDone:
@@ -106,7 +113,11 @@ def test_frames_are_stored_for_readers(bench: Bench) -> None:
 
 
 def test_lost_tracking_makes_the_next_cycle_a_full_one(bench: Bench) -> None:
-    bench.reconstructor.verdicts = [("ok", ""), ("rejected", "tracking lost: moved by 5 mrad"), ("ok", "")]
+    bench.reconstructor.verdicts = [
+        ("ok", ""),
+        ("rejected", "tracking lost: moved by 5 mrad"),
+        ("ok", ""),
+    ]
     results = [bench.done() for _ in range(4)]
     assert [r.estimate.kind for r in results] == ["full", "fringes", "full", "fringes"]
     assert all(r.pause_s == 0 for r in results)
@@ -134,7 +145,11 @@ def test_full_cycle_on_request(bench: Bench) -> None:
 def test_broken_screen_is_an_event_and_is_tried_again_more_and_more_slowly(bench: Bench) -> None:
     bench.screen.broken = True
     failures = [bench.failed() for _ in range(3)]
-    assert [(f.cycle, f.stage, f.pause_s) for f in failures] == [(1, "screen", 1), (2, "screen", 2), (3, "screen", 4)]
+    assert [(f.cycle, f.stage, f.pause_s) for f in failures] == [
+        (1, "screen", 1),
+        (2, "screen", 2),
+        (3, "screen", 4),
+    ]
     assert failures[0].message == "LinkError: screen: no display"
     bench.screen.broken = False
     assert bench.done().pause_s == 0

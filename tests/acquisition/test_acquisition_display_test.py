@@ -20,7 +20,9 @@ WIDTH_PX, HEIGHT_PX = 320, 240
 class Bench:
     """Camera and panel; the camera sees the screen in a part of its picture."""
 
-    def __init__(self, response: PanelResponse, gamma: float = 2.2, white_adu: float = 200.0) -> None:
+    def __init__(
+        self, response: PanelResponse, gamma: float = 2.2, white_adu: float = 200.0
+    ) -> None:
         self.clock = VirtualClock()
         self.panel: EmulatedPanel[Any] = EmulatedPanel(response, self.clock.now)
         self.gamma, self.white_adu = gamma, white_adu
@@ -54,7 +56,9 @@ def test_settle_time_is_enough_and_not_much_more(tau_s: float) -> None:
 
 
 def test_response_is_the_panels() -> None:
-    assert display_test(Bench(PanelResponse(), gamma=1.9)).response().gamma == pytest.approx(1.9, rel=0.03)
+    assert display_test(Bench(PanelResponse(), gamma=1.9)).response().gamma == pytest.approx(
+        1.9, rel=0.03
+    )
 
 
 def test_findings_name_what_they_are_about() -> None:
@@ -66,4 +70,6 @@ def test_findings_name_what_they_are_about() -> None:
     assert told("camera", lambda: right.exposure(255, 20.0)) == ""
     assert told("screen", right.checkerboard) == ""
     nothing = display_test(Bench(PanelResponse(), white_adu=0.0))
-    assert told("screen", lambda: str(nothing.response())).startswith("screen: the camera sees no ramp")
+    assert told("screen", lambda: str(nothing.response())).startswith(
+        "screen: the camera sees no ramp"
+    )

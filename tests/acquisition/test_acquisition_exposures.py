@@ -7,7 +7,15 @@ from contextlib import closing
 
 import numpy as np
 import pytest
-from acquisition_fakes import FRINGES, HEIGHT_PX, WIDTH_PX, FakeCamera, FakeLaser, FakeScreen, VirtualClock
+from acquisition_fakes import (
+    FRINGES,
+    HEIGHT_PX,
+    WIDTH_PX,
+    FakeCamera,
+    FakeLaser,
+    FakeScreen,
+    VirtualClock,
+)
 
 from firmware_iface.roles import Frame, FrameLostError, Pattern, Pixels
 from membrane_ctrl.acquisition.exposures import Exposures, StageError
@@ -42,7 +50,9 @@ class SettlingScreen:
 
 
 class SplitCamera:
-    """Sees what is on the screen while it exposes; its transfer takes `TRANSFER_S` beside everything else."""
+    """Sees what is on the screen while it exposes; its transfer takes `TRANSFER_S` beside
+    everything else.
+    """
 
     def __init__(self, clock: VirtualClock, screen: SettlingScreen) -> None:
         self.clock, self.screen = clock, screen
@@ -74,17 +84,25 @@ class SplitCamera:
 @pytest.fixture
 def frames() -> Iterator[tuple[FrameWriter, FrameReader]]:
     ring = FrameRing(19, HEIGHT_PX, WIDTH_PX)
-    with closing(ring), closing(FrameWriter(ring.address)) as writer, closing(FrameReader(ring.address)) as reader:
+    with (
+        closing(ring),
+        closing(FrameWriter(ring.address)) as writer,
+        closing(FrameReader(ring.address)) as reader,
+    ):
         yield writer, reader
 
 
-def split(writer: FrameWriter, clock: VirtualClock, interval_s: float = 0.0) -> tuple[Exposures, SplitCamera]:
+def split(
+    writer: FrameWriter, clock: VirtualClock, interval_s: float = 0.0
+) -> tuple[Exposures, SplitCamera]:
     screen = SettlingScreen(clock)
     camera = SplitCamera(clock, screen)
     return Exposures(camera, screen, writer, clock, FakeLaser(), interval_s), camera
 
 
-def test_transfer_costs_nothing_while_the_next_pattern_settles(frames: tuple[FrameWriter, FrameReader]) -> None:
+def test_transfer_costs_nothing_while_the_next_pattern_settles(
+    frames: tuple[FrameWriter, FrameReader],
+) -> None:
     clock = VirtualClock()
     exposures, camera = split(frames[0], clock)
     taken = exposures.take(FRINGES, 1, lambda: False)
@@ -96,7 +114,9 @@ def test_transfer_costs_nothing_while_the_next_pattern_settles(frames: tuple[Fra
     assert [head.time_s for head in frames[1].heads()] == [frame.time_s for frame in taken]
 
 
-def test_the_next_cycle_finds_its_first_pattern_settling(frames: tuple[FrameWriter, FrameReader]) -> None:
+def test_the_next_cycle_finds_its_first_pattern_settling(
+    frames: tuple[FrameWriter, FrameReader],
+) -> None:
     clock = VirtualClock()
     exposures, camera = split(frames[0], clock)
     exposures.take(FRINGES, 1, lambda: False)
@@ -123,13 +143,16 @@ def test_a_lost_frame_is_taken_again_with_its_own_pattern(
     assert camera.screen.shown[-1] == FRINGES[0].name
 
 
-def test_three_in_a_row_are_a_failure_of_the_camera(frames: tuple[FrameWriter, FrameReader]) -> None:
+def test_three_in_a_row_are_a_failure_of_the_camera(
+    frames: tuple[FrameWriter, FrameReader],
+) -> None:
     exposures, camera = split(frames[0], VirtualClock())
     camera.lose = {3, 4, 5}
     with pytest.raises(StageError, match="not whole") as failed:
         exposures.take(FRINGES, 1, lambda: False)
     assert failed.value.stage == "camera"
-    failed.value.__traceback__ = failed.value.__cause__ = None  # they keep the pixels of a slot alive
+    # they keep the pixels of a slot alive
+    failed.value.__traceback__ = failed.value.__cause__ = None
     del failed
 
 
@@ -142,7 +165,9 @@ def test_stopping_is_asked_before_every_exposure(frames: tuple[FrameWriter, Fram
 def test_plain_roles_are_used_step_by_step(frames: tuple[FrameWriter, FrameReader]) -> None:
     clock = VirtualClock()
     screen, camera = FakeScreen(), FakeCamera(clock)
-    taken = Exposures(camera, screen, frames[0], clock, FakeLaser(), 0.0).take(FRINGES, 1, lambda: False)
+    taken = Exposures(camera, screen, frames[0], clock, FakeLaser(), 0.0).take(
+        FRINGES, 1, lambda: False
+    )
     assert taken is not None
     assert screen.shown == [pattern.name for pattern in FRINGES]
     assert [int(frame.pixels[0, 0]) for frame in taken] == list(range(8))
@@ -152,7 +177,10 @@ def test_plain_roles_are_used_step_by_step(frames: tuple[FrameWriter, FrameReade
 def test_a_stopped_cycle_holds_no_pixels(plain: bool) -> None:
     ring = FrameRing(19, HEIGHT_PX, WIDTH_PX)
     clock = VirtualClock()
-    with closing(ring), closing(FrameWriter(ring.address)) as writer:  # which raises while someone holds pixels
+    with (
+        closing(ring),
+        closing(FrameWriter(ring.address)) as writer,
+    ):  # which raises while someone holds pixels
         if plain:
             camera = FakeCamera(clock)
             exposures = Exposures(camera, FakeScreen(), writer, clock, FakeLaser(), 0.0)

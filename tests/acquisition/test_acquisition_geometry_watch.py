@@ -35,7 +35,11 @@ CYCLE = ShapeEstimate(
 
 RING_UM = ring_um(Surface(CYCLE.coeffs_um / 1e3, 0.0, 500.0))
 CALIBRATION = CalibrationTable(
-    date_utc="2026", hash="x", slope_residual_urad=3.0, slope_noise_urad=1.0, ring_um=tuple(RING_UM.tolist())
+    date_utc="2026",
+    hash="x",
+    slope_residual_urad=3.0,
+    slope_noise_urad=1.0,
+    ring_um=tuple(RING_UM.tolist()),
 )
 
 
@@ -60,14 +64,19 @@ def test_a_ring_that_seems_to_tilt_is_said_and_a_deeper_bowl_is_not() -> None:
     assert not any(drift.after(deeper) for _ in range(CYCLES))
     tilted = CYCLE.coeffs_um.copy()
     tilted[1] += 4.0  # 2 x of the radius a unit: 8 µm at the rim, 5.7 µm RMS around it
-    told = [event for _ in range(CYCLES) if (event := drift.after(replace(CYCLE, coeffs_um=tilted))) is not None]
+    told = [
+        event
+        for _ in range(CYCLES)
+        if (event := drift.after(replace(CYCLE, coeffs_um=tilted))) is not None
+    ]
     assert [event.name for event in told] == ["calibrate"]
     assert "the ring is seen 5.7 µm RMS from where it was" in told[0].message
 
 
 def test_the_noise_of_weaker_fringes_is_no_drift() -> None:
     weak = LiveDrift(in_force(), 4)
-    # 2.83 µrad of film, and 1.5 µrad of noise that was 1.0 at the calibration and grows as the light fades
+    # 2.83 µrad of film, and 1.5 µrad of noise that was 1.0 at the calibration and grows as the
+    # light fades
     faded = replace(CYCLE, modulation_median_adu=4.0)
     noise_urad = weak.noise_urad(faded)
     assert noise_urad == pytest.approx(20 * weak.noise_urad(CYCLE))
@@ -80,7 +89,9 @@ def test_rejected_cycles_and_stated_geometries_say_nothing() -> None:
     drift = LiveDrift(in_force(), 4)
     assert not any(drift.after(rejected) for _ in range(2 * CYCLES))
     by_hand = LiveDrift(in_force(None), 4)
-    assert not any(by_hand.after(replace(CYCLE, slope_residual_urad=50.0)) for _ in range(2 * CYCLES))
+    assert not any(
+        by_hand.after(replace(CYCLE, slope_residual_urad=50.0)) for _ in range(2 * CYCLES)
+    )
 
 
 def test_the_record_names_the_geometry() -> None:

@@ -19,7 +19,11 @@ NOTHING = TelemetryRow(**dict.fromkeys(FIELDS, math.nan))
 
 def row(mono_s: float, displacement_um: float, counter: float, quality: float = 0.0) -> bytes:
     return replace(
-        NOTHING, mono_s=mono_s, displacement_um=displacement_um, sample_counter=counter, displacement_quality=quality
+        NOTHING,
+        mono_s=mono_s,
+        displacement_um=displacement_um,
+        sample_counter=counter,
+        displacement_quality=quality,
     ).pack()
 
 
@@ -51,7 +55,9 @@ def test_mean_of_the_readings_around_a_moment(telemetry: RingWriter, laser: Lase
 
 
 @pytest.mark.parametrize("rate_hz", [1.0, 5.0, 10.0])
-def test_a_slow_loop_has_readings_enough(telemetry: RingWriter, address: RingAddress, rate_hz: float) -> None:
+def test_a_slow_loop_has_readings_enough(
+    telemetry: RingWriter, address: RingAddress, rate_hz: float
+) -> None:
     with closing(LaserHistory(address, rate_hz)) as laser:
         for k in range(20):
             telemetry.put(row(k / rate_hz, 1.0, k))
@@ -84,7 +90,9 @@ def test_bad_readings_are_none(telemetry: RingWriter, laser: LaserHistory, bad: 
     assert math.isnan(laser.at(0.2))
 
 
-def test_readings_older_than_a_minute_are_forgotten(telemetry: RingWriter, laser: LaserHistory) -> None:
+def test_readings_older_than_a_minute_are_forgotten(
+    telemetry: RingWriter, laser: LaserHistory
+) -> None:
     for start_s in (0.0, 90.0):
         for k in range(20):
             telemetry.put(row(start_s + k * 0.02, 1.0, start_s + k))

@@ -38,7 +38,9 @@ SAG_MM = 37.1
 
 def truth(displacement_um: float) -> Truth:
     nothing = Truth(**dict.fromkeys((field.name for field in fields(Truth)), 0.0))
-    return replace(nothing, displacement_um=displacement_um, sag_mm=SAG_MM + displacement_um / 1000.0)
+    return replace(
+        nothing, displacement_um=displacement_um, sag_mm=SAG_MM + displacement_um / 1000.0
+    )
 
 
 class Run:
@@ -51,7 +53,9 @@ class Run:
         frames = FrameRing.for_optics(CONFIG.optics)
         stack.callback(frames.close)
         self.clock = RunClock.start()
-        self.spec = AcquisitionSpec(CONFIG, self.clock, telemetry, shapes, truths if twin else None, frames.address)
+        self.spec = AcquisitionSpec(
+            CONFIG, self.clock, telemetry, shapes, truths if twin else None, frames.address
+        )
         self._telemetry = stack.enter_context(closing(RingWriter(telemetry)))
         self._truth = stack.enter_context(closing(RingWriter(truths)))
         self._shapes = stack.enter_context(closing(RingReader(shapes)))
@@ -115,13 +119,17 @@ def test_measures_the_twin_follows_a_jump_and_stops_when_told(stack: ExitStack) 
     assert (geometry["hash"], geometry["file"]) == (origin_of(CONFIG.optics).hash, None)
     assert [e.kind for e in run.estimates[:3]] == ["full", "fringes", "fringes"]
     assert [e.cycle for e in run.estimates[:3]] == [1, 2, 3]
-    assert all(e.verdict == "ok" and e.displacement_um == 0.0 and e.latency_s > 0 for e in run.estimates)
+    assert all(
+        e.verdict == "ok" and e.displacement_um == 0.0 and e.latency_s > 0 for e in run.estimates
+    )
 
     before_um = run.estimates[-1].sag_um
     run.displacement_um = 20.0
     run.tick()
     moved_s = run.clock.now()
-    run.until(lambda: sum(e.time_s > moved_s for e in run.estimates) >= 2)  # the first may have begun before
+    run.until(
+        lambda: sum(e.time_s > moved_s for e in run.estimates) >= 2
+    )  # the first may have begun before
     assert run.estimates[-1].sag_um - before_um == pytest.approx(20.0, abs=0.5)
     assert run.estimates[-1].displacement_um == pytest.approx(20.0)
 
@@ -130,7 +138,9 @@ def test_measures_the_twin_follows_a_jump_and_stops_when_told(stack: ExitStack) 
     assert run.process.exitcode == 0
     reader = stack.enter_context(closing(FrameReader(run.spec.frames)))
     last = [head for head in reader.heads() if head.cycle == run.estimates[-1].cycle]
-    assert [head.pattern for head in last] == [pattern.name for pattern in fringe_sequence(CONFIG.optics.pattern)]
+    assert [head.pattern for head in last] == [
+        pattern.name for pattern in fringe_sequence(CONFIG.optics.pattern)
+    ]
     pixels = reader.copy(last[0])
     assert pixels is not None
     assert pixels.max() > 150  # fringes of about 90 grey levels around 110

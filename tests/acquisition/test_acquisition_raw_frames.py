@@ -36,7 +36,9 @@ class Keeping:
         settings = RecordingConfig(min_free_mb=recording.pop("min_free_mb", 1), **recording)  # type: ignore[arg-type]
         self.told: list[Any] = []
         raw = folder / "raw"
-        self.raw = RawFrames(raw, OPTICS, PLAN, settings, frames.address, telemetry, self.told.append)
+        self.raw = RawFrames(
+            raw, OPTICS, PLAN, settings, frames.address, telemetry, self.told.append
+        )
         self.folder = folder / "raw"
         self.cycle = 0
 
@@ -69,7 +71,9 @@ def stack() -> Iterator[ExitStack]:
         yield opened
 
 
-def test_every_third_cycle_and_the_full_one_that_anchors_it(stack: ExitStack, tmp_path: Path) -> None:
+def test_every_third_cycle_and_the_full_one_that_anchors_it(
+    stack: ExitStack, tmp_path: Path
+) -> None:
     keeping = Keeping(stack, tmp_path, raw_every_cycles=3)
     for kind in ("full", *["fringes"] * 6):
         keeping.take(kind)  # type: ignore[arg-type]
@@ -114,7 +118,9 @@ def test_an_anchor_that_nothing_refers_to_makes_room(stack: ExitStack, tmp_path:
     assert keeping.kept() == ["cycle-000003"]
 
 
-def test_a_set_that_was_asked_for_is_there_at_once_and_stays(stack: ExitStack, tmp_path: Path) -> None:
+def test_a_set_that_was_asked_for_is_there_at_once_and_stays(
+    stack: ExitStack, tmp_path: Path
+) -> None:
     keeping = Keeping(stack, tmp_path)
     keeping.take("full")
     assert read_head(keeping.capture(1)).kind == "full"
@@ -122,7 +128,9 @@ def test_a_set_that_was_asked_for_is_there_at_once_and_stays(stack: ExitStack, t
     assert keeping.kept() == ["cycle-000001", "cycle-000002"]
 
 
-def test_a_set_that_was_asked_for_and_cannot_be_written_is_an_error(stack: ExitStack, tmp_path: Path) -> None:
+def test_a_set_that_was_asked_for_and_cannot_be_written_is_an_error(
+    stack: ExitStack, tmp_path: Path
+) -> None:
     keeping = Keeping(stack, tmp_path, min_free_mb=1e9)
     keeping.take("full")
     with pytest.raises(OSError, match="disk full"):
@@ -154,7 +162,11 @@ def test_switched_off_and_without_room_nothing_is_written(stack: ExitStack, tmp_
 
 @pytest.mark.parametrize(("left_bytes", "kept"), [(-1, []), (1, ["cycle-000001"])])
 def test_a_set_has_to_leave_the_disk_to_the_telemetry(
-    stack: ExitStack, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, left_bytes: int, kept: list[str]
+    stack: ExitStack,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    left_bytes: int,
+    kept: list[str],
 ) -> None:
     free = 2 * 100_000_000 + len(FULL) * 16 * 8 + left_bytes
     monkeypatch.setattr(raw_frames.shutil, "disk_usage", lambda _: SimpleNamespace(free=free))
@@ -186,4 +198,6 @@ def test_what_the_disk_did_not_take_whole_goes_and_is_told_once(
     keeping.take()
     keeping.fault(3)
     assert keeping.kept() == ["cycle-000003"]
-    assert "reference" not in (keeping.folder / "cycle-000003" / "capture.toml").read_text()  # it is not there
+    assert (
+        "reference" not in (keeping.folder / "cycle-000003" / "capture.toml").read_text()
+    )  # it is not there

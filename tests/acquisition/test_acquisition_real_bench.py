@@ -32,7 +32,9 @@ pytestmark = pytest.mark.real_time
 
 PATIENCE_S = 300.0  # the kernels may have to be compiled
 SCREEN = {"width_px": 420, "height_px": 300, "pixel_mm": 1.6}
-SCREEN_TABLE = '[devices.screen]\ndriver = "pygame"\nwidth_px = 420\nheight_px = 300\npixel_mm = 1.6\n'
+SCREEN_TABLE = (
+    '[devices.screen]\ndriver = "pygame"\nwidth_px = 420\nheight_px = 300\npixel_mm = 1.6\n'
+)
 CONFIG = Config.model_validate(
     {
         "shape": {"period_s": 0.3, "frame_interval_s": 0.0},
@@ -40,8 +42,19 @@ CONFIG = Config.model_validate(
         "recording": {"min_free_mb": 1, "raw_every_cycles": 1},
         "devices": {
             "board": "tcp://127.0.0.1:1",
-            "camera": {"driver": "aravis", "camera": "127.0.0.1", "exposure_ms": 30, "packet_bytes": 8000},
-            "screen": {"driver": "pygame", **SCREEN, "settle_ms": 50, "linearise": False, "self_test": False},
+            "camera": {
+                "driver": "aravis",
+                "camera": "127.0.0.1",
+                "exposure_ms": 30,
+                "packet_bytes": 8000,
+            },
+            "screen": {
+                "driver": "pygame",
+                **SCREEN,
+                "settle_ms": 50,
+                "linearise": False,
+                "self_test": False,
+            },
         },
     }
 )
@@ -73,7 +86,9 @@ def stack() -> Iterator[ExitStack]:
 
 @pytest.fixture
 def camera(stack: ExitStack, tmp_path: Path) -> GigeCameraEmulator:
-    framebuffer = stack.enter_context(virtual_display(tmp_path, SCREEN["width_px"], SCREEN["height_px"]))  # type: ignore[arg-type]
+    framebuffer = stack.enter_context(
+        virtual_display(tmp_path, SCREEN["width_px"], SCREEN["height_px"])
+    )  # type: ignore[arg-type]
     return stack.enter_context(gige_camera(Sight(framebuffer).expose, 306, 256))
 
 
@@ -86,7 +101,9 @@ class Run:
         frames = FrameRing.for_optics(config.optics)
         stack.callback(frames.close)
         self._clock = RunClock.start()
-        spec = AcquisitionSpec(config, self._clock, telemetry, shapes, None, frames.address, run_dir)
+        spec = AcquisitionSpec(
+            config, self._clock, telemetry, shapes, None, frames.address, run_dir
+        )
         self._shapes = stack.enter_context(closing(RingReader(shapes)))
         context = multiprocessing.get_context("spawn")
         self.control, theirs = context.Pipe()
@@ -119,13 +136,16 @@ class Run:
         self.process.join()
 
 
-def test_cycles_through_display_and_camera(stack: ExitStack, camera: GigeCameraEmulator, tmp_path: Path) -> None:
+def test_cycles_through_display_and_camera(
+    stack: ExitStack, camera: GigeCameraEmulator, tmp_path: Path
+) -> None:
     run = Run(stack, CONFIG, tmp_path)
     run.until(lambda: any(e.kind == "fringes" and e.verdict == "ok" for e in run.estimates))
     fringes = next(e for e in run.estimates if e.kind == "fringes" and e.verdict == "ok")
     before = run.estimates[: run.estimates.index(fringes)]
     full = next(e for e in reversed(before) if e.kind == "full")
-    # a pause of the machine costs a cycle frames, or the whole cycle, after which a full one follows
+    # a pause of the machine costs a cycle frames, or the whole cycle, after which a full one
+    # follows
     assert all(e.kind == "full" or e.verdict == "rejected" for e in before[: before.index(full)])
     assert all(e.verdict != "ok" for e in before[before.index(full) + 1 :])
     assert full.verdict != "rejected"

@@ -63,7 +63,11 @@ class ScriptedCycle:
     def take(self) -> CycleDone | CycleFailed | None:
         self.started_s.append(self.clock.now_s)
         self.clock.sleep(self.duration_s)
-        return self.results.pop(0) if self.results else CycleDone(estimate(cycle=len(self.started_s)), 0.0)
+        return (
+            self.results.pop(0)
+            if self.results
+            else CycleDone(estimate(cycle=len(self.started_s)), 0.0)
+        )
 
     def want_full(self) -> None:
         self.full_wanted_at_s.append(self.clock.now_s)
@@ -78,7 +82,9 @@ class Loop:
         self.disk_full = False
 
     def run(self) -> None:
-        keep_cycling(self.cycle, self.remote, self.published.append, self.clock, lambda: 2.0, self.keep)  # type: ignore[arg-type]
+        keep_cycling(
+            self.cycle, self.remote, self.published.append, self.clock, lambda: 2.0, self.keep
+        )  # type: ignore[arg-type]
 
     def keep(self, estimate: ShapeEstimate) -> Path:
         if self.disk_full:
@@ -104,7 +110,12 @@ def test_the_next_cycle_is_prepared_once_the_figure_is_out_and_starts_late_at_wo
     loop.cycle.prepares_s = [0.0, 1.8]
     loop.run()
     assert loop.cycle.started_s == [0, 2, 4.3, 6]
-    assert loop.cycle.prepared_s == [0.5, 2.5, 4.8, 6.5]  # half a second after the start: the figure is out
+    assert loop.cycle.prepared_s == [
+        0.5,
+        2.5,
+        4.8,
+        6.5,
+    ]  # half a second after the start: the figure is out
 
 
 def test_pause_and_resume() -> None:
@@ -125,7 +136,14 @@ def test_a_set_on_request_is_a_full_cycle_that_is_kept_and_named() -> None:
     loop.run()
     assert loop.cycle.full_wanted_at_s == [2]
     assert loop.remote.events == [
-        {"kind": "capture", "cycle": 2, "set": "raw/cycle-2", "displacement_um": 0.0, "verdict": "ok", "reason": ""}
+        {
+            "kind": "capture",
+            "cycle": 2,
+            "set": "raw/cycle-2",
+            "displacement_um": 0.0,
+            "verdict": "ok",
+            "reason": "",
+        }
     ]
 
 
@@ -134,11 +152,16 @@ def test_a_set_on_request_is_a_full_cycle_that_is_kept_and_named() -> None:
     [
         (None, "the cycle was stopped"),
         (CycleFailed(7, "camera", "LinkError: no trigger", 1.0), "camera: LinkError: no trigger"),
-        (CycleDone(estimate("full", verdict="rejected", reason="no mirror"), 0.0), "rejected: no mirror"),
+        (
+            CycleDone(estimate("full", verdict="rejected", reason="no mirror"), 0.0),
+            "rejected: no mirror",
+        ),
         (CycleDone(estimate("full"), 0.0), "No space left on device"),
     ],
 )
-def test_a_set_that_cannot_be_had_says_why(result: CycleDone | CycleFailed | None, failed: str) -> None:
+def test_a_set_that_cannot_be_had_says_why(
+    result: CycleDone | CycleFailed | None, failed: str
+) -> None:
     loop = Loop({1.0: "capture", 3.0: "stop"})
     loop.cycle.results, loop.disk_full = [CycleDone(estimate(), 0.0), result], True
     loop.run()
@@ -207,7 +230,9 @@ def test_unknown_command_is_answered(line: tuple[Connection, Connection]) -> Non
     assert "unknown command 'dance'" in ours.recv()["message"]
 
 
-def test_it_promises_its_next_word_sooner_once_it_is_prepared(line: tuple[Connection, Connection]) -> None:
+def test_it_promises_its_next_word_sooner_once_it_is_prepared(
+    line: tuple[Connection, Connection],
+) -> None:
     ours, theirs = line
     remote = Remote(theirs)
     for _ in range(5):
@@ -237,7 +262,12 @@ def test_reports_never_wait_for_a_reader(line: tuple[Connection, Connection]) ->
     for number in range(3000):  # far more than the pipe holds
         remote.report("running", f"{number:0200}", cycle=1)
     assert not remote.stop
-    assert ours.recv() == {"kind": "acquisition", "state": "running", "message": "0" * 200, "cycle": 1}
+    assert ours.recv() == {
+        "kind": "acquisition",
+        "state": "running",
+        "message": "0" * 200,
+        "cycle": 1,
+    }
 
 
 def test_the_same_report_is_sent_once(line: tuple[Connection, Connection]) -> None:

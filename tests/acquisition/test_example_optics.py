@@ -1,4 +1,6 @@
-"""The example with camera and screen: `check` measures a real X display through an emulated GigE camera."""
+"""The example with camera and screen: `check` measures a real X display through an emulated GigE
+camera.
+"""
 
 from __future__ import annotations
 
@@ -22,15 +24,20 @@ from tests.support.virtual_display import screenshot, virtual_display
 
 pytestmark = pytest.mark.real_time
 
-SHRINK = 4  # large frames over loopback are tried elsewhere (tests/firmware_iface/test_camera_aravis.py)
+# large frames over loopback are tried elsewhere (tests/firmware_iface/test_camera_aravis.py)
+SHRINK = 4
 
 
 def _example() -> Config:
-    example = load(Path(__file__).parents[2] / "membrane_ctrl" / "examples" / "paper-bench.toml", Config)
+    example = load(
+        Path(__file__).parents[2] / "membrane_ctrl" / "examples" / "paper-bench.toml", Config
+    )
     camera = example.optics.camera
     size = {"width_px": camera.width_px // SHRINK, "height_px": camera.height_px // SHRINK}
     smaller = camera.model_copy(update={**size, "pixel_um": camera.pixel_um * SHRINK})
-    return example.model_copy(update={"optics": example.optics.model_copy(update={"camera": smaller})})
+    return example.model_copy(
+        update={"optics": example.optics.model_copy(update={"camera": smaller})}
+    )
 
 
 EXAMPLE = _example()
@@ -59,7 +66,9 @@ class Sight:
 
     def expose(self, exposure_ms: float, gain: int) -> Any:
         levels = screenshot(self._framebuffer)[::STRIDE_PX, ::STRIDE_PX, 0]
-        seen = cv2.resize(LIGHT.astype(np.float32)[levels], self._blocks, interpolation=cv2.INTER_AREA)
+        seen = cv2.resize(
+            LIGHT.astype(np.float32)[levels], self._blocks, interpolation=cv2.INTER_AREA
+        )
         counts = np.clip(np.rint(8 + 200 * seen * exposure_ms / 20.0), 0, 255).astype(np.uint8)
         return np.repeat(np.repeat(counts, BLOCK_PX, axis=0), BLOCK_PX, axis=1)
 
@@ -101,7 +110,9 @@ async def devices(camera: GigeCameraEmulator) -> AsyncIterator[DevicesConfig]:
     await lab.stop()
 
 
-async def test_the_example_passes_check_with_camera_and_screen(devices: DevicesConfig, tmp_path: Path) -> None:
+async def test_the_example_passes_check_with_camera_and_screen(
+    devices: DevicesConfig, tmp_path: Path
+) -> None:
     config = EXAMPLE.model_copy(update={"devices": devices})
     code, probe, errors = await check(config, tmp_path / "moved.toml")
     assert (code, probe["problem"]) == (0, ""), errors
@@ -116,7 +127,9 @@ async def test_too_bright_a_picture_is_told(devices: DevicesConfig, tmp_path: Pa
     bright = devices.camera.model_copy(update={"exposure_ms": 200.0})
     quick = devices.screen.model_copy(update={"settle_ms": 50.0, "linearise": False})
     changed = devices.model_copy(update={"camera": bright, "screen": quick})
-    code, probe, _ = await check(EXAMPLE.model_copy(update={"devices": changed}), tmp_path / "bright.toml")
+    code, probe, _ = await check(
+        EXAMPLE.model_copy(update={"devices": changed}), tmp_path / "bright.toml"
+    )
     assert code == 4
     assert "saturated" in probe["problem"]
     assert "lower exposure_ms" in probe["problem"]

@@ -1,4 +1,6 @@
-"""A camera and a display of another package at the twin's mirror, and what their mistakes do to the cycle."""
+"""A camera and a display of another package at the twin's mirror, and what their mistakes do to the
+cycle.
+"""
 
 from __future__ import annotations
 
@@ -53,7 +55,9 @@ def stack() -> Iterator[ExitStack]:
         yield opened
 
 
-def configured(camera: dict[str, Any] | None = None, screen: dict[str, Any] | None = None) -> Config:
+def configured(
+    camera: dict[str, Any] | None = None, screen: dict[str, Any] | None = None
+) -> Config:
     devices = {
         "board": "tcp://127.0.0.1:1",
         "camera": {"driver": "external", "name": "studio_cam", **(camera or {})},
@@ -82,9 +86,13 @@ def cycles_of(config: Config, stack: ExitStack) -> tuple[ShapeCycle, optical_ben
     writer = stack.enter_context(closing(FrameWriter(frames.address)))
     stack.callback(bench.close)
     optical_bench.open_bench(bench, config, clock)
-    plan = CyclePlan(full_sequence(config.optics.pattern), fringe_sequence(config.optics.pattern), 0.0)
+    plan = CyclePlan(
+        full_sequence(config.optics.pattern), fringe_sequence(config.optics.pattern), 0.0
+    )
     reconstructor = LiveReconstructor(config.optics, config.shape.bin_px)
-    return ShapeCycle(bench.camera, bench.screen, reconstructor, plan, writer, clock, Still()), bench
+    return ShapeCycle(
+        bench.camera, bench.screen, reconstructor, plan, writer, clock, Still()
+    ), bench
 
 
 def figure(taken: CycleDone | CycleFailed | None) -> ShapeEstimate:
@@ -115,7 +123,9 @@ def test_either_of_them_may_be_the_twins_own(role: str, site: Path, stack: ExitS
     tables = config.model_dump(mode="json", exclude_none=True)
     tables["devices"][role] = built_in[role]
     cycles, bench = cycles_of(Config.model_validate(tables), stack)
-    ours, theirs = {"camera": (bench.camera, bench.screen), "screen": (bench.screen, bench.camera)}[role]
+    ours, theirs = {"camera": (bench.camera, bench.screen), "screen": (bench.screen, bench.camera)}[
+        role
+    ]
     assert not isinstance(ours, GuardedCamera | PatternScreen)
     assert isinstance(theirs, GuardedCamera | PatternScreen)
     figure(cycles.take())
@@ -126,7 +136,8 @@ def test_each_mistake_costs_a_cycle_and_is_named(site: Path, stack: ExitStack) -
         "raise": "LinkError: camera studio_cam: grab: RuntimeError: bus error 5",
         "exit": "LinkError: camera studio_cam: grab: SystemExit: 3",
         "nothing": "LinkError: camera studio_cam: grab returned NoneType instead of Frame",
-        "size": "LinkError: camera studio_cam: gave 306 x 255 uint8, [optics.camera] states 306 x 256 uint8",
+        "size": "LinkError: camera studio_cam: gave 306 x 255 uint8, [optics.camera] states 306 x "
+        "256 uint8",
         "close": "LinkDownError: camera studio_cam: unplugged",
     }
     cycles, _ = cycles_of(configured({"faults": list(mistakes), "fault_every": 20}), stack)
@@ -168,9 +179,17 @@ def refusal(config: Config) -> str:
         ({"exposure": 5}, {}, "devices.camera: exposure: unknown key; did you mean exposure_ms?"),
         ({"exposure_ms": 2000.0}, {}, "exposure_ms: input should be less than or equal to 1000"),
         ({}, {"bright": 1}, "devices.screen: bright: 1: write true or false"),
-        ({"name": "studio_com"}, {}, "no camera driver 'studio_com' is installed; installed: studio_cam"),
+        (
+            {"name": "studio_com"},
+            {},
+            "no camera driver 'studio_com' is installed; installed: studio_cam",
+        ),
         ({"name": "studio_wall"}, {}, "no camera driver 'studio_wall' is installed"),
-        ({}, {"name": "studio_cam"}, "no screen driver 'studio_cam' is installed; installed: studio_wall"),
+        (
+            {},
+            {"name": "studio_cam"},
+            "no screen driver 'studio_cam' is installed; installed: studio_wall",
+        ),
     ],
     ids=["key", "range", "screen", "name", "screen as camera", "camera as screen"],
 )
@@ -195,7 +214,9 @@ def test_a_package_that_does_not_load_is_one_line(source: str, words: str, site:
     assert words in refusal(configured())
 
 
-def test_a_package_that_hangs_is_not_waited_for(site: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_package_that_hangs_is_not_waited_for(
+    site: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     (site / "studio_optics.py").write_text("import threading\nthreading.Event().wait()\n")
     monkeypatch.setattr(driver_check, "_LOADED_S", 0.0)
     assert "the drivers' packages do not load within 0 s" in refusal(configured())
@@ -218,20 +239,28 @@ def make(config: Config) -> Callable[[], object]:
 def test_a_driver_that_is_no_camera_is_refused(site: Path) -> None:
     source = (site / "studio_optics.py").read_text()
     (site / "studio_optics.py").write_text(source.replace("def grab(", "def snap("))
-    with pytest.raises(InputError, match=r"devices\.camera: camera studio_cam: the driver has neither grab nor"):
+    with pytest.raises(
+        InputError, match=r"devices\.camera: camera studio_cam: the driver has neither grab nor"
+    ):
         make(configured())()
 
 
 def test_a_driver_that_cannot_be_made_is_refused(site: Path) -> None:
     source = (site / "studio_optics.py").read_text()
-    (site / "studio_optics.py").write_text(source.replace("np.random.default_rng(3)", "np.random.rng(3)"))
-    with pytest.raises(InputError, match=r"devices\.camera: StudioCamera cannot be made: AttributeError"):
+    (site / "studio_optics.py").write_text(
+        source.replace("np.random.default_rng(3)", "np.random.rng(3)")
+    )
+    with pytest.raises(
+        InputError, match=r"devices\.camera: StudioCamera cannot be made: AttributeError"
+    ):
         make(configured())()
 
 
 def test_a_package_cannot_replace_a_built_in_driver(site: Path) -> None:
     entries = site / "studio_optics-2.1.dist-info" / "entry_points.txt"
-    entries.write_text(entries.read_text().replace("studio_cam = studio_optics:S", "folder = studio_optics:S"))
+    entries.write_text(
+        entries.read_text().replace("studio_cam = studio_optics:S", "folder = studio_optics:S")
+    )
     tables = configured().model_dump(mode="json", exclude_none=True)
     del tables["devices"]["screen"]
     tables["devices"]["camera"] = {"driver": "folder", "folder": str(site)}

@@ -1,4 +1,6 @@
-"""What a hold records of the mirror's vibrations, from its figures on: events, report, alarms, timeline, `modes`."""
+"""What a hold records of the mirror's vibrations, from its figures on: events, report, alarms,
+timeline, `modes`.
+"""
 
 from __future__ import annotations
 
@@ -45,7 +47,9 @@ DAY_S = 86400.0
 FEWER_HZ = (12.0, 12 / 1.09, 12 / 1.17)
 ROW = TelemetryRow(*(0.0 for _ in FIELDS)).pack()
 TICKS = rows_of(12.0)[300:]  # six seconds of hold
-CONFIG = Config.model_validate({"shape": {"mode": "track"}, "devices": {"board": "tcp://127.0.0.1:5020"}})
+CONFIG = Config.model_validate(
+    {"shape": {"mode": "track"}, "devices": {"board": "tcp://127.0.0.1:5020"}}
+)
 PUMPED = CONFIG.model_copy(update={"pump": CONFIG.pump.model_copy(update={"stroke_hz": 48.1})})
 
 
@@ -59,7 +63,9 @@ class HandClock(RunClock):
 
 
 class Hold:
-    """A run of a hold that begins on some day of the week, without its processes and its ticks in between."""
+    """A run of a hold that begins on some day of the week, without its processes and its ticks in
+    between.
+    """
 
     def __init__(self, logs: Path, day: float, stack: ExitStack, config: Config = CONFIG) -> None:
         self.clock = HandClock(0.0, STARTED_UTC + timedelta(days=day))
@@ -75,10 +81,19 @@ class Hold:
         recording = Recording(self.folder, "week", self.clock, config)
         self.troubles: list[str] = []
         self.recorder = Recorder(
-            self.folder, self.clock, config, readers, recording, None, lambda event: self.troubles.append(event.kind)
+            self.folder,
+            self.clock,
+            config,
+            readers,
+            recording,
+            None,
+            lambda event: self.troubles.append(event.kind),
         )
         self.supervisor = Supervisor(
-            Controller(config, zernike_projection()), Wiring(None, events=self.rings["events"]), self.clock, 50.0
+            Controller(config, zernike_projection()),
+            Wiring(None, events=self.rings["events"]),
+            self.clock,
+            50.0,
         )
         self.alarms: list[AlarmMessage] = []
         self.taken = 0
@@ -132,7 +147,9 @@ class Hold:
 
     def alarmed(self, name: str) -> list[str]:
         return [
-            notice.text for notice in self.alarms if (notice.name, notice.kind) == (f"maintenance_{name}", "raised")
+            notice.text
+            for notice in self.alarms
+            if (notice.name, notice.kind) == (f"maintenance_{name}", "raised")
         ]
 
     def timeline(self) -> tuple[np.ndarray, np.ndarray, list[str]]:
@@ -142,7 +159,11 @@ class Hold:
         assert "SeriesLines:names" in components(paths[0], "/shape/vibrations")
         plots = [plot for plot in plots if plot[0].size]
         words = [text for path in paths for _, text in strings(path, "/events", "TextLog:text")]
-        return np.concatenate([t for t, _ in plots]), np.concatenate([values for _, values in plots]), words
+        return (
+            np.concatenate([t for t, _ in plots]),
+            np.concatenate([values for _, values in plots]),
+            words,
+        )
 
 
 def components(path: Path, entity: str) -> set[str]:
@@ -187,7 +208,9 @@ def test_a_shift_over_a_restart_of_the_hold_is_told_everywhere(
     first.restart_acquisition()
     minutes(first, 400.0, 2, 48.0)
     first.end()
-    assert [(line["kind"], line["name"]) for line in first.told] == [("maintenance", "pump_resonance")]
+    assert [(line["kind"], line["name"]) for line in first.told] == [
+        ("maintenance", "pump_resonance")
+    ]
     (driven,) = first.alarmed("pump_resonance")
     assert "the pump's strokes, 48.1 Hz, drive the mirror's vibration at 48." in driven
     (reported,) = report_of(first.folder, capsys)
@@ -197,7 +220,10 @@ def test_a_shift_over_a_restart_of_the_hold_is_told_everywhere(
     second.end()
     (moved,) = second.told
     assert (moved["kind"], moved["name"]) == ("maintenance", "film_tension")
-    assert "moved by +1.0% within 168 h: the film's tension by +2.0%; check clamping" in moved["message"]
+    assert (
+        "moved by +1.0% within 168 h: the film's tension by +2.0%; check clamping"
+        in moved["message"]
+    )
     assert second.alarmed("film_tension") == [f"Maintenance film_tension: {moved['message']}"]
     assert [line["message"] for line in report_of(second.folder, capsys)] == [moved["message"]]
     before, after = (hold.timeline() for hold in (first, second))
@@ -219,11 +245,15 @@ class Film:
     def watch(self, hold: Hold, at_s: float, searches: int, change: float) -> None:
         """Minutes of a film whose vibrations have changed their frequencies."""
         modes = tuple(
-            replace(mode, amplitude_nm=20.0, frequency_hz=mode.frequency_hz * (1 + change)) for mode in DRUM_MODES
+            replace(mode, amplitude_nm=20.0, frequency_hz=mode.frequency_hz * (1 + change))
+            for mode in DRUM_MODES
         )
         renderer = OpticsRenderer(self.optics, FILM, seed=3, modes=modes)
         hold.ticks(at_s)
-        still = [renderer.render(p, float(self.moved_um[0])) for p in phase.full_sequence(self.optics.pattern)]
+        still = [
+            renderer.render(p, float(self.moved_um[0]))
+            for p in phase.full_sequence(self.optics.pattern)
+        ]
         full = self.tracker.full(still, at_s + 13.0 + 0.1 * np.arange(18), np.full(18, np.nan))
         assert full.verdict == "ok", full.reason
         hold.take(full)
@@ -243,7 +273,11 @@ MINUTES = (3, 2, 1, 1, 1, 1, 2, 3)  # of each day
 @pytest.mark.timeout(3600)
 @pytest.mark.parametrize("change", [0.01, -0.01, 0.003, 0.0])
 def test_of_a_week_of_pictures_a_shift_of_a_per_cent_is_told_everywhere(
-    change: float, tmp_path: Path, stack: ExitStack, capsys: pytest.CaptureFixture[str], undrawn: None
+    change: float,
+    tmp_path: Path,
+    stack: ExitStack,
+    capsys: pytest.CaptureFixture[str],
+    undrawn: None,
 ) -> None:
     """All of a drum's modes move by it within a week; on day 4 the acquisition restarts."""
     hold, film = Hold(tmp_path, 0.0, stack), Film()
@@ -275,7 +309,12 @@ def test_of_a_week_of_pictures_a_shift_of_a_per_cent_is_told_everywhere(
     (told,) = hold.told
     assert (told["kind"], told["name"]) == ("maintenance", "film_tension")
     # the first five searches end on day 1, and their median is of day 0
-    assert f"moved by {change:+.1%} within 144 h: the film's tension by {2 * change:+.1%}" in told["message"]
+    assert (
+        f"moved by {change:+.1%} within 144 h: the film's tension by {2 * change:+.1%}"
+        in told["message"]
+    )
     assert told["mono_s"] > 7 * DAY_S
-    assert hold.alarmed("film_tension") == [line["message"] for line in reported] == [told["message"]]
+    assert (
+        hold.alarmed("film_tension") == [line["message"] for line in reported] == [told["message"]]
+    )
     assert any(told["message"] in text for text in words)

@@ -71,7 +71,9 @@ def test_nobody_acknowledges_more_people_are_told() -> None:
     assert (notice.kind, notice.escalated) == ("reminder", True)
     book.take(GOOD, 5000.0)
     (notice,) = book.step(5030.0)
-    assert (notice.kind, notice.escalated) == ("cleared", True), "who was woken is told that it is over"
+    assert (notice.kind, notice.escalated) == ("cleared", True), (
+        "who was woken is told that it is over"
+    )
 
 
 def test_acknowledged_it_is_quiet_until_it_is_over() -> None:

@@ -1,4 +1,6 @@
-"""The watcher over real rings, the outbox, and Apprise replaced by a stand-in with its three names."""
+"""The watcher over real rings, the outbox, and Apprise replaced by a
+stand-in with its three names.
+"""
 
 from __future__ import annotations
 
@@ -63,7 +65,9 @@ def told(sender: FakeSender) -> list[tuple[str, str]]:
 def test_a_fault_that_was_held_for_too_long_is_told_as_latched() -> None:
     sender = FakeSender()
     watcher = Watcher(CONFIG, [Outbox(sender)], 0.0)
-    watcher.look([ROW.pack()], [message(kind="fault", name="displacement_missing", latching=False)], 1.0)
+    watcher.look(
+        [ROW.pack()], [message(kind="fault", name="displacement_missing", latching=False)], 1.0
+    )
     watcher.look([ROW.pack()], [message(kind="state", state="fault", **{"from": "hold"})], 31.0)
     assert [(notice.name, notice.severity) for notice in sender.through] == [
         ("glitch", "warning"),
@@ -137,7 +141,9 @@ def test_an_escalation_is_tried_until_it_is_through_and_keeps_nobody_else_waitin
     assert told(behind) == [("fault", "escalated")]
 
 
-@pytest.mark.parametrize("event", [{"kind": "alarms_acknowledged"}, {"kind": "command", "command": "ack"}])
+@pytest.mark.parametrize(
+    "event", [{"kind": "alarms_acknowledged"}, {"kind": "command", "command": "ack"}]
+)
 def test_an_acknowledgement_keeps_the_others_asleep(event: EventLine) -> None:
     sender = FakeSender()
     watcher = Watcher(CONFIG, [Outbox(sender)], 0.0)
@@ -229,15 +235,21 @@ def urls(folder: Path, *lines: str, name: str = "urls.txt") -> str:
 def test_who_is_told(tmp_path: Path, apprise: list[tuple[str, str, str, str]]) -> None:
     first = urls(tmp_path, "# people", "", "mail://ann", "broken://x")
     more = urls(tmp_path, "chat://all", name="more.txt")
-    send, escalate = apprise_senders(AlarmsConfig(urls_file=first, escalation_urls_file=more), "the-run")
+    send, escalate = apprise_senders(
+        AlarmsConfig(urls_file=first, escalation_urls_file=more), "the-run"
+    )
     assert send(TEST), "one of two is enough"
-    assert apprise == [("mail://ann", "membrane-ctrl warning raised: test", "text\nrun: the-run", "warning")]
+    assert apprise == [
+        ("mail://ann", "membrane-ctrl warning raised: test", "text\nrun: the-run", "warning")
+    ]
     assert escalate(replace(TEST, kind="escalated", escalated=True))
     assert [sent[0] for sent in apprise[1:]] == ["chat://all"]
     assert apprise[-1][3] == "failure"
 
 
-def test_files_of_urls_that_are_none(tmp_path: Path, apprise: list[tuple[str, str, str, str]]) -> None:
+def test_files_of_urls_that_are_none(
+    tmp_path: Path, apprise: list[tuple[str, str, str, str]]
+) -> None:
     with pytest.raises(InputError, match="no such file"):
         read_urls(tmp_path / "none")
     with pytest.raises(InputError, match="no URL found"):
@@ -248,7 +260,9 @@ def test_files_of_urls_that_are_none(tmp_path: Path, apprise: list[tuple[str, st
     assert "password" not in str(refused.value)
 
 
-def test_without_apprise_a_run_does_not_begin(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_without_apprise_a_run_does_not_begin(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.setattr("importlib.util.find_spec", lambda name: None)
     require_sendable(AlarmsConfig())
     with pytest.raises(DeviceError, match=r"pip install 'membrane-ctrl\[alarms\]'"):
@@ -266,7 +280,8 @@ def test_alarm_test(
     assert run(["alarm", "test", "--config", str(config), "--escalated"]) == 2
     assert "escalation_urls_file: missing" in capsys.readouterr().err
     config.write_text(
-        config.read_text() + f'escalation_urls_file = "{urls(tmp_path, "refusing://x", name="more.txt")}"\n'
+        config.read_text()
+        + f'escalation_urls_file = "{urls(tmp_path, "refusing://x", name="more.txt")}"\n'
     )
     assert run(["alarm", "test", "--config", str(config), "--escalated"]) == 4
     assert "more.txt: no service accepted the message" in capsys.readouterr().err

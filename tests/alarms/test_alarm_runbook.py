@@ -18,12 +18,21 @@ from membrane_ctrl.model.notices import NoticeKey, Topic
 RUNBOOK = (Path(__file__).parents[2] / "docs" / "operations.md").read_text(encoding="utf-8")
 SOURCES = "".join(path.read_text(encoding="utf-8") for path in Path(*alarms.__path__).glob("*.py"))
 BY_SUBJECT = {Topic.CHILD, Topic.MAINTENANCE}  # named by their subjects
-OF_EVENTS = {NoticeKey(topic).alarm for cls in KINDS.values() for topic in cls.opens if topic not in BY_SUBJECT}
+OF_EVENTS = {
+    NoticeKey(topic).alarm
+    for cls in KINDS.values()
+    for topic in cls.opens
+    if topic not in BY_SUBJECT
+}
 PLAIN = set(re.findall(r'Sign\("(\w+)"', SOURCES)) | OF_EVENTS
-MAINTENANCE = re.findall(r'^ +\(?"(\w+)",', Path(film_health.__file__).read_text(encoding="utf-8"), re.MULTILINE)
+MAINTENANCE = re.findall(
+    r'^ +\(?"(\w+)",', Path(film_health.__file__).read_text(encoding="utf-8"), re.MULTILINE
+)
 VIBRATIONS = re.findall(r'_notice\("(\w+)"', Path(live.__file__).read_text(encoding="utf-8"))
 RULES = [rule.name for rule in Config().alarms.rules]
-CHILDREN = [NoticeKey(Topic.CHILD, child).alarm for child in (run_events.RECORDER, "acquisition", "screen")]
+CHILDREN = [
+    NoticeKey(Topic.CHILD, child).alarm for child in (run_events.RECORDER, "acquisition", "screen")
+]
 
 
 def test_the_names_are_found() -> None:
@@ -33,7 +42,13 @@ def test_the_names_are_found() -> None:
 
 
 @pytest.mark.parametrize(
-    "name", [*sorted(PLAIN), *(f"maintenance_{name}" for name in MAINTENANCE + VIBRATIONS), *RULES, *CHILDREN]
+    "name",
+    [
+        *sorted(PLAIN),
+        *(f"maintenance_{name}" for name in MAINTENANCE + VIBRATIONS),
+        *RULES,
+        *CHILDREN,
+    ],
 )
 def test_what_to_do_is_said(name: str) -> None:
     assert re.search(rf"^\|.*`{name}`.*\|.+\|.+\|$", RUNBOOK, re.MULTILINE)

@@ -1,4 +1,6 @@
-"""Services that answer without end cost neither the alarms of the others, nor memory, nor more than a minute."""
+"""Services that answer without end cost neither the alarms of the others, nor memory, nor more than
+a minute.
+"""
 
 from __future__ import annotations
 
@@ -41,7 +43,9 @@ def test_one_success_suffices_and_all_are_asked() -> None:
     assert not send_to_all([Service(Broken()), Service(Plugin(False))], "t", "b", "warning")
 
 
-def test_a_service_that_hangs_delays_no_other_and_is_not_asked_again(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_service_that_hangs_delays_no_other_and_is_not_asked_again(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     monkeypatch.setattr(sending, "SERVICE_S", 0.3)
     release = threading.Event()
     hanging, good = Plugin(waits=release), Plugin()
@@ -89,11 +93,13 @@ threading.Thread(target=server.serve_forever, daemon=True).start()
 with limited_memory():
     print(send_to_all([Service(Reads())], "t", "b", "warning"), send_to_all([Service(Good())], "t", "b", "warning"))
 print(peak_mb())
-"""
+"""  # noqa: E501
 
 
 def test_an_answer_without_end_is_given_up_at_the_limit_of_memory() -> None:
-    done = subprocess.run([sys.executable, "-c", _ENDLESS], capture_output=True, text=True, check=False, timeout=60)
+    done = subprocess.run(
+        [sys.executable, "-c", _ENDLESS], capture_output=True, text=True, check=False, timeout=60
+    )
     assert done.returncode == 0, done.stderr
     outcome, memory_mb = done.stdout.splitlines()
     assert outcome == "False True"

@@ -27,7 +27,10 @@ LOW = AlarmRule(name="low", field="gauge_pressure_pa", raise_at=100.0, clear_at=
         ({"kind": "state", "state": "hold", "from": "settle"}, []),
         ({"kind": "link", "message": "no answer"}, [("link", True, "warning")]),
         ({"kind": "link", "message": "connected again", "up": True}, [("link", False, "warning")]),
-        ({"kind": "child_ended", "child": "recorder", "exit_code": -9}, [("recorder_ended", True, "warning")]),
+        (
+            {"kind": "child_ended", "child": "recorder", "exit_code": -9},
+            [("recorder_ended", True, "warning")],
+        ),
         ({"kind": "child_silent", "child": "recorder"}, [("recorder_ended", True, "warning")]),
         ({"kind": "child_given_up", "child": "recorder"}, [("recorder_ended", True, "warning")]),
         (
@@ -37,18 +40,33 @@ LOW = AlarmRule(name="low", field="gauge_pressure_pa", raise_at=100.0, clear_at=
         ({"kind": "child_restarted", "child": "screen"}, [("screen_ended", False, "warning")]),
         ({"kind": "recorder_error", "message": "disk full"}, [("recorder", True, "warning")]),
         ({"kind": "recorder_recovered"}, [("recorder", False, "warning")]),
-        ({"kind": "port_failed", "port": "tls", "message": "x", "again_s": 1.0}, [("port", True, "warning")]),
+        (
+            {"kind": "port_failed", "port": "tls", "message": "x", "again_s": 1.0},
+            [("port", True, "warning")],
+        ),
         ({"kind": "port_failed", "port": "tls", "message": "x"}, []),
         ({"kind": "port_open"}, [("port", False, "warning")]),
-        ({"kind": "maintenance", "name": "creep", "message": "x"}, [("maintenance_creep", True, "warning")]),
+        (
+            {"kind": "maintenance", "name": "creep", "message": "x"},
+            [("maintenance_creep", True, "warning")],
+        ),
         ({"kind": "maintenance_over", "name": "creep"}, [("maintenance_creep", False, "warning")]),
-        ({"kind": "plausibility", "faulty": "laser", "readings": "x"}, [("plausibility", True, "warning")]),
+        (
+            {"kind": "plausibility", "faulty": "laser", "readings": "x"},
+            [("plausibility", True, "warning")],
+        ),
         ({"kind": "plausibility", "faulty": "none"}, [("plausibility", False, "warning")]),
         ({"kind": "latch_failed", "message": "disk full"}, [("latch", True, "critical")]),
         ({"kind": "latch_written"}, [("latch", False, "warning")]),
         ({"kind": "lock", "word": "bofak"}, [("lock", True, "warning")]),
-        ({"kind": "unlock", "word": "bofak"}, [("lock", False, "warning"), ("lock_storage", False, "warning")]),
-        ({"kind": "lock_not_stored", "word": "bofak", "message": "disk full"}, [("lock_storage", True, "critical")]),
+        (
+            {"kind": "unlock", "word": "bofak"},
+            [("lock", False, "warning"), ("lock_storage", False, "warning")],
+        ),
+        (
+            {"kind": "lock_not_stored", "word": "bofak", "message": "disk full"},
+            [("lock_storage", True, "critical")],
+        ),
         ({"kind": "lock_stored", "word": "bofak"}, [("lock_storage", False, "warning")]),
         ({"kind": "end", "exit": "safety_trip"}, [("run_ended", True, "critical")]),
         ({"kind": "end", "exit": "done"}, []),
@@ -61,7 +79,7 @@ LOW = AlarmRule(name="low", field="gauge_pressure_pa", raise_at=100.0, clear_at=
         ({"kind": "why", "why": "x"}, []),
         ({}, []),
     ],
-)  # fmt: skip
+)
 def test_events_as_signs(event: EventLine, expected: list[tuple[str, bool, str]]) -> None:
     signs = signs_of(from_dict(event).notice_changes({}))
     assert [(sign.name, sign.bad, sign.severity) for sign in signs] == expected
@@ -69,7 +87,11 @@ def test_events_as_signs(event: EventLine, expected: list[tuple[str, bool, str]]
 
 @pytest.mark.parametrize(
     ("faulty", "says"),
-    [("laser", "the laser is wrong"), ("optics", "the camera is wrong"), ("unknown", "disagree (laser")],
+    [
+        ("laser", "the laser is wrong"),
+        ("optics", "the camera is wrong"),
+        ("unknown", "disagree (laser"),
+    ],
 )
 def test_who_is_wrong_is_said_in_the_operators_words(faulty: str, says: str) -> None:
     line = {"kind": "plausibility", "faulty": faulty, "readings": "laser +20.0 µm, camera +0.1 µm"}
@@ -109,9 +131,15 @@ def test_the_text_names_value_and_limit() -> None:
 @pytest.mark.parametrize(
     ("alarms", "says"),
     [
-        ({"rules": [{"name": "a", "field": "nothing", "raise_at": 1, "clear_at": 0}]}, "unknown telemetry field"),
+        (
+            {"rules": [{"name": "a", "field": "nothing", "raise_at": 1, "clear_at": 0}]},
+            "unknown telemetry field",
+        ),
         ({"rules": [{"name": "a", "field": "error_um", "raise_at": 1, "clear_at": 1}]}, "flap"),
-        ({"rules": [{"name": "a", "field": "error_um", "raise_at": 1, "clear_at": 0}] * 2}, "same name"),
+        (
+            {"rules": [{"name": "a", "field": "error_um", "raise_at": 1, "clear_at": 0}] * 2},
+            "same name",
+        ),
         ({"escalation_urls_file": "x"}, "needs urls_file"),
     ],
 )
@@ -121,7 +149,13 @@ def test_rules_that_are_none_are_one_line(alarms: dict[str, object], says: str) 
 
 
 def test_the_notice_of_a_lock_names_text_author_time_and_word() -> None:
-    line = {"kind": "lock", "word": "bofak", "text": "hands inside", "author": "unix:ann", "set_utc": "2026-01-02"}
+    line = {
+        "kind": "lock",
+        "word": "bofak",
+        "text": "hands inside",
+        "author": "unix:ann",
+        "set_utc": "2026-01-02",
+    }
     (sign,) = signs_of(from_dict(line).notice_changes({}))
     assert sign.about == "bofak"
     for part in ("hands inside", "unix:ann", "2026-01-02", "bofak"):

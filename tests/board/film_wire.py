@@ -1,4 +1,6 @@
-"""The far end of a simulated board's film wire (board/port_bench/bench_line.h): a plant in place of transducers."""
+"""The far end of a simulated board's film wire (board/port_bench/bench_line.h): a plant in place of
+transducers.
+"""
 
 from __future__ import annotations
 
@@ -14,7 +16,9 @@ _PERIOD_S = 0.01  # the age that a sample may have
 
 
 class FilmWire:
-    """Listens for one board. The pump's enable drops out when the board has not renewed it for `enable_s`."""
+    """Listens for one board. The pump's enable drops out when the board has not renewed it for
+    `enable_s`.
+    """
 
     def __init__(self, plant: BoardPlant, enable_s: float = 0.1) -> None:
         self._plant = plant
@@ -72,8 +76,13 @@ def sample_line(plant: BoardPlant) -> str:
     """The newest sample as the wire carries it: counts of the registers."""
     sample = plant.sample()
     registers = default_map()
-    counts = [_counts(getattr(sample, name), registers.register(name).counts_per_unit) for name in CHANNELS]
-    return f"I {' '.join(map(str, counts))} {sample.displacement_quality} {sample.interlock_inputs}\n"
+    counts = [
+        _counts(getattr(sample, name), registers.register(name).counts_per_unit)
+        for name in CHANNELS
+    ]
+    return (
+        f"I {' '.join(map(str, counts))} {sample.displacement_quality} {sample.interlock_inputs}\n"
+    )
 
 
 def _counts(value: float, counts_per_unit: int) -> int:

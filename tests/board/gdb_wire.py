@@ -1,4 +1,6 @@
-"""QEMU's gdbstub, spoken just far enough to damage an emulated board: stop it, write to it, let it go on."""
+"""QEMU's gdbstub, spoken just far enough to damage an emulated board: stop it, write to it, let it
+go on.
+"""
 
 from __future__ import annotations
 

@@ -1,4 +1,6 @@
-"""The firmware on an emulated Cortex-M3 (QEMU's mps2-an385): its line is a pseudo terminal, its film a socket."""
+"""The firmware on an emulated Cortex-M3 (QEMU's mps2-an385): its line is a pseudo terminal, its
+film a socket.
+"""
 
 from __future__ import annotations
 
@@ -24,8 +26,14 @@ def built_image(folder: Path) -> Path:
 
 def addresses(image: Path) -> dict[str, int]:
     """Addresses of functions and variables in the image."""
-    listing = subprocess.run(["arm-none-eabi-nm", str(image)], check=True, capture_output=True, text=True).stdout
-    return {row.split()[2]: int(row.split()[0], 16) for row in listing.splitlines() if len(row.split()) == 3}
+    listing = subprocess.run(
+        ["arm-none-eabi-nm", str(image)], check=True, capture_output=True, text=True
+    ).stdout
+    return {
+        row.split()[2]: int(row.split()[0], 16)
+        for row in listing.splitlines()
+        if len(row.split()) == 3
+    }
 
 
 @dataclass
@@ -53,20 +61,37 @@ class QemuBoard:
 
 
 @contextlib.asynccontextmanager
-async def qemu_board(image: Path, folder: Path, film_port: int, *options: str) -> AsyncIterator[QemuBoard]:
+async def qemu_board(
+    image: Path, folder: Path, film_port: int, *options: str
+) -> AsyncIterator[QemuBoard]:
     """Start the image and wait until its line is there; ends it afterwards."""
     socket = folder / "qmp"
     process = await asyncio.create_subprocess_exec(
-        "qemu-system-arm", "-M", "mps2-an385", "-display", "none", "-kernel", str(image), "-serial", "pty",
-        "-serial", f"tcp:127.0.0.1:{film_port}", "-qmp", f"unix:{socket},server=on,wait=off", *options,
-        stdout=asyncio.subprocess.PIPE, stderr=asyncio.subprocess.STDOUT,
-    )  # fmt: skip
+        "qemu-system-arm",
+        "-M",
+        "mps2-an385",
+        "-display",
+        "none",
+        "-kernel",
+        str(image),
+        "-serial",
+        "pty",
+        "-serial",
+        f"tcp:127.0.0.1:{film_port}",
+        "-qmp",
+        f"unix:{socket},server=on,wait=off",
+        *options,
+        stdout=asyncio.subprocess.PIPE,
+        stderr=asyncio.subprocess.STDOUT,
+    )
     try:
         assert process.stdout is not None
         line = (await asyncio.wait_for(process.stdout.readline(), _START_S)).decode()
         rtu = next((word for word in line.split() if word.startswith("/dev/")), "")
         assert rtu, line
-        kept = os.open(rtu, os.O_RDWR | os.O_NOCTTY)  # QEMU takes a second to notice a new client, and loses answers
+        kept = os.open(
+            rtu, os.O_RDWR | os.O_NOCTTY
+        )  # QEMU takes a second to notice a new client, and loses answers
         reader, writer = await asyncio.open_unix_connection(str(socket))
         board = QemuBoard(rtu, reader, writer)
         await reader.readline()  # the greeting

@@ -1,4 +1,6 @@
-"""The C firmware passes the conformance test: in memory, and as a program on a pseudo terminal and on TCP."""
+"""The C firmware passes the conformance test: in memory, and as a program on a pseudo terminal and
+on TCP.
+"""
 
 from __future__ import annotations
 
@@ -71,7 +73,9 @@ def host_board(host_program: Path, tmp_path: Path) -> Iterator[dict[str, str]]:
     """The firmware as a program: where its line, its TCP port and its film are."""
     settings = tmp_path / "settings.bin"
     settings.write_bytes(record({**SETTINGS, "silence_us": 50_000}))
-    with subprocess.Popen([str(host_program), str(settings)], stdout=subprocess.PIPE, text=True) as process:
+    with subprocess.Popen(
+        [str(host_program), str(settings)], stdout=subprocess.PIPE, text=True
+    ) as process:
         assert process.stdout is not None
         words = process.stdout.readline().split()
         yield dict(zip(words[::2], words[1::2], strict=True))
@@ -81,7 +85,10 @@ def host_board(host_program: Path, tmp_path: Path) -> Iterator[dict[str, str]]:
 
 @pytest.mark.real_time
 async def test_the_host_program_conforms_on_both_lines(host_board: dict[str, str]) -> None:
-    for url in (f"tcp://127.0.0.1:{host_board['tcp']}", f"rtu://{host_board['rtu']}?baud=115200&parity=N"):
+    for url in (
+        f"tcp://127.0.0.1:{host_board['tcp']}",
+        f"rtu://{host_board['rtu']}?baud=115200&parity=N",
+    ):
         findings = await examine(url, timeout_s=4.0)  # a busy machine pauses
         assert [(found.check, found.problem) for found in findings if found.problem] == []
         assert len(findings) == _FINDINGS
@@ -89,7 +96,9 @@ async def test_the_host_program_conforms_on_both_lines(host_board: dict[str, str
 
 def test_the_host_program_names_what_is_wrong(host_program: Path, tmp_path: Path) -> None:
     missing = tmp_path / "none.bin"
-    found = subprocess.run([str(host_program), str(missing)], capture_output=True, text=True, check=False)
+    found = subprocess.run(
+        [str(host_program), str(missing)], capture_output=True, text=True, check=False
+    )
     assert (found.returncode, found.stdout) == (4, "")
     assert "none.bin: No such file" in found.stderr
 
@@ -113,7 +122,9 @@ def test_tcp_clients_of_every_kind(host_board: dict[str, str]) -> None:
     assert clients[0].recv(64) == b""  # the longest idle made place
     clients[1].sendall(bytes.fromhex("000800000006090300000001"))
     assert clients[1].recv(64) == bytes.fromhex("00080000000309830b")
-    for client, junk in zip(clients[2:], ("47455420", "00010000ffff01", "000100000001010000"), strict=True):
+    for client, junk in zip(
+        clients[2:], ("47455420", "00010000ffff01", "000100000001010000"), strict=True
+    ):
         client.sendall(bytes.fromhex(junk).ljust(7, b"\r"))
         assert client.recv(64) == b""
     for client in clients:
@@ -125,7 +136,11 @@ def test_tcp_clients_of_every_kind(host_board: dict[str, str]) -> None:
 @pytest.mark.parametrize("line", ["rtu", "tcp"])
 def test_a_client_that_is_not_ours_reads_and_stops(host_board: dict[str, str], line: str) -> None:
     """mbpoll, over libmodbus."""
-    mode = ["-m", "rtu", "-b", "115200", "-P", "none"] if line == "rtu" else ["-m", "tcp", "-p", host_board["tcp"]]
+    mode = (
+        ["-m", "rtu", "-b", "115200", "-P", "none"]
+        if line == "rtu"
+        else ["-m", "tcp", "-p", host_board["tcp"]]
+    )
     target = host_board["rtu"] if line == "rtu" else "127.0.0.1"
     base = ["mbpoll", *mode, "-a", "1", "-0", "-o", "5"]
 
@@ -155,7 +170,11 @@ async def test_the_host_program_has_a_film(host_program: Path, tmp_path: Path) -
     await driver.open()
     while math.isnan((reading := await driver.read()).gauge_pressure_pa):
         continue
-    assert (reading.displacement_um, reading.gauge_pressure_pa, reading.gas_temperature_c) == (12.5, 100.0, 22.0)
+    assert (reading.displacement_um, reading.gauge_pressure_pa, reading.gas_temperature_c) == (
+        12.5,
+        100.0,
+        22.0,
+    )
     await driver.write(BenchCommand(0.5, 0.25))
     await film.until(lambda: (film.pump, film.vent) == (0.5, 0.25))
     film.gauge_pressure_pa = 801.0

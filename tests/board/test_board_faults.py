@@ -1,4 +1,6 @@
-"""The C firmware when memory, main loop, interrupts, settings or the line fail: outputs are safe in time."""
+"""The C firmware when memory, main loop, interrupts, settings or the line fail: outputs are safe in
+time.
+"""
 
 from __future__ import annotations
 
@@ -31,14 +33,22 @@ def write(name: str, values: dict[str, float]) -> bytes:
 
 def settings(period_s: float = 1.0, arm: int = 1) -> bytes:
     """Claim the board."""
-    return write("settings", {"watchdog_period_s": period_s, "watchdog_arm": arm, "claim_id": 7, "claim_key": _KEY})
+    return write(
+        "settings",
+        {"watchdog_period_s": period_s, "watchdog_arm": arm, "claim_id": 7, "claim_key": _KEY},
+    )
 
 
 def command(heartbeat: int, pump: float = 0.5, vent: float = 0.25, key: int = _KEY) -> bytes:
     """Drive pump and vent."""
     return write(
         "command",
-        {"pump_command_fraction": pump, "vent_command_fraction": vent, "heartbeat": heartbeat, "command_key": key},
+        {
+            "pump_command_fraction": pump,
+            "vent_command_fraction": vent,
+            "heartbeat": heartbeat,
+            "command_key": key,
+        },
     )
 
 
@@ -68,7 +78,9 @@ def test_the_pump_is_off_in_the_first_millisecond_after_the_period(
     assert sensors(virtual_board)["latched_faults"] == _MAP.fault_mask("watchdog")
 
 
-def test_the_period_counts_from_the_write_not_from_the_tick_before_it(virtual_board: VirtualBoard) -> None:
+def test_the_period_counts_from_the_write_not_from_the_tick_before_it(
+    virtual_board: VirtualBoard,
+) -> None:
     run_pump(virtual_board, 0.05)
     virtual_board.pass_us(400)
     virtual_board.hear(rtu_frame(1, command(2)))
@@ -104,7 +116,9 @@ def test_a_watchdog_trip_does_not_expire(virtual_board: VirtualBoard) -> None:
     assert sensors(virtual_board)["device_time_s"] == 100 * 60 + 1
 
 
-def test_over_pressure_stops_the_pump_and_opens_the_vent_within_a_sample(virtual_board: VirtualBoard) -> None:
+def test_over_pressure_stops_the_pump_and_opens_the_vent_within_a_sample(
+    virtual_board: VirtualBoard,
+) -> None:
     run_pump(virtual_board, 10.0)
     virtual_board.set_inputs([1000, 800_000])
     virtual_board.pass_us(10_000)
@@ -117,7 +131,9 @@ def test_over_pressure_stops_the_pump_and_opens_the_vent_within_a_sample(virtual
     assert virtual_board.outputs == (0, 50_000)
 
 
-def test_a_frozen_main_loop_stops_the_pump_and_resets_the_board(virtual_board: VirtualBoard) -> None:
+def test_a_frozen_main_loop_stops_the_pump_and_resets_the_board(
+    virtual_board: VirtualBoard,
+) -> None:
     run_pump(virtual_board, 10.0)
     virtual_board.pass_us(1000 * (_STALLED_MS - 1), main_loop=False)
     assert virtual_board.outputs == (25_000, 12_500)
@@ -128,7 +144,9 @@ def test_a_frozen_main_loop_stops_the_pump_and_resets_the_board(virtual_board: V
     assert sensors(virtual_board)["watchdog_armed"] == 0
 
 
-def test_frozen_interrupts_reset_the_board_although_the_main_loop_turns(virtual_board: VirtualBoard) -> None:
+def test_frozen_interrupts_reset_the_board_although_the_main_loop_turns(
+    virtual_board: VirtualBoard,
+) -> None:
     run_pump(virtual_board, 10.0)
     virtual_board.pass_us(1000 * (_HARDWARE_MS + 1), interrupts=False)
     assert (virtual_board.outputs, virtual_board.resets) == ((0, 0), 1)
@@ -165,11 +183,17 @@ def test_every_damaged_bit_of_what_the_board_decides_by_resets_it_in_a_milliseco
             refused = virtual_board.chip.board_write(72, 1, (ctypes.c_uint16 * 1)(1))
             assert refused == 4, "a write seals the damage"
             virtual_board.pass_us(_TICK_US)
-            assert (virtual_board.outputs, virtual_board.resets) == ((0, 0), 1), f"word {offset // 4}"
+            assert (virtual_board.outputs, virtual_board.resets) == ((0, 0), 1), (
+                f"word {offset // 4}"
+            )
 
 
-def test_damage_anywhere_in_the_firmware_s_memory_never_drives_the_pump_unfed(virtual_board: VirtualBoard) -> None:
-    """Random bits of all its variables flip while requests come: at worst it resets or does not answer."""
+def test_damage_anywhere_in_the_firmware_s_memory_never_drives_the_pump_unfed(
+    virtual_board: VirtualBoard,
+) -> None:
+    """Random bits of all its variables flip while requests come: at worst it resets or does not
+    answer.
+    """
     memory = virtual_board.memory()
     chance = random.Random(2)
     spans = [memory[name] for name in ("now", "inverse", "frame", "stalled_ticks", "clients")]
@@ -186,14 +210,23 @@ def test_damage_anywhere_in_the_firmware_s_memory_never_drives_the_pump_unfed(vi
 
 
 @pytest.mark.parametrize("damage", ["absent", "blank", "flipped", "short", "baud", "divisor"])
-def test_a_board_without_valid_settings_has_no_values_and_no_pump(virtual_board: VirtualBoard, damage: str) -> None:
-    records = (record({**SETTINGS, "unit_id": 9, "silence_us": 2000 + tried}) for tried in range(5000))
-    good = next(found for found in records if found[-1] == 0)  # the byte that a short one lacks is 0 in memory
+def test_a_board_without_valid_settings_has_no_values_and_no_pump(
+    virtual_board: VirtualBoard, damage: str
+) -> None:
+    records = (
+        record({**SETTINGS, "unit_id": 9, "silence_us": 2000 + tried}) for tried in range(5000)
+    )
+    good = next(
+        found for found in records if found[-1] == 0
+    )  # the byte that a short one lacks is 0 in memory
     bad = {
-        "absent": b"", "blank": b"\xff" * len(good), "short": good[:-1],
+        "absent": b"",
+        "blank": b"\xff" * len(good),
+        "short": good[:-1],
         "flipped": good[:30] + bytes([good[30] ^ 1]) + good[31:],
-        "baud": _sealed(good, 12, 100), "divisor": _sealed(good, 48, 0),
-    }[damage]  # fmt: skip
+        "baud": _sealed(good, 12, 100),
+        "divisor": _sealed(good, 48, 0),
+    }[damage]
     virtual_board.power_on(bad)
     virtual_board.set_inputs(_QUIET)
     virtual_board.pass_us(10_000)
@@ -213,7 +246,10 @@ def _sealed(good: bytes, at: int, value: int) -> bytes:
 
 
 def test_scales_turn_raw_values_into_counts(firmware_library: Path) -> None:
-    gauge = {"points": [[13_107, 0.0], [65_535, 1000.0]], "plausible_raw": [11_796, 65_534]}  # 4..20 mA
+    gauge = {
+        "points": [[13_107, 0.0], [65_535, 1000.0]],
+        "plausible_raw": [11_796, 65_534],
+    }  # 4..20 mA
     board = VirtualBoard(firmware_library, {**SETTINGS, "channel": {"gauge_pressure_pa": gauge}})
     for raw, pa in ((13_107, 0.0), (39_321, 500.0), (11_796, -25.0), (26_214, 250.0)):
         board.set_inputs([0, raw])
@@ -229,7 +265,9 @@ def test_a_laser_that_says_nothing_is_not_good(virtual_board: VirtualBoard) -> N
     assert sensors(virtual_board)["displacement_quality"] == 0xFFFF
 
 
-def test_a_request_cut_at_any_byte_does_nothing_and_the_next_one_is_answered(virtual_board: VirtualBoard) -> None:
+def test_a_request_cut_at_any_byte_does_nothing_and_the_next_one_is_answered(
+    virtual_board: VirtualBoard,
+) -> None:
     run_pump(virtual_board, 10.0)
     frame = rtu_frame(1, command(2, pump=0.75))
     for kept in range(len(frame)):
@@ -241,7 +279,9 @@ def test_a_request_cut_at_any_byte_does_nothing_and_the_next_one_is_answered(vir
     assert virtual_board.outputs == (37_500, 12_500)
 
 
-def test_a_line_cut_within_a_request_stops_the_pump_after_the_period(virtual_board: VirtualBoard) -> None:
+def test_a_line_cut_within_a_request_stops_the_pump_after_the_period(
+    virtual_board: VirtualBoard,
+) -> None:
     frame = rtu_frame(1, command(2))
     for kept in range(len(frame)):
         virtual_board.power_on(record(SETTINGS))
@@ -283,7 +323,9 @@ def test_a_line_that_tears_frames_apart_may_have_a_longer_silence(firmware_libra
     assert board.ask_frame(ask[3:]) == rtu_frame(1, bytes.fromhex("03044d420003"))
 
 
-def test_other_units_are_left_alone_and_a_broadcast_is_obeyed_without_an_answer(virtual_board: VirtualBoard) -> None:
+def test_other_units_are_left_alone_and_a_broadcast_is_obeyed_without_an_answer(
+    virtual_board: VirtualBoard,
+) -> None:
     run_pump(virtual_board, 10.0)
     stop = write("stop", {"stop": 1})
     assert virtual_board.ask(stop, unit=2) == b""

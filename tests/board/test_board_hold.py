@@ -1,7 +1,8 @@
-"""`hold` holds the twin's film through the C firmware on an emulated Cortex-M3, as well as through the Python board.
+"""`hold` holds the twin's film through the C firmware on an emulated Cortex-M3, as well as through
+the Python board.
 
-BOARD_HOLD_S says how long; `make board-hold` takes ten minutes each. Times are generous, as a busy machine takes the
-processor away from the emulator.
+BOARD_HOLD_S says how long; `make board-hold` takes ten minutes each. Times are generous, as a busy
+machine takes the processor away from the emulator.
 """
 
 from __future__ import annotations
@@ -38,17 +39,32 @@ async def _held(kind: str, folder: Path) -> tuple[dict[str, Any], list[float]]:
     """The summary of a hold, and the true displacements once settled (µm)."""
     (folder / kind).mkdir()
     bench = await asyncio.create_subprocess_exec(
-        sys.executable, "-m", "tests.board.film_bench", kind, str(folder / kind), stdout=asyncio.subprocess.PIPE
+        sys.executable,
+        "-m",
+        "tests.board.film_bench",
+        kind,
+        str(folder / kind),
+        stdout=asyncio.subprocess.PIPE,
     )
     assert bench.stdout is not None
     url = (await bench.stdout.readline()).decode().strip()
     config = folder / f"{kind}.toml"
     config.write_text(_CONFIG.format(url=url))
     hold = await asyncio.create_subprocess_exec(
-        sys.executable, "-m", "membrane_ctrl", "hold", "--config", str(config), "--duration", f"{_HOLD_S:g}s",
-        "--logs", str(folder / f"logs-{kind}"), "--json",
-        stdout=asyncio.subprocess.PIPE, stderr=asyncio.subprocess.PIPE,
-    )  # fmt: skip
+        sys.executable,
+        "-m",
+        "membrane_ctrl",
+        "hold",
+        "--config",
+        str(config),
+        "--duration",
+        f"{_HOLD_S:g}s",
+        "--logs",
+        str(folder / f"logs-{kind}"),
+        "--json",
+        stdout=asyncio.subprocess.PIPE,
+        stderr=asyncio.subprocess.PIPE,
+    )
     said, errors = await hold.communicate()
     bench.terminate()
     await bench.wait()

@@ -1,6 +1,8 @@
-"""The firmware on an emulated Cortex-M3: it conforms, and stops the pump when processor, code, memory or line fail.
+"""The firmware on an emulated Cortex-M3: it conforms, and stops the pump when processor, code,
+memory or line fail.
 
-The emulator has no brown-out and no real time: docs/board.md has the times, and here only the order of events counts.
+The emulator has no brown-out and no real time: docs/board.md has the times, and here only the order
+of events counts.
 """
 
 from __future__ import annotations
@@ -64,7 +66,9 @@ async def rig(
     wire = FilmWire(film, enable_s=getattr(request, "param", math.inf))
     await wire.start()
     gdb = tmp_path / "gdb"
-    async with qemu_board(image, tmp_path, wire.port, "-gdb", f"unix:{gdb},server=on,wait=off") as board:
+    async with qemu_board(
+        image, tmp_path, wire.port, "-gdb", f"unix:{gdb},server=on,wait=off"
+    ) as board:
         yield _Rig(film, board, gdb, symbols)
     await wire.stop()
 
@@ -79,7 +83,11 @@ async def test_sensors_arrive_and_outputs_leave(rig: _Rig) -> None:
     driver = await rig.running()
     reading = await driver.read()
     assert (reading.displacement_um, reading.gauge_pressure_pa) == (12.5, 100.0)
-    assert (reading.ambient_pressure_pa, reading.air_temperature_c, reading.gas_temperature_c) == (101_325, 21, 22)
+    assert (reading.ambient_pressure_pa, reading.air_temperature_c, reading.gas_temperature_c) == (
+        101_325,
+        21,
+        22,
+    )
     assert (reading.pump_fraction, reading.vent_fraction) == (0.5, 0.25)
     rig.film.gauge_pressure_pa = 801.0
     await rig.film.until(lambda: (rig.film.pump, rig.film.vent) == (0.0, 1.0))
@@ -123,7 +131,9 @@ async def _damage_registers(rig: _Rig, board: StoppedBoard) -> None:
 
 
 async def _overflow_stack(rig: _Rig, board: StoppedBoard) -> None:
-    assert await board.register(_STACK_POINTER) > rig.symbols["main_stack_guard"], "stopped within an interrupt"
+    assert await board.register(_STACK_POINTER) > rig.symbols["main_stack_guard"], (
+        "stopped within an interrupt"
+    )
     await board.set_register(_STACK_POINTER, rig.symbols["main_stack_guard"] + 16)
 
 

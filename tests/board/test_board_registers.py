@@ -1,4 +1,6 @@
-"""The C firmware and the Python emulator, which share no code, agree on every register after random transactions."""
+"""The C firmware and the Python emulator, which share no code, agree on every register after random
+transactions.
+"""
 
 from __future__ import annotations
 
@@ -15,18 +17,25 @@ from firmware_iface.emulators.modbus_server import respond
 from firmware_iface.register_map import Block, default_map
 from tests.board.virtual_board import NO_VALUE, SETTINGS, VirtualBoard
 
-# after a request until the outputs are compared: a sample lies in it, so that both boards know the same
+# after a request until the outputs are compared: a sample lies in it, so that both boards know the
+# same
 _SETTLED_MS = 7
 _KEYS = (0x12345678, 0x12340000, 0x00005678, 0xFFFFFFFF, 0)
 _MAP = default_map()
 _WRITABLE = [block for block in _MAP.blocks if block.access == "rw"]
-# odd, and what happens comes at even distances: no feed is exactly a period old, where one clock rounds up
+# odd, and what happens comes at even distances: no feed is exactly a period old, where one clock
+# rounds up
 _PERIODS_MS = (51, 75, 101, 333, 1001, 9999)
 _SAMPLE_MS = 5
-# short, so that they expire often; a microsecond more, because a sum of floats ends beside the firmware's integers
+# short, so that they expire often; a microsecond more, because a sum of floats ends beside the
+# firmware's integers
 _TIMEOUT_S, _FROZEN_S, _FITTED = 0.401, 1.501, 0b101
 _STORED = pump_board.StoredSettings(True, _TIMEOUT_S + 1e-6, _FROZEN_S + 1e-6, _FITTED)
-_PROTECTION = {"gauge_timeout_s": _TIMEOUT_S, "gauge_frozen_s": _FROZEN_S, "interlocks_fitted": [0, 2]}
+_PROTECTION = {
+    "gauge_timeout_s": _TIMEOUT_S,
+    "gauge_frozen_s": _FROZEN_S,
+    "interlocks_fitted": [0, 2],
+}
 
 
 class Twins:
@@ -50,7 +59,9 @@ class Twins:
         self.c.set_interlocks(self.interlocks)
 
     def _follow(self, to_us: int) -> None:
-        """Let the Python board run through the firmware's ticks; it samples at the first one, then at every fifth."""
+        """Let the Python board run through the firmware's ticks; it samples at the first one, then
+        at every fifth.
+        """
         while self.python_ms < to_us // 1000:
             self.python_ms += 1
             if (self.python_ms - 1) % _SAMPLE_MS == 0:
@@ -61,7 +72,9 @@ class Twins:
         self._follow(self.c.now_us)  # with the former values
         wide = [self.chance.randint(-(2**31) + 1, 2**31 - 1) for _ in range(5)]
         self.raws = [NO_VALUE if self.chance.random() < 0.2 else raw for raw in wide]
-        self.raws[1] = self.chance.choice([NO_VALUE, 0, -5_000, 799_999, 800_000, 800_001, 2_000_000, 100, 200])
+        self.raws[1] = self.chance.choice(
+            [NO_VALUE, 0, -5_000, 799_999, 800_000, 800_001, 2_000_000, 100, 200]
+        )
         self.raws.append(self.chance.choice([0, 0, 1, 65_535, 262]))
         self.interlocks = self.chance.choice([0xFFFF] * 8 + [0b101, 0b001, 0b100])
         if good:
@@ -74,9 +87,16 @@ class Twins:
         values = [math.nan if raw == NO_VALUE else raw for raw in self.raws[:5]]
         displacement, gauge, ambient, air, gas = values
         return pump_board.BoardSample(
-            displacement / 1000, self.raws[5], gauge / 1000, ambient / 1000, air / 10_000, gas / 10_000, count,
-            (1 + _SAMPLE_MS * (count - 1)) / 1000 + 1e-6, self.interlocks,
-        )  # fmt: skip
+            displacement / 1000,
+            self.raws[5],
+            gauge / 1000,
+            ambient / 1000,
+            air / 10_000,
+            gas / 10_000,
+            count,
+            (1 + _SAMPLE_MS * (count - 1)) / 1000 + 1e-6,
+            self.interlocks,
+        )
 
     def ask(self, pdu: bytes) -> None:
         said = self.c.ask(pdu)
@@ -85,23 +105,37 @@ class Twins:
         self.c.pass_us(1000 * _SETTLED_MS)
         self._follow(self.c.now_us)
         assert self.c.outputs == tuple(
-            round(50_000 * fraction) for fraction in (self.python.pump_fraction, self.python.vent_fraction)
+            round(50_000 * fraction)
+            for fraction in (self.python.pump_fraction, self.python.vent_fraction)
         )
         self.c.pass_us(1000)
 
     def run_pump(self) -> None:
-        """Claim, clear and command with good sensors, so that the pump runs unless a stranger holds the board."""
+        """Claim, clear and command with good sensors, so that the pump runs unless a stranger holds
+        the board.
+        """
         self.change_sensors(good=True)
         key = int(self.python._claim_key) or 9
         claim = {"claim_id": 7, "claim_key": key, "command_key": key, "clear_key": key}
         for name, values in (
             ("settings", {"watchdog_period_s": 9.999, "watchdog_arm": 1}),
             ("reset", {"clear_faults": 0xFFFF}),
-            ("command", {"pump_command_fraction": 0.5, "vent_command_fraction": 0.25, "heartbeat": self._beat()}),
+            (
+                "command",
+                {
+                    "pump_command_fraction": 0.5,
+                    "vent_command_fraction": 0.25,
+                    "heartbeat": self._beat(),
+                },
+            ),
         ):
             block = _MAP.block(name)
             words = block.encode(claim | values)
-            self.ask(struct.pack(f">BHHB{len(words)}H", 16, block.address, len(words), 2 * len(words), *words))
+            self.ask(
+                struct.pack(
+                    f">BHHB{len(words)}H", 16, block.address, len(words), 2 * len(words), *words
+                )
+            )
 
     def _beat(self) -> int:
         return self.chance.randrange(2**16)
@@ -112,18 +146,26 @@ class Twins:
 
 
 def _word(chance: random.Random) -> int:
-    return chance.choice([0, 1, 2, 50, 51, 10_000, 10_001, 49_999, 50_000, 50_001, 0xFFFF, chance.randrange(2**16)])
+    return chance.choice(
+        [0, 1, 2, 50, 51, 10_000, 10_001, 49_999, 50_000, 50_001, 0xFFFF, chance.randrange(2**16)]
+    )
 
 
 def _good_words(block: Block, chance: random.Random) -> list[int]:
     key = chance.choice(_KEYS[:3])
     values = {
-        "watchdog_period_s": chance.choice(_PERIODS_MS) / 1000, "watchdog_arm": chance.randrange(4) > 0,
-        "claim_id": chance.choice([7, 2**31, 2**32 - 1]), "claim_key": key,
-        "pump_command_fraction": chance.choice([0.0, 0.05, 1.0]), "vent_command_fraction": chance.choice([0.0, 1.0]),
-        "heartbeat": chance.randrange(4), "command_key": key,
-        "clear_faults": chance.choice([0, 1, 2, 4, 7, 8, 16, 0xFFFF]), "clear_key": key, "stop": 1,
-    }  # fmt: skip
+        "watchdog_period_s": chance.choice(_PERIODS_MS) / 1000,
+        "watchdog_arm": chance.randrange(4) > 0,
+        "claim_id": chance.choice([7, 2**31, 2**32 - 1]),
+        "claim_key": key,
+        "pump_command_fraction": chance.choice([0.0, 0.05, 1.0]),
+        "vent_command_fraction": chance.choice([0.0, 1.0]),
+        "heartbeat": chance.randrange(4),
+        "command_key": key,
+        "clear_faults": chance.choice([0, 1, 2, 4, 7, 8, 16, 0xFFFF]),
+        "clear_key": key,
+        "stop": 1,
+    }
     words = block.encode(values)
     if chance.random() < 0.15:
         at = chance.randrange(len(words))
@@ -138,13 +180,20 @@ def _pdu(chance: random.Random) -> bytes:
         block = chance.choices(_WRITABLE, weights=(4, 6, 2, 1))[0]
         words = _good_words(block, chance)
         if chance.random() < 0.2:
-            head = struct.pack(">BHH", 23, *chance.choice([(16, 26), (0, 11), (48, 6), (41, 1), (16, 126), (0, 0)]))
+            head = struct.pack(
+                ">BHH", 23, *chance.choice([(16, 26), (0, 11), (48, 6), (41, 1), (16, 126), (0, 0)])
+            )
         else:
             head = bytes([16])
-        return head + struct.pack(f">HHB{len(words)}H", block.address, len(words), 2 * len(words), *words)
+        return head + struct.pack(
+            f">HHB{len(words)}H", block.address, len(words), 2 * len(words), *words
+        )
     if kind < 0.65:
         return struct.pack(
-            ">BHH", 3, chance.choice([*range(76), 0xFFFF]), chance.choice([*range(30), 125, 126, 0xFFFF])
+            ">BHH",
+            3,
+            chance.choice([*range(76), 0xFFFF]),
+            chance.choice([*range(30), 125, 126, 0xFFFF]),
         )
     if kind < 0.8:
         return struct.pack(">BHH", 6, chance.choice([*range(76), 0xFFFF]), _word(chance))
@@ -153,7 +202,9 @@ def _pdu(chance: random.Random) -> bytes:
         data = [_word(chance) for _ in range(count)]
         address = chance.choice([49, 50, 52, 56, 57, 64, 71, 72, 16, 60])
         return struct.pack(f">BHHB{count}H", 16, address, count, 2 * count, *data)
-    return bytes([chance.choice([3, 6, 16, 23, 23, 1, 4, 43, 0x83])]) + chance.randbytes(chance.randrange(0, 20))
+    return bytes([chance.choice([3, 6, 16, 23, 23, 1, 4, 43, 0x83])]) + chance.randbytes(
+        chance.randrange(0, 20)
+    )
 
 
 def _transactions(board: VirtualBoard, seed: int, count: int) -> None:
@@ -177,4 +228,6 @@ def test_every_register_agrees_after_random_transactions(virtual_board: VirtualB
 
 @pytest.mark.campaign
 def test_every_register_agrees_after_many_random_transactions(virtual_board: VirtualBoard) -> None:
-    _transactions(virtual_board, int(os.environ.get("SEED", "2")), int(os.environ.get("COUNT", "100000")))
+    _transactions(
+        virtual_board, int(os.environ.get("SEED", "2")), int(os.environ.get("COUNT", "100000"))
+    )

@@ -1,7 +1,9 @@
-"""The board on an STM32F4: its image in QEMU, and the parser of its laser against the emulated sensor.
+"""The board on an STM32F4: its image in QEMU, and the parser of its laser against the emulated
+sensor.
 
-QEMU (netduinoplus2) has the processor, its UARTs, timers and interrupts. It has neither clock tree, pins, DMA,
-watchdog nor brown-out: what depends on them was not run anywhere (docs/board-hardware.md).
+QEMU (netduinoplus2) has the processor, its UARTs, timers and interrupts. It has neither clock tree,
+pins, DMA, watchdog nor brown-out: what depends on them was not run anywhere
+(docs/board-hardware.md).
 """
 
 from __future__ import annotations
@@ -49,7 +51,9 @@ def make(folder: Path, *targets: str) -> list[Path]:
 
 @dataclass
 class Stm32:
-    """The image running; `line` is its Modbus, `log` what it wrote to hardware that QEMU does not have."""
+    """The image running; `line` is its Modbus, `log` what it wrote to hardware that QEMU does not
+    have.
+    """
 
     url: str
     log: Path
@@ -67,7 +71,9 @@ class Stm32:
         return int(heard.partition(wanted)[2][:8], 16)
 
     async def drives(self, pump: int, vent: int) -> None:
-        """Wait until the outputs have these compare values: they follow with the next tick of a busy emulator."""
+        """Wait until the outputs have these compare values: they follow with the next tick of a
+        busy emulator.
+        """
         async with asyncio.timeout(START_S):
             while (await self.word(CCR1), await self.word(CCR2)) != (pump, vent):  # noqa: ASYNC110
                 await asyncio.sleep(0.01)
@@ -77,7 +83,8 @@ class Stm32:
 async def stm32(folder: Path) -> AsyncIterator[Stm32]:
     """Build the image for QEMU, start it, end it afterwards.
 
-    Its settings are those of the port, without the gauge: QEMU has no converter that could read one.
+    Its settings are those of the port, without the gauge: QEMU has no converter that could read
+    one.
     """
     image, settings = make(folder, "stm32f4-qemu.bin", "settings.bin")
     table = tomllib.loads((PORT / "board.toml").read_text(encoding="utf-8"))
@@ -86,12 +93,28 @@ async def stm32(folder: Path) -> AsyncIterator[Stm32]:
     server = await asyncio.start_server(lambda _, writer: lasers.put_nowait(writer), "127.0.0.1", 0)
     port = server.sockets[0].getsockname()[1]
     words = [
-        "qemu-system-arm", "-M", "netduinoplus2", "-display", "none", "-kernel", image,
-        "-device", f"loader,file={settings},addr=0x0800C000,force-raw=on",
-        "-serial", f"tcp:127.0.0.1:{port}", "-serial", "pty",
-        "-gdb", f"unix:{folder}/gdb,server=on,wait=off",
-        "-d", "unimp,guest_errors", "-D", folder / "log", "-monitor", f"unix:{folder}/monitor,server=on,wait=off",
-    ]  # fmt: skip
+        "qemu-system-arm",
+        "-M",
+        "netduinoplus2",
+        "-display",
+        "none",
+        "-kernel",
+        image,
+        "-device",
+        f"loader,file={settings},addr=0x0800C000,force-raw=on",
+        "-serial",
+        f"tcp:127.0.0.1:{port}",
+        "-serial",
+        "pty",
+        "-gdb",
+        f"unix:{folder}/gdb,server=on,wait=off",
+        "-d",
+        "unimp,guest_errors",
+        "-D",
+        folder / "log",
+        "-monitor",
+        f"unix:{folder}/monitor,server=on,wait=off",
+    ]
     process = await asyncio.create_subprocess_exec(
         *map(str, words), stdout=asyncio.subprocess.PIPE, stderr=asyncio.subprocess.STDOUT
     )
@@ -99,7 +122,9 @@ async def stm32(folder: Path) -> AsyncIterator[Stm32]:
         assert process.stdout is not None
         said = (await asyncio.wait_for(process.stdout.readline(), START_S)).decode()
         line = next(word for word in said.split() if word.startswith("/dev/"))
-        kept = os.open(line, os.O_RDWR | os.O_NOCTTY)  # QEMU takes a second to notice a new client, and loses answers
+        kept = os.open(
+            line, os.O_RDWR | os.O_NOCTTY
+        )  # QEMU takes a second to notice a new client, and loses answers
         laser = await asyncio.wait_for(lasers.get(), START_S)
         monitor = await asyncio.open_unix_connection(folder / "monitor")
         yield Stm32(f"rtu://{line}?baud=115200&parity=N", folder / "log", laser, *monitor)
@@ -137,13 +162,19 @@ async def test_the_image_starts_safe_answers_and_drives_its_outputs(tmp_path: Pa
     async with stm32(tmp_path) as board:
         driver = PumpBoard(board.url, timeout_s=4.0, watchdog_s=10.0)
         identity = await driver.identify()
-        assert (identity.map_version, identity.firmware, identity.gauge_fitted) == (3, "1.1.0", False)
+        assert (identity.map_version, identity.firmware, identity.gauge_fitted) == (
+            3,
+            "1.1.0",
+            False,
+        )
         assert identity.gauge_pressure_limit_pa == 800.0
         reading = await driver.read()
         assert (await board.word(CCR1), await board.word(CCR2)) == (0, 0)
         assert reading.pump_fraction == reading.vent_fraction == 0.0
         assert not reading.watchdog_tripped
-        assert math.isnan(reading.gauge_pressure_pa)  # no DMA in QEMU: never an old or invented value
+        assert math.isnan(
+            reading.gauge_pressure_pa
+        )  # no DMA in QEMU: never an old or invented value
         assert math.isnan(reading.displacement_um)
         assert reading.displacement_quality != 0
         assert reading.interlock_inputs == 0  # no pins in QEMU: open
@@ -155,8 +186,15 @@ async def test_the_image_starts_safe_answers_and_drives_its_outputs(tmp_path: Pa
         await board.drives(0, 0)
         await driver.close()
     first = written(board.log)
-    assert [each[:2] for each in first[:4]] == [("RCC", 0x30), ("GPIOA", 0x18), ("GPIOB", 0x18), ("GPIOA", 0x00)]
-    assert first[1][2] == 0x01C0_0000  # pump, vent and the line's driver low before they become outputs
+    assert [each[:2] for each in first[:4]] == [
+        ("RCC", 0x30),
+        ("GPIOA", 0x18),
+        ("GPIOB", 0x18),
+        ("GPIOA", 0x00),
+    ]
+    assert (
+        first[1][2] == 0x01C0_0000
+    )  # pump, vent and the line's driver low before they become outputs
     assert first[2][2] == 0x0020_0000  # the enable as well
     enable = [value for device, offset, value in first[5:] if (device, offset) == ("GPIOB", 0x18)]
     assert set(enable) == {0x20, 0x20_0000}
@@ -214,7 +252,9 @@ async def _run_wild(board: StoppedBoard, at: dict[str, int]) -> None:
 async def test_a_damaged_board_drives_its_outputs_low_and_starts_anew(
     tmp_path: Path, damage: Callable[[StoppedBoard, dict[str, int]], Awaitable[None]]
 ) -> None:
-    """As far as QEMU goes: what only the hardware watchdog ends, such as a stuck tick, is not here."""
+    """As far as QEMU goes: what only the hardware watchdog ends, such as a stuck tick,
+    is not here.
+    """
     async with stm32(tmp_path) as board:
         driver = PumpBoard(board.url, timeout_s=4.0, watchdog_s=10.0)
         await driver.open()
@@ -229,7 +269,9 @@ async def test_a_damaged_board_drives_its_outputs_low_and_starts_anew(
         await driver.close()
     wrote = written(board.log)
     start = [each[:2] for each in wrote].index(("RCC", 0x30), 1)
-    assert ("GPIOB", 0x18, 0x20_0000) in wrote[start - 4 : start]  # low before the reset, not only by it
+    assert ("GPIOB", 0x18, 0x20_0000) in wrote[
+        start - 4 : start
+    ]  # low before the reset, not only by it
     assert ("GPIOA", 0x18, 0x01C0_0000) in wrote[start - 4 : start]
 
 
@@ -242,7 +284,9 @@ async def test_a_main_loop_that_hangs_stops_the_pump(tmp_path: Path) -> None:
         await driver.write(roles.BenchCommand(0.25, 1.0))
         await board.drives(PWM_STEPS // 4, PWM_STEPS)
         async with stopped(tmp_path / "gdb") as processor:
-            await processor.write(addresses(tmp_path / "stm32f4-qemu.elf")["rtu_poll"], bytes.fromhex("fee7"))  # b .
+            await processor.write(
+                addresses(tmp_path / "stm32f4-qemu.elf")["rtu_poll"], bytes.fromhex("fee7")
+            )  # b .
         await board.drives(0, PWM_STEPS)
         await driver.close()
 
@@ -271,7 +315,8 @@ def laser_library(tmp_path_factory: pytest.TempPathFactory) -> Path:
         "-Wno-int-to-pointer-cast",
     ]
     subprocess.run(
-        [*words, "-o", str(folder / "laser.so"), str(PORT / "laser.c"), str(folder / "host.c")], check=True
+        [*words, "-o", str(folder / "laser.so"), str(PORT / "laser.c"), str(folder / "host.c")],
+        check=True,
     )
     return folder / "laser.so"
 

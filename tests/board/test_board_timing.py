@@ -1,4 +1,6 @@
-"""How many instructions the timer interrupt takes until the outputs are set, counted step by step in the emulator."""
+"""How many instructions the timer interrupt takes until the outputs are set, counted step by step
+in the emulator.
+"""
 
 from __future__ import annotations
 
@@ -36,14 +38,19 @@ async def test_the_timer_interrupt_is_short(tmp_path: Path) -> None:
     wire = FilmWire(StillFilm())
     await wire.start()
     gdb = tmp_path / "gdb"
-    async with qemu_board(image, tmp_path, wire.port, "-gdb", f"unix:{gdb},server=on,wait=off") as board:
+    async with qemu_board(
+        image, tmp_path, wire.port, "-gdb", f"unix:{gdb},server=on,wait=off"
+    ) as board:
         driver = PumpBoard(board.url, timeout_s=2.0, watchdog_s=10.0)
         await driver.open()
         while math.isnan((await driver.read()).gauge_pressure_pa):
             continue  # a channel without a value takes less
         await driver.close()
         async with stopped(gdb) as chip:
-            counts = [await _steps(chip, symbols["mps2_timer0"], symbols["hal_watchdog_feed"]) for _ in range(_TICKS)]
+            counts = [
+                await _steps(chip, symbols["mps2_timer0"], symbols["hal_watchdog_feed"])
+                for _ in range(_TICKS)
+            ]
     await wire.stop()
     print(f"instructions from the interrupt until the outputs are set: {counts}")
     assert 500 < max(counts) < _MOST

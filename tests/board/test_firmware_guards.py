@@ -1,4 +1,6 @@
-"""The C firmware's guard of its gauge, and its interlock inputs: the pump stops in time and stays off."""
+"""The C firmware's guard of its gauge, and its interlock inputs: the pump stops in time and stays
+off.
+"""
 
 from __future__ import annotations
 
@@ -46,7 +48,9 @@ def pump_on(board: VirtualBoard) -> None:
     assert board.ask(command(next_beat(board)))[0] == 16
 
 
-def test_the_pump_is_off_in_the_first_millisecond_after_the_time_out(firmware_library: Path) -> None:
+def test_the_pump_is_off_in_the_first_millisecond_after_the_time_out(
+    firmware_library: Path,
+) -> None:
     board = made(firmware_library, gauge_timeout_s=2.0)
     board.pass_us(board.now_us % _SAMPLE_US and _SAMPLE_US - board.now_us % _SAMPLE_US)
     set_gauge(board, NO_VALUE)
@@ -59,13 +63,22 @@ def test_the_pump_is_off_in_the_first_millisecond_after_the_time_out(firmware_li
 
 
 def test_a_gauge_out_of_its_plausible_range_is_lost(firmware_library: Path) -> None:
-    gauge = {"points": [[13_107, 0.0], [65_535, 1000.0]], "plausible_raw": [11_796, 65_534]}  # 4..20 mA
+    gauge = {
+        "points": [[13_107, 0.0], [65_535, 1000.0]],
+        "plausible_raw": [11_796, 65_534],
+    }  # 4..20 mA
     for raw in (11_795, 65_535, 0):
         board = VirtualBoard(
-            firmware_library, {**SETTINGS, "gauge_timeout_s": 1.0, "channel": {"gauge_pressure_pa": gauge}}
+            firmware_library,
+            {**SETTINGS, "gauge_timeout_s": 1.0, "channel": {"gauge_pressure_pa": gauge}},
         )
         board.set_inputs([0, 13_107, 0, 0, 0, 0])
-        board.ask(write("settings", {"watchdog_period_s": 10.0, "watchdog_arm": 1, "claim_id": 7, "claim_key": _KEY}))
+        board.ask(
+            write(
+                "settings",
+                {"watchdog_period_s": 10.0, "watchdog_arm": 1, "claim_id": 7, "claim_key": _KEY},
+            )
+        )
         board.ask(command(1))
         assert board.outputs == _RUNNING
         set_gauge(board, raw)
@@ -113,12 +126,22 @@ def test_clearing_without_a_gauge_does_not_run_the_pump(firmware_library: Path) 
     assert board.outputs == _RUNNING
 
 
-def test_a_command_without_a_gauge_does_not_drive_the_pump_for_a_single_tick(virtual_board: VirtualBoard) -> None:
+def test_a_command_without_a_gauge_does_not_drive_the_pump_for_a_single_tick(
+    virtual_board: VirtualBoard,
+) -> None:
     virtual_board.ask(
-        write("settings", {"watchdog_period_s": 10.0, "watchdog_arm": 1, "claim_id": 7, "claim_key": _KEY})
+        write(
+            "settings",
+            {"watchdog_period_s": 10.0, "watchdog_arm": 1, "claim_id": 7, "claim_key": _KEY},
+        )
     )
     words = _MAP.block("command").encode(
-        {"pump_command_fraction": 1, "vent_command_fraction": 0, "heartbeat": 5, "command_key": _KEY}
+        {
+            "pump_command_fraction": 1,
+            "vent_command_fraction": 0,
+            "heartbeat": 5,
+            "command_key": _KEY,
+        }
     )
     assert virtual_board.chip.board_write(56, 5, _words(words)) == 0
     assert virtual_board.read(32, 1) == [0]
@@ -244,7 +267,9 @@ def _record_words() -> list[int]:
     return list(struct.unpack(f">{_WORDS}I", record(SETTINGS)))[:-1]
 
 
-def test_a_record_of_an_earlier_board_means_that_the_gauge_is_fitted(virtual_board: VirtualBoard) -> None:
+def test_a_record_of_an_earlier_board_means_that_the_gauge_is_fitted(
+    virtual_board: VirtualBoard,
+) -> None:
     earlier = _record_words()[:_PROTECTION_AT]
     earlier[1] = 4 * (_PROTECTION_AT + 1)
     for rest in (b"", b"\xff" * 40):  # what lies in the flash behind it
@@ -252,7 +277,11 @@ def test_a_record_of_an_earlier_board_means_that_the_gauge_is_fitted(virtual_boa
         virtual_board.pass_us(10_000)
         block = _MAP.block("identity")
         found = block.decode(virtual_board.read(block.address, block.count))
-        assert (found["gauge_fitted"], found["gauge_timeout_s"], found["gauge_frozen_s"]) == (1, 15.0, 60.0)
+        assert (found["gauge_fitted"], found["gauge_timeout_s"], found["gauge_frozen_s"]) == (
+            1,
+            15.0,
+            60.0,
+        )
         assert (found["interlocks_fitted"], found["pump_limit_fraction"]) == (0, 1.0)
         run_pump(virtual_board, 10.0)
         set_gauge(virtual_board, NO_VALUE)
@@ -275,14 +304,21 @@ def test_the_stored_protections_are_in_the_identity(firmware_library: Path) -> N
     )
     block = _MAP.block("identity")
     found = block.decode(board.read(block.address, block.count))
-    assert (found["gauge_fitted"], found["gauge_timeout_s"], found["gauge_frozen_s"]) == (0, 2.5, 600.0)
+    assert (found["gauge_fitted"], found["gauge_timeout_s"], found["gauge_frozen_s"]) == (
+        0,
+        2.5,
+        600.0,
+    )
     assert (found["interlocks_fitted"], found["map_version"]) == (0b10001, 3)
 
 
 @pytest.mark.parametrize(
-    ("place", "value"), [(0, 2), (1, 99), (1, 60_001), (2, 999), (2, 600_001), (3, 0x10000), (0, 0xFFFFFFFF)]
+    ("place", "value"),
+    [(0, 2), (1, 99), (1, 60_001), (2, 999), (2, 600_001), (3, 0x10000), (0, 0xFFFFFFFF)],
 )
-def test_impossible_protections_make_the_record_invalid(virtual_board: VirtualBoard, place: int, value: int) -> None:
+def test_impossible_protections_make_the_record_invalid(
+    virtual_board: VirtualBoard, place: int, value: int
+) -> None:
     words = _record_words()
     words[_PROTECTION_AT + place] = value
     virtual_board.power_on(_sealed(words))

@@ -16,7 +16,8 @@ from firmware_iface.links.modbus_tcp import exception_error
 NO_VALUE = -(2**31)
 AT_REST = (0, 0, 101_325_000, 210_000, 220_000, 0)  # raw values of all channels with a flat film
 SETTINGS = {"baud": 115_200, "parity": "N", "pressure_limit_pa": 800.0, "pump_limit_fraction": 1.0}
-_ANSWERED_US = 3000  # heard at the next turn of the main loop, answered at the first one after a silence of 1750 us
+# heard at the next turn of the main loop, answered at the first one after a silence of 1750 us
+_ANSWERED_US = 3000
 _ASKED_US = 4000
 
 
@@ -100,7 +101,11 @@ class VirtualBoard:
             ["nm", "--print-size", str(self._path)], check=True, capture_output=True, text=True
         ).stdout
         rows = [line.split() for line in listing.splitlines()]
-        found = {row[3]: (int(row[0], 16), int(row[1], 16)) for row in rows if len(row) == 4 and row[2] in "bBdDtT"}
+        found = {
+            row[3]: (int(row[0], 16), int(row[1], 16))
+            for row in rows
+            if len(row) == 4 and row[2] in "bBdDtT"
+        }
         anchor = ctypes.cast(self.chip.board_tick, ctypes.c_void_p).value
         assert anchor is not None
         base = anchor - found["board_tick"][0]
@@ -134,7 +139,9 @@ class VirtualLink:
 
     async def read_holding(self, address: int, count: int) -> list[int]:
         """Function code 3."""
-        return list(struct.unpack(f">{count}H", self._ask(struct.pack(">BHH", 3, address, count))[2:]))
+        return list(
+            struct.unpack(f">{count}H", self._ask(struct.pack(">BHH", 3, address, count))[2:])
+        )
 
     async def read_input(self, address: int, count: int) -> list[int]:
         """Function code 4, which the board does not have."""
@@ -146,4 +153,6 @@ class VirtualLink:
 
     async def write_registers(self, address: int, words: Sequence[int]) -> None:
         """Function code 16."""
-        self._ask(struct.pack(f">BHHB{len(words)}H", 16, address, len(words), 2 * len(words), *words))
+        self._ask(
+            struct.pack(f">BHHB{len(words)}H", 16, address, len(words), 2 * len(words), *words)
+        )

@@ -1,4 +1,6 @@
-"""A held mirror in virtual time whose sets are rendered on a bench that differs from the stated one."""
+"""A held mirror in virtual time whose sets are rendered on a bench that differs from the stated
+one.
+"""
 
 from __future__ import annotations
 
@@ -32,19 +34,27 @@ from tuning.opening import TwinHold
 SHRINK = 12
 NOISE = 256 * float(np.hypot(0.4, np.sqrt(1 / 12))) / SHRINK
 CAMERA = CameraConfig(
-    width_px=2448 // SHRINK, height_px=2048 // SHRINK, pixel_um=3.45 * SHRINK, bits=16, noise_adu=NOISE
+    width_px=2448 // SHRINK,
+    height_px=2048 // SHRINK,
+    pixel_um=3.45 * SHRINK,
+    bits=16,
+    noise_adu=NOISE,
 )
 TRUE = GeometryConfig(a_mm=2674.0, b_mm=2869.0, alpha_deg=81.2, reference_displacement_um=0.0)
 FILM = typical_film(37.1, 500.0, seed=4)
 
 
 def config(place: Path | None = None, **limits: float) -> Config:
-    """A mirror that loses and gains gas twenty times as fast as a real one: a minute instead of twenty."""
+    """A mirror that loses and gains gas twenty times as fast as a real one: a minute instead of
+    twenty.
+    """
     return Config(
         twin=TwinConfig(scenario="quiet", start_error_um=-3.0, leak_time_constant_s=500.0),
         pump=PumpConfig(flow_full_um_per_s=60.0),
         loop=LoopConfig(rate_hz=20.0, flow_max_um_per_s=60.0, setpoint_ramp_um_per_s=40.0),
-        limits=LimitsConfig(**{"displacement_min_um": -4500.0, "displacement_max_um": 4500.0, **limits}),
+        limits=LimitsConfig(
+            **{"displacement_min_um": -4500.0, "displacement_max_um": 4500.0, **limits}
+        ),
         shape=ShapeConfig(period_s=2.0),
         optics=OpticsConfig(camera=CAMERA, geometry_file=place),
     )
@@ -121,7 +131,9 @@ class LiveBench:
             FILM,
             motion=Motion(start_um=self.hold.bench.plant.truth().displacement_um),
             laser_noise_um=1.0,
-            stated_geometry=self.config.optics.geometry.model_copy(update={"reference_displacement_um": 0.0}),
+            stated_geometry=self.config.optics.geometry.model_copy(
+                update={"reference_displacement_um": 0.0}
+            ),
             seed=self.captures,
         )
         simulate_set(self.run_dir / "raw" / f"cycle-{self.captures}", spec)

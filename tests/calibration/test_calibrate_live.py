@@ -75,7 +75,9 @@ def test_from_a_hold_to_a_geometry_with_an_abort_and_a_bad_set_on_the_way(
     assert row.shape_state != ShapeState.OFF  # as it was
     assert (tmp_path / "bench.toml").read_text() == OLD
 
-    bench.config = bench.config.model_copy(update={"optics": OpticsConfig(camera=CAMERA, geometry=TRUE)})
+    bench.config = bench.config.model_copy(
+        update={"optics": OpticsConfig(camera=CAMERA, geometry=TRUE)}
+    )
     assert run([*live, "--session", str(session), "--yes"]) == 2
     assert "set-1: camera or geometry differs from that of run" in capsys.readouterr().err
     bench.config = bench.hold.config
@@ -101,7 +103,9 @@ def test_from_a_hold_to_a_geometry_with_an_abort_and_a_bad_set_on_the_way(
         assert abs(value - true) < 4 * sigma, name
         assert sigma < known, name
     assert "in force: by hand" in said.err
-    assert f"adopted: {tmp_path / 'bench.toml'}; the previous one is {tmp_path / 'bench-'}" in said.err
+    assert (
+        f"adopted: {tmp_path / 'bench.toml'}; the previous one is {tmp_path / 'bench-'}" in said.err
+    )
     assert next(tmp_path.glob("bench-*.toml")).read_text() == OLD
     assert read_geometry(tmp_path / "bench.toml").origin.calibrated_utc
 
@@ -131,7 +135,9 @@ def test_a_fault_on_the_way_is_left_to_the_safety_table(
     said = capsys.readouterr().err
     assert "the mirror is not held, but in state fault (" in said
     assert "the mirror is left to whoever has command; the shape loop is off" in said
-    assert bench.asked[-1].value == 500.0  # on its way to the second set; no command after the fault
+    assert (
+        bench.asked[-1].value == 500.0
+    )  # on its way to the second set; no command after the fault
 
 
 def test_who_cannot_wait_for_the_way_back_leaves_the_hold_on_it(

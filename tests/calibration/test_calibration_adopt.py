@@ -29,14 +29,19 @@ def test_where_there_was_none(new: Path, tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("old", ["a_mm = 2672.0\nb_mm = 2871.0\nalpha_deg = 80.9\n", "spoilt ="])
-def test_the_old_one_is_kept_with_its_date_twice_if_need_be(new: Path, tmp_path: Path, old: str) -> None:
+def test_the_old_one_is_kept_with_its_date_twice_if_need_be(
+    new: Path, tmp_path: Path, old: str
+) -> None:
     place = tmp_path / "bench.toml"
     kept = []
     for _ in range(2):
         place.write_text(old)
         os.utime(place, (1e9, 1e9))
         kept.append(adopt(new, place))
-    assert [path.name for path in kept if path] == ["bench-20010909T014640Z.toml", "bench-20010909T014640Z-2.toml"]
+    assert [path.name for path in kept if path] == [
+        "bench-20010909T014640Z.toml",
+        "bench-20010909T014640Z-2.toml",
+    ]
     assert [path.read_text() for path in kept if path] == [old, old]
     assert place.read_text() == NEW
 

@@ -37,7 +37,11 @@ def test_eight_millimetres_about_where_it_is_held() -> None:
 
 
 def test_the_range_is_moved_into_the_reach_and_the_nearer_end_comes_first() -> None:
-    assert setpoints_um(HELD, Reach(-3000.0, 500.0, "low", "high"), 3000.0, 3) == (500.0, -1000.0, -2500.0)
+    assert setpoints_um(HELD, Reach(-3000.0, 500.0, "low", "high"), 3000.0, 3) == (
+        500.0,
+        -1000.0,
+        -2500.0,
+    )
     assert setpoints_um(HELD, Reach(-500.0, 3000.0, "low", "high"), None, 2) == (-500.0, 3000.0)
 
 
@@ -46,7 +50,11 @@ def test_the_range_is_moved_into_the_reach_and_the_nearer_end_comes_first() -> N
     [
         (WIDE, 10_001.0, "low and high leave 10000 µm"),
         (WIDE, 999.0, "closer together than 1000 µm add nothing to one set"),
-        (Reach(-300.0, 300.0, "low", "high"), None, "low and high leave 600 µm: sets closer together than 1000 µm"),
+        (
+            Reach(-300.0, 300.0, "low", "high"),
+            None,
+            "low and high leave 600 µm: sets closer together than 1000 µm",
+        ),
         (Reach(300.0, -300.0, "low", "high"), None, "leave 0 µm"),
     ],
 )

@@ -1,4 +1,6 @@
-"""A bench for the campaign with real processes: the emulated board on its own clock, and a monitor of its output."""
+"""A bench for the campaign with real processes: the emulated board on its own clock, and a monitor
+of its output.
+"""
 
 from __future__ import annotations
 
@@ -38,12 +40,15 @@ class Output:
 
 @dataclass
 class WatchedPlant:
-    """Between board and plant: notes every change of the pump's drive, and how far the mirror went."""
+    """Between board and plant: notes every change of the pump's drive,
+    and how far the mirror went.
+    """
 
     bench: LiveBench
     outputs: list[Output] = field(default_factory=list)
     looked_s: float = math.nan
-    longest_gap_s: float = 0.0  # between two rounds of the board: a busy machine adds this to its watchdog
+    # between two rounds of the board: a busy machine adds this to its watchdog
+    longest_gap_s: float = 0.0
 
     displacement_max_um: float = -math.inf
     gauge_pressure_max_pa: float = -math.inf
@@ -68,14 +73,22 @@ class WatchedPlant:
 
     def pump_ran_on_s(self, since_s: float) -> float:
         """How long after `since_s` the pump was driven, by the board's own clock."""
-        return max(0.0, next(o.time_s for o in self.outputs if o.time_s > since_s and o.pump_fraction == 0) - since_s)
+        return max(
+            0.0,
+            next(o.time_s for o in self.outputs if o.time_s > since_s and o.pump_fraction == 0)
+            - since_s,
+        )
 
 
 class Run:
     """A `hold` as its own process against the emulated board."""
 
     def __init__(
-        self, process: asyncio.subprocess.Process, folder: Path, board: PumpBoardEmulator, plant: WatchedPlant
+        self,
+        process: asyncio.subprocess.Process,
+        folder: Path,
+        board: PumpBoardEmulator,
+        plant: WatchedPlant,
     ) -> None:
         self.process, self.folder, self.board, self.plant = process, folder, board, plant
         self.killed_utc_s: float | None = None
@@ -85,11 +98,15 @@ class Run:
         found = list(self.folder.glob("logs/*/events.jsonl"))
         if not found:
             return []
-        return [json.loads(line) for line in found[0].read_text().splitlines() if line.endswith("}")]
+        return [
+            json.loads(line) for line in found[0].read_text().splitlines() if line.endswith("}")
+        ]
 
     @property
     def recorded(self) -> bool:
-        """Whether the recorder has made its first round; until then the measurements are only in the rings."""
+        """Whether the recorder has made its first round; until then the measurements are only in
+        the rings.
+        """
         return any(self.folder.glob("logs/*/.recorder-state"))
 
     def reached(self, state: str) -> bool:
@@ -100,7 +117,9 @@ class Run:
 
     def happened(self, kind: str, **words: Any) -> bool:
         """Whether an event of this kind with these words was recorded."""
-        return any(event["kind"] == kind and words.items() <= event.items() for event in self.events)
+        return any(
+            event["kind"] == kind and words.items() <= event.items() for event in self.events
+        )
 
     def recorder(self) -> psutil.Process:
         """The child that has the recording open. Raises LookupError."""
@@ -117,8 +136,12 @@ class Run:
         """Wait for something. Raises AssertionError when it does not come."""
         give_up_s = time.monotonic() + PATIENCE_S
         while not what():
-            assert time.monotonic() < give_up_s, f"waited in vain; {self.events[-3:]}; {self.said()}"
-            assert self.process.returncode is None or what(), f"ended with {self.process.returncode}; {self.said()}"
+            assert time.monotonic() < give_up_s, (
+                f"waited in vain; {self.events[-3:]}; {self.said()}"
+            )
+            assert self.process.returncode is None or what(), (
+                f"ended with {self.process.returncode}; {self.said()}"
+            )
             await asyncio.sleep(0.02)
 
     def said(self) -> str:
@@ -152,10 +175,25 @@ async def running(
     await board.start()
     keep_up = asyncio.create_task(_catch_up(plant.bench))
     lab = folder / "lab.toml"
-    lab.write_text(f'[devices]\nboard = "tcp://127.0.0.1:{board.port}"\nwatchdog_s = {WATCHDOG_S}\n{config}')
-    with (folder / "stderr.txt").open("wb") if not on_terminal else contextlib.nullcontext(terminal) as stderr:
+    lab.write_text(
+        f'[devices]\nboard = "tcp://127.0.0.1:{board.port}"\nwatchdog_s = {WATCHDOG_S}\n{config}'
+    )
+    with (
+        (folder / "stderr.txt").open("wb")
+        if not on_terminal
+        else contextlib.nullcontext(terminal) as stderr
+    ):
         process = await asyncio.create_subprocess_exec(
-            *(sys.executable, "-m", "membrane_ctrl", "hold", "--config", str(lab), "--logs", str(folder / "logs")),
+            *(
+                sys.executable,
+                "-m",
+                "membrane_ctrl",
+                "hold",
+                "--config",
+                str(lab),
+                "--logs",
+                str(folder / "logs"),
+            ),
             stdin=terminal,
             stdout=terminal,
             stderr=stderr,

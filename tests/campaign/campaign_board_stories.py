@@ -1,4 +1,6 @@
-"""Stories of the board: two programs on it, a gateway between, counters that wrap, its own limits and latches."""
+"""Stories of the board: two programs on it, a gateway between, counters that wrap, its own limits
+and latches.
+"""
 
 from __future__ import annotations
 
@@ -25,7 +27,9 @@ def counters_wrap() -> list[str]:
 
 
 def a_gateway_repeats_the_last_write() -> list[str]:
-    """The controller dies: neither a gateway's repetitions nor the reads of others feed the watchdog."""
+    """The controller dies: neither a gateway's repetitions nor the reads of others feed the
+    watchdog.
+    """
     stage = Stage()
     board, command = stage.bench.board, default_map().block("command")
     written: list[list[int]] = []
@@ -54,11 +58,15 @@ def a_gateway_repeats_the_last_write() -> list[str]:
 
 
 def others_disarm_the_watchdog() -> list[str]:
-    """Another program writes `watchdog_arm` 0 in every possible way while the pump runs; then the controller dies."""
+    """Another program writes `watchdog_arm` 0 in every possible way while the pump runs; then the
+    controller dies.
+    """
     stage = Stage().held()
     settings = default_map().block("settings")
     arm = default_map().register("watchdog_arm")
-    off = settings.encode({register.name: 0.0 for register in settings.registers} | {"watchdog_period_s": 10.0})
+    off = settings.encode(
+        {register.name: 0.0 for register in settings.registers} | {"watchdog_period_s": 10.0}
+    )
     for address, words in ((arm.address, [0]), (settings.address, off)):
         with contextlib.suppress(RegisterRefusal):
             stage.bench.board.write(address, words)
@@ -71,10 +79,14 @@ def others_disarm_the_watchdog() -> list[str]:
 
 
 def a_stranger_writes_the_command() -> list[str]:
-    """A program without a claim writes full pump again and again during a hold: none of it reaches the pump."""
+    """A program without a claim writes full pump again and again during a hold: none of it reaches
+    the pump.
+    """
     stage = Stage().held()
     command = default_map().block("command")
-    values = dict.fromkeys((register.name for register in command.registers), 0.0) | {"pump_command_fraction": 1.0}
+    values = dict.fromkeys((register.name for register in command.registers), 0.0) | {
+        "pump_command_fraction": 1.0
+    }
     for number in range(50):
         stage.tick()
         before = stage.plant.pump_given
@@ -88,7 +100,9 @@ def a_stranger_writes_the_command() -> list[str]:
 def a_board_that_takes_no_settings() -> list[str]:
     """The board ignores watchdog period and arming: no hold starts with such a board."""
     stage = Stage()
-    bench = VirtualBench(WatchedPlant(stage.world, stage.config.twin, stage.config.pump), WATCHDOG_S)
+    bench = VirtualBench(
+        WatchedPlant(stage.world, stage.config.twin, stage.config.pump), WATCHDOG_S
+    )
     settings, write = default_map().block("settings"), bench.board.write
 
     def deaf(address: int, words: Sequence[int]) -> None:
@@ -103,7 +117,9 @@ def a_board_that_takes_no_settings() -> list[str]:
 
 
 def faults_are_cleared_and_the_pump_stands() -> list[str]:
-    """The board's faults are cleared while nobody commands: the pump stays off until somebody does."""
+    """The board's faults are cleared while nobody commands:
+    the pump stays off until somebody does.
+    """
     stage = Stage().held()
     stage.bench.wrong.stalled = True
     stage.wait(2.0)
@@ -117,7 +133,9 @@ def faults_are_cleared_and_the_pump_stands() -> list[str]:
 
 
 def a_latched_board_keeps_the_pump_off() -> list[str]:
-    """A board that has latched over-pressure keeps the pump off and vents, whatever is commanded."""
+    """A board that has latched over-pressure keeps the pump off and vents,
+    whatever is commanded.
+    """
     stage = Stage()
     stage.bench.wrong.gauge_offset_pa = 300.0
     stage.wait(1.0)
@@ -126,12 +144,16 @@ def a_latched_board_keeps_the_pump_off() -> list[str]:
         stage.bench.advance(TICK_S)
         stage.bench.write(BenchCommand(0.7, 0.0))
         stage.must(not stage.still(), "the board pumps with a fault latched")
-        stage.must(stage.plant.vent_given == 1.0, "the board's vent is shut with over-pressure latched")
+        stage.must(
+            stage.plant.vent_given == 1.0, "the board's vent is shut with over-pressure latched"
+        )
     return stage.violations
 
 
 def another_program_opens_the_board_of_a_hold() -> list[str]:
-    """It is refused, and the hold's watchdog stays as it was: when the hold dies, its pump stops."""
+    """It is refused, and the hold's watchdog stays as it was: when the hold dies,
+    its pump stops.
+    """
     stage = Stage().held()
     other = another_client(stage, 10.0)
     refused = False
@@ -140,7 +162,12 @@ def another_program_opens_the_board_of_a_hold() -> list[str]:
     except LinkError:
         refused = True
     stage.must(refused, "two programs hold one board")
-    stage.wait(1.0, lambda: "" if stage.state == State.HOLD else "the hold was lost to a client that was refused")
+    stage.wait(
+        1.0,
+        lambda: (
+            "" if stage.state == State.HOLD else "the hold was lost to a client that was refused"
+        ),
+    )
     stage.bench.wrong.stalled = True
     stage.wait(WATCHDOG_S + 3 * TICK_S)
     stage.wait(10.0, stage.still)
@@ -148,7 +175,9 @@ def another_program_opens_the_board_of_a_hold() -> list[str]:
 
 
 def another_program_takes_the_board_of_a_dead_hold() -> list[str]:
-    """A hold is stopped for a second, and another program takes its board: the resumed hold moves no gas."""
+    """A hold is stopped for a second, and another program takes its board: the resumed hold moves
+    no gas.
+    """
     stage = Stage().held()
     stage.bench.wrong.stalled = True
     stage.wait(1.0)
@@ -167,7 +196,9 @@ def another_program_takes_the_board_of_a_dead_hold() -> list[str]:
 
 
 def anybody_may_stop_the_pump() -> list[str]:
-    """`safe` beside a hold that may resume every fault: the pump stays off until a person clears it."""
+    """`safe` beside a hold that may resume every fault: the pump stays off until a person clears
+    it.
+    """
     for resumes in (False, True):
         stage = Stage(resumes=resumes).held()
         other = another_client(stage)
@@ -197,14 +228,21 @@ def over_pressure_while_the_network_is_cut(resumes: bool = True) -> list[str]:
 
 
 def hold_is_asked_of_a_latched_board() -> list[str]:
-    """A mirror whose board has latched over-pressure is not inflated, however often `hold` is sent."""
+    """A mirror whose board has latched over-pressure is not inflated,
+    however often `hold` is sent.
+    """
     stage = Stage()
     stage.bench.wrong.gauge_offset_pa = 300.0
     stage.tick()
     stage.bench.wrong.gauge_offset_pa = 0.0
     stage.wait(1.0, stage.still)
     stage.ask("hold")
-    stage.wait(30.0, lambda: stage.still() or ("went on" if stage.state in (State.INFLATE, State.SETTLE) else ""))
+    stage.wait(
+        30.0,
+        lambda: (
+            stage.still() or ("went on" if stage.state in (State.INFLATE, State.SETTLE) else "")
+        ),
+    )
     return stage.violations
 
 
@@ -217,19 +255,30 @@ def what_is_read_is_true() -> list[str]:
         stage.bench.advance(TICK_S)
         reading, truth = stage.bench.read(), stage.bench.truth
         stage.must(
-            abs(reading.gauge_pressure_pa - truth.gauge_pressure_pa) < 4.0, "the pressure read is not the true one"
+            abs(reading.gauge_pressure_pa - truth.gauge_pressure_pa) < 4.0,
+            "the pressure read is not the true one",
         )
-        stage.must(abs(reading.displacement_um - truth.displacement_um) < 8.0, "the sag read is not the true one")
         stage.must(
-            abs(reading.pump_fraction - stage.plant.pump_given) < 0.01, "the pump's read-back is not its drive"
+            abs(reading.displacement_um - truth.displacement_um) < 8.0,
+            "the sag read is not the true one",
         )
-        stage.must(abs(stage.plant.pump_given - 0.4) < 0.01, "the pump is not given what was written")
-        stage.must(abs(stage.plant.vent_given - 0.25) < 0.01, "the vent is not given what was written")
+        stage.must(
+            abs(reading.pump_fraction - stage.plant.pump_given) < 0.01,
+            "the pump's read-back is not its drive",
+        )
+        stage.must(
+            abs(stage.plant.pump_given - 0.4) < 0.01, "the pump is not given what was written"
+        )
+        stage.must(
+            abs(stage.plant.vent_given - 0.25) < 0.01, "the vent is not given what was written"
+        )
     return stage.violations
 
 
 def the_board_alone_keeps_its_limit() -> list[str]:
-    """A controller writes full pump for ever: the board stops the pump at its own limit and vents."""
+    """A controller writes full pump for ever: the board stops the
+    pump at its own limit and vents.
+    """
     stage = Stage()
     for _ in range(round(1500.0 / TICK_S)):
         stage.bench.advance(TICK_S)

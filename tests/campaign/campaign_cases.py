@@ -36,8 +36,8 @@ class Case:
     said : frozenset of str
         Rules that may name it; empty: harmless, nothing may trip.
     moving, holding, checking, always : Reaction or None
-        What must follow in MOVING states, in `hold` alone, in `check`, in every state (in `fault` only what vents is
-        still judged).
+        What must follow in MOVING states, in `hold` alone, in `check`, in every state (in `fault`
+        only what vents is still judged).
     for_s : float
         It goes away after this.
     every_s : float
@@ -81,7 +81,10 @@ class Case:
         """Whether it shows only while the mirror is held: in `fault` it cannot be seen."""
         of_actuators = {"pump_share", "pump_stuck_fraction", "vent_stuck_fraction"}
         return (
-            self.power_cycle or self.leak_factor != 1.0 or self.door_pa != 0 or bool(of_actuators & self.wrong.keys())
+            self.power_cycle
+            or self.leak_factor != 1.0
+            or self.door_pa != 0
+            or bool(of_actuators & self.wrong.keys())
         )
 
     @property
@@ -96,7 +99,9 @@ class Case:
 
     def reaction(self, state: State) -> Reaction | None:
         """What must follow when it begins while the controller is in `state`."""
-        if self.always is not None and (state != State.FAULT or self.always.safe_level == SafeLevel.VENT):
+        if self.always is not None and (
+            state != State.FAULT or self.always.safe_level == SafeLevel.VENT
+        ):
             return self.always
         if self.holding is not None and state == State.HOLD:
             return self.holding
@@ -110,12 +115,16 @@ def _case(name: str, said: str = "", **rest: object) -> Case:
 
 
 _LOST = "displacement_missing displacement_frozen overdue"
-_SOON = 4 * TICK_S  # two ticks after a rule with a window of one, and the tick in which the fault begins
+_SOON = (
+    4 * TICK_S
+)  # two ticks after a rule with a window of one, and the tick in which the fault begins
 _TESTED = Reaction(SafeLevel.PUMP_OFF, 10.0)  # the actuator test, twice
 
 CASES: tuple[Case, ...] = (
     _case("nothing"),
-    _case("no light", _LOST, wrong={"no_light": 1}, moving=Reaction(SafeLevel.HOLD_FLOW, 6 * TICK_S)),
+    _case(
+        "no light", _LOST, wrong={"no_light": 1}, moving=Reaction(SafeLevel.HOLD_FLOW, 6 * TICK_S)
+    ),
     _case("no light for 5 s", _LOST, wrong={"no_light": 1}, for_s=5.0),
     _case(
         "light a fifth of the time",
@@ -123,13 +132,23 @@ CASES: tuple[Case, ...] = (
         wrong={"no_light": 1},
         for_s=1.6,
         every_s=2.0,
-        moving=Reaction(SafeLevel.RAMP_DOWN, 3.0 * HOLD_FLOW_S),  # two thirds of the used budget recover
+        moving=Reaction(
+            SafeLevel.RAMP_DOWN, 3.0 * HOLD_FLOW_S
+        ),  # two thirds of the used budget recover
     ),
     _case("light comes and goes", _LOST, wrong={"no_light": 1}, for_s=1.0, every_s=2.0),
-    _case("laser 20 µm off", "", wrong={"laser_offset_um": -20}, laser_lies=True, for_s=0.2, every_s=20.0),
+    _case(
+        "laser 20 µm off",
+        "",
+        wrong={"laser_offset_um": -20},
+        laser_lies=True,
+        for_s=0.2,
+        every_s=20.0,
+    ),
     _case(
         "laser 200 µm off",
-        f"{_LOST} displacement_jump following_error over_displacement under_displacement over_pressure actuator_test "
+        f"{_LOST} displacement_jump following_error over_displacement under_displacement "
+        "over_pressure actuator_test "
         "laser_gauge_apart",
         wrong={"laser_offset_um": -200},
         laser_lies=True,
@@ -223,7 +242,10 @@ CASES: tuple[Case, ...] = (
     ),
     _case("network cut for 0.1 s", "link_lost", wrong={"unreachable": 1}, for_s=0.1),
     _case(
-        "network cut for 5 s", "link_lost watchdog_tripped board_fault overdue", wrong={"unreachable": 1}, for_s=5.0
+        "network cut for 5 s",
+        "link_lost watchdog_tripped board_fault overdue",
+        wrong={"unreachable": 1},
+        for_s=5.0,
     ),
     _case(
         "network comes and goes",
@@ -237,7 +259,9 @@ CASES: tuple[Case, ...] = (
         "pump's read-back stays at 1",
         "pump_mismatch pump_runs_on",
         wrong={"readback_fraction": 1.0},
-        moving=Reaction(SafeLevel.PUMP_OFF, 8.0),  # the command itself may be near 1 while the mirror rises
+        moving=Reaction(
+            SafeLevel.PUMP_OFF, 8.0
+        ),  # the command itself may be near 1 while the mirror rises
     ),
     _case(
         "pump gives nothing",
@@ -273,14 +297,27 @@ CASES: tuple[Case, ...] = (
         for_s=2.0,
     ),
     _case("process stopped for ever", "-", wrong={"stalled": 1}),
-    _case("ticks 150 ms late", "late", wrong={"late_ms": 150}, moving=Reaction(SafeLevel.RAMP_DOWN, 8 * TICK_S)),
-    _case("task dead", "dead_task", wrong={"dead_task": 1}, always=Reaction(SafeLevel.PUMP_OFF, _SOON)),
-    _case("control code raises", "tick_error", raises=True, always=Reaction(SafeLevel.PUMP_OFF, _SOON)),
+    _case(
+        "ticks 150 ms late",
+        "late",
+        wrong={"late_ms": 150},
+        moving=Reaction(SafeLevel.RAMP_DOWN, 8 * TICK_S),
+    ),
+    _case(
+        "task dead", "dead_task", wrong={"dead_task": 1}, always=Reaction(SafeLevel.PUMP_OFF, _SOON)
+    ),
+    _case(
+        "control code raises", "tick_error", raises=True, always=Reaction(SafeLevel.PUMP_OFF, _SOON)
+    ),
     _case("camera lost", wrong={"camera_lost": 1}),
     _case("camera sees 30 µm too much", wrong={"camera_offset_um": 30.0}),
     _case("leak ten times", "following_error under_displacement actuator_test", leak_factor=10.0),
     _case("door, 20 Pa", "actuator_test", door_pa=20.0),
-    _case("storm, 250 Pa at once", f"{_LOST} displacement_jump following_error under_displacement", door_pa=250.0),
+    _case(
+        "storm, 250 Pa at once",
+        f"{_LOST} displacement_jump following_error under_displacement",
+        door_pa=250.0,
+    ),
     _case(
         "laser and gauge lost",
         f"{_LOST} pressure_missing",

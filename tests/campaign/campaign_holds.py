@@ -1,7 +1,8 @@
 """Stories with the real supervisor, drivers and files.
 
-The matrix runs `hold.virtual_run` instead of the supervisor. This is the supervisor itself, over the board and over a
-bench of single instruments, with its way out, its guards, its latched-fault file and its software watchdog.
+The matrix runs `hold.virtual_run` instead of the supervisor. This is the supervisor itself, over
+the board and over a bench of single instruments, with its way out, its guards, its latched-fault
+file and its software watchdog.
 """
 
 from __future__ import annotations
@@ -80,7 +81,9 @@ async def a_guard_ends() -> list[str]:
 
 
 async def a_slow_board() -> list[str]:
-    """Answers take 0.2 s: the loop cannot run, the pump ramps down; one of 0.4 s causes no burst of ticks."""
+    """Answers take 0.2 s: the loop cannot run, the pump ramps down; one of 0.4 s causes no burst of
+    ticks.
+    """
     async with a_hold(on_board) as rig:
         board_of(rig).slow_s = 0.4
         await asyncio.sleep(0.4)
@@ -88,8 +91,12 @@ async def a_slow_board() -> list[str]:
         await asyncio.sleep(0.5)
         before = rig.supervisor.ticks
         await asyncio.sleep(1.0)
-        rig.must(rig.supervisor.ticks - before < RATE_HZ * 1.1, "missed ticks are made up in a burst")
-        writes = [b.row.mono_s - a.row.mono_s for a, b in zip(rig.heard, rig.heard[1:], strict=False)]
+        rig.must(
+            rig.supervisor.ticks - before < RATE_HZ * 1.1, "missed ticks are made up in a burst"
+        )
+        writes = [
+            b.row.mono_s - a.row.mono_s for a, b in zip(rig.heard, rig.heard[1:], strict=False)
+        ]
         rig.must(min(writes) > 0.2 * TICK_S, f"two ticks {1e3 * min(writes):.1f} ms apart")
     async with a_hold(on_board) as slow:
         board_of(slow).slow_s = 0.2
@@ -99,7 +106,9 @@ async def a_slow_board() -> list[str]:
 
 
 async def a_board_that_latched_stays_latched() -> list[str]:
-    """Without an acknowledgement the board's over-pressure stays latched, whatever the supervisor does."""
+    """Without an acknowledgement the board's over-pressure stays latched, whatever the supervisor
+    does.
+    """
     async with a_hold(on_board) as rig:
         board_of(rig).virtual.wrong.gauge_offset_pa = 300.0
         await rig.wait(1.0)
@@ -119,7 +128,9 @@ async def the_network_comes_back() -> list[str]:
         rig.must(rig.state == State.FAULT, "no fault without a network")
         wrong.unreachable = False
         await rig.wait(5.0, rig.still)
-        rig.must(math.isfinite(rig.heard[-1].row.gauge_pressure_pa), "the link was not opened again")
+        rig.must(
+            math.isfinite(rig.heard[-1].row.gauge_pressure_pa), "the link was not opened again"
+        )
         rig.ask("ack")
         await rig.until(State.STANDBY, 10.0)
         rig.ask("hold")
@@ -129,7 +140,9 @@ async def the_network_comes_back() -> list[str]:
 
 
 async def faults_that_outlive_the_run() -> list[str]:
-    """A trip is in the file; an unreadable file is a fault; a refused acknowledgement clears nothing."""
+    """A trip is in the file; an unreadable file is a fault; a refused acknowledgement clears
+    nothing.
+    """
     from membrane_ctrl.hold.start import HoldOptions, _latched
 
     with tempfile.TemporaryDirectory() as folder:
@@ -158,7 +171,10 @@ async def faults_that_outlive_the_run() -> list[str]:
                 denied = CommandTaken("ack", "somebody", "", refused="not now")
                 for event in (locked, denied):
                     fault_latch.heard(cast(TickOutputs, _Told(rig.heard[-1], (event,))))
-            rig.must(file.read() == first, "the first cause was replaced, or cleared by a refused acknowledgement")
+            rig.must(
+                file.read() == first,
+                "the first cause was replaced, or cleared by a refused acknowledgement",
+            )
             for content in ("", "{", "[]", '{"schema": "other"}', "null"):
                 (Path(folder) / NAME).write_text(content)
                 rig.must(refused(), f"a file that holds {content!r} is no fault")
@@ -184,7 +200,9 @@ async def a_board_that_is_latched_at_the_start() -> list[str]:
     from membrane_ctrl.hold.start import HoldOptions, _identify
 
     config, devices = Config(), DevicesConfig(board="tcp://127.0.0.1:1")
-    asked = config.model_copy(update={"devices": devices, "resume": ResumeConfig(faults=("watchdog_tripped",))})
+    asked = config.model_copy(
+        update={"devices": devices, "resume": ResumeConfig(faults=("watchdog_tripped",))}
+    )
     options = HoldOptions(asked, "lab.toml", False, None, "campaign", None, False, False)
     bench = BoardBench(WatchedPlant(World(), config.twin, config.pump))
     bench.virtual.wrong.gauge_offset_pa = 300.0
@@ -221,7 +239,9 @@ async def _both(story: Callable[[HoldRig, Instruments], Awaitable[None]]) -> lis
     for bronkhorst in (False, True):
         async with instruments(bronkhorst) as (rig, lab):
             await story(rig, lab)
-            violations += [f"{'Bronkhorst' if bronkhorst else 'Modbus'}: {what}" for what in rig.violations]
+            violations += [
+                f"{'Bronkhorst' if bronkhorst else 'Modbus'}: {what}" for what in rig.violations
+            ]
     return violations
 
 
@@ -236,9 +256,13 @@ async def instruments_hold_a_mirror() -> list[str]:
             lab.now()
             row, truth = rig.heard[-1].row, rig.plant.truth()
             off = rig.plant.pump_given - row.pump_fraction
-            rig.must(abs(off) < 2e-3, f"commanded {row.pump_fraction:.3f}, given {rig.plant.pump_given:.3f}")
             rig.must(
-                abs(row.gauge_pressure_pa - truth.gauge_pressure_pa) < 4.0, "the pressure told is not the true one"
+                abs(off) < 2e-3,
+                f"commanded {row.pump_fraction:.3f}, given {rig.plant.pump_given:.3f}",
+            )
+            rig.must(
+                abs(row.gauge_pressure_pa - truth.gauge_pressure_pa) < 4.0,
+                "the pressure told is not the true one",
             )
             readback = row.pump_readback_fraction
             rig.must(abs(readback - rig.plant.pump_given) < 0.2, f"read-back {readback:.2f}")
@@ -310,7 +334,9 @@ async def the_software_watchdog_ends() -> list[str]:
     """The software watchdog itself ends: the pump stops."""
 
     async def story(rig: HoldRig, lab: Instruments) -> None:
-        next(task for task in asyncio.all_tasks() if task.get_name() == "software watchdog").cancel()
+        next(
+            task for task in asyncio.all_tasks() if task.get_name() == "software watchdog"
+        ).cancel()
         await rig.wait(4 * TICK_S)
         await rig.wait(5.0, rig.still)
         rig.must(rig.state == State.FAULT, "a bench without its watchdog is no fault")

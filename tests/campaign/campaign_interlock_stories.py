@@ -1,4 +1,5 @@
-"""Stories of interlocks: circuits that open, and signals that are lost, in every state in which gas moves.
+"""Stories of interlocks: circuits that open, and signals that are lost, in every state in which gas
+moves.
 
 Each story returns its violations; it judges the pump's drive and the vent, as the matrix does.
 """
@@ -22,10 +23,17 @@ from membrane_ctrl.sim.virtual_interlocks import VirtualInterlocks
 _AGE_MAX_S = 0.5
 _SLACK_S = 0.5
 _INTERLOCKS: tuple[InterlockDriver, ...] = (
-    BoardInputConfig(driver="board_input", name="door", text="shut it", safe_level="pump_off", input=3),
+    BoardInputConfig(
+        driver="board_input", name="door", text="shut it", safe_level="pump_off", input=3
+    ),
     BoardInputConfig(driver="board_input", name="stop", text="pull it", safe_level="vent", input=0),
     ModbusInputConfig(
-        driver="modbus_input", name="supply", text="open it", safe_level="ramp_down", link="tcp://plc", address=7
+        driver="modbus_input",
+        name="supply",
+        text="open it",
+        safe_level="ramp_down",
+        link="tcp://plc",
+        address=7,
     ),
 )
 _LEVELS = {"door": SafeLevel.PUMP_OFF, "stop": SafeLevel.VENT, "supply": SafeLevel.RAMP_DOWN}
@@ -70,7 +78,9 @@ class InterlockStage(Stage):
 
 
 def an_open_interlock_in_every_state() -> list[str]:
-    """A circuit opens in check, inflate, settle, hold and manual: its own safe level, in its time."""
+    """A circuit opens in check, inflate, settle, hold and manual: its own safe level,
+    in its time.
+    """
     violations: list[str] = []
     for name, level in _LEVELS.items():
         for state in _WAYS:
@@ -83,7 +93,9 @@ def an_open_interlock_in_every_state() -> list[str]:
 
 
 def the_signal_of_an_interlock_is_lost() -> list[str]:
-    """The wire of a board's input is cut, the module behind another stops answering: both are open circuits."""
+    """The wire of a board's input is cut, the module behind another stops answering: both are open
+    circuits.
+    """
     violations: list[str] = []
     for name, level in _LEVELS.items():
         stage = InterlockStage()
@@ -106,7 +118,9 @@ def an_interlock_that_closes_again_resumes_nothing() -> list[str]:
     stage.until(State.STANDBY, 10.0)
     stage.wait(20.0, stage.still)
     stage.ask("hold")
-    stage.until(State.INFLATE, 20.0)  # for an hour: the levels have timed out, and the mirror was vented
+    stage.until(
+        State.INFLATE, 20.0
+    )  # for an hour: the levels have timed out, and the mirror was vented
     return stage.violations
 
 
@@ -124,7 +138,9 @@ def an_open_interlock_forbids_the_hold() -> list[str]:
 
 
 def an_interlock_during_a_fault_that_may_resume() -> list[str]:
-    """The emergency stop is pushed for a moment while the network is cut for longer: it is vented, for good."""
+    """The emergency stop is pushed for a moment while the network is cut for longer: it is vented,
+    for good.
+    """
     stage = InterlockStage(resumes=True)
     stage.held()
     stage.bench.wrong.unreachable = True

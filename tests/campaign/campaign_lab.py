@@ -18,9 +18,13 @@ from firmware_iface.roles import DeviceRefusedError, LinkDownError, LinkError
 
 
 class Registers:
-    """Values in registers of 16 bit, by arithmetic of its own: 4000 .. 20000 for `low` .. `high`."""
+    """Values in registers of 16 bit, by arithmetic of its own: 4000 .. 20000 for `low` ..
+    `high`.
+    """
 
-    def __init__(self, low: float, high: float, value: Callable[[], float], tell: Callable[[float], None]) -> None:
+    def __init__(
+        self, low: float, high: float, value: Callable[[], float], tell: Callable[[float], None]
+    ) -> None:
         self._low, self._high, self._value, self._tell = low, high, value, tell
 
     def read(self, address: int, count: int) -> list[int]:
@@ -38,7 +42,9 @@ class Registers:
 
 
 class TableLink:
-    """A `ModbusLink` that ends at a table in memory; it can be unplugged, and lose single answers."""
+    """A `ModbusLink` that ends at a table in memory; it can be unplugged,
+    and lose single answers.
+    """
 
     def __init__(self, name: str, table: RegisterTable) -> None:
         self.name, self.table = name, table
@@ -92,20 +98,28 @@ class Instruments:
         self._pump = self._vent = 0.0
         self.offset_pa = 0.0
         sensor, lead = self._sensor, self._lead
-        self.laser = self._link("laser", Registers(-1000.0, 1000.0, sensor("displacement_um"), lambda _: None))
+        self.laser = self._link(
+            "laser", Registers(-1000.0, 1000.0, sensor("displacement_um"), lambda _: None)
+        )
         self.vent = self._link("vent", Registers(0.0, 1.0, lambda: self._vent, lead("_vent")))
         if bronkhorst:
             flow = Instrument("DMFC", "M1", 360.0, "mln/min", None, lead("_pump"))
             gauge = Instrument("DEPC", "M2", 10.0, "mbar(g)", lambda: self._gauge_pa() / 100)
-            self.pump, self.gauge = (self._link(n, BronkhorstRegisters(i)) for n, i in (("p", flow), ("g", gauge)))
+            self.pump, self.gauge = (
+                self._link(n, BronkhorstRegisters(i)) for n, i in (("p", flow), ("g", gauge))
+            )
             pump: Any = BronkhorstFlow(ModbusParameters(self.pump), "M1")
             pressure: Any = BronkhorstPressure(ModbusParameters(self.gauge), "M2")
         else:
             self.pump = self._link("pump", Registers(0.0, 1.0, lambda: self._pump, lead("_pump")))
-            self.gauge = self._link("gauge", Registers(-100.0, 1100.0, self._gauge_pa, lambda _: None))
+            self.gauge = self._link(
+                "gauge", Registers(-100.0, 1100.0, self._gauge_pa, lambda _: None)
+            )
             pump = ModbusValue(self.pump, _map(0.0, 1.0), rest=0.0)
             pressure = ModbusValue(self.gauge, _map(-100.0, 1100.0))
-        laser = ModbusValue(self.laser, _map(-1000.0, 1000.0), clock=asyncio.get_running_loop().time)
+        laser = ModbusValue(
+            self.laser, _map(-1000.0, 1000.0), clock=asyncio.get_running_loop().time
+        )
         roles = RoleDevices(laser, pump, pressure, ModbusValue(self.vent, _map(0.0, 1.0), rest=0.0))
         self.bench = RoleBench(roles, WATCHDOG_S, asyncio.get_running_loop().time)
 

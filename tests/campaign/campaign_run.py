@@ -1,4 +1,5 @@
-"""One run of the campaign: bring the controller to a state, let something go wrong, monitor to the end.
+"""One run of the campaign: bring the controller to a state, let something go wrong, monitor to the
+end.
 
 The end: 45 s after the fault, in which every safe level has had its time, somebody asks for a stop.
 """
@@ -31,7 +32,14 @@ from campaign_times import (
 from campaign_watch import Watch
 from campaign_world import WatchedPlant, World, world_of
 
-from membrane_ctrl.config.schema import Config, LimitsConfig, LoopConfig, ResumeConfig, ShapeConfig, StatesConfig
+from membrane_ctrl.config.schema import (
+    Config,
+    LimitsConfig,
+    LoopConfig,
+    ResumeConfig,
+    ShapeConfig,
+    StatesConfig,
+)
 from membrane_ctrl.control.experiments.trial import ExperimentSpec
 from membrane_ctrl.controller import states
 from membrane_ctrl.controller.commands import Command, Kind
@@ -49,9 +57,19 @@ _ROUNDING_S = 1e-6  # one tick is one tick, wherever on the clock it lies
 PAUSE_S, MANUAL_S, MANUAL_RANGE_UM = 20.0, 60.0, 20.0
 # what a person might list; a fault that vented may never resume
 RESUMABLE = (
-    "link_lost", "device_silent", "watchdog_tripped", "board_fault", "displacement_missing", "displacement_frozen",
-    "pressure_missing", "late", "over_pressure", "over_displacement", "following_error", "overdue",
-)  # fmt: skip
+    "link_lost",
+    "device_silent",
+    "watchdog_tripped",
+    "board_fault",
+    "displacement_missing",
+    "displacement_frozen",
+    "pressure_missing",
+    "late",
+    "over_pressure",
+    "over_displacement",
+    "following_error",
+    "overdue",
+)
 
 
 @dataclass(frozen=True)
@@ -133,7 +151,9 @@ def run_case(case: Case, at: Situation, seed: int) -> Result:
             stop = ()
         watch.after_the_stop(run)
     said = watch.names.get(watch.code, "")
-    return Result(case.name, at.name, seed, said, watch.deepest, watch.reaction_s, tuple(watch.violations))
+    return Result(
+        case.name, at.name, seed, said, watch.deepest, watch.reaction_s, tuple(watch.violations)
+    )
 
 
 def config_of(seed: int, world: World, resumes: bool) -> Config:
@@ -157,13 +177,17 @@ def config_of(seed: int, world: World, resumes: bool) -> Config:
             manual_max_s=MANUAL_S,
             manual_range_um=MANUAL_RANGE_UM,
         ),
-        resume=ResumeConfig(faults=RESUMABLE if resumes else (), wait_s=RESUME_WAIT_S, most_per_day=RESUMES_A_DAY),
+        resume=ResumeConfig(
+            faults=RESUMABLE if resumes else (), wait_s=RESUME_WAIT_S, most_per_day=RESUMES_A_DAY
+        ),
         shape=ShapeConfig(fresh_s=6.0),
         twin=world.twin(seed),
     )
 
 
-def _bench(config: Config, world: World, case: Case | None = None, begins_s: float = 0.0) -> VirtualBench:
+def _bench(
+    config: Config, world: World, case: Case | None = None, begins_s: float = 0.0
+) -> VirtualBench:
     """The mirror and its board; the plant gets events of the mirror itself beforehand."""
     events: list[AmbientChange | LeakChange] = []
     if case is not None and case.leak_factor != 1.0:
@@ -195,7 +219,11 @@ def _begins_s(config: Config, world: World, at: Situation) -> float:
 def relay_about(flow_um_per_s: float) -> ExperimentSpec:
     """An experiment that swings the mirror by some µm."""
     return ExperimentSpec(
-        kind="relay", duration_s=40.0, limit_um=8.0, holding_flow_um_per_s=flow_um_per_s, laser_um=1.0
+        kind="relay",
+        duration_s=40.0,
+        limit_um=8.0,
+        holding_flow_um_per_s=flow_um_per_s,
+        laser_um=1.0,
     )
 
 

@@ -34,7 +34,9 @@ def a_clock_that_stands() -> list[str]:
 def a_laser_that_doubts_itself() -> list[str]:
     """The laser's quality marks its readings as invalid: the loop does not follow them."""
     stage = Stage().held()
-    sensors_say(stage, lambda sample: replace(sample, displacement_um=-15.0, displacement_quality=2))
+    sensors_say(
+        stage, lambda sample: replace(sample, displacement_um=-15.0, displacement_quality=2)
+    )
     before_um = stage.plant.truth().displacement_um
     stage.wait(7.0)
     went_um = stage.plant.truth().displacement_um - before_um
@@ -51,7 +53,9 @@ def pressure_that_is_seen_now_and_then() -> list[str]:
     for number in range(40):
         stage.bench.wrong.gauge_lost = number % 4 != 0
         stage.tick()
-    stage.must(stage.plant.vent_given == 1.0, "over its limit whenever it speaks, and the vent is shut")
+    stage.must(
+        stage.plant.vent_given == 1.0, "over its limit whenever it speaks, and the vent is shut"
+    )
     return stage.violations
 
 
@@ -66,7 +70,9 @@ def pressure_in_standby() -> list[str]:
 
 
 def creeping(stage: Stage, um_per_s: float, deepest_um: float) -> Callable[[], str]:
-    """The laser's mount moves by a tick's drift; the violation if the bowl has followed it too far."""
+    """The laser's mount moves by a tick's drift; the violation if the
+    bowl has followed it too far.
+    """
 
     def creep() -> str:
         stage.bench.wrong.laser_offset_um -= um_per_s * TICK_S
@@ -161,7 +167,9 @@ def a_seam_that_opens() -> list[str]:
 
 
 def a_setpoint_is_reached() -> list[str]:
-    """A setpoint 15 µm higher moves the true mirror by 15 µm, and the gauge shows the true pressure."""
+    """A setpoint 15 µm higher moves the true mirror by 15 µm, and the gauge shows the true
+    pressure.
+    """
     stage = Stage(camera=True).held()
     stage.ask("setpoint", value=15.0)
     stage.wait(40.0)
@@ -170,7 +178,9 @@ def a_setpoint_is_reached() -> list[str]:
 
 
 def dead_actuators_are_found() -> list[str]:
-    """A dead vent is found before the hold, a dead pump soon after (noise may let it pass the test)."""
+    """A dead vent is found before the hold, a dead pump soon after (noise may let it pass the
+    test).
+    """
     violations = []
     config = config_of(1, World(), False)
     timed = config.states.model_copy(update={"inflate_timeout_s": 60.0})
@@ -217,9 +227,13 @@ def a_pump_that_does_not_obey_the_stop() -> list[str]:
 
 
 def a_pump_that_runs_behind_its_readback() -> list[str]:
-    """In standby the read-back says 0 while gas comes in: the vent opens long before a limit is reached."""
+    """In standby the read-back says 0 while gas comes in: the vent opens long before a limit is
+    reached.
+    """
     config = config_of(1, World(), False)
-    wide = config.limits.model_copy(update={"gauge_pressure_max_pa": 750.0, "displacement_max_um": 1000.0})
+    wide = config.limits.model_copy(
+        update={"gauge_pressure_max_pa": 750.0, "displacement_max_um": 1000.0}
+    )
     stage = Stage(config=config.model_copy(update={"limits": wide}))
     stage.wait(10.0)
     stage.bench.wrong.pump_stuck_fraction = 0.9

@@ -82,7 +82,11 @@ class Stage:
 
     def still(self) -> str:
         """The violation if the pump is driven."""
-        return f"the pump is driven with {self.plant.pump_given:.2f}" if self.plant.pump_given > 0 else ""
+        return (
+            f"the pump is driven with {self.plant.pump_given:.2f}"
+            if self.plant.pump_given > 0
+            else ""
+        )
 
     def near(self, target_um: float = 0.0, within_um: float = 10.0) -> None:
         """The mirror is where it should be."""
@@ -103,7 +107,9 @@ class OldBoard(Stage):
     """A board that has long been on: its heartbeat and its sample counter are about to wrap."""
 
     def make_bench(self) -> VirtualBench:
-        sensors_say(self, lambda sample: replace(sample, sample_counter=sample.sample_counter + 2**32 - 500))
+        sensors_say(
+            self, lambda sample: replace(sample, sample_counter=sample.sample_counter + 2**32 - 500)
+        )
         bench = VirtualBench(self.plant, WATCHDOG_S)
         bench.board._heartbeat_fed = bench.board._settable["heartbeat"] = float(_WORDS - 300)
         return bench

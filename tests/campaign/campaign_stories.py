@@ -75,7 +75,12 @@ def a_lock_while_it_vents() -> list[str]:
     stage.bench.wrong.gauge_offset_pa = 0.0
     stage.wait(1.0)
     stage.ask("latch")
-    stage.wait(8.0, lambda: stage.still() or ("" if stage.plant.vent_given == 1.0 else "the lock has shut the vent"))
+    stage.wait(
+        8.0,
+        lambda: (
+            stage.still() or ("" if stage.plant.vent_given == 1.0 else "the lock has shut the vent")
+        ),
+    )
     return stage.violations
 
 
@@ -85,7 +90,9 @@ def manual_once_is_not_manual_again() -> list[str]:
     stage.ask("manual", value=stage.world.holding_flow_um_per_s)
     stage.wait(3.0)
     stage.held()
-    stage.wait(10.0, lambda: "manual again, and nobody has asked" if stage.state == State.MANUAL else "")
+    stage.wait(
+        10.0, lambda: "manual again, and nobody has asked" if stage.state == State.MANUAL else ""
+    )
     stage.near()
     return stage.violations
 
@@ -119,7 +126,9 @@ def a_lock_forbids_the_hold() -> list[str]:
 
 
 def two_orders_in_one_tick() -> list[str]:
-    """A lowering command and another one in one tick, in both orders and in four states: lowering wins."""
+    """A lowering command and another one in one tick, in both orders and in four states: lowering
+    wins.
+    """
     violations = []
     others: tuple[Kind, ...] = ("hold", "resume", "manual", "setpoint", "ack")
     for way in ("latch", "vent", "stop", "lower"):
@@ -134,7 +143,9 @@ def two_orders_in_one_tick() -> list[str]:
 
 
 def vent_and_stop_from_everywhere() -> list[str]:
-    """`vent`, `lower` and `stop` from manual, tune and pause: the pump stops at once and stays off."""
+    """`vent`, `lower` and `stop` from manual, tune and pause:
+    the pump stops at once and stays off.
+    """
     violations = []
     for way in ("vent", "lower", "stop"):
         for situation in ("manual", "pause", "tune", "hold"):
@@ -160,7 +171,9 @@ def venting_to_the_end() -> list[str]:
     for _ in range(round(1200.0 / TICK_S)):
         if stage.state == State.STANDBY:
             break
-        stage.must(stage.plant.vent_given == 1.0 or stage.run.now_s < 30.0, "the vent shuts on the way")
+        stage.must(
+            stage.plant.vent_given == 1.0 or stage.run.now_s < 30.0, "the vent shuts on the way"
+        )
         stage.tick()
     pressure_pa = stage.plant.truth().gauge_pressure_pa
     stage.must(stage.state == State.STANDBY and pressure_pa < 110.0, f"{pressure_pa:.0f} Pa left")
@@ -235,7 +248,9 @@ def manual_without_light() -> list[str]:
 
 
 def resumes_of_a_day() -> list[str]:
-    """A cause comes and goes for an hour: the hold resumes as often as a day allows, and no more."""
+    """A cause comes and goes for an hour: the hold resumes as often as a day allows,
+    and no more.
+    """
     stage = Stage(resumes=True).held()
     begun = 0
     for _ in range(5):

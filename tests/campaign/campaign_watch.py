@@ -1,8 +1,8 @@
 """The invariants of the campaign, checked from outside after every period, to the end of a run.
 
-The true mirror counts: its pressure, its sag, and the drive of the pump's motor and of the valve. The controller's
-own reports (state, safe level, cause) are checked too, but excuse nothing. Limits and times are the campaign's own: a
-limit that changes in the code under test changes none here.
+The true mirror counts: its pressure, its sag, and the drive of the pump's motor and of the valve.
+The controller's own reports (state, safe level, cause) are checked too, but excuse nothing. Limits
+and times are the campaign's own: a limit that changes in the code under test changes none here.
 """
 
 from __future__ import annotations
@@ -61,7 +61,13 @@ class Watch:
     """
 
     def __init__(
-        self, case: Case, at: Situation, bench: VirtualBench, gauge_max_pa: float, tick_s: float, resumes: bool
+        self,
+        case: Case,
+        at: Situation,
+        bench: VirtualBench,
+        gauge_max_pa: float,
+        tick_s: float,
+        resumes: bool,
     ) -> None:
         assert isinstance(bench.plant, WatchedPlant)
         self._case, self._at, self._bench, self._plant = case, at, bench, bench.plant
@@ -104,7 +110,9 @@ class Watch:
         """Check at the end of the aftermath, before any command."""
         reaction = self._case.reaction(self._state_then)
         if reaction is not None and not self._met and "stalled" not in self._case.wrong:
-            self._say(now_s, f"never came to {reaction.safe_level.name}; got to {self.deepest.name}")
+            self._say(
+                now_s, f"never came to {reaction.safe_level.name}; got to {self.deepest.name}"
+            )
         if self._case.harmless and self._at.held and not self._case.lies:
             off_um = self._plant.truth().displacement_um - self._at.target_um
             if abs(off_um) > _HELD_UM:
@@ -129,7 +137,11 @@ class Watch:
             self._say(run.now_s, "the stop does not end")
         if run.finished is not None and int(run.finished) in (0, 130) and not self._believable:
             self._say(run.now_s, f"{run.finished.name}, although the pump does not obey")
-        if not self._believable and math.isnan(wrong.vent_stuck_fraction) and self._plant.vent_given < 1:
+        if (
+            not self._believable
+            and math.isnan(wrong.vent_stuck_fraction)
+            and self._plant.vent_given < 1
+        ):
             self._say(run.now_s, "the pump does not obey the stop, and the vent is shut")
 
     @property
@@ -191,7 +203,9 @@ class Watch:
             self._say(now_s, f"resumed {self._restarts} times within a day")
         if self._vented:
             self._say(now_s, "resumed after the vent was open")
-        seen = self._state_then in MOVING and not self._case.hidden  # else the fault has another cause
+        seen = (
+            self._state_then in MOVING and not self._case.hidden
+        )  # else the fault has another cause
         if now_s - self.wrong_s < RESUME_WAIT_S - _SLACK_S and seen:
             self._say(now_s, f"resumed {now_s - self.wrong_s:.2f} s after its cause")
 
@@ -200,12 +214,22 @@ class Watch:
         quiet_s = now_s - self._last_tick_s
         if quiet_s > WATCHDOG_S + 2 * self._tick_s and board.pump_fraction > 0:
             self._say(now_s, f"no tick for {quiet_s:.2f} s and the board still pumps")
-        if self.state == State.FAULT and plant.vent_given >= 1 and math.isnan(wrong.vent_stuck_fraction):
+        if (
+            self.state == State.FAULT
+            and plant.vent_given >= 1
+            and math.isnan(wrong.vent_stuck_fraction)
+        ):
             self._vented = True
         if quiet_s > 0:
-            board.read(_LATCHED_FAULTS, 1)  # another program reads: that proves no living controller
+            board.read(
+                _LATCHED_FAULTS, 1
+            )  # another program reads: that proves no living controller
         seen_pa = self._bench.truth.gauge_pressure_pa + wrong.gauge_offset_pa
-        if seen_pa > BOARD_PRESSURE_MAX_PA + _GAUGE_SLACK_PA and not wrong.gauge_lost and not wrong.samples_frozen:
+        if (
+            seen_pa > BOARD_PRESSURE_MAX_PA + _GAUGE_SLACK_PA
+            and not wrong.gauge_lost
+            and not wrong.samples_frozen
+        ):
             self._vented = self._board_vents = True
         if self._board_vents and plant.vent_given < 1 and math.isnan(wrong.vent_stuck_fraction):
             self._say(now_s, "the board was above its own limit, and the vent is shut")
@@ -218,7 +242,9 @@ class Watch:
         hidden_pa = max(0.0, -wrong.gauge_offset_pa) if not wrong.gauge_lost else math.inf
         board_max_pa = max(self._gauge_max_pa, BOARD_PRESSURE_MAX_PA) + hidden_pa + _GAUGE_SLACK_PA
         if truth.gauge_pressure_pa > board_max_pa:
-            self._say(now_s, f"gauge pressure {truth.gauge_pressure_pa:.1f} Pa, above the board's limit")
+            self._say(
+                now_s, f"gauge pressure {truth.gauge_pressure_pa:.1f} Pa, above the board's limit"
+            )
         ended = self._ended and not self._obeys  # from then on only the board's own limit protects
         if unseen or ended:
             return
@@ -226,21 +252,33 @@ class Watch:
             self._say(now_s, f"gauge pressure {truth.gauge_pressure_pa:.1f} Pa")
         blind = wrong.no_light or wrong.silent or wrong.unreachable
         seen = not blind and not case.laser_lies and math.isnan(wrong.vent_stuck_fraction)
-        if seen and truth.displacement_um > DISPLACEMENT_MAX_UM + _OVERSHOOT_UM and self._plant.vent_given < 1:
+        if (
+            seen
+            and truth.displacement_um > DISPLACEMENT_MAX_UM + _OVERSHOOT_UM
+            and self._plant.vent_given < 1
+        ):
             self._say(now_s, f"the bowl is at {truth.displacement_um:.1f} µm and the vent is shut")
         if not blind:
             self._blind_s = math.nan
         elif math.isnan(self._blind_s):
             self._blind_s, self._blind_um = now_s, truth.displacement_um
-        elif self._obeys and case.door_pa == 0 and truth.displacement_um > self._blind_um + _BLIND_UM:
-            self._say(now_s, f"blind, and the bowl went from {self._blind_um:.1f} to {truth.displacement_um:.1f} µm")
+        elif (
+            self._obeys and case.door_pa == 0 and truth.displacement_um > self._blind_um + _BLIND_UM
+        ):
+            self._say(
+                now_s,
+                f"blind, and the bowl went from {self._blind_um:.1f} to "
+                f"{truth.displacement_um:.1f} µm",
+            )
 
     def _look_at_the_way_down(self, now_s: float) -> None:
         """The pump is off where it must be, stops in time, and the vent opens in time."""
         given, wrong = self._plant.pump_given, self._bench.wrong
         reached = not (wrong.unreachable or wrong.stalled) and now_s == self._last_tick_s
         self._still_ticks = (
-            self._still_ticks + 1 if self.state in _STILL or self._safe_level >= SafeLevel.PUMP_OFF else 0
+            self._still_ticks + 1
+            if self.state in _STILL or self._safe_level >= SafeLevel.PUMP_OFF
+            else 0
         )
         self._look_at_mean_flow(reached, now_s)
         raised = self._case.raises and self._state_then != State.FAULT and now_s > self._begun_s
@@ -249,7 +287,12 @@ class Watch:
         if self._obeys and reached and self._still_ticks > 2 and given > 0:
             self._say(now_s, f"the pump is driven with {given:.2f} on {self._safe_level.name}")
         blind_s = 0.0 if math.isnan(self._blind_s) else now_s - self._blind_s
-        if blind_s > HOLD_FLOW_S + RAMP_S + _SLACK_S and self._obeys and given > 0 and not wrong.stalled:
+        if (
+            blind_s > HOLD_FLOW_S + RAMP_S + _SLACK_S
+            and self._obeys
+            and given > 0
+            and not wrong.stalled
+        ):
             self._say(now_s, f"blind for {blind_s:.1f} s and the pump runs")
         if math.isnan(self._fault_s):
             return
@@ -258,17 +301,24 @@ class Watch:
         if self._obeys and reached and given > ramp + 1e-3:
             self._say(now_s, f"{age_s:.1f} s in the fault the pump is driven with {given:.2f}")
         self._look_at_vent(
-            age_s > RAMP_S + PUMP_OFF_S + _SLACK_S or self._safe_level == SafeLevel.VENT, reached, now_s
+            age_s > RAMP_S + PUMP_OFF_S + _SLACK_S or self._safe_level == SafeLevel.VENT,
+            reached,
+            now_s,
         )
 
     def _look_at_mean_flow(self, reached: bool, now_s: float) -> None:
-        """On HOLD_FLOW the pump gives its mean flow: after a second for the rate limit, it is steady."""
+        """On HOLD_FLOW the pump gives its mean flow: after a second for the rate limit, it is
+        steady.
+        """
         steady = self._safe_level == SafeLevel.HOLD_FLOW and self._obeys and reached
         self._held_ticks = self._held_ticks + 1 if steady else 0
         if self._held_ticks * self._tick_s < 1.0:
             self._held_pump = self._plant.pump_given
         elif abs(self._plant.pump_given - self._held_pump) > _STEADY:
-            self._say(now_s, f"the mean flow went from {self._held_pump:.2f} to {self._plant.pump_given:.2f}")
+            self._say(
+                now_s,
+                f"the mean flow went from {self._held_pump:.2f} to {self._plant.pump_given:.2f}",
+            )
 
     def _look_at_vent(self, must_be_open: bool, reached: bool, now_s: float) -> None:
         stuck = not math.isnan(self._bench.wrong.vent_stuck_fraction)
@@ -292,11 +342,19 @@ class Watch:
             self._met = True  # report it once
             self._say(
                 now_s,
-                f"on {self._safe_level.name}, not on {reaction.safe_level.name} {reaction.within_s:.2f} s after",
+                f"on {self._safe_level.name}, not on {reaction.safe_level.name} "
+                f"{reaction.within_s:.2f} s after",
             )
         if not self._case.lasting:
             return
-        if age_s > OFF_AFTER_S[reaction.safe_level] + _SLACK_S and self._obeys and self._plant.pump_given > 0:
-            self._say(now_s, f"the pump runs {age_s:.1f} s after it had to be on {reaction.safe_level.name}")
+        if (
+            age_s > OFF_AFTER_S[reaction.safe_level] + _SLACK_S
+            and self._obeys
+            and self._plant.pump_given > 0
+        ):
+            self._say(
+                now_s,
+                f"the pump runs {age_s:.1f} s after it had to be on {reaction.safe_level.name}",
+            )
         reached = not self._bench.wrong.unreachable and now_s == self._last_tick_s
         self._look_at_vent(age_s > VENTS_AFTER_S[reaction.safe_level] + _SLACK_S, reached, now_s)

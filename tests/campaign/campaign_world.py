@@ -64,7 +64,9 @@ def world_of(seed: int, rng: np.random.Generator) -> World:
     scenario = str(rng.choice(SCENARIOS))
     if seed in NOMINAL_SEEDS:
         return World(scenario)
-    gain, leak, softness, transport_s = rng.uniform([0.8, 0.7, 0.985, 0.04], [1.25, 1.3, 1.015, 0.15]).tolist()
+    gain, leak, softness, transport_s = rng.uniform(
+        [0.8, 0.7, 0.985, 0.04], [1.25, 1.3, 1.015, 0.15]
+    ).tolist()
     return World(scenario, gain, leak, softness, transport_s)
 
 
@@ -77,10 +79,14 @@ class WatchedPlant(Plant):
         Drive of the pump's motor and of the valve, whoever sent it.
     """
 
-    def __init__(self, world: World, twin: TwinConfig, pump: PumpConfig, events: Sequence[BenchEvent] = ()) -> None:
+    def __init__(
+        self, world: World, twin: TwinConfig, pump: PumpConfig, events: Sequence[BenchEvent] = ()
+    ) -> None:
         self._softness = world.softness
         self.pump_given = self.vent_given = 0.0
-        real = pump.model_copy(update={"flow_full_um_per_s": world.pump_gain * pump.flow_full_um_per_s})
+        real = pump.model_copy(
+            update={"flow_full_um_per_s": world.pump_gain * pump.flow_full_um_per_s}
+        )
         super().__init__(twin, real, events)
         self._pump._tube = deque([self._inflow_ml_per_s] * round(world.transport_s / STEP_S))
 

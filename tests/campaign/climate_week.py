@@ -1,8 +1,9 @@
 """Weeks in which no sensor fails and the room's climate moves film and gauge: any fault is false.
 
-The film becomes longer with humidity (7e-6 per % of relative humidity) and where it is warmer than its ring (17e-6
-per kelvin; the ring follows the air within hours), the gauge's zero drifts by 1 Pa/K, and the film creeps. Each day
-the hold is paused, driven by hand, tuned, moved to another setpoint, lowered and inflated again.
+The film becomes longer with humidity (7e-6 per % of relative humidity) and where it is warmer than
+its ring (17e-6 per kelvin; the ring follows the air within hours), the gauge's zero drifts by 1
+Pa/K, and the film creeps. Each day the hold is paused, driven by hand, tuned, moved to another
+setpoint, lowered and inflated again.
 """
 
 from __future__ import annotations
@@ -15,7 +16,14 @@ import numpy as np
 from campaign_run import relay_about
 
 from firmware_iface.emulators.pump_board import BoardSample
-from membrane_ctrl.config.schema import Config, EstimatorConfig, LoopConfig, PumpConfig, ShapeConfig, TwinConfig
+from membrane_ctrl.config.schema import (
+    Config,
+    EstimatorConfig,
+    LoopConfig,
+    PumpConfig,
+    ShapeConfig,
+    TwinConfig,
+)
 from membrane_ctrl.controller.commands import Command
 from membrane_ctrl.controller.protection import ProcessValue
 from membrane_ctrl.hold.virtual_run import TruthShape, VirtualRun
@@ -62,7 +70,9 @@ class Climate:
 class ClimatePlant(Plant):
     """The twin in a room whose climate moves the film and the gauge's zero."""
 
-    def __init__(self, twin: TwinConfig, pump: PumpConfig, events: Sequence[BenchEvent], climate: Climate) -> None:
+    def __init__(
+        self, twin: TwinConfig, pump: PumpConfig, events: Sequence[BenchEvent], climate: Climate
+    ) -> None:
         self._climate = climate
         super().__init__(twin, pump, events)
 
@@ -111,7 +121,9 @@ def run_week(process_value: ProcessValue, climate: Climate, seed: int, days: flo
         estimator=EstimatorConfig(process_value=process_value.value),
         twin=twin,
     )
-    air = DailyTemperature(climate.temperature_k, warmest_s=-climate.temperature_phase * DAY_S / (2 * math.pi))
+    air = DailyTemperature(
+        climate.temperature_k, warmest_s=-climate.temperature_phase * DAY_S / (2 * math.pi)
+    )
     bench = VirtualBench(ClimatePlant(twin, config.pump, (air,), climate))
     figures = TruthShape(bench, config, seed, 0.036)
     run = VirtualRun(config, bench, zernike_projection(), figures)
@@ -126,7 +138,11 @@ def run_week(process_value: ProcessValue, climate: Climate, seed: int, days: flo
         assert tick is not None
         ticks += 1
         held += int(math.isfinite(tick.row.setpoint_um))
-        faults += [f"{e.name} at {run.now_s / 3600:.2f} h: {e.seen}" for e in tick.events if isinstance(e, Fault)]
+        faults += [
+            f"{e.name} at {run.now_s / 3600:.2f} h: {e.seen}"
+            for e in tick.events
+            if isinstance(e, Fault)
+        ]
         notices += [event.name for event in tick.events if isinstance(event, Maintenance)]
     return Week(run.now_s / DAY_S, tuple(faults), tuple(notices), held / ticks)
 
@@ -146,6 +162,11 @@ def _plan(seed: int, end_s: float) -> list[tuple[float, Command]]:
             (at_s[3], Command("setpoint", "campaign", value=float(chance.uniform(-100.0, 100.0)))),
             (at_s[4], Command("lower", "campaign")),
             (at_s[4] + 120.0, Command("hold", "campaign")),
-            (at_s[5], Command("gains", "campaign", value=300.0, loop=LOOP.model_copy(update={"kp_per_s": 0.5}))),
+            (
+                at_s[5],
+                Command(
+                    "gains", "campaign", value=300.0, loop=LOOP.model_copy(update={"kp_per_s": 0.5})
+                ),
+            ),
         ]
     return [(at_s, command) for at_s, command in plan if at_s < end_s]

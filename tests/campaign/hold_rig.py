@@ -1,4 +1,6 @@
-"""The real supervisor over a bench in memory, on an event loop in virtual time, observed from outside."""
+"""The real supervisor over a bench in memory, on an event loop in virtual time, observed from
+outside.
+"""
 
 from __future__ import annotations
 
@@ -128,7 +130,11 @@ class HoldRig:
 
     def still(self) -> str:
         """The violation if the pump is driven."""
-        return f"the pump is driven with {self.plant.pump_given:.2f}" if self.plant.pump_given > 0 else ""
+        return (
+            f"the pump is driven with {self.plant.pump_given:.2f}"
+            if self.plant.pump_given > 0
+            else ""
+        )
 
     def near(self) -> None:
         """The mirror is at its setpoint."""
@@ -142,19 +148,27 @@ class HoldRig:
 
 
 @contextlib.asynccontextmanager
-async def a_hold(make: Callable[[WatchedPlant], tuple[Bench, Callable[[], object]]]) -> AsyncIterator[HoldRig]:
+async def a_hold(
+    make: Callable[[WatchedPlant], tuple[Bench, Callable[[], object]]],
+) -> AsyncIterator[HoldRig]:
     """A supervisor that is about to hold a mirror."""
     config = config_of(1, World(), False)
     plant = WatchedPlant(World(), config.twin, config.pump)
     bench, now = make(plant)
     rig = HoldRig(plant, bench, now, config)
     with ExitStack() as stack:
-        rings = {name: stack.enter_context(ring(16, size)) for name, size in (("t", ROW_BYTES), ("e", 4096))}
+        rings = {
+            name: stack.enter_context(ring(16, size))
+            for name, size in (("t", ROW_BYTES), ("e", 4096))
+        }
         telemetry, events = (RingWriter(rings[name]) for name in ("t", "e"))
         stack.callback(telemetry.close)
         stack.callback(events.close)
         wiring = Wiring(bench, telemetry, events)
-        wiring.heard = {"rows": rig.heard.append, "listeners": lambda outputs: _tell_all(rig, outputs)}
+        wiring.heard = {
+            "rows": rig.heard.append,
+            "listeners": lambda outputs: _tell_all(rig, outputs),
+        }
         rig.supervisor = Supervisor(
             Controller(config, zernike_projection()), wiring, cast(RunClock, LoopClock()), RATE_HZ
         )

@@ -1,4 +1,6 @@
-"""Hostile clients of the control port, each until it is cancelled: they reconnect when thrown out."""
+"""Hostile clients of the control port, each until it is cancelled:
+they reconnect when thrown out.
+"""
 
 from __future__ import annotations
 
@@ -11,35 +13,53 @@ from collections.abc import Callable, Coroutine
 from pathlib import Path
 from typing import Any
 
-Attack = Callable[[asyncio.StreamReader, asyncio.StreamWriter, random.Random], Coroutine[Any, Any, None]]
+Attack = Callable[
+    [asyncio.StreamReader, asyncio.StreamWriter, random.Random], Coroutine[Any, Any, None]
+]
 
 
-async def nonsense(reader: asyncio.StreamReader, writer: asyncio.StreamWriter, chance: random.Random) -> None:
+async def nonsense(
+    reader: asyncio.StreamReader, writer: asyncio.StreamWriter, chance: random.Random
+) -> None:
     """Random bytes, as fast as they are accepted."""
-    writer.write(chance.randbytes(300) + b"\n" + b'{"do": "no such thing", "number": 1}\n' + b"[[[[[[" * 100 + b"\n")
+    writer.write(
+        chance.randbytes(300)
+        + b"\n"
+        + b'{"do": "no such thing", "number": 1}\n'
+        + b"[[[[[[" * 100
+        + b"\n"
+    )
     await writer.drain()
 
 
-async def huge(reader: asyncio.StreamReader, writer: asyncio.StreamWriter, chance: random.Random) -> None:
+async def huge(
+    reader: asyncio.StreamReader, writer: asyncio.StreamWriter, chance: random.Random
+) -> None:
     """A line that never ends."""
     writer.write(b"x" * 100_000)
     await writer.drain()
 
 
-async def slow(reader: asyncio.StreamReader, writer: asyncio.StreamWriter, chance: random.Random) -> None:
+async def slow(
+    reader: asyncio.StreamReader, writer: asyncio.StreamWriter, chance: random.Random
+) -> None:
     """A byte now and then."""
     writer.write(b"{")
     await asyncio.sleep(0.5)
 
 
-async def deaf(reader: asyncio.StreamReader, writer: asyncio.StreamWriter, chance: random.Random) -> None:
+async def deaf(
+    reader: asyncio.StreamReader, writer: asyncio.StreamWriter, chance: random.Random
+) -> None:
     """Asks for everything, reads nothing."""
     writer.write(json.dumps({"do": "watch", "period_s": 0.1, "number": 1}).encode() + b"\n")
     writer.write(b'{"do": "status", "number": 2}\n' * 100)
     await asyncio.sleep(0.5)
 
 
-async def flood(reader: asyncio.StreamReader, writer: asyncio.StreamWriter, chance: random.Random) -> None:
+async def flood(
+    reader: asyncio.StreamReader, writer: asyncio.StreamWriter, chance: random.Random
+) -> None:
     """Connects and disconnects."""
     raise ConnectionError
 

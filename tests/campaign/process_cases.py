@@ -20,7 +20,14 @@ WALL_CLOCK = "wall-clock-step"  # a file that says by how many seconds it is off
 CLOCK, DISK = "a wall clock of its own", "a small disk"
 _DAY_S = 86_400
 # The board has stopped the pump by itself; the first tick afterwards finds one of these.
-_STOPPED = ("watchdog_tripped", "board_fault", "device_silent", "displacement_frozen", "late", "displacement_missing")
+_STOPPED = (
+    "watchdog_tripped",
+    "board_fault",
+    "device_silent",
+    "displacement_frozen",
+    "late",
+    "displacement_missing",
+)
 _CUT = ("link_lost",)
 _QUIET = ("device_silent", "link_lost", "displacement_missing")
 
@@ -81,7 +88,9 @@ async def stop_recorder(run: Run) -> None:
 
 
 async def slow_disk(run: Run) -> None:
-    """A disk that takes 10 s for a second of data: seen from outside, the recorder stops and continues."""
+    """A disk that takes 10 s for a second of data: seen from outside, the recorder stops and
+    continues.
+    """
     recorder = run.recorder()
     recorder.suspend()
     await asyncio.sleep(10.0)
@@ -182,7 +191,9 @@ TRIP = int(Exit.SAFETY_TRIP)
 PROCESS_CASES: tuple[ProcessCase, ...] = (
     ProcessCase("control process stopped for 3 s", stop_control, TRIP, _STOPPED, stops_pump=True),
     # a tick that was late at the kill is no telemetry
-    ProcessCase("control process killed", kill_control, -signal.SIGKILL, stops_pump=True, lost_s=0.1),
+    ProcessCase(
+        "control process killed", kill_control, -signal.SIGKILL, stops_pump=True, lost_s=0.1
+    ),
     ProcessCase("event loop hangs for 3 s", hang_loop, TRIP, _STOPPED, stops_pump=True),
     ProcessCase("recorder killed", kill_recorder),
     ProcessCase("recorder stopped", stop_recorder),
@@ -196,12 +207,30 @@ PROCESS_CASES: tuple[ProcessCase, ...] = (
     ProcessCase("wall clock a day ahead", step_clock(_DAY_S), needs=CLOCK),
     ProcessCase("wall clock a day back", step_clock(-_DAY_S), needs=CLOCK),
     ProcessCase("recorder killed, network cut", recorder_killed_and_network_cut, TRIP, _CUT),
-    ProcessCase("recorder stopped, board loses its power", stopped_recorder_and_power_cycle, TRIP, _CUT),
-    ProcessCase("control process and recorder killed", kill_both, -signal.SIGKILL, stops_pump=True, lost_s=1.5),
     ProcessCase(
-        "wall clock a day back, event loop hangs", clock_stepped_and_loop_hangs, TRIP, _STOPPED, True, needs=CLOCK
+        "recorder stopped, board loses its power", stopped_recorder_and_power_cycle, TRIP, _CUT
     ),
     ProcessCase(
-        "disk full, laser unplugged", full_disk_and_no_laser, TRIP, ("displacement_missing",), lost_s=10.0, needs=DISK
+        "control process and recorder killed",
+        kill_both,
+        -signal.SIGKILL,
+        stops_pump=True,
+        lost_s=1.5,
+    ),
+    ProcessCase(
+        "wall clock a day back, event loop hangs",
+        clock_stepped_and_loop_hangs,
+        TRIP,
+        _STOPPED,
+        True,
+        needs=CLOCK,
+    ),
+    ProcessCase(
+        "disk full, laser unplugged",
+        full_disk_and_no_laser,
+        TRIP,
+        ("displacement_missing",),
+        lost_s=10.0,
+        needs=DISK,
     ),
 )

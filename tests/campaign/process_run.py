@@ -1,4 +1,6 @@
-"""One fault of real processes: a hold against the emulated board, and what must be true afterwards."""
+"""One fault of real processes: a hold against the emulated board,
+and what must be true afterwards.
+"""
 
 from __future__ import annotations
 
@@ -60,7 +62,10 @@ def missing(case: ProcessCase) -> str:
     """Why this machine cannot run the case; empty if it can."""
     if case.needs == CLOCK and shutil.which("cc") is None:
         return "no C compiler for the preloaded wall clock"
-    if case.needs == DISK and subprocess.run(["unshare", "-m", "true"], capture_output=True, check=False).returncode:
+    if (
+        case.needs == DISK
+        and subprocess.run(["unshare", "-m", "true"], capture_output=True, check=False).returncode
+    ):
         return "no right to mount a small disk"
     return ""
 
@@ -94,7 +99,9 @@ async def pump_stood_s(plant: WatchedPlant, since_s: float) -> float:
 def judged(case: ProcessCase, run: Run, code: int, pump_s: float) -> ProcessResult:
     """The invariants, on what the run has left."""
     (run_dir,) = (path for path in (run.folder / "logs").iterdir() if path.is_dir())
-    if not (run_dir / "summary.json").exists():  # controller and recorder are dead: a person repairs it
+    if not (
+        run_dir / "summary.json"
+    ).exists():  # controller and recorder are dead: a person repairs it
         repair(run_dir)
     summary = json.loads((run_dir / "summary.json").read_text())
     faults = run.faults()
@@ -104,12 +111,14 @@ def judged(case: ProcessCase, run: Run, code: int, pump_s: float) -> ProcessResu
     checks = {
         f"exit {code} in place of {case.exit}": code == case.exit,
         f"first cause {said!r}": said in case.faults if case.faults else not said,
-        f"pump ran on for {pump_s:.2f} s": not case.stops_pump or pump_s <= WATCHDOG_S + 2 * run.plant.longest_gap_s,
+        f"pump ran on for {pump_s:.2f} s": not case.stops_pump
+        or pump_s <= WATCHDOG_S + 2 * run.plant.longest_gap_s,
         "the pump runs after the end": not run.plant.pumping,
         "latched file": (latched is not None) == (case.exit == Exit.SAFETY_TRIP),
         f"latched as {latched and latched.name!r}": latched is None or latched.name == said,
         f"{lost_s:.2f} s of telemetry lost": lost_s <= case.lost_s,
-        "deeper than the limit": run.plant.displacement_max_um <= LimitsConfig().displacement_max_um,
+        "deeper than the limit": run.plant.displacement_max_um
+        <= LimitsConfig().displacement_max_um,
         "pressure above the limit": run.plant.gauge_pressure_max_pa
         <= LimitsConfig().gauge_pressure_max_pa + _GAUGE_SLACK_PA,
         "no segment can be opened": any(run_dir.glob("*.rrd")),
@@ -117,7 +126,9 @@ def judged(case: ProcessCase, run: Run, code: int, pump_s: float) -> ProcessResu
     }
     violations = tuple(what for what, holds in checks.items() if not holds)
     restarts = int((summary.get("recorder") or {}).get("restarts", 0))
-    return ProcessResult(case.name, str(summary["exit"]), said, pump_s, lost_s, restarts, violations)
+    return ProcessResult(
+        case.name, str(summary["exit"]), said, pump_s, lost_s, restarts, violations
+    )
 
 
 def lost_telemetry_s(run_dir: Path, killed_utc_s: float | None = None) -> float:
@@ -127,7 +138,11 @@ def lost_telemetry_s(run_dir: Path, killed_utc_s: float | None = None) -> float:
     ticks = table.column("tick").to_numpy()
     if not len(ticks):
         return math.inf
-    ends = [json.loads(line) for line in (run_dir / "events.jsonl").read_text().splitlines() if '"end"' in line]
+    ends = [
+        json.loads(line)
+        for line in (run_dir / "events.jsonl").read_text().splitlines()
+        if '"end"' in line
+    ]
     last = max([ticks[-1], *(event["ticks"] for event in ends if "ticks" in event)])
     assert len(np.unique(ticks)) == len(ticks), "a tick is there twice"
     gaps_s = float(last - len(ticks)) / RATE_HZ
@@ -141,7 +156,11 @@ def utc_is_steady(run: Run) -> bool:
     """Whether the events' UTC agrees with the run's own seconds, whatever the wall clock does."""
     from datetime import datetime
 
-    starts = [datetime.fromisoformat(e["time_utc"]).timestamp() - e["mono_s"] for e in run.events if "mono_s" in e]
+    starts = [
+        datetime.fromisoformat(e["time_utc"]).timestamp() - e["mono_s"]
+        for e in run.events
+        if "mono_s" in e
+    ]
     return max(starts) - min(starts) < 0.01
 
 
@@ -160,7 +179,10 @@ def small_disk(folder: Path) -> Iterator[None]:
 def wall_clock(folder: Path) -> dict[str, str]:
     """Environment of a process whose wall clock can be stepped by a file."""
     library = folder / "wall_clock.so"
-    subprocess.run(["cc", "-shared", "-fPIC", "-o", str(library), str(UPSET / "wall_clock.c"), "-ldl"], check=True)
+    subprocess.run(
+        ["cc", "-shared", "-fPIC", "-o", str(library), str(UPSET / "wall_clock.c"), "-ldl"],
+        check=True,
+    )
     return {"LD_PRELOAD": str(library), "WALL_CLOCK_STEP": str(folder / WALL_CLOCK)}
 
 
@@ -173,5 +195,8 @@ def process_table(results: list[ProcessResult]) -> list[str]:
     for r in results:
         pump = "-" if math.isnan(r.pump_s) else f"{r.pump_s:.2f} s"
         bad = f" **{'; '.join(r.violations)}**" if r.violations else ""
-        rows.append(f"| {r.name} | {r.exit} | {r.said or '-'} | {pump} | {r.lost_s:.2f} s | {r.restarts}{bad} |")
+        rows.append(
+            f"| {r.name} | {r.exit} | {r.said or '-'} | {pump} | {r.lost_s:.2f} s | "
+            f"{r.restarts}{bad} |"
+        )
     return rows

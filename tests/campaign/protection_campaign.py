@@ -1,9 +1,10 @@
-"""The protection campaign: every cell of the protection table with every failure, and pairs of failures.
+"""The protection campaign: every cell of the protection table with every failure, and pairs of
+failures.
 
 python tests/campaign/protection_campaign.py                  # all that is not done yet, and docs/protection.md
 python tests/campaign/protection_campaign.py --only "optics drifts" --value estimate    # some cells, printed
 python tests/campaign/protection_campaign.py --fresh          # forgets what is done
-"""
+"""  # noqa: E501
 
 from __future__ import annotations
 
@@ -30,8 +31,8 @@ from membrane_ctrl.controller.protection import Activity, FilmSensor, ProcessVal
 RESULTS = Path(__file__).parents[2] / "build" / "protection.jsonl"
 WEEKS = Path(__file__).parents[2] / "build" / "climate.json"
 PHASES = (0.0, 2.0, 4.0)  # of humidity against temperature
-# How long a cell is followed: beyond the ten minutes of a pause or of manual flow; beyond an experiment of a minute;
-# for drifts that take hours in a hold; otherwise for minutes.
+# How long a cell is followed: beyond the ten minutes of a pause or of manual flow; beyond an
+# experiment of a minute; for drifts that take hours in a hold; otherwise for minutes.
 PAUSE_S, TUNE_S, DRIFT_S, HOLD_S = 660.0, 120.0, 45_000.0, 330.0
 _PAIR_SEED, _ORDER_SEED = 7, 3
 
@@ -47,7 +48,9 @@ class Cell:
 
     @property
     def lasts_s(self) -> float:
-        """How long it is followed: a drift that takes hours in a hold, everything else for minutes."""
+        """How long it is followed: a drift that takes hours in a hold,
+        everything else for minutes.
+        """
         undertaking = Undertaking(self.undertaking)
         if undertaking is Undertaking.HOLD and len(self.failures) == 1 and self._drifts_slowly():
             return DRIFT_S
@@ -57,7 +60,9 @@ class Cell:
         return TUNE_S if activity is Activity.TUNE else HOLD_S
 
     def _drifts_slowly(self) -> bool:
-        """Whether a sensor that the process value follows drifts for hours; a gauge's drift is the same in all."""
+        """Whether a sensor that the process value follows drifts for hours; a gauge's drift is the
+        same in all.
+        """
         failure = BY_WORDS[self.failures[0]]
         followed = {
             ProcessValue.LASER: {FilmSensor.LASER, FilmSensor.GAUGE},
@@ -74,23 +79,28 @@ def is_possible(value: ProcessValue, failure: SensorFailure) -> bool:
 
 def list_singles() -> Iterator[Cell]:
     """Every process value, undertaking and failure; the seed alternates between two films."""
-    for number, (value, undertaking, failure) in enumerate(product(ProcessValue, Undertaking, FAILURES)):
+    for number, (value, undertaking, failure) in enumerate(
+        product(ProcessValue, Undertaking, FAILURES)
+    ):
         if is_possible(value, failure):
             yield Cell(value.value, undertaking.value, (failure.words,), 1 + number % 2)
 
 
 def list_pairs() -> Iterator[Cell]:
-    """Pairs of failures of two sensors, each in a cell drawn from the seed: a covering array of the pairs' cells.
+    """Pairs of failures of two sensors, each in a cell drawn from the seed: a covering array of the
+    pairs' cells.
 
-    Each failure meets at least one failure of each other sensor in every process value, and each undertaking is drawn
-    equally often.
+    Each failure meets at least one failure of each other sensor in every process value, and each
+    undertaking is drawn equally often.
     """
     rng = np.random.default_rng(_PAIR_SEED)
     undertakings = list(Undertaking)
     count = 0
     for value, first in product(ProcessValue, FAILURES):
         for sensor in FilmSensor:
-            partners = [other for other in FAILURES if other.sensor is sensor and is_possible(value, other)]
+            partners = [
+                other for other in FAILURES if other.sensor is sensor and is_possible(value, other)
+            ]
             if sensor is first.sensor or not partners or not is_possible(value, first):
                 continue
             second = partners[int(rng.integers(len(partners)))]
@@ -113,7 +123,9 @@ def load_done() -> dict[Cell, Outcome]:
         for line in RESULTS.read_text(encoding="utf-8").splitlines():
             entry = json.loads(line)
             cell = Cell(**{**entry["cell"], "failures": tuple(entry["cell"]["failures"])})
-            done[cell] = Outcome(**{key: math.nan if x is None else x for key, x in entry["outcome"].items()})
+            done[cell] = Outcome(
+                **{key: math.nan if x is None else x for key, x in entry["outcome"].items()}
+            )
     return done
 
 
@@ -154,7 +166,10 @@ def run_all(cells: Iterable[Cell], processes: int, minutes: float) -> dict[Cell,
 
 
 def _to_json(cell: Cell, outcome: Outcome) -> dict[str, object]:
-    finite = {key: None if isinstance(x, float) and math.isnan(x) else x for key, x in asdict(outcome).items()}
+    finite = {
+        key: None if isinstance(x, float) and math.isnan(x) else x
+        for key, x in asdict(outcome).items()
+    }
     return {"cell": asdict(cell), "outcome": finite}
 
 
@@ -163,7 +178,9 @@ def run_weeks(days: float, processes: int) -> dict[str, Week]:
     weeks: dict[str, Week] = {}
     if WEEKS.exists():
         for value, entry in json.loads(WEEKS.read_text(encoding="utf-8")).items():
-            weeks[value] = Week(entry["days"], tuple(entry["faults"]), tuple(entry["notices"]), entry["held_share"])
+            weeks[value] = Week(
+                entry["days"], tuple(entry["faults"]), tuple(entry["notices"]), entry["held_share"]
+            )
     todo = [value for value in ProcessValue if value.value not in weeks]
     with ProcessPoolExecutor(processes, mp_context=get_context("spawn")) as pool:
         futures = {
@@ -172,21 +189,34 @@ def run_weeks(days: float, processes: int) -> dict[str, Week]:
         }
         for future in as_completed(futures):
             weeks[futures[future].value] = future.result()
-            WEEKS.write_text(json.dumps({v: asdict(week) for v, week in weeks.items()}), encoding="utf-8")
+            WEEKS.write_text(
+                json.dumps({v: asdict(week) for v, week in weeks.items()}), encoding="utf-8"
+            )
     return {value.value: weeks[value.value] for value in ProcessValue if value.value in weeks}
 
 
 def main() -> int:
     """Run the campaign, or the cells that are asked for."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--only", default="", help="failures whose names contain this; prints, writes no document")
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument(
+        "--only", default="", help="failures whose names contain this; prints, writes no document"
+    )
     parser.add_argument("--value", default="", help="only this process value")
-    parser.add_argument("--in", dest="within", default="", help="only undertakings whose names contain this")
+    parser.add_argument(
+        "--in", dest="within", default="", help="only undertakings whose names contain this"
+    )
     parser.add_argument("--fresh", action="store_true", help="forget what is done")
     parser.add_argument("--processes", type=int, default=2)
-    parser.add_argument("--minutes", type=float, default=math.inf, help="begin no cell after so long")
     parser.add_argument(
-        "--days", type=float, default=7.0, help="of climate without a failure, for each process value"
+        "--minutes", type=float, default=math.inf, help="begin no cell after so long"
+    )
+    parser.add_argument(
+        "--days",
+        type=float,
+        default=7.0,
+        help="of climate without a failure, for each process value",
     )
     arguments = parser.parse_args()
     if arguments.fresh:
@@ -203,7 +233,10 @@ def main() -> int:
     weeks = run_weeks(arguments.days, arguments.processes) if arguments.days > 0 else {}
     beyond = write_page(results, weeks, cells)
     faults = sum(len(week.faults) for week in weeks.values())
-    print(f"{len(results)} runs, {beyond} beyond their bound; {len(weeks)} weeks, {faults} false faults")
+    print(
+        f"{len(results)} runs, {beyond} beyond their bound; {len(weeks)} weeks, {faults} "
+        "false faults"
+    )
     return int(beyond > 0 or faults > 0)
 
 

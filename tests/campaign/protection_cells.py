@@ -1,7 +1,9 @@
-"""Every process value and activity with every failure of a sensor: how far the true mirror goes, and what stops it.
+"""Every process value and activity with every failure of a sensor: how far the true mirror goes,
+and what stops it.
 
-The faulty sensors stand between plant and board, or between plant and figures; the plant's true state is judged. The
-film of odd seeds was stretched before it was inflated: its pressure is partly linear in the sag.
+The faulty sensors stand between plant and board, or between plant and figures; the plant's true
+state is judged. The film of odd seeds was stretched before it was inflated: its pressure is partly
+linear in the sag.
 """
 
 from __future__ import annotations
@@ -66,7 +68,8 @@ class Undertaking(Enum):
         return Activity(word)
 
 
-# How far an undertaking itself moves the mirror up; displacement 0 of the optics is up to 12 µm above the start.
+# How far an undertaking itself moves the mirror up; displacement 0 of the optics is up to 12 µm
+# above the start.
 WAYS_UM = {Undertaking.INFLATE: 17.0, Undertaking.SETPOINT: 40.0}
 
 
@@ -79,11 +82,13 @@ class SensorFailure:
     sensor : FilmSensor
     name : str
     kind : Failure or None
-        By what its effect is bounded; None where the figure says so itself and only the cell counts.
+        By what its effect is bounded; None where the figure says so itself and only the cell
+        counts.
     lie : callable or None
         The reading instead, as of a `SensorFault`; of optics, the sag.
     spoil : callable or None
-        The figure instead, or None for a lost one; from the figure, seconds since the failure and a random generator.
+        The figure instead, or None for a lost one; from the figure, seconds since the failure and a
+        random generator.
     slow : bool
         Takes hours to show.
     """
@@ -123,7 +128,9 @@ def _kind_of_drift(um_per_s: float) -> Failure:
 
 
 def _common(sensor: FilmSensor, unit: float, noise: float) -> Iterator[SensorFailure]:
-    """Failures of any sensor of the film; `unit` is its unit in µm of the centre, `noise` that of a reading."""
+    """Failures of any sensor of the film; `unit` is its unit in µm of the centre, `noise` that of a
+    reading.
+    """
     yield SensorFailure(sensor, "lost", Failure.LOST, lost)
     yield SensorFailure(sensor, "stuck", Failure.LOST, stuck)
     yield SensorFailure(sensor, "frozen with noise", Failure.STEP, frozen_with_noise(noise))
@@ -133,38 +140,61 @@ def _common(sensor: FilmSensor, unit: float, noise: float) -> Iterator[SensorFai
             lie = drift(sign * um_per_s / unit)
             yield SensorFailure(sensor, name, _kind_of_drift(um_per_s), lie, slow=um_per_s <= 0.05)
     for step_um in (-150.0, -30.0, 30.0, 150.0):
-        yield SensorFailure(sensor, f"steps by {step_um:+g} µm", Failure.STEP, offset(step_um / unit))
+        yield SensorFailure(
+            sensor, f"steps by {step_um:+g} µm", Failure.STEP, offset(step_um / unit)
+        )
     for share in (0.8, 1.25, -1.0):
         yield SensorFailure(sensor, f"scale {share:g}", Failure.STEP, scaled(share))
 
 
-def _shift_time(shift_s: float) -> Callable[[ShapeEstimate, float, np.random.Generator], ShapeEstimate]:
+def _shift_time(
+    shift_s: float,
+) -> Callable[[ShapeEstimate, float, np.random.Generator], ShapeEstimate]:
     return lambda figure, age_s, rng: replace(figure, time_s=figure.time_s + shift_s)
 
 
 FIGURE_FAILURES = (
     SensorFailure(
-        FilmSensor.OPTICS, "sigma NaN", Failure.LOST, spoil=lambda f, t, r: replace(f, sag_sigma_um=math.nan)
+        FilmSensor.OPTICS,
+        "sigma NaN",
+        Failure.LOST,
+        spoil=lambda f, t, r: replace(f, sag_sigma_um=math.nan),
     ),
     SensorFailure(
-        FilmSensor.OPTICS, "sigma 1e3 µm", Failure.LOST, spoil=lambda f, t, r: replace(f, sag_sigma_um=1e3)
+        FilmSensor.OPTICS,
+        "sigma 1e3 µm",
+        Failure.LOST,
+        spoil=lambda f, t, r: replace(f, sag_sigma_um=1e3),
     ),
     SensorFailure(
-        FilmSensor.OPTICS, "sigma 1e-9 µm", Failure.LOST, spoil=lambda f, t, r: replace(f, sag_sigma_um=1e-9)
+        FilmSensor.OPTICS,
+        "sigma 1e-9 µm",
+        Failure.LOST,
+        spoil=lambda f, t, r: replace(f, sag_sigma_um=1e-9),
     ),
     SensorFailure(
         FilmSensor.OPTICS,
         "sigma too small, 2 µm of noise",
         Failure.LOST,
-        spoil=lambda f, t, r: replace(f, sag_um=f.sag_um + 2.0 * r.standard_normal(), sag_sigma_um=1e-3),
+        spoil=lambda f, t, r: replace(
+            f, sag_um=f.sag_um + 2.0 * r.standard_normal(), sag_sigma_um=1e-3
+        ),
     ),
     SensorFailure(FilmSensor.OPTICS, "times of the future", Failure.LOST, spoil=_shift_time(5.0)),
     SensorFailure(FilmSensor.OPTICS, "times 30 s late", Failure.LOST, spoil=_shift_time(-30.0)),
     SensorFailure(FilmSensor.OPTICS, "times 0.5 s late", Failure.LOST, spoil=_shift_time(-0.5)),
     SensorFailure(FilmSensor.OPTICS, "times NaN", Failure.LOST, spoil=_shift_time(math.nan)),
-    SensorFailure(FilmSensor.OPTICS, "rejected", Failure.LOST, spoil=lambda f, t, r: replace(f, verdict="rejected")),
     SensorFailure(
-        FilmSensor.OPTICS, "every third figure", Failure.LOST, spoil=lambda f, t, r: f if r.random() < 0.33 else None
+        FilmSensor.OPTICS,
+        "rejected",
+        Failure.LOST,
+        spoil=lambda f, t, r: replace(f, verdict="rejected"),
+    ),
+    SensorFailure(
+        FilmSensor.OPTICS,
+        "every third figure",
+        Failure.LOST,
+        spoil=lambda f, t, r: f if r.random() < 0.33 else None,
     ),
 )
 FAILURES: tuple[SensorFailure, ...] = (
@@ -183,7 +213,8 @@ class Outcome:
     Attributes
     ----------
     off_um : float
-        Largest distance of the true centre from where it should be, until the pump is taken off, with its sign.
+        Largest distance of the true centre from where it should be, until the pump is taken off,
+        with its sign.
     after_s : float
         Time from the failure to the first fault that is not cleared; NaN without one.
     fault : str
@@ -211,9 +242,13 @@ class Outcome:
 
 
 class SpoiledFigures:
-    """Figures from the truth, altered by the failures of the optics, and the laser's part of them."""
+    """Figures from the truth, altered by the failures of the optics,
+    and the laser's part of them.
+    """
 
-    def __init__(self, source: TruthShape, lying: Lying, failures: tuple[SensorFailure, ...], seed: int) -> None:
+    def __init__(
+        self, source: TruthShape, lying: Lying, failures: tuple[SensorFailure, ...], seed: int
+    ) -> None:
         self._source, self._lying = source, lying
         self._spoils = [failure.spoil for failure in failures if failure.spoil is not None]
         self._rng = np.random.default_rng(seed)
@@ -234,7 +269,9 @@ class SpoiledFigures:
         )
         if math.isfinite(self.since_s):
             for spoil in self._spoils:
-                altered = None if altered is None else spoil(altered, now_s - self.since_s, self._rng)
+                altered = (
+                    None if altered is None else spoil(altered, now_s - self.since_s, self._rng)
+                )
         return altered
 
 
@@ -254,8 +291,14 @@ def make_config(process_value: ProcessValue, seed: int) -> Config:
 def _experiment(kind: ExperimentKind, flow_um_per_s: float) -> ExperimentSpec:
     if kind == "relay":
         return relay_about(flow_um_per_s)
-    steps = tuple(PumpStep(fraction=f, duration_s=3.0) for f in (0.5, 0.0, 0.7, 0.0)) if kind == "pump_map" else ()
-    return ExperimentSpec(kind=kind, duration_s=60.0, holding_flow_um_per_s=flow_um_per_s, laser_um=1.0, steps=steps)
+    steps = (
+        tuple(PumpStep(fraction=f, duration_s=3.0) for f in (0.5, 0.0, 0.7, 0.0))
+        if kind == "pump_map"
+        else ()
+    )
+    return ExperimentSpec(
+        kind=kind, duration_s=60.0, holding_flow_um_per_s=flow_um_per_s, laser_um=1.0, steps=steps
+    )
 
 
 def _begin(undertaking: Undertaking, config: Config, flow_um_per_s: float) -> Command | None:
@@ -356,9 +399,15 @@ def _watch(run: VirtualRun, bench: VirtualBench, until_s: float, way_um: float) 
                 case Maintenance() if not notice:
                     notice, notice_s, notice_um = event.name, run.now_s - since_s, away_um
                 case Plausibility() if not notice and event.stands:
-                    notice, notice_s, notice_um = f"{event.faulty} wrong", run.now_s - since_s, away_um
+                    notice, notice_s, notice_um = (
+                        f"{event.faulty} wrong",
+                        run.now_s - since_s,
+                        away_um,
+                    )
         if state == State.FAULT and row.pump_fraction == 0.0:
             break
         if row.safe_level == SafeLevel.NONE and state != State.FAULT:
             fault, after_s = "", math.nan
-    return Outcome(off_um, after_s, fault, notice, notice_s, notice_um, pressure_max_pa, state.name.lower())
+    return Outcome(
+        off_um, after_s, fault, notice, notice_s, notice_um, pressure_max_pa, state.name.lower()
+    )

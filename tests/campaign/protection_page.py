@@ -1,4 +1,6 @@
-"""Writes docs/protection.md from the results of the protection campaign and of the weeks of climate."""
+"""Writes docs/protection.md from the results of the protection campaign and of the weeks of
+climate.
+"""
 
 from __future__ import annotations
 
@@ -33,18 +35,25 @@ and guards.
 *Off* is the largest distance of the true centre from where it was, or on its way, before the pump was taken off for
 good. A setpoint's or an inflation's own way does not count; a pause, manual flow and experiments move the mirror by
 themselves, by up to `states.manual_range_um` (50 µm) and some µm.
-"""
+"""  # noqa: E501
 
 
 def write_page(results: Results, weeks: Mapping[str, Week], cells: Collection[Cell]) -> int:
-    """Write the page from the results of some or all cells; returns how many went beyond their bound."""
+    """Write the page from the results of some or all cells; returns how many went beyond their
+    bound.
+    """
     singles = {cell: outcome for cell, outcome in results.items() if len(cell.failures) == 1}
     pairs = {cell: outcome for cell, outcome in results.items() if len(cell.failures) == 2}
-    beyond = {cell: outcome for cell, outcome in singles.items() if abs(outcome.off_um) > _bound_um(cell)}
+    beyond = {
+        cell: outcome for cell, outcome in singles.items() if abs(outcome.off_um) > _bound_um(cell)
+    }
     share = ""
     if len(results) < len(cells):
         share = f"{len(results)} of {len(cells)} cells were run, in a seeded random order. "
-    counts = f"**{len(singles)} with one failure, {len(beyond)} beyond the stated bound; {len(pairs)} pairs.**"
+    counts = (
+        f"**{len(singles)} with one failure, {len(beyond)} beyond the stated bound; {len(pairs)} "
+        "pairs.**"
+    )
     lines = [_HEAD, share + counts, ""]
     lines += [*_bounds(singles), *_activities(singles), *_slow_drifts(singles)]
     if beyond:
@@ -56,30 +65,46 @@ def write_page(results: Results, weeks: Mapping[str, Week], cells: Collection[Ce
 
 def _bound_um(cell: Cell) -> float:
     failure = BY_WORDS[cell.failures[0]]
-    return find_bound(ProcessValue(cell.process_value), failure.sensor, failure.kind, Config()).distance_um
+    return find_bound(
+        ProcessValue(cell.process_value), failure.sensor, failure.kind, Config()
+    ).distance_um
 
 
 def _line(entry: tuple[Cell, Outcome]) -> str:
     cell, outcome = entry
-    ended = f"`{outcome.fault}` after {outcome.after_s:.0f} s" if outcome.fault else f"ends in {outcome.state}"
+    ended = (
+        f"`{outcome.fault}` after {outcome.after_s:.0f} s"
+        if outcome.fault
+        else f"ends in {outcome.state}"
+    )
     what = " and ".join(cell.failures)
     return f"- {cell.process_value}, {cell.undertaking}, {what}: {outcome.off_um:+.0f} µm, {ended}"
 
 
 def _bounds(singles: Results) -> list[str]:
-    """Largest distance for each process value, failed sensor and kind of failure, beside its bound."""
+    """Largest distance for each process value, failed sensor and kind of failure,
+    beside its bound.
+    """
     worst: dict[tuple[str, str, Failure], tuple[Cell, Outcome]] = {}
     for cell, outcome in singles.items():
         failure = BY_WORDS[cell.failures[0]]
         key = cell.process_value, failure.sensor.value, failure.kind
         if key not in worst or abs(outcome.off_um) > abs(worst[key][1].off_um):
             worst[key] = cell, outcome
-    lines = ["## One sensor fails", "", "| process value | failed | failure | off, µm | bound, µm | worst case |"]
+    lines = [
+        "## One sensor fails",
+        "",
+        "| process value | failed | failure | off, µm | bound, µm | worst case |",
+    ]
     lines += ["|---|---|---|---|---|---|"]
-    for (value, sensor, kind), (cell, outcome) in sorted(worst.items(), key=lambda item: str(item[0])):
+    for (value, sensor, kind), (cell, outcome) in sorted(
+        worst.items(), key=lambda item: str(item[0])
+    ):
         case = f"{cell.undertaking}, {BY_WORDS[cell.failures[0]].name}"
         bound = f"{_bound_um(cell):.0f}"
-        lines.append(f"| {value} | {sensor} | {kind.value} | {outcome.off_um:+.0f} | {bound} | {case} |")
+        lines.append(
+            f"| {value} | {sensor} | {kind.value} | {outcome.off_um:+.0f} | {bound} | {case} |"
+        )
     return lines
 
 
@@ -90,8 +115,17 @@ def _activities(singles: Results) -> list[str]:
         if not BY_WORDS[cell.failures[0]].slow:
             key = cell.undertaking, cell.process_value
             worst[key] = max(worst[key], abs(outcome.off_um))
-    lines = ["", "## By what the hold does", "", "Failures that show within minutes; off in µm.", ""]
-    lines += ["| | " + " | ".join(value.value for value in ProcessValue) + " |", "|---|" + "---|" * len(ProcessValue)]
+    lines = [
+        "",
+        "## By what the hold does",
+        "",
+        "Failures that show within minutes; off in µm.",
+        "",
+    ]
+    lines += [
+        "| | " + " | ".join(value.value for value in ProcessValue) + " |",
+        "|---|" + "---|" * len(ProcessValue),
+    ]
     for undertaking in Undertaking:
         cells = " | ".join(f"{worst[undertaking.value, value.value]:.0f}" for value in ProcessValue)
         lines.append(f"| {undertaking.value} | {cells} |")
@@ -112,9 +146,14 @@ def _slow_drifts(singles: Results) -> list[str]:
             fault = f"`{outcome.fault}` {_minutes(outcome.after_s)}" if outcome.fault else "-"
             what = cell.failures[0]
             lines.append(
-                f"| {cell.process_value} | {what} | {notice} | {notice_um} | {fault} | {outcome.off_um:+.0f} |"
+                f"| {cell.process_value} | {what} | {notice} | {notice_um} | {fault} | "
+                f"{outcome.off_um:+.0f} |"
             )
-    lines += ["", "A gauge that drifts moves nothing; it is stopped because the pressure limit is judged by it."]
+    lines += [
+        "",
+        "A gauge that drifts moves nothing; it is stopped because the pressure limit is "
+        "judged by it.",
+    ]
     return lines
 
 
@@ -124,7 +163,13 @@ def _minutes(seconds: float) -> str:
 
 def _is_lost(words: str) -> bool:
     """Whether a sensor gives no value at all."""
-    return BY_WORDS[words].name in ("lost", "rejected", "sigma NaN", "times NaN", "times of the future")
+    return BY_WORDS[words].name in (
+        "lost",
+        "rejected",
+        "sigma NaN",
+        "times NaN",
+        "times of the future",
+    )
 
 
 def _pairs(pairs: Results) -> list[str]:
@@ -136,14 +181,20 @@ def _pairs(pairs: Results) -> list[str]:
     far = {cell: outcome for cell, outcome in pairs.items() if abs(outcome.off_um) > NOTABLE_UM}
     lines = ["", "## Two sensors fail", ""]
     lines += [
-        f"Of {len(pairs)} pairs, drawn from a seed so that every failure meets one of each other sensor in each",
-        f"process value, {len(lost)} leave one sensor or none with a value; {len(lost) - len(late)} of them end",
+        f"Of {len(pairs)} pairs, drawn from a seed so that every failure meets one of each "
+        "other sensor in each",
+        f"process value, {len(lost)} leave one sensor or none with a value; "
+        f"{len(lost) - len(late)} of them end",
         f"in the safe state within `states.hold_flow_max_s` and the ramp ({allowed_s:.0f} s).",
         "",
     ]
     lines += ["Not within that time:", "", *map(_line, late.items()), ""] if late else []
     lines += (
-        [f"{len(far)} pairs lead the mirror further than {NOTABLE_UM:g} µm:", "", *map(_line, far.items())]
+        [
+            f"{len(far)} pairs lead the mirror further than {NOTABLE_UM:g} µm:",
+            "",
+            *map(_line, far.items()),
+        ]
         if far
         else []
     )
@@ -156,9 +207,12 @@ def _weeks(weeks: Mapping[str, Week]) -> list[str]:
         return []
     lines = ["", "## Weeks without a failure", ""]
     lines += [
-        "A room of +-2 K and +-10 % relative humidity a day (+235 µm of the centre per 10 % at constant",
-        "pressure), a film that is warmer than its ring (57 µm/K), creep and a gauge whose zero drifts by 1 Pa/K.",
-        "Each day the hold is paused, driven by hand, tuned, moved to another setpoint, lowered and inflated again",
+        "A room of +-2 K and +-10 % relative humidity a day (+235 µm of the centre per 10 % "
+        "at constant",
+        "pressure), a film that is warmer than its ring (57 µm/K), creep and a gauge whose "
+        "zero drifts by 1 Pa/K.",
+        "Each day the hold is paused, driven by hand, tuned, moved to another setpoint, "
+        "lowered and inflated again",
         "(`tests/campaign/climate_week.py`).",
         "",
         "| process value | days | faults | notices |",

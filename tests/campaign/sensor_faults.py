@@ -1,7 +1,8 @@
-"""Every sensor, every way in which it can fail: what notices it, how soon, and what the true mirror does.
+"""Every sensor, every way in which it can fail: what notices it, how soon, and what the true mirror
+does.
 
-The faulty sensors are between plant and board, so that the board's own limits are deceived as well; the plant's true
-state is judged. `sensor_faults_page.py` writes the results.
+The faulty sensors are between plant and board, so that the board's own limits are deceived as well;
+the plant's true state is judged. `sensor_faults_page.py` writes the results.
 """
 
 from __future__ import annotations
@@ -68,7 +69,9 @@ class SensorFault:
     swapped_with: str = ""
     lasts_s: float = 900.0
 
-    def read(self, values: dict[str, float], first: dict[str, float], age_s: float) -> dict[str, float]:
+    def read(
+        self, values: dict[str, float], first: dict[str, float], age_s: float
+    ) -> dict[str, float]:
         """All readings, from the truth."""
         if self.swapped_with:
             other = values.get(self.swapped_with, math.nan)
@@ -110,11 +113,17 @@ class LyingPlant(Plant):
         As of a `Plant`.
     lying : Lying
     linear : float
-        Share of a film's tension that was there before it was inflated: its pressure is no longer w^3 alone.
+        Share of a film's tension that was there before it was inflated: its pressure is no longer
+        w^3 alone.
     """
 
     def __init__(
-        self, twin: TwinConfig, pump: PumpConfig, events: Sequence[BenchEvent], lying: Lying, linear: float = 0.0
+        self,
+        twin: TwinConfig,
+        pump: PumpConfig,
+        events: Sequence[BenchEvent],
+        lying: Lying,
+        linear: float = 0.0,
     ) -> None:
         super().__init__(twin, pump, events)
         self._lying, self._linear = lying, linear
@@ -152,7 +161,12 @@ class LyingCamera:
             return None
         sag_um = self._lying.read({CAMERA: estimate.sag_um}, now_s)[CAMERA]
         laser_um = self._lying.read({"laser": estimate.displacement_um}, now_s)["laser"]
-        return replace(estimate, sag_um=sag_um, coeffs_um=sag_um * zernike_projection(), displacement_um=laser_um)
+        return replace(
+            estimate,
+            sag_um=sag_um,
+            coeffs_um=sag_um * zernike_projection(),
+            displacement_um=laser_um,
+        )
 
 
 def stuck(value: float, first: float, age_s: float) -> float:
@@ -195,7 +209,9 @@ def _failures(
 ) -> Iterator[SensorFault]:
     yield SensorFault(sensor, "stuck", stuck)
     for words, per_s in drifts.items():
-        yield SensorFault(sensor, f"drifts by {words}", drift(per_s), lasts_s=3600.0 if words in SLOW else 900.0)
+        yield SensorFault(
+            sensor, f"drifts by {words}", drift(per_s), lasts_s=3600.0 if words in SLOW else 900.0
+        )
     for by in (0.8, 1.25):
         yield SensorFault(sensor, f"scale {by}", scaled(by))
     for words, by in offsets.items():
@@ -221,16 +237,37 @@ FAULTS: tuple[SensorFault, ...] = (
         {"0.1 Pa/s": 0.1, "-0.1 Pa/s": -0.1, "-10 Pa an hour": -1 / 360},
         ("barometer",),
     ),
-    *_failures("barometer", {"+500 Pa": 500.0}, {"1 Pa/s": 1.0, "10 Pa/s": 10.0}, ("air thermometer",)),
-    *_failures("air thermometer", {"+10 K": 10.0}, {"1 K/min": 1 / 60, "-0.1 K/s": -0.1}, ("gas thermometer",)),
+    *_failures(
+        "barometer", {"+500 Pa": 500.0}, {"1 Pa/s": 1.0, "10 Pa/s": 10.0}, ("air thermometer",)
+    ),
+    *_failures(
+        "air thermometer",
+        {"+10 K": 10.0},
+        {"1 K/min": 1 / 60, "-0.1 K/s": -0.1},
+        ("gas thermometer",),
+    ),
     *_failures("gas thermometer", {"+10 K": 10.0}, {"1 K/min": 1 / 60}, units=(10.0,)),
-    *_failures("pump read-back", {"+0.04": 0.04, "+0.1": 0.1}, {"0.001/s": 0.001}, ("vent read-back",), (100.0,)),
+    *_failures(
+        "pump read-back",
+        {"+0.04": 0.04, "+0.1": 0.1},
+        {"0.001/s": 0.001},
+        ("vent read-back",),
+        (100.0,),
+    ),
     *_failures("vent read-back", {"+0.1": 0.1}, {"0.001/s": 0.001}, units=(100.0, 0.01)),
-    *_failures(CAMERA, {"+8 µm": 8.0, "+30 µm": 30.0}, {"2 µm/min": 2 / 60, "0.5 µm/s": 0.5}, units=(1000.0, 0.001)),
+    *_failures(
+        CAMERA,
+        {"+8 µm": 8.0, "+30 µm": 30.0},
+        {"2 µm/min": 2 / 60, "0.5 µm/s": 0.5},
+        units=(1000.0, 0.001),
+    ),
 )
 PAIRS: tuple[tuple[SensorFault, ...], ...] = (
     (SensorFault("gauge", "stuck", stuck), SensorFault("laser", "drifts by -2 µm/s", drift(-2.0))),
-    (SensorFault("gauge", "shows only noise", blocked(0.5)), SensorFault("laser", "drifts by -2 µm/s", drift(-2.0))),
+    (
+        SensorFault("gauge", "shows only noise", blocked(0.5)),
+        SensorFault("laser", "drifts by -2 µm/s", drift(-2.0)),
+    ),
     (
         SensorFault("gauge", "shows only noise", blocked(0.5), lasts_s=3600.0),
         SensorFault("laser", "drifts by -0.5 µm/s", drift(-0.5), lasts_s=3600.0),
@@ -266,7 +303,9 @@ class Story:
 
 
 def tell(faults: Sequence[SensorFault], seed: int, camera: bool, from_start: bool) -> Story:
-    """Run one story; equal arguments give equal results. Weather, moment and door are drawn from the seed."""
+    """Run one story; equal arguments give equal results. Weather, moment and door are drawn from
+    the seed.
+    """
     chance = np.random.default_rng([seed, *f"{faults[0].sensor} {faults[0].failure}".encode()])
     config = Config(
         loop=LoopConfig(rate_hz=RATE_HZ),
@@ -333,7 +372,14 @@ class _Watch:
                 self._noticed, self._after_s = name, now_s - self._begins_s
 
     def story(self) -> Story:
-        return Story(self._noticed, self._after_s, self._state, self._pumped_um, self._astray_um, self._pressure_pa)
+        return Story(
+            self._noticed,
+            self._after_s,
+            self._state,
+            self._pumped_um,
+            self._astray_um,
+            self._pressure_pa,
+        )
 
 
 def _speaks(event: events.Event) -> str:

@@ -1,4 +1,5 @@
-"""docs/sensor-faults.md: every sensor, every failure, what notices it and what the true mirror does.
+"""docs/sensor-faults.md: every sensor, every failure, what notices it and what the true mirror
+does.
 
     python tests/campaign/sensor_faults_page.py [--results FILE]
 
@@ -34,7 +35,7 @@ Each cell names the first rule or notice, and its time after the fault began. *U
 its setpoint; *astray* is its largest distance from its target in `hold`, in either direction, including the door's
 7 µm. A film that sinks after the hold has ended is no excursion. A bold dash: nothing notices the fault; the last
 column says why that is harmless, or what protects the mirror instead.
-"""
+"""  # noqa: E501
 NIGHTS_ARE = """
 No sensor fails in these nights; each has its own seed. Typical or gusty weather, passing fronts, the daily
 temperature cycle, doors of 20 Pa once an hour, a leak that doubles, setpoints within 300 µm, the mirror lowered and
@@ -42,49 +43,73 @@ inflated again, laser drop-outs of 5 s, a laser mount that drifts by 2 µm/min (
 half of the nights have a camera. The other bench has a film 42 µm thick that was stretched before it was inflated
 (its pressure is 30 % linear in the sag), creeps four times as fast and leaks twice as much; its pump gives a quarter
 more than the configuration says; its gauge and barometer have twice the noise.
-"""
+"""  # noqa: E501
 SHAPED = ("laser", "gauge", CAMERA)
-# Why an unnoticed failure is harmless, or what protects instead: by sensor and beginning of the failure.
+# Why an unnoticed failure is harmless, or what protects instead: by sensor and beginning of the
+# failure.
 NOTES: tuple[tuple[str, str, str], ...] = (
     (
         "laser",
         "drifts by 2 µm/min",
-        "The run ends after an hour, with the mirror 120 µm astray. So slow a mount is what the camera is "
+        "The run ends after an hour, with the mirror 120 µm astray. So slow a mount is what "
+        "the camera is "
         "for; the gauge notices the next slowest drift here at 125 µm.",
     ),
     (
         "laser",
         "scale",
-        "Setpoints are missed by the same share. The gauge does not contradict it: up to 30 % may be the film's own "
+        "Setpoints are missed by the same share. The gauge does not contradict it: up to 30 "
+        "% may be the film's own "
         "law. `over_pressure` is the limit.",
     ),
     (
         "laser",
         "offset",
-        "At the start displacement 0 is whatever the laser reads as 0. Without a camera an offset below 20 µm is "
+        "At the start displacement 0 is whatever the laser reads as 0. Without a camera an "
+        "offset below 20 µm is "
         "less than the gauge resolves.",
     ),
-    ("gauge", "scale", "The pressure limits act at 1.25 times their value; `over_displacement` (625 Pa) acts first."),
+    (
+        "gauge",
+        "scale",
+        "The pressure limits act at 1.25 times their value; `over_displacement` (625 Pa) "
+        "acts first.",
+    ),
     (
         "gauge",
         "offset",
-        "From the start: the pressure limits are off by as much; `over_displacement` (625 Pa) acts first.",
+        "From the start: the pressure limits are off by as much; `over_displacement` (625 "
+        "Pa) acts first.",
     ),
     ("barometer", "unit: times 1000", "Does not fit the board's register: sent as no value."),
-    ("barometer", "", "Harmless: only its changes are used, and the loop corrects a wrong feed-forward."),
-    ("air thermometer", "", "Harmless: only its changes are used, and the loop corrects a wrong feed-forward."),
+    (
+        "barometer",
+        "",
+        "Harmless: only its changes are used, and the loop corrects a wrong feed-forward.",
+    ),
+    (
+        "air thermometer",
+        "",
+        "Harmless: only its changes are used, and the loop corrects a wrong feed-forward.",
+    ),
     ("gas thermometer", "", "Harmless: it is only recorded."),
-    ("pump read-back", "", "Harmless: 0.05 of full scale is allowed, and the next start reports `pump_runs_on`."),
+    (
+        "pump read-back",
+        "",
+        "Harmless: 0.05 of full scale is allowed, and the next start reports `pump_runs_on`.",
+    ),
     (
         "vent read-back",
         "",
-        "Harmless while holding: the actuator test checks the vent itself at each start, and a vent that stays open "
+        "Harmless while holding: the actuator test checks the vent itself at each start, and "
+        "a vent that stays open "
         "is a leak, which `following_error` reports.",
     ),
     (
         CAMERA,
         "offset +8",
-        "Below `shape.disagreement_max_um` (10 µm) there is no verdict; the mirror is off by as much.",
+        "Below `shape.disagreement_max_um` (10 µm) there is no verdict; the mirror is off by "
+        "as much.",
     ),
 )
 _Job = tuple[str, int, bool, bool]  # kind, number, with a camera, from the start
@@ -121,15 +146,25 @@ def page(found: dict[_Job, dict[str, Any]]) -> str:
         "",
         *_wrapped(INTRODUCTION),
         "",
-        "| sensor | failure | from the start | while holding, no camera | while holding, with camera | remark |",
+        "| sensor | failure | from the start | while holding, no camera | while holding, "
+        "with camera | remark |",
         "|---|---|---|---|---|---|",
     ]
     for number, fault in enumerate(FAULTS):
         cells = [found.get(("fault", number, camera, start)) for camera, start in _COLUMNS]
         told = [_cell(Story(**cell)) if cell else "" for cell in cells]
         quiet = any(cell is not None and not cell["noticed"] for cell in cells)
-        lines.append(f"| {fault.sensor} | {fault.failure} | {' | '.join(told)} | {_note(fault) if quiet else ''} |")
-    lines += ["", "## Two at once", "", "| what | without a camera | with a camera |", "|---|---|---|"]
+        lines.append(
+            f"| {fault.sensor} | {fault.failure} | {' | '.join(told)} | "
+            f"{_note(fault) if quiet else ''} |"
+        )
+    lines += [
+        "",
+        "## Two at once",
+        "",
+        "| what | without a camera | with a camera |",
+        "|---|---|---|",
+    ]
     for number, pair in enumerate(PAIRS):
         told = [_cell(Story(**found["pair", number, camera, False])) for camera in (False, True)]
         words = " and ".join(f"{fault.sensor} {fault.failure}" for fault in pair)
@@ -156,7 +191,10 @@ def _time(seconds: float) -> str:
 
 
 def _note(fault: SensorFault) -> str:
-    return next((why for who, how, why in NOTES if who == fault.sensor and fault.failure.startswith(how)), "")
+    return next(
+        (why for who, how, why in NOTES if who == fault.sensor and fault.failure.startswith(how)),
+        "",
+    )
 
 
 def _quiet_lines(found: dict[_Job, dict[str, Any]]) -> list[str]:
@@ -200,7 +238,7 @@ FOOT = """
 - Laser and gauge are compared without barometer and thermometer: a differential gauge and the laser see the
   same film whatever the weather does. The gas is judged by the lesser of two: the leak estimate, which uses the
   feed-forward's sensors, and the pump's flow.
-"""
+"""  # noqa: E501
 
 
 def main() -> None:

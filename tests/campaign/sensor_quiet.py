@@ -46,17 +46,24 @@ class QuietHours:
 
 
 def quiet_hours(seed: int, other_world: bool, hours: float, rate_hz: float = 5.0) -> QuietHours:
-    """Weather, doors, a leak that doubles, setpoints, inflations, a laser that drifts, with and without a camera.
+    """Weather, doors, a leak that doubles, setpoints, inflations, a laser that drifts, with and
+    without a camera.
 
-    The other bench has another film (thinner, and stretched before it was inflated), a leak twice as large, a pump
-    that gives a quarter more than the configuration says, and sensors with twice the noise.
+    The other bench has another film (thinner, and stretched before it was inflated), a leak twice
+    as large, a pump that gives a quarter more than the configuration says, and sensors with twice
+    the noise.
     """
     if not other_world:
         return _quiet_hours(seed, hours, rate_hz, PumpConfig(), TwinConfig(seed=seed), 0.0)
     twin = TwinConfig(seed=seed, leak_time_constant_s=5000.0, barometer_noise_pa=0.1)
     thin = Film(thickness_um=42.0, creep_per_decade=0.02)
-    with patch.object(film_module, "MIRROR_FILM", thin), patch.object(plant_module, "GAUGE_NOISE_PA", 1.0):
-        return _quiet_hours(seed, hours, rate_hz, PumpConfig(flow_full_um_per_s=5.3 * 1.25), twin, 0.3)
+    with (
+        patch.object(film_module, "MIRROR_FILM", thin),
+        patch.object(plant_module, "GAUGE_NOISE_PA", 1.0),
+    ):
+        return _quiet_hours(
+            seed, hours, rate_hz, PumpConfig(flow_full_um_per_s=5.3 * 1.25), twin, 0.3
+        )
 
 
 def _quiet_hours(
@@ -72,7 +79,10 @@ def _quiet_hours(
         PressureWeather(700.0, seed),
         LeakChange(float(chance.uniform(0.3, 0.7)) * end_s, 2.0),
         LaserDrift(drift_s, 2.0, 2400.0 if camera else 1200.0),
-        *(AmbientChange(at_s, float(chance.choice([-20.0, 20.0]))) for at_s in _moments(chance, end_s, 3600.0)),
+        *(
+            AmbientChange(at_s, float(chance.choice([-20.0, 20.0])))
+            for at_s in _moments(chance, end_s, 3600.0)
+        ),
         *(LaserDropout(at_s, 5.0) for at_s in _moments(chance, end_s, 10_000.0)),
     ]
     lying = Lying(())
@@ -93,7 +103,9 @@ def _quiet_hours(
         due = tuple(command for at_s, command in asked if at_s <= run.now_s)
         asked = asked[len(due) :]
         tick = run.tick(due)
-        faults = [event for event in tick.events if isinstance(event, Fault)] if tick is not None else []
+        faults = (
+            [event for event in tick.events if isinstance(event, Fault)] if tick is not None else []
+        )
         alarms += [f"{event.name}: {event.seen}" for event in faults if event.name != _DROPOUT]
     return QuietHours(run.now_s / 3600.0, tuple(alarms))
 

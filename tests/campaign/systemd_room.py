@@ -44,8 +44,24 @@ def missing() -> str:
     tools = ("unshare", "nsenter", "ip", "adduser", "journalctl")
     if absent := [tool for tool in tools if shutil.which(tool) is None]:
         return f"needs {', '.join(absent)}"
-    probe = ["unshare", "--mount", "--pid", "--fork", "--cgroup", "--net", "mount", "-t", "tmpfs", "tmpfs", "/mnt"]
-    return "" if subprocess.run(probe, capture_output=True, check=False).returncode == 0 else "needs namespaces"
+    probe = [
+        "unshare",
+        "--mount",
+        "--pid",
+        "--fork",
+        "--cgroup",
+        "--net",
+        "mount",
+        "-t",
+        "tmpfs",
+        "tmpfs",
+        "/mnt",
+    ]
+    return (
+        ""
+        if subprocess.run(probe, capture_output=True, check=False).returncode == 0
+        else "needs namespaces"
+    )
 
 
 class Room:
@@ -65,7 +81,11 @@ class Room:
         """Output of a shell script in the room, as root. Raises CalledProcessError."""
         enter = ["nsenter", "-t", str(self._pid), "-m", "-p", "-C", "-u", "-i", "-n", "-r", "-w"]
         done = subprocess.run(
-            [*enter, "bash", "-euc", script], capture_output=True, text=True, timeout=120, check=True
+            [*enter, "bash", "-euc", script],
+            capture_output=True,
+            text=True,
+            timeout=120,
+            check=True,
         )
         return done.stdout.strip()
 
@@ -78,14 +98,23 @@ class Room:
         """Set more variables of the service, and let it write to /run/told."""
         lines = "".join(f"Environment={each}\\n" for each in environment)
         path = f"{_UNITS}/{_UNIT}.service.d/test.conf"
-        self.run(f"printf '[Service]\\nReadWritePaths=/run/told\\n{lines}' > {path}; systemctl daemon-reload")
+        self.run(
+            f"printf '[Service]\\nReadWritePaths=/run/told\\n{lines}' > {path}; systemctl "
+            "daemon-reload"
+        )
 
     def fresh(self, more: str = "") -> None:
         """A new board, no run, no latched fault, nothing started yet."""
-        self.run(f"systemctl stop {_UNIT} twin; systemctl reset-failed; rm -rf /var/lib/membrane-ctrl/* /run/told/*")
+        self.run(
+            f"systemctl stop {_UNIT} twin; systemctl reset-failed; rm -rf "
+            "/var/lib/membrane-ctrl/* /run/told/*"
+        )
         self._since = self.run("date '+%F %T.%N'")
         self.configure(more)
-        self.run("systemctl start twin; until (: > /dev/tcp/127.0.0.1/1502) 2> /dev/null; do sleep 0.1; done")
+        self.run(
+            "systemctl start twin; until (: > /dev/tcp/127.0.0.1/1502) 2> /dev/null; do "
+            "sleep 0.1; done"
+        )
 
     def start(self) -> None:
         """Start the service; systemd answers when it says READY."""
@@ -112,7 +141,9 @@ class Room:
 
     def survivors(self) -> list[str]:
         """Processes that the service left behind."""
-        return self.run(f"cat /sys/fs/cgroup/system.slice/{_UNIT}.service/cgroup.procs 2> /dev/null || true").split()
+        return self.run(
+            f"cat /sys/fs/cgroup/system.slice/{_UNIT}.service/cgroup.procs 2> /dev/null || true"
+        ).split()
 
     def until(self, what: Callable[[], bool], patience_s: float = 60.0) -> None:
         """Wait for something. Raises AssertionError when it does not come."""
@@ -140,16 +171,25 @@ def systemd_room(folder: Path) -> Iterator[Room]:
         "ROOM_SOURCE": str(SOURCE),
     }
     branch = ""
-    process = subprocess.Popen([Path(__file__).with_suffix(".sh")], env=environment, start_new_session=True)
+    process = subprocess.Popen(
+        [Path(__file__).with_suffix(".sh")], env=environment, start_new_session=True
+    )
     try:
         give_up_s = time.monotonic() + 30.0
-        while not (children := psutil.Process(process.pid).children()) or children[0].name() != "systemd":
+        while (
+            not (children := psutil.Process(process.pid).children())
+            or children[0].name() != "systemd"
+        ):
             assert process.poll() is None, "the room could not be made"
             assert time.monotonic() < give_up_s, "no systemd came up"
             time.sleep(0.1)
         branch = Path(f"/proc/{process.pid}/cgroup").read_text().splitlines()[-1].partition("::")[2]
         room = Room(children[0].pid)
-        room.until(lambda: "basic.target" in room.run("systemctl list-units --no-legend --no-pager || true"))
+        room.until(
+            lambda: (
+                "basic.target" in room.run("systemctl list-units --no-legend --no-pager || true")
+            )
+        )
         room.run(_SET_UP)
         yield room
     finally:
@@ -160,7 +200,9 @@ def systemd_room(folder: Path) -> Iterator[Room]:
 
 def _remove_branch(branch: str) -> None:
     """The control groups of the room; they stay when their processes have gone."""
-    tree = next(tree for tree in map(Path, ("/sys/fs/cgroup/unified", "/sys/fs/cgroup")) if tree.exists())
+    tree = next(
+        tree for tree in map(Path, ("/sys/fs/cgroup/unified", "/sys/fs/cgroup")) if tree.exists()
+    )
     top = tree / branch.strip("/")
     if not branch.strip("/") or not top.name.startswith("membrane-room-"):
         return

@@ -25,14 +25,22 @@ def at(name: str) -> Situation:
 
 # These take more than a second each.
 LONG = {
-    "a_creeping_laser", "a_creeping_laser_without_a_camera", "a_seam_that_opens", "manual_has_an_end",
-    "resumes_of_a_day", "the_board_alone_keeps_its_limit", "two_orders_in_one_tick", "vent_and_stop_from_everywhere",
+    "a_creeping_laser",
+    "a_creeping_laser_without_a_camera",
+    "a_seam_that_opens",
+    "manual_has_an_end",
+    "resumes_of_a_day",
+    "the_board_alone_keeps_its_limit",
+    "two_orders_in_one_tick",
+    "vent_and_stop_from_everywhere",
     "venting_to_the_end",
-}  # fmt: skip
+}
 NAMES = [story.__name__ for story in (*STORIES, *HOLDS)]
 
 
-@pytest.mark.parametrize("number", range(len(CASES)), ids=[case.name.replace(" ", "_") for case in CASES])
+@pytest.mark.parametrize(
+    "number", range(len(CASES)), ids=[case.name.replace(" ", "_") for case in CASES]
+)
 def test_every_fault_in_one_situation(number: int) -> None:
     """Every other fault in `hold`; the rest in each situation in turn."""
     situation = SITUATIONS[number // 2 % len(SITUATIONS)] if number % 2 else at("hold")
@@ -81,7 +89,10 @@ def test_the_committed_matrix_is_of_these_faults_stories_and_rules() -> None:
     assert f"**{runs} runs and {len(stories)} stories, 0 violations of an invariant.**" in lines
     firsts = [line.split(" | ")[0].removeprefix("| ") for line in lines]
     assert "| fault | " + " | ".join(at.name for at in SITUATIONS) + " |" in lines
-    for name in [*(case.name for case in CASES), *(story.__name__.replace("_", " ") for story in stories)]:
+    for name in [
+        *(case.name for case in CASES),
+        *(story.__name__.replace("_", " ") for story in stories),
+    ]:
         assert firsts.count(name) == 1, name
     for rule in TABLE:
         assert firsts.count(f"{rule.code} `{rule.name}`") == 1, rule.name

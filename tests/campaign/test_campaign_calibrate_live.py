@@ -1,4 +1,6 @@
-"""`calibrate --live` beside a hold with real processes whose bench differs from its configuration."""
+"""`calibrate --live` beside a hold with real processes whose bench
+differs from its configuration.
+"""
 
 from __future__ import annotations
 
@@ -57,17 +59,32 @@ def wait_for(what: Callable[[], bool]) -> None:
 def told(logs: Path) -> list[dict[str, object]]:
     """Events of the one run."""
     found = list(logs.glob("*-hold/events.jsonl"))
-    return [json.loads(line) for line in found[0].read_text().splitlines() if line.endswith("}")] if found else []
+    return (
+        [json.loads(line) for line in found[0].read_text().splitlines() if line.endswith("}")]
+        if found
+        else []
+    )
 
 
 @pytest.fixture
 def logs(tmp_path: Path) -> Iterator[Path]:
     """Logs of a hold that holds and tracks its shape."""
     (tmp_path / "lab.toml").write_text(CONFIG)
-    words = ["hold", "--twin", "--config", str(tmp_path / "lab.toml"), "--logs", str(tmp_path / "logs")]
+    words = [
+        "hold",
+        "--twin",
+        "--config",
+        str(tmp_path / "lab.toml"),
+        "--logs",
+        str(tmp_path / "logs"),
+    ]
     process = subprocess.Popen([*COMMAND, *words], stderr=subprocess.DEVNULL)
     try:
-        wait_for(lambda: any(e["kind"] == "shape" and e["state"] == "tracking" for e in told(tmp_path / "logs")))
+        wait_for(
+            lambda: any(
+                e["kind"] == "shape" and e["state"] == "tracking" for e in told(tmp_path / "logs")
+            )
+        )
         yield tmp_path / "logs"
     finally:
         process.terminate()
@@ -76,7 +93,9 @@ def logs(tmp_path: Path) -> Iterator[Path]:
 
 def test_aborted_gone_on_with_and_adopted(logs: Path) -> None:
     live = [*COMMAND, "calibrate", "--live", "--logs", str(logs), "--no-pictures", "--yes"]
-    first = subprocess.Popen([*live, "--range-um", "1200", "--sets", "3"], stderr=subprocess.PIPE, text=True)
+    first = subprocess.Popen(
+        [*live, "--range-um", "1200", "--sets", "3"], stderr=subprocess.PIPE, text=True
+    )
     wait_for(lambda: any(event["kind"] == "capture" for event in told(logs)))
     wait_for(lambda: any((logs / "calibration").glob("*/sets/set-1")))
     first.send_signal(signal.SIGINT)
@@ -86,7 +105,11 @@ def test_aborted_gone_on_with_and_adopted(logs: Path) -> None:
 
     (session,) = (logs / "calibration").iterdir()
     done = subprocess.run(
-        [*live, "--session", str(session), "--json"], capture_output=True, text=True, timeout=PATIENCE_S, check=False
+        [*live, "--session", str(session), "--json"],
+        capture_output=True,
+        text=True,
+        timeout=PATIENCE_S,
+        check=False,
     )
     assert done.returncode == 0, done.stderr
     found = {row["name"]: row for row in json.loads(done.stdout)["parameters"]}

@@ -1,4 +1,6 @@
-"""Hours of a hold by the estimate in which sensors are lost and come back, knocks, drifts and leaks happen."""
+"""Hours of a hold by the estimate in which sensors are lost and come back, knocks, drifts and leaks
+happen.
+"""
 
 from __future__ import annotations
 

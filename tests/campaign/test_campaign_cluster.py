@@ -1,6 +1,7 @@
 """The trials on a Dask cluster of two workers (extra `dask`): the same figures to twelve digits.
 
-The last digits depend on where an array lies in memory, which differs for one that came over a wire.
+The last digits depend on where an array lies in memory, which differs for one that came over a
+wire.
 """
 
 from __future__ import annotations
@@ -46,8 +47,20 @@ def finished(process: subprocess.Popen[str]) -> None:
 
 def figures(folder: Path, out: Path, *options: str) -> dict[str, Any]:
     """uncertainty.json without its times, from a process of its own."""
-    command = [sys.executable, "-m", "membrane_ctrl", "uncertainty", str(folder), "--trials", "300", "--seed", "4"]
-    with subprocess.Popen([*command, "--out", str(out), *options], text=True, env=os.environ | PATIENT) as process:
+    command = [
+        sys.executable,
+        "-m",
+        "membrane_ctrl",
+        "uncertainty",
+        str(folder),
+        "--trials",
+        "300",
+        "--seed",
+        "4",
+    ]
+    with subprocess.Popen(
+        [*command, "--out", str(out), *options], text=True, env=os.environ | PATIENT
+    ) as process:
         finished(process)
     table: dict[str, Any] = json.loads((out / "uncertainty.json").read_text())
     return {name: value for name, value in table.items() if name != "timing_s"}

@@ -1,7 +1,9 @@
-"""Twenty holds, their page in a real Chromium, and `ctl fleet`: both stay usable, and no tick is touched.
+"""Twenty holds, their page in a real Chromium, and `ctl fleet`: both stay usable, and no tick is
+touched.
 
-The holds run in slowed time (tests/support/slowed_holds.py), a quarter of the real one: two processors have no room
-for twenty at 50 Hz with all their processes. Page, browser and terminal are real, and as fast as ever.
+The holds run in slowed time (tests/support/slowed_holds.py), a quarter of the real one: two
+processors have no room for twenty at 50 Hz with all their processes. Page, browser and terminal are
+real, and as fast as ever.
 """
 
 from __future__ import annotations
@@ -34,7 +36,7 @@ ROWS = "[...document.querySelectorAll('tbody tr')].map(r => r.innerText)"
 # errors change all the time, and so does the table
 WATCHED = """window.seen = [performance.now()];
 new MutationObserver(() => window.seen.push(performance.now()))
-  .observe(document.querySelector('tbody'), {childList: true, subtree: true, characterData: true})"""
+  .observe(document.querySelector('tbody'), {childList: true, subtree: true, characterData: true})"""  # noqa: E501
 
 
 def ctl(*words: object) -> tuple[int, list[str], float]:
@@ -75,14 +77,22 @@ async def looked_at(file: Path, page: psutil.Process, tab: Tab) -> Phase:
     await asyncio.sleep(max(0.0, phase.from_s + PHASE_S - time.time()))
     after = page.cpu_times()
     phase.page_cpu_s = after.user + after.system - before.user - before.system
-    phase.page_gap_s = float(np.diff(await tab.value("[...window.seen, performance.now()]")).max()) / 1e3
+    phase.page_gap_s = (
+        float(np.diff(await tab.value("[...window.seen, performance.now()]")).max()) / 1e3
+    )
     return phase
 
 
 async def used(folder: Path, file: Path, tab: Tab, holds: subprocess.Popen[str]) -> None:
-    """One mirror is paused on the page, one driven by hand from a terminal, one ends and begins again; no other."""
-    await tab.value("[...document.querySelectorAll('a')].find(a => a.innerText === 'mirror7').click()")
-    await tab.until("location.search === '?hold=mirror7' && document.body.innerText.includes('mirror7 2')")
+    """One mirror is paused on the page, one driven by hand from a terminal, one ends and begins
+    again; no other.
+    """
+    await tab.value(
+        "[...document.querySelectorAll('a')].find(a => a.innerText === 'mirror7').click()"
+    )
+    await tab.until(
+        "location.search === '?hold=mirror7' && document.body.innerText.includes('mirror7 2')"
+    )
     pause = "[...document.querySelectorAll('button')].find(b => b.innerText.includes('Pause'))"
     await tab.until(f"!{pause}.disabled")
     await tab.value(f"{pause}.click()")
@@ -99,7 +109,11 @@ async def used(folder: Path, file: Path, tab: Tab, holds: subprocess.Popen[str])
     assert code == 4
     assert "no contact" in said["mirror19"]
     assert "manual" in said["mirror3"]
-    others = [line.split()[1] for name, line in said.items() if name not in ("mirror3", "mirror7", "mirror19")]
+    others = [
+        line.split()[1]
+        for name, line in said.items()
+        if name not in ("mirror3", "mirror7", "mirror19")
+    ]
     assert others == ["hold"] * 17
     order(holds, "begin mirror19")
     await tab.until(f"{ROWS}.some(r => r.startsWith('mirror19') && r.includes('hold'))")
@@ -126,12 +140,28 @@ def figures(folder: Path, phases: dict[bool, list[Phase]]) -> list[Figure]:
     watched = phases[True]
     return [
         at_most("ticks", beside.size, "", None, "no page", alone.size),
-        at_most("tick lateness p99", np.percentile(beside, 99), "ms", None, "no page", np.percentile(alone, 99)),
+        at_most(
+            "tick lateness p99",
+            np.percentile(beside, 99),
+            "ms",
+            None,
+            "no page",
+            np.percentile(alone, 99),
+        ),
         at_most("tick lateness, worst", beside.max(), "ms", None, "no page", alone.max()),
         at_most("ticks missed", missed[True], "", 0, "no page", missed[False]),
-        at_most("longest time without a new table", max(phase.page_gap_s for phase in watched), "s", 5.0),
-        at_most("processor of the page", 100 * max(phase.page_cpu_s for phase in watched) / PHASE_S, "%", 50.0),
-        at_most("`ctl fleet`, its start included", max(phase.fleet_s for phase in watched), "s", 10.0),
+        at_most(
+            "longest time without a new table", max(phase.page_gap_s for phase in watched), "s", 5.0
+        ),
+        at_most(
+            "processor of the page",
+            100 * max(phase.page_cpu_s for phase in watched) / PHASE_S,
+            "%",
+            50.0,
+        ),
+        at_most(
+            "`ctl fleet`, its start included", max(phase.fleet_s for phase in watched), "s", 10.0
+        ),
     ]
 
 

@@ -1,4 +1,6 @@
-"""A bench without a laser, with rendered frames: anchored, tracked and held in virtual time, as in a hold."""
+"""A bench without a laser, with rendered frames: anchored, tracked and held in virtual time, as in
+a hold.
+"""
 
 from __future__ import annotations
 
@@ -8,7 +10,14 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from membrane_ctrl.config.schema import CameraConfig, Config, EstimatorConfig, OpticsConfig, ShapeConfig, TwinConfig
+from membrane_ctrl.config.schema import (
+    CameraConfig,
+    Config,
+    EstimatorConfig,
+    OpticsConfig,
+    ShapeConfig,
+    TwinConfig,
+)
 from membrane_ctrl.controller.commands import Command
 from membrane_ctrl.hold.virtual_run import VirtualRun
 from membrane_ctrl.metrology import phase
@@ -23,7 +32,9 @@ from membrane_ctrl.sim.plant import Plant
 from membrane_ctrl.sim.virtual_bench import VirtualBench
 
 SHRINK, PERIOD_S = 8, 0.1
-OPTICS = OpticsConfig(camera=CameraConfig(width_px=2448 // SHRINK, height_px=2048 // SHRINK, pixel_um=3.45 * SHRINK))
+OPTICS = OpticsConfig(
+    camera=CameraConfig(width_px=2448 // SHRINK, height_px=2048 // SHRINK, pixel_um=3.45 * SHRINK)
+)
 CONFIG = Config(
     estimator=EstimatorConfig(process_value="optics"),
     shape=ShapeConfig(mode="track", track_rate_hz=1 / PERIOD_S),
@@ -33,12 +44,16 @@ CONFIG = Config(
 
 
 class Rendered:
-    """A frame a period, of the pattern that the tracking asks for; its figure arrives a period later."""
+    """A frame a period, of the pattern that the tracking asks for; its figure arrives a period
+    later.
+    """
 
     def __init__(self, bench: VirtualBench) -> None:
         self.now_s = 0.0
         self._optics = TwinOptics(OPTICS, CONFIG.twin, bench.plant.truth, self)
-        self._tracker = LiveTracker(OPTICS, LiveReconstructor(OPTICS, 1), CONFIG.shape.track_periods, 10.0)
+        self._tracker = LiveTracker(
+            OPTICS, LiveReconstructor(OPTICS, 1), CONFIG.shape.track_periods, 10.0
+        )
         self._cycle = list(phase.full_sequence(OPTICS.pattern))
         self._frames: list[np.ndarray] = []
         self._times_s: list[float] = []
@@ -51,7 +66,9 @@ class Rendered:
 
     def __call__(self, now_s: float) -> ShapeEstimate | None:
         self.now_s, done, self._done = now_s, self._done, None
-        self._optics.screen.show(self._tracker.pattern if self.anchored else self._cycle[len(self._frames)])
+        self._optics.screen.show(
+            self._tracker.pattern if self.anchored else self._cycle[len(self._frames)]
+        )
         pixels = self._optics.camera.grab().pixels.copy()
         if self.anchored:
             self._done = self._tracker.fringes([pixels], [now_s], [math.nan])
@@ -60,7 +77,9 @@ class Rendered:
             self._frames.append(pixels)
             self._times_s.append(now_s)
             if len(self._frames) == len(self._cycle):
-                self._done = self._tracker.full(self._frames, self._times_s, [math.nan] * len(self._frames))
+                self._done = self._tracker.full(
+                    self._frames, self._times_s, [math.nan] * len(self._frames)
+                )
                 self.anchored = self._done.verdict != "rejected"
                 self._frames, self._times_s = [], []
         self.figures += 1
@@ -84,7 +103,9 @@ def test_rendered_frames_alone_start_settle_and_hold_a_mirror_through_another_an
     assert rows[-1].state == State.HOLD
     held = [event.sensors for event in events if isinstance(event, HeldBy)]
     assert held[0] == ("optics", "barometer", "thermometer")
-    assert [event.name for event in events if isinstance(event, Fault)] == ["film_unseen"]  # during the anchor
+    assert [event.name for event in events if isinstance(event, Fault)] == [
+        "film_unseen"
+    ]  # during the anchor
     time_s, true_um = np.array([(row.mono_s, row.truth_displacement_um) for row in rows]).T
     before = true_um[(time_s > 27.0) & (time_s < 42.0)]
     assert before.std() < 0.1

@@ -1,4 +1,6 @@
-"""A hold whose control port is under attack: it holds, records what it refuses, and still hears a stop."""
+"""A hold whose control port is under attack: it holds, records what it refuses, and still hears a
+stop.
+"""
 
 from __future__ import annotations
 

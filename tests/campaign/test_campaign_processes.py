@@ -1,4 +1,6 @@
-"""Faults that need real processes and sockets: stopped, killed, cut off, without disk space, two at once."""
+"""Faults that need real processes and sockets: stopped, killed, cut off, without disk space, two at
+once.
+"""
 
 from __future__ import annotations
 
@@ -44,7 +46,15 @@ def results() -> Iterator[list[ProcessResult]]:
 
 
 def start_again(folder: Path, *options: str) -> subprocess.CompletedProcess[str]:
-    arguments = ("hold", "--config", str(folder / "lab.toml"), "--logs", str(folder / "logs"), "--duration", "1s")
+    arguments = (
+        "hold",
+        "--config",
+        str(folder / "lab.toml"),
+        "--logs",
+        str(folder / "logs"),
+        "--duration",
+        "1s",
+    )
     return subprocess.run(
         [sys.executable, "-m", "membrane_ctrl", *arguments, *options],
         capture_output=True,
@@ -55,7 +65,9 @@ def start_again(folder: Path, *options: str) -> subprocess.CompletedProcess[str]
 
 
 @pytest.mark.real_time
-async def test_a_stopped_process_stops_the_pump_and_what_was_latched_keeps_the_next_hold_down(tmp_path: Path) -> None:
+async def test_a_stopped_process_stops_the_pump_and_what_was_latched_keeps_the_next_hold_down(
+    tmp_path: Path,
+) -> None:
     plant = make_plant()
     async with running(tmp_path, plant) as run:
         stopped_s = run.signal(signal.SIGSTOP)
@@ -68,7 +80,9 @@ async def test_a_stopped_process_stops_the_pump_and_what_was_latched_keeps_the_n
         assert latched.name == run.faults()[0]
         refused = await asyncio.to_thread(start_again, tmp_path)
         assert refused.returncode == Exit.DEVICE_FAILED
-        assert sum(line.startswith("membrane-ctrl: ") for line in refused.stderr.splitlines()) == 1  # after progress
+        assert (
+            sum(line.startswith("membrane-ctrl: ") for line in refused.stderr.splitlines()) == 1
+        )  # after progress
         assert latched.name in refused.stderr
         assert not plant.pumping
 
@@ -76,7 +90,9 @@ async def test_a_stopped_process_stops_the_pump_and_what_was_latched_keeps_the_n
 @pytest.mark.campaign
 @pytest.mark.timeout(180)
 @pytest.mark.parametrize("case", PROCESS_CASES, ids=lambda case: case.name.replace(" ", "_"))
-async def test_a_fault_of_real_processes(case: ProcessCase, tmp_path: Path, results: list[ProcessResult]) -> None:
+async def test_a_fault_of_real_processes(
+    case: ProcessCase, tmp_path: Path, results: list[ProcessResult]
+) -> None:
     if why := missing(case):
         pytest.skip(why)
     result = await run_process_case(case, tmp_path)
@@ -96,7 +112,9 @@ async def test_a_latched_hold_starts_again_once_a_person_clears_it(tmp_path: Pat
 
 
 @pytest.mark.campaign
-async def test_after_a_kill_the_next_start_holds_again_only_if_the_resume_rule_says_so(tmp_path: Path) -> None:
+async def test_after_a_kill_the_next_start_holds_again_only_if_the_resume_rule_says_so(
+    tmp_path: Path,
+) -> None:
     plant = make_plant()
     async with running(tmp_path, plant) as run:
         await pump_stood_s(plant, run.signal(signal.SIGKILL))
@@ -110,7 +128,10 @@ async def test_after_a_kill_the_next_start_holds_again_only_if_the_resume_rule_s
         lab.write_text(lab.read_text() + '\n[resume]\nfaults = ["watchdog_tripped"]\n')
         again = await asyncio.to_thread(start_again, tmp_path)
         assert again.returncode == Exit.DONE, again.stderr
-    newest = max((path for path in (tmp_path / "logs").iterdir() if path.is_dir()), key=lambda path: path.name)
+    newest = max(
+        (path for path in (tmp_path / "logs").iterdir() if path.is_dir()),
+        key=lambda path: path.name,
+    )
     start = json.loads((newest / "events.jsonl").read_text().splitlines()[0])
     assert "cleared" in start["message"]
 
@@ -135,7 +156,11 @@ async def test_the_safe_state_writer_needs_no_hold(tmp_path: Path) -> None:
 
 
 def events_of(folder: Path) -> list[dict[str, object]]:
-    lines = [line for path in folder.glob("logs/*/events.jsonl") for line in path.read_text().splitlines()]
+    lines = [
+        line
+        for path in folder.glob("logs/*/events.jsonl")
+        for line in path.read_text().splitlines()
+    ]
     return [json.loads(line) for line in lines if line.endswith("}")]
 
 
@@ -155,7 +180,9 @@ def test_the_hold_goes_on_without_its_camera_until_another_takes_its_place(
     """The process that owns screen and camera dies, or is stopped until its 60 s are over."""
     (tmp_path / "lab.toml").write_text(CAMERA)
     words = ("--twin", "--config", str(tmp_path / "lab.toml"), "--logs", str(tmp_path / "logs"))
-    with subprocess.Popen([sys.executable, "-m", "membrane_ctrl", "hold", *words], stderr=subprocess.DEVNULL) as hold:
+    with subprocess.Popen(
+        [sys.executable, "-m", "membrane_ctrl", "hold", *words], stderr=subprocess.DEVNULL
+    ) as hold:
         try:
             wait_for_event(tmp_path, PATIENCE_S, kind="state", state="hold")
             wait_for_event(tmp_path, PATIENCE_S, kind="acquisition", state="running")

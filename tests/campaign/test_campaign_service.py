@@ -1,4 +1,6 @@
-"""The unit file under a real systemd: ready, watched, protected, stopped, killed, hung, latched, given up."""
+"""The unit file under a real systemd: ready, watched, protected, stopped, killed, hung, latched,
+given up.
+"""
 
 from __future__ import annotations
 
@@ -74,7 +76,9 @@ def test_it_is_ready_says_how_it_is_and_can_do_no_harm(room: Room) -> None:
     assert "Seccomp:\t2" in status
     assert "CapBnd:\t0000000000000000" in status
     assert "CapEff:\t0000000000000000" in status
-    as_service = f"nsenter -t {room.main_pid} -m setpriv --reuid membrane --regid membrane --init-groups"
+    as_service = (
+        f"nsenter -t {room.main_pid} -m setpriv --reuid membrane --regid membrane --init-groups"
+    )
     for place in ("/etc/membrane-ctrl", "/opt/membrane-ctrl", "/usr/local"):
         refused = room.run(f"{as_service} touch {place}/new 2>&1 || true")
         assert "Read-only file system" in refused
@@ -158,11 +162,16 @@ def test_a_damaged_latched_fault_file_keeps_it_down(room: Room, damage: str) -> 
     room.fresh()
     room.run(f"install -d -o membrane -g membrane {RUNS}; {damage}")
     room.run("systemctl start membrane-ctrl || true")
-    assert room.show("ActiveState", "ExecMainStatus") == {"ActiveState": "failed", "ExecMainStatus": "4"}
+    assert room.show("ActiveState", "ExecMainStatus") == {
+        "ActiveState": "failed",
+        "ExecMainStatus": "4",
+    }
     assert "a fault is latched: unreadable" in room.log()
 
 
-def test_in_standby_it_runs_with_a_latched_fault_and_holds_only_after_a_person_acknowledged(room: Room) -> None:
+def test_in_standby_it_runs_with_a_latched_fault_and_holds_only_after_a_person_acknowledged(
+    room: Room,
+) -> None:
     room.fresh()
     room.run(f"install -d -o membrane -g membrane {RUNS}; : > {LATCHED}; chown membrane {LATCHED}")
     unit = "/run/units/membrane-ctrl.service"
@@ -175,7 +184,10 @@ def test_in_standby_it_runs_with_a_latched_fault_and_holds_only_after_a_person_a
         assert "done" in ctl(room, "membrane", "hold")
         room.until(lambda: room.status_has("inflate"))
     finally:
-        room.run(f"cp /opt/source/membrane_ctrl/examples/membrane-ctrl.service {unit}; systemctl daemon-reload")
+        room.run(
+            f"cp /opt/source/membrane_ctrl/examples/membrane-ctrl.service {unit}; systemctl "
+            "daemon-reload"
+        )
 
 
 def test_a_member_of_the_group_operates_and_a_stranger_does_not_come_near(room: Room) -> None:
@@ -194,15 +206,23 @@ def test_a_member_of_the_group_operates_and_a_stranger_does_not_come_near(room: 
 @needs("Xvfb", "xauth", "xhost", "xdpyinfo")
 def test_the_service_reaches_a_desktops_display_once_it_may(room: Room) -> None:
     unit = "/opt/source/membrane_ctrl/examples/membrane-ctrl.service"
-    edits = "-e 's,^ExecStart=.*,ExecStart=/usr/bin/xdpyinfo -display :7,' -e '/^ExecStopPost/d' -e '/^Restart/d'"
+    edits = (
+        "-e 's,^ExecStart=.*,ExecStart=/usr/bin/xdpyinfo -display :7,' -e '/^ExecStopPost/d' -e "
+        "'/^Restart/d'"
+    )
     room.run(f"sed {edits} -e 's/Type=notify/Type=oneshot/' {unit} > /run/units/display.service")
     room.run("xauth -f /run/cookie add :7 . 0123456789abcdef0123456789abcdef")
     xvfb = "/usr/bin/Xvfb :7 -noreset -nolisten local -auth /run/cookie"
-    room.run(f"printf '[Service]\\nExecStart={xvfb}\\n' > /run/units/x.service; systemctl daemon-reload")
+    room.run(
+        f"printf '[Service]\\nExecStart={xvfb}\\n' > /run/units/x.service; systemctl daemon-reload"
+    )
     room.run("systemctl start x; until [ -e /tmp/.X11-unix/X7 ]; do sleep 0.1; done")
     try:
         room.run("! systemctl start display")
-        room.run("XAUTHORITY=/run/cookie DISPLAY=:7 xhost +si:localuser:membrane; systemctl start display")
+        room.run(
+            "XAUTHORITY=/run/cookie DISPLAY=:7 xhost +si:localuser:membrane; systemctl start "
+            "display"
+        )
     finally:
         room.run("systemctl stop x")
 

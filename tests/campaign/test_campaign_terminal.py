@@ -1,4 +1,6 @@
-"""A hold on a terminal: the console hangs or dies, or the terminal is closed, without effect on the mirror."""
+"""A hold on a terminal: the console hangs or dies, or the terminal is closed, without effect on the
+mirror.
+"""
 
 from __future__ import annotations
 
@@ -70,7 +72,9 @@ async def on_terminal(folder: Path) -> AsyncIterator[tuple[Run, Terminal]]:
 
 
 def screen(run: Run) -> psutil.Process:
-    """The last child that was started: a hold without camera and alarms has a recorder and a screen."""
+    """The last child that was started: a hold without camera and alarms has a recorder and a
+    screen.
+    """
     return max(psutil.Process(run.process.pid).children(), key=lambda child: child.pid)
 
 
@@ -121,7 +125,9 @@ async def test_keys_are_commands_that_are_recorded(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("number", [signal.SIGKILL, signal.SIGABRT])
-async def test_the_terminal_of_a_hold_that_was_killed_is_usable(tmp_path: Path, number: signal.Signals) -> None:
+async def test_the_terminal_of_a_hold_that_was_killed_is_usable(
+    tmp_path: Path, number: signal.Signals
+) -> None:
     async with on_terminal(tmp_path) as (run, terminal):
         run.signal(number)
         await run.ended()

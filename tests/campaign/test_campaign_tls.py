@@ -1,4 +1,5 @@
-"""A hold whose TLS port is under attack: no tick is missed, and operators from elsewhere are served.
+"""A hold whose TLS port is under attack: no tick is missed, and operators from elsewhere are
+served.
 
 Phases without and with the attack alternate in one hold, so that their lateness can be compared.
 """
@@ -58,7 +59,10 @@ class Operator:
 
     def __str__(self) -> str:
         worst_s = max(self.served_s, default=float("nan"))
-        return f"{len(self.served_s)} served (slowest {worst_s:.2f} s), {len(self.failed)} not {self.failed[:1]}"
+        return (
+            f"{len(self.served_s)} served (slowest {worst_s:.2f} s), {len(self.failed)} not "
+            f"{self.failed[:1]}"
+        )
 
 
 @pytest.fixture(scope="module")
@@ -69,7 +73,9 @@ def certificates(tmp_path_factory: pytest.TempPathFactory) -> Path:
     lab.certificate("bench")
     lab.certificate("operator", "operate")
     lab.certificate("insider", "read")
-    lab.certificate("expired", "tune", ("-startdate", "20200101000000Z", "-enddate", "20200102000000Z"))
+    lab.certificate(
+        "expired", "tune", ("-startdate", "20200101000000Z", "-enddate", "20200102000000Z")
+    )
     stranger.certificate("foreign", "tune")
     for name in ("foreign.pem", "foreign.key"):
         (folder / "stranger" / name).rename(folder / "lab" / name)
@@ -78,7 +84,9 @@ def certificates(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 def configured(certificates: Path) -> str:
     names = {"certificate_file": "bench.pem", "key_file": "bench.key", "client_ca_file": "ca.pem"}
-    return "[port.tls]\nport = 0\n" + "".join(f'{key} = "{certificates / name}"\n' for key, name in names.items())
+    return "[port.tls]\nport = 0\n" + "".join(
+        f'{key} = "{certificates / name}"\n' for key, name in names.items()
+    )
 
 
 @contextlib.asynccontextmanager
@@ -128,7 +136,9 @@ async def phases_of(run: Run, how: str, certificates: Path, port: int) -> list[P
             await asyncio.sleep(PHASE_S)
             to_s = time.time()
             busy = (sum(control.cpu_times()[:2]) - used_s) / (to_s - from_s)
-        phases.append(Phase(attacked, from_s - zero_s, to_s - zero_s, busy, control.memory_info().rss / 1e6))
+        phases.append(
+            Phase(attacked, from_s - zero_s, to_s - zero_s, busy, control.memory_info().rss / 1e6)
+        )
     return phases
 
 
@@ -146,8 +156,12 @@ def judge(folder: Path, phases: list[Phase]) -> None:
 
 
 @pytest.mark.parametrize("how", ["lone", "many"])
-async def test_strangers_disturb_neither_ticks_nor_operators(tmp_path: Path, certificates: Path, how: str) -> None:
-    context = client_context(certificates / "operator.pem", certificates / "operator.key", certificates / "ca.pem")
+async def test_strangers_disturb_neither_ticks_nor_operators(
+    tmp_path: Path, certificates: Path, how: str
+) -> None:
+    context = client_context(
+        certificates / "operator.pem", certificates / "operator.key", certificates / "ca.pem"
+    )
     async with running(tmp_path, make_plant(), configured(certificates)) as run:
         await run.until(lambda: run.reached("hold"))
         port, socket_file = tls_port(run), tmp_path / "logs" / "control.sock"
@@ -174,10 +188,18 @@ async def test_strangers_disturb_neither_ticks_nor_operators(tmp_path: Path, cer
         refused = [event for event in run.events if event["kind"] == "refused"]
     judge(tmp_path, phases)
     peace, attack = phases[::2], phases[1::2]
-    print(f"\n{how}: {told(phases)}; {grown_mb:+.1f} MB, {files} files, {len(refused)} refusals recorded")
-    print(f"  MB after each phase: {[round(phase.rss_mb) for phase in phases]}, {before_mb:.0f} before")
+    print(
+        f"\n{how}: {told(phases)}; {grown_mb:+.1f} MB, {files} files, {len(refused)} "
+        "refusals recorded"
+    )
+    print(
+        f"  MB after each phase: {[round(phase.rss_mb) for phase in phases]}, "
+        f"{before_mb:.0f} before"
+    )
     print(f"  by TLS {remote}; by socket {local}")
-    assert mean(p.busy for p in attack) < mean(p.busy for p in peace) + 0.05  # the machine's load does not show in it
+    assert (
+        mean(p.busy for p in attack) < mean(p.busy for p in peace) + 0.05
+    )  # the machine's load does not show in it
     ticks = 50 * CYCLES * PHASE_S
     assert sum(p.missed for p in attack) <= max(3 * sum(p.missed for p in peace), ticks // 20)
     assert grown_mb < 120.0  # seen: 80 MB in five attacks, 53 MB in one
@@ -197,7 +219,9 @@ def told(phases: list[Phase]) -> str:
     busy = [mean(p.busy for p in part) for part in (phases[::2], phases[1::2])]
     missed = [sum(p.missed for p in part) for part in (phases[::2], phases[1::2])]
     return (
-        f"p99 of the lateness in peace / under attack, ms: {', '.join(f'{a:.1f} / {b:.1f}' for a, b in pairs)}; "
-        f"ratio {median(ratios):.2f} ({ratios[0]:.2f} to {ratios[-1]:.2f}); missed {missed[0]} / {missed[1]}; "
+        "p99 of the lateness in peace / under attack, ms: "
+        f"{', '.join(f'{a:.1f} / {b:.1f}' for a, b in pairs)}; "
+        f"ratio {median(ratios):.2f} ({ratios[0]:.2f} to {ratios[-1]:.2f}); missed "
+        f"{missed[0]} / {missed[1]}; "
         f"{100 * busy[0]:.1f} / {100 * busy[1]:.1f} % of a processor"
     )

@@ -1,4 +1,6 @@
-"""A hold with its page, fifty viewers, one a real Chromium, and one that has stopped reading: nobody notices."""
+"""A hold with its page, fifty viewers, one a real Chromium, and one that has stopped reading:
+nobody notices.
+"""
 
 from __future__ import annotations
 
@@ -16,8 +18,14 @@ from benchmarks.figures import at_most, show
 from tests.support.browser import browser_tab
 from tests.support.machine_needs import needs
 
-pytestmark = [pytest.mark.real_time, pytest.mark.campaign, pytest.mark.timeout(900), needs("chromium")]
-# the error changes with every update; kept over a reload of the page, which a browser does that was hung up on
+pytestmark = [
+    pytest.mark.real_time,
+    pytest.mark.campaign,
+    pytest.mark.timeout(900),
+    needs("chromium"),
+]
+# the error changes with every update; kept over a reload of the page, which a browser does that was
+# hung up on
 WATCHED = """sessionStorage.loads = +(sessionStorage.loads || 0) + 1;
 new MutationObserver(changes => {
   const field = document.querySelector('[data-field=error_um]');
@@ -27,7 +35,9 @@ new MutationObserver(changes => {
 
 
 class Chromium:
-    """A browser on the page: the longest times without an update, and how often it loaded the page, of each cycle."""
+    """A browser on the page: the longest times without an update, and how often it loaded the page,
+    of each cycle.
+    """
 
     def __init__(self, folder: Path) -> None:
         self._folder = folder
@@ -74,7 +84,9 @@ def test_fifty_viewers_and_a_stalled_one(tmp_path: Path, monkeypatch: pytest.Mon
     assert len(chromium.gaps_s) == 2
     assert late.reference_value is not None
     assert late.value < max(2 * late.reference_value, 5.0)
-    assert missed.value <= max(3 * (missed.reference_value or 0.0), 0.01 * 100 * viewers.PHASE_S)  # 1 % of the ticks
+    assert missed.value <= max(
+        3 * (missed.reference_value or 0.0), 0.01 * 100 * viewers.PHASE_S
+    )  # 1 % of the ticks
     assert lost.met
     assert kept.met
     assert grown_mb.met

@@ -45,7 +45,9 @@ def test_a_camera_outvoted_by_two_liars_is_heard_when_the_gas_agrees_with_it() -
 
 @pytest.mark.parametrize("by", [10.0, 0.1, -1.0])
 def test_a_gauge_in_another_unit_keeps_the_mirror_down_from_the_start(by: float) -> None:
-    story = tell((SensorFault("gauge", f"times {by}", scaled(by), lasts_s=30.0),), 1, False, from_start=True)
+    story = tell(
+        (SensorFault("gauge", f"times {by}", scaled(by), lasts_s=30.0),), 1, False, from_start=True
+    )
     assert story.ended_in == State.FAULT
     assert story.noticed in {"laser_gauge_apart", "over_pressure"}
 
@@ -60,7 +62,9 @@ def test_an_hour_of_everything_that_is_no_fault_of_a_sensor_is_held(other_world:
 @pytest.mark.parametrize("seed", [2])
 @pytest.mark.parametrize("fault", FAULTS, ids=lambda fault: f"{fault.sensor} {fault.failure}")
 @pytest.mark.parametrize("camera", [False, True])
-def test_one_sensor_alone_never_leads_the_mirror_to_its_limits(fault: SensorFault, camera: bool, seed: int) -> None:
+def test_one_sensor_alone_never_leads_the_mirror_to_its_limits(
+    fault: SensorFault, camera: bool, seed: int
+) -> None:
     story = tell((fault,), seed, camera, from_start=False)
     limits = LimitsConfig()
     assert story.pumped_um < 200.0
@@ -69,7 +73,9 @@ def test_one_sensor_alone_never_leads_the_mirror_to_its_limits(fault: SensorFaul
 
 @pytest.mark.campaign
 @pytest.mark.timeout(900)
-@pytest.mark.parametrize("faults", PAIRS[:2], ids=lambda faults: " and ".join(f.failure for f in faults))
+@pytest.mark.parametrize(
+    "faults", PAIRS[:2], ids=lambda faults: " and ".join(f.failure for f in faults)
+)
 @pytest.mark.parametrize("seed", [2, 3])
 def test_two_at_once_are_found_before_the_limits(faults: Sequence[SensorFault], seed: int) -> None:
     story = tell(faults, seed, camera=False, from_start=False)

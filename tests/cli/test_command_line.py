@@ -12,14 +12,24 @@ import pytest
 from membrane_ctrl import cli
 from membrane_ctrl.model.errors import Exit
 
-HEAVY = ("control", "cv2", "matplotlib", "numba", "pyarrow", "rerun", "scipy")  # 0.1 s to 1 s of importing each
+HEAVY = (
+    "control",
+    "cv2",
+    "matplotlib",
+    "numba",
+    "pyarrow",
+    "rerun",
+    "scipy",
+)  # 0.1 s to 1 s of importing each
 
 
 def loaded(code: str) -> set[str]:
     """The heavy libraries that a new process has loaded after some code."""
     shown = f"import sys\n{code}\nprint(*(name for name in {HEAVY!r} if name in sys.modules))"
     return set(
-        subprocess.run([sys.executable, "-c", shown], capture_output=True, text=True, check=True).stdout.split()
+        subprocess.run(
+            [sys.executable, "-c", shown], capture_output=True, text=True, check=True
+        ).stdout.split()
     )
 
 
@@ -40,7 +50,9 @@ def test_hold_says_what_it_does_before_it_loads_the_control_program() -> None:
     code = "from membrane_ctrl.model import terminal\nfrom membrane_ctrl.cli import run\n"
     code += "terminal.progress = lambda words: sys.exit(str('membrane_ctrl.hold' in sys.modules))\n"
     code += "run(['hold', '--twin'])"
-    said = subprocess.run([sys.executable, "-c", f"import sys\n{code}"], capture_output=True, text=True, check=False)
+    said = subprocess.run(
+        [sys.executable, "-c", f"import sys\n{code}"], capture_output=True, text=True, check=False
+    )
     assert said.stderr == "False\n"
 
 
@@ -59,7 +71,9 @@ def test_a_file_error_that_no_command_foresaw_is_one_line(
 
 
 @pytest.mark.parametrize("words", [[], ["config"], ["ctl"], ["alarm"], ["tune"]], ids=" ".join)
-def test_a_group_without_a_command_prints_its_help(words: list[str], capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_group_without_a_command_prints_its_help(
+    words: list[str], capsys: pytest.CaptureFixture[str]
+) -> None:
     assert cli.run(words) == Exit.BAD_INPUT
     printed = capsys.readouterr()
     assert "Usage: membrane-ctrl" in printed.out
@@ -68,7 +82,11 @@ def test_a_group_without_a_command_prints_its_help(words: list[str], capsys: pyt
 
 @pytest.mark.parametrize(
     ("words", "told"),
-    [(["holdd"], "Did you mean 'hold'?"), (["ctl", "statsu"], "Did you mean 'status'?"), (["tnue"], "'tune'")],
+    [
+        (["holdd"], "Did you mean 'hold'?"),
+        (["ctl", "statsu"], "Did you mean 'status'?"),
+        (["tnue"], "'tune'"),
+    ],
     ids=str,
 )
 def test_a_misspelt_command_gets_a_suggestion(
@@ -79,7 +97,10 @@ def test_a_misspelt_command_gets_a_suggestion(
 
 
 def test_help_loads_no_configuration() -> None:
-    commands = [["--help"], *([name, "--help"] for name in ("hold", "safe", "check", "config", "measure", "runs"))]
+    commands = [
+        ["--help"],
+        *([name, "--help"] for name in ("hold", "safe", "check", "config", "measure", "runs")),
+    ]
     code = "import contextlib, io, sys\nfrom membrane_ctrl.cli import run\n"
     code += "with contextlib.redirect_stdout(io.StringIO()):\n"
     code += f"    assert [run(words) for words in {commands}] == {[0] * len(commands)}\n"
@@ -96,9 +117,14 @@ def test_square_brackets_stay(tmp_path: Path, capsys: pytest.CaptureFixture[str]
     assert "[loop].toml" in "".join(capsys.readouterr().out.split("\n"))
 
 
-def test_a_folder_of_runs_that_cannot_be_written_is_named(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_folder_of_runs_that_cannot_be_written_is_named(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     (tmp_path / "runs").write_text("a file")
-    assert cli.run(["hold", "--twin", "--duration", "1s", "--logs", str(tmp_path / "runs")]) == Exit.DEVICE_FAILED
+    assert (
+        cli.run(["hold", "--twin", "--duration", "1s", "--logs", str(tmp_path / "runs")])
+        == Exit.DEVICE_FAILED
+    )
     assert f"{tmp_path / 'runs'}: cannot be written" in capsys.readouterr().err
 
 
@@ -114,6 +140,10 @@ def test_a_setting_that_only_its_driver_refuses_is_named_with_its_file(
     link = 'driver = "modbus_map"\nlink = "tcp://127.0.0.1:1"\nvalue = [0.0, 1.0]\n'  # no raw
     path = tmp_path / "lab.toml"
     roles = enumerate(("displacement", "gauge_pressure", "pump"))
-    path.write_text("".join(f"[devices.{role}]\n{link}address = {address}\n" for address, role in roles))
+    path.write_text(
+        "".join(f"[devices.{role}]\n{link}address = {address}\n" for address, role in roles)
+    )
     assert cli.run(["safe", str(path)]) == Exit.BAD_INPUT
-    assert re.fullmatch(rf"membrane-ctrl: {path}: devices\.\w+: raw is missing.*\n", capsys.readouterr().err)
+    assert re.fullmatch(
+        rf"membrane-ctrl: {path}: devices\.\w+: raw is missing.*\n", capsys.readouterr().err
+    )

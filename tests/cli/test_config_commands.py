@@ -33,7 +33,10 @@ def answered(monkeypatch: pytest.MonkeyPatch, path: Path, *answers: str) -> int:
 
 @pytest.mark.parametrize("options", [["--twin"], []], ids=["twin", "nobody to ask"])
 async def test_the_first_configuration_passes_check_against_the_twin(
-    options: list[str], tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+    options: list[str],
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
+    monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     monkeypatch.setattr("sys.stdin", io.StringIO())
     path = tmp_path / "lab.toml"
@@ -46,7 +49,9 @@ async def test_the_first_configuration_passes_check_against_the_twin(
     lab = Lab(StillPlant(), config.devices)
     try:
         board = (await lab.start()).board
-        path.write_text(text.replace("tcp://127.0.0.1:5020", str(board)))  # another test may have that port
+        path.write_text(
+            text.replace("tcp://127.0.0.1:5020", str(board))
+        )  # another test may have that port
         with patient_check():
             assert await asyncio.to_thread(run, ["check", str(path), "--json"]) == 0
     finally:
@@ -54,7 +59,9 @@ async def test_the_first_configuration_passes_check_against_the_twin(
 
 
 @pytest.mark.parametrize("kind", ["file", "link", "folder"])
-def test_nothing_is_overwritten(kind: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_nothing_is_overwritten(
+    kind: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     path = tmp_path / "lab.toml"
     if kind == "file":
         path.write_text("mine")
@@ -68,7 +75,9 @@ def test_nothing_is_overwritten(kind: str, tmp_path: Path, capsys: pytest.Captur
     assert kind != "file" or path.read_text() == "mine"
 
 
-def test_a_folder_that_is_not_there_is_named(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_folder_that_is_not_there_is_named(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     assert run(["config", "init", str(tmp_path / "no" / "lab.toml"), "--twin"]) == 2
     assert "cannot be written (no such file or directory)" in capsys.readouterr().err
 
@@ -88,11 +97,20 @@ def test_single_instruments_are_asked_for_and_what_they_lack_is_switched_off(
 ) -> None:
     path = tmp_path / "lab.toml"
     laser = ["optoncdt", "optoncdt1420", "usb:0403:6001"]  # a typing error first
-    pump = ["bronkhorst_modbus", "/dev/x", "3", "bronkhorst_modbus", "rtu:///dev/ttyUSB1", "3"]  # no URL first
+    pump = [
+        "bronkhorst_modbus",
+        "/dev/x",
+        "3",
+        "bronkhorst_modbus",
+        "rtu:///dev/ttyUSB1",
+        "3",
+    ]  # no URL first
     gauge = ["bronkhorst_modbus", "rtu:///dev/ttyUSB1", "5"]
     screen = ["pygame", "1920", "1080", "0.4961"]
     vent = ["modbus_map", "tcp://10.0.0.1:502", "0", "[0, 20000]", "[0.0, 1.0]"]
-    assert answered(monkeypatch, path, "", *laser, *pump, *gauge, *vent, "", "", "uvc", *screen) == 0
+    assert (
+        answered(monkeypatch, path, "", *laser, *pump, *gauge, *vent, "", "", "uvc", *screen) == 0
+    )
     config = load(path, Config)
     assert config.devices is not None
     assert {*config.devices.roles()} == {"displacement", "pump", "gauge_pressure", "vent"}
@@ -114,7 +132,19 @@ def test_answers_that_contradict_each_other_write_nothing(
     monkeypatch: pytest.MonkeyPatch, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     path = tmp_path / "lab.toml"
-    answers = ["", "optoncdt1420", "/dev/x", "ventus", "/dev/x", "bronkhorst_propar", "/dev/y", "", "", "", ""]
+    answers = [
+        "",
+        "optoncdt1420",
+        "/dev/x",
+        "ventus",
+        "/dev/x",
+        "bronkhorst_propar",
+        "/dev/y",
+        "",
+        "",
+        "",
+        "",
+    ]
     assert answered(monkeypatch, path, *answers) == 2
     assert "displacement and pump name the same port" in capsys.readouterr().err
     assert not path.exists()
@@ -129,7 +159,10 @@ def test_a_pump_and_a_gauge_on_one_register_write_nothing(
     gauge = ["modbus_map", "tcp://10.0.0.1:502", "7", "[0, 20000]", "[0.0, 1000.0]"]
     assert answered(monkeypatch, path, "", *laser, *pump, *gauge, "", "", "", "") == 2
     told = capsys.readouterr().err
-    assert "devices.pump.address and devices.gauge_pressure.address name the same holding register 7" in told
+    assert (
+        "devices.pump.address and devices.gauge_pressure.address name the same holding register 7"
+        in told
+    )
     assert not path.exists()
 
 
@@ -140,13 +173,27 @@ def test_two_names_of_one_serial_port_write_nothing(
     port, other = tmp_path / "ttyUSB0", tmp_path / "by-id"
     port.touch()
     other.symlink_to(port)
-    answers = ["", "optoncdt1420", str(port), "ventus", str(other), "mks_937b", "/dev/y", "", "", "", ""]
+    answers = [
+        "",
+        "optoncdt1420",
+        str(port),
+        "ventus",
+        str(other),
+        "mks_937b",
+        "/dev/y",
+        "",
+        "",
+        "",
+        "",
+    ]
     assert answered(monkeypatch, path, *answers) == 2
     assert "devices.displacement and devices.pump name the same port" in capsys.readouterr().err
     assert not path.exists()
 
 
-def test_an_end_of_the_answers_writes_nothing(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+def test_an_end_of_the_answers_writes_nothing(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
     path = tmp_path / "lab.toml"
     assert answered(monkeypatch, path) == 130
     assert not path.exists()

@@ -39,20 +39,31 @@ def board_warnings(bench: Bench, capsys: pytest.CaptureFixture[str]) -> list[str
 
 
 @pytest.mark.parametrize("version", [1, 2])
-def test_a_board_of_an_earlier_map_is_used_and_warned_of(bench: Bench, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_board_of_an_earlier_map_is_used_and_warned_of(
+    bench: Bench, capsys: pytest.CaptureFixture[str]
+) -> None:
     check(bench, as_json=False)
     lines = " ".join(capsys.readouterr().out.split())
-    assert "this board's firmware does not stop the pump when its gauge fails; update to map version 3" in lines
-    assert board_warnings(bench, capsys) == ["this board's firmware does not stop the pump when its gauge fails"]
+    assert (
+        "this board's firmware does not stop the pump when its gauge fails; update to map version 3"
+        in lines
+    )
+    assert board_warnings(bench, capsys) == [
+        "this board's firmware does not stop the pump when its gauge fails"
+    ]
 
 
 @pytest.mark.parametrize("version", [3])
-def test_a_board_that_guards_its_gauge_is_not_warned_of(bench: Bench, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_board_that_guards_its_gauge_is_not_warned_of(
+    bench: Bench, capsys: pytest.CaptureFixture[str]
+) -> None:
     assert board_warnings(bench, capsys) == []
 
 
 @pytest.mark.parametrize("version", [3])
-def test_a_board_without_a_gauge_is_warned_of(bench: Bench, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_board_without_a_gauge_is_warned_of(
+    bench: Bench, capsys: pytest.CaptureFixture[str]
+) -> None:
     bench.board.state.stored = StoredSettings(gauge_fitted=False)
     (warning,) = board_warnings(bench, capsys)
     assert "has no over-pressure protection of its own" in warning

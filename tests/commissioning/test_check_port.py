@@ -35,7 +35,9 @@ def test_a_hold_that_tracks_is_told_as_such(capsys: pytest.CaptureFixture[str]) 
 def test_what_is_configured(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("importlib.util.find_spec", lambda name: name)  # as if Apprise were installed
+    monkeypatch.setattr(
+        "importlib.util.find_spec", lambda name: name
+    )  # as if Apprise were installed
     urls = tmp_path / "urls.txt"
     urls.write_text("json://localhost\n")
     port = PortConfig(socket="/run/m.sock", metrics_port=9464)
@@ -48,6 +50,9 @@ def test_what_is_configured(
 def test_files_that_are_not_there(tmp_path: Path) -> None:
     missing = str(tmp_path / "missing")
     tls = TlsConfig(certificate_file=missing, key_file=missing, client_ca_file=missing)
-    for config in (Config(port=PortConfig(tls=tls)), Config(alarms=AlarmsConfig(urls_file=missing))):
+    for config in (
+        Config(port=PortConfig(tls=tls)),
+        Config(alarms=AlarmsConfig(urls_file=missing)),
+    ):
         with pytest.raises(InputError, match="missing: no such file"):
             check_config(config, "lab.toml", as_json=False)

@@ -14,8 +14,13 @@ from membrane_ctrl.commissioning import devices
 from membrane_ctrl.config.toml_file import read_toml
 
 
-def test_a_usb_port_is_named_by_what_survives_a_replug(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
-    ports = [PortInfo("/dev/ttyS0", "", "n/a"), PortInfo("/dev/ttyUSB0", "usb:0403:6001:A5", "FT232R")]
+def test_a_usb_port_is_named_by_what_survives_a_replug(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    ports = [
+        PortInfo("/dev/ttyS0", "", "n/a"),
+        PortInfo("/dev/ttyUSB0", "usb:0403:6001:A5", "FT232R"),
+    ]
     monkeypatch.setattr(devices, "serial_ports", lambda: ports)
     first, second = devices.find_ports()
     path = tmp_path / "paste.toml"
@@ -26,7 +31,10 @@ def test_a_usb_port_is_named_by_what_survives_a_replug(monkeypatch: pytest.Monke
 
 
 def test_connected_displays_are_listed_with_their_size(tmp_path: Path) -> None:
-    for name, status, modes in (("card0-HDMI-A-1", "connected", "1920x1080\n1280x720\n"), ("card0-DP-1", "dis", "")):
+    for name, status, modes in (
+        ("card0-HDMI-A-1", "connected", "1920x1080\n1280x720\n"),
+        ("card0-DP-1", "dis", ""),
+    ):
         (tmp_path / name).mkdir()
         (tmp_path / name / "status").write_text(status + "\n")
         (tmp_path / name / "modes").write_text(modes)
@@ -38,7 +46,11 @@ def test_cameras_are_listed_by_aravis_when_it_is_there(monkeypatch: pytest.Monke
     there = [aravis.FoundCamera("Hikrobot-00J1", "Hikrobot", "MV-CS050-10UC", "USB3")]
     monkeypatch.setattr(aravis, "find_cameras", lambda: iter(there))
     (camera,), notes = devices.find_cameras()
-    assert (camera.name, camera.paste, notes) == ("Hikrobot MV-CS050-10UC", 'camera = "Hikrobot-00J1"', [])
+    assert (camera.name, camera.paste, notes) == (
+        "Hikrobot MV-CS050-10UC",
+        'camera = "Hikrobot-00J1"',
+        [],
+    )
 
 
 def test_without_aravis_the_rest_is_listed_and_the_remedy_named(

@@ -18,7 +18,11 @@ from firmware_iface.emulators.modbus_server import Answer, ModbusTcpServer
 from firmware_iface.emulators.pump_board import BoardSample, PumpBoardEmulator
 from firmware_iface.roles import BenchIdentity
 from membrane_ctrl.commissioning.check import check_config
-from membrane_ctrl.commissioning.interlock_check import HOW_TO_TEST, describe_effect, probe_interlocks
+from membrane_ctrl.commissioning.interlock_check import (
+    HOW_TO_TEST,
+    describe_effect,
+    probe_interlocks,
+)
 from membrane_ctrl.config.schema import Config
 from membrane_ctrl.config.toml_file import parse
 from membrane_ctrl.controller.cross_check import cross_check
@@ -28,7 +32,13 @@ from tests.config.test_device_places import roles
 MAP_3 = BenchIdentity("board", 3, "1.1.0", 0.5, 800.0, 1.0, interlocks_fitted=0xFFFF)
 MAP_2 = BenchIdentity("board", 2, "1.0.0", 0.5, 800.0, 1.0)
 DOOR = {"driver": "board_input", "name": "door", "text": "shut the door", "input": 3}
-AIR = {"driver": "modbus_input", "name": "air", "text": "leave the room", "link": "tcp://plc", "address": 3}
+AIR = {
+    "driver": "modbus_input",
+    "name": "air",
+    "text": "leave the room",
+    "link": "tcp://plc",
+    "address": 3,
+}
 STOP = {"driver": "gpio_line", "name": "stop", "text": "pull the button", "line": 5}
 
 
@@ -55,13 +65,23 @@ class Rig:
         self.board = PumpBoardEmulator(self.plant)
         self.air_closed = True
         self.module = InputModule({3: lambda: self.air_closed}, {})
-        self.server = ModbusTcpServer(lambda unit, pdu: Answer(self.module.respond(pdu) or b""), "127.0.0.1", 0)
+        self.server = ModbusTcpServer(
+            lambda unit, pdu: Answer(self.module.respond(pdu) or b""), "127.0.0.1", 0
+        )
         self.gpio = EmulatedGpio({("/dev/gpiochip0", 5): "closed"})
 
     @property
     def config(self) -> Config:
-        air = AIR | {"link": f"tcp://127.0.0.1:{self.server.port}", "timeout_s": 1.0, "age_max_s": 2.0}
-        devices = {"board": f"tcp://127.0.0.1:{self.board.port}", "timeout_s": 0.4, "interlocks": [DOOR, air, STOP]}
+        air = AIR | {
+            "link": f"tcp://127.0.0.1:{self.server.port}",
+            "timeout_s": 1.0,
+            "age_max_s": 2.0,
+        }
+        devices = {
+            "board": f"tcp://127.0.0.1:{self.board.port}",
+            "timeout_s": 0.4,
+            "interlocks": [DOOR, air, STOP],
+        }
         return parse({"devices": devices}, Config, "lab.toml")
 
 
@@ -97,10 +117,15 @@ async def test_a_signal_that_is_lost_is_named_and_does_not_hide_the_others(rig: 
     assert [probe.state for probe in probes] == ["closed", "no signal", "no signal"]
     assert "device failure" in probes[1].problem
     assert "/dev/gpiochip0" in probes[2].problem
-    assert describe_effect(probes) == "no hold before they are closed: air (no signal), stop (no signal)"
+    assert (
+        describe_effect(probes)
+        == "no hold before they are closed: air (no signal), stop (no signal)"
+    )
 
 
-async def test_the_command_lists_them_and_asks_for_a_test(rig: Rig, capsys: pytest.CaptureFixture[str]) -> None:
+async def test_the_command_lists_them_and_asks_for_a_test(
+    rig: Rig, capsys: pytest.CaptureFixture[str]
+) -> None:
     rig.air_closed = False
     await asyncio.to_thread(check_config, rig.config, "lab.toml", False)
     told = " ".join(capsys.readouterr().out.split())
@@ -116,7 +141,9 @@ async def test_the_command_lists_them_and_asks_for_a_test(rig: Rig, capsys: pyte
     assert report["would"]["interlocks"] == "no hold before they are closed: air (open)"
 
 
-async def test_a_lost_signal_is_an_error_after_the_report(rig: Rig, capsys: pytest.CaptureFixture[str]) -> None:
+async def test_a_lost_signal_is_an_error_after_the_report(
+    rig: Rig, capsys: pytest.CaptureFixture[str]
+) -> None:
     rig.module.broken = True
     with pytest.raises(DeviceError, match=r"interlock air: .*device failure"):
         await asyncio.to_thread(check_config, rig.config, "lab.toml", True)
@@ -127,7 +154,13 @@ async def test_inputs_of_a_board_of_an_earlier_map_are_refused(rig: Rig) -> None
     board = PumpBoardEmulator(rig.plant, registers=register_map.known_maps()[2])
     await board.start()
     config = parse(
-        {"devices": {"board": f"tcp://127.0.0.1:{board.port}", "timeout_s": 0.4, "interlocks": [DOOR]}},
+        {
+            "devices": {
+                "board": f"tcp://127.0.0.1:{board.port}",
+                "timeout_s": 0.4,
+                "interlocks": [DOOR],
+            }
+        },
         Config,
         "lab.toml",
     )
@@ -145,14 +178,20 @@ def test_a_missing_package_is_one_line(monkeypatch: pytest.MonkeyPatch) -> None:
         asyncio.run(probe_interlocks(config.devices))
 
 
-def findings(board: BenchIdentity | None = None, without_board: bool = False, **change: Any) -> dict[str, str]:
+def findings(
+    board: BenchIdentity | None = None, without_board: bool = False, **change: Any
+) -> dict[str, str]:
     """Fields of findings on one interlock, with their severity."""
     table = {**(AIR if "driver" not in change else {}), **change}
     tables = roles() if without_board else {"devices": {"board": "tcp://b"}}
     tables["devices"]["interlocks"] = [table]
     prefix = "devices.interlocks.0."
     found = cross_check(parse(tables, Config, "lab.toml"), board)
-    return {one.field.removeprefix(prefix): one.severity for one in found if one.field.startswith(prefix)}
+    return {
+        one.field.removeprefix(prefix): one.severity
+        for one in found
+        if one.field.startswith(prefix)
+    }
 
 
 def test_a_sound_source_gives_no_finding() -> None:
@@ -172,7 +211,9 @@ def test_a_sound_source_gives_no_finding() -> None:
         ({"safe_level": "vent"}, {}),
     ],
 )
-def test_a_source_that_reacts_too_late_or_cannot_be_trusted(change: dict[str, Any], expected: dict[str, str]) -> None:
+def test_a_source_that_reacts_too_late_or_cannot_be_trusted(
+    change: dict[str, Any], expected: dict[str, str]
+) -> None:
     assert findings(**change) == expected
 
 
@@ -192,7 +233,9 @@ def test_the_boards_map_and_its_own_guard_are_judged() -> None:
 def test_a_module_on_the_pumps_serial_line_is_warned_of_and_counted_among_its_answers() -> None:
     line = "rtu:///dev/ttyUSB0?baud=115200"
     tables: dict[str, Any] = roles(pump={"driver": "bronkhorst_modbus", "link": line, "unit_id": 3})
-    tables["devices"]["interlocks"] = [AIR | {"link": line, "unit_id": 9, "timeout_s": 0.3, "age_max_s": 1.0}]
+    tables["devices"]["interlocks"] = [
+        AIR | {"link": line, "unit_id": 9, "timeout_s": 0.3, "age_max_s": 1.0}
+    ]
     found = {one.field: one.severity for one in cross_check(parse(tables, Config, "lab.toml"))}
     assert found["devices.interlocks.0.link"] == "warning"
     assert found["devices.pump.timeout_s"] == "error"  # 0.2 s and 0.3 s before the watchdog's 0.5 s

@@ -1,4 +1,6 @@
-"""Commands beside a hold on a locked device: none that could let gas in begins, and the locks are shown."""
+"""Commands beside a hold on a locked device: none that could let gas in begins, and the locks are
+shown.
+"""
 
 from __future__ import annotations
 
@@ -20,14 +22,18 @@ from membrane_ctrl.sessions.live_hold import _require_unlocked
 URL = "tcp://127.0.0.1:1"
 KEYS = modbus_keys(URL, 1)
 ME = f"unix:{getpass.getuser()}"
-ANN = Lock("bofak", "hands inside", "unix:ann", "unix:ann", "process 7", "2026-01-02T03:04:05+00:00")
+ANN = Lock(
+    "bofak", "hands inside", "unix:ann", "unix:ann", "process 7", "2026-01-02T03:04:05+00:00"
+)
 OWN = Lock("gumil", "lens off", ME, ME, "process 8", "2026-01-02T03:05:05+00:00")
 
 
 @pytest.mark.parametrize("url", [URL, "tcp://localhost:1", "tcp://[::1]:1"])
 def test_conformance_does_not_touch_a_locked_board(url: str) -> None:
     LockStore.of_machine().write_lock(ANN, KEYS)
-    with pytest.raises(DeviceError, match=r'locked: "hands inside" by unix:ann.*word bofak.*locks remove'):
+    with pytest.raises(
+        DeviceError, match=r'locked: "hands inside" by unix:ann.*word bofak.*locks remove'
+    ):
         run_conformance(url, 1, False)
 
 
@@ -56,7 +62,9 @@ def test_a_session_does_not_begin_on_a_locked_mirror() -> None:
         _require_unlocked(Client({"state": "standby", "locks": [lock]}))  # type: ignore[arg-type]
 
 
-def test_locks_are_removed_by_their_author_or_by_their_word(capsys: pytest.CaptureFixture[str]) -> None:
+def test_locks_are_removed_by_their_author_or_by_their_word(
+    capsys: pytest.CaptureFixture[str],
+) -> None:
     store = LockStore.of_machine()
     first, _ = store.write_lock(ANN, KEYS), store.write_lock(OWN, KEYS)
     for words in (["locks", "remove", "wrong"], ["locks", "remove", "hands inside"]):
@@ -69,12 +77,17 @@ def test_locks_are_removed_by_their_author_or_by_their_word(capsys: pytest.Captu
     assert run(["locks", "remove", "bofak"]) == 0
     assert store.find_locks() == []
     log = Path(first).with_name("removed.log").read_text().splitlines()
-    assert [(entry["how"], entry["author"], entry["remover"]) for entry in map(json.loads, log)] == [
-        ("author", ME, ME), ("word", "unix:ann", ME),
-    ]  # fmt: skip
+    assert [
+        (entry["how"], entry["author"], entry["remover"]) for entry in map(json.loads, log)
+    ] == [
+        ("author", ME, ME),
+        ("word", "unix:ann", ME),
+    ]
 
 
-def test_while_a_program_has_the_devices_a_lock_is_removed_there(capsys: pytest.CaptureFixture[str]) -> None:
+def test_while_a_program_has_the_devices_a_lock_is_removed_there(
+    capsys: pytest.CaptureFixture[str],
+) -> None:
     LockStore.of_machine().write_lock(OWN, KEYS)
     with locked(KEYS):
         assert run(["locks", "remove"]) == 4

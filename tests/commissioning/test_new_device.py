@@ -1,4 +1,6 @@
-"""`devices new`, and drivers of other packages: what is written works at once, and only what is installed is run."""
+"""`devices new`, and drivers of other packages: what is written works at once, and only what is
+installed is run.
+"""
 
 from __future__ import annotations
 
@@ -31,7 +33,12 @@ def tool(*words: object, cwd: Path, path: str = "") -> str:
     """The output of a program that succeeds."""
     environment = {**os.environ, "PYTHONPATH": os.pathsep.join(filter(None, (path, str(ROOT))))}
     done = subprocess.run(
-        [str(word) for word in words], cwd=cwd, env=environment, capture_output=True, text=True, check=False
+        [str(word) for word in words],
+        cwd=cwd,
+        env=environment,
+        capture_output=True,
+        text=True,
+        check=False,
     )
     assert done.returncode == 0, done.stdout + done.stderr
     return done.stdout
@@ -43,7 +50,9 @@ def written(folder: Path, name: str, role: str = "gauge_pressure") -> Path:
 
 
 def install(site: Path, package: str, **entries: str) -> None:
-    """What pip leaves of a package: its metadata. `entries`: entry points by group, drivers or emulators."""
+    """What pip leaves of a package: its metadata. `entries`: entry points by group, drivers or
+    emulators.
+    """
     info = site / f"{package}-0.1.dist-info"
     info.mkdir(parents=True)
     (info / "METADATA").write_text(f"Metadata-Version: 2.1\nName: {package}\nVersion: 0.1\n")
@@ -87,7 +96,15 @@ def test_what_is_written_passes_its_own_tests_and_the_linter(tmp_path: Path) -> 
     tool(sys.executable, "-m", "ruff", "check", *made, cwd=tmp_path)
     tool(sys.executable, "-m", "ruff", "format", "--check", *made, cwd=tmp_path)
     where = os.pathsep.join(map(str, made))
-    config = ["-p", "no:cacheprovider", "-q", "-c", made[0] / "pyproject.toml", "--rootdir", tmp_path]
+    config = [
+        "-p",
+        "no:cacheprovider",
+        "-q",
+        "-c",
+        made[0] / "pyproject.toml",
+        "--rootdir",
+        tmp_path,
+    ]
     told = tool(sys.executable, "-m", "pytest", *config, *made, cwd=tmp_path, path=where)
     assert "62 passed" in told
 
@@ -101,7 +118,9 @@ class StillPlant:
 
     def sample(self) -> BoardSample:
         self._counter += 1
-        return BoardSample(12.5, 0, 600.0, 101_325.0, 22.5, 23.0, self._counter, self._counter / 200)
+        return BoardSample(
+            12.5, 0, 600.0, 101_325.0, 22.5, 23.0, self._counter, self._counter / 200
+        )
 
     def actuate(self, pump_fraction: float, vent_fraction: float) -> None:
         self.outputs.append((pump_fraction, vent_fraction))
@@ -122,7 +141,9 @@ async def test_check_reads_an_installed_driver_through_its_emulator(
         await lab.stop()
     printed = capsys.readouterr()
     assert code == 0, printed.err
-    (probe,) = (each for each in json.loads(printed.out)["devices"] if each["role"] == "gauge_pressure")
+    (probe,) = (
+        each for each in json.loads(printed.out)["devices"] if each["role"] == "gauge_pressure"
+    )
     assert (probe["identity"], probe["reading"]) == ("Acme Gauge A0001 1.0", "600 Pa")
 
 
@@ -145,10 +166,18 @@ def test_devices_and_config_know_an_installed_driver(
 
 def configured(**keys: object) -> Config:
     """A configuration whose gauge is `acme_gauge`, with these keys as well."""
-    modbus = {"driver": "modbus_map", "link": "tcp://h", "address": 0, "raw": [0.0, 1.0], "value": [0.0, 1.0]}
+    modbus = {
+        "driver": "modbus_map",
+        "link": "tcp://h",
+        "address": 0,
+        "raw": [0.0, 1.0],
+        "value": [0.0, 1.0],
+    }
     gauge = {"driver": "external", "name": "acme_gauge", "port": "/dev/ttyX", **keys}
     pump = {**modbus, "address": 1}
-    return Config.model_validate({"devices": {"displacement": modbus, "pump": pump, "gauge_pressure": gauge}})
+    return Config.model_validate(
+        {"devices": {"displacement": modbus, "pump": pump, "gauge_pressure": gauge}}
+    )
 
 
 def refusal(**keys: object) -> str:
@@ -163,8 +192,12 @@ def refusal(**keys: object) -> str:
     return line
 
 
-def test_a_configuration_runs_nothing(gauge: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """A run folder of a stranger, or of a machine with other drivers, is read without the driver."""
+def test_a_configuration_runs_nothing(
+    gauge: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A run folder of a stranger, or of a machine with other drivers,
+    is read without the driver.
+    """
     path = tmp_path / "config.toml"
     path.write_text(dump(configured(baud=9600, of_its_own={"deep": [1, 2]})))
     read = load(path, Config)
@@ -174,7 +207,9 @@ def test_a_configuration_runs_nothing(gauge: Path, tmp_path: Path, monkeypatch: 
     lying.mkdir()
     (lying / "other_gauge.py").write_text("raise SystemExit('a file lying around was run')\n")
     monkeypatch.chdir(lying)
-    assert "no driver 'other_gauge' is installed; installed: acme_gauge" in refusal(name="other_gauge")
+    assert "no driver 'other_gauge' is installed; installed: acme_gauge" in refusal(
+        name="other_gauge"
+    )
 
 
 @pytest.mark.parametrize(
@@ -187,7 +222,9 @@ def test_a_configuration_runs_nothing(gauge: Path, tmp_path: Path, monkeypatch: 
     ],
     ids=lambda value: str(value)[:20],
 )
-def test_a_wrong_key_of_its_own_is_one_line(gauge: Path, keys: dict[str, object], words: str) -> None:
+def test_a_wrong_key_of_its_own_is_one_line(
+    gauge: Path, keys: dict[str, object], words: str
+) -> None:
     assert words in refusal(**keys)
 
 
@@ -200,7 +237,8 @@ def test_a_wrong_key_of_its_own_is_one_line(gauge: Path, keys: dict[str, object]
         ("class AcmeGauge: pass", "has no class Settings"),
         (
             "from firmware_iface.settings import VentusConfig\n"
-            "class AcmeGauge:\n Settings = VentusConfig\n def __init__(self, config): raise RuntimeError('bang')",
+            "class AcmeGauge:\n Settings = VentusConfig\n def __init__(self, config): raise "
+            "RuntimeError('bang')",
             "cannot be made: RuntimeError: bang",
         ),
         (
@@ -300,7 +338,9 @@ def test_nothing_is_overwritten(tmp_path: Path, capsys: pytest.CaptureFixture[st
 
 
 @pytest.mark.campaign
-@pytest.mark.parametrize("role", ["displacement", "gauge_pressure", "pump", "thermometer", "camera", "screen"])
+@pytest.mark.parametrize(
+    "role", ["displacement", "gauge_pressure", "pump", "thermometer", "camera", "screen"]
+)
 def test_a_newcomer_installs_types_and_holds(role: str, tmp_path: Path) -> None:
     """docs/new-device.md, in an environment and a folder of its own."""
     tool(sys.executable, "-m", "venv", "--without-pip", tmp_path / "venv", cwd=tmp_path)
@@ -308,7 +348,16 @@ def test_a_newcomer_installs_types_and_holds(role: str, tmp_path: Path) -> None:
     (packages,) = (tmp_path / "venv").glob("lib/*/site-packages")
     (packages / "dependencies.pth").write_text(f"{ROOT}\n{sysconfig.get_path('purelib')}\n")
     folder = written(tmp_path, "acme_thing", role)
-    words = ["pip", "--python", python, "install", "--no-deps", "--no-build-isolation", "--editable", folder]
+    words = [
+        "pip",
+        "--python",
+        python,
+        "install",
+        "--no-deps",
+        "--no-build-isolation",
+        "--editable",
+        folder,
+    ]
     tool(sys.executable, "-m", *words, cwd=tmp_path)
     tool(python, "-m", "pytest", "-q", "-p", "no:cacheprovider", cwd=folder)
     tool(python, "-m", "mypy", "--cache-dir", tmp_path / "types", ".", cwd=folder)

@@ -1,4 +1,6 @@
-"""`devices new` for a camera and for a screen: what is written passes the conformance checks, and is listed."""
+"""`devices new` for a camera and for a screen: what is written passes the conformance checks, and
+is listed.
+"""
 
 from __future__ import annotations
 
@@ -54,7 +56,9 @@ def test_its_configuration_is_complete(role: str, tmp_path: Path) -> None:
     assert config.devices is not None
     assert config.shape.enabled
     tables = {"camera": config.devices.camera, "screen": config.devices.screen}
-    external = {name for name, table in tables.items() if table is not None and table.driver == "external"}
+    external = {
+        name for name, table in tables.items() if table is not None and table.driver == "external"
+    }
     assert external == {role}
     assert tables[role] is not None
     assert tables[role].name == f"acme_{role}"

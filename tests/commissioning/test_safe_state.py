@@ -39,7 +39,9 @@ class Still:
 
 
 class Bench:
-    """An emulated board in a thread of its own, its clock in the test's hand, and a program that holds it."""
+    """An emulated board in a thread of its own, its clock in the test's hand, and a program that
+    holds it.
+    """
 
     def __init__(self, version: int, folder: Path) -> None:
         self.now_s = 0.0
@@ -47,14 +49,18 @@ class Bench:
         self._thread = threading.Thread(target=self._loop.run_forever)
         self._thread.start()
         self.board = self.at_once(self._emulator, version)
-        self.devices = DevicesConfig(board=f"tcp://127.0.0.1:{self.board.port}", timeout_s=5.0, watchdog_s=0.5)
+        self.devices = DevicesConfig(
+            board=f"tcp://127.0.0.1:{self.board.port}", timeout_s=5.0, watchdog_s=0.5
+        )
         self.config = Config(devices=self.devices, recording=RecordingConfig(logs_dir=str(folder)))
         self.holder = PumpBoard(str(self.devices.board), timeout_s=5.0, watchdog_s=0.5)
         self.at_once(self.holder.open)
         self.write(0.5)
 
     async def _emulator(self, version: int) -> PumpBoardEmulator:
-        board = PumpBoardEmulator(Still(), clock=lambda: self.now_s, registers=known_maps()[version])
+        board = PumpBoardEmulator(
+            Still(), clock=lambda: self.now_s, registers=known_maps()[version]
+        )
         await board.start()
         return board
 
@@ -142,7 +148,9 @@ def test_after_a_run_nothing_is_latched(bench: Bench, tmp_path: Path) -> None:
     assert bench.read().latched_faults == 0
 
 
-def test_after_a_killed_run_it_waits_for_the_watchdog_and_latches_nothing_more(bench: Bench) -> None:
+def test_after_a_killed_run_it_waits_for_the_watchdog_and_latches_nothing_more(
+    bench: Bench,
+) -> None:
     with ThreadPoolExecutor(1) as pool:
         done = pool.submit(make_safe, bench.config, "lab.toml", latch=False)
         bench.now_s += 0.51
@@ -155,7 +163,9 @@ def test_a_pump_that_the_watchdog_leaves_on_is_stopped_after_all(
 ) -> None:
     monkeypatch.setattr("membrane_ctrl.commissioning.safe._LOOK_S", 0.001)
     monkeypatch.setattr("membrane_ctrl.commissioning.safe._LAPSE_S", -0.45)
-    assert make_safe(bench.config, "lab.toml", latch=False) == 0  # its clock is stopped: no watchdog trips
+    assert (
+        make_safe(bench.config, "lab.toml", latch=False) == 0
+    )  # its clock is stopped: no watchdog trips
     assert (bench.read().pump_fraction, bench.read().latched_faults) == (0.0, STOPPED)
 
 
@@ -177,7 +187,9 @@ def test_nobody_there_is_said_in_one_line(
 
 @every_map
 def test_a_check_beside_a_holder_writes_nothing(bench: Bench, version: int) -> None:
-    """As from another machine, where no lock is seen; with another watchdog period in its configuration."""
+    """As from another machine, where no lock is seen; with another watchdog period in its
+    configuration.
+    """
     before = bench.board.state.read(48, 2) + bench.board.state.read(56, 3)
     slow = bench.devices.model_copy(update={"watchdog_s": 10.0})
     probe = asyncio.run(probe_board(pump_board(slow, str(slow.board)), "board"))
@@ -192,7 +204,9 @@ def test_a_check_beside_a_holder_writes_nothing(bench: Bench, version: int) -> N
 class Hold:
     """Listens like a hold's control port, and keeps the requests."""
 
-    def __init__(self, path: Path, answer: dict[str, object], ticks: Callable[[], None] = lambda: None) -> None:
+    def __init__(
+        self, path: Path, answer: dict[str, object], ticks: Callable[[], None] = lambda: None
+    ) -> None:
         self._ticks = ticks
         self.asked: list[dict[str, object]] = []
         self._answer = answer
@@ -203,8 +217,14 @@ class Hold:
         self._thread.start()
 
     def _serve(self) -> None:
-        with self._listener, self._listener.accept()[0] as connection, connection.makefile("rwb") as lines:
-            lines.write(b'{"membrane_ctrl": 1, "run": "night", "you": "unix:ann", "role": "tune"}\n')
+        with (
+            self._listener,
+            self._listener.accept()[0] as connection,
+            connection.makefile("rwb") as lines,
+        ):
+            lines.write(
+                b'{"membrane_ctrl": 1, "run": "night", "you": "unix:ann", "role": "tune"}\n'
+            )
             lines.flush()
             request = json.loads(lines.readline())
             self.asked.append(request)
@@ -232,7 +252,10 @@ STORED = {"ok": True, "stored": True, "lock": {"word": "bofak"}}
 
 @pytest.mark.parametrize("answer", [{"ok": True}, STORED, {"ok": False, "refused": "not you"}])
 def test_a_running_hold_is_locked_and_that_is_enough_where_it_alone_has_the_pump(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], answer: dict[str, object]
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+    answer: dict[str, object],
 ) -> None:
     monkeypatch.setattr("membrane_ctrl.instruments.bench._PATIENCE_S", 0.05)
     hold = Hold(tmp_path / "control.sock", answer)

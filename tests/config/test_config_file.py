@@ -23,21 +23,35 @@ from membrane_ctrl.model.errors import InputError
         ("[loop]\nkp_per_s = nan\n", ["loop.kp_per_s", "finite"]),
         ("[twin]\nlaser_noise_um = -1\n", ["twin.laser_noise_um", "0"]),
         ("[twin]\nscenario = 'stormy'\n", ["twin.scenario", "gusty"]),
-        ("[optics.geometry]\na_mm = 2.672\nb_mm = 2871.0\nalpha_deg = 80.9\n", ["optics.geometry.a_mm", "100"]),
-        ("[optics.geometry]\na = 2.672\nb_mm = 2871.0\nalpha_deg = 80.9\n", ["optics.geometry.a", "a_mm"]),
+        (
+            "[optics.geometry]\na_mm = 2.672\nb_mm = 2871.0\nalpha_deg = 80.9\n",
+            ["optics.geometry.a_mm", "100"],
+        ),
+        (
+            "[optics.geometry]\na = 2.672\nb_mm = 2871.0\nalpha_deg = 80.9\n",
+            ["optics.geometry.a", "a_mm"],
+        ),
         ("[optics.geometry]\na_mm = 2672.0\n", ["optics.geometry", "alpha_deg"]),
-        ("[limits]\ndisplacement_min_um = 10\ndisplacement_max_um = 5\n", ["displacement_min_um", "below"]),
+        (
+            "[limits]\ndisplacement_min_um = 10\ndisplacement_max_um = 5\n",
+            ["displacement_min_um", "below"],
+        ),
         ("[loop\n", ["not valid TOML", "line 1"]),
         (
             "[devices.displacement]\ndriver = 'optoncdt1420'\nprot = '/dev/x'\n",
             ["devices.displacement.prot", "did you mean port?"],
         ),
         ("[devices.pump]\ndriver = 'vents'\n", ["devices.pump.driver", "did you mean ventus?"]),
-        ("[devices.camera]\ndriver = 'aravis'\nexposre_ms = 3\n", ["devices.camera.exposre_ms", "exposure_ms?"]),
+        (
+            "[devices.camera]\ndriver = 'aravis'\nexposre_ms = 3\n",
+            ["devices.camera.exposre_ms", "exposure_ms?"],
+        ),
         ("[[alarms.rules]]\nnam = 'x'\n", ["alarms.rules.0.nam", "did you mean name?"]),
     ],
 )
-def test_each_mistake_is_one_line_naming_file_and_field(tmp_path: Path, text: str, words: list[str]) -> None:
+def test_each_mistake_is_one_line_naming_file_and_field(
+    tmp_path: Path, text: str, words: list[str]
+) -> None:
     path = tmp_path / "lab.toml"
     path.write_text(text)
     with pytest.raises(InputError) as caught:
@@ -93,7 +107,9 @@ def test_a_wrong_height_map_is_one_line(tmp_path: Path, tail: str, words: list[s
 
 
 def test_what_is_written_reads_back_the_same() -> None:
-    config = Config.model_validate({"loop": {"rate_hz": 20}, "devices": {"board": "tcp://10.0.0.9:502"}})
+    config = Config.model_validate(
+        {"loop": {"rate_hz": 20}, "devices": {"board": "tcp://10.0.0.9:502"}}
+    )
     assert Config.model_validate(tomllib.loads(dump(config))) == config
 
 
@@ -107,9 +123,15 @@ def test_every_default_is_written_out() -> None:
     ("text", "words"),
     [
         (b"[loop]\nkp_per_s = 0,61\n", ["line 2", "write 0.61"]),
-        (b"[loop]\nkp_per_s = '0,61'\n", ["loop.kp_per_s", "'0,61'", "without quotes, with a decimal point"]),
+        (
+            b"[loop]\nkp_per_s = '0,61'\n",
+            ["loop.kp_per_s", "'0,61'", "without quotes, with a decimal point"],
+        ),
         (b"[loop]\nkp_per_s = '0.61'\n", ["loop.kp_per_s", "without quotes"]),
-        (b"[optics.camera]\nprincipal_px = ['1', 2]\n", ["optics.camera.principal_px", "without quotes"]),
+        (
+            b"[optics.camera]\nprincipal_px = ['1', 2]\n",
+            ["optics.camera.principal_px", "without quotes"],
+        ),
         (b"[loop]\nkp_per_s = true\n", ["loop.kp_per_s", "true is neither"]),
         (b"[shape]\nenabled = 1\n", ["shape.enabled", "write true or false"]),
         (b"[shape]\nenabled = 'no'\n", ["shape.enabled", "write true or false"]),
@@ -123,7 +145,10 @@ def test_every_default_is_written_out() -> None:
         (b"kp_per_s = 1\n", ["it belongs in [loop]"]),
         (b"[optics]\na_mm = 2672\n", ["it belongs in [optics.geometry]"]),
         (b"[devices.pump]\nport = '/dev/x'\n", ["devices.pump.driver: missing", "ventus"]),
-        (b"[devices.displacement]\ndriver = 'optoncdt1420'\n", ["devices.displacement.port: missing"]),
+        (
+            b"[devices.displacement]\ndriver = 'optoncdt1420'\n",
+            ["devices.displacement.port: missing"],
+        ),
         (b"[devices]\nboard = '10.0.0.3:502'\n", ["devices.board", "tcp://HOST:PORT"]),
         (b"[devices]\nboard = 'tcp://'\n", ["devices.board", "tcp://HOST:PORT"]),
         (b"[optics]\ngeometry_file = 3\n", ["optics.geometry_file", "valid path (it is 3)"]),
@@ -147,7 +172,12 @@ def test_the_line_says_what_to_write_instead(tmp_path: Path, text: bytes, words:
 
 @pytest.mark.parametrize(
     "text",
-    [b"", b"\xef\xbb\xbf[loop]\nkp_per_s = 0.5\n", b"[loop]\r\n\tkp_per_s = 0.5\r\n", b"# only a comment"],
+    [
+        b"",
+        b"\xef\xbb\xbf[loop]\nkp_per_s = 0.5\n",
+        b"[loop]\r\n\tkp_per_s = 0.5\r\n",
+        b"# only a comment",
+    ],
     ids=["empty", "byte order mark", "other line ends and tabs", "comment"],
 )
 def test_what_editors_write_is_read(tmp_path: Path, text: bytes) -> None:

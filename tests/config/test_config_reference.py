@@ -1,4 +1,6 @@
-"""Every key of the configuration explains itself, and page, editor schema and `config explain` say the same."""
+"""Every key of the configuration explains itself, and page, editor schema and `config explain` say
+the same.
+"""
 
 from __future__ import annotations
 
@@ -42,7 +44,10 @@ def test_a_key_says_what_it_means_and_when_to_change_it(title: str, key: referen
 
 def test_no_key_of_the_schema_is_left_out() -> None:
     """Counted from the classes, which the reference itself does not walk."""
-    missing, told = [], {(table.driver, key.name) for table in reference.tables() for key in table.keys}
+    missing, told = (
+        [],
+        {(table.driver, key.name) for table in reference.tables() for key in table.keys},
+    )
     todo: list[Any] = [Config]
     for section in todo:
         driver = (tags(section) or ("",))[0]
@@ -56,8 +61,16 @@ def test_no_key_of_the_schema_is_left_out() -> None:
 
 
 def test_a_quantity_has_its_unit() -> None:
-    numbers = {key.name: key.unit for _, key in ALL if " .. " in key.range and not key.range.endswith("whole")}
-    vectors = {name for name in numbers if name in ("rotation", "s_x", "s_y", "distortion", "raw", "value", "limits")}
+    numbers = {
+        key.name: key.unit
+        for _, key in ALL
+        if " .. " in key.range and not key.range.endswith("whole")
+    }
+    vectors = {
+        name
+        for name in numbers
+        if name in ("rotation", "s_x", "s_y", "distortion", "raw", "value", "limits")
+    }
     assert {name for name, unit in numbers.items() if not unit} == WITHOUT_UNIT | vectors
     assert numbers["flow_rate_limit_um_per_s2"] == "um/s2"
     assert numbers["kp_per_s"] == "1/s"
@@ -86,13 +99,19 @@ def test_a_role_shows_each_of_its_drivers() -> None:
     found = {table.driver for table in reference.explained("devices.pump")}
     assert found == {"bronkhorst_modbus", "bronkhorst_propar", "external", "modbus_map", "ventus"}
     assert {table.driver for table in reference.explained("devices.pump.serial")} == {
-        "bronkhorst_modbus", "bronkhorst_propar",
-    }  # fmt: skip
+        "bronkhorst_modbus",
+        "bronkhorst_propar",
+    }
 
 
 @pytest.mark.parametrize(
     ("word", "near"),
-    [("kp", "kp_per_s"), ("lop", "loop"), ("loop.kp_per_sec", "loop.kp_per_s"), ("zzzz", "config reference")],
+    [
+        ("kp", "kp_per_s"),
+        ("lop", "loop"),
+        ("loop.kp_per_sec", "loop.kp_per_s"),
+        ("zzzz", "config reference"),
+    ],
 )
 def test_a_near_miss_gets_a_suggestion(word: str, near: str) -> None:
     with pytest.raises(InputError, match=near) as caught:
@@ -102,16 +121,23 @@ def test_a_near_miss_gets_a_suggestion(word: str, near: str) -> None:
 
 def problems(text: str) -> list[str]:
     validator = Draft202012Validator(reference.json_schema())
-    return [f"{error.json_path}: {error.message}" for error in validator.iter_errors(tomllib.loads(text))]
+    return [
+        f"{error.json_path}: {error.message}"
+        for error in validator.iter_errors(tomllib.loads(text))
+    ]
 
 
 def test_the_editor_schema_is_a_schema_with_texts() -> None:
     schema = reference.json_schema()
     Draft202012Validator.check_schema(schema)
-    assert schema["$defs"]["LoopConfig"]["properties"]["td_s"]["description"].startswith("Derivative time")
+    assert schema["$defs"]["LoopConfig"]["properties"]["td_s"]["description"].startswith(
+        "Derivative time"
+    )
 
 
-@pytest.mark.parametrize("example", sorted(ROOT.glob("membrane_ctrl/examples/*.toml")), ids=lambda path: path.stem)
+@pytest.mark.parametrize(
+    "example", sorted(ROOT.glob("membrane_ctrl/examples/*.toml")), ids=lambda path: path.stem
+)
 def test_the_editor_accepts_the_examples(example: Path) -> None:
     assert problems(example.read_text()) == []
 
@@ -133,7 +159,10 @@ def test_the_editor_accepts_what_a_run_writes_and_a_height_map_in_a_file() -> No
         ("[devices.pump]\nport = '/dev/x'\n", "$.devices.pump"),
         ("[devices.displacement]\nport = '/dev/x'\nrate_khz = 2\n", "$.devices.displacement"),
         ("[devices.pump]\ndriver = 'ventus'\nport = '/dev/x'\nnode = 3\n", "$.devices.pump"),
-        ("[[alarms.rules]]\nname = 'Big'\nfield = 'x'\nraise_at = 1\nclear_at = 0\n", "$.alarms.rules[0].name"),
+        (
+            "[[alarms.rules]]\nname = 'Big'\nfield = 'x'\nraise_at = 1\nclear_at = 0\n",
+            "$.alarms.rules[0].name",
+        ),
     ],
 )
 def test_the_editor_marks_what_is_wrong(text: str, path: str) -> None:

@@ -20,7 +20,9 @@ urls_file = "urls"
 """
 
 
-def test_each_file_is_a_path_from_the_configurations_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_each_file_is_a_path_from_the_configurations_folder(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     (tmp_path / "lab").mkdir()
     (tmp_path / "lab" / "bench.toml").write_text(TEXT)
     monkeypatch.chdir(tmp_path)
@@ -31,7 +33,10 @@ def test_each_file_is_a_path_from_the_configurations_folder(tmp_path: Path, monk
     assert config.port.tls.certificate_file == str(tmp_path / "lab" / "keys" / "bench.pem")
     assert config.port.tls.key_file == "/etc/bench.key"
     assert config.port.tls.client_ca_file == str(tmp_path / "home" / "lab.pem")
-    assert (config.alarms.urls_file, config.alarms.escalation_urls_file) == (str(tmp_path / "lab" / "urls"), None)
+    assert (config.alarms.urls_file, config.alarms.escalation_urls_file) == (
+        str(tmp_path / "lab" / "urls"),
+        None,
+    )
 
 
 def test_what_is_not_named_stays_unnamed(tmp_path: Path) -> None:

@@ -76,7 +76,10 @@ def test_there_may_be_many_but_no_more_than_the_mask_has_bits() -> None:
 
 
 def test_a_written_file_is_read_back() -> None:
-    config = parsed(DOOR, {"driver": "modbus_input", "name": "air", "text": "x", "link": "tcp://plc", "address": 3})
+    config = parsed(
+        DOOR,
+        {"driver": "modbus_input", "name": "air", "text": "x", "link": "tcp://plc", "address": 3},
+    )
     assert parse(tomllib.loads(dump(config)), Config, "lab.toml") == config
 
 

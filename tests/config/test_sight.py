@@ -1,4 +1,6 @@
-"""Is a stated geometry plausible? Benches that are not, each with the key to check; and odd ones that are sound."""
+"""Is a stated geometry plausible? Benches that are not, each with the key to check; and odd ones
+that are sound.
+"""
 
 from __future__ import annotations
 
@@ -38,21 +40,31 @@ def general(
     everything: np.ndarray[Any, Any] | None = None,
     flip: float = 1.0,
 ) -> OpticsConfig:
-    """The paper's bench in the general form, with parts of it turned in world or moved along s_x."""
+    """The paper's bench in the general form, with parts of it turned
+    in world or moved along s_x.
+    """
     pinhole, rotation, origin, s_x, s_y = poses(GeometryConfig(**SHORT))
     none = np.eye(3)
-    camera, screen, everything = (none if turn is None else turn for turn in (camera, screen, everything))
+    camera, screen, everything = (
+        none if turn is None else turn for turn in (camera, screen, everything)
+    )
     rows = (rotation @ camera.T) @ everything.T
     s_x, s_y = everything @ screen @ s_x, flip * everything @ screen @ s_y
     table = {
         "camera": {"position_mm": tuple(everything @ pinhole), "rotation": tuple(map(tuple, rows))},
-        "screen": {"origin_mm": tuple(everything @ origin + shift_mm * s_x), "s_x": tuple(s_x), "s_y": tuple(s_y)},
+        "screen": {
+            "origin_mm": tuple(everything @ origin + shift_mm * s_x),
+            "s_x": tuple(s_x),
+            "s_y": tuple(s_y),
+        },
     }
     return parse({"geometry": table}, OpticsConfig, "test")
 
 
 # Below the film, with a pattern so large that its back would show it.
-BEHIND = general(everything=turned(0, 180.0)).model_copy(update={"pattern": PatternConfig(period_mm=500.0)})
+BEHIND = general(everything=turned(0, 180.0)).model_copy(
+    update={"pattern": PatternConfig(period_mm=500.0)}
+)
 
 
 @pytest.mark.parametrize(
@@ -70,7 +82,11 @@ BEHIND = general(everything=turned(0, 180.0)).model_copy(update={"pattern": Patt
         (optics_of(pattern={"period_mm": 4.982}), "alpha_deg", "[pattern]"),
         (optics_of(mirror={"sag_mm": 3.71}), "alpha_deg", "mirror.sag_mm"),
         (general(camera=turned(1, 20.0)), "camera.position_mm", "in the camera's image"),
-        (general(camera=turned(1, 180.0)), "camera.position_mm", "0% of the mirror is in the camera's image"),
+        (
+            general(camera=turned(1, 180.0)),
+            "camera.position_mm",
+            "0% of the mirror is in the camera's image",
+        ),
         (
             general(shift_mm=500.0),
             "screen.origin_mm",
@@ -81,7 +97,9 @@ BEHIND = general(everything=turned(0, 180.0)).model_copy(update={"pattern": Patt
         (BEHIND, "screen.origin_mm", "is seen in 0% of the mirror"),
     ],
 )
-def test_a_bench_that_cannot_measure_names_the_reason_and_the_key(optics: OpticsConfig, key: str, words: str) -> None:
+def test_a_bench_that_cannot_measure_names_the_reason_and_the_key(
+    optics: OpticsConfig, key: str, words: str
+) -> None:
     found = doubt(optics)
     assert found is not None
     assert (found.hopeless, found.key) == (True, key), found
@@ -94,7 +112,11 @@ WIDE = {"focal_mm": 8.0}
 def scaled(factor: float) -> OpticsConfig:
     """The paper's bench, smaller or larger, with the same camera."""
     lengths = {"a_mm": 2672.0 * factor, "b_mm": 2871.0 * factor}
-    mirror = {"radius_mm": 500.0 * factor, "analysis_radius_mm": 475.0 * factor, "sag_mm": 37.1 * factor}
+    mirror = {
+        "radius_mm": 500.0 * factor,
+        "analysis_radius_mm": 475.0 * factor,
+        "sag_mm": 37.1 * factor,
+    }
     return optics_of(lengths, pattern={"period_mm": 49.82 * factor}, mirror=mirror)
 
 
@@ -110,26 +132,44 @@ def scaled(factor: float) -> OpticsConfig:
         optics_of({"b_mm": 6000.0}),
         optics_of({"alpha_deg": 60.0}, pattern={"period_mm": 90.0}),
         optics_of(mirror={"sag_mm": 45.0}),
-        optics_of({"a_mm": 1500.0, "b_mm": 1200.0}, mirror={"sag_mm": 1}, camera=WIDE, pattern={"period_mm": 250.0}),
-        optics_of(camera={"width_px": 640, "height_px": 512, "pixel_um": 13.8, "principal_px": (330.0, 250.0)}),
+        optics_of(
+            {"a_mm": 1500.0, "b_mm": 1200.0},
+            mirror={"sag_mm": 1},
+            camera=WIDE,
+            pattern={"period_mm": 250.0},
+        ),
+        optics_of(
+            camera={
+                "width_px": 640,
+                "height_px": 512,
+                "pixel_um": 13.8,
+                "principal_px": (330.0, 250.0),
+            }
+        ),
         general(),
         general(everything=turned(2, 90.0)),
         general(everything=turned(2, 200.0)),
         general(screen=turned(1, 5.0), shift_mm=10.0),
     ],
-)  # fmt: skip
+)
 def test_an_odd_bench_that_can_measure_is_not_doubted(optics: OpticsConfig) -> None:
     assert doubt(optics) is None
 
 
 @pytest.mark.parametrize("alpha_deg", [80.9, 60.0, 45.0, 30.0])
 def test_the_share_is_that_of_the_twin_s_exact_rays(alpha_deg: float) -> None:
-    """By rays through every 25th pixel over the true film, which a bowl and equal areas only approximate."""
+    """By rays through every 25th pixel over the true film, which a bowl and equal areas only
+    approximate.
+    """
     optics = optics_of({"alpha_deg": alpha_deg})
     camera, screen = camera_pose(optics.geometry), screen_pose(optics.geometry)
-    columns, rows = (axis.ravel() for axis in np.meshgrid(np.arange(0, 2448, 25), np.arange(0, 2048, 25)))
+    columns, rows = (
+        axis.ravel() for axis in np.meshgrid(np.arange(0, 2448, 25), np.arange(0, 2048, 25))
+    )
     focal_px = 16.0 / 3.45e-3
-    rays = np.stack([(columns - 1223.5) / focal_px, (rows - 1023.5) / focal_px, np.ones(columns.size)], axis=1)
+    rays = np.stack(
+        [(columns - 1223.5) / focal_px, (rows - 1023.5) / focal_px, np.ones(columns.size)], axis=1
+    )
     rays = rays / np.linalg.norm(rays, axis=1)[:, None] @ camera.rotation
     film = FilmShape(37.1, 500.0)
     hits = trace(camera, rays, film.terms, film.sag_mm, 0.0, screen)
@@ -149,7 +189,9 @@ def test_a_film_of_unknown_depth_has_the_benefit_of_the_doubt() -> None:
 
 def test_less_than_the_whole_mirror_is_a_warning_and_unused_optics_are_not_judged() -> None:
     def findings(alpha_deg: float, **tables: Any) -> list[tuple[str, str]]:
-        config = parse({"optics": {"geometry": SHORT | {"alpha_deg": alpha_deg}}} | tables, Config, "test")
+        config = parse(
+            {"optics": {"geometry": SHORT | {"alpha_deg": alpha_deg}}} | tables, Config, "test"
+        )
         return [(found.severity, found.field) for found in cross_check(config)]
 
     field = "optics.geometry.alpha_deg"
@@ -159,4 +201,6 @@ def test_less_than_the_whole_mirror_is_a_warning_and_unused_optics_are_not_judge
     screen = {"driver": "pygame", "width_px": 1920, "height_px": 1080, "pixel_mm": 0.4961}
     devices = {"board": "tcp://192.0.2.1", "camera": {"driver": "aravis"}, "screen": screen}
     assert ("error", field) in findings(30.0, shape={"enabled": False}, devices=devices)
-    assert findings(80.9, twin={"geometry": SHORT | {"alpha_deg": 30.0}}) == [("error", "twin.geometry.alpha_deg")]
+    assert findings(80.9, twin={"geometry": SHORT | {"alpha_deg": 30.0}}) == [
+        ("error", "twin.geometry.alpha_deg")
+    ]

@@ -72,7 +72,11 @@ def rows(seconds_s: float, start_s: float = 0.0, seed: int = 1) -> list[Telemetr
 
 
 def shape(
-    time_s: float = 0.0, sag_um: float = 37100.0, verdict: Verdict = "ok", reason: str = "", cycle: int = 1
+    time_s: float = 0.0,
+    sag_um: float = 37100.0,
+    verdict: Verdict = "ok",
+    reason: str = "",
+    cycle: int = 1,
 ) -> ShapeEstimate:
     return ShapeEstimate(
         time_s=time_s,

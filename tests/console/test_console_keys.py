@@ -59,7 +59,11 @@ def typed(*texts: str, paused: bool = False) -> tuple[Desk, list[Request]]:
         (["m", "do", "xx\x7f\x7for", "\r"], False, [{"do": "mark", "text": "door"}]),
         (["m", "hello\x1b", "h"], False, [{"do": "hold"}]),
         (["m", "  \r"], False, []),
-        (["m", "one\nsy", "y"], False, [{"do": "mark", "text": "one"}]),  # the rest of a paste is no command
+        (
+            ["m", "one\nsy", "y"],
+            False,
+            [{"do": "mark", "text": "one"}],
+        ),  # the rest of a paste is no command
         (["m", "a\x07b\tc\r"], False, [{"do": "mark", "text": "abc"}]),
         (["m", "x" * 300, "\r"], False, [{"do": "mark", "text": "x" * 200}]),
         (["x", " ", "\x1a", "?", ""], False, []),
@@ -175,7 +179,9 @@ def test_without_a_terminal_on_stdin_there_is_no_keyboard(
     assert Keyboard.of_stdin() is None  # stdin is another terminal than the one that is drawn on
 
 
-def serve_once(path: Path, run: str, answer: dict[str, object]) -> tuple[threading.Thread, list[dict[str, object]]]:
+def serve_once(
+    path: Path, run: str, answer: dict[str, object]
+) -> tuple[threading.Thread, list[dict[str, object]]]:
     """A control port for one request."""
     listener = socket.socket(socket.AF_UNIX)
     listener.bind(str(path))
@@ -185,7 +191,10 @@ def serve_once(path: Path, run: str, answer: dict[str, object]) -> tuple[threadi
     def serve() -> None:
         with listener, listener.accept()[0] as client, client.makefile("rwb") as lines:
             lines.write(
-                json.dumps({"membrane_ctrl": 1, "run": run, "you": "unix:ann", "role": "tune"}).encode() + b"\n"
+                json.dumps(
+                    {"membrane_ctrl": 1, "run": run, "you": "unix:ann", "role": "tune"}
+                ).encode()
+                + b"\n"
             )
             lines.flush()
             if line := lines.readline():

@@ -49,7 +49,9 @@ def test_last_minute_of_the_error() -> None:
     errors = [row.error_um for row in rows(90.0) if row.mono_s >= 30.0]
     mean = sum(errors) / len(errors)
     assert view.error_mean_um == pytest.approx(mean)
-    assert view.error_std_um == pytest.approx(math.sqrt(sum((e - mean) ** 2 for e in errors) / len(errors)))
+    assert view.error_std_um == pytest.approx(
+        math.sqrt(sum((e - mean) ** 2 for e in errors) / len(errors))
+    )
     assert view.in_band_fraction == 1.0
     assert view.lateness_max_ms == max(row.lateness_ms for row in rows(90.0) if row.mono_s >= 30.0)
 
@@ -121,7 +123,9 @@ def test_sag_change_is_against_the_first_usable_shape_of_a_settled_hold() -> Non
     assert math.isnan(given.view(0.0).shape.sag_change_um)
     given.take_row(HOLDING)
     settled_s = HOLDING.mono_s + SETTLED_AFTER_S
-    given.take_shape(shape(time_s=settled_s + 0.5, sag_um=30000.0, verdict="rejected", reason="tracking lost"))
+    given.take_shape(
+        shape(time_s=settled_s + 0.5, sag_um=30000.0, verdict="rejected", reason="tracking lost")
+    )
     given.take_shape(shape(time_s=settled_s - 0.5, sag_um=37098.9))  # the mirror still moved
     given.take_shape(shape(time_s=settled_s + 1.0, sag_um=37100.0))
     given.take_shape(shape(time_s=settled_s + 4.0, sag_um=37100.5))
@@ -176,13 +180,20 @@ def test_gains_in_force_and_the_countdown_of_a_trial_are_shown() -> None:
     gains = Config().loop.model_dump()
     given.take_event(asked | {"loop": gains | {"kp_per_s": 9.0}, "refused": "no"})
     given.take_event(asked | {"loop": gains | {"kp_per_s": 0.5}, "value": 60.0})
-    assert given.view(20.0).gains == "Kp 0.5 1/s, Ti 6.5 s, Td 0 s; on trial, reverted in 50 s unless kept"
-    given.take_event({"kind": "command", "command": "keep", "who": "tom", "why": "", "mono_s": 30.0})
+    assert (
+        given.view(20.0).gains
+        == "Kp 0.5 1/s, Ti 6.5 s, Td 0 s; on trial, reverted in 50 s unless kept"
+    )
+    given.take_event(
+        {"kind": "command", "command": "keep", "who": "tom", "why": "", "mono_s": 30.0}
+    )
     given.take_event(asked | {"loop": gains | {"kp_per_s": 0.7}, "value": 60.0})
     given.take_event({"kind": "gains_reverted", "why": "nobody kept them", "mono_s": 70.0})
     assert given.view(70.0).gains == "Kp 0.5 1/s, Ti 6.5 s, Td 0 s"
     curve = {"curve_fraction": [0.1, 1.0], "curve_um_per_s": [0.0, 9.0]}
-    given.take_event(asked | {"loop": gains | {"flow_max_um_per_s": 20.0, "pump": curve}, "value": 60.0})
+    given.take_event(
+        asked | {"loop": gains | {"flow_max_um_per_s": 20.0, "pump": curve}, "value": 60.0}
+    )
     assert given.view(80.0).flow_most_um_per_s == 9.0
     given.take_event({"kind": "gains_reverted", "why": "nobody kept them", "mono_s": 90.0})
     assert given.view(90.0).flow_most_um_per_s == 5.3

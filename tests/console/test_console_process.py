@@ -38,7 +38,9 @@ class Run:
         telemetry = stack.enter_context(ring(256, ROW_BYTES))
         events = stack.enter_context(ring(16, 4096))
         shapes = stack.enter_context(ring(4, 1 << 16))
-        self.spec = ConsoleSpec(RunClock.start(), telemetry, events, shapes, Path("logs/demo"), Config(), 60.0)
+        self.spec = ConsoleSpec(
+            RunClock.start(), telemetry, events, shapes, Path("logs/demo"), Config(), 60.0
+        )
         self._telemetry = stack.enter_context(closing(RingWriter(telemetry)))
         self._events = stack.enter_context(closing(RingWriter(events)))
         self._shapes = stack.enter_context(closing(RingWriter(shapes)))
@@ -52,7 +54,9 @@ class Run:
         self._events.put(packed(event(self.spec.clock.now(), kind, **more)))
 
     def start(self, stderr: int) -> multiprocessing.process.BaseProcess:
-        process = multiprocessing.get_context("spawn").Process(target=on_stderr, args=(self.spec, os.ttyname(stderr)))
+        process = multiprocessing.get_context("spawn").Process(
+            target=on_stderr, args=(self.spec, os.ttyname(stderr))
+        )
         process.start()
         return process
 
@@ -82,7 +86,9 @@ def terminal() -> Iterator[tuple[int, int]]:
 
 def read_until(handle: int, words: bytes, seen: bytes = b"") -> bytes:
     while words not in seen:
-        assert select.select([handle], [], [], PATIENCE_S)[0], f"{words!r} never came: {seen[-300:]!r}"
+        assert select.select([handle], [], [], PATIENCE_S)[0], (
+            f"{words!r} never came: {seen[-300:]!r}"
+        )
         seen += os.read(handle, 1 << 16)
     return seen
 
@@ -94,7 +100,9 @@ def finish(process: multiprocessing.process.BaseProcess, handle: int) -> bytes:
     return seen
 
 
-def test_terminal_shows_the_run_and_is_given_back_at_the_end(run: Run, terminal: tuple[int, int]) -> None:
+def test_terminal_shows_the_run_and_is_given_back_at_the_end(
+    run: Run, terminal: tuple[int, int]
+) -> None:
     ours, theirs = terminal
     run.tick()
     process = run.start(theirs)

@@ -31,10 +31,17 @@ def held(duration_s: float | None = 120.0) -> ConsoleModel:
 
 
 def drawn(
-    model: ConsoleModel, now_s: float = 75.0, width: int = 80, height: int = 24, foot: str = "", help_: bool = False
+    model: ConsoleModel,
+    now_s: float = 75.0,
+    width: int = 80,
+    height: int = 24,
+    foot: str = "",
+    help_: bool = False,
 ) -> list[str]:
     console = Console(width=width, height=height, record=True, file=io.StringIO())
-    console.print(ConsolePage(model.view(now_s), CONFIG, "logs/20261121T031200Z-demo", foot, help_=help_))
+    console.print(
+        ConsolePage(model.view(now_s), CONFIG, "logs/20261121T031200Z-demo", foot, help_=help_)
+    )
     return console.export_text().rstrip("\n").splitlines()
 
 
@@ -68,12 +75,29 @@ def everything_wrong() -> ConsoleModel:
     model = held()
     model.take_event(event(75.0, "fault", **FAULT))
     model.take_event(
-        event(75.0, "shape", state="suspended", reason="no fresh estimate for 15 s: the last trim is held")
+        event(
+            75.0,
+            "shape",
+            state="suspended",
+            reason="no fresh estimate for 15 s: the last trim is held",
+        )
     )
-    model.take_shape(shape(70.0, verdict="rejected", reason="tracking lost: the film moved by 5 mrad"))
-    model.take_event(event(75.0, "recorder_error", what="recording", message="events.jsonl: No space left " * 20))
-    row = replace(HOLDING, state=State.FAULT, shape_state=ShapeState.SUSPENDED, safe_level=SafeLevel.VENT, fault=30.0)
-    model.take_row(replace(row, mono_s=75.0, tick=3e6, missed_ticks=12.0, vent_fraction=1.0, leak_um_per_s=0.1))
+    model.take_shape(
+        shape(70.0, verdict="rejected", reason="tracking lost: the film moved by 5 mrad")
+    )
+    model.take_event(
+        event(75.0, "recorder_error", what="recording", message="events.jsonl: No space left " * 20)
+    )
+    row = replace(
+        HOLDING,
+        state=State.FAULT,
+        shape_state=ShapeState.SUSPENDED,
+        safe_level=SafeLevel.VENT,
+        fault=30.0,
+    )
+    model.take_row(
+        replace(row, mono_s=75.0, tick=3e6, missed_ticks=12.0, vent_fraction=1.0, leak_um_per_s=0.1)
+    )
     return model
 
 
@@ -88,8 +112,16 @@ def test_it_fits(width: int, wrong: bool) -> None:
 @pytest.mark.parametrize(("width", "height"), [(60, 15), (70, 18), (80, 24), (132, 43), (250, 70)])
 @pytest.mark.parametrize("wrong", [False, True])
 @pytest.mark.parametrize("help_", [False, True])
-def test_every_terminal_is_used_and_none_overflows(width: int, height: int, wrong: bool, help_: bool) -> None:
-    page = drawn(everything_wrong() if wrong else held(), width=width, height=height, foot="h hold", help_=help_)
+def test_every_terminal_is_used_and_none_overflows(
+    width: int, height: int, wrong: bool, help_: bool
+) -> None:
+    page = drawn(
+        everything_wrong() if wrong else held(),
+        width=width,
+        height=height,
+        foot="h hold",
+        help_=help_,
+    )
     assert len(page) <= height
     assert all(len(row) == width for row in page)
     assert page[-2][2:].startswith("h hold")  # the last line inside
@@ -107,7 +139,9 @@ def test_a_wide_terminal_shows_a_longer_trend() -> None:
     for row in rows(150.0):
         model.take_row(row)
     page = drawn(model, now_s=150.0, width=160)
-    upper, lower = (next(row for row in page if f"{sign}1 µm" in row or f"{sign}2 µm" in row) for sign in "+-")
+    upper, lower = (
+        next(row for row in page if f"{sign}1 µm" in row or f"{sign}2 µm" in row) for sign in "+-"
+    )
     both = [a != " " or b != " " for a, b in zip(upper[12:-2], lower[12:-2], strict=True)]
     assert sum(both) > 140
 
@@ -115,8 +149,12 @@ def test_a_wide_terminal_shows_a_longer_trend() -> None:
 def test_a_large_terminal_lists_the_last_events_with_those_who_caused_them() -> None:
     model = held()
     for k in range(70):
-        model.take_event(event(70.0, "command", command="setpoint", who="unix:ann", why=f"step {k}"))
-    model.take_event(event(70.0, "command", command="hold", who="unix:tom", why="", refused="not now"))
+        model.take_event(
+            event(70.0, "command", command="setpoint", who="unix:ann", why=f"step {k}")
+        )
+    model.take_event(
+        event(70.0, "command", command="hold", who="unix:tom", why="", refused="not now")
+    )
     model.take_event(event(70.0, "why", why="only the headline says this"))
     page = "\n".join(drawn(model, width=100, height=40))
     assert "03:12:00  Command setpoint by unix:ann: step 69" in page
@@ -128,14 +166,21 @@ def test_a_large_terminal_lists_the_last_events_with_those_who_caused_them() -> 
 def test_who_waits_for_a_person_says_how_to_go_on() -> None:
     model = ConsoleModel(CONFIG, ctl="membrane-ctrl ctl --socket x/control.sock", keys=True)
     model.take_row(replace(HOLDING, state=State.STANDBY))
-    assert any("go on: `membrane-ctrl ctl --socket x/control.sock hold` or key h" in row for row in drawn(model, 0.0))
-    model.take_event(event(0.0, "command", command="latched", who="command line", why="", text="over_pressure"))
+    assert any(
+        "go on: `membrane-ctrl ctl --socket x/control.sock hold` or key h" in row
+        for row in drawn(model, 0.0)
+    )
+    model.take_event(
+        event(0.0, "command", command="latched", who="command line", why="", text="over_pressure")
+    )
     view = model.view(0.0)
     assert view.go_on == "go on: `membrane-ctrl ctl --socket x/control.sock ack`"
     assert line(view).endswith(view.go_on)
     model.take_row(HOLDING)
     assert model.view(0.0).go_on == ""
-    model.take_event(event(0.0, "why", why="held up by ann: the pump keeps its mean flow", code="paused"))
+    model.take_event(
+        event(0.0, "why", why="held up by ann: the pump keeps its mean flow", code="paused")
+    )
     assert model.view(0.0).paused
     assert model.view(0.0).go_on.endswith("resume` or key p")
 
@@ -156,7 +201,9 @@ def test_each_lock_is_shown_first_with_text_author_time_and_word_until_it_is_rem
     page = " ".join(" ".join(drawn(model, 0.0)).replace("│", " ").split())
     for author, word in (("unix:ann", "bofak"), ("page:bob", "gumil")):
         assert f'LOCKED "hands inside" by {author} (s), 2026-01-02, word {word}' in page
-        assert f'LOCKED "hands inside" by {author} (s), 2026-01-02, word {word}' in line(model.view(0.0))
+        assert f'LOCKED "hands inside" by {author} (s), 2026-01-02, word {word}' in line(
+            model.view(0.0)
+        )
     assert model.view(0.0).go_on == "go on: ask unix:ann, then `ctl unlock bofak`"
     removed = {"text": "", "author": "", "set_utc": "", "remover": "", "how": "word", "number": 2}
     model.take_event(event(0.0, "unlock", word="bofak", **removed))
@@ -169,13 +216,18 @@ def test_each_lock_is_shown_first_with_text_author_time_and_word_until_it_is_rem
 def test_fault_and_its_remedy_are_seen() -> None:
     page = " ".join(" ".join(drawn(everything_wrong())).replace("│", " ").split())
     assert "pump is off and the vent is open: link lost" in page
-    assert "link lost: the link to the pump board is down (link down); check cable, power and address" in page
+    assert (
+        "link lost: the link to the pump board is down (link down); check cable, power and address"
+        in page
+    )
     assert "12 of 3000012 ticks missed" in page
 
 
 def test_trouble_with_the_recording_is_seen_until_it_is_over() -> None:
     model = held()
-    model.take_event(event(75.0, "disk_low", what="disk", message="less than 500 MB free; delete old runs"))
+    model.take_event(
+        event(75.0, "disk_low", what="disk", message="less than 500 MB free; delete old runs")
+    )
     low = "Disk almost full: less than 500 MB free; delete old runs"
     assert any(f"notice {low}" in " ".join(row.split()) for row in drawn(model))
     assert line(model.view(75.0)).count(low) == 1
@@ -187,7 +239,9 @@ def test_trouble_with_the_recording_is_seen_until_it_is_over() -> None:
 def test_of_many_notices_the_first_are_shown() -> None:
     model = held()
     for nth in range(5):
-        model.take_event(event(75.0, "recorder_error", what=f"file {nth}", message=f"file {nth} failed"))
+        model.take_event(
+            event(75.0, "recorder_error", what=f"file {nth}", message=f"file {nth} failed")
+        )
     shown = [" ".join(row.split()) for row in drawn(model) if "notice" in row]
     assert len(shown) == 4
     assert "Not recorded: file 0 failed" in shown[0]
@@ -202,7 +256,15 @@ def test_before_the_first_tick_and_with_nothing_known() -> None:
     assert any("waiting for the first tick" in row for row in drawn(ConsoleModel(CONFIG)))
     model = ConsoleModel(CONFIG)
     model.take_row(
-        replace(NOTHING, mono_s=0.0, tick=1.0, missed_ticks=0.0, state=0.0, shape_state=0.0, safe_level=0.0)
+        replace(
+            NOTHING,
+            mono_s=0.0,
+            tick=1.0,
+            missed_ticks=0.0,
+            state=0.0,
+            shape_state=0.0,
+            safe_level=0.0,
+        )
     )
     assert not any("nan" in row for row in drawn(model))
     assert "nan" not in line(model.view(0.0))
@@ -210,7 +272,14 @@ def test_before_the_first_tick_and_with_nothing_known() -> None:
 
 def test_plain_line_has_the_second_in_it() -> None:
     said = line(held().view(75.0))
-    for words in ("75.0 s  hold", "error", "pump  29 %", "leak 1.240 µm/s", "shape tracking ok 1 s", "45 s left"):
+    for words in (
+        "75.0 s  hold",
+        "error",
+        "pump  29 %",
+        "leak 1.240 µm/s",
+        "shape tracking ok 1 s",
+        "45 s left",
+    ):
         assert words in said
     assert "\n" not in said
     assert "no tick for 10.0 s" in line(held().view(84.98))
@@ -219,10 +288,14 @@ def test_plain_line_has_the_second_in_it() -> None:
 
 def test_plain_events() -> None:
     assert event_line(event(12.345, "fault", **FAULT)) == (
-        "     12.3 s  Fault link_lost: the link to the pump board is down (link down). Do: check cable, power and "
+        "     12.3 s  Fault link_lost: the link to the pump board is down (link down). Do: "
+        "check cable, power and "
         "address; the board's watchdog has stopped the pump. Limit: must be up; safe level pump_off"
     )
-    assert event_line(event(1.0, "state", state="hold", why="settled")) == "      1.0 s  State hold: settled"
+    assert (
+        event_line(event(1.0, "state", state="hold", why="settled"))
+        == "      1.0 s  State hold: settled"
+    )
     assert event_line({"kind": "end", "exit": "done"}) == "        – s  Run ended: done"
     assert event_line({"kind": "end", "exit": 5}) == "        – s  end: exit 5"
     assert event_line(event(1.0, "raw_frames", message="a\n  b")) == "      1.0 s  A b"
@@ -230,9 +303,18 @@ def test_plain_events() -> None:
 
 def test_what_cannot_wait_a_second() -> None:
     kinds = ("fault", "cleared", "state", "link", "child_ended", "end", "command", "start")
-    kinds += ("recorder_error", "disk_low", "recorder_recovered", "interlock_opened", "interlock_closed")
+    kinds += (
+        "recorder_error",
+        "disk_low",
+        "recorder_recovered",
+        "interlock_opened",
+        "interlock_closed",
+    )
     assert all(from_dict({"kind": kind}).notable for kind in kinds)
-    assert not any(from_dict({"kind": kind}).notable for kind in ("why", "shape", "held_by", "pump", "vibrations"))
+    assert not any(
+        from_dict({"kind": kind}).notable
+        for kind in ("why", "shape", "held_by", "pump", "vibrations")
+    )
     assert from_dict({"kind": "acquisition", "state": "retrying"}).notable
     assert not from_dict({"kind": "acquisition", "state": "running"}).notable
 
@@ -245,14 +327,16 @@ def test_bars_stand_and_hang() -> None:
 
 
 @pytest.mark.parametrize(
-    ("largest", "full"), [(0.0, 0.5), (0.4, 0.5), (0.7, 1.0), (1.0, 1.0), (1.1, 2.0), (30.0, 50.0), (51.0, 100.0)]
+    ("largest", "full"),
+    [(0.0, 0.5), (0.4, 0.5), (0.7, 1.0), (1.0, 1.0), (1.1, 2.0), (30.0, 50.0), (51.0, 100.0)],
 )
 def test_full_scale_is_a_round_figure(largest: float, full: float) -> None:
     assert full_scale([math.nan, -largest], 0.5) == pytest.approx(full)
 
 
 @pytest.mark.parametrize(
-    ("fraction", "bar"), [(0.0, "░░░░"), (0.5, "██░░"), (1.0, "████"), (7.0, "████"), (math.nan, "░░░░")]
+    ("fraction", "bar"),
+    [(0.0, "░░░░"), (0.5, "██░░"), (1.0, "████"), (7.0, "████"), (math.nan, "░░░░")],
 )
 def test_level_bar(fraction: float, bar: str) -> None:
     assert level_bar(fraction, 4).plain == bar
@@ -260,7 +344,15 @@ def test_level_bar(fraction: float, bar: str) -> None:
 
 def test_words() -> None:
     spans_s = (0.9, 59.9, 60.0, 3599.0, 3600.0, 90061.0, math.nan)
-    assert [duration(s) for s in spans_s] == ["0 s", "59 s", "1:00", "59:59", "1:00:00", "1 d 01:01:01", "–"]
+    assert [duration(s) for s in spans_s] == [
+        "0 s",
+        "59 s",
+        "1:00",
+        "59:59",
+        "1:00:00",
+        "1 d 01:01:01",
+        "–",
+    ]
     assert number(-0.125, 2, "µm", sign=True) == "-0.12 µm"
     assert number(math.inf, 2, "µm") == "–"
     assert percent(0.254) == "25 %"

@@ -21,7 +21,9 @@ def line(told: str = "", fault: str = "", **changes: float) -> str:
 
 def test_hold_names_what_the_flow_is_made_of_largest_first() -> None:
     assert line() == "pump gives 1.14 µm/s: +1.24 leak, -0.11 feed-forward"
-    assert line(p_um_per_s=-2.0, flow_um_per_s=0.0) == ("pump is at 0: -2.00 error, +1.24 leak, -0.11 feed-forward")
+    assert line(p_um_per_s=-2.0, flow_um_per_s=0.0) == (
+        "pump is at 0: -2.00 error, +1.24 leak, -0.11 feed-forward"
+    )
 
 
 def test_settle_says_so() -> None:
@@ -50,14 +52,24 @@ def test_outside_the_band_says_which_way_and_what_is_done() -> None:
 
 
 def test_a_safe_level_names_its_fault() -> None:
-    assert line(safe_level=SafeLevel.VENT, fault="over pressure") == "pump is off and the vent is open: over pressure"
-    assert line(safe_level=SafeLevel.HOLD_FLOW, told="laser is back soon").endswith("laser is back soon")
+    assert (
+        line(safe_level=SafeLevel.VENT, fault="over pressure")
+        == "pump is off and the vent is open: over pressure"
+    )
+    assert line(safe_level=SafeLevel.HOLD_FLOW, told="laser is back soon").endswith(
+        "laser is back soon"
+    )
     assert line(safe_level=SafeLevel.PUMP_OFF) == "pump is off: unknown fault"
 
 
 VALUE = {"driver": "modbus_map", "link": "tcp://plc", "raw": [0, 1], "value": [0.0, 1.0]}
 NO_VENT = Config.model_validate(
-    {"devices": {r: VALUE | {"address": n} for n, r in enumerate(("displacement", "pump", "gauge_pressure"))}}
+    {
+        "devices": {
+            r: VALUE | {"address": n}
+            for n, r in enumerate(("displacement", "pump", "gauge_pressure"))
+        }
+    }
 )
 WITH_VENT = Config.model_validate(
     {"devices": {**NO_VENT.devices.model_dump(exclude_none=True), "vent": VALUE | {"address": 9}}}  # type: ignore[union-attr]
@@ -65,15 +77,26 @@ WITH_VENT = Config.model_validate(
 
 
 def test_a_bench_without_a_vent_is_never_said_to_have_it_open() -> None:
-    row = replace(HOLDING, safe_level=SafeLevel.VENT, vent_fraction=1.0, vent_readback_fraction=math.nan)
+    row = replace(
+        HOLDING, safe_level=SafeLevel.VENT, vent_fraction=1.0, vent_readback_fraction=math.nan
+    )
     said = why(row, "", "over pressure", NO_VENT)
     assert said == "pump is off; no vent is fitted, the leak lowers the mirror: over pressure"
-    assert why(row, "", "over pressure", WITH_VENT) == "pump is off and the vent is open: over pressure"
+    assert (
+        why(row, "", "over pressure", WITH_VENT)
+        == "pump is off and the vent is open: over pressure"
+    )
 
 
-@pytest.mark.parametrize(("readback", "open_"), [(1.0, True), (0.5, True), (0.49, False), (0.0, False)])
-def test_a_vent_whose_read_back_contradicts_its_command_is_not_said_to_be_open(readback: float, open_: bool) -> None:
-    said = line(safe_level=SafeLevel.VENT, vent_fraction=1.0, vent_readback_fraction=readback, fault="x")
+@pytest.mark.parametrize(
+    ("readback", "open_"), [(1.0, True), (0.5, True), (0.49, False), (0.0, False)]
+)
+def test_a_vent_whose_read_back_contradicts_its_command_is_not_said_to_be_open(
+    readback: float, open_: bool
+) -> None:
+    said = line(
+        safe_level=SafeLevel.VENT, vent_fraction=1.0, vent_readback_fraction=readback, fault="x"
+    )
     assert said.startswith("pump is off and the vent is open") == open_
     if not open_:
         assert f"commanded open, but its read-back is {100 * readback:.0f}" in said
@@ -85,7 +108,9 @@ def test_without_a_reading_the_pump_keeps_its_flow() -> None:
     assert line(state=State.INFLATE, filtered_um=math.nan) == said  # nothing has been filtered yet
 
 
-@pytest.mark.parametrize("state", [State.STANDBY, State.CHECK, State.LOWER, State.FAULT, State.MANUAL, State.TUNE])
+@pytest.mark.parametrize(
+    "state", [State.STANDBY, State.CHECK, State.LOWER, State.FAULT, State.MANUAL, State.TUNE]
+)
 def test_other_states_say_what_the_controller_told_or_what_is_always_true(state: State) -> None:
     assert line(state=state, told="waiting for the gauge") == "waiting for the gauge"
     assert line(state=state).startswith("pump is ")
@@ -94,18 +119,26 @@ def test_other_states_say_what_the_controller_told_or_what_is_always_true(state:
 @pytest.mark.parametrize("state", State)
 @pytest.mark.parametrize("safe_level", SafeLevel)
 def test_there_is_always_a_line(state: State, safe_level: SafeLevel) -> None:
-    empty = replace(TelemetryRow(*[math.nan] * 35), state=state, safe_level=safe_level, flow_um_per_s=0.0)
+    empty = replace(
+        TelemetryRow(*[math.nan] * 35), state=state, safe_level=safe_level, flow_um_per_s=0.0
+    )
     said = why(empty, "", "", CONFIG)
     assert "pump" in said
     assert "nan" not in said
 
 
 def test_the_sensors_that_hold_the_mirror_are_named_with_their_shares() -> None:
-    row = replace(HOLDING, estimate_sigma_um=0.02, optics_share=0.93, laser_innovation=-0.4, optics_innovation=0.1)
-    assert holders(row) == "laser 7 %, optics 93 %"
-    assert holders(replace(row, laser_innovation=math.nan, optics_share=1.0, barometer_innovation=0.0)) == (
-        "optics 100 %, barometer"
+    row = replace(
+        HOLDING,
+        estimate_sigma_um=0.02,
+        optics_share=0.93,
+        laser_innovation=-0.4,
+        optics_innovation=0.1,
     )
+    assert holders(row) == "laser 7 %, optics 93 %"
+    assert holders(
+        replace(row, laser_innovation=math.nan, optics_share=1.0, barometer_innovation=0.0)
+    ) == ("optics 100 %, barometer")
     assert holders(replace(row, laser_innovation=math.nan, optics_innovation=math.nan)) == "nothing"
 
 

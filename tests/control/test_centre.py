@@ -1,4 +1,6 @@
-"""The estimate of the centre: against a batch solution of its own code, in a second world, with bad sensors."""
+"""The estimate of the centre: against a batch solution of its own code, in a second world, with bad
+sensors.
+"""
 
 from __future__ import annotations
 
@@ -27,7 +29,8 @@ SAG_UM = 37_100.0
 LASER, OPTICS, BAROMETER = Sensor.LASER, Sensor.OPTICS, Sensor.BAROMETER
 
 
-# Against a batch solution: all states of all ticks as one Gaussian, conditioned on all readings at their true times.
+# Against a batch solution: all states of all ticks as one Gaussian, conditioned on all readings at
+# their true times.
 
 
 @dataclass(frozen=True)
@@ -40,7 +43,9 @@ class Reading:
 
 
 def _model() -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Transition, noise of a step, first covariance of gas, leak, pressure, air, gas temperature, mount, stand."""
+    """Transition, noise of a step, first covariance of gas, leak, pressure, air, gas temperature,
+    mount, stand.
+    """
     step = np.eye(7)
     step[0, 1] = -DT_S
     follow = 1 - math.exp(-DT_S / LOOP.gas_follows_air_s)
@@ -60,7 +65,9 @@ def _model() -> tuple[np.ndarray, np.ndarray, np.ndarray]:
 
 
 def _batch(ticks: int, readings: list[Reading], wanted: np.ndarray) -> tuple[float, float]:
-    """Mean and standard deviation of `wanted` states of the last tick, given the readings; the first mean is 0."""
+    """Mean and standard deviation of `wanted` states of the last tick, given the readings; the
+    first mean is 0.
+    """
     step, noise, first = _model()
     size = 7 * (ticks + 1)
     whole, last = np.zeros((size, size)), first
@@ -100,7 +107,9 @@ def fixed_noises(monkeypatch: pytest.MonkeyPatch) -> None:
 @pytest.mark.usefixtures("fixed_noises")
 @pytest.mark.parametrize("late_ticks", [0, 3, 40], ids=lambda n: f"{n} ticks late")
 def test_it_is_the_best_linear_estimate_of_all_readings_at_their_own_times(late_ticks: int) -> None:
-    """Frames taken every four ticks, some between two ticks, arrive later than what the other sensors said since."""
+    """Frames taken every four ticks, some between two ticks, arrive later than what the other
+    sensors said since.
+    """
     rng, ticks = np.random.default_rng(late_ticks), 64
     filtered = CentreFilter(CONFIG, LOOP)
     filtered.start(0.0, FLOW, 0.0)
@@ -110,8 +119,12 @@ def test_it_is_the_best_linear_estimate_of_all_readings_at_their_own_times(late_
     noises = rng.standard_normal((ticks + 1, 4)) * (1.0, 0.05, 0.002, 0.05)
     for k in range(1, ticks + 1):
         laser, pressure, air, frame = noises[k]
-        readings.append(Reading(((k, np.eye(7)[2]),), pressure - noises[1, 1], CONFIG.barometer_noise_pa**2))
-        readings.append(Reading(((k, np.eye(7)[3]),), air - noises[1, 2], CONFIG.thermometer_noise_k**2))
+        readings.append(
+            Reading(((k, np.eye(7)[2]),), pressure - noises[1, 1], CONFIG.barometer_noise_pa**2)
+        )
+        readings.append(
+            Reading(((k, np.eye(7)[3]),), air - noises[1, 2], CONFIG.thermometer_noise_k**2)
+        )
         taken, sag_um, sag_s = k - late_ticks, math.nan, math.nan
         if taken >= 1 and taken % 4 == 0:
             frames += 1
@@ -124,7 +137,9 @@ def test_it_is_the_best_linear_estimate_of_all_readings_at_their_own_times(late_
             if frames == centre.LOCK_FRAMES:
                 locked_at, until_lock = k, list(readings)
         readings.append(Reading(((k, CENTRE + MOUNT),), laser, CONFIG.laser_noise_um**2))
-        given = CentreReadings(k * DT_S, FLOW, laser, 98_000 + pressure, 21 + air, sag_um, 0.036, sag_s)
+        given = CentreReadings(
+            k * DT_S, FLOW, laser, 98_000 + pressure, 21 + air, sag_um, 0.036, sag_s
+        )
         estimate = filtered.step(given, DT_S)
     stand_um, _ = _batch(locked_at, until_lock, STAND)
     mean, sigma = _batch(ticks, readings, CENTRE - STAND)
@@ -137,10 +152,17 @@ def test_it_is_the_best_linear_estimate_of_all_readings_at_their_own_times(late_
 # In the second world.
 
 
-def _watch(plant: ForeignPlant, seconds: float, laser: Callable[[float], bool] = lambda _: True) -> np.ndarray:
-    """Run the filter beside a plant whose pump balances the leak, roughly; (n, 3) truth, estimate, sigma."""
+def _watch(
+    plant: ForeignPlant, seconds: float, laser: Callable[[float], bool] = lambda _: True
+) -> np.ndarray:
+    """Run the filter beside a plant whose pump balances the leak, roughly; (n, 3) truth, estimate,
+    sigma.
+    """
     loop = LoopConfig(
-        barometer_gain_um_per_pa=-0.36, temperature_gain_um_per_k=124.0, gas_follows_air_s=0.0, setpoint_um=0.0
+        barometer_gain_um_per_pa=-0.36,
+        temperature_gain_um_per_k=124.0,
+        gas_follows_air_s=0.0,
+        setpoint_um=0.0,
     )
     filtered = CentreFilter(EstimatorConfig(pump_delay_s=0.1, pump_lag_s=0.1), loop)
     rng, frames, rows = np.random.default_rng(5), deque[tuple[float, float]](), []
@@ -204,7 +226,9 @@ def _still(
     alter: Callable[[float, CentreReadings], CentreReadings] = lambda _, given: given,
     filtered: CentreFilter | None = None,
 ) -> list[CentreEstimate]:
-    """A mirror that stands still at 0, seen by everything; `alter` changes the readings of a time."""
+    """A mirror that stands still at 0, seen by everything;
+    `alter` changes the readings of a time.
+    """
     rng = np.random.default_rng(1)
     if filtered is None:
         filtered = CentreFilter(CONFIG, LOOP)
@@ -220,29 +244,39 @@ def _still(
 
 
 def _centres(estimates: list[CentreEstimate], from_s: float) -> np.ndarray:
-    """The centre from a time on, against its mean before 6 s: the figure at lock is the one to hold."""
+    """The centre from a time on, against its mean before 6 s: the figure at lock is the one to
+    hold.
+    """
     um = np.array([estimate.um - estimate.mount_um for estimate in estimates])
     return um[round(from_s / DT_S) :] - um[round(3.0 / DT_S) : round(6.0 / DT_S)].mean()
 
 
 def _changed(given: CentreReadings, **added: float) -> CentreReadings:
     values = {name: getattr(given, name) + by for name, by in added.items()}
-    return CentreReadings(**{name: values.get(name, getattr(given, name)) for name in CentreReadings.__slots__})
+    return CentreReadings(
+        **{name: values.get(name, getattr(given, name)) for name in CentreReadings.__slots__}
+    )
 
 
-@pytest.mark.parametrize("name", ["laser_um", "sag_um", "ambient_pressure_pa", "air_temperature_c", "sag_sigma_um"])
+@pytest.mark.parametrize(
+    "name", ["laser_um", "sag_um", "ambient_pressure_pa", "air_temperature_c", "sag_sigma_um"]
+)
 def test_single_bad_readings_have_no_effect(name: str) -> None:
     bad = [20.0, 1e300, math.inf, -math.inf, math.nan]
 
     def alter(now_s: float, given: CentreReadings) -> CentreReadings:
         tick = round(now_s / DT_S)
-        return _changed(given, **{name: bad[tick // 10 % 5]}) if now_s > 6 and tick % 10 < 2 else given
+        return (
+            _changed(given, **{name: bad[tick // 10 % 5]}) if now_s > 6 and tick % 10 < 2 else given
+        )
 
     assert np.abs(_centres(_still(8.0, alter), 6.0)).max() < 0.15
 
 
 def test_a_knocked_laser_is_the_mount_s_doing_if_the_optics_see_nothing() -> None:
-    estimates = _still(10.0, lambda now_s, given: _changed(given, laser_um=12.0 if now_s > 6 else 0.0))
+    estimates = _still(
+        10.0, lambda now_s, given: _changed(given, laser_um=12.0 if now_s > 6 else 0.0)
+    )
     assert np.abs(_centres(estimates, 6.0)).max() < 0.15
     before_um = estimates[round(5.9 / DT_S)].mount_um  # what was uncertain at lock is the mount's
     assert estimates[-1].mount_um - before_um == pytest.approx(12.0, abs=0.5)
@@ -265,30 +299,41 @@ def test_a_film_that_moves_is_followed_within_a_few_frames(um: float) -> None:
 def test_a_door_that_the_barometer_sees_is_followed_at_once() -> None:
     by_um = 20 * LOOP.barometer_gain_um_per_pa
     estimates = _still(
-        7.0, lambda now_s, given: _moved(_changed(given, ambient_pressure_pa=20.0 if now_s > 6 else 0.0), by_um)
+        7.0,
+        lambda now_s, given: _moved(
+            _changed(given, ambient_pressure_pa=20.0 if now_s > 6 else 0.0), by_um
+        ),
     )
     assert _centres(estimates, 6.08) == pytest.approx(by_um, abs=1.5)
     assert _centres(estimates, 6.3) == pytest.approx(by_um, abs=0.25)
 
 
 def test_a_false_door_is_undone() -> None:
-    estimates = _still(8.0, lambda now_s, given: _changed(given, ambient_pressure_pa=20.0 if now_s > 6 else 0.0))
+    estimates = _still(
+        8.0, lambda now_s, given: _changed(given, ambient_pressure_pa=20.0 if now_s > 6 else 0.0)
+    )
     assert np.abs(_centres(estimates, 6.3)).max() < 0.25
 
 
 def test_a_jump_of_the_optics_is_undone_by_the_laser() -> None:
-    estimates = _still(12.0, lambda _, given: _changed(given, sag_um=8.0 if given.sag_time_s > 6 else 0.0))
+    estimates = _still(
+        12.0, lambda _, given: _changed(given, sag_um=8.0 if given.sag_time_s > 6 else 0.0)
+    )
     assert np.abs(_centres(estimates, 11.0)).max() < 0.5
 
 
 def test_a_drifting_mount_does_not_move_the_centre() -> None:
-    """It is followed, and neither taken for noise nor left behind: the laser may soon have to hold alone."""
+    """It is followed, and neither taken for noise nor left behind: the laser may soon have to hold
+    alone.
+    """
     drifting = lambda now_s, given: _changed(given, laser_um=now_s * 2.0 / 60)  # noqa: E731
     filtered = CentreFilter(CONFIG, LOOP)
     filtered.start(0.0, FLOW, 0.0)
     estimates = _still(120.0, drifting, filtered)
     assert np.abs(_centres(estimates, 5.0)).max() < 0.12
-    assert estimates[-1].mount_um - estimates[round(5.0 / DT_S)].mount_um == pytest.approx(115 * 2 / 60, abs=0.6)
+    assert estimates[-1].mount_um - estimates[round(5.0 / DT_S)].mount_um == pytest.approx(
+        115 * 2 / 60, abs=0.6
+    )
     assert filtered.memory.noises[LASER].factor == pytest.approx(1.0, abs=0.15)
 
 
@@ -309,8 +354,14 @@ def test_each_sensor_alone_and_none() -> None:
     nothing = {"laser_um": math.nan, "sag_um": math.nan}
     lost = _still(20.0, lambda now_s, given: _changed(given, **(nothing if now_s > 8 else {})))
     assert lost[-1].sigma_um > 5 * lost[350].sigma_um  # it says that it does not know
-    assert [lost[-1].sensors[sensor].fresh for sensor in (LASER, OPTICS, BAROMETER)] == [False, False, True]
-    blind = _still(20.0, lambda now_s, given: _changed(given, laser_um=math.nan if now_s > 8 else 0.0))
+    assert [lost[-1].sensors[sensor].fresh for sensor in (LASER, OPTICS, BAROMETER)] == [
+        False,
+        False,
+        True,
+    ]
+    blind = _still(
+        20.0, lambda now_s, given: _changed(given, laser_um=math.nan if now_s > 8 else 0.0)
+    )
     assert blind[-1].sensors[OPTICS].share > 0.99
     assert blind[-1].sigma_um < 0.05
     no_camera = _still(8.0, lambda _, given: _changed(given, sag_um=math.nan))
@@ -330,7 +381,12 @@ def test_random_rubbish_never_makes_it_infinite() -> None:
         return CentreReadings(**values)
 
     for estimate in _still(20.0, alter):
-        assert all(map(math.isfinite, (estimate.um, estimate.sigma_um, estimate.ahead_um, estimate.drift_um_per_s)))
+        assert all(
+            map(
+                math.isfinite,
+                (estimate.um, estimate.sigma_um, estimate.ahead_um, estimate.drift_um_per_s),
+            )
+        )
 
 
 def test_relock_takes_a_new_zero_without_moving_the_centre() -> None:
@@ -338,7 +394,9 @@ def test_relock_takes_a_new_zero_without_moving_the_centre() -> None:
     filtered.start(0.0, FLOW, 0.0)
     before = _still(6.0, filtered=filtered)
     filtered.relock()
-    after = _still(6.0, lambda _, given: _changed(given, now_s=6.0, sag_time_s=6.0, sag_um=500.0), filtered)
+    after = _still(
+        6.0, lambda _, given: _changed(given, now_s=6.0, sag_time_s=6.0, sag_um=500.0), filtered
+    )
     centres = [estimate.um - estimate.mount_um for estimate in (before[-1], *after)]
     assert np.ptp(centres) < 0.2
 
@@ -347,22 +405,30 @@ def test_relock_takes_a_new_zero_without_moving_the_centre() -> None:
 
 
 def test_a_loop_of_few_ticks_a_second_does_not_swing() -> None:
-    """A tick of 0.25 s is four times the loop's own time: what it removes in one must not exceed the error."""
+    """A tick of 0.25 s is four times the loop's own time: what it removes in one must not exceed
+    the error.
+    """
     loop = LoopConfig(rate_hz=4.0)
-    held = hold(Sensors(optics=Optics(rate_hz=4.0)), TwinConfig(start_error_um=0.0), 60.0, loop=loop)
+    held = hold(
+        Sensors(optics=Optics(rate_hz=4.0)), TwinConfig(start_error_um=0.0), 60.0, loop=loop
+    )
     assert held.after(30.0).std() < 0.1
 
 
 def test_a_slow_pump_is_not_driven_from_limit_to_limit() -> None:
     """A micrometre asks for no more flow of a slow pump than of a quick one."""
-    quick, slow = (InnerLoop(LOOP, PumpConfig(), EstimatorConfig(pump_lag_s=lag_s)) for lag_s in (0.15, 0.6))
+    quick, slow = (
+        InnerLoop(LOOP, PumpConfig(), EstimatorConfig(pump_lag_s=lag_s)) for lag_s in (0.15, 0.6)
+    )
     assert slow._error_gain_per_s < quick._error_gain_per_s < 30.0
 
 
 # Gas in transit.
 
 
-@pytest.mark.parametrize(("delay_s", "lag_s"), [(0.08, 0.15), (0.0, 0.1), (0.05, 0.0), (0.013, 0.3)])
+@pytest.mark.parametrize(
+    ("delay_s", "lag_s"), [(0.08, 0.15), (0.0, 0.1), (0.05, 0.0), (0.013, 0.3)]
+)
 def test_transit_is_a_dead_time_and_a_lag(delay_s: float, lag_s: float) -> None:
     """Against a simulation in steps of 1 ms; what is under way arrives, to the last bit."""
     flows = np.random.default_rng(2).uniform(0, 5, 20)
@@ -390,7 +456,9 @@ def test_transit_is_a_dead_time_and_a_lag(delay_s: float, lag_s: float) -> None:
 def _follow(
     reading: ReadingNoise, level: LearnedFactor, noise: float, walk: float, steps: int = 12_000
 ) -> list[float]:
-    """Follow a walk seen with noise, both told as 1 a step, with what is learned; the last 5,000 error to sigma."""
+    """Follow a walk seen with noise, both told as 1 a step, with what is learned; the last 5,000
+    error to sigma.
+    """
     rng = np.random.default_rng(4)
     true = estimate = 0.0
     p, errors = 1.0, []
@@ -406,7 +474,9 @@ def _follow(
     return errors[-5000:]
 
 
-@pytest.mark.parametrize(("noise", "walk"), [(1.0, 1.0), (0.3, 0.3), (3.0, 0.3), (1.0, 5.0), (2.0, 0.1)])
+@pytest.mark.parametrize(
+    ("noise", "walk"), [(1.0, 1.0), (0.3, 0.3), (3.0, 0.3), (1.0, 5.0), (2.0, 0.1)]
+)
 def test_noise_and_walk_are_learned(noise: float, walk: float) -> None:
     reading, level = ReadingNoise.of_reading(stated=False), configured_walk()
     errors = _follow(reading, level, noise, walk)

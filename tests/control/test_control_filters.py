@@ -13,7 +13,9 @@ LAG_S = 0.2
 
 def test_smoothing_composes_over_steps() -> None:
     """Two steps equal one step of their sum."""
-    assert (1 - smoothing(0.3, 2.0)) * (1 - smoothing(0.5, 2.0)) == pytest.approx(1 - smoothing(0.8, 2.0))
+    assert (1 - smoothing(0.3, 2.0)) * (1 - smoothing(0.5, 2.0)) == pytest.approx(
+        1 - smoothing(0.8, 2.0)
+    )
 
 
 def test_no_lag_passes_through() -> None:

@@ -15,7 +15,9 @@ DT_S = 0.02
 
 def answered(loop: LoopConfig, pressure_pa: np.ndarray, air_c: np.ndarray) -> np.ndarray:
     feedforward = FeedForward(loop)
-    return np.array([feedforward.update(p, t, DT_S) for p, t in zip(pressure_pa, air_c, strict=True)])
+    return np.array(
+        [feedforward.update(p, t, DT_S) for p, t in zip(pressure_pa, air_c, strict=True)]
+    )
 
 
 def test_pressure_step_is_made_good() -> None:
@@ -59,7 +61,9 @@ def test_sensor_that_comes_and_goes_is_no_bump(lost: str) -> None:
 @pytest.mark.parametrize("air_said_c", [85.0, -127.0, 1e308])
 @pytest.mark.parametrize("pressure_said_pa", [0.0, 110_000.0, 1e308])
 @pytest.mark.parametrize("until", [201, 400])
-def test_a_sensor_that_fails_to_a_value_moves_nothing(air_said_c: float, pressure_said_pa: float, until: int) -> None:
+def test_a_sensor_that_fails_to_a_value_moves_nothing(
+    air_said_c: float, pressure_said_pa: float, until: int
+) -> None:
     """For one tick or for long, there and back again."""
     pressure_pa, air_c = np.full(600, 101_325.0), np.full(600, 20.0)
     pressure_pa[200:until], air_c[200:until] = pressure_said_pa, air_said_c
@@ -71,14 +75,20 @@ def test_switching_at_run_time_is_no_bump() -> None:
     flows = []
     for barometer in (True, False, True):
         feedforward.set_gains(LoopConfig(feedforward_barometer=barometer))
-        flows += [feedforward.update(101_325.0 + 0.1 * next(ramp), math.nan, DT_S) for _ in range(200)]
+        flows += [
+            feedforward.update(101_325.0 + 0.1 * next(ramp), math.nan, DT_S) for _ in range(200)
+        ]
     assert np.abs(np.diff(flows)).max() < 0.358 * 5.0 * DT_S / 0.2 * 1.01
     assert flows[399] == pytest.approx(0.0, abs=1e-6)
     assert flows[599] == pytest.approx(0.358 * 5.0, rel=1e-3)
 
 
-@pytest.mark.parametrize(("pressure_pa", "air_c"), [(1013.25, 20.0), (101_325.0, 293.15), (14.7, math.nan)])
-def test_a_weather_sensor_in_another_unit_moves_nothing_and_is_named(pressure_pa: float, air_c: float) -> None:
+@pytest.mark.parametrize(
+    ("pressure_pa", "air_c"), [(1013.25, 20.0), (101_325.0, 293.15), (14.7, math.nan)]
+)
+def test_a_weather_sensor_in_another_unit_moves_nothing_and_is_named(
+    pressure_pa: float, air_c: float
+) -> None:
     wave = np.sin(np.arange(200) / 10)
     wrong_pressure = weather_fault(pressure_pa, 20.0) != ""
     pressure = pressure_pa + (wave if wrong_pressure else 0.0 * wave)
@@ -87,6 +97,8 @@ def test_a_weather_sensor_in_another_unit_moves_nothing_and_is_named(pressure_pa
     assert "check its unit" in weather_fault(pressure_pa, air_c)
 
 
-@pytest.mark.parametrize(("pressure_pa", "air_c"), [(101_325.0, 20.0), (54_000.0, -5.0), (math.nan, math.nan)])
+@pytest.mark.parametrize(
+    ("pressure_pa", "air_c"), [(101_325.0, 20.0), (54_000.0, -5.0), (math.nan, math.nan)]
+)
 def test_weather_of_places_where_people_work_is_believed(pressure_pa: float, air_c: float) -> None:
     assert weather_fault(pressure_pa, air_c) == ""

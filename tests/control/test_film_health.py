@@ -44,7 +44,9 @@ def test_a_seam_that_opens_is_told_days_before_the_pump_gives_up() -> None:
 
 def test_a_tight_mirror_and_one_that_yields_are_told_once() -> None:
     assert [w.name for _, w in days(lambda h: 0.2, creeping, 3)] == ["too_tight"]
-    assert [w.name for _, w in days(lambda h: 1.24, lambda h: 600.0 * (1 - 0.02 * h / 24), 3)] == ["creep"]
+    assert [w.name for _, w in days(lambda h: 1.24, lambda h: 600.0 * (1 - 0.02 * h / 24), 3)] == [
+        "creep"
+    ]
 
 
 def test_a_warning_comes_again_only_after_better_times() -> None:

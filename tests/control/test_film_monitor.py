@@ -1,4 +1,6 @@
-"""Laser, gauge and gas: disagreement is reported in a stated time; weather, ramps, drift and another film are not."""
+"""Laser, gauge and gas: disagreement is reported in a stated time; weather, ramps, drift and
+another film are not.
+"""
 
 from __future__ import annotations
 
@@ -13,7 +15,8 @@ from membrane_ctrl.control.film import CONTRADICTED_MOST, FilmMonitor, LeakGrowt
 
 RATE_HZ = 10.0
 SAG_UM, PRESSURE_PA = 37_100.0, 600.0
-# time -> true motion of the film and the laser's error, µm; the gauge's error, Pa; the shape loop's trim, µm
+# time -> true motion of the film and the laser's error, µm; the gauge's error, Pa; the shape loop's
+# trim, µm
 Story = Callable[[float], tuple[float, float, float, float]]
 Law = Callable[[float], float]
 
@@ -44,7 +47,9 @@ def told(
         film_um, laser_um, gauge_pa, trim_um = story(time_s)
         true_pa = PRESSURE_PA * law(1 + film_um / SAG_UM)
         noise = rng.standard_normal(2)
-        said = monitor.step(1 / rate_hz, film_um + laser_um + noise[0], trim_um, true_pa + gauge_pa + 0.5 * noise[1])
+        said = monitor.step(
+            1 / rate_hz, film_um + laser_um + noise[0], trim_um, true_pa + gauge_pa + 0.5 * noise[1]
+        )
         if said:
             return said, time_s
     return "", math.nan
@@ -89,7 +94,9 @@ def test_a_gauge_that_drifts_or_sees_nothing_of_a_way_is_found() -> None:
 def test_slow_drift_of_the_laser_is_noticed_and_then_stopped_at_a_stated_distance(
     drift_um_per_s: float, noticed_um: float, stopped_um: float
 ) -> None:
-    """The loop holds the reading, so the film goes the other way; slower than the climate only days show it."""
+    """The loop holds the reading, so the film goes the other way; slower than the climate only days
+    show it.
+    """
     rng = np.random.default_rng(1)
     monitor = FilmMonitor(LimitsConfig(), MirrorConfig())
     off_um, noticed_at_um = 0.0, math.nan
@@ -107,7 +114,9 @@ def test_slow_drift_of_the_laser_is_noticed_and_then_stopped_at_a_stated_distanc
 
 
 def _climate_gauge_pa(time_s: float, phase: float) -> float:
-    """Gauge of a film held at its place for days: +-10 % relative humidity, +-2 K of film and gauge zero."""
+    """Gauge of a film held at its place for days: +-10 % relative humidity, +-2 K of film and gauge
+    zero.
+    """
     day = math.sin(2 * math.pi * time_s / 86_400.0 + phase)
     film_um = (235.0 + 114.0) * day  # by which the film is longer, at constant pressure
     return PRESSURE_PA * hencky(1 - film_um / SAG_UM) - 2.0 * day
@@ -133,7 +142,10 @@ def test_drift_that_the_camera_has_taken_out_is_no_lie(sign: float) -> None:
 
 
 def test_a_camera_that_drifts_moves_film_and_laser_alike() -> None:
-    assert told(lambda t: (min(t / 15, 200.0), 0.0, 0.0, min(t / 15, 200.0)), 4000.0, rate_hz=2.0)[0] == ""
+    assert (
+        told(lambda t: (min(t / 15, 200.0), 0.0, 0.0, min(t / 15, 200.0)), 4000.0, rate_hz=2.0)[0]
+        == ""
+    )
 
 
 def test_a_laser_that_shows_twice_the_way_is_found_on_it() -> None:
@@ -151,7 +163,10 @@ def test_a_long_way_is_no_lie_whatever_the_film(law: Law, speed_um_per_s: float)
 @pytest.mark.parametrize("law", [hencky, tense])
 def test_a_way_there_and_back_is_no_lie(law: Law) -> None:
     # the reference is a mean over the motion: with a curved law it is no point of the film's curve
-    assert told(lambda t: (2000.0 - abs(20.0 * t % 4000.0 - 2000.0), 0.0, 0.0, 0.0), 1000.0, law)[0] == ""
+    assert (
+        told(lambda t: (2000.0 - abs(20.0 * t % 4000.0 - 2000.0), 0.0, 0.0, 0.0), 1000.0, law)[0]
+        == ""
+    )
 
 
 def test_a_fill_from_flat_is_no_lie() -> None:
@@ -169,7 +184,12 @@ def test_a_film_of_another_thickness_is_no_wrong_unit(by: float) -> None:
 
 @pytest.mark.parametrize("rate_hz", [1.0, 10.0, 50.0])
 def test_noise_is_no_lie_at_any_rate(rate_hz: float) -> None:
-    assert told(lambda t: (8 * math.sin(t / 30), 0.0, 0.0, 0.0), 20_000.0 / rate_hz, rate_hz=rate_hz)[0] == ""
+    assert (
+        told(lambda t: (8 * math.sin(t / 30), 0.0, 0.0, 0.0), 20_000.0 / rate_hz, rate_hz=rate_hz)[
+            0
+        ]
+        == ""
+    )
 
 
 @pytest.mark.parametrize("by", [10.0, 0.1, 1000.0, 0.001, -1.0])
@@ -193,13 +213,18 @@ def test_a_gap_of_the_laser_during_which_the_film_goes_is_no_lie() -> None:
 
 
 def grown(
-    leak: Callable[[float], float], most: float, duration_s: float, flow: Callable[[float], float] | None = None
+    leak: Callable[[float], float],
+    most: float,
+    duration_s: float,
+    flow: Callable[[float], float] | None = None,
 ) -> float:
     """When it is said."""
     growth = LeakGrowth()
     for second in range(round(duration_s)):
         leak_um_per_s = leak(float(second))
-        if growth.step(leak_um_per_s, leak_um_per_s if flow is None else flow(float(second)), most, 1.0):
+        if growth.step(
+            leak_um_per_s, leak_um_per_s if flow is None else flow(float(second)), most, 1.0
+        ):
             return float(second)
     return math.nan
 
@@ -248,7 +273,9 @@ def test_a_thermometer_that_lies_takes_no_gas_and_a_room_that_cools_takes_what_i
 
 def test_what_it_used_to_take_is_no_matter_of_a_gust() -> None:
     # the pump gives little while the hold begins, and afterwards no more than the leak
-    assert math.isnan(grown(lambda t: 1.24, CONTRADICTED_MOST, 3600, lambda t: 0.3 if t < 100 else 1.24))
+    assert math.isnan(
+        grown(lambda t: 1.24, CONTRADICTED_MOST, 3600, lambda t: 0.3 if t < 100 else 1.24)
+    )
 
 
 def test_a_thermometer_that_has_lied_does_not_make_the_usual_look_like_an_excess() -> None:

@@ -63,7 +63,9 @@ def test_ramp_feeds_its_speed_forward() -> None:
     assert out.feedforward_um_per_s > 2.0
 
 
-@pytest.mark.parametrize(("displacement_um", "saturated"), [(50.0, True), (-50.0, True), (0.1, False), (-0.1, False)])
+@pytest.mark.parametrize(
+    ("displacement_um", "saturated"), [(50.0, True), (-50.0, True), (0.1, False), (-0.1, False)]
+)
 def test_saturation_is_told(displacement_um: float, saturated: bool) -> None:
     inner, _ = settled()
     for _ in range(50):
@@ -103,13 +105,17 @@ def test_ramp_down_works_without_a_reading() -> None:
 
 
 @given(st.floats(0.5, 5.0), st.floats(-500, 500), st.floats(-50, 50), st.floats(-0.3, 0.3))
-def test_manual_to_automatic_is_bumpless(flow: float, displacement: float, trim: float, slope: float) -> None:
+def test_manual_to_automatic_is_bumpless(
+    flow: float, displacement: float, trim: float, slope: float
+) -> None:
     """In moving air too; the setpoint then starts where the mirror is."""
     inner, _ = settled(displacement_um=displacement)
     for k in range(100):
         reading = LoopInput(0.0, trim, displacement, 101_325.0 + slope * k * DT_S, 20.0)
         out = inner.follow(reading, flow, DT_S)
-    there = LoopInput(out.filtered_um - trim, trim, displacement, 101_325.0 + slope * 100 * DT_S, 20.0)
+    there = LoopInput(
+        out.filtered_um - trim, trim, displacement, 101_325.0 + slope * 100 * DT_S, 20.0
+    )
     assert inner.step(there, DT_S).flow_wanted_um_per_s == pytest.approx(flow, abs=1e-3)
 
 
@@ -136,20 +142,26 @@ def test_gain_change_is_bumpless_off_the_setpoint() -> None:
     inner, _ = settled()
     for _ in range(20):
         before = inner.step(given_at(0.3, 0.0), DT_S)
-    inner.set_gains(LOOP.model_copy(update={"kp_per_s": 1.2, "ti_s": 3.0, "td_s": 0.2, "setpoint_weight": 0.5}))
+    inner.set_gains(
+        LOOP.model_copy(update={"kp_per_s": 1.2, "ti_s": 3.0, "td_s": 0.2, "setpoint_weight": 0.5})
+    )
     after = inner.step(given_at(0.3, 0.0), DT_S)
     assert after.flow_wanted_um_per_s == pytest.approx(before.flow_wanted_um_per_s, abs=0.05)
 
 
 def test_new_limits_are_obeyed_at_once() -> None:
     inner, _ = settled(flow=3.0)
-    inner.set_gains(LOOP.model_copy(update={"flow_max_um_per_s": 2.0, "flow_rate_limit_um_per_s2": 1000.0}))
+    inner.set_gains(
+        LOOP.model_copy(update={"flow_max_um_per_s": 2.0, "flow_rate_limit_um_per_s2": 1000.0})
+    )
     out = inner.step(given_at(0.0), DT_S)
     assert out.flow_um_per_s <= 2.0 + 1e-12
     assert out.i_um_per_s <= 2.0
 
 
-@pytest.mark.parametrize("loop", [LOOP.model_copy(update={"setpoint_weight": b}) for b in (0.0, 0.5, 1.0)])
+@pytest.mark.parametrize(
+    "loop", [LOOP.model_copy(update={"setpoint_weight": b}) for b in (0.0, 0.5, 1.0)]
+)
 def test_large_standing_displacement_needs_no_integrator(loop: LoopConfig) -> None:
     """The zero of the laser is arbitrary: far from it nothing is different."""
     _, out = settled(loop, displacement_um=-1900.0)
@@ -160,8 +172,14 @@ def test_large_standing_displacement_needs_no_integrator(loop: LoopConfig) -> No
 readings = st.one_of(st.floats(-3000, 3000), st.just(math.nan))
 pressures = st.one_of(st.floats(80_000, 110_000), st.just(math.nan))
 temperatures = st.one_of(st.floats(-20, 60), st.just(math.nan))
-inputs = st.builds(LoopInput, st.floats(-2000, 500), st.floats(-100, 100), readings, pressures, temperatures)
-calls = st.tuples(st.sampled_from(["step", "step", "step", "stale", "follow", "start"]), inputs, st.floats(1e-3, 1.0))
+inputs = st.builds(
+    LoopInput, st.floats(-2000, 500), st.floats(-100, 100), readings, pressures, temperatures
+)
+calls = st.tuples(
+    st.sampled_from(["step", "step", "step", "stale", "follow", "start"]),
+    inputs,
+    st.floats(1e-3, 1.0),
+)
 
 
 @settings(max_examples=60)
@@ -191,4 +209,7 @@ def test_flow_changes_no_faster_than_told(run: list[tuple[LoopInput, float]]) ->
     for reading, dt_s in run:
         before = inner._limiter.flow_um_per_s
         inner.step(reading, dt_s)
-        assert abs(inner._limiter.flow_um_per_s - before) <= LOOP.flow_rate_limit_um_per_s2 * dt_s + 1e-9
+        assert (
+            abs(inner._limiter.flow_um_per_s - before)
+            <= LOOP.flow_rate_limit_um_per_s2 * dt_s + 1e-9
+        )

@@ -11,12 +11,17 @@ from membrane_ctrl.sim.plant import Plant
 
 def true_centre_um(steps_s: np.ndarray) -> np.ndarray:
     """Hold the twin at the given times between ticks (multiples of the twin's 5 ms)."""
-    plant, inner = Plant(TwinConfig(start_error_um=-5.0), PumpConfig()), InnerLoop(LoopConfig(), PumpConfig())
+    plant, inner = (
+        Plant(TwinConfig(start_error_um=-5.0), PumpConfig()),
+        InnerLoop(LoopConfig(), PumpConfig()),
+    )
     inner.start(plant.sample().displacement_um, plant.truth().leak_um_per_s)
     centre_um, dt_s = [], 0.02
     for next_s in steps_s:
         sample = plant.sample()
-        given = LoopInput(0.0, 0.0, sample.displacement_um, sample.ambient_pressure_pa, sample.air_temperature_c)
+        given = LoopInput(
+            0.0, 0.0, sample.displacement_um, sample.ambient_pressure_pa, sample.air_temperature_c
+        )
         plant.actuate(inner.step(given, dt_s).pump_fraction, 0.0)
         plant.advance(next_s)
         dt_s = next_s

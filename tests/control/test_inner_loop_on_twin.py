@@ -47,7 +47,9 @@ def test_doubled_leak_stays_in_the_band() -> None:
 
 @pytest.mark.parametrize("change_pa", [20.0, -20.0])
 def test_door(change_pa: float) -> None:
-    """7 µm at once, which nothing can prevent; then back as fast as pump or leak allow, without wind-up."""
+    """7 µm at once, which nothing can prevent; then back as fast as pump or leak allow, without
+    wind-up.
+    """
     figures = answer(ALL, AmbientChange(60.0, change_pa), SEEDS, 2.0)
     assert 6.5 < figures["worst_peak_um"] < 8.0
     assert figures["back_s"] < 8.0
@@ -61,7 +63,10 @@ def test_ten_seconds_without_a_reading() -> None:
 
 def test_setpoint_change_down_is_as_fast_as_the_leak() -> None:
     held = hold(
-        LoopConfig(), TwinConfig(start_error_um=0.0), 70.0, target_um=lambda time_s: 0.0 if time_s < 20 else -20.0
+        LoopConfig(),
+        TwinConfig(start_error_um=0.0),
+        70.0,
+        target_um=lambda time_s: 0.0 if time_s < 20 else -20.0,
     )
     assert np.min(held.true_um) > -21.5
     assert np.abs(held.after(60.0) + 20.0).max() < 1.0
@@ -117,5 +122,8 @@ def test_pump_it_was_not_told_of(true_pump: PumpConfig) -> None:
 @pytest.mark.campaign
 def test_benchmark_has_every_figure() -> None:
     figures = run(seeds=1, duration_s=20.0)
-    assert figures["steady"]["typical"][ALL]["std_um"] < figures["steady"]["typical"]["laser"]["std_um"]
+    assert (
+        figures["steady"]["typical"][ALL]["std_um"]
+        < figures["steady"]["typical"]["laser"]["std_um"]
+    )
     assert figures["door +20 Pa"]["laser"]["peak_um"] > figures["leak doubled"]["laser"]["peak_um"]

@@ -13,8 +13,12 @@ from membrane_ctrl.control.filters import LowPass
 DT_S = 0.02
 
 
-def run(estimate: LeakEstimate, leak: float, seconds: float, flow: float = 1.0, weather: float = 0.0) -> None:
-    """A mirror that moves by the balance of flow, leak and weather (µm/s), read with the laser's filtered noise."""
+def run(
+    estimate: LeakEstimate, leak: float, seconds: float, flow: float = 1.0, weather: float = 0.0
+) -> None:
+    """A mirror that moves by the balance of flow, leak and weather (µm/s), read with the laser's
+    filtered noise.
+    """
     estimate.pause()  # the centre of each run starts at 0
     rng, centre_um = np.random.default_rng(3), 0.0
     for _ in range(round(seconds / DT_S)):

@@ -1,4 +1,6 @@
-"""Margins of the linear loop, with its dead times exact: the sampled loop as it runs, at every frequency."""
+"""Margins of the linear loop, with its dead times exact: the sampled loop as it runs, at every
+frequency.
+"""
 
 from __future__ import annotations
 
@@ -18,7 +20,9 @@ def test_default_tuning_is_robust(rate_hz: float) -> None:
 
 
 def excursion(loop: LoopConfig, last_s: float = 60.0) -> float:
-    """Largest error in the last quarter after a kick of 1 µm, stepped in time: checks the frequency domain."""
+    """Largest error in the last quarter after a kick of 1 µm, stepped in time: checks the frequency
+    domain.
+    """
     dt_s = 1 / loop.rate_hz
     fine = max(1, round(dt_s / 0.005))
     h_s = dt_s / fine

@@ -17,7 +17,9 @@ gains = st.builds(PidGains, st.floats(0, 20), st.floats(0.1, 3600), st.floats(0,
 
 
 @given(gains, st.lists(st.tuples(errors, errors, steps), max_size=50))
-def test_integrator_stays_in_the_pumps_range(given_gains: PidGains, run: list[tuple[float, float, float]]) -> None:
+def test_integrator_stays_in_the_pumps_range(
+    given_gains: PidGains, run: list[tuple[float, float, float]]
+) -> None:
     pid = Pid(given_gains, V_MAX)
     for error_um, rate_um_per_s, dt_s in run:
         assert math.isfinite(pid.terms(error_um, rate_um_per_s).sum_um_per_s)
@@ -26,7 +28,9 @@ def test_integrator_stays_in_the_pumps_range(given_gains: PidGains, run: list[tu
 
 
 @given(gains, gains, st.floats(0, V_MAX), st.floats(-0.1, 0.1))
-def test_gain_change_is_bumpless(before: PidGains, after: PidGains, mean: float, error_um: float) -> None:
+def test_gain_change_is_bumpless(
+    before: PidGains, after: PidGains, mean: float, error_um: float
+) -> None:
     pid = Pid(before, V_MAX)
     pid.place(mean)
     wanted = pid.terms(error_um, 0.0).sum_um_per_s
@@ -52,7 +56,9 @@ def test_derivative_brakes_a_rising_measurement() -> None:
 
 @pytest.mark.parametrize("error_um", [100.0, -100.0])
 def test_no_wind_up(error_um: float) -> None:
-    """An hour at the limit is forgotten as fast as ten seconds: the sum leaves the limit when the error does."""
+    """An hour at the limit is forgotten as fast as ten seconds: the sum leaves the limit when the
+    error does.
+    """
     pid = Pid(PidGains(0.61, 6.5, 0.0), V_MAX)
     pid.place(1.24)
     for _ in range(3600):
@@ -63,7 +69,9 @@ def test_no_wind_up(error_um: float) -> None:
 
 
 def test_back_calculation_settles_at_the_limit() -> None:
-    """Pushed up for ever, P + I exceeds the limit by K e: there back-calculation and integral action balance."""
+    """Pushed up for ever, P + I exceeds the limit by K e: there back-calculation and integral
+    action balance.
+    """
     pid = Pid(PidGains(0.61, 6.5, 0.0), V_MAX)
     for _ in range(10_000):
         pid.terms(2.0, 0.0)
@@ -72,7 +80,9 @@ def test_back_calculation_settles_at_the_limit() -> None:
 
 
 @pytest.mark.parametrize(("error_um", "limit_um_per_s"), [(10.0, V_MAX), (-10.0, 0.0)])
-def test_back_calculation_goes_to_the_limit_with_the_integral_time(error_um: float, limit_um_per_s: float) -> None:
+def test_back_calculation_goes_to_the_limit_with_the_integral_time(
+    error_um: float, limit_um_per_s: float
+) -> None:
     """Beyond the range dI/dt = (limit - I) / Ti, however large the error: v - u takes away K e."""
     pid = Pid(PidGains(0.61, 6.5, 0.0), V_MAX)
     pid.place(2.0)

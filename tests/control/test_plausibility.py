@@ -1,4 +1,6 @@
-"""The third sensor finds the wrong one, within a stated time and from a stated size; no false accusation."""
+"""The third sensor finds the wrong one, within a stated time and from a stated size; no false
+accusation.
+"""
 
 from __future__ import annotations
 
@@ -14,17 +16,33 @@ from membrane_ctrl.model.zernike_terms import ZERNIKE_TERMS
 
 RATE_HZ = 10.0
 SAG_UM, PRESSURE_PA = 37_100.0, 600.0
-Story = Callable[[float], tuple[float, float, float]]  # time -> true sag change, laser's error, camera's error; µm
+Story = Callable[
+    [float], tuple[float, float, float]
+]  # time -> true sag change, laser's error, camera's error; µm
 
 
 def estimate(time_s: float, sag_um: float, verdict: str = "ok") -> ShapeEstimate:
     nothing = np.zeros(ZERNIKE_TERMS)
     return ShapeEstimate(
-        time_s, "fringes", nothing, 0.0, np.eye(ZERNIKE_TERMS), sag_um, 1.0, 0.0, 1.0, 1.0, 80.0, 0.0, verdict  # type: ignore[arg-type]
-    )  # fmt: skip
+        time_s,
+        "fringes",
+        nothing,
+        0.0,
+        np.eye(ZERNIKE_TERMS),
+        sag_um,
+        1.0,
+        0.0,
+        1.0,
+        1.0,
+        80.0,
+        0.0,
+        verdict,  # type: ignore[arg-type]
+    )
 
 
-def told(story: Story, duration_s: float = 400.0, seed: int = 1, gauge_drift_pa_per_s: float = 0.0) -> list[Liar]:
+def told(
+    story: Story, duration_s: float = 400.0, seed: int = 1, gauge_drift_pa_per_s: float = 0.0
+) -> list[Liar]:
     """The verdict on every tick of a story; noise 1 µm, 1 µm and 0.5 Pa."""
     rng = np.random.default_rng(seed)
     judge, said = PlausibilityCheck(10.0, 37_100.0), []
@@ -32,8 +50,14 @@ def told(story: Story, duration_s: float = 400.0, seed: int = 1, gauge_drift_pa_
         time_s = tick / RATE_HZ
         true_um, laser_um, camera_um = story(time_s)
         noise = rng.standard_normal(3)
-        gauge_pa = PRESSURE_PA * (1 + 3 * true_um / SAG_UM) + 0.5 * noise[0] + gauge_drift_pa_per_s * time_s
-        shape = estimate(time_s, SAG_UM + true_um + camera_um + noise[1]) if tick % 20 == 0 else None
+        gauge_pa = (
+            PRESSURE_PA * (1 + 3 * true_um / SAG_UM)
+            + 0.5 * noise[0]
+            + gauge_drift_pa_per_s * time_s
+        )
+        shape = (
+            estimate(time_s, SAG_UM + true_um + camera_um + noise[1]) if tick % 20 == 0 else None
+        )
         said.append(judge.step(1 / RATE_HZ, true_um + laser_um + noise[2], gauge_pa, shape))
     return said
 
@@ -74,7 +98,9 @@ def test_a_lie_that_ends_is_forgiven() -> None:
 
 
 def test_slow_drifts_are_no_lies() -> None:
-    assert set(told(lambda t: (0.0, 2.0 * t / 60, 0.0), 900.0)) == {Liar.NOBODY}  # the laser's mount
+    assert set(told(lambda t: (0.0, 2.0 * t / 60, 0.0), 900.0)) == {
+        Liar.NOBODY
+    }  # the laser's mount
     assert set(told(lambda t: (0.0, 0.0, 0.0), 900.0, gauge_drift_pa_per_s=0.01)) == {Liar.NOBODY}
 
 
@@ -89,7 +115,10 @@ def test_without_a_camera_or_a_gauge_nothing_is_said() -> None:
     judge = PlausibilityCheck(10.0, 37_100.0)
     for tick in range(2000):
         assert judge.step(0.1, 500.0 * (tick > 1000), 600.0, None) == Liar.NOBODY
-        assert judge.step(0.1, 500.0 * (tick > 1000), math.nan, estimate(tick * 0.1, SAG_UM)) == Liar.NOBODY
+        assert (
+            judge.step(0.1, 500.0 * (tick > 1000), math.nan, estimate(tick * 0.1, SAG_UM))
+            == Liar.NOBODY
+        )
         judge.reset()
 
 
@@ -101,7 +130,9 @@ def test_a_rejected_shape_is_no_evidence() -> None:
         assert judge.step(0.1, 0.0, 600.0, bad or good) == Liar.NOBODY
 
 
-def shown(judge: PlausibilityCheck, time_s: float, laser_um: float, camera_um: float, gauge_um: float) -> Liar:
+def shown(
+    judge: PlausibilityCheck, time_s: float, laser_um: float, camera_um: float, gauge_um: float
+) -> Liar:
     """One tick of a second without noise."""
     gauge_pa = PRESSURE_PA * (1 + 3 * gauge_um / SAG_UM)
     return judge.step(1.0, laser_um, gauge_pa, estimate(time_s, SAG_UM + camera_um))

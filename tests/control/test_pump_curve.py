@@ -1,4 +1,6 @@
-"""Command for a flow: the straight line against the twin's pump, measured curves against the second world's."""
+"""Command for a flow: the straight line against the twin's pump, measured curves against the second
+world's.
+"""
 
 from __future__ import annotations
 
@@ -98,7 +100,10 @@ def measured(shape: str, play: float = 0.0) -> PumpConfig:
 def test_a_measured_curve_is_scipys_cubic() -> None:
     """Unevenly spaced, with a flat part in the middle and at the end."""
     commands, flows = (0.1, 0.2, 0.5, 0.6, 0.8, 1.0), (0.0, 2.0, 2.0, 5.0, 6.0, 6.0)
-    curve, reference = PumpCurve(PumpConfig(curve_fraction=commands, curve_um_per_s=flows)), PchipInterpolator
+    curve, reference = (
+        PumpCurve(PumpConfig(curve_fraction=commands, curve_um_per_s=flows)),
+        PchipInterpolator,
+    )
     at = np.linspace(0.1, 1.0, 500)
     off = [curve.flow(d) for d in at] - reference(commands, flows)(at)
     assert np.abs(off).max() < 0.005 * flows[-1]
@@ -107,7 +112,9 @@ def test_a_measured_curve_is_scipys_cubic() -> None:
 @pytest.mark.parametrize("shape", ["quadratic", "root", "s-shaped", "dead zone"])
 def test_a_curved_pump_gives_what_was_wanted(shape: str) -> None:
     curve, pump = PumpCurve(measured(shape)), ForeignPump(shape, 7.0)
-    for flow in np.linspace(2.3 if shape == "root" else 0.3, 6.9, 40):  # a root is steep at its foot
+    for flow in np.linspace(
+        2.3 if shape == "root" else 0.3, 6.9, 40
+    ):  # a root is steep at its foot
         command = curve.command(flow, DT_S)
         assert curve.flow(command) == pytest.approx(flow, abs=1e-6)
         assert pump.settled(command) == pytest.approx(flow, abs=0.03 * 7.0)
@@ -115,8 +122,13 @@ def test_a_curved_pump_gives_what_was_wanted(shape: str) -> None:
 
 @given(st.lists(st.floats(0.2, 6.5), min_size=2, max_size=30))
 def test_a_pump_with_play_gives_what_was_wanted(flows: list[float]) -> None:
-    """Up and down in any order; one branch alone would be wrong by 0.04 of the command, 0.3 µm/s."""
-    curve, pump = PumpCurve(measured("hysteretic", play=0.04)), ForeignPump("hysteretic", 7.0, play=0.04, lag_s=1e-3)
+    """Up and down in any order; one branch alone would be wrong by 0.04 of the command,
+    0.3 µm/s.
+    """
+    curve, pump = (
+        PumpCurve(measured("hysteretic", play=0.04)),
+        ForeignPump("hysteretic", 7.0, play=0.04, lag_s=1e-3),
+    )
     for flow in flows:
         command = curve.command(flow, DT_S)
         for _ in range(40):
@@ -127,7 +139,9 @@ def test_a_pump_with_play_gives_what_was_wanted(flows: list[float]) -> None:
 
 @pytest.mark.parametrize("wanted", [0.0, 0.3])
 def test_a_falling_branch_that_ends_in_the_middle_can_be_stopped(wanted: float) -> None:
-    """The pump ran on at its first command, where the branch gives 1.3 µm/s: the mirror rose by 62 µm."""
+    """The pump ran on at its first command, where the branch gives 1.3 µm/s: the mirror rose by 62
+    µm.
+    """
     table = {"curve_fraction": (0.086, 0.12, 1.0), "curve_um_per_s": (0.001, 1.8, 6.3)}
     pump = {"start_fraction": 0.0, "stall_fraction": 0.0, "curve_falling_um_per_s": (1.3, 2.0, 6.3)}
     curve = PumpCurve(PumpConfig.model_validate(table | pump))
@@ -150,8 +164,14 @@ NAN = float("nan")
 @pytest.mark.parametrize(
     ("table", "says"),
     [
-        ({"curve_fraction": (0.1, 0.3, 0.2), "curve_um_per_s": (0, 1, 2)}, "curve_fraction must rise"),
-        ({"curve_fraction": (0.1, 0.2, 0.3), "curve_um_per_s": (0, 2, 1)}, "curve_um_per_s must not fall"),
+        (
+            {"curve_fraction": (0.1, 0.3, 0.2), "curve_um_per_s": (0, 1, 2)},
+            "curve_fraction must rise",
+        ),
+        (
+            {"curve_fraction": (0.1, 0.2, 0.3), "curve_um_per_s": (0, 2, 1)},
+            "curve_um_per_s must not fall",
+        ),
         ({"curve_fraction": (0.1,), "curve_um_per_s": (1,)}, "at least two commands"),
         ({"curve_fraction": (0.1, 0.2)}, "2 commands, curve_um_per_s 0 flows"),
         ({"curve_um_per_s": (1, 2)}, "0 commands"),
@@ -159,9 +179,16 @@ NAN = float("nan")
         ({"curve_fraction": (0.1, 1.2), "curve_um_per_s": (1, 2)}, "curve_fraction"),
         ({"curve_fraction": (0.1, 0.2), "curve_um_per_s": (1, "x")}, "curve_um_per_s"),
         ({"curve_fraction": (0.1, 0.2), "curve_um_per_s": (0, 0)}, "flow_full_um_per_s"),
-        ({"curve_fraction": (0.1, 0.2), "curve_um_per_s": (1, 2), "flow_full_um_per_s": 3}, "last flow of the curve"),
         (
-            {"curve_fraction": (0.1, 0.2), "curve_um_per_s": (1, 2), "curve_falling_um_per_s": (0.5, 2)},
+            {"curve_fraction": (0.1, 0.2), "curve_um_per_s": (1, 2), "flow_full_um_per_s": 3},
+            "last flow of the curve",
+        ),
+        (
+            {
+                "curve_fraction": (0.1, 0.2),
+                "curve_um_per_s": (1, 2),
+                "curve_falling_um_per_s": (0.5, 2),
+            },
             "curve_falling_um_per_s must not be below",
         ),
     ],

@@ -1,4 +1,6 @@
-"""The pump's drift, on a bench of its own: a loop, a film and a weather that share no code with the product."""
+"""The pump's drift, on a bench of its own: a loop, a film and a weather that share no code with the
+product.
+"""
 
 from __future__ import annotations
 
@@ -11,7 +13,13 @@ import pytest
 from membrane_ctrl.config.schema import LoopConfig, PumpConfig
 from membrane_ctrl.control.film_health import PumpHealth
 from membrane_ctrl.control.inner_loop import InnerLoop, LoopInput
-from membrane_ctrl.control.pump_drift import PROBE_RAD_PER_S, SEGMENT_S, SIGMA_FIRST, PumpDrift, PumpScale
+from membrane_ctrl.control.pump_drift import (
+    PROBE_RAD_PER_S,
+    SEGMENT_S,
+    SIGMA_FIRST,
+    PumpDrift,
+    PumpScale,
+)
 
 DT_S = 0.2
 LASER_UM = 0.32  # as 1 µm at 50 Hz
@@ -46,12 +54,17 @@ class Bench:
             reading = centre + LASER_UM * noise[k]
             seen += 0.6 * (reading - seen)
             integral -= 0.5 / 8 * seen * DT_S
-            flow = min(max(integral - 0.5 * seen + drift.flow_um_per_s(self.probe_um), 0.0), 5.3) / drift.correction
+            flow = (
+                min(max(integral - 0.5 * seen + drift.flow_um_per_s(self.probe_um), 0.0), 5.3)
+                / drift.correction
+            )
             drift.step(reading, flow, DT_S)
             tube.append(flow)
             arriving += (1 - math.exp(-DT_S / 0.15)) * (tube.pop(0) - arriving)
             gust = gust * math.exp(-DT_S / 2) + (self.gusts * gusts[k] if blows[k] else 0.0)
-            speed = scale * arriving - 1.24 + gust + self.lift * math.sin(PROBE_RAD_PER_S * k * DT_S)
+            speed = (
+                scale * arriving - 1.24 + gust + self.lift * math.sin(PROBE_RAD_PER_S * k * DT_S)
+            )
             centre += speed * DT_S + self.walk * math.sqrt(DT_S) * walk[k]
         return drift
 
@@ -133,7 +146,9 @@ def test_a_drift_is_told_once_and_so_is_its_end() -> None:
     health = PumpHealth(change_max=0.15)
     told = []
     for scale in (1.0, 0.9, 0.84, 0.84, 0.86, 0.9, 0.95):
-        told += [(warning.bad, warning.message) for warning in health.step(PumpScale(scale, 0.04))[1]]
+        told += [
+            (warning.bad, warning.message) for warning in health.step(PumpScale(scale, 0.04))[1]
+        ]
     assert told == [
         (True, "the pump gives 16 % less than its curve (+- 4 %): check it, then `tune pump`"),
         (False, "no longer so"),
@@ -152,7 +167,10 @@ def commands(probe_um: float, may_probe: bool) -> list[float]:
     loop.may_probe = may_probe
     loop.start(0.0, 1.24)
     noise = np.random.default_rng(3).standard_normal(200).tolist()
-    return [loop.step(LoopInput(0.0, 0.0, reading, math.nan, math.nan), 0.02).pump_fraction for reading in noise]
+    return [
+        loop.step(LoopInput(0.0, 0.0, reading, math.nan, math.nan), 0.02).pump_fraction
+        for reading in noise
+    ]
 
 
 def test_the_loop_probes_only_if_it_is_asked_to_and_may() -> None:

@@ -16,20 +16,26 @@ COVARIANCE = 1e-6 * np.eye(ZERNIKE_TERMS)
 @pytest.mark.parametrize("sag_um", [-300.0, -0.1, 0.0, 2.0])
 def test_pure_change_of_sag_is_found(sag_um: float) -> None:
     reference = np.arange(float(ZERNIKE_TERMS))
-    assert sag_change(reference + S * sag_um, reference, COVARIANCE, S).change_um == pytest.approx(sag_um)
+    assert sag_change(reference + S * sag_um, reference, COVARIANCE, S).change_um == pytest.approx(
+        sag_um
+    )
 
 
 def test_piston_and_other_shapes_are_not_sag() -> None:
     other = np.zeros(ZERNIKE_TERMS)
     other[[0, 4, 5, 6, 7]] = 100.0, 3.0, -2.0, 5.0, 1.0
-    assert sag_change(other, np.zeros(ZERNIKE_TERMS), COVARIANCE, S).change_um == pytest.approx(0.0, abs=1e-12)
+    assert sag_change(other, np.zeros(ZERNIKE_TERMS), COVARIANCE, S).change_um == pytest.approx(
+        0.0, abs=1e-12
+    )
 
 
 def test_sigma_is_the_scatter() -> None:
     rng, noise_um = np.random.default_rng(1), 0.1
     covariance = (noise_um**2 - MODEL_FLOOR_UM**2) * np.eye(ZERNIKE_TERMS)
     found = [
-        sag_change(noise_um * rng.standard_normal(ZERNIKE_TERMS), np.zeros(ZERNIKE_TERMS), covariance, S)
+        sag_change(
+            noise_um * rng.standard_normal(ZERNIKE_TERMS), np.zeros(ZERNIKE_TERMS), covariance, S
+        )
         for _ in range(2000)
     ]
     assert np.std([f.change_um for f in found]) == pytest.approx(found[0].sigma_um, rel=0.05)

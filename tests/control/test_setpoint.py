@@ -9,7 +9,9 @@ from membrane_ctrl.control.filters import LowPass
 from membrane_ctrl.control.pid import RAMP_SHARE, SetpointRamp, SetpointWeight
 
 
-def ramped(target_um: float, mean_flow_um_per_s: float, ticks: int, dt_s: float = 0.02) -> np.ndarray:
+def ramped(
+    target_um: float, mean_flow_um_per_s: float, ticks: int, dt_s: float = 0.02
+) -> np.ndarray:
     ramp = SetpointRamp(3.0, 5.3)
     ramp.place(0.0)
     return np.array([ramp.advance(target_um, mean_flow_um_per_s, dt_s) for _ in range(ticks)])
@@ -39,7 +41,9 @@ def test_slow_ticks_do_not_overshoot() -> None:
 
 
 def test_weight_is_that_of_the_textbook() -> None:
-    """PI on the filtered setpoint equals PI with weight b on the setpoint (K = 1, the measurement at 0)."""
+    """PI on the filtered setpoint equals PI with weight b on the setpoint (K = 1, the measurement
+    at 0).
+    """
     weight, ti_s, dt_s = 0.4, 6.5, 0.002
     shaper, textbook_i, ours_i, worst = SetpointWeight(weight, ti_s), 0.0, 0.0, 0.0
     shaper.reset(0.0)

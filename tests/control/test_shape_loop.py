@@ -40,7 +40,9 @@ class Bench:
         self.trims_um: list[float] = []
         self.loop.switch(True, 0.0)
 
-    def run(self, seconds: float, settled: bool = True, shapes: bool = True, **change: Any) -> ShapeOutput:
+    def run(
+        self, seconds: float, settled: bool = True, shapes: bool = True, **change: Any
+    ) -> ShapeOutput:
         """Let time pass; `change` alters the estimates."""
         for _ in range(round(seconds / DT_S)):
             self.now_s += DT_S
@@ -67,18 +69,25 @@ def test_reference_is_taken_first() -> None:
     bench = Bench()
     assert bench.run(1.0).reason.code == ShapeCode.WAITING
     out = bench.run(SHAPES * PERIOD_S - 2.0)
-    assert (out.state, out.reason.text) == (ShapeState.WAITING, f"reference: shape {SHAPES - 1} of {SHAPES}")
+    assert (out.state, out.reason.text) == (
+        ShapeState.WAITING,
+        f"reference: shape {SHAPES - 1} of {SHAPES}",
+    )
     out = bench.run(PERIOD_S)
     assert (out.state, out.reason, out.trim_um) == (ShapeState.TRACKING, NO_REASON, 0.0)
     assert math.isnan(out.sag_change_um)
 
 
 def test_single_frames_make_a_reference_of_as_many_readings() -> None:
-    """Twenty figures a second share the laser's readings: five of them would be a quarter of a second."""
+    """Twenty figures a second share the laser's readings: five of them would be a quarter of a
+    second.
+    """
     bench = Bench()
     for k in range(12 * 20):
         bench.now_s = k / 20
-        out = bench.loop.step(bench.now_s, 0.05, bench.estimate(kind="track", time_s=bench.now_s), 0.0, True)
+        out = bench.loop.step(
+            bench.now_s, 0.05, bench.estimate(kind="track", time_s=bench.now_s), 0.0, True
+        )
         if out.state == ShapeState.TRACKING:
             break
     assert bench.now_s == pytest.approx((TRACKED_SHAPES - 1) * TRACKED_EVERY_S, abs=1.3)
@@ -91,7 +100,9 @@ def test_nothing_is_learnt_before_the_loop_is_settled() -> None:
 
 
 def test_trim_goes_to_the_lasers_drift(tracking: Bench) -> None:
-    """The laser reads 3 µm too much, the camera sees no change: the setpoint must be 3 µm higher."""
+    """The laser reads 3 µm too much, the camera sees no change:
+    the setpoint must be 3 µm higher.
+    """
     tracking.bias_um = 3.0
     out = tracking.run(600.0)
     assert out.trim_um == pytest.approx(3.0, abs=0.01)
@@ -137,7 +148,9 @@ def test_trim_is_bounded_in_range_and_says_so() -> None:
     ],
     ids=lambda value: value if isinstance(value, str) else "",
 )
-def test_suspended_with_a_reason_and_the_trim_held(tracking: Bench, change: dict[str, Any], word: str) -> None:
+def test_suspended_with_a_reason_and_the_trim_held(
+    tracking: Bench, change: dict[str, Any], word: str
+) -> None:
     tracking.bias_um = 2.0
     held_um = tracking.run(600.0).trim_um
     out = tracking.run(2 * PERIOD_S + 0.1, **change)
@@ -151,10 +164,16 @@ def test_suspended_with_a_reason_and_the_trim_held(tracking: Bench, change: dict
 
 def test_agreement_edge(tracking: Bench) -> None:
     limit_um = CONFIG.disagreement_max_um
-    assert tracking.run(PERIOD_S, coeffs_um=SENSITIVITY * (limit_um - 0.01)).state == ShapeState.TRACKING
+    assert (
+        tracking.run(PERIOD_S, coeffs_um=SENSITIVITY * (limit_um - 0.01)).state
+        == ShapeState.TRACKING
+    )
     tracking.loop.lock(tracking.now_s)
     tracking.run(30.0)
-    assert tracking.run(PERIOD_S, coeffs_um=SENSITIVITY * (limit_um + 0.01)).state == ShapeState.SUSPENDED
+    assert (
+        tracking.run(PERIOD_S, coeffs_um=SENSITIVITY * (limit_um + 0.01)).state
+        == ShapeState.SUSPENDED
+    )
 
 
 def test_degraded_shape_is_used(tracking: Bench) -> None:
@@ -164,7 +183,10 @@ def test_degraded_shape_is_used(tracking: Bench) -> None:
 def test_no_shapes_is_noticed(tracking: Bench) -> None:
     assert tracking.run(CONFIG.fresh_s - 1.0, shapes=False).state == ShapeState.TRACKING
     out = tracking.run(5.0, shapes=False)
-    assert (out.state, out.reason) == (ShapeState.SUSPENDED, Reason(ShapeCode.NO_SHAPE, "no shape younger than 15 s"))
+    assert (out.state, out.reason) == (
+        ShapeState.SUSPENDED,
+        Reason(ShapeCode.NO_SHAPE, "no shape younger than 15 s"),
+    )
     assert out.age_s > CONFIG.fresh_s
 
 
@@ -188,7 +210,11 @@ def test_off_holds_the_trim_and_on_goes_on_from_it(tracking: Bench) -> None:
     tracking.loop.switch(False, tracking.now_s)
     tracking.bias_um = 7.0
     out = tracking.run(60.0)
-    assert (out.state, out.reason.code, out.trim_um) == (ShapeState.OFF, ShapeCode.SWITCHED_OFF, held_um)
+    assert (out.state, out.reason.code, out.trim_um) == (
+        ShapeState.OFF,
+        ShapeCode.SWITCHED_OFF,
+        held_um,
+    )
     tracking.loop.switch(True, tracking.now_s)
     out = tracking.run(60.0)
     assert (out.state, out.trim_um) == (ShapeState.TRACKING, pytest.approx(held_um))

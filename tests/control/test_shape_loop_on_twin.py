@@ -1,4 +1,6 @@
-"""Both loops on the twin with a drifting laser, in virtual time; shapes are made from the truth and noise."""
+"""Both loops on the twin with a drifting laser, in virtual time; shapes are made from the truth and
+noise.
+"""
 
 from __future__ import annotations
 

@@ -13,8 +13,12 @@ from typing import Any
 
 GREETING = {"membrane_ctrl": 1, "run": "evil", "you": "unix:x", "role": "tune", "commander": None}
 STATUS: dict[str, Any] = {
-    "state": "hold", "why": "", "row": {"error_um": 0.1}, "fault": None, "notices": [],
-}  # fmt: skip
+    "state": "hold",
+    "why": "",
+    "row": {"error_um": 0.1},
+    "fault": None,
+    "notices": [],
+}
 _HUGE = "9" * 4000
 
 # Raw lines, so that a test may send what a JSON library would not write.
@@ -58,7 +62,9 @@ ANSWERS: dict[str, bytes] = {
     "notices_text": status_line(notices="x"),
     "notices_list": status_line(notices=["x"]),
     "notice_part": status_line(notices=[{"topic": "recorder", "text": "x"}]),
-    "notice_numbers": status_line(notices=[{"topic": "recorder", "subject": 1, "severity": 2, "text": 3}]),
+    "notice_numbers": status_line(
+        notices=[{"topic": "recorder", "subject": 1, "severity": 2, "text": 3}]
+    ),
     "recording_text": status_line(recording_ok="x"),
     "paused_text": status_line(paused="no"),
     "state_list": status_line(state=["hold"]),
@@ -138,13 +144,17 @@ def answering(line: bytes) -> Serve:
         connection.sendall(json.dumps(GREETING).encode() + b"\n")
         for request in connection.makefile("rb"):
             number = json.loads(request)["number"]
-            connection.sendall(line.replace(b'"number": 1,', f'"number": {number},'.encode(), 1) + b"\n")
+            connection.sendall(
+                line.replace(b'"number": 1,', f'"number": {number},'.encode(), 1) + b"\n"
+            )
 
     return serve
 
 
 def streaming(*stream: bytes, pause_s: float = 0.01) -> Serve:
-    """A peer that greets and answers as a hold, then repeats these lines to a client that watches."""
+    """A peer that greets and answers as a hold, then repeats these
+    lines to a client that watches.
+    """
 
     def serve(connection: socket.socket) -> None:
         connection.sendall(json.dumps(GREETING).encode() + b"\n")

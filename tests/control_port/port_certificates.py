@@ -27,7 +27,9 @@ organizationalUnitName = optional
 
 def openssl(folder: Path, *arguments: str) -> None:
     require("openssl")
-    subprocess.run(["openssl", *arguments], cwd=folder, check=True, capture_output=True, timeout=120)
+    subprocess.run(
+        ["openssl", *arguments], cwd=folder, check=True, capture_output=True, timeout=120
+    )
 
 
 @dataclass(frozen=True)
@@ -43,14 +45,40 @@ class Authority:
         (folder / "index.txt").write_text("")
         (folder / "serial").write_text("01\n")
         key = ("-newkey", "ec", "-pkeyopt", "ec_paramgen_curve:P-256", "-nodes")
-        openssl(folder, "req", "-x509", *key, "-keyout", "ca.key", "-out", "ca.pem", "-subj", "/CN=lab", "-days", "2")
+        openssl(
+            folder,
+            "req",
+            "-x509",
+            *key,
+            "-keyout",
+            "ca.key",
+            "-out",
+            "ca.pem",
+            "-subj",
+            "/CN=lab",
+            "-days",
+            "2",
+        )
         return cls(folder)
 
-    def certificate(self, name: str, role: str = "", dates: tuple[str, ...] = ("-days", "1")) -> tuple[Path, Path]:
+    def certificate(
+        self, name: str, role: str = "", dates: tuple[str, ...] = ("-days", "1")
+    ) -> tuple[Path, Path]:
         subject = (f"/OU={role}" if role else "") + f"/CN={name}"
         key = ("-newkey", "ec", "-pkeyopt", "ec_paramgen_curve:P-256", "-nodes")
         names = ("-addext", "subjectAltName=IP:127.0.0.1")
-        openssl(self.folder, "req", *key, "-keyout", f"{name}.key", "-out", f"{name}.csr", "-subj", subject, *names)
+        openssl(
+            self.folder,
+            "req",
+            *key,
+            "-keyout",
+            f"{name}.key",
+            "-out",
+            f"{name}.csr",
+            "-subj",
+            subject,
+            *names,
+        )
         ca = ("-config", "ca.cnf", "-cert", "ca.pem", "-keyfile", "ca.key", "-batch", "-notext")
         openssl(self.folder, "ca", *ca, "-in", f"{name}.csr", "-out", f"{name}.pem", *dates)
         return self.folder / f"{name}.pem", self.folder / f"{name}.key"
@@ -61,10 +89,15 @@ class Authority:
 
 
 def tls_fleet(file: Path, holds: dict[str, tuple[str, str, str]]) -> Path:
-    """A fleet file of holds: address, files of the client's certificate without suffix, and the authority's file."""
-    file.write_text("".join(
-        f'[[holds]]\nname = "{name}"\ntls = "{tls}"\ncertificate_file = "{pair}.pem"\nkey_file = "{pair}.key"\n'
-        f'authority_file = "{authority}"\n'
-        for name, (tls, pair, authority) in holds.items()
-    ))  # fmt: skip
+    """A fleet file of holds: address, files of the client's certificate without suffix, and the
+    authority's file.
+    """
+    file.write_text(
+        "".join(
+            f'[[holds]]\nname = "{name}"\ntls = "{tls}"\ncertificate_file = '
+            f'"{pair}.pem"\nkey_file = "{pair}.key"\n'
+            f'authority_file = "{authority}"\n'
+            for name, (tls, pair, authority) in holds.items()
+        )
+    )
     return file

@@ -24,7 +24,9 @@ from membrane_ctrl.model.events import Event, EventLine
 from membrane_ctrl.model.telemetry import FIELDS, State, TelemetryRow
 
 PATIENCE_S = 10.0
-ROW = replace(TelemetryRow(*(0.0 for _ in FIELDS)), mono_s=12.0, tick=600.0, state=State.HOLD, error_um=0.25)
+ROW = replace(
+    TelemetryRow(*(0.0 for _ in FIELDS)), mono_s=12.0, tick=600.0, state=State.HOLD, error_um=0.25
+)
 
 
 class NamedListener(UnixListener):
@@ -59,7 +61,14 @@ class PortRun:
         others = listeners_for(more, folder, self._stack)
         self.listeners = Listeners(self.listener, others.tls, others.metrics, self.path)
         self.outcomes: dict[int, Future[str]] = {}  # of storing locks, by number of the command
-        hooks = RunHooks(self._ask, self._tell, lambda: self.now_s, lambda: self.loop, PumpConfig, self.outcomes.get)
+        hooks = RunHooks(
+            self._ask,
+            self._tell,
+            lambda: self.now_s,
+            lambda: self.loop,
+            PumpConfig,
+            self.outcomes.get,
+        )
         self.port = Port(port_config, self.listeners, "the-run", hooks)
 
     async def somebody_asked(self) -> None:
@@ -81,7 +90,9 @@ class PortRun:
         answer = (command.number, refusal(command, self.state, self.config))
         self.tick(answers=(answer,))
 
-    def tick(self, events: tuple[Event, ...] = (), answers: tuple[tuple[int, str], ...] = ()) -> None:
+    def tick(
+        self, events: tuple[Event, ...] = (), answers: tuple[tuple[int, str], ...] = ()
+    ) -> None:
         row = replace(ROW, state=self.state)
         self.port.heard(TickOutputs(BenchCommand(0.0, 0.0), row, events, None, answers))
 

@@ -1,4 +1,6 @@
-"""Command belongs to a session, not to its user: a second one of the same user is refused and learns who has it."""
+"""Command belongs to a session, not to its user: a second one of the same user is refused and
+learns who has it.
+"""
 
 from __future__ import annotations
 
@@ -30,7 +32,7 @@ async def call(act: Callable[..., Any], *arguments: Any, **named: Any) -> Any:
     return await asyncio.to_thread(act, *arguments, **named)
 
 
-async def test_a_second_session_of_the_same_user_is_refused_with_the_first_ones_name_process_and_time(
+async def test_a_second_session_of_the_same_user_is_refused_with_the_first_ones_name_process_and_time(  # noqa: E501
     tmp_path: Path,
 ) -> None:
     async with port_run(tmp_path) as run:
@@ -39,11 +41,18 @@ async def test_a_second_session_of_the_same_user_is_refused_with_the_first_ones_
         assert (await call(first.ask, do="claim", text="tune morning"))["ok"]
         refused = (await call(second.ask, do="claim", text="tune again"))["refused"]
         status = (await call(second.status))["status"]
-        for part in ("tune morning", f"process {os.getpid()}", status["command_session"]["id"], "since 20"):
+        for part in (
+            "tune morning",
+            f"process {os.getpid()}",
+            status["command_session"]["id"],
+            "since 20",
+        ):
             assert part in refused
         assert first.greeting["you"] in refused
         assert status["commander"] == first.greeting["you"]
-        assert any("tune morning" in line and str(os.getpid()) in line for line in status_lines(status))
+        assert any(
+            "tune morning" in line and str(os.getpid()) in line for line in status_lines(status)
+        )
         for single in ({"do": "setpoint", "value": 1.0}, {"do": "hold"}, {"do": "pause"}):
             assert "tune morning" in (await call(second.ask, **single))["refused"]
         assert (await call(first.ask, do="setpoint", value=1.0))["ok"], "the first is not disturbed"
@@ -84,7 +93,8 @@ async def test_a_session_that_hangs_up_or_releases_gives_up_command(tmp_path: Pa
 async def test_a_session_whose_process_is_killed_gives_up_command(tmp_path: Path) -> None:
     claims = (
         "import sys, time; from membrane_ctrl.control_port.client import PortClient\n"
-        "hold = PortClient.unix(sys.argv[1], print); print(hold.ask(do='claim', text='doomed')['ok'], flush=True)\n"
+        "hold = PortClient.unix(sys.argv[1], print); print(hold.ask(do='claim', "
+        "text='doomed')['ok'], flush=True)\n"
         "time.sleep(60)"
     )
     async with port_run(tmp_path) as run:
@@ -93,7 +103,9 @@ async def test_a_session_whose_process_is_killed_gives_up_command(tmp_path: Path
         assert doomed.stdout is not None
         assert (await call(doomed.stdout.readline)).strip() == "True"
         second = await call(client_of, run)
-        assert f"process {doomed.pid}" in (await call(second.ask, do="claim", text="next"))["refused"]
+        assert (
+            f"process {doomed.pid}" in (await call(second.ask, do="claim", text="next"))["refused"]
+        )
         doomed.send_signal(signal.SIGKILL)
         await call(doomed.wait)
         doomed.stdout.close()
@@ -103,14 +115,18 @@ async def test_a_session_whose_process_is_killed_gives_up_command(tmp_path: Path
         second.close()
 
 
-async def test_a_deliberate_takeover_reaches_the_first_session_with_its_reason(tmp_path: Path) -> None:
+async def test_a_deliberate_takeover_reaches_the_first_session_with_its_reason(
+    tmp_path: Path,
+) -> None:
     async with port_run(tmp_path) as run:
         notices: list[str] = []
         first, second = await call(client_of, run, notices), await call(client_of, run)
         await call(first.ask, do="claim", text="tune morning")
         await call(first.poll)
         assert not first.command_taken
-        answer = await call(second.ask, do="claim", text="tune noon", take_over=True, why="wrong gas")
+        answer = await call(
+            second.ask, do="claim", text="tune noon", take_over=True, why="wrong gas"
+        )
         assert answer["ok"]
         await call(first.poll)
         assert first.command_taken == notices[0]
@@ -177,7 +193,9 @@ def test_a_single_command_of_another_user_keeps_sessions_out_until_it_lapses() -
     assert commander.begin_session(session, False, 601.0) == ""
     assert commander.holder(1e6) == "unix:bob"
     commander.release("unix:bob", "another")
-    assert commander.holder(1e6) == "unix:bob", "another connection of the same user does not end it"
+    assert commander.holder(1e6) == "unix:bob", (
+        "another connection of the same user does not end it"
+    )
     assert commander.end_session("another") is None
     assert commander.end_session("1a2b") is session
     assert commander.holder(1e6) == ""

@@ -20,9 +20,17 @@ from membrane_ctrl.model.run_events import GeometryInForce, from_dict
 from membrane_ctrl.model.run_status import RunStatus
 from membrane_ctrl.model.telemetry import State
 
-ARGUMENTS = {"setpoint": "-12.5", "manual": "0.5", "mark": "door", "gains": "kp_per_s = 0.5", "shape": "on"}
+ARGUMENTS = {
+    "setpoint": "-12.5",
+    "manual": "0.5",
+    "mark": "door",
+    "gains": "kp_per_s = 0.5",
+    "shape": "on",
+}
 add_actions()
-ACTIONS = [command.name or "" for command in ctl_app.registered_commands if command.name != "fleet"]  # asks several
+ACTIONS = [
+    command.name or "" for command in ctl_app.registered_commands if command.name != "fleet"
+]  # asks several
 Asked = list[dict[str, Any]]
 
 
@@ -36,7 +44,10 @@ def asked(monkeypatch: pytest.MonkeyPatch) -> Asked:
 
 def test_there_is_an_action_for_every_command_but_those_of_sessions() -> None:
     shape = {"shape_on", "shape_off"}
-    assert {*ACTIONS, *shape} == {*TABLE, *SAME_AS, *get_args(protocol.Errand), "shape"} - {"tune", "claim"}
+    assert {*ACTIONS, *shape} == {*TABLE, *SAME_AS, *get_args(protocol.Errand), "shape"} - {
+        "tune",
+        "claim",
+    }
 
 
 @pytest.mark.parametrize("action", ACTIONS)
@@ -110,9 +121,14 @@ def test_gains_from_files(tmp_path: Path, asked: Asked) -> None:
     toml.write_text("[loop]\nkp_per_s = 0.5\nfeedforward_barometer = false\n")
     plain = tmp_path / "gains.json"
     plain.write_text('{"kp_per_s": 0.25}')
-    assert run(["ctl", "gains", str(toml), "--trial", "2m"]) == run(["ctl", "gains", str(plain)]) == 0
+    assert (
+        run(["ctl", "gains", str(toml), "--trial", "2m"]) == run(["ctl", "gains", str(plain)]) == 0
+    )
     first, second = asked
-    assert (first["loop"], first["value"]) == ({"kp_per_s": 0.5, "feedforward_barometer": False}, 120.0)
+    assert (first["loop"], first["value"]) == (
+        {"kp_per_s": 0.5, "feedforward_barometer": False},
+        120.0,
+    )
     assert (second["loop"], "value" in second) == ({"kp_per_s": 0.25}, False)
 
 
@@ -148,12 +164,18 @@ def test_status_for_a_person() -> None:
 
 def test_what_stands_until_it_is_over_is_shown() -> None:
     status = RunStatus()
-    maintenance = {"kind": "maintenance", "name": "calibrate", "message": "calibrate again: too much is left"}
+    maintenance = {
+        "kind": "maintenance",
+        "name": "calibrate",
+        "message": "calibrate again: too much is left",
+    }
     status = status.after_row(ROW).after_event(from_dict(maintenance))
     lines = status_lines({"run": "r", **status_table(status)})
     assert "Maintenance calibrate: calibrate again: too much is left" in lines
     assert any("not in use yet" in line for line in lines)
-    status = status.after_event(from_dict({"kind": "disk_low", "what": "disk", "message": "less than 500 MB free"}))
+    status = status.after_event(
+        from_dict({"kind": "disk_low", "what": "disk", "message": "less than 500 MB free"})
+    )
     lines = status_lines({"run": "r", **status_table(status)})
     assert "Disk almost full: less than 500 MB free" in lines
     status = status.after_event(GeometryInForce("12ab", "g.toml", "2026-01-02", ""))
@@ -163,13 +185,17 @@ def test_what_stands_until_it_is_over_is_shown() -> None:
     assert "  geometry          g.toml, calibrated 2026-01-02 (hash 12ab)" in lines
 
 
-def test_nobody_there_is_one_line_and_exit_code_4(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_nobody_there_is_one_line_and_exit_code_4(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     assert run(["ctl", "status", "--socket", str(tmp_path / "control.sock")]) == 4
     assert "no hold is listening" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize(
-    "arguments", [["--tls", "nowhere"], ["--tls", "bench:7470"], ["--jsn"]], ids=["address", "certificate", "typo"]
+    "arguments",
+    [["--tls", "nowhere"], ["--tls", "bench:7470"], ["--jsn"]],
+    ids=["address", "certificate", "typo"],
 )
 def test_bad_usage_is_exit_code_2(arguments: list[str], capsys: pytest.CaptureFixture[str]) -> None:
     assert run(["ctl", "status", *arguments]) == 2

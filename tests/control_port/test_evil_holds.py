@@ -1,4 +1,6 @@
-"""Clients of a hold survive any peer: one line, exit code 4, bounded memory and time; other holds go on."""
+"""Clients of a hold survive any peer: one line, exit code 4, bounded memory and time; other holds
+go on.
+"""
 
 from __future__ import annotations
 
@@ -40,7 +42,11 @@ def test_a_greeting_that_no_hold_sends_is_one_line(
 @pytest.mark.parametrize("action", ["status", "watch"])
 @pytest.mark.parametrize("line", evil.ANSWERS.values(), ids=evil.ANSWERS)
 def test_an_answer_that_no_hold_sends_is_one_line(
-    action: str, line: bytes, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+    action: str,
+    line: bytes,
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
+    monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     monkeypatch.setattr("membrane_ctrl.control_port.client.ANSWER_S", 2.0)
     monkeypatch.setattr(PortClient, "patience", lambda self, seconds: None)
@@ -74,10 +80,14 @@ def test_the_cause_names_the_field(tmp_path: Path) -> None:
 NOTICE = {"topic": "maintenance", "subject": "leak", "severity": "warning"}
 
 
-def test_texts_of_a_peer_cannot_drive_a_terminal(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_texts_of_a_peer_cannot_drive_a_terminal(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     text = f"\x1b]0;owned\x07\x1b[2J\r\n{BIDI}<img src=x>"
     fault = {"code": 1, "name": text, "cause": text, "remedy": text}
-    line = evil.status_line(why=text, fault=fault, notices=[{**NOTICE, "text": text}], commander=text)
+    line = evil.status_line(
+        why=text, fault=fault, notices=[{**NOTICE, "text": text}], commander=text
+    )
     with evil.peer(tmp_path / "control.sock", evil.answering(line)) as path:
         assert run(["ctl", "status", "--socket", str(path)]) == 0
         with PortClient.unix(path, print) as hold:
@@ -90,7 +100,10 @@ def test_texts_of_a_peer_cannot_drive_a_terminal(tmp_path: Path, capsys: pytest.
 
 def test_fields_of_a_later_version_pass(tmp_path: Path) -> None:
     line = evil.status_line(locks=[{"text": "hands inside", "author": "ann"}], later=1.5)
-    with evil.peer(tmp_path / "control.sock", evil.answering(line)) as path, PortClient.unix(path, print) as hold:
+    with (
+        evil.peer(tmp_path / "control.sock", evil.answering(line)) as path,
+        PortClient.unix(path, print) as hold,
+    ):
         status = hold.ask(do="status")["status"]
     assert status["locks"] == [{"text": "hands inside", "author": "ann"}]
     assert status["later"] == 1.5
@@ -101,7 +114,10 @@ def test_an_endless_line_takes_neither_memory_nor_time(greets: bool, tmp_path: P
     with evil.peer(tmp_path / "control.sock", evil.endless(greets)) as path:
         began_s = time.monotonic()
         done = subprocess.run(
-            [sys.executable, "-c", _STATUS_AND_MEMORY, str(path)], capture_output=True, text=True, check=False
+            [sys.executable, "-c", _STATUS_AND_MEMORY, str(path)],
+            capture_output=True,
+            text=True,
+            check=False,
         )
         took_s = time.monotonic() - began_s
     assert done.returncode == 4, done.stderr
@@ -146,7 +162,10 @@ def test_a_flood_of_valid_messages_is_given_up(tmp_path: Path) -> None:
 
 
 def test_honest_bursts_of_events_pass(tmp_path: Path) -> None:
-    burst = [json.dumps({"event": {"kind": "mark", "text": str(number)}}).encode() for number in range(300)]
+    burst = [
+        json.dumps({"event": {"kind": "mark", "text": str(number)}}).encode()
+        for number in range(300)
+    ]
     with (
         evil.peer(tmp_path / "control.sock", evil.streaming(*burst, pause_s=5.0)) as path,
         PortClient.unix(path, print) as hold,
@@ -181,12 +200,21 @@ def test_feeds_outlive_every_peer_and_leave_others_alone(
     peers = {f"greets_{name}": evil.greeting_with(line) for name, line in evil.GREETINGS.items()}
     peers |= {f"answers_{name}": evil.answering(line) for name, line in evil.ANSWERS.items()}
     peers |= {f"event_{number}": evil.streaming(line) for number, line in enumerate(EVENTS)}
-    peers |= {"endless": evil.endless(True), "endless_greeting": evil.endless(False), "flooding": evil.flooding}
+    peers |= {
+        "endless": evil.endless(True),
+        "endless_greeting": evil.endless(False),
+        "flooding": evil.flooding,
+    }
 
     async def follow() -> None:
         with ExitStack() as stack:
             feeds = {
-                name: HoldFeed(Where(stack.enter_context(evil.peer(tmp_path / f"{name}.sock", serve)), logs=tmp_path))
+                name: HoldFeed(
+                    Where(
+                        stack.enter_context(evil.peer(tmp_path / f"{name}.sock", serve)),
+                        logs=tmp_path,
+                    )
+                )
                 for name, serve in peers.items()
             }
             async with port_run(tmp_path) as honest:
@@ -196,11 +224,16 @@ def test_feeds_outlive_every_peer_and_leave_others_alone(
                 async with asyncio.timeout(30.0):
                     while feeds["honest"].seen.silent:  # noqa: ASYNC110
                         await asyncio.sleep(0.05)
-                await asyncio.sleep(6.0)  # a peer whose messages mean nothing is given up after five
+                await asyncio.sleep(
+                    6.0
+                )  # a peer whose messages mean nothing is given up after five
                 rows = {str(row["hold"]): row for row in fleet_rows(feeds)}
                 assert rows["honest"]["state"] == "hold"
                 assert all(feed._thread.is_alive() for feed in feeds.values())
-                for name in (*(f"greets_{each}" for each in evil.GREETINGS), *(f"answers_{a}" for a in evil.ANSWERS)):
+                for name in (
+                    *(f"greets_{each}" for each in evil.GREETINGS),
+                    *(f"answers_{a}" for a in evil.ANSWERS),
+                ):
                     assert rows[name]["state"] == "no contact", name
                     assert ".sock: " in str(rows[name]["says"]), rows[name]
                 for row in rows.values():
@@ -216,7 +249,9 @@ def test_a_fleet_lists_the_honest_hold_beside_any_peers(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(ctl, "_FLEET_S", 4.0)
-    peers = {f"a-{name.replace('_', '-')}": evil.answering(line) for name, line in evil.ANSWERS.items()}
+    peers = {
+        f"a-{name.replace('_', '-')}": evil.answering(line) for name, line in evil.ANSWERS.items()
+    }
     peers |= {"endless": evil.endless(True), "dribbling": evil.dribbling, "flooding": evil.flooding}
     names = [*peers, "honest"]
     fleet = tmp_path / "fleet.toml"

@@ -48,7 +48,9 @@ def test_an_answer_that_no_hold_sends_ends_the_link(
         {"loop": LoopConfig().model_dump(), "pump": {"flow_full_um_per_s": {}}},
     ],
 )
-def test_settings_that_no_hold_has_end_the_link(settings: dict[str, object], tmp_path: Path) -> None:
+def test_settings_that_no_hold_has_end_the_link(
+    settings: dict[str, object], tmp_path: Path
+) -> None:
     run_folder(tmp_path)
     answer = {"number": 1, "ok": True, "status": evil.STATUS, **settings}
     line = json.dumps(answer).encode()
@@ -60,10 +62,16 @@ def test_settings_that_no_hold_has_end_the_link(settings: dict[str, object], tmp
         pass
 
 
-def test_a_session_command_prints_one_line(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_session_command_prints_one_line(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     run_folder(tmp_path)
     with evil.peer(tmp_path / "control.sock", evil.answering(evil.ANSWERS["status_list"])) as path:
         for words in (["tune", "run", "--yes"], ["calibrate", "--live"]):
             assert run([*words, "--socket", str(path), "--logs", str(tmp_path)]) == 4
-            (said,) = [line for line in capsys.readouterr().err.splitlines() if line.startswith("membrane-ctrl:")]
+            (said,) = [
+                line
+                for line in capsys.readouterr().err.splitlines()
+                if line.startswith("membrane-ctrl:")
+            ]
             assert "not an answer of a hold (status" in said

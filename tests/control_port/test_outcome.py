@@ -14,10 +14,16 @@ from membrane_ctrl.control_port.outcome import Outcome
     [
         ({"ok": True}, "lock: done", True),
         ({"ok": True, "problem": ""}, "lock: done", True),
-        ({"ok": True, "problem": "disk full"}, "lock: not stored, only this run knows: disk full", False),
+        (
+            {"ok": True, "problem": "disk full"},
+            "lock: not stored, only this run knows: disk full",
+            False,
+        ),
         ({"ok": False, "refused": "not now: done"}, "lock refused: not now: done", False),
         ({}, "lock refused: None", False),
     ],
 )
-def test_only_the_hold_decides_whether_it_is_done(answer: dict[str, Any], text: str, done: bool) -> None:
+def test_only_the_hold_decides_whether_it_is_done(
+    answer: dict[str, Any], text: str, done: bool
+) -> None:
     assert Outcome.from_answer("lock", answer) == Outcome("lock", text, done)

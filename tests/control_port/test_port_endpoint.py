@@ -28,7 +28,11 @@ def lab(tmp_path_factory: pytest.TempPathFactory) -> Authority:
 @pytest.fixture(scope="module")
 def config(lab: Authority) -> PortConfig:
     certificate, key = lab.certificate("bench")
-    files = {"certificate_file": str(certificate), "key_file": str(key), "client_ca_file": str(lab.own)}
+    files = {
+        "certificate_file": str(certificate),
+        "key_file": str(key),
+        "client_ca_file": str(lab.own),
+    }
     return PortConfig(tls=TlsConfig(port=0, **files))  # type: ignore[arg-type]
 
 
@@ -42,7 +46,9 @@ async def strangers(run: PortRun, addresses: list[str]) -> AsyncIterator[Crowd]:
     try:
         for address in addresses:
             with contextlib.suppress(ConnectionError):  # refused before it was connected
-                crowd.append(await asyncio.open_connection(*address_of(run), local_addr=(address, 0)))
+                crowd.append(
+                    await asyncio.open_connection(*address_of(run), local_addr=(address, 0))
+                )
             await asyncio.sleep(0)
         yield crowd
     finally:
@@ -58,7 +64,9 @@ async def dropped(crowd: Crowd, at_least: int) -> None:
     try:
         async with asyncio.timeout(10):
             while sum(task.done() for task in reads) < at_least:
-                await asyncio.wait([task for task in reads if not task.done()], return_when=asyncio.FIRST_COMPLETED)
+                await asyncio.wait(
+                    [task for task in reads if not task.done()], return_when=asyncio.FIRST_COMPLETED
+                )
     finally:
         for task in reads:
             task.cancel()
@@ -66,12 +74,20 @@ async def dropped(crowd: Crowd, at_least: int) -> None:
 
 
 @pytest.mark.parametrize(
-    "addresses", [["127.0.0.2"] * 40, [f"127.0.{n}.2" for n in range(40)]], ids=["one address", "forty addresses"]
+    "addresses",
+    [["127.0.0.2"] * 40, [f"127.0.{n}.2" for n in range(40)]],
+    ids=["one address", "forty addresses"],
 )
 async def test_who_does_not_shake_hands_keeps_nobody_out(
-    addresses: list[str], tmp_path: Path, lab: Authority, config: PortConfig, monkeypatch: pytest.MonkeyPatch
+    addresses: list[str],
+    tmp_path: Path,
+    lab: Authority,
+    config: PortConfig,
+    monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    monkeypatch.setattr("membrane_ctrl.control_port.protocol._HANDSHAKE_S", 60.0)  # none of them times out
+    monkeypatch.setattr(
+        "membrane_ctrl.control_port.protocol._HANDSHAKE_S", 60.0
+    )  # none of them times out
     pair = lab.certificate(f"ann{len(set(addresses))}", "operate")
     async with port_run(tmp_path, config) as run, strangers(run, addresses) as crowd:
         greeting = await asyncio.to_thread(greet, run, pair, lab.own)
@@ -86,7 +102,10 @@ async def test_newcomers_of_the_strangers_own_address_get_in_too(
     pair = lab.certificate("bob", "operate")
     async with port_run(tmp_path, config) as run, strangers(run, ["127.0.0.1"] * 8):
         assert (await asyncio.to_thread(greet, run, pair, lab.own))["role"] == "operate"
-        assert any(event["reason"].startswith("did not identify itself") for event in run.of_kind("refused"))
+        assert any(
+            event["reason"].startswith("did not identify itself")
+            for event in run.of_kind("refused")
+        )
 
 
 async def test_who_has_shaken_hands_is_no_stranger_any_more(
@@ -100,7 +119,9 @@ async def test_who_has_shaken_hands_is_no_stranger_any_more(
             with contextlib.ExitStack() as stack:
                 host, port = address_of(run)
                 clients = [
-                    stack.enter_context(PortClient.tls(host, port, client_context(*pair, lab.own), print))
+                    stack.enter_context(
+                        PortClient.tls(host, port, client_context(*pair, lab.own), print)
+                    )
                     for pair in pairs
                 ]
                 return sum(bool(c.ask(do="status")["ok"]) for c in clients)
@@ -121,11 +142,15 @@ async def test_a_flood_of_one_address_is_turned_away_unheard() -> None:
             all_seen.set()
 
     listener = listen_tcp("127.0.0.1", 0, "test")
-    endpoint = Endpoint("tls", listener, welcome, lambda event: None, lambda who, why: refused.append((who, why)))
+    endpoint = Endpoint(
+        "tls", listener, welcome, lambda event: None, lambda who, why: refused.append((who, why))
+    )
     endpoint.open()
     for address in ["127.0.0.3"] * 40 + ["127.0.0.4"]:
         with contextlib.suppress(ConnectionError):
-            _, writer = await asyncio.open_connection(*listener.getsockname(), local_addr=(address, 0))
+            _, writer = await asyncio.open_connection(
+                *listener.getsockname(), local_addr=(address, 0)
+            )
             writer.close()
             await writer.wait_closed()
     await asyncio.wait_for(all_seen.wait(), 10)

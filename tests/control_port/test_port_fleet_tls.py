@@ -1,4 +1,6 @@
-"""A fleet over mutual TLS: each mirror that cannot be asked is one clear line, and the others go on."""
+"""A fleet over mutual TLS: each mirror that cannot be asked is one clear line, and the others go
+on.
+"""
 
 from __future__ import annotations
 
@@ -27,7 +29,7 @@ SAID = {  # what the line of each says, besides its address
     "north": "as it should be",
     "reader": "as it should be",
     "foreign": "check the certificate",
-    "impostor": "the hold's certificate is not trusted: self-signed certificate in certificate chain",
+    "impostor": "the hold's certificate is not trusted: self-signed certificate in certificate chain",  # noqa: E501
     "other-name": "the hold's certificate is not trusted: Hostname mismatch",
     "away": "connection refused",
     "unknown": "",  # the resolver's words
@@ -72,7 +74,10 @@ async def two_holds(lab: Path, folder: Path) -> AsyncIterator[list[PortRun]]:
     async with AsyncExitStack() as stack:
         for name in ("one", "two"):
             (folder / name).mkdir()
-        yield [await stack.enter_async_context(port_run(folder / name, hold_of(lab))) for name in ("one", "two")]
+        yield [
+            await stack.enter_async_context(port_run(folder / name, hold_of(lab)))
+            for name in ("one", "two")
+        ]
 
 
 def fleet_file(lab: Path, ports: dict[str, int], runs: list[PortRun]) -> Path:
@@ -113,20 +118,32 @@ async def test_the_page_follows_each_and_asks_by_the_certificates_role(
     tmp_path: Path, lab: Path, ports: dict[str, int]
 ) -> None:
     async with two_holds(lab, tmp_path) as runs:
-        feeds = {name: HoldFeed(where) for name, where in fleet(fleet_file(lab, ports, runs)).items()}
+        feeds = {
+            name: HoldFeed(where) for name, where in fleet(fleet_file(lab, ports, runs)).items()
+        }
         try:
             for feed in feeds.values():
                 feed.open()
             async with asyncio.timeout(PATIENCE_S):
                 for feed in feeds.values():
-                    while feed.seen.problem == "not connected yet":  # noqa: ASYNC110, it is a thread that changes it
+                    while feed.seen.problem == ("not connected yet"):  # noqa: ASYNC110, it is a thread that changes it
                         await asyncio.sleep(0.05)
             problems = {name: feed.seen.silent for name, feed in feeds.items()}
-            assert [name for name, problem in problems.items() if not problem] == ["north", "reader"]
-            assert all(SAID[name].lower() in problem.lower() for name, problem in problems.items() if problem)
+            assert [name for name, problem in problems.items() if not problem] == [
+                "north",
+                "reader",
+            ]
+            assert all(
+                SAID[name].lower() in problem.lower()
+                for name, problem in problems.items()
+                if problem
+            )
             assert [feeds[name].seen.role for name in ("north", "reader")] == ["operate", "read"]
             request = {"do": "pause", "why": "web: anna"}
-            said = {name: await asyncio.to_thread(feeds[name].ask, request) for name in ("reader", "north", "away")}
+            said = {
+                name: await asyncio.to_thread(feeds[name].ask, request)
+                for name in ("reader", "north", "away")
+            }
             assert said["north"].text == "pause: done"
             assert "refused" in said["reader"].text
             assert "connection refused" in said["away"].text

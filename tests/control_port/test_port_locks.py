@@ -1,4 +1,6 @@
-"""Locks through the port: who is an author, for whom the page may speak, and what the answer confirms."""
+"""Locks through the port: who is an author, for whom the page may speak, and what the answer
+confirms.
+"""
 
 from __future__ import annotations
 
@@ -34,13 +36,18 @@ async def taken(run: PortRun, who: Peer, **request: Any) -> Command:
     return run.asked[-1]
 
 
-async def test_a_lock_has_its_author_session_word_and_time_as_inputs_of_the_tick(tmp_path: Path) -> None:
+async def test_a_lock_has_its_author_session_word_and_time_as_inputs_of_the_tick(
+    tmp_path: Path,
+) -> None:
     async with port_run(tmp_path) as run:
         lock = (await taken(run, ANN, do="lock", text="hands inside", number=1)).lock
         assert lock is not None
         assert (lock.text, lock.author, lock.account, lock.session) == (
-            "hands inside", "unix:ann", "unix:ann", "process 2",
-        )  # fmt: skip
+            "hands inside",
+            "unix:ann",
+            "unix:ann",
+            "process 2",
+        )
         assert len(lock.word) == 5
         assert lock.set_utc.endswith("+00:00")
 
@@ -55,14 +62,21 @@ async def test_the_page_speaks_for_its_viewer_and_the_lower_role_counts(tmp_path
         assert (command.who, command.account, command.from_person) == ("page:bob", "page:bob", True)
         run.asked.clear()
         async with client(run, HOLD) as page:
-            for role, do in (("read", "hold"), ("read", "stop"), ("read", "unlock"), ("operate", "keep")):
+            for role, do in (
+                ("read", "hold"),
+                ("read", "stop"),
+                ("read", "unlock"),
+                ("operate", "keep"),
+            ):
                 answer = await page.ask(do=do, on_behalf=BEHALF | {"role": role})
                 assert f"page:bob has {role}" in answer["refused"]
         assert run.asked == []
 
 
 @pytest.mark.parametrize("stated", [{}, {"name": "link", "account": ""}])
-async def test_an_account_is_believed_from_the_holds_own_user_only(tmp_path: Path, stated: dict[str, str]) -> None:
+async def test_an_account_is_believed_from_the_holds_own_user_only(
+    tmp_path: Path, stated: dict[str, str]
+) -> None:
     async with port_run(tmp_path) as run:
         who = ANN if not stated else HOLD
         command = await taken(run, who, do="unlock", text="bofak", on_behalf=BEHALF | stated)
@@ -81,7 +95,9 @@ async def test_a_peer_cannot_raise_its_role(tmp_path: Path) -> None:
 
 
 def test_a_bridge_is_no_author_and_no_person() -> None:
-    bridge = OnBehalf.model_validate({"via": "bridge", "account": "membrane", "name": "mqtt", "role": "operate"})
+    bridge = OnBehalf.model_validate(
+        {"via": "bridge", "account": "membrane", "name": "mqtt", "role": "operate"}
+    )
     sender = sender_of(HOLD, bridge)
     assert (sender.account, sender.from_person) == ("", False)
     assert not sender_of(ANN, bridge).from_person
@@ -89,14 +105,23 @@ def test_a_bridge_is_no_author_and_no_person() -> None:
 
 
 @pytest.mark.parametrize(
-    "wrong", [{"via": "ctl"}, {"role": "owner"}, {"account": "a" * 100}, {"account": "a\nb"}, {"admin": True}]
+    "wrong",
+    [
+        {"via": "ctl"},
+        {"role": "owner"},
+        {"account": "a" * 100},
+        {"account": "a\nb"},
+        {"admin": True},
+    ],
 )
 def test_what_cannot_be_stated_is_refused(wrong: dict[str, Any]) -> None:
     with pytest.raises(ValueError, match="on_behalf"):
         parse(json.dumps({"do": "stop", "on_behalf": BEHALF | wrong}).encode())
 
 
-async def test_the_kernel_decides_who_is_the_holds_own_user(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+async def test_the_kernel_decides_who_is_the_holds_own_user(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     async with port_run(tmp_path) as run:
         near, far = socket.socketpair(socket.AF_UNIX)
         with near, far:
@@ -132,21 +157,25 @@ async def confirmed(run: PortRun, asker: LineClient, outcome: Future[str] | None
     lock = command.lock
     event = LockSet(
         lock.word, lock.text, lock.author, lock.account, lock.session, lock.set_utc, command.number
-    )  # fmt: skip
+    )
     run.tick((event,), ((command.number, ""),))
     return await asker.answer()
 
 
-async def test_the_answer_confirms_only_what_is_on_the_disk(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+async def test_the_answer_confirms_only_what_is_on_the_disk(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.setattr(server, "_STORE_S", 0.05)
     stored: Future[str] = Future()
     stored.set_result("")
     full: Future[str] = Future()
     full.set_result("no space left on device")
     cases: list[tuple[Future[str] | None, object, str]] = [
-        (stored, True, ""), (full, False, "no space left on device"), (Future(), False, "has not confirmed"),
+        (stored, True, ""),
+        (full, False, "no space left on device"),
+        (Future(), False, "has not confirmed"),
         (None, None, ""),
-    ]  # fmt: skip
+    ]
     for number, (outcome, expected, problem) in enumerate(cases):
         folder = tmp_path / str(number)
         folder.mkdir()

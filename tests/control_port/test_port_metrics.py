@@ -20,14 +20,20 @@ SAMPLE = re.compile(r'[a-z_][a-z0-9_]*(\{state="[a-z]+"\})? (NaN|-?[0-9.e+-]+)')
 
 def test_every_line_is_one_that_prometheus_reads() -> None:
     text = metrics_text(RunStatus(row=replace(ROW, trim_um=nan)), 2, 7)
-    samples = [line for line in text.splitlines() if not line.startswith(("# TYPE membrane_", "# HELP membrane_"))]
+    samples = [
+        line
+        for line in text.splitlines()
+        if not line.startswith(("# TYPE membrane_", "# HELP membrane_"))
+    ]
     assert all(SAMPLE.fullmatch(line) for line in samples)
     assert "membrane_error_um 0.25" in samples
     assert "membrane_trim_um NaN" in samples
     assert 'membrane_in_state{state="hold"} 1.0' in samples
     assert "membrane_port_refused_total 7.0" in samples
     assert "membrane_ticks_total 600.0" in samples
-    assert sum(line.startswith("membrane_in_state") and line.endswith(" 1.0") for line in samples) == 1
+    assert (
+        sum(line.startswith("membrane_in_state") and line.endswith(" 1.0") for line in samples) == 1
+    )
     assert len(samples) >= len(FIELDS)
 
 

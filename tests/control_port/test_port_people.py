@@ -37,7 +37,9 @@ def test_each_command_keeps_it_from_lapsing() -> None:
 
 
 def test_roles_are_steps() -> None:
-    assert "needs the role tune; unix:ann has operate" in may_not(Peer("unix:ann", "operate"), "gains")
+    assert "needs the role tune; unix:ann has operate" in may_not(
+        Peer("unix:ann", "operate"), "gains"
+    )
     assert may_not(Peer("unix:ann", "operate"), "stop") == ""
     assert may_not(Peer("unix:ann", "tune"), "stop") == ""
     assert "needs the role operate" in may_not(Peer("unix:eve", "read"), "stop")

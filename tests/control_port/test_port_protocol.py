@@ -96,19 +96,34 @@ def test_the_longest_words_fit_an_event() -> None:
     request = parse(line(do="mark", text=worst * (TEXT_BYTES // 4), why=worst * (WHY_BYTES // 4)))
     who = "é" * (WHO_BYTES // 2)
     event = {
-        "time_utc": "2026-11-21T03:10:06.819914+00:00", "mono_s": 1234567.123456, "kind": "command",
-        "command": "mark", "who": who, "why": request.why, "text": request.text,
-        "value": 1.2345678901234567e-300, "refused": "r" * 400,
-    }  # fmt: skip
+        "time_utc": "2026-11-21T03:10:06.819914+00:00",
+        "mono_s": 1234567.123456,
+        "kind": "command",
+        "command": "mark",
+        "who": who,
+        "why": request.why,
+        "text": request.text,
+        "value": 1.2345678901234567e-300,
+        "refused": "r" * 400,
+    }
     assert len(json.dumps(event)) < EVENT_BYTES
 
 
 def test_the_longest_pump_map_fits_a_message_and_an_event() -> None:
     third = 1 / 3
     steps = [{"fraction": third, "duration_s": 100 + third, "until_um": -29 - third}] * 90
-    around = {"holding_flow_um_per_s": 10 * third, "laser_um": third, "gain": third, "limit_um": 10 * third}
-    spec = ExperimentSpec.model_validate({"kind": "pump_map", "duration_s": 1000 * third, "steps": steps, **around})
-    message = encode({"number": 2**53 - 1, "do": "tune", "why": "y" * WHY_BYTES, "experiment": spec.model_dump()})
+    around = {
+        "holding_flow_um_per_s": 10 * third,
+        "laser_um": third,
+        "gain": third,
+        "limit_um": 10 * third,
+    }
+    spec = ExperimentSpec.model_validate(
+        {"kind": "pump_map", "duration_s": 1000 * third, "steps": steps, **around}
+    )
+    message = encode(
+        {"number": 2**53 - 1, "do": "tune", "why": "y" * WHY_BYTES, "experiment": spec.model_dump()}
+    )
     assert len(message) < MESSAGE_BYTES
     assert ExperimentSpec.model_validate(parse(message).experiment) == spec
     who, why = "é" * (WHO_BYTES // 2), "\U0001f9ca" * (WHY_BYTES // 4)
@@ -119,7 +134,9 @@ def test_the_longest_pump_map_fits_a_message_and_an_event() -> None:
 
 values = st.recursive(
     st.none() | st.booleans() | st.integers() | st.floats() | st.text(max_size=20),
-    lambda inner: st.lists(inner, max_size=3) | st.dictionaries(st.text(max_size=8), inner, max_size=3),
+    lambda inner: (
+        st.lists(inner, max_size=3) | st.dictionaries(st.text(max_size=8), inner, max_size=3)
+    ),
     max_leaves=8,
 )
 fields = st.dictionaries(st.sampled_from([*Request.model_fields, "other"]), values, max_size=6)

@@ -1,4 +1,6 @@
-"""Safety commands overtake all others of a connection; whatever is not executed is answered with a reason."""
+"""Safety commands overtake all others of a connection; whatever is not executed is answered with a
+reason.
+"""
 
 from __future__ import annotations
 
@@ -65,7 +67,9 @@ async def test_every_request_of_a_flood_is_answered(tmp_path: Path) -> None:
             ann.put(line(do="mark", text=f"mark {number}", number=number))
         found = await answers_of(ann, set(range(1, 151)))
         refused = {number for number, answer in found.items() if not answer["ok"]}
-        assert all("requests of this connection wait" in found[number]["refused"] for number in refused)
+        assert all(
+            "requests of this connection wait" in found[number]["refused"] for number in refused
+        )
         done = sorted(set(found) - refused)
         assert [command.text for command in run.asked] == [f"mark {number}" for number in done]
         assert len(done) >= 16
@@ -101,19 +105,29 @@ async def test_a_flood_of_one_safety_command_does_not_delay_another(tmp_path: Pa
         assert kinds(run)[0] == "latch"
 
 
-async def test_the_same_safety_command_twice_is_executed_once_and_answered_twice(tmp_path: Path) -> None:
+async def test_the_same_safety_command_twice_is_executed_once_and_answered_twice(
+    tmp_path: Path,
+) -> None:
     async with port_run(tmp_path) as run, client(run, ANN) as ann:
         ann.put(b"".join(line(do="vent", number=number) for number in (1, 2, 3)))
         found = await answers_of(ann, {1, 2, 3})
         assert all(answer["ok"] for answer in found.values())
-        assert len(run.asked) <= 2, "one that was being executed, and one for those that came meanwhile"
+        assert len(run.asked) <= 2, (
+            "one that was being executed, and one for those that came meanwhile"
+        )
 
 
 @pytest.mark.parametrize("kind", SAFEST_FIRST)
-async def test_a_hold_that_waits_is_refused_by_a_later_safety_command(tmp_path: Path, kind: str) -> None:
+async def test_a_hold_that_waits_is_refused_by_a_later_safety_command(
+    tmp_path: Path, kind: str
+) -> None:
     async with port_run(tmp_path) as run, client(run, ANN) as ann, client(run, BOB) as bob:
         run.state = State.STANDBY
-        ann.put(line(do="quiet", number=1) + line(do="hold", number=2) + line(do="mark", text="kept", number=3))
+        ann.put(
+            line(do="quiet", number=1)
+            + line(do="hold", number=2)
+            + line(do="mark", text="kept", number=3)
+        )
         await answers_of(ann, {1})
         assert (await bob.ask(do=kind, number=4))["ok"]
         found = await answers_of(ann, {2, 3})
@@ -156,7 +170,9 @@ async def test_a_safety_command_needs_no_command_of_the_mirror(tmp_path: Path, k
         assert (await ann.ask(do="status"))["status"]["commander"] == "unix:ann"
 
 
-async def test_an_expired_request_is_refused_unless_it_makes_the_mirror_safe(tmp_path: Path) -> None:
+async def test_an_expired_request_is_refused_unless_it_makes_the_mirror_safe(
+    tmp_path: Path,
+) -> None:
     async with port_run(tmp_path) as run, client(run, ANN) as ann:
         run.state = State.STANDBY
         now_s = run.now_s
@@ -178,5 +194,7 @@ def test_kinds_are_served_in_turn() -> None:
 @pytest.mark.parametrize("kind", SAFEST_FIRST)
 def test_no_line_with_a_safety_command_is_taken_for_another(kind: str) -> None:
     assert may_hold_safety_command(json.dumps({"number": 3, "do": kind}).encode())
-    assert may_hold_safety_command(b'{"do":"' + "".join(f"\\u{ord(c):04x}" for c in kind).encode() + b'"}')
+    assert may_hold_safety_command(
+        b'{"do":"' + "".join(f"\\u{ord(c):04x}" for c in kind).encode() + b'"}'
+    )
     assert not may_hold_safety_command(b'{"do": "quiet", "number": 3}')

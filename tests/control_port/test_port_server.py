@@ -33,7 +33,11 @@ async def test_status_is_the_newest_tick(tmp_path: Path) -> None:
         answer = await eve.ask(do="status", number=5)
         assert (answer["number"], answer["ok"]) == (5, True)
         status = answer["status"]
-        assert (status["state"], status["why"], status["run"]) == ("hold", "inside the band", "the-run")
+        assert (status["state"], status["why"], status["run"]) == (
+            "hold",
+            "inside the band",
+            "the-run",
+        )
         assert status["row"]["error_um"] == ROW.error_um
         assert status["fault"] is None
         assert status["commander"] is None
@@ -62,7 +66,9 @@ async def test_what_the_controller_refuses_is_said(tmp_path: Path) -> None:
         assert run.of_kind("refused") == [], "the controller records these"
 
 
-async def test_a_loop_that_does_not_tick_is_said(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+async def test_a_loop_that_does_not_tick_is_said(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.setattr("membrane_ctrl.control_port.server._ANSWER_S", 0.05)
     async with port_run(tmp_path) as run, client(run, ANN) as ann:
         run.ticking = False
@@ -74,7 +80,10 @@ async def test_a_role_that_is_too_low_is_refused_and_recorded(tmp_path: Path) ->
         async with client(run, EVE) as eve:
             assert "needs the role operate" in (await eve.ask(do="stop", why="curious"))["refused"]
         async with client(run, ANN) as ann:
-            assert "needs the role tune" in (await ann.ask(do="gains", loop={"kp_per_s": 0.5}))["refused"]
+            assert (
+                "needs the role tune"
+                in (await ann.ask(do="gains", loop={"kp_per_s": 0.5}))["refused"]
+            )
         assert [(e["who"], e["command"], e["why"]) for e in run.of_kind("refused")] == [
             ("unix:eve", "stop", "curious"),
             ("unix:ann", "gains", ""),
@@ -90,7 +99,10 @@ async def test_one_commander_at_a_time(tmp_path: Path) -> None:
         assert (await bob.ask(do="mark", text="bob was here"))["ok"], "a mark moves nothing"
         assert (await bob.ask(do="setpoint", value=2.0, take_over=True, why="shift"))["ok"]
         notice = await ann.get()
-        assert notice == {"notice": "unix:bob has taken over command: shift", "code": "command_taken"}
+        assert notice == {
+            "notice": "unix:bob has taken over command: shift",
+            "code": "command_taken",
+        }
         assert "unix:bob has command" in (await ann.ask(do="setpoint", value=1.0))["refused"]
         assert [(e["who"], e["former"]) for e in run.of_kind("commander")] == [
             ("unix:ann", None),
@@ -125,12 +137,17 @@ async def test_gains_change_what_they_name(tmp_path: Path) -> None:
         ({"kp_per_s": -1.0}, "kp_per_s: input should be greater"),
         ({"setpoint_um": 3.0}, "use the command setpoint"),
         ({"rate_hz": 100.0}, "tick rate cannot be changed"),
-        ({"kp_per_s": 15.0}, "kp_per_s = 15: with Ti 6.5 s, Td 0 s, a filter of 0.2 s the loop is unstable"),
+        (
+            {"kp_per_s": 15.0},
+            "kp_per_s = 15: with Ti 6.5 s, Td 0 s, a filter of 0.2 s the loop is unstable",
+        ),
         ({"kp_per_s": 0.0}, "nothing would hold the mirror"),
         ({}, "takes"),
     ],
 )
-async def test_gains_that_are_none_are_one_line(tmp_path: Path, loop: dict[str, float], says: str) -> None:
+async def test_gains_that_are_none_are_one_line(
+    tmp_path: Path, loop: dict[str, float], says: str
+) -> None:
     async with port_run(tmp_path) as run, client(run, TOM) as tom:
         answer = await tom.ask(do="gains", loop=loop)
         if loop:
@@ -141,7 +158,10 @@ async def test_gains_that_are_none_are_one_line(tmp_path: Path, loop: dict[str, 
 
 async def test_an_experiment_is_validated_and_handed_on(tmp_path: Path) -> None:
     async with port_run(tmp_path) as run, client(run, TOM) as tom:
-        assert "holding_flow_um_per_s: missing" in (await tom.ask(do="tune", experiment={"kind": "relay"}))["refused"]
+        assert (
+            "holding_flow_um_per_s: missing"
+            in (await tom.ask(do="tune", experiment={"kind": "relay"}))["refused"]
+        )
         spec = {"kind": "relay", "holding_flow_um_per_s": 1.2, "laser_um": 1.0}
         assert (await tom.ask(do="tune", experiment=spec))["ok"]
         assert run.asked[0].experiment is not None
@@ -151,7 +171,11 @@ async def test_an_experiment_is_validated_and_handed_on(tmp_path: Path) -> None:
 async def test_watch_streams_status_and_events(tmp_path: Path) -> None:
     async with port_run(tmp_path) as run, client(run, EVE) as eve, client(run, ANN) as ann:
         assert (await eve.ask(do="watch", period_s=0.1))["status"]["state"] == "hold"
-        run.tick(events=(from_dict({"kind": "fault", "code": 10, "name": "n", "cause": "c", "remedy": "r"}),))
+        run.tick(
+            events=(
+                from_dict({"kind": "fault", "code": 10, "name": "n", "cause": "c", "remedy": "r"}),
+            )
+        )
         assert (await eve.get() or {})["event"]["name"] == "n"
         run.state = State.MANUAL
         run.tick()
@@ -196,7 +220,9 @@ async def test_a_message_that_does_not_end_ends_the_connection(
         assert await ann.gone()
 
 
-async def test_who_does_not_read_is_dropped(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+async def test_who_does_not_read_is_dropped(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.setattr("membrane_ctrl.control_port.protocol._UNREAD_BYTES", 10_000)
     async with port_run(tmp_path) as run, client(run, EVE) as eve, client(run, ANN) as ann:
         assert (await eve.ask(do="watch", period_s=3600))["ok"]
@@ -227,7 +253,9 @@ async def test_too_many_of_one_peer_cost_that_peer(tmp_path: Path) -> None:
         assert (await ann.ask(do="stop"))["ok"]
 
 
-async def test_too_many_peers_cost_the_one_silent_longest(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+async def test_too_many_peers_cost_the_one_silent_longest(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.setattr("membrane_ctrl.control_port.server._SESSIONS_MOST", 2)
     async with port_run(tmp_path) as run, client(run, EVE) as eve, client(run, BOB) as bob:
         assert (await eve.ask(do="status"))["ok"]
@@ -237,7 +265,9 @@ async def test_too_many_peers_cost_the_one_silent_longest(tmp_path: Path, monkey
             assert (await eve.ask(do="status"))["ok"]
 
 
-async def test_an_endpoint_that_fails_opens_again(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+async def test_an_endpoint_that_fails_opens_again(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.setattr("membrane_ctrl.control_port.endpoint._AGAIN_S", 0.01)
     run = PortRun(tmp_path)
     loop = asyncio.get_running_loop()
@@ -273,7 +303,9 @@ async def test_the_end_of_the_run_answers_who_waits(tmp_path: Path) -> None:
     await writer.wait_closed()
 
 
-@settings(max_examples=60, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@settings(
+    max_examples=60, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture]
+)
 @given(st.lists(st.binary(max_size=300), min_size=1, max_size=6))
 def test_no_bytes_disturb_another_client(tmp_path: Path, chunks: list[bytes]) -> None:
     async def attack() -> None:
@@ -283,7 +315,9 @@ def test_no_bytes_disturb_another_client(tmp_path: Path, chunks: list[bytes]) ->
                 await asyncio.sleep(0)
             assert (await bob.ask(do="stop", number=1))["ok"]
             assert not run.of_kind("port_failed")
-            assert [command.kind for command in run.asked] == ["stop"], "no random bytes are a command"
+            assert [command.kind for command in run.asked] == ["stop"], (
+                "no random bytes are a command"
+            )
 
     asyncio.run(attack())
 
@@ -328,13 +362,19 @@ def test_a_client_waits_its_turn_at_a_crowded_door(tmp_path: Path) -> None:
         with ThreadPoolExecutor(1) as elsewhere:
             second = elsewhere.submit(PortClient.unix, path, print)
             with endpoint.accept()[0], endpoint.accept()[0] as accepted:
-                accepted.sendall(b'{"membrane_ctrl": 1, "run": "r", "you": "unix:ann", "role": "tune"}\n')
+                accepted.sendall(
+                    b'{"membrane_ctrl": 1, "run": "r", "you": "unix:ann", "role": "tune"}\n'
+                )
                 with second.result() as client:
                     assert client.greeting["run"] == "r"
 
 
-def test_an_endpoint_that_is_flooded_is_said(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("membrane_ctrl.control_port.client._kernel_time", lambda _: struct.pack("ll", 0, 50_000))
+def test_an_endpoint_that_is_flooded_is_said(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(
+        "membrane_ctrl.control_port.client._kernel_time", lambda _: struct.pack("ll", 0, 50_000)
+    )
     with socket.socket(socket.AF_UNIX) as endpoint, socket.socket(socket.AF_UNIX) as first:
         endpoint.bind(str(tmp_path / "control.sock"))
         endpoint.listen(0)
@@ -342,7 +382,9 @@ def test_an_endpoint_that_is_flooded_is_said(tmp_path: Path, monkeypatch: pytest
         with pytest.raises(DeviceError, match="too many connections"):
             PortClient.unix(tmp_path / "control.sock", print)
         before = signal.signal(signal.SIGWINCH, lambda *_: None)
-        resize = threading.Timer(0.02, os.kill, (os.getpid(), signal.SIGWINCH))  # of the terminal, while one waits
+        resize = threading.Timer(
+            0.02, os.kill, (os.getpid(), signal.SIGWINCH)
+        )  # of the terminal, while one waits
         resize.start()
         with pytest.raises(DeviceError, match="too many connections"):
             PortClient.unix(tmp_path / "control.sock", print)

@@ -30,7 +30,9 @@ def lab(tmp_path_factory: pytest.TempPathFactory) -> Authority:
 @pytest.fixture(scope="module")
 def config(lab: Authority) -> PortConfig:
     certificate, key = lab.certificate("bench")
-    tls = TlsConfig(port=0, certificate_file=str(certificate), key_file=str(key), client_ca_file=str(lab.own))
+    tls = TlsConfig(
+        port=0, certificate_file=str(certificate), key_file=str(key), client_ca_file=str(lab.own)
+    )
     return PortConfig(tls=tls)
 
 
@@ -114,12 +116,16 @@ def test_who_has_no_name_only_reads(config: PortConfig) -> None:
     listener = TlsListener(config.tls)
     unit = (("organizationalUnitName", "tune"),)
     assert listener.peer({"subject": (unit,)}) == Peer("tls:nameless", "read")
-    assert listener.peer({"subject": (unit, (("commonName", " "),))}) == Peer("tls:nameless", "read")
+    assert listener.peer({"subject": (unit, (("commonName", " "),))}) == Peer(
+        "tls:nameless", "read"
+    )
     assert listener.peer({"subject": (unit, (("commonName", "bea"),))}) == Peer("tls:bea", "tune")
     listener.close()
 
 
-async def test_a_strangers_certificate_stays_out(tmp_path: Path, lab: Authority, config: PortConfig) -> None:
+async def test_a_strangers_certificate_stays_out(
+    tmp_path: Path, lab: Authority, config: PortConfig
+) -> None:
     stranger = Authority.new(tmp_path / "stranger")
     pair = stranger.certificate("eve", "tune")
     async with port_run(tmp_path, config) as run:
@@ -138,7 +144,9 @@ async def test_a_bench_of_another_authority_is_not_trusted(
             await asyncio.to_thread(greet, run, pair, stranger.own)
 
 
-async def test_without_a_certificate_or_without_tls(tmp_path: Path, lab: Authority, config: PortConfig) -> None:
+async def test_without_a_certificate_or_without_tls(
+    tmp_path: Path, lab: Authority, config: PortConfig
+) -> None:
     naked = ssl.SSLContext(ssl.PROTOCOL_TLS_CLIENT)
     naked.load_verify_locations(lab.own)
 
@@ -171,7 +179,11 @@ async def test_who_never_shakes_hands_is_dropped(
 
 def test_files_that_are_none_are_one_line(tmp_path: Path, lab: Authority) -> None:
     certificate, key = lab.certificate("good")
-    good = {"certificate_file": str(certificate), "key_file": str(key), "client_ca_file": str(lab.own)}
+    good = {
+        "certificate_file": str(certificate),
+        "key_file": str(key),
+        "client_ca_file": str(lab.own),
+    }
     empty = tmp_path / "empty.pem"
     empty.write_text("")
     for field, path, says in [

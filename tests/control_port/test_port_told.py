@@ -8,7 +8,12 @@ from port_run import port_run
 
 from membrane_ctrl.model.events import Maintenance, MaintenanceOver, StateEntered, Why
 from membrane_ctrl.model.reason import WhyCode
-from membrane_ctrl.model.run_events import DiskLow, GeometryInForce, RecorderError, RecorderRecovered
+from membrane_ctrl.model.run_events import (
+    DiskLow,
+    GeometryInForce,
+    RecorderError,
+    RecorderRecovered,
+)
 
 
 async def test_a_report_of_a_child_stands_in_the_status(tmp_path: Path) -> None:
@@ -29,7 +34,9 @@ async def test_a_report_of_a_child_stands_in_the_status(tmp_path: Path) -> None:
         assert run.port.status()["notices"] == []
 
 
-async def test_trouble_with_the_recording_stands_in_status_and_metrics_until_it_is_over(tmp_path: Path) -> None:
+async def test_trouble_with_the_recording_stands_in_status_and_metrics_until_it_is_over(
+    tmp_path: Path,
+) -> None:
     async with port_run(tmp_path) as run:
         run.port.told(DiskLow("disk", "less than 500 MB free"))
         run.port.told(RecorderError("state file", "state file: x"))
@@ -45,10 +52,15 @@ async def test_trouble_with_the_recording_stands_in_status_and_metrics_until_it_
         assert "membrane_recording_ok 1.0" in run.port.metrics()
 
 
-async def test_a_pause_stands_in_the_status_until_the_reason_or_the_state_changes(tmp_path: Path) -> None:
+async def test_a_pause_stands_in_the_status_until_the_reason_or_the_state_changes(
+    tmp_path: Path,
+) -> None:
     async with port_run(tmp_path) as run:
         assert run.port.status()["paused"] is False
-        for over in (Why("holding", "holding"), StateEntered("manual", "hold", "ann took over the pump")):
+        for over in (
+            Why("holding", "holding"),
+            StateEntered("manual", "hold", "ann took over the pump"),
+        ):
             run.tick(events=(Why("whatever the text says", WhyCode.PAUSED),))
             assert run.port.status()["paused"] is True
             run.tick(events=(over,))

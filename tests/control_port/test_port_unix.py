@@ -45,7 +45,9 @@ def test_the_owner_tunes(tmp_path: Path) -> None:
 
 def test_another_user_has_the_groups_role(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     listener = UnixListener(tmp_path / "control.sock", None, "operate")
-    credentials = type("Connection", (), {"getsockopt": lambda *_: (1).to_bytes(4, "little") + b"\x39\x30\0\0" * 2})
+    credentials = type(
+        "Connection", (), {"getsockopt": lambda *_: (1).to_bytes(4, "little") + b"\x39\x30\0\0" * 2}
+    )
     peer = listener.peer(credentials())  # type: ignore[arg-type]
     assert peer.role == "operate"
     assert peer.who == "unix:12345", "a uid without a name is named by its number"
@@ -71,7 +73,9 @@ def test_a_living_holds_socket_is_refused_and_left_alone(tmp_path: Path) -> None
     first.close()
 
 
-def test_a_hanging_holds_socket_is_busy_too(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_hanging_holds_socket_is_busy_too(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """Its queue is full and a connection waits: still no reason to replace it."""
     monkeypatch.setattr("membrane_ctrl.control_port.sockets._SOMEBODY_THERE_S", 0.05)
     path = tmp_path / "control.sock"
@@ -115,7 +119,9 @@ def test_a_path_longer_than_a_socket_address(tmp_path: Path) -> None:
 
 
 def test_a_group_that_is_none_is_one_line(tmp_path: Path) -> None:
-    with pytest.raises(InputError, match=r"port\.group: no group 'nobody-has-this' on this machine"):
+    with pytest.raises(
+        InputError, match=r"port\.group: no group 'nobody-has-this' on this machine"
+    ):
         UnixListener(tmp_path / "control.sock", "nobody-has-this", "operate")
     assert not list(tmp_path.iterdir())
 

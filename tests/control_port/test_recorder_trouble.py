@@ -1,7 +1,13 @@
 from __future__ import annotations
 
 from membrane_ctrl.model.events import Event
-from membrane_ctrl.model.run_events import ChildEnded, ChildGivenUp, ChildRestarted, DiskLow, RecorderError
+from membrane_ctrl.model.run_events import (
+    ChildEnded,
+    ChildGivenUp,
+    ChildRestarted,
+    DiskLow,
+    RecorderError,
+)
 from membrane_ctrl.model.run_status import RunStatus
 from membrane_ctrl.recorder.sink import RecorderErrors
 

@@ -16,19 +16,32 @@ from membrane_ctrl.sim.virtual_bench import VirtualBench
 from tests.support.virtual_record import run_virtual
 
 
-@pytest.mark.parametrize("rate_hz", [5.0, 10.0, 20.0, pytest.param(50.0, marks=pytest.mark.campaign)])
+@pytest.mark.parametrize(
+    "rate_hz", [5.0, 10.0, 20.0, pytest.param(50.0, marks=pytest.mark.campaign)]
+)
 def test_the_film_of_the_twin_passes_at_any_rate(rate_hz: float) -> None:
     for seed in range(12):
         config = Config(
-            loop=LoopConfig(rate_hz=rate_hz), twin=TwinConfig(seed=seed), shape=ShapeConfig(enabled=False)
+            loop=LoopConfig(rate_hz=rate_hz),
+            twin=TwinConfig(seed=seed),
+            shape=ShapeConfig(enabled=False),
         )
-        rows = [t.row for t in run_virtual(config, Plant(config.twin, config.pump), 14.0, zernike_projection())]
+        rows = [
+            t.row
+            for t in run_virtual(
+                config, Plant(config.twin, config.pump), 14.0, zernike_projection()
+            )
+        ]
         assert any(row.state == State.INFLATE for row in rows), seed
 
 
 @pytest.mark.parametrize("rate_hz", [10.0, 25.0, pytest.param(100.0, marks=pytest.mark.campaign)])
-@pytest.mark.parametrize("wrong", [{"pump_share": 0.0}, {"vent_stuck_fraction": 0.0}], ids=["pump", "vent"])
-def test_the_twin_is_not_inflated_with_a_dead_actuator_at_any_rate(rate_hz: float, wrong: dict[str, float]) -> None:
+@pytest.mark.parametrize(
+    "wrong", [{"pump_share": 0.0}, {"vent_stuck_fraction": 0.0}], ids=["pump", "vent"]
+)
+def test_the_twin_is_not_inflated_with_a_dead_actuator_at_any_rate(
+    rate_hz: float, wrong: dict[str, float]
+) -> None:
     config = Config(loop=LoopConfig(rate_hz=rate_hz), shape=ShapeConfig(enabled=False))
     for seed in range(6):
         twin = config.twin.model_copy(update={"seed": seed})
@@ -43,16 +56,24 @@ def test_the_twin_is_not_inflated_with_a_dead_actuator_at_any_rate(rate_hz: floa
         assert State.INFLATE not in states, seed
 
 
-def noisy_test(rate_hz: float, seed: int, pump_share: float = 1.0, vent_um_per_s: float = 100.0) -> ActuatorTest:
-    """As at a start, of a bench with 1 µm of noise: by default a perfect one, with 8 µm/s of vent."""
+def noisy_test(
+    rate_hz: float, seed: int, pump_share: float = 1.0, vent_um_per_s: float = 100.0
+) -> ActuatorTest:
+    """As at a start, of a bench with 1 µm of noise: by default a perfect one,
+    with 8 µm/s of vent.
+    """
     rng = np.random.default_rng(seed)
     pump = PumpConfig()
     test = ActuatorTest(pump, True, rate_hz)
     height_um, dt_s = 0.0, 1.0 / rate_hz
     for _ in range(2):
         while (part := test.part) is not None:
-            flow = max(0.0, part.pump_fraction * pump_share - pump.dead_fraction) / (1 - pump.dead_fraction)
-            height_um += dt_s * (pump.flow_full_um_per_s * flow - vent_um_per_s * part.vent_fraction - 1.2)
+            flow = max(0.0, part.pump_fraction * pump_share - pump.dead_fraction) / (
+                1 - pump.dead_fraction
+            )
+            height_um += dt_s * (
+                pump.flow_full_um_per_s * flow - vent_um_per_s * part.vent_fraction - 1.2
+            )
             test.step(height_um + rng.standard_normal(), dt_s)
         if test.is_second or not test.failure():
             break
@@ -68,13 +89,18 @@ def test_noise_alone_complains_hardly_ever_and_asks_twice_rarely(rate_hz: float)
 
 
 @pytest.mark.parametrize(
-    "rate_hz", [10.0, 25.0, *(pytest.param(rate, marks=pytest.mark.campaign) for rate in (50.0, 100.0))]
+    "rate_hz",
+    [10.0, 25.0, *(pytest.param(rate, marks=pytest.mark.campaign) for rate in (50.0, 100.0))],
 )
-@pytest.mark.parametrize(("pump_share", "vent_um_per_s"), [(0.0, 100.0), (1.0, 0.0)], ids=["pump", "vent"])
+@pytest.mark.parametrize(
+    ("pump_share", "vent_um_per_s"), [(0.0, 100.0), (1.0, 0.0)], ids=["pump", "vent"]
+)
 def test_noise_alone_hides_a_dead_actuator_hardly_ever(
     rate_hz: float, pump_share: float, vent_um_per_s: float
 ) -> None:
-    passed = sum(not noisy_test(rate_hz, seed, pump_share, vent_um_per_s).failure() for seed in range(300))
+    passed = sum(
+        not noisy_test(rate_hz, seed, pump_share, vent_um_per_s).failure() for seed in range(300)
+    )
     assert passed <= 5  # two in a thousand of a pump, six of a vent, are to be expected
 
 

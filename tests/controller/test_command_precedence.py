@@ -27,7 +27,12 @@ CONFIG = Config(
     loop=LoopConfig(rate_hz=1 / DT_S),
     shape=ShapeConfig(enabled=False),
     states=StatesConfig(
-        check_s=0.3, actuator_test=False, settle_s=0.3, ramp_down_s=1.0, stay_after_trip=True, vented_pressure_pa=0.0
+        check_s=0.3,
+        actuator_test=False,
+        settle_s=0.3,
+        ramp_down_s=1.0,
+        stay_after_trip=True,
+        vented_pressure_pa=0.0,
     ),
 )
 SPEC = ExperimentSpec.model_validate(
@@ -70,7 +75,18 @@ class Mirror:
         pump = self.last.command.pump_fraction if self.last else 0.0
         below_um = -1.5 + 1e-3 * (self.ticks % 7)  # inside the band, and so that the loop wants gas
         reading = BenchReading(
-            below_um, 0, 600.0, 101325.0, 23.0, 23.0, pump, 0.0, self.ticks, DT_S * self.ticks, False, 0
+            below_um,
+            0,
+            600.0,
+            101325.0,
+            23.0,
+            23.0,
+            pump,
+            0.0,
+            self.ticks,
+            DT_S * self.ticks,
+            False,
+            0,
         )
         reading = replace(reading, **wrong)  # type: ignore[arg-type]  # numbers all of them
         return TickInputs(self.ticks * DT_S, DT_S, reading, commands=tuple(given))
@@ -130,7 +146,9 @@ def test_a_latch_wins_over_any_other_command_in_either_order(state: State) -> No
 
 @pytest.mark.parametrize("state", State, ids=lambda state: state.name)
 def test_a_latch_wins_over_any_two_others_in_every_order(state: State) -> None:
-    for batch in sorted({order for two in itertools.product(RISKY, repeat=2) for order in orders("latch", *two)}):
+    for batch in sorted(
+        {order for two in itertools.product(RISKY, repeat=2) for order in orders("latch", *two)}
+    ):
         mirror = in_state(state)
         mirror.tick(*batch)
         stays_down(mirror)
@@ -186,7 +204,11 @@ def test_what_goes_down_wins_over_what_lifts_in_either_order(state: State) -> No
         for batch in orders(down, lifting):  # type: ignore[arg-type]  # literals of the table
             mirror = in_state(state)
             outputs = mirror.tick(*batch)
-            told = {event.command: bool(event.refused) for event in outputs.events if isinstance(event, CommandTaken)}
+            told = {
+                event.command: bool(event.refused)
+                for event in outputs.events
+                if isinstance(event, CommandTaken)
+            }
             answers.append(told)
             assert told[lifting] or told[down], batch
             if not told[down]:

@@ -29,14 +29,18 @@ Alter = Callable[[float, BenchReading], BenchReading | None]
 class Run:
     """A virtual run, kept whole."""
 
-    def __init__(self, config: Config = CALM, duration_s: float = 40.0, alter: Alter | None = None) -> None:
+    def __init__(
+        self, config: Config = CALM, duration_s: float = 40.0, alter: Alter | None = None
+    ) -> None:
         plant = Plant(config.twin, config.pump)
         self.ticks: list[VirtualTick] = list(
             run_virtual(config, plant, duration_s, zernike_projection(), alter=alter)
         )
         self.rows = [tick.row for tick in self.ticks]
         self.events: list[EventLine] = [
-            {**event.to_dict(), "mono_s": tick.row.mono_s} for tick in self.ticks for event in tick.events
+            {**event.to_dict(), "mono_s": tick.row.mono_s}
+            for tick in self.ticks
+            for event in tick.events
         ]
         self.finished = self.ticks[-1].outputs.finished
 
@@ -51,7 +55,9 @@ class Run:
         return np.array([getattr(row, field) for row in self.rows])
 
 
-def after(start_s: float, until_s: float, change: Callable[[BenchReading], BenchReading | None]) -> Alter:
+def after(
+    start_s: float, until_s: float, change: Callable[[BenchReading], BenchReading | None]
+) -> Alter:
     return lambda now_s, reading: change(reading) if start_s <= now_s < until_s else reading
 
 
@@ -102,7 +108,11 @@ def test_the_pump_is_handed_over_to_a_person_and_back_without_a_gap() -> None:
 
 def test_the_line_that_says_why_names_who_asked_for_that_and_nobody_else() -> None:
     run = VirtualRun(CALM, VirtualBench(Plant(CALM.twin, CALM.pump), 0.5), zernike_projection())
-    asked = {1: Command("hold", "ann"), 1000: Command("pause", "ann"), 1001: Command("shape_off", "bob")}
+    asked = {
+        1: Command("hold", "ann"),
+        1000: Command("pause", "ann"),
+        1001: Command("shape_off", "bob"),
+    }
     said = [
         event.why
         for number in range(1, 1200)
@@ -126,12 +136,19 @@ def test_a_repeated_sample_or_two_are_no_fault() -> None:
 
 
 def test_a_laser_that_stays_away_leads_down_the_safe_levels() -> None:
-    lost = after(25.0, math.inf, lambda r: replace(r, displacement_um=math.nan, displacement_quality=1))
+    lost = after(
+        25.0, math.inf, lambda r: replace(r, displacement_um=math.nan, displacement_quality=1)
+    )
     config = CALM.model_copy(update={"states": StatesConfig(hold_flow_max_s=2.0, ramp_down_s=3.0)})
     run = Run(config, 60.0, lost)
     assert run.finished == Exit.SAFETY_TRIP
     safe_levels = [SafeLevel(safe_level) for safe_level in dict.fromkeys(run.value("safe_level"))]
-    assert safe_levels == [SafeLevel.NONE, SafeLevel.HOLD_FLOW, SafeLevel.RAMP_DOWN, SafeLevel.PUMP_OFF]
+    assert safe_levels == [
+        SafeLevel.NONE,
+        SafeLevel.HOLD_FLOW,
+        SafeLevel.RAMP_DOWN,
+        SafeLevel.PUMP_OFF,
+    ]
     ramp = run.value("pump_fraction")[run.value("safe_level") == SafeLevel.RAMP_DOWN]
     assert np.all(np.diff(ramp) <= 0)
     assert run.rows[-1].pump_fraction == 0.0
@@ -184,7 +201,10 @@ def test_one_wild_reading_is_passed_over() -> None:
     run = Run(CALM, 40.0, wild)
     assert run.finished == Exit.DONE
     after_it = run.value("mono_s") > 25.0
-    assert np.max(np.abs(run.value("filtered_um")[after_it & (run.value("state") == State.HOLD)])) < 2.0
+    assert (
+        np.max(np.abs(run.value("filtered_um")[after_it & (run.value("state") == State.HOLD)]))
+        < 2.0
+    )
 
 
 def test_missing_sensors_never_start_the_pump() -> None:
@@ -205,7 +225,9 @@ def test_an_error_in_the_control_code_stops_the_pump(monkeypatch: pytest.MonkeyP
     monkeypatch.setitem(states.HANDLERS, State.HOLD, broken)
     run = Run()
     assert run.finished == Exit.SAFETY_TRIP
-    assert [(f["name"], f["seen"]) for f in run.of("fault")] == [("tick_error", "ZeroDivisionError: x / 0")]
+    assert [(f["name"], f["seen"]) for f in run.of("fault")] == [
+        ("tick_error", "ZeroDivisionError: x / 0")
+    ]
     first_error = 1 + next(i for i, row in enumerate(run.rows) if row.state == State.HOLD)
     assert np.all(run.value("pump_fraction")[first_error:] == 0.0)
 

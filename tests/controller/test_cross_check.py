@@ -1,4 +1,6 @@
-"""The whole configuration against itself and the board: each dangerous value is named, its sound neighbour passes."""
+"""The whole configuration against itself and the board: each dangerous value is named, its sound
+neighbour passes.
+"""
 
 from __future__ import annotations
 
@@ -52,7 +54,11 @@ def test_the_defaults_and_the_examples_are_sound() -> None:
     assert cross_check(Config()) == ()
     assert cross_check(Config(), BenchIdentity("board", 1, "1.0.0", 0.5, 800.0, 1.0)) == ()
     for example in sorted(EXAMPLES.glob("*.toml")):
-        found = [finding for finding in cross_check(load(example, Config)) if finding.field != "devices.vent"]
+        found = [
+            finding
+            for finding in cross_check(load(example, Config))
+            if finding.field != "devices.vent"
+        ]
         assert found == [], example
 
 
@@ -113,12 +119,16 @@ FIELDS: list[tuple[str, Any, Any]] = [
 ]
 MORE: dict[str, dict[str, Any]] = {
     "alarms.silent_s": {"loop.rate_hz": 1.5, "loop.measurement_filter_s": 1.0},
-    "port.metrics_port": {"port.tls": {"certificate_file": "a", "key_file": "b", "client_ca_file": "c"}},
+    "port.metrics_port": {
+        "port.tls": {"certificate_file": "a", "key_file": "b", "client_ca_file": "c"}
+    },
 }
 
 
 @pytest.mark.parametrize(("field", "dangerous", "sound"), FIELDS)
-def test_each_danger_is_an_error_and_its_neighbour_none(field: str, dangerous: Any, sound: Any) -> None:
+def test_each_danger_is_an_error_and_its_neighbour_none(
+    field: str, dangerous: Any, sound: Any
+) -> None:
     more = MORE.get(field, {})
     assert severity_of(config_of({**more, field: dangerous}), field) == "error"
     assert severity_of(config_of({**more, field: sound}), field) != "error"
@@ -156,13 +166,20 @@ DEVICES: list[tuple[str, dict[str, Any], Any, Any]] = [
 
 
 @pytest.mark.parametrize(("field", "devices", "dangerous", "sound"), DEVICES)
-def test_each_danger_of_a_device_is_an_error(field: str, devices: dict[str, Any], dangerous: Any, sound: Any) -> None:
-    assert severity_of(config_of({field: dangerous}, {"devices": devices}["devices"]), field) == "error"
+def test_each_danger_of_a_device_is_an_error(
+    field: str, devices: dict[str, Any], dangerous: Any, sound: Any
+) -> None:
+    assert (
+        severity_of(config_of({field: dangerous}, {"devices": devices}["devices"]), field)
+        == "error"
+    )
     assert severity_of(config_of({field: sound}, devices), field) == ""
 
 
 def test_a_slow_tick_and_a_short_watchdog() -> None:
-    config = config_of({"devices.watchdog_s": 0.1, "devices.timeout_s": 0.05, "loop.rate_hz": 2.5}, BOARD)
+    config = config_of(
+        {"devices.watchdog_s": 0.1, "devices.timeout_s": 0.05, "loop.rate_hz": 2.5}, BOARD
+    )
     assert severity_of(config, "loop.rate_hz") == "error"
 
 
@@ -177,15 +194,24 @@ def test_a_slow_tick_and_a_short_watchdog() -> None:
 def test_a_limit_that_its_sensor_cannot_show(changes: dict[str, float], field: str) -> None:
     assert severity_of(config_of(changes, ROLES), field) == "error"
     found = BenchIdentity(
-        "composed", 0, "", 0.5, displacement_range_um=(-2000.0, 2000.0), gauge_range_pa=(-100.0, 1050.0)
+        "composed",
+        0,
+        "",
+        0.5,
+        displacement_range_um=(-2000.0, 2000.0),
+        gauge_range_pa=(-100.0, 1050.0),
     )
     assert severity_of(config_of(changes), field, found) == "error"
     assert severity_of(Config(), field, found) == ""
 
 
-@pytest.mark.parametrize(("zero", "sound"), [(5.0, True), (9.6, True), (9.4, True), (0.4, False), (1.9, False)])
+@pytest.mark.parametrize(
+    ("zero", "sound"), [(5.0, True), (9.6, True), (9.4, True), (0.4, False), (1.9, False)]
+)
 def test_the_range_of_a_laser_about_its_zero(zero: float, sound: bool) -> None:
-    """10 mm, the bowl nearer when deeper: with the zero at 0.4 mm a limit of 500 µm is in front of the range."""
+    """10 mm, the bowl nearer when deeper: with the zero at 0.4 mm a limit of 500 µm is in front of
+    the range.
+    """
     laser = {"driver": "optoncdt1420", "port": "/dev/x", "range_mm": 10.0, "zero_mm": zero}
     shallow = {"limits.displacement_min_um": -300.0, "shape.trim_max_um": 100.0}
     config = config_of(shallow, {**ROLES, "displacement": laser})
@@ -197,9 +223,17 @@ def test_the_range_of_a_laser_about_its_zero(zero: float, sound: bool) -> None:
 def test_the_boards_own_limits_are_the_last_word() -> None:
     strict = BenchIdentity("board", 1, "1.0.0", 0.5, 700.0, 0.7)
     fields = {finding.field for finding in cross_check(Config(), strict)}
-    assert fields == {"limits.gauge_pressure_max_pa", "loop.flow_max_um_per_s", "states.actuator_test"}
+    assert fields == {
+        "limits.gauge_pressure_max_pa",
+        "loop.flow_max_um_per_s",
+        "states.actuator_test",
+    }
     weaker = config_of(
-        {"limits.gauge_pressure_max_pa": 700.0, "loop.flow_max_um_per_s": 3.5, "states.actuator_test": False}
+        {
+            "limits.gauge_pressure_max_pa": 700.0,
+            "loop.flow_max_um_per_s": 3.5,
+            "states.actuator_test": False,
+        }
     )
     assert cross_check(weaker, strict) == ()
 
@@ -209,7 +243,8 @@ def test_a_board_that_does_not_guard_its_gauge_is_a_warning(version: int) -> Non
     old = BenchIdentity("board", version, "1.0.0", 0.5, 800.0, 1.0)
     (finding,) = cross_check(config_of({}, BOARD), old)
     assert finding.line("lab.toml") == (
-        "lab.toml: warning: devices.board = tcp://127.0.0.1:1: this board's firmware does not stop the pump when its "
+        "lab.toml: warning: devices.board = tcp://127.0.0.1:1: this board's firmware does "
+        "not stop the pump when its "
         "gauge fails; update to map version 3"
     )
 
@@ -228,7 +263,10 @@ def test_a_ramp_that_the_board_cuts_off_is_a_warning() -> None:
     assert severity_of(config_of({}, BOARD), "states.ramp_down_s", board) == ""
     board = replace(board, gauge_timeout_s=10.1)
     assert severity_of(config_of({}, BOARD), "states.ramp_down_s", board) == "warning"
-    assert severity_of(config_of({}, BOARD), "states.ramp_down_s", replace(board, gauge_fitted=False)) == ""
+    assert (
+        severity_of(config_of({}, BOARD), "states.ramp_down_s", replace(board, gauge_fitted=False))
+        == ""
+    )
 
 
 def test_single_instruments_have_no_board_to_warn_of() -> None:
@@ -238,7 +276,9 @@ def test_single_instruments_have_no_board_to_warn_of() -> None:
 @pytest.mark.parametrize("room", [("loop.setpoint_um", 450.0), ("loop.setpoint_um", -1950.0)])
 def test_a_setpoint_whose_trim_reaches_the_limit(room: tuple[str, float]) -> None:
     assert severity_of(config_of(dict([room])), "shape.trim_max_um") == "error"
-    assert severity_of(config_of({**dict([room]), "shape.enabled": False}), "shape.trim_max_um") == ""
+    assert (
+        severity_of(config_of({**dict([room]), "shape.enabled": False}), "shape.trim_max_um") == ""
+    )
 
 
 def test_a_misspelt_fault_is_told_what_was_meant() -> None:
@@ -257,7 +297,9 @@ def test_only_faults_whose_cause_is_seen_to_have_gone_may_resume() -> None:
     }
     assert {rule.name for rule in TABLE if rule.may_resume} == may
     for rule in TABLE:
-        refused = severity_of(config_of({"resume.faults": [rule.name]}), "resume.faults.0") == "error"
+        refused = (
+            severity_of(config_of({"resume.faults": [rule.name]}), "resume.faults.0") == "error"
+        )
         assert refused == (not rule.may_resume), rule.name
 
 
@@ -291,15 +333,23 @@ def test_an_angle_in_radians(field: str) -> None:
 
 def test_a_camera_behind_the_mirror() -> None:
     poses = {
-        "camera": {"position_mm": [0.0, 0.0, -2000.0], "rotation": [[1, 0, 0], [0, 1, 0], [0, 0, 1]]},
+        "camera": {
+            "position_mm": [0.0, 0.0, -2000.0],
+            "rotation": [[1, 0, 0], [0, 1, 0], [0, 0, 1]],
+        },
         "screen": {"origin_mm": [0.0, 0.0, 2000.0], "s_x": [1, 0, 0], "s_y": [0, 1, 0]},
     }
-    assert severity_of(config_of({"optics.geometry": poses}), "optics.geometry.camera.position_mm") == "error"
+    assert (
+        severity_of(config_of({"optics.geometry": poses}), "optics.geometry.camera.position_mm")
+        == "error"
+    )
 
 
 def test_what_a_program_put_in_is_no_number_either() -> None:
     config = Config()
-    broken = config.model_copy(update={"loop": config.loop.model_copy(update={"ti_s": math.nan, "td_s": math.inf})})
+    broken = config.model_copy(
+        update={"loop": config.loop.model_copy(update={"ti_s": math.nan, "td_s": math.inf})}
+    )
     assert [finding.field for finding in cross_check(broken)] == ["loop.ti_s", "loop.td_s"]
 
 
@@ -316,17 +366,24 @@ def test_what_a_program_put_in_is_no_number_either() -> None:
 def test_true_is_no_number(text: str) -> None:
     with pytest.raises(InputError, match=r"true.* is neither a number nor a text"):
         parse(tomllib.loads(text), Config, "lab.toml")
-    assert parse({"states": {"actuator_test": False}}, Config, "lab.toml").states.actuator_test is False
+    assert (
+        parse({"states": {"actuator_test": False}}, Config, "lab.toml").states.actuator_test
+        is False
+    )
 
 
 DANGEROUS = (
-    "[states]\nhold_flow_max_s = 600.0\n[loop]\nbarometer_gain_um_per_pa = 0.358\nsetpoint_ramp_um_per_s = 6.0\n"
+    "[states]\nhold_flow_max_s = 600.0\n[loop]\nbarometer_gain_um_per_pa = "
+    "0.358\nsetpoint_ramp_um_per_s = 6.0\n"
 )
 
 
 @pytest.mark.parametrize("command", [["check"], ["hold", "--twin", "--duration", "1s", "--config"]])
 def test_every_finding_is_a_line_and_nothing_is_made(
-    command: list[str], tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+    command: list[str],
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
+    monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     monkeypatch.chdir(tmp_path)
     (tmp_path / "lab.toml").write_text(DANGEROUS)

@@ -1,6 +1,8 @@
-"""Random configurations, judged by the simulated mirror: those that the cross-check passes hold, and end safely.
+"""Random configurations, judged by the simulated mirror: those that the cross-check passes hold,
+and end safely.
 
-The judge's limits are its own, not the configuration's: seen from outside, by the true height and the true pump.
+The judge's limits are its own, not the configuration's: seen from outside, by the true height and
+the true pump.
 """
 
 from __future__ import annotations
@@ -60,12 +62,15 @@ CHOICES: dict[str, tuple[Any, ...]] = {
 }
 EVENTS = ("no_light", "unreachable", "stalled", "laser_stuck", "silent")
 SETTLED_S, AFTER_S = 45.0, 135.0  # HOLD_FLOW and RAMP_DOWN may last a minute each
-# With the worst that passes, the pump gives its mean flow for a minute, or its full flow while it is ramped down
+# With the worst that passes, the pump gives its mean flow for a minute, or its full flow while it
+# is ramped down
 HIGHEST_UM = 5.3 * 60.0 / 2 + 30.0
 
 
 def draw(chance: random.Random) -> Config | None:
-    """A configuration with one to four changes; None where already the fields' own ranges refuse it."""
+    """A configuration with one to four changes; None where already the fields' own ranges refuse
+    it.
+    """
     tables: dict[str, Any] = {
         "twin": {"scenario": "calm", "seed": chance.randrange(100)},
         "shape": {"enabled": False},

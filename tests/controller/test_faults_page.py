@@ -15,7 +15,9 @@ def test_the_committed_pages_are_fresh(capsys: pytest.CaptureFixture[str]) -> No
 def test_every_rule_is_on_both_pages() -> None:
     for rule in TABLE:
         assert f"| {rule.code} | `{rule.name}` | {rule.cause} |" in faults_page.faults_page()
-        assert f"| {rule.code} `{rule.name}` | {rule.cause} | {rule.remedy} |" in faults_page.alarms()
+        assert (
+            f"| {rule.code} `{rule.name}` | {rule.cause} | {rule.remedy} |" in faults_page.alarms()
+        )
 
 
 def test_a_page_that_is_old_is_said_and_not_touched(

@@ -45,7 +45,9 @@ from membrane_ctrl.run_files.latched_fault import LatchedFile, ResumeLog
 from tests.support.virtual_time import run_virtual
 
 CONFIG = Config(
-    devices=DevicesConfig(board="tcp://192.0.2.1"), loop=LoopConfig(rate_hz=10.0), shape=ShapeConfig(enabled=False)
+    devices=DevicesConfig(board="tcp://192.0.2.1"),
+    loop=LoopConfig(rate_hz=10.0),
+    shape=ShapeConfig(enabled=False),
 )
 BREAKS_S = 3.0
 
@@ -102,8 +104,12 @@ class Bench:
 
     def hold(self, breaks: Callable[[Bench], None]) -> Exit:
         """Hold in standby until something breaks after three seconds, and a stop after twenty."""
-        options = HoldOptions(CONFIG, "lab.toml", False, 20.0, "test", self.folder, False, False, standby=True)
-        latched = partial(FaultLatch, LatchedFile(self.folder), ResumeLog(self.folder), "run", LoopClock().utc)
+        options = HoldOptions(
+            CONFIG, "lab.toml", False, 20.0, "test", self.folder, False, False, standby=True
+        )
+        latched = partial(
+            FaultLatch, LatchedFile(self.folder), ResumeLog(self.folder), "run", LoopClock().utc
+        )
         port = partial(Port, CONFIG.port, Listeners(), "run")
         with ExitStack() as stack:
             rings = rings_for(CONFIG, None, stack)
@@ -115,7 +121,17 @@ class Bench:
                 children, clock = cast(ChildProcesses, self.children), cast(RunClock, LoopClock())
                 closing = Closing()
                 await _run(
-                    self.bench, CONFIG, options, clock, rings, children, None, port, latched, BoardAtStart(), closing
+                    self.bench,
+                    CONFIG,
+                    options,
+                    clock,
+                    rings,
+                    children,
+                    None,
+                    port,
+                    latched,
+                    BoardAtStart(),
+                    closing,
                 )
                 assert closing.exit is not None
                 return closing.exit
@@ -186,7 +202,8 @@ def test_a_software_watchdog_that_ended_is_a_fault(bench: Bench) -> None:
 
 
 @pytest.mark.parametrize(
-    ("kind", "name"), [(Port, "control port"), (FaultLatch, "latched-fault file"), (SystemdNotify, "systemd")]
+    ("kind", "name"),
+    [(Port, "control port"), (FaultLatch, "latched-fault file"), (SystemdNotify, "systemd")],
 )
 def test_a_listener_that_raises_is_a_fault(
     bench: Bench, monkeypatch: pytest.MonkeyPatch, kind: type, name: str
@@ -233,7 +250,9 @@ def test_whatever_ends_the_run_the_last_command_is_pump_off_with_the_vent_as_it_
 def test_a_thread_that_raises_tells_of_it(tmp_path: Path) -> None:
     """Nobody sees what a thread raises: any error is reported as a disk error is."""
     told: list[EventLine] = []
-    with FaultLatch(LatchedFile(tmp_path), None, "run", LoopClock().utc, told.append) as fault_latch:
+    with FaultLatch(
+        LatchedFile(tmp_path), None, "run", LoopClock().utc, told.append
+    ) as fault_latch:
         fault_latch._disk.submit(fault_latch._try, raises)
     assert told[0] == LatchFailed("broken")
 
@@ -252,7 +271,9 @@ def test_missed_deadlines_are_skipped_and_lateness_is_told_in_milliseconds() -> 
         def tick(self, inputs: TickInputs) -> TickOutputs:
             seen.append(inputs)
             row = TelemetryRow(**dict.fromkeys(FIELDS, 1.0))
-            return TickOutputs(BenchCommand(0.0, 0.0), row, (), Exit.DONE if len(seen) == 6 else None)
+            return TickOutputs(
+                BenchCommand(0.0, 0.0), row, (), Exit.DONE if len(seen) == 6 else None
+            )
 
     async def run() -> None:
         bench = Slow(RoleDevices(Instrument(), Instrument(), Instrument(600.0)), 0.5)
@@ -266,7 +287,9 @@ def test_missed_deadlines_are_skipped_and_lateness_is_told_in_milliseconds() -> 
 
     run_virtual(run())
     assert [inputs.now_s for inputs in seen] == pytest.approx([0.1, 0.2, 0.3, 0.65, 0.7, 0.8])
-    assert [inputs.lateness_ms for inputs in seen] == pytest.approx([0.0, 0.0, 0.0, 250.0, 0.0, 0.0], abs=1e-6)
+    assert [inputs.lateness_ms for inputs in seen] == pytest.approx(
+        [0.0, 0.0, 0.0, 250.0, 0.0, 0.0], abs=1e-6
+    )
     assert [inputs.missed_ticks for inputs in seen] == [0, 0, 0, 2, 2, 2]
 
 
@@ -311,4 +334,8 @@ def test_why_a_lost_link_does_not_come_back_is_told_once() -> None:
         await bench.close()
         return [event["message"] for event in events if event["kind"] == "link"]
 
-    assert run_virtual(run()) == ["the board has gone", "another program holds the board", "connected again"]
+    assert run_virtual(run()) == [
+        "the board has gone",
+        "another program holds the board",
+        "connected again",
+    ]

@@ -19,13 +19,17 @@ from membrane_ctrl.sim.plant import Plant
 from membrane_ctrl.sim.virtual_bench import VirtualBench, Wrong
 
 CONFIG = Config(
-    estimator=EstimatorConfig(process_value="estimate"), twin=TwinConfig(start_error_um=-1.0, scenario="quiet")
+    estimator=EstimatorConfig(process_value="estimate"),
+    twin=TwinConfig(start_error_um=-1.0, scenario="quiet"),
 )
 FROM_S, UNTIL_S = 18.0, 25.0  # of a failure
 
 
 def held(
-    fail: Callable[[Wrong, bool], None], config: Config = CONFIG, shape_s: float = 0.06, until_s: float = 31.0
+    fail: Callable[[Wrong, bool], None],
+    config: Config = CONFIG,
+    shape_s: float = 0.06,
+    until_s: float = 31.0,
 ) -> list[VirtualTick]:
     """A hold with figures every `shape_s`, in which something fails for a while."""
     bench = VirtualBench(Plant(config.twin, config.pump))
@@ -43,14 +47,21 @@ def held(
 
 def moved_um(ticks: list[VirtualTick]) -> float:
     """How far the true centre went from its mean before the failure."""
-    time_s, centre_um = np.array([(tick.row.mono_s, tick.row.truth_displacement_um) for tick in ticks]).T
+    time_s, centre_um = np.array(
+        [(tick.row.mono_s, tick.row.truth_displacement_um) for tick in ticks]
+    ).T
     before = centre_um[(time_s > FROM_S - 5) & (time_s < FROM_S)].mean()
     return float(np.abs(centre_um[time_s >= FROM_S] - before).max())
 
 
 def told(ticks: list[VirtualTick]) -> list[str]:
     """Which sensors hold the mirror, as it was told."""
-    return [", ".join(event.sensors) for tick in ticks for event in tick.events if isinstance(event, HeldBy)]
+    return [
+        ", ".join(event.sensors)
+        for tick in ticks
+        for event in tick.events
+        if isinstance(event, HeldBy)
+    ]
 
 
 ALL = "laser, optics, barometer, thermometer"
@@ -68,19 +79,26 @@ def set_to(name: str, value: float | bool) -> Callable[[Wrong, bool], None]:
         pytest.param(set_to("laser_stuck", True), [ALL], marks=pytest.mark.campaign),
         (set_to("camera_lost", True), [ALL, "laser, barometer, thermometer", ALL]),
         pytest.param(
-            set_to("barometer_lost", True), [ALL, "laser, optics, thermometer", ALL], marks=pytest.mark.campaign
+            set_to("barometer_lost", True),
+            [ALL, "laser, optics, thermometer", ALL],
+            marks=pytest.mark.campaign,
         ),
         pytest.param(set_to("laser_offset_um", 12.0), [ALL, ALL, ALL], marks=pytest.mark.campaign),
     ],
     ids=["no laser", "stuck laser", "no camera", "no barometer", "knocked laser"],
 )
-def test_a_lost_sensor_makes_no_bump_and_no_fault(fail: Callable[[Wrong, bool], None], holders: list[str]) -> None:
+def test_a_lost_sensor_makes_no_bump_and_no_fault(
+    fail: Callable[[Wrong, bool], None], holders: list[str]
+) -> None:
     ticks = held(fail)
     assert moved_um(ticks) < 0.3
     assert not [event for tick in ticks for event in tick.events if isinstance(event, Fault)]
     assert told(ticks) == holders
     alone = [
-        event for tick in ticks for event in tick.events if isinstance(event, Why) and "optics alone" in event.why
+        event
+        for tick in ticks
+        for event in tick.events
+        if isinstance(event, Why) and "optics alone" in event.why
     ]
     assert len(alone) == sum("laser" not in sensors for sensors in holders)
     assert ticks[-1].row.state == State.HOLD
@@ -113,7 +131,10 @@ def test_the_depth_stays_limited_without_a_laser() -> None:
 
     config = CONFIG.model_copy(update={"limits": limits})
     faults = [
-        event.name for tick in held(fail, config, until_s=21.0) for event in tick.events if isinstance(event, Fault)
+        event.name
+        for tick in held(fail, config, until_s=21.0)
+        for event in tick.events
+        if isinstance(event, Fault)
     ]
     assert faults == ["over_displacement"]
 

@@ -1,4 +1,6 @@
-"""Interlocks in the tick: what an open circuit does in each state, and that a replay decides the same."""
+"""Interlocks in the tick: what an open circuit does in each state, and that a replay decides the
+same.
+"""
 
 from __future__ import annotations
 
@@ -17,7 +19,15 @@ from membrane_ctrl.controller.snapshot import continue_from, take_snapshot
 from membrane_ctrl.controller.tick import TickAssembler, output_crc, pack_tick, unpack_tick
 from membrane_ctrl.hold.virtual_run import VirtualRun, VirtualTick
 from membrane_ctrl.metrology.optics.film_law import zernike_projection
-from membrane_ctrl.model.events import CommandTaken, Event, Fault, InterlockClosed, InterlockOpened, Resumed, Why
+from membrane_ctrl.model.events import (
+    CommandTaken,
+    Event,
+    Fault,
+    InterlockClosed,
+    InterlockOpened,
+    Resumed,
+    Why,
+)
 from membrane_ctrl.model.run_status import RunStatus
 from membrane_ctrl.model.telemetry import SafeLevel, State
 from membrane_ctrl.sim.plant import Plant
@@ -26,8 +36,12 @@ from membrane_ctrl.sim.virtual_interlocks import VirtualInterlocks
 
 DOOR, STOP, SUPPLY = 0, 1, 2
 INTERLOCKS = (
-    BoardInputConfig(driver="board_input", name="door", text="shut the door", safe_level="pump_off", input=3),
-    BoardInputConfig(driver="board_input", name="stop_button", text="pull the button", safe_level="vent", input=0),
+    BoardInputConfig(
+        driver="board_input", name="door", text="shut the door", safe_level="pump_off", input=3
+    ),
+    BoardInputConfig(
+        driver="board_input", name="stop_button", text="pull the button", safe_level="vent", input=0
+    ),
     ModbusInputConfig(
         driver="modbus_input",
         name="supply",
@@ -53,7 +67,9 @@ class Rig:
     """A virtual run, tick by tick, with the events so far."""
 
     def __init__(
-        self, config: Config = CONFIG, alter: Callable[[float, BenchReading], BenchReading | None] | None = None
+        self,
+        config: Config = CONFIG,
+        alter: Callable[[float, BenchReading], BenchReading | None] | None = None,
     ) -> None:
         plant = Plant(config.twin, config.pump)
         self.config = config
@@ -100,7 +116,9 @@ def hold() -> Command:
 
 
 @pytest.mark.parametrize("name", LEVELS)
-def test_an_open_circuit_enters_its_own_level_in_the_tick_that_shows_it_and_is_named(name: str) -> None:
+def test_an_open_circuit_enters_its_own_level_in_the_tick_that_shows_it_and_is_named(
+    name: str,
+) -> None:
     rig = Rig()
     rig.until(State.HOLD, hold())
     rig.circuits.open_names = {name}
@@ -113,11 +131,17 @@ def test_an_open_circuit_enters_its_own_level_in_the_tick_that_shows_it_and_is_n
     assert State(int(tick.row.state)) == State.FAULT
     assert SafeLevel(int(tick.row.safe_level)) == LEVELS[name]
     assert tick.row.vent_fraction == (1.0 if name == "stop_button" else 0.0)
-    assert (tick.row.pump_fraction == 0.0) == (name != "supply")  # a ramp begins at the present flow
-    assert rig.of(InterlockOpened) == [InterlockOpened(name, interlock.text, LEVELS[name].name.lower())]
+    assert (tick.row.pump_fraction == 0.0) == (
+        name != "supply"
+    )  # a ramp begins at the present flow
+    assert rig.of(InterlockOpened) == [
+        InterlockOpened(name, interlock.text, LEVELS[name].name.lower())
+    ]
 
 
-@pytest.mark.parametrize("state", [State.CHECK, State.INFLATE, State.SETTLE, State.HOLD, State.MANUAL, State.LOWER])
+@pytest.mark.parametrize(
+    "state", [State.CHECK, State.INFLATE, State.SETTLE, State.HOLD, State.MANUAL, State.LOWER]
+)
 def test_it_is_judged_in_every_state_in_which_gas_moves(state: State) -> None:
     rig = Rig()
     rig.until(State.HOLD if state in (State.MANUAL, State.LOWER) else state, hold())
@@ -194,7 +218,9 @@ def test_a_door_closed_and_opened_again_on_the_way_down_counts() -> None:
 
 
 @pytest.mark.parametrize("first", ["supply", "door"])
-def test_a_deeper_interlock_during_a_fault_deepens_the_level_and_a_milder_one_does_not(first: str) -> None:
+def test_a_deeper_interlock_during_a_fault_deepens_the_level_and_a_milder_one_does_not(
+    first: str,
+) -> None:
     rig = Rig()
     rig.until(State.HOLD, hold())
     rig.circuits.open_names = {first}
@@ -259,7 +285,9 @@ def test_the_same_fault_without_an_interlock_resumes() -> None:
     assert len(rig.of(Resumed)) == 1
 
 
-def test_it_never_resumes_by_itself_and_an_acknowledgement_while_it_is_open_leads_to_standby_only() -> None:
+def test_it_never_resumes_by_itself_and_an_acknowledgement_while_it_is_open_leads_to_standby_only() -> (  # noqa: E501
+    None
+):
     rig = Rig()
     rig.until(State.HOLD, hold())
     rig.circuits.open_names = {"door"}
@@ -317,7 +345,9 @@ def test_a_board_without_inputs_shows_every_circuit_open() -> None:
 
 
 def test_bits_beyond_the_configuration_are_ignored() -> None:
-    rig = Rig(alter=lambda _, reading: replace(reading, interlocks_open=reading.interlocks_open | 0b11000))
+    rig = Rig(
+        alter=lambda _, reading: replace(reading, interlocks_open=reading.interlocks_open | 0b11000)
+    )
     rig.until(State.HOLD, hold())
     assert rig.faults == []
 
@@ -335,9 +365,14 @@ def test_the_status_names_the_open_ones() -> None:
     status = RunStatus()
     for event in rig.events:
         status = status.after_event(event)
-    door, supply = "Interlock door is open: shut the door", "Interlock supply is open: open the bottle"
+    door, supply = (
+        "Interlock door is open: shut the door",
+        "Interlock supply is open: open the bottle",
+    )
     assert [notice.text for notice in status.other_notices] == [door, supply]
-    assert [notice.text for notice in status.after_event(InterlockClosed("door")).other_notices] == [supply]
+    assert [
+        notice.text for notice in status.after_event(InterlockClosed("door")).other_notices
+    ] == [supply]
 
 
 def test_a_replay_decides_the_same_to_the_last_bit() -> None:
@@ -360,7 +395,9 @@ def test_a_replay_decides_the_same_to_the_last_bit() -> None:
         controller.tick(unpack_tick(record, batch.tails.get(int(record["tick"]), b""), {}))
         for record in batch.records
     ]
-    assert [output_crc(outputs, outputs.row.pack()) for outputs in again] == batch.records["output_crc"].tolist()
+    assert [output_crc(outputs, outputs.row.pack()) for outputs in again] == batch.records[
+        "output_crc"
+    ].tolist()
     assert {int(record["interlocks_open"]) for record in batch.records} == {0, 0b010, 0b100}
 
 

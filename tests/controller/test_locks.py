@@ -1,4 +1,6 @@
-"""Locks in the tick: only `unlock` removes one, and while one is set no command, resume or state lets gas in."""
+"""Locks in the tick: only `unlock` removes one, and while one is set no command, resume or state
+lets gas in.
+"""
 
 from __future__ import annotations
 
@@ -22,11 +24,20 @@ from membrane_ctrl.controller.tick import (
 )
 from membrane_ctrl.metrology.optics.film_law import zernike_projection
 from membrane_ctrl.model.events import CommandTaken, LockRemoved, LockSet
-from membrane_ctrl.model.lock import LOCKS_MOST, WORDS, Lock, describe_locks, distinct_word, word_of_number
+from membrane_ctrl.model.lock import (
+    LOCKS_MOST,
+    WORDS,
+    Lock,
+    describe_locks,
+    distinct_word,
+    word_of_number,
+)
 from membrane_ctrl.model.run_status import RunStatus
 from membrane_ctrl.model.telemetry import State
 
-ANN = Lock("bofak", "hands inside", "unix:ann", "unix:ann", "process 7", "2026-01-02T03:04:05+00:00")
+ANN = Lock(
+    "bofak", "hands inside", "unix:ann", "unix:ann", "process 7", "2026-01-02T03:04:05+00:00"
+)
 BOB = Lock("gumil", "lens off", "page:bob", "page:bob", "page 1f", "2026-01-02T03:05:05+00:00")
 LINK = Lock("tarep", "I am inside", "page:link", "", "page 2a", "2026-01-02T03:06:05+00:00")
 
@@ -36,7 +47,9 @@ def lock(of: Lock) -> Command:
 
 
 def unlock(word: str = "", account: str = "", from_person: bool = True) -> Command:
-    return Command("unlock", account or "page:link", text=word, account=account, from_person=from_person)
+    return Command(
+        "unlock", account or "page:link", text=word, account=account, from_person=from_person
+    )
 
 
 def give(mirror: Mirror, *given: Command) -> TickOutputs:
@@ -111,12 +124,26 @@ def test_a_hold_that_was_wanted_already_does_not_begin_with_a_lock() -> None:
 
 def test_two_locks_of_two_authors_need_two_unlocks() -> None:
     mirror = locked(ANN, BOB)
-    (removed,) = [e for e in give(mirror, unlock(account="page:bob")).events if isinstance(e, LockRemoved)]
-    assert (removed.word, removed.author, removed.remover, removed.how) == ("gumil", "page:bob", "page:bob", "author")
+    (removed,) = [
+        e for e in give(mirror, unlock(account="page:bob")).events if isinstance(e, LockRemoved)
+    ]
+    assert (removed.word, removed.author, removed.remover, removed.how) == (
+        "gumil",
+        "page:bob",
+        "page:bob",
+        "author",
+    )
     assert words(mirror) == ["bofak"]
     assert refusals(mirror.tick("hold")) != [""]
-    (removed,) = [e for e in give(mirror, unlock("BOFAK ", "page:bob")).events if isinstance(e, LockRemoved)]
-    assert (removed.word, removed.author, removed.remover, removed.how) == ("bofak", "unix:ann", "page:bob", "word")
+    (removed,) = [
+        e for e in give(mirror, unlock("BOFAK ", "page:bob")).events if isinstance(e, LockRemoved)
+    ]
+    assert (removed.word, removed.author, removed.remover, removed.how) == (
+        "bofak",
+        "unix:ann",
+        "page:bob",
+        "word",
+    )
     assert words(mirror) == []
     assert refusals(mirror.tick("hold")) == [""]
     mirror.until(State.HOLD)
@@ -152,13 +179,17 @@ def test_an_author_of_two_locks_names_the_one() -> None:
     second = replace(ANN, word="dinof", text="still inside")
     mirror = locked(ANN, second)
     assert "several" in refusals(give(mirror, unlock(account="unix:ann")))[0]
-    (removed,) = [e for e in give(mirror, unlock("dinof", "unix:ann")).events if isinstance(e, LockRemoved)]
+    (removed,) = [
+        e for e in give(mirror, unlock("dinof", "unix:ann")).events if isinstance(e, LockRemoved)
+    ]
     assert removed.how == "author"
     assert words(mirror) == ["bofak"]
 
 
 def test_without_a_lock_there_is_nothing_to_unlock() -> None:
-    assert refusals(give(in_state(State.STANDBY), unlock("bofak", "unix:ann"))) == ["no lock is set"]
+    assert refusals(give(in_state(State.STANDBY), unlock("bofak", "unix:ann"))) == [
+        "no lock is set"
+    ]
 
 
 def test_locks_of_people_are_never_merged_and_a_program_that_repeats_itself_sets_one() -> None:
@@ -187,7 +218,12 @@ def test_there_is_a_bound_but_not_for_those_of_earlier_runs() -> None:
 
 def test_a_replay_of_the_recorded_inputs_decides_the_same() -> None:
     mirror, again = in_state(State.HOLD), in_state(State.HOLD)
-    batches = [(lock(ANN), lock(BOB)), (unlock("wrong", "page:bob"),), (unlock("", "page:bob"),), (unlock("bofak"),)]
+    batches = [
+        (lock(ANN), lock(BOB)),
+        (unlock("wrong", "page:bob"),),
+        (unlock("", "page:bob"),),
+        (unlock("bofak"),),
+    ]
     for batch in batches:
         mirror.ticks += 1
         inputs = mirror.inputs(batch)
@@ -204,7 +240,11 @@ def test_a_replay_of_the_recorded_inputs_decides_the_same() -> None:
 
 def test_inputs_of_earlier_versions_have_neither_lock_nor_account() -> None:
     command = Command("latch", "unix:ann", text="hands inside")
-    plain = {key: value for key, value in asdict(command).items() if key not in ("lock", "account", "from_person")}
+    plain = {
+        key: value
+        for key, value in asdict(command).items()
+        if key not in ("lock", "account", "from_person")
+    }
     inputs = TickInputs(1.0, 0.1, None, commands=(command,))
     outputs = in_state(State.STANDBY).controller.tick(inputs)
     taken = TickAssembler().take(pack_tick(1, inputs, outputs, outputs.row.pack()))
@@ -248,5 +288,7 @@ def test_many_locks_are_counted_in_one_line() -> None:
 
 def test_the_author_is_known_by_the_account_alone() -> None:
     assert locks.is_author(unlock(account="unix:ann"), ANN)
-    assert not locks.is_author(unlock(account="unix:ann"), replace(ANN, account="", author="unix:ann"))
+    assert not locks.is_author(
+        unlock(account="unix:ann"), replace(ANN, account="", author="unix:ann")
+    )
     assert not locks.is_author(unlock(), LINK)

@@ -12,7 +12,9 @@ from membrane_ctrl.controller.safety import Observation
 from membrane_ctrl.controller.tick import TickInputs
 
 
-def look(observer: Observer, tick: int, displacement_um: float, counter: int, device_time_s: float) -> Observation:
+def look(
+    observer: Observer, tick: int, displacement_um: float, counter: int, device_time_s: float
+) -> Observation:
     reading = BenchReading(
         displacement_um, 0, 600.0, 101325.0, 23.0, 23.0, 0.0, 0.0, counter, device_time_s, False, 0
     )
@@ -24,19 +26,26 @@ def look(observer: Observer, tick: int, displacement_um: float, counter: int, de
 def test_a_sample_is_new_only_when_counter_and_time_have_both_advanced() -> None:
     observer = Observer(Config())
     stamps = [(1, 0.1), (2, 0.1), (1, 0.2), (2, 0.2)]
-    valid = [look(observer, tick, 0.1 * tick, *stamp).displacement_valid for tick, stamp in enumerate(stamps, 1)]
+    valid = [
+        look(observer, tick, 0.1 * tick, *stamp).displacement_valid
+        for tick, stamp in enumerate(stamps, 1)
+    ]
     assert valid == [True, False, False, True]
 
 
 def test_a_jump_is_believed_after_ten_refusals() -> None:
     observer = Observer(Config())
     look(observer, 1, 0.0, 1, 0.02)
-    valid = [look(observer, tick, 200.0, tick, 0.02 * tick).displacement_valid for tick in range(2, 14)]
+    valid = [
+        look(observer, tick, 200.0, tick, 0.02 * tick).displacement_valid for tick in range(2, 14)
+    ]
     assert valid == [False] * 10 + [True] * 2
 
 
 def gauge(observer: Observer, tick: int, gauge_pa: float) -> Observation:
-    reading = BenchReading(0.1 * (tick % 2), 0, gauge_pa, 101325.0, 23.0, 23.0, 0.0, 0.0, tick, 0.1 * tick, False, 0)
+    reading = BenchReading(
+        0.1 * (tick % 2), 0, gauge_pa, 101325.0, 23.0, 23.0, 0.0, 0.0, tick, 0.1 * tick, False, 0
+    )
     inputs = TickInputs(now_s=0.1 * tick, dt_s=0.1, reading=reading, link_up=True)
     observer.look(inputs)
     return observer.observe(inputs, math.nan)

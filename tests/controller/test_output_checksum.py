@@ -1,4 +1,6 @@
-"""The checksum of a tick's outputs: what it covers, and what may change without another checksum."""
+"""The checksum of a tick's outputs: what it covers, and what may
+change without another checksum.
+"""
 
 from __future__ import annotations
 
@@ -14,7 +16,14 @@ from membrane_ctrl.model.telemetry import FIELDS, TelemetryRow
 
 ROW = TelemetryRow(**{name: float(place) for place, name in enumerate(FIELDS)})
 FAULT = Fault(
-    10, "displacement_missing", "no valid laser reading", "quality 1", "3 ticks", "hold_flow", False, "look"
+    10,
+    "displacement_missing",
+    "no valid laser reading",
+    "quality 1",
+    "3 ticks",
+    "hold_flow",
+    False,
+    "look",
 )
 OUTPUTS = TickOutputs(BenchCommand(0.3, 0.0), ROW, (FAULT, Why("holding")), None, ((7, ""),), 0)
 
@@ -47,7 +56,13 @@ def test_another_decision_or_number_is_another_checksum(other: TickOutputs) -> N
 @pytest.mark.parametrize(
     "other",
     [
-        replace(OUTPUTS, events=(replace(FAULT, cause="the laser has no reading", remedy="clean it"), Why("as is"))),
+        replace(
+            OUTPUTS,
+            events=(
+                replace(FAULT, cause="the laser has no reading", remedy="clean it"),
+                Why("as is"),
+            ),
+        ),
         replace(OUTPUTS, events=(replace(FAULT, name="no_laser"), Why("holding"))),
     ],
 )
@@ -74,4 +89,6 @@ def test_columns_that_the_program_does_not_have_are_named() -> None:
 
 def test_ends_and_events_in_different_places_are_different() -> None:
     entered = StateEntered("hold", "settle", "")
-    assert crc(replace(OUTPUTS, events=(entered,), answers=())) != crc(replace(OUTPUTS, events=(), answers=()))
+    assert crc(replace(OUTPUTS, events=(entered,), answers=())) != crc(
+        replace(OUTPUTS, events=(), answers=())
+    )

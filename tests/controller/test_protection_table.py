@@ -1,4 +1,6 @@
-"""The protection table is complete, names rules that exist, and no bound rests on the sensor that failed."""
+"""The protection table is complete, names rules that exist, and no bound rests on the sensor that
+failed.
+"""
 
 from __future__ import annotations
 
@@ -21,7 +23,8 @@ from membrane_ctrl.controller.safety import MOVING, TABLE
 
 RULES = {rule.name: rule for rule in TABLE}
 CELLS = list(product(ProcessValue, Activity, Duty))
-# Two sensors against one need a third sensor and a film near its working point; excess gas a mirror held long.
+# Two sensors against one need a third sensor and a film near its working point; excess gas a mirror
+# held long.
 NOT_EVERYWHERE = {Duty.MAJORITY, Duty.GAS}
 
 
@@ -30,7 +33,9 @@ def test_every_state_in_which_the_pump_may_run_has_a_row() -> None:
 
 
 @pytest.mark.parametrize(("value", "activity", "duty"), CELLS, ids=lambda part: part.name.lower())
-def test_every_duty_has_a_keeper_that_is_judged_there(value: ProcessValue, activity: Activity, duty: Duty) -> None:
+def test_every_duty_has_a_keeper_that_is_judged_there(
+    value: ProcessValue, activity: Activity, duty: Duty
+) -> None:
     keepers = find_keepers(value, activity, duty)
     assert keepers or duty in NOT_EVERYWHERE
     for keeper in keepers:
@@ -39,12 +44,18 @@ def test_every_duty_has_a_keeper_that_is_judged_there(value: ProcessValue, activ
 
 
 def test_every_guard_is_named_somewhere() -> None:
-    named = {keeper for cell in CELLS for keeper in find_keepers(*cell) if isinstance(keeper, Guard)}
+    named = {
+        keeper for cell in CELLS for keeper in find_keepers(*cell) if isinstance(keeper, Guard)
+    }
     assert named == set(Guard)
 
 
-@pytest.mark.parametrize(("value", "failed", "failure"), list(product(ProcessValue, FilmSensor, Failure)))
-def test_a_failed_sensor_is_bounded_by_another_one(value: ProcessValue, failed: FilmSensor, failure: Failure) -> None:
+@pytest.mark.parametrize(
+    ("value", "failed", "failure"), list(product(ProcessValue, FilmSensor, Failure))
+)
+def test_a_failed_sensor_is_bounded_by_another_one(
+    value: ProcessValue, failed: FilmSensor, failure: Failure
+) -> None:
     if value is ProcessValue.OPTICS and failed is FilmSensor.LASER:
         return  # no laser is used
     bound = find_bound(value, failed, failure, Config())

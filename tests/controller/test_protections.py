@@ -1,4 +1,6 @@
-"""Protections follow whichever sensor shows the film: one fails in virtual time, and the true mirror is judged."""
+"""Protections follow whichever sensor shows the film: one fails in virtual time, and the true
+mirror is judged.
+"""
 
 from __future__ import annotations
 
@@ -22,7 +24,13 @@ from membrane_ctrl.control.experiments.trial import ExperimentSpec
 from membrane_ctrl.controller.commands import Command
 from membrane_ctrl.hold.virtual_run import TruthShape, VirtualRun, VirtualTick
 from membrane_ctrl.metrology.optics.film_law import zernike_projection
-from membrane_ctrl.model.events import ExperimentEnded, Fault, Maintenance, MaintenanceOver, Plausibility
+from membrane_ctrl.model.events import (
+    ExperimentEnded,
+    Fault,
+    Maintenance,
+    MaintenanceOver,
+    Plausibility,
+)
 from membrane_ctrl.model.shape_estimate import ShapeEstimate
 from membrane_ctrl.model.telemetry import SafeLevel, State
 from membrane_ctrl.sim.plant import Plant
@@ -30,7 +38,9 @@ from membrane_ctrl.sim.virtual_bench import VirtualBench, Wrong
 from tests.support.copied_bench import Originals
 
 RATE_HZ = 10.0
-Spoil = Callable[[float, ShapeEstimate], ShapeEstimate | None]  # seconds since the failure, the figure
+Spoil = Callable[
+    [float, ShapeEstimate], ShapeEstimate | None
+]  # seconds since the failure, the figure
 Fail = Callable[[Wrong, float], None]  # switches of the bench, seconds since the failure
 MANUAL_RANGE_UM = StatesConfig().manual_range_um
 
@@ -42,7 +52,9 @@ def config_of(process_value: str, **tables: object) -> Config:
             "loop": LoopConfig(rate_hz=RATE_HZ),
             "shape": ShapeConfig(mode="track", track_rate_hz=RATE_HZ),
             "estimator": EstimatorConfig(process_value=process_value),  # type: ignore[arg-type]
-            "twin": TwinConfig(scenario="quiet", start_error_um=-1.0, laser=process_value != "optics"),
+            "twin": TwinConfig(
+                scenario="quiet", start_error_um=-1.0, laser=process_value != "optics"
+            ),
             **tables,
         }
     )
@@ -93,7 +105,9 @@ class Bench:
         self.run.tick()
 
     def fail(self, seconds: float, fail: Fail = lambda wrong, since_s: None) -> Bench:
-        """Let the sensor fail for a while, or until the run ends; afterwards the outcome can be read."""
+        """Let the sensor fail for a while, or until the run ends; afterwards the outcome can be
+        read.
+        """
         self._failed_s = self.run.now_s
         self.start_um = self.bench.plant.truth().displacement_um
         self._pass(seconds, fail)
@@ -165,7 +179,9 @@ def frozen() -> Spoil:
 
 @pytest.mark.parametrize("lose", [lose_laser, stick_laser], ids=["lost", "stuck"])
 @pytest.mark.parametrize("flow_um_per_s", [5.0, 0.0])
-def test_manual_flow_stays_within_its_range_when_the_laser_fails(lose: Fail, flow_um_per_s: float) -> None:
+def test_manual_flow_stays_within_its_range_when_the_laser_fails(
+    lose: Fail, flow_um_per_s: float
+) -> None:
     held = settled(config_of("estimate"))
     held.command(Command("manual", "a test", value=flow_um_per_s))
     held.fail(60.0, lose)
@@ -193,7 +209,9 @@ def test_the_displacement_limit_holds_by_the_optics_when_the_laser_is_lost() -> 
 
 
 @pytest.mark.parametrize("um_per_s", [-5.0, -1.0, -0.5, 1.0])
-def test_drifting_optics_that_hold_without_a_laser_are_stopped_by_the_gauge(um_per_s: float) -> None:
+def test_drifting_optics_that_hold_without_a_laser_are_stopped_by_the_gauge(
+    um_per_s: float,
+) -> None:
     held = settled(config_of("estimate"), drifting(um_per_s)).fail(200.0, lose_laser)
     assert held.faults == ["laser_gauge_apart"]
     assert held.moved_um < 65.0
@@ -207,7 +225,10 @@ def test_the_loss_of_the_laser_is_reported_at_once_and_its_return_too() -> None:
 
     held = settled(config_of("estimate")).fail(40.0, lose)
     times_s = [
-        t.row.mono_s - held.ticks[0].row.mono_s for t in held.ticks for e in t.events if isinstance(e, Maintenance)
+        t.row.mono_s - held.ticks[0].row.mono_s
+        for t in held.ticks
+        for e in t.events
+        if isinstance(e, Maintenance)
     ]
     assert held.notices == ["laser_lost"]
     assert times_s[0] == pytest.approx(7.0, abs=0.3)
@@ -269,7 +290,9 @@ def test_slow_drift_of_the_optics_is_outvoted_by_laser_and_gauge(um_per_s: float
     assert [event.faulty for event in held.told(Plausibility)] == ["optics"]  # type: ignore[attr-defined]
     assert held.moved_um < 40.0
     assert held.faults == []
-    assert abs(held.ticks[-1].row.truth_displacement_um - held.start_um) < 20.0  # most of it is undone
+    assert (
+        abs(held.ticks[-1].row.truth_displacement_um - held.start_um) < 20.0
+    )  # most of it is undone
 
 
 def test_laser_and_optics_may_drift_apart_no_further_than_the_trim() -> None:
@@ -281,7 +304,9 @@ def test_laser_and_optics_may_drift_apart_no_further_than_the_trim() -> None:
 
 def test_an_experiment_ends_when_the_laser_that_it_measures_with_is_lost() -> None:
     held = settled(config_of("estimate"))
-    spec = ExperimentSpec(kind="relay", duration_s=60.0, limit_um=8.0, holding_flow_um_per_s=1.24, laser_um=1.0)
+    spec = ExperimentSpec(
+        kind="relay", duration_s=60.0, limit_um=8.0, holding_flow_um_per_s=1.24, laser_um=1.0
+    )
     held.command(Command("tune", "a test", experiment=spec))
     held.fail(20.0, lose_laser)
     (ended,) = held.told(ExperimentEnded)
@@ -317,7 +342,9 @@ def stepping(um: float) -> Spoil:
     return lambda since_s, figure: replace(figure, sag_um=figure.sag_um + um)
 
 
-RELAY = ExperimentSpec(kind="relay", duration_s=60.0, limit_um=8.0, holding_flow_um_per_s=1.24, laser_um=1.0)
+RELAY = ExperimentSpec(
+    kind="relay", duration_s=60.0, limit_um=8.0, holding_flow_um_per_s=1.24, laser_um=1.0
+)
 UNDERTAKINGS = {
     "hold": Command("mark", "a test", text="nothing"),
     "setpoint": Command("setpoint", "a test", value=40.0),
@@ -330,7 +357,9 @@ UNDERTAKINGS = {
 @pytest.mark.parametrize("spoil", [drifting(-5.0), drifting(1.0), stepping(-150.0), stepping(30.0)])
 @pytest.mark.parametrize("undertaking", list(UNDERTAKINGS))
 def test_wrong_optics_are_outvoted_whatever_the_hold_does(undertaking: str, spoil: Spoil) -> None:
-    """Laser and gauge are sound; without a comparison while the film moves the loop follows the optics."""
+    """Laser and gauge are sound; without a comparison while the film moves the loop follows the
+    optics.
+    """
     held = settled(config_of("estimate"), spoil)
     held.command(UNDERTAKINGS[undertaking])
     held.fail(90.0)
@@ -356,7 +385,9 @@ def test_a_wrong_laser_ends_an_experiment(process_value: str) -> None:
 
 
 def test_figures_of_another_mirror_count_as_missing() -> None:
-    held = settled(config_of("estimate"), lambda since_s, figure: replace(figure, sag_um=-figure.sag_um)).fail(20.0)
+    held = settled(
+        config_of("estimate"), lambda since_s, figure: replace(figure, sag_um=-figure.sag_um)
+    ).fail(20.0)
     assert held.notices == ["optics_lost"]
     assert held.moved_um < 2.0
 
@@ -391,9 +422,13 @@ def outlying(um: float, one_in: int) -> Spoil:
     return spoil
 
 
-@pytest.mark.parametrize("spoil", [alternating(10.0, 2.0), outlying(15.0, 6)], ids=["alternating", "1 in 6"])
+@pytest.mark.parametrize(
+    "spoil", [alternating(10.0, 2.0), outlying(15.0, 6)], ids=["alternating", "1 in 6"]
+)
 def test_optics_that_jump_again_and_again_are_left_out(spoil: Spoil) -> None:
-    """Each step looks like a knock of the laser; together they led the mirror by hundreds of micrometres."""
+    """Each step looks like a knock of the laser; together they led the mirror by hundreds of
+    micrometres.
+    """
     held = settled(config_of("estimate"), spoil).fail(150.0)
     assert "optics_unsteady" in held.notices
     assert held.moved_um < 30.0
@@ -415,7 +450,9 @@ def leak_more(wrong: Wrong, since_s: float) -> None:
 
 
 def test_optics_that_the_estimate_does_not_use_replace_no_laser() -> None:
-    """With the shape loop off the loop would follow a dead reckoning, and only the optics would be judged."""
+    """With the shape loop off the loop would follow a dead reckoning, and only the optics would be
+    judged.
+    """
     held = settled(config_of("estimate"))
     held.command(Command("shape_off", "a test"))
     held.fail(60.0, leak_more)
@@ -449,6 +486,7 @@ def test_a_laser_that_answers_now_and_then_counts_as_missing() -> None:
 
 def test_a_figure_that_the_shape_loop_cannot_use_is_a_fault_and_no_exception() -> None:
     held = settled(
-        config_of("estimate"), lambda since_s, figure: replace(figure, coeffs_um=figure.coeffs_um[:5])
+        config_of("estimate"),
+        lambda since_s, figure: replace(figure, coeffs_um=figure.coeffs_um[:5]),
     ).fail(5.0)
     assert held.faults == ["tick_error"]

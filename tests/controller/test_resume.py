@@ -1,4 +1,6 @@
-"""The resume rule: only listed faults, only after the whole wait, only so often a day; never after a vent."""
+"""The resume rule: only listed faults, only after the whole wait, only so often a day; never after
+a vent.
+"""
 
 from __future__ import annotations
 
@@ -8,7 +10,14 @@ import pytest
 
 from firmware_iface.register_map import default_map
 from firmware_iface.roles import BenchReading
-from membrane_ctrl.config.schema import Config, LimitsConfig, LoopConfig, ResumeConfig, ShapeConfig, StatesConfig
+from membrane_ctrl.config.schema import (
+    Config,
+    LimitsConfig,
+    LoopConfig,
+    ResumeConfig,
+    ShapeConfig,
+    StatesConfig,
+)
 from membrane_ctrl.controller.commands import AT_START, Command
 from membrane_ctrl.controller.safe_levels import ResumeRule, SafeLevels
 from membrane_ctrl.controller.safety import TABLE, Observation
@@ -47,7 +56,10 @@ class Fault:
     """A fault under the resume rule."""
 
     def __init__(
-        self, name: str = "link_lost", config: ResumeConfig = CONFIG, safe_level: SafeLevel = SafeLevel.PUMP_OFF
+        self,
+        name: str = "link_lost",
+        config: ResumeConfig = CONFIG,
+        safe_level: SafeLevel = SafeLevel.PUMP_OFF,
     ) -> None:
         self.rule = ResumeRule(config, LimitsConfig())
         self.fault, self.levels = RULES[name], SafeLevels(StatesConfig())
@@ -67,7 +79,14 @@ def test_only_what_is_listed_is_possible() -> None:
 def test_what_never_resumes_is_not_possible_although_it_is_listed() -> None:
     config = ResumeConfig(faults=tuple(RULES), wait_s=10.0)
     never = {name for name, rule in RULES.items() if not rule.may_resume}
-    assert {"over_pressure", "over_displacement", "board_fault", "pump_runs_on", "board_taken", "locked"} <= never
+    assert {
+        "over_pressure",
+        "over_displacement",
+        "board_fault",
+        "pump_runs_on",
+        "board_taken",
+        "locked",
+    } <= never
     for name in never:
         fault = Fault(name, config)
         fault.due(0.0)
@@ -85,13 +104,17 @@ def test_what_never_resumes_is_not_possible_although_it_is_listed() -> None:
         replace(GONE, foreign=1),
     ],
 )
-def test_one_sight_of_a_latch_or_an_open_vent_decides_for_the_whole_fault(seen: Observation) -> None:
+def test_one_sight_of_a_latch_or_an_open_vent_decides_for_the_whole_fault(
+    seen: Observation,
+) -> None:
     fault = Fault()
     fault.due(0.0, LOST)
     assert fault.rule.possible
     fault.due(1.0, seen)
     assert (fault.rule.possible, fault.rule.clear_mask) == (False, 0)
-    assert not any(fault.due(2.0 + second) for second in range(60))  # although nothing of it is visible any more
+    assert not any(
+        fault.due(2.0 + second) for second in range(60)
+    )  # although nothing of it is visible any more
     assert not fault.rule.possible
     fault.rule.forget()
     fault.due(100.0)
@@ -157,8 +180,12 @@ def test_a_cause_that_comes_back_during_the_wait_is_waited_for_from_its_end(wron
     ("wrong", "fault"), [("no_light", "displacement_missing"), ("gauge_lost", "pressure_missing")]
 )
 def test_a_cause_that_stays_is_waited_out(wrong: str, fault: str) -> None:
-    """The link is there all the time, the sensor comes back at 100 s: nothing may resume before 110 s."""
-    outcome = play(scenario(At(time_s=20.0, wrong=wrong, for_s=80.0), duration_s=115.0, faults=(fault,)))
+    """The link is there all the time, the sensor comes back at 100 s: nothing may resume before 110
+    s.
+    """
+    outcome = play(
+        scenario(At(time_s=20.0, wrong=wrong, for_s=80.0), duration_s=115.0, faults=(fault,))
+    )
     assert [event["name"] for event in outcome.of("fault")] == [fault]
     resumed = [event["mono_s"] for event in outcome.of("state") if event["from"] == "fault"]
     assert len(resumed) == 1
@@ -180,7 +207,10 @@ def test_a_wait_does_not_count_in_the_next_fault() -> None:
 
 
 def test_a_flaky_link_does_not_keep_the_mirror_down() -> None:
-    steps = (At(time_s=20.0, wrong="unreachable", for_s=2.0), At(time_s=22.5, wrong="lost_every", value=7))
+    steps = (
+        At(time_s=20.0, wrong="unreachable", for_s=2.0),
+        At(time_s=22.5, wrong="lost_every", value=7),
+    )
     outcome = play(scenario(*steps, duration_s=40.0, faults=("link_lost",)))
     left = [event["mono_s"] for event in outcome.of("state") if event["from"] == "fault"]
     assert len(left) == 1
@@ -188,7 +218,9 @@ def test_a_flaky_link_does_not_keep_the_mirror_down() -> None:
 
 
 def test_a_board_that_has_vented_while_the_link_was_down_stays_down() -> None:
-    """Its own limit trips at 800 Pa during the outage; afterwards gauge, link and vent are as they should be."""
+    """Its own limit trips at 800 Pa during the outage; afterwards gauge, link and vent are as they
+    should be.
+    """
     steps = (
         At(time_s=20.0, wrong="unreachable", for_s=5.0),
         At(time_s=21.0, wrong="gauge_offset_pa", value=300.0, for_s=2.0),
@@ -219,7 +251,13 @@ def test_a_start_tells_of_earlier_resumes_and_nobody_else_does(who: str, possibl
     )
     bench = VirtualBench(Plant(config.twin, config.pump))
     run = VirtualRun(config, bench, zernike_projection())
-    run.tick((Command("resumed", who, value=7200.0), Command("resumed", who, value=60.0), Command("hold", "ann")))
+    run.tick(
+        (
+            Command("resumed", who, value=7200.0),
+            Command("resumed", who, value=60.0),
+            Command("hold", "ann"),
+        )
+    )
     resumed = 0
     for tick in range(400):
         bench.wrong.unreachable = 200 <= tick < 210

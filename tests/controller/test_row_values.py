@@ -26,7 +26,13 @@ def rows() -> list[TelemetryRow]:
         {"time_s": 80.0, "command": "hold"},
         {"time_s": 100.0, "command": "lower"},
     ]
-    about = {"title": "rows", "duration_s": 110.0, "config": {"loop": {"rate_hz": 10.0}}, "at": at, "expect": {}}
+    about = {
+        "title": "rows",
+        "duration_s": 110.0,
+        "config": {"loop": {"rate_hz": 10.0}},
+        "at": at,
+        "expect": {},
+    }
     return [tick.row for tick in play(CheckedScenario.model_validate(about)).ticks]
 
 

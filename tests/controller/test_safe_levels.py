@@ -35,8 +35,12 @@ def test_a_safe_level_further_up_is_not_entered() -> None:
     assert levels.age_s(1.0) == 1.0
 
 
-@pytest.mark.parametrize(("clear_s", "left_s"), [(0.5, 2.5), (6.0, 8.0), (8.0, 10.0), (1000.0, 10.0)])
-def test_the_time_of_the_first_safe_level_comes_back_only_as_fast_as_it_went(clear_s: float, left_s: float) -> None:
+@pytest.mark.parametrize(
+    ("clear_s", "left_s"), [(0.5, 2.5), (6.0, 8.0), (8.0, 10.0), (1000.0, 10.0)]
+)
+def test_the_time_of_the_first_safe_level_comes_back_only_as_fast_as_it_went(
+    clear_s: float, left_s: float
+) -> None:
     levels = SafeLevels(CONFIG)
     levels.enter(SafeLevel.HOLD_FLOW, 0.0)
     levels.clear(8.0)

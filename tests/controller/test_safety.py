@@ -1,4 +1,6 @@
-"""Every row of the safety table: one tick short of its N of M nothing happens, at N the fault trips."""
+"""Every row of the safety table: one tick short of its N of M nothing happens, at N the fault
+trips.
+"""
 
 from __future__ import annotations
 
@@ -55,7 +57,9 @@ BAD = {
     "pump_runs_on": replace(GOOD, runs_on="read-back 100 %"),
     "gas_comes_in": replace(GOOD, inflow="+40 µm in 20 s"),
     "board_taken": replace(GOOD, foreign=FOREIGN_PERIOD),
-    "interlock_open": replace(GOOD, open_interlocks=1, interlock_level=SafeLevel.PUMP_OFF, interlock_words="door"),
+    "interlock_open": replace(
+        GOOD, open_interlocks=1, interlock_level=SafeLevel.PUMP_OFF, interlock_words="door"
+    ),
     "locked": replace(GOOD, locked="hands inside"),
     "late": replace(GOOD, lateness_ms=LIMITS.lateness_max_ms + 1),
 }
@@ -139,13 +143,22 @@ def test_what_the_operator_is_told_carries_the_value() -> None:
     [
         (FOREIGN_CLAIM, "another claim is in force"),
         (FOREIGN_PERIOD, "another watchdog period is in force"),
-        (FOREIGN_CLAIM | FOREIGN_PERIOD, "another claim is in force and another watchdog period is in force"),
+        (
+            FOREIGN_CLAIM | FOREIGN_PERIOD,
+            "another claim is in force and another watchdog period is in force",
+        ),
     ],
 )
-def test_a_board_that_is_not_as_it_was_set_is_a_fault_in_the_same_tick(state: State, foreign: int, seen: str) -> None:
+def test_a_board_that_is_not_as_it_was_set_is_a_fault_in_the_same_tick(
+    state: State, foreign: int, seen: str
+) -> None:
     verdict = SafetyTable(LIMITS).judge(state, replace(GOOD, foreign=foreign))
     assert verdict.rule is not None
-    assert (verdict.rule.name, verdict.rule.may_resume, verdict.seen) == ("board_taken", False, seen)
+    assert (verdict.rule.name, verdict.rule.may_resume, verdict.seen) == (
+        "board_taken",
+        False,
+        seen,
+    )
 
 
 UNSEEN = {
@@ -197,19 +210,31 @@ def test_the_mirror_may_be_far_from_its_setpoint_on_neither_side(side: float) ->
 @pytest.mark.parametrize("level", [SafeLevel.RAMP_DOWN, SafeLevel.PUMP_OFF, SafeLevel.VENT])
 @pytest.mark.parametrize("state", [state for state in State if state != State.STANDBY])
 def test_an_open_interlock_enters_its_own_level_in_one_tick(state: State, level: SafeLevel) -> None:
-    verdict = SafetyTable(LIMITS).judge(state, replace(BAD["interlock_open"], interlock_level=level))
+    verdict = SafetyTable(LIMITS).judge(
+        state, replace(BAD["interlock_open"], interlock_level=level)
+    )
     assert verdict.rule is not None
-    assert (verdict.rule.name, verdict.safe_level, verdict.seen) == ("interlock_open", level, "door")
+    assert (verdict.rule.name, verdict.safe_level, verdict.seen) == (
+        "interlock_open",
+        level,
+        "door",
+    )
     assert verdict.rule.fault(verdict.seen, verdict.safe_level).safe_level == level.name.lower()
 
 
 def test_an_open_interlock_whose_level_is_not_known_stops_the_pump_at_least_slowly() -> None:
-    verdict = SafetyTable(LIMITS).judge(State.HOLD, replace(BAD["interlock_open"], interlock_level=SafeLevel.NONE))
+    verdict = SafetyTable(LIMITS).judge(
+        State.HOLD, replace(BAD["interlock_open"], interlock_level=SafeLevel.NONE)
+    )
     assert verdict.safe_level == SafeLevel.RAMP_DOWN
 
 
-@pytest.mark.parametrize(("level", "name"), [(SafeLevel.RAMP_DOWN, "link_lost"), (SafeLevel.VENT, "interlock_open")])
-def test_of_rules_that_trip_together_the_level_of_this_observation_decides(level: SafeLevel, name: str) -> None:
+@pytest.mark.parametrize(
+    ("level", "name"), [(SafeLevel.RAMP_DOWN, "link_lost"), (SafeLevel.VENT, "interlock_open")]
+)
+def test_of_rules_that_trip_together_the_level_of_this_observation_decides(
+    level: SafeLevel, name: str
+) -> None:
     both = replace(BAD["link_lost"], open_interlocks=1, interlock_level=level)
     rule = SafetyTable(LIMITS).judge(State.HOLD, both).rule
     assert rule is not None

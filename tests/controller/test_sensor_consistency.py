@@ -39,7 +39,9 @@ class Seconds:
     ) -> None:
         for _ in range(seconds):
             self.now_s += 1.0
-            reading = BenchReading(0.0, 0, gauge_pa, ambient_pa, 20.0, 20.0, 0.3, 0.0, 1, self.now_s, False, 0)
+            reading = BenchReading(
+                0.0, 0, gauge_pa, ambient_pa, 20.0, 20.0, 0.3, 0.0, 1, self.now_s, False, 0
+            )
             figure = self._shape() if camera else None
             inputs = TickInputs(self.now_s, 1.0, reading, estimate=figure)
             held = HoldStatus(
@@ -60,8 +62,20 @@ class Seconds:
         nothing = np.zeros(ZERNIKE_TERMS)
         sag_um = SAG_UM if self.camera_stuck else SAG_UM + 0.001 * (self.now_s % 7)
         return ShapeEstimate(
-            self.now_s, "fringes", nothing, 0.0, np.eye(ZERNIKE_TERMS), sag_um, 1.0, 0.0, 1.0, 1.0, 80.0, 0.0, "ok"
-        )  # fmt: skip
+            self.now_s,
+            "fringes",
+            nothing,
+            0.0,
+            np.eye(ZERNIKE_TERMS),
+            sag_um,
+            1.0,
+            0.0,
+            1.0,
+            1.0,
+            80.0,
+            0.0,
+            "ok",
+        )
 
 
 def test_gas_that_nobody_explains_is_told_and_forgotten_with_the_hold() -> None:
@@ -116,7 +130,9 @@ def test_a_barometer_in_another_unit_is_told_once_and_taken_back_once() -> None:
     mirror.pass_by(100, ambient_pa=1013.25)
     mirror.pass_by(100)
     mirror.pass_by(5, ambient_pa=1013.25)
-    kinds = [event.kind for event in mirror.events if getattr(event, "name", "") == "weather_sensor"]
+    kinds = [
+        event.kind for event in mirror.events if getattr(event, "name", "") == "weather_sensor"
+    ]
     assert kinds == ["maintenance", "maintenance_over"]
 
 

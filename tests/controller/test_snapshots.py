@@ -1,4 +1,6 @@
-"""Snapshots of the controller: a replay that begins with one is identical to the last bit; others are refused."""
+"""Snapshots of the controller: a replay that begins with one is identical to the last bit; others
+are refused.
+"""
 
 from __future__ import annotations
 
@@ -15,7 +17,12 @@ import pytest
 from membrane_ctrl.cli import run
 from membrane_ctrl.config.schema import Config
 from membrane_ctrl.controller.controller import Controller
-from membrane_ctrl.controller.snapshot import UnknownSnapshotError, continue_from, decode_snapshot, take_snapshot
+from membrane_ctrl.controller.snapshot import (
+    UnknownSnapshotError,
+    continue_from,
+    decode_snapshot,
+    take_snapshot,
+)
 from membrane_ctrl.controller.tick import SNAPSHOT_BYTES_MAX
 from membrane_ctrl.metrology.optics.film_law import zernike_projection
 from membrane_ctrl.model.errors import Exit
@@ -59,7 +66,9 @@ def with_value(path: str, value: object) -> bytes:
     return as_snapshot(data)
 
 
-@pytest.mark.parametrize("tick", [2, 150, MIDDLE, 720, LATER])  # in check, inflate, hold, without a laser
+@pytest.mark.parametrize(
+    "tick", [2, 150, MIDDLE, 720, LATER]
+)  # in check, inflate, hold, without a laser
 def test_what_follows_is_the_same_to_the_last_bit(tick: int) -> None:
     controller = resume(snapshot_at(TICKS, tick))
     for inputs, outputs in TICKS[tick - 1 :]:
@@ -70,7 +79,9 @@ def test_what_follows_is_the_same_to_the_last_bit(tick: int) -> None:
 
 @pytest.mark.parametrize("name", STORIES)
 def test_a_replay_goes_from_snapshot_to_snapshot_with_the_same_bits(name: str) -> None:
-    """In every state, with every sensor lost, on trial and in all experiments: nothing is remembered elsewhere."""
+    """In every state, with every sensor lost, on trial and in all experiments: nothing is
+    remembered elsewhere.
+    """
     story = STORIES[name]
     ticks, last = record_story(story)
     controller = Controller(story.config, zernike_projection())
@@ -79,7 +90,11 @@ def test_a_replay_goes_from_snapshot_to_snapshot_with_the_same_bits(name: str) -
             controller = resume(take_snapshot(controller), story.config)
         again = controller.tick(inputs)
         assert again.row.pack() == outputs.row.pack(), number
-        assert (again.command, again.events, again.answers) == (outputs.command, outputs.events, outputs.answers)
+        assert (again.command, again.events, again.answers) == (
+            outputs.command,
+            outputs.events,
+            outputs.answers,
+        )
     assert find_differences(controller.memory, last) == []
 
 
@@ -100,7 +115,9 @@ def test_a_snapshot_is_small_and_needs_no_other_file() -> None:
 def test_another_layout_is_refused_by_name() -> None:
     data = plain()
     del data["loop"]["integrator"]["error_um"]
-    with pytest.raises(UnknownSnapshotError, match=r"another layout: loop\.integrator\.error_um is missing"):
+    with pytest.raises(
+        UnknownSnapshotError, match=r"another layout: loop\.integrator\.error_um is missing"
+    ):
         resume(as_snapshot(data))
     data = plain()
     data["loop"]["integrator"]["wound_up"] = 0.0
@@ -173,7 +190,8 @@ def test_every_value_is_checked_against_its_type(path: str, value: object) -> No
 
 
 @pytest.mark.parametrize(
-    ("path", "value"), [("fault", 9999), ("gains.tried.loop.rate_hz", 200.0), ("gains.good.loop.rate_hz", 200.0)]
+    ("path", "value"),
+    [("fault", 9999), ("gains.tried.loop.rate_hz", 200.0), ("gains.good.loop.rate_hz", 200.0)],
 )
 def test_what_does_not_fit_the_configuration_is_refused(path: str, value: object) -> None:
     with pytest.raises(UnknownSnapshotError, match="does not fit the configuration"):
@@ -185,9 +203,14 @@ def test_the_limits_are_those_of_the_run_and_not_of_its_snapshot() -> None:
 
 
 def test_random_damage_is_refused_or_replayed_without_a_traceback() -> None:
-    """A forged snapshot of right types may hold any values; then the first tick that raises refuses it."""
+    """A forged snapshot of right types may hold any values; then the first tick that raises refuses
+    it.
+    """
     random_of = random.Random(15)
-    ticks = [RecordedTick(MIDDLE + k, inputs, 0) for k, (inputs, _) in enumerate(TICKS[MIDDLE - 1 : MIDDLE + 20])]
+    ticks = [
+        RecordedTick(MIDDLE + k, inputs, 0)
+        for k, (inputs, _) in enumerate(TICKS[MIDDLE - 1 : MIDDLE + 20])
+    ]
     outcomes = Counter[str]()
     for _ in range(1500):
         data = bytearray(SNAPSHOT)
@@ -231,7 +254,9 @@ def test_a_tick_that_raises_after_a_forged_snapshot_is_the_snapshots_fault() -> 
     consistency.camera_s = inputs.now_s
     consistency.plausibility.age_s, consistency.plausibility.readings = 100.0, 1000
     consistency.plausibility.optics.value = 37_000.0
-    consistency.plausibility.fast.begin((0.0, 37_000.0, 0.0))  # no gauge pressure, by which it divides
+    consistency.plausibility.fast.begin(
+        (0.0, 37_000.0, 0.0)
+    )  # no gauge pressure, by which it divides
     forged = take_snapshot(controller)
     with pytest.raises(UnknownSnapshotError, match="cannot be used: ZeroDivisionError at 13"):
         replay(CONFIG, [RecordedTick(MIDDLE, inputs, 0, forged)], zernike_projection())
@@ -258,7 +283,9 @@ def record(tmp_path: Path) -> Path:
     return folder
 
 
-@pytest.mark.parametrize(("start", "first"), [("13.2s", MIDDLE), ("16.9s", MIDDLE), ("18s", LATER), ("5s", 1)])
+@pytest.mark.parametrize(
+    ("start", "first"), [("13.2s", MIDDLE), ("16.9s", MIDDLE), ("18s", LATER), ("5s", 1)]
+)
 def test_a_replay_begins_with_the_last_snapshot_before(
     record: Path, start: str, first: int, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -294,7 +321,9 @@ def test_a_snapshot_of_another_layout_is_told_and_the_replay_begins_with_the_run
     assert "begins" not in printed.out
 
 
-def test_an_incident_begins_in_the_middle(record: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_an_incident_begins_in_the_middle(
+    record: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.chdir(tmp_path)
     (tmp_path / "tests" / "incidents").mkdir(parents=True)
     window = ("--from", "13.5s", "--to", "16s")
@@ -351,19 +380,25 @@ def test_inputs_of_which_nothing_can_be_read_are_said_to_be_so(
     assert said.count("\n") == 1
 
 
-def test_the_state_at_the_end_of_a_part_is_printed(record: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_the_state_at_the_end_of_a_part_is_printed(
+    record: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     assert run(["replay", str(record), "--from", "13.2s", "--to", "14s", "--state"]) == Exit.DONE
     lines = capsys.readouterr().out.splitlines()
     assert "state      after the tick at 14.000 s:" in lines
     assert [line.split() for line in lines if line.startswith("ticks ")] == [["ticks", "700"]]
-    assert [line.split()[1] for line in lines if line.startswith("state ") and "after" not in line] == ["SETTLE"]
+    assert [
+        line.split()[1] for line in lines if line.startswith("state ") and "after" not in line
+    ] == ["SETTLE"]
     assert run(["replay", str(record), "--to", "14s", "--state", "--json"]) == Exit.DONE
     report = json.loads(capsys.readouterr().out, parse_constant=pytest.fail)
     assert (report["state"]["ticks"], report["state"]["state"]) == (700, "SETTLE")
     assert report["state"]["gains"]["until_s"] is None  # JSON has no NaN
 
 
-def test_a_replayed_state_is_compared_with_each_snapshot(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_replayed_state_is_compared_with_each_snapshot(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     other = json.loads(snapshot_at(TICKS, LATER))
     other["loop"]["curve"]["kick_left_s"] = 1.0
     write_record(tmp_path, TICKS, snapshots={MIDDLE: SNAPSHOT, LATER: as_snapshot(other)})

@@ -24,7 +24,9 @@ class Watched:
         self.stand = Standstill(CONFIG.loop, CONFIG.states)
         self.now_s = 0.0
 
-    def look(self, reading: BenchReading | None = STILL, commanded: float = 0.0, link_up: bool = True) -> Standstill:
+    def look(
+        self, reading: BenchReading | None = STILL, commanded: float = 0.0, link_up: bool = True
+    ) -> Standstill:
         self.now_s += DT_S
         self.stand.look(self.now_s, reading, (commanded, commanded), link_up)
         return self.stand
@@ -33,7 +35,9 @@ class Watched:
         start = STILL
         for tick in range(round(seconds / DT_S)):
             t_s = tick * DT_S
-            reading = replace(start, displacement_um=um_per_s * t_s, gauge_pressure_pa=600.0 + pa_per_s * t_s)
+            reading = replace(
+                start, displacement_um=um_per_s * t_s, gauge_pressure_pa=600.0 + pa_per_s * t_s
+            )
             if self.look(replace(reading, **wrong)).inflow:  # type: ignore[arg-type]  # numbers all of them
                 return self.stand.inflow
         return ""
@@ -118,7 +122,9 @@ def test_warm_air_and_a_falling_barometer_are_allowed_for() -> None:
         watched = Watched()
         for _ in range(10):
             watched.look()
-        assert not watched.rises(3.0 if "air_temperature_c" in change else 2.0, 0.15, 22.0, **change)
+        assert not watched.rises(
+            3.0 if "air_temperature_c" in change else 2.0, 0.15, 22.0, **change
+        )
 
 
 def test_at_rest_is_seen_after_two_seconds_and_not_while_the_mirror_rises() -> None:
@@ -126,7 +132,9 @@ def test_at_rest_is_seen_after_two_seconds_and_not_while_the_mirror_rises() -> N
     rests = [watched.look().at_rest for _ in range(40)]
     assert rests.index(True) == pytest.approx(25, abs=2)
     rising = Watched()
-    assert not any(rising.look(replace(STILL, displacement_um=4.0 * DT_S * tick)).at_rest for tick in range(40))
+    assert not any(
+        rising.look(replace(STILL, displacement_um=4.0 * DT_S * tick)).at_rest for tick in range(40)
+    )
     blind = Watched()
     assert any(blind.look(replace(STILL, displacement_quality=1)).at_rest for _ in range(40))
 
@@ -141,9 +149,12 @@ def test_weather_on_films_that_lose_no_gas_is_no_pump() -> None:
         plant.advance(0.2)
         sample = plant.sample()
         reading = replace(
-            STILL, displacement_um=sample.displacement_um, gauge_pressure_pa=sample.gauge_pressure_pa,
-            ambient_pressure_pa=sample.ambient_pressure_pa, air_temperature_c=sample.air_temperature_c,
-        )  # fmt: skip
+            STILL,
+            displacement_um=sample.displacement_um,
+            gauge_pressure_pa=sample.gauge_pressure_pa,
+            ambient_pressure_pa=sample.ambient_pressure_pa,
+            air_temperature_c=sample.air_temperature_c,
+        )
         stand.look(0.2 * tick, reading, (0.0, 0.0), True)
         assert not stand.inflow
         rests += stand.at_rest

@@ -1,4 +1,6 @@
-"""With any readings and any commands in any order, the invariants of the state machine hold (hypothesis)."""
+"""With any readings and any commands in any order, the invariants of the state machine hold
+(hypothesis).
+"""
 
 from __future__ import annotations
 
@@ -26,7 +28,9 @@ CONFIG = Config(
     devices=DevicesConfig.model_validate({"board": "tcp://twin", "interlocks": INTERLOCKS}),
     loop=LoopConfig(rate_hz=1 / DT_S),
     shape=ShapeConfig(enabled=False),
-    states=StatesConfig(check_s=0.3, actuator_test=False, settle_s=0.3, hold_flow_max_s=1.0, ramp_down_s=1.0),
+    states=StatesConfig(
+        check_s=0.3, actuator_test=False, settle_s=0.3, hold_flow_max_s=1.0, ramp_down_s=1.0
+    ),
 )
 MAY_PUMP = MOVING | {State.CHECK, State.FAULT}
 
@@ -39,7 +43,9 @@ readings = st.builds(
     ambient_pressure_pa=st.one_of(st.just(101325.0), anything),
     air_temperature_c=st.one_of(st.just(23.0), anything),
     gas_temperature_c=anything,
-    pump_fraction=st.one_of(st.just(math.inf), st.floats(0, 1), anything),  # inf: what was commanded
+    pump_fraction=st.one_of(
+        st.just(math.inf), st.floats(0, 1), anything
+    ),  # inf: what was commanded
     vent_fraction=st.one_of(st.just(0.0), anything),
     sample_counter=st.integers(0, 3),  # how far it advances
     device_time_s=st.just(0.0),
@@ -50,7 +56,9 @@ readings = st.builds(
 steady = BenchReading(0.0, 0, 600.0, 101325.0, 23.0, 23.0, math.inf, 0.0, 1, 0.0, False, 0)
 commands = st.builds(
     Command,
-    kind=st.sampled_from([*sorted(set(TABLE) - {"tune"}), "manual", "manual", "manual", "hold", "setpoint", "ack"]),
+    kind=st.sampled_from(
+        [*sorted(set(TABLE) - {"tune"}), "manual", "manual", "manual", "hold", "setpoint", "ack"]
+    ),
     who=st.just("hypothesis"),
     value=st.one_of(st.floats(0, 5), st.floats(0, 5), st.floats(-20, 20), anything),
     text=st.sampled_from(["", "x"]),
@@ -101,7 +109,11 @@ class Driver:
                 interlocks_open=reading.interlocks_open,
             )
         inputs = TickInputs(
-            now_s=self.tick * DT_S, dt_s=DT_S, reading=reading if link_up else None, link_up=link_up, commands=asked
+            now_s=self.tick * DT_S,
+            dt_s=DT_S,
+            reading=reading if link_up else None,
+            link_up=link_up,
+            commands=asked,
         )
         interlock_open = inputs.reading is not None and inputs.reading.interlocks_open != 0
         self.look(self.controller.tick(inputs), len(asked), interlock_open)
@@ -116,7 +128,11 @@ class Driver:
         assert safe_level != SafeLevel.VENT or command.vent_fraction == 1.0
         assert (safe_level > SafeLevel.HOLD_FLOW) == (state == State.FAULT)
         assert (row.fault != 0) == (safe_level != SafeLevel.NONE)
-        assert safe_level >= self.safe_level or self.safe_level == SafeLevel.HOLD_FLOW or state == State.STANDBY
+        assert (
+            safe_level >= self.safe_level
+            or self.safe_level == SafeLevel.HOLD_FLOW
+            or state == State.STANDBY
+        )
         if state == State.FAULT:
             assert command.pump_fraction <= self.fault_pump
             self.fault_pump = command.pump_fraction

@@ -65,12 +65,18 @@ def test_the_ramp_down_is_a_straight_line() -> None:
     before = [row.pump_fraction for row in rows if row.mono_s < fault_s][-1]
     for row in rows:
         if fault_s <= row.mono_s < fault_s + 10.0:
-            assert row.pump_fraction == pytest.approx(before * (1.0 - (row.mono_s - fault_s) / 10.0), abs=1e-6)
+            assert row.pump_fraction == pytest.approx(
+                before * (1.0 - (row.mono_s - fault_s) / 10.0), abs=1e-6
+            )
 
 
 def test_a_pause_that_nobody_ends_ends_itself() -> None:
     outcome = played({"time_s": 20.0, "command": "pause"}, states={"pause_max_s": 15.0})
-    paused = [tick.row.mono_s for tick in outcome.ticks if tick.row.mono_s > 20.5 and tick.row.p_um_per_s == 0.0]
+    paused = [
+        tick.row.mono_s
+        for tick in outcome.ticks
+        if tick.row.mono_s > 20.5 and tick.row.p_um_per_s == 0.0
+    ]
     assert 34.5 < max(second for second in paused if second < 50.0) < 35.5
 
 
@@ -98,19 +104,29 @@ def test_what_is_called_hold_has_been_inside_the_band_for_settle_s() -> None:
     outcome = played(states={"settle_s": 6.0}, duration_s=40.0)
     settle_s, hold_s = changes(outcome, "settle")[0], changes(outcome, "hold")[0]
     assert hold_s - settle_s >= 6.0
-    errors_um = [tick.row.error_um for tick in outcome.ticks if hold_s - 6.0 < tick.row.mono_s < hold_s]
+    errors_um = [
+        tick.row.error_um for tick in outcome.ticks if hold_s - 6.0 < tick.row.mono_s < hold_s
+    ]
     assert max(map(abs, errors_um)) < 2.0
 
 
 def test_venting_without_a_gauge_goes_on() -> None:
-    outcome = played({"time_s": 20.0, "wrong": "gauge_lost"}, {"time_s": 20.0, "command": "vent"}, duration_s=40.0)
+    outcome = played(
+        {"time_s": 20.0, "wrong": "gauge_lost"},
+        {"time_s": 20.0, "command": "vent"},
+        duration_s=40.0,
+    )
     rows = [tick.row for tick in outcome.ticks if 21.0 < tick.row.mono_s < 40.0]
     assert {row.state for row in rows} == {State.LOWER}
     assert {row.vent_fraction for row in rows} == {1.0}
 
 
 def test_a_vent_that_does_not_empty_the_bowl_is_told_of() -> None:
-    outcome = played({"time_s": 20.0, "wrong": "gauge_lost"}, {"time_s": 20.0, "command": "vent"}, duration_s=950.0)
+    outcome = played(
+        {"time_s": 20.0, "wrong": "gauge_lost"},
+        {"time_s": 20.0, "command": "vent"},
+        duration_s=950.0,
+    )
     (told,) = [event for event in outcome.of("why") if "check the vent" in event["why"]]
     assert 920.0 <= told["mono_s"] < 930.0
     assert not changes(outcome, "standby")
@@ -145,8 +161,12 @@ def test_manual_lapses_and_the_loop_takes_the_mirror_back() -> None:
         {"time_s": 30.0, "command": "manual", "value": 1.1},
         states={"manual_max_s": 15.0, "manual_range_um": 1000.0},
     )
-    assert [change for change in changes(outcome, "inflate") if change > 20.0] == [pytest.approx(45.1, abs=0.15)]
-    assert "no flow was set for 15 s" in next(e["why"] for e in outcome.of("state") if e["from"] == "manual")
+    assert [change for change in changes(outcome, "inflate") if change > 20.0] == [
+        pytest.approx(45.1, abs=0.15)
+    ]
+    assert "no flow was set for 15 s" in next(
+        e["why"] for e in outcome.of("state") if e["from"] == "manual"
+    )
     assert len(changes(outcome, "hold")) == 2
 
 
@@ -156,7 +176,9 @@ def test_manual_ends_where_the_mirror_strays_too_far(flow: float) -> None:
     (manual_s,) = changes(outcome, "manual")
     back = next(e for e in outcome.of("state") if e["from"] == "manual")
     assert back["why"].startswith("manual is over: more than 50 µm")
-    away_um = [abs(tick.row.truth_displacement_um) for tick in outcome.ticks if tick.row.mono_s > manual_s]
+    away_um = [
+        abs(tick.row.truth_displacement_um) for tick in outcome.ticks if tick.row.mono_s > manual_s
+    ]
     assert 45.0 < max(away_um) < 60.0
     assert State(outcome.ticks[-200].row.state) == State.HOLD
 
@@ -177,7 +199,8 @@ def test_manual_without_a_laser_gives_the_mean_flow_of_the_hold_before_it() -> N
 
 def test_nobody_takes_the_pump_while_the_mean_flow_is_held() -> None:
     outcome = played(
-        {"time_s": 20.0, "wrong": "no_light", "for_s": 5.0}, {"time_s": 22.0, "command": "manual", "value": 5.3}
+        {"time_s": 20.0, "wrong": "no_light", "for_s": 5.0},
+        {"time_s": 22.0, "command": "manual", "value": 5.3},
     )
     (refused,) = [event for event in outcome.of("command") if event["command"] == "manual"]
     assert "holds the mean flow" in refused["refused"]
@@ -207,7 +230,9 @@ def test_a_stop_of_a_pump_that_runs_on_is_no_success() -> None:
     assert outcome.ticks[-1].outputs.finished == Exit.SAFETY_TRIP
     assert last.row.mono_s < 40.0
     assert (last.outputs.command.pump_fraction, last.outputs.command.vent_fraction) == (0.0, 1.0)
-    assert [(event["name"], "100 %" in event["seen"]) for event in outcome.of("fault")] == [("pump_runs_on", True)]
+    assert [(event["name"], "100 %" in event["seen"]) for event in outcome.of("fault")] == [
+        ("pump_runs_on", True)
+    ]
 
 
 @pytest.mark.parametrize("lower_s", [0.0, 20.0])
@@ -266,7 +291,9 @@ def test_a_way_down_is_over_only_when_the_pump_is_seen_to_be_off() -> None:
 
 
 @pytest.mark.parametrize("stop", [(), ({"time_s": 21.0, "command": "stop"},)])
-def test_a_fault_ends_the_run_only_when_the_pump_is_seen_to_be_off(stop: tuple[dict[str, Any], ...]) -> None:
+def test_a_fault_ends_the_run_only_when_the_pump_is_seen_to_be_off(
+    stop: tuple[dict[str, Any], ...],
+) -> None:
     """Whether the run ends by itself after a trip or by a stop."""
     outcome = played(
         {"time_s": 20.0, "wrong": "unreachable", "for_s": 0.5},
@@ -276,7 +303,9 @@ def test_a_fault_ends_the_run_only_when_the_pump_is_seen_to_be_off(stop: tuple[d
     )
     assert [event["name"] for event in outcome.of("fault")] == ["link_lost"]
     assert outcome.ticks[-1].outputs.finished == Exit.SAFETY_TRIP
-    assert outcome.ticks[-1].row.mono_s == pytest.approx(40.6, abs=0.3)  # the mirror has rested long before
+    assert outcome.ticks[-1].row.mono_s == pytest.approx(
+        40.6, abs=0.3
+    )  # the mirror has rested long before
 
 
 def test_a_stop_of_a_bench_that_is_gone_is_no_success() -> None:
@@ -286,7 +315,9 @@ def test_a_stop_of_a_bench_that_is_gone_is_no_success() -> None:
 
 
 def test_a_latch_between_a_resume_and_its_hold_is_for_good() -> None:
-    """In that one tick of standby the hold is already requested; a later `ack` revives no request."""
+    """In that one tick of standby the hold is already requested;
+    a later `ack` revives no request.
+    """
     lost = {"time_s": 20.0, "wrong": "unreachable", "for_s": 1.0}
     resume = {"faults": ["link_lost"], "wait_s": 5.0}
     (standby_s,) = changes(played(lost, duration_s=40.0, resume=resume), "standby")
@@ -314,7 +345,11 @@ def test_an_ack_clears_what_the_board_has_latched() -> None:
         {"time_s": 26.0, "command": "hold"},
         duration_s=40.0,
     )
-    latched = [tick.inputs.reading.latched_faults for tick in outcome.ticks if tick.inputs.reading is not None]
+    latched = [
+        tick.inputs.reading.latched_faults
+        for tick in outcome.ticks
+        if tick.inputs.reading is not None
+    ]
     assert max(latched) > 0
     assert latched[-1] == 0
     assert len(changes(outcome, "inflate")) == 2
@@ -327,7 +362,9 @@ def test_a_way_down_stops_the_pump_in_its_first_tick(way: str) -> None:
 
 
 def test_readings_that_the_table_distrusts_do_not_drive_the_pump() -> None:
-    outcome = played({"time_s": 25.0, "wrong": "laser_stuck"}, limits={"stuck_s": 2.0}, duration_s=38.0)
+    outcome = played(
+        {"time_s": 25.0, "wrong": "laser_stuck"}, limits={"stuck_s": 2.0}, duration_s=38.0
+    )
     held = [tick.row for tick in outcome.ticks if tick.row.state == State.HOLD]
     distrusted = [row for row in held if row.safe_level == SafeLevel.HOLD_FLOW]
     assert len(distrusted) > 50
@@ -336,7 +373,8 @@ def test_readings_that_the_table_distrusts_do_not_drive_the_pump() -> None:
 
 def test_a_fill_that_takes_too_long_is_given_up() -> None:
     outcome = played(
-        {"time_s": 8.0, "wrong": "vent_stuck_fraction", "value": 0.1}, states={"inflate_timeout_s": 20.0}
+        {"time_s": 8.0, "wrong": "vent_stuck_fraction", "value": 0.1},
+        states={"inflate_timeout_s": 20.0},
     )
     assert [event["name"] for event in outcome.of("fault")] == ["overdue"]
 
@@ -351,8 +389,12 @@ def test_after_an_acknowledged_fault_nobody_holds_unasked() -> None:
     assert len(changes(outcome, "check")) == 1
 
 
-@pytest.mark.parametrize("again", [(), ({"time_s": 32.0, "command": "ack"},)], ids=["once", "in standby as well"])
-def test_an_acknowledgement_acknowledges_no_fault_to_come(again: tuple[dict[str, Any], ...]) -> None:
+@pytest.mark.parametrize(
+    "again", [(), ({"time_s": 32.0, "command": "ack"},)], ids=["once", "in standby as well"]
+)
+def test_an_acknowledgement_acknowledges_no_fault_to_come(
+    again: tuple[dict[str, Any], ...],
+) -> None:
     outcome = played(
         {"time_s": 20.0, "wrong": "gauge_lost", "for_s": 2.0},
         {"time_s": 30.0, "command": "ack"},
@@ -367,7 +409,9 @@ def test_an_acknowledgement_acknowledges_no_fault_to_come(again: tuple[dict[str,
 
 
 def test_the_ramp_waits_for_a_mirror_that_lags() -> None:
-    """A pump of 65 % lifts the mirror more slowly than the ramp; the setpoint stays within reach of the mirror."""
+    """A pump of 65 % lifts the mirror more slowly than the ramp; the setpoint stays within reach of
+    the mirror.
+    """
     outcome = played({"time_s": 0.0, "wrong": "pump_share", "value": 0.65}, **_FAR_BELOW)
     inflating = [tick.row for tick in outcome.ticks if tick.row.state == State.INFLATE]
     assert np.nanmax([row.error_um for row in inflating]) == pytest.approx(5.0, abs=1.0)
@@ -391,6 +435,8 @@ def test_a_mirror_that_the_pump_does_not_lift_is_given_up(pump_share: float) -> 
 
 
 def test_a_mirror_above_its_setpoint_may_sink_as_slowly_as_it_leaks() -> None:
-    outcome = played(duration_s=200.0, twin={"start_error_um": 150.0}, states={"inflate_stall_s": 20.0})
+    outcome = played(
+        duration_s=200.0, twin={"start_error_um": 150.0}, states={"inflate_stall_s": 20.0}
+    )
     assert not outcome.of("fault")
     assert changes(outcome, "hold")[0] > 60.0

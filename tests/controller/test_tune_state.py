@@ -1,4 +1,6 @@
-"""The controller's state `tune` on the twin in virtual time: experiments, their ends, and gains on trial."""
+"""The controller's state `tune` on the twin in virtual time: experiments, their ends, and gains on
+trial.
+"""
 
 from __future__ import annotations
 
@@ -26,12 +28,19 @@ from membrane_ctrl.sim.plant import Plant
 from membrane_ctrl.sim.surroundings import AmbientChange, BenchEvent
 from membrane_ctrl.sim.virtual_bench import VirtualBench
 
-CONFIG = Config(twin=TwinConfig(scenario="quiet", start_error_um=-5.0), shape=ShapeConfig(enabled=False))
+CONFIG = Config(
+    twin=TwinConfig(scenario="quiet", start_error_um=-5.0), shape=ShapeConfig(enabled=False)
+)
 BEGIN_S = 40.0
 
 
 def spec(**changed: Any) -> ExperimentSpec:
-    base: dict[str, Any] = {"kind": "relay", "duration_s": 20.0, "holding_flow_um_per_s": 1.24, "laser_um": 1.0}
+    base: dict[str, Any] = {
+        "kind": "relay",
+        "duration_s": 20.0,
+        "holding_flow_um_per_s": 1.24,
+        "laser_um": 1.0,
+    }
     return ExperimentSpec.model_validate(base | changed)
 
 
@@ -60,7 +69,9 @@ class Held:
             commands = ()
             if tick is not None:
                 self.rows.append(tick.row)
-                self.events += [{**event.to_dict(), "mono_s": tick.row.mono_s} for event in tick.events]
+                self.events += [
+                    {**event.to_dict(), "mono_s": tick.row.mono_s} for event in tick.events
+                ]
 
     def until_hold(self, at_most_s: float) -> None:
         self.go(0.02)
@@ -74,7 +85,9 @@ class Held:
         return [event for event in self.events if event["kind"] == kind]
 
     def furthest_um(self, since_s: float) -> float:
-        return float(max(abs(row.truth_displacement_um) for row in self.rows if row.mono_s >= since_s))
+        return float(
+            max(abs(row.truth_displacement_um) for row in self.rows if row.mono_s >= since_s)
+        )
 
 
 @pytest.mark.parametrize("kind", ["relay", "steps", "doublets", "multisine"])
@@ -84,8 +97,13 @@ def test_an_experiment_moves_the_mirror_within_its_limit_and_gives_it_back(kind:
     assert held.state == State.TUNE
     held.until_hold(40.0)
     assert held.of("experiment")[-1] | {"mono_s": 0, "reason": ""} == {
-        "kind": "experiment", "experiment": kind, "completed": True, "reason": "", "end": "completed", "mono_s": 0,
-    }  # fmt: skip
+        "kind": "experiment",
+        "experiment": kind,
+        "completed": True,
+        "reason": "",
+        "end": "completed",
+        "mono_s": 0,
+    }
     assert 1.0 < held.furthest_um(BEGIN_S) < 10.0
     held.go(30.0)
     assert held.state == State.HOLD
@@ -108,14 +126,20 @@ def test_a_pump_map_gives_its_commands_until_the_heights() -> None:
     given = [row.pump_fraction for row in held.rows if row.state == State.TUNE][1:]
     lengths_s = [0.02 * given.count(step["fraction"]) for step in STEPS]
     assert sum(lengths_s) == pytest.approx(0.02 * len(given), abs=0.05)
-    assert lengths_s == [pytest.approx(2.5, abs=1.0), pytest.approx(3.0, abs=1.0), pytest.approx(1.0, abs=0.05)]
+    assert lengths_s == [
+        pytest.approx(2.5, abs=1.0),
+        pytest.approx(3.0, abs=1.0),
+        pytest.approx(1.0, abs=0.05),
+    ]
     held.go(30.0)
     assert held.furthest_um(held.rows[-1].mono_s - 5.0) < 2.0
 
 
 def test_a_pump_map_that_takes_too_long_is_ended() -> None:
     held = Held()
-    held.go(0.1, tune(kind="pump_map", duration_s=5.0, steps=[{"fraction": 0.31, "duration_s": 60.0}]))
+    held.go(
+        0.1, tune(kind="pump_map", duration_s=5.0, steps=[{"fraction": 0.31, "duration_s": 60.0}])
+    )
     held.until_hold(12.0)
     assert "not done within 5 s" in held.of("experiment")[-1]["reason"]
 
@@ -159,7 +183,9 @@ def test_a_laser_that_is_distrusted_ends_it_although_it_reads() -> None:
     assert not held.of("experiment")[-1]["completed"]
 
 
-@pytest.mark.parametrize(("kind", "state"), [("hold", State.HOLD), ("lower", State.STANDBY), ("vent", State.LOWER)])
+@pytest.mark.parametrize(
+    ("kind", "state"), [("hold", State.HOLD), ("lower", State.STANDBY), ("vent", State.LOWER)]
+)
 def test_whoever_operates_ends_it(kind: Any, state: State) -> None:
     held = Held()
     held.go(4.0, tune())
@@ -176,7 +202,9 @@ def test_a_fault_ends_it_and_it_is_not_resumed() -> None:
     held.bench.wrong.gauge_offset_pa = 500.0
     held.go(1.0)
     assert held.state == State.FAULT
-    assert "fault" in held.of("experiment")[-1]["reason"]  # the board's own limit is the first to see it
+    assert (
+        "fault" in held.of("experiment")[-1]["reason"]
+    )  # the board's own limit is the first to see it
 
 
 def test_an_experiment_asked_for_in_the_tick_of_a_fault_never_runs() -> None:
@@ -202,7 +230,14 @@ def test_without_room_for_it_the_command_is_refused_with_the_remedy() -> None:
 
 
 @pytest.mark.parametrize(
-    "changed", [{"limit_um": 99.0}, {"limit_um": math.nan}, {"duration_s": 1e5}, {"kind": "jump"}, {"version": 2}]
+    "changed",
+    [
+        {"limit_um": 99.0},
+        {"limit_um": math.nan},
+        {"duration_s": 1e5},
+        {"kind": "jump"},
+        {"version": 2},
+    ],
 )
 def test_an_experiment_without_bounds_does_not_exist(changed: dict[str, Any]) -> None:
     with pytest.raises(ValidationError):
@@ -210,7 +245,9 @@ def test_an_experiment_without_bounds_does_not_exist(changed: dict[str, Any]) ->
 
 
 def gains(kp_per_s: float, trial_s: float = float("nan")) -> Command:
-    return Command("gains", "tester", loop=CONFIG.loop.model_copy(update={"kp_per_s": kp_per_s}), value=trial_s)
+    return Command(
+        "gains", "tester", loop=CONFIG.loop.model_copy(update={"kp_per_s": kp_per_s}), value=trial_s
+    )
 
 
 def kp_of(held: Held) -> float:
@@ -273,7 +310,9 @@ def test_the_shape_loop_s_time_constant_goes_on_trial_with_the_gains() -> None:
 
 
 class Stepped:
-    """A controller with its shape loop on and the setpoint at 2 µm, told of trials that step the setpoint."""
+    """A controller with its shape loop on and the setpoint at 2 µm, told of trials that step the
+    setpoint.
+    """
 
     def __init__(self) -> None:
         self.controller = Controller(CONFIG, zernike_projection())
@@ -282,7 +321,9 @@ class Stepped:
 
     def told(self, *commands: Command, after_s: float = 1.0) -> tuple[float, bool]:
         self.now_s += after_s
-        out = self.controller.tick(TickInputs(now_s=self.now_s, dt_s=0.02, reading=None, commands=commands))
+        out = self.controller.tick(
+            TickInputs(now_s=self.now_s, dt_s=0.02, reading=None, commands=commands)
+        )
         assert not any(refused for _, refused in out.answers), out.answers
         return self.controller._scene.setpoint_um, self.controller._shape.on
 
@@ -311,7 +352,10 @@ def test_a_step_ends_with_its_trial_also_when_gains_stay(ends: Command) -> None:
 def test_what_a_person_sets_during_a_step_stays() -> None:
     run = Stepped()
     run.told(stepped(5.0))
-    assert run.told(Command("setpoint", "tester", value=-1.0), Command("shape_off", "tester")) == (-1.0, False)
+    assert run.told(Command("setpoint", "tester", value=-1.0), Command("shape_off", "tester")) == (
+        -1.0,
+        False,
+    )
     assert run.told(after_s=20.0) == (-1.0, False)
 
 
@@ -348,7 +392,9 @@ def mean_flow(held: Held) -> float:
     return float(np.mean([row.flow_um_per_s for row in held.rows[-300:]]))
 
 
-def test_a_curve_on_trial_changes_what_the_flow_means_not_the_mirror_and_goes_back_by_itself() -> None:
+def test_a_curve_on_trial_changes_what_the_flow_means_not_the_mirror_and_goes_back_by_itself() -> (
+    None
+):
     held = Held()
     held.go(8.0, on_curve(TWICE, 10.0))
     assert mean_flow(held) == pytest.approx(2 * 1.24, rel=0.15)

@@ -1,4 +1,6 @@
-"""A bench held by its optics alone, and a laser that is knocked while the optics see the film; in virtual time."""
+"""A bench held by its optics alone, and a laser that is knocked while the optics see the film; in
+virtual time.
+"""
 
 from __future__ import annotations
 
@@ -29,13 +31,21 @@ from membrane_ctrl.model.events import (
 )
 from membrane_ctrl.model.telemetry import SafeLevel, State
 from membrane_ctrl.sim.plant import Plant
-from membrane_ctrl.sim.surroundings import AirTemperatureChange, AmbientChange, BenchEvent, LaserDrift
+from membrane_ctrl.sim.surroundings import (
+    AirTemperatureChange,
+    AmbientChange,
+    BenchEvent,
+    LaserDrift,
+)
 from membrane_ctrl.sim.virtual_bench import VirtualBench, Wrong
 
 TWIN = TwinConfig(laser=False, start_error_um=-5.0, scenario="quiet")
-BY_OPTICS = Config(estimator=EstimatorConfig(process_value="optics"), shape=ShapeConfig(mode="track"), twin=TWIN)
+BY_OPTICS = Config(
+    estimator=EstimatorConfig(process_value="optics"), shape=ShapeConfig(mode="track"), twin=TWIN
+)
 BY_ALL = Config(
-    estimator=EstimatorConfig(process_value="estimate"), twin=TwinConfig(start_error_um=-1.0, scenario="quiet")
+    estimator=EstimatorConfig(process_value="estimate"),
+    twin=TwinConfig(start_error_um=-1.0, scenario="quiet"),
 )
 BY_TRACKS = BY_ALL.model_copy(update={"shape": ShapeConfig(mode="track")})
 BY_LASER = Config(twin=BY_ALL.twin)
@@ -72,7 +82,9 @@ def told(ticks: list[VirtualTick], kind: type[Any]) -> list[Any]:
 
 
 def true_um(ticks: list[VirtualTick], from_s: float, to_s: float = math.inf) -> np.ndarray:
-    return np.array([tick.row.truth_displacement_um for tick in ticks if from_s <= tick.row.mono_s < to_s])
+    return np.array(
+        [tick.row.truth_displacement_um for tick in ticks if from_s <= tick.row.mono_s < to_s]
+    )
 
 
 def states(ticks: list[VirtualTick]) -> list[State]:
@@ -88,11 +100,15 @@ def test_a_bench_without_a_laser_starts_settles_and_holds_the_sag_it_was_told() 
     ticks = held(28.0)
     assert states(ticks) == [State.CHECK, State.INFLATE, State.SETTLE, State.HOLD]
     assert not told(ticks, Fault)
-    assert [event.sensors for event in told(ticks, HeldBy)] == [("optics", "barometer", "thermometer")]
+    assert [event.sensors for event in told(ticks, HeldBy)] == [
+        ("optics", "barometer", "thermometer")
+    ]
     held_um = true_um(ticks, 18.0)
     assert held_um.std() < 0.05
     nominal = Plant(TWIN, BY_OPTICS.pump).truth()
-    zero_um = 1e3 * (BY_OPTICS.optics.mirror.sag_mm - nominal.sag_mm) + nominal.displacement_um  # of the optics
+    zero_um = (
+        1e3 * (BY_OPTICS.optics.mirror.sag_mm - nominal.sag_mm) + nominal.displacement_um
+    )  # of the optics
     assert held_um.mean() == pytest.approx(zero_um, abs=0.1)
     row = ticks[-1].row
     assert math.isfinite(row.displacement_um)
@@ -166,21 +182,41 @@ def test_figures_that_come_and_go_end_the_check_with_the_reason() -> None:
     ("spoil", "seen"),
     [
         (lambda figure, n: None if n % 2 else figure, ""),
-        (lambda figure, n: _with(figure, verdict="rejected", reason="a hand") if n % 3 else figure, ""),
+        (
+            lambda figure, n: (
+                _with(figure, verdict="rejected", reason="a hand") if n % 3 else figure
+            ),
+            "",
+        ),
         (lambda figure, n: None, "no figure of the mirror for 1.0 s"),
-        (lambda figure, n: _with(figure, sag_um=37_100.0), "the camera repeats one figure to the last bit"),
-        (lambda figure, n: _with(figure, sag_um=math.nan), "no figure of the mirror for 1.0 s: it is not finite"),
+        (
+            lambda figure, n: _with(figure, sag_um=37_100.0),
+            "the camera repeats one figure to the last bit",
+        ),
+        (
+            lambda figure, n: _with(figure, sag_um=math.nan),
+            "no figure of the mirror for 1.0 s: it is not finite",
+        ),
         (
             lambda figure, n: _with(figure, sag_um=37_300.0 + n),
             "no figure of the mirror for 0.3 s: the sag jumped by",
         ),
-        (lambda figure, n: _with(figure, time_s=figure.time_s - 1.1), "no figure of the mirror for 1.0 s: its time"),
-        (lambda figure, n: _with(figure, time_s=figure.time_s + 9), "no figure of the mirror for 1.0 s: its time"),
+        (
+            lambda figure, n: _with(figure, time_s=figure.time_s - 1.1),
+            "no figure of the mirror for 1.0 s: its time",
+        ),
+        (
+            lambda figure, n: _with(figure, time_s=figure.time_s + 9),
+            "no figure of the mirror for 1.0 s: its time",
+        ),
         (
             lambda figure, n: _with(figure, kind="full"),
             "no figure of the mirror for 1.0 s: it has only been anchored",
         ),
-        (lambda figure, n: _with(figure, time_s=math.nan), "no figure of the mirror for 1.0 s: its time"),
+        (
+            lambda figure, n: _with(figure, time_s=math.nan),
+            "no figure of the mirror for 1.0 s: its time",
+        ),
         (
             lambda figure, n: _with(figure, verdict="rejected", reason="a hand"),
             "no figure of the mirror for 1.0 s: a hand",
@@ -200,7 +236,9 @@ def test_figures_that_come_and_go_end_the_check_with_the_reason() -> None:
         "rejected",
     ],
 )
-def test_a_figure_counts_only_if_it_shows_the_film_now(spoil: Callable[[Any, int], Any], seen: str) -> None:
+def test_a_figure_counts_only_if_it_shows_the_film_now(
+    spoil: Callable[[Any, int], Any], seen: str
+) -> None:
     figures = TruthShape(VirtualBench(Plant(TWIN, BY_OPTICS.pump)), BY_OPTICS, 3, 0.036)
     watching = observer.Observer(BY_OPTICS)
     why: list[str] = []
@@ -223,7 +261,9 @@ def _with(figure: Any, **changes: Any) -> Any:
 
 
 def test_a_camera_that_stood_still_does_not_take_its_zero_with_it() -> None:
-    """A door that no barometer sees moves the film meanwhile; afterwards the mirror is where it was."""
+    """A door that no barometer sees moves the film meanwhile; afterwards the mirror is where it
+    was.
+    """
     bench = VirtualBench(Plant(TWIN, BY_OPTICS.pump, (AmbientChange(20.5, -20.0, 0.1),)))
     bench.wrong.barometer_lost = True
     figures, kept = TruthShape(bench, BY_OPTICS, 3, 0.036), []
@@ -269,7 +309,9 @@ def test_another_anchor_of_the_tracking_does_not_move_the_mirror(config: Config)
 
 def test_the_optics_of_such_a_bench_cannot_be_switched_off() -> None:
     ticks = held(1.0, commands={20: Command("shape_off", "a test")})
-    refusals = [taken.refused for taken in told(ticks, CommandTaken) if taken.command == "shape_off"]
+    refusals = [
+        taken.refused for taken in told(ticks, CommandTaken) if taken.command == "shape_off"
+    ]
     assert refusals == ["the mirror is held by the optics alone (estimator.process_value)"]
 
 
@@ -315,7 +357,9 @@ def _judge_knock(um: float, until_s: float) -> None:
     assert liars == ["laser", "none"]
     assert ticks[-1].row.laser_innovation == pytest.approx(0.0, abs=5.0)  # it is used again
     assert told(ticks, ShapeLoopState)[-1].state == "tracking"
-    assert min(tick.row.leak_um_per_s for tick in ticks if tick.row.mono_s > 38.0) > 1.0  # no gas went anywhere
+    assert (
+        min(tick.row.leak_um_per_s for tick in ticks if tick.row.mono_s > 38.0) > 1.0
+    )  # no gas went anywhere
 
 
 def test_a_knocked_laser_is_told_once_and_the_optics_hold_on() -> None:
@@ -326,24 +370,34 @@ def test_a_knocked_laser_is_told_once_and_the_optics_hold_on() -> None:
 @pytest.mark.parametrize("seed", range(12))
 def test_a_knock_of_any_size_is_told_once(seed: int) -> None:
     rng = np.random.default_rng(seed)
-    _judge_knock(float(np.exp(rng.uniform(math.log(14.0), math.log(400.0))) * rng.choice([-1.0, 1.0])), 120.0)
+    _judge_knock(
+        float(np.exp(rng.uniform(math.log(14.0), math.log(400.0))) * rng.choice([-1.0, 1.0])), 120.0
+    )
 
 
 @pytest.mark.parametrize("shape_off", [False, pytest.param(True, marks=pytest.mark.campaign)])
 def test_a_laser_whose_mount_drifts_takes_over_where_the_mirror_is(shape_off: bool) -> None:
-    """The camera goes after four minutes of drift by 2 µm/min: half a minute later the mirror is 1 µm off, not 7."""
+    """The camera goes after four minutes of drift by 2 µm/min: half a minute later the mirror is 1
+    µm off, not 7.
+    """
 
     def lose(wrong: Wrong, now_s: float) -> None:
         wrong.camera_lost = 300.0 < now_s < 330.0 and not shape_off
 
-    switches = {3000: Command("shape_off", "a test"), 3300: Command("shape_on", "a test")} if shape_off else {}
+    switches = (
+        {3000: Command("shape_off", "a test"), 3300: Command("shape_on", "a test")}
+        if shape_off
+        else {}
+    )
     config = BY_ALL.model_copy(update=AT_10_HZ)
     ticks = held(360.0, lose, config, LaserDrift(60.0, 2.0, 600.0), switches, 0.2)
     assert not told(ticks, Fault)
     before_um = true_um(ticks, 280.0, 300.0).mean()
     assert np.abs(true_um(ticks, 300.0, 330.0) - before_um).max() < 1.5
     after_um = true_um(ticks, 345.0).mean()  # a switch takes the figure of its time as the new one
-    assert after_um == pytest.approx(true_um(ticks, 325.0, 330.0).mean() if shape_off else before_um, abs=0.2)
+    assert after_um == pytest.approx(
+        true_um(ticks, 325.0, 330.0).mean() if shape_off else before_um, abs=0.2
+    )
 
 
 # A film that jumps.
@@ -372,33 +426,57 @@ def _judge_jump(um: float, seen: bool) -> None:
     liars = [event.faulty for event in told(ticks, Plausibility)]
     assert liars == ([] if seen else ["optics"])
     before_um = true_um(ticks, 30.0, JUMP_S).mean()
-    assert np.abs(true_um(ticks, JUMP_S, JUMP_S + 1) - before_um).max() == pytest.approx(abs(um), rel=0.15)
-    assert true_um(ticks, ticks[-1].row.mono_s - 3.0).mean() == pytest.approx(before_um, abs=0.1 if seen else 3.0)
+    assert np.abs(true_um(ticks, JUMP_S, JUMP_S + 1) - before_um).max() == pytest.approx(
+        abs(um), rel=0.15
+    )
+    assert true_um(ticks, ticks[-1].row.mono_s - 3.0).mean() == pytest.approx(
+        before_um, abs=0.1 if seen else 3.0
+    )
 
 
 @pytest.mark.parametrize(
-    "seen", [pytest.param(True, marks=pytest.mark.campaign), False], ids=["seen", "unseen by the camera"]
+    "seen",
+    [pytest.param(True, marks=pytest.mark.campaign), False],
+    ids=["seen", "unseen by the camera"],
 )
 def test_a_film_that_jumps_is_brought_back_whatever_the_camera_says(seen: bool) -> None:
-    """The gauge is the third witness: it sides with the laser, and what the mount was blamed for is undone."""
+    """The gauge is the third witness: it sides with the laser, and what the mount was blamed for is
+    undone.
+    """
     _judge_jump(-25.0, seen)
 
 
-def _early(config: Config, jump_s: float, um: float, fail: Callable[[Wrong, float], None]) -> tuple[str, float]:
-    """A jump soon after the start, which settles from 8.5 s on: the safe state or the verdict, and how far off."""
+def _early(
+    config: Config, jump_s: float, um: float, fail: Callable[[Wrong, float], None]
+) -> tuple[str, float]:
+    """A jump soon after the start, which settles from 8.5 s on: the safe state or the verdict, and
+    how far off.
+    """
     ticks = held(
-        jump_s + 60.0, fail, config.model_copy(update=AT_10_HZ), AmbientChange(jump_s, um / -0.358, 0.1), None, 0.2
+        jump_s + 60.0,
+        fail,
+        config.model_copy(update=AT_10_HZ),
+        AmbientChange(jump_s, um / -0.358, 0.1),
+        None,
+        0.2,
     )
     faults = [fault.name for fault in told(ticks, Fault) if fault.name != "displacement_missing"]
     liars = [event.faulty for event in told(ticks, Plausibility)]
-    off_um = true_um(ticks, ticks[-1].row.mono_s - 3.0).mean() - true_um(ticks, jump_s - 1.0, jump_s).mean()
+    off_um = (
+        true_um(ticks, ticks[-1].row.mono_s - 3.0).mean()
+        - true_um(ticks, jump_s - 1.0, jump_s).mean()
+    )
     return (faults or liars or [""])[-1], off_um
 
 
 @pytest.mark.parametrize("jump_s", [12.0, 20.0, 30.0])
 @pytest.mark.parametrize("config", [BY_ALL, BY_LASER], ids=["all", "laser"])
-def test_a_jump_at_the_start_that_the_camera_misses_is_brought_back(config: Config, jump_s: float) -> None:
-    """The gauge is asked from the fifth second of settling on; before that the laser is believed."""
+def test_a_jump_at_the_start_that_the_camera_misses_is_brought_back(
+    config: Config, jump_s: float
+) -> None:
+    """The gauge is asked from the fifth second of settling on;
+    before that the laser is believed.
+    """
     verdict, off_um = _early(config, jump_s, -40.0, _blind(-40.0, jump_s))
     assert (verdict, off_um) == ("optics", pytest.approx(0.0, abs=2.0))
 
@@ -420,12 +498,19 @@ def test_a_smaller_jump_that_optics_alone_miss_is_told(um: float) -> None:
 
 
 def test_doors_and_setpoints_raise_no_doubt_of_the_optics() -> None:
-    moves = {600: Command("setpoint", "a test", "", 30.0), 1200: Command("setpoint", "a test", "", -20.0)}
+    moves = {
+        600: Command("setpoint", "a test", "", 30.0),
+        1200: Command("setpoint", "a test", "", -20.0),
+    }
     config = BY_OPTICS.model_copy(update=AT_10_HZ)
-    assert not told(held(150.0, NOTHING, config, AmbientChange(30.0, 20.0, 0.1), moves, 0.2), Maintenance)
+    assert not told(
+        held(150.0, NOTHING, config, AmbientChange(30.0, 20.0, 0.1), moves, 0.2), Maintenance
+    )
 
 
-@pytest.mark.parametrize("config", [BY_ALL, pytest.param(BY_LASER, marks=pytest.mark.campaign)], ids=["all", "laser"])
+@pytest.mark.parametrize(
+    "config", [BY_ALL, pytest.param(BY_LASER, marks=pytest.mark.campaign)], ids=["all", "laser"]
+)
 def test_a_camera_that_is_away_is_not_accused_of_a_jump_that_it_did_not_see(config: Config) -> None:
     """Laser and gauge see the film jump and come back; the camera is away before and after it."""
 
@@ -441,7 +526,9 @@ def test_a_camera_that_is_away_is_not_accused_of_a_jump_that_it_did_not_see(conf
 
 
 @pytest.mark.parametrize("config", [BY_ALL, BY_LASER], ids=["all", "laser"])
-def test_a_knock_at_the_start_that_the_camera_cannot_see_ends_in_the_safe_state(config: Config) -> None:
+def test_a_knock_at_the_start_that_the_camera_cannot_see_ends_in_the_safe_state(
+    config: Config,
+) -> None:
     def fail(wrong: Wrong, now_s: float) -> None:
         wrong.camera_lost = 15.0 < now_s < 25.0
         wrong.laser_offset_um = 60.0 if now_s > 20.0 else 0.0
@@ -460,7 +547,9 @@ def test_knock_and_jump_at_once_are_told_apart() -> None:
 @pytest.mark.parametrize("config", [BY_ALL, BY_LASER, BY_OPTICS], ids=["all", "laser", "optics"])
 @pytest.mark.parametrize("seed", range(15))
 def test_no_jump_of_the_first_minute_stays_unnoticed(config: Config, seed: int) -> None:
-    """Below 10 µm the optics prevail in the trim; 20 µm and a third are what optics alone and gauge may be apart."""
+    """Below 10 µm the optics prevail in the trim; 20 µm and a third are what optics alone and gauge
+    may be apart.
+    """
     rng = np.random.default_rng(seed)
     least_um = 32.0 if config is BY_OPTICS else 22.0
     um = float(np.exp(rng.uniform(math.log(least_um), math.log(60.0))) * rng.choice([-1.0, 1.0]))
@@ -474,14 +563,22 @@ def test_no_jump_of_the_first_minute_stays_unnoticed(config: Config, seed: int) 
 @pytest.mark.parametrize("seen", [True, False])
 def test_a_jump_of_any_size_is_brought_back(seed: int, seen: bool) -> None:
     rng = np.random.default_rng(seed)
-    _judge_jump(float(np.exp(rng.uniform(math.log(15.0), math.log(50.0))) * rng.choice([-1.0, 1.0])), seen)
+    _judge_jump(
+        float(np.exp(rng.uniform(math.log(15.0), math.log(50.0))) * rng.choice([-1.0, 1.0])), seen
+    )
 
 
-@pytest.mark.parametrize("config", [BY_ALL, pytest.param(BY_LASER, marks=pytest.mark.campaign)], ids=["all", "laser"])
+@pytest.mark.parametrize(
+    "config", [BY_ALL, pytest.param(BY_LASER, marks=pytest.mark.campaign)], ids=["all", "laser"]
+)
 def test_a_jump_that_the_camera_missed_is_no_leak(config: Config) -> None:
-    """Before the usual consumption is known, a jump upwards must not make the later one look like a seam."""
+    """Before the usual consumption is known, a jump upwards must not make the later one look like a
+    seam.
+    """
     config = config.model_copy(update={"loop": LoopConfig(rate_hz=10.0)})
-    ticks = held(180.0, _blind(40.0), config, AmbientChange(JUMP_S, 40.0 / -0.358, 0.1), shape_s=0.2)
+    ticks = held(
+        180.0, _blind(40.0), config, AmbientChange(JUMP_S, 40.0 / -0.358, 0.1), shape_s=0.2
+    )
     assert [event.faulty for event in told(ticks, Plausibility)] == ["optics"]
     assert not told(ticks, Fault)
     leaks_um_per_s = [tick.row.leak_um_per_s for tick in ticks[600:]]
@@ -492,7 +589,9 @@ def test_a_jump_that_the_camera_missed_is_no_leak(config: Config) -> None:
 
 
 class Growing:
-    """Optics whose stand follows the air in two steps, as a second world has it, and shows too much sag."""
+    """Optics whose stand follows the air in two steps, as a second world has it, and shows too much
+    sag.
+    """
 
     def __init__(self, um_per_k: float, follows_s: float, air_k: Callable[[float], float]) -> None:
         self._um_per_k, self._share_s, self._air_k = um_per_k, follows_s / 2, air_k
@@ -511,7 +610,9 @@ class Growing:
         return self._um_per_k * self._temperatures_k[-1]
 
 
-def _warmed(um_per_k: float, told_um_per_k: float, hours: float) -> tuple[list[VirtualTick], Growing]:
+def _warmed(
+    um_per_k: float, told_um_per_k: float, hours: float
+) -> tuple[list[VirtualTick], Growing]:
     """Hours of hold at 10 Hz in air that becomes 1 K warmer in each."""
     growing = Growing(um_per_k, 1800.0, lambda now_s: max(0.0, now_s - 60.0) / 3600)
     estimator = EstimatorConfig(process_value="estimate", stand_um_per_k=told_um_per_k)
@@ -521,12 +622,18 @@ def _warmed(um_per_k: float, told_um_per_k: float, hours: float) -> tuple[list[V
 
 
 @pytest.mark.campaign
-@pytest.mark.parametrize(("told_um_per_k", "most_um"), [(0.0, 0.9), (0.34, 0.25)], ids=["unknown", "taken out"])
-def test_a_stand_that_warms_by_a_kelvin_an_hour_is_told_and_bounded(told_um_per_k: float, most_um: float) -> None:
+@pytest.mark.parametrize(
+    ("told_um_per_k", "most_um"), [(0.0, 0.9), (0.34, 0.25)], ids=["unknown", "taken out"]
+)
+def test_a_stand_that_warms_by_a_kelvin_an_hour_is_told_and_bounded(
+    told_um_per_k: float, most_um: float
+) -> None:
     """It truly grows by 0.44 µm/K: what is known of it is 30 % wrong."""
     ticks, growing = _warmed(0.44, told_um_per_k, 2.5)
     assert not told(ticks, Fault)
-    moved_um = true_um(ticks, ticks[-1].row.mono_s - 60.0).mean() - true_um(ticks, 30.0, 60.0).mean()
+    moved_um = (
+        true_um(ticks, ticks[-1].row.mono_s - 60.0).mean() - true_um(ticks, 30.0, 60.0).mean()
+    )
     assert abs(moved_um) < most_um
     assert abs(moved_um) < 2.0 * ticks[-1].row.estimate_sigma_um
     (notice,) = told(ticks, Maintenance)
@@ -541,7 +648,10 @@ def test_what_a_stand_is_known_to_grow_does_not_move_the_mirror() -> None:
     """A stand of straw: 20 µm/K, and follows within seconds; a new lock ends the notice."""
     growing = Growing(20.0, 4.0, lambda now_s: 0.1 if now_s > 18.0 else 0.0)
     estimator = EstimatorConfig(
-        process_value="estimate", stand_um_per_k=20.0, stand_sigma_um_per_k=10.0, stand_follows_air_s=4.0
+        process_value="estimate",
+        stand_um_per_k=20.0,
+        stand_sigma_um_per_k=10.0,
+        stand_follows_air_s=4.0,
     )
     config = BY_ALL.model_copy(update={"estimator": estimator})
     anew = {50 * 30: Command("shape_off", "a test"), 50 * 30 + 5: Command("shape_on", "a test")}

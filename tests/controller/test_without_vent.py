@@ -35,7 +35,9 @@ def config(vent: bool, **more: Any) -> Config:
 
 
 def reasons(bench: Config, *asked: str, seconds: float = 5.0) -> tuple[list[str], SafeLevel]:
-    """Run a hold into a fault of safe level vent; returns the operator's lines after it, and the level."""
+    """Run a hold into a fault of safe level vent; returns the operator's lines after it, and the
+    level.
+    """
     without = not bench.vent_fitted
     excess_pa = [0.0]
     run = VirtualRun(
@@ -80,7 +82,9 @@ def test_the_command_vent_states_that_only_the_leak_lowers_the_mirror() -> None:
 def test_check_warns_of_it_with_the_time_and_its_basis() -> None:
     assert "devices.vent" not in {finding.field for finding in cross_check(config(vent=True))}
     assert "devices.vent" not in {finding.field for finding in cross_check(Config())}
-    (finding,) = (found for found in cross_check(config(vent=False)) if found.field == "devices.vent")
+    (finding,) = (
+        found for found in cross_check(config(vent=False)) if found.field == "devices.vent"
+    )
     assert finding.severity == "warning"
     assert "no vent is fitted" in finding.why
     assert "from 600 to 100 Pa in about 9.6 h" in finding.why
@@ -95,7 +99,9 @@ def test_a_slack_film_needs_no_estimate() -> None:
 
 @pytest.mark.parametrize("leak_time_constant_s", [100.0, 200.0])
 def test_the_estimate_is_that_of_the_twin(leak_time_constant_s: float) -> None:
-    bench = config(vent=False, twin={"scenario": "calm", "leak_time_constant_s": leak_time_constant_s})
+    bench = config(
+        vent=False, twin={"scenario": "calm", "leak_time_constant_s": leak_time_constant_s}
+    )
     (finding,) = (found for found in cross_check(bench) if found.field == "devices.vent")
     match = re.search(r"in about ([\d.e+-]+) h", finding.why)
     assert match is not None

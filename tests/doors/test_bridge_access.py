@@ -17,7 +17,11 @@ USERS = OpcuaConfig(users_file="users.txt")
 
 def warnings(**doors: object) -> list[str]:
     config = Config(doors=DoorsConfig(**doors))  # type: ignore[arg-type]
-    return [f"{found.why}; {found.remedy}" for found in cross_check(config) if found.field == "doors.role"]
+    return [
+        f"{found.why}; {found.remedy}"
+        for found in cross_check(config)
+        if found.field == "doors.role"
+    ]
 
 
 @pytest.mark.parametrize(
@@ -27,12 +31,20 @@ def warnings(**doors: object) -> list[str]:
             {"opcua": OpcuaConfig()},
             "OPC UA on 127.0.0.1:4840: every program on this machine may act; give users_file",
         ),
-        ({"epics": EpicsConfig()}, "EPICS on 127.0.0.1: every program on this machine may act; set the role to read"),
-        ({"mqtt": MqttConfig()}, "MQTT by the broker 127.0.0.1:1883: whoever the broker lets publish there"),
+        (
+            {"epics": EpicsConfig()},
+            "EPICS on 127.0.0.1: every program on this machine may act; set the role to read",
+        ),
+        (
+            {"mqtt": MqttConfig()},
+            "MQTT by the broker 127.0.0.1:1883: whoever the broker lets publish there",
+        ),
     ],
 )
 @pytest.mark.parametrize("role", ["operate", "tune"])
-def test_a_bridge_through_which_anybody_acts_gives_a_warning(doors: dict[str, object], says: str, role: str) -> None:
+def test_a_bridge_through_which_anybody_acts_gives_a_warning(
+    doors: dict[str, object], says: str, role: str
+) -> None:
     (found,) = warnings(role=role, **doors)
     assert found.startswith(says)
 
@@ -56,19 +68,26 @@ def test_check_states_who_may_act(capsys: pytest.CaptureFixture[str]) -> None:
     assert check_config(config, "lab.toml", as_json=True) == 0
     found = json.loads(capsys.readouterr().out)
     assert found["would"]["bridges"] == (
-        "OPC UA on 127.0.0.1:4840: every program on this machine may read and act (role operate at most)"
+        "OPC UA on 127.0.0.1:4840: every program on this machine may read and act (role "
+        "operate at most)"
     )
     assert [each["field"] for each in found["findings"]] == ["doors.role"]
     assert check_config(config, "lab.toml", as_json=False) == 0
     shown = capsys.readouterr().out
-    assert "lab.toml: warning: doors.role = operate: OPC UA on 127.0.0.1:4840: every program on this machine" in shown
+    assert (
+        "lab.toml: warning: doors.role = operate: OPC UA on 127.0.0.1:4840: every program on "
+        "this machine"
+    ) in shown
 
 
 def test_the_words_for_users_and_for_readers() -> None:
     assert describe_bridges(DoorsConfig()) == "none"
-    encrypted = OpcuaConfig(host="0.0.0.0", users_file="users.txt", certificate_file="a.pem", key_file="a.key")
+    encrypted = OpcuaConfig(
+        host="0.0.0.0", users_file="users.txt", certificate_file="a.pem", key_file="a.key"
+    )
     assert describe_bridges(DoorsConfig(role="operate", opcua=encrypted)) == (
-        "OPC UA on 0.0.0.0:4840, encrypted: the users in users.txt, each by its role may read and act "
+        "OPC UA on 0.0.0.0:4840, encrypted: the users in users.txt, each by its role may "
+        "read and act "
         "(role operate at most)"
     )
     assert describe_bridges(DoorsConfig(epics=EpicsConfig())).endswith("may read, and nobody acts")

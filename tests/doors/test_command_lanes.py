@@ -1,4 +1,6 @@
-"""Two lanes to the hold: safety commands at once, all others bounded in number and time; every sender is answered."""
+"""Two lanes to the hold: safety commands at once, all others bounded in number and time; every
+sender is answered.
+"""
 
 from __future__ import annotations
 
@@ -74,14 +76,18 @@ async def test_a_safety_command_overtakes_a_crowd_and_the_crowd_is_answered(kind
     said = await texts_of(crowd)
     refused = [each for each in said if "too many commands at once" in each]
     assert len(refused) == 150 - ORDINARY_MOST
-    assert hold.most_at_once <= 2, "one connection a lane: the port drops connections of a user that has too many"
+    assert hold.most_at_once <= 2, (
+        "one connection a lane: the port drops connections of a user that has too many"
+    )
     assert hold.sent.index((kind, "")) <= 1
 
 
 async def test_ordinary_commands_keep_their_order_one_at_a_time() -> None:
     hold = FakeHold()
     lanes = lanes_to(hold)
-    await asyncio.gather(*(lanes.submit({"do": "mark", "text": str(number)}) for number in range(ORDINARY_MOST)))
+    await asyncio.gather(
+        *(lanes.submit({"do": "mark", "text": str(number)}) for number in range(ORDINARY_MOST))
+    )
     assert hold.sent == [("mark", str(number)) for number in range(ORDINARY_MOST)]
     assert hold.most_at_once == 1
 
@@ -101,7 +107,9 @@ async def test_a_waiting_hold_is_refused_by_a_later_safety_command(kind: str) ->
     assert set(hold.sent) == {(kind, ""), ("mark", "kept")}
 
 
-async def test_a_command_that_waits_too_long_is_refused_and_never_sent(monkeypatch: pytest.MonkeyPatch) -> None:
+async def test_a_command_that_waits_too_long_is_refused_and_never_sent(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     monkeypatch.setattr(command_lanes, "TIME_LIMIT_S", 0.1)
     hold = FakeHold()
     hold.open.clear()
@@ -122,11 +130,18 @@ async def test_a_hold_that_hangs_delays_no_answer_and_gets_the_latch_as_soon_as_
     hold, late = FakeHold(), list[Outcome]()
     hold.open.clear()
     lanes = lanes_to(hold, late)
-    assert "no answer from the hold within 0.1 s" in await outcome_within(lanes.submit({"do": "latch"}), 0.5)
-    assert "no answer from the hold within 0.1 s" in await outcome_within(lanes.submit({"do": "stop"}), 0.5)
+    assert "no answer from the hold within 0.1 s" in await outcome_within(
+        lanes.submit({"do": "latch"}), 0.5
+    )
+    assert "no answer from the hold within 0.1 s" in await outcome_within(
+        lanes.submit({"do": "stop"}), 0.5
+    )
     hold.open.set()
     await wait_for(lambda: len(late) == 2)
-    assert [(outcome.command, outcome.done) for outcome in late] == [("latch", True), ("stop", True)]
+    assert [(outcome.command, outcome.done) for outcome in late] == [
+        ("latch", True),
+        ("stop", True),
+    ]
 
 
 async def test_a_flood_of_latches_does_not_delay_a_stop() -> None:
@@ -159,6 +174,8 @@ async def test_an_error_of_the_sender_is_an_answer_and_the_lanes_go_on() -> None
 
     lanes = CommandLanes(send, [].append)
     for kind in ("mark", "stop"):
-        assert await lanes.submit({"do": kind}) == Outcome(kind, f"{kind}: not sent: RuntimeError: bug")
+        assert await lanes.submit({"do": kind}) == Outcome(
+            kind, f"{kind}: not sent: RuntimeError: bug"
+        )
     for kind in ("mark", "stop"):
         assert await lanes.submit({"do": kind}) == Outcome.succeeded(kind)

@@ -1,4 +1,6 @@
-"""Clients of other makers at the doors read, are refused or obeyed, and survive a restart of either side."""
+"""Clients of other makers at the doors read, are refused or obeyed, and survive a restart of either
+side.
+"""
 
 from __future__ import annotations
 
@@ -29,7 +31,10 @@ pytestmark = [pytest.mark.real_time, needs("mosquitto", "mosquitto_pub", "mosqui
 async def program(*words: str, **env: str) -> AsyncIterator[asyncio.subprocess.Process]:
     """A program of the test; killed at the end if it still runs."""
     process = await asyncio.create_subprocess_exec(
-        *words, env=os.environ | env, stdout=asyncio.subprocess.PIPE, stderr=asyncio.subprocess.STDOUT
+        *words,
+        env=os.environ | env,
+        stdout=asyncio.subprocess.PIPE,
+        stderr=asyncio.subprocess.STDOUT,
     )
     try:
         yield process
@@ -44,7 +49,9 @@ async def doors(folder: Path, text: str) -> AsyncIterator[asyncio.subprocess.Pro
     """`membrane-ctrl doors` with the settings, once all doors are open."""
     (folder / "lab.toml").write_text(text)
     words = ["--config", str(folder / "lab.toml"), "--logs", str(folder)]
-    async with program(sys.executable, "-c", "from membrane_ctrl.doors.cli import app; app()", *words) as process:
+    async with program(
+        sys.executable, "-c", "from membrane_ctrl.doors.cli import app; app()", *words
+    ) as process:
         wanted = {name for name in ("mqtt", "opcua", "epics") if f"[doors.{name}]" in text}
         assert process.stdout is not None
         async with asyncio.timeout(PATIENCE_S):
@@ -100,13 +107,17 @@ async def told(port: int, topic: str, text: str, *more: str) -> None:
 @asynccontextmanager
 async def hearing(port: int, topic: str) -> AsyncIterator[Callable[[], Awaitable[str]]]:
     """A subscriber; what it yields waits for its next message."""
-    async with program("stdbuf", "-oL", "mosquitto_sub", "-p", str(port), "-t", topic, "-d") as client:
+    async with program(
+        "stdbuf", "-oL", "mosquitto_sub", "-p", str(port), "-t", topic, "-d"
+    ) as client:
         assert client.stdout is not None
         stdout = client.stdout
 
         async def answer() -> str:
             async with asyncio.timeout(PATIENCE_S):
-                while (line := (await stdout.readline()).decode()).startswith(("Client", "Subscribed")):
+                while (line := (await stdout.readline()).decode()).startswith(
+                    ("Client", "Subscribed")
+                ):
                     pass
             return line.strip()
 
@@ -165,7 +176,7 @@ async def main():
     found["admin"] = await name_of(admin.connect())
     print(json.dumps(found))
 asyncio.run(main())
-"""
+"""  # noqa: E501
 CA_CLIENT = """
 import json
 from caproto.sync.client import read, write
@@ -174,7 +185,7 @@ refused = write("mirror:error_um", 5.0, notify=True, repeater=False).status.name
 write("mirror:do:setpoint", -2.0, notify=True, timeout=20, repeater=False)
 answer = bytes(read("mirror:answer", repeater=False).data).decode().rstrip(chr(0)).partition(", ")[2]
 print(json.dumps(dict(error_um=value.data[0], unit=value.metadata.units.decode(), write=refused, answer=answer)))
-"""
+"""  # noqa: E501
 PVA_CLIENT = """
 import json
 from p4p.client.thread import Context, RemoteError
@@ -187,7 +198,7 @@ with Context("pva") as client:
     client.put("mirror:do:mark", "pva", timeout=20, request="record[process=true,block=true]")
     found["answer"] = client.get("mirror:answer").partition(", ")[2]
 print(json.dumps(found))
-"""
+"""  # noqa: E501
 HOSTILE_OPCUA = """
 import asyncio, json
 from asyncua import Client, ua
@@ -213,7 +224,7 @@ async def main():
         found["unit"] = await name_of(node(".error_um.unit").write_value("mm"))
     print(json.dumps(found))
 asyncio.run(main())
-"""
+"""  # noqa: E501
 # a field that is not the value would chain commands, repeat them, or shut them
 HOSTILE_CA = """
 import json
@@ -228,7 +239,7 @@ for name, value in (
     answer = bytes(read("mirror:answer", repeater=False).data).decode().rstrip(chr(0)).partition("epics: ")[2]
     found[name + " " + str(value)[:3]] = answer if status == "ECA_NORMAL" else status
 print(json.dumps(found))
-"""
+"""  # noqa: E501
 WATCHER = """
 import asyncio, json
 from asyncua import Client
@@ -259,7 +270,11 @@ port = {port}
 async def test_mqtt_tells_obeys_and_survives_restarts(tmp_path: Path) -> None:
     port, base = free_port(), "membrane/bench"
     settings = MQTT.format(port=port)
-    async with AsyncExitStack() as first_broker, AsyncExitStack() as first_hold, AsyncExitStack() as door_stack:
+    async with (
+        AsyncExitStack() as first_broker,
+        AsyncExitStack() as first_hold,
+        AsyncExitStack() as door_stack,
+    ):
         run = await first_hold.enter_async_context(held(tmp_path))
         await first_broker.enter_async_context(broker(port))
         await told(port, f"{base}/do/vent", "PRESS", "-r")  # stays at the broker
@@ -300,14 +315,33 @@ async def test_opc_ua_and_epics_tell_refuse_and_obey(tmp_path: Path) -> None:
     async with held(tmp_path) as run, doors(tmp_path, settings):
         found = await said_by(OPCUA_CLIENT, ports)
         assert found == {
-            "error_um": 0.25, "unit": "µm", "state": "hold", "write": "BadUserAccessDenied",
-            "admin": "BadIdentityTokenRejected", "setpoint": "opcua: setpoint: done", "keep": "BadNodeIdUnknown",
-        }  # fmt: skip
+            "error_um": 0.25,
+            "unit": "µm",
+            "state": "hold",
+            "write": "BadUserAccessDenied",
+            "admin": "BadIdentityTokenRejected",
+            "setpoint": "opcua: setpoint: done",
+            "keep": "BadNodeIdUnknown",
+        }
         found = await said_by(CA_CLIENT, ports)
-        assert found == {"error_um": 0.25, "unit": "µm", "write": "ECA_NOWTACCESS", "answer": "epics: setpoint: done"}
+        assert found == {
+            "error_um": 0.25,
+            "unit": "µm",
+            "write": "ECA_NOWTACCESS",
+            "answer": "epics: setpoint: done",
+        }
         found = await said_by(PVA_CLIENT, ports)
-        assert found == {"error_um": 0.25, "state": "hold", "write": "refused", "answer": "epics: mark: done"}
-        assert [(each.kind, each.text) for each in run.asked] == [("setpoint", ""), ("setpoint", ""), ("mark", "pva")]
+        assert found == {
+            "error_um": 0.25,
+            "state": "hold",
+            "write": "refused",
+            "answer": "epics: mark: done",
+        }
+        assert [(each.kind, each.text) for each in run.asked] == [
+            ("setpoint", ""),
+            ("setpoint", ""),
+            ("mark", "pva"),
+        ]
 
 
 @pytest.mark.campaign
@@ -327,22 +361,28 @@ async def test_hostile_clients_change_nothing(tmp_path: Path) -> None:
     async with held(tmp_path) as run, doors(tmp_path, SERVERS.format(**ports)):
         finite = "Setpoint: enter a finite number in µm"
         assert await said_by(HOSTILE_OPCUA, ports) == {
-            "nan": finite, "text": f"Setpoint: enter a number in µm: 'abc' {NO_NUMBER}",
+            "nan": finite,
+            "text": f"Setpoint: enter a number in µm: 'abc' {NO_NUMBER}",
             "none": f"Setpoint: enter a number in µm: '' {NO_NUMBER}",
             **dict.fromkeys(("two", "array", "bytes"), "BadInvalidArgument"),
             "huge": "setpoint refused: longer than 500 bytes",
             **dict.fromkeys(("add", "delete", "shut", "unit"), "BadUserAccessDenied"),
-        }  # fmt: skip
+        }
         fields = ("FLNK mir", "OUT mir", "SCAN [6]", "PROC [1]")
         assert await said_by(HOSTILE_CA, ports) == {
             **{f"setpoint.{each}": "ECA_NOWTACCESS" for each in fields},
-            "stop.ASG DEF": "ECA_NOWTACCESS", "stop.DISP [1]": "ECA_NOWTACCESS",
+            "stop.ASG DEF": "ECA_NOWTACCESS",
+            "stop.DISP [1]": "ECA_NOWTACCESS",
             "setpoint nan": finite,
-            "setpoint 100": "setpoint refused: setpoint 1e+09 µm is outside the limits (-2000 .. 500 µm)",
+            (
+                "setpoint 100"
+            ): "setpoint refused: setpoint 1e+09 µm is outside the limits (-2000 .. 500 µm)",
             "mark xxx": "mark refused: longer than 500 bytes",
             "mark b'\\": "mark refused: text: only printable characters, in one line",
-        }  # fmt: skip
-        assert [(each.kind, each.value) for each in run.asked] == [("setpoint", 1e9)], "which the tick refused"
+        }
+        assert [(each.kind, each.value) for each in run.asked] == [("setpoint", 1e9)], (
+            "which the tick refused"
+        )
 
 
 async def fresh(file: Path, after_s: float) -> None:
@@ -363,9 +403,21 @@ async def fresh(file: Path, after_s: float) -> None:
 @pytest.mark.parametrize("kind", ["opcua", "ca", "pva"])
 async def test_a_client_and_its_door_may_be_killed(tmp_path: Path, kind: str) -> None:
     ports = {"opcua": free_port(), "ca": free_port(), "pva": free_port()}
-    part = (sys.executable, "-m", "benchmarks.doors", str(tmp_path), "--part", kind, "--ports", json.dumps(ports))
+    part = (
+        sys.executable,
+        "-m",
+        "benchmarks.doors",
+        str(tmp_path),
+        "--part",
+        kind,
+        "--ports",
+        json.dumps(ports),
+    )
     seen, settings = tmp_path / f"{kind}.jsonl", SERVERS.format(**ports)
-    env = {"EPICS_PVA_NAME_SERVERS": f"127.0.0.1:{ports['pva']}", "EPICS_PVA_ADDR_LIST": ""}  # this door, no other
+    env = {
+        "EPICS_PVA_NAME_SERVERS": f"127.0.0.1:{ports['pva']}",
+        "EPICS_PVA_ADDR_LIST": "",
+    }  # this door, no other
     async with held(tmp_path), AsyncExitStack() as stack:
         async with doors(tmp_path, settings) as door:
             async with program(*part, **env):  # killed at the end

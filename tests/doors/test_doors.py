@@ -57,7 +57,19 @@ def seen_hold(**row: float | None) -> HoldSeen:
 def figure(**changed: object) -> ShapeEstimate:
     coeffs_um = np.arange(1.0, ZERNIKE_TERMS + 1.0)
     made = ShapeEstimate(
-        97.5, "full", coeffs_um, 0.0, np.eye(ZERNIKE_TERMS), 500.0, 0.1, 0.0, 1.0, 1.0, 80.0, 0.0, "ok"
+        97.5,
+        "full",
+        coeffs_um,
+        0.0,
+        np.eye(ZERNIKE_TERMS),
+        500.0,
+        0.1,
+        0.0,
+        1.0,
+        1.0,
+        80.0,
+        0.0,
+        "ok",
     )
     return dataclasses.replace(made, **changed)  # type: ignore[arg-type]
 
@@ -73,7 +85,9 @@ def test_names_are_unique_and_short_enough() -> None:
     names = [each.name for each in TABLE]
     assert len(set(names)) == len(names)
     for each in TABLE:
-        assert len(f"do:{each.name}") <= 60 - 31, "an EPICS name has room for 60 letters with that of the mirror"
+        assert len(f"do:{each.name}") <= 60 - 31, (
+            "an EPICS name has room for 60 letters with that of the mirror"
+        )
 
 
 def test_the_page_has_the_table() -> None:
@@ -103,7 +117,11 @@ def test_without_contact_no_number_is_shown() -> None:
         found = values(seen)
         assert found["state"] == "no contact"
         assert "run has ended" in str(found["why"]) or "no status for 60 s" in str(found["why"])
-        assert [name for name, value in found.items() if value is not None] == ["state", "why", "run"]
+        assert [name for name, value in found.items() if value is not None] == [
+            "state",
+            "why",
+            "run",
+        ]
 
 
 def test_a_figure_has_its_age_and_terms() -> None:
@@ -115,7 +133,10 @@ def test_a_figure_has_its_age_and_terms() -> None:
 
 def test_faults_and_notices_are_in_words() -> None:
     seen = seen_hold()
-    notices = [{"topic": "interlock", "text": "door open"}, {"topic": "recorder", "text": "disk full"}]
+    notices = [
+        {"topic": "interlock", "text": "door open"},
+        {"topic": "recorder", "text": "disk full"},
+    ]
     seen.status.update(fault=FAULT, notices=notices)
     found = values(seen)
     assert found["fault"] == "7 laser_lost: no light; clean it"
@@ -125,11 +146,20 @@ def test_faults_and_notices_are_in_words() -> None:
 
 @pytest.mark.parametrize(
     ("role", "command", "refused"),
-    [("read", "stop", True), ("operate", "stop", False), ("operate", "keep", True), ("tune", "keep", False)],
+    [
+        ("read", "stop", True),
+        ("operate", "stop", False),
+        ("operate", "keep", True),
+        ("tune", "keep", False),
+    ],
 )
-async def test_a_door_asks_by_its_role(tmp_path: Path, role: str, command: str, refused: bool) -> None:
+async def test_a_door_asks_by_its_role(
+    tmp_path: Path, role: str, command: str, refused: bool
+) -> None:
     async with port_run(tmp_path) as run:
-        door = door_with(role, dataclasses.replace(seen_hold(), name="the-run"), tmp_path / "control.sock")
+        door = door_with(
+            role, dataclasses.replace(seen_hold(), name="the-run"), tmp_path / "control.sock"
+        )
         said = await door.ask("mqtt", command)
         assert ("needs the role" in said) is refused
         assert [asked.kind for asked in run.asked] == ([] if refused else [command])
@@ -139,11 +169,17 @@ async def test_a_door_asks_by_its_role(tmp_path: Path, role: str, command: str, 
 
 async def test_a_door_locks_for_nobody_and_removes_no_lock(tmp_path: Path) -> None:
     async with port_run(tmp_path) as run:
-        door = door_with("tune", dataclasses.replace(seen_hold(), name="the-run"), tmp_path / "control.sock")
+        door = door_with(
+            "tune", dataclasses.replace(seen_hold(), name="the-run"), tmp_path / "control.sock"
+        )
         assert "done" in await door.ask("mqtt", "latch", "hands inside")
         (command,) = run.asked
         assert command.lock is not None
-        assert (command.lock.text, command.lock.author, command.lock.account) == ("hands inside", "bridge:mqtt", "")
+        assert (command.lock.text, command.lock.author, command.lock.account) == (
+            "hands inside",
+            "bridge:mqtt",
+            "",
+        )
         assert not command.from_person
         assert "no such command" in await door.ask("mqtt", "unlock", command.lock.word)
         assert run.asked == [command]
@@ -154,7 +190,9 @@ def test_the_locks_are_published() -> None:
     lock = {"word": "bofak", "text": "hands inside", "author": "unix:ann", "set_utc": "2026-01-02"}
     assert values(seen)["locks"] == ""
     seen = dataclasses.replace(seen, status={**seen.status, "locks": [lock, lock]})
-    assert str(values(seen)["locks"]).count('"hands inside" by unix:ann, 2026-01-02, word bofak') == 2
+    assert (
+        str(values(seen)["locks"]).count('"hands inside" by unix:ann, 2026-01-02, word bofak') == 2
+    )
 
 
 async def test_a_hold_that_grants_less_is_not_asked(tmp_path: Path) -> None:
@@ -175,7 +213,10 @@ async def test_a_safety_command_is_sent_before_the_first_contact(tmp_path: Path)
     [
         ("setpoint", "", "enter a number"),
         *(("setpoint", text, "Setpoint: enter a number in µm") for text in STRANGE_NUMBERS),
-        *(("setpoint", number, "enter a finite number") for number in (math.nan, math.inf, 10**400)),
+        *(
+            ("setpoint", number, "enter a finite number")
+            for number in (math.nan, math.inf, 10**400)
+        ),
         ("setpoint", True, "enter a number"),
         ("setpoint", b"\xff\xfe", "setpoint refused: the payload is not text in UTF-8"),
         ("mark", b"\xff\xfe", "mark refused: the payload is not text in UTF-8"),
@@ -189,9 +230,13 @@ async def test_a_safety_command_is_sent_before_the_first_contact(tmp_path: Path)
         ("__class__", "", "no such command"),
     ],
 )
-async def test_nonsense_gets_an_answer(tmp_path: Path, command: str, given: object, says: str) -> None:
+async def test_nonsense_gets_an_answer(
+    tmp_path: Path, command: str, given: object, says: str
+) -> None:
     async with port_run(tmp_path) as run:
-        door = door_with("tune", dataclasses.replace(seen_hold(), name="the-run"), tmp_path / "control.sock")
+        door = door_with(
+            "tune", dataclasses.replace(seen_hold(), name="the-run"), tmp_path / "control.sock"
+        )
         assert says in await door.ask("opcua", command, given)
         assert run.asked == [] or given == "1e9", "the tick judges limits"
 
@@ -208,12 +253,17 @@ def test_home_assistant_finds_every_name_and_only_the_allowed_commands() -> None
     assert commands["do_stop"]["platform"] == "button"
     limits = Config().limits
     setpoint = commands["do_setpoint"]
-    assert (setpoint["min"], setpoint["max"]) == (limits.displacement_min_um, limits.displacement_max_um)
+    assert (setpoint["min"], setpoint["max"]) == (
+        limits.displacement_min_um,
+        limits.displacement_max_um,
+    )
     ids = [each["unique_id"] for each in found["components"].values()]
     assert len(set(ids)) == len(ids)
 
 
-@pytest.mark.parametrize("door", [{"opcua": OpcuaConfig(host="0.0.0.0")}, {"epics": EpicsConfig(host="::")}], ids=str)
+@pytest.mark.parametrize(
+    "door", [{"opcua": OpcuaConfig(host="0.0.0.0")}, {"epics": EpicsConfig(host="::")}], ids=str
+)
 def test_nobody_unknown_acts_from_another_machine(door: dict[str, object]) -> None:
     DoorsConfig(**door)  # type: ignore[arg-type]
     with pytest.raises(ValidationError, match="cannot tell who acts from another machine"):
@@ -228,10 +278,14 @@ def test_no_door_is_said(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("name", ["mqtt", "opcua", "epics"])
-def test_a_missing_library_is_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, name: str) -> None:
+def test_a_missing_library_is_named(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, name: str
+) -> None:
     monkeypatch.setattr("importlib.util.find_spec", lambda library: None)
     (tmp_path / "lab.toml").write_text(f"[doors.{name}]\n")
-    done = CliRunner().invoke(app, ["--logs", str(tmp_path), "--config", str(tmp_path / "lab.toml")])
+    done = CliRunner().invoke(
+        app, ["--logs", str(tmp_path), "--config", str(tmp_path / "lab.toml")]
+    )
     assert isinstance(done.exception, InputError)
     assert f"pip install 'membrane-ctrl[{name}]'" in str(done.exception)
 
@@ -240,7 +294,9 @@ def test_a_taken_port_is_named(tmp_path: Path) -> None:
     with socket.create_server(("127.0.0.1", 0)) as taken:
         port = taken.getsockname()[1]
         (tmp_path / "lab.toml").write_text(f"[doors.epics]\nca_port = {port}\n")
-        done = CliRunner().invoke(app, ["--logs", str(tmp_path), "--config", str(tmp_path / "lab.toml")])
+        done = CliRunner().invoke(
+            app, ["--logs", str(tmp_path), "--config", str(tmp_path / "lab.toml")]
+        )
     assert isinstance(done.exception, DeviceError)
     assert f"epics: 127.0.0.1:{port}: address already in use" in str(done.exception)
 

@@ -37,12 +37,25 @@ async def test_two_bridges_of_one_prefix_with_different_ports(tmp_path: Path) ->
     others = {"opcua": free_port(), "ca": free_port(), "pva": free_port()}
     only_epics = "[doors.epics]" + SERVERS.partition("[doors.epics]")[2]
     async with held(tmp_path), doors(tmp_path, only_epics.format(**ports)) as first:
-        assert await asyncio.to_thread(find_server, "mirror:state", [("127.0.0.1", ports["ca"])]) == "127.0.0.1"
-        assert await asyncio.to_thread(find_server, "other:state", [("127.0.0.1", ports["ca"])]) == ""
+        assert (
+            await asyncio.to_thread(find_server, "mirror:state", [("127.0.0.1", ports["ca"])])
+            == "127.0.0.1"
+        )
+        assert (
+            await asyncio.to_thread(find_server, "other:state", [("127.0.0.1", ports["ca"])]) == ""
+        )
         second = tmp_path / "second"
         second.mkdir()
         (second / "lab.toml").write_text(only_epics.format(**others))
-        words = ("-m", "membrane_ctrl", "doors", "--config", str(second / "lab.toml"), "--logs", str(tmp_path))
+        words = (
+            "-m",
+            "membrane_ctrl",
+            "doors",
+            "--config",
+            str(second / "lab.toml"),
+            "--logs",
+            str(tmp_path),
+        )
         async with program(sys.executable, *words) as process, asyncio.timeout(120.0):
             out = (await process.communicate())[0].decode()
         assert process.returncode == 4
@@ -67,12 +80,16 @@ def test_a_server_elsewhere_that_has_the_record_is_named(monkeypatch: pytest.Mon
         thread = threading.Thread(target=answer_once)
         thread.start()
         monkeypatch.setenv("EPICS_CA_ADDR_LIST", f"127.0.0.1:{port}")
-        with pytest.raises(DeviceError, match=r"another server \(127.0.0.1\) has the record mirror:state"):
+        with pytest.raises(
+            DeviceError, match=r"another server \(127.0.0.1\) has the record mirror:state"
+        ):
             require_unserved("mirror:state", free_port())
         thread.join()
 
 
-@pytest.mark.parametrize("reply", [b"", b"\0" * 15, b"\0" * 16, b"\xff" * 200, b"\0\0\xff\xff" + b"\0" * 12])
+@pytest.mark.parametrize(
+    "reply", [b"", b"\0" * 15, b"\0" * 16, b"\xff" * 200, b"\0\0\xff\xff" + b"\0" * 12]
+)
 def test_garbage_is_no_reply(reply: bytes) -> None:
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as server:
         server.bind(("127.0.0.1", 0))

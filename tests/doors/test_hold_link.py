@@ -1,4 +1,6 @@
-"""No command of a bridge is obeyed late, whatever hangs; safety commands are obeyed nevertheless."""
+"""No command of a bridge is obeyed late, whatever hangs;
+safety commands are obeyed nevertheless.
+"""
 
 from __future__ import annotations
 
@@ -24,7 +26,9 @@ def limits(seconds: float, refusal: str = "") -> SendLimits:
 
 
 async def test_a_hold_that_does_not_greet_gets_no_command_later(tmp_path: Path) -> None:
-    """As a hold that is stopped: the kernel accepts the connection, and the hold would read it when it goes on."""
+    """As a hold that is stopped: the kernel accepts the connection, and the hold would read it when
+    it goes on.
+    """
     path = tmp_path / "control.sock"
     with socket.socket(socket.AF_UNIX) as frozen:
         frozen.bind(str(path))
@@ -34,15 +38,21 @@ async def test_a_hold_that_does_not_greet_gets_no_command_later(tmp_path: Path) 
         assert "hold refused: not obeyed within 2 s" in await door.ask("mqtt", "hold")
         assert time.monotonic() - begin_s < 2.5
         begin_s = time.monotonic()
-        assert "latch: no answer from the hold within 0.9 s; still being sent" in await door.ask("mqtt", "latch")
+        assert "latch: no answer from the hold within 0.9 s; still being sent" in await door.ask(
+            "mqtt", "latch"
+        )
         assert time.monotonic() - begin_s < 1.0
         waiting, _ = frozen.accept()  # the hold goes on
-        waiting.sendall(b'{"membrane_ctrl": 1, "run": "the-run", "you": "unix:ann", "role": "tune"}\n')
+        waiting.sendall(
+            b'{"membrane_ctrl": 1, "run": "the-run", "you": "unix:ann", "role": "tune"}\n'
+        )
         waiting.settimeout(1.0)
         assert waiting.recv(1000) == b"", "the hold command is not sent any more"
         waiting.close()
         latching, _ = frozen.accept()
-        latching.sendall(b'{"membrane_ctrl": 1, "run": "the-run", "you": "unix:ann", "role": "tune"}\n')
+        latching.sendall(
+            b'{"membrane_ctrl": 1, "run": "the-run", "you": "unix:ann", "role": "tune"}\n'
+        )
         latching.settimeout(5.0)
         assert b'"do": "latch"' in await asyncio.to_thread(latching.recv, 1000)
         latching.close()
@@ -76,9 +86,13 @@ async def test_a_command_is_not_sent_after_its_deadline_or_another_decision(tmp_
             said = await asyncio.to_thread(send_command, where, "the-run", {"do": "hold"}, given)
             assert says in said.text
             assert not said.done
-        said = await asyncio.to_thread(send_command, where, "another-run", {"do": "hold"}, limits(2.0))
+        said = await asyncio.to_thread(
+            send_command, where, "another-run", {"do": "hold"}, limits(2.0)
+        )
         assert "another run is listening now" in said.text
-        said = await asyncio.to_thread(send_command, where, "another-run", {"do": "stop"}, limits(-5.0, "no"))
+        said = await asyncio.to_thread(
+            send_command, where, "another-run", {"do": "stop"}, limits(-5.0, "no")
+        )
         assert said == Outcome.succeeded("stop"), "a safety command has no conditions"
         assert [command.kind for command in run.asked] == ["stop"]
 

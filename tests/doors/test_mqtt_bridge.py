@@ -1,4 +1,6 @@
-"""The MQTT bridge against floods, garbage, old messages, lost connections, and brokers that do not answer."""
+"""The MQTT bridge against floods, garbage, old messages, lost connections, and brokers that do not
+answer.
+"""
 
 from __future__ import annotations
 
@@ -49,7 +51,9 @@ def fast(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def door_to(folder: Path, role: str = "operate") -> Door:
-    seen = dataclasses.replace(seen_hold(error_um=0.25), name="the-run", seen_s=time.monotonic() + 1e6)
+    seen = dataclasses.replace(
+        seen_hold(error_um=0.25), name="the-run", seen_s=time.monotonic() + 1e6
+    )
     return door_with(role, seen, folder / "control.sock")
 
 
@@ -75,7 +79,11 @@ class Listener:
 
     async def run(self) -> None:
         async for message in self.client.messages:
-            payload = message.payload.decode("utf-8", "replace") if isinstance(message.payload, bytes) else ""
+            payload = (
+                message.payload.decode("utf-8", "replace")
+                if isinstance(message.payload, bytes)
+                else ""
+            )
             self.seen.append((str(message.topic).removeprefix(f"{BASE}/"), payload))
 
     def of(self, topic: str) -> list[str]:
@@ -112,7 +120,12 @@ async def bridge(folder: Path) -> AsyncIterator[tuple[PortRun, Listener, int]]:
     """A run, a broker, a bridge between them, and a listener."""
     port = free_port()
     asyncio.get_running_loop().set_debug(False)  # which makes each message several times as slow
-    async with port_run(folder) as run, broker(port), listening(port) as listener, serving(port, door_to(folder)):
+    async with (
+        port_run(folder) as run,
+        broker(port),
+        listening(port) as listener,
+        serving(port, door_to(folder)),
+    ):
         await listener.until(lambda: "online" in listener.of("availability"))
         yield run, listener, port
 
@@ -131,7 +144,10 @@ def kinds(run: PortRun) -> list[str]:
 async def test_a_safety_command_behind_150_others_is_answered_within_a_second(
     tmp_path: Path, kind: str, flood: str
 ) -> None:
-    async with bridge(tmp_path) as (run, listener, port), aiomqtt.Client("127.0.0.1", port) as client:
+    async with (
+        bridge(tmp_path) as (run, listener, port),
+        aiomqtt.Client("127.0.0.1", port) as client,
+    ):
         for number in range(150):
             await client.publish(f"{BASE}/do/{flood}", f"x{number}", qos=1)
         begin_s = time.monotonic()
@@ -142,8 +158,13 @@ async def test_a_safety_command_behind_150_others_is_answered_within_a_second(
 
 
 async def test_a_latch_behind_a_flood_that_the_broker_itself_drops_arrives(tmp_path: Path) -> None:
-    """The broker keeps 1000 messages for a slow client; the safety commands are another client's."""
-    async with bridge(tmp_path) as (run, listener, port), aiomqtt.Client("127.0.0.1", port) as client:
+    """The broker keeps 1000 messages for a slow client;
+    the safety commands are another client's.
+    """
+    async with (
+        bridge(tmp_path) as (run, listener, port),
+        aiomqtt.Client("127.0.0.1", port) as client,
+    ):
         flooding = [asyncio.create_task(flood_for(port, 3.0)) for _ in range(3)]
         await asyncio.sleep(1.5)
         begin_s = time.monotonic()
@@ -164,7 +185,10 @@ async def flood_for(port: int, duration_s: float) -> None:
 
 
 async def test_what_a_flood_loses_is_reported(tmp_path: Path) -> None:
-    async with bridge(tmp_path) as (run, listener, port), aiomqtt.Client("127.0.0.1", port) as client:
+    async with (
+        bridge(tmp_path) as (run, listener, port),
+        aiomqtt.Client("127.0.0.1", port) as client,
+    ):
         for number in range(150):
             await client.publish(f"{BASE}/do/mark", f"x{number}", qos=1)
         await client.publish(f"{BASE}/do/mark", "the last", qos=1)
@@ -183,8 +207,13 @@ async def test_what_a_flood_loses_is_reported(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("qos", [0, 1])
 @pytest.mark.parametrize("before", [0, 4, 150])
-async def test_a_hold_published_before_a_lower_is_not_obeyed_after_it(tmp_path: Path, qos: int, before: int) -> None:
-    async with bridge(tmp_path) as (run, listener, port), aiomqtt.Client("127.0.0.1", port) as client:
+async def test_a_hold_published_before_a_lower_is_not_obeyed_after_it(
+    tmp_path: Path, qos: int, before: int
+) -> None:
+    async with (
+        bridge(tmp_path) as (run, listener, port),
+        aiomqtt.Client("127.0.0.1", port) as client,
+    ):
         run.state = State.STANDBY
         for round_ in range(5):
             listener.seen.clear()
@@ -209,7 +238,10 @@ async def test_a_retained_command_is_never_obeyed(tmp_path: Path, command: str) 
         for _ in range(2):  # at the first connection, and at the next one
             listener.seen.clear()
             async with serving(port, door_to(tmp_path)):
-                assert await listener.answer(command) == f"{command} refused: a retained message is no command"
+                assert (
+                    await listener.answer(command)
+                    == f"{command} refused: a retained message is no command"
+                )
         assert run.asked == []
 
 
@@ -224,8 +256,19 @@ async def test_a_text_that_is_no_number_is_refused(tmp_path: Path, text: str) ->
 
 async def test_garbage_on_every_topic_is_answered_and_the_bridge_goes_on(tmp_path: Path) -> None:
     rng = random.Random(5)
-    payloads = [b"", b"\xff\xfe", b"\0" * 10, rng.randbytes(600), b"9" * 300_000, b"NaN", b'{"value": 1}']
-    async with bridge(tmp_path) as (run, listener, port), aiomqtt.Client("127.0.0.1", port) as client:
+    payloads = [
+        b"",
+        b"\xff\xfe",
+        b"\0" * 10,
+        rng.randbytes(600),
+        b"9" * 300_000,
+        b"NaN",
+        b'{"value": 1}',
+    ]
+    async with (
+        bridge(tmp_path) as (run, listener, port),
+        aiomqtt.Client("127.0.0.1", port) as client,
+    ):
         for name in ("setpoint", "manual", "open_the_roof", "__class__", "mark"):
             for payload in payloads:
                 listener.seen.clear()
@@ -254,7 +297,9 @@ async def test_a_latch_with_a_bad_text_is_obeyed(tmp_path: Path) -> None:
 
 
 async def test_an_old_will_is_corrected_within_seconds(tmp_path: Path) -> None:
-    """The bridge's side of its connections is reset, the broker's side stays open until its keep-alive ends."""
+    """The bridge's side of its connections is reset, the broker's side stays open until its
+    keep-alive ends.
+    """
     port, relay_port = free_port(), free_port()
     async with (
         port_run(tmp_path),
@@ -276,11 +321,15 @@ async def test_an_old_will_is_corrected_within_seconds(tmp_path: Path) -> None:
 
 @asynccontextmanager
 async def relay(listens: int, port: int) -> AsyncIterator[Callable[[], None]]:
-    """A relay to the broker; what it yields resets the clients' sides and forgets the broker's, as a NAT box does."""
+    """A relay to the broker; what it yields resets the clients' sides and forgets the broker's, as
+    a NAT box does.
+    """
     live: list[tuple[asyncio.StreamWriter, asyncio.StreamWriter, asyncio.Event]] = []
     forgotten = []
 
-    async def pump(reader: asyncio.StreamReader, writer: asyncio.StreamWriter, dead: asyncio.Event) -> None:
+    async def pump(
+        reader: asyncio.StreamReader, writer: asyncio.StreamWriter, dead: asyncio.Event
+    ) -> None:
         with contextlib.suppress(OSError):
             while (data := await reader.read(65536)) and not dead.is_set():
                 writer.write(data)
@@ -334,7 +383,9 @@ async def test_a_second_bridge_of_the_name_is_refused_and_the_first_goes_on(tmp_
             assert time.monotonic() - begin_s < 8.0
         (error,) = mqtt._leaves(refused.value)
         assert isinstance(error, DeviceError)
-        assert f"the name 'mirror' is in use by another bridge (process {os.getpid()} on " in str(error)
+        assert f"the name 'mirror' is in use by another bridge (process {os.getpid()} on " in str(
+            error
+        )
         listener.seen.clear()
         await asyncio.sleep(2.5)
         assert len(listener.of("values")) >= 2
@@ -350,13 +401,19 @@ async def test_of_two_bridges_that_start_together_one_goes_on(tmp_path: Path) ->
             serving(port, door_to(tmp_path)) as one,
             serving(port, door_to(tmp_path)) as two,
         ):
-            done, pending = await asyncio.wait({one, two}, timeout=PATIENCE_S, return_when=asyncio.FIRST_COMPLETED)
+            done, pending = await asyncio.wait(
+                {one, two}, timeout=PATIENCE_S, return_when=asyncio.FIRST_COMPLETED
+            )
             assert len(done) == 1
             refused = done.pop().exception()
             assert isinstance(refused, ExceptionGroup)
             assert [type(error) for error in mqtt._leaves(refused)] == [DeviceError]
             await listener.until(lambda: "online" in listener.of("availability"))
-            owners = {json.loads(each)["instance"] for each in listener.of("owner") if '"since_s": null' not in each}
+            owners = {
+                json.loads(each)["instance"]
+                for each in listener.of("owner")
+                if '"since_s": null' not in each
+            }
             assert len(owners) == 1
             assert not pending.pop().done()
 
@@ -382,7 +439,9 @@ async def test_a_bridge_that_ends_frees_the_name_at_once(tmp_path: Path) -> None
                 await listener.until(lambda: "online" in listener.of("availability"))
                 assert time.monotonic() - begin_s < mqtt_owner.SILENT_S
             await listener.until(
-                lambda: listener.of("availability")[-1] == "offline" and listener.of("owner")[-1] == ""
+                lambda: (
+                    listener.of("availability")[-1] == "offline" and listener.of("owner")[-1] == ""
+                )
             )
 
 
@@ -464,7 +523,9 @@ async def test_a_broker_that_does_not_answer_costs_neither_memory_nor_commands(
     assert len(capsys.readouterr().err.splitlines()) <= 3, "one line, not one for each attempt"
 
 
-async def test_a_cancellation_in_the_moment_of_a_confirmation_ends_the_task(monkeypatch: pytest.MonkeyPatch) -> None:
+async def test_a_cancellation_in_the_moment_of_a_confirmation_ends_the_task(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     """`asyncio.wait_for` of Python 3.11 returns the result, and the cancellation is lost."""
     confirmed = asyncio.Event()
 

@@ -1,4 +1,6 @@
-"""The OPC UA bridge with asyncua's client: calls behind a flood, who may log in, and what each user may do."""
+"""The OPC UA bridge with asyncua's client: calls behind a flood, who may log in, and what each user
+may do.
+"""
 
 from __future__ import annotations
 
@@ -34,7 +36,11 @@ ROLES = {"anna": "operate", "reto": "read"}
 @pytest.fixture
 def users_file(tmp_path: Path) -> str:
     file = tmp_path / "users.txt"
-    file.write_text("".join(known_user(name, ROLES[name], word).line() + "\n" for name, word in PASSWORDS.items()))
+    file.write_text(
+        "".join(
+            known_user(name, ROLES[name], word).line() + "\n" for name, word in PASSWORDS.items()
+        )
+    )
     return str(file)
 
 
@@ -42,16 +48,22 @@ def write_certificate(folder: Path, name: str) -> tuple[str, str]:
     key = generate_private_key()
     uses = [ExtendedKeyUsageOID.CLIENT_AUTH, ExtendedKeyUsageOID.SERVER_AUTH]
     uri = "urn:membrane-ctrl:mirror" if name == "server" else "urn:freeopcua:client"
-    certificate = generate_self_signed_app_certificate(key, uri, {"commonName": name}, [], extended=uses, days=1)
+    certificate = generate_self_signed_app_certificate(
+        key, uri, {"commonName": name}, [], extended=uses, days=1
+    )
     pem = serialization.Encoding.PEM
     (folder / f"{name}.pem").write_bytes(certificate.public_bytes(pem))
-    private = key.private_bytes(pem, serialization.PrivateFormat.PKCS8, serialization.NoEncryption())
+    private = key.private_bytes(
+        pem, serialization.PrivateFormat.PKCS8, serialization.NoEncryption()
+    )
     (folder / f"{name}-key.pem").write_bytes(private)
     return str(folder / f"{name}.pem"), str(folder / f"{name}-key.pem")
 
 
 @asynccontextmanager
-async def bridge(folder: Path, role: str = "operate", **settings: object) -> AsyncIterator[tuple[PortRun, str]]:
+async def bridge(
+    folder: Path, role: str = "operate", **settings: object
+) -> AsyncIterator[tuple[PortRun, str]]:
     """A run with an OPC UA bridge; yields the run and the server's address."""
     port = free_port()
     seen = dataclasses.replace(seen_hold(), name="the-run", seen_s=time.monotonic() + 1e6)
@@ -102,7 +114,9 @@ async def refusal_of(client: Client) -> str:
 
 def call_of(space: int, do: str, *given: str) -> ua.CallMethodRequest:
     method = ua.NodeId(f"mirror.do.{do}", space)
-    return ua.CallMethodRequest(ua.NodeId("mirror", space), method, [ua.Variant(each) for each in given])
+    return ua.CallMethodRequest(
+        ua.NodeId("mirror", space), method, [ua.Variant(each) for each in given]
+    )
 
 
 async def answer_to(client: Client, call: ua.CallMethodRequest) -> str:
@@ -114,22 +128,32 @@ def text_for(kind: str) -> list[str]:
     return ["hands inside"] if kind in ("latch", "lock") else []
 
 
-async def test_a_safety_command_behind_a_flood_of_calls_is_answered_within_a_second(tmp_path: Path) -> None:
+async def test_a_safety_command_behind_a_flood_of_calls_is_answered_within_a_second(
+    tmp_path: Path,
+) -> None:
     async with bridge(tmp_path) as (run, url), client_of(url) as client:
         _, space = await mirror_of(client)
         for kind in sorted(SAFETY):
             run.asked.clear()
-            flood = [asyncio.create_task(answer_to(client, call_of(space, "shape_on"))) for _ in range(150)]
+            flood = [
+                asyncio.create_task(answer_to(client, call_of(space, "shape_on")))
+                for _ in range(150)
+            ]
             begin_s = time.monotonic()
             safe = asyncio.create_task(answer_to(client, call_of(space, kind, *text_for(kind))))
             assert (await safe).endswith(f"opcua: {kind}: done")
             assert time.monotonic() - begin_s < ANSWER_S
             said = await asyncio.gather(*flood)
-            assert all(": done" in each or "too many commands" in each or "takes precedence" in each for each in said)
+            assert all(
+                ": done" in each or "too many commands" in each or "takes precedence" in each
+                for each in said
+            )
             assert kind in [command.kind for command in run.asked]
 
 
-async def test_a_latch_in_one_message_with_many_calls_does_not_wait_for_them(tmp_path: Path) -> None:
+async def test_a_latch_in_one_message_with_many_calls_does_not_wait_for_them(
+    tmp_path: Path,
+) -> None:
     async with bridge(tmp_path) as (run, url), client_of(url) as client:
         _, space = await mirror_of(client)
         calls = [call_of(space, "mark", "x") for _ in range(149)]
@@ -147,7 +171,9 @@ async def test_a_text_that_is_no_number_is_refused(tmp_path: Path) -> None:
         assert run.asked == []
 
 
-async def test_only_known_users_have_a_session_and_each_has_its_role(tmp_path: Path, users_file: str) -> None:
+async def test_only_known_users_have_a_session_and_each_has_its_role(
+    tmp_path: Path, users_file: str
+) -> None:
     async with bridge(tmp_path, users_file=users_file) as (run, url):
         assert await refusal_of(client_of(url)) == "BadIdentityTokenRejected"
         assert await refusal_of(client_of(url, "anna", "the wrong one")) == "BadUserAccessDenied"
@@ -157,12 +183,16 @@ async def test_only_known_users_have_a_session_and_each_has_its_role(tmp_path: P
             mirror, space = await mirror_of(reader)
             assert await reader.get_node(f"ns={space};s=mirror.state").read_value() == "hold"
             for do in ("stop", "shape_on"):
-                assert f"{do} refused: needs the role operate" in await mirror.call_method(f"{space}:{do}")
+                assert f"{do} refused: needs the role operate" in await mirror.call_method(
+                    f"{space}:{do}"
+                )
         assert run.asked == []
         async with client_of(url, "anna", PASSWORDS["anna"]) as operator:
             mirror, space = await mirror_of(operator)
             assert (await mirror.call_method(f"{space}:shape_on")).endswith("shape on: done")
-        assert [(command.kind, command.why) for command in run.asked] == [("shape_on", "door: opcua, anna")]
+        assert [(command.kind, command.why) for command in run.asked] == [
+            ("shape_on", "door: opcua, anna")
+        ]
 
 
 async def test_the_configured_role_limits_a_user(tmp_path: Path, users_file: str) -> None:
@@ -180,12 +210,16 @@ async def test_guesses_delay_neither_a_stop_nor_the_owner(tmp_path: Path, users_
         client_of(url, "anna", PASSWORDS["anna"]) as operator,
     ):
         mirror, space = await mirror_of(operator)
-        guesses = [asyncio.create_task(refusal_of(client_of(url, "anna", f"guess {n}"))) for n in range(40)]
+        guesses = [
+            asyncio.create_task(refusal_of(client_of(url, "anna", f"guess {n}"))) for n in range(40)
+        ]
         await asyncio.sleep(0.2)
         begin_s = time.monotonic()
         assert (await mirror.call_method(f"{space}:stop")).endswith("stop: done")
         assert time.monotonic() - begin_s < ANSWER_S
-        assert await refusal_of(client_of(url, "anna", PASSWORDS["anna"])) == "", "the owner logs in again"
+        assert await refusal_of(client_of(url, "anna", PASSWORDS["anna"])) == "", (
+            "the owner logs in again"
+        )
         assert set(await asyncio.gather(*guesses)) == {"BadUserAccessDenied"}
 
 
@@ -196,9 +230,14 @@ async def test_encrypted_sessions_only_with_a_certificate(tmp_path: Path, users_
     async with bridge(tmp_path, **settings) as (_, url):
         plain = client_of(url, "anna", PASSWORDS["anna"])
         assert await refusal_of(plain) != ""
-        for password, refusal in ((PASSWORDS["anna"], ""), ("the wrong one", "BadUserAccessDenied")):
+        for password, refusal in (
+            (PASSWORDS["anna"], ""),
+            ("the wrong one", "BadUserAccessDenied"),
+        ):
             client = client_of(url, "anna", password)
-            await client.set_security_string(f"Basic256Sha256,SignAndEncrypt,{own_certificate},{own_key}")
+            await client.set_security_string(
+                f"Basic256Sha256,SignAndEncrypt,{own_certificate},{own_key}"
+            )
             assert await refusal_of(client) == refusal
 
 

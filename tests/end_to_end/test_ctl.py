@@ -25,7 +25,9 @@ PATIENCE_S = 60.0
 
 @dataclass(frozen=True)
 class Asked:
-    """Output of `ctl`; run in the test's own process, as Python's start takes longer than the command."""
+    """Output of `ctl`; run in the test's own process, as Python's start takes longer than the
+    command.
+    """
 
     code: int
     out: str
@@ -42,7 +44,17 @@ def ctl(folder: Path, *arguments: str) -> Asked:
 def hold_command(folder: Path) -> list[str]:
     config = folder / "lab.toml"
     config.write_text(f"{slow_machine()}[twin]\nport = 0\n[shape]\nenabled = false\n")
-    return [*COMMAND, "hold", "--twin", "--config", str(config), "--logs", str(folder / "logs"), "--name", "ctl"]
+    return [
+        *COMMAND,
+        "hold",
+        "--twin",
+        "--config",
+        str(config),
+        "--logs",
+        str(folder / "logs"),
+        "--name",
+        "ctl",
+    ]
 
 
 def until_ticking(folder: Path) -> dict[str, object]:
@@ -59,7 +71,9 @@ def until_ticking(folder: Path) -> dict[str, object]:
 
 @pytest.fixture
 def running(tmp_path: Path) -> Iterator[subprocess.Popen[str]]:
-    process = subprocess.Popen(hold_command(tmp_path), stderr=subprocess.PIPE, stdout=subprocess.PIPE, text=True)
+    process = subprocess.Popen(
+        hold_command(tmp_path), stderr=subprocess.PIPE, stdout=subprocess.PIPE, text=True
+    )
     yield process
     if process.poll() is None:
         process.kill()
@@ -76,7 +90,9 @@ def test_a_session_of_an_operator(tmp_path: Path, running: subprocess.Popen[str]
     assert ctl(tmp_path, "mark", "door opened").code == 0
     assert ctl(tmp_path, "gains", "kp_per_s = 0.5").code == 0
 
-    second = subprocess.run(hold_command(tmp_path), capture_output=True, text=True, timeout=PATIENCE_S, check=False)
+    second = subprocess.run(
+        hold_command(tmp_path), capture_output=True, text=True, timeout=PATIENCE_S, check=False
+    )
     assert (second.returncode, "another hold is listening" in second.stderr) == (4, True)
     assert [path.name for path in (tmp_path / "logs").iterdir() if path.is_dir()] == [run_dir.name]
 
@@ -97,13 +113,17 @@ def test_a_session_of_an_operator(tmp_path: Path, running: subprocess.Popen[str]
     assert events[-1]["kind"] == "end"
 
 
-def test_a_killed_holds_socket_does_not_stop_the_next(tmp_path: Path, running: subprocess.Popen[str]) -> None:
+def test_a_killed_holds_socket_does_not_stop_the_next(
+    tmp_path: Path, running: subprocess.Popen[str]
+) -> None:
     until_ticking(tmp_path)
     running.kill()
     running.wait()
     assert (tmp_path / "logs" / "control.sock").exists()
     assert ctl(tmp_path, "status").code == 4
-    following = subprocess.Popen(hold_command(tmp_path), stderr=subprocess.PIPE, stdout=subprocess.PIPE, text=True)
+    following = subprocess.Popen(
+        hold_command(tmp_path), stderr=subprocess.PIPE, stdout=subprocess.PIPE, text=True
+    )
     try:
         until_ticking(tmp_path)
         assert ctl(tmp_path, "stop").code == 0

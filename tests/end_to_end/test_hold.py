@@ -1,4 +1,6 @@
-"""`hold --twin` as its user runs it: a process, a socket, signals, and what is on the disk afterwards."""
+"""`hold --twin` as its user runs it: a process, a socket, signals, and what is on the disk
+afterwards.
+"""
 
 from __future__ import annotations
 
@@ -85,7 +87,9 @@ def rows_in(folder: Path) -> int:
     return sum(
         chunk.to_record_batch().num_rows
         for path in run_dir(folder).glob("*.rrd")
-        for chunk in RrdReader(path).stream().filter(content="/tick/lateness")  # there in every state
+        for chunk in RrdReader(path)
+        .stream()
+        .filter(content="/tick/lateness")  # there in every state
     )
 
 
@@ -106,7 +110,9 @@ def read_board(client: ModbusTcpClient) -> dict[str, float]:
 
 @pytest.fixture
 def running(tmp_path: Path) -> Iterator[subprocess.Popen[str]]:
-    process = subprocess.Popen(hold(tmp_path), stderr=subprocess.PIPE, stdout=subprocess.PIPE, text=True)
+    process = subprocess.Popen(
+        hold(tmp_path), stderr=subprocess.PIPE, stdout=subprocess.PIPE, text=True
+    )
     yield process
     if process.poll() is None:
         process.kill()
@@ -128,16 +134,31 @@ def test_a_short_hold_with_the_camera_loop_leaves_everything_it_should(tmp_path:
     assert captured["verdict"] == "ok"
     head = read_head(run_dir(tmp_path) / str(captured["set"]))
     assert (head.kind, len(head.patterns)) == ("full", 18)
-    assert np.isfinite(head.displacement_um).mean() > 0.5  # none for a frame during which the machine was paused
+    assert (
+        np.isfinite(head.displacement_um).mean() > 0.5
+    )  # none for a frame during which the machine was paused
     assert abs(np.nanmean(head.displacement_um)) < 5.0
     summary = json.loads((run_dir(tmp_path) / "summary.json").read_text())
     assert summary["exit"] == "done"
-    assert [s["state"] for s in summary["states"]] == ["check", "inflate", "settle", "hold", "lower"]
+    assert [s["state"] for s in summary["states"]] == [
+        "check",
+        "inflate",
+        "settle",
+        "hold",
+        "lower",
+    ]
     assert summary["cycles"] >= 3
     assert summary["cycles_rejected"] == 0
     assert 0 < summary["true_std_um"] < 0.5
     assert summary["in_band_1s_fraction"] == 1.0
-    for key in ("true_bias_um", "lateness_ms", "ticks", "missed_ticks", "cycle_latency_ms", "sag_error_um"):
+    for key in (
+        "true_bias_um",
+        "lateness_ms",
+        "ticks",
+        "missed_ticks",
+        "cycle_latency_ms",
+        "sag_error_um",
+    ):
         assert summary[key] is not None
     config = tomllib.loads((run_dir(tmp_path) / "config.toml").read_text())
     assert config["optics"]["camera"]["width_px"] == 306
@@ -178,7 +199,9 @@ def test_another_client_reads_along_and_sigkill_stops_the_pump_and_loses_nothing
     assert read_board(client)["pump_readback_fraction"] == 0.0
     client.close()
     psutil.wait_procs(children, timeout=PATIENCE_S)
-    assert not [child for child in children if child.is_running() and child.status() != psutil.STATUS_ZOMBIE]
+    assert not [
+        child for child in children if child.is_running() and child.status() != psutil.STATUS_ZOMBIE
+    ]
     assert json.loads((run_dir(tmp_path) / "summary.json").read_text())["exit"] == "killed"
     assert events(tmp_path)[-1]["kind"] == "end"
     assert rows_in(tmp_path) > 50
@@ -201,11 +224,16 @@ def run_refused(arguments: list[str], exit_code: int) -> str:
     ("config", "words"),
     [
         ("[loop]\nrate_khz = 1\n", ["loop.rate_khz", "rate_hz"]),
-        ("[optics.geometry]\na_mm = 2.672\nb_mm = 2871.0\nalpha_deg = 80.9\n", ["optics.geometry.a_mm", "100"]),
+        (
+            "[optics.geometry]\na_mm = 2.672\nb_mm = 2871.0\nalpha_deg = 80.9\n",
+            ["optics.geometry.a_mm", "100"],
+        ),
         ("[loop]\nsetpoint_um = 4000.0\n", ["setpoint_um", "limits"]),
     ],
 )
-def test_a_bad_configuration_is_one_line_and_leaves_nothing(tmp_path: Path, config: str, words: list[str]) -> None:
+def test_a_bad_configuration_is_one_line_and_leaves_nothing(
+    tmp_path: Path, config: str, words: list[str]
+) -> None:
     line = run_refused(hold(tmp_path, config=config)[3:], 2)
     assert "lab.toml" in line
     assert all(word in line for word in words)
@@ -228,7 +256,9 @@ def test_a_busy_port_is_one_line_and_leaves_nothing(tmp_path: Path) -> None:
         taken.listen()
         port = taken.getsockname()[1]
         config = write_config(tmp_path, port=port)
-        line = run_refused(["hold", "--twin", "--config", str(config), "--logs", str(tmp_path / "logs")], 4)
+        line = run_refused(
+            ["hold", "--twin", "--config", str(config), "--logs", str(tmp_path / "logs")], 4
+        )
     assert str(port) in line
     assert not (tmp_path / "logs").exists()
 
@@ -246,20 +276,26 @@ def test_a_full_disk_is_refused_before_anything_exists(tmp_path: Path) -> None:
     assert not list(tmp_path.glob("logs/*"))
 
 
-def test_nobody_at_the_address_is_a_device_failure(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_nobody_at_the_address_is_a_device_failure(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.setattr("membrane_ctrl.instruments.bench._PATIENCE_S", 0.3)
     with socket.socket() as free:
         free.bind(("127.0.0.1", 0))
         port = free.getsockname()[1]
     config = tmp_path / "lab.toml"
     config.write_text(f'[devices]\nboard = "tcp://127.0.0.1:{port}"\n')
-    assert str(port) in run_refused(["hold", "--config", str(config), "--logs", str(tmp_path / "logs")], 4)
+    assert str(port) in run_refused(
+        ["hold", "--config", str(config), "--logs", str(tmp_path / "logs")], 4
+    )
     assert not (tmp_path / "logs").exists()
 
 
 def test_the_served_twin_can_be_held_by_another_process(tmp_path: Path) -> None:
     config = write_config(tmp_path)
-    twin = subprocess.Popen([*COMMAND, "twin", "--config", str(config)], stderr=subprocess.PIPE, text=True)
+    twin = subprocess.Popen(
+        [*COMMAND, "twin", "--config", str(config)], stderr=subprocess.PIPE, text=True
+    )
     try:
         assert twin.stderr is not None
         listens = [twin.stderr.readline() for _ in range(2)][1]
@@ -267,12 +303,26 @@ def test_the_served_twin_can_be_held_by_another_process(tmp_path: Path) -> None:
         lab = tmp_path / "devices.toml"
         lab.write_text(slow_machine(address))
         checked = subprocess.run(
-            [*COMMAND, "check", str(lab), "--json"], capture_output=True, text=True, timeout=PATIENCE_S, check=True
+            [*COMMAND, "check", str(lab), "--json"],
+            capture_output=True,
+            text=True,
+            timeout=PATIENCE_S,
+            check=True,
         )
         report = json.loads(checked.stdout)
         assert report["devices"][0]["identity"].startswith("membrane pump board")
         held = subprocess.run(
-            [*COMMAND, "hold", "--config", str(lab), "--logs", str(tmp_path / "logs"), "--duration", "2s", "--json"],
+            [
+                *COMMAND,
+                "hold",
+                "--config",
+                str(lab),
+                "--logs",
+                str(tmp_path / "logs"),
+                "--duration",
+                "2s",
+                "--json",
+            ],
             capture_output=True,
             text=True,
             timeout=PATIENCE_S,
@@ -289,7 +339,9 @@ def test_the_served_twin_can_be_held_by_another_process(tmp_path: Path) -> None:
 def test_a_board_with_another_map_version_is_refused(tmp_path: Path) -> None:
     """A board that we cannot drive is detected before a run folder exists."""
     server = subprocess.Popen(
-        [sys.executable, str(Path(__file__).with_name("wrong_board.py"))], stdout=subprocess.PIPE, text=True
+        [sys.executable, str(Path(__file__).with_name("wrong_board.py"))],
+        stdout=subprocess.PIPE,
+        text=True,
     )
     try:
         assert server.stdout is not None
@@ -326,7 +378,9 @@ def test_no_shared_memory_is_left_behind(tmp_path: Path) -> None:
 
 
 def test_sigterm_while_the_processes_start_cleans_up(running: subprocess.Popen[str]) -> None:
-    """The twin is there before the recorder and the others: none of them may be left, nor the signal lost."""
+    """The twin is there before the recorder and the others: none of them may be left, nor the
+    signal lost.
+    """
     wait_for(lambda: len(psutil.Process(running.pid).children()) > 1)
     children = psutil.Process(running.pid).children()
     running.send_signal(signal.SIGTERM)

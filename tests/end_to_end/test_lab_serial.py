@@ -1,4 +1,6 @@
-"""The mirror held through a serial laser, a Bronkhorst flow controller and a barometer, all in bytes on ptys."""
+"""The mirror held through a serial laser, a Bronkhorst flow controller and a barometer, all in
+bytes on ptys.
+"""
 
 from __future__ import annotations
 
@@ -18,8 +20,9 @@ HOLD = [sys.executable, "-m", "membrane_ctrl", "hold", "--devices", str(EXAMPLE)
 def test_the_mirror_is_held_through_serial_instruments(tmp_path: Path) -> None:
     near = tmp_path / "near.toml"
     patient = {
-        "[devices.displacement]\n": "[devices]\nwatchdog_s = 2.0\n[devices.displacement]\ntimeout_s = 1.9\n",
-        "unit_id = 3\n": "unit_id = 3\ntimeout_s = 0.9\n",  # the waits of the two on one line add up
+        "[devices.displacement]\n": "[devices]\nwatchdog_s = 2.0\n[devices.displacement]\ntimeout_s = 1.9\n",  # noqa: E501
+        # the waits of the two on one line add up
+        "unit_id = 3\n": "unit_id = 3\ntimeout_s = 0.9\n",
         "unit_id = 5\n": "unit_id = 5\ntimeout_s = 0.9\n",
         "metrics_port = 9464": "",  # another hold of this machine may have it
     }
@@ -29,7 +32,16 @@ def test_the_mirror_is_held_through_serial_instruments(tmp_path: Path) -> None:
         text = text.replace(words, slow)
     near.write_text(text + "[twin]\nstart_error_um = -2.0\n")
     done = subprocess.run(
-        [*HOLD[:-1], str(near), "--twin", "--duration", "30s", "--logs", str(tmp_path / "logs"), "--json"],
+        [
+            *HOLD[:-1],
+            str(near),
+            "--twin",
+            "--duration",
+            "30s",
+            "--logs",
+            str(tmp_path / "logs"),
+            "--json",
+        ],
         capture_output=True,
         text=True,
         timeout=120,
@@ -44,7 +56,11 @@ def test_the_mirror_is_held_through_serial_instruments(tmp_path: Path) -> None:
 
 def test_devices_without_twin_is_a_usage_error(tmp_path: Path) -> None:
     done = subprocess.run(
-        [*HOLD, "--logs", str(tmp_path / "logs")], capture_output=True, text=True, timeout=60, check=False
+        [*HOLD, "--logs", str(tmp_path / "logs")],
+        capture_output=True,
+        text=True,
+        timeout=60,
+        check=False,
     )
     assert done.returncode == 2
     assert "--devices needs --twin" in done.stderr

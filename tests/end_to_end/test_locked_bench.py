@@ -1,4 +1,6 @@
-"""Hands inside: whatever others try on this machine, a locked bench does not move until the lock is removed."""
+"""Hands inside: whatever others try on this machine, a locked bench does not move until the lock is
+removed.
+"""
 
 from __future__ import annotations
 
@@ -54,14 +56,19 @@ class Lab:
     def start(self, *words: str) -> subprocess.Popen[str]:
         """Start one of our commands as a process."""
         program = subprocess.Popen(
-            [sys.executable, "-m", "membrane_ctrl", *words], stderr=subprocess.PIPE, text=True, cwd=self.folder
+            [sys.executable, "-m", "membrane_ctrl", *words],
+            stderr=subprocess.PIPE,
+            text=True,
+            cwd=self.folder,
         )
         self._programs.append(program)
         return program
 
     def hold(self, *words: str) -> subprocess.Popen[str]:
         """Start a hold, and wait until it listens."""
-        program = self.start("hold", "--config", "lab.toml", "--logs", str(self.folder / "logs"), *words)
+        program = self.start(
+            "hold", "--config", "lab.toml", "--logs", str(self.folder / "logs"), *words
+        )
         wait_for(lambda: program.poll() is not None or self.answers())
         return program
 
@@ -73,7 +80,9 @@ class Lab:
 
     def ask(self, **request: Any) -> dict[str, Any]:
         """One request at the hold's socket, as the hold's own user."""
-        with PortClient.unix(self.folder / "logs" / "control.sock", notice=lambda _: None) as client:
+        with PortClient.unix(
+            self.folder / "logs" / "control.sock", notice=lambda _: None
+        ) as client:
             return client.ask(**request)
 
     def pump(self) -> int:
@@ -83,7 +92,9 @@ class Lab:
 
     def events(self, kind: str) -> list[dict[str, Any]]:
         lines = [
-            line for path in sorted(self.folder.glob("logs/*/events.jsonl")) for line in path.read_text().splitlines()
+            line
+            for path in sorted(self.folder.glob("logs/*/events.jsonl"))
+            for line in path.read_text().splitlines()
         ]
         return [event for event in map(json.loads, lines) if event["kind"] == kind]
 
@@ -136,11 +147,16 @@ def test_nothing_moves_a_locked_mirror_until_its_lock_is_removed(lab: Lab) -> No
     for words in (("tune", "run", "--short", "--yes"), ("calibrate", "--live")):
         assert "locked" in refused(*words, "--socket", socket)
     for request in (
-        {"do": "ack", "on_behalf": BOB}, {"do": "hold", "on_behalf": BOB}, {"do": "ack", "on_behalf": BRIDGE},
-        {"do": "unlock", "text": lock["word"], "on_behalf": BRIDGE}, {"do": "unlock", "on_behalf": BOB},
-        {"do": "unlock", "text": "wrong", "on_behalf": BOB}, {"do": "unlock", "on_behalf": LINK},
-        {"do": "hold"}, {"do": "unlock"},
-    ):  # fmt: skip
+        {"do": "ack", "on_behalf": BOB},
+        {"do": "hold", "on_behalf": BOB},
+        {"do": "ack", "on_behalf": BRIDGE},
+        {"do": "unlock", "text": lock["word"], "on_behalf": BRIDGE},
+        {"do": "unlock", "on_behalf": BOB},
+        {"do": "unlock", "text": "wrong", "on_behalf": BOB},
+        {"do": "unlock", "on_behalf": LINK},
+        {"do": "hold"},
+        {"do": "unlock"},
+    ):
         answer = lab.ask(**request)
         assert answer["ok"] == (request["do"] == "ack"), answer
         assert lab.ask(do="status")["status"]["state"] == "standby"
@@ -149,8 +165,16 @@ def test_nothing_moves_a_locked_mirror_until_its_lock_is_removed(lab: Lab) -> No
     assert (answer["ok"], answer["stored"]) == (True, True)
     wait_for(lambda: bool(lab.events("unlock")))
     (removed,) = lab.events("unlock")
-    assert (removed["author"], removed["remover"], removed["how"]) == ("page:ann", "page:bob", "word")
-    wrong = [event for event in lab.events("command") if event["command"] == "unlock" and event.get("refused")]
+    assert (removed["author"], removed["remover"], removed["how"]) == (
+        "page:ann",
+        "page:bob",
+        "word",
+    )
+    wrong = [
+        event
+        for event in lab.events("command")
+        if event["command"] == "unlock" and event.get("refused")
+    ]
     assert "wrong" in [event.get("text") for event in wrong]
     assert lab.ask(do="hold")["ok"]
     wait_for(lambda: lab.pump() > 0)
@@ -179,7 +203,9 @@ def test_a_lock_that_cannot_be_stored_holds_for_the_run_and_says_so(
 
 
 def test_safe_stops_a_hold_that_it_does_not_find(lab: Lab) -> None:
-    """The hold's folder of runs is not the configured one: `safe` stores a lock, and the hold sees it."""
+    """The hold's folder of runs is not the configured one: `safe` stores a lock, and the hold sees
+    it.
+    """
     lab.hold()
     wait_for(lambda: lab.pump() > 0)
     assert run(["safe", str(lab.folder / "lab.toml"), "--logs", str(lab.folder / "elsewhere")]) == 0
@@ -206,7 +232,9 @@ def test_locks_are_listed_and_removed_without_a_hold(
     assert json.loads(log.read_text())["how"] == "author"
 
 
-def test_a_lock_of_a_running_hold_is_removed_there(lab: Lab, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_lock_of_a_running_hold_is_removed_there(
+    lab: Lab, capsys: pytest.CaptureFixture[str]
+) -> None:
     lab.hold("--standby")
     lab.ask(do="latch", text="hands inside")
     assert "ctl unlock" in refused("locks", "remove")

@@ -1,4 +1,6 @@
-"""Two programs and one bench on one machine, as their users start them: the second changes nothing of a hold."""
+"""Two programs and one bench on one machine, as their users start them: the second changes nothing
+of a hold.
+"""
 
 from __future__ import annotations
 
@@ -36,17 +38,31 @@ class Bench:
 
     def __init__(self, folder: Path) -> None:
         self.folder = folder
-        (folder / "twin.toml").write_text(slow_machine() + "[twin]\nport = 0\n[shape]\nenabled = false\n")
-        words = ["hold", "--twin", "--config", str(folder / "twin.toml"), "--logs", str(folder / "logs")]
-        self.process = subprocess.Popen([sys.executable, "-m", "membrane_ctrl", *words], stderr=subprocess.PIPE)
+        (folder / "twin.toml").write_text(
+            slow_machine() + "[twin]\nport = 0\n[shape]\nenabled = false\n"
+        )
+        words = [
+            "hold",
+            "--twin",
+            "--config",
+            str(folder / "twin.toml"),
+            "--logs",
+            str(folder / "logs"),
+        ]
+        self.process = subprocess.Popen(
+            [sys.executable, "-m", "membrane_ctrl", *words], stderr=subprocess.PIPE
+        )
         wait_for(lambda: bool(list(folder.glob("logs/*/config.toml"))))
         run_dir = next(folder.glob("logs/*/config.toml"))
         self.board = str(tomllib.loads(run_dir.read_text())["devices"]["board"])
-        self.client = ModbusTcpClient("127.0.0.1", port=int(self.board.rpartition(":")[2]), timeout=20)
+        self.client = ModbusTcpClient(
+            "127.0.0.1", port=int(self.board.rpartition(":")[2]), timeout=20
+        )
         assert self.client.connect()
         wait_for(lambda: self.sensors()[PUMP] > 0)
         (folder / "slow.toml").write_text(
-            f'[devices]\nboard = "{self.board}"\nwatchdog_s = 1.5\n[recording]\nlogs_dir = "{folder}/other"\n'
+            f'[devices]\nboard = "{self.board}"\nwatchdog_s = 1.5\n[recording]\nlogs_dir = '
+            f'"{folder}/other"\n'
         )
 
     def sensors(self) -> list[int]:
@@ -82,7 +98,9 @@ def refused(*words: str) -> str:
     return err.getvalue().strip().splitlines()[-1]
 
 
-def test_beside_a_hold_nothing_else_opens_its_board_and_safe_stops_it_for_good(bench: Bench) -> None:
+def test_beside_a_hold_nothing_else_opens_its_board_and_safe_stops_it_for_good(
+    bench: Bench,
+) -> None:
     slow, logs = str(bench.folder / "slow.toml"), str(bench.folder / "logs")
     before = bench.claim()
     assert before[0] == 2000

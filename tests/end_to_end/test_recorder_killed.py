@@ -1,4 +1,6 @@
-"""A hold whose recorder is killed: the hold continues, another recorder takes over, and the night can be replayed."""
+"""A hold whose recorder is killed: the hold continues, another recorder takes over, and the night
+can be replayed.
+"""
 
 from __future__ import annotations
 
@@ -63,7 +65,9 @@ def test_a_killed_recorder_is_replaced_and_every_tick_replayed(
     assert summary["recorder"]["partial"] is False
     assert summary["dropped"] == dict.fromkeys(summary["dropped"], 0)
     assert summary["ticks"] == summary["end"]["ticks"] >= 300
-    kinds = [json.loads(line)["kind"] for line in (run_dir / "events.jsonl").read_text().splitlines()]
+    kinds = [
+        json.loads(line)["kind"] for line in (run_dir / "events.jsonl").read_text().splitlines()
+    ]
     assert kinds.count("child_ended") == kinds.count("child_restarted") == kinds.count("end") == 1
     assert run(["replay", str(run_dir), "--json"]) == Exit.DONE
     report = json.loads(capsys.readouterr().out)

@@ -1,4 +1,6 @@
-"""A session beside an independent hold: commands through the port, ticks from the rings; the hold outlives both."""
+"""A session beside an independent hold: commands through the port, ticks from the rings; the hold
+outlives both.
+"""
 
 from __future__ import annotations
 
@@ -42,7 +44,9 @@ def logs(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
     folder = tmp_path_factory.mktemp("tune")
     (folder / "lab.toml").write_text(CONFIG)
     words = ["hold", "--twin", "--config", str(folder / "lab.toml"), "--logs", str(folder / "logs")]
-    process = subprocess.Popen([sys.executable, "-m", "membrane_ctrl", *words], stderr=subprocess.DEVNULL)
+    process = subprocess.Popen(
+        [sys.executable, "-m", "membrane_ctrl", *words], stderr=subprocess.DEVNULL
+    )
     try:
         yield folder / "logs"
     finally:
@@ -69,7 +73,9 @@ def connected(logs: Path) -> LiveHold:
 def steps(rig: HoldRig, duration_s: float) -> ExperimentSpec:
     around = rig.around(rig.hold(2.0), 10.0)
     flow = min(max(around.holding_flow_um_per_s, 0.8), 1.8)  # two seconds give it only roughly
-    return ExperimentSpec(kind="steps", duration_s=duration_s, holding_flow_um_per_s=flow, laser_um=around.laser_um)
+    return ExperimentSpec(
+        kind="steps", duration_s=duration_s, holding_flow_um_per_s=flow, laser_um=around.laser_um
+    )
 
 
 def test_an_experiment_and_gains_on_a_live_hold(logs: Path) -> None:
@@ -78,7 +84,9 @@ def test_an_experiment_and_gains_on_a_live_hold(logs: Path) -> None:
     record, finished = rig.perform(steps(rig, 12.0))
     assert finished.completed, finished.reason
     assert 12.0 <= record.duration_s < 24.0
-    assert record.lost_fraction < 0.3  # a machine that pauses twice skips ticks; they are counted, not hidden
+    assert (
+        record.lost_fraction < 0.3
+    )  # a machine that pauses twice skips ticks; they are counted, not hidden
     curve = PumpConfig(curve_fraction=(0.1, 1.0), curve_um_per_s=(0.0, 5.3), flow_full_um_per_s=5.3)
     rig.set_gains(rig.loop.model_copy(update={"kp_per_s": 0.4}), "test", 60.0, pump=curve)
     rig.keep()

@@ -1,4 +1,6 @@
-"""A service as systemd starts it: reports every start, stays down with a latched fault, waits in standby."""
+"""A service as systemd starts it: reports every start, stays down with a latched fault, waits in
+standby.
+"""
 
 from __future__ import annotations
 
@@ -17,12 +19,22 @@ from membrane_ctrl.run_files.latched_fault import NAME
 
 pytestmark = pytest.mark.real_time
 
-CONFIG = slow_machine() + "[twin]\nport = 0\n[shape]\nenabled = false\n[states]\nlatch_twin_faults = true\n"
+CONFIG = (
+    slow_machine()
+    + "[twin]\nport = 0\n[shape]\nenabled = false\n[states]\nlatch_twin_faults = true\n"
+)
 
 
 def start(folder: Path, *options: str) -> subprocess.CompletedProcess[str]:
     (folder / "lab.toml").write_text(CONFIG)
-    arguments = ("hold", "--twin", "--config", str(folder / "lab.toml"), "--logs", str(folder / "logs"))
+    arguments = (
+        "hold",
+        "--twin",
+        "--config",
+        str(folder / "lab.toml"),
+        "--logs",
+        str(folder / "logs"),
+    )
     return subprocess.run(
         [sys.executable, "-m", "membrane_ctrl", *arguments, *options],
         capture_output=True,
@@ -40,10 +52,15 @@ def told_until_it_stops(systemd: socket.socket) -> list[list[str]]:
     return messages
 
 
-def test_standby_is_told_to_systemd_and_a_corrupt_latched_file_keeps_the_hold_down(tmp_path: Path) -> None:
+def test_standby_is_told_to_systemd_and_a_corrupt_latched_file_keeps_the_hold_down(
+    tmp_path: Path,
+) -> None:
     (tmp_path / "logs").mkdir()
     (tmp_path / "logs" / NAME).write_text("{")
-    with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as systemd, ThreadPoolExecutor(1) as beside:
+    with (
+        socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as systemd,
+        ThreadPoolExecutor(1) as beside,
+    ):
         systemd.bind(str(tmp_path / "notify"))
         systemd.settimeout(120)
         refused = start(tmp_path)

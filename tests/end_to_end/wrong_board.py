@@ -1,4 +1,6 @@
-"""A pump board of a later map version, as a process: prints its port and serves until it is ended."""
+"""A pump board of a later map version, as a process: prints its port
+and serves until it is ended.
+"""
 
 from __future__ import annotations
 

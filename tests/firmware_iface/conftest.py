@@ -28,7 +28,9 @@ def map_version() -> int:
 
 
 @pytest.fixture
-async def board(plant: CountingPlant, clock: ManualClock, map_version: int) -> AsyncIterator[PumpBoardEmulator]:
+async def board(
+    plant: CountingPlant, clock: ManualClock, map_version: int
+) -> AsyncIterator[PumpBoardEmulator]:
     """The emulated board, running."""
     emulator = PumpBoardEmulator(plant, clock=clock, registers=known_maps()[map_version])
     await emulator.start()

@@ -9,7 +9,12 @@ from typing import Any
 import pytest
 
 from firmware_iface.emulators.modbus_server import RegisterRefusal
-from firmware_iface.emulators.pump_board import GAUGE_PRESSURE_LIMIT_PA, BoardSample, BoardState, StoredSettings
+from firmware_iface.emulators.pump_board import (
+    GAUGE_PRESSURE_LIMIT_PA,
+    BoardSample,
+    BoardState,
+    StoredSettings,
+)
 from firmware_iface.register_map import known_maps
 
 SAMPLE = BoardSample(1.5, 0, 600.0, 101_325.0, 20.0, 21.0, 7, 3.25)
@@ -22,7 +27,11 @@ class Bench:
     """A board with a manual clock, claimed where it supports claims."""
 
     def __init__(
-        self, version: int, key: int = KEY, stored: StoredSettings = DELIVERED, sample: BoardSample = SAMPLE
+        self,
+        version: int,
+        key: int = KEY,
+        stored: StoredSettings = DELIVERED,
+        sample: BoardSample = SAMPLE,
     ) -> None:
         self.map = known_maps()[version]
         self.state = BoardState(self.map, sample, stored)
@@ -41,7 +50,9 @@ class Bench:
         self.state.write(found.address, found.encode(self.claim | values))
 
     def command(self, pump: float, heartbeat: int, vent: float = 0.0) -> None:
-        self.put("command", pump_command_fraction=pump, vent_command_fraction=vent, heartbeat=heartbeat)
+        self.put(
+            "command", pump_command_fraction=pump, vent_command_fraction=vent, heartbeat=heartbeat
+        )
 
     def get(self, block: str) -> dict[str, float]:
         found = self.map.block(block)
@@ -83,7 +94,9 @@ def claimed(request: pytest.FixtureRequest) -> Bench:
 def test_power_up_is_off_and_unarmed(bench: Bench) -> None:
     sensors = bench.get("sensors")
     assert (bench.state.pump_fraction, bench.state.vent_fraction) == (0.0, 0.0)
-    assert sensors["watchdog_armed"] == sensors["watchdog_tripped"] == sensors["latched_faults"] == 0
+    assert (
+        sensors["watchdog_armed"] == sensors["watchdog_tripped"] == sensors["latched_faults"] == 0
+    )
     assert sensors["displacement_um"] == 1.5
     assert sensors["device_time_s"] + sensors["device_time_fraction_s"] == 3.25
 
@@ -224,7 +237,9 @@ def test_disarming_is_refused_while_the_pump_is_commanded(bench: Bench) -> None:
         (0, [1], 2),
     ],
 )
-def test_a_refused_write_changes_nothing(old: Bench, address: int, words: list[int], code: int) -> None:
+def test_a_refused_write_changes_nothing(
+    old: Bench, address: int, words: list[int], code: int
+) -> None:
     old.command(0.5, 1, vent=0.5)
     before = old.everything()
     with pytest.raises(RegisterRefusal) as refused:
@@ -263,7 +278,9 @@ def test_missing_values_are_read_as_such(bench: Bench) -> None:
 def test_device_time_is_never_rounded_up(bench: Bench, device_time_s: float) -> None:
     bench.at(0.0, replace(SAMPLE, device_time_s=device_time_s, sample_counter=2**32 + 5))
     sensors = bench.get("sensors")
-    assert 0 <= device_time_s - sensors["device_time_s"] - sensors["device_time_fraction_s"] < 1.01e-4
+    assert (
+        0 <= device_time_s - sensors["device_time_s"] - sensors["device_time_fraction_s"] < 1.01e-4
+    )
     assert sensors["sample_counter"] == 5  # wraps
 
 
@@ -271,7 +288,11 @@ def refused(code: int) -> Any:
     return pytest.raises(RegisterRefusal, match=f"exception {code}")
 
 
-STRANGERS = [KEY ^ 1, KEY ^ (1 << 31), 1]  # one that differs in its low word, in its high word, in both
+STRANGERS = [
+    KEY ^ 1,
+    KEY ^ (1 << 31),
+    1,
+]  # one that differs in its low word, in its high word, in both
 
 
 @pytest.mark.parametrize("key", STRANGERS)
@@ -294,13 +315,22 @@ def test_a_stranger_can_do_nothing_to_a_fed_board(claimed: Bench, key: int) -> N
 def test_parts_of_a_block_are_refused_and_do_not_feed(claimed: Bench) -> None:
     command = claimed.map.block("command")
     before = claimed.everything()
-    for address, words in ((56, [50_000]), (56, [50_000, 0, 2]), (58, [2]), (49, [0]), (48, [10_000, 1]), (64, [1])):
+    for address, words in (
+        (56, [50_000]),
+        (56, [50_000, 0, 2]),
+        (58, [2]),
+        (49, [0]),
+        (48, [10_000, 1]),
+        (64, [1]),
+    ):
         with refused(2):
             claimed.state.write(address, words)
     assert claimed.everything() == before
     claimed.at(0.4)
     with refused(2):
-        claimed.state.write(command.address + 1, [0, 2, *divmod(KEY, 2**16)])  # all but the pump, with the right key
+        claimed.state.write(
+            command.address + 1, [0, 2, *divmod(KEY, 2**16)]
+        )  # all but the pump, with the right key
     claimed.at(PERIOD_S + 1e-6)
     assert claimed.state.pump_fraction == 0.0
 
@@ -309,7 +339,13 @@ def test_parts_of_a_block_are_refused_and_do_not_feed(claimed: Bench) -> None:
 def test_without_a_claim_nobody_commands_or_clears(block: str) -> None:
     bench = Bench(2)
     with refused(3):
-        bench.put(block, pump_command_fraction=0.5, vent_command_fraction=0, heartbeat=1, clear_faults=0xFFFF)
+        bench.put(
+            block,
+            pump_command_fraction=0.5,
+            vent_command_fraction=0,
+            heartbeat=1,
+            clear_faults=0xFFFF,
+        )
     with refused(3):  # neither is there anything to disarm
         bench.put("settings", watchdog_period_s=PERIOD_S, watchdog_arm=0)
     assert bench.state.pump_fraction == 0.0
@@ -317,14 +353,23 @@ def test_without_a_claim_nobody_commands_or_clears(block: str) -> None:
 
 @pytest.mark.parametrize("name", ["claim_id", "claim_key", "command_key", "clear_key"])
 def test_no_claim_is_zero(claimed: Bench, name: str) -> None:
-    values = {"watchdog_period_s": 1, "watchdog_arm": 1, "pump_command_fraction": 0.5, "vent_command_fraction": 0}
+    values = {
+        "watchdog_period_s": 1,
+        "watchdog_arm": 1,
+        "pump_command_fraction": 0.5,
+        "vent_command_fraction": 0,
+    }
     block = {"command_key": "command", "clear_key": "reset"}.get(name, "settings")
     with refused(3):
         claimed.put(block, **values, heartbeat=2, clear_faults=1, **{name: 0})
 
 
 def test_the_key_is_never_read_back(claimed: Bench) -> None:
-    for name, key in (("settings", "claim_key"), ("command", "command_key"), ("reset", "clear_key")):
+    for name, key in (
+        ("settings", "claim_key"),
+        ("command", "command_key"),
+        ("reset", "clear_key"),
+    ):
         assert claimed.get(name)[key] == 0
     assert claimed.get("sensors")["claim_in_force"] == claimed.get("settings")["claim_id"] == 7
     assert claimed.get("sensors")["period_in_force_s"] == PERIOD_S
@@ -339,7 +384,9 @@ def test_claiming_again_with_the_same_key_does_no_harm_and_does_not_feed(claimed
     assert claimed.state.pump_fraction == 0.0
 
 
-def test_a_claim_lapses_with_its_watchdog_and_the_next_one_has_a_whole_period(claimed: Bench) -> None:
+def test_a_claim_lapses_with_its_watchdog_and_the_next_one_has_a_whole_period(
+    claimed: Bench,
+) -> None:
     claimed.at(PERIOD_S)
     with refused(6):
         claimed.put("settings", watchdog_period_s=10.0, watchdog_arm=1, claim_id=9, claim_key=9)
@@ -347,7 +394,9 @@ def test_a_claim_lapses_with_its_watchdog_and_the_next_one_has_a_whole_period(cl
     claimed.put("settings", watchdog_period_s=0.25, watchdog_arm=1, claim_id=9, claim_key=9)
     sensors = claimed.get("sensors")
     assert (sensors["claim_in_force"], sensors["period_in_force_s"]) == (9, 0.25)
-    assert sensors["latched_faults"] == claimed.map.fault_mask("watchdog")  # the claim clears nothing
+    assert sensors["latched_faults"] == claimed.map.fault_mask(
+        "watchdog"
+    )  # the claim clears nothing
     with refused(6):  # the former holder has lost it, although the fault stays latched
         claimed.command(0.3, 2)
     claimed.at(PERIOD_S + 1e-3 + 0.25)
@@ -405,7 +454,13 @@ def test_a_board_nobody_holds_can_be_stopped_too_and_stays_stopped() -> None:
 
 
 def test_an_old_board_knows_neither_claim_nor_stop(old: Bench) -> None:
-    assert {block.name for block in old.map.blocks} == {"identity", "sensors", "settings", "command", "reset"}
+    assert {block.name for block in old.map.blocks} == {
+        "identity",
+        "sensors",
+        "settings",
+        "command",
+        "reset",
+    }
     assert [block.count for block in old.map.blocks] == [7, 22, 2, 3, 1]
     with refused(2):
         old.state.write(72, [1])

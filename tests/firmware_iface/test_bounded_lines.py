@@ -1,4 +1,6 @@
-"""A serial device that sends without end fills no memory: its question fails, and the next one may succeed."""
+"""A serial device that sends without end fills no memory: its question fails, and the next one may
+succeed.
+"""
 
 from __future__ import annotations
 
@@ -43,7 +45,9 @@ async def test_an_answer_without_end_ends_the_question(junk: bytes) -> None:
     port = FakePort()
     exchange = SerialExchange(port, gap_s=0.0, quiet_s=0.01)  # type: ignore[arg-type]
     exchange.connect()
-    question = Question(b"?", lambda heard: heard if re.fullmatch(b"ok\n", heard) else None, 3, "question")
+    question = Question(
+        b"?", lambda heard: heard if re.fullmatch(b"ok\n", heard) else None, 3, "question"
+    )
     received: list[int] = []
 
     def flood() -> None:

@@ -1,4 +1,6 @@
-"""Bronkhorst: the bytes of the manual, both protocols against the emulator, the vendor's own library against it."""
+"""Bronkhorst: the bytes of the manual, both protocols against the emulator, the vendor's own
+library against it.
+"""
 
 from __future__ import annotations
 
@@ -38,7 +40,13 @@ from firmware_iface.emulators.serial_device import PtyWire
 from firmware_iface.links.modbus_rtu import RtuBus
 from firmware_iface.links.serial_port import SerialSettings
 from firmware_iface.roles import DeviceRefusedError, LinkDownError, LinkError
-from tests.support.faulty_devices import MemoryWire, ProparDevice, RtuBusEmulator, SerialDevice, SerialFaults
+from tests.support.faulty_devices import (
+    MemoryWire,
+    ProparDevice,
+    RtuBusEmulator,
+    SerialDevice,
+    SerialFaults,
+)
 from tests.support.virtual_time import run_virtual
 
 LINE = SerialSettings(38_400)
@@ -94,7 +102,8 @@ def test_the_registers_of_the_manual() -> None:
 def test_binary_frames_survive_any_data_and_any_cut() -> None:
     rng = random.Random(1)
     messages = [
-        ProparMessage(rng.randrange(256), rng.choice([3, 16, 128]), rng.randbytes(1 + n % 40)) for n in range(300)
+        ProparMessage(rng.randrange(256), rng.choice([3, 16, 128]), rng.randbytes(1 + n % 40))
+        for n in range(300)
     ]
     messages.append(ProparMessage(16, 16, bytes([16] * 16)))
     stream = b"".join(binary_frame(message) for message in messages)
@@ -123,7 +132,11 @@ def test_the_flow_controller_does_as_told(protocol: Callable[[Instrument], Made]
     async def run() -> None:
         device = BronkhorstFlow(port())
         found = await device.open()
-        assert (found.kind, found.serial, found.detail) == ("Bronkhorst DMFC", "M1234567A", "0 .. 360 mln/min")
+        assert (found.kind, found.serial, found.detail) == (
+            "Bronkhorst DMFC",
+            "M1234567A",
+            "0 .. 360 mln/min",
+        )
         for fraction in (0.0, 0.25, 1.0, 1 / 3):
             await device.set_pump(fraction)
             assert await device.pump_fraction() == pytest.approx(fraction, abs=2e-5)
@@ -135,7 +148,9 @@ def test_the_flow_controller_does_as_told(protocol: Callable[[Instrument], Made]
 
 
 @both
-def test_after_a_power_cycle_nothing_flows_until_it_is_opened_again(protocol: Callable[[Instrument], Made]) -> None:
+def test_after_a_power_cycle_nothing_flows_until_it_is_opened_again(
+    protocol: Callable[[Instrument], Made],
+) -> None:
     flows: list[float] = []
     instrument = flow(flows)
     line, port, _ = protocol(instrument)
@@ -208,7 +223,9 @@ def test_a_pressure_against_vacuum_is_refused(protocol: Callable[[Instrument], M
 
 
 @both
-def test_a_pulled_plug_is_noticed_at_once_and_found_again(protocol: Callable[[Instrument], Made]) -> None:
+def test_a_pulled_plug_is_noticed_at_once_and_found_again(
+    protocol: Callable[[Instrument], Made],
+) -> None:
     _, port, wire = protocol(flow([]))
 
     async def run() -> None:
@@ -250,7 +267,9 @@ def random_faults(rng: random.Random) -> SerialFaults:
 
 
 @both
-def test_no_wrong_value_is_accepted_under_random_faults(protocol: Callable[[Instrument], Made]) -> None:
+def test_no_wrong_value_is_accepted_under_random_faults(
+    protocol: Callable[[Instrument], Made],
+) -> None:
     """Every setpoint differs, so that any late, spoilt or shifted answer would show."""
     rng = random.Random(5)
     instrument = flow([])

@@ -100,8 +100,12 @@ class Bench(camera_conformance.CameraBench):
         self._emulator.plug_in()
 
 
-@pytest.mark.parametrize("check", camera_conformance.list_checks(Bench), ids=lambda check: check.__name__)
-def test_conformance(check: camera_conformance.Check, emulator: GigeCameraEmulator, sight: Sight) -> None:
+@pytest.mark.parametrize(
+    "check", camera_conformance.list_checks(Bench), ids=lambda check: check.__name__
+)
+def test_conformance(
+    check: camera_conformance.Check, emulator: GigeCameraEmulator, sight: Sight
+) -> None:
     check(Bench(emulator, sight))
 
 
@@ -128,14 +132,18 @@ def test_identity_and_pixels(emulator: GigeCameraEmulator, sight: Sight) -> None
     assert "6 taken" in camera.describe()["frames"]
 
 
-def test_every_frame_is_triggered_and_dated(camera: GuardedCamera, emulator: GigeCameraEmulator) -> None:
+def test_every_frame_is_triggered_and_dated(
+    camera: GuardedCamera, emulator: GigeCameraEmulator
+) -> None:
     before = emulator.exposures
     times = [camera.grab().time_s for _ in range(4)]
     assert emulator.exposures == before + 4
     assert all(later - earlier >= 0.002 for earlier, later in pairwise(times))
 
 
-def test_the_screen_may_change_between_expose_and_fetch(camera: GuardedCamera, sight: Sight) -> None:
+def test_the_screen_may_change_between_expose_and_fetch(
+    camera: GuardedCamera, sight: Sight
+) -> None:
     out = np.zeros((HEIGHT_PX, WIDTH_PX), np.uint8)
     camera.expose(out)
     assert not out.any()  # nothing is written before it is fetched
@@ -162,7 +170,9 @@ def test_exposure_and_gain_arrive(emulator: GigeCameraEmulator, sight: Sight) ->
         ("Mono16", np.uint16, 65536),
     ],
 )
-def test_pixel_formats(emulator: GigeCameraEmulator, sight: Sight, pixel_format: str, dtype: Any, top: int) -> None:
+def test_pixel_formats(
+    emulator: GigeCameraEmulator, sight: Sight, pixel_format: str, dtype: Any, top: int
+) -> None:
     sight.dtype, sight.top = dtype, top
     camera = guarded(SETTINGS.model_copy(update={"pixel_format": pixel_format}))
     pixels = camera.grab().pixels
@@ -263,8 +273,13 @@ def test_discovery_names_it(emulator: GigeCameraEmulator) -> None:
 
 def test_aravis_own_tool_gets_frames(emulator: GigeCameraEmulator) -> None:
     tool = program_path("arv-camera-test-0.8")
-    options = f"-n 127.0.0.1 -w {WIDTH_PX} -h {HEIGHT_PX} -i 8000 -e 2000 -o 20 -a --no-packet-socket --duration=2"
-    said = subprocess.run([tool, *options.split()], capture_output=True, text=True, timeout=120, check=True).stdout
+    options = (
+        f"-n 127.0.0.1 -w {WIDTH_PX} -h {HEIGHT_PX} -i 8000 -e 2000 -o 20 -a --no-packet-socket "
+        "--duration=2"
+    )
+    said = subprocess.run(
+        [tool, *options.split()], capture_output=True, text=True, timeout=120, check=True
+    ).stdout
     assert "EMU1" in said
     completed = int(re.search(r"n_completed_buffers\s*=\s*(\d+)", said)[1])  # type: ignore[index]
     assert 1 <= completed <= emulator.exposures

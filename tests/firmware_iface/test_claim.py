@@ -1,4 +1,5 @@
-"""Two programs and one board: only the holder of the claim moves gas, anybody may stop it, and each sees why.
+"""Two programs and one board: only the holder of the claim moves gas, anybody may stop it, and each
+sees why.
 
 The other program is a plain pymodbus client that knows docs/registers.md and nothing of our driver.
 """
@@ -34,7 +35,9 @@ class Plain:
     """A foreign program, with its own claim."""
 
     def __init__(self, port: int, name: int = 0xAAAA_0001, key: int = 0xBBBB_0002) -> None:
-        self._client = AsyncModbusTcpClient("127.0.0.1", port=port, timeout=5, retries=0, reconnect_delay=0)
+        self._client = AsyncModbusTcpClient(
+            "127.0.0.1", port=port, timeout=5, retries=0, reconnect_delay=0
+        )
         self._name, self._key = list(divmod(name, 2**16)), list(divmod(key, 2**16))
         self._heartbeat = 0
 
@@ -86,7 +89,11 @@ async def other(board: PumpBoardEmulator) -> AsyncIterator[Plain]:
 
 
 async def test_another_program_cannot_pump_feed_arm_disarm_or_clear(
-    holder: PumpBoard, other: Plain, board: PumpBoardEmulator, plant: CountingPlant, clock: ManualClock
+    holder: PumpBoard,
+    other: Plain,
+    board: PumpBoardEmulator,
+    plant: CountingPlant,
+    clock: ManualClock,
 ) -> None:
     before = board.state.read(SETTINGS, 4) + board.state.read(COMMAND, 3)
     sent = {
@@ -102,7 +109,9 @@ async def test_another_program_cannot_pump_feed_arm_disarm_or_clear(
         (SETTINGS, [10_000, 1]),
         (RESET, [0xFFFF]),
     ):
-        assert await other.put(address, *words) == ILLEGAL_ADDRESS  # as a client of map version 1 would write
+        assert (
+            await other.put(address, *words) == ILLEGAL_ADDRESS
+        )  # as a client of map version 1 would write
     assert board.state.read(SETTINGS, 4) + board.state.read(COMMAND, 3) == before
     assert plant.outputs[-1] == (0.5, 0.25)
     assert (await holder.read()).foreign == 0
@@ -116,11 +125,15 @@ async def test_what_the_sensors_show_does_not_help_to_command(
     holder: PumpBoard, other: Plain, board: PumpBoardEmulator
 ) -> None:
     """The claim's name serves for comparison only."""
-    name = int.from_bytes(b"".join(word.to_bytes(2, "big") for word in (await other.sensors())[23:25]), "big")
+    name = int.from_bytes(
+        b"".join(word.to_bytes(2, "big") for word in (await other.sensors())[23:25]), "big"
+    )
     thief = await Plain(board.port, name=name, key=name).connect()
     assert (await thief.claim(), await thief.command(50_000)) == (BUSY, BUSY)
     thief.close()
-    readable = [board.state.read(block.address, block.count) for block in board.state.registers.blocks]
+    readable = [
+        board.state.read(block.address, block.count) for block in board.state.registers.blocks
+    ]
     secret = list(divmod(int(board.state._claim_key), 2**16))
     for words in readable:
         assert secret not in [words[at : at + 2] for at in range(len(words) - 1)]
@@ -152,9 +165,14 @@ async def test_the_drivers_stop_needs_no_claim_and_takes_none(
     assert (reading.latched_faults, reading.foreign) == (0b100, 0)
 
 
-async def test_a_second_driver_is_refused_with_who_holds_it(holder: PumpBoard, board: PumpBoardEmulator) -> None:
+async def test_a_second_driver_is_refused_with_who_holds_it(
+    holder: PumpBoard, board: PumpBoardEmulator
+) -> None:
     second = PumpBoard(f"tcp://127.0.0.1:{board.port}", timeout_s=5.0, watchdog_s=10.0)
-    with pytest.raises(DeviceBusyError, match=r"another program holds the board \(claim 0x[0-9a-f]+, watchdog 0.5 s"):
+    with pytest.raises(
+        DeviceBusyError,
+        match=r"another program holds the board \(claim 0x[0-9a-f]+, watchdog 0.5 s",
+    ):
         await second.open()
     await second.close()
     reading = await holder.read()
@@ -162,7 +180,9 @@ async def test_a_second_driver_is_refused_with_who_holds_it(holder: PumpBoard, b
     assert board.state.read(SETTINGS, 2) == [500, 1]
 
 
-async def test_the_close_of_one_that_was_refused_disarms_nothing(holder: PumpBoard, board: PumpBoardEmulator) -> None:
+async def test_the_close_of_one_that_was_refused_disarms_nothing(
+    holder: PumpBoard, board: PumpBoardEmulator
+) -> None:
     await holder.write(OFF)
     second = PumpBoard(f"tcp://127.0.0.1:{board.port}", timeout_s=5.0, watchdog_s=WATCHDOG_S)
     with pytest.raises(DeviceBusyError):
@@ -206,7 +226,9 @@ async def test_a_thief_of_the_name_shows_by_three_refused_writes(
     thief.close()
 
 
-async def test_a_changed_period_shows_in_the_next_reading(holder: PumpBoard, board: PumpBoardEmulator) -> None:
+async def test_a_changed_period_shows_in_the_next_reading(
+    holder: PumpBoard, board: PumpBoardEmulator
+) -> None:
     board.state._settable["watchdog_period_s"] = 0.501  # by a firmware that is wrong
     assert (await holder.read()).foreign == FOREIGN_PERIOD
 

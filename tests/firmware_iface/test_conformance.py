@@ -129,7 +129,11 @@ class HalfKey(BoardState):
     """Compares only the low word of a key."""
 
     def _check_claim(self, block: str, written: dict[str, float]) -> None:
-        low = {name: float(int(value) & 0xFFFF) for name, value in written.items() if name.endswith("_key")}
+        low = {
+            name: float(int(value) & 0xFFFF)
+            for name, value in written.items()
+            if name.endswith("_key")
+        }
         own, self._claim_key = self._claim_key, float(int(self._claim_key) & 0xFFFF)
         try:
             super()._check_claim(block, written | low)
@@ -262,7 +266,9 @@ Serve = Callable[..., Awaitable[Bench]]
 async def serve() -> AsyncIterator[Serve]:
     benches: list[Bench] = []
 
-    async def make(kind: type[BoardState], version: int = 3, stored: StoredSettings = DELIVERED) -> Bench:
+    async def make(
+        kind: type[BoardState], version: int = 3, stored: StoredSettings = DELIVERED
+    ) -> Bench:
         clock = ManualClock()
         plant = ClockedPlant(clock)
         registers = known_maps()[version]
@@ -296,7 +302,9 @@ async def test_the_emulator_conforms_over_rtu_and_in_real_time(tmp_path: Path) -
     board = PumpBoardEmulator(plant)
     await board.start()
     settings = SerialSettings(115_200, parity="E")
-    wire = PtyWire(RtuBusEmulator(settings, {1: partial(respond, table=board.state)}), tmp_path / "tty")
+    wire = PtyWire(
+        RtuBusEmulator(settings, {1: partial(respond, table=board.state)}), tmp_path / "tty"
+    )
     wire.plug()
     try:
         findings = await examine(f"rtu://{tmp_path}/tty?baud=115200&parity=E", timeout_s=4.0)
@@ -309,10 +317,18 @@ async def test_the_emulator_conforms_over_rtu_and_in_real_time(tmp_path: Path) -
 BROKEN = [
     (NoWatchdog, "a silent host stops the pump", "holds the pump at 0.05 after a host silent"),
     (HoldsLastValue, "a silent host stops the pump", "holds the pump at 0.05 after a host silent"),
-    (AcceptsOutOfRange, "values outside the limits are refused", "accepts watchdog_period_s = 0.049"),
+    (
+        AcceptsOutOfRange,
+        "values outside the limits are refused",
+        "accepts watchdog_period_s = 0.049",
+    ),
     (AnyWriteFeeds, "the same heartbeat does not feed", "writes that repeat one heartbeat"),
     (AnyWriteFeeds, "half a command does not feed", "writes of the pump command alone"),
-    (DisarmsAnyTime, "disarming is refused while the pump is commanded", "be disarmed while the pump is comm"),
+    (
+        DisarmsAnyTime,
+        "disarming is refused while the pump is commanded",
+        "be disarmed while the pump is comm",
+    ),
     (Frozen, "samples advance", "sample_counter stands still"),
     (ForgetsPeriod, "settings are read back as written", "written 0.3, read back 1"),
     (StartsWhenCleared, "clearing sets the pump to 0", "starts the pump at 0.05"),
@@ -329,13 +345,20 @@ CLAIMS_BROKEN = [
     (StopsForATick, "anybody may stop the pump", "runs the pump at 0.05 after stop"),
 ]
 GUARDS_BROKEN = [
-    (StopsWithoutCause, "a gauge with a value and closed interlocks let the pump run", "faults 0x8 without a cause"),
+    (
+        StopsWithoutCause,
+        "a gauge with a value and closed interlocks let the pump run",
+        "faults 0x8 without a cause",
+    ),
     (OddSettings, "identity", "gauge_timeout_s is 0.05, expected 0.1..60"),
 ]
 NOT_RUN = "all other requirements"
 WITHOUT_GAUGE = "without a gauge the pump is off after the time-out"
 CLEARED_WITHOUT_GAUGE = "clearing does not run the pump without a gauge"
-OPEN, CLEARED_OPEN = ("an open interlock keeps the pump off", "clearing does not run the pump with an open interlock")
+OPEN, CLEARED_OPEN = (
+    "an open interlock keeps the pump off",
+    "clearing does not run the pump with an open interlock",
+)
 
 
 @pytest.mark.parametrize(
@@ -360,19 +383,30 @@ async def test_without_a_gauge_the_guard_is_tested_and_the_rest_is_not(serve: Se
         WITHOUT_GAUGE,
         CLEARED_WITHOUT_GAUGE,
     ]
-    assert problems(findings) == {NOT_RUN: "not run: the fitted gauge has no value; connect it and run it again"}
+    assert problems(findings) == {
+        NOT_RUN: "not run: the fitted gauge has no value; connect it and run it again"
+    }
     assert bench.board.state.pump_fraction == 0.0
 
 
-async def test_with_an_open_interlock_the_interlock_is_tested_and_the_rest_is_not(serve: Serve) -> None:
+async def test_with_an_open_interlock_the_interlock_is_tested_and_the_rest_is_not(
+    serve: Serve,
+) -> None:
     bench = await serve(BoardState, stored=StoredSettings(interlocks_fitted=0b101))
     bench.plant.interlock_inputs = 0b011
     findings = await bench.examine()
-    assert [finding.check for finding in findings if not finding.problem][-2:] == [OPEN, CLEARED_OPEN]
-    assert problems(findings) == {NOT_RUN: "not run: interlock inputs 0x4 are open; close them and run it again"}
+    assert [finding.check for finding in findings if not finding.problem][-2:] == [
+        OPEN,
+        CLEARED_OPEN,
+    ]
+    assert problems(findings) == {
+        NOT_RUN: "not run: interlock inputs 0x4 are open; close them and run it again"
+    }
 
 
-@pytest.mark.parametrize("stored", [StoredSettings(gauge_fitted=False), StoredSettings(interlocks_fitted=0b11)])
+@pytest.mark.parametrize(
+    "stored", [StoredSettings(gauge_fitted=False), StoredSettings(interlocks_fitted=0b11)]
+)
 async def test_a_board_without_a_gauge_or_with_closed_interlocks_conforms(
     serve: Serve, stored: StoredSettings
 ) -> None:
@@ -388,7 +422,11 @@ async def test_a_board_without_a_gauge_or_with_closed_interlocks_conforms(
     ("kind", "check", "words"),
     [
         (NoGaugeGuard, WITHOUT_GAUGE, "runs the pump at 0.05 after 15 s without a gauge"),
-        (ShortMemory, CLEARED_WITHOUT_GAUGE, "runs the pump at 0.05 after a command without a gauge"),
+        (
+            ShortMemory,
+            CLEARED_WITHOUT_GAUGE,
+            "runs the pump at 0.05 after a command without a gauge",
+        ),
         (VentsWithoutGauge, WITHOUT_GAUGE, "moves the vent after 15 s without a gauge"),
         (NoLatch, WITHOUT_GAUGE, "does not latch the fault `gauge_lost`"),
     ],

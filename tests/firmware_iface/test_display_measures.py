@@ -1,4 +1,6 @@
-"""Patterns, settle time, response, checkerboard and exposure: against displays whose truth is known."""
+"""Patterns, settle time, response, checkerboard and exposure: against displays whose truth is
+known.
+"""
 
 from __future__ import annotations
 
@@ -41,7 +43,9 @@ def test_crossed_fringes_share_the_light_of_both_axes() -> None:
     light = pattern_light(Pattern("crossed", "", 7, 0.3, shift_y_rad=1.1), RASTER)
     phi_x = 2 * math.pi * ((180 - 170) * 0.25 + 28) / 8 - math.pi
     phi_y = 2 * math.pi * ((128 - 100) * 0.25 + 28) / 8 - math.pi
-    assert light[100, 180] == pytest.approx(0.5 + 0.25 * (math.cos(phi_x + 0.3) + math.cos(phi_y + 1.1)), abs=1e-6)
+    assert light[100, 180] == pytest.approx(
+        0.5 + 0.25 * (math.cos(phi_x + 0.3) + math.cos(phi_y + 1.1)), abs=1e-6
+    )
     assert not light[pattern_light(Pattern("white"), RASTER) == 0].any()
 
 
@@ -76,7 +80,9 @@ def test_a_region_larger_than_the_screen_is_refused() -> None:
 def test_settling_finds_what_was_put_in(latency_s: float, tau_s: float, seed: int) -> None:
     generator = np.random.default_rng(seed)
     delay_s = np.sort(generator.uniform(0.0, 0.45, 150))
-    left = np.exp(-np.maximum(delay_s - latency_s, 0) / tau_s) + np.abs(generator.normal(0, 0.002, 150))
+    left = np.exp(-np.maximum(delay_s - latency_s, 0) / tau_s) + np.abs(
+        generator.normal(0, 0.002, 150)
+    )
     found = settling(delay_s, left, noise=0.002)
     true_s = latency_s + tau_s * math.log(256)
     assert 0.85 * true_s < found.settle_s < 1.5 * true_s + 0.02
@@ -154,7 +160,9 @@ def test_a_ramp_that_is_none(seen: np.ndarray, words: str) -> None:
 
 
 def seen_through(levels: np.ndarray, scale: float = 1.0) -> np.ndarray:
-    """What an unresolving camera sees of levels that a scaler stretched and a panel of gamma 2.2 lit."""
+    """What an unresolving camera sees of levels that a scaler stretched and a panel of gamma 2.2
+    lit.
+    """
     if scale != 1.0:
         length = levels.shape[1]
         at = np.clip(np.arange(length) / scale, 0, length - 1)
@@ -177,9 +185,13 @@ def test_checkerboard_shown_as_sent_and_scaled() -> None:
 
 @pytest.mark.parametrize(
     ("white", "black", "words"),
-    [(200, 5, ""), (255, 5, "saturated.*lower exposure_ms = 20"), (30, 2, "raise exposure_ms = 20 to about 140"),
-     (180, 90, "other light")],
-)  # fmt: skip
+    [
+        (200, 5, ""),
+        (255, 5, "saturated.*lower exposure_ms = 20"),
+        (30, 2, "raise exposure_ms = 20 to about 140"),
+        (180, 90, "other light"),
+    ],
+)
 def test_exposure(white: int, black: int, words: str) -> None:
     frames = (np.full((64, 64), level, np.uint8) for level in (white, black))
     problem = exposure_problem(*frames, 255, 20.0)

@@ -34,7 +34,9 @@ class Run:
         self.heartbeat = 1
         self.pumped_s = 0.0  # for how long the pump has run in all
 
-    def wait(self, duration_s: float, sample: BoardSample | Iterator[BoardSample], pump: float = 0.3) -> None:
+    def wait(
+        self, duration_s: float, sample: BoardSample | Iterator[BoardSample], pump: float = 0.3
+    ) -> None:
         for _ in range(round(duration_s / TICK_S)):
             before = self.bench.state.pump_fraction
             now = sample if isinstance(sample, BoardSample) else next(sample)
@@ -58,7 +60,9 @@ def run() -> Run:
 
 
 @pytest.mark.parametrize("gauge_pa", [math.nan, -math.inf, -3e6])
-def test_a_gauge_without_a_value_stops_the_pump_after_the_time_out_and_not_before(run: Run, gauge_pa: float) -> None:
+def test_a_gauge_without_a_value_stops_the_pump_after_the_time_out_and_not_before(
+    run: Run, gauge_pa: float
+) -> None:
     lost = replace(SAMPLE, gauge_pressure_pa=gauge_pa)
     run.wait(100.0, noisy())
     run.wait(TIMEOUT_S, lost)
@@ -209,7 +213,9 @@ def test_the_time_out_is_that_of_the_stored_settings() -> None:
 
 
 @pytest.mark.parametrize("version", [1, 2])
-def test_boards_of_earlier_maps_have_no_guard_of_their_gauge_and_no_interlocks(version: int) -> None:
+def test_boards_of_earlier_maps_have_no_guard_of_their_gauge_and_no_interlocks(
+    version: int,
+) -> None:
     run = Run(pumping(version, StoredSettings(interlocks_fitted=0xFFFF)))
     run.wait(1000.0, replace(NO_GAUGE, interlock_inputs=0))
     assert (run.outputs, run.faults) == ((0.3, 0.25), 0)
@@ -258,7 +264,9 @@ def test_clearing_with_an_open_input_latches_again_before_the_pump_runs() -> Non
 
 
 def test_an_open_input_is_remembered_although_the_pump_was_off() -> None:
-    """An emergency stop that is pressed and released between two strokes of the pump still needs a person."""
+    """An emergency stop that is pressed and released between two strokes of the pump still needs a
+    person.
+    """
     run = Run(pumping(stored=StoredSettings(interlocks_fitted=1)))
     run.bench.command(0.0, 2)
     run.bench.at(0.01, with_inputs(0))

@@ -37,7 +37,10 @@ async def test_lines_come_in_the_order_of_the_circuits() -> None:
     assert await lines.closed_circuits() == (True, False, False)
     gpio.contacts[CHIP, 2] = "closed"
     assert await lines.closed_circuits() == (True, True, False)
-    assert lines.describe() == {"port": CHIP, "register": "line 7 to_ground, line 2 to_ground, line 4 to_supply"}
+    assert lines.describe() == {
+        "port": CHIP,
+        "register": "line 7 to_ground, line 2 to_ground, line 4 to_supply",
+    }
     await lines.close()
 
 
@@ -51,7 +54,9 @@ async def test_lines_come_in_the_order_of_the_circuits() -> None:
         (errno.ENOENT, LinkDownError, CHIP),
     ],
 )
-async def test_what_the_kernel_refuses_is_one_line(number: int, kind: type[LinkError], words: str) -> None:
+async def test_what_the_kernel_refuses_is_one_line(
+    number: int, kind: type[LinkError], words: str
+) -> None:
     gpio = EmulatedGpio({(CHIP, 5): "closed"})
     lines = GpioLines(CHIP, [GpioCircuit(5)], gpio)
     gpio.failing = OSError(number, "as the kernel says")

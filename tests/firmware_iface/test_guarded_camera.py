@@ -1,4 +1,6 @@
-"""A camera whose driver makes every mistake: each becomes one line, and the camera is opened again."""
+"""A camera whose driver makes every mistake: each becomes one line,
+and the camera is opened again.
+"""
 
 from __future__ import annotations
 
@@ -111,7 +113,9 @@ def test_a_driver_that_grabs_does_for_both_steps() -> None:
 
 
 def test_what_takes_no_frames_is_no_camera() -> None:
-    with pytest.raises(ValueError, match="camera acme: the driver has neither grab nor expose and fetch"):
+    with pytest.raises(
+        ValueError, match="camera acme: the driver has neither grab nor expose and fetch"
+    ):
         GuardedCamera(Driver(Time()), SENSOR, Time().now, "camera acme")
 
 
@@ -148,7 +152,9 @@ def test_a_link_error_keeps_its_kind_and_closes_it(
         camera.expose()
 
 
-def test_a_lost_frame_leaves_it_open_and_is_taken_again(camera: GuardedCamera, driver: Exposing) -> None:
+def test_a_lost_frame_leaves_it_open_and_is_taken_again(
+    camera: GuardedCamera, driver: Exposing
+) -> None:
     camera.expose()
     driver.fails["fetch"] = FrameLostError("not whole")
     message(camera.fetch, FrameLostError)

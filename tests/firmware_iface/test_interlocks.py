@@ -1,4 +1,6 @@
-"""Circuits read in the background: an answer counts only while it is young, whatever the source does."""
+"""Circuits read in the background: an answer counts only while it is young, whatever the source
+does.
+"""
 
 from __future__ import annotations
 
@@ -66,7 +68,19 @@ class FakeBench:
 
     async def read(self) -> roles.BenchReading:
         return roles.BenchReading(
-            0.0, 0, 600.0, 1e5, 20.0, 20.0, 0.0, math.nan, 1, 1.0, False, 0, interlock_inputs=self.interlock_inputs
+            0.0,
+            0,
+            600.0,
+            1e5,
+            20.0,
+            20.0,
+            0.0,
+            math.nan,
+            1,
+            1.0,
+            False,
+            0,
+            interlock_inputs=self.interlock_inputs,
         )
 
     async def write(self, command: roles.BenchCommand) -> None:
@@ -94,7 +108,9 @@ async def open_mask(bench: InterlockBench) -> int:
     return (await bench.read()).interlocks_open
 
 
-def made(source: FakeSource, *bits: int, inner: FakeBench | None = None, **inputs: int) -> InterlockBench:
+def made(
+    source: FakeSource, *bits: int, inner: FakeBench | None = None, **inputs: int
+) -> InterlockBench:
     board_inputs = {int(bit.removeprefix("bit")): place for bit, place in inputs.items()}
     clock = asyncio.get_running_loop().time
     return InterlockBench(inner or FakeBench(), board_inputs, [polled(source, *bits)], clock)
@@ -151,9 +167,12 @@ def test_the_boards_inputs_and_polled_circuits_are_in_one_mask() -> None:
 
 
 @pytest.mark.parametrize(
-    "error", [roles.LinkError("no answer"), roles.LinkDownError("gone"), TypeError("a driver's mistake")]
+    "error",
+    [roles.LinkError("no answer"), roles.LinkDownError("gone"), TypeError("a driver's mistake")],
 )
-def test_a_lost_signal_is_open_once_its_last_answer_is_old_and_closed_when_it_is_back(error: Exception) -> None:
+def test_a_lost_signal_is_open_once_its_last_answer_is_old_and_closed_when_it_is_back(
+    error: Exception,
+) -> None:
     async def test() -> None:
         source = FakeSource(True)
         bench = made(source, 0)
@@ -222,7 +241,9 @@ def test_a_source_that_is_absent_does_not_keep_the_bench_from_opening() -> None:
     in_virtual_time(test)
 
 
-def test_a_source_that_hangs_delays_the_opening_by_its_limit_only_and_before_the_watchdog_runs() -> None:
+def test_a_source_that_hangs_delays_the_opening_by_its_limit_only_and_before_the_watchdog_runs() -> (  # noqa: E501
+    None
+):
     async def test() -> None:
         source = FakeSource(True)
         source.hangs = True

@@ -10,7 +10,11 @@ from typing import Any
 
 import pytest
 
-from firmware_iface.drivers.keyence_dl_rs1a import QUALITY_AMPLIFIER_ERROR, QUALITY_OUT_OF_RANGE, KeyenceDlRs1a
+from firmware_iface.drivers.keyence_dl_rs1a import (
+    QUALITY_AMPLIFIER_ERROR,
+    QUALITY_OUT_OF_RANGE,
+    KeyenceDlRs1a,
+)
 from firmware_iface.emulators.serial_device import PtyWire
 from firmware_iface.roles import DeviceRefusedError, LinkDownError, LinkError
 from firmware_iface.settings import KeyenceDlRs1aConfig
@@ -98,7 +102,11 @@ def test_a_zero_shift_at_the_keys_moves_nothing() -> None:
 
 @pytest.mark.parametrize(
     ("displacement_um", "quality"),
-    [(math.nan, QUALITY_AMPLIFIER_ERROR), (2e5, QUALITY_OUT_OF_RANGE), (-2e5, QUALITY_OUT_OF_RANGE)],
+    [
+        (math.nan, QUALITY_AMPLIFIER_ERROR),
+        (2e5, QUALITY_OUT_OF_RANGE),
+        (-2e5, QUALITY_OUT_OF_RANGE),
+    ],
 )
 def test_what_is_no_value(displacement_um: float, quality: int) -> None:
     async def test(bench: Bench) -> None:
@@ -178,7 +186,11 @@ def test_a_pulled_plug() -> None:
 
 @pytest.mark.parametrize(
     ("settings", "message"),
-    [({"baud": 115_200}, "baud"), ({"amplifier": 15}, "amplifier"), ({"direction": 2}, "direction")],
+    [
+        ({"baud": 115_200}, "baud"),
+        ({"amplifier": 15}, "amplifier"),
+        ({"direction": 2}, "direction"),
+    ],
 )
 def test_settings_that_cannot_be(settings: dict[str, Any], message: str) -> None:
     with pytest.raises(ValueError, match=message):

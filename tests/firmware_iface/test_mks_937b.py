@@ -32,9 +32,13 @@ class Bench:
         return await self.driver.gauge_pressure_pa()
 
 
-def on_bench(test: Callable[[Bench], Coroutine[Any, Any, None]], opened: bool = True, **config: Any) -> None:
+def on_bench(
+    test: Callable[[Bench], Coroutine[Any, Any, None]], opened: bool = True, **config: Any
+) -> None:
     async def run() -> None:
-        bench = Bench(config, {key: config[key] for key in ("address", "channel", "parity") if key in config})
+        bench = Bench(
+            config, {key: config[key] for key in ("address", "channel", "parity") if key in config}
+        )
         if opened:
             await bench.driver.open()
         await test(bench)
@@ -65,9 +69,15 @@ class Manual(SerialDevice):
 
 def test_the_bytes_of_the_manual() -> None:
     async def test() -> None:
-        driver = Mks937b(Mks937bConfig(port="memory", address=3), MemoryWire(Manual(SerialSettings(115_200))))
+        driver = Mks937b(
+            Mks937bConfig(port="memory", address=3), MemoryWire(Manual(SerialSettings(115_200)))
+        )
         identity = await driver.open()
-        assert (identity.kind, identity.serial, identity.firmware) == ("MKS 937B", "1234567890", "1.27")
+        assert (identity.kind, identity.serial, identity.firmware) == (
+            "MKS 937B",
+            "1234567890",
+            "1.27",
+        )
         assert await driver.gauge_pressure_pa() == 760.2
         await driver.close()
 
@@ -158,7 +168,9 @@ def test_a_true_step_passes_with_its_second_reading() -> None:
     ids=str,
 )
 def test_with_each_fault_no_false_pressure(faults: SerialFaults) -> None:
-    """Off by a step of the gate at most: a corrupted last digit cannot be told from noise without a checksum."""
+    """Off by a step of the gate at most: a corrupted last digit cannot be told from noise without a
+    checksum.
+    """
 
     async def test(bench: Bench) -> None:
         bench.emulator.faults = faults

@@ -24,7 +24,12 @@ class Rig:
     """A module whose circuits a test opens, behind a server."""
 
     def __init__(self) -> None:
-        self.closed = {("discrete", 3): True, ("coil", 3): True, ("discrete", 11): True, ("discrete", 4): False}
+        self.closed = {
+            ("discrete", 3): True,
+            ("coil", 3): True,
+            ("discrete", 11): True,
+            ("discrete", 4): False,
+        }
         tables = {
             kind: {at: self._circuit(kind, at) for name, at in self.closed if name == kind}
             for kind in ("discrete", "coil")
@@ -37,7 +42,11 @@ class Rig:
         return lambda: self.closed[kind, at]
 
     def _answer(self, unit: int, pdu: bytes) -> Answer:
-        return Answer(self.spoil if self.spoil is not None else self.module.respond(pdu) or bytes([pdu[0] | 128, 1]))
+        return Answer(
+            self.spoil
+            if self.spoil is not None
+            else self.module.respond(pdu) or bytes([pdu[0] | 128, 1])
+        )
 
     def inputs(self) -> ModbusInputs:
         return ModbusInputs(GuardedModbusTcp("127.0.0.1", self.server.port, 1, 5.0), BITS)  # type: ignore[arg-type]
@@ -70,7 +79,9 @@ async def test_a_module_without_its_supply_reads_open(rig: Rig) -> None:
     await inputs.close()
 
 
-@pytest.mark.parametrize("pdu", [bytes([2, 2, 255, 255]), bytes([2, 0]), bytes([1, 1, 1]), bytes([2, 1, 1, 1])])
+@pytest.mark.parametrize(
+    "pdu", [bytes([2, 2, 255, 255]), bytes([2, 0]), bytes([1, 1, 1]), bytes([2, 1, 1, 1])]
+)
 async def test_an_answer_of_another_length_or_function_is_an_error(rig: Rig, pdu: bytes) -> None:
     inputs = ModbusInputs(GuardedModbusTcp("127.0.0.1", rig.server.port, 1, 0.5), [("discrete", 3)])
     await inputs.open()
@@ -80,7 +91,9 @@ async def test_an_answer_of_another_length_or_function_is_an_error(rig: Rig, pdu
     await inputs.close()
 
 
-async def test_a_module_that_reports_a_failure_is_an_error_and_an_unknown_address_is_refused(rig: Rig) -> None:
+async def test_a_module_that_reports_a_failure_is_an_error_and_an_unknown_address_is_refused(
+    rig: Rig,
+) -> None:
     inputs = rig.inputs()
     await inputs.open()
     rig.module.broken = True
@@ -88,7 +101,9 @@ async def test_a_module_that_reports_a_failure_is_an_error_and_an_unknown_addres
         await inputs.closed_circuits()
     rig.module.broken = False
     await inputs.close()
-    elsewhere = ModbusInputs(GuardedModbusTcp("127.0.0.1", rig.server.port, 1, 5.0), [("discrete", 99)])
+    elsewhere = ModbusInputs(
+        GuardedModbusTcp("127.0.0.1", rig.server.port, 1, 5.0), [("discrete", 99)]
+    )
     with pytest.raises(DeviceRefusedError, match="illegal address"):
         await elsewhere.open()
     await elsewhere.close()
@@ -108,7 +123,9 @@ def test_a_serial_bus_carries_bits_beside_registers() -> None:
         slaves = {4: lambda pdu: module.respond(pdu) or bytes([pdu[0] | 128, 1])}
         bus = RtuBus(MemoryWire(RtuBusEmulator(SerialSettings(115_200), slaves)), quiet_s=0.05)
         device = bus.device(4, 0.05)
-        inputs = ModbusInputs(device, [("discrete", 0), ("discrete", 7), ("discrete", 8), ("coil", 2)])
+        inputs = ModbusInputs(
+            device, [("discrete", 0), ("discrete", 7), ("discrete", 8), ("coil", 2)]
+        )
         await inputs.open()
         assert await inputs.closed_circuits() == (True, False, True, True)
         with pytest.raises(DeviceRefusedError):
@@ -122,7 +139,10 @@ def test_bits_over_rtu_are_in_the_standards_order() -> None:
     async def test() -> None:
         module = InputModule({at: (lambda at=at: at in (0, 9)) for at in range(10)}, {})
         bus = RtuBus(
-            MemoryWire(RtuBusEmulator(SerialSettings(115_200), {1: lambda pdu: module.respond(pdu) or b""})), 0.05
+            MemoryWire(
+                RtuBusEmulator(SerialSettings(115_200), {1: lambda pdu: module.respond(pdu) or b""})
+            ),
+            0.05,
         )
         device = bus.device(1, 0.05)
         await device.connect()

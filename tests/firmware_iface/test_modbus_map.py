@@ -23,7 +23,9 @@ PUMP, _ = make_map({"address": 0, "value": [0.0, 1.0]}, "waveshare_ao8")
 
 
 def made(device: MapDevice, value_map: ValueMap, rest: float | None = None) -> ModbusValue:
-    wire = MemoryWire(RtuBusEmulator(LINE, {1: partial(respond_to_input, table=device)}, echo_test=False))
+    wire = MemoryWire(
+        RtuBusEmulator(LINE, {1: partial(respond_to_input, table=device)}, echo_test=False)
+    )
     return ModbusValue(RtuBus(wire).device(1, 0.2), value_map, rest)
 
 
@@ -89,9 +91,17 @@ def test_an_output_that_lost_its_power_reads_back_as_an_error_not_as_off() -> No
 def test_a_sensor_is_read_from_input_registers_and_an_impossible_value_is_none() -> None:
     values = [600.0]
     gauge, _ = make_map(
-        {"address": 4, "value": (0.0, 1000.0), "raw": (6400, 32_000), "function": "input", "limits": (-20.0, 900.0)}
+        {
+            "address": 4,
+            "value": (0.0, 1000.0),
+            "raw": (6400, 32_000),
+            "function": "input",
+            "limits": (-20.0, 900.0),
+        }
     )
-    device = MapDevice({ValueMap(4, (0.0, 1000.0), (6400, 32_000), (-100.0, 2000.0)): lambda: values[0]}, {})
+    device = MapDevice(
+        {ValueMap(4, (0.0, 1000.0), (6400, 32_000), (-100.0, 2000.0)): lambda: values[0]}, {}
+    )
 
     async def run() -> None:
         sensor = made(device, gauge)

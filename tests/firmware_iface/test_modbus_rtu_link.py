@@ -1,4 +1,6 @@
-"""Modbus RTU: frames byte by byte, and answers that are late, wrong, incomplete or missing. In virtual time."""
+"""Modbus RTU: frames byte by byte, and answers that are late, wrong, incomplete or missing. In
+virtual time.
+"""
 
 from __future__ import annotations
 
@@ -93,7 +95,11 @@ def test_the_vendors_frame() -> None:
     [
         ("rtu:///dev/ttyUSB0", "/dev/ttyUSB0", SerialSettings(19_200, parity="E")),
         ("rtu:///dev/ttyS1?baud=115200&parity=N", "/dev/ttyS1", SerialSettings(115_200)),
-        ("rtu://usb:0403:6001:A5?stop_bits=2&parity=N", "usb:0403:6001:A5", SerialSettings(19_200, 8, "N", 2)),
+        (
+            "rtu://usb:0403:6001:A5?stop_bits=2&parity=N",
+            "usb:0403:6001:A5",
+            SerialSettings(19_200, 8, "N", 2),
+        ),
     ],
 )
 def test_urls(url: str, port: str, settings: SerialSettings) -> None:
@@ -101,7 +107,14 @@ def test_urls(url: str, port: str, settings: SerialSettings) -> None:
 
 
 @pytest.mark.parametrize(
-    "url", ["tcp://host", "rtu://", "rtu:///dev/x?bauds=1", "rtu:///dev/x?baud=fast", "rtu:///dev/x?baud=12345"]
+    "url",
+    [
+        "tcp://host",
+        "rtu://",
+        "rtu:///dev/x?bauds=1",
+        "rtu:///dev/x?baud=fast",
+        "rtu:///dev/x?baud=12345",
+    ],
 )
 def test_urls_that_are_none(url: str) -> None:
     with pytest.raises(ValueError, match=r"rtu://|baud|tcp://"):
@@ -294,7 +307,8 @@ def test_each_fault_is_an_error_and_passes(faults: SerialFaults) -> None:
 
 
 @pytest.mark.parametrize(
-    ("fault", "message"), [("wrong_unit", "answer from unit 2"), ("wrong_function", "function code 4")]
+    ("fault", "message"),
+    [("wrong_unit", "answer from unit 2"), ("wrong_function", "function code 4")],
 )
 def test_faults_of_the_protocol(fault: str, message: str) -> None:
     async def test(bus: Bus) -> None:

@@ -81,7 +81,9 @@ async def test_a_request_in_pieces_and_two_at_once_are_answered() -> None:
     assert await _talk([whole[:3], whole[3:8], whole[8:]], len(wanted)) == wanted
 
 
-@pytest.mark.parametrize("header", [struct.pack(">HHHBB", 1, 7, 2, 1, 3), struct.pack(">HHHBB", 1, 0, 300, 1, 3)])
+@pytest.mark.parametrize(
+    "header", [struct.pack(">HHHBB", 1, 7, 2, 1, 3), struct.pack(">HHHBB", 1, 0, 300, 1, 3)]
+)
 async def test_what_is_not_modbus_is_hung_up_on(header: bytes) -> None:
     try:
         received = await _talk([header], 0)

@@ -20,7 +20,9 @@ GUARD_S = 5.0
 
 
 class ScriptedServer(asyncio.Protocol):
-    """Answers each request with whatever bytes `reply` makes of its transaction id, unit and PDU."""
+    """Answers each request with whatever bytes `reply` makes of its transaction id,
+    unit and PDU.
+    """
 
     def __init__(self, reply: Callable[[int, int, bytes], list[bytes]]) -> None:
         self.reply = reply
@@ -85,7 +87,9 @@ def good_read(words: list[int]) -> bytes:
 
 
 async def test_a_right_answer_is_taken(setup: Setup) -> None:
-    setup.server.reply = lambda transaction, unit, pdu: [frame(transaction, unit, good_read([5, 65_535]))]
+    setup.server.reply = lambda transaction, unit, pdu: [
+        frame(transaction, unit, good_read([5, 65_535]))
+    ]
     link = await setup.connected()
     assert await link.read_holding(3, 2) == [5, 65_535]
     assert setup.server.requests[0][7:] == struct.pack(">BHH", 3, 3, 2)
@@ -138,7 +142,9 @@ async def test_a_wrong_echo_of_a_write_is_an_error(setup: Setup, pdu: bytes, mes
 
 @pytest.mark.parametrize("code", [1, 2, 3])
 async def test_a_refusal_has_its_own_type(setup: Setup, code: int) -> None:
-    setup.server.reply = lambda transaction, unit, pdu: [frame(transaction, unit, bytes([pdu[0] | 0x80, code]))]
+    setup.server.reply = lambda transaction, unit, pdu: [
+        frame(transaction, unit, bytes([pdu[0] | 0x80, code]))
+    ]
     link = await setup.connected()
     with pytest.raises(DeviceRefusedError, match=f"writing 5..6: exception {code}"):
         await link.write_registers(5, [1, 2])
@@ -153,7 +159,8 @@ async def test_transaction_0_is_not_an_answer(setup: Setup) -> None:
 
 async def test_answers_of_other_transactions_and_units_are_passed_over(setup: Setup) -> None:
     setup.server.reply = lambda transaction, unit, pdu: [
-        frame(transaction + 1, unit, good_read([8, 8])) + frame(transaction, unit + 1, good_read([9, 9])),
+        frame(transaction + 1, unit, good_read([8, 8]))
+        + frame(transaction, unit + 1, good_read([9, 9])),
         frame(transaction, unit, good_read([1, 2])),
     ]
     link = await setup.connected()
@@ -185,9 +192,13 @@ async def test_garbage_is_never_a_value(setup: Setup) -> None:
 
 
 async def test_an_undecodable_answer_is_a_lost_link(setup: Setup) -> None:
-    setup.server.reply = lambda transaction, unit, pdu: [frame(transaction, unit, bytes([3, 200, 1]))]
+    setup.server.reply = lambda transaction, unit, pdu: [
+        frame(transaction, unit, bytes([3, 200, 1]))
+    ]
     link = await setup.connected()
-    asyncio.get_running_loop().set_exception_handler(lambda loop, context: None)  # asyncio reports what it cuts
+    asyncio.get_running_loop().set_exception_handler(
+        lambda loop, context: None
+    )  # asyncio reports what it cuts
     with pytest.raises(LinkDownError, match="connection lost"):
         async with asyncio.timeout(GUARD_S):
             await link.read_holding(0, 2)
@@ -221,7 +232,9 @@ async def test_one_request_at_a_time_and_none_sent_twice(setup: Setup) -> None:
     tasks = [asyncio.create_task(link.read_holding(address, 1)) for address in range(3)]
     await setup.server.asked.wait()
     assert len(setup.server.requests) == 1
-    setup.server.reply = lambda transaction, unit, pdu: [frame(transaction, unit, good_read([transaction]))]
+    setup.server.reply = lambda transaction, unit, pdu: [
+        frame(transaction, unit, good_read([transaction]))
+    ]
     first = setup.server.requests[0]
     setup.server.transports[-1].write(frame(first[1], 1, good_read([1])))
     assert await asyncio.gather(*tasks) == [[1], [2], [3]]
@@ -253,7 +266,9 @@ async def test_a_request_cancelled_before_its_turn_is_never_sent(setup: Setup) -
     waiting.cancel()
     with pytest.raises(asyncio.CancelledError):
         await waiting
-    setup.server.reply = lambda transaction, unit, pdu: [frame(transaction, unit, good_read([transaction]))]
+    setup.server.reply = lambda transaction, unit, pdu: [
+        frame(transaction, unit, good_read([transaction]))
+    ]
     setup.server.transports[-1].write(frame(1, 1, good_read([1])))
     assert await first == [1]
     assert await link.read_holding(9, 1) == [2]
@@ -330,7 +345,9 @@ def test_back_off_doubles_up_to_its_longest() -> None:
 
 
 async def test_the_servers_wrong_transaction_ids_time_out(setup: Setup) -> None:
-    server = ModbusTcpServer(lambda unit, pdu: Answer(good_read([1]), transaction_offset=1), "127.0.0.1", 0)
+    server = ModbusTcpServer(
+        lambda unit, pdu: Answer(good_read([1]), transaction_offset=1), "127.0.0.1", 0
+    )
     await server.start()
     setup.port = server.port
     link = await setup.connected(timeout_s=SOON_S)

@@ -1,4 +1,6 @@
-"""The conformance checks of cameras and displays pass a driver that is right, and find each mistake."""
+"""The conformance checks of cameras and displays pass a driver that is right, and find each
+mistake.
+"""
 
 from __future__ import annotations
 
@@ -128,7 +130,9 @@ class BenchOfFewFaults(camera_conformance.CameraBench):
         """Lost."""
 
 
-@pytest.mark.parametrize("check", camera_conformance.list_checks(Bench), ids=lambda check: check.__name__)
+@pytest.mark.parametrize(
+    "check", camera_conformance.list_checks(Bench), ids=lambda check: check.__name__
+)
 def test_a_right_camera_driver_passes(check: camera_conformance.Check) -> None:
     check(Bench())
 
@@ -236,15 +240,27 @@ class Verbose(Camera):
     [
         (Nameless, camera_conformance.check_identity, "without a kind"),
         (OneBehind, camera_conformance.check_pictures, "not what the sensor saw"),
-        (AtTransfer, camera_conformance.check_screen_may_change_after_exposure, "was over before the scene changed"),
+        (
+            AtTransfer,
+            camera_conformance.check_screen_may_change_after_exposure,
+            "was over before the scene changed",
+        ),
         (KeepsTheArray, camera_conformance.check_given_array_is_not_kept, "keeps a reference"),
         (TimeOfArrival, camera_conformance.check_time_stamps, "is not within its exposure"),
         (Hasty, camera_conformance.check_time_stamps, "is over after"),
-        (TakesWhateverComes, camera_conformance.check_abandoned_exposure, "not what the sensor saw"),
+        (
+            TakesWhateverComes,
+            camera_conformance.check_abandoned_exposure,
+            "not what the sensor saw",
+        ),
         (TakesWhateverComes, camera_conformance.check_late_frame, "a frame after a late one"),
         (TakesWhateverComes, camera_conformance.check_frozen_camera, "raises no LinkError"),
         (Fills, camera_conformance.check_lost_frame, "raises no FrameLostError"),
-        (RaisesOSError, camera_conformance.check_unplugged, "raises LinkError instead of LinkDownError"),
+        (
+            RaisesOSError,
+            camera_conformance.check_unplugged,
+            "raises LinkError instead of LinkDownError",
+        ),
         (TakesAnySensor, camera_conformance.check_other_sensor, "raises no DeviceRefusedError"),
     ],
     ids=lambda value: getattr(value, "__name__", "")[:30],
@@ -315,7 +331,9 @@ class PanelBench(display_conformance.DisplayBench):
         self.there = True
 
 
-@pytest.mark.parametrize("check", display_conformance.list_checks(PanelBench), ids=lambda check: check.__name__)
+@pytest.mark.parametrize(
+    "check", display_conformance.list_checks(PanelBench), ids=lambda check: check.__name__
+)
 def test_a_right_display_driver_passes(check: display_conformance.Check) -> None:
     check(PanelBench())
 

@@ -54,7 +54,9 @@ def measurement(raw: int, counter: int) -> bytes:
 
 
 def test_the_marks_of_the_three_bytes() -> None:
-    assert three_bytes(0b101010_110011_001111, first=True) == bytes([0b00_001111, 0b01_110011, 0b10_101010])
+    assert three_bytes(0b101010_110011_001111, first=True) == bytes(
+        [0b00_001111, 0b01_110011, 0b10_101010]
+    )
     assert three_bytes(0, first=False) == bytes([0, 0x40, 0xC0])
 
 
@@ -70,7 +72,9 @@ def test_the_stream_in_any_portions() -> None:
     data = b"".join(measurement(int(value), 7 + k) for k, value in enumerate(raw))
     for portion in (1, 2, 5, 6, 7, 100):
         parser = StreamParser()
-        found = np.concatenate([parser.feed(data[i : i + portion]) for i in range(0, len(data), portion)])
+        found = np.concatenate(
+            [parser.feed(data[i : i + portion]) for i in range(0, len(data), portion)]
+        )
         np.testing.assert_array_equal(found, raw[1:])  # the first has none before it
         assert (parser.bytes_lost, parser.untrusted) == (0, 1)
 
@@ -98,15 +102,26 @@ def test_the_middle_of_many_ignores_a_quarter() -> None:
 def test_the_gate_wants_a_second_reading() -> None:
     gate = StepGate(10.0)
     assert [gate.passes(v) for v in (0, 3, 500, 5, 8, 300, 303, 301)] == [
-        False, True, False, True, True, False, True, True,
-    ]  # fmt: skip
+        False,
+        True,
+        False,
+        True,
+        True,
+        False,
+        True,
+        True,
+    ]
 
 
 def test_identity_settings_and_readings() -> None:
     async def test() -> None:
         bench = Bench(range_mm=50)
         identity = await bench.driver.open()
-        assert (identity.kind, identity.serial, identity.firmware) == ("ILD1420-50", "15030002", "001.010")
+        assert (identity.kind, identity.serial, identity.firmware) == (
+            "ILD1420-50",
+            "15030002",
+            "001.010",
+        )
         before = await bench.driver.displacement()
         assert before.displacement_um == pytest.approx(12.0, abs=STEP_UM)
         bench.displacement_um = 40.0
@@ -160,7 +175,9 @@ def test_the_mean_resolves_less_than_a_step() -> None:
 def test_a_deeper_bowl_is_nearer() -> None:
     async def test() -> None:
         emulator = Optoncdt1420Emulator(lambda: 1000.0, direction=1)
-        driver = Optoncdt1420(Optoncdt1420Config(port="memory", direction=-1, zero_mm=25.0), MemoryWire(emulator))
+        driver = Optoncdt1420(
+            Optoncdt1420Config(port="memory", direction=-1, zero_mm=25.0), MemoryWire(emulator)
+        )
         await driver.open()
         assert (await driver.displacement()).displacement_um == pytest.approx(-1000.0, abs=STEP_UM)
         await driver.close()
@@ -169,7 +186,8 @@ def test_a_deeper_bowl_is_nearer() -> None:
 
 
 @pytest.mark.parametrize(
-    ("displacement_um", "code"), [(math.nan, NO_PEAK), (26_000.0, NO_PEAK + 1), (-26_000.0, NO_PEAK + 2)]
+    ("displacement_um", "code"),
+    [(math.nan, NO_PEAK), (26_000.0, NO_PEAK + 1), (-26_000.0, NO_PEAK + 2)],
 )
 def test_error_codes_are_the_quality(displacement_um: float, code: int) -> None:
     async def test(bench: Bench) -> None:
@@ -268,7 +286,9 @@ def test_a_pulled_plug_is_noticed_while_waiting() -> None:
         ({"range_mm": 10}, {"range_mm": 50}, "measures 10 mm, range_mm = 50"),
     ],
 )
-def test_another_sensor_is_refused(emulator: dict[str, Any], settings: dict[str, Any], message: str) -> None:
+def test_another_sensor_is_refused(
+    emulator: dict[str, Any], settings: dict[str, Any], message: str
+) -> None:
     async def test() -> None:
         wire = MemoryWire(Optoncdt1420Emulator(lambda: 0.0, **emulator))
         driver = Optoncdt1420(Optoncdt1420Config(port="memory", **settings), wire)
@@ -291,7 +311,11 @@ def test_half_a_command_of_someone_else_is_not_in_the_way() -> None:
 
 @pytest.mark.parametrize(
     ("faults", "message"),
-    [({"silent": True}, "no answer"), ({"garbage_bytes": 40}, "wrong baud rate"), ({"delay_s": 1.0}, "no answer")],
+    [
+        ({"silent": True}, "no answer"),
+        ({"garbage_bytes": 40}, "wrong baud rate"),
+        ({"delay_s": 1.0}, "no answer"),
+    ],
 )
 def test_open_says_what_is_wrong(faults: dict[str, Any], message: str) -> None:
     async def test() -> None:

@@ -1,4 +1,6 @@
-"""Instruments that follow their manuals in other ways than our emulators: line ends, echo, junk at power-up."""
+"""Instruments that follow their manuals in other ways than our emulators: line ends, echo, junk at
+power-up.
+"""
 
 from __future__ import annotations
 
@@ -10,14 +12,21 @@ from firmware_iface.drivers.keyence_dl_rs1a import KeyenceDlRs1a
 from firmware_iface.drivers.optoncdt1420 import Optoncdt1420
 from firmware_iface.drivers.ventus import Ventus
 from firmware_iface.settings import KeyenceDlRs1aConfig, Optoncdt1420Config, VentusConfig
-from tests.support.faulty_devices import KeyenceDlRs1aEmulator, MemoryWire, Optoncdt1420Emulator, VentusEmulator
+from tests.support.faulty_devices import (
+    KeyenceDlRs1aEmulator,
+    MemoryWire,
+    Optoncdt1420Emulator,
+    VentusEmulator,
+)
 from tests.support.virtual_time import run_virtual
 
 BANNER = b"\r\nboot 1.2 \x00\xff ready\r\n"
 
 
 class WordyOptoncdt(Optoncdt1420Emulator):
-    """Echoes commands, writes units and zeros, ends its prompt with a line, and was left streaming."""
+    """Echoes commands, writes units and zeros, ends its prompt with a line,
+    and was left streaming.
+    """
 
     rate = "4.00"
 
@@ -51,7 +60,9 @@ def test_a_wordy_optoncdt(rate: str) -> None:
 
 
 class TerseKeyence(KeyenceDlRs1aEmulator):
-    """Ends lines in CR alone, or sends the LF by itself; its amplifiers tell no state; it greets when plugged in."""
+    """Ends lines in CR alone, or sends the LF by itself; its amplifiers tell no state; it greets
+    when plugged in.
+    """
 
     def __init__(self, end: tuple[bytes, ...]) -> None:
         super().__init__(lambda: -123.0, baud=38_400, parity="E")
@@ -67,7 +78,9 @@ class TerseKeyence(KeyenceDlRs1aEmulator):
             super().say(more)
 
 
-@pytest.mark.parametrize("end", [(b"\r",), (b"\r", b"\n"), (b"\r\n",)], ids=["CR", "CR, then LF", "CRLF"])
+@pytest.mark.parametrize(
+    "end", [(b"\r",), (b"\r", b"\n"), (b"\r\n",)], ids=["CR", "CR, then LF", "CRLF"]
+)
 def test_a_terse_keyence(end: tuple[bytes, ...]) -> None:
     async def test() -> None:
         emulator = TerseKeyence(end)
@@ -80,7 +93,9 @@ def test_a_terse_keyence(end: tuple[bytes, ...]) -> None:
         begin_s = asyncio.get_running_loop().time()
         for _ in range(10):
             assert (await driver.displacement()).displacement_um == -123.0
-        assert asyncio.get_running_loop().time() - begin_s < 10 * 0.02  # a line end by itself is no noise to wait for
+        assert (
+            asyncio.get_running_loop().time() - begin_s < 10 * 0.02
+        )  # a line end by itself is no noise to wait for
         await driver.close()
 
     run_virtual(test())

@@ -1,4 +1,6 @@
-"""The screen on any display: patterns rendered once, corrected and settled; and drivers that make mistakes."""
+"""The screen on any display: patterns rendered once, corrected and settled; and drivers that make
+mistakes.
+"""
 
 from __future__ import annotations
 
@@ -73,14 +75,20 @@ def display() -> Display:
 
 @pytest.fixture
 def screen(display: Display, time: Time) -> PatternScreen:
-    return PatternScreen(display, RASTER, PATTERNS, DriverClock(time.now, time.sleep), "screen acme")
+    return PatternScreen(
+        display, RASTER, PATTERNS, DriverClock(time.now, time.sleep), "screen acme"
+    )
 
 
-def test_patterns_are_prepared_once_and_shown_pixel_by_pixel(screen: PatternScreen, display: Display) -> None:
+def test_patterns_are_prepared_once_and_shown_pixel_by_pixel(
+    screen: PatternScreen, display: Display
+) -> None:
     assert screen.open().kind == "Acme panel"
     for pattern in PATTERNS * 2:
         screen.begin(pattern)
-        assert np.array_equal(display.shown, np.rint(255 * pattern_light(pattern, RASTER).astype(float)))
+        assert np.array_equal(
+            display.shown, np.rint(255 * pattern_light(pattern, RASTER).astype(float))
+        )
     assert display.prepared == len(PATTERNS)
 
 

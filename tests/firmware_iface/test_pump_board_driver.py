@@ -46,7 +46,8 @@ def agrees(reading: BenchReading) -> bool:
     """Whether every value belongs to the reading's own sample."""
     return (
         abs(reading.displacement_um - CountingPlant.displacement_um(reading.sample_counter)) < 1e-3
-        and abs(reading.ambient_pressure_pa - 101_325.0 - 0.5 * (reading.sample_counter % 100)) < 1e-2
+        and abs(reading.ambient_pressure_pa - 101_325.0 - 0.5 * (reading.sample_counter % 100))
+        < 1e-2
         and abs(reading.device_time_s - reading.sample_counter / 128) < 2e-4
     )
 
@@ -58,20 +59,36 @@ async def test_open_says_who_answers_and_arms_the_watchdog(
     identity = await driver.open()
     gauge_timeout_s = 15.0 if map_version == 3 else math.inf
     assert identity == BenchIdentity(
-        "membrane pump board", map_version, "1.1.0", WATCHDOG_S, 800.0, 1.0, gauge_timeout_s=gauge_timeout_s
+        "membrane pump board",
+        map_version,
+        "1.1.0",
+        WATCHDOG_S,
+        800.0,
+        1.0,
+        gauge_timeout_s=gauge_timeout_s,
     )
     assert board.state.read(48, 2) == [500, 1]
     assert (await driver.read()).foreign == 0
 
 
-async def test_a_reading_is_one_new_sample_in_si_units(driver: PumpBoard, plant: CountingPlant) -> None:
+async def test_a_reading_is_one_new_sample_in_si_units(
+    driver: PumpBoard, plant: CountingPlant
+) -> None:
     await driver.open()
     seen = plant.counter
     reading = await driver.read()
     assert reading.sample_counter > seen
     assert agrees(reading)
-    assert (reading.gauge_pressure_pa, reading.air_temperature_c, reading.gas_temperature_c) == (600.0, 20.25, -3.125)
-    assert (reading.displacement_quality, reading.watchdog_tripped, reading.latched_faults) == (0, False, 0)
+    assert (reading.gauge_pressure_pa, reading.air_temperature_c, reading.gas_temperature_c) == (
+        600.0,
+        20.25,
+        -3.125,
+    )
+    assert (reading.displacement_quality, reading.watchdog_tripped, reading.latched_faults) == (
+        0,
+        False,
+        0,
+    )
 
 
 @every_map
@@ -87,11 +104,17 @@ async def test_interlock_inputs_are_read_where_the_board_has_them(
     ("stored", "found"),
     [
         (StoredSettings(), (True, 15.0, 0)),
-        (StoredSettings(gauge_fitted=False, gauge_timeout_s=2.5, interlocks_fitted=6), (False, 2.5, 6)),
+        (
+            StoredSettings(gauge_fitted=False, gauge_timeout_s=2.5, interlocks_fitted=6),
+            (False, 2.5, 6),
+        ),
     ],
 )
 async def test_the_identity_states_which_protections_the_board_has(
-    driver: PumpBoard, board: PumpBoardEmulator, stored: StoredSettings, found: tuple[bool, float, int]
+    driver: PumpBoard,
+    board: PumpBoardEmulator,
+    stored: StoredSettings,
+    found: tuple[bool, float, int],
 ) -> None:
     board.state.stored = stored
     identity = await driver.identify()
@@ -99,7 +122,9 @@ async def test_the_identity_states_which_protections_the_board_has(
 
 
 @every_map
-async def test_a_command_reaches_the_plant_and_is_read_back(driver: PumpBoard, plant: CountingPlant) -> None:
+async def test_a_command_reaches_the_plant_and_is_read_back(
+    driver: PumpBoard, plant: CountingPlant
+) -> None:
     await driver.open()
     await driver.write(BenchCommand(0.125, 1.0))
     assert plant.outputs[-1] == (0.125, 1.0)
@@ -122,13 +147,16 @@ async def test_an_impossible_command_never_reaches_the_wire(
 
 
 @pytest.mark.parametrize(
-    ("url", "target"), [("tcp://bench.local:5020", ("bench.local", 5020)), ("tcp://127.0.0.1", ("127.0.0.1", 502))]
+    ("url", "target"),
+    [("tcp://bench.local:5020", ("bench.local", 5020)), ("tcp://127.0.0.1", ("127.0.0.1", 502))],
 )
 def test_urls(url: str, target: tuple[str, int]) -> None:
     assert parse_tcp_url(url) == target
 
 
-@pytest.mark.parametrize("url", ["127.0.0.1:5020", "http://h", "tcp://", "tcp://h:x", "tcp://h:70000", "tcp://h/p"])
+@pytest.mark.parametrize(
+    "url", ["127.0.0.1:5020", "http://h", "tcp://", "tcp://h:x", "tcp://h:70000", "tcp://h/p"]
+)
 def test_a_wrong_url_is_named(url: str) -> None:
     with pytest.raises(ValueError, match=url):
         PumpBoard(url)
@@ -140,7 +168,9 @@ def test_a_watchdog_period_the_board_cannot_have_is_refused(watchdog_s: float) -
         PumpBoard("tcp://127.0.0.1:1", watchdog_s=watchdog_s)
 
 
-async def test_an_unknown_map_version_is_refused_with_both_named(driver: PumpBoard, board: PumpBoardEmulator) -> None:
+async def test_an_unknown_map_version_is_refused_with_both_named(
+    driver: PumpBoard, board: PumpBoardEmulator
+) -> None:
     board.faults.map_version = 9
     with pytest.raises(DeviceRefusedError, match="version 9, this program knows 1, 2, 3"):
         await driver.open()
@@ -153,7 +183,9 @@ async def test_another_kind_of_device_is_refused(
     driver: PumpBoard, board: PumpBoardEmulator, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     read = board.state.read
-    monkeypatch.setattr(board.state, "read", lambda address, count: [word ^ 1 for word in read(address, count)])
+    monkeypatch.setattr(
+        board.state, "read", lambda address, count: [word ^ 1 for word in read(address, count)]
+    )
     with pytest.raises(DeviceRefusedError, match="device kind 19779 is not a membrane pump board"):
         await driver.open()
 
@@ -175,17 +207,28 @@ async def test_a_missing_displacement_is_nan(driver: PumpBoard, board: PumpBoard
     assert reading.gauge_pressure_pa == 600.0
 
 
-async def test_a_frozen_board_shows_in_counter_and_time(driver: PumpBoard, board: PumpBoardEmulator) -> None:
+async def test_a_frozen_board_shows_in_counter_and_time(
+    driver: PumpBoard, board: PumpBoardEmulator
+) -> None:
     await driver.open()
     board.faults.frozen = True
     first, second = await driver.read(), await driver.read()
-    assert (first.sample_counter, first.device_time_s) == (second.sample_counter, second.device_time_s)
+    assert (first.sample_counter, first.device_time_s) == (
+        second.sample_counter,
+        second.device_time_s,
+    )
     board.faults.frozen = False
     assert (await driver.read()).sample_counter > first.sample_counter
 
 
 @pytest.mark.parametrize(
-    "fault", [Faults(short_reply=True), Faults(wrong_function=True), Faults(exception_code=4), Faults(hang_up=True)]
+    "fault",
+    [
+        Faults(short_reply=True),
+        Faults(wrong_function=True),
+        Faults(exception_code=4),
+        Faults(hang_up=True),
+    ],
 )
 async def test_a_wrong_answer_is_an_error_at_once_and_the_next_right_one_is_taken(
     driver: PumpBoard, board: PumpBoardEmulator, fault: Faults
@@ -201,7 +244,9 @@ async def test_a_wrong_answer_is_an_error_at_once_and_the_next_right_one_is_take
     assert agrees(await driver.read())
 
 
-@pytest.mark.parametrize("fault", [Faults(silent=True), Faults(delay_s=10.0), Faults(wrong_transaction=True)])
+@pytest.mark.parametrize(
+    "fault", [Faults(silent=True), Faults(delay_s=10.0), Faults(wrong_transaction=True)]
+)
 async def test_no_answer_in_time_is_an_error(board: PumpBoardEmulator, fault: Faults) -> None:
     driver = impatient(board)
     await driver.open()
@@ -247,7 +292,9 @@ async def test_watchdog_trips_when_only_readers_are_there(
 ) -> None:
     await driver.open()
     await driver.write(BenchCommand(0.5, 0.0))
-    other = AsyncModbusTcpClient("127.0.0.1", port=board.port, timeout=5, retries=0, reconnect_delay=0)
+    other = AsyncModbusTcpClient(
+        "127.0.0.1", port=board.port, timeout=5, retries=0, reconnect_delay=0
+    )
     assert await other.connect()
     for _ in range(6):
         clock.now_s += 0.1
@@ -260,7 +307,9 @@ async def test_watchdog_trips_when_only_readers_are_there(
 async def test_watchdog_trips_when_the_heartbeat_stands(
     board: PumpBoardEmulator, driver: PumpBoard, plant: CountingPlant, clock: ManualClock
 ) -> None:
-    stuck = AsyncModbusTcpClient("127.0.0.1", port=board.port, timeout=5, retries=0, reconnect_delay=0)
+    stuck = AsyncModbusTcpClient(
+        "127.0.0.1", port=board.port, timeout=5, retries=0, reconnect_delay=0
+    )
     assert await stuck.connect()
     await stuck.write_registers(48, [500, 1, 0, 7, 0, 9], device_id=1)
     for _ in range(6):
@@ -300,7 +349,11 @@ async def test_after_a_trip_only_a_person_gets_the_pump_back(
     assert (await driver.read()).pump_fraction == 0.0
     await driver.clear_faults(ALL_FAULTS)
     reading = await driver.read()
-    assert (reading.pump_fraction, reading.watchdog_tripped, reading.latched_faults) == (0.0, False, 0)
+    assert (reading.pump_fraction, reading.watchdog_tripped, reading.latched_faults) == (
+        0.0,
+        False,
+        0,
+    )
     await driver.write(BenchCommand(0.5, 0.0))
     assert (await driver.read()).pump_fraction == 0.5
     await driver.write(OFF)
@@ -326,7 +379,9 @@ async def test_a_reconnect_within_the_period_goes_on_without_a_trip(
 
 
 @every_map
-async def test_a_restarted_board_is_not_read_on(driver: PumpBoard, board: PumpBoardEmulator) -> None:
+async def test_a_restarted_board_is_not_read_on(
+    driver: PumpBoard, board: PumpBoardEmulator
+) -> None:
     await driver.open()
     await driver.write(BenchCommand(0.5, 0.0))
     board.power_cycle()
@@ -338,7 +393,9 @@ async def test_a_restarted_board_is_not_read_on(driver: PumpBoard, board: PumpBo
     assert (await driver.read()).pump_fraction == 0.0
 
 
-async def test_over_pressure_is_acted_on_by_the_board_itself(driver: PumpBoard, plant: CountingPlant) -> None:
+async def test_over_pressure_is_acted_on_by_the_board_itself(
+    driver: PumpBoard, plant: CountingPlant
+) -> None:
     await driver.open()
     await driver.write(BenchCommand(0.5, 0.0))
     plant.gauge_pressure_pa = 801.0
@@ -397,7 +454,9 @@ def _random_fault(source: random.Random) -> Faults:
 
 
 async def _reopen(driver: PumpBoard) -> None:
-    """Open like an owner, again and again: on a busy machine 10 ms may be short even for a healthy board."""
+    """Open like an owner, again and again: on a busy machine 10 ms may be short even for a healthy
+    board.
+    """
     for _ in range(10):
         try:
             await driver.open()

@@ -22,7 +22,9 @@ CLAIM = [500, 1, 0, 7, *KEY]  # period, armed, id, key
 
 @pytest.fixture
 async def client(board: PumpBoardEmulator) -> AsyncIterator[AsyncModbusTcpClient]:
-    plain = AsyncModbusTcpClient("127.0.0.1", port=board.port, timeout=5, retries=0, reconnect_delay=0)
+    plain = AsyncModbusTcpClient(
+        "127.0.0.1", port=board.port, timeout=5, retries=0, reconnect_delay=0
+    )
     assert await plain.connect()
     yield plain
     plain.close()
@@ -58,10 +60,15 @@ async def test_a_plain_client_reads_what_the_documentation_says(
 
 
 @pytest.mark.parametrize(
-    ("address", "words", "code"), [(56, [50_001, 0, 1, 0, 1], 3), (56, [1], 2), (16, [0, 0], 2), (200, [1], 2)]
+    ("address", "words", "code"),
+    [(56, [50_001, 0, 1, 0, 1], 3), (56, [1], 2), (16, [0, 0], 2), (200, [1], 2)],
 )
 async def test_wrong_writes_get_an_exception(
-    board: PumpBoardEmulator, client: AsyncModbusTcpClient, address: int, words: list[int], code: int
+    board: PumpBoardEmulator,
+    client: AsyncModbusTcpClient,
+    address: int,
+    words: list[int],
+    code: int,
 ) -> None:
     reply = await client.write_registers(address, words, device_id=1)
     assert reply.isError()
@@ -82,12 +89,16 @@ async def test_function_codes_6_and_23_reach_the_registers(
     assert plant.outputs[-1] == (0.0, 0.1)
 
 
-async def test_another_unit_is_not_there(board: PumpBoardEmulator, client: AsyncModbusTcpClient) -> None:
+async def test_another_unit_is_not_there(
+    board: PumpBoardEmulator, client: AsyncModbusTcpClient
+) -> None:
     reply = await client.read_holding_registers(0, count=1, device_id=2)
     assert reply.exception_code == 11
 
 
-async def test_the_plant_is_driven_off_at_start_and_at_stop(plant: CountingPlant, clock: ManualClock) -> None:
+async def test_the_plant_is_driven_off_at_start_and_at_stop(
+    plant: CountingPlant, clock: ManualClock
+) -> None:
     emulator = PumpBoardEmulator(plant, clock=clock)
     await emulator.start()
     assert plant.outputs == [(0.0, 0.0)]

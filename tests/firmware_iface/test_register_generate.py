@@ -47,15 +47,31 @@ def test_c_header_compiles_and_agrees_with_the_map(tmp_path: Path) -> None:
         for register in registers
         if register.access == "rw"
     }
-    wanted |= {"MAP_VERSION": registers.map_version, "DEVICE_KIND": registers.device_kind, "I32_NO_VALUE": -(2**31)}
+    wanted |= {
+        "MAP_VERSION": registers.map_version,
+        "DEVICE_KIND": registers.device_kind,
+        "I32_NO_VALUE": -(2**31),
+    }
     prints = "\n".join(f'    printf("{name} %ld\\n", (long)MEMBRANE_{name});' for name in wanted)
     source = tmp_path / "main.c"
     source.write_text(
-        f'#include <stdio.h>\n#include "membrane_board.h"\nint main(void) {{\n{prints}\n    return 0;\n}}\n',
+        f'#include <stdio.h>\n#include "membrane_board.h"\nint main(void) {{\n{prints}\n    '
+        f"return 0;\n}}\n",
         encoding="utf-8",
     )
     program = tmp_path / "main"
-    flags = ["-std=c89", "-Wall", "-Wextra", "-Werror", "-pedantic", f"-I{generate.HEADER_PATH.parent}"]
-    subprocess.run(["cc", *flags, str(source), "-o", str(program)], check=True, capture_output=True, text=True)
+    flags = [
+        "-std=c89",
+        "-Wall",
+        "-Wextra",
+        "-Werror",
+        "-pedantic",
+        f"-I{generate.HEADER_PATH.parent}",
+    ]
+    subprocess.run(
+        ["cc", *flags, str(source), "-o", str(program)], check=True, capture_output=True, text=True
+    )
     printed = subprocess.run([str(program)], check=True, capture_output=True, text=True).stdout
-    assert {name: int(value) for name, value in (line.split() for line in printed.splitlines())} == wanted
+    assert {
+        name: int(value) for name, value in (line.split() for line in printed.splitlines())
+    } == wanted

@@ -34,7 +34,9 @@ def test_sensor_and_command_blocks_are_one_transaction_each() -> None:
     for name in ("identity", "sensors", "settings", "command"):
         block = registers.block(name)
         addresses = [
-            at for register in block.registers for at in range(register.address, register.address + register.words)
+            at
+            for register in block.registers
+            for at in range(register.address, register.address + register.words)
         ]
         assert addresses == list(range(block.address, block.address + block.count))
 
@@ -46,7 +48,13 @@ def test_an_earlier_map_is_the_newest_without_what_came_later() -> None:
     assert [fault.name for fault in second.faults] == ["watchdog", "over_pressure", "stopped"]
     assert [(block.address, block.count) for block in second.blocks[:2]] == [(0, 7), (16, 25)]
     assert [register for register in newest if register.since == 1] == list(first)
-    assert [(block.address, block.count) for block in first.blocks] == [(0, 7), (16, 22), (48, 2), (56, 3), (64, 1)]
+    assert [(block.address, block.count) for block in first.blocks] == [
+        (0, 7),
+        (16, 22),
+        (48, 2),
+        (56, 3),
+        (64, 1),
+    ]
     for version in (0, 4):
         with pytest.raises(RegisterMapError, match=f"map version {version} is none of"):
             newest.of_version(version)
@@ -61,7 +69,9 @@ def test_resolutions_are_finer_than_the_sensors() -> None:
 
 
 @settings(derandomize=True, deadline=None, max_examples=200)
-@given(st.floats(-2.1e6, 2.1e6), st.floats(-2.1e6, 2.1e6), st.floats(0, 1), st.integers(0, 2**32 - 1))
+@given(
+    st.floats(-2.1e6, 2.1e6), st.floats(-2.1e6, 2.1e6), st.floats(0, 1), st.integers(0, 2**32 - 1)
+)
 def test_values_survive_to_half_a_count(
     displacement_um: float, pressure_pa: float, pump: float, counter: int
 ) -> None:
@@ -88,7 +98,9 @@ def test_big_word_comes_first() -> None:
 
 def test_f32_registers_are_ieee() -> None:
     block = default_map().block("identity")
-    values = dict.fromkeys((register.name for register in block.registers), 0.0) | {"gauge_pressure_limit_pa": 812.5}
+    values = dict.fromkeys((register.name for register in block.registers), 0.0) | {
+        "gauge_pressure_limit_pa": 812.5
+    }
     words = block.encode(values)
     assert struct.unpack(">f", struct.pack(">2H", *words[4:6])) == (812.5,)
     assert block.decode(words)["gauge_pressure_limit_pa"] == 812.5
@@ -149,7 +161,12 @@ def _edit(table: dict[str, Any], block: int, register: int, **changes: Any) -> d
         (1, 17, {"since": 4}, "interlock_inputs: since must be a map version, 1..3"),
         (1, 0, {"since": 2}, "device_time_s is older than sample_counter before it"),
         (3, 0, {"meaning": None}, "pump_command_fraction: meaning is missing"),
-        (3, 2, {"name": "vent_command_fraction", "unit": "fraction"}, "vent_command_fraction is there twice"),
+        (
+            3,
+            2,
+            {"name": "vent_command_fraction", "unit": "fraction"},
+            "vent_command_fraction is there twice",
+        ),
     ],
 )
 def test_a_wrong_register_is_named(
@@ -182,7 +199,10 @@ def test_a_file_that_cannot_be_read_is_named(tmp_path: Path) -> None:
 
 
 def test_a_block_longer_than_a_transaction_is_refused(table: dict[str, Any]) -> None:
-    many = [{"name": f"spare{i}", "address": 100 + i, "type": "u16", "meaning": "spare"} for i in range(126)]
+    many = [
+        {"name": f"spare{i}", "address": 100 + i, "type": "u16", "meaning": "spare"}
+        for i in range(126)
+    ]
     spare = {"name": "spare", "access": "ro", "meaning": "spare", "registers": many}
     with pytest.raises(RegisterMapError, match="block spare has 126 words"):
         parse(table | {"block": [*table["block"], spare]})

@@ -1,4 +1,6 @@
-"""A bench of single devices: what each failure becomes, and the software watchdog; all in virtual time."""
+"""A bench of single devices: what each failure becomes, and the software watchdog; all in virtual
+time.
+"""
 
 from __future__ import annotations
 
@@ -78,7 +80,8 @@ class Devices:
     def __init__(self, vent: bool = True, laser: bool = True) -> None:
         self.log: list[str] = []
         self.laser, self.pump, self.gauge, self.barometer, self.air, self.vent = (
-            FakeDevice(kind, self.log) for kind in ("laser", "pump", "gauge", "barometer", "air", "vent")
+            FakeDevice(kind, self.log)
+            for kind in ("laser", "pump", "gauge", "barometer", "air", "vent")
         )
         self.laser.value, self.gauge.value, self.barometer.value = 7.0, 600.0, 101_325.0
         roles = RoleDevices(
@@ -100,13 +103,24 @@ def test_a_reading_has_every_role_and_takes_as_long_as_the_slowest() -> None:
         devices = Devices()
         identity = await devices.bench.open()
         assert "displacement laser" in identity.kind
-        for device in (devices.laser, devices.pump, devices.gauge, devices.barometer, devices.air, devices.vent):
+        for device in (
+            devices.laser,
+            devices.pump,
+            devices.gauge,
+            devices.barometer,
+            devices.air,
+            devices.vent,
+        ):
             device.took_s = 0.01
         await devices.bench.write(BenchCommand(0.5, 0.25))
         begin_s = asyncio.get_running_loop().time()
         reading = await devices.bench.read()
         assert asyncio.get_running_loop().time() - begin_s == pytest.approx(0.01)
-        assert (reading.displacement_um, reading.gauge_pressure_pa, reading.sample_counter) == (7.0, 600.0, 1)
+        assert (reading.displacement_um, reading.gauge_pressure_pa, reading.sample_counter) == (
+            7.0,
+            600.0,
+            1,
+        )
         assert (reading.pump_fraction, reading.vent_fraction) == (0.5, 0.25)
         assert (reading.latched_faults, reading.watchdog_tripped) == (0, False)
         await devices.bench.close()
@@ -149,7 +163,11 @@ def test_a_failed_sensor_is_a_missing_value_and_no_old_one(error: LinkError) -> 
         assert math.isnan(reading.displacement_um)
         assert reading.displacement_quality == NO_ANSWER
         assert reading.sample_counter == before.sample_counter  # stands still: seen as frozen
-        for value in (reading.gauge_pressure_pa, reading.ambient_pressure_pa, reading.air_temperature_c):
+        for value in (
+            reading.gauge_pressure_pa,
+            reading.ambient_pressure_pa,
+            reading.air_temperature_c,
+        ):
             assert math.isnan(value)
         await devices.bench.close()
 
@@ -174,7 +192,9 @@ def test_a_lost_sensor_is_opened_again_and_read_within_a_fifth_of_a_second() -> 
 
 
 def test_a_lost_laser_does_not_stop_the_clock_of_a_bench_whose_gauge_answers() -> None:
-    """The bench may be held by its optics; the laser's first sample afterwards is a new one, whatever its number."""
+    """The bench may be held by its optics; the laser's first sample afterwards is a new one,
+    whatever its number.
+    """
 
     async def run() -> None:
         devices = Devices()
@@ -186,7 +206,12 @@ def test_a_lost_laser_does_not_stop_the_clock_of_a_bench_whose_gauge_answers() -
             seen.append(await devices.bench.read())
         devices.laser.error = None
         seen.append(await devices.bench.read())
-        assert [math.isnan(reading.displacement_um) for reading in seen] == [False, True, True, False]
+        assert [math.isnan(reading.displacement_um) for reading in seen] == [
+            False,
+            True,
+            True,
+            False,
+        ]
         assert len({reading.sample_counter for reading in seen}) == 4
         assert len({reading.device_time_s for reading in seen}) == 4
         await devices.bench.close()
@@ -214,7 +239,9 @@ def test_a_lost_actuator_is_a_lost_bench_but_the_other_one_is_still_commanded(na
     async def run() -> None:
         devices = Devices()
         await devices.bench.open()
-        lost, other = (devices.pump, devices.vent) if name == "pump" else (devices.vent, devices.pump)
+        lost, other = (
+            (devices.pump, devices.vent) if name == "pump" else (devices.vent, devices.pump)
+        )
         lost.error = LinkDownError("unplugged")
         with pytest.raises(LinkDownError):
             await devices.bench.read()
@@ -257,7 +284,9 @@ def test_without_a_vent_its_read_back_is_nan() -> None:
     virtual(run())
 
 
-@pytest.mark.parametrize("command", [BenchCommand(math.nan, 0.0), BenchCommand(0.5, 1.01), BenchCommand(-0.1, 0.0)])
+@pytest.mark.parametrize(
+    "command", [BenchCommand(math.nan, 0.0), BenchCommand(0.5, 1.01), BenchCommand(-0.1, 0.0)]
+)
 def test_an_impossible_command_reaches_no_device(command: BenchCommand) -> None:
     async def run() -> None:
         devices = Devices()
@@ -270,7 +299,9 @@ def test_an_impossible_command_reaches_no_device(command: BenchCommand) -> None:
     virtual(run())
 
 
-def test_the_watchdog_stops_the_pump_of_a_silent_controller_and_says_so_until_a_person_clears_it() -> None:
+def test_the_watchdog_stops_the_pump_of_a_silent_controller_and_says_so_until_a_person_clears_it() -> (  # noqa: E501
+    None
+):
     async def run() -> None:
         devices = Devices()
         await devices.bench.open()
@@ -282,7 +313,11 @@ def test_the_watchdog_stops_the_pump_of_a_silent_controller_and_says_so_until_a_
         assert devices.pump.value == 0.0
         await devices.bench.write(BenchCommand(0.5, 0.0))
         reading = await devices.bench.read()
-        assert (devices.pump.value, reading.watchdog_tripped, reading.latched_faults) == (0.0, True, 1)
+        assert (devices.pump.value, reading.watchdog_tripped, reading.latched_faults) == (
+            0.0,
+            True,
+            1,
+        )
         await devices.bench.clear_faults(ALL_FAULTS)
         await devices.bench.write(BenchCommand(0.5, 0.0))
         reading = await devices.bench.read()
@@ -323,7 +358,9 @@ def test_a_write_that_failed_still_counts_as_commanded() -> None:
     virtual(run())
 
 
-@pytest.mark.parametrize("error", [LinkError("noise"), OSError("gone"), ValueError("bad"), TimeoutError()])
+@pytest.mark.parametrize(
+    "error", [LinkError("noise"), OSError("gone"), ValueError("bad"), TimeoutError()]
+)
 def test_the_watchdog_survives_whatever_a_driver_raises(error: Exception) -> None:
     async def run() -> None:
         devices = Devices()
@@ -348,15 +385,23 @@ def dead_watchdog(devices: Devices) -> None:
 
 
 @pytest.mark.parametrize("call", ["read", "write"])
-def test_a_watchdog_that_ended_stops_the_pump_and_is_a_lost_bench_at_the_next_call(call: str) -> None:
+def test_a_watchdog_that_ended_stops_the_pump_and_is_a_lost_bench_at_the_next_call(
+    call: str,
+) -> None:
     async def run() -> None:
         devices = Devices()
         await devices.bench.open()
         await devices.bench.write(BenchCommand(0.7, 0.0))
         dead_watchdog(devices)
         await asyncio.sleep(0.01)
-        with pytest.raises(LinkDownError, match="the software watchdog was cancelled; the pump was set to 0"):
-            await (devices.bench.read() if call == "read" else devices.bench.write(BenchCommand(0.7, 0.0)))
+        with pytest.raises(
+            LinkDownError, match="the software watchdog was cancelled; the pump was set to 0"
+        ):
+            await (
+                devices.bench.read()
+                if call == "read"
+                else devices.bench.write(BenchCommand(0.7, 0.0))
+            )
         assert devices.pump.value == 0.0
         await devices.bench.open()
         reading = await devices.bench.read()

@@ -51,13 +51,17 @@ def made(time: Time, raster: ScreenRaster = RASTER, display: int = 0) -> Pattern
     """The display as the cycle uses it."""
     size = {"width_px": raster.width_px, "height_px": raster.height_px, "pixel_mm": raster.pixel_mm}
     shown = PygameDisplay(PygameScreenConfig(**size, display=display))
-    return PatternScreen(shown, raster, PATTERNS, DriverClock(time.now, time.sleep), "screen pygame")
+    return PatternScreen(
+        shown, raster, PATTERNS, DriverClock(time.now, time.sleep), "screen pygame"
+    )
 
 
 class PhotographedDisplay(PygameDisplay):
     """A display whose pixels are read back after every picture."""
 
-    def __init__(self, config: PygameScreenConfig, framebuffer: Path, light: Callable[[np.ndarray], None]) -> None:
+    def __init__(
+        self, config: PygameScreenConfig, framebuffer: Path, light: Callable[[np.ndarray], None]
+    ) -> None:
         super().__init__(config)
         self._framebuffer, self._light = framebuffer, light
 
@@ -78,7 +82,9 @@ class Bench(display_conformance.DisplayBench):
         return PhotographedDisplay(config, self._framebuffer, self.light)
 
 
-@pytest.mark.parametrize("check", display_conformance.list_checks(Bench), ids=lambda check: check.__name__)
+@pytest.mark.parametrize(
+    "check", display_conformance.list_checks(Bench), ids=lambda check: check.__name__
+)
 def test_conformance(check: display_conformance.Check, framebuffer: Path) -> None:
     check(Bench(framebuffer))
 
@@ -94,7 +100,9 @@ def levels(pattern: Pattern) -> np.ndarray:
     return np.rint(255 * pattern_light(pattern, RASTER).astype(np.float64)).astype(np.uint8)
 
 
-def test_every_pattern_is_on_the_screen_byte_for_byte(screen: PatternScreen, framebuffer: Path) -> None:
+def test_every_pattern_is_on_the_screen_byte_for_byte(
+    screen: PatternScreen, framebuffer: Path
+) -> None:
     screen.open()
     for pattern in PATTERNS:
         screen.show(pattern)
@@ -115,7 +123,9 @@ def test_light_is_made_linear(screen: PatternScreen, framebuffer: Path) -> None:
     pattern = PATTERNS[1]
     screen.show(pattern)
     light = (screenshot(framebuffer)[:, :, 0] / 255.0) ** 2.2
-    assert np.abs(light - pattern_light(pattern, RASTER)).max() < 0.01  # half a level at the steepest is 0.0043
+    assert (
+        np.abs(light - pattern_light(pattern, RASTER)).max() < 0.01
+    )  # half a level at the steepest is 0.0043
     assert not np.array_equal(screenshot(framebuffer)[:, :, 0], levels(pattern))
 
 

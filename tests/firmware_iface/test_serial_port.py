@@ -1,4 +1,6 @@
-"""Serial ports on pseudo-terminals: what the kernel reports of a port, and names that survive a replug."""
+"""Serial ports on pseudo-terminals: what the kernel reports of a port, and names that survive a
+replug.
+"""
 
 from __future__ import annotations
 
@@ -11,7 +13,13 @@ import pytest
 
 from firmware_iface.emulators.serial_device import PtyWire
 from firmware_iface.links.modbus_rtu import RtuBus
-from firmware_iface.links.serial_port import SerialPort, SerialSettings, check_port_name, port_path, serial_ports
+from firmware_iface.links.serial_port import (
+    SerialPort,
+    SerialSettings,
+    check_port_name,
+    port_path,
+    serial_ports,
+)
 from firmware_iface.roles import DeviceRefusedError, LinkDownError, LinkError
 from tests.support.faulty_devices import RtuBusEmulator, SerialDevice
 
@@ -180,7 +188,9 @@ def test_a_usb_name_finds_its_adapter() -> None:
     assert port_path("/dev/anything", lambda: PORTS) == "/dev/anything"
     with pytest.raises(LinkDownError, match="no such USB adapter"):
         port_path("usb:0403:6015", lambda: PORTS)
-    with pytest.raises(DeviceRefusedError, match=r"2 adapters match.*usb:0403:6001:A1, usb:0403:6001:B2"):
+    with pytest.raises(
+        DeviceRefusedError, match=r"2 adapters match.*usb:0403:6001:A1, usb:0403:6001:B2"
+    ):
         port_path("usb:0403:6001", lambda: PORTS)
 
 

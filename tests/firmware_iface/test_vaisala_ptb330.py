@@ -52,7 +52,8 @@ def test_frames() -> None:
         emulator.hear(b"ECHO OFF\r\nFORM 4.3 P #r #n\r\nSEND\r\nFORM ?\r\nERRS\r\nVERS\r\n")
         await asyncio.sleep(2.0)
         assert b"".join(said) == (
-            b"ECHO OFF\r\nEcho           : OFF\r\n" + b"OK\r\n1013.250\r\nOutput format  : 4.3 P \\r \\n\r\n"
+            b"ECHO OFF\r\nEcho           : OFF\r\n"
+            + b"OK\r\n1013.250\r\nOutput format  : 4.3 P \\r \\n\r\n"
             b"PASS\r\nNo errors\r\nPTB330 / 1.01\r\n"
         )
 
@@ -79,7 +80,11 @@ def test_identity_and_reading(running: bool) -> None:
         bench = Bench(running=running)
         identity = await bench.driver.open()
         assert identity.kind == "Vaisala PTB330"
-        assert (identity.serial, identity.firmware, identity.detail) == ("A1234567", "1.01", "No errors")
+        assert (identity.serial, identity.firmware, identity.detail) == (
+            "A1234567",
+            "1.01",
+            "No errors",
+        )
         assert await bench.driver.ambient_pressure_pa() == pytest.approx(101_325.0)
         bench.pressure_pa = 99_876.54
         assert await bench.after(0.5) == pytest.approx(99_876.54, abs=0.051)

@@ -108,7 +108,9 @@ def test_a_power_cycle_is_seen_and_healed() -> None:
     async def test(bench: Bench) -> None:
         await bench.driver.set_pump(0.5)
         bench.emulator.power_cycle()  # enabled at what an analogue input says
-        with pytest.raises(LinkDownError, match=r"commanded 500\.000 mW, the pump has 250 mW.*restarted"):
+        with pytest.raises(
+            LinkDownError, match=r"commanded 500\.000 mW, the pump has 250 mW.*restarted"
+        ):
             await bench.driver.pump_fraction()
         await bench.driver.open()
         await bench.driver.set_pump(0.5)
@@ -117,7 +119,9 @@ def test_a_power_cycle_is_seen_and_healed() -> None:
     on_bench(test)
 
 
-@pytest.mark.parametrize(("register", "value"), [(1, 1.0), (10, 1.0), (11, 3.0), (0, 0.0), (23, 900.0)])
+@pytest.mark.parametrize(
+    ("register", "value"), [(1, 1.0), (10, 1.0), (11, 3.0), (0, 0.0), (23, 900.0)]
+)
 def test_a_setting_that_moved_is_seen(register: int, value: float) -> None:
     async def test(bench: Bench) -> None:
         await bench.driver.set_pump(0.5)

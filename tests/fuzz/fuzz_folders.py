@@ -1,9 +1,10 @@
 """Mutated run folders and capture sets through every command that reads them: `make fuzz`.
 
-A worker process runs cases one after the other, in itself, under a limit of memory and an alarm; it says on its
-output which case it is at, so that one that kills it is known, and another worker goes on behind it. What is wrong:
-anything raised, an exit code that is none of the documented ones, control characters printed, a case that hangs,
-a file outside the folder that was changed, memory beyond the limit, a worker that dies.
+A worker process runs cases one after the other, in itself, under a limit of memory and an alarm; it
+says on its output which case it is at, so that one that kills it is known, and another worker goes
+on behind it. What is wrong: anything raised, an exit code that is none of the documented ones,
+control characters printed, a case that hangs, a file outside the folder that was changed, memory
+beyond the limit, a worker that dies.
 """
 
 from __future__ import annotations
@@ -32,7 +33,8 @@ HERE = Path(__file__).parent
 sys.path[:0] = [str(HERE.parents[1]), str(HERE)]
 
 MEMORY_BYTES = 700_000_000  # of a case, above what the process has: a command begins with 0.2 GB
-_CASES_A_WORKER = 250  # each review leaves threads of Rerun behind, whose address space counts against the limit
+# each review leaves threads of Rerun behind, whose address space counts against the limit
+_CASES_A_WORKER = 250
 CASE_S = 120  # on a busy machine; a step of a tuning session takes ten
 _CODES = frozenset({0, 2, 3, 4})
 _REFUSED = {"Cc", "Cf", "Cs", "Zl", "Zp"}
@@ -48,7 +50,8 @@ class Command:
     reads: str = "logs"
 
 
-# RUN, LOGS, SET, SETS, TRACK, FIGURES, TUNING, LIVE, H5 and OUT are put in; `runs` costs 15 ms and `report` a second
+# RUN, LOGS, SET, SETS, TRACK, FIGURES, TUNING, LIVE, H5 and OUT are put in; `runs` costs 15 ms and
+# `report` a second
 COMMANDS = (
     Command("runs", ("runs", "--logs", "LOGS"), 160),
     Command("runs --json", ("runs", "--logs", "LOGS", "--json"), 50),
@@ -70,7 +73,9 @@ COMMANDS = (
     Command("track", ("track", "TRACK", "--no-pictures"), 30, "track"),
     Command("modes", ("modes", "FIGURES", "--no-pictures"), 20, "track"),
     Command("measure h5", ("measure", "H5", "--no-pictures"), 60, "sofast"),
-    Command("calibrate --live", ("calibrate", "--live", "--session", "LIVE", "--no-pictures"), 3, "live"),
+    Command(
+        "calibrate --live", ("calibrate", "--live", "--session", "LIVE", "--no-pictures"), 3, "live"
+    ),
     Command("tune history", ("tune", "history", "--logs", "TUNED"), 20, "tuned"),
     Command("tune identify", ("tune", "identify", "--session", "TUNING"), 8, "tuned"),
     Command("tune design", ("tune", "design", "--session", "TUNING"), 4, "tuned"),
@@ -115,7 +120,14 @@ class Room:
 
     def make(self, kind: str) -> None:
         """A good folder of a kind, unless it is there."""
-        from good_folders import good_live, good_run, good_sets, good_sofast, good_track, good_tuning
+        from good_folders import (
+            good_live,
+            good_run,
+            good_sets,
+            good_sofast,
+            good_track,
+            good_tuning,
+        )
 
         folder = self._good / kind
         if kind == "live":
@@ -157,8 +169,12 @@ class Room:
             spoil(inside, rng)
         else:
             spoil(inside / self._run_name, rng)
-            if one.command.name.startswith("runs"):  # one bad folder must not hide the good ones from the list
-                shutil.copytree(self._good / "logs" / self._run_name, inside / "20261122T000000Z-good")
+            if one.command.name.startswith(
+                "runs"
+            ):  # one bad folder must not hide the good ones from the list
+                shutil.copytree(
+                    self._good / "logs" / self._run_name, inside / "20261122T000000Z-good"
+                )
         before = _outside(place)
         words = [self._word(word, inside, rng) for word in one.command.words]
         with _captured() as said:
@@ -167,26 +183,40 @@ class Room:
 
     def _word(self, word: str, inside: Path, rng: random.Random) -> str:
         places = {
-            "LOGS": inside, "RUN": inside / self._run_name,
-            "SETS": inside, "SET": inside / rng.choice(("0000", "0001")),
-            "TRACK": inside / "track", "FIGURES": inside,
-            "TUNED": inside, "TUNING": inside / "tuning" / self._tuning_name,
-            "LIVE": inside, "H5": inside / "m.h5",
-            "SET0": inside / "0000", "SET1": inside / "0001", "OUT": inside.parent / "out",
-            "OUT.rrd": inside.parent / "out.rrd", "OUT.toml": inside.parent / "out.toml",
-        }  # fmt: skip
+            "LOGS": inside,
+            "RUN": inside / self._run_name,
+            "SETS": inside,
+            "SET": inside / rng.choice(("0000", "0001")),
+            "TRACK": inside / "track",
+            "FIGURES": inside,
+            "TUNED": inside,
+            "TUNING": inside / "tuning" / self._tuning_name,
+            "LIVE": inside,
+            "H5": inside / "m.h5",
+            "SET0": inside / "0000",
+            "SET1": inside / "0001",
+            "OUT": inside.parent / "out",
+            "OUT.rrd": inside.parent / "out.rrd",
+            "OUT.toml": inside.parent / "out.toml",
+        }
         return str(places.get(word, word))
 
 
 def _wrong(
-    one: Case, code: int, said: tuple[str, str], before: dict[str, tuple[int, int]], after: dict[str, tuple[int, int]]
+    one: Case,
+    code: int,
+    said: tuple[str, str],
+    before: dict[str, tuple[int, int]],
+    after: dict[str, tuple[int, int]],
 ) -> Iterator[str]:
     import unicodedata
 
     out, err = said
     if code not in _CODES:
         yield f"exit {code}"
-    if any(unicodedata.category(letter) in _REFUSED and letter not in "\n\t" for letter in out + err):
+    if any(
+        unicodedata.category(letter) in _REFUSED and letter not in "\n\t" for letter in out + err
+    ):
         yield "control characters were printed"
     if code == 2 and sum(line.startswith("membrane-ctrl: ") for line in err.splitlines()) != 1:
         yield f"not one line: {err[-200:]!r}"
@@ -197,7 +227,9 @@ def _wrong(
 
 
 def _outside(place: Path) -> dict[str, tuple[int, int]]:
-    """Size and time of all beside the folder that is spoiled, but for what a command was told to write."""
+    """Size and time of all beside the folder that is spoiled, but for what a command was told to
+    write.
+    """
     return {
         path.name: (path.lstat().st_size, path.lstat().st_mtime_ns)
         for path in place.iterdir()
@@ -236,7 +268,9 @@ def work(first: int, last: int, root: Path, good: Path, only: str | None) -> Non
         typer.main.get_command
     )  # making it anew takes four times what a case does
     warnings.simplefilter("error")
-    warnings.simplefilter("ignore", RuntimeWarning)  # NumPy's, of numbers that are none: a line, and no end
+    warnings.simplefilter(
+        "ignore", RuntimeWarning
+    )  # NumPy's, of numbers that are none: a line, and no end
     room = Room(root, good)
     for kind in {case(number, only).command.reads for number in range(first, last)}:
         room.make(kind)
@@ -256,9 +290,12 @@ def work(first: int, last: int, root: Path, good: Path, only: str | None) -> Non
             wrong = room.run(one)
         except BaseException as error:
             frames = traceback.extract_tb(error.__traceback__)
-            ours = next((f for f in reversed(frames) if "/membrane_ctrl/" in f.filename), frames[-1])
+            ours = next(
+                (f for f in reversed(frames) if "/membrane_ctrl/" in f.filename), frames[-1]
+            )
             wrong = (
-                f"{type(error).__name__}: {str(error)[:120]} at {Path(ours.filename).name}:{ours.lineno} {ours.name}"
+                f"{type(error).__name__}: {str(error)[:120]} at "
+                f"{Path(ours.filename).name}:{ours.lineno} {ours.name}"
             )
             if os.environ.get("FUZZ_TRACE"):
                 traceback.print_exc()
@@ -271,7 +308,13 @@ def work(first: int, last: int, root: Path, good: Path, only: str | None) -> Non
             wrong = f"it took {taken_mb:.0f} MB"
         took_s = time.perf_counter() - began_s
         cpu_s = time.process_time() - began_cpu_s
-        done = {"done": number, "wrong": wrong, "took_s": round(took_s, 3), "cpu_s": cpu_s, "peak_mb": taken_mb}
+        done = {
+            "done": number,
+            "wrong": wrong,
+            "took_s": round(took_s, 3),
+            "cpu_s": cpu_s,
+            "peak_mb": taken_mb,
+        }
         print(json.dumps(done), flush=True)
 
 
@@ -279,7 +322,9 @@ Outcome = tuple[Counter[str], list[tuple[int, str, str]], float]
 
 
 def campaign(first: int, last: int, only: str | None = None, say: object = print) -> Outcome:
-    """Cases in worker processes; counts by command, what was wrong, and the greatest memory in MB."""
+    """Cases in worker processes; counts by command, what was wrong,
+    and the greatest memory in MB.
+    """
     with tempfile.TemporaryDirectory(prefix="membrane-fuzz-good-") as good:
         return _campaign(first, last, only, good, say)
 
@@ -294,7 +339,13 @@ def _campaign(first: int, last: int, only: str | None, good: str, say: object) -
         with tempfile.TemporaryDirectory(prefix="membrane-fuzz-") as root:
             end = min(last, at + _CASES_A_WORKER)
             words = [sys.executable, str(Path(__file__)), "--worker", root, "--good", good]
-            words += ["--first", str(at), "--last", str(end), *(["--command", only] if only else [])]
+            words += [
+                "--first",
+                str(at),
+                "--last",
+                str(end),
+                *(["--command", only] if only else []),
+            ]
             with subprocess.Popen(words, stdout=subprocess.PIPE, text=True) as worker:
                 assert worker.stdout is not None
                 name = "start"
@@ -330,9 +381,13 @@ def main(arguments: Sequence[str]) -> int:
     parser = argparse.ArgumentParser(
         description="Mutated run folders and capture sets through every reading command."
     )
-    parser.add_argument("--first", type=int, default=0, help="number of the first case, which is its seed")
+    parser.add_argument(
+        "--first", type=int, default=0, help="number of the first case, which is its seed"
+    )
     parser.add_argument("--last", type=int, default=20_000, help="and of the one behind the last")
-    parser.add_argument("--command", choices=[command.name for command in COMMANDS], help="cases of this one alone")
+    parser.add_argument(
+        "--command", choices=[command.name for command in COMMANDS], help="cases of this one alone"
+    )
     parser.add_argument("--worker", type=Path, help=argparse.SUPPRESS)
     parser.add_argument("--good", type=Path, help=argparse.SUPPRESS)
     options = parser.parse_args(arguments)
@@ -342,7 +397,9 @@ def main(arguments: Sequence[str]) -> int:
     began_s = time.perf_counter()
     counts, found, peak_mb = campaign(options.first, options.last, options.command)
     took_s = time.perf_counter() - began_s
-    print(f"{sum(counts.values())} cases in {took_s:.0f} s, peak {peak_mb:.0f} MB, {len(found)} wrong")
+    print(
+        f"{sum(counts.values())} cases in {took_s:.0f} s, peak {peak_mb:.0f} MB, {len(found)} wrong"
+    )
     return int(bool(found))
 
 

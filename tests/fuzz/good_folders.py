@@ -1,4 +1,6 @@
-"""Small good folders for the fuzzer to spoil: a run of some seconds with every kind of file, and capture sets."""
+"""Small good folders for the fuzzer to spoil: a run of some seconds with every kind of file, and
+capture sets.
+"""
 
 from __future__ import annotations
 
@@ -27,7 +29,9 @@ _SET = ("--shrink", "16")
 
 
 def good_run(logs: Path) -> Path:
-    """A run with configuration, events, a mark, tables with inputs and figures, a Rerun segment and a summary."""
+    """A run with configuration, events, a mark, tables with inputs and figures, a Rerun segment and
+    a summary.
+    """
     folder = logs / RUN
     folder.mkdir(parents=True)
     ticks = kept_ticks(_SECONDS)
@@ -39,14 +43,27 @@ def good_run(logs: Path) -> Path:
     _write_segment(folder, rows)
     lines = [json.loads(line) for line in (folder / "events.jsonl").read_text().splitlines()]
     stamped = [{"time_utc": "2026-11-21T01:02:03+00:00", **line} for line in lines]
-    stamped.append({"time_utc": "2026-11-21T01:02:05+00:00", "mono_s": 2.0, "kind": "fault", "name": "laser_lost"})
+    stamped.append(
+        {
+            "time_utc": "2026-11-21T01:02:05+00:00",
+            "mono_s": 2.0,
+            "kind": "fault",
+            "name": "laser_lost",
+        }
+    )
     (folder / "events.jsonl").write_text("".join(f"{dumps_checked(line)}\n" for line in stamped))
     for event in stamped:
         summary.add_event(event)
     files = [path.parent.name for path in folder.glob("*/*.parquet")]
     counts = {"segments": 1, "tables": {table: files.count(table) for table in files}}
     (folder / "summary.json").write_text(dumps_checked(summary.as_dict({}, counts), indent=2))
-    mark = {"mono_s": 1.0, "kind": "mark", "text": "door", "who": "me", "time_utc": "2026-11-21T01:02:04+00:00"}
+    mark = {
+        "mono_s": 1.0,
+        "kind": "mark",
+        "text": "door",
+        "who": "me",
+        "time_utc": "2026-11-21T01:02:04+00:00",
+    }
     (folder / "annotations.jsonl").write_text(json.dumps(mark) + "\n")
     return folder
 
@@ -80,7 +97,9 @@ def good_sofast(folder: Path) -> None:
 
 
 def good_tuning(folder: Path) -> None:
-    """Run folders with the journal of a tuning session, all steps of it done on the twin: 30 s of computing."""
+    """Run folders with the journal of a tuning session, all steps of it done on the twin: 30 s of
+    computing.
+    """
     times = ("--observe", "5m", "--verify", "5m")
     assert run(["tune", "run", "--twin", "--yes", "--logs", str(folder), *times]) in (0, 3)
     (session,) = (folder / "tuning").glob("2*")
@@ -88,7 +107,9 @@ def good_tuning(folder: Path) -> None:
 
 
 def good_track(folder: Path) -> None:
-    """A tracking set `track` with its reference `full`, and half a minute of figures in `track.npz`."""
+    """A tracking set `track` with its reference `full`, and half a minute of figures in
+    `track.npz`.
+    """
     assert run(["simulate", str(folder), "--shrink", "12", "--track", "6"]) == 0
     for extra in folder.glob("*/truth.*"):
         extra.unlink()

@@ -1,4 +1,6 @@
-"""What a stranger, a bad disk or a careless person may do to a good folder; every change from a seed."""
+"""What a stranger, a bad disk or a careless person may do to a good folder; every change from a
+seed.
+"""
 
 from __future__ import annotations
 
@@ -25,9 +27,25 @@ from membrane_ctrl.run_files.table_store.journal import MAGIC
 CANARY = "canary.txt"  # beside the folder: what nobody may read, change or remove
 _TEXT = "\x1b]0;owned\x07\x1b[2J\x9b31m\r\b\u202emirror\u2066[bold]\U000e0041"
 _NUMBERS = (
-    -1, 0, 1, 2, 1e308, -1e308, 1e-308, 5e-324, 2**31, 2**53, 2**63 - 1, 10**25, -(10**25), 1e12, 0.1,
-    float("inf"), float("-inf"), float("nan"),
-)  # fmt: skip
+    -1,
+    0,
+    1,
+    2,
+    1e308,
+    -1e308,
+    1e-308,
+    5e-324,
+    2**31,
+    2**53,
+    2**63 - 1,
+    10**25,
+    -(10**25),
+    1e12,
+    0.1,
+    float("inf"),
+    float("-inf"),
+    float("nan"),
+)
 _OTHERS = (
     "",
     "nan",
@@ -42,7 +60,13 @@ _OTHERS = (
     "../../etc/passwd",
     "/dev/zero",
 )
-_TIMES = ("2026-11-21", "9999-12-31T23:59:59+00:00", "0001-01-01T00:00:00-12:00", "2026-11-21T01:02:03", "now")
+_TIMES = (
+    "2026-11-21",
+    "9999-12-31T23:59:59+00:00",
+    "0001-01-01T00:00:00-12:00",
+    "2026-11-21T01:02:03",
+    "now",
+)
 _HEAD_BYTES = 32  # of a journal's frame
 
 Mutation = Callable[[Path, random.Random], None]
@@ -51,7 +75,9 @@ Mutation = Callable[[Path, random.Random], None]
 def spoil(folder: Path, rng: random.Random) -> None:
     """One to four changes somewhere below a folder."""
     for _ in range(rng.choice((1, 1, 1, 2, 3, 4))):
-        files = sorted(path for path in folder.rglob("*") if not path.is_symlink() and _is_small_file(path))
+        files = sorted(
+            path for path in folder.rglob("*") if not path.is_symlink() and _is_small_file(path)
+        )
         if not files:
             return
         path = rng.choice(files)
@@ -95,7 +121,14 @@ def numbers(path: Path, rng: random.Random) -> None:
     """A word of 4 or 8 bytes is a large number: a length, a count, an offset."""
     data = bytearray(path.read_bytes())
     kind, value = rng.choice(
-        (("<I", 2**32 - 1), ("<I", 2**31), ("<Q", 2**63 - 1), ("<Q", 2**40), ("<q", -1), (">I", 20000))
+        (
+            ("<I", 2**32 - 1),
+            ("<I", 2**31),
+            ("<Q", 2**63 - 1),
+            ("<Q", 2**40),
+            ("<q", -1),
+            (">I", 20000),
+        )
     )
     if len(data) > 16:
         at = _place(data[:-8], rng)
@@ -126,7 +159,9 @@ def link(path: Path, rng: random.Random) -> None:
     """The file is a link: out of the folder, to itself, to a device, to nothing."""
     outside = next(parent / CANARY for parent in path.parents if (parent / CANARY).exists())
     path.unlink()
-    path.symlink_to(rng.choice((outside, path, Path("/dev/zero"), Path("/nowhere/at/all"), Path("/etc/passwd"))))
+    path.symlink_to(
+        rng.choice((outside, path, Path("/dev/zero"), Path("/nowhere/at/all"), Path("/etc/passwd")))
+    )
 
 
 def pipe(path: Path, rng: random.Random) -> None:
@@ -144,7 +179,9 @@ def sparse(path: Path, rng: random.Random) -> None:
 def swap(path: Path, rng: random.Random) -> None:
     """Two files have each other's names, or one is there under another name as well."""
     others = [
-        other for other in path.parent.iterdir() if not other.is_symlink() and _is_small_file(other) and other != path
+        other
+        for other in path.parent.iterdir()
+        if not other.is_symlink() and _is_small_file(other) and other != path
     ]
     if not others:
         return
@@ -154,7 +191,9 @@ def swap(path: Path, rng: random.Random) -> None:
         path.write_bytes(theirs)
         other.write_bytes(ours)
         return
-    name = rng.choice((f"ticks-{rng.randrange(9999):04d}.parquet", "x\x1b[31m.rrd", "night-007.rrd"))
+    name = rng.choice(
+        (f"ticks-{rng.randrange(9999):04d}.parquet", "x\x1b[31m.rrd", "night-007.rrd")
+    )
     shutil.copy(path, path.parent / name)
 
 
@@ -162,11 +201,26 @@ def planted(path: Path, rng: random.Random) -> None:
     """A link waits where a program may write."""
     outside = next(parent / CANARY for parent in path.parents if (parent / CANARY).exists())
     names = (
-        ".probe", ".night-000.rrd.part", ".summary.json.part", "summary.json", "repaired", "report", "export",
-        "report/report.html", "result/result.json", ".recorder-state", "annotations.jsonl", "stability", "ticks",
-        "result/.result.json.part", "export/ticks.csv", "repaired/night-000.rrd", "events.jsonl.torn", "result",
+        ".probe",
+        ".night-000.rrd.part",
+        ".summary.json.part",
+        "summary.json",
+        "repaired",
+        "report",
+        "export",
+        "report/report.html",
+        "result/result.json",
+        ".recorder-state",
+        "annotations.jsonl",
+        "stability",
+        "ticks",
+        "result/.result.json.part",
+        "export/ticks.csv",
+        "repaired/night-000.rrd",
+        "events.jsonl.torn",
+        "result",
         "geometry.toml",
-    )  # fmt: skip
+    )
     place = path.parent / rng.choice(names)
     place.parent.mkdir(exist_ok=True)
     if not place.exists():
@@ -182,13 +236,17 @@ def table(path: Path, rng: random.Random) -> None:
     _change(value, rng)
     text = dumps_checked(value) if rng.random() < 0.7 else json.dumps(value)
     if rng.random() < 0.1:
-        text = text.replace("0", rng.choice(("1" * 5000, "1e999", "-" * 3, "[" * 3000, "\\ud800")), 1)
+        text = text.replace(
+            "0", rng.choice(("1" * 5000, "1e999", "-" * 3, "[" * 3000, "\\ud800")), 1
+        )
     lines[at] = text
     path.write_text("\n".join(lines) + "\n", errors="surrogatepass")
 
 
 def toml(path: Path, rng: random.Random) -> None:
-    """A value of a TOML file is another; a key of 30 000 parts is left as it is, since tomllib takes 2 GB for it."""
+    """A value of a TOML file is another; a key of 30 000 parts is left as it is, since tomllib
+    takes 2 GB for it.
+    """
     before = path.read_text()
     if ".a" * 30000 in before:
         return
@@ -213,7 +271,11 @@ def toml(path: Path, rng: random.Random) -> None:
 def _without_none(value: Any) -> Any:
     if isinstance(value, dict):
         return {str(key): _without_none(item) for key, item in value.items() if item is not None}
-    return [_without_none(item) for item in value if item is not None] if isinstance(value, list) else value
+    return (
+        [_without_none(item) for item in value if item is not None]
+        if isinstance(value, list)
+        else value
+    )
 
 
 def _change(value: Any, rng: random.Random) -> None:
@@ -238,7 +300,9 @@ def _change(value: Any, rng: random.Random) -> None:
 
 
 def resealed(path: Path, rng: random.Random) -> None:
-    """Bytes of a journal are others, and its checksums are right again: what a forger would write."""
+    """Bytes of a journal are others, and its checksums are right again:
+    what a forger would write.
+    """
     rng.choice((flip, numbers))(path, rng)
     path.write_bytes(sealed_again(path.read_bytes()))
 
@@ -251,7 +315,8 @@ def sealed_again(content: bytes) -> bytes:
             break
         (packed_bytes,) = struct.unpack_from("<I", data, start + 20)
         crc = zlib.crc32(
-            data[start + _HEAD_BYTES : start + _HEAD_BYTES + packed_bytes], zlib.crc32(data[start : start + 28])
+            data[start + _HEAD_BYTES : start + _HEAD_BYTES + packed_bytes],
+            zlib.crc32(data[start : start + 28]),
         )
         struct.pack_into("<I", data, start + 28, crc)
     return bytes(data)
@@ -270,8 +335,12 @@ def rewritten(path: Path, rng: random.Random) -> None:
     place = rng.randrange(table.num_columns)
     field = table.schema.field(place)
     other = rng.choice((pa.nulls(table.num_rows, field.type), pa.array([_TEXT] * table.num_rows)))
-    table = rng.choice((table.set_column(place, field.name, other), table.append_column(field.name, other)))
-    pq.write_table(table, path, compression=rng.choice(("zstd", "snappy", "none")), data_page_version="2.0")
+    table = rng.choice(
+        (table.set_column(place, field.name, other), table.append_column(field.name, other))
+    )
+    pq.write_table(
+        table, path, compression=rng.choice(("zstd", "snappy", "none")), data_page_version="2.0"
+    )
 
 
 def picture(path: Path, rng: random.Random) -> None:
@@ -279,7 +348,9 @@ def picture(path: Path, rng: random.Random) -> None:
     data = bytearray(path.read_bytes())
     if len(data) < 33:
         return
-    struct.pack_into(">II", data, 16, *(rng.choice((0, 1, 152, 20000, 2**31 - 1)) for _ in range(2)))
+    struct.pack_into(
+        ">II", data, 16, *(rng.choice((0, 1, 152, 20000, 2**31 - 1)) for _ in range(2))
+    )
     data[24] = rng.choice((1, 2, 4, 8, 16))
     data[25] = rng.choice((0, 2, 3, 4, 6))
     struct.pack_into(">I", data, 29, zlib.crc32(data[12:29]))

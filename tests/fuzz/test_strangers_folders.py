@@ -1,4 +1,6 @@
-"""Run folders and capture sets made to do harm, one for each finding; and a small share of the fuzzer."""
+"""Run folders and capture sets made to do harm, one for each finding; and a small share of the
+fuzzer.
+"""
 
 from __future__ import annotations
 
@@ -74,14 +76,23 @@ def rewrite(path: Path, change: Callable[[dict[str, Any]], object]) -> None:
     path.write_text(tomli_w.dumps(tables))
 
 
-# ---------------------------------------------------------------------------------------------------------- links
+# ----------------------------------------------------------------------------------------------------------  # noqa: E501
+# links
 
 
 @pytest.mark.usefixtures("undrawn")
 @pytest.mark.parametrize(
     ("words", "names"),
     [
-        (("repair",), (".probe", ".summary.json.part", "repaired/events.jsonl", "repaired/.events.jsonl.part")),
+        (
+            ("repair",),
+            (
+                ".probe",
+                ".summary.json.part",
+                "repaired/events.jsonl",
+                "repaired/.events.jsonl.part",
+            ),
+        ),
         (("repair", "--in-place"), (".events.jsonl.part", "events.jsonl.torn")),
         (("report",), ("report/report.html", "report/.report.json.part")),
         (("export", "--format", "csv"), ("export/ticks.csv", "export/events.jsonl")),
@@ -140,7 +151,14 @@ def test_a_folder_that_the_user_names_may_be_a_link(folder: Path, tmp_path: Path
 
 @pytest.mark.parametrize("what", ["link", "pipe", "folder", "device"])
 @pytest.mark.parametrize(
-    "name", ["config.toml", "events.jsonl", "summary.json", "ticks/ticks-0000.parquet", "ticks/manifest.jsonl"]
+    "name",
+    [
+        "config.toml",
+        "events.jsonl",
+        "summary.json",
+        "ticks/ticks-0000.parquet",
+        "ticks/manifest.jsonl",
+    ],
 )
 def test_what_is_no_plain_file_is_noted_and_not_waited_for(
     folder: Path, secret: Path, name: str, what: str, capsys: Said
@@ -159,14 +177,17 @@ def test_what_is_no_plain_file_is_noted_and_not_waited_for(
     assert "secret" not in out.replace(str(secret), "")
 
 
-# ---------------------------------------------------------------------------------------------------------- bounds
+# ----------------------------------------------------------------------------------------------------------  # noqa: E501
+# bounds
 
 
 @pytest.mark.usefixtures("undrawn")
 def test_a_small_part_that_would_be_gigabytes(folder: Path, capsys: Said) -> None:
     path = folder / "ticks" / "ticks-0000.parquet"
     zeros = pa.array(np.zeros(20_000_000, np.int8))
-    table = pa.table([zeros.cast(field.type) for field in TICKS.schema][:8], names=TICKS.schema.names[:8])
+    table = pa.table(
+        [zeros.cast(field.type) for field in TICKS.schema][:8], names=TICKS.schema.names[:8]
+    )
     pq.write_table(table, path, compression="zstd", row_group_size=len(zeros))
     (path.parent / "manifest.jsonl").unlink()
     assert path.stat().st_size < 1e6
@@ -182,7 +203,9 @@ def test_words_in_no_alphabet_are_not_read(folder: Path, capsys: Said) -> None:
     table = pq.read_table(path)
     binary = pa.array([b"fr\xff\xfe\xfdes"] * table.num_rows)
     place = table.schema.get_field_index("kind")
-    forged = table.set_column(place, "kind", pa.Array.from_buffers(pa.string(), table.num_rows, binary.buffers()))
+    forged = table.set_column(
+        place, "kind", pa.Array.from_buffers(pa.string(), table.num_rows, binary.buffers())
+    )
     pq.write_table(forged, path)
     assert run(["runs", "show", str(folder)]) == 0
     assert run(["replay", str(folder)]) in (0, 2, 3)
@@ -190,7 +213,9 @@ def test_words_in_no_alphabet_are_not_read(folder: Path, capsys: Said) -> None:
 
 
 def test_tables_of_other_kinds_are_no_tables(folder: Path, capsys: Said) -> None:
-    """Words where numbers belong, a column twice, lists of nothing: said, and the run is shown without."""
+    """Words where numbers belong, a column twice, lists of nothing: said, and the run is shown
+    without.
+    """
     schemas = (
         pa.schema([("mono_s", pa.string())]),
         pa.schema([("mono_s", pa.float64())] * 2),
@@ -214,7 +239,9 @@ def test_tables_of_other_kinds_are_no_tables(folder: Path, capsys: Said) -> None
     ],
     ids=["dotted", "quoted", "deep", "digits", "long"],
 )
-def test_toml_that_would_take_all_there_is(folder: Path, sets: Path, text: str, why: str, capsys: Said) -> None:
+def test_toml_that_would_take_all_there_is(
+    folder: Path, sets: Path, text: str, why: str, capsys: Said
+) -> None:
     for path, words in (
         (folder / "config.toml", ("replay", str(folder))),
         (sets / "0000" / "capture.toml", ("measure", str(sets / "0000"))),
@@ -228,7 +255,10 @@ def test_toml_that_would_take_all_there_is(folder: Path, sets: Path, text: str, 
     [
         ("[" * 100_000, "summary.json: cannot be read (nested too deep)"),
         ('{"a": ' * 40 + "1" + "}" * 40, "summary.json: cannot be read (nested too deep)"),
-        ("[" + "[]," * 6_000_000 + "1]", "events.jsonl: cannot be read (more than 6000000 elements)"),
+        (
+            "[" + "[]," * 6_000_000 + "1]",
+            "events.jsonl: cannot be read (more than 6000000 elements)",
+        ),
         ('{"duration_s": ' + "9" * 5000 + "}", "events.jsonl: 1 line unreadable"),
     ],
     ids=["deep", "depth", "many", "digits"],
@@ -271,7 +301,10 @@ def test_other_pictures_are_measured_before_they_are_decoded(suffix: str) -> Non
 
 
 def test_a_camera_of_more_pixels_than_there_is_memory(sets: Path, capsys: Said) -> None:
-    rewrite(sets / "0000" / "capture.toml", lambda tables: tables["camera"].update(width_px=16_000, height_px=12_000))
+    rewrite(
+        sets / "0000" / "capture.toml",
+        lambda tables: tables["camera"].update(width_px=16_000, height_px=12_000),
+    )
     assert "exceed the limit of 300 million" in refused(capsys, "measure", str(sets / "0000"))
 
 
@@ -283,7 +316,8 @@ def test_many_unknown_keys_are_left_out_in_one_go(folder: Path, capsys: Said) ->
     assert RUN in capsys.readouterr().out
 
 
-# ---------------------------------------------------------------------------------------------------------- sets
+# ----------------------------------------------------------------------------------------------------------  # noqa: E501
+# sets
 
 
 @pytest.mark.parametrize(
@@ -305,7 +339,10 @@ def test_a_frame_that_is_a_link_within_the_set_is_no_picture(sets: Path, capsys:
     (folder / "x_sin_0.png").rename(folder / "other.png")
     (folder / "x_sin_0.png").symlink_to("other.png")
     assert run(["measure", str(folder), "--json"]) == 3
-    assert "a link, and links are not followed" in json.loads(capsys.readouterr().out)["quality"]["reason"]
+    assert (
+        "a link, and links are not followed"
+        in json.loads(capsys.readouterr().out)["quality"]["reason"]
+    )
 
 
 def test_a_reference_beside_the_set_still_anchors_it(sets: Path) -> None:
@@ -321,7 +358,8 @@ def test_a_height_map_is_of_the_sets_own_folder(sets: Path, capsys: Said) -> Non
     assert ":x:0" not in said
 
 
-# ---------------------------------------------------------------------------------------------------------- words
+# ----------------------------------------------------------------------------------------------------------  # noqa: E501
+# words
 
 
 @pytest.mark.usefixtures("undrawn")
@@ -371,7 +409,9 @@ def test_a_report_shows_words_and_runs_none(folder: Path) -> None:
 
 def test_a_formula_in_a_frames_name_is_no_formula(sets: Path) -> None:
     folder = sets / "0000"
-    rewrite(folder / "capture.toml", lambda tables: tables["frames"][1].update(file="$\\frac{$.png"))
+    rewrite(
+        folder / "capture.toml", lambda tables: tables["frames"][1].update(file="$\\frac{$.png")
+    )
     assert run(["measure", str(folder)]) == 3
 
 
@@ -423,16 +463,30 @@ def test_events_of_nonsense_end_no_command(folder: Path) -> None:
         file.write('{"kind": "state", "state": "hold", "mono_s": 1e308}\n')
         file.write('{"kind": "state", "state": ["hold"], "mono_s": NaN}\n')
         file.write('{"kind": "state", "state": {"a": 1}}\n')
-        file.write('{"kind": "end", "exit": "done", "mono_s": -Infinity, "time_utc": "9999-12-31T23:59:59"}\n')
+        file.write(
+            '{"kind": "end", "exit": "done", "mono_s": -Infinity, "time_utc": '
+            '"9999-12-31T23:59:59"}\n'
+        )
         file.write('{"kind": "end", "exit": {"a": 1}, "mono_s": true, "time_utc": {"a": 1}}\n')
         file.write('{"kind": "mark", "text": {"a": 1}, "mono_s": 12345678901234567890123456789}\n')
-        file.write('{"kind": "mark", "text": {"a": 1}, "mono_s": 2, "time_utc": "0001-01-01T00:00:00-12:00"}\n')
-    for words in (["runs", "show"], ["replay"], ["repair"], ["report"], ["export"], ["runs", "--logs"]):
+        file.write(
+            '{"kind": "mark", "text": {"a": 1}, "mono_s": 2, "time_utc": '
+            '"0001-01-01T00:00:00-12:00"}\n'
+        )
+    for words in (
+        ["runs", "show"],
+        ["replay"],
+        ["repair"],
+        ["report"],
+        ["export"],
+        ["runs", "--logs"],
+    ):
         where = folder.parent if words == ["runs", "--logs"] else folder
         assert run([*words, str(where)]) in {0, 3}, words
 
 
-# ------------------------------------------------------------------------------------------------------ the fuzzer
+# ------------------------------------------------------------------------------------------------------  # noqa: E501
+# the fuzzer
 
 
 @pytest.fixture(scope="module")

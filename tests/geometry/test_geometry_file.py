@@ -7,13 +7,31 @@ from pathlib import Path
 import pytest
 import tomli_w
 
-from membrane_ctrl.config.schema import CameraConfig, Config, GeometryConfig, OpticsConfig, PatternConfig
-from membrane_ctrl.geometry.file import KEPT, geometry_in_force, geometry_of_run, origin_of, read_geometry
+from membrane_ctrl.config.schema import (
+    CameraConfig,
+    Config,
+    GeometryConfig,
+    OpticsConfig,
+    PatternConfig,
+)
+from membrane_ctrl.geometry.file import (
+    KEPT,
+    geometry_in_force,
+    geometry_of_run,
+    origin_of,
+    read_geometry,
+)
 from membrane_ctrl.model.errors import InputError
 from membrane_ctrl.model.plain_json import SCHEMA, content_hash
 
 CAMERA = CameraConfig(width_px=306, height_px=256, pixel_um=27.6)
-LENS = {"width_px": 306, "height_px": 256, "pixel_um": 27.6, "focal_mm": 16.1, "principal_px": [150.0, 127.0]}
+LENS = {
+    "width_px": 306,
+    "height_px": 256,
+    "pixel_um": 27.6,
+    "focal_mm": 16.1,
+    "principal_px": [150.0, 127.0],
+}
 
 
 def calibrated(path: Path, **more: object) -> Path:
@@ -53,7 +71,10 @@ def test_lens_and_pitch_of_a_calibrated_file_count(tmp_path: Path) -> None:
 
 def test_the_camera_of_a_set_counts_for_nothing_elsewhere(tmp_path: Path) -> None:
     path = tmp_path / "capture.toml"
-    tables = {"schema": "membrane-capture/1", "geometry": {"a_mm": 2600.0, "b_mm": 2800.0, "alpha_deg": 80.0}}
+    tables = {
+        "schema": "membrane-capture/1",
+        "geometry": {"a_mm": 2600.0, "b_mm": 2800.0, "alpha_deg": 80.0},
+    }
     path.write_text(tomli_w.dumps({**tables, "camera": {"focal_mm": 25.0}}))
     file = read_geometry(path)
     assert file.calibration is None
@@ -62,14 +83,18 @@ def test_the_camera_of_a_set_counts_for_nothing_elsewhere(tmp_path: Path) -> Non
 
 def test_a_lens_of_another_camera_is_refused(tmp_path: Path) -> None:
     file = read_geometry(calibrated(tmp_path / "g.toml", camera=LENS))
-    with pytest.raises(InputError, match=r"g\.toml: camera\.width_px = 306, the frames' camera has 2448"):
+    with pytest.raises(
+        InputError, match=r"g\.toml: camera\.width_px = 306, the frames' camera has 2448"
+    ):
         file.over(OpticsConfig())
 
 
 def test_numbers_that_were_changed_after_the_calibration_are_refused(tmp_path: Path) -> None:
     path = calibrated(tmp_path / "g.toml")
     path.write_text(path.read_text().replace("2674.0", "2675.0"))
-    with pytest.raises(InputError, match=r"g\.toml: calibration\.hash = .*edited after the calibration"):
+    with pytest.raises(
+        InputError, match=r"g\.toml: calibration\.hash = .*edited after the calibration"
+    ):
         read_geometry(path)
 
 
@@ -102,7 +127,14 @@ def test_a_height_map_beside_the_file_is_kept_with_the_run(tmp_path: Path) -> No
     run_dir.mkdir()
     (lab / "screen.txt").write_text("0.1 0.0 0.1\n0.2 0.1 0.2\n")
     height_map = {"s_x_mm": [-300, 0, 300], "s_y_mm": [-300, 300], "file": "screen.txt"}
-    tables = {"geometry": {"a_mm": 2672.0, "b_mm": 2871.0, "alpha_deg": 80.9, "screen": {"height_map": height_map}}}
+    tables = {
+        "geometry": {
+            "a_mm": 2672.0,
+            "b_mm": 2871.0,
+            "alpha_deg": 80.9,
+            "screen": {"height_map": height_map},
+        }
+    }
     covariance = {"names": ["a_mm"], "matrix": [[4.0]]}
     (lab / "g.toml").write_text(tomli_w.dumps({**tables, "covariance": covariance}))
     config = Config(optics=OpticsConfig(geometry_file=lab / "g.toml"))
@@ -130,7 +162,9 @@ def test_without_a_file_yet_the_hand_counts_and_it_is_said(tmp_path: Path) -> No
 def test_a_file_with_which_the_mirror_cannot_be_measured_is_refused(tmp_path: Path) -> None:
     path = tmp_path / "g.toml"
     path.write_text("a_mm = 2672.0\nb_mm = 2871.0\nalpha_deg = 30.0\n")
-    with pytest.raises(InputError, match=r"g\.toml: geometry\.alpha_deg: the pattern .* in 28% of the mirror"):
+    with pytest.raises(
+        InputError, match=r"g\.toml: geometry\.alpha_deg: the pattern .* in 28% of the mirror"
+    ):
         geometry_in_force(Config(optics=OpticsConfig(geometry_file=path)))
 
 

@@ -1,4 +1,6 @@
-"""Faults latched by the board when a hold begins: refused, waited for, or cleared as the resume rule allows."""
+"""Faults latched by the board when a hold begins: refused, waited for, or cleared as the resume
+rule allows.
+"""
 
 from __future__ import annotations
 
@@ -40,11 +42,16 @@ async def board() -> AsyncIterator[PumpBoardEmulator]:
 
 
 def options(standby: bool = False, clear_faults: bool = False) -> HoldOptions:
-    return HoldOptions(Config(), "lab.toml", False, None, "test", None, clear_faults, False, standby)
+    return HoldOptions(
+        Config(), "lab.toml", False, None, "test", None, clear_faults, False, standby
+    )
 
 
 async def identified(
-    board: PumpBoardEmulator, asked: HoldOptions, resumes: tuple[str, ...] = (), log: ResumeLog | None = None
+    board: PumpBoardEmulator,
+    asked: HoldOptions,
+    resumes: tuple[str, ...] = (),
+    log: ResumeLog | None = None,
 ) -> BoardAtStart:
     devices = DevicesConfig(board=f"tcp://127.0.0.1:{board.port}")
     config = Config(devices=devices, resume=ResumeConfig(faults=resumes, most_per_day=2))
@@ -55,7 +62,9 @@ async def test_a_board_without_faults_is_taken(board: PumpBoardEmulator) -> None
     assert await identified(board, options()) == BoardAtStart()
 
 
-async def test_a_latched_board_is_refused_and_in_standby_waited_for(board: PumpBoardEmulator) -> None:
+async def test_a_latched_board_is_refused_and_in_standby_waited_for(
+    board: PumpBoardEmulator,
+) -> None:
     board.state._latch(OVER_PRESSURE)
     with pytest.raises(DeviceError, match=f"latched faults {OVER_PRESSURE:#x}.*--clear-faults"):
         await identified(board, options())
@@ -64,7 +73,9 @@ async def test_a_latched_board_is_refused_and_in_standby_waited_for(board: PumpB
     assert await identified(board, options()) == BoardAtStart()
 
 
-async def test_the_watchdogs_own_trip_is_cleared_only_if_the_resume_rule_names_it(board: PumpBoardEmulator) -> None:
+async def test_the_watchdogs_own_trip_is_cleared_only_if_the_resume_rule_names_it(
+    board: PumpBoardEmulator,
+) -> None:
     board.state._latch(WATCHDOG)
     with pytest.raises(DeviceError, match="latched"):
         await identified(board, options(), ("link_lost",))
@@ -74,30 +85,42 @@ async def test_the_watchdogs_own_trip_is_cleared_only_if_the_resume_rule_names_i
 
 
 @pytest.mark.parametrize("other", [OVER_PRESSURE, default_map().fault_mask("stopped")])
-async def test_the_watchdog_beside_another_fault_is_not_cleared(board: PumpBoardEmulator, other: int) -> None:
+async def test_the_watchdog_beside_another_fault_is_not_cleared(
+    board: PumpBoardEmulator, other: int
+) -> None:
     board.state._latch(WATCHDOG | other)
     with pytest.raises(DeviceError, match="latched"):
         await identified(board, options(), ("watchdog_tripped",))
 
 
-async def test_a_watchdog_that_stopped_a_venting_board_is_not_cleared(board: PumpBoardEmulator) -> None:
-    """The controller before this one was killed while it vented; the board leaves the vent as it was."""
+async def test_a_watchdog_that_stopped_a_venting_board_is_not_cleared(
+    board: PumpBoardEmulator,
+) -> None:
+    """The controller before this one was killed while it vented; the board leaves the vent as it
+    was.
+    """
     board.state._settable["vent_command_fraction"] = 1.0
     board.state._latch(WATCHDOG)
     with pytest.raises(DeviceError, match="latched"):
         await identified(board, options(), ("watchdog_tripped",))
 
 
-async def test_starts_that_clear_the_watchdog_use_up_the_number(board: PumpBoardEmulator, tmp_path: Path) -> None:
+async def test_starts_that_clear_the_watchdog_use_up_the_number(
+    board: PumpBoardEmulator, tmp_path: Path
+) -> None:
     for _ in range(2):
         board.state._latch(WATCHDOG)
-        assert (await identified(board, options(), ("watchdog_tripped",), ResumeLog(tmp_path))).cleared
+        assert (
+            await identified(board, options(), ("watchdog_tripped",), ResumeLog(tmp_path))
+        ).cleared
     board.state._latch(WATCHDOG)
     with pytest.raises(DeviceError, match="latched"):
         await identified(board, options(), ("watchdog_tripped",), ResumeLog(tmp_path))
 
 
-async def test_a_clearing_that_cannot_be_counted_is_not_done(board: PumpBoardEmulator, tmp_path: Path) -> None:
+async def test_a_clearing_that_cannot_be_counted_is_not_done(
+    board: PumpBoardEmulator, tmp_path: Path
+) -> None:
     board.state._latch(WATCHDOG)
     with pytest.raises(DeviceError, match="latched"):
         await identified(board, options(), ("watchdog_tripped",), ResumeLog(tmp_path / "nowhere"))
@@ -130,7 +153,9 @@ async def test_a_board_that_is_not_there_is_told_by_why_it_could_not_be_reached(
 
 
 @pytest.mark.parametrize("content", ["{", '{"schema": "another"}'])
-def test_a_latched_fault_keeps_the_next_hold_down_and_standby_waits(tmp_path: Path, content: str) -> None:
+def test_a_latched_fault_keeps_the_next_hold_down_and_standby_waits(
+    tmp_path: Path, content: str
+) -> None:
     (tmp_path / NAME).write_text(content)
     with pytest.raises(DeviceError, match=r"a fault is latched.*--clear-faults"):
         _latched(Config(), tmp_path, options())
@@ -151,11 +176,20 @@ class Door(Still):
 async def test_an_open_interlock_is_refused_and_in_standby_waited_for() -> None:
     emulator = PumpBoardEmulator(Door())
     await emulator.start()
-    devices = DevicesConfig.model_validate({"board": f"tcp://127.0.0.1:{emulator.port}", "interlocks": [DOOR]})
-    with pytest.raises(DeviceError, match=r"interlock door is open: shut the door; close it.*--standby"):
+    devices = DevicesConfig.model_validate(
+        {"board": f"tcp://127.0.0.1:{emulator.port}", "interlocks": [DOOR]}
+    )
+    with pytest.raises(
+        DeviceError, match=r"interlock door is open: shut the door; close it.*--standby"
+    ):
         await _identify(open_bench(devices), Config(devices=devices), options())
-    assert await _identify(open_bench(devices), Config(devices=devices), options(standby=True)) == BoardAtStart()
-    other = DevicesConfig.model_validate({**devices.model_dump(), "interlocks": [DOOR | {"input": 2}]})
+    assert (
+        await _identify(open_bench(devices), Config(devices=devices), options(standby=True))
+        == BoardAtStart()
+    )
+    other = DevicesConfig.model_validate(
+        {**devices.model_dump(), "interlocks": [DOOR | {"input": 2}]}
+    )
     assert await _identify(open_bench(other), Config(devices=other), options()) == BoardAtStart()
     await emulator.stop()
 
@@ -163,7 +197,9 @@ async def test_an_open_interlock_is_refused_and_in_standby_waited_for() -> None:
 async def test_an_input_of_a_board_of_an_earlier_map_is_refused() -> None:
     emulator = PumpBoardEmulator(Still(), registers=known_maps()[2])
     await emulator.start()
-    devices = DevicesConfig.model_validate({"board": f"tcp://127.0.0.1:{emulator.port}", "interlocks": [DOOR]})
+    devices = DevicesConfig.model_validate(
+        {"board": f"tcp://127.0.0.1:{emulator.port}", "interlocks": [DOOR]}
+    )
     with pytest.raises(FindingsError, match="register map 2"):
         await _identify(open_bench(devices), Config(devices=devices), options(standby=True))
     await emulator.stop()

@@ -1,4 +1,6 @@
-"""What `hold` and `twin play` report at their end: a fault first, then the figures, and a changed run folder."""
+"""What `hold` and `twin play` report at their end: a fault first, then the figures, and a changed
+run folder.
+"""
 
 from __future__ import annotations
 
@@ -20,14 +22,18 @@ def words(run_dir: Path, capsys: pytest.CaptureFixture[str]) -> str:
     return capsys.readouterr().err
 
 
-def test_a_folder_that_is_gone_is_not_offered(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_folder_that_is_gone_is_not_offered(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     said = words(tmp_path / "run", capsys)
     assert "removed or moved" in said
     assert "rerun" not in said
     assert "are readable" not in said
 
 
-def test_a_folder_begun_anew_says_from_when(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_folder_begun_anew_says_from_when(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     (tmp_path / "summary.json").write_text(json.dumps({"recorder": {"folder_anew_s": 13.44}}))
     assert "starts at 13.4 s" in words(tmp_path, capsys)
     (tmp_path / "summary.json").write_text(json.dumps({"recorder": {"folder_anew_s": None}}))
@@ -49,13 +55,26 @@ def test_only_a_recording_that_is_there_is_offered(
     assert "open it:    membrane-ctrl review last\n" in words(run_dir, capsys)
 
 
-FAULT = Fault(14, "laser_implausible", "the laser is wrong", "laser +9 µm", "limits.x", "hold_flow", False, "look")
+FAULT = Fault(
+    14,
+    "laser_implausible",
+    "the laser is wrong",
+    "laser +9 µm",
+    "limits.x",
+    "hold_flow",
+    False,
+    "look",
+)
 
 
 @pytest.mark.parametrize(
     ("exit_", "fault", "says"),
     [
-        (Exit.SAFETY_TRIP, FAULT, ["FAULT 14 laser_implausible: the laser is wrong", "laser +9 µm", "look"]),
+        (
+            Exit.SAFETY_TRIP,
+            FAULT,
+            ["FAULT 14 laser_implausible: the laser is wrong", "laser +9 µm", "look"],
+        ),
         (Exit.DEVICE_FAILED, FAULT, ["FAULT 14 laser_implausible", "laser +9 µm", "look"]),
         (Exit.DEVICE_FAILED, None, ["DEVICE FAILED", "to do: ", "supply"]),
         (Exit.SAFETY_TRIP, None, ["SAFETY TRIP", "to do: "]),
@@ -65,7 +84,11 @@ FAULT = Fault(14, "laser_implausible", "the laser is wrong", "laser +9 µm", "li
     ],
 )
 def test_a_run_that_ends_in_a_fault_says_so_first(
-    exit_: Exit, fault: Fault | None, says: list[str], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    exit_: Exit,
+    fault: Fault | None,
+    says: list[str],
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
 ) -> None:
     closing = Closing(exit_, fault, 205.5)
     (tmp_path / "summary.json").write_text(json.dumps({"recorder": {}, "missed_ticks": 3}))
@@ -78,7 +101,9 @@ def test_a_run_that_ends_in_a_fault_says_so_first(
     assert lines[count].startswith("missed ticks:")
 
 
-def test_a_fault_is_said_without_a_disk_and_beside_json(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_fault_is_said_without_a_disk_and_beside_json(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     for as_json in (False, True):
         report(tmp_path / "gone", as_json, Closing(Exit.SAFETY_TRIP, FAULT, 1.0))
         printed = capsys.readouterr()
@@ -96,7 +121,12 @@ def test_which_fault_stands() -> None:
     assert standing(FAULT) == FAULT
     assert standing(FAULT, StateEntered("fault", "hold", "latched")) == FAULT
     assert standing(FAULT, Cleared("laser_implausible")) is None
-    assert standing(FAULT, StateEntered("fault", "hold", "latched"), StateEntered("standby", "fault", "ack")) is None
+    assert (
+        standing(
+            FAULT, StateEntered("fault", "hold", "latched"), StateEntered("standby", "fault", "ack")
+        )
+        is None
+    )
     assert fault_of_end(FAULT, "safety_trip") == fault_of_end(FAULT, "device_failed") == FAULT
     assert fault_of_end(FAULT, None) == fault_of_end(FAULT, "crashed") == FAULT
     assert fault_of_end(FAULT, "done") is None
@@ -119,7 +149,8 @@ def test_exit_code_words_summary_and_catalogue_agree(
     happens, code, name = ENDS[what]
     scene = tmp_path / "scene.toml"
     scene.write_text(
-        'title = "x"\nduration_s = 60.0\n[config.loop]\nrate_hz = 10.0\n[config.twin]\nscenario = "calm"\n'
+        'title = "x"\nduration_s = 60.0\n[config.loop]\nrate_hz = '
+        '10.0\n[config.twin]\nscenario = "calm"\n'
         f"start_error_um = -5.0\n[config.states]\nactuator_test = false\n{happens}"
     )
     logs = tmp_path / "logs"

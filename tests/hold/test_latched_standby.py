@@ -12,8 +12,10 @@ from membrane_ctrl.sim.plant import Plant
 from membrane_ctrl.sim.virtual_bench import VirtualBench
 
 CONFIG = Config(
-    loop=LoopConfig(rate_hz=10.0), twin=TwinConfig(scenario="calm"), shape=ShapeConfig(enabled=False)
-)  # fmt: skip
+    loop=LoopConfig(rate_hz=10.0),
+    twin=TwinConfig(scenario="calm"),
+    shape=ShapeConfig(enabled=False),
+)
 
 
 def refusals(run: VirtualRun, *commands: Command) -> list[str]:

@@ -1,4 +1,6 @@
-"""The locks of a hold on disk: confirmed when synced, kept in memory when the disk is full, removed singly."""
+"""The locks of a hold on disk: confirmed when synced, kept in memory when the disk is full, removed
+singly.
+"""
 
 from __future__ import annotations
 
@@ -25,7 +27,9 @@ from membrane_ctrl.model.lock import Lock
 from membrane_ctrl.model.run_events import LockNotStored, LockStored
 
 DEVICES = frozenset({"10.0.0.5 port 502 unit 1"})
-SET = LockSet("bofak", "hands inside", "unix:ann", "unix:ann", "process 7", "2026-01-02T03:04:05+00:00", 3)
+SET = LockSet(
+    "bofak", "hands inside", "unix:ann", "unix:ann", "process 7", "2026-01-02T03:04:05+00:00", 3
+)
 REMOVED = LockRemoved("bofak", "hands inside", "unix:ann", SET.set_utc, "page:bob", "word", 4)
 BOARD = Config(devices=DevicesConfig(board="tcp://10.0.0.5:502"))
 
@@ -40,7 +44,9 @@ def outputs(*events: Event) -> TickOutputs:
 
 
 @contextmanager
-def keeper(folder: Path, told: list[Event], asked: list[Command] | None = None) -> Iterator[LockKeeper]:
+def keeper(
+    folder: Path, told: list[Event], asked: list[Command] | None = None
+) -> Iterator[LockKeeper]:
     store = LockStore([folder])
     storage = LockStorage(store, DEVICES, tuple(store.find_locks(DEVICES)))
     with LockKeeper(storage, told.append, [].append if asked is None else asked.append) as made:
@@ -57,7 +63,9 @@ def words(folder: Path) -> list[str]:
     return [each.lock.word for each in LockStore([folder]).find_locks()]
 
 
-def test_a_lock_is_on_the_disk_when_its_outcome_is_there_and_a_removal_likewise(tmp_path: Path) -> None:
+def test_a_lock_is_on_the_disk_when_its_outcome_is_there_and_a_removal_likewise(
+    tmp_path: Path,
+) -> None:
     with keeper(tmp_path, []) as kept:
         kept.heard(outputs(SET))
         assert outcome(kept, 3) == ""
@@ -69,7 +77,9 @@ def test_a_lock_is_on_the_disk_when_its_outcome_is_there_and_a_removal_likewise(
     assert words(tmp_path) == []
 
 
-def test_a_lock_of_an_earlier_run_is_not_stored_twice_and_is_removed_from_its_file(tmp_path: Path) -> None:
+def test_a_lock_of_an_earlier_run_is_not_stored_twice_and_is_removed_from_its_file(
+    tmp_path: Path,
+) -> None:
     LockStore([tmp_path]).write_lock(Lock("bofak", "hands inside", "unix:ann"), DEVICES)
     at_start = LockSet("bofak", "hands inside", "unix:ann", "", "", "", 0)
     with keeper(tmp_path, []) as kept:
@@ -122,7 +132,9 @@ def test_a_lock_that_was_removed_before_there_was_room_is_not_stored_later(
     assert words(tmp_path) == []
 
 
-def test_a_removal_that_fails_is_tried_again_at_the_end(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_removal_that_fails_is_tried_again_at_the_end(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     with keeper(tmp_path, []) as kept:
         kept.heard(outputs(SET))
         assert outcome(kept, 3) == ""
@@ -144,7 +156,9 @@ def test_a_lock_that_another_program_stores_becomes_a_command_once(
     with keeper(tmp_path, [], asked) as kept:
         kept.heard(outputs(SET))
         assert outcome(kept, 3) == ""
-        other.write_lock(Lock("gumil", "on another bench", "unix:bob"), {"10.0.0.6 port 502 unit 1"})
+        other.write_lock(
+            Lock("gumil", "on another bench", "unix:bob"), {"10.0.0.6 port 502 unit 1"}
+        )
         (tmp_path / "damaged.json").write_text("{")
         other.write_lock(Lock("bofak", "made safe by hand", "unix:bob"), DEVICES)
         until(lambda: kept.heard(outputs()), lambda: bool(asked))
@@ -172,13 +186,17 @@ def test_the_twin_stores_nothing() -> None:
 
 def options(config: Config, **changes: Any) -> HoldOptions:
     given = {"twin": False, "clear_faults": False, "standby": False, "logs_dir": None} | changes
-    return HoldOptions(config=config, source="lab.toml", duration_s=None, name="hold", json=False, **given)
+    return HoldOptions(
+        config=config, source="lab.toml", duration_s=None, name="hold", json=False, **given
+    )
 
 
 @pytest.mark.parametrize("changes", [{}, {"clear_faults": True}, {"logs_dir": Path("elsewhere")}])
 def test_a_hold_does_not_start_on_a_locked_device(changes: dict[str, Any]) -> None:
     assert _find_locks(BOARD, options(BOARD, **changes)) is not None
-    LockStore.of_machine().write_lock(Lock("bofak", "hands inside", "unix:ann"), device_keys(BOARD.devices or no()))
+    LockStore.of_machine().write_lock(
+        Lock("bofak", "hands inside", "unix:ann"), device_keys(BOARD.devices or no())
+    )
     with pytest.raises(DeviceError, match="hands inside"):
         _find_locks(BOARD, options(BOARD, **changes))
     other = Config(devices=DevicesConfig(board="tcp://10.0.0.6:502"))
@@ -190,7 +208,9 @@ def no() -> DevicesConfig:
 
 
 def test_in_standby_it_starts_with_the_locks() -> None:
-    LockStore.of_machine().write_lock(Lock("bofak", "hands inside", "unix:ann"), device_keys(BOARD.devices or no()))
+    LockStore.of_machine().write_lock(
+        Lock("bofak", "hands inside", "unix:ann"), device_keys(BOARD.devices or no())
+    )
     storage = _find_locks(BOARD, options(BOARD, standby=True))
     assert storage is not None
     assert [each.lock.word for each in storage.locks] == ["bofak"]

@@ -1,4 +1,6 @@
-"""A hold with `[web]`: the page is a program beside it, and nothing that becomes of it reaches the hold."""
+"""A hold with `[web]`: the page is a program beside it, and nothing that becomes of it reaches the
+hold.
+"""
 
 from __future__ import annotations
 
@@ -21,7 +23,10 @@ from membrane_ctrl.model.errors import Exit, InputError
 from membrane_ctrl.processes.child import Program
 from tests.web.test_page import free_port
 
-WAITS = "from membrane_ctrl.processes.child import end_with_parent; end_with_parent(); import time; time.sleep(60)"
+WAITS = (
+    "from membrane_ctrl.processes.child import end_with_parent; end_with_parent(); import time; "
+    "time.sleep(60)"
+)
 
 
 def test_it_gets_what_the_settings_say(tmp_path: Path) -> None:
@@ -35,10 +40,15 @@ def test_it_gets_what_the_settings_say(tmp_path: Path) -> None:
     pairs = dict(zip(words[2::2], words[3::2], strict=True))
     assert words[:2] == ["web", "--with-hold"]
     assert pairs == {
-        "--logs": str(tmp_path / "logs"), "--socket": str(tmp_path / "a.sock"), "--host": "0.0.0.0",
-        "--port": "7481", "--users": str(tmp_path / "users"), "--certificate": str(tmp_path / "bench.pem"),
-        "--key": str(tmp_path / "bench.key"), "--name": "bench.lab",
-    }  # fmt: skip
+        "--logs": str(tmp_path / "logs"),
+        "--socket": str(tmp_path / "a.sock"),
+        "--host": "0.0.0.0",
+        "--port": "7481",
+        "--users": str(tmp_path / "users"),
+        "--certificate": str(tmp_path / "bench.pem"),
+        "--key": str(tmp_path / "bench.key"),
+        "--name": "bench.lab",
+    }
 
 
 @pytest.mark.parametrize(
@@ -59,7 +69,14 @@ def test_without_its_library_no_hold_begins(
 ) -> None:
     monkeypatch.setattr("importlib.util.find_spec", lambda name: None)
     (tmp_path / "lab.toml").write_text("[web]\n")
-    words = ["hold", "--twin", "--config", str(tmp_path / "lab.toml"), "--logs", str(tmp_path / "logs")]
+    words = [
+        "hold",
+        "--twin",
+        "--config",
+        str(tmp_path / "lab.toml"),
+        "--logs",
+        str(tmp_path / "logs"),
+    ]
     assert run(words) == Exit.BAD_INPUT
     assert "[web] needs NiceGUI: pip install 'membrane-ctrl[web]'" in capsys.readouterr().err
     assert not (tmp_path / "logs").exists()
@@ -72,7 +89,9 @@ def test_it_ends_when_its_parent_has_died() -> None:
         assert page.wait(30.0) == -signal.SIGTERM
 
 
-def test_a_program_that_cannot_start_has_ended(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_program_that_cannot_start_has_ended(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     def refuse(*_: object, **__: object) -> None:
         raise OSError("no more processes")
 
@@ -95,10 +114,21 @@ def until(found: Callable[[], object]) -> None:
 @pytest.mark.real_time
 def test_a_hold_outlives_its_page(tmp_path: Path) -> None:
     (tmp_path / "lab.toml").write_text(
-        f"[twin]\nport = 0\nscenario = 'quiet'\n[shape]\nenabled = false\n[web]\nport = {free_port()}\n"
+        "[twin]\nport = 0\nscenario = 'quiet'\n[shape]\nenabled = false\n[web]\nport = "
+        f"{free_port()}\n"
     )
-    words = ["--twin", "--config", str(tmp_path / "lab.toml"), "--logs", str(tmp_path), "--duration", "45s"]
-    env = {name: value for name, value in os.environ.items() if name != "PYTEST_CURRENT_TEST"}  # NiceGUI looks for it
+    words = [
+        "--twin",
+        "--config",
+        str(tmp_path / "lab.toml"),
+        "--logs",
+        str(tmp_path),
+        "--duration",
+        "45s",
+    ]
+    env = {
+        name: value for name, value in os.environ.items() if name != "PYTEST_CURRENT_TEST"
+    }  # NiceGUI looks for it
     program = [sys.executable, "-m", "membrane_ctrl", "hold", *words]
     hold = subprocess.Popen(program, stderr=subprocess.DEVNULL, env=env)
 
@@ -107,7 +137,11 @@ def test_a_hold_outlives_its_page(tmp_path: Path) -> None:
 
     def links() -> list[str]:
         file = log()
-        return [] if file is None else [line for line in file.read_text().splitlines() if "open http" in line]
+        return (
+            []
+            if file is None
+            else [line for line in file.read_text().splitlines() if "open http" in line]
+        )
 
     try:
         until(lambda: len(links()) == 1)

@@ -55,7 +55,9 @@ def test_a_played_scenario_is_a_run_for_every_reader(
     run = open_run(folder)
     run.look_through()
     assert run.notes == []
-    assert run.config.recording == RecordingConfig()  # a file decides neither where runs are nor which are deleted
+    assert (
+        run.config.recording == RecordingConfig()
+    )  # a file decides neither where runs are nor which are deleted
     assert not Path("elsewhere").exists()
     rows = run.ticks()
     assert rows.num_rows == run.summary["ticks"]  # type: ignore[index]
@@ -63,7 +65,10 @@ def test_a_played_scenario_is_a_run_for_every_reader(
     kinds = [event["kind"] for event in run.events]
     assert (kinds[0], kinds[-1]) == ("start", "end")
     (fault,) = (event for event in run.events if event["kind"] == "fault")
-    assert (fault["name"], fault["mono_s"]) == ("displacement_missing", pytest.approx(22.3, abs=0.3))
+    assert (fault["name"], fault["mono_s"]) == (
+        "displacement_missing",
+        pytest.approx(22.3, abs=0.3),
+    )
     assert any(event["kind"] == "mark" and event["text"] == "light again" for event in run.events)
     assert len(run.shapes().time_s) >= 10
     assert run.summary["exit"] == "done"  # type: ignore[index]
@@ -71,11 +76,16 @@ def test_a_played_scenario_is_a_run_for_every_reader(
     assert "identical" in capsys.readouterr().out
 
 
-def test_names_come_with_titles_and_a_dash_is_as_good_as_an_underscore(capsys: pytest.CaptureFixture[str]) -> None:
+def test_names_come_with_titles_and_a_dash_is_as_good_as_an_underscore(
+    capsys: pytest.CaptureFixture[str],
+) -> None:
     assert cli.run(["twin", "play"]) == Exit.DONE
     lines = capsys.readouterr().out.splitlines()
     assert [line.split()[0] for line in lines] == [path.stem for path in shipped()]
-    assert all(load_scenario(path, Scenario).title in line for path, line in zip(shipped(), lines, strict=True))
+    assert all(
+        load_scenario(path, Scenario).title in line
+        for path, line in zip(shipped(), lines, strict=True)
+    )
     assert find_scenario("calm-night") == find_scenario("calm_night")
     assert cli.run(["twin", "play", "bright_day"]) == Exit.BAD_INPUT
     assert "bright_day: no such scenario" in capsys.readouterr().err
@@ -84,14 +94,17 @@ def test_names_come_with_titles_and_a_dash_is_as_good_as_an_underscore(capsys: p
 def test_a_file_cannot_ask_for_more_than_fits_in_memory(tmp_path: Path) -> None:
     path = tmp_path / "many.toml"
     path.write_text(
-        'title = "x"\nduration_s = 1e7\n[[at]]\ntime_s = 0.0\nwrong = "silent"\nfor_s = 1e-4\nevery_s = 1e-3\n'
+        'title = "x"\nduration_s = 1e7\n[[at]]\ntime_s = 0.0\nwrong = "silent"\nfor_s = '
+        "1e-4\nevery_s = 1e-3\n"
     )
     with pytest.raises(InputError, match=r"at\.0: every_s"):
         load_scenario(path, Scenario)
 
 
 def short_run() -> ScenarioRun:
-    return ScenarioRun(Scenario.model_validate({"title": "x", "config": {"loop": {"rate_hz": 10.0}}}))
+    return ScenarioRun(
+        Scenario.model_validate({"title": "x", "config": {"loop": {"rate_hz": 10.0}}})
+    )
 
 
 def test_a_stopped_run_ends_in_the_safe_state() -> None:

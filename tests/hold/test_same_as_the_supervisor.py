@@ -28,7 +28,8 @@ from membrane_ctrl.sim.virtual_bench import VirtualBench
 from tests.support.loop_bench import LoopBench
 from tests.support.virtual_time import run_virtual as in_virtual_time
 
-# a power of two, so that the supervisor's sum of periods is exact and both tick at the same instants to the bit
+# a power of two, so that the supervisor's sum of periods is exact and both tick at the same
+# instants to the bit
 RATE_HZ = 32.0
 CONFIG = Config(loop=LoopConfig(rate_hz=RATE_HZ), twin=TwinConfig(seed=11))
 LASTS_S = 60.0
@@ -73,7 +74,11 @@ class UpsetBench(LoopBench):
     def __init__(self, upset: Upset, shapes: RingWriter) -> None:
         super().__init__(CONFIG)
         self._upset, self._upset_s = upset, 0.0
-        self._shapes, self._shape, self._shape_due_s = shapes, TruthShape(self.virtual, CONFIG, 5), 0.0
+        self._shapes, self._shape, self._shape_due_s = (
+            shapes,
+            TruthShape(self.virtual, CONFIG, 5),
+            0.0,
+        )
 
     def before(self, now_s: float) -> None:
         upset_between(self.virtual, self._upset, self._upset_s, now_s)
@@ -103,7 +108,12 @@ def supervised(upset: Upset) -> tuple[list[TickOutputs], Exit]:
                 stack.callback(end.close)
             bench = UpsetBench(upset, shapes)
             wiring = Wiring(
-                bench, telemetry, events, shapes=newest_of(reader), truth=bench.truth, heard={"test": heard.append}
+                bench,
+                telemetry,
+                events,
+                shapes=newest_of(reader),
+                truth=bench.truth,
+                heard={"test": heard.append},
             )
             controller = Controller(CONFIG, zernike_projection())
             await bench.open()

@@ -15,7 +15,9 @@ FOLDER = Path(__file__).parents[1] / "scenarios"
 LONGEST_S = 1000.0
 
 
-@pytest.mark.parametrize("path", [*shipped(), *sorted(FOLDER.glob("*.toml"))], ids=lambda path: path.stem)
+@pytest.mark.parametrize(
+    "path", [*shipped(), *sorted(FOLDER.glob("*.toml"))], ids=lambda path: path.stem
+)
 def test_scenario(path: Path) -> None:
     whole = load_scenario(path, CheckedScenario)
     kept = tuple(at for at in whole.at if at.time_s < LONGEST_S)
@@ -32,11 +34,23 @@ GOOD = 'title = "x"\nduration_s = 20.0\n[config.loop]\nrate_hz = 10.0\n'
     ("text", "words"),
     [
         ('[[at]]\ntime_s = 1.0\nwrong = "gremlins"\n[expect]\n', ["at.0", "gremlins", "no_light"]),
-        ('[[at]]\ntime_s = 1.0\nwrong = "pump_share"\nvalue = 1.5\n[expect]\n', ["at.0", "pump_share", "0 to 1"]),
-        ('[[at]]\ntime_s = 1.0\nwrong = "silent"\ncommand = "stop"\n[expect]\n', ["at.0", "exactly one"]),
+        (
+            '[[at]]\ntime_s = 1.0\nwrong = "pump_share"\nvalue = 1.5\n[expect]\n',
+            ["at.0", "pump_share", "0 to 1"],
+        ),
+        (
+            '[[at]]\ntime_s = 1.0\nwrong = "silent"\ncommand = "stop"\n[expect]\n',
+            ["at.0", "exactly one"],
+        ),
         ('[[at]]\ntime_s = 1.0\ncommand = "explode"\n[expect]\n', ["at.0", "explode", "lower"]),
-        ('[[at]]\ntime_s = 1.0\nevent = "laser_dropout"\nfor_s = 9.0\n[expect]\n', ["at.0", "for_s", "over_s"]),
-        ('[[at]]\ntime_s = 1.0\nwrong = "silent"\nover_s = 9.0\n[expect]\n', ["at.0", "over_s", "for_s"]),
+        (
+            '[[at]]\ntime_s = 1.0\nevent = "laser_dropout"\nfor_s = 9.0\n[expect]\n',
+            ["at.0", "for_s", "over_s"],
+        ),
+        (
+            '[[at]]\ntime_s = 1.0\nwrong = "silent"\nover_s = 9.0\n[expect]\n',
+            ["at.0", "over_s", "for_s"],
+        ),
         ('[[at]]\ntime_s = 20.0\nwrong = "silent"\n[expect]\n', ["at.0", "20", "duration_s"]),
         ('[[expect.bounds]]\nfield = "height"\nlow = 1.0\n', ["expect.bounds.0", "height"]),
         ('[[expect.bounds]]\nfield = "trim_um"\n', ["expect.bounds.0", "low, high"]),
@@ -63,7 +77,10 @@ def test_what_does_not_come_is_complained_of(tmp_path: Path) -> None:
     path.write_text(GOOD + expect + 'shape_reasons = ["bored"]\n' + bounds)
     scenario = load_scenario(path, CheckedScenario)
     found = "\n".join(failures(scenario.expect, play(scenario)))
-    assert all(word in found for word in ("exit", "states", "faults", "party", "bored", "truth_displacement_um"))
+    assert all(
+        word in found
+        for word in ("exit", "states", "faults", "party", "bored", "truth_displacement_um")
+    )
 
 
 def test_a_process_that_never_runs_is_complained_of(tmp_path: Path) -> None:

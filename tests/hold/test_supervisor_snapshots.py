@@ -1,4 +1,6 @@
-"""The supervisor takes a snapshot of the controller now and then, and a replay can begin with it."""
+"""The supervisor takes a snapshot of the controller now and then,
+and a replay can begin with it.
+"""
 
 from __future__ import annotations
 
@@ -66,7 +68,9 @@ async def test_the_snapshot_is_the_one_before_its_tick(monkeypatch: pytest.Monke
         for end in (*writers.values(), inputs, snapshots):
             stack.callback(end.close)
         controller = Controller(CONFIG, zernike_projection())
-        supervisor = Supervisor(controller, Wiring(bench=PromptBench(), **writers), RunClock.start(), 50.0)
+        supervisor = Supervisor(
+            controller, Wiring(bench=PromptBench(), **writers), RunClock.start(), 50.0
+        )
         assert await supervisor.run(0.4) == Exit.DONE
         assembler = TickAssembler()
         assembler.add_snapshots(snapshots.drain())
@@ -83,8 +87,12 @@ def test_an_event_that_is_too_long_for_its_slot_is_cut() -> None:
         for end in (writer, reader):
             stack.callback(end.close)
         wiring = Wiring(bench=PromptBench(), telemetry=writer, events=writer)
-        supervisor = Supervisor(Controller(CONFIG, zernike_projection()), wiring, RunClock.start(), 50.0)
-        texts = dict.fromkeys(("cause", "seen", "limit", "remedy"), "\N{LOUDLY CRYING FACE}" * 10_000)
+        supervisor = Supervisor(
+            Controller(CONFIG, zernike_projection()), wiring, RunClock.start(), 50.0
+        )
+        texts = dict.fromkeys(
+            ("cause", "seen", "limit", "remedy"), "\N{LOUDLY CRYING FACE}" * 10_000
+        )
         supervisor.tell(from_dict({"kind": "fault", "name": "tick_error", **texts}))
         (told,) = reader.drain()
     assert json.loads(told)["name"] == "tick_error"
@@ -92,7 +100,9 @@ def test_an_event_that_is_too_long_for_its_slot_is_cut() -> None:
 
 async def test_a_shape_that_cannot_be_read_is_told_once_and_the_hold_goes_on() -> None:
     with ExitStack() as stack:
-        addresses = {name: stack.enter_context(ring(64, 4096)) for name in ("telemetry", "events", "shapes")}
+        addresses = {
+            name: stack.enter_context(ring(64, 4096)) for name in ("telemetry", "events", "shapes")
+        }
         writers = {name: RingWriter(address) for name, address in addresses.items()}
         shapes, events = RingReader(addresses["shapes"]), RingReader(addresses["events"])
         for end in (*writers.values(), shapes, events):
@@ -102,9 +112,23 @@ async def test_a_shape_that_cannot_be_read_is_told_once_and_the_hold_goes_on() -
             writers["shapes"].put(b"{}\nno shape")
             return 0.0, 0.0
 
-        wiring = Wiring(PromptBench(), writers["telemetry"], writers["events"], shapes=newest_of(shapes), truth=truth)
-        supervisor = Supervisor(Controller(CONFIG, zernike_projection()), wiring, RunClock.start(), 50.0)
+        wiring = Wiring(
+            PromptBench(),
+            writers["telemetry"],
+            writers["events"],
+            shapes=newest_of(shapes),
+            truth=truth,
+        )
+        supervisor = Supervisor(
+            Controller(CONFIG, zernike_projection()), wiring, RunClock.start(), 50.0
+        )
         assert await supervisor.run(0.2) == Exit.DONE
-        told = [event for event in map(json.loads, events.drain()) if event["kind"] == "shape_unreadable"]
+        told = [
+            event
+            for event in map(json.loads, events.drain())
+            if event["kind"] == "shape_unreadable"
+        ]
     assert supervisor.ticks > 3
-    assert [event["message"] for event in told] == ["shape estimate: missing or unknown fields in the first line"]
+    assert [event["message"] for event in told] == [
+        "shape estimate: missing or unknown fields in the first line"
+    ]

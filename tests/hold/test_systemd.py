@@ -24,7 +24,9 @@ ROW = TelemetryRow(**dict.fromkeys(FIELDS, 0.0))
 UNIT = Path(__file__).parents[2] / "membrane_ctrl" / "examples" / "membrane-ctrl.service"
 
 
-def outputs(mono_s: float, state: State, error_um: float = math.nan, fault: float = 0) -> TickOutputs:
+def outputs(
+    mono_s: float, state: State, error_um: float = math.nan, fault: float = 0
+) -> TickOutputs:
     row = replace(ROW, mono_s=mono_s, state=state, error_um=error_um, fault=fault)
     return TickOutputs(BenchCommand(0.0, 0.0), row, (), None)
 
@@ -46,7 +48,9 @@ def said(heard: socket.socket) -> list[list[str]]:
             return found
 
 
-def test_ready_once_then_the_watchdog_twice_a_second_and_at_each_change(systemd: socket.socket) -> None:
+def test_ready_once_then_the_watchdog_twice_a_second_and_at_each_change(
+    systemd: socket.socket,
+) -> None:
     with SystemdNotify() as notify:
         for tick in range(101):
             notify.heard(outputs(tick * 0.02, State.CHECK))
@@ -62,11 +66,23 @@ def test_ready_once_then_the_watchdog_twice_a_second_and_at_each_change(systemd:
     ]
 
 
-def test_trouble_with_the_recording_is_in_the_status_until_it_is_over(systemd: socket.socket) -> None:
+def test_trouble_with_the_recording_is_in_the_status_until_it_is_over(
+    systemd: socket.socket,
+) -> None:
     with SystemdNotify() as notify:
-        notify.told(from_dict({"kind": "disk_low", "what": "disk", "message": "/srv/\udcff: less than 500 MB\nfree"}))
+        notify.told(
+            from_dict(
+                {
+                    "kind": "disk_low",
+                    "what": "disk",
+                    "message": "/srv/\udcff: less than 500 MB\nfree",
+                }
+            )
+        )
         notify.heard(outputs(0.0, State.HOLD, fault=20))
-        notify.told(from_dict({"kind": "recorder_recovered", "what": "disk", "message": "disk works again"}))
+        notify.told(
+            from_dict({"kind": "recorder_recovered", "what": "disk", "message": "disk works again"})
+        )
         notify.heard(outputs(1.0, State.HOLD))
     messages = said(systemd)
     assert messages[0][1:] == [
@@ -99,7 +115,8 @@ def test_the_unit_stops_what_it_must_and_never_restarts_into_a_fault() -> None:
     unit.read(UNIT)
     service = unit["Service"]
     assert service["Type"] == "notify"
-    # the children ignore what a terminal sends, and so outlive the control process to close the run and tell people
+    # the children ignore what a terminal sends, and so outlive the control process to close the run
+    # and tell people
     assert (service["KillMode"], service["KillSignal"], service["WatchdogSignal"]) == (
         "control-group",
         "SIGINT",
@@ -114,9 +131,16 @@ def test_the_unit_stops_what_it_must_and_never_restarts_into_a_fault() -> None:
 def test_the_unit_file_is_one_that_systemd_takes_and_calls_protected(tmp_path: Path) -> None:
     example = Path(__file__).parents[2] / "membrane_ctrl" / "examples" / "membrane-ctrl.service"
     unit = tmp_path / example.name
-    unit.write_text(example.read_text().replace("/opt/membrane-ctrl/.venv/bin/membrane-ctrl", sys.executable))
-    for words in (["verify", str(unit)], ["security", "--offline=true", "--threshold=40", str(unit)]):
-        done = subprocess.run(["systemd-analyze", *words], capture_output=True, text=True, timeout=60, check=False)
+    unit.write_text(
+        example.read_text().replace("/opt/membrane-ctrl/.venv/bin/membrane-ctrl", sys.executable)
+    )
+    for words in (
+        ["verify", str(unit)],
+        ["security", "--offline=true", "--threshold=40", str(unit)],
+    ):
+        done = subprocess.run(
+            ["systemd-analyze", *words], capture_output=True, text=True, timeout=60, check=False
+        )
         assert done.returncode == 0, done.stdout + done.stderr
         assert str(unit) not in done.stderr  # a complaint names the file
         assert unit.name + ":" not in done.stderr

@@ -47,7 +47,9 @@ class Story:
 
 
 def intrude(bench: VirtualBench, pump_fraction: float) -> str:
-    """Another program claims the board, clears its faults and pumps; returns the refusal, or nothing."""
+    """Another program claims the board, clears its faults and pumps; returns the refusal, or
+    nothing.
+    """
     other = PumpBoard("", watchdog_s=10.0, link=MemoryLink(bench))
     try:
         at_once(other.open())
@@ -80,7 +82,9 @@ def test_a_hold_that_lost_its_board_sees_it_in_its_next_tick_and_never_takes_it_
     (first,) = story.go_on(0.1)
     assert faults([first]) == ["board_taken"]
     assert first.outputs.command.pump_fraction == 0.0
-    assert story.bench.board.pump_fraction == 0.2  # the other program's, which is responsible for it
+    assert (
+        story.bench.board.pump_fraction == 0.2
+    )  # the other program's, which is responsible for it
     later = story.go_on(5.0)
     assert {tick.outputs.command.pump_fraction for tick in later} == {0.0}
     story.stall(11.0)  # also the other one's claim lapses

@@ -1,4 +1,6 @@
-"""Every incident of this folder through today's control code (`membrane-ctrl replay RUN --to-test NAME`)."""
+"""Every incident of this folder through today's control code (`membrane-ctrl replay RUN --to-test
+NAME`).
+"""
 
 from __future__ import annotations
 

@@ -35,7 +35,9 @@ def device(tmp_path: Path) -> str:
 def other(device: str) -> Iterator[subprocess.Popen[str]]:
     """Another process that has the device."""
     words = [sys.executable, "-c", HOLDS, device, "--config", "\x1b[2Jlab.toml"]
-    with subprocess.Popen(words, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True) as process:
+    with subprocess.Popen(
+        words, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True
+    ) as process:
         assert process.stdout is not None
         assert process.stdout.readline() == "held\n"
         yield process
@@ -48,7 +50,9 @@ def refused(device: str) -> str:
     return str(caught.value)
 
 
-def test_another_process_is_named_with_its_number_and_words(device: str, other: subprocess.Popen[str]) -> None:
+def test_another_process_is_named_with_its_number_and_words(
+    device: str, other: subprocess.Popen[str]
+) -> None:
     said = refused(device)
     assert said.startswith(f"{device}: in use by process {other.pid} (")
     assert "stop that first" in said
@@ -78,7 +82,10 @@ def test_it_is_given_back_and_may_be_had_again(device: str) -> None:
 
 def test_of_several_devices_none_is_kept_when_one_is_refused(device: str) -> None:
     with locked([f"{device} b"]):
-        with pytest.raises(DeviceError, match=" b: in use"), locked([f"{device} a", f"{device} b", f"{device} c"]):
+        with (
+            pytest.raises(DeviceError, match=" b: in use"),
+            locked([f"{device} a", f"{device} b", f"{device} c"]),
+        ):
             pass
         with locked([f"{device} a", f"{device} c"]):
             pass
@@ -92,9 +99,15 @@ def test_many_that_are_refused_do_not_wait(device: str, other: subprocess.Popen[
 
 @pytest.mark.parametrize(
     "url",
-    ["tcp://127.0.0.1:1502", "tcp://LOCALHOST:1502", "tcp://[::1]:1502", "tcp://127.0.0.7:1502", "tcp://0.0.0.0:1502",
-     "tcp://[::ffff:127.0.0.1]:1502"],
-)  # fmt: skip
+    [
+        "tcp://127.0.0.1:1502",
+        "tcp://LOCALHOST:1502",
+        "tcp://[::1]:1502",
+        "tcp://127.0.0.7:1502",
+        "tcp://0.0.0.0:1502",
+        "tcp://[::ffff:127.0.0.1]:1502",
+    ],
+)
 def test_all_names_of_this_machine_are_one(url: str) -> None:
     assert modbus_names(url, 1) == {"localhost port 1502 unit 1"}
 
@@ -103,11 +116,17 @@ def test_a_name_is_locked_by_its_addresses(monkeypatch: pytest.MonkeyPatch) -> N
     def addresses(host: str, *_: object, **__: object) -> list[tuple[object, ...]]:
         if host == "unknown.lab":
             raise socket.gaierror(-2, "Name or service not known")
-        found = {"board.lab": ["192.0.2.7"], "old-name.lab": ["192.0.2.7", "2001:db8::7"], "192.0.2.7": ["192.0.2.7"]}
+        found = {
+            "board.lab": ["192.0.2.7"],
+            "old-name.lab": ["192.0.2.7", "2001:db8::7"],
+            "192.0.2.7": ["192.0.2.7"],
+        }
         return [(0, 0, 0, "", (address, 0)) for address in found[host]]
 
     monkeypatch.setattr(socket, "getaddrinfo", addresses)
-    names = [modbus_names(f"tcp://{host}", 1) for host in ("board.lab", "old-name.lab", "192.0.2.7")]
+    names = [
+        modbus_names(f"tcp://{host}", 1) for host in ("board.lab", "old-name.lab", "192.0.2.7")
+    ]
     assert set.intersection(*names) == {"192.0.2.7 port 502 unit 1"}
     assert modbus_names("tcp://Unknown.lab:502", 1) == {"unknown.lab port 502 unit 1"}
 
@@ -122,11 +141,18 @@ def test_a_serial_line_is_what_its_links_lead_to(tmp_path: Path) -> None:
     line, by_id = tmp_path / "ttyUSB0", tmp_path / "usb-FTDI"
     line.touch()
     by_id.symlink_to(line)
-    assert modbus_names(f"rtu://{line}?baud=115200", 1) == modbus_names(f"rtu://{by_id}?baud=9600&parity=E", 2)
+    assert modbus_names(f"rtu://{line}?baud=115200", 1) == modbus_names(
+        f"rtu://{by_id}?baud=9600&parity=E", 2
+    )
 
 
 def test_a_composed_bench_has_all_its_devices(tmp_path: Path) -> None:
-    analog = {"driver": "modbus_map", "link": "tcp://127.0.0.1:1502", "address": 0, "value": [0.0, 1.0]}
+    analog = {
+        "driver": "modbus_map",
+        "link": "tcp://127.0.0.1:1502",
+        "address": 0,
+        "value": [0.0, 1.0],
+    }
     devices = DevicesConfig.model_validate(
         {
             "displacement": {"driver": "optoncdt1420", "port": f"{tmp_path}/laser"},

@@ -11,11 +11,19 @@ import pytest
 
 from membrane_ctrl.config.schema import DevicesConfig
 from membrane_ctrl.instruments import lock_store
-from membrane_ctrl.instruments.lock_store import LockStore, StoredLock, device_keys, modbus_keys, require_unlocked
+from membrane_ctrl.instruments.lock_store import (
+    LockStore,
+    StoredLock,
+    device_keys,
+    modbus_keys,
+    require_unlocked,
+)
 from membrane_ctrl.model.errors import DeviceError
 from membrane_ctrl.model.lock import Lock
 
-ANN = Lock("bofak", "hands inside", "unix:ann", "unix:ann", "process 7", "2026-01-02T03:04:05+00:00")
+ANN = Lock(
+    "bofak", "hands inside", "unix:ann", "unix:ann", "process 7", "2026-01-02T03:04:05+00:00"
+)
 BOB = Lock("gumil", "lens off", "page:bob", "page:bob", "page 1f", "2026-01-02T03:05:05+00:00")
 BENCH, OTHER = {"10.0.0.5 port 502 unit 1"}, {"10.0.0.6 port 502 unit 1"}
 
@@ -62,15 +70,27 @@ def test_without_a_folder_nothing_is_locked(store: LockStore) -> None:
 @pytest.mark.parametrize(
     "content",
     [
-        b"", b"{", b"[]", b"null", b"\xff", b"[" * 5000, b" " * 20_000,
+        b"",
+        b"{",
+        b"[]",
+        b"null",
+        b"\xff",
+        b"[" * 5000,
+        b" " * 20_000,
         json.dumps({"schema": "other", "devices": ["x"], **asdict(ANN)}).encode(),
         json.dumps({"schema": lock_store.SCHEMA, "devices": [], **asdict(ANN)}).encode(),
-        json.dumps({"schema": lock_store.SCHEMA, "devices": ["x"], **asdict(ANN), "word": ""}).encode(),
-        json.dumps({"schema": lock_store.SCHEMA, "devices": ["x"], **asdict(ANN), "text": 3}).encode(),
+        json.dumps(
+            {"schema": lock_store.SCHEMA, "devices": ["x"], **asdict(ANN), "word": ""}
+        ).encode(),
+        json.dumps(
+            {"schema": lock_store.SCHEMA, "devices": ["x"], **asdict(ANN), "text": 3}
+        ).encode(),
         json.dumps({"schema": lock_store.SCHEMA, "devices": ["x"], "word": "bofak"}).encode(),
     ],
-)  # fmt: skip
-def test_a_damaged_file_locks_every_device_and_can_be_removed_by_its_word(store: LockStore, content: bytes) -> None:
+)
+def test_a_damaged_file_locks_every_device_and_can_be_removed_by_its_word(
+    store: LockStore, content: bytes
+) -> None:
     file = store.write_lock(ANN, BENCH)
     file.write_bytes(content)
     (lock,) = found(store, OTHER)
@@ -113,7 +133,9 @@ def test_a_folder_from_which_anybody_may_remove_locks_locks(store: LockStore, fo
     assert found(store, BENCH) == [ANN]
 
 
-def test_a_dangling_link_or_a_file_in_the_folders_place_locks(folder: Path, store: LockStore) -> None:
+def test_a_dangling_link_or_a_file_in_the_folders_place_locks(
+    folder: Path, store: LockStore
+) -> None:
     folder.parent.mkdir()
     folder.symlink_to(folder.parent / "nowhere")
     assert found(store)
@@ -122,7 +144,9 @@ def test_a_dangling_link_or_a_file_in_the_folders_place_locks(folder: Path, stor
     assert found(store)
 
 
-def test_a_folder_of_a_stranger_locks(store: LockStore, monkeypatch: pytest.MonkeyPatch, folder: Path) -> None:
+def test_a_folder_of_a_stranger_locks(
+    store: LockStore, monkeypatch: pytest.MonkeyPatch, folder: Path
+) -> None:
     store.write_lock(ANN, BENCH)
     if os.geteuid() != 0:
         pytest.skip("only root gives a folder away")
@@ -131,7 +155,9 @@ def test_a_folder_of_a_stranger_locks(store: LockStore, monkeypatch: pytest.Monk
     assert "belongs to user 12345" in lock.text
 
 
-def test_a_full_disk_leaves_no_half_lock(store: LockStore, folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_full_disk_leaves_no_half_lock(
+    store: LockStore, folder: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     def full(_: int) -> None:
         raise OSError(28, "No space left on device")
 
@@ -174,7 +200,9 @@ def test_other_users_read_a_lock_whatever_the_umask(store: LockStore) -> None:
     assert file.stat().st_mode & 0o777 == 0o644
 
 
-def test_a_device_is_known_by_every_name_it_may_get(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+def test_a_device_is_known_by_every_name_it_may_get(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
     assert modbus_keys("tcp://LOCALHOST:5020", 1) & modbus_keys("tcp://127.0.0.1:5020", 1)
     assert not modbus_keys("tcp://127.0.0.1:5020", 2) & modbus_keys("tcp://127.0.0.1:5020", 1)
     board = DevicesConfig(board="tcp://127.0.0.1:5020")
@@ -197,7 +225,9 @@ def test_single_instruments_are_each_locked() -> None:
         "pump": {"driver": "ventus", "port": "/dev/pump"},
         "gauge_pressure": {"driver": "bronkhorst_propar", "port": "/dev/gauge"},
     }
-    assert {"/dev/laser", "/dev/pump", "/dev/gauge"} <= device_keys(DevicesConfig.model_validate(roles))
+    assert {"/dev/laser", "/dev/pump", "/dev/gauge"} <= device_keys(
+        DevicesConfig.model_validate(roles)
+    )
 
 
 def test_the_refusal_is_one_line_with_everything_that_a_person_needs(store: LockStore) -> None:
@@ -208,7 +238,15 @@ def test_the_refusal_is_one_line_with_everything_that_a_person_needs(store: Lock
     with pytest.raises(DeviceError) as refused:
         require_unlocked(store, BENCH)
     (line,) = refused.value.lines
-    for part in ("hands inside", "unix:ann", ANN.set_utc, "bofak", "lens off", "gumil", "locks remove WORD"):
+    for part in (
+        "hands inside",
+        "unix:ann",
+        ANN.set_utc,
+        "bofak",
+        "lens off",
+        "gumil",
+        "locks remove WORD",
+    ):
         assert part in line
     assert refused.value.exit == 4
 

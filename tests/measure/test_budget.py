@@ -1,4 +1,6 @@
-"""The error bars hold the truth: sets with errors unknown to the model, rendered by the twin's ray tracer."""
+"""The error bars hold the truth: sets with errors unknown to the model, rendered by the twin's ray
+tracer.
+"""
 
 from __future__ import annotations
 
@@ -12,7 +14,13 @@ import pytest
 from numpy.typing import NDArray
 
 from benchmarks.coverage import BentRays, answers
-from membrane_ctrl.config.optics import CameraConfig, CameraPoseConfig, GeometryConfig, OpticsConfig, ScreenPoseConfig
+from membrane_ctrl.config.optics import (
+    CameraConfig,
+    CameraPoseConfig,
+    GeometryConfig,
+    OpticsConfig,
+    ScreenPoseConfig,
+)
 from membrane_ctrl.geometry.spread_file import spread_of
 from membrane_ctrl.metrology.calibrate.parameters import NAMES, bench_at
 from membrane_ctrl.metrology.checked import check
@@ -31,7 +39,10 @@ from membrane_ctrl.sim.optics.shade import pattern_sequence
 SHRINK = 8
 CAMERA = CameraConfig(width_px=2448 // SHRINK, height_px=2048 // SHRINK, pixel_um=3.45 * SHRINK)
 STATED = OpticsConfig(
-    geometry=GeometryConfig(a_mm=2672.0, b_mm=2871.0, alpha_deg=80.9, reference_displacement_um=0.0), camera=CAMERA
+    geometry=GeometryConfig(
+        a_mm=2672.0, b_mm=2871.0, alpha_deg=80.9, reference_displacement_um=0.0
+    ),
+    camera=CAMERA,
 )
 X, Y = np.meshgrid(*[np.linspace(-475, 475, 41)] * 2)
 INSIDE = np.hypot(X, Y) <= 475
@@ -56,17 +67,23 @@ def true_bench(**off: float) -> OpticsConfig:
     there = bench_at(Geometry.from_config(STATED), np.array([off.get(name, 0.0) for name in NAMES]))
     geometry = there.geometry
     camera = CameraPoseConfig(
-        position_mm=tuple(geometry.pinhole_mm), rotation=tuple(tuple(row) for row in geometry.rotation)
+        position_mm=tuple(geometry.pinhole_mm),
+        rotation=tuple(tuple(row) for row in geometry.rotation),
     )
     s_x, s_y = tuple(geometry.screen_s_x), tuple(geometry.screen_s_y)
     screen = ScreenPoseConfig(
         origin_mm=tuple(geometry.screen_origin_mm), s_x=s_x, s_y=s_y, bow_mm=off.get("bow_mm", 0.0)
     )
-    lens = {"focal_mm": geometry.focal_px * CAMERA.pixel_um * 1e-3, "principal_px": geometry.principal_px}
+    lens = {
+        "focal_mm": geometry.focal_px * CAMERA.pixel_um * 1e-3,
+        "principal_px": geometry.principal_px,
+    }
     return OpticsConfig(
         geometry=GeometryConfig(camera=camera, screen=screen, reference_displacement_um=0.0),
         camera=CAMERA.model_copy(update={**lens, "distortion": geometry.distortion}),
-        pattern=STATED.pattern.model_copy(update={"period_mm": STATED.pattern.period_mm * there.pitch}),
+        pattern=STATED.pattern.model_copy(
+            update={"period_mm": STATED.pattern.period_mm * there.pitch}
+        ),
     )
 
 
@@ -77,16 +94,27 @@ def measured(
     y_moved_um: float | None = None,
     film: FilmShape | None = None,
 ) -> Outcome:
-    """A set of a true bench, measured as the stated one. A motion of the film comes without a laser."""
+    """A set of a true bench, measured as the stated one. A motion of the film comes without a
+    laser.
+    """
     film, moved_um = film or typical_film(37.1, 500.0, seed), y_moved_um or 0.0
-    renderer, shown = OpticsRenderer(optics, film, seed=seed), pattern_sequence("full", STATED.pattern)
-    frames = np.stack([renderer.render(p, moved_um / 2 * (1 if p.axis == "y" else -1)) for p in shown])
+    renderer, shown = (
+        OpticsRenderer(optics, film, seed=seed),
+        pattern_sequence("full", STATED.pattern),
+    )
+    frames = np.stack(
+        [renderer.render(p, moved_um / 2 * (1 if p.axis == "y" else -1)) for p in shown]
+    )
     if blur_px:
         frames = np.stack([cv2.GaussianBlur(frame, (0, 0), blur_px) for frame in frames])
     readings: NDArray[np.float64] = np.full(len(shown), np.nan if y_moved_um is not None else 0.0)
     checked = check(FrameStack(frames, tuple(shown), readings, {}), STATED)
     full = reconstruct_full(STATED, checked, measure_pixels(STATED, checked))
-    light = checked.binned.means[[k for used in checked.view.used for k in used]].mean(axis=0).astype(float)
+    light = (
+        checked.binned.means[[k for used in checked.view.used for k in used]]
+        .mean(axis=0)
+        .astype(float)
+    )
     outline = find_outline(light, checked.tracer.geometry, 500.0, full.surface.sag_mm)
     error_um = 1e3 * (full.surface.height(X, Y) - film.height_mm(X, Y, 0.0))[INSIDE]
     angle = np.linspace(0, 2 * np.pi, 72, endpoint=False)
@@ -129,9 +157,11 @@ def test_optics_that_are_off(off: dict[str, float], doubt: str) -> None:
     ("prestrain", "poisson"), [(1e-3, 0.4), pytest.param(2e-4, 0.36, marks=pytest.mark.campaign)]
 )
 def test_a_film_that_is_not_henckys(prestrain: float, poisson: float) -> None:
-    """Its row is the error of the sag, since nothing else is wrong here; of Hencky's film it is noise.
+    """Its row is the error of the sag, since nothing else is wrong here; of Hencky's film it is
+    noise.
 
-    A stretched film's slopes are finite and bend its profile beyond the shapes that the row knows: 0.28 µm for 0.19.
+    A stretched film's slopes are finite and bend its profile beyond the shapes that the row knows:
+    0.28 µm for 0.19.
     """
     found = measured(STATED, film=typical_film(37.1, 500.0, 3, prestrain, poisson))
     row, none = (
@@ -146,10 +176,16 @@ def test_a_film_that_is_not_henckys(prestrain: float, poisson: float) -> None:
     "name", ["air_k_per_m", "glass_mm", pytest.param("temperature_k", marks=pytest.mark.campaign)]
 )
 def test_what_bends_the_rays_or_moves_the_bench(name: str) -> None:
-    """Rays traced through Snell's glass, along parabolas in warm air, on a grown frame: the row is what they do."""
+    """Rays traced through Snell's glass, along parabolas in warm air, on a grown frame: the row is
+    what they do.
+    """
     film, times = typical_film(37.1, 500.0, 3), 20.0
     grown = 1 + times * 2.0 * 12e-6 * (name == "temperature_k")
-    bent = {name: times * {"air_k_per_m": 0.5, "glass_mm": 1.0}[name]} if name != "temperature_k" else {}
+    bent = (
+        {name: times * {"air_k_per_m": 0.5, "glass_mm": 1.0}[name]}
+        if name != "temperature_k"
+        else {}
+    )
     geometry = STATED.geometry.model_copy(update={"a_mm": 2672.0 * grown, "b_mm": 2871.0 * grown})
     exact = Tracer(Geometry.from_config(STATED), 500.0)
     surfaces = []
@@ -160,12 +196,17 @@ def test_what_bends_the_rays_or_moves_the_bench(name: str) -> None:
         seen = renderer.trace_pixels(0.0)
         inside = np.flatnonzero(seen.x_mm**2 + seen.y_mm**2 < 475**2)[::7]
         rows, columns = np.divmod(inside, CAMERA.width_px)
-        points = Points.of(exact.geometry.rays(columns, rows), np.stack([seen.s_x_mm, seen.s_y_mm])[:, inside])
+        points = Points.of(
+            exact.geometry.rays(columns, rows), np.stack([seen.s_x_mm, seen.s_y_mm])[:, inside]
+        )
         surfaces.append(solve(exact, points, parabola(37.0, 500.0)).surface.parameters)
     budget = set_of_the_stated_bench().examined.budget
     row = next(source for source in budget.sources if source.name == name)
     heights = height_matrix(X[INSIDE], Y[INSIDE], 500.0)
-    true_um, said_um = 1e3 * heights @ (surfaces[1] - surfaces[0]) / times, 1e3 * heights @ row.effects_mm[:, 0]
+    true_um, said_um = (
+        1e3 * heights @ (surfaces[1] - surfaces[0]) / times,
+        1e3 * heights @ row.effects_mm[:, 0],
+    )
     assert np.sqrt(np.mean(said_um**2)) > 0.1  # or this test would say nothing
     said_um *= np.sign(said_um @ true_um)  # which way the input is off, nobody knows
     np.testing.assert_allclose(said_um, true_um, atol=0.03 * float(np.abs(true_um).max()))
@@ -184,19 +225,24 @@ def test_a_film_that_moved_between_x_and_y_without_a_laser() -> None:
 
 
 def test_a_change_counts_noise_that_has_its_own_row_once() -> None:
-    """Two sets show the same slopes, each with its noise: nothing of their row is left in the change between them."""
+    """Two sets show the same slopes, each with its noise: nothing of their row is left in the
+    change between them.
+    """
     rng = np.random.default_rng(1)
     shown = 1e-4 * rng.standard_normal((ZERNIKE_TERMS, 400))
 
     def row(noise_mm: float, grown: float) -> Source:
         effects = grown * shown + noise_mm * rng.standard_normal(shown.shape)
-        return Source("slope_urad", "", 1.0, effects, common=False, noise_mm2=noise_mm**2 * shown.size)
+        return Source(
+            "slope_urad", "", 1.0, effects, common=False, noise_mm2=noise_mm**2 * shown.size
+        )
 
     one, same, other = row(3e-5, 1.0), row(3e-5, 1.0), row(3e-5, 1.2)
     square = float(np.sum(shown**2))
     assert np.trace(one.covariance_mm2) == pytest.approx(square, rel=0.02)
     left, grown = (
-        np.trace(Budget((later,), 0.95).change_covariance(Budget((one,), 0.95))) for later in (same, other)
+        np.trace(Budget((later,), 0.95).change_covariance(Budget((one,), 0.95)))
+        for later in (same, other)
     )
     assert left < 0.01 * square  # with its noise 0.18
     assert grown == pytest.approx(0.04 * square, rel=0.2)
@@ -212,7 +258,9 @@ def test_a_benchmark_that_was_killed_goes_on_where_it_was(tmp_path: Path) -> Non
     path = tmp_path / "answers.jsonl"
     whole = answers(path, 5, bench)
     text = path.read_text(encoding="utf-8")
-    path.write_text(text[: text.index('"square": 9') + 4], encoding="utf-8")  # in the middle of the fourth line
+    path.write_text(
+        text[: text.index('"square": 9') + 4], encoding="utf-8"
+    )  # in the middle of the fourth line
     assert answers(path, 5, bench) == whole
     assert asked == [0, 1, 2, 3, 4, 3, 4]
     assert path.read_text(encoding="utf-8") == text

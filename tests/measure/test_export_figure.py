@@ -1,4 +1,6 @@
-"""`export-figure`: every format read back by a program that is not ours, and results that mean harm."""
+"""`export-figure`: every format read back by a program that is not ours, and results that mean
+harm.
+"""
 
 from __future__ import annotations
 
@@ -20,7 +22,9 @@ from membrane_ctrl.model.zernike_terms import NOLL_INDICES, ZERNIKE_TERMS
 X, Y = np.linspace(-300, 300, 61), np.linspace(-200, 250, 46)
 GX, GY = np.meshgrid(X, Y)
 BOWL = (GX**2 + GY**2) / 7000 + 2e-3 * GX - 1e-3 * GY + 0.4
-DENT = -0.003 * np.exp(-((GX - 150) ** 2 + (GY - 100) ** 2) / 800)  # to the right of the middle, and above it
+DENT = -0.003 * np.exp(
+    -((GX - 150) ** 2 + (GY - 100) ** 2) / 800
+)  # to the right of the middle, and above it
 HEIGHT = np.where(np.hypot(GX, GY) < 290, BOWL + DENT, np.nan)
 COEFFS = [float(j) for j in range(ZERNIKE_TERMS)]
 
@@ -29,7 +33,9 @@ COEFFS = [float(j) for j in range(ZERNIKE_TERMS)]
 def result(tmp_path: Path) -> Path:
     """A result folder, of a grid that is not square."""
     np.savez(tmp_path / "height.npz", x_mm=X, y_mm=Y, h_mm=HEIGHT)
-    (tmp_path / "result.json").write_text(json.dumps({"zernike": {"radius_mm": 500.0, "coeffs_um": COEFFS}}))
+    (tmp_path / "result.json").write_text(
+        json.dumps({"zernike": {"radius_mm": 500.0, "coeffs_um": COEFFS}})
+    )
     return tmp_path
 
 
@@ -56,11 +62,15 @@ def test_prysm_reads_the_zygo_file(result: Path) -> None:
     assert row < Y.size / 2 < X.size / 2 < column  # above and to the right
 
 
-def test_a_deep_bowl_fits_the_zygo_file_in_coarser_steps(result: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_deep_bowl_fits_the_zygo_file_in_coarser_steps(
+    result: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     np.savez(result / "height.npz", x_mm=X, y_mm=Y, h_mm=3 * HEIGHT)
     exported(result, "zygo-dat")
     assert "steps of 0.0772 nm" in capsys.readouterr().out
-    np.testing.assert_allclose(prysm_io.read_zygo_dat(result / "figure.dat")["phase"][::-1], 3e6 * HEIGHT, atol=0.1)
+    np.testing.assert_allclose(
+        prysm_io.read_zygo_dat(result / "figure.dat")["phase"][::-1], 3e6 * HEIGHT, atol=0.1
+    )
     np.savez(result / "height.npz", x_mm=X, y_mm=Y, h_mm=30 * HEIGHT)
     assert run(["export-figure", str(result), "--format", "zygo-dat"]) == 2
     assert "holds heights up to 166 mm, not 3" in capsys.readouterr().err
@@ -85,7 +95,12 @@ def test_a_sphere_without_its_sphere_is_flat(result: Path) -> None:
 def test_pandas_reads_the_points(result: Path) -> None:
     exported(result, "zygo-xyz")
     table = pd.read_csv(
-        result / "figure.xyz", sep=r"\s+", skiprows=14, skipfooter=1, engine="python", names=["j", "i", "z", "rest"]
+        result / "figure.xyz",
+        sep=r"\s+",
+        skiprows=14,
+        skipfooter=1,
+        engine="python",
+        names=["j", "i", "z", "rest"],
     )
     read = pd.to_numeric(table["z"], errors="coerce").to_numpy().reshape(Y.size, X.size)
     np.testing.assert_allclose(read[::-1], 1e3 * HEIGHT, atol=1e-6)
@@ -142,7 +157,10 @@ def saved(values: object) -> bytes:
         (b"no archive", "damaged"),
         (archive(x_mm=saved(X)), "damaged or lacks an array"),
         (archive(x_mm=harmful_header(), y_mm=b"", h_mm=b""), "x_mm is not an array"),
-        (archive(x_mm=saved(np.array([{}, {}], object)), y_mm=b"", h_mm=b""), "x_mm is not an array"),
+        (
+            archive(x_mm=saved(np.array([{}, {}], object)), y_mm=b"", h_mm=b""),
+            "x_mm is not an array",
+        ),
         (archive(x_mm=b"junk", y_mm=b"", h_mm=b""), "not a usable result"),
         (archive(x_mm=saved(X), y_mm=saved(Y), h_mm=saved(HEIGHT.T)), "has not the shape"),
         (archive(x_mm=saved(X**3), y_mm=saved(Y), h_mm=saved(HEIGHT)), "even steps"),
@@ -160,7 +178,9 @@ def test_a_harmful_result_is_one_line(
     assert not list(result.glob("figure*"))
 
 
-def test_links_missing_files_and_wrong_words_are_refused(result: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_links_missing_files_and_wrong_words_are_refused(
+    result: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     cases: list[tuple[list[str], str]] = [
         (["--format", "stl"], "--format stl: give one of zygo-dat"),
         (["--format", "h5", "--remove", "coma"], "--remove coma: give piston"),

@@ -1,4 +1,6 @@
-"""`export-figure --format fits`: read back by astropy, and by POPPY, which computes the point spread function."""
+"""`export-figure --format fits`: read back by astropy, and by POPPY, which computes the point
+spread function.
+"""
 
 from __future__ import annotations
 
@@ -30,7 +32,9 @@ ARCSEC_PER_RAD = np.degrees(1) * 3600
 def write_result(folder: Path, height_mm: FloatArray, y_mm: FloatArray = AXIS_MM) -> None:
     np.savez(folder / "height.npz", x_mm=AXIS_MM, y_mm=y_mm, h_mm=height_mm)
     coeffs_um = [0.0] * ZERNIKE_TERMS
-    (folder / "result.json").write_text(json.dumps({"zernike": {"radius_mm": 500.0, "coeffs_um": coeffs_um}}))
+    (folder / "result.json").write_text(
+        json.dumps({"zernike": {"radius_mm": 500.0, "coeffs_um": coeffs_um}})
+    )
 
 
 def exported(folder: Path, error_mm: FloatArray) -> Path:
@@ -45,7 +49,9 @@ def spread_function(path: Path) -> tuple[FloatArray, float]:
     """POPPY's point spread function of a file, and its pixel in seconds of arc."""
     with fits.open(path) as file:
         mask = fits.HDUList([fits.PrimaryHDU(file["MASK"].data, file["MASK"].header)])
-        mirror = poppy.FITSOpticalElement(opd=file, transmission=mask, planetype=poppy.poppy_core.PlaneType.pupil)
+        mirror = poppy.FITSOpticalElement(
+            opd=file, transmission=mask, planetype=poppy.poppy_core.PlaneType.pupil
+        )
     system = poppy.OpticalSystem(npix=AXIS_MM.size)
     system.add_pupil(mirror)
     pixel_arcsec = 0.02
@@ -71,7 +77,9 @@ def test_a_perfect_paraboloid_gives_the_diffraction_limit(tmp_path: Path) -> Non
 
 
 def test_the_strehl_ratio_follows_from_twice_the_height(tmp_path: Path) -> None:
-    """Marechal: exp(-(2 pi sigma)^2) for small errors; sigma of the path is twice that of the height."""
+    """Marechal: exp(-(2 pi sigma)^2) for small errors; sigma of the path is twice that of the
+    height.
+    """
     error_mm = 2e-5 * np.cos(2 * np.pi * X_MM / 200) * np.cos(2 * np.pi * Y_MM / 200)
     (tmp_path / "flat").mkdir()
     (tmp_path / "rough").mkdir()
@@ -79,12 +87,16 @@ def test_the_strehl_ratio_follows_from_twice_the_height(tmp_path: Path) -> None:
     path = exported(tmp_path / "rough", error_mm)
     rough, _ = spread_function(path)
     sigma_m = 2e-3 * float(error_mm[INSIDE].std())
-    assert rough.max() / flat.max() == pytest.approx(np.exp(-((2 * np.pi * sigma_m / WAVELENGTH_M) ** 2)), abs=2e-3)
+    assert rough.max() / flat.max() == pytest.approx(
+        np.exp(-((2 * np.pi * sigma_m / WAVELENGTH_M) ** 2)), abs=2e-3
+    )
     assert 0.8 < rough.max() / flat.max() < 0.99
 
 
 def test_a_mirror_that_rises_to_the_right_sends_the_light_to_the_left(tmp_path: Path) -> None:
-    """A tilt of the surface turns the reflected light by twice its angle, away from the raised side."""
+    """A tilt of the surface turns the reflected light by twice its angle, away from the raised
+    side.
+    """
     slope = 0.25 / ARCSEC_PER_RAD
     write_result(tmp_path, np.where(INSIDE, slope * X_MM, np.nan))
     assert run(["export-figure", str(tmp_path), "--format", "fits"]) == 0
@@ -106,7 +118,9 @@ def test_the_images_and_their_header(tmp_path: Path) -> None:
         np.testing.assert_allclose(opd.data[INSIDE], 2 * height.data[INSIDE], rtol=1e-12)
         assert not opd.data[~INSIDE].any()
         row, column = np.unravel_index(np.nanargmax(height.data), height.data.shape)
-        assert opd.header["CRVAL1"] + column * opd.header["CDELT1"] == pytest.approx(0.200, abs=0.011)
+        assert opd.header["CRVAL1"] + column * opd.header["CDELT1"] == pytest.approx(
+            0.200, abs=0.011
+        )
         assert opd.header["CRVAL2"] + row * opd.header["CDELT2"] == pytest.approx(0.100, abs=0.011)
 
 

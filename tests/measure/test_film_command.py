@@ -23,14 +23,20 @@ def sets(tmp_path_factory: pytest.TempPathFactory) -> list[str]:
     folder = tmp_path_factory.mktemp("film")
     for number, start_um in enumerate((-3000.0, 0.0, 3000.0)):
         spec = SimulationSpec(
-            OPTICS, FILM, motion=Motion(start_um), seed=number, stiffness_n_per_m=1.7e5,
+            OPTICS,
+            FILM,
+            motion=Motion(start_um),
+            seed=number,
+            stiffness_n_per_m=1.7e5,
             stated_geometry=OPTICS.geometry.model_copy(update={"reference_displacement_um": 0.0}),
-        )  # fmt: skip
+        )
         simulate_set(folder / f"set{number}", spec)
     return [str(folder / f"set{number}") for number in range(3)]
 
 
-def test_the_material_is_found_and_shown(sets: list[str], capsys: pytest.CaptureFixture[str]) -> None:
+def test_the_material_is_found_and_shown(
+    sets: list[str], capsys: pytest.CaptureFixture[str]
+) -> None:
     assert run(["film", *sets, "--json"]) == 0
     table = json.loads(capsys.readouterr().out)
     for name, true, most in (
@@ -47,17 +53,23 @@ def test_the_material_is_found_and_shown(sets: list[str], capsys: pytest.Capture
     assert (out / "film.png").stat().st_size > 10_000
 
 
-def test_without_pressures_the_stiffness_is_missing(sets: list[str], capsys: pytest.CaptureFixture[str]) -> None:
+def test_without_pressures_the_stiffness_is_missing(
+    sets: list[str], capsys: pytest.CaptureFixture[str]
+) -> None:
     for folder in sets[:2]:
         path = Path(folder) / "capture.toml"
         lines = path.read_text().splitlines(keepends=True)
-        path.write_text("".join(line for k, line in enumerate(lines) if k > 4 or "pressure_pa" not in line))
+        path.write_text(
+            "".join(line for k, line in enumerate(lines) if k > 4 or "pressure_pa" not in line)
+        )
     assert run(["film", *sets[:2], "--no-pictures"]) == 0
     shown = capsys.readouterr().out
     assert "E t is not determined: no set states pressure_pa" in shown
     assert "E t  " not in shown
 
 
-def test_one_set_is_refused_in_one_line(sets: list[str], capsys: pytest.CaptureFixture[str]) -> None:
+def test_one_set_is_refused_in_one_line(
+    sets: list[str], capsys: pytest.CaptureFixture[str]
+) -> None:
     assert run(["film", sets[0]]) == 3
     assert "two or more pressures are needed" in capsys.readouterr().err

@@ -1,4 +1,6 @@
-"""`simulate` and `measure` from the command line: files, exit codes, and one line for every bad input."""
+"""`simulate` and `measure` from the command line: files, exit codes, and one line for every bad
+input.
+"""
 
 from __future__ import annotations
 
@@ -56,8 +58,12 @@ def test_a_full_set(made: Path, tmp_path: Path, capsys: pytest.CaptureFixture[st
     assert json.loads(capsys.readouterr().out) == result
     assert result["schema"] == "membrane-result/1"
     assert result["zernike"] | {"coeffs_um": None} == {
-        "index": "noll", "first": 1, "normalisation": "rms", "radius_mm": 500.0, "coeffs_um": None,
-    }  # fmt: skip
+        "index": "noll",
+        "first": 1,
+        "normalisation": "rms",
+        "radius_mm": 500.0,
+        "coeffs_um": None,
+    }
     assert len(result["zernike"]["coeffs_um"]) == ZERNIKE_TERMS
     assert result["fit"]["converged"]
     assert result["fit"]["last_change_mm"] <= 1e-6
@@ -83,7 +89,9 @@ def test_a_full_set(made: Path, tmp_path: Path, capsys: pytest.CaptureFixture[st
     inside = np.hypot(*np.meshgrid(truth["x_mm"], truth["y_mm"])) < 450
     columns = np.searchsorted(maps["x_mm"], truth["x_mm"]).clip(0, maps["x_mm"].size - 1)
     near = maps["h_mm"][np.ix_(columns, columns)]
-    assert np.nanmax(np.abs(near - truth["h_mm"])[inside]) < 1.5  # a cell beside, on a slope of 0.15: sign and place
+    assert (
+        np.nanmax(np.abs(near - truth["h_mm"])[inside]) < 1.5
+    )  # a cell beside, on a slope of 0.15: sign and place
 
 
 def test_a_fringes_set_leans_on_its_reference(made: Path, tmp_path: Path) -> None:
@@ -118,7 +126,9 @@ def test_pictures_report_and_recording(made: Path, tmp_path: Path) -> None:
     figure = json.loads((tmp_path / "result.json").read_text())["figure"]
     depth = 3400 - np.sqrt(3400**2 - 475**2)
     told = figure["numbers"]["power_um"]["value"]
-    assert told == pytest.approx(1e3 * (figure["numbers"]["sphere_sag_mm"]["value"] - depth), abs=1e-6)
+    assert told == pytest.approx(
+        1e3 * (figure["numbers"]["sphere_sag_mm"]["value"] - depth), abs=1e-6
+    )
     assert f"<td>power_um<td>{told:.6g}<td>" in page
     assert figure["not_given"] == {}
     document = (tmp_path / "report.pdf").read_bytes()
@@ -138,18 +148,27 @@ def test_pictures_report_and_recording(made: Path, tmp_path: Path) -> None:
 def test_a_nominal_radius_below_the_apertures_is_refused(
     made: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    assert run(["measure", str(made / "0000"), "--out", str(tmp_path), "--nominal-radius-mm", "-400"]) == 2
+    assert (
+        run(["measure", str(made / "0000"), "--out", str(tmp_path), "--nominal-radius-mm", "-400"])
+        == 2
+    )
     (line,) = capsys.readouterr().err.splitlines()
-    assert line == "membrane-ctrl: --nominal-radius-mm -400: must be larger than the aperture's radius, 475 mm"
+    assert line == (
+        "membrane-ctrl: --nominal-radius-mm -400: must be larger than the aperture's radius, 475 mm"
+    )
 
 
 @pytest.mark.parametrize("frame", ["x_sin_2.png", "y_gray_3.png", "white.png", "black.png"])
-def test_a_missing_picture_is_a_rejection_that_names_it(capture_set: Path, tmp_path: Path, frame: str) -> None:
+def test_a_missing_picture_is_a_rejection_that_names_it(
+    capture_set: Path, tmp_path: Path, frame: str
+) -> None:
     (capture_set / frame).unlink()
     code, result = measured(capture_set, tmp_path / "out")
     assert code == 3
     assert result["quality"]["verdict"] == "rejected"
-    assert result["quality"]["flagged_frames"] == [{"file": frame, "reason": "missing: no such file"}]
+    assert result["quality"]["flagged_frames"] == [
+        {"file": frame, "reason": "missing: no such file"}
+    ]
 
 
 def test_a_picture_in_colour_is_a_rejection_that_says_so(capture_set: Path, tmp_path: Path) -> None:
@@ -170,10 +189,15 @@ def test_a_torn_picture_is_a_rejection_that_names_it(capture_set: Path, tmp_path
 
 @pytest.mark.parametrize(
     ("image", "reason"),
-    [(np.zeros((255, 306), np.uint8), "wrong size"), (np.zeros((256, 306), np.uint16), "wrong bit depth")],
+    [
+        (np.zeros((255, 306), np.uint8), "wrong size"),
+        (np.zeros((256, 306), np.uint16), "wrong bit depth"),
+    ],
     ids=["size", "depth"],
 )
-def test_a_frame_of_another_kind_is_named(capture_set: Path, tmp_path: Path, image: np.ndarray, reason: str) -> None:
+def test_a_frame_of_another_kind_is_named(
+    capture_set: Path, tmp_path: Path, image: np.ndarray, reason: str
+) -> None:
     assert cv2.imwrite(str(capture_set / "y_sin_1.png"), image)
     code, result = measured(capture_set, tmp_path / "out")
     assert code == 0
@@ -188,7 +212,10 @@ def test_too_many_bad_frames_are_a_rejection(capture_set: Path, tmp_path: Path) 
     code, result = measured(capture_set, tmp_path / "out")
     assert code == 3
     assert result["quality"]["verdict"] == "rejected"
-    assert [flag["file"] for flag in result["quality"]["flagged_frames"]] == ["x_sin_2.png", "x_sin_3.png"]
+    assert [flag["file"] for flag in result["quality"]["flagged_frames"]] == [
+        "x_sin_2.png",
+        "x_sin_3.png",
+    ]
     assert not (tmp_path / "out" / "height.npz").exists()
 
 
@@ -208,22 +235,37 @@ def _sixteen(folder: Path) -> None:
 @pytest.mark.parametrize(
     ("spoil", "words"),
     [
-        (lambda f: rewrite(f, lambda t: t["geometry"].update(a_mm=2.672)), ["capture.toml", "geometry.a_mm", "100"]),
+        (
+            lambda f: rewrite(f, lambda t: t["geometry"].update(a_mm=2.672)),
+            ["capture.toml", "geometry.a_mm", "100"],
+        ),
         (lambda f: rewrite(f, lambda t: t["frames"].pop()), ["capture.toml", "frames", "black"]),
         (lambda f: rewrite(f, lambda t: t["frames"].pop(0)), ["x_sin_0"]),
         (lambda f: rewrite(f, lambda t: t["frames"].append(t["frames"][0])), ["x_sin_0", "twice"]),
         (lambda f: rewrite(f, lambda t: t.update(kind="half")), ["kind"]),
         (lambda f: rewrite(f, lambda t: t.update(schema="other/2")), ["schema"]),
-        (lambda f: rewrite(f, lambda t: t["camera"].update(width_px=400)), ["camera.width_px", "306 x 256"]),
-        (lambda f: rewrite(f, lambda t: t["geometry"].update(a_mm=float("nan"))), ["geometry.a_mm"]),
-        (lambda f: (_sixteen(f), rewrite(f, lambda t: t["camera"].update(bits=8))), ["camera.bits = 8", "16 bit"]),
+        (
+            lambda f: rewrite(f, lambda t: t["camera"].update(width_px=400)),
+            ["camera.width_px", "306 x 256"],
+        ),
+        (
+            lambda f: rewrite(f, lambda t: t["geometry"].update(a_mm=float("nan"))),
+            ["geometry.a_mm"],
+        ),
+        (
+            lambda f: (_sixteen(f), rewrite(f, lambda t: t["camera"].update(bits=8))),
+            ["camera.bits = 8", "16 bit"],
+        ),
         (lambda f: (f / "capture.toml").write_text("a = = 1"), ["capture.toml", "TOML"]),
         (lambda f: (f / "capture.toml").unlink(), ["capture.toml", "no such file"]),
         (lambda f: [p.unlink() for p in f.glob("*.png")], ["none of the 18 images"]),
     ],
-)  # fmt: skip
+)
 def test_bad_input_is_one_line(
-    capture_set: Path, capsys: pytest.CaptureFixture[str], spoil: Callable[[Path], object], words: list[str]
+    capture_set: Path,
+    capsys: pytest.CaptureFixture[str],
+    spoil: Callable[[Path], object],
+    words: list[str],
 ) -> None:
     spoil(capture_set)
     assert run(["measure", str(capture_set)]) == 2
@@ -239,17 +281,25 @@ def test_16_bit_frames_need_no_declaration(capture_set: Path, tmp_path: Path) ->
     assert result["quality"]["modulation_median_adu"] > 10_000
 
 
-def test_a_reference_that_is_not_there(made: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_reference_that_is_not_there(
+    made: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     shutil.copytree(made / "0001", tmp_path / "alone")
     assert run(["measure", str(tmp_path / "alone")]) == 2
     assert "no such capture set" in capsys.readouterr().err
 
 
 def test_another_geometry(made: Path, tmp_path: Path) -> None:
-    (tmp_path / "geometry.toml").write_text("[geometry]\na_mm = 2680.0\nb_mm = 2871.0\nalpha_deg = 80.9\n")
+    (tmp_path / "geometry.toml").write_text(
+        "[geometry]\na_mm = 2680.0\nb_mm = 2871.0\nalpha_deg = 80.9\n"
+    )
     _, own = measured(made / "0000", tmp_path / "own")
-    _, other = measured(made / "0000", tmp_path / "other", "--geometry", str(tmp_path / "geometry.toml"))
-    assert other["zernike"]["coeffs_um"][3] != pytest.approx(own["zernike"]["coeffs_um"][3], abs=1.0)
+    _, other = measured(
+        made / "0000", tmp_path / "other", "--geometry", str(tmp_path / "geometry.toml")
+    )
+    assert other["zernike"]["coeffs_um"][3] != pytest.approx(
+        own["zernike"]["coeffs_um"][3], abs=1.0
+    )
 
 
 @pytest.mark.parametrize("alpha_deg", [30.0, 1.41])
@@ -259,11 +309,15 @@ def test_a_geometry_that_cannot_be_is_refused_with_the_file_that_states_it(
     file = tmp_path / "geometry.toml"
     file.write_text(f"[geometry]\na_mm = 2672.0\nb_mm = 2871.0\nalpha_deg = {alpha_deg}\n")
     assert run(["measure", str(capture_set), "--geometry", str(file)]) == 2
-    assert capsys.readouterr().err.startswith(f"membrane-ctrl: {file}: geometry.alpha_deg: the pattern (")
+    assert capsys.readouterr().err.startswith(
+        f"membrane-ctrl: {file}: geometry.alpha_deg: the pattern ("
+    )
     rewrite(capture_set, lambda t: t["geometry"].update(alpha_deg=alpha_deg))
     assert run(["measure", str(capture_set)]) == 2
     (said,) = capsys.readouterr().err.splitlines()
-    assert said.startswith(f"membrane-ctrl: {capture_set / 'capture.toml'}: geometry.alpha_deg: the pattern (")
+    assert said.startswith(
+        f"membrane-ctrl: {capture_set / 'capture.toml'}: geometry.alpha_deg: the pattern ("
+    )
 
 
 def test_unknown_keys_are_said_and_ignored(
@@ -275,7 +329,9 @@ def test_unknown_keys_are_said_and_ignored(
     assert "camera.gain_db" in capsys.readouterr().err
 
 
-def test_simulate_refuses_what_cannot_be(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_simulate_refuses_what_cannot_be(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     assert run(["simulate", str(tmp_path / "a"), *SMALL, "--fault", "eaten:x_sin_0"]) == 2
     assert "eaten" in capsys.readouterr().err
     (tmp_path / "full").mkdir()
@@ -285,7 +341,10 @@ def test_simulate_refuses_what_cannot_be(tmp_path: Path, capsys: pytest.CaptureF
 
 
 def test_a_simulated_fault_is_found_by_measure(tmp_path: Path) -> None:
-    assert run(["simulate", str(tmp_path / "set"), *SMALL, "--fault", "stale:y_sin_3", "--steps", "5"]) == 0
+    assert (
+        run(["simulate", str(tmp_path / "set"), *SMALL, "--fault", "stale:y_sin_3", "--steps", "5"])
+        == 0
+    )
     code, result = measured(tmp_path / "set", tmp_path / "out")
     assert code == 0
     (flag,) = result["quality"]["flagged_frames"]
@@ -304,10 +363,14 @@ def test_a_geometry_file_with_a_crooked_screen(capture_set: Path, tmp_path: Path
     nearer = tmp_path / "nearer.toml"
     nearer.write_text(tomli_w.dumps({"geometry": {**short, "b_mm": short["b_mm"] - 0.5}}))
     _, expected = measured(capture_set, tmp_path / "nearer", "--geometry", str(nearer))
-    assert found["zernike"]["coeffs_um"] == pytest.approx(expected["zernike"]["coeffs_um"], abs=1e-6)
+    assert found["zernike"]["coeffs_um"] == pytest.approx(
+        expected["zernike"]["coeffs_um"], abs=1e-6
+    )
 
 
-def test_an_image_that_ends_too_early(capture_set: Path, tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
+def test_an_image_that_ends_too_early(
+    capture_set: Path, tmp_path: Path, capfd: pytest.CaptureFixture[str]
+) -> None:
     picture = (capture_set / "x_sin_1.png").read_bytes()
     (capture_set / "x_sin_1.png").write_bytes(picture[: len(picture) // 2])
     code, result = measured(capture_set, tmp_path)
@@ -352,23 +415,36 @@ def test_error_bars(made: Path, tmp_path: Path, capsys: pytest.CaptureFixture[st
     details = json.loads((tmp_path / "details.json").read_text())["sag_sigma_um"]
     sigma = np.load(tmp_path / "sigma.npz")
     assert (
-        sigma["sigma_noise_um"].shape == sigma["sigma_geometry_um"].shape == (sigma["y_mm"].size, sigma["x_mm"].size)
+        sigma["sigma_noise_um"].shape
+        == sigma["sigma_geometry_um"].shape
+        == (sigma["y_mm"].size, sigma["x_mm"].size)
     )
     assert np.isnan(sigma["sigma_noise_um"][0, 0])
     middle = sigma["x_mm"].size // 2
-    assert sigma["sigma_geometry_um"][middle, middle] == pytest.approx(0, abs=1e-9)  # counted from the vertex
+    assert sigma["sigma_geometry_um"][middle, middle] == pytest.approx(
+        0, abs=1e-9
+    )  # counted from the vertex
     # what the Monte Carlo of the same set says
-    assert run(["uncertainty", str(made / "0000"), "--out", str(tmp_path / "mc"), "--trials", "100"]) == 0
+    assert (
+        run(["uncertainty", str(made / "0000"), "--out", str(tmp_path / "mc"), "--trials", "100"])
+        == 0
+    )
     trials = json.loads((tmp_path / "mc" / "uncertainty.json").read_text())
-    assert details["geometry"] == pytest.approx(trials["sag_sigma_um"], rel=0.25)  # of 100 trials: 7 % sigma
-    assert np.nanmean(sigma["sigma_geometry_um"]) == pytest.approx(trials["rmse_um"]["mean"], rel=0.25)
+    assert details["geometry"] == pytest.approx(
+        trials["sag_sigma_um"], rel=0.25
+    )  # of 100 trials: 7 % sigma
+    assert np.nanmean(sigma["sigma_geometry_um"]) == pytest.approx(
+        trials["rmse_um"]["mean"], rel=0.25
+    )
 
 
 def test_a_geometrys_own_covariance_makes_the_error_bars(made: Path, tmp_path: Path) -> None:
     geometry = tomllib.loads((made / "0000" / "capture.toml").read_text())["geometry"]
     covariance = {"names": ["a_mm"], "matrix": [[1e-8]]}
     geometry["sigmas"] = dict.fromkeys(SigmasConfig().model_dump(), 0.0)
-    (tmp_path / "g.toml").write_text(tomli_w.dumps({"geometry": geometry, "covariance": covariance}))
+    (tmp_path / "g.toml").write_text(
+        tomli_w.dumps({"geometry": geometry, "covariance": covariance})
+    )
     assert measured(made / "0000", tmp_path / "out", "--geometry", str(tmp_path / "g.toml"))[0] == 0
     details = json.loads((tmp_path / "out" / "details.json").read_text())["sag_sigma_um"]
     assert details["geometry"] < 0.01
@@ -379,7 +455,14 @@ def test_a_geometrys_own_covariance_makes_the_error_bars(made: Path, tmp_path: P
 def several(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A set of three fringe periods whose very first coarser frame is too dark."""
     folder = tmp_path_factory.mktemp("several") / "set"
-    options = ["--coarser-mm", "55.3", "--coarser-mm", "61.7", "--fault", "flicker:x_sin_0_of_55.3mm:0.9"]
+    options = [
+        "--coarser-mm",
+        "55.3",
+        "--coarser-mm",
+        "61.7",
+        "--fault",
+        "flicker:x_sin_0_of_55.3mm:0.9",
+    ]
     assert run(["simulate", str(folder), "--shrink", "12", *options]) == 0
     return folder
 
@@ -400,8 +483,14 @@ def test_a_set_of_several_periods(several: Path, tmp_path: Path) -> None:
         (lambda table: table.update(kind="fringes", reference="../0"), "its own period_mm"),
         (lambda table: [row.pop("period_mm", None) for row in table["frames"]], "appears twice"),
         (lambda table: table["frames"].pop(), "needs y_sin_3_of_61.7mm"),
-        (lambda table: table["frames"][-1].update(period_mm=10.0), "is finer than pattern.period_mm"),
-        (lambda table: table.update(frames=table["frames"][:8]), "needs frames of another period_mm"),
+        (
+            lambda table: table["frames"][-1].update(period_mm=10.0),
+            "is finer than pattern.period_mm",
+        ),
+        (
+            lambda table: table.update(frames=table["frames"][:8]),
+            "needs frames of another period_mm",
+        ),
     ],
     ids=["kind", "no periods", "a frame is missing", "finer", "one period"],
 )

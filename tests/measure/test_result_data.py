@@ -56,8 +56,12 @@ def test_a_result_without_sigmas_has_its_height(made: Path, tmp_path: Path) -> N
     assert "height_mm" in data
 
 
-@pytest.mark.parametrize("content", [{}, {"zernike": 3}, {"zernike": {"coeffs_um": ["x"]}, "quality": []}])
-def test_a_result_of_another_program_may_state_less(made: Path, tmp_path: Path, content: dict[str, object]) -> None:
+@pytest.mark.parametrize(
+    "content", [{}, {"zernike": 3}, {"zernike": {"coeffs_um": ["x"]}, "quality": []}]
+)
+def test_a_result_of_another_program_may_state_less(
+    made: Path, tmp_path: Path, content: dict[str, object]
+) -> None:
     (tmp_path / "height.npz").write_bytes((made / "0000" / "result" / "height.npz").read_bytes())
     (tmp_path / "result.json").write_text(json.dumps(content))
     result = open_result(tmp_path)

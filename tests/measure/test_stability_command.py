@@ -1,4 +1,6 @@
-"""`stability` from the command line: against the film's known motion, with bad sets, and its errors."""
+"""`stability` from the command line: against the film's known motion, with bad sets, and its
+errors.
+"""
 
 from __future__ import annotations
 
@@ -26,7 +28,14 @@ SETS, INTERVAL_S, DRIFT_UM_PER_S = 13, 60.0, 0.02
 def made(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A run over twelve minutes in which the film sinks by 1.2 µm a minute."""
     folder = tmp_path_factory.mktemp("sets") / "run"
-    motion = ["--sets", str(SETS), "--interval-s", str(INTERVAL_S), "--drift-um-per-s", str(DRIFT_UM_PER_S)]
+    motion = [
+        "--sets",
+        str(SETS),
+        "--interval-s",
+        str(INTERVAL_S),
+        "--drift-um-per-s",
+        str(DRIFT_UM_PER_S),
+    ]
     assert run(["simulate", str(folder), "--shrink", "12", *motion]) == 0
     return folder
 
@@ -44,7 +53,9 @@ def result(made: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """What the analysis of all of it leaves."""
     out = tmp_path_factory.mktemp("result") / "deep" / "out"
     points = ["--point", "rim=474,0", "--point", "vertex=0,0"]
-    assert run(["stability", str(made), "--out", str(out), "--trials", "20", "--rerun", *points]) == 0
+    assert (
+        run(["stability", str(made), "--out", str(out), "--trials", "20", "--rerun", *points]) == 0
+    )
     return out
 
 
@@ -92,7 +103,9 @@ def test_pairs_of_every_set(result: Path) -> None:
     minute, ten = table["pairs"]
     assert (minute["lag_s"], minute["count"]) == (60.0, SETS - 1)
     assert (ten["lag_s"], ten["count"]) == (600.0, SETS - 10)
-    assert ten["change_rms_um"]["mean"] == pytest.approx(10 * minute["change_rms_um"]["mean"], rel=0.05)
+    assert ten["change_rms_um"]["mean"] == pytest.approx(
+        10 * minute["change_rms_um"]["mean"], rel=0.05
+    )
     # noise of 1/144 of the real sensor's pixels; the geometry's 12 µm cancel
     assert 0.02 < minute["rmse_um"]["mean"] < 0.08
     assert table["rmse_um"]["mean"] > 100 * ten["rmse_um"]["mean"]
@@ -114,7 +127,12 @@ def test_files_and_pictures(result: Path) -> None:
 
 def test_the_recording_holds_the_series(result: Path) -> None:
     entities = {chunk.entity_path for chunk in RrdReader(result / "stability.rrd").stream()}
-    assert {"/stability/points_um", "/stability/zernike_um", "/stability/sd_um", "/stability/report"} <= entities
+    assert {
+        "/stability/points_um",
+        "/stability/zernike_um",
+        "/stability/sd_um",
+        "/stability/report",
+    } <= entities
     assert {f"/stability/pictures/{name}" for name in ("stability", "zernike", "pairs")} <= entities
 
 
@@ -123,17 +141,24 @@ def test_a_recording_that_cannot_be_written(
 ) -> None:
     (tmp_path / "out" / "stability.rrd").mkdir(parents=True)
     keep_two(spoiled)
-    assert run(["stability", str(spoiled), "--out", str(tmp_path / "out"), "--trials", "2", "--rerun"]) == 2
+    assert (
+        run(["stability", str(spoiled), "--out", str(tmp_path / "out"), "--trials", "2", "--rerun"])
+        == 2
+    )
     assert "stability.rrd" in capsys.readouterr().err
 
 
-def test_a_geometry_of_its_own(spoiled: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_geometry_of_its_own(
+    spoiled: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     keep_two(spoiled)
     path = tmp_path / "geometry.toml"
     geometry = tomllib.loads((spoiled / "0000" / "capture.toml").read_text())["geometry"]
     covariance = {"names": ["a_mm"], "matrix": [[0.25]]}
     geometry["sigmas"] = dict.fromkeys(SigmasConfig().model_dump(), 0.0)
-    path.write_text(tomli_w.dumps({"geometry": {**geometry, "a_mm": 2680.0}, "covariance": covariance}))
+    path.write_text(
+        tomli_w.dumps({"geometry": {**geometry, "a_mm": 2680.0}, "covariance": covariance})
+    )
     _, own = analysed(spoiled, tmp_path / "own")
     code, table = analysed(spoiled, tmp_path / "out", "--geometry", str(path))
     assert code == 0
@@ -161,7 +186,9 @@ def test_runs_repeat_and_do_not_take_their_results_for_sets(
     assert list(second["points"]) == ["A", "B", "C"]
 
 
-def test_bad_sets_are_counted_and_named(spoiled: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_bad_sets_are_counted_and_named(
+    spoiled: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     (spoiled / "0001" / "x_sin_1.png").unlink()
     small = cv2.imread(str(spoiled / "0002" / "x_sin_0.png"), cv2.IMREAD_UNCHANGED)[:-1]
     for file in (spoiled / "0002").glob("*.png"):
@@ -172,7 +199,12 @@ def test_bad_sets_are_counted_and_named(spoiled: Path, tmp_path: Path, capsys: p
     bad = {item["set"]: item["reason"] for item in table["sets"]["bad_sets"]}
     assert "x_sin_1.png is missing" in bad["0001"]
     assert "204 x 169" in bad["0002"]
-    assert [row["verdict"] for row in rows(tmp_path / "out" / "series.csv")] == ["ok", "rejected", "rejected", "ok"]
+    assert [row["verdict"] for row in rows(tmp_path / "out" / "series.csv")] == [
+        "ok",
+        "rejected",
+        "rejected",
+        "ok",
+    ]
     said = capsys.readouterr().err
     assert "skipped 0001" in said
     assert "skipped 0002" in said
@@ -206,7 +238,9 @@ def test_two_sizes(spoiled: Path, tmp_path: Path, capsys: pytest.CaptureFixture[
     assert not (tmp_path / "out").exists()
 
 
-def test_no_set_gives_a_figure(spoiled: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_no_set_gives_a_figure(
+    spoiled: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     shutil.rmtree(spoiled / "0000")  # the reference of all
     for options in ([], ["--out", str(tmp_path / "out")]):  # what the first leaves behind is no set
         assert run(["stability", str(spoiled), *options]) == 3
@@ -224,7 +258,9 @@ def test_no_set_gives_a_figure(spoiled: Path, tmp_path: Path, capsys: pytest.Cap
         (["run", "--trials", "1"], "--trials"),
     ],
 )
-def test_bad_usage(spoiled: Path, capsys: pytest.CaptureFixture[str], arguments: list[str], text: str) -> None:
+def test_bad_usage(
+    spoiled: Path, capsys: pytest.CaptureFixture[str], arguments: list[str], text: str
+) -> None:
     (spoiled.parent / "empty").mkdir()
     (spoiled / "0000" / "result").mkdir()
     assert run(["stability", str(spoiled.parent / arguments[0]), *arguments[1:]]) == 2
@@ -233,7 +269,9 @@ def test_bad_usage(spoiled: Path, capsys: pytest.CaptureFixture[str], arguments:
     assert text in said[0]
 
 
-def test_a_folder_that_cannot_be_written(spoiled: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_folder_that_cannot_be_written(
+    spoiled: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     (tmp_path / "file").write_text("")
     assert run(["stability", str(spoiled), "--out", str(tmp_path / "file" / "out")]) == 2
     assert "cannot be written" in capsys.readouterr().err

@@ -20,7 +20,16 @@ FRAMES = 8
 @pytest.fixture(scope="module")
 def demo(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("tracking") / "demo"
-    wanted = ["--track", str(FRAMES), "--shrink", "10", "--drift-um-per-s", "10", "--laser-noise-um", "1"]
+    wanted = [
+        "--track",
+        str(FRAMES),
+        "--shrink",
+        "10",
+        "--drift-um-per-s",
+        "10",
+        "--laser-noise-um",
+        "1",
+    ]
     assert run(["simulate", str(folder), *wanted]) == 0
     return folder
 
@@ -32,8 +41,15 @@ def test_every_frame_has_a_figure(demo: Path, capsys: pytest.CaptureFixture[str]
     assert table["stepped"]
     with np.load(demo / "track/result/track.npz", allow_pickle=False) as found:
         assert set(found) == {
-            "time_s", "coeffs_um", "sigma_um", "hencky_um", "sag_um", "sag_sigma_um", "verdict", "reason"
-        }  # fmt: skip
+            "time_s",
+            "coeffs_um",
+            "sigma_um",
+            "hencky_um",
+            "sag_um",
+            "sag_sigma_um",
+            "verdict",
+            "reason",
+        }
         assert found["coeffs_um"].shape == found["sigma_um"].shape == (FRAMES, ZERNIKE_TERMS)
         truth = np.load(demo / "track/truth.npz")
         assert np.array_equal(found["time_s"], np.round(truth["time_s"], 9))
@@ -104,7 +120,10 @@ def test_frames_of_another_size_are_refused_and_missing_ones_rejected(
     assert run(["track", str(folder), "--json", "--no-pictures"]) == 0
     table = json.loads(capsys.readouterr().out)
     assert table["verdicts"] == {"ok": 5, "degraded": 0, "rejected": 3}
-    assert all(any(why in reason for reason in table["reasons"]) for why in ("missing", "pipe", "unreadable"))
+    assert all(
+        any(why in reason for reason in table["reasons"])
+        for why in ("missing", "pipe", "unreadable")
+    )
     large = folder.parent / "large"
     assert run(["simulate", str(large), "--shrink", "8"]) == 0
     shutil.copy(large / "white.png", folder / "t_00006.png")
@@ -112,7 +131,9 @@ def test_frames_of_another_size_are_refused_and_missing_ones_rejected(
     assert "t_00006.png has 306 x 256 pixels, the reference 244 x 204" in capsys.readouterr().err
 
 
-def test_no_usable_frame_is_exit_3(demo: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_no_usable_frame_is_exit_3(
+    demo: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     folder = edited(demo, tmp_path, str)
     for path in folder.glob("t_*.png"):
         shutil.copy(demo / "full/black.png", path)

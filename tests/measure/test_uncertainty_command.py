@@ -1,4 +1,6 @@
-"""`uncertainty` from the command line: sets and pairs, seeds and workers, a cluster, and one line for bad input."""
+"""`uncertainty` from the command line: sets and pairs, seeds and workers, a cluster, and one line
+for bad input.
+"""
 
 from __future__ import annotations
 
@@ -31,7 +33,9 @@ s_y = [0.0, 1.0, 0.0]
 """
 SHORT = "[geometry]\na_mm = 2672.0\nb_mm = 2871.0\nalpha_deg = 80.9\n"
 
-EXACT = "[geometry.sigmas]\n" + "".join(f"{name} = 0.0\n" for name in SigmasConfig().model_dump())  # but a, b, alpha
+EXACT = "[geometry.sigmas]\n" + "".join(
+    f"{name} = 0.0\n" for name in SigmasConfig().model_dump()
+)  # but a, b, alpha
 
 
 @pytest.fixture(scope="module")
@@ -56,13 +60,17 @@ def analysed(made: Path, tmp_path: Path) -> Callable[..., dict[str, Any]]:
     return analyse
 
 
-def test_a_set(analysed: Callable[..., dict[str, Any]], tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_set(
+    analysed: Callable[..., dict[str, Any]], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     table = analysed("--json", "--trials", "400")
     said = capsys.readouterr()
     assert json.loads(said.out) == table
     assert "no sigma is stated for any input" in said.err  # the set does not state its sigmas
     assert table["schema"] == "membrane-uncertainty/1"
-    assert table["rmse_um"]["mean"] == pytest.approx(262, rel=0.15)  # of a principal point by data sheet
+    assert table["rmse_um"]["mean"] == pytest.approx(
+        262, rel=0.15
+    )  # of a principal point by data sheet
     assert table["linear_um"]["mean"] == pytest.approx(table["rmse_um"]["mean"], rel=0.1)
     assert 0.01 < table["noise_um"]["mean"] < 0.05
     assert len(table["coeffs_sigma_um"]) == ZERNIKE_TERMS
@@ -96,7 +104,9 @@ def test_workers_change_nothing(analysed: Callable[..., dict[str, Any]]) -> None
 
 
 @pytest.mark.usefixtures("undrawn")
-def test_stated_sigmas_and_a_covariance(analysed: Callable[..., dict[str, Any]], tmp_path: Path) -> None:
+def test_stated_sigmas_and_a_covariance(
+    analysed: Callable[..., dict[str, Any]], tmp_path: Path
+) -> None:
     geometry = tmp_path / "geometry.toml"
     geometry.write_text(SHORT + "alpha_sigma_deg = 0.03\n" + EXACT)
     tenth = analysed("--geometry", str(geometry))
@@ -104,10 +114,16 @@ def test_stated_sigmas_and_a_covariance(analysed: Callable[..., dict[str, Any]],
     assert tenth["rmse_um"]["mean"] == pytest.approx(0.93, rel=0.3)
     # a and b that err together by as much in opposite directions nearly cancel
     geometry.write_text(
-        SHORT + '[covariance]\nnames = ["a_mm", "b_mm"]\nmatrix = [[4.0, -3.9], [-3.9, 4.0]]\n' + EXACT
+        SHORT
+        + '[covariance]\nnames = ["a_mm", "b_mm"]\nmatrix = [[4.0, -3.9], [-3.9, 4.0]]\n'
+        + EXACT
     )
     opposite = analysed("--geometry", str(geometry))
-    geometry.write_text(SHORT + '[covariance]\nnames = ["a_mm", "b_mm"]\nmatrix = [[4.0, 3.9], [3.9, 4.0]]\n' + EXACT)
+    geometry.write_text(
+        SHORT
+        + '[covariance]\nnames = ["a_mm", "b_mm"]\nmatrix = [[4.0, 3.9], [3.9, 4.0]]\n'
+        + EXACT
+    )
     alike = analysed("--geometry", str(geometry))
     assert opposite["rmse_um"]["mean"] < 0.5 * alike["rmse_um"]["mean"]
 
@@ -116,7 +132,9 @@ def test_stated_sigmas_and_a_covariance(analysed: Callable[..., dict[str, Any]],
 def test_general_poses(analysed: Callable[..., dict[str, Any]], tmp_path: Path) -> None:
     geometry = tmp_path / "geometry.toml"
     geometry.write_text(POSES)
-    assert analysed("--geometry", str(geometry))["rmse_um"]["mean"] > 100  # nobody is exact who does not say so
+    assert (
+        analysed("--geometry", str(geometry))["rmse_um"]["mean"] > 100
+    )  # nobody is exact who does not say so
     means = []
     for variance in (1e-12, 1.0):
         covariance = f'[covariance]\nnames = ["screen_shift_x_mm"]\nmatrix = [[{variance}]]\n'
@@ -174,10 +192,16 @@ def test_on_a_cluster(analysed: Callable[..., dict[str, Any]], cluster: list[str
 
 @pytest.mark.usefixtures("cluster")
 @pytest.mark.parametrize(
-    ("address", "code", "text"), [("tcp://nobody:1", 4, "does not answer"), ("nonsense", 2, "missing port")]
+    ("address", "code", "text"),
+    [("tcp://nobody:1", 4, "does not answer"), ("nonsense", 2, "missing port")],
 )
 def test_no_such_scheduler(
-    made: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], address: str, code: int, text: str
+    made: Path,
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
+    address: str,
+    code: int,
+    text: str,
 ) -> None:
     options = ["--out", str(tmp_path / "out"), "--scheduler", address]
     assert run(["uncertainty", str(made / "0000"), *options]) == code
@@ -203,16 +227,24 @@ def test_dask_is_not_installed(
 @pytest.mark.parametrize(
     ("text", "said"),
     [
-        (SHORT + '[covariance]\nnames = ["a_mm"]\nmatrix = [[1.0, 2.0]]\n', "needs 1 rows and columns"),
+        (
+            SHORT + '[covariance]\nnames = ["a_mm"]\nmatrix = [[1.0, 2.0]]\n',
+            "needs 1 rows and columns",
+        ),
         (SHORT + '[covariance]\nnames = ["a_mm"]\nmatrix = [[-1.0]]\n', "variance is negative"),
         (SHORT + '[covariance]\nnames = ["a_m"]\nmatrix = [[1.0]]\n', "all from"),
-        (SHORT + '[covariance]\nnames = ["camera_shift_x_mm"]\nmatrix = [[1.0]]\n', "a, b and alpha"),
+        (
+            SHORT + '[covariance]\nnames = ["camera_shift_x_mm"]\nmatrix = [[1.0]]\n',
+            "a, b and alpha",
+        ),
         (SHORT + '[covariance]\nnames = ["alpha_deg"]\nmatrix = [[2500.0]]\n', "too wide"),
         (SHORT + "[covariance]\nmatrix = [[1.0]]\n", "names"),
         ("[geometry]\na_mm = 2.672\nb_mm = 2871.0\nalpha_deg = 80.9\n", "a_mm"),
     ],
 )
-def test_bad_geometry(made: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], text: str, said: str) -> None:
+def test_bad_geometry(
+    made: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], text: str, said: str
+) -> None:
     geometry = tmp_path / "geometry.toml"
     geometry.write_text(text)
     options = ["--geometry", str(geometry), "--out", str(tmp_path / "out")]
@@ -231,7 +263,9 @@ def test_a_rejected_set(made: Path, tmp_path: Path, capsys: pytest.CaptureFixtur
     assert run(["uncertainty", str(tmp_path / "nowhere")]) == 2
 
 
-def test_a_pair_of_two_benches(made: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_pair_of_two_benches(
+    made: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     shutil.copytree(made / "0000", tmp_path / "other")
     path = tmp_path / "other" / "capture.toml"
     path.write_text(path.read_text().replace("a_mm = 2672.0", "a_mm = 2670.0"))

@@ -43,7 +43,8 @@ class Photographer:
         shift: FloatArray,
         rng: np.random.Generator,
     ) -> NDArray[np.uint8]:
-        """The picture, `unit_px` pixels a unit, its first pixel's outer corner at the plane's origin.
+        """The picture, `unit_px` pixels a unit, its first pixel's outer corner at the plane's
+        origin.
 
         A point p of the plane z = 0 is at `turn` p + `shift` in the camera.
         """
@@ -55,7 +56,9 @@ class Photographer:
         light = np.full(rays.shape[1], 128.0)
         light[inside] = 40 + picture[i[inside], j[inside]] * (160 / 255)
         shape = (self.height_px, _SIDE, self.width_px, _SIDE)
-        seen = light.reshape(shape).mean(axis=(1, 3)) + rng.normal(0, 1.0, (self.height_px, self.width_px))
+        seen = light.reshape(shape).mean(axis=(1, 3)) + rng.normal(
+            0, 1.0, (self.height_px, self.width_px)
+        )
         return np.clip(np.round(seen), 0, 255).astype(np.uint8)
 
     @cached_property
@@ -68,9 +71,14 @@ class Photographer:
         return np.stack([x, y, np.ones_like(x)]).reshape(3, -1)
 
     def straight(self, column: FloatArray, row: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Tangents of the rays through image points: the lens' formula inverted by repeated insertion."""
+        """Tangents of the rays through image points: the lens' formula inverted by repeated
+        insertion.
+        """
         k1, k2, p1, p2 = self.lens
-        xd, yd = (column - self.principal_px[0]) / self.focal_px, (row - self.principal_px[1]) / self.focal_px
+        xd, yd = (
+            (column - self.principal_px[0]) / self.focal_px,
+            (row - self.principal_px[1]) / self.focal_px,
+        )
         x, y = xd.copy(), yd.copy()
         for _ in range(20):
             r2 = x * x + y * y

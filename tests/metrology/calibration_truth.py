@@ -1,4 +1,6 @@
-"""Sets of phases from the twin's own trace: a bench whose parameters are off, a mounted film at several sags."""
+"""Sets of phases from the twin's own trace: a bench whose parameters are off, a mounted film at
+several sags.
+"""
 
 from __future__ import annotations
 
@@ -42,15 +44,21 @@ class Truth:
 
 
 def plain(truth: Truth) -> Problem:
-    """A fit of a, b and alpha alone, from what the fringes of single sets contradict: no ring, no laser's scale."""
+    """A fit of a, b and alpha alone, from what the fringes of single sets contradict: no ring, no
+    laser's scale.
+    """
     held = {p.name: 0.0 for p in ALL if p.name not in ("a_mm", "b_mm", "alpha_deg")}
     problem = truth.problem(sigmas(held))
-    # what three parameters cannot explain counts as noise, or the hand's measurements would count for nothing
+    # what three parameters cannot explain counts as noise, or the hand's measurements would count
+    # for nothing
     left = [
         np.std(residual_mm(BenchGeometry(STATED), phases, state.surface, state.vertex_z_mm))
         for phases, state in zip(problem.sets, first_states(problem), strict=True)
     ]
-    sets = [replace(p, sigma_mm=np.full_like(p.sigma_mm, own)) for p, own in zip(problem.sets, left, strict=True)]
+    sets = [
+        replace(p, sigma_mm=np.full_like(p.sigma_mm, own))
+        for p, own in zip(problem.sets, left, strict=True)
+    ]
     return replace(problem, sets=tuple(sets), references=References(0.0, 1.0, 1e6))
 
 
@@ -64,7 +72,9 @@ def make(
     prestrain: float = 0.0,
     poisson: float = 0.3,
 ) -> Truth:
-    """Sets with as few points as that and the information of all pixels; `bumped` are other values for some sets."""
+    """Sets with as few points as that and the information of all pixels; `bumped` are other values
+    for some sets.
+    """
     film = typical_film(NOMINAL_MM, 500.0, seed, prestrain, poisson)
     rng = np.random.default_rng(seed)
     sigma_mm = PIXEL_SIGMA_MM * np.sqrt(points / PIXELS)
@@ -72,7 +82,10 @@ def make(
     for k, sag_mm in enumerate(sags_mm):
         own = (bumped or {}).get(k, values)
         moved_um = 1e3 * (sag_mm - NOMINAL_MM)
-        column, row = rng.uniform(0, 2447, int(points / 0.43)), rng.uniform(0, 2047, int(points / 0.43))
+        column, row = (
+            rng.uniform(0, 2447, int(points / 0.43)),
+            rng.uniform(0, 2047, int(points / 0.43)),
+        )
         seen, inside = _traced(bench_at(STATED, own), film, moved_um, column, row, bow_mm)
         seen = seen + rng.normal(0, sigma_mm, seen.shape)
         reading_um = moved_um / (1 + own[NAMES.index("laser_relative")]) + rng.normal(0, 1.0)
@@ -82,13 +95,22 @@ def make(
 
 
 def _traced(
-    bench: BenchGeometry, film: FilmShape, moved_um: float, column: FloatArray, row: FloatArray, bow_mm: float
+    bench: BenchGeometry,
+    film: FilmShape,
+    moved_um: float,
+    column: FloatArray,
+    row: FloatArray,
+    bow_mm: float,
 ) -> tuple[FloatArray, NDArray[np.bool_]]:
     geometry = bench.geometry
     camera = CameraPose(geometry.pinhole_mm, geometry.rotation)
-    screen = ScreenPose(geometry.screen_origin_mm, geometry.screen_s_x, geometry.screen_s_y, bow_mm / 200.0**2)
+    screen = ScreenPose(
+        geometry.screen_origin_mm, geometry.screen_s_x, geometry.screen_s_y, bow_mm / 200.0**2
+    )
     rays = geometry.rays(column, row).T
-    met = trace(camera, rays, film.terms_at(moved_um), film.sag_at_mm(moved_um), -1e-3 * moved_um, screen)
+    met = trace(
+        camera, rays, film.terms_at(moved_um), film.sag_at_mm(moved_um), -1e-3 * moved_um, screen
+    )
     inside = (met.x_mm**2 + met.y_mm**2 < 475.0**2) & np.isfinite(met.s_x_mm)
     return np.stack([met.s_x_mm, met.s_y_mm])[:, inside], inside
 
@@ -109,7 +131,9 @@ def errors_um(surface: Surface, truth: Truth, index: int) -> tuple[float, float]
 
 
 def calibrated_errors_um(solution: Solution, truth: Truth, index: int = 2) -> tuple[float, float]:
-    """Of a set measured with the calibrated geometry, the vertex where the laser says, as `measure` does."""
+    """Of a set measured with the calibrated geometry, the vertex where the laser says, as `measure`
+    does.
+    """
     phases = solution.problem.sets[index]
     vertex_z_mm = -1e-3 * (phases.displacement_um - solution.problem.references.reference_um)
     return errors_um(fit_on(solution.bench, phases, 500.0, vertex_z_mm).surface, truth, index)
@@ -119,5 +143,7 @@ def stated_errors_um(truth: Truth, index: int = 2) -> tuple[float, float]:
     """Of a set measured with the stated geometry."""
     phases = truth.sets[index]
     return errors_um(
-        fit_on(BenchGeometry(STATED), phases, 500.0, -1e-3 * phases.displacement_um).surface, truth, index
+        fit_on(BenchGeometry(STATED), phases, 500.0, -1e-3 * phases.displacement_um).surface,
+        truth,
+        index,
     )

@@ -1,8 +1,9 @@
-"""Films of a second world: Foeppl's energy in Cartesian coordinates, minimised over Chebyshev polynomials.
+"""Films of a second world: Foeppl's energy in Cartesian coordinates, minimised over Chebyshev
+polynomials.
 
-It shares no code, no coordinates and no equation of equilibrium with the product: only the strain of a film,
-e_ij = (u_i,j + u_j,i + w_i w_j) / 2, the plane-stress energy and the work of the pressure. The ring's displacements
-are constraints at points of the ring, which may be of any form.
+It shares no code, no coordinates and no equation of equilibrium with the product: only the strain
+of a film, e_ij = (u_i,j + u_j,i + w_i w_j) / 2, the plane-stress energy and the work of the
+pressure. The ring's displacements are constraints at points of the ring, which may be of any form.
 """
 
 from collections.abc import Callable
@@ -30,7 +31,9 @@ class MinimalFilm:
     ) -> None:
         self._powers = [(i, j) for i in range(degree + 1) for j in range(degree + 1 - i)]
         radial, weight = legendre.leggauss(degree + 10)
-        r, angle = np.meshgrid((radial + 1) / 2, 2 * np.pi * np.arange(2 * degree + 16) / (2 * degree + 16))
+        r, angle = np.meshgrid(
+            (radial + 1) / 2, 2 * np.pi * np.arange(2 * degree + 16) / (2 * degree + 16)
+        )
         rim = 1 + wider(angle)  # r runs to the ring, wherever it is
         area = np.broadcast_to(weight / 2, r.shape) * r * rim**2 * 2 * np.pi / r.shape[0]
         x, y = (r * rim * np.cos(angle)).ravel(), (r * rim * np.sin(angle)).ravel()
@@ -68,7 +71,9 @@ class MinimalFilm:
         bowl = -0.5 * self._load ** (1 / 3)
         xy = np.linspace(-1, 1, 15)
         gx, gy = (part.ravel() for part in np.meshgrid(xy, xy))
-        paraboloid = np.linalg.lstsq(self._basis(gx, gy)[0], bowl * (1 - gx**2 - gy**2), rcond=None)[0]
+        paraboloid = np.linalg.lstsq(
+            self._basis(gx, gy)[0], bowl * (1 - gx**2 - gy**2), rcond=None
+        )[0]
         q[2 * n :] += self._inside @ (self._inside.T @ paraboloid)
         for _ in range(60):
             wx, wy = bx @ q[2 * n :], by @ q[2 * n :]

@@ -1,7 +1,7 @@
 """A forward model of the tests' own, by other means than the code under test.
 
-Zernike terms from prysm, the Hencky bowl from an integrated differential equation, slopes by central differences,
-rays met with the film by bisection, reflection by Householder's matrix.
+Zernike terms from prysm, the Hencky bowl from an integrated differential equation, slopes by
+central differences, rays met with the film by bisection, reflection by Householder's matrix.
 """
 
 from __future__ import annotations
@@ -28,7 +28,8 @@ OPTICS = OpticsConfig(camera=SMALL)
 
 @cache
 def film_solution(ring_strain: float = 0.0, poisson: float = 0.3):  # type: ignore[no-untyped-def]
-    """n, n' and the integral of rho / n, from rho = 0 (series) to 1, for the n(0) that meets the rim's condition.
+    """n, n' and the integral of rho / n, from rho = 0 (series) to 1, for the n(0) that meets the
+    rim's condition.
 
     `ring_strain` is the pre-strain over q^(2/3).
     """
@@ -40,7 +41,9 @@ def film_solution(ring_strain: float = 0.0, poisson: float = 0.3):  # type: igno
     def shoot(centre: float, dense: bool = False):  # type: ignore[no-untyped-def]
         eps = 1e-3
         start = [centre - eps**2 / (64 * centre**2), -eps / (32 * centre**2), eps**2 / (2 * centre)]
-        return solve_ivp(slope, (eps, 1), start, rtol=1e-12, atol=1e-14, dense_output=dense, method="DOP853")
+        return solve_ivp(
+            slope, (eps, 1), start, rtol=1e-12, atol=1e-14, dense_output=dense, method="DOP853"
+        )
 
     def rim(centre: float) -> float:
         n, dn, _ = shoot(centre).y[:, -1]
@@ -97,7 +100,9 @@ class Seen:
 
 def pixel_grid(camera: CameraConfig, stride: int = 1) -> tuple[FloatArray, FloatArray]:
     """Columns and rows of every `stride`-th pixel."""
-    columns, rows = np.meshgrid(np.arange(0, camera.width_px, stride), np.arange(0, camera.height_px, stride))
+    columns, rows = np.meshgrid(
+        np.arange(0, camera.width_px, stride), np.arange(0, camera.height_px, stride)
+    )
     return columns.ravel().astype(float), rows.ravel().astype(float)
 
 
@@ -130,11 +135,15 @@ def look(  # type: ignore[no-untyped-def]
     axes = np.stack([geometry.screen_s_x, geometry.screen_s_y])
     # p + k u = O' + s_x e_x + s_y e_y: three equations for s_x, s_y and k
     matrix = np.stack([*(np.broadcast_to(axis[:, None], p.shape) for axis in axes), -u], axis=1)
-    solved = np.linalg.solve(matrix.transpose(2, 0, 1), (p - geometry.screen_origin_mm[:, None]).T[:, :, None])
+    solved = np.linalg.solve(
+        matrix.transpose(2, 0, 1), (p - geometry.screen_origin_mm[:, None]).T[:, :, None]
+    )
     return Seen(rays, p, solved[:, :2, 0].T.copy())
 
 
-def fringe_frames(screen_mm: FloatArray, shifts_rad: FloatArray, period_mm: float, periods: int) -> FloatArray:
+def fringe_frames(
+    screen_mm: FloatArray, shifts_rad: FloatArray, period_mm: float, periods: int
+) -> FloatArray:
     """Intensities (N, ...) of the sinusoids at places on the screen, mean 100 and amplitude 80."""
     phase = 2 * np.pi * (screen_mm + periods * period_mm / 2) / period_mm - np.pi
     return 100 + 80 * np.cos(phase + np.asarray(shifts_rad).reshape(-1, *[1] * screen_mm.ndim))

@@ -23,7 +23,11 @@ GAINS = {"saturated": 2.0, "dark": 0.05, "flicker": 0.8}
 def bench(steps: int = 4, bits: int = 8, noise_adu: float = 0.4, shrink: int = 8) -> OpticsConfig:
     """The paper's geometry with larger pixels."""
     camera = CameraConfig(
-        width_px=2448 // shrink, height_px=2048 // shrink, pixel_um=3.45 * shrink, bits=bits, noise_adu=noise_adu
+        width_px=2448 // shrink,
+        height_px=2048 // shrink,
+        pixel_um=3.45 * shrink,
+        bits=bits,
+        noise_adu=noise_adu,
     )
     return OpticsConfig(camera=camera, pattern=PatternConfig(steps=steps))
 
@@ -56,7 +60,9 @@ def good_set(
 ) -> FrameStack:
     """A full set; with `motion_um` of the time the film moves and the laser says so."""
     shown = patterns(optics, shifts_rad)
-    readings = tuple(0.0 if motion_um is None else float(motion_um(0.1 * k)) for k in range(len(shown)))
+    readings = tuple(
+        0.0 if motion_um is None else float(motion_um(0.1 * k)) for k in range(len(shown))
+    )
     frames = _frames(optics, film, light or Light(), shifts_rad, seed, readings).copy()
     return stack_of(frames, shown, None if motion_um is None else np.array(readings))
 

@@ -1,4 +1,6 @@
-"""Bands of a pulsed backlight in the phase steps of a set: found, removed, and not mistaken for what looks alike."""
+"""Bands of a pulsed backlight in the phase steps of a set: found, removed, and not mistaken for
+what looks alike.
+"""
 
 from __future__ import annotations
 
@@ -25,7 +27,9 @@ INSIDE = np.hypot(ROW - 127.5, COLUMN - 119.5) < 115
 
 
 def phases(turned: bool = False) -> Array:
-    """Of x and y (2, height, width): 15 fringes each, bent and a little turned; x along the rows if `turned`."""
+    """Of x and y (2, height, width): 15 fringes each, bent and a little turned; x along the rows if
+    `turned`.
+    """
     across, along = 2 * np.pi * 15 * COLUMN / WIDTH, 2 * np.pi * 15 * ROW / HEIGHT
     bent = 2.0 * ((ROW - 127.5) / 128) ** 2 + 1.5 * (ROW - 127.5) * (COLUMN - 119.5) / 128**2
     x, y = across + 0.03 * along + bent, along - 0.03 * across - 0.7 * bent
@@ -43,18 +47,24 @@ def stack_of(
     shared: float = 0.0,
     flicker: float = 0.0,
 ) -> FrameStack:
-    """Steps of x, then of y, in 12 bits; bands, motion and noise of each frame, and `shared` bands of each axis."""
+    """Steps of x, then of y, in 12 bits; bands, motion and noise of each frame, and `shared` bands
+    of each axis.
+    """
     random, frames, patterns = np.random.default_rng(7), [], []
     for axis, phase in zip(("x", "y"), phases(turned), strict=True):
         for k in range(steps):
-            psi = phase + 2 * np.pi * k / steps + motion_rad * random.normal() * (1 + COLUMN / WIDTH)
+            psi = (
+                phase + 2 * np.pi * k / steps + motion_rad * random.normal() * (1 + COLUMN / WIDTH)
+            )
             shown = 0.5 + 0.5 * np.cos(psi)
             shown += bend * np.sin(np.pi * shown) ** 2
             gain = 1 + bands * np.cos(2 * np.pi * (bands_across * ROW / HEIGHT + random.random()))
             gain *= 1 + flicker * random.normal()
             gain *= 1 + shared * np.sin(2 * np.pi * bands_across * ROW / HEIGHT + (axis == "y"))
             light = np.where(INSIDE, 200 + 3000 * (1 - 0.2 * COLUMN / WIDTH) * shown * gain, 20.0)
-            frames.append(np.rint(light + random.normal(0, noise_adu, light.shape)).astype(np.uint16))
+            frames.append(
+                np.rint(light + random.normal(0, noise_adu, light.shape)).astype(np.uint16)
+            )
             patterns.append(Pattern("sin", axis, k, shift_rad=2 * np.pi * k / steps))
     return FrameStack(np.stack(frames), tuple(patterns), np.full(2 * steps, np.nan), {})
 
@@ -112,7 +122,9 @@ def test_bands_leave_the_phases(change: dict[str, float], turned: bool, share: f
     ],
 )
 def test_what_looks_like_bands_changes_nothing(change: dict[str, float]) -> None:
-    """Fringes of a bent panel and of a film that moved, noise, a lamp that flickers; three steps cannot tell."""
+    """Fringes of a bent panel and of a film that moved, noise, a lamp that flickers; three steps
+    cannot tell.
+    """
     stack = stack_of(**change)  # type: ignore[arg-type]
     binned = bin_frames(stack, 4095)
     found, same, _ = without_bands(stack, binned)
@@ -122,7 +134,9 @@ def test_what_looks_like_bands_changes_nothing(change: dict[str, float]) -> None
 
 @pytest.mark.parametrize(("bands_across", "flicker"), [(15.0, 0.0), (1.5, 0.01)])
 def test_both_axes_have_the_same_light_afterwards(bands_across: float, flicker: float) -> None:
-    """What all steps of an axis share bends no phase, but in the light of the other axis the film seems to move."""
+    """What all steps of an axis share bends no phase, but in the light of the other axis the film
+    seems to move.
+    """
     stack = stack_of(bands=0.01, shared=0.02, bands_across=bands_across, flicker=flicker)
     _, binned, _ = without_bands(stack, bin_frames(stack, 4095))
     x, y = binned.means[:4].mean(axis=0), binned.means[4:].mean(axis=0)
@@ -163,13 +177,18 @@ def test_pixels_are_measured_without_the_bands() -> None:
     index, phase = np.flatnonzero(INSIDE), phases()[1]
     still = combine_steps(stack.weights([4, 5, 6, 7]), stack.shifts_rad([4, 5, 6, 7]), 1)
     fixed = stack.design([4, 5, 6, 7]), still, index, np.zeros(index.size), phase[INSIDE], 4095
-    seen, bare = pixel_phases(stack.frames[4:], *fixed, gain[4:]), pixel_phases(stack.frames[4:], *fixed)
+    seen, bare = (
+        pixel_phases(stack.frames[4:], *fixed, gain[4:]),
+        pixel_phases(stack.frames[4:], *fixed),
+    )
     assert np.median(seen.rest_adu) < 0.25 * np.median(bare.rest_adu)
     assert np.std(seen.phase_rad - phase[INSIDE]) < 0.5 * np.std(bare.phase_rad - phase[INSIDE])
 
 
 @pytest.mark.parametrize("turned", [False, True])
-@pytest.mark.parametrize("fault", ["the other axis", "black", "one picture twice", "exchanged", "all black"])
+@pytest.mark.parametrize(
+    "fault", ["the other axis", "black", "one picture twice", "exchanged", "all black"]
+)
 def test_wrong_pictures_are_no_bands(fault: str, turned: bool) -> None:
     stack = stack_of(bands=0.0, turned=turned)
     if fault == "the other axis":
@@ -217,7 +236,10 @@ def test_bands_bend_no_figure_of_a_full_set(
     """Those of 1 % moved it by 0.1 µm, those of 16 % by micrometres or to a refusal."""
     steady = CrossedWorld(seed=1, **SIZE | CLEAN)  # type: ignore[arg-type]
     pulsed = CrossedWorld(seed=1, backlight_hz=pulses_hz, rolling_s=rolling_s, **SIZE | CLEAN)  # type: ignore[arg-type]
-    (before_um, before), (after_um, after) = measured(steady, tmp_path / "a"), measured(pulsed, tmp_path / "b")
+    (before_um, before), (after_um, after) = (
+        measured(steady, tmp_path / "a"),
+        measured(pulsed, tmp_path / "b"),
+    )
     assert np.linalg.norm((after_um - before_um)[3:]) < most_um
     assert ("bands" in after) == bool(said)
     assert said in after

@@ -12,7 +12,8 @@ from membrane_ctrl.metrology.optics.geometry import Geometry
 from membrane_ctrl.metrology.optics.surface import Surface
 from membrane_ctrl.metrology.reconstruct import Points, Tracer
 
-# 16 pixels of the paper's camera in one: bins of 4 pixels are 9 mm on the mirror, and the bias is large
+# 16 pixels of the paper's camera in one: bins of 4 pixels are 9 mm on the mirror, and the bias is
+# large
 CAMERA = CameraConfig(width_px=612, height_px=512, pixel_um=3.45 * 4)
 GEOMETRY = Geometry.from_config(OpticsConfig(camera=CAMERA))
 TRACER = Tracer(GEOMETRY, RADIUS_MM)

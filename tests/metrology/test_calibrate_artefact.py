@@ -1,4 +1,6 @@
-"""The geometry file of a calibration: readable by the others, its covariance that of the parameters."""
+"""The geometry file of a calibration: readable by the others, its covariance that of the
+parameters.
+"""
 
 from __future__ import annotations
 
@@ -12,9 +14,19 @@ from calibration_truth import OPTICS, make
 
 from membrane_ctrl.config.optics import GeometryConfig, OpticsConfig, ScreenPoseConfig
 from membrane_ctrl.metrology.calibrate.parameters import NAMES, bench_at, sigmas
-from membrane_ctrl.metrology.calibrate.solve import Origin, Solution, general_covariance, solve, tables_of
+from membrane_ctrl.metrology.calibrate.solve import (
+    Origin,
+    Solution,
+    general_covariance,
+    solve,
+    tables_of,
+)
 from membrane_ctrl.metrology.optics.geometry import Geometry
-from membrane_ctrl.metrology.uncertainty.geometry_spread import GENERAL_NAMES, GeometrySpread, changed
+from membrane_ctrl.metrology.uncertainty.geometry_spread import (
+    GENERAL_NAMES,
+    GeometrySpread,
+    changed,
+)
 from membrane_ctrl.model.plain_json import content_hash
 
 ORIGIN = Origin("2026-01-01T00:00:00+00:00", ("a", "b"), 1.0, 2.0, 1.5, 3.0, ("a note",))
@@ -35,7 +47,9 @@ def test_the_file_says_the_calibrated_bench(solution: Solution) -> None:
     bench = solution.bench
     for field in ("pinhole_mm", "rotation", "screen_origin_mm", "screen_s_x", "screen_s_y"):
         assert np.array_equal(getattr(there, field), getattr(bench.geometry, field)), field
-    assert tables["geometry"]["screen"]["bow_mm"] == pytest.approx(solution.values[NAMES.index("bow_mm")])
+    assert tables["geometry"]["screen"]["bow_mm"] == pytest.approx(
+        solution.values[NAMES.index("bow_mm")]
+    )
     assert there.face.bow_per_mm == pytest.approx(bench.geometry.face.bow_per_mm, rel=1e-14)
     assert tables["camera"]["distortion"] == list(bench.geometry.distortion)
     assert tables["pattern"]["period_mm"] == pytest.approx(OPTICS.pattern.period_mm * bench.pitch)
@@ -51,8 +65,14 @@ def test_only_what_was_free_is_written() -> None:
 
 
 def test_a_stated_bow_and_map_are_kept() -> None:
-    stated_map = {"s_x_mm": [-300, 0, 300], "s_y_mm": [-300, 300], "heights_mm": [[0.1, 0, 0.1], [0, 0, 0]]}
-    stated = OPTICS.geometry.model_copy(update={"screen": ScreenPoseConfig(bow_mm=0.5, height_map=stated_map)})
+    stated_map = {
+        "s_x_mm": [-300, 0, 300],
+        "s_y_mm": [-300, 300],
+        "heights_mm": [[0.1, 0, 0.1], [0, 0, 0]],
+    }
+    stated = OPTICS.geometry.model_copy(
+        update={"screen": ScreenPoseConfig(bow_mm=0.5, height_map=stated_map)}
+    )
     optics = OPTICS.model_copy(update={"geometry": stated})
     bench = bench_at(Geometry.from_config(optics), FREE)
     assert bench.geometry.face.bow_per_mm * 200.0**2 == pytest.approx(2.0)
@@ -67,9 +87,12 @@ def test_the_covariance_is_that_of_drawn_parameters(solution: Solution) -> None:
     freed = ("k1", "bow_mm", "pitch_relative")
     whole = GeometrySpread((*GENERAL_NAMES, *freed), covariance)  # refuses what is no covariance
     own = [NAMES.index(name) for name in freed]
-    assert whole.covariance[12:, 12:] == pytest.approx(solution.covariance[np.ix_(own, own)], rel=1e-9)
+    assert whole.covariance[12:, 12:] == pytest.approx(
+        solution.covariance[np.ix_(own, own)], rel=1e-9
+    )
     spread = GeometrySpread(GENERAL_NAMES, covariance[:12, :12])
-    # a change along one parameter, and the poses' own change by the twelve numbers that stand for it
+    # a change along one parameter, and the poses' own change by the twelve numbers that stand for
+    # it
     config = GeometryConfig.model_validate(tables_of(solution, OPTICS, ORIGIN)["geometry"])
     rng = np.random.default_rng(0)
     inverse = np.linalg.pinv(spread.correlation(), rcond=1e-10)
@@ -109,7 +132,9 @@ def test_the_hash_stands_for_the_numbers_alone(solution: Solution) -> None:
     tables = tables_of(solution, OPTICS, ORIGIN)
     there_and_back = tomllib.loads(tomli_w.dumps(tables))
     assert content_hash(there_and_back) == tables["calibration"]["hash"]
-    later = tables_of(solution, OPTICS, Origin("2027-01-01T00:00:00+00:00", ("c",), 1.0, 2.0, 1.5, 3.0))
+    later = tables_of(
+        solution, OPTICS, Origin("2027-01-01T00:00:00+00:00", ("c",), 1.0, 2.0, 1.5, 3.0)
+    )
     assert later["calibration"]["hash"] == tables["calibration"]["hash"]
     edited = copy.deepcopy(there_and_back)
     edited["geometry"]["camera"]["position_mm"][0] += 0.001

@@ -1,4 +1,6 @@
-"""The calibrate-camera and calibrate-board commands, from pictures to a prior that calibrate takes."""
+"""The calibrate-camera and calibrate-board commands, from pictures to
+a prior that calibrate takes.
+"""
 
 from __future__ import annotations
 
@@ -31,12 +33,21 @@ def bench(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A configuration, and photographs of the board as `calibrate-board` draws it."""
     root = tmp_path_factory.mktemp("camera")
     (root / "lab.toml").write_text(CONFIG)
-    size = ["--width-px", str(11 * SQUARE_PX), "--height-px", str(9 * SQUARE_PX), "--square-px", str(SQUARE_PX)]
+    size = [
+        "--width-px",
+        str(11 * SQUARE_PX),
+        "--height-px",
+        str(9 * SQUARE_PX),
+        "--square-px",
+        str(SQUARE_PX),
+    ]
     assert run(["calibrate-board", str(root / "board.png"), *size, "--board", "charuco:11x9"]) == 0
     picture = np.asarray(cv2.imread(str(root / "board.png"), cv2.IMREAD_UNCHANGED), np.uint8)
     (root / "photographs").mkdir()
     for k, image in enumerate(photographs(TRUE, picture, SQUARE_PX, 6, 3)):
-        deep = image.astype(np.uint16) * 16 if k == 2 else image  # a 12-bit camera's picture among the others
+        deep = (
+            image.astype(np.uint16) * 16 if k == 2 else image
+        )  # a 12-bit camera's picture among the others
         cv2.imwrite(str(root / "photographs" / f"{k}.png"), deep)
     cv2.imwrite(str(root / "photographs" / "wall.png"), np.full((342, 408), 77, np.uint8))
     return root
@@ -47,7 +58,9 @@ def words(bench: Path, out: Path, board: str = "charuco:11x9") -> list[str]:
     return ["calibrate-camera", str(bench / "photographs"), *names]
 
 
-def test_from_photographs_to_a_prior(bench: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_from_photographs_to_a_prior(
+    bench: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     out = tmp_path / "camera.toml"
     assert run([*words(bench, out), "--json"]) == 0
     report = json.loads(capsys.readouterr().out)
@@ -63,7 +76,9 @@ def test_from_photographs_to_a_prior(bench: Path, tmp_path: Path, capsys: pytest
         prior.over(OpticsConfig())
 
 
-def test_what_was_gained_is_said(bench: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_what_was_gained_is_said(
+    bench: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     assert run(words(bench, tmp_path / "camera.toml")) == 0
     said = capsys.readouterr().out
     assert "known before" in said
@@ -71,7 +86,9 @@ def test_what_was_gained_is_said(bench: Path, tmp_path: Path, capsys: pytest.Cap
     assert f"calibrate --prior {tmp_path / 'camera.toml'}" in said
 
 
-def test_bad_input_is_one_line(bench: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_bad_input_is_one_line(
+    bench: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     out = tmp_path / "camera.toml"
     empty = tmp_path / "empty"
     empty.mkdir()
@@ -86,7 +103,16 @@ def test_bad_input_is_one_line(bench: Path, tmp_path: Path, capsys: pytest.Captu
         (words(bench, out, "charuco:9x11"), 3, "at least 4 are needed"),
         (words(bench, out, "circles:9x11"), 2, "circles:9x11 is not a board"),
         (
-            ["calibrate-board", str(tmp_path / "b.png"), "--width-px", "90", "--height-px", "90", "--square-px", "9"],
+            [
+                "calibrate-board",
+                str(tmp_path / "b.png"),
+                "--width-px",
+                "90",
+                "--height-px",
+                "90",
+                "--square-px",
+                "9",
+            ],
             2,
             "a multiple of 8",
         ),

@@ -48,12 +48,15 @@ FREE = [k for k, name in enumerate(NAMES) if name != "bow_mm"]
 
 
 def bench_of(seed: int) -> tuple[FloatArray, Truth, Problem]:
-    """A bench that is off in everything but the bow, and sets of a stretched film with the rim's edge."""
+    """A bench that is off in everything but the bow, and sets of a stretched film with the rim's
+    edge.
+    """
     values = SIGMAS * np.random.default_rng(seed).normal(size=len(NAMES))
     values[NAMES.index("bow_mm")] = 0.0
     truth = make(values, seed, points=700, sags_mm=SAGS_MM, prestrain=3e-4, poisson=0.36)
     sets = tuple(
-        replace(phases, screen_mm=phases.screen_mm / bench_at(STATED, values).pitch) for phases in truth.sets
+        replace(phases, screen_mm=phases.screen_mm / bench_at(STATED, values).pitch)
+        for phases in truth.sets
     )
     theta = np.linspace(0, 2 * np.pi, 120, endpoint=False)
     x, y = 500.0 * np.cos(theta), 500.0 * np.sin(theta)
@@ -61,11 +64,18 @@ def bench_of(seed: int) -> tuple[FloatArray, Truth, Problem]:
     return values, truth, replace(truth.problem(SIGMAS, sets), rim=Rim(edges, 500.0, 0.2))
 
 
-def with_moved_screen(values: FloatArray, truth: Truth, base: SetPhases, seed: int, off_mm: float = 0.0) -> SetPhases:
-    """The set, and the same film, a little deeper, with the screen elsewhere; the twin traces the rays."""
+def with_moved_screen(
+    values: FloatArray, truth: Truth, base: SetPhases, seed: int, off_mm: float = 0.0
+) -> SetPhases:
+    """The set, and the same film, a little deeper, with the screen elsewhere; the twin traces the
+    rays.
+    """
     rng, bench = np.random.default_rng((seed, 1)), bench_at(STATED, values)
     there = bench.geometry
-    rail, turn = (Rotation.from_rotvec(np.radians(TURN_SIGMA_DEG) * rng.normal(size=3)).as_matrix() for _ in range(2))
+    rail, turn = (
+        Rotation.from_rotvec(np.radians(TURN_SIGMA_DEG) * rng.normal(size=3)).as_matrix()
+        for _ in range(2)
+    )
     shift_mm = rail @ np.array(SHIFT_MM) + SHIFT_SIGMA_MM * rng.normal(size=3) + [0.0, 0.0, off_mm]
     s_x, s_y = turn @ there.screen_s_x, turn @ there.screen_s_y
     screen = ScreenPose(there.screen_origin_mm + shift_mm @ there.screen_axes, s_x, s_y)
@@ -74,7 +84,9 @@ def with_moved_screen(values: FloatArray, truth: Truth, base: SetPhases, seed: i
     moved_um = 1e3 * (SAGS_MM[int(base.name[-1])] - calibration_truth.NOMINAL_MM) + DEEPER_UM
     camera, film = CameraPose(there.pinhole_mm, there.rotation), truth.film
     rays = there.rays(column, row).T
-    met = trace(camera, rays, film.terms_at(moved_um), film.sag_at_mm(moved_um), -1e-3 * moved_um, screen)
+    met = trace(
+        camera, rays, film.terms_at(moved_um), film.sag_at_mm(moved_um), -1e-3 * moved_um, screen
+    )
     seen = np.stack([met.s_x_mm, met.s_y_mm])
     inside = (np.hypot(met.x_mm, met.y_mm) < 475.0) & (np.abs(seen) < 199).all(axis=0)
     sigma = PIXEL_SIGMA_MM * np.sqrt(700 / calibration_truth.PIXELS)
@@ -93,11 +105,17 @@ def with_moved_screen(values: FloatArray, truth: Truth, base: SetPhases, seed: i
 
 
 def seen_directly(
-    values: FloatArray, tilt_deg: tuple[float, float], seed: int, name: str = "direct", glass_mm: float = 0.0
+    values: FloatArray,
+    tilt_deg: tuple[float, float],
+    seed: int,
+    name: str = "direct",
+    glass_mm: float = 0.0,
 ) -> SetPhases:
     """The screen 900 mm before the camera, by rays that meet a plane, its pixels behind glass."""
     rng, bench = np.random.default_rng((seed, 2)), bench_at(STATED, values)
-    facing = Rotation.from_euler("XYZ", [*tilt_deg, 40.0], degrees=True).as_matrix() @ np.diag([1.0, -1.0, -1.0])
+    facing = Rotation.from_euler("XYZ", [*tilt_deg, 40.0], degrees=True).as_matrix() @ np.diag(
+        [1.0, -1.0, -1.0]
+    )
     there, axes = bench.geometry, (bench.geometry.rotation.T @ facing).T
     origin = there.pinhole_mm + there.rotation.T @ np.array([*rng.normal(0, 20, 2), 900.0])
     column, row = rng.uniform(0, 2447, 1200), rng.uniform(0, 2047, 1200)
@@ -110,7 +128,14 @@ def seen_directly(
     screen_mm = seen[:, inside] / bench.pitch + rng.normal(0, sigma, (2, np.count_nonzero(inside)))
     place = column[inside], row[inside], screen_mm
     screen = screen_seen(STATED, *place)
-    return SetPhases(name, *place, np.full(screen_mm.shape[1], sigma), np.nan, artefact=screen, elsewhere=(ANYWHERE,))
+    return SetPhases(
+        name,
+        *place,
+        np.full(screen_mm.shape[1], sigma),
+        np.nan,
+        artefact=screen,
+        elsewhere=(ANYWHERE,),
+    )
 
 
 def assert_true(solution: Solution, values: FloatArray, truth: Truth, index: int) -> None:
@@ -119,20 +144,29 @@ def assert_true(solution: Solution, values: FloatArray, truth: Truth, index: int
     claim = propagate(solution, index, 475.0)
     only = replace(solution.problem, sets=(solution.problem.sets[index],))
     # `calibration_truth` counts the film of 37 mm as set 2
-    sag_um, figure_um = calibrated_errors_um(replace(solution, problem=replace(only, sets=only.sets * 3)), truth, 2)
+    sag_um, figure_um = calibrated_errors_um(
+        replace(solution, problem=replace(only, sets=only.sets * 3)), truth, 2
+    )
     assert abs(sag_um) < 3 * claim.sag_um
     assert figure_um < 3 * claim.figure_rms_um
     errors = (solution.values - values)[FREE] / solution.sigmas[FREE]
     assert np.abs(errors).max() < 4
 
 
-@pytest.mark.parametrize("seed", [2, *(pytest.param(k, marks=pytest.mark.campaign) for k in range(3, 9))])
+@pytest.mark.parametrize(
+    "seed", [2, *(pytest.param(k, marks=pytest.mark.campaign) for k in range(3, 9))]
+)
 def test_a_moved_screen_and_the_screen_itself_sharpen_the_sag_and_tell_the_truth(seed: int) -> None:
     values, truth, problem = bench_of(seed)
     far = tuple(with_moved_screen(values, truth, phases, seed) for phases in problem.sets)
     direct = seen_directly(values, (0.0, 25.0), seed), seen_directly(values, (25.0, 0.0), seed + 50)
     sag_um = {}
-    rows = {"film": problem.sets, "far": far, "direct": (*direct, *problem.sets), "both": direct + far}
+    rows = {
+        "film": problem.sets,
+        "far": far,
+        "direct": (*direct, *problem.sets),
+        "both": direct + far,
+    }
     for name, sets in rows.items():
         solution = solve(replace(problem, sets=sets))
         assert_true(solution, values, truth, len(sets) - 1)
@@ -145,7 +179,9 @@ def test_a_moved_screen_and_the_screen_itself_sharpen_the_sag_and_tell_the_truth
     assert solution.sigmas[focal] < 1e-5
 
 
-@pytest.mark.parametrize("seed", [3, *(pytest.param(k, marks=pytest.mark.campaign) for k in range(4, 9))])
+@pytest.mark.parametrize(
+    "seed", [3, *(pytest.param(k, marks=pytest.mark.campaign) for k in range(4, 9))]
+)
 def test_a_screen_seen_through_its_cover_glass_is_no_other_screen(seed: int) -> None:
     """A millimetre of glass was taken for another lens, or another screen."""
     values, truth, problem = bench_of(seed)
@@ -154,10 +190,14 @@ def test_a_screen_seen_through_its_cover_glass_is_no_other_screen(seed: int) -> 
     direct = tuple(seen_directly(values, *each, glass_mm=glass_mm) for each in tilts)
     solution = solve(replace(problem, sets=(*direct, *problem.sets)))
     assert_true(solution, values, truth, 3)
-    assert [state.elsewhere[0][-2] for state in solution.states[:2]] == pytest.approx([glass_mm] * 2, rel=0.3)
+    assert [state.elsewhere[0][-2] for state in solution.states[:2]] == pytest.approx(
+        [glass_mm] * 2, rel=0.3
+    )
 
 
-@pytest.mark.parametrize("seed", [9, *(pytest.param(k, marks=pytest.mark.campaign) for k in range(10, 16))])
+@pytest.mark.parametrize(
+    "seed", [9, *(pytest.param(k, marks=pytest.mark.campaign) for k in range(10, 16))]
+)
 def test_advised_screens_keep_their_promise(seed: int) -> None:
     values, truth, problem = bench_of(seed)
     alone = solve(problem)
@@ -192,9 +232,14 @@ def test_a_screen_seen_through_another_lens_is_named() -> None:
     other[NAMES.index("focal_relative")] += 0.01
     known = seen_directly(values, (0.0, 25.0), 5), seen_directly(values, (25.0, 0.0), 6)
     wrong = seen_directly(other, (-20.0, 10.0), 7, "later")
-    says = [each.says for each in after(solve(replace(problem, sets=(*known, *problem.sets, wrong)))) if each.fatal]
+    says = [
+        each.says
+        for each in after(solve(replace(problem, sets=(*known, *problem.sets, wrong))))
+        if each.fatal
+    ]
     assert says == [
-        "later disagrees with all the others: it shows another lens, another screen, or it was out of focus"
+        "later disagrees with all the others: it shows another lens, another screen, or it "
+        "was out of focus"
     ]
 
 
@@ -211,7 +256,9 @@ def test_derivatives_of_moved_and_seen_screens_are_those_of_the_rays() -> None:
     rng = np.random.default_rng(3)
     column, row = rng.uniform(700, 1700, 40), rng.uniform(600, 1400, 40)
     dark, ones = np.zeros((2, 40)), np.ones(40)
-    film = SetPhases("a", column, row, dark, ones, 0.0, elsewhere=(ANYWHERE,), screen=np.repeat([0, 1], 20))
+    film = SetPhases(
+        "a", column, row, dark, ones, 0.0, elsewhere=(ANYWHERE,), screen=np.repeat([0, 1], 20)
+    )
     values = SIGMAS * rng.normal(size=len(NAMES))
     direct = replace(film, screen=None, artefact=seen_directly(values, (10.0, 25.0), 3).artefact)
     surface = Surface.hencky_bowl(37.0, 500.0)
@@ -227,12 +274,18 @@ def test_derivatives_of_moved_and_seen_screens_are_those_of_the_rays() -> None:
         (chunk,) = chunks(bench, turns, phases.subset(last), surface, 0.1)
         for k, step in enumerate(1e-4 * np.eye(6)):
             whole = np.append(step, [0.0, 0.0])
-            by = (predicted(values, move + whole, phases) - predicted(values, move - whole, phases)) / 2e-4
-            assert chunk.derivatives[:, COLUMNS + k] == pytest.approx(by[:, last], rel=1e-5, abs=1e-6)
+            by = (
+                predicted(values, move + whole, phases) - predicted(values, move - whole, phases)
+            ) / 2e-4
+            assert chunk.derivatives[:, COLUMNS + k] == pytest.approx(
+                by[:, last], rel=1e-5, abs=1e-6
+            )
         for k in range(OPTICAL):
             step = np.zeros(len(NAMES))
             step[k] = 1e-3 * usual_sigma(NAMES[k])
-            by = (predicted(values + step, move, phases) - predicted(values - step, move, phases)) / (2 * step[k])
+            by = (
+                predicted(values + step, move, phases) - predicted(values - step, move, phases)
+            ) / (2 * step[k])
             assert chunk.derivatives[:, LOCAL + k] == pytest.approx(
                 by[:, last], rel=1e-4, abs=1e-5 * np.abs(by).max() + 1e-7
             )
@@ -255,8 +308,11 @@ def test_the_start_of_a_seen_screen_does_not_matter() -> None:
     direct = seen_directly(values, (0.0, 25.0), 7)
     screen = direct.artefact
     turned = Rotation.from_rotvec([0.02, 0.01, -0.03]).as_matrix()
-    other = replace(screen, origin_mm=screen.origin_mm + np.array([5.0, -3.0, 10.0]), axes=turned @ screen.axes)
+    other = replace(
+        screen, origin_mm=screen.origin_mm + np.array([5.0, -3.0, 10.0]), axes=turned @ screen.axes
+    )
     first, second = (
-        solve(replace(problem, sets=(replace(direct, artefact=each), *problem.sets))) for each in (screen, other)
+        solve(replace(problem, sets=(replace(direct, artefact=each), *problem.sets)))
+        for each in (screen, other)
     )
     assert np.abs((first.values - second.values)[FREE] / first.sigmas[FREE]).max() < 0.05

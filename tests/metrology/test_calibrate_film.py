@@ -1,4 +1,6 @@
-"""A calibration that does not trust the film: any film gives the same bench, or is refused by its name."""
+"""A calibration that does not trust the film: any film gives the same bench, or is refused by its
+name.
+"""
 
 from __future__ import annotations
 
@@ -51,7 +53,8 @@ def test_the_terms_beyond_follow_the_excess_of_any_film_of_the_law() -> None:
         x, weight = np.polynomial.legendre.leggauss(60)
         depth = 37.0 * hencky_depth(np.sqrt((x + 1) / 2), strain, poisson)
         terms = [
-            np.sum(weight / 2 * depth * np.sqrt(2 * k + 1) * np.polynomial.Legendre.basis(k)(x)) for k in (4, 5, 6, 7)
+            np.sum(weight / 2 * depth * np.sqrt(2 * k + 1) * np.polynomial.Legendre.basis(k)(x))
+            for k in (4, 5, 6, 7)
         ]
         law = FilmLaw(0.0, 0.3, 1.0, 500.0).with_sag(37.0)
         assert excess_rms() > 0
@@ -102,13 +105,19 @@ def test_residuals_that_neighbours_share_lower_the_trust_and_noise_does_not() ->
 def test_a_film_that_moved_from_the_x_to_the_y_frames_is_found_to_have_moved() -> None:
     """x of a bowl that is deeper, y of one that is less deep, unseen by the laser."""
     moved_um = np.array([0.9, -0.6, 0.0, 1.2, -0.8])
-    there, back = (make(VALUES, 9, points=500, sags_mm=tuple(SAGS_MM + s * moved_um / 2e3)) for s in (1, -1))
+    there, back = (
+        make(VALUES, 9, points=500, sags_mm=tuple(SAGS_MM + s * moved_um / 2e3)) for s in (1, -1)
+    )
     sets = []
     for x, y, still in zip(there.sets, back.sets, make(VALUES, 9, points=500).sets, strict=True):
         size = min(x.column_px.size, y.column_px.size)
         assert np.array_equal(x.column_px[:size], y.column_px[:size])
-        both = replace(x.subset(slice(size)), displacement_um=still.displacement_um, motion_sigma_um=1.0)
-        sets.append(replace(both, screen_mm=np.stack([x.screen_mm[0, :size], y.screen_mm[1, :size]])))
+        both = replace(
+            x.subset(slice(size)), displacement_um=still.displacement_um, motion_sigma_um=1.0
+        )
+        sets.append(
+            replace(both, screen_mm=np.stack([x.screen_mm[0, :size], y.screen_mm[1, :size]]))
+        )
     solution = solve(there.problem(SIGMAS, tuple(sets)))
     assert after(solution) == ()
     assert [1e3 * state.motion_mm for state in solution.states] == pytest.approx(moved_um, abs=0.3)

@@ -12,7 +12,9 @@ from membrane_ctrl.metrology.calibrate.propagate import foresee
 
 # docs/calibration.md: claims of calibrations of the twin's film, sag and figure in µm
 @pytest.mark.parametrize(("range_mm", "sag_um", "figure_um"), [(8.0, 4.2, 1.0), (2.0, 8.4, 2.0)])
-def test_it_is_what_sets_of_a_mounted_film_claim(range_mm: float, sag_um: float, figure_um: float) -> None:
+def test_it_is_what_sets_of_a_mounted_film_claim(
+    range_mm: float, sag_um: float, figure_um: float
+) -> None:
     sags_mm = (37.0 + range_mm * np.linspace(-0.5, 0.5, 5)).tolist()
     claim = foresee(OpticsConfig(), sigmas(), sags_mm, 80.0, 1.0)
     assert claim.sag_um == pytest.approx(sag_um, rel=0.15)
@@ -20,6 +22,8 @@ def test_it_is_what_sets_of_a_mounted_film_claim(range_mm: float, sag_um: float,
 
 
 def test_a_bench_that_sees_no_fringes_is_named() -> None:
-    optics = OpticsConfig(camera=CameraConfig(principal_px=(-9000.0, 1023.5)))  # looks past the mirror
+    optics = OpticsConfig(
+        camera=CameraConfig(principal_px=(-9000.0, 1023.5))
+    )  # looks past the mirror
     with pytest.raises(ValueError, match="sees no fringes in the mirror"):
         foresee(optics, sigmas(), [36.0, 38.0], 80.0, 1.0)

@@ -9,7 +9,13 @@ import pytest
 from board_photograph import Photographer, photographs
 
 from membrane_ctrl.config.schema import CameraConfig
-from membrane_ctrl.metrology.calibrate.lens import LEAST_VIEWS, Board, BoardView, calibrate_lens, on_screen
+from membrane_ctrl.metrology.calibrate.lens import (
+    LEAST_VIEWS,
+    Board,
+    BoardView,
+    calibrate_lens,
+    on_screen,
+)
 
 STATED = CameraConfig(width_px=408, height_px=342, pixel_um=20.7, focal_mm=16.0)  # 773 px
 TRUE = Photographer(408, 342, 781.3, (206.9, 167.4), (-0.12, 0.08, 4e-4, -6e-4))
@@ -40,20 +46,28 @@ def test_the_lens_is_found_within_its_sigmas(views: list[BoardView]) -> None:
 
 def test_a_plain_chessboard_says_the_same() -> None:
     board = Board.parse("chessboard:11x9")
-    lens = calibrate_lens(views_of(board, photographs(TRUE, board.draw(SQUARE_PX), SQUARE_PX, 5, 2)), STATED)
+    lens = calibrate_lens(
+        views_of(board, photographs(TRUE, board.draw(SQUARE_PX), SQUARE_PX, 5, 2)), STATED
+    )
     assert lens.focal_px == pytest.approx(TRUE.focal_px, rel=3e-3)
 
 
 def test_a_view_that_does_not_fit_is_left_out_and_named(views: list[BoardView]) -> None:
     rng = np.random.default_rng(0)
-    bad = replace(views[3], name="blurred.png", seen_px=views[3].seen_px + rng.normal(0, 3.0, views[3].seen_px.shape))
+    bad = replace(
+        views[3],
+        name="blurred.png",
+        seen_px=views[3].seen_px + rng.normal(0, 3.0, views[3].seen_px.shape),
+    )
     lens = calibrate_lens([*views, bad], STATED)
     assert lens.left_out == ("blurred.png",)
     assert lens.rms_px < 0.3
 
 
 def test_too_few_views_are_refused(views: list[BoardView]) -> None:
-    with pytest.raises(ValueError, match=f"seen in {LEAST_VIEWS - 1} photographs; at least {LEAST_VIEWS}"):
+    with pytest.raises(
+        ValueError, match=f"seen in {LEAST_VIEWS - 1} photographs; at least {LEAST_VIEWS}"
+    ):
         calibrate_lens(views[: LEAST_VIEWS - 1], STATED)
 
 
@@ -67,7 +81,9 @@ def test_the_picture_is_exact_to_the_pixel() -> None:
     assert set(np.unique(levels)) == {0, 255}
     drawn = levels[24:-24, 56:-56]
     assert drawn.shape == (9 * SQUARE_PX, 11 * SQUARE_PX)
-    blocks = drawn.reshape(9 * 8, SQUARE_PX // 8, 11 * 8, SQUARE_PX // 8)  # a module is one level throughout
+    blocks = drawn.reshape(
+        9 * 8, SQUARE_PX // 8, 11 * 8, SQUARE_PX // 8
+    )  # a module is one level throughout
     assert np.array_equal(blocks.min(axis=(1, 3)), blocks.max(axis=(1, 3)))
 
 

@@ -20,16 +20,28 @@ from membrane_ctrl.metrology.calibrate.parameters import (
     poses_at,
     sigmas,
 )
-from membrane_ctrl.metrology.calibrate.residuals import BEYOND, COLUMNS, LOCAL, MOTION, SetPhases, chunks, residual_mm
+from membrane_ctrl.metrology.calibrate.residuals import (
+    BEYOND,
+    COLUMNS,
+    LOCAL,
+    MOTION,
+    SetPhases,
+    chunks,
+    residual_mm,
+)
 from membrane_ctrl.metrology.calibrate.separable import SetState, averaged, rim_harmonics
 from membrane_ctrl.metrology.optics.geometry import Geometry
 from membrane_ctrl.metrology.optics.surface import PARAMETERS, Surface
 
 RNG = np.random.default_rng(1)
-LENS = Geometry.from_config(OpticsConfig(camera=CameraConfig(distortion=(-0.05, 0.02, 1e-3, -5e-4))))
+LENS = Geometry.from_config(
+    OpticsConfig(camera=CameraConfig(distortion=(-0.05, 0.02, 1e-3, -5e-4)))
+)
 VALUES = np.array([0.5 * p.sigma for p in ALL]) * RNG.normal(size=len(ALL))
 SURFACE = Surface.from_parameters(
-    Surface.hencky_bowl(37.0, 500.0).parameters + np.append(RNG.normal(size=PARAMETERS - 1) * 0.1, 0.0), 500.0
+    Surface.hencky_bowl(37.0, 500.0).parameters
+    + np.append(RNG.normal(size=PARAMETERS - 1) * 0.1, 0.0),
+    500.0,
 )
 
 
@@ -45,7 +57,9 @@ def test_derivatives_are_those_of_the_model() -> None:
     def predicted(values=VALUES, surface=SURFACE, z=z_mm):  # type: ignore[no-untyped-def]
         return -residual_mm(bench_at(LENS, values), phases, surface, z)
 
-    chunk = next(iter(chunks(bench_at(LENS, VALUES), pose_derivatives(LENS, VALUES), phases, SURFACE, z_mm)))
+    chunk = next(
+        iter(chunks(bench_at(LENS, VALUES), pose_derivatives(LENS, VALUES), phases, SURFACE, z_mm))
+    )
     assert chunk.derivatives.shape == (2, COLUMNS, 200)
     for column in range(COLUMNS):
         if column < PARAMETERS:
@@ -60,13 +74,19 @@ def test_derivatives_are_those_of_the_model() -> None:
         elif column == MOTION:  # a bowl that is deeper in the x frames, its ring at rest
             deeper = Surface.hencky_bowl(1e-2, 500.0).parameters
             both = [
-                predicted(surface=Surface.from_parameters(SURFACE.parameters + s * deeper, 500.0), z=z_mm - s * 1e-2)
+                predicted(
+                    surface=Surface.from_parameters(SURFACE.parameters + s * deeper, 500.0),
+                    z=z_mm - s * 1e-2,
+                )
                 for s in (0.5, -0.5)
             ]
             numeric = (both[0] - both[1]) / 1e-2 * np.array([[0.5], [-0.5]])
         elif column < LOCAL:
             steps = [np.eye(LOCAL)[column, BEYOND] * size for size in (1e-5, -1e-5)]
-            both = [predicted(surface=replace(SURFACE, beyond_mm=tuple(step.tolist()))) for step in steps]
+            both = [
+                predicted(surface=replace(SURFACE, beyond_mm=tuple(step.tolist())))
+                for step in steps
+            ]
             numeric = (both[0] - both[1]) / 2e-5
         else:
             step = np.zeros(len(NAMES))
@@ -94,7 +114,14 @@ def test_zero_parameters_are_the_stated_bench() -> None:
     bench = bench_at(LENS, np.zeros(len(NAMES)))
     assert bench.geometry.face.is_plane
     assert bench.pitch == 1
-    for field in ("pinhole_mm", "rotation", "screen_origin_mm", "screen_s_x", "screen_s_y", "principal_px"):
+    for field in (
+        "pinhole_mm",
+        "rotation",
+        "screen_origin_mm",
+        "screen_s_x",
+        "screen_s_y",
+        "principal_px",
+    ):
         assert np.allclose(getattr(bench.geometry, field), getattr(LENS, field), atol=1e-12), field
     assert bench.geometry.distortion == LENS.distortion
 
@@ -103,7 +130,9 @@ def test_a_b_alpha_are_the_papers() -> None:
     values = np.zeros(len(NAMES))
     values[:3] = 2.0, -3.0, 0.4
     there = bench_at(STATED, values).geometry
-    optics = OPTICS.model_copy(update={"geometry": GeometryConfig(a_mm=2674.0, b_mm=2868.0, alpha_deg=81.3)})
+    optics = OPTICS.model_copy(
+        update={"geometry": GeometryConfig(a_mm=2674.0, b_mm=2868.0, alpha_deg=81.3)}
+    )
     expected = Geometry.from_config(optics)
     for field in ("pinhole_mm", "rotation", "screen_origin_mm", "screen_s_x", "screen_s_y"):
         assert np.allclose(getattr(there, field), getattr(expected, field), atol=1e-9), field
@@ -132,7 +161,9 @@ def test_sigmas_free_and_hold() -> None:
 
 
 def test_camera_over_the_screen_is_refused() -> None:
-    optics = OPTICS.model_copy(update={"geometry": GeometryConfig(a_mm=2000.0, b_mm=2500.0, alpha_deg=90.0)})
+    optics = OPTICS.model_copy(
+        update={"geometry": GeometryConfig(a_mm=2000.0, b_mm=2500.0, alpha_deg=90.0)}
+    )
     with pytest.raises(ValueError, match="in line with the vertex"):
         poses_at(Geometry.from_config(optics), np.zeros(len(NAMES)) + 0j)
 
@@ -142,7 +173,8 @@ def test_rim_harmonics_are_those_of_the_surface() -> None:
     height = SURFACE.height(500 * np.cos(theta), 500 * np.sin(theta))
     mean, *waves = rim_harmonics() @ SURFACE.parameters
     series = mean + sum(
-        waves[m - 1] * np.cos(m * theta) + waves[m + 6] * np.sin(m * theta) for m in range(1, len(waves) // 2 + 1)
+        waves[m - 1] * np.cos(m * theta) + waves[m + 6] * np.sin(m * theta)
+        for m in range(1, len(waves) // 2 + 1)
     )
     assert np.allclose(series, height, atol=1e-10)
 

@@ -14,11 +14,19 @@ from membrane_ctrl.metrology.optics.geometry import Geometry, find_outline
 
 FloatArray = NDArray[np.float64]
 
-CAMERA = CameraConfig(width_px=612, height_px=512, pixel_um=13.8, distortion=(-0.1, 0.05, 3e-4, -2e-4))
+CAMERA = CameraConfig(
+    width_px=612, height_px=512, pixel_um=13.8, distortion=(-0.1, 0.05, 3e-4, -2e-4)
+)
 OPTICS = OpticsConfig(camera=CAMERA)
 STATED = Geometry.from_config(OPTICS)
 RIM_MM, RIM_Z_MM = 500.0, 37.0
-TRUE = {"a_mm": 3.0, "alpha_deg": 0.35, "camera_yaw_deg": 0.15, "camera_pitch_deg": -0.12, "camera_roll_deg": 0.1}
+TRUE = {
+    "a_mm": 3.0,
+    "alpha_deg": 0.35,
+    "camera_yaw_deg": 0.15,
+    "camera_pitch_deg": -0.12,
+    "camera_roll_deg": 0.1,
+}
 
 
 def picture(flat: bool = True) -> FloatArray:
@@ -27,9 +35,13 @@ def picture(flat: bool = True) -> FloatArray:
     a_mm = 2672.0 + TRUE["a_mm"]
     alpha = np.radians(80.9 + TRUE["alpha_deg"])
     pinhole = a_mm * np.array([np.cos(alpha), 0.0, np.sin(alpha)])
-    rows = np.array([[np.sin(alpha), 0, -np.cos(alpha)], [0, -1, 0], [-np.cos(alpha), 0, -np.sin(alpha)]])
+    rows = np.array(
+        [[np.sin(alpha), 0, -np.cos(alpha)], [0, -1, 0], [-np.cos(alpha), 0, -np.sin(alpha)]]
+    )
     for axis, name in enumerate(("camera_pitch_deg", "camera_yaw_deg", "camera_roll_deg")[::-1]):
-        rows = Rotation.from_rotvec(TRUE[name] * np.eye(3)[2 - axis], degrees=True).as_matrix() @ rows
+        rows = (
+            Rotation.from_rotvec(TRUE[name] * np.eye(3)[2 - axis], degrees=True).as_matrix() @ rows
+        )
     rays = rows.T @ own.rays
     t = (RIM_Z_MM - pinhole[2]) / rays[2]
     x, y = pinhole[:2, None] + t * rays[:2]
@@ -60,7 +72,9 @@ def test_the_pose_is_found_within_its_sigmas() -> None:
     pose = fitted(picture())
     error = pose.values - np.array([TRUE[name] for name in POSE_NAMES])
     # hand's sigmas are weighed in: what the ring says little of stays near 0
-    assert np.all(np.abs(error) < 2.5 * pose.sigmas), dict(zip(POSE_NAMES, error / pose.sigmas, strict=True))
+    assert np.all(np.abs(error) < 2.5 * pose.sigmas), dict(
+        zip(POSE_NAMES, error / pose.sigmas, strict=True)
+    )
     known = dict(zip(POSE_NAMES, pose.sigmas, strict=True))
     assert known["a_mm"] < 1.5
     assert known["camera_yaw_deg"] < 0.01

@@ -1,4 +1,6 @@
-"""Calibrations of benches whose truth is known: accuracy, covariance, bow; plain fit and no calibration beside."""
+"""Calibrations of benches whose truth is known: accuracy, covariance, bow; plain fit and no
+calibration beside.
+"""
 
 from __future__ import annotations
 
@@ -7,12 +9,24 @@ from functools import cache
 
 import numpy as np
 import pytest
-from calibration_truth import OPTICS, Truth, calibrated_errors_um, errors_um, make, plain, stated_errors_um
+from calibration_truth import (
+    OPTICS,
+    Truth,
+    calibrated_errors_um,
+    errors_um,
+    make,
+    plain,
+    stated_errors_um,
+)
 
 from membrane_ctrl.calibration.sets import known_sigmas
 from membrane_ctrl.config.optics import SigmasConfig
 from membrane_ctrl.metrology.calibrate.parameters import NAMES, sigmas
-from membrane_ctrl.metrology.calibrate.propagate import condition_number, propagate, weak_combinations
+from membrane_ctrl.metrology.calibrate.propagate import (
+    condition_number,
+    propagate,
+    weak_combinations,
+)
 from membrane_ctrl.metrology.calibrate.separable import without_waves
 from membrane_ctrl.metrology.calibrate.solve import Solution, solve
 from membrane_ctrl.metrology.calibrate.verdict import after
@@ -55,7 +69,8 @@ def test_a_plain_fit_of_a_b_alpha_is_not_enough() -> None:
 def test_the_covariance_is_true() -> None:
     free = SIGMAS > 0
     errors = np.array([(s.values - t.values)[free] / s.sigmas[free] for t, s in map(solved, SEEDS)])
-    # 12 seeds: the RMS of one parameter scatters by a fifth, that of all by less; `benchmarks` has a hundred
+    # 12 seeds: the RMS of one parameter scatters by a fifth, that of all by less; `benchmarks` has
+    # a hundred
     assert 0.85 < np.sqrt(np.mean(errors**2)) < 1.2
     assert np.all(np.sqrt(np.mean(errors**2, axis=0)) < 1.7)
     assert np.all(np.sqrt(np.mean(errors**2, axis=0)) > 0.45)
@@ -130,7 +145,9 @@ def test_a_set_whose_light_differed_between_its_frames_is_not_of_another_bench()
     assert not [finding.says for finding in after(solution) if finding.fatal]
     clean = np.sqrt([each.variance for each in solution.equations])
     assert clean[3] < 2.5 * np.median(clean)  # second order is left
-    unknown = solve(with_waves(truth, 6 * float(truth.sets[3].sigma_mm.mean()), 0.0).problem(sigmas()))
+    unknown = solve(
+        with_waves(truth, 6 * float(truth.sets[3].sigma_mm.mean()), 0.0).problem(sigmas())
+    )
     left = np.sqrt([each.variance for each in unknown.equations])
     assert left[3] > 3 * np.median(left)
 
@@ -140,11 +157,16 @@ def test_waves_that_all_sets_have_and_what_is_no_wave_stay() -> None:
     sigma_mm = float(truth.sets[3].sigma_mm.mean())
     sets = [replace(phases, period_mm=49.82) for phases in truth.sets]
     turns = [2 * np.pi * phases.screen_mm / 49.82 for phases in sets]
-    alike = [replace(p, screen_mm=p.screen_mm + 3 * sigma_mm * np.cos(t)) for p, t in zip(sets, turns, strict=True)]
+    alike = [
+        replace(p, screen_mm=p.screen_mm + 3 * sigma_mm * np.cos(t))
+        for p, t in zip(sets, turns, strict=True)
+    ]
     for some in (sets, alike):
         kept = without_waves(solution.bench, some, solution.states)
         assert all(a.screen_mm is b.screen_mm for a, b in zip(kept, some, strict=True))
-    bowl_mm = 1e-5 * sets[3].screen_mm * np.hypot(*sets[3].screen_mm)  # as of another bench: 40 sigma
+    bowl_mm = (
+        1e-5 * sets[3].screen_mm * np.hypot(*sets[3].screen_mm)
+    )  # as of another bench: 40 sigma
     sets[3] = replace(sets[3], screen_mm=sets[3].screen_mm + bowl_mm)
     kept = without_waves(solution.bench, sets, solution.states)
     assert np.std(kept[3].screen_mm - truth.sets[3].screen_mm - bowl_mm) < 0.05 * np.std(bowl_mm)
@@ -178,7 +200,9 @@ def test_one_step_settles_from_the_solution() -> None:
     truth, solution = solved(2)
     again = solve(truth.problem(SIGMAS), start=solution)
     assert len(again.changes) < len(solution.changes)
-    assert np.all(np.abs(again.values - solution.values)[SIGMAS > 0] < 0.05 * solution.sigmas[SIGMAS > 0])
+    assert np.all(
+        np.abs(again.values - solution.values)[SIGMAS > 0] < 0.05 * solution.sigmas[SIGMAS > 0]
+    )
 
 
 def test_progress_is_told() -> None:
@@ -199,7 +223,9 @@ def test_what_a_set_calls_exact_has_the_tolerance_of_a_data_sheet() -> None:
     values[NAMES.index("focal_relative")] = 1e-3
     truth = make(values, 3, points=600)
     exact = SigmasConfig(focal_relative=0.0, pitch_relative=0.0)
-    optics = OPTICS.model_copy(update={"geometry": OPTICS.geometry.model_copy(update={"sigmas": exact})})
+    optics = OPTICS.model_copy(
+        update={"geometry": OPTICS.geometry.model_copy(update={"sigmas": exact})}
+    )
     known = known_sigmas(optics, {"k1": 0.01})
     assert (known["k1"], known["focal_relative"], known["pitch_relative"]) == (0.01, 0.01, 1e-3)
     held, free = (solve(truth.problem(own)) for own in (SIGMAS, sigmas(known)))

@@ -1,4 +1,6 @@
-"""Calibration with a flat or a sphere in the mirror's place, whose rays are traced in closed form."""
+"""Calibration with a flat or a sphere in the mirror's place,
+whose rays are traced in closed form.
+"""
 
 from __future__ import annotations
 
@@ -34,7 +36,9 @@ def drawn(seed: int) -> FloatArray:
     return values
 
 
-def bench_of(values: FloatArray, seed: int, sags_mm: tuple[float, ...] = SAGS_MM) -> tuple[Truth, Problem]:
+def bench_of(
+    values: FloatArray, seed: int, sags_mm: tuple[float, ...] = SAGS_MM
+) -> tuple[Truth, Problem]:
     """Sets of a stretched film, with the rim's edge."""
     truth = make(values, seed, points=700, sags_mm=sags_mm, prestrain=3e-4, poisson=0.36)
     pitch = 1 + values[NAMES.index("pitch_relative")]  # the trace ends in true millimetres
@@ -45,12 +49,19 @@ def bench_of(values: FloatArray, seed: int, sags_mm: tuple[float, ...] = SAGS_MM
     return truth, replace(truth.problem(SIGMAS, sets), rim=Rim(edges, 500.0, 0.2))
 
 
-def looked_at(values: FloatArray, artefact: Artefact, curvature: float, vertex_mm: float, seed: int) -> SetPhases:
-    """What the camera sees in a sphere, or a flat, that leans by hand: rays meet it by a quadratic equation."""
+def looked_at(
+    values: FloatArray, artefact: Artefact, curvature: float, vertex_mm: float, seed: int
+) -> SetPhases:
+    """What the camera sees in a sphere, or a flat, that leans by hand: rays meet it by a quadratic
+    equation.
+    """
     rng, bench = np.random.default_rng(seed), bench_at(STATED, values)
     column, row = rng.uniform(0, 2447, 60_000), rng.uniform(0, 2047, 60_000)
     d, start = bench.geometry.rays(column, row), bench.geometry.pinhole_mm
-    vertex, up = np.array([0.0, 0.0, vertex_mm]), Rotation.from_rotvec([*rng.normal(0, 2e-3, 2), 0.0]).as_matrix()[2]
+    vertex, up = (
+        np.array([0.0, 0.0, vertex_mm]),
+        Rotation.from_rotvec([*rng.normal(0, 2e-3, 2), 0.0]).as_matrix()[2],
+    )
     # c |P - V|^2 = 2 up (P - V) along P = start + t d; one root lies ahead
     from_vertex = (start - vertex)[:, None]
     half = curvature * np.sum(from_vertex * d, axis=0) - up @ d
@@ -62,7 +73,9 @@ def looked_at(values: FloatArray, artefact: Artefact, curvature: float, vertex_m
     axes = bench.geometry.screen_axes
     q, out = axes @ (place - bench.geometry.screen_origin_mm[:, None]), axes @ away
     seen = (q - q[2] / out[2] * out)[:2]
-    inside = np.flatnonzero((np.hypot(*place[:2]) < 0.95 * artefact.radius_mm) & (np.abs(seen) < 199).all(axis=0))
+    inside = np.flatnonzero(
+        (np.hypot(*place[:2]) < 0.95 * artefact.radius_mm) & (np.abs(seen) < 199).all(axis=0)
+    )
     few = inside[:700]
     sigma = np.full(few.size, PIXEL_SIGMA_MM * np.sqrt(few.size / (inside.size / 60_000 * PIXELS)))
     noisy = seen[:, few] / bench.pitch + rng.normal(0, sigma[0], (2, few.size))
@@ -76,13 +89,19 @@ def with_known(problem: Problem, *known: SetPhases) -> Solution:
     return solve(more)
 
 
-def sphere(radius_mm: float, curvature_mm: float, relative: float, vertex_sigma_mm: float) -> Artefact:
+def sphere(
+    radius_mm: float, curvature_mm: float, relative: float, vertex_sigma_mm: float
+) -> Artefact:
     """As a file states it."""
-    return Artefact(1 / curvature_mm, relative / curvature_mm, 5e-5, 0.0, vertex_sigma_mm, radius_mm)
+    return Artefact(
+        1 / curvature_mm, relative / curvature_mm, 5e-5, 0.0, vertex_sigma_mm, radius_mm
+    )
 
 
 def middle_errors_um(solution: Solution, truth: Truth) -> tuple[float, float]:
-    """Error of the sag and of the figure of the film at 37 mm, whose truth `calibration_truth` counts as set 2."""
+    """Error of the sag and of the figure of the film at 37 mm, whose truth `calibration_truth`
+    counts as set 2.
+    """
     only = replace(solution.problem, sets=solution.problem.sets[-len(SAGS_MM) :])
     return calibrated_errors_um(replace(solution, problem=only), truth, 2)
 
@@ -100,7 +119,9 @@ def test_the_sphere_that_is_advised_gives_what_was_promised(seed: int) -> None:
     relative = advice.curvature_radius_sigma_mm / advice.curvature_radius_mm
     stated = sphere(advice.radius_mm, advice.curvature_radius_mm, relative, advice.vertex_sigma_mm)
     curvature = stated.curvature_per_mm + stated.curvature_sigma_per_mm * rng.normal()
-    obeyed = with_known(problem, looked_at(values, stated, curvature, advice.vertex_sigma_mm * rng.normal(), seed))
+    obeyed = with_known(
+        problem, looked_at(values, stated, curvature, advice.vertex_sigma_mm * rng.normal(), seed)
+    )
     assert after(obeyed) == ()
     claim = propagate(obeyed, 3, 475.0)
     assert claim.sag_um == pytest.approx(advice.sag_um, rel=0.1)
@@ -121,7 +142,8 @@ def test_a_sphere_that_is_not_as_stated_is_refused_by_its_name() -> None:
     (finding,) = after(with_known(problem, looked_at(values, stated, 1 / 3460.0, 0.0, 4)))
     assert finding.fatal
     assert finding.says == (
-        "known disagrees with all the others: it is not the sphere that its file states, it stood elsewhere, or it "
+        "known disagrees with all the others: it is not the sphere that its file states, it "
+        "stood elsewhere, or it "
         "was out of focus"
     )
 
@@ -133,7 +155,10 @@ def test_one_set_of_the_film_is_enough_beside_a_sphere_and_a_flat_is_true_but_ad
     stated, flat = sphere(480.0, 3400.0, 1e-4, 0.05), Artefact(0.0, 0.0, 5e-5, 0.0, 0.05, 95.0)
     seen = looked_at(values, stated, stated.curvature_per_mm, 0.0, 5)
     one = with_known(replace(problem, sets=problem.sets[2:]), seen)
-    claims = {"sphere": propagate(one, 1, 475.0).sag_um, "film": propagate(solve(problem), 2, 475.0).sag_um}
+    claims = {
+        "sphere": propagate(one, 1, 475.0).sag_um,
+        "film": propagate(solve(problem), 2, 475.0).sag_um,
+    }
     beside = with_known(problem, looked_at(values, flat, 0.0, 0.0, 6))
     claims["flat"] = propagate(beside, 3, 475.0).sag_um
     assert after(one) == after(beside) == ()
@@ -153,7 +178,8 @@ def test_terms_of_a_leaning_sphere() -> None:
     up = lean.as_matrix()[:, 2]
     terms = known.terms_mm(-up[0] / up[2], -up[1] / up[2])
     surface = replace(
-        Surface.from_parameters(terms[:ZERNIKE_TERMS], 400.0), beyond_mm=tuple(terms[ZERNIKE_TERMS:].tolist())
+        Surface.from_parameters(terms[:ZERNIKE_TERMS], 400.0),
+        beyond_mm=tuple(terms[ZERNIKE_TERMS:].tolist()),
     )
     inside = np.hypot(x, y) < 400
     assert surface.height(x, y)[inside] == pytest.approx(z[inside], abs=1e-6)

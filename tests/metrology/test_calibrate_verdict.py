@@ -14,7 +14,13 @@ from membrane_ctrl.metrology.calibrate.diagnose import bumps, left_out, suspects
 from membrane_ctrl.metrology.calibrate.parameters import NAMES, sigmas
 from membrane_ctrl.metrology.calibrate.residuals import SetPhases
 from membrane_ctrl.metrology.calibrate.solve import solve
-from membrane_ctrl.metrology.calibrate.verdict import CYCLES, CalibrationFinding, DriftMonitor, after, before
+from membrane_ctrl.metrology.calibrate.verdict import (
+    CYCLES,
+    CalibrationFinding,
+    DriftMonitor,
+    after,
+    before,
+)
 
 SIGMAS = sigmas()
 VALUES = SIGMAS * np.random.default_rng(3).normal(size=len(NAMES))
@@ -32,7 +38,9 @@ def yawed(degrees: float, *which: int) -> Truth:
     return make(VALUES, 3, points=600, bumped=dict.fromkeys(which, other))
 
 
-def judged(truth: Truth, sets: tuple[SetPhases, ...] | None = None) -> tuple[CalibrationFinding, ...]:
+def judged(
+    truth: Truth, sets: tuple[SetPhases, ...] | None = None
+) -> tuple[CalibrationFinding, ...]:
     problem = truth.problem(SIGMAS, sets)
     return before(problem) or after(solve(problem))
 
@@ -84,7 +92,11 @@ def test_laser_faults_are_named(edit: Edit, which: tuple[int, ...], says: str) -
 @pytest.mark.parametrize(
     ("edit", "which", "says"),
     [
-        (reading(lambda d: d + 50), (1,), "the film moved by 9 µm RMS while set1 was taken: hold it still"),
+        (
+            reading(lambda d: d + 50),
+            (1,),
+            "the film moved by 9 µm RMS while set1 was taken: hold it still",
+        ),
         (reading(lambda d: 1.02 * d), ALL_SETS, "the laser's scale is wrong: the optics see 0.98"),
     ],
 )
@@ -179,7 +191,9 @@ def test_a_bow_is_told_by_its_pattern() -> None:
 
 def test_a_set_with_bad_fringes_hardly_counts_and_is_named() -> None:
     rng = np.random.default_rng(1)
-    noisy = edited(lambda p: replace(p, screen_mm=p.screen_mm + rng.normal(size=p.screen_mm.shape) * 0.2), 3)
+    noisy = edited(
+        lambda p: replace(p, screen_mm=p.screen_mm + rng.normal(size=p.screen_mm.shape) * 0.2), 3
+    )
     (finding,) = judged(good(), noisy)
     assert not finding.fatal
     assert finding.sets == (3,)

@@ -16,13 +16,20 @@ def scene(steps, seed=1):
     phase = rng.uniform(-20, 20, PIXELS)
     mean, amplitude = rng.uniform(90, 130, PIXELS), rng.uniform(60, 100, PIXELS)
     shifts = equal_shifts(steps)
-    frames = mean + amplitude * np.cos(phase + shifts[:, None]) + rng.normal(0, NOISE_ADU, (steps, PIXELS))
+    frames = (
+        mean
+        + amplitude * np.cos(phase + shifts[:, None])
+        + rng.normal(0, NOISE_ADU, (steps, PIXELS))
+    )
     return frames, shifts, phase, mean, amplitude
 
 
 def checks(frames, shifts, phase, mean, amplitude):
     """The closures that can name a frame for this number of steps."""
-    out = [closure_with_phase(frames, shifts, phase), closure_with_level(frames, shifts, mean, amplitude)]
+    out = [
+        closure_with_phase(frames, shifts, phase),
+        closure_with_level(frames, shifts, mean, amplitude),
+    ]
     return out if len(shifts) == 4 else [closure(frames, shifts), *out]
 
 
@@ -58,7 +65,9 @@ def test_four_steps_alone_see_the_fault_but_blame_all_alike():
     frames, shifts, *_ = scene(4)
     frames[1] += 30
     result = closure(frames, shifts)
-    assert result.rms_adu == pytest.approx(15, rel=0.01)  # (I0 - I1 + I2 - I3) / 2 for one degree of freedom
+    assert result.rms_adu == pytest.approx(
+        15, rel=0.01
+    )  # (I0 - I1 + I2 - I3) / 2 for one degree of freedom
     np.testing.assert_allclose(result.frame_rms_adu, 7.5, rtol=0.01)
     assert result.suspect is None
     assert result.gain == 1
@@ -107,7 +116,10 @@ def test_images_and_lists_of_pixels_give_the_same():
     frames, shifts, phase, mean, amplitude = scene(4)
     image = frames.reshape(4, 50, 80)
     flat = closure_with_level(frames, shifts, mean, amplitude)
-    assert closure_with_level(image, shifts, mean.reshape(50, 80), amplitude.reshape(50, 80)).rms_adu == flat.rms_adu
+    assert (
+        closure_with_level(image, shifts, mean.reshape(50, 80), amplitude.reshape(50, 80)).rms_adu
+        == flat.rms_adu
+    )
     assert (
         closure_with_phase(image, shifts, phase.reshape(50, 80)).gain
         == closure_with_phase(frames, shifts, phase).gain
@@ -133,4 +145,6 @@ def test_a_pixel_without_any_fringe_weighs_no_more_than_others():
     frames, shifts, _, mean, amplitude = scene(4)
     frames[:, 0] = mean[0]
     result = closure_with_level(frames, shifts, mean, amplitude)
-    assert result.rms_adu == pytest.approx(np.sqrt(NOISE_ADU**2 + 2 * amplitude[0] ** 2 / 3 / PIXELS), rel=0.05)
+    assert result.rms_adu == pytest.approx(
+        np.sqrt(NOISE_ADU**2 + 2 * amplitude[0] ** 2 / 3 / PIXELS), rel=0.05
+    )

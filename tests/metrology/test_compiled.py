@@ -49,7 +49,9 @@ def place(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
 
 
 def total(folder: Path, module: str) -> tuple[float, int]:
-    """Sum of a point whose class is in a module, in a new process as it were; how often the cache had the kernel."""
+    """Sum of a point whose class is in a module, in a new process as it were; how often the cache
+    had the kernel.
+    """
     for name in MODULES:
         sys.modules.pop(name, None)
     importlib.invalidate_caches()
@@ -76,7 +78,9 @@ def test_a_torn_index_is_no_error(place: Path, left: float) -> None:
 
 
 def test_a_kernel_is_compiled_again_when_one_that_it_calls_has_changed(place: Path) -> None:
-    """Numba looks at the kernel's own file only: after an update, half of it was of the former version."""
+    """Numba looks at the kernel's own file only: after an update, half of it was of the former
+    version.
+    """
     assert total(place, "cached_former_place") == (3.0, 0)
     (place / "cached_steps.py").write_text(STEPS.replace("x + y", "2 * x + y"))
     assert [total(place, "cached_former_place") for _ in range(2)] == [(4.0, 0), (4.0, 1)]

@@ -9,7 +9,13 @@ import pytest
 
 from membrane_ctrl.model.shape_estimate import Quality, judge
 
-GOOD = Quality(modulation_share=0.35, saturated_fraction=0.0, valid_fraction=0.99, residual_urad=3.0, converged=True)
+GOOD = Quality(
+    modulation_share=0.35,
+    saturated_fraction=0.0,
+    valid_fraction=0.99,
+    residual_urad=3.0,
+    converged=True,
+)
 
 
 def test_good_cycle() -> None:

@@ -36,7 +36,9 @@ def test_the_response_is_read_backwards_whatever_a_pixels_gain():
 
 def test_a_dark_pixel_has_no_level():
     response = DisplayResponse(np.array([0.0, 200.0]), np.array([0.0, 255.0]))
-    assert np.isnan(response.shown_levels(np.full((4, 1), 10.0), np.array([10.0]), np.array([10.0]))).all()
+    assert np.isnan(
+        response.shown_levels(np.full((4, 1), 10.0), np.array([10.0]), np.array([10.0]))
+    ).all()
 
 
 def test_a_curve_that_turns_back_is_refused():

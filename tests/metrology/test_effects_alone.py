@@ -1,4 +1,6 @@
-"""One effect at a time that `measure` is not told of, rendered by a ray tracer that shares no code with it."""
+"""One effect at a time that `measure` is not told of, rendered by a ray tracer that shares no code
+with it.
+"""
 
 from __future__ import annotations
 
@@ -35,7 +37,11 @@ def test_a_film_that_moved_without_a_laser_is_in_the_bar_of_its_sag(moved_um: in
 
 @pytest.mark.parametrize(
     ("name", "doubt"),
-    [("nothing", ""), ("camera turned by 0.1 degrees", "the rim is"), ("blur of 8 px", "focus the camera")],
+    [
+        ("nothing", ""),
+        ("camera turned by 0.1 degrees", "the rim is"),
+        ("blur of 8 px", "focus the camera"),
+    ],
 )
 def test_what_a_set_says_of_itself_is_in_its_verdict(name: str, doubt: str) -> None:
     assert_held(BY_NAME[name], doubt)

@@ -1,4 +1,6 @@
-"""The metrologist's figure against closed forms, prysm, and a ray trace and a sphere fit by other means."""
+"""The metrologist's figure against closed forms, prysm, and a ray trace and a sphere fit by other
+means.
+"""
 
 from __future__ import annotations
 
@@ -40,7 +42,9 @@ def of(surface_map: figure.SurfaceMap) -> figure.Figure:
     return figure.FigureOf(surface_map, APERTURE)(surface_map)
 
 
-def bars_of(some: figure.SurfaceMap, covariance: np.ndarray, cell_slope: float = 0.0) -> figure.FigureBars:
+def bars_of(
+    some: figure.SurfaceMap, covariance: np.ndarray, cell_slope: float = 0.0
+) -> figure.FigureBars:
     """Its error bars."""
     evaluate = figure.FigureOf(some, APERTURE)
     return figure.figure_bars(evaluate, some, evaluate(some), 500.0, covariance, cell_slope)
@@ -79,14 +83,18 @@ def test_the_sphere_has_the_least_squares_of_the_distances() -> None:
     def distances(p: np.ndarray) -> np.ndarray:
         return np.linalg.norm(cloud - p[:3, None], axis=0) - p[3]
 
-    best = least_squares(distances, [0, 0, 3400, 3400], x_scale=[1, 1, 1e3, 1e3], xtol=1e-15, ftol=1e-15, gtol=1e-15)
+    best = least_squares(
+        distances, [0, 0, 3400, 3400], x_scale=[1, 1, 1e3, 1e3], xtol=1e-15, ftol=1e-15, gtol=1e-15
+    )
     found = surface.best_sphere(cloud)
     assert 1 / found.curvature_per_mm == pytest.approx(best.x[3], rel=1e-7)
     np.testing.assert_allclose(found.deviation(cloud)[0], -distances(best.x), atol=1e-6)
 
 
 def test_pv_rms_and_pvr_agree_with_prysm() -> None:
-    found = of(seen(ball(3400.0) + height_of(TrueFilm(0.0, {6: 0.01, 8: -0.004, 17: 0.002, 30: 0.001}))))
+    found = of(
+        seen(ball(3400.0) + height_of(TrueFilm(0.0, {6: 0.01, 8: -0.004, 17: 0.002, 30: 0.001})))
+    )
     other = interferogram.Interferogram(found.deviation_um, dx=float(AXIS[1] - AXIS[0]))
     assert found.numbers.irregularity_pv_um == pytest.approx(other.pv, rel=1e-12)
     assert found.numbers.irregularity_rms_um == pytest.approx(other.rms, rel=1e-9)
@@ -95,7 +103,9 @@ def test_pv_rms_and_pvr_agree_with_prysm() -> None:
 
 
 def test_terms_of_each_index_are_those_of_prysm() -> None:
-    assert [zernike.fringe(j) for j in range(1, 37)] == [tuple(fringe_to_nm(j)) for j in range(1, 37)]
+    assert [zernike.fringe(j) for j in range(1, 37)] == [
+        tuple(fringe_to_nm(j)) for j in range(1, 37)
+    ]
     assert zernike.fringe(37) == (12, 0)
     noll = [noll_to_nm(j) for j in NOLL_INDICES]
     osa = [noll[k] for k in zernike.osa_from_noll(np.arange(ZERNIKE_TERMS))]
@@ -118,12 +128,16 @@ def test_the_invariant_part_is_told_from_the_rest() -> None:
     rest_um = 5 * rho**2 * np.cos(2 * THETA) + 2 * np.sin(X / 9)
     found = of(seen(ball(3400.0) + 1e-3 * (round_um + rest_um)))
     assert found.numbers.rotational_pv_um == pytest.approx(np.ptp(round_um[INSIDE]), rel=0.04)
-    assert found.numbers.asymmetry_rms_um == pytest.approx(np.sqrt(np.mean(rest_um[INSIDE] ** 2)), rel=0.02)
+    assert found.numbers.asymmetry_rms_um == pytest.approx(
+        np.sqrt(np.mean(rest_um[INSIDE] ** 2)), rel=0.02
+    )
 
 
 def test_slopes_of_a_ripple() -> None:
     found = of(seen(ball(3400.0) + 0.002 * np.sin(2 * np.pi * X / 200)))
-    assert found.numbers.slope_rms_urad == pytest.approx(1e6 * 0.002 * 2 * np.pi / 200 / np.sqrt(2), rel=0.03)
+    assert found.numbers.slope_rms_urad == pytest.approx(
+        1e6 * 0.002 * 2 * np.pi / 200 / np.sqrt(2), rel=0.03
+    )
 
 
 def test_the_spot_of_a_paraboloid_is_a_point_in_its_focus() -> None:
@@ -155,13 +169,17 @@ def test_the_spot_agrees_with_a_ray_trace_by_householder() -> None:
 
 
 def test_the_spectrum_is_prysms_and_sees_a_ripple() -> None:
-    axis = np.linspace(-APERTURE, APERTURE, 160)  # an even number: prysm centres odd ones half a cell off
+    axis = np.linspace(
+        -APERTURE, APERTURE, 160
+    )  # an even number: prysm centres odd ones half a cell off
     x, y = np.meshgrid(axis, axis)
     inside = np.hypot(x, y) <= APERTURE
     height = np.where(inside, 1e-3 * np.cos(2 * np.pi * x / 50), np.nan)
     ripple = of(figure.SurfaceMap(axis, height, 0 * x, 0 * x))
     found = figure.power_spectrum(ripple, axis, APERTURE)
-    assert 1 / found.frequency_per_mm[np.argmax(found.density_um2_mm2)] == pytest.approx(50, rel=0.03)
+    assert 1 / found.frequency_per_mm[np.argmax(found.density_um2_mm2)] == pytest.approx(
+        50, rel=0.03
+    )
     window = np.where(inside, np.cos(np.pi / 2 * np.minimum(np.hypot(x, y) / APERTURE, 1)) ** 2, 0)
     values = np.where(inside, ripple.deviation_um, 0)
     values = values - np.sum(window * values) / np.sum(window)
@@ -179,16 +197,22 @@ def test_error_bars_are_the_scatter_of_disturbed_surfaces() -> None:
     root = np.zeros((ZERNIKE_TERMS, 3))
     root[[2, 3, 4, 10], [0, 1, 2, 1]] = 2e-3, 5e-3, 8e-3, 1e-3
     bowl = surface.Surface.hencky_bowl(37.0, 500.0)
-    true = replace(bowl, coeffs_mm=bowl.coeffs_mm + 0.1 * np.eye(ZERNIKE_TERMS)[[4, 5, 6, 9]].sum(axis=0))
+    true = replace(
+        bowl, coeffs_mm=bowl.coeffs_mm + 0.1 * np.eye(ZERNIKE_TERMS)[[4, 5, 6, 9]].sum(axis=0)
+    )
     evaluate = figure.FigureOf(seen(true.height(X, Y)), APERTURE)
     nominal = np.array(astuple(evaluate(seen(true.height(X, Y))).numbers))
     bars = bars_of(seen(true.height(X, Y)), root @ root.T)
     off = []
     for _ in range(40):
-        moved = surface.Surface.from_parameters(true.parameters + root @ random.normal(size=3), 500.0)
+        moved = surface.Surface.from_parameters(
+            true.parameters + root @ random.normal(size=3), 500.0
+        )
         off.append(np.array(astuple(evaluate(seen(moved.height(X, Y))).numbers)) - nominal)
     scatter = np.sqrt(np.mean(np.square(off), axis=0))
-    np.testing.assert_allclose(astuple(bars.numbers), scatter, rtol=0.4, atol=2e-3)  # rays: a grid's own grain
+    np.testing.assert_allclose(
+        astuple(bars.numbers), scatter, rtol=0.4, atol=2e-3
+    )  # rays: a grid's own grain
     noll = zernike_nm(2, 0, R / 500, THETA, norm=True)
     per_unit = np.polyfit((R[INSIDE] / APERTURE) ** 2, noll[INSIDE], 1)[0] / 2
     assert bars.fringe_um[3] == pytest.approx(1e3 * per_unit * 2e-3, rel=0.01)

@@ -1,4 +1,6 @@
-"""The film's material from figures of the twin's films, whose solution and projection share no code with the fit."""
+"""The film's material from figures of the twin's films, whose solution and projection share no code
+with the fit.
+"""
 
 from __future__ import annotations
 
@@ -17,7 +19,9 @@ from membrane_ctrl.model.zernike_terms import NOLL_INDICES, ZERNIKE_TERMS
 from membrane_ctrl.sim.film import stretched
 
 RADIUS_MM, REACH = 500.0, 0.95
-ROUND = [j - 2 for j in NOLL_INDICES[1:] if noll_to_nm(j)[1] == 0] + [ZERNIKE_TERMS - 1]  # and the excess
+ROUND = [j - 2 for j in NOLL_INDICES[1:] if noll_to_nm(j)[1] == 0] + [
+    ZERNIKE_TERMS - 1
+]  # and the excess
 STIFFNESS = 2.05e5
 
 
@@ -37,14 +41,19 @@ class World:
     def figures(self, seed: int) -> list[film_fit.FilmFigure]:
         """One draw."""
         rng = np.random.default_rng(seed)
-        common, wrong = self.figure_mm * rng.normal(size=ZERNIKE_TERMS), self.follows_mm * rng.normal(size=len(ROUND))
+        common, wrong = (
+            self.figure_mm * rng.normal(size=ZERNIKE_TERMS),
+            self.follows_mm * rng.normal(size=len(ROUND)),
+        )
         common[-1], wrong[-1] = common[-1] / 10, wrong[-1] / 10
         gain, offset_pa, scale = rng.normal(size=3)
         out = []
         for k, sag_mm in enumerate(self.sags_mm):
             load, profile = stretched(sag_mm / RADIUS_MM, self.prestrain, self.poisson)
             true = np.zeros(ZERNIKE_TERMS)
-            true[ROUND] = _round_terms(sag_mm * Polynomial(profile)) + wrong * (sag_mm / 36) ** self.power
+            true[ROUND] = (
+                _round_terms(sag_mm * Polynomial(profile)) + wrong * (sag_mm / 36) ** self.power
+            )
             error = self.scale * true
             seen = true + common + gain * error + rng.normal(0, 3e-6, ZERNIKE_TERMS)
             pressure = load * STIFFNESS / 0.5 * (1 + 1e-3 * scale) + offset_pa + rng.normal(0, 0.3)
@@ -64,7 +73,10 @@ class World:
 def _round_terms(height_mm: Polynomial) -> FloatArray:
     """The round terms and the excess of a height over v, by slopes at many radii."""
     rho = REACH * np.sqrt((np.arange(1500) + 0.5) / 1500)
-    slopes = [np.sqrt(2 * k + 1) * Legendre.basis(k, domain=[0, 1]).deriv()(rho**2) for k in range(1, len(ROUND))]
+    slopes = [
+        np.sqrt(2 * k + 1) * Legendre.basis(k, domain=[0, 1]).deriv()(rho**2)
+        for k in range(1, len(ROUND))
+    ]
     slopes.append(Polynomial(film_law.excess()).deriv()(rho**2) / film_law.excess_rms())
     design = np.stack([2 * rho * slope for slope in slopes], axis=1)
     return np.linalg.lstsq(design, 2 * rho * height_mm.deriv()(rho**2), rcond=None)[0]
@@ -76,7 +88,11 @@ def _fit(figures: list[film_fit.FilmFigure]) -> film_fit.FilmFit:
 
 def _z(fit: film_fit.FilmFit, world: World) -> FloatArray:
     law = fit.law
-    off = [law.prestrain - world.prestrain, law.poisson - world.poisson, np.log(law.stiffness_n_per_m / STIFFNESS)]
+    off = [
+        law.prestrain - world.prestrain,
+        law.poisson - world.poisson,
+        np.log(law.stiffness_n_per_m / STIFFNESS),
+    ]
     return np.array(off) / fit.sigmas
 
 
@@ -114,7 +130,9 @@ def test_a_ring_that_is_not_flat_is_told_from_an_uneven_strain() -> None:
     """Waves of the film's law, seen through Zernike terms of another library."""
     world = World()
     law = FilmLaw(world.prestrain, world.poisson, STIFFNESS, RADIUS_MM)
-    rho, angle = np.meshgrid(REACH * np.sqrt((np.arange(60) + 0.5) / 60), 2 * np.pi * np.arange(16) / 16)
+    rho, angle = np.meshgrid(
+        REACH * np.sqrt((np.arange(60) + 0.5) / 60), 2 * np.pi * np.arange(16) / 16
+    )
     terms, step = [6, 12, 24], 1e-5
 
     def slopes(height) -> FloatArray:  # type: ignore[no-untyped-def]
@@ -122,12 +140,17 @@ def test_a_ring_that_is_not_flat_is_told_from_an_uneven_strain() -> None:
         by_t = (height(rho, angle + step) - height(rho, angle - step)) / (2 * step) / rho
         return np.concatenate([by_r.ravel(), by_t.ravel()])
 
-    design = np.stack([slopes(lambda r, t, j=j: zernike_nm(*noll_to_nm(j), r, t, norm=True)) for j in terms], axis=1)
+    design = np.stack(
+        [slopes(lambda r, t, j=j: zernike_nm(*noll_to_nm(j), r, t, norm=True)) for j in terms],
+        axis=1,
+    )
     figures = []
     for figure in world.figures(5):
         bowl = law.with_sag(figure.sag_mm)
         flat, uneven = bowl.harmonic(2, "flat"), bowl.harmonic(2, "prestrain")
-        seen = slopes(lambda r, t, f=flat, u=uneven: r**2 * (0.3 * f(r**2) + 4e-5 * u(r**2)) * np.cos(2 * t))
+        seen = slopes(
+            lambda r, t, f=flat, u=uneven: r**2 * (0.3 * f(r**2) + 4e-5 * u(r**2)) * np.cos(2 * t)
+        )
         parameters = figure.parameters_mm.copy()
         parameters[[j - 2 for j in terms]] += np.linalg.lstsq(design, seen, rcond=None)[0]
         figures.append(replace(figure, parameters_mm=parameters))

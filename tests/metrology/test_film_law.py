@@ -1,4 +1,6 @@
-"""The film's law against an integrated differential equation, an energy in Cartesian coordinates, and its limits."""
+"""The film's law against an integrated differential equation, an energy in Cartesian coordinates,
+and its limits.
+"""
 
 from __future__ import annotations
 
@@ -16,16 +18,26 @@ RADIUS_MM = 500.0
 
 @pytest.mark.parametrize(
     ("prestrain", "poisson", "pressure_pa"),
-    [(0.0, 0.3, 600.0), (1e-3, 0.3, 600.0), (2e-5, 0.45, 300.0), (3e-2, 0.2, 900.0), (-4e-4, 0.1, 500.0)],
+    [
+        (0.0, 0.3, 600.0),
+        (1e-3, 0.3, 600.0),
+        (2e-5, 0.45, 300.0),
+        (3e-2, 0.2, 900.0),
+        (-4e-4, 0.1, 500.0),
+    ],
 )
-def test_bowl_solves_the_differential_equation(prestrain: float, poisson: float, pressure_pa: float) -> None:
+def test_bowl_solves_the_differential_equation(
+    prestrain: float, poisson: float, pressure_pa: float
+) -> None:
     law = FilmLaw(prestrain, poisson, STIFFNESS, RADIUS_MM)
     bowl = law.under(pressure_pa)
     load = pressure_pa * 0.5 / STIFFNESS
     strain = prestrain / load ** (2 / 3)
     sag_mm = RADIUS_MM * load ** (1 / 3) * film_solution(strain, poisson).y[2, -1] / 2
     assert float(bowl.sag_mm) == pytest.approx(sag_mm, rel=1e-9)
-    assert bowl.height_mm(RHO) == pytest.approx(sag_mm * hencky_depth(RHO, strain, poisson), abs=1e-9 * sag_mm)
+    assert bowl.height_mm(RHO) == pytest.approx(
+        sag_mm * hencky_depth(RHO, strain, poisson), abs=1e-9 * sag_mm
+    )
 
 
 def test_the_sag_alone_gives_the_same_film_as_the_pressure() -> None:
@@ -62,10 +74,16 @@ def test_a_film_that_no_ring_holds_is_refused() -> None:
 
 
 def test_disturbances_of_the_ring() -> None:
-    """Of the minimal energy, two films with opposite disturbances: their difference is linear to second order."""
+    """Of the minimal energy, two films with opposite disturbances: their difference is linear to
+    second order.
+    """
     law = FilmLaw(4e-4, 0.35, STIFFNESS, RADIUS_MM)
     bowl = law.under(600.0)
-    amounts: dict[tuple[HarmonicCause, int], float] = {("prestrain", 2): 6e-5, ("flat", 3): 0.1, ("round", 1): 0.5}
+    amounts: dict[tuple[HarmonicCause, int], float] = {
+        ("prestrain", 2): 6e-5,
+        ("flat", 3): 0.1,
+        ("round", 1): 0.5,
+    }
     rho, angle = 0.95 * np.sqrt(np.linspace(0, 1, 40)), 2.4 * np.arange(40)
 
     def film(sign: int) -> FloatArray:
@@ -75,9 +93,12 @@ def test_disturbances_of_the_ring() -> None:
 
         stretched, flat, wide = ring("prestrain"), ring("flat"), ring("round")
         world = MinimalFilm(
-            float(bowl.load), 0.35, lambda a: 4e-4 + stretched(a),
-            lambda a: flat(a) / RADIUS_MM, lambda a: wide(a) / RADIUS_MM,
-        )  # fmt: skip
+            float(bowl.load),
+            0.35,
+            lambda a: 4e-4 + stretched(a),
+            lambda a: flat(a) / RADIUS_MM,
+            lambda a: wide(a) / RADIUS_MM,
+        )
         return RADIUS_MM * world.height(rho * np.cos(angle), rho * np.sin(angle))
 
     expected = sum(

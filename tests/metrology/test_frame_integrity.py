@@ -1,4 +1,6 @@
-"""Every frame x every fault is named, on data new to the checker; good sets of all kinds raise no alarm."""
+"""Every frame x every fault is named, on data new to the checker; good sets of all kinds raise no
+alarm.
+"""
 
 from __future__ import annotations
 
@@ -27,10 +29,14 @@ INSIDE = np.hypot(X, Y) <= 475
 
 def error_um(surface: Surface, film: FilmShape = FILM, displacement_um: float = 0.0) -> float:
     """RMS over the analysis radius."""
-    return float(np.std((surface.height(X, Y) - film.height_mm(X, Y, displacement_um))[INSIDE]) * 1e3)
+    return float(
+        np.std((surface.height(X, Y) - film.height_mm(X, Y, displacement_um))[INSIDE]) * 1e3
+    )
 
 
-def named(kind: str, frame: str, steps: int = 4, gamma: float = 1.0) -> tuple[set[str], list[str], float | None]:
+def named(
+    kind: str, frame: str, steps: int = 4, gamma: float = 1.0
+) -> tuple[set[str], list[str], float | None]:
     """Frames flagged, reasons, and the figure's error in µm (None if rejected)."""
     stack = faulty_set(kind, frame, steps, gamma)
     try:
@@ -64,7 +70,9 @@ def test_a_twentieth_of_the_frame_before_is_seen(frame: str) -> None:
 
 
 @pytest.mark.parametrize("frame", EVERY[:-1])
-@pytest.mark.parametrize(("kind", "word"), [("dark", "dark"), ("flicker", "flicker"), ("saturated", "")])
+@pytest.mark.parametrize(
+    ("kind", "word"), [("dark", "dark"), ("flicker", "flicker"), ("saturated", "")]
+)
 def test_a_wrong_exposure_is_named(kind: str, word: str, frame: str) -> None:
     flagged, reasons, wrong = named(kind, frame)
     assert flagged == {frame}
@@ -81,7 +89,9 @@ def test_swapped_frames_are_both_named_and_put_back(frame: str) -> None:
     assert wrong < 0.05
 
 
-@pytest.mark.parametrize("frame", [p for p, name in zip(EVERY, NAMES, strict=True) if name in SINUSOIDS])
+@pytest.mark.parametrize(
+    "frame", [p for p, name in zip(EVERY, NAMES, strict=True) if name in SINUSOIDS]
+)
 def test_a_film_that_moved_behind_the_lasers_back_is_named(frame: str) -> None:
     flagged, reasons, wrong = named("moved", frame)
     assert flagged == {frame}
@@ -99,7 +109,8 @@ def test_a_film_that_moved_during_a_gray_frame_does_no_harm(frame: str) -> None:
 
 @pytest.mark.parametrize("frame", ["x_sin_1"])
 @pytest.mark.parametrize(
-    "kind", ["stale", "moved", *(pytest.param(k, marks=pytest.mark.campaign) for k in ("dark", "flicker"))]
+    "kind",
+    ["stale", "moved", *(pytest.param(k, marks=pytest.mark.campaign) for k in ("dark", "flicker"))],
 )
 def test_three_steps_have_nothing_to_spare(kind: str, frame: str) -> None:
     flagged, _, wrong = named(kind, frame, steps=3)
@@ -108,7 +119,12 @@ def test_three_steps_have_nothing_to_spare(kind: str, frame: str) -> None:
 
 
 @pytest.mark.parametrize(
-    "frame", ["x_sin_1", "y_sin_0", *(pytest.param(f, marks=pytest.mark.campaign) for f in ("x_sin_0", "y_sin_1"))]
+    "frame",
+    [
+        "x_sin_1",
+        "y_sin_0",
+        *(pytest.param(f, marks=pytest.mark.campaign) for f in ("x_sin_0", "y_sin_1")),
+    ],
 )
 def test_two_of_three_steps_that_were_swapped_are_put_back(frame: str) -> None:
     flagged, reasons, wrong = named("swapped", frame, steps=3)
@@ -182,14 +198,18 @@ def test_no_alarm_for_a_film_that_moves(steps: int, told: bool) -> None:
     optics = bench(steps)
     stack = good_set(optics, motion_um=lambda t: 5 * math.sin(2 * math.pi * 0.3 * t))
     if not told:
-        stack = type(stack)(stack.frames, stack.patterns, np.full(len(stack.patterns), math.nan), {})
+        stack = type(stack)(
+            stack.frames, stack.patterns, np.full(len(stack.patterns), math.nan), {}
+        )
     assert check(stack, optics).flags == ()
 
 
 @pytest.mark.parametrize(
     "film",
     [
-        FilmShape(37.1, 500.0, ripples=(Ripple(10.0, 60.0, 30.0),), bumps=(Bump(20.0, 100.0, 50.0, 15.0),)),
+        FilmShape(
+            37.1, 500.0, ripples=(Ripple(10.0, 60.0, 30.0),), bumps=(Bump(20.0, 100.0, 50.0, 15.0),)
+        ),
         FilmShape(37.1, 500.0, wrinkles=(Wrinkle(20.0, 24),)),
         typical_film(50.0, 500.0, seed=4),
     ],
@@ -235,7 +255,9 @@ def test_identical_frames_are_found_whichever_they_are() -> None:
 def test_geometry_that_sees_no_mirror_is_rejected() -> None:
     optics = bench()
     blind = type(optics)(
-        geometry=optics.geometry.model_copy(update={"alpha_deg": 20.0}), camera=optics.camera, pattern=optics.pattern
+        geometry=optics.geometry.model_copy(update={"alpha_deg": 20.0}),
+        camera=optics.camera,
+        pattern=optics.pattern,
     )
     stack = good_set(optics)
     stack.frames[:] = 7

@@ -27,20 +27,30 @@ class Case:
     gamma: float = 1.0
 
     def optics(self) -> OpticsConfig:
-        geometry = GeometryConfig(a_mm=2672.0, b_mm=2871.0, alpha_deg=80.9, reference_displacement_um=0.0)
+        geometry = GeometryConfig(
+            a_mm=2672.0, b_mm=2871.0, alpha_deg=80.9, reference_displacement_um=0.0
+        )
         camera = CameraConfig(width_px=204, height_px=171, pixel_um=41.4)
         optics = OpticsConfig(geometry=geometry, camera=camera)
-        return optics.model_copy(update={"pattern": optics.pattern.model_copy(update={"steps": self.steps})})
+        return optics.model_copy(
+            update={"pattern": optics.pattern.model_copy(update={"steps": self.steps})}
+        )
 
-    def stack(self, gains: dict[str, float] | None = None, swap: tuple[str, str] | None = None) -> FrameStack:
+    def stack(
+        self, gains: dict[str, float] | None = None, swap: tuple[str, str] | None = None
+    ) -> FrameStack:
         """The set's frames; `gains` are exposures of single frames, `swap` exchanges two."""
         renderer = OpticsRenderer(self.optics(), FILM, Light(gamma=self.gamma), seed=2)
         shown = pattern_sequence("frequencies", self.optics().pattern, coarser_mm=self.coarser_mm)
-        pictures = {p.name: renderer.render(p, 0.0, gain=(gains or {}).get(p.name, 1.0)) for p in shown}
+        pictures = {
+            p.name: renderer.render(p, 0.0, gain=(gains or {}).get(p.name, 1.0)) for p in shown
+        }
         if swap is not None:
             a, b = swap
             pictures[a], pictures[b] = pictures[b], pictures[a]
-        return FrameStack(np.stack([pictures[p.name] for p in shown]), tuple(shown), np.zeros(len(shown)), {})
+        return FrameStack(
+            np.stack([pictures[p.name] for p in shown]), tuple(shown), np.zeros(len(shown)), {}
+        )
 
 
 def error_um(checked: Checked, case: Case) -> float:
@@ -94,10 +104,14 @@ def test_both_first_frames_of_an_axis_are_named() -> None:
 
 
 def test_frames_in_the_wrong_place_are_no_figure() -> None:
-    """Two frames of a coarser period for each other reverse its phase: nothing agrees on a place."""
+    """Two frames of a coarser period for each other reverse its phase:
+    nothing agrees on a place.
+    """
     case = Case(coarser_mm=(61.7,))
     with pytest.raises(RejectedSetError, match="the phases of the x periods do not agree"):
-        check_frequencies(case.stack(swap=("x_sin_1_of_61.7mm", "x_sin_3_of_61.7mm")), case.optics())
+        check_frequencies(
+            case.stack(swap=("x_sin_1_of_61.7mm", "x_sin_3_of_61.7mm")), case.optics()
+        )
 
 
 def test_a_frame_that_cannot_be_read_is_left_out() -> None:

@@ -1,4 +1,6 @@
-"""Fringes alone: their frames are checked against the reference's fringe orders and light; lenses that distort."""
+"""Fringes alone: their frames are checked against the reference's fringe orders and light; lenses
+that distort.
+"""
 
 from __future__ import annotations
 
@@ -23,7 +25,9 @@ def anchor() -> Anchor:
 def fringes_of(stack: FrameStack) -> FrameStack:
     """The sinusoids alone."""
     kept = [k for k, p in enumerate(stack.patterns) if p.role == "sin"]
-    return FrameStack(stack.frames[kept], tuple(stack.patterns[k] for k in kept), stack.displacement_um[kept], {})
+    return FrameStack(
+        stack.frames[kept], tuple(stack.patterns[k] for k in kept), stack.displacement_um[kept], {}
+    )
 
 
 def error_um(surface: Surface) -> float:

@@ -15,7 +15,13 @@ from benchmarks import coverage
 from membrane_ctrl.config.schema import OpticsConfig
 from membrane_ctrl.metrology.checked import check
 from membrane_ctrl.metrology.frames.frame_stack import FrameStack
-from membrane_ctrl.metrology.full import FilmMotion, FullResult, measure_pixels, reconstruct_full, tukey
+from membrane_ctrl.metrology.full import (
+    FilmMotion,
+    FullResult,
+    measure_pixels,
+    reconstruct_full,
+    tukey,
+)
 from membrane_ctrl.metrology.optics.surface import Surface
 from membrane_ctrl.metrology.reconstruct import HeightFunction, parabola
 from membrane_ctrl.model.zernike_terms import ZERNIKE_TERMS
@@ -27,7 +33,9 @@ X, Y = np.meshgrid(*[np.linspace(-475, 475, 81)] * 2)
 INSIDE = np.hypot(X, Y) <= 475
 
 
-def measured(stack: FrameStack, optics: OpticsConfig, start: HeightFunction | None = None) -> FullResult:
+def measured(
+    stack: FrameStack, optics: OpticsConfig, start: HeightFunction | None = None
+) -> FullResult:
     """Frames to the full result."""
     checked = check(stack, optics)
     return reconstruct_full(optics, checked, measure_pixels(optics, checked), start)
@@ -61,7 +69,9 @@ def test_a_shape_of_36_terms_comes_back_to_a_nanometre() -> None:
 
 
 def test_16_bit_frames_without_noise_cost_little_more() -> None:
-    """Rounding to 1/65535 at an amplitude of 25000 is 1e-5 rad a pixel; the fit averages 30 000 of them."""
+    """Rounding to 1/65535 at an amplitude of 25000 is 1e-5 rad a pixel; the fit averages 30 000 of
+    them.
+    """
     film = FilmShape(37.1, 500.0, bowl="paraboloid", zernike_um=FILM.zernike_um)
     optics = bench(bits=16, noise_adu=0.0)
     error = surface_error_um(measured(good_set(optics, film), optics).surface, film)
@@ -97,12 +107,17 @@ def test_all_starts_agree(start: HeightFunction) -> None:
 def test_noise_repeats_to_ten_nanometres() -> None:
     """On 1/16 of the pixels noise counts four times: 40 nm here are the 10 nm of a full picture."""
     optics = bench(shrink=4)
-    maps = [measured(good_set(optics, seed=seed), optics).surface.height(X, Y)[INSIDE] for seed in (1, 2)]
+    maps = [
+        measured(good_set(optics, seed=seed), optics).surface.height(X, Y)[INSIDE]
+        for seed in (1, 2)
+    ]
     assert 1e6 * float(np.std(maps[0] - maps[1])) / math.sqrt(2) <= 40.0
 
 
 def test_motion_is_taken_out_of_the_phase() -> None:
-    """From frame to frame of an axis by the fringes, from x to y by the laser, whose noise is a micrometre."""
+    """From frame to frame of an axis by the fringes, from x to y by the laser, whose noise is a
+    micrometre.
+    """
     optics, rng = bench(), np.random.default_rng(2)
     stack = good_set(optics, motion_um=lambda t: 5 * math.sin(2 * math.pi * 0.3 * t))
     mean_um, noise_um = stack.mean_reading_um, rng.standard_normal(len(stack.patterns))
@@ -130,18 +145,33 @@ def test_motion_is_taken_out_of_the_phase() -> None:
 def test_noisy_pictures_move_no_film_and_hide_no_motion(
     motion_um: Callable[[float], float], most_um: float, most_left_um: float
 ) -> None:
-    """The laser tells a motion from x to y with a noise of 0.7 µm, most of which was taken out of a film at rest."""
-    optics, rng, off_um, sigma_um, left_um, film_um = bench(noise_adu=3.0), np.random.default_rng(6), [], [], [], []
+    """The laser tells a motion from x to y with a noise of 0.7 µm, most of which was taken out of a
+    film at rest.
+    """
+    optics, rng, off_um, sigma_um, left_um, film_um = (
+        bench(noise_adu=3.0),
+        np.random.default_rng(6),
+        [],
+        [],
+        [],
+        [],
+    )
     for seed in (1, 2, 3):
         stack = good_set(optics, motion_um=motion_um, seed=seed)
         checked, place_um = check(stack, optics), stack.displacement_um
         for _ in range(30):
-            noisy = replace(checked.stack, displacement_um=place_um + rng.standard_normal(place_um.size))
+            noisy = replace(
+                checked.stack, displacement_um=place_um + rng.standard_normal(place_um.size)
+            )
             film = FilmMotion.of(replace(checked, stack=noisy))
             told_um = [told * film.worth_correcting for told in film.told_um]
-            off = [told - place_um[used] for told, used in zip(told_um, checked.view.used, strict=True)]
+            off = [
+                told - place_um[used] for told, used in zip(told_um, checked.view.used, strict=True)
+            ]
             off_um.append(off[0].mean() - off[1].mean())
-            sigma_um.append(math.hypot(film.x_to_y_sigma_um, told_um[0].mean() - film.told_um[0].mean()))
+            sigma_um.append(
+                math.hypot(film.x_to_y_sigma_um, told_um[0].mean() - film.told_um[0].mean())
+            )
             left_um += [np.std(one) for one in off]
         budget = coverage.measured(stack, optics)[1].budget
         film_um.append(next(source.sigma for source in budget.sources if source.name == "film_um"))
@@ -152,16 +182,27 @@ def test_noisy_pictures_move_no_film_and_hide_no_motion(
 
 
 @pytest.mark.parametrize(("flicker", "swing_um"), [(0.02, 0.0), (0.0, 14.0)], ids=["lamp", "film"])
-def test_the_frames_say_what_light_they_had_and_where_the_film_was(flicker: float, swing_um: float) -> None:
-    """Beside the light of their own axis, in which both leave waves, they would say a tenth too little."""
+def test_the_frames_say_what_light_they_had_and_where_the_film_was(
+    flicker: float, swing_um: float
+) -> None:
+    """Beside the light of their own axis, in which both leave waves, they would say a tenth too
+    little.
+    """
     optics, rng, shown = bench(), np.random.default_rng(4), patterns(bench())
-    renderer, place_um = OpticsRenderer(optics, FILM, seed=1), swing_um * np.sin(0.4 * np.arange(len(shown)))
+    renderer, place_um = (
+        OpticsRenderer(optics, FILM, seed=1),
+        swing_um * np.sin(0.4 * np.arange(len(shown))),
+    )
     gains = 1 + flicker * rng.standard_normal(len(shown))
-    frames = [renderer.render(*one, gain=gain) for *one, gain in zip(shown, place_um, gains, strict=True)]
+    frames = [
+        renderer.render(*one, gain=gain) for *one, gain in zip(shown, place_um, gains, strict=True)
+    ]
     checked = check(stack_of(np.stack(frames), shown), optics)
     light = np.ones((2, len(gains))) if checked.stack.light is None else checked.stack.light
     for used, seen_um in zip(checked.view.used, np.split(checked.film_um, 2), strict=True):
-        assert light[1, used] == pytest.approx(gains[used] / gains[used].mean(), abs=4e-4 if flicker else 1e-12)
+        assert light[1, used] == pytest.approx(
+            gains[used] / gains[used].mean(), abs=4e-4 if flicker else 1e-12
+        )
         true_um = place_um[used] - place_um[used].mean()
         assert seen_um - seen_um.mean() == pytest.approx(true_um, abs=0.3)
     assert checked.light_left < 3e-4 + (swing_um > 0) * 1e-3
@@ -169,21 +210,29 @@ def test_the_frames_say_what_light_they_had_and_where_the_film_was(flicker: floa
 
 @pytest.mark.parametrize(("flicker", "drift"), [(0.02, 0.0), (0.0, 0.05)], ids=["lamp", "ambient"])
 def test_light_that_differs_between_the_frames_is_taken_out(flicker: float, drift: float) -> None:
-    """Two hundredths of flicker bend the figure by 0.3 µm, an ambient light that grows by a twentieth by 0.14."""
+    """Two hundredths of flicker bend the figure by 0.3 µm, an ambient light that grows by a
+    twentieth by 0.14.
+    """
     optics, rng = bench(), np.random.default_rng(8)
     stack = good_set(optics)
     quiet = measured(stack, optics).surface.height(X, Y)
     white = stack.frames[-2].astype(float)
     for k, frame in enumerate(stack.frames):
-        lit = frame * (1 + flicker * rng.standard_normal()) + drift * white / 2 * k / len(stack.frames)
+        lit = frame * (1 + flicker * rng.standard_normal()) + drift * white / 2 * k / len(
+            stack.frames
+        )
         stack.frames[k] = np.clip(np.rint(lit), 0, 255)
     uneven = measured(stack, optics)
-    assert 1e3 * float(np.std((uneven.surface.height(X, Y) - quiet)[INSIDE])) <= 0.08  # of new noise: 0.03
+    assert (
+        1e3 * float(np.std((uneven.surface.height(X, Y) - quiet)[INSIDE])) <= 0.08
+    )  # of new noise: 0.03
     assert uneven.quality.residual_urad < 6  # of noise; 15 with the light left in
 
 
 def test_ripple_and_dent_are_in_the_map_and_not_in_the_fit() -> None:
-    film = FilmShape(37.1, 500.0, ripples=(Ripple(1.0, 80.0, 30.0),), bumps=(Bump(-2.0, 120.0, -60.0, 25.0),))
+    film = FilmShape(
+        37.1, 500.0, ripples=(Ripple(1.0, 80.0, 30.0),), bumps=(Bump(-2.0, 120.0, -60.0, 25.0),)
+    )
     optics = bench(shrink=4)
     result = measured(good_set(optics, film), optics)
     # cells of 2 mm: the vertex' own ripple is an offset of all
@@ -220,7 +269,10 @@ def test_fringes_lean_on_their_reference() -> None:
     sinusoids = [k for k, p in enumerate(full.patterns) if p.role == "sin"]
     moved = good_set(optics, motion_um=lambda _t: 30.0, seed=2)
     stack = FrameStack(
-        moved.frames[sinusoids], tuple(full.patterns[k] for k in sinusoids), moved.displacement_um[sinusoids], {}
+        moved.frames[sinusoids],
+        tuple(full.patterns[k] for k in sinusoids),
+        moved.displacement_um[sinusoids],
+        {},
     )
     geometry = optics.geometry.model_copy(update={"reference_displacement_um": 0.0})
     optics = optics.model_copy(update={"geometry": geometry})

@@ -5,7 +5,12 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from membrane_ctrl.config.optics import CameraPoseConfig, GeometryConfig, OpticsConfig, ScreenPoseConfig
+from membrane_ctrl.config.optics import (
+    CameraPoseConfig,
+    GeometryConfig,
+    OpticsConfig,
+    ScreenPoseConfig,
+)
 from membrane_ctrl.metrology.optics.geometry import Geometry
 from membrane_ctrl.metrology.uncertainty.geometry_spread import (
     GENERAL_NAMES,
@@ -24,7 +29,9 @@ def _general() -> GeometryConfig:
     poses = Geometry.from_config(OpticsConfig(geometry=SHORT))
     rows = [tuple(row) for row in poses.rotation.tolist()]
     return GeometryConfig(
-        camera=CameraPoseConfig(position_mm=tuple(poses.pinhole_mm.tolist()), rotation=(rows[0], rows[1], rows[2])),
+        camera=CameraPoseConfig(
+            position_mm=tuple(poses.pinhole_mm.tolist()), rotation=(rows[0], rows[1], rows[2])
+        ),
         screen=ScreenPoseConfig(
             origin_mm=tuple(poses.screen_origin_mm.tolist()),
             s_x=tuple(poses.screen_s_x.tolist()),
@@ -66,7 +73,9 @@ def test_general_form_is_shifted_and_turned_about_its_own_origin() -> None:
     # d v = w x v to first order
     axis = before.rotation[2]
     assert after.rotation[2] - axis == pytest.approx(np.cross([0, 1e-3, 0], axis), abs=1e-6)
-    assert after.screen_s_y - before.screen_s_y == pytest.approx(np.cross([0, 0, 2e-3], before.screen_s_y), abs=3e-6)
+    assert after.screen_s_y - before.screen_s_y == pytest.approx(
+        np.cross([0, 0, 2e-3], before.screen_s_y), abs=3e-6
+    )
 
 
 def test_nothing_named_changes_nothing() -> None:
@@ -92,7 +101,9 @@ def test_refuses(names: tuple[str, ...], covariance: np.ndarray, text: str) -> N
 
 
 def test_names_of_the_other_form() -> None:
-    with pytest.raises(ValueError, match="camera_shift_x_mm: the geometry is given by a, b and alpha"):
+    with pytest.raises(
+        ValueError, match="camera_shift_x_mm: the geometry is given by a, b and alpha"
+    ):
         changed(SHORT, GENERAL_NAMES[:1], [1.0])
     with pytest.raises(ValueError, match="a_mm: the geometry is given by two poses"):
         changed(_general(), PAPER_SPREAD.names[:1], [1.0])

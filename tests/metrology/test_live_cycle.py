@@ -1,4 +1,6 @@
-"""The live cycle on frames rendered by the twin, an exact forward model that shares no code with it."""
+"""The live cycle on frames rendered by the twin, an exact forward model that shares no code with
+it.
+"""
 
 from __future__ import annotations
 
@@ -20,7 +22,11 @@ from membrane_ctrl.metrology.frames import bands
 from membrane_ctrl.metrology.live import LiveReconstructor
 from membrane_ctrl.metrology.optics.geometry import Geometry
 from membrane_ctrl.metrology.phase import fringe_sequence, full_sequence
-from membrane_ctrl.metrology.uncertainty.geometry_spread import PAPER_SPREAD, GeometrySpread, changed
+from membrane_ctrl.metrology.uncertainty.geometry_spread import (
+    PAPER_SPREAD,
+    GeometrySpread,
+    changed,
+)
 from membrane_ctrl.model.shape_estimate import ShapeEstimate
 from membrane_ctrl.model.zernike_terms import ZERNIKE_TERMS
 from membrane_ctrl.sim.optics.camera import OpticsRenderer
@@ -48,11 +54,15 @@ def _render(
     patterns = full_sequence(optics.pattern) if kind == "full" else fringe_sequence(optics.pattern)
     where = np.broadcast_to(np.asarray(displacement_um, float), len(patterns)).copy()
     renderer = _renderer(optics, light or Light())
-    frames = [renderer.render(pattern, d).copy() for pattern, d in zip(patterns, where, strict=True)]
+    frames = [
+        renderer.render(pattern, d).copy() for pattern, d in zip(patterns, where, strict=True)
+    ]
     return frames, 0.1 * np.arange(len(patterns)), where
 
 
-def _live(optics: OpticsConfig = OPTICS, light: Light | None = None, bin_px: int = 1) -> LiveReconstructor:
+def _live(
+    optics: OpticsConfig = OPTICS, light: Light | None = None, bin_px: int = 1
+) -> LiveReconstructor:
     """A reconstructor after its first full cycle at displacement 0."""
     live = LiveReconstructor(optics, bin_px)
     first = live.full(*_render("full", 0.0, optics, light))
@@ -60,10 +70,14 @@ def _live(optics: OpticsConfig = OPTICS, light: Light | None = None, bin_px: int
     return live
 
 
-def _error_um(live: LiveReconstructor, estimate: ShapeEstimate, displacement_um: float) -> tuple[float, float]:
+def _error_um(
+    live: LiveReconstructor, estimate: ShapeEstimate, displacement_um: float
+) -> tuple[float, float]:
     """RMS and largest error of the height inside the analysis radius."""
     x, y, h = live.height_map(estimate.coeffs_um, estimate.hencky_um, 96)
-    truth = FilmShape(37.1 + displacement_um / 1e3, 500.0, "hencky", ZERNIKE_UM).height_mm(*np.meshgrid(x, y), 0.0)
+    truth = FilmShape(37.1 + displacement_um / 1e3, 500.0, "hencky", ZERNIKE_UM).height_mm(
+        *np.meshgrid(x, y), 0.0
+    )
     error = 1e3 * (h - truth)[np.isfinite(h)]
     return float(np.sqrt(np.mean(error**2))), float(np.abs(error).max())
 
@@ -75,7 +89,9 @@ def test_full_cycle(bin_px: int) -> None:
     estimate = live.full(frames, times, where)
     assert (estimate.verdict, estimate.reason, estimate.kind) == ("ok", "", "full")
     rms, worst = _error_um(live, estimate, 0.0)
-    assert rms <= 0.05  # 0.4 ADU of noise on 1/64 of the real sensor's pixels: 8 times the 3 nm there
+    assert (
+        rms <= 0.05
+    )  # 0.4 ADU of noise on 1/64 of the real sensor's pixels: 8 times the 3 nm there
     assert worst <= 0.3
     assert estimate.sag_um == pytest.approx(37100, abs=5 * estimate.sag_sigma_um)
     assert estimate.valid_fraction == pytest.approx(1, abs=0.02)
@@ -109,20 +125,27 @@ def test_jump_beyond_half_a_fringe_asks_for_a_full_cycle(jump_um: float) -> None
     assert lost.tracking_lost
     assert lost.reason.startswith("tracking lost")
     assert np.isnan(lost.coeffs_um).all()
-    assert live.fringes(*_render("fringes", 0.0)).verdict == "ok"  # the old orders are still good there
+    assert (
+        live.fringes(*_render("fringes", 0.0)).verdict == "ok"
+    )  # the old orders are still good there
     again = live.full(*_render("full", jump_um))
     assert again.verdict == "ok"
     assert _error_um(live, again, jump_um)[0] <= 0.05
 
 
 def test_knock_that_looks_like_a_small_tilt_the_other_way() -> None:
-    """5.5 mrad of tilt move every phase by 1.27 half periods: seen as -0.73, below the guard at every point."""
+    """5.5 mrad of tilt move every phase by 1.27 half periods: seen as -0.73, below the guard at
+    every point.
+    """
     live = _live()
     tilted = FilmShape(37.1, 500.0, "hencky", (0, 5.5e-3 * 500e3 / 2, *ZERNIKE_UM[2:]))
     renderer = OpticsRenderer(OPTICS, tilted, seed=6)
     frames = [renderer.render(pattern, 0.0).copy() for pattern in fringe_sequence(OPTICS.pattern)]
     estimate = live.fringes(frames, np.arange(8.0), np.zeros(8))
-    assert (estimate.verdict, estimate.reason) == ("rejected", "tracking lost: the whole mirror tilted")
+    assert (estimate.verdict, estimate.reason) == (
+        "rejected",
+        "tracking lost: the whole mirror tilted",
+    )
 
 
 def test_fringes_before_any_full_cycle() -> None:
@@ -143,7 +166,10 @@ def test_dark_cycle_is_rejected_and_the_next_one_is_fine() -> None:
 def test_full_cycle_of_black_frames_is_rejected() -> None:
     frames, times, where = _render("full")
     black = LiveReconstructor(OPTICS, 1).full([0 * frame for frame in frames], times, where)
-    assert (black.verdict, black.reason) == ("rejected", "only 0 bins see the pattern in the mirror")
+    assert (black.verdict, black.reason) == (
+        "rejected",
+        "only 0 bins see the pattern in the mirror",
+    )
 
 
 def test_failed_full_cycle_leaves_nothing_to_follow() -> None:
@@ -188,7 +214,9 @@ def test_other_steps_and_depths(steps: int, bits: int) -> None:
 
 
 def test_without_a_laser() -> None:
-    """Displacement unknown: the vertex is taken to stand still, which costs nothing while it does."""
+    """Displacement unknown: the vertex is taken to stand still,
+    which costs nothing while it does.
+    """
     live = LiveReconstructor(OPTICS, 1)
     frames, times, where = _render("full")
     estimate = live.full(frames, times, where * np.nan)
@@ -216,7 +244,9 @@ def test_motion_during_the_frames_is_taken_out() -> None:
     where = _moving(5.0)
     frames, times, _ = _render("fringes", where)
     corrected = _error_um(live, live.fringes(frames, times, where), float(where.mean()))[0]
-    blind = _error_um(live, live.fringes(frames, times, np.full(8, where.mean())), float(where.mean()))[0]
+    blind = _error_um(
+        live, live.fringes(frames, times, np.full(8, where.mean())), float(where.mean())
+    )[0]
     assert corrected <= 0.1
     assert blind > 5 * corrected > 0
 
@@ -233,14 +263,18 @@ def test_predicted_sigma_is_the_scatter_of_cycles() -> None:
     live = _live(bin_px=2)
     estimates = [live.fringes(*_render("fringes")) for _ in range(60)]
     sags = np.array([e.sag_um for e in estimates])
-    assert sags.std() == pytest.approx(estimates[0].sag_sigma_um, rel=0.3)  # 60 cycles give a sigma to 9 %
+    assert sags.std() == pytest.approx(
+        estimates[0].sag_sigma_um, rel=0.3
+    )  # 60 cycles give a sigma to 9 %
     coeffs = np.array([e.coeffs_um for e in estimates])
     ratio = coeffs.std(axis=0) / np.sqrt(np.diag(estimates[0].covariance_um2))
     assert np.sqrt(np.mean(ratio**2)) == pytest.approx(1, abs=0.15)
 
 
 def test_same_frames_give_the_same_figure() -> None:
-    """Except for the last bits: the library's small products depend on an array's place in memory."""
+    """Except for the last bits: the library's small products depend
+    on an array's place in memory.
+    """
     cycles = [_render("full"), *(_render("fringes", d) for d in (1.0, -2.0))]
     runs = []
     for _ in range(2):
@@ -311,14 +345,18 @@ UNEQUAL = np.array([[0.0, 1.3, 2.9, 4.4], [0.2, 1.7, 3.4, 4.9]])
 def _render_unequal(kind: str, displacement_um: float) -> Frames:
     patterns = full_sequence(OPTICS.pattern) if kind == "full" else fringe_sequence(OPTICS.pattern)
     shown = [
-        replace(p, shift_rad=float(UNEQUAL["xy".index(p.axis), p.index])) if p.role == "sin" else p for p in patterns
+        replace(p, shift_rad=float(UNEQUAL["xy".index(p.axis), p.index])) if p.role == "sin" else p
+        for p in patterns
     ]
     return [_renderer().render(pattern, displacement_um).copy() for pattern in shown]
 
 
 def test_unequal_steps() -> None:
     live = LiveReconstructor(OPTICS, 1, shifts_rad=UNEQUAL)
-    assert _error_um(live, live.full(_render_unequal("full", 0.0), np.zeros(18), np.zeros(18)), 0.0)[0] < 0.05
+    assert (
+        _error_um(live, live.full(_render_unequal("full", 0.0), np.zeros(18), np.zeros(18)), 0.0)[0]
+        < 0.05
+    )
     estimate = live.fringes(_render_unequal("fringes", 3.0), np.zeros(8), np.full(8, 3.0))
     assert estimate.verdict == "ok"
     assert _error_um(live, estimate, 3.0)[0] < 0.05
@@ -360,23 +398,32 @@ def test_without_a_spread_nothing_is_said_of_the_geometry() -> None:
 def _flickering(kind: str, seed: int, share: float) -> Frames:
     frames, *_ = _render(kind)
     gains = 1 + share * np.random.default_rng(seed).standard_normal(len(frames))
-    return [np.clip(np.rint(f * g), 0, 255).astype(np.uint8) for f, g in zip(frames, gains, strict=True)]
+    return [
+        np.clip(np.rint(f * g), 0, 255).astype(np.uint8) for f, g in zip(frames, gains, strict=True)
+    ]
 
 
 def test_light_that_flickers_is_taken_out_and_the_rest_is_in_the_bar() -> None:
     live = _live(bin_px=2)
     still = live.fringes(*_render("fringes"))
-    found = [live.fringes(_flickering("fringes", seed, 0.02), np.zeros(8), np.zeros(8)) for seed in range(12)]
+    found = [
+        live.fringes(_flickering("fringes", seed, 0.02), np.zeros(8), np.zeros(8))
+        for seed in range(12)
+    ]
     apart_um = np.array([e.coeffs_um - still.coeffs_um for e in found])[:, 3:]
     assert np.abs(apart_um).max() < 0.1  # 0.4 µm and more where the light is taken for even
     bar_um = np.array([np.sqrt(np.diag(e.covariance_um2))[3:] for e in found])
-    share = np.mean(np.abs(apart_um) < 1.96 * np.hypot(bar_um, np.sqrt(np.diag(still.covariance_um2))[3:]))
+    share = np.mean(
+        np.abs(apart_um) < 1.96 * np.hypot(bar_um, np.sqrt(np.diag(still.covariance_um2))[3:])
+    )
     assert share >= 0.9
     assert np.median(np.abs(apart_um) / bar_um) > 0.2  # and not by a wide bar
 
 
 @pytest.mark.parametrize(("share", "most_um"), [(0.02, 0.05), (0.12, 0.3)])
-def test_bands_of_a_pulsed_backlight_are_taken_out_of_full_and_fringes_cycles(share: float, most_um: float) -> None:
+def test_bands_of_a_pulsed_backlight_are_taken_out_of_full_and_fringes_cycles(
+    share: float, most_um: float
+) -> None:
     """They moved the figure by 0.3 and 1.6 µm in cycles called ok; large ones are told."""
     row, random = (
         np.arange(float(OPTICS.camera.height_px))[:, None] / OPTICS.camera.height_px,
@@ -385,8 +432,14 @@ def test_bands_of_a_pulsed_backlight_are_taken_out_of_full_and_fringes_cycles(sh
 
     def banded(kind: str) -> tuple[Frames, np.ndarray, np.ndarray]:
         frames, *rest = _render(kind)
-        gains = [1 + share * np.cos(2 * np.pi * (11.3 * row + turns)) for turns in random.random(len(frames))]
-        return [np.clip(np.rint(f * g), 0, 255).astype(np.uint8) for f, g in zip(frames, gains, strict=True)], *rest
+        gains = [
+            1 + share * np.cos(2 * np.pi * (11.3 * row + turns))
+            for turns in random.random(len(frames))
+        ]
+        return [
+            np.clip(np.rint(f * g), 0, 255).astype(np.uint8)
+            for f, g in zip(frames, gains, strict=True)
+        ], *rest
 
     still, live = _live(), LiveReconstructor(OPTICS, 1)
     steady = still.fringes(*_render("fringes"))
@@ -409,7 +462,9 @@ def test_bands_that_cannot_be_explained_degrade_the_cycle(monkeypatch: pytest.Mo
 
 
 def test_a_noisy_laser_is_in_the_bar() -> None:
-    """Readings with 1 µm of noise turn x against y: astigmatism of 0.1 µm, fifty times the noise of the pixels."""
+    """Readings with 1 µm of noise turn x against y: astigmatism of 0.1 µm, fifty times the noise of
+    the pixels.
+    """
     live = LiveReconstructor(OPTICS, 2, laser_noise_um=1.0)
     live.full(*_render("full"))
     where, rng = _moving(5.0), np.random.default_rng(4)
@@ -423,7 +478,9 @@ def test_a_noisy_laser_is_in_the_bar() -> None:
 
 
 def test_the_harmonics_of_the_display_move_with_the_film() -> None:
-    """A told motion is corrected as if the fringes were pure: gamma 2 leaves 0.1 µm of sag, five times the noise."""
+    """A told motion is corrected as if the fringes were pure: gamma 2 leaves 0.1 µm of sag, five
+    times the noise.
+    """
     light = Light(gamma=2.0)
     live, where = _live(light=light, bin_px=2), _moving(25.0)
     still = live.fringes(*_render("fringes", float(where.mean()), light=light))
@@ -436,7 +493,9 @@ def test_the_harmonics_of_the_display_move_with_the_film() -> None:
 
 
 def test_what_a_wrong_geometry_makes_of_a_told_motion_is_in_the_bar() -> None:
-    """A film that is deeper in all x frames than in all y frames, as the laser says; benches that are a sigma off."""
+    """A film that is deeper in all x frames than in all y frames, as the laser says; benches that
+    are a sigma off.
+    """
     names, sigma_deg = ("camera_roll_deg", "screen_turn_z_deg"), 0.3
     spread, ratios = GeometrySpread(names, np.diag([sigma_deg**2] * 2)), []
     where = np.repeat([30.0, -30.0], 4)
@@ -453,7 +512,9 @@ def test_what_a_wrong_geometry_makes_of_a_told_motion_is_in_the_bar() -> None:
 
 
 def test_the_bar_grows_with_the_displacement_until_a_new_reference() -> None:
-    """A wrong geometry makes an error of each change: 1e-3 of it, which no cycle shows by itself."""
+    """A wrong geometry makes an error of each change: 1e-3 of it,
+    which no cycle shows by itself.
+    """
     live = LiveReconstructor(OPTICS, 2, spread=PAPER_SPREAD)
     bars = [live.full(*_render("full", d)).sag_sigma_um for d in (0.0, 80.0, 400.0, 402.0)]
     assert bars[1] > 3 * bars[0]
@@ -471,8 +532,12 @@ def test_what_all_cycles_share_is_more_than_the_geometry() -> None:
 
 def _shared_um2(frames: Frames, times: np.ndarray, where: np.ndarray) -> np.ndarray:
     narrow = replace(PAPER_SPREAD, covariance=1e-8 * PAPER_SPREAD.covariance)
-    exact = SigmasConfig(**{name: 1e-6 * sigma for name, sigma in SigmasConfig().model_dump().items()})
-    optics = OPTICS.model_copy(update={"geometry": OPTICS.geometry.model_copy(update={"sigmas": exact})})
+    exact = SigmasConfig(
+        **{name: 1e-6 * sigma for name, sigma in SigmasConfig().model_dump().items()}
+    )
+    optics = OPTICS.model_copy(
+        update={"geometry": OPTICS.geometry.model_copy(update={"sigmas": exact})}
+    )
     live = LiveReconstructor(optics, 2, spread=narrow)
     assert live.full(frames, times, where).verdict == "ok"
     return live.common_covariance_um2

@@ -15,9 +15,13 @@ TERMS, FRAMES = 2, 8
 
 
 def vertex_sigma_um(moved_um: float, reading_um: float) -> float:
-    """Of a bench on which only the vertex' place has an effect: 1 mm of the second parameter per µm."""
+    """Of a bench on which only the vertex' place has an effect: 1 mm of the second parameter per
+    µm.
+    """
     none, still = np.zeros((TERMS, FRAMES)), np.zeros((TERMS, TERMS))
-    errors = LiveErrors(FrameEffects(none, none, none, none), np.array([0.0, 1.0]), still, still, still)
+    errors = LiveErrors(
+        FrameEffects(none, none, none, none), np.array([0.0, 1.0]), still, still, still
+    )
     quiet = np.zeros(FRAMES)
     film = moved_um * np.tile([1.0, -1.0], FRAMES // 2)
     seen = FramesSeen(quiet, quiet, quiet, film, np.zeros((2, 2)), np.zeros((2, 1)))

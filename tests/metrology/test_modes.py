@@ -1,4 +1,6 @@
-"""Vibrations are named beyond half the frame rate, with their shape; noise, drift and steps are none."""
+"""Vibrations are named beyond half the frame rate, with their shape; noise, drift and steps are
+none.
+"""
 
 from __future__ import annotations
 
@@ -40,8 +42,12 @@ def test_frames_of_a_busy_machine_name_the_lines_as_well(seed: int) -> None:
 
 
 def test_lines_with_one_alias_at_one_rate_make_no_others() -> None:
-    """A drum's, which move the vertex: at 17.1 frames a second, 27 and 61 Hz are at 7.2 and 7.4 Hz."""
-    time_s, coeffs_um, planted = watched(1, rates_hz=(20, 20 / 1.09, 20 / 1.17), amplitude_nm=20.0, drums=True)
+    """A drum's, which move the vertex: at 17.1 frames a second,
+    27 and 61 Hz are at 7.2 and 7.4 Hz.
+    """
+    time_s, coeffs_um, planted = watched(
+        1, rates_hz=(20, 20 / 1.09, 20 / 1.17), amplitude_nm=20.0, drums=True
+    )
     found = find_modes(time_s, coeffs_um)
     assert found is not None
     assert len(found) == len(planted)
@@ -53,9 +59,16 @@ def test_lines_with_one_alias_at_one_rate_make_no_others() -> None:
 
 @pytest.mark.parametrize("seed", [1, 2])
 def test_terms_of_less_noise_than_a_nanometre_make_no_others(seed: int) -> None:
-    """A hold gives whole nanometres: a term that hardly leaves one has next to no noise of its own."""
+    """A hold gives whole nanometres: a term that hardly leaves one
+    has next to no noise of its own.
+    """
     time_s, coeffs_um, planted = watched(
-        seed, rates_hz=(20, 20 / 1.09, 20 / 1.17), amplitude_nm=20.0, noise_nm=1.0, drift_nm=0.0, drums=True
+        seed,
+        rates_hz=(20, 20 / 1.09, 20 / 1.17),
+        amplitude_nm=20.0,
+        noise_nm=1.0,
+        drift_nm=0.0,
+        drums=True,
     )
     found = find_modes(time_s, np.round(coeffs_um, 3))
     assert found is not None
@@ -65,14 +78,21 @@ def test_terms_of_less_noise_than_a_nanometre_make_no_others(seed: int) -> None:
 
 @pytest.mark.parametrize("seed", [1, 2, 5])
 def test_the_slow_motion_of_a_held_film_makes_no_lines(seed: int) -> None:
-    """It is nearly all in one term, 28 nm/rtHz at 1 Hz, and at one of the rates among a mode's aliases."""
+    """It is nearly all in one term, 28 nm/rtHz at 1 Hz, and at one of the rates among a mode's
+    aliases.
+    """
     time_s, coeffs_um, planted = watched(
-        seed, rates_hz=(20, 20 / 1.09, 20 / 1.17), amplitude_nm=20.0, noise_nm=3.0, drift_nm=0.0, drums=True
+        seed,
+        rates_hz=(20, 20 / 1.09, 20 / 1.17),
+        amplitude_nm=20.0,
+        noise_nm=3.0,
+        drift_nm=0.0,
+        drums=True,
     )
     each_hz = np.linspace(0.05, 8.0, 400)
-    turns = np.outer(time_s - time_s[0], 2 * math.pi * each_hz) + np.random.default_rng(seed).uniform(
-        0, 2 * math.pi, 400
-    )
+    turns = np.outer(time_s - time_s[0], 2 * math.pi * each_hz) + np.random.default_rng(
+        seed
+    ).uniform(0, 2 * math.pi, 400)
     bowl_nm = np.cos(turns) @ (28.0 * math.sqrt(2 * (each_hz[1] - each_hz[0])) / each_hz)
     coeffs_um[:, [0, 3]] += 1e-3 * bowl_nm[:, None] * [math.sqrt(3), 1.0]  # the vertex stays at 0
     found = find_modes(time_s, np.round(coeffs_um, 3))
@@ -86,7 +106,9 @@ def test_the_slow_motion_of_a_held_film_makes_no_lines(seed: int) -> None:
 
 @pytest.mark.parametrize("seed", [307, 312])
 def test_a_line_that_one_rate_alone_shows_may_be_any_of_its_aliases(seed: int) -> None:
-    """48 Hz is six times a rate of 8: where two rates of three are blind, another frequency may look alike."""
+    """48 Hz is six times a rate of 8: where two rates of three are blind, another frequency may
+    look alike.
+    """
     time_s, coeffs_um, planted = watched(seed, rates_hz=(8.0, 8 / 1.09, 8 / 1.17), noise_nm=6.0)
     found = find_modes(time_s, coeffs_um)
     assert found
@@ -101,7 +123,9 @@ def test_a_line_that_one_rate_cannot_see_makes_no_other(seed: int) -> None:
     time_s, coeffs_um, planted = watched(seed, rates_hz=(15, 15 / 1.09, 15 / 1.17), noise_nm=6.0)
     sure = [line for line in find_modes(time_s, coeffs_um) if not line.aliases_hz]
     assert len(sure) >= 3
-    assert all(any(abs(line.frequency_hz - mode.frequency_hz) < 0.1 for mode in planted) for line in sure)
+    assert all(
+        any(abs(line.frequency_hz - mode.frequency_hz) < 0.1 for mode in planted) for line in sure
+    )
 
 
 def test_a_hold_does_not_tell_of_a_line_that_may_be_another() -> None:
@@ -116,7 +140,9 @@ def test_noise_and_drift_are_no_line(seed: int) -> None:
 def test_steps_outliers_and_rejected_frames_are_no_line_and_hide_none() -> None:
     time_s, coeffs_um, planted = watched(3, lines_hz=(48.0,))
     rng = np.random.default_rng(3)
-    coeffs_um += 0.02 * rng.normal(size=(9, ZERNIKE_TERMS))[np.floor((time_s - time_s[0]) / 10).astype(int)]
+    coeffs_um += (
+        0.02 * rng.normal(size=(9, ZERNIKE_TERMS))[np.floor((time_s - time_s[0]) / 10).astype(int)]
+    )
     coeffs_um[rng.integers(0, time_s.size, 20)] += rng.normal(size=(20, ZERNIKE_TERMS))
     coeffs_um[rng.integers(0, time_s.size, 60)] = math.nan
     found = find_modes(time_s, coeffs_um)
@@ -146,7 +172,10 @@ def test_a_night_of_steps_and_outliers_tells_no_line() -> None:
     for seed in range(1000, 1480):
         time_s, coeffs_um, _ = watched(seed, lines_hz=())
         rng = np.random.default_rng(seed)
-        coeffs_um += 0.02 * rng.normal(size=(9, ZERNIKE_TERMS))[np.floor((time_s - time_s[0]) / 10).astype(int)]
+        coeffs_um += (
+            0.02
+            * rng.normal(size=(9, ZERNIKE_TERMS))[np.floor((time_s - time_s[0]) / 10).astype(int)]
+        )
         coeffs_um[rng.integers(0, time_s.size, 5)] += rng.normal(size=(5, ZERNIKE_TERMS))
         assert listener.search(time_s, coeffs_um) == []
 
@@ -168,12 +197,16 @@ def test_a_hundred_minutes_of_noise_have_no_line_and_sixty_seconds_show_all() ->
 
 @pytest.mark.campaign
 def test_a_damped_mode_has_the_error_of_its_width() -> None:
-    """Pushed at random, it may ring in the pieces of one rate alone: one search in twenty takes an alias for it."""
+    """Pushed at random, it may ring in the pieces of one rate alone: one search in twenty takes an
+    alias for it.
+    """
     errors = []
     for seed in range(40):
         time_s, coeffs_um, planted = watched(seed, lines_hz=(48.0,), quality=200.0)
         strongest = find_modes(time_s, coeffs_um)[:1]
-        errors += [(line.frequency_hz - planted[0].frequency_hz) / line.sigma_hz for line in strongest]
+        errors += [
+            (line.frequency_hz - planted[0].frequency_hz) / line.sigma_hz for line in strongest
+        ]
     near = [error for error in errors if abs(error) < 5]
     assert len(near) >= 36
     assert 0.7 < np.sqrt(np.mean(np.square(near))) < 1.6
@@ -188,13 +221,18 @@ Searches = list[dict[int, float]]
 def heard(
     monkeypatch: pytest.MonkeyPatch, listener: Stethoscope, lines: Searches, day: float = 0.0
 ) -> list[list[Event]]:
-    """What a hold tells in minutes, from a day on, in which modes, by the number of their shape, have these lines."""
+    """What a hold tells in minutes, from a day on, in which modes, by the number of their shape,
+    have these lines.
+    """
     told: list[list[Event]] = []
     for minute, found in enumerate(lines):
         modes = tuple(VibrationMode(hz, 0.01, 5.0, SHAPES[k], 100.0) for k, hz in found.items())
         monkeypatch.setattr(live, "find_modes", lambda *_, modes=modes: modes)
         told.append(
-            listener.search(day * DAY_S + 60.0 * minute + np.arange(0.0, 60.0, 0.05), np.zeros((1200, ZERNIKE_TERMS)))
+            listener.search(
+                day * DAY_S + 60.0 * minute + np.arange(0.0, 60.0, 0.05),
+                np.zeros((1200, ZERNIKE_TERMS)),
+            )
         )
     return told
 
@@ -204,20 +242,26 @@ def notices(told: list[list[Event]]) -> list[Event]:
 
 
 def places(told: list[list[Event]]) -> list[list[float | None]]:
-    return [event.frequency_hz for minute in told for event in minute if isinstance(event, Vibrations)]
+    return [
+        event.frequency_hz for minute in told for event in minute if isinstance(event, Vibrations)
+    ]
 
 
 def scaled(by: float) -> dict[int, float]:
     return {k: by * hz for k, hz in USUAL.items()}
 
 
-def test_a_mode_keeps_its_place_and_a_minute_without_it_says_so(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_mode_keeps_its_place_and_a_minute_without_it_says_so(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     told = heard(monkeypatch, Stethoscope(), [{}, {3: 48.0}, {}, {7: 27.0, 3: 48.1}, {3: 47.0}])
     assert places(told) == [[48.0], [None], [48.1, 27.0], [47.0, None]]
     assert told[2][0].to_dict()["message"] == "none"
 
 
-def test_a_line_that_passes_by_leaves_its_place_and_a_mode_does_not(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_line_that_passes_by_leaves_its_place_and_a_mode_does_not(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     """A hold of a week would be full of them."""
     passing: Searches = [{3: 48.0, k: 30.0 + 5 * k} for k in range(8, 20)]
     told = heard(monkeypatch, Stethoscope(), [{3: 48.0}] * 5 + [{}] * 9 + passing)
@@ -227,16 +271,22 @@ def test_a_line_that_passes_by_leaves_its_place_and_a_mode_does_not(monkeypatch:
     assert [sum(hz is not None for hz in each) for each in lines[-12:]] == [2] * 12
 
 
-def test_of_two_modes_of_nearly_one_frequency_each_keeps_its_place(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_of_two_modes_of_nearly_one_frequency_each_keeps_its_place(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     told = heard(monkeypatch, Stethoscope(), [{3: 48.0, 4: 48.15}, {4: 48.15, 3: 48.0}])
     assert places(told) == [[48.0, 48.15], [48.0, 48.15]]
 
 
-def test_a_mode_that_moves_by_a_per_cent_is_told_once_and_its_return_too(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_mode_that_moves_by_a_per_cent_is_told_once_and_its_return_too(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     listener, lower = Stethoscope(), {3: 47.3, 7: 61.0}
     assert notices(heard(monkeypatch, listener, 10 * [USUAL] + 10 * [{3: 48.2, 7: 61.0}])) == []
     moved, *again = notices(
-        heard(monkeypatch, listener, 2 * [lower] + 6 * [USUAL] + 6 * [lower] + 6 * [USUAL], 20 / 1440)
+        heard(
+            monkeypatch, listener, 2 * [lower] + 6 * [USUAL] + 6 * [lower] + 6 * [USUAL], 20 / 1440
+        )
     )
     assert isinstance(moved, Maintenance)
     assert moved.name == "film_tension"
@@ -244,22 +294,34 @@ def test_a_mode_that_moves_by_a_per_cent_is_told_once_and_its_return_too(monkeyp
     assert [type(event) for event in again] == [MaintenanceOver]
 
 
-@pytest.mark.parametrize(("change", "told"), [(0.01, 1), (-0.01, 1), (0.003, 0), (-0.003, 0), (0.0, 0)])
-def test_a_slow_shift_within_a_week_is_told(monkeypatch: pytest.MonkeyPatch, change: float, told: int) -> None:
+@pytest.mark.parametrize(
+    ("change", "told"), [(0.01, 1), (-0.01, 1), (0.003, 0), (-0.003, 0), (0.0, 0)]
+)
+def test_a_slow_shift_within_a_week_is_told(
+    monkeypatch: pytest.MonkeyPatch, change: float, told: int
+) -> None:
     """Five minutes a day; the last on day 7."""
     listener, said = Stethoscope(), []
     for day in range(8):
         said += notices(heard(monkeypatch, listener, 5 * [scaled(1 + change * day / 7)], day))
     assert [type(event) for event in said] == [Maintenance] * told
     assert all(
-        f"moved by {change:+.1%} within 168 h: the film's tension by {2 * change:+.1%}" in str(e) for e in said
+        f"moved by {change:+.1%} within 168 h: the film's tension by {2 * change:+.1%}" in str(e)
+        for e in said
     )
 
 
-def test_what_stays_where_it_moved_to_is_the_usual_after_a_week(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_what_stays_where_it_moved_to_is_the_usual_after_a_week(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     listener = Stethoscope()
     said = [
-        [event.kind for event in notices(heard(monkeypatch, listener, 6 * [scaled(1.0 if day < 2 else 0.985)], day))]
+        [
+            event.kind
+            for event in notices(
+                heard(monkeypatch, listener, 6 * [scaled(1.0 if day < 2 else 0.985)], day)
+            )
+        ]
         for day in range(12)
     ]
     assert said == [[], [], ["maintenance"], *[[]] * 7, ["maintenance_over"], []]
@@ -277,7 +339,9 @@ def test_a_mode_that_was_away_for_a_week_begins_anew(monkeypatch: pytest.MonkeyP
     assert notices(heard(monkeypatch, listener, 12 * [scaled(1.015)], day=9)) == []
 
 
-def test_the_next_listener_goes_on_where_the_last_one_ended(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_next_listener_goes_on_where_the_last_one_ended(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     first = Stethoscope(61.0, begin_utc_s=0.0)
     (driven,) = notices(heard(monkeypatch, first, 6 * [USUAL]))
     same_run = Stethoscope(61.0, begin_utc_s=0.0, known=first.heard)
@@ -289,7 +353,9 @@ def test_the_next_listener_goes_on_where_the_last_one_ended(monkeypatch: pytest.
     assert "48.00 Hz moved by -1.0% within 48 h" in moved[0].message
 
 
-def test_strokes_of_the_pump_at_a_mode_are_told_once_and_their_end_too(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_strokes_of_the_pump_at_a_mode_are_told_once_and_their_end_too(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     away = {3: 48.0}
 
     def told(stroke_hz: float) -> list[Event]:
@@ -306,7 +372,9 @@ def test_strokes_of_the_pump_at_a_mode_are_told_once_and_their_end_too(monkeypat
 
 
 def test_a_line_heard_once_at_the_strokes_is_not_told(monkeypatch: pytest.MonkeyPatch) -> None:
-    assert notices(heard(monkeypatch, Stethoscope(61.5), [{3: 48.0}, USUAL, *8 * [{3: 48.0}]])) == []
+    assert (
+        notices(heard(monkeypatch, Stethoscope(61.5), [{3: 48.0}, USUAL, *8 * [{3: 48.0}]])) == []
+    )
 
 
 @pytest.mark.campaign

@@ -13,7 +13,11 @@ from membrane_ctrl.metrology.checked import Checked, check
 from membrane_ctrl.metrology.frames.frame_stack import FrameStack
 from membrane_ctrl.metrology.full import BinFigure, bin_figure
 from membrane_ctrl.metrology.optics.surface import Surface
-from membrane_ctrl.metrology.uncertainty.geometry_spread import PAPER_SPREAD, GeometrySpread, changed
+from membrane_ctrl.metrology.uncertainty.geometry_spread import (
+    PAPER_SPREAD,
+    GeometrySpread,
+    changed,
+)
 from membrane_ctrl.metrology.uncertainty.monte_carlo import (
     HeightMap,
     TrialBench,
@@ -65,29 +69,39 @@ def _anchored() -> OpticsConfig:
 
 def test_figure_of_the_bins_is_the_film() -> None:
     x, y = np.meshgrid(MAP.axis_mm, MAP.axis_mm)
-    error_um = 1e3 * (MAP.matrix @ _first()[1].fit.surface.parameters - FILM.height_mm(x, y, 0.0)[MAP.inside])
-    assert np.sqrt(np.mean(error_um**2)) < 0.06  # three times the noise of 1/64 of the real sensor's pixels
+    error_um = 1e3 * (
+        MAP.matrix @ _first()[1].fit.surface.parameters - FILM.height_mm(x, y, 0.0)[MAP.inside]
+    )
+    assert (
+        np.sqrt(np.mean(error_um**2)) < 0.06
+    )  # three times the noise of 1/64 of the real sensor's pixels
 
 
 def test_figure_of_a_moving_film() -> None:
     """5 µm at 0.3 Hz over the 8 frames, with the laser's readings."""
     shown = [p for p in patterns(OPTICS) if p.role == "sin"]
     where_um = 5 * np.sin(2 * np.pi * 0.3 * 0.1 * np.arange(8))
-    frames = np.stack([_renderer().render(p, float(d)) for p, d in zip(shown, where_um, strict=True)])
+    frames = np.stack(
+        [_renderer().render(p, float(d)) for p, d in zip(shown, where_um, strict=True)]
+    )
     x, y = np.meshgrid(MAP.axis_mm, MAP.axis_mm)
     errors = {}
     for laser in (True, False):
         stack = stack_of(frames, shown, where_um if laser else None)
         figure = bin_figure(_anchored(), check(stack, _anchored(), _first()[0].anchor()))
         truth = FILM.height_mm(x, y, float(where_um.mean()))[MAP.inside]
-        errors[laser] = np.sqrt(np.mean(np.square(1e3 * (MAP.matrix @ figure.fit.surface.parameters - truth))))
+        errors[laser] = np.sqrt(
+            np.mean(np.square(1e3 * (MAP.matrix @ figure.fit.surface.parameters - truth)))
+        )
     assert errors[True] < 0.1
     assert errors[False] > 3 * errors[True]
 
 
 @pytest.mark.campaign
 def test_noise_is_that_of_whole_measurements() -> None:
-    """Variances of the 36 parameters over 24 sets with new pixel noise, against those of 600 trials."""
+    """Variances of the 36 parameters over 24 sets with new pixel noise, against those of 600
+    trials.
+    """
     anchor = _first()[0].anchor()
     whole = []
     for _ in range(24):
@@ -98,23 +112,33 @@ def test_noise_is_that_of_whole_measurements() -> None:
     assert np.mean(ratio) == pytest.approx(1.0, abs=0.2)
     rmse = [MAP.sigma(trial_covariance(np.array(p))).mean() for p in (whole, cheap)]
     assert rmse[0] == pytest.approx(rmse[1], rel=0.15)
-    assert 1e6 * rmse[0] / 8 <= 10  # nm: repeatability with the real sensor's 64 times as many pixels
+    assert (
+        1e6 * rmse[0] / 8 <= 10
+    )  # nm: repeatability with the real sensor's 64 times as many pixels
 
 
 def test_thinned_points_have_the_noise_of_all() -> None:
     checked, figure = _first()
     sigmas = [
-        MAP.sigma(noise_covariance(TrialBench.of(OPTICS, checked, figure, count))).mean() for count in (1500, 10**9)
+        MAP.sigma(noise_covariance(TrialBench.of(OPTICS, checked, figure, count))).mean()
+        for count in (1500, 10**9)
     ]
     assert sigmas[0] == pytest.approx(sigmas[1], rel=0.05)
 
 
 def test_geometry_is_that_of_a_whole_measurement() -> None:
-    """The same frames measured under another geometry: the trial with that geometry finds the same change."""
+    """The same frames measured under another geometry: the trial with that geometry finds the same
+    change.
+    """
     change = np.array([2.0, -2.0, 0.3])
-    other = OPTICS.model_copy(update={"geometry": changed(OPTICS.geometry, PAPER_SPREAD.names, change)})
+    other = OPTICS.model_copy(
+        update={"geometry": changed(OPTICS.geometry, PAPER_SPREAD.names, change)}
+    )
     checked, figure = _first()
-    there = bin_figure(other, check(checked.stack, other)).fit.surface.parameters - figure.fit.surface.parameters
+    there = (
+        bin_figure(other, check(checked.stack, other)).fit.surface.parameters
+        - figure.fit.surface.parameters
+    )
     trial = _bench()
     cheap = trial.solve(trial.geometry(PAPER_SPREAD.names, change)) - trial.surface.parameters
     assert np.abs(MAP.matrix @ there).max() > 0.03
@@ -128,10 +152,15 @@ def test_trials_repeat_whatever_the_batches() -> None:
     parts = [run_trials([trial], PAPER_SPREAD, 5, [t], first_set=8)[0, 0] for t in (5, 0, 3)]
     assert np.abs(whole[[5, 0, 3], 1] - parts).max() < 1e-12  # mm: the rounding of sums
     assert np.abs(whole[:, 0] - whole[:, 1]).max() > 1e-6  # noise differs from set to set
-    assert np.abs(whole - run_trials([trial, trial], PAPER_SPREAD, 6, range(6), first_set=7)).max() > 1e-4
+    assert (
+        np.abs(whole - run_trials([trial, trial], PAPER_SPREAD, 6, range(6), first_set=7)).max()
+        > 1e-4
+    )
 
 
-@pytest.mark.parametrize(("count", "within"), [(150, 0.3), pytest.param(1500, 0.1, marks=pytest.mark.campaign)])
+@pytest.mark.parametrize(
+    ("count", "within"), [(150, 0.3), pytest.param(1500, 0.1, marks=pytest.mark.campaign)]
+)
 def test_linear_covariance_is_that_of_the_monte_carlo(count: int, within: float) -> None:
     trial = _bench()
     sampled = MAP.sigma(trial_covariance(run_trials([trial], PAPER_SPREAD, 1, range(count))[:, 0]))
@@ -144,7 +173,9 @@ def test_linear_covariance_is_that_of_the_monte_carlo(count: int, within: float)
 
 @pytest.mark.campaign
 def test_the_papers_figures() -> None:
-    """Absolute: the largest is the paper's 50 µm, the mean half of its 24.8. Pairs: geometry cancels (docs)."""
+    """Absolute: the largest is the paper's 50 µm, the mean half of its 24.8. Pairs: geometry
+    cancels (docs).
+    """
     sets = [_bench(), _bench(20.0)]
     trials = run_trials(sets, PAPER_SPREAD, 1, range(1000))
     absolute_um = 1e3 * MAP.sigma(trial_covariance(trials[:, 0]))
@@ -167,7 +198,9 @@ def test_what_a_wrong_geometry_does_to_a_change_is_in_proportion_to_it() -> None
 def test_a_map_of_the_covariance_is_the_spread_of_the_heights() -> None:
     parameters = run_trials([_bench()], PAPER_SPREAD, 2, range(20))[:, 0]
     heights = np.stack([Surface.from_parameters(p, 500.0).height(*_inside()) for p in parameters])
-    assert MAP.sigma(trial_covariance(parameters)) == pytest.approx(heights.std(axis=0, ddof=1), abs=1e-10)
+    assert MAP.sigma(trial_covariance(parameters)) == pytest.approx(
+        heights.std(axis=0, ddof=1), abs=1e-10
+    )
     picture = MAP.picture(heights[0])
     assert np.isnan(picture[0, 0])
     assert picture[20, 20] == pytest.approx(0, abs=1e-12)  # the vertex

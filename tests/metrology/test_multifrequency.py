@@ -36,7 +36,9 @@ def test_noise_of_the_finest_phase_is_all_that_is_left():
 def test_a_wrong_coarse_phase_is_flagged():
     position = np.full(3, 0.4)
     phases = wrapped(position)
-    phases[0, 1] += 2 * np.pi * 0.9 * 0.4 / 3.9  # shifts the coarse position by 0.4 of the next period
+    phases[0, 1] += (
+        2 * np.pi * 0.9 * 0.4 / 3.9
+    )  # shifts the coarse position by 0.4 of the next period
     out = unwrap(phases, PERIODS)
     assert out.consistent.tolist() == [True, False, True]
     assert abs(out.step_periods[0, 1]) == pytest.approx(0.4)
@@ -50,7 +52,9 @@ def test_a_stuck_order_is_one_whole_fine_period():
     phases = wrapped(np.array([0.3]))
     phases[2] += np.pi  # half a period of frequency 2 is two periods of frequency 3
     out = unwrap(phases, PERIODS)
-    assert (out.screens[0] - 0.3) * 63.9 == pytest.approx(round((out.screens[0] - 0.3) * 63.9), abs=1e-9)
+    assert (out.screens[0] - 0.3) * 63.9 == pytest.approx(
+        round((out.screens[0] - 0.3) * 63.9), abs=1e-9
+    )
     assert abs(out.screens[0] - 0.3) * 63.9 > 0.5
     assert not out.consistent[0]
 
@@ -68,10 +72,14 @@ def test_prediction_of_the_coarsest_takes_it_for_the_order_only():
     position = np.linspace(0.1, 0.9, 50)
     phases = wrapped(position)
     phases[0] += 0.1
-    np.testing.assert_allclose(predicted_phase(phases, PERIODS, 0), 2 * np.pi * 0.9 * position, atol=1e-9)
+    np.testing.assert_allclose(
+        predicted_phase(phases, PERIODS, 0), 2 * np.pi * 0.9 * position, atol=1e-9
+    )
 
 
-@pytest.mark.parametrize(("periods", "count"), [([1.5, 4], 2), ([0.9, 0.8], 2), ([0.9, 3.9], 3), ([0, 2], 2)])
+@pytest.mark.parametrize(
+    ("periods", "count"), [([1.5, 4], 2), ([0.9, 0.8], 2), ([0.9, 3.9], 3), ([0, 2], 2)]
+)
 def test_periods_that_cannot_be_unwrapped_are_refused(periods, count):
     with pytest.raises(ValueError, match="periods"):
         unwrap(np.zeros((count, 4)), periods)

@@ -1,4 +1,6 @@
-"""Frames of other benches: several periods, Gray codes of any length, crossed fringes; and the page's own example."""
+"""Frames of other benches: several periods, Gray codes of any length, crossed fringes; and the
+page's own example.
+"""
 
 from __future__ import annotations
 
@@ -18,10 +20,14 @@ PLACE = np.random.default_rng(5).uniform(-210, 190, 4000)
 def wrapped(periods: list[float], sigma: float = 0.0, seed: int = 1) -> np.ndarray:
     """Phases of the places, in (-pi, pi]."""
     turns = PLACE / np.array(periods)[:, None]
-    return np.angle(np.exp(2j * np.pi * turns)) + np.random.default_rng(seed).normal(0, sigma, turns.shape)
+    return np.angle(np.exp(2j * np.pi * turns)) + np.random.default_rng(seed).normal(
+        0, sigma, turns.shape
+    )
 
 
-@pytest.mark.parametrize("periods", [[420.5, 49.8], [17.0, 19.0, 23.0], [13.3, 40.0, 131.0, 401.0], [61.3, 37.9]])
+@pytest.mark.parametrize(
+    "periods", [[420.5, 49.8], [17.0, 19.0, 23.0], [13.3, 40.0, 131.0, 401.0], [61.3, 37.9]]
+)
 def test_any_periods_give_the_place(periods: list[float]) -> None:
     found = phase.places_mm(wrapped(periods), periods, (-210, 190), sigma_rad=0.02)
     np.testing.assert_allclose(found.place_mm, PLACE, atol=1e-9)
@@ -81,7 +87,9 @@ def test_crossed_fringes_are_told_apart() -> None:
 
 
 def test_the_example_of_the_page_measures_another_bench() -> None:
-    """A camera and a screen side by side before a 1.7 m sphere; fringes of two periods in five steps."""
+    """A camera and a screen side by side before a 1.7 m sphere; fringes of two periods in five
+    steps.
+    """
     text = (Path(__file__).parents[2] / "docs" / "library.md").read_text()
     code = re.findall("```python\n(.*?)```", text, re.S)
     camera, screen = np.array([120.0, 30.0, 1650.0]), np.array([-140.0, 10.0, 1700.0])
@@ -91,22 +99,42 @@ def test_the_example_of_the_page_measures_another_bench() -> None:
     truth = TrueFilm(0.0, {4: 21.2, 5: 0.2, 8: -0.1})
     s_x, s_y = np.array([-1.0, 0, 0]), np.array([0.0, 1, 0])
     bench = Geometry(camera, rotation, 3000.0, (319.5, 239.5), (), screen, s_x, s_y, Face.of(None))
-    columns, rows = (a.ravel().astype(float) for a in np.meshgrid(np.arange(640.0)[::4], np.arange(480.0)[::4]))
+    columns, rows = (
+        a.ravel().astype(float) for a in np.meshgrid(np.arange(640.0)[::4], np.arange(480.0)[::4])
+    )
     seen = look(bench, truth, columns, rows, radius_mm=110.0)
     periods, shifts = [36.0, 25.0], 2 * np.pi * np.arange(5) / 5
     random = np.random.default_rng(3)
-    frames = np.array([
-        [[100 + 80 * np.cos(2 * np.pi * s / p + d) + random.normal(0, 0.5, s.size) for d in shifts] for p in periods]
-        for s in seen.screen_mm
-    ])  # fmt: skip
+    frames = np.array(
+        [
+            [
+                [
+                    100 + 80 * np.cos(2 * np.pi * s / p + d) + random.normal(0, 0.5, s.size)
+                    for d in shifts
+                ]
+                for p in periods
+            ]
+            for s in seen.screen_mm
+        ]
+    )
     in_camera = rotation @ seen.rays
     column, row = 3000 * in_camera[:2] / in_camera[2] + [[319.5], [239.5]]
     names = {
-        "frames": frames, "shifts_rad": shifts, "periods_mm": periods, "camera_mm": camera, "rotation": rotation,
-        "focal_px": 3000.0, "principal_px": (319.5, 239.5), "screen_mm": screen, "s_x": s_x, "s_y": s_y,
-        "column": column, "row": row, "radius_mm": 115.0,
+        "frames": frames,
+        "shifts_rad": shifts,
+        "periods_mm": periods,
+        "camera_mm": camera,
+        "rotation": rotation,
+        "focal_px": 3000.0,
+        "principal_px": (319.5, 239.5),
+        "screen_mm": screen,
+        "s_x": s_x,
+        "s_y": s_y,
+        "column": column,
+        "row": row,
+        "radius_mm": 115.0,
         "range_mm": (float(seen.screen_mm.min()) - 5, float(seen.screen_mm.max()) + 5),
-    }  # fmt: skip
+    }
     for part in code:
         exec(part, names)
     surface = names["fit"].surface

@@ -17,7 +17,9 @@ def white_minus_black() -> np.ndarray:
 
 
 def test_the_rim_is_where_the_pose_puts_it() -> None:
-    outline = find_outline(white_minus_black(), Geometry.from_config(bench(shrink=4)), 500.0, FILM.sag_mm)
+    outline = find_outline(
+        white_minus_black(), Geometry.from_config(bench(shrink=4)), 500.0, FILM.sag_mm
+    )
     assert outline is not None
     assert outline.offset_mm < 2
     assert outline.size_ratio == pytest.approx(1.0, abs=0.005)

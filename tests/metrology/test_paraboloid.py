@@ -40,7 +40,9 @@ def test_robust_fits_shrug_off_a_turned_down_edge():
     assert error["tukey"] < 5e-3
     fit = fit_slopes(x, y, slopes, "tukey")
     assert np.all(fit.weights[0, x > 560] == 0)
-    assert fit.weights[1, x > 560].mean() > 0.8  # the other component of the same pixel is good and is used
+    assert (
+        fit.weights[1, x > 560].mean() > 0.8
+    )  # the other component of the same pixel is good and is used
 
 
 @pytest.mark.parametrize("loss", ["squares", "huber", "tukey"])
@@ -48,7 +50,9 @@ def test_gaussian_noise_costs_a_robust_fit_little(loss):
     x, y = grid(20)
     rng = np.random.default_rng(2)
     noisy = [TRUE.slopes(x, y) + rng.normal(0, 1e-4, (2, x.size)) for _ in range(60)]
-    scatter = np.std([fit_slopes(x, y, slopes, loss).surface.curvature_xx_per_mm for slopes in noisy])
+    scatter = np.std(
+        [fit_slopes(x, y, slopes, loss).surface.curvature_xx_per_mm for slopes in noisy]
+    )
     assert scatter == pytest.approx(1e-4 / np.sqrt(np.sum(x**2)), rel=0.3)
 
 
@@ -65,16 +69,21 @@ def test_rays_meet_the_surface_first_side_up():
     x, y = grid(9)
     target = np.stack([x, y, TRUE.height_mm(x, y)])
     rays = target - origin[:, None]
-    np.testing.assert_allclose(TRUE.intersect(origin, rays / np.linalg.norm(rays, axis=0)), target, atol=1e-9)
+    np.testing.assert_allclose(
+        TRUE.intersect(origin, rays / np.linalg.norm(rays, axis=0)), target, atol=1e-9
+    )
 
 
 def test_rays_meet_a_plane_and_miss_a_bowl():
     flat = Paraboloid(0.0, 0.0, 0.0, 0.0, 0.0)
     np.testing.assert_allclose(
-        flat.intersect(np.array([0.0, 0.0, 10.0]), np.array([[0.6], [0.0], [-0.8]])), [[7.5], [0.0], [0.0]]
+        flat.intersect(np.array([0.0, 0.0, 10.0]), np.array([[0.6], [0.0], [-0.8]])),
+        [[7.5], [0.0], [0.0]],
     )
     dome = replace(flat, curvature_xx_per_mm=-1.0)
-    assert np.isnan(dome.intersect(np.array([0.0, 0.0, 1.0]), np.array([[1.0], [0.0], [0.0]]))).all()
+    assert np.isnan(
+        dome.intersect(np.array([0.0, 0.0, 1.0]), np.array([[1.0], [0.0], [0.0]]))
+    ).all()
 
 
 def rig():
@@ -107,12 +116,16 @@ def seen(surface, geometry, columns, rows):
 
 def test_a_traced_facet_is_found_again():
     geometry = rig()
-    columns, rows = (axis.ravel() for axis in np.meshgrid(np.arange(205.0, 290.0, 6), np.arange(40.0, 125.0, 6)))
+    columns, rows = (
+        axis.ravel() for axis in np.meshgrid(np.arange(205.0, 290.0, 6), np.arange(40.0, 125.0, 6))
+    )
     level = replace(TRUE, tilt_x=0.0, tilt_y=0.0)
     sight = Sight(columns, rows, seen(level, geometry, columns, rows))
     points, slopes = measure_on(level, geometry, sight)
     np.testing.assert_allclose(slopes, level.slopes(points[0], points[1]), atol=1e-14)
-    rough = Rotation.from_rotvec([4e-3, -7e-3, 0.0]).as_matrix()  # as badly as a pose from corners is known
+    rough = Rotation.from_rotvec(
+        [4e-3, -7e-3, 0.0]
+    ).as_matrix()  # as badly as a pose from corners is known
     found = solve_facet(turned(geometry, rough), sight)
     assert found.fit.surface.focal_x_mm == pytest.approx(120e3, rel=1e-6)
     assert found.fit.surface.focal_y_mm == pytest.approx(109e3, rel=1e-6)
@@ -122,11 +135,15 @@ def test_a_traced_facet_is_found_again():
 
 def test_a_pixel_that_sees_no_screen_is_refused():
     with pytest.raises(ValueError, match="not finite"):
-        solve_facet(rig(), Sight(np.array([240.0, 250.0]), np.array([75.0, 80.0]), np.full((2, 2), np.nan)))
+        solve_facet(
+            rig(), Sight(np.array([240.0, 250.0]), np.array([75.0, 80.0]), np.full((2, 2), np.nan))
+        )
 
 
 def test_thinning_keeps_pixels_together():
-    sight = Sight(np.arange(10.0), np.arange(10.0) + 100, np.stack([np.arange(10.0), -np.arange(10.0)])).every(4)
+    sight = Sight(
+        np.arange(10.0), np.arange(10.0) + 100, np.stack([np.arange(10.0), -np.arange(10.0)])
+    ).every(4)
     assert sight.columns_px.tolist() == [0, 4, 8]
     assert sight.rows_px.tolist() == [100, 104, 108]
     assert sight.screen_mm.tolist() == [[0, 4, 8], [0, -4, -8]]

@@ -12,7 +12,10 @@ from membrane_ctrl.metrology.phase import FullSlots, fringe_sequence, full_seque
 def test_the_papers_18_images() -> None:
     names = [image.name for image in full_sequence(PatternConfig())]
     axis = [f"{{0}}_sin_{k}" for k in range(4)] + [f"{{0}}_gray_{k}" for k in range(1, 5)]
-    assert names == [n.format("x") for n in axis] + [n.format("y") for n in axis] + ["white", "black"]
+    assert names == [n.format("x") for n in axis] + [n.format("y") for n in axis] + [
+        "white",
+        "black",
+    ]
 
 
 @pytest.mark.parametrize("steps", [3, 4, 7])

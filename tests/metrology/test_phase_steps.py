@@ -32,7 +32,9 @@ def test_unequal_steps_in_any_order() -> None:
     assert np.angle(phase.phasors(_frames(shifts), shifts)) == pytest.approx(PHASES, abs=1e-12)
 
 
-@pytest.mark.parametrize("shifts", [[0.0, 1.0], [0.0, 0.0, np.pi, np.pi], [0.0, 2 * np.pi, 4 * np.pi, 1.0]])
+@pytest.mark.parametrize(
+    "shifts", [[0.0, 1.0], [0.0, 0.0, np.pi, np.pi], [0.0, 2 * np.pi, 4 * np.pi, 1.0]]
+)
 def test_steps_that_determine_nothing_are_refused(shifts: list[float]) -> None:
     with pytest.raises(ValueError, match="do not determine a phase"):
         phase.step_weights(shifts)

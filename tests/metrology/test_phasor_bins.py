@@ -24,7 +24,9 @@ def test_sums_are_those_of_the_pixels(bin_px: int, kind: type) -> None:
     binner = Binner(50, 71, bin_px, top, 2)
     binner.add(frames, [1, 0])
     rows, columns = 50 // bin_px, 71 // bin_px
-    blocks = frames[:, : rows * bin_px, : columns * bin_px].reshape(2, rows, bin_px, columns, bin_px)
+    blocks = frames[:, : rows * bin_px, : columns * bin_px].reshape(
+        2, rows, bin_px, columns, bin_px
+    )
     assert np.array_equal(binner.sums[[1, 0]], blocks.sum(axis=(2, 4), dtype=np.int64))
     assert np.array_equal(binner.saturated, (blocks == top).sum(axis=(0, 2, 4)))
 
@@ -76,7 +78,9 @@ def test_arctan2_is_the_librarys() -> None:
     assert out[0] == 0
 
 
-def _followed(intensity: np.ndarray, last_rad: np.ndarray, sensitivity: np.ndarray, motion: np.ndarray | None):  # type: ignore[no-untyped-def]
+def _followed(
+    intensity: np.ndarray, last_rad: np.ndarray, sensitivity: np.ndarray, motion: np.ndarray | None
+):  # type: ignore[no-untyped-def]
     """`track` on one axis, used twice, of frames given in thousandths."""
     steps, count = intensity.shape
     shifts = equal_shifts(steps)
@@ -123,7 +127,11 @@ def test_a_constant_displacement_is_a_plain_shift() -> None:
 
 @pytest.mark.parametrize(
     ("readings", "worth"),
-    [([0.0, 9.0, 0.0, 9.0], True), ([0.0, 1.0, -1.0, 0.5], False), ([0.0, 9.0, math.nan, 9.0], False)],
+    [
+        ([0.0, 9.0, 0.0, 9.0], True),
+        ([0.0, 1.0, -1.0, 0.5], False),
+        ([0.0, 9.0, math.nan, 9.0], False),
+    ],
 )
 def test_motion_within_the_lasers_noise_is_left_alone(readings: list[float], worth: bool) -> None:
     assert worth_correcting(np.array(readings), 1.0) is worth

@@ -8,7 +8,12 @@ import numpy as np
 import pytest
 from metrology_truth import OPTICS, RADIUS_MM, SMALL, Seen, TrueFilm, cone, look, pixel_grid, v_fold
 
-from membrane_ctrl.config.optics import CameraPoseConfig, GeometryConfig, OpticsConfig, ScreenPoseConfig
+from membrane_ctrl.config.optics import (
+    CameraPoseConfig,
+    GeometryConfig,
+    OpticsConfig,
+    ScreenPoseConfig,
+)
 from membrane_ctrl.metrology.bins import parameter_covariance, slope_per_screen
 from membrane_ctrl.metrology.optics.geometry import Geometry
 from membrane_ctrl.metrology.optics.kernels import invert
@@ -72,12 +77,18 @@ def test_true_hencky_bowl_with_aberrations() -> None:
 def test_hencky_amplitude_is_the_bowls_sag() -> None:
     fit = solve(TRACER, _points(_seen("bowl")), START)
     assert fit.surface.hencky_mm == pytest.approx(37.1, abs=0.01)
-    assert fit.surface.sag_mm == pytest.approx(37.1, abs=1e-5)  # the terms added have no mean on the rim
+    assert fit.surface.sag_mm == pytest.approx(
+        37.1, abs=1e-5
+    )  # the terms added have no mean on the rim
 
 
 @pytest.mark.parametrize(
     "start",
-    [*(parabola(h, RADIUS_MM) for h in (10.0, 100.0)), cone(40.0, RADIUS_MM), v_fold(40.0, RADIUS_MM)],
+    [
+        *(parabola(h, RADIUS_MM) for h in (10.0, 100.0)),
+        cone(40.0, RADIUS_MM),
+        v_fold(40.0, RADIUS_MM),
+    ],
     ids=["parabola 10", "parabola 100", "cone", "V-fold"],
 )
 def test_all_starts_end_in_one_surface(start) -> None:  # type: ignore[no-untyped-def]
@@ -85,7 +96,9 @@ def test_all_starts_end_in_one_surface(start) -> None:  # type: ignore[no-untype
     grid = np.meshgrid(*[np.linspace(-350, 350, 40)] * 2)
     assert np.abs(ends[0].surface.height(*grid) - ends[1].surface.height(*grid)).max() <= 1e-9
     within = next(k for k, change in enumerate(ends[1].changes_mm, 1) if change < 1e-6)
-    assert within <= 6  # the paper: 5 steps until a change is below 1e-6 mm; the step that shows it included
+    assert (
+        within <= 6
+    )  # the paper: 5 steps until a change is below 1e-6 mm; the step that shows it included
 
 
 def test_kept_normal_matrix_has_the_same_end() -> None:
@@ -108,11 +121,16 @@ def test_warm_start_needs_two_steps_after_a_micrometre() -> None:
     points.screen_mm[:] = moved.screen_mm
     warm = solve(tracer, points, first.surface, normal=first.normal)
     assert len(warm.changes_mm) <= 2
-    assert np.abs(_error_mm(warm.surface, deeper)).max() <= 1e-6 + np.abs(_error_mm(first.surface, BOWL)).max()
+    assert (
+        np.abs(_error_mm(warm.surface, deeper)).max()
+        <= 1e-6 + np.abs(_error_mm(first.surface, BOWL)).max()
+    )
 
 
 def test_vertex_shift_that_is_known_does_no_harm() -> None:
-    """1 mm deeper, the ring in its place: knowing it keeps the accuracy, not knowing it costs micrometres."""
+    """1 mm deeper, the ring in its place: knowing it keeps the accuracy, not knowing it costs
+    micrometres.
+    """
     deeper = TrueFilm(38.1, BOWL.terms_mm)
     seen = look(GEOMETRY, deeper, *pixel_grid(SMALL, 3), vertex_z_mm=-1.0)
     known = solve(Tracer(GEOMETRY, RADIUS_MM, vertex_z_mm=-1.0), _points(seen), START)
@@ -122,7 +140,9 @@ def test_vertex_shift_that_is_known_does_no_harm() -> None:
 
 
 def test_any_pose_with_a_distorting_lens() -> None:
-    """Camera and screen turned, moved and rolled, and 300 µm of barrel distortion: the code knows only poses."""
+    """Camera and screen turned, moved and rolled, and 300 µm of barrel distortion: the code knows
+    only poses.
+    """
     rng = np.random.default_rng(4)
     turn = np.linalg.qr(np.eye(3) + 0.02 * rng.normal(size=(3, 3)))[0]
     turn *= np.sign(np.diag(turn))
@@ -148,7 +168,9 @@ def test_any_pose_with_a_distorting_lens() -> None:
 def test_measured_slopes_are_those_of_the_papers_scalar_equations() -> None:
     """In the plane y = 0, with O'A = s_x, the paper's tan(theta) is -dh/dx."""
     columns = np.linspace(20, 285, 60)
-    film = TrueFilm(37.1, {8: 0.5, 22: 0.05})  # symmetric in y: the reflected rays stay in the plane
+    film = TrueFilm(
+        37.1, {8: 0.5, 22: 0.05}
+    )  # symmetric in y: the reflected rays stay in the plane
     seen = look(GEOMETRY, film, columns, np.full(60, SMALL.principal[1]))
     a, b, alpha = 2672.0, 2871.0, np.radians(80.9)
     x0, _, h = seen.film_mm
@@ -179,7 +201,9 @@ def test_piston_makes_the_papers_normal_matrix_singular_and_ours_is_not() -> Non
     gx, gy = gradients(x, y)
     papers = gx @ gx.T + gy @ gy.T
     assert np.linalg.matrix_rank(papers) == ZERNIKE_TERMS - 1
-    assert (fit.normal.x + fit.normal.y)[:-1, :-1] * RADIUS_MM**2 == pytest.approx(papers[1:, 1:], rel=1e-6, abs=1e-4)
+    assert (fit.normal.x + fit.normal.y)[:-1, :-1] * RADIUS_MM**2 == pytest.approx(
+        papers[1:, 1:], rel=1e-6, abs=1e-4
+    )
 
 
 def test_points_that_determine_nothing_are_refused() -> None:

@@ -29,14 +29,18 @@ from membrane_ctrl.sim.optics.trace import camera_pose, screen_pose, trace
 RNG = np.random.default_rng(5)
 NODES_X, NODES_Y = np.linspace(-250, 250, 6), np.linspace(-210, 240, 5)
 MAP = HeightMapConfig(
-    s_x_mm=tuple(NODES_X), s_y_mm=tuple(NODES_Y), heights_mm=tuple(tuple(row) for row in RNG.normal(0, 0.5, (5, 6)))
+    s_x_mm=tuple(NODES_X),
+    s_y_mm=tuple(NODES_Y),
+    heights_mm=tuple(tuple(row) for row in RNG.normal(0, 0.5, (5, 6))),
 )
 CROOKED = ScreenPoseConfig(bow_mm=0.8, height_map=MAP)
 
 
 def _optics(screen: ScreenPoseConfig | None) -> OpticsConfig:
     optics = bench(noise_adu=0.0)
-    return optics.model_copy(update={"geometry": optics.geometry.model_copy(update={"screen": screen})})
+    return optics.model_copy(
+        update={"geometry": optics.geometry.model_copy(update={"screen": screen})}
+    )
 
 
 def _map(x: np.ndarray, y: np.ndarray, heights: np.ndarray) -> HeightMapConfig:
@@ -71,8 +75,12 @@ def test_few_nodes_make_a_bow_or_a_plane() -> None:
     points = RNG.uniform(-190, 190, (2, 40))
     x, y = np.meshgrid([-200.0, 0, 200], [-200.0, 0, 200])
     bowed = Face.of(ScreenPoseConfig(height_map=_map(x[0], y[:, 0], 1.5 * (x**2 + y**2) / 200**2)))
-    assert bowed.heights(points) == pytest.approx(Face.of(ScreenPoseConfig(bow_mm=1.5)).heights(points), abs=1e-12)
-    tilted = Face.of(ScreenPoseConfig(height_map=_map(np.array([-200.0, 200]), y[:, 0], 0.01 * x[:, ::2])))
+    assert bowed.heights(points) == pytest.approx(
+        Face.of(ScreenPoseConfig(bow_mm=1.5)).heights(points), abs=1e-12
+    )
+    tilted = Face.of(
+        ScreenPoseConfig(height_map=_map(np.array([-200.0, 200]), y[:, 0], 0.01 * x[:, ::2]))
+    )
     assert tilted.heights(points)[0] == pytest.approx(0.01 * points[0], abs=1e-12)
 
 
@@ -88,7 +96,14 @@ def test_rays_meet_the_face_where_the_twin_says() -> None:
     optics = _optics(CROOKED)
     geometry = Geometry.from_config(optics)
     rays = geometry.rays(*pixel_grid(SMALL, stride=3))
-    seen = trace(camera_pose(optics.geometry), rays.T, FilmShape(37.1).terms, 37.1, 0.0, screen_pose(optics.geometry))
+    seen = trace(
+        camera_pose(optics.geometry),
+        rays.T,
+        FilmShape(37.1).terms,
+        37.1,
+        0.0,
+        screen_pose(optics.geometry),
+    )
     inside = seen.on_film(475.0)
     points = Points.of(rays[:, inside], np.zeros((2, int(inside.sum()))))
     tracer, surface = Tracer(geometry, 500.0), Surface.hencky_bowl(37.1, 500.0)
@@ -151,9 +166,15 @@ def test_the_live_cycle_has_the_face() -> None:
 def test_both_forms_of_the_geometry_carry_the_face() -> None:
     short = GeometryConfig(a_mm=2672.0, b_mm=2871.0, alpha_deg=90.0, screen=CROOKED)
     assert changed(short, ("a_mm",), [1.0]).screen == CROOKED
-    camera = CameraPoseConfig(position_mm=(0, 0, 2672), rotation=((1, 0, 0), (0, -1, 0), (0, 0, -1)))
-    posed = CROOKED.model_copy(update={"origin_mm": (0, 0, 2871), "s_x": (-1, 0, 0), "s_y": (0, 1, 0)})
-    moved = changed(GeometryConfig(camera=camera, screen=posed), GENERAL_NAMES, np.full(12, 0.01)).screen
+    camera = CameraPoseConfig(
+        position_mm=(0, 0, 2672), rotation=((1, 0, 0), (0, -1, 0), (0, 0, -1))
+    )
+    posed = CROOKED.model_copy(
+        update={"origin_mm": (0, 0, 2871), "s_x": (-1, 0, 0), "s_y": (0, 1, 0)}
+    )
+    moved = changed(
+        GeometryConfig(camera=camera, screen=posed), GENERAL_NAMES, np.full(12, 0.01)
+    ).screen
     assert moved is not None
     assert (moved.bow_mm, moved.height_map) == (0.8, MAP)
 
@@ -163,7 +184,10 @@ def test_both_forms_of_the_geometry_carry_the_face() -> None:
     [
         ({"s_x_mm": (-250.0, 0.0, 249.0, 300.0, 400.0, 500.0)}, "s_x_mm must rise in even steps"),
         ({"s_y_mm": tuple(NODES_Y[::-1])}, "s_y_mm must rise"),
-        ({"heights_mm": ((0.0,) * 6,) * 4}, "4 rows of 6 numbers; s_y_mm and s_x_mm require 5 rows of 6"),
+        (
+            {"heights_mm": ((0.0,) * 6,) * 4},
+            "4 rows of 6 numbers; s_y_mm and s_x_mm require 5 rows of 6",
+        ),
         ({"heights_mm": ((800.0,) * 6,) * 5}, "beyond 100 mm"),
     ],
 )
@@ -175,7 +199,11 @@ def test_a_map_that_is_no_grid_is_refused(change: dict[str, object], message: st
 def test_a_map_must_reach_over_the_pattern() -> None:
     small = _map(NODES_X / 2, NODES_Y / 2, np.array(MAP.heights_mm))
     with pytest.raises(ValueError, match=r"height_map must reach over the pattern, 199\.28 mm"):
-        OpticsConfig(geometry=GeometryConfig(a_mm=2672, b_mm=2871, alpha_deg=80.9, screen={"height_map": small}))
+        OpticsConfig(
+            geometry=GeometryConfig(
+                a_mm=2672, b_mm=2871, alpha_deg=80.9, screen={"height_map": small}
+            )
+        )
 
 
 def test_half_a_pose_is_refused() -> None:
@@ -183,5 +211,8 @@ def test_half_a_pose_is_refused() -> None:
         ScreenPoseConfig(origin_mm=(0, 0, 2871))
     with pytest.raises(ValueError, match="give either a_mm"):
         GeometryConfig(
-            a_mm=2672, b_mm=2871, alpha_deg=80.9, screen={"origin_mm": (0, 0, 1), "s_x": (1, 0, 0), "s_y": (0, 1, 0)}
+            a_mm=2672,
+            b_mm=2871,
+            alpha_deg=80.9,
+            screen={"origin_mm": (0, 0, 1), "s_x": (1, 0, 0), "s_y": (0, 1, 0)},
         )

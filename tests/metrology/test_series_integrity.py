@@ -1,4 +1,6 @@
-"""Simulated frames of a multi-frequency set: each fault is named and repaired where possible; good sets pass."""
+"""Simulated frames of a multi-frequency set: each fault is named and repaired where possible; good
+sets pass.
+"""
 
 from __future__ import annotations
 
@@ -23,7 +25,9 @@ def scene(second: float = 0.0, noise_adu: float = 1.0) -> tuple[AxisSeries, Axis
         place = rng.uniform(0.2, 0.8, PIXELS)
         phase = 2 * np.pi * PERIODS[:, None, None] * place + SHIFTS[:, None]
         frames = 110 + 90 * np.cos(phase) + 90 * second * np.cos(2 * phase)
-        axes.append(AxisSeries(axis, frames + rng.normal(0, noise_adu, frames.shape), PERIODS, SHIFTS))
+        axes.append(
+            AxisSeries(axis, frames + rng.normal(0, noise_adu, frames.shape), PERIODS, SHIFTS)
+        )
     return axes[0], axes[1]
 
 
@@ -56,7 +60,11 @@ def test_good_frames_pass_whatever_the_display_does(second: float) -> None:
 @pytest.mark.parametrize("step", [0, 1, 3])
 def test_a_stale_frame_is_named_and_done_without(index: int, step: int) -> None:
     y, x = scene()
-    before = y.frames[-1, -1] if (index, step) == (0, 0) else x.frames.reshape(-1, PIXELS)[4 * index + step - 1]
+    before = (
+        y.frames[-1, -1]
+        if (index, step) == (0, 0)
+        else x.frames.reshape(-1, PIXELS)[4 * index + step - 1]
+    )
     found = checked(spoiled(index, step, before + np.random.default_rng(1).normal(0, 1, PIXELS)))
     assert found.verdict == "degraded"
     assert named(found) == {("x", index, step)}

@@ -1,4 +1,6 @@
-"""The real facet beside the golden result of its own tool (docs/real-facet.md explains every figure)."""
+"""The real facet beside the golden result of its own tool (docs/real-facet.md explains every
+figure).
+"""
 
 from itertools import product
 from pathlib import Path
@@ -43,7 +45,9 @@ def camera():
 def golden(request):
     """Screen as measured or as a rectangle, with the tool's result for it."""
     screen, result = SCREENS[request.param]
-    return sofast_facet.read_screen(DATA / f"{screen}.h5"), sofast_facet.read_result(DATA / f"{result}.h5")
+    return sofast_facet.read_screen(DATA / f"{screen}.h5"), sofast_facet.read_result(
+        DATA / f"{result}.h5"
+    )
 
 
 @pytest.fixture(scope="module")
@@ -58,7 +62,9 @@ def mask():
 
 
 def golden_focal_mm(result):
-    return 250 / result.coefficients[2], 250 / result.coefficients[5]  # h = x^2 / (4 f), coefficients in 1/m
+    return 250 / result.coefficients[2], 250 / result.coefficients[
+        5
+    ]  # h = x^2 / (4 f), coefficients in 1/m
 
 
 def test_every_pixel_unwraps_alike(golden, measurement, response):
@@ -73,8 +79,12 @@ def test_every_pixel_unwraps_alike(golden, measurement, response):
 def test_rays_and_screen_points_are_the_golden_ones(golden, seen, camera):
     result = golden[1]
     geometry = result.geometry(camera)
-    np.testing.assert_allclose(geometry.rays(seen.columns_px, seen.rows_px), result.rays, atol=1e-14)
-    np.testing.assert_allclose(geometry.screen_points(seen.screen_mm), result.screen_points_mm, atol=1e-3)
+    np.testing.assert_allclose(
+        geometry.rays(seen.columns_px, seen.rows_px), result.rays, atol=1e-14
+    )
+    np.testing.assert_allclose(
+        geometry.screen_points(seen.screen_mm), result.screen_points_mm, atol=1e-3
+    )
 
 
 def test_the_pose_taken_over_stands_at_the_measured_distance(golden, measurement, camera):
@@ -88,11 +98,15 @@ def test_robust_fit_of_all_pixels_agrees(golden, seen, camera):
     focal_x_mm, focal_y_mm = golden_focal_mm(result)
     assert ours.fit.surface.focal_x_mm == pytest.approx(focal_x_mm, rel=8e-4)
     assert ours.fit.surface.focal_y_mm == pytest.approx(focal_y_mm, rel=8e-4)
-    assert ours.fit.surface.curvature_xy_per_mm == pytest.approx(result.coefficients[4] * 1e-3, rel=3e-3)
+    assert ours.fit.surface.curvature_xy_per_mm == pytest.approx(
+        result.coefficients[4] * 1e-3, rel=3e-3
+    )
     difference = ours.slopes - result.slopes
     assert np.all(np.std(difference, axis=1) < 0.02e-6)  # in shape: 0.02 µrad
     assert np.abs(difference).max() < 0.8e-6  # with the tilt in which the two fits differ
-    np.testing.assert_allclose(np.std(ours.slopes, axis=1), np.std(result.slopes, axis=1), rtol=1e-4)
+    np.testing.assert_allclose(
+        np.std(ours.slopes, axis=1), np.std(result.slopes, axis=1), rtol=1e-4
+    )
     np.testing.assert_allclose(ours.points_mm, result.points_mm, atol=1e-3)
     spread = np.sqrt(np.mean(ours.fit.residual**2, axis=1))
     np.testing.assert_allclose(spread, golden_residual(result), rtol=2e-3)
@@ -127,21 +141,31 @@ def test_the_response_calibration_does_not_fit_these_frames(measurement, respons
     black, white = measurement.black[mask], measurement.white[mask]
     for frames in (*measurement.frames_x, *measurement.frames_y):
         as_seen = closure(frames[..., mask], SHIFTS_RAD).rms_adu / np.median(white)
-        as_shown = closure(response.shown_levels(frames[..., mask], black, white), SHIFTS_RAD).rms_adu / 255
+        as_shown = (
+            closure(response.shown_levels(frames[..., mask], black, white), SHIFTS_RAD).rms_adu
+            / 255
+        )
         assert as_shown > 2.5 * as_seen
     with_it, without = (decode(measurement, mask, choice) for choice in (response, None))
     for corrected, raw in ((with_it.x, without.x), (with_it.y, without.y)):
-        assert np.all(np.std(corrected.step_periods, axis=1) > 1.15 * np.std(raw.step_periods, axis=1))
+        assert np.all(
+            np.std(corrected.step_periods, axis=1) > 1.15 * np.std(raw.step_periods, axis=1)
+        )
 
 
 def frame_series(measurement, mask, axis):
     """Frames (F, 4, N) as seen, and the periods."""
-    frames, periods = getattr(measurement, f"frames_{axis}"), getattr(measurement, f"periods_{axis}")
+    frames, periods = (
+        getattr(measurement, f"frames_{axis}"),
+        getattr(measurement, f"periods_{axis}"),
+    )
     return frames[..., mask].copy(), periods
 
 
 def named(frames, periods, index):
-    """The suspect of one frequency: by level against the next frequency for the coarsest, else by phase."""
+    """The suspect of one frequency: by level against the next frequency for the coarsest, else by
+    phase.
+    """
     if index == 0:
         neighbour = frames[1]
         level = neighbour.mean(axis=0), np.abs(phasors(neighbour, SHIFTS_RAD))
@@ -183,7 +207,9 @@ def test_unwrapping_alone_does_not_notice_a_stale_frame_of_the_finest_fringe(mea
 
 
 def series(measurement, change=None):
-    """The check of the measured frames, one of them changed, at pixels chosen without the golden result."""
+    """The check of the measured frames, one of them changed, at pixels chosen without the golden
+    result.
+    """
     pixels = lit_pixels(measurement)
     axes = series_of(measurement, pixels)
     if change is not None:
@@ -207,7 +233,9 @@ def test_every_stale_frame_is_named_by_the_check(measurement):
 
         found = series(measurement, stale)
         assert found.verdict == "degraded"
-        assert [(flag.axis, flag.index, flag.step) for flag in found.flags] == [("yx"[axis], index, step)]
+        assert [(flag.axis, flag.index, flag.step) for flag in found.flags] == [
+            ("yx"[axis], index, step)
+        ]
         assert found.flags[0].reason.startswith("stale")
 
 
@@ -231,5 +259,6 @@ def test_a_stale_frame_of_the_finest_fringe_costs_nothing_once_it_is_known(measu
 
     mended = series(measurement, stale).axes[1]
     position, truth = (unwrap(axis.phases_rad(), axis.periods).screens for axis in (mended, good))
-    # 5 mm and more when it is not noticed (see above); the second harmonic, which three steps alias, is what is left
+    # 5 mm and more when it is not noticed (see above); the second harmonic, which three steps
+    # alias, is what is left
     assert 8727 * np.sqrt(np.mean((position - truth) ** 2)) < 0.5

@@ -21,8 +21,10 @@ def write(path, **items):
 def measurement(path, frames=32):
     return write(
         path,
-        MeasurementSofastFringe__fringe_images=np.arange(frames, dtype=np.uint8) * np.ones((3, 5, 1), np.uint8),
-        MeasurementSofastFringe__mask_images=np.array([1, 200], np.uint8) * np.ones((3, 5, 1), np.uint8),
+        MeasurementSofastFringe__fringe_images=np.arange(frames, dtype=np.uint8)
+        * np.ones((3, 5, 1), np.uint8),
+        MeasurementSofastFringe__mask_images=np.array([1, 200], np.uint8)
+        * np.ones((3, 5, 1), np.uint8),
         MeasurementSofastFringe__fringe_periods_x=[0.9, 3.9, 15.9, 63.9],
         MeasurementSofastFringe__fringe_periods_y=[0.9, 3.9, 15.9, 63.9],
         MeasurementSofastFringe__dist_optic_screen=np.array([10.5]),
@@ -60,7 +62,10 @@ def test_screens_of_both_models_in_mm_and_no_other(tmp_path):
         DisplayShape__screen_x=8.0,
         DisplayShape__screen_y=3.0,
     )
-    assert sofast_facet.read_screen(screen).screen_mm(np.array([[1.0], [0.0]])).tolist() == [[4000], [-1500]]
+    assert sofast_facet.read_screen(screen).screen_mm(np.array([[1.0], [0.0]])).tolist() == [
+        [4000],
+        [-1500],
+    ]
     corners = np.array([[0.0, 1, 0, 1], [0, 0, 1, 1]])
     screen = write(
         tmp_path / "d.h5",
@@ -68,7 +73,9 @@ def test_screens_of_both_models_in_mm_and_no_other(tmp_path):
         DisplayShape__xy_screen_fraction=corners,
         DisplayShape__xy_screen_coords=2 * corners,
     )
-    np.testing.assert_allclose(sofast_facet.read_screen(screen).screen_mm(np.array([[0.5], [0.25]])), [[1000], [500]])
+    np.testing.assert_allclose(
+        sofast_facet.read_screen(screen).screen_mm(np.array([[0.5], [0.25]])), [[1000], [500]]
+    )
     with pytest.raises(ValueError, match="distorted3D"):
         sofast_facet.read_screen(write(tmp_path / "3.h5", DisplayShape__screen_model="distorted3D"))
 
@@ -80,7 +87,9 @@ def test_oblong_pixels_become_square_ones_of_the_same_rays(tmp_path):
         Camera__distortion_coef=np.zeros(5),
     )
     camera = sofast_facet.read_camera(path)
-    assert (camera.square_rows(np.array([85.0])) - 75) / camera.focal_px[0] == pytest.approx(10 / 350)
+    assert (camera.square_rows(np.array([85.0])) - 75) / camera.focal_px[0] == pytest.approx(
+        10 / 350
+    )
 
 
 def test_without_h5py_the_extra_is_named(tmp_path, monkeypatch):
@@ -94,14 +103,18 @@ def test_what_leads_out_of_the_file_or_is_too_large_is_refused(tmp_path):
     path = tmp_path / "e.h5"
     with h5py.File(path, "w") as file:
         file["Camera/intrinsic_mat"] = h5py.ExternalLink(other.name, "Camera/intrinsic_mat")
-    with pytest.raises(ValueError, match="intrinsic_mat is a link, and links are not followed here"):
+    with pytest.raises(
+        ValueError, match="intrinsic_mat is a link, and links are not followed here"
+    ):
         sofast_facet.read_camera(path)
     with h5py.File(path, "w") as file:
         file["Camera"] = h5py.ExternalLink(other.name, "Camera")
     with pytest.raises(ValueError, match="is a link"):
         sofast_facet.read_camera(path)
     with h5py.File(path, "w") as file:
-        file.create_dataset("Camera/intrinsic_mat", (2**38,), "f8", chunks=(2**16,))  # 2 TB of nothing, in 1 kB
+        file.create_dataset(
+            "Camera/intrinsic_mat", (2**38,), "f8", chunks=(2**16,)
+        )  # 2 TB of nothing, in 1 kB
     with pytest.raises(ValueError, match="too many to read"):
         sofast_facet.read_camera(path)
     with h5py.File(path, "w") as file:

@@ -1,4 +1,6 @@
-"""Running statistics and pairs: the same numbers as from everything at once, in memory that does not grow."""
+"""Running statistics and pairs: the same numbers as from everything at once, in memory that does
+not grow.
+"""
 
 from __future__ import annotations
 
@@ -19,7 +21,9 @@ from membrane_ctrl.model.zernike_terms import ZERNIKE_TERMS
 
 
 def test_running_covariance() -> None:
-    vectors = np.random.default_rng(1).normal(1e4, [0.1, 2.0, 30.0], (500, 3))  # far from 0: no cancellation
+    vectors = np.random.default_rng(1).normal(
+        1e4, [0.1, 2.0, 30.0], (500, 3)
+    )  # far from 0: no cancellation
     running = RunningCovariance(3)
     assert not running.covariance.any()
     for vector in vectors:
@@ -45,7 +49,12 @@ def test_default_points_are_inside_and_apart() -> None:
 
 
 def _moment(time_s: float, value: float = 0.0, trials: int = 3) -> Moment:
-    return Moment(f"{time_s:g}", time_s, np.full(ZERNIKE_TERMS, value), np.full((trials, ZERNIKE_TERMS), value))
+    return Moment(
+        f"{time_s:g}",
+        time_s,
+        np.full(ZERNIKE_TERMS, value),
+        np.full((trials, ZERNIKE_TERMS), value),
+    )
 
 
 def _lags(finder: PairFinder, time_s: float) -> dict[float, str]:
@@ -85,7 +94,10 @@ def test_sets_without_a_time_and_with_another_clock() -> None:
 
 def test_what_both_sets_share_cancels_trial_by_trial() -> None:
     rng = np.random.default_rng(2)
-    shared, own = rng.normal(0, 10.0, (400, ZERNIKE_TERMS)), rng.normal(0, 0.1, (2, 400, ZERNIKE_TERMS))
+    shared, own = (
+        rng.normal(0, 10.0, (400, ZERNIKE_TERMS)),
+        rng.normal(0, 0.1, (2, 400, ZERNIKE_TERMS)),
+    )
     finder = PairFinder((60.0,))
     finder.add(Moment("a", 0.0, np.zeros(ZERNIKE_TERMS), shared + own[0]))
     (pair,) = finder.add(Moment("b", 60.0, np.ones(ZERNIKE_TERMS), shared + own[1]))

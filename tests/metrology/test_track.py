@@ -25,7 +25,9 @@ from membrane_ctrl.sim.optics.simulation_spec import SimulationSpec
 Frames = list[NDArray[np.uint8]]
 SHRINK = 10
 SIZE = (2048 // SHRINK, 2448 // SHRINK)
-OPTICS = OpticsConfig(camera=CameraConfig(width_px=SIZE[1], height_px=SIZE[0], pixel_um=3.45 * SHRINK))
+OPTICS = OpticsConfig(
+    camera=CameraConfig(width_px=SIZE[1], height_px=SIZE[0], pixel_um=3.45 * SHRINK)
+)
 FILM = typical_film(37.1, 500.0, seed=1)
 STEPS = np.array([(2 * math.pi * k / 5, 4 * math.pi * k / 5) for k in range(5)])
 STILL = (0.0, 0.0)
@@ -41,17 +43,25 @@ class Bench:
     taken: int = 0
 
     def frame(
-        self, moved_um: float = 0.0, film: FilmShape = FILM, gain: float = 1.0, shifts: tuple[float, float] = STILL
+        self,
+        moved_um: float = 0.0,
+        film: FilmShape = FILM,
+        gain: float = 1.0,
+        shifts: tuple[float, float] = STILL,
     ) -> NDArray[np.uint8]:
         self.taken += 1
         renderer = OpticsRenderer(OPTICS, film, seed=100 + self.taken)
         return np.asarray(
-            renderer.render(Pattern("crossed", "", 32, shifts[0], shift_y_rad=shifts[1]), moved_um, gain=gain),
+            renderer.render(
+                Pattern("crossed", "", 32, shifts[0], shift_y_rad=shifts[1]), moved_um, gain=gain
+            ),
             np.uint8,
         )
 
     def tracker(self) -> Tracker:
-        """A tracker that has seen nothing, or only the still mirror; its derivatives are made once."""
+        """A tracker that has seen nothing, or only the still mirror;
+        its derivatives are made once.
+        """
         return deepcopy(self.prepared)
 
 
@@ -63,9 +73,12 @@ def reference(tmp_path_factory: pytest.TempPathFactory) -> SetFigure:
 
 
 @pytest.mark.parametrize(
-    ("periods", "why"), [(12, "only 8 fringes across the mirror"), (120, r"only \d\.\d pixels a fringe")]
+    ("periods", "why"),
+    [(12, "only 8 fringes across the mirror"), (120, r"only \d\.\d pixels a fringe")],
 )
-def test_fringes_that_tell_nothing_are_refused(reference: SetFigure, periods: int, why: str) -> None:
+def test_fringes_that_tell_nothing_are_refused(
+    reference: SetFigure, periods: int, why: str
+) -> None:
     with pytest.raises(ValueError, match=why):
         scene_of(reference.head.optics, reference.checked, reference.figure, 398.56 / periods)
 
@@ -116,8 +129,12 @@ def test_every_frame_gives_the_figure_within_its_error_bar(bench: Bench) -> None
 
 
 @pytest.mark.parametrize(("noise_adu", "verdict"), [(0.1, "rejected"), (0.0, "ok")])
-def test_a_frame_again_is_frozen_unless_the_camera_has_no_noise(bench: Bench, noise_adu: float, verdict: str) -> None:
-    """With a tenth of a count a pixel in nine differs; below 0.2 counts a frozen camera was called ok."""
+def test_a_frame_again_is_frozen_unless_the_camera_has_no_noise(
+    bench: Bench, noise_adu: float, verdict: str
+) -> None:
+    """With a tenth of a count a pixel in nine differs; below 0.2 counts a frozen camera was called
+    ok.
+    """
     tracker, frame = Tracker(bench.scene, SIZE, 255, noise_adu), bench.frame()
     assert tracker.follow(frame, STILL, 0.0).verdict == "ok"
     assert tracker.follow(frame, STILL, 0.1).verdict == verdict
@@ -131,7 +148,9 @@ def test_without_steps_the_reference_gives_the_light(bench: Bench) -> None:
 
 
 def test_a_drift_is_no_error_of_the_steps_and_errors_are_no_motion() -> None:
-    """The first parameter drifts, the others only scatter: as their errors do, so that they stay on the drift."""
+    """The first parameter drifts, the others only scatter: as their errors do, so that they stay on
+    the drift.
+    """
     random, step_s = np.random.default_rng(2), 10.0 * np.arange(5)
     drifted = np.outer(step_s, np.eye(ZERNIKE_TERMS)[0] * 2e-6)
     places = drifted + random.normal(0, 2e-5, (5, ZERNIKE_TERMS))
@@ -141,7 +160,9 @@ def test_a_drift_is_no_error_of_the_steps_and_errors_are_no_motion() -> None:
     assert np.ptp(found[:, 1]) == 0
     assert np.allclose(found.mean(axis=0), places.mean(axis=0))
     assert (left < variance).all()
-    moved, _ = steadied(places, variance / 1e6, 0 * drifted)  # errors that explain nothing: it is motion
+    moved, _ = steadied(
+        places, variance / 1e6, 0 * drifted
+    )  # errors that explain nothing: it is motion
     assert np.allclose(moved, places, atol=1e-7)
 
 
@@ -158,12 +179,22 @@ def test_a_hand_makes_the_error_bars_larger_while_it_is_there(bench: Bench) -> N
     for _ in range(5):
         tracker = bench.tracker()
         pictures = [bench.frame(), bench.frame(), hand(bench.frame(), 46), bench.frame()]
-        _, before, covered, after = [tracker.follow(one, STILL, 0.1 * k) for k, one in enumerate(pictures)]
+        _, before, covered, after = [
+            tracker.follow(one, STILL, 0.1 * k) for k, one in enumerate(pictures)
+        ]
         assert covered.verdict == "degraded", covered.reason
         assert np.abs((covered.coeffs_um - before.coeffs_um)[1:] / covered.sigma_um[1:]).max() < 5
         terms = np.median(covered.sigma_um[1:] / before.sigma_um[1:])
-        grown.append([covered.sag_sigma_um / before.sag_sigma_um, terms, after.sag_sigma_um / before.sag_sigma_um])
-    sag, terms, back = np.mean(grown, axis=0)  # from picture to picture they scatter by 0.12, 0.06 and 0.08
+        grown.append(
+            [
+                covered.sag_sigma_um / before.sag_sigma_um,
+                terms,
+                after.sag_sigma_um / before.sag_sigma_um,
+            ]
+        )
+    sag, terms, back = np.mean(
+        grown, axis=0
+    )  # from picture to picture they scatter by 0.12, 0.06 and 0.08
     assert sag > 1.15
     assert terms > 1.05
     assert back == pytest.approx(1.0, abs=0.1)
@@ -181,7 +212,9 @@ def test_jumps_at_steps_of_the_pattern_are_told_from_noise_and_motion() -> None:
     assert sigma[1] == pytest.approx(0.1, rel=0.05)
     assert sigma[0] < 0.01
     assert np.median(sigma) < 0.002
-    known = np.sqrt(jumps.variance_mm2(np.full(ZERNIKE_TERMS, 0.004**2)))  # of that much the place explains
+    known = np.sqrt(
+        jumps.variance_mm2(np.full(ZERNIKE_TERMS, 0.004**2))
+    )  # of that much the place explains
     assert known[1] == pytest.approx(0.0998, rel=0.05)
     assert (known[2:] < sigma[2:].clip(1e-9)).all()
     jumps.begin()  # what was before is no jump
@@ -231,8 +264,12 @@ def dusty(frame: NDArray[np.uint8]) -> NDArray[np.uint8]:
     return np.where(spots, 0.8 * frame, frame).astype(np.uint8)
 
 
-def test_a_fit_that_stays_lost_knows_no_forgotten_bands(bench: Bench, monkeypatch: pytest.MonkeyPatch) -> None:
-    """A brighter frame may be lost and yet be accepted: bands that were forgotten then ended the acquisition."""
+def test_a_fit_that_stays_lost_knows_no_forgotten_bands(
+    bench: Bench, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A brighter frame may be lost and yet be accepted: bands that were forgotten then ended the
+    acquisition.
+    """
     tracker, rows = bench.tracker(), np.arange(SIZE[0])[:, None]
     assert tracker.follow(bench.frame(), STILL, 0.0).verdict == "ok"
     banded = (bench.frame() * (1 + 0.1 * np.cos(0.9 * rows))).astype(np.uint8)
@@ -254,7 +291,9 @@ def judged(bench: Bench, name: str) -> tuple[TrackedFrame, TrackedFrame]:
         "frozen": lambda: good,
         "hand": lambda: hand(bench.frame(), 40),
         "grey hand": lambda: hand(bench.frame(), 36, float(np.median(bench.scene.light_adu[0]))),
-        "large grey hand": lambda: hand(bench.frame(), 44, float(np.median(bench.scene.light_adu[0]))),
+        "large grey hand": lambda: hand(
+            bench.frame(), 44, float(np.median(bench.scene.light_adu[0]))
+        ),
         "body": lambda: hand(bench.frame(), 100),
         "dust": lambda: dusty(bench.frame()),
         "dark": lambda: bench.frame(gain=0.1),
@@ -265,7 +304,9 @@ def judged(bench: Bench, name: str) -> tuple[TrackedFrame, TrackedFrame]:
         "tilt by half a period": lambda: bench.frame(film=with_terms({2: LOST_TILT_UM / 2})),
         "knock": lambda: bench.frame(film=with_terms({3: 20.0})),
         "blank": lambda: np.full(SIZE, 120, np.uint8),
-        "stripes": lambda: (120 + 30 * np.cos(0.9 * np.arange(SIZE[0]))[:, None] + np.zeros(SIZE)).astype(np.uint8),
+        "stripes": lambda: (
+            120 + 30 * np.cos(0.9 * np.arange(SIZE[0]))[:, None] + np.zeros(SIZE)
+        ).astype(np.uint8),
         "blank screen": lambda: noisy_grey(float(np.median(bench.scene.light_adu[0]))),
     }
     found = tracker.follow(faulty[name](), STILL, 0.05)
@@ -294,12 +335,18 @@ def judged(bench: Bench, name: str) -> tuple[TrackedFrame, TrackedFrame]:
         ("stripes", "rejected", "no fringes"),
     ],
 )
-def test_a_faulty_frame_is_named_and_spoils_no_other(bench: Bench, name: str, verdict: str, reason: str) -> None:
+def test_a_faulty_frame_is_named_and_spoils_no_other(
+    bench: Bench, name: str, verdict: str, reason: str
+) -> None:
     faulty, after = judged(bench, name)
     assert (faulty.verdict, faulty.reason[: len(reason)]) == (verdict, reason), faulty.reason
     assert np.isnan(faulty.sag_um) == (verdict == "rejected")
-    named = {"exposure": "exposure changed", "knock": "knocked"}.get(name, "")  # light returns; a knock remains
-    assert (after.verdict, after.reason[: len(named)]) == ("degraded" if named else "ok", named), after.reason
+    named = {"exposure": "exposure changed", "knock": "knocked"}.get(
+        name, ""
+    )  # light returns; a knock remains
+    assert (after.verdict, after.reason[: len(named)]) == ("degraded" if named else "ok", named), (
+        after.reason
+    )
     assert after.sag_um - 1e3 * bench.scene.surface.sag_mm == pytest.approx(2.0, abs=0.2)
 
 
@@ -312,7 +359,9 @@ def test_fringes_of_which_a_lost_period_looks_like_a_film_are_refused(bench: Ben
 
 
 def jumps(bench: Bench, count: int, seed: int) -> list[str]:
-    """Random jumps of sag and tilt, each from the still mirror, whose frames were wrong and not refused."""
+    """Random jumps of sag and tilt, each from the still mirror, whose frames were wrong and not
+    refused.
+    """
     generator, silent, good = np.random.default_rng(seed), [], bench.tracker()
     assert good.follow(bench.frame(), STILL, 0.0).verdict == "ok"
     for _ in range(count):
@@ -322,7 +371,9 @@ def jumps(bench: Bench, count: int, seed: int) -> list[str]:
         found = deepcopy(good).follow(bench.frame(sag_um, film), STILL, 0.05)
         error_um = found.sag_um - 1e3 * bench.scene.surface.sag_mm - sag_um
         if found.verdict != "rejected" and not abs(error_um) < 1.0:
-            silent.append(f"{sag_um:.0f} µm, {tilt_mrad:.2f} mrad: {found.verdict}, {error_um:.2f} µm off")
+            silent.append(
+                f"{sag_um:.0f} µm, {tilt_mrad:.2f} mrad: {found.verdict}, {error_um:.2f} µm off"
+            )
     return silent
 
 

@@ -1,4 +1,6 @@
-"""The compiled loops over a frame's bins, against the same formulas in double precision, bin by bin."""
+"""The compiled loops over a frame's bins, against the same formulas in double precision, bin by
+bin.
+"""
 
 import platform
 import re
@@ -62,7 +64,11 @@ def test_light_and_its_sums_are_those_of_the_formulas(response: tuple[float, ...
     seen = 50 + single(bins, scale=40)
     bent = np.array(response, np.float32)
 
-    x, y = base + cells.spread(np.einsum("k,akiq->aiq", changes[0], slow[:2])) + shifts[:, None].astype(float)
+    x, y = (
+        base
+        + cells.spread(np.einsum("k,akiq->aiq", changes[0], slow[:2]))
+        + shifts[:, None].astype(float)
+    )
     maps = 1 + cells.spread(np.einsum("mk,kiq->miq", changes[1:], slow[2])).astype(float)
     v = 0.5 + 0.25 * (np.cos(x) + np.cos(y))
     beyond = sum(c * (v**k - v) for k, c in enumerate(response, 2))
@@ -75,7 +81,9 @@ def test_light_and_its_sums_are_those_of_the_formulas(response: tuple[float, ...
             light[0].astype(float),
             light[1] * (np.cos(x) + 2 * beyond),
             light[2] * (np.cos(y) + 2 * beyond),
-            light[0] * maps[0] + swings[0] * (np.cos(x) + 2 * beyond) + swings[1] * (np.cos(y) + 2 * beyond),
+            light[0] * maps[0]
+            + swings[0] * (np.cos(x) + 2 * beyond)
+            + swings[1] * (np.cos(y) + 2 * beyond),
         ]
     )
     rest = seen - gain * expected[5]
@@ -88,30 +96,42 @@ def test_light_and_its_sums_are_those_of_the_formulas(response: tuple[float, ...
     by_maps = np.einsum("kiq,miq->mk", slow[2].astype(float), pull[2:])
 
     shown = base, light, cells.blocks(*slow), cells.offset, bent, changes, shifts
-    waves, out, right = np.empty((6, bins), np.float32), np.empty((4, bins), np.float32), np.empty((4, ZERNIKE_TERMS))
+    waves, out, right = (
+        np.empty((6, bins), np.float32),
+        np.empty((4, bins), np.float32),
+        np.empty((4, ZERNIKE_TERMS)),
+    )
     light_waves(*shown, waves)
     light_left(*shown, edge, gain, seen, reach, right, out)
     np.testing.assert_allclose(waves, expected, atol=2e-3)
     np.testing.assert_allclose(out[0], rest, atol=2e-3)
     np.testing.assert_allclose(out[1], weight, atol=3e-4)
-    np.testing.assert_allclose(out[2], weight * rest * edge * gain * expected[5], atol=2.0)  # of 10,000
+    np.testing.assert_allclose(
+        out[2], weight * rest * edge * gain * expected[5], atol=2.0
+    )  # of 10,000
     np.testing.assert_allclose(out[3], weight * edge * expected[5] ** 2, atol=3.0)
     sums = np.vstack([by_surface, by_maps])
     np.testing.assert_allclose(right, sums, atol=1e-4 * np.abs(sums).max())
 
 
-@pytest.mark.skipif(platform.machine() != "x86_64", reason="the instruction's name is another one there")
+@pytest.mark.skipif(
+    platform.machine() != "x86_64", reason="the instruction's name is another one there"
+)
 def test_the_loop_over_bins_uses_vector_units() -> None:
-    """It did not where the compiler could not tell that its arrays do not overlap, and took five times as long."""
+    """It did not where the compiler could not tell that its arrays do not overlap, and took five
+    times as long.
+    """
     single, wide, blocks = numba.float32[::1], numba.float32[:, ::1], numba.float32[:, :, ::1]
     offset, sums = numba.float32[:, :, :, ::1], numba.float64[:, ::1]
     shown = wide, wide, blocks, offset, single, wide, single
-    compiled = numba.njit(nogil=True, error_model="numpy", fastmath=light_left.targetoptions["fastmath"])(
-        light_left.py_func
-    )
+    compiled = numba.njit(
+        nogil=True, error_model="numpy", fastmath=light_left.targetoptions["fastmath"]
+    )(light_left.py_func)
     compiled.compile((*shown, single, single, single, single, sums, wide))
     (code,) = compiled.inspect_asm().values()
-    assert re.search("roundps|vrndscaleps", code)  # of several numbers at a time; that of one ends in "ss"
+    assert re.search(
+        "roundps|vrndscaleps", code
+    )  # of several numbers at a time; that of one ends in "ss"
 
 
 def test_sums_by_number() -> None:

@@ -1,4 +1,6 @@
-"""Tracking in a hold: the anchor, the steps of the pattern, and what follows when the mirror is lost."""
+"""Tracking in a hold: the anchor, the steps of the pattern, and what follows when the mirror is
+lost.
+"""
 
 from __future__ import annotations
 
@@ -14,7 +16,14 @@ from membrane_ctrl.config.schema import CameraConfig, Config, OpticsConfig
 from membrane_ctrl.metrology import phase
 from membrane_ctrl.metrology.live import LiveReconstructor
 from membrane_ctrl.metrology.optics.film_law import zernike_projection
-from membrane_ctrl.metrology.track.live import COVARIANCE_S, LOST_S, REJECTED_S, LiveTracker, Stethoscope, _estimate
+from membrane_ctrl.metrology.track.live import (
+    COVARIANCE_S,
+    LOST_S,
+    REJECTED_S,
+    LiveTracker,
+    Stethoscope,
+    _estimate,
+)
 from membrane_ctrl.metrology.track.tracked import rejected_frame
 from membrane_ctrl.model.run_events import Vibrations
 from membrane_ctrl.model.shape_estimate import ShapeEstimate, pack_estimate, unpack_estimate
@@ -27,16 +36,22 @@ from membrane_ctrl.sim.plant import Plant
 from tests.support.virtual_record import run_virtual
 
 SHRINK = 8
-OPTICS = OpticsConfig(camera=CameraConfig(width_px=2448 // SHRINK, height_px=2048 // SHRINK, pixel_um=3.45 * SHRINK))
+OPTICS = OpticsConfig(
+    camera=CameraConfig(width_px=2448 // SHRINK, height_px=2048 // SHRINK, pixel_um=3.45 * SHRINK)
+)
 FILM = typical_film(37.1, 500.0, seed=1)
 RATE_HZ, STEP_S = 4.0, 1.0
 
 
 class Bench:
-    """A tracker, and the twin's frames for it at a rate; `stains` multiply the light of the crossed frames."""
+    """A tracker, and the twin's frames for it at a rate; `stains` multiply the light of the crossed
+    frames.
+    """
 
     def __init__(self, gamma: float = 1.0) -> None:
-        self.tracker = LiveTracker(OPTICS, LiveReconstructor(OPTICS, 1), 32, STEP_S, exposure_s=0.02)
+        self.tracker = LiveTracker(
+            OPTICS, LiveReconstructor(OPTICS, 1), 32, STEP_S, exposure_s=0.02
+        )
         self.renderer = OpticsRenderer(OPTICS, FILM, Light(gamma=gamma), seed=3)
         self.time_s, self.rate_hz = 0.0, RATE_HZ
         self.shown: list[Pattern] = []
@@ -48,7 +63,9 @@ class Bench:
         self.time_s += 2.0
         return self.tracker.full(frames, self.time_s + 0.1 * np.arange(18), np.full(18, moved_um))
 
-    def frame(self, moved_um: float = 0.0, reading_um: float = math.nan, gain: float = 1.0) -> ShapeEstimate:
+    def frame(
+        self, moved_um: float = 0.0, reading_um: float = math.nan, gain: float = 1.0
+    ) -> ShapeEstimate:
         picture = self.renderer.render(self.tracker.pattern, moved_um, gain=gain)
         self.picture = np.rint(picture * self.stains).clip(0, 255).astype(np.uint8)
         return self.again(reading_um)
@@ -84,11 +101,17 @@ def test_every_frame_follows_the_film(bench: Bench) -> None:
     assert {(e.kind, e.verdict, e.tracking_lost) for e in found} == {("track", "ok", False)}, [
         e.reason for e in found
     ]
-    error_um = np.array([e.sag_um - 1e3 * FILM.sag_at_mm(um) for e, um in zip(found, truth_um, strict=True)])
+    error_um = np.array(
+        [e.sag_um - 1e3 * FILM.sag_at_mm(um) for e, um in zip(found, truth_um, strict=True)]
+    )
     assert np.std(error_um) < 2 * found[-1].sag_sigma_um
     assert [e.displacement_um for e in found] == pytest.approx(truth_um, abs=6e-4)
-    assert found[0].time_s == pytest.approx(bench.time_s - 11 / RATE_HZ + 0.01)  # the middle of the exposure
-    assert unpack_estimate(pack_estimate(found[0])).coeffs_um.tolist() == found[0].coeffs_um.tolist()
+    assert found[0].time_s == pytest.approx(
+        bench.time_s - 11 / RATE_HZ + 0.01
+    )  # the middle of the exposure
+    assert (
+        unpack_estimate(pack_estimate(found[0])).coeffs_um.tolist() == found[0].coeffs_um.tolist()
+    )
     counts = 1e3 * found[0].coeffs_um
     assert np.allclose(counts, np.rint(counts), atol=1e-6)  # whole nanometres
     assert 0.9 < found[-1].valid_fraction <= 1
@@ -99,9 +122,15 @@ def test_every_frame_follows_the_film(bench: Bench) -> None:
 
 
 def test_a_rounded_term_is_no_minus_zero() -> None:
-    """It is no whole number of nanometres to the recorder, which then stores all bits of every term."""
+    """It is no whole number of nanometres to the recorder, which then stores all bits of every
+    term.
+    """
     frame = replace(
-        rejected_frame(1.0, ""), coeffs_um=np.full(ZERNIKE_TERMS, -1e-4), hencky_um=0.0, sag_um=0.0, sag_sigma_um=0.0
+        rejected_frame(1.0, ""),
+        coeffs_um=np.full(ZERNIKE_TERMS, -1e-4),
+        hencky_um=0.0,
+        sag_um=0.0,
+        sag_sigma_um=0.0,
     )
     assert not np.signbit(_estimate(frame, math.nan, False, 1.0).coeffs_um).any()
 
@@ -118,17 +147,23 @@ def test_the_pattern_steps_at_first_and_then_now_and_then(bench: Bench) -> None:
 
 
 def test_a_camera_that_freezes_while_the_pattern_steps_is_frozen_and_no_knock(bench: Bench) -> None:
-    """Where five steps renewed the light, the frozen frame fitted as a tilt by a fifth of a period."""
+    """Where five steps renewed the light, the frozen frame fitted as
+    a tilt by a fifth of a period.
+    """
     steps = 0
     while steps < 10:
         assert bench.frame().verdict == "ok"
         steps += bench.tracker.pattern != bench.shown[-1]
     found = [bench.again(), bench.again(), bench.frame()]
-    assert [(e.verdict, e.reason.split(":")[0]) for e in found] == [("rejected", "frozen")] * 2 + [("ok", "")]
+    assert [(e.verdict, e.reason.split(":")[0]) for e in found] == [("rejected", "frozen")] * 2 + [
+        ("ok", "")
+    ]
 
 
 def test_a_bent_response_of_the_panel_turns_no_tilt() -> None:
-    """The reference's own harmonic stands where crossed fringes are four times finer: steps turned it into tilts."""
+    """The reference's own harmonic stands where crossed fringes are four times finer: steps turned
+    it into tilts.
+    """
     bench = Bench(gamma=1.8)
     assert bench.full().verdict == "ok"
     found = bench.frames(5)
@@ -194,8 +229,12 @@ def held_um(seconds: float) -> NDArray[np.float64]:
 
 @pytest.mark.campaign
 def test_a_hold_hears_the_films_vibrations_and_no_others() -> None:
-    """Two minutes of the twin's film, as a hold moves it, vibrating by 20 nm at each of a drum's frequencies."""
-    optics = OPTICS.model_copy(update={"camera": OPTICS.camera.model_copy(update={"bits": 12, "noise_adu": 1.0})})
+    """Two minutes of the twin's film, as a hold moves it, vibrating by 20 nm at each of a drum's
+    frequencies.
+    """
+    optics = OPTICS.model_copy(
+        update={"camera": OPTICS.camera.model_copy(update={"bits": 12, "noise_adu": 1.0})}
+    )
     tracker = LiveTracker(optics, LiveReconstructor(optics, 1), 32, step_s=10.0)
     modes = tuple(replace(mode, amplitude_nm=20.0) for mode in DRUM_MODES)
     renderer = OpticsRenderer(optics, FILM, seed=3, modes=modes)
@@ -204,7 +243,9 @@ def test_a_hold_hears_the_films_vibrations_and_no_others() -> None:
     assert tracker.full(still, 0.1 * np.arange(18), np.full(18, math.nan)).verdict == "ok"
     time_s = 2.0
     while time_s < 125.0:
-        picture = renderer.render(tracker.pattern, float(film_um[round(50 * time_s)]), time_s=time_s)
+        picture = renderer.render(
+            tracker.pattern, float(film_um[round(50 * time_s)]), time_s=time_s
+        )
         told += listener.after(tracker.fringes([picture], np.array([time_s]), np.array([math.nan])))
         time_s += tracker.slower / 20
     assert len(told) == 2

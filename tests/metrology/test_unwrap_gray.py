@@ -32,7 +32,9 @@ def test_orders() -> None:
 
 @pytest.mark.parametrize("shift", [-0.24, -0.1, 0.0, 0.1, 0.24])
 def test_orders_misplaced_by_less_than_a_quarter_period_do_no_harm(shift: float) -> None:
-    """Noise and blur move a Gray edge against the phase jump: K1 alone would be wrong by a period there."""
+    """Noise and blur move a Gray edge against the phase jump: K1 alone would be wrong by a period
+    there.
+    """
     inner = (S > 0.3) & (S < 7.7)
     k1, k2 = unwrap.gray_orders(_gray(S + shift), WHITE, BLACK)
     absolute = unwrap.absolute_phase(_wrapped(S), k1, k2)
@@ -47,4 +49,8 @@ def test_screen_distance_is_zero_in_the_middle(periods: int) -> None:
     pattern = PatternConfig(periods=periods, period_mm=50.0)
     phase = 2 * np.pi * np.array([0.0, periods / 2, periods]) - np.pi
     assert unwrap.screen_mm(phase, pattern) == pytest.approx([-25.0 * periods, 0, 25.0 * periods])
-    assert unwrap.inside_pattern(phase * 1.0 + np.array([-0.1, 0, 0.1]), pattern).tolist() == [False, True, False]
+    assert unwrap.inside_pattern(phase * 1.0 + np.array([-0.1, 0, 0.1]), pattern).tolist() == [
+        False,
+        True,
+        False,
+    ]

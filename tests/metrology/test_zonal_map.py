@@ -13,7 +13,9 @@ X, Y = np.meshgrid(AXIS, AXIS)
 
 def bowl_grid(seen: np.ndarray) -> ResidualGrid:
     """Slopes of 1e-6 (x^2 + x y): Southwell's mean of two slopes is exact for it."""
-    return ResidualGrid(AXIS, np.where(seen, 1e-6 * (2 * X + Y), 0), np.where(seen, 1e-6 * X, 0), seen.astype(float))
+    return ResidualGrid(
+        AXIS, np.where(seen, 1e-6 * (2 * X + Y), 0), np.where(seen, 1e-6 * X, 0), seen.astype(float)
+    )
 
 
 @pytest.mark.parametrize("hole_mm", [0.0, 20.0])

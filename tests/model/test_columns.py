@@ -6,7 +6,15 @@ from dataclasses import fields
 
 import pytest
 
-from membrane_ctrl.model.columns import COLUMNS, DRAWN, TRUE_ERROR_COLUMN, Aggregation, Kind, TelemetryColumn, unit_of
+from membrane_ctrl.model.columns import (
+    COLUMNS,
+    DRAWN,
+    TRUE_ERROR_COLUMN,
+    Aggregation,
+    Kind,
+    TelemetryColumn,
+    unit_of,
+)
 from membrane_ctrl.model.telemetry import FIELDS, TelemetryRow
 
 EVERY = [*COLUMNS.values(), TRUE_ERROR_COLUMN]
@@ -88,8 +96,16 @@ def test_values_for_people() -> None:
     assert error.format_value(1.005) == "1.00"
     assert error.format_value(-0.001) == "0.00", "no negative zero"
     assert pump.format_value(0.12345) == "0.123"
-    assert error.format_value(None) == error.format_value(math.nan) == error.format_value(math.inf) == "–"
+    assert (
+        error.format_value(None)
+        == error.format_value(math.nan)
+        == error.format_value(math.inf)
+        == "–"
+    )
 
 
 def test_a_column_without_a_unit_suffix_has_no_unit() -> None:
-    assert TelemetryColumn("gusts", "gusts", "count of gusts", TRUE_ERROR_COLUMN.plot, "/x").title == "gusts"
+    assert (
+        TelemetryColumn("gusts", "gusts", "count of gusts", TRUE_ERROR_COLUMN.plot, "/x").title
+        == "gusts"
+    )

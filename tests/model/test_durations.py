@@ -10,7 +10,15 @@ from membrane_ctrl.model.errors import InputError
 
 @pytest.mark.parametrize(
     ("text", "seconds"),
-    [("90", 90), ("40s", 40), ("3m", 180), ("2h30m", 9000), ("1d", 86400), (" 1.5 m ", 90), ("0.5", 0.5)],
+    [
+        ("90", 90),
+        ("40s", 40),
+        ("3m", 180),
+        ("2h30m", 9000),
+        ("1d", 86400),
+        (" 1.5 m ", 90),
+        ("0.5", 0.5),
+    ],
 )
 def test_understood(text: str, seconds: float) -> None:
     assert parse_duration_s(text) == seconds

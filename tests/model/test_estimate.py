@@ -1,4 +1,6 @@
-"""A shape estimate crosses in plain bytes: exact to the last bit, and nothing else is taken for one."""
+"""A shape estimate crosses in plain bytes: exact to the last bit, and nothing else is taken for
+one.
+"""
 
 from __future__ import annotations
 
@@ -23,7 +25,10 @@ COEFFS_BYTES = 8 * ZERNIKE_TERMS
 
 
 def bits(estimate: ShapeEstimate) -> list[object]:
-    return [value.tobytes() if isinstance(value, np.ndarray) else repr(value) for value in astuple(estimate)]
+    return [
+        value.tobytes() if isinstance(value, np.ndarray) else repr(value)
+        for value in astuple(estimate)
+    ]
 
 
 def with_head(**changed: object) -> bytes:
@@ -46,7 +51,9 @@ def with_head(**changed: object) -> bytes:
             covariance_um2=np.random.default_rng(1).normal(size=(ZERNIKE_TERMS, ZERNIKE_TERMS)),
             time_s=-0.0,
         ),
-        replace(shape_at(4.0), covariance_um2=np.full((ZERNIKE_TERMS, ZERNIKE_TERMS), np.nan), cycle=7),
+        replace(
+            shape_at(4.0), covariance_um2=np.full((ZERNIKE_TERMS, ZERNIKE_TERMS), np.nan), cycle=7
+        ),
     ],
 )
 def test_an_estimate_that_was_sent_comes_back_to_the_last_bit(estimate: ShapeEstimate) -> None:
@@ -91,7 +98,10 @@ def test_the_covariance_crosses_in_singles_and_the_message_is_small() -> None:
         with_head(cycle=2**80),
         with_head(reason=7),
         LINE + b"\n" + np.full(ZERNIKE_TERMS, np.inf).tobytes() + ARRAYS[COEFFS_BYTES:],
-        LINE + b"\n" + ARRAYS[:COEFFS_BYTES] + np.full(COVARIANCE_UPPER_SIZE, np.inf, "<f4").tobytes(),
+        LINE
+        + b"\n"
+        + ARRAYS[:COEFFS_BYTES]
+        + np.full(COVARIANCE_UPPER_SIZE, np.inf, "<f4").tobytes(),
     ],
     ids=range(26),
 )

@@ -9,15 +9,25 @@ from membrane_ctrl.model.event_base import KINDS, Event, EventLine
 from membrane_ctrl.model.run_events import from_dict
 
 FAULT = {
-    "time_utc": "x", "mono_s": 1.0, "kind": "fault", "code": 21, "name": "over_displacement", "seen": "501.0 µm",
-    "cause": "the bowl is deeper than its limit", "limit": "limits.displacement_max_um", "safe_level": "vent",
-    "latching": True, "remedy": "check the laser against a ruler", "crc32": "0",
-}  # fmt: skip
+    "time_utc": "x",
+    "mono_s": 1.0,
+    "kind": "fault",
+    "code": 21,
+    "name": "over_displacement",
+    "seen": "501.0 µm",
+    "cause": "the bowl is deeper than its limit",
+    "limit": "limits.displacement_max_um",
+    "safe_level": "vent",
+    "latching": True,
+    "remedy": "check the laser against a ruler",
+    "crc32": "0",
+}
 
 
 def test_a_fault_says_what_where_and_what_to_do() -> None:
     assert from_dict(FAULT).sentence == (
-        "Fault over_displacement: the bowl is deeper than its limit (501.0 µm). Do: check the laser against a ruler. "
+        "Fault over_displacement: the bowl is deeper than its limit (501.0 µm). Do: check "
+        "the laser against a ruler. "
         "Limit: limits.displacement_max_um; safe level vent"
     )
 
@@ -27,7 +37,10 @@ def test_a_fault_says_what_where_and_what_to_do() -> None:
     [
         ({"kind": "end", "exit": "done"}, "Run ended: done"),
         ({"kind": "why", "why": "inside +-2 µm"}, "Inside ±2 µm"),
-        ({"kind": "state", "state": "hold", "from": "settle", "why": ""}, "State hold, from settle"),
+        (
+            {"kind": "state", "state": "hold", "from": "settle", "why": ""},
+            "State hold, from settle",
+        ),
         (
             {"kind": "command", "command": "setpoint", "value": 5.0, "who": "ann", "why": "step"},
             "Command setpoint 5 µm by ann: step",
@@ -46,8 +59,14 @@ def test_a_fault_says_what_where_and_what_to_do() -> None:
             "Laser and camera agree again (laser +1.0 µm)",
         ),
         # not as expected: the fields, whatever they are
-        ({"kind": "state", "to": "hold", "error_um": 1 / 3, "why": None}, "state: to hold, error_um 0.333333"),
-        ({"kind": "command", "command": "setpoint", "value": "much"}, "command: command setpoint, value much"),
+        (
+            {"kind": "state", "to": "hold", "error_um": 1 / 3, "why": None},
+            "state: to hold, error_um 0.333333",
+        ),
+        (
+            {"kind": "command", "command": "setpoint", "value": "much"},
+            "command: command setpoint, value much",
+        ),
         ({"kind": "of_tomorrow"}, "of_tomorrow"),
         ({}, "?"),
     ],

@@ -9,7 +9,14 @@ from typing import Any
 import pytest
 
 from membrane_ctrl.model.event_base import KINDS, Event, UnknownEvent
-from membrane_ctrl.model.events import CommandTaken, Fault, FaultySensor, HeldBy, Plausibility, StateEntered
+from membrane_ctrl.model.events import (
+    CommandTaken,
+    Fault,
+    FaultySensor,
+    HeldBy,
+    Plausibility,
+    StateEntered,
+)
 from membrane_ctrl.model.run_events import Capture, CommanderChanged, from_dict
 
 
@@ -19,7 +26,12 @@ def test_keys_stay_in_the_order_of_the_format() -> None:
 
 
 def test_what_there_is_nothing_to_say_of_is_left_out_but_nobody_is_somebody() -> None:
-    assert CommandTaken("ack", "ann", "").to_dict() == {"kind": "command", "command": "ack", "who": "ann", "why": ""}
+    assert CommandTaken("ack", "ann", "").to_dict() == {
+        "kind": "command",
+        "command": "ack",
+        "who": "ann",
+        "why": "",
+    }
     assert Capture(3, failed="dark").to_dict() == {"kind": "capture", "cycle": 3, "failed": "dark"}
     assert CommanderChanged(None, "ann", "").to_dict() == {
         "kind": "commander",
@@ -39,9 +51,15 @@ def test_every_kind_comes_back_from_its_line(cls: type[Event]) -> None:
 
 @pytest.mark.parametrize(
     "line",
-    [{}, {"kind": 3}, {"kind": ["fault"]}, {"kind": "of tomorrow", "x": 1}, {"kind": "fault", "code": "x"},
-     {"kind": "state", "state": None}],
-)  # fmt: skip
+    [
+        {},
+        {"kind": 3},
+        {"kind": ["fault"]},
+        {"kind": "of tomorrow", "x": 1},
+        {"kind": "fault", "code": "x"},
+        {"kind": "state", "state": None},
+    ],
+)
 def test_what_is_not_understood_is_kept_as_it_is(line: dict[str, Any]) -> None:
     event = from_dict(line)
     assert isinstance(event, UnknownEvent)
@@ -64,8 +82,12 @@ def test_the_numbers_of_an_event_do_not_depend_on_its_words() -> None:
 
 
 def test_the_numbers_of_a_table_come_in_the_order_of_its_keys() -> None:
-    one = CommandTaken("gains", "ann", "", 60.0, loop={"ti_s": 2.0, "pump": {"scale": [1, 2]}, "name": "x"})
-    other = CommandTaken("gains", "bob", "", 60.0, loop={"pump": {"scale": (1, 2)}, "name": "y", "ti_s": 2.0})
+    one = CommandTaken(
+        "gains", "ann", "", 60.0, loop={"ti_s": 2.0, "pump": {"scale": [1, 2]}, "name": "x"}
+    )
+    other = CommandTaken(
+        "gains", "bob", "", 60.0, loop={"pump": {"scale": (1, 2)}, "name": "y", "ti_s": 2.0}
+    )
     assert one.numbers() == other.numbers() == (60.0, 1.0, 2.0, 2.0)
 
 

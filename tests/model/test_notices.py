@@ -17,10 +17,26 @@ from membrane_ctrl.model.events import (
     StateEntered,
 )
 from membrane_ctrl.model.notices import NoticeKey, Topic
-from membrane_ctrl.model.run_events import ChildEnded, ChildRestarted, DiskLow, Link, LockNotStored, RecorderError
+from membrane_ctrl.model.run_events import (
+    ChildEnded,
+    ChildRestarted,
+    DiskLow,
+    Link,
+    LockNotStored,
+    RecorderError,
+)
 from membrane_ctrl.model.run_status import RunStatus
 
-HOLDS_FLOW = Fault(10, "displacement_missing", "no valid laser reading", "", "", "hold_flow", False, "aim the laser")
+HOLDS_FLOW = Fault(
+    10,
+    "displacement_missing",
+    "no valid laser reading",
+    "",
+    "",
+    "hold_flow",
+    False,
+    "aim the laser",
+)
 LATCHED = Fault(20, "over_pressure", "too much", "", "", "vent", True, "find out why")
 
 
@@ -37,7 +53,10 @@ def keys_after(*told: Event) -> list[NoticeKey]:
 
 def test_a_notice_stands_until_the_event_that_closes_its_subject() -> None:
     door, gate = (InterlockOpened(name, "text", "vent") for name in ("door", "gate"))
-    assert keys_after(door, gate) == [NoticeKey(Topic.INTERLOCK, "door"), NoticeKey(Topic.INTERLOCK, "gate")]
+    assert keys_after(door, gate) == [
+        NoticeKey(Topic.INTERLOCK, "door"),
+        NoticeKey(Topic.INTERLOCK, "gate"),
+    ]
     assert keys_after(door, gate, InterlockClosed("door")) == [NoticeKey(Topic.INTERLOCK, "gate")]
     assert keys_after(Maintenance("creep", "x"), MaintenanceOver("creep", "y")) == []
     assert keys_after(MaintenanceOver("creep", "y")) == []
@@ -54,7 +73,12 @@ def test_a_fault_that_held_the_flow_for_too_long_is_latched() -> None:
     fault = latched[NoticeKey(Topic.FAULT)]
     assert (fault.severity, fault.always_new, fault.text) == ("critical", True, HOLDS_FLOW.sentence)
     assert keys_after(HOLDS_FLOW, Cleared("displacement_missing")) == []
-    assert keys_after(HOLDS_FLOW, StateEntered("fault", "hold", ""), StateEntered("standby", "fault", "")) == []
+    assert (
+        keys_after(
+            HOLDS_FLOW, StateEntered("fault", "hold", ""), StateEntered("standby", "fault", "")
+        )
+        == []
+    )
 
 
 def test_a_latched_fault_is_one_notice() -> None:
@@ -68,14 +92,20 @@ def test_a_removed_lock_takes_the_notice_on_its_storage_along() -> None:
 
 
 def test_a_new_recorder_ends_what_the_former_one_reported_and_another_child_does_not() -> None:
-    before = (RecorderError("disk", "full"), RecorderError("tables", "x"), Maintenance("creep", "x"))
+    before = (
+        RecorderError("disk", "full"),
+        RecorderError("tables", "x"),
+        Maintenance("creep", "x"),
+    )
     left = keys_after(*before, ChildEnded("recorder", -9), ChildRestarted("recorder", 1))
     assert left == [NoticeKey(Topic.MAINTENANCE, "creep")]
     assert len(keys_after(*before, ChildRestarted("screen", 1))) == 3
 
 
 def test_displays_list_what_they_do_not_show_with_details() -> None:
-    status = status_after(LATCHED, LockSet("bofak", "x", "ann", "", "", "", 1), Link("no answer", False))
+    status = status_after(
+        LATCHED, LockSet("bofak", "x", "ann", "", "", "", 1), Link("no answer", False)
+    )
     assert [notice.text for notice in status.other_notices] == ["Link to the pump board: no answer"]
     assert status.recording_problems == ()
 

@@ -20,14 +20,18 @@ from membrane_ctrl.model.zernike_terms import (
 from tests.support.synthetic_shape import shape_at
 
 
-@pytest.mark.parametrize(("terms", "degree"), [(21, 5), (28, 6), (36, 7), (45, 8), (55, 9), (66, 10)])
+@pytest.mark.parametrize(
+    ("terms", "degree"), [(21, 5), (28, 6), (36, 7), (45, 8), (55, 9), (66, 10)]
+)
 def test_a_complete_number_of_terms_has_a_degree(terms: int, degree: int) -> None:
     assert degree_of(terms) == degree
 
 
 @pytest.mark.parametrize("terms", [-1, 0, 1, 15, 20, 22, 35, 37, 65, 67, 78])
 def test_other_numbers_are_refused(terms: int) -> None:
-    with pytest.raises(ValueError, match=f"^{terms} Zernike terms .* possible: 21, 28, 36, 45, 55, 66$"):
+    with pytest.raises(
+        ValueError, match=f"^{terms} Zernike terms .* possible: 21, 28, 36, 45, 55, 66$"
+    ):
         degree_of(terms)
 
 

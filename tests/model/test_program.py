@@ -1,4 +1,6 @@
-"""The commit of the running source: from the build, from git, from `.git` without git, or unknown."""
+"""The commit of the running source: from the build, from git, from `.git` without git,
+or unknown.
+"""
 
 from __future__ import annotations
 
@@ -14,7 +16,9 @@ from membrane_ctrl.model.program import file_origin, find_commit, program_identi
 
 def git(folder: Path, *words: str) -> str:
     author = ("-c", "user.name=a", "-c", "user.email=a@example.org", "-c", "commit.gpgsign=false")
-    done = subprocess.run(["git", *author, *words], cwd=folder, check=True, capture_output=True, text=True)
+    done = subprocess.run(
+        ["git", *author, *words], cwd=folder, check=True, capture_output=True, text=True
+    )
     return done.stdout.strip()
 
 
@@ -50,11 +54,19 @@ def test_without_git_the_commit_is_read_from_the_branch(without_git: Path) -> No
 
 @pytest.mark.parametrize(
     ("head", "commit"),
-    [("0123456789abcdef0123456789abcdef01234567", "0123456789ab"), ("ref: refs/heads/gone", ""), ("ref: ../file", ""),
-     ("", ""), ("\x1b[31m", ""), ("ref: /etc/hostname", "")],
+    [
+        ("0123456789abcdef0123456789abcdef01234567", "0123456789ab"),
+        ("ref: refs/heads/gone", ""),
+        ("ref: ../file", ""),
+        ("", ""),
+        ("\x1b[31m", ""),
+        ("ref: /etc/hostname", ""),
+    ],
     ids=["detached", "no such branch", "outside", "empty", "other bytes", "absolute"],
-)  # fmt: skip
-def test_without_git_another_head_gives_its_commit_or_none(without_git: Path, head: str, commit: str) -> None:
+)
+def test_without_git_another_head_gives_its_commit_or_none(
+    without_git: Path, head: str, commit: str
+) -> None:
     (without_git / ".git" / "HEAD").write_text(head)
     assert find_commit(without_git) == commit
 
@@ -88,8 +100,13 @@ def test_a_file_states_format_program_and_commit() -> None:
 
 @pytest.mark.parametrize(
     ("table", "stated"),
-    [({}, ""), ({"program": 3}, ""), ({"program": "x 1"}, "x 1"), ({"program": "x 1", "commit": 7}, "x 1"),
-     ({"commit": "ab"}, "")],
-)  # fmt: skip
+    [
+        ({}, ""),
+        ({"program": 3}, ""),
+        ({"program": "x 1"}, "x 1"),
+        ({"program": "x 1", "commit": 7}, "x 1"),
+        ({"commit": "ab"}, ""),
+    ],
+)
 def test_a_file_from_elsewhere_may_state_less(table: dict[str, object], stated: str) -> None:
     assert stated_program(table) == stated

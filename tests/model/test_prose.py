@@ -18,7 +18,9 @@ from membrane_ctrl.model.prose import fields_of, fill, for_people
         ({"a": "[b] {c}"}, "[b] {c}"),
     ],
 )
-def test_parts_without_a_value_are_left_out(values: dict[str, object], sentence: str | None) -> None:
+def test_parts_without_a_value_are_left_out(
+    values: dict[str, object], sentence: str | None
+) -> None:
     assert fill("{a}[ ({b})][ {c:g}]", values) == sentence
 
 

@@ -62,8 +62,12 @@ class Tree(StateNode):
     last: deque[float] = field(default_factory=deque)
     leaves: list[Leaf] = field(default_factory=list)
     loop: LoopConfig = field(default_factory=LoopConfig)
-    matrix: Annotated[FloatArray, ArrayShape((3, 2))] = field(default_factory=lambda: np.zeros((3, 2)))
-    phasors: Annotated[ComplexArray, ArrayShape((2,), "<c16")] = field(default_factory=lambda: np.zeros(2, complex))
+    matrix: Annotated[FloatArray, ArrayShape((3, 2))] = field(
+        default_factory=lambda: np.zeros((3, 2))
+    )
+    phasors: Annotated[ComplexArray, ArrayShape((2,), "<c16")] = field(
+        default_factory=lambda: np.zeros(2, complex)
+    )
 
 
 def full() -> Tree:
@@ -104,7 +108,9 @@ def test_every_number_keeps_its_bits() -> None:
     numbers = [struct.unpack("<d", bits.randbytes(8))[0] for _ in range(2000)]
     now = decoded(encode_state(Tree(last=deque(numbers)))).last
     for before, after in zip(numbers, now, strict=True):
-        assert struct.pack("<d", before) == struct.pack("<d", after) or math.isnan(before) == math.isnan(after)
+        assert struct.pack("<d", before) == struct.pack("<d", after) or math.isnan(
+            before
+        ) == math.isnan(after)
 
 
 def changed(**values: object) -> bytes:
@@ -116,7 +122,12 @@ def spelled(data: Any) -> bytes:
 
 
 def test_the_spelling_of_the_values_does_not_matter() -> None:
-    assert find_differences(decoded(json.dumps(json.loads(encode_state(full())), indent=1).encode()), full()) == []
+    assert (
+        find_differences(
+            decoded(json.dumps(json.loads(encode_state(full())), indent=1).encode()), full()
+        )
+        == []
+    )
 
 
 @pytest.mark.parametrize(
@@ -177,7 +188,17 @@ def test_a_missing_field_of_a_part_is_named_with_its_place() -> None:
 
 
 @pytest.mark.parametrize(
-    "data", [b"", b"{", b"[]", b"null", b"[" * 50_000, b"\xff", b" " * (MOST_BYTES + 1), encode_state(full()) + b"]"]
+    "data",
+    [
+        b"",
+        b"{",
+        b"[]",
+        b"null",
+        b"[" * 50_000,
+        b"\xff",
+        b" " * (MOST_BYTES + 1),
+        encode_state(full()) + b"]",
+    ],
 )
 def test_what_is_no_tree_is_refused(data: bytes) -> None:
     with pytest.raises(StateError):

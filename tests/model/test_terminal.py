@@ -12,11 +12,20 @@ from rich.table import Table
 from rich.text import Text
 
 from membrane_ctrl.cli import run
-from membrane_ctrl.model.terminal import Plain, counted, live_line, one_line, only_text, plain, table_console
+from membrane_ctrl.model.terminal import (
+    Plain,
+    counted,
+    live_line,
+    one_line,
+    only_text,
+    plain,
+    table_console,
+)
 
-# title, bell, carriage return, backspace, C1 of one byte, a line drawn backwards, an invisible tag, half a pair, NUL
+# title, bell, carriage return, backspace, C1 of one byte, a line drawn backwards, an invisible tag,
+# half a pair, NUL
 HOSTILE = "a\x1b]0;owned\x07\r\b\x9b2J\u202ebad\u2066\U000e0041\ud800\u2028\x00\x7fz"
-ESCAPED = "a\\u001b]0;owned\\u0007\\u000d\\u0008\\u009b2J\\u202ebad\\u2066\\udb40\\udc41\\ud800\\u2028\\u0000\\u007fz"
+ESCAPED = "a\\u001b]0;owned\\u0007\\u000d\\u0008\\u009b2J\\u202ebad\\u2066\\udb40\\udc41\\ud800\\u2028\\u0000\\u007fz"  # noqa: E501
 
 
 class Terminal(io.StringIO):
@@ -52,7 +61,9 @@ def test_both_streams_are_covered_and_given_back(capsys: pytest.CaptureFixture[s
     assert capsys.readouterr() == (ESCAPED * 2, ESCAPED)
 
 
-def test_a_table_keeps_its_colours_and_loses_what_its_cells_say(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_table_keeps_its_colours_and_loses_what_its_cells_say(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     terminal = Terminal()
     monkeypatch.setattr(sys, "stdout", terminal)
     monkeypatch.setenv("TERM", "xterm")
@@ -67,7 +78,9 @@ def test_a_table_keeps_its_colours_and_loses_what_its_cells_say(monkeypatch: pyt
     assert "\\u001b]0;owned" in sent
 
 
-def test_a_bar_is_drawn_while_items_are_taken_and_lines_beside_it_stay_text(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_bar_is_drawn_while_items_are_taken_and_lines_beside_it_stay_text(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     terminal = Terminal()
     monkeypatch.setattr(sys, "stderr", terminal)
     monkeypatch.setenv("TERM", "xterm")
@@ -81,7 +94,9 @@ def test_a_bar_is_drawn_while_items_are_taken_and_lines_beside_it_stay_text(monk
         assert letter not in sent
 
 
-def test_a_live_line_replaces_itself_and_its_text_moves_no_cursor(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_live_line_replaces_itself_and_its_text_moves_no_cursor(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     terminal = Terminal()
     monkeypatch.setattr(sys, "stderr", terminal)
     with only_text():
@@ -97,7 +112,9 @@ def test_without_a_terminal_there_is_no_bar(capsys: pytest.CaptureFixture[str]) 
 
 def test_what_a_live_screen_draws_is_looked_through_too() -> None:
     console = table_console(width=200)
-    drawn = "".join(segment.text for segment in console.render(Plain(Text(HOSTILE))) if not segment.control)
+    drawn = "".join(
+        segment.text for segment in console.render(Plain(Text(HOSTILE))) if not segment.control
+    )
     assert "\x1b" not in drawn
     assert "\\u001b]0;owned" in drawn
 
@@ -117,9 +134,20 @@ def test_help_is_as_it_was(capsys: pytest.CaptureFixture[str]) -> None:
 
 
 def test_nobody_else_makes_a_console() -> None:
-    """Rich writes past the edge: every console has to be of `table_console`, or draw no text of others."""
+    """Rich writes past the edge: every console has to be of `table_console`, or draw no text of
+    others.
+    """
     root = Path(__file__).parents[2] / "membrane_ctrl"
-    makers = {str(path.relative_to(root)) for path in root.rglob("*.py") if " Console(" in path.read_text("utf-8")}
+    makers = {
+        str(path.relative_to(root))
+        for path in root.rglob("*.py")
+        if " Console(" in path.read_text("utf-8")
+    }
     # two bars that count, and the screen, whose text goes through `Plain`
-    allowed = {"model/terminal.py", "measure/uncertainty.py", "measure/stability.py", "console/process.py"}
+    allowed = {
+        "model/terminal.py",
+        "measure/uncertainty.py",
+        "measure/stability.py",
+        "console/process.py",
+    }
     assert makers <= allowed

@@ -1,12 +1,15 @@
-"""Code made wrong on purpose: what do the fast tests notice, what the campaign alone? Writes docs/mutants.md.
+"""Code made wrong on purpose: what do the fast tests notice, what the campaign alone? Writes
+docs/mutants.md.
 
 python tests/mutants/mutants.py                       # all, 2 at a time
 python tests/mutants/mutants.py --only "no wait" "levels"     # those whose words contain one of these
-python tests/mutants/mutants.py --campaign-sample 60  # fast tests on all, the campaign on so many, drawn at random
+python tests/mutants/mutants.py --campaign-sample 60  # fast tests on all, the campaign on so many,
+drawn at random
 python tests/mutants/mutants.py --missing             # only those without a result of their present text
 
-Results are kept in results.json, from which the document is made; a mutation whose text has changed has none.
-"""
+Results are kept in results.json, from which the document is made; a mutation whose text has changed
+has none.
+"""  # noqa: E501
 
 from __future__ import annotations
 
@@ -52,7 +55,8 @@ ALL_FAST = tuple(
         "sim",
     )
 )
-# These compare a generated document with its source: any change of the source would count as noticed ...
+# These compare a generated document with its source: any change of the source would count as
+# noticed ...
 COMPARISONS = (
     "test_configuration_page.py",
     "test_faults_page.py",
@@ -62,8 +66,11 @@ COMPARISONS = (
 )
 # ... and this one waits for real devices' time-outs: on a busy machine it fails without a mutation.
 _OF_TIME = ("test_examples.py",)
-_LEAVE = shutil.ignore_patterns(".git", ".venv", "__pycache__", ".mypy_cache", ".ruff_cache", "logs", "images")
-PATIENCE_S = 1200.0  # a mutation that waits for ever is noticed, too; all tests on a busy machine take 500 s
+_LEAVE = shutil.ignore_patterns(
+    ".git", ".venv", "__pycache__", ".mypy_cache", ".ruff_cache", "logs", "images"
+)
+# a mutation that waits for ever is noticed, too; all tests on a busy machine take 500 s
+PATIENCE_S = 1200.0
 
 
 @dataclass(frozen=True)
@@ -76,7 +83,8 @@ class Mutant:
     replace: str
     lives: str = ""
     guard: str = ""  # name of the `controller.protection.Guard` that it removes, if it removes one
-    rule: str = ""  # name of the rule of the safety table that it removes, if it was made from the table
+    # name of the rule of the safety table that it removes, if it was made from the table
+    rule: str = ""
 
     @property
     def digest(self) -> str:
@@ -99,7 +107,9 @@ class Mutant:
 
 @dataclass(frozen=True)
 class Verdict:
-    """Who noticed a mutation; empty: nobody. `by_campaign` is None where the campaign was not run."""
+    """Who noticed a mutation; empty: nobody. `by_campaign` is None
+    where the campaign was not run.
+    """
 
     mutant: Mutant
     place: str
@@ -116,17 +126,22 @@ def _sources(root: Path) -> Iterator[tuple[Path, str]]:
 
 @dataclass(frozen=True)
 class First:
-    """The tests, and the part of the campaign, that run first on an area's mutations; the rest follows."""
+    """The tests, and the part of the campaign, that run first on an area's mutations; the rest
+    follows.
+    """
 
     tests: tuple[str, ...]
     campaign: str
 
 
 def load(root: Path = ROOT) -> tuple[list[Mutant], dict[str, First]]:
-    """All mutations, and what runs first on them, by area. Raises LookupError for a missing test."""
+    """All mutations, and what runs first on them, by area.
+    Raises LookupError for a missing test.
+    """
     table = tomllib.loads(LIST.read_text(encoding="utf-8"))
     firsts = {
-        name: First(_paths_of_tests(root, area["tests"]), area["campaign"]) for name, area in table["area"].items()
+        name: First(_paths_of_tests(root, area["tests"]), area["campaign"])
+        for name, area in table["area"].items()
     }
     listed = [Mutant(**entry) for entry in table["mutant"]]
     return make_rule_mutants(root, table["rule_lives"]) + listed, firsts
@@ -195,7 +210,11 @@ def mutated(tree: Path, mutant: Mutant) -> Iterator[str]:
 def ask_tests(tree: Path, first: Sequence[str]) -> str:
     """The first fast test that fails; empty if all pass."""
     rest = [str(p.relative_to(tree)) for pattern in ALL_FAST for p in sorted(tree.glob(pattern))]
-    left = [path for path in rest if path not in first and Path(path).name not in (*COMPARISONS, *_OF_TIME)]
+    left = [
+        path
+        for path in rest
+        if path not in first and Path(path).name not in (*COMPARISONS, *_OF_TIME)
+    ]
     for files in filter(None, (first, left)):  # pytest without a file would run every test there is
         if found := _failed_test(_run(tree, "-m", "pytest", *_PYTEST, *files)):
             return found
@@ -206,7 +225,9 @@ _PYTEST = ("-x", "-q", "-p", "no:cacheprovider", "-m", "not campaign and not rea
 
 
 def ask_campaign(tree: Path, first: str) -> str:
-    """The first violation that the short campaign finds, with one of its parts first; empty if there is none."""
+    """The first violation that the short campaign finds, with one of its parts first; empty if
+    there is none.
+    """
     ended = _run(tree, "tests/campaign/campaign.py", "--short", "--first", first)
     if ended is None:
         return "hangs"
@@ -219,7 +240,13 @@ def _run(tree: Path, *arguments: str) -> subprocess.CompletedProcess[str] | None
     command = ["nice", "-n", "5", sys.executable, *arguments]
     try:
         return subprocess.run(
-            command, cwd=tree, env=environment, capture_output=True, text=True, timeout=PATIENCE_S, check=False
+            command,
+            cwd=tree,
+            env=environment,
+            capture_output=True,
+            text=True,
+            timeout=PATIENCE_S,
+            check=False,
         )
     except subprocess.TimeoutExpired:
         return None
@@ -295,9 +322,14 @@ def current_verdicts(mutants: Sequence[Mutant]) -> list[Verdict]:
 
 
 def examine_all(
-    mutants: Sequence[Mutant], firsts: dict[str, First], at_once: int, for_campaign: Sequence[Mutant]
+    mutants: Sequence[Mutant],
+    firsts: dict[str, First],
+    at_once: int,
+    for_campaign: Sequence[Mutant],
 ) -> list[Verdict]:
-    """All mutations, each worker with a copy of the tree outside the repository; those `for_campaign` also by it."""
+    """All mutations, each worker with a copy of the tree outside the repository; those
+    `for_campaign` also by it.
+    """
     stored = Lock()
     with tempfile.TemporaryDirectory(prefix="mutants-") as folder:
         trees: Queue[Path] = Queue()
@@ -318,9 +350,12 @@ def examine_all(
                 trees.put(tree)
             with stored:
                 store_result(verdict)
-            by_campaign = "not run" if verdict.by_campaign is None else verdict.by_campaign or "LIVES"
+            by_campaign = (
+                "not run" if verdict.by_campaign is None else verdict.by_campaign or "LIVES"
+            )
             print(
-                f"{verdict.lasted_s:4.0f} s  {mutant.what}\n        tests:    {verdict.by_tests or 'LIVES'}"
+                f"{verdict.lasted_s:4.0f} s  {mutant.what}\n        tests:    "
+                f"{verdict.by_tests or 'LIVES'}"
                 f"\n        campaign: {by_campaign}",
                 flush=True,
             )
@@ -331,14 +366,20 @@ def examine_all(
 
 
 def removes(mutant: Mutant) -> str:
-    """The rule of the safety table, or the guard, that a mutation removes; empty if it is about something else."""
+    """The rule of the safety table, or the guard, that a mutation removes; empty if it is about
+    something else.
+    """
     if mutant.guard or mutant.rule:
         return mutant.guard or mutant.rule
     text = SAFETY.read_text(encoding="utf-8")
     place = text.find(mutant.find)
     if not 0 <= place < text.index("# fmt: on"):
         return ""
-    rows = [row for row in re.finditer(r'code=\d+, name="(\w+)"', text) if row.start() < place + len(mutant.find)]
+    rows = [
+        row
+        for row in re.finditer(r'code=\d+, name="(\w+)"', text)
+        if row.start() < place + len(mutant.find)
+    ]
     return rows[-1][1] if rows else ""
 
 
@@ -353,7 +394,10 @@ def count_kills(verdicts: Sequence[Verdict]) -> tuple[tuple[int, int], tuple[int
     """Killed and examined, by the fast tests and by the campaign."""
     by_tests = [verdict.by_tests for verdict in verdicts]
     by_campaign = [verdict.by_campaign for verdict in verdicts if verdict.by_campaign is not None]
-    return (sum(map(bool, by_tests)), len(by_tests)), (sum(map(bool, by_campaign)), len(by_campaign))
+    return (sum(map(bool, by_tests)), len(by_tests)), (
+        sum(map(bool, by_campaign)),
+        len(by_campaign),
+    )
 
 
 def document(verdicts: Sequence[Verdict], listed: int) -> str:
@@ -363,29 +407,46 @@ def document(verdicts: Sequence[Verdict], listed: int) -> str:
     lines = [
         "# Mutants",
         "",
-        "Generated by `make mutants` from `tests/mutants/mutants.toml` and the safety table: code made wrong on "
-        "purpose, one mutation at a time, and the test that notices. The list says how the mutations are chosen. It "
-        "is a list and not a tool such as mutmut, because a tool changes every operator, mostly without an effect on "
-        "the mirror, and takes days; the list holds the ways in which each decision about gas can be wrong.",
+        "Generated by `make mutants` from `tests/mutants/mutants.toml` and the safety table: "
+        "code made wrong on "
+        "purpose, one mutation at a time, and the test that notices. The list says how the "
+        "mutations are chosen. It "
+        "is a list and not a tool such as mutmut, because a tool changes every operator, "
+        "mostly without an effect on "
+        "the mirror, and takes days; the list holds the ways in which each decision about "
+        "gas can be wrong.",
         "",
-        (f"{listed} mutations are listed" if total == listed else f"{total} of {listed} were examined")
-        + f". **Fast tests kill {tests} of {total} ({100 * tests / max(total, 1):.0f} %), the campaign alone kills "
+        (
+            f"{listed} mutations are listed"
+            if total == listed
+            else f"{total} of {listed} were examined"
+        )
+        + f". **Fast tests kill {tests} of {total} ({100 * tests / max(total, 1):.0f} %), the "
+        "campaign alone kills "
         f"{campaign} of {of_campaign} ({100 * campaign / max(of_campaign, 1):.0f} %).**",
         "",
-        "The fast tests are those of control and devices, without the campaign, the real-time tests and the "
-        f"comparisons of generated documents ({', '.join(f'`{name}`' for name in COMPARISONS)}). The campaign is its "
+        "The fast tests are those of control and devices, without the campaign, the "
+        "real-time tests and the "
+        "comparisons of generated documents "
+        f"({', '.join(f'`{name}`' for name in COMPARISONS)}). The campaign is its "
         "short part (`python tests/campaign/campaign.py --short`).",
         "",
         "| mutation | in | killed by test | killed by campaign |",
         "|---|---|---|---|",
     ]
-    lines += [f"| {v.mutant.what} | `{v.place}` | {_cell(v.by_tests)} | {_cell(v.by_campaign)} |" for v in verdicts]
+    lines += [
+        f"| {v.mutant.what} | `{v.place}` | {_cell(v.by_tests)} | {_cell(v.by_campaign)} |"
+        for v in verdicts
+    ]
     lines += ["", "## Survivors", ""]
     for verdict in verdicts:
         by = (("tests", verdict.by_tests), ("campaign", verdict.by_campaign))
         who = [name for name, found in by if found == ""]
         if who:
-            lines.append(f"- {verdict.mutant.what} ({' and '.join(who)}): {verdict.mutant.lives or 'not examined'}")
+            lines.append(
+                f"- {verdict.mutant.what} ({' and '.join(who)}): "
+                f"{verdict.mutant.lives or 'not examined'}"
+            )
     return "\n".join(lines) + "\n"
 
 
@@ -397,33 +458,51 @@ def _cell(found: str | None) -> str:
 
 def main(arguments: list[str] | None = None) -> int:
     """Examine the mutants; 1 if a share is below its goal."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--only", nargs="+", metavar="WORDS", help="mutations whose words contain one of these")
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument(
+        "--only", nargs="+", metavar="WORDS", help="mutations whose words contain one of these"
+    )
     parser.add_argument("--missing", action="store_true", help="only those without a result")
-    parser.add_argument("--safety-case", action="store_true", help="only those that remove a rule or a guard")
+    parser.add_argument(
+        "--safety-case", action="store_true", help="only those that remove a rule or a guard"
+    )
     parser.add_argument("--sample", type=int, metavar="NUMBER", help="so many, drawn at random")
-    parser.add_argument("--campaign-sample", type=int, metavar="NUMBER", help="run the campaign on so many of all")
+    parser.add_argument(
+        "--campaign-sample", type=int, metavar="NUMBER", help="run the campaign on so many of all"
+    )
     parser.add_argument("--processes", type=int, default=2)
     options = parser.parse_args(arguments)
     listed, firsts = load()
-    of_campaign = listed if options.campaign_sample is None else sample(listed, options.campaign_sample)
+    of_campaign = (
+        listed if options.campaign_sample is None else sample(listed, options.campaign_sample)
+    )
     chosen = listed
     if options.only:
-        chosen = [mutant for mutant in chosen if any(words in mutant.what for words in options.only)]
+        chosen = [
+            mutant for mutant in chosen if any(words in mutant.what for words in options.only)
+        ]
     if options.safety_case:
         chosen = [mutant for mutant in chosen if removes(mutant)]
     if options.sample is not None:
         chosen = sample(chosen, options.sample)
     if options.missing:
         known = {
-            v.mutant for v in current_verdicts(listed) if v.by_campaign is not None or v.mutant not in of_campaign
+            v.mutant
+            for v in current_verdicts(listed)
+            if v.by_campaign is not None or v.mutant not in of_campaign
         }
         chosen = [mutant for mutant in chosen if mutant not in known]
-    examine_all(chosen, firsts, options.processes, [mutant for mutant in chosen if mutant in of_campaign])
+    examine_all(
+        chosen, firsts, options.processes, [mutant for mutant in chosen if mutant in of_campaign]
+    )
     verdicts = current_verdicts(listed)
     DOCUMENT.write_text(document(verdicts, len(listed)), encoding="utf-8")
     (tests, total), (campaign, run) = count_kills(verdicts)
-    print(f"tests kill {tests} of {total}, the campaign {campaign} of {run}; {len(listed)} are listed")
+    print(
+        f"tests kill {tests} of {total}, the campaign {campaign} of {run}; {len(listed)} are listed"
+    )
     return int(tests < TESTS_GOAL * total or campaign < CAMPAIGN_GOAL * run)
 
 

@@ -32,7 +32,9 @@ def test_every_mutation_applies_exactly_once_and_is_python(monkeypatch: pytest.M
 
 def test_each_rule_of_the_safety_table_is_made_to_never_trip() -> None:
     made = [mutant for mutant in load()[0] if mutant.rule]
-    assert [(mutant.rule, mutant.what) for mutant in made] == [(r.name, f"{r.name} never trips") for r in TABLE]
+    assert [(mutant.rule, mutant.what) for mutant in made] == [
+        (r.name, f"{r.name} never trips") for r in TABLE
+    ]
     for mutant in made:
         assert removes(mutant) == mutant.rule
         scope: dict[str, object] = {}
@@ -65,7 +67,9 @@ def test_the_committed_document_reaches_the_goals() -> None:
     listed = load()[0]
     verdicts = current_verdicts(listed)
     examined = {verdict.mutant.what for verdict in verdicts}
-    assert {mutant.what for mutant in listed if removes(mutant)} <= examined, "each rule and each guard"
+    assert {mutant.what for mutant in listed if removes(mutant)} <= examined, (
+        "each rule and each guard"
+    )
     (tests, total), (campaign, of_campaign) = count_kills(verdicts)
     assert total >= 50
     assert tests >= TESTS_GOAL * total

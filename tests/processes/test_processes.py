@@ -13,7 +13,8 @@ from membrane_ctrl.processes.child import Child, pipe
 
 def test_what_is_sent_to_the_whole_group_is_not_for_the_children() -> None:
     before = {
-        number: signal.getsignal(number) for number in (signal.SIGINT, signal.SIGQUIT, signal.SIGHUP, signal.SIGTERM)
+        number: signal.getsignal(number)
+        for number in (signal.SIGINT, signal.SIGQUIT, signal.SIGHUP, signal.SIGTERM)
     }
     ours, theirs = pipe()
     child = Child("waits", "multiprocessing.connection:wait", ([theirs],), nice=0)
@@ -22,7 +23,9 @@ def test_what_is_sent_to_the_whole_group_is_not_for_the_children() -> None:
         assert child.pid is not None
         for number, handler in before.items():
             os.kill(child.pid, number)
-            assert signal.getsignal(number) == handler  # nor does this process lose what it does with them
+            assert (
+                signal.getsignal(number) == handler
+            )  # nor does this process lose what it does with them
         assert not child.join(0.2)
         ours.send("go home")
         assert child.join(20.0)
@@ -41,7 +44,9 @@ def test_a_child_that_does_not_obey_is_killed(number: signal.Signals) -> None:
     assert not child.alive
 
 
-def test_a_signal_that_comes_while_a_child_is_started_is_not_lost(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_signal_that_comes_while_a_child_is_started_is_not_lost(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     class ToldError(Exception):
         """By the handler."""
 
@@ -53,7 +58,9 @@ def test_a_signal_that_comes_while_a_child_is_started_is_not_lost(monkeypatch: p
 
     def start_while_signalled(self: SpawnProcess) -> None:
         start(self)
-        signal.raise_signal(signal.SIGTERM)  # to this thread: another one would take it, now or somewhat later
+        signal.raise_signal(
+            signal.SIGTERM
+        )  # to this thread: another one would take it, now or somewhat later
 
     monkeypatch.setattr(SpawnProcess, "start", start_while_signalled)
     before = signal.signal(signal.SIGTERM, tell)

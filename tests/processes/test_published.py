@@ -1,4 +1,6 @@
-"""A session reads the rings that a run has published, and opens nothing else that a run folder names."""
+"""A session reads the rings that a run has published, and opens nothing else that a run folder
+names.
+"""
 
 from __future__ import annotations
 
@@ -73,7 +75,8 @@ def test_another_address_is_refused_in_one_line(
 
 
 @pytest.mark.parametrize(
-    "text", [b"", b"[]", b"5", b"\xff", b"[" * 4000, b'{"telemetry": 5}', b'{"a": {}}', b" " * 10_000_000]
+    "text",
+    [b"", b"[]", b"5", b"\xff", b"[" * 4000, b'{"telemetry": 5}', b'{"a": {}}', b" " * 10_000_000],
 )
 def test_a_damaged_file_is_refused(tmp_path: Path, text: bytes) -> None:
     (tmp_path / "rings.json").write_bytes(text)

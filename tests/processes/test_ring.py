@@ -116,7 +116,9 @@ OLD, NEW = b"old one." * 2, b"newest!."
 
 
 def _stores(address: RingAddress) -> tuple[bytes, list[tuple[int, bytes]]]:
-    """The memory before the third message of a ring of two is put, and the stores of that put in their order."""
+    """The memory before the third message of a ring of two is put, and the stores of that put in
+    their order.
+    """
     memory = SharedMemory(address.name)
     writer = RingWriter(address)
     writer.put(OLD)
@@ -128,7 +130,9 @@ def _stores(address: RingAddress) -> tuple[bytes, list[tuple[int, bytes]]]:
     memory.close()
     words = range(0, len(before), 8)
     changed = [word for word in words if before[word : word + 8] != after[word : word + 8]]
-    return before, [(word, after[word : word + 8]) for word in [*changed[1:], changed[0]]]  # the counter is the last
+    return before, [
+        (word, after[word : word + 8]) for word in [*changed[1:], changed[0]]
+    ]  # the counter is the last
 
 
 @pytest.mark.parametrize("seen", range(32))
@@ -172,7 +176,13 @@ def test_a_slot_that_is_never_whole_costs_one_message_and_hangs_nobody() -> None
 
 
 @pytest.mark.parametrize(
-    "told", [RingAddress("", 8, 16), RingAddress("", 4, 8), RingAddress("", 0, 16), RingAddress("", 2**40, 16)]
+    "told",
+    [
+        RingAddress("", 8, 16),
+        RingAddress("", 4, 8),
+        RingAddress("", 0, 16),
+        RingAddress("", 2**40, 16),
+    ],
 )
 def test_a_ring_that_is_not_the_one_it_is_said_to_be_is_refused(told: RingAddress) -> None:
     with ring(4, 16) as address, pytest.raises(RingError):
@@ -180,7 +190,9 @@ def test_a_ring_that_is_not_the_one_it_is_said_to_be_is_refused(told: RingAddres
 
 
 def test_a_reader_refuses_or_reads_whatever_the_memory_holds() -> None:
-    """Random headers, counters and slots; half of the headers are true, so that what is behind them is read."""
+    """Random headers, counters and slots; half of the headers are true, so that what is behind them
+    is read.
+    """
     rng = random.Random(12)
     read = 0
     for _ in range(10_000):

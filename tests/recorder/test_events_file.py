@@ -30,7 +30,9 @@ def test_events_are_lines_in_their_order(tmp_path: Path) -> None:
     file.close()
 
 
-def test_faults_and_the_end_are_synced_at_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_faults_and_the_end_are_synced_at_once(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     synced: list[int] = []
     monkeypatch.setattr(os, "fsync", synced.append)
     file = EventsFile(tmp_path / "events.jsonl")
@@ -42,7 +44,9 @@ def test_faults_and_the_end_are_synced_at_once(tmp_path: Path, monkeypatch: pyte
     file.close()
 
 
-def test_a_disk_that_was_full_tears_no_line(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_disk_that_was_full_tears_no_line(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     real_write = os.write
     room = [25]
 
@@ -65,7 +69,9 @@ def test_a_disk_that_was_full_tears_no_line(tmp_path: Path, monkeypatch: pytest.
     file.close()
 
 
-def test_too_many_waiting_events_are_counted_as_lost(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_too_many_waiting_events_are_counted_as_lost(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.setattr(sink, "_WAITING_MAX", 5)
     file = EventsFile(tmp_path / "missing" / "events.jsonl")
     with pytest.raises(OSError):
@@ -73,7 +79,13 @@ def test_too_many_waiting_events_are_counted_as_lost(tmp_path: Path, monkeypatch
     assert file.lost == 3
     (tmp_path / "missing").mkdir()
     file.append([])
-    assert [line["number"] for line in lines(tmp_path / "missing" / "events.jsonl")] == [0, 4, 5, 6, 7]
+    assert [line["number"] for line in lines(tmp_path / "missing" / "events.jsonl")] == [
+        0,
+        4,
+        5,
+        6,
+        7,
+    ]
     file.close()
 
 
@@ -85,9 +97,18 @@ def test_a_message_that_is_no_event_becomes_one_that_says_so(message: bytes) -> 
 @pytest.mark.parametrize(
     ("line", "event"),
     [
-        ({"kind": "mark", "text": "door", "who": "ann", "made_utc": "now"}, Mark("door", "ann", "now")),
-        ({"kind": "command", "command": "mark", "text": "door", "who": "ann", "why": ""}, Mark("door", "ann")),
-        ({"kind": "command", "command": "mark", "who": "ann", "why": "a door"}, Mark("a door", "ann")),
+        (
+            {"kind": "mark", "text": "door", "who": "ann", "made_utc": "now"},
+            Mark("door", "ann", "now"),
+        ),
+        (
+            {"kind": "command", "command": "mark", "text": "door", "who": "ann", "why": ""},
+            Mark("door", "ann"),
+        ),
+        (
+            {"kind": "command", "command": "mark", "who": "ann", "why": "a door"},
+            Mark("a door", "ann"),
+        ),
         ({"kind": "fault", "name": 3}, UnknownEvent({"mono_s": 2, "kind": "fault", "name": 3})),
     ],
 )

@@ -16,7 +16,7 @@ from membrane_ctrl.run_files.shapes import (
     outside_disc,
     uncertainty_map_um,
     without_terms,
-)  # fmt: skip
+)
 from tests.support.synthetic_run import shape_of
 
 # pixel centres on the unit disc, row 0 on top
@@ -41,7 +41,9 @@ def test_tilt_shows_right_and_up(j: int, slope: np.ndarray) -> None:
     now = flat()
     now[j - 1] = 0.5
     reference = shape_of(0.0, 0)
-    change_um = difference_map_um(replace(reference, coeffs_um=reference.coeffs_um + now), reference)
+    change_um = difference_map_um(
+        replace(reference, coeffs_um=reference.coeffs_um + now), reference
+    )
     inside = np.isfinite(change_um)
     assert change_um[inside] == pytest.approx(slope[inside], abs=1e-5)
 
@@ -57,7 +59,10 @@ def test_uncertainty_agrees_with_drawn_coefficients() -> None:
     reference = shape_of(0.0, 0)
     drawn = [
         difference_map_um(
-            replace(reference, coeffs_um=reference.coeffs_um + root @ rng.normal(size=ZERNIKE_TERMS)), reference
+            replace(
+                reference, coeffs_um=reference.coeffs_um + root @ rng.normal(size=ZERNIKE_TERMS)
+            ),
+            reference,
         )
         for _ in range(400)
     ]
@@ -81,7 +86,9 @@ def test_only_the_wanted_terms_are_removed(terms: int, removed: tuple[int, ...])
     expected = change_um(left)
     if terms:  # above its mean, not above its vertex
         expected -= np.nanmean(expected)
-    assert without_terms(change_um(coeffs_um), terms) == pytest.approx(expected, abs=2e-3, nan_ok=True)
+    assert without_terms(change_um(coeffs_um), terms) == pytest.approx(
+        expected, abs=2e-3, nan_ok=True
+    )
 
 
 def test_scatter_is_the_deviation_of_the_cycles() -> None:
@@ -90,7 +97,9 @@ def test_scatter_is_the_deviation_of_the_cycles() -> None:
     scatter = Scatter()
     for coeffs_um in cycles:
         scatter.add(coeffs_um)
-    assert scatter.map_um() == pytest.approx(uncertainty_map_um(np.cov(cycles.T)), rel=1e-4, nan_ok=True)
+    assert scatter.map_um() == pytest.approx(
+        uncertainty_map_um(np.cov(cycles.T)), rel=1e-4, nan_ok=True
+    )
 
 
 def test_one_cycle_does_not_scatter() -> None:

@@ -47,7 +47,9 @@ def test_an_error_outside_the_band_is_no_quiet() -> None:
 
 def test_no_row_is_sent_twice_or_lost_where_something_happens() -> None:
     quiet = QuietFilter(50.0, 10.0, 2.0)
-    sent = np.concatenate([quiet.take(second(n, state=8.0 if n == 150 else 4.0)) for n in range(220)])
+    sent = np.concatenate(
+        [quiet.take(second(n, state=8.0 if n == 150 else 4.0)) for n in range(220)]
+    )
     ticks = np.sort(sent[:, COLUMN["tick"]])
     assert np.all(np.diff(ticks) > 0)
     around = ticks[(ticks >= 142 * 50) & (ticks < 205 * 50)]

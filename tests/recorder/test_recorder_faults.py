@@ -1,4 +1,6 @@
-"""A recorder whose disk or data fails: it reports this, loses as little as possible, and continues."""
+"""A recorder whose disk or data fails: it reports this, loses as little as possible,
+and continues.
+"""
 
 from __future__ import annotations
 
@@ -101,7 +103,15 @@ def make_bench(run_dir: Path, config: Config) -> Iterator[Bench]:
         yield Bench(
             run_dir,
             recording,
-            Recorder(run_dir, clock, config, readers, recording, None, lambda event: reports.append(event.to_dict())),
+            Recorder(
+                run_dir,
+                clock,
+                config,
+                readers,
+                recording,
+                None,
+                lambda event: reports.append(event.to_dict()),
+            ),
             writers,
             reports,
         )
@@ -118,7 +128,9 @@ def times_s(bench: Bench) -> list[int]:
     return sorted(found)
 
 
-def test_a_dead_writer_gets_a_new_file_and_no_row_is_lost(bench: Bench, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_dead_writer_gets_a_new_file_and_no_row_is_lost(
+    bench: Bench, monkeypatch: pytest.MonkeyPatch
+) -> None:
     bench.second(0)
     real_flush, failures = FlakyRecording.flush, iter([True])
 
@@ -141,20 +153,25 @@ def test_a_full_disk_is_reported_once_counted_and_recovered_from(bench: Bench) -
     bench.recording.full = True
     for number in range(1, 6):
         bench.second(number)
-    assert bench.kinds().count("recorder_error") <= 2  # the flush, then the new file: not one a second
+    assert (
+        bench.kinds().count("recorder_error") <= 2
+    )  # the flush, then the new file: not one a second
     bench.recording.full = False
     back_s = int(2 + 2 * RETRY_S)
     bench.second(back_s)
     bench.recorder.finish(in_haste=True)
     assert bench.kinds()[-2:] == ["recorder_recovered", "recorder_done"]
-    # second 1 was on its way when the disk was full: here it can still arrive, on a real disk it would not
+    # second 1 was on its way when the disk was full: here it can still arrive, on a real disk it
+    # would not
     assert set(times_s(bench)) - {1} == {0, back_s}
     found = json.loads((bench.run_dir / "summary.json").read_text())
     assert found["recorder"]["rows_lost"] == 5 * 50
     assert found["ticks"] == 7 * 50  # the statistics lost nothing
 
 
-def test_a_file_that_was_not_closed_whole_is_reported(bench: Bench, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_file_that_was_not_closed_whole_is_reported(
+    bench: Bench, monkeypatch: pytest.MonkeyPatch
+) -> None:
     bench.second(0)
     monkeypatch.setattr(FlakyRecording, "sync", lambda _: None)
     (bench.run_dir / "test-000.rrd").unlink()
@@ -231,7 +248,10 @@ def test_segments_are_changed_in_time_without_losing_a_row(bench: Bench) -> None
     bench.recorder.drain()
     bench.recorder.write()
     bench.recorder.finish(in_haste=True)
-    assert sorted(path.name for path in bench.run_dir.glob("*.rrd")) == ["test-000.rrd", "test-001.rrd"]
+    assert sorted(path.name for path in bench.run_dir.glob("*.rrd")) == [
+        "test-000.rrd",
+        "test-001.rrd",
+    ]
     assert times_s(bench) == [0, 1, 2]
 
 

@@ -52,7 +52,9 @@ class Feed:
     shapes: RingWriter
 
     def event(self, kind: str, **more: Any) -> None:
-        self.events.put(json.dumps({"time_utc": "2026-11-21T01:23:45+00:00", "kind": kind, **more}).encode())
+        self.events.put(
+            json.dumps({"time_utc": "2026-11-21T01:23:45+00:00", "kind": kind, **more}).encode()
+        )
 
 
 @pytest.fixture
@@ -72,7 +74,9 @@ def feed(tmp_path: Path) -> Iterator[Feed]:
 
 
 @contextmanager
-def recorder(spec: RecorderSpec, file_bytes_max: int | None = None) -> Iterator[tuple[Any, Connection]]:
+def recorder(
+    spec: RecorderSpec, file_bytes_max: int | None = None
+) -> Iterator[tuple[Any, Connection]]:
     """A recorder in its process; it cannot make a file larger than `file_bytes_max`.
 
     That limit is the nearest thing to a small disk that needs no rights.
@@ -129,7 +133,9 @@ def test_every_row_event_and_shape_is_found_again(feed: Feed) -> None:
         for row in rows:
             feed.inputs.put(message_of(row))
         for cycle in range(5):
-            feed.shapes.put(pack_estimate(shape_of(2.0 * cycle, cycle, "rejected" if cycle == 3 else "ok")))
+            feed.shapes.put(
+                pack_estimate(shape_of(2.0 * cycle, cycle, "rejected" if cycle == 3 else "ok"))
+            )
         feed.event("fault", mono_s=19.0, cause="over_pressure")
         feed.event("end", mono_s=20.0, exit="done")
         process.join(DEADLINE_S)
@@ -150,13 +156,27 @@ def test_every_row_event_and_shape_is_found_again(feed: Feed) -> None:
         "settle",
         "hold",
     ]
-    assert [word for _, word in strings(path, "/state/verdict", "StateChange:state")] == ["ok", "rejected", "ok"]
-    said = [text.split()[1].rstrip(":") for _, text in strings(path, "/events", "TextLog:text")]  # after the time
+    assert [word for _, word in strings(path, "/state/verdict", "StateChange:state")] == [
+        "ok",
+        "rejected",
+        "ok",
+    ]
+    said = [
+        text.split()[1].rstrip(":") for _, text in strings(path, "/events", "TextLog:text")
+    ]  # after the time
     assert said == ["state", "fault", "Run"]
     found = summary_of(feed.spec.run_dir)
-    assert (found["ticks"], found["cycles"], found["cycles_rejected"], found["exit"]) == (1000, 5, 1, "done")
+    assert (found["ticks"], found["cycles"], found["cycles_rejected"], found["exit"]) == (
+        1000,
+        5,
+        1,
+        "done",
+    )
     assert found["dropped"] == {"inputs": 0, "events": 0, "shapes": 0}
-    kinds = [json.loads(line)["kind"] for line in (feed.spec.run_dir / "events.jsonl").read_text().splitlines()]
+    kinds = [
+        json.loads(line)["kind"]
+        for line in (feed.spec.run_dir / "events.jsonl").read_text().splitlines()
+    ]
     assert kinds == ["state", "fault", "end"]
 
 
@@ -175,12 +195,18 @@ def recorder_in_process(spec: RecorderSpec) -> list[dict[str, Any]]:
     from membrane_ctrl.recorder import process
 
     reports: list[dict[str, Any]] = []
-    process._record(spec, lambda event: reports.append(event.to_dict()), lambda: False, lambda: False)
+    process._record(
+        spec, lambda event: reports.append(event.to_dict()), lambda: False, lambda: False
+    )
     return reports
 
 
-@pytest.mark.parametrize(("asked", "orphan", "word"), [(True, False, "terminated"), (False, True, "killed")])
-def test_without_an_end_event_the_run_still_gets_one(feed: Feed, asked: bool, orphan: bool, word: str) -> None:
+@pytest.mark.parametrize(
+    ("asked", "orphan", "word"), [(True, False, "terminated"), (False, True, "killed")]
+)
+def test_without_an_end_event_the_run_still_gets_one(
+    feed: Feed, asked: bool, orphan: bool, word: str
+) -> None:
     from membrane_ctrl.recorder import process
 
     feed.inputs.put(message_of(rows_of(0.02)[0]))
@@ -229,7 +255,7 @@ if __name__ == "__main__":
     for row in rows[500:]:
         writer.put(message_of(row))
     os.kill(os.getpid(), signal.SIGKILL)
-"""
+"""  # noqa: E501
 
 
 def test_a_killed_control_process_leaves_a_whole_recording(tmp_path: Path) -> None:
@@ -254,7 +280,9 @@ def test_a_writer_that_dies_is_reported_and_the_recording_goes_on(feed: Feed) ->
     with recorder(replace(feed.spec, flush_s=0.2), file_bytes_max=1_000_000) as (process, status):
         wait_for((run_dir / "test-000.rrd").exists)
         while not (run_dir / "test-001.rrd").exists():
-            enough_bytes = recorded_bytes(run_dir) + 40_000  # of the 60 000 and more that 100 rows take
+            enough_bytes = (
+                recorded_bytes(run_dir) + 40_000
+            )  # of the 60 000 and more that 100 rows take
             for row in islice(rows, 100):
                 feed.inputs.put(message_of(row))
                 fed.append(row.mono_s)
@@ -265,7 +293,9 @@ def test_a_writer_that_dies_is_reported_and_the_recording_goes_on(feed: Feed) ->
         kinds = [report["kind"] for report in received(status)]
     assert kinds == ["recorder_error", "recorder_recovered", "recorder_done"]
     account = summary_of(run_dir)["recorder"]
-    lost = dict.fromkeys(("rows_lost", "table_rows_lost", "events_lost", "input_ticks_lost", "restarts"), 0)
+    lost = dict.fromkeys(
+        ("rows_lost", "table_rows_lost", "events_lost", "input_ticks_lost", "restarts"), 0
+    )
     assert account["tables"]["ticks"] == len(list((run_dir / "ticks").glob("ticks-*")))
     said = {"errors": 1, "partial": False, "folder_anew_s": None}
     assert account == {"segments": account["segments"], "tables": account["tables"]} | said | lost

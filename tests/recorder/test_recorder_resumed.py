@@ -1,4 +1,6 @@
-"""A recorder dies in the middle of a run; the next one continues, and the run has everything once."""
+"""A recorder dies in the middle of a run; the next one continues,
+and the run has everything once.
+"""
 
 from __future__ import annotations
 
@@ -41,7 +43,9 @@ class HandClock(RunClock):
 class Run:
     """Rings of a run that outlive its recorders."""
 
-    def __init__(self, run_dir: Path, stack: ExitStack, config: Config, rows_kept: int = 3000) -> None:
+    def __init__(
+        self, run_dir: Path, stack: ExitStack, config: Config, rows_kept: int = 3000
+    ) -> None:
         HandClock.moment_s = 0.0
         self.run_dir, self.config = run_dir, config
         self._stack = stack
@@ -63,7 +67,9 @@ class Run:
         readers = {name: RingReader(address) for name, address in self.addresses.items()}
         for ring_reader in readers.values():
             self._stack.callback(ring_reader.close)
-        return Recorder(self.run_dir, clock, self.config, readers, recording, None, self._report, resumes)
+        return Recorder(
+            self.run_dir, clock, self.config, readers, recording, None, self._report, resumes
+        )
 
     def _report(self, event: Event) -> None:
         self.reports.append(event.to_dict())
@@ -97,13 +103,17 @@ def recorded(run_dir: Path) -> np.ndarray:
     return np.concatenate([recorded_rows(path) for path in sorted(run_dir.glob("*.rrd"))])
 
 
-def test_the_next_recorder_goes_on_and_everything_is_there_once(tmp_path: Path, stack: ExitStack) -> None:
+def test_the_next_recorder_goes_on_and_everything_is_there_once(
+    tmp_path: Path, stack: ExitStack
+) -> None:
     run = Run(tmp_path, stack, Config())
     first = run.recorder(0)
     run.writers["shapes"].put(pack_estimate(shape_of(0.5, 0)))
     for number in range(5):
         run.second(first, number)
-    run.second(first, 5, write=False)  # its events are in the file, its rows are not: then it is killed
+    run.second(
+        first, 5, write=False
+    )  # its events are in the file, its rows are not: then it is killed
     second = run.recorder(1)
     for number in range(6, 12):
         run.second(second, number)
@@ -112,7 +122,9 @@ def test_the_next_recorder_goes_on_and_everything_is_there_once(tmp_path: Path, 
     second.finish(in_haste=True)
     ticks = recorded(tmp_path)[:, 1]
     assert np.array_equal(np.sort(ticks), np.arange(600))
-    numbers = [json.loads(line)["mono_s"] for line in (tmp_path / "events.jsonl").read_text().splitlines()]
+    numbers = [
+        json.loads(line)["mono_s"] for line in (tmp_path / "events.jsonl").read_text().splitlines()
+    ]
     assert numbers == [*range(12), 12.0]
     summary = run.summary
     assert summary["ticks"] == 600
@@ -128,15 +140,23 @@ def test_the_next_recorder_goes_on_and_everything_is_there_once(tmp_path: Path, 
 def test_the_page_of_the_next_recorder_knows_the_gains(tmp_path: Path, stack: ExitStack) -> None:
     run = Run(tmp_path, stack, Config())
     first = run.recorder(0)
-    gains = {"mono_s": 0.0, "kind": "command", "command": "gains", "who": "ann", "why": "", "loop": {
-        "kp_per_s": 0.8, "ti_s": 6.0, "td_s": 0.0}}  # fmt: skip
+    gains = {
+        "mono_s": 0.0,
+        "kind": "command",
+        "command": "gains",
+        "who": "ann",
+        "why": "",
+        "loop": {"kp_per_s": 0.8, "ti_s": 6.0, "td_s": 0.0},
+    }
     run.writers["events"].put(json.dumps(gains).encode())
     run.second(first, 0)
     second = run.recorder(1)
     run.second(second, 1)
     second.finish(in_haste=True)
     pages = [
-        text for path in sorted(tmp_path.glob("*.rrd")) for _, text in strings(path, "/summary", "TextDocument:text")
+        text
+        for path in sorted(tmp_path.glob("*.rrd"))
+        for _, text in strings(path, "/summary", "TextDocument:text")
     ]
     assert len(pages) >= 2
     assert all("| gains | Kp 0.8 1/s, Ti 6 s, Td 0 s |" in page for page in pages)
@@ -166,7 +186,9 @@ def test_what_is_handed_on_comes_back_to_the_last_bit(tmp_path: Path, stack: Exi
     assert load_state(tmp_path) is None
 
 
-@pytest.mark.parametrize("left", [None, b"", b"no state", b"\x80\x04N.", b"[]", b"[" * 10_000, b"{}", b"null"])
+@pytest.mark.parametrize(
+    "left", [None, b"", b"no state", b"\x80\x04N.", b"[]", b"[" * 10_000, b"{}", b"null"]
+)
 @pytest.mark.parametrize(("rows_kept", "partial", "ticks"), [(3000, False, 100), (75, True, 100)])
 def test_without_what_the_first_knew_the_statistics_begin_with_what_the_ring_has_and_say_so(
     tmp_path: Path, stack: ExitStack, left: bytes | None, rows_kept: int, partial: bool, ticks: int
@@ -186,7 +208,9 @@ def test_without_what_the_first_knew_the_statistics_begin_with_what_the_ring_has
     assert run.summary["recorder"]["partial"] is partial
     assert run.summary["ticks"] == ticks
     assert run.summary["dropped"]["inputs"] == max(0, 100 - rows_kept)
-    assert [json.loads(line)["mono_s"] for line in (tmp_path / "events.jsonl").read_text().splitlines()] == [0, 1, 2]
+    assert [
+        json.loads(line)["mono_s"] for line in (tmp_path / "events.jsonl").read_text().splitlines()
+    ] == [0, 1, 2]
 
 
 def test_half_a_line_of_the_event_log_is_written_again_whole(tmp_path: Path) -> None:
@@ -227,7 +251,11 @@ def test_on_the_last_megabytes_rerun_stops_and_goes_on_when_there_is_room(
     recorder.drain()
     recorder.finish(in_haste=True)
     assert {int(moment) for moment in scalars(tmp_path / "test-001.rrd", "/loop/error")[0]} == {2}
-    assert [report["kind"] for report in run.reports] == ["disk_low", "recorder_recovered", "recorder_done"]
+    assert [report["kind"] for report in run.reports] == [
+        "disk_low",
+        "recorder_recovered",
+        "recorder_done",
+    ]
     assert run.summary["ticks"] == 150
     assert run.summary["recorder"]["rows_lost"] == 50
 
@@ -249,7 +277,9 @@ def test_with_little_room_maps_are_left_out(
 
 def chunks(path: Path) -> int:
     """Pieces that one signal is in."""
-    found = (chunk.to_record_batch() for chunk in reader(path).stream().filter(content="/loop/error"))
+    found = (
+        chunk.to_record_batch() for chunk in reader(path).stream().filter(content="/loop/error")
+    )
     return sum("Scalars:scalars" in batch.schema.names for batch in found)
 
 
@@ -257,7 +287,9 @@ def has_layout(path: Path) -> bool:
     return b"ViewportBlueprint" in path.read_bytes()
 
 
-def test_closed_segments_are_optimised_beside_the_recording(tmp_path: Path, stack: ExitStack) -> None:
+def test_closed_segments_are_optimised_beside_the_recording(
+    tmp_path: Path, stack: ExitStack
+) -> None:
     run = Run(tmp_path, stack, Config(recording=RecordingConfig(segment_s=10)))
     recorder = run.recorder(0)
     for number in range(10):

@@ -19,7 +19,9 @@ from tests.support.synthetic_run import shape_of
 
 def test_both_error_bars_of_the_sag_are_told_apart() -> None:
     shape = shape_of(1.0, 3)
-    assert "± 0.100 µm in a change\n" in _legend(shape, shape, {})  # nothing is stated of what they share
+    assert "± 0.100 µm in a change\n" in _legend(
+        shape, shape, {}
+    )  # nothing is stated of what they share
     assert "± 0.100 µm in a change, ± 21.8 µm shared by all cycles\n" in _legend(
         replace(shape, geometry_sag_sigma_um=21.84), shape, {}
     )
@@ -41,7 +43,10 @@ def test_colours_of_changes_are_around_zero_and_those_of_others_from_it(tmp_path
 
     low, high = span("difference")
     assert 9.0 < high == -low < 10.0  # a tilt of 5 µm RMS is 10 µm at the rim
-    assert span("difference_no_tilt") == [-0.5, 0.5]  # nothing left: noise must not fill the colours
+    assert span("difference_no_tilt") == [
+        -0.5,
+        0.5,
+    ]  # nothing left: noise must not fill the colours
     assert span("difference_no_defocus") == pytest.approx([-0.1, 0.1])
     assert span("scatter") == pytest.approx([0.0, high / np.sqrt(2)], rel=1e-3)
     assert span("height")[0] == span("uncertainty")[0] == 0.0
@@ -49,7 +54,9 @@ def test_colours_of_changes_are_around_zero_and_those_of_others_from_it(tmp_path
     assert f"| change | ±{high:.3g} µm |" in legend
 
 
-def test_of_twenty_frames_a_second_the_timeline_has_one_and_every_change_of_verdict(tmp_path: Path) -> None:
+def test_of_twenty_frames_a_second_the_timeline_has_one_and_every_change_of_verdict(
+    tmp_path: Path,
+) -> None:
     recording = Recording(tmp_path, "test", RunClock.start(), Config())
     recording.next_segment()
     streams = ShapeStreams(recording)
@@ -58,12 +65,18 @@ def test_of_twenty_frames_a_second_the_timeline_has_one_and_every_change_of_verd
         lost = 105 <= k < 110
         coeffs_um = first.coeffs_um + 0.3 * (np.arange(ZERNIKE_TERMS) == 11) * (k >= 100)
         verdict = "rejected" if lost else "ok"
-        streams.send(replace(first, time_s=k / 20, kind="track", coeffs_um=coeffs_um, verdict=verdict))
+        streams.send(
+            replace(first, time_s=k / 20, kind="track", coeffs_um=coeffs_um, verdict=verdict)
+        )
     recording.close()
     path = tmp_path / "test-000.rrd"
     times = scalars(path, "/shape/residual", "Scalars:scalars")[0]
     assert 11 <= len(times) <= 14
-    assert [state for _, state in strings(path, "/state/verdict", "StateChange:state")] == ["ok", "rejected", "ok"]
+    assert [state for _, state in strings(path, "/state/verdict", "StateChange:state")] == [
+        "ok",
+        "rejected",
+        "ok",
+    ]
     span = scalars(path, "/shape/waterfall", "DepthImage:depth_range")[1]
     assert span[0, 0].tolist() == pytest.approx([-0.05, 0.05])
     assert span[-1, 0].tolist() == pytest.approx([-0.3, 0.3], rel=1e-3)

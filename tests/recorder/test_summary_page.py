@@ -12,13 +12,17 @@ from membrane_ctrl.recorder.blueprint import summary_page
 from membrane_ctrl.run_files.summary import Summary
 from tests.support.synthetic_run import rows_of, shape_of
 
-FAULT = events.Fault(33, "board_fault", "a cause", "bits 0x4", "must be 0", "pump_off", True, "a remedy")
+FAULT = events.Fault(
+    33, "board_fault", "a cause", "bits 0x4", "must be 0", "pump_off", True, "a remedy"
+)
 
 
 def page(summary: Summary, status: RunStatus) -> dict[str, str]:
     lines = summary_page(summary.as_dict({}, {}), status, Config()).splitlines()
     assert lines[1] == "|---|---|"
-    return dict(line.strip("| ").split(" | ") for line in (lines[0].replace("|  |", "| - |"), *lines[2:]))
+    return dict(
+        line.strip("| ").split(" | ") for line in (lines[0].replace("|  |", "| - |"), *lines[2:])
+    )
 
 
 def test_before_anything_happened() -> None:

@@ -51,7 +51,9 @@ def test_overview_shows_the_error_and_the_states(run_dir: Path) -> None:
 
 
 def test_shape_tab_shows_maps_in_colour(run_dir: Path) -> None:
-    picture = cv2.imdecode(np.frombuffer(screenshot(run_dir, "Shape"), np.uint8), cv2.IMREAD_COLOR).astype(int)
+    picture = cv2.imdecode(
+        np.frombuffer(screenshot(run_dir, "Shape"), np.uint8), cv2.IMREAD_COLOR
+    ).astype(int)
     colourful = (picture.max(axis=2) - picture.min(axis=2)) > 100
     top = colourful[: picture.shape[0] * 2 // 5]
     assert top.mean() > 0.15  # three maps fill much of the upper part

@@ -1,4 +1,6 @@
-"""A replay elsewhere: other last bits of numbers are no difference, other decisions and other numbers are."""
+"""A replay elsewhere: other last bits of numbers are no difference, other decisions and other
+numbers are.
+"""
 
 from __future__ import annotations
 
@@ -46,7 +48,9 @@ def off_by(monkeypatch: pytest.MonkeyPatch) -> Callable[[float], None]:
     smoothing = filters.smoothing
 
     def compute_wrong(share: float) -> None:
-        monkeypatch.setattr(filters, "smoothing", lambda dt_s, lag_s: smoothing(dt_s, lag_s) * (1.0 + share))
+        monkeypatch.setattr(
+            filters, "smoothing", lambda dt_s, lag_s: smoothing(dt_s, lag_s) * (1.0 + share)
+        )
 
     return compute_wrong
 
@@ -57,7 +61,9 @@ def replayed(folder: Path, capsys: pytest.CaptureFixture[str]) -> tuple[int, dic
 
 
 @pytest.mark.usefixtures("elsewhere")
-def test_the_same_bits_are_identical_anywhere(record: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_the_same_bits_are_identical_anywhere(
+    record: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     code, report = replayed(record, capsys)
     assert (code, report["verdict"], report["near"]) == (Exit.DONE, "identical", 0)
     assert report["computed_on"] == describe_arithmetic()
@@ -105,7 +111,11 @@ def test_a_column_that_the_program_does_not_have_leaves_the_others_compared(
     monkeypatch.setattr(InputsReader, "columns", property(lambda _: [*FIELDS, "gone_um"]))
     monkeypatch.setattr(replays, "output_crc", lambda *_: -1)  # it lacks the column
     code, report = replayed(record, capsys)
-    assert (code, report["verdict"], report["unknown_columns"]) == (Exit.DONE, "same numbers", ["gone_um"])
+    assert (code, report["verdict"], report["unknown_columns"]) == (
+        Exit.DONE,
+        "same numbers",
+        ["gone_um"],
+    )
     assert report["near"] == report["compared"] == len(TICKS)
 
 
@@ -148,7 +158,10 @@ def test_a_missing_value_is_the_same_twice_and_a_row_that_is_missing_is_none() -
 
 
 def test_the_processor_is_described_by_its_model() -> None:
-    assert find_model("processor\t: 0\nmodel name\t: Foo 9\n\nprocessor\t: 1\nmodel name\t: Foo 9\n") == "Foo 9"
+    assert (
+        find_model("processor\t: 0\nmodel name\t: Foo 9\n\nprocessor\t: 1\nmodel name\t: Foo 9\n")
+        == "Foo 9"
+    )
     assert find_model("processor: 0\nCPU implementer: 0x41\nCPU part: 0xd0b\n") == "0x41 0xd0b"
     assert find_model("") == ""
     assert f"NumPy {np.__version__}" in describe_arithmetic()

@@ -1,4 +1,6 @@
-"""Repair: files torn by a crash, cut at every kind of place; originals stay unless requested otherwise."""
+"""Repair: files torn by a crash, cut at every kind of place; originals stay unless requested
+otherwise.
+"""
 
 from __future__ import annotations
 
@@ -70,7 +72,14 @@ def test_in_place_makes_parts_of_the_journals(folder: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    "tail", [b'{"mono_s": 3, "kind": "sta', b"\x00" * 512, b'{"a": 1}', b"[" * 30_000, "\u00e4".encode()[:1]]
+    "tail",
+    [
+        b'{"mono_s": 3, "kind": "sta',
+        b"\x00" * 512,
+        b'{"a": 1}',
+        b"[" * 30_000,
+        "\u00e4".encode()[:1],
+    ],
 )
 def test_a_torn_tail_of_the_event_log_is_cut_and_kept(folder: Path, tail: bytes) -> None:
     path = folder / "events.jsonl"
@@ -92,16 +101,28 @@ def test_the_summary_is_rebuilt_as_the_recorder_would_have_written_it(folder: Pa
         expected.add_event(json.loads(line))
     wanted, found = expected.as_dict({}, {}), rebuild_summary(folder)
     assert found["rebuilt"] is True
-    for key in ("exit", "ticks", "cycles", "transitions", "fault_count", "band_1s_windows", "missed_ticks"):
+    for key in (
+        "exit",
+        "ticks",
+        "cycles",
+        "transitions",
+        "fault_count",
+        "band_1s_windows",
+        "missed_ticks",
+    ):
         assert found[key] == wanted[key], key
     for key in ("true_std_um", "true_bias_um", "reading_std_um", "leak_um_per_s"):
         assert found[key] == pytest.approx(wanted[key], rel=1e-4), key  # a table holds singles
-    assert [state["state"] for state in found["states"]] == [state["state"] for state in wanted["states"]]
+    assert [state["state"] for state in found["states"]] == [
+        state["state"] for state in wanted["states"]
+    ]
 
 
 def test_a_run_without_an_end_has_crashed(folder: Path) -> None:
     path = folder / "events.jsonl"
-    path.write_text("".join(line for line in path.read_text().splitlines(keepends=True) if '"end"' not in line))
+    path.write_text(
+        "".join(line for line in path.read_text().splitlines(keepends=True) if '"end"' not in line)
+    )
     assert rebuild_summary(folder)["exit"] == "crashed"
 
 
@@ -125,7 +146,9 @@ def test_a_run_with_nothing_but_its_configuration_is_no_error(folder: Path) -> N
 
 
 @pytest.mark.parametrize("config", [b"\0" * 500, b"\xff", b"[loop]\nrate = 3\n"])
-def test_a_damaged_configuration_is_named_and_keeps_nothing_from_being_mended(folder: Path, config: bytes) -> None:
+def test_a_damaged_configuration_is_named_and_keeps_nothing_from_being_mended(
+    folder: Path, config: bytes
+) -> None:
     (folder / "config.toml").write_bytes(config)
     findings = {finding.file: finding for finding in repair(folder)}
     assert "config.toml" in findings["config.toml"].action
@@ -146,7 +169,9 @@ def test_a_run_that_is_still_recorded_is_left_alone(folder: Path) -> None:
         repair(folder)
 
 
-def test_the_command_says_what_it_did(folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_the_command_says_what_it_did(
+    folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     repair(folder, in_place=True)
     (folder / "summary.json").unlink()
     cut(folder / "inputs" / "inputs-0000.parquet", 0.5)

@@ -57,10 +57,18 @@ def report_of(capsys: pytest.CaptureFixture[str]) -> dict[str, object]:
 
 
 def bits(inputs: TickInputs) -> str:
-    """Every value of the inputs; two that differ in one bit give different texts (`repr` of a float is exact)."""
+    """Every value of the inputs; two that differ in one bit give different texts (`repr` of a float
+    is exact).
+    """
     estimate = inputs.estimate
-    arrays = () if estimate is None else (estimate.coeffs_um.tobytes(), estimate.covariance_um2.tobytes())
-    return repr((replace(inputs, estimate=None), arrays, None if estimate is None else estimate.latency_s))
+    arrays = (
+        ()
+        if estimate is None
+        else (estimate.coeffs_um.tobytes(), estimate.covariance_um2.tobytes())
+    )
+    return repr(
+        (replace(inputs, estimate=None), arrays, None if estimate is None else estimate.latency_s)
+    )
 
 
 def test_every_input_comes_back_to_the_last_bit(record: Path) -> None:
@@ -71,7 +79,9 @@ def test_every_input_comes_back_to_the_last_bit(record: Path) -> None:
         assert bits(item.inputs) == bits(inputs)
 
 
-def test_the_same_code_decides_the_same_to_the_last_bit(record: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_the_same_code_decides_the_same_to_the_last_bit(
+    record: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     assert run(["replay", str(record), "--json"]) == Exit.DONE
     report = report_of(capsys)
     assert report["verdict"] == "identical"
@@ -93,7 +103,9 @@ def changed_from(tick: int, step: float = 1e-3) -> type[Controller]:
             outputs = super().tick(inputs)
             if outputs.row.tick < tick:
                 return outputs
-            return replace(outputs, row=replace(outputs.row, pump_fraction=outputs.row.pump_fraction + step))
+            return replace(
+                outputs, row=replace(outputs.row, pump_fraction=outputs.row.pump_fraction + step)
+            )
 
     return Changed
 
@@ -113,11 +125,17 @@ def test_a_changed_gain_shows_as_another_pump_but_the_same_states(record: Path) 
     found = replay(config, recorded_ticks(InputsReader(record)), zernike_projection())
     assert found.different > 100
     assert [d.what for d in found.decisions if d.what.startswith("state")] == [
-        "state check", "state inflate", "state settle", "state hold", "state lower",
-    ]  # fmt: skip
+        "state check",
+        "state inflate",
+        "state settle",
+        "state hold",
+        "state lower",
+    ]
 
 
-def test_another_configuration_than_the_run_had_is_named(record: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_another_configuration_than_the_run_had_is_named(
+    record: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     text = with_comment(config_file.dump(CONFIG)).replace("kp_per_s = 0.61", "kp_per_s = 0.5")
     (record / "config.toml").write_text(text)
     assert run(["replay", str(record)]) == Exit.REJECTED
@@ -134,7 +152,10 @@ def test_only_what_is_asked_for_is_compared(
 
 
 def test_run_and_part_are_named_as_for_a_review(
-    record: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+    record: Path,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
 ) -> None:
     shutil.copytree(record, tmp_path / "here" / "logs" / "20261121T180000Z-night")
     monkeypatch.chdir(tmp_path / "here")
@@ -154,9 +175,14 @@ def test_missing_ticks_are_a_gap_and_nothing_is_claimed_behind_it(
     report = report_of(capsys)
     assert report["verdict"] == "gaps"
     assert report["compared"] == 509
-    assert report["gaps"] == [{"after_tick": 509, "time_s": 10.18, "ticks": 11, "why": "not recorded"}]
-    # behind the gap the loop commands another flow than the recorded read-back shows: said, and no verdict
-    times_s = [float(found) for line in report["decisions"] for found in re.findall(r"at ([\d.]+) s", line)]
+    assert report["gaps"] == [
+        {"after_tick": 509, "time_s": 10.18, "ticks": 11, "why": "not recorded"}
+    ]
+    # behind the gap the loop commands another flow than the recorded read-back shows: said, and no
+    # verdict
+    times_s = [
+        float(found) for line in report["decisions"] for found in re.findall(r"at ([\d.]+) s", line)
+    ]
     assert all(time_s > 10.18 for time_s in times_s)
 
 
@@ -170,7 +196,9 @@ def test_a_long_command_comes_in_pieces_and_whole_again() -> None:
     messages = pack_tick(1, inputs, outputs, outputs.row.pack())
     assert len(messages) > 10
     assert max(len(message) for message in messages) <= MESSAGE_BYTES
-    assert len(messages[-1]) == MESSAGE_BYTES, "a slot is as large as a tick, whatever columns and sensors it has"
+    assert len(messages[-1]) == MESSAGE_BYTES, (
+        "a slot is as large as a tick, whatever columns and sensors it has"
+    )
     assembler = TickAssembler()
     assert not len(assembler.take(messages[:4]).records)
     batch = assembler.take(messages[4:])
@@ -181,7 +209,9 @@ def test_a_long_command_comes_in_pieces_and_whole_again() -> None:
 
 def test_a_command_whose_pieces_were_overwritten_is_a_gap_not_another_command() -> None:
     inputs, outputs = TICKS[0]
-    messages = pack_tick(1, replace(inputs, commands=(Command("mark", "x", text="y" * 2000),)), outputs, b"")
+    messages = pack_tick(
+        1, replace(inputs, commands=(Command("mark", "x", text="y" * 2000),)), outputs, b""
+    )
     batch = TickAssembler().take(messages[2:])
     with pytest.raises(LookupError, match="commands of tick 1"):
         unpack_tick(batch.records[0], batch.tails[1], {})
@@ -193,7 +223,11 @@ def test_an_estimate_comes_back_to_the_last_bit() -> None:
     assert back.covariance_um2.tobytes() == estimate.covariance_um2.tobytes()
     assert back.coeffs_um.tobytes() == estimate.coeffs_um.tobytes()
     assert struct.pack("<d", back.time_s) == struct.pack("<d", estimate.time_s)
-    assert (back.verdict, back.reason, back.cycle) == (estimate.verdict, estimate.reason, estimate.cycle)
+    assert (back.verdict, back.reason, back.cycle) == (
+        estimate.verdict,
+        estimate.reason,
+        estimate.cycle,
+    )
     assert len(pack_estimate(estimate)) < 4000
 
 
@@ -206,14 +240,21 @@ def test_an_incident_becomes_a_test_that_fails_when_the_decision_changes(
     folder = tmp_path / "tests" / "incidents" / "laser-lost"
     assert check_incident(read_incident(folder)) == []
     about = (folder / "incident.toml").read_text()
-    (folder / "incident.toml").write_text(about.replace("displacement_missing", "displacement_frozen", 1))
+    (folder / "incident.toml").write_text(
+        about.replace("displacement_missing", "displacement_frozen", 1)
+    )
     assert len(check_incident(read_incident(folder))) == 1
-    assert run(["replay", str(record), "--to-test", "laser-lost"]) == Exit.BAD_INPUT  # the name is taken
+    assert (
+        run(["replay", str(record), "--to-test", "laser-lost"]) == Exit.BAD_INPUT
+    )  # the name is taken
     assert run(["replay", str(record), "--to-test", "../x"]) == Exit.BAD_INPUT
 
 
 def test_an_incident_too_large_for_a_repository_is_refused_and_leaves_nothing(
-    record: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+    record: Path,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
 ) -> None:
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr("membrane_ctrl.replay.command._BYTES_MAX", 1000)
@@ -224,7 +265,9 @@ def test_an_incident_too_large_for_a_repository_is_refused_and_leaves_nothing(
 
 
 @pytest.mark.parametrize("missing", ["config.toml", "inputs"])
-def test_what_is_no_run_is_one_line(record: Path, missing: str, capsys: pytest.CaptureFixture[str]) -> None:
+def test_what_is_no_run_is_one_line(
+    record: Path, missing: str, capsys: pytest.CaptureFixture[str]
+) -> None:
     (record / missing).rename(record.parent / "elsewhere")
     assert run(["replay", str(record)]) == Exit.BAD_INPUT
     said = capsys.readouterr().err
@@ -232,7 +275,9 @@ def test_what_is_no_run_is_one_line(record: Path, missing: str, capsys: pytest.C
     assert missing in said
 
 
-def test_a_damaged_row_group_of_the_inputs_is_a_gap(record: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_damaged_row_group_of_the_inputs_is_a_gap(
+    record: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     small = replace(table_specs.INPUTS, group_rows=100)
     monkeypatch.setattr(table_specs, "INPUTS", small)
     specs = tuple(small if spec.name == small.name else spec for spec in table_specs.ALL)
@@ -262,7 +307,11 @@ def test_shapes_without_their_times_are_damage(record: Path) -> None:
 
 @pytest.mark.parametrize(("step", "shown"), [(2.0**-10, True), (1e-12, False)])
 def test_a_difference_is_shown_with_what_was_recorded(
-    record: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], step: float, shown: bool
+    record: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+    step: float,
+    shown: bool,
 ) -> None:
     monkeypatch.setattr(replay_module, "Controller", changed_from(720, step))
     assert run(["replay", str(record), "--json"]) == Exit.REJECTED
@@ -273,4 +322,8 @@ def test_a_difference_is_shown_with_what_was_recorded(
     assert report["fields"] == ({"pump_fraction": [then, now]} if shown else {})
     assert run(["replay", str(record)]) == Exit.REJECTED
     said = capsys.readouterr().out
-    assert f"pump_fraction: recorded {then!r}, today {now!r}" in said if shown else "smaller difference" in said
+    assert (
+        f"pump_fraction: recorded {then!r}, today {now!r}" in said
+        if shown
+        else "smaller difference" in said
+    )

@@ -10,7 +10,11 @@ import pytest
 from membrane_ctrl.model.telemetry import FIELDS, TelemetryRow
 from membrane_ctrl.replay.replay import Decision, differing_fields, unmatched
 
-CHECK, HOLD, FAULT = Decision(1.0, "state", "check"), Decision(5.0, "state", "hold"), Decision(9.0, "fault", "late")
+CHECK, HOLD, FAULT = (
+    Decision(1.0, "state", "check"),
+    Decision(5.0, "state", "hold"),
+    Decision(9.0, "fault", "late"),
+)
 ROW = TelemetryRow(**dict.fromkeys(FIELDS, 1.0))
 
 
@@ -23,10 +27,18 @@ def at(decision: Decision, time_s: float) -> Decision:
     [
         ([CHECK, HOLD], [CHECK, HOLD], []),
         ([CHECK, HOLD], [CHECK, at(HOLD, 6.0)], []),
-        ([CHECK, HOLD], [CHECK, at(HOLD, 6.1)], ["recorded: state hold at 5.00 s; today: state hold at 6.10 s"]),
+        (
+            [CHECK, HOLD],
+            [CHECK, at(HOLD, 6.1)],
+            ["recorded: state hold at 5.00 s; today: state hold at 6.10 s"],
+        ),
         ([CHECK, HOLD], [CHECK], ["recorded: state hold at 5.00 s; today: nothing more"]),
         ([CHECK], [CHECK, HOLD, FAULT], ["recorded: nothing more; today: state hold at 5.00 s"]),
-        ([CHECK, FAULT], [HOLD, FAULT], ["recorded: state check at 1.00 s; today: state hold at 5.00 s"]),
+        (
+            [CHECK, FAULT],
+            [HOLD, FAULT],
+            ["recorded: state check at 1.00 s; today: state hold at 5.00 s"],
+        ),
     ],
 )
 def test_decisions_are_the_same_ones_within_the_slack_until_one_is_another(

@@ -15,7 +15,14 @@ from membrane_ctrl.cli import run as command
 from membrane_ctrl.review.viewer.command import PROPERTIES
 from tests.support.review_runs import set_summary, written
 
-HELD = {"std_um": 0.1234567, "in_band": 0.98, "held_s": 300.0, "faults_s": 36.0, "paused_s": 0.0, "moving_s": 1.0}
+HELD = {
+    "std_um": 0.1234567,
+    "in_band": 0.98,
+    "held_s": 300.0,
+    "faults_s": 36.0,
+    "paused_s": 0.0,
+    "moving_s": 1.0,
+}
 
 
 @pytest.fixture(scope="module")
@@ -56,13 +63,32 @@ def test_other_programs_read_the_catalogue_on_this_machine_until_it_is_ended(
     logs: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setenv("TMPDIR", str(tmp_path))
-    arguments = [sys.executable, "-m", "membrane_ctrl", "review", "--all", "--web", "--logs", str(logs)]
+    arguments = [
+        sys.executable,
+        "-m",
+        "membrane_ctrl",
+        "review",
+        "--all",
+        "--web",
+        "--logs",
+        str(logs),
+    ]
     with subprocess.Popen(arguments, stderr=subprocess.PIPE, text=True) as process:
         assert process.stderr is not None
         url = next(line for line in process.stderr if "rerun+http" in line).split()[-1]
-        told = json.loads(subprocess.check_output([sys.executable, "-c", CLIENT, url], text=True, timeout=60))
-        family = [psutil.Process(process.pid), *psutil.Process(process.pid).children(recursive=True)]
-        places = {c.laddr.ip for p in family for c in p.net_connections() if c.status == psutil.CONN_LISTEN}
+        told = json.loads(
+            subprocess.check_output([sys.executable, "-c", CLIENT, url], text=True, timeout=60)
+        )
+        family = [
+            psutil.Process(process.pid),
+            *psutil.Process(process.pid).children(recursive=True),
+        ]
+        places = {
+            c.laddr.ip
+            for p in family
+            for c in p.net_connections()
+            if c.status == psutil.CONN_LISTEN
+        }
         process.send_signal(signal.SIGINT)
         assert process.wait(20) == 0
     assert places == {"127.0.0.1"}
@@ -70,13 +96,26 @@ def test_other_programs_read_the_catalogue_on_this_machine_until_it_is_ended(
     assert not any(each.is_running() for each in family)
     assert told["seconds"] == 360
     rows = {row.pop("rerun_segment_id")[:8]: row for row in told["rows"]}
-    night = {name.removeprefix("property:run:"): cell[0] for name, cell in rows["20261122"].items() if cell}
+    night = {
+        name.removeprefix("property:run:"): cell[0]
+        for name, cell in rows["20261122"].items()
+        if cell
+    }
     assert len(night.pop("configuration")) == 8
     assert night == {
-        "started_utc": "2026-11-21 18:00:00", "duration_s": 360.0, "held_s": 300.0, "std_um": 0.1235, "in_band": 0.98,
-        "faults": 1, "faults_share": 0.1, "kp_per_s": 0.61, "ti_s": 6.5, "geometry": "ae735b0b", "exit": "done",
+        "started_utc": "2026-11-21 18:00:00",
+        "duration_s": 360.0,
+        "held_s": 300.0,
+        "std_um": 0.1235,
+        "in_band": 0.98,
+        "faults": 1,
+        "faults_share": 0.1,
+        "kp_per_s": 0.61,
+        "ti_s": 6.5,
+        "geometry": "ae735b0b",
+        "exit": "done",
         "marks": 0,
-    }  # fmt: skip
+    }
     learned = {"pump_scale", "pump_sigma"}  # nothing was
     assert set(rows["20261122"]) == {f"property:run:{name}" for name in PROPERTIES.keys() - learned}
     assert rows["20261121"]["property:run:std_um"] is None  # of a version without it
@@ -85,11 +124,20 @@ def test_other_programs_read_the_catalogue_on_this_machine_until_it_is_ended(
 
 @pytest.mark.parametrize(
     ("asked", "said"),
-    [(["--all", "last"], "or give --all"), ([], "or give --all"), (["--all", "--at", "03:12"], "omit --bind, --at"),
-     (["--all", "--web", "--bind", "0.0.0.0"], "this machine only"), (["--all"], "no such folder")],
-)  # fmt: skip
+    [
+        (["--all", "last"], "or give --all"),
+        ([], "or give --all"),
+        (["--all", "--at", "03:12"], "omit --bind, --at"),
+        (["--all", "--web", "--bind", "0.0.0.0"], "this machine only"),
+        (["--all"], "no such folder"),
+    ],
+)
 def test_requests_that_contradict_each_other_are_refused(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], asked: list[str], said: str
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+    asked: list[str],
+    said: str,
 ) -> None:
     monkeypatch.chdir(tmp_path)
     assert command(["review", *asked]) == 2

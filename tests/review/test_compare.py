@@ -1,4 +1,6 @@
-"""The tests of a comparison: alike runs seldom differ, differences are found, rows state their test."""
+"""The tests of a comparison: alike runs seldom differ, differences are found, rows state their
+test.
+"""
 
 from __future__ import annotations
 
@@ -19,7 +21,9 @@ from tests.support.review_runs import written
 HOURS = 0.5
 
 
-def series(rng: np.random.Generator, hours: float, std: float = 1.0, memory: float = 0.9) -> np.ndarray:
+def series(
+    rng: np.random.Generator, hours: float, std: float = 1.0, memory: float = 0.9
+) -> np.ndarray:
     """(2, n): seconds and a wander of that standard deviation."""
     size = round(hours * 3600)
     noise = signal.lfilter([1.0], [1.0, -memory], rng.normal(size=size + 500))[500:]
@@ -34,7 +38,8 @@ def long_windows(values: np.ndarray, window_s: float) -> np.ndarray:
 def test_spreads_of_alike_series_of_different_length_seldom_differ(window_s: float) -> None:
     rng = np.random.default_rng(1)
     seen = [
-        spread_p(*(long_windows(series(rng, hours), window_s) for hours in (0.5, 3.0)), window_s) for _ in range(150)
+        spread_p(*(long_windows(series(rng, hours), window_s) for hours in (0.5, 3.0)), window_s)
+        for _ in range(150)
     ]
     assert np.mean(np.array(seen) < 0.01) < 0.05
     assert np.mean(seen) > 0.35
@@ -95,13 +100,21 @@ def test_blocks_that_remember_each_other_count_for_fewer() -> None:
 @pytest.fixture(scope="module")
 def analyses(tmp_path_factory: pytest.TempPathFactory) -> list[Analysis]:
     logs: Path = tmp_path_factory.mktemp("compare")
-    return [analyse(open_run(written(logs, HOURS, seed=seed, name=f"2026112{seed}T180000Z-n"))) for seed in (1, 2)]
+    return [
+        analyse(open_run(written(logs, HOURS, seed=seed, name=f"2026112{seed}T180000Z-n")))
+        for seed in (1, 2)
+    ]
 
 
 def test_every_row_is_tested_or_says_why_not(analyses: list[Analysis]) -> None:
     rows = {row.name: row for row in compare(*analyses)}
-    assert all(math.isfinite(row.p_value) or row.note.startswith("no test") for row in rows.values())
-    assert {name for name, row in rows.items() if not math.isfinite(row.p_value)} <= {"pump strokes", "lateness p99"}
+    assert all(
+        math.isfinite(row.p_value) or row.note.startswith("no test") for row in rows.values()
+    )
+    assert {name for name, row in rows.items() if not math.isfinite(row.p_value)} <= {
+        "pump strokes",
+        "lateness p99",
+    }
     assert "stretches" in rows["leak"].note
     assert not any(row.said in {"larger", "smaller"} for row in rows.values())
 

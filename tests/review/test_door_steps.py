@@ -64,7 +64,9 @@ def test_a_door_that_takes_its_time_has_its_size(over_s: float, size_pa: float) 
 
 @pytest.mark.parametrize("open_s", [1.0, 2.0, 3.0, 6.0])
 def test_a_door_that_is_closed_at_once_is_two_steps(open_s: float) -> None:
-    rows, _ = night(11, HOURS, "typical", [Planted(DOOR, 3000.4, 20.0), Planted(DOOR, 3000.4 + open_s, -20.0)])
+    rows, _ = night(
+        11, HOURS, "typical", [Planted(DOOR, 3000.4, 20.0), Planted(DOOR, 3000.4 + open_s, -20.0)]
+    )
     up, down = doors_in(rows)
     assert up.size > 9.0
     assert down.size < -9.0

@@ -11,7 +11,12 @@ from benchmarks.events_found import matched
 from benchmarks.nights import DOOR, GLITCH, JUMP, LATE, LEAK, LOST, Planted, night
 from membrane_ctrl.metrology.optics.film_law import zernike_projection
 from membrane_ctrl.model.telemetry import COLUMN, Rows, State, column
-from membrane_ctrl.review.events.found import find_events, laser_losses, noise_changes, weather_losses
+from membrane_ctrl.review.events.found import (
+    find_events,
+    laser_losses,
+    noise_changes,
+    weather_losses,
+)
 from membrane_ctrl.review.events.steps import FoundEvent, confidence, steps
 from membrane_ctrl.run_files.levels import TICK_FIELDS, Columns, first_level
 from tests.support.synthetic_shape import from_estimates
@@ -36,12 +41,18 @@ def test_a_calm_night_raises_no_alarm(scenario: str) -> None:
 @pytest.mark.parametrize(
     "event",
     [
-        Planted(DOOR, 3000.4, 10.0), Planted(DOOR, 3000.9, -12.0), Planted(LEAK, 3000.0, 30.0),
-        Planted(LEAK, 3000.0, -30.0), Planted(GLITCH, 3000.3, 15.0), Planted(GLITCH, 3000.3, -15.0),
-        Planted(LOST, 3000.0, 2.0), Planted(LATE, 3000.0, 30.0), Planted(JUMP, 3000.0, 1.0),
+        Planted(DOOR, 3000.4, 10.0),
+        Planted(DOOR, 3000.9, -12.0),
+        Planted(LEAK, 3000.0, 30.0),
+        Planted(LEAK, 3000.0, -30.0),
+        Planted(GLITCH, 3000.3, 15.0),
+        Planted(GLITCH, 3000.3, -15.0),
+        Planted(LOST, 3000.0, 2.0),
+        Planted(LATE, 3000.0, 30.0),
+        Planted(JUMP, 3000.0, 1.0),
     ],
     ids=lambda event: f"{event.kind} {event.size:g}",
-)  # fmt: skip
+)
 def test_what_was_planted_is_found_and_nothing_else(event: Planted) -> None:
     found = found_in([event])
     missed, false = matched([event], found)
@@ -63,12 +74,15 @@ def test_a_change_of_noise_is_found() -> None:
 
 
 @pytest.mark.parametrize(
-    ("field", "kind"), [("ambient_pressure_pa", "barometer lost"), ("air_temperature_c", "thermometer lost")]
+    ("field", "kind"),
+    [("ambient_pressure_pa", "barometer lost"), ("air_temperature_c", "thermometer lost")],
 )
 def test_lost_weather_is_found_once_it_was_there(field: str, kind: str) -> None:
     rows, _ = night(4, 0.2, "quiet", [])
     time_s = column(rows, "mono_s")
-    rows[(time_s < 20.0) | ((time_s >= 300.0) & (time_s < 360.0)) | (time_s == 100.0), COLUMN[field]] = np.nan
+    rows[
+        (time_s < 20.0) | ((time_s >= 300.0) & (time_s < 360.0)) | (time_s == 100.0), COLUMN[field]
+    ] = np.nan
     (found,) = weather_losses(level_of(rows))
     assert (found.kind, found.time_s, found.size) == (kind, 300.0, 60.0)
     rows[:, COLUMN[field]] = np.nan  # a bench without one
@@ -103,7 +117,9 @@ def test_confidence_falls_with_the_places_looked_at() -> None:
 
 
 def test_a_mirror_that_is_moved_makes_no_jump_of_its_figure() -> None:
-    """A deeper bowl has more of Z11, and frames of a bowl that moves have some of Z6; inflating is no event."""
+    """A deeper bowl has more of Z11, and frames of a bowl that moves have some of Z6; inflating is
+    no event.
+    """
     rows, shapes = night(1, 0.5, "quiet", [])
     time_s = column(rows, "mono_s")
     moved_um = np.interp(time_s, [300, 317, 1000, 1017], [0, 60, 60, 0])
@@ -118,6 +134,6 @@ def test_a_mirror_that_is_moved_makes_no_jump_of_its_figure() -> None:
         sag_um = estimate.sag_um + at_um
         estimates.append(
             replace(estimate, coeffs_um=coeffs_um, sag_um=sag_um, displacement_um=displacement_um)
-        )  # fmt: skip
+        )
     found = find_events(level_of(rows), from_estimates(estimates), 2.0)
     assert [event for event in found if event.kind == JUMP] == []

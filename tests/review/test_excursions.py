@@ -17,7 +17,9 @@ AT_S = 1500.0
 
 
 def found_in(rows: Rows, band_um: float = BAND_UM) -> list[FoundEvent]:
-    return find_events(first_level({name: column(rows, name) for name in TICK_FIELDS}), from_estimates([]), band_um)
+    return find_events(
+        first_level({name: column(rows, name) for name in TICK_FIELDS}), from_estimates([]), band_um
+    )
 
 
 def bumped(events: list[Planted], size_um: float, scenario: str = "typical") -> Rows:

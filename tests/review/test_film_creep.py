@@ -11,7 +11,9 @@ DAY_S = 86_400.0
 
 
 def chain(rng: np.random.Generator, time_s: np.ndarray) -> np.ndarray:
-    """Log stiffness of a Prony series: springs and dashpots with retardation times over seven decades."""
+    """Log stiffness of a Prony series: springs and dashpots with retardation times over seven
+    decades.
+    """
     times_s = 10 ** np.arange(1.0, 8.5, 0.5)
     parts = rng.uniform(0.5, 1.5, times_s.size) * 10 ** rng.uniform(-3.5, -2.5)
     return -np.log1p(parts @ (1 - np.exp(-time_s / times_s[:, None])))
@@ -38,7 +40,10 @@ def test_the_interval_of_tomorrow_holds_the_truth() -> None:
 
 def test_a_film_that_does_not_creep_is_not_said_to() -> None:
     rng = np.random.default_rng(2)
-    found = [fit_creep(np.linspace(0, 5 * DAY_S, 50), 1e-5 * rng.normal(size=50), DAY_S) for _ in range(10)]
+    found = [
+        fit_creep(np.linspace(0, 5 * DAY_S, 50), 1e-5 * rng.normal(size=50), DAY_S)
+        for _ in range(10)
+    ]
     assert sum(creep.sure for creep in found) <= 2
 
 

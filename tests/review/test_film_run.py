@@ -1,4 +1,6 @@
-"""`film RUN...`: the twin's film gives way under a hold; its drift of tomorrow is known from its own equations."""
+"""`film RUN...`: the twin's film gives way under a hold; its drift of tomorrow is known from its
+own equations.
+"""
 
 from __future__ import annotations
 
@@ -29,7 +31,9 @@ def sag_mm(pressure_pa: float, stiffness: float) -> float:
     for _ in range(50):
         middle = (low + high) / 2
         load = stretched(middle / RADIUS_MM, PRESTRAIN, POISSON)[0]
-        low, high = (middle, high) if load * stiffness / (RADIUS_MM * 1e-3) < pressure_pa else (low, middle)
+        low, high = (
+            (middle, high) if load * stiffness / (RADIUS_MM * 1e-3) < pressure_pa else (low, middle)
+        )
     return low
 
 
@@ -42,9 +46,13 @@ def run_of(folder: Path, hours: float) -> SimpleNamespace:
     shapes = SimpleNamespace(time_s=time_s, sag_um=np.full(60, 37e3), verdict=np.full(60, "ok"))
     level = {"time_s": time_s - 30.0, "mean_gauge_pressure_pa": pressure_pa}
     return SimpleNamespace(
-        name="night", folder=folder, config=Config(), origin_utc=datetime(2026, 11, 1, tzinfo=UTC),
-        shapes=lambda: shapes, level=lambda _window_s, names: level,
-    )  # fmt: skip
+        name="night",
+        folder=folder,
+        config=Config(),
+        origin_utc=datetime(2026, 11, 1, tzinfo=UTC),
+        shapes=lambda: shapes,
+        level=lambda _window_s, names: level,
+    )
 
 
 def test_tomorrow_is_within_its_interval(
@@ -54,7 +62,9 @@ def test_tomorrow_is_within_its_interval(
     assert film_run.film_run_command([tmp_path], PRESTRAIN, POISSON, None, True, True) == 0
     table = json.loads(capsys.readouterr().out)
     times_s = np.array([48.0, 72.0]) * HOUR_S
-    pressure_pa = stretched(37.0 / RADIUS_MM, PRESTRAIN, POISSON)[0] * stiffness_n_per_m(times_s[:1])[0] / 0.5
+    pressure_pa = (
+        stretched(37.0 / RADIUS_MM, PRESTRAIN, POISSON)[0] * stiffness_n_per_m(times_s[:1])[0] / 0.5
+    )
     now, then = (sag_mm(pressure_pa, float(stiffness)) for stiffness in stiffness_n_per_m(times_s))
     drift = table["tomorrow_um"]
     assert table["creeps"]

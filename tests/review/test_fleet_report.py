@@ -1,4 +1,6 @@
-"""`report --fleet`: the figures of each run's own report on one page, also on several processes or a cluster."""
+"""`report --fleet`: the figures of each run's own report on one page, also on several processes or
+a cluster.
+"""
 
 from __future__ import annotations
 
@@ -28,9 +30,27 @@ def lab(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("lab")
     for seed, (mirror, name) in enumerate(zip(("north", "south"), NAMES, strict=True), 1):
         written(folder / mirror, 0.02, seed=seed, name=name)
-    event = {"kind": "alarm", "mono_s": 5.0, "time_utc": "2026-11-21T18:00:05+00:00", "alarm": "leaky"}
-    event |= {"what": "raised", "severity": "warning", "text": "t", "to": "lab", "sent": True, "escalated": False}
-    fault = {"kind": "fault", "mono_s": 6.0, "time_utc": "2026-11-21T18:00:06+00:00", "code": 40, "name": "late"}
+    event = {
+        "kind": "alarm",
+        "mono_s": 5.0,
+        "time_utc": "2026-11-21T18:00:05+00:00",
+        "alarm": "leaky",
+    }
+    event |= {
+        "what": "raised",
+        "severity": "warning",
+        "text": "t",
+        "to": "lab",
+        "sent": True,
+        "escalated": False,
+    }
+    fault = {
+        "kind": "fault",
+        "mono_s": 6.0,
+        "time_utc": "2026-11-21T18:00:06+00:00",
+        "code": 40,
+        "name": "late",
+    }
     with (folder / "north" / NAMES[0] / "events.jsonl").open("a") as log:
         log.writelines(json.dumps(each) + "\n" for each in (event, fault))
     (folder / "south" / HOSTILE).mkdir()
@@ -43,7 +63,9 @@ def lab(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def undrawn(monkeypatch: pytest.MonkeyPatch) -> None:
     """Pages without pictures, which take seconds."""
     for module in (fleet, html):
-        monkeypatch.setattr(module, "render", lambda analysis, *_, **__: f"page of {analysis.run.name}")
+        monkeypatch.setattr(
+            module, "render", lambda analysis, *_, **__: f"page of {analysis.run.name}"
+        )
 
 
 def table_of(out: Path) -> dict[str, dict[str, Any]]:
@@ -76,10 +98,21 @@ class Cells(HTMLParser):
 
 @pytest.mark.usefixtures("undrawn")
 def test_the_page_has_the_figures_of_each_runs_own_report(lab: Path, tmp_path: Path) -> None:
-    given = [str(lab / each) for each in ("north", "south", "empty", "missing", f"north/{NAMES[0]}")]
-    assert command(["report", "--fleet", *given, "--out", str(tmp_path / "out"), "--workers", "1"]) == Exit.DONE
+    given = [
+        str(lab / each) for each in ("north", "south", "empty", "missing", f"north/{NAMES[0]}")
+    ]
+    assert (
+        command(["report", "--fleet", *given, "--out", str(tmp_path / "out"), "--workers", "1"])
+        == Exit.DONE
+    )
     found = table_of(tmp_path / "out")
-    assert list(found) == [f"north/{NAMES[0]}", f"south/{NAMES[1]}", f"south/{HOSTILE}", "empty", "missing"]
+    assert list(found) == [
+        f"north/{NAMES[0]}",
+        f"south/{NAMES[1]}",
+        f"south/{HOSTILE}",
+        "empty",
+        "missing",
+    ]
     for name in list(found)[:2]:
         own = tmp_path / "own" / name
         assert command(["report", str(lab / name), "--out", str(own)]) == Exit.DONE
@@ -95,7 +128,11 @@ def test_the_page_has_the_figures_of_each_runs_own_report(lab: Path, tmp_path: P
     assert [line.get("faults") for line in found.values()] == [["late"], [], None, None, None]
     assert [line.get("alarms") for line in found.values()] == [["leaky"], [], None, None, None]
     said = [line.get("problem", "") for line in found.values()]
-    assert ["nothing to report" in said[2], "not a run" in said[3], "no such run" in said[4]] == [True, True, True]
+    assert ["nothing to report" in said[2], "not a run" in said[3], "no such run" in said[4]] == [
+        True,
+        True,
+        True,
+    ]
     page = Cells((tmp_path / "out" / "fleet.html").read_text())
     assert [len(row) for row in page.rows] == [13] * 6
     assert page.rows[1][9] == "leaky"
@@ -125,7 +162,11 @@ def test_what_no_run_can_break(lab: Path, tmp_path: Path, monkeypatch: pytest.Mo
     ],
 )
 def test_what_cannot_be_asked(
-    lab: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], words: list[str], says: str
+    lab: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+    words: list[str],
+    says: str,
 ) -> None:
     monkeypatch.chdir(lab)
     assert command(["report", *words]) == Exit.BAD_INPUT
@@ -134,12 +175,18 @@ def test_what_cannot_be_asked(
 
 
 def files_of(out: Path) -> dict[str, bytes]:
-    return {str(path.relative_to(out)): path.read_bytes() for path in sorted(out.rglob("*")) if path.is_file()}
+    return {
+        str(path.relative_to(out)): path.read_bytes()
+        for path in sorted(out.rglob("*"))
+        if path.is_file()
+    }
 
 
 def reported(lab: Path, out: Path, *more: str) -> dict[str, bytes]:
     words = ["report", "--fleet", str(lab / "north"), str(lab / "south"), "--out", str(out), *more]
-    subprocess.run([sys.executable, "-m", "membrane_ctrl", *words], check=True, env=os.environ | PATIENT)
+    subprocess.run(
+        [sys.executable, "-m", "membrane_ctrl", *words], check=True, env=os.environ | PATIENT
+    )
     return files_of(out)
 
 
@@ -153,7 +200,11 @@ def test_processes_and_a_cluster_write_the_same_bytes(lab: Path, tmp_path: Path)
     assert there == here
 
 
-def test_a_fleet_of_nothing_is_a_line_for_each(lab: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    assert command(["report", "--fleet", str(lab / "empty"), str(lab / "missing")]) == Exit.BAD_INPUT
+def test_a_fleet_of_nothing_is_a_line_for_each(
+    lab: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert (
+        command(["report", "--fleet", str(lab / "empty"), str(lab / "missing")]) == Exit.BAD_INPUT
+    )
     said = capsys.readouterr().err.splitlines()
     assert [line.split(":")[1].strip().rsplit("/")[-1] for line in said] == ["empty", "missing"]

@@ -8,8 +8,12 @@ from membrane_ctrl.review.report.figures import broken_at_gaps
 
 
 def test_a_missing_hour_breaks_the_line_and_a_missing_second_does_not() -> None:
-    time_s = np.concatenate((np.arange(0.0, 100.0), np.arange(101.0, 200.0), np.arange(3800.0, 3900.0)))
-    broken = broken_at_gaps({"time_s": time_s, "error_um": np.ones(time_s.size), "both": np.ones((time_s.size, 2))})
+    time_s = np.concatenate(
+        (np.arange(0.0, 100.0), np.arange(101.0, 200.0), np.arange(3800.0, 3900.0))
+    )
+    broken = broken_at_gaps(
+        {"time_s": time_s, "error_um": np.ones(time_s.size), "both": np.ones((time_s.size, 2))}
+    )
     (place,) = np.flatnonzero(np.isnan(broken["error_um"]))
     assert broken["time_s"][place] == (199.0 + 3800.0) / 2
     assert np.isnan(broken["both"][place]).all()

@@ -50,7 +50,8 @@ def _with_ticks(folder: Path, rows: Rows, kept: np.ndarray) -> Path:
 def test_seconds_without_every_tick_are_those_of_the_level(tmp_path: Path) -> None:
     rows, _ = night(1, HOURS, "typical", [])
     rows[:300, COLUMN["state"]] = State.SETTLE
-    rows[1000:1050, COLUMN["displacement_um"]] += 1.0  # something happened: ten seconds with every tick
+    # something happened: ten seconds with every tick
+    rows[1000:1050, COLUMN["displacement_um"]] += 1.0
     tick = column(rows, "tick")
     some = (tick % 5 == 0) | ((tick >= 950) & (tick < 1050))
     every = analyse(open_run(_with_ticks(tmp_path / "every", rows, tick >= 0)))
@@ -64,7 +65,9 @@ def test_seconds_without_every_tick_are_those_of_the_level(tmp_path: Path) -> No
         assert ours.count == theirs.count
         assert ours.std_um == pytest.approx(theirs.std_um, rel=1e-3)
         assert ours.mean_um == pytest.approx(theirs.mean_um, abs=1e-4)
-    assert [odd.name for odd in thinned.anomalies if odd not in every.anomalies] == ["thinned ticks"]
+    assert [odd.name for odd in thinned.anomalies if odd not in every.anomalies] == [
+        "thinned ticks"
+    ]
     assert every.benefit is not None
     assert thinned.benefit is None
     for path in (tmp_path / "some").glob("ticks_*"):
@@ -76,7 +79,9 @@ def test_seconds_without_every_tick_are_those_of_the_level(tmp_path: Path) -> No
 
 def test_a_part_between_seconds_and_a_lost_tick_are_not_thin(tmp_path: Path) -> None:
     rows, _ = night(1, HOURS, "typical", [])
-    run = open_run(_with_ticks(tmp_path / "run", rows, ~np.isin(column(rows, "tick"), [1203, 1204, 1205])))
+    run = open_run(
+        _with_ticks(tmp_path / "run", rows, ~np.isin(column(rows, "tick"), [1203, 1204, 1205]))
+    )
     analysis = analyse(run, 60.5, 140.3)
     assert (analysis.ticks.thin_s, analysis.benefit is None) == (0, False)
     assert analysis.ticks.hold_s == pytest.approx(79.8, abs=0.1)
@@ -92,7 +97,10 @@ def test_a_setpoint_on_its_way_is_told_from_what_counts(tmp_path: Path) -> None:
     assert analysis.ticks.hold_s == pytest.approx(360, abs=0.5)
     assert analysis.ticks.settled_s == pytest.approx(360 - 90 - 5 - 5, abs=0.5)
     assert report_table(analysis)["settled_s"] == analysis.ticks.settled_s
-    assert "Held for 4 min 20 s of 6 min (moving or settling 1 min 40 s (27.8 %))" in verdict(analysis)[1]
+    assert (
+        "Held for 4 min 20 s of 6 min (moving or settling 1 min 40 s (27.8 %))"
+        in verdict(analysis)[1]
+    )
 
 
 def test_a_tick_that_comes_just_behind_its_second_thins_none(tmp_path: Path) -> None:
@@ -126,7 +134,9 @@ def test_a_flow_that_only_lags_is_not_at_a_limit(tmp_path: Path) -> None:
     rows[::4, COLUMN["flow_wanted_um_per_s"]] = -0.1
     rows[1::4, COLUMN["flow_wanted_um_per_s"]] = CONFIG.loop.flow_max_um_per_s + 0.1
     write_run(tmp_path / "run", iter([(rows, [])]))
-    assert analyse(open_run(tmp_path / "run")).ticks.pump.saturated_share == pytest.approx(0.5, abs=1e-3)
+    assert analyse(open_run(tmp_path / "run")).ticks.pump.saturated_share == pytest.approx(
+        0.5, abs=1e-3
+    )
 
 
 def test_the_limit_of_the_flow_is_that_of_the_curve_in_force(tmp_path: Path) -> None:
@@ -136,7 +146,14 @@ def test_the_limit_of_the_flow_is_that_of_the_curve_in_force(tmp_path: Path) -> 
     write_run(tmp_path / "run", iter([(rows, [])]))
     third_s = float(rows[-1, COLUMN["mono_s"]]) / 3
     curve = {"curve_fraction": [0.1, 1.0], "curve_um_per_s": [0.0, 10.0]}
-    asked = {"kind": "command", "command": "gains", "who": "tom", "why": "", "value": 1e4, "refused": None}
+    asked = {
+        "kind": "command",
+        "command": "gains",
+        "who": "tom",
+        "why": "",
+        "value": 1e4,
+        "refused": None,
+    }
     loop = CONFIG.loop.model_dump() | {"flow_max_um_per_s": 10.0}
     told = [
         asked | {"mono_s": third_s, "loop": loop | {"pump": curve}},
@@ -145,5 +162,9 @@ def test_the_limit_of_the_flow_is_that_of_the_curve_in_force(tmp_path: Path) -> 
         {"kind": "gains_reverted", "why": "nobody kept them", "mono_s": 2 * third_s},
     ]
     with (tmp_path / "run/events.jsonl").open("a") as log:
-        log.writelines(json.dumps({"time_utc": "2026-11-21T18:00:00+00:00", **event}) + "\n" for event in told)
-    assert analyse(open_run(tmp_path / "run")).ticks.pump.saturated_share == pytest.approx(2 / 3, abs=1e-2)
+        log.writelines(
+            json.dumps({"time_utc": "2026-11-21T18:00:00+00:00", **event}) + "\n" for event in told
+        )
+    assert analyse(open_run(tmp_path / "run")).ticks.pump.saturated_share == pytest.approx(
+        2 / 3, abs=1e-2
+    )

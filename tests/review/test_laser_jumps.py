@@ -21,7 +21,9 @@ def glitches_in(rows: Rows) -> list[FoundEvent]:
 
 
 def wrong_for(rows: Rows, size_um: float, lasts_s: float) -> None:
-    """A reading that is wrong for a while; the loop takes it back at the leak's speed, and afterwards again."""
+    """A reading that is wrong for a while; the loop takes it back at the leak's speed, and
+    afterwards again.
+    """
     time_s = column(rows, "mono_s")
     there = (time_s >= AT_S) & (time_s < AT_S + lasts_s)
     taken = np.minimum(1.2 * np.clip(time_s - AT_S, 0, lasts_s), abs(size_um))
@@ -62,7 +64,10 @@ def test_a_loop_that_follows_at_full_speed_does_not_end_a_glitch() -> None:
     after = 12.0 * (time_s >= AT_S + 8) - 1.2 * np.clip(time_s - AT_S - 8, 0, 10)
     rows[:, READING] += there * np.minimum(0.0, -12.0 + 4.0 * (time_s - AT_S)) + after
     (found,) = glitches_in(rows)
-    assert (found.time_s, found.size) == (pytest.approx(AT_S, abs=1.0), pytest.approx(-12.0, rel=0.4))
+    assert (found.time_s, found.size) == (
+        pytest.approx(AT_S, abs=1.0),
+        pytest.approx(-12.0, rel=0.4),
+    )
     assert found.end_s > AT_S + 8 + 25
 
 
@@ -71,7 +76,10 @@ def test_two_glitches_are_two() -> None:
     time_s = column(rows, "mono_s")
     for at_s in (AT_S, AT_S + 15):
         rows[(time_s >= at_s) & (time_s < at_s + 4), READING] += 10.0
-    assert [round(g.time_s - AT_S) for g in glitches_in(rows)] == [pytest.approx(0, abs=1), pytest.approx(15, abs=1)]
+    assert [round(g.time_s - AT_S) for g in glitches_in(rows)] == [
+        pytest.approx(0, abs=1),
+        pytest.approx(15, abs=1),
+    ]
 
 
 def test_a_reading_that_stays_away_is_no_glitch() -> None:

@@ -1,4 +1,6 @@
-"""`modes`: what a person reads of the mirror's vibrations, from sets and from runs; files that are none."""
+"""`modes`: what a person reads of the mirror's vibrations, from sets and from runs; files that are
+none.
+"""
 
 from __future__ import annotations
 
@@ -27,7 +29,9 @@ def tracked(folder: Path, **world: object) -> list[Planted]:
     return planted
 
 
-def test_a_set_gives_a_table_a_picture_and_a_recording(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_set_gives_a_table_a_picture_and_a_recording(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     planted = tracked(tmp_path / "set", seed=5, lines_hz=(27.0, 48.0), seconds=120.0)
     assert command_line(["modes", str(tmp_path / "set"), "--json"]) == Exit.DONE
     table = json.loads(capsys.readouterr().out)
@@ -47,7 +51,9 @@ def test_a_mode_that_moves_within_a_week_is_told(
     for day in range(8):
         line_hz = 48.3 if day < 4 else 48.3 * 0.985
         time_s, coeffs_um, _ = watched(seed=6, lines_hz=(line_hz,), rates_hz=THREE_RATES)
-        shapes = SimpleNamespace(time_s=time_s, coeffs_um=coeffs_um, verdict=np.full(time_s.size, "ok", "<U8"))
+        shapes = SimpleNamespace(
+            time_s=time_s, coeffs_um=coeffs_um, verdict=np.full(time_s.size, "ok", "<U8")
+        )
         shapes.verdict[::50] = "rejected"
         shapes.coeffs_um[::50] = 1e6
         runs[tmp_path / str(day)] = SimpleNamespace(
@@ -55,7 +61,9 @@ def test_a_mode_that_moves_within_a_week_is_told(
         )
     monkeypatch.setattr(modes_run, "is_run", lambda folder: True)
     monkeypatch.setattr(modes_run, "open_run", runs.__getitem__)
-    assert modes_run.modes_command(tuple(runs), tmp_path / "out", as_json=False, pictures=False) == 0
+    assert (
+        modes_run.modes_command(tuple(runs), tmp_path / "out", as_json=False, pictures=False) == 0
+    )
     said = capsys.readouterr().out
     assert "it moved by -1.5%: the film's tension by -3.0%" in said
     assert said.count("mode  ") == 1
@@ -77,15 +85,31 @@ def test_none_is_said(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> Non
             Exit.BAD_INPUT,
             f"9 x 4 numbers where times x terms are 9 x {ZERNIKE_TERMS}",
         ),
-        ({"time_s": np.array([]), "coeffs_um": np.zeros((0, ZERNIKE_TERMS))}, Exit.REJECTED, "no usable figures"),
+        (
+            {"time_s": np.array([]), "coeffs_um": np.zeros((0, ZERNIKE_TERMS))},
+            Exit.REJECTED,
+            "no usable figures",
+        ),
         (
             {"time_s": np.arange(90.0), "coeffs_um": np.zeros((90, ZERNIKE_TERMS))},
             Exit.REJECTED,
             "4 a second are needed",
         ),
-        ({"time_s": np.arange(90) / 20, "coeffs_um": np.zeros((90, ZERNIKE_TERMS))}, Exit.REJECTED, "less than 20 s"),
-        ({"time_s": np.full(900, 7.0), "coeffs_um": np.zeros((900, ZERNIKE_TERMS))}, Exit.REJECTED, "less than 20 s"),
-        ({"time_s": np.arange(900) / 20, "coeffs_um": np.zeros((900, ZERNIKE_TERMS))}, Exit.DONE, ""),
+        (
+            {"time_s": np.arange(90) / 20, "coeffs_um": np.zeros((90, ZERNIKE_TERMS))},
+            Exit.REJECTED,
+            "less than 20 s",
+        ),
+        (
+            {"time_s": np.full(900, 7.0), "coeffs_um": np.zeros((900, ZERNIKE_TERMS))},
+            Exit.REJECTED,
+            "less than 20 s",
+        ),
+        (
+            {"time_s": np.arange(900) / 20, "coeffs_um": np.zeros((900, ZERNIKE_TERMS))},
+            Exit.DONE,
+            "",
+        ),
         (
             {"time_s": np.full(9, np.nan), "coeffs_um": np.full((9, ZERNIKE_TERMS), np.inf)},
             Exit.REJECTED,
@@ -96,17 +120,31 @@ def test_none_is_said(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> Non
             Exit.REJECTED,
             "no usable figures",
         ),
-        ({"time_s": np.arange(900) / 20 + 1e15 * (np.arange(900) > 450), "coeffs_um": CALM}, Exit.DONE, ""),
-        ({"time_s": np.arange(900) / 20 + 1e18, "coeffs_um": CALM}, Exit.REJECTED, "less than 20 s"),
+        (
+            {"time_s": np.arange(900) / 20 + 1e15 * (np.arange(900) > 450), "coeffs_um": CALM},
+            Exit.DONE,
+            "",
+        ),
+        (
+            {"time_s": np.arange(900) / 20 + 1e18, "coeffs_um": CALM},
+            Exit.REJECTED,
+            "less than 20 s",
+        ),
     ],
 )
 def test_what_shows_no_vibrations_is_one_line(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str], arrays: dict[str, np.ndarray] | None, code: Exit, says: str
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
+    arrays: dict[str, np.ndarray] | None,
+    code: Exit,
+    says: str,
 ) -> None:
     if arrays is not None:
         np.savez(tmp_path / "track.npz", **arrays)
     assert command_line(["modes", str(tmp_path)]) == code
-    errors = [line for line in capsys.readouterr().err.splitlines() if line.startswith("membrane-ctrl: ")]
+    errors = [
+        line for line in capsys.readouterr().err.splitlines() if line.startswith("membrane-ctrl: ")
+    ]
     assert len(errors) == (code != Exit.DONE)
     assert all(says in line for line in errors)
     assert (tmp_path / "modes").exists() == (code == Exit.DONE)

@@ -15,7 +15,14 @@ from benchmarks.nights import Planted, night, write_run
 from membrane_ctrl.cli import run as command
 from membrane_ctrl.model import plain_json
 from membrane_ctrl.model.errors import InputError
-from membrane_ctrl.model.telemetry import COLUMN, SETTLED_AFTER_S, ShapeState, State, column, columns
+from membrane_ctrl.model.telemetry import (
+    COLUMN,
+    SETTLED_AFTER_S,
+    ShapeState,
+    State,
+    column,
+    columns,
+)
 from membrane_ctrl.review import open_run
 from membrane_ctrl.review.report.html import render
 from membrane_ctrl.review.report.json import report_table
@@ -36,7 +43,9 @@ def quiet_run(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def test_windows_are_those_of_the_ticks(quiet_run: Path) -> None:
     rows, _ = night(1, HOURS, "typical", [])
     time_s = column(rows, "mono_s")
-    reading = (column(rows, "setpoint_um") - column(rows, "displacement_um"))[time_s >= time_s[0] + SETTLED_AFTER_S]
+    reading = (column(rows, "setpoint_um") - column(rows, "displacement_um"))[
+        time_s >= time_s[0] + SETTLED_AFTER_S
+    ]
     seconds = reading[np.floor(time_s[-reading.size :]) >= np.ceil(time_s[-reading.size])]
     means = seconds[: seconds.size // 10 * 10].reshape(-1, 10).mean(axis=1)
     analysis = analyse(open_run(quiet_run))
@@ -54,9 +63,13 @@ def test_settled_is_five_seconds_of_hold_at_the_target() -> None:
     rows[100:200, COLUMN["state"]] = State.SETTLE
     rows[400:450, COLUMN["setpoint_um"]] = 3.0  # a ramp
     hold_parts = HoldParts(2.0)
-    mask = np.concatenate([hold_parts.of(columns(part))["held"] for part in np.split(rows, (150, 151, 430))])
+    mask = np.concatenate(
+        [hold_parts.of(columns(part))["held"] for part in np.split(rows, (150, 151, 430))]
+    )
     expected, unsettled_s = [], np.nan
-    for time_s, state, setpoint_um in rows[:, [COLUMN[name] for name in ("mono_s", "state", "setpoint_um")]]:
+    for time_s, state, setpoint_um in rows[
+        :, [COLUMN[name] for name in ("mono_s", "state", "setpoint_um")]
+    ]:
         if state != State.HOLD:
             unsettled_s = np.nan
         elif np.isnan(unsettled_s) or setpoint_um != 0.0:
@@ -66,7 +79,9 @@ def test_settled_is_five_seconds_of_hold_at_the_target() -> None:
     assert mask.any()
 
 
-def held(disturbance: np.ndarray, feedforward: np.ndarray, kp: float, ti: float, period_s: float) -> np.ndarray:
+def held(
+    disturbance: np.ndarray, feedforward: np.ndarray, kp: float, ti: float, period_s: float
+) -> np.ndarray:
     """Error of a PI loop round an integrator that is disturbed, and helped by a feed-forward."""
     error, integral, position = np.zeros(disturbance.size), 0.0, 0.0
     for k in range(disturbance.size):
@@ -80,9 +95,13 @@ def test_the_benefit_of_the_feedforward_is_that_of_a_loop_without() -> None:
     rng = np.random.default_rng(2)
     disturbance = np.convolve(rng.normal(size=20_000), np.ones(50) / 50, "same")
     feedforward = -0.8 * disturbance
-    with_it, without = (held(disturbance, ff, 0.61, 6.5, 0.02) for ff in (feedforward, 0 * feedforward))
+    with_it, without = (
+        held(disturbance, ff, 0.61, 6.5, 0.02) for ff in (feedforward, 0 * feedforward)
+    )
     kept = WithoutFeedforward(0.61, 6.5, 0.02)
-    computed = with_it + np.concatenate([kept.kept_away_um(part) for part in np.array_split(feedforward, 7)])
+    computed = with_it + np.concatenate(
+        [kept.kept_away_um(part) for part in np.array_split(feedforward, 7)]
+    )
     assert np.std(computed - without) < 0.03 * np.std(without)
     assert np.std(without) > 3 * np.std(with_it)
 
@@ -101,7 +120,8 @@ def test_shape_figures(quiet_run: Path) -> None:
     assert shape is not None
     assert shape.cycles == HOURS * 900
     assert [round(pair.lag_s) for pair in shape.pairs] == [60, 600]
-    # 20 nm of noise in each of 36 terms, twice: sqrt(2) 20 nm sqrt(36) over the disc, less inside the rim
+    # 20 nm of noise in each of 36 terms, twice: sqrt(2) 20 nm sqrt(36) over the disc, less inside
+    # the rim
     for pair in shape.pairs:
         assert 0.05 < pair.mean_sigma_um < 0.25
         assert pair.pairs > 50
@@ -129,14 +149,23 @@ class Tags(HTMLParser):
     def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
         self.count[tag] = self.count.get(tag, 0) + 1
         for name, value in attrs:
-            if name in {"src", "href", "xlink:href"} and value and not value.startswith(("#", "data:")):
+            if (
+                name in {"src", "href", "xlink:href"}
+                and value
+                and not value.startswith(("#", "data:"))
+            ):
                 self.loaded.append(value)
 
 
 def test_the_page_carries_everything_itself(tmp_path: Path) -> None:
     folder = written(tmp_path, HOURS, [Planted("pressure step", 900.5, 20.0)], name="a night")
     with (folder / "events.jsonl").open("a") as file:
-        file.write(json.dumps({"mono_s": 60.0, "kind": "command", "command": "mark", "text": "<b>knock</b>"}) + "\n")
+        file.write(
+            json.dumps(
+                {"mono_s": 60.0, "kind": "command", "command": "mark", "text": "<b>knock</b>"}
+            )
+            + "\n"
+        )
     tags = Tags()
     page = render(analyse(open_run(folder)))
     tags.feed(page)
@@ -148,7 +177,9 @@ def test_the_page_carries_everything_itself(tmp_path: Path) -> None:
 
 
 @pytest.mark.usefixtures("undrawn")
-def test_command_writes_page_and_json(quiet_run: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_command_writes_page_and_json(
+    quiet_run: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     out = tmp_path / "out"
     assert command(["report", str(quiet_run), "--out", str(out), "--json"]) == 0
     assert json.loads(capsys.readouterr().out)["run"] == quiet_run.name
@@ -172,7 +203,10 @@ def test_alike_runs_do_not_differ_and_unlike_ones_do(quiet_run: Path, tmp_path: 
 @pytest.mark.usefixtures("undrawn")
 def test_compare_command(quiet_run: Path, tmp_path: Path) -> None:
     other = written(tmp_path, 0.1, seed=8, name="20261122T180000Z-short")
-    assert command(["report", str(quiet_run), "--compare", str(other), "--out", str(tmp_path / "o")]) == 0
+    assert (
+        command(["report", str(quiet_run), "--compare", str(other), "--out", str(tmp_path / "o")])
+        == 0
+    )
     table = json.loads((tmp_path / "o" / "report.json").read_text())
     assert table["compared_with"]["run"] == other.name
     assert "Against 20261122T180000Z-short" in (tmp_path / "o" / "report.html").read_text()
@@ -199,13 +233,23 @@ def test_a_mark_may_say_anything(quiet_run: Path, tmp_path: Path) -> None:
     assert "<b>" not in page.split("<svg")[1]
 
 
-@pytest.mark.parametrize(("state", "share"), [(ShapeState.WAITING, "0 %"), (ShapeState.TRACKING, None)])
-def test_a_shape_loop_that_does_not_track_is_named(tmp_path: Path, state: ShapeState, share: str | None) -> None:
+@pytest.mark.parametrize(
+    ("state", "share"), [(ShapeState.WAITING, "0 %"), (ShapeState.TRACKING, None)]
+)
+def test_a_shape_loop_that_does_not_track_is_named(
+    tmp_path: Path, state: ShapeState, share: str | None
+) -> None:
     rows, _ = night(1, 0.1, "quiet", [])
     rows[:, COLUMN["shape_state"]] = state
     write_run(tmp_path / "run", iter([(rows, [])]))
-    seen = [odd.seen for odd in analyse(open_run(tmp_path / "run")).anomalies if odd.name == "shape loop"]
-    assert [text.split(" of ")[0] for text in seen] == ([] if share is None else [f"tracked {share}"])
+    seen = [
+        odd.seen
+        for odd in analyse(open_run(tmp_path / "run")).anomalies
+        if odd.name == "shape loop"
+    ]
+    assert [text.split(" of ")[0] for text in seen] == (
+        [] if share is None else [f"tracked {share}"]
+    )
 
 
 def test_one_window_has_no_spread(quiet_run: Path) -> None:

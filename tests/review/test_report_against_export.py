@@ -1,4 +1,6 @@
-"""The figures of a report against plain sums over the exported columns, with nothing of the review in them."""
+"""The figures of a report against plain sums over the exported columns, with nothing of the review
+in them.
+"""
 
 from __future__ import annotations
 
@@ -43,7 +45,9 @@ def report(folder: Path) -> dict[str, Any]:
 
 def columns(folder: Path, name: str) -> dict[str, np.ndarray]:
     table: pa.Table = pyarrow.parquet.read_table(folder / "export" / f"{name}.parquet")
-    return {field: table.column(field).to_numpy() for field in table.column_names if field != "verdict"}
+    return {
+        field: table.column(field).to_numpy() for field in table.column_names if field != "verdict"
+    }
 
 
 def errors(folder: Path) -> dict[str, tuple[np.ndarray, np.ndarray]]:
@@ -71,10 +75,13 @@ def test_windows(folder: Path, report: dict[str, Any], name: str) -> None:
         _, mean_um = means(*errors(folder)[name], window_s)
         said = report[name]["windows"][place]
         expected = {
-            "count": mean_um.size, "mean_um": mean_um.mean(), "std_um": mean_um.std(),
-            "max_um": np.abs(mean_um).max(), "p99_7_um": np.quantile(np.abs(mean_um), 0.997),
+            "count": mean_um.size,
+            "mean_um": mean_um.mean(),
+            "std_um": mean_um.std(),
+            "max_um": np.abs(mean_um).max(),
+            "p99_7_um": np.quantile(np.abs(mean_um), 0.997),
             "in_band": (np.abs(mean_um) <= report["band_um"]).mean(),
-        }  # fmt: skip
+        }
         assert {key: said[key] for key in expected} == pytest.approx(expected, rel=1e-6, abs=1e-9)
 
 
@@ -84,13 +91,16 @@ def test_slope_and_its_interval(folder: Path, report: dict[str, Any]) -> None:
     (rate, _), covariance = np.polyfit(hours, mean_um, 1, cov=True)
     said = report["true"]["drift_um_per_hour"]
     assert said["per_hour"] == pytest.approx(rate, abs=1e-7)
-    # the means of a second are correlated over some seconds, so the interval is wider than that of independent ones
+    # the means of a second are correlated over some seconds, so the interval is wider than that of
+    # independent ones
     independent = 2 * 1.96 * np.sqrt(covariance[0, 0])
     assert independent < said["high"] - said["low"] < 6 * independent
 
 
 def zernike(x: np.ndarray, y: np.ndarray) -> np.ndarray:
-    """(terms, points) orthonormal Noll terms, from the formula with factorials; piston sees to the vertex."""
+    """(terms, points) orthonormal Noll terms, from the formula with factorials; piston sees to the
+    vertex.
+    """
     orders = [
         (n, m)
         for n in range(ZERNIKE_DEGREE + 1)
@@ -105,7 +115,9 @@ def zernike(x: np.ndarray, y: np.ndarray) -> np.ndarray:
             factor = (-1) ** k * factorial(n - k) / parts
             radial += factor * rho ** (n - 2 * k)
         angular = (
-            np.ones_like(rho) if m == 0 else np.sqrt(2) * (np.cos(m * theta) if j % 2 == 0 else np.sin(m * theta))
+            np.ones_like(rho)
+            if m == 0
+            else np.sqrt(2) * (np.cos(m * theta) if j % 2 == 0 else np.sin(m * theta))
         )
         terms.append(np.sqrt(n + 1) * radial * angular)
     return np.array(terms)
@@ -119,7 +131,9 @@ def area(folder: Path) -> np.ndarray:
     return zernike(x[inside], y[inside])
 
 
-def test_figure_at_the_points_over_the_area_and_between_pairs(folder: Path, report: dict[str, Any]) -> None:
+def test_figure_at_the_points_over_the_area_and_between_pairs(
+    folder: Path, report: dict[str, Any]
+) -> None:
     shapes, said = columns(folder, "shapes"), report["shape"]
     coeffs = np.column_stack([shapes[f"z{j}_um"] for j in NOLL_INDICES])
     assert said["used"] == len(coeffs)
@@ -127,10 +141,15 @@ def test_figure_at_the_points_over_the_area_and_between_pairs(folder: Path, repo
         height_um = coeffs @ zernike(np.array([x]), np.array([y]))[:, 0]
         assert said["points_sd_um"][name] == pytest.approx(height_um.std(), rel=1e-6)
     terms = area(folder)
-    assert said["mean_sd_um"] == pytest.approx((coeffs @ terms).std(axis=0, ddof=1).mean(), rel=0.01)
+    assert said["mean_sd_um"] == pytest.approx(
+        (coeffs @ terms).std(axis=0, ddof=1).mean(), rel=0.01
+    )
     for pair, cycles in zip(said["pairs"], (15, 150), strict=True):
         change_um = (coeffs[cycles:] - coeffs[:-cycles]) @ terms
-        assert (pair["pairs"], pair["lag_s"]) == (len(change_um), pytest.approx(4 * cycles, abs=0.01))
+        assert (pair["pairs"], pair["lag_s"]) == (
+            len(change_um),
+            pytest.approx(4 * cycles, abs=0.01),
+        )
         assert pair["all_pairs_rms_um"] == pytest.approx(np.sqrt((change_um**2).mean()), rel=0.01)
         first = int(np.argmin(np.abs(shapes["time_s"] - pair["first_s"])))
         assert pair["rms_um"] == pytest.approx(np.sqrt((change_um[first] ** 2).mean()), rel=0.02)

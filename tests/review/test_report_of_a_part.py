@@ -19,13 +19,17 @@ HOURS = 0.1
 
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Six minutes with a fault at 50 s and at 300 s, and 5 ticks missed before 100 s, 2 at 200 s."""
+    """Six minutes with a fault at 50 s and at 300 s, and 5 ticks missed before 100 s,
+    2 at 200 s.
+    """
     rows, shapes = night(1, HOURS, "typical", [])
     time_s = column(rows, "mono_s")
     rows[:, COLUMN["missed_ticks"]] = 5.0 * (time_s > 60) + 2.0 * (time_s > 200)
     folder = tmp_path_factory.mktemp("part") / "20261121T180000Z-part"
     write_run(folder, iter([(rows, shapes)]))
-    faults = [{"mono_s": at_s, "kind": "fault", "name": "displacement_missing"} for at_s in (50.0, 300.0)]
+    faults = [
+        {"mono_s": at_s, "kind": "fault", "name": "displacement_missing"} for at_s in (50.0, 300.0)
+    ]
     with (folder / "events.jsonl").open("a") as file:
         file.write("".join(json.dumps(fault) + "\n" for fault in faults))
     return folder
@@ -56,10 +60,20 @@ def test_faults_and_missed_ticks_of_a_part_are_its_own(folder: Path) -> None:
     ],
 )
 def test_a_part_is_set_against_the_same_part_or_says_that_it_is_not(
-    folder: Path, tmp_path: Path, part: list[str], whole: bool, said: str, capsys: pytest.CaptureFixture[str]
+    folder: Path,
+    tmp_path: Path,
+    part: list[str],
+    whole: bool,
+    said: str,
+    capsys: pytest.CaptureFixture[str],
 ) -> None:
     other = written(tmp_path, HOURS, seed=8, name="20261122T180000Z-other")
-    assert command(["report", str(folder), *part, "--compare", str(other), "--out", str(tmp_path / "o")]) == 0
+    assert (
+        command(
+            ["report", str(folder), *part, "--compare", str(other), "--out", str(tmp_path / "o")]
+        )
+        == 0
+    )
     assert said in capsys.readouterr().out
     table = json.loads((tmp_path / "o" / "report.json").read_text())["compared_with"]
     assert table["whole_run"] is whole

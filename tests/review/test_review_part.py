@@ -25,19 +25,31 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     run = written(tmp_path_factory.mktemp("part"), 0.2, doors)
     with (run / "events.jsonl").open("a") as file:
         for at_s in (50.0, 390.0, 700.0):
-            file.write(json.dumps({"mono_s": at_s, "kind": "command", "command": "mark", "text": "knock"}) + "\n")
+            file.write(
+                json.dumps({"mono_s": at_s, "kind": "command", "command": "mark", "text": "knock"})
+                + "\n"
+            )
     return run
 
 
 def times_s(path: Path, entity: str) -> list[float]:
-    batches = (chunk.to_record_batch() for chunk in RrdReader(path).stream() if chunk.entity_path == entity)
-    columns = (batch.column("run_time").cast("int64") for batch in batches if "run_time" in batch.schema.names)
+    batches = (
+        chunk.to_record_batch() for chunk in RrdReader(path).stream() if chunk.entity_path == entity
+    )
+    columns = (
+        batch.column("run_time").cast("int64")
+        for batch in batches
+        if "run_time" in batch.schema.names
+    )
     return sorted(1e-9 * tick for column in columns for tick in column.to_pylist())
 
 
 @pytest.mark.parametrize(
     ("asked", "from_s", "to_s", "cursor_s"),
-    [({"at": "+400s"}, 280.0, 520.0, 400.0), ({"start": "+350s", "end": "+450s"}, 350.0, 450.0, 350.0)],
+    [
+        ({"at": "+400s"}, 280.0, 520.0, 400.0),
+        ({"start": "+350s", "end": "+450s"}, 350.0, 450.0, 350.0),
+    ],
 )
 def test_logs_maps_and_cursor_are_those_of_the_part(
     folder: Path, tmp_path: Path, asked: dict[str, str], from_s: float, to_s: float, cursor_s: float
@@ -50,11 +62,15 @@ def test_logs_maps_and_cursor_are_those_of_the_part(
     maps_s = times_s(file, "/shape/map/difference")
     assert len(maps_s) > 10
     assert from_s <= maps_s[0] <= maps_s[-1] <= to_s
-    lines_s = times_s(file, "/found/lines/pressure_step")  # of the whole run, as the plots can be zoomed out
+    lines_s = times_s(
+        file, "/found/lines/pressure_step"
+    )  # of the whole run, as the plots can be zoomed out
     assert lines_s[::3] == pytest.approx([150.0, 400.0, 650.0], abs=1.5)
 
 
-def test_of_a_whole_run_everything_is_there_and_no_moment_was_asked_for(folder: Path, tmp_path: Path) -> None:
+def test_of_a_whole_run_everything_is_there_and_no_moment_was_asked_for(
+    folder: Path, tmp_path: Path
+) -> None:
     file = tmp_path / "r.rrd"
     assert make_review([open_run(folder)], ReviewOptions([folder]), file) is None
     assert {50.0, 390.0, 700.0} <= {round(at_s, 3) for at_s in times_s(file, "/events")}
@@ -89,5 +105,7 @@ def test_the_cursor_is_put_again_until_it_stands_there(monkeypatch: pytest.Monke
         viewer.put_cursor(process, 1, viewer.CursorTime("utc", 800_250_000_001))
         assert (Client.calls, Client.at_ns) == (3, 800_250_000_001)
         process.communicate(b"\n")
-        viewer.put_cursor(process, 1, viewer.CursorTime("utc", 10))  # ended meanwhile: nothing to do
+        viewer.put_cursor(
+            process, 1, viewer.CursorTime("utc", 10)
+        )  # ended meanwhile: nothing to do
     assert Client.calls == 3

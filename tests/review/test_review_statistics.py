@@ -9,21 +9,31 @@ from scipy import signal
 
 from membrane_ctrl.review.statistics.analysis import slow_spectrum
 from membrane_ctrl.review.statistics.drift import slope
-from membrane_ctrl.review.statistics.spectra import Spectrum, allan_deviation, bands, power_spectrum, unseen_s
+from membrane_ctrl.review.statistics.spectra import (
+    Spectrum,
+    allan_deviation,
+    bands,
+    power_spectrum,
+    unseen_s,
+)
 
 RATE_HZ = 10.0
 
 
 def coloured(size: int, seed: int) -> np.ndarray:
     rng = np.random.default_rng(seed)
-    return signal.lfilter([1.0], [1.0, -0.97], rng.normal(size=size)) + 100.0 + rng.normal(size=size)
+    return (
+        signal.lfilter([1.0], [1.0, -0.97], rng.normal(size=size)) + 100.0 + rng.normal(size=size)
+    )
 
 
 @pytest.mark.parametrize("seed", [0, 1])
 def test_allan_deviation_is_allantools(seed: int) -> None:
     values = coloured(20_000, seed)
     ours = allan_deviation(values, 1 / RATE_HZ)
-    taus, reference, _, counts = allantools.oadev(values, rate=RATE_HZ, data_type="freq", taus=ours.tau_s)
+    taus, reference, _, counts = allantools.oadev(
+        values, rate=RATE_HZ, data_type="freq", taus=ours.tau_s
+    )
     assert ours.tau_s.size > 10
     np.testing.assert_allclose(ours.tau_s, taus)
     np.testing.assert_allclose(ours.deviation, reference, rtol=1e-6)
@@ -68,19 +78,29 @@ def spectra(values: np.ndarray, rate_hz: int) -> tuple[Spectrum, Spectrum]:
     """Of ticks and of their 1 s means."""
     means = values.reshape(-1, rate_hz).mean(axis=1)
     kept = np.isfinite(means)
-    return power_spectrum(values, rate_hz), slow_spectrum(np.arange(means.size)[kept] + 0.5, means[kept])
+    return power_spectrum(values, rate_hz), slow_spectrum(
+        np.arange(means.size)[kept] + 0.5, means[kept]
+    )
 
 
-@pytest.mark.parametrize(("hours", "period_s"), [(8.0, 1800.0), (8.0, 600.0), (8.0, 60.0), (0.5, 200.0)])
-def test_the_bands_of_a_long_hold_add_up_and_slow_motion_is_in_its_own(hours: float, period_s: float) -> None:
+@pytest.mark.parametrize(
+    ("hours", "period_s"), [(8.0, 1800.0), (8.0, 600.0), (8.0, 60.0), (0.5, 200.0)]
+)
+def test_the_bands_of_a_long_hold_add_up_and_slow_motion_is_in_its_own(
+    hours: float, period_s: float
+) -> None:
     time_s = np.arange(round(hours * 3600 * 50)) / 50
-    values = np.sin(2 * np.pi * time_s / period_s) + 0.1 * np.random.default_rng(6).normal(size=time_s.size)
+    values = np.sin(2 * np.pi * time_s / period_s) + 0.1 * np.random.default_rng(6).normal(
+        size=time_s.size
+    )
     found = bands(*spectra(values, 50))
     powers = {band.low_hz: band.rms_um**2 for band in found if np.isfinite(band.rms_um)}
     assert np.sqrt(sum(powers.values())) == pytest.approx(values.std(), rel=0.01)
     own = next(band for band in found if band.low_hz < 1 / period_s <= band.high_hz)
     assert own.rms_um == pytest.approx(np.sqrt(0.5), rel=0.01)
-    assert sum(power for low_hz, power in powers.items() if low_hz != own.low_hz) == pytest.approx(0.01, rel=0.05)
+    assert sum(power for low_hz, power in powers.items() if low_hz != own.low_hz) == pytest.approx(
+        0.01, rel=0.05
+    )
     assert unseen_s(found) == pytest.approx(hours * 1800, rel=0.02)
 
 
@@ -91,7 +111,9 @@ def test_a_lost_light_leaves_the_slow_bands() -> None:
     values[250_000:260_000] = np.nan  # not bridged
     fast, slow = spectra(values, 10)
     assert slow.segments >= 2
-    assert next(band for band in bands(fast, slow) if band.low_hz == 1e-4).rms_um == pytest.approx(0.707, rel=0.03)
+    assert next(band for band in bands(fast, slow) if band.low_hz == 1e-4).rms_um == pytest.approx(
+        0.707, rel=0.03
+    )
 
 
 def test_too_short_for_a_band_is_said() -> None:
@@ -114,7 +136,9 @@ def test_the_interval_of_the_slope_covers_the_truth_as_often_as_it_says(memory: 
     assert 180 <= covered <= 199
 
 
-@pytest.mark.parametrize(("count", "step_s", "tau_s"), [(60, 60.0, 300.0), (600, 1.0, 30.0), (600, 1.0, 100.0)])
+@pytest.mark.parametrize(
+    ("count", "step_s", "tau_s"), [(60, 60.0, 300.0), (600, 1.0, 30.0), (600, 1.0, 100.0)]
+)
 def test_the_interval_of_a_short_record_knows_that_the_line_took_up_its_wander(
     count: int, step_s: float, tau_s: float
 ) -> None:

@@ -28,7 +28,16 @@ from membrane_ctrl.model.errors import DeviceError, InputError
 from membrane_ctrl.model.telemetry import column
 from membrane_ctrl.model.zernike_terms import NOLL_INDICES
 from membrane_ctrl.review import open_run
-from membrane_ctrl.review.catalogue import Filter, entries, moment_s, number, one_line, resolve, span, to_prune
+from membrane_ctrl.review.catalogue import (
+    Filter,
+    entries,
+    moment_s,
+    number,
+    one_line,
+    resolve,
+    span,
+    to_prune,
+)
 from membrane_ctrl.review.report import html
 from membrane_ctrl.review.report.json import pump_change, pump_history
 from membrane_ctrl.review.runs import export
@@ -52,17 +61,25 @@ def logs(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
-def week(logs: Path, number: int, scale: float, sigma: float = 0.03, devices: str = "", curve: str = "") -> Path:
+def week(
+    logs: Path, number: int, scale: float, sigma: float = 0.03, devices: str = "", curve: str = ""
+) -> Path:
     """A run that has learned its pump, from its small files only; `curve` is set before."""
     run = logs / f"2026100{number}T120000Z-week"
     run.mkdir(parents=True)
-    (run / "config.toml").write_text("[pump]\ncurve_fraction = [0, 1]\ncurve_um_per_s = [0, 6]\n" + devices)
-    told: list[dict[str, object]] = [{"kind": "pump", "scale": 9.0, "sigma": 0.1, "correction": 1.0}]
+    (run / "config.toml").write_text(
+        "[pump]\ncurve_fraction = [0, 1]\ncurve_um_per_s = [0, 6]\n" + devices
+    )
+    told: list[dict[str, object]] = [
+        {"kind": "pump", "scale": 9.0, "sigma": 0.1, "correction": 1.0}
+    ]
     if curve:
         gains = LoopConfig().model_dump() | {"pump": json.loads(curve)}
         told.append({"kind": "command", "command": "gains", "who": "eve", "why": "", "loop": gains})
     told.append({"kind": "pump", "scale": scale, "sigma": sigma, "correction": 1.0})
-    lines = [{"time_utc": f"2026-10-0{number}T12:00:00+00:00", "mono_s": 0.0, **event} for event in told]
+    lines = [
+        {"time_utc": f"2026-10-0{number}T12:00:00+00:00", "mono_s": 0.0, **event} for event in told
+    ]
     (run / "events.jsonl").write_text("".join(json.dumps(line) + "\n" for line in lines))
     (run / "summary.json").write_text(
         json.dumps({"schema": "membrane-summary/2", "leak_um_per_s": 1.0 + 0.1 * number})
@@ -81,10 +98,17 @@ def test_a_pump_that_wears_over_the_weeks_is_told(tmp_path: Path) -> None:
     third = week(tmp_path, 3, 0.80)
     week(tmp_path, 4, 0.5)
     seen = pump_history(third)
-    assert [round(each.scale, 3) for each in seen] == [1.0, 0.97, 0.8]  # the later run is not known yet
+    assert [round(each.scale, 3) for each in seen] == [
+        1.0,
+        0.97,
+        0.8,
+    ]  # the later run is not known yet
     assert [round(each.leak_um_per_s, 3) for each in seen] == [1.1, 1.2, 1.3]
     assert [each.started_utc.day for each in seen] == [1, 2, 3]
-    said = "the pump gives 20 % less than in 20261001T120000Z-week (+- 4 %): check it, then `tune pump`"
+    said = (
+        "the pump gives 20 % less than in 20261001T120000Z-week (+- 4 %): check it, then `tune "
+        "pump`"
+    )
     assert pump_change(seen, 0.12) == said
     assert pump_change(seen, 0.25) == ""
     page = html._history(seen, 0.12)
@@ -135,7 +159,12 @@ def test_a_run_is_found_by_part_of_its_name(logs: Path) -> None:
     for copy in (second, leftover):
         shutil.copytree(logs / "20261122T180000Z-night", copy)
     assert resolve(Path("20261122T180000Z-night"), logs).name == "20261122T180000Z-night"
-    assert [entry.name[:8] for entry in entries(logs)] == ["20261121", "20261122", "20261122", "20261123"]
+    assert [entry.name[:8] for entry in entries(logs)] == [
+        "20261121",
+        "20261122",
+        "20261122",
+        "20261123",
+    ]
     for copy in (second, leftover):
         shutil.rmtree(copy)
 
@@ -153,7 +182,9 @@ def test_runs_commands(logs: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert "--logs in front of `prune`" in capsys.readouterr().err
 
 
-def test_runs_of_several_folders_are_one_list(logs: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_runs_of_several_folders_are_one_list(
+    logs: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     south = tmp_path / "south"
     south.mkdir()
     shutil.copytree(logs / "20261122T180000Z-night", south / "20261122T190000Z-later")
@@ -235,10 +266,19 @@ def test_a_mark_made_later_is_an_event_and_touches_nothing_else(tmp_path: Path) 
 
 @pytest.mark.parametrize(
     ("text", "seconds"),
-    [("18:01", 30.0), ("18:00:45", 15.0), ("03:12", 33_090.0), ("+1h5m", 3900.0), ("+0s", 0.0),
-     ("90", 90.0), ("2h30m", 9000.0), ("0s", 0.0),
-     ("2026-11-21T18:01:30", 60.0), ("2026-11-21T19:01:30+01:00", 60.0)],
-)  # fmt: skip
+    [
+        ("18:01", 30.0),
+        ("18:00:45", 15.0),
+        ("03:12", 33_090.0),
+        ("+1h5m", 3900.0),
+        ("+0s", 0.0),
+        ("90", 90.0),
+        ("2h30m", 9000.0),
+        ("0s", 0.0),
+        ("2026-11-21T18:01:30", 60.0),
+        ("2026-11-21T19:01:30+01:00", 60.0),
+    ],
+)
 def test_moments(text: str, seconds: float) -> None:
     assert moment_s(text, ORIGIN) == seconds
 
@@ -271,8 +311,14 @@ def entities(path: Path) -> dict[str, int]:
 
 def colours(path: Path, entity: str) -> list[int]:
     """Of the lines of a plot."""
-    batches = (chunk.to_record_batch() for chunk in RrdReader(path).stream() if chunk.entity_path == entity)
-    columns = (batch.column("SeriesLines:colors") for batch in batches if "SeriesLines:colors" in batch.schema.names)
+    batches = (
+        chunk.to_record_batch() for chunk in RrdReader(path).stream() if chunk.entity_path == entity
+    )
+    columns = (
+        batch.column("SeriesLines:colors")
+        for batch in batches
+        if "SeriesLines:colors" in batch.schema.names
+    )
     return next(column.to_pylist()[0] for column in columns)
 
 
@@ -299,20 +345,35 @@ def test_a_window_limits_the_ticks_and_runs_lie_over_each_other(tmp_path: Path) 
 
 @pytest.mark.parametrize(
     ("asked", "said"),
-    [("--at +9h", "not in the run"), ("--at 25:00", "write 03:12"), ("--around explosion", "no such event"),
-     ("--around= ", "name an event"), ("--tab x", "--tab"), ("--align x", "--align"),
-     ("--from +20s --to +10s", "not before"), ("--from +3h --to +4h", "not in the run"),
-     ("--to 2020-01-01", "not in the run"), ("--at +10s --around hold", "only one"), ("--port 9", "only with --web"),
-     ("--live", "--live follows")],
-)  # fmt: skip
-def test_what_is_not_there_is_said(logs: Path, tmp_path: Path, capsys: Capsys, asked: str, said: str) -> None:
+    [
+        ("--at +9h", "not in the run"),
+        ("--at 25:00", "write 03:12"),
+        ("--around explosion", "no such event"),
+        ("--around= ", "name an event"),
+        ("--tab x", "--tab"),
+        ("--align x", "--align"),
+        ("--from +20s --to +10s", "not before"),
+        ("--from +3h --to +4h", "not in the run"),
+        ("--to 2020-01-01", "not in the run"),
+        ("--at +10s --around hold", "only one"),
+        ("--port 9", "only with --web"),
+        ("--live", "--live follows"),
+    ],
+)
+def test_what_is_not_there_is_said(
+    logs: Path, tmp_path: Path, capsys: Capsys, asked: str, said: str
+) -> None:
     folder, target = logs / "20261121T180000Z-night", tmp_path / "r.rrd"
-    assert command(["review", str(folder), *asked.split(" ", maxsplit=3), "--save", str(target)]) == 2
+    assert (
+        command(["review", str(folder), *asked.split(" ", maxsplit=3), "--save", str(target)]) == 2
+    )
     assert said in capsys.readouterr().err
     assert not target.exists()
 
 
-def test_a_place_that_cannot_be_written_is_said_before_the_work(logs: Path, tmp_path: Path, capsys: Capsys) -> None:
+def test_a_place_that_cannot_be_written_is_said_before_the_work(
+    logs: Path, tmp_path: Path, capsys: Capsys
+) -> None:
     folder = logs / "20261121T180000Z-night"
     assert command(["review", str(folder), "--screenshot", str(tmp_path / "absent" / "p.png")]) == 4
     assert "cannot be written" in capsys.readouterr().err
@@ -345,11 +406,24 @@ def listens(port: int) -> bool:
 
 
 @pytest.mark.usefixtures("signals_are_heeded")
-@pytest.mark.parametrize("number", [signal.SIGTERM, pytest.param(signal.SIGHUP, marks=pytest.mark.campaign)])
-def test_a_review_that_is_ended_leaves_nothing_behind(logs: Path, tmp_path: Path, number: signal.Signals) -> None:
-    command_line = [sys.executable, "-m", "membrane_ctrl", "review", str(logs / "20261121T180000Z-night"), "--web"]
+@pytest.mark.parametrize(
+    "number", [signal.SIGTERM, pytest.param(signal.SIGHUP, marks=pytest.mark.campaign)]
+)
+def test_a_review_that_is_ended_leaves_nothing_behind(
+    logs: Path, tmp_path: Path, number: signal.Signals
+) -> None:
+    command_line = [
+        sys.executable,
+        "-m",
+        "membrane_ctrl",
+        "review",
+        str(logs / "20261121T180000Z-night"),
+        "--web",
+    ]
     environment = {**os.environ, "TMPDIR": str(tmp_path)}
-    with subprocess.Popen(command_line, env=environment, stderr=subprocess.PIPE, text=True) as review:
+    with subprocess.Popen(
+        command_line, env=environment, stderr=subprocess.PIPE, text=True
+    ) as review:
         assert review.stderr is not None
         page = next(line for line in review.stderr if line.startswith("open http"))
         port = int(page.split("/")[2].split(":")[1])
@@ -375,7 +449,9 @@ def test_around_finds_events_and_what_was_found(tmp_path: Path) -> None:
         assert cursor.nanos / 1e9 == pytest.approx(run.origin_utc.timestamp() + at_s, abs=2.0)
 
 
-def test_following_a_long_run_begins_some_minutes_back(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_following_a_long_run_begins_some_minutes_back(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     whole = segment(tmp_path, night(1, 0.2, "typical", [])[0]).read_bytes()
     (tmp_path / "night-000.rrd").write_bytes(whole)
     (tmp_path / "summary.json").touch()
@@ -389,7 +465,9 @@ def test_following_a_long_run_begins_some_minutes_back(tmp_path: Path, monkeypat
     assert len(followed) < len(whole) // 2
     (tmp_path / "shorter.rrd").write_bytes(followed)
     end = first_message_after(tmp_path / "shorter.rrd", len(followed))
-    assert followed[end : end + 8] == bytes(8)  # from message to message up to the one that ends a file
+    assert followed[end : end + 8] == bytes(
+        8
+    )  # from message to message up to the one that ends a file
 
 
 def test_following_copies_what_grows_until_the_run_is_over(tmp_path: Path) -> None:

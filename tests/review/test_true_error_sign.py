@@ -1,4 +1,6 @@
-"""The error of the true centre has one sign, that of `error_um` (setpoint minus value), wherever it is shown."""
+"""The error of the true centre has one sign, that of `error_um` (setpoint minus value), wherever it
+is shown.
+"""
 
 from __future__ import annotations
 

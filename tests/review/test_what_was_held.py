@@ -1,4 +1,6 @@
-"""The figures of a hold are those of the settled hold; the rest is reported beside them, everywhere the same."""
+"""The figures of a hold are those of the settled hold; the rest is reported beside them, everywhere
+the same.
+"""
 
 from __future__ import annotations
 
@@ -32,7 +34,13 @@ def rows() -> Rows:
         {"time_s": 200.0, "command": "resume"},
         {"time_s": 320.0, "wrong": "no_light", "for_s": 8.0},
     ]
-    about = {"title": "held", "duration_s": 420.0, "config": {"loop": {"rate_hz": RATE_HZ}}, "at": at, "expect": {}}
+    about = {
+        "title": "held",
+        "duration_s": 420.0,
+        "config": {"loop": {"rate_hz": RATE_HZ}},
+        "at": at,
+        "expect": {},
+    }
     return unpack([tick.row.pack() for tick in play(CheckedScenario.model_validate(about)).ticks])
 
 
@@ -51,7 +59,9 @@ def folder(rows: Rows, tmp_path_factory: pytest.TempPathFactory) -> Path:
 @pytest.mark.parametrize("batch", [1, 7, 100, 10_000])
 def test_the_parts_are_those_that_were_asked_for_in_any_blocks(rows: Rows, batch: int) -> None:
     parts = HoldParts(2.0)
-    blocks = [parts.of(columns(rows[first : first + batch])) for first in range(0, len(rows), batch)]
+    blocks = [
+        parts.of(columns(rows[first : first + batch])) for first in range(0, len(rows), batch)
+    ]
     found = {name: np.concatenate([block[name] for block in blocks]) for name in blocks[0]}
     assert np.sum([*found.values()], axis=0).max() == 1
     time_s = columns(rows)["mono_s"]
@@ -64,12 +74,16 @@ def test_the_parts_are_those_that_were_asked_for_in_any_blocks(rows: Rows, batch
     assert found["held"][time_s > 345.0].mean() > 0.9
 
 
-def test_every_place_states_the_same_quality(folder: Path, rows: Rows, capsys: pytest.CaptureFixture[str]) -> None:
+def test_every_place_states_the_same_quality(
+    folder: Path, rows: Rows, capsys: pytest.CaptureFixture[str]
+) -> None:
     report = report_table(analyse(open_run(folder)))
     listed = entry(folder)
     window = report["true"]["windows"][0]
     assert window["std_um"] < 0.5
-    assert (listed.std_um, listed.in_band) == pytest.approx((window["std_um"], window["in_band"]), rel=1e-4)
+    assert (listed.std_um, listed.in_band) == pytest.approx(
+        (window["std_um"], window["in_band"]), rel=1e-4
+    )
     times_s = (listed.held_s, listed.faults_s, listed.paused_s, listed.moving_s)
     assert times_s == pytest.approx(
         [report[f"{name}_s"] for name in ("settled", "faults", "paused", "moving")], abs=1.0
@@ -82,10 +96,14 @@ def test_every_place_states_the_same_quality(folder: Path, rows: Rows, capsys: p
     assert [odd["seen"][:4] for odd in report["anomalies"] if odd["name"] == "paused"] == ["40 s"]
 
 
-def test_a_summary_of_no_length_is_shown(folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_summary_of_no_length_is_shown(
+    folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     run = tmp_path / folder.name
     shutil.copytree(folder, run)
-    (run / "summary.json").write_text('{"schema": "membrane-summary/2", "duration_s": 0, "held": {"faults_s": 5}}')
+    (run / "summary.json").write_text(
+        '{"schema": "membrane-summary/2", "duration_s": 0, "held": {"faults_s": 5}}'
+    )
     assert command(["runs", "show", str(run)]) == 0
     assert "faults 5 s (100 %)" in capsys.readouterr().out
 

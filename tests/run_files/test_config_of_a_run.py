@@ -26,7 +26,11 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def test_an_unknown_key_does_not_take_its_table_along(folder: Path) -> None:
     path = folder / "config.toml"
     text = path.read_text()
-    path.write_text(text.replace("[loop]", "[loop]\nold_option = 1").replace("kp_per_s = 0.61", "kp_per_s = 0.5"))
+    path.write_text(
+        text.replace("[loop]", "[loop]\nold_option = 1").replace(
+            "kp_per_s = 0.61", "kp_per_s = 0.5"
+        )
+    )
     run = open_run(folder)
     path.write_text(text)
     assert run.config.loop.rate_hz == 10.0
@@ -76,7 +80,9 @@ def test_without_ticks_the_seconds_know_the_rate(tmp_path: Path) -> None:
 
 
 def test_late_ticks_are_no_other_rate(tmp_path: Path) -> None:
-    """Where a sleep ends up to a fifth of a period late, most ticks are farther apart than the period."""
+    """Where a sleep ends up to a fifth of a period late, most ticks are farther apart than the
+    period.
+    """
     rows, _ = night(1, 0.01, "quiet", [])
     late_ms = np.arange(len(rows)) * 0.7 % 2.0 * 10
     rows[:, COLUMN["mono_s"]] = 0.1 * np.arange(len(rows)) + 1e-3 * late_ms

@@ -47,12 +47,21 @@ HARM: dict[str, Callable[[Path], object]] = {
     "flipped": lambda path: path.write_bytes(_flipped(path.read_bytes(), path.stat().st_size // 2)),
 }
 CASES = (
-    ("ticks/ticks-0000.parquet", "garbage"), ("ticks/ticks-0000.parquet", "folder"),
-    ("ticks/ticks-0000.parquet", "missing"), ("ticks_1s/ticks_1s-0000.parquet", "flipped"),
-    ("ticks_60s/ticks_60s-0000.parquet", "loop"), ("shapes/shapes-0000.parquet", "half"), ("config.toml", "empty"),
-    ("config.toml", "loop"), ("config.toml", "flipped"), ("events.jsonl", "folder"), ("events.jsonl", "empty"),
-    ("events.jsonl", "flipped"), ("summary.json", "garbage"), ("ticks/manifest.jsonl", "flipped"),
-)  # fmt: skip
+    ("ticks/ticks-0000.parquet", "garbage"),
+    ("ticks/ticks-0000.parquet", "folder"),
+    ("ticks/ticks-0000.parquet", "missing"),
+    ("ticks_1s/ticks_1s-0000.parquet", "flipped"),
+    ("ticks_60s/ticks_60s-0000.parquet", "loop"),
+    ("shapes/shapes-0000.parquet", "half"),
+    ("config.toml", "empty"),
+    ("config.toml", "loop"),
+    ("config.toml", "flipped"),
+    ("events.jsonl", "folder"),
+    ("events.jsonl", "empty"),
+    ("events.jsonl", "flipped"),
+    ("summary.json", "garbage"),
+    ("ticks/manifest.jsonl", "flipped"),
+)
 
 
 @pytest.fixture(scope="module")
@@ -75,7 +84,11 @@ def _objects(path: Path) -> list[dict[str, object]]:
 
 
 def _content(folder: Path) -> dict[str, bytes]:
-    return {str(path.relative_to(folder)): path.read_bytes() for path in folder.rglob("*") if path.is_file()}
+    return {
+        str(path.relative_to(folder)): path.read_bytes()
+        for path in folder.rglob("*")
+        if path.is_file()
+    }
 
 
 def test_a_sound_run_has_nothing_to_say(sound: Path) -> None:
@@ -101,7 +114,9 @@ def test_any_file_may_be_damaged(
     assert _content(folder) == before
 
 
-def test_report_and_export_show_the_rest(sound: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_report_and_export_show_the_rest(
+    sound: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     folder = shutil.copytree(sound, tmp_path / sound.name)
     whole = open_run(folder).level(10.0)
     (folder / "ticks_10s" / "ticks_10s-0000.parquet").unlink()
@@ -111,7 +126,9 @@ def test_report_and_export_show_the_rest(sound: Path, tmp_path: Path, capsys: py
     assert np.array_equal(open_run(folder).level(10.0)["rows"], whole["rows"])
     assert cli(["report", str(folder), "--out", str(tmp_path / "report")]) == 0
     pages = [(tmp_path / "report" / page).read_text() for page in ("report.html", "report.json")]
-    assert cli(["export", str(folder), "--format", "parquet", "--out", str(tmp_path / "export")]) == 0
+    assert (
+        cli(["export", str(folder), "--format", "parquet", "--out", str(tmp_path / "export")]) == 0
+    )
     assert "events.jsonl" in capsys.readouterr().out
     for name in ("ticks_10s-0000.parquet", "ticks_1s-0000.parquet", "events.jsonl"):
         assert all(name in page for page in pages)
@@ -130,12 +147,19 @@ def test_no_flipped_byte_changes_a_value(sound: Path, tmp_path: Path) -> None:
         found = run.ticks()
         kept = np.isin(whole.column("tick").to_numpy(), found.column("tick").to_numpy())
         assert not found.num_rows or found.equals(whole.filter(pa.array(kept)))
-        assert found.num_rows == whole.num_rows or any("ticks-0000.parquet" in note for note in run.notes)
+        assert found.num_rows == whole.num_rows or any(
+            "ticks-0000.parquet" in note for note in run.notes
+        )
 
 
-def test_an_event_and_a_figure_that_were_changed_are_not_believed(sound: Path, tmp_path: Path) -> None:
+def test_an_event_and_a_figure_that_were_changed_are_not_believed(
+    sound: Path, tmp_path: Path
+) -> None:
     folder = shutil.copytree(sound, tmp_path / sound.name)
-    for name, old, new in (("events.jsonl", '"settle"', '"sottle"'), ("summary.json", '"done"', '"dune"')):
+    for name, old, new in (
+        ("events.jsonl", '"settle"', '"sottle"'),
+        ("summary.json", '"done"', '"dune"'),
+    ):
         path = folder / name
         path.write_text(path.read_text().replace(old, new))
     run = open_run(folder)
@@ -143,7 +167,9 @@ def test_an_event_and_a_figure_that_were_changed_are_not_believed(sound: Path, t
     assert [event["kind"] for event in run.events] == ["start", "end"]
 
 
-def test_an_empty_export_is_refused(sound: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_an_empty_export_is_refused(
+    sound: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     folder = shutil.copytree(sound, tmp_path / sound.name)
     for path in folder.glob("*/manifest.jsonl"):
         shutil.rmtree(path.parent)

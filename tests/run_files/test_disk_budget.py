@@ -14,16 +14,29 @@ from membrane_ctrl.model.events import Event
 from membrane_ctrl.model.run_events import RecorderError, RecorderRecovered
 from membrane_ctrl.recorder.housekeeping import RETENTION_INTERVAL_S, Housekeeping
 from membrane_ctrl.recorder.sink import RecorderErrors
-from membrane_ctrl.run_files.disk_budget import DetailLevel, OldRun, deletable_runs, delete_run, detail_level, expired
+from membrane_ctrl.run_files.disk_budget import (
+    DetailLevel,
+    OldRun,
+    deletable_runs,
+    delete_run,
+    detail_level,
+    expired,
+)
 
 NOW = datetime(2026, 11, 21, 12, tzinfo=UTC)
 
 
 @pytest.mark.parametrize(
     ("free_mb", "level"),
-    [(5000, DetailLevel.ALL), (1000, DetailLevel.ALL), (999, DetailLevel.NO_PICTURES), (100, DetailLevel.NO_PICTURES),
-     (99, DetailLevel.ESSENTIAL), (0, DetailLevel.ESSENTIAL)],
-)  # fmt: skip
+    [
+        (5000, DetailLevel.ALL),
+        (1000, DetailLevel.ALL),
+        (999, DetailLevel.NO_PICTURES),
+        (100, DetailLevel.NO_PICTURES),
+        (99, DetailLevel.ESSENTIAL),
+        (0, DetailLevel.ESSENTIAL),
+    ],
+)
 def test_pictures_go_first_and_numbers_last(free_mb: float, level: DetailLevel) -> None:
     assert detail_level(free_mb, 500.0, DetailLevel.ALL) == level
 
@@ -39,8 +52,12 @@ def old_run(days: float, size_gb: float) -> OldRun:
     return OldRun(Path(f"run-{days}"), NOW - timedelta(days=days), int(size_gb * 1e9))
 
 
-def gone(runs: list[OldRun], keep_gb: float | None, keep_days: float | None, present_gb: float = 0.0) -> list[str]:
-    return [run.folder.name for run, _ in expired(runs, int(present_gb * 1e9), keep_gb, keep_days, NOW)]
+def gone(
+    runs: list[OldRun], keep_gb: float | None, keep_days: float | None, present_gb: float = 0.0
+) -> list[str]:
+    return [
+        run.folder.name for run, _ in expired(runs, int(present_gb * 1e9), keep_gb, keep_days, NOW)
+    ]
 
 
 def test_without_limits_nothing_goes() -> None:
@@ -83,7 +100,10 @@ def test_only_runs_that_are_over_and_nobody_keeps_may_go(tmp_path: Path) -> None
     (tmp_path / "20261104T110000Z-notes").mkdir()
     (tmp_path / "notes.txt").touch()
     found = deletable_runs(tmp_path, present, NOW)
-    assert [run.folder.name for run in found] == ["20261101T110000Z-over", "20261102T110000Z-crashed"]
+    assert [run.folder.name for run in found] == [
+        "20261101T110000Z-over",
+        "20261102T110000Z-crashed",
+    ]
     assert found[0].size_bytes == 2000
 
 
@@ -101,7 +121,9 @@ class HandClock(RunClock):
         return 0.0
 
 
-def test_the_recorder_deletes_old_runs_at_its_start_and_each_hour_and_says_which(tmp_path: Path) -> None:
+def test_the_recorder_deletes_old_runs_at_its_start_and_each_hour_and_says_which(
+    tmp_path: Path,
+) -> None:
     logs = tmp_path / "logs"
     logs.mkdir()
     present = make_run(logs, "20261121T120000Z-now", summary=False)
@@ -111,7 +133,10 @@ def test_the_recorder_deletes_old_runs_at_its_start_and_each_hour_and_says_which
     config = RecordingConfig(keep_days=30.0, min_free_mb=1.0)
     keeping = Housekeeping(present, HandClock(0.0, NOW), config, RecorderErrors(reports.append))
     keeping.look(0.0, [])
-    assert [report.to_dict()["run"] for report in reports] == ["20261001T110000Z-old", "20261002T110000Z-old"]
+    assert [report.to_dict()["run"] for report in reports] == [
+        "20261001T110000Z-old",
+        "20261002T110000Z-old",
+    ]
     make_run(logs, "20260901T110000Z-brought")
     keeping.look(RETENTION_INTERVAL_S - 1, [])
     assert len(reports) == 2

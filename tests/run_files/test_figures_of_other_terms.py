@@ -1,4 +1,6 @@
-"""Tables of the figure that another number of Zernike terms wrote: named and left out, never read as others."""
+"""Tables of the figure that another number of Zernike terms wrote: named and left out, never read
+as others.
+"""
 
 from __future__ import annotations
 
@@ -22,7 +24,10 @@ ROWS = 20
 def spec_of(terms: int, stated: bool = True) -> TableSpec:
     """The table of covariances of a program with another number of terms."""
     usual = table_specs.COVARIANCES
-    fields = [usual.schema.field("time_s"), pa.field("covariance_um2", pa.list_(pa.float32(), terms**2))]
+    fields = [
+        usual.schema.field("time_s"),
+        pa.field("covariance_um2", pa.list_(pa.float32(), terms**2)),
+    ]
     about = {**(usual.schema.metadata or {}), b"zernike_terms": str(terms).encode()}
     if not stated:
         del about[b"zernike_terms"]
@@ -55,7 +60,8 @@ def read_rows(run_dir: Path) -> tuple[int, list[str]]:
 def test_another_number_is_named(tmp_path: Path, terms: int, close: bool) -> None:
     path = write_rows(tmp_path, spec_of(terms), close)
     wanted = (
-        f"covariances/{path.name}: written with zernike terms = {terms}, this program has {ZERNIKE_TERMS}: left out"
+        f"covariances/{path.name}: written with zernike terms = {terms}, this program has "
+        f"{ZERNIKE_TERMS}: left out"
     )
     assert read_rows(tmp_path) == (0, [wanted])
 
@@ -67,7 +73,9 @@ def test_the_own_number_is_read(tmp_path: Path, close: bool) -> None:
 
 
 @pytest.mark.parametrize("close", [False, True], ids=["journal", "part"])
-def test_a_file_that_states_no_number_is_read_by_the_size_of_its_lists(tmp_path: Path, close: bool) -> None:
+def test_a_file_that_states_no_number_is_read_by_the_size_of_its_lists(
+    tmp_path: Path, close: bool
+) -> None:
     path = write_rows(tmp_path, spec_of(ZERNIKE_TERMS + 1, stated=False), close)
     assert read_rows(tmp_path) == (0, [f"covariances/{path.name}: without covariance_um2"])
 

@@ -87,7 +87,9 @@ def test_an_unknown_table_or_column_is_named(run: Run) -> None:
 
 
 @pytest.mark.parametrize(("library", "method"), [("pandas", "to_pandas"), ("xarray", "to_xarray")])
-def test_a_missing_library_is_named(run: Run, library: str, method: str, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_missing_library_is_named(
+    run: Run, library: str, method: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.setitem(sys.modules, library, None)
     with pytest.raises(InputError, match=rf"needs {library}: pip install 'membrane-ctrl\[data\]'"):
         getattr(run, method)(end_s=1.0)

@@ -15,9 +15,17 @@ from membrane_ctrl.hold.listeners import FaultLatch
 from membrane_ctrl.model.events import CommandTaken, Event, Fault, Resumed, StateEntered
 from membrane_ctrl.model.run_events import LatchFailed, LatchWritten
 from membrane_ctrl.model.telemetry import FIELDS, TelemetryRow
-from membrane_ctrl.run_files.latched_fault import NAME, RESUMES_NAME, LatchedFault, LatchedFile, ResumeLog
+from membrane_ctrl.run_files.latched_fault import (
+    NAME,
+    RESUMES_NAME,
+    LatchedFault,
+    LatchedFile,
+    ResumeLog,
+)
 
-FAULT = LatchedFault("over_pressure", "too much", "801 Pa", "look", "2026-01-02T03:04:05+00:00", "run-1")
+FAULT = LatchedFault(
+    "over_pressure", "too much", "801 Pa", "look", "2026-01-02T03:04:05+00:00", "run-1"
+)
 TRIP: tuple[Event, ...] = (
     Fault(40, "late", "ticks start too late", "150 ms", "50 ms", "ramp_down", True, "less work"),
     StateEntered("fault", "hold", "late"),
@@ -28,7 +36,9 @@ ACK = CommandTaken("ack", "unix:ann", "")
 
 
 def outputs(*events: Event) -> TickOutputs:
-    return TickOutputs(BenchCommand(0.0, 0.0), TelemetryRow(**dict.fromkeys(FIELDS, 1.0)), events, None)
+    return TickOutputs(
+        BenchCommand(0.0, 0.0), TelemetryRow(**dict.fromkeys(FIELDS, 1.0)), events, None
+    )
 
 
 def test_it_comes_back_as_it_was_and_goes_when_cleared(tmp_path: Path) -> None:
@@ -45,10 +55,21 @@ def test_it_comes_back_as_it_was_and_goes_when_cleared(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize(
     "content",
-    [b"", b"{", b"\xff\xfe", b"[]", b'"x"', b"null", b'{"schema": "other"}', b"\0" * 300,
-     b'{"schema": "membrane-latched-fault/1"}', b'{"schema": "membrane-latched-fault/1", "name": 3}',
-     b"[" * 30_000, b" " * 70_000 + b"{}"],
-)  # fmt: skip
+    [
+        b"",
+        b"{",
+        b"\xff\xfe",
+        b"[]",
+        b'"x"',
+        b"null",
+        b'{"schema": "other"}',
+        b"\0" * 300,
+        b'{"schema": "membrane-latched-fault/1"}',
+        b'{"schema": "membrane-latched-fault/1", "name": 3}',
+        b"[" * 30_000,
+        b" " * 70_000 + b"{}",
+    ],
+)
 def test_a_corrupt_file_counts_as_latched(tmp_path: Path, content: bytes) -> None:
     (tmp_path / NAME).write_bytes(content)
     found = LatchedFile(tmp_path).read()
@@ -87,7 +108,11 @@ def test_a_fault_of_many_lines_is_told_in_one(tmp_path: Path) -> None:
 
 def make(folder: Path, told: list[Event]) -> FaultLatch:
     return FaultLatch(
-        LatchedFile(folder), ResumeLog(folder), "run-7", lambda mono_s: datetime(2026, 1, 1, tzinfo=UTC), told.append
+        LatchedFile(folder),
+        ResumeLog(folder),
+        "run-7",
+        lambda mono_s: datetime(2026, 1, 1, tzinfo=UTC),
+        told.append,
     )
 
 
@@ -156,7 +181,9 @@ def test_the_twin_latches_nothing(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("aim", ["mine.txt", "nowhere.txt"])
 def test_a_link_in_place_of_the_reserve_takes_nothing_of_anybody(tmp_path: Path, aim: str) -> None:
-    """A folder of runs may have been unpacked: the fault is latched, and what the link leads to stays."""
+    """A folder of runs may have been unpacked: the fault is latched, and what the link leads to
+    stays.
+    """
     (tmp_path / "mine.txt").write_text("mine")
     logs = tmp_path / "logs"
     logs.mkdir()
@@ -166,7 +193,9 @@ def test_a_link_in_place_of_the_reserve_takes_nothing_of_anybody(tmp_path: Path,
     latched = file.read()
     assert latched is not None
     assert latched.name == "over_pressure"
-    assert [(path.name, path.read_text()) for path in tmp_path.iterdir() if path.is_file()] == [("mine.txt", "mine")]
+    assert [(path.name, path.read_text()) for path in tmp_path.iterdir() if path.is_file()] == [
+        ("mine.txt", "mine")
+    ]
 
 
 def test_a_fault_on_a_full_disk_is_latched_in_the_room_that_was_kept(
@@ -200,7 +229,9 @@ def test_resumes_are_counted_for_a_day_and_beyond_a_restart(tmp_path: Path) -> N
     assert ResumeLog(tmp_path).ages_s(NOW) == (18_000.0, 0.0)
 
 
-@pytest.mark.parametrize("content", [b"", b"{", b"\xff", b"3", b"[3]", b'["tomorrow"]', b'["2026-01-02T11:00:00"]'])
+@pytest.mark.parametrize(
+    "content", [b"", b"{", b"\xff", b"3", b"[3]", b'["tomorrow"]', b'["2026-01-02T11:00:00"]']
+)
 def test_a_count_of_resumes_that_cannot_be_read_is_full(tmp_path: Path, content: bytes) -> None:
     (tmp_path / RESUMES_NAME).write_bytes(content)
     assert len(ResumeLog(tmp_path).ages_s(NOW)) == 1000

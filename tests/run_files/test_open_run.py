@@ -12,7 +12,14 @@ from benchmarks.nights import night
 from membrane_ctrl.model.errors import InputError
 from membrane_ctrl.model.telemetry import FIELDS, column
 from membrane_ctrl.review import open_run
-from membrane_ctrl.run_files.levels import CODES, NAMES, SIGNALS, TICK_FIELDS, coarser_level, first_level
+from membrane_ctrl.run_files.levels import (
+    CODES,
+    NAMES,
+    SIGNALS,
+    TICK_FIELDS,
+    coarser_level,
+    first_level,
+)
 from membrane_ctrl.run_files.table_store.spec import PART_S
 from tests.support.review_runs import same, set_summary, tables, written
 
@@ -45,7 +52,9 @@ def test_an_unknown_column_is_refused(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("window_s", [1.0, 10.0, 60.0])
-def test_levels_are_least_mean_and_greatest_of_their_windows(tmp_path: Path, window_s: float) -> None:
+def test_levels_are_least_mean_and_greatest_of_their_windows(
+    tmp_path: Path, window_s: float
+) -> None:
     rows, _ = night(1, 0.1, "typical", [])
     level = open_run(written(tmp_path, 0.1)).level(window_s)
     number = np.floor(column(rows, "mono_s") / window_s)
@@ -110,7 +119,10 @@ def test_a_torn_table_gives_what_is_whole(tmp_path: Path) -> None:
     run = open_run(folder)
     assert run.ticks(["error_um"]).num_rows == 7200, "its column lies in the first two thirds"
     assert run.ticks().num_rows == 0
-    assert any("ticks-0000.parquet: rows from 0.00 s to 719.90 s are left out" in note for note in run.notes)
+    assert any(
+        "ticks-0000.parquet: rows from 0.00 s to 719.90 s are left out" in note
+        for note in run.notes
+    )
 
 
 def test_a_damaged_file_is_named(tmp_path: Path) -> None:
@@ -142,12 +154,18 @@ def test_broken_small_files_are_named(tmp_path: Path) -> None:
     folder = written(tmp_path, 0.02)
     with (folder / "events.jsonl").open("a") as file:
         file.write('{"kind": "half')
-    (folder / "config.toml").write_text("[loop]\nrate_hz = 10.0\n[limits]\nband_um = 3.0\n[unheard_of]\nx = 1\n")
+    (folder / "config.toml").write_text(
+        "[loop]\nrate_hz = 10.0\n[limits]\nband_um = 3.0\n[unheard_of]\nx = 1\n"
+    )
     (folder / "summary.json").write_text("not json")
     run = open_run(folder)
     assert run.config.limits.band_um == 3.0
     assert run.summary is None
-    assert {note.split(":")[0] for note in run.notes} >= {"events.jsonl", "config.toml", "summary.json"}
+    assert {note.split(":")[0] for note in run.notes} >= {
+        "events.jsonl",
+        "config.toml",
+        "summary.json",
+    }
 
 
 def test_another_schema_is_said(tmp_path: Path) -> None:

@@ -25,7 +25,21 @@ def test_nothing_is_exported_over_a_run(tmp_path: Path, capsys: Capsys, inside: 
     folder, other = written(tmp_path / "a", 0.01), written(tmp_path / "b", 0.01)
     before = contents(tmp_path)
     for target in (folder / inside, other / inside):
-        assert command(["export", str(folder), "--format", "csv", "--streams", "events", "--out", str(target)]) == 2
+        assert (
+            command(
+                [
+                    "export",
+                    str(folder),
+                    "--format",
+                    "csv",
+                    "--streams",
+                    "events",
+                    "--out",
+                    str(target),
+                ]
+            )
+            == 2
+        )
         assert "choose another folder" in capsys.readouterr().err
     assert contents(tmp_path) == before
 
@@ -41,7 +55,9 @@ def test_an_export_that_fails_leaves_the_one_before(tmp_path: Path, to: str) -> 
 
 
 @pytest.mark.parametrize(("at", "text"), [("+9h", "beyond"), ("-5s", "before"), ("+10s", " ")])
-def test_a_mark_outside_the_run_or_without_words_is_refused(tmp_path: Path, at: str, text: str) -> None:
+def test_a_mark_outside_the_run_or_without_words_is_refused(
+    tmp_path: Path, at: str, text: str
+) -> None:
     folder = written(tmp_path, 0.01)
     assert command(["review", "mark", str(folder), text, f"--at={at}"]) == 2
     assert not (folder / ANNOTATIONS_FILE).exists()

@@ -16,13 +16,17 @@ from tests.support.synthetic_run import STARTED_UTC
 
 
 def test_folder_is_named_by_utc_and_name(tmp_path: Path) -> None:
-    run_dir = run_folder.create_run_folder(tmp_path / "deep" / "logs", "demo", STARTED_UTC, Config())
+    run_dir = run_folder.create_run_folder(
+        tmp_path / "deep" / "logs", "demo", STARTED_UTC, Config()
+    )
     assert run_dir == tmp_path / "deep" / "logs" / "20261121T012345Z-demo"
     assert run_dir.is_dir()
 
 
 def test_second_run_of_a_second_gets_its_own_folder(tmp_path: Path) -> None:
-    first, second = (run_folder.create_run_folder(tmp_path, "demo", STARTED_UTC, Config()) for _ in range(2))
+    first, second = (
+        run_folder.create_run_folder(tmp_path, "demo", STARTED_UTC, Config()) for _ in range(2)
+    )
     assert second.name == f"{first.name}-2"
 
 
@@ -52,7 +56,9 @@ def test_logs_that_is_a_file_is_named_with_a_remedy(tmp_path: Path) -> None:
 
 def test_too_little_space_is_named_with_a_remedy(tmp_path: Path) -> None:
     config = Config(recording=RecordingConfig(min_free_mb=1e9))
-    with pytest.raises(DeviceError, match=r"MB free, recording.min_free_mb requires 1000000000; delete"):
+    with pytest.raises(
+        DeviceError, match=r"MB free, recording.min_free_mb requires 1000000000; delete"
+    ):
         run_folder.create_run_folder(tmp_path, "demo", STARTED_UTC, config)
     assert not list(tmp_path.iterdir())
 

@@ -39,7 +39,11 @@ def test_a_run_without_head_has_an_unknown_program(tmp_path: Path) -> None:
 
 
 def test_a_later_format_is_named_with_its_program(folder: Path) -> None:
-    table = {"schema": f"membrane-run/{FORMAT + 1}", "program": "membrane-ctrl 7.0", "commit": "0123456789ab"}
+    table = {
+        "schema": f"membrane-run/{FORMAT + 1}",
+        "program": "membrane-ctrl 7.0",
+        "commit": "0123456789ab",
+    }
     (folder / HEAD_FILE).write_text(dumps_checked(table))
     notes: list[str] = []
     assert read_run_head(folder, notes) == RunHead(FORMAT + 1, "membrane-ctrl 7.0 (0123456789ab)")
@@ -49,7 +53,16 @@ def test_a_later_format_is_named_with_its_program(folder: Path) -> None:
 
 @pytest.mark.parametrize(
     "text",
-    ["", "{", "[]", "null", '{"schema": "membrane-run/x"}', '{"schema": 1}', "[" * 1000, "x" * 100_000],
+    [
+        "",
+        "{",
+        "[]",
+        "null",
+        '{"schema": "membrane-run/x"}',
+        '{"schema": 1}',
+        "[" * 1000,
+        "x" * 100_000,
+    ],
     ids=["empty", "torn", "list", "null", "no number", "number", "deep", "long"],
 )
 def test_a_damaged_head_is_noted_and_not_used(folder: Path, text: str) -> None:

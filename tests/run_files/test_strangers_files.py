@@ -1,4 +1,6 @@
-"""Files in folders of strangers: no link is followed, no pipe waited for, nothing large read, written or changed."""
+"""Files in folders of strangers: no link is followed, no pipe waited for, nothing large read,
+written or changed.
+"""
 
 from __future__ import annotations
 
@@ -74,7 +76,9 @@ def test_nor_is_a_file_in_a_linked_folder(folder: Path, secret: Path) -> None:
 
 
 @pytest.mark.parametrize("name", ["a", ".a.part"])
-def test_a_planted_link_is_replaced_and_what_it_leads_to_stays(folder: Path, secret: Path, name: str) -> None:
+def test_a_planted_link_is_replaced_and_what_it_leads_to_stays(
+    folder: Path, secret: Path, name: str
+) -> None:
     (folder / name).symlink_to(secret)
     write_text_atomic(folder / "a", "mine")
     assert (folder / "a").read_text() == "mine"
@@ -82,7 +86,9 @@ def test_a_planted_link_is_replaced_and_what_it_leads_to_stays(folder: Path, sec
     assert secret.read_text() == "secret"
 
 
-def test_a_link_that_comes_back_is_refused(folder: Path, secret: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_link_that_comes_back_is_refused(
+    folder: Path, secret: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """Between taking it away and making the file somebody may be quick."""
     (folder / ".a.part").symlink_to(secret)
     monkeypatch.setattr(os, "unlink", lambda *_, **__: None)
@@ -156,24 +162,43 @@ _OWN = {
     # the recorder, and the log of a program beside a hold, in the folder that the run has just made
     "processes/child.py",
     "recorder/recorder.py",
-    "run_files/table_store/disk.py", "run_files/table_store/part_writer.py",
-    "recorder/sink.py", "recorder/housekeeping.py", "run_files/run_folder.py",
+    "run_files/table_store/disk.py",
+    "run_files/table_store/part_writer.py",
+    "recorder/sink.py",
+    "recorder/housekeeping.py",
+    "run_files/run_folder.py",
     "acquisition/raw_frames.py",
-    # the logs' own folder, each by its own handle or without following; a socket; a set of one's own run
-    "run_files/latched_fault.py", "run_files/disk_budget.py", "control_port/sockets.py",
-    "sessions/folder.py", "sessions/live_log.py", "web/panels.py",
+    # the logs' own folder, each by its own handle or without following; a socket; a set of one's
+    # own run
+    "run_files/latched_fault.py",
+    "run_files/disk_budget.py",
+    "control_port/sockets.py",
+    "sessions/folder.py",
+    "sessions/live_log.py",
+    "web/panels.py",
     # the machine's own folder of locks, whose owner and mode are checked
     "instruments/lock_store.py",
     # a new folder, a temporary one, or a file that the user has named
-    "sim/optics/simulate.py", "replay/command.py", "review/viewer/command.py",
-    "review/runs.py", "calibration/session.py", "calibration/camera.py",
-    "calibration/sets.py", "calibration/report.py", "geometry/spread_file.py", "commissioning/devices.py",
+    "sim/optics/simulate.py",
+    "replay/command.py",
+    "review/viewer/command.py",
+    "review/runs.py",
+    "calibration/session.py",
+    "calibration/camera.py",
+    "calibration/sets.py",
+    "calibration/report.py",
+    "geometry/spread_file.py",
+    "commissioning/devices.py",
     "commissioning/new_driver.py",
     # shared memory
-    "processes/frames.py", "processes/ring.py",
+    "processes/frames.py",
+    "processes/ring.py",
     # into memory, and from there by `model.files`
-    "measure/results.py", "measure/figure_results.py", "measure/export_figure.py", "review/report/figures.py",
-}  # fmt: skip
+    "measure/results.py",
+    "measure/figure_results.py",
+    "measure/export_figure.py",
+    "review/report/figures.py",
+}
 _WRITES = re.compile(
     r"""\.write_(text|bytes)\(|open\(\s*(str\()?[\w./]*,?\s*["'](w|a|x|r\+)|\.open\(["'](w|a|x|r\+)|np\.savez|savefig\("""
     r"""|imwrite\(|\.unlink\(|\.rename\(|\.mkdir\(|\.touch\(|O_CREAT|OSFile|h5py\.File\([^)]*"w"|print_figure\("""

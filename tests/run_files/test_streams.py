@@ -28,7 +28,7 @@ from membrane_ctrl.run_files.streams import (
     mark_lines,
     mean_row,
     overview_um,
-)  # fmt: skip
+)
 from tests.support.rrd_reading import scalars
 from tests.support.synthetic_run import rows_of, shape_of
 
@@ -85,7 +85,10 @@ def test_overviews_have_a_point_for_every_second(tmp_path: Path, block: int) -> 
     telemetry.finish()
     recording.close()
     seconds = rows.reshape(20, 50, -1)
-    for path, field in (("/overview/loop/error", "error_um"), ("/overview/loop/flow", "flow_um_per_s")):
+    for path, field in (
+        ("/overview/loop/error", "error_um"),
+        ("/overview/loop/flow", "flow_um_per_s"),
+    ):
         time_s, values = scalars(tmp_path / "test-000.rrd", path)
         assert time_s == pytest.approx(np.arange(20) + 0.49), path
         assert values[:, 1] == pytest.approx(seconds[:, :, COLUMN[field]].mean(axis=1)), path
@@ -141,7 +144,11 @@ def test_changes_of_the_figure_are_against_the_first_since_rebase(tmp_path: Path
     for cycle in range(4):
         if cycle == 1:
             shapes.rebase(1.5)
-        shapes.send(replace(shape_of(float(cycle), cycle), sag_um=100.0 * cycle, displacement_um=7.0 * cycle))
+        shapes.send(
+            replace(
+                shape_of(float(cycle), cycle), sag_um=100.0 * cycle, displacement_um=7.0 * cycle
+            )
+        )
     recording.close()
     _, values = scalars(tmp_path / "test-000.rrd", "/shape/sag_change", "Measurements:values")
     _, variances = scalars(tmp_path / "test-000.rrd", "/shape/sag_change", "Measurements:variances")
@@ -170,7 +177,13 @@ def test_thumbnails_come_at_their_interval(dtype: str) -> None:
     take("y_sin_0")  # x_sin_0 and what was too early ...
     take("y_sin_1")  # ... has been overwritten by now
     made += thumbnails.take_due(THUMBNAIL_INTERVAL_S)
-    assert [each.pattern for each in made] == ["x_sin_0", "x_sin_2", "x_sin_3", "y_sin_0", "y_sin_1"]
+    assert [each.pattern for each in made] == [
+        "x_sin_0",
+        "x_sin_2",
+        "x_sin_3",
+        "y_sin_0",
+        "y_sin_1",
+    ]
     picture = cv2.imdecode(np.frombuffer(made[0].jpeg, np.uint8), cv2.IMREAD_UNCHANGED)
     assert picture.shape == (256, 300)
     thumbnails.close()

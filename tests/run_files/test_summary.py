@@ -90,7 +90,8 @@ def test_rows_of_a_setpoint_ramp_do_not_count() -> None:
             row,
             target_um=row.target_um + 100.0,
             setpoint_um=row.setpoint_um + min(100.0, (row.mono_s - 20.0) * 20.0),
-            truth_displacement_um=row.truth_displacement_um + min(100.0, (row.mono_s - 20.0) * 20.0),
+            truth_displacement_um=row.truth_displacement_um
+            + min(100.0, (row.mono_s - 20.0) * 20.0),
         )
         if row.mono_s >= 20.0
         else row
@@ -107,7 +108,9 @@ def test_rows_of_a_setpoint_ramp_do_not_count() -> None:
 
 def test_out_of_band_seconds_are_counted() -> None:
     rows = [
-        replace(row, truth_displacement_um=row.truth_displacement_um + 5.0) if 20.0 <= row.mono_s < 22.0 else row
+        replace(row, truth_displacement_um=row.truth_displacement_um + 5.0)
+        if 20.0 <= row.mono_s < 22.0
+        else row
         for row in rows_of(41.02)
     ]
     found = summary_of(rows)
@@ -116,7 +119,9 @@ def test_out_of_band_seconds_are_counted() -> None:
 
 def test_leaving_hold_ends_the_settled_rows() -> None:
     rows = [
-        replace(row, state=float(State.LOWER), truth_displacement_um=-500.0) if row.mono_s >= 30.0 else row
+        replace(row, state=float(State.LOWER), truth_displacement_um=-500.0)
+        if row.mono_s >= 30.0
+        else row
         for row in rows_of(40.0)
     ]
     found = summary_of(rows)
@@ -131,18 +136,31 @@ def test_events_and_cycles() -> None:
         summary.add_event(event)
     latencies_s = np.linspace(0.02, 0.12, 40)
     for k, latency_s in enumerate(latencies_s):
-        summary.add_shape(replace(shape_of(float(k), k, "rejected" if k < 3 else "ok"), latency_s=float(latency_s)))
+        summary.add_shape(
+            replace(
+                shape_of(float(k), k, "rejected" if k < 3 else "ok"), latency_s=float(latency_s)
+            )
+        )
     found = summary.as_dict({}, {})
     assert (found["faults"], found["fault_count"], found["exit"]) == ([fault], 1, "safety_trip")
     assert found["duration_s"] == 9.5
     assert (found["cycles"], found["cycles_rejected"]) == (40, 3)
-    assert found["cycle_latency_ms"]["p50"] == pytest.approx(np.quantile(latencies_s, 0.5) * 1e3, rel=0.05)
+    assert found["cycle_latency_ms"]["p50"] == pytest.approx(
+        np.quantile(latencies_s, 0.5) * 1e3, rel=0.05
+    )
 
 
 def test_the_fault_in_which_a_run_ends_is_named_and_survives_a_restart_of_the_recorder() -> None:
     summary = Summary(Config())
     fault = Fault(
-        14, "laser_implausible", "the laser is wrong", "laser +9 µm", "limits.x", "hold_flow", False, "look"
+        14,
+        "laser_implausible",
+        "the laser is wrong",
+        "laser +9 µm",
+        "limits.x",
+        "hold_flow",
+        False,
+        "look",
     )
     summary.add_event({"mono_s": 1.0, **fault.to_dict()})
     state = json.loads(json.dumps(encode(summary, _SPECIALS)))
@@ -191,4 +209,6 @@ def test_a_cycle_counts_once_the_hold_has_settled(window_s: float) -> None:
     state = np.where(starts_s >= 20.0, State.HOLD, State.SETTLE)
     seen = held_at({"time_s": starts_s, "state": state}, np.array([3.0, 20.5, 24.9, 25.1, 59.0]))
     assert list(seen) == [False, False, False, True, True]
-    assert list(held_at({"time_s": starts_s, "state": state * 0 + State.HOLD}, np.array([3.0]))) == [True]
+    assert list(
+        held_at({"time_s": starts_s, "state": state * 0 + State.HOLD}, np.array([3.0]))
+    ) == [True]

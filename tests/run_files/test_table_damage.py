@@ -1,4 +1,6 @@
-"""Tables of a run: damage costs its row group, is named, and changes no value; strangers' files take no memory."""
+"""Tables of a run: damage costs its row group, is named, and changes no value; strangers' files
+take no memory.
+"""
 
 from __future__ import annotations
 
@@ -43,7 +45,9 @@ def _counts(run_dir: Path, notes: list[str]) -> list[int]:
         counts = table.column("count").to_pylist()
         expected = batch_of(counts, STEP_S)
         for name in table.column_names:
-            assert repr(table.column(name).to_pylist()) == repr(expected.column(name).to_pylist()), name
+            assert repr(table.column(name).to_pylist()) == repr(
+                expected.column(name).to_pylist()
+            ), name
         found += counts
     return found
 
@@ -77,9 +81,14 @@ def test_any_flipped_byte_of_a_part_costs_its_row_group_at_most(run_dir: Path) -
         assert lost in ([], [*range(20)], [*range(20, 40)], [*range(40, 60)]), place
         assert found == [count for count in range(150) if count not in lost]
         if lost:
-            assert f"rows from {lost[0] * STEP_S:.2f} s to {lost[-1] * STEP_S:.2f} s are left out" in notes[0]
+            assert (
+                f"rows from {lost[0] * STEP_S:.2f} s to {lost[-1] * STEP_S:.2f} s are left out"
+                in notes[0]
+            )
         TableReader(run_dir, TABLE, notes).check_all()
-        assert any("SHA-256" in note for note in notes), "the check of everything finds what reading does not need"
+        assert any("SHA-256" in note for note in notes), (
+            "the check of everything finds what reading does not need"
+        )
 
 
 def test_a_damaged_column_costs_nothing_of_the_others(run_dir: Path) -> None:
@@ -171,8 +180,19 @@ def test_damage_of_a_journal_is_kept_in_the_manifest(run_dir: Path) -> None:
 
 def test_a_part_of_a_run_reads_only_its_row_groups(run_dir: Path) -> None:
     reader = TableReader(run_dir, TABLE, [])
-    for start_s, end_s in ((0.0, 1.0), (1190.0, 1210.0), (3599.0, 3601.0), (-5.0, 0.0), (8940.0, 1e9), (9e9, 1e10)):
-        found = [c for table in reader.tables(["count"], start_s, end_s) for c in table["count"].to_pylist()]
+    for start_s, end_s in (
+        (0.0, 1.0),
+        (1190.0, 1210.0),
+        (3599.0, 3601.0),
+        (-5.0, 0.0),
+        (8940.0, 1e9),
+        (9e9, 1e10),
+    ):
+        found = [
+            c
+            for table in reader.tables(["count"], start_s, end_s)
+            for c in table["count"].to_pylist()
+        ]
         assert found == [count for count in range(150) if start_s <= count * STEP_S < end_s]
 
 
@@ -184,14 +204,22 @@ def test_a_month_is_read_a_row_group_at_a_time(run_dir: Path) -> None:
 
 def test_the_bits_of_nan_and_missing_values_stay_apart(tmp_path: Path) -> None:
     odd_nan = np.uint64(0xFFF8000000000123).view(np.float64)
-    values = pa.array(np.array([1.0, np.nan, odd_nan, -0.0]), mask=np.array([False, False, False, False]))
-    table = spec.TableSpec("t", pa.schema([("time_s", pa.float64()), ("x", pa.float64())]), "time_s")
+    values = pa.array(
+        np.array([1.0, np.nan, odd_nan, -0.0]), mask=np.array([False, False, False, False])
+    )
+    table = spec.TableSpec(
+        "t", pa.schema([("time_s", pa.float64()), ("x", pa.float64())]), "time_s"
+    )
     writer = TableWriter(tmp_path, table)
     writer.add(pa.record_batch([pa.array([0.0, 1.0, 2.0, 3.0]), values], schema=table.schema))
-    writer.add(pa.record_batch([pa.array([4.0]), pa.array([None], pa.float64())], schema=table.schema))
+    writer.add(
+        pa.record_batch([pa.array([4.0]), pa.array([None], pa.float64())], schema=table.schema)
+    )
     writer.sync()
     for _ in range(2):
-        read = pa.concat_tables(TableReader(tmp_path, table, []).tables()).column("x").combine_chunks()
+        read = (
+            pa.concat_tables(TableReader(tmp_path, table, []).tables()).column("x").combine_chunks()
+        )
         bits = np.frombuffer(read.buffers()[1], np.uint64)[:4]
         assert bits.tolist() == np.asarray(values.to_numpy()).view(np.uint64).tolist()
         assert read.null_count == 1
@@ -238,7 +266,9 @@ def test_a_pipe_in_place_of_a_journal_does_not_block(run_dir: Path) -> None:
 def test_columns_of_another_type_are_not_read(run_dir: Path) -> None:
     (run_dir / TABLE.name / spec.MANIFEST).unlink()
     table = pa.Table.from_batches([batch_of(range(60), STEP_S)])
-    table = table.set_column(2, "value", pa.array(["x"] * 60)).append_column("more", pa.array([[1]] * 60))
+    table = table.set_column(2, "value", pa.array(["x"] * 60)).append_column(
+        "more", pa.array([[1]] * 60)
+    )
     pq.write_table(table, _part(run_dir, 0))
     notes: list[str] = []
     tables = list(TableReader(run_dir, TABLE, notes).tables())
@@ -251,7 +281,9 @@ def test_repeated_texts_take_no_memory(run_dir: Path) -> None:
     """30 kB of Parquet that would be 60 GB of text."""
     (run_dir / TABLE.name / spec.MANIFEST).unlink()
     rows = 60_000
-    words = pa.DictionaryArray.from_arrays(pa.array(np.zeros(rows, np.int32)), pa.array(["x" * 1_000_000]))
+    words = pa.DictionaryArray.from_arrays(
+        pa.array(np.zeros(rows, np.int32)), pa.array(["x" * 1_000_000])
+    )
     batch = pa.Table.from_batches([batch_of(range(rows), 0.05)]).set_column(4, "word", words)
     pq.write_table(batch, _part(run_dir, 0), use_dictionary=["word"], compression="zstd")
     notes: list[str] = []
@@ -259,18 +291,31 @@ def test_repeated_texts_take_no_memory(run_dir: Path) -> None:
     assert "more text than a recorder writes" in notes[0]
 
 
-def test_pages_that_claim_gigabytes_are_refused(run_dir: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_pages_that_claim_gigabytes_are_refused(
+    run_dir: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     _replace_part(run_dir, compression="zstd", use_dictionary=False)
     monkeypatch.setattr("membrane_ctrl.run_files.table_store.part_reader.CHUNK_BYTES_MAX", 479)
     notes: list[str] = []
     assert _counts(run_dir, notes) == [*range(60, 150)]
     assert "larger than a recorder writes" in notes[0]
-    found = page_headers.measure_chunk(b"\x15\x00\x15\xfe\xff\xff\xff\x0f\x15\x02\x2c\x15\x78\x00\x00x")
+    found = page_headers.measure_chunk(
+        b"\x15\x00\x15\xfe\xff\xff\xff\x0f\x15\x02\x2c\x15\x78\x00\x00x"
+    )
     assert found == page_headers.ChunkSize(2**31 - 1, 60)
 
 
 @pytest.mark.parametrize(
-    "data", [b"", b"\x15", b"\xff" * 40, b"\x15\x00", b"\x1c" * 60, b"\x19\xf4" + b"\xff" * 9, b"\x15" + b"\xff" * 30]
+    "data",
+    [
+        b"",
+        b"\x15",
+        b"\xff" * 40,
+        b"\x15\x00",
+        b"\x1c" * 60,
+        b"\x19\xf4" + b"\xff" * 9,
+        b"\x15" + b"\xff" * 30,
+    ],
 )
 def test_page_headers_of_any_bytes_are_refused(data: bytes) -> None:
     if not data:
@@ -311,7 +356,9 @@ def test_forged_frames_are_left_out(run_dir: Path, unpacked_bytes: int) -> None:
 
 def test_compressed_buffers_in_a_frame_are_refused(run_dir: Path) -> None:
     sink = pa.BufferOutputStream()
-    with pa.ipc.new_stream(sink, TABLE.schema, options=pa.ipc.IpcWriteOptions(compression="zstd")) as stream:
+    with pa.ipc.new_stream(
+        sink, TABLE.schema, options=pa.ipc.IpcWriteOptions(compression="zstd")
+    ) as stream:
         stream.write_batch(batch_of(range(150, 155), STEP_S))
     reader = pa.ipc.MessageReader.open_stream(sink.getvalue())
     reader.read_next_message()
@@ -338,7 +385,13 @@ def test_a_manifest_of_nonsense_is_left_out(run_dir: Path) -> None:
 
 def test_names_that_are_no_files_of_the_table_are_ignored(run_dir: Path) -> None:
     folder = run_dir / TABLE.name
-    for name in ("other-0000.parquet", "numbers-1.parquet", "numbers-.parquet", "numbers-0000.part", "a-b"):
+    for name in (
+        "other-0000.parquet",
+        "numbers-1.parquet",
+        "numbers-.parquet",
+        "numbers-0000.part",
+        "a-b",
+    ):
         (folder / name).write_bytes(b"x")
     assert _counts(run_dir, []) == [*range(150)]
 

@@ -1,4 +1,6 @@
-"""Tables of a run: a kill at any system call, a power cut and a full disk lose a second, and double nothing."""
+"""Tables of a run: a kill at any system call, a power cut and a full disk lose a second, and double
+nothing.
+"""
 
 from __future__ import annotations
 
@@ -10,13 +12,22 @@ import pytest
 from membrane_ctrl.run_files.table_store import journal, spec
 from membrane_ctrl.run_files.table_store.reader import TableReader
 from membrane_ctrl.run_files.table_store.writer import WAIT_S, TableWriter
-from tests.support.table_disk import TABLE, FullDisk, KilledError, KillingDisk, batch_of, read_counts
+from tests.support.table_disk import (
+    TABLE,
+    FullDisk,
+    KilledError,
+    KillingDisk,
+    batch_of,
+    read_counts,
+)
 
 ROWS = 15  # in parts of twelve
 
 
 def _write_all(run_dir: Path, disk: KillingDisk, synced: list[int]) -> None:
-    """Write the rows one by one, as a recorder does each second; `synced` has those that it believes safe."""
+    """Write the rows one by one, as a recorder does each second; `synced` has those that it
+    believes safe.
+    """
     writer = TableWriter(run_dir, TABLE, disk=disk)
     for count in range(ROWS):
         writer.add(batch_of([count]))
@@ -38,11 +49,17 @@ def _calls() -> list[str]:
 CALLS = _calls()
 
 
-KILLS = [(at, share) for at, call in enumerate(CALLS) for share in ((0.0, 0.6) if call == "write" else (0.0,))]
+KILLS = [
+    (at, share)
+    for at, call in enumerate(CALLS)
+    for share in ((0.0, 0.6) if call == "write" else (0.0,))
+]
 
 
 @pytest.mark.parametrize(("at", "share"), KILLS)
-def test_a_kill_at_any_call_loses_and_doubles_nothing(tmp_path: Path, at: int, share: float) -> None:
+def test_a_kill_at_any_call_loses_and_doubles_nothing(
+    tmp_path: Path, at: int, share: float
+) -> None:
     synced: list[int] = []
     with pytest.raises(KilledError):
         _write_all(tmp_path, KillingDisk(at, share), synced)
@@ -57,9 +74,13 @@ def test_a_kill_at_any_call_loses_and_doubles_nothing(tmp_path: Path, at: int, s
     writer.close()
     notes: list[str] = []
     assert read_counts(tmp_path, notes) == list(range(ROWS))
-    assert not [note for note in notes if "no intact rows" not in note], "only a torn frame may be noted"
+    assert not [note for note in notes if "no intact rows" not in note], (
+        "only a torn frame may be noted"
+    )
     left = [path.read_bytes() for path in (tmp_path / TABLE.name).glob(f"*{spec.JOURNAL_SUFFIX}")]
-    assert not any(frame.rows for data in left for frame in journal.find_frames(data)), "torn before any row"
+    assert not any(frame.rows for data in left for frame in journal.find_frames(data)), (
+        "torn before any row"
+    )
 
 
 def test_every_step_of_sealing_is_interrupted() -> None:
@@ -97,7 +118,13 @@ def test_a_journal_cut_at_any_byte_is_continued(tmp_path: Path) -> None:
     whole = path.read_bytes()
     frames = journal.find_frames(whole)
     for place, frame in enumerate(frames):
-        for cut in (frame.start, frame.start + 1, frame.start + 31, frame.start + 32, frame.end - 1):
+        for cut in (
+            frame.start,
+            frame.start + 1,
+            frame.start + 31,
+            frame.start + 32,
+            frame.end - 1,
+        ):
             for old in path.parent.iterdir():
                 old.unlink()
             path.write_bytes(whole[:cut])
@@ -134,9 +161,9 @@ def test_a_journal_sealed_while_it_is_read_is_read_from_its_part(
         return found
 
     monkeypatch.setattr(Path, "exists", sealed_after)
-    assert [count for table in reader.tables(["count"]) for count in table.column("count").to_pylist()] == [
-        *range(10)
-    ]
+    assert [
+        count for table in reader.tables(["count"]) for count in table.column("count").to_pylist()
+    ] == [*range(10)]
 
 
 @pytest.mark.parametrize("free_bytes", [0, 1, 40, 700, 3000])
@@ -210,5 +237,7 @@ def test_a_removed_folder_starts_again_with_what_waits(tmp_path: Path) -> None:
 
 def _counts(run_dir: Path) -> list[int]:
     return [
-        count for table in TableReader(run_dir, TABLE, []).tables(["count"]) for count in table["count"].to_pylist()
+        count
+        for table in TableReader(run_dir, TABLE, []).tables(["count"])
+        for count in table["count"].to_pylist()
     ]

@@ -40,22 +40,46 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 def test_codes_are_names(folder: Path) -> None:
     ticks = open_run(folder).ticks()
-    rows = {row: {name: ticks.column(name)[row].as_py() for name in ("state", "shape_state", "safe_level", "fault")}
-            for row in (0, 400, 550, 650)}  # fmt: skip
-    assert rows[0] == {"state": "settle", "shape_state": "tracking", "safe_level": "none", "fault": "none"}
+    rows = {
+        row: {
+            name: ticks.column(name)[row].as_py()
+            for name in ("state", "shape_state", "safe_level", "fault")
+        }
+        for row in (0, 400, 550, 650)
+    }
+    assert rows[0] == {
+        "state": "settle",
+        "shape_state": "tracking",
+        "safe_level": "none",
+        "fault": "none",
+    }
     assert (rows[400]["state"], rows[400]["fault"]) == ("hold", "none")
-    assert rows[550] == {"state": "fault", "shape_state": "tracking", "safe_level": "pump_off", "fault": "link_lost"}
+    assert rows[550] == {
+        "state": "fault",
+        "shape_state": "tracking",
+        "safe_level": "pump_off",
+        "fault": "link_lost",
+    }
     assert rows[650]["fault"] == "code 99"  # of a later version
 
 
 def test_absent_values_are_null_and_counts_are_integers(folder: Path) -> None:
     ticks = open_run(folder).ticks()
-    assert [ticks.column(name).null_count for name in ("displacement_um", "trim_um", "setpoint_um")] == [100, 1080, 0]
+    assert [
+        ticks.column(name).null_count for name in ("displacement_um", "trim_um", "setpoint_um")
+    ] == [100, 1080, 0]
     assert ticks.column("displacement_um")[100].as_py() is None
     assert ticks.column("tick").type == ticks.column("sample_counter").type == pa.int64()
     assert ticks.column("sample_counter").null_count == ticks.num_rows
     level = open_run(folder).overview(10.0, names=["state", "mean_trim_um", "min_displacement_um"])
-    assert level.column_names == ["time_s", "time_utc", "rows", "state", "mean_trim_um", "min_displacement_um"]
+    assert level.column_names == [
+        "time_s",
+        "time_utc",
+        "rows",
+        "state",
+        "mean_trim_um",
+        "min_displacement_um",
+    ]
     assert level.column("mean_trim_um").null_count == level.num_rows
     assert level.column("rows")[0].as_py() == 100
     assert level.column("state")[0].as_py() == "settle"
@@ -73,14 +97,19 @@ def test_every_table_has_the_same_times(folder: Path, place: int) -> None:
     assert "mono_s" not in table.column_names
     for row in (0, -1):
         passed = table.column("time_utc")[row].as_py() - run.origin_utc
-        assert passed / timedelta(seconds=1) == pytest.approx(table.column("time_s")[row].as_py(), abs=1e-6)
+        assert passed / timedelta(seconds=1) == pytest.approx(
+            table.column("time_s")[row].as_py(), abs=1e-6
+        )
 
 
 def test_an_impossible_time_has_no_utc() -> None:
     table = named_table({"time_s": np.array([0.5, np.nan, np.inf, 1e12])}, ORIGIN)
     assert [moment and moment.isoformat() for moment in table.column("time_utc").to_pylist()] == [
-        "2026-11-21T18:00:00.750000+00:00", None, None, None,
-    ]  # fmt: skip
+        "2026-11-21T18:00:00.750000+00:00",
+        None,
+        None,
+        None,
+    ]
 
 
 def test_a_code_that_was_not_recorded_is_null() -> None:
@@ -90,8 +119,11 @@ def test_a_code_that_was_not_recorded_is_null() -> None:
 
 def test_a_part_without_data_has_the_same_columns(folder: Path) -> None:
     run = open_run(folder)
-    for whole, none in ((run.ticks(), run.ticks(start_s=1e6)), (run.overview(), run.overview(start_s=1e6)),
-                        (run.cycles(), run.cycles(start_s=1e6))):  # fmt: skip
+    for whole, none in (
+        (run.ticks(), run.ticks(start_s=1e6)),
+        (run.overview(), run.overview(start_s=1e6)),
+        (run.cycles(), run.cycles(start_s=1e6)),
+    ):
         assert none.column_names == whole.column_names
         assert none.num_rows == 0
         assert none.column("time_utc").type == pa.timestamp("us", "UTC")
@@ -104,4 +136,8 @@ def test_a_csv_has_words_and_empty_cells(folder: Path, tmp_path: Path) -> None:
     assert lines[101].endswith('"settle",')
     read = pyarrow.csv.read_csv(tmp_path / "ticks.csv")
     assert read.column("time_utc").type == pa.timestamp("ns", "UTC")
-    assert pyarrow.csv.read_csv(tmp_path / "shapes.csv").column_names[:3] == ["time_s", "time_utc", "z1_um"]
+    assert pyarrow.csv.read_csv(tmp_path / "shapes.csv").column_names[:3] == [
+        "time_s",
+        "time_utc",
+        "z1_um",
+    ]

@@ -36,7 +36,9 @@ def feed(tables: RunTables, number: int) -> None:
 
 
 @pytest.mark.parametrize("repeated", [0, 1], ids=["the state was newer", "the state was older"])
-def test_after_four_deaths_every_tick_window_and_shape_is_there_once(tmp_path: Path, repeated: int) -> None:
+def test_after_four_deaths_every_tick_window_and_shape_is_there_once(
+    tmp_path: Path, repeated: int
+) -> None:
     tables = RunTables(tmp_path)
     handed_on = deepcopy(tables.open_windows)
     for number in SECONDS:

@@ -1,8 +1,9 @@
-"""docs/safety-case.md, made from safety_case.toml, the safety table, the tests and the mutants' results.
+"""docs/safety-case.md, made from safety_case.toml, the safety table, the tests and the mutants'
+results.
 
 python tests/safety_case/safety_case.py            # writes the page
 python tests/safety_case/safety_case.py --check    # writes nothing; names what is open or out of date, exits with 1
-"""
+"""  # noqa: E501
 
 from __future__ import annotations
 
@@ -68,7 +69,9 @@ def load_case() -> SafetyCase:
     """Read safety_case.toml. Raises TypeError for an unknown key."""
     table = tomllib.loads(SOURCE.read_text(encoding="utf-8"))
     constraints = [
-        Constraint(**{**entry, "external": [External(**each) for each in entry.get("external", [])]})
+        Constraint(
+            **{**entry, "external": [External(**each) for each in entry.get("external", [])]}
+        )
         for entry in table["constraint"]
     ]
     losses = {loss["id"]: loss["text"] for loss in table["loss"]}
@@ -88,42 +91,75 @@ def find_killed() -> dict[str, list[Verdict]]:
 
 @cache
 def _test_texts() -> dict[str, str]:
-    return {str(path.relative_to(ROOT)): path.read_text(encoding="utf-8") for path in (ROOT / "tests").rglob("*.py")}
+    return {
+        str(path.relative_to(ROOT)): path.read_text(encoding="utf-8")
+        for path in (ROOT / "tests").rglob("*.py")
+    }
 
 
 def _tests_of_rule(name: str) -> list[str]:
     """Test files of the controller that name the rule."""
-    return [path for path, text in _test_texts().items() if f'"{name}"' in text and "/test_" in path]
+    return [
+        path for path, text in _test_texts().items() if f'"{name}"' in text and "/test_" in path
+    ]
 
 
 def _tests_of_board_fault(name: str) -> list[str]:
-    """Test files of the board and its emulator in which a line with the name of the fault compares or expects it."""
+    """Test files of the board and its emulator in which a line with the name of the fault compares
+    or expects it.
+    """
     names = rf"(\"{name}\"|'{name}'|\b{name.upper()}\b|_FAULT_{name.upper()}\b)"
     pattern = re.compile(names)
     wanted = ("tests/board/test_", "tests/firmware_iface/test_")
-    return [path for path, text in _test_texts().items() if path.startswith(wanted) and pattern.search(text)]
+    return [
+        path
+        for path, text in _test_texts().items()
+        if path.startswith(wanted) and pattern.search(text)
+    ]
 
 
 def find_gaps(case: SafetyCase) -> Iterator[str]:
-    """What is open: a hazard without a constraint; a constraint, rule, guard or hardware without its proof."""
+    """What is open: a hazard without a constraint; a constraint, rule, guard or hardware without
+    its proof.
+    """
     for hazard, entry in case.hazards.items():
         if not any(hazard in constraint.hazards for constraint in case.constraints):
             yield f"{hazard}: no constraint prevents it"
-        yield from (f"{hazard}: unknown loss {loss}" for loss in entry["losses"] if loss not in case.losses)
+        yield from (
+            f"{hazard}: unknown loss {loss}" for loss in entry["losses"] if loss not in case.losses
+        )
     for constraint in case.constraints:
         yield from _find_gaps_of(constraint, case)
     used = {name for constraint in case.constraints for name in constraint.rules}
     yield from (f"rule {name}: enforces no constraint" for name in _RULES if name not in used)
     guarding = {name for constraint in case.constraints for name in constraint.guards}
-    yield from (f"guard {guard.name}: enforces no constraint" for guard in Guard if guard.name not in guarding)
+    yield from (
+        f"guard {guard.name}: enforces no constraint"
+        for guard in Guard
+        if guard.name not in guarding
+    )
     board = {name for constraint in case.constraints for name in constraint.board}
-    yield from (f"board fault {f.name}: enforces no constraint" for f in default_map().faults if f.name not in board)
+    yield from (
+        f"board fault {f.name}: enforces no constraint"
+        for f in default_map().faults
+        if f.name not in board
+    )
 
 
 def _find_gaps_of(constraint: Constraint, case: SafetyCase) -> Iterator[str]:
     name, killed = constraint.id, find_killed()
-    yield from (f"{name}: unknown hazard {hazard}" for hazard in constraint.hazards if hazard not in case.hazards)
-    if not (constraint.rules or constraint.guards or constraint.board or constraint.tests or constraint.external):
+    yield from (
+        f"{name}: unknown hazard {hazard}"
+        for hazard in constraint.hazards
+        if hazard not in case.hazards
+    )
+    if not (
+        constraint.rules
+        or constraint.guards
+        or constraint.board
+        or constraint.tests
+        or constraint.external
+    ):
         yield f"{name}: nothing enforces it"
     for rule in constraint.rules:
         if rule not in _RULES:
@@ -150,7 +186,9 @@ def _find_gaps_of(constraint: Constraint, case: SafetyCase) -> Iterator[str]:
     headings = OPERATIONS.read_text(encoding="utf-8")
     for hardware in constraint.external:
         if not re.search(rf"^#+ {re.escape(hardware.step)}$", headings, re.MULTILINE):
-            yield f"{name}: docs/operations.md has no step {hardware.step!r} for the {hardware.name}"
+            yield (
+                f"{name}: docs/operations.md has no step {hardware.step!r} for the {hardware.name}"
+            )
 
 
 _HEAD = """# Safety case
@@ -197,7 +235,7 @@ rule is tested, not that it suffices.
 **How it is proved.** Each rule has tests, and at least one *mutant*: the rule is removed on purpose, and a test
 must notice ([mutants](mutants.md)). The [fault matrix](fault-matrix.md), [sensor faults](sensor-faults.md) and
 [protection](protection.md) inject failures into a simulated bench and judge its true state.
-"""
+"""  # noqa: E501
 
 
 def make_page(case: SafetyCase) -> str:
@@ -206,11 +244,15 @@ def make_page(case: SafetyCase) -> str:
     lines += [f"| {loss} | {text} |" for loss, text in case.losses.items()]
     lines += ["", "## Hazards", "", "| | hazard | leads to | prevented by |", "|---|---|---|---|"]
     for hazard, entry in case.hazards.items():
-        by = ", ".join(constraint.id for constraint in case.constraints if hazard in constraint.hazards)
+        by = ", ".join(
+            constraint.id for constraint in case.constraints if hazard in constraint.hazards
+        )
         lines.append(f"| {hazard} | {entry['text']} | {', '.join(entry['losses'])} | {by} |")
     lines += ["", "## Constraints", ""]
     lines += ["| | unsafe control action | constraint | hazards |", "|---|---|---|---|"]
-    lines += [f"| {c.id} | {c.action} | {c.text} | {', '.join(c.hazards)} |" for c in case.constraints]
+    lines += [
+        f"| {c.id} | {c.action} | {c.text} | {', '.join(c.hazards)} |" for c in case.constraints
+    ]
     lines += ["", "## Enforcement and proof", ""]
     for constraint in case.constraints:
         lines += _describe(constraint)
@@ -235,12 +277,17 @@ def _describe(constraint: Constraint) -> list[str]:
     for name in constraint.guards:
         verdicts = killed.get(name, [])
         by = f"`{verdicts[0].by_tests.split('::')[0]}`" if verdicts else ""
-        lines.append(f"| guard `{name.lower()}` | {Guard[name].value} | {by} | {_mutant(verdicts)} |")
+        lines.append(
+            f"| guard `{name.lower()}` | {Guard[name].value} | {by} | {_mutant(verdicts)} |"
+        )
     for name in constraint.board:
         fault = next(fault for fault in default_map().faults if fault.name == name)
         by = ", ".join(f"`{Path(path).name}`" for path in _tests_of_board_fault(name)[:2])
         lines.append(f"| board fault {fault.bit} `{name}` | {fault.meaning} | {by} | - |")
-    lines += [f"| program | tests of the constraint | `{Path(path).name}` | - |" for path in constraint.tests]
+    lines += [
+        f"| program | tests of the constraint | `{Path(path).name}` | - |"
+        for path in constraint.tests
+    ]
     lines += [
         f"| external: {hardware.name} | fitted by the laboratory | commissioning step "
         f"[{hardware.step}](operations.md#{hardware.step.lower().replace(' ', '-')}) | - |"
@@ -255,7 +302,9 @@ def _mutant(verdicts: list[Verdict]) -> str:
 
 def main(arguments: list[str] | None = None) -> int:
     """Write the page, or name what is open; returns the exit code."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("--check", action="store_true")
     check = parser.parse_args(arguments).check
     case = load_case()

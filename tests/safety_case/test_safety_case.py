@@ -1,4 +1,6 @@
-"""The safety case is complete and its page is the present one; what would leave it open is found."""
+"""The safety case is complete and its page is the present one;
+what would leave it open is found.
+"""
 
 from __future__ import annotations
 
@@ -28,10 +30,19 @@ def test_a_hazard_that_no_constraint_prevents_is_open() -> None:
     [
         (Constraint("C99", ["H1"], "", ""), "C99: nothing enforces it"),
         (Constraint("C99", ["H99"], "", "", rules=["late"]), "C99: unknown hazard H99"),
-        (Constraint("C99", ["H1"], "", "", rules=["no_rule"]), "C99: the safety table has no rule no_rule"),
+        (
+            Constraint("C99", ["H1"], "", "", rules=["no_rule"]),
+            "C99: the safety table has no rule no_rule",
+        ),
         (Constraint("C99", ["H1"], "", "", guards=["NO_GUARD"]), "C99: there is no guard NO_GUARD"),
-        (Constraint("C99", ["H1"], "", "", board=["no_fault"]), "C99: the board has no fault no_fault"),
-        (Constraint("C99", ["H1"], "", "", tests=["tests/conftest.py"]), "C99: tests/conftest.py has no test"),
+        (
+            Constraint("C99", ["H1"], "", "", board=["no_fault"]),
+            "C99: the board has no fault no_fault",
+        ),
+        (
+            Constraint("C99", ["H1"], "", "", tests=["tests/conftest.py"]),
+            "C99: tests/conftest.py has no test",
+        ),
         (
             Constraint("C99", ["H1"], "", "", external=[External("net", "No such step")]),
             "C99: docs/operations.md has no step 'No such step' for the net",

@@ -93,7 +93,12 @@ class Client:
         self.write("settings", {"watchdog_period_s": period_s, "watchdog_arm": 1.0, **claim})
 
     def command(self, pump: float) -> None:
-        values = {"pump_command_fraction": pump, "vent_command_fraction": 0.0, "heartbeat": 1.0, "command_key": 2.0}
+        values = {
+            "pump_command_fraction": pump,
+            "vent_command_fraction": 0.0,
+            "heartbeat": 1.0,
+            "command_key": 2.0,
+        }
         self.write("command", values)
 
     def write(self, name: str, values: dict[str, float]) -> None:
@@ -126,7 +131,9 @@ def test_serves_the_plant_in_real_time_and_publishes_the_truth() -> None:
         assert process.exitcode == 0
     device_s = device_time_s(last) - device_time_s(first)
     assert 0.5 < device_s < ended_s  # a virtual clock tests how exactly time is kept
-    assert last["sample_counter"] - first["sample_counter"] == pytest.approx(device_s / 0.005, abs=1.01)
+    assert last["sample_counter"] - first["sample_counter"] == pytest.approx(
+        device_s / 0.005, abs=1.01
+    )
     assert last["pump_readback_fraction"] == 1.0
     assert max(truth.pump_um_per_s for truth in truths) == pytest.approx(5.3, rel=0.05)
     stamps = [truth.time_s for truth in truths]

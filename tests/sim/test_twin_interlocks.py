@@ -36,7 +36,9 @@ class Still:
 
     def sample(self) -> BoardSample:
         self.samples += 1
-        return BoardSample(0.0, 0, 600.0, 101325.0, 23.0, 21.0, self.samples, 0.01 * self.samples, self.inputs)
+        return BoardSample(
+            0.0, 0, 600.0, 101325.0, 23.0, 21.0, self.samples, 0.01 * self.samples, self.inputs
+        )
 
     def actuate(self, pump_fraction: float, vent_fraction: float) -> None:
         assert pump_fraction == 0.0
@@ -52,13 +54,20 @@ async def reading_of(devices: DevicesConfig) -> BenchReading:
 
 
 def patient(tables: dict[str, Any]) -> dict[str, Any]:
-    return tables | ({"timeout_s": 2.0, "age_max_s": 5.0} if tables["driver"] == "modbus_input" else {})
+    return tables | (
+        {"timeout_s": 2.0, "age_max_s": 5.0} if tables["driver"] == "modbus_input" else {}
+    )
 
 
 @pytest.mark.parametrize("open_input", [False, True])
 async def test_the_emulated_lab_answers_for_each_source(open_input: bool) -> None:
     devices = DevicesConfig.model_validate(
-        {"board": "tcp://b", "timeout_s": 2.0, "watchdog_s": 2.0, "interlocks": [patient(each) for each in SOURCES]}
+        {
+            "board": "tcp://b",
+            "timeout_s": 2.0,
+            "watchdog_s": 2.0,
+            "interlocks": [patient(each) for each in SOURCES],
+        }
     )
     plant = Still()
     if open_input:
@@ -67,7 +76,11 @@ async def test_the_emulated_lab_answers_for_each_source(open_input: bool) -> Non
     try:
         moved = await lab.start()
         kinds = [type(interlock) for interlock in moved.interlocks]
-        assert kinds == [BoardInputConfig, ModbusInputConfig, ModbusInputConfig]  # no machine has the GPIO line
+        assert kinds == [
+            BoardInputConfig,
+            ModbusInputConfig,
+            ModbusInputConfig,
+        ]  # no machine has the GPIO line
         assert [interlock.name for interlock in moved.interlocks] == ["door", "air", "stop"]
         assert (await reading_of(moved)).interlocks_open == int(open_input)
     finally:
@@ -75,9 +88,16 @@ async def test_the_emulated_lab_answers_for_each_source(open_input: bool) -> Non
 
 
 async def test_single_instruments_have_interlocks_as_well() -> None:
-    tables = roles()["devices"] | {"interlocks": [patient(SOURCES[1]), SOURCES[2]], "watchdog_s": 2.0}
+    tables = roles()["devices"] | {
+        "interlocks": [patient(SOURCES[1]), SOURCES[2]],
+        "watchdog_s": 2.0,
+    }
     for role in ("displacement", "pump", "gauge_pressure"):
-        tables[role] |= {"timeout_s": 2.0, "type": "f32", "limits": [0.0, 1.0] if role == "pump" else [-1e4, 7e4]}
+        tables[role] |= {
+            "timeout_s": 2.0,
+            "type": "f32",
+            "limits": [0.0, 1.0] if role == "pump" else [-1e4, 7e4],
+        }
     lab = Lab(Still(), DevicesConfig.model_validate(tables))
     try:
         moved = await lab.start()
@@ -98,9 +118,14 @@ def test_the_twins_board_takes_the_place_of_every_source_in_order() -> None:
 
 
 def test_more_than_the_twins_board_has_inputs_are_refused() -> None:
-    many = [{"driver": "gpio_line", "name": f"n{line}", "text": "x", "line": line} for line in range(17)]
+    many = [
+        {"driver": "gpio_line", "name": f"n{line}", "text": "x", "line": line} for line in range(17)
+    ]
     config = Config.model_validate({"devices": {"board": "tcp://b", "interlocks": many}})
-    with contextlib.ExitStack() as stack, pytest.raises(InputError, match="17 of them; the twin's pump board has 16"):
+    with (
+        contextlib.ExitStack() as stack,
+        pytest.raises(InputError, match="17 of them; the twin's pump board has 16"),
+    ):
         bench.TwinProcess.started(config, RunClock.start(), stack)
 
 

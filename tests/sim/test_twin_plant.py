@@ -10,14 +10,22 @@ import pytest
 
 from membrane_ctrl.config.schema import PumpConfig, TwinConfig
 from membrane_ctrl.sim.plant import TRUTH_BYTES, Plant, Truth
-from membrane_ctrl.sim.surroundings import SCENARIOS, AmbientChange, LaserDrift, LaserDropout, OrnsteinUhlenbeck
+from membrane_ctrl.sim.surroundings import (
+    SCENARIOS,
+    AmbientChange,
+    LaserDrift,
+    LaserDropout,
+    OrnsteinUhlenbeck,
+)
 
 PUMP = PumpConfig()
 
 
 @pytest.mark.parametrize("scenario", ["quiet", "typical", "gusty"])
 @pytest.mark.parametrize("quantity", [0, 1])
-def test_ornstein_uhlenbeck_has_the_scenarios_spread_and_memory(scenario: str, quantity: int) -> None:
+def test_ornstein_uhlenbeck_has_the_scenarios_spread_and_memory(
+    scenario: str, quantity: int
+) -> None:
     std, correlation_s = SCENARIOS[scenario][quantity]
     step_s = correlation_s / 10
     noise = OrnsteinUhlenbeck(std, correlation_s, step_s, np.random.default_rng(3))
@@ -88,7 +96,12 @@ def test_laser_noise_and_resolution() -> None:
 
 
 def test_noise_free_sensors_tell_the_truth() -> None:
-    quiet = {"laser_noise_um": 0.0, "laser_resolution_um": 0.0, "barometer_noise_pa": 0.0, "thermometer_noise_k": 0.0}
+    quiet = {
+        "laser_noise_um": 0.0,
+        "laser_resolution_um": 0.0,
+        "barometer_noise_pa": 0.0,
+        "thermometer_noise_k": 0.0,
+    }
     plant = Plant(TwinConfig.model_validate(quiet), PUMP)
     plant.advance(12.0)
     sample, truth = plant.sample(), plant.truth()
@@ -127,7 +140,9 @@ def test_laser_without_light_has_no_reading() -> None:
 
 def test_laser_mount_drifts_and_the_mirror_does_not() -> None:
     events = [LaserDrift(at_s=60.0, rate_um_per_min=3.0, duration_s=20.0)]
-    plant = Plant(TwinConfig(scenario="calm", laser_noise_um=0.0, laser_drift_um_per_min=2.0), PUMP, events)
+    plant = Plant(
+        TwinConfig(scenario="calm", laser_noise_um=0.0, laser_drift_um_per_min=2.0), PUMP, events
+    )
     plant.advance(120.0)
     truth = plant.truth()
     assert truth.laser_bias_um == pytest.approx(2 * 2.0 + 1.0)

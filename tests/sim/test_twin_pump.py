@@ -42,7 +42,9 @@ def test_stalls_and_needs_the_start_command_again(pump: PumpModel) -> None:
 
 
 def test_never_takes_gas_away() -> None:
-    pump = PumpModel(PumpConfig(dead_fraction=0.3), FULL_ML_PER_S, STEP_S)  # dead above stall and start
+    pump = PumpModel(
+        PumpConfig(dead_fraction=0.3), FULL_ML_PER_S, STEP_S
+    )  # dead above stall and start
     assert settle(pump, 0.25) == 0.0
     settle(pump, 1.0)
     assert all(pump.step(0.2) >= 0 for _ in range(2000))
@@ -84,7 +86,9 @@ def test_a_fresh_plant_is_just_held() -> None:
 
 
 def test_full_flow_lifts_the_centre_by_the_configured_speed() -> None:
-    plant = Plant(TwinConfig(scenario="calm", leak_time_constant_s=1e8), PumpConfig(flow_full_um_per_s=4.0))
+    plant = Plant(
+        TwinConfig(scenario="calm", leak_time_constant_s=1e8), PumpConfig(flow_full_um_per_s=4.0)
+    )
     plant.actuate(1.0, 0.0)
     plant.advance(5.0)
     assert plant.truth().pump_um_per_s == pytest.approx(4.0, rel=2e-3)
@@ -92,7 +96,9 @@ def test_full_flow_lifts_the_centre_by_the_configured_speed() -> None:
 
 @pytest.mark.campaign
 def test_filling_from_flat_takes_two_hours() -> None:
-    plant = Plant(TwinConfig(scenario="calm", from_flat=True, leak_time_constant_s=1e8), PumpConfig())
+    plant = Plant(
+        TwinConfig(scenario="calm", from_flat=True, leak_time_constant_s=1e8), PumpConfig()
+    )
     assert plant.truth().sag_mm == 0.0
     assert plant.truth().displacement_um == pytest.approx(-37_094, abs=1)
     plant.actuate(1.0, 0.0)
@@ -114,12 +120,18 @@ def test_refuses_a_command_that_is_no_fraction(command: tuple[float, float]) -> 
 @pytest.mark.parametrize("shape", ["quadratic", "root", "s-shaped", "saturating", "pwm"])
 def test_shapes_of_the_twins_pump(shape: str) -> None:
     """Each has the full flow of the straight line at its end, and another one in the middle."""
-    pump = PumpModel(PumpConfig(), FULL_ML_PER_S, STEP_S, TwinConfig.model_validate({"pump_shape": shape}))
+    pump = PumpModel(
+        PumpConfig(), FULL_ML_PER_S, STEP_S, TwinConfig.model_validate({"pump_shape": shape})
+    )
     flows = [settle(pump, command) for command in (0.3, 0.5, 0.7, 0.9, 1.0)]
     assert flows == sorted(flows)
     assert flows[-1] == pytest.approx(FULL_ML_PER_S)
     straight = FULL_ML_PER_S * 0.4 / 0.9
-    assert flows[1] == pytest.approx(straight, abs=0.01) if shape == "pwm" else abs(flows[1] - straight) > 0.05
+    assert (
+        flows[1] == pytest.approx(straight, abs=0.01)
+        if shape == "pwm"
+        else abs(flows[1] - straight) > 0.05
+    )
 
 
 def test_a_hysteretic_twin_gives_more_on_the_way_down() -> None:

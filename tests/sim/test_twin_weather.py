@@ -5,14 +5,21 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from membrane_ctrl.sim.surroundings import BenchEvent, DailyTemperature, PressureWeather, Surroundings
+from membrane_ctrl.sim.surroundings import (
+    BenchEvent,
+    DailyTemperature,
+    PressureWeather,
+    Surroundings,
+)
 
 DAY_S = 86_400.0
 
 
 def series(event: BenchEvent, time_s: np.ndarray) -> Surroundings:
     zero = np.zeros_like(time_s)
-    on = Surroundings(time_s, zero.copy(), zero.copy(), np.ones_like(time_s), zero.copy(), zero.copy())
+    on = Surroundings(
+        time_s, zero.copy(), zero.copy(), np.ones_like(time_s), zero.copy(), zero.copy()
+    )
     event.apply(on)
     return on
 
@@ -32,7 +39,9 @@ def test_weather_has_its_size_begins_at_nothing_and_is_slow() -> None:
         assert ambient_pa[0] == pytest.approx(0.0, abs=1e-9)
         stds.append(ambient_pa.std())
         assert np.max(np.abs(np.diff(ambient_pa))) < 100.0  # Pa in ten minutes
-    assert np.mean(stds) == pytest.approx(700.0, rel=0.2)  # few of the slow waves fit into two months
+    assert np.mean(stds) == pytest.approx(
+        700.0, rel=0.2
+    )  # few of the slow waves fit into two months
 
 
 @pytest.mark.parametrize("event", [DailyTemperature(1.0), PressureWeather(500.0, 3)])

@@ -1,4 +1,6 @@
-"""The board in virtual time does what the board does: watchdog, restart, latches, and nothing without a link."""
+"""The board in virtual time does what the board does: watchdog, restart, latches, and nothing
+without a link.
+"""
 
 from __future__ import annotations
 
@@ -145,8 +147,12 @@ def test_a_host_that_ignores_a_lost_gauge_is_stopped_by_the_board() -> None:
 
 
 @pytest.mark.parametrize(("fitted", "pump"), [(0b10, 0.0), (0b01, 0.4), (0, 0.4)])
-def test_an_open_circuit_is_read_and_stops_the_pump_where_it_is_fitted(fitted: int, pump: float) -> None:
-    bench = VirtualBench(Plant(CONFIG.twin, CONFIG.pump), stored=StoredSettings(interlocks_fitted=fitted))
+def test_an_open_circuit_is_read_and_stops_the_pump_where_it_is_fitted(
+    fitted: int, pump: float
+) -> None:
+    bench = VirtualBench(
+        Plant(CONFIG.twin, CONFIG.pump), stored=StoredSettings(interlocks_fitted=fitted)
+    )
     assert bench.open().interlocks_fitted == fitted
     bench.write(BenchCommand(0.4, 0.0))
     assert bench.read().interlock_inputs == 0xFFFF

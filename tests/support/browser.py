@@ -1,4 +1,6 @@
-"""A real Chromium for tests, driven over its DevTools protocol: open a page, evaluate, wait, take a picture."""
+"""A real Chromium for tests, driven over its DevTools protocol: open a page, evaluate, wait, take a
+picture.
+"""
 
 from __future__ import annotations
 
@@ -35,9 +37,13 @@ class Tab:
         self._socket, self._numbers = socket, itertools.count(1)
 
     async def call(self, method: str, **params: Any) -> dict[str, Any]:
-        """Call a method of the protocol and return its result. Raises AssertionError with the browser's error."""
+        """Call a method of the protocol and return its result. Raises AssertionError with the
+        browser's error.
+        """
         number = next(self._numbers)
-        await self._socket.write_message(json.dumps({"id": number, "method": method, "params": params}))
+        await self._socket.write_message(
+            json.dumps({"id": number, "method": method, "params": params})
+        )
         while True:
             answer = await self._socket.read_message()
             assert answer is not None, "the browser closed the connection"
@@ -48,12 +54,16 @@ class Tab:
 
     async def value(self, script: str) -> Any:
         """Value of a JavaScript expression, which must be plain data."""
-        found = await self.call("Runtime.evaluate", expression=script, returnByValue=True, awaitPromise=True)
+        found = await self.call(
+            "Runtime.evaluate", expression=script, returnByValue=True, awaitPromise=True
+        )
         assert "exceptionDetails" not in found, found["exceptionDetails"]
         return found["result"].get("value")
 
     async def until(self, script: str) -> Any:
-        """Wait until an expression is true, and return it; a page that is still loading raises nothing."""
+        """Wait until an expression is true, and return it; a page that is still loading raises
+        nothing.
+        """
         guarded = f"(() => {{ try {{ return {script} }} catch {{ return null }} }})()"
         async with asyncio.timeout(_PATIENCE_S):
             while not (found := await self.value(guarded)):  # noqa: ASYNC110
@@ -69,15 +79,27 @@ class Tab:
         """Press keys one after the other, such as `s`, `Enter` or `Tab`."""
         codes = {"Enter": 13, "Tab": 9, "Escape": 27}
         for key in keys:
-            pressed: dict[str, Any] = {"key": key, "windowsVirtualKeyCode": codes.get(key, ord(key[0].upper()))}
-            text = {"text": "\r" if key == "Enter" else key} if key == "Enter" or len(key) == 1 else {}
+            pressed: dict[str, Any] = {
+                "key": key,
+                "windowsVirtualKeyCode": codes.get(key, ord(key[0].upper())),
+            }
+            text = (
+                {"text": "\r" if key == "Enter" else key} if key == "Enter" or len(key) == 1 else {}
+            )
             await self.call("Input.dispatchKeyEvent", type="keyDown", **pressed, **text)
             await self.call("Input.dispatchKeyEvent", type="keyUp", **pressed)
 
     async def show_as(self, width: int, height: int, dark: bool = False) -> None:
-        """Show the page as on a screen of that size, a phone if it is narrow, by day or by night."""
-        await self.call("Emulation.setDeviceMetricsOverride", width=width, height=height, deviceScaleFactor=1,
-                        mobile=width < 600)  # fmt: skip
+        """Show the page as on a screen of that size, a phone if it is narrow,
+        by day or by night.
+        """
+        await self.call(
+            "Emulation.setDeviceMetricsOverride",
+            width=width,
+            height=height,
+            deviceScaleFactor=1,
+            mobile=width < 600,
+        )
         scheme = {"name": "prefers-color-scheme", "value": "dark" if dark else "light"}
         await self.call("Emulation.setEmulatedMedia", features=[scheme])
         await self.value("window.before = true")
@@ -96,10 +118,18 @@ async def browser_tab(
 ) -> AsyncIterator[Tab]:
     """A tab of a new Chromium on a page; `folder` takes its profile."""
     process = await asyncio.create_subprocess_exec(
-        program_path("chromium"), "--headless", "--no-sandbox", "--disable-gpu", "--remote-debugging-port=0",
-        f"--window-size={width},{height}", f"--user-data-dir={folder}", *flags, "about:blank",
-        stdout=asyncio.subprocess.DEVNULL, stderr=asyncio.subprocess.DEVNULL,
-    )  # fmt: skip
+        program_path("chromium"),
+        "--headless",
+        "--no-sandbox",
+        "--disable-gpu",
+        "--remote-debugging-port=0",
+        f"--window-size={width},{height}",
+        f"--user-data-dir={folder}",
+        *flags,
+        "about:blank",
+        stdout=asyncio.subprocess.DEVNULL,
+        stderr=asyncio.subprocess.DEVNULL,
+    )
     try:
         port_file = folder / "DevToolsActivePort"
         async with asyncio.timeout(_PATIENCE_S):
@@ -107,8 +137,12 @@ async def browser_tab(
                 await asyncio.sleep(_LOOK_S)
         port = int(port_file.read_text().splitlines()[0])
         new = f"http://127.0.0.1:{port}/json/new?{quote(url, safe=':/')}"
-        answer = await AsyncHTTPClient().fetch(new, method="PUT", body="", request_timeout=_PATIENCE_S)
-        socket = await websocket_connect(json.loads(answer.body)["webSocketDebuggerUrl"], max_message_size=1 << 27)
+        answer = await AsyncHTTPClient().fetch(
+            new, method="PUT", body="", request_timeout=_PATIENCE_S
+        )
+        socket = await websocket_connect(
+            json.loads(answer.body)["webSocketDebuggerUrl"], max_message_size=1 << 27
+        )
         yield Tab(socket)
         socket.close()
     finally:

@@ -1,4 +1,6 @@
-"""Recorded runs of the twin that reach every part of the controller's state, for tests of snapshots and replay."""
+"""Recorded runs of the twin that reach every part of the controller's state, for tests of snapshots
+and replay.
+"""
 
 from __future__ import annotations
 
@@ -41,7 +43,9 @@ class Story:
     config: Config
     until_s: float
     commands: Mapping[float, Command] = field(default_factory=dict)
-    failures: Mapping[tuple[float, float], Callable[[Wrong, bool], None]] = field(default_factory=dict)
+    failures: Mapping[tuple[float, float], Callable[[Wrong, bool], None]] = field(
+        default_factory=dict
+    )
     shape_s: float | None = None
 
 
@@ -51,7 +55,12 @@ def switched(name: str, value: float | bool) -> Callable[[Wrong, bool], None]:
 
 
 def _trial(kind: str, **changed: Any) -> Command:
-    given = {"kind": kind, "duration_s": 15.0, "holding_flow_um_per_s": 1.24, "laser_um": 0.5} | changed
+    given = {
+        "kind": kind,
+        "duration_s": 15.0,
+        "holding_flow_um_per_s": 1.24,
+        "laser_um": 0.5,
+    } | changed
     return Command("tune", "tester", experiment=ExperimentSpec.model_validate(given), number=7)
 
 
@@ -63,7 +72,9 @@ _CURVE = PumpConfig(
 )
 _SAFE = StatesConfig(stay_after_trip=True)
 _LOOP = LoopConfig(rate_hz=20.0)
-_DOOR = BoardInputConfig(driver="board_input", name="door", text="shut the door", safe_level="pump_off", input=3)
+_DOOR = BoardInputConfig(
+    driver="board_input", name="door", text="shut the door", safe_level="pump_off", input=3
+)
 _LOCK = Lock("bofak", "hands inside", "unix:ann", "unix:ann", "p 7", "")
 _TUNED = Config(twin=_TWIN, loop=_LOOP, shape=ShapeConfig(enabled=False))
 
@@ -126,7 +137,9 @@ STORIES: dict[str, Story] = {
             twin=_TWIN,
             loop=_LOOP,
             states=_SAFE,
-            resume=ResumeConfig(faults=("link_lost", "device_silent", "watchdog_tripped"), wait_s=1.0),
+            resume=ResumeConfig(
+                faults=("link_lost", "device_silent", "watchdog_tripped"), wait_s=1.0
+            ),
             devices=DevicesConfig(board="tcp://twin", interlocks=(_DOOR,)),
         ),
         80.0,
@@ -183,17 +196,24 @@ STORIES: dict[str, Story] = {
         {(30.0, 30.2): switched("no_light", True)},
     ),
     "check": Story(
-        Config(twin=_TWIN.model_copy(update={"laser_noise_um": 3.0}), states=StatesConfig(actuator_test=True)),
+        Config(
+            twin=_TWIN.model_copy(update={"laser_noise_um": 3.0}),
+            states=StatesConfig(actuator_test=True),
+        ),
         12.0,
         {0.02: _HOLD},
         {(1.0, 1.3): switched("no_light", True), (4.0, 9.0): switched("pump_share", 0.2)},
     ),
-    "slow check": Story(Config(twin=_TWIN, loop=_LOOP, states=StatesConfig(actuator_test=False)), 8.0, {0.05: _HOLD}),
+    "slow check": Story(
+        Config(twin=_TWIN, loop=_LOOP, states=StatesConfig(actuator_test=False)), 8.0, {0.05: _HOLD}
+    ),
 }
 
 
 def record_story(story: Story) -> tuple[Ticks, ControllerState]:
-    """Run a story in virtual time; returns inputs and outputs of its ticks, and the controller's last state."""
+    """Run a story in virtual time; returns inputs and outputs of its ticks, and the controller's
+    last state.
+    """
     config = story.config
     circuits = VirtualInterlocks(config.interlocks)
     bench = VirtualBench(Plant(config.twin, config.pump), interlocks=circuits)

@@ -1,4 +1,5 @@
-"""Copies of a virtual bench with its controller: tests that begin from the same held mirror compute it once.
+"""Copies of a virtual bench with its controller: tests that begin from the same held mirror compute
+it once.
 
 A copy goes on exactly as the original would, and neither changes the other.
 """

@@ -1,9 +1,12 @@
-"""A second world of crossed fringes: rays, film, panel, light and air share no code with the product.
+"""A second world of crossed fringes: rays, film, panel, light and air share no code with the
+product.
 
-Film: a height function of its own, moving with time; rays by fixed-point steps, normals by differences of the height.
-Panel: a response that is not straight, brightness that wanders in space and time, dimming, a pulsed backlight,
-pictures that stick. Room: ambient light with a slope. Air: waves that bend the rays. Stand: grows along the camera's
-axis. Dust: spots that move now and then. The film may vibrate, and the camera's shutter may roll.
+Film: a height function of its own, moving with time; rays by fixed-point steps, normals by
+differences of the height.
+Panel: a response that is not straight, brightness that wanders in space and time, dimming, a pulsed
+backlight, pictures that stick. Room: ambient light with a slope. Air: waves that bend the rays.
+Stand: grows along the camera's axis. Dust: spots that move now and then. The film may vibrate, and
+the camera's shutter may roll.
 """
 
 from __future__ import annotations
@@ -29,11 +32,17 @@ EXPOSURE_S, DUTY = 0.02, 0.7
 
 
 def _bessel(lobes: int, circles: int) -> Array:
-    """Coefficients of J_m(z r) / r^m as a polynomial of r^2, z the zero at the rim; unit RMS times cos(m theta)."""
+    """Coefficients of J_m(z r) / r^m as a polynomial of r^2, z the zero at the rim; unit RMS times
+    cos(m theta).
+    """
     zero = special.jn_zeros(lobes, circles)[-1]
     rms = abs(special.jv(lobes + 1, zero)) * (math.sqrt(0.5) if lobes else 1.0)
-    series = [(-1) ** k * (zero / 2) ** (2 * k + lobes) / (special.factorial(k) * special.factorial(k + lobes))
-              for k in range(14)]  # fmt: skip
+    series = [
+        (-1) ** k
+        * (zero / 2) ** (2 * k + lobes)
+        / (special.factorial(k) * special.factorial(k + lobes))
+        for k in range(14)
+    ]
     return np.asarray(np.array(series[::-1]) / rms)
 
 
@@ -42,7 +51,9 @@ _BESSEL = [_bessel(lobes, circles) for _, lobes, circles in DRUM]
 
 @dataclass
 class Waves:
-    """A random field: waves whose lengths are about `length_mm`; each amplitude forgets itself in `memory_s`."""
+    """A random field: waves whose lengths are about `length_mm`; each amplitude forgets itself in
+    `memory_s`.
+    """
 
     rms: float
     length_mm: float
@@ -57,7 +68,10 @@ class Waves:
         k = self._random.normal(0, 2 * math.pi / self.length_mm / 2, (self.count, 2))
         self._amplitude = self._random.normal(size=(2, self.count))
         self._nodes_mm, self._step_mm = np.linspace(
-            -self.reach_mm, self.reach_mm, 1 + math.ceil(20 * self.reach_mm / self.length_mm), retstep=True
+            -self.reach_mm,
+            self.reach_mm,
+            1 + math.ceil(20 * self.reach_mm / self.length_mm),
+            retstep=True,
         )
         x, y = np.meshgrid(self._nodes_mm, self._nodes_mm)
         angle = np.multiply.outer(k[:, 0], x) + np.multiply.outer(k[:, 1], y)
@@ -130,18 +144,29 @@ class CrossedWorld:
 
     def sag_um(self, t: Any) -> Any:
         """Without the vibrations."""
-        return 1e3 * self.sag_mm + self.drift_um_per_s * t + self.swing_um * np.sin(0.7 * t + self._phase[0])
+        return (
+            1e3 * self.sag_mm
+            + self.drift_um_per_s * t
+            + self.swing_um * np.sin(0.7 * t + self._phase[0])
+        )
 
     def film_mm(self, x: Array, y: Array, t: Any) -> Array:
-        """Height above the vertex of the film without vibrations, and these; `t` is one time or that of each row."""
+        """Height above the vertex of the film without vibrations, and these; `t` is one time or
+        that of each row.
+        """
         u, v = x / RADIUS_MM, y / RADIUS_MM
         q = u * u + v * v
         bowl = q * (1.075 - 0.06 * q - 0.015 * q * q)
         swing = [
-            1e-3 * self.shimmer_um * np.sin(w * t + p) for w, p in zip((1.3, 2.1, 0.9), self._phase[1:], strict=True)
+            1e-3 * self.shimmer_um * np.sin(w * t + p)
+            for w, p in zip((1.3, 2.1, 0.9), self._phase[1:], strict=True)
         ]
         out = 1e-3 * self.sag_um(t) * bowl + (self.astigmatism_mm[0] + swing[0]) * (u * u - v * v)
-        out = out + (self.astigmatism_mm[1] + swing[1]) * 2 * u * v + (self.coma_mm + swing[2]) * u * (3 * q - 2)
+        out = (
+            out
+            + (self.astigmatism_mm[1] + swing[1]) * 2 * u * v
+            + (self.coma_mm + swing[2]) * u * (3 * q - 2)
+        )
         out = out + self.ripple_mm * np.cos(self.ripple_waves[0] * u + self.ripple_waves[1] * v)
         for k, (hz, lobes, _) in enumerate(DRUM if self.drum_nm else ()):
             part = np.polyval(_BESSEL[k], q) * (1.0, u, u * u - v * v)[lobes]
@@ -162,12 +187,17 @@ class CrossedWorld:
         """
         now = float(np.mean(t))
         alpha = math.radians(self.alpha_deg)
-        pinhole = (self.a_mm + 0.060 * self.kelvin_at(now)) * np.array([math.cos(alpha), 0.0, math.sin(alpha)])
+        pinhole = (self.a_mm + 0.060 * self.kelvin_at(now)) * np.array(
+            [math.cos(alpha), 0.0, math.sin(alpha)]
+        )
         forward = -np.array([math.cos(alpha), 0.0, math.sin(alpha)])
         right, down = np.array([math.sin(alpha), 0.0, -math.cos(alpha)]), np.array([0.0, -1.0, 0.0])
         row, column = np.mgrid[: self.height, : self.width].astype(float)
         scale = self.pixel_um * 1e-3 / self.focal_mm
-        across, along = (column - (self.width - 1) / 2) * scale, (row - (self.height - 1) / 2) * scale
+        across, along = (
+            (column - (self.width - 1) / 2) * scale,
+            (row - (self.height - 1) / 2) * scale,
+        )
         ray = forward + across[..., None] * right + along[..., None] * down
         known = self._height.shape == row.shape
         low, h = self.vertex_z_mm(t), self._height if known else np.zeros(row.shape)
@@ -187,15 +217,24 @@ class CrossedWorld:
         place = np.stack([x, y, low + h], axis=-1)
         far = ((origin - place) @ away) / (back @ away)
         hit = place + far[..., None] * back - origin
-        s_x, s_y = hit @ np.array([-math.sin(alpha), 0.0, -math.cos(alpha)]), hit @ np.array([0.0, 1.0, 0.0])
+        s_x, s_y = (
+            hit @ np.array([-math.sin(alpha), 0.0, -math.cos(alpha)]),
+            hit @ np.array([0.0, 1.0, 0.0]),
+        )
         if self.air_um:
             s_x = s_x + 1e-3 * self._air[0].at(now, x, y)
             s_y = s_y + 1e-3 * self._air[1].at(now, x, y)
         return s_x, s_y, x, y, np.hypot(x, y) <= RADIUS_MM
 
     def frame(self, t: float, pattern: Any, gain: float = 1.0) -> NDArray[Any]:
-        """What the camera sees of a pattern, a function of s_x and s_y from the low edge that gives 0 to 1."""
-        rows = t + self.rolling_s * np.linspace(-0.5, 0.5, self.height)[:, None] if self.rolling_s else t
+        """What the camera sees of a pattern, a function of s_x and s_y from the low edge that gives
+        0 to 1.
+        """
+        rows = (
+            t + self.rolling_s * np.linspace(-0.5, 0.5, self.height)[:, None]
+            if self.rolling_s
+            else t
+        )
         s_x, s_y, x, y, inside = self.trace(rows)
         level = np.clip(pattern(s_x + self.side_mm / 2, s_y + self.side_mm / 2), 0, 1)
         lit = level + self.bend * np.sin(math.pi * level) ** 2
@@ -206,39 +245,54 @@ class CrossedWorld:
         if self._dust.shape != x.shape:
             self._dust = np.ones(x.shape)
             for spot_x, spot_y in self._spots:
-                self._dust *= 1 - 0.6 * np.exp(-((x - spot_x) ** 2 + (y - spot_y) ** 2) / (2 * 6.0**2))
+                self._dust *= 1 - 0.6 * np.exp(
+                    -((x - spot_x) ** 2 + (y - spot_y) ** 2) / (2 * 6.0**2)
+                )
         lit = lit * self._dust * self._backlight(rows)
         room = self.ambient_adu * (1 + 0.3 * x / RADIUS_MM + 0.2 * math.sin(0.05 * t))
         corner = 1 - 0.1 * (x**2 + y**2) / RADIUS_MM**2
         counts = 5 + np.where(inside, room + 190 * gain * lit * corner, 0.0)
         counts += self._random.normal(0, self.noise_adu, counts.shape)
         full = 2**self.bits - 1
-        return np.asarray(np.rint(counts * full / 255).clip(0, full), np.uint8 if self.bits == 8 else np.uint16)
+        return np.asarray(
+            np.rint(counts * full / 255).clip(0, full), np.uint8 if self.bits == 8 else np.uint16
+        )
 
     def _backlight(self, t: Any) -> Any:
         """Light of an exposure whose middle is `t`, over the mean."""
         if not self.backlight_hz:
             return 1.0
         begin, end = (self.backlight_hz * (t + side * EXPOSURE_S / 2) for side in (-1, 1))
-        lit = [np.floor(turns) * DUTY + np.minimum(turns - np.floor(turns), DUTY) for turns in (begin, end)]
+        lit = [
+            np.floor(turns) * DUTY + np.minimum(turns - np.floor(turns), DUTY)
+            for turns in (begin, end)
+        ]
         return (lit[1] - lit[0]) / (DUTY * self.backlight_hz * EXPOSURE_S)
 
     def move_dust(self) -> None:
         self._spots = self._random.uniform(-0.9, 0.9, (self.dust, 2)) * RADIUS_MM
         self._dust = np.ones((0, 0))
 
-    def crossed(self, t: float, shift_x: float = 0.0, shift_y: float = 0.0, gain: float = 1.0) -> NDArray[Any]:
+    def crossed(
+        self, t: float, shift_x: float = 0.0, shift_y: float = 0.0, gain: float = 1.0
+    ) -> NDArray[Any]:
         """A frame of the crossed pattern, which has been shown since the frame before."""
         rate = 2 * math.pi * self.crossed_periods / self.side_mm
         keep = math.exp(-(t - self._shown_s) / self.sticking_s)
-        self._burnt, self._shown_s = keep * self._burnt + (1 - keep) * np.exp([1j * shift_x, 1j * shift_y]), t
+        self._burnt, self._shown_s = (
+            keep * self._burnt + (1 - keep) * np.exp([1j * shift_x, 1j * shift_y]),
+            t,
+        )
 
         def pattern(s_x: Array, s_y: Array) -> Array:
             turns = [rate * s - math.pi for s in (s_x, s_y)]
-            shown = 0.5 + self.contrast * (np.cos(turns[0] + shift_x) + np.cos(turns[1] + shift_y)) / 4
+            shown = (
+                0.5 + self.contrast * (np.cos(turns[0] + shift_x) + np.cos(turns[1] + shift_y)) / 4
+            )
             if self.sticking:
                 stuck = [
-                    self.contrast * np.real(b * np.exp(1j * turn)) for b, turn in zip(self._burnt, turns, strict=True)
+                    self.contrast * np.real(b * np.exp(1j * turn))
+                    for b, turn in zip(self._burnt, turns, strict=True)
                 ]
                 shown = shown * (1 - self.sticking * (0.5 + (stuck[0] + stuck[1]) / 4))
             return np.asarray(shown)
@@ -249,7 +303,11 @@ class CrossedWorld:
         """The reading of a row, against the film at rest."""
         if math.isnan(self.laser_um):
             return {}
-        return {"displacement_um": float(self.sag_um(t) - 1e3 * self.sag_mm + self._random.normal(0, self.laser_um))}
+        return {
+            "displacement_um": float(
+                self.sag_um(t) - 1e3 * self.sag_mm + self._random.normal(0, self.laser_um)
+            )
+        }
 
     def _table(self, kind: str) -> dict[str, Any]:
         pattern = {"steps": 4, "periods": PERIODS, "period_mm": self.side_mm / PERIODS}
@@ -266,17 +324,28 @@ class CrossedWorld:
         table = self._table("full")
         table["geometry"] = {"a_mm": self.a_mm, "b_mm": self.b_mm, "alpha_deg": self.alpha_deg}
         table["camera"] = {
-            "width_px": self.width, "height_px": self.height, "focal_mm": self.focal_mm, "pixel_um": self.pixel_um,
-            "noise_adu": self.noise_adu * (2**self.bits - 1) / 255, "bits": self.bits,
-        }  # fmt: skip
+            "width_px": self.width,
+            "height_px": self.height,
+            "focal_mm": self.focal_mm,
+            "pixel_um": self.pixel_um,
+            "noise_adu": self.noise_adu * (2**self.bits - 1) / 255,
+            "bits": self.bits,
+        }
         table["mirror"] = {"radius_mm": RADIUS_MM, "analysis_radius_mm": 475.0}
         table["frames"] = rows
         (folder / "capture.toml").write_text(tomli_w.dumps(table))
 
     def write_track(
-        self, folder: Path, times: Array, step_every_s: float = 10.0, dust_every: int = 25, first_steps: int = 5
+        self,
+        folder: Path,
+        times: Array,
+        step_every_s: float = 10.0,
+        dust_every: int = 25,
+        first_steps: int = 5,
     ) -> None:
-        """Write a tracking set beside `full`: first steps, then a pattern that stands still from step to step."""
+        """Write a tracking set beside `full`: first steps, then a pattern that stands still from
+        step to step.
+        """
         folder.mkdir(parents=True)
         rows, step, stepped_s = [], -1, -math.inf
         for k, t in enumerate(times):
@@ -286,15 +355,22 @@ class CrossedWorld:
                 step, stepped_s = step + 1, float(t)
             shift_x, shift_y = 2 * math.pi * (step % 5) / 5, 2 * math.pi * (2 * step % 5) / 5
             cv2.imwrite(str(folder / f"t{k}.png"), self.crossed(float(t), shift_x, shift_y))
-            rows.append({
-                "file": f"t{k}.png", "role": "crossed", "shift_x_rad": shift_x, "shift_y_rad": shift_y,
-                "time_s": float(t), **self._laser(float(t)),
-            })  # fmt: skip
+            rows.append(
+                {
+                    "file": f"t{k}.png",
+                    "role": "crossed",
+                    "shift_x_rad": shift_x,
+                    "shift_y_rad": shift_y,
+                    "time_s": float(t),
+                    **self._laser(float(t)),
+                }
+            )
         table = self._table("track") | {"reference": "../full", "frames": rows}
         table["pattern"]["crossed"] = {
-            "periods": self.crossed_periods, "period_mm": self.side_mm / self.crossed_periods,
+            "periods": self.crossed_periods,
+            "period_mm": self.side_mm / self.crossed_periods,
             "contrast": self.contrast,
-        }  # fmt: skip
+        }
         (folder / "capture.toml").write_text(tomli_w.dumps(table))
 
     def height_um(self, t: float, x: Array, y: Array) -> Array:
@@ -314,7 +390,9 @@ def _full(period_mm: float) -> Any:
         for k in range(4):
 
             def wave(s_x: Array, s_y: Array, k: int = k, along: Any = along) -> Array:
-                return np.asarray(0.5 + 0.5 * np.cos(rate * along(s_x, s_y) - math.pi + k * math.pi / 2))
+                return np.asarray(
+                    0.5 + 0.5 * np.cos(rate * along(s_x, s_y) - math.pi + k * math.pi / 2)
+                )
 
             yield f"{axis}{k}", {"role": "sin", "axis": axis, "index": k}, wave
         for bit in range(1, 5):

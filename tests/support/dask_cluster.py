@@ -26,7 +26,9 @@ def cluster(folder: Path) -> Iterator[str]:
     script = folder / "cluster.py"
     script.write_text(CLUSTER)
     pipes = {"stdin": subprocess.PIPE, "stdout": subprocess.PIPE}
-    with subprocess.Popen([sys.executable, script], text=True, env=os.environ | PATIENT, **pipes) as process:
+    with subprocess.Popen(
+        [sys.executable, script], text=True, env=os.environ | PATIENT, **pipes
+    ) as process:
         assert process.stdout is not None
         assert process.stdin is not None
         try:

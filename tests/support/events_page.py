@@ -1,4 +1,6 @@
-"""docs/events.md, made from the classes of events: `python -m tests.support.events_page [--check]`."""
+"""docs/events.md, made from the classes of events: `python -m
+tests.support.events_page [--check]`.
+"""
 
 import argparse
 import inspect
@@ -32,7 +34,7 @@ one, or its keys. The sentence is what console, page, timeline, report and alarm
 out if one of its keys has no value.
 
 *Notice*: the alarm that the event raises (+) or ends (-); some kinds do either, depending on their keys. Displays
-list a notice until it ends. [Operations](operations.md) has what to do about each.""".splitlines()
+list a notice until it ends. [Operations](operations.md) has what to do about each.""".splitlines()  # noqa: E501
 
 
 def events_page() -> str:
@@ -47,13 +49,17 @@ def events_page() -> str:
             "|---|---|---|---|---|---|",
         ]
         kinds = {kind: cls for kind, cls in KINDS.items() if cls.__module__ == module.__name__}
-        lines += [_row(kind, cls) for kind, cls in sorted(kinds.items()) if kind not in _NOT_RECORDED]
+        lines += [
+            _row(kind, cls) for kind, cls in sorted(kinds.items()) if kind not in _NOT_RECORDED
+        ]
     return "\n".join([*lines, ""])
 
 
 def _row(kind: str, cls: type[Event]) -> str:
     meaning = (inspect.getdoc(cls) or "").split("\n\n")[0].replace("\n", " ")
-    keys = ", ".join(_describe_key(key, field.type, field.default is MISSING) for field, key in cls.keys)
+    keys = ", ".join(
+        _describe_key(key, field.type, field.default is MISSING) for field, key in cls.keys
+    )
     level = "by its keys" if "level" in vars(cls) else cls._level.value
     notices = [f"+`{_name_alarm(topic)}`" for topic in cls.opens] + [
         f"-`{_name_alarm(topic)}`" for topic in cls.closes
@@ -83,8 +89,12 @@ def _name_alarm(topic: Topic) -> str:
 
 def main(arguments: list[str] | None = None) -> int:
     """Write the page, or say that it is out of date; returns the exit code."""
-    parser = argparse.ArgumentParser(prog="python -m tests.support.events_page", description=__doc__)
-    parser.add_argument("--check", action="store_true", help="write nothing; exit with 1 if the page is out of date")
+    parser = argparse.ArgumentParser(
+        prog="python -m tests.support.events_page", description=__doc__
+    )
+    parser.add_argument(
+        "--check", action="store_true", help="write nothing; exit with 1 if the page is out of date"
+    )
     check = parser.parse_args(arguments).check
     text = events_page()
     if PAGE.exists() and PAGE.read_text(encoding="utf-8") == text:

@@ -1,8 +1,9 @@
 """Slopes and paraboloid of a facet from positions on the screen, in the facet's own frame.
 
-Where a camera ray meets the facet depends on the shape, and the slope there on where: the paraboloid of the last
-round places the points of the next. The facet's pose from its corners is good to a few hundredths of a degree only,
-much coarser than its slopes, so camera and screen are turned about the vertex until the fitted normal there is z.
+Where a camera ray meets the facet depends on the shape, and the slope there on where: the
+paraboloid of the last round places the points of the next. The facet's pose from its corners is
+good to a few hundredths of a degree only, much coarser than its slopes, so camera and screen are
+turned about the vertex until the fitted normal there is z.
 """
 
 from __future__ import annotations
@@ -16,18 +17,21 @@ from numpy.typing import NDArray
 
 from membrane_ctrl.metrology.optics.geometry import Geometry
 
-# A general paraboloid from slopes: plain least squares, or robust against glints, dust and turned-down edges.
+# A general paraboloid from slopes: plain least squares, or robust against glints, dust and
+# turned-down edges.
 #
-# h = t_x x + t_y y + (c_xx x^2 + 2 c_xy x y + c_yy y^2) / 2 has slopes that are linear in its five parameters,
+# h = t_x x + t_y y + (c_xx x^2 + 2 c_xy x y + c_yy y^2) / 2 has slopes that are linear in its five
+# parameters,
 #
 #     dh/dx = t_x + c_xx x + c_xy y,      dh/dy = t_y + c_xy x + c_yy y.
 #
-# Both slopes share c_xy: a surface that exists. (Fitting each slope by itself and averaging the two c_xy afterwards
-# is nearly the same, and throws the integrability away as a check.) The focal length along x is 1 / (2 c_xx).
+# Both slopes share c_xy: a surface that exists. (Fitting each slope by itself and averaging the two
+# c_xy afterwards is nearly the same, and throws the integrability away as a check.) The focal
+# length along x is 1 / (2 c_xx).
 #
-# Robust: iteratively reweighted least squares. Each slope component has a weight of its own from its residual in
-# units of its axis' spread, 1.4826 median |r| (Tukey: Beaton & Tukey 1974, 4.685; Huber 1964, 1.345; both tuned to
-# 95 % efficiency on Gaussian noise).
+# Robust: iteratively reweighted least squares. Each slope component has a weight of its own from
+# its residual in units of its axis' spread, 1.4826 median |r| (Tukey: Beaton & Tukey 1974, 4.685;
+# Huber 1964, 1.345; both tuned to 95 % efficiency on Gaussian noise).
 
 
 FloatArray = NDArray[np.float64]
@@ -37,7 +41,8 @@ _MAD_TO_SIGMA = 1.4826  # of a Gaussian
 _TUKEY = 4.685
 _HUBER = 1.345
 _MAX_ITERATIONS = 200
-_TOLERANCE = 1e-10  # of the largest parameter: 10 nm in a focal length of 100 m, far below what any noise allows
+# of the largest parameter: 10 nm in a focal length of 100 m, far below what any noise allows
+_TOLERANCE = 1e-10
 
 
 @dataclass(frozen=True)
@@ -75,11 +80,16 @@ class Paraboloid:
     def intersect(self, origin_mm: FloatArray, rays: FloatArray) -> FloatArray:
         """Points (3, N) where rays (3, N) from one origin (3,) first meet the surface.
 
-        With d(t) = z - h along the ray a quadratic a t^2 + b t + c, t = 2 c / (-b + sqrt(b^2 - 4 a c)): the form
-        that loses no digits when a, the curvature along the ray, is nearly 0. NaN where a ray misses.
+        With d(t) = z - h along the ray a quadratic a t^2 + b t + c, t = 2 c / (-b + sqrt(b^2 - 4 a
+        c)): the form that loses no digits when a, the curvature along the ray, is nearly 0. NaN
+        where a ray misses.
         """
         (x, y, z), (u, v, w) = origin_mm, rays
-        k_xx, k_xy, k_yy = self.curvature_xx_per_mm, self.curvature_xy_per_mm, self.curvature_yy_per_mm
+        k_xx, k_xy, k_yy = (
+            self.curvature_xx_per_mm,
+            self.curvature_xy_per_mm,
+            self.curvature_yy_per_mm,
+        )
         a = -(k_xx * u**2 + 2 * k_xy * u * v + k_yy * v**2) / 2
         slope_x, slope_y = self.slopes(np.asarray(x), np.asarray(y))
         b = w - slope_x * u - slope_y * v
@@ -106,17 +116,22 @@ class ParaboloidFit:
     weights: FloatArray
 
 
-def fit_slopes(x_mm: FloatArray, y_mm: FloatArray, slopes: FloatArray, loss: Loss = "squares") -> ParaboloidFit:
+def fit_slopes(
+    x_mm: FloatArray, y_mm: FloatArray, slopes: FloatArray, loss: Loss = "squares"
+) -> ParaboloidFit:
     """Fit a paraboloid to slopes (2, N) measured at points (N,).
 
     Raises
     ------
     ValueError
-        If a number is not finite, the points do not determine a paraboloid, or the weights do not settle.
+        If a number is not finite, the points do not determine a paraboloid, or the weights do not
+        settle.
     """
     if not (np.isfinite(slopes).all() and np.isfinite(x_mm).all() and np.isfinite(y_mm).all()):
         raise ValueError("slopes or points that are not finite")
-    scale_mm = float(np.max(np.abs([x_mm, y_mm]), initial=0.0)) or 1.0  # columns of like size: a sound condition
+    scale_mm = (
+        float(np.max(np.abs([x_mm, y_mm]), initial=0.0)) or 1.0
+    )  # columns of like size: a sound condition
     design = _design(x_mm / scale_mm, y_mm / scale_mm)
     weights = np.ones_like(slopes)
     parameters = _solve(design, slopes, weights)
@@ -136,7 +151,9 @@ def fit_slopes(x_mm: FloatArray, y_mm: FloatArray, slopes: FloatArray, loss: Los
 def _design(x: FloatArray, y: FloatArray) -> FloatArray:
     """Derivatives of both slopes with respect to (t_x, t_y, c_xx, c_xy, c_yy), (2, N, 5)."""
     one, zero = np.ones_like(x), np.zeros_like(x)
-    return np.stack([np.stack([one, zero, x, y, zero], axis=1), np.stack([zero, one, zero, x, y], axis=1)])
+    return np.stack(
+        [np.stack([one, zero, x, y, zero], axis=1), np.stack([zero, one, zero, x, y], axis=1)]
+    )
 
 
 def _solve(design: FloatArray, slopes: FloatArray, weights: FloatArray) -> FloatArray:
@@ -204,18 +221,30 @@ class FacetFit:
     slopes: FloatArray
 
 
-def exact_slopes(points_mm: FloatArray, pinhole_mm: FloatArray, screen_points_mm: FloatArray) -> FloatArray:
-    """Slopes (2, N): the normal is the bisector of the rays to the pinhole and to the screen point."""
+def exact_slopes(
+    points_mm: FloatArray, pinhole_mm: FloatArray, screen_points_mm: FloatArray
+) -> FloatArray:
+    """Slopes (2, N): the normal is the bisector of the rays to the
+    pinhole and to the screen point.
+    """
     to_camera = pinhole_mm[:, None] - points_mm
     to_screen = screen_points_mm - points_mm
-    normal = to_camera / np.linalg.norm(to_camera, axis=0) + to_screen / np.linalg.norm(to_screen, axis=0)
+    normal = to_camera / np.linalg.norm(to_camera, axis=0) + to_screen / np.linalg.norm(
+        to_screen, axis=0
+    )
     return np.asarray(-normal[:2] / normal[2])
 
 
-def measure_on(surface: Paraboloid, geometry: Geometry, sight: Sight) -> tuple[FloatArray, FloatArray]:
+def measure_on(
+    surface: Paraboloid, geometry: Geometry, sight: Sight
+) -> tuple[FloatArray, FloatArray]:
     """Points (3, N) where the pixels' rays meet `surface`, and the slopes (2, N) measured there."""
-    points_mm = surface.intersect(geometry.pinhole_mm, geometry.rays(sight.columns_px, sight.rows_px))
-    return points_mm, exact_slopes(points_mm, geometry.pinhole_mm, geometry.screen_points(sight.screen_mm))
+    points_mm = surface.intersect(
+        geometry.pinhole_mm, geometry.rays(sight.columns_px, sight.rows_px)
+    )
+    return points_mm, exact_slopes(
+        points_mm, geometry.pinhole_mm, geometry.screen_points(sight.screen_mm)
+    )
 
 
 def solve_facet(geometry: Geometry, sight: Sight, loss: Loss = "squares") -> FacetFit:
@@ -250,7 +279,9 @@ def turned(geometry: Geometry, rotation: FloatArray) -> Geometry:
 
 
 def _normal_to_z(surface: Paraboloid) -> FloatArray:
-    """The shortest rotation that turns the normal at the vertex to z: I + K + K^2 / (1 + n_z), K = [n x z]."""
+    """The shortest rotation that turns the normal at the vertex to z: I + K + K^2 / (1 + n_z), K =
+    [n x z].
+    """
     normal = np.array([-surface.tilt_x, -surface.tilt_y, 1.0])
     normal /= np.linalg.norm(normal)
     axis_x, axis_y = normal[1], -normal[0]

@@ -1,4 +1,6 @@
-"""docs/faults.md and the alarms of docs/operations.md, made from the safety table: `python -m ... [--check]`."""
+"""docs/faults.md and the alarms of docs/operations.md, made from the safety table: `python -m ...
+[--check]`.
+"""
 
 import argparse
 import sys
@@ -59,22 +61,34 @@ def faults_page() -> str:
     lines = [
         "# Faults",
         "",
-        "Generated from `membrane_ctrl/controller/safety.py` (`make generate`). The tests of these rules are in the",
-        "[fault matrix](fault-matrix.md) and, for faulty sensors, in [sensor faults](sensor-faults.md); the remedies",
+        "Generated from `membrane_ctrl/controller/safety.py` (`make generate`). The tests of "
+        "these rules are in the",
+        "[fault matrix](fault-matrix.md) and, for faulty sensors, in [sensor "
+        "faults](sensor-faults.md); the remedies",
         "are in [operations](operations.md).",
         "",
-        "A rule trips when `needed` of the last `window` ticks show its cause; ticks without the value that the",
-        "rule judges do not count. If several rules trip together, the one with the deepest safe level wins; the",
-        "first cause of a fault is the one reported. Every level below `hold_flow` latches: the state is `fault`",
-        "until a person acknowledges it, or until the cause has been absent for `resume.wait_s`, provided that",
-        "the rule's name is in `resume.faults` and the day's `resume.most_per_day` is not used up. A fault that",
-        "vented the mirror, a board fault other than its watchdog's trip, an open interlock, and a person's lock",
-        "never resume automatically; one of them seen during a fault decides for the whole fault. `resume.faults`",
+        "A rule trips when `needed` of the last `window` ticks show its cause; ticks without "
+        "the value that the",
+        "rule judges do not count. If several rules trip together, the one with the deepest "
+        "safe level wins; the",
+        "first cause of a fault is the one reported. Every level below `hold_flow` latches: "
+        "the state is `fault`",
+        "until a person acknowledges it, or until the cause has been absent for "
+        "`resume.wait_s`, provided that",
+        "the rule's name is in `resume.faults` and the day's `resume.most_per_day` is not "
+        "used up. A fault that",
+        "vented the mirror, a board fault other than its watchdog's trip, an open interlock, "
+        "and a person's lock",
+        "never resume automatically; one of them seen during a fault decides for the whole "
+        "fault. `resume.faults`",
         "accepts only the names of faults that may resume.",
         "",
-        "A new rule is a row of the table, and the field or property of `Observation` that it judges. This page, the",
-        "runbook, the list of the fault matrix and a [mutant](mutants.md) that never trips follow from it. An",
-        "observation that shows its cause (`tests/controller/test_safety.py`) and the constraint that it enforces",
+        "A new rule is a row of the table, and the field or property of `Observation` that "
+        "it judges. This page, the",
+        "runbook, the list of the fault matrix and a [mutant](mutants.md) that never trips "
+        "follow from it. An",
+        "observation that shows its cause (`tests/controller/test_safety.py`) and the "
+        "constraint that it enforces",
         "([safety case](safety-case.md)) are written by hand: CI fails without them.",
         "",
         "## Safe levels",
@@ -95,7 +109,8 @@ def faults_page() -> str:
         "",
         "## Rules",
         "",
-        "| code | name | cause | needed / window | limit | enters | latches | may resume | judged in |",
+        "| code | name | cause | needed / window | limit | enters | latches | may resume | "
+        "judged in |",
     ]
     lines += ["|---|---|---|---|---|---|---|---|---|"]
     lines += [_row(rule) for rule in sorted(TABLE, key=lambda rule: rule.code)]
@@ -114,23 +129,34 @@ def _protections() -> list[str]:
         "",
         "## What protects the mirror in each process value and state",
         "",
-        "Whatever the loop holds (`estimator.process_value`), each duty is fulfilled wherever gas can move. Numbers",
-        "are rules of the table above, letters the guards below; each acts by itself. A dash: two sensors against",
-        "one need a third sensor and a film near its working point, excess gas needs a mirror that is held. Gains",
+        "Whatever the loop holds (`estimator.process_value`), each duty is fulfilled "
+        "wherever gas can move. Numbers",
+        "are rules of the table above, letters the guards below; each acts by itself. A "
+        "dash: two sensors against",
+        "one need a third sensor and a film near its working point, excess gas needs a "
+        "mirror that is held. Gains",
         "and a pump curve on trial change nothing here. (`membrane_ctrl/controller/protection.py`)",
         "",
     ]
     lines += [f"- **{letter}**: {guard.value}" for guard, letter in _LETTERS.items()]
     for value in ProcessValue:
-        lines += ["", f"`{value.value}`:", "", "| duty | " + " | ".join(a.value for a in Activity) + " |"]
+        lines += [
+            "",
+            f"`{value.value}`:",
+            "",
+            "| duty | " + " | ".join(a.value for a in Activity) + " |",
+        ]
         lines += ["|---|" + "---|" * len(Activity)]
         lines += [
-            f"| {duty.value} | " + " | ".join(_keepers(value, activity, duty) for activity in Activity) + " |"
+            f"| {duty.value} | "
+            + " | ".join(_keepers(value, activity, duty) for activity in Activity)
+            + " |"
             for duty in Duty
         ]
     lines += [
         "",
-        "How far the true centre can be off when one sensor of the film fails, with the default limits, and which",
+        "How far the true centre can be off when one sensor of the film fails, with the "
+        "default limits, and which",
         "other sensor bounds it. [Protection](protection.md) has what the campaign measured.",
         "",
         "| process value | failed | " + " | ".join(failure.value for failure in Failure) + " |",
@@ -140,7 +166,9 @@ def _protections() -> list[str]:
         for sensor in FilmSensor:
             if value is not ProcessValue.OPTICS or sensor is not FilmSensor.LASER:
                 cells = (find_bound(value, sensor, failure, Config()) for failure in Failure)
-                bounds = " | ".join(f"{bound.distance_um:.0f} µm ({bound.sensor.value})" for bound in cells)
+                bounds = " | ".join(
+                    f"{bound.distance_um:.0f} µm ({bound.sensor.value})" for bound in cells
+                )
                 lines.append(f"| {value.value} | {sensor.value} | {bounds} |")
     return lines
 
@@ -178,7 +206,9 @@ def _limit(limit: str) -> str:
 def alarms() -> str:
     """Every alarm with its remedy, as Markdown."""
     lines = [_BEGIN, "", "| alarm | what it means | what to do |", "|---|---|---|"]
-    lines += [f"| {rule.code} `{rule.name}` | {rule.cause} | {rule.remedy} |" for rule in _by_urgency()]
+    lines += [
+        f"| {rule.code} `{rule.name}` | {rule.cause} | {rule.remedy} |" for rule in _by_urgency()
+    ]
     return "\n".join([*lines, "", _END])
 
 
@@ -194,8 +224,12 @@ def operations_page(text: str) -> str:
 
 def main(arguments: list[str] | None = None) -> int:
     """Write the pages, or say which are out of date; returns the exit code."""
-    parser = argparse.ArgumentParser(prog="python -m tests.support.faults_page", description=__doc__)
-    parser.add_argument("--check", action="store_true", help="write nothing; exit with 1 when a page is out of date")
+    parser = argparse.ArgumentParser(
+        prog="python -m tests.support.faults_page", description=__doc__
+    )
+    parser.add_argument(
+        "--check", action="store_true", help="write nothing; exit with 1 when a page is out of date"
+    )
     check = parser.parse_args(arguments).check
     stale = False
     for path, text in (
@@ -206,7 +240,9 @@ def main(arguments: list[str] | None = None) -> int:
             continue
         stale = True
         if check:
-            print(f"{path} is out of date: run python -m tests.support.faults_page", file=sys.stderr)
+            print(
+                f"{path} is out of date: run python -m tests.support.faults_page", file=sys.stderr
+            )
         else:
             path.write_text(text, encoding="utf-8")
     return 1 if check and stale else 0

@@ -22,7 +22,8 @@ class Faults:
     exception_code: int = 0  # every request gets this Modbus exception and is not executed; 0: off
     map_version: int = 0  # the map version that the board reports; 0: the true one
     hang_up: bool = False  # the connection is dropped at every request
-    short_reply: bool = False  # answers to reads have one register too few, in an otherwise correct frame
+    # answers to reads have one register too few, in an otherwise correct frame
+    short_reply: bool = False
     wrong_function: bool = False  # answers have function code 23 instead of 3, and 6 instead of 16
     wrong_transaction: bool = False  # answers carry another transaction id
 

@@ -21,8 +21,8 @@ class SerialFaults:
     # delay of answers; beyond the asker's time-out the reply is late. Answers keep their order
     delay_s: float = 0.0
     garbage_bytes: int = 0  # so many random bytes instead of each answer
-    # so many bits of each answer are flipped. On a line with parity, a byte with an odd number of them is dropped, as
-    # the receiver does
+    # so many bits of each answer are flipped. On a line with parity, a byte with an odd number of
+    # them is dropped, as the receiver does
     bit_errors: int = 0
     question_bit_errors: int = 0  # so many bits of each question are flipped
     cut_bytes: int = 0  # so many bytes are missing at the end of each answer
@@ -81,7 +81,9 @@ class KeyenceDlRs1aEmulator(SerialDevice, lasers.KeyenceDlRs1aEmulator):
 
 
 class Optoncdt1420Emulator(SerialDevice, lasers.Optoncdt1420Emulator):
-    """With noise of a single value; one byte in `lose_bytes_every` is lost from the stream (0: none)."""
+    """With noise of a single value; one byte in `lose_bytes_every` is lost from the stream (0:
+    none).
+    """
 
     lose_bytes_every = 0
 
@@ -115,7 +117,9 @@ class ProparDevice(SerialDevice, pumps.ProparDevice):
 
 
 class RtuBusEmulator(SerialDevice, modbus_server.RtuBusEmulator):
-    """A bus whose answers carry the next unit id, the next function code, or an exception (0: off)."""
+    """A bus whose answers carry the next unit id, the next function code, or an exception (0:
+    off).
+    """
 
     wrong_unit = wrong_function = False
     exception_code = 0

@@ -1,8 +1,9 @@
 """A GigE Vision camera on loopback whose pixels come from a Python function.
 
-Discovery, control channel, GenICam description and packet stream are those of aravis' own `ArvGvFakeCamera`, hosted
-in this process; the picture, the size of the sensor and the list of pixel formats are ours. Faults are switched on
-while it runs: packets are lost, it is unplugged and plugged in again.
+Discovery, control channel, GenICam description and packet stream are those of aravis' own
+`ArvGvFakeCamera`, hosted in this process; the picture, the size of the sensor and the list of pixel
+formats are ours. Faults are switched on while it runs: packets are lost, it is unplugged and
+plugged in again.
 """
 
 from __future__ import annotations
@@ -45,12 +46,13 @@ class GigeCameraEmulator:
     Parameters
     ----------
     expose : callable
-        (exposure_ms, gain) -> (height, width) pixels, uint8 or uint16; called from the camera's own thread at every
-        exposure. An exception is kept in `error`, and the frame is black.
+        (exposure_ms, gain) -> (height, width) pixels, uint8 or uint16; called from the camera's own
+        thread at every exposure. An exception is kept in `error`, and the frame is black.
     width_px, height_px : int
         Size of the sensor.
     address : str
-        Of a network interface of this machine; one camera each (`ip addr add 127.0.0.2/8 dev lo` makes another).
+        Of a network interface of this machine; one camera each (`ip addr add 127.0.0.2/8 dev lo`
+        makes another).
     serial : str
         Its serial number.
 
@@ -93,12 +95,17 @@ class GigeCameraEmulator:
             file.write(_description())
             file.flush()
             made = call(
-                "arv_gv_fake_camera_new_full", self._address.encode(), self._serial.encode(), file.name.encode()
+                "arv_gv_fake_camera_new_full",
+                self._address.encode(),
+                self._serial.encode(),
+                file.name.encode(),
             )
         self._camera = made
         if not call("arv_gv_fake_camera_is_running", made):
             self.unplug()
-            raise LinkError(f"emulated camera: no network interface has the address {self._address}")
+            raise LinkError(
+                f"emulated camera: no network interface has the address {self._address}"
+            )
         self._inner = inner = call("arv_gv_fake_camera_get_fake_camera", made)
         width_px, height_px = self._size
         for register, value in (
@@ -117,7 +124,9 @@ class GigeCameraEmulator:
             try:
                 probe.bind((self._address, _GVCP_PORT))
             except OSError as error:
-                raise LinkError(f"emulated camera: {self._address} port {_GVCP_PORT}: {error.strerror}") from None
+                raise LinkError(
+                    f"emulated camera: {self._address} port {_GVCP_PORT}: {error.strerror}"
+                ) from None
 
     def unplug(self) -> None:
         """Vanish, with all settings and the controlling client."""
@@ -137,7 +146,9 @@ class GigeCameraEmulator:
     def __exit__(self, *error: object) -> None:
         self.unplug()
 
-    def _fill_buffer(self, buffer: int, _: Any, exposure_us: int, gain: int, pixel_format: int) -> None:
+    def _fill_buffer(
+        self, buffer: int, _: Any, exposure_us: int, gain: int, pixel_format: int
+    ) -> None:
         self.exposures += 1
         over_s = time.monotonic() + exposure_us / 1e6
         # the buffer does not know its size before it is filled
@@ -156,9 +167,11 @@ class GigeCameraEmulator:
 def gige_camera(
     expose: Callable[[float, int], Pixels], width_px: int, height_px: int
 ) -> Iterator[GigeCameraEmulator]:
-    """A camera that is plugged in, for a test; waits until other tests of this machine have unplugged theirs.
+    """A camera that is plugged in, for a test; waits until other tests of this machine have
+    unplugged theirs.
 
-    The test is skipped where the library is missing, or where another program has the standard's one port.
+    The test is skipped where the library is missing, or where another program has the standard's
+    one port.
     """
     require("aravis")
     with _PORT_LOCK.open("w") as lock:
@@ -182,5 +195,7 @@ def _description() -> str:
     start = library.call("arv_fake_camera_get_genicam_xml", camera, ctypes.byref(size))
     xml = ctypes.string_at(start, size.value).decode()
     library.call("g_object_unref", camera)
-    extra = "".join(_XML_FORMAT.format(name=name, value=PIXEL_FORMATS[name]) for name in ("Mono10", "Mono12"))
+    extra = "".join(
+        _XML_FORMAT.format(name=name, value=PIXEL_FORMATS[name]) for name in ("Mono10", "Mono12")
+    )
     return xml.replace(_XML_LAST_FORMAT, extra + _XML_LAST_FORMAT)

@@ -13,7 +13,8 @@ from membrane_ctrl.model import errors
 from membrane_ctrl.replay.replay import Decision, recorded_ticks, replay, unmatched
 from membrane_ctrl.run_files import inputs_file
 
-# A decision may come this much earlier or later after a change of the control code, and still be the same one.
+# A decision may come this much earlier or later after a change of the control code, and still be
+# the same one.
 _SLACK_S = 1.0
 
 

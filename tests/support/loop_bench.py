@@ -1,4 +1,6 @@
-"""The virtual bench as the supervisor's: whoever asks it something finds it at the event loop's time."""
+"""The virtual bench as the supervisor's: whoever asks it something finds it at the event loop's
+time.
+"""
 
 import asyncio
 

@@ -1,7 +1,8 @@
 """What some tests need of the machine: programs, libraries and drivers that pip does not install.
 
-The table names each with the package of Debian that brings it. A test of which a need is missing is skipped, and the
-reason names both. Python packages are in the extra `dev`, so that every test may import them.
+The table names each with the package of Debian that brings it. A test of which a need is missing is
+skipped, and the reason names both. Python packages are in the extra `dev`, so that every test may
+import them.
 """
 
 from __future__ import annotations

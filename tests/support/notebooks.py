@@ -1,4 +1,6 @@
-"""Runs docs/notebooks; `python -m tests.support.notebooks [NAME...]` also stores what they print and draw."""
+"""Runs docs/notebooks; `python -m tests.support.notebooks [NAME...]` also stores what they print
+and draw.
+"""
 
 from __future__ import annotations
 
@@ -20,7 +22,9 @@ _TIMEOUT_S = 600
 
 
 def executed(name: str, scratch: Path) -> nbformat.NotebookNode:
-    """The notebook with new outputs, run by a kernel of its own in an empty folder with a run in `logs`."""
+    """The notebook with new outputs, run by a kernel of its own in an empty folder with a run in
+    `logs`.
+    """
     events = [
         Planted("pressure step", 1500.0, 20.0),
         Planted(GLITCH, 2200.0, 8.0),
@@ -31,7 +35,10 @@ def executed(name: str, scratch: Path) -> nbformat.NotebookNode:
     notebook = nbformat.read(FOLDER / f"{name}.ipynb", as_version=4)
     environment = {name: value for name, value in os.environ.items() if name != "RUN"}
     client = NotebookClient(
-        notebook, timeout=_TIMEOUT_S, resources={"metadata": {"path": str(scratch)}}, record_timing=False
+        notebook,
+        timeout=_TIMEOUT_S,
+        resources={"metadata": {"path": str(scratch)}},
+        record_timing=False,
     )
     manager = client.create_kernel_manager()
     manager.transport, manager.ip = "ipc", str(scratch / "kernel")  # sockets in a folder, no ports

@@ -1,7 +1,8 @@
 """A liquid-crystal panel in front of an emulated camera: refresh, latency and first-order response.
 
-The light of a shown image begins at the first refresh after it was sent, plus a latency, and approaches the image as
-1 - exp(-t / tau). A camera that exposes for a while sees the mean over that while.
+The light of a shown image begins at the first refresh after it was sent, plus a latency, and
+approaches the image as 1 - exp(-t / tau). A camera that exposes for a while sees the mean over that
+while.
 """
 
 from __future__ import annotations
@@ -45,7 +46,9 @@ class EmulatedPanel(Generic[Image]):
         self._shown.append((refresh_s + response.latency_s, image))
 
     def lit(self, exposure_s: float) -> list[tuple[float, Image]]:
-        """Shares of the images in the light of an exposure that begins now; the newest first, their sum is 1."""
+        """Shares of the images in the light of an exposure that begins now; the newest first, their
+        sum is 1.
+        """
         left, shares = 1.0, []
         begin_s = self._now()
         for lights_s, image in reversed(self._shown):

@@ -1,6 +1,7 @@
 """The largest memory that this process has had: the kernel's VmHWM, which it can be made to forget.
 
-`ru_maxrss` of getrusage begins, in a new process, with the peak of the process that started it, and never falls.
+`ru_maxrss` of getrusage begins, in a new process, with the peak of the process that started it, and
+never falls.
 """
 
 from __future__ import annotations

@@ -1,8 +1,9 @@
-"""The pictures of README and documentation, taken anew: `make pictures`, or `python -m tests.support.pictures run-*`.
+"""The pictures of README and documentation, taken anew: `make pictures`, or `python -m
+tests.support.pictures run-*`.
 
-Needs a Vulkan driver (`apt-get install mesa-vulkan-drivers libvulkan1`) and, for report and page, Chromium. Each
-picture is of a run made here: a hold of the twin in real time, a night with planted events, a hold whose laser fails,
-sets of a screen bowed by 1 mm.
+Needs a Vulkan driver (`apt-get install mesa-vulkan-drivers libvulkan1`) and, for report and page,
+Chromium. Each picture is of a run made here: a hold of the twin in real time, a night with planted
+events, a hold whose laser fails, sets of a screen bowed by 1 mm.
 """
 
 from __future__ import annotations
@@ -50,14 +51,20 @@ def run_pictures(folder: Path) -> dict[str, bytes]:
 
 def review_pictures(folder: Path) -> dict[str, bytes]:
     """The tabs of a night's review, and its report."""
-    events = [Planted(DOOR, 2500.0, 20.0), Planted(LEAK, 4700.0, 60.0), Planted(GLITCH, 7000.0, 30.0),
-              Planted(JUMP, 9000.0, 3.0)]  # fmt: skip
+    events = [
+        Planted(DOOR, 2500.0, 20.0),
+        Planted(LEAK, 4700.0, 60.0),
+        Planted(GLITCH, 7000.0, 30.0),
+        Planted(JUMP, 9000.0, 3.0),
+    ]
     night = written(folder, 3.0, events)
     (night / "summary.json").unlink()
     command("repair", night, "--in-place")  # which makes one with all figures
     found = {f"review-{tab}": _tab(folder, night, "--tab", tab) for tab in ("overview", "shape")}
     parts = {"loop": ("--at", "+2500s"), "tuning": ("--from", "+30m", "--to", "+35m")}
-    found |= {f"review-{tab}": _tab(folder, night, "--tab", tab, *part) for tab, part in parts.items()}
+    found |= {
+        f"review-{tab}": _tab(folder, night, "--tab", tab, *part) for tab, part in parts.items()
+    }
     command("report", night, "--out", folder / "report")
     return found | {"report": _page(folder / "report" / "report.html", 800, 3082)}
 
@@ -65,7 +72,9 @@ def review_pictures(folder: Path) -> dict[str, bytes]:
 def catalogue_picture(folder: Path) -> dict[str, bytes]:
     """The table of some nights."""
     for day, hours in ((21, 0.5), (22, 1.0), (23, 0.2)):
-        night = written(folder, hours, [Planted(DOOR, 500.0, 20.0)], day, f"202611{day}T180000Z-night")
+        night = written(
+            folder, hours, [Planted(DOOR, 500.0, 20.0)], day, f"202611{day}T180000Z-night"
+        )
         (night / "summary.json").unlink()
         command("repair", night, "--in-place")
     return {"review-catalogue": _tab(folder, "--all", "--logs", folder)}
@@ -92,10 +101,22 @@ def bowed_picture(folder: Path) -> dict[str, bytes]:
     flat.write_text(f"[geometry]\n{numbers}")
     sets = [folder / str(place) for place in range(5)]
     for place, capture in enumerate(sets):
-        command("simulate", capture, "--config", bowed, "--stated", flat, "--shrink", 2, "--displacement-um",
-                1750 * (place - 2))  # fmt: skip
+        command(
+            "simulate",
+            capture,
+            "--config",
+            bowed,
+            "--stated",
+            flat,
+            "--shrink",
+            2,
+            "--displacement-um",
+            1750 * (place - 2),
+        )
     out = folder / "geometry.toml"
-    refused = subprocess.run([sys.executable, "-m", "membrane_ctrl", "calibrate", *sets, "--out", out], check=False)
+    refused = subprocess.run(
+        [sys.executable, "-m", "membrane_ctrl", "calibrate", *sets, "--out", out], check=False
+    )
     assert refused.returncode == 3
     return {"calibration-bowed-screen": (folder / "geometry-residuals.png").read_bytes()}
 
@@ -137,7 +158,9 @@ async def _page_pictures(folder: Path) -> dict[str, bytes]:
                 await asyncio.sleep(10.0)
                 await tab.value(f"{step}; 0")
                 if step == PRESS.format("LOOK BACK"):
-                    await tab.until("document.querySelector('[role=tabpanel]').innerText.includes('night')")
+                    await tab.until(
+                        "document.querySelector('[role=tabpanel]').innerText.includes('night')"
+                    )
                 if step == PRESS.format("NOW"):
                     await tab.click("bookmarkMark")
                     await tab.until("document.body.innerText.includes('DO IT')")
@@ -158,7 +181,9 @@ async def _fleet_picture(folder: Path, names: list[str], holds: subprocess.Popen
     options = ("--fleet", str(fleet_file(folder, *names)))
     async with served(folder, *options) as link, browser_tab(link, folder / "profile") as tab:
         await asyncio.sleep(220.0)
-        await asyncio.to_thread(command, "ctl", "manual", 1.2, "--socket", folder / "east" / "control.sock")
+        await asyncio.to_thread(
+            command, "ctl", "manual", 1.2, "--socket", folder / "east" / "control.sock"
+        )
         await tab.show_as(1500, 1000, dark=True)
         await asyncio.sleep(20.0)
         assert holds.stdin is not None
@@ -174,9 +199,9 @@ def _tab(folder: Path, *asked: object) -> bytes:
     command("review", *asked, "--screenshot", target)
     picture = cv2.imread(str(target))
     height_px = round(picture.shape[0] * _WIDTH_PX / picture.shape[1])
-    return cv2.imencode(".png", cv2.resize(picture, (_WIDTH_PX, height_px), interpolation=cv2.INTER_AREA))[
-        1
-    ].tobytes()
+    return cv2.imencode(
+        ".png", cv2.resize(picture, (_WIDTH_PX, height_px), interpolation=cv2.INTER_AREA)
+    )[1].tobytes()
 
 
 def _page(page: Path, width_px: int, height_px: int) -> bytes:
@@ -184,9 +209,17 @@ def _page(page: Path, width_px: int, height_px: int) -> bytes:
     if chromium is None:
         sys.exit("no Chromium: apt-get install chromium")
     target = page.with_suffix(".png")
-    options = ["--headless", "--no-sandbox", "--disable-gpu", f"--window-size={width_px},{height_px}",
-               f"--user-data-dir={page.parent / 'profile'}", f"--screenshot={target}"]  # fmt: skip
-    subprocess.run([chromium, *options, page.as_uri()], check=True, capture_output=True, timeout=120)
+    options = [
+        "--headless",
+        "--no-sandbox",
+        "--disable-gpu",
+        f"--window-size={width_px},{height_px}",
+        f"--user-data-dir={page.parent / 'profile'}",
+        f"--screenshot={target}",
+    ]
+    subprocess.run(
+        [chromium, *options, page.as_uri()], check=True, capture_output=True, timeout=120
+    )
     return target.read_bytes()
 
 

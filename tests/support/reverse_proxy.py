@@ -47,7 +47,15 @@ async def reverse_proxy(
         folder=folder, port=port, location=location, target=target, headers=headers, rest=rest
     )
     file = _write_configuration(folder, text)
-    words = [program_path("nginx"), "-p", str(folder), "-e", str(folder / "nginx-errors.txt"), "-c", str(file)]
+    words = [
+        program_path("nginx"),
+        "-p",
+        str(folder),
+        "-e",
+        str(folder / "nginx-errors.txt"),
+        "-c",
+        str(file),
+    ]
     process = await asyncio.create_subprocess_exec(*words)
     try:
         async with asyncio.timeout(_START_S):

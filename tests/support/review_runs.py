@@ -19,7 +19,9 @@ NAME = "20261121T180000Z-night"
 _SYNC_ROWS = 120
 
 
-def written(logs: Path, hours: float, events: list[Planted] | None = None, seed: int = 1, name: str = NAME) -> Path:
+def written(
+    logs: Path, hours: float, events: list[Planted] | None = None, seed: int = 1, name: str = NAME
+) -> Path:
     """A finished run of so many hours."""
     folder = logs / name
     write_run(folder, iter([night(seed, hours, "typical", events or [])]))
@@ -33,7 +35,9 @@ def set_summary(folder: Path, **changes: object) -> None:
 
 
 def segment(folder: Path, rows: Rows) -> Path:
-    """A Rerun segment of telemetry in the folder, as the recorder writes it, a block a second and every tick."""
+    """A Rerun segment of telemetry in the folder, as the recorder writes it, a block a second and
+    every tick.
+    """
     every = CONFIG.recording.model_copy(update={"quiet_hz": CONFIG.loop.rate_hz})
     config = CONFIG.model_copy(update={"recording": every})
     recording = Recording(folder, "night", RunClock.start(), config)

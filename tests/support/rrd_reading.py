@@ -12,7 +12,9 @@ from membrane_ctrl.model.telemetry import COLUMN, FIELDS
 from membrane_ctrl.run_files.streams import STREAMS
 
 
-def scalars(path: Path, entity: str, component: str = "Scalars:scalars") -> tuple[np.ndarray, np.ndarray]:
+def scalars(
+    path: Path, entity: str, component: str = "Scalars:scalars"
+) -> tuple[np.ndarray, np.ndarray]:
     """Times in s of the run (n,) and values (n, m) of one entity, sorted by time."""
     times, values = [], []
     for chunk in reader(path).stream().filter(content=entity):

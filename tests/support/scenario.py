@@ -18,7 +18,9 @@ from membrane_ctrl.sim.virtual_bench import VirtualBench
 
 
 class Bound(Section):
-    """A telemetry field stays within bounds: every row, or the mean over `mean_s`; and its standard deviation."""
+    """A telemetry field stays within bounds: every row, or the mean over `mean_s`; and its standard
+    deviation.
+    """
 
     field: str
     from_s: float = 0.0
@@ -31,7 +33,9 @@ class Bound(Section):
     @model_validator(mode="after")
     def _known(self) -> Bound:
         if self.field not in FIELDS:
-            raise ValueError(f"field = {self.field!r} is not in the telemetry; known are {', '.join(FIELDS)}")
+            raise ValueError(
+                f"field = {self.field!r} is not in the telemetry; known are {', '.join(FIELDS)}"
+            )
         if self.low is None and self.high is None and self.std_max is None:
             raise ValueError("give low, high or std_max")
         return self
@@ -78,11 +82,15 @@ class Outcome:
 
 
 def play(scenario: CheckedScenario) -> Outcome:
-    """Run a scenario in virtual time, from the command `hold` until its end and 5 s of aftermath."""
+    """Run a scenario in virtual time, from the command `hold` until
+    its end and 5 s of aftermath.
+    """
     run = ScenarioRun(scenario)
     ticks = tuple(tick for tick in run.ticks() if tick is not None)
     run.bench.advance(5.0)
-    events = tuple({**event.to_dict(), "mono_s": tick.row.mono_s} for tick in ticks for event in tick.events)
+    events = tuple(
+        {**event.to_dict(), "mono_s": tick.row.mono_s} for tick in ticks for event in tick.events
+    )
     return Outcome(ticks, events, run.bench)
 
 
@@ -95,7 +103,11 @@ def failures(expect: Expectation, outcome: Outcome) -> Iterator[str]:
         ("states", expect.states, tuple(e["state"] for e in outcome.of("state"))),
         ("faults", expect.faults, tuple(e["name"] for e in outcome.of("fault"))),
     ]
-    yield from (f"{name}: {got}, not {wanted}" for name, wanted, got in found if wanted is not None and wanted != got)
+    yield from (
+        f"{name}: {got}, not {wanted}"
+        for name, wanted, got in found
+        if wanted is not None and wanted != got
+    )
     kinds = {event["kind"] for event in outcome.events}
     yield from (f"no event of kind {kind}" for kind in expect.events if kind not in kinds)
     reasons = [str(event["reason"]) for event in outcome.of("shape")]
@@ -111,8 +123,12 @@ def _broken(bound: Bound, outcome: Outcome) -> Iterator[str]:
     values = np.array([getattr(row, bound.field) for row in rows])
     where = f"{bound.field} from {bound.from_s:g} s to {bound.to_s:g} s"
     if bound.mean_s is not None and rows:
-        bins = ((np.array([row.mono_s for row in rows]) - rows[0].mono_s) / bound.mean_s).astype(int)
-        values = np.array([values[bins == k].mean() for k in range(int(bins[-1]))])  # the last bin is cut
+        bins = ((np.array([row.mono_s for row in rows]) - rows[0].mono_s) / bound.mean_s).astype(
+            int
+        )
+        values = np.array(
+            [values[bins == k].mean() for k in range(int(bins[-1]))]
+        )  # the last bin is cut
     if not values.size or not np.isfinite(values).all():
         yield f"{where}: not there all the time"
         return

@@ -1,8 +1,9 @@
 """A second world: a bench whose physics share no code and no assumption with `membrane_ctrl.sim`.
 
-Film: tension and stretch, p = a w + b w^3. Gas: ideal, isothermal, its volume proportional to the sag, solved by
-Newton's method. Leak: an orifice, its flow proportional to the root of the pressure. Weather: 1/f pressure noise,
-gusts, and the cycles of an air conditioner. Pump: any curve, then a dead time and a lag.
+Film: tension and stretch, p = a w + b w^3. Gas: ideal, isothermal, its volume proportional to the
+sag, solved by Newton's method. Leak: an orifice, its flow proportional to the root of the pressure.
+Weather: 1/f pressure noise, gusts, and the cycles of an air conditioner. Pump: any curve, then a
+dead time and a lag.
 """
 
 from __future__ import annotations
@@ -83,7 +84,9 @@ class ForeignPump:
 
     def balance(self, flow_um_per_s: float) -> None:
         """Deliver this flow now, whatever the command was."""
-        self._drive = next((d for d in np.linspace(0, 1, 2001) if self.settled(0, d) >= flow_um_per_s), 1.0)
+        self._drive = next(
+            (d for d in np.linspace(0, 1, 2001) if self.settled(0, d) >= flow_um_per_s), 1.0
+        )
         self._runs = True
         self._flow = flow_um_per_s
         self._tube = deque([flow_um_per_s] * round(self.delay_s / STEP_S))
@@ -91,7 +94,9 @@ class ForeignPump:
     def step(self, command: float) -> float:
         """Flow that arrives in this step."""
         self._runs = command > 0 and command >= (self.stall if self._runs else self.start)
-        self._drive = min(max(self._drive, command - self.play), command + self.play) if command > 0 else 0.0
+        self._drive = (
+            min(max(self._drive, command - self.play), command + self.play) if command > 0 else 0.0
+        )
         self._tube.append(self.settled(0.0, max(self._drive, 0.0)) if self._runs else 0.0)
         self._flow += (self._tube.popleft() - self._flow) * -math.expm1(-STEP_S / self.lag_s)
         return self._flow
@@ -139,11 +144,15 @@ class ForeignPlant:
     weather_s = _WEATHER_S
 
     def undisturbed_um(self) -> np.ndarray:
-        """The centre's displacement by the weather alone, every 50 ms: the first gas, no pump, no leak."""
+        """The centre's displacement by the weather alone, every 50 ms: the first gas, no pump, no
+        leak.
+        """
         sag = np.full_like(self._ambient, _SAG_UM)
         for _ in range(4):
             total = self._ambient + sag * (_TENSION + _STRETCH * sag**2)
-            sag -= (total * sag - self._gas * self._air) / (total + (_TENSION + 3 * _STRETCH * sag**2) * sag)
+            sag -= (total * sag - self._gas * self._air) / (
+                total + (_TENSION + 3 * _STRETCH * sag**2) * sag
+            )
         return sag - _SAG_UM
 
     def actuate(self, pump_fraction: float, vent_fraction: float) -> None:
@@ -172,7 +181,10 @@ class ForeignPlant:
     def truth(self) -> ForeignTruth:
         i = min(int(self.time_s / _WEATHER_STEP_S), self._ambient.size - 1)
         return ForeignTruth(
-            self._sag_um - _SAG_UM, self._gauge(), float(self._ambient[i]), float(self._air[i]) - 273.15
+            self._sag_um - _SAG_UM,
+            self._gauge(),
+            float(self._ambient[i]),
+            float(self._air[i]) - 273.15,
         )
 
     def sample(self) -> BoardSample:
@@ -185,8 +197,12 @@ class ForeignPlant:
             displacement_um=round(truth.displacement_um + self._laser_um * laser, 1),
             displacement_quality=0,
             gauge_pressure_pa=truth.gauge_pressure_pa + 0.5 * gauge,
-            ambient_pressure_pa=truth.ambient_pressure_pa + 0.1 * ambient if self._barometer else math.nan,
-            air_temperature_c=truth.air_temperature_c + 0.004 * air if self._barometer else math.nan,
+            ambient_pressure_pa=truth.ambient_pressure_pa + 0.1 * ambient
+            if self._barometer
+            else math.nan,
+            air_temperature_c=truth.air_temperature_c + 0.004 * air
+            if self._barometer
+            else math.nan,
             gas_temperature_c=math.nan,
             sample_counter=self._samples,
             device_time_s=self.time_s,
@@ -203,18 +219,24 @@ class ForeignPlant:
         return _TENSION + 3 * _STRETCH * sag_um**2
 
 
-def _weather(strength: float, gusts: bool, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
+def _weather(
+    strength: float, gusts: bool, rng: np.random.Generator
+) -> tuple[np.ndarray, np.ndarray]:
     """Air pressure in Pa (1/f below 1 Hz, gusts) and the gas's temperature in K, every 50 ms."""
     steps = round(_WEATHER_S / _WEATHER_STEP_S)
     f = np.fft.rfftfreq(steps, _WEATHER_STEP_S)
     shape = np.where(f > 0, 1 / np.sqrt(np.maximum(f, f[1]) * (1 + f**2)), 0.0)
-    noise = np.fft.irfft(shape * (rng.standard_normal(f.size) + 1j * rng.standard_normal(f.size)), steps)
+    noise = np.fft.irfft(
+        shape * (rng.standard_normal(f.size) + 1j * rng.standard_normal(f.size)), steps
+    )
     pressure = _AMBIENT_PA + strength * noise / noise.std()
     time_s = np.arange(steps) * _WEATHER_STEP_S
     if gusts:
         for at_s in np.cumsum(rng.exponential(40.0, round(_WEATHER_S / 40.0))):
             since = (time_s - at_s) / rng.uniform(1.5, 5.0)
-            pressure += rng.normal(0.0, 4.0) * np.maximum(since, 0.0) * np.exp(1 - np.maximum(since, 0.0))
+            pressure += (
+                rng.normal(0.0, 4.0) * np.maximum(since, 0.0) * np.exp(1 - np.maximum(since, 0.0))
+            )
     period_s = rng.uniform(600.0, 1200.0)
     cycle = np.sin(2 * np.pi * time_s / period_s + rng.uniform(0, 6.28))
     return pressure, _AIR_K + 0.05 * strength * np.tanh(3 * cycle)
@@ -226,7 +248,9 @@ def foreign_bench(plant: ForeignPlant) -> VirtualBench:
 
 
 def foreign_config(**loop: float) -> Config:
-    """What somebody knows who knows nothing: the defaults, without the test that presumes a quick pump."""
+    """What somebody knows who knows nothing: the defaults, without the test that presumes a quick
+    pump.
+    """
     return Config(
         loop=LoopConfig.model_validate({"flow_max_um_per_s": 5.3, **loop}),
         pump=PumpConfig(),

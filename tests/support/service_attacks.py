@@ -1,8 +1,9 @@
-"""Attacks on a service of the mirror over plain HTTP and WebSocket, and what a logged-in user notices of them.
+"""Attacks on a service of the mirror over plain HTTP and WebSocket, and what a logged-in user
+notices of them.
 
-The attacks know only the address of the service and the names in `Routes`, so that they apply to every service that
-takes its place. Each attack is a program of its own, which shares no interpreter with the measurement:
-`python -m tests.support.service_attacks ATTACK URL CLIENTS`.
+The attacks know only the address of the service and the names in `Routes`, so that they apply to
+every service that takes its place. Each attack is a program of its own, which shares no interpreter
+with the measurement: `python -m tests.support.service_attacks ATTACK URL CLIENTS`.
 """
 
 from __future__ import annotations
@@ -30,7 +31,8 @@ class Routes:
     """Paths of a service, relative to its address."""
 
     login: str = "login"
-    live: str = "chart?hold=&signal=error_um&span=1+min&utc=true"  # what a viewer fetches every second
+    # what a viewer fetches every second
+    live: str = "chart?hold=&signal=error_um&span=1+min&utc=true"
     history: str = "chart?hold=&signal={signal}&span={span}&utc={utc}"
     stop: str = "stop?hold="
     socket: str = "_nicegui_ws/socket.io/?EIO=4&transport=websocket"
@@ -46,7 +48,9 @@ async def connect(url: str) -> Streams:
     return await asyncio.open_connection(parts.hostname, parts.port)
 
 
-def request_bytes(url: str, path: str, method: str = "GET", body: bytes = b"", *headers: str) -> bytes:
+def request_bytes(
+    url: str, path: str, method: str = "GET", body: bytes = b"", *headers: str
+) -> bytes:
     """A request as it is sent, its head complete."""
     parts = urlsplit(url)
     lines = [f"{method} {parts.path}{path} HTTP/1.1", f"Host: {parts.netloc}", *headers]
@@ -100,7 +104,9 @@ async def _repeat_login(url: str, streams: Streams, name: str, password: str) ->
     """Post a login without a pause, on one connection as long as it lives."""
     reader, writer = streams
     form = f"name={name}&password={password}".encode()
-    raw = request_bytes(url, ROUTES.login, "POST", form, "Content-Type: application/x-www-form-urlencoded")
+    raw = request_bytes(
+        url, ROUTES.login, "POST", form, "Content-Type: application/x-www-form-urlencoded"
+    )
     while True:
         writer.write(raw)
         await writer.drain()
@@ -111,7 +117,12 @@ async def _open_sockets(url: str, streams: Streams, number: int) -> None:
     """Ask for a web socket without a session, again and again."""
     reader, writer = streams
     key = base64.b64encode(os.urandom(16)).decode()
-    upgrade = ("Upgrade: websocket", "Connection: Upgrade", f"Sec-WebSocket-Key: {key}", "Sec-WebSocket-Version: 13")
+    upgrade = (
+        "Upgrade: websocket",
+        "Connection: Upgrade",
+        f"Sec-WebSocket-Key: {key}",
+        "Sec-WebSocket-Version: 13",
+    )
     writer.write(request_bytes(url, ROUTES.socket, "GET", b"", *upgrade))
     await reader.read()
 
@@ -146,13 +157,17 @@ async def _send_large_bodies(url: str, streams: Streams, number: int) -> None:
     """Post a body of a gigabyte, as fast as it is received."""
     writer = streams[1]
     path = ROUTES.login if number % 2 else ""
-    head = request_bytes(url, path, "POST").replace(b"Content-Length: 0", b"Content-Length: 1000000000")
+    head = request_bytes(url, path, "POST").replace(
+        b"Content-Length: 0", b"Content-Length: 1000000000"
+    )
     writer.write(head)
     await _send_forever(writer, b"x" * 65_536)
 
 
 async def _send_forever(writer: asyncio.StreamWriter, data: bytes, pause_s: float = 0.0) -> None:
-    """Send the same bytes until the connection is closed, as fast as they are received but for the pause."""
+    """Send the same bytes until the connection is closed, as fast as they are received but for the
+    pause.
+    """
     while True:
         writer.write(data)
         await writer.drain()
@@ -202,7 +217,9 @@ async def attack_until_ended(name: str, url: str, clients: int) -> None:
 async def attack(name: str, url: str, clients: int) -> AsyncIterator[None]:
     """An attack in a process of its own, until left."""
     words = ["-m", "tests.support.service_attacks", name, url, str(clients)]
-    process = await asyncio.create_subprocess_exec(sys.executable, *words, stdout=asyncio.subprocess.PIPE)
+    process = await asyncio.create_subprocess_exec(
+        sys.executable, *words, stdout=asyncio.subprocess.PIPE
+    )
     try:
         assert process.stdout is not None
         async with asyncio.timeout(_BEGIN_S):
@@ -228,7 +245,9 @@ class Viewer:
         answer = await self.client.post(ROUTES.login, data={"name": name, "password": password})
         return answer.status_code
 
-    async def latencies_s(self, path: str, count: int, pause_s: float = 0.2, method: str = "GET") -> list[float]:
+    async def latencies_s(
+        self, path: str, count: int, pause_s: float = 0.2, method: str = "GET"
+    ) -> list[float]:
         """Times until an answer, sorted; each must be a success."""
         found = []
         for _ in range(count):

@@ -1,10 +1,11 @@
 """Holds of the twin in slowed time, for a machine that has no room for so many in real time.
 
-`python -m tests.support.slowed_holds FOLDER SLOWNESS NAME...` runs one of each name on one event loop whose seconds
-last SLOWNESS seconds: supervisor, controller, plant with its board, control port and rings are the product's; there
-is no link, no child process and no recording. It prints `ready`; a line `end NAME` ends a hold, `begin NAME` begins
-it again, and the end of its standard input ends all. Then `ticks.npy` of each run's folder holds its ticks: UNIX
-time, lateness in ms of slowed time, ticks missed so far.
+`python -m tests.support.slowed_holds FOLDER SLOWNESS NAME...` runs one of each name on one event
+loop whose seconds last SLOWNESS seconds: supervisor, controller, plant with its board, control port
+and rings are the product's; there is no link, no child process and no recording. It prints `ready`;
+a line `end NAME` ends a hold, `begin NAME` begins it again, and the end of its standard input ends
+all. Then `ticks.npy` of each run's folder holds its ticks: UNIX time, lateness in ms of slowed
+time, ticks missed so far.
 """
 
 from __future__ import annotations
@@ -67,15 +68,24 @@ async def hold(logs: Path, number: int) -> None:
     """Hold until cancelled."""
     config = Config()
     config = config.model_copy(update={"twin": config.twin.model_copy(update={"seed": number})})
-    loop, board, ticks = asyncio.get_running_loop(), LoopBench(config), list[tuple[float, float, float]]()
+    loop, board, ticks = (
+        asyncio.get_running_loop(),
+        LoopBench(config),
+        list[tuple[float, float, float]](),
+    )
     begin_s, utc = loop.time(), datetime.now(UTC)
     run = logs / f"{utc:%Y%m%dT%H%M%SZ}-held"
     await asyncio.to_thread(run.mkdir, parents=True)
     with ExitStack() as stack:
-        sizes = {"telemetry": (3000, ROW_BYTES), "events": (64, 4096), "shapes": (8, ESTIMATE_BYTES_MAX)}
+        sizes = {
+            "telemetry": (3000, ROW_BYTES),
+            "events": (64, 4096),
+            "shapes": (8, ESTIMATE_BYTES_MAX),
+        }
         rings = {name: stack.enter_context(ring.ring(*size)) for name, size in sizes.items()}
         writers = {
-            name: stack.enter_context(contextlib.closing(ring.RingWriter(each))) for name, each in rings.items()
+            name: stack.enter_context(contextlib.closing(ring.RingWriter(each)))
+            for name, each in rings.items()
         }
         ring.publish(run, rings)
         clock = VirtualClock(0.0, utc, lambda: loop.time() - begin_s)
@@ -100,7 +110,10 @@ async def hold(logs: Path, number: int) -> None:
         settings = (lambda: controller.loop_config, lambda: controller.pump_config)
         listeners = listeners_for(PortConfig(), logs, stack)
         port = Port(
-            PortConfig(), listeners, run.name, RunHooks(supervisor.ask, supervisor.tell, clock.now, *settings)
+            PortConfig(),
+            listeners,
+            run.name,
+            RunHooks(supervisor.ask, supervisor.tell, clock.now, *settings),
         )
         wiring.heard = {"control port": port.heard, "noted": noted}
         await board.open()
@@ -146,10 +159,14 @@ async def _ended(task: asyncio.Task[None]) -> None:
 
 
 @contextlib.contextmanager
-def slowed_holds(folder: Path, slowness: float, names: list[str]) -> Iterator[subprocess.Popen[str]]:
+def slowed_holds(
+    folder: Path, slowness: float, names: list[str]
+) -> Iterator[subprocess.Popen[str]]:
     """Run them; to end one or begin it again, write a line to the process."""
     words = [sys.executable, "-m", "tests.support.slowed_holds", str(folder), str(slowness), *names]
-    with subprocess.Popen(words, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True) as process:
+    with subprocess.Popen(
+        words, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True
+    ) as process:
         assert process.stdin is not None
         assert process.stdout is not None
         try:

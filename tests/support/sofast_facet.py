@@ -1,7 +1,8 @@
-"""SOFAST's result for a measured facet, and its frames as screen points of pixels: the reference for our fit.
+"""SOFAST's result for a measured facet, and its frames as screen points of pixels: the reference
+for our fit.
 
-Vectors and rotations keep SOFAST's names: `r_cam_optic` turns a vector from camera into optic (facet) coordinates,
-`v_cam_optic_cam` leads from camera to optic, in camera coordinates.
+Vectors and rotations keep SOFAST's names: `r_cam_optic` turns a vector from camera into optic
+(facet) coordinates, `v_cam_optic_cam` leads from camera to optic, in camera coordinates.
 """
 
 from dataclasses import dataclass
@@ -14,7 +15,14 @@ from numpy.typing import NDArray
 from scipy.interpolate import LinearNDInterpolator
 from scipy.spatial.transform import Rotation
 
-from membrane_ctrl.measure.measure import MM_PER_M, SHIFTS_RAD, SofastMeasurement, floats, item, open_file
+from membrane_ctrl.measure.measure import (
+    MM_PER_M,
+    SHIFTS_RAD,
+    SofastMeasurement,
+    floats,
+    item,
+    open_file,
+)
 from membrane_ctrl.metrology.frames.series_integrity import Unwrapped, unwrap
 from membrane_ctrl.metrology.optics.geometry import Face, Geometry
 from membrane_ctrl.metrology.phase import phasors
@@ -55,8 +63,8 @@ class RectangularScreen:
 class MeasuredScreen:
     """A flat screen on which the raster was measured at points.
 
-    Between the points it is linear on triangles: no assumption on the projector's lens, and the error is the
-    sagitta of the distortion over one cell.
+    Between the points it is linear on triangles: no assumption on the projector's lens, and the
+    error is the sagitta of the distortion over one cell.
     """
 
     points_screens: FloatArray
@@ -80,14 +88,17 @@ class DisplayResponse:
 
     def __post_init__(self) -> None:
         """Refuse a curve that cannot be read backwards."""
-        if len(self.camera_adu) != len(self.display_levels) or not np.all(np.diff(self.camera_adu) > 0):
+        if len(self.camera_adu) != len(self.display_levels) or not np.all(
+            np.diff(self.camera_adu) > 0
+        ):
             raise ValueError("display response: camera values must rise with every display value")
 
     def shown_levels(self, frames: FloatArray, black: FloatArray, white: FloatArray) -> FloatArray:
         """Levels the screen showed, (N, ...), from frames (N, ...), black and white (...) as seen.
 
-        The curve is that of a bright pixel; each pixel's own gain and stray light are taken out by stretching its
-        levels so that black and white are 0 and the curve's end. NaN where white is not above black.
+        The curve is that of a bright pixel; each pixel's own gain and stray light are taken out by
+        stretching its levels so that black and white are 0 and the curve's end. NaN where white is
+        not above black.
         """
         low, high = self._levels(black), self._levels(white)
         span = np.where(high > low, high - low, np.nan)
@@ -99,14 +110,18 @@ class DisplayResponse:
 
 @dataclass(frozen=True)
 class SofastCamera:
-    """Intrinsics of a camera whose pixels may be oblong; `distortion` is OpenCV's k1, k2, p1, p2, k3."""
+    """Intrinsics of a camera whose pixels may be oblong; `distortion` is OpenCV's k1, k2, p1, p2,
+    k3.
+    """
 
     focal_px: tuple[float, float]
     principal_px: tuple[float, float]
     distortion: tuple[float, ...]
 
     def square_rows(self, rows_px: FloatArray) -> FloatArray:
-        """Rows of the same rays on square pixels of the size of the columns: what `Geometry` knows."""
+        """Rows of the same rays on square pixels of the size of the columns:
+        what `Geometry` knows.
+        """
         focal_x, focal_y = self.focal_px
         return self.principal_px[1] + (rows_px - self.principal_px[1]) * (focal_x / focal_y)
 
@@ -152,8 +167,9 @@ class SofastResult:
     def geometry(self, camera: SofastCamera) -> Geometry:
         """Camera and screen in the facet's frame, before any alignment.
 
-        A point p of the camera frame is R (p - v) in the facet's, R = `r_cam_optic`, v = `v_cam_optic`; the rows of
-        the pose's rotation are the camera's axes there, the columns of R.
+        A point p of the camera frame is R (p - v) in the facet's, R = `r_cam_optic`, v =
+        `v_cam_optic`; the rows of the pose's rotation are the camera's axes there, the columns of
+        R.
         """
         r_screen_optic = self.r_cam_optic @ self.r_cam_screen.T
         return Geometry(
@@ -170,7 +186,9 @@ class SofastResult:
 
 
 def read_camera(path: Path) -> SofastCamera:
-    """Intrinsics. The matrix' last element is not used: downsampling divides it along with the others."""
+    """Intrinsics. The matrix' last element is not used: downsampling divides it along with the
+    others.
+    """
     with open_file(path) as file:
         matrix = floats(file, "Camera/intrinsic_mat")
         distortion = floats(file, "Camera/distortion_coef")
@@ -186,19 +204,27 @@ def read_screen(path: Path) -> ScreenShape:
     with open_file(path) as file:
         model = item(file, "DisplayShape/screen_model").decode()
         if model == "rectangular2D":
-            width_m, height_m = (float(floats(file, f"DisplayShape/screen_{axis}").item()) for axis in "xy")
+            width_m, height_m = (
+                float(floats(file, f"DisplayShape/screen_{axis}").item()) for axis in "xy"
+            )
             return RectangularScreen(width_m * MM_PER_M, height_m * MM_PER_M)
         if model == "distorted2D":
             points_m = floats(file, "DisplayShape/xy_screen_coords")
-            return MeasuredScreen(floats(file, "DisplayShape/xy_screen_fraction"), points_m * MM_PER_M)
-    raise ValueError(f"{path}: DisplayShape/screen_model is {model!r}, known are rectangular2D and distorted2D")
+            return MeasuredScreen(
+                floats(file, "DisplayShape/xy_screen_fraction"), points_m * MM_PER_M
+            )
+    raise ValueError(
+        f"{path}: DisplayShape/screen_model is {model!r}, known are rectangular2D and distorted2D"
+    )
 
 
 def read_response(path: Path) -> DisplayResponse:
     """Grey value shown against grey value seen."""
     with open_file(path) as file:
         group = "ImageCalibration"
-        return DisplayResponse(floats(file, f"{group}/camera_values"), floats(file, f"{group}/display_values"))
+        return DisplayResponse(
+            floats(file, f"{group}/camera_values"), floats(file, f"{group}/display_values")
+        )
 
 
 def read_result(path: Path) -> SofastResult:
@@ -212,7 +238,9 @@ def read_result(path: Path) -> SofastResult:
             for name in ("r_cam_optic", "r_cam_screen")
         )
         return SofastResult(
-            mask=floats(file, f"{_FACET}/CalculationImageProcessingFacet/mask_processed").astype(bool),
+            mask=floats(file, f"{_FACET}/CalculationImageProcessingFacet/mask_processed").astype(
+                bool
+            ),
             r_cam_optic=r_cam_optic,
             r_cam_screen=r_cam_screen,
             v_cam_optic_mm=floats(file, f"{pose}/v_cam_optic_cam").ravel() * MM_PER_M,
@@ -248,7 +276,9 @@ class Decoded:
 def wrapped_phases(
     measurement: SofastMeasurement, mask: NDArray[np.bool_], response: DisplayResponse | None
 ) -> tuple[FloatArray, FloatArray]:
-    """Wrapped phases (F, N) along x and y of the pixels in `mask`; frames as seen if there is no response."""
+    """Wrapped phases (F, N) along x and y of the pixels in `mask`; frames as seen if there is no
+    response.
+    """
     black, white = measurement.black[mask], measurement.white[mask]
 
     def phases(frames: FloatArray) -> FloatArray:
@@ -259,14 +289,20 @@ def wrapped_phases(
     return phases(measurement.frames_x), phases(measurement.frames_y)
 
 
-def decode(measurement: SofastMeasurement, mask: NDArray[np.bool_], response: DisplayResponse | None) -> Decoded:
+def decode(
+    measurement: SofastMeasurement, mask: NDArray[np.bool_], response: DisplayResponse | None
+) -> Decoded:
     """Screen positions of the pixels in `mask`, in reading order."""
     along_x, along_y = wrapped_phases(measurement, mask, response)
     return Decoded(unwrap(along_x, measurement.periods_x), unwrap(along_y, measurement.periods_y))
 
 
-def sight(decoded: Decoded, mask: NDArray[np.bool_], camera: SofastCamera, screen: ScreenShape) -> Sight:
-    """Screen points of the pixels of `mask`, except where frequencies disagree or the screen is missed."""
+def sight(
+    decoded: Decoded, mask: NDArray[np.bool_], camera: SofastCamera, screen: ScreenShape
+) -> Sight:
+    """Screen points of the pixels of `mask`, except where frequencies disagree or the screen is
+    missed.
+    """
     rows_px, columns_px = (index.astype(float) for index in np.nonzero(mask))
     screen_mm = screen.screen_mm(decoded.screens)
     good = decoded.consistent & np.isfinite(screen_mm).all(axis=0)

@@ -1,4 +1,6 @@
-"""Installs the camera and display of another vendor, `studio/`, into a folder, as pip leaves them."""
+"""Installs the camera and display of another vendor, `studio/`, into a folder,
+as pip leaves them.
+"""
 
 from __future__ import annotations
 

@@ -27,7 +27,12 @@ def _row(k: int, rng: np.random.Generator, truth: bool) -> TelemetryRow:
     state = State.STANDBY if time_s < 1 else State.SETTLE if time_s < 6 else State.HOLD
     moving = state is not State.STANDBY
     target_um = 10.0
-    true_um = target_um - 25.0 * np.exp(-max(0.0, time_s - 1.0)) + 0.1 * np.sin(time_s / 3) + 0.05 * rng.normal()
+    true_um = (
+        target_um
+        - 25.0 * np.exp(-max(0.0, time_s - 1.0))
+        + 0.1 * np.sin(time_s / 3)
+        + 0.05 * rng.normal()
+    )
     reading_um = true_um + rng.normal()
     flow = 1.24 + 0.3 * np.sin(time_s / 5) if moving else 0.0
     values = dict.fromkeys((field.name for field in fields(TelemetryRow)), 0.0)

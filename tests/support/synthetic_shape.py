@@ -40,10 +40,14 @@ def shape_at(time_s: float) -> ShapeEstimate:
 
 def from_estimates(estimates: Sequence[ShapeEstimate]) -> Shapes:
     """Shapes of estimates in memory, all covariances among them."""
-    numbers = {name: np.array([getattr(estimate, name) for estimate in estimates]) for name in NUMBERS}
+    numbers = {
+        name: np.array([getattr(estimate, name) for estimate in estimates]) for name in NUMBERS
+    }
     return Shapes(
         **numbers,
-        coeffs_um=np.array([estimate.coeffs_um for estimate in estimates]).reshape(-1, ZERNIKE_TERMS),
+        coeffs_um=np.array([estimate.coeffs_um for estimate in estimates]).reshape(
+            -1, ZERNIKE_TERMS
+        ),
         verdict=np.array([estimate.verdict for estimate in estimates], dtype=np.str_),
         covariance_time_s=numbers["time_s"],
         covariance_um2=np.array([estimate.covariance_um2 for estimate in estimates]).reshape(

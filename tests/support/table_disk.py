@@ -1,4 +1,6 @@
-"""Disks for tests of table files, one that dies at a chosen call, one that is full; and a table to write to them."""
+"""Disks for tests of table files, one that dies at a chosen call, one that is full; and a table to
+write to them.
+"""
 
 from __future__ import annotations
 
@@ -141,6 +143,8 @@ def read_counts(run_dir: Path, notes: list[str] | None = None) -> list[int]:
         counts = table.column("count").to_pylist()
         expected = pa.Table.from_batches([batch_of(counts)])
         for name in TABLE.schema.names:
-            assert repr(table.column(name).to_pylist()) == repr(expected.column(name).to_pylist()), name
+            assert repr(table.column(name).to_pylist()) == repr(
+                expected.column(name).to_pylist()
+            ), name
         found += counts
     return found

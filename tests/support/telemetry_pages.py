@@ -1,6 +1,8 @@
-"""Files made from the table of telemetry columns: `python -m tests.support.telemetry_pages [--check]`.
+"""Files made from the table of telemetry columns: `python -m tests.support.telemetry_pages
+[--check]`.
 
-docs/telemetry.md, the table of published values in docs/doors.md and the Grafana dashboard of the metrics.
+docs/telemetry.md, the table of published values in docs/doors.md and the Grafana dashboard of the
+metrics.
 """
 
 import argparse
@@ -43,7 +45,7 @@ is NaN, or null in tables.
 
 *Overview* is what the tables of 1, 10 and 60 s keep. *Shown* columns are on the [page](web.md), on the console, in
 `ctl status`, in the dashboard and in the [bridges](doors.md). *Entity* is the path in the [viewer](rerun.md).
-"""
+"""  # noqa: E501
 _HEAD = "| column | unit | label | what | overview | shown | entity |"
 _RULE = "|---|---|---|---|---|---|---|"
 
@@ -70,7 +72,9 @@ def _row(each: TelemetryColumn) -> str:
 
 
 def doors_page(text: str) -> str:
-    """Return the page of the bridges with the present table. Raises ValueError if its marks are missing."""
+    """Return the page of the bridges with the present table. Raises ValueError if its marks are
+    missing.
+    """
     before, _, rest = text.partition(_BEGIN)
     _, end, after = rest.partition(_END)
     if not end:
@@ -82,17 +86,29 @@ def doors_page(text: str) -> str:
 # The dashboard
 
 _SOURCE = {"type": "prometheus", "uid": "${datasource}"}
-_UNITS = {"Pa": "pressurepa", "°C": "celsius", "ms": "ms"}  # Grafana's names; it has none for micrometres
+_UNITS = {
+    "Pa": "pressurepa",
+    "°C": "celsius",
+    "ms": "ms",
+}  # Grafana's names; it has none for micrometres
 _WIDTH = 24
 
 
 def dashboard_text() -> str:
-    """Return the dashboard: state, fault and recording; a panel for each plot with published columns; the port."""
+    """Return the dashboard: state, fault and recording; a panel for each plot with published
+    columns; the port.
+    """
     panels = [
-        _panel("State", "state-timeline", [("membrane_in_state{} == 1", "{{state}}")], "short", (16, 5)),
+        _panel(
+            "State", "state-timeline", [("membrane_in_state{} == 1", "{{state}}")], "short", (16, 5)
+        ),
         _light("Fault (0: none)", "membrane_fault{}", ("green", "red")),
         _light("Recording (1: works)", "membrane_recording_ok{}", ("red", "green")),
-        *(_plot_panel(plot) for plot in plots_of(*Group) if any(each.published for each in columns_of(plot))),
+        *(
+            _plot_panel(plot)
+            for plot in plots_of(*Group)
+            if any(each.published for each in columns_of(plot))
+        ),
         _panel(
             "Control port",
             "timeseries",
@@ -106,7 +122,8 @@ def dashboard_text() -> str:
         panel["id"] = number
         panel["gridPos"] |= place
     dashboard = {
-        "description": "Grafana dashboard for the metrics ([port] metrics_port): import it, choose the data source",
+        "description": "Grafana dashboard for the metrics ([port] metrics_port): import it, choose the data "  # noqa: E501
+        "source",
         "title": "membrane mirror",
         "uid": "membrane-mirror",
         "schemaVersion": 39,
@@ -127,7 +144,9 @@ def _plot_panel(plot: Plot) -> dict[str, Any]:
         targets = [(f"increase({_metric(each)}[5m])", each.label) for each in shown]
         return _panel(f"{plot.title}, in 5 minutes", "timeseries", targets)
     targets = [(_metric(each), each.label) for each in shown]
-    unit = "percentunit" if shown[0].name.endswith("_fraction") else _UNITS.get(shown[0].unit, "short")
+    unit = (
+        "percentunit" if shown[0].name.endswith("_fraction") else _UNITS.get(shown[0].unit, "short")
+    )
     return _panel(plot_title(plot), "timeseries", targets, unit)
 
 
@@ -136,7 +155,11 @@ def _metric(each: TelemetryColumn) -> str:
 
 
 def _panel(
-    title: str, kind: str, targets: list[tuple[str, str]], unit: str = "short", size: tuple[int, int] = (8, 7)
+    title: str,
+    kind: str,
+    targets: list[tuple[str, str]],
+    unit: str = "short",
+    size: tuple[int, int] = (8, 7),
 ) -> dict[str, Any]:
     """A panel without its place; `{}` in an expression becomes the choice of mirrors."""
     asked = [
@@ -163,7 +186,9 @@ def _panel(
 def _light(title: str, expression: str, colours: tuple[str, str]) -> dict[str, Any]:
     """A number with one colour for 0 and another one from 1."""
     panel = _panel(title, "stat", [(expression, "")], size=(4, 5))
-    steps = [{"color": colour, "value": value} for colour, value in zip(colours, (None, 1), strict=True)]
+    steps = [
+        {"color": colour, "value": value} for colour, value in zip(colours, (None, 1), strict=True)
+    ]
     panel["fieldConfig"]["defaults"]["thresholds"] = {"mode": "absolute", "steps": steps}
     return panel
 
@@ -181,7 +206,12 @@ def _places(panels: list[dict[str, Any]]) -> Iterator[dict[str, int]]:
 
 
 def _source_choice() -> dict[str, Any]:
-    return {"name": "datasource", "type": "datasource", "query": "prometheus", "label": "Data source"}
+    return {
+        "name": "datasource",
+        "type": "datasource",
+        "query": "prometheus",
+        "label": "Data source",
+    }
 
 
 def _mirror_choice() -> dict[str, Any]:
@@ -200,8 +230,12 @@ def _mirror_choice() -> dict[str, Any]:
 
 def main(arguments: list[str] | None = None) -> int:
     """Write the files, or say which are out of date; returns the exit code."""
-    parser = argparse.ArgumentParser(prog="python -m tests.support.telemetry_pages", description=__doc__)
-    parser.add_argument("--check", action="store_true", help="write nothing; exit with 1 when a file is out of date")
+    parser = argparse.ArgumentParser(
+        prog="python -m tests.support.telemetry_pages", description=__doc__
+    )
+    parser.add_argument(
+        "--check", action="store_true", help="write nothing; exit with 1 when a file is out of date"
+    )
     check = parser.parse_args(arguments).check
     stale = False
     for path, text in (
@@ -213,7 +247,10 @@ def main(arguments: list[str] | None = None) -> int:
             continue
         stale = True
         if check:
-            print(f"{path} is out of date: run python -m tests.support.telemetry_pages", file=sys.stderr)
+            print(
+                f"{path} is out of date: run python -m tests.support.telemetry_pages",
+                file=sys.stderr,
+            )
         else:
             path.write_text(text, encoding="utf-8")
     return 1 if check and stale else 0

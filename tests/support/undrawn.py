@@ -1,4 +1,6 @@
-"""Empty pictures, for tests of the texts and numbers beside them: a report takes seconds to draw."""
+"""Empty pictures, for tests of the texts and numbers beside them:
+a report takes seconds to draw.
+"""
 
 from __future__ import annotations
 
@@ -12,7 +14,11 @@ import numpy as np
 
 
 def _empty(self: object, file: IO[Any], **options: object) -> None:
-    file.write("<svg></svg>" if options["format"] == "svg" else cv2.imencode(".png", np.zeros((1, 1)))[1].tobytes())
+    file.write(
+        "<svg></svg>"
+        if options["format"] == "svg"
+        else cv2.imencode(".png", np.zeros((1, 1)))[1].tobytes()
+    )
 
 
 @contextmanager

@@ -77,9 +77,11 @@ def watched(
     drift_nm: float = 1.0,
     jitter_s: float = 0.0,
 ) -> tuple[FloatArray, FloatArray, list[Planted]]:
-    """Times, terms in µm and what was planted, in noise that terms share, on terms that drift; the vertex is at 0.
+    """Times, terms in µm and what was planted, in noise that terms share, on terms that drift; the
+    vertex is at 0.
 
-    Frequencies and shapes are drawn, unless they are a drum's. `jitter_s` is that of the times of the frames.
+    Frequencies and shapes are drawn, unless they are a drum's. `jitter_s` is that of the times of
+    the frames.
     """
     rng = np.random.default_rng(seed)
     t = frame_times_s(rates_hz, seconds)
@@ -89,7 +91,10 @@ def watched(
     terms_nm += drift_nm * np.cumsum(rng.normal(size=(t.size, ZERNIKE_TERMS)), axis=0)
     planted = []
     for line_hz in lines_hz:
-        frequency_hz, shape = line_hz + rng.uniform(-0.3, 0.3), at_rest(rng.normal(size=ZERNIKE_TERMS))
+        frequency_hz, shape = (
+            line_hz + rng.uniform(-0.3, 0.3),
+            at_rest(rng.normal(size=ZERNIKE_TERMS)),
+        )
         if drums:
             frequency_hz, shape = line_hz, drum(line_hz)
         planted.append(Planted(frequency_hz, shape))
@@ -100,7 +105,9 @@ def watched(
             pole = np.exp((2j - 1 / quality) * math.pi * frequency_hz * step_s)
             pushed = rng.normal(size=(round((t[-1] - t[0]) / step_s) + 2, 2)) @ [1, 1j]
             ringing = lfilter([1], [1, -pole], pushed).real
-            wave = np.interp(t - t[0], np.arange(ringing.size) * step_s, ringing / ringing.std() * math.sqrt(0.5))
+            wave = np.interp(
+                t - t[0], np.arange(ringing.size) * step_s, ringing / ringing.std() * math.sqrt(0.5)
+            )
         terms_nm += amplitude_nm * np.outer(wave, shape)
     terms_nm[:, 0] = -sum(height * terms_nm[:, j - 1] for j, height in VERTEX.items() if j > 1)
     return t, terms_nm * 1e-3, planted

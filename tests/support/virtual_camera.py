@@ -1,7 +1,8 @@
-"""The measurement cycle on the twin's camera in virtual time: real frames, real reconstruction, no waiting.
+"""The measurement cycle on the twin's camera in virtual time: real frames, real reconstruction, no
+waiting.
 
-The film stands still while the frames of a cycle are taken (the virtual plant does not advance meanwhile); motion
-between frames is the business of runs in real time and of `simulate`.
+The film stands still while the frames of a cycle are taken (the virtual plant does not advance
+meanwhile); motion between frames is the business of runs in real time and of `simulate`.
 """
 
 from __future__ import annotations
@@ -17,7 +18,8 @@ from membrane_ctrl.sim.plant import Plant
 
 
 class VirtualCamera:
-    """A `virtual_run.ShapeSource`: call it with the time, it takes a cycle of the plant as it is then.
+    """A `virtual_run.ShapeSource`: call it with the time, it takes a cycle of the plant as it is
+    then.
 
     Parameters
     ----------
@@ -52,7 +54,9 @@ class VirtualCamera:
             frames.append(self._optics.camera.grab().pixels.copy())
             readings_um.append(self._plant.sample().displacement_um)
         take = self._reconstructor.full if self._full else self._reconstructor.fringes
-        readings = np.full(len(frames), np.mean(readings_um))  # the film stands still: so does its mean reading
+        readings = np.full(
+            len(frames), np.mean(readings_um)
+        )  # the film stands still: so does its mean reading
         estimate = take(frames, np.full(len(frames), now_s), readings)
         self._full = estimate.verdict == "rejected"
         return estimate

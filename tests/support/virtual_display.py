@@ -23,7 +23,9 @@ def virtual_display(folder: Path, width_px: int, height_px: int) -> Iterator[Pat
     command = ["Xvfb", "-displayfd", str(server_end), "-screen", "0", f"{width_px}x{height_px}x24"]
     # without -noreset it resets when its last client leaves, and the next may come too early
     options = ["-fbdir", str(folder), "-nolisten", "tcp", "-noreset"]
-    server = subprocess.Popen([*command, *options], pass_fds=[server_end], stderr=subprocess.DEVNULL)
+    server = subprocess.Popen(
+        [*command, *options], pass_fds=[server_end], stderr=subprocess.DEVNULL
+    )
     os.close(server_end)
     before = {name: os.environ.get(name) for name in ("DISPLAY", "SDL_VIDEODRIVER")}
     try:
@@ -45,7 +47,15 @@ def screenshot(framebuffer: Path) -> NDArray[np.uint8]:
     """(height, width, 3) red, green, blue from the XWD file that the server draws into."""
     content = framebuffer.read_bytes()
     head = struct.unpack(">25I", content[:100])  # XWDFile.h
-    header_bytes, width, height, bytes_per_line, colours = head[0], head[4], head[5], head[12], head[19]
+    header_bytes, width, height, bytes_per_line, colours = (
+        head[0],
+        head[4],
+        head[5],
+        head[12],
+        head[19],
+    )
     start = header_bytes + 12 * colours
-    lines = np.frombuffer(content, np.uint8, height * bytes_per_line, start).reshape(height, bytes_per_line)
+    lines = np.frombuffer(content, np.uint8, height * bytes_per_line, start).reshape(
+        height, bytes_per_line
+    )
     return lines[:, : 4 * width].reshape(height, width, 4)[:, :, 2::-1]

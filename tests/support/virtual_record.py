@@ -15,7 +15,14 @@ from membrane_ctrl.config.schema import Config, TwinConfig
 from membrane_ctrl.controller.commands import Command
 from membrane_ctrl.controller.controller import Controller
 from membrane_ctrl.controller.snapshot import take_snapshot
-from membrane_ctrl.controller.tick import TickAssembler, TickBatch, TickInputs, TickOutputs, pack_snapshot, pack_tick
+from membrane_ctrl.controller.tick import (
+    TickAssembler,
+    TickBatch,
+    TickInputs,
+    TickOutputs,
+    pack_snapshot,
+    pack_tick,
+)
 from membrane_ctrl.hold.virtual_run import Alter, ShapeSource, VirtualRun, VirtualTick
 from membrane_ctrl.metrology.optics.film_law import zernike_projection
 from membrane_ctrl.model.arrays import FloatArray
@@ -64,14 +71,18 @@ def run_virtual(
             yield tick
 
 
-def kept_ticks(duration_s: float, alter: Alter | None = None) -> list[tuple[TickInputs, TickOutputs]]:
+def kept_ticks(
+    duration_s: float, alter: Alter | None = None
+) -> list[tuple[TickInputs, TickOutputs]]:
     """Inputs and outputs of every tick of a hold of the twin."""
 
     def shape(now_s: float) -> ShapeEstimate | None:
         estimate = shape_at(now_s)
         return None if estimate is None else ring_trip(estimate)
 
-    run = run_virtual(CONFIG, Plant(CONFIG.twin, CONFIG.pump), duration_s, zernike_projection(), shape, alter)
+    run = run_virtual(
+        CONFIG, Plant(CONFIG.twin, CONFIG.pump), duration_s, zernike_projection(), shape, alter
+    )
     return [(tick.inputs, tick.outputs) for tick in run]
 
 
@@ -87,7 +98,9 @@ Batch = tuple[TickBatch, list[ShapeEstimate]]
 
 
 def batches_of(
-    ticks: list[tuple[TickInputs, TickOutputs]], lost: range = range(0), snapshots: Mapping[int, bytes] | None = None
+    ticks: list[tuple[TickInputs, TickOutputs]],
+    lost: range = range(0),
+    snapshots: Mapping[int, bytes] | None = None,
 ) -> list[Batch]:
     """What the rings bring, a second at a time; ticks of `lost` are not in it."""
     assembler, batches = TickAssembler(), []
@@ -144,4 +157,8 @@ def laser_lost(now_s: float, reading: BenchReading) -> BenchReading:
     """The laser sees nothing for a second of the hold."""
     from dataclasses import replace
 
-    return replace(reading, displacement_um=np.nan, displacement_quality=1) if 14.3 <= now_s < 15.3 else reading
+    return (
+        replace(reading, displacement_um=np.nan, displacement_quality=1)
+        if 14.3 <= now_s < 15.3
+        else reading
+    )

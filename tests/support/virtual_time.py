@@ -1,7 +1,7 @@
 """An event loop whose clock jumps to the next timer instead of waiting for it.
 
-For emulated devices on a `MemoryWire`: an hour of late answers and timeouts takes seconds, and is the same every
-time. Nothing in it may wait for the outside world.
+For emulated devices on a `MemoryWire`: an hour of late answers and timeouts takes seconds, and is
+the same every time. Nothing in it may wait for the outside world.
 """
 
 from __future__ import annotations

@@ -1,4 +1,6 @@
-"""`tune explore`: responses against another implementation, sources, saved gains, and the page in a browser."""
+"""`tune explore`: responses against another implementation, sources, saved gains, and the page in a
+browser.
+"""
 
 from __future__ import annotations
 
@@ -48,10 +50,14 @@ GAINS = (
 
 
 def closed_loop(gains: loop_model.Gains, output: str) -> control.TransferFunction:
-    """From setpoint (T) or from the leak to the centre, with the delay as a Pade approximation of order 8."""
+    """From setpoint (T) or from the leak to the centre, with the delay as a Pade approximation of
+    order 8.
+    """
     s = control.tf("s")
     delay = control.tf(*control.pade(PLANT.dead_time_s + CALM.dt_s / 2, 8))
-    controller = gains.kp_per_s * (1 + 1 / (gains.ti_s * s) + gains.td_s * s) / (1 + gains.filter_s * s)
+    controller = (
+        gains.kp_per_s * (1 + 1 / (gains.ti_s * s) + gains.td_s * s) / (1 + gains.filter_s * s)
+    )
     pump = PLANT.gain * delay / (1 + PLANT.lag_s * s)
     loop = controller * pump / s
     return control.minreal((loop if output == "step" else -1 / s) / (1 + loop), verbose=False)
@@ -59,8 +65,12 @@ def closed_loop(gains: loop_model.Gains, output: str) -> control.TransferFunctio
 
 @pytest.mark.parametrize("gains", GAINS)
 @pytest.mark.parametrize("output", ["step", "load"])
-def test_the_responses_are_those_of_another_implementation(gains: loop_model.Gains, output: str) -> None:
-    """The D term sees the measurement alone, so for a setpoint step only PI loops are comparable."""
+def test_the_responses_are_those_of_another_implementation(
+    gains: loop_model.Gains, output: str
+) -> None:
+    """The D term sees the measurement alone, so for a setpoint step
+    only PI loops are comparable.
+    """
     if output == "step" and gains.td_s:
         gains = replace(gains, td_s=0.0)
     step = (1.0, 0.0) if output == "step" else (0.0, 1.0)
@@ -129,12 +139,16 @@ def test_a_session_gives_plant_weather_and_proposal(template: Path, tmp_path: Pa
     opened = copy_of(template, tmp_path)
     found = of_path(opened.path, tmp_path)
     assert found.model.gain == pytest.approx(PLANT.gain, rel=0.05)
-    assert found.proposed == loop_model.Gains.of(gains_file.load_gains(opened.file("gains.toml")).loop)
+    assert found.proposed == loop_model.Gains.of(
+        gains_file.load_gains(opened.file("gains.toml")).loop
+    )
     opened.begin("design")
     assert of_path(opened.path, tmp_path).proposed is None
 
 
-def test_a_short_session_takes_the_weather_from_before_its_experiments(template: Path, tmp_path: Path) -> None:
+def test_a_short_session_takes_the_weather_from_before_its_experiments(
+    template: Path, tmp_path: Path
+) -> None:
     """The hold is not asked for more."""
     opened = copy_of(template, tmp_path)
     before = session.disturbance_of(opened)
@@ -168,13 +182,22 @@ def test_a_hold_lost_in_the_verification_is_what_is_told(template: Path, tmp_pat
 
 @pytest.mark.parametrize(
     ("growths", "kept", "until_s"),
-    [((1.0,) * 4, True, 600.0), ((1.0, 1.0, 1.0, 1.15, 1.05), True, 1200.0), ((1.0, 1.6), False, 180.0),
-     ((1.0, 1.0, 1.0, 1.15, 1.12), False, 1200.0), ((1.0, 1.0, 1.0, 1.3), False, 600.0)],
-)  # fmt: skip
+    [
+        ((1.0,) * 4, True, 600.0),
+        ((1.0, 1.0, 1.0, 1.15, 1.05), True, 1200.0),
+        ((1.0, 1.6), False, 180.0),
+        ((1.0, 1.0, 1.0, 1.15, 1.12), False, 1200.0),
+        ((1.0, 1.0, 1.0, 1.3), False, 600.0),
+    ],
+)
 def test_a_close_verification_goes_on_for_as_long_again(
-    template: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch,
-    growths: tuple[float, ...], kept: bool, until_s: float,
-) -> None:  # fmt: skip
+    template: Path,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    growths: tuple[float, ...],
+    kept: bool,
+    until_s: float,
+) -> None:
     """Ten minutes tell a standard deviation to 13 %."""
     opened = copy_of(template, tmp_path)
     folder.write(opened.file("applied.json"), {})
@@ -182,9 +205,12 @@ def test_a_close_verification_goes_on_for_as_long_again(
     held = SimpleNamespace(followed_by=lambda more: held)
     rig = SimpleNamespace(
         pump=PumpConfig(),
-        dt_s=1.0, set_gains=lambda *given: None, keep=lambda: told.append("keep"), hold=lambda seconds: None,
+        dt_s=1.0,
+        set_gains=lambda *given: None,
+        keep=lambda: told.append("keep"),
+        hold=lambda seconds: None,
         hold_about=lambda seconds: (held, np.zeros(round(seconds))),
-    )  # fmt: skip
+    )
 
     def look(record: object, setpoint_um: FloatArray, trial: object, growth_max: float) -> Stage:
         growth = left.pop(0)
@@ -226,8 +252,12 @@ def test_saved_gains_are_the_next_to_be_applied(template: Path, tmp_path: Path) 
     assert not opened.done("preview")  # it was of other gains
 
 
-@pytest.mark.parametrize("gains", [loop_model.Gains(9.0, 1.0, 0.0, 0.1), loop_model.Gains(1.2, 4.0, 0.0, 0.1)])
-def test_gains_without_margin_are_not_saved(gains: loop_model.Gains, template: Path, tmp_path: Path) -> None:
+@pytest.mark.parametrize(
+    "gains", [loop_model.Gains(9.0, 1.0, 0.0, 0.1), loop_model.Gains(1.2, 4.0, 0.0, 0.1)]
+)
+def test_gains_without_margin_are_not_saved(
+    gains: loop_model.Gains, template: Path, tmp_path: Path
+) -> None:
     opened = copy_of(template, tmp_path)
     before = opened.file("gains.toml").read_bytes()
     save = saver(of_path(opened.path, tmp_path), "ada")
@@ -238,7 +268,8 @@ def test_gains_without_margin_are_not_saved(gains: loop_model.Gains, template: P
 
 _ROW = "Bokeh.documents[0].get_model_by_name('table').text"
 _GAINS_NEAR = (
-    "(() => {{ const found = Bokeh.documents[0].get_model_by_name('command').text.match(/{{.*}}/)[0];"
+    "(() => {{ const found = "
+    "Bokeh.documents[0].get_model_by_name('command').text.match(/{{.*}}/)[0];"
     "return Math.abs(JSON.parse(found).ti_s / {} - 1) < 0.05 && found }})()"
 )
 _MOVE = "Bokeh.documents[0].get_model_by_name('{}').value = {}"
@@ -267,9 +298,13 @@ async def test_the_page_in_a_browser(template: Path, tmp_path: Path) -> None:
             await tab.until("Bokeh.documents[0].get_model_by_name('said').text.includes('Saved')")
             await tab.screenshot(tmp_path / "page.png")
             await tab.call("Page.navigate", url=f"{url}session")
-            await tab.until("Bokeh.documents[0].get_model_by_name('now').text.includes('Nothing recorded yet')")
+            await tab.until(
+                "Bokeh.documents[0].get_model_by_name('now').text.includes('Nothing recorded yet')"
+            )
         assert (tmp_path / "page.png").stat().st_size > 30_000
-        assert gains_file.load_gains(opened.file("gains.toml")).loop.ti_s == pytest.approx(shown["ti_s"], rel=1e-3)
+        assert gains_file.load_gains(opened.file("gains.toml")).loop.ti_s == pytest.approx(
+            shown["ti_s"], rel=1e-3
+        )
         await _is_refused(url)
     finally:
         served.terminate()  # a shell that runs us in the background has SIGINT ignored

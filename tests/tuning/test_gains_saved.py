@@ -1,4 +1,6 @@
-"""`tune save`: a configuration with a session's kept gains, its comments, and nothing else changed."""
+"""`tune save`: a configuration with a session's kept gains, its comments,
+and nothing else changed.
+"""
 
 from __future__ import annotations
 
@@ -19,7 +21,12 @@ from tuning.pump_trial import MappedPump
 from tuning.session import Verified
 
 BEFORE = LoopConfig()
-GAINS = {"kp_per_s": 0.448, "ti_s": 8.79, "measurement_filter_s": 0.1, "temperature_gain_um_per_k": 121.5}
+GAINS = {
+    "kp_per_s": 0.448,
+    "ti_s": 8.79,
+    "measurement_filter_s": 0.1,
+    "temperature_gain_um_per_k": 121.5,
+}
 AFTER = LoopConfig.model_validate(BEFORE.model_dump() | GAINS)
 TEXT = """# The bench in room 3.
 [limits]
@@ -41,7 +48,10 @@ def kept_session(logs: Path, kept: bool = True, config: Config | None = None) ->
     session = plain.create_session(logs, "s1", "eve", "a-run", config or Config(), BEFORE)
     reason = "" if kept else "the readings show a sensitivity of 2.3"
     plain.write(session.file("verified.json"), Verified(kept, reason, (), BEFORE, AFTER))
-    note(logs, entry("kept" if kept else "taken_back", session.path.name, "eve", "why", BEFORE, AFTER))
+    note(
+        logs,
+        entry("kept" if kept else "taken_back", session.path.name, "eve", "why", BEFORE, AFTER),
+    )
     return session.path
 
 
@@ -57,10 +67,15 @@ def test_the_next_hold_starts_with_the_kept_gains_and_comments_stay(
     path.touch(0o600)
     assert saved(path, "--yes") == Exit.DONE
     assert load(path, Config).loop == AFTER.model_copy(update={"setpoint_um": 5.0})
-    assert tomllib.loads(path.read_text()) == tomllib.loads(TEXT) | {"loop": {"setpoint_um": 5.0, **GAINS}}
+    assert tomllib.loads(path.read_text()) == tomllib.loads(TEXT) | {
+        "loop": {"setpoint_um": 5.0, **GAINS}
+    }
     lines = path.read_text().splitlines()
     assert "kp_per_s = 0.448   # 1/s" in lines
-    assert [line for line in TEXT.splitlines() if line not in lines] == ["kp_per_s = 0.61   # 1/s", "ti_s     = 6.5"]
+    assert [line for line in TEXT.splitlines() if line not in lines] == [
+        "kp_per_s = 0.61   # 1/s",
+        "ti_s     = 6.5",
+    ]
     said = capsys.readouterr().out.splitlines()
     assert "-kp_per_s = 0.61   # 1/s" in said
     assert "+kp_per_s = 0.448   # 1/s" in said
@@ -136,8 +151,14 @@ def test_only_a_yes_writes(
 @pytest.mark.parametrize(
     ("text", "reason"),
     [
-        (TEXT + "[pump]\nflow_full_um_per_s = 8.0\n", "pump.flow_full_um_per_s = 8.0, the session had 5.3"),
-        (TEXT.replace("setpoint", "rate_hz = 25.0\nsetpoint"), "loop.rate_hz = 25.0, the session had 50.0"),
+        (
+            TEXT + "[pump]\nflow_full_um_per_s = 8.0\n",
+            "pump.flow_full_um_per_s = 8.0, the session had 5.3",
+        ),
+        (
+            TEXT.replace("setpoint", "rate_hz = 25.0\nsetpoint"),
+            "loop.rate_hz = 25.0, the session had 50.0",
+        ),
         (TEXT + '[devices]\nboard = "tcp://192.0.2.1"\n', "the session tuned the simulated bench"),
         (TEXT.replace("band_um = 2.0 ", "band_um = 900.0 "), "limits.band_um = 900"),
         (TEXT.replace("[loop]", "[lop]"), "unknown key"),
@@ -151,7 +172,9 @@ def test_gains_for_another_bench_are_not_saved(
     path = tmp_path / "lab.toml"
     assert saved(path, "--yes", text=text) == Exit.BAD_INPUT
     assert path.read_text() == text
-    said = [line for line in capsys.readouterr().err.splitlines() if line.startswith("membrane-ctrl: ")]
+    said = [
+        line for line in capsys.readouterr().err.splitlines() if line.startswith("membrane-ctrl: ")
+    ]
     assert any("lab.toml" in line and reason in line for line in said), said
 
 
@@ -213,7 +236,9 @@ def test_what_cannot_be_edited_says_what_to_set(
     assert set(choice.GAIN_KEYS) <= set(LoopConfig.model_fields)
 
 
-CURVE = PumpConfig(curve_fraction=(0.1, 0.5, 1.0), curve_um_per_s=(0.0, 1.5, 6.0), start_fraction=0.2)
+CURVE = PumpConfig(
+    curve_fraction=(0.1, 0.5, 1.0), curve_um_per_s=(0.0, 1.5, 6.0), start_fraction=0.2
+)
 
 
 def mapped_session(logs: Path, text: str) -> Path:
@@ -266,14 +291,20 @@ def kept_time_constant(logs: Path, name: str = "outer", what: What = "kept") -> 
 
 
 @pytest.mark.parametrize("named", [False, True])
-def test_the_time_constant_of_the_shape_loop_is_saved_without_gains(tmp_path: Path, named: bool) -> None:
+def test_the_time_constant_of_the_shape_loop_is_saved_without_gains(
+    tmp_path: Path, named: bool
+) -> None:
     session, path = kept_time_constant(tmp_path / "logs"), tmp_path / "lab.toml"
     assert saved(path, "--yes", *([str(session)] if named else [])) == Exit.DONE
     wanted = tomllib.loads(TEXT)
-    assert tomllib.loads(path.read_text()) == wanted | {"shape": wanted["shape"] | {"time_constant_s": 62.5}}
+    assert tomllib.loads(path.read_text()) == wanted | {
+        "shape": wanted["shape"] | {"time_constant_s": 62.5}
+    }
 
 
-def test_gains_and_time_constant_of_two_sessions_are_saved_at_once_and_a_named_one_alone(tmp_path: Path) -> None:
+def test_gains_and_time_constant_of_two_sessions_are_saved_at_once_and_a_named_one_alone(
+    tmp_path: Path,
+) -> None:
     gains, path = kept_session(tmp_path / "logs"), tmp_path / "lab.toml"
     kept_time_constant(tmp_path / "logs")
     assert saved(path, "--yes") == Exit.DONE
@@ -293,7 +324,12 @@ def test_a_time_constant_that_was_not_kept_or_rolled_back_is_not_saved(tmp_path:
     assert path.read_text() == TEXT
 
 
-def test_a_curve_is_not_saved_over_that_of_another_pump(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_curve_is_not_saved_over_that_of_another_pump(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     session, path = mapped_session(tmp_path, TEXT), tmp_path / "lab.toml"
-    assert saved(path, str(session), "--yes", text=TEXT + "[pump]\nflow_full_um_per_s = 9.0\n") == Exit.BAD_INPUT
+    assert (
+        saved(path, str(session), "--yes", text=TEXT + "[pump]\nflow_full_um_per_s = 9.0\n")
+        == Exit.BAD_INPUT
+    )
     assert "pump.flow_full_um_per_s" in capsys.readouterr().err

@@ -18,7 +18,15 @@ from membrane_ctrl.model import telemetry
 from membrane_ctrl.model.errors import InputError
 from membrane_ctrl.sessions import folder, live_hold
 from membrane_ctrl.sessions.live_hold import Progress
-from membrane_ctrl.sessions.live_log import ANSWER, NAME, LiveLog, LiveReader, PageAnswer, Progressed, give_answer
+from membrane_ctrl.sessions.live_log import (
+    ANSWER,
+    NAME,
+    LiveLog,
+    LiveReader,
+    PageAnswer,
+    Progressed,
+    give_answer,
+)
 from tuning import choice
 from tuning.explore.live_page import LivePage, status
 
@@ -27,7 +35,12 @@ RATE_HZ = 50.0
 
 def row(tick: int, displacement_um: float) -> telemetry.TelemetryRow:
     values = dict.fromkeys(telemetry.FIELDS, math.nan)
-    values |= {"tick": float(tick), "displacement_um": displacement_um, "setpoint_um": 1.0, "flow_um_per_s": 1.2}
+    values |= {
+        "tick": float(tick),
+        "displacement_um": displacement_um,
+        "setpoint_um": 1.0,
+        "flow_um_per_s": 1.2,
+    }
     return telemetry.TelemetryRow(**values)
 
 
@@ -49,7 +62,11 @@ def test_a_reader_beside_the_session_sees_what_it_does(tmp_path: Path) -> None:
     assert first["time_s"] == pytest.approx([0.2 * n for n in range(1, 11)])
     assert first["displacement_um"] == pytest.approx([0.5] * 10)
     assert first["flow_um_per_s"] == pytest.approx([1.2] * 10)
-    assert (reader.progress.step, reader.progress.planned_s, reader.progress.done_s) == ("observe", 300.0, 2.0)
+    assert (reader.progress.step, reader.progress.planned_s, reader.progress.done_s) == (
+        "observe",
+        300.0,
+        2.0,
+    )
     held(log, 1.0, math.nan)
     log.note("said", "observe: laser noise 1.00 µm")
     log.note("step", "design", planned_s=0.0, after_s=320.0)
@@ -58,9 +75,15 @@ def test_a_reader_beside_the_session_sees_what_it_does(tmp_path: Path) -> None:
     assert more["time_s"][0] == pytest.approx(2.2)
     assert all(math.isnan(value) for value in more["displacement_um"])
     assert reader.progress == Progressed(
-        "design", 0.0, 320.0, 0.0, "apply which?", "", ("observe: laser noise 1.00 µm",),
+        "design",
+        0.0,
+        320.0,
+        0.0,
+        "apply which?",
+        "",
+        ("observe: laser noise 1.00 µm",),
         ((0.0, "observe"), (3.0, "design")),
-    )  # fmt: skip
+    )
     assert reader.read()["time_s"] == []
 
 
@@ -79,7 +102,8 @@ def test_a_line_torn_by_a_kill_costs_no_other_line(tmp_path: Path) -> None:
 
 def test_a_foreign_log_harms_nobody(tmp_path: Path) -> None:
     (tmp_path / NAME).write_bytes(
-        b'[]\n5\n{"every_s": 1e400, "displacement_um": [], "setpoint_um": [], "flow_um_per_s": []}\n\xff\xfe\n'
+        b'[]\n5\n{"every_s": 1e400, "displacement_um": [], "setpoint_um": [], '
+        b'"flow_um_per_s": []}\n\xff\xfe\n'
         b'{"every_s": 0.2, "displacement_um": [1], "setpoint_um": [1, 2], "flow_um_per_s": [1]}\n'
         b'{"step": {}, "planned_s": "x", "after_s": 1}\n{"said": "' + b"a" * 9000 + b'"}\n'
     )
@@ -102,15 +126,37 @@ def test_a_full_disk_ends_the_log_and_says_so_once(tmp_path: Path) -> None:
     ("progress", "done", "silent_s", "words"),
     [
         (Progressed(), 0, 0.0, "Nothing recorded yet"),
-        (Progressed("observe", 300.0, 320.0, 60.0), 2, 1.0, "Now: observe, 1:00 of about 5:00; 9:20 of holding left"),
+        (
+            Progressed("observe", 300.0, 320.0, 60.0),
+            2,
+            1.0,
+            "Now: observe, 1:00 of about 5:00; 9:20 of holding left",
+        ),
         (Progressed("design"), 3, 40.0, "Now: design"),
-        (Progressed("design", asks="which?"), 5, 4000.0, "Waiting for an answer on its terminal: which?"),
-        (Progressed("verify", 600.0), 6, 100.0, "killed or hangs; resume it with: membrane-ctrl tune run --resume"),
-        (Progressed("verify", ended="interrupted"), 6, 0.0, "Ended after verify (interrupted); resume it with"),
+        (
+            Progressed("design", asks="which?"),
+            5,
+            4000.0,
+            "Waiting for an answer on its terminal: which?",
+        ),
+        (
+            Progressed("verify", 600.0),
+            6,
+            100.0,
+            "killed or hangs; resume it with: membrane-ctrl tune run --resume",
+        ),
+        (
+            Progressed("verify", ended="interrupted"),
+            6,
+            0.0,
+            "Ended after verify (interrupted); resume it with",
+        ),
         (Progressed("verify", ended="done"), 7, 0.0, "Done."),
     ],
 )
-def test_the_page_says_what_a_session_does(progress: Progressed, done: int, silent_s: float, words: str) -> None:
+def test_the_page_says_what_a_session_does(
+    progress: Progressed, done: int, silent_s: float, words: str
+) -> None:
     assert words in status(progress, set(folder.STEPS[:done]), silent_s, Path("logs/tuning/s"))
 
 
@@ -134,22 +180,34 @@ RUNNING = LoopConfig(kp_per_s=0.5, setpoint_um=7.0)
     [
         (RUNNING, {}, ""),
         (RUNNING.model_copy(update={"setpoint_um": 0.0, "bleed_fraction": 0.01}), {}, ""),
-        (RUNNING.model_copy(update={"kp_per_s": 0.61}), {}, "loop.kp_per_s = 0.61, .* began with 0.5"),
-        (RUNNING, {"flow_full_um_per_s": 8.0}, "pump.flow_full_um_per_s = 8.0, the session had 5.3"),
+        (
+            RUNNING.model_copy(update={"kp_per_s": 0.61}),
+            {},
+            "loop.kp_per_s = 0.61, .* began with 0.5",
+        ),
+        (
+            RUNNING,
+            {"flow_full_um_per_s": 8.0},
+            "pump.flow_full_um_per_s = 8.0, the session had 5.3",
+        ),
         (RUNNING.model_copy(update={"rate_hz": 25.0}), {}, "loop.rate_hz = 25.0"),
     ],
 )
 def test_a_session_goes_on_with_a_later_hold_of_the_same_bench(
     tmp_path: Path, running: LoopConfig, pump: dict[str, float], refused: str
 ) -> None:
-    opened = folder.create_session(tmp_path, "s", "eve", "an-earlier-run", Config(loop=RUNNING), RUNNING)
+    opened = folder.create_session(
+        tmp_path, "s", "eve", "an-earlier-run", Config(loop=RUNNING), RUNNING
+    )
     config = Config(loop=running)
     config = config.model_copy(update={"pump": config.pump.model_copy(update=pump)})
     link = SimpleNamespace(config=config, name="a-later-run")
     if not refused:
         going_on = choice.for_hold(opened, link)  # type: ignore[arg-type]
         bleed = {"bleed_fraction": running.bleed_fraction}  # what a refusal may have asked for
-        assert going_on == replace(opened, head=replace(opened.head, before=RUNNING.model_copy(update=bleed)))
+        assert going_on == replace(
+            opened, head=replace(opened.head, before=RUNNING.model_copy(update=bleed))
+        )
         return
     with pytest.raises(InputError, match=refused):
         choice.for_hold(opened, link)  # type: ignore[arg-type]
@@ -171,7 +229,12 @@ class AskedPage(LiveLog):
 
     def __init__(self, session: Path, *answers: str, keyboard: int = -1, typed: str = "") -> None:
         super().__init__(session, RATE_HZ, lambda line: pytest.fail(line))
-        self._session, self._answers, self._keyboard, self._typed = session, iter(answers), keyboard, typed
+        self._session, self._answers, self._keyboard, self._typed = (
+            session,
+            iter(answers),
+            keyboard,
+            typed,
+        )
 
     def note(self, what: str, line: str, **more: object) -> None:
         super().note(what, line, **more)  # type: ignore[arg-type]
@@ -212,7 +275,14 @@ def test_a_question_is_answered_on_the_page(
 
 @pytest.mark.parametrize(
     "unfit",
-    [answer("wild"), answer("calm", to="another?"), "{", "[]", '{"to": "which?", "said": ["calm"], "by": 1}', "\0"],
+    [
+        answer("wild"),
+        answer("calm", to="another?"),
+        "{",
+        "[]",
+        '{"to": "which?", "said": ["calm"], "by": 1}',
+        "\0",
+    ],
 )
 def test_the_terminal_answers_as_ever_and_an_unfit_answer_of_the_page_does_not(
     tmp_path: Path, keyboard: int, unfit: str

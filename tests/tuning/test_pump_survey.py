@@ -1,4 +1,6 @@
-"""The pump's curve on actuators that nobody told the product of: second world, defaults in the configuration."""
+"""The pump's curve on actuators that nobody told the product of: second world, defaults in the
+configuration.
+"""
 
 from __future__ import annotations
 
@@ -20,7 +22,13 @@ from membrane_ctrl.controller.cross_check import cross_check
 from membrane_ctrl.model.errors import Exit, RejectedError
 from membrane_ctrl.model.telemetry import State
 from membrane_ctrl.sessions.folder import SessionFolder, create_session, open_session
-from tests.support.second_world import CURVES, ForeignPlant, ForeignPump, foreign_bench, foreign_config
+from tests.support.second_world import (
+    CURVES,
+    ForeignPlant,
+    ForeignPump,
+    foreign_bench,
+    foreign_config,
+)
 from tuning import command as tune
 from tuning import pump_trial
 from tuning.identification.loop_model import Gains, PlantModel, margins
@@ -33,8 +41,12 @@ from tuning.rig import HoldRig
 DT_S = 0.1
 
 
-def measured_run(pump: ForeignPump, commands: list[tuple[float, float]], seed: int = 1, leak: float = 1.2) -> PumpRun:
-    """What a mirror without weather shows of a series of (command, seconds); the pump held it before."""
+def measured_run(
+    pump: ForeignPump, commands: list[tuple[float, float]], seed: int = 1, leak: float = 1.2
+) -> PumpRun:
+    """What a mirror without weather shows of a series of (command, seconds); the pump held it
+    before.
+    """
     rng = np.random.default_rng(seed)
     pump.balance(leak)
     given = np.repeat([c for c, _ in commands], [round(s / DT_S) for _, s in commands])
@@ -43,18 +55,34 @@ def measured_run(pump: ForeignPump, commands: list[tuple[float, float]], seed: i
         heights.append(height)
         height += sum(pump.step(command) - leak for _ in range(10)) * 0.01
     return PumpRun(
-        DT_S, given, np.array(heights) + 0.3 * rng.standard_normal(given.size), np.full(given.size, math.nan)
+        DT_S,
+        given,
+        np.array(heights) + 0.3 * rng.standard_normal(given.size),
+        np.full(given.size, math.nan),
     )
 
 
 @pytest.mark.parametrize(("delay_s", "lag_s"), [(0.1, 0.1), (0.9, 0.4), (1.5, 0.5)])
-def test_the_flow_at_each_command_behind_any_dead_time_and_lag(delay_s: float, lag_s: float) -> None:
+def test_the_flow_at_each_command_behind_any_dead_time_and_lag(
+    delay_s: float, lag_s: float
+) -> None:
     pump = ForeignPump("quadratic", 7.0, delay_s, lag_s)
-    cycle = [(0.0, 5.0), (0.8, 1.5), (0.0, 4.0), (0.6, 3.0), (0.0, 3.0), (0.4, 4.0), (1.0, 1.0), (0.0, 4.0)]
+    cycle = [
+        (0.0, 5.0),
+        (0.8, 1.5),
+        (0.0, 4.0),
+        (0.6, 3.0),
+        (0.0, 3.0),
+        (0.4, 4.0),
+        (1.0, 1.0),
+        (0.0, 4.0),
+    ]
     found = fit([measured_run(pump, 4 * cycle, seed) for seed in (1, 2)])
     for command in (0.4, 0.6, 0.8, 1.0):
         at = found.levels[Level(command)]
-        assert at.flow_um_per_s == pytest.approx(pump.settled(command), abs=max(4 * at.sigma_um_per_s, 0.1))
+        assert at.flow_um_per_s == pytest.approx(
+            pump.settled(command), abs=max(4 * at.sigma_um_per_s, 0.1)
+        )
         assert at.sigma_um_per_s < 0.15
     assert found.leak_um_per_s == pytest.approx(1.2, abs=0.1)
     assert found.delay_s + found.lag_s == pytest.approx(delay_s + lag_s, abs=0.1)
@@ -73,11 +101,17 @@ def test_runs_without_readings_are_refused() -> None:
         fit([PumpRun(DT_S, np.full(100, 0.3), np.full(100, math.nan), np.full(100, math.nan))])
 
 
-def started(tmp_path: Path, plant: ForeignPlant, **loop: float) -> tuple[TwinHold, HoldRig, SessionFolder]:
+def started(
+    tmp_path: Path, plant: ForeignPlant, **loop: float
+) -> tuple[TwinHold, HoldRig, SessionFolder]:
     """A session on a bench of the second world, in a hold with the default configuration."""
     link = TwinHold(foreign_config(**{"rate_hz": 20.0, **loop}), bench=foreign_bench(plant))
     rig = HoldRig(link, "tester")
-    return link, rig, create_session(tmp_path, "foreign", "tester", link.name, link.config, rig.loop)
+    return (
+        link,
+        rig,
+        create_session(tmp_path, "foreign", "tester", link.name, link.config, rig.loop),
+    )
 
 
 def mapped(tmp_path: Path, plant: ForeignPlant) -> tuple[PumpMap, TwinHold]:
@@ -90,7 +124,9 @@ def mapped(tmp_path: Path, plant: ForeignPlant) -> tuple[PumpMap, TwinHold]:
 
 @pytest.mark.campaign
 def test_a_late_quadratic_pump_is_mapped(tmp_path: Path) -> None:
-    """It stopped both the relay's fit ("stalls at small flows") and the former map ("too tight, or no pump")."""
+    """It stopped both the relay's fit ("stalls at small flows") and the former map ("too tight, or
+    no pump").
+    """
     pump = ForeignPump("quadratic", 7.0, 0.9, 0.3, start=0.2, stall=0.2)
     found, link = mapped(tmp_path, ForeignPlant(pump, laser_um=0.5, weather=0.5))
     assert worst_share(found, pump) < 0.03
@@ -103,7 +139,9 @@ def test_a_late_quadratic_pump_is_mapped(tmp_path: Path) -> None:
 
 @pytest.mark.campaign
 def test_a_weak_pump_that_starts_steeply_is_mapped(tmp_path: Path) -> None:
-    """The spline carried the certainty of no flow at command 0 into the dead zone: 0.3 µm/s where there is none."""
+    """The spline carried the certainty of no flow at command 0 into the dead zone: 0.3 µm/s where
+    there is none.
+    """
     pump = ForeignPump("root", 3.1, 0.22, 0.09)
     found, _ = mapped(tmp_path, ForeignPlant(pump, 20, 2.36, 2.1, laser_um=1.34))
     assert worst_share(found, pump) < 0.03
@@ -111,7 +149,9 @@ def test_a_weak_pump_that_starts_steeply_is_mapped(tmp_path: Path) -> None:
 
 @pytest.mark.campaign
 def test_a_pump_whose_first_percent_holds_the_mirror_is_mapped(tmp_path: Path) -> None:
-    """The curve began at 0.06 with 0.85 µm/s, more than the leak, and the session was told to open the bleed."""
+    """The curve began at 0.06 with 0.85 µm/s, more than the leak, and the session was told to open
+    the bleed.
+    """
     pump = ForeignPump("root", 6.74, 0.45, 1.38)
     found, _ = mapped(tmp_path, ForeignPlant(pump, 141, 0.41, 0.57, laser_um=0.11))
     assert PumpCurve(found.pump).least_flow_um_per_s < 0.2
@@ -120,12 +160,16 @@ def test_a_pump_whose_first_percent_holds_the_mirror_is_mapped(tmp_path: Path) -
 
 @pytest.mark.campaign
 def test_a_survey_holds_the_mirror_on_what_it_knows_so_far(tmp_path: Path) -> None:
-    """With the line of the defaults the hold of a pump 15 times its leak swings by 20 µm, and was not surveyed."""
+    """With the line of the defaults the hold of a pump 15 times its leak swings by 20 µm, and was
+    not surveyed.
+    """
     pump = ForeignPump("root", 29.4, 0.25, 0.45)
     link, rig, _ = started(tmp_path, ForeignPlant(pump, 25, 1.0, 2.0, laser_um=0.4))
     pump_trial._calmed(rig, 10.0)
     assert worst_share(pump_trial._surveyed(rig, 10.0), pump) < 0.03
-    late = [row for row in link.rows[len(link.rows) // 2 :] if row.state in (State.HOLD, State.TUNE)]
+    late = [
+        row for row in link.rows[len(link.rows) // 2 :] if row.state in (State.HOLD, State.TUNE)
+    ]
     assert max(abs(row.truth_displacement_um) for row in late) < 12.0
 
 
@@ -134,7 +178,9 @@ def test_a_survey_holds_the_mirror_on_what_it_knows_so_far(tmp_path: Path) -> No
 @pytest.mark.parametrize("shape", sorted(CURVES))
 def test_every_actuator_is_mapped(tmp_path: Path, shape: str, gusts: bool) -> None:
     stiction = {"start": 0.22, "stall": 0.15} if shape == "straight" else {}
-    pump = ForeignPump(shape, 6.0, 0.3, 0.2, play=0.04 if shape == "hysteretic" else 0.0, **stiction)
+    pump = ForeignPump(
+        shape, 6.0, 0.3, 0.2, play=0.04 if shape == "hysteretic" else 0.0, **stiction
+    )
     found, _ = mapped(tmp_path, ForeignPlant(pump, gusts=gusts))
     assert worst_share(found, pump) < (0.05 if gusts else 0.03)
     assert bool(found.pump.curve_falling_um_per_s) == (shape == "hysteretic")
@@ -181,10 +227,14 @@ def test_a_stuck_pump_is_told(
     link.bench.wrong.pump_stuck_fraction = math.nan
     for _ in range(240):
         link.news()
-    assert all(abs(row.truth_displacement_um) < 3.0 for row in link.rows[-400:])  # with the former gains and curve
+    assert all(
+        abs(row.truth_displacement_um) < 3.0 for row in link.rows[-400:]
+    )  # with the former gains and curve
 
 
-def survey_of(fractions: list[float], flows: list[float], leak: float, delay_s: float = 0.1) -> PumpSurvey:
+def survey_of(
+    fractions: list[float], flows: list[float], leak: float, delay_s: float = 0.1
+) -> PumpSurvey:
     """A survey that has found these flows at these commands, to 3 % and 0.05 µm/s."""
     found = PumpSurvey(0.15, runs=[PumpRun(DT_S, *np.zeros((3, 1)))])
     sigmas = [0.03 * flow + 0.05 for flow in flows]
@@ -197,17 +247,28 @@ def survey_of(fractions: list[float], flows: list[float], leak: float, delay_s: 
 
 
 def test_a_pump_that_starts_with_several_leaks_is_told_from_one_whose_flow_is_not_known() -> None:
-    said = "rises from 0.1 µm/s at a command of 0.25 to 17.0 µm/s at 0.35, and the mirror loses 1.8 µm/s: throttle"
+    said = (
+        "rises from 0.1 µm/s at a command of 0.25 to 17.0 µm/s at 0.35, and the mirror loses 1.8 "
+        "µm/s: throttle"
+    )
     with pytest.raises(ValueError, match=said):
         survey_of([0.25, 0.35], [0.1, 17.0], 1.8).result()
-    with pytest.raises(ValueError, match=r"beyond a command of 0\.25 is not known"):  # what is between may hold it
+    with pytest.raises(
+        ValueError, match=r"beyond a command of 0\.25 is not known"
+    ):  # what is between may hold it
         survey_of([0.25, 0.55], [0.1, 17.0], 1.8).result()
-    with pytest.raises(ValueError, match=r"beyond a command of 0\.25 is not known"):  # a hold at 4.5 is possible
+    with pytest.raises(
+        ValueError, match=r"beyond a command of 0\.25 is not known"
+    ):  # a hold at 4.5 is possible
         survey_of([0.25, 0.35], [0.1, 17.0], 4.5).result()
 
 
-@pytest.mark.parametrize(("leak", "delay_s", "least_um"), [(2.4, 1.9, -0.7), (0.5, 0.1, -5.4), (6.0, 1.9, 0.0)])
-def test_a_visit_ends_while_the_hold_can_still_catch_the_mirror(leak: float, delay_s: float, least_um: float) -> None:
+@pytest.mark.parametrize(
+    ("leak", "delay_s", "least_um"), [(2.4, 1.9, -0.7), (0.5, 0.1, -5.4), (6.0, 1.9, 0.0)]
+)
+def test_a_visit_ends_while_the_hold_can_still_catch_the_mirror(
+    leak: float, delay_s: float, least_um: float
+) -> None:
     survey = survey_of([0.3, 0.6], [leak - 0.2, leak + 0.2], leak, delay_s)
     steps = survey._visit(Level(0.6))
     run = next(i for i, step in enumerate(steps) if step.fraction == 0.6 and step.until_um is None)
@@ -215,14 +276,20 @@ def test_a_visit_ends_while_the_hold_can_still_catch_the_mirror(leak: float, del
     assert steps[-1].until_um == pytest.approx(least_um)
 
 
-def furthest_um(steps: list[PumpStep], full: float, leak: float, delay_s: float) -> tuple[float, float]:
-    """Lowest and highest point of a mirror that follows `steps` behind a dead time, on a linear pump."""
+def furthest_um(
+    steps: list[PumpStep], full: float, leak: float, delay_s: float
+) -> tuple[float, float]:
+    """Lowest and highest point of a mirror that follows `steps` behind a dead time, on a linear
+    pump.
+    """
     dt_s, at_um, heights, left = 0.01, 0.0, [0.0], list(steps)
     sent = [leak / full] * round(delay_s / dt_s)
     since_s = 0.0
     while left:
         now = left[0]
-        met = now.until_um is not None and (at_um <= now.until_um if now.fraction == 0 else at_um >= now.until_um)
+        met = now.until_um is not None and (
+            at_um <= now.until_um if now.fraction == 0 else at_um >= now.until_um
+        )
         if met or since_s > now.duration_s:
             left.pop(0)
             since_s = 0.0
@@ -258,7 +325,8 @@ def test_while_no_command_lifts_the_mirror_first_pulses_go_on() -> None:
 
 
 @pytest.mark.parametrize(
-    ("shape", "share"), [("root", 0.95), ("dead zone", 0.95), ("top unreachable", 0.9), ("quadratic", 0.95)]
+    ("shape", "share"),
+    [("root", 0.95), ("dead zone", 0.95), ("top unreachable", 0.9), ("quadratic", 0.95)],
 )
 def test_the_smoothed_flows_are_as_wrong_as_they_say(shape: str, share: float) -> None:
     """All flows share the leak's error, and a dead zone must not be smoothed away with it."""
@@ -295,23 +363,34 @@ def test_first_pulses_are_longer_and_at_once_after_a_fall_and_shorter_after_a_ri
 
 def test_the_levels_with_the_largest_errors_are_visited_first() -> None:
     survey = survey_of([0.2, 0.4, 0.6, 0.8], [0.5, 1.0, 1.5, 2.0], 0.9)
-    survey._branches[True].sigmas[1:] = [0.05, 0.05, 0.30, 0.06]  # of the smaller ones that of the leak
+    survey._branches[True].sigmas[1:] = [
+        0.05,
+        0.05,
+        0.30,
+        0.06,
+    ]  # of the smaller ones that of the leak
     survey._wanted = set(survey.fit.levels)
     assert [level.fraction for level in survey._visits()[:2]] == [0.6, 0.8]
 
 
 @pytest.mark.parametrize(
     ("flows", "finer"),
-    [([0.0, 0.7, 1.4], True),  # of a leak of 0.57: no command known so far gives less
-     ([0.0, 0.2, 1.4], False)],
-)  # fmt: skip
-def test_a_rise_through_the_leak_is_followed_further_than_one_below_it(flows: list[float], finer: bool) -> None:
+    [
+        ([0.0, 0.7, 1.4], True),  # of a leak of 0.57: no command known so far gives less
+        ([0.0, 0.2, 1.4], False),
+    ],
+)
+def test_a_rise_through_the_leak_is_followed_further_than_one_below_it(
+    flows: list[float], finer: bool
+) -> None:
     assert (0.053 in survey_of([0.045, 0.061, 0.2], flows, 0.57)._finer(True)) == finer
 
 
 @pytest.mark.parametrize(("leak", "finer"), [(0.4, True), (12.0, False)])
 def test_a_kink_that_the_hold_sees_is_followed(leak: float, finer: bool) -> None:
-    """A dead zone ends at 0.31, hidden within 2 % of the full flow; but a hold on that curve saw k = 1.2."""
+    """A dead zone ends at 0.31, hidden within 2 % of the full flow; but a hold on that curve saw k
+    = 1.2.
+    """
     survey = survey_of([0.242, 0.322, 0.422, 0.567, 1.0], [0.0, 0.226, 2.106, 4.83, 13.0], leak)
     survey._branches[True].sigmas[1:] = 0.02
     assert (0.282 in survey._finer(True)) == finer
@@ -319,16 +398,30 @@ def test_a_kink_that_the_hold_sees_is_followed(leak: float, finer: bool) -> None
 
 @pytest.mark.parametrize(
     ("before", "high", "jump"),
-    [(0.0, 0.088, True), (0.142, 0.088, True), (0.6, 0.088, False), (0.0, 0.13, True), (0.142, 0.13, False)],
+    [
+        (0.0, 0.088, True),
+        (0.142, 0.088, True),
+        (0.6, 0.088, False),
+        (0.0, 0.13, True),
+        (0.142, 0.13, False),
+    ],
 )
-def test_a_start_behind_noise_is_a_jump_and_a_slope_is_none(before: float, high: float, jump: bool) -> None:
-    """A level below the start read 2.4 % of the full flow in gusts, and the start was taken for a steep rise."""
-    branch = Branch(np.array([0.0, 0.087, high]), np.array([0.0, before, 1.4]), np.array([0.001, 0.25, 0.03]))
+def test_a_start_behind_noise_is_a_jump_and_a_slope_is_none(
+    before: float, high: float, jump: bool
+) -> None:
+    """A level below the start read 2.4 % of the full flow in gusts, and the start was taken for a
+    steep rise.
+    """
+    branch = Branch(
+        np.array([0.0, 0.087, high]), np.array([0.0, before, 1.4]), np.array([0.001, 0.25, 0.03])
+    )
     assert first_jump(branch, 6.0) == ((0.087, high) if jump else None)
 
 
 @pytest.mark.parametrize("late_s", [0.1, 0.9])
-def test_the_guard_of_a_round_knows_how_late_the_pump_is(monkeypatch: pytest.MonkeyPatch, late_s: float) -> None:
+def test_the_guard_of_a_round_knows_how_late_the_pump_is(
+    monkeypatch: pytest.MonkeyPatch, late_s: float
+) -> None:
     """It looked 0.4 s ahead of a pump that answers after 1.1 s, and the mirror sank by 10.8 µm."""
     survey = survey_of([0.2, 0.4], [0.5, 3.5], 1.2, delay_s=late_s)
     monkeypatch.setattr(pump_trial.pump_survey, "PumpSurvey", lambda *given: survey)
@@ -340,9 +433,11 @@ def test_the_guard_of_a_round_knows_how_late_the_pump_is(monkeypatch: pytest.Mon
         raise ValueError("enough")
 
     rig = SimpleNamespace(
-        hold=lambda seconds: None, around=lambda held, limit_um: pump_trial.machine.Around(1.2, 0.3, 5.0, 0.5),
-        pump=PumpConfig(), performed=performed,
-    )  # fmt: skip
+        hold=lambda seconds: None,
+        around=lambda held, limit_um: pump_trial.machine.Around(1.2, 0.3, 5.0, 0.5),
+        pump=PumpConfig(),
+        performed=performed,
+    )
     with pytest.raises(ValueError, match="enough"):
         pump_trial._surveyed(rig, 10.0)  # type: ignore[arg-type]
     assert given[0].late_s == pytest.approx(max(0.4, late_s + 0.1))
@@ -381,11 +476,17 @@ class Standing:
         for _ in range(round(duration_s / self.dt_s)):
             self.at_um = min(0.0, self.at_um + self.ramp_um_per_s * self.dt_s)
             here_um = 5.0 + 1.5 + self.at_um
-            rows.append(SimpleNamespace(target_um=5.0, trim_um=1.5, setpoint_um=here_um, displacement_um=here_um))
+            rows.append(
+                SimpleNamespace(
+                    target_um=5.0, trim_um=1.5, setpoint_um=here_um, displacement_um=here_um
+                )
+            )
         return rows
 
     def record(self, rows: list[SimpleNamespace]) -> SimpleNamespace:
-        return SimpleNamespace(filled_displacement_um=lambda: np.array([row.displacement_um for row in rows]))
+        return SimpleNamespace(
+            filled_displacement_um=lambda: np.array([row.displacement_um for row in rows])
+        )
 
 
 def test_a_round_begins_only_when_the_mirror_is_back_at_the_end_of_its_ramp() -> None:
@@ -395,26 +496,37 @@ def test_a_round_begins_only_when_the_mirror_is_back_at_the_end_of_its_ramp() ->
     assert not pump_trial._returned(Standing(-9.0, 0.0))  # type: ignore[arg-type]
 
 
-@pytest.mark.parametrize(("full", "least", "holds"), [(5.0, 0.3, True), (3.9, 0.3, False), (5.0, 2.5, False)])
+@pytest.mark.parametrize(
+    ("full", "least", "holds"), [(5.0, 0.3, True), (3.9, 0.3, False), (5.0, 2.5, False)]
+)
 def test_a_curve_that_ends_near_the_leak_does_not_hold_the_mirror_meanwhile(
     full: float, least: float, holds: bool
 ) -> None:
-    pump = PumpConfig.model_validate({"curve_fraction": [0.1, 0.9], "curve_um_per_s": [least, full]})
+    pump = PumpConfig.model_validate(
+        {"curve_fraction": [0.1, 0.9], "curve_um_per_s": [least, full]}
+    )
     assert pump_trial._holds(replace(flat_map(pump), leak_um_per_s=2.46)) == holds
 
 
 @pytest.mark.parametrize(("above_um", "back"), [(5.0, True), (-5.0, False)])
 def test_a_mirror_that_slow_gains_leave_above_gets_its_own(above_um: float, back: bool) -> None:
-    """In strong weather slow gains left it 8 µm high for three minutes, and a sound pump was refused."""
+    """In strong weather slow gains left it 8 µm high for three minutes, and a sound pump was
+    refused.
+    """
     own = LoopConfig(kp_per_s=0.5, ti_s=8.0)
     given: list[LoopConfig] = []
 
     class Rig(Standing):
-        loop, good = own.model_copy(update={"kp_per_s": 0.12, "flow_max_um_per_s": 3.0}), (own, PumpConfig())
+        loop, good = (
+            own.model_copy(update={"kp_per_s": 0.12, "flow_max_um_per_s": 3.0}),
+            (own, PumpConfig()),
+        )
 
         def ticks(self, duration_s: float) -> list[SimpleNamespace]:
             here_um = 6.5 if given else 6.5 + above_um
-            return [SimpleNamespace(target_um=5.0, trim_um=1.5, displacement_um=here_um)] * round(duration_s / 0.1)
+            return [SimpleNamespace(target_um=5.0, trim_um=1.5, displacement_um=here_um)] * round(
+                duration_s / 0.1
+            )
 
         def set_gains(self, loop: LoopConfig, *_: object) -> None:
             given.append(loop)
@@ -425,14 +537,20 @@ def test_a_mirror_that_slow_gains_leave_above_gets_its_own(above_um: float, back
 
 @pytest.mark.parametrize(
     ("seen", "lasted_s", "kept"),
-    [([(1.1, 0.02, False)], [120.0], True), ([(2.5, 0.5, True), (1.2, 0.15, False)], [120.0, 240.0], True),
-     ([(0.7, 0.05, False), (1.0, 0.05, False)], [120.0, 240.0], True),
-     ([(2.5, 0.05, False)] * 3, [120.0, 240.0, 480.0], False),
-     ([(2.5, 0.5, True)] * 3, [120.0, 240.0, 480.0], False),
-     ([(0.7, 0.3, False)] * 3, [120.0, 240.0, 480.0], True)],
-)  # fmt: skip
+    [
+        ([(1.1, 0.02, False)], [120.0], True),
+        ([(2.5, 0.5, True), (1.2, 0.15, False)], [120.0, 240.0], True),
+        ([(0.7, 0.05, False), (1.0, 0.05, False)], [120.0, 240.0], True),
+        ([(2.5, 0.05, False)] * 3, [120.0, 240.0, 480.0], False),
+        ([(2.5, 0.5, True)] * 3, [120.0, 240.0, 480.0], False),
+        ([(0.7, 0.3, False)] * 3, [120.0, 240.0, 480.0], True),
+    ],
+)
 def test_steps_that_see_little_or_contradict_the_curve_are_repeated_for_longer(
-    monkeypatch: pytest.MonkeyPatch, seen: list[tuple[float, float, bool]], lasted_s: list[float], kept: bool
+    monkeypatch: pytest.MonkeyPatch,
+    seen: list[tuple[float, float, bool]],
+    lasted_s: list[float],
+    kept: bool,
 ) -> None:
     done_s, left = [], list(seen)
     record = SimpleNamespace(followed_by=lambda more: left.pop(0))
@@ -446,10 +564,15 @@ def test_steps_that_see_little_or_contradict_the_curve_are_repeated_for_longer(
     monkeypatch.setattr(pump_trial.characterise, "spec_of", lambda kind, around, seconds: seconds)
     bent = {gain: told for gain, _, told in seen}
     monkeypatch.setattr(
-        pump_trial.identify, "identify",
-        lambda at: SimpleNamespace(model=SimpleNamespace(gain=at[0]), sigma=SimpleNamespace(gain=at[1])),
-    )  # fmt: skip
-    monkeypatch.setattr(pump_trial.characterise, "bent", lambda record, found: ["bent"] * bent[found.model.gain])
+        pump_trial.identify,
+        "identify",
+        lambda at: SimpleNamespace(
+            model=SimpleNamespace(gain=at[0]), sigma=SimpleNamespace(gain=at[1])
+        ),
+    )
+    monkeypatch.setattr(
+        pump_trial.characterise, "bent", lambda record, found: ["bent"] * bent[found.model.gain]
+    )
     if kept:
         assert pump_trial._checked(rig, 0.3) == seen[-1][:2]  # type: ignore[arg-type]
     else:
@@ -460,20 +583,29 @@ def test_steps_that_see_little_or_contradict_the_curve_are_repeated_for_longer(
 
 @pytest.mark.parametrize(
     ("fractions", "flows", "said"),
-    [([0.03, 0.22], [2.4, 4.8], r"to 2\.4 µm/s at 0\.03, .* larger by 0\.026"),
-     ([0.23, 0.42], [12.6, 14.8], "did not come back"),
-     ([0.03, 0.22], [0.0, 4.8], "did not come back to its setpoint .* steadier weather")],
-)  # fmt: skip
-def test_a_mirror_that_does_not_come_back_is_told(fractions: list[float], flows: list[float], said: str) -> None:
+    [
+        ([0.03, 0.22], [2.4, 4.8], r"to 2\.4 µm/s at 0\.03, .* larger by 0\.026"),
+        ([0.23, 0.42], [12.6, 14.8], "did not come back"),
+        ([0.03, 0.22], [0.0, 4.8], "did not come back to its setpoint .* steadier weather"),
+    ],
+)
+def test_a_mirror_that_does_not_come_back_is_told(
+    fractions: list[float], flows: list[float], said: str
+) -> None:
     with pytest.raises(ValueError, match=said):
         survey_of(fractions, flows, 1.0).result(held=False)
 
 
 @pytest.mark.parametrize(
     ("white", "worse", "seconds", "said"),
-    [(0.9995, 1.1, 1200.0, "--limit-um 20"), (0.9995, 1.5, 1200.0, "--limit-um 30"),
-     (0.9995, 4.0, 1200.0, "steadier"), (0.9, 1.1, 1200.0, "steadier"), (0.9, 1.1, 20.0, "--limit-um 20")],
-)  # fmt: skip
+    [
+        (0.9995, 1.1, 1200.0, "--limit-um 20"),
+        (0.9995, 1.5, 1200.0, "--limit-um 30"),
+        (0.9995, 4.0, 1200.0, "steadier"),
+        (0.9, 1.1, 1200.0, "steadier"),
+        (0.9, 1.1, 20.0, "--limit-um 20"),
+    ],
+)
 def test_a_larger_limit_is_asked_for_only_where_it_would_do(
     white: float, worse: float, seconds: float, said: str
 ) -> None:
@@ -497,10 +629,14 @@ def test_only_a_curve_that_steps_of_the_flow_confirm_is_kept(
 ) -> None:
     """The pump is as strong as this, and so is the map; another time the map says twice as much."""
     link, rig, folder = started(
-        tmp_path, ForeignPlant(ForeignPump("straight", 5.0), laser_um=0.4, weather=0.3), rate_hz=10.0
+        tmp_path,
+        ForeignPlant(ForeignPump("straight", 5.0), laser_um=0.4, weather=0.3),
+        rate_hz=10.0,
     )
     full = 5.0 * strength
-    wrong = PumpConfig(curve_fraction=(0.1, 1.0), curve_um_per_s=(0.0, full), flow_full_um_per_s=full)
+    wrong = PumpConfig(
+        curve_fraction=(0.1, 1.0), curve_um_per_s=(0.0, full), flow_full_um_per_s=full
+    )
     monkeypatch.setattr(pump_trial, "_surveyed", lambda rig, limit_um: flat_map(wrong))
     before = rig.loop, rig.pump
     if strength == 1.0:
@@ -509,7 +645,9 @@ def test_only_a_curve_that_steps_of_the_flow_confirm_is_kept(
         assert done.before == before[1]
         assert rig.pump == wrong
     else:
-        with pytest.raises(RejectedError, match=r"steps of the flow contradict the curve .* run `tune pump` again"):
+        with pytest.raises(
+            RejectedError, match=r"steps of the flow contradict the curve .* run `tune pump` again"
+        ):
             pump_trial.map_pump(folder, rig)
         assert (rig.loop, rig.pump) == before
         assert not pump_trial.mapped(folder)
@@ -530,7 +668,12 @@ def test_gains_too_fast_for_the_measured_actuator_become_slower() -> None:
 
 @pytest.mark.parametrize(
     ("limit", "rate_limit", "full", "after"),
-    [(5.3, 20.0, 15.9, 15.9), (6.0, 20.0, 2.0, 2.0), (5.3, 20.0, 60.0, 40.0), (3.0, 20.0, 15.9, 3.0)],
+    [
+        (5.3, 20.0, 15.9, 15.9),
+        (6.0, 20.0, 2.0, 2.0),
+        (5.3, 20.0, 60.0, 40.0),
+        (3.0, 20.0, 15.9, 3.0),
+    ],
 )
 def test_the_limit_of_the_flow_comes_with_the_curve_unless_somebody_set_a_lower_one(
     limit: float, rate_limit: float, full: float, after: float
@@ -547,10 +690,19 @@ def test_the_limit_of_the_flow_comes_with_the_curve_unless_somebody_set_a_lower_
 def test_a_leak_above_the_configured_flow_is_held_on_the_measured_curve(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """The pump is three times as strong as configured: the leak seems to be 2.2 µm/s until there is a curve."""
-    plant = ForeignPlant(ForeignPump("straight", 15.9), laser_um=0.4, weather=0.3, leak_um_per_s=6.5)
+    """The pump is three times as strong as configured: the leak seems to be 2.2 µm/s until there is
+    a curve.
+    """
+    plant = ForeignPlant(
+        ForeignPump("straight", 15.9), laser_um=0.4, weather=0.3, leak_um_per_s=6.5
+    )
     link, rig, folder = started(tmp_path, plant, rate_hz=10.0)
-    true = PumpConfig(curve_fraction=(0.1, 1.0), curve_um_per_s=(0.0, 15.9), start_fraction=0.1, stall_fraction=0.1)
+    true = PumpConfig(
+        curve_fraction=(0.1, 1.0),
+        curve_um_per_s=(0.0, 15.9),
+        start_fraction=0.1,
+        stall_fraction=0.1,
+    )
     rig.pump = rig.pump.model_copy(update={"probe_um": 0.1, "change_max": 0.3})
     monkeypatch.setattr(pump_trial, "_surveyed", lambda rig, limit_um: flat_map(true))
     done, folder = pump_trial.map_pump(folder, rig)
@@ -564,7 +716,9 @@ def test_a_leak_above_the_configured_flow_is_held_on_the_measured_curve(
 def test_a_whole_session_on_a_pump_that_nobody_told_it_of(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    """A quadratic diaphragm that starts at 0.22, 1.2 s late: from the defaults to verified gains, by one command."""
+    """A quadratic diaphragm that starts at 0.22, 1.2 s late: from the defaults to verified gains,
+    by one command.
+    """
     pump = ForeignPump("quadratic", 6.0, 1.0, 0.2, start=0.22, stall=0.2)
     ForeignHold.plant = ForeignPlant(pump, seed=4, laser_um=0.5, weather=0.6)
     assert tuned(tmp_path, monkeypatch, "run", "--yes") == Exit.DONE
@@ -573,7 +727,10 @@ def test_a_whole_session_on_a_pump_that_nobody_told_it_of(
     assert "verify: kept" in said
     assert all(abs(row.truth_displacement_um) < 3.0 for row in ForeignHold.last.rows[-6000:])
     config = tmp_path / "foreign.toml"
-    assert run(["tune", "save", "--config", str(config), "--logs", str(tmp_path), "--yes"]) == Exit.DONE
+    assert (
+        run(["tune", "save", "--config", str(config), "--logs", str(tmp_path), "--yes"])
+        == Exit.DONE
+    )
     saved = load(config, Config)
     flow = PumpCurve(saved.pump)
     assert all(abs(flow.flow(d) - pump.settled(d)) < 0.03 * 6.0 for d in np.linspace(0.25, 1.0, 50))
@@ -583,7 +740,9 @@ def test_a_whole_session_on_a_pump_that_nobody_told_it_of(
 def test_a_straight_pump_is_tuned_without_a_map(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    ForeignHold.plant = ForeignPlant(ForeignPump("straight", 5.3, start=0.22, stall=0.15), laser_um=0.5)
+    ForeignHold.plant = ForeignPlant(
+        ForeignPump("straight", 5.3, start=0.22, stall=0.15), laser_um=0.5
+    )
     assert tuned(tmp_path, monkeypatch, "run", "--yes") == Exit.DONE
     assert "pump:" not in capsys.readouterr().err
     assert ForeignHold.last.rows[-1].mono_s < 1700.0

@@ -1,4 +1,6 @@
-"""Who does what a refusal of `tune` says gets what was asked for; benches of the second world, defaults, 10 Hz."""
+"""Who does what a refusal of `tune` says gets what was asked for; benches of the second world,
+defaults, 10 Hz.
+"""
 
 from __future__ import annotations
 
@@ -27,7 +29,9 @@ class Refusal:
     words: tuple[str, ...]  # of the command
     said: str
     instead: tuple[str, ...] = ()  # the words that the refusal asks for; else the same
-    plant: Callable[[], ForeignPlant] = lambda: ForeignPlant(ForeignPump(), weather=0.3, laser_um=0.5)
+    plant: Callable[[], ForeignPlant] = lambda: ForeignPlant(
+        ForeignPump(), weather=0.3, laser_um=0.5
+    )
     wrong: dict[str, float] = field(default_factory=dict)  # until the refusal is obeyed
     then: Callable[[], ForeignPlant] | None = None  # another bench than before
     code: Exit = Exit.REJECTED
@@ -51,16 +55,25 @@ REFUSALS = {
         ("run", "--yes", "--observe", "200s", "--verify", "60s"),
     ),
     "stuck pump": Refusal(
-        ("pump",), "the pump is stuck, or its gas does not arrive: free it", wrong={"pump_stuck_fraction": 0.31}
+        ("pump",),
+        "the pump is stuck, or its gas does not arrive: free it",
+        wrong={"pump_stuck_fraction": 0.31},
     ),
     "laser lost": Refusal(
-        ("characterise",), "no valid laser reading; start or resume", wrong={"no_light": 1}, code=Exit.DEVICE_FAILED
+        ("characterise",),
+        "no valid laser reading; start or resume",
+        wrong={"no_light": 1},
+        code=Exit.DEVICE_FAILED,
     ),
-    "too tight": Refusal(("characterise",), "open the bleed", plant=straight(leak_um_per_s=0.04, weather=0.1)),
+    "too tight": Refusal(
+        ("characterise",), "open the bleed", plant=straight(leak_um_per_s=0.04, weather=0.1)
+    ),
     "least flow above the leak": Refusal(
         ("pump",),
         "open the bleed",
-        plant=lambda: ForeignPlant(ForeignPump("bottom unreachable", 25.0, 0.3, 0.3), 5, 0.8, 0.6, laser_um=0.5),
+        plant=lambda: ForeignPlant(
+            ForeignPump("bottom unreachable", 25.0, 0.3, 0.3), 5, 0.8, 0.6, laser_um=0.5
+        ),
     ),
     "relays stopped by weather": Refusal(
         ("characterise",),
@@ -71,8 +84,12 @@ REFUSALS = {
     "survey stopped by weather": Refusal(
         ("pump", "--limit-um", "30"),
         "in steadier weather",
-        plant=lambda: ForeignPlant(ForeignPump("quadratic", 1.66, 0.07, 0.63), 2241, 1.72, 1.25, True, 2.3),
-        then=lambda: ForeignPlant(ForeignPump("quadratic", 1.66, 0.07, 0.63), 2241, 0.3, 1.25, False, 0.5),
+        plant=lambda: ForeignPlant(
+            ForeignPump("quadratic", 1.66, 0.07, 0.63), 2241, 1.72, 1.25, True, 2.3
+        ),
+        then=lambda: ForeignPlant(
+            ForeignPump("quadratic", 1.66, 0.07, 0.63), 2241, 0.3, 1.25, False, 0.5
+        ),
     ),
 }
 
@@ -92,7 +109,12 @@ class Hold(TwinHold):
             setattr(self.bench.wrong, name, value)
 
 
-def obeyed(refusal: Refusal, logs: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
+def obeyed(
+    refusal: Refusal,
+    logs: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
     """Ask, be refused, do what the refusal says, and get it."""
     monkeypatch.setattr(opening, "TwinHold", Hold)
     monkeypatch.setattr(Hold, "refusal", refusal, raising=False)
@@ -129,7 +151,8 @@ def test_a_refusal_that_is_obeyed_is_not_given_again(
 def test_relays_that_noise_and_weather_stop_tell_the_gain(seed: int, weather: float) -> None:
     """They were discarded, and the session asked for a larger limit."""
     hold = TwinHold(
-        foreign_config(rate_hz=10.0), bench=foreign_bench(straight(seed=seed, weather=weather, laser_um=3.0)())
+        foreign_config(rate_hz=10.0),
+        bench=foreign_bench(straight(seed=seed, weather=weather, laser_um=3.0)()),
     )
     done = experiment(HoldRig(hold, "test"))
     found = fitted(done)

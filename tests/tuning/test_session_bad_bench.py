@@ -1,4 +1,6 @@
-"""Sessions on benches with something wrong: detected, named with what would help, and the mirror stays held."""
+"""Sessions on benches with something wrong: detected, named with what would help, and the mirror
+stays held.
+"""
 
 from __future__ import annotations
 
@@ -35,7 +37,9 @@ def held(events: Sequence[BenchEvent] = (), **twin: object) -> tuple[TwinHold, H
 def still_held(link: TwinHold) -> bool:
     for _ in range(80):
         link.news()
-    return link.rows[-1].state == State.HOLD and all(abs(row.truth_displacement_um) < 2.0 for row in link.rows[-250:])
+    return link.rows[-1].state == State.HOLD and all(
+        abs(row.truth_displacement_um) < 2.0 for row in link.rows[-250:]
+    )
 
 
 @pytest.mark.campaign
@@ -101,7 +105,9 @@ def test_a_refused_command_is_an_error_with_the_reason() -> None:
 
 
 class Outer(TwinHold):
-    """What `tune outer` works on: the connection is lost, or Ctrl-C comes, a time after a trial begins."""
+    """What `tune outer` works on: the connection is lost, or Ctrl-C comes, a time after a trial
+    begins.
+    """
 
     last: Outer
     when = (0, 0.0)  # trials before it, seconds after its begin
@@ -136,11 +142,25 @@ class Outer(TwinHold):
 
 @pytest.mark.parametrize(
     ("when", "lost", "back_s"),
-    [((1, 20.0), False, 12.0), ((1, 20.0), True, 45.0), ((3, 5.0), False, 3.0), ((3, 5.0), True, 155.0)],
-    ids=["Ctrl-C, setpoint stepped", "lost, setpoint stepped", "Ctrl-C, on trial", "lost, on trial"],
+    [
+        ((1, 20.0), False, 12.0),
+        ((1, 20.0), True, 45.0),
+        ((3, 5.0), False, 3.0),
+        ((3, 5.0), True, 155.0),
+    ],
+    ids=[
+        "Ctrl-C, setpoint stepped",
+        "lost, setpoint stepped",
+        "Ctrl-C, on trial",
+        "lost, on trial",
+    ],
 )
 def test_an_interrupted_outer_restores_setpoint_shape_loop_and_time_constant(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, when: tuple[int, float], lost: bool, back_s: float
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    when: tuple[int, float],
+    lost: bool,
+    back_s: float,
 ) -> None:
     monkeypatch.setattr(opening, "TwinHold", Outer)
     monkeypatch.setattr(Outer, "when", when)
@@ -157,7 +177,9 @@ def test_an_interrupted_outer_restores_setpoint_shape_loop_and_time_constant(
     until_s = hold.rows[-1].mono_s + back_s
     while hold.rows[-1].mono_s < until_s:
         hold._advance(5)
-    assert hold.rows[-1].setpoint_um == pytest.approx(setpoint_um, abs=0.2)  # the shape loop trims it
+    assert hold.rows[-1].setpoint_um == pytest.approx(
+        setpoint_um, abs=0.2
+    )  # the shape loop trims it
     assert time_constant_s(hold) == hold.config.shape.time_constant_s
     assert hold.rows[-1].shape_state in (ShapeState.WAITING, ShapeState.TRACKING)
 
@@ -179,7 +201,9 @@ def time_constant_s(hold: TwinHold) -> float:
 def test_the_map_is_asked_for_by_the_first_relay_that_shows_the_need(
     pump: ForeignPump, at_most_s: float, words: str
 ) -> None:
-    link = TwinHold(foreign_config(rate_hz=20.0), bench=foreign_bench(ForeignPlant(pump, 4, 0.6, laser_um=0.5)))
+    link = TwinHold(
+        foreign_config(rate_hz=20.0), bench=foreign_bench(ForeignPlant(pump, 4, 0.6, laser_um=0.5))
+    )
     rig, before_s = HoldRig(link, "tester"), link.rows[-1].mono_s
     try:
         said = "; ".join(characterise(rig).quality.reasons)

@@ -1,4 +1,6 @@
-"""A whole session on the twin, as the command runs it: what it leaves, and how each step goes wrong."""
+"""A whole session on the twin, as the command runs it: what it leaves, and how each step goes
+wrong.
+"""
 
 from __future__ import annotations
 
@@ -113,7 +115,9 @@ def test_a_session_killed_at_any_moment_has_whole_steps_only(killed: Killed) -> 
         opened = open_session(path)
         steps = [step for step in STEPS if opened.done(step)]
         assert steps == list(STEPS[: len(steps)])
-        if steps and steps[-1] not in reached:  # the earlier a step counts as done, the less of it may be there
+        if (
+            steps and steps[-1] not in reached
+        ):  # the earlier a step counts as done, the less of it may be there
             LOADED[steps[-1]](opened)
             reached.add(steps[-1])
     assert reached == set(STEPS)
@@ -137,7 +141,9 @@ def test_a_session_killed_before_its_journal_is_complete_when_resumed(
 
 @pytest.mark.campaign
 @pytest.mark.parametrize("step", STEPS)
-def test_a_session_killed_in_any_step_goes_on_with_it(killed: Killed, tmp_path: Path, step: str) -> None:
+def test_a_session_killed_in_any_step_goes_on_with_it(
+    killed: Killed, tmp_path: Path, step: str
+) -> None:
     """The steps before it are not repeated, and the end is the same."""
     at = next(
         path
@@ -174,7 +180,9 @@ def test_it_leaves_gains_that_are_kept_and_justified(done: SessionFolder) -> Non
     assert gains.plant.model.delay_s == pytest.approx(0.225, abs=0.05)
     assert gains.predicted_std_um < 1.2 * gains.least_std_um
     assert gains.predicted_std_um < 0.98 * next(
-        row.predicted.std_um for row in session.design_of(done).candidates if row.name == "present" and row.predicted
+        row.predicted.std_um
+        for row in session.design_of(done).candidates
+        if row.name == "present" and row.predicted
     )
     assert verified.stages[-1].std_um == pytest.approx(gains.predicted_std_um, rel=0.3)
 
@@ -209,7 +217,9 @@ def test_a_picture_is_drawn_anew_when_what_it_shows_is(
     if renewed in pictures:
         done.file(renewed).unlink()
     elif renewed is not None:
-        os.utime(done.file(renewed), ns=(10**18, 2 * 10**18))  # at the same moment: which was first is not known
+        os.utime(
+            done.file(renewed), ns=(10**18, 2 * 10**18)
+        )  # at the same moment: which was first is not known
     seen: set[str] = set()
     monkeypatch.setattr(report, "write_figure", lambda path, figure, dpi: seen.add(path.name))
     report.draw(done)
@@ -225,7 +235,9 @@ def test_calculating_steps_can_be_repeated_without_a_hold(done: SessionFolder) -
 
 def test_a_step_whose_data_are_missing_names_the_step_to_run(done: SessionFolder) -> None:
     done.begin("observe")
-    with pytest.raises(InputError, match="observe is missing; run `membrane-ctrl tune observe` first"):
+    with pytest.raises(
+        InputError, match="observe is missing; run `membrane-ctrl tune observe` first"
+    ):
         session.design_step(done)
 
 
@@ -234,7 +246,9 @@ def test_the_estimate_is_told_what_the_session_measured(
 ) -> None:
     """The twin's own numbers; its laser rounds to 0.1 µm."""
     twin, found = TwinConfig(), session.estimator_of(done)
-    assert found["pump_delay_s"] + found["pump_lag_s"] == pytest.approx(twin.pump_delay_s + twin.pump_lag_s, abs=0.04)
+    assert found["pump_delay_s"] + found["pump_lag_s"] == pytest.approx(
+        twin.pump_delay_s + twin.pump_lag_s, abs=0.04
+    )
     assert found["laser_noise_um"] == pytest.approx(twin.laser_noise_um, rel=0.1)
     assert found["barometer_noise_pa"] == pytest.approx(twin.barometer_noise_pa, rel=0.2)
     assert found["thermometer_noise_k"] == pytest.approx(twin.thermometer_noise_k, rel=0.2)
@@ -245,14 +259,18 @@ def test_the_estimate_is_told_what_the_session_measured(
     words = ["tune", "save", str(done.path), "--config", str(path), "--yes"]
     assert command_line(words) == Exit.DONE
     saved = tomllib.loads(path.read_text())["estimator"]
-    changed = {key: value for key, value in found.items() if value != getattr(EstimatorConfig(), key)}
+    changed = {
+        key: value for key, value in found.items() if value != getattr(EstimatorConfig(), key)
+    }
     assert saved == {"process_value": "estimate"} | changed
     capsys.readouterr()
     assert command_line(words) == Exit.DONE
     assert "already has what" in capsys.readouterr().out
 
 
-def test_gains_are_not_designed_for_a_loop_that_has_none(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_gains_are_not_designed_for_a_loop_that_has_none(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     config = Config(estimator=EstimatorConfig(process_value="estimate"))
     made = create_session(tmp_path, "s", "eve", "a-run", config, config.loop)
     tune._do_all(["design", "apply"], made, None, None, Progress())  # type: ignore[arg-type]  # are not reached
@@ -261,27 +279,38 @@ def test_gains_are_not_designed_for_a_loop_that_has_none(tmp_path: Path, capsys:
         tune._do_all(["apply"], made, None, None, Progress())  # type: ignore[arg-type]
 
 
-BY_OPTICS = '[estimator]\nprocess_value = "optics"\n[shape]\nmode = "track"\n[twin]\nlaser = false\n'
+BY_OPTICS = (
+    '[estimator]\nprocess_value = "optics"\n[shape]\nmode = "track"\n[twin]\nlaser = false\n'
+)
 
 
-def test_a_hold_without_a_laser_is_tuned_by_its_figures(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_hold_without_a_laser_is_tuned_by_its_figures(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     config = BY_OPTICS + "pump_lag_s = 0.3\n[loop]\nrate_hz = 25.0\n"
     assert tune_twin(tmp_path / "logs", "run", "--short", "--yes", config=config) == Exit.DONE
     assert "figure noise 0.0" in capsys.readouterr().err
     path = tmp_path / "lab.toml"
     path.write_text(config)
     assert (
-        command_line(["tune", "save", "--config", str(path), "--logs", str(tmp_path / "logs"), "--yes"]) == Exit.DONE
+        command_line(
+            ["tune", "save", "--config", str(path), "--logs", str(tmp_path / "logs"), "--yes"]
+        )
+        == Exit.DONE
     )
     saved = tomllib.loads(path.read_text())["estimator"]
     assert saved["pump_delay_s"] + saved["pump_lag_s"] == pytest.approx(0.375, abs=0.05)
     assert "laser_noise_um" not in saved
 
 
-def test_without_a_laser_there_is_no_shape_loop_to_tune(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_without_a_laser_there_is_no_shape_loop_to_tune(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     assert tune_twin(tmp_path / "logs", "outer", "--yes", config=BY_OPTICS) == Exit.BAD_INPUT
     (line,) = capsys.readouterr().err.strip().splitlines()
-    assert line.endswith("has nothing to follow: the figure itself is held (estimator.process_value)")
+    assert line.endswith(
+        "has nothing to follow: the figure itself is held (estimator.process_value)"
+    )
     assert not (tmp_path / "logs" / "tuning").exists()
 
 
@@ -300,16 +329,22 @@ def test_an_identified_plant_of_other_experiments_is_refused(done: SessionFolder
     shorter = good["identified"] | {"residual_um": good["identified"]["residual_um"][:-1]}
     for forged in (good | {"data_sha256": "0" * 64}, good | {"identified": shorter}):
         path.write_text(json.dumps(forged))
-        with pytest.raises(InputError, match=r"identified\.json comes from other experiments; run identify again"):
+        with pytest.raises(
+            InputError, match=r"identified\.json comes from other experiments; run identify again"
+        ):
             session.found_of(done)
 
 
 @pytest.mark.parametrize("white", [1e200, 1e20, -1.0, "nan"])
-def test_noise_that_is_no_number_ends_the_design_in_one_line(done: SessionFolder, white: float | str) -> None:
+def test_noise_that_is_no_number_ends_the_design_in_one_line(
+    done: SessionFolder, white: float | str
+) -> None:
     path = done.file("disturbance.json")
     weather = json.loads(path.read_text())
     path.write_text(json.dumps(weather | {"rest": weather["rest"] | {"white": white}}))
-    with pytest.raises((RejectedError, InputError), match=r"^(design: |.*disturbance\.json: damaged)"):
+    with pytest.raises(
+        (RejectedError, InputError), match=r"^(design: |.*disturbance\.json: damaged)"
+    ):
         session.design_step(done)
 
 
@@ -318,7 +353,10 @@ def edited(done: SessionFolder, **changed: float) -> None:
     path = done.file("gains.toml")
     lines = path.read_text().splitlines()
     path.write_text(
-        "\n".join(f"{k} = {changed[k]}" if (k := line.split(" ")[0]) in changed else line for line in lines)
+        "\n".join(
+            f"{k} = {changed[k]}" if (k := line.split(" ")[0]) in changed else line
+            for line in lines
+        )
     )
 
 
@@ -340,11 +378,15 @@ def test_a_gains_file_edited_to_something_bad_is_not_applied(
     assert "gains.toml" in str(told.value)
 
 
-def test_gains_that_are_worse_are_taken_back_by_themselves(done: SessionFolder, tmp_path: Path) -> None:
+def test_gains_that_are_worse_are_taken_back_by_themselves(
+    done: SessionFolder, tmp_path: Path
+) -> None:
     """Sluggish gains, with margins that nothing can be said against."""
     edited(done, kp_per_s=0.1, ti_s=60.0)
     words = ("apply", "verify")
-    codes = [tune_twin(tmp_path, word, "--session", str(done.path), "--yes", *TIMES) for word in words]
+    codes = [
+        tune_twin(tmp_path, word, "--session", str(done.path), "--yes", *TIMES) for word in words
+    ]
     assert codes == [Exit.DONE, Exit.REJECTED]
     verified = session.verified_of(done)
     assert not verified.kept
@@ -371,7 +413,9 @@ class Kept(TwinHold):
         """Leaves the twin as it was left."""
 
 
-@pytest.mark.parametrize(("step", "after_s"), [("characterise", 75.0), ("characterise", 10.0), ("verify", 30.0)])
+@pytest.mark.parametrize(
+    ("step", "after_s"), [("characterise", 75.0), ("characterise", 10.0), ("verify", 30.0)]
+)
 def test_an_interrupt_gives_the_mirror_back_with_the_last_good_gains(
     done: SessionFolder, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, step: str, after_s: float
 ) -> None:
@@ -412,8 +456,9 @@ def test_history_rollback_and_comparison(
     assert back["reason"] == "did not like it"
     assert kept["traded"]["candidate"] == "least-variance"
     assert kept["traded"]["before"]["std_um"] > kept["traded"]["after"]["std_um"]
-    assert f"| least-variance | {kept['traded']['before']['std_um']:.3f} -> " in journal.history_table(
-        journal.entries(copied)
+    assert (
+        f"| least-variance | {kept['traded']['before']['std_um']:.3f} -> "
+        in journal.history_table(journal.entries(copied))
     )
 
 
@@ -425,7 +470,9 @@ def test_a_comparison_crosses_gains_and_benches(done: SessionFolder, tmp_path: P
     assert len([line for line in text.splitlines() if line.startswith(("| A | ", "| B | "))]) == 4
 
 
-def test_rolling_back_sets_the_gains_of_before(logs: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_rolling_back_sets_the_gains_of_before(
+    logs: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     copied = tmp_path / "logs"
     shutil.copytree(logs, copied)
     monkeypatch.setattr(tune.opening, "TwinHold", Kept)
@@ -464,27 +511,41 @@ def asked(
 
 
 def test_the_candidate_that_a_person_chooses_is_the_one_that_is_applied(
-    done: SessionFolder, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+    done: SessionFolder,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
 ) -> None:
-    code, kp_per_s = asked(done, tmp_path, monkeypatch, "fast\nziegler-nichols\npresent\nsimc-slow\n")
+    code, kp_per_s = asked(
+        done, tmp_path, monkeypatch, "fast\nziegler-nichols\npresent\nsimc-slow\n"
+    )
     chosen = next(row for row in session.design_of(done).candidates if row.name == "simc-slow")
     gains = load_gains(done.file("gains.toml"))
     assert code == Exit.DONE
     assert kp_per_s == pytest.approx(chosen.gains.kp_per_s, rel=0.02)
     assert (gains.candidate, gains.loop.kp_per_s) == ("simc-slow", chosen.gains.kp_per_s)
-    assert session.preview_of(done).proposed[0].load_peak_um == pytest.approx(chosen.load_peak_um, rel=0.05)
+    assert session.preview_of(done).proposed[0].load_peak_um == pytest.approx(
+        chosen.load_peak_um, rel=0.05
+    )
     said = capsys.readouterr().err
-    assert [name for name in ("fast", "present") if f"{name}: not a candidate of" in said] == ["fast", "present"]
+    assert [name for name in ("fast", "present") if f"{name}: not a candidate of" in said] == [
+        "fast",
+        "present",
+    ]
     assert "ziegler-nichols: is not applied: Ms" in said
     shown = [line.split()[0] for line in said.splitlines() if line.strip()]
     ordered = ["present", "least-variance", *[name for name in NAMES[1:] if name in shown]]
-    assert [name for name in shown if name in ordered] == 2 * ordered  # the figures, and what gets better and worse
+    assert [
+        name for name in shown if name in ordered
+    ] == 2 * ordered  # the figures, and what gets better and worse
     assert "in force" in said
     assert "simc-slow is on trial" in said
     assert "simc-slow is chosen" in done.file("report.html").read_text()
 
 
-@pytest.mark.parametrize(("answers", "code"), [("\n", Exit.DONE), ("", Exit.DONE), ("!\n", Exit.INTERRUPTED)])
+@pytest.mark.parametrize(
+    ("answers", "code"), [("\n", Exit.DONE), ("", Exit.DONE), ("!\n", Exit.INTERRUPTED)]
+)
 def test_no_answer_applies_nothing(
     done: SessionFolder,
     tmp_path: Path,
@@ -494,7 +555,10 @@ def test_no_answer_applies_nothing(
     code: Exit,
 ) -> None:
     before = done.file("gains.toml").read_bytes()
-    assert asked(done, tmp_path, monkeypatch, answers) == (code, pytest.approx(done.head.before.kp_per_s, rel=0.02))
+    assert asked(done, tmp_path, monkeypatch, answers) == (
+        code,
+        pytest.approx(done.head.before.kp_per_s, rel=0.02),
+    )
     assert done.file("gains.toml").read_bytes() == before
     assert not done.done("apply")
     said = capsys.readouterr().err
@@ -504,7 +568,9 @@ def test_no_answer_applies_nothing(
 def test_the_proposal_is_the_same_load_where_it_answers_a_load_no_worse(
     done: SessionFolder, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """`hold --autotune` asks for `same-load`, which is designed only where the proposal answers a load worse."""
+    """`hold --autotune` asks for `same-load`, which is designed only where the proposal answers a
+    load worse.
+    """
     rows = [row for row in session.offered(done)[0] if row.name != "same-load"]
     opened = open_session(Path(shutil.copytree(done.path, tmp_path / "copy")))
     monkeypatch.setattr(session, "offered", lambda folder: (tuple(rows), rows[0]))
@@ -524,11 +590,18 @@ def test_a_refused_name_applies_nothing(
 
 @pytest.mark.parametrize(
     ("words", "reason"),
-    [((), "add --yes (the proposal) or --choose NAME"), (("--choose", "fast"), "--choose fast: not a candidate")],
+    [
+        ((), "add --yes (the proposal) or --choose NAME"),
+        (("--choose", "fast"), "--choose fast: not a candidate"),
+    ],
 )
 @pytest.mark.parametrize("step", ["run", "apply"])
 def test_gains_that_nobody_can_choose_are_refused_before_anything_moves(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str], step: str, words: tuple[str, ...], reason: str
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
+    step: str,
+    words: tuple[str, ...],
+    reason: str,
 ) -> None:
     assert tune_twin(tmp_path, step, *words) == Exit.BAD_INPUT
     assert reason in capsys.readouterr().err
@@ -551,7 +624,11 @@ def test_edited_gains_are_a_candidate_of_their_own(done: SessionFolder) -> None:
     assert session.offered(done)[1].name == "least-variance"
     edited(done, kp_per_s=0.2)
     rows, now = session.offered(done)
-    assert (now.name, now.gains.kp_per_s, len(rows)) == ("edited", 0.2, 1 + len(session.design_of(done).candidates))
+    assert (now.name, now.gains.kp_per_s, len(rows)) == (
+        "edited",
+        0.2,
+        1 + len(session.design_of(done).candidates),
+    )
     assert "worse: " in against(now, next(row for row in rows if row.name == "present"))
 
 
@@ -591,7 +668,9 @@ def test_what_cannot_be_written_ends_in_one_line(
     path.unlink()
     path.mkdir()
     assert command_line(["tune", "identify", "--session", str(done.path)]) == Exit.DEVICE_FAILED
-    (said,) = (line for line in capsys.readouterr().err.splitlines() if line.startswith("membrane-ctrl: "))
+    (said,) = (
+        line for line in capsys.readouterr().err.splitlines() if line.startswith("membrane-ctrl: ")
+    )
     assert "cannot be written" in said
 
 

@@ -25,7 +25,15 @@ from tuning.identification.loop_model import Gains, PlantModel, Record, load_rec
 from tuning.identification.shape_loop import STEP_UM, evaluate, trial, unfit
 from tuning.opening import TuneOptions, TwinHold
 from tuning.proposal.prediction import ModelBench, predict
-from tuning.proposal.verify import SETTLE_LEAST_S, STAGES, VerificationTrial, centre_std_um, health, look, settle_s
+from tuning.proposal.verify import (
+    SETTLE_LEAST_S,
+    STAGES,
+    VerificationTrial,
+    centre_std_um,
+    health,
+    look,
+    settle_s,
+)
 from tuning.rig import HoldRig, Rig
 
 PLANT = PlantModel(1.0, 0.08, 0.15, 1.24)
@@ -35,7 +43,10 @@ LOOP = LoopConfig(feedforward_barometer=False, feedforward_temperature=False)
 
 @cache
 def held(
-    loop: LoopConfig, plant: PlantModel = PLANT, duration_s: float = 600.0, weather: DisturbanceModel = WEATHER
+    loop: LoopConfig,
+    plant: PlantModel = PLANT,
+    duration_s: float = 600.0,
+    weather: DisturbanceModel = WEATHER,
 ) -> tuple[Record, ModelBench]:
     """A hold of the model's own bench, settled; nobody changes it."""
     bench = ModelBench(plant, weather, PumpConfig(), 3)
@@ -48,7 +59,9 @@ def test_the_centre_s_deviation_is_seen_through_ten_times_the_noise() -> None:
     record, bench = held(LOOP)
     true_um = float(np.std(bench.true_um[1500:]))
     trial = VerificationTrial(PLANT, WEATHER, LOOP, LOOP)
-    assert centre_std_um(record.displacement_um, trial, WEATHER, LOOP) == pytest.approx(true_um, rel=0.2)
+    assert centre_std_um(record.displacement_um, trial, WEATHER, LOOP) == pytest.approx(
+        true_um, rel=0.2
+    )
 
 
 def test_a_slow_loop_is_given_longer_to_forget_the_change() -> None:
@@ -70,12 +83,21 @@ def test_a_look_passes_good_gains_and_names_what_is_wrong_with_bad_ones() -> Non
     assert "times that of the previous gains" in stage.reason
 
 
-@pytest.mark.parametrize(("kp_per_s", "reason"), [(0.1, ""), (0.03, "times that of the previous gains")])
-def test_a_deviation_that_was_predicted_and_accepted_is_no_failure(kp_per_s: float, reason: str) -> None:
+@pytest.mark.parametrize(
+    ("kp_per_s", "reason"), [(0.1, ""), (0.03, "times that of the previous gains")]
+)
+def test_a_deviation_that_was_predicted_and_accepted_is_no_failure(
+    kp_per_s: float, reason: str
+) -> None:
     """Gains chosen knowing what they cost; those that cost more than was predicted still fail."""
     chosen = LOOP.model_copy(update={"kp_per_s": 0.1, "ti_s": 60.0})
     record, _ = held(LOOP.model_copy(update={"kp_per_s": kp_per_s, "ti_s": 60.0}))
-    stage = look(record, np.zeros(len(record)), VerificationTrial(PLANT, WEATHER, LOOP, chosen, accepted=True), 1.1)
+    stage = look(
+        record,
+        np.zeros(len(record)),
+        VerificationTrial(PLANT, WEATHER, LOOP, chosen, accepted=True),
+        1.1,
+    )
     assert stage.growth > 1.1
     assert reason in stage.reason
     assert bool(stage.reason) == bool(reason)
@@ -86,17 +108,23 @@ def test_a_plant_with_less_margin_than_designed_shows_in_the_readings() -> None:
     loop = LOOP.model_copy(update={"kp_per_s": 1.0, "ti_s": 8.0, "measurement_filter_s": 0.1})
     changed = replace(PLANT, gain=2.0, dead_time_s=0.35, leak_um_per_s=2.48)
     record, _ = held(loop, changed)
-    stage = look(record, np.zeros(len(record)), VerificationTrial(PLANT, WEATHER, loop, loop), 100.0)
+    stage = look(
+        record, np.zeros(len(record)), VerificationTrial(PLANT, WEATHER, loop, loop), 100.0
+    )
     assert stage.ms > 2.0
     assert "less margin than designed" in stage.reason
 
 
-STORM_PUMP = PumpConfig(start_fraction=0, stall_fraction=0, curve_fraction=(0.0, 1.0), curve_um_per_s=(0.0, 5.3))
+STORM_PUMP = PumpConfig(
+    start_fraction=0, stall_fraction=0, curve_fraction=(0.0, 1.0), curve_um_per_s=(0.0, 5.3)
+)
 STORM_MODEL = PlantModel(1.0, 0.4, 0.3, 0.2)
 
 
 def in_a_storm(loop: LoopConfig) -> tuple[Record, float]:
-    """Ten minutes on a tight mirror of the second world, whose weather asks for less than no flow; true deviation."""
+    """Ten minutes on a tight mirror of the second world, whose weather asks for less than no flow;
+    true deviation.
+    """
     plant = ForeignPlant(ForeignPump("straight", 5.3, 0.4, 0.3), 7, 3.0, 0.2, True, 0.5, False)
     config = foreign_config(rate_hz=10.0).model_copy(update={"loop": loop, "pump": STORM_PUMP})
     link = TwinHold(config, bench=foreign_bench(plant))
@@ -107,8 +135,12 @@ def in_a_storm(loop: LoopConfig) -> tuple[Record, float]:
 
 
 def test_the_gains_before_are_judged_in_the_very_weather_of_the_new_ones() -> None:
-    """It asks for less than no flow for minutes: its spectrum says less than half of what the gains before had."""
-    before = foreign_config(rate_hz=10.0, feedforward_barometer=False, feedforward_temperature=False).loop
+    """It asks for less than no flow for minutes: its spectrum says less than half of what the gains
+    before had.
+    """
+    before = foreign_config(
+        rate_hz=10.0, feedforward_barometer=False, feedforward_temperature=False
+    ).loop
     after = before.model_copy(update={"kp_per_s": 0.35, "ti_s": 20.0})
     record, after_um = in_a_storm(after)
     _, before_um = in_a_storm(before)
@@ -121,7 +153,8 @@ def test_the_gains_before_are_judged_in_the_very_weather_of_the_new_ones() -> No
 
 
 @pytest.mark.parametrize(
-    ("verify_s", "until_s"), [(600.0, [60.0, 180.0, 300.0, 600.0]), (300.0, [60.0, 180.0, 300.0]), (30.0, [30.0])]
+    ("verify_s", "until_s"),
+    [(600.0, [60.0, 180.0, 300.0, 600.0]), (300.0, [60.0, 180.0, 300.0]), (30.0, [30.0])],
 )
 def test_a_short_verification_has_no_shorter_stages(verify_s: float, until_s: list[float]) -> None:
     """A gust of five seconds is half of what 30 s see, and took good gains back."""
@@ -137,10 +170,14 @@ def test_a_setpoint_that_moved_is_no_deviation() -> None:
     moved = replace(record, displacement_um=record.displacement_um + walk_um)
     trial = VerificationTrial(PLANT, WEATHER, LOOP, LOOP)
     plain_um = centre_std_um(record.displacement_um, trial, WEATHER, LOOP)
-    assert centre_std_um(moved.displacement_um - walk_um, trial, WEATHER, LOOP) == pytest.approx(plain_um, rel=1e-9)
+    assert centre_std_um(moved.displacement_um - walk_um, trial, WEATHER, LOOP) == pytest.approx(
+        plain_um, rel=1e-9
+    )
 
 
-def shapes(count: int, start_s: float, sag_um: float, sigma_um: float, drift_um: np.ndarray) -> list[ShapeEstimate]:
+def shapes(
+    count: int, start_s: float, sag_um: float, sigma_um: float, drift_um: np.ndarray
+) -> list[ShapeEstimate]:
     rng = np.random.default_rng(int(start_s))
     s = zernike_projection()
     made = []
@@ -148,17 +185,33 @@ def shapes(count: int, start_s: float, sag_um: float, sigma_um: float, drift_um:
         seen_um = sag_um + sigma_um * rng.standard_normal()
         made.append(
             ShapeEstimate(
-                start_s + 2.0 * k, "fringes", seen_um * s, 0.0, np.outer(s, s), seen_um, 1.0,
-                sag_um + float(drift_um[k]), 1.0, 1.0, 80.0, 0.0, "ok",
+                start_s + 2.0 * k,
+                "fringes",
+                seen_um * s,
+                0.0,
+                np.outer(s, s),
+                seen_um,
+                1.0,
+                sag_um + float(drift_um[k]),
+                1.0,
+                1.0,
+                80.0,
+                0.0,
+                "ok",
             )
-        )  # fmt: skip
+        )
     return made
 
 
 def test_the_shape_loop_s_sensitivity_noise_and_time_constant() -> None:
     still = np.zeros(2000)
-    levels = [shapes(60, 10_000.0 + 200 * k, 37_100.0 + at, 0.3, still) for k, at in enumerate((0.0, STEP_UM, 0.0))]
-    drift = np.cumsum(np.random.default_rng(5).standard_normal(2000)) * 0.05 * math.sqrt(2.0)  # 0.05 µm/sqrt(s)
+    levels = [
+        shapes(60, 10_000.0 + 200 * k, 37_100.0 + at, 0.3, still)
+        for k, at in enumerate((0.0, STEP_UM, 0.0))
+    ]
+    drift = (
+        np.cumsum(np.random.default_rng(5).standard_normal(2000)) * 0.05 * math.sqrt(2.0)
+    )  # 0.05 µm/sqrt(s)
     found = evaluate(levels, shapes(2000, 0.0, 37_100.0, 0.3, drift), zernike_projection())
     assert found.agreement == pytest.approx(1.0)
     assert found.scale == pytest.approx(1.0, abs=0.05)
@@ -170,7 +223,10 @@ def test_the_shape_loop_s_sensitivity_noise_and_time_constant() -> None:
 
 def test_a_drift_that_is_not_seen_asks_for_minutes() -> None:
     still = np.zeros(400)
-    levels = [shapes(40, 10_000.0 + 200 * k, 37_100.0 + at, 1.0, still) for k, at in enumerate((0.0, STEP_UM, 0.0))]
+    levels = [
+        shapes(40, 10_000.0 + 200 * k, 37_100.0 + at, 1.0, still)
+        for k, at in enumerate((0.0, STEP_UM, 0.0))
+    ]
     found = evaluate(levels, shapes(400, 0.0, 37_100.0, 1.0, still), zernike_projection())
     assert not found.drift_seen
     assert found.drift_um_per_sqrt_h < 2.0
@@ -187,7 +243,9 @@ class OuterRig:
         self.told: list[tuple[float, float] | str] = []
         self._trial, self._tracking = trial, tracking
 
-    def set_gains(self, loop: LoopConfig, why: str, trial_s: float, shape_s: float = math.nan) -> None:
+    def set_gains(
+        self, loop: LoopConfig, why: str, trial_s: float, shape_s: float = math.nan
+    ) -> None:
         self.told.append((trial_s, shape_s))
 
     def keep(self) -> None:
@@ -195,7 +253,10 @@ class OuterRig:
 
     def ticks(self, duration_s: float) -> list[SimpleNamespace]:
         self.shapes += self._trial
-        codes = [ShapeState.TRACKING if k < 100 * self._tracking else ShapeState.SUSPENDED for k in range(100)]
+        codes = [
+            ShapeState.TRACKING if k < 100 * self._tracking else ShapeState.SUSPENDED
+            for k in range(100)
+        ]
         return [SimpleNamespace(shape_state=code) for code in codes]
 
 
@@ -220,12 +281,17 @@ def test_a_time_constant_is_kept_if_it_predicts_the_shapes(
     assert words in done.reason
     assert bool(words) == bool(done.reason)
     assert rig.told[0] == (720.0, after_s)
-    assert rig.told[1:] == (["keep"] if not words else [(1.0, pytest.approx(math.nan, nan_ok=True))])
+    assert rig.told[1:] == (
+        ["keep"] if not words else [(1.0, pytest.approx(math.nan, nan_ok=True))]
+    )
 
 
 def test_a_figure_that_does_not_answer_the_setpoint_is_not_tuned_on() -> None:
     still = np.zeros(400)
-    levels = [shapes(40, 10_000.0 + 200 * k, 37_100.0 + at, 0.3, still) for k, at in enumerate((0.0, STEP_UM, 0.0))]
+    levels = [
+        shapes(40, 10_000.0 + 200 * k, 37_100.0 + at, 0.3, still)
+        for k, at in enumerate((0.0, STEP_UM, 0.0))
+    ]
     found = evaluate(levels, shapes(400, 0.0, 37_100.0, 0.3, still), zernike_projection())
     assert unfit(found) == ""
     assert "calibrate the camera first" in unfit(replace(found, scale=0.7))
@@ -234,23 +300,38 @@ def test_a_figure_that_does_not_answer_the_setpoint_is_not_tuned_on() -> None:
 
 def test_a_rolled_back_time_constant_leaves_the_gains_of_its_session(tmp_path: Path) -> None:
     journal.note(tmp_path, journal.entry("kept", "s1", "eve", "why", LOOP, LOOP))
-    journal.note(tmp_path, journal.entry("kept", "s1", "eve", "why", LOOP, LOOP, None, (40.0, 62.0)))
+    journal.note(
+        tmp_path, journal.entry("kept", "s1", "eve", "why", LOOP, LOOP, None, (40.0, 62.0))
+    )
     assert journal.to_roll_back(tmp_path).shape_s == (40.0, 62.0)
     assert journal.to_roll_back(tmp_path, gains_only=True).shape_s is None
-    journal.note(tmp_path, journal.entry("rolled_back", "s1", "eve", "why", LOOP, LOOP, None, (40.0, 62.0)))
+    journal.note(
+        tmp_path, journal.entry("rolled_back", "s1", "eve", "why", LOOP, LOOP, None, (40.0, 62.0))
+    )
     assert journal.to_roll_back(tmp_path).shape_s is None
     assert "shape loop 62 -> 40 s" in journal.history_table(journal.entries(tmp_path))
 
 
 def gains_file(plant: PlantModel) -> GainsFile:
     section = PlantSection(
-        gain=plant.gain, dead_time_s=plant.dead_time_s, lag_s=plant.lag_s, leak_um_per_s=plant.leak_um_per_s,
-        gain_sigma=0.02, delay_sigma_s=0.01,
-    )  # fmt: skip
+        gain=plant.gain,
+        dead_time_s=plant.dead_time_s,
+        lag_s=plant.lag_s,
+        leak_um_per_s=plant.leak_um_per_s,
+        gain_sigma=0.02,
+        delay_sigma_s=0.01,
+    )
     return GainsFile(
-        author="eve", date_utc="2026-01-01", reason="test", source="test", data_sha256="0",
-        predicted_std_um=0.2, least_std_um=0.15, plant=section, loop=LOOP,
-    )  # fmt: skip
+        author="eve",
+        date_utc="2026-01-01",
+        reason="test",
+        source="test",
+        data_sha256="0",
+        predicted_std_um=0.2,
+        least_std_um=0.15,
+        plant=section,
+        loop=LOOP,
+    )
 
 
 def test_a_loop_in_order_suggests_nothing_and_an_aged_one_says_why() -> None:
@@ -266,10 +347,14 @@ def test_a_loop_in_order_suggests_nothing_and_an_aged_one_says_why() -> None:
 
 @pytest.mark.parametrize("gain", [0.6, pytest.param(1.0, marks=pytest.mark.campaign)])
 def test_the_gain_is_seen_although_the_feed_forward_cancels_the_weather(gain: float) -> None:
-    """A slow loop whose flow is nearly all feed-forward; the pump as it was, and one that has lost 40 %."""
+    """A slow loop whose flow is nearly all feed-forward; the pump as it was, and one that has lost
+    40 %.
+    """
     rest = Noise(1.0, 1e-4, 1e-4, 12.0, 0.02)
     barometer = WeatherGain(-0.36, 0.01, 2 * 1.2**2 / 30, 0.05, 0.0)
-    weather = DisturbanceModel(rest, barometer, WeatherGain(123.0, 1.0, 2 * 0.05**2 / 300, 0.002, 12.0))
+    weather = DisturbanceModel(
+        rest, barometer, WeatherGain(123.0, 1.0, 2 * 0.05**2 / 300, 0.002, 12.0)
+    )
     loop = LoopConfig(kp_per_s=0.25, ti_s=20.0)
     record, _ = held(loop, replace(PLANT, gain=gain), weather=weather)
     found = health(record, np.zeros(len(record)), loop, gains_file(PLANT))

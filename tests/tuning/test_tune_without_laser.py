@@ -1,4 +1,6 @@
-"""Sessions on a hold without a laser: figures, each of a moment before it arrives, instead of readings."""
+"""Sessions on a hold without a laser: figures, each of a moment before it arrives, instead of
+readings.
+"""
 
 from __future__ import annotations
 
@@ -27,9 +29,21 @@ SIGMA_UM = 0.036
 
 def figure(time_s: float, sag_um: float, number: int = 0) -> ShapeEstimate:
     return ShapeEstimate(
-        time_s, "track", np.full(ZERNIKE_TERMS, sag_um / 100), 0.0, SIGMA_UM**2 * np.eye(ZERNIKE_TERMS),
-        sag_um, SIGMA_UM, math.nan, 1.0, 1.0, 80.0, 0.0, "ok", cycle=number,
-    )  # fmt: skip
+        time_s,
+        "track",
+        np.full(ZERNIKE_TERMS, sag_um / 100),
+        0.0,
+        SIGMA_UM**2 * np.eye(ZERNIKE_TERMS),
+        sag_um,
+        SIGMA_UM,
+        math.nan,
+        1.0,
+        1.0,
+        80.0,
+        0.0,
+        "ok",
+        cycle=number,
+    )
 
 
 class LateFigures:
@@ -42,12 +56,16 @@ class LateFigures:
 
     def __call__(self, now_s: float) -> ShapeEstimate | None:
         self._number += 1
-        sag_um = 37_100.0 + self._plant.truth().displacement_um + SIGMA_UM * self._rng.standard_normal()
+        sag_um = (
+            37_100.0 + self._plant.truth().displacement_um + SIGMA_UM * self._rng.standard_normal()
+        )
         self._kept.append(figure(now_s, float(sag_um), self._number))
         return self._kept.popleft() if self._kept[0].time_s <= now_s - self._late_s + 1e-9 else None
 
 
-def by_optics(figures_hz: float, full_um_per_s: float = 5.3, weather_sensors: bool = True, **loop: float) -> Config:
+def by_optics(
+    figures_hz: float, full_um_per_s: float = 5.3, weather_sensors: bool = True, **loop: float
+) -> Config:
     feed = {"feedforward_barometer": weather_sensors, "feedforward_temperature": weather_sensors}
     config = foreign_config(**{"flow_max_um_per_s": full_um_per_s, **feed, **loop})
     changed = {
@@ -96,11 +114,15 @@ def test_a_tick_waits_for_the_figure_after_it_and_has_what_both_show(ticks: Tick
     early, late = ticks.take([row(1.04)], [figure(1.03, 37_104.0)])
     assert (early.mono_s, late.mono_s) == (1.00, 1.02)
     assert [early.displacement_um, late.displacement_um] == pytest.approx([1.0, 3.0])
-    assert [tick.displacement_um for tick in ticks.take([], [figure(1.05, 37_100.0)])] == pytest.approx([2.0])
+    assert [
+        tick.displacement_um for tick in ticks.take([], [figure(1.05, 37_100.0)])
+    ] == pytest.approx([2.0])
 
 
 @pytest.mark.parametrize("kind", ["full", "rejected", "older", "none"])
-def test_a_figure_that_does_not_show_the_mirror_is_not_used(ticks: TicksByFigures, kind: str) -> None:
+def test_a_figure_that_does_not_show_the_mirror_is_not_used(
+    ticks: TicksByFigures, kind: str
+) -> None:
     wrong = figure(1.03, 37_150.0)
     spoilt = {
         "full": [replace(wrong, kind="full")],
@@ -113,7 +135,9 @@ def test_a_figure_that_does_not_show_the_mirror_is_not_used(ticks: TicksByFigure
     assert tick.displacement_um == pytest.approx(3.0)
 
 
-def test_ticks_that_no_figure_shows_are_lost_readings_and_not_a_straight_line(ticks: TicksByFigures) -> None:
+def test_ticks_that_no_figure_shows_are_lost_readings_and_not_a_straight_line(
+    ticks: TicksByFigures,
+) -> None:
     taken = ticks.take([row(0.9), row(1.0)], [figure(0.95, 37_100.0)])
     assert math.isnan(taken[0].displacement_um)  # before the first figure
     dark = ticks.take([row(1.0 + 0.02 * n) for n in range(1, 100)], [])
@@ -125,9 +149,12 @@ def test_ticks_that_no_figure_shows_are_lost_readings_and_not_a_straight_line(ti
 
 
 @pytest.mark.parametrize(
-    ("asked_hz", "comes_s", "expected_s"), [(20.0, 0.05, 0.05), (20.0, 0.11, 0.11), (5.0, 0.02, 0.2)]
+    ("asked_hz", "comes_s", "expected_s"),
+    [(20.0, 0.05, 0.05), (20.0, 0.11, 0.11), (5.0, 0.02, 0.2)],
 )
-def test_readings_are_as_far_apart_as_figures_are(asked_hz: float, comes_s: float, expected_s: float) -> None:
+def test_readings_are_as_far_apart_as_figures_are(
+    asked_hz: float, comes_s: float, expected_s: float
+) -> None:
     ticks = TicksByFigures(by_optics(asked_hz))
     ticks.take([], [figure(comes_s * n, 37_100.0 + n) for n in range(1, 20)])
     assert ticks.interval_s == pytest.approx(expected_s)
@@ -138,7 +165,10 @@ def test_a_record_of_every_third_reading_has_the_mean_flow_between_them() -> Non
     third = Record(0.02, flow, read, read + 10, read + 20).every(3)
     assert third.dt_s == pytest.approx(0.06)
     assert third.flow_um_per_s.tolist() == [2.0, 4.0]
-    assert [column.tolist() for column in (third.displacement_um, third.ambient_pressure_pa)] == [[0, 3], [10, 13]]
+    assert [column.tolist() for column in (third.displacement_um, third.ambient_pressure_pa)] == [
+        [0, 3],
+        [10, 13],
+    ]
 
 
 # Random benches of the second world.
@@ -149,13 +179,21 @@ def held_std_um(config: Config, plant: ForeignPlant, late_s: float) -> float:
     link = TwinHold(config, bench=foreign_bench(plant), figures=LateFigures(plant, 5, late_s))
     while link.rows[-1].mono_s < link.rows[0].mono_s + 340.0:
         link.news()
-    return float(np.std([tick.truth_displacement_um for tick in link.rows[round(40.0 * config.loop.rate_hz) :]]))
+    return float(
+        np.std(
+            [tick.truth_displacement_um for tick in link.rows[round(40.0 * config.loop.rate_hz) :]]
+        )
+    )
 
 
 @pytest.mark.campaign
 @pytest.mark.parametrize("seed", range(12))
-def test_a_bench_of_which_nothing_is_known_is_held_better_by_what_was_identified(seed: int, tmp_path: Path) -> None:
-    """Delays up to 1.1 s, which are not those of the configuration; 5 to 25 figures a second, up to 0.15 s late."""
+def test_a_bench_of_which_nothing_is_known_is_held_better_by_what_was_identified(
+    seed: int, tmp_path: Path
+) -> None:
+    """Delays up to 1.1 s, which are not those of the configuration; 5 to 25 figures a second, up to
+    0.15 s late.
+    """
     rng = np.random.default_rng(900 + seed)
     full_um_per_s, delay_s, lag_s = rng.uniform((4, 0.03, 0.05), (8, 0.6, 0.5)).tolist()
     figures_hz, weather = np.exp(rng.uniform(np.log((5, 0.3)), np.log((25, 2)))).tolist()
@@ -178,9 +216,13 @@ def test_a_bench_of_which_nothing_is_known_is_held_better_by_what_was_identified
         found = session.identify_step(folder)
     session.observe_step(folder, rig)
     identified = found.identified
-    assert identified.model.delay_s == pytest.approx(delay_s + lag_s, abs=max(0.03, 3 * identified.sigma.delay_s))
+    assert identified.model.delay_s == pytest.approx(
+        delay_s + lag_s, abs=max(0.03, 3 * identified.sigma.delay_s)
+    )
     assert max(abs(tick.truth_displacement_um) for tick in link.rows[2000:]) < 10.0
-    told = EstimatorConfig.model_validate(config.estimator.model_dump() | session.estimator_of(folder))
+    told = EstimatorConfig.model_validate(
+        config.estimator.model_dump() | session.estimator_of(folder)
+    )
     before_um = held_std_um(config, plant(seed + 50), late_s)
     after_um = held_std_um(config.model_copy(update={"estimator": told}), plant(seed + 50), late_s)
     assert after_um < 1.1 * before_um

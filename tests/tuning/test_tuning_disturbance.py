@@ -13,7 +13,10 @@ from tuning.identification.loop_model import PlantModel, Record
 
 DT_S = 0.02
 N = 30_000
-PLANT, LOOP = PlantModel(1.0, 0.1, 0.15, 1.2), LoopConfig(feedforward_barometer=False, feedforward_temperature=False)
+PLANT, LOOP = (
+    PlantModel(1.0, 0.1, 0.15, 1.2),
+    LoopConfig(feedforward_barometer=False, feedforward_temperature=False),
+)
 
 
 def walk(rng: np.random.Generator, per_s: float) -> np.ndarray:
@@ -32,7 +35,9 @@ def test_both_walks_are_told_from_noise() -> None:
 
 
 def coloured(rng: np.random.Generator, psd: Callable[[np.ndarray], np.ndarray]) -> np.ndarray:
-    """A series of a given two-sided spectrum; the FFT of white noise shares no code with the fit."""
+    """A series of a given two-sided spectrum; the FFT of white noise
+    shares no code with the fit.
+    """
     w = 2 * np.pi * np.fft.rfftfreq(N, DT_S)
     w[0] = w[1]
     return np.fft.irfft(np.fft.rfft(rng.standard_normal(N)) * np.sqrt(psd(w) / DT_S), N)
@@ -55,7 +60,9 @@ def test_the_deviation_of_a_loop_is_predicted_in_movement_of_any_colour(
     found = fit_noise(coloured(rng, psd) + laser_um * rng.standard_normal(N), DT_S, 12.0)
     w = np.geomspace(0.02, np.pi / DT_S, 2000)
     for k in (0.2, 0.5):
-        predicted, true = (np.trapezoid(s * w**2 / (w**2 + k**2), w) for s in (found.moving_psd(w), psd(w)))
+        predicted, true = (
+            np.trapezoid(s * w**2 / (w**2 + k**2), w) for s in (found.moving_psd(w), psd(w))
+        )
         assert predicted**0.5 == pytest.approx(true**0.5, rel=0.2)
 
 
@@ -66,7 +73,11 @@ def test_weather_that_comes_and_goes_widens_the_prediction() -> None:
     gust = np.where(np.arange(N) % N < N // 5, 4.0, 1.0)
     found = [
         observe(
-            Record(DT_S, np.full(N, 1.2), x + 0.1 * rng.standard_normal(N), *np.full((2, N), np.nan)), PLANT, LOOP
+            Record(
+                DT_S, np.full(N, 1.2), x + 0.1 * rng.standard_normal(N), *np.full((2, N), np.nan)
+            ),
+            PLANT,
+            LOOP,
         )
         for x in (steady, gust * steady)
     ]
@@ -101,7 +112,12 @@ def test_a_short_hold_is_refused() -> None:
 def weather_record(seed: int, sensor_pa: float) -> Record:
     rng = np.random.default_rng(seed)
     pressure, air = walk(rng, 0.1), walk(rng, 2e-5)
-    y = -0.36 * pressure + 120.0 * lagged(air, 12.0, DT_S) + walk(rng, 1e-4) + rng.standard_normal(N)
+    y = (
+        -0.36 * pressure
+        + 120.0 * lagged(air, 12.0, DT_S)
+        + walk(rng, 1e-4)
+        + rng.standard_normal(N)
+    )
     return Record(
         DT_S,
         np.full(N, 1.2),

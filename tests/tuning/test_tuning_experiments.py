@@ -1,4 +1,6 @@
-"""Experiments on the twin: bounded on any plant, stopped by name when something is wrong, the mirror stays held."""
+"""Experiments on the twin: bounded on any plant, stopped by name when something is wrong, the
+mirror stays held.
+"""
 
 from __future__ import annotations
 
@@ -147,19 +149,31 @@ def test_a_saturating_pump_is_no_weak_one(most_fraction: float) -> None:
     rig = Rig(bench, case.loop(), PumpConfig(), case.holding_flow_um_per_s)
     found = characterise(rig).quality
     assert found.verdict == "refused"
-    assert any("the pump saturates" in reason and "run `tune pump`" in reason for reason in found.reasons)
+    assert any(
+        "the pump saturates" in reason and "run `tune pump`" in reason for reason in found.reasons
+    )
     assert held_again(rig, bench)
 
 
 @pytest.mark.parametrize(("rate_hz", "least_um"), [(50.0, 7.7), (10.0, 5.3)])
-def test_the_guard_keeps_more_in_hand_where_readings_are_few(rate_hz: float, least_um: float) -> None:
-    """White readings of 1 µm: three standard deviations of position and coast are never taken for the limit."""
+def test_the_guard_keeps_more_in_hand_where_readings_are_few(
+    rate_hz: float, least_um: float
+) -> None:
+    """White readings of 1 µm: three standard deviations of position and coast are never taken for
+    the limit.
+    """
     rng = np.random.default_rng(3)
     guard = ExcursionGuard(Patterned(AROUND, lambda _: 0.0, 600.0, 0.0), AROUND, 0.0, rate_hz)
-    seen = [guard.step(BenchSample(float(x), math.nan, math.nan), 1 / rate_hz) for x in rng.standard_normal(5000)]
+    seen = [
+        guard.step(BenchSample(float(x), math.nan, math.nan), 1 / rate_hz)
+        for x in rng.standard_normal(5000)
+    ]
     assert not any(isinstance(out, Finished) and not out.completed for out in seen)
     slow = ExcursionGuard(Constant(), AROUND, 0.0, rate_hz)
-    out = [slow.step(BenchSample(float(x), math.nan, math.nan), 1 / rate_hz) for x in np.arange(0.0, 10.0, 1e-3)]
+    out = [
+        slow.step(BenchSample(float(x), math.nan, math.nan), 1 / rate_hz)
+        for x in np.arange(0.0, 10.0, 1e-3)
+    ]
     stopped = next(i for i, flow in enumerate(out) if flow != Constant.FLOW_UM_PER_S)
     assert stopped * 1e-3 == pytest.approx(least_um, abs=0.5)
 
@@ -212,7 +226,9 @@ def test_laser_noise_is_measured_while_the_weather_moves_the_mirror() -> None:
 
 
 def test_handing_over_between_loop_and_experiment_is_bumpless() -> None:
-    """In still air, the flow jumps by no more than the loop's own ripple when the loop takes over again."""
+    """In still air, the flow jumps by no more than the loop's own ripple when the loop takes over
+    again.
+    """
     case = Case("calm", laser_noise_um=0.0)
     bench = TwinBench(case, 1)
     rig = Rig(bench, case.loop(), PumpConfig(), case.holding_flow_um_per_s)
@@ -235,15 +251,21 @@ def test_noise_alone_stops_no_experiment_at_any_rate(rate_hz: float, laser_um: f
 
 
 def test_the_noise_kept_in_hand_is_that_of_the_tick_rate() -> None:
-    """4 µm of laser noise leave something of 10 µm at 50 readings a second (3 x 0.652 x 4), nothing at 25."""
+    """4 µm of laser noise leave something of 10 µm at 50 readings a second (3 x 0.652 x 4), nothing
+    at 25.
+    """
     noisy = replace(AROUND, laser_um=4.0)
     ExcursionGuard(Relay(noisy, 0.0), noisy, 0.0, rate_hz=50.0)
-    with pytest.raises(ValueError, match=r"takes 11\.1 µm of it at 25 readings/s; give a larger limit"):
+    with pytest.raises(
+        ValueError, match=r"takes 11\.1 µm of it at 25 readings/s; give a larger limit"
+    ):
         ExcursionGuard(Relay(noisy, 0.0), noisy, 0.0, rate_hz=25.0)
 
 
 def test_after_its_end_an_experiment_brings_the_mirror_back_without_winding_up() -> None:
-    """On a pump that gives little at small commands a loop came back from +8.5 µm and went on to -12.9."""
+    """On a pump that gives little at small commands a loop came back from +8.5 µm and went on to
+    -12.9.
+    """
     guard = ExcursionGuard(Constant(), AROUND, 0.0, 50.0)
     at_um, lowest_um, out = 9.5, 9.5, 0.0
     for _ in range(50 * 60):
@@ -251,7 +273,9 @@ def test_after_its_end_an_experiment_brings_the_mirror_back_without_winding_up()
         if isinstance(step, Finished):
             break
         out = step
-        at_um += 0.02 * (8.0 * (out / 5.3) ** 2 - 0.438)  # a quadratic pump; the configured one is straight
+        at_um += 0.02 * (
+            8.0 * (out / 5.3) ** 2 - 0.438
+        )  # a quadratic pump; the configured one is straight
         lowest_um = min(lowest_um, at_um)
     assert isinstance(step, Finished)
     assert not step.completed
@@ -280,12 +304,18 @@ def test_a_raw_experiment_ends_where_it_is_and_one_without_readings_at_once() ->
     assert "the limit of 10 µm was near" in lost[-1].reason
 
 
-def test_what_is_known_of_the_delay_stops_a_moving_mirror_earlier_unless_the_noise_forbids() -> None:
+def test_what_is_known_of_the_delay_stops_a_moving_mirror_earlier_unless_the_noise_forbids() -> (
+    None
+):
     def stopped_um(laser_um: float, late_s: float) -> float:
         around = quieted(replace(AROUND, laser_um=laser_um, late_s=late_s), 50.0)
         guard = ExcursionGuard(Constant(), around, 0.0, 50.0)
         way_um = np.arange(0.0, 10.0, 0.06)  # 3 µm/s
-        return next(float(x) for x in way_um if guard.step(BenchSample(float(x)), 0.02) != Constant.FLOW_UM_PER_S)
+        return next(
+            float(x)
+            for x in way_um
+            if guard.step(BenchSample(float(x)), 0.02) != Constant.FLOW_UM_PER_S
+        )
 
     assert stopped_um(0.1, 0.9) < stopped_um(0.1, 0.4) - 1.2
     assert stopped_um(0.1, 2.0) == stopped_um(0.1, 1.0)  # pulses turn within it

@@ -24,7 +24,9 @@ def test_recovers_a_plant_from_nearly_clean_data() -> None:
 
 
 def test_error_bars_are_honest() -> None:
-    """Of 16 fits, at 2 sigma 95 % should hold the truth; fewer than 13 would be a chance of 1 in 150."""
+    """Of 16 fits, at 2 sigma 95 % should hold the truth; fewer than 13 would be a chance of 1 in
+    150.
+    """
     fits = [identify(record(TRUTH, seed=seed, samples=2000)) for seed in range(16)]
     gain = [abs(f.model.gain - TRUTH.gain) <= 2 * f.sigma.gain for f in fits]
     delay = [abs(f.model.delay_s - TRUTH.delay_s) <= 2 * f.sigma.delay_s for f in fits]
@@ -72,7 +74,9 @@ def test_a_bench_that_changed_is_seen_on_fresh_data() -> None:
 
 def test_a_slammed_door_is_named_with_its_time() -> None:
     whole = record(TRUTH)
-    jumped = replace(whole, displacement_um=whole.displacement_um + 12.0 * (np.arange(3000) >= 1500))
+    jumped = replace(
+        whole, displacement_um=whole.displacement_um + 12.0 * (np.arange(3000) >= 1500)
+    )
     found = judge(jumped, identify(jumped))
     assert found.verdict == "refused"
     assert any("30.0 s" in reason and "relay" in reason for reason in found.reasons)
@@ -86,7 +90,9 @@ def test_a_pump_that_does_nothing_is_named() -> None:
 
 
 @pytest.mark.parametrize(("gain", "verdict"), [(2.6, "refused"), (0.6, "degraded")])
-def test_only_a_strong_pump_beside_which_something_swings_is_mapped(gain: float, verdict: str) -> None:
+def test_only_a_strong_pump_beside_which_something_swings_is_mapped(
+    gain: float, verdict: str
+) -> None:
     """One that starts with more than the leak can only pulse: no gains hold it without swinging."""
     whole = record(replace(TRUTH, gain=gain), laser_um=0.1)
     swing_um = 0.1 * np.sin(2 * np.pi * 1.3 * whole.dt_s * np.arange(len(whole)))
@@ -110,7 +116,8 @@ def test_too_little_excitation_is_refused_with_the_experiment_that_helps() -> No
     found = judge(whole, identify(whole))
     assert found.verdict == "refused"
     assert any(
-        "tune characterise" in reason or "longer" in reason or "tune pump" in reason for reason in found.reasons
+        "tune characterise" in reason or "longer" in reason or "tune pump" in reason
+        for reason in found.reasons
     )
 
 

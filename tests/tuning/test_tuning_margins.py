@@ -1,4 +1,6 @@
-"""Margins and designs against closed forms and against python-control's own delay approximations."""
+"""Margins and designs against closed forms and against
+python-control's own delay approximations.
+"""
 
 from __future__ import annotations
 
@@ -13,8 +15,23 @@ from scipy.signal import lfilter
 from benchmarks.minimum_variance import least_std_um as least_of_the_twin
 from membrane_ctrl.config.schema import LoopConfig, PumpConfig, TwinConfig
 from tuning.identification.disturbance import DisturbanceModel, Noise, WeatherGain
-from tuning.identification.loop_model import RECOVERED_UM, Gains, PlantModel, load_step, margins, sensitivity_peak
-from tuning.proposal.candidates import Demands, amigo, lambda_tuned, least_variance, load_peak_um, max_ki, simc
+from tuning.identification.loop_model import (
+    RECOVERED_UM,
+    Gains,
+    PlantModel,
+    load_step,
+    margins,
+    sensitivity_peak,
+)
+from tuning.proposal.candidates import (
+    Demands,
+    amigo,
+    lambda_tuned,
+    least_variance,
+    load_peak_um,
+    max_ki,
+    simc,
+)
 from tuning.proposal.design import candidate, cells, designs, refusal
 from tuning.proposal.prediction import Walks, _clipped, least_std_um, predict, preview
 
@@ -49,7 +66,9 @@ def test_an_integrator_that_is_too_fast_is_unstable() -> None:
 def test_margins_agree_with_a_high_order_pade() -> None:
     s = control.tf("s")
     num, den = control.pade(PUMP.dead_time_s + 0.01, 8)
-    loop = 0.9 * (1 + 1 / (7 * s)) / (0.1 * s + 1) / (s * (PUMP.lag_s * s + 1)) * control.tf(num, den)
+    loop = (
+        0.9 * (1 + 1 / (7 * s)) / (0.1 * s + 1) / (s * (PUMP.lag_s * s + 1)) * control.tf(num, den)
+    )
     gain_margin, phase_margin, _, _, _, _ = control.stability_margins(loop)
     disk, _, _ = control.disk_margins(loop, np.geomspace(1e-3, 100, 2000))
     found = margins(Gains(0.9, 7.0, 0.0, 0.1), PUMP, 0.02)
@@ -102,7 +121,9 @@ def test_a_load_step_with_delay_and_filter_is_that_of_the_loop_tick_by_tick() ->
 
 
 def test_load_recovery_of_a_double_root_and_of_a_loop_that_never_comes_back() -> None:
-    """k K = 1 and Ti = 4: y = D t exp(-t / 2), for D = 1 within 0.5 µm after 4.3 s; without gain never."""
+    """k K = 1 and Ti = 4: y = D t exp(-t / 2), for D = 1 within 0.5 µm after 4.3 s; without gain
+    never.
+    """
     model = PlantModel(1.0, 0.0, 0.0, 1.0)
     assert load_step(Gains(1.0, 4.0), model, 1.0, 1e-9).recovery_s == pytest.approx(4.31, abs=0.1)
     assert load_step(Gains(1e-6, 1e6), model, 1.0, 1e-9).recovery_s == math.inf
@@ -113,17 +134,26 @@ def test_the_same_answer_to_a_load_is_to_be_had_with_less_noise() -> None:
     """The designs that keep the present loop's answer, and nothing worse in it."""
     loop = LoopConfig()
     named = designs(PUMP, typical(loop), loop, Demands())
-    present, kept = (load_step(gains, PUMP, 0.6, 0.02) for gains in (Gains.of(loop), named["same-load"]))
+    present, kept = (
+        load_step(gains, PUMP, 0.6, 0.02) for gains in (Gains.of(loop), named["same-load"])
+    )
     assert kept.peak_um <= 1.01 * present.peak_um
     assert kept.recovery_s <= present.recovery_s + 0.1
-    stds = [predict(gains, PUMP, typical(loop), loop).std_um for gains in (Gains.of(loop), named["same-load"])]
+    stds = [
+        predict(gains, PUMP, typical(loop), loop).std_um
+        for gains in (Gains.of(loop), named["same-load"])
+    ]
     assert stds[1] < stds[0]
-    assert "same-load" not in designs(PUMP, typical(loop), loop.model_copy(update={"kp_per_s": 0.05}), Demands())
+    assert "same-load" not in designs(
+        PUMP, typical(loop), loop.model_copy(update={"kp_per_s": 0.05}), Demands()
+    )
 
 
 @pytest.mark.parametrize(("name", "known"), [("ziegler-nichols", False), ("simc", True)])
 def test_what_a_pump_that_only_switches_would_do_is_not_known(name: str, known: bool) -> None:
-    """Ziegler-Nichols has no filter: its flow would swing by 140 µm/s, and 6.6 µm were predicted where 0.9 came."""
+    """Ziegler-Nichols has no filter: its flow would swing by 140 µm/s, and 6.6 µm were predicted
+    where 0.9 came.
+    """
     loop = LoopConfig()
     gains = designs(PUMP, typical(loop), loop, Demands())[name]
     row = candidate(name, gains, PUMP, typical(loop), loop, Demands())
@@ -139,12 +169,16 @@ def typical(loop: LoopConfig) -> DisturbanceModel:
     """The twin's typical weather, known exactly; its slow return is left out."""
     noise = Noise(math.sqrt(1.0 + 0.1**2 / 12), 0.0, 0.0, 12.0, 1 / loop.rate_hz)
     barometer = WeatherGain(-0.358, 0.0, 2 * 1.2**2 / 30, 0.05, 0.0)
-    return DisturbanceModel(noise, barometer, WeatherGain(123.0, 0.0, 2 * 0.05**2 / 300, 0.002, 12.0))
+    return DisturbanceModel(
+        noise, barometer, WeatherGain(123.0, 0.0, 2 * 0.05**2 / 300, 0.002, 12.0)
+    )
 
 
 @pytest.mark.parametrize(("feedforward", "agreement"), [(False, 0.05), (True, 0.1)])
 def test_the_bound_is_that_of_the_twin(feedforward: bool, agreement: float) -> None:
-    """The twin's weather returns to its mean and a walk does not, which the slow end of the bound sees."""
+    """The twin's weather returns to its mean and a walk does not, which the slow end of the bound
+    sees.
+    """
     loop = LoopConfig(feedforward_barometer=feedforward, feedforward_temperature=feedforward)
     twin = TwinConfig(laser_noise_um=1.0)
     assert least_std_um(PUMP, typical(loop), loop, write_s=0.005) == pytest.approx(
@@ -177,7 +211,9 @@ def test_nothing_predicted_is_below_the_bound_and_the_search_comes_near_it() -> 
 
 
 def test_demands_hold_where_the_weather_asks_for_nothing() -> None:
-    """With feed-forward the weather leaves so little that the least variance alone would switch the loop off."""
+    """With feed-forward the weather leaves so little that the least variance alone would switch the
+    loop off.
+    """
     loop, demands = LoopConfig(), Demands()
     gains = least_variance(PUMP, typical(loop), loop, demands)
     assert load_peak_um(gains, PUMP, demands.load_step_um_per_s) <= 1.01 * demands.load_peak_um
@@ -193,16 +229,28 @@ def test_feed_forward_leaves_less_of_the_weather() -> None:
 
 @pytest.mark.parametrize(
     ("gains", "cut"),
-    [(Gains(0.2, 5.2, 0.0, 0.1), 1.5), (Gains(0.6, 6.5, 0.0, 0.2), 1.2), (Gains(0.3, 13.7, 0.0, 0.2), 1.4)],
+    [
+        (Gains(0.2, 5.2, 0.0, 0.1), 1.5),
+        (Gains(0.6, 6.5, 0.0, 0.2), 1.2),
+        (Gains(0.3, 13.7, 0.0, 0.2), 1.4),
+    ],
 )
 def test_the_prediction_counts_what_the_pumps_limits_cut(gains: Gains, cut: float) -> None:
-    """The barometer's feed-forward asks for less than nothing half of the time; the preview has the real pump."""
+    """The barometer's feed-forward asks for less than nothing half of the time; the preview has the
+    real pump.
+    """
     model = PlantModel(1.0, 0.13, 0.3, 0.4)
-    weather = DisturbanceModel(Noise(0.13, 0.0, 1e-3, 12.0, 0.1), WeatherGain(-0.37, 0.0, 2.0, 0.13, 0.0), None)
+    weather = DisturbanceModel(
+        Noise(0.13, 0.0, 1e-3, 12.0, 0.1), WeatherGain(-0.37, 0.0, 2.0, 0.13, 0.0), None
+    )
     wide = LoopConfig(rate_hz=10.0, feedforward_temperature=False, flow_max_um_per_s=20.0)
     loop = gains.applied_to(wide.model_copy(update={"flow_max_um_per_s": 2.3}))
-    pump = PumpConfig(flow_full_um_per_s=2.3, dead_fraction=0.0, start_fraction=0.0, stall_fraction=0.0)
-    held = [preview(loop, pump, model, weather, seed, duration_s=300.0).std_um for seed in (1, 2, 3)]
+    pump = PumpConfig(
+        flow_full_um_per_s=2.3, dead_fraction=0.0, start_fraction=0.0, stall_fraction=0.0
+    )
+    held = [
+        preview(loop, pump, model, weather, seed, duration_s=300.0).std_um for seed in (1, 2, 3)
+    ]
     found_um = predict(gains, model, weather, loop).std_um
     assert found_um == pytest.approx(np.mean(held), rel=0.15)  # 2 % with less cut, 11 % with most
     # a plant that loses ten times as much has room for all of it
@@ -215,7 +263,9 @@ def test_the_prediction_counts_what_the_pumps_limits_cut(gains: Gains, cut: floa
 )
 def test_what_limits_leave_of_a_gaussian(std: float, mean: float, most: float) -> None:
     z = np.random.default_rng(7).standard_normal(400_000)
-    before = scipy.optimize.brentq(lambda at: np.clip(at + std * z, 0.0, most).mean() - mean, -60.0, 60.0)
+    before = scipy.optimize.brentq(
+        lambda at: np.clip(at + std * z, 0.0, most).mean() - mean, -60.0, 60.0
+    )
     after = np.clip(before + std * z, 0.0, most)
     share, rest = _clipped(std, mean, most)
     assert share == pytest.approx(np.mean(after * z) / std, abs=0.005)

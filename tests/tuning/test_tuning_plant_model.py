@@ -51,7 +51,9 @@ def test_a_record_without_any_reading_is_refused() -> None:
 
 
 def test_parts_join_again_and_hash_the_same() -> None:
-    whole = Record.from_samples(0.02, [1.0, 2.0, 3.0, 4.0], [BenchSample(float(i), 1.0, 2.0) for i in range(4)])
+    whole = Record.from_samples(
+        0.02, [1.0, 2.0, 3.0, 4.0], [BenchSample(float(i), 1.0, 2.0) for i in range(4)]
+    )
     joined = whole.part(0.0, 0.04).followed_by(whole.part(0.04, 0.08))
     assert joined.sha256() == whole.sha256()
     assert joined.sha256() != whole.part(0.0, 0.06).sha256()

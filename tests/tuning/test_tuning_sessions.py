@@ -1,4 +1,6 @@
-"""Whole sessions on the twin: what they must reach, with few seeds; `benchmarks.tuning` has sixteen."""
+"""Whole sessions on the twin: what they must reach, with few seeds; `benchmarks.tuning` has
+sixteen.
+"""
 
 from __future__ import annotations
 
@@ -14,7 +16,15 @@ from membrane_ctrl.config.schema import LoopConfig, PumpConfig
 from tuning.identification.characterise import FitQuality, characterise
 from tuning.identification.disturbance import observe
 from tuning.identification.loop_model import Gains
-from tuning.proposal.design import NAMES, PRESENT, RefusedError, propose, robustness, sampled_plants, table
+from tuning.proposal.design import (
+    NAMES,
+    PRESENT,
+    RefusedError,
+    propose,
+    robustness,
+    sampled_plants,
+    table,
+)
 from tuning.proposal.prediction import ModelBench, preview
 from tuning.rig import Rig
 
@@ -31,7 +41,10 @@ RATIO_MAX = {
     ("name", "rules"),
     [
         ("typical, 1 µm", False),
-        *(pytest.param(name, name == "typical, 1 µm", marks=pytest.mark.campaign) for name in RATIO_MAX),
+        *(
+            pytest.param(name, name == "typical, 1 µm", marks=pytest.mark.campaign)
+            for name in RATIO_MAX
+        ),
     ],
 )
 def test_a_session_reaches_what_it_must(name: str, rules: bool) -> None:
@@ -119,7 +132,9 @@ def test_the_preview_bench_repeats_itself(designed) -> None:  # type: ignore[no-
     assert runs[0] == runs[1] != runs[2]
 
 
-@pytest.mark.parametrize("file", sorted(Path(tuning.__file__).parent.glob("*.py")), ids=lambda p: p.name)
+@pytest.mark.parametrize(
+    "file", sorted(Path(tuning.__file__).parent.glob("*.py")), ids=lambda p: p.name
+)
 def test_tuning_knows_nothing_of_the_twin(file: Path) -> None:
     """A tuner that knew the simulator would tune the simulator."""
     for node in ast.walk(ast.parse(file.read_text(encoding="utf-8"))):

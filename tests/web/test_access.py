@@ -1,4 +1,6 @@
-"""Nobody sees the page or reaches the hold through it without a link or a password, from this page and no other."""
+"""Nobody sees the page or reaches the hold through it without a link or a password, from this page
+and no other.
+"""
 
 from __future__ import annotations
 
@@ -33,14 +35,22 @@ class Site:
         await send({"type": "http.response.body", "body": b"in"})
 
     async def ask(
-        self, path: str = "/", query: str = "", body: bytes | None = None, kind: str = "http", **headers: str
+        self,
+        path: str = "/",
+        query: str = "",
+        body: bytes | None = None,
+        kind: str = "http",
+        **headers: str,
     ) -> tuple[int, dict[str, str]]:
         """Status (for a web socket, its close code) and headers of the answer."""
         given = {"host": HOST, **{name.replace("_", "-"): value for name, value in headers.items()}}
         scope = {
-            "type": kind, "method": "GET" if body is None else "POST", "path": path, "query_string": query.encode(),
+            "type": kind,
+            "method": "GET" if body is None else "POST",
+            "path": path,
+            "query_string": query.encode(),
             "headers": [(name.encode(), value.encode()) for name, value in given.items()],
-        }  # fmt: skip
+        }
         sent: list[dict[str, Any]] = []
 
         async def receive() -> dict[str, Any]:
@@ -69,11 +79,15 @@ async def test_the_link_lets_in_and_its_session_stays() -> None:
     assert "this link is wrong" not in site.said.lower()
     status, headers = await site.ask(query="key=wrong")
     assert (status, "This link is wrong, or of an earlier start." in site.said) == (401, True)
-    assert headers["referrer-policy"] == "same-origin", "with none, browsers send the login form's origin as null"
+    assert headers["referrer-policy"] == "same-origin", (
+        "with none, browsers send the login form's origin as null"
+    )
     status, headers = await site.ask(query=f"key={accounts.secret}")
     assert status == 303
     assert headers["location"] == "/"
-    assert {"HttpOnly", "SameSite=Strict"} <= {part.strip() for part in headers["set-cookie"].split(";")}
+    assert {"HttpOnly", "SameSite=Strict"} <= {
+        part.strip() for part in headers["set-cookie"].split(";")
+    }
     assert site.seen == []
     assert (await site.ask(cookie=cookie_of(headers)))[0] == 200
     assert [user.role for user in site.seen] == ["tune"]
@@ -92,7 +106,9 @@ async def test_a_session_ends(monkeypatch: pytest.MonkeyPatch) -> None:
 @pytest.mark.parametrize(
     "headers",
     [
-        {"host": "evil.example:7480"},  # DNS rebinding: the browser was told that this name is 127.0.0.1
+        {
+            "host": "evil.example:7480"
+        },  # DNS rebinding: the browser was told that this name is 127.0.0.1
         {"origin": "http://evil.example"},
         {"origin": "http://127.0.0.1:9999"},  # another server on this machine
         {"origin": "null"},
@@ -105,7 +121,9 @@ async def test_a_session_ends(monkeypatch: pytest.MonkeyPatch) -> None:
     ids=str,
 )
 @pytest.mark.parametrize("kind", ["http", "websocket"])
-async def test_other_pages_are_refused_even_with_the_cookie(kind: str, headers: dict[str, str]) -> None:
+async def test_other_pages_are_refused_even_with_the_cookie(
+    kind: str, headers: dict[str, str]
+) -> None:
     accounts = Accounts({})
     site = Site(accounts)
     key = accounts.session(WebUser("a", "operate"))
@@ -123,10 +141,15 @@ async def test_a_web_socket_without_a_session_is_closed() -> None:
 
 
 async def test_names_and_passwords() -> None:
-    users = {"anna": known_user("anna", "operate", "membrane!"), "bob": known_user("bob", "read", "password")}
+    users = {
+        "anna": known_user("anna", "operate", "membrane!"),
+        "bob": known_user("bob", "read", "password"),
+    }
     accounts = Accounts(users, attributes="HttpOnly; Secure")
     site = Site(accounts)
-    assert (await site.ask(query=f"key={accounts.secret}"))[0] == 401, "with users, the link lets nobody in"
+    assert (await site.ask(query=f"key={accounts.secret}"))[0] == 401, (
+        "with users, the link lets nobody in"
+    )
     for body in (b"name=anna&password=wrong", b"name=nobody&password=membrane!", b"", b"name=anna"):
         assert (await site.ask("/login", body=body))[0] == 401
     assert (await site.ask("/login", body=b"x" * 5000))[0] == 413
@@ -138,7 +161,9 @@ async def test_names_and_passwords() -> None:
 
 
 def test_a_password_proves_an_account_and_a_link_does_not() -> None:
-    anna = Accounts({"anna": known_user("anna", "operate", "membrane!")}).by_password("anna", "membrane!")
+    anna = Accounts({"anna": known_user("anna", "operate", "membrane!")}).by_password(
+        "anna", "membrane!"
+    )
     assert anna is not None
     assert on_behalf(anna, "page 1f")["account"] == "anna"
     accounts = Accounts({})
@@ -162,7 +187,8 @@ def test_a_users_file_is_read_back_and_holds_no_password() -> None:
 
 
 @pytest.mark.parametrize(
-    "line", ["anna", "anna:operate:zz:00", "anna:king:00:00", "anna:operate:00", ":" * 9, "\0:read:00:00:"]
+    "line",
+    ["anna", "anna:operate:zz:00", "anna:king:00:00", "anna:operate:00", ":" * 9, "\0:read:00:00:"],
 )
 def test_a_damaged_users_file_is_named_with_its_line(line: str) -> None:
     with pytest.raises(InputError, match=r"users, line 2: expected NAME:ROLE:SALT:HASH"):
@@ -184,14 +210,18 @@ def test_a_user_that_cannot_be(name: str, role: str, password: str, says: str) -
         known_user(name, role, password)
 
 
-def test_add_user_writes_a_file_of_its_own(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_add_user_writes_a_file_of_its_own(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     from typer.testing import CliRunner
 
     from membrane_ctrl.web.cli import app
 
     file = tmp_path / "users"
     for name, password in (("anna", "membrane!"), ("bob", "password"), ("anna", "changed it")):
-        done = CliRunner().invoke(app, ["add-user", str(file), name, "operate"], input=f"{password}\n")
+        done = CliRunner().invoke(
+            app, ["add-user", str(file), name, "operate"], input=f"{password}\n"
+        )
         assert done.exit_code == 0, done.output
     found = Accounts(known_users(file.read_text(), str(file)))
     assert found.by_password("anna", "changed it") == WebUser("anna", "operate")

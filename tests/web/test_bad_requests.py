@@ -1,4 +1,6 @@
-"""A request that is malformed, broken or hostile gets a status of the 400s, and the page serves on."""
+"""A request that is malformed, broken or hostile gets a status of the 400s,
+and the page serves on.
+"""
 
 from __future__ import annotations
 
@@ -14,27 +16,85 @@ from tests.support.service_attacks import ROUTES, Viewer, request_bytes, status_
 from tests.web.test_page_under_attack import PASSWORD, serving
 
 TARGETS = (
-    "/report/a%00b", "/report/%00", "/report/..%2f..%2fetc", "/report/%2e%2e", "/report/" + "a" * 300,
-    "/report/" + "a" * 5000, "/a%00", "/%ff%fe", "/%zz", "/%", "/report/a%0d%0aX:y", "/a%1b%5b2J", "/..",
-    "/../../etc/passwd", "//evil", "/\x7f", "/\u00e4", "*", "/docs", "/openapi.json",
-    "/chart", "/chart?hold=&signal=x%00&span=1+min&utc=1", "/chart?hold=&signal=error_um&span=1+min&utc=maybe",
-    "/chart?hold=&signal=error_um&span=1_0&utc=1", "/chart?hold=%00&signal=error_um&span=1+min&utc=1",
-    "/chart?" + "a=b&" * 1500, "/map?hold=&removed=%ff", "/map?hold=x&removed=nothing", "/stop?hold=%00",
-    "/_nicegui_ws/socket.io/?EIO=x&transport=polling", "/_nicegui_ws/socket.io/?EIO=4&transport=polling&sid=bad",
-    "/_nicegui/static/%00", "/_nicegui/static/..%2f..%2f", "/_nicegui/components/%2e%2e",
-)  # fmt: skip
+    "/report/a%00b",
+    "/report/%00",
+    "/report/..%2f..%2fetc",
+    "/report/%2e%2e",
+    "/report/" + "a" * 300,
+    "/report/" + "a" * 5000,
+    "/a%00",
+    "/%ff%fe",
+    "/%zz",
+    "/%",
+    "/report/a%0d%0aX:y",
+    "/a%1b%5b2J",
+    "/..",
+    "/../../etc/passwd",
+    "//evil",
+    "/\x7f",
+    "/\u00e4",
+    "*",
+    "/docs",
+    "/openapi.json",
+    "/chart",
+    "/chart?hold=&signal=x%00&span=1+min&utc=1",
+    "/chart?hold=&signal=error_um&span=1+min&utc=maybe",
+    "/chart?hold=&signal=error_um&span=1_0&utc=1",
+    "/chart?hold=%00&signal=error_um&span=1+min&utc=1",
+    "/chart?" + "a=b&" * 1500,
+    "/map?hold=&removed=%ff",
+    "/map?hold=x&removed=nothing",
+    "/stop?hold=%00",
+    "/_nicegui_ws/socket.io/?EIO=x&transport=polling",
+    "/_nicegui_ws/socket.io/?EIO=4&transport=polling&sid=bad",
+    "/_nicegui/static/%00",
+    "/_nicegui/static/..%2f..%2f",
+    "/_nicegui/components/%2e%2e",
+)
 HOSTS = (
-    "", "[", "[::1", "[::1]]:1", "a b", "127.0.0.1:abc", "127.0.0.1:99999", "127.0.0.1:-1", "127.0.0.1:\u0663",
-    "[v1.x]", "\x00", "\u00e4", "%", "a" * 5000, "@", "127.0.0.1@evil.example", "127.0.0.1,evil.example",
-    "evil.example", "127.0.0.1.evil.example",
-)  # fmt: skip
+    "",
+    "[",
+    "[::1",
+    "[::1]]:1",
+    "a b",
+    "127.0.0.1:abc",
+    "127.0.0.1:99999",
+    "127.0.0.1:-1",
+    "127.0.0.1:\u0663",
+    "[v1.x]",
+    "\x00",
+    "\u00e4",
+    "%",
+    "a" * 5000,
+    "@",
+    "127.0.0.1@evil.example",
+    "127.0.0.1,evil.example",
+    "evil.example",
+    "127.0.0.1.evil.example",
+)
 MESSAGES = (
-    "", "4", "40", "42", "42[", '42["event"', '42["event",{"id":"x","client_id":null}]', '42["handshake",{}]',
-    '42["javascript_response",[]]', '42["\\u0000"]', "43", "45", "451-[",
+    "",
+    "4",
+    "40",
+    "42",
+    "42[",
+    '42["event"',
+    '42["event",{"id":"x","client_id":null}]',
+    '42["handshake",{}]',
+    '42["javascript_response",[]]',
+    '42["\\u0000"]',
+    "43",
+    "45",
+    "451-[",
     '452-["event",{"_placeholder":true,"num":9}]',
-    "42" + "[" * 100_000, '42["event",' + "1" * 100_000 + "]", "9", "\u0663", "42[NaN,1e999]",
-    b"\x00", b"\xff" * 100,
-)  # fmt: skip
+    "42" + "[" * 100_000,
+    '42["event",' + "1" * 100_000 + "]",
+    "9",
+    "\u0663",
+    "42[NaN,1e999]",
+    b"\x00",
+    b"\xff" * 100,
+)
 
 
 def head(target: str, host: str, *headers: str, method: str = "GET") -> bytes:
@@ -61,18 +121,36 @@ async def test_a_malformed_request_gets_a_status_of_the_400s(tmp_path: Path) -> 
                 status = await status_of(url, head("/", name, cookie))
                 assert 400 <= status < 500, (name[:60], status)
         for header in (
-            f"Host: {host}", "Origin: http://[::1", "Origin: null", "Content-Length: -5", "Transfer-Encoding: zz",
+            f"Host: {host}",
+            "Origin: http://[::1",
+            "Origin: null",
+            "Content-Length: -5",
+            "Transfer-Encoding: zz",
             "X-Padding: " + "x" * 40_000,
-        ):  # fmt: skip
+        ):
             status = await status_of(url, head("/", host, session, header))
             assert 400 <= status < 500, (header, status)
-        for body in (b"name=%00%ff&password=%ed%a0%80", b"\xff\x00&&==;", b"&" * 4000, b"x" * 5000, b""):
+        for body in (
+            b"name=%00%ff&password=%ed%a0%80",
+            b"\xff\x00&&==;",
+            b"&" * 4000,
+            b"x" * 5000,
+            b"",
+        ):
             status = await status_of(url, request_bytes(url, ROUTES.login, "POST", body))
             assert 400 <= status < 500, (body, status)
-        for raw in (b"\x16\x03\x01\x02\x00\n\n", b"PRI * HTTP/2.0\r\n\r\nSM\r\n\r\n", b"GET / HTTP/9.9\r\n\r\n"):
+        for raw in (
+            b"\x16\x03\x01\x02\x00\n\n",
+            b"PRI * HTTP/2.0\r\n\r\nSM\r\n\r\n",
+            b"GET / HTTP/9.9\r\n\r\n",
+        ):
             assert await status_of(url, raw) in (0, 400)
         # what is only unusual is served, and a header of a stranger is not repeated in the page
-        unusual = ("Range: bytes=0-,5-,-", "If-Modified-Since: never", 'X-Forwarded-Prefix: "><script>')
+        unusual = (
+            "Range: bytes=0-,5-,-",
+            "If-Modified-Since: never",
+            'X-Forwarded-Prefix: "><script>',
+        )
         assert await status_of(url, head("/?hold=%00", host, session, *unusual)) == 200
         page = await anna.client.get("", headers={"X-Forwarded-Prefix": "/evil"})
         assert (page.status_code, "/evil" in page.text) == (200, False)

@@ -42,7 +42,9 @@ def test_the_stranger_who_was_silent_longest_gives_way() -> None:
     assert len(guard) == 0
 
 
-async def ended(streams: list[tuple[asyncio.StreamReader, asyncio.StreamWriter]], within_s: float) -> int:
+async def ended(
+    streams: list[tuple[asyncio.StreamReader, asyncio.StreamWriter]], within_s: float
+) -> int:
     """Number of connections that the service ends within a time."""
 
     async def wait(reader: asyncio.StreamReader) -> bool:
@@ -66,7 +68,8 @@ async def test_strangers_have_a_deadline_a_bound_and_a_number(tmp_path: Path) ->
         assert await anna.log_in("anna", PASSWORD) == 303
         await anna.latencies_s(ROUTES.live, 1)
 
-        # of many silent connections, those that came first make room at once, long before the deadline of the last
+        # of many silent connections, those that came first make room at once, long before the
+        # deadline of the last
         silent = [await connect(url) for _ in range(places + 100)]
         assert await ended(silent[:90], 2.0) == 90
         assert await ended(silent[-90:], 1.0) == 0

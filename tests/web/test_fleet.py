@@ -25,13 +25,17 @@ from tests.web.test_page import served, ticking
 
 def fleet_file(folder: Path, *names: str) -> Path:
     file = folder / "fleet.toml"
-    file.write_text("".join(f'[[holds]]\nname = "{name}"\nsocket = "{name}/control.sock"\n' for name in names))
+    file.write_text(
+        "".join(f'[[holds]]\nname = "{name}"\nsocket = "{name}/control.sock"\n' for name in names)
+    )
     for name in names:
         (folder / name).mkdir(exist_ok=True)
     return file
 
 
-async def test_the_terminal_lists_all_holds(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+async def test_the_terminal_lists_all_holds(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     file = fleet_file(tmp_path, "north", "south", "spare")
     async with port_run(tmp_path / "north"), port_run(tmp_path / "south") as south:
         south.state = State.FAULT
@@ -44,16 +48,26 @@ async def test_the_terminal_lists_all_holds(tmp_path: Path, capsys: pytest.Captu
         assert "no hold is listening" in spare
         assert "--socket" not in spare, "the fleet file names it"
         assert "0.250" not in spare
-        assert await asyncio.to_thread(command, ["ctl", "fleet", str(file), "--json"]) == Exit.DEVICE_FAILED
+        assert (
+            await asyncio.to_thread(command, ["ctl", "fleet", str(file), "--json"])
+            == Exit.DEVICE_FAILED
+        )
         found = json.loads(capsys.readouterr().out)
-        assert [found[name].get("state") for name in ("north", "south", "spare")] == ["hold", "fault", None]
-    assert await asyncio.to_thread(command, ["ctl", "fleet", str(fleet_file(tmp_path, "north"))]) == 4
+        assert [found[name].get("state") for name in ("north", "south", "spare")] == [
+            "hold",
+            "fault",
+            None,
+        ]
+    assert (
+        await asyncio.to_thread(command, ["ctl", "fleet", str(fleet_file(tmp_path, "north"))]) == 4
+    )
 
 
 def test_files_are_beside_the_fleet_file(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     (tmp_path / "lab").mkdir()
     (tmp_path / "lab" / "fleet.toml").write_text(
-        '[[holds]]\nname = "here"\nsocket = "runs/control.sock"\n[[holds]]\nname = "far"\ntls = "bench2.lab:7470"\n'
+        '[[holds]]\nname = "here"\nsocket = "runs/control.sock"\n[[holds]]\nname = '
+        '"far"\ntls = "bench2.lab:7470"\n'
         'certificate_file = "me.pem"\nkey_file = "/etc/me.key"\nauthority_file = "lab.pem"\n'
     )
     monkeypatch.chdir(tmp_path)
@@ -61,7 +75,11 @@ def test_files_are_beside_the_fleet_file(tmp_path: Path, monkeypatch: pytest.Mon
     found = fleet(Path("lab/fleet.toml"))
     assert found["here"] == Where(lab / "runs" / "control.sock", logs=lab / "runs")
     far = found["far"]
-    assert (far.tls, far.certificate, far.key) == ("bench2.lab:7470", lab / "me.pem", Path("/etc/me.key"))
+    assert (far.tls, far.certificate, far.key) == (
+        "bench2.lab:7470",
+        lab / "me.pem",
+        Path("/etc/me.key"),
+    )
     assert HoldFeed(far).logs is None, "its runs are on its host"
     assert HoldFeed(found["here"]).logs == lab / "runs"
 
@@ -73,8 +91,14 @@ def test_files_are_beside_the_fleet_file(tmp_path: Path, monkeypatch: pytest.Mon
         ("holds = []\n", "holds"),
         ('[[holds]]\nname = "a"\n', "give either socket or tls"),
         ('[[holds]]\nname = "a"\nsocket = "s"\ntls = "b:1"\n', "give either socket or tls"),
-        ('[[holds]]\nname = "a"\ntls = "b:1"\n', "tls needs certificate_file, key_file and authority_file"),
-        ('[[holds]]\nname = "a"\nsocket = "s"\n[[holds]]\nname = "a"\nsocket = "t"\n', "two have the same name"),
+        (
+            '[[holds]]\nname = "a"\ntls = "b:1"\n',
+            "tls needs certificate_file, key_file and authority_file",
+        ),
+        (
+            '[[holds]]\nname = "a"\nsocket = "s"\n[[holds]]\nname = "a"\nsocket = "t"\n',
+            "two have the same name",
+        ),
         ('[[holds]]\nname = "<b>"\nsocket = "s"\n', "name"),
     ],
 )
@@ -115,19 +139,27 @@ async def test_twenty_holds_on_one_page(tmp_path: Path) -> None:
             link = await stack.enter_async_context(served(tmp_path, "--fleet", str(file)))
             tab = await stack.enter_async_context(browser_tab(link, tmp_path / "profile"))
             rows = "[...document.querySelectorAll('tbody tr')].map(r => r.innerText)"
-            await tab.until(f"{rows}.filter(r => r.includes('hold') && r.includes('0.25')).length === 20")
+            await tab.until(
+                f"{rows}.filter(r => r.includes('hold') && r.includes('0.25')).length === 20"
+            )
             await tab.screenshot(tmp_path / "fleet.png")
             tasks[-1].cancel()
             await last.aclose()
             await tab.until(f"{rows}.filter(r => r.includes('no contact')).length === 1")
-            await tab.value("[...document.querySelectorAll('a')].find(a => a.innerText === 'mirror7').click()")
+            await tab.value(
+                "[...document.querySelectorAll('a')].find(a => a.innerText === 'mirror7').click()"
+            )
             await tab.until(
-                "location.search === '?hold=mirror7' && document.body.innerText.includes('mirror7 the-run')"
+                "location.search === '?hold=mirror7' && "
+                "document.body.innerText.includes('mirror7 the-run')"
             )
             await tab.value(
-                "[...document.querySelectorAll('button')].find(b => b.innerText.includes('Pause')).click()"
+                "[...document.querySelectorAll('button')].find(b => "
+                "b.innerText.includes('Pause')).click()"
             )
-            await tab.until("[...document.querySelectorAll('button')].some(b => b.innerText.trim() === 'DO IT')")
+            await tab.until(
+                "[...document.querySelectorAll('button')].some(b => b.innerText.trim() === 'DO IT')"
+            )
             await tab.click("Do it")
             await tab.until("document.body.innerText.includes('pause: done')")
             assert [bool(run.asked) for run in runs] == [number == 7 for number in range(20)]

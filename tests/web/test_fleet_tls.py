@@ -1,4 +1,6 @@
-"""The page of a fleet over TLS in a real Chromium: names and roles, and what is refused with which words."""
+"""The page of a fleet over TLS in a real Chromium: names and roles, and what is refused with which
+words.
+"""
 
 from __future__ import annotations
 
@@ -26,7 +28,8 @@ from tests.web.test_page import free_port, served, ticking
 PASSWORD = "membrane!"
 ROWS = "[...document.querySelectorAll('tbody tr')].map(r => r.innerText)"
 BUTTON = "[...document.querySelectorAll('button')].find(b => b.innerText.includes('{}'))"
-SAYS = {  # the row of each mirror, by the certificate that the page shows or the authority that it trusts
+# the row of each mirror, by the certificate that the page shows or the authority that it trusts
+SAYS = {
     "north": "as it should be",
     "reader": "as it should be",
     "foreign": "check the certificate",
@@ -66,12 +69,14 @@ def trusting(certificate: Path) -> str:
     words = ["openssl", "x509", "-in", certificate, "-pubkey", "-noout"]
     public = subprocess.run(words, check=True, capture_output=True).stdout
     der = base64.b64decode(b"".join(public.splitlines()[1:-1]))
-    return f"--ignore-certificate-errors-spki-list={base64.b64encode(hashlib.sha256(der).digest()).decode()}"
+    return f"--ignore-certificate-errors-spki-list={base64.b64encode(hashlib.sha256(der).digest()).decode()}"  # noqa: E501
 
 
 async def log_in(tab: Tab, name: str, password: str) -> None:
     for field, text in (("name", name), ("password", password)):
-        await tab.until(f"(document.querySelector('input[name={field}]').value = {json.dumps(text)}, true)")
+        await tab.until(
+            f"(document.querySelector('input[name={field}]').value = {json.dumps(text)}, true)"
+        )
     await tab.click("Log in")
 
 
@@ -100,9 +105,13 @@ async def test_names_and_certificates_decide(tmp_path: Path, lab: Path) -> None:
         false = await stack.enter_async_context(served(tmp_path, *options, *pair(lab / "stranger")))
         assert link.startswith("https://127.0.0.1:")
         trusted = trusting(lab / "lab" / "page.pem")
-        tab = await stack.enter_async_context(browser_tab(false, tmp_path / "profile", 1500, 1000, trusted))
+        tab = await stack.enter_async_context(
+            browser_tab(false, tmp_path / "profile", 1500, 1000, trusted)
+        )
         await tab.until("document.body.innerText.includes('NET::ERR_CERT_AUTHORITY_INVALID')")
-        assert not await tab.value("!!document.querySelector('input[name=password]')"), "no password to a false page"
+        assert not await tab.value("!!document.querySelector('input[name=password]')"), (
+            "no password to a false page"
+        )
         await tab.call("Page.navigate", url=link)
         for name, password in (("anna", "of another"), ("eve", PASSWORD), ("", "")):
             await log_in(tab, name, password)
@@ -113,7 +122,9 @@ async def test_names_and_certificates_decide(tmp_path: Path, lab: Path) -> None:
         assert await tab.value("fetch('/').then(answer => answer.status)") == 401
         await log_in(tab, "anna", PASSWORD)
         for name, says in SAYS.items():
-            await tab.until(f"{ROWS}.some(r => r.startsWith({name!r}) && r.includes({json.dumps(says)}))")
+            await tab.until(
+                f"{ROWS}.some(r => r.startsWith({name!r}) && r.includes({json.dumps(says)}))"
+            )
             there = name in ("north", "reader")
             row = await tab.value(f"{ROWS}.find(r => r.startsWith({name!r}))")
             assert (("0.25" in row), ("no contact" in row)) == (there, not there)
@@ -122,8 +133,12 @@ async def test_names_and_certificates_decide(tmp_path: Path, lab: Path) -> None:
         await tab.value(f"{BUTTON.format('Pause')}.click()")
         await tab.click("Do it")
         await tab.until("document.body.innerText.includes('pause: done')")
-        assert [(each.kind, each.who, each.why) for each in runs[0].asked] == [("pause", "tls:ann", "web: anna")]
-        await tab.call("Page.navigate", url=f"{link}?hold=reader")  # anna may, the page's certificate there may not
+        assert [(each.kind, each.who, each.why) for each in runs[0].asked] == [
+            ("pause", "tls:ann", "web: anna")
+        ]
+        await tab.call(
+            "Page.navigate", url=f"{link}?hold=reader"
+        )  # anna may, the page's certificate there may not
         await tab.until("document.body.innerText.includes('reader the-run')")
         assert await tab.value(f"{BUTTON.format('STOP')}.disabled")
         await tab.call("Network.clearBrowserCookies")
@@ -145,8 +160,19 @@ async def test_names_and_certificates_decide(tmp_path: Path, lab: Path) -> None:
         ("users", "lab/page.key", "not a certificate and its unencrypted key"),
     ],
 )
-def test_a_page_that_cannot_be_served_says_why(lab: Path, certificate: str, key: str, says: str) -> None:
-    words = ["--users", lab / "users", "--certificate", lab / certificate, "--key", lab / key, "--port", free_port()]
+def test_a_page_that_cannot_be_served_says_why(
+    lab: Path, certificate: str, key: str, says: str
+) -> None:
+    words = [
+        "--users",
+        lab / "users",
+        "--certificate",
+        lab / certificate,
+        "--key",
+        lab / key,
+        "--port",
+        free_port(),
+    ]
     done = CliRunner().invoke(cli.app, list(map(str, words)))
     assert isinstance(done.exception, InputError)
     assert says in str(done.exception)
@@ -156,7 +182,9 @@ def test_a_page_that_cannot_be_served_says_why(lab: Path, certificate: str, key:
 def test_an_address_that_is_taken_is_named() -> None:
     with socket.create_server(("127.0.0.1", 0)) as other:
         port = other.getsockname()[1]
-        with pytest.raises(DeviceError, match=rf"web: cannot listen on 127.0.0.1:{port} \(address already in use\)"):
+        with pytest.raises(
+            DeviceError, match=rf"web: cannot listen on 127.0.0.1:{port} \(address already in use\)"
+        ):
             server.require_servable(WebConfig(port=port))
     server.require_servable(WebConfig(host="::1", port=port))
 

@@ -1,4 +1,6 @@
-"""The chart's data: of the last seconds from the feed, of a month from the runs' tables, with gaps as gaps."""
+"""The chart's data: of the last seconds from the feed, of a month from the runs' tables, with gaps
+as gaps.
+"""
 
 from __future__ import annotations
 
@@ -29,7 +31,14 @@ def feed_of(seconds: int, end_s: float = NOW_S) -> HoldFeed:
 
 def test_seconds_have_least_mean_and_largest_value() -> None:
     seconds = Seconds()
-    for at_s, value in ((0.0, 1.0), (0.4, 3.0), (0.8, math.nan), (1.1, 5.0), (2.5, 0.0), (3.0, 0.0)):
+    for at_s, value in (
+        (0.0, 1.0),
+        (0.4, 3.0),
+        (0.8, math.nan),
+        (1.1, 5.0),
+        (2.5, 0.0),
+        (3.0, 0.0),
+    ):
         seconds.add(at_s, {"error_um": value})
     found = seconds.since(0.0)
     assert [(each.utc_s, each.values["error_um"]) for each in found] == [
@@ -74,22 +83,35 @@ def test_a_month_is_thinned_and_keeps_its_extremes() -> None:
 def test_marks_are_the_feeds_and_those_of_the_runs_before(tmp_path: Path) -> None:
     origin = datetime.fromtimestamp(NOW_S - 600.0, UTC)
     told = [(0.0, {"kind": "started"})]
-    for at_s, text in ((-700.0 + 600.0, "too early"), (100.0, "door"), (550.0, "seen by the feed, too")):
-        told.append((at_s, {"kind": "command", "command": "mark", "who": "anna", "why": "", "text": text}))
+    for at_s, text in (
+        (-700.0 + 600.0, "too early"),
+        (100.0, "door"),
+        (550.0, "seen by the feed, too"),
+    ):
+        told.append(
+            (at_s, {"kind": "command", "command": "mark", "who": "anna", "why": "", "text": text})
+        )
     run = tmp_path / f"{origin:%Y%m%dT%H%M%SZ}-night"
     run.mkdir()
     stamped = [
-        {"time_utc": (origin + timedelta(seconds=at_s)).isoformat(), "mono_s": at_s} | line for at_s, line in told
+        {"time_utc": (origin + timedelta(seconds=at_s)).isoformat(), "mono_s": at_s} | line
+        for at_s, line in told
     ]
     (run / "events.jsonl").write_text("".join(f"{json.dumps(line)}\n" for line in stamped))
     (tmp_path / "20260101T000000Z-torn").mkdir()
     (tmp_path / "20260101T000000Z-torn" / "events.jsonl").write_text('{"kind":')
     feed = HoldFeed(Where())
     assert marks(feed, None, 600.0, NOW_S) == [], "no page has seen one, and the runs are elsewhere"
-    assert [text for _, text in marks(feed, tmp_path, 600.0, NOW_S)] == ["door", "seen by the feed, too"]
+    assert [text for _, text in marks(feed, tmp_path, 600.0, NOW_S)] == [
+        "door",
+        "seen by the feed, too",
+    ]
     feed.met_s = NOW_S - 60.0
     feed.marks.append((NOW_S - 49.5, "seen by the feed, too"))
-    assert marks(feed, tmp_path, 600.0, NOW_S) == [(NOW_S - 500.0, "door"), (NOW_S - 49.5, "seen by the feed, too")]
+    assert marks(feed, tmp_path, 600.0, NOW_S) == [
+        (NOW_S - 500.0, "door"),
+        (NOW_S - 49.5, "seen by the feed, too"),
+    ]
     assert marks(feed, tmp_path, 55.0, NOW_S) == [(NOW_S - 49.5, "seen by the feed, too")]
 
 
@@ -104,7 +126,12 @@ def test_sparklines_and_charts_are_drawn_of_anything() -> None:
     assert sparkline([1.0]) == ""
     assert sparkline([math.nan, 1.0, 2.0, math.nan, 3.0]).count("M") == 2
     assert 'd="M' in sparkline([5.0, 5.0])
-    series = Series(np.array([1.0, 2.0]), np.array([0.0, math.nan]), np.array([1.0, math.nan]), np.array([2.0, 1.0]))
+    series = Series(
+        np.array([1.0, 2.0]),
+        np.array([0.0, math.nan]),
+        np.array([1.0, math.nan]),
+        np.array([2.0, 1.0]),
+    )
     options = figures.chart("error_um", series, True)
     assert options["series"][2]["markLine"]["data"] == [], "earlier marks do not stay"
     many = [(float(number), "x" * 30) for number in range(30)]

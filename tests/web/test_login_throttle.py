@@ -1,4 +1,6 @@
-"""Guesses are limited for each source and account, and no guess of a stranger keeps the owner out."""
+"""Guesses are limited for each source and account, and no guess of a
+stranger keeps the owner out.
+"""
 
 from __future__ import annotations
 
@@ -43,9 +45,12 @@ def evaluated(monkeypatch: pytest.MonkeyPatch) -> list[str]:
 
 
 def accounts() -> Accounts:
-    return Accounts({
-        name: KnownUser(name, "operate", name.encode(), RIGHT.encode() + name.encode()) for name in ("anna", "bob")
-    })  # fmt: skip
+    return Accounts(
+        {
+            name: KnownUser(name, "operate", name.encode(), RIGHT.encode() + name.encode())
+            for name in ("anna", "bob")
+        }
+    )
 
 
 def device_of(found: Accounts, name: str) -> str:
@@ -75,7 +80,9 @@ def test_guesses_from_one_address_are_limited_over_time(clock: Clock, evaluated:
     assert 290 <= len(evaluated) <= 310, "5 at once, then one every 12 s"
 
 
-def test_an_attack_from_one_address_leaves_other_addresses_alone(clock: Clock, evaluated: list[str]) -> None:
+def test_an_attack_from_one_address_leaves_other_addresses_alone(
+    clock: Clock, evaluated: list[str]
+) -> None:
     found = accounts()
     for number in range(2000):
         found.by_password("anna", f"guess {number}", "198.51.100.7")
@@ -91,7 +98,9 @@ def test_an_attack_from_many_addresses_is_limited_and_leaves_a_new_address_its_f
     for number in range(20_000):
         found.by_password("anna", WRONG, f"198.51.100.{number % 200}")
         clock.now_s += 0.01
-    assert len(evaluated) <= 2 * 200 + 60 + 200, "first tries of each address, then the budget of the account"
+    assert len(evaluated) <= 2 * 200 + 60 + 200, (
+        "first tries of each address, then the budget of the account"
+    )
     assert found.by_password("anna", RIGHT, "10.0.0.1") is not None
     assert found.by_password("anna", WRONG, "10.0.0.2") is None
     assert found.by_password("anna", RIGHT, "10.0.0.2") is not None, "the owner may mistype once"
@@ -112,18 +121,26 @@ def test_a_device_that_has_logged_in_has_its_own_budget(clock: Clock, evaluated:
 
 
 @pytest.mark.parametrize("made", ["other", "forged", "cut", "empty"])
-def test_a_device_counts_for_its_own_account_only(made: str, clock: Clock, evaluated: list[str]) -> None:
+def test_a_device_counts_for_its_own_account_only(
+    made: str, clock: Clock, evaluated: list[str]
+) -> None:
     found = accounts()
     own = device_of(found, "anna")
-    devices = {"other": device_of(found, "bob"), "forged": own[:-1] + ("0" if own[-1] != "0" else "1"), "cut": "x.",
-               "empty": ""}  # fmt: skip
+    devices = {
+        "other": device_of(found, "bob"),
+        "forged": own[:-1] + ("0" if own[-1] != "0" else "1"),
+        "cut": "x.",
+        "empty": "",
+    }
     evaluated.clear()
     for _ in range(50):
         found.by_password("anna", WRONG, "198.51.100.7", devices[made])
     assert len(evaluated) == 5
 
 
-def test_a_device_ends_with_the_password_and_survives_a_restart(clock: Clock, evaluated: list[str]) -> None:
+def test_a_device_ends_with_the_password_and_survives_a_restart(
+    clock: Clock, evaluated: list[str]
+) -> None:
     device = device_of(accounts(), "anna")
     assert accounts().guess_of("anna", "a", device).device == device
     changed = Accounts({"anna": KnownUser("anna", "operate", b"anna", b"another password")})
@@ -189,7 +206,10 @@ def test_memory_of_the_throttle_is_bounded(clock: Clock, monkeypatch: pytest.Mon
     throttle = LoginThrottle()
     for number in range(1000):
         throttle.admit(Guess(f"name {number}", f"source {number}"))
-    assert max(len(budgets._tokens) for budgets in (throttle._source, throttle._source_and_account)) <= 100
+    assert (
+        max(len(budgets._tokens) for budgets in (throttle._source, throttle._source_and_account))
+        <= 100
+    )
 
 
 def test_who_logs_in_again_and_again_ends_no_session_of_others() -> None:

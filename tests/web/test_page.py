@@ -1,4 +1,6 @@
-"""The page in a real browser, on a port that is real: what a viewer sees, sends, and cannot be made to do."""
+"""The page in a real browser, on a port that is real: what a viewer sees, sends, and cannot be made
+to do.
+"""
 
 from __future__ import annotations
 
@@ -40,11 +42,21 @@ def free_port() -> int:
 @asynccontextmanager
 async def served(folder: Path, *options: str) -> AsyncIterator[str]:
     """`membrane-ctrl web` on a folder of runs; yields the link that it prints."""
-    env = {name: value for name, value in os.environ.items() if name != "PYTEST_CURRENT_TEST"}  # NiceGUI looks for it
+    env = {
+        name: value for name, value in os.environ.items() if name != "PYTEST_CURRENT_TEST"
+    }  # NiceGUI looks for it
     process = await asyncio.create_subprocess_exec(
-        sys.executable, "-c", "from membrane_ctrl.web.cli import app; app()", "--logs", str(folder),
-        "--port", str(free_port()), *options, stderr=asyncio.subprocess.PIPE, env=env,
-    )  # fmt: skip
+        sys.executable,
+        "-c",
+        "from membrane_ctrl.web.cli import app; app()",
+        "--logs",
+        str(folder),
+        "--port",
+        str(free_port()),
+        *options,
+        stderr=asyncio.subprocess.PIPE,
+        env=env,
+    )
     try:
         assert process.stderr is not None
         async with asyncio.timeout(_START_S):
@@ -71,7 +83,9 @@ async def viewed(tmp_path: Path, *options: str) -> AsyncIterator[tuple[PortRun, 
         try:
             await asyncio.sleep(1.0)
             async with browser_tab(link, tmp_path / "profile") as tab:
-                await tab.until("document.querySelector('[data-field=error_um]').innerText === '0.25'")
+                await tab.until(
+                    "document.querySelector('[data-field=error_um]').innerText === '0.25'"
+                )
                 yield run, tab
         finally:
             task.cancel()
@@ -84,10 +98,18 @@ async def test_a_viewer_sees_the_hold_and_pauses_it(tmp_path: Path) -> None:
         assert "the-run" in await tab.value("document.body.innerText")
         fetched = "performance.getEntriesByType('resource').filter(r => r.name.includes('/chart?'))"
         await tab.until(f"{fetched}.some(r => r.responseStatus === 200 && r.decodedBodySize > 500)")
-        await tab.value("[...document.querySelectorAll('button')].find(b => b.innerText.includes('Pause')).click()")
-        await tab.until("[...document.querySelectorAll('button')].some(b => b.innerText.trim() === 'DO IT')")
+        await tab.value(
+            "[...document.querySelectorAll('button')].find(b => "
+            "b.innerText.includes('Pause')).click()"
+        )
+        await tab.until(
+            "[...document.querySelectorAll('button')].some(b => b.innerText.trim() === 'DO IT')"
+        )
         assert run.asked == [], "nothing is sent before the confirmation"
-        await tab.value("[...document.querySelectorAll('button')].find(b => b.innerText.trim() === 'DO IT').click()")
+        await tab.value(
+            "[...document.querySelectorAll('button')].find(b => b.innerText.trim() === 'DO "
+            "IT').click()"
+        )
         await tab.until("document.body.innerText.includes('pause: done')")
         assert [(command.kind, command.why) for command in run.asked] == [("pause", "web: link")]
         run.port.told(Mark(HOSTILE, "anna"))
@@ -99,20 +121,35 @@ async def test_a_viewer_sees_the_hold_and_pauses_it(tmp_path: Path) -> None:
 @needs("chromium")
 @pytest.mark.real_time
 async def test_a_viewer_sees_all_locks_and_types_the_word_of_one(tmp_path: Path) -> None:
-    press = "[...document.querySelectorAll('button')].find(b => b.innerText.trim().toLowerCase() === '{}').click()"
+    press = (
+        "[...document.querySelectorAll('button')].find(b => b.innerText.trim().toLowerCase() === "
+        "'{}').click()"
+    )
     async with viewed(tmp_path) as (run, tab):
         for number, author in enumerate(("unix:ann", "page:bob")):
             word = f"bofa{number}"
-            run.tick((LockSet(word, "hands inside", author, author, "s", "2026-01-02T03:04:05+00:00", 1),))
-            await tab.until(
-                f"document.body.innerText.includes('hands inside') && document.body.innerText.includes('{word}')"
+            run.tick(
+                (
+                    LockSet(
+                        word, "hands inside", author, author, "s", "2026-01-02T03:04:05+00:00", 1
+                    ),
+                )
             )
-        await tab.value("[...document.querySelectorAll('button')].find(b => b.innerText.includes('Unlock')).click()")
+            await tab.until(
+                "document.body.innerText.includes('hands inside') && "
+                f"document.body.innerText.includes('{word}')"
+            )
+        await tab.value(
+            "[...document.querySelectorAll('button')].find(b => "
+            "b.innerText.includes('Unlock')).click()"
+        )
         await tab.until("document.querySelector('.q-dialog input')")
         dialog = str(await tab.value("document.querySelector('.q-dialog').innerText"))
         for part in ("unix:ann", "page:bob", "bofa0", "bofa1", "Type the word"):
             assert part in dialog
-        assert await tab.value("document.querySelector('.q-dialog input').value") == "", "a person types the word"
+        assert await tab.value("document.querySelector('.q-dialog input').value") == "", (
+            "a person types the word"
+        )
         await tab.until("document.activeElement.tagName === 'INPUT'")
         await tab.press(*"bofa1")
         await tab.value(press.format("do it"))
@@ -133,7 +170,7 @@ CONTRAST = """(element => {
   while (behind && getComputedStyle(behind).backgroundColor.startsWith('rgba')) behind = behind.parentElement;
   const back = behind ? getComputedStyle(behind).backgroundColor : 'rgb(255, 255, 255)';
   const [low, high] = [light(getComputedStyle(element).color), light(back)].sort((a, b) => a - b);
-  return (high + 0.05) / (low + 0.05) })"""
+  return (high + 0.05) / (low + 0.05) })"""  # noqa: E501
 
 
 @needs("chromium")
@@ -144,13 +181,25 @@ async def test_a_phone_and_the_keyboard_alone(tmp_path: Path) -> None:
         for dark in (True, False):
             await tab.show_as(390, 844, dark)
             await tab.until("document.querySelector('[data-field=error_um]').innerText === '0.25'")
-            for name, has in (("LOOK BACK", "REFRESH"), ("TUNE", "No tuning session"), ("NOW", "0.25")):
+            for name, has in (
+                ("LOOK BACK", "REFRESH"),
+                ("TUNE", "No tuning session"),
+                ("NOW", "0.25"),
+            ):
                 await tab.value(PRESS.format(name))
-                await tab.until(f"document.querySelector('[role=tabpanel]').innerText.includes('{has}') && {FITS}")
+                await tab.until(
+                    f"document.querySelector('[role=tabpanel]').innerText.includes('{has}') "
+                    f"&& {FITS}"
+                )
                 if name == "LOOK BACK":
-                    refresh = "[...document.querySelectorAll('button')].find(b => b.innerText.includes('REFRESH'))"
+                    refresh = (
+                        "[...document.querySelectorAll('button')].find(b => "
+                        "b.innerText.includes('REFRESH'))"
+                    )
                     assert await tab.value(f"{CONTRAST}({refresh})") > 4.5
-                await asyncio.sleep(1.0)  # until the page has answered, which knows the open tab, too
+                await asyncio.sleep(
+                    1.0
+                )  # until the page has answered, which knows the open tab, too
             for what in (
                 "[data-field=error_um]",
                 "[aria-label=state]",
@@ -158,12 +207,18 @@ async def test_a_phone_and_the_keyboard_alone(tmp_path: Path) -> None:
                 "header .text-caption",
                 "button",
             ):
-                assert await tab.value(f"{CONTRAST}(document.querySelector('{what}'))") > 4.5, (what, dark)
+                assert await tab.value(f"{CONTRAST}(document.querySelector('{what}'))") > 4.5, (
+                    what,
+                    dark,
+                )
             await tab.screenshot(tmp_path / f"phone{dark:d}.png")
         chart = "getElement(+document.querySelector('canvas').closest('[id^=c]').id.slice(1)).chart"
         await tab.until(f"{chart}.getOption().dataZoom.length === 2")
         await tab.value(f"{chart}.dispatchAction({{type: 'dataZoom', start: 40, end: 90}}), 0")
-        fetched = "performance.getEntriesByType('resource').filter(r => r.name.includes('/chart?')).length"
+        fetched = (
+            "performance.getEntriesByType('resource').filter(r => "
+            "r.name.includes('/chart?')).length"
+        )
         before = await tab.value(fetched)
         await tab.until(f"{fetched} > {before} + 1")
         zoom = f"{chart}.getOption().dataZoom.map(z => [z.start, z.end])"
@@ -196,13 +251,18 @@ CANDIDATES = """| candidate | K 1/s | std µm | Ms | against present |
 | least-variance | 0.520 | 0.130 +- 0.008 | 1.58 | better: std x 0.62; worse: Ms x 1.17 |
 | simc-slow | 0.410 | 0.160 +- 0.009 | 1.42 | better: std x 0.76; worse: Ms x 1.05 |
 """
-PRESS = "[...document.querySelectorAll('[role=tab]')].find(t => t.innerText.toUpperCase().includes('{}')).click()"
+PRESS = (
+    "[...document.querySelectorAll('[role=tab]')].find(t => "
+    "t.innerText.toUpperCase().includes('{}')).click()"
+)
 
 
 @needs("chromium")
 @pytest.mark.real_time
 @pytest.mark.campaign
-async def test_a_candidate_is_chosen_on_the_page(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+async def test_a_candidate_is_chosen_on_the_page(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     path = create_session(tmp_path, "night", "eve", "the-run", Config(), LoopConfig()).path
     (path / "candidates.md").write_text(CANDIDATES)
     progress = Progress()
@@ -214,17 +274,23 @@ async def test_a_candidate_is_chosen_on_the_page(tmp_path: Path, monkeypatch: py
         monkeypatch.setattr(sys, "stdin", stdin)
         async with viewed(tmp_path) as (_, tab):
             names = ("least-variance", "simc-slow")
-            asking = asyncio.create_task(asyncio.to_thread(progress.ask, "apply which candidate?", names))
+            asking = asyncio.create_task(
+                asyncio.to_thread(progress.ask, "apply which candidate?", names)
+            )
             await tab.value(PRESS.format("TUNE"))
             await tab.until("document.body.innerText.includes('0.160 +- 0.009')")
             await tab.screenshot(tmp_path / "choice.png")
             await tab.click("simc-slow")
-            await tab.until("[...document.querySelectorAll('button')].some(b => b.innerText.trim() === 'DO IT')")
+            await tab.until(
+                "[...document.querySelectorAll('button')].some(b => b.innerText.trim() === 'DO IT')"
+            )
             assert not asking.done(), "nothing is chosen before the confirmation"
             await tab.click("Do it")
             assert await asking == "simc-slow"
             await tab.until("document.body.innerText.includes('simc-slow: done')")
-            await tab.until("document.body.innerText.includes('link answers on the page: simc-slow')")
+            await tab.until(
+                "document.body.innerText.includes('link answers on the page: simc-slow')"
+            )
             await tab.until("!document.body.innerText.includes('0.160 +- 0.009')")
 
 
@@ -275,4 +341,6 @@ def test_a_reader_starts_no_writing(tmp_path: Path, monkeypatch: pytest.MonkeyPa
     assert panels.report_problem(run, reader) == "", "what exists may be read"
     assert len(started) == 1
     assert panels.run_folder(tmp_path, "run") == run
-    assert [panels.run_folder(tmp_path, name) for name in ("../run", "/etc", "..", "", "a/b", ".x")] == [None] * 6
+    assert [
+        panels.run_folder(tmp_path, name) for name in ("../run", "/etc", "..", "", "a/b", ".x")
+    ] == [None] * 6

@@ -23,7 +23,10 @@ CHART_S = 3.0  # also on a busy machine
 async def serving(folder: Path, *options: str) -> AsyncIterator[tuple[PortRun, str]]:
     """A hold and its page with two accounts; yields the hold and the page's address."""
     users = folder / "users"
-    lines = [known_user(name, role, PASSWORD).line() for name, role in (("anna", "operate"), ("bob", "read"))]
+    lines = [
+        known_user(name, role, PASSWORD).line()
+        for name, role in (("anna", "operate"), ("bob", "read"))
+    ]
     users.write_text("\n".join(lines))
     async with port_run(folder) as run, served(folder, "--users", str(users), *options) as url:
         ticks = asyncio.create_task(ticking(run))
@@ -54,12 +57,21 @@ async def test_strangers_delay_neither_chart_nor_stop(tmp_path: Path) -> None:
 
 @pytest.mark.real_time
 async def test_a_user_who_asks_for_everything_delays_no_other(tmp_path: Path) -> None:
-    signals = ("error_um", "displacement_um", "pump_fraction", "leak_um_per_s", "gauge_pressure_pa", "trim_um")
+    signals = (
+        "error_um",
+        "displacement_um",
+        "pump_fraction",
+        "leak_um_per_s",
+        "gauge_pressure_pa",
+        "trim_um",
+    )
     spans = ("1 min", "10 min", "1 h", "8 h", "1 day", "1 week", "1 month")
     paths = [
         ROUTES.history.format(signal=signal, span=span, utc=utc)
-        for signal in signals for span in spans for utc in ("true", "false")
-    ]  # fmt: skip
+        for signal in signals
+        for span in spans
+        for utc in ("true", "false")
+    ]
 
     async with serving(tmp_path) as (_, url), Viewer(url) as anna, Viewer(url) as bob:
         assert await anna.log_in("anna", PASSWORD) == 303

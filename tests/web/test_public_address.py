@@ -1,4 +1,6 @@
-"""Links, cookies, origins and the client's address follow from the settings, not from headers of strangers."""
+"""Links, cookies, origins and the client's address follow from the settings, not from headers of
+strangers.
+"""
 
 from __future__ import annotations
 
@@ -6,9 +8,16 @@ import pytest
 from pydantic import ValidationError
 
 from membrane_ctrl.config.port import WebConfig
-from membrane_ctrl.web.public_address import PublicAddress, host_name, normalised_origin, public_address
+from membrane_ctrl.web.public_address import (
+    PublicAddress,
+    host_name,
+    normalised_origin,
+    public_address,
+)
 
-PROXIED = public_address(WebConfig(public_url="https://Lab.example/mirror/".lower(), users_file="users"))
+PROXIED = public_address(
+    WebConfig(public_url="https://Lab.example/mirror/".lower(), users_file="users")
+)
 
 
 def test_without_a_public_address_the_page_is_where_it_listens() -> None:
@@ -31,13 +40,20 @@ def test_all_follows_from_the_public_address() -> None:
 @pytest.mark.parametrize(
     ("origin", "admitted"),
     [
-        ("https://lab.example", True), ("https://lab.example:443", True), ("https://LAB.example", True),
+        ("https://lab.example", True),
+        ("https://lab.example:443", True),
+        ("https://LAB.example", True),
         ("http://127.0.0.1:7480", True),
-        ("http://lab.example", False), ("https://lab.example:8443", False), ("https://lab.example.evil", False),
-        ("https://evil.example", False), ("https://lab.example@evil.example", False), ("null", False), ("", False),
+        ("http://lab.example", False),
+        ("https://lab.example:8443", False),
+        ("https://lab.example.evil", False),
+        ("https://evil.example", False),
+        ("https://lab.example@evil.example", False),
+        ("null", False),
+        ("", False),
         ("https://[::1", False),
     ],
-)  # fmt: skip
+)
 def test_only_the_public_origin_and_the_own_one_are_admitted(origin: str, admitted: bool) -> None:
     assert PROXIED.admits_origin(origin, "127.0.0.1:7480") is admitted
 
@@ -45,10 +61,15 @@ def test_only_the_public_origin_and_the_own_one_are_admitted(origin: str, admitt
 @pytest.mark.parametrize(
     ("path", "inside"),
     [
-        ("/mirror/", "/"), ("/mirror", ""), ("/mirror/chart", "/chart"), ("/chart", "/chart"), ("/", "/"),
-        ("/mirrors/x", "/mirrors/x"), ("/mirror/mirror/x", "/mirror/x"),
+        ("/mirror/", "/"),
+        ("/mirror", ""),
+        ("/mirror/chart", "/chart"),
+        ("/chart", "/chart"),
+        ("/", "/"),
+        ("/mirrors/x", "/mirrors/x"),
+        ("/mirror/mirror/x", "/mirror/x"),
     ],
-)  # fmt: skip
+)
 def test_the_prefix_is_removed_once(path: str, inside: str) -> None:
     assert PROXIED.path_inside(path) == inside
     assert PublicAddress(frozenset()).path_inside(path) == path
@@ -57,12 +78,21 @@ def test_the_prefix_is_removed_once(path: str, inside: str) -> None:
 @pytest.mark.parametrize(
     "url",
     [
-        "lab.example/mirror", "ftp://lab.example", "https://user@lab.example/", "https://lab.example/?x=1",
-        "https://lab.example/a/../b", "https://lab.example//a", "https://lab.example/a b", "https://lab.example/%2e",
-        "https://lab.example:port/", "https://lab.example/#a", "https:///mirror", "javascript:alert(1)",
+        "lab.example/mirror",
+        "ftp://lab.example",
+        "https://user@lab.example/",
+        "https://lab.example/?x=1",
+        "https://lab.example/a/../b",
+        "https://lab.example//a",
+        "https://lab.example/a b",
+        "https://lab.example/%2e",
+        "https://lab.example:port/",
+        "https://lab.example/#a",
+        "https:///mirror",
+        "javascript:alert(1)",
         "https://lab.example/\r\nX: y",
     ],
-)  # fmt: skip
+)
 def test_a_public_address_that_is_none_is_refused(url: str) -> None:
     with pytest.raises(ValidationError, match="public_url"):
         WebConfig(public_url=url, users_file="users")
@@ -88,7 +118,11 @@ def test_a_proxy_that_is_no_address_is_refused() -> None:
         ("198.51.100.7", ["10.9.9.9"], "198.51.100.7"),  # a stranger's header
         ("127.0.0.1", [], "127.0.0.1"),
         ("127.0.0.1", ["198.51.100.7"], "198.51.100.7"),
-        ("127.0.0.1", ["10.9.9.9, 198.51.100.7"], "198.51.100.7"),  # the client sent the first, the proxy the second
+        (
+            "127.0.0.1",
+            ["10.9.9.9, 198.51.100.7"],
+            "198.51.100.7",
+        ),  # the client sent the first, the proxy the second
         ("127.0.0.1", ["10.9.9.9", "198.51.100.7"], "198.51.100.7"),
         ("127.0.0.1", ["198.51.100.7, 192.0.2.5"], "198.51.100.7"),  # two trusted proxies
         ("127.0.0.1", ["10.9.9.9, 198.51.100.7, 192.0.2.5"], "198.51.100.7"),
@@ -102,7 +136,9 @@ def test_a_proxy_that_is_no_address_is_refused() -> None:
         ("", [], ""),
     ],
 )
-def test_the_source_is_the_client_if_a_trusted_proxy_names_it(peer: str, forwarded: list[str], source: str) -> None:
+def test_the_source_is_the_client_if_a_trusted_proxy_names_it(
+    peer: str, forwarded: list[str], source: str
+) -> None:
     address = public_address(WebConfig(trusted_proxies=("127.0.0.1", "192.0.2.0/24")))
     assert address.source_of(peer, forwarded) == source
 
@@ -114,11 +150,20 @@ def test_without_a_trusted_proxy_no_header_counts() -> None:
 @pytest.mark.parametrize(
     ("header", "name"),
     [
-        ("Lab.Example:7480", "lab.example"), ("127.0.0.1", "127.0.0.1"), ("[::1]:7480", "::1"), ("[::1", None),
-        ("a b", None), ("", None), ("a:b", None), ("a:70000", None), ("a@b", None), ("a/b", None), ("\u0663", None),
+        ("Lab.Example:7480", "lab.example"),
+        ("127.0.0.1", "127.0.0.1"),
+        ("[::1]:7480", "::1"),
+        ("[::1", None),
+        ("a b", None),
+        ("", None),
+        ("a:b", None),
+        ("a:70000", None),
+        ("a@b", None),
+        ("a/b", None),
+        ("\u0663", None),
         ("a:\u0663", None),
     ],
-)  # fmt: skip
+)
 def test_the_name_in_a_host_header(header: str, name: str | None) -> None:
     assert host_name(header) == name
 

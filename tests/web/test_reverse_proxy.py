@@ -1,4 +1,6 @@
-"""The page behind a real nginx: under a path or not, whatever the proxy does to the path and the headers."""
+"""The page behind a real nginx: under a path or not, whatever the proxy does to the path and the
+headers.
+"""
 
 from __future__ import annotations
 
@@ -61,8 +63,14 @@ async def proxied(folder: Path, setup: Setup, *options: str) -> AsyncIterator[tu
 
 def socket_request(url: str, session: str, origin: str) -> bytes:
     """What a browser sends to open the page's web socket."""
-    upgrade = ("Upgrade: websocket", "Connection: Upgrade", "Sec-WebSocket-Version: 13",
-               "Sec-WebSocket-Key: AAAAAAAAAAAAAAAAAAAAAA==", f"Origin: {origin}", f"Cookie: {session}")  # fmt: skip
+    upgrade = (
+        "Upgrade: websocket",
+        "Connection: Upgrade",
+        "Sec-WebSocket-Version: 13",
+        "Sec-WebSocket-Key: AAAAAAAAAAAAAAAAAAAAAA==",
+        f"Origin: {origin}",
+        f"Cookie: {session}",
+    )
     return request_bytes(url, ROUTES.socket, "GET", b"", *upgrade)
 
 
@@ -96,7 +104,9 @@ async def test_everything_works_under_the_public_address(name: str, tmp_path: Pa
 
 
 async def test_the_page_finds_no_other_way_than_its_settings(tmp_path: Path) -> None:
-    """A proxy with a path needs the setting: a header that strangers could send as well changes nothing."""
+    """A proxy with a path needs the setting: a header that strangers could send as well changes
+    nothing.
+    """
     async with (
         serving(tmp_path) as (_, url),
         reverse_proxy(tmp_path / "nginx", outside := free_port(), "/mirror/", url, PREFIX),
@@ -107,7 +117,9 @@ async def test_the_page_finds_no_other_way_than_its_settings(tmp_path: Path) -> 
 
 
 @pytest.mark.parametrize("trusted", [True, False])
-async def test_a_trusted_proxy_names_the_client_whose_logins_are_limited(trusted: bool, tmp_path: Path) -> None:
+async def test_a_trusted_proxy_names_the_client_whose_logins_are_limited(
+    trusted: bool, tmp_path: Path
+) -> None:
     options = ("--trusted-proxy", "127.0.0.1") if trusted else ()
     setup = Setup("/mirror/", "/", CLIENT)
     async with proxied(tmp_path, setup, *options) as (_, url), Viewer(url, "127.0.0.2") as client:
@@ -115,12 +127,16 @@ async def test_a_trusted_proxy_names_the_client_whose_logins_are_limited(trusted
             forged = {"X-Forwarded-For": f"198.51.100.{number}"}
             form = {"name": "anna", "password": "wrong wrong"}
             answer = await client.client.post(ROUTES.login, data=form, headers=forged)
-            assert answer.status_code == (401 if number < 5 else 429), "nginx appends the real address"
-        # another machine in front of the same proxy, which the test imitates by asking the page itself
+            assert answer.status_code == (401 if number < 5 else 429), (
+                "nginx appends the real address"
+            )
+        # another machine in front of the same proxy, which the test imitates by asking the page
+        # itself
         inside = next(
             line.split()[1].rstrip(";")
-            for line in (tmp_path / "nginx" / "nginx.conf").read_text().splitlines() if "proxy_pass" in line
-        )  # fmt: skip
+            for line in (tmp_path / "nginx" / "nginx.conf").read_text().splitlines()
+            if "proxy_pass" in line
+        )
         form = {"name": "anna", "password": PASSWORD}
         owner = {"X-Forwarded-For": "203.0.113.5"}
         async with Viewer(inside) as proxy:
@@ -130,7 +146,10 @@ async def test_a_trusted_proxy_names_the_client_whose_logins_are_limited(trusted
 
 async def test_a_flood_through_the_proxy_delays_no_viewer(tmp_path: Path) -> None:
     setup = Setup("/mirror/", "/", CLIENT)
-    async with proxied(tmp_path, setup, "--trusted-proxy", "127.0.0.1") as (run, url), Viewer(url) as anna:
+    async with (
+        proxied(tmp_path, setup, "--trusted-proxy", "127.0.0.1") as (run, url),
+        Viewer(url) as anna,
+    ):
         assert await anna.log_in("anna", PASSWORD) == 303
         async with attack("logins", url, 100):
             stops_s = await anna.latencies_s(ROUTES.stop, 8, method="POST")
@@ -152,11 +171,21 @@ async def test_a_browser_operates_the_hold_under_a_path(tmp_path: Path) -> None:
         try:
             await asyncio.sleep(1.0)
             async with browser_tab(link, tmp_path / "profile") as tab:
-                await tab.until("document.querySelector('[data-field=error_um]').innerText === '0.25'")
-                fetched = "performance.getEntriesByType('resource').filter(r => r.name.includes('/mirror/chart?'))"
-                await tab.until(f"{fetched}.some(r => r.responseStatus === 200 && r.decodedBodySize > 500)")
+                await tab.until(
+                    "document.querySelector('[data-field=error_um]').innerText === '0.25'"
+                )
+                fetched = (
+                    "performance.getEntriesByType('resource').filter(r => "
+                    "r.name.includes('/mirror/chart?'))"
+                )
+                await tab.until(
+                    f"{fetched}.some(r => r.responseStatus === 200 && r.decodedBodySize > 500)"
+                )
                 await tab.value(f"{STOP}.click()")
-                await tab.until("[...document.querySelectorAll('button')].some(b => b.innerText.trim() === 'DO IT')")
+                await tab.until(
+                    "[...document.querySelectorAll('button')].some(b => b.innerText.trim() "
+                    "=== 'DO IT')"
+                )
                 await tab.click("Do it")
                 await tab.until("document.body.innerText.includes('stop: done')")
             assert [command.kind for command in run.asked] == ["stop"]

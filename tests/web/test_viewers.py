@@ -18,7 +18,9 @@ from membrane_ctrl.web.figures import Shared
 from membrane_ctrl.web.work_pools import WorkPool
 
 
-async def test_what_all_see_is_made_once_and_again_when_it_is_old(monkeypatch: pytest.MonkeyPatch) -> None:
+async def test_what_all_see_is_made_once_and_again_when_it_is_old(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     made: list[tuple[str, int]] = []
     ready = threading.Event()
 
@@ -33,7 +35,9 @@ async def test_what_all_see_is_made_once_and_again_when_it_is_old(monkeypatch: p
     other = asyncio.create_task(shared.get("b", 2))
     await asyncio.sleep(0)
     leaving.cancel()
-    monkeypatch.setattr("time.monotonic", lambda: 1e9)  # it takes longer than it lives: still made once
+    monkeypatch.setattr(
+        "time.monotonic", lambda: 1e9
+    )  # it takes longer than it lives: still made once
     late = asyncio.create_task(shared.get("a", 1))
     await asyncio.sleep(0)
     ready.set()
@@ -73,7 +77,9 @@ async def test_what_cannot_be_made_is_tried_again() -> None:
         (("a", "b"), (), ()),
     ],
 )
-def test_only_new_lines_are_shown(old: tuple[str, ...], new: tuple[str, ...], expected: tuple[str, ...]) -> None:
+def test_only_new_lines_are_shown(
+    old: tuple[str, ...], new: tuple[str, ...], expected: tuple[str, ...]
+) -> None:
     assert panels.fresh(old, new) == expected
 
 
@@ -98,7 +104,9 @@ async def test_a_viewer_who_does_not_read_is_hung_up_on(
 
     scope = {"type": "websocket", "membrane_user": WebUser("anna", "read")}
     await server.HangUp(app)(scope, receive, send)  # type: ignore[arg-type]
-    assert capsys.readouterr().err == ("" if leaves else "membrane-ctrl web: viewer anna does not read: hung up\n")
+    assert capsys.readouterr().err == (
+        "" if leaves else "membrane-ctrl web: viewer anna does not read: hung up\n"
+    )
 
 
 def test_the_newest_session_is_followed(tmp_path: Path) -> None:
@@ -114,7 +122,9 @@ def test_the_newest_session_is_followed(tmp_path: Path) -> None:
     assert (seen.head, seen.done) == (f"{path.name}: observe", frozenset())
     log.note("said", "line 300")
     log.note("asks", "apply which?", among=("calm", "lively"))
-    (path / "candidates.md").write_text("| candidate | Ms |\n|---|---:|\n| calm | 1.3 |\n| torn\n| lively | 1.6 |\n")
+    (path / "candidates.md").write_text(
+        "| candidate | Ms |\n|---|---:|\n| calm | 1.3 |\n| torn\n| lively | 1.6 |\n"
+    )
     (path / "identified.json").write_text("{}")
     later = watch.look()
     assert later is not None
@@ -126,10 +136,14 @@ def test_the_newest_session_is_followed(tmp_path: Path) -> None:
     second = create_session(tmp_path, "second", "eve", "twin", Config(), LoopConfig()).path
     newest = watch.look()
     assert newest is not None
-    assert newest.head == f"{max(path, second).name}: " + ("begun" if second > path else "observe, ended: stopped")
+    assert newest.head == f"{max(path, second).name}: " + (
+        "begun" if second > path else "observe, ended: stopped"
+    )
 
 
-def test_an_answer_that_no_session_takes_is_withdrawn(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_an_answer_that_no_session_takes_is_withdrawn(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     slept: list[float] = []
     monkeypatch.setattr(panels.time, "sleep", slept.append)
     given = PageAnswer("calm", "anna")
@@ -139,7 +153,9 @@ def test_an_answer_that_no_session_takes_is_withdrawn(tmp_path: Path, monkeypatc
     assert not (tmp_path / ANSWER).exists()
     log = LiveLog(tmp_path, 50.0, print)
     taken: list[PageAnswer | None] = []
-    monkeypatch.setattr(panels.time, "sleep", lambda _: taken.append(log.answer("which?", ("calm",))))
+    monkeypatch.setattr(
+        panels.time, "sleep", lambda _: taken.append(log.answer("which?", ("calm",)))
+    )
     assert panels.answered(tmp_path, "which?", given).done
     assert taken == [given]
     assert panels.answered(tmp_path / "none", "which?", given).text.startswith("calm: not given: ")

@@ -1,4 +1,6 @@
-"""The feed follows a port that is real, whatever becomes of it; buttons ask for what the viewer may ask."""
+"""The feed follows a port that is real, whatever becomes of it; buttons ask for what the viewer may
+ask.
+"""
 
 from __future__ import annotations
 
@@ -40,9 +42,13 @@ async def test_a_hold_is_followed_asked_and_found_again(tmp_path: Path) -> None:
             assert feed.seen.role == "tune"
             said = await asyncio.to_thread(feed.ask, {"do": "pause", "why": "web: anna"})
             assert said == Outcome.succeeded("pause")
-            assert [(command.kind, command.why) for command in run.asked] == [("pause", "web: anna")]
+            assert [(command.kind, command.why) for command in run.asked] == [
+                ("pause", "web: anna")
+            ]
             refused = await asyncio.to_thread(feed.ask, {"do": "setpoint", "value": 1e9})
-            assert refused.text.startswith("setpoint refused: setpoint 1e+09 µm is outside the limits")
+            assert refused.text.startswith(
+                "setpoint refused: setpoint 1e+09 µm is outside the limits"
+            )
             run.port.told(Mark("door <b>opened</b>", "anna"))
             await until(lambda: any("door" in line for line in feed.seen.events))
             assert [text for _, text in feed.marks] == ["door <b>opened</b>"]
@@ -85,18 +91,33 @@ def test_every_action_is_one_that_the_port_reads() -> None:
 def test_what_the_page_states_of_a_viewer_is_read_by_the_port_and_a_link_is_no_account() -> None:
     for has_login, account in ((True, "anna"), (False, "")):
         user = WebUser("anna", "operate", has_login=has_login)
-        asked = {**request(UNLOCK, "web: anna", "bofak"), "on_behalf": on_behalf(user, "page 1f"), "number": 1}
+        asked = {
+            **request(UNLOCK, "web: anna", "bofak"),
+            "on_behalf": on_behalf(user, "page 1f"),
+            "number": 1,
+        }
         read = parse(encode(asked))
         assert read.text == "bofak"
         assert read.on_behalf is not None
-        assert (read.on_behalf.account, read.on_behalf.role, read.on_behalf.via) == (account, "operate", "page")
+        assert (read.on_behalf.account, read.on_behalf.role, read.on_behalf.via) == (
+            account,
+            "operate",
+            "page",
+        )
 
 
 def test_locks_come_first_among_the_alarms() -> None:
     lock = {"word": "bofak", "text": "hands inside", "author": "unix:ann", "set_utc": "2026-01-02"}
     fault = {"code": 51, "name": "locked", "cause": "a lock", "remedy": "ask"}
-    notice = {"topic": "recorder", "subject": "disk", "severity": "warning", "text": "Disk almost full"}
-    shown = alarm_lines({"locks": [lock, {**lock, "word": "gumil"}], "fault": fault, "notices": [notice]})
+    notice = {
+        "topic": "recorder",
+        "subject": "disk",
+        "severity": "warning",
+        "text": "Disk almost full",
+    }
+    shown = alarm_lines(
+        {"locks": [lock, {**lock, "word": "gumil"}], "fault": fault, "notices": [notice]}
+    )
     assert shown == [
         'LOCKED "hands inside" by unix:ann, 2026-01-02, word bofak',
         'LOCKED "hands inside" by unix:ann, 2026-01-02, word gumil',
@@ -108,7 +129,12 @@ def test_locks_come_first_among_the_alarms() -> None:
 
 @pytest.mark.parametrize(
     ("user", "port", "allowed"),
-    [("tune", "tune", True), ("read", "tune", False), ("tune", "read", False), ("operate", "operate", True)],
+    [
+        ("tune", "tune", True),
+        ("read", "tune", False),
+        ("tune", "read", False),
+        ("operate", "operate", True),
+    ],
 )
 def test_the_lesser_of_both_roles_counts(user: str, port: str, allowed: bool) -> None:
     assert may(WebUser("anna", user), port, STOP) is allowed  # type: ignore[arg-type]

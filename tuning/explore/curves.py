@@ -1,4 +1,6 @@
-"""What is explored, from a session or a run: plant, weather, present gains; and what other gains would do."""
+"""What is explored, from a session or a run: plant, weather, present gains; and what other gains
+would do.
+"""
 
 import math
 from dataclasses import dataclass
@@ -15,7 +17,8 @@ from tuning import gains_file, session
 from tuning.identification import disturbance, loop_model
 from tuning.proposal import candidates, design
 
-# An hour is a hundred times the slowest motion that the fit uses; two of its periods are the least it accepts.
+# An hour is a hundred times the slowest motion that the fit uses; two of its periods are the least
+# it accepts.
 _LONGEST_S, _SHORTEST_S = 3600.0, 2.0 * disturbance.SLOWEST_S
 _COLUMNS = ("flow_um_per_s", "displacement_um", "ambient_pressure_pa", "air_temperature_c")
 
@@ -35,9 +38,14 @@ class Workpiece:
 def of_path(path: Path, logs: Path) -> Workpiece:
     """The workpiece of a session folder or of a run folder.
 
-    Raises InputError if it is neither, a session without quiet hold, or a run without 200 s of undisturbed hold.
+    Raises InputError if it is neither, a session without quiet hold, or a run without 200 s of
+    undisturbed hold.
     """
-    return of_session(folder.open_session(path)) if (path / "session.json").exists() else of_run(path, logs)
+    return (
+        of_session(folder.open_session(path))
+        if (path / "session.json").exists()
+        else of_run(path, logs)
+    )
 
 
 def of_session(opened: folder.SessionFolder) -> Workpiece:
@@ -51,13 +59,19 @@ def of_session(opened: folder.SessionFolder) -> Workpiece:
 
 
 def of_run(path: Path, logs: Path) -> Workpiece:
-    """Weather of a run's longest undisturbed hold; plant of the newest session, else as the configuration assumes."""
+    """Weather of a run's longest undisturbed hold; plant of the newest session, else as the
+    configuration assumes.
+    """
     run = open_run(path)
     loop = run.config.loop
     names = (*_COLUMNS, "state", "safe_level", "leak_um_per_s")
     blocks = list(run.tick_blocks(names))
-    columns = {name: np.concatenate([block[name] for block in blocks] or [np.empty(0)]) for name in names}
-    quiet = (columns["state"] == telemetry.State.HOLD) & (columns["safe_level"] == telemetry.SafeLevel.NONE)
+    columns = {
+        name: np.concatenate([block[name] for block in blocks] or [np.empty(0)]) for name in names
+    }
+    quiet = (columns["state"] == telemetry.State.HOLD) & (
+        columns["safe_level"] == telemetry.SafeLevel.NONE
+    )
     part = _longest(quiet, round(_LONGEST_S * loop.rate_hz))
     dt_s = 1.0 / loop.rate_hz
     if (part.stop - part.start) * dt_s < _SHORTEST_S:
@@ -71,7 +85,9 @@ def of_run(path: Path, logs: Path) -> Workpiece:
     except ValueError as error:
         raise errors.InputError(f"{path}: {error}") from None
     minutes = record.duration_s / 60
-    return Workpiece(f"Weather of {minutes:.0f} min of {run.name}; {whose}.", model, weather, loop, None, None)
+    return Workpiece(
+        f"Weather of {minutes:.0f} min of {run.name}; {whose}.", model, weather, loop, None, None
+    )
 
 
 def _longest(good: arrays.BoolArray, at_most: int) -> slice:
@@ -85,7 +101,9 @@ def _longest(good: arrays.BoolArray, at_most: int) -> slice:
 
 
 def _plant_for(logs: Path, leak_um_per_s: float) -> tuple[loop_model.PlantModel, str]:
-    """The newest identified plant, else the assumed one with the run's own leak; and whose it is."""
+    """The newest identified plant, else the assumed one with the run's own leak;
+    and whose it is.
+    """
     try:
         newest = folder.newest_session(logs)
         return session.found_of(newest).identified.model, f"plant of the session {newest.path.name}"
@@ -96,9 +114,11 @@ def _plant_for(logs: Path, leak_um_per_s: float) -> tuple[loop_model.PlantModel,
 
 
 STEP_UM = 1.0
-# Shortest and longest closed-loop time constant that the slider offers, in delays of the plant; SIMC recommends 1.
+# Shortest and longest closed-loop time constant that the slider offers, in delays of the plant;
+# SIMC recommends 1.
 DELAYS = (0.3, 30.0)
-# Integral time in closed-loop time constants: 4 is SIMC's, critically damped; 2 oscillates, 16 forgives much
+# Integral time in closed-loop time constants: 4 is SIMC's, critically damped; 2 oscillates, 16
+# forgives much
 DAMPINGS = (2.0, 16.0)
 _SETTLINGS = 25.0  # duration of the responses in delays and closed-loop time constants
 _POINTS_MAX = 6000
@@ -115,7 +135,9 @@ class Sliders:
     def gains(self, model: loop_model.PlantModel, dt_s: float) -> loop_model.Gains:
         """PI gains, K = 1 / (k (tc + d)), Ti = c (tc + d): SIMC for c = 4 (Skogestad 2003)."""
         slowed_s = self.closed_loop_s + candidates.effective_delay_s(model, dt_s, self.filter_s)
-        return loop_model.Gains(1 / (model.gain * slowed_s), self.damping * slowed_s, 0.0, self.filter_s)
+        return loop_model.Gains(
+            1 / (model.gain * slowed_s), self.damping * slowed_s, 0.0, self.filter_s
+        )
 
     @classmethod
     def near(cls, gains: loop_model.Gains, model: loop_model.PlantModel, dt_s: float) -> "Sliders":
@@ -137,7 +159,9 @@ class Curves:
     load_um: arrays.FloatArray  # (n,): the centre after a step of the leak
     w_rad_per_s: arrays.FloatArray  # (m,)
     open_loop: arrays.ComplexArray  # (m,): L
-    centre_um2_s: arrays.FloatArray  # (m,): two-sided spectrum of the true centre in the recorded weather
+    centre_um2_s: (
+        arrays.FloatArray
+    )  # (m,): two-sided spectrum of the true centre in the recorded weather
 
 
 def curves(name: str, gains: loop_model.Gains, of: Workpiece, duration_s: float) -> Curves:
@@ -163,7 +187,11 @@ def shown_s(gains: loop_model.Gains, model: loop_model.PlantModel) -> float:
 
 
 def responded(
-    gains: loop_model.Gains, of: Workpiece, duration_s: float, setpoint_um: float, load_um_per_s: float
+    gains: loop_model.Gains,
+    of: Workpiece,
+    duration_s: float,
+    setpoint_um: float,
+    load_um_per_s: float,
 ) -> tuple[arrays.FloatArray, arrays.FloatArray]:
     """Centre of the mirror, linear and without noise, after steps of setpoint and leak at time 0.
 
@@ -178,7 +206,9 @@ def responded(
     smooth = -math.expm1(-dt_s / gains.filter_s) if gains.filter_s > 0 else 1.0
     count = max(2, round(duration_s / dt_s))
     whole = int(model.dead_time_s // dt_s)
-    early = 1.0 - (model.dead_time_s / dt_s - whole)  # share of a tick that the newer of two flows lasts
+    early = 1.0 - (
+        model.dead_time_s / dt_s - whole
+    )  # share of a tick that the newer of two flows lasts
     follow = -math.expm1(-dt_s / model.lag_s) if model.lag_s > 0 else 1.0
     flows = [0.0] * (whole + 2)
     centre = filtered = matched = integral = speed = 0.0

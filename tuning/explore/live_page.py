@@ -1,4 +1,6 @@
-"""The page of a session: what it does now, what it has found, what is left, and the centre as it moves."""
+"""The page of a session: what it does now, what it has found, what is left, and the centre as it
+moves.
+"""
 
 import html
 import time
@@ -28,7 +30,9 @@ class LivePage:
         self._log = live_log.LiveReader(opened.path)
         self._points = models.ColumnDataSource({"minutes": [], **{name: [] for name in _COLOURS}})
         self._begun = models.ColumnDataSource({"at_s": [], "minutes": [], "step": []})
-        self._now = widgets.Div(name="now", sizing_mode="stretch_width", styles={"font-size": "18px"})
+        self._now = widgets.Div(
+            name="now", sizing_mode="stretch_width", styles={"font-size": "18px"}
+        )
         self._steps = widgets.Div(name="steps", width=330)
         self._said = widgets.Div(name="found", sizing_mode="stretch_width")
         self._look()
@@ -40,24 +44,47 @@ class LivePage:
         of = f"{self._session.path.name}: {head.author} on {head.source}, begun {head.created_utc}"
         title = widgets.Div(text=f"<b>{html.escape(of)}</b>", sizing_mode="stretch_width")
         found = layouts.row(self._steps, self._said, sizing_mode="stretch_width")
-        page.add_root(layouts.column(title, self._now, found, *self._plots(), sizing_mode="stretch_width"))
+        page.add_root(
+            layouts.column(title, self._now, found, *self._plots(), sizing_mode="stretch_width")
+        )
         page.add_periodic_callback(self._look, _POLL_MS)
 
     def _plots(self) -> list[plotting.figure]:
         centre = plotting.figure(
-            title="centre (blue) and setpoint (grey)", y_axis_label="µm", height=300, width=_WIDTH,
+            title="centre (blue) and setpoint (grey)",
+            y_axis_label="µm",
+            height=300,
+            width=_WIDTH,
             tools="pan,box_zoom,wheel_zoom,reset,save",
-        )  # fmt: skip
+        )
         flow = plotting.figure(
-            title="flow", x_axis_label="minutes of hold", y_axis_label="µm/s", height=180, width=_WIDTH,
-            x_range=centre.x_range, tools="",
-        )  # fmt: skip
-        for plot, names in ((centre, ("setpoint_um", "displacement_um")), (flow, ("flow_um_per_s",))):
+            title="flow",
+            x_axis_label="minutes of hold",
+            y_axis_label="µm/s",
+            height=180,
+            width=_WIDTH,
+            x_range=centre.x_range,
+            tools="",
+        )
+        for plot, names in (
+            (centre, ("setpoint_um", "displacement_um")),
+            (flow, ("flow_um_per_s",)),
+        ):
             for name in names:
-                plot.line("minutes", name, source=self._points, color=_COLOURS[name], line_width=1.3)
+                plot.line(
+                    "minutes", name, source=self._points, color=_COLOURS[name], line_width=1.3
+                )
             plot.vspan(x="minutes", source=self._begun, line_color="#060", line_dash="dotted")
             plot.toolbar.update(logo=None)
-        flow.text("minutes", 0, "step", source=self._begun, text_font_size="11px", text_color="#060", x_offset=4)
+        flow.text(
+            "minutes",
+            0,
+            "step",
+            source=self._begun,
+            text_font_size="11px",
+            text_color="#060",
+            x_offset=4,
+        )
         return [centre, flow]
 
     def _look(self) -> None:
@@ -70,7 +97,11 @@ class LivePage:
         begun = dict(progress.begun_s)  # of steps that begin together, the last
         if begun != dict(zip(self._begun.data["at_s"], self._begun.data["step"], strict=True)):
             minutes = [at_s / 60 for at_s in begun]
-            self._begun.data = {"at_s": list(begun), "minutes": minutes, "step": list(begun.values())}
+            self._begun.data = {
+                "at_s": list(begun),
+                "minutes": minutes,
+                "step": list(begun.values()),
+            }
         done = {step for step in folder.STEPS if self._session.done(step)}
         silent_s = time.time() - _changed_s(self._session.path / live_log.NAME)
         self._now.text = html.escape(status(progress, done, silent_s, self._session.path))
@@ -104,7 +135,9 @@ def status(progress: live_log.Progressed, done: set[str], silent_s: float, sessi
 def _step_list(progress: live_log.Progressed, done: set[str]) -> str:
     def item(step: str) -> str:
         now = step == progress.step and step not in done
-        kind, sign = ("now", "&#9654;") if now else ("done", "&#10003;") if step in done else ("", "&#9675;")
+        kind, sign = (
+            ("now", "&#9654;") if now else ("done", "&#10003;") if step in done else ("", "&#9675;")
+        )
         return f"<li class={kind or 'left'}>{sign} {step}</li>"
 
     return f"<ul class=steps>{''.join(item(step) for step in folder.STEPS)}</ul>"

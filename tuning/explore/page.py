@@ -18,7 +18,17 @@ from bokeh.server.server import Server
 from membrane_ctrl.model import errors
 from membrane_ctrl.sessions import folder
 from tuning import gains_file, session
-from tuning.explore.curves import DAMPINGS, DELAYS, STEP_UM, Curves, Sliders, Workpiece, curves, of_path, shown_s
+from tuning.explore.curves import (
+    DAMPINGS,
+    DELAYS,
+    STEP_UM,
+    Curves,
+    Sliders,
+    Workpiece,
+    curves,
+    of_path,
+    shown_s,
+)
 from tuning.explore.live_page import LivePage
 from tuning.identification import loop_model
 from tuning.proposal import candidates, design
@@ -33,11 +43,25 @@ _SIZE: dict[str, Any] = {
 }
 _DECADES = models.CustomJSTickFormatter(code="return (10 ** tick).toPrecision(2) + ' s'")
 _FILTER_S = (0.01, 2.0)
-_HEAD = ("", "K 1/s", "Ti s", "Td s", "filter s", "std µm", "x least", "Ms", "gain margin", "phase margin °",
-         "delay margin s", "load peak µm", "recovery s")  # fmt: skip
+_HEAD = (
+    "",
+    "K 1/s",
+    "Ti s",
+    "Td s",
+    "filter s",
+    "std µm",
+    "x least",
+    "Ms",
+    "gain margin",
+    "phase margin °",
+    "delay margin s",
+    "load peak µm",
+    "recovery s",
+)
 _STYLE = (
     "<style>table.gains{border-collapse:collapse;font:13px sans-serif}table.gains td,table.gains th"
-    "{padding:2px 8px;text-align:right;border-bottom:1px solid #ccc}table.gains td:first-child{text-align:left}"
+    "{padding:2px 8px;text-align:right;border-bottom:1px solid #ccc}table.gains "
+    "td:first-child{text-align:left}"
     "</style>"
 )
 
@@ -47,8 +71,8 @@ Save = Callable[[loop_model.Gains], str]
 class Page:
     """One viewer's page; each has sliders of its own.
 
-    `save` receives the gains that a person saves and returns what the page then says; None: there is no session to
-    save into.
+    `save` receives the gains that a person saves and returns what the page then says; None: there
+    is no session to save into.
     """
 
     def __init__(self, of: Workpiece, save: Save | None) -> None:
@@ -58,7 +82,9 @@ class Page:
         if of.proposed is not None:
             self._fixed["proposed"] = of.proposed
         self._duration_s = max(shown_s(gains, of.model) for gains in self._fixed.values())
-        self._curves = {name: curves(name, gains, of, self._duration_s) for name, gains in self._fixed.items()}
+        self._curves = {
+            name: curves(name, gains, of, self._duration_s) for name, gains in self._fixed.items()
+        }
         self._gains = list(self._fixed.values())[-1]
         self._moving = False
         self._make_sliders()
@@ -73,20 +99,37 @@ class Page:
     def attach(self, page: document.Document) -> None:
         """Put the page into a viewer's document."""
         page.title = "tune explore"
-        copy = widgets.Button(label="Copy the command", name="copy", button_type="default", width=170)
+        copy = widgets.Button(
+            label="Copy the command", name="copy", button_type="default", width=170
+        )
         copy.js_on_click(
-            models.CustomJS(args={"said": self._command}, code="navigator.clipboard.writeText(said.text)")
+            models.CustomJS(
+                args={"said": self._command}, code="navigator.clipboard.writeText(said.text)"
+            )
         )
         unable = self._save is None
         save = widgets.Button(
-            label="Save as gains.toml", name="save", button_type="primary", width=170, disabled=unable
+            label="Save as gains.toml",
+            name="save",
+            button_type="primary",
+            width=170,
+            disabled=unable,
         )
         save.on_click(self._saved)
-        source = widgets.Div(text=f"<b>{html.escape(self._of.source)}</b>", sizing_mode="stretch_width")
+        source = widgets.Div(
+            text=f"<b>{html.escape(self._of.source)}</b>", sizing_mode="stretch_width"
+        )
         buttons = layouts.row(copy, save, self._said)
-        controls = layouts.column(self._start, self._speed, self._damping, self._filter, buttons, self._command)
+        controls = layouts.column(
+            self._start, self._speed, self._damping, self._filter, buttons, self._command
+        )
         page.add_root(
-            layouts.column(source, layouts.row(controls, self._table), *self._plots(), sizing_mode="stretch_width")
+            layouts.column(
+                source,
+                layouts.row(controls, self._table),
+                *self._plots(),
+                sizing_mode="stretch_width",
+            )
         )
 
     def _make_sliders(self) -> None:
@@ -101,18 +144,37 @@ class Page:
             value=list(self._fixed)[-1],
         )
         self._speed = widgets.Slider(
-            title="response: closed-loop time constant (fast to slow)", name="speed",
-            start=low, end=high, step=0.01, value=math.log10(at.closed_loop_s), format=_DECADES, width=420,
-        )  # fmt: skip
+            title="response: closed-loop time constant (fast to slow)",
+            name="speed",
+            start=low,
+            end=high,
+            step=0.01,
+            value=math.log10(at.closed_loop_s),
+            format=_DECADES,
+            width=420,
+        )
         self._damping = widgets.Slider(
-            title="robustness: integral time per time constant (lively to calm; SIMC 4)", name="damping",
-            start=DAMPINGS[0], end=DAMPINGS[1], step=0.1, value=at.damping, width=420,
-        )  # fmt: skip
+            title="robustness: integral time per time constant (lively to calm; SIMC 4)",
+            name="damping",
+            start=DAMPINGS[0],
+            end=DAMPINGS[1],
+            step=0.1,
+            value=at.damping,
+            width=420,
+        )
         self._filter = widgets.Slider(
-            title="measurement filter", name="filter", start=math.log10(_FILTER_S[0]), end=math.log10(_FILTER_S[1]),
-            step=0.01, value=_filter_place(at.filter_s), format=_DECADES, width=420,
-        )  # fmt: skip
-        self._command = widgets.Div(name="command", styles={"font-family": "monospace", "font-size": "12px"})
+            title="measurement filter",
+            name="filter",
+            start=math.log10(_FILTER_S[0]),
+            end=math.log10(_FILTER_S[1]),
+            step=0.01,
+            value=_filter_place(at.filter_s),
+            format=_DECADES,
+            width=420,
+        )
+        self._command = widgets.Div(
+            name="command", styles={"font-family": "monospace", "font-size": "12px"}
+        )
         self._start.on_change("value", lambda attr, old, new: self._start_from(new))
         for slider in (self._speed, self._damping, self._filter):
             slider.on_change("value", lambda attr, old, new: self._moved())
@@ -147,14 +209,19 @@ class Page:
         self._command.text = f"membrane-ctrl ctl gains --trial 5m '{words}'"
 
     def _fill(self, name: str, found: Curves) -> None:
-        self._over_time[name].data = {"time_s": found.time_s, "step_um": found.step_um, "load_um": found.load_um}
+        self._over_time[name].data = {
+            "time_s": found.time_s,
+            "step_um": found.step_um,
+            "load_um": found.load_um,
+        }
         response = found.open_loop
         near = np.abs(response) < 30.0  # the Nyquist plot shows the neighbourhood of -1
         hertz = found.w_rad_per_s / (2 * math.pi)
         self._over_frequency[name].data = {
             "hertz": hertz,
             "gain": np.abs(response),
-            "phase_deg": np.degrees(np.unwrap(np.angle(response))) - 360.0 * (np.angle(response[0]) > 0),
+            "phase_deg": np.degrees(np.unwrap(np.angle(response)))
+            - 360.0 * (np.angle(response[0]) > 0),
             "sensitivity": np.abs(1 / (1 + response)),
             "re": np.where(near, response.real, np.nan),
             "im": np.where(near, response.imag, np.nan),
@@ -168,7 +235,9 @@ class Page:
     def _plots(self) -> list[models.Row]:
         times, over, demands = self._over_time, self._over_frequency, candidates.Demands()
         seconds, hertz = ("time_s", "time (s)"), ("hertz", "frequency (Hz)")
-        step = self._plot(f"setpoint step of {STEP_UM:g} µm", times, seconds, ("step_um", "centre (µm)"))
+        step = self._plot(
+            f"setpoint step of {STEP_UM:g} µm", times, seconds, ("step_um", "centre (µm)")
+        )
         title = f"leak grows by {demands.load_step_um_per_s:g} µm/s"
         load = self._plot(title, times, seconds, ("load_um", "centre (µm)"), x_range=step.x_range)
         log_x = {"x_axis_type": "log", "x_range": models.Range1d(start=1e-3, end=0.5 / self._dt_s)}
@@ -177,10 +246,17 @@ class Page:
         centre = self._plot(title, over, hertz, ("centre", "µm²/Hz"), **log)
         gain = self._plot("open loop, gain", over, hertz, ("gain", "|L|"), **log, y_range=high)
         below = models.Range1d(start=-360, end=-60)
-        phase = self._plot("open loop, phase", over, hertz, ("phase_deg", "degrees"), **log_x, y_range=below)
+        phase = self._plot(
+            "open loop, phase", over, hertz, ("phase_deg", "degrees"), **log_x, y_range=below
+        )
         peak = models.Range1d(start=0.0, end=2.5)
         sensitivity = self._plot(
-            "sensitivity; Ms is its peak", over, hertz, ("sensitivity", "|S|"), **log_x, y_range=peak
+            "sensitivity; Ms is its peak",
+            over,
+            hertz,
+            ("sensitivity", "|S|"),
+            **log_x,
+            y_range=peak,
         )
         near = {
             "x_range": models.Range1d(start=-3, end=1),
@@ -191,7 +267,11 @@ class Page:
         nyquist.scatter([-1.0], [0.0], marker="x", size=12, line_width=2, line_color="#c00000")
         for plot, limit in ((gain, 1.0), (phase, -180.0), (sensitivity, demands.ms)):
             plot.hspan(y=[limit], line_dash="dashed", line_color="#999999")
-        return [layouts.row(step, load, centre), layouts.row(gain, phase, sensitivity), layouts.row(nyquist)]
+        return [
+            layouts.row(step, load, centre),
+            layouts.row(gain, phase, sensitivity),
+            layouts.row(nyquist),
+        ]
 
     def _plot(
         self,
@@ -218,10 +298,22 @@ def _filter_place(filter_s: float) -> float:
 def _row(found: Curves) -> list[str]:
     """Cells of a set of gains."""
     of, gains, margins = found.figures, found.figures.gains, found.figures.margins
-    cells = [of.name, f"{gains.kp_per_s:.3f}", f"{gains.ti_s:.2f}", f"{gains.td_s:.2f}", f"{gains.filter_s:.2f}"]
+    cells = [
+        of.name,
+        f"{gains.kp_per_s:.3f}",
+        f"{gains.ti_s:.2f}",
+        f"{gains.td_s:.2f}",
+        f"{gains.filter_s:.2f}",
+    ]
     if of.predicted is None:
         return [*cells, "unstable", *[""] * (len(_HEAD) - len(cells) - 1)]
-    figures = (of.predicted.std_um, of.ratio, margins.ms, margins.gain_margin, margins.phase_margin_deg)
+    figures = (
+        of.predicted.std_um,
+        of.ratio,
+        margins.ms,
+        margins.gain_margin,
+        margins.phase_margin_deg,
+    )
     more = (margins.delay_margin_s, of.load_peak_um, of.load_recovery_s)
     return cells + [f"{value:.3g}" for value in (*figures, *more)]
 
@@ -238,7 +330,9 @@ def _table(rows: list[list[str]]) -> str:
 
 
 def saver(of: Workpiece, author: str) -> Save | None:
-    """What the page's button does: put the gains into the session's design, or say why not. None without a design."""
+    """What the page's button does: put the gains into the session's design, or say why not. None
+    without a design.
+    """
     opened = of.session
     if opened is None or of.proposed is None:
         return None
@@ -247,9 +341,16 @@ def saver(of: Workpiece, author: str) -> Save | None:
         path = opened.file("gains.toml")
         try:
             loop = gains.applied_to(gains_file.load_gains(path).loop)
-            found = design.candidate(session.EDITED, gains, of.model, of.weather, loop, candidates.Demands())
+            found = design.candidate(
+                session.EDITED, gains, of.model, of.weather, loop, candidates.Demands()
+            )
             std_um = found.predicted.std_um if found.predicted is not None else math.nan
-            edits = {"author": author, "candidate": session.EDITED, "predicted_std_um": std_um, "loop": loop}
+            edits = {
+                "author": author,
+                "candidate": session.EDITED,
+                "predicted_std_um": std_um,
+                "loop": loop,
+            }
             made = gains_file.load_gains(path).model_copy(update=edits)
             gains_file.require_sound(made, "these gains", opened.config.loop)
             opened.begin("preview")  # what followed was of other gains
@@ -264,7 +365,8 @@ def saver(of: Workpiece, author: str) -> Save | None:
 
 
 def explore(path: Path, logs: Path, port: int, author: str) -> int:
-    """Serve the page of a session or run on localhost; print its address, and end on Ctrl-C or SIGTERM.
+    """Serve the page of a session or run on localhost; print its address, and end on Ctrl-C or
+    SIGTERM.
 
     Raises InputError for a folder that is neither, DeviceError if the port is taken.
     """
@@ -299,7 +401,9 @@ def serve_beside(opened: folder.SessionFolder, logs: Path, author: str) -> str:
 
 
 def _server(path: Path, logs: Path, port: int, author: str) -> Server:
-    """A server, started: at `/` gains to explore, or the session until there are any; at `/session` the session."""
+    """A server, started: at `/` gains to explore, or the session until there are any; at `/session`
+    the session.
+    """
     opened = folder.open_session(path) if (path / "session.json").exists() else None
     of = of_path(path, logs) if opened is None else None
 
@@ -316,9 +420,13 @@ def _server(path: Path, logs: Path, port: int, author: str) -> Server:
         Page(found, saver(found, author)).attach(page)
 
     apps = {"/": gains} if opened is None else {"/": gains, "/session": live}
-    try:  # Bokeh refuses web sockets of any origin but localhost and this port: no other site moves the sliders
+    # Bokeh refuses web sockets of any origin but localhost and this port: no other site moves the
+    # sliders
+    try:
         server = Server(apps, address=_HOST, port=port)
     except OSError as error:
-        raise errors.DeviceError(f"port {port}: {errors.os_reason(error)}; choose another with --port") from None
+        raise errors.DeviceError(
+            f"port {port}: {errors.os_reason(error)}; choose another with --port"
+        ) from None
     server.start()
     return server

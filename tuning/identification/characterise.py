@@ -1,4 +1,6 @@
-"""The first step of a session: relay until the gain is known, doublets until the dead time is, within bounds."""
+"""The first step of a session: relay until the gain is known, doublets until the dead time is,
+within bounds.
+"""
 
 from dataclasses import dataclass, replace
 from typing import Literal, Protocol
@@ -7,7 +9,14 @@ import numpy as np
 
 from membrane_ctrl.control.experiments import machine, trial
 from tuning.identification.disturbance import SLOWEST_S
-from tuning.identification.identify import Identified, identify, independence, prediction_errors, two_gains, whiteness
+from tuning.identification.identify import (
+    Identified,
+    identify,
+    independence,
+    prediction_errors,
+    two_gains,
+    whiteness,
+)
 from tuning.identification.loop_model import Record
 
 MAP_THE_PUMP = "run `tune pump`"
@@ -16,14 +25,17 @@ _FURTHER = "repeat `tune characterise` with a larger --limit-um"
 # Whether the data support a proposal; if not, the problem and the experiment that would help.
 
 _LOST_MAX = 0.01
-_GAIN_SIGMA_MAX = 0.10  # an error of k beyond +-20 % (2 sigma) changes Ms and variance by more than designs differ
+# an error of k beyond +-20 % (2 sigma) changes Ms and variance by more than designs differ
+_GAIN_SIGMA_MAX = 0.10
 _GAIN_SIGMA_GOOD = 0.03
 _DELAY_SIGMA_MAX_S = 0.1
-_DELAY_SIGMA_SHARE = 0.1  # or of the delay: the loop is as slow as its delay is long, and as tolerant
+# or of the delay: the loop is as slow as its delay is long, and as tolerant
+_DELAY_SIGMA_SHARE = 0.1
 _UNANSWERED = 5.0  # k below this many standard errors: the pump's effect is lost in the weather
 _JUMP_SIGMAS = 8.0  # of 10^4 residuals none is beyond 5
 _P_MIN = 1e-4
-_BENT_SIGMAS = 5.0  # sound benches show up to 2.7 in 192 sessions, pumps that saturate at 0.6 of the command 9
+# sound benches show up to 2.7 in 192 sessions, pumps that saturate at 0.6 of the command 9
+_BENT_SIGMAS = 5.0
 _BENT_SHARE = 0.2  # of k; the margins tolerate less
 _STRONG = 1.5  # k of a pump whose least flow may be more than the leak: it swings with any gains
 _WORSE_MAX = 1.5  # innovation on new data relative to the fit
@@ -69,21 +81,41 @@ class Validation:
 def validate(identified: Identified, fresh: Record, settle_s: float = 2.0) -> Validation:
     """Predict a fresh record with a fitted model, without the noise filter's start-up."""
     errors = prediction_errors(
-        fresh, identified.model, identified.noise, identified.pressure_gain_um_per_pa if fresh.has_barometer else 0.0
+        fresh,
+        identified.model,
+        identified.noise,
+        identified.pressure_gain_um_per_pa if fresh.has_barometer else 0.0,
     )[round(settle_s / fresh.dt_s) :]
     change = np.diff(fresh.flow_um_per_s)[-errors.size :]
-    return Validation(float(errors.std() / identified.innovation_um), whiteness(errors), independence(errors, change))
+    return Validation(
+        float(errors.std() / identified.innovation_um),
+        whiteness(errors),
+        independence(errors, change),
+    )
 
 
-def judge(record: Record, identified: Identified, validation: Validation | None = None) -> FitQuality:
+def judge(
+    record: Record, identified: Identified, validation: Validation | None = None
+) -> FitQuality:
     """Verdict on a record and its fit."""
     refused, degraded = _faults(record, identified)
     if validation is not None and validation.innovation_ratio > _WORSE_MAX:
-        worse = f"new data are predicted {validation.innovation_ratio:.1f} times worse than those of the fit"
-        degraded.append(FitFinding(f"{worse}: the bench changed in between; repeat the relay in steadier weather"))
+        worse = (
+            f"new data are predicted {validation.innovation_ratio:.1f} times worse than those of "
+            "the fit"
+        )
+        degraded.append(
+            FitFinding(
+                f"{worse}: the bench changed in between; repeat the relay in steadier weather"
+            )
+        )
     if validation is not None and validation.independence_p < _P_MIN:
-        degraded.append(FitFinding("new residuals still follow the flow: repeat with the doublets experiment"))
-    verdict: Literal["ok", "degraded", "refused"] = "refused" if refused else "degraded" if degraded else "ok"
+        degraded.append(
+            FitFinding("new residuals still follow the flow: repeat with the doublets experiment")
+        )
+    verdict: Literal["ok", "degraded", "refused"] = (
+        "refused" if refused else "degraded" if degraded else "ok"
+    )
     findings = (*refused, *degraded)
     texts = tuple(finding.text for finding in findings)
     return FitQuality(verdict, texts, any(finding.pump_suspected for finding in findings))
@@ -107,17 +139,25 @@ def _faults(record: Record, identified: Identified) -> tuple[list[FitFinding], l
     if sigma.gain > _GAIN_SIGMA_MAX * model.gain:
         refused.append(FitFinding(f"k is known to {sigma.gain / model.gain:.0%} only: {_FURTHER}"))
     elif sigma.gain > _GAIN_SIGMA_GOOD * model.gain:
-        degraded.append(FitFinding(f"k is known to {sigma.gain / model.gain:.0%}: a longer relay would make it 3 %"))
+        degraded.append(
+            FitFinding(
+                f"k is known to {sigma.gain / model.gain:.0%}: a longer relay would make it 3 %"
+            )
+        )
     if sigma.delay_s > max(_DELAY_SIGMA_MAX_S, _DELAY_SIGMA_SHARE * model.delay_s):
         refused.append(FitFinding(f"the delay is known to {sigma.delay_s:.2f} s only: {_FURTHER}"))
     refused.extend(bent(record, identified))
     if identified.independence_p < _P_MIN:
-        degraded.append(_suspect_pump("the residuals follow the flow (a saturating or sticking pump?)"))
+        degraded.append(
+            _suspect_pump("the residuals follow the flow (a saturating or sticking pump?)")
+        )
     if identified.whiteness_p < _P_MIN and model.gain > _STRONG:
         coloured = f"k = {model.gain:.2f}, and the residuals are coloured (a sticking pump?)"
         refused.append(_suspect_pump(coloured))
     elif identified.whiteness_p < _P_MIN:
-        periodic = "something periodic moves the mirror or the reading, or the weather is no random walk"
+        periodic = (
+            "something periodic moves the mirror or the reading, or the weather is no random walk"
+        )
         degraded.append(FitFinding(f"the residuals are coloured: {periodic}"))
     return refused, degraded
 
@@ -159,11 +199,15 @@ class Plan:
 
 FULL = Plan()
 # Five minutes; its quiet hold is long enough to know the weather from
-SHORT = Plan(settle_s=0.0, quiet_s=2.0 * SLOWEST_S + 1.0, relay_s=45.0, relays=2, doublets_s=24.0, doublets=1)
+SHORT = Plan(
+    settle_s=0.0, quiet_s=2.0 * SLOWEST_S + 1.0, relay_s=45.0, relays=2, doublets_s=24.0, doublets=1
+)
 
 
 class ExperimentRig(Protocol):
-    """The rig needed for characterising: `rig.Rig` on a bench, or `rig.HoldRig` on a running hold."""
+    """The rig needed for characterising: `rig.Rig` on a bench,
+    or `rig.HoldRig` on a running hold.
+    """
 
     def hold(self, duration_s: float) -> Record:
         """Hold for a time."""
@@ -213,7 +257,9 @@ class ExperimentError(Exception):
 def spec_of(
     kind: trial.ExperimentKind, around: machine.Around, duration_s: float, gain: float = 1.0
 ) -> trial.ExperimentSpec:
-    """The specification of an experiment at an operating point. Raises pydantic.ValidationError out of bounds."""
+    """The specification of an experiment at an operating point. Raises pydantic.ValidationError out
+    of bounds.
+    """
     return trial.ExperimentSpec(
         kind=kind,
         duration_s=duration_s,
@@ -233,10 +279,11 @@ def characterise(rig: ExperimentRig, limit_um: float = 10.0) -> Characterised:
 def experiment(rig: ExperimentRig, limit_um: float = 10.0, plan: Plan = FULL) -> Experiments:
     """Hold, relay and doublets on a rig that holds its mirror.
 
-    What was stopped is kept, and repeated while too little is known; `judge` sees a jump that stopped it.
+    What was stopped is kept, and repeated while too little is known; `judge` sees a jump that
+    stopped it.
 
-    Raises ExperimentError if the relays were stopped before they lasted as long as one; ValueError if the pump has no
-    room about the holding flow: the mirror is too tight or too leaky.
+    Raises ExperimentError if the relays were stopped before they lasted as long as one; ValueError
+    if the pump has no room about the holding flow: the mirror is too tight or too leaky.
     """
     if plan.settle_s:
         rig.hold(plan.settle_s)
@@ -270,11 +317,13 @@ def fitted(done: Experiments) -> Characterised:
     return Characterised(done, found, judge(done.record, found, checked))
 
 
-def _relays(rig: ExperimentRig, around: machine.Around, plan: Plan) -> tuple[Record, machine.Finished]:
+def _relays(
+    rig: ExperimentRig, around: machine.Around, plan: Plan
+) -> tuple[Record, machine.Finished]:
     """Relays until the gain is known, or the data ask for the pump's map, each followed by a hold.
 
-    One that the guard stopped tells as much of its time as another, unless the mirror jumped: gusts and a laser's
-    noise stop sound experiments, too.
+    One that the guard stopped tells as much of its time as another, unless the mirror jumped: gusts
+    and a laser's noise stop sound experiments, too.
     """
     done: Record | None = None
     finished = machine.Finished(machine.ExperimentEnd.INTERRUPTED, "")
@@ -295,7 +344,9 @@ def _relays(rig: ExperimentRig, around: machine.Around, plan: Plan) -> tuple[Rec
         if not finished.completed and _too_strong(found):
             raise ExperimentError(f"{finished.reason}: {MAP_THE_PUMP}", pump_suspected=True)
         around = replace(around, late_s=found.model.delay_s)
-        if _enough(done, plan) and (found.sigma.gain <= _GAIN_SIGMA * found.model.gain or bent(done, found)):
+        if _enough(done, plan) and (
+            found.sigma.gain <= _GAIN_SIGMA * found.model.gain or bent(done, found)
+        ):
             break
     if done is None or not _enough(done, plan):
         stopped_near = finished.end is machine.ExperimentEnd.STOPPED_BY_GUARD
@@ -308,5 +359,7 @@ def _enough(relays: Record, plan: Plan) -> bool:
 
 
 def _too_strong(found: Identified) -> bool:
-    """Whether the pump stopped these relays, and not the weather: the next one would end like them."""
+    """Whether the pump stopped these relays, and not the weather:
+    the next one would end like them.
+    """
     return found.model.gain - _CERTAIN_SIGMAS * found.sigma.gain > _TOO_STRONG

@@ -1,17 +1,21 @@
 """Separates motion of the mirror from noise of the reading: intensities from a quiet hold.
 
-The response to the flow is removed from the readings, z = y - k int v(t - theta) dt, whatever loop made the flow. The
-rest is the weather and the laser's noise. Its increments have the spectrum (per sample, dt S)
+The response to the flow is removed from the readings, z = y - k int v(t - theta) dt, whatever loop
+made the flow. The rest is the weather and the laser's noise. Its increments have the spectrum (per
+sample, dt S)
 
-    |1 - e^(-j w dt)|^2 (r + sum of s_i / dt / (1 + w^2 tau_i^2)^2)  +  q_fast dt  +  q_slow dt / (1 + w^2 tau^2)
+    |1 - e^(-j w dt)|^2 (r + sum of s_i / dt / (1 + w^2 tau_i^2)^2)  +  q_fast dt  +  q_slow dt / (1
+    + w^2 tau^2)
 
-r: laser noise (µm^2 per sample), q_fast: a random walk (air pressure), q_slow: a random walk that reaches the gas
-through the film, tau = 12 s (air temperature), s_i: movement of any other colour, for weather is no random walk at
-all frequencies and the standard deviation of a loop depends on those about its bandwidth. The tau_i stand in
-equal ratios; log s_i bends little from one to the next, so that the spectrum goes on as it was where noise hides it.
-The intensities maximise Whittle's likelihood, sum of log S + I / S over the periodogram I of the tapered increments,
-times that prior.
-Source: Percival and Walden, Spectral Analysis for Univariate Time Series (2020), sections 6.3 and 9.
+r: laser noise (µm^2 per sample), q_fast: a random walk (air pressure), q_slow: a random walk that
+reaches the gas through the film, tau = 12 s (air temperature), s_i: movement of any other colour,
+for weather is no random walk at all frequencies and the standard deviation of a loop depends on
+those about its bandwidth. The tau_i stand in equal ratios; log s_i bends little from one to the
+next, so that the spectrum goes on as it was where noise hides it. The intensities maximise
+Whittle's likelihood, sum of log S + I / S over the periodogram I of the tapered increments, times
+that prior.
+Source: Percival and Walden, Spectral Analysis for Univariate Time Series (2020), sections 6.3 and
+9.
 """
 
 import math
@@ -33,8 +37,8 @@ _FLOOR = 1e-12  # µm^2: stands for a zero intensity
 _LARGEST = 1e9  # µm^2/s: the film would burst
 _HANN_LOSS = 35.0 / 18.0  # neighbouring frequencies of a Hann taper share this much
 _COLOUR_RATIO = 2.0  # of neighbouring tau_i, from the sample time to the slowest
-# of first and second differences of log s_i: a spectrum falls with the square of the frequency, more or less, and
-# does not bend all at once
+# of first and second differences of log s_i: a spectrum falls with the square of the frequency,
+# more or less, and does not bend all at once
 _SLOPE_SIGMA, _BEND_SIGMA = 2.0, 1.0
 _BAND = 0.03  # frequencies nearer than this factor count as one
 _BLOCKS = 10  # of a record, whose variances show how steady the weather is
@@ -49,7 +53,9 @@ def _coloured_psd(coloured: Coloured, w_rad_per_s: Series) -> Series:
 
 @dataclass(frozen=True, slots=True)
 class Noise:
-    """White noise of a reading, the random walk of its quantity, and its movement of other colours."""
+    """White noise of a reading, the random walk of its quantity,
+    and its movement of other colours.
+    """
 
     white: float  # standard deviation of a sample
     fast: float  # intensities of the walks: variance per second
@@ -60,9 +66,16 @@ class Noise:
 
     def __post_init__(self) -> None:
         """Raises ValueError for impossible fits, as a file may hold anything."""
-        if not all(0 <= part <= _LARGEST for part in (self.white, self.fast, self.slow, self.slow_s, self.dt_s)):
-            raise ValueError(f"noise of {self.white:g} and walks of {self.fast:g} and {self.slow:g}")
-        if not all(0 < tau_s <= _LARGEST and 0 <= part <= _LARGEST for tau_s, part in self.coloured):
+        if not all(
+            0 <= part <= _LARGEST
+            for part in (self.white, self.fast, self.slow, self.slow_s, self.dt_s)
+        ):
+            raise ValueError(
+                f"noise of {self.white:g} and walks of {self.fast:g} and {self.slow:g}"
+            )
+        if not all(
+            0 < tau_s <= _LARGEST and 0 <= part <= _LARGEST for tau_s, part in self.coloured
+        ):
             raise ValueError(f"movement of {self.coloured}")
 
     def moving_psd(self, w_rad_per_s: Series) -> Series:
@@ -85,21 +98,29 @@ def undriven_um(record: Record, model: loop_model.PlantModel) -> Series:
 def fit_noise(series: Series, dt_s: float, slow_s: float) -> Noise:
     """Fit the intensities of white noise and movement in a series; a straight trend has no effect.
 
-    Raises ValueError if the series is shorter than two of the slowest periods used. `slow_s` is the lag of the slow
-    walk; 0 omits it.
+    Raises ValueError if the series is shorter than two of the slowest periods used. `slow_s` is the
+    lag of the slow walk; 0 omits it.
     """
     if series.size * dt_s < 2 * SLOWEST_S:
-        raise ValueError(f"{series.size * dt_s:.0f} s of hold are too short: {2 * SLOWEST_S:.0f} s at least")
+        raise ValueError(
+            f"{series.size * dt_s:.0f} s of hold are too short: {2 * SLOWEST_S:.0f} s at least"
+        )
     w, power, count = _periodogram(np.diff(series), dt_s)
     white = np.abs(1 - np.exp(-1j * w * dt_s)) ** 2
     walks = [np.full(w.size, dt_s), *([dt_s / (1 + (w * slow_s) ** 2)] if slow_s > 0 else [])]
     slowest_s = SLOWEST_S / (2 * math.pi)
     taus_s = np.geomspace(dt_s, slowest_s, 1 + round(math.log(slowest_s / dt_s, _COLOUR_RATIO)))
     first = 1 + len(walks)
-    basis = np.array([white, *walks, *(white / dt_s / (1 + (w * tau_s) ** 2) ** 2 for tau_s in taus_s)])
+    basis = np.array(
+        [white, *walks, *(white / dt_s / (1 + (w * tau_s) ** 2) ** 2 for tau_s in taus_s)]
+    )
     likely, usual = _prior(taus_s, first)
     walk = float(np.mean(power[:8])) / dt_s
-    guess = [float(power @ count / count.sum()) / 2, *[walk] * len(walks), *(walk * taus_s**2 / taus_s.size)]
+    guess = [
+        float(power @ count / count.sum()) / 2,
+        *[walk] * len(walks),
+        *(walk * taus_s**2 / taus_s.size),
+    ]
     intensities = np.exp(_likeliest(basis, power, count, likely, usual, np.log(guess)))
     fast, slow = (*intensities[1:first].tolist(), 0.0)[:2]
     coloured = tuple(zip(taus_s.tolist(), intensities[first:].tolist(), strict=True))
@@ -107,13 +128,17 @@ def fit_noise(series: Series, dt_s: float, slow_s: float) -> Noise:
 
 
 def _prior(taus_s: Series, first: int) -> tuple[Series, Series]:
-    """Rows R and values r: R x logs - r are independent and of unit variance; `first` logs are free."""
+    """Rows R and values r: R x logs - r are independent and of unit variance; `first` logs are
+    free.
+    """
     one = np.eye(taus_s.size)
     rows = np.vstack((np.diff(one, 2, axis=0) / _BEND_SIGMA, np.diff(one, axis=0) / _SLOPE_SIGMA))
     return np.hstack((np.zeros((len(rows), first)), rows)), rows @ (2 * np.log(taus_s))
 
 
-def _likeliest(basis: Series, power: Series, count: Series, likely: Series, usual: Series, start: Series) -> Series:
+def _likeliest(
+    basis: Series, power: Series, count: Series, likely: Series, usual: Series, start: Series
+) -> Series:
     """Logarithms of the intensities; Whittle's likelihood with its information matrix."""
 
     def cost(logs: Series) -> tuple[float, Series]:
@@ -127,7 +152,12 @@ def _likeliest(basis: Series, power: Series, count: Series, likely: Series, usua
         return np.asarray(shares * count @ shares.T + likely.T @ likely)
 
     found = minimize(
-        cost, start, jac=True, hess=information, method="trust-exact", options={"gtol": 1e-2, "maxiter": 200}
+        cost,
+        start,
+        jac=True,
+        hess=information,
+        method="trust-exact",
+        options={"gtol": 1e-2, "maxiter": 200},
     ).x
     return np.asarray(np.maximum(found, math.log(_FLOOR)), dtype=float)
 
@@ -138,7 +168,9 @@ def _shares(logs: Series, basis: Series) -> Series:
 
 
 def _periodogram(increments: Series, dt_s: float) -> tuple[Series, Series, Series]:
-    """Angular frequencies from the slowest that matters to Nyquist, tapered power per sample, independent ones."""
+    """Angular frequencies from the slowest that matters to Nyquist, tapered power per sample,
+    independent ones.
+    """
     taper = hann(increments.size, sym=False)
     taper /= math.sqrt(float(taper @ taper))
     power = np.abs(np.fft.rfft((increments - increments.mean()) * taper)) ** 2
@@ -150,13 +182,14 @@ def _periodogram(increments: Series, dt_s: float) -> tuple[Series, Series, Serie
     return np.bincount(band, w) / count, np.bincount(band, power) / count, count / _HANN_LOSS
 
 
-# Gains of the weather on the centre: regression of the undriven readings on barometer and lagged air temperature.
+# Gains of the weather on the centre: regression of the undriven readings on barometer and lagged
+# air temperature.
 #
 #     z = c t + g_p p + g_T lag(T_air) + n,    n = IMA(1,1)
 #
-# All columns are differenced and prewhitened with 1 / (1 - beta B), on means over blocks. A noisy sensor makes its
-# gain too small (errors in variables): white noise of variance r has the variance 2 r / (1 + beta) after the
-# filter, which is taken off the diagonal of the normal equations.
+# All columns are differenced and prewhitened with 1 / (1 - beta B), on means over blocks. A noisy
+# sensor makes its gain too small (errors in variables): white noise of variance r has the variance
+# 2 r / (1 + beta) after the filter, which is taken off the diagonal of the normal equations.
 # Source: Fuller, Measurement Error Models (1987), section 2.2.
 
 _BLOCK_S = 0.5  # with shorter blocks a barometer's noise hides its signal; longer ones blur events
@@ -180,7 +213,8 @@ class WeatherGain:
     def agreed(self, configured: float) -> float:
         """Gain to use: the fitted one if known to 10 %, else the configured one if they agree.
 
-        Steady weather reveals nothing about its gain; the bench's physics is then the better source.
+        Steady weather reveals nothing about its gain; the bench's physics is then the better
+        source.
         """
         if self.sigma <= 0.1 * abs(self.gain):
             return self.gain
@@ -203,7 +237,9 @@ def lagged(series: Series, lag_s: float, dt_s: float) -> Series:
     return followed + float(series[0])
 
 
-def fit_weather(record: Record, model: loop_model.PlantModel, gas_follows_air_s: float) -> WeatherFit:
+def fit_weather(
+    record: Record, model: loop_model.PlantModel, gas_follows_air_s: float
+) -> WeatherFit:
     """Regress the motion not caused by the pump on the weather.
 
     `record` is a quiet hold of some minutes, `gas_follows_air_s` the lag of the gas behind the air.
@@ -221,7 +257,9 @@ def fit_weather(record: Record, model: loop_model.PlantModel, gas_follows_air_s:
     # of a lagged sensor's noise only dt / (2 T) of the variance passes the lag
     shares = [1.0 if lag_s == 0 else record.dt_s / (2 * lag_s) for _, lag_s in channels]
     per_block = max(1, round(_BLOCK_S / record.dt_s))
-    variances = np.array([n.white**2 * share / per_block for n, share in zip(noises, shares, strict=True)])
+    variances = np.array(
+        [n.white**2 * share / per_block for n, share in zip(noises, shares, strict=True)]
+    )
     gains, sigmas = _regress(z, columns, variances, per_block)
     found = [
         WeatherGain(float(g), float(s), noise.fast, noise.white, lag_s, noise.coloured)
@@ -235,10 +273,14 @@ def fit_weather(record: Record, model: loop_model.PlantModel, gas_follows_air_s:
     )
 
 
-def _regress(z: Series, columns: list[Series], variances: Series, per_block: int) -> tuple[Series, Series]:
+def _regress(
+    z: Series, columns: list[Series], variances: Series, per_block: int
+) -> tuple[Series, Series]:
     """Gains and their standard errors, with the best-fitting beta of the noise."""
     used = z.size // per_block * per_block
-    blocks = np.array([column[:used].reshape(-1, per_block).mean(axis=1) for column in (z, *columns)])
+    blocks = np.array(
+        [column[:used].reshape(-1, per_block).mean(axis=1) for column in (z, *columns)]
+    )
     moved = np.diff(blocks, axis=1)
     moved -= moved.mean(axis=1, keepdims=True)
 
@@ -254,7 +296,9 @@ def _regress(z: Series, columns: list[Series], variances: Series, per_block: int
         variance = float(rest @ rest) / (target.size - len(gains) - 1)
         return gains, np.sqrt(np.diag(inverse @ normal @ inverse) * variance), variance
 
-    best = minimize_scalar(lambda beta: math.log(fit(beta)[2]), bounds=(0.0, 0.99), method="bounded")
+    best = minimize_scalar(
+        lambda beta: math.log(fit(beta)[2]), bounds=(0.0, 0.99), method="bounded"
+    )
     gains, sigmas, _ = fit(float(best.x))
     return gains, sigmas
 
@@ -269,8 +313,8 @@ class DisturbanceModel:
     rest: Noise  # the laser's noise and the walks that no weather sensor explains
     barometer: WeatherGain | None  # the part explained by the sensors
     air: WeatherGain | None
-    # Relative, 1 sigma: how far the standard deviation of ten other minutes may be from the one predicted, by weather
-    # that comes and goes (gusts)
+    # Relative, 1 sigma: how far the standard deviation of ten other minutes may be from the one
+    # predicted, by weather that comes and goes (gusts)
     unsteady: float = 0.0
 
     @property
@@ -279,17 +323,20 @@ class DisturbanceModel:
         return self.rest.white
 
     def psd(self, w_rad_per_s: Series, model: loop_model.PlantModel, loop: LoopConfig) -> Series:
-        """Two-sided spectrum of the centre without feedback but with the loop's feed-forward, µm^2 s.
+        """Two-sided spectrum of the centre without feedback but with the loop's feed-forward, µm^2
+        s.
 
-        The feed-forward takes a channel's movement x away as far as the pump is in time: x (1 - H), with H the pump
-        behind the feed-forward's filter; the sensor's noise comes in through H.
+        The feed-forward takes a channel's movement x away as far as the pump is in time: x (1 - H),
+        with H the pump behind the feed-forward's filter; the sensor's noise comes in through H.
         """
         dt_s = self.rest.dt_s
         pump = loop_model.pump_response(model, w_rad_per_s, dt_s)
         total = self.rest.moving_psd(w_rad_per_s)
         for weather, used, gain, filter_s in self._channels(loop):
             lag = 1 / (1 + 1j * w_rad_per_s * weather.lag_s)
-            reaction = gain * pump / (1 + 1j * w_rad_per_s * filter_s) if used else np.zeros_like(pump)
+            reaction = (
+                gain * pump / (1 + 1j * w_rad_per_s * filter_s) if used else np.zeros_like(pump)
+            )
             total = total + weather.psd(w_rad_per_s) * np.abs(weather.gain * lag - reaction) ** 2
             total = total + weather.noise**2 * dt_s * np.abs(reaction) ** 2
         return np.asarray(total, dtype=float)
@@ -305,30 +352,51 @@ class DisturbanceModel:
     def _channels(self, loop: LoopConfig) -> list[tuple[WeatherGain, bool, float, float]]:
         """Each weather sensor with its feed-forward: whether it is used, its gain and filter."""
         channels = (
-            (self.barometer, loop.feedforward_barometer, loop.barometer_gain_um_per_pa, loop.feedforward_filter_s),
-            (self.air, loop.feedforward_temperature, loop.temperature_gain_um_per_k, loop.gas_follows_air_s),
+            (
+                self.barometer,
+                loop.feedforward_barometer,
+                loop.barometer_gain_um_per_pa,
+                loop.feedforward_filter_s,
+            ),
+            (
+                self.air,
+                loop.feedforward_temperature,
+                loop.temperature_gain_um_per_k,
+                loop.gas_follows_air_s,
+            ),
         )
-        return [(of, used, gain, filter_s) for of, used, gain, filter_s in channels if of is not None]
+        return [
+            (of, used, gain, filter_s) for of, used, gain, filter_s in channels if of is not None
+        ]
 
 
 def observe(record: Record, model: loop_model.PlantModel, loop: LoopConfig) -> DisturbanceModel:
-    """Weather gains and noise from a quiet hold under any loop. Raises ValueError if it is too short."""
+    """Weather gains and noise from a quiet hold under any loop. Raises ValueError if it is too
+    short.
+    """
     weather = fit_weather(record, model, loop.gas_follows_air_s)
     rest = fit_noise(weather.rest_um, record.dt_s, loop.gas_follows_air_s)
     found = DisturbanceModel(rest, weather.barometer, weather.air)
     return replace(found, unsteady=_unsteady(record.filled_displacement_um(), found, model, loop))
 
 
-def _unsteady(read_um: Series, found: DisturbanceModel, model: loop_model.PlantModel, loop: LoopConfig) -> float:
-    """Relative standard error of the centre's standard deviation, for this record and one more like it.
+def _unsteady(
+    read_um: Series, found: DisturbanceModel, model: loop_model.PlantModel, loop: LoopConfig
+) -> float:
+    """Relative standard error of the centre's standard deviation, for this record and one more like
+    it.
 
-    From the scatter of the variance among blocks of the record, after Wiener's filter, which leaves the movement.
+    From the scatter of the variance among blocks of the record, after Wiener's filter, which leaves
+    the movement.
     """
     w = np.asarray(2 * np.pi * np.fft.rfftfreq(read_um.size, found.rest.dt_s), dtype=float)
     w[0] = w[1]
     moving = found.psd(w, model, loop)
     centre_um = np.fft.irfft(
-        np.fft.rfft(read_um - read_um.mean()) * moving / (moving + found.rest.white_psd), read_um.size
+        np.fft.rfft(read_um - read_um.mean()) * moving / (moving + found.rest.white_psd),
+        read_um.size,
     )
-    variances = np.mean(centre_um[: read_um.size // _BLOCKS * _BLOCKS].reshape(_BLOCKS, -1) ** 2, axis=1)
+    variances = np.mean(
+        centre_um[: read_um.size // _BLOCKS * _BLOCKS].reshape(_BLOCKS, -1) ** 2, axis=1
+    )
     return float(variances.std(ddof=1) / max(variances.mean(), _FLOOR) / 2 * math.sqrt(2 / _BLOCKS))

@@ -1,19 +1,22 @@
 """Gain and dead time from a record, by prediction error with a noise model.
 
-The reading is y = k x - leak t + g_p p + n, with x the path of a mirror of gain 1 (`driven_um`). Weather
-wanders and the laser is noisy: n is a random walk plus white noise, which is an IMA(1,1) process
+The reading is y = k x - leak t + g_p p + n, with x the path of a mirror of gain 1 (`driven_um`).
+Weather wanders and the laser is noisy: n is a random walk plus white noise, which is an IMA(1,1)
+process
 
     n[i] - n[i-1] = (1 - beta B) e[i],    e white, B one sample back.
 
-Weather that reaches the gas through the film (air temperature, 12 s) is a walk with its own memory. Omitting
-it makes k too small where the flow responds to the readings (by 3 % in gusty weather): so the increments get a pole,
+Weather that reaches the gas through the film (air temperature, 12 s) is a walk with its own memory.
+Omitting it makes k too small where the flow responds to the readings (by 3 % in gusty weather): so
+the increments get a pole,
 
     n[i] - n[i-1] = (1 - beta B) (1 - gamma B) / (1 - phi B) e[i],    phi = exp(-dt / 12 s),
 
-which is IMA(1,1) for gamma = phi. Minimising the sum of e^2 over (k, leak, theta, T, beta, gamma) weights the record
-by its disturbance. Plain output error assumes white n and is biased; the describing function of a relay uses only
-one frequency.
-Source: Ljung, System Identification (1999), sections 7.2 and 9.4 (covariance from the gradient of e).
+which is IMA(1,1) for gamma = phi. Minimising the sum of e^2 over (k, leak, theta, T, beta, gamma)
+weights the record by its disturbance. Plain output error assumes white n and is biased; the
+describing function of a relay uses only one frequency.
+Source: Ljung, System Identification (1999), sections 7.2 and 9.4 (covariance from the gradient of
+e).
 """
 
 import math
@@ -29,7 +32,10 @@ from tuning.identification import loop_model
 
 _FILM_S = 12.0  # lag of the gas behind the air (estimate; a factor of 2 does not matter)
 _BETA_MAX = 0.9999  # 1 would mean a reading without disturbance
-_LAG_MIN_S, _LAG_MAX_S = 0.01, 2.0  # a film pump responds within seconds, and a lag below a tick does not matter
+_LAG_MIN_S, _LAG_MAX_S = (
+    0.01,
+    2.0,
+)  # a film pump responds within seconds, and a lag below a tick does not matter
 _DEAD_TIME_MAX_S = 3.0
 _STARTS_S = (0.03, 0.1, 0.3, 0.6, 1.0, 1.6)
 _LAG_START_S = 0.1
@@ -74,7 +80,8 @@ class Identified:
     # Of the barometer, 0 without one; a nuisance parameter, biased low by the barometer's noise
     pressure_gain_um_per_pa: float
     innovation_um: float  # standard deviation of the one-step prediction error
-    # Probability of residuals at least as coloured, and as correlated with past flow, if the model were true
+    # Probability of residuals at least as coloured, and as correlated with past flow, if the model
+    # were true
     whiteness_p: float
     independence_p: float
     largest_residual: float  # in standard deviations
@@ -82,14 +89,22 @@ class Identified:
 
 
 def prediction_errors(
-    record: loop_model.Record, model: loop_model.PlantModel, noise: NoiseModel, pressure_gain_um_per_pa: float = 0.0
+    record: loop_model.Record,
+    model: loop_model.PlantModel,
+    noise: NoiseModel,
+    pressure_gain_um_per_pa: float = 0.0,
 ) -> loop_model.Series:
-    """One-step prediction errors of a model on a record, (n - 1,) µm; the first ones include the filter's start-up.
+    """One-step prediction errors of a model on a record, (n - 1,) µm; the first ones include the
+    filter's start-up.
 
     `pressure_gain_um_per_pa` is the barometer's effect on the centre; 0 omits it.
     """
     x = loop_model.driven_um(record.flow_um_per_s, model.dead_time_s, model.lag_s, record.dt_s)
-    moved = np.diff(record.filled_displacement_um()) - model.gain * np.diff(x) + model.leak_um_per_s * record.dt_s
+    moved = (
+        np.diff(record.filled_displacement_um())
+        - model.gain * np.diff(x)
+        + model.leak_um_per_s * record.dt_s
+    )
     if pressure_gain_um_per_pa != 0.0:
         moved -= pressure_gain_um_per_pa * np.diff(record.ambient_pressure_pa)
     return noise.whitened(moved, record.dt_s)
@@ -114,8 +129,8 @@ def identify(record: loop_model.Record) -> Identified:
     residual = errors(q)
     innovation_um = float(np.sqrt(np.sum(residual**2) / (residual.size - q.size)))
     covariance = innovation_um**2 * np.linalg.pinv(best.jac.T @ best.jac)
-    # The model does not resolve times within a sample, and with little noise the fit would claim a dead time more
-    # precise than a sample allows.
+    # The model does not resolve times within a sample, and with little noise the fit would claim a
+    # dead time more precise than a sample allows.
     covariance[1, 1] += record.dt_s**2 / 12
     return Identified(
         model=loop_model.PlantModel(*(float(v) for v in q[:4])),
@@ -131,11 +146,15 @@ def identify(record: loop_model.Record) -> Identified:
     )
 
 
-def _best_fit(errors: Callable[[loop_model.Series], loop_model.Series], record: loop_model.Record) -> OptimizeResult:
+def _best_fit(
+    errors: Callable[[loop_model.Series], loop_model.Series], record: loop_model.Record
+) -> OptimizeResult:
     """Least squares from the most promising dead time, as the criterion has several minima."""
     extra = [-0.3] if record.has_barometer and np.ptp(record.ambient_pressure_pa) > 0 else []
     low = [-np.inf, 0.0, _LAG_MIN_S, -np.inf, 0.0, _GAMMA_MIN] + [-np.inf] * len(extra)
-    high = [np.inf, _DEAD_TIME_MAX_S, _LAG_MAX_S, np.inf, _BETA_MAX, _BETA_MAX] + [np.inf] * len(extra)
+    high = [np.inf, _DEAD_TIME_MAX_S, _LAG_MAX_S, np.inf, _BETA_MAX, _BETA_MAX] + [np.inf] * len(
+        extra
+    )
     starts = [_start(record, dead_time_s, extra) for dead_time_s in _STARTS_S]
     return least_squares(
         errors,
@@ -150,7 +169,9 @@ def _best_fit(errors: Callable[[loop_model.Series], loop_model.Series], record: 
 def _start(record: loop_model.Record, dead_time_s: float, extra: list[float]) -> loop_model.Series:
     """Best gain and leak for a dead time, by linear least squares on the prefiltered record."""
     unit = loop_model.PlantModel(1.0, dead_time_s, _LAG_START_S, 0.0)
-    x = np.diff(loop_model.driven_um(record.flow_um_per_s, unit.dead_time_s, unit.lag_s, record.dt_s))
+    x = np.diff(
+        loop_model.driven_um(record.flow_um_per_s, unit.dead_time_s, unit.lag_s, record.dt_s)
+    )
     columns = np.array([x, np.full(x.size, -record.dt_s), np.diff(record.filled_displacement_um())])
     columns = lfilter([1.0], [1.0, -_BETA_START], columns, axis=1)
     gain, leak = np.linalg.lstsq(columns[:2].T, columns[2], rcond=None)[0]
@@ -173,7 +194,9 @@ def whiteness(residual: loop_model.Series, fitted: int = 0) -> float:
 
 
 def independence(residual: loop_model.Series, change: loop_model.Series) -> float:
-    """Probability of residuals this correlated with earlier changes of the flow, if the model were complete."""
+    """Probability of residuals this correlated with earlier changes of the flow, if the model were
+    complete.
+    """
     e = (residual - residual.mean()) / residual.std()
     u = change - change.mean()
     n = e.size
@@ -183,17 +206,19 @@ def independence(residual: loop_model.Series, change: loop_model.Series) -> floa
     return float(chi2.sf(cross @ np.linalg.pinv(past @ past.T) @ cross, _LAGS))
 
 
-# Tests whether the pump is as strong above the holding flow as below, which a saturating or stalling pump is not.
+# Tests whether the pump is as strong above the holding flow as below, which a saturating or
+# stalling pump is not.
 #
-# A relay has two flows, and a straight line goes through any two points; the holds about it are the third. A pump
-# that saturates is then a weak one to a fit with a single gain, and gains made for that are too high for what the
-# loop does every second about the holding flow. So the record is fitted once more with a difference d between two
-# gains,
+# A relay has two flows, and a straight line goes through any two points; the holds about it are the
+# third. A pump that saturates is then a weak one to a fit with a single gain, and gains made for
+# that are too high for what the loop does every second about the holding flow. So the record is
+# fitted once more with a difference d between two gains,
 #
 #     y = k x + d x_above - leak t + n,    x_above: the way by max(v - mean v, 0),
 #
-# with dead time, lag and noise of the fit. What is left of x_above when x and t have taken their share (r) decides:
-# d = r y / r r, with the standard error sigma / |r| (Frisch and Waugh, Econometrica 1 (1933) 387).
+# with dead time, lag and noise of the fit. What is left of x_above when x and t have taken their
+# share (r) decides: d = r y / r r, with the standard error sigma / |r| (Frisch and Waugh,
+# Econometrica 1 (1933) 387).
 
 _SAME = 1e-6  # with two flows in the whole record, x_above is x and t but for rounding
 
@@ -204,7 +229,9 @@ class TwoGains:
 
     below: float  # gain of each part
     above: float
-    difference_sigma: float  # standard error of `above - below`; infinite if the flow had two values only
+    difference_sigma: (
+        float  # standard error of `above - below`; infinite if the flow had two values only
+    )
 
 
 def two_gains(record: loop_model.Record, identified: Identified) -> TwoGains:
@@ -227,4 +254,6 @@ def two_gains(record: loop_model.Record, identified: Identified) -> TwoGains:
         return TwoGains(model.gain, model.gain, math.inf)
     difference = float(rest_um @ moved_um / (rest_um @ rest_um))
     below = float(np.linalg.lstsq(straight, moved_um - difference * above_um, rcond=None)[0][0])
-    return TwoGains(below, below + difference, identified.innovation_um / float(np.linalg.norm(rest_um)))
+    return TwoGains(
+        below, below + difference, identified.innovation_um / float(np.linalg.norm(rest_um))
+    )

@@ -2,9 +2,10 @@
 
     y = sum over commands of f(command) x path(command) - leak path + g pressure + n
 
-The path of a command is the time for which it was given, behind the dead time and the lag of the actuator: whatever
-its curve, the flow at each command is one linear unknown. A command reached from above is another unknown than the
-same one reached from below. The leak may change within a minute; n is white noise on a random walk.
+The path of a command is the time for which it was given, behind the dead time and the lag of the
+actuator: whatever its curve, the flow at each command is one linear unknown. A command reached from
+above is another unknown than the same one reached from below. The leak may change within a minute;
+n is white noise on a random walk.
 """
 
 import math
@@ -19,7 +20,11 @@ from membrane_ctrl.model.arrays import FloatArray
 BLOCK_S = 0.1
 _BEFORE_S = 8.0  # a flow that was on its way before the first command has arrived by then
 _LEAK_S = 40.0  # between the nodes of the leak's course
-_LEAK_CHANGES_UM_PER_S = (0.02, 0.06, 0.2)  # the weather's slow course looks like it; the last is 1.5 mK/s of the air
+_LEAK_CHANGES_UM_PER_S = (
+    0.02,
+    0.06,
+    0.2,
+)  # the weather's slow course looks like it; the last is 1.5 mK/s of the air
 _BEFORE_UM_PER_S = 0.5  # of the loop's flow from the leak, when a run begins
 _WHITES = (0.9, 0.97, 0.99, 0.997, 0.9995)
 _DELAYS_S, _LAGS_S = (0.05, 0.2, 0.5, 1.0, 1.6, 2.2), (0.1, 0.4, 1.0, 2.0)
@@ -39,7 +44,9 @@ class Level:
 
 @dataclass(frozen=True, slots=True)
 class PumpRun:
-    """Commands and readings of one experiment, evenly sampled, arrays (n,); NaN for missing values."""
+    """Commands and readings of one experiment, evenly sampled, arrays (n,);
+    NaN for missing values.
+    """
 
     dt_s: float
     fraction: FloatArray  # from each reading until the next
@@ -89,7 +96,9 @@ NO_FIT = PumpFit({}, np.empty((0, 0)), 0.0, 0.0, 0.0, 0.8)
 
 @dataclass(frozen=True, slots=True)
 class _Blocks:
-    """A run in blocks of `BLOCK_S`: the paths of its levels before the actuator, beginning before the run."""
+    """A run in blocks of `BLOCK_S`: the paths of its levels before the actuator, beginning before
+    the run.
+    """
 
     columns: list[int]  # which of all levels these are
     paths: FloatArray  # (before + n, levels + 1); the last is what flowed before
@@ -100,7 +109,9 @@ class _Blocks:
 
 @dataclass(frozen=True, slots=True)
 class _Flows:
-    """The linear unknowns behind an actuator: flow of each level, leak, pressure, (what delay and lag are off)."""
+    """The linear unknowns behind an actuator: flow of each level, leak, pressure, (what delay and
+    lag are off).
+    """
 
     delay_s: float
     lag_s: float
@@ -128,17 +139,23 @@ def levels_of(run: PumpRun) -> list[Level | None]:
 
 
 def fit(runs: Sequence[PumpRun], near: PumpFit | None = None) -> PumpFit:
-    """Fit the flow at every level of the runs. Begins at the actuator and the noise of `near`, if given.
+    """Fit the flow at every level of the runs. Begins at the actuator and the noise of `near`, if
+    given.
 
     Raises ValueError for runs without readings, or too short.
     """
     levels = sorted({level for run in runs for level in levels_of(run) if level is not None})
     model = _Mirror([_blocks(run, levels) for run in runs], len(levels))
     starts = product(_DELAYS_S, _LAGS_S, _WHITES[1:2], _LEAK_CHANGES_UM_PER_S[-1:])
-    best = min((model.solved(*start) for start in (starts if near is None else (near.likeliest,))), key=_cost)
+    best = min(
+        (model.solved(*start) for start in (starts if near is None else (near.likeliest,))),
+        key=_cost,
+    )
     for _ in range(_TURNS):
         noises = product(_WHITES, _LEAK_CHANGES_UM_PER_S)
-        tried = (model.solved(best.delay_s, best.lag_s, *noise) for noise in noises if best.near(*noise))
+        tried = (
+            model.solved(best.delay_s, best.lag_s, *noise) for noise in noises if best.near(*noise)
+        )
         better = min((model.improved(best), *tried), key=_cost)
         enough = best.cost - better.cost < _ENOUGH
         best = better
@@ -150,8 +167,8 @@ def fit(runs: Sequence[PumpRun], near: PumpFit | None = None) -> PumpFit:
 class _Mirror:
     """The mirror as a flow meter: the likelihood of its runs behind an actuator and in noise.
 
-    Delay and lag are linear unknowns as well, about where they are: Gauss and Newton's step, and their share of the
-    errors.
+    Delay and lag are linear unknowns as well, about where they are: Gauss and Newton's step, and
+    their share of the errors.
     """
 
     def __init__(self, blocks: Sequence[_Blocks], levels: int) -> None:
@@ -162,9 +179,16 @@ class _Mirror:
         self._rows = sum(block.displacement_um.size for block in blocks)
 
     def solved(
-        self, delay_s: float, lag_s: float, white: float, changes: float, flows: FloatArray | None = None
+        self,
+        delay_s: float,
+        lag_s: float,
+        white: float,
+        changes: float,
+        flows: FloatArray | None = None,
     ) -> _Flows:
-        """Flows behind an actuator; with `flows` also how far delay and lag are off, if those flowed."""
+        """Flows behind an actuator; with `flows` also how far delay and lag are off, if those
+        flowed.
+        """
         gram, cost = self._gram((delay_s, lag_s, white), changes, flows)
         here = np.delete(np.delete(gram, _OFF, axis=0), _OFF, axis=1)
         variance, values, covariance = _least_squares(here, self._rows)
@@ -179,7 +203,9 @@ class _Mirror:
         kept = best.white, best.leak_changes_um_per_s
         off = self.solved(best.delay_s, best.lag_s, *kept, best.values).values[-2:]
         for share in (1.0, 0.4, 0.1):
-            delay_s, lag_s = np.clip((best.delay_s, best.lag_s) + share * off, _LEAST_S, _MOST_S).tolist()
+            delay_s, lag_s = np.clip(
+                (best.delay_s, best.lag_s) + share * off, _LEAST_S, _MOST_S
+            ).tolist()
             found = self.solved(delay_s, lag_s, *kept)
             if found.cost < best.cost:
                 return found
@@ -193,18 +219,28 @@ class _Mirror:
         covariance = found.covariance[:count, :count]
         columns = found.values[:count].tolist(), np.sqrt(np.diag(covariance)).tolist()
         flows = {level: FlowAt(*at) for level, *at in zip(levels, *columns, strict=True)}
-        return PumpFit(flows, covariance, float(found.values[count]), best.delay_s, best.lag_s, *kept)
+        return PumpFit(
+            flows, covariance, float(found.values[count]), best.delay_s, best.lag_s, *kept
+        )
 
     def _gram(
         self, at: tuple[float, float, float], changes: float, flows: FloatArray | None
     ) -> tuple[FloatArray, float]:
-        """Products of the columns levels, leak, pressure, delay, lag, height; and the likelihood's determinant."""
+        """Products of the columns levels, leak, pressure, delay, lag, height; and the likelihood's
+        determinant.
+        """
         last = self._levels + np.arange(5)
         whole, determinant = np.zeros((self._levels + 5,) * 2), 0.0
         for block in self._blocks:
-            given = np.zeros(len(block.columns) + 1) if flows is None else flows[[*block.columns, self._levels]]
+            given = (
+                np.zeros(len(block.columns) + 1)
+                if flows is None
+                else flows[[*block.columns, self._levels]]
+            )
             columns = _whitened(block, at, given, self._has_pressure)
-            gram, logarithm = _without_own(columns, block.leak.shape[1], at[2], (self._noise_um, changes))
+            gram, logarithm = _without_own(
+                columns, block.leak.shape[1], at[2], (self._noise_um, changes)
+            )
             where = np.append(block.columns, last).astype(int)
             whole[np.ix_(where, where)] += gram
             determinant += logarithm
@@ -223,7 +259,9 @@ def _blocks(run: PumpRun, levels: Sequence[Level]) -> _Blocks:
         raise ValueError("a run of the pump without readings, or too short")
 
     def mean(column: FloatArray) -> FloatArray:
-        return np.asarray(column[: count * size].reshape(count, size, *column.shape[1:]).mean(axis=1))
+        return np.asarray(
+            column[: count * size].reshape(count, size, *column.shape[1:]).mean(axis=1)
+        )
 
     given = levels_of(run)
     own = sorted({level for level in given if level is not None})
@@ -261,10 +299,14 @@ def _arrived(paths: FloatArray, delay_s: float, lag_s: float) -> FloatArray:
     return np.asarray(lfilter([1 - keep], [1, -keep], given - given[0], axis=0))
 
 
-def _whitened(block: _Blocks, at: tuple[float, float, float], flows: FloatArray, has_pressure: bool) -> FloatArray:
-    """Columns levels, before, leak, pressure, delay, lag, height, differenced so that the noise is white.
+def _whitened(
+    block: _Blocks, at: tuple[float, float, float], flows: FloatArray, has_pressure: bool
+) -> FloatArray:
+    """Columns levels, before, leak, pressure, delay, lag, height, differenced so that the noise is
+    white.
 
-    Those of delay and lag say what a second more of them changes, with these flows of the levels and before.
+    Those of delay and lag say what a second more of them changes, with these flows of the levels
+    and before.
     """
     from scipy.signal import lfilter
 
@@ -272,26 +314,31 @@ def _whitened(block: _Blocks, at: tuple[float, float, float], flows: FloatArray,
     count = block.displacement_um.size
     given = block.paths @ flows[:, None]
     slopes = [
-        (_arrived(given, delay_s + more_s, lag_s + slower_s) - _arrived(given, delay_s, lag_s)) / _SLOPE_S
+        (_arrived(given, delay_s + more_s, lag_s + slower_s) - _arrived(given, delay_s, lag_s))
+        / _SLOPE_S
         for more_s, slower_s in ((_SLOPE_S, 0.0), (0.0, _SLOPE_S))
     ]
-    columns = np.column_stack((
-        _arrived(block.paths, delay_s, lag_s)[-count:],
-        block.leak,
-        block.pressure_pa if has_pressure else np.zeros(count),
-        *(slope[-count:] for slope in slopes),
-        block.displacement_um,
-    ))  # fmt: skip
+    columns = np.column_stack(
+        (
+            _arrived(block.paths, delay_s, lag_s)[-count:],
+            block.leak,
+            block.pressure_pa if has_pressure else np.zeros(count),
+            *(slope[-count:] for slope in slopes),
+            block.displacement_um,
+        )
+    )
     return np.asarray(lfilter([1.0], [1.0, -white], np.diff(columns, axis=0), axis=0))
 
 
 def _without_own(
     columns: FloatArray, nodes: int, white: float, noises: tuple[float, float]
 ) -> tuple[FloatArray, float]:
-    """Products of a run's columns levels, leak, pressure, delay, lag, height, after what belongs to this run alone.
+    """Products of a run's columns levels, leak, pressure, delay, lag, height, after what belongs to
+    this run alone.
 
-    These are the course of the leak, what the pump gave before the run, and the noise of the first reading. Also the
-    logarithm of their determinant. Noises: of a reading in µm, of the leak in µm/s.
+    These are the course of the leak, what the pump gave before the run, and the noise of the first
+    reading. Also the logarithm of their determinant. Noises: of a reading in µm, of the leak in
+    µm/s.
     """
     paths, leak, rest = np.split(columns, (-4 - nodes, -4), axis=1)
     levels, before = paths[:, :-1], paths[:, -1:]
@@ -308,7 +355,9 @@ def _without_own(
 
 
 def _least_squares(gram: FloatArray, rows: int) -> tuple[float, FloatArray, FloatArray]:
-    """Variance of the residual, values, their covariance, from the columns' products; the last is the reading."""
+    """Variance of the residual, values, their covariance, from the columns' products; the last is
+    the reading.
+    """
     scale = np.maximum(np.sqrt(np.diag(gram)[:-1]), 1e-9)
     inverse = np.linalg.inv(gram[:-1, :-1] / np.outer(scale, scale) + 1e-9 * np.eye(scale.size))
     values = inverse @ (gram[:-1, -1] / scale) / scale

@@ -16,15 +16,25 @@ _USEFUL_SHARE = 0.02  # standard error of a level, of the full flow; beyond it t
 _STUCK_LEAKS, _STUCK_UM_PER_S = 0.3, 0.2  # a pump that surely gives less than both, at any command
 _REACHES_LEAKS = 1.2
 _FEW_S = 300.0  # of experiments: fewer say nothing of the noise
-_STEP_LEAKS, _STEP_MOST = 4.0, 0.105  # a pump that starts with more than the mirror loses, between two commands
+_STEP_LEAKS, _STEP_MOST = (
+    4.0,
+    0.105,
+)  # a pump that starts with more than the mirror loses, between two commands
 _NONE_SHARE, JUMP_SHARE = 0.02, 0.05  # flow at which a pump starts or stalls at once
-_EDGE_MOST, _EDGE_NOISY = 0.1, 0.005  # between the commands of a jump, and of one that begins in noise
+_EDGE_MOST, _EDGE_NOISY = (
+    0.1,
+    0.005,
+)  # between the commands of a jump, and of one that begins in noise
 _ASTRAY = (
-    "the mirror did not come back to its setpoint within three minutes, with slow gains: the weather is too strong, "
-    "or the pump gives too much as soon as it runs; run `tune pump` again in steadier weather, or open the bleed "
+    "the mirror did not come back to its setpoint within three minutes, with slow gains: the "
+    "weather is too strong, "
+    "or the pump gives too much as soon as it runs; run `tune pump` again in steadier "
+    "weather, or open the bleed "
     "(loop.bleed_fraction)"
 )
-_ROUGH = np.geomspace(0.02, 2e4, 8)  # of the curve: square of its second derivative, of the full flow
+_ROUGH = np.geomspace(
+    0.02, 2e4, 8
+)  # of the curve: square of its second derivative, of the full flow
 _KINKED = (0.0, 0.01, 0.1, 1.0)  # likewise: square of the change of its slope ...
 _AT_ONCE = (0.0, 0.1)  # ... square of the flow with which it starts ...
 _SLOPE = 10.0  # ... and of its slope there
@@ -78,14 +88,17 @@ class Surveyed:
     held: bool = True  # the hold brought the mirror back after the last round
 
     def map(self) -> PumpMap:
-        """The curve. Raises ValueError, with what to check, if there is none to hold a mirror with."""
+        """The curve. Raises ValueError, with what to check,
+        if there is none to hold a mirror with.
+        """
         from scipy.optimize import isotonic_regression
 
         rising, from_bottom = self._known_part()
         leak, full = self.fit.leak_um_per_s, float(rising.flows[-1])
         if full < leak:
             raise ValueError(
-                f"the pump gives {full:.2f} µm/s at most and the mirror loses {leak:.2f} µm/s: find the leak, or "
+                f"the pump gives {full:.2f} µm/s at most and the mirror loses {leak:.2f} "
+                "µm/s: find the leak, or "
                 "take a stronger pump, then run `tune pump` again"
             )
         start, above = first_jump(rising, full), self.falling.columns
@@ -94,42 +107,67 @@ class Surveyed:
             begin = stall = start[1]
             stalls = first_jump(self.falling, full)
             stall = min(begin, stalls[1]) if stalls is not None else begin
-        falling = {f: v for f, v in zip(above[0].tolist(), above[1].tolist(), strict=True) if stall <= f < begin}
-        up = {f: v for f, v in zip(rising.fractions.tolist(), rising.flows.tolist(), strict=True) if f >= begin}
+        falling = {
+            f: v
+            for f, v in zip(above[0].tolist(), above[1].tolist(), strict=True)
+            if stall <= f < begin
+        }
+        up = {
+            f: v
+            for f, v in zip(rising.fractions.tolist(), rising.flows.tolist(), strict=True)
+            if f >= begin
+        }
         points = sorted({**falling, **up}.items())
         while len(points) > 2 and points[1][1] <= 0.005 * full:
             points.pop(0)
         while len(points) > 2 and points[-2][1] >= 0.995 * full:
             points.pop()
         xs, ys = np.array(points).T
-        table: dict[str, object] = {"curve_fraction": _tuple(xs), "curve_um_per_s": _tuple(isotonic_regression(ys).x)}
+        table: dict[str, object] = {
+            "curve_fraction": _tuple(xs),
+            "curve_um_per_s": _tuple(isotonic_regression(ys).x),
+        }
         if self.hysteretic:
             more = np.maximum(np.interp(xs, above[0], above[1]), isotonic_regression(ys).x)
             more[-1] = ys[-1]
-            table["curve_falling_um_per_s"] = _tuple(np.maximum.accumulate(np.minimum(more, ys[-1])))
-        pump = PumpConfig.model_validate({**table, "start_fraction": begin, "stall_fraction": stall})
+            table["curve_falling_um_per_s"] = _tuple(
+                np.maximum.accumulate(np.minimum(more, ys[-1]))
+            )
+        pump = PumpConfig.model_validate(
+            {**table, "start_fraction": begin, "stall_fraction": stall}
+        )
         return PumpMap(
-            _tuple(rising.fractions), _tuple(rising.flows), _tuple(rising.sigmas),
-            pump, leak, self.fit.delay_s, self.fit.lag_s, self.duration_s, self.done,
-        )  # fmt: skip
+            _tuple(rising.fractions),
+            _tuple(rising.flows),
+            _tuple(rising.sigmas),
+            pump,
+            leak,
+            self.fit.delay_s,
+            self.fit.lag_s,
+            self.duration_s,
+            self.done,
+        )
 
     def _further(self, off: float = 2.0) -> str:
         """What makes the flows known better; the errors are `off` times too large.
 
-        Runs twice as long see a flow 1.4 times as well (measured, on pumps of a second world), in a random walk no
-        better.
+        Runs twice as long see a flow 1.4 times as well (measured, on pumps of a second world), in a
+        random walk no better.
         """
         walk_shows_s = BLOCK_S / (1 - self.fit.share_white)
         enough_um = 5.0 * math.ceil(1.3 * off**2 * self.limit_um / 5.0)
         stopped = self.duration_s < _FEW_S  # the limit ended nearly every run
         drowned = walk_shows_s * self.fit.leak_um_per_s < self.limit_um
-        if self.limit_um < LIMIT_MAX_UM and (stopped or (not drowned and enough_um <= LIMIT_MAX_UM)):
+        if self.limit_um < LIMIT_MAX_UM and (
+            stopped or (not drowned and enough_um <= LIMIT_MAX_UM)
+        ):
             limit_um = min(max(enough_um if not stopped else 0.0, 2 * self.limit_um), LIMIT_MAX_UM)
             return f"run `tune pump` again with --limit-um {limit_um:g}"
         return "run `tune pump` again in steadier weather, or with a quieter laser"
 
     def _known_part(self) -> tuple[Branch, bool]:
-        """The levels reached from below that are known, on either side of the leak; and whether that begins at 0.
+        """The levels reached from below that are known, on either side of the leak; and whether
+        that begins at 0.
 
         Beyond them nothing is said. Raises ValueError if there are none.
         """
@@ -141,8 +179,10 @@ class Surveyed:
         leak, last = self.fit.leak_um_per_s, int(np.argmin(sigmas[1:])) + 1
         if stuck(self.fit, self.rising):
             raise ValueError(
-                f"the mirror moves alike at every command ({flows[last]:.2f} +- {sigmas[last]:.2f} µm/s more at "
-                f"{fractions[last]:.2f} than at 0): the pump is stuck, or its gas does not arrive: free it, then run "
+                f"the mirror moves alike at every command ({flows[last]:.2f} +- "
+                f"{sigmas[last]:.2f} µm/s more at "
+                f"{fractions[last]:.2f} than at 0): the pump is stuck, or its gas does not "
+                "arrive: free it, then run "
                 "`tune pump` again"
             )
         if not self.held:
@@ -157,11 +197,17 @@ class Surveyed:
         beyond = top == low or (fractions[top] < 1.0 and flows[top] < _REACHES_LEAKS * leak)
         if beyond:
             self._refuse_steep(_STEP_LEAKS, "no command holds the mirror")
-        if beyond or (low > 0 and flows[low] > leak):  # the flow that holds the mirror must be on the curve
+        if beyond or (
+            low > 0 and flows[low] > leak
+        ):  # the flow that holds the mirror must be on the curve
             unknown = min(top + 1, known.size - 1) if beyond else low - 1
-            where = f"{'beyond' if beyond else 'below'} a command of {fractions[top if beyond else low]:.2f}"
+            where = (
+                f"{'beyond' if beyond else 'below'} a command of "
+                f"{fractions[top if beyond else low]:.2f}"
+            )
             raise ValueError(
-                f"the flow {where if top else 'at every command'} is not known to {_USEFUL_SHARE:.0%} after "
+                f"the flow {where if top else 'at every command'} is not known to "
+                f"{_USEFUL_SHARE:.0%} after "
                 f"{self.duration_s / 60:.0f} minutes of experiments: "
                 f"{self._further(float(sigmas[unknown]) / (_USEFUL_SHARE * self.full_um_per_s))}"
             )
@@ -169,15 +215,23 @@ class Surveyed:
         return Branch(fractions[part], flows[part], sigmas[part]), low == 0
 
     def _refuse_steep(self, leaks: float, said: str) -> None:
-        """Raises ValueError if the flow rises at once from less than the leak to more than so many times as much."""
+        """Raises ValueError if the flow rises at once from less than the leak to more than so many
+        times as much.
+        """
         fractions, flows, sigmas = self.rising.columns
         leak = self.fit.leak_um_per_s
         above = int(np.argmax(flows - 2 * sigmas > leaks * leak))
         below = above - 1
-        if above and flows[below] + 2 * sigmas[below] < leak and fractions[above] - fractions[below] <= _STEP_MOST:
+        if (
+            above
+            and flows[below] + 2 * sigmas[below] < leak
+            and fractions[above] - fractions[below] <= _STEP_MOST
+        ):
             raise ValueError(
-                f"{said}: the flow rises from {flows[below]:.1f} µm/s at a command of {fractions[below]:.2f} to "
-                f"{flows[above]:.1f} µm/s at {fractions[above]:.2f}, and the mirror loses {leak:.1f} µm/s: throttle "
+                f"{said}: the flow rises from {flows[below]:.1f} µm/s at a command of "
+                f"{fractions[below]:.2f} to "
+                f"{flows[above]:.1f} µm/s at {fractions[above]:.2f}, and the mirror loses "
+                f"{leak:.1f} µm/s: throttle "
                 f"the pump, or {bleed_open(leak, flows[above])}, then run `tune pump` again"
             )
 
@@ -186,7 +240,9 @@ def stuck(fit: PumpFit, rising: Branch) -> bool:
     """Whether no command so far gives what would matter, beyond doubt."""
     # a pump that is stuck at what leaks makes the mirror look tight
     matters_um_per_s = max(_STUCK_LEAKS * fit.leak_um_per_s, _STUCK_UM_PER_S)
-    if not rising.flows.size or any(at.flow_um_per_s > 5 * at.sigma_um_per_s for at in fit.levels.values()):
+    if not rising.flows.size or any(
+        at.flow_um_per_s > 5 * at.sigma_um_per_s for at in fit.levels.values()
+    ):
         return False
     _, flows, sigmas = (column[1:] for column in rising.columns)
     return bool((flows + 3 * sigmas < matters_um_per_s).all())
@@ -209,16 +265,22 @@ def _tuple(values: FloatArray) -> tuple[float, ...]:
     return tuple(round(value, 4) for value in values.tolist())
 
 
-def smoothed(fractions: FloatArray, flows: FloatArray, noise: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Noisy flows, made as smooth as they look, and the covariance of the result; `noise` is that of the flows.
+def smoothed(
+    fractions: FloatArray, flows: FloatArray, noise: FloatArray
+) -> tuple[FloatArray, FloatArray]:
+    """Noisy flows, made as smooth as they look, and the covariance of the result; `noise` is that
+    of the flows.
 
-    The first is at command 0. The average over curves by their likelihood: nothing up to one of the commands, then
-    perhaps at once a flow, then a cubic or linear smoothing spline (Wahba 1978), as most curves are smooth and some
-    have kinks. A spline from command 0 would carry its certainty of no flow into a dead zone.
+    The first is at command 0. The average over curves by their likelihood: nothing up to one of the
+    commands, then perhaps at once a flow, then a cubic or linear smoothing spline (Wahba 1978), as
+    most curves are smooth and some have kinks. A spline from command 0 would carry its certainty of
+    no flow into a dead zone.
     """
     full = max(float(flows.max()), 1e-3)
     y, noise = flows / full, noise / full**2
-    none = int(np.argmax(np.append(y - _CLEAR * np.sqrt(np.diag(noise)) > 0, True)))  # the first certain flow
+    none = int(
+        np.argmax(np.append(y - _CLEAR * np.sqrt(np.diag(noise)) > 0, True))
+    )  # the first certain flow
     found: list[tuple[float, FloatArray, FloatArray]] = []
     for last in range(max(none, 1)):
         x = np.maximum(fractions - fractions[last], 0.0)
@@ -239,7 +301,8 @@ def smoothed(fractions: FloatArray, flows: FloatArray, noise: FloatArray) -> tup
 
 
 def may_bend(fractions: FloatArray, flows: FloatArray) -> FloatArray:
-    """By how much the flow may be off the straight line in each interval: where the chords beside it would meet.
+    """By how much the flow may be off the straight line in each interval: where the chords beside
+    it would meet.
 
     There is no flow below the first command, and perhaps no more of it beyond the last.
     """

@@ -1,8 +1,8 @@
 """Which commands to give next, until the pump's curve is known.
 
-A round is a minute or two of short runs, each from below the centre to above it or back; the hold between two rounds
-brings the mirror back. What is known so far says how long a command may last. Levels are added where the curve bends
-or jumps, and repeated until they are known.
+A round is a minute or two of short runs, each from below the centre to above it or back; the hold
+between two rounds brings the mirror back. What is known so far says how long a command may last.
+Levels are added where the curve bends or jumps, and repeated until they are known.
 """
 
 import math
@@ -29,24 +29,32 @@ from tuning.identification.pump_map import (
 
 _KNOWN_SHARE = 0.009  # standard error of a level, of the full flow
 _BENT_SHARE = 0.02  # of the full flow, by which a kink between two levels may be hidden
-# Likewise of the leak, in flows up to so many leaks: the loop's gain there is the slope of the curve
+# Likewise of the leak, in flows up to so many leaks: the loop's gain there is the slope of the
+# curve
 _BENT_LEAKS, _ABOUT_LEAKS, _SURE = 0.15, 2.0, 3.0
 _PLAY_SHARE = 0.03  # hysteresis that is worth a second branch
 _EDGE, _NEAREST = 0.02, 0.04  # commands between which a jump lies; levels for a bend
-_FINE_EDGE, _TOO_MUCH = 0.002, 0.6  # a jump to more than this share of the leak may be a steep rise through it
+_FINE_EDGE, _TOO_MUCH = (
+    0.002,
+    0.6,
+)  # a jump to more than this share of the leak may be a steep rise through it
 _MOST_ROUNDS, _MOST_S, _ROUND_S = 40, 1500.0, 120.0
 TYPICAL_S = 900.0  # of a survey, with the holds between its rounds
 _LEAST_S = 1.5  # of a run
 _TRAVEL_UM = 6.0  # of a run, in an excursion limit of 10
 _HIGHEST = 0.25  # of the limit, where a run begins at most
-_CAUGHT = 0.55  # of the limit; the rest is for gusts, and for the noise that the guard keeps in hand
+# of the limit; the rest is for gusts, and for the noise that the guard keeps in hand
+_CAUGHT = 0.55
 _SHARE_LEAST = 0.4  # of the travel: shorter runs see little but noise, and gusts stop them as well
 _NONE_UM_PER_S = 1e-3  # at command 0
 _SHORTEST_S, _PULSE_S, _LONGEST_S = 0.05, 0.2, 20.0
 _MOST_VISITS = 6
 _ABOVE = 0.15
 _SCOUTS = (0.25, 0.5, 0.75, 1.0)
-_FIRST_ROUNDS, _FIRST_RISE = 5, 0.2  # rounds without any flow; share of the limit at most, by a first pulse
+_FIRST_ROUNDS, _FIRST_RISE = (
+    5,
+    0.2,
+)  # rounds without any flow; share of the limit at most, by a first pulse
 _FIRST_PULSES_S = (0.3, 0.6, 1.2, 2.4, 2.4, 2.4, 2.4)
 
 
@@ -80,11 +88,17 @@ class PumpSurvey:
         return sum(run.dt_s * run.fraction.size for run in self.runs)
 
     def take(self, run: PumpRun, completed: bool) -> None:
-        """Learn from a run; one that its guard stopped counts as well, and the next ones go less far."""
+        """Learn from a run; one that its guard stopped counts as well, and the next ones go less
+        far.
+        """
         self._rounds += 1
         if not self._scarce:
-            self._share = float(np.clip(self._share * (1.2 if completed else 0.8), _SHARE_LEAST, 1.0))
-        elif not completed:  # a weak pump sinks between short pulses; a strong one rises too far in long ones
+            self._share = float(
+                np.clip(self._share * (1.2 if completed else 0.8), _SHARE_LEAST, 1.0)
+            )
+        elif (
+            not completed
+        ):  # a weak pump sinks between short pulses; a strong one rises too far in long ones
             self._longer *= 2.0 if run.sank else 0.5
         if run.fraction.size * run.dt_s > _LEAST_S:
             self.runs.append(run)
@@ -102,11 +116,17 @@ class PumpSurvey:
             if self._rounds >= (1 if hopeless else 3) * _FIRST_ROUNDS:
                 return ()
             first = min(1.0, self.holding_fraction + 0.1 * (1 + self._rounds % _FIRST_ROUNDS))
-            rise_um = min(max(1.0, 1.5 * self.laser_um), _FIRST_RISE * self.limit_um)  # shows in the noise
+            rise_um = min(
+                max(1.0, 1.5 * self.laser_um), _FIRST_RISE * self.limit_um
+            )  # shows in the noise
             # after a round that sank, at once: it sinks further until the first gas arrives
             down = [_for(0.0, 20.0, -1.5 * rise_um)] if self._longer <= 1.0 else []
-            lengths_s = np.clip(self._longer * np.array(_FIRST_PULSES_S), _SHORTEST_S, _LONGEST_S).tolist()
-            pulses = ((*down, _for(first, longest_s, rise_um), _for(0.0, 0.5)) for longest_s in lengths_s)
+            lengths_s = np.clip(
+                self._longer * np.array(_FIRST_PULSES_S), _SHORTEST_S, _LONGEST_S
+            ).tolist()
+            pulses = (
+                (*down, _for(first, longest_s, rise_um), _for(0.0, 0.5)) for longest_s in lengths_s
+            )
             return tuple(step for pulse in pulses for step in pulse)
         self._want()
         made: list[PumpStep] = []
@@ -121,8 +141,12 @@ class PumpSurvey:
 
     @property
     def full_um_per_s(self) -> float:
-        """The largest flow seen for certain; a level that was only passed through may look strong."""
-        return max([1e-3, *(float((at.flows - 2 * at.sigmas).max()) for at in self._branches.values())])
+        """The largest flow seen for certain; a level that was only
+        passed through may look strong.
+        """
+        return max(
+            [1e-3, *(float((at.flows - 2 * at.sigmas).max()) for at in self._branches.values())]
+        )
 
     @property
     def holding(self) -> float:
@@ -137,16 +161,22 @@ class PumpSurvey:
         return self.sigma(level) <= _KNOWN_SHARE * self.full_um_per_s
 
     def sigma(self, level: Level) -> float:
-        """Standard error of its flow in µm/s, with what its neighbours tell; infinite for one not visited."""
+        """Standard error of its flow in µm/s, with what its neighbours tell; infinite for one not
+        visited.
+        """
         branch = self._branches[level.rising]
         at = np.flatnonzero(branch.fractions == level.fraction)
         return float(branch.sigmas[at[0]]) if at.size else math.inf
 
     def _branch(self, rising: bool) -> Branch:
-        """One branch, from no flow at command 0; its flows never fall, and are as smooth as they look."""
+        """One branch, from no flow at command 0; its flows never fall, and are as smooth as they
+        look.
+        """
         from scipy.optimize import isotonic_regression
 
-        asked = [level in self._wanted or not self._wanted for level in self.fit.levels]  # not just passed through
+        asked = [
+            level in self._wanted or not self._wanted for level in self.fit.levels
+        ]  # not just passed through
         own = [i for i, level in enumerate(self.fit.levels) if level.rising == rising and asked[i]]
         levels = list(self.fit.levels.items())
         at = [(levels[i][0].fraction, levels[i][1].flow_um_per_s) for i in own]
@@ -159,7 +189,9 @@ class PumpSurvey:
         return Branch(fractions, np.asarray(isotonic_regression(np.maximum(flows, 0.0)).x), sigmas)
 
     def start(self) -> tuple[float, float] | None:
-        """The command at which a standing pump starts with a flow at once, and the one below it, if it does."""
+        """The command at which a standing pump starts with a flow at once, and the one below it, if
+        it does.
+        """
         return first_jump(self._branches[True], self.full_um_per_s)
 
     def hysteretic(self) -> bool:
@@ -176,10 +208,14 @@ class PumpSurvey:
         return False
 
     def _want(self) -> None:
-        """Add levels: scouts first, then where the curve bends or jumps, then those reached from above."""
+        """Add levels: scouts first, then where the curve bends or jumps, then those reached from
+        above.
+        """
         if not self._wanted:
             low, high = self.holding_fraction, min(level.fraction for level in self.fit.levels)
-            self._wanted |= {Level(_rounded(high + share * (1 - high))) for share in _SCOUTS} | {Level(high)}
+            self._wanted |= {Level(_rounded(high + share * (1 - high))) for share in _SCOUTS} | {
+                Level(high)
+            }
             self._wanted |= {Level(_rounded(low * share)) for share in _SCOUTS}
         seen = all(level in self.fit.levels for level in self._wanted if self._reachable(level))
         if seen:
@@ -201,9 +237,16 @@ class PumpSurvey:
         found: list[float] = []
         for i, (low, high) in enumerate(pairwise(fractions.tolist())):
             clear = flows[i + 1] - flows[i] > 4 * math.hypot(sigmas[i], sigmas[i + 1])
-            least = float(np.interp(high + STALL_MARGIN, fractions, flows))  # that a loop would give
+            least = float(
+                np.interp(high + STALL_MARGIN, fractions, flows)
+            )  # that a loop would give
             edge = _FINE_EDGE if least > _TOO_MUCH * self.fit.leak_um_per_s else _EDGE
-            if clear and flows[i] < 0.02 * full and flows[i + 1] > JUMP_SHARE * full and high - low > edge:
+            if (
+                clear
+                and flows[i] < 0.02 * full
+                and flows[i + 1] > JUMP_SHARE * full
+                and high - low > edge
+            ):
                 found.append(_rounded((low + high) / 2))
         if not rising:
             return found
@@ -218,11 +261,14 @@ class PumpSurvey:
         return found
 
     def _from_above(self) -> list[float]:
-        """Commands to reach from above: two for hysteresis, all if there is any; below the start for the stall."""
+        """Commands to reach from above: two for hysteresis, all if there is any; below the start
+        for the stall.
+        """
         fractions, flows, _ = self._branches[True].columns
         reached = np.array([f for f in fractions.tolist() if self._reachable(Level(f))])
         found = [
-            float(reached[np.argmin(np.abs(flows[: reached.size] - s * self.full_um_per_s))]) for s in (0.3, 0.6)
+            float(reached[np.argmin(np.abs(flows[: reached.size] - s * self.full_um_per_s))])
+            for s in (0.3, 0.6)
         ]
         start = self.start()
         if start is not None:
@@ -232,18 +278,24 @@ class PumpSurvey:
         return [f for f in found if f > 0]
 
     def _visits(self) -> list[Level]:
-        """Levels to visit in the next round: new ones once, small ones first, then others as often as they ask for.
+        """Levels to visit in the next round: new ones once, small ones first, then others as often
+        as they ask for.
 
-        A round reaches only the first of them. Where the leak's error keeps every level from being known, those with
-        the largest error of their own must be among them.
+        A round reaches only the first of them. Where the leak's error keeps every level from being
+        known, those with the largest error of their own must be among them.
         """
         wanted = sorted(level for level in self._wanted if self._reachable(level))
         fresh = [level for level in wanted if level not in self.fit.levels]
         wide = max(_KNOWN_SHARE * self.full_um_per_s, 1e-3)
-        worst = sorted((level for level in wanted if level not in fresh), key=self.sigma, reverse=True)
+        worst = sorted(
+            (level for level in wanted if level not in fresh), key=self.sigma, reverse=True
+        )
         asked = [3 * (self.sigma(level) / wide) ** 2 for level in worst]
         again = [
-            level for turn in range(_MOST_VISITS) for level, n in zip(worst, asked, strict=True) if n > max(turn, 3)
+            level
+            for turn in range(_MOST_VISITS)
+            for level, n in zip(worst, asked, strict=True)
+            if n > max(turn, 3)
         ]
         return fresh + again
 
@@ -251,7 +303,9 @@ class PumpSurvey:
     def _scarce(self) -> bool:
         """No flow is known, or, in the rounds of the first pulses, none that lifts the mirror."""
         flows = self._sure()[1]
-        return not flows.any() or (self._rounds < 3 * _FIRST_ROUNDS and flows.max() <= self.fit.leak_um_per_s)
+        return not flows.any() or (
+            self._rounds < 3 * _FIRST_ROUNDS and flows.max() <= self.fit.leak_um_per_s
+        )
 
     def _sure(self) -> tuple[FloatArray, FloatArray]:
         """Commands whose flows are known to a third, and the flows."""
@@ -262,7 +316,9 @@ class PumpSurvey:
         return fractions[sure], flows[sure]
 
     def _guess(self, fraction: float) -> float:
-        """Flow that a command may have, rather too large: beyond the largest known one like a square."""
+        """Flow that a command may have, rather too large: beyond the largest known one like a
+        square.
+        """
         fractions, flows = (np.append(0.0, column) for column in self._sure())
         if fraction <= fractions[-1] or not flows[-1]:
             return float(np.interp(fraction, fractions, flows))
@@ -278,19 +334,29 @@ class PumpSurvey:
         """From where the mirror may be to the level's run, and until its gas has arrived."""
         leak, travel_um, up = max(self.fit.leak_um_per_s, 0.05), self._travel_um, self._up()
         run = _for(level.fraction, self._run_s(level))
-        up_s = 60.0 if self._least(up) > leak else _FIRST_PULSES_S[-1]  # what an unknown command gives is not awaited
+        up_s = (
+            60.0 if self._least(up) > leak else _FIRST_PULSES_S[-1]
+        )  # what an unknown command gives is not awaited
         if self._net(level) > 0:
             late_s = self.fit.delay_s + self.fit.lag_s
-            late_um, caught_um = leak * late_s, _CAUGHT * self._share * self.limit_um  # sinks before an answer
+            late_um, caught_um = (
+                leak * late_s,
+                _CAUGHT * self._share * self.limit_um,
+            )  # sinks before an answer
             bottom_um = -0.5 * travel_um - min(1.0, 0.1 * self._net(level))
             above = [] if level.rising else [_for(self._higher(level), 0.1)]
-            # where nothing is known to lift it meanwhile it begins higher, so that its gas can be awaited
+            # where nothing is known to lift it meanwhile it begins higher, so that its gas can be
+            # awaited
             sinks_um = late_um + (leak - self._least(level.fraction)) * run.duration_s
             least_um = min(bottom_um + late_um, 0.0)
             start_um = max(least_um, min(sinks_um - caught_um, _HIGHEST * self.limit_um))
-            first = [_for(up, up_s, bottom_um + start_um - least_um - 0.5), _for(0.0, 60.0, start_um)]
+            first = [
+                _for(up, up_s, bottom_um + start_um - least_um - 0.5),
+                _for(0.0, 60.0, start_um),
+            ]
             wait = [_for(0.0, max(0.1, late_s))] if start_um >= sinks_um - caught_um else []
-            # a short run lifts it less than the leak takes meanwhile: the hold must catch it within the limit
+            # a short run lifts it less than the leak takes meanwhile: the hold must catch it within
+            # the limit
             until_um = min(late_um - caught_um, 0.0)
             wait.append(_for(0.0, max(0.3, self.fit.answer_s - late_s * len(wait)), until_um))
             return [*first, *above, run, *wait]
@@ -314,15 +380,21 @@ class PumpSurvey:
         fresh, net = level not in self.fit.levels, self._net(level)
         longest_s, way_um = _LONGEST_S, self._travel_um
         if fresh:
-            sinks_um_per_s = self.fit.leak_um_per_s - self._least(level.fraction)  # the guess may be wrong
-            longest_s = min(longest_s, way_um * (0.5 if net > 0 else 1.5) / max(sinks_um_per_s, 1e-3))
+            sinks_um_per_s = self.fit.leak_um_per_s - self._least(
+                level.fraction
+            )  # the guess may be wrong
+            longest_s = min(
+                longest_s, way_um * (0.5 if net > 0 else 1.5) / max(sinks_um_per_s, 1e-3)
+            )
             way_um *= 0.6
         return max(min(way_um / max(abs(net), 0.05), longest_s), _PULSE_S)
 
     def _lasts_s(self, level: Level) -> float:
         leak = max(self.fit.leak_um_per_s, 0.05)
         return (
-            self._run_s(level) * (1 + max(self._net(level), 0.0) / leak) + self.fit.answer_s + self._travel_um / leak
+            self._run_s(level) * (1 + max(self._net(level), 0.0) / leak)
+            + self.fit.answer_s
+            + self._travel_um / leak
         )
 
     def _higher(self, level: Level) -> float:
@@ -335,12 +407,21 @@ class PumpSurvey:
         `held`: the hold brought the mirror back after the last round.
         """
         return Surveyed(
-            self.fit, self._branches.get(True, NO_BRANCH), self._branches.get(False, NO_BRANCH), self.full_um_per_s,
-            bool(self._branches) and self.hysteretic(), self.duration_s, self.done, self.limit_um, held,
-        ).map()  # fmt: skip
+            self.fit,
+            self._branches.get(True, NO_BRANCH),
+            self._branches.get(False, NO_BRANCH),
+            self.full_um_per_s,
+            bool(self._branches) and self.hysteretic(),
+            self.duration_s,
+            self.done,
+            self.limit_um,
+            held,
+        ).map()
 
     def _up(self) -> float:
-        """The smallest known command that lifts the mirror well; if none does, the first that may."""
+        """The smallest known command that lifts the mirror well; if none does,
+        the first that may.
+        """
         fractions, flows, sigmas = self._branches[True].columns
         lifts = fractions[flows - 2 * sigmas > 1.5 * self.fit.leak_um_per_s]
         if lifts.size:

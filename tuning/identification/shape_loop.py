@@ -1,9 +1,11 @@
-"""The shape loop: the figure's response to sag, noise and drift of its measurement, and the time constant.
+"""The shape loop: the figure's response to sag, noise and drift of its measurement, and the time
+constant.
 
-A small step of the setpoint moves the sag by a known amount: the change of the Zernike vector over it is the
-sensitivity. Sag by deflectometry less the laser's reading is, while the mirror is held, the deflectometry's noise and
-the drift between the two: white noise of sigma a cycle of length T, and a random walk of q µm/sqrt(s). The best
-time constant between them is (docs/physics.md, shape loop)
+A small step of the setpoint moves the sag by a known amount: the change of the Zernike vector over
+it is the sensitivity. Sag by deflectometry less the laser's reading is, while the mirror is held,
+the deflectometry's noise and the drift between the two: white noise of sigma a cycle of length T,
+and a random walk of q µm/sqrt(s). The best time constant between them is (docs/physics.md, shape
+loop)
 
     tau = sigma sqrt(T) / q.
 """
@@ -23,10 +25,13 @@ from membrane_ctrl.sessions.live_hold import HoldError
 from tuning.identification.loop_model import Series
 from tuning.rig import HoldRig
 
-# White noise on a random walk, at any times: the amount of each, and the largest walk that the data permit.
+# White noise on a random walk, at any times: the amount of each, and the largest walk that the data
+# permit.
 #
-# The likelihood of the local level model by its Kalman filter, with the noise's variance concentrated out, over the
-# ratio of walk to noise. Source: Durbin and Koopman, Time Series Analysis by State Space Methods (2012), chapter 2.
+# The likelihood of the local level model by its Kalman filter, with the noise's variance
+# concentrated out, over the ratio of walk to noise. Source: Durbin and Koopman, Time Series
+# Analysis by State Space Methods
+# (2012), chapter 2.
 
 _RATIOS = np.geomspace(1e-9, 10.0, 61)  # variance of the walk per cycle over that of the noise
 _DROP = 2.0  # of the log likelihood: 95 % one-sided, with some margin for the grid
@@ -37,7 +42,8 @@ class LocalLevel:
     """Result of the fit."""
 
     white: float  # standard deviation of the noise
-    walk: float  # variance of the walk per second; if no walk is seen, the largest that the data permit
+    # variance of the walk per second; if no walk is seen, the largest that the data permit
+    walk: float
     seen: bool  # the data are much less likely without a walk
 
 
@@ -57,7 +63,9 @@ def fit_local_level(values: FloatArray, times_s: FloatArray) -> LocalLevel:
 
 
 def _likelihood(values: FloatArray, steps: FloatArray, ratio: float) -> tuple[float, float]:
-    """Log likelihood and noise variance for a ratio; the first value only initialises the filter."""
+    """Log likelihood and noise variance for a ratio; the first value
+    only initialises the filter.
+    """
     level, spread = float(values[0]), 1.0
     squares = logs = 0.0
     for value, step in zip(values[1:].tolist(), steps.tolist(), strict=True):
@@ -75,7 +83,10 @@ def _likelihood(values: FloatArray, steps: FloatArray, ratio: float) -> tuple[fl
 
 
 STEP_UM = 5.0
-_LEVEL_S, _SETTLE_S = 60.0, 12.0  # of each level; the ramp, the loop's recovery, and a cycle started earlier
+_LEVEL_S, _SETTLE_S = (
+    60.0,
+    12.0,
+)  # of each level; the ramp, the loop's recovery, and a cycle started earlier
 TYPICAL_S = 3 * (_LEVEL_S + _SETTLE_S)
 _LATE_S = 15.0  # that a level may take longer on a busy machine
 _LEAST_CYCLES = 8
@@ -91,7 +102,9 @@ class ShapeLoopFit:
 
     sensitivity: Series  # (terms,): change of the coefficients per µm of sag, and standard errors
     sensitivity_sigma: Series  # (terms,)
-    agreement: float  # cosine between it and the one assumed, piston left out; 1 is the same direction
+    agreement: (
+        float  # cosine between it and the one assumed, piston left out; 1 is the same direction
+    )
     scale: float  # sag by deflectometry per µm of laser reading
     sigma_um: float  # noise of a cycle
     cycle_s: float  # between results
@@ -117,23 +130,32 @@ def step_experiment(rig: HoldRig) -> list[list[ShapeEstimate]]:
     finally:
         rig.set_gains(rig.loop, f"{why}: back")
     if min(len(level) for level in levels) < _LEAST_CYCLES:
-        raise HoldError(f"fewer than {_LEAST_CYCLES} shapes per level: is the shape measured every few seconds?")
+        raise HoldError(
+            f"fewer than {_LEAST_CYCLES} shapes per level: is the shape measured every few seconds?"
+        )
     return levels
 
 
 def evaluate(
     levels: Sequence[Sequence[ShapeEstimate]], steady: Sequence[ShapeEstimate], assumed: Series
 ) -> ShapeLoopFit:
-    """Sensitivity from the levels (low, high, low), noise and drift from these and the shapes of a steady hold.
+    """Sensitivity from the levels (low, high, low), noise and drift from these and the shapes of a
+    steady hold.
 
-    `assumed` (terms,) is the controller's sensitivity. Raises ValueError if there are too few shapes.
+    `assumed` (terms,) is the controller's sensitivity. Raises ValueError if there are too few
+    shapes.
     """
     means = [np.mean([shape.coeffs_um for shape in level], axis=0) for level in levels]
     laser_um = [float(np.mean([shape.displacement_um for shape in level])) for level in levels]
     step_um = laser_um[1] - (laser_um[0] + laser_um[2]) / 2
     sensitivity = (means[1] - (means[0] + means[2]) / 2) / step_um
-    scatter = np.mean([np.var([s.coeffs_um for s in level], axis=0, ddof=1) / len(level) for level in levels], axis=0)
-    shapes = sorted((*steady, *(s for level in levels for s in level)), key=lambda shape: shape.time_s)
+    scatter = np.mean(
+        [np.var([s.coeffs_um for s in level], axis=0, ddof=1) / len(level) for level in levels],
+        axis=0,
+    )
+    shapes = sorted(
+        (*steady, *(s for level in levels for s in level)), key=lambda shape: shape.time_s
+    )
     times_s, gaps_um = _gaps(shapes, assumed)
     cycle_s = float(np.median(np.diff(times_s)))
     noise = fit_local_level(gaps_um, times_s)
@@ -153,15 +175,23 @@ def evaluate(
 
 
 def _gaps(shapes: Sequence[ShapeEstimate], assumed: Series) -> tuple[Series, Series]:
-    """Times, and change of sag less laser reading: the drift between the two and the noise of a cycle."""
+    """Times, and change of sag less laser reading: the drift between the two and the noise of a
+    cycle.
+    """
     first = shapes[0]
-    seen = (sag_change(s.coeffs_um, first.coeffs_um, s.covariance_um2, assumed).change_um for s in shapes)
-    gaps_um = np.array([sag_um - shape.displacement_um for sag_um, shape in zip(seen, shapes, strict=True)])
+    seen = (
+        sag_change(s.coeffs_um, first.coeffs_um, s.covariance_um2, assumed).change_um
+        for s in shapes
+    )
+    gaps_um = np.array(
+        [sag_um - shape.displacement_um for sag_um, shape in zip(seen, shapes, strict=True)]
+    )
     return np.array([shape.time_s for shape in shapes]), gaps_um
 
 
-# The trial of a time constant. The drift does not depend on the trim, so that both trackers can be run on the very
-# shapes of the trial: what differs is the tracker alone, and no weather has to be compared.
+# The trial of a time constant. The drift does not depend on the trim, so that both trackers can be
+# run on the very shapes of the trial: what differs is the tracker alone, and no weather has to be
+# compared.
 
 GROWTH_MAX = 1.1  # of the error with which the next shape is predicted
 _TRACKING_LEAST = 0.9  # of the trial
@@ -181,11 +211,17 @@ class OuterTrial:
 
 
 def trial(
-    rig: HoldRig, times_s: tuple[float, float], earlier: Sequence[ShapeEstimate], assumed: Series, duration_s: float
+    rig: HoldRig,
+    times_s: tuple[float, float],
+    earlier: Sequence[ShapeEstimate],
+    assumed: Series,
+    duration_s: float,
 ) -> OuterTrial:
-    """Hold with the second time constant; keep it if it predicts the shapes as well as the first, the present one.
+    """Hold with the second time constant; keep it if it predicts the shapes as well as the first,
+    the present one.
 
-    `earlier` shapes let both trackers settle. If the session ends, or is killed, the hold takes it back by itself.
+    `earlier` shapes let both trackers settle. If the session ends, or is killed, the hold takes it
+    back by itself.
     """
     before_s, after_s = times_s
     why = "shape loop: time constant"
@@ -199,12 +235,19 @@ def trial(
     during = [shape for shape in rig.shapes[begun:] if shape.verdict != "rejected"]
     tracking = float(np.mean([row.shape_state == ShapeState.TRACKING for row in rows]))
     gaps = _gaps([*earlier, *during], assumed)
-    error_before_um, error_um = (_predicted(*gaps, memory_s, len(during)) for memory_s in (before_s, after_s))
+    error_before_um, error_um = (
+        _predicted(*gaps, memory_s, len(during)) for memory_s in (before_s, after_s)
+    )
     reason = ""
     if len(during) < _LEAST_CYCLES or tracking < _TRACKING_LEAST:
-        reason = f"the shape loop tracked only {tracking:.0%} of the trial, with {len(during)} shapes"
+        reason = (
+            f"the shape loop tracked only {tracking:.0%} of the trial, with {len(during)} shapes"
+        )
     elif error_um > GROWTH_MAX * error_before_um:
-        reason = f"the next shape is predicted to {error_um:.2f} µm, by the former one to {error_before_um:.2f} µm"
+        reason = (
+            f"the next shape is predicted to {error_um:.2f} µm, by the former one to "
+            f"{error_before_um:.2f} µm"
+        )
     if reason:
         rig.set_gains(rig.loop, f"{why}: {reason}"[:250], _BACK_S)
     else:
@@ -227,7 +270,9 @@ def _predicted(times_s: Series, gaps_um: Series, memory_s: float, last: int) -> 
     tracker = DriftTracker()
     tracker.begin(float(times_s[0]))
     errors_um: list[float] = []
-    for time_s, gap_um in zip(times_s[1:].tolist(), (gaps_um[1:] - gaps_um[0]).tolist(), strict=True):
+    for time_s, gap_um in zip(
+        times_s[1:].tolist(), (gaps_um[1:] - gaps_um[0]).tolist(), strict=True
+    ):
         errors_um.append(gap_um - tracker.at(time_s, memory_s))
         tracker.take(gap_um, time_s, memory_s)
     return float(np.sqrt(np.mean(np.square(errors_um[-last:])))) if last else math.nan

@@ -1,7 +1,8 @@
 """Gains from a model, by well-known rules and by search.
 
-All treat lags as dead time (delay = theta + T + filter + half a sample): the rules are made for an integrator with
-delay, and the pump's lag of a tenth of the loop's time constant does not justify a D term.
+All treat lags as dead time (delay = theta + T + filter + half a sample): the rules are made for an
+integrator with delay, and the pump's lag of a tenth of the loop's time constant does not justify a
+D term.
 """
 
 import math
@@ -30,27 +31,32 @@ class Demands:
     """Demands on every proposal, whatever their effect on the variance."""
 
     ms: float = 1.4  # largest sensitivity
-    # A step of the leak by half that of a sound mirror must not move the centre further than the band. Without this
-    # demand, a mirror without weather would get no gain at all.
+    # A step of the leak by half that of a sound mirror must not move the centre further than the
+    # band. Without this demand, a mirror without weather would get no gain at all.
     load_step_um_per_s: float = 0.6
     load_peak_um: float = 2.0
     recovery_s: float = 60.0  # three integral times at most
     # A further demand: as good an answer to that step as this one
     as_good_as: loop_model.LoadStep | None = None
-    # Standard deviations of the flow's change per tick within the rate limit: beyond, it distorts the loop's answer
+    # Standard deviations of the flow's change per tick within the rate limit: beyond, it distorts
+    # the loop's answer
     rate_sigmas: float = 1.7
-    # Of a reading behind the loop's filter: half of the band; beyond, a mirror at rest is seen to leave the band, and
-    # a hold takes minutes to settle
+    # Of a reading behind the loop's filter: half of the band; beyond, a mirror at rest is seen to
+    # leave the band, and a hold takes minutes to settle
     reading_um: float = 1.0
 
 
-def load_peak_um(gains: loop_model.Gains, model: loop_model.PlantModel, step_um_per_s: float) -> float:
-    """Bound on the largest excursion after a step of the leak: the loop's delay counts as time without response.
+def load_peak_um(
+    gains: loop_model.Gains, model: loop_model.PlantModel, step_um_per_s: float
+) -> float:
+    """Bound on the largest excursion after a step of the leak: the loop's delay counts as time
+    without response.
 
     For searches: `loop_model.load_step` is exact, smaller, and takes longer.
 
     y'' + k K y' + k K / Ti y = D delta(t): a step D of the speed peaks at
-    D / w0 exp(-zeta w0 t), with w0 = sqrt(k K / Ti) and zeta = sqrt(k K Ti) / 2, where the speed is back to 0.
+    D / w0 exp(-zeta w0 t), with w0 = sqrt(k K / Ti) and zeta = sqrt(k K Ti) / 2, where the speed is
+    back to 0.
     """
     natural = math.sqrt(model.gain * gains.kp_per_s / gains.ti_s)
     zeta = math.sqrt(model.gain * gains.kp_per_s * gains.ti_s) / 2
@@ -78,12 +84,16 @@ def simc(
 
 
 def amigo(model: loop_model.PlantModel, dt_s: float, filter_s: float) -> loop_model.Gains:
-    """AMIGO PI for an integrating process: K = 0.35 / (k d), Ti = 13.4 d (Astrom and Hagglund 2006, eq. 7.3)."""
+    """AMIGO PI for an integrating process: K = 0.35 / (k d), Ti = 13.4 d (Astrom and Hagglund 2006,
+    eq. 7.3).
+    """
     delay_s = effective_delay_s(model, dt_s, filter_s)
     return loop_model.Gains(0.35 / (model.gain * delay_s), 13.4 * delay_s, 0.0, filter_s)
 
 
-def lambda_tuned(model: loop_model.PlantModel, dt_s: float, filter_s: float, factor: float = 3.0) -> loop_model.Gains:
+def lambda_tuned(
+    model: loop_model.PlantModel, dt_s: float, filter_s: float, factor: float = 3.0
+) -> loop_model.Gains:
     """Lambda PI, lambda = factor x delay: Ti = 2 lambda + d, K = Ti / (k (lambda + d)^2)."""
     delay_s = effective_delay_s(model, dt_s, filter_s)
     lambda_s = factor * delay_s
@@ -92,11 +102,17 @@ def lambda_tuned(model: loop_model.PlantModel, dt_s: float, filter_s: float, fac
 
 
 def ziegler_nichols(ultimate_gain_per_s: float, ultimate_period_s: float) -> loop_model.Gains:
-    """The Ziegler-Nichols PID from a relay: K = 0.6 Ku, Ti = Tu / 2, Td = Tu / 8, no filter on D."""
-    return loop_model.Gains(0.6 * ultimate_gain_per_s, ultimate_period_s / 2, ultimate_period_s / 8, 0.0)
+    """The Ziegler-Nichols PID from a relay: K = 0.6 Ku, Ti = Tu / 2, Td = Tu / 8,
+    no filter on D.
+    """
+    return loop_model.Gains(
+        0.6 * ultimate_gain_per_s, ultimate_period_s / 2, ultimate_period_s / 8, 0.0
+    )
 
 
-def max_ki(model: loop_model.PlantModel, dt_s: float, filter_s: float, ms: float) -> loop_model.Gains:
+def max_ki(
+    model: loop_model.PlantModel, dt_s: float, filter_s: float, ms: float
+) -> loop_model.Gains:
     """PI with the largest K / Ti at a sensitivity below `ms`: best against a step of the leak."""
     start = simc(model, dt_s, filter_s)
     return _search(model, dt_s, start, ms, lambda gains: -math.log(gains.kp_per_s / gains.ti_s))
@@ -107,8 +123,8 @@ def least_variance(
 ) -> loop_model.Gains:
     """PI and filter with the least predicted variance of the true centre, within the demands.
 
-    No D: at best it improves the prediction by 1 %, for twice the pump's activity, and on pumps with a second of lag
-    by 5 %: the pump cannot give less than nothing.
+    No D: at best it improves the prediction by 1 %, for twice the pump's activity, and on pumps
+    with a second of lag by 5 %: the pump cannot give less than nothing.
 
     Only the feed-forward of `loop` matters, not its gains.
     """
@@ -116,10 +132,18 @@ def least_variance(
 
     def cost(gains: loop_model.Gains) -> float:
         found = predict(gains, model, disturbance, loop)
-        jump = demands.rate_sigmas * found.flow_step_std_um_per_s / (loop.flow_rate_limit_um_per_s2 * dt_s)
+        jump = (
+            demands.rate_sigmas
+            * found.flow_step_std_um_per_s
+            / (loop.flow_rate_limit_um_per_s2 * dt_s)
+        )
         peak = load_peak_um(gains, model, demands.load_step_um_per_s) / demands.load_peak_um
         slow = 3 * gains.ti_s / demands.recovery_s
-        reading = disturbance.laser_um * math.sqrt(dt_s / (dt_s + 2 * gains.filter_s)) / demands.reading_um
+        reading = (
+            disturbance.laser_um
+            * math.sqrt(dt_s / (dt_s + 2 * gains.filter_s))
+            / demands.reading_um
+        )
         shares = [jump, peak, slow, reading]
         if demands.as_good_as is not None:
             answer = loop_model.load_step(gains, model, demands.load_step_um_per_s, dt_s)
@@ -139,7 +163,9 @@ def _search(
     ms: float,
     cost: Callable[[loop_model.Gains], float],
 ) -> loop_model.Gains:
-    """PI with the least cost at the filter of `start`, with the sensitivity below `ms`; in logarithms."""
+    """PI with the least cost at the filter of `start`, with the sensitivity below `ms`; in
+    logarithms.
+    """
     delay_s = effective_delay_s(model, dt_s, start.filter_s)
     low = np.log([_GAIN_RANGE[0] / (model.gain * delay_s), _TI_RANGE[0] * delay_s])
     high = np.log([_GAIN_RANGE[1] / (model.gain * delay_s), _TI_RANGE[1] * delay_s])
@@ -157,7 +183,15 @@ def _search(
         return cost(gains) + _STEEP * max(0.0, peak - ms) + outside
 
     first = np.clip(np.log([start.kp_per_s, start.ti_s]), low, high)
-    while not math.isfinite(loop_model.sensitivity_peak(gains_at(first), model, dt_s)) and first[0] > low[0]:
+    while (
+        not math.isfinite(loop_model.sensitivity_peak(gains_at(first), model, dt_s))
+        and first[0] > low[0]
+    ):
         first[0] = max(low[0], first[0] - 0.5)
-    fit = minimize(penalised, first, method="Nelder-Mead", options={"xatol": 1e-3, "fatol": 1e-5, "maxiter": 300})
+    fit = minimize(
+        penalised,
+        first,
+        method="Nelder-Mead",
+        options={"xatol": 1e-3, "fatol": 1e-5, "maxiter": 300},
+    )
     return gains_at(fit.x)

@@ -1,9 +1,11 @@
-"""What a design will do: the predicted standard deviations, the lower bound for any controller, and a preview.
+"""What a design will do: the predicted standard deviations, the lower bound for any controller, and
+a preview.
 
-Predicted: the true centre is S d - T n for a disturbance d and laser noise n; its variance is the integral of its
-spectrum. Bound: no controller acts before the dead time, so the error is at least that of the best prediction of the
-disturbance over it (Astrom, Introduction to Stochastic Control Theory, 1970, chapter 6). The pump's lag is no limit:
-it can be inverted. Preview: the real one-sided pump on the fitted plant.
+Predicted: the true centre is S d - T n for a disturbance d and laser noise n; its variance is the
+integral of its spectrum. Bound: no controller acts before the dead time, so the error is at least
+that of the best prediction of the disturbance over it (Astrom, Introduction to Stochastic Control
+Theory, 1970, chapter 6). The pump's lag is no limit: it can be inverted. Preview: the real
+one-sided pump on the fitted plant.
 """
 
 import math
@@ -27,7 +29,9 @@ Matrix = FloatArray
 
 @dataclass(frozen=True, slots=True)
 class Predicted:
-    """Standard deviations: of the true centre, of the feedback's flow, and of its change from tick to tick."""
+    """Standard deviations: of the true centre, of the feedback's flow, and of its change from tick
+    to tick.
+    """
 
     std_um: float
     flow_std_um_per_s: float
@@ -35,13 +39,19 @@ class Predicted:
 
 
 def predict(
-    gains: loop_model.Gains, model: loop_model.PlantModel, disturbance: DisturbanceModel, loop: LoopConfig
+    gains: loop_model.Gains,
+    model: loop_model.PlantModel,
+    disturbance: DisturbanceModel,
+    loop: LoopConfig,
 ) -> Predicted:
     """Of a stable loop; the pump's limits count as they do on average (`limited`)."""
     dt_s = disturbance.rest.dt_s
     w = loop_model.frequencies(dt_s)
     model, moving = limited(gains, model, disturbance, loop, w)
-    sensitivity, noise = 1 / (1 + loop_model.loop_response(gains, model, w, dt_s)), disturbance.rest.white_psd
+    sensitivity, noise = (
+        1 / (1 + loop_model.loop_response(gains, model, w, dt_s)),
+        disturbance.rest.white_psd,
+    )
     centre = np.abs(sensitivity) ** 2 * moving + np.abs(1 - sensitivity) ** 2 * noise
     flow = np.abs(loop_model.controller_response(gains, w) * sensitivity) ** 2 * (moving + noise)
     change = flow * np.abs(2 * np.sin(w * dt_s / 2)) ** 2
@@ -52,7 +62,8 @@ def _variance(psd: FloatArray, w: FloatArray) -> float:
     return float(np.trapezoid(psd * w, np.log(w))) / math.pi
 
 
-_ROUNDS = 4  # of the swing and what the limits leave of it, each from the other: within 1 % of the preview's
+# of the swing and what the limits leave of it, each from the other: within 1 % of the preview's
+_ROUNDS = 4
 
 
 def limited(
@@ -62,33 +73,45 @@ def limited(
     loop: LoopConfig,
     w: FloatArray,
 ) -> tuple[loop_model.PlantModel, FloatArray]:
-    """The plant as a pump with limits drives it, and the spectrum of the centre without feedback at `w`, µm^2 s.
+    """The plant as a pump with limits drives it, and the spectrum of the centre without feedback at
+    `w`, µm^2 s.
 
-    The pump gives no less than nothing and no more than `loop.flow_max_um_per_s`. Statistical linearisation (Gelb and
-    Vander Velde, Multiple-Input Describing Functions, 1968, chapter 7): of a flow that swings like a Gaussian, the
-    limits leave a share, and add noise of their own, whose correlation is the square of the flow's.
+    The pump gives no less than nothing and no more than `loop.flow_max_um_per_s`. Statistical
+    linearisation (Gelb and Vander Velde, Multiple-Input Describing Functions, 1968, chapter 7): of
+    a flow that swings like a Gaussian, the limits leave a share, and add noise of their own, whose
+    correlation is the square of the flow's.
     """
     dt_s, noise = disturbance.rest.dt_s, disturbance.rest.white_psd
-    controller, forward = loop_model.controller_response(gains, w), disturbance.feedforward_psd(w, loop)
+    controller, forward = (
+        loop_model.controller_response(gains, w),
+        disturbance.feedforward_psd(w, loop),
+    )
     plant, moving = model, disturbance.psd(w, model, loop)
     for _ in range(_ROUNDS):
         sensitivity = 1 / (1 + loop_model.loop_response(gains, plant, w, dt_s))
         flow = np.abs(controller * sensitivity) ** 2 * (moving + noise) + forward
         variance = _variance(flow, w)
-        share, rest = _clipped(math.sqrt(variance), model.holding_flow_um_per_s, loop.flow_max_um_per_s)
+        share, rest = _clipped(
+            math.sqrt(variance), model.holding_flow_um_per_s, loop.flow_max_um_per_s
+        )
         if share > 1 - 1e-3:
             break
         memory_s = _variance(flow**2, w) / variance**2
         plant = replace(model, gain=model.gain * share)
         added = rest * memory_s / (1 + (w * memory_s / 2) ** 2)
-        moving = disturbance.psd(w, plant, loop) + added * np.abs(loop_model.pump_response(model, w, dt_s) / w) ** 2
+        moving = (
+            disturbance.psd(w, plant, loop)
+            + added * np.abs(loop_model.pump_response(model, w, dt_s) / w) ** 2
+        )
     return plant, moving
 
 
 def _clipped(std: float, mean: float, most: float) -> tuple[float, float]:
-    """What limits of 0 and `most` leave of a Gaussian's small changes, and the variance that they add.
+    """What limits of 0 and `most` leave of a Gaussian's small changes, and the variance that they
+    add.
 
-    `mean` is that of the clipped flow; an integrator finds the unclipped one, as Newton's method does here.
+    `mean` is that of the clipped flow; an integrator finds the unclipped one, as Newton's method
+    does here.
     """
     before = mean = min(max(mean, 1e-3 * most), 0.999 * most)
     for _ in range(20):
@@ -99,16 +122,25 @@ def _clipped(std: float, mean: float, most: float) -> tuple[float, float]:
         if abs(after - mean) < 1e-3 * mean:
             break
         before += (mean - after) / max(inside, 1e-3)
-    square = (before**2 + std**2) * inside + std * (before * density[0] - (before + most) * density[1]) + most * above
+    square = (
+        (before**2 + std**2) * inside
+        + std * (before * density[0] - (before + most) * density[1])
+        + most * above
+    )
     return float(inside), float(max(0.0, square - after**2 - (inside * std) ** 2))
 
 
 def least_std_um(
-    model: loop_model.PlantModel, disturbance: DisturbanceModel, loop: LoopConfig, write_s: float = 0.0
+    model: loop_model.PlantModel,
+    disturbance: DisturbanceModel,
+    loop: LoopConfig,
+    write_s: float = 0.0,
 ) -> float:
-    """Bound for the sensors that the loop's feed-forward uses; unused weather counts as disturbance.
+    """Bound for the sensors that the loop's feed-forward uses; unused weather counts as
+    disturbance.
 
-    `write_s` is the time from a reading to its command, if the model's dead time does not include it.
+    `write_s` is the time from a reading to its command, if the model's dead time does not include
+    it.
     """
     moving = Walks.of(disturbance)
     centre = moving.centre
@@ -128,15 +160,19 @@ def least_std_um(
     return float(np.sqrt(centre @ (transition @ after @ transition.T + kicks) @ centre))
 
 
-# A walk that returns after an hour is equivalent for the loop, and bounds what the laser cannot distinguish.
+# A walk that returns after an hour is equivalent for the loop, and bounds what the laser cannot
+# distinguish.
 _RETURN_S = 3600.0
-# Intensity of an unseen walk, µm^2/s: 1 nm in a second; zero would leave the filter without a solution.
+# Intensity of an unseen walk, µm^2/s: 1 nm in a second; zero would leave the filter without a
+# solution.
 _UNSEEN = 1e-6
 
 
 @dataclass(frozen=True, slots=True)
 class Walks:
-    """The disturbance as states: their drift (n, n) and diffusion (n, n), and three sums of them (n,)."""
+    """The disturbance as states: their drift (n, n) and diffusion (n, n), and three sums of them
+    (n,).
+    """
 
     drift: Matrix
     diffusion: Matrix
@@ -146,16 +182,23 @@ class Walks:
 
     @classmethod
     def of(cls, disturbance: DisturbanceModel) -> "Walks":
-        """States: barometer, air, gas, fast rest, slow rest, what it reaches; two more for each colour."""
+        """States: barometer, air, gas, fast rest, slow rest, what it reaches; two more for each
+        colour.
+        """
         barometer, air, rest = disturbance.barometer, disturbance.air, disturbance.rest
         colours = [
-            (source, *colour) for source, of in enumerate((barometer, air, rest)) if of for colour in of.coloured
+            (source, *colour)
+            for source, of in enumerate((barometer, air, rest))
+            if of
+            for colour in of.coloured
         ]
         n = 6 + 2 * len(colours)
         drift, diffusion = -np.eye(n) / _RETURN_S, np.zeros((n, n))
         air_s = air.lag_s if air is not None else rest.slow_s
         walks = (barometer.walk if barometer else _UNSEEN, air.walk if air else _UNSEEN)
-        np.fill_diagonal(diffusion[:6, :6], [*walks, 0.0, max(rest.fast, _UNSEEN), max(rest.slow, _UNSEEN), 0.0])
+        np.fill_diagonal(
+            diffusion[:6, :6], [*walks, 0.0, max(rest.fast, _UNSEEN), max(rest.slow, _UNSEEN), 0.0]
+        )
         sums = np.zeros((3, n))
         sums[0, 0] = sums[1, 1] = sums[2, 3] = sums[2, 5] = 1.0
         for first, (source, tau_s, intensity) in zip(range(6, n, 2), colours, strict=True):
@@ -171,7 +214,9 @@ class Walks:
         return cls(drift, diffusion, sums[0], sums[1], centre)
 
     def over(self, step_s: float) -> tuple[Matrix, Matrix]:
-        """Transition and noise covariance over a step (Van Loan 1978), doubled from one shorter than every lag."""
+        """Transition and noise covariance over a step (Van Loan 1978), doubled from one shorter
+        than every lag.
+        """
         n = len(self.drift)
         doublings = max(0, math.ceil(math.log2(step_s * np.abs(self.drift).max())))
         block = np.block([[-self.drift, self.diffusion], [np.zeros((n, n)), self.drift.T]])
@@ -184,10 +229,13 @@ class Walks:
         return transition, covariance
 
 
-# The fitted plant as a bench: previews a proposal with the real one-sided pump before anything is applied.
+# The fitted plant as a bench: previews a proposal with the real one-sided pump before anything is
+# applied.
 #
-# Linear prediction ignores that the pump only adds gas, stalls and starts. Here the real loop drives a pump
-# with the configured curve in front of the identified delay, lag, gain and leak, in the identified weather.
+# Linear prediction ignores that the pump only adds gas, stalls and starts. Here the real loop
+# drives a pump with the configured curve in front of the identified delay, lag, gain and leak, in
+# the identified
+# weather.
 
 _SUBSTEPS = 4  # per tick: resolves a dead time to 2.5 ms at 50 Hz
 _SETTLE_S, _START_S = 30.0, 10.0
@@ -195,9 +243,13 @@ _LEVEL_PA, _LEVEL_C = 101_325.0, 23.0  # arbitrary: only changes matter
 
 
 class _Driven:
-    """Way of the centre for the commands of a pump, through the identified delay and lag, with unit leak left out."""
+    """Way of the centre for the commands of a pump, through the identified delay and lag, with unit
+    leak left out.
+    """
 
-    def __init__(self, model: loop_model.PlantModel, pump: PumpConfig, flow_um_per_s: float, dt_s: float) -> None:
+    def __init__(
+        self, model: loop_model.PlantModel, pump: PumpConfig, flow_um_per_s: float, dt_s: float
+    ) -> None:
         self._model, self._pump = model, pump
         self._curve = gas.branch(pump, pump.curve_um_per_s)
         self._step_s = dt_s / _SUBSTEPS
@@ -209,7 +261,9 @@ class _Driven:
     def step(self, pump_fraction: float) -> float:
         """Run one tick; return the way since the start, without the leak's."""
         pump = self._pump
-        self._running = pump_fraction >= (pump.stall_fraction if self._running else pump.start_fraction)
+        self._running = pump_fraction >= (
+            pump.stall_fraction if self._running else pump.start_fraction
+        )
         flow = self._curve.flow(pump_fraction) if self._running else 0.0
         follow = -math.expm1(-self._step_s / self._model.lag_s)
         for _ in range(_SUBSTEPS):
@@ -253,7 +307,9 @@ class ModelBench:
         leak = self._model.leak_um_per_s + (size if self._ticks * self._dt_s >= at_s else 0.0)
         self._leaked_um += leak * self._dt_s
         self._driven.step(pump_fraction)
-        self._weather = self._transition @ self._weather + self._kicks @ self._rng.standard_normal(self._weather.size)
+        self._weather = self._transition @ self._weather + self._kicks @ self._rng.standard_normal(
+            self._weather.size
+        )
         return self._read()
 
     def _read(self) -> BenchSample:
@@ -267,19 +323,30 @@ class ModelBench:
             _LEVEL_PA + float(walks.barometer @ self._weather) + of.barometer.noise * pressure
             if of.barometer
             else math.nan,
-            _LEVEL_C + float(walks.air @ self._weather) + of.air.noise * temperature if of.air else math.nan,
+            _LEVEL_C + float(walks.air @ self._weather) + of.air.noise * temperature
+            if of.air
+            else math.nan,
         )
 
 
 class _ReplayBench:
-    """The readings of a record with the motion by its own pump replaced by that for other commands."""
+    """The readings of a record with the motion by its own pump
+    replaced by that for other commands.
+    """
 
     def __init__(
-        self, record: loop_model.Record, off_um: loop_model.Series, model: loop_model.PlantModel, pump: PumpConfig
+        self,
+        record: loop_model.Record,
+        off_um: loop_model.Series,
+        model: loop_model.PlantModel,
+        pump: PumpConfig,
     ) -> None:
         self.flow_um_per_s = float(record.part(0.0, _START_S).flow_um_per_s.mean())
         flows = np.append(self.flow_um_per_s, record.flow_um_per_s)
-        own_um = model.gain * loop_model.driven_um(flows, model.dead_time_s, model.lag_s, record.dt_s)[1:]
+        own_um = (
+            model.gain
+            * loop_model.driven_um(flows, model.dead_time_s, model.lag_s, record.dt_s)[1:]
+        )
         columns = (off_um - own_um, record.ambient_pressure_pa, record.air_temperature_c)
         self._rest = zip(*(column.tolist() for column in columns), strict=True)
         self._driven = _Driven(model, pump, self.flow_um_per_s, record.dt_s)
@@ -292,16 +359,23 @@ class _ReplayBench:
 
 
 def replayed_um(
-    record: loop_model.Record, off_um: loop_model.Series, model: loop_model.PlantModel, loop: LoopConfig,
+    record: loop_model.Record,
+    off_um: loop_model.Series,
+    model: loop_model.PlantModel,
+    loop: LoopConfig,
     pump: PumpConfig,
-) -> loop_model.Series:  # fmt: skip
+) -> loop_model.Series:
     """What would have been read, less the setpoint, (n - 1,), had another loop held the mirror.
 
-    With the limits of pump and loop: weather that asks for less than no flow is as hard for it as for the one that
-    held. `off_um` (n,) are the record's readings less its setpoint.
+    With the limits of pump and loop: weather that asks for less than no flow is as hard for it as
+    for the one that held. `off_um` (n,) are the record's readings less its setpoint.
     """
     bench = _ReplayBench(record, off_um, model, pump)
-    return Rig(bench, loop, pump, bench.flow_um_per_s).hold(record.duration_s - record.dt_s).displacement_um
+    return (
+        Rig(bench, loop, pump, bench.flow_um_per_s)
+        .hold(record.duration_s - record.dt_s)
+        .displacement_um
+    )
 
 
 @dataclass(frozen=True, slots=True)
@@ -310,7 +384,8 @@ class Preview:
 
     std_um: float  # of the true centre
     bias_um: float  # target minus true centre
-    # After a step of the leak, weather off: furthest excursion, and time until the centre stays within `RECOVERED_UM`
+    # After a step of the leak, weather off: furthest excursion, and time until the centre stays
+    # within `RECOVERED_UM`
     load_peak_um: float
     recovery_s: float
 
@@ -324,9 +399,13 @@ def preview(
     duration_s: float = 180.0,
     load_step_um_per_s: float = 0.6,
 ) -> Preview:
-    """Hold on the fitted twin in its weather, and once more without weather for a step of the leak."""
+    """Hold on the fitted twin in its weather, and once more without
+    weather for a step of the leak.
+    """
     true_um = _held(loop, pump, model, ModelBench(model, disturbance, pump, seed), duration_s)
-    noise = replace(disturbance.rest, white=disturbance.rest.white * 1e-3, fast=0.0, slow=0.0, coloured=())
+    noise = replace(
+        disturbance.rest, white=disturbance.rest.white * 1e-3, fast=0.0, slow=0.0, coloured=()
+    )
     calm = DisturbanceModel(noise, None, None)
     stepped = ModelBench(model, calm, pump, seed, (_SETTLE_S, load_step_um_per_s))
     answer_um = _held(loop, pump, model, stepped, 120.0)
@@ -340,7 +419,11 @@ def preview(
 
 
 def _held(
-    loop: LoopConfig, pump: PumpConfig, model: loop_model.PlantModel, bench: ModelBench, duration_s: float
+    loop: LoopConfig,
+    pump: PumpConfig,
+    model: loop_model.PlantModel,
+    bench: ModelBench,
+    duration_s: float,
 ) -> loop_model.Series:
     """True centre after settling."""
     rig = Rig(bench, loop, pump, model.holding_flow_um_per_s)

@@ -1,8 +1,8 @@
 """Experiments as step machines: one reading in, one flow out, no clock and no I/O.
 
-The caller runs `step` once per tick and returns the mirror to the loop on `Finished`. Every machine runs inside an
-`ExcursionGuard`, which ends it before the mirror exceeds its permitted excursion from where it
-stood.
+The caller runs `step` once per tick and returns the mirror to the loop on `Finished`. Every machine
+runs inside an `ExcursionGuard`, which ends it before the mirror exceeds its permitted excursion
+from where it stood.
 """
 
 import math
@@ -28,9 +28,12 @@ class BenchSample:
     air_temperature_c: float = float("nan")
 
 
-FAST_S, SLOW_S = 0.1, 0.4  # of the two filters whose difference is the speed, for a reading with little noise
-# A moving mirror continues for the pump's delay and lag after the flow is reduced: 0.24 s, up to twice that on a slow
-# bench, unless more is known; pulses turn within the longest
+FAST_S, SLOW_S = (
+    0.1,
+    0.4,
+)  # of the two filters whose difference is the speed, for a reading with little noise
+# A moving mirror continues for the pump's delay and lag after the flow is reduced: 0.24 s, up to
+# twice that on a slow bench, unless more is known; pulses turn within the longest
 _LATE_S, _LATE_MOST_S = 0.4, 1.0
 _LOST_MAX_S = 0.3  # as long as the safety table tolerates a stale reading
 
@@ -93,9 +96,13 @@ class MotionState(StateNode):
 
 
 class CentreMotion:
-    """Position and speed of the centre from noisy readings: two lags, and their difference over their times'."""
+    """Position and speed of the centre from noisy readings: two lags, and their difference over
+    their times'.
+    """
 
-    def __init__(self, stretch: float = 1.0, late_s: float = _LATE_S, memory: MotionState | None = None) -> None:
+    def __init__(
+        self, stretch: float = 1.0, late_s: float = _LATE_S, memory: MotionState | None = None
+    ) -> None:
         self.memory = memory or MotionState()
         self._fast_s, self._slow_s = stretch * FAST_S, stretch * SLOW_S
         # from a reading to its effect: the filter is late as well
@@ -139,13 +146,16 @@ class CentreMotion:
 
 
 _IN_HAND_SIGMAS = 3.0
-# Of the limit, for the noise: with more, the noise stops sound experiments; longer filters see motion later
+# Of the limit, for the noise: with more, the noise stops sound experiments; longer filters see
+# motion later
 _IN_HAND_SHARE = 0.22
 _STRETCHES = (1.0, 1.5, 2.0, 3.0, 4.0, 6.0)
 
 
 def quieted(around: Around, rate_hz: float) -> Around:
-    """With filters that leave the noise its share of the limit; if none does, the longest for the usual delay."""
+    """With filters that leave the noise its share of the limit; if none does, the longest for the
+    usual delay.
+    """
     share_um = _IN_HAND_SHARE * around.limit_um / _IN_HAND_SIGMAS
     for late_s, stretch in product((around.late_s, _LATE_S), _STRETCHES):
         if around.laser_um * CentreMotion(stretch, late_s).noise_per_laser_um(rate_hz) <= share_um:
@@ -156,7 +166,8 @@ def quieted(around: Around, rate_hz: float) -> Around:
 _PULL_PER_S = 0.15  # stable on a pump three times as strong as configured, and 2 s late
 _BACK_SHARE = 0.2  # of the limit, within which the loop takes over
 _BACK_MOST_S = 40.0  # with a wrong holding flow the pull ends further off
-_STRAYED = 2.0  # limits: this far off something else moves the mirror, and the loop's safety rules are needed
+# limits: this far off something else moves the mirror, and the loop's safety rules are needed
+_STRAYED = 2.0
 
 
 @dataclass(slots=True)
@@ -169,16 +180,17 @@ class GuardState(StateNode):
 
 
 class ExcursionGuard:
-    """Lets an experiment run while the centre can still be stopped within the limit, then brings it back.
+    """Lets an experiment run while the centre can still be stopped within the limit, then brings it
+    back.
 
-    The centre is judged where it will come to rest, position + speed x time to react, with a margin of three standard
-    deviations of that figure's own noise, which grows with fewer readings per second. Raises ValueError, with a
-    remedy, if the margin uses up the limit.
+    The centre is judged where it will come to rest, position + speed x time to react, with a margin
+    of three standard deviations of that figure's own noise, which grows with fewer readings per
+    second. Raises ValueError, with a remedy, if the margin uses up the limit.
 
-    Back it goes on the holding flow with a weak pull: behind a curve other than the configured one, an integrator
-    would wind up on the way and carry the mirror further past the centre than the experiment may. A mirror that
-    strays all the same, behind an open vent or a dead pump, is given to the loop at twice the limit. An experiment
-    that sets raw commands (`raw`) ends where it is.
+    Back it goes on the holding flow with a weak pull: behind a curve other than the configured one,
+    an integrator would wind up on the way and carry the mirror further past the centre than the
+    experiment may. A mirror that strays all the same, behind an open vent or a dead pump, is given
+    to the loop at twice the limit. An experiment that sets raw commands (`raw`) ends where it is.
     """
 
     def __init__(
@@ -198,7 +210,8 @@ class ExcursionGuard:
         in_hand_um = _IN_HAND_SIGMAS * self._motion.noise_per_laser_um(rate_hz) * around.laser_um
         if in_hand_um >= around.limit_um:
             raise ValueError(
-                f"limit of {around.limit_um:g} µm: the laser's noise alone takes {in_hand_um:.1f} µm of it at "
+                f"limit of {around.limit_um:g} µm: the laser's noise alone takes "
+                f"{in_hand_um:.1f} µm of it at "
                 f"{rate_hz:g} readings/s; give a larger limit, or a faster or quieter laser"
             )
         self._bound_um = around.limit_um - in_hand_um
@@ -209,7 +222,8 @@ class ExcursionGuard:
         self._motion.update(measurement.displacement_um, dt_s)
         if self._motion.lost_s > _LOST_MAX_S:
             lost = (
-                f"the reading was lost for {_LOST_MAX_S:g} s: check the laser (without one, the camera), then repeat"
+                f"the reading was lost for {_LOST_MAX_S:g} s: check the laser (without one, the "
+                "camera), then repeat"
             )
             return self.memory.ended or Finished(ExperimentEnd.READING_LOST, lost)
         off_um = self._motion.position_um - self._centre_um
@@ -230,8 +244,10 @@ class ExcursionGuard:
         if max(abs(off_um), abs(coming_um)) > self._bound_um:
             return Finished(
                 ExperimentEnd.STOPPED_BY_GUARD,
-                f"stopped at {off_um:+.1f} µm, moving at {self._motion.speed_um_per_s:+.1f} µm/s: the limit of "
-                f"{self._limit_um:g} µm was near; something else moved the mirror, or the pump is much stronger "
+                f"stopped at {off_um:+.1f} µm, moving at {self._motion.speed_um_per_s:+.1f} "
+                "µm/s: the limit of "
+                f"{self._limit_um:g} µm was near; something else moved the mirror, or the "
+                "pump is much stronger "
                 "than configured",
             )
         return self._experiment.step(measurement, dt_s)
@@ -246,10 +262,12 @@ class PatternState(StateNode):
 
 
 class Patterned:
-    """A flow that follows a pattern (s to µm/s) about the holding flow, with a weak pull back to where it began.
+    """A flow that follows a pattern (s to µm/s) about the holding flow, with a weak pull back to
+    where it began.
 
-    The pull is needed because the holding flow is never known exactly and the mirror integrates the difference; it is
-    too slow to disturb the pattern, and harmless to the identification, which knows the flow.
+    The pull is needed because the holding flow is never known exactly and the mirror integrates the
+    difference; it is too slow to disturb the pattern, and harmless to the identification, which
+    knows the flow.
     """
 
     def __init__(
@@ -276,18 +294,27 @@ class Patterned:
         back_um_per_s = _PULL_PER_S * (self._centre_um - self._motion.position_um)
         pattern_um_per_s = self._pattern(memory.time_s)
         memory.time_s += dt_s
-        return self._around.within(self._around.holding_flow_um_per_s + pattern_um_per_s + back_um_per_s)
+        return self._around.within(
+            self._around.holding_flow_um_per_s + pattern_um_per_s + back_um_per_s
+        )
 
 
 def room(around: Around) -> tuple[float, float]:
-    """Flow above and below the holding flow. Raises ValueError without any: the mirror is too tight or too leaky."""
+    """Flow above and below the holding flow. Raises ValueError without any: the mirror is too tight
+    or too leaky.
+    """
     up = around.full_flow_um_per_s - around.holding_flow_um_per_s
     down = around.holding_flow_um_per_s - around.least_flow_um_per_s
     if min(up, down) <= 0:
         raise ValueError(
-            f"no room around the holding flow of {around.holding_flow_um_per_s:.2f} µm/s in the pump's range of "
+            f"no room around the holding flow of {around.holding_flow_um_per_s:.2f} µm/s in "
+            "the pump's range of "
             f"{around.least_flow_um_per_s:.2f} .. {around.full_flow_um_per_s:.2f} µm/s: "
-            + (bleed_open(around.holding_flow_um_per_s, around.least_flow_um_per_s) if down <= 0 else "find the leak")
+            + (
+                bleed_open(around.holding_flow_um_per_s, around.least_flow_um_per_s)
+                if down <= 0
+                else "find the leak"
+            )
         )
     return up, down
 
@@ -301,9 +328,12 @@ def bleed_open(loss_um_per_s: float, least_um_per_s: float = 0.0) -> str:
 
 # Bounded asymmetric relay about the holding flow.
 #
-# Asymmetric, because the way down is no faster than the leak and the pump must not stall (its least flow is the lower
-# end), while the way up has most of the pump. The amplitude starts small and grows while the mirror overshoots its
-# threshold by little, so that a pump three times stronger or slower than configured stays within the same bounds.
+# Asymmetric, because the way down is no faster than the leak and the pump must not stall (its least
+# flow is the lower end), while the way up has most of the pump. The amplitude starts small and
+# grows while the mirror overshoots its threshold by little, so that a pump three times stronger or
+# slower than configured
+# stays within
+# the same bounds.
 
 THRESHOLD_SHARE = 0.25  # of the excursion limit
 OVERSHOOT_SHARE = 0.2
@@ -349,10 +379,16 @@ def begin_relay(around: Around) -> RelayState:
 
 
 class Relay:
-    """Switches between a high and a low flow whenever the centre leaves a band about `centre_um`."""
+    """Switches between a high and a low flow whenever the centre
+    leaves a band about `centre_um`.
+    """
 
     def __init__(
-        self, around: Around, centre_um: float, duration_s: float = 120.0, memory: RelayState | None = None
+        self,
+        around: Around,
+        centre_um: float,
+        duration_s: float = 120.0,
+        memory: RelayState | None = None,
     ) -> None:
         self.memory = memory or begin_relay(around)
         self._around = around
@@ -376,7 +412,9 @@ class Relay:
         memory.since_switch_s += dt_s
         off_um = self._motion.position_um - self._centre_um
         # beyond the threshold on the side it came from, for the delay after a switch
-        memory.overshoot_um = max(memory.overshoot_um, -memory.direction * off_um - self._threshold_um)
+        memory.overshoot_um = max(
+            memory.overshoot_um, -memory.direction * off_um - self._threshold_um
+        )
         if math.isnan(memory.at_centre_s) and memory.direction * off_um > 0:
             memory.at_centre_s = memory.time_s
         around = self._around
@@ -386,10 +424,15 @@ class Relay:
             way = "rise" if memory.rises else "sink"
             open_bleed = bleed_open(around.holding_flow_um_per_s, around.least_flow_um_per_s)
             remedy = "check the pump, its tube and the leak" if memory.rises else open_bleed
-            still = f"the mirror did not {way} by {self._threshold_um:g} µm in {_PATIENCE_S:g} s: {remedy}"
+            still = (
+                f"the mirror did not {way} by {self._threshold_um:g} µm in {_PATIENCE_S:g} s: "
+                f"{remedy}"
+            )
             return Finished(ExperimentEnd.NO_RESPONSE, still)
         half = memory.up if memory.rises else memory.down
-        return around.within(around.holding_flow_um_per_s + memory.direction * half.amplitude_um_per_s)
+        return around.within(
+            around.holding_flow_um_per_s + memory.direction * half.amplitude_um_per_s
+        )
 
     def _switch(self) -> None:
         """Reverse; adapt the flow of the previous half cycle, whose overshoot is now known."""

@@ -1,4 +1,6 @@
-"""One experiment of a running hold: made of its specification, stepped in ticks, guarded, with its result."""
+"""One experiment of a running hold: made of its specification, stepped in ticks, guarded, with its
+result.
+"""
 
 import math
 from collections.abc import Callable, Sequence
@@ -21,11 +23,14 @@ _Short = AfterValidator(lambda value: round(value, 3))  # ninety steps fit one m
 
 
 class PumpStep(Section):
-    """A command until the time is over or, if a height is given, the centre has sunk (command 0) or risen to it."""
+    """A command until the time is over or, if a height is given, the centre has sunk (command 0) or
+    risen to it.
+    """
 
     fraction: Annotated[Fraction, _Short]
     duration_s: Annotated[float, Field(ge=0.01, le=120), _Short]
-    until_um: Annotated[float, Field(ge=-30, le=30), _Short] | None = None  # from where the experiment began
+    # from where the experiment began
+    until_um: Annotated[float, Field(ge=-30, le=30), _Short] | None = None
 
 
 LIMIT_MAX_UM = 30.0
@@ -35,8 +40,8 @@ ExperimentKind = Literal["relay", "steps", "doublets", "multisine", "pump_map"]
 class ExperimentSpec(Section):
     """A named, bounded experiment about the holding flow.
 
-    What the bounds are for: half an hour of a person's time; an excursion that the safety table's following error
-    (60 µm) never sees; flows that a film pump can have.
+    What the bounds are for: half an hour of a person's time; an excursion that the safety table's
+    following error (60 µm) never sees; flows that a film pump can have.
     """
 
     version: Literal[1] = 1
@@ -60,13 +65,19 @@ class PumpStepsState(StateNode):
 
 
 class PumpSteps:
-    """The experiment behind the pump's curve: constant pump commands, 0..1; the mirror is the flow meter.
+    """The experiment behind the pump's curve: constant pump commands, 0..1; the mirror is the flow
+    meter.
 
-    The session (`tuning`) decides which commands, for how long and until which height, between two experiments.
+    The session (`tuning`) decides which commands, for how long and until which height, between two
+    experiments.
     """
 
     def __init__(
-        self, centre_um: float, steps: Sequence[PumpStep], stretch: float = 1.0, memory: PumpStepsState | None = None
+        self,
+        centre_um: float,
+        steps: Sequence[PumpStep],
+        stretch: float = 1.0,
+        memory: PumpStepsState | None = None,
     ) -> None:
         self.memory = memory or PumpStepsState()
         self._centre_um = centre_um
@@ -87,14 +98,19 @@ class PumpSteps:
 
     def _over(self) -> bool:
         """Whether the present step is."""
-        now, off_um = self._steps[self.memory.steps_done], self._motion.position_um - self._centre_um
-        if now.until_um is not None and (off_um <= now.until_um if now.fraction == 0 else off_um >= now.until_um):
+        now, off_um = (
+            self._steps[self.memory.steps_done],
+            self._motion.position_um - self._centre_um,
+        )
+        if now.until_um is not None and (
+            off_um <= now.until_um if now.fraction == 0 else off_um >= now.until_um
+        ):
             return True
         return self.memory.in_step_s > now.duration_s
 
 
-# Flows in time for `Patterned`, sized so that the mirror stays within a few µm. Each takes the identified gain: the
-# same excursion on a strong and a weak pump.
+# Flows in time for `Patterned`, sized so that the mirror stays within a few µm. Each takes the
+# identified gain: the same excursion on a strong and a weak pump.
 
 Pattern = Callable[[float], float]
 
@@ -110,7 +126,8 @@ def steps(around: machine.Around, gain: float, hold_s: float = 2.0) -> Pattern:
 
 
 def doublets(around: machine.Around, gain: float, pulse_s: float = 0.3) -> Pattern:
-    """Short pulses up, each followed by an equal one down: many steep edges, which separate dead time from lag.
+    """Short pulses up, each followed by an equal one down: many steep edges, which separate dead
+    time from lag.
 
     The downward flow is limited by the leak, so it takes longer; the mean flow is the holding flow.
     """
@@ -138,7 +155,10 @@ def multisine(
     time_s = np.arange(0.0, 4 * math.pi / slowest_rad_per_s, 0.05)[:, None]
     flow = (amplitudes * np.sin(w * time_s + phases)).sum(axis=1)
     way = (amplitudes / w * np.cos(w * time_s + phases)).sum(axis=1)
-    scale = min(min(machine.room(around)) / np.abs(flow).max(), _SHARE * around.limit_um / (gain * np.abs(way).max()))
+    scale = min(
+        min(machine.room(around)) / np.abs(flow).max(),
+        _SHARE * around.limit_um / (gain * np.abs(way).max()),
+    )
     return lambda now_s: float(scale * (amplitudes * np.sin(w * now_s + phases)).sum())
 
 
@@ -160,7 +180,9 @@ class TrialState(StateNode):
     pump_steps: PumpStepsState | None = None
 
 
-def begin_trial(spec: ExperimentSpec, loop: LoopConfig, pump: PumpConfig, centre_um: float) -> TrialState:
+def begin_trial(
+    spec: ExperimentSpec, loop: LoopConfig, pump: PumpConfig, centre_um: float
+) -> TrialState:
     """The state of an experiment that begins about `centre_um`."""
     around = machine.Around(
         holding_flow_um_per_s=spec.holding_flow_um_per_s,
@@ -185,8 +207,8 @@ def begin_trial(spec: ExperimentSpec, loop: LoopConfig, pump: PumpConfig, centre
 class Trial:
     """An experiment inside its guard.
 
-    Raises ValueError if the pump has no room around the holding flow, or the noise fills the limit; the message says
-    what would help.
+    Raises ValueError if the pump has no room around the holding flow, or the noise fills the limit;
+    the message says what would help.
 
     Parameters
     ----------

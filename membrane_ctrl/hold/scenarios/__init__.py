@@ -25,5 +25,7 @@ def find_scenario(word: str) -> Path:
     named = _FOLDER / f"{word.replace('-', '_')}.toml"
     path = named if named in shipped() else Path(word)
     if not path.is_file():
-        raise InputError(f"{word}: no such scenario; `membrane-ctrl twin play` lists them, or name a file")
+        raise InputError(
+            f"{word}: no such scenario; `membrane-ctrl twin play` lists them, or name a file"
+        )
     return path

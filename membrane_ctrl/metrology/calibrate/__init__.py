@@ -1,1 +1,3 @@
-"""The mirror calibrates its own optics: one geometry for many sets of different sag (docs/calibration.md)."""
+"""The mirror calibrates its own optics: one geometry for many sets of different sag
+(docs/calibration.md).
+"""

@@ -1,7 +1,9 @@
-"""What to measure next: the number, or the sets, that would lower the sag's sigma most, with the sigma then.
+"""What to measure next: the number, or the sets, that would lower the sag's sigma most, with the
+sigma then.
 
-A set that is not taken yet is foreseen on the bench found: its rays are followed to where they would end, with the
-noise of the film's set, and its normal equations are added. No prediction needs its readings.
+A set that is not taken yet is foreseen on the bench found: its rays are followed to where they
+would end, with the noise of the film's set, and its normal equations are added. No prediction needs
+its readings.
 """
 
 from dataclasses import dataclass, replace
@@ -11,7 +13,11 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from membrane_ctrl.metrology.calibrate import parameters, residuals, separable
-from membrane_ctrl.metrology.calibrate.propagate import sag_um, surface_covariance, weak_combinations
+from membrane_ctrl.metrology.calibrate.propagate import (
+    sag_um,
+    surface_covariance,
+    weak_combinations,
+)
 from membrane_ctrl.metrology.calibrate.solve import Solution, step
 from membrane_ctrl.metrology.optics.surface import PARAMETERS, Artefact, SeenScreen, Surface
 from membrane_ctrl.model.arrays import FloatArray
@@ -31,18 +37,28 @@ class Advice:
 
 def number_advice(solution: Solution, index: int) -> Advice | None:
     """What to measure better, from the equations alone; None if no single number is worth it."""
-    sums, own = np.sum([each.reduced() for each in solution.equations], axis=0), solution.problem.sigmas
+    sums, own = (
+        np.sum([each.reduced() for each in solution.equations], axis=0),
+        solution.problem.sigmas,
+    )
     found = []
     for k in np.flatnonzero(own > 0):
         better = own.copy()
         better[k] /= _BETTER
         moved = replace(solution, covariance=step(sums + solution.known(better), better).covariance)
-        found.append(Advice(parameters.NAMES[k], float(better[k]), sag_um(surface_covariance(moved, index))))
+        found.append(
+            Advice(parameters.NAMES[k], float(better[k]), sag_um(surface_covariance(moved, index)))
+        )
     best = min(found, key=lambda each: each.sag_um, default=None)
-    return best if best is not None and best.sag_um < _WORTH * sag_um(surface_covariance(solution, index)) else None
+    return (
+        best
+        if best is not None and best.sag_um < _WORTH * sag_um(surface_covariance(solution, index))
+        else None
+    )
 
 
-# A sphere that a telescope maker can deliver: radius of curvature by interferometer and scale, place by a dial gauge
+# A sphere that a telescope maker can deliver: radius of curvature by interferometer and scale,
+# place by a dial gauge
 _SPHERE_MM, _SPHERE_USED = 200.0, 0.95
 _SPHERE_KNOWN, _FORM_MM, _VERTEX_MM = 1e-4, 5e-5, 0.05
 
@@ -60,9 +76,11 @@ class ArtefactAdvice:
 
 
 def artefact_advice(solution: Solution, index: int) -> ArtefactAdvice | None:
-    """What a sphere in the mirror's place would give; None if it is not worth it, or if an artefact stood there.
+    """What a sphere in the mirror's place would give; None if it is not worth it, or if an artefact
+    stood there.
 
-    Its set is foreseen from the bench found: rays of the film's set that meet the sphere, with their noise.
+    Its set is foreseen from the bench found: rays of the film's set that meet the sphere, with
+    their noise.
     """
     if solution.problem.with_artefact:
         return None
@@ -71,10 +89,13 @@ def artefact_advice(solution: Solution, index: int) -> ArtefactAdvice | None:
     # as deep as the film, so that the fringes fall on the same places of the screen
     curvature_mm = (surface.radius_mm**2 + surface.sag_mm**2) / (2 * surface.sag_mm)
     spread = _SPHERE_KNOWN / curvature_mm
-    sphere = Artefact(1 / curvature_mm, spread, _FORM_MM, 0.0, _VERTEX_MM, min(_SPHERE_MM, surface.radius_mm))
+    sphere = Artefact(
+        1 / curvature_mm, spread, _FORM_MM, 0.0, _VERTEX_MM, min(_SPHERE_MM, surface.radius_mm)
+    )
     terms = sphere.terms_mm()
     shape = replace(
-        Surface.from_parameters(terms[:PARAMETERS], sphere.radius_mm), beyond_mm=tuple(terms[PARAMETERS:].tolist())
+        Surface.from_parameters(terms[:PARAMETERS], sphere.radius_mm),
+        beyond_mm=tuple(terms[PARAMETERS:].tolist()),
     )
     bench = solution.bench
     points = residuals.place_rays(bench, phases, shape, 0.0)
@@ -90,13 +111,21 @@ def artefact_advice(solution: Solution, index: int) -> ArtefactAdvice | None:
     then_um, now_um = (sag_um(surface_covariance(each, index)) for each in (then, solution))
     if not then_um < _WORTH * now_um:
         return None
-    worst = max(weak_combinations(solution, index, surface.radius_mm), key=lambda each: each.figure_um, default=None)
+    worst = max(
+        weak_combinations(solution, index, surface.radius_mm),
+        key=lambda each: each.figure_um,
+        default=None,
+    )
     together = () if worst is None else tuple(name for name, _ in worst.parts)
-    return ArtefactAdvice(together, curvature_mm, _SPHERE_KNOWN * curvature_mm, _VERTEX_MM, sphere.radius_mm, then_um)
+    return ArtefactAdvice(
+        together, curvature_mm, _SPHERE_KNOWN * curvature_mm, _VERTEX_MM, sphere.radius_mm, then_um
+    )
 
 
-# The screen itself before the camera, and the screen on a rail: what a pair of hands and a dial gauge can do
-TILT_DEG = 25.0  # of the screen itself, to two sides: one tilt leaves the focal length with the distance
+# The screen itself before the camera, and the screen on a rail: what a pair of hands and a dial
+# gauge can do
+# of the screen itself, to two sides: one tilt leaves the focal length with the distance
+TILT_DEG = 25.0
 RAIL_SIGMA_MM = 0.05
 _RAIL_MM, _RAIL_TURN_DEG = -300.0, 0.5  # away from the mirror
 _FILLS = 0.9  # of the picture that the fringes fill
@@ -106,13 +135,16 @@ _FILLS = 0.9  # of the picture that the fringes fill
 class ScreenAdvice:
     """Sets with the screen in another place, each in addition to those named before it."""
 
-    sets: Literal["screen", "screen_moved"]  # `[artefact] form = "screen"`, or `[screen_moved]` beside a film's set
+    sets: Literal[
+        "screen", "screen_moved"
+    ]  # `[artefact] form = "screen"`, or `[screen_moved]` beside a film's set
     distance_mm: float  # of the screen from the camera; by how far it moves along its normal
     sag_um: float  # 1 sigma then
 
 
 def screen_advice(solution: Solution, index: int) -> tuple[ScreenAdvice, ...]:
-    """Sets of the screen itself, and of the film with the screen elsewhere, the most useful first; those worth it.
+    """Sets of the screen itself, and of the film with the screen elsewhere, the most useful first;
+    those worth it.
 
     The second is judged as taken with the first.
     """
@@ -126,7 +158,9 @@ def screen_advice(solution: Solution, index: int) -> tuple[ScreenAdvice, ...]:
     out: list[ScreenAdvice] = []
     while left:
         tried = {name: _FORESEEN[name](found, index, half_mm) for name in left}
-        claims = {name: sag_um(surface_covariance(then, index)) for name, (then, _) in tried.items()}
+        claims = {
+            name: sag_um(surface_covariance(then, index)) for name, (then, _) in tried.items()
+        }
         name = min(claims, key=lambda each: claims[each])
         if not claims[name] < _WORTH * sag_um(surface_covariance(found, index)):
             break
@@ -137,20 +171,29 @@ def screen_advice(solution: Solution, index: int) -> tuple[ScreenAdvice, ...]:
 
 
 def _with_screens(solution: Solution, index: int, half_mm: FloatArray) -> tuple[Solution, float]:
-    """The solution with sets of the screen itself, tilted to two sides, and its distance from the camera."""
+    """The solution with sets of the screen itself, tilted to two sides, and its distance from the
+    camera.
+    """
     film, camera = solution.problem.sets[index], solution.bench.geometry
     film = replace(
-        film.subset(film.seen_with(0)), displacement_um=np.nan, screen=None, elsewhere=(residuals.ANYWHERE,)
+        film.subset(film.seen_with(0)),
+        displacement_um=np.nan,
+        screen=None,
+        elsewhere=(residuals.ANYWHERE,),
     )
     rays = camera.rotation @ residuals.camera_rays(camera, film)
     tangents = rays[:2] / rays[2]
     distance_mm = float(_FILLS * 2 * np.min(half_mm) / np.ptp(tangents, axis=1).max())
     middle = np.append(tangents.mean(axis=1), 1.0)
-    state = separable.SetState(solution.states[index].surface, 0.0, elsewhere=(np.zeros(residuals.MOVED),))
+    state = separable.SetState(
+        solution.states[index].surface, 0.0, elsewhere=(np.zeros(residuals.MOVED),)
+    )
     more = []
     for turn in ("x", "y"):
         # it faces the camera, and s_y goes up in the picture
-        facing = Rotation.from_euler(turn, TILT_DEG, degrees=True).as_matrix() @ np.diag([1.0, -1.0, -1.0])
+        facing = Rotation.from_euler(turn, TILT_DEG, degrees=True).as_matrix() @ np.diag(
+            [1.0, -1.0, -1.0]
+        )
         phases = replace(film, artefact=SeenScreen(distance_mm * middle, facing.T))
         seen = _foreseen(solution, phases, state, half_mm)
         more.append(_equations(solution, seen, state, separable.Trust.full(seen)))
@@ -158,7 +201,9 @@ def _with_screens(solution: Solution, index: int, half_mm: FloatArray) -> tuple[
 
 
 def _with_rail(solution: Solution, index: int, half_mm: FloatArray) -> tuple[Solution, float]:
-    """The solution with the film of one set seen again, the screen moved along a rail, and by how far."""
+    """The solution with the film of one set seen again, the screen moved along a rail, and by how
+    far.
+    """
     film, now = solution.problem.sets[index], solution.equations[index]
     known = residuals.Elsewhere((0.0, 0.0, _RAIL_MM), RAIL_SIGMA_MM, _RAIL_TURN_DEG, 0.0, 0.0, 0.0)
     move = known.known(solution.problem.references.laser_sigma_um)[0]
@@ -179,18 +224,31 @@ def _foreseen(
 ) -> residuals.SetPhases:
     """A set whose rays end where the bench found sends them; those that end on the fringes."""
     dark = replace(phases, screen_mm=np.zeros_like(phases.screen_mm))
-    at_mm = -residuals.residual_mm(solution.bench, dark, state.surface, state.vertex_z_mm, state.elsewhere)
-    return replace(phases, screen_mm=at_mm).subset(np.asarray(np.all(np.abs(at_mm) < half_mm[:, None], axis=0)))
+    at_mm = -residuals.residual_mm(
+        solution.bench, dark, state.surface, state.vertex_z_mm, state.elsewhere
+    )
+    return replace(phases, screen_mm=at_mm).subset(
+        np.asarray(np.all(np.abs(at_mm) < half_mm[:, None], axis=0))
+    )
 
 
 def _equations(
-    solution: Solution, phases: residuals.SetPhases, state: separable.SetState, trust: separable.Trust
+    solution: Solution,
+    phases: residuals.SetPhases,
+    state: separable.SetState,
+    trust: separable.Trust,
 ) -> separable.Equations:
     turns = parameters.pose_derivatives(solution.problem.stated, solution.values)
     references = solution.problem.references
-    return separable.equations(solution.bench, turns, phases, state, solution.common, references, trust)
+    return separable.equations(
+        solution.bench, turns, phases, state, solution.common, references, trust
+    )
 
 
 def _with_equations(solution: Solution, linear: tuple[separable.Equations, ...]) -> Solution:
     sums, sigmas = np.sum([each.reduced() for each in linear], axis=0), solution.problem.sigmas
-    return replace(solution, equations=linear, covariance=step(sums + solution.known(sigmas), sigmas).covariance)
+    return replace(
+        solution,
+        equations=linear,
+        covariance=step(sums + solution.known(sigmas), sigmas).covariance,
+    )

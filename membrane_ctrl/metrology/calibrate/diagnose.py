@@ -1,8 +1,9 @@
-"""Is the model right, and do the sets belong together? All of it from the equations at the solution.
+"""Is the model right, and do the sets belong together? All of it from the equations at the
+solution.
 
-Every test is the same: by how much does the sum of squares fall if more is free? With good data the fall is a
-chi-square with as many degrees of freedom. Freed in turn: a parameter that was held (a bent screen, a lens that
-distorts), the camera's pose for some of the sets, everything for one set.
+Every test is the same: by how much does the sum of squares fall if more is free? With good data the
+fall is a chi-square with as many degrees of freedom. Freed in turn: a parameter that was held (a
+bent screen, a lens that distorts), the camera's pose for some of the sets, everything for one set.
 """
 
 from collections.abc import Sequence
@@ -15,7 +16,10 @@ from membrane_ctrl.metrology.calibrate import parameters, propagate, residuals, 
 from membrane_ctrl.model.arrays import FloatArray, IntArray
 
 SURE = 1e-6  # probability that good data look as bad
-_CAMERA = tuple(parameters.NAMES.index(name) for name in ("camera_yaw_deg", "camera_pitch_deg", "camera_roll_deg"))
+_CAMERA = tuple(
+    parameters.NAMES.index(name)
+    for name in ("camera_yaw_deg", "camera_pitch_deg", "camera_roll_deg")
+)
 _CAMERA_SIGMA_DEG = 1.0  # of a bump: a hand on the mount
 _CREEP_SIGMA_MM = 1.0
 _LEAST_TO_CREEP = 3  # sets
@@ -40,7 +44,9 @@ class Suspect:
 
 @dataclass(frozen=True)
 class LaserScale:
-    """Scale of the laser and its sigma by the optics alone (1: good); the fall is against the prior."""
+    """Scale of the laser and its sigma by the optics alone (1: good); the fall is against the
+    prior.
+    """
 
     value: float
     sigma: float
@@ -49,7 +55,10 @@ class LaserScale:
     @property
     def sure(self) -> bool:
         """As for `Suspect`: whether it is off by more than its data sheet allows."""
-        return bool(chi2.sf(((self.value - 1) / np.hypot(self.sigma, parameters.LASER.sigma)) ** 2, 1) < SURE)
+        return bool(
+            chi2.sf(((self.value - 1) / np.hypot(self.sigma, parameters.LASER.sigma)) ** 2, 1)
+            < SURE
+        )
 
 
 @dataclass(frozen=True)
@@ -96,7 +105,9 @@ class LeftOut:
 
 
 def suspects(solution: solve.Solution) -> tuple[Suspect, ...]:
-    """Held optical parameters that would remove more than noise from the residuals, the strongest first."""
+    """Held optical parameters that would remove more than noise from the residuals, the strongest
+    first.
+    """
     sums = np.sum(_reduced(solution), axis=0)
     response = propagate.surface_response(solution, solution.problem.middle)[:, :-1]
     flat = propagate.without_plane(*propagate.disc(1.0))
@@ -123,7 +134,9 @@ def laser_scale(solution: solve.Solution) -> LaserScale:
     sums = np.sum(_reduced(solution), axis=0)
     moved = solve.step(sums + solution.known(free), free)
     fall = _squares(sums, solution) - moved.squares
-    return LaserScale(1 + float(solution.common[k] + moved.delta[k]), float(np.sqrt(moved.covariance[k, k])), fall)
+    return LaserScale(
+        1 + float(solution.common[k] + moved.delta[k]), float(np.sqrt(moved.covariance[k, k])), fall
+    )
 
 
 def left_out(solution: solve.Solution) -> tuple[LeftOut, ...]:
@@ -141,18 +154,27 @@ def left_out(solution: solve.Solution) -> tuple[LeftOut, ...]:
 
 
 def elsewhere(solution: solve.Solution) -> list[tuple[int, float]]:
-    """Sets beside which the screen was moved, but not as stated: each with the fall if that place is free."""
+    """Sets beside which the screen was moved, but not as stated: each with the fall if that place
+    is free.
+    """
     reduced, out = _reduced(solution), []
-    everything, moved = _squares(np.sum(reduced, axis=0), solution), np.arange(parameters.SCREEN_MOVE)
+    everything, moved = (
+        _squares(np.sum(reduced, axis=0), solution),
+        np.arange(parameters.SCREEN_MOVE),
+    )
     for k, each in enumerate(solution.equations):
         free = each.sums.copy()
         phases, state = solution.problem.sets[k], solution.states[k]
-        for sums, known, move in zip(each.elsewhere, phases.elsewhere, state.elsewhere, strict=True):
+        for sums, known, move in zip(
+            each.elsewhere, phases.elsewhere, state.elsewhere, strict=True
+        ):
             told, sigmas = known.known(solution.problem.references.laser_sigma_um)[:, moved]
             hand = np.hstack([np.eye(moved.size), (told - move[moved])[:, None]]) / sigmas[:, None]
             own, without_hand = np.append(moved, len(sums) - 1), sums.copy()
             without_hand[np.ix_(own, own)] -= hand.T @ hand
-            free += separable.without(without_hand, residuals.MOVED) - separable.without(sums, residuals.MOVED)
+            free += separable.without(without_hand, residuals.MOVED) - separable.without(
+                sums, residuals.MOVED
+            )
         others = [*reduced[:k], replace(each, sums=free).reduced(), *reduced[k + 1 :]]
         fall = everything - _squares(np.sum(others, axis=0), solution)
         if chi2.sf(fall, moved.size) < SURE:
@@ -167,19 +189,25 @@ def bumps(solution: solve.Solution) -> tuple[CameraBump, ...]:
     out = []
     for group in sorted(groups):
         share = np.isin(np.arange(count), group).astype(float)
-        amounts, fall = _moved_by(solution, _CAMERA, share, np.full(len(_CAMERA), _CAMERA_SIGMA_DEG))
+        amounts, fall = _moved_by(
+            solution, _CAMERA, share, np.full(len(_CAMERA), _CAMERA_SIGMA_DEG)
+        )
         yaw, pitch, roll = amounts
         out.append(CameraBump(group, (yaw, pitch, roll), fall))
     return tuple(sorted((bump for bump in out if bump.sure), key=lambda bump: -bump.fall))
 
 
 def creep(solution: solve.Solution) -> MountCreep | None:
-    """Whether camera or screen crept from the first set to the last, and what changed most; None if not sure."""
+    """Whether camera or screen crept from the first set to the last, and what changed most; None if
+    not sure.
+    """
     count, poses = len(solution.states), tuple(range(len(parameters.POSE)))
     if count < _LEAST_TO_CREEP:
         return None
     share = np.linspace(-0.5, 0.5, count)
-    sigmas = np.array([_CAMERA_SIGMA_DEG if p.unit == "deg" else _CREEP_SIGMA_MM for p in parameters.POSE])
+    sigmas = np.array(
+        [_CAMERA_SIGMA_DEG if p.unit == "deg" else _CREEP_SIGMA_MM for p in parameters.POSE]
+    )
     whole = _moved_by(solution, poses, share, sigmas)[1]
     single = [_moved_by(solution, (k,), share, sigmas[[k]]) for k in poses]
     most = max(poses, key=lambda k: single[k][1])
@@ -190,24 +218,36 @@ def creep(solution: solve.Solution) -> MountCreep | None:
 def _moved_by(
     solution: solve.Solution, columns: tuple[int, ...], share: FloatArray, sigmas: FloatArray
 ) -> tuple[tuple[float, ...], float]:
-    """Amounts by which parameters moved in the sets, each by its share, and the fall of the sum of squares."""
+    """Amounts by which parameters moved in the sets, each by its share, and the fall of the sum of
+    squares.
+    """
     reduced, hand = _reduced(solution), solution.problem.sigmas
-    sums = np.sum([_with_more(each, columns, part) for each, part in zip(reduced, share, strict=True)], axis=0)
+    sums = np.sum(
+        [_with_more(each, columns, part) for each, part in zip(reduced, share, strict=True)], axis=0
+    )
     known = _with_more(solution.known(hand), columns, 0.0)
     extra = np.arange(separable.COMMON, separable.COMMON + len(columns))
     known[extra, extra] += 1 / sigmas**2
-    kept = np.append(hand > 0, np.ones(separable.COMMON - len(parameters.NAMES) + len(columns), bool))
+    kept = np.append(
+        hand > 0, np.ones(separable.COMMON - len(parameters.NAMES) + len(columns), bool)
+    )
     delta, squares = _solved(sums + known, np.flatnonzero(kept))
-    return tuple(delta[-len(columns) :].tolist()), _squares(np.sum(reduced, axis=0), solution) - squares
+    return tuple(delta[-len(columns) :].tolist()), _squares(
+        np.sum(reduced, axis=0), solution
+    ) - squares
 
 
 def without(solution: solve.Solution, index: int) -> solve.Solution:
-    """The solution without one set, to first order: its equations and state are left out, the unknowns moved."""
+    """The solution without one set, to first order: its equations and state are left out, the
+    unknowns moved.
+    """
     keep = [k for k in range(len(solution.states)) if k != index]
     problem = replace(solution.problem, sets=tuple(solution.problem.sets[k] for k in keep))
     linear = tuple(solution.equations[k] for k in keep)
     sigmas = problem.sigmas
-    moved = solve.step(np.sum([each.reduced() for each in linear], axis=0) + solution.known(sigmas), sigmas)
+    moved = solve.step(
+        np.sum([each.reduced() for each in linear], axis=0) + solution.known(sigmas), sigmas
+    )
     common = solution.common + moved.delta
     return replace(
         solution,
@@ -225,14 +265,18 @@ def _reduced(solution: solve.Solution) -> list[FloatArray]:
 
 
 def film_rise(solution: solve.Solution, film: separable.FilmModel) -> float:
-    """By how much the sum of squares of a solution with a free film rises if the film is like that."""
+    """By how much the sum of squares of a solution with a free film
+    rises if the film is like that.
+    """
     bound = []
     films = solution.problem.films
     for k, (each, state) in enumerate(zip(solution.equations, solution.states, strict=True)):
         rows = separable.film_rows(state.surface, film)
         told = each.sums + rows.T @ rows if k in films else each.sums
         bound.append(replace(each, sums=told).reduced())
-    return _squares(np.sum(bound, axis=0), solution) - _squares(np.sum(_reduced(solution), axis=0), solution)
+    return _squares(np.sum(bound, axis=0), solution) - _squares(
+        np.sum(_reduced(solution), axis=0), solution
+    )
 
 
 def _squares(sums: FloatArray, solution: solve.Solution) -> float:
@@ -242,17 +286,23 @@ def _squares(sums: FloatArray, solution: solve.Solution) -> float:
 
 def _alone(reduced: FloatArray, sigmas: FloatArray) -> tuple[float, int]:
     """Least sum of squares of one set by itself, and how many numbers it determines; no prior."""
-    free = np.flatnonzero(np.append(sigmas > 0, np.ones(separable.COMMON - len(parameters.NAMES), bool)))
+    free = np.flatnonzero(
+        np.append(sigmas > 0, np.ones(separable.COMMON - len(parameters.NAMES), bool))
+    )
     matrix, right = reduced[np.ix_(free, free)], reduced[free, -1]
     scale = 1 / np.sqrt(np.maximum(np.diag(matrix), 1e-300))
     values, vectors = np.linalg.eigh(matrix * np.outer(scale, scale))
     good = values > 1e-10
     along = vectors.T @ (right * scale)
-    return float(reduced[-1, -1] - np.sum(along[good] ** 2 / values[good])), int(np.count_nonzero(good))
+    return float(reduced[-1, -1] - np.sum(along[good] ** 2 / values[good])), int(
+        np.count_nonzero(good)
+    )
 
 
 def _with_more(sums: FloatArray, columns: Sequence[int], share: float) -> FloatArray:
-    """The sums with more unknowns before the residual, which act as some of the parameters do, times a share."""
+    """The sums with more unknowns before the residual, which act as some of the parameters do,
+    times a share.
+    """
     order: Sequence[int] = [*range(separable.COMMON), *columns, separable.COMMON]
     out = sums[np.ix_(order, order)].copy()
     out[separable.COMMON : -1, :] *= share

@@ -1,7 +1,7 @@
 """Focal length, principal point and distortion from photographs of a board (OpenCV's calibration).
 
-The model is the one that the self-calibration frees: one focal length, k1, k2, p1, p2. Views that fit much worse than
-the others (blurred, a corner taken for its neighbour) are left out and named.
+The model is the one that the self-calibration frees: one focal length, k1, k2, p1, p2. Views that
+fit much worse than the others (blurred, a corner taken for its neighbour) are left out and named.
 """
 
 import re
@@ -26,7 +26,9 @@ _PLANE_SHARE = 0.8
 _NAMES = ("focal_relative", "principal_x_px", "principal_y_px", "k1", "k2", "p1", "p2")
 
 
-def screen_seen(geometry: Geometry, column_px: FloatArray, row_px: FloatArray, screen_mm: FloatArray) -> SeenScreen:
+def screen_seen(
+    geometry: Geometry, column_px: FloatArray, row_px: FloatArray, screen_mm: FloatArray
+) -> SeenScreen:
     """Where the screen stands that the camera sees at points (2, n), about, with the stated lens.
 
     Raises ValueError if no plane is seen.
@@ -42,15 +44,20 @@ def screen_seen(geometry: Geometry, column_px: FloatArray, row_px: FloatArray, s
     keep = good == 1
     place = np.column_stack([flat[keep], np.zeros(np.count_nonzero(keep))])
     _, turn, shift = cv2.solvePnP(place, seen[keep], np.eye(3), None, flags=cv2.SOLVEPNP_IPPE)
-    return SeenScreen(np.asarray(shift.ravel(), np.float64), np.asarray(cv2.Rodrigues(turn)[0].T, np.float64))
+    return SeenScreen(
+        np.asarray(shift.ravel(), np.float64), np.asarray(cv2.Rodrigues(turn)[0].T, np.float64)
+    )
 
 
-def lens_derivatives(geometry: Geometry, column_px: FloatArray, row_px: FloatArray, rays: FloatArray) -> FloatArray:
+def lens_derivatives(
+    geometry: Geometry, column_px: FloatArray, row_px: FloatArray, rays: FloatArray
+) -> FloatArray:
     """d ray / d (relative focal length, principal point, k1, k2, p1, p2), (7, 3, m).
 
-    A pixel fixes the distorted point q = ((c, r) - principal) / focal = f(p; k): dp = (df/dp)^-1 (dq - df/dk dk), and
-    the unit vector c of (p, 1) turns by (1 - c c^T) (dp, 0) / |(p, 1)|. Coefficients beyond the first four, if the
-    stated lens has any, count as constants of df/dp only to first order: they are left out there.
+    A pixel fixes the distorted point q = ((c, r) - principal) / focal = f(p; k): dp = (df/dp)^-1
+    (dq - df/dk dk), and the unit vector c of (p, 1) turns by (1 - c c^T) (dp, 0) / |(p, 1)|.
+    Coefficients beyond the first four, if the stated lens has any, count as constants of df/dp only
+    to first order: they are left out there.
     """
     c = geometry.rotation @ rays
     x, y = c[0] / c[2], c[1] / c[2]
@@ -98,14 +105,15 @@ class Lens:
 def calibrate_lens(views: Sequence[BoardView], stated: CameraConfig) -> Lens:
     """Fit the lens.
 
-    Raises ValueError with fewer than `LEAST_VIEWS` views of `LEAST_CORNERS` corners, or if nothing fits. `stated`
-    is where the fit begins, and what the result is compared with.
+    Raises ValueError with fewer than `LEAST_VIEWS` views of `LEAST_CORNERS` corners, or if nothing
+    fits. `stated` is where the fit begins, and what the result is compared with.
     """
     good = [view for view in views if len(view.place) >= LEAST_CORNERS]
     while True:
         if len(good) < LEAST_VIEWS:
             raise ValueError(
-                f"the board is seen in {len(good)} photographs; at least {LEAST_VIEWS} are needed, tilted both ways"
+                f"the board is seen in {len(good)} photographs; at least {LEAST_VIEWS} are "
+                "needed, tilted both ways"
             )
         rms, matrix, lens, sigmas, errors = _fit(good, stated)
         worst = int(np.argmax(errors))
@@ -170,8 +178,8 @@ def _matrix(camera: CameraConfig) -> FloatArray:
 
 Levels = AnyArray
 
-# A marker of 4 x 4 bits has a border of one: 6 modules; with a margin of one on each side a square has 8, so that
-# squares of a multiple of 8 pixels have every edge on a pixel's edge
+# A marker of 4 x 4 bits has a border of one: 6 modules; with a margin of one on each side a square
+# has 8, so that squares of a multiple of 8 pixels have every edge on a pixel's edge
 MODULES = 8
 _MARKER_SHARE = 6 / MODULES
 _MARKERS = 1000  # of the dictionary
@@ -181,7 +189,9 @@ _MARKERS = 1000  # of the dictionary
 class Board:
     """A board."""
 
-    kind: str  # "charuco" or "chessboard": with markers (OpenCV's DICT_4X4_1000), of which a part is enough, or plain
+    # "charuco" or "chessboard": with markers (OpenCV's DICT_4X4_1000), of which a part is enough,
+    # or plain
+    kind: str
     columns: int  # squares
     rows: int
 
@@ -191,11 +201,14 @@ class Board:
         found = re.fullmatch(r"(charuco|chessboard):(\d{1,3})x(\d{1,3})", text)
         if found is None:
             raise ValueError(
-                f"{text} is not a board: KIND:COLUMNSxROWS of squares, e.g. charuco:15x9, chessboard:10x7"
+                f"{text} is not a board: KIND:COLUMNSxROWS of squares, e.g. charuco:15x9, "
+                "chessboard:10x7"
             )
         board = cls(found[1], int(found[2]), int(found[3]))
         if min(board.columns, board.rows) < 4 or (board.columns * board.rows > 2 * _MARKERS):
-            raise ValueError(f"{text}: a board has at least 4 squares each way and at most {2 * _MARKERS} in all")
+            raise ValueError(
+                f"{text}: a board has at least 4 squares each way and at most {2 * _MARKERS} in all"
+            )
         return board
 
     def __str__(self) -> str:
@@ -205,7 +218,9 @@ class Board:
     def draw(self, square_px: int) -> Levels:
         """The board alone, one level a pixel. Raises ValueError unless its edges fall on pixels."""
         if square_px % MODULES:
-            raise ValueError(f"squares of {square_px} px: a multiple of {MODULES} is needed for edges on pixels")
+            raise ValueError(
+                f"squares of {square_px} px: a multiple of {MODULES} is needed for edges on pixels"
+            )
         if self.kind == "chessboard":
             row, column = np.indices((self.rows * square_px, self.columns * square_px)) // square_px
             return np.asarray(255 * ((row + column) % 2), np.uint8)
@@ -213,7 +228,9 @@ class Board:
         return np.asarray(self._charuco().generateImage(size, marginSize=0), np.uint8)
 
     def corners(self, image: Levels) -> tuple[FloatArray, FloatArray]:
-        """Inner corners in a photograph: place (n, 3) on the board in squares, and (n, 2) column and row in px."""
+        """Inner corners in a photograph: place (n, 3) on the board in squares, and (n, 2) column
+        and row in px.
+        """
         if self.kind == "chessboard":
             inner = (self.columns - 1, self.rows - 1)
             found, seen = cv2.findChessboardCornersSB(image, inner, flags=cv2.CALIB_CB_ACCURACY)
@@ -233,7 +250,9 @@ class Board:
 
 
 def on_screen(board: Board, square_px: int, width_px: int, height_px: int) -> Levels:
-    """The board in the middle of a white screen. Raises ValueError if it does not fit, or `Board.draw` does."""
+    """The board in the middle of a white screen. Raises ValueError if it does not fit, or
+    `Board.draw` does.
+    """
     drawn = board.draw(square_px)
     height, width = drawn.shape
     if width > width_px or height > height_px:

@@ -1,16 +1,18 @@
 """Possible errors of a bench, as one vector of named parameters around the stated values.
 
-All are 0 for the stated bench. With hinge = F x O' / |F x O'| (world -y for the paper's bench), R(n, w) the turn by w
-about n, and the stated pinhole F0, camera rows C0, screen origin O0 and screen rows X0 (s_x, s_y, normal):
+All are 0 for the stated bench. With hinge = F x O' / |F x O'| (world -y for the paper's bench),
+R(n, w) the turn by w about n, and the stated pinhole F0, camera rows C0, screen origin O0 and
+screen rows X0 (s_x, s_y, normal):
 
     F = (1 + a / |F0|) R(hinge, alpha) F0           C = R(x, pitch) R(y, yaw) R(z, roll) C0 R(hinge, alpha)^T
     O' = R(hinge, -alpha) ((1 + b / |O0|) O0 + x s_x + y s_y)
     X = R(s_x, turn_x) R(s_y, turn_y) R(normal, turn_z) X0 R(hinge, -alpha)^T
 
-so that a, b and alpha are the paper's. A turn of everything about z is unobservable: the camera's azimuth is
-therefore not a parameter and defines the direction of x. The other rigid motions are parameters: two shifts, which
-the fixed ring determines, and two tilts, which only hand measurements determine.
-"""
+so that a, b and alpha are the paper's. A turn of everything about z is unobservable: the camera's
+azimuth is therefore not a parameter and defines the direction of x. The other rigid motions are
+parameters: two shifts, which the fixed ring determines, and two tilts, which only hand measurements
+determine.
+"""  # noqa: E501
 
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
@@ -23,7 +25,13 @@ from membrane_ctrl.metrology.optics.geometry import BOW_RADIUS_MM, Geometry
 from membrane_ctrl.model.arrays import AnyArray, FloatArray
 
 # a, b and alpha: the paper's; the principal point: of the paper's camera
-_BY_HAND = {"a_mm": 2.0, "b_mm": 2.0, "alpha_deg": 0.3, "principal_x_px": 20.0, "principal_y_px": 20.0}
+_BY_HAND = {
+    "a_mm": 2.0,
+    "b_mm": 2.0,
+    "alpha_deg": 0.3,
+    "principal_x_px": 20.0,
+    "principal_y_px": 20.0,
+}
 _BY_HAND |= SigmasConfig().model_dump()
 _COMPLEX_STEP = 1e-30  # small enough that its square is nothing beside 1
 
@@ -74,14 +82,17 @@ OPTIONAL = (
 LASER = Parameter("laser_relative", "scale of the laser, relative")
 ALL = (*POSE, *OPTIONAL, LASER)
 NAMES = tuple(parameter.name for parameter in ALL)
-OPTICAL = len(POSE) + len(OPTIONAL)  # those that the fringes depend on; the laser's scale comes after them
+OPTICAL = len(POSE) + len(
+    OPTIONAL
+)  # those that the fringes depend on; the laser's scale comes after them
 
 
 def sigmas(free: Mapping[str, float] | None = None) -> FloatArray:
     """Prior standard deviations in the order of `NAMES`; 0 holds a parameter where it is.
 
     Raises ValueError for a name that is not a parameter, or a sigma below 0. `free` has changes:
-    another sigma, 0 to hold, more than 0 to free. Without it the poses and the laser's scale are free.
+    another sigma, 0 to hold, more than 0 to free. Without it the poses and the laser's scale are
+    free.
     """
     own = {p.name: p.sigma for p in (*POSE, LASER)}
     for name, sigma in (free or {}).items():
@@ -108,7 +119,9 @@ class BenchGeometry:
 
 @dataclass(frozen=True)
 class Poses:
-    """Pinhole (3,), camera rows (3, 3), screen origin (3,) and screen rows (3, 3): s_x, s_y, normal."""
+    """Pinhole (3,), camera rows (3, 3), screen origin (3,) and screen rows (3, 3): s_x, s_y,
+    normal.
+    """
 
     pinhole_mm: AnyArray
     camera: AnyArray
@@ -138,7 +151,9 @@ def bench_at(stated: Geometry, values: FloatArray) -> BenchGeometry:
 
 
 def poses_at(stated: Geometry, values: AnyArray) -> Poses:
-    """Poses of a parameter vector (real, or complex for `pose_derivatives`); only the first eleven count."""
+    """Poses of a parameter vector (real, or complex for `pose_derivatives`); only the first eleven
+    count.
+    """
     in_radians = [np.pi / 180 if parameter.unit == "deg" else 1.0 for parameter in POSE]
     a, b, alpha, x, y, turn_x, turn_y, turn_z, yaw, pitch, roll = values[: len(POSE)] * in_radians
     f0, o0 = stated.pinhole_mm, stated.screen_origin_mm
@@ -156,7 +171,8 @@ def poses_at(stated: Geometry, values: AnyArray) -> Poses:
 def pose_derivatives(stated: Geometry, values: FloatArray) -> list[Poses]:
     """d poses / d parameter, one for each of the eleven, exact to rounding.
 
-    All of `poses_at` is analytic, so Im f(p + i h) / h is its derivative, without the loss of a difference.
+    All of `poses_at` is analytic, so Im f(p + i h) / h is its derivative, without the loss of a
+    difference.
     """
     out = []
     for k in range(len(POSE)):
@@ -168,22 +184,30 @@ def pose_derivatives(stated: Geometry, values: FloatArray) -> list[Poses]:
     return out
 
 
-SCREEN_MOVE = (
-    6  # numbers of a screen put elsewhere: its shift along s_x, s_y and normal, mm, turns about them, degrees
-)
+# numbers of a screen put elsewhere: its shift along s_x, s_y and normal, mm, turns about them,
+# degrees
+SCREEN_MOVE = 6
 
 
-def screen_elsewhere(bench: BenchGeometry, turns: list[Poses], move: FloatArray) -> tuple[BenchGeometry, list[Poses]]:
-    """The bench with its screen moved by `move` (6,), and d poses by the parameters of `turns` and by the six."""
+def screen_elsewhere(
+    bench: BenchGeometry, turns: list[Poses], move: FloatArray
+) -> tuple[BenchGeometry, list[Poses]]:
+    """The bench with its screen moved by `move` (6,), and d poses by the parameters of `turns` and
+    by the six.
+    """
     there, rows = bench.geometry, bench.geometry.screen_axes
     origin_mm, screen = _moved(there.screen_origin_mm, rows, move)
     by_turn = screen @ rows.T
     derivatives = [
-        replace(turn, origin_mm=turn.origin_mm + turn.screen.T @ move[:3], screen=by_turn @ turn.screen)
+        replace(
+            turn, origin_mm=turn.origin_mm + turn.screen.T @ move[:3], screen=by_turn @ turn.screen
+        )
         for turn in turns
     ]
     for step in 1j * _COMPLEX_STEP * np.eye(SCREEN_MOVE):
-        parts = (part.imag / _COMPLEX_STEP for part in _moved(there.screen_origin_mm, rows, move + step))
+        parts = (
+            part.imag / _COMPLEX_STEP for part in _moved(there.screen_origin_mm, rows, move + step)
+        )
         derivatives.append(Poses(np.zeros(3), np.zeros((3, 3)), *parts))
     moved = replace(there, screen_origin_mm=origin_mm, screen_s_x=screen[0], screen_s_y=screen[1])
     return replace(bench, geometry=moved), derivatives

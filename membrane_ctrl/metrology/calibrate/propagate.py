@@ -1,7 +1,8 @@
-"""A figure's uncertainty after the calibration: height, sag, Zernike terms, with and without a tilt.
+"""A figure's uncertainty after the calibration: height, sag, Zernike terms, with and without a
+tilt.
 
-With a wrong geometry the fit gives a wrong surface: dq = -(J_q^T W J_q)^-1 J_q^T W J_g dg, whose blocks are known.
-The laser sets the vertex, with its own error.
+With a wrong geometry the fit gives a wrong surface: dq = -(J_q^T W J_q)^-1 J_q^T W J_g dg, whose
+blocks are known. The laser sets the vertex, with its own error.
 """
 
 from collections.abc import Sequence
@@ -14,7 +15,12 @@ from membrane_ctrl.metrology import bins, phase
 from membrane_ctrl.metrology.calibrate import parameters, residuals, separable
 from membrane_ctrl.metrology.calibrate.solve import Problem, Solution, solve
 from membrane_ctrl.metrology.optics.geometry import Geometry
-from membrane_ctrl.metrology.optics.surface import PARAMETERS, Surface, parameter_to_coeffs, sag_gradient
+from membrane_ctrl.metrology.optics.surface import (
+    PARAMETERS,
+    Surface,
+    parameter_to_coeffs,
+    sag_gradient,
+)
 from membrane_ctrl.model.arrays import FloatArray, IntArray
 
 
@@ -58,12 +64,16 @@ def propagate(solution: Solution, index: int, analysis_radius_mm: float) -> Prop
 
 
 def sag_um(covariance: FloatArray) -> float:
-    """Standard deviation of the sag from a covariance (parameters, parameters) in mm^2 of a surface's parameters."""
+    """Standard deviation of the sag from a covariance (parameters, parameters) in mm^2 of a
+    surface's parameters.
+    """
     return 1e3 * float(np.sqrt(sag_gradient() @ covariance @ sag_gradient()))
 
 
 def disc(radius: float) -> tuple[FloatArray, FloatArray]:
-    """Heights (n, parameters) of a surface over a disc of some radii, and the plane's columns (n, 3)."""
+    """Heights (n, parameters) of a surface over a disc of some radii, and the plane's columns (n,
+    3).
+    """
     x, y = (a.ravel() for a in np.meshgrid(*[np.linspace(-radius, radius, 41)] * 2))
     inside = np.hypot(x, y) <= radius
     x, y = x[inside], y[inside]
@@ -79,11 +89,12 @@ def _rms_um(heights: FloatArray, covariance: FloatArray) -> float:
     return 1e3 * float(np.sqrt(np.mean(np.einsum("ij,jk,ik->i", heights, covariance, heights))))
 
 
-# Which combinations of parameters the sets do not determine, and their effect on a figure, in words.
+# Which combinations of parameters the sets do not determine, and their effect on a figure, in
+# words.
 #
-# In units of the hand measurements' sigmas, the covariance has eigenvalues between 0 (the sets know far better) and 1
-# (they know nothing). A combination near 1 is named by its largest parts and by the effect of one sigma on the
-# surface.
+# In units of the hand measurements' sigmas, the covariance has eigenvalues between 0 (the sets know
+# far better) and 1 (they know nothing). A combination near 1 is named by its largest parts and by
+# the effect of one sigma on the surface.
 
 WEAK = 0.5  # of the hand's sigma: the sets have not even doubled the knowledge
 _PART = 0.3  # of a unit combination: smaller parts are not named
@@ -96,7 +107,9 @@ class Combination:
     """A direction in the space of parameters."""
 
     left: float  # sigma after over sigma before; 1: the sets say nothing
-    parts: tuple[tuple[str, float], ...]  # of one sigma, in the parameters' units, the largest first
+    parts: tuple[
+        tuple[str, float], ...
+    ]  # of one sigma, in the parameters' units, the largest first
     height_um: float  # effect of one sigma on the surface, RMS, and without the best plane
     figure_um: float
     words: str  # name of that effect
@@ -108,8 +121,12 @@ def condition_number(solution: Solution) -> float:
     return float(values[-1] / values[0])
 
 
-def weak_combinations(solution: Solution, index: int, analysis_radius_mm: float) -> tuple[Combination, ...]:
-    """Combinations that the sets leave undetermined, the worst first; `index` is the set whose surface shows it."""
+def weak_combinations(
+    solution: Solution, index: int, analysis_radius_mm: float
+) -> tuple[Combination, ...]:
+    """Combinations that the sets leave undetermined, the worst first; `index` is the set whose
+    surface shows it.
+    """
     covariance, free = _scaled(solution)
     values, vectors = np.linalg.eigh(covariance)
     out = []
@@ -118,8 +135,14 @@ def weak_combinations(solution: Solution, index: int, analysis_radius_mm: float)
             break
         amounts = vector * np.sqrt(value) * solution.problem.sigmas[free]
         order = np.argsort(-np.abs(vector))
-        parts = tuple((parameters.NAMES[free[k]], float(amounts[k])) for k in order if abs(vector[k]) > _PART)
-        out.append(_described(solution, index, analysis_radius_mm, float(np.sqrt(value)), parts, free, amounts))
+        parts = tuple(
+            (parameters.NAMES[free[k]], float(amounts[k])) for k in order if abs(vector[k]) > _PART
+        )
+        out.append(
+            _described(
+                solution, index, analysis_radius_mm, float(np.sqrt(value)), parts, free, amounts
+            )
+        )
     return tuple(out)
 
 
@@ -145,13 +168,19 @@ def _described(
     figure_um = without_plane(moved_um, plane)
     height, figure = (float(np.sqrt(np.mean(part**2))) for part in (moved_um, figure_um))
     named = [(parameters.ALL[parameters.NAMES.index(name)], amount) for name, amount in parts]
-    says = "; ".join(f"{amount:+.2g} {parameter.unit}: {parameter.says}" for parameter, amount in named)
+    says = "; ".join(
+        f"{amount:+.2g} {parameter.unit}: {parameter.says}" for parameter, amount in named
+    )
     effect = _effect(solution, index, moved_um, figure_um, plane)
     return Combination(left, parts, height, figure, f"{effect} ({says})")
 
 
-def _effect(solution: Solution, index: int, moved_um: FloatArray, figure_um: FloatArray, plane: FloatArray) -> str:
-    """The name of a change of the surface: one of the motions of a rigid body, a scale, or a figure."""
+def _effect(
+    solution: Solution, index: int, moved_um: FloatArray, figure_um: FloatArray, plane: FloatArray
+) -> str:
+    """The name of a change of the surface: one of the motions of a rigid body, a scale, or a
+    figure.
+    """
     total = float(np.mean(moved_um**2))
     if total < _NOTHING_UM**2:
         return "nothing that a figure shows"
@@ -162,33 +191,49 @@ def _effect(solution: Solution, index: int, moved_um: FloatArray, figure_um: Flo
     x, y = plane[:, 1], plane[:, 2]
     surface = solution.states[index].surface.parameters
     height, by_x, by_y = (part.T @ surface for part in residuals.basis(x, y))
-    for name, field in (("a scale of the surface", height), ("a turn about z", x * by_y - y * by_x)):
+    for name, field in (
+        ("a scale of the surface", height),
+        ("a turn about z", x * by_y - y * by_x),
+    ):
         share = (moved_um @ field) ** 2 / (field @ field) / (moved_um @ moved_um)
         if share > _MOSTLY:
             return f"{name}{kept}"
     return f"a change of figure of {np.sqrt(np.mean(figure_um**2)):.2g} µm RMS"
 
 
-# What sets that are still to be taken will determine: the covariance at the stated bench, linear and without noise.
+# What sets that are still to be taken will determine: the covariance at the stated bench, linear
+# and without noise.
 #
-# Rays are followed from a bowl at each depth to the screen, and the problem is solved from there. Its solution is the
-# bowl itself, and its covariance is within a tenth of that claimed by sets of a mounted film (docs/calibration.md).
-# The bowl has the figure of a film that is clamped by hand: a smooth one would claim a fifth more.
+# Rays are followed from a bowl at each depth to the screen, and the problem is solved from there.
+# Its solution is the bowl itself, and its covariance is within a tenth of that claimed by sets of a
+# mounted film (docs/calibration.md). The bowl has the figure of a film that is clamped by hand: a
+# smooth one
+# would claim a fifth more.
 
 _MOUNTED_MM = np.zeros(PARAMETERS)
-_MOUNTED_MM[[3, 5, 7]] = 0.3, 0.1, 0.05  # astigmatism, coma, trefoil; and 10 µm RMS over the terms above
+_MOUNTED_MM[[3, 5, 7]] = (
+    0.3,
+    0.1,
+    0.05,
+)  # astigmatism, coma, trefoil; and 10 µm RMS over the terms above
 _HIGHER = np.arange(9, PARAMETERS - 1)  # Noll 11 and all terms above
 _MOUNTED_MM[_HIGHER] = 0.01 / np.sqrt(_HIGHER.size) * (-1.0) ** np.arange(_HIGHER.size)
-_ACROSS = 48  # rays along the picture's longer side; twice as many change a claim by less than a fiftieth
+# rays along the picture's longer side; twice as many change a claim by less than a fiftieth
+_ACROSS = 48
 
 
 def foresee(
-    optics: OpticsConfig, sigmas: FloatArray, sags_mm: Sequence[float], swing_adu: float, laser_sigma_um: float
+    optics: OpticsConfig,
+    sigmas: FloatArray,
+    sags_mm: Sequence[float],
+    swing_adu: float,
+    laser_sigma_um: float,
 ) -> Propagated:
     """Standard deviations of a figure that is measured with the geometry of sets at these sags.
 
-    `sigmas` (len(NAMES),) are those of the hand's measurements, `swing_adu` is the amplitude of the fringes and
-    `laser_sigma_um` that of a set's mean reading. Raises ValueError if no ray of such a set ends on the pattern.
+    `sigmas` (len(NAMES),) are those of the hand's measurements, `swing_adu` is the amplitude of the
+    fringes and `laser_sigma_um` that of a set's mean reading. Raises ValueError if no ray of such a
+    set ends on the pattern.
     """
     geometry, middle_mm = Geometry.from_config(optics), sags_mm[len(sags_mm) // 2]
     sets = [_set(geometry, optics, sag_mm, sag_mm - middle_mm, swing_adu) for sag_mm in sags_mm]
@@ -212,10 +257,18 @@ def _set(
     if column.size == 0:
         raise ValueError(blind)
     dark = residuals.SetPhases(
-        f"{sag_mm:.2f} mm", column, row, np.zeros((2, column.size)), np.full(column.size, sigma_mm), 1e3 * moved_mm
+        f"{sag_mm:.2f} mm",
+        column,
+        row,
+        np.zeros((2, column.size)),
+        np.full(column.size, sigma_mm),
+        1e3 * moved_mm,
     )
     bowl = Surface.hencky_bowl(sag_mm, mirror.radius_mm).parameters
-    bench, surface = parameters.BenchGeometry(geometry), Surface.from_parameters(bowl + _MOUNTED_MM, mirror.radius_mm)
+    bench, surface = (
+        parameters.BenchGeometry(geometry),
+        Surface.from_parameters(bowl + _MOUNTED_MM, mirror.radius_mm),
+    )
     points = residuals.place_rays(bench, dark, surface, -moved_mm)
     x_mm, y_mm, _z = geometry.pinhole_mm[:, None] + points.t_mm * points.rays
     screen_mm = -residuals.residual_mm(bench, dark, surface, -moved_mm)
@@ -229,11 +282,17 @@ def _set(
 def _towards_mirror(
     geometry: Geometry, optics: OpticsConfig, every_px: float, sag_mm: float
 ) -> tuple[FloatArray, FloatArray]:
-    """Columns and rows whose rays meet the plane half way up the bowl inside its ring; others may miss the film."""
+    """Columns and rows whose rays meet the plane half way up the bowl inside its ring; others may
+    miss the film.
+    """
     camera = optics.camera
-    grid = np.meshgrid(np.arange(0, camera.width_px, every_px), np.arange(0, camera.height_px, every_px))
+    grid = np.meshgrid(
+        np.arange(0, camera.width_px, every_px), np.arange(0, camera.height_px, every_px)
+    )
     column, row = (axis.ravel() for axis in grid)
     rays = geometry.rays(column, row)
-    x_mm, y_mm, _z = geometry.pinhole_mm[:, None] + (sag_mm / 2 - geometry.pinhole_mm[2]) / rays[2] * rays
+    x_mm, y_mm, _z = (
+        geometry.pinhole_mm[:, None] + (sag_mm / 2 - geometry.pinhole_mm[2]) / rays[2] * rays
+    )
     near = np.hypot(x_mm, y_mm) < optics.mirror.radius_mm
     return column[near], row[near]

@@ -1,7 +1,9 @@
-"""The camera's pose from the ring: a circle of known radius is seen as an ellipse, whose five numbers are its pose.
+"""The camera's pose from the ring: a circle of known radius is seen as an ellipse, whose five
+numbers are its pose.
 
-The sixth, a turn of everything about z, is unobservable and defines x (`parameters`). The fit minimises the distance
-from the ring to the points where the rim's rays meet its plane, over a, alpha, yaw, pitch and roll.
+The sixth, a turn of everything about z, is unobservable and defines x (`parameters`). The fit
+minimises the distance from the ring to the points where the rim's rays meet its plane, over a,
+alpha, yaw, pitch and roll.
 """
 
 from collections.abc import Sequence
@@ -17,7 +19,9 @@ from membrane_ctrl.model.arrays import FloatArray
 
 POSE_NAMES = ("a_mm", "alpha_deg", "camera_yaw_deg", "camera_pitch_deg", "camera_roll_deg")
 _PLACES = [NAMES.index(name) for name in POSE_NAMES]
-_UNITS = np.array([usual_sigma(name) for name in POSE_NAMES])  # so that the solver's steps are of one size
+_UNITS = np.array(
+    [usual_sigma(name) for name in POSE_NAMES]
+)  # so that the solver's steps are of one size
 _POINTS = 720
 _REACH_PX = 8.0  # each way from the rough rim
 _STEP_PX = 0.25
@@ -69,11 +73,15 @@ def ring_pose(
     """
     edges = rim_edges(light, rough_px)
     if edges.shape[1] < _LEAST_FOUND * _POINTS:
-        raise ValueError(f"only {edges.shape[1] / _POINTS:.0%} of the rim is seen as an edge of light")
+        raise ValueError(
+            f"only {edges.shape[1] / _POINTS:.0%} of the rim is seen as an edge of light"
+        )
     mm_per_px = radius_mm / float(np.mean(np.hypot(*_from_middle(edges))))
 
     def miss_px(x: FloatArray) -> FloatArray:
-        return np.asarray((_radii_mm(_bench(stated, x * _UNITS), edges, rim_z) - radius_mm) / mm_per_px)
+        return np.asarray(
+            (_radii_mm(_bench(stated, x * _UNITS), edges, rim_z) - radius_mm) / mm_per_px
+        )
 
     from scipy.optimize import least_squares  # calibrations without a pose start sooner
 
@@ -84,7 +92,9 @@ def ring_pose(
     shared = inverse @ slopes.T @ _shared(edges, radius_sigma_mm / mm_per_px)
     seen = np.linalg.inv(inverse * rms_px**2 + shared @ shared.T)
     both = np.linalg.inv(seen + np.eye(len(POSE_NAMES)))  # in units of the hand's sigmas
-    return RingPose(both @ seen @ found * _UNITS, np.sqrt(np.diag(both)) * _UNITS, rms_px, edges.shape[1])
+    return RingPose(
+        both @ seen @ found * _UNITS, np.sqrt(np.diag(both)) * _UNITS, rms_px, edges.shape[1]
+    )
 
 
 def _bench(stated: Geometry, own: FloatArray) -> Geometry:
@@ -97,18 +107,24 @@ def _radii_mm(geometry: Geometry, edges: FloatArray, rim_z: HeightFunction) -> F
     return np.asarray(np.hypot(*on_rim(geometry, edges, rim_z)))
 
 
-def on_rim(geometry: Geometry, edges: FloatArray, rim_z: HeightFunction) -> tuple[FloatArray, FloatArray]:
+def on_rim(
+    geometry: Geometry, edges: FloatArray, rim_z: HeightFunction
+) -> tuple[FloatArray, FloatArray]:
     """x and y in mm at which the rays of edges (2, n) meet the rim's height."""
     rays, z = geometry.rays(*edges), np.zeros(edges.shape[1])
     x = y = z
-    for _ in range(4):  # the height at the rim hardly changes with the place: each step gains three digits
+    for _ in range(
+        4
+    ):  # the height at the rim hardly changes with the place: each step gains three digits
         t = (z - geometry.pinhole_mm[2]) / rays[2]
         x, y = geometry.pinhole_mm[:2, None] + t * rays[:2]
         z = rim_z(x, y)
     return x, y
 
 
-def find_edges(light: FloatArray, stated: Geometry, radius_mm: float, rim_z_mm: float) -> FloatArray | None:
+def find_edges(
+    light: FloatArray, stated: Geometry, radius_mm: float, rim_z_mm: float
+) -> FloatArray | None:
     """Edges of the light (2, n) at the rim; None if half of it or more is not visible."""
     outline = find_outline(light, stated, radius_mm, rim_z_mm)
     try:
@@ -119,7 +135,9 @@ def find_edges(light: FloatArray, stated: Geometry, radius_mm: float, rim_z_mm: 
 
 
 def rim_edges(light: FloatArray, rough_px: FloatArray) -> FloatArray:
-    """Edges of the light (2, n), to a fraction of a pixel, along normals of the ellipse through the rough rim."""
+    """Edges of the light (2, n), to a fraction of a pixel, along normals of the ellipse through the
+    rough rim.
+    """
     ellipse = _ellipse(rough_px)
     ahead = np.roll(ellipse, -1, axis=1) - np.roll(ellipse, 1, axis=1)
     normal = np.stack([ahead[1], -ahead[0]]) / np.hypot(*ahead)
@@ -143,10 +161,14 @@ def rim_edges(light: FloatArray, rough_px: FloatArray) -> FloatArray:
 
 
 def _ellipse(points_px: FloatArray) -> FloatArray:
-    """(2, _POINTS) on the ellipse nearest to the points: the conic through them, by least squares."""
+    """(2, _POINTS) on the ellipse nearest to the points: the conic through them,
+    by least squares.
+    """
     middle, size = points_px.mean(axis=1), float(np.std(points_px))
     x, y = (points_px - middle[:, None]) / size
-    a, b, c, d, e = np.linalg.lstsq(np.stack([x * x, x * y, y * y, x, y], axis=1), np.ones(x.size), rcond=None)[0]
+    a, b, c, d, e = np.linalg.lstsq(
+        np.stack([x * x, x * y, y * y, x, y], axis=1), np.ones(x.size), rcond=None
+    )[0]
     form = np.array([[a, b / 2], [b / 2, c]])
     centre = np.linalg.solve(form, [-d / 2, -e / 2])
     values, axes = np.linalg.eigh(form / (1 + centre @ form @ centre))
@@ -160,7 +182,8 @@ def _ellipse(points_px: FloatArray) -> FloatArray:
 def _shared(edges: FloatArray, radius_sigma_px: float) -> FloatArray:
     """Misses that the edges have in common, one sigma each, (n, 3).
 
-    The radius; and the edge's own error as a rim that is larger, longer across, or longer along a diagonal.
+    The radius; and the edge's own error as a rim that is larger, longer across, or longer along a
+    diagonal.
     """
     x, y = _from_middle(edges) / np.hypot(*_from_middle(edges))
     alike = np.full(x.size, np.hypot(radius_sigma_px, EDGE_SIGMA_PX))
@@ -173,9 +196,9 @@ def _from_middle(edges: FloatArray) -> FloatArray:
 
 # The rim as evidence in the calibration: it shows the size of everything that is seen.
 #
-# Seen from the true bench the radii at which the edges' rays meet the ring are the ring's: their mean, their place
-# and their ovalness are five observations. Their errors are the ring's own and the edge's, which all edges share;
-# the noise of single edges is nothing beside them.
+# Seen from the true bench the radii at which the edges' rays meet the ring are the ring's: their
+# mean, their place and their ovalness are five observations. Their errors are the ring's own and
+# the edge's, which all edges share; the noise of single edges is nothing beside them.
 
 
 @dataclass(frozen=True)
@@ -187,15 +210,25 @@ class Rim:
     radius_sigma_mm: float = RADIUS_SIGMA_MM
 
     @classmethod
-    def of(cls, edges_px: Sequence[FloatArray], radius_mm: float, radius_sigma_mm: float) -> "Rim | None":
+    def of(
+        cls, edges_px: Sequence[FloatArray], radius_mm: float, radius_sigma_mm: float
+    ) -> "Rim | None":
         """The edges of several sets together; None without any."""
-        return cls(np.concatenate(edges_px, axis=1), radius_mm, radius_sigma_mm) if edges_px else None
+        return (
+            cls(np.concatenate(edges_px, axis=1), radius_mm, radius_sigma_mm) if edges_px else None
+        )
 
     def sums(self, stated: Geometry, common: FloatArray) -> FloatArray:
-        """Normal equations (COMMON + 1, squared) of the five observations at the common unknowns."""
+        """Normal equations (COMMON + 1, squared) of the five
+        observations at the common unknowns.
+        """
         now = self._seen_mm(stated, common)
         columns = [np.zeros(now.size)] * common.size
-        optical = [k for k, name in enumerate(parameters.NAMES[: parameters.OPTICAL]) if name not in _OF_SCREEN]
+        optical = [
+            k
+            for k, name in enumerate(parameters.NAMES[: parameters.OPTICAL])
+            if name not in _OF_SCREEN
+        ]
         for k in (*optical, *range(len(parameters.NAMES), common.size)):
             step = _STEP * (parameters.ALL[k].sigma if k < len(parameters.NAMES) else 1.0)
             there = common.copy()
@@ -211,7 +244,10 @@ class Rim:
 
     def _seen_mm(self, stated: Geometry, common: FloatArray) -> FloatArray:
         """Mean radius less the ring's, place (2,) and ovalness (2,) of the edges."""
-        geometry, ring = parameters.bench_at(stated, common[: len(parameters.NAMES)]).geometry, common[_RING]
+        geometry, ring = (
+            parameters.bench_at(stated, common[: len(parameters.NAMES)]).geometry,
+            common[_RING],
+        )
         orders = np.arange(1, ring.size // 2 + 1)
 
         def height(x: FloatArray, y: FloatArray) -> FloatArray:
@@ -220,9 +256,19 @@ class Rim:
 
         x, y = on_rim(geometry, self.edges_px, height)
         theta = np.arctan2(y, x)
-        waves = [np.ones_like(theta), np.cos(theta), np.sin(theta), np.cos(2 * theta), np.sin(2 * theta)]
-        return np.asarray(np.linalg.lstsq(np.stack(waves, axis=1), np.hypot(x, y) - self.radius_mm, rcond=None)[0])
+        waves = [
+            np.ones_like(theta),
+            np.cos(theta),
+            np.sin(theta),
+            np.cos(2 * theta),
+            np.sin(2 * theta),
+        ]
+        return np.asarray(
+            np.linalg.lstsq(np.stack(waves, axis=1), np.hypot(x, y) - self.radius_mm, rcond=None)[0]
+        )
 
 
 _RING = slice(len(parameters.NAMES), None)
-_OF_SCREEN = {name for name in parameters.NAMES if name.startswith(("b_", "screen_", "bow_", "pitch_"))}
+_OF_SCREEN = {
+    name for name in parameters.NAMES if name.startswith(("b_", "screen_", "bow_", "pitch_"))
+}

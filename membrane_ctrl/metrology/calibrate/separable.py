@@ -1,12 +1,14 @@
 """Normal equations of one set, with its surface eliminated (variable projection).
 
-The unknowns of set i are its surface q_i (parameters,) and the height z_i of its vertex; those of all sets are the
-geometry's parameters, the ring's form and the laser's scale. The Schur complement over (q_i, z_i) leaves a matrix of
-the common unknowns alone. These matrices add, so that the cost grows with the number of sets and not with its cube,
-and any subset of the sets, and any choice of free parameters, can be solved again without another look at the points.
+The unknowns of set i are its surface q_i (parameters,) and the height z_i of its vertex; those of
+all sets are the geometry's parameters, the ring's form and the laser's scale. The Schur complement
+over (q_i, z_i) leaves a matrix of the common unknowns alone. These matrices add, so that the cost
+grows with the number of sets and not with its cube, and any subset of the sets, and any choice of
+free parameters, can be solved again without another look at the points.
 
-Each set adds two more observations to the same matrix. The ring does not move: the harmonics 0..7 of the height of
-the rim, z_i e_0 + E q_i, are the same in all sets (a polynomial of degree 7 has no others). The laser gives the
+Each set adds two more observations to the same matrix. The ring does not move: the harmonics 0..7
+of the height of the rim, z_i e_0 + E q_i, are the same in all sets (a polynomial of degree 7 has no
+others). The laser gives the
 vertex: z_i = -(1 + scale) (d_i - reference) / 1000, d_i in µm.
 """
 
@@ -19,22 +21,35 @@ import numpy as np
 
 from membrane_ctrl.metrology.calibrate import parameters, residuals
 from membrane_ctrl.metrology.optics import film_law
-from membrane_ctrl.metrology.optics.surface import PARAMETERS, Artefact, SeenScreen, Surface, beyond_of
+from membrane_ctrl.metrology.optics.surface import (
+    PARAMETERS,
+    Artefact,
+    SeenScreen,
+    Surface,
+    beyond_of,
+)
 from membrane_ctrl.model.arrays import FloatArray
 from membrane_ctrl.model.zernike_terms import ZERNIKE_DEGREE
 
-RING = 2 * ZERNIKE_DEGREE + 1  # harmonics of the rim: a constant, cosines and sines up to the degree
+RING = (
+    2 * ZERNIKE_DEGREE + 1
+)  # harmonics of the rim: a constant, cosines and sines up to the degree
 COMMON = len(parameters.NAMES) + RING  # parameters of `NAMES`, then the ring
-# The film as a check of the geometry. Its round terms beyond the fit's are a micrometre of a 37 mm bowl, and a
-# nanometre of them is 10 µm of sag: "free" knows nothing of them, "prestressed" takes them from the law, whatever
-# slackness the set's own excess shows, "hencky" has the excess of the film without pre-strain and nu = 0.3
+# The film as a check of the geometry. Its round terms beyond the fit's are a micrometre of a 37 mm
+# bowl, and a nanometre of them is 10 µm of sag: "free" knows nothing of them, "prestressed" takes
+# them from the law, whatever slackness the set's own excess shows, "hencky" has the excess of the
+# film without
+# pre-strain and
+# nu = 0.3
 FilmModel = Literal["free", "hencky", "prestressed"]
 _FREE_MM, _LAW_MM = 1e-3, 1e-7
 _TILT_STEP = 1e-4
-_PATCHES = 12  # across the mirror's picture: finer than the geometry's patterns, coarser than a film's ripple
+# across the mirror's picture: finer than the geometry's patterns, coarser than a film's ripple
+_PATCHES = 12
 _FEW_IN_PATCH = 4
 _CHANCE = 0.5  # by which patches' variance exceeds single points' without a cause
-_HUBER = 1.9  # of the length of two normal components: keeps 95 % of the efficiency of least squares
+# of the length of two normal components: keeps 95 % of the efficiency of least squares
+_HUBER = 1.9
 
 
 @dataclass(frozen=True)
@@ -75,7 +90,8 @@ class Trust:
     def seen(cls, phases: residuals.SetPhases, residual_mm: FloatArray) -> "Trust":
         """From residuals (2, n): Huber's weights against their own scatter."""
         length = np.hypot(*residual_mm) / phases.sigma_mm
-        # the median of a Rayleigh distribution is 1.177 sigma; less noise than the camera must have is not accepted
+        # the median of a Rayleigh distribution is 1.177 sigma; less noise than the camera must have
+        # is not accepted
         variance = max(float(np.median(length) / 1.1774) ** 2, 1.0)
         return cls(_HUBER / np.maximum(length / np.sqrt(variance), _HUBER), variance)
 
@@ -85,18 +101,28 @@ def less_trust(
 ) -> tuple[Trust, ...]:
     """Trust in the points of all sets, from their residuals (2, n) at a solution.
 
-    What a film has beyond the model is alike in neighbouring points, and in all sets: it does not average
-    out as noise does. So the means over patches of the picture are compared with what single points let expect,
-    set by set and as sums over the sets; where they scatter more, all points weigh less.
+    What a film has beyond the model is alike in neighbouring points, and in all sets: it does not
+    average out as noise does. So the means over patches of the picture are compared with what
+    single points let expect, set by set and as sums over the sets; where they scatter more, all
+    points weigh less.
     """
-    films = [k for k, phases in enumerate(sets) if phases.artefact is None]  # an artefact is seen smaller
+    films = [
+        k for k, phases in enumerate(sets) if phases.artefact is None
+    ]  # an artefact is seen smaller
     side_px = max(_across_px(sets[k]) for k in films) / _PATCHES
-    sides_px = [side_px if phases.artefact is None else _across_px(phases) / _PATCHES for phases in sets]
+    sides_px = [
+        side_px if phases.artefact is None else _across_px(phases) / _PATCHES for phases in sets
+    ]
     patches = [_patch_means(*each) for each in zip(sets, left_mm, trust, sides_px, strict=True)]
     together = _scatter(np.sum([patches[k] for k in films], axis=0) / np.sqrt(len(films)))
     alike = [together if phases.artefact is None else 0.0 for phases in sets]
-    factors = [max(1.0, _scatter(m) - _CHANCE, all_ - _CHANCE) for m, all_ in zip(patches, alike, strict=True)]
-    return tuple(replace(t, variance=t.variance * f, alike=f) for t, f in zip(trust, factors, strict=True))
+    factors = [
+        max(1.0, _scatter(m) - _CHANCE, all_ - _CHANCE)
+        for m, all_ in zip(patches, alike, strict=True)
+    ]
+    return tuple(
+        replace(t, variance=t.variance * f, alike=f) for t, f in zip(trust, factors, strict=True)
+    )
 
 
 def _across_px(phases: residuals.SetPhases) -> float:
@@ -104,9 +130,15 @@ def _across_px(phases: residuals.SetPhases) -> float:
     return float(max(np.ptp(phases.column_px), np.ptp(phases.row_px)))
 
 
-def _patch_means(phases: residuals.SetPhases, left_mm: FloatArray, trust: Trust, side_px: float) -> FloatArray:
-    """Residuals' means over patches in units of their noise, (2, patches, patches); NaN with few points."""
-    column, row = (np.floor(place / side_px).astype(int) for place in (phases.column_px, phases.row_px))
+def _patch_means(
+    phases: residuals.SetPhases, left_mm: FloatArray, trust: Trust, side_px: float
+) -> FloatArray:
+    """Residuals' means over patches in units of their noise, (2, patches, patches); NaN with few
+    points.
+    """
+    column, row = (
+        np.floor(place / side_px).astype(int) for place in (phases.column_px, phases.row_px)
+    )
     count = _PATCHES + 2
     patch = row % count * count + column % count  # the same in all sets
     weights = trust.weights / (trust.variance * phases.sigma_mm**2)
@@ -127,13 +159,14 @@ def _scatter(means: FloatArray) -> float:
 class Equations:
     """The equations of one set, linearised at its unknowns."""
 
-    # (LOCAL + COMMON + 1, squared): J^T W J of the prediction's derivatives, with the residual as one more column:
-    # normal matrix, right side and sum of squares in one
+    # (LOCAL + COMMON + 1, squared): J^T W J of the prediction's derivatives, with the residual as
+    # one more column: normal matrix, right side and sum of squares in one
     sums: FloatArray
     residual_mm: FloatArray  # (2, n): seen minus predicted screen points
     trust: Trust  # the points' weights
     residual_rms_mm: float  # RMS of one component, each point counting by its weight
-    # of each screen elsewhere, (MOVED + LOCAL + COMMON + 1, squared): its own unknowns first, which `sums` eliminates
+    # of each screen elsewhere, (MOVED + LOCAL + COMMON + 1, squared): its own unknowns first, which
+    # `sums` eliminates
     elsewhere: tuple[FloatArray, ...] = ()
 
     @property
@@ -143,7 +176,10 @@ class Equations:
 
     def local_step(self, common_step: FloatArray) -> FloatArray:
         """Step (LOCAL,) of the set's own unknowns that goes with one of the common ones."""
-        own, mixed = self.sums[: residuals.LOCAL, : residuals.LOCAL], self.sums[: residuals.LOCAL, residuals.LOCAL :]
+        own, mixed = (
+            self.sums[: residuals.LOCAL, : residuals.LOCAL],
+            self.sums[: residuals.LOCAL, residuals.LOCAL :],
+        )
         return np.asarray(np.linalg.solve(own, mixed[:, -1] - mixed[:, :-1] @ common_step))
 
     def moved(self, local_step: FloatArray, common_step: FloatArray) -> list[FloatArray]:
@@ -197,8 +233,12 @@ def equations(
     return Equations(sums, residual, trust, rms, tuple(elsewhere))
 
 
-def _fringes(parts: Iterable[residuals.Chunk], root: FloatArray, moved: bool) -> tuple[FloatArray, FloatArray]:
-    """Sums of points, those of a moved screen with its own unknowns first, and their residuals (2, n)."""
+def _fringes(
+    parts: Iterable[residuals.Chunk], root: FloatArray, moved: bool
+) -> tuple[FloatArray, FloatArray]:
+    """Sums of points, those of a moved screen with its own unknowns first, and their residuals (2,
+    n).
+    """
     first = residuals.MOVED if moved else 0
     sums, left = np.zeros((first + residuals.LOCAL + COMMON + 1,) * 2), np.empty((2, root.size))
     keep = np.append(np.arange(first + residuals.COLUMNS), len(sums) - 1)
@@ -208,7 +248,11 @@ def _fringes(parts: Iterable[residuals.Chunk], root: FloatArray, moved: bool) ->
         if moved:
             motion = derivatives[:, residuals.MOTION].copy()
             derivatives[:, residuals.MOTION] = 0.0  # its own
-            columns = [derivatives[:, residuals.COLUMNS :], residuals.deeper(motion)[:, None], motion[:, None]]
+            columns = [
+                derivatives[:, residuals.COLUMNS :],
+                residuals.deeper(motion)[:, None],
+                motion[:, None],
+            ]
             derivatives = np.concatenate([*columns, derivatives[:, : residuals.COLUMNS]], axis=1)
         for rows, miss in zip(derivatives, part.residual_mm, strict=True):
             weighed = np.vstack([rows, miss]) * root[part.place]
@@ -261,21 +305,32 @@ def film_rows(surface: Surface, film: FilmModel) -> FloatArray:
 
 
 def _artefact_rows(artefact: Artefact, state: SetState) -> FloatArray:
-    """Form and place of an artefact as weighted rows; its tilt, the first two terms, is not known."""
+    """Form and place of an artefact as weighted rows; its tilt, the first two terms,
+    is not known.
+    """
     terms = [*range(PARAMETERS), *range(residuals.BEYOND.start, residuals.BEYOND.stop)]
     rows = np.zeros((len(terms), residuals.LOCAL + COMMON + 1))
     form, (vertex, still) = rows[2:], rows[:2]
     surface, origin = state.surface, np.zeros(1)
     form[:, terms] = np.eye(len(terms))[2:]
-    # the tilt at the vertex is the surface's own, and its form follows: 5 µm of coma for a milliradian
-    leans = np.stack([part[:, 0] for part in residuals.basis(origin, origin)[1:]]) / surface.radius_mm
+    # the tilt at the vertex is the surface's own, and its form follows: 5 µm of coma for a
+    # milliradian
+    leans = (
+        np.stack([part[:, 0] for part in residuals.basis(origin, origin)[1:]]) / surface.radius_mm
+    )
     tilt = leans @ surface.parameters
     here = artefact.terms_mm(*tilt)
-    form[:, -1] = (here - np.append(surface.parameters, surface.beyond_mm or [0.0] * len(film_law.BEYOND)))[2:]
+    form[:, -1] = (
+        here - np.append(surface.parameters, surface.beyond_mm or [0.0] * len(film_law.BEYOND))
+    )[2:]
     for step, lean in zip(_TILT_STEP * np.eye(2), leans, strict=True):
-        form[:, :PARAMETERS] -= np.outer((artefact.terms_mm(*(tilt + step)) - here)[2:] / _TILT_STEP, lean)
+        form[:, :PARAMETERS] -= np.outer(
+            (artefact.terms_mm(*(tilt + step)) - here)[2:] / _TILT_STEP, lean
+        )
     form[:] = np.linalg.solve(np.linalg.cholesky(artefact.covariance_mm2()[2:, 2:]), form)
-    vertex[[PARAMETERS, -1]] = np.array([1.0, artefact.vertex_mm - state.vertex_z_mm]) / artefact.vertex_sigma_mm
+    vertex[[PARAMETERS, -1]] = (
+        np.array([1.0, artefact.vertex_mm - state.vertex_z_mm]) / artefact.vertex_sigma_mm
+    )
     still[residuals.MOTION] = 1.0 / (1e-3 * residuals.STILL_UM)
     return rows
 
@@ -283,7 +338,9 @@ def _artefact_rows(artefact: Artefact, state: SetState) -> FloatArray:
 def rim_of(state: SetState) -> FloatArray:
     """Harmonics (RING,) of the rim's height in world."""
     out = rim_harmonics() @ state.surface.parameters
-    out[0] += state.vertex_z_mm + (_rim_beyond() @ state.surface.beyond_mm if state.surface.beyond_mm else 0.0)
+    out[0] += state.vertex_z_mm + (
+        _rim_beyond() @ state.surface.beyond_mm if state.surface.beyond_mm else 0.0
+    )
     return np.asarray(out)
 
 
@@ -295,7 +352,9 @@ def _rim_beyond() -> FloatArray:
 
 @cache
 def rim_harmonics() -> FloatArray:
-    """Matrix (RING, parameters) from a surface to the harmonics of its rim's height above the vertex."""
+    """Matrix (RING, parameters) from a surface to the harmonics of its rim's height above the
+    vertex.
+    """
     theta = 2 * np.pi * np.arange(4 * RING) / (4 * RING)
     heights = residuals.basis(np.cos(theta), np.sin(theta))[0]
     orders = np.outer(np.arange(1, ZERNIKE_DEGREE + 1), theta)
@@ -305,12 +364,14 @@ def rim_harmonics() -> FloatArray:
 
 # Hundreds of thousands of bins as a few thousand points with the same information.
 #
-# About a bench and a surface that are nearly right, the residual of the seen screen points is smooth but for noise:
-# its mean over a cell of the picture keeps all information. The cell's point is the model's at its middle plus that
-# mean.
+# About a bench and a surface that are nearly right, the residual of the seen screen points is
+# smooth but for noise: its mean over a cell of the picture keeps all information. The cell's point
+# is the model's at its middle plus that mean.
 
 
-_WAVES = range(1, 5)  # per fringe: light that differs between frames makes one and two, gamma in four steps four
+_WAVES = range(
+    1, 5
+)  # per fringe: light that differs between frames makes one and two, gamma in four steps four
 _WAVES_SEEN, _OUTSTANDING = (
     0.5,
     2.0,
@@ -322,11 +383,14 @@ def without_waves(
 ) -> tuple[residuals.SetPhases, ...]:
     """The sets, those with outstanding errors that repeat with the fringes without these.
 
-    Light that differs between frames makes them: errors of a phase that depend on the phase alone. They show in the
-    residuals, beside what is smooth there. Such a set would count as one of another bench.
+    Light that differs between frames makes them: errors of a phase that depend on the phase alone.
+    They show in the residuals, beside what is smooth there. Such a set would count as one of
+    another bench.
     """
     waves = [_waves_mm(bench, *pair) for pair in zip(sets, states, strict=True)]
-    sizes = np.array([np.std(of_set) / np.mean(each.sigma_mm) for of_set, each in zip(waves, sets, strict=True)])
+    sizes = np.array(
+        [np.std(of_set) / np.mean(each.sigma_mm) for of_set, each in zip(waves, sets, strict=True)]
+    )
     strong = sizes > np.maximum(_WAVES_SEEN, _OUTSTANDING * np.median(sizes))
     return tuple(
         replace(each, screen_mm=each.screen_mm - of_set) if bad else each
@@ -334,24 +398,36 @@ def without_waves(
     )
 
 
-def _waves_mm(bench: parameters.BenchGeometry, phases: residuals.SetPhases, state: SetState) -> FloatArray:
+def _waves_mm(
+    bench: parameters.BenchGeometry, phases: residuals.SetPhases, state: SetState
+) -> FloatArray:
     """What of a set's residuals (2, n) repeats with its fringes; 0 if their period is unknown."""
     out = np.zeros_like(phases.screen_mm)
     if not phases.period_mm:
         return out
     left = residuals.residual_mm(bench, phases, state.surface, state.vertex_z_mm, state.elsewhere)
-    root, turn = np.sqrt(Trust.seen(phases, left).weights) / phases.sigma_mm, 2 * np.pi / phases.period_mm
+    root, turn = (
+        np.sqrt(Trust.seen(phases, left).weights) / phases.sigma_mm,
+        2 * np.pi / phases.period_mm,
+    )
     for there in range(1 if phases.screen is None else len(phases.elsewhere) + 1):
         some = phases.seen_with(there)
-        column, row = (place[some] / _across_px(phases) for place in (phases.column_px, phases.row_px))
+        column, row = (
+            place[some] / _across_px(phases) for place in (phases.column_px, phases.row_px)
+        )
         smooth = [column**p * row**q for p in range(4) for q in range(4 - p)]
         for axis in range(2 if some.any() else 0):
             phase_rad = turn * phases.screen_mm[axis, some]
             waves = [
-                wave(k * phase_rad) * by for k in _WAVES for wave in (np.cos, np.sin) for by in (1.0, column, row)
+                wave(k * phase_rad) * by
+                for k in _WAVES
+                for wave in (np.cos, np.sin)
+                for by in (1.0, column, row)
             ]
             design = np.stack([*waves, *smooth], axis=1) * root[some, None]
-            found = np.linalg.lstsq(design, left[axis, some] * root[some], rcond=None)[0][: len(waves)]
+            found = np.linalg.lstsq(design, left[axis, some] * root[some], rcond=None)[0][
+                : len(waves)
+            ]
             out[axis, some] = found @ np.stack(waves)
     return out
 
@@ -364,19 +440,29 @@ def averaged(
     left = residuals.residual_mm(bench, phases, *shape)
     weights = Trust.seen(phases, left).weights / phases.sigma_mm**2
     width, height = np.ptp(phases.column_px), np.ptp(phases.row_px)
-    cell_px = max(float(np.sqrt(width * height * np.pi / 4 / about)), 1.0)  # the mirror is seen as an ellipse
-    column, row = (np.floor(place / cell_px).astype(int) for place in (phases.column_px, phases.row_px))
+    cell_px = max(
+        float(np.sqrt(width * height * np.pi / 4 / about)), 1.0
+    )  # the mirror is seen as an ellipse
+    column, row = (
+        np.floor(place / cell_px).astype(int) for place in (phases.column_px, phases.row_px)
+    )
     screen = np.zeros(row.size, int) if phases.screen is None else phases.screen
     place = column + (row.max() + 1 - row + (row.max() + 2) * screen) * (column.max() + 1)
     _, first, cell = np.unique(place, return_index=True, return_inverse=True)
     total = np.bincount(cell, weights)
     column_px, row_px, *rest = (
-        np.bincount(cell, weights * value) / total for value in (phases.column_px, phases.row_px, *left)
+        np.bincount(cell, weights * value) / total
+        for value in (phases.column_px, phases.row_px, *left)
     )
     sigma_mm = 1 / np.sqrt(total)
     dark = np.zeros((2, total.size))
     bare = replace(
-        phases, column_px=column_px, row_px=row_px, screen_mm=dark, sigma_mm=sigma_mm, screen=screen[first]
+        phases,
+        column_px=column_px,
+        row_px=row_px,
+        screen_mm=dark,
+        sigma_mm=sigma_mm,
+        screen=screen[first],
     )
     model = -residuals.residual_mm(bench, bare, *shape)
     return replace(bare, screen_mm=model + np.stack(rest))

@@ -1,11 +1,13 @@
-"""The one least-squares problem: Gauss-Newton on the common unknowns, surfaces eliminated (`separable`).
+"""The one least-squares problem: Gauss-Newton on the common unknowns, surfaces eliminated
+(`separable`).
 
-`tables_of` gives the solution as the tables of `geometry.toml`. `[geometry]` is what every command reads.
-`[covariance]` is what error bars and a Monte Carlo use: shifts and turns of camera and screen in world, twelve of
-them, made from the eleven parameters (the twelfth direction, a turn of everything about z, has no variance: it
-defines x), and the parameters of lens, bow and pitch that were free. `[parameters]` are the calibration's own,
-`[calibration]` states the origin of all that. The screen's bow is in `[geometry.screen]`. `[camera]` and `[pattern]`
-are there if the lens or the screen's pitch were calibrated; a measurement with such a file needs them too.
+`tables_of` gives the solution as the tables of `geometry.toml`. `[geometry]` is what every command
+reads. `[covariance]` is what error bars and a Monte Carlo use: shifts and turns of camera and
+screen in world, twelve of them, made from the eleven parameters (the twelfth direction, a turn of
+everything about z, has no variance: it defines x), and the parameters of lens, bow and pitch that
+were free. `[parameters]` are the calibration's own, `[calibration]` states the origin of all that.
+The screen's bow is in `[geometry.screen]`. `[camera]` and `[pattern]` are there if the lens or the
+screen's pitch were calibrated; a measurement with such a file needs them too.
 """
 
 from collections.abc import Callable, Sequence
@@ -14,7 +16,13 @@ from typing import Any
 
 import numpy as np
 
-from membrane_ctrl.config.optics import CameraPoseConfig, GeometryConfig, OpticsConfig, ScreenPoseConfig, Vector3
+from membrane_ctrl.config.optics import (
+    CameraPoseConfig,
+    GeometryConfig,
+    OpticsConfig,
+    ScreenPoseConfig,
+    Vector3,
+)
 from membrane_ctrl.metrology import reconstruct
 from membrane_ctrl.metrology.calibrate import parameters, residuals, separable
 from membrane_ctrl.metrology.calibrate.ring_pose import Rim
@@ -30,7 +38,8 @@ MAX_ITERATIONS = 40
 _SETTLED = 1e-2  # of each parameter's own standard deviation: less is invisible in the result
 _NEARLY = 0.1  # likewise: the next step is far below the noise
 _FEW = 4000  # points of a set: a hundred times its unknowns
-_FURTHEST = 4.0  # in sigmas of the hand measurements; sets that contradict each other would lead out of the room
+# in sigmas of the hand measurements; sets that contradict each other would lead out of the room
+_FURTHEST = 4.0
 _START_SAG_MM = 40.0
 _FREE_RING_MM = 1e3  # the ring's form is not known beforehand
 
@@ -58,7 +67,9 @@ class Problem:
 
     @property
     def middle(self) -> int:
-        """The set of the film in the middle of their order: results are stated for a figure like its."""
+        """The set of the film in the middle of their order: results are stated for a figure like
+        its.
+        """
         return self.films[len(self.films) // 2]
 
 
@@ -82,13 +93,19 @@ class Solution:
         return parameters.bench_at(self.problem.stated, self.values)
 
     def known(self, sigmas: FloatArray) -> FloatArray:
-        """What is known besides the sets, as sums (COMMON + 1, squared), with these sigmas of the hand."""
+        """What is known besides the sets, as sums (COMMON + 1, squared), with these sigmas of the
+        hand.
+        """
         return prior(sigmas, self.common) + self.at_rim
 
     @property
     def free(self) -> list[str]:
         """Names of the parameters that were free."""
-        return [name for name, sigma in zip(parameters.NAMES, self.problem.sigmas, strict=True) if sigma > 0]
+        return [
+            name
+            for name, sigma in zip(parameters.NAMES, self.problem.sigmas, strict=True)
+            if sigma > 0
+        ]
 
     @property
     def sigmas(self) -> FloatArray:
@@ -115,9 +132,13 @@ class SolverStep:
 
 def step(sums: FloatArray, sigmas: FloatArray) -> SolverStep:
     """Solve for the free unknowns. `sums` (COMMON + 1, squared) hold the sets and the prior."""
-    free = np.flatnonzero(np.append(sigmas > 0, np.ones(separable.COMMON - len(parameters.NAMES), bool)))
+    free = np.flatnonzero(
+        np.append(sigmas > 0, np.ones(separable.COMMON - len(parameters.NAMES), bool))
+    )
     matrix, right = sums[np.ix_(free, free)], sums[free, -1]
-    scale = 1 / np.sqrt(np.diag(matrix))  # parameters have units of their own: the scaled matrix loses fewer digits
+    scale = 1 / np.sqrt(
+        np.diag(matrix)
+    )  # parameters have units of their own: the scaled matrix loses fewer digits
     inverse = np.linalg.inv(matrix * np.outer(scale, scale)) * np.outer(scale, scale)
     delta, covariance = np.zeros(separable.COMMON), np.zeros((separable.COMMON, separable.COMMON))
     delta[free] = inverse @ right
@@ -126,12 +147,16 @@ def step(sums: FloatArray, sigmas: FloatArray) -> SolverStep:
 
 
 def solve(
-    problem: Problem, progress: Callable[[int, float], None] | None = None, start: Solution | None = None
+    problem: Problem,
+    progress: Callable[[int, float], None] | None = None,
+    start: Solution | None = None,
 ) -> Solution:
-    """Calibrate. Sets of very many bins are solved with some of them first, and then with means of them all.
+    """Calibrate. Sets of very many bins are solved with some of them first, and then with means of
+    them all.
 
-    Raises ValueError if there is no set of the film, or if a set's points do not determine a surface. `progress` gets
-    the number of the step and its largest change in standard deviations; `start` is a solution of the same sets.
+    Raises ValueError if there is no set of the film, or if a set's points do not determine a
+    surface. `progress` gets the number of the step and its largest change in standard deviations;
+    `start` is a solution of the same sets.
     """
     if not problem.films:
         raise ValueError("no capture set of the film to calibrate with")
@@ -139,7 +164,9 @@ def solve(
         return _solve(problem, progress, start)
 
 
-def _solve(problem: Problem, progress: Callable[[int, float], None] | None, start: Solution | None) -> Solution:
+def _solve(
+    problem: Problem, progress: Callable[[int, float], None] | None, start: Solution | None
+) -> Solution:
     if start is None and max(phases.sigma_mm.size for phases in problem.sets) > 2 * _FEW:
         some = replace(problem, sets=tuple(phases.thinned(_FEW) for phases in problem.sets))
         start = _solve(some, progress, None)
@@ -147,7 +174,9 @@ def _solve(problem: Problem, progress: Callable[[int, float], None] | None, star
             return start  # means about a diverged bench would be meaningless
         clean = separable.without_waves(start.bench, problem.sets, start.states)
         pairs = zip(clean, start.states, strict=True)
-        problem = replace(problem, sets=tuple(separable.averaged(start.bench, *pair, _FEW) for pair in pairs))
+        problem = replace(
+            problem, sets=tuple(separable.averaged(start.bench, *pair, _FEW) for pair in pairs)
+        )
     states = start.states if start is not None else first_states(problem)
     # the parameters as stated, and the ring as the first surfaces have it
     ring = np.mean([separable.rim_of(states[k]) for k in problem.films], axis=0)
@@ -155,58 +184,101 @@ def _solve(problem: Problem, progress: Callable[[int, float], None] | None, star
     trust = tuple(separable.Trust.full(phases) for phases in problem.sets)
     free = problem.sigmas > 0
     changes: list[float] = []
-    weighed = final = near = False  # the step before was the first with new weights; they stay; a solution was near
+    # the step before was the first with new weights; they stay; a solution was near
+    weighed = final = near = False
     while True:
         linear = _linearise(problem, states, common, trust)
-        at_rim = np.zeros((common.size + 1,) * 2) if problem.rim is None else problem.rim.sums(problem.stated, common)
-        sums = np.sum([each.reduced() for each in linear], axis=0) + prior(problem.sigmas, common) + at_rim
+        at_rim = (
+            np.zeros((common.size + 1,) * 2)
+            if problem.rim is None
+            else problem.rim.sums(problem.stated, common)
+        )
+        sums = (
+            np.sum([each.reduced() for each in linear], axis=0)
+            + prior(problem.sigmas, common)
+            + at_rim
+        )
         moved = step(sums, problem.sigmas)
         sigmas = np.sqrt(np.diag(moved.covariance))
         if not (np.isfinite(moved.delta).all() and np.isfinite(sigmas).all()):
             raise ValueError("the calibration diverges: the sets do not show the stated bench")
-        changes.append(float(np.max(np.abs(moved.delta[sigmas > 0]) / sigmas[sigmas > 0], initial=0.0)))
+        changes.append(
+            float(np.max(np.abs(moved.delta[sigmas > 0]) / sigmas[sigmas > 0], initial=0.0))
+        )
         if progress is not None:
             progress(len(changes), changes[-1])
         settled = (weighed or final) and changes[-1] < _SETTLED
         left = [each.residual_mm for each in linear]
         if settled and not final and len(changes) < MAX_ITERATIONS:
-            # not before: far from the solution a wrong bench looks like a film, and both would be believed in turn
+            # not before: far from the solution a wrong bench looks like a film, and both would be
+            # believed in turn
             trust, final, settled = separable.less_trust(problem.sets, left, trust), True, False
             continue
         if settled or len(changes) == MAX_ITERATIONS:
             values = common[: len(parameters.NAMES)].copy()
             return Solution(
-                problem, values, common, states, linear, at_rim, moved.covariance, tuple(changes), settled
+                problem,
+                values,
+                common,
+                states,
+                linear,
+                at_rim,
+                moved.covariance,
+                tuple(changes),
+                settled,
             )
-        far = float(np.max(np.abs(moved.delta[: len(parameters.NAMES)][free]) / problem.sigmas[free], initial=0.0))
+        far = float(
+            np.max(
+                np.abs(moved.delta[: len(parameters.NAMES)][free]) / problem.sigmas[free],
+                initial=0.0,
+            )
+        )
         delta = moved.delta * min(1.0, _FURTHEST / far) if far > 0 else moved.delta
         states = tuple(_moved(s, each, delta) for s, each in zip(states, linear, strict=True))
         common = common + delta
-        # Weights are renewed where the steps have nearly converged (at every step, the two may chase each other), and
-        # where points with too much weight lead astray before a solution was near
+        # Weights are renewed where the steps have nearly converged (at every step, the two may
+        # chase each other), and where points with too much weight lead astray before a solution was
+        # near
         near |= changes[-1] < _NEARLY
         weighed = not final and (changes[-1] < _NEARLY or (far > _FURTHEST and not near))
         if weighed:
-            trust = tuple(separable.Trust.seen(*pair) for pair in zip(problem.sets, left, strict=True))
+            trust = tuple(
+                separable.Trust.seen(*pair) for pair in zip(problem.sets, left, strict=True)
+            )
 
 
 def _linearise(
-    problem: Problem, states: Sequence[separable.SetState], common: FloatArray, trust: Sequence[separable.Trust]
+    problem: Problem,
+    states: Sequence[separable.SetState],
+    common: FloatArray,
+    trust: Sequence[separable.Trust],
 ) -> tuple[separable.Equations, ...]:
     values = common[: len(parameters.NAMES)]
-    bench, turns = parameters.bench_at(problem.stated, values), parameters.pose_derivatives(problem.stated, values)
+    bench, turns = (
+        parameters.bench_at(problem.stated, values),
+        parameters.pose_derivatives(problem.stated, values),
+    )
     return tuple(
         separable.equations(bench, turns, phases, state, common, problem.references, believed)
         for phases, state, believed in zip(problem.sets, states, trust, strict=True)
     )
 
 
-def _moved(state: separable.SetState, linear: separable.Equations, common_step: FloatArray) -> separable.SetState:
+def _moved(
+    state: separable.SetState, linear: separable.Equations, common_step: FloatArray
+) -> separable.SetState:
     own = linear.local_step(common_step)
-    surface = Surface.from_parameters(state.surface.parameters + own[:PARAMETERS], state.surface.radius_mm)
-    beyond_mm = np.array(state.surface.beyond_mm or [0.0] * len(film_law.BEYOND)) + own[residuals.BEYOND]
+    surface = Surface.from_parameters(
+        state.surface.parameters + own[:PARAMETERS], state.surface.radius_mm
+    )
+    beyond_mm = (
+        np.array(state.surface.beyond_mm or [0.0] * len(film_law.BEYOND)) + own[residuals.BEYOND]
+    )
     surface = replace(surface, beyond_mm=tuple(beyond_mm.tolist()))
-    vertex_z_mm, motion_mm = state.vertex_z_mm + own[PARAMETERS], state.motion_mm + own[residuals.MOTION]
+    vertex_z_mm, motion_mm = (
+        state.vertex_z_mm + own[PARAMETERS],
+        state.motion_mm + own[residuals.MOTION],
+    )
     steps = linear.moved(own, common_step)
     elsewhere = tuple(move + step for move, step in zip(state.elsewhere, steps, strict=True))
     return separable.SetState(surface, float(vertex_z_mm), float(motion_mm), elsewhere)
@@ -223,7 +295,9 @@ def _first(problem: Problem, phases: residuals.SetPhases) -> separable.SetState:
     radius_mm = problem.radius_mm
     elsewhere = tuple(each.known(problem.references.laser_sigma_um)[0] for each in phases.elsewhere)
     if isinstance(artefact, SeenScreen):
-        return separable.SetState(Surface.from_parameters(np.zeros(PARAMETERS), radius_mm), 0.0, elsewhere=elsewhere)
+        return separable.SetState(
+            Surface.from_parameters(np.zeros(PARAMETERS), radius_mm), 0.0, elsewhere=elsewhere
+        )
     if artefact is not None:
         vertex_z_mm, radius_mm = artefact.vertex_mm, artefact.radius_mm
     fit = fit_on(parameters.BenchGeometry(problem.stated), phases, radius_mm, vertex_z_mm)
@@ -231,12 +305,19 @@ def _first(problem: Problem, phases: residuals.SetPhases) -> separable.SetState:
 
 
 def fit_on(
-    bench: parameters.BenchGeometry, phases: residuals.SetPhases, radius_mm: float, vertex_z_mm: float
+    bench: parameters.BenchGeometry,
+    phases: residuals.SetPhases,
+    radius_mm: float,
+    vertex_z_mm: float,
 ) -> reconstruct.Fit:
-    """One set's surface on a bench without bow, as `measure` fits it. Raises ValueError if there is none."""
+    """One set's surface on a bench without bow, as `measure` fits it. Raises ValueError if there is
+    none.
+    """
     phases = phases.subset(phases.seen_with(0))
     tracer = reconstruct.Tracer(bench.geometry, radius_mm, vertex_z_mm)
-    points = reconstruct.Points.of(residuals.camera_rays(bench.geometry, phases), phases.screen_mm * bench.pitch)
+    points = reconstruct.Points.of(
+        residuals.camera_rays(bench.geometry, phases), phases.screen_mm * bench.pitch
+    )
     return reconstruct.solve(tracer, points, reconstruct.parabola(_START_SAG_MM, radius_mm))
 
 
@@ -249,8 +330,11 @@ class Origin:
 
     date_utc: str
     sets: tuple[str, ...]
-    screen_residual_um: float  # median over the sets of the RMS of seen minus predicted screen points
-    # Median over the sets of the RMS that `measure` states with this geometry: the reference for a drift
+    screen_residual_um: (
+        float  # median over the sets of the RMS of seen minus predicted screen points
+    )
+    # Median over the sets of the RMS that `measure` states with this geometry: the reference for a
+    # drift
     slope_residual_urad: float
     slope_noise_urad: float  # share of the camera's noise in it
     condition: float  # see `propagate.condition_number`
@@ -276,7 +360,9 @@ def tables_of(solution: Solution, optics: OpticsConfig, origin: Origin) -> dict[
     }
     bench = solution.bench
     if set(solution.free) & set(_LENS):
-        of_camera = {key: getattr(optics.camera, key) for key in ("width_px", "height_px", "pixel_um")}
+        of_camera = {
+            key: getattr(optics.camera, key) for key in ("width_px", "height_px", "pixel_um")
+        }
         tables["camera"] = of_camera | {
             "focal_mm": bench.geometry.focal_px * optics.camera.pixel_um * 1e-3,
             "principal_px": list(bench.geometry.principal_px),
@@ -299,18 +385,24 @@ def tables_of(solution: Solution, optics: OpticsConfig, origin: Origin) -> dict[
 
 
 def geometry_of(solution: Solution, optics: OpticsConfig) -> GeometryConfig:
-    """The calibrated geometry in the general form; the screen's height map is the stated bench's."""
+    """The calibrated geometry in the general form; the screen's
+    height map is the stated bench's.
+    """
     reference = {"reference_displacement_um": solution.problem.references.reference_um}
     return general_form(solution.bench.geometry, optics).model_copy(update=reference)
 
 
 def general_form(geometry: Geometry, optics: OpticsConfig) -> GeometryConfig:
-    """A geometry as two poses; the height map and the reference displacement are the stated bench's."""
+    """A geometry as two poses; the height map and the reference displacement are the stated
+    bench's.
+    """
     stated = optics.geometry.screen
     right, down, forward = (_vector(row) for row in geometry.rotation)
     return GeometryConfig(
         reference_displacement_um=optics.geometry.reference_displacement_um,
-        camera=CameraPoseConfig(position_mm=_vector(geometry.pinhole_mm), rotation=(right, down, forward)),
+        camera=CameraPoseConfig(
+            position_mm=_vector(geometry.pinhole_mm), rotation=(right, down, forward)
+        ),
         screen=ScreenPoseConfig(
             origin_mm=_vector(geometry.screen_origin_mm),
             s_x=_vector(geometry.screen_s_x),
@@ -322,14 +414,19 @@ def general_form(geometry: Geometry, optics: OpticsConfig) -> GeometryConfig:
 
 
 def general_covariance(solution: Solution) -> FloatArray:
-    """Covariance (12 + k, 12 + k) of `GENERAL_NAMES` and of the k free parameters of lens, bow and pitch.
+    """Covariance (12 + k, 12 + k) of `GENERAL_NAMES` and of the k free parameters of lens, bow and
+    pitch.
 
-    Rows r of a body turned by a small w become r + w x r, so that C^T dC is minus the cross-product matrix of w.
+    Rows r of a body turned by a small w become r + w x r, so that C^T dC is minus the cross-product
+    matrix of w.
     """
     geometry = solution.bench.geometry
     columns = []
     for turn in parameters.pose_derivatives(solution.problem.stated, solution.values):
-        turns = _turn_vector(geometry.rotation.T @ turn.camera), _turn_vector(geometry.screen_axes.T @ turn.screen)
+        turns = (
+            _turn_vector(geometry.rotation.T @ turn.camera),
+            _turn_vector(geometry.screen_axes.T @ turn.screen),
+        )
         columns.append(np.concatenate([turn.pinhole_mm, turns[0], turn.origin_mm, turns[1]]))
     poses = np.stack(columns, axis=1)
     optional = [parameters.NAMES.index(name) for name in _optional(solution)]
@@ -345,7 +442,10 @@ def _optional(solution: Solution) -> list[str]:
 
 
 def _turn_vector(cross: FloatArray) -> FloatArray:
-    return -np.array([cross[2, 1] - cross[1, 2], cross[0, 2] - cross[2, 0], cross[1, 0] - cross[0, 1]]) / 2
+    return (
+        -np.array([cross[2, 1] - cross[1, 2], cross[0, 2] - cross[2, 0], cross[1, 0] - cross[0, 1]])
+        / 2
+    )
 
 
 def _vector(values: FloatArray) -> Vector3:

@@ -1,4 +1,6 @@
-"""May a solution be used, and for how long? The objections, one line each, the cause before its consequences."""
+"""May a solution be used, and for how long? The objections, one line each, the cause before its
+consequences.
+"""
 
 from collections import deque
 from dataclasses import dataclass, field, replace
@@ -15,10 +17,12 @@ from membrane_ctrl.metrology.optics.geometry import Geometry
 from membrane_ctrl.metrology.optics.surface import Surface
 from membrane_ctrl.model.arrays import FloatArray
 
-# Sets closer together than this add nothing to one set: the sag's sigma is then twice that of sets 8 mm apart
+# Sets closer together than this add nothing to one set: the sag's sigma is then twice that of sets
+# 8 mm apart
 LEAST_SPREAD_UM = 1000.0
 GOOD_SPREAD_UM = 8000.0
-# A wrong geometry changes the sag's slope against the laser by some per cent at most; a wrong unit or sign by more
+# A wrong geometry changes the sag's slope against the laser by some per cent at most; a wrong unit
+# or sign by more
 _SLOPE_OFF = 0.2
 _LASER_SIGMAS = 10.0  # of one reading: below, the fringes are as likely to be wrong
 _FEW_POINTS = 500  # of a set: ten times its unknowns
@@ -50,26 +54,35 @@ def before(problem: Problem) -> tuple[CalibrationFinding, ...]:
         if problem.with_artefact:
             return ()  # the artefacts add what the film does not
         says = (
-            f"the sets are only {max(spread_um, seen_um):.0f} µm apart: they add nothing to one of them; "
-            f"at least {LEAST_SPREAD_UM / 1000:.0f} mm are needed, {GOOD_SPREAD_UM / 1000:.0f} mm are good"
+            f"the sets are only {max(spread_um, seen_um):.0f} µm apart: they add nothing to "
+            "one of them; "
+            f"at least {LEAST_SPREAD_UM / 1000:.0f} mm are needed, "
+            f"{GOOD_SPREAD_UM / 1000:.0f} mm are good"
         )
         return (CalibrationFinding(True, says),)
     if np.count_nonzero(known) < 2:
         return ()  # nothing to compare
     slope = float(np.polyfit(moved[known], sag_um[known], 1)[0]) if spread_um > 0 else np.inf
     if slope < 0:
-        return (CalibrationFinding(True, "the laser counts the wrong way: its reading falls as the bowl deepens"),)
+        return (
+            CalibrationFinding(
+                True, "the laser counts the wrong way: its reading falls as the bowl deepens"
+            ),
+        )
     if abs(slope - 1) > _SLOPE_OFF:
         says = f"its readings are {spread_um:.4g} µm apart, the sags {seen_um:.4g} µm"
-        return (CalibrationFinding(True, f"the laser's unit or scale is wrong, or it is stuck: {says}"),)
+        return (
+            CalibrationFinding(True, f"the laser's unit or scale is wrong, or it is stuck: {says}"),
+        )
     return ()
 
 
 def after(solution: Solution) -> tuple[CalibrationFinding, ...]:
     """Findings from the solution about sets and model.
 
-    One error makes many things look wrong. Of all explanations, the one that removes most from the sum of squares,
-    less two for each number it frees (Akaike's rule), is the cause; the others wait until it is gone.
+    One error makes many things look wrong. Of all explanations, the one that removes most from the
+    sum of squares, less two for each number it frees (Akaike's rule), is the cause; the others wait
+    until it is gone.
     """
     film = _film(solution)
     if not solution.converged:
@@ -90,7 +103,9 @@ def _elsewhere(solution: Solution) -> list[tuple[float, CalibrationFinding]]:
 
 
 def _of_still_sets(solution: Solution, finding: CalibrationFinding) -> CalibrationFinding:
-    """The finding; where the film moved much in some sets, that of the others, or its motion if they have none."""
+    """The finding; where the film moved much in some sets, that of the others, or its motion if
+    they have none.
+    """
     sets = solution.problem.sets
     moved = [k for k, phases in enumerate(sets) if phases.moved_um >= _STEADY_UM]
     if not moved:
@@ -104,7 +119,8 @@ def _of_still_sets(solution: Solution, finding: CalibrationFinding) -> Calibrati
         return replace(max(causes, key=lambda each: each[0])[1], sets=())
     most = sets[max(moved, key=lambda k: sets[k].moved_um)]
     says = (
-        f"the film moved by {most.moved_um:.0f} µm RMS while {most.name} was taken: hold it still, and take it anew"
+        f"the film moved by {most.moved_um:.0f} µm RMS while {most.name} was taken: hold it "
+        "still, and take it anew"
     )
     return CalibrationFinding(True, says, tuple(moved))
 
@@ -132,26 +148,36 @@ def _film(solution: Solution) -> list[tuple[float, CalibrationFinding]]:
 
 
 def _sets(solution: Solution) -> list[tuple[float, CalibrationFinding]]:
-    """A bumped camera, a bad set, sets that do not belong together, each with the share that it explains."""
+    """A bumped camera, a bad set, sets that do not belong together, each with the share that it
+    explains.
+    """
     names = [phases.name for phases in solution.problem.sets]
     out = [
         (
             np.inf,
             CalibrationFinding(
-                True, f"{names[k]} disagrees with all the others: {_doubt(solution.problem, k)}", (k,)
+                True,
+                f"{names[k]} disagrees with all the others: {_doubt(solution.problem, k)}",
+                (k,),
             ),
         )
         for k in _of_others(solution)[:1]
     ]
     for bump in diagnose.bumps(solution)[:1]:
         yaw, pitch, roll = bump.turned_deg
-        where = f"in {names[bump.sets[0]]}" if len(bump.sets) == 1 else f"from {names[bump.sets[0]]} on"
-        says = f"the camera had moved {where}: yaw {yaw:+.3f}, pitch {pitch:+.3f}, roll {roll:+.3f} degrees"
+        where = (
+            f"in {names[bump.sets[0]]}" if len(bump.sets) == 1 else f"from {names[bump.sets[0]]} on"
+        )
+        says = (
+            f"the camera had moved {where}: yaw {yaw:+.3f}, pitch {pitch:+.3f}, roll {roll:+.3f} "
+            "degrees"
+        )
         out.append((bump.fall - 2 * 3, CalibrationFinding(True, says, bump.sets)))
     if (crept := diagnose.creep(solution)) is not None:
         parameter = parameters.ALL[parameters.NAMES.index(crept.name)]
         says = (
-            f"camera or screen crept from {names[0]} to {names[-1]}, as if by {crept.amount:+.2g} {parameter.unit} "
+            f"camera or screen crept from {names[0]} to {names[-1]}, as if by "
+            f"{crept.amount:+.2g} {parameter.unit} "
             f"of {crept.name} ({parameter.says}): let the mounts settle, and take the sets anew"
         )
         out.append((crept.fall - 2 * crept.freedom, CalibrationFinding(True, says)))
@@ -161,10 +187,15 @@ def _sets(solution: Solution) -> list[tuple[float, CalibrationFinding]]:
         if len(names) > 2 and not any(
             each.disagrees for each in diagnose.left_out(diagnose.without(solution, worst.index))
         ):
-            says = f"{names[worst.index]} disagrees with all the others: {_why(solution, worst.index)}"
+            says = (
+                f"{names[worst.index]} disagrees with all the others: {_why(solution, worst.index)}"
+            )
             out.append((explained, CalibrationFinding(True, says, (worst.index,))))
         else:
-            says = "the sets contradict each other: they are not of one bench, or several of them are bad"
+            says = (
+                "the sets contradict each other: they are not of one bench, or several of them "
+                "are bad"
+            )
             out.append((explained, CalibrationFinding(True, says)))
     return out
 
@@ -175,28 +206,43 @@ def _doubt(problem: Problem, index: int) -> str:
 
 
 def _of_others(solution: Solution) -> list[int]:
-    """Sets whose fringes show a bench of their own: they hardly count, and by a pattern, not by noise."""
+    """Sets whose fringes show a bench of their own: they hardly count, and by a pattern, not by
+    noise.
+    """
     ratios = np.array([(np.sqrt(each.variance), each.trust.alike) for each in solution.equations])
-    return [int(k) for k in np.flatnonzero((ratios > _SCATTER * np.median(ratios, axis=0)).all(axis=1))]
+    return [
+        int(k) for k in np.flatnonzero((ratios > _SCATTER * np.median(ratios, axis=0)).all(axis=1))
+    ]
 
 
 def _astray(solution: Solution) -> CalibrationFinding:
-    """No common geometry was found: is there one without one of the sets, or for those before and after a moment?"""
+    """No common geometry was found: is there one without one of the sets, or for those before and
+    after a moment?
+    """
     problem, count = solution.problem, len(solution.problem.sets)
     for k in range(count if count > 2 else 0):
         if _agree(replace(problem, sets=problem.sets[:k] + problem.sets[k + 1 :])):
             says = f"{problem.sets[k].name} disagrees with all the others: {_doubt(problem, k)}"
             return CalibrationFinding(True, says, (k,))
     for k in range(2, count - 1):
-        if all(_agree(replace(problem, sets=part)) for part in (problem.sets[:k], problem.sets[k:])):
-            says = f"the bench was changed between {problem.sets[k - 1].name} and {problem.sets[k].name}"
+        if all(
+            _agree(replace(problem, sets=part)) for part in (problem.sets[:k], problem.sets[k:])
+        ):
+            says = (
+                f"the bench was changed between {problem.sets[k - 1].name} and "
+                f"{problem.sets[k].name}"
+            )
             return CalibrationFinding(True, says, tuple(range(k, count)))
-    says = "the sets do not show one bench: they are of different benches, or several of them are bad"
+    says = (
+        "the sets do not show one bench: they are of different benches, or several of them are bad"
+    )
     return CalibrationFinding(True, says)
 
 
 def _agree(problem: Problem) -> bool:
-    """Whether the sets share one bench; a few points of each are enough to show that they do not."""
+    """Whether the sets share one bench; a few points of each are
+    enough to show that they do not.
+    """
     few = replace(problem, sets=tuple(phases.thinned(_FEW_POINTS) for phases in problem.sets))
     try:
         solution = solve(few)
@@ -213,7 +259,9 @@ def _why(solution: Solution, index: int) -> str:
     rim_mm = separable.rim_of(replace(solution.states[index], vertex_z_mm=0.0))[0]
     vertex_um = 1e3 * (rest.common[len(parameters.NAMES)] - rim_mm)
     moved_um = phases.displacement_um - solution.problem.references.reference_um
-    miss_um = moved_um + vertex_um / (1 + rest.values[parameters.NAMES.index(parameters.LASER.name)])
+    miss_um = moved_um + vertex_um / (
+        1 + rest.values[parameters.NAMES.index(parameters.LASER.name)]
+    )
     if abs(miss_um) > _LASER_SIGMAS * solution.problem.references.laser_sigma_um:
         return f"its laser reads {miss_um:+.1f} µm against the optics"
     return "its fringes show another bench"
@@ -232,7 +280,10 @@ def _laser(solution: Solution) -> list[tuple[float, CalibrationFinding]]:
     laser = diagnose.laser_scale(solution)
     if not laser.sure:
         return []
-    says = f"the laser's scale is wrong: the optics see {laser.value:.4f} +- {laser.sigma:.4f} µm per µm of it"
+    says = (
+        f"the laser's scale is wrong: the optics see {laser.value:.4f} +- {laser.sigma:.4f} µm "
+        "per µm of it"
+    )
     return [(laser.fall - 2, CalibrationFinding(True, says))]
 
 
@@ -245,8 +296,10 @@ def _model(solution: Solution) -> list[tuple[float, CalibrationFinding]]:
     unit = f" {parameter.unit}" if parameter.unit else ""
     also = f" (or {', '.join(other.name for other in others)})" if others else ""
     says = (
-        f"the residuals have the pattern of {first.name} = {first.value:.3g} +- {first.sigma:.2g}{unit} "
-        f"({parameter.says}){also}, {first.figure_um:.1f} µm of figure: free it with --free {first.name}"
+        f"the residuals have the pattern of {first.name} = {first.value:.3g} +- "
+        f"{first.sigma:.2g}{unit} "
+        f"({parameter.says}){also}, {first.figure_um:.1f} µm of figure: free it with --free "
+        f"{first.name}"
     )
     return [(first.fall - 2, CalibrationFinding(first.figure_um > _HARMLESS_UM, says))]
 
@@ -264,20 +317,24 @@ def _spread(solution: Solution) -> tuple[CalibrationFinding, ...]:
     if spread_um >= GOOD_SPREAD_UM / 2:
         return ()
     says = (
-        f"the sets are {spread_um / 1000:.1f} mm apart; {GOOD_SPREAD_UM / 1000:.0f} mm would determine the sag better"
+        f"the sets are {spread_um / 1000:.1f} mm apart; {GOOD_SPREAD_UM / 1000:.0f} mm would "
+        "determine the sag better"
     )
     return (CalibrationFinding(False, says),)
 
 
-# When to calibrate again: the fit's residual now, against that of the calibration. A wrong geometry bends the fringes
-# as no surface can (a camera that rolls), or as one can (a camera that turns): the ring, which cannot have tilted,
-# shows the latter. Only what noise leaves is compared: live cycles have other bins and light. One bad cycle is no
-# drift (a door, a hand before the screen); the median of many is.
+# When to calibrate again: the fit's residual now, against that of the calibration. A wrong geometry
+# bends the fringes as no surface can (a camera that rolls), or as one can (a camera that turns):
+# the ring, which cannot have tilted, shows the latter. Only what noise leaves is compared: live
+# cycles have other bins and light. One bad cycle is no drift (a door, a hand before the screen);
+# the median of many
+# is.
 
 CYCLES = 60  # two minutes of cycles
 GROWN = 1.25  # times the expected residual: 0.75 of it more, added in squares
 FINE = 1.1  # times the expected residual: a warning ends here
-# The required accuracy. A camera turned by 0.02 degrees moves the ring by 5.6 µm and bends the figure by 4
+# The required accuracy. A camera turned by 0.02 degrees moves the ring by 5.6 µm and bends the
+# figure by 4
 RING_MOVED_UM = 5.0
 RING_BACK_UM = 3.0
 
@@ -290,7 +347,9 @@ def noise_urad(geometry: Geometry, surface: Surface, screen_sigma_mm: float) -> 
 
 @dataclass
 class DriftMonitor:
-    """Monitors the live residual; `[calibration]` of the geometry has both arguments, as `slope_...`."""
+    """Monitors the live residual; `[calibration]` of the geometry has both arguments, as
+    `slope_...`.
+    """
 
     calibrated_urad: float
     calibrated_noise_urad: float
@@ -298,7 +357,9 @@ class DriftMonitor:
     _seen: deque[tuple[float, float]] = field(default_factory=lambda: deque(maxlen=CYCLES))
 
     def add(self, residual_urad: float, live_noise_urad: float) -> None:
-        """Take one cycle's residual and the camera's share of it; cycles without a figure (NaN) do not count."""
+        """Take one cycle's residual and the camera's share of it; cycles without a figure (NaN) do
+        not count.
+        """
         if np.isfinite(residual_urad) and np.isfinite(live_noise_urad):
             self._seen.append((residual_urad, live_noise_urad))
         if len(self._seen) < CYCLES:
@@ -322,7 +383,9 @@ def ring_um(surface: Surface) -> FloatArray:
 
 @dataclass
 class RingMonitor:
-    """Monitors the ring's position in the live cycles against `ring_um` (14,) of the geometry's `[calibration]`."""
+    """Monitors the ring's position in the live cycles against `ring_um` (14,) of the geometry's
+    `[calibration]`.
+    """
 
     calibrated_um: FloatArray
     says: str = ""  # as for `DriftMonitor`
@@ -339,6 +402,7 @@ class RingMonitor:
             self.says = ""
         elif moved_um > RING_MOVED_UM and not self.says:
             self.says = (
-                f"calibrate again: the ring is seen {moved_um:.1f} µm RMS from where it was when the geometry was "
+                f"calibrate again: the ring is seen {moved_um:.1f} µm RMS from where it was "
+                "when the geometry was "
                 "calibrated; camera or screen has moved"
             )

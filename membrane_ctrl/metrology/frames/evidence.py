@@ -1,14 +1,16 @@
 """What each frame shows, measured against what the surface predicts it should show.
 
-After the fit the phase of every bin is known without any single frame, so each frame alone gives its own phase step,
-brightness, contrast and film position. For a sinusoid with predicted phase psi = phi + d_k
+After the fit the phase of every bin is known without any single frame, so each frame alone gives
+its own phase step, brightness, contrast and film position. For a sinusoid with predicted phase psi
+= phi + d_k
 
-    I = g [m + b cos(psi + delta) + c2 cos 2 psi + c3 cos 3 psi + c4 cos 4 psi - b e (q - <q>) sin psi]
+    I = g [m + b cos(psi + delta) + c2 cos 2 psi + c3 cos 3 psi + c4 cos 4 psi - b e (q - <q>) sin
+    psi]
 
-with g the bin's light and q its known change of phase per µm of film motion: linear in m, b cos delta, b sin delta,
-b e, c2, c3 and c4. The harmonics are the display's response, alike in all frames. A Gray frame has two levels,
-I = g (lo + (hi - lo) bit); white and black have one. Over thousands of bins noise does not matter; what is left over
-does not belong there.
+with g the bin's light and q its known change of phase per µm of film motion: linear in m, b cos
+delta, b sin delta, b e, c2, c3 and c4. The harmonics are the display's response, alike in all
+frames. A Gray frame has two levels, I = g (lo + (hi - lo) bit); white and black have one. Over
+thousands of bins noise does not matter; what is left over does not belong there.
 """
 
 from collections.abc import Collection
@@ -22,10 +24,13 @@ from membrane_ctrl.metrology.phase import AXES, CONTRAST_SHARE, FRINGE_SHARE
 from membrane_ctrl.model.arrays import BoolArray, FloatArray, IntArray
 
 _SAMPLE = 6_000
-# For the film's places, whose noise would be taken for motion: as many pixels, whatever the size of the bins
+# For the film's places, whose noise would be taken for motion: as many pixels, whatever the size of
+# the bins
 _SAMPLED_PX = 96_000
-_SEVERAL_RAD = 6.0  # standard deviation of the phases: fewer fringes cannot be told from a contrast that differs
-# Distance from a Gray bit's edge, rad: blur, and the film's motion by up to some hundred µm, stay inside
+# standard deviation of the phases: fewer fringes cannot be told from a contrast that differs
+_SEVERAL_RAD = 6.0
+# Distance from a Gray bit's edge, rad: blur, and the film's motion by up to some hundred µm, stay
+# inside
 _EDGE_RAD = 0.5
 
 
@@ -60,11 +65,14 @@ class Evidence:
     rest: float  # RMS of what is left over, as a share of the light
     saturated: float  # share of bins with a saturated pixel
     shows: int  # frame whose pattern this one fits best
-    # Share of the bins where a Gray frame is predicted bright: 0 or 1 where the mirror shows no edge of that bit
+    # Share of the bins where a Gray frame is predicted bright: 0 or 1 where the mirror shows no
+    # edge of that bit
     lit: float = 1.0
 
 
-def gather(stack: FrameStack, binned: Binned, scene: SampledBins, readable: list[int]) -> dict[int, Evidence]:
+def gather(
+    stack: FrameStack, binned: Binned, scene: SampledBins, readable: list[int]
+) -> dict[int, Evidence]:
     """Evidence of all readable frames."""
     scene = scene.thinned()
     readings = np.nan_to_num(stack.displacement_um - np.nan_to_num(stack.mean_reading_um))
@@ -74,19 +82,27 @@ def gather(stack: FrameStack, binned: Binned, scene: SampledBins, readable: list
     for k in readable:
         seen = binned.means[k].reshape(-1)[scene.index].astype(float)
         saturated = float(np.mean(binned.saturated[k].reshape(-1)[scene.index]))
-        out[k] = _evidence(seen, templates[k], scene.light, saturated, _best(seen, waves, scene.light, k))
+        out[k] = _evidence(
+            seen, templates[k], scene.light, saturated, _best(seen, waves, scene.light, k)
+        )
     return out
 
 
 def light_and_film(
-    stack: FrameStack, binned: Binned, scene: SampledBins, used: tuple[list[int], list[int]], phase_rad: FloatArray
+    stack: FrameStack,
+    binned: Binned,
+    scene: SampledBins,
+    used: tuple[list[int], list[int]],
+    phase_rad: FloatArray,
 ) -> tuple[FloatArray, FloatArray, float]:
-    """Level and swing (2, frames) of the used sinusoids about the mean of their axis; the film's places, 1 sigma, µm.
+    """Level and swing (2, frames) of the used sinusoids about the mean of their axis; the film's
+    places, 1 sigma, µm.
 
-    Places are those of the used sinusoids of x and then of y. Each frame is compared with the light that the other
-    axis saw: in that of its own axis it leaves waves, which would hide a tenth of what differs. Phases `phase_rad`
-    (2, bins) that differ smoothly from the surface's (a film that moved between the axes, a wrong geometry) and a
-    contrast that differs over the mirror (blur) would be taken for both.
+    Places are those of the used sinusoids of x and then of y. Each frame is compared with the light
+    that the other axis saw: in that of its own axis it leaves waves, which would hide a tenth of
+    what differs. Phases `phase_rad` (2, bins) that differ smoothly from the surface's (a film that
+    moved between the axes, a wrong geometry) and a contrast that differs over the mirror (blur)
+    would be taken for both.
     """
     scene, light = scene.thinned(_SAMPLED_PX // binned.bin_px**2), np.ones((2, len(stack.patterns)))
     film_um, sigma_um = np.empty(0), np.empty(0)
@@ -114,14 +130,18 @@ def light_and_film(
 
 @dataclass(frozen=True)
 class _Template:
-    """Columns (p, n) that a frame is a sum of, in units of the light; `sure` are the bins to compare on."""
+    """Columns (p, n) that a frame is a sum of, in units of the light; `sure` are the bins to
+    compare on.
+    """
 
     role: str
     columns: FloatArray
     sure: BoolArray
 
     def wave(self) -> tuple[BoolArray, FloatArray]:
-        """The sure bins, and the pattern there: times a picture of deviation 1 it is their correlation."""
+        """The sure bins, and the pattern there: times a picture of deviation 1 it is their
+        correlation.
+        """
         wave = self.columns[:2][-1][self.sure]
         return self.sure, (wave - wave.mean()) / (wave.size * max(wave.std(), 1e-6))
 
@@ -138,14 +158,24 @@ def _template(stack: FrameStack, scene: SampledBins, frame: int, reading_um: flo
         shown, from_edge = gray_bit(phase, pattern.index)
         sure = from_edge > _EDGE_RAD
         # where edges are everywhere (a nonsense prediction) all bins are used
-        return _Template("gray", np.stack([ones, shown.astype(float)]), sure if sure.any() else ones.astype(bool))
+        return _Template(
+            "gray", np.stack([ones, shown.astype(float)]), sure if sure.any() else ones.astype(bool)
+        )
     psi = phase + pattern.shift_rad
     sine = np.sin(psi)
-    columns = [ones, np.cos(psi), -sine, -(slope - slope.mean()) * sine, *(np.cos(k * psi) for k in (2, 3, 4))]
+    columns = [
+        ones,
+        np.cos(psi),
+        -sine,
+        -(slope - slope.mean()) * sine,
+        *(np.cos(k * psi) for k in (2, 3, 4)),
+    ]
     return _Template("sin", np.stack(columns), ones.astype(bool))
 
 
-def _solve(seen: FloatArray, template: _Template, light: FloatArray) -> tuple[FloatArray, FloatArray, float]:
+def _solve(
+    seen: FloatArray, template: _Template, light: FloatArray
+) -> tuple[FloatArray, FloatArray, float]:
     """Coefficients, their noise if the rest is noise, and the RMS of the rest over the light."""
     sure = template.sure
     columns = (template.columns * light)[:, sure]
@@ -154,10 +184,16 @@ def _solve(seen: FloatArray, template: _Template, light: FloatArray) -> tuple[Fl
     inverse = np.linalg.pinv(normal / np.outer(scale, scale)) / np.outer(scale, scale)
     solved = inverse @ (columns @ seen[sure])
     rest = float(np.sqrt(np.mean((seen[sure] - solved @ columns) ** 2)))
-    return solved, rest * np.sqrt(np.maximum(np.diag(inverse), 0.0)), rest / float(np.mean(light[sure]))
+    return (
+        solved,
+        rest * np.sqrt(np.maximum(np.diag(inverse), 0.0)),
+        rest / float(np.mean(light[sure])),
+    )
 
 
-def _evidence(seen: FloatArray, template: _Template, light: FloatArray, saturated: float, shows: int) -> Evidence:
+def _evidence(
+    seen: FloatArray, template: _Template, light: FloatArray, saturated: float, shows: int
+) -> Evidence:
     solved, sigma, rest = _solve(seen, template, light)
     if template.role == "sin":
         swing = float(np.hypot(solved[1], solved[2]))
@@ -166,12 +202,17 @@ def _evidence(seen: FloatArray, template: _Template, light: FloatArray, saturate
         return Evidence(float(solved[0]), swing, step, moved_um, sigma_um, rest, saturated, shows)
     if template.role == "gray":
         lit = float(np.mean(template.columns[1][template.sure]))
-        return Evidence(float(solved.sum()), float(solved[1]), 0.0, 0.0, 0.0, rest, saturated, shows, lit)
+        return Evidence(
+            float(solved.sum()), float(solved[1]), 0.0, 0.0, 0.0, rest, saturated, shows, lit
+        )
     return Evidence(float(solved[0]), 0.0, 0.0, 0.0, 0.0, rest, saturated, shows)
 
 
-def _best(seen: FloatArray, waves: list[tuple[BoolArray, FloatArray]], light: FloatArray, own: int) -> int:
-    """The pattern that the frame looks like most: largest correlation of the picture over the light.
+def _best(
+    seen: FloatArray, waves: list[tuple[BoolArray, FloatArray]], light: FloatArray, own: int
+) -> int:
+    """The pattern that the frame looks like most: largest correlation of the picture over the
+    light.
 
     A flat picture, white or black, correlates with nothing and is taken for its own.
     """
@@ -186,11 +227,13 @@ def _best(seen: FloatArray, waves: list[tuple[BoolArray, FloatArray]], light: Fl
     return where
 
 
-# What the usable frames show of each bin: light, fringes, wrapped phase, and where the pattern is seen.
+# What the usable frames show of each bin: light, fringes, wrapped phase, and where the pattern is
+# seen.
 #
-# The light of a bin has three estimates, the mean of the x fringes, that of the y fringes, and white minus black; the
-# fringes' swing likewise. The median of three is right when one of them is wrong, so that one bad frame, whichever it
-# is, does not spoil the picture that all frames are compared with.
+# The light of a bin has three estimates, the mean of the x fringes, that of the y fringes, and
+# white minus black; the fringes' swing likewise. The median of three is right when one of them is
+# wrong, so that one bad frame, whichever it is, does not spoil the picture that all frames are
+# compared with.
 
 _LEAST_SWING_ADU = 1.0  # less than a rounding step is no fringe
 
@@ -210,11 +253,14 @@ class BinView:
     mask: BoolArray  # bins that see the pattern in the mirror
 
 
-def look(stack: FrameStack, binned: Binned, excluded: Collection[int], estimate: FloatArray | None = None) -> BinView:
+def look(
+    stack: FrameStack, binned: Binned, excluded: Collection[int], estimate: FloatArray | None = None
+) -> BinView:
     """Combine the frames that are not excluded.
 
-    `estimate` (rows, columns) is the light that another set saw, the third estimate of a set without white and black.
-    Raises NoFigureError if an axis has fewer than three usable steps, or if there are no fringes.
+    `estimate` (rows, columns) is the light that another set saw, the third estimate of a set
+    without white and black. Raises NoFigureError if an axis has fewer than three usable steps, or
+    if there are no fringes.
     """
     used = tuple([k for k in stack.sinusoids(axis) if k not in excluded] for axis in AXES)
     light, swing, phase, saturated = [], [], [], np.zeros(binned.means.shape[1:], bool)
@@ -223,7 +269,8 @@ def look(stack: FrameStack, binned: Binned, excluded: Collection[int], estimate:
             weights = stack.weights(frames)
         except ValueError:
             raise NoFigureError(
-                f"{len(frames)} of {len(stack.sinusoids(axis))} {axis} phase steps are usable: too few for a phase"
+                f"{len(frames)} of {len(stack.sinusoids(axis))} {axis} phase steps are "
+                "usable: too few for a phase"
             ) from None
         mean, cosine, sine = np.tensordot(weights, binned.means[frames].astype(float), axes=1)
         light.append(mean)
@@ -242,7 +289,9 @@ def look(stack: FrameStack, binned: Binned, excluded: Collection[int], estimate:
     return BinView((used[0], used[1]), np.stack(phase), np.stack(swing), _middle(every, mask), mask)
 
 
-def _third_estimate(stack: FrameStack, binned: Binned, excluded: Collection[int]) -> FloatArray | None:
+def _third_estimate(
+    stack: FrameStack, binned: Binned, excluded: Collection[int]
+) -> FloatArray | None:
     white, black = stack.single("white"), stack.single("black")
     if white is None or black is None or {white, black} & set(excluded):
         return None
@@ -250,7 +299,9 @@ def _third_estimate(stack: FrameStack, binned: Binned, excluded: Collection[int]
 
 
 def _middle(maps: list[FloatArray], where: BoolArray | None = None) -> FloatArray:
-    """Median of two or three maps, each scaled to the median of the first (over its brighter half by default)."""
+    """Median of two or three maps, each scaled to the median of the first (over its brighter half
+    by default).
+    """
     if where is None or not where.any():
         where = maps[0] >= np.median(maps[0])
     medians = [max(float(np.median(m[where])), 1e-9) for m in maps]

@@ -23,16 +23,20 @@ class FrameStack:
     patterns: tuple[Pattern, ...]  # what each frame should show; sinusoids with their phase step
     displacement_um: FloatArray  # (frames,): laser reading at each, NaN without
     unusable: dict[int, str]  # frames that hold no picture
-    # (2, frames): level and swing of the light of each sinusoid about 1, where the frames' light is known to differ
+    # (2, frames): level and swing of the light of each sinusoid about 1, where the frames' light is
+    # known to differ
     light: FloatArray | None = None
-    gain: FloatArray | None = None  # (frames, height): of the light of each row, where bands of a backlight are known
+    # (frames, height): of the light of each row, where bands of a backlight are known
+    gain: FloatArray | None = None
 
     def sinusoids(self, axis: str) -> list[int]:
         """Frames that show the sinusoids of an axis."""
         return [k for k, p in enumerate(self.patterns) if p.role == "sin" and p.axis == axis]
 
     def gray(self, axis: str) -> list[int]:
-        """Frames that show the Gray bits of an axis, most significant first; empty for fringes alone."""
+        """Frames that show the Gray bits of an axis, most significant first; empty for fringes
+        alone.
+        """
         return [k for k, p in enumerate(self.patterns) if p.role == "gray" and p.axis == axis]
 
     def single(self, role: str) -> int | None:
@@ -45,11 +49,17 @@ class FrameStack:
 
     def design(self, frames: list[int]) -> FloatArray:
         """`phase.step_design` of sinusoids (N, 3)."""
-        return step_design(self.shifts_rad(frames), None if self.light is None else self.light[:, frames])
+        return step_design(
+            self.shifts_rad(frames), None if self.light is None else self.light[:, frames]
+        )
 
     def weights(self, frames: list[int]) -> FloatArray:
-        """`phase.step_weights` of sinusoids (3, N). Raises ValueError if they do not determine a phase."""
-        return step_weights(self.shifts_rad(frames), None if self.light is None else self.light[:, frames])
+        """`phase.step_weights` of sinusoids (3, N). Raises ValueError if they do not determine a
+        phase.
+        """
+        return step_weights(
+            self.shifts_rad(frames), None if self.light is None else self.light[:, frames]
+        )
 
     def reordered(self, order: list[int]) -> "FrameStack":
         """The same with other pictures for the patterns: frame k shows what `order[k]` did."""
@@ -113,13 +123,19 @@ class PixelPhases:
 
     phase_rad: FloatArray  # (n,): absolute phase, the period nearest to the reference
     swing_adu: Singles  # (n,): fringe amplitude
-    rest_adu: Singles  # (n,): root of the sum of squares that the sinusoid leaves; 0 for three frames
+    rest_adu: (
+        Singles  # (n,): root of the sum of squares that the sinusoid leaves; 0 for three frames
+    )
     saturated: BoolArray  # (n,): whether a frame is saturated there
 
 
 @kernel
-def _phases(frames, index, fade, weights, design, turn, mirror, slope, reference, limit, out, start, stop):  # type: ignore[no-untyped-def]
-    """Rows of `out` (2, n): swing (negative where saturated) and rest; `reference` (n,) is replaced by the phase."""
+def _phases(  # type: ignore[no-untyped-def]
+    frames, index, fade, weights, design, turn, mirror, slope, reference, limit, out, start, stop
+):
+    """Rows of `out` (2, n): swing (negative where saturated) and rest; `reference` (n,) is replaced
+    by the phase.
+    """
     steps, height = fade.shape
     for p in range(start, stop):
         place = index[p]
@@ -137,11 +153,18 @@ def _phases(frames, index, fade, weights, design, turn, mirror, slope, reference
             s += weights[2, k] * value
         rest = 0.0
         for k in range(steps):
-            left = float(frames[k, place]) * fade[k, row] - mean * design[k, 0] - c * design[k, 1] - s * design[k, 2]
+            left = (
+                float(frames[k, place]) * fade[k, row]
+                - mean * design[k, 0]
+                - c * design[k, 1]
+                - s * design[k, 2]
+            )
             rest += left * left
         c, s = still(c, s, slope[p], turn, mirror)
         wrapped = arctan2(s, c)
-        reference[p] = wrapped + 2 * math.pi * math.floor((reference[p] - wrapped) / (2 * math.pi) + 0.5)
+        reference[p] = wrapped + 2 * math.pi * math.floor(
+            (reference[p] - wrapped) / (2 * math.pi) + 0.5
+        )
         swing = math.sqrt(c * c + s * s)
         out[0, p] = -swing if top >= limit else swing
         out[1, p] = math.sqrt(rest)
@@ -183,7 +206,17 @@ def pixel_phases(
     fixed = (fade, np.linalg.pinv(design), design, combined.turn, combined.mirror)
 
     def run(start: int, stop: int) -> None:
-        _phases(flat, index, *fixed, sensitivity_rad_per_um, phase, float(full_scale_adu), out, start, stop)
+        _phases(
+            flat,
+            index,
+            *fixed,
+            sensitivity_rad_per_um,
+            phase,
+            float(full_scale_adu),
+            out,
+            start,
+            stop,
+        )
 
     split(run, index.size)
     return PixelPhases(phase, np.abs(out[0]), out[1], np.signbit(out[0]))

@@ -1,21 +1,24 @@
 """Which frames do not belong to their set, and why: from the data alone.
 
-Every frame is judged against the other frames of its own set, so the display's gamma, vignetting, the film's ripple
-or a motion that all share is no fault. A limit is the larger of a floor, below which the figure does not suffer, and
-a multiple of the scatter of the set's own good frames.
+Every frame is judged against the other frames of its own set, so the display's gamma, vignetting,
+the film's ripple or a motion that all share is no fault. A limit is the larger of a floor, below
+which the figure does not suffer, and a multiple of the scatter of the set's own good frames.
 
 `closure`: do the frames of a series of phase steps agree, and if not, which one is wrong?
 
-Least squares leave of each pixel's N intensities the residual r = P I, with P the projector off the model's columns.
-Leaving out frame k needs no second fit: the sum of squares falls by exactly r_k^2 / P_kk. The frame whose omission
-makes the rest agree is the wrong one.
+Least squares leave of each pixel's N intensities the residual r = P I, with P the projector off the
+model's columns. Leaving out frame k needs no second fit: the sum of squares falls by exactly r_k^2
+/ P_kk. The frame whose omission makes the rest agree is the wrong one.
 
-With nothing known of a pixel the model has three parameters (mean, cosine, sine). For N = 4 one degree of freedom is
-left, I_0 - I_1 + I_2 - I_3: it says that something is wrong, and blames all four alike. Other knowledge decides:
+With nothing known of a pixel the model has three parameters (mean, cosine, sine). For N = 4 one
+degree of freedom is left, I_0 - I_1 + I_2 - I_3: it says that something is wrong, and blames all
+four alike. Other knowledge decides:
 
-- the phase, from other frequencies, the other sets or the surface: two parameters are left (mean, amplitude);
-- mean and amplitude, from the other axis or frequency, or from white and black: with the mean alone, two frames half
-  a period apart would share the blame; the length of the phasor tells them apart.
+- the phase, from other frequencies, the other sets or the surface: two parameters are left (mean,
+  amplitude);
+- mean and amplitude, from the other axis or frequency, or from white and black: with the mean
+  alone, two frames half a period apart would share the blame; the length of the phasor tells them
+  apart.
 
 Both work for any N >= 4; from N = 5 on nothing else needs to be known.
 """
@@ -41,18 +44,29 @@ class Closure:
 
     rms_adu: float  # the residual, per degree of freedom: the noise, if all is well
     frame_rms_adu: FloatArray  # (N,): the residual of each frame, over all pixels
-    # (N,): the residual, per degree of freedom, without that frame; NaN where nothing would be left to test
+    # (N,): the residual, per degree of freedom, without that frame; NaN where nothing would be left
+    # to test
     without_rms_adu: FloatArray
 
     @property
     def suspect(self) -> int | None:
-        """The frame that explains the disagreement best when left out; None if the data cannot tell."""
-        return None if np.isnan(self.without_rms_adu).any() else int(np.argmin(self.without_rms_adu))
+        """The frame that explains the disagreement best when left out; None if the data cannot
+        tell.
+        """
+        return (
+            None if np.isnan(self.without_rms_adu).any() else int(np.argmin(self.without_rms_adu))
+        )
 
     @property
     def gain(self) -> float:
-        """How many times better the rest agrees without the suspect: about 1 if no frame is wrong."""
-        return 1.0 if self.suspect is None else self.rms_adu / max(float(self.without_rms_adu.min()), _TINY)
+        """How many times better the rest agrees without the suspect:
+        about 1 if no frame is wrong.
+        """
+        return (
+            1.0
+            if self.suspect is None
+            else self.rms_adu / max(float(self.without_rms_adu.min()), _TINY)
+        )
 
 
 def closure(frames: ArrayLike, shifts_rad: Sequence[float] | FloatArray) -> Closure:
@@ -74,8 +88,11 @@ def closure(frames: ArrayLike, shifts_rad: Sequence[float] | FloatArray) -> Clos
     return _summary(residual, np.broadcast_to(free[:, None], residual.shape), len(shifts) - 3)
 
 
-def closure_with_phase(frames: ArrayLike, shifts_rad: Sequence[float] | FloatArray, phase_rad: FloatArray) -> Closure:
-    """Agreement with a sinusoid of known phase (...) and unknown mean and amplitude; names a frame from N = 4 on.
+def closure_with_phase(
+    frames: ArrayLike, shifts_rad: Sequence[float] | FloatArray, phase_rad: FloatArray
+) -> Closure:
+    """Agreement with a sinusoid of known phase (...) and unknown mean and amplitude; names a frame
+    from N = 4 on.
 
     An error of the phase shows in all frames, as amplitude times error: it hides faults below that.
     """
@@ -89,36 +106,49 @@ def closure_with_phase(frames: ArrayLike, shifts_rad: Sequence[float] | FloatArr
 
 
 def closure_with_level(
-    frames: ArrayLike, shifts_rad: Sequence[float] | FloatArray, mean_adu: FloatArray, amplitude_adu: FloatArray
+    frames: ArrayLike,
+    shifts_rad: Sequence[float] | FloatArray,
+    mean_adu: FloatArray,
+    amplitude_adu: FloatArray,
 ) -> Closure:
-    """Agreement with a sinusoid of known mean and amplitude (...) and unknown phase; names a frame from N = 4 on.
+    """Agreement with a sinusoid of known mean and amplitude (...) and unknown phase; names a frame
+    from N = 4 on.
 
-    Linear in cosine and sine with the mean known; the phasor's length, which should be the amplitude, is one more
-    equation. To first order in the noise that is the fit of the phase alone.
+    Linear in cosine and sine with the mean known; the phasor's length, which should be the
+    amplitude, is one more equation. To first order in the noise that is the fit of the phase alone.
     """
     stack, shifts = _checked(frames, shifts_rad)
     centred, amplitude = stack - np.ravel(mean_adu), np.ravel(amplitude_adu)
     design = np.stack([np.cos(shifts), -np.sin(shifts)], axis=1)
     rest = [np.arange(len(shifts)) != k for k in range(len(shifts))]
-    without = [math.sqrt(_level_rss(centred[keep], design[keep], amplitude) / (len(shifts) - 2)) for keep in rest]
+    without = [
+        math.sqrt(_level_rss(centred[keep], design[keep], amplitude) / (len(shifts) - 2))
+        for keep in rest
+    ]
     rms = math.sqrt(_level_rss(centred, design, amplitude) / (len(shifts) - 1))
     residual = centred - design @ np.linalg.pinv(design) @ centred
     return Closure(rms, np.sqrt(np.mean(residual**2, axis=1)), np.array(without))
 
 
 def _level_rss(centred: FloatArray, design: FloatArray, amplitude: FloatArray) -> float:
-    """Mean over pixels of the residual squares, that of the phasor's length in units of its variance along itself."""
+    """Mean over pixels of the residual squares, that of the phasor's length in units of its
+    variance along itself.
+    """
     covariance = np.linalg.inv(design.T @ design)
     phasor = covariance @ design.T @ centred
     length = np.linalg.norm(phasor, axis=0)
     along = phasor / np.maximum(length, _TINY)
     variance = np.einsum("ip,ij,jp->p", along, covariance, along)
-    variance = np.maximum(variance, np.linalg.eigvalsh(covariance)[0])  # a phasor of 0 points nowhere
+    variance = np.maximum(
+        variance, np.linalg.eigvalsh(covariance)[0]
+    )  # a phasor of 0 points nowhere
     rss = np.sum((centred - design @ phasor) ** 2, axis=0)
     return float(np.mean(rss + (length - amplitude) ** 2 / variance))
 
 
-def _checked(frames: ArrayLike, shifts_rad: Sequence[float] | FloatArray) -> tuple[FloatArray, FloatArray]:
+def _checked(
+    frames: ArrayLike, shifts_rad: Sequence[float] | FloatArray
+) -> tuple[FloatArray, FloatArray]:
     """Frames as (N, pixels) and shifts; four frames at least, as three always agree."""
     shifts = np.asarray(shifts_rad, float)
     stack = np.asarray(frames, float).reshape(len(shifts), -1)
@@ -131,10 +161,13 @@ def _checked(frames: ArrayLike, shifts_rad: Sequence[float] | FloatArray) -> tup
 
 
 def _summary(residual: FloatArray, free: FloatArray, freedom: int) -> Closure:
-    """From the residual (N, pixels), the diagonal of P there, and the degrees of freedom of a pixel."""
+    """From the residual (N, pixels), the diagonal of P there, and the degrees of freedom of a
+    pixel.
+    """
     rss = np.sum(residual**2, axis=0)
     rms = math.sqrt(float(rss.mean()) / freedom)
-    # a frame that the model explains in any case cannot be tested by omission: its pixel keeps its sum
+    # a frame that the model explains in any case cannot be tested by omission: its pixel keeps its
+    # sum
     drop = np.where(free > _TINY, residual**2 / np.maximum(free, _TINY), 0.0)
     without = np.full(len(residual), math.nan)
     if freedom > 1:
@@ -142,8 +175,10 @@ def _summary(residual: FloatArray, free: FloatArray, freedom: int) -> Closure:
     return Closure(rms, np.sqrt(np.mean(residual**2, axis=1)), without)
 
 
-# Floors. Good frames of simulated sets (gamma 2.2, a rippled film, 20 µm of motion) differ by up to 0.005 rad of step
-# and 0.005 of swing. A twentieth of the frame before left in one by a slow display is 0.05 rad, and 4 µm of figure.
+# Floors. Good frames of simulated sets (gamma 2.2, a rippled film, 20 µm of motion) differ by up to
+# 0.005 rad of step and 0.005 of swing. A twentieth of the frame before left in one by a slow
+# display is 0.05 rad, and
+# 4 µm of figure.
 STEP_RAD = 0.03
 LEVEL_SHARE = 0.05
 SWING_SHARE = 0.05
@@ -152,12 +187,14 @@ _FLICKER = 0.03  # of light is called flicker whatever else is wrong
 MOVED_UM = 15.0
 REST_SHARE = 0.015
 SATURATED_SHARE = 0.02
-# Bits are read against half the light: a Gray frame may be a tenth off; Gray frames agree better among themselves.
+# Bits are read against half the light: a Gray frame may be a tenth off; Gray frames agree better
+# among themselves.
 GRAY_SHARE = 0.04
 WHITE_SHARE = 0.08
 GRAY_REST = 0.15
 FLAT_REST = 0.08
-# With fewer bins than this beyond a Gray frame's only edge, no more than FLAT_REST of its light is not flat.
+# With fewer bins than this beyond a Gray frame's only edge, no more than FLAT_REST of its light is
+# not flat.
 _NO_EDGE = 0.005
 _SCATTERS = 6.0  # of the good frames' scatter
 _DARK = 0.4  # less than this share of the light is no flicker
@@ -179,7 +216,8 @@ class FrameDefect(Enum):
     INCONSISTENT = auto()  # with the other steps of its series
 
 
-# Found by comparing the frame with what the geometry predicts: a wrong geometry blames many frames so.
+# Found by comparing the frame with what the geometry predicts: a wrong geometry blames many frames
+# so.
 FOUND_BY_PREDICTION = frozenset(
     {FrameDefect.MOVED, FrameDefect.DIFFERS, FrameDefect.WRONG_PICTURE, FrameDefect.FLICKER}
 )
@@ -193,7 +231,8 @@ class Flag:
     defect: FrameDefect
     reason: str  # for people
     severity: float  # times the limit
-    swapped_with: int | None = None  # the frame that shows this one's pattern while this one shows its
+    # the frame that shows this one's pattern while this one shows its
+    swapped_with: int | None = None
 
 
 def flag_unreadable(frame: int, reason: str) -> Flag:
@@ -202,14 +241,18 @@ def flag_unreadable(frame: int, reason: str) -> Flag:
 
 
 def identical_frames(stack: FrameStack) -> dict[int, int]:
-    """Frames that are byte for byte an earlier one of the sequence, and which: noise never repeats."""
+    """Frames that are byte for byte an earlier one of the sequence, and which:
+    noise never repeats.
+    """
     seen: dict[bytes, int] = {}
     out: dict[int, int] = {}
     for k, frame in enumerate(stack.frames):
         if k in stack.unusable:
             continue
         key = frame[:: max(1, len(frame) // 16)].tobytes()  # 16 rows tell two frames apart ...
-        if key in seen and np.array_equal(stack.frames[seen[key]], frame):  # ... and all rows are compared then
+        if key in seen and np.array_equal(
+            stack.frames[seen[key]], frame
+        ):  # ... and all rows are compared then
             out[k] = seen[key]
         else:
             seen.setdefault(key, k)
@@ -237,11 +280,13 @@ def obvious(stack: FrameStack, binned: Binned) -> list[Flag]:
     return flags
 
 
-def inspect(stack: FrameStack, evidence: dict[int, Evidence], excluded: Collection[int]) -> list[Flag]:
+def inspect(
+    stack: FrameStack, evidence: dict[int, Evidence], excluded: Collection[int]
+) -> list[Flag]:
     """Judge all readable frames, worst first.
 
-    The evidence compares them with the surface fitted to the frames that are not excluded. Excluded frames are judged
-    too, but not used to judge the others.
+    The evidence compares them with the surface fitted to the frames that are not excluded. Excluded
+    frames are judged too, but not used to judge the others.
     """
     trusted = {k: e for k, e in evidence.items() if k not in excluded}
     flags = [*_judge_sinusoids(stack, evidence, trusted), *_judge_gray(stack, evidence, trusted)]
@@ -250,7 +295,9 @@ def inspect(stack: FrameStack, evidence: dict[int, Evidence], excluded: Collecti
     return sorted(flags, key=lambda flag: -flag.severity)
 
 
-def _judge_sinusoids(stack: FrameStack, evidence: dict[int, Evidence], trusted: dict[int, Evidence]) -> list[Flag]:
+def _judge_sinusoids(
+    stack: FrameStack, evidence: dict[int, Evidence], trusted: dict[int, Evidence]
+) -> list[Flag]:
     """Judge each against the others, itself left out, so that it cannot widen its own limit."""
     flags = []
     for axis in AXES:
@@ -264,7 +311,11 @@ def _judge_sinusoids(stack: FrameStack, evidence: dict[int, Evidence], trusted: 
 
 
 def _judge_sinusoid(
-    frame: int, e: Evidence, same: list[Evidence], every: list[Evidence], trusted: dict[int, Evidence]
+    frame: int,
+    e: Evidence,
+    same: list[Evidence],
+    every: list[Evidence],
+    trusted: dict[int, Evidence],
 ) -> list[Flag]:
     """One sinusoid against those of its axis and, for the light, against those of both."""
     step_limit, step = _limit([o.step_rad for o in same], STEP_RAD)
@@ -288,7 +339,9 @@ def _judge_sinusoid(
     return [Flag(frame, defect, reason, worst[kind])]
 
 
-def _sinusoid_defect(kind: str, e: Evidence, level: float, moved_um: float) -> tuple[FrameDefect, str]:
+def _sinusoid_defect(
+    kind: str, e: Evidence, level: float, moved_um: float
+) -> tuple[FrameDefect, str]:
     light = e.level / max(level, 1e-9)
     if e.saturated > 10 * SATURATED_SHARE or kind == "saturated":
         return FrameDefect.SATURATED, f"saturated: {e.saturated:.0%} of the bins"
@@ -298,13 +351,21 @@ def _sinusoid_defect(kind: str, e: Evidence, level: float, moved_um: float) -> t
         return FrameDefect.FLICKER, f"flicker: {light:.3f} of the light of the others"
     if kind in ("moved", "rest") and abs(e.moved_um - moved_um) > MOVED_UM:
         away_um = e.moved_um - moved_um
-        return FrameDefect.MOVED, f"moved: the film was {away_um:+.0f} µm from where the others saw it"
+        return (
+            FrameDefect.MOVED,
+            f"moved: the film was {away_um:+.0f} µm from where the others saw it",
+        )
     if kind == "step":
-        return FrameDefect.WRONG_PICTURE, f"stale or wrong picture: its phase step is {e.step_rad:+.2f} rad off"
+        return (
+            FrameDefect.WRONG_PICTURE,
+            f"stale or wrong picture: its phase step is {e.step_rad:+.2f} rad off",
+        )
     return FrameDefect.DIFFERS, f"differs from its prediction by {e.rest:.1%} of the light"
 
 
-def _judge_gray(stack: FrameStack, evidence: dict[int, Evidence], trusted: dict[int, Evidence]) -> list[Flag]:
+def _judge_gray(
+    stack: FrameStack, evidence: dict[int, Evidence], trusted: dict[int, Evidence]
+) -> list[Flag]:
     """Gray frames against each other, white against them, black against white."""
     gray = [k for axis in AXES for k in stack.gray(axis) if k in evidence]
     good = [evidence[k] for k in gray if k in trusted and evidence[k].lit > _NO_EDGE]
@@ -317,8 +378,14 @@ def _judge_gray(stack: FrameStack, evidence: dict[int, Evidence], trusted: dict[
         if not _NO_EDGE < e.lit < 1 - _NO_EDGE:
             flags += _judge_flat(k, e, bright, white=e.lit > 0.5)
             continue
-        light = abs(e.level / max(bright, 1e-9) - 1) / max(GRAY_SHARE, bright_limit / max(bright, 1e-9))
-        content = max(e.rest / (GRAY_REST * bright), 2.0 if e.shows != k else 0.0, 0.5 * bright / max(e.swing, 1e-9))
+        light = abs(e.level / max(bright, 1e-9) - 1) / max(
+            GRAY_SHARE, bright_limit / max(bright, 1e-9)
+        )
+        content = max(
+            e.rest / (GRAY_REST * bright),
+            2.0 if e.shows != k else 0.0,
+            0.5 * bright / max(e.swing, 1e-9),
+        )
         if max(light, content) > 1:
             defect, reason = _gray_defect(e, bright, content > light)
             flags.append(Flag(k, defect, reason, max(light, content)))
@@ -352,10 +419,14 @@ def _judge_flat(frame: int, e: Evidence, bright: float, white: bool) -> list[Fla
     defect = FrameDefect.SATURATED if e.saturated > 0.5 else FrameDefect.FLICKER
     if light < _DARK:
         defect = FrameDefect.DARK
-    return [Flag(frame, defect, f"{defect.name.lower()}: {light:.3f} of the light of the others", off)]
+    return [
+        Flag(frame, defect, f"{defect.name.lower()}: {light:.3f} of the light of the others", off)
+    ]
 
 
-def _named(stack: FrameStack, flag: Flag, evidence: dict[int, Evidence], twins: dict[int, int]) -> Flag:
+def _named(
+    stack: FrameStack, flag: Flag, evidence: dict[int, Evidence], twins: dict[int, int]
+) -> Flag:
     """Add the frame whose picture it is, if that is known."""
     k = flag.frame
     e = evidence[k]

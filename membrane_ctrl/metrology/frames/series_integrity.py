@@ -1,15 +1,18 @@
 """Which frames of a multi-frequency set do not belong, and what can be done without them.
 
-A set is two axes of some frequencies of four steps, and white and black. It is judged against itself: how large a
-disagreement is too large follows from the other series of the set, so that a display's gamma, which all share, is no
-fault. Three checks:
+A set is two axes of some frequencies of four steps, and white and black. It is judged against
+itself: how large a disagreement is too large follows from the other series of the set, so that a
+display's gamma, which all share, is no fault. Three checks:
 
-- equal pictures: no two frames of a set should be the same (a stale frame, however little it matters);
-- the closure I0 - I1 + I2 - I3 of each series and, with the phase or the level known, the frame at fault;
-- the frequencies against each other: exchanging steps 0 and 2, or 1 and 3, keeps the closure but reverses the phase,
-  which then contradicts the other frequencies.
+- equal pictures: no two frames of a set should be the same (a stale frame, however little it
+  matters);
+- the closure I0 - I1 + I2 - I3 of each series and, with the phase or the level known, the frame at
+  fault;
+- the frequencies against each other: exchanging steps 0 and 2, or 1 and 3, keeps the closure but
+  reverses the phase, which then contradicts the other frequencies.
 
-One of four steps can be replaced: the phase of the other three gives I0 = I1 + I3 - I2, and likewise for the others.
+One of four steps can be replaced: the phase of the other three gives I0 = I1 + I3 - I2, and
+likewise for the others.
 """
 
 import math
@@ -19,21 +22,27 @@ from itertools import combinations
 
 import numpy as np
 
-from membrane_ctrl.metrology.frames.integrity import Closure, closure, closure_with_level, closure_with_phase
+from membrane_ctrl.metrology.frames.integrity import (
+    Closure,
+    closure,
+    closure_with_level,
+    closure_with_phase,
+)
 from membrane_ctrl.metrology.phase import phasors
 from membrane_ctrl.model.arrays import BoolArray, FloatArray
 from membrane_ctrl.model.shape_estimate import Verdict
 
 # Absolute phase in time: fringes of several frequencies, coarse to fine, each pixel by itself.
 #
-# The coarsest pattern has at most one period on the screen, so its phase is a position; each finer one is put into
-# the period that lies nearest to what is known so far. With x the position in screens, p the periods a screen and
-# w = phi / (2 pi p) the wrapped position,
+# The coarsest pattern has at most one period on the screen, so its phase is a position; each finer
+# one is put into the period that lies nearest to what is known so far. With x the position in
+# screens, p the periods a screen and w = phi / (2 pi p) the wrapped position,
 #
 #     x_f = w_f + rint((x_(f-1) - w_f) p_f) / p_f.
 #
-# The distance before rounding, e = (x_f - x_(f-1)) p_f in periods, is at most 1/2 by construction and should be near
-# 0: it is the coarser phase's error seen through the finer fringe. Near 1/2 the order is uncertain.
+# The distance before rounding, e = (x_f - x_(f-1)) p_f in periods, is at most 1/2 by construction
+# and should be near 0: it is the coarser phase's error seen through the finer fringe. Near 1/2 the
+# order is uncertain.
 
 # A wrong order begins at half a period; for a pixel half way there, twice its error would be wrong.
 CONSISTENT_PERIODS = 0.25
@@ -43,13 +52,20 @@ CONSISTENT_PERIODS = 0.25
 class Unwrapped:
     """Positions on the screen from all frequencies."""
 
-    screens: FloatArray  # (...): position along the axis, 0 to 1 over the screen, from the finest fringe
-    step_periods: FloatArray  # (F - 1, ...): e of each step, in periods of the finer fringe, within +-1/2
-    consistent: BoolArray  # (...): all |e| below `CONSISTENT_PERIODS` and the position on the screen
+    screens: (
+        FloatArray  # (...): position along the axis, 0 to 1 over the screen, from the finest fringe
+    )
+    step_periods: (
+        FloatArray  # (F - 1, ...): e of each step, in periods of the finer fringe, within +-1/2
+    )
+    consistent: (
+        BoolArray  # (...): all |e| below `CONSISTENT_PERIODS` and the position on the screen
+    )
 
 
 def unwrap(wrapped_rad: FloatArray, periods: Sequence[float] | FloatArray) -> Unwrapped:
-    """Unwrap in time. Raises ValueError if the periods are not rising from at most one, or do not match the phases.
+    """Unwrap in time. Raises ValueError if the periods are not rising from at most one, or do not
+    match the phases.
 
     Parameters
     ----------
@@ -74,7 +90,9 @@ def unwrap(wrapped_rad: FloatArray, periods: Sequence[float] | FloatArray) -> Un
     return Unwrapped(position, steps, agree)
 
 
-def predicted_phase(wrapped_rad: FloatArray, periods: Sequence[float] | FloatArray, index: int) -> FloatArray:
+def predicted_phase(
+    wrapped_rad: FloatArray, periods: Sequence[float] | FloatArray, index: int
+) -> FloatArray:
     """Phase that the other frequencies expect of frequency `index`, (...), not wrapped.
 
     The chain always needs the coarsest; in the coarsest's own prediction it only chooses the order.
@@ -84,10 +102,12 @@ def predicted_phase(wrapped_rad: FloatArray, periods: Sequence[float] | FloatArr
     return np.asarray(2 * math.pi * counts[index] * unwrap(wrapped_rad[keep], counts[keep]).screens)
 
 
-# Shares of the fringes' amplitude. Good real series close to 0.02 to 0.04; a stale frame leaves 0.25 or more.
+# Shares of the fringes' amplitude. Good real series close to 0.02 to 0.04; a stale frame leaves
+# 0.25 or more.
 CLOSURE_SHARE = 0.05
 CLOSURE_TIMES = 3.0  # of the median of the other series of the set
-# Two frames of different steps differ by 0.7 of the amplitude or more where a quarter of a period is seen.
+# Two frames of different steps differ by 0.7 of the amplitude or more where a quarter of a period
+# is seen.
 SAME_SHARE = 0.15
 LEFT_TIMES = 2.0  # of the limit: how far the others may disagree once the bad frame is left out
 GAIN = 2.0  # good frames reach 1.4, a stale one gives 6.8 or more
@@ -121,7 +141,9 @@ class AxisSeries:
 
 @dataclass(frozen=True)
 class SeriesFlag:
-    """A frame that does not belong: axis ("x", "y", "white", "black"), frequency and step (0 for white), and why."""
+    """A frame that does not belong: axis ("x", "y", "white", "black"), frequency and step (0 for
+    white), and why.
+    """
 
     axis: str
     index: int
@@ -159,15 +181,24 @@ def check_series(axes: tuple[AxisSeries, ...], black: FloatArray, white: FloatAr
             found, axis = _mend(axis, index, limits[axis.axis][index], axes)
             flags += found
         mended.append(axis)
-        bad = [k for k in range(len(axis.periods)) if _closure_share(axis, k) > limits[axis.axis][k]]
+        bad = [
+            k for k in range(len(axis.periods)) if _closure_share(axis, k) > limits[axis.axis][k]
+        ]
         if bad:
-            failures.append(f"{axis.axis}, {axis.periods[bad[0]]:g} periods: the steps do not agree")
+            failures.append(
+                f"{axis.axis}, {axis.periods[bad[0]]:g} periods: the steps do not agree"
+            )
         elif axis.inconsistent_share() > INCONSISTENT_SHARE:
-            failures.append(f"{axis.axis}: the frequencies disagree at {axis.inconsistent_share():.0%} of the pixels")
+            failures.append(
+                f"{axis.axis}: the frequencies disagree at {axis.inconsistent_share():.0%} "
+                "of the pixels"
+            )
     if failures:
         return SeriesCheck("rejected", failures[0], tuple(flags), tuple(mended))
     if flags:
-        return SeriesCheck("degraded", f"{len(flags)} frame(s) flagged and left out", tuple(flags), tuple(mended))
+        return SeriesCheck(
+            "degraded", f"{len(flags)} frame(s) flagged and left out", tuple(flags), tuple(mended)
+        )
     return SeriesCheck("ok", "", (), tuple(mended))
 
 
@@ -183,11 +214,17 @@ def _closure_share(axis: AxisSeries, index: int) -> float:
 
 def _closure_limits(axes: tuple[AxisSeries, ...]) -> dict[str, list[float]]:
     """For each series, from all the others."""
-    shares = {(axis.axis, k): _closure_share(axis, k) for axis in axes for k in range(len(axis.periods))}
+    shares = {
+        (axis.axis, k): _closure_share(axis, k) for axis in axes for k in range(len(axis.periods))
+    }
 
     def limit(own: tuple[str, int]) -> float:
         others = [share for key, share in shares.items() if key != own]
-        return max(CLOSURE_SHARE, CLOSURE_TIMES * float(np.median(others))) if others else CLOSURE_SHARE
+        return (
+            max(CLOSURE_SHARE, CLOSURE_TIMES * float(np.median(others)))
+            if others
+            else CLOSURE_SHARE
+        )
 
     return {axis.axis: [limit((axis.axis, k)) for k in range(len(axis.periods))] for axis in axes}
 
@@ -202,7 +239,9 @@ def _mend(
     swapped = _exchange(axis, index, limit)
     if swapped is not None:
         (a, b), better = swapped
-        flags = [SeriesFlag(axis.axis, index, k, f"swapped with step {j}") for k, j in ((a, b), (b, a))]
+        flags = [
+            SeriesFlag(axis.axis, index, k, f"swapped with step {j}") for k, j in ((a, b), (b, a))
+        ]
         return flags, better
     if not disagree:
         return [], axis
@@ -226,7 +265,9 @@ def _mend(
 
 
 def _closures(axis: AxisSeries, index: int) -> tuple[Closure, Closure]:
-    """Closures that can name a frame: with the other frequencies' phase known, and with the level of the next."""
+    """Closures that can name a frame: with the other frequencies' phase known, and with the level
+    of the next.
+    """
     neighbour = index - 1 if index + 1 == len(axis.periods) else index + 1
     steps, near = axis.frames[index], axis.frames[neighbour]
     amplitude = np.abs(phasors(near, axis.shifts_rad))
@@ -239,14 +280,21 @@ def _closures(axis: AxisSeries, index: int) -> tuple[Closure, Closure]:
     )
 
 
-def _exchange(axis: AxisSeries, index: int, limit: float) -> tuple[tuple[int, int], AxisSeries] | None:
-    """The only exchange of two steps after which they agree, among themselves and with the other frequencies."""
+def _exchange(
+    axis: AxisSeries, index: int, limit: float
+) -> tuple[tuple[int, int], AxisSeries] | None:
+    """The only exchange of two steps after which they agree, among themselves and with the other
+    frequencies.
+    """
     found = []
     for a, b in combinations(range(len(axis.shifts_rad)), 2):
         steps = axis.frames[index].copy()
         steps[[a, b]] = steps[[b, a]]
         other = axis.with_frames(index, steps)
-        if _closure_share(other, index) <= limit and other.inconsistent_share() <= INCONSISTENT_SHARE:
+        if (
+            _closure_share(other, index) <= limit
+            and other.inconsistent_share() <= INCONSISTENT_SHARE
+        ):
             found.append(((a, b), other))
     return found[0] if len(found) == 1 else None
 
@@ -263,13 +311,17 @@ def _twin(axis: AxisSeries, index: int, axes: tuple[AxisSeries, ...]) -> tuple[i
                     for name, other in reversed(earlier):
                         if math.sqrt(float(np.mean((frame - other) ** 2))) < SAME_SHARE * amplitude:
                             return step, f"stale: the same picture as {name}"
-                earlier.append((f"{series.axis}, {series.periods[k]:g} periods, step {step}", frame))
+                earlier.append(
+                    (f"{series.axis}, {series.periods[k]:g} periods, step {step}", frame)
+                )
             if series.axis == axis.axis and k == index:
                 return None
     return None
 
 
-def _flat_flags(axes: tuple[AxisSeries, ...], black: FloatArray, white: FloatArray) -> list[SeriesFlag]:
+def _flat_flags(
+    axes: tuple[AxisSeries, ...], black: FloatArray, white: FloatArray
+) -> list[SeriesFlag]:
     """White and black must enclose all that the fringes show."""
     frames = np.concatenate([axis.frames.reshape(-1, black.size) for axis in axes])
     margin = 0.1 * np.ptp(np.percentile(frames, [5, 95]))
@@ -278,6 +330,9 @@ def _flat_flags(axes: tuple[AxisSeries, ...], black: FloatArray, white: FloatArr
     black_share = float(np.mean(typical_low < black - margin))
     return [
         SeriesFlag(name, 0, 0, f"not {word} than the fringes at {share:.0%} of the pixels")
-        for name, word, share in (("white", "brighter", white_share), ("black", "darker", black_share))
+        for name, word, share in (
+            ("white", "brighter", white_share),
+            ("black", "darker", black_share),
+        )
         if share > BEYOND_SHARE
     ]

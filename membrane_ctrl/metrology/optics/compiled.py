@@ -29,16 +29,18 @@ def kernel(function: Callable[..., Any]) -> Any:
 
 
 def step(function: Callable[..., Any]) -> Any:
-    """Compile what a loop does to one point. Inlined by force: a loop with a call in it uses no vector units."""
+    """Compile what a loop does to one point. Inlined by force: a loop with a call in it uses no
+    vector units.
+    """
     return _recompiled_if_stale(njit(forceinline=True, **_OPTIONS)(function))
 
 
 def _recompiled_if_stale(dispatcher: Any) -> Any:
     """Let an index of the cache that is of other sources, or that cannot be read, count as empty.
 
-    A kernel contains the kernels that it calls and the number of Zernike terms, but Numba looks for changes only in
-    its own file. And it raises if an
-    index was cut by a power failure, or names the classes of arguments by modules that are gone.
+    A kernel contains the kernels that it calls and the number of Zernike terms, but Numba looks for
+    changes only in its own file. And it raises if an index was cut by a power failure, or names the
+    classes of arguments by modules that are gone.
     """
     file = getattr(dispatcher._cache, "_cache_file", None)  # None where no folder is writable
     if file is not None:
@@ -66,10 +68,10 @@ def _sources(folder: Path) -> int:
     return zlib.crc32(b"".join(text for text in texts if b"@kernel" in text or b"@step" in text))
 
 
-# Two threads of our own for kernels that release the interpreter lock: plain compiled loops over [start, stop).
-# Splitting them here, instead of in the compiler's parallel loops, keeps idle threads asleep (the control loop shares
-# the machine), avoids a library that only one thread may enter, and adds partial sums in a fixed order, so that
-# results repeat to the last bit.
+# Two threads of our own for kernels that release the interpreter lock: plain compiled loops over
+# [start, stop). Splitting them here, instead of in the compiler's parallel loops, keeps idle
+# threads asleep (the control loop shares the machine), avoids a library that only one thread may
+# enter, and adds partial sums in a fixed order, so that results repeat to the last bit.
 
 T = TypeVar("T")
 WORKERS = 2
@@ -82,7 +84,8 @@ def _pool() -> ThreadPoolExecutor:
 
 
 def split(run: Callable[[int, int], T], count: int, fewest: int = 0) -> list[T]:
-    """`run(start, stop)` over [0, count) in WORKERS pieces; results in order. The caller's thread takes one.
+    """`run(start, stop)` over [0, count) in WORKERS pieces; results in order. The caller's thread
+    takes one.
 
     A count below `fewest` is not split.
     """
@@ -96,7 +99,9 @@ def split(run: Callable[[int, int], T], count: int, fewest: int = 0) -> list[T]:
 
 @kernel
 def sums_by(number, values, count):  # type: ignore[no-untyped-def]
-    """Sums (k, count) of values (k, n) over the columns of each `number` (n,), which is below `count`."""
+    """Sums (k, count) of values (k, n) over the columns of each `number` (n,), which is below
+    `count`.
+    """
     out = np.zeros((values.shape[0], count))
     for k in range(values.shape[0]):
         for p in range(number.size):

@@ -1,22 +1,26 @@
-"""The law of the film: a flat film, stretched by a pre-strain and clamped in a ring, under uniform pressure.
+"""The law of the film: a flat film, stretched by a pre-strain and clamped in a ring, under uniform
+pressure.
 
-Foeppl's membrane with N = E t q^(2/3) n, q = p a / (E t), v = (r / a)^2 obeys 4 v n_vv + 8 n_v + 1 / (8 n^2) = 0, and
-its height rises by dh/dv = a q^(1/3) / (4 n). The equation scales: n(v) = n(0) F(s v), s = n(0)^-3, with *one* series
-F(x) = 1 - x / 64 - ... for all films, pressures and materials. The ring holds the hoop's strain at the pre-strain e:
+Foeppl's membrane with N = E t q^(2/3) n, q = p a / (E t), v = (r / a)^2 obeys 4 v n_vv + 8 n_v + 1
+/ (8 n^2) = 0, and its height rises by dh/dv = a q^(1/3) / (4 n). The equation scales: n(v) = n(0)
+F(s v), s = n(0)^-3, with *one* series F(x) = 1 - x / 64 - ... for all films, pressures and
+materials. The ring holds the hoop's strain at the pre-strain e:
 
     n(0) ((1 - nu) F(s) + 2 s F'(s)) = e / q^(2/3)
 
-so that a film is one number s, the slackness: 0 is a drum (N constant, a paraboloid), 12.5 Hencky's film without
-pre-strain (nu = 0.3). It follows from the pressure, or, without stiffness and pressure, from the sag. F's nearest
-singularity, a film without stress at its ring, is at s = 30.6.
+so that a film is one number s, the slackness: 0 is a drum (N constant, a paraboloid), 12.5 Hencky's
+film without pre-strain (nu = 0.3). It follows from the pressure, or, without stiffness and
+pressure, from the sag. F's nearest singularity, a film without stress at its ring, is at s = 30.6.
 
-What varies with azimuth (pre-strain, a ring that is not flat or not round) is a small disturbance cos(m theta) of
-that film. Of all displacements that meet the ring's, the true one has the least energy (Ritz, `Bowl.harmonic`).
+What varies with azimuth (pre-strain, a ring that is not flat or not round) is a small disturbance
+cos(m theta) of that film. Of all displacements that meet the ring's, the true one has the least
+energy (Ritz, `Bowl.harmonic`).
 
-All that is Foeppl's: small slopes, pressure along z. It misses 1 % of the slopes at 37 mm of sag, which would be
-taken for a Poisson ratio that is lower by 0.05; `finite_rise_mm` does not.
+All that is Foeppl's: small slopes, pressure along z. It misses 1 % of the slopes at 37 mm of sag,
+which would be taken for a Poisson ratio that is lower by 0.05; `finite_rise_mm` does not.
 
-Sources: H. Hencky, Z. Math. Phys. 63, 311 (1915); J. D. Campbell, Quart. J. Mech. Appl. Math. 9, 84 (1956).
+Sources: H. Hencky, Z. Math. Phys. 63, 311 (1915); J. D. Campbell, Quart. J. Mech. Appl. Math. 9, 84
+(1956).
 """
 
 from collections.abc import Callable
@@ -44,7 +48,10 @@ HarmonicCause = Literal["prestrain", "flat", "round"]
 @cache
 def _universal() -> tuple[FloatArray, FloatArray, FloatArray]:
     """F, F' and G = integral of dx / F from 0, as power series in x."""
-    force, square = np.zeros(_SERIES_TERMS), np.zeros(_SERIES_TERMS)  # F and F^-2, by the recurrence for powers
+    force, square = (
+        np.zeros(_SERIES_TERMS),
+        np.zeros(_SERIES_TERMS),
+    )  # F and F^-2, by the recurrence for powers
     inverse = np.zeros(_SERIES_TERMS)
     force[0] = square[0] = inverse[0] = 1.0
     for k in range(_SERIES_TERMS - 1):
@@ -56,9 +63,13 @@ def _universal() -> tuple[FloatArray, FloatArray, FloatArray]:
 
 
 def _ring_strain(slackness: AnyArray, poisson: FloatArray | float) -> AnyArray:
-    """Strain e / q^(2/3) of the hoop at the ring; falls, ever more slowly, as the film gets slacker."""
+    """Strain e / q^(2/3) of the hoop at the ring; falls, ever more slowly, as the film gets
+    slacker.
+    """
     force, slope, _ = _universal()
-    at_ring = (1 - poisson) * series.polyval(slackness, force) + 2 * slackness * series.polyval(slackness, slope)
+    at_ring = (1 - poisson) * series.polyval(slackness, force) + 2 * slackness * series.polyval(
+        slackness, slope
+    )
     return np.asarray(slackness ** (-1 / 3) * at_ring)
 
 
@@ -68,7 +79,8 @@ def _sag(slackness: AnyArray) -> AnyArray:
 
 
 def _slackness(falls: Callable[[AnyArray], AnyArray], wanted: FloatArray) -> FloatArray:
-    """Where a convex falling function has the wanted values: Newton from the left, which never overshoots.
+    """Where a convex falling function has the wanted values: Newton from the left, which never
+    overshoots.
 
     Raises ValueError if a film would be slack at its ring.
     """
@@ -81,13 +93,17 @@ def _slackness(falls: Callable[[AnyArray], AnyArray], wanted: FloatArray) -> Flo
         if np.all(np.abs(step) <= 1e-15 * s):
             break
     if np.any(s >= SLACKEST):
-        raise ValueError("the film would be slack at its ring: the pre-strain is too far below 0 for this load")
+        raise ValueError(
+            "the film would be slack at its ring: the pre-strain is too far below 0 for this load"
+        )
     return s
 
 
 @dataclass(frozen=True)
 class FilmLaw:
-    """A film in its ring; any number may be an array. Raises ValueError for one that no film has."""
+    """A film in its ring; any number may be an array. Raises
+    ValueError for one that no film has.
+    """
 
     prestrain: FloatArray | float  # of the flat film, equal in all directions; below 0: slack
     poisson: FloatArray | float
@@ -101,18 +117,29 @@ class FilmLaw:
             raise ValueError("stiffness_n_per_m and radius_mm must be above 0")
 
     def under(self, pressure_pa: FloatArray | float) -> "Bowl":
-        """The film under a gauge pressure above 0. Raises ValueError if it would be slack at its ring."""
+        """The film under a gauge pressure above 0. Raises ValueError if it would be slack at its
+        ring.
+        """
         return self.loaded(np.asarray(pressure_pa) * self.radius_mm * 1e-3 / self.stiffness_n_per_m)
 
     def loaded(self, load: FloatArray) -> "Bowl":
         """The film under a load q. Raises ValueError as `under`."""
         wanted = np.asarray(self.prestrain / load ** (2 / 3))
-        return Bowl(_slackness(lambda s: _ring_strain(s, self.poisson), wanted), load, self.poisson, self.radius_mm)
+        return Bowl(
+            _slackness(lambda s: _ring_strain(s, self.poisson), wanted),
+            load,
+            self.poisson,
+            self.radius_mm,
+        )
 
     def with_sag(self, sag_mm: FloatArray | float) -> "Bowl":
-        """The film at a sag above 0; no stiffness is needed. Raises ValueError if it would be slack at its ring."""
+        """The film at a sag above 0; no stiffness is needed. Raises ValueError if it would be slack
+        at its ring.
+        """
         depth = np.asarray(sag_mm) / self.radius_mm
-        s = _slackness(lambda s: _ring_strain(s, self.poisson) / _sag(s) ** 2, self.prestrain / depth**2)
+        s = _slackness(
+            lambda s: _ring_strain(s, self.poisson) / _sag(s) ** 2, self.prestrain / depth**2
+        )
         return Bowl(s, (depth / _sag(s)) ** 3, self.poisson, self.radius_mm)
 
     def pressure_pa(self, bowl: "Bowl") -> FloatArray:
@@ -162,7 +189,8 @@ class Bowl:
         order : int
             m, from 1.
         cause : "prestrain", "flat" or "round"
-            The ring's hoop of film is stretched by 1, raised by 1 mm, or 1 mm wider, each times cos(m theta).
+            The ring's hoop of film is stretched by 1, raised by 1 mm, or 1 mm wider, each times
+            cos(m theta).
 
         Returns
         -------
@@ -174,11 +202,15 @@ class Bowl:
         radial, hoop = (float(force) for force in self.stresses(one))
         nu = float(self.poisson)
         stretch = hoop - nu * radial - (radial - nu * hoop - rise**2 / 2)  # u / a - du/dr
-        ring = {"prestrain": (1.0, 0.0), "flat": (0.0, 1 / a), "round": (stretch / a, -rise / a)}[cause]
+        ring = {"prestrain": (1.0, 0.0), "flat": (0.0, 1 / a), "round": (stretch / a, -rise / a)}[
+            cause
+        ]
         return Legendre(a * self._ritz(order, *ring), domain=[0, 1])
 
     def _ritz(self, order: int, outward: float, upward: float) -> FloatArray:
-        """Coefficients (_WAVE_TERMS,) of the height / a with the least energy, given the ring's displacements / a."""
+        """Coefficients (_WAVE_TERMS,) of the height / a with the least energy, given the ring's
+        displacements / a.
+        """
         nodes, weights = legendre.leggauss(_NODES)
         rho = (nodes + 1) / 2
         rise, stresses = self.rise_mm(rho) / self.radius_mm, self.stresses(rho)
@@ -193,12 +225,20 @@ class Bowl:
         hoop = (u + order * v) / rho
         shear = v_r - (order * u + v) / rho - order * rise * w / rho
         nu, area = float(self.poisson), weights * rho
-        energy = ((radial * area) @ (radial + nu * hoop).T + (hoop * area) @ (hoop + nu * radial).T) / (1 - nu**2)
+        energy = (
+            (radial * area) @ (radial + nu * hoop).T + (hoop * area) @ (hoop + nu * radial).T
+        ) / (1 - nu**2)
         energy += (shear * area) @ shear.T / (2 * (1 + nu))
-        energy += (w_r * area * stresses[0]) @ w_r.T + order**2 * (w * area * stresses[1] / rho**2) @ w.T
+        energy += (w_r * area * stresses[0]) @ w_r.T + order**2 * (
+            w * area * stresses[1] / rho**2
+        ) @ w.T
         ones, none = np.ones(_WAVE_TERMS), np.zeros(_WAVE_TERMS)
         ring = np.stack(
-            [np.concatenate([none, ones, ones]), np.concatenate([none, -ones, ones]), np.append(ones, [none, none])]
+            [
+                np.concatenate([none, ones, ones]),
+                np.concatenate([none, -ones, ones]),
+                np.append(ones, [none, none]),
+            ]
         )
         system = np.block([[energy, ring.T], [ring, np.zeros((3, 3))]])
         right = np.append(np.zeros(len(energy)), [outward, 0.0, upward])
@@ -214,15 +254,17 @@ def _powers(rho: FloatArray, power: int) -> tuple[FloatArray, FloatArray]:
 
 # The film without small slopes: Green's strains, and pressure normal to the film where it is.
 #
-# With u = r U(v) outward and S, H the second Piola-Kirchhoff forces over E t, the balance along z integrates to
-# h' = q r (1 + U)^2 / (2 S). Outward it is (r S (1 + u'))' = H (1 + U) - q r (1 + U) h', and Hooke's law says
-# S (1 - nu^2) = e + u' + (u'^2 + h'^2) / 2 + nu (e + U + U^2 / 2).
+# With u = r U(v) outward and S, H the second Piola-Kirchhoff forces over E t, the balance along z
+# integrates to h' = q r (1 + U)^2 / (2 S). Outward it is (r S (1 + u'))' = H (1 + U) - q r (1 + U)
+# h', and Hooke's law says S (1 - nu^2) = e + u' + (u'^2 + h'^2) / 2 + nu (e + U + U^2 / 2).
 
 _FINITE_TERMS = 14  # of U: 1e-12 of the slopes
 
 
 def finite_rise_mm(law: FilmLaw, load: float, rho: FloatArray) -> FloatArray:
-    """dh / drho (n,) at radii rho of the deformed film, of one film under one load. Raises ValueError as `under`."""
+    """dh / drho (n,) at radii rho of the deformed film, of one film under one load. Raises
+    ValueError as `under`.
+    """
     v, outward, grows, slope = _finite_tables()
     bowl, poisson = law.loaded(np.asarray(load)), float(law.poisson)
     film = float(law.prestrain), poisson, load
@@ -233,7 +275,12 @@ def finite_rise_mm(law: FilmLaw, load: float, rho: FloatArray) -> FloatArray:
         near = unknowns[:, None] + steps
         force, around, along, wide = _finite_forces(film, v, outward @ near, grows @ near, radial)
         pull = force * along
-        left = pull + 2 * v[:, None] * (slope @ pull) - around * wide + load**2 * v[:, None] * wide**3 / (2 * force)
+        left = (
+            pull
+            + 2 * v[:, None] * (slope @ pull)
+            - around * wide
+            + load**2 * v[:, None] * wide**3 / (2 * force)
+        )
         step = np.linalg.solve(left[:, 1:].imag / _COMPLEX_STEP, -left[:, 0].real)
         unknowns = unknowns + step
         if np.max(np.abs(step)) < 1e-14:
@@ -247,9 +294,15 @@ def finite_rise_mm(law: FilmLaw, load: float, rho: FloatArray) -> FloatArray:
 
 
 def _finite_forces(
-    film: tuple[float, float, float], v: FloatArray, outward: AnyArray, grows: AnyArray, near: FloatArray
+    film: tuple[float, float, float],
+    v: FloatArray,
+    outward: AnyArray,
+    grows: AnyArray,
+    near: FloatArray,
 ) -> tuple[AnyArray, AnyArray, AnyArray, AnyArray]:
-    """S, H, 1 + u' and 1 + U, (n, m), from U and dU/dv; S is the positive root of a cubic, by Newton from `near`."""
+    """S, H, 1 + u' and 1 + U, (n, m), from U and dU/dv; S is the positive root of a cubic, by
+    Newton from `near`.
+    """
     prestrain, poisson, load = film
     u_r, hoop = outward + 2 * v[:, None] * grows, prestrain + outward + outward**2 / 2
     flat = prestrain + u_r + u_r**2 / 2 + poisson * hoop
@@ -264,7 +317,10 @@ def _finite_forces(
 def _finite_basis(v: FloatArray) -> tuple[FloatArray, FloatArray]:
     """U and dU/dv (n, terms) of U = (1 - v) T_k(2 v - 1): the ring holds the film."""
     eye = np.eye(_FINITE_TERMS)
-    value, slope = chebyshev.chebval(2 * v - 1, eye).T, 2 * chebyshev.chebval(2 * v - 1, chebyshev.chebder(eye)).T
+    value, slope = (
+        chebyshev.chebval(2 * v - 1, eye).T,
+        2 * chebyshev.chebval(2 * v - 1, chebyshev.chebder(eye)).T,
+    )
     return (1 - v)[:, None] * value, (1 - v)[:, None] * slope - value
 
 
@@ -278,22 +334,27 @@ def _finite_tables() -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
 
 # Hencky's bowl: the law without pre-strain, as a polynomial in v.
 #
-# Over the unit disc the rotationally symmetric Zernike terms are sqrt(2k + 1) P_k(2v - 1) with Legendre's P_k, so the
-# Legendre series of the profile *is* its Zernike expansion: P_0, P_1, P_2, ... are Noll 1, 4, 11, ... What lies above
-# the degree of the fit is the "excess", with 36 terms some micrometres of a 37 mm bowl.
+# Over the unit disc the rotationally symmetric Zernike terms are sqrt(2k + 1) P_k(2v - 1) with
+# Legendre's P_k, so the Legendre series of the profile *is* its Zernike expansion: P_0, P_1, P_2,
+# ... are Noll 1, 4, 11, ... What lies above the degree of the fit is the "excess", with 36 terms
+# some micrometres of a 37
+# mm bowl.
 
 POISSON_RATIO = 0.3
-# Legendre degree 14; the coefficients fall sevenfold a degree: what is cut off is below 1e-13 of the sag
+# Legendre degree 14; the coefficients fall sevenfold a degree: what is cut off is below 1e-13 of
+# the sag
 EXCESS_TERMS = 15
-# Noll indices of the round terms that the fit has, by Legendre degree: the first of order n = 2k has (n^2 + n) / 2
-# terms before it, and its m = 0
+# Noll indices of the round terms that the fit has, by Legendre degree: the first of order n = 2k
+# has (n^2 + n) / 2 terms before it, and its m = 0
 ROUND_NOLL = tuple(k * (2 * k + 1) + 1 for k in range(ZERNIKE_DEGREE // 2 + 1))
 EXCESS_DEGREE = len(ROUND_NOLL)  # Legendre degree of the excess' largest part
 
 
 @cache
 def profile_legendre() -> Legendre:
-    """Depth H(v) of a bowl of unit sag, 0 at the vertex and 1 at the rim, as Legendre series on v in [0, 1]."""
+    """Depth H(v) of a bowl of unit sag, 0 at the vertex and 1 at the rim, as Legendre series on v
+    in [0, 1].
+    """
     bowl = FilmLaw(0.0, POISSON_RATIO, 1.0, 1.0).with_sag(1.0)
     return legendre_series(bowl, EXCESS_TERMS + 8).truncate(EXCESS_TERMS)
 
@@ -306,7 +367,9 @@ def legendre_series(bowl: Bowl, degree: int) -> Legendre:
 
 @cache
 def zernike_projection() -> FloatArray:
-    """Noll coefficients (terms,) of a Hencky bowl of unit sag; also their change per unit of sag."""
+    """Noll coefficients (terms,) of a Hencky bowl of unit sag;
+    also their change per unit of sag.
+    """
     out = np.zeros(ZERNIKE_TERMS)
     for degree, j in enumerate(ROUND_NOLL):
         out[j - 1] = profile_legendre().coef[degree] / np.sqrt(2 * degree + 1)
@@ -324,16 +387,22 @@ def excess() -> FloatArray:
     return np.asarray(out)
 
 
-# Round terms beyond the fit's that a calibration does not take from Hencky: three Legendre degrees, of unit RMS
+# Round terms beyond the fit's that a calibration does not take from Hencky: three Legendre degrees,
+# of unit RMS
 BEYOND = (EXCESS_DEGREE + 1, EXCESS_DEGREE + 2, EXCESS_DEGREE + 3)
 
 
 @cache
 def beyond() -> FloatArray:
-    """Power series in v, (len(BEYOND), EXCESS_TERMS), of the round terms beyond the fit's, each 0 at the vertex."""
+    """Power series in v, (len(BEYOND), EXCESS_TERMS), of the round terms beyond the fit's, each 0
+    at the vertex.
+    """
     out = np.zeros((len(BEYOND), EXCESS_TERMS))
     for row, degree in zip(out, BEYOND, strict=True):
-        power = np.sqrt(2 * degree + 1) * Legendre.basis(degree, domain=[0, 1]).convert(kind=Polynomial).coef
+        power = (
+            np.sqrt(2 * degree + 1)
+            * Legendre.basis(degree, domain=[0, 1]).convert(kind=Polynomial).coef
+        )
         row[1 : degree + 1] = power[1:]
     out.setflags(write=False)
     return out

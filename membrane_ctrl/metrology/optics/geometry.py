@@ -1,14 +1,15 @@
 """Camera and screen in world coordinates: the one form that the code uses (docs/interfaces.md).
 
-The short form is converted to it on loading. With the camera at F = a (cos alpha, 0, sin alpha) looking at O without
-roll, image down is world -y, forward is -F / a, and image right is the unit vector normal to both that points towards
-+x: (sin alpha, 0, -cos alpha).
+The short form is converted to it on loading. With the camera at F = a (cos alpha, 0, sin alpha)
+looking at O without roll, image down is world -y, forward is -F / a, and image right is the unit
+vector normal to both that points towards +x: (sin alpha, 0, -cos alpha).
 
 The screen's face: its deviation from its plane, w(s_x, s_y), towards the mirror (along s_x x s_y).
 
-w = c (s_x^2 + s_y^2) + map(s_x, s_y): a bow, and a bicubic spline through the nodes of a measured grid. The spline is
-kept as its polynomial in each cell, sum of C[m, n] v^m u^n with u and v from 0 to 1 across the cell, so that a loop
-needs one look-up and a Horner scheme. Beyond the grid the height of its edge continues.
+w = c (s_x^2 + s_y^2) + map(s_x, s_y): a bow, and a bicubic spline through the nodes of a measured
+grid. The spline is kept as its polynomial in each cell, sum of C[m, n] v^m u^n with u and v from 0
+to 1 across the cell, so that a loop needs one look-up and a Horner scheme. Beyond the grid the
+height of its edge continues.
 """
 
 import math
@@ -32,7 +33,8 @@ class Face(NamedTuple):
     """A face; a named tuple, since compiled loops take one as it is."""
 
     bow_per_mm: float  # c, in 1/mm
-    # (rows, columns, 4, 4): polynomials of the map's cells, along s_y and s_x; without cells there is no map
+    # (rows, columns, 4, 4): polynomials of the map's cells, along s_y and s_x; without cells there
+    # is no map
     cells_mm: FloatArray
     low_mm: FloatArray  # (2,): first node along s_x and s_y
     pitch_mm: FloatArray  # (2,): distance of the nodes
@@ -50,7 +52,9 @@ class Face(NamedTuple):
         return bool(is_plane(self))
 
     def heights(self, screen_mm: FloatArray) -> FloatArray:
-        """w, dw/ds_x and dw/ds_y, (3, ...), in mm and without unit, at screen coordinates (2, ...) in mm."""
+        """w, dw/ds_x and dw/ds_y, (3, ...), in mm and without unit, at screen coordinates (2, ...)
+        in mm.
+        """
         flat = np.ascontiguousarray(screen_mm.reshape(2, -1))
         out = np.empty((3, flat.shape[1]))
         _heights(self, flat, out)
@@ -69,8 +73,12 @@ def _cells(config: HeightMapConfig | None) -> tuple[FloatArray, FloatArray, Floa
 
 
 def _taylor(values: FloatArray, nodes_mm: FloatArray) -> FloatArray:
-    """Coefficients (cells, 4, ...) of the spline through values (nodes, ...), in powers of the share of a cell."""
-    from scipy.interpolate import make_interp_spline  # loads for a third of a second; most screens have no map
+    """Coefficients (cells, 4, ...) of the spline through values (nodes, ...), in powers of the
+    share of a cell.
+    """
+    from scipy.interpolate import (
+        make_interp_spline,
+    )  # loads for a third of a second; most screens have no map
 
     degree = min(_ORDER, nodes_mm.size) - 1
     spline = make_interp_spline(nodes_mm, values, k=degree)
@@ -134,10 +142,14 @@ class Geometry:
     """Poses of camera and screen, and the lens."""
 
     pinhole_mm: FloatArray  # (3,): camera pinhole F in world
-    rotation: FloatArray  # (3, 3): rows are the camera's x (right), y (down) and z (forward) in world
+    rotation: (
+        FloatArray  # (3, 3): rows are the camera's x (right), y (down) and z (forward) in world
+    )
     focal_px: float
     principal_px: tuple[float, float]  # column, row
-    distortion: tuple[float, ...]  # OpenCV's k1, k2, p1, p2[, k3[, k4, k5, k6]]; empty for a pinhole
+    distortion: tuple[
+        float, ...
+    ]  # OpenCV's k1, k2, p1, p2[, k3[, k4, k5, k6]]; empty for a pinhole
     screen_origin_mm: FloatArray  # (3,): O' in world
     screen_s_x: FloatArray  # (3,): unit vectors of s_x and s_y in world
     screen_s_y: FloatArray  # (3,)
@@ -161,8 +173,12 @@ class Geometry:
         )
 
     def rays(self, columns_px: ArrayLike, rows_px: ArrayLike) -> FloatArray:
-        """Unit vectors in world, (3, ...), from the pinhole through image points (pixel centres are integers)."""
-        columns, rows = np.broadcast_arrays(np.asarray(columns_px, float), np.asarray(rows_px, float))
+        """Unit vectors in world, (3, ...), from the pinhole through image points (pixel centres are
+        integers).
+        """
+        columns, rows = np.broadcast_arrays(
+            np.asarray(columns_px, float), np.asarray(rows_px, float)
+        )
         x = (columns - self.principal_px[0]) / self.focal_px
         y = (rows - self.principal_px[1]) / self.focal_px
         if any(self.distortion):
@@ -173,8 +189,12 @@ class Geometry:
 
     @property
     def screen_axes(self) -> FloatArray:
-        """Unit vectors of s_x, s_y and of the normal towards the mirror, as rows (3, 3) in world."""
-        return np.stack([self.screen_s_x, self.screen_s_y, np.cross(self.screen_s_x, self.screen_s_y)])
+        """Unit vectors of s_x, s_y and of the normal towards the mirror, as rows (3,
+        3) in world.
+        """
+        return np.stack(
+            [self.screen_s_x, self.screen_s_y, np.cross(self.screen_s_x, self.screen_s_y)]
+        )
 
     def screen_points(self, screen_mm: FloatArray) -> FloatArray:
         """World points (3, ...) on the face at screen coordinates (2, ...) in mm from O'."""
@@ -183,11 +203,13 @@ class Geometry:
         return np.asarray(origin + np.tensordot(self.screen_axes.T, in_screen, axes=1))
 
 
-def _undistort(x: FloatArray, y: FloatArray, distortion: tuple[float, ...]) -> tuple[FloatArray, FloatArray]:
+def _undistort(
+    x: FloatArray, y: FloatArray, distortion: tuple[float, ...]
+) -> tuple[FloatArray, FloatArray]:
     """Normalised pinhole coordinates of distorted ones; iterated until the last digit is stable.
 
-    NaN where the iteration does not reach the point, or reaches one beyond a fold of the model, where the distance
-    from the axis falls again: no ray, or another one, belongs to such a point.
+    NaN where the iteration does not reach the point, or reaches one beyond a fold of the model,
+    where the distance from the axis falls again: no ray, or another one, belongs to such a point.
     """
     points, lens = np.stack([x.ravel(), y.ravel()], axis=1), np.array(distortion)
     criteria = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 200, 1e-15)
@@ -200,7 +222,9 @@ def _undistort(x: FloatArray, y: FloatArray, distortion: tuple[float, ...]) -> t
 
 
 def _fold(distortion: tuple[float, ...]) -> float:
-    """Distance from the axis, as a tangent, at which the lens' radial part stops growing; at most 2 (63 degrees)."""
+    """Distance from the axis, as a tangent, at which the lens' radial part stops growing; at most 2
+    (63 degrees).
+    """
     radius: FloatArray = np.linspace(0.0, 2.0, 2001)
     radial = (*distortion[:2], 0.0, 0.0, *distortion[4:])
     falls = np.diff(distort(radius, np.zeros_like(radius), radial)[0]) <= 0
@@ -214,10 +238,12 @@ def distort(x: FloatArray, y: FloatArray, distortion: tuple[float, ...]) -> Floa
     return np.asarray(seen[:, 0].T, np.float64)
 
 
-# The mirror's rim in the picture: where the light ends, against where the camera's pose puts the rim.
+# The mirror's rim in the picture: where the light ends, against where the camera's pose puts the
+# rim.
 #
-# A circle on the mirror is an ellipse in the picture. The pose predicts points of the rim; the edge of the light is
-# searched along the line from the middle through each. The edge is at half the light well inside.
+# A circle on the mirror is an ellipse in the picture. The pose predicts points of the rim; the edge
+# of the light is searched along the line from the middle through each. The edge is at half the
+# light well inside.
 
 _POINTS = 180
 _FROM, _TO = 0.85, 1.15  # of the expected radius
@@ -237,16 +263,22 @@ class Outline:
 
 
 def light_at(light: FloatArray, places_px: FloatArray) -> FloatArray:
-    """Light (H, W) between pixels, at columns and rows (2, ...); NaN outside. SciPy's would load for 0.2 s."""
+    """Light (H, W) between pixels, at columns and rows (2, ...); NaN outside. SciPy's would load
+    for 0.2 s.
+    """
     far = np.array(light.shape[::-1]).reshape(2, *[1] * (places_px.ndim - 1)) - 1
     inside = ((places_px >= 0) & (places_px <= far)).all(axis=0)
     column, row = low = np.clip(np.floor(np.where(inside, places_px, 0.0)), 0, far - 1).astype(int)
     right, down = places_px - low
-    upper, lower = ((1 - right) * light[k, column] + right * light[k, column + 1] for k in (row, row + 1))
+    upper, lower = (
+        (1 - right) * light[k, column] + right * light[k, column + 1] for k in (row, row + 1)
+    )
     return np.where(inside, (1 - down) * upper + down * lower, np.nan)
 
 
-def find_outline(light: FloatArray, geometry: Geometry, rim_mm: float, rim_z_mm: float) -> Outline | None:
+def find_outline(
+    light: FloatArray, geometry: Geometry, rim_mm: float, rim_z_mm: float
+) -> Outline | None:
     """Look for the rim.
 
     Parameters
@@ -278,8 +310,8 @@ def find_outline(light: FloatArray, geometry: Geometry, rim_mm: float, rim_z_mm:
     scale = reach[first] - (reach[1] - reach[0]) / 2
     ray = expected - middle[:, None]
     rim = middle[:, None] + ray * scale
-    # A rim shifted by w and scaled by ratio meets the ray at scale |ray| = ratio |ray| + (n w) / (n u), with n the
-    # normal of the expected rim and u the ray's direction.
+    # A rim shifted by w and scaled by ratio meets the ray at scale |ray| = ratio |ray| + (n w) / (n
+    # u), with n the normal of the expected rim and u the ray's direction.
     length = np.linalg.norm(ray, axis=0)
     tangent = np.roll(expected, -1, axis=1) - np.roll(expected, 1, axis=1)
     normal = np.stack([tangent[1], -tangent[0]])

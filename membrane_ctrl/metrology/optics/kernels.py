@@ -1,13 +1,13 @@
 """Compiled loops over points: ray to surface, surface to screen, sums for the least squares.
 
-Lengths are in mm; x and y in the polynomials are divided by the radius. A point is a ray from the pinhole,
-P = F + t d, and what the camera saw there, a screen point S. All loops are linear in the number of points and work
-on a range of them, so that threads can share them.
+Lengths are in mm; x and y in the polynomials are divided by the radius. A point is a ray from the
+pinhole, P = F + t d, and what the camera saw there, a screen point S. All loops are linear in the
+number of points and work on a range of them, so that threads can share them.
 
-Arguments shared by the loops: `rays` (3, n) unit vectors d, `t` (n,) their lengths to the surface (updated in place
-by Newton steps), `pinhole` (3,), `plane` (4, 3) = O', s_x, s_y and the normal of the screen, `face` the `Face` that
-deviates from it, `poly` (degree + 1, degree + 1) the Zernike part, `excess` (15,) the Hencky excess of unit RMS and
-`amplitude` its size.
+Arguments shared by the loops: `rays` (3, n) unit vectors d, `t` (n,) their lengths to the surface
+(updated in place by Newton steps), `pinhole` (3,), `plane` (4, 3) = O', s_x, s_y and the normal of
+the screen, `face` the `Face` that deviates from it, `poly` (degree + 1, degree + 1) the Zernike
+part, `excess` (15,) the Hencky excess of unit RMS and `amplitude` its size.
 """
 
 import math
@@ -22,7 +22,9 @@ FACE_STEPS = 6  # see `_onto_face`
 _BLOCK = 256  # points whose intermediate values stay in the first-level cache
 
 SLOPE_MONOMIALS = ZERNIKE_DEGREE * (ZERNIKE_DEGREE + 1) // 2  # x^p y^q with p + q < degree
-SUMS = 2 * SLOPE_MONOMIALS + 5  # moments of r_x and of r_y, two for the excess, sum w r_x^2, sum w r_y^2, sum w
+SUMS = (
+    2 * SLOPE_MONOMIALS + 5
+)  # moments of r_x and of r_y, two for the excess, sum w r_x^2, sum w r_y^2, sum w
 PRODUCT_DEGREE = 2 * (ZERNIKE_DEGREE - 1)
 PRODUCT_MONOMIALS = (PRODUCT_DEGREE + 1) * (PRODUCT_DEGREE + 2) // 2  # p + q <= PRODUCT_DEGREE
 PRODUCTS = PRODUCT_MONOMIALS + 2 * SLOPE_MONOMIALS + 2
@@ -30,7 +32,9 @@ PRODUCTS = PRODUCT_MONOMIALS + 2 * SLOPE_MONOMIALS + 2
 
 @step
 def evaluate(poly, excess, amplitude, x, y):  # type: ignore[no-untyped-def]
-    """Height, dh/dx, dh/dy and the excess' own d/dv at a point in radii (Horner's rule in x and y)."""
+    """Height, dh/dx, dh/dy and the excess' own d/dv at a point in
+    radii (Horner's rule in x and y).
+    """
     h = 0.0
     hx = 0.0
     hy = 0.0
@@ -65,12 +69,15 @@ def _load(rays, t, first, count, block):  # type: ignore[no-untyped-def]
 def _newton(block, count, pinhole, poly, excess, amplitude, radius, vertex_z):  # type: ignore[no-untyped-def]
     """One Newton step on F_z + t d_z = vertex_z + h(x, y); rows of `block` are d_x, d_y, d_z, t.
 
-    The derivative along the ray is d_z - h_x d_x - h_y d_y: never 0 for a ray that is steeper than the film.
+    The derivative along the ray is d_z - h_x d_x - h_y d_y: never 0 for a ray that is steeper than
+    the film.
     """
     fx, fy, fz = pinhole[0], pinhole[1], pinhole[2]
     for p in range(count):
         dx, dy, dz, t = block[0, p], block[1, p], block[2, p], block[3, p]
-        h, hx, hy, _ev = evaluate(poly, excess, amplitude, (fx + t * dx) / radius, (fy + t * dy) / radius)
+        h, hx, hy, _ev = evaluate(
+            poly, excess, amplitude, (fx + t * dx) / radius, (fy + t * dy) / radius
+        )
         block[3, p] = t - (fz + t * dz - vertex_z - h) / (dz - (hx * dx + hy * dy) / radius)
 
 
@@ -88,7 +95,9 @@ def intersect(rays, t, pinhole, poly, excess, amplitude, radius, vertex_z, newto
 
 @step
 def bisector(dx, dy, dz, qx, qy, qz):  # type: ignore[no-untyped-def]
-    """Slopes of the mirror that turns the ray d towards q: its normal halves the angle between -d and q."""
+    """Slopes of the mirror that turns the ray d towards q: its normal halves the angle between -d
+    and q.
+    """
     scale = 1 / math.sqrt(qx * qx + qy * qy + qz * qz)
     nz = qz * scale - dz
     return -(qx * scale - dx) / nz, -(qy * scale - dy) / nz
@@ -96,7 +105,9 @@ def bisector(dx, dy, dz, qx, qy, qz):  # type: ignore[no-untyped-def]
 
 @step
 def measured_slope(rays, t, screen, w, pinhole, plane, p):  # type: ignore[no-untyped-def]
-    """x, y and both measured slopes at point p, from exact vectors; the screen point is w off the plane."""
+    """x, y and both measured slopes at point p, from exact vectors; the screen point is w off the
+    plane.
+    """
     dx, dy, dz = rays[0, p], rays[1, p], rays[2, p]
     x = pinhole[0] + t[p] * dx
     y = pinhole[1] + t[p] * dy
@@ -115,7 +126,9 @@ def measured_slope(rays, t, screen, w, pinhole, plane, p):  # type: ignore[no-un
 
 @kernel
 def _lift(screen, face, first, count, out):  # type: ignore[no-untyped-def]
-    """Deviation of the face at some points, in a separate loop: a look-up prevents vector instructions."""
+    """Deviation of the face at some points, in a separate loop: a look-up prevents vector
+    instructions.
+    """
     if geometry.is_plane(face):
         out[:count] = 0.0
         return
@@ -125,7 +138,8 @@ def _lift(screen, face, first, count, out):  # type: ignore[no-untyped-def]
 
 @kernel
 def _add_moments(values, x, powers_y, count, sums, first):  # type: ignore[no-untyped-def]
-    """sums[first + k] += sum over points of values x^p y^q, p outer, q inner, p + q < rows of powers_y.
+    """sums[first + k] += sum over points of values x^p y^q, p outer, q inner, p + q < rows of
+    powers_y.
 
     `values` is used up: it is multiplied by x from power to power.
     """
@@ -152,11 +166,14 @@ def _powers(y, powers_y, count):  # type: ignore[no-untyped-def]
 
 
 @kernel
-def residual_sums(rays, t, screen, weights, pinhole, plane, face, poly, excess, amplitude, radius, start, stop):  # type: ignore[no-untyped-def]
-    """Moments of the weighted slope residual g - D a: all that the right-hand side of the least squares needs.
+def residual_sums(  # type: ignore[no-untyped-def]
+    rays, t, screen, weights, pinhole, plane, face, poly, excess, amplitude, radius, start, stop
+):
+    """Moments of the weighted slope residual g - D a: all that the right-hand side of the least
+    squares needs.
 
-    Returns (SUMS,): sum w r_x x^p y^q (SLOPE_MONOMIALS), as many of r_y, sum w r_x x e'(v) and sum w r_y y e'(v) for
-    the excess, sum w r_x^2, sum w r_y^2, sum w.
+    Returns (SUMS,): sum w r_x x^p y^q (SLOPE_MONOMIALS), as many of r_y, sum w r_x x e'(v) and sum
+    w r_y y e'(v) for the excess, sum w r_x^2, sum w r_y^2, sum w.
     """
     sums = np.zeros(SUMS)
     block = np.empty((5, _BLOCK))
@@ -200,8 +217,8 @@ def residual_sums(rays, t, screen, weights, pinhole, plane, face, poly, excess, 
 def product_sums(rays, t, weights, pinhole, excess, radius, start, stop):  # type: ignore[no-untyped-def]
     """Moments from which the normal matrix is made.
 
-    Returns (PRODUCTS,): sum w x^p y^q of PRODUCT_MONOMIALS, sum w e' x x^p y^q and sum w e' y x^p y^q with
-    SLOPE_MONOMIALS each, sum w (e' x)^2, sum w (e' y)^2.
+    Returns (PRODUCTS,): sum w x^p y^q of PRODUCT_MONOMIALS, sum w e' x x^p y^q and sum w e' y x^p
+    y^q with SLOPE_MONOMIALS each, sum w (e' x)^2, sum w (e' y)^2.
     """
     sums = np.zeros(PRODUCTS)
     block = np.empty((5, _BLOCK))
@@ -223,17 +240,20 @@ def product_sums(rays, t, weights, pinhole, excess, radius, start, stop):  # typ
         _powers(ys, powers_y, count)
         _add_moments(ws, xs, powers_y, count, sums, 0)
         _add_moments(ex, xs, powers_y[:ZERNIKE_DEGREE], count, sums, PRODUCT_MONOMIALS)
-        _add_moments(ey, xs, powers_y[:ZERNIKE_DEGREE], count, sums, PRODUCT_MONOMIALS + SLOPE_MONOMIALS)
+        _add_moments(
+            ey, xs, powers_y[:ZERNIKE_DEGREE], count, sums, PRODUCT_MONOMIALS + SLOPE_MONOMIALS
+        )
     return sums
 
 
 @kernel
 def invert(matrix):  # type: ignore[no-untyped-def]
-    """Inverse of a symmetric positive matrix in place by Gauss-Jordan; False, and no usable result, if it is not one.
+    """Inverse of a symmetric positive matrix in place by Gauss-Jordan; False, and no usable result,
+    if it is not one.
 
-    A 36 x 36 matrix takes some 20 us here; on a busy machine the linear algebra library may wait a thousand times
-    longer for its threads. A positive matrix needs no pivoting: each pivot is a Schur complement, and one below 1e-13
-    of its diagonal element is only rounding.
+    A 36 x 36 matrix takes some 20 us here; on a busy machine the linear algebra library may wait a
+    thousand times longer for its threads. A positive matrix needs no pivoting: each pivot is a
+    Schur complement, and one below 1e-13 of its diagonal element is only rounding.
     """
     size = matrix.shape[0]
     diagonal = np.diag(matrix).copy()
@@ -254,7 +274,9 @@ def invert(matrix):  # type: ignore[no-untyped-def]
 
 
 @kernel
-def slope_field(rays, t, screen, pinhole, plane, face, poly, excess, amplitude, radius, out, start, stop):  # type: ignore[no-untyped-def]
+def slope_field(  # type: ignore[no-untyped-def]
+    rays, t, screen, pinhole, plane, face, poly, excess, amplitude, radius, out, start, stop
+):
     """x, y, measured g_x, g_y and fitted h_x, h_y of each point into `out` (6, n)."""
     off = np.empty(_BLOCK)
     for first in range(start, stop, _BLOCK):
@@ -273,8 +295,12 @@ def slope_field(rays, t, screen, pinhole, plane, face, poly, excess, amplitude, 
 
 
 @kernel
-def predict_screen(rays, t, pinhole, plane, face, poly, excess, amplitude, radius, out, start, stop):  # type: ignore[no-untyped-def]
-    """Where the surface sends each ray on the screen, s_x and s_y into `out` (2, n); t must be on it."""
+def predict_screen(  # type: ignore[no-untyped-def]
+    rays, t, pinhole, plane, face, poly, excess, amplitude, radius, out, start, stop
+):
+    """Where the surface sends each ray on the screen, s_x and s_y into `out` (2, n); t must be on
+    it.
+    """
     tangents = np.empty((2, _BLOCK))
     for first in range(start, stop, _BLOCK):
         count = min(_BLOCK, stop - first)
@@ -301,10 +327,11 @@ def predict_screen(rays, t, pinhole, plane, face, poly, excess, amplitude, radiu
 
 @kernel
 def _onto_face(out, tangents, face, first, count):  # type: ignore[no-untyped-def]
-    """From where rays cross the plane to where they meet the face, by Newton's steps on w = face(s + w tangent).
+    """From where rays cross the plane to where they meet the face, by Newton's steps on w = face(s
+    + w tangent).
 
-    A step leaves the square of the miss times the face's curvature: 1 mm of bow 200 mm wide is met to rounding after
-    three, a map of a few millimetres after four or five.
+    A step leaves the square of the miss times the face's curvature: 1 mm of bow 200 mm wide is met
+    to rounding after three, a map of a few millimetres after four or five.
     """
     if geometry.is_plane(face):
         return
@@ -322,7 +349,8 @@ def _onto_face(out, tangents, face, first, count):  # type: ignore[no-untyped-de
 def cos_sin(x):  # type: ignore[no-untyped-def]
     """Cosine and sine of a phase in single precision, to 1e-6 within three turns.
 
-    Taylor's series about the nearest quarter of a turn: unlike a library's functions, they run on vector units.
+    Taylor's series about the nearest quarter of a turn: unlike a library's functions, they run on
+    vector units.
     """
     quarter = np.rint(x * np.float32(2 / math.pi))
     y = x - quarter * np.float32(math.pi / 2)

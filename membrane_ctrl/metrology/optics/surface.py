@@ -1,7 +1,8 @@
 """The fitted surface: Zernike terms plus the part of a Hencky bowl that they cannot represent.
 
-The excess is orthogonal to the terms over the disc, so the coefficients are those of the whole surface whatever
-its amplitude: a shape made of the terms has amplitude 0, a true Hencky bowl has its own sag.
+The excess is orthogonal to the terms over the disc, so the coefficients are those of the whole
+surface whatever its amplitude: a shape made of the terms has amplitude 0, a true Hencky bowl has
+its own sag.
 """
 
 import math
@@ -22,14 +23,20 @@ PARAMETERS = ZERNIKE_TERMS  # all but piston, which follows from h(0) = 0, and t
 class Surface:
     """Height above the vertex, h(0, 0) = 0, over a disc."""
 
-    coeffs_mm: FloatArray  # (terms,): in Noll's order, orthonormal; piston is whatever makes h(0, 0) = 0
+    coeffs_mm: (
+        FloatArray  # (terms,): in Noll's order, orthonormal; piston is whatever makes h(0, 0) = 0
+    )
     hencky_mm: float  # amplitude of the excess, as the sag of the Hencky bowl it belongs to
     radius_mm: float  # radius of the Zernike disc
-    beyond_mm: tuple[float, ...] = ()  # of `film_law.BEYOND`: a calibration's; a measurement has none
+    beyond_mm: tuple[
+        float, ...
+    ] = ()  # of `film_law.BEYOND`: a calibration's; a measurement has none
 
     @classmethod
     def from_parameters(cls, parameters: FloatArray, radius_mm: float) -> "Surface":
-        """The surface of parameters [a_2, a_3, ..., excess with unit RMS] in mm; piston makes h(0, 0) = 0."""
+        """The surface of parameters [a_2, a_3, ..., excess with unit RMS] in mm; piston makes h(0,
+        0) = 0.
+        """
         hencky_mm = float(parameters[-1]) / film_law.excess_rms()
         return cls(parameter_to_coeffs() @ parameters, hencky_mm, radius_mm)
 
@@ -69,10 +76,14 @@ class Surface:
         """dh/dx and dh/dy."""
         x, y = x_mm / self.radius_mm, y_mm / self.radius_mm
         grows = 2 * series.polyval(x * x + y * y, series.polyder(self.excess))
-        of_x, of_y = (series.polyval2d(x, y, series.polyder(self.polynomial, axis=axis)) for axis in (0, 1))
+        of_x, of_y = (
+            series.polyval2d(x, y, series.polyder(self.polynomial, axis=axis)) for axis in (0, 1)
+        )
         return (of_x + grows * x) / self.radius_mm, (of_y + grows * y) / self.radius_mm
 
-    def curvatures(self, x_mm: FloatArray, y_mm: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
+    def curvatures(
+        self, x_mm: FloatArray, y_mm: FloatArray
+    ) -> tuple[FloatArray, FloatArray, FloatArray]:
         """h_xx, h_xy and h_yy in 1/mm."""
         x, y = x_mm / self.radius_mm, y_mm / self.radius_mm
         v = x * x + y * y
@@ -100,7 +111,8 @@ class Surface:
 def parameter_to_coeffs() -> FloatArray:
     """Matrix (terms, parameters) from parameters to Noll coefficients.
 
-    Row 1 is the piston that puts the vertex at 0: a_1 = -(sum over j >= 2 of a_j Z_j(0) + excess(0)).
+    Row 1 is the piston that puts the vertex at 0: a_1 = -(sum over j >= 2 of a_j Z_j(0) +
+    excess(0)).
     """
     out = np.zeros((ZERNIKE_TERMS, PARAMETERS))
     out[1:, :-1] = np.eye(ZERNIKE_TERMS - 1)
@@ -119,7 +131,8 @@ def sag_gradient() -> FloatArray:
 
 @cache
 def height_probe() -> FloatArray:
-    """Matrix from parameters to heights at 512 points spread evenly over the disc (a sunflower), vertex at 0.
+    """Matrix from parameters to heights at 512 points spread evenly over the disc (a sunflower),
+    vertex at 0.
 
     Enough to see the largest height of such a surface to a few per cent.
     """
@@ -128,13 +141,15 @@ def height_probe() -> FloatArray:
     x, y = rho * np.cos(theta), rho * np.sin(theta)
     excess = series.polyval(rho**2, film_law.excess()) / film_law.excess_rms()
     terms = np.vstack([zernike.values(x, y), excess])
-    return np.asarray(terms[:-1].T @ parameter_to_coeffs() + np.outer(terms[-1], np.eye(PARAMETERS)[-1]))
+    return np.asarray(
+        terms[:-1].T @ parameter_to_coeffs() + np.outer(terms[-1], np.eye(PARAMETERS)[-1])
+    )
 
 
 @cache
 def _from_heights() -> tuple[FloatArray, FloatArray, FloatArray]:
-    """x and y (n,) over the unit disc, and least squares (parameters + 3, n) from heights there to the
-    parameters and `BEYOND`."""
+    """x and y (n,) over the unit disc, and least squares (parameters + 3, n) from heights there to
+    the parameters and `BEYOND`."""
     k = np.arange(1024)
     rho, theta = np.sqrt((k + 0.5) / k.size), k * np.pi * (3 - np.sqrt(5))
     x, y = rho * np.cos(theta), rho * np.sin(theta)
@@ -146,20 +161,26 @@ def _from_heights() -> tuple[FloatArray, FloatArray, FloatArray]:
 
 @cache
 def _family() -> tuple[FloatArray, FloatArray]:
-    """`EXCESS_DEGREE` (n,) and `BEYOND` (n, 3), unit RMS, of films of unit sag, from a drum to the slackest."""
+    """`EXCESS_DEGREE` (n,) and `BEYOND` (n, 3), unit RMS, of films of unit sag, from a drum to the
+    slackest.
+    """
     rows = []
     for slackness in np.linspace(1e-3, film_law.SLACKEST, 240):
         bowl = film_law.Bowl(np.asarray(slackness), np.ones(()), film_law.POISSON_RATIO, 1.0)
         coef = film_law.legendre_series(bowl, 40).coef.astype(np.float64) / bowl.sag_mm
-        rows.append([coef[k] / np.sqrt(2 * k + 1) for k in (film_law.EXCESS_DEGREE, *film_law.BEYOND)])
+        rows.append(
+            [coef[k] / np.sqrt(2 * k + 1) for k in (film_law.EXCESS_DEGREE, *film_law.BEYOND)]
+        )
     table = np.array(rows)
     return table[:, 0], table[:, 1:]
 
 
 def beyond_of(excess_mm: float, sag_mm: float) -> FloatArray:
-    """Terms of `BEYOND` (3,) in mm of the film of this law whose excess, of unit RMS, is this at this sag.
+    """Terms of `BEYOND` (3,) in mm of the film of this law whose excess, of unit RMS, is this at
+    this sag.
 
-    At a given sag every film is one number, the slackness, and so is its round figure, whatever makes it slack.
+    At a given sag every film is one number, the slackness, and so is its round figure, whatever
+    makes it slack.
     """
     own = (
         film_law.profile_legendre().coef[[film_law.EXCESS_DEGREE, *film_law.BEYOND]]
@@ -190,10 +211,15 @@ class Artefact:
     @property
     def doubt(self) -> str:
         """What is wrong if it disagrees with the other sets."""
-        return f"it is not the {self.name} that its file states, it stood elsewhere, or it was out of focus"
+        return (
+            f"it is not the {self.name} that its file states, it stood elsewhere, or it was out "
+            "of focus"
+        )
 
     def terms_mm(self, tilt_x: float = 0.0, tilt_y: float = 0.0) -> FloatArray:
-        """Parameters (parameters,) of the surface with these slopes at its vertex, and its terms `BEYOND`."""
+        """Parameters (parameters,) of the surface with these slopes at its vertex, and its terms
+        `BEYOND`.
+        """
         x, y, onto = _from_heights()
         return np.asarray(onto @ self._heights_mm(self.curvature_per_mm, x, y, tilt_x, tilt_y))
 
@@ -201,14 +227,25 @@ class Artefact:
         """Covariance of `terms_mm` by curvature and form."""
         x, y, onto = _from_heights()
         step = 1e-9  # per mm: the sag is linear in so little
-        change = self._heights_mm(self.curvature_per_mm + step, x, y) - self._heights_mm(self.curvature_per_mm, x, y)
+        change = self._heights_mm(self.curvature_per_mm + step, x, y) - self._heights_mm(
+            self.curvature_per_mm, x, y
+        )
         by_curvature = onto @ change / step * self.curvature_sigma_per_mm
-        return np.asarray(np.outer(by_curvature, by_curvature) + self.form_sigma_mm**2 * np.eye(len(onto)))
+        return np.asarray(
+            np.outer(by_curvature, by_curvature) + self.form_sigma_mm**2 * np.eye(len(onto))
+        )
 
     def _heights_mm(
-        self, curvature: float, x: FloatArray, y: FloatArray, tilt_x: float = 0.0, tilt_y: float = 0.0
+        self,
+        curvature: float,
+        x: FloatArray,
+        y: FloatArray,
+        tilt_x: float = 0.0,
+        tilt_y: float = 0.0,
     ) -> FloatArray:
-        """The sphere c |P|^2 = 2 n P through the origin with the normal n, at points (n,) of the unit disc."""
+        """The sphere c |P|^2 = 2 n P through the origin with the normal n, at points (n,) of the
+        unit disc.
+        """
         x, y = x * self.radius_mm, y * self.radius_mm
         across = 1 / math.sqrt(1 + tilt_x**2 + tilt_y**2)
         q = curvature * (x * x + y * y) + 2 * across * (tilt_x * x + tilt_y * y)
@@ -249,7 +286,9 @@ class RadialProfile:
 
 
 def radial_profile(axis_mm: FloatArray, height_mm: FloatArray, rim_mm: float) -> RadialProfile:
-    """Profile of a height map (n, n) on `axis_mm`, NaN where not measured, of a film with its rim at `rim_mm`."""
+    """Profile of a height map (n, n) on `axis_mm`, NaN where not measured, of a film with its rim
+    at `rim_mm`.
+    """
     x, y = np.meshgrid(axis_mm, axis_mm)
     seen = np.isfinite(height_mm)
     r, h = np.hypot(x[seen], y[seen]), height_mm[seen]
@@ -265,19 +304,27 @@ def radial_profile(axis_mm: FloatArray, height_mm: FloatArray, rim_mm: float) ->
         inside = ring == k
         if np.any(inside):
             # of the difference to the bowl: across a ring the bowl itself climbs by millimetres
-            rows.append((r[inside].mean(), left[inside].mean(), *np.percentile(left[inside], [2.5, 97.5])))
+            rows.append(
+                (r[inside].mean(), left[inside].mean(), *np.percentile(left[inside], [2.5, 97.5]))
+            )
     radius, mean, low, high = np.array(rows).T
     bowl = sag * film_law.profile(radius / rim_mm) + h_mean - sag * shape_mean
-    return RadialProfile(radius, bowl + mean, bowl + low, bowl + high, bowl, sag, pressure_pa(sag, rim_mm))
+    return RadialProfile(
+        radius, bowl + mean, bowl + low, bowl + high, bowl, sag, pressure_pa(sag, rim_mm)
+    )
 
 
 def pressure_pa(sag_mm: float, rim_mm: float) -> float:
-    """Gauge pressure under a film of the paper's kind with that sag: (w0 / (0.65344 a))^3 E t / a."""
+    """Gauge pressure under a film of the paper's kind with that sag:
+    (w0 / (0.65344 a))^3 E t / a.
+    """
     return (sag_mm / (_CENTRE * rim_mm)) ** 3 * _YOUNG_PA * _THICKNESS_MM / rim_mm
 
 
-# The best sphere. It passes (0, 0, z0) with unit normal n and has the curvature c; with q = P - (0, 0, z0) its
-# distance from a point is d = (1 - s) / c = (2 q n - c q^2) / (1 + s), s^2 = 1 - 2 c q n + c^2 q^2, also for a flat.
+# The best sphere. It passes (0, 0, z0) with unit normal n and has the curvature c; with q = P - (0,
+# 0, z0) its distance from a point is d = (1 - s) / c = (2 q n - c q^2) / (1 + s), s^2 = 1 - 2 c q n
+# + c^2 q^2,
+# also for a flat.
 
 _SPHERE_POINTS = 20_000  # enough to come close; the last step takes all
 
@@ -298,7 +345,9 @@ class Sphere:
         return np.asarray(normal / np.linalg.norm(normal))
 
     def deviation(self, points_mm: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Deviation (n,) in mm of points (3, n), and the unit normals (3, n) of the sphere there."""
+        """Deviation (n,) in mm of points (3, n), and the unit normals (3,
+        n) of the sphere there.
+        """
         q = points_mm - np.array([[0.0], [0.0], [self.vertex_mm]])
         c, along, square = self.curvature_per_mm, self.normal @ q, np.einsum("in,in->n", q, q)
         s = np.sqrt(1 - 2 * c * along + c * c * square)
@@ -325,7 +374,9 @@ def best_sphere(points_mm: FloatArray) -> Sphere:
 
 
 def _sphere_step(sphere: Sphere, points_mm: FloatArray, columns: FloatArray) -> FloatArray:
-    """Gauss-Newton step (4,); from (1 - c d)^2 = s^2, the derivatives of d need no division by c."""
+    """Gauss-Newton step (4,); from (1 - c d)^2 = s^2, the derivatives
+    of d need no division by c.
+    """
     deviation, normals = sphere.deviation(points_mm)
     q = points_mm - np.array([[0.0], [0.0], [sphere.vertex_mm]])
     s, n = 1 - sphere.curvature_per_mm * deviation, sphere.normal
@@ -333,6 +384,8 @@ def _sphere_step(sphere: Sphere, points_mm: FloatArray, columns: FloatArray) -> 
     turn_x = (np.array([-1.0, 0, 0]) + n * n[0]) / length  # d normal / d tilt_x
     turn_y = (np.array([0.0, -1, 0]) + n * n[1]) / length
     square = np.einsum("in,in->n", q, q)
-    rows = np.stack([-normals[2], turn_x @ q / s, turn_y @ q / s, (deviation**2 - square) / (2 * s)])
+    rows = np.stack(
+        [-normals[2], turn_x @ q / s, turn_y @ q / s, (deviation**2 - square) / (2 * s)]
+    )
     rows *= columns[:, None]
     return np.asarray(columns * np.linalg.lstsq(rows @ rows.T, -rows @ deviation, rcond=1e-13)[0])

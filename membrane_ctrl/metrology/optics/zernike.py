@@ -1,7 +1,9 @@
-"""The first `ZERNIKE_TERMS` Zernike terms in Noll's order, orthonormal over the unit disc, as polynomials in x and y.
+"""The first `ZERNIKE_TERMS` Zernike terms in Noll's order, orthonormal over the unit disc, as
+polynomials in x and y.
 
-They are all terms up to radial order `ZERNIKE_DEGREE`, that is exactly all polynomials of this degree in x and y: a
-sum of them is evaluated as one such polynomial, which costs a multiplication a term instead of a radial function.
+They are all terms up to radial order `ZERNIKE_DEGREE`, that is exactly all polynomials of this
+degree in x and y: a sum of them is evaluated as one such polynomial, which costs a multiplication a
+term instead of a radial function.
 
 Source: R. J. Noll, J. Opt. Soc. Am. 66, 207 (1976): even j takes the cosine, odd j the sine.
 """
@@ -30,13 +32,17 @@ def noll(j: int) -> tuple[int, int]:
 
 
 def osa_from_noll(per_term: FloatArray) -> FloatArray:
-    """Values (terms, ...) in the order of OSA/ANSI's index from 0, of the same terms in Noll's order."""
+    """Values (terms, ...) in the order of OSA/ANSI's index from 0, of the same terms in Noll's
+    order.
+    """
     orders = [noll(j) for j in NOLL_INDICES]
     return np.asarray(per_term)[sorted(range(ZERNIKE_TERMS), key=orders.__getitem__)]
 
 
 def fringe(j: int) -> tuple[int, int]:
-    """Radial and azimuthal order (negative: sine) of the Fringe set's index 1..37; the last is n = 12, m = 0."""
+    """Radial and azimuthal order (negative: sine) of the Fringe set's index 1..37; the last is n =
+    12, m = 0.
+    """
     if not 1 <= j <= FRINGE_TERMS:
         raise ValueError(f"the Fringe set has the terms 1 to {FRINGE_TERMS}, got {j}")
     if j == FRINGE_TERMS:
@@ -49,7 +55,9 @@ def fringe(j: int) -> tuple[int, int]:
 
 @cache
 def monomial_table() -> FloatArray:
-    """Coefficients (terms, degree + 1, degree + 1): Z_j = sum over p, q of table[j - 1, p, q] x^p y^q."""
+    """Coefficients (terms, degree + 1, degree + 1): Z_j = sum over p, q of table[j - 1, p, q] x^p
+    y^q.
+    """
     table = np.stack([_polynomial(j) for j in NOLL_INDICES])
     table.setflags(write=False)
     return table
@@ -62,7 +70,9 @@ def _polynomial(j: int) -> FloatArray:
 
 
 def term(n: int, m: int, degree: int) -> FloatArray:
-    """Polynomial (degree + 1, degree + 1) in x and y of a term without normalisation, R(1) = 1; sine for m < 0."""
+    """Polynomial (degree + 1, degree + 1) in x and y of a term without normalisation, R(1) = 1;
+    sine for m < 0.
+    """
     order = abs(m)
     out = np.zeros((degree + 1, degree + 1))
     for k in range((n - order) // 2 + 1):
@@ -82,9 +92,13 @@ def polynomial(coeffs: FloatArray) -> FloatArray:
 
 
 def values(x: FloatArray, y: FloatArray, table: FloatArray | None = None) -> FloatArray:
-    """All terms, (terms, ...), at points of the unit disc; or the polynomials of a table like theirs."""
+    """All terms, (terms, ...), at points of the unit disc; or the polynomials of a table like
+    theirs.
+    """
     table = monomial_table() if table is None else table
-    p, q = np.array([(p, q) for p in range(ZERNIKE_DEGREE + 1) for q in range(ZERNIKE_DEGREE + 1 - p)]).T
+    p, q = np.array(
+        [(p, q) for p in range(ZERNIKE_DEGREE + 1) for q in range(ZERNIKE_DEGREE + 1 - p)]
+    ).T
     powers_x = np.stack([x**k for k in range(ZERNIKE_DEGREE + 1)])
     powers_y = np.stack([y**k for k in range(ZERNIKE_DEGREE + 1)])
     return np.asarray(np.tensordot(table[:, p, q], powers_x[p] * powers_y[q], axes=1))
@@ -92,7 +106,9 @@ def values(x: FloatArray, y: FloatArray, table: FloatArray | None = None) -> Flo
 
 def gradients(x: FloatArray, y: FloatArray) -> tuple[FloatArray, FloatArray]:
     """d/dx and d/dy of all terms, each (terms, ...), at points of the unit disc."""
-    return values(x, y, differentiate(monomial_table(), 1)), values(x, y, differentiate(monomial_table(), 2))
+    return values(x, y, differentiate(monomial_table(), 1)), values(
+        x, y, differentiate(monomial_table(), 2)
+    )
 
 
 def differentiate(table: FloatArray, axis: int) -> FloatArray:
@@ -113,8 +129,10 @@ def at_rim() -> FloatArray:
     return np.array([math.sqrt(n + 1) if m == 0 else 0.0 for n, m in orders])
 
 
-# Terms fitted to a map on a square grid. A grid is a product of its axes: with the terms as sums of T[k, a, b] P_a(x)
-# P_b(y), Legendre's P, every sum over cells is two products of small matrices, without the terms of each cell.
+# Terms fitted to a map on a square grid. A grid is a product of its axes: with the terms as sums of
+# T[k, a, b] P_a(x) P_b(y), Legendre's P, every sum over cells is two products of small matrices,
+# without the terms of
+# each cell.
 
 
 class GridFit:
@@ -131,11 +149,19 @@ class GridFit:
     """
 
     def __init__(
-        self, x: FloatArray, mask: BoolArray, orders: Sequence[tuple[int, int]], y: FloatArray | None = None
+        self,
+        x: FloatArray,
+        mask: BoolArray,
+        orders: Sequence[tuple[int, int]],
+        y: FloatArray | None = None,
     ) -> None:
         degree = max(n for n, _ in orders)
-        to_legendre = np.stack([np.pad(p, (0, degree + 1 - p.size)) for p in map(poly2leg, np.eye(degree + 1))])
-        self._terms = np.stack([to_legendre.T @ term(n, m, degree) @ to_legendre for n, m in orders])
+        to_legendre = np.stack(
+            [np.pad(p, (0, degree + 1 - p.size)) for p in map(poly2leg, np.eye(degree + 1))]
+        )
+        self._terms = np.stack(
+            [to_legendre.T @ term(n, m, degree) @ to_legendre for n, m in orders]
+        )
         self._x, self._y = legvander(x, degree), legvander(x if y is None else y, degree)
         self._mask = mask
         pairs_y, pairs_x = (np.einsum("ia,ib->iab", along, along) for along in (self._y, self._x))

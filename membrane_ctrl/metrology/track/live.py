@@ -1,7 +1,8 @@
-"""Tracking in a hold: a full cycle anchors it, every frame of the crossed pattern is a figure, steps renew the light.
+"""Tracking in a hold: a full cycle anchors it, every frame of the crossed pattern is a figure,
+steps renew the light.
 
-The controller's inputs are recorded exactly, twenty figures a second of them: numbers are rounded to what their noise
-leaves of them, and the covariance stays the same for many frames.
+The controller's inputs are recorded exactly, twenty figures a second of them: numbers are rounded
+to what their noise leaves of them, and the covariance stays the same for many frames.
 """
 
 import math
@@ -16,7 +17,13 @@ from membrane_ctrl.config.schema import OpticsConfig
 from membrane_ctrl.metrology import bins, checked, full, live, phase
 from membrane_ctrl.metrology.frames import evidence, frame_stack
 from membrane_ctrl.metrology.track.fit import ENOUGH_STEPS
-from membrane_ctrl.metrology.track.modes import LEAST_RATE_HZ, MOVED, SEARCH_S, VibrationMode, find_modes
+from membrane_ctrl.metrology.track.modes import (
+    LEAST_RATE_HZ,
+    MOVED,
+    SEARCH_S,
+    VibrationMode,
+    find_modes,
+)
 from membrane_ctrl.metrology.track.scene import scene_of
 from membrane_ctrl.metrology.track.tracked import TrackedFrame
 from membrane_ctrl.metrology.track.tracker import Tracker
@@ -31,8 +38,8 @@ LOST_S = 1.0
 COVARIANCE_S = 10.0
 # A hand or a lamp goes away by itself, and meanwhile a full cycle would be rejected too.
 REJECTED_S = 10.0
-# The interval between frames is longer in two of three steps: vibrations faster than half the frame rate then have
-# different aliases (`modes`).
+# The interval between frames is longer in two of three steps: vibrations faster than half the frame
+# rate then have different aliases (`modes`).
 _SLOWER = (1.0, 1.09, 1.17)
 MODES = 8  # that a hold follows
 _SEARCHES = 5  # whose median is a mode's frequency; a line heard in fewer passes by
@@ -43,7 +50,8 @@ _UM, _SHARE, _TIME_S = 3, 4, 6  # decimals: a nanometre, a hundredth of a per ce
 
 
 class LiveTracker:
-    """Figures of full cycles and of single crossed frames, for a cycle of measurements (`acquisition.cycle`).
+    """Figures of full cycles and of single crossed frames, for a cycle of measurements
+    (`acquisition.cycle`).
 
     Parameters
     ----------
@@ -54,7 +62,8 @@ class LiveTracker:
     periods : int
         Of the crossed fringes, over the pattern.
     step_s : float
-        Interval between steps of the crossed fringes; the first five frames after a full cycle are steps.
+        Interval between steps of the crossed fringes; the first five frames after a full cycle are
+        steps.
     exposure_s : float
         Exposure time: a frame's figure is that of its middle.
     """
@@ -86,8 +95,12 @@ class LiveTracker:
         """How much longer than usual the interval to the next frame is."""
         return _SLOWER[self._step % len(_SLOWER)]
 
-    def full(self, frames: Sequence[Image], time_s: ArrayLike, displacement_um: ArrayLike) -> ShapeEstimate:
-        """The figure of a full cycle, which anchors the frames after it. As `LiveReconstructor.full`."""
+    def full(
+        self, frames: Sequence[Image], time_s: ArrayLike, displacement_um: ArrayLike
+    ) -> ShapeEstimate:
+        """The figure of a full cycle, which anchors the frames after it. As
+        `LiveReconstructor.full`.
+        """
         estimate = self._cycles.full(frames, time_s, displacement_um)
         self._tracker = None
         if estimate.verdict == "rejected":
@@ -101,19 +114,28 @@ class LiveTracker:
         self._lost_since_s = self._rejected_since_s = math.inf
         return estimate
 
-    def fringes(self, frames: Sequence[Image], time_s: ArrayLike, displacement_um: ArrayLike) -> ShapeEstimate:
-        """The figure of one frame of `pattern`. An estimate with `tracking_lost` asks for a full cycle."""
+    def fringes(
+        self, frames: Sequence[Image], time_s: ArrayLike, displacement_um: ArrayLike
+    ) -> ShapeEstimate:
+        """The figure of one frame of `pattern`. An estimate with `tracking_lost` asks for a full
+        cycle.
+        """
         at_s = round(float(np.asarray(time_s)[0]) + self._exposure_s / 2, _TIME_S)
         reading_um = round(float(np.asarray(displacement_um)[0]), _UM)
         if self._tracker is None:
             none = np.array([at_s]), np.array([reading_um])
             return live.rejected("track", *none, live.NOTHING_TO_FOLLOW, tracking_lost=True)
         shown = self.pattern
-        found = self._tracker.follow(frames[0], (shown.shift_rad, shown.shift_y_rad), at_s, reading_um)
+        found = self._tracker.follow(
+            frames[0], (shown.shift_rad, shown.shift_y_rad), at_s, reading_um
+        )
         if found.verdict != "rejected":
             self._next_step(at_s)
             if at_s >= self._covariance_until_s:
-                self._covariance_um2, self._covariance_until_s = found.covariance_um2, at_s + COVARIANCE_S
+                self._covariance_um2, self._covariance_until_s = (
+                    found.covariance_um2,
+                    at_s + COVARIANCE_S,
+                )
             found = replace(found, covariance_um2=self._covariance_um2)
         return _estimate(found, reading_um, self._astray(found), self._urad_per_rad)
 
@@ -123,11 +145,15 @@ class LiveTracker:
             self._tracker.prepare((self.pattern.shift_rad, self.pattern.shift_y_rad))
 
     def _anchored(self, frames: Sequence[Image], displacement_um: FloatArray) -> Tracker:
-        """A tracker that begins with the figure of a full cycle. Raises NoFigureError, ValueError."""
+        """A tracker that begins with the figure of a full cycle. Raises NoFigureError,
+        ValueError.
+        """
         optics = self._optics
         known = displacement_um[np.isfinite(displacement_um)]
         if optics.geometry.reference_displacement_um is None and known.size:
-            geometry = optics.geometry.model_copy(update={"reference_displacement_um": float(known[0])})
+            geometry = optics.geometry.model_copy(
+                update={"reference_displacement_um": float(known[0])}
+            )
             optics = self._optics = optics.model_copy(update={"geometry": geometry})
         patterns = tuple(phase.full_sequence(optics.pattern))
         pictures: Any = np.asarray(frames)  # of one kind, as the frames are
@@ -135,7 +161,9 @@ class LiveTracker:
         seen = checked.check(stack, optics)
         period_mm = optics.pattern.periods * optics.pattern.period_mm / self.pattern.index
         scene = scene_of(optics, seen, full.bin_figure(optics, seen), period_mm)
-        gain = bins.slope_per_screen(scene.tracer.geometry, scene.surface.radius_mm, scene.surface.sag_mm)
+        gain = bins.slope_per_screen(
+            scene.tracer.geometry, scene.surface.radius_mm, scene.surface.sag_mm
+        )
         self._urad_per_rad = 1e6 * float(np.sqrt(np.sum(gain) / 2)) / scene.rad_per_mm
         camera = optics.camera
         size_px = camera.height_px, camera.width_px
@@ -162,18 +190,27 @@ def crossed_patterns(periods: int) -> tuple[Pattern, ...]:
     turn = 2 * math.pi
     return tuple(
         Pattern(
-            "crossed", "", periods, turn * k / ENOUGH_STEPS, shift_y_rad=turn * (2 * k % ENOUGH_STEPS) / ENOUGH_STEPS
+            "crossed",
+            "",
+            periods,
+            turn * k / ENOUGH_STEPS,
+            shift_y_rad=turn * (2 * k % ENOUGH_STEPS) / ENOUGH_STEPS,
         )
         for k in range(ENOUGH_STEPS)
     )
 
 
-def _estimate(found: TrackedFrame, reading_um: float, tracking_lost: bool, urad: float) -> ShapeEstimate:
-    """The figure of a frame as control and recorder take it; `urad` of slope turn the phases by 1 rad."""
+def _estimate(
+    found: TrackedFrame, reading_um: float, tracking_lost: bool, urad: float
+) -> ShapeEstimate:
+    """The figure of a frame as control and recorder take it; `urad` of slope turn the phases by 1
+    rad.
+    """
     return ShapeEstimate(
         time_s=found.time_s,
         kind="track",
-        coeffs_um=np.round(found.coeffs_um, _UM) + 0.0,  # a minus zero is no whole number to the recorder
+        coeffs_um=np.round(found.coeffs_um, _UM)
+        + 0.0,  # a minus zero is no whole number to the recorder
         hencky_um=round(found.hencky_um, _UM),
         covariance_um2=found.covariance_um2,
         sag_um=round(found.sag_um, _UM + 1),  # a camera that repeats itself is known by equal sags
@@ -192,12 +229,15 @@ def _estimate(found: TrackedFrame, reading_um: float, tracking_lost: bool, urad:
 class Stethoscope:
     """The mirror's vibrations while it is held, searched in each minute of tracked figures.
 
-    Eight modes are followed. One that moves by 1 % within a week tells of another tension; one within 1 % of
-    `stroke_hz`, the pump's strokes (0: unknown), is driven by them. `begin_utc_s` is time 0 of the figures; `known`
-    is what an earlier listener has heard, and the notices of this run that stand.
+    Eight modes are followed. One that moves by 1 % within a week tells of another tension; one
+    within 1 % of `stroke_hz`, the pump's strokes (0: unknown), is driven by them. `begin_utc_s` is
+    time 0 of the figures; `known` is what an earlier listener has heard, and the notices of this
+    run that stand.
     """
 
-    def __init__(self, stroke_hz: float = 0.0, begin_utc_s: float = 0.0, known: "Heard | None" = None) -> None:
+    def __init__(
+        self, stroke_hz: float = 0.0, begin_utc_s: float = 0.0, known: "Heard | None" = None
+    ) -> None:
         self._time_s: list[float] = []
         self._terms_um: list[FloatArray] = []
         self._stroke_hz, self._begin_utc_s = stroke_hz, begin_utc_s
@@ -216,7 +256,9 @@ class Stethoscope:
         return [] if len(time_s) < LEAST_RATE_HZ * SEARCH_S else self.search(time_s, terms_um)
 
     def search(self, time_s: FloatArray, terms_um: FloatArray) -> list[events.Event]:
-        """Search a minute of terms (n, terms) at times (n,); a line of several possible frequencies is not told."""
+        """Search a minute of terms (n, terms) at times (n,); a line of several possible frequencies
+        is not told.
+        """
         found = find_modes(time_s, terms_um)
         if found is None:
             return []
@@ -224,8 +266,16 @@ class Stethoscope:
         for mode in modes:
             mode.begin_search(utc_s)
         for line in (line for line in found if not line.aliases_hz):
-            alike = (mode for mode in modes if mode.line is None and not mode.gone and line.is_like(mode.last))
-            known = min(alike, key=lambda mode: abs(line.frequency_hz - mode.last.frequency_hz), default=None)
+            alike = (
+                mode
+                for mode in modes
+                if mode.line is None and not mode.gone and line.is_like(mode.last)
+            )
+            known = min(
+                alike,
+                key=lambda mode: abs(line.frequency_hz - mode.last.frequency_hz),
+                default=None,
+            )
             free = next((k for k, mode in enumerate(modes) if mode.gone), len(modes))
             if known is None and free < MODES:
                 modes[free : free + 1] = [known := HeardMode(line)]
@@ -234,7 +284,9 @@ class Stethoscope:
         if not modes:
             return []
         lines = [mode.line for mode in modes]
-        told = ", ".join(f"{line.frequency_hz:.2f} Hz {line.amplitude_nm:.1f} nm" for line in lines if line)
+        told = ", ".join(
+            f"{line.frequency_hz:.2f} Hz {line.amplitude_nm:.1f} nm" for line in lines if line
+        )
         heard = run_events.Vibrations(
             [None if line is None else round(line.frequency_hz, 4) for line in lines],
             [None if line is None else round(line.amplitude_nm, 2) for line in lines],
@@ -252,21 +304,35 @@ class Stethoscope:
             change, since_s, then_hz = moved.moved
             hours = max(1, round((utc_s - since_s) / 3600.0))
             says = (
-                f"the mirror's vibration at {then_hz:.2f} Hz moved by {change:+.1%} within {hours} h: the film's "
+                f"the mirror's vibration at {then_hz:.2f} Hz moved by {change:+.1%} within "
+                f"{hours} h: the film's "
                 f"tension by {2 * change:+.1%}; check clamping and pressure"
             )
-        return self._notice("film_tension", says, "no vibration of the mirror has moved within a week")
+        return self._notice(
+            "film_tension", says, "no vibration of the mirror has moved within a week"
+        )
 
     def _strokes(self, modes: "Sequence[HeardMode]") -> list[events.Event]:
-        """A notice when the pump's strokes meet a mode, and when none has been heard there for some searches."""
+        """A notice when the pump's strokes meet a mode, and when none has been heard there for some
+        searches.
+        """
         near_hz = _AT_STROKES * self._stroke_hz
         lines = [mode.last for mode in modes if mode.missed < _SEARCHES]
-        driven = next((line for line in lines if abs(line.frequency_hz - self._stroke_hz) < near_hz), None)
-        says = "" if driven is None else (
-            f"the pump's strokes, {self._stroke_hz:g} Hz, drive the mirror's vibration at {driven.frequency_hz:.2f} "
-            f"Hz, {driven.amplitude_nm:.0f} nm; change the pump's speed or its mount"
-        )  # fmt: skip
-        return self._notice("pump_resonance", says, "no vibration of the mirror is at the pump's strokes")
+        driven = next(
+            (line for line in lines if abs(line.frequency_hz - self._stroke_hz) < near_hz), None
+        )
+        says = (
+            ""
+            if driven is None
+            else (
+                f"the pump's strokes, {self._stroke_hz:g} Hz, drive the mirror's vibration at "
+                f"{driven.frequency_hz:.2f} "
+                f"Hz, {driven.amplitude_nm:.0f} nm; change the pump's speed or its mount"
+            )
+        )
+        return self._notice(
+            "pump_resonance", says, "no vibration of the mirror is at the pump's strokes"
+        )
 
     def _notice(self, name: str, says: str, over: str) -> list[events.Event]:
         """What is new of a matter: that it begins, or that it is over."""
@@ -287,7 +353,9 @@ class HeardMode(StateNode):
     line: VibrationMode | None = None  # of the last search; None where it was not heard
     missed: Count = 0  # searches since it was heard
     recent_hz: list[float] = field(default_factory=list)
-    past: list[tuple[float, float]] = field(default_factory=list)  # time and frequency, some a day, of a week
+    past: list[tuple[float, float]] = field(
+        default_factory=list
+    )  # time and frequency, some a day, of a week
 
     @property
     def gone(self) -> bool:
@@ -312,7 +380,9 @@ class HeardMode(StateNode):
         """Take its line of a search."""
         self.line, self.last, self.missed = line, line, 0
         self.recent_hz = [*self.recent_hz, line.frequency_hz][-_SEARCHES:]
-        if len(self.recent_hz) == _SEARCHES and (not self.past or utc_s - self.past[-1][0] >= _PAST_EVERY_S):
+        if len(self.recent_hz) == _SEARCHES and (
+            not self.past or utc_s - self.past[-1][0] >= _PAST_EVERY_S
+        ):
             self.past.append((utc_s, float(np.median(self.recent_hz))))
 
 

@@ -1,16 +1,18 @@
 """Vibrations of the mirror in its tracked terms: frequency, shape and amplitude of each.
 
-A term that oscillates at f gives, at the frames' own times t, the same numbers at f and at every alias of f. Frames
-taken at two rates have different aliases: only the true frequency explains both. So each piece of some seconds is
-projected on exp(-2 pi i f t) for frequencies far beyond half the frame rate,
+A term that oscillates at f gives, at the frames' own times t, the same numbers at f and at every
+alias of f. Frames taken at two rates have different aliases: only the true frequency explains both.
+So each piece of some seconds is projected on exp(-2 pi i f t) for frequencies far beyond half the
+frame rate,
 
     X_p(f) = sum over frames of w z exp(-2 pi i f t),
 
-with a Hann window w. T(f) is the power of all X_p of one shape, in units of their noise: the largest eigenvalue over
-the shapes. Without a vibration it follows about a gamma distribution, whose scale and order its quantiles give. The
-largest T is a vibration if chance would give it once in ten thousand nights; it is subtracted from the terms, and the
-search goes on with what is left. T is also the logarithm of the likelihood (Bretthorst 1988, chapter 3), so that its
-curvature is the frequency's variance, and frequencies with a T nearly as large are named as equally possible.
+with a Hann window w. T(f) is the power of all X_p of one shape, in units of their noise: the
+largest eigenvalue over the shapes. Without a vibration it follows about a gamma distribution, whose
+scale and order its quantiles give. The largest T is a vibration if chance would give it once in ten
+thousand nights; it is subtracted from the terms, and the search goes on with what is left. T is
+also the logarithm of the likelihood (Bretthorst 1988, chapter 3), so that its curvature is the
+frequency's variance, and frequencies with a T nearly as large are named as equally possible.
 """
 
 from collections.abc import Sequence
@@ -32,24 +34,42 @@ PIECE_S = 10.0  # a line of 48 Hz with a quality of 500 is as wide as the resolu
 LEAST_S = 20.0
 _LEAST_HZ = 1.2  # slower than that is weather, leak and control
 _GRID = 4  # frequencies per resolution
-_TAKEN = (-2.1, -1.4, -0.7, 0.0, 0.7, 1.4, 2.1)  # resolutions about a line that go with it: it may be damped
+_TAKEN = (
+    -2.1,
+    -1.4,
+    -0.7,
+    0.0,
+    0.7,
+    1.4,
+    2.1,
+)  # resolutions about a line that go with it: it may be damped
 _SHORTEST = 0.6  # shorter frames of one rate, in pieces, are left out
 _GRAIN_UM = 1e-3  # of a hold's terms: they have at least the noise of rounding
-_HALF, _OTHER_RATE = 12, 0.04  # intervals on each side, and change of their median; busy machines scatter by as much
+_HALF, _OTHER_RATE = (
+    12,
+    0.04,
+)  # intervals on each side, and change of their median; busy machines scatter by as much
 _GAP = 4.5  # intervals: as long a pause ends a piece
 _MOST = 24
 _CHANCE = 1e-9  # of a false line in one search
-_ALIKE = 10.0  # difference of T, a factor of 2e4 in likelihood, below which two frequencies are equally possible
-_LEAKED = 0.1  # of T: what a line leaves where its alias is as slow as drift, and another frequency takes for itself
+# difference of T, a factor of 2e4 in likelihood, below which two frequencies are equally possible
+_ALIKE = 10.0
+# of T: what a line leaves where its alias is as slow as drift, and another frequency takes for
+# itself
+_LEAKED = 0.1
 _MISSING = 0.9  # of T for each piece: below it, some of the pieces do not show the line
 _MARGIN = 1.5  # of T at one rate: errors of the noise's spectrum are the same in all pieces
 _APART_HZ = 0.3  # closer ones are one line
 _SAME = 0.004  # relative: two searches see one mode, whatever the shapes
-_FAR, _SIMILAR = 0.05, 0.8  # relative, and correlation: two searches see one mode whose frequency has moved
+_FAR, _SIMILAR = (
+    0.05,
+    0.8,
+)  # relative, and correlation: two searches see one mode whose frequency has moved
 
 SEARCH_S = 60.0
 LEAST_RATE_HZ = 4.0  # of the frames; a cycle of eight gives 0.5
-MOVED = 0.009  # relative, told from here on: none of 1 %, which is 2 % of the film's tension, is missed
+# relative, told from here on: none of 1 %, which is 2 % of the film's tension, is missed
+MOVED = 0.009
 
 
 @dataclass(frozen=True)
@@ -62,11 +82,14 @@ class VibrationMode(StateNode):
     # (terms,): terms, unit RMS; the largest is positive
     shape: Annotated[FloatArray, ArrayShape((ZERNIKE_TERMS,))]
     evidence: float  # T less that of noise
-    # Frequencies that explain the frames as well: aliases that one frame rate cannot tell apart. The lowest is given.
+    # Frequencies that explain the frames as well: aliases that one frame rate cannot tell apart.
+    # The lowest is given.
     aliases_hz: tuple[float, ...] = ()
 
     def is_like(self, other: "VibrationMode") -> bool:
-        """Whether two searches see one mode: nearly its frequency, or its shape somewhat beside it."""
+        """Whether two searches see one mode: nearly its frequency,
+        or its shape somewhat beside it.
+        """
         change = abs(self.frequency_hz / other.frequency_hz - 1)
         return change < _SAME or (change < _FAR and abs(float(self.shape @ other.shape)) > _SIMILAR)
 
@@ -80,7 +103,8 @@ class _Piece:
     window: FloatArray  # (n,)
     waves: ComplexArray  # (frequencies, n)
     alias_hz: FloatArray  # (frequencies,): their aliases below half its frame rate
-    blind: BoolArray  # (frequencies,): those with the alias of drift, or of half the frame rate, where X is real
+    # (frequencies,): those with the alias of drift, or of half the frame rate, where X is real
+    blind: BoolArray
 
     def projected(self, terms_um: FloatArray) -> ComplexArray:
         """X (frequencies, terms - 1) of terms (n, terms - 1)."""
@@ -92,12 +116,13 @@ class _Piece:
         return np.asarray(np.abs(self.alias_hz - alias_hz) < (_TAKEN[-1] + 1) / PIECE_S)
 
     def noise(self, power: FloatArray, gone: BoolArray) -> FloatArray:
-        """Noise (frequencies, terms - 1) under the lines, a function of the alias that falls with it: drift, then
-        white.
+        """Noise (frequencies, terms - 1) under the lines, a function of the alias that falls with
+        it: drift, then white.
 
-        Medians over bands of half an octave (power is exponential: its median is ln 2 of its mean), none larger than
-        that of a slower band, in which a line has less to say. What is `gone` with a line is left out if other power
-        is there; a slow band that a line has emptied would leave no noise to it and to all the faster ones.
+        Medians over bands of half an octave (power is exponential: its median is ln 2 of its mean),
+        none larger than that of a slower band, in which a line has less to say. What is `gone` with
+        a line is left out if other power is there; a slow band that a line has emptied would leave
+        no noise to it and to all the faster ones.
         """
         slowest_hz, levels, middles = _LEAST_HZ / 2, [], []
         octaves = np.log2(self.alias_hz.max() / slowest_hz)
@@ -106,24 +131,32 @@ class _Piece:
             inside = (self.alias_hz >= low) & (self.alias_hz < high)
             left = inside & ~gone
             if inside.any():
-                levels.append(np.median(power[left if 2 * left.sum() > inside.sum() else inside], axis=0) / np.log(2))
+                levels.append(
+                    np.median(power[left if 2 * left.sum() > inside.sum() else inside], axis=0)
+                    / np.log(2)
+                )
                 middles.append(np.log(np.sqrt(low * high)))
         rounding = np.sum(self.window**2) * _GRAIN_UM**2 / 12
         logs = np.log(np.maximum(np.minimum.accumulate(levels, axis=0), rounding))
         at = np.log(np.maximum(self.alias_hz, slowest_hz))
-        return np.exp(np.column_stack([np.interp(at, middles, logs[:, j]) for j in range(power.shape[1])]))
+        return np.exp(
+            np.column_stack([np.interp(at, middles, logs[:, j]) for j in range(power.shape[1])])
+        )
 
     def without(self, terms_um: FloatArray, frequency_hz: float, shapes: FloatArray) -> FloatArray:
-        """The terms without oscillations about a frequency that `shapes` (terms - 1, terms - 1) projects on; others
-        stay."""
+        """The terms without oscillations about a frequency that `shapes` (terms - 1, terms - 1)
+        projects on; others stay."""
         times = 2 * np.pi * (self.time_s - self.time_s[0])
         phases = [(frequency_hz + offset / PIECE_S) * times for offset in _TAKEN]
         base = np.column_stack([wave(phase) for phase in phases for wave in (np.cos, np.sin)])
         return np.asarray(terms_um - base @ np.linalg.lstsq(base, terms_um @ shapes, rcond=None)[0])
 
 
-def find_modes(time_s: FloatArray, coeffs_um: FloatArray, most_hz: float = 100.0) -> tuple[VibrationMode, ...] | None:
-    """Vibrations in terms (n, terms) of frames at times (n,), NaN where a frame was rejected; the strongest first.
+def find_modes(
+    time_s: FloatArray, coeffs_um: FloatArray, most_hz: float = 100.0
+) -> tuple[VibrationMode, ...] | None:
+    """Vibrations in terms (n, terms) of frames at times (n,), NaN where a frame was rejected; the
+    strongest first.
 
     None if there are less than 20 s of frames at a steady rate.
     """
@@ -136,18 +169,26 @@ def find_modes(time_s: FloatArray, coeffs_um: FloatArray, most_hz: float = 100.0
     found: list[VibrationMode] = []
     margin = _MARGIN if _one_rate([piece.rate_hz for piece in pieces]) else 1.0
     whole = [np.abs(piece.projected(part)) ** 2 for piece, part in zip(pieces, terms, strict=True)]
-    gone = [np.zeros(grid_hz.size, bool) for _ in pieces]  # frequencies whose aliases went with a line
+    gone = [
+        np.zeros(grid_hz.size, bool) for _ in pieces
+    ]  # frequencies whose aliases went with a line
     for _ in range(_MOST):
         spectra = [piece.projected(part) for piece, part in zip(pieces, terms, strict=True)]
-        noises = [piece.noise(np.where(away[:, None], before, np.abs(spectrum) ** 2), away)
-                  for spectrum, before, piece, away in zip(spectra, whole, pieces, gone, strict=True)]  # fmt: skip
+        noises = [
+            piece.noise(np.where(away[:, None], before, np.abs(spectrum) ** 2), away)
+            for spectrum, before, piece, away in zip(spectra, whole, pieces, gone, strict=True)
+        ]
         seen = _evidence(spectra, noises, pieces)
         if seen.max() < margin * _threshold(seen, grid_hz.size):
             break
         k, rivals = _likeliest(seen, np.sum([~piece.blind for piece in pieces], axis=0))
         frequency, sigma = _refined(seen, grid_hz, k)
-        used = [p for p, piece in enumerate(pieces) if not piece.blind[k]]  # others have drift there
-        amplitude_nm, shape = _shape(*zip(*((spectra[p][k], pieces[p], noises[p][k]) for p in used), strict=True))
+        used = [
+            p for p, piece in enumerate(pieces) if not piece.blind[k]
+        ]  # others have drift there
+        amplitude_nm, shape = _shape(
+            *zip(*((spectra[p][k], pieces[p], noises[p][k]) for p in used), strict=True)
+        )
         own = shape[1:] / np.linalg.norm(shape[1:])
         sigma = max(sigma, _scatter_hz([np.abs(spectra[p] @ own) ** 2 for p in used], grid_hz, k))
         again = any(abs(frequency - mode.frequency_hz) < _APART_HZ for mode in found)
@@ -156,8 +197,10 @@ def find_modes(time_s: FloatArray, coeffs_um: FloatArray, most_hz: float = 100.0
             rates_hz = [pieces[p].rate_hz for p in used]
             aliases = _aliases_hz(rates_hz, frequency, most_hz) or tuple(grid_hz[rivals].tolist())
             found.append(VibrationMode(frequency, sigma, amplitude_nm, shape, evidence, aliases))
-        terms = [piece.without(part, frequency, np.eye(own.size) if again else _onto(own, noise[k]))
-                 for piece, part, noise in zip(pieces, terms, noises, strict=True)]  # fmt: skip
+        terms = [
+            piece.without(part, frequency, np.eye(own.size) if again else _onto(own, noise[k]))
+            for piece, part, noise in zip(pieces, terms, noises, strict=True)
+        ]
         gone = [away | piece.goes_with(frequency) for piece, away in zip(pieces, gone, strict=True)]
     return tuple(_sole(mode, found) for mode in found)
 
@@ -169,7 +212,9 @@ def _sole(mode: VibrationMode, found: list[VibrationMode]) -> VibrationMode:
     return replace(mode, aliases_hz=tuple(kept))
 
 
-def _pieces(time_s: FloatArray, coeffs_um: FloatArray, grid_hz: FloatArray) -> tuple[list[_Piece], list[FloatArray]]:
+def _pieces(
+    time_s: FloatArray, coeffs_um: FloatArray, grid_hz: FloatArray
+) -> tuple[list[_Piece], list[FloatArray]]:
     """The frames in pieces, and their terms without drift."""
     pieces, terms = [], []
     for frames in _runs(time_s):
@@ -214,11 +259,19 @@ def _without_drift(time_s: FloatArray, terms_um: FloatArray) -> FloatArray:
     return np.asarray(np.clip(left, -6 * spread, 6 * spread))
 
 
-def _evidence(spectra: list[ComplexArray], noises: list[FloatArray], pieces: list[_Piece]) -> FloatArray:
-    """T (frequencies,): the largest eigenvalue over the shapes, with terms and pieces in units of their noise."""
-    white = np.stack([spectrum / np.sqrt(noise) for spectrum, noise in zip(spectra, noises, strict=True)], axis=1)
+def _evidence(
+    spectra: list[ComplexArray], noises: list[FloatArray], pieces: list[_Piece]
+) -> FloatArray:
+    """T (frequencies,): the largest eigenvalue over the shapes, with terms and pieces in units of
+    their noise.
+    """
+    white = np.stack(
+        [spectrum / np.sqrt(noise) for spectrum, noise in zip(spectra, noises, strict=True)], axis=1
+    )
     power = np.sum(np.abs(white) ** 2, axis=2)
-    quiet = white[power <= np.median(power, axis=0)]  # lines, and their aliases, are in the other half
+    quiet = white[
+        power <= np.median(power, axis=0)
+    ]  # lines, and their aliases, are in the other half
     values, vectors = np.linalg.eigh(np.real(quiet.conj().T @ quiet) / len(quiet))
     kept = values > 1e-3 * values[-1]
     alone = (white @ vectors[:, kept]) / np.sqrt(values[kept])
@@ -228,7 +281,9 @@ def _evidence(spectra: list[ComplexArray], noises: list[FloatArray], pieces: lis
 
 
 def _threshold(seen: FloatArray, frequencies: int) -> float:
-    """T that chance exceeds at any of the frequencies with `_CHANCE`, for a gamma distribution of these quantiles."""
+    """T that chance exceeds at any of the frequencies with `_CHANCE`, for a gamma distribution of
+    these quantiles.
+    """
     from scipy import stats
 
     heard = seen[seen > 0]  # to the others all pieces are blind
@@ -262,13 +317,21 @@ def _one_rate(rates_hz: list[float]) -> bool:
 
 
 def _aliases_hz(rates_hz: list[float], frequency_hz: float, most_hz: float) -> tuple[float, ...]:
-    """All aliases of a frequency that pieces of one rate alone show: others may be blind to the true one."""
+    """All aliases of a frequency that pieces of one rate alone show: others may be blind to the
+    true one.
+    """
     if not _one_rate(rates_hz):
         return ()
     rate_hz = float(np.mean(rates_hz))
     alias_hz = abs(frequency_hz - rate_hz * round(frequency_hz / rate_hz))
-    every = {abs(m * rate_hz + sign * alias_hz) for m in range(int(most_hz / rate_hz) + 1) for sign in (-1, 1)}
-    return tuple(sorted(f for f in every if _LEAST_HZ < f < most_hz and abs(f - frequency_hz) > _APART_HZ))
+    every = {
+        abs(m * rate_hz + sign * alias_hz)
+        for m in range(int(most_hz / rate_hz) + 1)
+        for sign in (-1, 1)
+    }
+    return tuple(
+        sorted(f for f in every if _LEAST_HZ < f < most_hz and abs(f - frequency_hz) > _APART_HZ)
+    )
 
 
 def _refined(seen: FloatArray, grid_hz: FloatArray, k: int) -> tuple[float, float]:
@@ -287,31 +350,45 @@ def _refined(seen: FloatArray, grid_hz: FloatArray, k: int) -> tuple[float, floa
 def _shape(
     lines: Sequence[ComplexArray], pieces: Sequence[_Piece], noises: Sequence[FloatArray]
 ) -> tuple[float, FloatArray]:
-    """Amplitude in nm and terms (terms,) of unit RMS with the ring at rest, from X (terms - 1,) of each piece at the
-    line.
+    """Amplitude in nm and terms (terms,) of unit RMS with the ring at rest, from X (terms - 1,) of
+    each piece at the line.
 
-    All terms are in phase. A piece that has the line among slow motion, which is a shape too, has little weight.
+    All terms are in phase. A piece that has the line among slow motion, which is a shape too, has
+    little weight.
     """
-    waves = np.array([2 * line / piece.window.sum() for line, piece in zip(lines, pieces, strict=True)])
-    weights = np.array([piece.window.sum() ** 2 / noise.mean() for piece, noise in zip(pieces, noises, strict=True)])
+    waves = np.array(
+        [2 * line / piece.window.sum() for line, piece in zip(lines, pieces, strict=True)]
+    )
+    weights = np.array(
+        [
+            piece.window.sum() ** 2 / noise.mean()
+            for piece, noise in zip(pieces, noises, strict=True)
+        ]
+    )
     terms = np.linalg.eigh(np.real((weights[:, None] * waves).conj().T @ waves))[1][:, -1]
     shape = np.append(-terms @ zernike.at_rim()[1:], terms)
     size = float(np.linalg.norm(shape))
     shape *= np.sign(shape[np.argmax(np.abs(shape))]) / size
-    return float(1e3 * size * np.sqrt(np.average(np.abs(waves @ terms) ** 2, weights=weights))), np.asarray(shape)
+    return float(
+        1e3 * size * np.sqrt(np.average(np.abs(waves @ terms) ** 2, weights=weights))
+    ), np.asarray(shape)
 
 
 def _onto(shape: FloatArray, noise: FloatArray) -> FloatArray:
-    """What takes terms to their part in a shape, (terms - 1, terms - 1), told by those with little noise.
+    """What takes terms to their part in a shape, (terms - 1, terms - 1), told by those with little
+    noise.
 
-    The film's slow motion is mostly one term: by all of them alike, it would be taken for the shape's other terms.
+    The film's slow motion is mostly one term: by all of them alike, it would be taken for the
+    shape's other terms.
     """
     weighed = shape / noise
     return np.outer(weighed, shape) / (weighed @ shape)
 
 
 def _scatter_hz(lines: list[FloatArray], grid_hz: FloatArray, k: int) -> float:
-    """Standard error of the mean of the pieces' own frequencies: a damped line wanders by its width."""
+    """Standard error of the mean of the pieces' own frequencies: a damped line wanders by its
+    width.
+    """
     reach = round(_APART_HZ * _GRID * PIECE_S)
     first, last = max(k - reach, 0), min(k + reach + 1, grid_hz.size)
     own = [_refined(line, grid_hz, first + int(np.argmax(line[first:last])))[0] for line in lines]

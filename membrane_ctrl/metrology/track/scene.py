@@ -1,8 +1,10 @@
-"""What a frame of crossed fringes must show: phases predicted from the surface, light predicted from the reference.
+"""What a frame of crossed fringes must show: phases predicted from the surface, light predicted
+from the reference.
 
-A bin shows I = A + B_x cos(phi_x + d_x) + B_y cos(phi_y + d_y) + harmonics. Its phases are those of the screen points
-that the surface sends its ray to, traced exactly, plus what the reference saw beyond its own fit: averaging over the
-bin, and shape that the terms cannot represent. Light and response of the panel are the reference's.
+A bin shows I = A + B_x cos(phi_x + d_x) + B_y cos(phi_y + d_y) + harmonics. Its phases are those of
+the screen points that the surface sends its ray to, traced exactly, plus what the reference saw
+beyond its own fit: averaging over the bin, and shape that the terms cannot represent. Light and
+response of the panel are the reference's.
 """
 
 import math
@@ -13,7 +15,16 @@ from scipy import ndimage
 
 from membrane_ctrl.config.schema import OpticsConfig
 from membrane_ctrl.metrology import bins, full, phase, reconstruct
-from membrane_ctrl.metrology.bins import BLOCK_BINS, BLOCK_CELLS, CELL_BINS, Cells, combine, moments, project, spread
+from membrane_ctrl.metrology.bins import (
+    BLOCK_BINS,
+    BLOCK_CELLS,
+    CELL_BINS,
+    Cells,
+    combine,
+    moments,
+    project,
+    spread,
+)
 from membrane_ctrl.metrology.checked import Checked
 from membrane_ctrl.metrology.optics import zernike
 from membrane_ctrl.metrology.optics.compiled import kernel
@@ -21,31 +32,42 @@ from membrane_ctrl.metrology.optics.kernels import cos_sin
 from membrane_ctrl.metrology.optics.surface import PARAMETERS, Surface
 from membrane_ctrl.model.arrays import FloatArray, IntArray, Singles
 
-# A bin averages the fringes: at this phase across it (95 % of the bins have less) they lose a tenth of their swing.
+# A bin averages the fringes: at this phase across it (95 % of the bins have less) they lose a tenth
+# of their swing.
 _BIN_RAD = 1.6
 _PIXEL_RAD = 2.5  # across a pixel: more is hardly sampled
 _BINS_PX = (16, 8, 4, 2, 1)
-_AT = 0, PARAMETERS, 2 * PARAMETERS, 2 * PARAMETERS, 2 * PARAMETERS  # in `Cells.blocks`: x, y, then the maps' terms
+_AT = (
+    0,
+    PARAMETERS,
+    2 * PARAMETERS,
+    2 * PARAMETERS,
+    2 * PARAMETERS,
+)  # in `Cells.blocks`: x, y, then the maps' terms
 _ENOUGH_BINS = 280 * PARAMETERS  # fewer cannot carry the surface and three maps of as many terms
 _STEP_MM = 0.01  # of a parameter, for the derivatives: their error is 1e-7 of them
 _HARMONIC = 2e-3  # a panel that deviates less from a straight line is straight
 _RESPONSE_POWERS = (2, 3, 4, 5)
-# Across the mirror. Light is judged in squares of a twelfth of its diameter: with eight fringes, squares of a dark
-# part looked covered, and the error bars came out three times too small.
+# Across the mirror. Light is judged in squares of a twelfth of its diameter: with eight fringes,
+# squares of a dark part looked covered, and the error bars came out three times too small.
 _LEAST_FRINGES = 9
-# Light that wanders is orthogonal to shape over whole fringes; where bins end, parts of fringes are left, which cost
-# ten times the error. Weights that fade over this much of a fringe cost 9 % of noise.
+# Light that wanders is orthogonal to shape over whole fringes; where bins end, parts of fringes are
+# left, which cost ten times the error. Weights that fade over this much of a fringe cost 9 % of
+# noise.
 _FADES = 0.8
 _USUAL = 0.75  # quantile of the changes of phase, half of which are across the fringes
-# Share of the reach within which weights are 1. Where they fall from the start, as Tukey's do, they differ between
-# bright and dark fringes as soon as light wanders, and bend the figure: 20 nm of sag at 0.5 %.
+# Share of the reach within which weights are 1. Where they fall from the start, as Tukey's do, they
+# differ between bright and dark fringes as soon as light wanders, and bend the figure: 20 nm of sag
+# at 0.5 %.
 _TRUSTED = np.float32(0.6)
 _RIPPLES = 8  # harmonics of the reference's fringes in the mean of its steps
 
 
 @dataclass(frozen=True)
 class CrossedScene:
-    """The bench as a frame of crossed fringes sees it; n bins inside the analysis radius, cell by cell."""
+    """The bench as a frame of crossed fringes sees it; n bins inside the analysis radius, cell by
+    cell.
+    """
 
     tracer: reconstruct.Tracer  # the bench with the vertex of the reference
     surface: Surface  # of the reference
@@ -60,7 +82,8 @@ class CrossedScene:
     taper: Singles  # (n,): weight, which fades to 0 where the bins end
     edge: Singles  # (n,): the same, 0 for bins that changed between the last five steps
     position_mm: FloatArray  # (2, n): on the mirror
-    # (4,): deviation of the panel's response from a straight line, sum c_k (v^k - v), k = 2..5; zeros if straight
+    # (4,): deviation of the panel's response from a straight line, sum c_k (v^k - v), k = 2..5;
+    # zeros if straight
     response: FloatArray
     rad_per_mm: float
     half_side_mm: float  # of the pattern
@@ -71,7 +94,9 @@ class CrossedScene:
         The ring does not move: a deeper bowl has its vertex lower.
         """
         lower_mm = shape.sag_mm - self.surface.sag_mm
-        bench = reconstruct.Tracer(self.tracer.geometry, shape.radius_mm, self.tracer.vertex_z_mm - lower_mm)
+        bench = reconstruct.Tracer(
+            self.tracer.geometry, shape.radius_mm, self.tracer.vertex_z_mm - lower_mm
+        )
         bench.intersect(self.points, shape, newton=2)
         seen = bench.predict_screen(self.points, shape) + self.beyond_mm
         return (seen + self.half_side_mm) * self.rad_per_mm - math.pi
@@ -81,7 +106,9 @@ class CrossedScene:
         out = np.empty((2, PARAMETERS, self.index.size), np.float32)
         for k, change_mm in enumerate(np.eye(PARAMETERS) * _STEP_MM):
             above, below = (
-                self.phase_rad(Surface.from_parameters(shape.parameters + sign * change_mm, shape.radius_mm))
+                self.phase_rad(
+                    Surface.from_parameters(shape.parameters + sign * change_mm, shape.radius_mm)
+                )
                 for sign in (1, -1)
             )
             out[:, k] = (above - below) / (2 * _STEP_MM)
@@ -96,14 +123,19 @@ class CrossedScene:
 
 @kernel
 def _light(rows, base, light, response, begin):  # type: ignore[no-untyped-def]
-    """Derivatives of the light of a block's bins, as in `light_waves`, in place of the changes of phases and maps."""
+    """Derivatives of the light of a block's bins, as in `light_waves`, in place of the changes of
+    phases and maps.
+    """
     one, two, half = np.float32(1), np.float32(2), np.float32(0.5)
     for k in range(BLOCK_BINS):
         p = begin + k
         cx, sx = cos_sin(base[0, p] + rows[k])
         cy, sy = cos_sin(base[1, p] + rows[BLOCK_BINS + k])
         level = light[0, p] * rows[2 * BLOCK_BINS + k]
-        swing_x, swing_y = light[1, p] * rows[3 * BLOCK_BINS + k], light[2, p] * rows[4 * BLOCK_BINS + k]
+        swing_x, swing_y = (
+            light[1, p] * rows[3 * BLOCK_BINS + k],
+            light[2, p] * rows[4 * BLOCK_BINS + k],
+        )
         shade = half + half * half * (cx + cy)
         power, slope, bent = shade, np.float32(0), np.float32(0)
         for j in range(4):
@@ -121,7 +153,9 @@ def _light(rows, base, light, response, begin):  # type: ignore[no-untyped-def]
 
 @kernel
 def _weigh(rows, edge, gain, seen, reach, begin):  # type: ignore[no-untyped-def]
-    """Turn what `_light` leaves into e w r times the derivatives (5 rows), then `out` of `light_left` (4 rows)."""
+    """Turn what `_light` leaves into e w r times the derivatives (5 rows), then `out` of
+    `light_left` (4 rows).
+    """
     zero, one = np.float32(0), np.float32(1)
     for k in range(BLOCK_BINS):
         p = begin + k
@@ -144,14 +178,17 @@ def _block(b, base, light, slow, offset, response, changes, shifts, planes, rows
     squares = rows.reshape(-1, CELL_BINS, BLOCK_CELLS)
     for k in range(5):
         at, factors = _AT[k], changes[max(k - 1, 0)]
-        combine(slow[b, at : at + factors.size], factors, shifts[k] if k < 2 else np.float32(1), planes)
+        combine(
+            slow[b, at : at + factors.size], factors, shifts[k] if k < 2 else np.float32(1), planes
+        )
         spread(planes, offset[b], squares[k])
     _light(rows, base, light, response, b * BLOCK_BINS)
 
 
 @kernel
 def light_waves(base, light, slow, offset, response, changes, shifts, out):  # type: ignore[no-untyped-def]
-    """Derivatives (6, n) of the light of n bins by phi_x, phi_y and relative changes of A, B_x, B_y and of all.
+    """Derivatives (6, n) of the light of n bins by phi_x, phi_y and relative changes of A, B_x, B_y
+    and of all.
 
     Arguments as in `light_left`.
     """
@@ -162,15 +199,18 @@ def light_waves(base, light, slow, offset, response, changes, shifts, out):  # t
 
 
 @kernel
-def light_left(base, light, slow, offset, response, changes, shifts, edge, gain, seen, reach, right, out):  # type: ignore[no-untyped-def]
-    """Residual r and weight w of n bins in `out` (4, n), with e w r times the derivative by a relative change of all
-    light and e w times its square; and in `right` (4, parameters) the sums of e w r times the derivatives by
-    `changes`.
+def light_left(  # type: ignore[no-untyped-def]
+    base, light, slow, offset, response, changes, shifts, edge, gain, seen, reach, right, out
+):
+    """Residual r and weight w of n bins in `out` (4, n), with e w r times the derivative by a
+    relative change of all light and e w times its square; and in `right` (4, parameters) the sums
+    of e w r times the derivatives by `changes`.
 
-    `base` (2, n) are phases and `light` (3, n) A, B_x, B_y. They change by `shifts` (2,) and by `changes`
-    (4, parameters), of the surface's parameters and of the maps of A, B_x, B_y, times `slow`, as in `Cells.blocks`;
-    `offset` as in `Cells`. `edge` (n,) is e, `gain` (n,) multiplies all light, `reach` (n,) is where w ends; 0 leaves
-    out. All but `right` are of single precision and without gaps, or no vector units are used.
+    `base` (2, n) are phases and `light` (3, n) A, B_x, B_y. They change by `shifts` (2,) and by
+    `changes` (4, parameters), of the surface's parameters and of the maps of A, B_x, B_y, times
+    `slow`, as in `Cells.blocks`; `offset` as in `Cells`. `edge` (n,) is e, `gain` (n,) multiplies
+    all light, `reach` (n,) is where w ends; 0 leaves out. All but `right` are of single precision
+    and without gaps, or no vector units are used.
     """
     rows, planes = np.empty(9 * BLOCK_BINS, np.float32), np.empty(3 * BLOCK_CELLS, np.float32)
     squares = rows.reshape(-1, CELL_BINS, BLOCK_CELLS)
@@ -186,7 +226,11 @@ def light_left(base, light, slow, offset, response, changes, shifts, edge, gain,
 
 
 def scene_of(
-    optics: OpticsConfig, checked: Checked, figure: full.BinFigure, period_mm: float, contrast: float = 1.0
+    optics: OpticsConfig,
+    checked: Checked,
+    figure: full.BinFigure,
+    period_mm: float,
+    contrast: float = 1.0,
 ) -> CrossedScene:
     """The scene of a reference set for a crossed pattern on the same region.
 
@@ -210,10 +254,16 @@ def scene_of(
     fringes = float(np.ptp(traced, axis=1).min()) / period_mm
     if fringes < _LEAST_FRINGES:
         seen = f"only {fringes:.0f} fringes across the mirror"
-        raise ValueError(f"{seen}, {_LEAST_FRINGES} at least tell light from shape: use a shorter period")
+        raise ValueError(
+            f"{seen}, {_LEAST_FRINGES} at least tell light from shape: use a shorter period"
+        )
     bin_px = _bin_px(checked, figure, traced * rad_per_mm)
-    response, level_range = _response(checked, figure, traced, phase.mm_per_rad(optics.pattern), optics)
-    fine = _pictures(checked, figure, traced, phase.mm_per_rad(optics.pattern), level_range, contrast)
+    response, level_range = _response(
+        checked, figure, traced, phase.mm_per_rad(optics.pattern), optics
+    )
+    fine = _pictures(
+        checked, figure, traced, phase.mm_per_rad(optics.pattern), level_range, contrast
+    )
     coarse = _coarser(fine, bin_px // fine_px)
     rows, columns = camera.height_px // bin_px, camera.width_px // bin_px
     coarse = coarse[:, :rows, :columns].reshape(5, -1)
@@ -226,8 +276,12 @@ def scene_of(
     position = tracer.position_mm(points)
     seen_rad = tracer.predict_screen(points, shape) * rad_per_mm
     fringe = 2 * math.pi / _rad_per_bin(index, (rows, columns), seen_rad, _USUAL)
-    inwards = ndimage.distance_transform_edt(np.pad(known.reshape(rows, columns), 1))[1:-1, 1:-1].reshape(-1)[index]
-    taper = (np.sin(np.minimum(inwards / (_FADES * fringe), 1) * math.pi / 2) ** 2 * counted).astype(np.float32)
+    inwards = ndimage.distance_transform_edt(np.pad(known.reshape(rows, columns), 1))[
+        1:-1, 1:-1
+    ].reshape(-1)[index]
+    taper = (
+        np.sin(np.minimum(inwards / (_FADES * fringe), 1) * math.pi / 2) ** 2 * counted
+    ).astype(np.float32)
     return CrossedScene(
         tracer=tracer,
         surface=shape,
@@ -256,20 +310,28 @@ def _pictures(
     level_range: FloatArray | None,
     contrast: float,
 ) -> FloatArray:
-    """Of the reference (5, rows, columns): screen points beyond `traced` in mm, light and both swings in ADU."""
+    """Of the reference (5, rows, columns): screen points beyond `traced` in mm, light and both
+    swings in ADU.
+    """
     fine = np.full((5, *checked.binned.means.shape[1:]), np.nan)
     coarser_rad = traced / mm_per_rad  # the reference's errors repeat with its fringes
     for axis, beyond_mm in enumerate(figure.points.screen_mm - traced):
         fine[axis].reshape(-1)[figure.index] = _without_harmonics(beyond_mm, coarser_rad[axis])
     fine[2] = checked.view.light
-    fine[3:] = contrast * checked.view.swing_adu.mean(axis=0) / 2  # each axis has half of the panel's range
+    fine[3:] = (
+        contrast * checked.view.swing_adu.mean(axis=0) / 2
+    )  # each axis has half of the panel's range
     if level_range is not None:
-        fine[2:].reshape(3, -1)[:, figure.index] = level_range * np.array([[1.0], [contrast / 4], [contrast / 4]])
+        fine[2:].reshape(3, -1)[:, figure.index] = level_range * np.array(
+            [[1.0], [contrast / 4], [contrast / 4]]
+        )
     return fine
 
 
 def _bin_px(checked: Checked, figure: full.BinFigure, phase_rad: FloatArray) -> int:
-    """The largest bins, made of whole ones of the reference, over which the fringes hardly average out."""
+    """The largest bins, made of whole ones of the reference, over which the fringes hardly average
+    out.
+    """
     fine_px = checked.binned.bin_px
     per_px = _rad_per_bin(figure.index, checked.binned.means.shape[1:], phase_rad, 0.95) / fine_px
     for side in _BINS_PX:
@@ -280,15 +342,23 @@ def _bin_px(checked: Checked, figure: full.BinFigure, phase_rad: FloatArray) -> 
         ):
             return side
     if per_px > _PIXEL_RAD:
-        raise ValueError(f"the camera sees only {2 * math.pi / per_px:.1f} pixels a fringe: use a longer period")
+        raise ValueError(
+            f"the camera sees only {2 * math.pi / per_px:.1f} pixels a fringe: use a longer period"
+        )
     return fine_px
 
 
-def _rad_per_bin(index: IntArray, shape: tuple[int, ...], phase_rad: FloatArray, quantile: float) -> float:
-    """Change of phases (2, n) of x and y from bin to bin, a quantile of both; along rows or columns, the larger."""
+def _rad_per_bin(
+    index: IntArray, shape: tuple[int, ...], phase_rad: FloatArray, quantile: float
+) -> float:
+    """Change of phases (2, n) of x and y from bin to bin, a quantile of both; along rows or
+    columns, the larger.
+    """
     pictures = np.full((2, *shape), np.nan)
     pictures.reshape(2, -1)[:, index] = phase_rad
-    return max(float(np.nanquantile(np.abs(np.diff(pictures, axis=axis)), quantile)) for axis in (1, 2))
+    return max(
+        float(np.nanquantile(np.abs(np.diff(pictures, axis=axis)), quantile)) for axis in (1, 2)
+    )
 
 
 def _coarser(fine: FloatArray, side: int) -> FloatArray:
@@ -299,14 +369,19 @@ def _coarser(fine: FloatArray, side: int) -> FloatArray:
 
 
 def _response(
-    checked: Checked, figure: full.BinFigure, traced_mm: FloatArray, mm_per_rad: float, optics: OpticsConfig
+    checked: Checked,
+    figure: full.BinFigure,
+    traced_mm: FloatArray,
+    mm_per_rad: float,
+    optics: OpticsConfig,
 ) -> tuple[FloatArray, FloatArray | None]:
-    """The panel's response from the reference's sinusoids, between its black and its white frame; level and range.
+    """The panel's response from the reference's sinusoids, between its black and its white frame;
+    level and range.
 
-    Steps put harmonics of the reference's fringes into their mean and their swing, the fourth where there are four: a
-    ripple that stands where the crossed fringes are four times finer, and looks like a tilt that turns with their
-    steps. The level is without it, and the range is that of black and white: (3, n) of level, range, range; None
-    without those.
+    Steps put harmonics of the reference's fringes into their mean and their swing, the fourth where
+    there are four: a ripple that stands where the crossed fringes are four times finer, and looks
+    like a tilt that turns with their steps. The level is without it, and the range is that of black
+    and white: (3, n) of level, range, range; None without those.
     """
     stack, index = checked.stack, figure.index
     straight = np.zeros(len(_RESPONSE_POWERS))

@@ -1,7 +1,9 @@
 """Follows the figure from frame to frame, and says which frames must not be used and why.
 
-A frame is fitted from the last good solution. A period lost everywhere at once leaves no residual, but it is no tilt
-either: rays meet the screen at other distances, so that micrometres of astigmatism and coma appear (`LostOrders`).
+A frame is fitted from the last good solution. A period lost everywhere at once leaves no residual,
+but it is no tilt
+either: rays meet the screen at other distances, so that micrometres of astigmatism and coma appear
+(`LostOrders`).
 """
 
 import math
@@ -14,7 +16,13 @@ from membrane_ctrl.metrology.frames.bands import Bands
 from membrane_ctrl.metrology.optics import surface
 from membrane_ctrl.metrology.phasor import Binner
 from membrane_ctrl.metrology.track import tracked
-from membrane_ctrl.metrology.track.fit import ENOUGH_STEPS, FrameFit, FrameFitter, separable, stepped
+from membrane_ctrl.metrology.track.fit import (
+    ENOUGH_STEPS,
+    FrameFit,
+    FrameFitter,
+    separable,
+    stepped,
+)
 from membrane_ctrl.metrology.track.scene import CrossedScene
 from membrane_ctrl.metrology.track.tracked import Finding, TrackedFrame
 from membrane_ctrl.model.arrays import BoolArray, FloatArray, Image, Singles
@@ -25,7 +33,8 @@ _OUT_USUAL = 0.01  # dust and glints
 _REACH_SIGMAS = 7.0
 _FIRST_REACH = 1e6  # everything counts
 _KNOCK_UM, _KNOCK_UM_PER_S = 2.0, 0.5  # RMS of a tilt that neither film nor air makes: 8 µrad
-_BLIND_NOISE_ADU = 0.01  # with less, frames of a still mirror may be the same; here a pixel in 90 differs
+# with less, frames of a still mirror may be the same; here a pixel in 90 differs
+_BLIND_NOISE_ADU = 0.01
 _OTHER_BINS = 0.03  # change of their share with weight with which the errors change, too
 _SIGMA_EVERY_S = 2.5  # errors change slowly, and the covariance costs as much as eight fits
 
@@ -72,7 +81,8 @@ class Tracker:
         self._orders = tracked.LostOrders(self._fitter)
         self._orders.require_telling()
         self._knocked = ""
-        self._mean_place: tuple[float, FloatArray] | None = None  # its time, parameters: of the last five steps
+        # its time, parameters: of the last five steps
+        self._mean_place: tuple[float, FloatArray] | None = None
         self._places_mm2: dict[tuple[float, float], FloatArray] = {}  # by the shifts of a step
         self._fit_mm2, self._covariance_s = np.full((surface.PARAMETERS,) * 2, math.nan), -math.inf
         self._used_share = math.nan  # of the bins, when errors were estimated
@@ -81,7 +91,10 @@ class Tracker:
 
     def _begin(self, scene: CrossedScene, shape: surface.Surface, light: FloatArray) -> None:
         """Start from a scene, a surface and maps (3, terms) of light."""
-        none, all_bins = np.zeros(scene.index.size, np.float32), np.ones(scene.index.size, np.float32)
+        none, all_bins = (
+            np.zeros(scene.index.size, np.float32),
+            np.ones(scene.index.size, np.float32),
+        )
         self._swing_adu = float(np.median(scene.light_adu[1]))
         self._fitter = FrameFitter(scene, self._bands, self._fitter.jacobian)
         self._last = FrameFit(shape, light, none, all_bins, True)
@@ -92,20 +105,30 @@ class Tracker:
         self._steps: list[tracked.StandingFrames] = []
 
     def anchor(
-        self, frames: Sequence[Image], shifts_rad: FloatArray, time_s: FloatArray, displacement_um: FloatArray
+        self,
+        frames: Sequence[Image],
+        shifts_rad: FloatArray,
+        time_s: FloatArray,
+        displacement_um: FloatArray,
     ) -> list[TrackedFrame]:
-        """Take light, swings and phases of each bin from five steps of the pattern or more; the film moves little.
+        """Take light, swings and phases of each bin from five steps of the pattern or more; the
+        film moves little.
 
-        Frames, `shifts_rad` (frames, 2), `time_s` and `displacement_um` (frames,) are those of `follow`. Returns the
-        frames' figures; if one is rejected or partly covered, the light remains that of the reference.
+        Frames, `shifts_rad` (frames, 2), `time_s` and `displacement_um` (frames,) are those of
+        `follow`. Returns the frames' figures; if one is rejected or partly covered, the light
+        remains that of the reference.
         """
         found, fits, seen = [], [], []
-        for frame, (x, y), at_s, reading in zip(frames, shifts_rad, time_s, displacement_um, strict=True):
+        for frame, (x, y), at_s, reading in zip(
+            frames, shifts_rad, time_s, displacement_um, strict=True
+        ):
             found.append(self.follow(frame, (float(x), float(y)), float(at_s), float(reading)))
             fits.append(self._last)
             seen.append(self._clear)
         used = [frame.used_share for frame in found]  # 0 where rejected
-        if not min(used) > max(max(used) - _OTHER_BINS, 0):  # what a hand covers in one has light in none
+        if not min(used) > max(
+            max(used) - _OTHER_BINS, 0
+        ):  # what a hand covers in one has light in none
             return found
         if self._bands.recall():
             self._begin(self._fitter.scene, self._last.surface, self._last.light)
@@ -125,37 +148,45 @@ class Tracker:
         seen_adu: Singles,
         shifts_rad: list[tuple[float, float]],
     ) -> FloatArray:
-        """Light, swings and phases of each bin from steps; returns by how much the parameters (parameters,) move.
+        """Light, swings and phases of each bin from steps; returns by how much the parameters
+        (parameters,) move.
 
         `variance_mm2` are those of the fits' parameters, each (parameters,).
         """
         old, radius_mm = self._fitter.scene, self._last.surface.radius_mm
         fitted = np.array([fit.surface.parameters for fit in fits])
-        drifted_mm = np.outer(time_s, self._drift_mm_per_s(float(np.mean(time_s)), fitted.mean(axis=0)))
+        drifted_mm = np.outer(
+            time_s, self._drift_mm_per_s(float(np.mean(time_s)), fitted.mean(axis=0))
+        )
         seen_at, place_mm2 = tracked.steadied(fitted, np.array(variance_mm2), drifted_mm)
         places = [surface.Surface.from_parameters(place, radius_mm) for place in seen_at]
         fits = [replace(fit, surface=place) for fit, place in zip(fits, places, strict=True)]
         scene, moved, moved_mm2 = stepped(self._fitter, fits, seen_adu, np.array(shifts_rad))
         self._mean_place = float(np.mean(time_s)), seen_at.mean(axis=0) + moved
         self._places_mm2 = dict(zip(shifts_rad, place_mm2 + moved_mm2, strict=True))
-        self._anchor_light /= float(np.median(scene.light_adu[0] / old.light_adu[0]))  # light counts from the scene's
+        self._anchor_light /= float(
+            np.median(scene.light_adu[0] / old.light_adu[0])
+        )  # light counts from the scene's
         parameters = self._last.surface.parameters + moved
         shape = surface.Surface.from_parameters(parameters, scene.surface.radius_mm)
         self._begin(scene, shape, np.mean([fit.light for fit in fits], axis=0))
         return moved
 
     def _drift_mm_per_s(self, time_s: float, place_mm: FloatArray) -> FloatArray:
-        """Of the parameters (parameters,), from the mean place in the last five steps to that in these.
+        """Of the parameters (parameters,), from the mean place in the last five steps to that in
+        these.
 
-        The mean of five steps is free of the errors of each. Taken from the steps themselves, a drift was lost in
-        these errors: 0.1 µm in a cycle of five became a saw-tooth of as much.
+        The mean of five steps is free of the errors of each. Taken from the steps themselves, a
+        drift was lost in these errors: 0.1 µm in a cycle of five became a saw-tooth of as much.
         """
         if self._mean_place is None:
             return np.zeros(surface.PARAMETERS)
         before_s, before_mm = self._mean_place
         return np.asarray((place_mm - before_mm) / (time_s - before_s))
 
-    def _remember(self, shifts_rad: tuple[float, float], seen_adu: Singles, fit: FrameFit, time_s: float) -> None:
+    def _remember(
+        self, shifts_rad: tuple[float, float], seen_adu: Singles, fit: FrameFit, time_s: float
+    ) -> None:
         """Add a good frame to its step."""
         if not self._steps or self._steps[-1].shifts_rad != shifts_rad:
             self._steps = [*self._steps[1 - ENOUGH_STEPS :], tracked.StandingFrames(shifts_rad)]
@@ -164,8 +195,8 @@ class Tracker:
     def prepare(self, shifts_rad: tuple[float, float]) -> None:
         """Do ahead what the next frame, with these phase steps of x and y, needs.
 
-        New error bars take three times as long as a frame's fit, light from five steps twenty times: between frames
-        they make no figure late. `follow` does what was not done ahead.
+        New error bars take three times as long as a frame's fit, light from five steps twenty
+        times: between frames they make no figure late. `follow` does what was not done ahead.
         """
         if self._errors_due is not None:
             self._estimate_errors(*self._errors_due)
@@ -177,7 +208,9 @@ class Tracker:
         self._prepared_rad = shifts_rad
 
     def _take_steps(self, shifts_rad: tuple[float, float]) -> None:
-        """At the end of a step of the pattern, judge its mean; renew the scene after five that separate the axes."""
+        """At the end of a step of the pattern, judge its mean; renew the scene after five that
+        separate the axes.
+        """
         steps = self._steps
         if not steps or steps[-1].shifts_rad == shifts_rad:
             return
@@ -187,17 +220,26 @@ class Tracker:
         steps[-1].variance_mm2 = errors_mm2 + self._place_mm2(steps[-1].shifts_rad)
         shown = [step.shifts_rad for step in steps]
         if separable(np.array(shown)):
-            fits, variance_mm2 = [step.fit(radius_mm) for step in steps], [step.variance_mm2 for step in steps]
+            fits, variance_mm2 = (
+                [step.fit(radius_mm) for step in steps],
+                [step.variance_mm2 for step in steps],
+            )
             times_s = np.array([step.time_s for step in steps])
-            self._renew(times_s, fits, variance_mm2, np.stack([step.seen_adu() for step in steps]), shown)
+            self._renew(
+                times_s, fits, variance_mm2, np.stack([step.seen_adu() for step in steps]), shown
+            )
 
     def _place_mm2(self, shifts_rad: tuple[float, float]) -> FloatArray:
-        """Variance (parameters,) of the place at which the steps saw the mirror with these shifts, common to their
-        frames."""
+        """Variance (parameters,) of the place at which the steps saw the mirror with these shifts,
+        common to their frames."""
         return self._places_mm2.get(shifts_rad, np.zeros(surface.PARAMETERS))
 
     def follow(
-        self, frame: Image, shifts_rad: tuple[float, float], time_s: float, displacement_um: float = math.nan
+        self,
+        frame: Image,
+        shifts_rad: tuple[float, float],
+        time_s: float,
+        displacement_um: float = math.nan,
     ) -> TrackedFrame:
         """The figure of the next frame.
 
@@ -217,10 +259,14 @@ class Tracker:
         self._binner.clear()
         self._binner.add([frame], [0])
         index = self._fitter.scene.index
-        seen = self._binner.sums[0].ravel()[index].astype(np.float32) / np.float32(self._binner.bin_px**2)
+        seen = self._binner.sums[0].ravel()[index].astype(np.float32) / np.float32(
+            self._binner.bin_px**2
+        )
         same, self._seen = bool(np.array_equal(seen, self._seen)), seen
         if same and not self._blind:
-            return tracked.rejected_frame(time_s, "frozen: the frame is identical to the one before")
+            return tracked.rejected_frame(
+                time_s, "frozen: the frame is identical to the one before"
+            )
         saturated = self._binner.saturated.ravel()[index] > 0
         light, covered = self._squares.look(seen)
         faults = tracked.light_faults(float(np.mean(saturated)), light, covered)
@@ -228,7 +274,9 @@ class Tracker:
         rejected = next((f for f in faults if f.verdict == "rejected"), None)
         if rejected is not None:
             return tracked.rejected_frame(time_s, rejected.reason)
-        fit = self._fitted(seen, shifts_rad, light, saturated | self._squares.bins(covered), displacement_um)
+        fit = self._fitted(
+            seen, shifts_rad, light, saturated | self._squares.bins(covered), displacement_um
+        )
         swing_adu = self._swing_adu * light
         rest, far = self._scale_of(fit) / swing_adu, np.abs(fit.residual_adu) > _FAR_OFF * swing_adu
         out = float(np.mean((far & (fit.weights == 0))[~saturated & ~self._squares.bins(covered)]))
@@ -245,7 +293,9 @@ class Tracker:
         return replace(found, saturated_share=float(np.mean(saturated)))
 
     def mean_residual_adu(self) -> FloatArray:
-        """Light (rows, columns) that the fits left on average, over the bins; NaN outside the mirror."""
+        """Light (rows, columns) that the fits left on average, over the bins; NaN outside the
+        mirror.
+        """
         out = np.full(self._binner.sums.shape[1:], math.nan)
         out.ravel()[self._fitter.scene.index] = self._left / max(self._count, 1)
         return out
@@ -258,9 +308,11 @@ class Tracker:
         left_out: BoolArray,
         displacement_um: float,
     ) -> FrameFit:
-        """Fit from the last solution; if that fails and the laser saw the film move, from where the laser puts it."""
-        # A square shows no whole number of fringes: where these step, its light changes by a per cent, which the maps
-        # must not follow.
+        """Fit from the last solution; if that fails and the laser saw the film move, from where the
+        laser puts it.
+        """
+        # A square shows no whole number of fringes: where these step, its light changes by a per
+        # cent, which the maps must not follow.
         brighter = light / self._light if shifts_rad == self._shown_rad else 1.0
         maps = self._last.light * brighter
         maps[:, 0] += brighter - 1  # the first term is 1 everywhere
@@ -272,27 +324,35 @@ class Tracker:
                 fit = self._robust(seen, shifts_rad, start if self._lost(fit) else fit, left_out)
                 if not self._lost(fit):
                     self._bands.refine(self._fitter.rows(), fit.bands)
-        if self._lost(fit) and len(self._bands.waves) > known:  # a lost order leaves fringes, which are no bands
+        if (
+            self._lost(fit) and len(self._bands.waves) > known
+        ):  # a lost order leaves fringes, which are no bands
             self._bands.keep(known)
             fit = self._robust(seen, shifts_rad, start, left_out)
         moved_um = displacement_um - self._last_displacement_um
         if self._lost(fit) and math.isfinite(moved_um):
             bowl = surface.Surface.hencky_bowl(1e-3 * moved_um, fit.surface.radius_mm).parameters
-            there = surface.Surface.from_parameters(self._last.surface.parameters + bowl, fit.surface.radius_mm)
+            there = surface.Surface.from_parameters(
+                self._last.surface.parameters + bowl, fit.surface.radius_mm
+            )
             fit = self._robust(seen, shifts_rad, replace(start, surface=there), left_out)
         return fit
 
     def _robust(
         self, seen: Singles, shifts_rad: tuple[float, float], start: FrameFit, left_out: BoolArray
     ) -> FrameFit:
-        """Fit without outliers, at first of the last frame's scale: a film that moved needs all bins to begin."""
+        """Fit without outliers, at first of the last frame's scale: a film that moved needs all
+        bins to begin.
+        """
         fit = start
         # light wanders in proportion to itself: bright fringes in a bright patch are no outliers
         bright = np.maximum(seen / self._fitter.light_adu[0], np.float32(1)) * ~left_out
         for first in filter(None, (self._scale_adu, _FIRST_REACH)):
             fit, scale = start, first
             for _ in range(4):
-                fit = self._fitter.fit(seen, shifts_rad, fit, np.float32(_REACH_SIGMAS * scale) * bright)
+                fit = self._fitter.fit(
+                    seen, shifts_rad, fit, np.float32(_REACH_SIGMAS * scale) * bright
+                )
                 found = self._scale_of(fit)
                 if 0.67 * scale < found < 1.5 * scale or self._lost(fit):
                     break
@@ -302,13 +362,17 @@ class Tracker:
         return fit
 
     def _scale_of(self, fit: FrameFit) -> float:
-        """Robust sigma of the residual: the median of its size, unless rounding makes that less than the noise."""
+        """Robust sigma of the residual: the median of its size, unless rounding makes that less
+        than the noise.
+        """
         return max(fit.scale_adu, self._noise_adu)
 
     def _lost(self, fit: FrameFit) -> bool:
         return not fit.converged or self._scale_of(fit) > tracked.REST_REJECTED * self._swing_adu
 
-    def _doubt(self, fit: FrameFit, rest: float, out: float, time_s: float, displacement_um: float) -> Finding | None:
+    def _doubt(
+        self, fit: FrameFit, rest: float, out: float, time_s: float, displacement_um: float
+    ) -> Finding | None:
         """Whether the solution is the next one of this mirror."""
         failed = tracked.fit_fault(fit, rest, out)
         if failed is not None:
@@ -316,19 +380,27 @@ class Tracker:
         change_um = 1e3 * (fit.surface.parameters - self._last.surface.parameters)
         passed_s = time_s - self._last_time_s
         passed_s = passed_s if math.isfinite(passed_s) else math.inf
-        strange = self._orders.doubt(change_um, passed_s, displacement_um - self._last_displacement_um)
+        strange = self._orders.doubt(
+            change_um, passed_s, displacement_um - self._last_displacement_um
+        )
         if strange is not None:
             return strange
         tilt_um = float(np.hypot(*change_um[:2]))
         if math.isfinite(self._last_time_s) and tilt_um > _KNOCK_UM + _KNOCK_UM_PER_S * passed_s:
             urad = 2e3 * tilt_um / fit.surface.radius_mm
             self._knocked = (
-                f"knocked: the figure tilted by {urad:.0f} µrad at {time_s:.2f} s; check camera and screen"
+                f"knocked: the figure tilted by {urad:.0f} µrad at {time_s:.2f} s; check camera "
+                "and screen"
             )
         return Finding("degraded", self._knocked, True) if self._knocked else None
 
     def _accept(
-        self, fit: FrameFit, light: float, shifts_rad: tuple[float, float], time_s: float, displacement_um: float
+        self,
+        fit: FrameFit,
+        light: float,
+        shifts_rad: tuple[float, float],
+        time_s: float,
+        displacement_um: float,
     ) -> None:
         self._last, self._light, self._shown_rad = fit, light, shifts_rad
         self._clear = self._seen / self._bands.gain(fit.bands)
@@ -341,16 +413,26 @@ class Tracker:
             self._anchor_light = light
 
     def _result(
-        self, fit: FrameFit, shifts_rad: tuple[float, float], time_s: float, fault: Finding, rest: float
+        self,
+        fit: FrameFit,
+        shifts_rad: tuple[float, float],
+        time_s: float,
+        fault: Finding,
+        rest: float,
     ) -> TrackedFrame:
-        if self._jumps.add(shifts_rad, fit.surface.parameters) or time_s >= self._covariance_s + _SIGMA_EVERY_S:
+        if (
+            self._jumps.add(shifts_rad, fit.surface.parameters)
+            or time_s >= self._covariance_s + _SIGMA_EVERY_S
+        ):
             self._covariance_s, self._errors_due = time_s, (fit, shifts_rad)
         used = float(np.mean(fit.weights > 0))
         if not abs(used - self._used_share) < _OTHER_BINS or np.isnan(self._fit_mm2).any():
             self._fit_mm2, self._used_share = np.full_like(self._fit_mm2, math.nan), used
             self._estimate_errors(fit, shifts_rad)
         places_mm2 = [*self._places_mm2.values()] or [np.zeros(surface.PARAMETERS)]
-        apart_mm2 = self._place_mm2(shifts_rad) + self._jumps.variance_mm2(np.mean(places_mm2, axis=0))
+        apart_mm2 = self._place_mm2(shifts_rad) + self._jumps.variance_mm2(
+            np.mean(places_mm2, axis=0)
+        )
         covariance_mm2 = self._fit_mm2 + np.diag(apart_mm2)
         to_coeffs, gradient = surface.parameter_to_coeffs(), surface.sag_gradient()
         return TrackedFrame(
@@ -372,4 +454,6 @@ class Tracker:
         """Covariance of a fit's parameters, smoothed over the estimates."""
         self._errors_due = None
         found = self._fitter.covariance_mm2(fit, shifts_rad, self._noise_adu)
-        self._fit_mm2 = 0.7 * self._fit_mm2 + 0.3 * found if np.isfinite(self._fit_mm2).all() else found
+        self._fit_mm2 = (
+            0.7 * self._fit_mm2 + 0.3 * found if np.isfinite(self._fit_mm2).all() else found
+        )

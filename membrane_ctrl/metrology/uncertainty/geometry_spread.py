@@ -1,8 +1,9 @@
 """How well a geometry is known: a covariance over named changes of it, from which trials draw.
 
-The poses change in eleven numbers, a, b, alpha and the others of `calibrate.parameters.POSE`, or in the twelve of a
-calibrated geometry: camera and screen are each shifted (mm, in world) and turned (rad, a rotation vector in world,
-about the pinhole and about O'). Lens, bow and pitch change in those of `calibrate.parameters.OPTIONAL`.
+The poses change in eleven numbers, a, b, alpha and the others of `calibrate.parameters.POSE`, or in
+the twelve of a calibrated geometry: camera and screen are each shifted (mm, in world) and turned
+(rad, a rotation vector in world, about the pinhole and about O'). Lens, bow and pitch change in
+those of `calibrate.parameters.OPTIONAL`.
 """
 
 from dataclasses import dataclass
@@ -30,10 +31,13 @@ GENERAL_NAMES = tuple(
 class GeometrySpread:
     """Covariance of a geometry.
 
-    Raises ValueError on construction, for unknown or mixed names and for a matrix that is no covariance.
+    Raises ValueError on construction, for unknown or mixed names and for a matrix that is no
+    covariance.
     """
 
-    names: tuple[str, ...]  # of `calibrate.parameters`, the poses' or `GENERAL_NAMES`; numbers not named are exact
+    names: tuple[
+        str, ...
+    ]  # of `calibrate.parameters`, the poses' or `GENERAL_NAMES`; numbers not named are exact
     covariance: FloatArray  # (k, k): of their changes, in the units of the names
 
     def __post_init__(self) -> None:
@@ -42,12 +46,15 @@ class GeometrySpread:
         poses = set(self.names) - set(OPTIONAL_NAMES)
         if not (poses <= set(POSE_NAMES) or poses <= set(GENERAL_NAMES)):
             raise ValueError(
-                f"names: poses all from {', '.join(POSE_NAMES)} or all from {', '.join(GENERAL_NAMES)}, "
+                f"names: poses all from {', '.join(POSE_NAMES)} or all from "
+                f"{', '.join(GENERAL_NAMES)}, "
                 f"the rest from {', '.join(OPTIONAL_NAMES)}"
             )
         if self.covariance.shape != (len(self.names), len(self.names)):
             raise ValueError(f"matrix: {len(self.names)} names need as many rows and columns")
-        if not np.all(np.isfinite(self.covariance)) or not np.allclose(self.covariance, self.covariance.T):
+        if not np.all(np.isfinite(self.covariance)) or not np.allclose(
+            self.covariance, self.covariance.T
+        ):
             raise ValueError("matrix: not finite and symmetric")
         if np.any(np.diag(self.covariance) < 0):
             raise ValueError("matrix: a variance is negative")
@@ -62,7 +69,9 @@ class GeometrySpread:
 
     def with_others(self, sigmas: dict[str, float]) -> "GeometrySpread":
         """Independent numbers added to these; those already named stay."""
-        other = GeometrySpread.independent({n: s for n, s in sigmas.items() if n not in self.names and s > 0})
+        other = GeometrySpread.independent(
+            {n: s for n, s in sigmas.items() if n not in self.names and s > 0}
+        )
         size = len(self.names)
         whole = np.zeros((size + len(other.names), size + len(other.names)))
         whole[:size, :size], whole[size:, size:] = self.covariance, other.covariance
@@ -85,19 +94,27 @@ class GeometrySpread:
     def root(self) -> FloatArray:
         """(k, k): times its transpose it is the covariance."""
         values, vectors = np.linalg.eigh(self.correlation())
-        return np.asarray(self.sigmas[:, None] * ((vectors * np.sqrt(np.maximum(values, 0.0))) @ vectors.T))
+        return np.asarray(
+            self.sigmas[:, None] * ((vectors * np.sqrt(np.maximum(values, 0.0))) @ vectors.T)
+        )
 
 
 def stated_spread(geometry: GeometryConfig) -> GeometrySpread | None:
-    """What `a_sigma_mm`, `b_sigma_mm` and `alpha_sigma_deg` say; None if the geometry has none of them."""
+    """What `a_sigma_mm`, `b_sigma_mm` and `alpha_sigma_deg` say; None if the geometry has none of
+    them.
+    """
     sigmas = (geometry.a_sigma_mm, geometry.b_sigma_mm, geometry.alpha_sigma_deg)
     if geometry.a_mm is None or all(sigma is None for sigma in sigmas):
         return None
-    return GeometrySpread.independent({n: s or 0.0 for n, s in zip(SHORT_NAMES, sigmas, strict=True)})
+    return GeometrySpread.independent(
+        {n: s or 0.0 for n, s in zip(SHORT_NAMES, sigmas, strict=True)}
+    )
 
 
 def changed(geometry: GeometryConfig, names: tuple[str, ...], change: ArrayLike) -> GeometryConfig:
-    """The geometry changed by (k,) amounts. Raises ValueError if the names belong to the other form."""
+    """The geometry changed by (k,) amounts. Raises ValueError if the names belong to the other
+    form.
+    """
     amounts = dict(zip(names, np.asarray(change, float).tolist(), strict=True))
     if not amounts:
         return geometry
@@ -111,7 +128,8 @@ def changed(geometry: GeometryConfig, names: tuple[str, ...], change: ArrayLike)
     turn = _turn(amounts, "camera")
     rows = [_vector(turn @ np.array(row)) for row in camera.rotation]
     moved_camera = CameraPoseConfig(
-        position_mm=_shifted(camera.position_mm, amounts, "camera"), rotation=(rows[0], rows[1], rows[2])
+        position_mm=_shifted(camera.position_mm, amounts, "camera"),
+        rotation=(rows[0], rows[1], rows[2]),
     )
     turn = _turn(amounts, "screen")
     origin_mm, s_x, s_y = screen.pose
@@ -125,7 +143,9 @@ def changed(geometry: GeometryConfig, names: tuple[str, ...], change: ArrayLike)
     return geometry.model_copy(update={"camera": moved_camera, "screen": moved_screen})
 
 
-def moved_bench(optics: OpticsConfig, names: tuple[str, ...], change: ArrayLike) -> parameters.BenchGeometry:
+def moved_bench(
+    optics: OpticsConfig, names: tuple[str, ...], change: ArrayLike
+) -> parameters.BenchGeometry:
     """The bench with its poses, lens, bow and pitch changed by (k,) amounts.
 
     Raises ValueError if the names belong to another form of geometry.
@@ -134,7 +154,9 @@ def moved_bench(optics: OpticsConfig, names: tuple[str, ...], change: ArrayLike)
     general = tuple(name for name in names if name in GENERAL_NAMES)
     geometry = changed(optics.geometry, general, [amounts.pop(name) for name in general])
     values = np.array([amounts.get(name, 0.0) for name in parameters.NAMES])
-    return parameters.bench_at(Geometry.from_config(optics.model_copy(update={"geometry": geometry})), values)
+    return parameters.bench_at(
+        Geometry.from_config(optics.model_copy(update={"geometry": geometry})), values
+    )
 
 
 def _turn(amounts: dict[str, float], thing: str) -> FloatArray:
@@ -143,7 +165,9 @@ def _turn(amounts: dict[str, float], thing: str) -> FloatArray:
 
 
 def _shifted(place_mm: Vector3, amounts: dict[str, float], thing: str) -> Vector3:
-    return _vector(np.array(place_mm) + [amounts.get(f"{thing}_shift_{axis}_mm", 0.0) for axis in "xyz"])
+    return _vector(
+        np.array(place_mm) + [amounts.get(f"{thing}_shift_{axis}_mm", 0.0) for axis in "xyz"]
+    )
 
 
 def _vector(values: FloatArray) -> Vector3:

@@ -1,9 +1,11 @@
-"""Errors of live cycles beyond the noise of the pixels: what the frames show of them, and what that leaves.
+"""Errors of live cycles beyond the noise of the pixels: what the frames show of them, and what that
+leaves.
 
-The sensitivities are those of the budget of `measure`, computed once, with the first full cycle. Each cycle then asks
-some of its points what light each frame had and where the film was (see `frames.evidence`), takes the effect out, and
-states what is left. Errors that all cycles share count for one figure, not for a change since the reference cycle:
-the first one near the film's present displacement.
+The sensitivities are those of the budget of `measure`, computed once, with the first full cycle.
+Each cycle then asks some of its points what light each frame had and where the film was (see
+`frames.evidence`), takes the effect out, and states what is left. Errors that all cycles share
+count for one figure, not for a change since the reference cycle: the first one near the film's
+present displacement.
 """
 
 import math
@@ -20,27 +22,33 @@ from membrane_ctrl.model.arrays import AnyArray, FloatArray, IntArray
 
 # Some points determine light and place of a frame to 1e-4 and 20 nm, a tenth of what they leave
 POINTS = 1500
-# Share of what the frames show that is left when it has been taken out: higher orders, and light that is not even
+# Share of what the frames show that is left when it has been taken out: higher orders, and light
+# that is not even
 _LEFT = 0.03
-# Waves of uneven light nearly cancel over the mirror: the few points that show them would not show what is left
+# Waves of uneven light nearly cancel over the mirror: the few points that show them would not show
+# what is left
 _WAVE_POINTS = 20_000
 _COLUMNS = 6  # of a frame, see `frames_seen`
 _DIFFERS = np.array([1.0, 1.0, 0.0, 1.0, 1.0, 1.0])  # of these columns, all but the phase step
 _SECOND_ORDER = 0.01
 _FAR_UM = 300.0  # displacement over which the sensitivities are compared
-# A film this far from the reference cycle makes a new one: changes are stated within a hold, not across setpoints
+# A film this far from the reference cycle makes a new one: changes are stated within a hold, not
+# across setpoints
 _REFERENCE_UM = 100.0
 
 
 @dataclass(frozen=True)
 class FramesSeen:
-    """Light and film of the 2 N frames of a cycle, x frames first, each about the mean of its axis."""
+    """Light and film of the 2 N frames of a cycle, x frames first,
+    each about the mean of its axis.
+    """
 
     level: FloatArray  # (2 N,): relative
     swing: FloatArray  # (2 N,): relative
     told_um: FloatArray  # (2 N,): the film, as the phases were corrected for
     moved_um: FloatArray  # (2 N,): the film beyond that
-    harmonics: FloatArray  # (2, 2): second and third of x and of y over the amplitude: the display's response
+    # (2, 2): second and third of x and of y over the amplitude: the display's response
+    harmonics: FloatArray
     waves_rad: FloatArray  # (2, n): what all that adds to the phases of the points
 
 
@@ -50,13 +58,14 @@ class LiveErrors:
 
     frames: budget.FrameEffects
     vertex: FloatArray  # (parameters,): per µm of the vertex' place
-    # (parameters, parameters): covariance of what all cycles share; NaN if the spread is unknown or too wide
+    # (parameters, parameters): covariance of what all cycles share; NaN if the spread is unknown or
+    # too wide
     common_mm2: FloatArray
-    # (parameters, parameters): covariance of what is left of that in a change, per µm^2 of the film's displacement
-    # between the cycles
+    # (parameters, parameters): covariance of what is left of that in a change, per µm^2 of the
+    # film's displacement between the cycles
     per_um2: FloatArray
-    # (parameters, parameters): covariance of what the geometry makes of a film that was told to be 1 µm deeper in x
-    # than in y
+    # (parameters, parameters): covariance of what the geometry makes of a film that was told to be
+    # 1 µm deeper in x than in y
     told_um2: FloatArray
 
     @classmethod
@@ -73,8 +82,8 @@ class LiveErrors:
     ) -> "LiveErrors":
         """Of some points of a cycle, and of the many more that the waves of uneven light need.
 
-        `light` (2, n) is that of the latter over the amplitude of their fringes, and `left` (parameters, k) the
-        effects of the slopes that the fit leaves.
+        `light` (2, n) is that of the latter over the amplitude of their fringes, and `left`
+        (parameters, k) the effects of the slopes that the fit leaves.
         """
         frames = budget.frame_effects(waves, bench.optics, shifts_rad, light, seen.harmonics)
         vertex = budget.vertex_source(bench, 1.0, "").effects_mm[:, 0]
@@ -84,7 +93,9 @@ class LiveErrors:
         try:
             here = _shared(bench, spread, blur_px)
             per_um = (_shared(budget.moved_film(bench, _FAR_UM), spread, blur_px) - here) / _FAR_UM
-            x_mm, y_mm = (budget.moved_film(bench, sign * _FAR_UM / 2).screen_mm for sign in (1, -1))
+            x_mm, y_mm = (
+                budget.moved_film(bench, sign * _FAR_UM / 2).screen_mm for sign in (1, -1)
+            )
             told = _of_geometry(replace(bench, screen_mm=np.stack([x_mm[0], y_mm[1]])), spread)
             told = (told - here[:, : told.shape[1]]) / _FAR_UM
         except ArithmeticError:  # a fit at the spread's end fails
@@ -97,17 +108,20 @@ class LiveErrors:
         # the phases were corrected for the told motion as if the fringes were pure sinusoids
         display = effects.display @ (seen.told_um + seen.moved_um)
         return np.asarray(
-            effects.level @ seen.level + effects.swing @ seen.swing + effects.film @ seen.moved_um + display
+            effects.level @ seen.level
+            + effects.swing @ seen.swing
+            + effects.film @ seen.moved_um
+            + display
         )
 
     def own_mm2(
         self, seen: FramesSeen, readings_um: FloatArray, laser_noise_um: float, moved_um: float
     ) -> FloatArray:
-        """Covariance (parameters, parameters) in mm^2 of what the reference cycle does not share, without slopes and
-        pixels.
+        """Covariance (parameters, parameters) in mm^2 of what the reference cycle does not share,
+        without slopes and pixels.
 
-        It is from light and film as `seen` and taken out, from the laser's readings (2 N,) of the frames, and from
-        the film's displacement since the reference.
+        It is from light and film as `seen` and taken out, from the laser's readings (2 N,) of the
+        frames, and from the film's displacement since the reference.
         """
         light, film_um = _LEFT * _rms(seen.level, seen.swing), _LEFT * _rms(seen.moved_um)
         if np.isfinite(readings_um).all():  # motion is taken out to first order
@@ -128,17 +142,27 @@ class LiveErrors:
         return np.asarray(sum(effect @ effect.T for effect in effects) + shared_mm2)
 
 
-def _shared(bench: monte_carlo.TrialBench, spread: geometry_spread.GeometrySpread, blur_px: float) -> FloatArray:
-    """Effects (parameters, k) of what all cycles share. Raises ArithmeticError if a fit at the spread's end fails."""
+def _shared(
+    bench: monte_carlo.TrialBench, spread: geometry_spread.GeometrySpread, blur_px: float
+) -> FloatArray:
+    """Effects (parameters, k) of what all cycles share. Raises ArithmeticError if a fit at the
+    spread's end fails.
+    """
     sources = [
         *budget.bench_sources(bench, bench.optics.geometry.sigmas or SigmasConfig()),
         budget.blur_source(bench, blur_px),
     ]
-    return np.concatenate([_of_geometry(bench, spread), *(source.effects_mm for source in sources)], axis=1)
+    return np.concatenate(
+        [_of_geometry(bench, spread), *(source.effects_mm for source in sources)], axis=1
+    )
 
 
-def _of_geometry(bench: monte_carlo.TrialBench, spread: geometry_spread.GeometrySpread) -> FloatArray:
-    return np.concatenate([source.effects_mm for source in budget.geometry_sources(bench, spread)], axis=1)
+def _of_geometry(
+    bench: monte_carlo.TrialBench, spread: geometry_spread.GeometrySpread
+) -> FloatArray:
+    return np.concatenate(
+        [source.effects_mm for source in budget.geometry_sources(bench, spread)], axis=1
+    )
 
 
 @dataclass(frozen=True)
@@ -157,9 +181,11 @@ class CycleErrors:
     """What is known of the errors of one cycle."""
 
     correction_mm: FloatArray  # (parameters,): to be subtracted from the parameters
-    # (parameters, parameters): covariance of what the reference cycle does not share, without slopes and pixels
+    # (parameters, parameters): covariance of what the reference cycle does not share, without
+    # slopes and pixels
     own_mm2: FloatArray
-    changed_rad2: FloatArray  # (2,): variance of the phases' change since the reference that no surface explains
+    # (2,): variance of the phases' change since the reference that no surface explains
+    changed_rad2: FloatArray
     asked: int  # points it is known at
 
 
@@ -198,13 +224,21 @@ class ErrorWatch:
 
     @property
     def common_mm2(self) -> FloatArray:
-        """Covariance (parameters, parameters) that all cycles share; NaN before the first, and without a spread."""
-        return np.full((PARAMETERS, PARAMETERS), np.nan) if self._errors is None else self._errors.common_mm2
+        """Covariance (parameters, parameters) that all cycles share; NaN before the first, and
+        without a spread.
+        """
+        return (
+            np.full((PARAMETERS, PARAMETERS), np.nan)
+            if self._errors is None
+            else self._errors.common_mm2
+        )
 
     def begin(self, state: motion.TrackedPoints) -> None:
         """Choose from the points of a full cycle those that are asked."""
         places_px = self._places_px[:, state.index]
-        self._asked = np.flatnonzero(monte_carlo.spread_evenly(places_px, self._optics.camera.width_px, POINTS))
+        self._asked = np.flatnonzero(
+            monte_carlo.spread_evenly(places_px, self._optics.camera.width_px, POINTS)
+        )
 
     def look(self, cycle: Cycle) -> CycleErrors:
         """The errors of a cycle; the first one's determine the sensitivities."""
@@ -226,9 +260,13 @@ class ErrorWatch:
             self._reference_rad[:, index], moved_um = left_rad, 0.0
         changed_rad = left_rad - self._reference_rad[:, index]
         known = np.isfinite(changed_rad[0])
-        changed_rad2 = np.mean(np.square(changed_rad[:, known]), axis=1) if known.any() else np.zeros(2)
+        changed_rad2 = (
+            np.mean(np.square(changed_rad[:, known]), axis=1) if known.any() else np.zeros(2)
+        )
         own_mm2 = self._errors.own_mm2(seen, cycle.readings_um, self._laser_noise_um, moved_um)
-        return CycleErrors(self._errors.correction_mm(seen), own_mm2, changed_rad2, int(np.count_nonzero(known)))
+        return CycleErrors(
+            self._errors.correction_mm(seen), own_mm2, changed_rad2, int(np.count_nonzero(known))
+        )
 
     def _moved_um(self, readings_um: FloatArray) -> float:
         """The film's displacement since the reference cycle; NaN if that is to be this one."""
@@ -246,11 +284,15 @@ class ErrorWatch:
         patches = budget.Patches.of(field[:2], state.points.weights, slopes, reach_mm)
         law, _ = consistency.law_effect(patches, tracer.radius_mm, fit.normal.inverse)
         left = np.column_stack([patches.effects(tracer.radius_mm, fit.normal.inverse), law])
-        levels = [w[0] @ sums[:, state.index] for w, sums in zip(self._weights, cycle.sums, strict=True)]
+        levels = [
+            w[0] @ sums[:, state.index] for w, sums in zip(self._weights, cycle.sums, strict=True)
+        ]
         light = np.stack(levels) / self._bin_px**2 / state.fresh[:, 4]
         phases = np.full((2, self._places_px.shape[1]), np.nan)
         phases[:, state.index] = state.fresh[:, 0]
-        blur_px = consistency.blur_px(phases.reshape(2, *self._shape), 1 / light, state.index, self._bin_px)
+        blur_px = consistency.blur_px(
+            phases.reshape(2, *self._shape), 1 / light, state.index, self._bin_px
+        )
         places_px, width_px = self._places_px[:, state.index], self._optics.camera.width_px
         many = np.flatnonzero(monte_carlo.spread_evenly(places_px, width_px, _WAVE_POINTS))
 
@@ -261,7 +303,14 @@ class ErrorWatch:
             )
 
         return LiveErrors.of(
-            bench(asked), bench(many), self._shifts_rad, light[:, many], seen, self._spread, blur_px, left
+            bench(asked),
+            bench(many),
+            self._shifts_rad,
+            light[:, many],
+            seen,
+            self._spread,
+            blur_px,
+            left,
         )
 
 
@@ -290,10 +339,13 @@ def frames_seen(
     """
     scenes, out, waves = weights @ means, [], []
     for axis, frames in enumerate(means):
-        # of the other axis: uneven light leaves waves in the scene of its own frames, which would hide half of it
+        # of the other axis: uneven light leaves waves in the scene of its own frames, which would
+        # hide half of it
         level, cosine, sine = scenes[1 - axis]
         swing, slope = np.hypot(cosine, sine), sensitivity_rad_per_um[axis]
-        wave = np.exp(1j * (shifts_rad[axis][:, None] + phase_rad[axis] + told_um[axis][:, None] * slope))
+        wave = np.exp(
+            1j * (shifts_rad[axis][:, None] + phase_rad[axis] + told_um[axis][:, None] * slope)
+        )
         # level, swing, step, film, the display's harmonics (`frames.evidence`), and the frame
         table = np.empty((len(frames), _COLUMNS + 1, level.size))
         table[:, 0], table[:, 1], table[:, 2] = level, swing * wave.real, swing * wave.imag
@@ -304,7 +356,9 @@ def frames_seen(
         gram = table @ table.transpose(0, 2, 1)
         scale = np.sqrt(np.maximum(np.diagonal(gram, axis1=1, axis2=2), 1e-30))
         gram = gram / (scale[:, :, None] * scale[:, None, :])
-        solved = np.linalg.solve(gram[:, :-1, :-1] + 1e-9 * np.eye(_COLUMNS), gram[:, :-1, -1:])[:, :, 0]
+        solved = np.linalg.solve(gram[:, :-1, :-1] + 1e-9 * np.eye(_COLUMNS), gram[:, :-1, -1:])[
+            :, :, 0
+        ]
         found = solved * scale[:, -1:] / scale[:, :-1]
         # of errors of light and place alone: what differs from frame to frame
         differs = (found - found.mean(axis=0)) * _DIFFERS
@@ -316,7 +370,9 @@ def frames_seen(
         errors = np.einsum("kp,kpn->kn", differs, table[:, :-1]) + told_um[axis][:, None] * display
         added = weights[axis, 1:] @ errors
         unit = np.exp(1j * phase_rad[axis])
-        waves.append((added[1] * unit.real - added[0] * unit.imag) / (swing * abs(found[:, 1].mean())))
+        waves.append(
+            (added[1] * unit.real - added[0] * unit.imag) / (swing * abs(found[:, 1].mean()))
+        )
         out.append(np.stack([found[:, 0], amplitude, *relative.T]))
     shown = np.stack(out, axis=1)  # (5, 2, N): level, swing, film, harmonics
     means = shown.mean(axis=2)

@@ -1,13 +1,15 @@
 """Monte Carlo over geometry and pixel noise (the paper's section 3.1), on a few thousand bins.
 
-A trial of the paper disturbs the frames of every pixel and reconstructs them anew. The disturbance of a bin's phase
-by white noise of the pixels is known: sigma sqrt(2 / N) / (B m) for bins of m x m pixels. A few thousand of the bins
-determine the terms: one in k, each with a k-th of the variance, gives the fit the same covariance as all of them. A
-trial therefore draws a geometry, disturbs the screen points that the fitted surface predicts, and takes the two or
-three Gauss-Newton steps from the fitted surface to the disturbed one.
+A trial of the paper disturbs the frames of every pixel and reconstructs them anew. The disturbance
+of a bin's phase by white noise of the pixels is known: sigma sqrt(2 / N) / (B m) for bins of m x m
+pixels. A few thousand of the bins determine the terms: one in k, each with a k-th of the variance,
+gives the fit the same covariance as all of them. A trial therefore draws a geometry, disturbs the
+screen points that the fitted surface predicts, and takes the two or three Gauss-Newton steps from
+the fitted surface to the disturbed one.
 
-Seeds: the geometry of trial t comes from (seed, 0, t), the noise of set s in it from (seed, 1 + s, t): independent
-of the order, of the number of workers and of what else is in the run, and the geometry is common to all sets.
+Seeds: the geometry of trial t comes from (seed, 0, t), the noise of set s in it from (seed, 1 + s,
+t): independent of the order, of the number of workers and of what else is in the run, and the
+geometry is common to all sets.
 """
 
 from collections.abc import Sequence
@@ -25,13 +27,16 @@ from membrane_ctrl.metrology.optics.surface import PARAMETERS, Surface, paramete
 from membrane_ctrl.metrology.uncertainty.geometry_spread import GeometrySpread, moved_bench
 from membrane_ctrl.model.arrays import ArrayLike, BoolArray, FloatArray
 
-# 170 a parameter: errors of a geometry are smooth and need fewer; a trial then takes about a millisecond
+# 170 a parameter: errors of a geometry are smooth and need fewer; a trial then takes about a
+# millisecond
 TRIAL_POINTS = 6000
 
 
 @dataclass(frozen=True)
 class TrialBench:
-    """All that the trials of one set need; half a megabyte, so that it can be sent to where they run."""
+    """All that the trials of one set need; half a megabyte, so that it can be sent to where they
+    run.
+    """
 
     optics: OpticsConfig  # with the nominal geometry
     vertex_z_mm: float  # position of the vertex
@@ -46,12 +51,22 @@ class TrialBench:
 
     @classmethod
     def of(
-        cls, optics: OpticsConfig, checked: Checked, figure: full.BinFigure, count: int = TRIAL_POINTS
+        cls,
+        optics: OpticsConfig,
+        checked: Checked,
+        figure: full.BinFigure,
+        count: int = TRIAL_POINTS,
     ) -> "TrialBench":
         """Of a set's figure, its points thinned to about `count`."""
         places_px = checked.places_px(figure.index)
         return cls.of_points(
-            optics, checked.tracer, figure.fit.surface, figure.points, places_px, figure.sigma_mm, count
+            optics,
+            checked.tracer,
+            figure.fit.surface,
+            figure.points,
+            places_px,
+            figure.sigma_mm,
+            count,
         )
 
     @classmethod
@@ -65,7 +80,9 @@ class TrialBench:
         sigma_mm: FloatArray,
         count: int,
     ) -> "TrialBench":
-        """Of points that stand on a surface, seen at `place_px` (2, n), thinned to about `count`."""
+        """Of points that stand on a surface, seen at `place_px` (2, n),
+        thinned to about `count`.
+        """
         chosen = spread_evenly(place_px, optics.camera.width_px, count)
         thinning = points.t_mm.size / np.count_nonzero(chosen)
         points = points.subset(chosen)
@@ -87,12 +104,13 @@ class TrialBench:
     def solve(
         self, there: BenchGeometry, disturbance_mm: FloatArray | float = 0.0, linear: bool = False
     ) -> FloatArray:
-        """Parameters (parameters,) in mm of the surface on another bench, the screen points (2, n) off by a
-        disturbance.
+        """Parameters (parameters,) in mm of the surface on another bench, the screen points (2, n)
+        off by a disturbance.
 
         One step suffices for a `linear` answer: the next would change it by 1/300.
 
-        Raises ArithmeticError if the fit does not converge: the geometry is not near the nominal one.
+        Raises ArithmeticError if the fit does not converge: the geometry is not near the nominal
+        one.
         """
         geometry, screen_mm = there.geometry, there.pitch * (self.screen_mm + disturbance_mm)
         tracer = reconstruct.Tracer(geometry, self.surface.radius_mm, self.vertex_z_mm)
@@ -100,10 +118,16 @@ class TrialBench:
         points.t_mm[:] = self.t_mm
         tracer.intersect(points, self.surface, newton=3)
         steps = 1 if linear else reconstruct.MAX_ITERATIONS
-        with np.errstate(over="ignore", invalid="ignore"):  # of a fit that diverges, which is reported below
-            try:  # the nominal points' matrix would not do: a turn of the camera moves them by centimetres
+        with np.errstate(
+            over="ignore", invalid="ignore"
+        ):  # of a fit that diverges, which is reported below
+            # the nominal points' matrix would not do: a turn of the camera moves them by
+            # centimetres
+            try:
                 normal = tracer.normal_matrix(points)
-                fit = reconstruct.solve(tracer, points, self.surface, normal=normal, max_iterations=steps)
+                fit = reconstruct.solve(
+                    tracer, points, self.surface, normal=normal, max_iterations=steps
+                )
             except ValueError:
                 fit = None
         if fit is None or not (fit.converged or (linear and np.isfinite(fit.changes_mm[-1]))):
@@ -116,12 +140,15 @@ class TrialBench:
 
     def slope_variance(self) -> FloatArray:
         """(2,) variance of an x and of a y slope from the noise."""
-        gain = bins.slope_per_screen(Geometry.from_config(self.optics), self.surface.radius_mm, self.surface.sag_mm)
+        gain = bins.slope_per_screen(
+            Geometry.from_config(self.optics), self.surface.radius_mm, self.surface.sag_mm
+        )
         return np.asarray(gain @ np.mean(np.square(self.sigma_mm), axis=1))
 
 
 def spread_evenly(place_px: FloatArray, width_px: int, count: int) -> BoolArray:
-    """About `count` of the points at `place_px` (2, n) by a golden-ratio sequence: even along rows and columns alike.
+    """About `count` of the points at `place_px` (2, n) by a golden-ratio sequence: even along rows
+    and columns alike.
 
     A place is chosen in every set or in none, so that sets of one bench can be compared.
     """
@@ -133,39 +160,49 @@ def spread_evenly(place_px: FloatArray, width_px: int, count: int) -> BoolArray:
 
 
 def run_trials(
-    benches: Sequence[TrialBench], spread: GeometrySpread, seed: int, trials: Sequence[int], first_set: int = 0
+    benches: Sequence[TrialBench],
+    spread: GeometrySpread,
+    seed: int,
+    trials: Sequence[int],
+    first_set: int = 0,
 ) -> FloatArray:
-    """Parameters (trials, sets, parameters) in mm of the trials with these numbers; all sets share the geometry of a
-    trial.
+    """Parameters (trials, sets, parameters) in mm of the trials with these numbers; all sets share
+    the geometry of a trial.
 
-    The benches, one a set, have the same nominal geometry. `first_set` is the number of the first set in its run:
-    noise differs from set to set.
+    The benches, one a set, have the same nominal geometry. `first_set` is the number of the first
+    set in its run: noise differs from set to set.
     """
     out = np.empty((len(trials), len(benches), PARAMETERS))
     for row, trial in enumerate(trials):
         change = spread.draw(np.random.default_rng((seed, 0, trial)))
         for k, bench in enumerate(benches):
-            noise = np.random.default_rng((seed, 1 + first_set + k, trial)).standard_normal(bench.sigma_mm.shape)
+            noise = np.random.default_rng((seed, 1 + first_set + k, trial)).standard_normal(
+                bench.sigma_mm.shape
+            )
             out[row, k] = bench.solve(bench.geometry(spread.names, change), noise * bench.sigma_mm)
     return out
 
 
-# From the spread of the parameters to the spread of the height, and the linear covariance beside the Monte Carlo.
+# From the spread of the parameters to the spread of the height, and the linear covariance beside
+# the Monte Carlo.
 #
-# The fitted height is linear in the parameters, h = P a, so its standard deviation at every point follows from
-# their covariance C alone: sigma^2 = diag(P C P^T). With C the sample covariance of the trials that is, to the last
-# bit of rounding, the standard deviation over the trials' heights: the paper's RMSE map.
+# The fitted height is linear in the parameters, h = P a, so its standard deviation at every point
+# follows from their covariance C alone: sigma^2 = diag(P C P^T). With C the sample covariance of
+# the trials that is, to the last bit of rounding, the standard deviation over the trials' heights:
+# the paper's RMSE map.
 #
-# Linear: C = J S J^T + C_noise with S the covariance of the geometry and J the change of the parameters with it, from
-# two solutions a number (some ms each); J hardly changes while the film moves by micrometres, so the live cycle
-# computes it once a full cycle.
+# Linear: C = J S J^T + C_noise with S the covariance of the geometry and J the change of the
+# parameters with it, from two solutions a number (some ms each); J hardly changes while the film
+# moves by micrometres, so the live cycle computes it once a full cycle.
 
 MAP_SIDE = 101  # points across a map: 10 mm a cell, far below what the terms can change over
 
 
 @dataclass(frozen=True)
 class HeightMap:
-    """Points of a square grid inside a radius, and the matrix that makes heights of parameters there."""
+    """Points of a square grid inside a radius, and the matrix that makes heights of parameters
+    there.
+    """
 
     axis_mm: FloatArray  # (n,): of x and of y
     inside: BoolArray  # (n, n): rows along y
@@ -186,7 +223,9 @@ class HeightMap:
         return out
 
     def sigma(self, covariance: FloatArray) -> FloatArray:
-        """(points,) standard deviation for a covariance (parameters, parameters) of the parameters, in its unit."""
+        """(points,) standard deviation for a covariance (parameters, parameters) of the parameters,
+        in its unit.
+        """
         variance = np.einsum("pi,pi->p", self.matrix @ covariance, self.matrix)
         return np.asarray(np.sqrt(np.maximum(variance, 0.0)))
 
@@ -195,7 +234,9 @@ def height_matrix(x_mm: FloatArray, y_mm: FloatArray, radius_mm: float) -> Float
     """Matrix (points, parameters) from parameters to heights, 0 at the vertex."""
     x, y = np.asarray(x_mm) / radius_mm, np.asarray(y_mm) / radius_mm
     out = np.asarray(zernike.values(x, y).T @ parameter_to_coeffs())
-    out[:, -1] += np.polynomial.polynomial.polyval(x * x + y * y, film_law.excess()) / film_law.excess_rms()
+    out[:, -1] += (
+        np.polynomial.polynomial.polyval(x * x + y * y, film_law.excess()) / film_law.excess_rms()
+    )
     return out
 
 
@@ -205,10 +246,11 @@ def trial_covariance(parameters: FloatArray) -> FloatArray:
 
 
 def geometry_jacobian(bench: TrialBench, spread: GeometrySpread) -> FloatArray:
-    """Change (parameters, k) of the parameters in mm with each number of the geometry, by central differences of one
-    sigma.
+    """Change (parameters, k) of the parameters in mm with each number of the geometry, by central
+    differences of one sigma.
 
-    The difference is as wide as the spread itself, so that curvature counts as it does in the spread.
+    The difference is as wide as the spread itself, so that curvature counts as it does in the
+    spread.
     """
     columns = []
     for k, sigma in enumerate(spread.sigmas):
@@ -217,7 +259,10 @@ def geometry_jacobian(bench: TrialBench, spread: GeometrySpread) -> FloatArray:
             continue
         step = np.zeros(len(spread.names))
         step[k] = sigma
-        ends = [bench.solve(bench.geometry(spread.names, sign * step), linear=True) for sign in (1.0, -1.0)]
+        ends = [
+            bench.solve(bench.geometry(spread.names, sign * step), linear=True)
+            for sign in (1.0, -1.0)
+        ]
         columns.append((ends[0] - ends[1]) / (2 * sigma))
     return np.stack(columns, axis=1) if columns else np.zeros((PARAMETERS, 0))
 
@@ -228,14 +273,17 @@ def noise_covariance(bench: TrialBench) -> FloatArray:
 
 
 def geometry_covariance(jacobian: FloatArray, spread: GeometrySpread) -> FloatArray:
-    """Covariance (parameters, parameters) in mm^2 from the geometry; the live cycle reports it beside its own."""
+    """Covariance (parameters, parameters) in mm^2 from the geometry; the live cycle reports it
+    beside its own.
+    """
     return np.asarray(jacobian @ spread.covariance @ jacobian.T)
 
 
 def linear_covariance(benches: Sequence[TrialBench], spread: GeometrySpread) -> FloatArray:
     """What the Monte Carlo finds, without it: (parameters, parameters) in mm^2.
 
-    With two benches the covariance is that of the change between them: they share the geometry, not the noise.
+    With two benches the covariance is that of the change between them: they share the geometry, not
+    the noise.
     """
     jacobian = geometry_jacobian(benches[0], spread)
     if len(benches) > 1:

@@ -1,7 +1,7 @@
 """Statistics of a run of figures in memory that does not grow with it.
 
-The fitted height is linear in the parameters: their running mean and covariance hold the standard deviation at
-every point of the mirror (see `uncertainty.HeightMap.sigma`).
+The fitted height is linear in the parameters: their running mean and covariance hold the standard
+deviation at every point of the mirror (see `uncertainty.HeightMap.sigma`).
 """
 
 import math
@@ -14,15 +14,22 @@ import numpy as np
 from membrane_ctrl.metrology.uncertainty.monte_carlo import trial_covariance
 from membrane_ctrl.model.arrays import FloatArray
 
-# Where the film is watched, as (radius in analysis radii, azimuth in degrees): a third of a turn apart and inside,
-# halfway and near the rim, so that a tilt, a bend and a wave of the rim look different in the three.
+# Where the film is watched, as (radius in analysis radii, azimuth in degrees): a third of a turn
+# apart and inside, halfway and near the rim, so that a tilt, a bend and a wave of the rim look
+# different in the
+# three.
 _WATCHED = {"A": (0.45, 90.0), "B": (0.70, 210.0), "C": (0.95, 330.0)}
 
 
 def default_points_mm(analysis_radius_mm: float) -> dict[str, tuple[float, float]]:
     """A, B and C: name to (x, y) in mm."""
-    turns = {name: (analysis_radius_mm * r, math.radians(azimuth)) for name, (r, azimuth) in _WATCHED.items()}
-    return {name: (r_mm * math.cos(turn), r_mm * math.sin(turn)) for name, (r_mm, turn) in turns.items()}
+    turns = {
+        name: (analysis_radius_mm * r, math.radians(azimuth))
+        for name, (r, azimuth) in _WATCHED.items()
+    }
+    return {
+        name: (r_mm * math.cos(turn), r_mm * math.sin(turn)) for name, (r_mm, turn) in turns.items()
+    }
 
 
 class RunningCovariance:
@@ -72,11 +79,13 @@ class Tally:
 
 # Changes of the figure over fixed times, with their uncertainty, for every set of a run.
 #
-# Both sets of a pair were disturbed with the same geometries (see `monte_carlo`), so that the effect of a wrong
-# geometry on both cancels, trial by trial. Only the sets within the longest lag are kept.
+# Both sets of a pair were disturbed with the same geometries (see `monte_carlo`), so that the
+# effect of a wrong geometry on both cancels, trial by trial. Only the sets within the longest lag
+# are kept.
 
 LAGS_S = (60.0, 600.0)  # the paper's
-# A set this far from the requested moment still serves: next to a bad set a run has a neighbour there.
+# A set this far from the requested moment still serves: next to a bad set a run has a neighbour
+# there.
 _TOLERANCE = 0.1
 
 
@@ -122,7 +131,9 @@ class PairFinder:
             return []
         if self._kept and moment.time_s < self._kept[-1].time_s:
             self._kept.clear()  # another clock
-        while self._kept and moment.time_s - self._kept[0].time_s > (1 + _TOLERANCE) * max(self._lags_s):
+        while self._kept and moment.time_s - self._kept[0].time_s > (1 + _TOLERANCE) * max(
+            self._lags_s
+        ):
             self._kept.popleft()
         pairs = [
             FigurePair(lag, earlier, moment)

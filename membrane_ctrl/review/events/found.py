@@ -13,11 +13,25 @@ from membrane_ctrl.run_files.shapes import Shapes
 
 # Columns of the 1 s level used here.
 LEVEL_COLUMNS = (
-    "state", "fault", "min_ambient_pressure_pa", "mean_ambient_pressure_pa", "mean_flow_um_per_s",
-    "mean_feedforward_um_per_s", "min_displacement_um", "mean_displacement_um", "max_displacement_um",
-    "max_displacement_quality", "max_lateness_ms", "mean_error_um", "mean_air_temperature_c", "mean_leak_um_per_s",
-)  # fmt: skip
-_WEATHER = {"mean_ambient_pressure_pa": "barometer lost", "mean_air_temperature_c": "thermometer lost"}
+    "state",
+    "fault",
+    "min_ambient_pressure_pa",
+    "mean_ambient_pressure_pa",
+    "mean_flow_um_per_s",
+    "mean_feedforward_um_per_s",
+    "min_displacement_um",
+    "mean_displacement_um",
+    "max_displacement_um",
+    "max_displacement_quality",
+    "max_lateness_ms",
+    "mean_error_um",
+    "mean_air_temperature_c",
+    "mean_leak_um_per_s",
+)
+_WEATHER = {
+    "mean_ambient_pressure_pa": "barometer lost",
+    "mean_air_temperature_c": "thermometer lost",
+}
 # A door is 20 Pa; weather within two seconds is a few Pa (gusty: 1.8 Pa, 1 sigma).
 DOOR_LEAST_PA = 6.0
 DOOR_LEAST_SIGMAS = 5.5
@@ -55,9 +69,14 @@ def find_events(level: steps.Level, shapes: Shapes, band_um: float) -> list[step
     if level["time_s"].size:
         even = _even(level)
         finders: Iterable[Callable[[steps.Level], list[steps.FoundEvent]]] = (
-            pressure_steps, leak_steps, laser_glitches, laser_losses, weather_losses, lateness_bursts,
+            pressure_steps,
+            leak_steps,
+            laser_glitches,
+            laser_losses,
+            weather_losses,
+            lateness_bursts,
             noise_changes,
-        )  # fmt: skip
+        )
         for finder in finders:
             found += finder(even)
         found += steps.excursions(even, band_um, found)
@@ -68,10 +87,14 @@ def find_events(level: steps.Level, shapes: Shapes, band_um: float) -> list[step
 def pressure_steps(level: steps.Level) -> list[steps.FoundEvent]:
     """Doors: steps of the air pressure within a few seconds."""
     values = level["mean_ambient_pressure_pa"]
-    found = doors.door_steps(values, level["min_ambient_pressure_pa"], DOOR_LEAST_PA, DOOR_LEAST_SIGMAS)
+    found = doors.door_steps(
+        values, level["min_ambient_pressure_pa"], DOOR_LEAST_PA, DOOR_LEAST_SIGMAS
+    )
     places = values.size * len(doors.LAGS)
     return [
-        steps.event_around("pressure step", level, s.row, 1, s.size, "Pa", steps.confidence(s.sigmas, places))
+        steps.event_around(
+            "pressure step", level, s.row, 1, s.size, "Pa", steps.confidence(s.sigmas, places)
+        )
         for s in found
     ]
 
@@ -84,11 +107,19 @@ def leak_steps(level: steps.Level) -> list[steps.FoundEvent]:
     leak = np.where(whole, leak, np.nan)
     if not np.isfinite(leak).any():
         return []
-    found = steps.steps(leak, half=LEAK_HALF_MIN, skip=1, least=LEAK_LEAST_UM_PER_S, least_sigmas=LEAK_LEAST_SIGMAS)
+    found = steps.steps(
+        leak, half=LEAK_HALF_MIN, skip=1, least=LEAK_LEAST_UM_PER_S, least_sigmas=LEAK_LEAST_SIGMAS
+    )
     before = [float(np.nanmean(leak[max(0, s.row - LEAK_HALF_MIN) : s.row])) for s in found]
     return [
         steps.event_around(
-            "leak step", minutes, s.row, 60, 100 * s.size / old, "%", steps.confidence(s.sigmas, leak.size)
+            "leak step",
+            minutes,
+            s.row,
+            60,
+            100 * s.size / old,
+            "%",
+            steps.confidence(s.sigmas, leak.size),
         )
         for s, old in zip(found, before, strict=True)
         if old > 0 and abs(s.size) >= LEAK_LEAST_SHARE * old
@@ -112,14 +143,22 @@ def laser_glitches(level: steps.Level) -> list[steps.FoundEvent]:
     spans = [(float(time_s[g.first]), float(time_s[g.last])) for g in found]
     return [
         steps.FoundEvent(
-            "laser glitch", a_s, a_s - 30, b_s + 30, g.size_um, "µm", steps.confidence(g.sigmas, time_s.size)
+            "laser glitch",
+            a_s,
+            a_s - 30,
+            b_s + 30,
+            g.size_um,
+            "µm",
+            steps.confidence(g.sigmas, time_s.size),
         )
         for g, (a_s, b_s) in zip(found, spans, strict=True)
     ]
 
 
 def laser_losses(level: steps.Level) -> list[steps.FoundEvent]:
-    """The laser flagged its reading as bad, or gave none; on a bench held without one, the optics."""
+    """The laser flagged its reading as bad, or gave none; on a bench held without one,
+    the optics.
+    """
     quality, seen = level["max_displacement_quality"], np.isfinite(level["mean_displacement_um"])
     bad = (quality > 0) | ~seen
     bad &= (level["state"] == State.HOLD) & (level["rows"] > 0)
@@ -138,8 +177,12 @@ def weather_losses(level: steps.Level) -> list[steps.FoundEvent]:
 
 def _losses(kind: str, lost: BoolArray, level: steps.Level, join: int) -> list[steps.FoundEvent]:
     time_s = level["time_s"]
-    return [steps.FoundEvent(kind, float(time_s[a]), time_s[a] - 5, time_s[b] + 6, b - a + 1.0, "s", 1.0)
-            for a, b in steps.runs(lost, join)]  # fmt: skip
+    return [
+        steps.FoundEvent(
+            kind, float(time_s[a]), time_s[a] - 5, time_s[b] + 6, b - a + 1.0, "s", 1.0
+        )
+        for a, b in steps.runs(lost, join)
+    ]
 
 
 def lateness_bursts(level: steps.Level) -> list[steps.FoundEvent]:
@@ -148,11 +191,18 @@ def lateness_bursts(level: steps.Level) -> list[steps.FoundEvent]:
     usual = float(np.nanmedian(worst)) if np.isfinite(worst).any() else 0.0
     late = worst > max(LATE_LEAST_MS, LATE_LEAST_RATIO * usual)
     return [
-        steps.FoundEvent("lateness burst", float(level["time_s"][a]), level["time_s"][a] - 5, level["time_s"][b] + 6,
-              float(np.nanmax(worst[a : b + 1])), "ms", 1.0)
+        steps.FoundEvent(
+            "lateness burst",
+            float(level["time_s"][a]),
+            level["time_s"][a] - 5,
+            level["time_s"][b] + 6,
+            float(np.nanmax(worst[a : b + 1])),
+            "ms",
+            1.0,
+        )
         for a, b in steps.runs(late, int(LATE_BURST_S))
         if int(late[a : b + 1].sum()) >= LATE_BURST_LEAST
-    ]  # fmt: skip
+    ]
 
 
 def noise_changes(level: steps.Level) -> list[steps.FoundEvent]:
@@ -169,21 +219,34 @@ def noise_changes(level: steps.Level) -> list[steps.FoundEvent]:
     mean = np.bincount(number, error, size) / np.maximum(count, 1)
     spread = np.sqrt(np.bincount(number, (error - mean[number]) ** 2, size) / np.maximum(count, 1))
     value = np.where((count >= 50) & (spread > 0), np.log(np.maximum(spread, 1e-12)), np.nan)
-    found = steps.steps(value, SPREAD_HALF_MIN, 1, least=float(SPREAD_LEAST), least_sigmas=SPREAD_LEAST_SIGMAS)
+    found = steps.steps(
+        value, SPREAD_HALF_MIN, 1, least=float(SPREAD_LEAST), least_sigmas=SPREAD_LEAST_SIGMAS
+    )
     time_s = {"time_s": (first + np.arange(size)) * 60.0}
     return [
         steps.event_around(
-            "noise change", time_s, s.row, 60, float(np.exp(s.size)), "times", steps.confidence(s.sigmas, size)
+            "noise change",
+            time_s,
+            s.row,
+            60,
+            float(np.exp(s.size)),
+            "times",
+            steps.confidence(s.sigmas, size),
         )
         for s in found
     ]
 
 
 def _held(level: steps.Level) -> steps.Level:
-    """The level with NaN where the mirror was not held, so that the start of a hold is not a step."""
+    """The level with NaN where the mirror was not held,
+    so that the start of a hold is not a step.
+    """
     held = level["state"] == State.HOLD
     kept = {"time_s", "rows", "state"}
-    return {name: values if name in kept else np.where(held, values, np.nan) for name, values in level.items()}
+    return {
+        name: values if name in kept else np.where(held, values, np.nan)
+        for name, values in level.items()
+    }
 
 
 def _even(level: steps.Level) -> steps.Level:

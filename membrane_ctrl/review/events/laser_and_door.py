@@ -1,4 +1,6 @@
-"""Laser readings that jump and jump back (spikes within a second, glitches of up to a minute), and doors."""
+"""Laser readings that jump and jump back (spikes within a second, glitches of up to a minute), and
+doors.
+"""
 
 from dataclasses import dataclass, replace
 
@@ -32,7 +34,9 @@ class Glitch:
     sigmas: float
 
 
-def glitches(low_um: Column, mean_um: Column, high_um: Column, usable: BoolArray, calm: BoolArray) -> list[Glitch]:
+def glitches(
+    low_um: Column, mean_um: Column, high_um: Column, usable: BoolArray, calm: BoolArray
+) -> list[Glitch]:
     """Spikes and longer glitches, each once.
 
     Parameters
@@ -40,9 +44,11 @@ def glitches(low_um: Column, mean_um: Column, high_um: Column, usable: BoolArray
     low_um, mean_um, high_um : (n,) arrays
         Minimum, mean and maximum reading of each second.
     usable : (n,) array
-        Seconds in which the mirror is held, and neither a step of the air pressure moved it nor the laser was lost.
+        Seconds in which the mirror is held, and neither a step of the air pressure moved it nor the
+        laser was lost.
     calm : (n,) array
-        Seconds that a barometer confirms as calm: without one, a door closed again looks like a long glitch.
+        Seconds that a barometer confirms as calm: without one, a door closed again looks like a
+        long glitch.
     """
     if not np.isfinite(mean_um).any():
         return []
@@ -58,7 +64,9 @@ def _farthest(low_um: Column, mean_um: Column, high_um: Column) -> Column:
     """(n,) per second, the largest deviation of a reading from the surrounding seconds."""
     rows = np.arange(mean_um.size)
     there = np.isfinite(mean_um)
-    base = ndimage.median_filter(np.interp(rows, rows[there], mean_um[there]), _BASE_S, mode="nearest")
+    base = ndimage.median_filter(
+        np.interp(rows, rows[there], mean_um[there]), _BASE_S, mode="nearest"
+    )
     above, below = high_um - base, base - low_um
     return np.where(above >= below, above, -below)
 
@@ -85,7 +93,9 @@ def _spikes(size_um: Column, mean_um: Column, usable: BoolArray) -> list[Glitch]
 
 
 def _edges(mean_um: Column, usable: BoolArray) -> list[Glitch]:
-    """Steps of the reading within two seconds, each a glitch without an end; `first` is the second of the step."""
+    """Steps of the reading within two seconds, each a glitch without an end; `first` is the second
+    of the step.
+    """
     change = np.full(mean_um.size, np.nan)
     change[1:-1] = mean_um[_EDGE_S:] - mean_um[:-_EDGE_S]
     sigma = local_sigma(change)
@@ -117,12 +127,16 @@ def _pairs(edges: list[Glitch]) -> list[Glitch]:
 
 
 def _back(edge: Glitch, later: list[Glitch]) -> Glitch | None:
-    """The largest opposite edge before the next equal one: a loop at full speed makes smaller ones."""
+    """The largest opposite edge before the next equal one:
+    a loop at full speed makes smaller ones.
+    """
     best = None
     for other in later:
         if other.first > edge.first + GLITCH_LONGEST_S or _alike(edge.size_um, other.size_um):
             break
-        if _alike(edge.size_um, -other.size_um) and (best is None or abs(other.size_um) > abs(best.size_um)):
+        if _alike(edge.size_um, -other.size_um) and (
+            best is None or abs(other.size_um) > abs(best.size_um)
+        ):
             best = other
     return best
 
@@ -133,13 +147,15 @@ def _alike(size_um: float, other_um: float) -> bool:
 
 # A door takes up to 5 s, and a start within a second adds a window; longer changes are weather.
 LAGS = (1, 2, 3, 4, 6, 8)
-# Nine in ten differences are weather: a coarse barometer repeats its value in more than half of the windows.
+# Nine in ten differences are weather: a coarse barometer repeats its value in more than half of the
+# windows.
 _USUAL_SHARE = 0.9
 # Standard deviation of the difference of two rounded values, in rounding steps.
 _ROUNDING = 6**-0.5
 # A slower barometer cannot detect doors.
 _SLOWEST_S = 120
-# A value every third second changes two seconds of three if it comes within one; more is not a period.
+# A value every third second changes two seconds of three if it comes within one; more is not a
+# period.
 _ALWAYS_NEW = 0.85
 # Of the times between new values: an interval that is short by chance is not the period.
 _LOW_SHARE = 0.02
@@ -157,7 +173,9 @@ class _Candidates:
     score: Column
 
 
-def door_steps(mean_pa: Column, reading_pa: Column, least_pa: float, least_sigmas: float) -> list[FoundStep]:
+def door_steps(
+    mean_pa: Column, reading_pa: Column, least_pa: float, least_sigmas: float
+) -> list[FoundStep]:
     """Steps of the air pressure, each once; both of a door that is closed at once.
 
     Parameters
@@ -179,7 +197,11 @@ def door_steps(mean_pa: Column, reading_pa: Column, least_pa: float, least_sigma
     result = []
     for place in chosen:
         row, lag = int(found.row[place]), int(found.lag[place])
-        size = _whole_size(values, row, lag, float(found.size[place])) if every == 1 else float(found.size[place])
+        size = (
+            _whole_size(values, row, lag, float(found.size[place]))
+            if every == 1
+            else float(found.size[place])
+        )
         changes = np.abs(np.diff(mean_pa[row * every : (row + lag) * every + 1]))
         steepest = row * every + 1 + int(np.argmax(np.nan_to_num(changes)))
         result.append(FoundStep(steepest, size, float(found.score[place])))
@@ -201,7 +223,9 @@ def update_s(mean_pa: Column) -> int:
 
 
 def quantum(reading_pa: Column) -> float:
-    """The resolution of the readings, Pa: about the smallest change; almost 0 for a fine barometer."""
+    """The resolution of the readings, Pa: about the smallest change;
+    almost 0 for a fine barometer.
+    """
     change = np.abs(np.diff(reading_pa))
     change = change[np.isfinite(change) & (change > 0)]
     return float(np.quantile(change, _LOW_SHARE)) if change.size else 0.0
@@ -214,8 +238,12 @@ def _candidates(
     for lag in lags:  # one after the other: each takes 20 MB for a month
         change = values[lag:] - values[:-lag]
         sigma = np.fmax(local_sigma(change, _USUAL_SHARE), max(floor_pa, 1e-9))
-        rows = np.flatnonzero((np.abs(change) >= least_pa) & (np.abs(change) >= least_sigmas * sigma))
-        parts.append((rows, np.full(rows.size, lag), change[rows], np.abs(change[rows]) / sigma[rows]))
+        rows = np.flatnonzero(
+            (np.abs(change) >= least_pa) & (np.abs(change) >= least_sigmas * sigma)
+        )
+        parts.append(
+            (rows, np.full(rows.size, lag), change[rows], np.abs(change[rows]) / sigma[rows])
+        )
     row, lag_of, size, score = (np.concatenate(columns) for columns in zip(*parts, strict=True))
     return _Candidates(row, lag_of, size, score)
 

@@ -24,7 +24,9 @@ class FoundStep:
     sigmas: float  # its size over the noise of such differences
 
 
-def steps(values: Column, half: int, skip: int, least: float, least_sigmas: float) -> list[FoundStep]:
+def steps(
+    values: Column, half: int, skip: int, least: float, least_sigmas: float
+) -> list[FoundStep]:
     """Steps of at least `least` and `least_sigmas`, each once.
 
     Parameters
@@ -55,12 +57,16 @@ def steps(values: Column, half: int, skip: int, least: float, least_sigmas: floa
 
 
 def differences(values: Column, half: int, skip: int) -> Column:
-    """(n,) mean of the `half` values after a place minus that before it; NaN at the ends and at gaps."""
+    """(n,) mean of the `half` values after a place minus that before it; NaN at the ends and at
+    gaps.
+    """
     result = np.full(values.size, np.nan)
     span = 2 * half + skip
     if values.size < span:
         return result
-    windows = np.lib.stride_tricks.sliding_window_view(np.asarray(values, dtype=np.float64), half).mean(axis=1)
+    windows = np.lib.stride_tricks.sliding_window_view(
+        np.asarray(values, dtype=np.float64), half
+    ).mean(axis=1)
     middle = half + skip // 2
     count = values.size - span + 1
     result[middle : middle + count] = windows[half + skip :][:count] - windows[:count]
@@ -70,8 +76,8 @@ def differences(values: Column, half: int, skip: int) -> Column:
 def local_sigma(values: Column, share: float = 0.5) -> Column:
     """(n,) robust standard deviation of stretches of the series, constant within each, about 0.
 
-    The quantile `share` of the absolute values is compared with that of a normal distribution. Half (the median) is
-    the most robust, but fails for values that mostly repeat.
+    The quantile `share` of the absolute values is compared with that of a normal distribution. Half
+    (the median) is the most robust, but fails for values that mostly repeat.
     """
     result = np.full(values.size, np.nan)
     sigmas = float(special.ndtri(0.5 * (1 + share)))
@@ -80,12 +86,16 @@ def local_sigma(values: Column, share: float = 0.5) -> Column:
         start = max(0, min(first, values.size - _STRETCH))
         part = values[start : first + _STRETCH]
         part = np.abs(part[np.isfinite(part)])
-        result[first : first + _STRETCH] = np.quantile(part, share) / sigmas if part.size else np.nan
+        result[first : first + _STRETCH] = (
+            np.quantile(part, share) / sigmas if part.size else np.nan
+        )
     return result
 
 
 def confidence(sigmas: float, looked_at: int) -> float:
-    """1 minus the probability that (normal) noise alone makes a step this high anywhere in `looked_at` places."""
+    """1 minus the probability that (normal) noise alone makes a step this high anywhere in
+    `looked_at` places.
+    """
     return float(max(0.0, 1.0 - looked_at * special.erfc(sigmas / np.sqrt(2))))
 
 
@@ -104,18 +114,26 @@ class FoundEvent:
     end_s: float
     size: float  # in `unit`
     unit: str
-    confidence: float  # 1 minus the probability that noise alone looks like this somewhere in the run
+    confidence: (
+        float  # 1 minus the probability that noise alone looks like this somewhere in the run
+    )
 
 
-def event_around(kind: str, table: Level, row: int, half_s: float, size: float, unit: str, sure: float) -> FoundEvent:
+def event_around(
+    kind: str, table: Level, row: int, half_s: float, size: float, unit: str, sure: float
+) -> FoundEvent:
     """An event with a time range of several detection windows around it."""
     time_s = float(table["time_s"][row])
-    return FoundEvent(kind, time_s, time_s - 30 * half_s**0.5, time_s + 30 * half_s**0.5, size, unit, sure)
+    return FoundEvent(
+        kind, time_s, time_s - 30 * half_s**0.5, time_s + 30 * half_s**0.5, size, unit, sure
+    )
 
 
 def widened(flags: BoolArray, rows: int) -> BoolArray:
     """True flags, widened by `rows` on each side."""
-    return np.asarray(ndimage.maximum_filter1d(flags, 2 * rows + 1, mode="constant", cval=0), dtype=bool)
+    return np.asarray(
+        ndimage.maximum_filter1d(flags, 2 * rows + 1, mode="constant", cval=0), dtype=bool
+    )
 
 
 def runs(flags: BoolArray, join: int) -> list[tuple[int, int]]:
@@ -138,7 +156,9 @@ _TIMED_TO_MINUTES = ("leak step", "noise change")
 
 
 def excursions(level: Level, band_um: float, known: Sequence[FoundEvent]) -> list[FoundEvent]:
-    """The 1 s mean of the error leaves the band without a fault, pause, ramp or event that explains it."""
+    """The 1 s mean of the error leaves the band without a fault, pause, ramp or event that explains
+    it.
+    """
     time_s, error_um = level["time_s"], level["mean_error_um"]
     out = (np.abs(error_um) > band_um) & (level["state"] == State.HOLD)
     paused = np.isnan(level["mean_leak_um_per_s"])  # a loop that waits has no estimate of the leak
@@ -152,8 +172,17 @@ def excursions(level: Level, band_um: float, known: Sequence[FoundEvent]) -> lis
     found = []
     for a, b in runs(out, BACK_S):
         worst = a + int(np.nanargmax(np.abs(error_um[a : b + 1])))
-        found.append(FoundEvent("excursion", float(time_s[a]), float(time_s[a]) - 30, float(time_s[b]) + 30,
-                           float(error_um[worst]), "µm", 1.0))  # fmt: skip
+        found.append(
+            FoundEvent(
+                "excursion",
+                float(time_s[a]),
+                float(time_s[a]) - 30,
+                float(time_s[b]) + 30,
+                float(error_um[worst]),
+                "µm",
+                1.0,
+            )
+        )
     return found
 
 
@@ -181,10 +210,22 @@ def shape_jumps(shapes: Shapes, held: BoolArray) -> list[FoundEvent]:
     sigma = _SIGMA_OVER_MAD * float(np.nanmedian(np.abs(size - scale))) + 1e-12
     score = np.nan_to_num((size - scale) / sigma)
     rows = np.flatnonzero((np.nan_to_num(size) >= JUMP_LEAST_UM) & (score >= JUMP_LEAST_SIGMAS))
-    groups = np.split(rows, np.flatnonzero(np.diff(rows) > 2 * JUMP_HALF_CYCLES) + 1) if rows.size else []
+    groups = (
+        np.split(rows, np.flatnonzero(np.diff(rows) > 2 * JUMP_HALF_CYCLES) + 1)
+        if rows.size
+        else []
+    )
     best = [int(group[np.argmax(size[group])]) for group in groups]
     time_s = {"time_s": shapes.time_s[good]}
     return [
-        event_around("shape jump", time_s, row, 60, float(size[row]), "µm", confidence(float(score[row]), size.size))
+        event_around(
+            "shape jump",
+            time_s,
+            row,
+            60,
+            float(size[row]),
+            "µm",
+            confidence(float(score[row]), size.size),
+        )
         for row in best
     ]

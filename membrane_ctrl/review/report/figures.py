@@ -15,7 +15,15 @@ from matplotlib.figure import Figure
 from membrane_ctrl.model import colours, events, run_events, zernike_terms
 from membrane_ctrl.model.arrays import Column
 from membrane_ctrl.model.colours import Colour
-from membrane_ctrl.model.columns import DRAWN, ERROR, TelemetryColumn, aggregated_of, columns_of, plot_title, plots_of
+from membrane_ctrl.model.columns import (
+    DRAWN,
+    ERROR,
+    TelemetryColumn,
+    aggregated_of,
+    columns_of,
+    plot_title,
+    plots_of,
+)
 from membrane_ctrl.model.telemetry import State
 from membrane_ctrl.review.catalogue import one_line, span
 from membrane_ctrl.review.report.json import PumpSeen, timeline
@@ -23,7 +31,14 @@ from membrane_ctrl.review.statistics import shape_review, spectra
 from membrane_ctrl.review.statistics.analysis import Analysis
 from membrane_ctrl.run_files.shapes import without_terms
 
-BLUE, ORANGE, GREEN, RED, VIOLET, GREY = "#0072b2", "#e69f00", "#009e73", "#d55e00", "#cc79a7", "#8a8f98"
+BLUE, ORANGE, GREEN, RED, VIOLET, GREY = (
+    "#0072b2",
+    "#e69f00",
+    "#009e73",
+    "#d55e00",
+    "#cc79a7",
+    "#8a8f98",
+)
 WIDTH_IN = 10.5
 
 _STYLE: dict[Any, Any] = {
@@ -55,7 +70,11 @@ _STYLE: dict[Any, Any] = {
 
 
 # Colours that are too pale on white.
-_DARKER: dict[Colour, str] = {colours.BLUE: BLUE, colours.WHITE: "#444b55", colours.YELLOW: "#a89b00"}
+_DARKER: dict[Colour, str] = {
+    colours.BLUE: BLUE,
+    colours.WHITE: "#444b55",
+    colours.YELLOW: "#a89b00",
+}
 
 
 def on_white(colour: Colour) -> str:
@@ -65,7 +84,9 @@ def on_white(colour: Colour) -> str:
 
 
 @contextmanager
-def picture(rows: int = 1, columns: int = 1, height_in: float = 3.0, **subplots: Any) -> Iterator[tuple[Figure, Any]]:
+def picture(
+    rows: int = 1, columns: int = 1, height_in: float = 3.0, **subplots: Any
+) -> Iterator[tuple[Figure, Any]]:
     """A figure in the report's style and its axes, as `Figure.subplots` gives them."""
     with mpl.rc_context(_STYLE):
         figure = Figure(figsize=(WIDTH_IN, height_in), layout="constrained")
@@ -81,7 +102,11 @@ def svg(figure: Figure) -> str:
         figure.savefig(buffer, format="svg", metadata={"Date": None})
     text = buffer.getvalue()
     text = text[text.index("<svg") :]
-    return re.sub(r'(<svg[^>]*?) width="[^"]*"', r"\1", re.sub(r'(<svg[^>]*?) height="[^"]*"', r"\1", text, count=1))
+    return re.sub(
+        r'(<svg[^>]*?) width="[^"]*"',
+        r"\1",
+        re.sub(r'(<svg[^>]*?) height="[^"]*"', r"\1", text, count=1),
+    )
 
 
 # An occasional missing cycle or second is not a gap.
@@ -90,27 +115,43 @@ _LEAST_S = 5.0
 
 
 def broken_at_gaps(columns: Mapping[str, Column], time_name: str = "time_s") -> dict[str, Column]:
-    """Columns with a row of NaN in every gap, so that a plot does not bridge it with a straight line.
+    """Columns with a row of NaN in every gap, so that a plot does not bridge it with a straight
+    line.
 
-    A gap in the times (s, ascending, in the column `time_name`) is longer than 5 s and three of their usual steps.
+    A gap in the times (s, ascending, in the column `time_name`) is longer than 5 s and three of
+    their usual steps.
     """
     time_s = columns[time_name]
     steps_s = np.diff(time_s)
     longest_s = max(_LEAST_S, _STEPS * float(np.median(steps_s))) if steps_s.size else np.inf
     before = np.flatnonzero(steps_s > longest_s)
-    broken = {name: np.insert(np.asarray(values, np.float64), before + 1, np.nan, axis=0)
-              for name, values in columns.items()}  # fmt: skip
+    broken = {
+        name: np.insert(np.asarray(values, np.float64), before + 1, np.nan, axis=0)
+        for name, values in columns.items()
+    }
     broken[time_name] = np.insert(time_s, before + 1, time_s[before] + steps_s[before] / 2)
     return broken
 
 
 _STATE_COLOURS = {
-    State.STANDBY: "#c9ccd1", State.CHECK: "#9ecae1", State.INFLATE: "#56b4e9", State.SETTLE: ORANGE,
-    State.HOLD: GREEN, State.MANUAL: VIOLET, State.TUNE: "#f0e442", State.LOWER: ORANGE, State.FAULT: RED,
-}  # fmt: skip
+    State.STANDBY: "#c9ccd1",
+    State.CHECK: "#9ecae1",
+    State.INFLATE: "#56b4e9",
+    State.SETTLE: ORANGE,
+    State.HOLD: GREEN,
+    State.MANUAL: VIOLET,
+    State.TUNE: "#f0e442",
+    State.LOWER: ORANGE,
+    State.FAULT: RED,
+}
 # Of a mark's text: more would not fit beside its line; the timeline has the full text.
 _LETTERS_MOST = 40
-_FOUND_COLOURS = {"pressure step": VIOLET, "leak step": ORANGE, "noise change": ORANGE, "shape jump": BLUE}
+_FOUND_COLOURS = {
+    "pressure step": VIOLET,
+    "leak step": ORANGE,
+    "noise change": ORANGE,
+    "shape jump": BLUE,
+}
 
 
 def hours_or_less(time_s: Column | float, span_s: float) -> tuple[Any, str]:
@@ -130,9 +171,13 @@ def overview(analysis: Analysis) -> str:
         plot.axhspan(-band_um, band_um, color=GREEN, alpha=0.09, lw=0)
         ends = level["min_error_um"], level["max_error_um"]
         plot.fill_between(time, *ends, color=GREY, alpha=0.35, lw=0, label="minimum to maximum")
-        plot.plot(time, level["mean_error_um"], color=BLUE, label=f"error, mean of {analysis.level_s:g} s")
+        plot.plot(
+            time, level["mean_error_um"], color=BLUE, label=f"error, mean of {analysis.level_s:g} s"
+        )
         if np.isfinite(level["mean_true_error_um"]).any():
-            plot.plot(time, level["mean_true_error_um"], color=GREEN, lw=0.9, label="true centre (twin)")
+            plot.plot(
+                time, level["mean_true_error_um"], color=GREEN, lw=0.9, label="true centre (twin)"
+            )
         plot.set_ylim(-3 * band_um, 3 * band_um)
         plot.set(ylabel=plot_title(ERROR), title="The run at a glance")
         _found(plot, analysis, span_s)
@@ -152,19 +197,32 @@ def _found(plot: Any, analysis: Analysis, span_s: float) -> None:
     for noted in timeline(analysis):
         if isinstance(event := noted.event, (events.Fault, run_events.Mark)):
             at, _ = hours_or_less(noted.mono_s, span_s)
-            colour, text = (RED, event.name) if isinstance(event, events.Fault) else ("black", event.text)
+            colour, text = (
+                (RED, event.name) if isinstance(event, events.Fault) else ("black", event.text)
+            )
             plot.axvline(at, color=colour, lw=1)
             text = one_line(text)
             if len(text) > _LETTERS_MOST:
                 text = f"{text[: _LETTERS_MOST - 1]}…"
             plot.annotate(
-                text, (at, 0.8 * top), rotation=90, fontsize=7, color=colour, ha="right", va="top", parse_math=False
+                text,
+                (at, 0.8 * top),
+                rotation=90,
+                fontsize=7,
+                color=colour,
+                ha="right",
+                va="top",
+                parse_math=False,
             )
 
 
 def _lane(lane: Any, analysis: Analysis, span_s: float) -> None:
     """States as coloured bars, named where there is room."""
-    states = [(at.mono_s, at.event.state) for at in timeline(analysis) if isinstance(at.event, events.StateEntered)]
+    states = [
+        (at.mono_s, at.event.state)
+        for at in timeline(analysis)
+        if isinstance(at.event, events.StateEntered)
+    ]
     edges_s = [start_s for start_s, _ in states]
     edges_s.append(max(analysis.ticks.end_s, *edges_s, 0.0))
     for (start_s, name), end_s in zip(states, edges_s[1:], strict=True):
@@ -175,16 +233,29 @@ def _lane(lane: Any, analysis: Analysis, span_s: float) -> None:
         (start, end), _ = hours_or_less(np.array([start_s, end_s]), span_s)
         lane.axvspan(start, end, color=_STATE_COLOURS[state], lw=0)
         if end_s - start_s > 0.06 * span_s:
-            lane.text((start + end) / 2, 0.5, state.name.lower(), ha="center", va="center", fontsize=8, color="white")
+            lane.text(
+                (start + end) / 2,
+                0.5,
+                state.name.lower(),
+                ha="center",
+                va="center",
+                fontsize=8,
+                color="white",
+            )
     lane.set(ylim=(0, 1), yticks=[])
     lane.grid(False)
 
 
 def everything_else(analysis: Analysis) -> str:
-    """Position, flow, pump, gas, air, trim, timing: each plot of the table of columns that the run has values for."""
+    """Position, flow, pump, gas, air, trim, timing: each plot of the table of columns that the run
+    has values for.
+    """
     level = broken_at_gaps(analysis.level)
     time, unit = hours_or_less(level["time_s"], analysis.ticks.end_s - analysis.ticks.start_s)
-    plots = {plot: [each for each in aggregated_of(plot) if _has_values(level, each)] for plot in plots_of(*DRAWN)}
+    plots = {
+        plot: [each for each in aggregated_of(plot) if _has_values(level, each)]
+        for plot in plots_of(*DRAWN)
+    }
     shown = {plot: columns for plot, columns in plots.items() if columns and plot != ERROR}
     rows = max(1, math.ceil(len(shown) / 2))
     with picture(rows, 2, 2.1 * rows, sharex=True, squeeze=False) as (figure, axes):
@@ -202,10 +273,14 @@ def _has_values(level: Mapping[str, Column], each: TelemetryColumn) -> bool:
     return bool(np.isfinite(level[f"mean_{each.name}"]).any())
 
 
-def _draw_columns(axis: Any, time: Column, level: Mapping[str, Column], columns: Sequence[TelemetryColumn]) -> None:
+def _draw_columns(
+    axis: Any, time: Column, level: Mapping[str, Column], columns: Sequence[TelemetryColumn]
+) -> None:
     """Draw the means of columns of one plot; of a single one minimum and maximum, too."""
     for each in columns:
-        axis.plot(time, level[f"mean_{each.name}"], color=on_white(each.colour), label=each.short_label)
+        axis.plot(
+            time, level[f"mean_{each.name}"], color=on_white(each.colour), label=each.short_label
+        )
     if len(columns) == 1:
         (each,) = columns
         lowest, highest = level[f"min_{each.name}"], level[f"max_{each.name}"]
@@ -232,7 +307,9 @@ def distributions(analysis: Analysis) -> str:
             if series is None:
                 continue
             if series.allan.tau_s.size:
-                allan.loglog(series.allan.tau_s, series.allan.deviation, "o-", ms=3, color=colour, label=name)
+                allan.loglog(
+                    series.allan.tau_s, series.allan.deviation, "o-", ms=3, color=colour, label=name
+                )
             frequency_hz, power = spectra.density(series.spectrum, series.slow)
             if np.isfinite(power).any():
                 spectrum.loglog(frequency_hz, np.sqrt(power), color=colour, lw=0.8, label=name)
@@ -249,7 +326,9 @@ def pump_history(history: Sequence[PumpSeen], change_max: float) -> str:
     first = next(seen for seen in history if seen.same_curve)
     days = [seen.started_utc for seen in history]
     with picture(1, 2, 2.6) as (figure, (scale, leak)):
-        scale.errorbar(days, [s.scale for s in history], [s.sigma for s in history], fmt="o-", color=BLUE, ms=4)
+        scale.errorbar(
+            days, [s.scale for s in history], [s.sigma for s in history], fmt="o-", color=BLUE, ms=4
+        )
         for limit in (1 - change_max, 1 + change_max):
             scale.axhline(first.scale * limit, color=RED, lw=0.8, ls="--")
         scale.set(title="Pump's flow against its curve ± 1 σ")
@@ -260,28 +339,41 @@ def pump_history(history: Sequence[PumpSeen], change_max: float) -> str:
         return svg(figure)
 
 
-# The paper's stability plots, from the live cycles. More points than pixels only make the file large.
+# The paper's stability plots, from the live cycles. More points than pixels only make the file
+# large.
 _LINE_POINTS = 1500
 _POINT_COLOURS = {"A": BLUE, "B": ORANGE, "C": VIOLET}
 
 
 def stability(shape: shape_review.ShapeReview) -> str:
-    """Heights at A, B, C; camera against laser; the map of the standard deviation; drift of the terms."""
+    """Heights at A, B, C; camera against laser; the map of the standard deviation; drift of the
+    terms.
+    """
     span_s = float(np.ptp(shape.time_s))
     every = max(1, shape.time_s.size // _LINE_POINTS)
-    lines = {"time_s": shape.time_s, "sag": shape.sag_um, "laser": shape.laser_um, **shape.points_um}
+    lines = {
+        "time_s": shape.time_s,
+        "sag": shape.sag_um,
+        "laser": shape.laser_um,
+        **shape.points_um,
+    }
     lines = broken_at_gaps({name: values[::every] for name, values in lines.items()})
     time, unit = hours_or_less(lines["time_s"], span_s)
     with picture(2, 2, 6.2, width_ratios=[1.9, 1]) as (figure, plots):
         points, sd, loops, drift = plots.ravel()
         for name in shape.points_um:
             points.plot(time, lines[name], color=_POINT_COLOURS[name], lw=0.9, label=name)
-        points.set(title=f"Height at A, B and C since the settled cycle at {span(shape.time_s[0])}, µm", xlabel=unit)
+        points.set(
+            title=f"Height at A, B and C since the settled cycle at {span(shape.time_s[0])}, µm",
+            xlabel=unit,
+        )
         points.legend(loc="upper right", ncols=3)
         _map(figure, sd, shape.sd_um, "Standard deviation of the height, µm", "viridis", (0, None))
         for name, (x, y) in shape_review.POINTS.items():
             sd.plot(x, y, "o", ms=4, mfc="none", mec="white")
-            sd.annotate(name, (x, y), color="white", fontsize=8, xytext=(4, 3), textcoords="offset points")
+            sd.annotate(
+                name, (x, y), color="white", fontsize=8, xytext=(4, 3), textcoords="offset points"
+            )
         loops.plot(time, lines["laser"], color=GREY, lw=0.9, label="laser (in the loop)")
         loops.plot(time, lines["sag"], color=BLUE, lw=0.9, label="sag by the camera")
         loops.set(title="Change of the centre by laser and by camera, µm", xlabel=unit)
@@ -303,7 +395,9 @@ def _drift(plot: Any, shape: shape_review.ShapeReview) -> None:
 
 
 def pairs(shape: shape_review.ShapeReview) -> str:
-    """Height change of cycles 1 and 10 minutes apart, the same less its low terms, and its uncertainty."""
+    """Height change of cycles 1 and 10 minutes apart, the same less its low terms, and its
+    uncertainty.
+    """
     with picture(len(shape.pairs), 3, 2.8 * len(shape.pairs), squeeze=False) as (figure, plots):
         for (change, less, sigma), pair in zip(plots, shape.pairs, strict=True):
             title = f"Change over {pair.lag_s:.0f} s, µm (RMS {pair.rms_um:.3f})"
@@ -311,10 +405,14 @@ def pairs(shape: shape_review.ShapeReview) -> str:
                 (change, pair.change_um, title),
                 (less, without_terms(pair.change_um, 4), "Less piston, tilt, defocus, µm"),
             ):
-                most = float(np.nanquantile(np.abs(values), 0.99)) or 1e-3  # a few pixels must not hide the rest
+                most = (
+                    float(np.nanquantile(np.abs(values), 0.99)) or 1e-3
+                )  # a few pixels must not hide the rest
                 _map(figure, plot, values, said, "RdBu_r", (-most, most))
             if pair.sigma_um is None:
-                sigma.text(0.5, 0.5, "no covariance was recorded", ha="center", transform=sigma.transAxes)
+                sigma.text(
+                    0.5, 0.5, "no covariance was recorded", ha="center", transform=sigma.transAxes
+                )
                 sigma.set_axis_off()
             else:
                 title = f"Its uncertainty, 1 σ, µm (mean {pair.mean_sigma_um:.4f})"
@@ -322,8 +420,22 @@ def pairs(shape: shape_review.ShapeReview) -> str:
         return svg(figure)
 
 
-def _map(figure: Any, plot: Any, values: Column, title: str, colours: str, span: tuple[float, float | None]) -> None:
-    shown = plot.imshow(values, extent=(-1, 1, -1, 1), cmap=colours, vmin=span[0], vmax=span[1], interpolation="none")
+def _map(
+    figure: Any,
+    plot: Any,
+    values: Column,
+    title: str,
+    colours: str,
+    span: tuple[float, float | None],
+) -> None:
+    shown = plot.imshow(
+        values,
+        extent=(-1, 1, -1, 1),
+        cmap=colours,
+        vmin=span[0],
+        vmax=span[1],
+        interpolation="none",
+    )
     plot.set(title=title, xticks=[], yticks=[])
     plot.grid(False)
     for side in plot.spines.values():

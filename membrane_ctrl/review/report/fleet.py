@@ -1,4 +1,6 @@
-"""The report of many runs, `report --fleet`: a page with a line for each, and each run's own report beside it."""
+"""The report of many runs, `report --fleet`: a page with a line for each, and each run's own report
+beside it.
+"""
 
 import os
 from collections.abc import Sequence
@@ -22,9 +24,19 @@ from membrane_ctrl.run_files.run import open_run
 
 SCHEMA = "membrane-fleet-report/1"
 _SAME = (
-    "run", "started_utc", "duration_s", "settled_s", "faults_s", "paused_s", "moving_s", "ticks_missed", "band_um",
-    "verdict", "sentence", "exit",
-)  # fmt: skip
+    "run",
+    "started_utc",
+    "duration_s",
+    "settled_s",
+    "faults_s",
+    "paused_s",
+    "moving_s",
+    "ticks_missed",
+    "band_um",
+    "verdict",
+    "sentence",
+    "exit",
+)
 _STYLE = "main{max-width:none}td svg{width:160px}td:first-child{white-space:normal}"
 
 
@@ -52,7 +64,9 @@ class RunReport:
 
 
 def run_report(start: str | None, end: str | None, folder: Path) -> RunReport:
-    """Analyse one run, or the same part of each. A run that cannot be reported gives its reason, whatever it is."""
+    """Analyse one run, or the same part of each. A run that cannot be reported gives its reason,
+    whatever it is.
+    """
     try:
         run = open_run(folder)
         analysis = analyse(run, *part_s(run.origin_utc, start, end))
@@ -67,18 +81,26 @@ def run_report(start: str | None, end: str | None, folder: Path) -> RunReport:
 
 
 def _line(analysis: Analysis, table: dict[str, Any]) -> dict[str, Any]:
-    """The figures of the run's own report that the fleet's page shows, and the names in its event log."""
+    """The figures of the run's own report that the fleet's page shows, and the names in its event
+    log.
+    """
     series = table["true"] or table["reading"]
     seconds = series["windows"][0] if series else {}
     log = [each.event for each in analysis.run.log]
     states = [event.state for event in log if isinstance(event, events.StateEntered)]
-    alarms = {event.alarm for event in log if isinstance(event, run_events.AlarmTold) and event.what == "raised"}
+    alarms = {
+        event.alarm
+        for event in log
+        if isinstance(event, run_events.AlarmTold) and event.what == "raised"
+    }
     return {
         **{name: table[name] for name in _SAME},
         **{name: seconds.get(name) for name in ("mean_um", "std_um", "in_band")},
         "of": "true centre" if table["true"] else "reading",
         "state": states[-1] if states else "",
-        "faults": [each.event.name for each in timeline(analysis) if isinstance(each.event, events.Fault)],
+        "faults": [
+            each.event.name for each in timeline(analysis) if isinstance(each.event, events.Fault)
+        ],
         "alarms": sorted(alarms),
         "found": len(table["found"]),
         "anomalies": [anomaly["name"] for anomaly in table["anomalies"]],
@@ -86,7 +108,9 @@ def _line(analysis: Analysis, table: dict[str, Any]) -> dict[str, Any]:
 
 
 def folders_of(given: Sequence[Path]) -> list[Path]:
-    """The runs that are named, or lie in a named folder, each once; a folder without a run stands for itself."""
+    """The runs that are named, or lie in a named folder, each once; a folder without a run stands
+    for itself.
+    """
     found: list[Path] = []
     for each in given:
         folder, inside = catalogue.resolve(each).resolve(), []
@@ -98,7 +122,9 @@ def folders_of(given: Sequence[Path]) -> list[Path]:
 
 
 def fleet_command(options: FleetOptions) -> int:
-    """Write the fleet's page, its figures as JSON, and each run's report; see `membrane-ctrl report --help`."""
+    """Write the fleet's page, its figures as JSON, and each run's report; see `membrane-ctrl report
+    --help`.
+    """
     folders, out = folders_of(options.runs), options.out.resolve()
     common = Path(os.path.commonpath([folder.parent for folder in folders]))
     workers = options.workers or min(os.cpu_count() or 1, len(folders))
@@ -132,27 +158,50 @@ def fleet_command(options: FleetOptions) -> int:
 
 
 _HEAD = (
-    "run", "started, UTC", "error", "state", "held", "std µm", "mean µm", "in band", "faults", "alarms", "events",
-    "ticks missed", "check",
-)  # fmt: skip
+    "run",
+    "started, UTC",
+    "error",
+    "state",
+    "held",
+    "std µm",
+    "mean µm",
+    "in band",
+    "faults",
+    "alarms",
+    "events",
+    "ticks missed",
+    "check",
+)
 
 
 def _row(line: dict[str, Any], curve: str) -> list[str]:
     """A row of the page's table; its texts come from files, so they are escaped."""
     name = escape(line["name"])
     if "problem" in line:
-        return [name, "", "", "<b>not reported</b>", escape(line["problem"]), *[""] * (len(_HEAD) - 5)]
+        return [
+            name,
+            "",
+            "",
+            "<b>not reported</b>",
+            escape(line["problem"]),
+            *[""] * (len(_HEAD) - 5),
+        ]
     in_band = line["in_band"]
     share = "–" if in_band is None or in_band != in_band else f"{100 * in_band:.4g} %"
     rest = beside(line["faults_s"], line["paused_s"], line["moving_s"], line["duration_s"])
-    faults = f"{len(line['faults'])}: {', '.join(dict.fromkeys(line['faults']))}" if line["faults"] else "0"
+    faults = (
+        f"{len(line['faults'])}: {', '.join(dict.fromkeys(line['faults']))}"
+        if line["faults"]
+        else "0"
+    )
     return [
         f"<a href='{quote(line['report'])}'>{name}</a>",
         f"{datetime.fromisoformat(line['started_utc']):%Y-%m-%d %H:%M}",
         curve,
         escape(f"{line['state']}, {line['exit'] or 'open'}"),
         escape(
-            f"{span(line['settled_s'])} of {span(line['duration_s'])}" + (f" ({', '.join(rest)})" if rest else "")
+            f"{span(line['settled_s'])} of {span(line['duration_s'])}"
+            + (f" ({', '.join(rest)})" if rest else "")
         ),
         *(number(line[key]) for key in ("std_um", "mean_um")),
         share,
@@ -169,5 +218,8 @@ def _page(lines: Sequence[dict[str, Any]], rows: Sequence[Sequence[str]]) -> str
     odd = sum(line.get("verdict") in ("look", "bad") for line in lines)
     said = f"{len(lines)} runs: {odd} to look at, {failed} cannot be reported."
     word = "bad" if failed else "look" if odd else "good"
-    head = f"<style>{_STYLE}</style><header><h1>Fleet</h1></header><p class='verdict {word}'>{said}</p>"
+    head = (
+        f"<style>{_STYLE}</style><header><h1>Fleet</h1></header><p class='verdict "
+        f"{word}'>{said}</p>"
+    )
     return html_page("Fleet", head + html_table(_HEAD, rows))

@@ -1,4 +1,6 @@
-"""The report for people, one self-contained HTML file, and the command `report`, which writes it."""
+"""The report for people, one self-contained HTML file, and the command `report`,
+which writes it.
+"""
 
 import html
 import shlex
@@ -12,7 +14,14 @@ from membrane_ctrl.model import errors, files, plain_json, program
 from membrane_ctrl.review import catalogue
 from membrane_ctrl.review.catalogue import beside, number, part_s, span
 from membrane_ctrl.review.report import figures
-from membrane_ctrl.review.report.json import PumpSeen, pump_change, pump_history, report_table, timeline, verdict
+from membrane_ctrl.review.report.json import (
+    PumpSeen,
+    pump_change,
+    pump_history,
+    report_table,
+    timeline,
+    verdict,
+)
 from membrane_ctrl.review.statistics import compare, drift, shape_review, spectra
 from membrane_ctrl.review.statistics.analysis import Analysis, ErrorSeries, analyse
 from membrane_ctrl.run_files.run import Run, open_run
@@ -45,7 +54,7 @@ dt{color:#667}
 dd{margin:0}
 footer{margin-top:30px;color:#889;font-size:12px}
 @media print{body{background:#fff}main{padding:0}section,figure{break-inside:avoid}}
-"""
+"""  # noqa: E501
 
 
 # A month has thousands of lines; the JSON report has them all.
@@ -59,7 +68,8 @@ def render(
     differences: Sequence[compare.Difference] = (),
     history: Sequence[PumpSeen] = (),
 ) -> str:
-    """HTML of a report, optionally with another run and the differences from it (`compare.compare`).
+    """HTML of a report, optionally with another run and the differences from it
+    (`compare.compare`).
 
     `history`: the pump in this and earlier runs (`pump_history`).
     """
@@ -86,11 +96,16 @@ def render(
     if len(history) > 1:
         parts.append(_section("Pump over the runs", _history(history, run.config.pump.change_max)))
     if other is not None:
-        parts.append(_section(f"Against {_text(other.run.name)}", _compared(analysis, other, differences)))
+        parts.append(
+            _section(f"Against {_text(other.run.name)}", _compared(analysis, other, differences))
+        )
         parts.append(f"<figure>{figures.overview(other)}</figure>")
     parts.append(_section("Timeline", _timeline(analysis)))
     recorded = f", recorded by {_text(run.recorded_by)}" if run.recorded_by else ""
-    parts.append(f"<footer>{program.program_identity()}, report of {_text(str(run.folder.name))}{recorded}</footer>")
+    parts.append(
+        f"<footer>{program.program_identity()}, report of "
+        f"{_text(str(run.folder.name))}{recorded}</footer>"
+    )
     return html_page(run.name, "".join(parts))
 
 
@@ -111,7 +126,8 @@ def _anomalies(analysis: Analysis) -> str:
 def _found(analysis: Analysis) -> str:
     if not analysis.found:
         return (
-            "<p>None: no door, leak step, laser glitch or loss, lateness burst, noise change, excursion or jump.</p>"
+            "<p>None: no door, leak step, laser glitch or loss, lateness burst, noise change, "
+            "excursion or jump.</p>"
         )
     name = _text(shlex.quote(analysis.run.name))
     rows = [
@@ -120,11 +136,14 @@ def _found(analysis: Analysis) -> str:
             event.kind,
             f"{number(event.size)} {_text(event.unit)}",
             f"{event.confidence:.3f}",
-            f"<code>membrane-ctrl review {name} --from +{max(event.start_s, 1):.0f}s --to +{event.end_s:.0f}s</code>",
+            f"<code>membrane-ctrl review {name} --from +{max(event.start_s, 1):.0f}s --to "
+            f"+{event.end_s:.0f}s</code>",
         ]
         for event in analysis.found[:_LINES_MOST]
     ]
-    return html_table(["UTC", "what", "size", "confidence", "look at it"], rows) + _more(len(analysis.found))
+    return html_table(["UTC", "what", "size", "confidence", "look at it"], rows) + _more(
+        len(analysis.found)
+    )
 
 
 def _windows(analysis: Analysis) -> str:
@@ -140,7 +159,9 @@ def _windows(analysis: Analysis) -> str:
         for window in (() if series is None else series.windows)
     ]
     band = f"in ±{analysis.run.config.limits.band_um:g} µm"
-    return html_table(["", "means of", "count", "mean µm", "std µm", "p99.7 µm", "maximum µm", band], rows)
+    return html_table(
+        ["", "means of", "count", "mean µm", "std µm", "p99.7 µm", "maximum µm", band], rows
+    )
 
 
 def _details(analysis: Analysis) -> str:
@@ -148,18 +169,31 @@ def _details(analysis: Analysis) -> str:
     if series is None:
         return ""
     ticks = analysis.ticks
-    single = f"std {number(ticks.raw_reading.std)} µm, {100 * ticks.raw_in_band:.2f} % within the band"
-    return _facts([
-        (f"drift, {name}", _slope(series.drift, "µm/h")),
-        ("not counted as held", ", ".join(beside(ticks.faults_s, ticks.paused_s, ticks.moving_s,
-                                                  ticks.end_s - ticks.start_s)) or "nothing"),
-        ("single readings", f"{single}; {number(ticks.unread_s)} s held without readings"),
-        (f"RMS by frequency, {name}", _bands(series)),
-    ])  # fmt: skip
+    single = (
+        f"std {number(ticks.raw_reading.std)} µm, {100 * ticks.raw_in_band:.2f} % within the band"
+    )
+    return _facts(
+        [
+            (f"drift, {name}", _slope(series.drift, "µm/h")),
+            (
+                "not counted as held",
+                ", ".join(
+                    beside(
+                        ticks.faults_s, ticks.paused_s, ticks.moving_s, ticks.end_s - ticks.start_s
+                    )
+                )
+                or "nothing",
+            ),
+            ("single readings", f"{single}; {number(ticks.unread_s)} s held without readings"),
+            (f"RMS by frequency, {name}", _bands(series)),
+        ]
+    )
 
 
 def _bands(series: ErrorSeries) -> str:
-    there = [band for band in spectra.bands(series.spectrum, series.slow) if band.rms_um == band.rms_um]
+    there = [
+        band for band in spectra.bands(series.spectrum, series.slow) if band.rms_um == band.rms_um
+    ]
     if not there:
         return "too short to say"
     said = [f"{number(b.from_hz)}–{number(b.high_hz)} Hz: {number(b.rms_um)} µm" for b in there]
@@ -171,16 +205,29 @@ def _pump(analysis: Analysis) -> str:
     median, least, most = analysis.leak_um_per_s
     benefit = analysis.benefit
     facts = [
-        ("pump", f"{100 * pump.mean_fraction:.1f} ± {100 * pump.std_fraction:.1f} % of full, running "
-                 f"{100 * pump.running_share:.1f} % of the time"),
-        ("wear", f"{number(pump.starts_per_hour)} starts and {number(pump.travel_per_hour)} full strokes an hour"),
+        (
+            "pump",
+            f"{100 * pump.mean_fraction:.1f} ± {100 * pump.std_fraction:.1f} % of full, running "
+            f"{100 * pump.running_share:.1f} % of the time",
+        ),
+        (
+            "wear",
+            f"{number(pump.starts_per_hour)} starts and {number(pump.travel_per_hour)} full "
+            "strokes an hour",
+        ),
         ("at a limit", f"{100 * pump.saturated_share:.2f} % of ticks"),
         ("leak", f"{number(median)} µm/s (from {number(least)} to {number(most)})"),
-        ("lateness", f"p50 {number(late.quantile(0.5))}, p99 {number(late.quantile(0.99))}, maximum "
-                     f"{number(late.largest)} ms; {ticks.missed_ticks} ticks missed"),
-    ]  # fmt: skip
+        (
+            "lateness",
+            f"p50 {number(late.quantile(0.5))}, p99 {number(late.quantile(0.99))}, maximum "
+            f"{number(late.largest)} ms; {ticks.missed_ticks} ticks missed",
+        ),
+    ]
     if benefit is not None:
-        said = f"std of 1 s means {number(benefit.with_um)} µm, without it {number(benefit.without_um)} µm (computed)"
+        said = (
+            f"std of 1 s means {number(benefit.with_um)} µm, without it "
+            f"{number(benefit.without_um)} µm (computed)"
+        )
         facts.insert(4, ("feed-forward", said))
     return _facts(facts)
 
@@ -197,26 +244,37 @@ def _history(history: Sequence[PumpSeen], change_max: float) -> str:
     ]
     said = pump_change(history, change_max)
     warning = f"<ul class='odd'><li><b>pump</b> {_text(said)}</li></ul>" if said else ""
-    table = html_table(["UTC", "run", "flow / curve of the newest run", "leak and offset µm/s"], rows)
+    table = html_table(
+        ["UTC", "run", "flow / curve of the newest run", "leak and offset µm/s"], rows
+    )
     return f"{warning}<figure>{figures.pump_history(history, change_max)}</figure>{table}"
 
 
 def _shape(shape: shape_review.ShapeReview) -> str:
     drifting = [
-        f"Z{j} {_slope(term, 'µm/h')}" for j, term in enumerate(shape.drift_um_per_hour, 2) if term.significant
+        f"Z{j} {_slope(term, 'µm/h')}"
+        for j, term in enumerate(shape.drift_um_per_hour, 2)
+        if term.significant
     ]
     facts = [
         ("cycles", f"{shape.time_s.size} used of {shape.cycles}, {shape.rejected} rejected"),
-        ("changes are since", f"the first settled one, at {span(float(shape.time_s[0]))} of the run"),
+        (
+            "changes are since",
+            f"the first settled one, at {span(float(shape.time_s[0]))} of the run",
+        ),
         ("standard deviation", f"{number(shape.mean_sd_um)} µm, mean over the area"),
-        ("A, B, C", ", ".join(f"{name} {number(float(v.std()))} µm" for name, v in shape.points_um.items())),
+        (
+            "A, B, C",
+            ", ".join(f"{name} {number(float(v.std()))} µm" for name, v in shape.points_um.items()),
+        ),
         ("drifting terms", ", ".join(drifting) or "none"),
         ("sag by camera − laser", _slope(shape.disagreement, "µm/h")),
     ]
     facts += [
         (
             f"{pair.lag_s:.0f} s apart",
-            f"RMS change {number(pair.rms_um)} µm (pair shown), {number(pair.all_rms_um)} µm (all {pair.pairs}); "
+            f"RMS change {number(pair.rms_um)} µm (pair shown), {number(pair.all_rms_um)} µm "
+            f"(all {pair.pairs}); "
             f"uncertainty {number(pair.mean_sigma_um)} µm",
         )
         for pair in shape.pairs
@@ -224,9 +282,19 @@ def _shape(shape: shape_review.ShapeReview) -> str:
     return _facts(facts)
 
 
-def _compared(analysis: Analysis, other: Analysis, differences: Sequence[compare.Difference]) -> str:
+def _compared(
+    analysis: Analysis, other: Analysis, differences: Sequence[compare.Difference]
+) -> str:
     rows = [
-        [d.name, number(d.ours), number(d.theirs), d.unit, d.said, number(d.p_value, 2), _text(d.note)]
+        [
+            d.name,
+            number(d.ours),
+            number(d.theirs),
+            d.unit,
+            d.said,
+            number(d.p_value, 2),
+            _text(d.note),
+        ]
         for d in differences
     ]
     _, sentence = verdict(other)
@@ -239,7 +307,11 @@ def _compared(analysis: Analysis, other: Analysis, differences: Sequence[compare
 def _timeline(analysis: Analysis) -> str:
     told = timeline(analysis)
     rows = [
-        [f"{analysis.run.utc(each.mono_s):%Y-%m-%d %H:%M:%S}", _text(each.event.kind), _text(each.event.sentence)]
+        [
+            f"{analysis.run.utc(each.mono_s):%Y-%m-%d %H:%M:%S}",
+            _text(each.event.kind),
+            _text(each.event.sentence),
+        ]
         for each in told[:_LINES_MOST]
     ]
     return html_table(["UTC", "what", ""], rows) + _more(len(told))
@@ -261,14 +333,19 @@ def _section(title: str, body: str) -> str:
 
 
 def _facts(facts: Iterable[tuple[str, str]]) -> str:
-    return "<dl>" + "".join(f"<dt>{_text(name)}</dt><dd>{said}</dd>" for name, said in facts) + "</dl>"
+    return (
+        "<dl>" + "".join(f"<dt>{_text(name)}</dt><dd>{said}</dd>" for name, said in facts) + "</dl>"
+    )
 
 
 def html_table(head: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
     """A table; its cells are HTML."""
     cells = "".join(f"<th>{title}</th>" for title in head)
     body = "".join("<tr>" + "".join(f"<td>{cell}</td>" for cell in row) + "</tr>" for row in rows)
-    return f"<div class='scroll'><table><thead><tr>{cells}</tr></thead><tbody>{body}</tbody></table></div>"
+    return (
+        "<div "
+        f"class='scroll'><table><thead><tr>{cells}</tr></thead><tbody>{body}</tbody></table></div>"
+    )
 
 
 def _text(text: str) -> str:
@@ -282,13 +359,22 @@ _SHOWN_MOST = 20
 
 
 def report_command(
-    run: Path, out: Path | None, compare_with: Path | None, start: str | None, end: str | None, json: bool
+    run: Path,
+    out: Path | None,
+    compare_with: Path | None,
+    start: str | None,
+    end: str | None,
+    json: bool,
 ) -> int:
     """Write `report.html` and `report.json`; see `membrane-ctrl report --help`."""
     began_s = time.monotonic()
     opened = open_run(catalogue.resolve(run))
     analysis = analyse(opened, *part_s(opened.origin_utc, start, end))
-    other = None if compare_with is None else _other(open_run(catalogue.resolve(compare_with)), start, end)
+    other = (
+        None
+        if compare_with is None
+        else _other(open_run(catalogue.resolve(compare_with)), start, end)
+    )
     differences = [] if other is None else compare.compare(analysis, other)
     history = pump_history(opened.folder)
     table = report_table(analysis) | {"pump_over_runs": [asdict(seen) for seen in history]}
@@ -297,7 +383,9 @@ def report_command(
             "run": other.run.name,
             "whole_run": not other.is_part,
             "report": report_table(other),
-            "differences": [asdict(difference) | {"said": difference.said} for difference in differences],
+            "differences": [
+                asdict(difference) | {"said": difference.said} for difference in differences
+            ],
         }
     folder = out.resolve() if out else opened.folder / "report"  # follow a link that the user names
     text = plain_json.dumps(table, indent=1)
@@ -321,7 +409,9 @@ def write_report(folder: Path, text: str, page: str) -> None:
 
 
 def _other(run: Run, start: str | None, end: str | None) -> Analysis:
-    """The run to compare with: the same part if counted from the start, else all, as times of day differ."""
+    """The run to compare with: the same part if counted from the start, else all, as times of day
+    differ.
+    """
     from_start = all(text is None or text.strip().startswith("+") for text in (start, end))
     return analyse(run, *part_s(run.origin_utc, start, end)) if from_start else analyse(run)
 
@@ -331,7 +421,10 @@ def _say(analysis: Analysis, other: Analysis | None, folder: Path, took_s: float
         print(f"note: {note}", file=sys.stderr)
     print(verdict(analysis)[1])
     for event in analysis.found[:_SHOWN_MOST]:
-        print(f"  {analysis.run.utc(event.time_s):%Y-%m-%d %H:%M:%S}  {event.kind}, {event.size:.3g} {event.unit}")
+        print(
+            f"  {analysis.run.utc(event.time_s):%Y-%m-%d %H:%M:%S}  {event.kind}, "
+            f"{event.size:.3g} {event.unit}"
+        )
     if len(analysis.found) > _SHOWN_MOST:
         print(f"  and {len(analysis.found) - _SHOWN_MOST} more in the report")
     if other is not None:

@@ -88,12 +88,18 @@ def report_table(analysis: Analysis) -> dict[str, Any]:
         "std_single_ticks_um": ticks.raw_reading.std,
         "reading": _series(analysis.reading),
         "true": _series(analysis.true),
-        "histogram": {"edges_um": list(ticks.histogram_um), "counts": [int(n) for n in ticks.histogram_counts]},
+        "histogram": {
+            "edges_um": list(ticks.histogram_um),
+            "counts": [int(n) for n in ticks.histogram_counts],
+        },
         "pump": asdict(ticks.pump),
         "leak_um_per_s": dict(zip(("median", "min", "max"), analysis.leak_um_per_s, strict=True)),
         "feedforward": None
         if analysis.benefit is None
-        else {"std_1s_with_um": analysis.benefit.with_um, "std_1s_without_um": analysis.benefit.without_um},
+        else {
+            "std_1s_with_um": analysis.benefit.with_um,
+            "std_1s_without_um": analysis.benefit.without_um,
+        },
         "lateness_ms": {"p50": late.quantile(0.5), "p99": late.quantile(0.99), "max": late.largest},
         "timeline": [each.line for each in timeline(analysis)],
         "found": [asdict(event) for event in analysis.found],
@@ -110,7 +116,11 @@ def timeline(analysis: Analysis) -> list[LoggedEvent]:
     if not any(isinstance(each.event, events.StateEntered) for each in told):
         time_s, codes = analysis.level["time_s"], analysis.level["state"]
         lines = (
-            {"mono_s": float(time_s[row]), "kind": "state", "state": State(int(codes[row])).name.lower()}
+            {
+                "mono_s": float(time_s[row]),
+                "kind": "state",
+                "state": State(int(codes[row])).name.lower(),
+            }
             for row in range(codes.size)
             if math.isfinite(codes[row]) and (row == 0 or codes[row] != codes[row - 1])
         )
@@ -147,19 +157,25 @@ def _shape(shape: shape_review.ShapeReview) -> dict[str, Any]:
         "reference_s": float(shape.time_s[0]),
         "mean_sd_um": shape.mean_sd_um,
         "points_sd_um": {name: float(values.std()) for name, values in shape.points_um.items()},
-        "drift_um_per_hour": {f"Z{j}": _slope(term) for j, term in enumerate(shape.drift_um_per_hour, 2)},
+        "drift_um_per_hour": {
+            f"Z{j}": _slope(term) for j, term in enumerate(shape.drift_um_per_hour, 2)
+        },
         "sag_minus_laser_um_per_hour": _slope(shape.disagreement),
         "sag_std_um": float(shape.sag_um.std()),
         "laser_std_um": float(shape.laser_um.std()),
         "pairs": [
-            {name: getattr(pair, name) for name in ("first_s", "lag_s", "rms_um", "mean_sigma_um", "pairs")}
+            {
+                name: getattr(pair, name)
+                for name in ("first_s", "lag_s", "rms_um", "mean_sigma_um", "pairs")
+            }
             | {"all_pairs_rms_um": pair.all_rms_um}
             for pair in shape.pairs
         ],
     }
 
 
-# The pump over the weeks, as the runs of one bench have learned it by their probe (`pump.probe_um`).
+# The pump over the weeks, as the runs of one bench have learned it by their probe
+# (`pump.probe_um`).
 
 _LOOKED_BACK = 400  # runs
 _CERTAIN_SIGMAS = 3.0
@@ -178,15 +194,21 @@ class PumpSeen:
 
 
 def pump_change(history: Sequence[PumpSeen], change_max: float) -> str:
-    """Words for a certain change beyond the limit since the first run on the present curve; empty without one."""
+    """Words for a certain change beyond the limit since the first run on the present curve; empty
+    without one.
+    """
     if not history:
         return ""
     newest, first = history[-1], next(seen for seen in history if seen.same_curve)
-    change, sigma = newest.scale / first.scale - 1, math.hypot(newest.sigma, first.sigma) / first.scale
+    change, sigma = (
+        newest.scale / first.scale - 1,
+        math.hypot(newest.sigma, first.sigma) / first.scale,
+    )
     if abs(change) <= max(change_max, _CERTAIN_SIGMAS * sigma):
         return ""
     return (
-        f"the pump gives {100 * abs(change):.0f} % {'less' if change < 0 else 'more'} than in {first.run} "
+        f"the pump gives {100 * abs(change):.0f} % {'less' if change < 0 else 'more'} than "
+        f"in {first.run} "
         f"(+- {100 * sigma:.0f} %): check it, then `tune pump`"
     )
 

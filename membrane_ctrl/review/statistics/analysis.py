@@ -1,4 +1,6 @@
-"""All figures of a run's report, computed once; `review/report/json.py` and `html.py` only write them."""
+"""All figures of a run's report, computed once; `review/report/json.py` and `html.py` only write
+them.
+"""
 
 import math
 from collections import Counter
@@ -15,7 +17,14 @@ from membrane_ctrl.review.events.found import LEVEL_COLUMNS, find_events
 from membrane_ctrl.review.events.steps import FoundEvent
 from membrane_ctrl.review.statistics import shape_review, spectra
 from membrane_ctrl.review.statistics.drift import FittedSlope, slope
-from membrane_ctrl.review.statistics.hold_pass import ERROR, KEPT_AWAY, READING, TRUE, HoldPass, hold_pass
+from membrane_ctrl.review.statistics.hold_pass import (
+    ERROR,
+    KEPT_AWAY,
+    READING,
+    TRUE,
+    HoldPass,
+    hold_pass,
+)
 from membrane_ctrl.review.statistics.spectra import WindowStatistics, describe, window_means
 from membrane_ctrl.run_files import summary
 from membrane_ctrl.run_files.run import Block, Run
@@ -25,9 +34,11 @@ WINDOWS_S = (1, 4, 60)
 _PICTURE_ROWS = 9000
 # The slope is fitted to minutes or, in a short run, to seconds.
 _SLOPE_MINUTES_FROM_S = 3600.0
-# A straight line bridges a missed tick or a glitch; otherwise no segment of a spectrum would be complete.
+# A straight line bridges a missed tick or a glitch; otherwise no segment of a spectrum would be
+# complete.
 FILLED_S = 0.5
-# Of the 1 s means, whose spectrum is used below 0.1 Hz: gaps left by a laser without light for a moment.
+# Of the 1 s means, whose spectrum is used below 0.1 Hz: gaps left by a laser without light for a
+# moment.
 _FILLED_SECONDS = 5
 # A day has slower and larger motions than any hold; longer means add nothing to the slope.
 _ALLAN_LONGEST_S = 1e5
@@ -41,7 +52,8 @@ class ErrorSeries:
     seconds_um: Column  # (2, n): times and means of the 1 s windows
     allan: spectra.Allan
     spectrum: spectra.Spectrum  # of the ticks
-    # Of the 1 s means, in segments of half the hold: for motion slower than the segments of `spectrum`
+    # Of the 1 s means, in segments of half the hold: for motion slower than the segments of
+    # `spectrum`
     slow: spectra.Spectrum
     drift: FittedSlope  # µm per hour
 
@@ -119,7 +131,9 @@ def analyse(run: Run, start_s: float = -math.inf, end_s: float = math.inf) -> An
     seconds = run.level(1.0, start_s, end_s, LEVEL_COLUMNS)
     if not seconds["time_s"].size:
         known = "".join(f"; {note}" for note in run.notes)
-        raise errors.InputError(f"{run.folder}: nothing to report: no telemetry in this part of the run{known}")
+        raise errors.InputError(
+            f"{run.folder}: nothing to report: no telemetry in this part of the run{known}"
+        )
     span_s = (float(seconds["time_s"][0]), float(seconds["time_s"][-1]) + 1.0)
     found, shape = _found_and_shape(run, seconds, start_s, end_s)
     del seconds  # a month takes a quarter of a GB, and the next steps need more
@@ -130,10 +144,23 @@ def analyse(run: Run, start_s: float = -math.inf, end_s: float = math.inf) -> An
     true = _series(run, ticks, TRUE)
     benefit = _benefit(run, ticks, true is not None)
     leak = _leak(level)
-    odd = _anomalies(run, (start_s, end_s), ticks, reading, true, leak[0], _tracking(level), found, shape)
+    odd = _anomalies(
+        run, (start_s, end_s), ticks, reading, true, leak[0], _tracking(level), found, shape
+    )
     return Analysis(
-        run, (start_s, end_s), ticks, level, level_s, reading, true, benefit, leak, found, shape, odd
-    )  # fmt: skip
+        run,
+        (start_s, end_s),
+        ticks,
+        level,
+        level_s,
+        reading,
+        true,
+        benefit,
+        leak,
+        found,
+        shape,
+        odd,
+    )
 
 
 def _found_and_shape(
@@ -156,7 +183,9 @@ def _series(run: Run, ticks: HoldPass, which: int) -> ErrorSeries | None:
         return None
     means = {w: window_means(second, counts, sums[ERROR], w, rate_hz) for w in WINDOWS_S}
     grid = ticks.reading_um if which == READING else ticks.true_um
-    grid = fill_short_gaps(grid[_first(grid) : grid.size - _first(grid[::-1])], round(FILLED_S * rate_hz))
+    grid = fill_short_gaps(
+        grid[_first(grid) : grid.size - _first(grid[::-1])], round(FILLED_S * rate_hz)
+    )
     longest = max(1, min(grid.size // 4, round(_ALLAN_LONGEST_S * rate_hz)))
     lengths = 2 ** np.arange(int(np.log2(longest)) + 1)
     minutes = ticks.hold_s >= _SLOPE_MINUTES_FROM_S
@@ -171,7 +200,8 @@ def _series(run: Run, ticks: HoldPass, which: int) -> ErrorSeries | None:
 
 
 def slow_spectrum(time_s: Column, means: Column) -> spectra.Spectrum:
-    """Spectrum of 1 s means in segments half as long as the longest gapless stretch: three in a whole hold.
+    """Spectrum of 1 s means in segments half as long as the longest gapless stretch: three in a
+    whole hold.
 
     `time_s` (n,) are the middles of the seconds; gaps up to 5 s are bridged.
     """
@@ -208,7 +238,9 @@ def _benefit(run: Run, ticks: HoldPass, true: bool) -> Benefit | None:
         return None
     error = sums[ERROR]
     _, held = window_means(second, counts, error, 1, run.config.loop.rate_hz)
-    without = np.stack(window_means(second, counts, error + sums[KEPT_AWAY], 1, run.config.loop.rate_hz))
+    without = np.stack(
+        window_means(second, counts, error + sums[KEPT_AWAY], 1, run.config.loop.rate_hz)
+    )
     return Benefit(float(held.std()), float(without[1].std()), without) if held.size else None
 
 
@@ -235,8 +267,10 @@ _BIAS_MOST_UM = 0.1
 _LATE_P99_MOST_MS = 5.0
 _REJECTED_MOST = 0.02
 _THIN = (
-    "without every tick: means are those of the 1 s level; single readings, their histogram, spectrum, Allan "
-    "deviation and pump are those of the existing ticks, and the benefit of the feed-forward is unknown"
+    "without every tick: means are those of the 1 s level; single readings, their histogram, "
+    "spectrum, Allan "
+    "deviation and pump are those of the existing ticks, and the benefit of the feed-forward "
+    "is unknown"
 )
 # Every hold waits a few seconds for its first cycles.
 _TRACKING_LEAST = 0.8
@@ -260,36 +294,70 @@ def _anomalies(
 ) -> tuple[Anomaly, ...]:
     """All anomalies of a part of a run, the gravest first."""
     odd = [Anomaly("incomplete recording", note) for note in run.notes]
-    names = Counter(each.event.name for each in run.log_between(*part_s) if isinstance(each.event, events.Fault))
-    odd += [Anomaly("fault", f"{name}, {count} time{'s' * (count > 1)}") for name, count in names.most_common()]
+    names = Counter(
+        each.event.name for each in run.log_between(*part_s) if isinstance(each.event, events.Fault)
+    )
+    odd += [
+        Anomaly("fault", f"{name}, {count} time{'s' * (count > 1)}")
+        for name, count in names.most_common()
+    ]
     if reading is None:
         odd.append(Anomaly("never settled", "no tick counts as held: there are no hold statistics"))
     series = true or reading
     if series is not None:
         seconds = series.windows[0]
         if seconds.count and not seconds.in_band >= _IN_BAND_LEAST:
-            odd.append(Anomaly("band left", f"{100 * seconds.in_band:.3g} % of 1 s means within the band"))
+            odd.append(
+                Anomaly("band left", f"{100 * seconds.in_band:.3g} % of 1 s means within the band")
+            )
         if seconds.count and abs(seconds.mean_um) > _BIAS_MOST_UM:
             odd.append(Anomaly("bias", f"{seconds.mean_um:+.3f} µm on average"))
         if series.drift.significant:
             odd.append(Anomaly("drift", _of(series.drift, "um/h")))
     if ticks.paused_s:
-        odd.append(Anomaly("paused", f"{span(ticks.paused_s)}: the pump gave its mean flow, nothing held the mirror"))
+        odd.append(
+            Anomaly(
+                "paused",
+                f"{span(ticks.paused_s)}: the pump gave its mean flow, nothing held the mirror",
+            )
+        )
     if ticks.missed_ticks:
-        odd.append(Anomaly("missed ticks", f"{ticks.missed_ticks} of {ticks.ticks + ticks.missed_ticks}"))
+        odd.append(
+            Anomaly("missed ticks", f"{ticks.missed_ticks} of {ticks.ticks + ticks.missed_ticks}")
+        )
     if ticks.thin_s:
         odd.append(Anomaly("thinned ticks", f"{span(ticks.thin_s)} held {_THIN}"))
     if ticks.uncovered_s:
-        odd.append(Anomaly("thinned ticks", f"{span(ticks.uncovered_s)} held not counted: few ticks, no level"))
+        odd.append(
+            Anomaly(
+                "thinned ticks", f"{span(ticks.uncovered_s)} held not counted: few ticks, no level"
+            )
+        )
     if ticks.lateness_ms.quantile(0.99) > _LATE_P99_MOST_MS:
         odd.append(Anomaly("late ticks", f"p99 is {ticks.lateness_ms.quantile(0.99):.1f} ms"))
     if leak_um_per_s < _LEAK_LEAST_UM_PER_S:
-        odd.append(Anomaly("too tight", f"a leak of {leak_um_per_s:.2f} µm/s leaves the pump no way to lower"))
+        odd.append(
+            Anomaly(
+                "too tight", f"a leak of {leak_um_per_s:.2f} µm/s leaves the pump no way to lower"
+            )
+        )
     if ticks.pump.saturated_share > _SATURATED_MOST:
-        odd.append(Anomaly("saturation", f"{100 * ticks.pump.saturated_share:.1f} % of ticks at a limit of the flow"))
+        odd.append(
+            Anomaly(
+                "saturation",
+                f"{100 * ticks.pump.saturated_share:.1f} % of ticks at a limit of the flow",
+            )
+        )
     untracked_s = (1 - tracking_share) * ticks.hold_s
-    if run.config.shape.enabled and tracking_share < _TRACKING_LEAST and untracked_s > _UNTRACKED_MOST_S:
-        seen = f"tracked {100 * tracking_share:.0f} % of the time held; else the centre follows the laser's mount"
+    if (
+        run.config.shape.enabled
+        and tracking_share < _TRACKING_LEAST
+        and untracked_s > _UNTRACKED_MOST_S
+    ):
+        seen = (
+            f"tracked {100 * tracking_share:.0f} % of the time held; else the centre follows the "
+            "laser's mount"
+        )
         odd.append(Anomaly("shape loop", seen))
     if shape is not None:
         if shape.rejected > _REJECTED_MOST * shape.cycles:

@@ -14,7 +14,9 @@ from membrane_ctrl.review.statistics.drift import FittedSlope, mean_p, spread_p,
 
 _SIGNIFICANT = 0.01
 _SHORT = "no test: too short"
-_STRETCHES = "tests these two stretches of time, not the settings: the weather differs from day to day"
+_STRETCHES = (
+    "tests these two stretches of time, not the settings: the weather differs from day to day"
+)
 
 
 @dataclass(frozen=True, slots=True)
@@ -42,13 +44,21 @@ class Difference:
 def compare(ours: Analysis, theirs: Analysis) -> list[Difference]:
     """Differences of two analyses.
 
-    Means are tested between blocks: each run gives one every five minutes, and Welch's t test asks whether the two
-    sets differ. Spreads are tested so, too, and as a whole (`spread_p`); slopes by their own standard errors.
+    Means are tested between blocks: each run gives one every five minutes, and Welch's t test asks
+    whether the two sets differ. Spreads are tested so, too, and as a whole (`spread_p`); slopes by
+    their own standard errors.
     """
     found: list[Difference] = []
-    for name, a, b in (("reading", ours.reading, theirs.reading), ("true centre", ours.true, theirs.true)):
+    for name, a, b in (
+        ("reading", ours.reading, theirs.reading),
+        ("true centre", ours.true, theirs.true),
+    ):
         if a is not None and b is not None:
-            offset_um = math.hypot(_reference_um(ours), _reference_um(theirs)) if name == "true centre" else 0.0
+            offset_um = (
+                math.hypot(_reference_um(ours), _reference_um(theirs))
+                if name == "true centre"
+                else 0.0
+            )
             tracks = name == "true centre" and (_tracks(ours) or _tracks(theirs))
             found += _series(name, a, b, offset_um, tracks)
     if ours.benefit is not None and theirs.benefit is not None:
@@ -61,16 +71,36 @@ def compare(ours: Analysis, theirs: Analysis) -> list[Difference]:
     return found
 
 
-def _series(name: str, a: ErrorSeries, b: ErrorSeries, offset_um: float, tracks: bool) -> list[Difference]:
+def _series(
+    name: str, a: ErrorSeries, b: ErrorSeries, offset_um: float, tracks: bool
+) -> list[Difference]:
     first = a.windows[0], b.windows[0]
     mean = mean_p(a.seconds_um, b.seconds_um, offset=offset_um)
     found = [
-        _tested(f"{name}, mean", "µm", first[0].mean_um, first[1].mean_um, mean, _of_mean(offset_um, tracks)),
-        _tested(f"{name}, std of 1 s", "µm", first[0].std_um, first[1].std_um, spread_p(a.seconds_um, b.seconds_um)),
-        _tested(f"{name}, drift", "µm/h", a.drift.per_hour, b.drift.per_hour, _slope_p(a.drift, b.drift)),
+        _tested(
+            f"{name}, mean",
+            "µm",
+            first[0].mean_um,
+            first[1].mean_um,
+            mean,
+            _of_mean(offset_um, tracks),
+        ),
+        _tested(
+            f"{name}, std of 1 s",
+            "µm",
+            first[0].std_um,
+            first[1].std_um,
+            spread_p(a.seconds_um, b.seconds_um),
+        ),
+        _tested(
+            f"{name}, drift", "µm/h", a.drift.per_hour, b.drift.per_hour, _slope_p(a.drift, b.drift)
+        ),
     ]
     for x, y in zip(a.windows[1:], b.windows[1:], strict=True):
-        parts = [np.stack(windowed(series.seconds_um[0], series.seconds_um[1], x.window_s)) for series in (a, b)]
+        parts = [
+            np.stack(windowed(series.seconds_um[0], series.seconds_um[1], x.window_s))
+            for series in (a, b)
+        ]
         p_value = spread_p(parts[0], parts[1], x.window_s)
         found.append(_tested(f"{name}, std of {x.window_s:g} s", "µm", x.std_um, y.std_um, p_value))
     return found
@@ -98,15 +128,39 @@ def _loop(ours: Analysis, theirs: Analysis) -> list[Difference]:
     elif math.isnan(late_p):
         late_note = _SHORT
     return [
-        _tested("leak", "µm/s", ours.leak_um_per_s[0], theirs.leak_um_per_s[0],
-                mean_p(leak[0], leak[1], window_s), _STRETCHES),
-        _tested("pump, mean", "of full", mine.pump.mean_fraction, other.pump.mean_fraction,
-                mean_p(pump[0], pump[1], window_s), _STRETCHES),
-        Difference("pump strokes", "1/h", mine.pump.travel_per_hour, other.pump.travel_per_hour, math.nan,
-                   "no test: one sum over the run"),
-        Difference("lateness p99", "ms", mine.lateness_ms.quantile(0.99), other.lateness_ms.quantile(0.99),
-                   late_p, late_note),
-    ]  # fmt: skip
+        _tested(
+            "leak",
+            "µm/s",
+            ours.leak_um_per_s[0],
+            theirs.leak_um_per_s[0],
+            mean_p(leak[0], leak[1], window_s),
+            _STRETCHES,
+        ),
+        _tested(
+            "pump, mean",
+            "of full",
+            mine.pump.mean_fraction,
+            other.pump.mean_fraction,
+            mean_p(pump[0], pump[1], window_s),
+            _STRETCHES,
+        ),
+        Difference(
+            "pump strokes",
+            "1/h",
+            mine.pump.travel_per_hour,
+            other.pump.travel_per_hour,
+            math.nan,
+            "no test: one sum over the run",
+        ),
+        Difference(
+            "lateness p99",
+            "ms",
+            mine.lateness_ms.quantile(0.99),
+            other.lateness_ms.quantile(0.99),
+            late_p,
+            late_note,
+        ),
+    ]
 
 
 def _figure(ours: Analysis, theirs: Analysis) -> list[Difference]:
@@ -114,21 +168,34 @@ def _figure(ours: Analysis, theirs: Analysis) -> list[Difference]:
     assert theirs.shape is not None
     cycle_s = max(float(np.median(np.diff(shape.time_s))) for shape in (ours.shape, theirs.shape))
     points = [
-        spread_p(np.stack((ours.shape.time_s, height)), np.stack((theirs.shape.time_s, theirs.shape.points_um[name])),
-                 cycle_s)
+        spread_p(
+            np.stack((ours.shape.time_s, height)),
+            np.stack((theirs.shape.time_s, theirs.shape.points_um[name])),
+            cycle_s,
+        )
         for name, height in ours.shape.points_um.items()
-    ]  # fmt: skip
+    ]
     # the smallest p of three tests, times three (Bonferroni)
     least = float(np.minimum(1.0, len(points) * np.min(points)))
     parting = ours.shape.disagreement, theirs.shape.disagreement
     return [
-        _tested("figure, mean SD", "µm", ours.shape.mean_sd_um, theirs.shape.mean_sd_um, least,
-                "tested at A, B and C"),
-        _tested("sag − laser", "µm/h", parting[0].per_hour, parting[1].per_hour, _slope_p(*parting)),
-    ]  # fmt: skip
+        _tested(
+            "figure, mean SD",
+            "µm",
+            ours.shape.mean_sd_um,
+            theirs.shape.mean_sd_um,
+            least,
+            "tested at A, B and C",
+        ),
+        _tested(
+            "sag − laser", "µm/h", parting[0].per_hour, parting[1].per_hour, _slope_p(*parting)
+        ),
+    ]
 
 
-def _tested(name: str, unit: str, ours: float, theirs: float, p_value: float, note: str = "") -> Difference:
+def _tested(
+    name: str, unit: str, ours: float, theirs: float, p_value: float, note: str = ""
+) -> Difference:
     """A row with a test; it states if that was not possible."""
     return Difference(name, unit, ours, theirs, p_value, _SHORT if math.isnan(p_value) else note)
 
@@ -145,10 +212,11 @@ def _tracks(analysis: Analysis) -> bool:
 
 
 def _reference_um(analysis: Analysis) -> float:
-    """Standard error (µm) of the shape loop's reference, an offset of the true centre for the whole run.
+    """Standard error (µm) of the shape loop's reference, an offset of the true centre for the whole
+    run.
 
-    From the observed scatter of sag minus laser between cycles; 0 if the loop does not track or there are
-    too few cycles.
+    From the observed scatter of sag minus laser between cycles; 0 if the loop does not track or
+    there are too few cycles.
     """
     shape = analysis.shape
     if shape is None or shape.time_s.size < 2 * SHAPES or not _tracks(analysis):

@@ -1,4 +1,6 @@
-"""A straight line through correlated samples, with a confidence interval that allows for the correlation."""
+"""A straight line through correlated samples, with a confidence interval that allows for the
+correlation.
+"""
 
 import math
 from dataclasses import dataclass
@@ -9,8 +11,8 @@ from scipy import special, stats
 from membrane_ctrl.model.arrays import Column
 from membrane_ctrl.review.statistics.spectra import group_starts
 
-# Iterations of g and of the variance absorbed by the line: three give short records the right coverage; more leave
-# the shortest records no degree of freedom, and so a meaningless interval.
+# Iterations of g and of the variance absorbed by the line: three give short records the right
+# coverage; more leave the shortest records no degree of freedom, and so a meaningless interval.
 _BIAS_ROUNDS = 3
 # Of the variance; beyond, the correction itself would dominate the correlation.
 _TAKEN_MOST = 0.5
@@ -34,12 +36,13 @@ class FittedSlope:
 def slope(time_s: Column, values: Column) -> FittedSlope:
     """Slope of values against time.
 
-    The variance of the ordinary slope is multiplied by the integrated autocorrelation time of the residuals,
-    g = 1 + 2 sum r_k, summed while the sums of neighbouring pairs stay positive and fall (Geyer 1992, initial
-    monotone sequence); Student's t has the degrees of freedom that are left, n / g - 2. A line takes up part of a
-    slow wander and makes g too small in short series: each of its two parameters takes g / n of the variance out of
-    every r_k, which is put back, with g from the round before. An interval of 95 % then covers 94 to 97 % of
-    long records, and 90 % of those of six correlation times.
+    The variance of the ordinary slope is multiplied by the integrated autocorrelation time of the
+    residuals, g = 1 + 2 sum r_k, summed while the sums of neighbouring pairs stay positive and fall
+    (Geyer 1992, initial monotone sequence); Student's t has the degrees of freedom that are left, n
+    / g - 2. A line takes up part of a slow wander and makes g too small in short series: each of
+    its two parameters takes g / n of the variance out of every r_k, which is put back, with g from
+    the round before. An interval of 95 % then covers 94 to 97 % of long records, and 90 % of those
+    of six correlation times.
 
     `time_s` (n,) is equally spaced except for gaps; values that are not finite are ignored.
     """
@@ -54,7 +57,9 @@ def slope(time_s: Column, values: Column) -> FittedSlope:
     factor = correlation_time(residual)
     effective = values.size / factor
     freedom = max(effective - 2, 1.0)
-    sigma = np.sqrt(float((residual**2).sum()) / (values.size - 2) * effective / freedom * factor / spread)
+    sigma = np.sqrt(
+        float((residual**2).sum()) / (values.size - 2) * effective / freedom * factor / spread
+    )
     reach = float(stats.t.ppf(0.975, freedom) * sigma)
     return FittedSlope(rate, rate - reach, rate + reach, effective)
 
@@ -65,7 +70,9 @@ def correlation_time(residual: Column) -> float:
 
 
 def _times(residual: Column) -> tuple[float, float]:
-    """1 + 2 sum of the autocorrelation, and of its square, which tells of a variance; in samples, at least 1."""
+    """1 + 2 sum of the autocorrelation, and of its square, which tells of a variance; in samples,
+    at least 1.
+    """
     size = residual.size
     power = np.abs(np.fft.rfft(residual, 2 * size)) ** 2
     covariance = np.fft.irfft(power)[:size]
@@ -84,8 +91,8 @@ def _times(residual: Column) -> tuple[float, float]:
 
 
 # Tests whether two series differ, using blocks of time that count as independent.
-# After five minutes the effects of weather (30 s) and air (300 s) have decayed enough for independence; a short run
-# is cut into eight blocks, which makes its test a rough one.
+# After five minutes the effects of weather (30 s) and air (300 s) have decayed enough for
+# independence; a short run is cut into eight blocks, which makes its test a rough one.
 _BLOCK_S = 300.0
 _LEAST_BLOCKS = 8
 # Least number of values in a block for a variance.
@@ -95,13 +102,17 @@ _LEAST_TESTED = 3
 
 
 def block_s(a_s: Column, b_s: Column, window_s: float) -> float:
-    """Common block length of two series at these times: unequal blocks would include different motion."""
+    """Common block length of two series at these times: unequal blocks would include different
+    motion.
+    """
     spans_s = [float(np.ptp(time_s)) if time_s.size else 0.0 for time_s in (a_s, b_s)]
     return max(min(_BLOCK_S, min(spans_s) / _LEAST_BLOCKS), _LEAST_VALUES * window_s)
 
 
 def blocks(time_s: Column, values: Column, length_s: float) -> tuple[Column, Column]:
-    """Mean and log variance of each block; the logarithm is corrected for its bias from the number of values."""
+    """Mean and log variance of each block; the logarithm is corrected for its bias from the number
+    of values.
+    """
     there = np.isfinite(values)
     time_s, values = time_s[there], values[there]
     if values.size < _LEAST_TESTED or length_s <= 0:
@@ -131,11 +142,13 @@ def windowed(time_s: Column, values: Column, window_s: float) -> tuple[Column, C
 
 
 def spread_p(a: Column, b: Column, window_s: float = 1.0) -> float:
-    """Chance of spreads as different between alike series (2, n) of times and values; NaN: too short.
+    """Chance of spreads as different between alike series (2, n) of times and values; NaN: too
+    short.
 
-    Two tests, each of half the level. Within blocks: Welch's of log variances, which sees any difference of the usual
-    motion. Of the whole: the ratio of the variances against F with their effective degrees of freedom, the fewer of
-    n / (1 + 2 sum r_k^2) and what the scatter of the squares says; it sees what is slower or rarer than a block.
+    Two tests, each of half the level. Within blocks: Welch's of log variances, which sees any
+    difference of the usual motion. Of the whole: the ratio of the variances against F with their
+    effective degrees of freedom, the fewer of n / (1 + 2 sum r_k^2) and what the scatter of the
+    squares says; it sees what is slower or rarer than a block.
     """
     length_s = block_s(a[0], b[0], window_s)
     within = welch_p(blocks(a[0], a[1], length_s)[1], blocks(b[0], b[1], length_s)[1])
@@ -154,7 +167,8 @@ def _variances_p(a: Column, b: Column) -> float:
         if square <= 0:
             return math.nan
         excess = residual**2 - square
-        # of a Gaussian series (Bartlett 1946), and of its squares as they are: rare excursions make them few
+        # of a Gaussian series (Bartlett 1946), and of its squares as they are: rare excursions make
+        # them few
         gaussian = 1 / _times(residual)[1]
         seen = 2 * square**2 / (max(float(excess.var()), 1e-300) * correlation_time(excess))
         freedoms.append(max(values.size * min(gaussian, seen) - 1, 1.0))
@@ -171,14 +185,19 @@ def mean_p(a: Column, b: Column, window_s: float = 1.0, offset: float = 0.0) -> 
     window_s : float
         Length of a value's window.
     offset : float
-        Standard deviation of the difference common to all blocks of a run, in addition to that between blocks.
+        Standard deviation of the difference common to all blocks of a run, in addition to that
+        between blocks.
     """
     length_s = block_s(a[0], b[0], window_s)
-    return welch_p(blocks(a[0], a[1], length_s)[0], blocks(b[0], b[1], length_s)[0], offset, correlated=True)
+    return welch_p(
+        blocks(a[0], a[1], length_s)[0], blocks(b[0], b[1], length_s)[0], offset, correlated=True
+    )
 
 
 def welch_p(a: Column, b: Column, offset: float = 0.0, correlated: bool = False) -> float:
-    """Welch's t test of two sets of blocks; correlated ones count for fewer. `offset` as in `mean_p`."""
+    """Welch's t test of two sets of blocks; correlated ones count for fewer. `offset` as in
+    `mean_p`.
+    """
     if min(a.size, b.size) < _LEAST_TESTED:
         return math.nan
     variance, weights = offset**2, 0.0

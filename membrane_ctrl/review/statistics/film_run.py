@@ -1,14 +1,16 @@
 """`film RUN...`: the film's stiffness over the hours of runs, its creep, and tomorrow's drift.
 
-Creep: a loaded film goes on giving way, ever more slowly; what it will do tomorrow, with an interval. Polymers creep
-about evenly in the logarithm of the time since the load, or by a small power of it, but none exactly. So y, the
-logarithm of the stiffness E t that sag and pressure show, is a curve over u = ln(t + t0),
+Creep: a loaded film goes on giving way, ever more slowly; what it will do tomorrow, with an
+interval. Polymers creep about evenly in the logarithm of the time since the load, or by a small
+power of it, but none exactly. So y, the logarithm of the stiffness E t that sag and pressure show,
+is a curve over u = ln(t + t0),
 
     y = a + b u + W(u) + noise
 
-with W a curve of unknown bends (the integral of a random walk: a smoothing spline). A power law is such a curve.
-How much it bends, t0, and for how long the noise lasts (weather makes errors of hours) are not known: the results are
-averages over all three, weighted with how well each agrees with the readings.
+with W a curve of unknown bends (the integral of a random walk: a smoothing spline). A power law is
+such a curve. How much it bends, t0, and for how long the noise lasts (weather makes errors of
+hours) are not known: the results are averages over all three, weighted with how well each agrees
+with the readings.
 """
 
 import json
@@ -55,15 +57,20 @@ class FilmCreep:
 def fit_creep(time_s: FloatArray, y: FloatArray, ahead_s: float) -> FilmCreep:
     """Fit the law to readings (n,) of the logarithm of the stiffness.
 
-    Raises ValueError for fewer than `LEAST` readings, or a look ahead of more than twice their time.
+    Raises ValueError for fewer than `LEAST` readings, or a look ahead of more than twice their
+    time.
     """
     order = np.argsort(time_s)
     time_s, y = _blocks(np.asarray(time_s, float)[order], np.asarray(y, float)[order])
     if time_s.size < LEAST:
-        raise ValueError(f"{time_s.size} readings are too few for a law of creep; {LEAST} are needed")
+        raise ValueError(
+            f"{time_s.size} readings are too few for a law of creep; {LEAST} are needed"
+        )
     span_s = float(time_s[-1] - time_s[0])
     if ahead_s > _AHEAD * span_s:
-        raise ValueError(f"readings over {span_s / 3600:.1f} h say nothing of {ahead_s / 3600:.0f} h ahead")
+        raise ValueError(
+            f"readings over {span_s / 3600:.1f} h say nothing of {ahead_s / 3600:.0f} h ahead"
+        )
     t = np.append((time_s - time_s[0]) / span_s, 1 + ahead_s / span_s)
     found = np.array([_one(t, y, *each) for each in product(_ONSETS, _BENDS, _LASTING)])
     weight = np.exp(found[:, 0] - np.max(found[:, 0]))
@@ -88,7 +95,8 @@ def _blocks(time_s: FloatArray, y: FloatArray) -> tuple[FloatArray, FloatArray]:
 def _one(
     t: FloatArray, y: FloatArray, onset: float, bend: float, lasting: float
 ) -> tuple[float, float, float, float, float]:
-    """One law: log evidence, drift to the last t from the one before, its variance, drift per decade, scatter.
+    """One law: log evidence, drift to the last t from the one before, its variance, drift per
+    decade, scatter.
 
     t (n + 1,) is in units of the readings' time; the last one is ahead of the n readings y.
     """
@@ -108,7 +116,11 @@ def _one(
     drift = float(step @ line + onto @ left)
     short = step - a.T @ onto
     own = curve[-1, -1] + curve[-2, -2] - 2 * curve[-1, -2] - onto @ onto + short @ inverse @ short
-    evidence = -np.sum(np.log(np.diag(root))) - np.linalg.slogdet(a.T @ a)[1] / 2 - free / 2 * math.log(variance)
+    evidence = (
+        -np.sum(np.log(np.diag(root)))
+        - np.linalg.slogdet(a.T @ a)[1] / 2
+        - free / 2 * math.log(variance)
+    )
     decade = math.log(10) * drift / float(u[-1] - u[-2])
     return float(evidence), drift, variance * float(own), decade, math.sqrt(variance)
 
@@ -119,12 +131,19 @@ _SURE = 1.96  # sigmas of a 95 % interval
 
 
 def film_run_command(
-    folders: Sequence[Path], prestrain: float, poisson: float, out: Path | None, pictures: bool, as_json: bool
+    folders: Sequence[Path],
+    prestrain: float,
+    poisson: float,
+    out: Path | None,
+    pictures: bool,
+    as_json: bool,
 ) -> int:
     """Read the runs, fit the creep, write `creep.json` and its picture. Raises CommandError."""
     runs = [open_run(folder) for folder in folders]
     radius_mm = runs[0].config.optics.mirror.radius_mm
-    time_s, sag_mm, pressure_pa = (np.concatenate(part) for part in zip(*map(_readings, runs), strict=True))
+    time_s, sag_mm, pressure_pa = (
+        np.concatenate(part) for part in zip(*map(_readings, runs), strict=True)
+    )
     law = FilmLaw(prestrain, poisson, 1.0, radius_mm)
     try:
         stiffness = pressure_pa / law.pressure_pa(law.with_sag(sag_mm))
@@ -135,7 +154,10 @@ def film_run_command(
     now = law.with_sag(sag_mm[np.argmax(time_s)])
     softer = FilmLaw(prestrain, poisson, math.exp(-1e-3), radius_mm).under(law.pressure_pa(now))
     um_per_log = -1e6 * float(softer.sag_mm - now.sag_mm)
-    table = _table(runs, stiffness, creep, um_per_log) | {"prestrain": prestrain, "poisson": poisson}
+    table = _table(runs, stiffness, creep, um_per_log) | {
+        "prestrain": prestrain,
+        "poisson": poisson,
+    }
     folder = (out or runs[-1].folder / "film").resolve()
     with errors.writing(folder):
         files.make_folder(folder)
@@ -153,14 +175,22 @@ def _readings(run: Run) -> tuple[FloatArray, FloatArray, FloatArray]:
     known = np.isfinite(level[_GAUGE])
     good = np.isfinite(shapes.sag_um) & np.isin(shapes.verdict, ("ok", "degraded"))
     if not (known.any() and good.any()):
-        raise errors.RejectedError(f"{run.folder}: without figures and a gauge a run says nothing of its film")
+        raise errors.RejectedError(
+            f"{run.folder}: without figures and a gauge a run says nothing of its film"
+        )
     time_s = np.asarray(shapes.time_s[good], float)
     middle_s = level["time_s"][known] + _LEVEL_S / 2
     pressure_pa = np.interp(time_s, middle_s, level[_GAUGE][known])
-    return time_s + run.origin_utc.timestamp(), np.asarray(shapes.sag_um[good], float) / 1e3, pressure_pa
+    return (
+        time_s + run.origin_utc.timestamp(),
+        np.asarray(shapes.sag_um[good], float) / 1e3,
+        pressure_pa,
+    )
 
 
-def _table(runs: Sequence[Run], stiffness: FloatArray, creep: FilmCreep, um_per_log: float) -> dict[str, Any]:
+def _table(
+    runs: Sequence[Run], stiffness: FloatArray, creep: FilmCreep, um_per_log: float
+) -> dict[str, Any]:
     return {
         **program.file_origin("membrane-creep/1"),
         "runs": [run.name for run in runs],
@@ -168,7 +198,10 @@ def _table(runs: Sequence[Run], stiffness: FloatArray, creep: FilmCreep, um_per_
         "stiffness_n_per_m": float(np.median(stiffness)),
         "percent_per_decade": 100 * creep.per_decade,
         "scatter_percent": 100 * creep.scatter,
-        "tomorrow_um": {"value": creep.drift * um_per_log, "sigma": creep.drift_sigma * abs(um_per_log)},
+        "tomorrow_um": {
+            "value": creep.drift * um_per_log,
+            "sigma": creep.drift_sigma * abs(um_per_log),
+        },
         "creeps": creep.sure,
     }
 
@@ -183,7 +216,8 @@ def _lines(table: dict[str, Any]) -> list[str]:
         f"E t        {table['stiffness_n_per_m'] / 1e3:.2f} kN/m, if the pre-strain is "
         f"{1e6 * table['prestrain']:g} µm/m and nu {table['poisson']:g}",
         creeps if table["creeps"] else "creep      none that these readings show",
-        f"tomorrow   at the same pressure the sag changes by {drift['value']:+.3g} µm in 24 h; 95 %: {low:+.3g} to "
+        f"tomorrow   at the same pressure the sag changes by {drift['value']:+.3g} µm in 24 "
+        f"h; 95 %: {low:+.3g} to "
         f"{high:+.3g} µm, without the weather",
     ]
 

@@ -1,4 +1,6 @@
-"""One pass over every tick of a run, for all parts of the report that need single ticks, in bounded memory."""
+"""One pass over every tick of a run, for all parts of the report that need single ticks, in bounded
+memory.
+"""
 
 import math
 from collections.abc import Mapping
@@ -46,7 +48,9 @@ class ThinSeconds:
         if not second.size:
             return second, np.empty(0)
         starts = spectra.group_starts(second)
-        ticks, settled, setpoint_um = np.add.reduceat(np.hstack([part[1] for part in self._parts]), starts, axis=1)
+        ticks, settled, setpoint_um = np.add.reduceat(
+            np.hstack([part[1] for part in self._parts]), starts, axis=1
+        )
         thin = (ticks < self._least) & (settled == ticks)
         return second[starts][thin], setpoint_um[thin] / ticks[thin]
 
@@ -64,19 +68,24 @@ class LevelMeans:
 def level_means(run: Run, second: spectra.Seconds, setpoint_um: Column) -> LevelMeans:
     """Means of thin seconds from the 1 s level, as far as the level's are complete."""
     level: Block = run.level(1.0, float(second[0]), float(second[-1]) + 1.0, LEVEL_COLUMNS)
-    _, place, row = np.intersect1d(second, np.rint(level["time_s"]).astype(np.int32), return_indices=True)
+    _, place, row = np.intersect1d(
+        second, np.rint(level["time_s"]).astype(np.int32), return_indices=True
+    )
     whole = (level["rows"][row] >= summary.least_ticks(1.0, run.config.loop.rate_hz)) & (
         level["state"][row] == State.HOLD
     )
     place, row = place[whole], row[whole]
     reading_um = setpoint_um[place] - level["mean_displacement_um"][row]
-    return LevelMeans(second[place], level["rows"][row], reading_um, level["mean_true_error_um"][row])
+    return LevelMeans(
+        second[place], level["rows"][row], reading_um, level["mean_true_error_um"][row]
+    )
 
 
 def filled(seconds: spectra.SecondsOf, means: LevelMeans, error_um: Column) -> spectra.SecondsOf:
     """Sums over seconds, replacing thin ones by the level's.
 
-    The error prevented by the feed-forward (the second row) needs every earlier tick: it is then unknown.
+    The error prevented by the feed-forward (the second row) needs every earlier tick: it is then
+    unknown.
     """
     there = np.isfinite(error_um)
     second, counts, sums = seconds
@@ -85,13 +94,22 @@ def filled(seconds: spectra.SecondsOf, means: LevelMeans, error_um: Column) -> s
     joined = np.concatenate((second[kept], means.second[there]))
     order = np.argsort(joined, kind="stable")
     errors_um = np.concatenate((sums[0][kept], error_um[there] * ticks))[order]
-    return joined[order], np.concatenate((counts[kept], ticks))[order], np.stack((errors_um, errors_um * np.nan))
+    return (
+        joined[order],
+        np.concatenate((counts[kept], ticks))[order],
+        np.stack((errors_um, errors_um * np.nan)),
+    )
 
 
 NAMES = (
-    *summary.FIELDS, "truth_displacement_um", "feedforward_um_per_s", "flow_wanted_um_per_s",
-    "pump_fraction", "lateness_ms", "missed_ticks",
-)  # fmt: skip
+    *summary.FIELDS,
+    "truth_displacement_um",
+    "feedforward_um_per_s",
+    "flow_wanted_um_per_s",
+    "pump_fraction",
+    "lateness_ms",
+    "missed_ticks",
+)
 # Kind of error: a tick without a reading still has a true centre, so each kind has its own sums,
 READING, TRUE = range(2)
 # and these are their rows.
@@ -101,7 +119,8 @@ _HISTOGRAM_BANDS = 5
 _HISTOGRAM_BINS = 500
 # A few seconds lose ticks to a damaged batch or a slow machine: those are omitted, the rest kept.
 _THIN_FROM = 0.05
-# A wanted flow that exceeds the pump's range by less than this is a rounding error of single precision.
+# A wanted flow that exceeds the pump's range by less than this is a rounding error of single
+# precision.
 _SATURATED_UM_PER_S = 1e-3
 
 
@@ -134,11 +153,14 @@ class HoldPass:
     moving_s: float  # the setpoint on its way, or not yet settled
     thin_s: float  # settled seconds with incomplete ticks, whose means come from the level
     uncovered_s: float  # those missing in the level too: no statistics cover them
-    # (n,) each: setpoint minus laser reading, target minus true centre; on a grid of ticks, NaN where not settled
+    # (n,) each: setpoint minus laser reading, target minus true centre; on a grid of ticks, NaN
+    # where not settled
     reading_um: Singles
     true_um: Singles
-    # `SecondSums.result` of the ticks with a reading (`READING`) and of those with a true centre (`TRUE`): rows of
-    # sums are the error (`ERROR`) and what the feed-forward kept away (`KEPT_AWAY`: of the true centre, if known)
+    # `SecondSums.result` of the ticks with a reading (`READING`) and of those with a true centre
+    # (`TRUE`): rows of sums are the error (`ERROR`) and what the feed-forward kept away
+    # (`KEPT_AWAY`: of the true
+    # centre, if known)
     seconds: tuple[spectra.SecondsOf, spectra.SecondsOf]
     raw_reading: summary.Moments
     raw_true: summary.Moments
@@ -149,8 +171,12 @@ class HoldPass:
     pump: PumpActivity
 
 
-def hold_pass(run: Run, span_s: tuple[float, float], part_s: tuple[float, float] = (-np.inf, np.inf)) -> HoldPass:
-    """Pass once through a run, or a part of it; `span_s` is its first and last second, from a level."""
+def hold_pass(
+    run: Run, span_s: tuple[float, float], part_s: tuple[float, float] = (-np.inf, np.inf)
+) -> HoldPass:
+    """Pass once through a run, or a part of it; `span_s` is its first and last second, from a
+    level.
+    """
     collected = _Collector(run, span_s, math.isfinite(part_s[0]))
     for block in run.tick_blocks(NAMES, *part_s):
         collected.add(block)
@@ -160,7 +186,9 @@ def hold_pass(run: Run, span_s: tuple[float, float], part_s: tuple[float, float]
     if np.count_nonzero(within) <= _THIN_FROM * ticks.seconds[READING][0].size:
         return ticks
     means = level_means(run, thin[within], setpoint_um[within])
-    return replace(_with_level(ticks, means), uncovered_s=float(np.count_nonzero(within) - means.second.size))
+    return replace(
+        _with_level(ticks, means), uncovered_s=float(np.count_nonzero(within) - means.second.size)
+    )
 
 
 def _with_level(ticks: HoldPass, means: LevelMeans) -> HoldPass:
@@ -190,9 +218,13 @@ class _Collector:
         self._lateness = summary.LogHistogram()
         self._pump = _PumpSums(run)
         self._ticks = self._counted = self._unread = self._inside = 0
-        self._times = {name: spectra.HeldTime(run.config.recording.quiet_hz) for name in ("hold", *summary.PARTS)}
+        self._times = {
+            name: spectra.HeldTime(run.config.recording.quiet_hz)
+            for name in ("hold", *summary.PARTS)
+        }
         self.thin = ThinSeconds(loop.rate_hz)
-        # the running count at the start: for a part that of its first tick, which includes earlier ones
+        # the running count at the start: for a part that of its first tick, which includes earlier
+        # ones
         self._missed_before = math.nan if from_within else 0.0
         self._missed = 0.0
         self._span = (math.nan, math.nan)
@@ -203,13 +235,18 @@ class _Collector:
         mask = parts["held"]
         kept_away = self._without.kept_away_um(block["feedforward_um_per_s"])[mask]
         self._ticks += time_s.size
-        self._span = (self._span[0] if self._ticks > time_s.size else float(time_s[0]), float(time_s[-1]))
+        self._span = (
+            self._span[0] if self._ticks > time_s.size else float(time_s[0]),
+            float(time_s[-1]),
+        )
         for name, part in {"hold": block["state"] == State.HOLD, **parts}.items():
             self._times[name].add(time_s, part)
         self.thin.add(time_s, block["setpoint_um"], mask)
         missed = block["missed_ticks"][np.isfinite(block["missed_ticks"])]
         if missed.size:
-            self._missed_before = float(missed[0]) if math.isnan(self._missed_before) else self._missed_before
+            self._missed_before = (
+                float(missed[0]) if math.isnan(self._missed_before) else self._missed_before
+            )
             self._missed = max(self._missed, float(missed.max()) - self._missed_before)
         self._lateness.add(block["lateness_ms"])
         held = {name: np.asarray(block[name][mask], dtype=np.float64) for name in NAMES}
@@ -230,7 +267,9 @@ class _Collector:
         self._unread += true.size - reading.size
         self._inside += int((np.abs(reading) <= self._band_um).sum())
         scale = _HISTOGRAM_BINS / (self._edges_um[-1] - self._edges_um[0])
-        bins = np.clip((reading - self._edges_um[0]) * scale, 0, _HISTOGRAM_BINS - 1).astype(np.int64)
+        bins = np.clip((reading - self._edges_um[0]) * scale, 0, _HISTOGRAM_BINS - 1).astype(
+            np.int64
+        )
         self._histogram += np.bincount(bins, minlength=_HISTOGRAM_BINS)
 
     def result(self) -> HoldPass:
@@ -281,7 +320,10 @@ class _PumpSums:
         self._travel += float(np.abs(np.diff(pump)).sum())
         self._starts += int((running[1:] & ~running[:-1]).sum())
         self._running += int(running.sum())
-        wanted, since = held["flow_wanted_um_per_s"], np.searchsorted(self._since_s, held["mono_s"], "right")
+        wanted, since = (
+            held["flow_wanted_um_per_s"],
+            np.searchsorted(self._since_s, held["mono_s"], "right"),
+        )
         most = self._most_um_per_s[since - 1] + _SATURATED_UM_PER_S
         self._saturated += int(((wanted < -_SATURATED_UM_PER_S) | (wanted > most)).sum())
 
@@ -301,12 +343,16 @@ class _PumpSums:
 
 
 def _flow_limits(run: Run) -> tuple[Column, Column]:
-    """Times from which a largest flow was in force, and those flows: they change with a curve of the pump."""
+    """Times from which a largest flow was in force, and those flows: they change with a curve of
+    the pump.
+    """
     found = [(-math.inf, run.config)]
     status = RunStatus()
     for each in run.log:
         before, status = status.loop, status.after_event(each.event, each.mono_s)
         if status.loop is not before:
             found.append((each.mono_s, run.config.with_gains(status.loop)))
-    since_s, most = np.array([(at_s, config.loop.flow_most_um_per_s(config.pump)) for at_s, config in found]).T
+    since_s, most = np.array(
+        [(at_s, config.loop.flow_most_um_per_s(config.pump)) for at_s, config in found]
+    ).T
     return since_s, most

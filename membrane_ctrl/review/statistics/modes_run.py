@@ -1,4 +1,6 @@
-"""`modes`: the mirror's vibrations in tracked figures, minute by minute, and whether one of them moves."""
+"""`modes`: the mirror's vibrations in tracked figures, minute by minute, and whether one of them
+moves.
+"""
 
 import json
 import sys
@@ -11,7 +13,14 @@ import numpy as np
 
 from membrane_ctrl.measure.results import read_arrays, write_figure, write_json
 from membrane_ctrl.metrology.optics import zernike
-from membrane_ctrl.metrology.track.modes import LEAST_RATE_HZ, LEAST_S, MOVED, SEARCH_S, VibrationMode, find_modes
+from membrane_ctrl.metrology.track.modes import (
+    LEAST_RATE_HZ,
+    LEAST_S,
+    MOVED,
+    SEARCH_S,
+    VibrationMode,
+    find_modes,
+)
 from membrane_ctrl.model import errors, files, program, terminal
 from membrane_ctrl.model.arrays import FloatArray
 from membrane_ctrl.model.zernike_terms import ZERNIKE_TERMS
@@ -39,14 +48,20 @@ class SeenMode:
     @property
     def frequency_hz(self) -> float:
         """Mean, weighted by the searches' own errors."""
-        return float(np.average([line.frequency_hz for line in self.lines], weights=self._weights()))
+        return float(
+            np.average([line.frequency_hz for line in self.lines], weights=self._weights())
+        )
 
     @property
     def sigma_hz(self) -> float:
-        """Standard error of the mean, from the searches' errors or from their scatter if that is larger."""
+        """Standard error of the mean, from the searches' errors or from their scatter if that is
+        larger.
+        """
         own = 1 / np.sqrt(np.sum(self._weights()))
         values = [line.frequency_hz for line in self.lines]
-        return float(max(own, np.std(values, ddof=1) / np.sqrt(len(values)) if len(values) > 1 else 0.0))
+        return float(
+            max(own, np.std(values, ddof=1) / np.sqrt(len(values)) if len(values) > 1 else 0.0)
+        )
 
     @property
     def shape(self) -> FloatArray:
@@ -56,7 +71,8 @@ class SeenMode:
 
     @property
     def moved(self) -> float:
-        """Relative change from the first searches to the last, three of each; 0 with fewer than six in all.
+        """Relative change from the first searches to the last, three of each; 0 with fewer than six
+        in all.
 
         More of them, as thirds of all, would hide a third of what moves slowly.
         """
@@ -69,7 +85,9 @@ class SeenMode:
 
 
 def modes_command(folders: Sequence[Path], out: Path | None, as_json: bool, pictures: bool) -> int:
-    """Search the frames for vibrations, write `modes.json` and pictures, report. Raises CommandError."""
+    """Search the frames for vibrations, write `modes.json` and pictures, report. Raises
+    CommandError.
+    """
     times: list[float] = []
     searches: list[tuple[VibrationMode, ...] | None] = []
     for folder in folders:
@@ -79,7 +97,9 @@ def modes_command(folders: Sequence[Path], out: Path | None, as_json: bool, pict
             searches.append(find_modes(time_s[part], coeffs_um[part]))
     done = [(at_s, lines) for at_s, lines in zip(times, searches, strict=True) if lines is not None]
     if not done:
-        raise errors.RejectedError(f"{folders[0]}: less than {LEAST_S:g} s of frames at a steady rate")
+        raise errors.RejectedError(
+            f"{folders[0]}: less than {LEAST_S:g} s of frames at a steady rate"
+        )
     modes, passing = _together(np.array([at_s for at_s, _ in done]), [lines for _, lines in done])
     table = _table(folders, modes, passing, len(done))
     out = (out or folders[-1] / "modes").resolve()
@@ -94,33 +114,51 @@ def modes_command(folders: Sequence[Path], out: Path | None, as_json: bool, pict
 
 
 def _frames(folder: Path) -> tuple[FloatArray, FloatArray, float]:
-    """Times, terms (n, terms) with NaN where rejected, and the UTC of time 0. Raises CommandError."""
+    """Times, terms (n, terms) with NaN where rejected, and the UTC of time 0.
+    Raises CommandError.
+    """
     if is_run(folder):
         run = open_run(folder)
         shapes, origin_s = run.shapes(), run.origin_utc.timestamp()
         time_s, coeffs_um, verdict = shapes.time_s, shapes.coeffs_um, shapes.verdict
     else:
-        path = next((p for p in (folder / "track.npz", folder / "result" / "track.npz") if p.exists()), None)
+        path = next(
+            (p for p in (folder / "track.npz", folder / "result" / "track.npz") if p.exists()), None
+        )
         if path is None:
-            raise errors.InputError(f"{folder}: neither a run nor the result of `membrane-ctrl track`")
+            raise errors.InputError(
+                f"{folder}: neither a run nor the result of `membrane-ctrl track`"
+            )
         try:
-            time_s, coeffs_um = read_arrays(path, ("time_s", "coeffs_um"), _FRAMES_MOST * ZERNIKE_TERMS)
+            time_s, coeffs_um = read_arrays(
+                path, ("time_s", "coeffs_um"), _FRAMES_MOST * ZERNIKE_TERMS
+            )
         except (OSError, ValueError) as error:
             raise errors.InputError(f"{path}: {error}") from None
         if coeffs_um.shape != (time_s.size, ZERNIKE_TERMS):
             found = " x ".join(str(size) for size in coeffs_um.shape)
             wanted = f"{time_s.size} x {ZERNIKE_TERMS}"
-            raise errors.InputError(f"{path}: coeffs_um: {found} numbers where times x terms are {wanted}")
+            raise errors.InputError(
+                f"{path}: coeffs_um: {found} numbers where times x terms are {wanted}"
+            )
         origin_s, verdict = 0.0, np.full(time_s.size, "")  # rejected frames are NaN
-    good = np.isfinite(time_s) & (verdict != "rejected") & (np.abs(coeffs_um) < _LARGEST_UM).all(axis=1)
+    good = (
+        np.isfinite(time_s)
+        & (verdict != "rejected")
+        & (np.abs(coeffs_um) < _LARGEST_UM).all(axis=1)
+    )
     order = np.argsort(time_s[good], kind="stable")
-    time_s, coeffs_um = np.asarray(time_s[good][order], float), np.asarray(coeffs_um[good][order], float)
+    time_s, coeffs_um = (
+        np.asarray(time_s[good][order], float),
+        np.asarray(coeffs_um[good][order], float),
+    )
     if time_s.size < 2:
         raise errors.RejectedError(f"{folder}: no usable figures")
     interval_s = float(np.median(np.diff(time_s)))
     if not interval_s * LEAST_RATE_HZ <= 1:
         raise errors.RejectedError(
-            f"{folder}: a figure every {interval_s:.2g} s shows no vibrations; {LEAST_RATE_HZ:g} a second are "
+            f"{folder}: a figure every {interval_s:.2g} s shows no vibrations; "
+            f"{LEAST_RATE_HZ:g} a second are "
             'needed: hold with shape.mode = "track"'
         )
     return time_s, coeffs_um, origin_s
@@ -130,16 +168,26 @@ def _minutes(time_s: FloatArray) -> list[slice]:
     """Minutes of frames, evenly spread if there are many."""
     _, first = np.unique(np.floor((time_s - time_s[0]) / SEARCH_S), return_index=True)
     edges = [*first, time_s.size]
-    chosen = np.unique(np.linspace(0, len(first) - 1, min(len(first), _SEARCHES)).round().astype(int))
+    chosen = np.unique(
+        np.linspace(0, len(first) - 1, min(len(first), _SEARCHES)).round().astype(int)
+    )
     return [slice(edges[k], edges[k + 1]) for k in chosen]
 
 
-def _together(times_s: FloatArray, searches: Sequence[tuple[VibrationMode, ...]]) -> tuple[list[SeenMode], int]:
-    """Lines of neighbouring frequencies in at least half of the searches, the strongest first; how many others."""
+def _together(
+    times_s: FloatArray, searches: Sequence[tuple[VibrationMode, ...]]
+) -> tuple[list[SeenMode], int]:
+    """Lines of neighbouring frequencies in at least half of the searches, the strongest first; how
+    many others.
+    """
     modes: list[SeenMode] = []
     seen = [(line, at_s) for at_s, lines in zip(times_s, searches, strict=True) for line in lines]
     for line, at_s in sorted(seen, key=lambda each: each[0].frequency_hz):
-        near = (k for k, m in enumerate(modes) if at_s not in m.time_s.tolist() and line.is_like(m.lines[-1]))
+        near = (
+            k
+            for k, m in enumerate(modes)
+            if at_s not in m.time_s.tolist() and line.is_like(m.lines[-1])
+        )
         if (k := next(near, None)) is None:
             modes.append(SeenMode(np.array([at_s]), (line,)))
         else:
@@ -152,7 +200,9 @@ def _together(times_s: FloatArray, searches: Sequence[tuple[VibrationMode, ...]]
     return usual, len(seen) - sum(len(mode.lines) for mode in usual)
 
 
-def _table(folders: Sequence[Path], modes: Sequence[SeenMode], passing: int, searches: int) -> dict[str, Any]:
+def _table(
+    folders: Sequence[Path], modes: Sequence[SeenMode], passing: int, searches: int
+) -> dict[str, Any]:
     return {
         **program.file_origin("membrane-modes/1"),
         "sources": [folder.name for folder in folders],
@@ -163,7 +213,9 @@ def _table(folders: Sequence[Path], modes: Sequence[SeenMode], passing: int, sea
                 "sigma_hz": mode.sigma_hz,
                 "amplitude_nm": float(np.median([line.amplitude_nm for line in mode.lines])),
                 "searches": len(mode.lines),
-                "aliases_hz": list(mode.lines[0].aliases_hz) if all(line.aliases_hz for line in mode.lines) else [],
+                "aliases_hz": list(mode.lines[0].aliases_hz)
+                if all(line.aliases_hz for line in mode.lines)
+                else [],
                 "moved": mode.moved,
                 "shape": mode.shape.tolist(),
             }
@@ -179,7 +231,8 @@ def _lines(table: dict[str, Any]) -> list[str]:
         terms = np.argsort(np.abs(mode["shape"]))[::-1][:3]
         made = ", ".join(f"{mode['shape'][j]:+.2f} Z{j + 1}" for j in terms)
         line = (
-            f"mode       {mode['frequency_hz']:.3f} +- {mode['sigma_hz']:.3f} Hz, {mode['amplitude_nm']:.1f} nm, in "
+            f"mode       {mode['frequency_hz']:.3f} +- {mode['sigma_hz']:.3f} Hz, "
+            f"{mode['amplitude_nm']:.1f} nm, in "
             f"{mode['searches']} searches; {made}"
         )
         if mode["aliases_hz"]:
@@ -188,7 +241,8 @@ def _lines(table: dict[str, Any]) -> list[str]:
         lines.append(line)
         if abs(mode["moved"]) > MOVED:
             lines.append(
-                f"           it moved by {mode['moved']:+.1%}: the film's tension by {2 * mode['moved']:+.1%}; check "
+                f"           it moved by {mode['moved']:+.1%}: the film's tension by "
+                f"{2 * mode['moved']:+.1%}; check "
                 "clamping and pressure"
             )
     if not table["modes"]:
@@ -205,7 +259,9 @@ def _show(out: Path, modes: Sequence[SeenMode], begin_s: float, lines: Sequence[
     from membrane_ctrl.measure.pictures import log_pictures, result_recording
 
     picture = _draw(out / "modes.png", modes, begin_s)
-    with result_recording(out / "modes.rrd", "membrane_ctrl_modes", _layout(len(modes), picture)) as recording:
+    with result_recording(
+        out / "modes.rrd", "membrane_ctrl_modes", _layout(len(modes), picture)
+    ) as recording:
         recording.log("modes/report", rr.TextDocument("\n".join(lines)), static=True)
         for k, mode in enumerate(modes, start=1):
             at = [rr.TimeColumn("run_time", duration=mode.time_s - begin_s)]
@@ -217,7 +273,9 @@ def _show(out: Path, modes: Sequence[SeenMode], begin_s: float, lines: Sequence[
             }
             for name, values in columns.items():
                 recording.log(
-                    f"modes/{k}/{name}", rr.SeriesLines(names=f"{mode.frequency_hz:.2f} Hz", widths=2), static=True
+                    f"modes/{k}/{name}",
+                    rr.SeriesLines(names=f"{mode.frequency_hz:.2f} Hz", widths=2),
+                    static=True,
                 )
                 recording.send_columns(f"modes/{k}/{name}", at, rr.Scalars.columns(scalars=values))
         log_pictures(recording, "modes/pictures", [picture])
@@ -228,8 +286,13 @@ def _layout(count: int, picture: Path) -> "rrb.Blueprint":
     import rerun as rr
 
     end = rr.TimeRangeBoundary.infinite()
-    whole = rr.blueprint.TimeAxis(view_range=rr.TimeRange(start=end, end=end))  # the default is a minute
-    plots = (("Change of the frequency, %", "change_percent"), ("Amplitude, nm RMS", "amplitude_nm"))
+    whole = rr.blueprint.TimeAxis(
+        view_range=rr.TimeRange(start=end, end=end)
+    )  # the default is a minute
+    plots = (
+        ("Change of the frequency, %", "change_percent"),
+        ("Amplitude, nm RMS", "amplitude_nm"),
+    )
     return rr.blueprint.Blueprint(
         rr.blueprint.Horizontal(
             rr.blueprint.Vertical(
@@ -264,11 +327,18 @@ def _draw(path: Path, modes: Sequence[SeenMode], begin_s: float) -> Path:
     for mode, (over_time, shape) in zip(shown, np.reshape(axes, (-1, 2)), strict=True):
         minutes = (mode.time_s - begin_s) / 60
         over_time.errorbar(
-            minutes, [line.frequency_hz for line in mode.lines], [line.sigma_hz for line in mode.lines], fmt="."
+            minutes,
+            [line.frequency_hz for line in mode.lines],
+            [line.sigma_hz for line in mode.lines],
+            fmt=".",
         )
         over_time.set(xlabel="time (min)", ylabel="frequency (Hz)")
-        height = np.where(np.hypot(x, y) <= 1, np.tensordot(mode.shape, zernike.values(x, y), 1), np.nan)
+        height = np.where(
+            np.hypot(x, y) <= 1, np.tensordot(mode.shape, zernike.values(x, y), 1), np.nan
+        )
         most = float(np.nanmax(np.abs(height)))
-        shape.imshow(height, cmap="RdBu_r", vmin=-most, vmax=most, origin="lower", extent=(-1, 1, -1, 1))
+        shape.imshow(
+            height, cmap="RdBu_r", vmin=-most, vmax=most, origin="lower", extent=(-1, 1, -1, 1)
+        )
         shape.set(title=f"shape at {mode.frequency_hz:.2f} Hz", xticks=[], yticks=[])
     return write_figure(path, figure)

@@ -11,8 +11,8 @@ from membrane_ctrl.run_files.shapes import Shapes, height_basis
 
 MAP_PX = 128
 
-# Monitored points on the unit disc: within the analysis area, at three radii and azimuths (the paper gives A, B and C
-# only in a figure).
+# Monitored points on the unit disc: within the analysis area, at three radii and azimuths (the
+# paper gives A, B and C only in a figure).
 POINTS: dict[str, tuple[float, float]] = {"A": (0.0, 0.3), "B": (-0.52, -0.3), "C": (0.74, -0.43)}
 PAIRS_S = (60.0, 600.0)
 # Slopes are fitted to means over enough cycles to leave at most this many values.
@@ -38,7 +38,8 @@ class CyclePair:
 class ShapeReview:
     """Figure of a held mirror over the run."""
 
-    time_s: Column  # (n,): of the cycles used: settled and not rejected; the first is what changes refer to
+    # (n,): of the cycles used: settled and not rejected; the first is what changes refer to
+    time_s: Column
     cycles: int  # of the run
     rejected: int
     points_um: dict[str, Column]  # (n,) change of height at `POINTS` against the first cycle
@@ -63,7 +64,9 @@ def review_shapes(shapes: Shapes, held: BoolArray, analysis_share: float) -> Sha
     analysis_share : float
         Radius of the analysis area over the mirror's.
     """
-    good = shapes.select(held & (shapes.verdict != "rejected") & np.isfinite(shapes.coeffs_um).all(axis=1))
+    good = shapes.select(
+        held & (shapes.verdict != "rejected") & np.isfinite(shapes.coeffs_um).all(axis=1)
+    )
     if len(good) < _LEAST_CYCLES:
         return None
     area = _Area(analysis_share)
@@ -85,12 +88,16 @@ def review_shapes(shapes: Shapes, held: BoolArray, analysis_share: float) -> Sha
         sag_um=sag_um,
         laser_um=laser_um,
         disagreement=_slope(good.time_s, sag_um - laser_um),
-        pairs=tuple(pair for lag_s in PAIRS_S if (pair := _pair(good, parameters, area, lag_s)) is not None),
+        pairs=tuple(
+            pair for lag_s in PAIRS_S if (pair := _pair(good, parameters, area, lag_s)) is not None
+        ),
     )
 
 
 class _Area:
-    """The pixels of a map inside the analysis area, and what a unit of each parameter does there."""
+    """The pixels of a map inside the analysis area, and what a unit
+    of each parameter does there.
+    """
 
     def __init__(self, share: float) -> None:
         axis = (np.arange(MAP_PX) + 0.5) * 2 / MAP_PX - 1
@@ -106,7 +113,9 @@ class _Area:
 
 
 def _pair(good: Shapes, parameters: Column, area: _Area, lag_s: float) -> CyclePair | None:
-    """The pair nearest to the run's middle, and the RMS of all pairs as far apart (within half a cycle)."""
+    """The pair nearest to the run's middle, and the RMS of all pairs as far apart (within half a
+    cycle).
+    """
     time_s = good.time_s
     half_s = 0.5 * float(np.median(np.diff(time_s)))
     other = np.minimum(np.searchsorted(time_s, time_s + lag_s - half_s), time_s.size - 1)

@@ -1,4 +1,6 @@
-"""Statistics of a series with gaps: means over windows, power spectral density, RMS in its bands, Allan deviation."""
+"""Statistics of a series with gaps: means over windows, power spectral density, RMS in its bands,
+Allan deviation.
+"""
 
 import math
 from dataclasses import dataclass
@@ -19,7 +21,9 @@ SecondsOf = tuple[Seconds, Counts, Column]
 
 @dataclass(frozen=True, slots=True)
 class WindowStatistics:
-    """Statistics of means over windows of one length; NaN without windows; a single window has no `std_um`."""
+    """Statistics of means over windows of one length; NaN without windows; a single window has no
+    `std_um`.
+    """
 
     window_s: float  # 0: single ticks
     count: int
@@ -36,7 +40,9 @@ def group_starts(number: AnyArray) -> IntArray:
 
 
 class SecondSums:
-    """Sums over whole seconds of the run, of several series at once, from blocks in order of time."""
+    """Sums over whole seconds of the run, of several series at once,
+    from blocks in order of time.
+    """
 
     def __init__(self, series: int) -> None:
         self._parts: list[SecondsOf] = []
@@ -54,23 +60,37 @@ class SecondSums:
     def result(self) -> SecondsOf:
         """(k,) seconds with ticks, (k,) numbers of ticks, (series, k) sums."""
         if not self._parts:
-            return np.empty(0, dtype=np.int32), np.empty(0, dtype=np.float32), np.empty((self._series, 0))
-        second, counts, sums = (np.concatenate(parts, axis=-1) for parts in zip(*self._parts, strict=True))
+            return (
+                np.empty(0, dtype=np.int32),
+                np.empty(0, dtype=np.float32),
+                np.empty((self._series, 0)),
+            )
+        second, counts, sums = (
+            np.concatenate(parts, axis=-1) for parts in zip(*self._parts, strict=True)
+        )
         starts = group_starts(second)  # two blocks may share a second
-        return second[starts], np.add.reduceat(counts, starts), np.add.reduceat(sums, starts, axis=1)
+        return (
+            second[starts],
+            np.add.reduceat(counts, starts),
+            np.add.reduceat(sums, starts, axis=1),
+        )
 
 
 def window_means(
     second: Seconds, counts: Counts, sums: Column, window_s: int, rate_hz: float
 ) -> tuple[Column, Column]:
-    """Middles (k,) in s and means of the windows with at least `least_ticks`, from (n,) sums of `SecondSums`."""
+    """Middles (k,) in s and means of the windows with at least `least_ticks`, from (n,) sums of
+    `SecondSums`.
+    """
     if not second.size:
         return np.empty(0), np.empty(0)
     number = second // window_s
     starts = group_starts(number)
     ticks, total = np.add.reduceat(counts, starts), np.add.reduceat(sums, starts)
     whole = (ticks >= least_ticks(window_s, rate_hz)) & np.isfinite(total)
-    return np.asarray((number[starts][whole] + 0.5) * window_s, dtype=np.float64), total[whole] / ticks[whole]
+    return np.asarray((number[starts][whole] + 0.5) * window_s, dtype=np.float64), total[
+        whole
+    ] / ticks[whole]
 
 
 def describe(means_um: Column, window_s: float, band_um: float) -> WindowStatistics:
@@ -122,13 +142,14 @@ class HeldTime:
 class WithoutFeedforward:
     """Adds to the error what the feed-forward's flow prevented, from consecutive blocks.
 
-    The mirror's centre nearly integrates the flow. A speed v without feed-forward reaches the error through the
-    closed loop of a PI controller,
+    The mirror's centre nearly integrates the flow. A speed v without feed-forward reaches the error
+    through the closed loop of a PI controller,
 
         e / v = s / (s^2 + Kp s + Kp / Ti),
 
-    here by the bilinear transform. Dead time and pump lag (0.26 s together) are ignored: they hardly change the
-    effect of a disturbance of tens of seconds, and make the benefit appear slightly too small.
+    here by the bilinear transform. Dead time and pump lag (0.26 s together) are ignored: they
+    hardly change the effect of a disturbance of tens of seconds, and make the benefit appear
+    slightly too small.
     """
 
     def __init__(self, kp_per_s: float, ti_s: float, period_s: float) -> None:
@@ -143,7 +164,8 @@ class WithoutFeedforward:
         return np.asarray(kept, dtype=np.float64)
 
 
-# Enough segments for an estimate good to a third, and segments only long enough for one more decade.
+# Enough segments for an estimate good to a third, and segments only long enough for one more
+# decade.
 _SEGMENTS = 8
 _LONGEST = 1 << 15
 # Segments transformed at once, to bound the memory.
@@ -168,7 +190,8 @@ class Spectrum:
 
 
 def power_spectrum(values: AnyArray, rate_hz: float, length: int | None = None) -> Spectrum:
-    """Welch's estimate: Hann window, half overlapping segments, each without its mean; as `scipy.signal.welch`.
+    """Welch's estimate: Hann window, half overlapping segments, each without its mean; as
+    `scipy.signal.welch`.
 
     Parameters
     ----------
@@ -224,8 +247,8 @@ def allan_deviation(values: AnyArray, period_s: float, lengths: IntArray | None 
     period_s : float
         Time between values.
     lengths : (k,) array of int, optional
-        Samples in each tau; by default powers of two up to a quarter of the series, which leaves about four
-        independent means.
+        Samples in each tau; by default powers of two up to a quarter of the series, which leaves
+        about four independent means.
     """
     there = np.isfinite(values)
     count = int(there.sum())
@@ -262,7 +285,8 @@ def _second_differences(total: Column, gaps: AnyArray, m: int) -> tuple[float, i
 
 # Decades of frequency with an RMS; the last ends at half the tick rate. The first is that of days.
 BANDS_HZ = (1e-5, 1e-4, 1e-3, 1e-2, 0.1, 1.0)
-# A Hann window leaks two lines to each side: from the fourth line on, a band contains no slower motion.
+# A Hann window leaks two lines to each side: from the fourth line on, a band contains no slower
+# motion.
 _RESOLVED_LINES = 4
 # Above this, one-second means attenuate the signal (0.1 Hz: by 2 %).
 _SLOW_MOST_HZ = 0.1
@@ -274,29 +298,45 @@ class Band:
 
     low_hz: float
     high_hz: float
-    # Lowest frequency resolved: above `low_hz` if the series is too short for the whole band; NaN if it is too short
-    # for any of it
+    # Lowest frequency resolved: above `low_hz` if the series is too short for the whole band; NaN
+    # if it is too short for any of it
     from_hz: float
     rms_um: float  # NaN if nothing is resolved
 
 
 def bands(fast: Spectrum, slow: Spectrum) -> list[Band]:
-    """RMS in each of `BANDS_HZ`: from the ticks' spectrum where it resolves a band, else from the 1 s means."""
+    """RMS in each of `BANDS_HZ`: from the ticks' spectrum where it resolves a band, else from the 1
+    s means.
+    """
     edges = [*BANDS_HZ, float(fast.frequency_hz[-1])]
-    return [_band(slow if _is_slow(fast, slow, low, high) else fast, low, high) for low, high in pairwise(edges)]
+    return [
+        _band(slow if _is_slow(fast, slow, low, high) else fast, low, high)
+        for low, high in pairwise(edges)
+    ]
 
 
 def unseen_s(found: list[Band]) -> float:
     """The period (s) beyond which no band includes the motion; NaN if all bands are empty."""
-    return max((1 / band.from_hz for band in found if math.isfinite(band.from_hz)), default=math.nan)
+    return max(
+        (1 / band.from_hz for band in found if math.isfinite(band.from_hz)), default=math.nan
+    )
 
 
 def density(fast: Spectrum, slow: Spectrum) -> tuple[Column, Column]:
-    """Frequencies (Hz) and one density, which uses the 1 s means below the resolution of the ticks' spectrum."""
+    """Frequencies (Hz) and one density, which uses the 1 s means below the resolution of the ticks'
+    spectrum.
+    """
     resolved_hz = min(_RESOLVED_LINES * float(fast.frequency_hz[1]), _SLOW_MOST_HZ)
-    below = slow.frequency_hz < resolved_hz if slow.segments else np.zeros(slow.frequency_hz.size, dtype=bool)
+    below = (
+        slow.frequency_hz < resolved_hz
+        if slow.segments
+        else np.zeros(slow.frequency_hz.size, dtype=bool)
+    )
     above = fast.frequency_hz >= (resolved_hz if slow.segments else 0.0)
-    joined = [(x[below], y[above]) for x, y in ((slow.frequency_hz, fast.frequency_hz), (slow.density, fast.density))]
+    joined = [
+        (x[below], y[above])
+        for x, y in ((slow.frequency_hz, fast.frequency_hz), (slow.density, fast.density))
+    ]
     frequency_hz, together = (np.concatenate(parts) for parts in joined)
     return frequency_hz[frequency_hz > 0], together[frequency_hz > 0]
 

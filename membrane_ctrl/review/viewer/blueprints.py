@@ -47,9 +47,13 @@ class ReviewBlueprint:
     def made(self, tab: str = "overview", tabs: Sequence[str] = TABS) -> rrb.Blueprint:
         """The blueprint, with some of `TABS`, `tab` selected."""
         makers = {
-            "overview": self._overview, "loop": self._loop, "environment": self._environment, "shape": self._shape,
-            "faults": self._faults, "tuning": self._tuning,
-        }  # fmt: skip
+            "overview": self._overview,
+            "loop": self._loop,
+            "environment": self._environment,
+            "shape": self._shape,
+            "faults": self._faults,
+            "tuning": self._tuning,
+        }
         selection = None if self.span_ns is None else AbsoluteTimeRange(*self.span_ns)
         return rrb.Blueprint(
             rrb.Tabs(*(makers[name]() for name in tabs), active_tab=tabs.index(tab)),
@@ -68,7 +72,9 @@ class ReviewBlueprint:
     def _contents(self, paths: Sequence[str]) -> list[str]:
         return [f"+ {prefix_of(label)}{path}" for label in self.labels for path in paths]
 
-    def _plot(self, name: str, *paths: str, span: tuple[float, float] | None = None) -> rrb.TimeSeriesView:
+    def _plot(
+        self, name: str, *paths: str, span: tuple[float, float] | None = None
+    ) -> rrb.TimeSeriesView:
         return rrb.TimeSeriesView(
             name=name,
             origin="/",
@@ -85,14 +91,17 @@ class ReviewBlueprint:
         return self._plot(plot_title(plot), *(stream.path for stream in overview_streams(plot)))
 
     def _around_band(self, name: str, *paths: str) -> rrb.TimeSeriesView:
-        """A plot of the error, with lines where something happened: these would stretch an axis of no fixed span."""
+        """A plot of the error, with lines where something happened: these would stretch an axis of
+        no fixed span.
+        """
         band_um = self.config.limits.band_um
         span_um = (-3 * band_um, 3 * band_um)
         return self._plot(name, "/loop/band", "/marks/**", "/found/lines/**", *paths, span=span_um)
 
     def _error(self) -> rrb.TimeSeriesView:
         return self._around_band(
-            "Error: minimum, mean, maximum, µm", *(stream.path for stream in overview_streams(columns.ERROR))
+            "Error: minimum, mean, maximum, µm",
+            *(stream.path for stream in overview_streams(columns.ERROR)),
         )
 
     def _lanes(self) -> rrb.StateTimelineView:
@@ -104,15 +113,19 @@ class ReviewBlueprint:
         )
         return rrb.StateTimelineView(
             name="States", origin="/", contents=self._contents(paths), time_view=self._axis()
-        )  # fmt: skip
+        )
 
     def _log(self, name: str, *paths: str) -> rrb.TextLogView:
-        hidden = TimelineColumn(self.timeline, visible=False)  # too narrow to read: the lines begin with it
+        hidden = TimelineColumn(
+            self.timeline, visible=False
+        )  # too narrow to read: the lines begin with it
         return rrb.TextLogView(
             name=name,
             origin="/",
             contents=self._contents(paths),
-            columns=rrb.TextLogColumns(timeline_columns=[hidden], text_log_columns=["loglevel", "body"]),
+            columns=rrb.TextLogColumns(
+                timeline_columns=[hidden], text_log_columns=["loglevel", "body"]
+            ),
             format_options=rrb.TextLogFormat(monospace_body=False),
         )
 
@@ -121,29 +134,37 @@ class ReviewBlueprint:
         names = [label or "Summary" for label in self.labels]
         origins = [prefix_of(label) + blueprint.SUMMARY_PATH for label in self.labels]
         return rrb.Tabs(
-            *(rrb.TextDocumentView(name=n, origin=o) for n, o in zip(names, origins, strict=True)), active_tab=0
+            *(rrb.TextDocumentView(name=n, origin=o) for n, o in zip(names, origins, strict=True)),
+            active_tab=0,
         )
 
     def _overview(self) -> rrb.Vertical:
         plots = rrb.Vertical(
             self._error(),
             self._lanes(),
-            rrb.Horizontal(*map(self._level, (columns.FLOW, columns.AMBIENT, columns.TEMPERATURES))),
+            rrb.Horizontal(
+                *map(self._level, (columns.FLOW, columns.AMBIENT, columns.TEMPERATURES))
+            ),
             row_shares=[3.6, 2.5, 2],
         )
         return rrb.Vertical(
             rrb.Horizontal(plots, self._pages(), column_shares=[3.4, 1]),
-            rrb.Horizontal(self._log("Detected events, UTC", "/found"), self._log("Events, UTC", "/events")),
+            rrb.Horizontal(
+                self._log("Detected events, UTC", "/found"), self._log("Events, UTC", "/events")
+            ),
             row_shares=[4.2, 1],
             name="overview",
         )
 
     def _loop(self) -> rrb.Vertical:
-        further = [self._plot(name, *paths) for name, paths in blueprint.learned(self.config).items()]
+        further = [
+            self._plot(name, *paths) for name, paths in blueprint.learned(self.config).items()
+        ]
         plots = [*map(self._ticks, blueprint.LOOP_PLOTS), *further]
         return rrb.Vertical(
             self._around_band(
-                f"{plot_title(columns.ERROR, 'each tick')} (shown for short runs, or with --from and --to)",
+                f"{plot_title(columns.ERROR, 'each tick')} (shown for short runs, or with "
+                "--from and --to)",
                 "/loop/error",
             ),
             *plots,
@@ -153,24 +174,31 @@ class ReviewBlueprint:
 
     def _environment(self) -> rrb.Vertical:
         plots = [self._level(plot) for plot in plots_of(Group.PUMP, Group.ENVIRONMENT)]
-        return rrb.Vertical(self._error(), *plots, row_shares=[2, *(1 for _ in plots)], name="environment")
+        return rrb.Vertical(
+            self._error(), *plots, row_shares=[2, *(1 for _ in plots)], name="environment"
+        )
 
     def _shape(self) -> rrb.Vertical:
         rows = [self._maps(label) for label in self.labels]
         plots = [
             rrb.Horizontal(
-                self._plot("Change of the centre by camera (± 1σ) and laser, µm", "/shape/sag_change"),
+                self._plot(
+                    "Change of the centre by camera (± 1σ) and laser, µm", "/shape/sag_change"
+                ),
                 self._plot("Low orders, change ± 1σ, µm", "/shape/change"),
             ),
             rrb.Horizontal(
-                self._plot("Slope residual, µrad", "/shape/residual"), *map(self._level, plots_of(Group.SHAPE))
+                self._plot("Slope residual, µrad", "/shape/residual"),
+                *map(self._level, plots_of(Group.SHAPE)),
             ),
         ]
         return rrb.Vertical(*rows, *plots, row_shares=[3] * len(rows) + [2.5, 1.5], name="shape")
 
     def _maps(self, label: str) -> rrb.Horizontal:
         def view(kind: str, name: str) -> rrb.Spatial2DView:
-            return rrb.Spatial2DView(name=f"{label} {name}".strip(), origin=f"{prefix_of(label)}/shape/map/{kind}")
+            return rrb.Spatial2DView(
+                name=f"{label} {name}".strip(), origin=f"{prefix_of(label)}/shape/map/{kind}"
+            )
 
         less = rrb.Tabs(
             view("difference_no_defocus", "Less piston, tilt, defocus"),
@@ -190,7 +218,9 @@ class ReviewBlueprint:
             self._lanes(),
             self._error(),
             rrb.Horizontal(*map(self._level, (columns.LATENESS, columns.MISSED, columns.GAUGE))),
-            rrb.Horizontal(self._log("Events, UTC", "/events"), self._log("Detected events, UTC", "/found")),
+            rrb.Horizontal(
+                self._log("Events, UTC", "/events"), self._log("Detected events, UTC", "/found")
+            ),
             row_shares=[2.2, 3, 2, 2.8],
             name="faults",
         )
@@ -206,9 +236,14 @@ class ReviewBlueprint:
 
 
 def labels_of(names: Sequence[str]) -> list[str]:
-    """Names of overlaid runs, without the times of their starts if they differ even so; empty for a single run."""
+    """Names of overlaid runs, without the times of their starts if they differ even so; empty for a
+    single run.
+    """
     if len(names) == 1:
         return [""]
     short = [re.sub(r"^\d{8}T\d{6}Z-(?=.)", "", name) for name in names]
     names = short if len(set(short)) == len(names) else names
-    return [name if names.count(name) == 1 else f"{name} ({place})" for place, name in enumerate(names, 1)]
+    return [
+        name if names.count(name) == 1 else f"{name} ({place})"
+        for place, name in enumerate(names, 1)
+    ]

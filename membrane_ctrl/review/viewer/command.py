@@ -1,7 +1,8 @@
 """`membrane-ctrl review RUN...`: the timeline of one or several runs, at the requested time.
 
-`review --all`: all runs of a folder in one viewer, a Rerun catalogue with a row per run, served to this machine only.
-The rows come first, from the runs' small files; each run's timeline follows in the background, newest first.
+`review --all`: all runs of a folder in one viewer, a Rerun catalogue with a row per run, served to
+this machine only. The rows come first, from the runs' small files; each run's timeline follows in
+the background, newest first.
 """
 
 import sys
@@ -53,7 +54,10 @@ def review_command(options: ReviewOptions) -> int:
     if options.every:
         return _show_every_run(options)
     runs = [open_run(catalogue.resolve(path)) for path in options.runs]
-    with terminal.ends_as_by_ctrl_c(), tempfile.TemporaryDirectory(prefix="membrane-review-") as folder:
+    with (
+        terminal.ends_as_by_ctrl_c(),
+        tempfile.TemporaryDirectory(prefix="membrane-review-") as folder,
+    ):
         if options.live:
             return viewer.live(runs[0].folder, options.web, options.port)
         for target in (options.save, options.screenshot):
@@ -75,7 +79,9 @@ def _show(file: Path, options: ReviewOptions, cursor: viewer.CursorTime | None) 
     if options.save is not None:
         print(file)
         return 0
-    return viewer.serve(file, options.bind, options.port) if options.web else viewer.show(file, cursor)
+    return (
+        viewer.serve(file, options.bind, options.port) if options.web else viewer.show(file, cursor)
+    )
 
 
 def _picture(target: Path, source: Path | str, cursor: viewer.CursorTime | None = None) -> int:
@@ -90,7 +96,10 @@ def _show_every_run(options: ReviewOptions) -> int:
     found = catalogue.entries(options.logs)
     if not found:
         raise errors.InputError(f"{options.logs}: contains no run")
-    with terminal.ends_as_by_ctrl_c(), tempfile.TemporaryDirectory(prefix="membrane-review-") as folder:
+    with (
+        terminal.ends_as_by_ctrl_c(),
+        tempfile.TemporaryDirectory(prefix="membrane-review-") as folder,
+    ):
         served = RunCatalogue(found, Path(folder))
         print(f"catalogue of {len(found)} runs for Rerun clients: {served.url}", file=sys.stderr)
         try:
@@ -118,16 +127,24 @@ def _require_sense(options: ReviewOptions) -> None:
         raise errors.InputError("--at, --around, --from with --to: only one of these at a time")
     if not options.web and (options.bind != _THIS_MACHINE or options.port):
         raise errors.InputError("--bind and --port: only with --web")
-    if options.every and (options.live or options.save or options.bind != _THIS_MACHINE or any(moments)):
-        raise errors.InputError("--all serves this machine only, and all of each run: omit --bind, --at and the like")
+    if options.every and (
+        options.live or options.save or options.bind != _THIS_MACHINE or any(moments)
+    ):
+        raise errors.InputError(
+            "--all serves this machine only, and all of each run: omit --bind, --at and the like"
+        )
     if not options.live:
         return
     if len(options.runs) != 1:
         raise errors.InputError("--live: one run at a time")
     if any(part is not None for part in (*moments, options.save, options.screenshot)):
-        raise errors.InputError("--live follows the run in progress: omit --at, --from, --save and similar options")
+        raise errors.InputError(
+            "--live follows the run in progress: omit --at, --from, --save and similar options"
+        )
     if options.bind != _THIS_MACHINE:
-        raise errors.InputError("--live serves this machine only: omit --bind and use the printed ssh line")
+        raise errors.InputError(
+            "--live serves this machine only: omit --bind and use the printed ssh line"
+        )
 
 
 def _require_writable(target: Path, runs: Sequence[Run]) -> None:
@@ -141,7 +158,9 @@ def _require_writable(target: Path, runs: Sequence[Run]) -> None:
             target.unlink()
 
 
-def make_review(runs: Sequence[Run], options: ReviewOptions, file: Path) -> viewer.CursorTime | None:
+def make_review(
+    runs: Sequence[Run], options: ReviewOptions, file: Path
+) -> viewer.CursorTime | None:
     """Write the recording that the viewer opens.
 
     Raises InputError if the first run lacks a requested time or event, or no run has telemetry.
@@ -164,25 +183,37 @@ def make_review(runs: Sequence[Run], options: ReviewOptions, file: Path) -> view
     labels = blueprints.labels_of([run.name for run in runs])
     layer = Layer(file, runs[0].name if len(runs) == 1 else " and ".join(labels))
     for run, label, zero_s in zip(runs, labels, zeros_s, strict=True):
-        part_s = ALL if span_s is None else (span_s[0] - zeros_s[0] + zero_s, span_s[1] - zeros_s[0] + zero_s)
+        part_s = (
+            ALL
+            if span_s is None
+            else (span_s[0] - zeros_s[0] + zero_s, span_s[1] - zeros_s[0] + zero_s)
+        )
         layer.add(run, label, zero_s, part_s)
     by_clock = len(runs) == 1 or options.align == "utc"
     timeline = "utc" if by_clock else "run_time"
     zero_ns = round(1e9 * runs[0].origin_utc.timestamp()) if by_clock else -round(1e9 * zeros_s[0])
-    shown_ns = None if span_s is None else (zero_ns + round(1e9 * span_s[0]), zero_ns + round(1e9 * span_s[1]))
+    shown_ns = (
+        None
+        if span_s is None
+        else (zero_ns + round(1e9 * span_s[0]), zero_ns + round(1e9 * span_s[1]))
+    )
     blueprint = blueprints.ReviewBlueprint(labels, timeline, shown_ns, runs[0].config)
     layer.blueprint(blueprint.made(options.tab))
     layer.close()
     if shown_ns is None:
         return None
-    return viewer.CursorTime(timeline, shown_ns[0] if options.start or options.end else sum(shown_ns) // 2)
+    return viewer.CursorTime(
+        timeline, shown_ns[0] if options.start or options.end else sum(shown_ns) // 2
+    )
 
 
 def _with_telemetry(runs: Sequence[Run]) -> list[Run]:
     """The runs that can be shown; adds a note to the others."""
     there = [run for run in runs if catalogue.end_s(run)]
     if not there:
-        raise errors.InputError(f"{', '.join(str(run.folder) for run in runs)}: no readable telemetry")
+        raise errors.InputError(
+            f"{', '.join(str(run.folder) for run in runs)}: no readable telemetry"
+        )
     for run in runs:
         if run not in there:
             run.notes.append("not shown: no readable telemetry")
@@ -197,7 +228,9 @@ def _span(run: Run, options: ReviewOptions) -> tuple[float, float] | None:
             raise catalogue.not_in(run, f"--from {options.start}")
         if end_s <= 0:
             raise catalogue.not_in(run, f"--to {options.end}")
-        return (0.0 if options.start is None else start_s), (catalogue.end_s(run) if options.end is None else end_s)
+        return (0.0 if options.start is None else start_s), (
+            catalogue.end_s(run) if options.end is None else end_s
+        )
     if options.at is not None:
         at_s = catalogue.moment_s(options.at, run.origin_utc)
         if not -_AROUND_S <= at_s <= catalogue.end_s(run) + _AROUND_S:
@@ -210,7 +243,9 @@ def _span(run: Run, options: ReviewOptions) -> tuple[float, float] | None:
 
 
 def _around(run: Run, what: str) -> float:
-    """Time of the first event, recorded or detected, whose kind, name, state, text or command contains `what`."""
+    """Time of the first event, recorded or detected, whose kind, name, state, text or command
+    contains `what`.
+    """
     wanted = what.lower()
     # `hold` means the state, not the command that led to it
     for keys in (("kind", "name", "state", "text"), ("command",)):
@@ -219,13 +254,20 @@ def _around(run: Run, what: str) -> float:
                 return each.mono_s
     from membrane_ctrl.review.events.found import LEVEL_COLUMNS, find_events
 
-    found = find_events(run.level(1.0, names=LEVEL_COLUMNS), run.shapes(), run.config.limits.band_um)
+    found = find_events(
+        run.level(1.0, names=LEVEL_COLUMNS), run.shapes(), run.config.limits.band_um
+    )
     for item in found:
         if wanted in item.kind:
             return item.time_s
-    told = {str(e.get("name") or e.get("state") or e.get("command") or e.get("kind")) for e in run.events}
+    told = {
+        str(e.get("name") or e.get("state") or e.get("command") or e.get("kind"))
+        for e in run.events
+    }
     named = sorted(told - {"why"} | {item.kind for item in found})
-    raise errors.InputError(f"--around {what}: no such event in {run.name}; known: {', '.join(named)}")
+    raise errors.InputError(
+        f"--around {what}: no such event in {run.name}; known: {', '.join(named)}"
+    )
 
 
 def _zeros(runs: Sequence[Run], align: str) -> list[float]:
@@ -296,7 +338,9 @@ class RunCatalogue:
         self._server.shutdown()
 
     def add_timelines(self, wanted: Callable[[], bool]) -> None:
-        """Add the runs' timelines, newest first, while `wanted`; a run that has none is named on stderr."""
+        """Add the runs' timelines, newest first, while `wanted`; a run that has none is named on
+        stderr.
+        """
         for number, entry in reversed(list(enumerate(self._entries))):
             if not wanted():
                 return
@@ -317,9 +361,16 @@ class RunCatalogue:
         """One layout for the table, one for every run."""
         columns = [Column("recording link", name="run")]
         learned = any(entry.pump_scale == entry.pump_scale for entry in self._entries)
-        shown = {name: words for name, words in PROPERTIES.items() if learned or not name.startswith("pump_")}
+        shown = {
+            name: words
+            for name, words in PROPERTIES.items()
+            if learned or not name.startswith("pump_")
+        }
         columns += [Column(f"property:run:{name}", name=heading) for name, heading in shown.items()]
-        hidden = [Column(f"property:RecordingInfo:{name}", visible=False) for name in ("name", "start_time")]
+        hidden = [
+            Column(f"property:RecordingInfo:{name}", visible=False)
+            for name in ("name", "start_time")
+        ]
         started = SortBy("property:run:started_utc", direction="Descending")
         table = TableBlueprint(table_layout=TableLayout(columns=columns + hidden), sort_by=started)
         coarse = blueprints.ReviewBlueprint(("",), "utc", None, Config())
@@ -336,8 +387,14 @@ def _row(entry: catalogue.RunEntry, file: Path) -> Path:
     values["geometry"] = entry.geometry[:8]
     values["faults_share"] = entry.faults_s / entry.duration_s if entry.duration_s else float("nan")
     # more digits would make the table's columns too wide to compare
-    values |= {name: float(f"{value:.4g}") for name, value in values.items() if isinstance(value, float)}
-    known = {name: values[name] for name in PROPERTIES if values[name] == values[name] and values[name] != ""}
+    values |= {
+        name: float(f"{value:.4g}") for name, value in values.items() if isinstance(value, float)
+    }
+    known = {
+        name: values[name]
+        for name in PROPERTIES
+        if values[name] == values[name] and values[name] != ""
+    }
     stream = rr.RecordingStream(APPLICATION, recording_id=entry.name)
     stream.save(file)
     stream.send_recording_name(entry.name)

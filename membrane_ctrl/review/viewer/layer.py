@@ -1,7 +1,7 @@
 """The viewer's input: a separate recording, made from the tables in a second; the run is only read.
 
-It has the overview levels of the whole run; every tick of the requested part, unless that is too much to draw; the
-figure with maps; states; events, marks and detected events.
+It has the overview levels of the whole run; every tick of the requested part, unless that is too
+much to draw; the figure with maps; states; events, marks and detected events.
 """
 
 from collections.abc import Iterable, Sequence
@@ -39,9 +39,11 @@ _RUN_COLOURS: tuple[Colour, ...] = (BLUE, ORANGE, GREEN, VIOLET, RED)
 
 
 def overview_streams(plot: Plot) -> tuple[streams.Stream, ...]:
-    """Return the streams of a plot of an overview level; the field of a line is a column of the level.
+    """Return the streams of a plot of an overview level; the field of a line is a column of the
+    level.
 
-    Each column of the plot that levels keep gives a line of its means; a single one gives minimum and maximum, too.
+    Each column of the plot that levels keep gives a line of its means; a single one gives minimum
+    and maximum, too.
     """
     kept = aggregated_of(plot)
     alone = sum(not each.twin_only for each in kept) == 1
@@ -49,8 +51,14 @@ def overview_streams(plot: Plot) -> tuple[streams.Stream, ...]:
     for each in kept:
         lines = by_entity.setdefault(streams.mean_path(each.entity), [])
         for kind, name in _EXTREMES.items() if alone and not each.twin_only else ():
-            lines.append(streams.Line(f"{kind}_{each.name}", f"{each.label}, {name} {each.unit}", GREY, 1.0))
-        lines.append(streams.Line(f"mean_{each.name}", f"{each.label}, mean {each.unit}", each.colour, each.width))
+            lines.append(
+                streams.Line(f"{kind}_{each.name}", f"{each.label}, {name} {each.unit}", GREY, 1.0)
+            )
+        lines.append(
+            streams.Line(
+                f"mean_{each.name}", f"{each.label}, mean {each.unit}", each.colour, each.width
+            )
+        )
     return tuple(streams.Stream(path, tuple(lines)) for path, lines in by_entity.items())
 
 
@@ -58,21 +66,26 @@ _EXTREMES = {"min": "minimum", "max": "maximum"}
 OVERVIEWS = tuple(stream for plot in plots_of(*DRAWN) for stream in overview_streams(plot))
 
 _COLOUR_WORDS = (
-    "Change: cyan below, dark 0, yellow above. Others: violet to yellow. 99 % of the maps are in their range."
+    "Change: cyan below, dark 0, yellow above. Others: violet to yellow. 99 % of the maps are in "
+    "their range."
 )
 _SIGNED = {"Pa", "µm", "%"}
 _OTHER_FOUND: Colour = (255, 150, 150)  # a lost laser's line must differ from that of its fault
 _FOUND_COLOURS = {
-    "pressure step": VIOLET, "leak step": ORANGE, "noise change": ORANGE,
+    "pressure step": VIOLET,
+    "leak step": ORANGE,
+    "noise change": ORANGE,
     "shape jump": BLUE,
-}  # fmt: skip
+}
 
 
 ALL = (-np.inf, np.inf)
 
 
 class Layer:
-    """Writes runs into one recording, the `.rrd` file `path`; with `overview_only` coarse levels without ticks."""
+    """Writes runs into one recording, the `.rrd` file `path`; with `overview_only` coarse levels
+    without ticks.
+    """
 
     def __init__(self, path: Path, name: str, overview_only: bool = False) -> None:
         self._overview_only = overview_only
@@ -93,7 +106,9 @@ class Layer:
         self._stream.flush()
         self._stream.disconnect()
 
-    def add(self, run: Run, label: str = "", zero_s: float = 0.0, part_s: tuple[float, float] = ALL) -> None:
+    def add(
+        self, run: Run, label: str = "", zero_s: float = 0.0, part_s: tuple[float, float] = ALL
+    ) -> None:
         """Add a run.
 
         Parameters
@@ -103,8 +118,8 @@ class Layer:
         zero_s : float
             Second of the run at 0 on the timeline.
         part_s : tuple
-            Requested part: shown tick by tick unless too long; logs and maps hold only this part, as otherwise a
-            cursor at the end of the recording would show those of the end.
+            Requested part: shown tick by tick unless too long; logs and maps hold only this part,
+            as otherwise a cursor at the end of the recording would show those of the end.
         """
         self._prefix, self._shift_s = prefix_of(label), zero_s
         self._label = f"{label}: " if label else ""
@@ -134,10 +149,14 @@ class Layer:
         ends = level["time_s"][[0, -1]] if level["time_s"].size else np.empty(0)
         band = streams.band(band_um)
         square = np.full((ends.size, 1), band_um**2)
-        self._measured(band.path, [(band.lines[0].name, GREEN)], ends, np.zeros_like(square), square, 0.0)
+        self._measured(
+            band.path, [(band.lines[0].name, GREEN)], ends, np.zeros_like(square), square, 0.0
+        )
 
     def _ticks(self, run: Run, part_s: tuple[float, float]) -> None:
-        rows_expected = run.config.loop.rate_hz * (min(part_s[1], _end_s(run)) - max(part_s[0], 0.0))
+        rows_expected = run.config.loop.rate_hz * (
+            min(part_s[1], _end_s(run)) - max(part_s[0], 0.0)
+        )
         if rows_expected > RAW_ROWS_MOST:
             return
         for block in run.tick_blocks(FIELDS, *part_s):
@@ -152,32 +171,52 @@ class Layer:
             path = self._prefix + lane.path
             words = list(lane.colours)
             colours = np.array([lane.colours[word] for word in words], dtype=np.uint32)
-            self._stream.log(path, rr.StateConfiguration(values=words, labels=words, colors=colours), static=True)
+            self._stream.log(
+                path, rr.StateConfiguration(values=words, labels=words, colors=colours), static=True
+            )
             found = changes(level[lane.field], np.nan)
             if found:
-                times = np.append(level["time_s"][[row for row, _ in found]], level["time_s"][-1] + 1.0)
-                states = pa.array([*(lane.word(code) for _, code in found), None])  # the lane ends with the run
+                times = np.append(
+                    level["time_s"][[row for row, _ in found]], level["time_s"][-1] + 1.0
+                )
+                states = pa.array(
+                    [*(lane.word(code) for _, code in found), None]
+                )  # the lane ends with the run
                 self._columns(lane.path, times, rr.StateChange.columns(state=states))
 
     def _events(self, run: Run, found: Sequence[FoundEvent], part_s: tuple[float, float]) -> None:
-        told = [e for e in run.log if not isinstance(e.event, events.Why) and part_s[0] <= e.mono_s <= part_s[1]]
+        told = [
+            e
+            for e in run.log
+            if not isinstance(e.event, events.Why) and part_s[0] <= e.mono_s <= part_s[1]
+        ]
         if told:
             levels = [each.event.level.value for each in told]
             texts = [each.event.sentence for each in told]
             self._log(run, "/events", np.array([each.mono_s for each in told]), texts, levels)
-        for stream, time_s, values in streams.mark_lines([(each.mono_s, each.event) for each in run.log]):
-            self._style(stream.path, [(line.name, line.colour) for line in stream.lines], 2.0, vertical=True)
+        for stream, time_s, values in streams.mark_lines(
+            [(each.mono_s, each.event) for each in run.log]
+        ):
+            self._style(
+                stream.path, [(line.name, line.colour) for line in stream.lines], 2.0, vertical=True
+            )
             self._columns(stream.path, time_s, rr.Scalars.columns(scalars=values))
         pump = [(e.mono_s, e.event) for e in run.log if isinstance(e.event, events.PumpLearned)]
         if pump:
             values = np.array([(told.scale, told.correction) for _, told in pump])
             variances = np.array([(told.sigma**2, 0.0) for _, told in pump])
             lines = [(line.name, line.colour) for line in streams.PUMP.lines]
-            self._measured(streams.PUMP.path, lines, np.array([at_s for at_s, _ in pump]), values, variances)
+            self._measured(
+                streams.PUMP.path, lines, np.array([at_s for at_s, _ in pump]), values, variances
+            )
         seen = [f for f in found if part_s[0] <= f.time_s <= part_s[1]]
         if seen:
-            texts = [f"{f.kind}, {_size(f.size, f.unit)} (confidence {f.confidence:.3f})" for f in seen]
-            self._log(run, "/found", np.array([f.time_s for f in seen]), texts, ["WARN"] * len(seen))
+            texts = [
+                f"{f.kind}, {_size(f.size, f.unit)} (confidence {f.confidence:.3f})" for f in seen
+            ]
+            self._log(
+                run, "/found", np.array([f.time_s for f in seen]), texts, ["WARN"] * len(seen)
+            )
         for kind in dict.fromkeys(f.kind for f in found):
             alike = sorted((f for f in found if f.kind == kind), key=lambda f: f.size)
             ends = " to ".join(dict.fromkeys(_size(f.size, f.unit) for f in (alike[0], alike[-1])))
@@ -187,24 +226,37 @@ class Layer:
             time_s, values = streams.vertical_lines(np.array([f.time_s for f in alike]))
             self._columns(path, time_s, rr.Scalars.columns(scalars=values))
 
-    def _log(self, run: Run, path: str, time_s: Column, texts: list[str], levels: list[str]) -> None:
+    def _log(
+        self, run: Run, path: str, time_s: Column, texts: list[str], levels: list[str]
+    ) -> None:
         """Log lines that begin with the time of day."""
         lines = [
-            f"{self._label}{run.utc(at_s):%H:%M:%S} {text}" for at_s, text in zip(time_s.tolist(), texts, strict=True)
+            f"{self._label}{run.utc(at_s):%H:%M:%S} {text}"
+            for at_s, text in zip(time_s.tolist(), texts, strict=True)
         ]
         self._columns(path, time_s, rr.TextLog.columns(text=lines, level=levels))
 
     def _figure(self, cycles: shapes.Shapes, part_s: tuple[float, float]) -> None:
         """Changes since the first cycle of the hold."""
-        good = cycles.select((cycles.verdict != "rejected") & np.isfinite(cycles.coeffs_um).all(axis=1))
+        good = cycles.select(
+            (cycles.verdict != "rejected") & np.isfinite(cycles.coeffs_um).all(axis=1)
+        )
         if not len(good):
             return
         shown = good.select(_some(len(good), SHAPES_MOST))
         parameters = shown.parameters_um() - shown.parameters_um()[0]
         terms = [j - 1 for j in streams.LOW_ORDERS]
         variances = _variances(shown)[:, terms]
-        self._measured("/shape/change", streams.LOW_ORDERS.values(), shown.time_s, parameters[:, terms], variances)
-        change = np.column_stack((shown.sag_um - shown.sag_um[0], shown.displacement_um - shown.displacement_um[0]))
+        self._measured(
+            "/shape/change",
+            streams.LOW_ORDERS.values(),
+            shown.time_s,
+            parameters[:, terms],
+            variances,
+        )
+        change = np.column_stack(
+            (shown.sag_um - shown.sag_um[0], shown.displacement_um - shown.displacement_um[0])
+        )
         variances = np.nan_to_num(np.column_stack((shown.sag_sigma_um**2, np.zeros(len(shown)))))
         lines = [(line.name, line.colour) for line in streams.SAG.lines]
         self._measured("/shape/sag_change", lines, shown.time_s, change, variances)
@@ -215,7 +267,9 @@ class Layer:
         self._maps(shown.time_s[seen], parameters[seen])
 
     def _maps(self, time_s: Column, parameters: Column) -> None:
-        """Maps of change, each kind on one scale for playback, and of the standard deviation over the part."""
+        """Maps of change, each kind on one scale for playback, and of the standard deviation over
+        the part.
+        """
         context = rr.AnnotationContext([(0, "", (0, 0, 0, 0)), (1, "", (24, 24, 24, 255))])
         self._stream.log(self._prefix + "/shape", context, static=True)
         colours = {}
@@ -233,11 +287,14 @@ class Layer:
             for row, change in zip(wanted, changes, strict=True):
                 self._map(kind, change, span, float(time_s[row]))
         rows = "".join(
-            f"| {shapes.MAPS[kind].replace(' so far', '')} | {words} |\n" for kind, words in colours.items()
+            f"| {shapes.MAPS[kind].replace(' so far', '')} | {words} |\n"
+            for kind, words in colours.items()
         )
         self._page("/shape/legend", f"| map | colours |\n|---|---|\n{rows}\n{_COLOUR_WORDS}")
 
-    def _map(self, kind: str, values: shapes.Map, span: tuple[float, float], at_s: float | None = None) -> None:
+    def _map(
+        self, kind: str, values: shapes.Map, span: tuple[float, float], at_s: float | None = None
+    ) -> None:
         """Log a map at a second of the run, or for all of it."""
         path, picture = f"{self._prefix}/shape/map/{kind}", np.nan_to_num(values).astype(np.float16)
         outside = rr.SegmentationImage(shapes.outside_disc(), opacity=1.0, draw_order=1.0)
@@ -249,28 +306,45 @@ class Layer:
         self._stream.log(path, rerun_streams.map_picture(picture, span), static=at_s is None)
 
     def _page(self, path: str, text: str) -> None:
-        self._stream.log(self._prefix + path, rr.TextDocument(text, media_type="text/markdown"), static=True)
+        self._stream.log(
+            self._prefix + path, rr.TextDocument(text, media_type="text/markdown"), static=True
+        )
 
     def _named(self, lines: Iterable[tuple[str, Colour]], width: float) -> dict[str, Any]:
-        """Names, colours and widths of the lines of an entity; those of overlaid runs tell the runs apart."""
+        """Names, colours and widths of the lines of an entity; those of overlaid runs tell the runs
+        apart.
+        """
         names, colours = zip(*lines, strict=True)
         if self._prefix:
             colours = tuple(_of_run(colour, self._number) for colour in colours)
         return {
-            "names": [self._label + name for name in names], "colors": list(colours), "widths": [width] * len(names)
-        }  # fmt: skip
+            "names": [self._label + name for name in names],
+            "colors": list(colours),
+            "widths": [width] * len(names),
+        }
 
     def _style(
-        self, path: str, lines: Iterable[tuple[str, Colour]], width: float = 1.5, vertical: bool = False
+        self,
+        path: str,
+        lines: Iterable[tuple[str, Colour]],
+        width: float = 1.5,
+        vertical: bool = False,
     ) -> None:
         # the average of the lines in a pixel would be none
-        style = rr.SeriesLines(**self._named(lines, width), aggregation_policy="Off" if vertical else None)
+        style = rr.SeriesLines(
+            **self._named(lines, width), aggregation_policy="Off" if vertical else None
+        )
         self._stream.log(self._prefix + path, style, static=True)
 
     def _measured(
-        self, path: str, lines: Iterable[tuple[str, Colour]], time_s: Column, values: Column,
-        variances: Column, width: float = 1.5,
-    ) -> None:  # fmt: skip
+        self,
+        path: str,
+        lines: Iterable[tuple[str, Colour]],
+        time_s: Column,
+        values: Column,
+        variances: Column,
+        width: float = 1.5,
+    ) -> None:
         """Log values with a shaded area of one standard deviation."""
         style = rr.Measurements.from_fields(**self._named(lines, width))
         self._stream.log(self._prefix + path, style, static=True)
@@ -297,7 +371,9 @@ def prefix_of(label: str) -> str:
 
 
 def _summary_page(run: Run) -> str:
-    """The page of figures as the recorder wrote it last, from `summary.json`: what `runs` and `report` state."""
+    """The page of figures as the recorder wrote it last, from `summary.json`: what `runs` and
+    `report` state.
+    """
     status = RunStatus()
     for each in run.log:
         status = status.after_event(each.event, each.mono_s)
@@ -314,7 +390,9 @@ def _size(size: float, unit: str) -> str:
 
 
 def _variances(cycles: shapes.Shapes) -> Column:
-    """(n, terms) variances of the coefficients, of the covariance recorded last before each cycle; 0 without any."""
+    """(n, terms) variances of the coefficients, of the covariance recorded last before each cycle;
+    0 without any.
+    """
     if not cycles.covariance_time_s.size:
         return np.zeros_like(cycles.coeffs_um)
     place = np.searchsorted(cycles.covariance_time_s, cycles.time_s, side="right") - 1

@@ -1,4 +1,6 @@
-"""Starts the viewer on a review: on this screen, for a browser, to a picture, or following a run in progress."""
+"""Starts the viewer on a review: on this screen, for a browser, to a picture, or following a run in
+progress.
+"""
 
 import os
 import socket
@@ -20,7 +22,8 @@ from membrane_ctrl.model import errors
 from membrane_ctrl.model.files import open_plain
 from membrane_ctrl.run_files.segments import first_message_after, segments
 
-# Work to do while a viewer is open, until the question whether it is still open is answered with no.
+# Work to do while a viewer is open, until the question whether it is still open is answered with
+# no.
 Meanwhile: TypeAlias = Callable[[Callable[[], bool]], None]
 
 # The recorder flushes every second.
@@ -49,11 +52,15 @@ def _put(client: ViewerClient, at: CursorTime) -> None:
 
 
 def viewer_command(*arguments: str) -> list[str]:
-    """The viewer's binary: the `rerun` command is a Python shim, and ending that would leave the viewer running."""
+    """The viewer's binary: the `rerun` command is a Python shim, and ending that would leave the
+    viewer running.
+    """
     return [str(Path(rerun_cli.__file__).parent / "rerun"), *arguments]
 
 
-def show(source: Path | str, at: CursorTime | None = None, meanwhile: Meanwhile = lambda _: None) -> int:
+def show(
+    source: Path | str, at: CursorTime | None = None, meanwhile: Meanwhile = lambda _: None
+) -> int:
     """Open a file or a server's page on this machine's screen; return when the window is closed.
 
     The cursor is put at a moment; `meanwhile` runs while the window is open and ends with it.
@@ -69,10 +76,13 @@ def show(source: Path | str, at: CursorTime | None = None, meanwhile: Meanwhile 
     return _run(viewer_command("--bind", "127.0.0.1", "--port", str(port), str(source)), started)
 
 
-def put_cursor(process: subprocess.Popen[bytes], port: int, at: CursorTime, most_s: float = _CURSOR_S) -> None:
+def put_cursor(
+    process: subprocess.Popen[bytes], port: int, at: CursorTime, most_s: float = _CURSOR_S
+) -> None:
     """Set a viewer's time cursor once its files are open, which a blueprint cannot do.
 
-    A viewer that does not answer in time is left unchanged: its plots show the requested part anyway.
+    A viewer that does not answer in time is left unchanged: its plots show the requested part
+    anyway.
     """
     until_s = time.monotonic() + most_s
     while time.monotonic() < until_s and process.poll() is None:
@@ -87,27 +97,37 @@ def put_cursor(process: subprocess.Popen[bytes], port: int, at: CursorTime, most
 
 
 def serve(source: Path | str, bind: str, port: int, meanwhile: Meanwhile = lambda _: None) -> int:
-    """Serve a file, or a page for a server's data, to browsers until interrupted; `meanwhile` as for `show`.
+    """Serve a file, or a page for a server's data, to browsers until interrupted; `meanwhile` as
+    for `show`.
 
-    Raises DeviceError if it cannot listen there, or the viewer does not start. `bind` is 127.0.0.1, or
-    an address of this machine for remote viewers; `port` is that of the page, 0 for a free one.
+    Raises DeviceError if it cannot listen there, or the viewer does not start. `bind` is 127.0.0.1,
+    or an address of this machine for remote viewers; `port` is that of the page, 0 for a free one.
     """
     port = port or free_port()
     _require_listening(bind, port)
     data_port = free_port()
     url = source if isinstance(source, str) else _proxy(_host(bind), data_port)
     _say_where(bind, port, url)
-    options = ["--serve-web", "--bind", bind, "--port", str(data_port), "--web-viewer-port", str(port)]
+    options = [
+        "--serve-web",
+        "--bind",
+        bind,
+        "--port",
+        str(data_port),
+        "--web-viewer-port",
+        str(port),
+    ]
     return _run(
-        viewer_command(*options, str(source)), lambda process: meanwhile(lambda: process.poll() is None)
-    )  # fmt: skip
+        viewer_command(*options, str(source)),
+        lambda process: meanwhile(lambda: process.poll() is None),
+    )
 
 
 def live(folder: Path, web: bool, port: int = 0) -> int:
     """Show a run in progress by reading its files, without affecting the run.
 
-    The segments are piped into a separate server, to which the viewer (or, with `web`, a browser) connects: a
-    viewer that reads its standard input itself draws nothing before the input ends.
+    The segments are piped into a separate server, to which the viewer (or, with `web`, a browser)
+    connects: a viewer that reads its standard input itself draws nothing before the input ends.
     """
     data_port, port = free_port(), port or free_port()
     kind = ["--serve-web", "--web-viewer-port", str(port)] if web else ["--serve-grpc"]
@@ -120,7 +140,9 @@ def live(folder: Path, web: bool, port: int = 0) -> int:
         _require_screen()
     try:
         with subprocess.Popen(server, stdin=subprocess.PIPE, env=_environment()) as served:
-            viewer = viewer_command("--bind", "127.0.0.1", "--port", str(free_port()), "--connect", proxy)
+            viewer = viewer_command(
+                "--bind", "127.0.0.1", "--port", str(free_port()), "--connect", proxy
+            )
             watched = served if web else subprocess.Popen(viewer, env=_environment())
             assert served.stdin is not None
             try:
@@ -137,8 +159,12 @@ def live(folder: Path, web: bool, port: int = 0) -> int:
 
 
 def _require_screen() -> None:
-    if sys.platform.startswith("linux") and not (os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY")):
-        raise errors.DeviceError("no screen: use --web and open the address in a browser, or --screenshot FILE")
+    if sys.platform.startswith("linux") and not (
+        os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY")
+    ):
+        raise errors.DeviceError(
+            "no screen: use --web and open the address in a browser, or --screenshot FILE"
+        )
 
 
 def _host(bind: str) -> str:
@@ -150,21 +176,30 @@ def _proxy(host: str, port: int) -> str:
 
 
 def _say_where(bind: str, port: int, url: str) -> None:
-    """Print the address of the page that shows a server's data, and how to reach it from another machine."""
+    """Print the address of the page that shows a server's data, and how to reach it from another
+    machine.
+    """
     print(f"open http://{_host(bind)}:{port}/?url={quote(url, safe='')}", file=sys.stderr)
     if bind == "127.0.0.1":
         data_port = urlsplit(url).port
-        tunnel = f"ssh -L {port}:127.0.0.1:{port} -L {data_port}:127.0.0.1:{data_port} {socket.gethostname()}"
+        tunnel = (
+            f"ssh -L {port}:127.0.0.1:{port} -L {data_port}:127.0.0.1:{data_port} "
+            f"{socket.gethostname()}"
+        )
         print(f"from another machine first: {tunnel}", file=sys.stderr)
 
 
 def follow(
-    folder: Path, out: IO[bytes], wanted: Callable[[], bool], sleep: Callable[[float], None] = time.sleep
+    folder: Path,
+    out: IO[bytes],
+    wanted: Callable[[], bool],
+    sleep: Callable[[float], None] = time.sleep,
 ) -> None:
     """Copy a growing run, segment by segment, until it has its summary or the viewer closes.
 
-    It starts a few minutes back: a browser reads only a few times faster than a run grows, and would be hours behind
-    after a night. The start of the segment precedes that, as it defines how to draw everything.
+    It starts a few minutes back: a browser reads only a few times faster than a run grows, and
+    would be hours behind after a night. The start of the segment precedes that, as it defines how
+    to draw everything.
 
     Raises BrokenPipeError when the reader has gone.
     """
@@ -173,7 +208,9 @@ def follow(
         out.flush()
 
 
-def _grown(folder: Path, wanted: Callable[[], bool], sleep: Callable[[float], None]) -> Iterator[bytes]:
+def _grown(
+    folder: Path, wanted: Callable[[], bool], sleep: Callable[[float], None]
+) -> Iterator[bytes]:
     number, place, style = _recent(segments(folder))
     yield style
     while wanted():
@@ -217,7 +254,9 @@ def _require_listening(bind: str, port: int) -> None:
             probe.bind((bind, port))
     except OSError as error:
         where = f"{bind}, port {port} ({errors.os_reason(error)})"
-        raise errors.DeviceError(f"cannot listen on {where}: choose another --port or --bind") from None
+        raise errors.DeviceError(
+            f"cannot listen on {where}: choose another --port or --bind"
+        ) from None
 
 
 def free_port() -> int:
@@ -227,7 +266,9 @@ def free_port() -> int:
         return int(probe.getsockname()[1])
 
 
-def _run(command: list[str], started: Callable[[subprocess.Popen[bytes]], None] = lambda _: None) -> int:
+def _run(
+    command: list[str], started: Callable[[subprocess.Popen[bytes]], None] = lambda _: None
+) -> int:
     try:
         with subprocess.Popen(command, env=_environment()) as viewer:
             try:
@@ -244,9 +285,11 @@ def _environment() -> dict[str, str]:
     return {**os.environ, "RUST_LOG": os.environ.get("RUST_LOG", "error")}
 
 
-# A picture of a run as the viewer opens it, without a screen; needs a Vulkan driver, e.g. Mesa's software one.
+# A picture of a run as the viewer opens it, without a screen; needs a Vulkan driver, e.g. Mesa's
+# software one.
 
-# The viewer is ready when two consecutive pictures are equal, about 7 s for a short run on two cores.
+# The viewer is ready when two consecutive pictures are equal, about 7 s for a short run on two
+# cores.
 _WAIT_S = 60.0
 _BETWEEN_S = 0.5
 
@@ -254,9 +297,9 @@ _BETWEEN_S = 0.5
 def screenshot(run_dir: Path, tab: str = "Overview") -> bytes:
     """PNG of the whole run, at its end.
 
-    Raises FileNotFoundError if the folder has no recording; ValueError if the recording has no such tab;
-    RuntimeError if the viewer does not start (no Vulkan driver) or its picture keeps changing. Opens all
-    segments of the run; `tab` is the name of a tab of the blueprint.
+    Raises FileNotFoundError if the folder has no recording; ValueError if the recording has no such
+    tab; RuntimeError if the viewer does not start (no Vulkan driver) or its picture keeps changing.
+    Opens all segments of the run; `tab` is the name of a tab of the blueprint.
     """
     files = [str(path.resolve()) for path in segments(run_dir)]
     if not files:
@@ -291,8 +334,13 @@ def _show_tab(viewer: ViewerClient, name: str) -> None:
         for path, parts in blueprint.items()
         if "ContainerBlueprint" in parts
     }
-    wanted = next((path for path, container in containers.items() if container.get("display_name") == name), None)
-    tabs = next((container for container in containers.values() if wanted in container["contents"]), None)
+    wanted = next(
+        (path for path, container in containers.items() if container.get("display_name") == name),
+        None,
+    )
+    tabs = next(
+        (container for container in containers.values() if wanted in container["contents"]), None
+    )
     if tabs is None:
         raise ValueError(f"no tab {name!r} in the recording")
     tabs["active_tab"] = wanted
@@ -313,10 +361,16 @@ def _at_rest(viewer: ViewerClient) -> bytes:
 
 @contextmanager
 def _headless() -> Iterator[ViewerClient]:
-    """A headless viewer reachable only from this machine; `ViewerClient.spawn` would listen on every interface."""
+    """A headless viewer reachable only from this machine; `ViewerClient.spawn` would listen on
+    every interface.
+    """
     port = free_port()
-    command = viewer_command("--headless", "--bind", "127.0.0.1", "--port", str(port), "--hide-welcome-screen")
-    with subprocess.Popen(command, env=_environment(), stdout=subprocess.DEVNULL, stderr=subprocess.PIPE) as process:
+    command = viewer_command(
+        "--headless", "--bind", "127.0.0.1", "--port", str(port), "--hide-welcome-screen"
+    )
+    with subprocess.Popen(
+        command, env=_environment(), stdout=subprocess.DEVNULL, stderr=subprocess.PIPE
+    ) as process:
         try:
             yield _connect(port, process)
         finally:
@@ -335,4 +389,6 @@ def _connect(port: int, process: subprocess.Popen[bytes]) -> ViewerClient:
             return viewer
     process.terminate()
     reason = process.stderr.read().decode(errors="replace").strip() if process.stderr else ""
-    raise RuntimeError(f"the headless viewer did not start (Vulkan driver installed?): {reason[-300:]}")
+    raise RuntimeError(
+        f"the headless viewer did not start (Vulkan driver installed?): {reason[-300:]}"
+    )

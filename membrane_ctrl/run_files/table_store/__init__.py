@@ -1,1 +1,3 @@
-"""Tables of a run: Parquet parts that any program reads, and a journal of the newest rows (docs/recording.md)."""
+"""Tables of a run: Parquet parts that any program reads, and a journal of the newest rows
+(docs/recording.md).
+"""

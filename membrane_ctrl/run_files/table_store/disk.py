@@ -1,4 +1,6 @@
-"""The system calls of a table's writer, in one place: tests interrupt each of them, and fill the disk."""
+"""The system calls of a table's writer, in one place: tests interrupt each of them, and fill the
+disk.
+"""
 
 import os
 from pathlib import Path

@@ -1,11 +1,12 @@
 """The journal: a table's newest rows, on the disk within a second, as frames that each stand alone.
 
-A frame is a head of 32 bytes (magic, number of its first row, rows, packed bytes, unpacked bytes, CRC-32 of all else)
-and an Arrow IPC message packed with zstd. The first frame holds the schema, each other one a record batch. After a
-damaged stretch reading continues with the next frame whose checksum is right.
+A frame is a head of 32 bytes (magic, number of its first row, rows, packed bytes, unpacked bytes,
+CRC-32 of all else) and an Arrow IPC message packed with zstd. The first frame holds the schema,
+each other one a record batch. After a damaged stretch reading continues with the next frame whose
+checksum is right.
 
-Sizes are checked before memory is taken for them: a head states what its message unpacks to, and a message whose own
-buffers are compressed, as an Arrow writer may do, is refused.
+Sizes are checked before memory is taken for them: a head states what its message unpacks to, and a
+message whose own buffers are compressed, as an Arrow writer may do, is refused.
 """
 
 import contextlib
@@ -131,8 +132,13 @@ def read_batch(frame: JournalFrame, schema: pa.Schema) -> pa.RecordBatch:
         raise ValueError("a frame that no recorder writes")
     batch = pa.ipc.read_record_batch(message, schema)
     batch.validate(full=True)  # otherwise Arrow trusts lengths and offsets
-    for column in batch.columns:  # Arrow accepts longer lists than those of the schema, and cuts them at other places
-        if isinstance(column, pa.FixedSizeListArray) and len(column.values) != len(column) * column.type.list_size:
+    for column in (
+        batch.columns
+    ):  # Arrow accepts longer lists than those of the schema, and cuts them at other places
+        if (
+            isinstance(column, pa.FixedSizeListArray)
+            and len(column.values) != len(column) * column.type.list_size
+        ):
             raise ValueError("lists of another length than those of the schema")
     if batch.num_rows != frame.rows or batch.nbytes > FRAME_BYTES_MAX:
         raise ValueError("a frame that does not hold its stated rows")
@@ -144,7 +150,9 @@ def _unpacked(frame: JournalFrame) -> pa.Buffer:
 
 
 def _is_compressed(message: memoryview) -> bool:
-    """Whether a record batch says that its buffers are compressed. Raises ValueError for a damaged header."""
+    """Whether a record batch says that its buffers are compressed. Raises ValueError for a damaged
+    header.
+    """
     try:
         batch = _table_at(message, _field_place(message, _table_at(message, 0), _HEADER_FIELD))
         return _field_place(message, batch, _COMPRESSION_FIELD) != 0
@@ -185,11 +193,13 @@ class LostBytes:
     at_end: bool
 
 
-def read_journal(data: bytes, group_rows: int, schema: pa.Schema) -> Iterator[JournalBlock | LostBytes]:
+def read_journal(
+    data: bytes, group_rows: int, schema: pa.Schema
+) -> Iterator[JournalBlock | LostBytes]:
     """Rows of a journal in blocks of about `group_rows`, and its damaged stretches, in order.
 
-    `schema` replaces that of a journal whose first frame is damaged. Raises pa.ArrowException, OSError or ValueError
-    if the journal's own schema cannot be read.
+    `schema` replaces that of a journal whose first frame is damaged. Raises pa.ArrowException,
+    OSError or ValueError if the journal's own schema cannot be read.
     """
     frames = find_frames(data)
     if frames and frames[0].rows == 0:

@@ -1,8 +1,9 @@
-"""The manifest of a table: what each finished part holds, so that damage is found where Parquet has no checksum.
+"""The manifest of a table: what each finished part holds, so that damage is found where Parquet has
+no checksum.
 
-One JSON object a line, appended and synced after the part has its name. Page checksums of Parquet cover the content
-of pages only. A line has the SHA-256 of the file, a CRC-32 of each column of each row group with its page headers,
-and a copy of the footer.
+One JSON object a line, appended and synced after the part has its name. Page checksums of Parquet
+cover the content of pages only. A line has the SHA-256 of the file, a CRC-32 of each column of each
+row group with its page headers, and a copy of the footer.
 """
 
 from __future__ import annotations
@@ -76,7 +77,9 @@ def unpack_footer(text: str) -> bytes | None:
 
 
 def append_entry(disk: Disk, folder: Path, entry: PartEntry) -> None:
-    """Append a part's line and sync it, in place of a torn last line. Raises OSError; a torn line is then cut off."""
+    """Append a part's line and sync it, in place of a torn last line. Raises OSError; a torn line
+    is then cut off.
+    """
     path = folder / MANIFEST
     line = plain_json.dumps_checked(entry.model_dump()) + "\n"
     size_bytes, whole_bytes = _sizes(path)

@@ -1,8 +1,9 @@
 """Walks the page headers of a Parquet column chunk, to know its memory before Arrow takes it.
 
-A page header states the size to which its page unpacks and the number of its values, and Arrow believes it. It is a
-structure in Thrift's compact protocol (`parquet.thrift`: `PageHeader`, `DataPageHeader`, `DictionaryPageHeader`): a
-field is a byte with its type and the step of its number, then its value; numbers are varints, zigzag coded.
+A page header states the size to which its page unpacks and the number of its values, and Arrow
+believes it. It is a structure in Thrift's compact protocol (`parquet.thrift`: `PageHeader`,
+`DataPageHeader`, `DictionaryPageHeader`): a field is a byte with its type and the step of its
+number, then its value; numbers are varints, zigzag coded.
 """
 
 from dataclasses import dataclass
@@ -81,7 +82,9 @@ def _read_struct(data: bytes, place: int, depth: int) -> tuple[Fields, int]:
             fields[number] = value
 
 
-def _read_value(data: bytes, place: int, kind: int, depth: int) -> tuple["int | Fields | None", int]:
+def _read_value(
+    data: bytes, place: int, kind: int, depth: int
+) -> tuple["int | Fields | None", int]:
     """A value, None if it is neither a number nor a structure, and the place after it."""
     if kind in (_I16, _I32, _I64):
         zigzag, place = _varint(data, place)

@@ -1,7 +1,8 @@
 """Reads a finished part, column by column of each row group, whoever wrote it.
 
-Nothing is decoded on trust: the footer is compared with the manifest's copy, the sizes of pages are added up before
-Arrow takes memory for them, and each column is checked against its checksum. A damaged column costs its row group.
+Nothing is decoded on trust: the footer is compared with the manifest's copy, the sizes of pages are
+added up before Arrow takes memory for them, and each column is checked against its checksum. A
+damaged column costs its row group.
 """
 
 from __future__ import annotations
@@ -50,7 +51,8 @@ class LostGroup:
 
 
 class PartReader:
-    """An open part; use it as a context manager. `entry` is the manifest's line, None if it is lost.
+    """An open part; use it as a context manager. `entry` is the manifest's line, None if it is
+    lost.
 
     Raises OSError or PartError.
     """
@@ -85,17 +87,27 @@ class PartReader:
         text = (self.schema.metadata or {}).get(FIRST_ROW, b"0")
         return int(text) if text.isdigit() and len(text) < 18 else 0
 
-    def groups(self, names: Sequence[str], start_s: float, end_s: float) -> Iterator[pa.Table | LostGroup]:
-        """Columns of the row groups that may have rows from `start_s` up to `end_s`; the file has all of `names`."""
+    def groups(
+        self, names: Sequence[str], start_s: float, end_s: float
+    ) -> Iterator[pa.Table | LostGroup]:
+        """Columns of the row groups that may have rows from `start_s` up to `end_s`; the file has
+        all of `names`.
+        """
         metadata = self._parquet.metadata
         for number in range(metadata.num_row_groups):
-            known = self._entry.groups[number] if self._entry and number < len(self._entry.groups) else None
+            known = (
+                self._entry.groups[number]
+                if self._entry and number < len(self._entry.groups)
+                else None
+            )
             if known is not None and (known.last_s < start_s or known.first_s >= end_s):
                 continue
             try:
                 yield self._group(number, metadata.row_group(number), names)
             except _FAULTS as error:
-                first_s, last_s = (known.first_s, known.last_s) if known is not None else (None, None)
+                first_s, last_s = (
+                    (known.first_s, known.last_s) if known is not None else (None, None)
+                )
                 yield LostGroup(first_s, last_s, _first_line(error))
 
     def _footer(self) -> bytes:
@@ -107,20 +119,29 @@ class PartReader:
         if tail[4:] == MAGIC and length <= min(FOOTER_BYTES_MAX, self._size_bytes - TAIL_BYTES):
             found = self._bytes_at(self._size_bytes - TAIL_BYTES - length, length)
         if expected is not None and found != expected:
-            self.notes.append("its footer is damaged or missing: read with the copy in the manifest")
+            self.notes.append(
+                "its footer is damaged or missing: read with the copy in the manifest"
+            )
             return expected
         if found is None:
             raise PartError("its footer is damaged or missing")
         return found
 
     def _opened(self, footer: bytes) -> pq.ParquetFile:
-        limits = {"thrift_string_size_limit": FOOTER_BYTES_MAX, "thrift_container_size_limit": _THRIFT_ITEMS_MAX}
+        limits = {
+            "thrift_string_size_limit": FOOTER_BYTES_MAX,
+            "thrift_container_size_limit": _THRIFT_ITEMS_MAX,
+        }
         whole = MAGIC + footer + len(footer).to_bytes(4, "little") + MAGIC
         metadata = pq.ParquetFile(pa.BufferReader(whole), **limits).metadata
         words = [metadata.schema.column(n).path for n in range(metadata.num_columns)]
         # a repeated string is kept once: a small file could claim gigabytes of them
         return pq.ParquetFile(
-            self._file, metadata=metadata, read_dictionary=words, page_checksum_verification=True, **limits
+            self._file,
+            metadata=metadata,
+            read_dictionary=words,
+            page_checksum_verification=True,
+            **limits,
         )
 
     def _group(self, number: int, group: pq.RowGroupMetaData, names: Sequence[str]) -> pa.Table:
@@ -138,8 +159,12 @@ class PartReader:
         table = self._parquet.read_row_group(number, columns=list(names), use_threads=False)
         return _plain(table.select(list(names)))
 
-    def _checked_bytes(self, number: int, place: int, chunk: pq.ColumnChunkMetaData, rows: int) -> int:
-        """Bytes to which a column chunk unpacks. Raises ValueError if it is damaged, or too large."""
+    def _checked_bytes(
+        self, number: int, place: int, chunk: pq.ColumnChunkMetaData, rows: int
+    ) -> int:
+        """Bytes to which a column chunk unpacks. Raises ValueError if it is damaged,
+        or too large.
+        """
         start, size = chunk_span(chunk)
         if start < 0 or size < 0 or start + size > self._size_bytes:
             raise ValueError(f"column {chunk.path_in_schema} is cut off")
@@ -170,7 +195,9 @@ class PartReader:
         """Whether the file has the manifest's SHA-256; True without a manifest. Raises OSError."""
         if self._entry is None:
             return True
-        return self._size_bytes == self._entry.size_bytes and _sha256(self._file) == self._entry.sha256
+        return (
+            self._size_bytes == self._entry.size_bytes and _sha256(self._file) == self._entry.sha256
+        )
 
 
 def _sha256(file: BinaryIO) -> str:
@@ -182,7 +209,9 @@ def _sha256(file: BinaryIO) -> str:
 
 
 def _plain(table: pa.Table) -> pa.Table:
-    """A table without dictionaries. Raises ValueError if its texts would take more than a recorder writes."""
+    """A table without dictionaries. Raises ValueError if its texts would take more than a recorder
+    writes.
+    """
     for place, field in enumerate(table.schema):
         if not pa.types.is_dictionary(field.type):
             continue

@@ -68,7 +68,9 @@ def write_part(
 
 
 class _HashedFile(io.RawIOBase):
-    """What Arrow writes to: a file with the size and the SHA-256 of its content. Closing it leaves the file open."""
+    """What Arrow writes to: a file with the size and the SHA-256 of its content. Closing it leaves
+    the file open.
+    """
 
     def __init__(self, disk: Disk, descriptor: int) -> None:
         super().__init__()
@@ -109,7 +111,9 @@ def _write_groups(
     return times_s
 
 
-def _new_writer(file: _HashedFile, schema: pa.Schema, first_group: pa.Table, time_name: str) -> pq.ParquetWriter:
+def _new_writer(
+    file: _HashedFile, schema: pa.Schema, first_group: pa.Table, time_name: str
+) -> pq.ParquetWriter:
     encodings = dict(_encodings(first_group.slice(0, _TRIAL_ROWS)))
     dictionaries = [path for path, encoding in encodings.items() if encoding == _DICTIONARY]
     others = {path: encoding for path, encoding in encodings.items() if encoding != _DICTIONARY}
@@ -137,7 +141,10 @@ def _encodings(rows: pa.Table) -> Iterator[tuple[str, str]]:
         elif pa.types.is_string(kind):
             yield path, _DICTIONARY
         else:
-            yield path, min(_candidates(kind), key=lambda encoding: _trial_bytes(values, path, encoding))
+            yield (
+                path,
+                min(_candidates(kind), key=lambda encoding: _trial_bytes(values, path, encoding)),
+            )
 
 
 def _candidates(kind: pa.DataType) -> list[str]:
@@ -152,9 +159,20 @@ def _candidates(kind: pa.DataType) -> list[str]:
 def _trial_bytes(values: pa.ChunkedArray, path: str, encoding: str) -> int:
     table = pa.table([values], names=[path.partition(".")[0]])
     sink = pa.BufferOutputStream()
-    chosen = {"use_dictionary": True} if encoding == _DICTIONARY else {"column_encoding": {path: encoding}}
+    chosen = (
+        {"use_dictionary": True}
+        if encoding == _DICTIONARY
+        else {"column_encoding": {path: encoding}}
+    )
     options = {"use_dictionary": False, **chosen}
-    pq.write_table(table, sink, compression="zstd", compression_level=_TRIAL_LEVEL, write_statistics=False, **options)
+    pq.write_table(
+        table,
+        sink,
+        compression="zstd",
+        compression_level=_TRIAL_LEVEL,
+        write_statistics=False,
+        **options,
+    )
     return int(sink.getvalue().size)
 
 

@@ -42,7 +42,9 @@ class TableReader:
         damage: list[str] = []
         self._entries = read_manifest(self._folder, damage)
         notes += [line for line in damage if line not in notes]
-        found = {n for path in self._folder.glob("*-*") if (n := spec.file_number(path)) is not None}
+        found = {
+            n for path in self._folder.glob("*-*") if (n := spec.file_number(path)) is not None
+        }
         self.numbers = sorted(found | set(self._entries))[:_NUMBERS_MAX]
         for entry in self._entries.values():
             for text in entry.damage:
@@ -63,11 +65,18 @@ class TableReader:
         for number in range(max([count, *(n + 1 for n in self.numbers)])):
             if not self._part(number).exists() and not self._journal(number).exists():
                 entry = self._entries.get(number)
-                rows = f"rows from {entry.first_s:.2f} s to {entry.last_s:.2f} s are" if entry else "its rows are"
+                rows = (
+                    f"rows from {entry.first_s:.2f} s to {entry.last_s:.2f} s are"
+                    if entry
+                    else "its rows are"
+                )
                 self._note(self._part(number), f"missing; {rows} left out")
 
     def tables(
-        self, names: Sequence[str] | None = None, start_s: float = -math.inf, end_s: float = math.inf
+        self,
+        names: Sequence[str] | None = None,
+        start_s: float = -math.inf,
+        end_s: float = math.inf,
     ) -> Iterator[pa.Table]:
         """Rows from `start_s` up to `end_s`, a row group at a time.
 
@@ -90,7 +99,9 @@ class TableReader:
     def newest(self, name: str) -> pa.Scalar | None:
         """A column's value in the last readable row; None without one."""
         for number in reversed(self.numbers):
-            found = list(self._file_tables(number, self._entries.get(number), (name,), -math.inf, math.inf))
+            found = list(
+                self._file_tables(number, self._entries.get(number), (name,), -math.inf, math.inf)
+            )
             if found and found[-1].num_rows:
                 return found[-1].column(name)[-1]
         return None
@@ -101,12 +112,18 @@ class TableReader:
             schema = self._schema_of(number)
             if schema is not None:
                 pairs = (schema.metadata or {}).items()
-                return {key.decode(errors="replace"): text.decode(errors="replace") for key, text in pairs}
+                return {
+                    key.decode(errors="replace"): text.decode(errors="replace")
+                    for key, text in pairs
+                }
         return {}
 
     def column_names(self) -> list[str]:
         """The columns of the table, as in its first readable file; empty without one."""
-        return next((schema.names for schema in map(self._schema_of, self.numbers) if schema is not None), [])
+        return next(
+            (schema.names for schema in map(self._schema_of, self.numbers) if schema is not None),
+            [],
+        )
 
     def _schema_of(self, number: int) -> pa.Schema | None:
         try:
@@ -125,14 +142,21 @@ class TableReader:
             try:
                 with PartReader(path, entry) as part:
                     if not part.is_unchanged():
-                        self._note(path, "its SHA-256 is not that of the manifest: damaged or changed")
+                        self._note(
+                            path, "its SHA-256 is not that of the manifest: damaged or changed"
+                        )
             except FileNotFoundError:
                 continue
             except _FAULTS as error:
                 self._note(path, f"cannot be read ({_reason(error)})")
 
     def _file_tables(
-        self, number: int, entry: PartEntry | None, names: Sequence[str], start_s: float, end_s: float
+        self,
+        number: int,
+        entry: PartEntry | None,
+        names: Sequence[str],
+        start_s: float,
+        end_s: float,
     ) -> Iterator[pa.Table]:
         """Tables of a part, or of its journal if there is no part yet."""
         if self._part(number).exists():
@@ -142,7 +166,9 @@ class TableReader:
         try:
             data = read_bytes(path, journal.FILE_BYTES_MAX)
         except FileNotFoundError:  # sealed in the meantime, or missing
-            yield from self._part_tables(number, read_manifest(self._folder, []).get(number), names, start_s, end_s)
+            yield from self._part_tables(
+                number, read_manifest(self._folder, []).get(number), names, start_s, end_s
+            )
             return
         except OSError as error:
             self._note(path, f"cannot be read ({error.strerror})")
@@ -150,7 +176,12 @@ class TableReader:
         yield from self._journal_tables(path, data, names)
 
     def _part_tables(
-        self, number: int, entry: PartEntry | None, names: Sequence[str], start_s: float, end_s: float
+        self,
+        number: int,
+        entry: PartEntry | None,
+        names: Sequence[str],
+        start_s: float,
+        end_s: float,
     ) -> Iterator[pa.Table]:
         path = self._part(number)
         try:
@@ -200,7 +231,10 @@ class TableReader:
         for name, own in self._table.layout:
             found = stated.get(name.encode(), own.encode()).decode(errors="replace")[:20]
             if found != own:
-                return f"written with {name.replace('_', ' ')} = {found}, this program has {own}: left out"
+                return (
+                    f"written with {name.replace('_', ' ')} = {found}, this program has {own}: "
+                    "left out"
+                )
         return None
 
     def _is_ours(self, schema: pa.Schema, name: str) -> bool:
@@ -240,4 +274,7 @@ def _span_of(lost: LostGroup) -> str:
 def _reason(error: BaseException) -> str:
     if isinstance(error, PartError):
         return str(error)
-    return getattr(error, "strerror", None) or (str(error).splitlines() or [type(error).__name__])[0][:120]
+    return (
+        getattr(error, "strerror", None)
+        or (str(error).splitlines() or [type(error).__name__])[0][:120]
+    )

@@ -1,4 +1,6 @@
-"""Makes a part of a closed journal: write, sync, rename, record, and only then remove the journal."""
+"""Makes a part of a closed journal: write, sync, rename, record,
+and only then remove the journal.
+"""
 
 from collections.abc import Iterator
 from pathlib import Path
@@ -8,7 +10,12 @@ import pyarrow as pa
 from membrane_ctrl.model.files import read_bytes
 from membrane_ctrl.run_files.table_store import spec
 from membrane_ctrl.run_files.table_store.disk import Disk
-from membrane_ctrl.run_files.table_store.journal import FILE_BYTES_MAX, JournalBlock, LostBytes, read_journal
+from membrane_ctrl.run_files.table_store.journal import (
+    FILE_BYTES_MAX,
+    JournalBlock,
+    LostBytes,
+    read_journal,
+)
 from membrane_ctrl.run_files.table_store.manifest import append_entry, read_manifest
 from membrane_ctrl.run_files.table_store.part_writer import write_part
 
@@ -16,8 +23,8 @@ from membrane_ctrl.run_files.table_store.part_writer import write_part
 def seal_journal(disk: Disk, folder: Path, number: int, table: spec.TableSpec) -> None:
     """Make the part of a journal; may be repeated after a kill at any step.
 
-    A journal without any intact row stays, for people. Raises OSError (full disk, or a journal that cannot be read):
-    the journal stays as well.
+    A journal without any intact row stays, for people. Raises OSError (full disk, or a journal that
+    cannot be read): the journal stays as well.
     """
     source, target = spec.journal_path(folder, number), spec.part_path(folder, number)
     if target.exists() and number in read_manifest(folder, []):

@@ -30,8 +30,8 @@ class TableSpec:
     group_rows : int
         Rows of a row group, the smallest unit that is read or lost.
     layout : tuple of (str, str)
-        Names and values of the program's numbers on which the meaning of the columns depends. The schema's metadata
-        state them as well. A file that states others is not read.
+        Names and values of the program's numbers on which the meaning of the columns depends. The
+        schema's metadata state them as well. A file that states others is not read.
     """
 
     name: str
@@ -54,6 +54,8 @@ def journal_path(folder: Path, number: int) -> Path:
 def file_number(path: Path) -> int | None:
     """Number of a part or a journal; None for any other file."""
     stem, _, digits = path.stem.rpartition("-")
-    if stem != path.parent.name or not (digits.isascii() and digits.isdigit() and len(digits) >= _DIGITS):
+    if stem != path.parent.name or not (
+        digits.isascii() and digits.isdigit() and len(digits) >= _DIGITS
+    ):
         return None
     return int(digits) if len(digits) <= 2 * _DIGITS else None

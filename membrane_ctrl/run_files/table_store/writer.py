@@ -1,8 +1,9 @@
 """Writes a table of a run: rows to the journal within a second, journals to parts within an hour.
 
-A journal and the part made from it have the same number. Sealing a journal writes the part under another name, syncs
-and renames it, appends its line to the manifest, and removes the journal. A reader ignores a journal whose part
-exists, so that a kill between any two of these steps loses and doubles nothing.
+A journal and the part made from it have the same number. Sealing a journal writes the part under
+another name, syncs and renames it, appends its line to the manifest, and removes the journal. A
+reader ignores a journal whose part exists, so that a kill between any two of these steps loses and
+doubles nothing.
 """
 
 import contextlib
@@ -31,7 +32,8 @@ class TableWriter:
     run_dir : Path
     table : TableSpec
     resumed : bool
-        Continue after a recorder that died: with its journals, and without repeating rows that it wrote.
+        Continue after a recorder that died: with its journals, and without repeating rows that it
+        wrote.
     disk : Disk
         The system calls; tests replace them.
 
@@ -41,7 +43,9 @@ class TableWriter:
         Time of the last row taken; -inf without one.
     """
 
-    def __init__(self, run_dir: Path, table: TableSpec, resumed: bool = False, disk: Disk | None = None) -> None:
+    def __init__(
+        self, run_dir: Path, table: TableSpec, resumed: bool = False, disk: Disk | None = None
+    ) -> None:
         self._folder = run_dir / table.name
         self._table = table
         self._disk = disk or Disk()
@@ -57,7 +61,9 @@ class TableWriter:
             self._continue_after_kill()
 
     def add(self, batch: pa.RecordBatch) -> None:
-        """Take rows; those not later than the last one taken are dropped. They are on the disk after `sync`."""
+        """Take rows; those not later than the last one taken are dropped. They are on the disk
+        after `sync`.
+        """
         time_s = batch.column(self._table.time_name).to_numpy(zero_copy_only=False)
         if time_s.size and time_s[0] <= self.until_s:
             batch = batch.filter(pa.array(time_s > self.until_s))
@@ -90,7 +96,10 @@ class TableWriter:
         self._waiting.clear()
 
     def _is_full(self, current: journal.JournalWriter) -> bool:
-        return self.until_s - self._journal_from_s >= spec.PART_S or current.size_bytes >= journal.JOURNAL_BYTES_MOST
+        return (
+            self.until_s - self._journal_from_s >= spec.PART_S
+            or current.size_bytes >= journal.JOURNAL_BYTES_MOST
+        )
 
     def _begin_journal(self, first_s: float) -> None:
         while (path := spec.journal_path(self._folder, self._number)).exists():
@@ -117,7 +126,9 @@ class TableWriter:
         return float(batch.column(self._table.time_name)[row].as_py())
 
     def seal_next(self) -> bool:
-        """Make a part of the oldest closed journal; whether there was one. Raises OSError; call again later."""
+        """Make a part of the oldest closed journal; whether there was one. Raises OSError; call
+        again later.
+        """
         if not self._sealable:
             return False
         seal_journal(self._disk, self._folder, self._sealable[0], self._table)
@@ -125,14 +136,18 @@ class TableWriter:
         return True
 
     def close(self) -> None:
-        """Bring all rows to the disk and seal all journals. Raises OSError: unsealed journals are kept."""
+        """Bring all rows to the disk and seal all journals. Raises OSError: unsealed journals are
+        kept.
+        """
         self.sync()
         self._close_journal()
         while self.seal_next():
             pass
 
     def leave_folder(self) -> None:
-        """Continue after the folder's removal: waiting rows go to its successor, written ones are lost."""
+        """Continue after the folder's removal: waiting rows go to its successor, written ones are
+        lost.
+        """
         self._close_journal()
         self._sealable.clear()
 
@@ -148,11 +163,17 @@ class TableWriter:
 
     def _continue_after_kill(self) -> None:
         """Seal what a dead recorder left, and find the number and the time of the last row."""
-        numbers = sorted(number for path in _files(self._folder) if (number := spec.file_number(path)) is not None)
+        numbers = sorted(
+            number
+            for path in _files(self._folder)
+            if (number := spec.file_number(path)) is not None
+        )
         if not numbers:
             return
         self._number = numbers[-1] + 1
-        journals = [number for number in numbers if spec.journal_path(self._folder, number).exists()]
+        journals = [
+            number for number in numbers if spec.journal_path(self._folder, number).exists()
+        ]
         self._sealable.extend(dict.fromkeys(journals))
         listed = read_manifest(self._folder, [])
         for entry in listed.values():

@@ -1,4 +1,6 @@
-"""Screen and camera of the twin: the screen, seen in the film as it is at the moment of exposure."""
+"""Screen and camera of the twin: the screen, seen in the film as it
+is at the moment of exposure.
+"""
 
 from collections import OrderedDict
 from collections.abc import Callable
@@ -28,11 +30,20 @@ from membrane_ctrl.sim.optics.shade import (
     shade_panel,
     vignetting,
 )
-from membrane_ctrl.sim.optics.trace import ScreenError, Trace, camera_pose, pixel_directions, screen_pose, trace
+from membrane_ctrl.sim.optics.trace import (
+    ScreenError,
+    Trace,
+    camera_pose,
+    pixel_directions,
+    screen_pose,
+    trace,
+)
 
-# Nodes this far apart on the mirror put a typical film's phase < 1e-4 rad off the exact trace (asserted in the tests)
+# Nodes this far apart on the mirror put a typical film's phase < 1e-4 rad off the exact trace
+# (asserted in the tests)
 _NODE_MM = 4.6
-# Displacements traced; a parabola through three of them is exact to 1e-6 rad, a straight line only to 2e-5 rad
+# Displacements traced; a parabola through three of them is exact to 1e-6 rad, a straight line only
+# to 2e-5 rad
 _CELL_UM = 100.0
 _KEPT_TRACES = 8
 _DARK = Pattern("black")
@@ -43,11 +54,12 @@ _NO_PATTERN = Pattern("picture")  # of a panel whose pixels are given
 class OpticsRenderer:
     """Renders the camera's picture of any pattern at any displacement of the film.
 
-    The film is traced at nodes (see `shade`) and, unless `exact`, at displacements _CELL_UM apart: a parabola through
-    the three nearest gives the maps at any other, so that a moving film costs nothing until it leaves its cell.
-    `exact` traces every pixel at every displacement: slow, for sets that must be exact. At `reference_um` the vertex
-    is at the origin of the geometry. Each picture has its own pixel noise (`camera.noise_adu`). Raises ValueError if
-    the film's rim is not the configured one.
+    The film is traced at nodes (see `shade`) and, unless `exact`, at displacements _CELL_UM apart:
+    a parabola through the three nearest gives the maps at any other, so that a moving film costs
+    nothing until it leaves its cell. `exact` traces every pixel at every displacement: slow, for
+    sets that must be exact. At `reference_um` the vertex is at the origin of the geometry. Each
+    picture has its own pixel noise (`camera.noise_adu`). Raises ValueError if the film's rim is not
+    the configured one.
     """
 
     optics: OpticsConfig
@@ -60,26 +72,38 @@ class OpticsRenderer:
     modes: tuple[DrumMode, ...] = ()
     disturbances: DisturbancesConfig = field(default_factory=DisturbancesConfig)
     _disturber: Disturber | None = field(default=None, init=False, repr=False)
-    _traces: OrderedDict[float, FloatArray] = field(default_factory=OrderedDict, init=False, repr=False)
+    _traces: OrderedDict[float, FloatArray] = field(
+        default_factory=OrderedDict, init=False, repr=False
+    )
     _swings: dict[DrumMode, FloatArray] = field(default_factory=dict, init=False, repr=False)
     _pictures: int = field(default=0, init=False, repr=False)
 
     def __post_init__(self) -> None:
         if self.film.radius_mm != self.optics.mirror.radius_mm:
             raise ValueError(
-                f"film radius {self.film.radius_mm:g} mm is not mirror.radius_mm = {self.optics.mirror.radius_mm:g}"
+                f"film radius {self.film.radius_mm:g} mm is not mirror.radius_mm = "
+                f"{self.optics.mirror.radius_mm:g}"
             )
         camera = self.optics.camera
         self._camera_pose = camera_pose(self.optics.geometry)
         self._screen_pose = screen_pose(self.optics.geometry, self.screen_error)
-        pixel_mm = camera.pixel_um / 1000.0 / camera.focal_mm * float(np.linalg.norm(self._camera_pose.position_mm))
+        pixel_mm = (
+            camera.pixel_um
+            / 1000.0
+            / camera.focal_mm
+            * float(np.linalg.norm(self._camera_pose.position_mm))
+        )
         self._step = 1 if self.exact else max(1, int(_NODE_MM / pixel_mm + 0.5))
         self._weights = cubic_weights(self._step)
         self._columns = node_positions(camera.width_px, self._step)
         self._rows = node_positions(camera.height_px, self._step)
         columns, rows = np.meshgrid(self._columns, self._rows)
-        self._directions = pixel_directions(camera, self._camera_pose, columns.ravel(), rows.ravel())
-        self._side_mm = self.optics.pattern.periods * self.optics.pattern.period_mm  # of the pattern's region
+        self._directions = pixel_directions(
+            camera, self._camera_pose, columns.ravel(), rows.ravel()
+        )
+        self._side_mm = (
+            self.optics.pattern.periods * self.optics.pattern.period_mm
+        )  # of the pattern's region
         self._loss = vignetting(camera.width_px, camera.height_px, self.light.vignetting)
         if self.disturbances != DisturbancesConfig():
             self._disturber = self._disturbed()
@@ -99,23 +123,29 @@ class OpticsRenderer:
         gain: float = 1.0,
         time_s: float = 0.0,
     ) -> Pixels:
-        """The picture of what is shown, (H, W), at a displacement; `gain` is the exposure over the nominal one.
+        """The picture of what is shown, (H, W), at a displacement; `gain` is the exposure over the
+        nominal one.
 
-        `out` (as of `blank`) is filled and returned; otherwise a new array is made. The vibrations are those of
-        `time_s`. Raises ValueError if the pattern is unknown or `out` has another shape or type.
+        `out` (as of `blank`) is filled and returned; otherwise a new array is made. The vibrations
+        are those of `time_s`. Raises ValueError if the pattern is unknown or `out` has another
+        shape or type.
         """
         camera = self.optics.camera
         picture = self.blank() if out is None else out
         depth = np.dtype(np.uint8 if camera.bits == 8 else np.uint16)
         if picture.shape != (camera.height_px, camera.width_px) or picture.dtype != depth:
             raise ValueError(
-                f"out is {picture.shape} {picture.dtype}, not ({camera.height_px}, {camera.width_px}) {depth}"
+                f"out is {picture.shape} {picture.dtype}, not ({camera.height_px}, "
+                f"{camera.width_px}) {depth}"
             )
         self._pictures += 1
         paint = self._painter(shown, gain)
         nodes, times_s = self._nodes(displacement_um), np.array([[time_s]])
         if self._disturber is not None:
-            nodes, times_s = nodes + self._disturber.rays(time_s), self._disturber.row_times_s(time_s)
+            nodes, times_s = (
+                nodes + self._disturber.rays(time_s),
+                self._disturber.row_times_s(time_s),
+            )
         for mode in self.modes:
             nodes = nodes + mode.swing_um(times_s) * self._swing_maps(mode)
         if self._disturber is not None:
@@ -144,7 +174,17 @@ class OpticsRenderer:
         def paint(nodes: FloatArray, seed: int, picture: Pixels, start: int, stop: int) -> None:
             noise = normal_quantiles(), noise_adu, seed
             shade_panel(
-                nodes, self._weights, radius_mm, places, light, scale, self._loss, noise, picture, start, stop
+                nodes,
+                self._weights,
+                radius_mm,
+                places,
+                light,
+                scale,
+                self._loss,
+                noise,
+                picture,
+                start,
+                stop,
             )
 
         return paint
@@ -177,17 +217,33 @@ class OpticsRenderer:
         """Shades rows of a picture of crossed fringes."""
         if pattern.index < 1:
             raise ValueError(f"pattern {pattern.name!r}: crossed fringes need 1 or more periods")
-        first = (shift_rad / (2 * np.pi) - 0.5 for shift_rad in (pattern.shift_rad, pattern.shift_y_rad))
-        shape: tuple[float, ...] = pattern.index / self._side_mm, *first, self._side_mm / 2, self.film.radius_mm**2
+        first = (
+            shift_rad / (2 * np.pi) - 0.5 for shift_rad in (pattern.shift_rad, pattern.shift_y_rad)
+        )
+        shape: tuple[float, ...] = (
+            pattern.index / self._side_mm,
+            *first,
+            self._side_mm / 2,
+            self.film.radius_mm**2,
+        )
         dark, white, full = self._levels(gain)
-        scale: tuple[float, ...] = dark, white, self.light.leak, self.light.gamma, self.optics.camera.noise_adu, full
+        scale: tuple[float, ...] = (
+            dark,
+            white,
+            self.light.leak,
+            self.light.gamma,
+            self.optics.camera.noise_adu,
+            full,
+        )
         columns, rows = (loss.astype(np.float32) for loss in self._loss)
         columns = np.pad(columns, (0, -columns.size % self._step)).reshape(-1, self._step).T
         weights, loss = self._weights.T.astype(np.float32), (columns.copy(), rows)
         shape, scale = (tuple(np.array(each, np.float32)) for each in (shape, scale))
 
         def paint(nodes: FloatArray, seed: int, picture: Pixels, start: int, stop: int) -> None:
-            shade_crossed(nodes, weights, shape, scale, loss, (noise_bank(), seed), picture, start, stop)
+            shade_crossed(
+                nodes, weights, shape, scale, loss, (noise_bank(), seed), picture, start, stop
+            )
 
         return paint
 
@@ -198,26 +254,36 @@ class OpticsRenderer:
         return dark, gain * (self.light.white_fraction * full - dark), full
 
     def trace_pixels(self, displacement_um: float) -> Trace:
-        """Exact s_x, s_y and place on the film of every pixel, each (H * W,), row by row; nothing interpolated."""
+        """Exact s_x, s_y and place on the film of every pixel, each (H * W,), row by row; nothing
+        interpolated.
+        """
         camera = self.optics.camera
-        columns, rows = np.meshgrid(np.arange(float(camera.width_px)), np.arange(float(camera.height_px)))
+        columns, rows = np.meshgrid(
+            np.arange(float(camera.width_px)), np.arange(float(camera.height_px))
+        )
         directions = pixel_directions(camera, self._camera_pose, columns.ravel(), rows.ravel())
         return self._trace(directions, displacement_um)
 
-    def _trace(self, directions: FloatArray, displacement_um: float, film: FilmTerms | None = None) -> Trace:
+    def _trace(
+        self, directions: FloatArray, displacement_um: float, film: FilmTerms | None = None
+    ) -> Trace:
         vertex_z_mm = -(displacement_um - self.reference_um) / 1000.0
         sag_mm = self.film.sag_at_mm(displacement_um)
         film = film or self.film.terms_at(displacement_um)
         return trace(self._camera_pose, directions, film, sag_mm, vertex_z_mm, self._screen_pose)
 
     def _nodes(self, displacement_um: float) -> FloatArray:
-        """Traced maps at the nodes, (3, rows, columns), at this displacement (Lagrange through the nearest three)."""
+        """Traced maps at the nodes, (3, rows, columns), at this displacement (Lagrange through the
+        nearest three).
+        """
         if self.exact:
             return self._traced(displacement_um)
         nearest = float(np.floor(displacement_um / _CELL_UM + 0.5))
         f = displacement_um / _CELL_UM - nearest
         below, here, above = (self._traced((nearest + k) * _CELL_UM) for k in (-1, 0, 1))
-        return 0.5 * f * (f - 1.0) * below + (1.0 - f) * (1.0 + f) * here + 0.5 * f * (f + 1.0) * above
+        return (
+            0.5 * f * (f - 1.0) * below + (1.0 - f) * (1.0 + f) * here + 0.5 * f * (f + 1.0) * above
+        )
 
     def _traced(self, displacement_um: float) -> FloatArray:
         if displacement_um in self._traces:
@@ -230,7 +296,9 @@ class OpticsRenderer:
         return maps
 
     def _swing_maps(self, mode: DrumMode) -> FloatArray:
-        """Change of the maps at the nodes by 1 µm of a mode: linear to 1e-4 of it, at any displacement."""
+        """Change of the maps at the nodes by 1 µm of a mode: linear to 1e-4 of it, at any
+        displacement.
+        """
         if mode not in self._swings:
             still, moved = (
                 self._maps(self._trace(self._directions, 0.0, film))
@@ -242,7 +310,9 @@ class OpticsRenderer:
     def _disturbed(self) -> Disturber:
         """The disturbances, for the nodes of a film at displacement 0."""
         pose, still = self._camera_pose, self._trace(self._directions, 0.0)
-        self._camera_pose = replace(pose, position_mm=pose.position_mm * (1 + 1 / np.linalg.norm(pose.position_mm)))
+        self._camera_pose = replace(
+            pose, position_mm=pose.position_mm * (1 + 1 / np.linalg.norm(pose.position_mm))
+        )
         maps, grown = (self._maps(found) for found in (still, self._trace(self._directions, 0.0)))
         self._camera_pose = pose
         x_mm, y_mm = (place.reshape(maps.shape[1:]) for place in (still.x_mm, still.y_mm))
@@ -253,9 +323,17 @@ class OpticsRenderer:
         return Disturber(self.disturbances, nodes, self.seed)
 
     def _maps(self, found: Trace) -> FloatArray:
-        """Screen point from the region's low edges, squared distance from the vertex: (3, rows, columns)."""
+        """Screen point from the region's low edges, squared distance from the vertex: (3, rows,
+        columns).
+        """
         half_side_mm = self._side_mm / 2.0
-        maps = np.stack([found.s_x_mm + half_side_mm, found.s_y_mm + half_side_mm, found.x_mm**2 + found.y_mm**2])
+        maps = np.stack(
+            [
+                found.s_x_mm + half_side_mm,
+                found.s_y_mm + half_side_mm,
+                found.x_mm**2 + found.y_mm**2,
+            ]
+        )
         return maps.reshape(3, len(self._rows), len(self._columns))
 
 
@@ -287,10 +365,10 @@ class Clock(Protocol):
 class TwinOptics:
     """The optical half of the simulated bench: one film, one `screen`, one `camera`.
 
-    The film is a Hencky bowl with the figure of `typical_film` drawn from the twin's seed, unless `film` is given.
-    Bowl and rim follow the truth; only the sag at displacement 0 is taken from it, once, at the first look. The
-    optics are the configured ones, except for the geometry if `twin` has its own; without a reference displacement
-    the geometry refers to the film at the first look.
+    The film is a Hencky bowl with the figure of `typical_film` drawn from the twin's seed, unless
+    `film` is given. Bowl and rim follow the truth; only the sag at displacement 0 is taken from it,
+    once, at the first look. The optics are the configured ones, except for the geometry if `twin`
+    has its own; without a reference displacement the geometry refers to the film at the first look.
     """
 
     def __init__(
@@ -301,7 +379,11 @@ class TwinOptics:
         clock: Clock,
         film: FilmShape | None = None,
     ) -> None:
-        self._optics = optics if twin.geometry is None else optics.model_copy(update={"geometry": twin.geometry})
+        self._optics = (
+            optics
+            if twin.geometry is None
+            else optics.model_copy(update={"geometry": twin.geometry})
+        )
         self._twin, self._seed = twin, twin.seed
         self._truth = truth
         self._clock = clock
@@ -311,7 +393,9 @@ class TwinOptics:
         self.camera = TwinCamera(self)
 
     def prepare(self) -> None:
-        """Trace the film where it is and take one picture, so that the first real one comes at the usual speed."""
+        """Trace the film where it is and take one picture, so that the first real one comes at the
+        usual speed.
+        """
         self._expose(_DARK, None)
 
     @property
@@ -326,20 +410,26 @@ class TwinOptics:
         return self._expose(self.screen.shown, out)
 
     def view(self) -> Pixels:
-        """What the sensor of an emulated camera sees now; before the first picture the screen is dark."""
+        """What the sensor of an emulated camera sees now; before the first picture the screen is
+        dark.
+        """
         return self._expose(self.screen.shown or _DARK, None).pixels
 
     def _expose(self, shown: Pattern | PanelPicture, out: Pixels | None) -> Frame:
         renderer = self._looked()
         time_s = self._clock.now()
-        return Frame(renderer.render(shown, self._truth().displacement_um, out, time_s=time_s), time_s)
+        return Frame(
+            renderer.render(shown, self._truth().displacement_um, out, time_s=time_s), time_s
+        )
 
     def _looked(self) -> OpticsRenderer:
         if self._renderer is None:
             position = self._truth()
             sag_mm = position.sag_mm - position.displacement_um / 1000.0
             material = self._twin.film_prestrain, self._twin.film_poisson
-            film = self._film or typical_film(sag_mm, self._optics.mirror.radius_mm, self._seed, *material)
+            film = self._film or typical_film(
+                sag_mm, self._optics.mirror.radius_mm, self._seed, *material
+            )
             stated = self._optics.geometry.reference_displacement_um
             reference_um = position.displacement_um if stated is None else stated
             self._renderer = OpticsRenderer(

@@ -1,7 +1,9 @@
-"""What disturbs the pictures of a real bench: light, room, dust, air, the camera's stand, and the film's vibrations.
+"""What disturbs the pictures of a real bench: light, room, dust, air, the camera's stand, and the
+film's vibrations.
 
-Each effect is a map over the nodes of `shade`: two move the point of the screen that a ray meets, two change the
-counts. The amplitudes are settings (`[twin.disturbances]`); sizes of waves and spots, and times, are not.
+Each effect is a map over the nodes of `shade`: two move the point of the screen that a ray meets,
+two change the counts. The amplitudes are settings (`[twin.disturbances]`); sizes of waves and
+spots, and times, are not.
 """
 
 import math
@@ -18,10 +20,17 @@ from membrane_ctrl.sim.optics.film_shape import FilmShape, FilmTerms
 _BRIGHT_MM, _BRIGHT_S = 75.0, 60.0  # lengths of the waves on the screen, and memory
 _AIR_MM, _AIR_S = 400.0, 0.5  # of cells of warm air over the mirror
 _WAVES, _NODES_A_WAVE = 40, 16  # a smooth field needs no more
-_DUST_S, _DUST_MM, _DUST_LOSS = 25.0, 6.0, 0.6  # how long it lies; radius and loss of light of a spot
+_DUST_S, _DUST_MM, _DUST_LOSS = (
+    25.0,
+    6.0,
+    0.6,
+)  # how long it lies; radius and loss of light of a spot
 _EXPOSURE_S, _LIT_SHARE = 0.02, 0.7  # of a pulse of the backlight
 _STICKING_S = 3600.0  # a panel's memory
-_GROWTH_MM_PER_K, _WARMS_S = 0.060, 1200.0  # of an aluminium stand of 2.6 m; period of an air conditioner
+_GROWTH_MM_PER_K, _WARMS_S = (
+    0.060,
+    1200.0,
+)  # of an aluminium stand of 2.6 m; period of an air conditioner
 _SLOPE, _SWING, _SWING_S = 0.3, 0.2, 120.0  # of the room's light: across the mirror, and in time
 
 
@@ -36,18 +45,30 @@ class DrumMode:
 
     def swing_um(self, time_s: FloatArray) -> FloatArray:
         """RMS over the mirror at a time, or at each of an array."""
-        return np.asarray(1e-3 * self.amplitude_nm * np.sin(2 * math.pi * self.frequency_hz * time_s + self.lobes))
+        return np.asarray(
+            1e-3 * self.amplitude_nm * np.sin(2 * math.pi * self.frequency_hz * time_s + self.lobes)
+        )
 
     def moved(self, film: FilmShape) -> FilmTerms:
         """The film displaced by 1 µm RMS, its ring at rest."""
         from scipy import special
 
-        m, terms, zero = self.lobes, film.terms_at(0.0), special.jn_zeros(self.lobes, self.circles)[-1]
+        m, terms, zero = (
+            self.lobes,
+            film.terms_at(0.0),
+            special.jn_zeros(self.lobes, self.circles)[-1],
+        )
         rms = abs(special.jv(m + 1, zero)) * (math.sqrt(0.5) if m else 1.0)
         poly_mm = np.zeros((2 * _SERIES + m + 1,) * 2)
         poly_mm[: terms.poly_mm.shape[0], : terms.poly_mm.shape[1]] = terms.poly_mm
         for k in range(_SERIES + 1):
-            part_mm = 1e-3 / rms * (-1) ** k * (zero / 2) ** (2 * k + m) / (math.factorial(k) * math.factorial(k + m))
+            part_mm = (
+                1e-3
+                / rms
+                * (-1) ** k
+                * (zero / 2) ** (2 * k + m)
+                / (math.factorial(k) * math.factorial(k + m))
+            )
             for p, q in np.ndindex(k + 1, m // 2 + 1):  # (x^2 + y^2)^k Re (x + i y)^m
                 poly_mm[2 * (k - p + m // 2 - q) + m % 2, 2 * (p + q)] += (
                     part_mm * math.comb(k, p) * math.comb(m, 2 * q) * (-1) ** q
@@ -56,7 +77,12 @@ class DrumMode:
 
 
 _SERIES = 12  # powers of (r / radius)^2: J_0 and J_2 to 1e-6 beyond their second zeros
-DRUM_MODES = (DrumMode(27.0, 0, 1), DrumMode(48.0, 1, 1), DrumMode(57.0, 2, 1), DrumMode(61.0, 0, 2))
+DRUM_MODES = (
+    DrumMode(27.0, 0, 1),
+    DrumMode(48.0, 1, 1),
+    DrumMode(57.0, 2, 1),
+    DrumMode(61.0, 0, 2),
+)
 
 
 def drummed(amplitude_nm: float) -> tuple[DrumMode, ...]:
@@ -65,17 +91,26 @@ def drummed(amplitude_nm: float) -> tuple[DrumMode, ...]:
 
 
 class Waves:
-    """A random field of unit RMS on a square: plane waves about `length_mm` long, each with a memory."""
+    """A random field of unit RMS on a square: plane waves about `length_mm` long, each with a
+    memory.
+    """
 
-    def __init__(self, length_mm: float, memory_s: float, half_side_mm: float, rng: np.random.Generator) -> None:
+    def __init__(
+        self, length_mm: float, memory_s: float, half_side_mm: float, rng: np.random.Generator
+    ) -> None:
         self._rng, self._memory_s = rng, memory_s
         count = max(8, math.ceil(2 * half_side_mm / length_mm * _NODES_A_WAVE))
         self._half_side_mm, self._per_mm = half_side_mm, (count - 1) / (2 * half_side_mm)
         along = np.linspace(-half_side_mm, half_side_mm, count)
         across, down = np.meshgrid(along, along)
-        lengths_mm, turns = length_mm * rng.lognormal(0.0, 0.3, _WAVES), rng.uniform(0.0, 2 * math.pi, _WAVES)
-        ways = [np.multiply.outer(2 * math.pi / lengths_mm * part, place)
-                for part, place in ((np.cos(turns), across), (np.sin(turns), down))]  # fmt: skip
+        lengths_mm, turns = (
+            length_mm * rng.lognormal(0.0, 0.3, _WAVES),
+            rng.uniform(0.0, 2 * math.pi, _WAVES),
+        )
+        ways = [
+            np.multiply.outer(2 * math.pi / lengths_mm * part, place)
+            for part, place in ((np.cos(turns), across), (np.sin(turns), down))
+        ]
         self._basis = np.concatenate([np.cos(sum(ways)), np.sin(sum(ways))]) / math.sqrt(_WAVES)
         self._amplitudes = rng.standard_normal(2 * _WAVES)
         self._time_s = -math.inf
@@ -88,7 +123,9 @@ class Waves:
             self._amplitudes = keep * self._amplitudes + math.sqrt(1.0 - keep * keep) * fresh
             self._time_s = time_s
         field = np.tensordot(self._amplitudes, self._basis, 1).astype(np.float32)
-        column, row = (((p + self._half_side_mm) * self._per_mm).astype(np.float32) for p in (x_mm, y_mm))
+        column, row = (
+            ((p + self._half_side_mm) * self._per_mm).astype(np.float32) for p in (x_mm, y_mm)
+        )
         moved = cv2.remap(field, column, row, cv2.INTER_CUBIC, borderMode=cv2.BORDER_REPLICATE)
         return np.asarray(moved, dtype=float)
 
@@ -109,7 +146,9 @@ class Nodes:
 
 
 class Disturber:
-    """The disturbances of one bench, picture after picture. Equal seeds and times give equal pictures."""
+    """The disturbances of one bench, picture after picture. Equal seeds and times give equal
+    pictures.
+    """
 
     def __init__(self, wanted: DisturbancesConfig, nodes: Nodes, seed: int) -> None:
         self._wanted, self._nodes, self._seed = wanted, nodes, seed
@@ -124,7 +163,9 @@ class Disturber:
         return time_s + self._wanted.rolling_s * self._nodes.row_share[:, None]
 
     def rays(self, time_s: float) -> FloatArray:
-        """What to add to the renderer's maps, (3, rows, columns): the stand's growth, and air that bends the rays."""
+        """What to add to the renderer's maps, (3, rows, columns): the stand's growth, and air that
+        bends the rays.
+        """
         wanted, nodes = self._wanted, self._nodes
         warm_k = wanted.stand_k * math.sin(2 * math.pi * time_s / _WARMS_S)
         moved = _GROWTH_MM_PER_K * warm_k * nodes.grown
@@ -146,7 +187,11 @@ class Disturber:
         if wanted.sticking_fraction and pattern.role == "crossed":
             factor *= 1.0 - wanted.sticking_fraction * self._stuck(time_s, pattern)
         swing = _SWING * math.sin(2 * math.pi * time_s / _SWING_S)
-        room_adu = wanted.ambient_fraction * nodes.full_adu * (1.0 + _SLOPE * nodes.x_mm / nodes.radius_mm + swing)
+        room_adu = (
+            wanted.ambient_fraction
+            * nodes.full_adu
+            * (1.0 + _SLOPE * nodes.x_mm / nodes.radius_mm + swing)
+        )
         return np.stack([factor, room_adu])
 
     def _dust_at(self, time_s: float) -> FloatArray:
@@ -164,7 +209,9 @@ class Disturber:
         return self._dust[1].copy()
 
     def _backlight(self, middle_s: FloatArray) -> FloatArray:
-        """Light of an exposure over the mean: how much of it falls into the pulses of the backlight."""
+        """Light of an exposure over the mean: how much of it falls into the pulses of the
+        backlight.
+        """
         hz = self._wanted.backlight_hz
         if not hz:
             return np.ones_like(middle_s)
@@ -178,12 +225,16 @@ class Disturber:
         return np.asarray(lit / (_LIT_SHARE * hz * _EXPOSURE_S))
 
     def _stuck(self, time_s: float, pattern: Pattern) -> FloatArray:
-        """Level, 0 to 1, of the picture that the panel remembers: the mean of the patterns shown so far."""
+        """Level, 0 to 1, of the picture that the panel remembers: the mean of the patterns shown so
+        far.
+        """
         nodes = self._nodes
         now = np.exp(1j * np.array([pattern.shift_rad, pattern.shift_y_rad]))
         keep = math.exp(min(0.0, self._shown_s - time_s) / _STICKING_S)
         self._burnt, self._shown_s = keep * self._burnt + (1.0 - keep) * now, time_s
         rate = 2 * math.pi * pattern.index / nodes.side_mm
-        waves = [np.real(burnt * np.exp(1j * (rate * s_mm - math.pi)))
-                 for burnt, s_mm in zip(self._burnt, (nodes.s_x_mm, nodes.s_y_mm), strict=True)]  # fmt: skip
+        waves = [
+            np.real(burnt * np.exp(1j * (rate * s_mm - math.pi)))
+            for burnt, s_mm in zip(self._burnt, (nodes.s_x_mm, nodes.s_y_mm), strict=True)
+        ]
         return np.asarray(0.5 + 0.25 * (waves[0] + waves[1]))

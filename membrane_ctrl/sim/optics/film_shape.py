@@ -1,8 +1,8 @@
 """Shape of the film: a bowl, Zernike terms, and what these terms cannot represent.
 
-Frame: the mirror's own, x horizontal, y up, height h above the vertex, h(0, 0) = 0. The displacement's zero is where
-the bowl has `sag_mm`; the rim stays where it is, so the bowl is `sag_mm + displacement` deep and everything else
-moves with the rim.
+Frame: the mirror's own, x horizontal, y up, height h above the vertex, h(0, 0) = 0. The
+displacement's zero is where the bowl has `sag_mm`; the rim stays where it is, so the bowl is
+`sag_mm + displacement` deep and everything else moves with the rim.
 """
 
 from dataclasses import dataclass, field
@@ -18,7 +18,8 @@ from membrane_ctrl.model.zernike_terms import ZERNIKE_TERMS
 from membrane_ctrl.sim import film as gas_film
 
 MAX_FILM_TERMS = 66  # Noll's, up to radial order 10: finer errors are ripples, wrinkles and bumps
-_TYPICAL_TERMS = 36  # of a mounted film, up to radial order 7; the film does not depend on how many are fitted
+# of a mounted film, up to radial order 7; the film does not depend on how many are fitted
+_TYPICAL_TERMS = 36
 _SPHERE_TERMS = 40  # those left out are below 1e-12 for radii up to half of the curvature's
 _Form = Literal["hencky", "paraboloid", "sphere"]
 
@@ -26,9 +27,9 @@ _Form = Literal["hencky", "paraboloid", "sphere"]
 class FilmTerms(NamedTuple):
     """A film as plain numbers; heights in mm above the vertex, which `offset_mm` puts at 0.
 
-    `bowl[k]` multiplies (r/radius)^(2k) and the sag; `poly_mm[i, k]` multiplies (x/radius)^i (y/radius)^k.
-    Rows of `ripples`: amplitude_mm, k_x and k_y in rad/mm, phase_rad; of `wrinkles`: amplitude_mm, lobes, phase_rad;
-    of `bumps`: amplitude_mm, x_mm, y_mm, sigma_mm.
+    `bowl[k]` multiplies (r/radius)^(2k) and the sag; `poly_mm[i, k]` multiplies (x/radius)^i
+    (y/radius)^k. Rows of `ripples`: amplitude_mm, k_x and k_y in rad/mm, phase_rad; of `wrinkles`:
+    amplitude_mm, lobes, phase_rad; of `bumps`: amplitude_mm, x_mm, y_mm, sigma_mm.
     """
 
     radius_mm: float
@@ -41,7 +42,9 @@ class FilmTerms(NamedTuple):
 
 
 @njit(cache=True)
-def height_and_slopes(terms: FilmTerms, sag_mm: float, x_mm: float, y_mm: float) -> tuple[float, float, float]:
+def height_and_slopes(
+    terms: FilmTerms, sag_mm: float, x_mm: float, y_mm: float
+) -> tuple[float, float, float]:
     """Height above the vertex (mm) and its derivatives along x and y."""
     X, Y = x_mm / terms.radius_mm, y_mm / terms.radius_mm
     u = X * X + Y * Y
@@ -103,24 +106,28 @@ def heights(terms: FilmTerms, sag_mm: float, x_mm: FloatArray, y_mm: FloatArray)
 def bowl_series(bowl: _Form, sag_mm: float, radius_mm: float) -> FloatArray:
     """Height of a bowl of unit sag above its vertex: element k multiplies rho^(2k).
 
-    Hencky's has nu = 0.3; a concave sphere's depends on its sag: 1 - sqrt(1 - x rho^2), x = (radius / curvature's)^2.
+    Hencky's has nu = 0.3; a concave sphere's depends on its sag: 1 - sqrt(1 - x rho^2), x = (radius
+    / curvature's)^2.
     """
     if bowl == "hencky":
         return gas_film.solve().profile
     if bowl == "paraboloid":
         return np.array([0.0, 1.0])
     x = (2 * sag_mm * radius_mm / (radius_mm**2 + sag_mm**2)) ** 2
-    terms = np.array([0.0] + [comb(2 * k, k) / (4**k * (2 * k - 1)) * x**k for k in range(1, _SPHERE_TERMS)])
+    terms = np.array(
+        [0.0] + [comb(2 * k, k) / (4**k * (2 * k - 1)) * x**k for k in range(1, _SPHERE_TERMS)]
+    )
     return np.asarray(terms / terms.sum())
 
 
-# Zernike terms in Noll's order as polynomials in x and y, orthonormal (unit RMS) over the unit disc.
-# The twin's own implementation: it shares nothing with the reconstruction it is used to check.
-# Source: R. J. Noll, "Zernike polynomials and atmospheric turbulence", JOSA 66, 207 (1976).
+# Zernike terms in Noll's order as polynomials in x and y, orthonormal (unit RMS) over the unit
+# disc. The twin's own implementation: it shares nothing with the reconstruction it is used to
+# check. Source: R. J. Noll, "Zernike polynomials and atmospheric turbulence", JOSA 66, 207 (1976).
 
 
 def noll_orders(j: int) -> tuple[int, int]:
-    """Radial order n and azimuthal order m of Noll's index j (from 1); m < 0 stands for the sine term.
+    """Radial order n and azimuthal order m of Noll's index j (from 1); m < 0 stands for the sine
+    term.
 
     Raises ValueError if j < 1.
     """
@@ -139,14 +146,19 @@ def _monomials(j: int) -> dict[tuple[int, int], float]:
     """Z_j as {(i, k): coefficient of x^i y^k}.
 
     R_n^m(rho) = sum_s (-1)^s (n-s)! / (s! ((n+m)/2-s)! ((n-m)/2-s)!) rho^(n-2s); with
-    rho^m cos(m theta) + i rho^m sin(m theta) = (x + i y)^m and rho^2 = x^2 + y^2 every term is a polynomial.
+    rho^m cos(m theta) + i rho^m sin(m theta) = (x + i y)^m and rho^2 = x^2 + y^2 every term is a
+    polynomial.
     """
     n, signed_m = noll_orders(j)
     m = abs(signed_m)
     norm = sqrt(n + 1) if m == 0 else sqrt(2 * (n + 1))
     # (x + i y)^m: y^k carries i^k, real (cosine) for even k, imaginary (sine) for odd k
     first = 1 if signed_m < 0 else 0
-    angular = {(m - k, k): comb(m, k) * (-1) ** (k // 2) for k in range(first, m + 1, 2)} if m else {(0, 0): 1}
+    angular = (
+        {(m - k, k): comb(m, k) * (-1) ** (k // 2) for k in range(first, m + 1, 2)}
+        if m
+        else {(0, 0): 1}
+    )
     terms: dict[tuple[int, int], float] = {}
     for s in range((n - m) // 2 + 1):
         radial = (-1) ** s * factorial(n - s)
@@ -160,9 +172,11 @@ def _monomials(j: int) -> dict[tuple[int, int], float]:
 
 
 def polynomial(coeffs: FloatArray) -> FloatArray:
-    """Sum of Zernike terms, coefficients (J,) of Noll's j = 1..J, as a polynomial of the unit disc's x and y.
+    """Sum of Zernike terms, coefficients (J,) of Noll's j = 1..J, as a polynomial of the unit
+    disc's x and y.
 
-    Element (i, k) of the (D + 1, D + 1) array multiplies x^i y^k, in the same unit; D is the highest degree used.
+    Element (i, k) of the (D + 1, D + 1) array multiplies x^i y^k, in the same unit; D is the
+    highest degree used.
     """
     used = [j for j, value in enumerate(coeffs, start=1) if value != 0.0]
     degree = max((noll_orders(j)[0] for j in used), default=0)
@@ -175,7 +189,9 @@ def polynomial(coeffs: FloatArray) -> FloatArray:
 
 @dataclass(frozen=True, slots=True)
 class Ripple:
-    """A plane wave all over the film, crests perpendicular to `direction_deg` (from +x towards +y)."""
+    """A plane wave all over the film, crests perpendicular to
+    `direction_deg` (from +x towards +y).
+    """
 
     amplitude_um: float
     wavelength_mm: float
@@ -189,7 +205,9 @@ class Ripple:
 
 @dataclass(frozen=True, slots=True)
 class Wrinkle:
-    """Radial folds at the rim: amplitude Re(((x + iy)/radius)^lobes e^(i phase)); they fade as r^lobes inwards."""
+    """Radial folds at the rim: amplitude Re(((x + iy)/radius)^lobes e^(i phase)); they fade as
+    r^lobes inwards.
+    """
 
     amplitude_um: float
     lobes: int
@@ -226,7 +244,8 @@ class FilmShape:
     ripples: tuple[Ripple, ...] = ()
     wrinkles: tuple[Wrinkle, ...] = ()
     bumps: tuple[Bump, ...] = ()
-    # of a Hencky bowl: strain of the flat film before it was clamped, and the material's Poisson ratio
+    # of a Hencky bowl: strain of the flat film before it was clamped, and the material's Poisson
+    # ratio
     prestrain: float = 0.0
     poisson: float = gas_film.POISSON_PET
     terms: FilmTerms = field(init=False, repr=False, compare=False)
@@ -239,11 +258,15 @@ class FilmShape:
         if self.bowl not in get_args(_Form):
             raise ValueError(f"bowl = {self.bowl!r} must be one of {', '.join(get_args(_Form))}")
         if self.bowl == "sphere" and not 0 < self.sag_mm < self.radius_mm:
-            raise ValueError(f"sag_mm = {self.sag_mm:g}: a concave sphere's is above 0 and below its radius")
+            raise ValueError(
+                f"sag_mm = {self.sag_mm:g}: a concave sphere's is above 0 and below its radius"
+            )
         if not all(isfinite(c) for c in self.zernike_um):
             raise ValueError("zernike_um: every value must be a number")
         if len(self.zernike_um) > MAX_FILM_TERMS:
-            raise ValueError(f"zernike_um holds {len(self.zernike_um)} terms; at most {MAX_FILM_TERMS} are known")
+            raise ValueError(
+                f"zernike_um holds {len(self.zernike_um)} terms; at most {MAX_FILM_TERMS} are known"
+            )
         if not 0 <= self.poisson <= 0.5:
             raise ValueError(f"poisson = {self.poisson:g} is outside 0 .. 0.5")
         object.__setattr__(self, "terms", _terms(self))
@@ -253,24 +276,36 @@ class FilmShape:
         return self.sag_mm + displacement_um / 1000.0
 
     def terms_at(self, displacement_um: float) -> FilmTerms:
-        """The film as numbers at a displacement, where a stretched film has a profile of its own."""
+        """The film as numbers at a displacement, where a stretched
+        film has a profile of its own.
+        """
         if self.bowl != "hencky" or (self.prestrain, self.poisson) == (0.0, gas_film.POISSON_PET):
             return self.terms
         return self.terms._replace(bowl=self.load_and_bowl(displacement_um)[1])
 
     def load_and_bowl(self, displacement_um: float) -> tuple[float, FloatArray]:
-        """Load p a / (E t) of a Hencky film at a displacement, and its profile as `FilmTerms.bowl`."""
-        return gas_film.stretched(self.sag_at_mm(displacement_um) / self.radius_mm, self.prestrain, self.poisson)
+        """Load p a / (E t) of a Hencky film at a displacement,
+        and its profile as `FilmTerms.bowl`.
+        """
+        return gas_film.stretched(
+            self.sag_at_mm(displacement_um) / self.radius_mm, self.prestrain, self.poisson
+        )
 
-    def height_mm(self, x_mm: FloatArray, y_mm: FloatArray, displacement_um: float = 0.0) -> FloatArray:
+    def height_mm(
+        self, x_mm: FloatArray, y_mm: FloatArray, displacement_um: float = 0.0
+    ) -> FloatArray:
         """Height above the vertex at points of any (equal) shape."""
         flat = heights(
-            self.terms_at(displacement_um), self.sag_at_mm(displacement_um), np.ravel(x_mm), np.ravel(y_mm)
+            self.terms_at(displacement_um),
+            self.sag_at_mm(displacement_um),
+            np.ravel(x_mm),
+            np.ravel(y_mm),
         )
         return np.reshape(flat, np.shape(x_mm))
 
     def coeffs_um(self, displacement_um: float = 0.0) -> FloatArray | None:
-        """Noll terms (ZERNIKE_TERMS,) of the whole surface, 0 at the vertex; None if they cannot represent it.
+        """Noll terms (ZERNIKE_TERMS,) of the whole surface, 0 at the vertex; None if they cannot
+        represent it.
 
         A paraboloid s rho^2 is s/(2 sqrt 3) of Z4 = sqrt(3) (2 rho^2 - 1) above a piston of s/2.
         """
@@ -290,7 +325,9 @@ class FilmShape:
 def _terms(film: FilmShape) -> FilmTerms:
     """The film as numbers for the kernel, its offset chosen so that h(0, 0) = 0."""
     waves = [(r, 2.0 * pi / r.wavelength_mm, radians(r.direction_deg)) for r in film.ripples]
-    ripples = [(r.amplitude_um / 1000.0, k * cos(turn), k * sin(turn), r.phase_rad) for r, k, turn in waves]
+    ripples = [
+        (r.amplitude_um / 1000.0, k * cos(turn), k * sin(turn), r.phase_rad) for r, k, turn in waves
+    ]
     wrinkles = [(w.amplitude_um / 1000.0, float(w.lobes), w.phase_rad) for w in film.wrinkles]
     bumps = [(b.amplitude_um / 1000.0, b.x_mm, b.y_mm, b.sigma_mm) for b in film.bumps]
     raised = FilmTerms(
@@ -307,18 +344,25 @@ def _terms(film: FilmShape) -> FilmTerms:
 
 
 def typical_film(
-    sag_mm: float, radius_mm: float, seed: int, prestrain: float = 0.0, poisson: float = gas_film.POISSON_PET
+    sag_mm: float,
+    radius_mm: float,
+    seed: int,
+    prestrain: float = 0.0,
+    poisson: float = gas_film.POISSON_PET,
 ) -> FilmShape:
     """A mounted film: a Hencky bowl with the figure errors of clamping by hand.
 
-    0.3 mm of astigmatism, 0.1 mm of coma and 0.05 mm of trefoil, each in a direction drawn from the seed,
-    and 10 µm RMS spread over the terms above.
+    0.3 mm of astigmatism, 0.1 mm of coma and 0.05 mm of trefoil, each in a direction drawn from the
+    seed, and 10 µm RMS spread over the terms above.
     """
     rng = np.random.default_rng(seed)
     coeffs_um = np.zeros(_TYPICAL_TERMS)
     for amplitude_um, sine, cosine in ((300.0, 5, 6), (100.0, 7, 8), (50.0, 9, 10)):
         angle = rng.uniform(0.0, 2.0 * pi)
-        coeffs_um[sine - 1], coeffs_um[cosine - 1] = amplitude_um * sin(angle), amplitude_um * cos(angle)
+        coeffs_um[sine - 1], coeffs_um[cosine - 1] = (
+            amplitude_um * sin(angle),
+            amplitude_um * cos(angle),
+        )
     higher = rng.normal(size=_TYPICAL_TERMS - 10)
     coeffs_um[10:] = 10.0 * higher / sqrt(float(np.dot(higher, higher)))
     figure = tuple(float(c) for c in coeffs_um)

@@ -1,7 +1,9 @@
-"""Turns traced nodes into counts: one compiled pass over the picture, about ten nanoseconds per pixel.
+"""Turns traced nodes into counts: one compiled pass over the picture, about ten nanoseconds per
+pixel.
 
-Nodes are `step` pixels apart, one before the first pixel and two after the last. Between them a cubic through four
-nodes (Lagrange) in each direction; with step 1 every pixel is a node and nothing is interpolated.
+Nodes are `step` pixels apart, one before the first pixel and two after the last. Between them a
+cubic through four nodes (Lagrange) in each direction; with step 1 every pixel is a node and nothing
+is interpolated.
 """
 
 from dataclasses import dataclass, replace
@@ -17,7 +19,11 @@ from firmware_iface.roles import Levels, Pattern, Pixels
 from membrane_ctrl.config.schema import PatternConfig
 from membrane_ctrl.model.arrays import FloatArray, Singles
 
-_GOLDEN, _MIX_1, _MIX_2 = np.uint64(0x9E3779B97F4A7C15), np.uint64(0xBF58476D1CE4E5B9), np.uint64(0x94D049BB133111EB)
+_GOLDEN, _MIX_1, _MIX_2 = (
+    np.uint64(0x9E3779B97F4A7C15),
+    np.uint64(0xBF58476D1CE4E5B9),
+    np.uint64(0x94D049BB133111EB),
+)
 _LOW_16 = np.uint64(0xFFFF)
 
 
@@ -27,7 +33,9 @@ def node_positions(pixels: int, step: int) -> FloatArray:
 
 
 def cubic_weights(step: int) -> FloatArray:
-    """Weights (step, 4) of the nodes at -1, 0, 1, 2 for the places k / step, k = 0..step-1 (Lagrange)."""
+    """Weights (step, 4) of the nodes at -1, 0, 1, 2 for the places k / step, k = 0..step-1
+    (Lagrange).
+    """
     f = np.arange(step) / step
     return np.stack(
         [
@@ -41,8 +49,13 @@ def cubic_weights(step: int) -> FloatArray:
 
 
 def vignetting(width_px: int, height_px: int, corner_loss: float) -> tuple[FloatArray, FloatArray]:
-    """Loss by column and by row; their sum is corner_loss (distance from the middle / distance of the corner)^2."""
-    columns, rows = np.arange(width_px) - (width_px - 1) / 2.0, np.arange(height_px) - (height_px - 1) / 2.0
+    """Loss by column and by row; their sum is corner_loss (distance from the middle / distance of
+    the corner)^2.
+    """
+    columns, rows = (
+        np.arange(width_px) - (width_px - 1) / 2.0,
+        np.arange(height_px) - (height_px - 1) / 2.0,
+    )
     per_px2 = corner_loss / (columns[0] ** 2 + rows[0] ** 2)
     return per_px2 * columns**2, per_px2 * rows**2
 
@@ -57,7 +70,9 @@ def normal_quantiles() -> Singles:
 
 @njit(cache=True)
 def _random_64(state: np.uint64) -> np.uint64:
-    """SplitMix64's output for a state that grows by `_GOLDEN` (Steele et al., 2014): four 16-bit numbers."""
+    """SplitMix64's output for a state that grows by `_GOLDEN` (Steele et al., 2014): four 16-bit
+    numbers.
+    """
     z = (state ^ (state >> np.uint64(30))) * _MIX_1
     z = (z ^ (z >> np.uint64(27))) * _MIX_2
     return z ^ (z >> np.uint64(31))
@@ -79,12 +94,17 @@ def _level(s_mm: float, values: FloatArray, cell_mm: float, smooth: bool) -> flo
 def _between(line: FloatArray, cell: int, w: FloatArray, k: int) -> float:
     """Value of a cubic through the nodes cell .. cell + 3, at the k-th of the places between."""
     return float(
-        w[k, 0] * line[cell] + w[k, 1] * line[cell + 1] + w[k, 2] * line[cell + 2] + w[k, 3] * line[cell + 3]
+        w[k, 0] * line[cell]
+        + w[k, 1] * line[cell + 1]
+        + w[k, 2] * line[cell + 2]
+        + w[k, 3] * line[cell + 3]
     )
 
 
 @njit(cache=True)
-def _row_of_nodes(nodes: FloatArray, k: int, node: int, w: FloatArray | Singles, line: FloatArray | Singles) -> None:
+def _row_of_nodes(
+    nodes: FloatArray, k: int, node: int, w: FloatArray | Singles, line: FloatArray | Singles
+) -> None:
     """Map k at one row of the picture, at the nodes' columns."""
     for c in range(nodes.shape[2]):
         line[c] = (
@@ -97,8 +117,9 @@ def _row_of_nodes(nodes: FloatArray, k: int, node: int, w: FloatArray | Singles,
 
 @njit(cache=True, nogil=True)
 def shade(
-    # (3, rows, columns): s_x, s_y (from the low edges of the region, mm), squared distance from the vertex (mm^2); a
-    # disturbed bench has two more: factor of the screen's light, and counts of the room's
+    # (3, rows, columns): s_x, s_y (from the low edges of the region, mm), squared distance from the
+    # vertex (mm^2); a disturbed bench has two more: factor of the screen's light, and counts of the
+    # room's
     nodes: FloatArray,
     weights: FloatArray,  # (step, 4) of `cubic_weights`
     axis: int,  # 0: the pattern runs along s_x, 1: along s_y
@@ -107,7 +128,9 @@ def shade(
     table: tuple[FloatArray, float, bool],  # the fields of a `LevelTable`
     scale: FloatArray,  # (4,): counts without light, counts of white above that, leak, full scale
     loss: tuple[FloatArray, FloatArray],  # vignetting (W,), (H,): a column's part and a row's
-    noise: tuple[Singles, float, int],  # `normal_quantiles()`, standard deviation in counts, seed of this picture
+    noise: tuple[
+        Singles, float, int
+    ],  # `normal_quantiles()`, standard deviation in counts, seed of this picture
     out: Pixels,
     start: int,
     stop: int,
@@ -121,7 +144,11 @@ def shade(
     quantiles, sigma, seed = noise
     radius2_mm2 = radius_mm * radius_mm
     # three arrays, not rows of one: a view taken per pixel costs more than the pixel
-    line_x, line_y, line_r2 = np.empty(nodes.shape[2]), np.empty(nodes.shape[2]), np.empty(nodes.shape[2])
+    line_x, line_y, line_r2 = (
+        np.empty(nodes.shape[2]),
+        np.empty(nodes.shape[2]),
+        np.empty(nodes.shape[2]),
+    )
     line_factor, line_room = np.ones(nodes.shape[2]), np.zeros(nodes.shape[2])
     disturbed = nodes.shape[0] > 3
     bits = np.uint64(0)
@@ -157,15 +184,19 @@ def shade(
                 out[row, column] = min(max(counts + 0.5, 0.0), full)
 
 
-# Crossed fringes, in single precision and in an order that the processor does many at a time: first all pixels that
-# are k beyond their node, then those at k + 1. A hold that tracks takes twenty such pictures a second.
+# Crossed fringes, in single precision and in an order that the processor does many at a time: first
+# all pixels that are k beyond their node, then those at k + 1. A hold that tracks takes twenty such
+# pictures a
+# second.
 
 _FLOAT = np.float32
 
 
 @cache
 def noise_bank() -> Singles:
-    """A quarter of a million values of a unit normal distribution; each row of a picture takes its own part."""
+    """A quarter of a million values of a unit normal distribution; each row of a picture takes its
+    own part.
+    """
     return np.random.default_rng(0).permutation(np.tile(normal_quantiles(), 4))
 
 
@@ -183,7 +214,9 @@ def _cosine(turns: float) -> float:
 def _crossed_pixels(  # type: ignore[no-untyped-def]
     lines, weights, loss, noise, pattern, scale, levels, rooms, counts
 ):
-    """Levels, room light and counts of the pixels (cells,) at one place between their nodes, `lines`, of a row."""
+    """Levels, room light and counts of the pixels (cells,) at one place between their nodes,
+    `lines`, of a row.
+    """
     w0, w1, w2, w3 = weights
     rate, first_x, first_y, half_mm, radius2_mm2 = pattern
     dark, white, leak, gamma, sigma, full, row_loss = scale
@@ -192,14 +225,26 @@ def _crossed_pixels(  # type: ignore[no-untyped-def]
         x = w0 * lines[0, c] + w1 * lines[0, c + 1] + w2 * lines[0, c + 2] + w3 * lines[0, c + 3]
         y = w0 * lines[1, c] + w1 * lines[1, c + 1] + w2 * lines[1, c + 2] + w3 * lines[1, c + 3]
         r2 = w0 * lines[2, c] + w1 * lines[2, c + 1] + w2 * lines[2, c + 2] + w3 * lines[2, c + 3]
-        level = _FLOAT(0.5) + _FLOAT(0.25) * (_cosine(x * rate + first_x) + _cosine(y * rate + first_y))
+        level = _FLOAT(0.5) + _FLOAT(0.25) * (
+            _cosine(x * rate + first_x) + _cosine(y * rate + first_y)
+        )
         inside = (abs(x - half_mm) < half_mm) & (abs(y - half_mm) < half_mm)
         levels[c] = level if inside else none
         counts[c] = white if r2 <= radius2_mm2 else none
     if lines.shape[0] > 3:
         for c in range(counts.size):
-            factor = w0 * lines[3, c] + w1 * lines[3, c + 1] + w2 * lines[3, c + 2] + w3 * lines[3, c + 3]
-            room = w0 * lines[4, c] + w1 * lines[4, c + 1] + w2 * lines[4, c + 2] + w3 * lines[4, c + 3]
+            factor = (
+                w0 * lines[3, c]
+                + w1 * lines[3, c + 1]
+                + w2 * lines[3, c + 2]
+                + w3 * lines[3, c + 3]
+            )
+            room = (
+                w0 * lines[4, c]
+                + w1 * lines[4, c + 1]
+                + w2 * lines[4, c + 2]
+                + w3 * lines[4, c + 3]
+            )
             rooms[c] = room if counts[c] > none else none
             counts[c] *= factor
     if gamma != one:  # a power costs ten times the rest, and does not go many at a time
@@ -216,23 +261,32 @@ def _crossed_pixels(  # type: ignore[no-untyped-def]
 def shade_crossed(
     nodes: FloatArray,  # as in `shade`
     weights: Singles,  # (4, step): of `cubic_weights`, transposed
-    # periods per mm, phases of x and y at the low edge in turns, half a side of the region (mm), the rim's radius^2
+    # periods per mm, phases of x and y at the low edge in turns, half a side of the region (mm),
+    # the rim's radius^2
     pattern: tuple[float, ...],
     # counts without light, of white above that, leak, gamma, sigma of the noise, full scale
     scale: tuple[float, ...],
-    loss: tuple[Singles, Singles],  # vignetting (step, cells) of columns k + step * cell, and (H,) of rows
+    loss: tuple[
+        Singles, Singles
+    ],  # vignetting (step, cells) of columns k + step * cell, and (H,) of rows
     noise: tuple[Singles, int],  # `noise_bank()`, seed of this picture
     out: Pixels,
     start: int,
     stop: int,
 ) -> None:
-    """Fill rows start to stop of `out` (H, W) with the picture of crossed fringes; its tuples hold single floats."""
+    """Fill rows start to stop of `out` (H, W) with the picture of crossed fringes; its tuples hold
+    single floats.
+    """
     step, width = weights.shape[1], out.shape[1]
     column_loss, row_loss = loss
     cells = column_loss.shape[1]
     bank, seed = noise
     lines = np.empty((nodes.shape[0], nodes.shape[2]), np.float32)
-    levels, rooms, counts = np.empty(cells, np.float32), np.zeros(cells, np.float32), np.empty(cells, np.float32)
+    levels, rooms, counts = (
+        np.empty(cells, np.float32),
+        np.zeros(cells, np.float32),
+        np.empty(cells, np.float32),
+    )
     for row in range(start, stop):
         for k in range(nodes.shape[0]):
             _row_of_nodes(nodes, k, row // step, weights[:, row % step], lines[k])
@@ -241,17 +295,29 @@ def shade_crossed(
         for k in range(step):
             own = weights[0, k], weights[1, k], weights[2, k], weights[3, k]
             some = bank[first + k * cells : first + (k + 1) * cells]
-            _crossed_pixels(lines, own, column_loss[k], some, pattern, (*scale, row_loss[row]), levels, rooms, counts)
+            _crossed_pixels(
+                lines,
+                own,
+                column_loss[k],
+                some,
+                pattern,
+                (*scale, row_loss[row]),
+                levels,
+                rooms,
+                counts,
+            )
             for cell in range((width - k + step - 1) // step):
                 out[row, cell * step + k] = np.int32(counts[cell])
 
 
 # A pattern's light level (0..1) at each place along one axis of the screen.
 #
-# s is measured from the low edge of the pattern region, a square centred on O'; outside it the screen is dark.
+# s is measured from the low edge of the pattern region, a square centred on O'; outside it the
+# screen is dark.
 
 _GRAY_BITS = 4
-# linear interpolation of a cosine in this many cells is 2e-8 off at most: below a thousandth of a 16-bit count
+# linear interpolation of a cosine in this many cells is 2e-8 off at most: below a thousandth of a
+# 16-bit count
 _SINE_CELLS = 16384
 
 
@@ -263,7 +329,8 @@ class Light:
     """
 
     dark_fraction: float = 0.02  # counts without light, of full scale
-    white_fraction: float = 0.80  # counts of a white screen in the middle of the picture, of full scale
+    # counts of a white screen in the middle of the picture, of full scale
+    white_fraction: float = 0.80
     leak: float = 0.02  # light of a black screen, of a white one
     gamma: float = 1.0  # the screen's light is level**gamma; 1 is a linear screen
     # loss of light at the picture's corner, growing with the square of the distance from its middle
@@ -272,7 +339,8 @@ class Light:
     def __post_init__(self) -> None:
         if not 0 <= self.dark_fraction < self.white_fraction <= 1:
             raise ValueError(
-                f"dark_fraction = {self.dark_fraction} and white_fraction = {self.white_fraction} must be"
+                f"dark_fraction = {self.dark_fraction} and white_fraction = "
+                f"{self.white_fraction} must be"
                 " 0 or more, at most 1, and the white above the dark"
             )
         for name, value in (("leak", self.leak), ("vignetting", self.vignetting)):
@@ -286,8 +354,8 @@ class Light:
 class LevelTable:
     """Light along an axis in cells `cell_mm` wide.
 
-    A smooth table is one period, repeated and interpolated, with one value more than cells so that the last cell has
-    an end; the other has one value per cell over the whole region.
+    A smooth table is one period, repeated and interpolated, with one value more than cells so that
+    the last cell has an end; the other has one value per cell over the whole region.
     """
 
     values: FloatArray  # (cells,)
@@ -299,10 +367,12 @@ def level_table(pattern: Pattern, config: PatternConfig, light: Light) -> LevelT
     """Light of a pattern along its axis.
 
     - "sin": (1 + cos(phi + shift)) / 2 with phi = 2 pi s / T - pi, over one period, to be repeated;
-    - "gray": bit `index` (1 is the most significant of 4) of gray(V2), V2 = floor(2 s / T), over the region;
+    - "gray": bit `index` (1 is the most significant of 4) of gray(V2), V2 = floor(2 s / T), over
+      the region;
     - "white" and "black": 1 and 0 over the region.
 
-    Crossed fringes have none (`shade_crossed`). Raises ValueError if the pattern's role or Gray bit is unknown.
+    Crossed fringes have none (`shade_crossed`). Raises ValueError if the pattern's role or Gray bit
+    is unknown.
     """
     phi = np.linspace(0.0, 2.0 * np.pi, _SINE_CELLS + 1) - np.pi
     if pattern.role == "sin":
@@ -316,17 +386,23 @@ def level_table(pattern: Pattern, config: PatternConfig, light: Light) -> LevelT
     elif pattern.role in ("white", "black"):
         levels = np.full(half_periods.shape, 1.0 if pattern.role == "white" else 0.0)
     else:
-        raise ValueError(f"pattern {pattern.name!r}: role must be sin, crossed, gray (bit 1..4), white or black")
+        raise ValueError(
+            f"pattern {pattern.name!r}: role must be sin, crossed, gray (bit 1..4), white or black"
+        )
     return LevelTable(_lit(levels, light), config.period_mm / 2.0, smooth=False)
 
 
 def pattern_sequence(
-    kind: str, config: PatternConfig, shifts_rad: tuple[float, ...] = (), coarser_mm: tuple[float, ...] = ()
+    kind: str,
+    config: PatternConfig,
+    shifts_rad: tuple[float, ...] = (),
+    coarser_mm: tuple[float, ...] = (),
 ) -> list[Pattern]:
-    """The patterns of a set in the order they are shown: x and y sinusoids and Gray bits, white, black.
+    """The patterns of a set in the order they are shown: x and y sinusoids and Gray bits, white,
+    black.
 
-    The kind is "full", "fringes" (sinusoids alone) or "frequencies" (sinusoids, and those of the periods
-    `coarser_mm`), else ValueError; `shifts_rad` one a step, empty: 2 pi k / N.
+    The kind is "full", "fringes" (sinusoids alone) or "frequencies" (sinusoids, and those of the
+    periods `coarser_mm`), else ValueError; `shifts_rad` one a step, empty: 2 pi k / N.
     """
     if kind not in ("full", "fringes", "frequencies"):
         raise ValueError(f"kind = {kind!r} must be full, fringes or frequencies")
@@ -347,12 +423,16 @@ def _lit(levels: FloatArray, light: Light) -> FloatArray:
 
 # The pixels of a panel: what a screen driver has sent, instead of a pattern.
 
-_BLUR_PX = 1.5  # of the lens, at the panel: it does not resolve a checkerboard, and takes 0.4 % of a fringe of 100 px
+# of the lens, at the panel: it does not resolve a checkerboard, and takes 0.4 % of a fringe of 100
+# px
+_BLUR_PX = 1.5
 
 
 @dataclass(frozen=True, slots=True)
 class PanelPicture:
-    """A picture on a panel as the camera sees it; its place on the screen is that of the pattern region."""
+    """A picture on a panel as the camera sees it; its place on the screen is that of the pattern
+    region.
+    """
 
     levels: Levels  # (height, width)
     raster: ScreenRaster
@@ -365,9 +445,13 @@ class PanelPicture:
         return np.array([column_px - half_px, row_px + half_px, self.raster.pixel_mm])
 
     def light_of_pixels(self, light: Light) -> Singles:
-        """Share of a white screen's light, (height, width), not resolved further than the lens does."""
+        """Share of a white screen's light, (height, width), not resolved further than the lens
+        does.
+        """
         sharp = _lit(np.arange(256) / 255.0, light).astype(np.float32)[self.levels]
-        return np.asarray(cv2.GaussianBlur(sharp, (0, 0), _BLUR_PX, borderType=cv2.BORDER_REFLECT), np.float32)
+        return np.asarray(
+            cv2.GaussianBlur(sharp, (0, 0), _BLUR_PX, borderType=cv2.BORDER_REFLECT), np.float32
+        )
 
 
 @njit(cache=True, nogil=True)
@@ -384,7 +468,9 @@ def shade_panel(
     start: int,
     stop: int,
 ) -> None:
-    """Fill rows start to stop of `out` (H, W) with what the camera sees of a panel in dark surroundings."""
+    """Fill rows start to stop of `out` (H, W) with what the camera sees of a panel in dark
+    surroundings.
+    """
     step = weights.shape[0]
     dark, white, leak, full = scale
     column_loss, row_loss = loss
@@ -416,9 +502,18 @@ def shade_panel(
 def _pixel_light(picture: Singles, column: float, row: float, outside: float) -> float:
     """Light at a place of a picture, between its pixels by bilinear interpolation."""
     first_column, first_row = int(np.floor(column)), int(np.floor(row))
-    if first_column < 0 or first_row < 0 or first_column + 1 >= picture.shape[1] or first_row + 1 >= picture.shape[0]:
+    if (
+        first_column < 0
+        or first_row < 0
+        or first_column + 1 >= picture.shape[1]
+        or first_row + 1 >= picture.shape[0]
+    ):
         return outside
     right, down = column - first_column, row - first_row
-    above = (1.0 - right) * picture[first_row, first_column] + right * picture[first_row, first_column + 1]
-    below = (1.0 - right) * picture[first_row + 1, first_column] + right * picture[first_row + 1, first_column + 1]
+    above = (1.0 - right) * picture[first_row, first_column] + right * picture[
+        first_row, first_column + 1
+    ]
+    below = (1.0 - right) * picture[first_row + 1, first_column] + right * picture[
+        first_row + 1, first_column + 1
+    ]
     return float((1.0 - down) * above + down * below)

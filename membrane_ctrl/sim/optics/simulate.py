@@ -23,7 +23,9 @@ _GRID = 201  # odd, so that the vertex is a point of the truth's map
 
 
 def capture_table(spec: SimulationSpec, readings_um: FloatArray) -> dict[str, Any]:
-    """The content of `capture.toml` (schema membrane-capture/1); `readings_um` (frames,) are the laser's readings."""
+    """The content of `capture.toml` (schema membrane-capture/1); `readings_um` (frames,) are the
+    laser's readings.
+    """
     geometry = _written(spec.stated_geometry or spec.optics.geometry)
     if spec.laser:
         geometry["reference_displacement_um"] = spec.reference_um
@@ -43,7 +45,10 @@ def capture_table(spec: SimulationSpec, readings_um: FloatArray) -> dict[str, An
         "mirror": _written(spec.optics.mirror),
         **({"artefact": dict(spec.artefact)} if spec.artefact else {}),
         **({"screen_moved": dict(spec.screen_moved)} if spec.screen_moved else {}),
-        "frames": [_frame_row(spec, frame, float(readings_um[frame])) for frame in range(len(spec.patterns))],
+        "frames": [
+            _frame_row(spec, frame, float(readings_um[frame]))
+            for frame in range(len(spec.patterns))
+        ],
     }
     return table
 
@@ -56,10 +61,11 @@ def write_capture_toml(folder: Path, spec: SimulationSpec, readings_um: FloatArr
 def write_truth(folder: Path, spec: SimulationSpec) -> None:
     """Write the truth of a set.
 
-    `truth.npz`: `x_mm` (W,), `y_mm` (H,), `h_mm` (H, W) above the vertex, NaN outside the rim, at the mean
-    displacement of the sinusoids; `h_per_sag` (H, W), its change with sag; `displacement_um` (frames,); `coeffs_um`
-    (ZERNIKE_TERMS,), Noll with the surface 0 at the vertex, if these terms represent the shape.
-    `truth.json`: the same numbers without the maps, and the request.
+    `truth.npz`: `x_mm` (W,), `y_mm` (H,), `h_mm` (H, W) above the vertex, NaN outside the rim, at
+    the mean displacement of the sinusoids; `h_per_sag` (H, W), its change with sag;
+    `displacement_um` (frames,); `coeffs_um` (ZERNIKE_TERMS,), Noll with the surface 0 at the
+    vertex, if these terms represent the shape. `truth.json`: the same numbers without the maps, and
+    the request.
     """
     displacement_um = np.array([spec.displacement_um(frame) for frame in range(len(spec.patterns))])
     mean_um = _mean_um(spec)
@@ -70,7 +76,12 @@ def write_truth(folder: Path, spec: SimulationSpec) -> None:
     inside = x_mm**2 + y_mm**2 <= radius_mm**2
     h_mm = np.where(inside, spec.film.height_mm(x_mm, y_mm, mean_um), np.nan)
     deeper_mm = np.where(inside, spec.film.height_mm(x_mm, y_mm, mean_um + 1000.0), np.nan)
-    maps: dict[str, Any] = {"x_mm": axis_mm, "y_mm": axis_mm, "h_mm": h_mm, "h_per_sag": deeper_mm - h_mm}
+    maps: dict[str, Any] = {
+        "x_mm": axis_mm,
+        "y_mm": axis_mm,
+        "h_mm": h_mm,
+        "h_per_sag": deeper_mm - h_mm,
+    }
     if coeffs_um is not None:
         maps["coeffs_um"] = coeffs_um
     np.savez_compressed(folder / "truth.npz", displacement_um=displacement_um, **maps)
@@ -82,7 +93,8 @@ def write_truth(folder: Path, spec: SimulationSpec) -> None:
         "coeffs_um": None if coeffs_um is None else coeffs_um.tolist(),
         "frame_displacement_um": displacement_um.tolist(),
         "film": film,
-        "geometry": _written(spec.optics.geometry) | {"reference_displacement_um": spec.reference_um},
+        "geometry": _written(spec.optics.geometry)
+        | {"reference_displacement_um": spec.reference_um},
         "light": asdict(spec.light),
         "screen_error": None if spec.screen_error is None else asdict(spec.screen_error),
         "faults": [asdict(fault) for fault in spec.faults],
@@ -100,7 +112,11 @@ def _mean_um(spec: SimulationSpec) -> float:
 
 def _written(section: settings.Section) -> dict[str, Any]:
     """A configuration table as written, without absent fields and empty lists."""
-    return {key: value for key, value in section.model_dump(mode="json", exclude_none=True).items() if value != []}
+    return {
+        key: value
+        for key, value in section.model_dump(mode="json", exclude_none=True).items()
+        if value != []
+    }
 
 
 def _frame_row(spec: SimulationSpec, frame: int, reading_um: float) -> dict[str, Any]:
@@ -119,7 +135,12 @@ def _frame_row(spec: SimulationSpec, frame: int, reading_um: float) -> dict[str,
 
 
 # noise does not compress: higher levels cost time and save nothing
-_PNG_SPEED = (cv2.IMWRITE_PNG_COMPRESSION, 1, cv2.IMWRITE_PNG_STRATEGY, cv2.IMWRITE_PNG_STRATEGY_RLE)
+_PNG_SPEED = (
+    cv2.IMWRITE_PNG_COMPRESSION,
+    1,
+    cv2.IMWRITE_PNG_STRATEGY,
+    cv2.IMWRITE_PNG_STRATEGY_RLE,
+)
 
 
 @dataclass(frozen=True, slots=True)
@@ -133,7 +154,9 @@ class _Exposure:
 
 
 def simulate_set(folder: str | Path, spec: SimulationSpec) -> None:
-    """Write one capture set and its truth. Raises OSError if the folder or a file cannot be written."""
+    """Write one capture set and its truth. Raises OSError if the folder or a file cannot be
+    written.
+    """
     _write_set(Path(folder), spec, _renderer(spec))
 
 
@@ -144,19 +167,23 @@ def simulate_run(
     interval_s: float = 4.0,
     on_set: Callable[[int], None] | None = None,
 ) -> None:
-    """Write a run: `0000` is the full set, the others are fringes anchored to it; one clock and one motion for all.
+    """Write a run: `0000` is the full set, the others are fringes anchored to it; one clock and one
+    motion for all.
 
-    Each set has a folder. The first set's motion continues through the others, its faults do not; sets start
-    `interval_s` apart. `on_set` gets the number of sets written, after each. Raises ValueError if the first set is
-    not full, lists its displacements, or the sets overlap in time.
+    Each set has a folder. The first set's motion continues through the others, its faults do not;
+    sets start `interval_s` apart. `on_set` gets the number of sets written, after each. Raises
+    ValueError if the first set is not full, lists its displacements, or the sets overlap in time.
     """
     if spec.kind != "full" or spec.displacements_um:
-        raise ValueError("kind: the first set of a run must be full, and move by motion, not displacements_um")
+        raise ValueError(
+            "kind: the first set of a run must be full, and move by motion, not displacements_um"
+        )
     if sets < 1:
         raise ValueError(f"sets = {sets} must be 1 or more")
     if interval_s < len(spec.patterns) * spec.frame_interval_s:
         raise ValueError(
-            f"interval_s = {interval_s:g} is shorter than the {len(spec.patterns)} frames of the first set"
+            f"interval_s = {interval_s:g} is shorter than the {len(spec.patterns)} frames of "
+            "the first set"
         )
     spec = _anchored(spec)
     renderer = _renderer(spec)
@@ -165,7 +192,9 @@ def simulate_run(
             this = spec
         else:
             start_s, seed = spec.start_s + number * interval_s, spec.seed + number
-            this = replace(spec, kind="fringes", reference="../0000", start_s=start_s, seed=seed, faults=())
+            this = replace(
+                spec, kind="fringes", reference="../0000", start_s=start_s, seed=seed, faults=()
+            )
         _write_set(Path(folder) / f"{number:04d}", this, renderer)
         if on_set is not None:
             on_set(number + 1)
@@ -182,15 +211,19 @@ def simulate_track(
     rate_hz: float = 20.0,
     on_frame: Callable[[int], None] | None = None,
 ) -> None:
-    """Write a tracking set: `full`, and `track` with frames of a crossed pattern; both share clock and motion.
+    """Write a tracking set: `full`, and `track` with frames of a crossed pattern; both share clock
+    and motion.
 
-    The first five frames step the pattern. `truth.npz` in `track` has `time_s`, `displacement_um`, `sag_um` (frames,)
-    and, if these represent the film, `coeffs_um` (frames, ZERNIKE_TERMS), all without the vibrations, `drum_um`
-    (frames, modes): RMS over the mirror. `on_frame` gets the number of frames written.
-    Raises ValueError for frames or a rate that are not above 0, and for a specification that is not of a full set.
+    The first five frames step the pattern. `truth.npz` in `track` has `time_s`, `displacement_um`,
+    `sag_um` (frames,) and, if these represent the film, `coeffs_um` (frames, ZERNIKE_TERMS), all
+    without the vibrations, `drum_um` (frames, modes): RMS over the mirror. `on_frame` gets the
+    number of frames written. Raises ValueError for frames or a rate that are not above 0, and for a
+    specification that is not of a full set.
     """
     if spec.kind != "full" or spec.displacements_um or frames < 1 or not rate_hz > 0:
-        raise ValueError("track: one frame or more, at a rate above 0, of a film that moves by motion")
+        raise ValueError(
+            "track: one frame or more, at a rate above 0, of a film that moves by motion"
+        )
     spec = _anchored(spec)
     renderer, target = _renderer(spec), Path(folder) / "track"
     _write_set(Path(folder) / "full", spec, renderer)
@@ -201,19 +234,35 @@ def simulate_track(
     noise_um = np.random.default_rng(spec.seed + 1).normal(0.0, spec.laser_noise_um, frames)
     rows = []
     for k in range(frames):
-        shift_x, shift_y = (turns * 2 * np.pi * (k % _STEPS) / _STEPS if k < _STEPS else 0.0 for turns in (1, 2))
+        shift_x, shift_y = (
+            turns * 2 * np.pi * (k % _STEPS) / _STEPS if k < _STEPS else 0.0 for turns in (1, 2)
+        )
         pattern = roles.Pattern("crossed", "", _CROSSED_PERIODS, shift_x, shift_y_rad=shift_y)
         row: dict[str, Any] = {"file": f"t_{k:05d}.png", "role": "crossed"}
-        row |= {"shift_x_rad": shift_x, "shift_y_rad": shift_y, "time_s": round(float(time_s[k]), 9)}
+        row |= {
+            "shift_x_rad": shift_x,
+            "shift_y_rad": shift_y,
+            "time_s": round(float(time_s[k]), 9),
+        }
         if spec.laser:
             row["displacement_um"] = float(displacement_um[k] + noise_um[k])
-        _write_png(target / row["file"], renderer.render(pattern, float(displacement_um[k]), time_s=float(time_s[k])))
+        _write_png(
+            target / row["file"],
+            renderer.render(pattern, float(displacement_um[k]), time_s=float(time_s[k])),
+        )
         rows.append(row)
         if on_frame is not None:
             on_frame(k + 1)
     pattern_mm = spec.optics.pattern
-    crossed = {"periods": _CROSSED_PERIODS, "period_mm": pattern_mm.periods * pattern_mm.period_mm / _CROSSED_PERIODS}
-    table: dict[str, Any] = {**file_origin("membrane-capture/1"), "kind": "track", "reference": "../full"}
+    crossed = {
+        "periods": _CROSSED_PERIODS,
+        "period_mm": pattern_mm.periods * pattern_mm.period_mm / _CROSSED_PERIODS,
+    }
+    table: dict[str, Any] = {
+        **file_origin("membrane-capture/1"),
+        "kind": "track",
+        "reference": "../full",
+    }
     table |= {"pattern": _written(pattern_mm) | {"crossed": crossed}, "frames": rows}
     (target / "capture.toml").write_bytes(tomli_w.dumps(table).encode())
     sag_um = np.array([1e3 * spec.film.sag_at_mm(float(d)) for d in displacement_um])
@@ -227,9 +276,14 @@ def simulate_track(
 
 
 def _anchored(spec: SimulationSpec) -> SimulationSpec:
-    """The specification with an explicit reference displacement of the geometry, common to all sets of a run."""
+    """The specification with an explicit reference displacement of the geometry, common to all sets
+    of a run.
+    """
     stated = spec.stated_geometry or spec.optics.geometry
-    return replace(spec, stated_geometry=stated.model_copy(update={"reference_displacement_um": spec.reference_um}))
+    return replace(
+        spec,
+        stated_geometry=stated.model_copy(update={"reference_displacement_um": spec.reference_um}),
+    )
 
 
 class _SeenDirectly(OpticsRenderer):
@@ -238,9 +292,14 @@ class _SeenDirectly(OpticsRenderer):
     def _trace(self, directions: FloatArray, displacement_um: float, film: Any = None) -> Trace:
         screen = self._screen_pose
         axes = np.stack([screen.s_x, screen.s_y, np.cross(screen.s_x, screen.s_y)])
-        start, along = axes @ (self._camera_pose.position_mm - screen.origin_mm), directions @ axes.T
+        start, along = (
+            axes @ (self._camera_pose.position_mm - screen.origin_mm),
+            directions @ axes.T,
+        )
         tangents = along[:, :2].T / along[:, 2]
-        seen_mm = onto_face(start[:2, None] - start[2] * tangents, tangents, screen.bow_per_mm, screen.height_map)
+        seen_mm = onto_face(
+            start[:2, None] - start[2] * tangents, tangents, screen.bow_per_mm, screen.height_map
+        )
         return Trace(np.zeros(len(along)), np.zeros(len(along)), *seen_mm)
 
 

@@ -17,27 +17,44 @@ from membrane_ctrl.sim.optics import film_shape, shade, trace
 
 
 FaultKind = Literal[
-    "stale", "swapped", "missing", "saturated", "dark", "flicker", "moved", "wrong_size", "wrong_depth"
+    "stale",
+    "swapped",
+    "missing",
+    "saturated",
+    "dark",
+    "flicker",
+    "moved",
+    "wrong_size",
+    "wrong_depth",
 ]
 
 # Strength of a fault: relative exposure, or µm of film displacement
-_DEFAULT_AMOUNT: dict[FaultKind, float] = {"saturated": 2.0, "dark": 0.05, "flicker": 0.8, "moved": 200.0}
+_DEFAULT_AMOUNT: dict[FaultKind, float] = {
+    "saturated": 2.0,
+    "dark": 0.05,
+    "flicker": 0.8,
+    "moved": 200.0,
+}
 
 
 @dataclass(frozen=True, slots=True)
 class FrameFault:
     """One fault of one frame."""
 
-    # "stale" (the picture of the frame before, byte for byte), "swapped" (with the frame after), "missing" (listed
-    # but not written), "saturated", "dark", "flicker" (wrong exposure), "moved" (the film moved unnoticed by the
-    # laser), "wrong_size" (one row short), "wrong_depth" (8 for 16 bit or the reverse)
+    # "stale" (the picture of the frame before, byte for byte), "swapped" (with the frame after),
+    # "missing" (listed but not written), "saturated", "dark", "flicker" (wrong exposure), "moved"
+    # (the film moved unnoticed by the laser), "wrong_size" (one row short), "wrong_depth" (8 for 16
+    # bit or the
+    # reverse)
     kind: FaultKind
     frame: str  # the frame's name, as `x_sin_2`
     amount: float | None = None  # relative exposure, or µm for "moved"; None: a typical one
 
     def __post_init__(self) -> None:
         if self.kind not in get_args(FaultKind):
-            raise ValueError(f"faults: kind {self.kind!r} is not one of {', '.join(get_args(FaultKind))}")
+            raise ValueError(
+                f"faults: kind {self.kind!r} is not one of {', '.join(get_args(FaultKind))}"
+            )
         if self.amount is not None and self.kind not in _DEFAULT_AMOUNT:
             raise ValueError(f"faults: {self.kind} has no amount")
 
@@ -55,7 +72,10 @@ class FrameFault:
         kind, _, rest = text.partition(":")
         frame, _, amount = rest.partition(":")
         if not frame:
-            raise ValueError(f"faults: {text!r} must read kind:frame or kind:frame:amount, as flicker:x_sin_2:0.8")
+            raise ValueError(
+                f"faults: {text!r} must read kind:frame or kind:frame:amount, as "
+                "flicker:x_sin_2:0.8"
+            )
         try:
             strength = float(amount) if amount else None
         except ValueError:
@@ -79,17 +99,22 @@ class Motion:
         return self.start_um + self.drift_um_per_s * time_s + swing
 
 
-# Of a sphere that leans: its coma is of micrometres, its terms above radial order 7 far below a nanometre.
+# Of a sphere that leans: its coma is of micrometres, its terms above radial order 7 far below a
+# nanometre.
 _LEANING_TERMS = 36
 
 
 def leaning(
-    curvature_mm: float, radius_mm: float, lean_x: float, lean_y: float, form_um: FloatArray | None = None
+    curvature_mm: float,
+    radius_mm: float,
+    lean_x: float,
+    lean_y: float,
+    form_um: FloatArray | None = None,
 ) -> film_shape.FilmShape:
     """A concave sphere, or a flat (infinite radius of curvature), in the mirror's place.
 
-    Its slopes at the vertex are `lean_x`, `lean_y`: a sphere that leans by 1 mrad has micrometres of coma. `form_um`
-    (terms,) are Noll terms of its form error.
+    Its slopes at the vertex are `lean_x`, `lean_y`: a sphere that leans by 1 mrad has micrometres
+    of coma. `form_um` (terms,) are Noll terms of its form error.
     """
     coeffs_um = np.zeros(_LEANING_TERMS) if form_um is None else np.array(form_um)
     coeffs_um[1:3] += 1e3 * radius_mm / 2 * np.array([lean_x, lean_y])
@@ -119,12 +144,17 @@ class SimulationSpec:
     film: film_shape.FilmShape  # its sag belongs to displacement 0
     # 18 frames (for four steps), the sinusoids alone, or the sinusoids of several periods
     kind: Literal["full", "fringes", "frequencies"] = "full"
-    reference: str = ""  # of a fringes set: the full set whose fringe orders anchor it, as `../0000`
+    # of a fringes set: the full set whose fringe orders anchor it, as `../0000`
+    reference: str = ""
     # one phase shift a step, written into each frame; empty: 2 pi k / N, not written
     shifts_rad: tuple[float, ...] = ()
-    coarser_mm: tuple[float, ...] = ()  # further periods of a set of kind "frequencies", longer than the pattern's
+    coarser_mm: tuple[
+        float, ...
+    ] = ()  # further periods of a set of kind "frequencies", longer than the pattern's
     motion: Motion = Motion()  # of the film on the run's clock
-    displacements_um: tuple[float, ...] = ()  # instead of `motion`: one a frame, in the order of `patterns`
+    displacements_um: tuple[
+        float, ...
+    ] = ()  # instead of `motion`: one a frame, in the order of `patterns`
     start_s: float = 0.0  # start of the first exposure on the run's clock
     frame_interval_s: float = 0.1
     laser: bool = True  # whether the frames carry the laser's reading
@@ -136,30 +166,48 @@ class SimulationSpec:
     drum_nm: float = 0.0  # amplitude of each of the film's vibrations
     exact: bool = False
     seed: int = 1
-    artefact: Mapping[str, str | float] = field(default_factory=dict)  # `[artefact]` of a set that shows one
-    screen_moved: Mapping[str, Any] = field(default_factory=dict)  # `[screen_moved]`, if the true one is elsewhere
+    artefact: Mapping[str, str | float] = field(
+        default_factory=dict
+    )  # `[artefact]` of a set that shows one
+    screen_moved: Mapping[str, Any] = field(
+        default_factory=dict
+    )  # `[screen_moved]`, if the true one is elsewhere
     faults: tuple[FrameFault, ...] = ()  # faults of single frames
     # modulus times thickness, for the gauge's reading
     stiffness_n_per_m: float = gas_film.MODULUS_PA * gas_film.MIRROR_FILM.thickness_um * 1e-6
 
     def __post_init__(self) -> None:
         if self.kind == "fringes" and not self.reference:
-            raise ValueError("reference: a fringes set needs the full set that anchors it, as ../0000")
+            raise ValueError(
+                "reference: a fringes set needs the full set that anchors it, as ../0000"
+            )
         if self.kind != "fringes" and self.reference:
             raise ValueError("reference: only a fringes set has one")
         if (self.kind == "frequencies") != bool(self.coarser_mm):
-            raise ValueError("coarser_mm: a set of several frequencies has further periods, any other has none")
-        if any(not isfinite(period) or period <= self.optics.pattern.period_mm for period in self.coarser_mm):
-            raise ValueError(f"coarser_mm: every period must exceed period_mm = {self.optics.pattern.period_mm:g}")
+            raise ValueError(
+                "coarser_mm: a set of several frequencies has further periods, any other has none"
+            )
+        if any(
+            not isfinite(period) or period <= self.optics.pattern.period_mm
+            for period in self.coarser_mm
+        ):
+            raise ValueError(
+                "coarser_mm: every period must exceed period_mm = "
+                f"{self.optics.pattern.period_mm:g}"
+            )
         if len(set(self.coarser_mm)) < len(self.coarser_mm):
             raise ValueError("coarser_mm: a period occurs twice")
         if self.shifts_rad and len(self.shifts_rad) != self.optics.pattern.steps:
-            raise ValueError(f"shifts_rad: {len(self.shifts_rad)} shifts for steps = {self.optics.pattern.steps}")
+            raise ValueError(
+                f"shifts_rad: {len(self.shifts_rad)} shifts for steps = {self.optics.pattern.steps}"
+            )
         if self.displacements_um and self.motion != Motion():
             raise ValueError("displacements_um: give these or motion, not both")
         names = [pattern.name for pattern in self.patterns]
         if self.displacements_um and len(self.displacements_um) != len(names):
-            raise ValueError(f"displacements_um: {len(self.displacements_um)} values for {len(names)} frames")
+            raise ValueError(
+                f"displacements_um: {len(self.displacements_um)} values for {len(names)} frames"
+            )
         if not all(isfinite(self.displacement_um(frame)) for frame in range(len(names))):
             raise ValueError("motion, displacements_um: every value must be a number")
         for name, value in (
@@ -171,14 +219,18 @@ class SimulationSpec:
                 raise ValueError(f"{name} = {value} must be 0 or more")
         for fault in self.faults:
             if fault.frame not in names:
-                raise ValueError(f"faults: no frame {fault.frame!r} in this set ({names[0]} .. {names[-1]})")
+                raise ValueError(
+                    f"faults: no frame {fault.frame!r} in this set ({names[0]} .. {names[-1]})"
+                )
             if (fault.kind, fault.frame) in (("stale", names[0]), ("swapped", names[-1])):
                 raise ValueError(f"faults: {fault.frame} has no neighbour to be {fault.kind} with")
 
     @property
     def patterns(self) -> list[Pattern]:
         """The patterns, frame by frame."""
-        return shade.pattern_sequence(self.kind, self.optics.pattern, self.shifts_rad, self.coarser_mm)
+        return shade.pattern_sequence(
+            self.kind, self.optics.pattern, self.shifts_rad, self.coarser_mm
+        )
 
     def time_s(self, frame: int) -> float:
         """Start of exposure of a frame on the run's clock."""
@@ -186,7 +238,11 @@ class SimulationSpec:
 
     def displacement_um(self, frame: int) -> float:
         """True position of the film during a frame (faults aside)."""
-        return self.displacements_um[frame] if self.displacements_um else self.motion.at_um(self.time_s(frame))
+        return (
+            self.displacements_um[frame]
+            if self.displacements_um
+            else self.motion.at_um(self.time_s(frame))
+        )
 
     def pressure_pa(self, displacement_um: float) -> float:
         """Gauge pressure under a Hencky film there."""

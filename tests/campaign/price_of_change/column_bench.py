@@ -1,7 +1,8 @@
-"""Shows one telemetry column wherever people look: a program that a changed copy of the source runs; prints JSON.
+"""Shows one telemetry column wherever people look: a program that a changed copy of the source
+runs; prints JSON.
 
-python column_bench.py COLUMN RUN [RUN...]: what console, `ctl status`, bridges and viewer have of a column; the runs
-must be finished.
+python column_bench.py COLUMN RUN [RUN...]: what console, `ctl status`, bridges and viewer have of a
+column; the runs must be finished.
 """
 
 from __future__ import annotations
@@ -56,11 +57,16 @@ def bridge_values(status: RunStatus, column: str) -> dict[str, Any]:
     table = status_table(status)
     seen = HoldSeen("a-run", status=table, seen_s=time.monotonic(), problem="")
     door = Door(HoldFeed(Where()), Config(doors=DoorsConfig()))
-    return {"value": values(seen)[column], "entity": discovery(door, "membrane/mirror")["components"][column]}
+    return {
+        "value": values(seen)[column],
+        "entity": discovery(door, "membrane/mirror")["components"][column],
+    }
 
 
 def viewer_plots(entity: str) -> dict[str, bool]:
-    """Whether the blueprints of a run and of a review draw an entity, or the means of its seconds."""
+    """Whether the blueprints of a run and of a review draw an entity,
+    or the means of its seconds.
+    """
     config = Config()
     review = ReviewBlueprint(("",), "utc", None, config).made()
     found = {}

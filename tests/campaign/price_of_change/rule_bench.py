@@ -1,7 +1,9 @@
-"""Shows one rule of the safety table at work and in lists: a program that a changed copy of the source runs.
+"""Shows one rule of the safety table at work and in lists: a program that a changed copy of the
+source runs.
 
-python rule_bench.py RULE FIELD VALUE: holds the twin in virtual time, lets a field of the device's answer take a
-value, and prints as JSON what happens; which mutant removes the rule, and where; and its row in the fault matrix.
+python rule_bench.py RULE FIELD VALUE: holds the twin in virtual time, lets a field of the device's
+answer take a value, and prints as JSON what happens; which mutant removes the rule, and where; and
+its row in the fault matrix.
 """
 
 from __future__ import annotations
@@ -37,7 +39,9 @@ def hold_with(field: str, value: float) -> list[dict[str, Any]]:
     def alter(now_s: float, reading: BenchReading) -> BenchReading:
         return replace(reading, **{field: value}) if now_s >= BEGINS_S else reading
 
-    config = Config.model_validate({"twin": {"scenario": "quiet"}, "states": {"stay_after_trip": True}})
+    config = Config.model_validate(
+        {"twin": {"scenario": "quiet"}, "states": {"stay_after_trip": True}}
+    )
     bench = VirtualBench(Plant(config.twin, config.pump))
     run = VirtualRun(config, bench, zernike_projection(), alter=alter)
     commands: tuple[Command, ...] = (Command("hold", "campaign"),)
@@ -46,7 +50,9 @@ def hold_with(field: str, value: float) -> list[dict[str, Any]]:
         tick = run.tick(commands)
         commands = ()
         if tick is not None and run.now_s >= BEGINS_S:
-            found += [event.to_dict() for event in tick.events if isinstance(event, Fault | StateEntered)]
+            found += [
+                event.to_dict() for event in tick.events if isinstance(event, Fault | StateEntered)
+            ]
     return found
 
 
@@ -56,7 +62,10 @@ def main() -> None:
     mutant = next(each for each in mutants.load()[0] if each.rule == rule)
     shown = {
         "events": hold_with(field, value),
-        "mutant": {"what": mutant.what, "place": str(mutant.place(mutants.ROOT).relative_to(mutants.ROOT))},
+        "mutant": {
+            "what": mutant.what,
+            "place": str(mutant.place(mutants.ROOT).relative_to(mutants.ROOT)),
+        },
         "matrix": [line for line in campaign.document([], []).splitlines() if f"`{rule}`" in line],
     }
     print(json.dumps(shown))

@@ -1,4 +1,5 @@
-"""Shows one sensor role wherever a bench has roles: a program that a changed copy of the source runs; prints JSON.
+"""Shows one sensor role wherever a bench has roles: a program that a changed copy of the source
+runs; prints JSON.
 
 python sensor_role_bench.py ROLE FIELD CONFIG
 """
@@ -36,14 +37,18 @@ class StillPlant:
     def sample(self) -> BoardSample:
         """What its sensors show."""
         self._counter += 1
-        return BoardSample(12.5, 0, 600.0, 101_325.0, 22.5, 23.0, self._counter, self._counter / 200)
+        return BoardSample(
+            12.5, 0, 600.0, 101_325.0, 22.5, 23.0, self._counter, self._counter / 200
+        )
 
     def actuate(self, pump_fraction: float, vent_fraction: float) -> None:
         """Nothing moves."""
 
 
 async def checked(path: Path) -> dict[str, str]:
-    """Readings of the devices of a configuration, by role, as `check` finds them at emulated instruments."""
+    """Readings of the devices of a configuration, by role, as `check` finds them at emulated
+    instruments.
+    """
     config = load(path, Config)
     assert config.devices is not None
     lab = Lab(StillPlant(), config.devices)

@@ -1,7 +1,7 @@
 """A new telemetry column costs one row of the table and the line that computes it.
 
-The two are written into a copy of the source. Then the column is in the run's tables, in recording and viewer, in the
-report, on page and console, at the bridges and in the documentation.
+The two are written into a copy of the source. Then the column is in the run's tables, in recording
+and viewer, in the report, on page and console, at the bridges and in the documentation.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ ROW = f"""\
     {COLUMN}: float = column(
         "{LABEL}", "gas less air temperature", Plot("Warmth", Group.ENVIRONMENT), "{ENTITY}", published=True
     )
-    error_um: float = column("""
+    error_um: float = column("""  # noqa: E501
 COMPUTED = f"""\
         {COLUMN}=reading.gas_temperature_c - reading.air_temperature_c,
         trim_um=shape.trim_um,"""
@@ -56,7 +56,7 @@ async def test_the_page_has_the_column(tmp_path, monkeypatch):
         assert "{LABEL}, °C" in await tab.value("document.body.innerText")
         fetched = await tab.value("fetch('/chart?hold=&signal={COLUMN}&span=10+min&utc=True').then(r => r.status)")
         assert fetched == 200
-'''
+'''  # noqa: E501
 
 
 @pytest.fixture(scope="module")
@@ -121,7 +121,10 @@ def test_documents_and_dashboard_have_it(source: ChangedSource) -> None:
     source.run_python("-m", "tests.support.telemetry_pages")
     assert f"| `{COLUMN}` | °C | {LABEL} |" in (source.folder / "docs" / "telemetry.md").read_text()
     assert f"| `{COLUMN}` | °C |" in (source.folder / "docs" / "doors.md").read_text()
-    assert f"membrane_{COLUMN}{{" in (source.folder / "membrane_ctrl" / "examples" / "grafana.json").read_text()
+    assert (
+        f"membrane_{COLUMN}{{"
+        in (source.folder / "membrane_ctrl" / "examples" / "grafana.json").read_text()
+    )
 
 
 @needs("chromium")
@@ -129,7 +132,9 @@ def test_documents_and_dashboard_have_it(source: ChangedSource) -> None:
 def test_the_page_shows_it(source: ChangedSource) -> None:
     test = source.folder / "tests" / "web" / "test_new_column.py"
     test.write_text(PAGE)
-    source.run_python("-m", "pytest", "-q", "-p", "no:cacheprovider", "-o", "asyncio_mode=auto", test)
+    source.run_python(
+        "-m", "pytest", "-q", "-p", "no:cacheprovider", "-o", "asyncio_mode=auto", test
+    )
 
 
 def test_a_replay_decides_the_same(source: ChangedSource, run_dir: Path) -> None:

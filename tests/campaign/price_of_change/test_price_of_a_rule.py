@@ -1,9 +1,9 @@
 """A new rule of the safety table costs its row, and the field of the observation that it judges.
 
-The two are written into a copy of the source. Then the rule trips, and it is in the documentation, in the list of the
-fault matrix and in that of the mutants. What remains is evidence, and a person must write it: an observation that
-shows the cause (`tests/controller/test_safety.py`), and the constraint that the rule enforces
-(`tests/safety_case/safety_case.toml`).
+The two are written into a copy of the source. Then the rule trips, and it is in the documentation,
+in the list of the fault matrix and in that of the mutants. What remains is evidence, and a person
+must write it: an observation that shows the cause (`tests/controller/test_safety.py`), and the
+constraint that the rule enforces (`tests/safety_case/safety_case.toml`).
 """
 
 from __future__ import annotations
@@ -17,7 +17,11 @@ from changed_source import ChangedSource
 
 pytestmark = [pytest.mark.campaign, pytest.mark.timeout(1800)]
 
-RULE, CAUSE, REMEDY = "gas_hot", "the gas is hotter than the film stands", "find what heats the mirror"
+RULE, CAUSE, REMEDY = (
+    "gas_hot",
+    "the gas is hotter than the film stands",
+    "find what heats the mirror",
+)
 SAFETY = "membrane_ctrl/controller/safety.py"
 FIELD = '''\
     @property
@@ -35,7 +39,7 @@ ROW = f"""\
         seen=lambda o: f"{{o.gas_temperature_c:.0f}} °C", broken=lambda o, c: o.gas_temperature_c > 60.0,
     ),
     Rule(
-        code=40, name="late","""
+        code=40, name="late","""  # noqa: E501
 BENCH = Path(__file__).with_name("rule_bench.py")
 
 
@@ -59,7 +63,12 @@ def shown(source: ChangedSource) -> dict[str, Any]:
 
 def test_it_trips_and_its_event_has_the_sentence_of_every_fault(shown: dict[str, Any]) -> None:
     fault, entered = shown["events"]
-    assert (fault["kind"], fault["code"], fault["name"], fault["seen"]) == ("fault", 27, RULE, "85 °C")
+    assert (fault["kind"], fault["code"], fault["name"], fault["seen"]) == (
+        "fault",
+        27,
+        RULE,
+        "85 °C",
+    )
     assert (fault["safe_level"], fault["latching"], fault["remedy"]) == ("ramp_down", True, REMEDY)
     assert (entered["kind"], entered["state"]) == ("state", "fault")
 
@@ -67,7 +76,10 @@ def test_it_trips_and_its_event_has_the_sentence_of_every_fault(shown: dict[str,
 def test_the_pages_have_it(source: ChangedSource) -> None:
     source.run_python("-m", "tests.support.faults_page")
     assert f"| 27 | `{RULE}` | {CAUSE} |" in (source.folder / "docs" / "faults.md").read_text()
-    assert f"| 27 `{RULE}` | {CAUSE} | {REMEDY} |" in (source.folder / "docs" / "operations.md").read_text()
+    assert (
+        f"| 27 `{RULE}` | {CAUSE} | {REMEDY} |"
+        in (source.folder / "docs" / "operations.md").read_text()
+    )
 
 
 def test_the_fault_matrix_lists_it(shown: dict[str, Any]) -> None:
@@ -80,6 +92,8 @@ def test_the_mutants_list_removes_it(shown: dict[str, Any]) -> None:
 
 
 def test_the_evidence_that_a_person_must_write_is_missed(source: ChangedSource) -> None:
-    gaps = "import safety_case as s; print([g for g in s.find_gaps(s.load_case()) if 'gas_hot' in g])"
+    gaps = (
+        "import safety_case as s; print([g for g in s.find_gaps(s.load_case()) if 'gas_hot' in g])"
+    )
     said = source.run_python("-c", f"import sys; sys.path.insert(0, 'tests/safety_case'); {gaps}")
     assert f"rule {RULE}: enforces no constraint" in said

@@ -1,4 +1,5 @@
-"""A second pressure gauge costs three places: its role, its telemetry column, the rule that uses it.
+"""A second pressure gauge costs three places: its role, its telemetry column, the rule that uses
+it.
 
 The places are written into a copy of the source. Its driver is one of those of the first gauge.
 """
@@ -25,7 +26,7 @@ IN_COLUMNS = f"""\
     {FIELD}: float = column(
         "{LABEL}", "reading of the second gauge", GAUGE, "/gas/second_pressure", decimals=1, published=True
     )
-    ambient_pressure_pa: float = column("""
+    ambient_pressure_pa: float = column("""  # noqa: E501
 IN_SAFETY = f"""\
 TABLE: tuple[Rule, ...] = (
     Rule(
@@ -52,7 +53,9 @@ def source(tmp_path_factory: pytest.TempPathFactory) -> ChangedSource:
     source = ChangedSource.copy_to(tmp_path_factory.mktemp("gauge"))
     source.copy_more("tests", "docs", "benchmarks")
     source.replace("firmware_iface/roles.py", "\n    interlocks_open: int = 0\n", IN_ROLES)
-    source.replace("membrane_ctrl/model/columns.py", "    ambient_pressure_pa: float = column(", IN_COLUMNS)
+    source.replace(
+        "membrane_ctrl/model/columns.py", "    ambient_pressure_pa: float = column(", IN_COLUMNS
+    )
     source.replace("membrane_ctrl/controller/safety.py", "TABLE: tuple[Rule, ...] = (\n", IN_SAFETY)
     return source
 
@@ -86,7 +89,7 @@ def test_a_hold_records_and_replays_it(source: ChangedSource, lab: Path) -> None
     logs = source.folder / "logs"
     source.run_program(
         "hold", "--twin", "--devices", lab, "--duration", "20s", "--logs", logs, "--name", "gauges"
-    )  # fmt: skip
+    )
     (run_dir,) = logs.glob("*-gauges")
     source.run_program("export", run_dir)
     ticks = pq.read_table(run_dir / "export" / "ticks.parquet").to_pydict()
@@ -96,7 +99,10 @@ def test_a_hold_records_and_replays_it(source: ChangedSource, lab: Path) -> None
     assert abs(math.fsum(apart_pa)) / len(apart_pa) < 1.0
     assert "identical" in source.run_program("replay", run_dir)
     source.run_program("report", run_dir, "--out", source.folder / "report")
-    assert f">{LABEL.removesuffix(' pressure')}<" in (source.folder / "report" / "report.html").read_text()
+    assert (
+        f">{LABEL.removesuffix(' pressure')}<"
+        in (source.folder / "report" / "report.html").read_text()
+    )
 
 
 def test_a_driver_for_it_is_written(source: ChangedSource) -> None:

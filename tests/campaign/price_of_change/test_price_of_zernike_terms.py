@@ -1,7 +1,8 @@
-"""Another number of Zernike terms costs one changed line: the product works with the fewest and with the most.
+"""Another number of Zernike terms costs one changed line: the product works with the fewest and
+with the most.
 
-The line is changed in copies of the source. All copies see the same frames of a film that the fewest terms represent,
-so that sag and low terms must agree within their own error bars.
+The line is changed in copies of the source. All copies see the same frames of a film that the
+fewest terms represent, so that sag and low terms must agree within their own error bars.
 """
 
 from __future__ import annotations
@@ -79,7 +80,12 @@ class Product:
         """Result of `measure`."""
         found: dict[str, Any] = json.loads(
             self.source.run_program(
-                "measure", self.sets / "full", "--out", self.folder / "measured", "--json", "--rerun"
+                "measure",
+                self.sets / "full",
+                "--out",
+                self.folder / "measured",
+                "--json",
+                "--rerun",
             )
         )
         return found
@@ -96,7 +102,16 @@ class Product:
         config.write_text(HOLD.replace("MODE", mode))
         logs = self.folder / "logs"
         self.source.run_program(
-            "hold", "--twin", "--config", config, "--duration", "90s", "--logs", logs, "--name", mode
+            "hold",
+            "--twin",
+            "--config",
+            config,
+            "--duration",
+            "90s",
+            "--logs",
+            logs,
+            "--name",
+            mode,
         )
         (run,) = logs.glob(f"*-{mode}")
         return run
@@ -118,7 +133,9 @@ def usual(sets: Path, tmp_path_factory: pytest.TempPathFactory) -> Product:
 
 
 @pytest.fixture(scope="module", params=[FEWEST, MOST])
-def changed(request: pytest.FixtureRequest, sets: Path, tmp_path_factory: pytest.TempPathFactory) -> Product:
+def changed(
+    request: pytest.FixtureRequest, sets: Path, tmp_path_factory: pytest.TempPathFactory
+) -> Product:
     """The product with another number of terms: one line differs."""
     terms: int = request.param
     source = ChangedSource.copy_to(tmp_path_factory.mktemp(f"terms{terms}"))
@@ -136,7 +153,9 @@ def require_alike(found: dict[str, Any], usual: dict[str, Any], moved_um: float)
     assert (found["verdict"], found["reason"]) == ("ok", "")
     sag_bar_um = np.hypot(found["sag_sigma_um"], usual["sag_sigma_um"])
     assert found["sag_um"] == pytest.approx(usual["sag_um"], abs=ALIKE_SIGMAS * sag_bar_um)
-    assert found["sag_um"] == pytest.approx(1e3 * FILM.sag_mm + moved_um, abs=TRUE_SIGMAS * found["sag_sigma_um"])
+    assert found["sag_um"] == pytest.approx(
+        1e3 * FILM.sag_mm + moved_um, abs=TRUE_SIGMAS * found["sag_sigma_um"]
+    )
     bars_um = np.hypot(low_terms(found, "sigma_um"), low_terms(usual, "sigma_um"))
     assert (np.abs(low_terms(found) - low_terms(usual)) < ALIKE_SIGMAS * bars_um).all()
     off_um = np.array(found["coeffs_um"][:FEWEST]) - np.array(FILM.zernike_um)
@@ -161,7 +180,11 @@ def test_tracked_frames(changed: Product, usual: Product) -> None:
 def test_measure(changed: Product, usual: Product) -> None:
     found, other = changed.measured, usual.measured
     assert found["quality"]["verdict"] == "ok"
-    assert len(found["zernike"]["coeffs_um"]) == len(found["uncertainty"]["coeffs_um"]) == changed.terms
+    assert (
+        len(found["zernike"]["coeffs_um"])
+        == len(found["uncertainty"]["coeffs_um"])
+        == changed.terms
+    )
     noll, osa, fringe = found["figure"]["zernike"]
     assert len(noll["coeffs_um"]) == len(osa["coeffs_um"]) == changed.terms
     usual_noll, _, usual_fringe = other["figure"]["zernike"]

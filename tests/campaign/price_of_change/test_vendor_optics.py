@@ -1,4 +1,5 @@
-"""A camera and a screen of another vendor cost no place in ours: a package is installed, a configuration names it.
+"""A camera and a screen of another vendor cost no place in ours: a package is installed, a
+configuration names it.
 
 The package is built and installed as a stranger would; the commands run in processes of their own.
 """
@@ -100,7 +101,16 @@ def site(tmp_path_factory: pytest.TempPathFactory) -> Path:
     project = tmp_path_factory.mktemp("studio") / "project"
     shutil.copytree(SOURCE, project, ignore=shutil.ignore_patterns("__pycache__"))
     target = tmp_path_factory.mktemp("site")
-    words = ["install", "--quiet", "--no-deps", "--no-index", "--no-build-isolation", "--target", target, project]
+    words = [
+        "install",
+        "--quiet",
+        "--no-deps",
+        "--no-index",
+        "--no-build-isolation",
+        "--target",
+        target,
+        project,
+    ]
     subprocess.run([sys.executable, "-m", "pip", *map(str, words)], check=True, capture_output=True)
     return target
 
@@ -122,10 +132,16 @@ def output(site: Path, *words: object, code: int = 0) -> str:
 def test_no_place_of_ours_knows_them() -> None:
     names = ("studio_cam", "studio_wall", "studio_optics")
     texts = [
-        path for top in ("membrane_ctrl", "firmware_iface", "tuning", "docs") for path in (ROOT / top).rglob("*")
+        path
+        for top in ("membrane_ctrl", "firmware_iface", "tuning", "docs")
+        for path in (ROOT / top).rglob("*")
     ]
     suffixes = {".py", ".toml", ".md", ".txt"}
-    found = [path for path in texts if path.suffix in suffixes and any(name in path.read_text() for name in names)]
+    found = [
+        path
+        for path in texts
+        if path.suffix in suffixes and any(name in path.read_text() for name in names)
+    ]
     assert found == []
 
 
@@ -134,7 +150,9 @@ def test_they_are_listed_and_explained(site: Path) -> None:
     kinds = {device["name"].partition(",")[0]: device["kind"] for device in listed}
     assert kinds["studio_cam"] == "camera driver"
     assert kinds["studio_wall"] == "screen driver"
-    assert '[devices.screen] driver = "external"' in output(site, "config", "explain", "studio_wall")
+    assert '[devices.screen] driver = "external"' in output(
+        site, "config", "explain", "studio_wall"
+    )
 
 
 def test_check_measures_the_screen_with_the_camera(site: Path, tmp_path: Path) -> None:
@@ -191,7 +209,9 @@ class Hold:
 
 def said(events: list[dict[str, Any]], words: str) -> bool:
     """Whether the acquisition has reported this."""
-    return any(words in str(event.get("message", "")) for event in events if event["kind"] == "acquisition")
+    return any(
+        words in str(event.get("message", "")) for event in events if event["kind"] == "acquisition"
+    )
 
 
 def measured(events: list[dict[str, Any]]) -> int:
@@ -205,7 +225,9 @@ def test_the_simulated_mirror_is_measured_through_them(site: Path, tmp_path: Pat
         hold.until(lambda events: said(events, "camera: Studio camera S1"))
         hold.until(lambda events: measured(events) > 0)
         hold.until(lambda events: any(event.get("state") == "hold" for event in events))
-        (identity,) = (event["message"] for event in hold.events() if said([event], "Studio camera"))
+        (identity,) = (
+            event["message"] for event in hold.events() if said([event], "Studio camera")
+        )
         assert str(os.getpid()) not in identity
         summary = hold.end()
     finally:

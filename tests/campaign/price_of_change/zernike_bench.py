@@ -1,7 +1,8 @@
-"""Program for a changed source: live cycles and tracked frames of one film; prints their figures as JSON.
+"""Program for a changed source: live cycles and tracked frames of one film; prints their figures as
+JSON.
 
-The film has terms up to Noll 21, so that every supported number of terms represents it, and every number of terms
-sees the same frames.
+The film has terms up to Noll 21, so that every supported number of terms represents it, and every
+number of terms sees the same frames.
 """
 
 from __future__ import annotations
@@ -21,8 +22,13 @@ from membrane_ctrl.sim.optics.camera import OpticsRenderer
 from membrane_ctrl.sim.optics.film_shape import FilmShape
 
 SHRINK = 8
-OPTICS = OpticsConfig(camera=CameraConfig(width_px=2448 // SHRINK, height_px=2048 // SHRINK, pixel_um=3.45 * SHRINK))
-FILM = FilmShape(37.1, zernike_um=(0, 0, 0, 0, 200, -150, 80, -40, 30, 20, 5, -3, -4, 3, 6, 2, -1, 1.5, -2, 1, 0.5))
+OPTICS = OpticsConfig(
+    camera=CameraConfig(width_px=2448 // SHRINK, height_px=2048 // SHRINK, pixel_um=3.45 * SHRINK)
+)
+FILM = FilmShape(
+    37.1,
+    zernike_um=(0, 0, 0, 0, 200, -150, 80, -40, 30, 20, 5, -3, -4, 3, 6, 2, -1, 1.5, -2, 1, 0.5),
+)
 MOVED_UM = (0.0, 30.0, -12.0)
 FRAMES, RATE_HZ, PERIODS, STEP_S = 12, 4.0, 32, 1.0
 

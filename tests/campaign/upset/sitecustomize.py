@@ -1,4 +1,6 @@
-"""On the path of a hold under test: SIGUSR1 makes whatever its main thread does hang for some seconds."""
+"""On the path of a hold under test: SIGUSR1 makes whatever its main thread does hang for some
+seconds.
+"""
 
 import os
 import signal

@@ -17,7 +17,9 @@ def small_optics() -> OpticsConfig:
 @pytest.fixture
 def clean_optics() -> OpticsConfig:
     """The same with 16 bit and no noise."""
-    return OpticsConfig(camera=CameraConfig(width_px=306, height_px=256, pixel_um=27.6, bits=16, noise_adu=0.0))
+    return OpticsConfig(
+        camera=CameraConfig(width_px=306, height_px=256, pixel_um=27.6, bits=16, noise_adu=0.0)
+    )
 
 
 @pytest.fixture

@@ -1,4 +1,6 @@
-"""The twin's camera sees the pixels of an emulated display as it sees the pattern that they show."""
+"""The twin's camera sees the pixels of an emulated display as it sees
+the pattern that they show.
+"""
 
 from __future__ import annotations
 
@@ -15,10 +17,17 @@ from membrane_ctrl.sim.optics.camera import OpticsRenderer, TwinOptics
 from membrane_ctrl.sim.optics.film_shape import typical_film
 from membrane_ctrl.sim.optics.shade import PanelPicture
 
-OPTICS = OpticsConfig(camera=CameraConfig(width_px=204, height_px=171, pixel_um=41.4, noise_adu=0.0))
+OPTICS = OpticsConfig(
+    camera=CameraConfig(width_px=204, height_px=171, pixel_um=41.4, noise_adu=0.0)
+)
 PATTERN = OPTICS.pattern
 RASTER = ScreenRaster(1300, 1100, 0.4, PATTERN.periods, PATTERN.period_mm, centre_px=(640.2, 555.5))
-EDGE = {"gray": 0.03, "sin": 0.01, "white": 0.01, "black": 0.0}  # share of pixels beside an edge of the picture
+EDGE = {
+    "gray": 0.03,
+    "sin": 0.01,
+    "white": 0.01,
+    "black": 0.0,
+}  # share of pixels beside an edge of the picture
 
 
 @pytest.fixture(scope="module")
@@ -30,14 +39,19 @@ def picture(pattern: Pattern) -> PanelPicture:
     return PanelPicture(linear_response().levels_of(pattern_light(pattern, RASTER)), RASTER)
 
 
-def seen(renderer: OpticsRenderer, shown: Pattern | PanelPicture, displacement_um: float) -> FloatArray:
+def seen(
+    renderer: OpticsRenderer, shown: Pattern | PanelPicture, displacement_um: float
+) -> FloatArray:
     return renderer.render(shown, displacement_um).astype(np.float64)
 
 
 @pytest.mark.parametrize("displacement_um", [0.0, 1234.0])
 def test_each_pattern_looks_as_its_pixels(renderer: OpticsRenderer, displacement_um: float) -> None:
     for pattern in full_sequence(PATTERN):
-        apart = np.abs(seen(renderer, pattern, displacement_um) - seen(renderer, picture(pattern), displacement_um))
+        apart = np.abs(
+            seen(renderer, pattern, displacement_um)
+            - seen(renderer, picture(pattern), displacement_um)
+        )
         assert np.mean(apart > 2.0) <= EDGE[pattern.role], pattern.name
 
 
@@ -59,7 +73,9 @@ def test_the_lens_does_not_resolve_a_checkerboard(renderer: OpticsRenderer) -> N
 
 def test_a_disturbed_bench_disturbs_the_pixels_as_well() -> None:
     disturbed = OpticsRenderer(
-        OPTICS, typical_film(37.1, 500.0, seed=1), disturbances=DisturbancesConfig(ambient_fraction=0.1)
+        OPTICS,
+        typical_film(37.1, 500.0, seed=1),
+        disturbances=DisturbancesConfig(ambient_fraction=0.1),
     )
     white = Pattern("white")
     apart = np.abs(seen(disturbed, white, 0.0) - seen(disturbed, picture(white), 0.0))

@@ -37,7 +37,9 @@ def _optics(optics: OpticsConfig, bench: Bench, film: FilmShape | None = None) -
     return TwinOptics(optics, TwinConfig(seed=3), bench.truth, bench, film)
 
 
-def test_a_frame_shows_the_pattern_on_the_film_where_it_stands(clean_optics: OpticsConfig, film: FilmShape) -> None:
+def test_a_frame_shows_the_pattern_on_the_film_where_it_stands(
+    clean_optics: OpticsConfig, film: FilmShape
+) -> None:
     bench = Bench()
     twin = _optics(clean_optics, bench, film)
     screen: Screen = twin.screen
@@ -55,7 +57,9 @@ def test_a_frame_shows_the_pattern_on_the_film_where_it_stands(clean_optics: Opt
     assert (first.pixels != second.pixels).mean() > 0.3
 
 
-def test_the_film_gets_its_sag_from_the_truth_and_its_figure_from_the_seed(small_optics: OpticsConfig) -> None:
+def test_the_film_gets_its_sag_from_the_truth_and_its_figure_from_the_seed(
+    small_optics: OpticsConfig,
+) -> None:
     film = _optics(small_optics, Bench()).film
     assert film.sag_at_mm(-25.0) == pytest.approx(37.075)
     assert np.hypot(film.zernike_um[4], film.zernike_um[5]) == pytest.approx(300.0)

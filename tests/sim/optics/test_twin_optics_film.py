@@ -1,4 +1,6 @@
-"""Shape of the film: Hencky's bowl, slopes, vertex, rim, and the coefficients of the fitted terms."""
+"""Shape of the film: Hencky's bowl, slopes, vertex, rim,
+and the coefficients of the fitted terms.
+"""
 
 from __future__ import annotations
 
@@ -43,7 +45,8 @@ def _slope_over_rho(u: float) -> float:
 
 
 def test_the_series_solves_henckys_equation() -> None:
-    # n = c / g with g = (dW/drho)/rho; c follows from the equation itself at the centre, then must hold everywhere
+    # n = c / g with g = (dW/drho)/rho; c follows from the equation itself at the centre, then must
+    # hold everywhere
     def n_over_c(rho: float) -> float:
         return 1.0 / _slope_over_rho(rho * rho)
 
@@ -66,13 +69,21 @@ def test_the_series_keeps_the_rims_condition() -> None:
 
 def test_the_bowl_holds_the_volume_that_the_gas_sees() -> None:
     # volume between the film and the plane of the rim, over pi a^2 w0
-    volume = quad(lambda rho: 2.0 * rho * (1.0 - polyval(rho * rho, bowl_series("hencky", 37.0, 500.0))), 0.0, 1.0)[0]
+    volume = quad(
+        lambda rho: 2.0 * rho * (1.0 - polyval(rho * rho, bowl_series("hencky", 37.0, 500.0))),
+        0.0,
+        1.0,
+    )[0]
     assert volume == pytest.approx(hencky.solve().volume, rel=1e-9)
 
 
-@pytest.mark.parametrize(("prestrain", "poisson"), [(0.0, 0.3), (8e-4, 0.38), (-3e-4, 0.2), (2e-2, 0.3)])
+@pytest.mark.parametrize(
+    ("prestrain", "poisson"), [(0.0, 0.3), (8e-4, 0.38), (-3e-4, 0.2), (2e-2, 0.3)]
+)
 def test_a_stretched_film_is_the_laws(prestrain: float, poisson: float) -> None:
-    """The least energy against the balance of forces of the metrology: neither knows of the other."""
+    """The least energy against the balance of forces of the metrology:
+    neither knows of the other.
+    """
     load, profile = hencky.stretched(0.074, prestrain, poisson)
     law = FilmLaw(prestrain, poisson, 1.0, 1.0)
     rho = np.linspace(0.02, 1, 21)
@@ -89,7 +100,9 @@ def test_a_stretched_film_keeps_its_ring_and_changes_its_profile() -> None:
     film = FilmShape(37.1, prestrain=1e-3, poisson=0.36)
     rim, half = (film.height_mm(np.array([r]), np.zeros(1), -4000.0)[0] for r in (500.0, 250.0))
     assert rim == pytest.approx(33.1, abs=1e-9)
-    assert half / rim != pytest.approx(film.height_mm(np.array([250.0]), np.zeros(1))[0] / 37.1, abs=1e-4)
+    assert half / rim != pytest.approx(
+        film.height_mm(np.array([250.0]), np.zeros(1))[0] / 37.1, abs=1e-4
+    )
     with pytest.raises(ValueError, match=r"poisson = 0.6 is outside 0 .. 0.5"):
         FilmShape(37.1, poisson=0.6)
     with pytest.raises(ValueError, match="slack at its ring"):
@@ -99,26 +112,34 @@ def test_a_stretched_film_keeps_its_ring_and_changes_its_profile() -> None:
 STRETCHED = FilmShape(37.1, prestrain=1e-3, poisson=0.36)
 
 
-@pytest.mark.parametrize("film", [RICH, FilmShape(37.1, bowl="paraboloid"), FilmShape(37.1), STRETCHED])
+@pytest.mark.parametrize(
+    "film", [RICH, FilmShape(37.1, bowl="paraboloid"), FilmShape(37.1), STRETCHED]
+)
 def test_slopes_are_the_derivatives_of_the_height(film: FilmShape) -> None:
     step = 1e-3
     for x, y in ((0.0, 0.0), (120.0, -60.0), (-300.0, 350.0), (0.0, 499.0)):
         _, hx, hy = height_and_slopes(film.terms_at(-100.0), 37.0, x, y)
-        grid = film.height_mm(np.array([x + step, x - step, x, x]), np.array([y, y, y + step, y - step]), -100.0)
+        grid = film.height_mm(
+            np.array([x + step, x - step, x, x]), np.array([y, y, y + step, y - step]), -100.0
+        )
         assert hx == pytest.approx((grid[0] - grid[1]) / (2 * step), abs=1e-9)
         assert hy == pytest.approx((grid[2] - grid[3]) / (2 * step), abs=1e-9)
 
 
 def test_the_vertex_is_zero_at_any_displacement() -> None:
     for displacement_um in (-500.0, 0.0, 300.0):
-        assert RICH.height_mm(np.zeros(1), np.zeros(1), displacement_um)[0] == pytest.approx(0.0, abs=1e-12)
+        assert RICH.height_mm(np.zeros(1), np.zeros(1), displacement_um)[0] == pytest.approx(
+            0.0, abs=1e-12
+        )
 
 
 def test_the_rim_stays_where_it_is() -> None:
     angle = np.linspace(0.0, 2.0 * np.pi, 13)
     x, y = 500.0 * np.cos(angle), 500.0 * np.sin(angle)
     # the vertex falls by the displacement, so heights above it grow by as much
-    np.testing.assert_allclose(RICH.height_mm(x, y, 250.0) - RICH.height_mm(x, y), 0.250, atol=1e-11)
+    np.testing.assert_allclose(
+        RICH.height_mm(x, y, 250.0) - RICH.height_mm(x, y), 0.250, atol=1e-11
+    )
 
 
 def test_coefficients_of_a_shape_of_the_fitted_terms_give_its_heights() -> None:
@@ -128,16 +149,23 @@ def test_coefficients_of_a_shape_of_the_fitted_terms_give_its_heights() -> None:
     flat = FilmShape(0.0, bowl="paraboloid", zernike_um=tuple(coeffs_um))
     x, y = np.random.default_rng(5).uniform(-350.0, 350.0, (2, 40))
     np.testing.assert_allclose(flat.height_mm(x, y), film.height_mm(x, y, 400.0), atol=1e-11)
-    # piston included: the sum of the terms is 0 at the vertex, where only the rotationally symmetric ones are not
+    # piston included: the sum of the terms is 0 at the vertex, where only the rotationally
+    # symmetric ones are not
     at_vertex = {n: (-1) ** (n // 2) * np.sqrt(n + 1.0) for n in range(0, ZERNIKE_DEGREE + 1, 2)}
-    total = sum(c * at_vertex[noll_orders(j)[0]] for j, c in enumerate(coeffs_um, 1) if noll_orders(j)[1] == 0)
+    total = sum(
+        c * at_vertex[noll_orders(j)[0]]
+        for j, c in enumerate(coeffs_um, 1)
+        if noll_orders(j)[1] == 0
+    )
     assert total == pytest.approx(0.0, abs=1e-9)
 
 
 def test_what_the_fitted_terms_cannot_represent_has_no_coefficients() -> None:
     assert FilmShape(37.1).coeffs_um() is None
     finer_um = (*[0.0] * ZERNIKE_TERMS, 1.0)[:MAX_FILM_TERMS]
-    assert (FilmShape(37.1, bowl="paraboloid", zernike_um=finer_um).coeffs_um() is None) == any(finer_um)
+    assert (FilmShape(37.1, bowl="paraboloid", zernike_um=finer_um).coeffs_um() is None) == any(
+        finer_um
+    )
     assert FilmShape(37.1, bowl="paraboloid", ripples=(Ripple(1.0, 50.0),)).coeffs_um() is None
 
 
@@ -148,13 +176,18 @@ def test_what_the_fitted_terms_cannot_represent_has_no_coefficients() -> None:
         (lambda: FilmShape(37.1, zernike_um=(float("nan"),)), "zernike_um: every value"),
         (lambda: FilmShape(float("inf")), "sag_mm = inf"),
         (lambda: FilmShape(37.1, radius_mm=0.0), "radius_mm = 0"),
-        (lambda: FilmShape(37.1, bowl="cone"), "bowl = 'cone' must be one of hencky, paraboloid, sphere"),  # type: ignore[arg-type]
+        (
+            lambda: FilmShape(37.1, bowl="cone"),
+            "bowl = 'cone' must be one of hencky, paraboloid, sphere",
+        ),  # type: ignore[arg-type]
         (lambda: Ripple(1.0, 0.0), "wavelength_mm = 0"),
         (lambda: Wrinkle(1.0, 0), "lobes = 0"),
         (lambda: Bump(1.0, 0.0, 0.0, -1.0), "sigma_mm = -1"),
     ],
 )
-def test_films_that_cannot_be_are_refused_by_their_field(make: Callable[[], object], message: str) -> None:
+def test_films_that_cannot_be_are_refused_by_their_field(
+    make: Callable[[], object], message: str
+) -> None:
     with pytest.raises(ValueError, match=message):
         make()
 
@@ -186,4 +219,7 @@ def test_a_drum_mode_moves_the_film_inside_its_ring(mode: DrumMode) -> None:
     assert moved_um == pytest.approx(wanted / np.sqrt(np.mean(wanted**2)), abs=0.02)
     angle = np.linspace(0, 2 * np.pi, 36)
     ring = 500.0 * np.cos(angle), 500.0 * np.sin(angle)
-    assert np.abs(heights(mode.moved(film), 37.1, *ring) - heights(film.terms, 37.1, *ring)).max() < 1e-7
+    assert (
+        np.abs(heights(mode.moved(film), 37.1, *ring) - heights(film.terms, 37.1, *ring)).max()
+        < 1e-7
+    )

@@ -19,7 +19,17 @@ def _values(j: int, x: np.ndarray, y: np.ndarray) -> np.ndarray:
 
 
 def test_the_low_terms_have_nolls_names() -> None:
-    known = {1: (0, 0), 2: (1, 1), 3: (1, -1), 4: (2, 0), 5: (2, -2), 6: (2, 2), 7: (3, -1), 8: (3, 1), 11: (4, 0)}
+    known = {
+        1: (0, 0),
+        2: (1, 1),
+        3: (1, -1),
+        4: (2, 0),
+        5: (2, -2),
+        6: (2, 2),
+        7: (3, -1),
+        8: (3, 1),
+        11: (4, 0),
+    }
     assert {j: noll_orders(j) for j in known} == known
 
 

@@ -1,4 +1,6 @@
-"""Rendered pictures: intensities as the interfaces say, interpolation against the exact trace, noise and depth."""
+"""Rendered pictures: intensities as the interfaces say, interpolation against the exact trace,
+noise and depth.
+"""
 
 from __future__ import annotations
 
@@ -25,7 +27,9 @@ def _region(hits: Trace) -> np.ndarray:
 def _phases(renderer: OpticsRenderer, axis: str, displacement_um: float) -> np.ndarray:
     """Wrapped phase seen in four rendered pictures (the paper's eq. 1)."""
     patterns = [Pattern("sin", axis, k, k * np.pi / 2) for k in range(4)]
-    i1, i2, i3, i4 = (renderer.render(p, displacement_um).astype(np.float64).ravel() for p in patterns)
+    i1, i2, i3, i4 = (
+        renderer.render(p, displacement_um).astype(np.float64).ravel() for p in patterns
+    )
     return np.arctan2(i4 - i2, i1 - i3)
 
 
@@ -47,12 +51,16 @@ def test_sinusoids_are_as_bright_as_the_interfaces_say(
 
 
 @pytest.mark.parametrize("axis", ["x", "y"])
-def test_gray_bits_read_together_are_the_half_period(clean_optics: OpticsConfig, film: FilmShape, axis: str) -> None:
+def test_gray_bits_read_together_are_the_half_period(
+    clean_optics: OpticsConfig, film: FilmShape, axis: str
+) -> None:
     renderer = OpticsRenderer(clean_optics, film, LINEAR, exact=True)
     hits = renderer.trace_pixels(0.0)
     on = _region(hits)
     s_mm = (hits.s_x_mm if axis == "x" else hits.s_y_mm)[on] + SIDE_MM / 2
-    bits = [renderer.render(Pattern("gray", axis, bit), 0.0).ravel()[on] > 32768 for bit in (1, 2, 3, 4)]
+    bits = [
+        renderer.render(Pattern("gray", axis, bit), 0.0).ravel()[on] > 32768 for bit in (1, 2, 3, 4)
+    ]
     value = np.zeros(on.sum(), dtype=int)
     binary = np.zeros(on.sum(), dtype=bool)
     for bit in bits:  # Gray to binary: each bit flips by the one above
@@ -67,7 +75,9 @@ def test_white_black_and_what_is_not_the_film(clean_optics: OpticsConfig, film: 
     renderer = OpticsRenderer(clean_optics, film, light)
     on = renderer.trace_pixels(0.0).on_film(499.0)
     beside = ~renderer.trace_pixels(0.0).on_film(501.0)
-    white, black = (renderer.render(Pattern(role), 0.0).ravel() / 65535 for role in ("white", "black"))
+    white, black = (
+        renderer.render(Pattern(role), 0.0).ravel() / 65535 for role in ("white", "black")
+    )
     np.testing.assert_allclose(white[on], 0.9, atol=1e-5)
     np.testing.assert_allclose(black[on], 0.1 + 0.05 * 0.8, atol=1e-5)
     np.testing.assert_allclose(white[beside], 0.1, atol=1e-5)
@@ -84,10 +94,15 @@ def test_beyond_the_pattern_region_the_screen_is_dark(clean_optics: OpticsConfig
 
 
 @pytest.mark.parametrize(
-    "displacement_um", [-149.0, 1234.5, *(pytest.param(more, marks=pytest.mark.campaign) for more in (0.0, 37.0))]
+    "displacement_um",
+    [-149.0, 1234.5, *(pytest.param(more, marks=pytest.mark.campaign) for more in (0.0, 37.0))],
 )
-def test_interpolated_phases_stay_within_a_tenth_of_a_milliradian(film: FilmShape, displacement_um: float) -> None:
-    optics = OpticsConfig(camera=CameraConfig(width_px=1224, height_px=1024, pixel_um=6.9, bits=16, noise_adu=0.0))
+def test_interpolated_phases_stay_within_a_tenth_of_a_milliradian(
+    film: FilmShape, displacement_um: float
+) -> None:
+    optics = OpticsConfig(
+        camera=CameraConfig(width_px=1224, height_px=1024, pixel_um=6.9, bits=16, noise_adu=0.0)
+    )
     renderer = OpticsRenderer(optics, film, LINEAR)
     hits = renderer.trace_pixels(displacement_um)
     on = hits.on_film(499.0) & (np.abs(hits.s_x_mm) < 199.0) & (np.abs(hits.s_y_mm) < 199.0)
@@ -102,7 +117,9 @@ def replace_noise(optics: OpticsConfig) -> OpticsConfig:
 
 
 def test_a_fine_ripple_survives_the_interpolation() -> None:
-    optics = OpticsConfig(camera=CameraConfig(width_px=1224, height_px=1024, pixel_um=6.9, bits=16, noise_adu=0.0))
+    optics = OpticsConfig(
+        camera=CameraConfig(width_px=1224, height_px=1024, pixel_um=6.9, bits=16, noise_adu=0.0)
+    )
     film = FilmShape(37.1, ripples=(Ripple(1.0, 50.0, 20.0),))
     renderer = OpticsRenderer(optics, film, LINEAR)
     hits = renderer.trace_pixels(0.0)
@@ -117,22 +134,32 @@ def test_crossed_fringes_are_what_traced_rays_see(film: FilmShape, gamma: float,
     width, height = 245, 205
     camera = CameraConfig(width_px=width, height_px=height, pixel_um=34.5, bits=bits, noise_adu=0.0)
     renderer = OpticsRenderer(OpticsConfig(camera=camera), film, Light(gamma=gamma))
-    picture = renderer.render(Pattern("crossed", "", 32, 0.7, shift_y_rad=1.9), 3.0, gain=0.9).astype(float)
+    picture = renderer.render(
+        Pattern("crossed", "", 32, 0.7, shift_y_rad=1.9), 3.0, gain=0.9
+    ).astype(float)
     hits = renderer.trace_pixels(3.0)
     rate = 2 * np.pi * 32 / SIDE_MM
-    waves = np.cos(rate * hits.s_x_mm + 0.7 + 31 * np.pi) + np.cos(rate * hits.s_y_mm + 1.9 + 31 * np.pi)
+    waves = np.cos(rate * hits.s_x_mm + 0.7 + 31 * np.pi) + np.cos(
+        rate * hits.s_y_mm + 1.9 + 31 * np.pi
+    )
     shown = np.maximum(np.abs(hits.s_x_mm), np.abs(hits.s_y_mm)) < SIDE_MM / 2
     light = 0.02 + 0.98 * np.where(shown, np.maximum(0.5 + waves / 4, 0) ** gamma, 0.0)
     row, column = np.mgrid[:height, :width]
     away = ((row - (height - 1) / 2) ** 2 + (column - (width - 1) / 2) ** 2).ravel()
     full = 2**bits - 1
-    counts = 0.02 * full + 0.9 * 0.78 * full * light * (1 - 0.15 * away / away.max()) * hits.on_film(500.0)
+    counts = 0.02 * full + 0.9 * 0.78 * full * light * (
+        1 - 0.15 * away / away.max()
+    ) * hits.on_film(500.0)
     sure = np.abs(np.hypot(hits.x_mm, hits.y_mm) - 500.0) > 1.0
     assert np.abs(picture.ravel() - counts)[sure].max() < 0.51 + 2e-5 * full
 
 
-def test_noise_of_crossed_fringes_is_as_configured_and_new_in_each_row_and_picture(film: FilmShape) -> None:
-    optics = OpticsConfig(camera=CameraConfig(width_px=300, height_px=250, pixel_um=28.0, bits=16, noise_adu=40.0))
+def test_noise_of_crossed_fringes_is_as_configured_and_new_in_each_row_and_picture(
+    film: FilmShape,
+) -> None:
+    optics = OpticsConfig(
+        camera=CameraConfig(width_px=300, height_px=250, pixel_um=28.0, bits=16, noise_adu=40.0)
+    )
     renderer = OpticsRenderer(optics, film)
     pattern = Pattern("crossed", "", 32)
     clean = OpticsRenderer(replace_noise(optics), film).render(pattern, 0.0).astype(float)
@@ -153,9 +180,14 @@ def test_a_film_that_moves_moves_the_fringes_by_half_a_period_a_millimetre(
 
 
 def test_noise_has_the_configured_deviation_and_is_new_in_each_picture(film: FilmShape) -> None:
-    optics = OpticsConfig(camera=CameraConfig(width_px=306, height_px=256, pixel_um=27.6, bits=12, noise_adu=20.0))
-    clean = optics.model_copy(update={"camera": optics.camera.model_copy(update={"noise_adu": 0.0})})
-    # far from both ends, so that nothing clips, and on whole counts, so that the still picture is not rounded
+    optics = OpticsConfig(
+        camera=CameraConfig(width_px=306, height_px=256, pixel_um=27.6, bits=12, noise_adu=20.0)
+    )
+    clean = optics.model_copy(
+        update={"camera": optics.camera.model_copy(update={"noise_adu": 0.0})}
+    )
+    # far from both ends, so that nothing clips, and on whole counts, so that the still picture is
+    # not rounded
     light = Light(dark_fraction=0.4, white_fraction=0.8, vignetting=0.0)
     renderer = OpticsRenderer(optics, film, light, seed=4)
     still = OpticsRenderer(clean, film, light).render(Pattern("white"), 0.0).astype(float)
@@ -166,18 +198,23 @@ def test_noise_has_the_configured_deviation_and_is_new_in_each_picture(film: Fil
         assert abs(np.corrcoef(noise[:, 1:].ravel(), noise[:, :-1].ravel())[0, 1]) < 0.02
         assert abs(np.corrcoef(noise[1:].ravel(), noise[:-1].ravel())[0, 1]) < 0.02
     assert abs(np.corrcoef(one.ravel(), two.ravel())[0, 1]) < 0.02
-    assert ((one / 20.0) ** 4).mean() == pytest.approx(3.0, abs=0.15)  # a normal distribution's kurtosis
+    assert ((one / 20.0) ** 4).mean() == pytest.approx(
+        3.0, abs=0.15
+    )  # a normal distribution's kurtosis
 
 
 def test_the_same_seed_gives_the_same_pictures(small_optics: OpticsConfig, film: FilmShape) -> None:
     one, again, other = (
-        OpticsRenderer(small_optics, film, seed=seed).render(Pattern("white"), 3.0) for seed in (7, 7, 8)
+        OpticsRenderer(small_optics, film, seed=seed).render(Pattern("white"), 3.0)
+        for seed in (7, 7, 8)
     )
     np.testing.assert_array_equal(one, again)
     assert (one != other).any()
 
 
-def test_too_long_an_exposure_saturates_at_full_scale(small_optics: OpticsConfig, film: FilmShape) -> None:
+def test_too_long_an_exposure_saturates_at_full_scale(
+    small_optics: OpticsConfig, film: FilmShape
+) -> None:
     renderer = OpticsRenderer(small_optics, film)
     assert renderer.render(Pattern("white"), 0.0).max() < 255
     long = renderer.render(Pattern("white"), 0.0, gain=2.0)
@@ -192,7 +229,9 @@ def test_gamma_bends_the_levels(clean_optics: OpticsConfig, film: FilmShape) -> 
     np.testing.assert_allclose(bent, linear**2.2, atol=3e-5)
 
 
-def test_vignetting_takes_light_from_the_corners(clean_optics: OpticsConfig, film: FilmShape) -> None:
+def test_vignetting_takes_light_from_the_corners(
+    clean_optics: OpticsConfig, film: FilmShape
+) -> None:
     light = Light(dark_fraction=0.0, white_fraction=1.0, leak=0.0, vignetting=0.3)
     white = OpticsRenderer(clean_optics, film, light).render(Pattern("white"), 0.0) / 65535
     distance2 = ((127 - 127.5) ** 2 + (60 - 152.5) ** 2) / (127.5**2 + 152.5**2)
@@ -215,8 +254,12 @@ def test_a_film_of_another_radius_is_refused(small_optics: OpticsConfig) -> None
         OpticsRenderer(small_optics, FilmShape(37.1, 400.0))
 
 
-@pytest.mark.parametrize("pattern", [Pattern("gray", "x", 5), Pattern("gray", "x", 0), Pattern("stripes", "x")])
-def test_unknown_patterns_are_refused(small_optics: OpticsConfig, film: FilmShape, pattern: Pattern) -> None:
+@pytest.mark.parametrize(
+    "pattern", [Pattern("gray", "x", 5), Pattern("gray", "x", 0), Pattern("stripes", "x")]
+)
+def test_unknown_patterns_are_refused(
+    small_optics: OpticsConfig, film: FilmShape, pattern: Pattern
+) -> None:
     with pytest.raises(ValueError, match="role must be"):
         OpticsRenderer(small_optics, film).render(pattern, 0.0)
 
@@ -231,7 +274,9 @@ def test_unknown_patterns_are_refused(small_optics: OpticsConfig, film: FilmShap
         ({"gamma": 0.0}, "gamma = 0.0"),
     ],
 )
-def test_light_that_cannot_be_is_refused_by_its_field(change: dict[str, float], message: str) -> None:
+def test_light_that_cannot_be_is_refused_by_its_field(
+    change: dict[str, float], message: str
+) -> None:
     with pytest.raises(ValueError, match=message):
         Light(**change)
 
@@ -241,7 +286,14 @@ def test_the_sets_have_their_patterns_in_order() -> None:
     assert full[:8] == [f"x_sin_{k}" for k in range(4)] + [f"x_gray_{bit}" for bit in range(1, 5)]
     assert full[8:] == [name.replace("x_", "y_") for name in full[:8]] + ["white", "black"]
     fringes = pattern_sequence("fringes", PatternConfig(steps=3))
-    assert [p.name for p in fringes] == ["x_sin_0", "x_sin_1", "x_sin_2", "y_sin_0", "y_sin_1", "y_sin_2"]
+    assert [p.name for p in fringes] == [
+        "x_sin_0",
+        "x_sin_1",
+        "x_sin_2",
+        "y_sin_0",
+        "y_sin_1",
+        "y_sin_2",
+    ]
     assert fringes[2].shift_rad == pytest.approx(4 * np.pi / 3)
     with pytest.raises(ValueError, match="kind = 'half'"):
         pattern_sequence("half", PatternConfig())

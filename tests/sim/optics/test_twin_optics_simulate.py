@@ -12,7 +12,13 @@ import cv2
 import numpy as np
 import pytest
 
-from membrane_ctrl.config.schema import CameraConfig, GeometryConfig, MirrorConfig, OpticsConfig, PatternConfig
+from membrane_ctrl.config.schema import (
+    CameraConfig,
+    GeometryConfig,
+    MirrorConfig,
+    OpticsConfig,
+    PatternConfig,
+)
 from membrane_ctrl.sim.optics.camera import OpticsRenderer
 from membrane_ctrl.sim.optics.film_shape import FilmShape
 from membrane_ctrl.sim.optics.simulate import simulate_run, simulate_set
@@ -32,7 +38,9 @@ def spec(clean_optics: OpticsConfig, film: FilmShape) -> SimulationSpec:
     return SimulationSpec(clean_optics, film)
 
 
-def test_a_full_set_is_18_frames_and_what_the_interfaces_ask(tmp_path: Path, spec: SimulationSpec) -> None:
+def test_a_full_set_is_18_frames_and_what_the_interfaces_ask(
+    tmp_path: Path, spec: SimulationSpec
+) -> None:
     simulate_set(tmp_path / "set", replace(spec, motion=Motion(12.0), start_s=3.0))
     table = _toml(tmp_path / "set")
     assert (table["schema"], table["kind"]) == ("membrane-capture/1", "full")
@@ -42,9 +50,19 @@ def test_a_full_set_is_18_frames_and_what_the_interfaces_ask(tmp_path: Path, spe
     assert GeometryConfig(**table["geometry"]).reference_displacement_um == 12.0
     assert len(table["frames"]) == 18
     assert table["frames"][5] == {
-        "file": "x_gray_2.png", "axis": "x", "role": "gray", "index": 2, "time_s": 3.5, "displacement_um": 12.0,
-    }  # fmt: skip
-    assert table["frames"][16] == {"file": "white.png", "role": "white", "time_s": 4.6, "displacement_um": 12.0}
+        "file": "x_gray_2.png",
+        "axis": "x",
+        "role": "gray",
+        "index": 2,
+        "time_s": 3.5,
+        "displacement_um": 12.0,
+    }
+    assert table["frames"][16] == {
+        "file": "white.png",
+        "role": "white",
+        "time_s": 4.6,
+        "displacement_um": 12.0,
+    }
     for frame in table["frames"]:
         picture = cv2.imread(str(tmp_path / "set" / frame["file"]), cv2.IMREAD_UNCHANGED)
         assert picture.shape == (256, 306)
@@ -66,7 +84,9 @@ def test_each_frame_is_taken_at_its_own_displacement(tmp_path: Path, spec: Simul
     with np.load(tmp_path / "truth.npz") as truth:
         displacement_um = truth["displacement_um"]
     time_s = 0.1 * np.arange(18)
-    np.testing.assert_allclose(displacement_um, 5 + time_s + 30 * np.sin(2 * np.pi * 0.3 * time_s + 0.2), rtol=1e-12)
+    np.testing.assert_allclose(
+        displacement_um, 5 + time_s + 30 * np.sin(2 * np.pi * 0.3 * time_s + 0.2), rtol=1e-12
+    )
     readings = np.array([frame["displacement_um"] for frame in _toml(tmp_path)["frames"]])
     assert 0.3 < (readings - displacement_um).std() < 2.0
     for frame in (0, 3, 9, 16):
@@ -93,7 +113,9 @@ def test_the_truth_is_the_surface_above_its_vertex(tmp_path: Path, spec: Simulat
     assert summary["film"]["zernike_um"] == list(spec.film.zernike_um)
 
 
-def test_a_shape_of_36_terms_comes_with_its_coefficients(tmp_path: Path, clean_optics: OpticsConfig) -> None:
+def test_a_shape_of_36_terms_comes_with_its_coefficients(
+    tmp_path: Path, clean_optics: OpticsConfig
+) -> None:
     film = FilmShape(37.0, bowl="paraboloid", zernike_um=(0, 0, 0, 0, 100.0))
     simulate_set(tmp_path, SimulationSpec(clean_optics, film))
     with np.load(tmp_path / "truth.npz") as truth:
@@ -110,7 +132,8 @@ def test_unequal_shifts_are_written_and_shown(tmp_path: Path, clean_optics: Opti
     frames = _toml(tmp_path)["frames"]
     assert [frame["shift_rad"] for frame in frames] == [*shifts, *shifts]
     assert _toml(tmp_path)["reference"] == "../0000"
-    # the chief ray ends at O', where the phase is 8 pi - pi, so I = A - B cos(shift): two frames give A and B
+    # the chief ray ends at O', where the phase is 8 pi - pi, so I = A - B cos(shift): two frames
+    # give A and B
     levels = [float(_picture(tmp_path, f"x_sin_{k}")[127:129, 152:154].mean()) for k in range(3)]
     b = (levels[1] - levels[0]) / (np.cos(0.1) - np.cos(1.9))
     assert levels[2] == pytest.approx(levels[0] + b * (np.cos(0.1) - np.cos(4.4)), rel=0.01)
@@ -128,20 +151,43 @@ def _with_fault(folder: Path, spec: SimulationSpec, *faults: str) -> dict[str, n
     """Pictures of the set with the faults, None where the file is missing."""
     simulate_set(folder, replace(spec, faults=tuple(FrameFault.parse(text) for text in faults)))
     names = [pattern.name for pattern in spec.patterns]
-    return {name: _picture(folder, name) if (folder / f"{name}.png").exists() else None for name in names}
+    return {
+        name: _picture(folder, name) if (folder / f"{name}.png").exists() else None
+        for name in names
+    }
 
 
 def test_faults_hit_the_named_frames_and_no_other(tmp_path: Path, spec: SimulationSpec) -> None:
     spec = replace(spec, motion=Motion(0.0, 5.0))
     good = _with_fault(tmp_path / "good", spec)
     bad = _with_fault(
-        tmp_path / "bad", spec, "stale:x_sin_2", "swapped:y_sin_1", "missing:black", "saturated:white",
-        "dark:x_gray_1", "flicker:x_sin_0:0.7", "moved:y_gray_3", "wrong_size:y_gray_1", "wrong_depth:y_gray_4",
-    )  # fmt: skip
-    touched = {name for name in good if bad[name] is None or not np.array_equal(bad[name], good[name])}
+        tmp_path / "bad",
+        spec,
+        "stale:x_sin_2",
+        "swapped:y_sin_1",
+        "missing:black",
+        "saturated:white",
+        "dark:x_gray_1",
+        "flicker:x_sin_0:0.7",
+        "moved:y_gray_3",
+        "wrong_size:y_gray_1",
+        "wrong_depth:y_gray_4",
+    )
+    touched = {
+        name for name in good if bad[name] is None or not np.array_equal(bad[name], good[name])
+    }
     assert touched == {
-        "x_sin_2", "y_sin_1", "y_sin_2", "black", "white", "x_gray_1", "x_sin_0", "y_gray_3", "y_gray_1", "y_gray_4",
-    }  # fmt: skip
+        "x_sin_2",
+        "y_sin_1",
+        "y_sin_2",
+        "black",
+        "white",
+        "x_gray_1",
+        "x_sin_0",
+        "y_gray_3",
+        "y_gray_1",
+        "y_gray_4",
+    }
     np.testing.assert_array_equal(bad["x_sin_2"], bad["x_sin_1"])
     np.testing.assert_array_equal(bad["y_sin_1"], good["y_sin_2"])
     np.testing.assert_array_equal(bad["y_sin_2"], good["y_sin_1"])
@@ -152,13 +198,17 @@ def test_faults_hit_the_named_frames_and_no_other(tmp_path: Path, spec: Simulati
     assert flicker is not None
     assert (white == 65535).mean() > 0.3
     assert dark.max() < 0.1 * 65535
-    assert flicker.max() == pytest.approx(0.02 * 65535 + 0.7 * (good["x_sin_0"].max() - 0.02 * 65535), rel=1e-3)
+    assert flicker.max() == pytest.approx(
+        0.02 * 65535 + 0.7 * (good["x_sin_0"].max() - 0.02 * 65535), rel=1e-3
+    )
     assert bad["y_gray_1"].shape == (255, 306)
     assert bad["y_gray_4"].dtype == np.uint8
     assert len(_toml(tmp_path / "bad")["frames"]) == 18
 
 
-def test_a_run_is_one_full_set_and_fringes_that_lean_on_it(tmp_path: Path, spec: SimulationSpec) -> None:
+def test_a_run_is_one_full_set_and_fringes_that_lean_on_it(
+    tmp_path: Path, spec: SimulationSpec
+) -> None:
     told: list[int] = []
     simulate_run(tmp_path, replace(spec, motion=Motion(10.0, 2.0)), 3, 4.0, told.append)
     assert told == [1, 2, 3]
@@ -172,10 +222,16 @@ def test_a_run_is_one_full_set_and_fringes_that_lean_on_it(tmp_path: Path, spec:
     assert len(tables[1]["frames"]) == 8
 
 
-def test_the_same_seed_writes_the_same_set(tmp_path: Path, small_optics: OpticsConfig, film: FilmShape) -> None:
+def test_the_same_seed_writes_the_same_set(
+    tmp_path: Path, small_optics: OpticsConfig, film: FilmShape
+) -> None:
     for name, seed in (("one", 5), ("again", 5), ("other", 6)):
-        simulate_set(tmp_path / name, SimulationSpec(small_optics, film, seed=seed, laser_noise_um=1.0))
-    one, again, other = ((tmp_path / n / "x_sin_0.png").read_bytes() for n in ("one", "again", "other"))
+        simulate_set(
+            tmp_path / name, SimulationSpec(small_optics, film, seed=seed, laser_noise_um=1.0)
+        )
+    one, again, other = (
+        (tmp_path / n / "x_sin_0.png").read_bytes() for n in ("one", "again", "other")
+    )
     assert one == again
     assert one != other
     assert _toml(tmp_path / "one") == _toml(tmp_path / "again")
@@ -190,7 +246,10 @@ def test_the_same_seed_writes_the_same_set(tmp_path: Path, small_optics: OpticsC
         ({"displacements_um": (0.0,)}, "displacements_um: 1 values for 18 frames"),
         ({"displacements_um": (float("nan"),) * 18}, "displacements_um: every value"),
         ({"motion": Motion(float("inf"))}, "motion, displacements_um: every value"),
-        ({"displacements_um": (0.0,) * 18, "motion": Motion(1.0)}, "displacements_um: give these or motion"),
+        (
+            {"displacements_um": (0.0,) * 18, "motion": Motion(1.0)},
+            "displacements_um: give these or motion",
+        ),
         ({"frame_interval_s": -1.0}, "frame_interval_s = -1.0 must be 0 or more"),
         ({"laser_noise_um": float("inf")}, "laser_noise_um = inf"),
         ({"seed": -1}, "seed = -1"),
@@ -200,12 +259,16 @@ def test_the_same_seed_writes_the_same_set(tmp_path: Path, small_optics: OpticsC
         ({"faults": (FrameFault("swapped", "black"),)}, "faults: black has no neighbour"),
     ],
 )
-def test_what_cannot_be_is_refused_by_its_field(spec: SimulationSpec, change: dict[str, Any], message: str) -> None:
+def test_what_cannot_be_is_refused_by_its_field(
+    spec: SimulationSpec, change: dict[str, Any], message: str
+) -> None:
     with pytest.raises(ValueError, match=message):
         replace(spec, **change)
 
 
-@pytest.mark.parametrize("text", ["stale", "melted:x_sin_0", "flicker:x_sin_0:much", "stale:x_sin_1:2"])
+@pytest.mark.parametrize(
+    "text", ["stale", "melted:x_sin_0", "flicker:x_sin_0:much", "stale:x_sin_1:2"]
+)
 def test_faults_that_make_no_sense_are_refused(text: str) -> None:
     with pytest.raises(ValueError, match="faults:"):
         FrameFault.parse(text)

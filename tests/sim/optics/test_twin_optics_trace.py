@@ -6,7 +6,13 @@ import cv2
 import numpy as np
 import pytest
 
-from membrane_ctrl.config.optics import CameraConfig, CameraPoseConfig, GeometryConfig, OpticsConfig, ScreenPoseConfig
+from membrane_ctrl.config.optics import (
+    CameraConfig,
+    CameraPoseConfig,
+    GeometryConfig,
+    OpticsConfig,
+    ScreenPoseConfig,
+)
 from membrane_ctrl.sim.optics.camera import OpticsRenderer
 from membrane_ctrl.sim.optics.film_shape import FilmShape
 from membrane_ctrl.sim.optics.trace import (
@@ -47,13 +53,17 @@ def test_the_law_of_reflection_holds(film: FilmShape, error: ScreenError | None)
     assert hits.on_film(500.0).all()
 
     p = np.stack([hits.x_mm, hits.y_mm, film.height_mm(hits.x_mm, hits.y_mm, 100.0) - 0.1], axis=1)
-    np.testing.assert_allclose(_unit(p - camera.position_mm), directions, atol=1e-14)  # on the camera's ray
+    np.testing.assert_allclose(
+        _unit(p - camera.position_mm), directions, atol=1e-14
+    )  # on the camera's ray
     # slopes by a five-point difference of the heights, independent of the trace's own derivatives
     step, weights = 0.5, np.array([1.0, -8.0, 8.0, -1.0]) / 12.0
     offsets = np.array([-2.0, -1.0, 1.0, 2.0]) * step
 
     def slope(along_x: float, along_y: float) -> np.ndarray:
-        heights = [film.height_mm(hits.x_mm + o * along_x, hits.y_mm + o * along_y, 100.0) for o in offsets]
+        heights = [
+            film.height_mm(hits.x_mm + o * along_x, hits.y_mm + o * along_y, 100.0) for o in offsets
+        ]
         return np.asarray(weights @ np.array(heights) / step)
 
     normal = _unit(np.stack([-slope(1, 0), -slope(0, 1), np.ones(300)], axis=1))
@@ -73,10 +83,14 @@ def test_the_chief_ray_runs_from_f_over_o_to_its_end() -> None:
     )
     assert np.abs([hits.x_mm, hits.y_mm, hits.s_x_mm, hits.s_y_mm]).max() < 1e-10
     np.testing.assert_allclose(
-        camera_pose(GEOMETRY).position_mm, [A_MM * np.cos(ALPHA), 0, A_MM * np.sin(ALPHA)], rtol=1e-15
+        camera_pose(GEOMETRY).position_mm,
+        [A_MM * np.cos(ALPHA), 0, A_MM * np.sin(ALPHA)],
+        rtol=1e-15,
     )
     np.testing.assert_allclose(
-        screen_pose(GEOMETRY).origin_mm, [-B_MM * np.cos(ALPHA), 0, B_MM * np.sin(ALPHA)], rtol=1e-15
+        screen_pose(GEOMETRY).origin_mm,
+        [-B_MM * np.cos(ALPHA), 0, B_MM * np.sin(ALPHA)],
+        rtol=1e-15,
     )
 
 
@@ -84,7 +98,9 @@ def test_light_from_a_paraboloids_focus_leaves_parallel_to_its_axis() -> None:
     sag_mm, radius_mm = 37.1, 500.0
     focus_mm = radius_mm**2 / (4.0 * sag_mm)
     straight = GeometryConfig(
-        camera=CameraPoseConfig(position_mm=(0, 0, focus_mm), rotation=((1, 0, 0), (0, -1, 0), (0, 0, -1))),
+        camera=CameraPoseConfig(
+            position_mm=(0, 0, focus_mm), rotation=((1, 0, 0), (0, -1, 0), (0, 0, -1))
+        ),
         screen=ScreenPoseConfig(origin_mm=(0, 0, 3000), s_x=(-1, 0, 0), s_y=(0, 1, 0)),
     )
     camera = camera_pose(straight)
@@ -98,11 +114,22 @@ def test_light_from_a_paraboloids_focus_leaves_parallel_to_its_axis() -> None:
 
 
 def test_in_the_plane_y_0_s_x_is_the_papers_distance_to_a() -> None:
-    """The paper's scalar equations, with tan(theta) = -dh/dx as the interfaces warn; no y slope in that plane."""
-    flat_in_y = FilmShape(37.1, zernike_um=(0, 300.0, 0, 0, 0, 0, 0, 100.0))  # even in y: stays in the plane
+    """The paper's scalar equations, with tan(theta) = -dh/dx as the interfaces warn; no y slope in
+    that plane.
+    """
+    flat_in_y = FilmShape(
+        37.1, zernike_um=(0, 300.0, 0, 0, 0, 0, 0, 100.0)
+    )  # even in y: stays in the plane
     columns = np.linspace(700.0, 1750.0, 40)
     rows = np.full(40, CameraConfig().principal[1])
-    hits = trace(camera_pose(GEOMETRY), _rays(columns, rows), flat_in_y.terms, 37.1, 0.0, screen_pose(GEOMETRY))
+    hits = trace(
+        camera_pose(GEOMETRY),
+        _rays(columns, rows),
+        flat_in_y.terms,
+        37.1,
+        0.0,
+        screen_pose(GEOMETRY),
+    )
     x, h = hits.x_mm, flat_in_y.height_mm(hits.x_mm, hits.y_mm)
     step = 1e-2
     dh = (flat_in_y.height_mm(x + step, 0 * x) - flat_in_y.height_mm(x - step, 0 * x)) / (2 * step)
@@ -138,8 +165,16 @@ def test_the_picture_is_upright() -> None:
 
 def test_a_flat_film_shows_the_screen_as_a_plane_mirror_does() -> None:
     columns, rows = np.array([1000.0, 1400.0]), np.array([1200.0, 900.0])
-    hits = trace(camera_pose(GEOMETRY), _rays(columns, rows), FilmShape(0.0).terms, 0.0, 0.0, screen_pose(GEOMETRY))
-    # the mirrored pinhole (z reversed), the point on the film and the point on the screen are in one line
+    hits = trace(
+        camera_pose(GEOMETRY),
+        _rays(columns, rows),
+        FilmShape(0.0).terms,
+        0.0,
+        0.0,
+        screen_pose(GEOMETRY),
+    )
+    # the mirrored pinhole (z reversed), the point on the film and the point on the screen are in
+    # one line
     mirrored = camera_pose(GEOMETRY).position_mm * [1, 1, -1]
     on_film = np.stack([hits.x_mm, hits.y_mm, [0.0, 0.0]], axis=1)
     on_screen = _world(screen_pose(GEOMETRY), hits)
@@ -151,17 +186,27 @@ def test_the_general_form_of_the_short_geometry_gives_the_same_rays(
 ) -> None:
     camera, screen = camera_pose(GEOMETRY), screen_pose(GEOMETRY)
     general = GeometryConfig(
-        camera=CameraPoseConfig(position_mm=tuple(camera.position_mm), rotation=tuple(map(tuple, camera.rotation))),
-        screen=ScreenPoseConfig(origin_mm=tuple(screen.origin_mm), s_x=tuple(screen.s_x), s_y=tuple(screen.s_y)),
+        camera=CameraPoseConfig(
+            position_mm=tuple(camera.position_mm), rotation=tuple(map(tuple, camera.rotation))
+        ),
+        screen=ScreenPoseConfig(
+            origin_mm=tuple(screen.origin_mm), s_x=tuple(screen.s_x), s_y=tuple(screen.s_y)
+        ),
     )
     short = OpticsRenderer(small_optics, film).trace_pixels(20.0)
-    long = OpticsRenderer(small_optics.model_copy(update={"geometry": general}), film).trace_pixels(20.0)
+    long = OpticsRenderer(small_optics.model_copy(update={"geometry": general}), film).trace_pixels(
+        20.0
+    )
     np.testing.assert_allclose(long.s_x_mm, short.s_x_mm, atol=1e-12)
     np.testing.assert_allclose(long.s_y_mm, short.s_y_mm, atol=1e-12)
 
 
-def test_the_vertex_moves_away_when_the_bowl_deepens(clean_optics: OpticsConfig, film: FilmShape) -> None:
-    """The ring does not move: at displacement d the vertex is at -(d - reference), which a moved world shows too."""
+def test_the_vertex_moves_away_when_the_bowl_deepens(
+    clean_optics: OpticsConfig, film: FilmShape
+) -> None:
+    """The ring does not move: at displacement d the vertex is at -(d - reference), which a moved
+    world shows too.
+    """
     raised = OpticsRenderer(clean_optics, film, reference_um=150.0).trace_pixels(150.0)
     same = OpticsRenderer(clean_optics, film, reference_um=0.0).trace_pixels(150.0)
     on = raised.on_film(490.0)
@@ -170,15 +215,21 @@ def test_the_vertex_moves_away_when_the_bowl_deepens(clean_optics: OpticsConfig,
         z = vertex_z + film.height_mm(hits.x_mm[on], hits.y_mm[on], 150.0)
         p = np.stack([hits.x_mm[on], hits.y_mm[on], z], axis=1)
         columns, rows = np.meshgrid(np.arange(306.0), np.arange(256.0))
-        directions = pixel_directions(clean_optics.camera, camera, columns.ravel()[on], rows.ravel()[on])
+        directions = pixel_directions(
+            clean_optics.camera, camera, columns.ravel()[on], rows.ravel()[on]
+        )
         np.testing.assert_allclose(_unit(p - camera.position_mm), directions, atol=1e-14)
 
 
-@pytest.mark.parametrize("coeffs", [(-0.12, 0.05, 1e-3, -5e-4), (-0.1, 0.02, 0.0, 1e-3, 0.01, 0.02, 0.01, -0.01)])
+@pytest.mark.parametrize(
+    "coeffs", [(-0.12, 0.05, 1e-3, -5e-4), (-0.1, 0.02, 0.0, 1e-3, 0.01, 0.02, 0.01, -0.01)]
+)
 def test_lens_distortion_is_opencvs(coeffs: tuple[float, ...]) -> None:
     camera = CameraConfig(distortion=coeffs)
     pose = camera_pose(GEOMETRY)
-    columns, rows = (v.ravel() for v in np.meshgrid(np.linspace(0, 2447, 9), np.linspace(0, 2047, 7)))
+    columns, rows = (
+        v.ravel() for v in np.meshgrid(np.linspace(0, 2447, 9), np.linspace(0, 2047, 7))
+    )
     in_camera = pixel_directions(camera, pose, columns, rows) @ pose.rotation.T
     focal_px = camera.focal_mm * 1000.0 / camera.pixel_um
     c0, r0 = camera.principal
@@ -190,15 +241,25 @@ def test_lens_distortion_is_opencvs(coeffs: tuple[float, ...]) -> None:
 def test_a_lens_that_folds_the_picture_is_refused() -> None:
     with pytest.raises(ValueError, match=r"camera\.distortion"):
         pixel_directions(
-            CameraConfig(distortion=(-8.0, 0.0, 0.0, 0.0)), camera_pose(GEOMETRY), np.array([0.0]), np.array([0.0])
+            CameraConfig(distortion=(-8.0, 0.0, 0.0, 0.0)),
+            camera_pose(GEOMETRY),
+            np.array([0.0]),
+            np.array([0.0]),
         )
 
 
 def test_a_screen_behind_the_film_is_never_reached() -> None:
-    behind = ScreenPose(np.array([0.0, 0.0, -1000.0]), np.array([-1.0, 0.0, 0.0]), np.array([0.0, 1.0, 0.0]))
+    behind = ScreenPose(
+        np.array([0.0, 0.0, -1000.0]), np.array([-1.0, 0.0, 0.0]), np.array([0.0, 1.0, 0.0])
+    )
     c0, r0 = CameraConfig().principal
     hits = trace(
-        camera_pose(GEOMETRY), _rays(np.array([c0]), np.array([r0])), FilmShape(37.1).terms, 37.1, 0.0, behind
+        camera_pose(GEOMETRY),
+        _rays(np.array([c0]), np.array([r0])),
+        FilmShape(37.1).terms,
+        37.1,
+        0.0,
+        behind,
     )
     assert np.isnan(hits.s_x_mm[0])
     assert np.isnan(hits.s_y_mm[0])
@@ -206,9 +267,13 @@ def test_a_screen_behind_the_film_is_never_reached() -> None:
 
 def test_rays_beside_the_film_are_not_on_it() -> None:
     hits = trace(
-        camera_pose(GEOMETRY), _rays(np.array([5.0]), np.array([5.0])), FilmShape(37.1).terms, 37.1, 0.0,
+        camera_pose(GEOMETRY),
+        _rays(np.array([5.0]), np.array([5.0])),
+        FilmShape(37.1).terms,
+        37.1,
+        0.0,
         screen_pose(GEOMETRY),
-    )  # fmt: skip
+    )
     assert not hits.on_film(500.0)[0]
 
 

@@ -1,7 +1,7 @@
 """Camera and display of another vendor, as a package of its own: nothing of the product knows it.
 
-Without an emulator the camera films the display directly, in a dark room without a mirror. The camera brings about
-the `faults` of its settings, one at each `fault_every`-th exposure.
+Without an emulator the camera films the display directly, in a dark room without a mirror. The
+camera brings about the `faults` of its settings, one at each `fault_every`-th exposure.
 """
 
 from __future__ import annotations
@@ -33,8 +33,12 @@ class Room:
         """The display in the camera's pixels, each the mean of a block of the display's."""
         counts = np.full(shape, DARK_ADU)
         if self.levels is not None:
-            rows, columns = (big // small for big, small in zip(self.levels.shape, shape, strict=True))
-            blocks = self.levels[: rows * shape[0], : columns * shape[1]].reshape(shape[0], rows, shape[1], columns)
+            rows, columns = (
+                big // small for big, small in zip(self.levels.shape, shape, strict=True)
+            )
+            blocks = self.levels[: rows * shape[0], : columns * shape[1]].reshape(
+                shape[0], rows, shape[1], columns
+            )
             counts += WHITE_ADU * blocks.mean(axis=(1, 3)) / 255.0
         return np.rint(counts + random.normal(0.0, NOISE_ADU, shape)).clip(0, 255).astype(np.uint8)
 
@@ -88,7 +92,9 @@ class StudioCamera:
         self._exposures += 1
         time_s = self._clock.now()
         self._clock.sleep(self._config.exposure_ms / 1000.0)
-        pixels = self._library.view() if self._library else ROOM.see(self._sensor.shape, self._random)
+        pixels = (
+            self._library.view() if self._library else ROOM.see(self._sensor.shape, self._random)
+        )
         if self._faults and self._exposures % self._config.fault_every == 0:
             return self._fail(self._faults.pop(0), roles.Frame(pixels, time_s))
         return roles.Frame(pixels, time_s)
