@@ -63,7 +63,7 @@ pictures: $(STAMP)  ## the pictures of README and documentation, taken anew; ONL
 bench: $(STAMP)  ## measured figures, each against a reference of the same run
 	$(BIN)/python -m benchmarks
 
-campaign: $(STAMP)  ## all faults, in virtual time and with real processes; docs/fault-matrix.md, sensor-faults.md
+campaign: $(STAMP)  ## all faults, in virtual time and with real processes; docs/measurements/fault-matrix.md, sensor-faults.md
 	$(BIN)/pytest -m campaign
 	rm -f build/sensor-faults.jsonl
 	$(BIN)/python tests/campaign/sensor_faults_page.py
@@ -96,7 +96,7 @@ generate: $(STAMP)  ## the files made from registers.toml, the tables of safety,
 	$(BIN)/python -m tests.support.faults_page
 	$(BIN)/python -m tests.support.events_page
 	$(BIN)/python -m tests.support.telemetry_pages
-	$(BIN)/membrane-ctrl config reference > docs/configuration.md
+	$(BIN)/membrane-ctrl config reference > docs/reference/configuration.md
 
 notebooks: $(STAMP)  ## runs docs/notebooks and stores what they print and draw
 	$(BIN)/python -m tests.support.notebooks

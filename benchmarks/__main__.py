@@ -50,8 +50,8 @@ NAMES = (
     "tracking_long",
     "soak",
 )
-OUT = Path("docs/bench.json")
-PAGE = Path("docs/bench.md")
+OUT = Path("docs/measurements/bench.json")
+PAGE = Path("docs/measurements/bench.md")
 
 
 def main(names: list[str]) -> int:

@@ -66,9 +66,9 @@ class HouseFigures:
 
 
 # The size has no limit: a module is as large as its concept. The order has: rooms must not import
-# each other in a circle, `docs/architecture.md` explains nine floors, and a loose module belongs to
-# no room. More than 6 % of the lines as imports means that concepts are spread over too many
-# modules; a concept a
+# each other in a circle, `docs/explanation/architecture.md` explains nine floors, and a loose
+# module belongs to no room. More than 6 % of the lines as imports means that concepts are spread
+# over too many modules; a concept a
 # module
 # has 5 %.
 ORDER_LIMITS = {"import_percent": 6.0, "loose": 3, "floors": 9, "largest_circle": 1}

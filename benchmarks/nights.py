@@ -2,9 +2,9 @@
 control.
 
 The film as an integrator of pump flow, leak, air pressure and gas temperature with the numbers of
-docs/physics.md and of the twin's scenarios; a 10 Hz PI loop with filter, feed-forward, dead time
-and pump lag; laser noise, quantisation; Ornstein-Uhlenbeck weather. A night of eight hours takes a
-quarter of a second. Written by the recorder's own code.
+docs/explanation/physics.md and of the twin's scenarios; a 10 Hz PI loop with filter, feed-forward,
+dead time and pump lag; laser noise, quantisation; Ornstein-Uhlenbeck weather. A night of eight
+hours takes a quarter of a second. Written by the recorder's own code.
 """
 
 from __future__ import annotations
@@ -31,7 +31,8 @@ from membrane_ctrl.run_files.table_specs import ROW_COLUMNS
 RATE_HZ = 10.0
 CONFIG = Config(loop=LoopConfig(rate_hz=RATE_HZ))
 STARTED_UTC = datetime(2026, 11, 21, 18, 0, 0, tzinfo=UTC)
-# Standard deviation and correlation time of air pressure and air temperature (docs/physics.md).
+# Standard deviation and correlation time of air pressure and air temperature
+# (docs/explanation/physics.md).
 WEATHER = {
     "quiet": (0.2, 30.0, 0.010, 300.0),
     "typical": (1.2, 30.0, 0.050, 300.0),

@@ -2,7 +2,7 @@
 figures.
 
 `run()` gives the figures, `python -m benchmarks.tuning` prints them as the tables of
-docs/tuning.md.
+docs/how-to/tuning.md.
 """
 
 from __future__ import annotations

@@ -1,7 +1,7 @@
 """Tests whether a camera driver does what the cycle needs, against an emulated camera.
 
 A package's tests extend `CameraBench` and run each check of `list_checks`. A check that needs a
-fault which the emulated camera cannot bring about is left out; docs/new-camera.md lists the
+fault which the emulated camera cannot bring about is left out; docs/how-to/new-camera.md lists the
 requirements.
 """
 

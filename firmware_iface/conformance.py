@@ -1,8 +1,8 @@
 """Tests whether a board does what a pump board must, over its own protocol and without touching
 anything else.
 
-docs/firmware.md explains the requirements; each check names its section. The pump is briefly
-commanded to a few per
+docs/reference/firmware.md explains the requirements; each check names its section. The pump is
+briefly commanded to a few per
 cent: do not run it on a mirror that must not move.
 """
 
@@ -24,7 +24,7 @@ _UNDISTURBED_S = 1.0
 
 _Check = tuple[
     str, str, Callable[[], Awaitable[None]]
-]  # its name, the section of docs/firmware.md, the check
+]  # its name, the section of docs/reference/firmware.md, the check
 
 
 @dataclass(frozen=True, slots=True)

@@ -83,7 +83,7 @@ def measured_response(levels: ArrayLike, seen_adu: ArrayLike) -> DisplayResponse
     return DisplayResponse(shown, (rising - rising[0]) / (rising[-1] - rising[0]))
 
 
-# Patterns as the pixels of a screen (docs/interfaces.md section 2).
+# Patterns as the pixels of a screen (docs/reference/interfaces.md section 2).
 
 _GRAY_BITS = 4
 

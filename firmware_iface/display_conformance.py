@@ -1,7 +1,7 @@
 """Tests whether a display driver does what a screen needs, against an emulated display.
 
 A package's tests extend `DisplayBench` and run each check of `list_checks`. A check that needs a
-fault which the emulated display cannot bring about is left out; docs/new-camera.md lists the
+fault which the emulated display cannot bring about is left out; docs/how-to/new-camera.md lists the
 requirements.
 """
 

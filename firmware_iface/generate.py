@@ -1,5 +1,5 @@
-"""Writes the files generated from the register map: `docs/registers.md`, `membrane_board.h` and the
-board's table.
+"""Writes the files generated from the register map: `docs/reference/registers.md`,
+`membrane_board.h` and the board's table.
 
 Run `python -m firmware_iface.generate` after changing the map; with `--check` it writes nothing and
 exits with 1 if a file is out of date.
@@ -14,7 +14,7 @@ from firmware_iface.register_map import I32_NO_VALUE, Block, Register, RegisterM
 _HERE = Path(__file__).resolve().parent
 HEADER_PATH = _HERE / "membrane_board.h"
 TABLE_PATH = _HERE / "board" / "core" / "register_table.h"
-DOCS_PATH = _HERE.parent / "docs" / "registers.md"
+DOCS_PATH = _HERE.parent / "docs" / "reference" / "registers.md"
 _SOURCE = "firmware_iface/registers.toml with python -m firmware_iface.generate"
 
 

@@ -280,8 +280,8 @@ class ExternalSection(Section):
 
 
 class ExternalConfig(ExternalSection):
-    """An instrument whose driver is a package of its own (docs/new-device.md). The driver defines
-    more keys.
+    """An instrument whose driver is a package of its own (docs/how-to/new-device.md). The driver
+    defines more keys.
 
     Reading a configuration never loads that package: only opening or emulating the devices does.
     """
@@ -487,8 +487,8 @@ class FolderCameraConfig(CameraSection):
 
 
 class ExternalCameraConfig(CameraSection, ExternalSection):
-    """A camera whose driver is a package of its own (docs/new-camera.md). The driver defines more
-    keys.
+    """A camera whose driver is a package of its own (docs/how-to/new-camera.md). The driver defines
+    more keys.
 
     Reading a configuration never loads that package: only opening or emulating the camera does.
     """
@@ -538,8 +538,8 @@ class PygameScreenConfig(ScreenSection):
 
 
 class ExternalScreenConfig(ScreenSection, ExternalSection):
-    """A screen whose driver is a package of its own (docs/new-camera.md). The driver defines more
-    keys.
+    """A screen whose driver is a package of its own (docs/how-to/new-camera.md). The driver defines
+    more keys.
 
     Reading a configuration never loads that package: only opening or emulating the screen does.
     """

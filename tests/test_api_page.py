@@ -1,4 +1,5 @@
-"""The examples of docs/api.md run, in their order, where a run, a set and a configuration are."""
+"""The examples of docs/reference/api.md run, in their order, where a run, a set and a configuration
+are."""
 
 from __future__ import annotations
 
@@ -13,7 +14,7 @@ from membrane_ctrl.sim.optics.simulate import simulate_set
 from membrane_ctrl.sim.optics.simulation_spec import SimulationSpec
 from tests.support.review_runs import written
 
-PAGE = Path(__file__).parents[1] / "docs" / "api.md"
+PAGE = Path(__file__).parents[1] / "docs" / "reference" / "api.md"
 
 
 def test_the_examples_of_the_page_run(

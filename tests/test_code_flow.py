@@ -1,5 +1,5 @@
-"""Files and functions that docs/ names exist, and the counts of files in docs/code-flow.md are
-right.
+"""Files and functions that docs/ names exist, and the counts of files in
+docs/explanation/code-flow.md are right.
 """
 
 import ast
@@ -10,7 +10,7 @@ import pytest
 
 ROOT = Path(__file__).parent.parent
 TOPS = ("membrane_ctrl", "firmware_iface", "tuning", "tests", "benchmarks")
-PAGE = (ROOT / "docs" / "code-flow.md").read_text()
+PAGE = (ROOT / "docs" / "explanation" / "code-flow.md").read_text()
 WALKS = {part[0]: part for part in re.split(r"^## ", PAGE, flags=re.MULTILINE)[1:]}
 COUNTS = dict(re.findall(r"^\| \[(\w)\. .*?\]\(.*?\) \| (\d+)", PAGE, re.MULTILINE))
 STEP = re.compile(r"^\| (\d+) \| `([^`]+)` \| (.+?) \|", re.MULTILINE)
@@ -58,7 +58,7 @@ def test_every_file_that_the_prose_names_exists() -> None:
     assert missing == []
 
 
-@pytest.mark.parametrize("page", sorted((ROOT / "docs").glob("*.md")), ids=lambda page: page.name)
+@pytest.mark.parametrize("page", sorted((ROOT / "docs").rglob("*.md")), ids=lambda page: page.name)
 def test_a_python_file_that_a_page_names_exists(page: Path) -> None:
     known = [path.as_posix() for top in TOPS for path in (ROOT / top).rglob("*.py")]
     named = re.findall(r"`([\w/]+\.py)\b", page.read_text())

@@ -1,4 +1,4 @@
-"""The examples of docs/data.md run, where runs and results are,
+"""The examples of docs/how-to/data.md run, where runs and results are,
 and give the figures of `report`.
 """
 
@@ -22,7 +22,7 @@ from membrane_ctrl.review.statistics.analysis import analyse
 from tests.support.dask_cluster import PATIENT
 from tests.support.review_runs import written
 
-PAGE = Path(__file__).parents[1] / "docs" / "data.md"
+PAGE = Path(__file__).parents[1] / "docs" / "how-to" / "data.md"
 EXAMPLES = re.findall(r"```python\n(.*?)```", PAGE.read_text(encoding="utf-8"), re.DOTALL)
 NIGHTS = [f"2026112{day}T180000Z-night" for day in (1, 2, 3)]
 Figures = Mapping[str, tuple[int, int, float]]  # by run: ticks, settled ones, standard deviation

@@ -1,4 +1,4 @@
-"""Who may import whom (docs/architecture.md). A broken rule here
+"""Who may import whom (docs/explanation/architecture.md). A broken rule here
 means that the design has slipped.
 """
 
@@ -33,7 +33,7 @@ NOT_PLAIN = {
 }  # I/O
 
 # Each room with its floor: it imports from lower floors only. A new room is entered here and in
-# docs/architecture.md.
+# docs/explanation/architecture.md.
 FLOORS = {
     1: {"firmware_iface", "membrane_ctrl/__init__", "membrane_ctrl/model"},
     2: {"membrane_ctrl/config"},

@@ -39,7 +39,7 @@ Camera  # the role that the camera drivers fill
     _.screen_points,
     gradients,
     _.experiments,
-)  # a library: docs/metrology.md, tuning.md
+)  # a library: docs/explanation/metrology.md, docs/how-to/tuning.md
 _.frame_rms_adu, _.step_periods, _.sensitivity_sigma  # parts of a result
 (
     _.trace_pixels,
@@ -73,8 +73,8 @@ _.__init_subclass__  # Python calls it
     _.slope_rms_urad,
 )  # written and read by their names
 _.spot_rms_mm, _.spot_50_mm, _.spot_80_mm, _.spot_95_mm
-_.places_mm, _.misfit, _.crossed_phasors  # a library: docs/library.md
-_.to_xarray, open_result, open_stability  # for scripts: docs/data.md
+_.places_mm, _.misfit, _.crossed_phasors  # a library: docs/how-to/library.md
+_.to_xarray, open_result, open_stability  # for scripts: docs/how-to/data.md
 (
     _.screen_x_mm,
     _.screen_y_mm,
@@ -139,7 +139,7 @@ _.culprit  # in the template of a sentence
     find_keepers,
     find_bound,
     _.distance_um,
-)  # the protection table, for docs/faults.md, the safety case and the campaign
+)  # the protection table, for docs/reference/faults.md, the safety case and the campaign
 _.sent  # of an event, written as a whole
 _.writable  # of a file that Arrow writes to
 Barometer, Thermometer  # contracts of drivers, which packages of others fill

@@ -1,10 +1,10 @@
 """Drivers of devices, each of which fills a role of `roles.py`; and those of other packages.
 
 A package names its driver in the entry point group of its kind, and an emulator of the device in
-the group of its emulators (docs/new-device.md). The drivers of this package that are made from
-their settings alone, and those of cameras and screens, are entry points as well, listed below. Only
-an installed package is ever executed, and only when a configuration names it: no configuration, run
-folder or working folder can name a file.
+the group of its emulators (docs/how-to/new-device.md). The drivers of this package that are made
+from their settings alone, and those of cameras and screens, are entry points as well, listed below.
+Only an installed package is ever executed, and only when a configuration names it: no
+configuration, run folder or working folder can name a file.
 """
 
 from dataclasses import dataclass
@@ -98,7 +98,7 @@ def _load(name: str, what: str, entries: list["EntryPoint"]) -> Any:
     if not found:
         known = ", ".join(entry.name for entry in entries) or "none"
         raise ValueError(
-            f"no {what} {name!r} is installed; installed: {known} (docs/new-device.md)"
+            f"no {what} {name!r} is installed; installed: {known} (docs/how-to/new-device.md)"
         )
     if len(found) > 1:
         packages = " and ".join(entry.dist.name if entry.dist else entry.value for entry in found)

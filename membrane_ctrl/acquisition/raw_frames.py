@@ -1,9 +1,9 @@
 """Keeps raw frames of every n-th cycle, and of the last cycles before a fault, as capture sets to
 remeasure.
 
-`raw/cycle-000017/` in the run's folder is a set like any other (docs/interfaces.md section 3). A
-set of fringes only refers to the full cycle that anchors it, so the newest accepted full cycle is
-kept too, until the next one replaces it or a set refers to it.
+`raw/cycle-000017/` in the run's folder is a set like any other (docs/reference/interfaces.md
+section 3). A set of fringes only refers to the full cycle that anchors it, so the newest accepted
+full cycle is kept too, until the next one replaces it or a set refers to it.
 """
 
 import shutil

@@ -1,1 +1,2 @@
-"""Alarms: which are sent, to whom, and when they are repeated (docs/control-port.md, alarms)."""
+"""Alarms: which are sent, to whom, and when they are repeated (docs/reference/control-port.md,
+alarms)."""

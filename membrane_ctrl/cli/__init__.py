@@ -1,5 +1,5 @@
 """The command line: one thin function per command; errors end in one line and an exit code
-(docs/interfaces.md).
+(docs/reference/interfaces.md).
 """
 
 import sys

@@ -263,7 +263,10 @@ def _board_reading(reading: roles.BenchReading) -> str:
 
 def _board_problem(reading: roles.BenchReading, laser: bool) -> str:
     if reading.latched_faults:
-        return f"faults {reading.latched_faults:#x} are latched (docs/registers.md); find the cause"
+        return (
+            f"faults {reading.latched_faults:#x} are latched (docs/reference/registers.md); "
+            "find the cause"
+        )
     if laser and not math.isfinite(reading.displacement_um):
         return f"no laser reading (code {reading.displacement_quality}); check its aim"
     return (
@@ -406,7 +409,7 @@ def run_conformance(url: str, unit_id: int, as_json: bool) -> int:
             )
         )
     else:
-        table = Table("check", "result", "docs/firmware.md")
+        table = Table("check", "result", "docs/reference/firmware.md")
         for finding in findings:
             table.add_row(finding.check, finding.problem or "passed", finding.section)
         terminal.table_console().print(table)

@@ -23,7 +23,7 @@ from membrane_ctrl.model import errors, terminal
 _DRM = Path("/sys/class/drm")
 _HEAD = """\
 # Configuration of membrane-ctrl. Omitted keys use their defaults; `membrane-ctrl config explain KEY` tells what a key
-# means, docs/configuration.md lists them all, and `membrane-ctrl check {name}` checks this file and its devices.
+# means, docs/reference/configuration.md lists them all, and `membrane-ctrl check {name}` checks this file and its devices.
 """  # noqa: E501
 _TWIN = "tcp://127.0.0.1:{port}"
 
@@ -100,7 +100,7 @@ def find_displays(root: Path = _DRM) -> list[FoundDevice]:
 
 
 def find_drivers() -> list[FoundDevice]:
-    """Drivers that other packages provide (docs/new-device.md); none of them is loaded."""
+    """Drivers that other packages provide (docs/how-to/new-device.md); none of them is loaded."""
     return [
         FoundDevice(
             kind.name,

@@ -117,7 +117,7 @@ def write_package(name: str, role: str, folder: Path) -> int:
         for file, template in files.items():
             text = _of_kind((_TEMPLATES / template).read_text(encoding="utf-8"), kind)
             (target / file).write_text(string.Template(text).substitute(words), encoding="utf-8")
-    page = "docs/new-camera.md" if role in _OPTICS else "docs/new-device.md"
+    page = "docs/how-to/new-camera.md" if role in _OPTICS else "docs/how-to/new-device.md"
     typer.echo(
         f"{target}: a driver, its emulator, its tests and lab.toml are written. Next ({page}):\n"
         f"  pip install --no-deps --editable {target}\n"

@@ -21,9 +21,9 @@ class LoopConfig(Section):
     """Displacement to hold. Change it to hold another depth; in a running hold use `ctl setpoint`.
     """
     kp_per_s: Annotated[float, Field(ge=0, le=20)] = 0.61
-    """Proportional gain; SIMC with the time constant of least predicted variance (docs/physics.md,
-    inner loop). Change it with `tune`: a larger gain follows gusts faster and passes more laser
-    noise."""
+    """Proportional gain; SIMC with the time constant of least predicted variance
+    (docs/explanation/physics.md, inner loop). Change it with `tune`: a larger gain follows gusts
+    faster and passes more laser noise."""
     ti_s: Annotated[float, Field(gt=0.05, le=3600)] = 6.5
     """Integral time. Change it with `tune`, together with `kp_per_s`."""
     td_s: Annotated[float, Field(ge=0, le=10)] = 0.0
@@ -85,8 +85,8 @@ class LoopConfig(Section):
 
 
 class PumpConfig(Section):
-    """Flow of the pump against its command (docs/physics.md, film and gas); measure it with `tune
-    pump`.
+    """Flow of the pump against its command (docs/explanation/physics.md, film and gas); measure it
+    with `tune pump`.
     """
 
     flow_full_um_per_s: Annotated[float, Field(gt=0, le=100)] = 5.3
@@ -246,7 +246,8 @@ class StatesConfig(Section):
     """Longest settling. Raise it for slow loops."""
     hold_flow_max_s: Annotated[float, Field(gt=0, le=600)] = 12.0
     """Longest hold of the mean flow without a reading. 10 s cost 1.6 µm on average
-    (docs/physics.md); longer is no glitch. Raise it where a longer loss is known to be harmless."""
+    (docs/explanation/physics.md); longer is no glitch. Raise it where a longer loss is known to be
+    harmless."""
     ramp_down_s: Annotated[float, Field(gt=0, le=600)] = 10.0
     """Time in which the flow then ramps down. Leave it, except for a film that must be lowered more
     slowly.
@@ -283,8 +284,8 @@ class ResumeConfig(Section):
     """Which latched faults may clear automatically once their cause has gone."""
 
     faults: tuple[str, ...] = ()
-    """Names of those faults (docs/faults.md, "may resume"). Set it for known harmless causes, e.g.
-    `link_lost`.
+    """Names of those faults (docs/reference/faults.md, "may resume"). Set it for known harmless
+    causes, e.g. `link_lost`.
     """
     wait_s: Annotated[float, Field(ge=1, le=1e5)] = 30.0
     """Time without the cause before a resume. Raise it for causes that come and go."""
@@ -300,7 +301,7 @@ class ShapeConfig(Section):
     mode: Literal["cycle", "track"] = "cycle"
     """`cycle` takes the frames of a figure one pattern after the other; `track` lets crossed
     fringes stand still, so that every frame is a figure. Set it to `track` for a figure at the
-    camera's rate (docs/tracking.md)."""
+    camera's rate (docs/how-to/tracking.md)."""
     period_s: Annotated[float, Field(ge=0.2, le=3600)] = 2.0
     """Interval between cycles. Raise it for a camera or machine that needs longer."""
     frame_interval_s: Annotated[float, Field(ge=0.0, le=10)] = 0.1
@@ -333,7 +334,7 @@ class ShapeConfig(Section):
 
 class EstimatorConfig(Section):
     """The estimate of the centre from laser, optics, barometer and
-    thermometer (docs/estimator.md).
+    thermometer (docs/explanation/estimator.md).
     """
 
     process_value: Literal["laser", "estimate", "optics"] = "laser"

@@ -107,7 +107,7 @@ class ScreenPoseConfig(Section):
 
 
 class PatternConfig(Section):
-    """Fringes on the screen (docs/interfaces.md)."""
+    """Fringes on the screen (docs/reference/interfaces.md)."""
 
     steps: Annotated[int, Field(ge=3, le=64)] = 4
     """Phase steps per axis. Raise it against harmonics of the display; each step takes a frame."""
@@ -193,7 +193,8 @@ class SigmasConfig(Section):
 
 
 class GeometryConfig(Section):
-    """Camera and screen: the paper's a, b, alpha, or two general poses (docs/interfaces.md).
+    """Camera and screen: the paper's a, b, alpha, or two general poses
+    (docs/reference/interfaces.md).
 
     In either form, `screen` may give the departure of the screen's face from its plane.
     """

@@ -23,7 +23,7 @@ Limit = Annotated[float, Field(ge=-1e12, le=1e12)]
 
 
 class TlsConfig(Section):
-    """The port on TCP, with a certificate on either side (docs/control-port.md)."""
+    """The port on TCP, with a certificate on either side (docs/reference/control-port.md)."""
 
     host: str = "127.0.0.1"
     """Address to listen on. Change it to let other machines connect."""
@@ -94,7 +94,7 @@ class FleetHold(Section):
 
 
 class FleetConfig(Section):
-    """A fleet file: `[[holds]]`, each with a name (docs/control-port.md)."""
+    """A fleet file: `[[holds]]`, each with a name (docs/reference/control-port.md)."""
 
     holds: Annotated[tuple[FleetHold, ...], Field(min_length=1, max_length=100)]
     """The holds."""
@@ -107,7 +107,7 @@ class FleetConfig(Section):
 
 
 class WebConfig(Section):
-    """The page (docs/web.md), which a hold with this table starts and keeps alive."""
+    """The page (docs/how-to/web.md), which a hold with this table starts and keeps alive."""
 
     host: str = LOCAL
     """Address to listen on. Change it to let other machines connect, with TLS and users."""
@@ -239,7 +239,8 @@ class EpicsConfig(Section):
 
 
 class DoorsConfig(Section):
-    """Doors for the lab's other systems (docs/doors.md), opened by `membrane-ctrl doors`."""
+    """Doors for the lab's other systems (docs/how-to/bridges.md), opened by `membrane-ctrl
+    doors`."""
 
     name: Annotated[str, Field(pattern=r"^[a-z][a-z0-9_]{0,30}$")] = "mirror"
     """First part of every published name. Change it where there are several mirrors."""
@@ -280,7 +281,8 @@ class AlarmRule(Section):
     name: Annotated[str, Field(pattern=r"^[a-z][a-z0-9_]{0,40}$")]
     """Name of the alarm in messages. Set it to a word of lower-case letters, digits and `_`."""
     field: str
-    """Telemetry field to watch. Set it to a field of docs/recording.md, e.g. `error_um`."""
+    """Telemetry field to watch. Set it to a field of docs/reference/recording.md, e.g.
+    `error_um`."""
     raise_at: Limit
     """Value at which the alarm is raised, in the field's unit. Set it beyond what weather does."""
     clear_at: Limit

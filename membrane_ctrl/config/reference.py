@@ -1,5 +1,5 @@
-"""What each key means: `docs/configuration.md`, the JSON schema and `config explain`, all made from
-the schema.
+"""What each key means: `docs/reference/configuration.md`, the JSON schema and `config explain`, all
+made from the schema.
 
 Range and default come from pydantic, the unit from the key's name, meaning and advice from the text
 below the key.
@@ -327,7 +327,7 @@ def _classes(section: type[BaseModel]) -> Iterator[type[BaseModel]]:
 
 
 def page() -> str:
-    """docs/configuration.md."""
+    """docs/reference/configuration.md."""
     lines = _PAGE.splitlines()
     for table in tables():
         lines += ["", f"## {_heading(table)}", "", f"`{table.title}`: {table.meaning}"]

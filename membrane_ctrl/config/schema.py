@@ -211,7 +211,8 @@ def _is_fraction(pair: tuple[float, float]) -> bool:
 
 
 class TwinConfig(Section):
-    """The simulated bench. The defaults are assumptions, explained in docs/physics.md."""
+    """The simulated bench. The defaults are assumptions, explained in
+    docs/explanation/physics.md."""
 
     port: Annotated[int, Field(ge=0, le=65535)] = 5020
     """Port of its Modbus TCP server; 0: any free one. Change it if another program has it."""

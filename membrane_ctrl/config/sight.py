@@ -41,7 +41,7 @@ def poses(
     geometry: GeometryConfig,
 ) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray, FloatArray]:
     """Pinhole (3,), rotation (3, 3), O', s_x and s_y (3,) in world, from either form
-    (docs/interfaces.md).
+    (docs/reference/interfaces.md).
     """
     screen = None if geometry.screen is None else geometry.screen.pose
     if geometry.camera is not None and screen is not None:

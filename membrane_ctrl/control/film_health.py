@@ -32,7 +32,7 @@ FIRST_S = 10.0
 # The loop moves the flow by 0.15 µm/s (standard deviation) and the pump's least running flow is 0.3
 # µm/s: with less than this to make up for, the pump stops and starts, and in the end the band of 2
 # µm is lost
-# (docs/control.md).
+# (docs/explanation/control.md).
 TOO_TIGHT_UM_PER_S = 0.4
 
 # A warning stands until the leak is clearly above the limit again.

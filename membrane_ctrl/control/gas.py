@@ -1,6 +1,6 @@
 """The pump: command for a flow, and the flow a command gives.
 
-    q = q_full (d - dead) / (1 - dead)   while it runs; starts at `start`, stalls below `stall`   (docs/physics.md)
+    q = q_full (d - dead) / (1 - dead)   while it runs; starts at `start`, stalls below `stall`   (docs/explanation/physics.md)
 
 or a measured curve through any number of points, with a second branch for falling commands if there
 is hysteresis.

@@ -95,7 +95,7 @@ class InnerLoop:
             1 / estimator.gain_per_s, lag_s / 3
         )  # a faster one drives a slow pump from limit to limit
         # both poles of the loop, its own and the pump's or a faster one, by what a tick leaves
-        # (docs/estimator.md)
+        # (docs/explanation/estimator.md)
         slow_per_s, fast_per_s = (
             filters.smoothing(tick_s, s) / tick_s for s in (own_s, min(own_s, lag_s))
         )
@@ -237,8 +237,8 @@ class InnerLoop:
         """One tick without control: the integrator is frozen and put out, for it is the mean flow.
 
         Repeating the last reading instead would integrate its error: 5 times the excursion
-        (docs/physics.md). A reading that is there (a pause) is filtered all the same, so that the
-        error is the present one.
+        (docs/explanation/physics.md). A reading that is there (a pause) is filtered all the same,
+        so that the error is the present one.
         """
         seen = math.isfinite(given.displacement_um)
         filtered_um = self._filter_reading(given.displacement_um, dt_s) if seen else math.nan

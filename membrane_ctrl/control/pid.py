@@ -249,7 +249,7 @@ class SetpointWeight:
 # frequency.
 
 
-# docs/physics.md, inner loop; the tick itself takes 5 ms from sample to write
+# docs/explanation/physics.md, inner loop; the tick itself takes 5 ms from sample to write
 PUMP_LAG_S = 0.15
 DEAD_S = 0.075 + 0.005
 # Below the corner frequencies of the controller by this factor, L is a double integrator

@@ -83,5 +83,5 @@ def judge_interlock_board(config: Config, board: BenchIdentity, say: ConfigFindi
             not old and not stops,
             field,
             why,
-            "set the input as fitted in the board's settings (docs/board.md)",
+            "set the input as fitted in the board's settings (docs/how-to/board.md)",
         )

@@ -16,7 +16,7 @@ from membrane_ctrl.controller import pump_obeys, safety
 Severity = Literal["error", "warning"]
 
 _MS_MOST, _MS_WARN = 3.0, 1.8  # peak sensitivity: 3 leaves a phase margin of 19 deg
-_BAROMETER_UM_PER_PA, _TEMPERATURE_UM_PER_K = -0.358, 123.0  # docs/physics.md
+_BAROMETER_UM_PER_PA, _TEMPERATURE_UM_PER_K = -0.358, 123.0  # docs/explanation/physics.md
 _FEEDFORWARD_MOST = 2.0  # times the physical gain: beyond, feed-forward is worse than none
 _GAUGE_BLIND_S = 600.0  # a slow, filtered gauge on a calm mirror repeats itself for minutes
 _STORM_PA = 5.0  # effect on the gauge of 250 Pa of weather at once
@@ -197,7 +197,7 @@ def judge_loop(config: Config, say: ConfigFindings) -> None:
     ):
         share, remedy = (
             getattr(loop, name) / nominal,
-            f"physics gives {nominal:g}, see docs/physics.md",
+            f"physics gives {nominal:g}, see docs/explanation/physics.md",
         )
         say.error(
             on and share < 0.0,

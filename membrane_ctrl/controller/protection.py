@@ -2,8 +2,8 @@
 review and tests.
 
 The rules are in `safety.TABLE`. Whichever sensor the loop follows, for each `Duty` and `Activity`
-at least one rule or guard exists; tests check that. `docs/faults.md` shows the table, and the
-campaign measures the bounds (`docs/protection.md`).
+at least one rule or guard exists; tests check that. `docs/reference/faults.md` shows the table, and
+the campaign measures the bounds (`docs/measurements/protection.md`).
 """
 
 from collections.abc import Mapping

@@ -1,5 +1,5 @@
-"""The safety table: turns a tick's observation into a verdict. No I/O, no clock. docs/faults.md is
-made from it.
+"""The safety table: turns a tick's observation into a verdict. No I/O, no clock.
+docs/reference/faults.md is made from it.
 
 `Observation` is what a tick shows. Each `Rule` names a cause, how many of the last ticks must show
 it (N of M), its limit and the safe level it enters. It is judged on every tick in the states where
@@ -319,7 +319,7 @@ TABLE: tuple[Rule, ...] = (
         limit="must be 0",
         safe_level=SafeLevel.PUMP_OFF,
         states=CONNECTED,
-        remedy="read the board's fault bits (docs/registers.md)",
+        remedy="read the board's fault bits (docs/reference/registers.md)",
         seen=lambda o: f"bits {o.board_faults:#x}",
         broken=lambda o, c: o.board_faults != 0,
     ),

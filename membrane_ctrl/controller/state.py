@@ -1,7 +1,7 @@
 """What the controller remembers from tick to tick: one tree of dataclasses, and nothing beside it.
 
 `Controller` works on the tree in place. A snapshot is the tree as JSON (`encode_state`); a
-controller that is made with a decoded snapshot continues to the last bit (docs/replay.md).
+controller that is made with a decoded snapshot continues to the last bit (docs/how-to/replay.md).
 """
 
 import math

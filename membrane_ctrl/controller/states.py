@@ -18,7 +18,8 @@ from membrane_ctrl.model.reason import NO_REASON, Reason, WhyCode, make_reason
 from membrane_ctrl.model.telemetry import SafeLevel, State
 
 _LOCKS_SHOWN = 3  # in the operator's line; the status has all of them
-# by then a pump that was left running has stopped: lag 0.15 s, transport 0.1 s (docs/physics.md)
+# by then a pump that was left running has stopped: lag 0.15 s, transport 0.1 s
+# (docs/explanation/physics.md)
 _PUMP_STANDS_S = 0.5
 _NO_VENT = "no vent is fitted, the leak lowers the mirror"
 _VENTED_S = 900.0  # twice the twin's time from 600 Pa; longer means a shut vent or a wrong gauge

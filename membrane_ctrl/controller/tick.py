@@ -58,7 +58,7 @@ class TickOutputs:
     clear_mask: int = 0
 
 
-# The exact inputs of a tick as bytes, so that a replay gives the same tick (docs/replay.md).
+# The exact inputs of a tick as bytes, so that a replay gives the same tick (docs/how-to/replay.md).
 #
 # A tick is one fixed record and its telemetry row; rare data (commands, ended tasks) precede it as
 # JSON, in pieces. A shape estimate is referred to by its time: the recorder has it from its own

@@ -53,7 +53,8 @@ def doors(
     settings = configured(config)
     if not any(getattr(settings.doors, name) for name in _LIBRARIES):
         raise errors.InputError(
-            "no door to open: add [doors.mqtt], [doors.opcua] or [doors.epics] (docs/doors.md)"
+            "no bridge is configured: add [doors.mqtt], [doors.opcua] or [doors.epics] "
+            "(docs/how-to/bridges.md)"
         )
     asyncio.run(_serve(Door.to(settings, logs, socket)))
 

@@ -138,7 +138,7 @@ _ALARMS_LEAVE_S = 10.0  # the process allows itself 8 s for the last notices
 
 @dataclass(frozen=True, slots=True)
 class Rings:
-    """The shared memory of a run (docs/architecture.md)."""
+    """The shared memory of a run (docs/explanation/architecture.md)."""
 
     telemetry: RingAddress
     events: RingAddress

@@ -1,5 +1,5 @@
-"""Scenarios: what happens to a simulated bench and when, one TOML file each (docs/scenarios.md);
-`twin play`.
+"""Scenarios: what happens to a simulated bench and when, one TOML file each
+(docs/reference/scenarios.md); `twin play`.
 """
 
 from __future__ import annotations

@@ -278,7 +278,10 @@ async def _identify(
         faults = reading.latched_faults
         if not faults:
             return BoardAtStart()
-        what = f"{devices.name}: the board has latched faults {faults:#x} (docs/registers.md)"
+        what = (
+            f"{devices.name}: the board has latched faults {faults:#x} "
+            "(docs/reference/registers.md)"
+        )
         # the last controller was killed, and nothing else happened if no other fault is latched and
         # nobody vented
         vented = reading.vent_fraction > safe_levels.VENTED_FRACTION

@@ -26,7 +26,7 @@ Rings = Mapping[str, ring.RingWriter]
 Alter = Callable[[float, roles.BenchReading], roles.BenchReading | None]
 ShapeSource = Callable[[float], shape_estimate.ShapeEstimate | None]
 # Change of sag of a cycle of rendered full-size frames at 50 Hz in typical weather: 0.007 µm
-# (docs/control.md).
+# (docs/explanation/control.md).
 SAG_SIGMA_UM = 0.01
 EXPOSURES_S = 0.9  # first to last frame of that cycle, over which the laser's readings are averaged
 

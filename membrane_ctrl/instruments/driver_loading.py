@@ -28,7 +28,8 @@ def check_settings(section: Any, where: str, kind: drivers.DriverKind) -> settin
     expected = getattr(_load_driver(section, where, kind), "Settings", None)
     if not (isinstance(expected, type) and issubclass(expected, settings.Section)):
         raise InputError(
-            f"{where}: the {kind.name} {section.name} has no class Settings (docs/new-device.md)"
+            f"{where}: the {kind.name} {section.name} has no class Settings "
+            "(docs/how-to/new-device.md)"
         )
     return toml_file.parse(section.keys, expected, where)
 

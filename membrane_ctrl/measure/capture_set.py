@@ -1,5 +1,5 @@
-"""Capture sets on disk (docs/interfaces.md, section 3): `capture.toml` and one image per frame,
-read and checked.
+"""Capture sets on disk (docs/reference/interfaces.md, section 3): `capture.toml` and one image per
+frame, read and checked.
 
 An invalid description of a set is an InputError. Defects of single frames (missing, unreadable,
 different size or depth) are kept beside the frames: the measurement decides whether it can do

@@ -1,5 +1,5 @@
 """The command `export-figure`: a measured height map in the formats of other programs
-(docs/figure.md).
+(docs/reference/figure.md).
 
 Rows of these formats start at the top, +y; a viewer in front of the mirror sees +x on the right.
 High is towards +z.

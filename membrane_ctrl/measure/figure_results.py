@@ -91,7 +91,7 @@ def figure_table(
     measurement: Measurement, found: MeasuredFigure, bars: ErrorBars
 ) -> dict[str, Any]:
     """The block `figure`: every number with 1 sigma from noise and from the geometry
-    (docs/figure.md).
+    (docs/reference/figure.md).
     """
     numbers = {
         name: quantity(

@@ -1,5 +1,5 @@
-"""The files written by `measure`: `result.json` and `height.npz` (docs/interfaces.md), and
-`details.json`.
+"""The files written by `measure`: `result.json` and `height.npz` (docs/reference/interfaces.md),
+and `details.json`.
 """
 
 from __future__ import annotations

@@ -1,5 +1,5 @@
-"""The `track` command: the figure of every frame of a crossed pattern (docs/interfaces.md, section
-3b).
+"""The `track` command: the figure of every frame of a crossed pattern
+(docs/reference/interfaces.md, section 3b).
 """
 
 import json

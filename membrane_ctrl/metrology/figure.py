@@ -53,7 +53,8 @@ class SurfaceMap:
 
 @dataclass(frozen=True)
 class Quantities:
-    """Numbers of a figure; NaN where the surface has none. docs/figure.md defines them."""
+    """Numbers of a figure; NaN where the surface has none. docs/reference/figure.md defines
+    them."""
 
     radius_of_curvature_mm: float
     focal_length_mm: float  # half of it

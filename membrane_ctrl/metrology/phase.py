@@ -137,8 +137,8 @@ def absolute_phase(wrapped_rad: FloatArray, k1: IntArray, k2: IntArray) -> Float
     return wrapped_rad + 2 * math.pi * order
 
 
-# Frames of other benches (docs/library.md): fringes of several periods, and fringes of both axes in
-# one frame.
+# Frames of other benches (docs/how-to/library.md): fringes of several periods, and fringes of both
+# axes in one frame.
 
 
 @dataclass(frozen=True)

@@ -1,7 +1,8 @@
 """On which processor and with which libraries numbers are computed: their last bits depend on it.
 
 The same program gives the same bits on the same processor with the same libraries. Elsewhere the
-order of a sum in the linear algebra, or the last bit of a sine, may be another (docs/replay.md).
+order of a sum in the linear algebra, or the last bit of a sine, may be another
+(docs/how-to/replay.md).
 """
 
 import platform

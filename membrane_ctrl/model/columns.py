@@ -4,7 +4,8 @@ descriptions.
 Each field of `ColumnValues` is a column, and its `column(...)` is the column's row of the table. To
 add a column, add a field here, and its value where the controller makes the row
 (`controller/scene.py`). The recording, the run's tables, the viewer's plots, page, console, `ctl
-status`, bridges, report, Grafana dashboard and docs/telemetry.md are made from this table.
+status`, bridges, report, Grafana dashboard and docs/reference/telemetry.md are made from this
+table.
 
 An identifier ends in its unit (`error_um`), people read the unit as usual (µm): `unit_of` gives one
 for the other.
@@ -509,7 +510,7 @@ class ColumnValues:
         "/truth/laser_bias",
         colour=RED,
     )
-    # the estimate of the centre (docs/estimator.md), which is then the process value
+    # the estimate of the centre (docs/explanation/estimator.md), which is then the process value
     estimate_sigma_um: float = column(
         "estimate of the centre, 1 σ",
         "standard deviation of the estimate; missing where the laser is held",

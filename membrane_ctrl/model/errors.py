@@ -1,4 +1,4 @@
-"""Errors that end a command with one line and an exit code (docs/interfaces.md)."""
+"""Errors that end a command with one line and an exit code (docs/reference/interfaces.md)."""
 
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager

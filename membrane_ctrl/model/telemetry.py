@@ -18,7 +18,7 @@ from membrane_ctrl.model.columns import COLUMNS, ColumnValues
 
 
 class State(IntEnum):
-    """States of the controller (docs/architecture.md)."""
+    """States of the controller (docs/explanation/architecture.md)."""
 
     STANDBY = 0
     CHECK = 1
@@ -96,8 +96,8 @@ ROW_BYTES = _STRUCT.size
 
 
 # A mirror counts as settled this long after hold began and after each setpoint ramp: three
-# closed-loop time constants of 1.45 s (docs/physics.md, inner loop) leave 5 % of a step, of which
-# the `settle` state has
+# closed-loop time constants of 1.45 s (docs/explanation/physics.md, inner loop) leave 5 % of a
+# step, of which the `settle` state has
 # already taken most.
 SETTLED_AFTER_S = 5.0
 

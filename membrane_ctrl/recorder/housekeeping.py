@@ -167,7 +167,8 @@ class Optimizer:
 # Counting the bytes of a hundred runs keeps the disk busy for a second.
 RETENTION_INTERVAL_S = 3600.0
 # At the run's end a person waits for the prompt, and a service manager is about to kill remaining
-# processes. A one-hour segment takes longer only on a very busy machine (docs/recording.md).
+# processes. A one-hour segment takes longer only on a very busy machine
+# (docs/reference/recording.md).
 _OPTIMISE_LAST_S = 20.0
 _LOOK_S = 0.05
 _RUN = "retention: "  # followed by the run that cannot be deleted

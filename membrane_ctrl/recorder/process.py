@@ -144,7 +144,7 @@ class Thumbnail:
 
 
 # Raw frames would be 1.7 TB a day; eight thumbnails every half minute are about 0.2 GB (no video:
-# docs/recording.md).
+# docs/reference/recording.md).
 THUMBNAIL_INTERVAL_S = 30.0
 THUMBNAIL_HEIGHT_PX = 256
 _JPEG_QUALITY = 80

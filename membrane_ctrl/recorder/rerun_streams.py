@@ -55,7 +55,7 @@ def send_events(recording: sink.Recording, events: Sequence[EventLine]) -> None:
 
 
 # Fewer rows for the viewer while nothing happens; every tick is in the other files
-# (docs/recording.md).
+# (docs/reference/recording.md).
 
 
 # Every tick is recorded around a change of these, and while the error is outside the band.

@@ -1,4 +1,4 @@
-"""The controller's inputs, tick by tick, for a replay (docs/replay.md)."""
+"""The controller's inputs, tick by tick, for a replay (docs/how-to/replay.md)."""
 
 from __future__ import annotations
 

@@ -19,7 +19,7 @@ from membrane_ctrl.model import errors, events, files, plain_json, program, run_
 from membrane_ctrl.run_files import run_head
 
 # The folder of a run: `logs/<UTC time>-<name>/` with the configuration as it ran
-# (docs/interfaces.md).
+# (docs/reference/interfaces.md).
 
 
 CONFIG = "config.toml"

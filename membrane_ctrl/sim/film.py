@@ -226,7 +226,7 @@ REFERENCE_K = 296.15  # 23 deg C, the standard laboratory atmosphere (ISO 291); 
 JOULE_PER_ML = (
     STANDARD_AMBIENT_PA + NOMINAL_PRESSURE_PA
 ) * 1e-6  # P V of a reference mL at 23 deg C
-GAS_FOLLOWS_AIR_S = 12.0  # through 10 µm of PET (docs/physics.md, estimate)
+GAS_FOLLOWS_AIR_S = 12.0  # through 10 µm of PET (docs/explanation/physics.md, estimate)
 
 
 @dataclass(slots=True)

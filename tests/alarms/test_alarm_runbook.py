@@ -15,7 +15,9 @@ from membrane_ctrl.model import run_events
 from membrane_ctrl.model.event_base import KINDS
 from membrane_ctrl.model.notices import NoticeKey, Topic
 
-RUNBOOK = (Path(__file__).parents[2] / "docs" / "operations.md").read_text(encoding="utf-8")
+RUNBOOK = (Path(__file__).parents[2] / "docs" / "how-to" / "operations.md").read_text(
+    encoding="utf-8"
+)
 SOURCES = "".join(path.read_text(encoding="utf-8") for path in Path(*alarms.__path__).glob("*.py"))
 BY_SUBJECT = {Topic.CHILD, Topic.MAINTENANCE}  # named by their subjects
 OF_EVENTS = {

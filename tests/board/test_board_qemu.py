@@ -1,8 +1,8 @@
 """The firmware on an emulated Cortex-M3: it conforms, and stops the pump when processor, code,
 memory or line fail.
 
-The emulator has no brown-out and no real time: docs/board.md has the times, and here only the order
-of events counts.
+The emulator has no brown-out and no real time: docs/how-to/board.md has the times, and here only
+the order of events counts.
 """
 
 from __future__ import annotations

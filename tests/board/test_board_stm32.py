@@ -3,7 +3,7 @@ sensor.
 
 QEMU (netduinoplus2) has the processor, its UARTs, timers and interrupts. It has neither clock tree,
 pins, DMA, watchdog nor brown-out: what depends on them was not run anywhere
-(docs/board-hardware.md).
+(docs/how-to/board-hardware.md).
 """
 
 from __future__ import annotations

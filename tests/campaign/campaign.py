@@ -1,5 +1,5 @@
 """The whole fault campaign: every fault x every situation x seeds, and the stories; writes
-docs/fault-matrix.md.
+docs/measurements/fault-matrix.md.
 
 python tests/campaign/campaign.py                        # all, 2 processes, and the document
 python tests/campaign/campaign.py --only "no light" --situation hold --seed 3    # one run again
@@ -36,7 +36,7 @@ from membrane_ctrl.model.telemetry import SafeLevel, State
 
 SEEDS = range(1, 5)
 _BEGIN, _END = "## With real processes\n", "<!-- end of the part with real processes -->"
-DOCUMENT = Path(__file__).parents[2] / "docs" / "fault-matrix.md"
+DOCUMENT = Path(__file__).parents[2] / "docs" / "measurements" / "fault-matrix.md"
 _BY_NAME = {case.name: case for case in CASES}
 _AT = {at.name: at for at in SITUATIONS}
 STORIES = (

@@ -1,7 +1,7 @@
 """The protection campaign: every cell of the protection table with every failure, and pairs of
 failures.
 
-python tests/campaign/protection_campaign.py                  # all that is not done yet, and docs/protection.md
+python tests/campaign/protection_campaign.py                  # all that is not done yet, and docs/measurements/protection.md
 python tests/campaign/protection_campaign.py --only "optics drifts" --value estimate    # some cells, printed
 python tests/campaign/protection_campaign.py --fresh          # forgets what is done
 """  # noqa: E501

@@ -1,5 +1,5 @@
-"""docs/sensor-faults.md: every sensor, every failure, what notices it and what the true mirror
-does.
+"""docs/measurements/sensor-faults.md: every sensor, every failure, what notices it and what the
+true mirror does.
 
     python tests/campaign/sensor_faults_page.py [--results FILE]
 
@@ -24,7 +24,7 @@ from sensor_quiet import QuietHours, quiet_hours
 
 from membrane_ctrl.model.telemetry import State
 
-PAGE = Path(__file__).parents[2] / "docs" / "sensor-faults.md"
+PAGE = Path(__file__).parents[2] / "docs" / "measurements" / "sensor-faults.md"
 SEED = 1
 NIGHTS, HOURS = 56, 3.0
 INTRODUCTION = """

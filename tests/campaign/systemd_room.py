@@ -163,7 +163,7 @@ class Room:
 
 @contextmanager
 def systemd_room(folder: Path) -> Iterator[Room]:
-    """A room with everything installed as docs/operations.md says, and a twin to start."""
+    """A room with everything installed as docs/how-to/operations.md says, and a twin to start."""
     environment = os.environ | {
         "ROOM": str(folder),
         "ROOM_PYTHON": sys.base_prefix,

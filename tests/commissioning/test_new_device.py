@@ -342,7 +342,7 @@ def test_nothing_is_overwritten(tmp_path: Path, capsys: pytest.CaptureFixture[st
     "role", ["displacement", "gauge_pressure", "pump", "thermometer", "camera", "screen"]
 )
 def test_a_newcomer_installs_types_and_holds(role: str, tmp_path: Path) -> None:
-    """docs/new-device.md, in an environment and a folder of its own."""
+    """docs/how-to/new-device.md, in an environment and a folder of its own."""
     tool(sys.executable, "-m", "venv", "--without-pip", tmp_path / "venv", cwd=tmp_path)
     python = tmp_path / "venv" / "bin" / "python"
     (packages,) = (tmp_path / "venv").glob("lib/*/site-packages")

@@ -1,4 +1,4 @@
-"""docs/configuration.md is what the schema makes of it."""
+"""docs/reference/configuration.md is what the schema makes of it."""
 
 from pathlib import Path
 
@@ -6,5 +6,5 @@ from membrane_ctrl.config import reference
 
 
 def test_the_page_is_up_to_date() -> None:
-    page = Path(__file__).parents[2] / "docs" / "configuration.md"
+    page = Path(__file__).parents[2] / "docs" / "reference" / "configuration.md"
     assert page.read_text() == reference.page(), "run make generate"

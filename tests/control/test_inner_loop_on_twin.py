@@ -1,6 +1,6 @@
 """The inner loop on the twin: what the mirror's centre truly does, in virtual time.
 
-The bounds are the project's requirements; docs/control.md has the achieved figures.
+The bounds are the project's requirements; docs/explanation/control.md has the achieved figures.
 """
 
 from __future__ import annotations

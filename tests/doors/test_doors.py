@@ -28,7 +28,7 @@ from membrane_ctrl.model.zernike_terms import ZERNIKE_TERMS
 from membrane_ctrl.web.feed import HoldFeed, HoldSeen
 from tests.control_port.port_run import port_run
 
-PAGE = Path(__file__).parents[2] / "docs" / "doors.md"
+PAGE = Path(__file__).parents[2] / "docs" / "how-to" / "bridges.md"
 STRANGE_NUMBERS = (
     "1,000",
     "1_0",

@@ -1,7 +1,8 @@
 """Two programs and one board: only the holder of the claim moves gas, anybody may stop it, and each
 sees why.
 
-The other program is a plain pymodbus client that knows docs/registers.md and nothing of our driver.
+The other program is a plain pymodbus client that knows docs/reference/registers.md and nothing of
+our driver.
 """
 
 from __future__ import annotations

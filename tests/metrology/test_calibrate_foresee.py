@@ -10,7 +10,7 @@ from membrane_ctrl.metrology.calibrate.parameters import sigmas
 from membrane_ctrl.metrology.calibrate.propagate import foresee
 
 
-# docs/calibration.md: claims of calibrations of the twin's film, sag and figure in µm
+# docs/how-to/calibration.md: claims of calibrations of the twin's film, sag and figure in µm
 @pytest.mark.parametrize(("range_mm", "sag_um", "figure_um"), [(8.0, 4.2, 1.0), (2.0, 8.4, 2.0)])
 def test_it_is_what_sets_of_a_mounted_film_claim(
     range_mm: float, sag_um: float, figure_um: float

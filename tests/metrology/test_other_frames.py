@@ -90,7 +90,7 @@ def test_the_example_of_the_page_measures_another_bench() -> None:
     """A camera and a screen side by side before a 1.7 m sphere; fringes of two periods in five
     steps.
     """
-    text = (Path(__file__).parents[2] / "docs" / "library.md").read_text()
+    text = (Path(__file__).parents[2] / "docs" / "how-to" / "library.md").read_text()
     code = re.findall("```python\n(.*?)```", text, re.S)
     camera, screen = np.array([120.0, 30.0, 1650.0]), np.array([-140.0, 10.0, 1700.0])
     forward = -camera / np.linalg.norm(camera)

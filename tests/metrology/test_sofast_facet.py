@@ -1,5 +1,5 @@
-"""The real facet beside the golden result of its own tool (docs/real-facet.md explains every
-figure).
+"""The real facet beside the golden result of its own tool (docs/measurements/real-facet.md explains
+every figure).
 """
 
 from itertools import product

@@ -1,5 +1,5 @@
 """Code made wrong on purpose: what do the fast tests notice, what the campaign alone? Writes
-docs/mutants.md.
+docs/measurements/mutants.md.
 
 python tests/mutants/mutants.py                       # all, 2 at a time
 python tests/mutants/mutants.py --only "no wait" "levels"     # those whose words contain one of these
@@ -39,7 +39,7 @@ ROOT = Path(__file__).parents[2]
 LIST = Path(__file__).with_name("mutants.toml")
 SAFETY = ROOT / "membrane_ctrl" / "controller" / "safety.py"
 RESULTS = Path(__file__).with_name("results.json")
-DOCUMENT = ROOT / "docs" / "mutants.md"
+DOCUMENT = ROOT / "docs" / "measurements" / "mutants.md"
 PRODUCT = ("membrane_ctrl", "firmware_iface")
 # after the tests that an area names: all fast tests of control and devices
 ALL_FAST = tuple(

@@ -1,4 +1,4 @@
-"""docs/safety-case.md, made from safety_case.toml, the safety table, the tests and the mutants'
+"""docs/reference/safety-case.md, made from safety_case.toml, the safety table, the tests and the mutants'
 results.
 
 python tests/safety_case/safety_case.py            # writes the page
@@ -28,14 +28,15 @@ from membrane_ctrl.controller.protection import Guard  # noqa: E402
 from membrane_ctrl.controller.safety import TABLE, Rule  # noqa: E402
 
 SOURCE = Path(__file__).with_name("safety_case.toml")
-DOCUMENT = ROOT / "docs" / "safety-case.md"
-OPERATIONS = ROOT / "docs" / "operations.md"
+DOCUMENT = ROOT / "docs" / "reference" / "safety-case.md"
+OPERATIONS = ROOT / "docs" / "how-to" / "operations.md"
 _RULES = {rule.name: rule for rule in TABLE}
 
 
 @dataclass(frozen=True)
 class External:
-    """Hardware that the laboratory fits, and the step of docs/operations.md that tests it."""
+    """Hardware that the laboratory fits, and the step of docs/how-to/operations.md that tests
+    it."""
 
     name: str
     step: str
@@ -187,7 +188,8 @@ def _find_gaps_of(constraint: Constraint, case: SafetyCase) -> Iterator[str]:
     for hardware in constraint.external:
         if not re.search(rf"^#+ {re.escape(hardware.step)}$", headings, re.MULTILINE):
             yield (
-                f"{name}: docs/operations.md has no step {hardware.step!r} for the {hardware.name}"
+                f"{name}: docs/how-to/operations.md has no step {hardware.step!r} "
+                f"for the {hardware.name}"
             )
 
 
@@ -213,7 +215,7 @@ ramp down, pump off, vent ([faults](faults.md)). A latched fault needs a person.
 **Numbers** (defaults; `membrane-ctrl config explain limits`): films work at 600 Pa; the controller vents above
 750 Pa, the board at its own limit; displacement limits -2000 and +500 µm. The pump gives 5.3 µm/s or 0.26 Pa/s at
 most, so that 150 Pa take ten minutes; the controller decides within 20 ms to some seconds ([fault
-matrix](fault-matrix.md)), the board's watchdog within 0.5 s.
+matrix](../measurements/fault-matrix.md)), the board's watchdog within 0.5 s.
 
 **What this page does not claim.** No hardware has been driven yet: everything here is proved on simulated benches,
 an emulated board and the board's firmware in an emulator. The relief valve, the emergency stop and the oxygen
@@ -226,15 +228,15 @@ rule is tested, not that it suffices.
 - *Bench with a pump board.* On a bench of single instruments nothing stops the pump if the computer fails: C12, and
   the board's part of C1, C2 and C5, do not hold there. Fit a board, or hardware that cuts the pump's power.
 - *One gauge* serves the controller and the board (C1, C2): the relief valve is the independent protection.
-- *Slow drifts* within what a room's climate does are found late (C9; [protection](protection.md) has the distances).
+- *Slow drifts* within what a room's climate does are found late (C9; [protection](../measurements/protection.md) has the distances).
 - *Interlocks*: a welded contact or a short circuit of its wires is not found. *Locks* are known on one machine.
 - *The actuator test* in `check` runs the pump for less than two seconds, with all sensors good.
-- Whoever may reach page, control port or a bridge with the role `operate` may command; [operations](operations.md)
+- Whoever may reach page, control port or a bridge with the role `operate` may command; [operations](../how-to/operations.md)
   has the roles. Locks and interlocks apply to all of them.
 
 **How it is proved.** Each rule has tests, and at least one *mutant*: the rule is removed on purpose, and a test
-must notice ([mutants](mutants.md)). The [fault matrix](fault-matrix.md), [sensor faults](sensor-faults.md) and
-[protection](protection.md) inject failures into a simulated bench and judge its true state.
+must notice ([mutants](../measurements/mutants.md)). The [fault matrix](../measurements/fault-matrix.md), [sensor faults](../measurements/sensor-faults.md) and
+[protection](../measurements/protection.md) inject failures into a simulated bench and judge its true state.
 """  # noqa: E501
 
 
@@ -257,6 +259,10 @@ def make_page(case: SafetyCase) -> str:
     for constraint in case.constraints:
         lines += _describe(constraint)
     return "\n".join(lines).rstrip("\n") + "\n"
+
+
+def _link_to_step(step: str) -> str:
+    return f"../how-to/operations.md#{step.lower().replace(' ', '-')}"
 
 
 def _describe(constraint: Constraint) -> list[str]:
@@ -290,7 +296,7 @@ def _describe(constraint: Constraint) -> list[str]:
     ]
     lines += [
         f"| external: {hardware.name} | fitted by the laboratory | commissioning step "
-        f"[{hardware.step}](operations.md#{hardware.step.lower().replace(' ', '-')}) | - |"
+        f"[{hardware.step}]({_link_to_step(hardware.step)}) | - |"
         for hardware in constraint.external
     ]
     return [*lines, ""]
@@ -315,7 +321,7 @@ def main(arguments: list[str] | None = None) -> int:
     if not check:
         DOCUMENT.write_text(page, encoding="utf-8")
     elif not DOCUMENT.exists() or DOCUMENT.read_text(encoding="utf-8") != page:
-        gaps.append("docs/safety-case.md is out of date")
+        gaps.append("docs/reference/safety-case.md is out of date")
         print(gaps[-1], file=sys.stderr)
     return int(bool(gaps))
 

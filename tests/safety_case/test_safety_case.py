@@ -45,7 +45,7 @@ def test_a_hazard_that_no_constraint_prevents_is_open() -> None:
         ),
         (
             Constraint("C99", ["H1"], "", "", external=[External("net", "No such step")]),
-            "C99: docs/operations.md has no step 'No such step' for the net",
+            "C99: docs/how-to/operations.md has no step 'No such step' for the net",
         ),
     ],
 )

@@ -1,4 +1,4 @@
-"""docs/events.md, made from the classes of events: `python -m
+"""docs/reference/events.md, made from the classes of events: `python -m
 tests.support.events_page [--check]`.
 """
 
@@ -15,7 +15,7 @@ from membrane_ctrl.model import events, run_events
 from membrane_ctrl.model.event_base import KINDS, Event
 from membrane_ctrl.model.notices import NoticeKey, Topic
 
-PAGE = Path(__file__).parents[2] / "docs" / "events.md"
+PAGE = Path(__file__).parents[2] / "docs" / "reference" / "events.md"
 _NOT_RECORDED = frozenset({"alive"})  # between processes only
 _TYPES = {
     str: "text",
@@ -34,7 +34,7 @@ one, or its keys. The sentence is what console, page, timeline, report and alarm
 out if one of its keys has no value.
 
 *Notice*: the alarm that the event raises (+) or ends (-); some kinds do either, depending on their keys. Displays
-list a notice until it ends. [Operations](operations.md) has what to do about each.""".splitlines()  # noqa: E501
+list a notice until it ends. [Operations](../how-to/operations.md) has what to do about each.""".splitlines()  # noqa: E501
 
 
 def events_page() -> str:

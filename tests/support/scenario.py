@@ -1,4 +1,4 @@
-"""Expected outcomes of scenario files (docs/scenarios.md), and whether they came."""
+"""Expected outcomes of scenario files (docs/reference/scenarios.md), and whether they came."""
 
 from __future__ import annotations
 

@@ -4,8 +4,8 @@ constant.
 A small step of the setpoint moves the sag by a known amount: the change of the Zernike vector over
 it is the sensitivity. Sag by deflectometry less the laser's reading is, while the mirror is held,
 the deflectometry's noise and the drift between the two: white noise of sigma a cycle of length T,
-and a random walk of q µm/sqrt(s). The best time constant between them is (docs/physics.md, shape
-loop)
+and a random walk of q µm/sqrt(s). The best time constant between them is
+(docs/explanation/physics.md, shape loop)
 
     tau = sigma sqrt(T) / q.
 """

@@ -1,4 +1,4 @@
-/* The board between two requests: claim, watchdog, latched faults, outputs. docs/firmware.md says what it must do. */
+/* The board between two requests: claim, watchdog, latched faults, outputs. docs/reference/firmware.md says what it must do. */
 #ifndef MEMBRANE_BOARD_STATE_H
 #define MEMBRANE_BOARD_STATE_H
 

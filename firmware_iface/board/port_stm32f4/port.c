@@ -1,4 +1,4 @@
-/* The hardware layer on an STM32F446 or STM32F405 with a crystal or clock of 8 MHz. docs/board-hardware.md has the pins.
+/* The hardware layer on an STM32F446 or STM32F405 with a crystal or clock of 8 MHz. docs/how-to/board-hardware.md has the pins.
  * Not run on silicon; see that page for what was run in QEMU. */
 #include "board.h"
 #include "hal.h"

@@ -1,3 +1,3 @@
 """The mirror calibrates its own optics: one geometry for many sets of different sag
-(docs/calibration.md).
+(docs/how-to/calibration.md).
 """

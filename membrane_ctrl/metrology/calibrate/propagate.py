@@ -206,8 +206,8 @@ def _effect(
 #
 # Rays are followed from a bowl at each depth to the screen, and the problem is solved from there.
 # Its solution is the bowl itself, and its covariance is within a tenth of that claimed by sets of a
-# mounted film (docs/calibration.md). The bowl has the figure of a film that is clamped by hand: a
-# smooth one
+# mounted film (docs/how-to/calibration.md). The bowl has the figure of a film that is clamped by
+# hand: a smooth one
 # would claim a fifth more.
 
 _MOUNTED_MM = np.zeros(PARAMETERS)

@@ -1,4 +1,5 @@
-"""Camera and screen in world coordinates: the one form that the code uses (docs/interfaces.md).
+"""Camera and screen in world coordinates: the one form that the code uses
+(docs/reference/interfaces.md).
 
 The short form is converted to it on loading. With the camera at F = a (cos alpha, 0, sin alpha)
 looking at O without roll, image down is world -y, forward is -F / a, and image right is the unit

@@ -1,1 +1,1 @@
-"""The figure from every frame of a crossed pattern that stands still (docs/tracking.md)."""
+"""The figure from every frame of a crossed pattern that stands still (docs/how-to/tracking.md)."""

@@ -275,7 +275,7 @@ _THIN = (
 # Every hold waits a few seconds for its first cycles.
 _TRACKING_LEAST = 0.8
 _UNTRACKED_MOST_S = 60.0
-# Below this a one-sided pump loses the band (docs/physics.md).
+# Below this a one-sided pump loses the band (docs/explanation/physics.md).
 _LEAK_LEAST_UM_PER_S = 0.4
 # A one-sided pump is at 0 now and then in typical weather (2 % on the twin).
 _SATURATED_MOST = 0.05

@@ -289,7 +289,8 @@ def _hold_s(run: Run) -> float:
 
 
 _DATASET = "runs"
-# Property of a recording to its heading; the properties are an interface (docs/interfaces.md).
+# Property of a recording to its heading; the properties are an interface
+# (docs/reference/interfaces.md).
 PROPERTIES = {
     "started_utc": "started, UTC",
     "duration_s": "length, s",

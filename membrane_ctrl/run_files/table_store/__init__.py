@@ -1,3 +1,3 @@
 """Tables of a run: Parquet parts that any program reads, and a journal of the newest rows
-(docs/recording.md).
+(docs/reference/recording.md).
 """

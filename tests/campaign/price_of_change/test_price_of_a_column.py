@@ -119,8 +119,11 @@ def test_bridges_and_metrics_have_it(shown: dict[str, Any]) -> None:
 
 def test_documents_and_dashboard_have_it(source: ChangedSource) -> None:
     source.run_python("-m", "tests.support.telemetry_pages")
-    assert f"| `{COLUMN}` | °C | {LABEL} |" in (source.folder / "docs" / "telemetry.md").read_text()
-    assert f"| `{COLUMN}` | °C |" in (source.folder / "docs" / "doors.md").read_text()
+    assert (
+        f"| `{COLUMN}` | °C | {LABEL} |"
+        in (source.folder / "docs" / "reference" / "telemetry.md").read_text()
+    )
+    assert f"| `{COLUMN}` | °C |" in (source.folder / "docs" / "how-to" / "bridges.md").read_text()
     assert (
         f"membrane_{COLUMN}{{"
         in (source.folder / "membrane_ctrl" / "examples" / "grafana.json").read_text()

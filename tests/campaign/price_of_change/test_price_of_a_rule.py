@@ -75,10 +75,13 @@ def test_it_trips_and_its_event_has_the_sentence_of_every_fault(shown: dict[str,
 
 def test_the_pages_have_it(source: ChangedSource) -> None:
     source.run_python("-m", "tests.support.faults_page")
-    assert f"| 27 | `{RULE}` | {CAUSE} |" in (source.folder / "docs" / "faults.md").read_text()
+    assert (
+        f"| 27 | `{RULE}` | {CAUSE} |"
+        in (source.folder / "docs" / "reference" / "faults.md").read_text()
+    )
     assert (
         f"| 27 `{RULE}` | {CAUSE} | {REMEDY} |"
-        in (source.folder / "docs" / "operations.md").read_text()
+        in (source.folder / "docs" / "how-to" / "operations.md").read_text()
     )
 
 

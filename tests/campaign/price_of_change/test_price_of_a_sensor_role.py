@@ -113,6 +113,12 @@ def test_a_driver_for_it_is_written(source: ChangedSource) -> None:
 def test_documents_have_it(source: ChangedSource) -> None:
     source.run_python("-m", "tests.support.telemetry_pages")
     source.run_python("-m", "tests.support.faults_page")
-    assert f"| `{FIELD}` | Pa | {LABEL} |" in (source.folder / "docs" / "telemetry.md").read_text()
-    assert "| 70 | `gauges_apart` |" in (source.folder / "docs" / "faults.md").read_text()
+    assert (
+        f"| `{FIELD}` | Pa | {LABEL} |"
+        in (source.folder / "docs" / "reference" / "telemetry.md").read_text()
+    )
+    assert (
+        "| 70 | `gauges_apart` |"
+        in (source.folder / "docs" / "reference" / "faults.md").read_text()
+    )
     assert f"[devices.{ROLE}]" in source.run_program("config", "reference")

@@ -81,7 +81,7 @@ def test_white_black_and_what_is_not_the_film(clean_optics: OpticsConfig, film: 
     np.testing.assert_allclose(white[on], 0.9, atol=1e-5)
     np.testing.assert_allclose(black[on], 0.1 + 0.05 * 0.8, atol=1e-5)
     np.testing.assert_allclose(white[beside], 0.1, atol=1e-5)
-    assert 0.45 < on.mean() < 0.5  # docs/physics.md: 2.16 M of 5 M pixels inside 475 mm
+    assert 0.45 < on.mean() < 0.5  # docs/explanation/physics.md: 2.16 M of 5 M pixels inside 475 mm
 
 
 def test_beyond_the_pattern_region_the_screen_is_dark(clean_optics: OpticsConfig) -> None:
