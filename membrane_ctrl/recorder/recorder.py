@@ -2,116 +2,29 @@
 silently.
 """
 
-import contextlib
-import json
-import math
-from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
 
 from membrane_ctrl.config.schema import Config
 from membrane_ctrl.controller.tick import TickAssembler
-from membrane_ctrl.model import files, object_codec, plain_json, run_events, shape_estimate
+from membrane_ctrl.model import files, plain_json, run_events, shape_estimate
 from membrane_ctrl.model.clock import RunClock
 from membrane_ctrl.model.events import Event, EventLine
 from membrane_ctrl.model.run_status import RunStatus
 from membrane_ctrl.processes.ring import RingReader
 from membrane_ctrl.recorder import blueprint, housekeeping, rerun_output, sink
+from membrane_ctrl.recorder.feed import Feed
+from membrane_ctrl.recorder.handover import (
+    RecorderState,
+    load_state,
+    remove_state,
+    save_state,
+)
 from membrane_ctrl.recorder.process import Thumbnail, Thumbnails
-from membrane_ctrl.run_files import levels, run_folder
+from membrane_ctrl.run_files import run_folder
 from membrane_ctrl.run_files.disk_budget import DetailLevel
 from membrane_ctrl.run_files.run_tables import RunTables
 from membrane_ctrl.run_files.summary import Summary
-
-# A ring as the recorder reads it: each message once, even when a new recorder continues after a
-# killed one.
-
-
-class Feed:
-    """Counts messages from the ring's first one, and skips those that an earlier recorder has
-    written to disk.
-
-    The reader is fresh: it starts at the oldest message still in the ring. `position` messages are
-    recorded or lost, `dropped` of them overwritten before any recorder got to them.
-    """
-
-    def __init__(self, reader: RingReader, position: int = 0, dropped: int = 0) -> None:
-        self._reader = reader
-        self._end = 0
-        self._lost_by_reader = 0
-        self.position = position
-        self.dropped = dropped
-
-    def drain(self) -> list[bytes]:
-        """Unrecorded messages since the last call."""
-        messages = self._reader.drain()
-        lost = self._reader.dropped - self._lost_by_reader
-        self._lost_by_reader = self._reader.dropped
-        first = self._end + lost
-        self._end = first + len(messages)
-        known = min(max(0, self.position - first), len(messages))
-        self.dropped += max(0, first - self.position) if lost else 0
-        self.position = max(self.position, self._end)
-        return messages[known:]
-
-
-# What a recorder hands to its successor: its progress, and the statistics so far.
-#
-# Plain JSON (`object_codec`), written and read by the same program and removed at the run's end.
-
-
-_NAME = ".recorder-state"
-# usually 0.2 MB; 0.5 MB with all the transitions and faults that a summary lists
-_BYTES_MAX = 16_000_000
-_SPECIALS: object_codec.Specials = {shape_estimate.ShapeEstimate: object_codec.ESTIMATE}
-
-
-@dataclass(slots=True)
-class RecorderState:
-    """The state of a recorder that is not in the run's files."""
-
-    summary: Summary
-    positions: dict[str, int] = field(default_factory=dict)  # per ring: messages recorded or lost
-    dropped: dict[str, int] = field(default_factory=dict)  # per ring: messages lost
-    reference: shape_estimate.ShapeEstimate | None = None  # reference for changes of the figure
-    state: float = math.nan  # of the controller, in the last row
-    windows: levels.OpenWindows = field(default_factory=levels.OpenWindows)
-    errors: int = 0
-    rows_lost: int = 0
-    events_lost: int = 0
-    input_ticks_lost: int = 0
-    folder_anew_s: float | None = None  # when the folder was found removed
-
-
-def save_state(run_dir: Path, state: RecorderState) -> None:
-    """Write the state atomically. Raises OSError.
-
-    Not synced: it serves after a killed recorder, not after a power cut, which also loses the
-    rings.
-    """
-    part = run_dir / f"{_NAME}.part"
-    with files.fresh_file(part) as file:
-        file.write(json.dumps(object_codec.encode(state, _SPECIALS)).encode())
-    files.move(part, run_dir / _NAME)
-
-
-def load_state(run_dir: Path) -> RecorderState | None:
-    """Read the state left behind; None if there is none or it is unreadable."""
-    decoder = object_codec.Decoder((RecorderState(Summary(Config())),), _SPECIALS)
-    try:
-        state = decoder.decode(
-            json.loads(files.read_bytes(run_dir / _NAME, _BYTES_MAX)), RecorderState
-        )
-    except (OSError, ValueError, RecursionError):  # the recorder starts afresh and reports that
-        return None
-    assert isinstance(state, RecorderState)
-    return state
-
-
-def remove_state(run_dir: Path) -> None:
-    """Remove the state file of a finished run."""
-    with contextlib.suppress(OSError):
-        (run_dir / _NAME).unlink(missing_ok=True)
 
 
 class Recorder:

@@ -7,7 +7,7 @@ from collections.abc import Iterator
 import pytest
 
 from membrane_ctrl.processes.ring import RingAddress, RingReader, RingWriter, ring
-from membrane_ctrl.recorder.recorder import Feed
+from membrane_ctrl.recorder.feed import Feed
 
 
 @pytest.fixture

@@ -21,8 +21,9 @@ from membrane_ctrl.model.events import Event
 from membrane_ctrl.model.plain_json import dumps_checked
 from membrane_ctrl.model.shape_estimate import pack_estimate
 from membrane_ctrl.processes.ring import RingAddress, RingReader, RingWriter, ring
+from membrane_ctrl.recorder.handover import load_state, save_state
 from membrane_ctrl.recorder.housekeeping import Optimizer
-from membrane_ctrl.recorder.recorder import Recorder, load_state, save_state
+from membrane_ctrl.recorder.recorder import Recorder
 from membrane_ctrl.recorder.sink import EventsFile, Recording, is_whole
 from membrane_ctrl.run_files.disk_budget import DetailLevel
 from tests.support.rrd_reading import has_footer, reader, recorded_rows, scalars, strings

@@ -29,7 +29,7 @@ from membrane_ctrl.review.report.json import report_table
 from membrane_ctrl.review.statistics.analysis import analyse, fill_short_gaps
 from membrane_ctrl.review.statistics.compare import compare
 from membrane_ctrl.review.statistics.spectra import WithoutFeedforward
-from membrane_ctrl.run_files.summary import HoldParts
+from membrane_ctrl.run_files.hold_parts import HoldParts
 from tests.support.review_runs import same, written
 
 HOURS = 0.5

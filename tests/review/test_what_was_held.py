@@ -18,7 +18,8 @@ from membrane_ctrl.review import open_run
 from membrane_ctrl.review.catalogue import entry
 from membrane_ctrl.review.report.json import report_table
 from membrane_ctrl.review.statistics.analysis import analyse
-from membrane_ctrl.run_files.summary import HoldParts, Summary
+from membrane_ctrl.run_files.hold_parts import HoldParts
+from membrane_ctrl.run_files.summary import Summary
 from tests.support.scenario import CheckedScenario, play
 
 RATE_HZ = 10.0

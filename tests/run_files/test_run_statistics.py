@@ -7,7 +7,7 @@ import math
 import numpy as np
 import pytest
 
-from membrane_ctrl.run_files.summary import LogHistogram, Moments, SecondMeans
+from membrane_ctrl.run_files.run_statistics import LogHistogram, Moments, SecondMeans
 
 
 @pytest.mark.parametrize("batch", [1, 7, 50, 1000])

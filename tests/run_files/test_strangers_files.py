@@ -161,7 +161,7 @@ def test_a_path_that_the_user_named_may_lead_through_links(folder: Path, tmp_pat
 _OWN = {
     # the recorder, and the log of a program beside a hold, in the folder that the run has just made
     "processes/child.py",
-    "recorder/recorder.py",
+    "recorder/handover.py",
     "run_files/table_store/disk.py",
     "run_files/table_store/part_writer.py",
     "recorder/sink.py",

@@ -14,8 +14,9 @@ from membrane_ctrl.model import plain_json
 from membrane_ctrl.model.events import Fault
 from membrane_ctrl.model.object_codec import Decoder, encode
 from membrane_ctrl.model.telemetry import SETTLED_AFTER_S, Rows, State, TelemetryRow, column, unpack
-from membrane_ctrl.recorder.recorder import _SPECIALS
-from membrane_ctrl.run_files.summary import SCHEMA, Summary, held_at
+from membrane_ctrl.recorder.handover import _SPECIALS
+from membrane_ctrl.run_files.hold_parts import held_at
+from membrane_ctrl.run_files.summary import SCHEMA, Summary
 from tests.support.synthetic_run import RATE_HZ, rows_of, shape_of
 
 HOLD_FROM_S = 6.0

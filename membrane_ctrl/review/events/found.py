@@ -8,7 +8,7 @@ from membrane_ctrl.model.arrays import BoolArray
 from membrane_ctrl.model.telemetry import State
 from membrane_ctrl.review.events import laser_and_door as doors
 from membrane_ctrl.review.events import steps
-from membrane_ctrl.run_files import levels, summary
+from membrane_ctrl.run_files import hold_parts, levels
 from membrane_ctrl.run_files.shapes import Shapes
 
 # Columns of the 1 s level used here.
@@ -80,7 +80,7 @@ def find_events(level: steps.Level, shapes: Shapes, band_um: float) -> list[step
         for finder in finders:
             found += finder(even)
         found += steps.excursions(even, band_um, found)
-    found += steps.shape_jumps(shapes, summary.held_at(level, shapes.time_s))
+    found += steps.shape_jumps(shapes, hold_parts.held_at(level, shapes.time_s))
     return sorted(found, key=lambda event: event.time_s)
 
 

@@ -26,7 +26,7 @@ from membrane_ctrl.review.statistics.hold_pass import (
     hold_pass,
 )
 from membrane_ctrl.review.statistics.spectra import WindowStatistics, describe, window_means
-from membrane_ctrl.run_files import summary
+from membrane_ctrl.run_files.hold_parts import held_at
 from membrane_ctrl.run_files.run import Block, Run
 
 WINDOWS_S = (1, 4, 60)
@@ -170,7 +170,7 @@ def _found_and_shape(
     shapes = run.shapes()
     shapes = shapes.select((shapes.time_s >= start_s) & (shapes.time_s < end_s))
     mirror = run.config.optics.mirror
-    held = summary.held_at(seconds, shapes.time_s)
+    held = held_at(seconds, shapes.time_s)
     shape = shape_review.review_shapes(shapes, held, mirror.analysis_radius_mm / mirror.radius_mm)
     return tuple(find_events(seconds, shapes, run.config.limits.band_um)), shape
 

@@ -13,7 +13,7 @@ from membrane_ctrl.model.arrays import BoolArray, Column, IntArray, Singles
 from membrane_ctrl.model.run_status import RunStatus
 from membrane_ctrl.model.telemetry import State
 from membrane_ctrl.review.statistics import spectra
-from membrane_ctrl.run_files import summary
+from membrane_ctrl.run_files import hold_parts, run_statistics
 from membrane_ctrl.run_files.run import Block, Run
 
 # Seconds with incomplete ticks (segments in quiet times), whose means come from the 1 s level.
@@ -25,7 +25,7 @@ class ThinSeconds:
     """Finds thin seconds, over blocks in order of time."""
 
     def __init__(self, rate_hz: float) -> None:
-        self._least = summary.least_ticks(1.0, rate_hz)
+        self._least = run_statistics.least_ticks(1.0, rate_hz)
         self._parts: list[tuple[spectra.Seconds, Column]] = []
 
     def add(self, time_s: Column, setpoint_um: Column, settled: BoolArray) -> None:
@@ -71,7 +71,7 @@ def level_means(run: Run, second: spectra.Seconds, setpoint_um: Column) -> Level
     _, place, row = np.intersect1d(
         second, np.rint(level["time_s"]).astype(np.int32), return_indices=True
     )
-    whole = (level["rows"][row] >= summary.least_ticks(1.0, run.config.loop.rate_hz)) & (
+    whole = (level["rows"][row] >= run_statistics.least_ticks(1.0, run.config.loop.rate_hz)) & (
         level["state"][row] == State.HOLD
     )
     place, row = place[whole], row[whole]
@@ -102,7 +102,7 @@ def filled(seconds: spectra.SecondsOf, means: LevelMeans, error_um: Column) -> s
 
 
 NAMES = (
-    *summary.FIELDS,
+    *hold_parts.FIELDS,
     "truth_displacement_um",
     "feedforward_um_per_s",
     "flow_wanted_um_per_s",
@@ -147,7 +147,7 @@ class HoldPass:
     start_s: float
     end_s: float
     hold_s: float  # time in `hold`
-    settled_s: float  # the settled hold of `summary.HoldParts`
+    settled_s: float  # the settled hold of `hold_parts.HoldParts`
     faults_s: float
     paused_s: float
     moving_s: float  # the setpoint on its way, or not yet settled
@@ -162,12 +162,12 @@ class HoldPass:
     # (`KEPT_AWAY`: of the true
     # centre, if known)
     seconds: tuple[spectra.SecondsOf, spectra.SecondsOf]
-    raw_reading: summary.Moments
-    raw_true: summary.Moments
+    raw_reading: run_statistics.Moments
+    raw_true: run_statistics.Moments
     raw_in_band: float  # share of settled readings within the band
     histogram_um: Column  # edges and counts of the reading error
     histogram_counts: IntArray
-    lateness_ms: summary.LogHistogram
+    lateness_ms: run_statistics.LogHistogram
     pump: PumpActivity
 
 
@@ -204,23 +204,23 @@ class _Collector:
     def __init__(self, run: Run, span_s: tuple[float, float], from_within: bool) -> None:
         loop, self._band_um = run.config.loop, run.config.limits.band_um
         self._period_s = 1 / loop.rate_hz
-        self._parts = summary.HoldParts(self._band_um)
+        self._parts = hold_parts.HoldParts(self._band_um)
         self._without = spectra.WithoutFeedforward(loop.kp_per_s, loop.ti_s, self._period_s)
         self._grid_s = span_s[0]
         size = max(0, math.ceil((span_s[1] - span_s[0]) / self._period_s) + 2)
         self._reading = np.full(size, np.nan, dtype=np.float32)
         self._true = np.full(size, np.nan, dtype=np.float32)
         self._seconds = spectra.SecondSums(2), spectra.SecondSums(2)
-        self._raw_reading, self._raw_true = summary.Moments(), summary.Moments()
+        self._raw_reading, self._raw_true = run_statistics.Moments(), run_statistics.Moments()
         reach_um = _HISTOGRAM_BANDS * self._band_um
         self._edges_um = np.linspace(-reach_um, reach_um, _HISTOGRAM_BINS + 1)
         self._histogram = np.zeros(_HISTOGRAM_BINS, dtype=np.int64)
-        self._lateness = summary.LogHistogram()
+        self._lateness = run_statistics.LogHistogram()
         self._pump = _PumpSums(run)
         self._ticks = self._counted = self._unread = self._inside = 0
         self._times = {
             name: spectra.HeldTime(run.config.recording.quiet_hz)
-            for name in ("hold", *summary.PARTS)
+            for name in ("hold", *hold_parts.PARTS)
         }
         self.thin = ThinSeconds(loop.rate_hz)
         # the running count at the start: for a part that of its first tick, which includes earlier
@@ -309,7 +309,7 @@ class _PumpSums:
 
     def __init__(self, run: Run) -> None:
         self._since_s, self._most_um_per_s = _flow_limits(run)
-        self._fraction = summary.Moments()
+        self._fraction = run_statistics.Moments()
         self._travel = 0.0
         self._starts = self._running = self._saturated = 0
 

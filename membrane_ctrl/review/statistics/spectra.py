@@ -11,7 +11,7 @@ from numba import njit
 from scipy import signal
 
 from membrane_ctrl.model.arrays import AnyArray, BoolArray, Column, IntArray, Singles
-from membrane_ctrl.run_files.summary import least_ticks
+from membrane_ctrl.run_files.run_statistics import least_ticks
 
 # A month has millions: single precision, which counts ticks exactly.
 Seconds = AnyArray

@@ -25,7 +25,7 @@ from membrane_ctrl.review.catalogue import end_s
 from membrane_ctrl.review.events.found import LEVEL_COLUMNS, find_events
 from membrane_ctrl.review.events.steps import FoundEvent
 from membrane_ctrl.review.report.figures import broken_at_gaps
-from membrane_ctrl.run_files import shapes, streams, summary
+from membrane_ctrl.run_files import hold_parts, shapes, streams
 from membrane_ctrl.run_files.run import Block, Run
 
 APPLICATION = "membrane_review"
@@ -138,7 +138,7 @@ class Layer:
             self._ticks(run, part_s)
         self._lanes(level)
         self._events(run, found, part_s)
-        self._figure(cycles.select(summary.held_at(level, cycles.time_s)), part_s)
+        self._figure(cycles.select(hold_parts.held_at(level, cycles.time_s)), part_s)
 
     def _overviews(self, level: Block, band_um: float) -> None:
         for stream in OVERVIEWS:

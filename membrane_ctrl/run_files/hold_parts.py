@@ -1,0 +1,109 @@
+"""What counts as held: in `hold`, the setpoint ramp at its target, no pause, no fault, and that for
+some seconds.
+"""
+
+import math
+from collections.abc import Mapping
+
+import numpy as np
+
+from membrane_ctrl.model import telemetry
+from membrane_ctrl.model.arrays import BoolArray, Column
+
+FIELDS = (
+    "mono_s",
+    "state",
+    "safe_level",
+    "setpoint_um",
+    "trim_um",
+    "target_um",
+    "displacement_um",
+    "error_um",
+    "p_um_per_s",
+)
+PARTS = ("held", "faults", "paused", "moving")
+# The ramp has ended when setpoint minus trim is this near the target; far below the laser's 0.1 µm
+# steps.
+ARRIVED_UM = 0.01
+# A mirror that was let go (a pause, a fault's mean flow) may have strayed: it counts again once it
+# has stayed in the band, and after this time in any case.
+_BACK_WITHIN_S = 60.0
+
+
+class HoldParts:
+    """Parts of a run's ticks, over blocks that come in their order.
+
+    `held` is the settled hold; `faults`: a safe level is in force; `paused`; `moving`: in
+    `hold`, the setpoint on its way, or not yet settled after that or after what let the mirror go.
+    """
+
+    def __init__(self, band_um: float) -> None:
+        self._band_um = band_um
+        self._since_s = math.nan  # last unsettled time; NaN: not in hold
+        self._let_go_s = math.nan  # last moment that nothing held it; NaN: it has been back since
+        self._away_s = math.nan  # last moment that it was outside the band since
+
+    def of(self, block: Mapping[str, Column]) -> dict[str, BoolArray]:
+        """(n,) masks of the next block by the names of `PARTS`; no tick is in two."""
+        time_s, hold = block["mono_s"], block["state"] == telemetry.State.HOLD
+        faults = block["safe_level"] > 0
+        # a loop that follows its error has a proportional part; a lost reading alone is no pause
+        open_loop = (
+            (block["p_um_per_s"] == 0)
+            & (block["error_um"] != 0)
+            & np.isfinite(block["displacement_um"])
+        )
+        paused = hold & ~faults & open_loop
+        ramp_um = block["setpoint_um"] - np.nan_to_num(block["trim_um"]) - block["target_um"]
+        began = hold & ~np.concatenate(([not math.isnan(self._since_s)], hold[:-1]))
+        away = paused | faults | self._straying(block, paused | (faults & hold))
+        marks = np.where(hold & (began | away | ~(np.abs(ramp_um) <= ARRIVED_UM)), time_s, -np.inf)
+        if not math.isnan(self._since_s) and time_s.size and hold[0]:
+            marks[0] = max(marks[0], self._since_s)
+        since_s = np.maximum.accumulate(marks)
+        held = hold & (time_s - since_s >= telemetry.SETTLED_AFTER_S)
+        if time_s.size:
+            self._since_s = float(since_s[-1]) if hold[-1] else math.nan
+        return {
+            "held": held,
+            "faults": faults,
+            "paused": paused,
+            "moving": hold & ~(held | paused | faults),
+        }
+
+    def _straying(self, block: Mapping[str, Column], let_go: BoolArray) -> BoolArray:
+        """(n,) the ticks outside the band from the moment that it is held again until it has stayed
+        inside.
+        """
+        time_s, outside = block["mono_s"], ~(np.abs(block["error_um"]) <= self._band_um)
+        straying = np.zeros(time_s.size, dtype=bool)
+        for first in np.flatnonzero(
+            ~let_go & np.concatenate(([not math.isnan(self._let_go_s)], let_go[:-1]))
+        ):
+            gone_s, away_s = (
+                (time_s[first - 1], time_s[first - 1]) if first else (self._let_go_s, self._away_s)
+            )
+            rows = first + np.flatnonzero((outside & (time_s <= gone_s + _BACK_WITHIN_S))[first:])
+            away = np.append(away_s, time_s[rows])
+            stayed = np.flatnonzero(np.diff(away, append=time_s[-1]) >= telemetry.SETTLED_AFTER_S)
+            count = int(stayed[0]) if stayed.size else rows.size
+            straying[rows[:count]] = True
+            over = stayed.size or time_s[-1] > gone_s + _BACK_WITHIN_S
+            self._let_go_s, self._away_s = (
+                (math.nan, math.nan) if over else (float(gone_s), float(away[count]))
+            )
+        if let_go.size and let_go[-1]:
+            self._let_go_s = self._away_s = float(time_s[-1])
+        return straying
+
+
+def held_at(level: Mapping[str, Column], time_s: Column) -> BoolArray:
+    """(n,) whether the mirror was settled in `hold` at each time, as far as the windows of a level
+    tell.
+    """
+    if not level["time_s"].size:
+        return np.zeros(time_s.size, dtype=bool)
+    place = np.clip(np.searchsorted(level["time_s"], time_s, side="right") - 1, 0, None)
+    hold = level["state"] == telemetry.State.HOLD
+    since_s = np.maximum.accumulate(np.where(hold, -np.inf, np.append(level["time_s"][1:], np.inf)))
+    return np.asarray(hold[place] & (time_s - since_s[place] >= telemetry.SETTLED_AFTER_S))
