@@ -14,7 +14,6 @@ import base64
 import binascii
 import dataclasses
 import json
-import math
 from collections import deque
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
@@ -58,6 +57,7 @@ class ArrayShape:
     Parameters
     ----------
     shape : tuple of int
+        -1 for one axis of any length.
     dtype : str
         As NumPy spells it, little-endian.
     """
@@ -75,7 +75,7 @@ class ArrayShape:
         return core_schema.no_info_plain_validator_function(self._decode, serialization=encoder)
 
     def _encode(self, array: NDArray[Any]) -> str:
-        if array.shape != self.shape or array.dtype != self.dtype:
+        if not self._fits(array.shape) or array.dtype != self.dtype:
             raise ValueError(
                 f"an array {array.dtype.str}{array.shape} where {self.dtype}{self.shape} is "
                 "declared"
@@ -89,9 +89,15 @@ class ArrayShape:
             values = np.frombuffer(base64.b64decode(data, validate=True), dtype=self.dtype)
         except (binascii.Error, ValueError) as error:
             raise ValueError(f"no array: {error}") from None
-        if values.size != math.prod(self.shape):
-            raise ValueError(f"{values.size} numbers where {self.shape} are declared")
-        return values.reshape(self.shape).copy()
+        try:
+            return values.reshape(self.shape).copy()
+        except ValueError:
+            raise ValueError(f"{values.size} numbers where {self.shape} are declared") from None
+
+    def _fits(self, shape: tuple[int, ...]) -> bool:
+        if len(shape) != len(self.shape):
+            return False
+        return all(length in (given, -1) for given, length in zip(shape, self.shape, strict=True))
 
 
 _ADAPTERS: dict[type[StateNode], TypeAdapter[Any]] = {}

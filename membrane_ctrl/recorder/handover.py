@@ -1,39 +1,66 @@
 """What a recorder hands to its successor: its progress, and the statistics so far.
 
-Plain JSON (`object_codec`), written and read by the same program and removed at the run's end.
+A state tree (`model/state_tree.py`) as JSON, written and read by the same program and removed at
+the run's end. Of the event lines in it, NaN becomes null, as in `summary.json`.
 """
 
+import base64
 import contextlib
-import json
 import math
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Annotated
 
-from membrane_ctrl.config.schema import Config
-from membrane_ctrl.model import files, object_codec, shape_estimate
-from membrane_ctrl.run_files import levels
+from pydantic import PlainSerializer, PlainValidator
+
+from membrane_ctrl.model import files
+from membrane_ctrl.model.shape_estimate import ShapeEstimate, pack_estimate, unpack_estimate
+from membrane_ctrl.model.state_tree import (
+    Count,
+    StateError,
+    StateNode,
+    decode_state,
+    encode_state,
+)
+from membrane_ctrl.run_files.levels import OpenWindows
 from membrane_ctrl.run_files.summary import Summary
 
 _NAME = ".recorder-state"
-# usually 0.2 MB; 0.5 MB with all the transitions and faults that a summary lists
+# usually 0.1 MB; 0.5 MB with all the transitions and faults that a summary lists
 _BYTES_MAX = 16_000_000
-_SPECIALS: object_codec.Specials = {shape_estimate.ShapeEstimate: object_codec.ESTIMATE}
+
+
+def _encode_estimate(estimate: ShapeEstimate) -> str:
+    return base64.b64encode(pack_estimate(estimate)).decode()
+
+
+def _decode_estimate(data: object) -> ShapeEstimate:
+    if not isinstance(data, str):
+        raise ValueError("a shape estimate is a text in base64")
+    return unpack_estimate(base64.b64decode(data, validate=True))
+
+
+_StoredEstimate = Annotated[
+    ShapeEstimate,
+    PlainValidator(_decode_estimate),
+    PlainSerializer(_encode_estimate, return_type=str, when_used="json"),
+]
 
 
 @dataclass(slots=True)
-class RecorderState:
+class RecorderState(StateNode):
     """The state of a recorder that is not in the run's files."""
 
     summary: Summary
-    positions: dict[str, int] = field(default_factory=dict)  # per ring: messages recorded or lost
-    dropped: dict[str, int] = field(default_factory=dict)  # per ring: messages lost
-    reference: shape_estimate.ShapeEstimate | None = None  # reference for changes of the figure
+    positions: dict[str, Count] = field(default_factory=dict)  # per ring: messages recorded or lost
+    dropped: dict[str, Count] = field(default_factory=dict)  # per ring: messages lost
+    reference: _StoredEstimate | None = None  # reference for changes of the figure
     state: float = math.nan  # of the controller, in the last row
-    windows: levels.OpenWindows = field(default_factory=levels.OpenWindows)
-    errors: int = 0
-    rows_lost: int = 0
-    events_lost: int = 0
-    input_ticks_lost: int = 0
+    windows: OpenWindows = field(default_factory=OpenWindows)
+    errors: Count = 0
+    rows_lost: Count = 0
+    events_lost: Count = 0
+    input_ticks_lost: Count = 0
     folder_anew_s: float | None = None  # when the folder was found removed
 
 
@@ -45,21 +72,17 @@ def save_state(run_dir: Path, state: RecorderState) -> None:
     """
     part = run_dir / f"{_NAME}.part"
     with files.fresh_file(part) as file:
-        file.write(json.dumps(object_codec.encode(state, _SPECIALS)).encode())
+        file.write(encode_state(state))
     files.move(part, run_dir / _NAME)
 
 
 def load_state(run_dir: Path) -> RecorderState | None:
     """Read the state left behind; None if there is none or it is unreadable."""
-    decoder = object_codec.Decoder((RecorderState(Summary(Config())),), _SPECIALS)
     try:
-        state = decoder.decode(
-            json.loads(files.read_bytes(run_dir / _NAME, _BYTES_MAX)), RecorderState
-        )
-    except (OSError, ValueError, RecursionError):  # the recorder starts afresh and reports that
+        data = files.read_bytes(run_dir / _NAME, _BYTES_MAX)
+        return decode_state(data, RecorderState, _BYTES_MAX)
+    except (OSError, StateError):  # the recorder starts afresh and reports that
         return None
-    assert isinstance(state, RecorderState)
-    return state
 
 
 def remove_state(run_dir: Path) -> None:

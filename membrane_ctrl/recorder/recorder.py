@@ -62,7 +62,7 @@ class Recorder:
         resumes: int = 0,
     ) -> None:
         handed_on = load_state(run_dir) if resumes else None
-        before = handed_on or RecorderState(Summary(config))
+        before = handed_on or RecorderState(Summary.for_config(config))
         self._run_dir = run_dir
         self._config = config
         self._folder = housekeeping.FolderWatch(run_dir)

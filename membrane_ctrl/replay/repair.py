@@ -204,7 +204,7 @@ def _repair_summary(run_dir: Path, in_place: bool) -> FileFinding:
 
 def rebuild_summary(run_dir: Path) -> dict[str, Any]:
     """Rebuild `summary.json` from the files on disk, marked `"rebuilt": true`."""
-    summary = Summary(run_folder.read_config(run_dir, []))
+    summary = Summary.for_config(run_folder.read_config(run_dir, []))
     path = run_dir / "events.jsonl"
     last_s = -np.inf
     for rows in _all_rows(run_dir):

@@ -4,11 +4,13 @@ some seconds.
 
 import math
 from collections.abc import Mapping
+from dataclasses import dataclass
 
 import numpy as np
 
 from membrane_ctrl.model import telemetry
 from membrane_ctrl.model.arrays import BoolArray, Column
+from membrane_ctrl.model.state_tree import StateNode
 
 FIELDS = (
     "mono_s",
@@ -30,18 +32,18 @@ ARRIVED_UM = 0.01
 _BACK_WITHIN_S = 60.0
 
 
-class HoldParts:
+@dataclass(slots=True)
+class HoldParts(StateNode):
     """Parts of a run's ticks, over blocks that come in their order.
 
     `held` is the settled hold; `faults`: a safe level is in force; `paused`; `moving`: in
     `hold`, the setpoint on its way, or not yet settled after that or after what let the mirror go.
     """
 
-    def __init__(self, band_um: float) -> None:
-        self._band_um = band_um
-        self._since_s = math.nan  # last unsettled time; NaN: not in hold
-        self._let_go_s = math.nan  # last moment that nothing held it; NaN: it has been back since
-        self._away_s = math.nan  # last moment that it was outside the band since
+    band_um: float
+    since_s: float = math.nan  # last unsettled time; NaN: not in hold
+    let_go_s: float = math.nan  # last moment that nothing held it; NaN: it has been back since
+    away_s: float = math.nan  # last moment that it was outside the band since
 
     def of(self, block: Mapping[str, Column]) -> dict[str, BoolArray]:
         """(n,) masks of the next block by the names of `PARTS`; no tick is in two."""
@@ -55,15 +57,15 @@ class HoldParts:
         )
         paused = hold & ~faults & open_loop
         ramp_um = block["setpoint_um"] - np.nan_to_num(block["trim_um"]) - block["target_um"]
-        began = hold & ~np.concatenate(([not math.isnan(self._since_s)], hold[:-1]))
+        began = hold & ~np.concatenate(([not math.isnan(self.since_s)], hold[:-1]))
         away = paused | faults | self._straying(block, paused | (faults & hold))
         marks = np.where(hold & (began | away | ~(np.abs(ramp_um) <= ARRIVED_UM)), time_s, -np.inf)
-        if not math.isnan(self._since_s) and time_s.size and hold[0]:
-            marks[0] = max(marks[0], self._since_s)
+        if not math.isnan(self.since_s) and time_s.size and hold[0]:
+            marks[0] = max(marks[0], self.since_s)
         since_s = np.maximum.accumulate(marks)
         held = hold & (time_s - since_s >= telemetry.SETTLED_AFTER_S)
         if time_s.size:
-            self._since_s = float(since_s[-1]) if hold[-1] else math.nan
+            self.since_s = float(since_s[-1]) if hold[-1] else math.nan
         return {
             "held": held,
             "faults": faults,
@@ -75,13 +77,13 @@ class HoldParts:
         """(n,) the ticks outside the band from the moment that it is held again until it has stayed
         inside.
         """
-        time_s, outside = block["mono_s"], ~(np.abs(block["error_um"]) <= self._band_um)
+        time_s, outside = block["mono_s"], ~(np.abs(block["error_um"]) <= self.band_um)
         straying = np.zeros(time_s.size, dtype=bool)
         for first in np.flatnonzero(
-            ~let_go & np.concatenate(([not math.isnan(self._let_go_s)], let_go[:-1]))
+            ~let_go & np.concatenate(([not math.isnan(self.let_go_s)], let_go[:-1]))
         ):
             gone_s, away_s = (
-                (time_s[first - 1], time_s[first - 1]) if first else (self._let_go_s, self._away_s)
+                (time_s[first - 1], time_s[first - 1]) if first else (self.let_go_s, self.away_s)
             )
             rows = first + np.flatnonzero((outside & (time_s <= gone_s + _BACK_WITHIN_S))[first:])
             away = np.append(away_s, time_s[rows])
@@ -89,11 +91,11 @@ class HoldParts:
             count = int(stayed[0]) if stayed.size else rows.size
             straying[rows[:count]] = True
             over = stayed.size or time_s[-1] > gone_s + _BACK_WITHIN_S
-            self._let_go_s, self._away_s = (
+            self.let_go_s, self.away_s = (
                 (math.nan, math.nan) if over else (float(gone_s), float(away[count]))
             )
         if let_go.size and let_go[-1]:
-            self._let_go_s = self._away_s = float(time_s[-1])
+            self.let_go_s = self.away_s = float(time_s[-1])
         return straying
 
 

@@ -8,6 +8,7 @@ A level is a dict of columns: `time_s` (start of the window, a multiple of its l
 
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
+from typing import Annotated
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,6 +16,7 @@ from numpy.typing import NDArray
 from membrane_ctrl.model import telemetry
 from membrane_ctrl.model.arrays import Column
 from membrane_ctrl.model.columns import AGGREGATED, COLUMNS, TRUE_ERROR_COLUMN, Aggregation, Kind
+from membrane_ctrl.model.state_tree import ArrayShape, StateNode
 
 Columns = dict[str, Column]
 
@@ -107,14 +109,34 @@ def _mean(values: Column, weights: Column, starts: NDArray[np.intp]) -> Column:
     return np.where(total > 0, base + summed / np.where(total > 0, total, 1.0), np.nan)
 
 
+_StoredColumns = dict[str, Annotated[Column, ArrayShape((-1,))]]
+
+
+def _no_ticks() -> Columns:
+    return {name: np.empty(0) for name in TICK_FIELDS}
+
+
 @dataclass(slots=True)
-class OpenWindows:
+class OpenWindows(StateNode):
     """Unfinished windows of the overview, which a successor of a dead recorder needs to finish."""
 
-    # rows of the open 1 s window
-    ticks: Columns = field(default_factory=lambda: {name: np.empty(0) for name in TICK_FIELDS})
+    ticks: _StoredColumns = field(default_factory=_no_ticks)  # rows of the open 1 s window
     # by the coarser window in s: rows of the finer level in its open window
-    levels: dict[float, Columns] = field(default_factory=dict)
+    levels: dict[float, _StoredColumns] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        """Check the columns, which may have been read from a file.
+
+        Raises
+        ------
+        ValueError
+            A column is missing or unknown, or of another length than the others.
+        """
+        _require_columns(self.ticks, TICK_FIELDS)
+        for window_s, rows in self.levels.items():
+            if window_s not in WINDOWS_S[1:]:
+                raise ValueError(f"no level has windows of {window_s:g} s")
+            _require_columns(rows, NAMES)
 
     def finished_rows(self, new: Columns | None) -> Iterator[tuple[float, Columns]]:
         """Take the `TICK_FIELDS` of ticks, and yield the rows of each level, by its window in s,
@@ -141,6 +163,13 @@ class OpenWindows:
             self.levels[coarse_s] = {name: values[done:] for name, values in level.items()}
             level = coarser_level({name: values[:done] for name, values in level.items()}, coarse_s)
             yield coarse_s, level
+
+
+def _require_columns(rows: Columns, names: tuple[str, ...]) -> None:
+    if rows.keys() != set(names):
+        raise ValueError(f"other columns than {', '.join(names)}")
+    if len({values.size for values in rows.values()}) > 1:
+        raise ValueError("columns of different lengths")
 
 
 def _first_of_last(time_s: np.ndarray, window_s: float) -> int:

@@ -2,15 +2,19 @@
 
 import copy
 import math
+from dataclasses import dataclass, field
+from typing import Annotated
 
 import numpy as np
 
-from membrane_ctrl.model.arrays import Column, FloatArray
+from membrane_ctrl.model.arrays import Column, FloatArray, IntArray
+from membrane_ctrl.model.state_tree import ArrayShape, Count, StateNode
 
 Values = FloatArray
 
 
-class Moments:
+@dataclass(slots=True)
+class Moments(StateNode):
     """Mean and standard deviation of values that arrive in batches.
 
     Batches are merged by the pairwise update of Chan, Golub and LeVeque (1979): with n, m the
@@ -21,10 +25,9 @@ class Moments:
     which avoids cancellation when the mean is large compared with the deviation.
     """
 
-    def __init__(self) -> None:
-        self.count = 0
-        self.mean = 0.0
-        self._squares = 0.0
+    count: Count = 0
+    mean: float = 0.0
+    squares: float = 0.0  # sum of the squared deviations from the mean
 
     def add(self, values: Values) -> None:
         """Add a batch, ignoring values that are not finite."""
@@ -34,7 +37,7 @@ class Moments:
         mean = float(values.mean())
         delta = mean - self.mean
         total = self.count + values.size
-        self._squares += (
+        self.squares += (
             float(((values - mean) ** 2).sum()) + delta**2 * self.count * values.size / total
         )
         self.mean += delta * values.size / total
@@ -43,32 +46,39 @@ class Moments:
     @property
     def std(self) -> float:
         """Standard deviation about the mean (divisor n, as `numpy.std`); NaN without values."""
-        return math.sqrt(self._squares / self.count) if self.count else math.nan
+        return math.sqrt(self.squares / self.count) if self.count else math.nan
 
 
-class LogHistogram:
-    """Quantiles of positive values from bins of equal ratio between `low` and `high`, with one more
-    bin beyond each.
+# Range and resolution of a histogram. The values are times in ms.
+_LOWEST, _HIGHEST = 1e-3, 1e5
+_BIN_RATIO = 1.02
+_LOG_RATIO = math.log(_BIN_RATIO)
+_BINS = math.ceil(math.log(_HIGHEST / _LOWEST) / _LOG_RATIO)
+
+
+@dataclass(slots=True)
+class LogHistogram(StateNode):
+    """Quantiles of positive values from bins of equal ratio. The first and the last bin also count
+    the values beyond them.
 
     A quantile is its bin's geometric middle, so its relative error is at most sqrt(ratio) - 1;
     `largest` is exact.
     """
 
-    def __init__(self, low: float = 1e-3, high: float = 1e5, ratio: float = 1.02) -> None:
-        self._low = low
-        self._log_ratio = math.log(ratio)
-        self._bins = np.zeros(math.ceil(math.log(high / low) / self._log_ratio), dtype=np.int64)
-        self.count = 0
-        self.largest = math.nan
+    bins: Annotated[IntArray, ArrayShape((_BINS,), "<i8")] = field(
+        default_factory=lambda: np.zeros(_BINS, dtype=np.int64)
+    )
+    count: Count = 0
+    largest: float = math.nan
 
     def add(self, values: Values) -> None:
         """Add a batch, ignoring values that are not finite."""
         values = values[np.isfinite(values)]
         if not values.size:
             return
-        places = np.log(np.maximum(values, self._low) / self._low) / self._log_ratio
-        places = np.clip(places.astype(np.int64), 0, self._bins.size - 1)
-        self._bins += np.bincount(places, minlength=self._bins.size)
+        places = np.log(np.maximum(values, _LOWEST) / _LOWEST) / _LOG_RATIO
+        places = np.clip(places.astype(np.int64), 0, _BINS - 1)
+        self.bins += np.bincount(places, minlength=_BINS)
         self.count += values.size
         self.largest = float(np.fmax(self.largest, values.max()))
 
@@ -76,8 +86,8 @@ class LogHistogram:
         """The value not exceeded by `share` of all values; NaN without values."""
         if not self.count:
             return math.nan
-        place = int(np.searchsorted(np.cumsum(self._bins), share * self.count))
-        return self._low * math.exp((place + 0.5) * self._log_ratio)
+        place = int(np.searchsorted(np.cumsum(self.bins), share * self.count))
+        return _LOWEST * math.exp((place + 0.5) * _LOG_RATIO)
 
 
 # A window with fewer of its ticks than this says nothing of its length.
@@ -92,39 +102,43 @@ def least_ticks(window_s: float, rate_hz: float) -> float:
     return min(_LEAST_SHARE * ticks, ticks - 1)
 
 
-class SecondMeans:
+@dataclass(slots=True)
+class SecondMeans(StateNode):
     """Means of the seconds of the run that have at least `least` values; `result` is that of all
     until now.
     """
 
-    def __init__(self, band: float, least: float) -> None:
-        self._band = band
-        self._least = least
-        self._second = self._count = self._sum = 0.0  # of the last second, which may go on
-        self._means = Moments()
-        self._inside = 0
-        self._first = self._last = math.nan
+    band: float
+    least: float
+    # of the last second, which may be unfinished
+    second: float = 0.0
+    count: float = 0.0
+    sum: float = 0.0
+    means: Moments = field(default_factory=Moments)
+    inside: Count = 0
+    first: float = math.nan
+    last: float = math.nan
 
     def add(self, time_s: Column, values: Column) -> None:
         """Take in (n,) values at their times, which rise;
         those that are not finite are left out.
         """
         there = np.isfinite(values)
-        second = np.append(self._second, np.floor(time_s[there] + 1e-9))
+        second = np.append(self.second, np.floor(time_s[there] + 1e-9))
         starts = np.flatnonzero(np.diff(second, prepend=np.nan))
-        counts = np.add.reduceat(np.append(self._count, np.ones(second.size - 1)), starts)
-        sums = np.add.reduceat(np.append(self._sum, values[there]), starts)
-        self._second, self._count, self._sum = float(second[-1]), float(counts[-1]), float(sums[-1])
+        counts = np.add.reduceat(np.append(self.count, np.ones(second.size - 1)), starts)
+        sums = np.add.reduceat(np.append(self.sum, values[there]), starts)
+        self.second, self.count, self.sum = float(second[-1]), float(counts[-1]), float(sums[-1])
         self._take(counts[:-1], sums[:-1])
 
     def _take(self, counts: Column, sums: Column) -> None:
-        whole = counts >= self._least
+        whole = counts >= self.least
         means = sums[whole] / counts[whole]
-        self._means.add(means)
-        self._inside += int((np.abs(means) <= self._band).sum())
+        self.means.add(means)
+        self.inside += int((np.abs(means) <= self.band).sum())
         if means.size:
-            self._first, self._last = (
-                float(means[0]) if math.isnan(self._first) else self._first,
+            self.first, self.last = (
+                float(means[0]) if math.isnan(self.first) else self.first,
                 float(means[-1]),
             )
 
@@ -133,13 +147,13 @@ class SecondMeans:
         the band.
         """
         all_of = copy.deepcopy(self)
-        all_of._take(np.array([self._count]), np.array([self._sum]))
-        count = all_of._means.count
+        all_of._take(np.array([self.count]), np.array([self.sum]))
+        count = all_of.means.count
         return {
             "seconds": count,
-            "mean_um": all_of._means.mean if count else math.nan,
-            "std_um": all_of._means.std if count > 1 else math.nan,
-            "in_band": all_of._inside / count if count else math.nan,
-            "first_um": all_of._first,
-            "last_um": all_of._last,
+            "mean_um": all_of.means.mean if count else math.nan,
+            "std_um": all_of.means.std if count > 1 else math.nan,
+            "in_band": all_of.inside / count if count else math.nan,
+            "first_um": all_of.first,
+            "last_um": all_of.last,
         }

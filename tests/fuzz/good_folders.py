@@ -38,7 +38,7 @@ def good_run(logs: Path) -> Path:
     write_record(folder, ticks, snapshots={101: snapshot_at(ticks, 101)})
     (folder / "config.toml").write_text(with_comment(dump(CONFIG)))
     rows = unpack([outputs.row.pack() for _, outputs in ticks])
-    summary = Summary(CONFIG)
+    summary = Summary.for_config(CONFIG)
     summary.add_rows(rows)
     _write_segment(folder, rows)
     lines = [json.loads(line) for line in (folder / "events.jsonl").read_text().splitlines()]

@@ -263,3 +263,26 @@ def test_people_read_names_and_numbers() -> None:
     assert plain["level"] == "HIGH"
     assert plain["colours"].keys() == {"RED"}
     assert np.shape(plain["matrix"]) == (3, 2)
+
+
+@dataclass(slots=True)
+class Columns(StateNode):
+    values: Annotated[FloatArray, ArrayShape((-1, 2))]
+
+
+@pytest.mark.parametrize("rows", [0, 1, 5])
+def test_an_array_may_have_one_axis_of_any_length(rows: int) -> None:
+    was = Columns(np.arange(2.0 * rows).reshape(rows, 2))
+    now = decode_state(encode_state(was), Columns, MOST_BYTES)
+    assert now.values.shape == (rows, 2)
+    assert np.array_equal(now.values, was.values)
+
+
+def test_the_other_axes_are_checked() -> None:
+    with pytest.raises(ValueError, match="is declared"):
+        encode_state(Columns(np.zeros((2, 3))))
+    with pytest.raises(ValueError, match="is declared"):
+        encode_state(Columns(np.zeros(2)))
+    three = json.loads(encode_state(Tree()))["matrix"][:32]  # 3 numbers
+    with pytest.raises(StateError, match="3 numbers where"):
+        decode_state(json.dumps({"values": three}).encode(), Columns, MOST_BYTES)

@@ -5,7 +5,7 @@ and the run has everything once.
 from __future__ import annotations
 
 import json
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import ExitStack
 from pathlib import Path
 from typing import Any
@@ -20,6 +20,7 @@ from membrane_ctrl.model.clock import RunClock
 from membrane_ctrl.model.events import Event
 from membrane_ctrl.model.plain_json import dumps_checked
 from membrane_ctrl.model.shape_estimate import pack_estimate
+from membrane_ctrl.model.state_tree import find_differences
 from membrane_ctrl.processes.ring import RingAddress, RingReader, RingWriter, ring
 from membrane_ctrl.recorder.handover import load_state, save_state
 from membrane_ctrl.recorder.housekeeping import Optimizer
@@ -183,7 +184,60 @@ def test_what_is_handed_on_comes_back_to_the_last_bit(tmp_path: Path, stack: Exi
     assert np.array_equal(again.reference.covariance_um2, state.reference.covariance_um2)
     save_state(tmp_path, again)
     assert path.read_bytes() == written
-    path.write_bytes(written.replace(b'"errors": 0', b'"errors": "0"'))
+    assert find_differences(again, state) == []
+
+
+def _rename_a_column(state: dict[str, Any]) -> None:
+    ticks = state["windows"]["ticks"]
+    ticks["another"] = ticks.pop("mono_s")
+
+
+def _shorten_a_column(state: dict[str, Any]) -> None:
+    state["windows"]["levels"]["10.0"]["time_s"] = ""
+
+
+def _name_another_window(state: dict[str, Any]) -> None:
+    state["windows"]["levels"]["7.0"] = state["windows"]["levels"].pop("10.0")
+
+
+@pytest.mark.parametrize(
+    "damage",
+    [
+        lambda state: state.update(errors="0"),
+        lambda state: state.update(errors=-1),
+        lambda state: state.update(more=1),
+        lambda state: state.pop("dropped"),
+        lambda state: state.update(reference=5),
+        lambda state: state.update(reference="AAAA"),
+        lambda state: state.update(reference="no base64"),
+        lambda state: state["summary"]["lateness_ms"].update(bins="AAAAAAAAAAA="),
+        lambda state: state["summary"]["states"].append({"state": "hold"}),
+        _rename_a_column,
+        _shorten_a_column,
+        _name_another_window,
+    ],
+)
+def test_a_damaged_state_is_refused(
+    tmp_path: Path, stack: ExitStack, damage: Callable[[dict[str, Any]], object]
+) -> None:
+    run = Run(tmp_path, stack, Config())
+    recorder = run.recorder(0)
+    for number in range(2):
+        run.second(recorder, number)
+    path = tmp_path / ".recorder-state"
+    state = json.loads(path.read_bytes())
+    assert load_state(tmp_path) is not None
+    damage(state)
+    path.write_text(json.dumps(state))
+    assert load_state(tmp_path) is None
+
+
+def test_a_state_above_the_size_limit_is_refused(
+    tmp_path: Path, stack: ExitStack, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    run = Run(tmp_path, stack, Config())
+    run.second(run.recorder(0), 0)
+    monkeypatch.setattr("membrane_ctrl.recorder.handover._BYTES_MAX", 1000)
     assert load_state(tmp_path) is None
 
 

@@ -26,14 +26,14 @@ def page(summary: Summary, status: RunStatus) -> dict[str, str]:
 
 
 def test_before_anything_happened() -> None:
-    told = page(Summary(Config()), RunStatus())
+    told = page(Summary.for_config(Config()), RunStatus())
     assert told["not started"] == "-"
     assert told["faults"] == "none"
     assert "mean error" not in told
 
 
 def test_figures_are_those_of_the_summary() -> None:
-    summary = Summary(Config())
+    summary = Summary.for_config(Config())
     summary.add_rows(unpack([row.pack() for row in rows_of(30.0)]))
     summary.add_shape(shape_of(20.0, 1, verdict="rejected"))
     for event in (FAULT, run_events.GeometryInForce("0f93", "bench.toml", "2026-11-21", "")):

@@ -92,7 +92,7 @@ def test_a_torn_tail_of_the_event_log_is_cut_and_kept(folder: Path, tail: bytes)
 
 
 def test_the_summary_is_rebuilt_as_the_recorder_would_have_written_it(folder: Path) -> None:
-    expected = Summary(CONFIG)
+    expected = Summary.for_config(CONFIG)
     expected.add_rows(ROWS)
     for inputs, _ in TICKS:
         if inputs.estimate is not None:
@@ -189,7 +189,7 @@ def test_with_tables_the_statistics_are_of_every_tick(folder: Path) -> None:
     tables = RunTables(folder)
     tables.add_ticks(batch_of(ROWS))
     tables.sync()  # and then it was killed
-    expected = Summary(CONFIG)
+    expected = Summary.for_config(CONFIG)
     expected.add_rows(ROWS)
     wanted = expected.as_dict({}, {})
     for path in folder.glob("*.rrd"):

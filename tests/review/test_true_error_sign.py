@@ -32,7 +32,7 @@ def rows() -> Rows:
 
 def test_every_place_shows_the_same_sign(tmp_path: Path, rows: Rows) -> None:
     assert true_error_um(columns(rows)).mean() == pytest.approx(SHALLOW_UM)
-    summary = Summary(CONFIG)
+    summary = Summary.for_config(CONFIG)
     summary.add_rows(rows)
     table = summary.as_dict({}, {})
     folder = tmp_path / "20261121T180000Z-shallow"

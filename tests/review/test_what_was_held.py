@@ -50,7 +50,7 @@ def folder(rows: Rows, tmp_path_factory: pytest.TempPathFactory) -> Path:
     run = tmp_path_factory.mktemp("held") / "20261121T180000Z-held"
     write_run(run, iter([(rows, [])]))
     config = open_run(run).config
-    summary = Summary(config)
+    summary = Summary.for_config(config)
     for first in range(0, len(rows), 33):
         summary.add_rows(rows[first : first + 33])
     (run / "summary.json").write_text(plain_json.dumps_checked(summary.as_dict({}, {})))

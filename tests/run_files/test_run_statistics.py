@@ -37,7 +37,7 @@ def test_moments_of_nothing_are_nan() -> None:
 @pytest.mark.parametrize("share", [0.01, 0.5, 0.9, 0.99, 0.999])
 def test_quantiles_are_within_a_bin_of_numpys(share: float) -> None:
     values = np.random.default_rng(2).lognormal(0.3, 1.0, 20_000)
-    histogram = LogHistogram(ratio=1.02)
+    histogram = LogHistogram()
     for part in np.array_split(values, 37):
         histogram.add(part)
     assert histogram.quantile(share) == pytest.approx(np.quantile(values, share), rel=0.02)
@@ -45,11 +45,11 @@ def test_quantiles_are_within_a_bin_of_numpys(share: float) -> None:
 
 
 def test_values_out_of_range_are_counted_at_the_ends() -> None:
-    histogram = LogHistogram(low=1.0, high=10.0)
+    histogram = LogHistogram()
     histogram.add(np.array([-5.0, 0.0, 1e9]))
     assert histogram.count == 3
-    assert histogram.quantile(0.5) == pytest.approx(1.0, rel=0.02)
-    assert histogram.quantile(1.0) == pytest.approx(10.0, rel=0.03)
+    assert histogram.quantile(0.5) == pytest.approx(1e-3, rel=0.02)
+    assert histogram.quantile(1.0) == pytest.approx(1e5, rel=0.03)
     assert histogram.largest == 1e9
 
 

@@ -12,9 +12,8 @@ import pytest
 from membrane_ctrl.config.schema import Config
 from membrane_ctrl.model import plain_json
 from membrane_ctrl.model.events import Fault
-from membrane_ctrl.model.object_codec import Decoder, encode
+from membrane_ctrl.model.state_tree import decode_state, encode_state
 from membrane_ctrl.model.telemetry import SETTLED_AFTER_S, Rows, State, TelemetryRow, column, unpack
-from membrane_ctrl.recorder.handover import _SPECIALS
 from membrane_ctrl.run_files.hold_parts import held_at
 from membrane_ctrl.run_files.summary import SCHEMA, Summary
 from tests.support.synthetic_run import RATE_HZ, rows_of, shape_of
@@ -27,7 +26,7 @@ def table(rows: list[TelemetryRow]) -> Rows:
 
 
 def summary_of(rows: list[TelemetryRow], batch: int = 50) -> dict[str, object]:
-    summary = Summary(Config())
+    summary = Summary.for_config(Config())
     values = table(rows)
     for start in range(0, len(values), batch):
         summary.add_rows(values[start : start + batch])
@@ -69,7 +68,7 @@ def test_counters_states_and_lateness() -> None:
 
 
 def test_dropped_rows_are_ticks_too() -> None:
-    summary = Summary(Config())
+    summary = Summary.for_config(Config())
     summary.add_rows(table(rows_of(1.0)))
     assert summary.as_dict({"inputs": 7}, {})["ticks"] == 57
 
@@ -131,7 +130,7 @@ def test_leaving_hold_ends_the_settled_rows() -> None:
 
 
 def test_events_and_cycles() -> None:
-    summary = Summary(Config())
+    summary = Summary.for_config(Config())
     fault = {"kind": "fault", "mono_s": 3.0, "cause": "over_pressure"}
     for event in ({"kind": "state"}, fault, {"kind": "end", "mono_s": 9.5, "exit": "safety_trip"}):
         summary.add_event(event)
@@ -152,7 +151,7 @@ def test_events_and_cycles() -> None:
 
 
 def test_the_fault_in_which_a_run_ends_is_named_and_survives_a_restart_of_the_recorder() -> None:
-    summary = Summary(Config())
+    summary = Summary.for_config(Config())
     fault = Fault(
         14,
         "laser_implausible",
@@ -164,8 +163,7 @@ def test_the_fault_in_which_a_run_ends_is_named_and_survives_a_restart_of_the_re
         "look",
     )
     summary.add_event({"mono_s": 1.0, **fault.to_dict()})
-    state = json.loads(json.dumps(encode(summary, _SPECIALS)))
-    restored = Decoder((Summary(Config()),), _SPECIALS).decode(state, Summary)
+    restored = decode_state(encode_state(summary), Summary, 1_000_000)
     for each in (summary, restored):
         each.add_event({"kind": "end", "mono_s": 2.0, "exit": "safety_trip"})
         assert each.as_dict({}, {})["ended_in"] == fault.to_dict()
@@ -174,7 +172,7 @@ def test_the_fault_in_which_a_run_ends_is_named_and_survives_a_restart_of_the_re
 
 
 def test_lists_do_not_grow_with_a_flickering_state() -> None:
-    summary = Summary(Config())
+    summary = Summary.for_config(Config())
     rows = table(rows_of(60.0))
     rows = rows.copy()
     column(rows, "state")[:] = np.arange(len(rows)) % 2
@@ -187,7 +185,7 @@ def test_lists_do_not_grow_with_a_flickering_state() -> None:
 
 
 def test_an_empty_run_has_a_summary_of_nulls() -> None:
-    found = json.loads(plain_json.dumps(Summary(Config()).as_dict({}, {})))
+    found = json.loads(plain_json.dumps(Summary.for_config(Config()).as_dict({}, {})))
     assert (found["ticks"], found["exit"], found["lateness_ms"]["p99"]) == (0, None, None)
 
 
@@ -197,7 +195,7 @@ def test_json_has_null_for_what_is_not_a_number() -> None:
 
 
 def test_the_geometry_that_was_measured_with_is_named() -> None:
-    summary = Summary(Config())
+    summary = Summary.for_config(Config())
     assert summary.as_dict({}, {})["geometry"] == {}
     origin = {"hash": "12ab", "file": "g.toml", "calibrated_utc": "2026-01-02"}
     summary.add_event({"kind": "geometry", **origin, "message": "", "mono_s": 3.0})
