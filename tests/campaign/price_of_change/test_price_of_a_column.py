@@ -20,13 +20,15 @@ pytestmark = [pytest.mark.campaign, pytest.mark.timeout(1800)]
 
 COLUMN, ENTITY, LABEL = "gas_warmth_c", "/gas/warmth", "warmth of the gas"
 ROW = f"""\
-    {COLUMN}: float = column(
-        "{LABEL}", "gas less air temperature", Plot("Warmth", Group.ENVIRONMENT), "{ENTITY}", published=True
-    )
-    error_um: float = column("""  # noqa: E501
-COMPUTED = f"""\
-        {COLUMN}=reading.gas_temperature_c - reading.air_temperature_c,
-        trim_um=shape.trim_um,"""
+{COLUMN}: float = column(
+    "{LABEL}",
+    "gas less air temperature",
+    Plot("Warmth", Group.ENVIRONMENT),
+    "{ENTITY}",
+    published=True,
+)
+"""
+COMPUTED = f"{COLUMN}=reading.gas_temperature_c - reading.air_temperature_c"
 BENCH = Path(__file__).with_name("column_bench.py")
 SCENARIO = """
 title = "A mirror that is held while the air becomes warmer"
@@ -54,9 +56,9 @@ async def test_the_page_has_the_column(tmp_path, monkeypatch):
     async with test_page.viewed(tmp_path) as (run, tab):
         await tab.until("document.querySelector('[data-field={COLUMN}]').innerText === '12.34'")
         assert "{LABEL}, °C" in await tab.value("document.body.innerText")
-        fetched = await tab.value("fetch('/chart?hold=&signal={COLUMN}&span=10+min&utc=True').then(r => r.status)")
-        assert fetched == 200
-'''  # noqa: E501
+        chart = "/chart?hold=&signal={COLUMN}&span=10+min&utc=True"
+        assert await tab.value(f"fetch('{{chart}}').then(r => r.status)") == 200
+'''
 
 
 @pytest.fixture(scope="module")
@@ -64,8 +66,9 @@ def source(tmp_path_factory: pytest.TempPathFactory) -> ChangedSource:
     """The product with one more column: two places differ."""
     source = ChangedSource.copy_to(tmp_path_factory.mktemp("column"))
     source.copy_more("tests", "docs", "benchmarks")
-    source.replace("membrane_ctrl/model/columns.py", "    error_um: float = column(", ROW)
-    source.replace("membrane_ctrl/controller/scene.py", "        trim_um=shape.trim_um,", COMPUTED)
+    source.add_field("membrane_ctrl/model/columns.py", "ColumnValues", ROW, before="error_um")
+    source.add_argument("membrane_ctrl/controller/scene.py", "trim_um", COMPUTED)
+    assert source.count_places() == 2
     return source
 
 

@@ -24,22 +24,21 @@ RULE, CAUSE, REMEDY = (
 )
 SAFETY = "membrane_ctrl/controller/safety.py"
 FIELD = '''\
-    @property
-    def gas_temperature_c(self) -> float:
-        """Of the gas in the mirror; NaN without an answer."""
-        return self.reading.gas_temperature_c
 
-    @property
-    def depth_um(self)'''
+@property
+def gas_temperature_c(self) -> float:
+    """Of the gas in the mirror; NaN without an answer."""
+    return self.reading.gas_temperature_c
+'''
 ROW = f"""\
-    Rule(
-        code=27, name="{RULE}", cause="{CAUSE}",
-        limit="60 °C", safe_level=SafeLevel.RAMP_DOWN, seen_in=_TWICE, states=CONNECTED,
-        remedy="{REMEDY}",
-        seen=lambda o: f"{{o.gas_temperature_c:.0f}} °C", broken=lambda o, c: o.gas_temperature_c > 60.0,
-    ),
-    Rule(
-        code=40, name="late","""  # noqa: E501
+Rule(
+    code=27, name="{RULE}", cause="{CAUSE}",
+    limit="60 °C", safe_level=SafeLevel.RAMP_DOWN, seen_in=_TWICE, states=CONNECTED,
+    remedy="{REMEDY}",
+    seen=lambda o: f"{{o.gas_temperature_c:.0f}} °C",
+    broken=lambda o, c: o.gas_temperature_c > 60.0,
+)
+"""
 BENCH = Path(__file__).with_name("rule_bench.py")
 
 
@@ -48,8 +47,9 @@ def source(tmp_path_factory: pytest.TempPathFactory) -> ChangedSource:
     """The product with one more rule: two places differ."""
     source = ChangedSource.copy_to(tmp_path_factory.mktemp("rule"))
     source.copy_more("tests", "docs", "benchmarks")
-    source.replace(SAFETY, "    @property\n    def depth_um(self)", FIELD)
-    source.replace(SAFETY, '    Rule(\n        code=40, name="late",', ROW)
+    source.add_field(SAFETY, "Observation", FIELD)
+    source.add_row(SAFETY, "TABLE", ROW)
+    assert source.count_places() == 2
     return source
 
 

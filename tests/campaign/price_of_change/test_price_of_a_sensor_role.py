@@ -18,25 +18,30 @@ from changed_source import ROOT, ChangedSource
 pytestmark = [pytest.mark.campaign, pytest.mark.real_time, pytest.mark.timeout(1800)]
 
 ROLE, FIELD, LABEL = "second_gauge", "second_gauge_pressure_pa", "second gauge pressure"
-IN_ROLES = f"""
-    interlocks_open: int = 0
-    {FIELD}: float = field(default=math.nan, metadata=_sensor("{ROLE}", "gauge_pressure_pa", "Pa"))
+IN_ROLES = f"""\
+{FIELD}: float = field(
+    default=math.nan, metadata=_sensor("{ROLE}", "gauge_pressure_pa", "Pa")
+)
 """
 IN_COLUMNS = f"""\
-    {FIELD}: float = column(
-        "{LABEL}", "reading of the second gauge", GAUGE, "/gas/second_pressure", decimals=1, published=True
-    )
-    ambient_pressure_pa: float = column("""  # noqa: E501
+{FIELD}: float = column(
+    "{LABEL}",
+    "reading of the second gauge",
+    GAUGE,
+    "/gas/second_pressure",
+    decimals=1,
+    published=True,
+)
+"""
 IN_SAFETY = f"""\
-TABLE: tuple[Rule, ...] = (
-    Rule(
-        code=70, name="gauges_apart", cause="the two gauges contradict each other",
-        limit="50 Pa", safe_level=SafeLevel.RAMP_DOWN, seen_in=_TWICE,
-        remedy="find out which gauge is wrong",
-        seen=lambda o: f"{{o.reading.{FIELD} - o.gauge_pressure_pa:+.1f}} Pa",
-        broken=lambda o, c: abs(o.reading.{FIELD} - o.gauge_pressure_pa) > 50.0,
-        unseen=lambda o: math.isnan(o.reading.{FIELD}),
-    ),
+Rule(
+    code=70, name="gauges_apart", cause="the two gauges contradict each other",
+    limit="50 Pa", safe_level=SafeLevel.RAMP_DOWN, seen_in=_TWICE,
+    remedy="find out which gauge is wrong",
+    seen=lambda o: f"{{o.reading.{FIELD} - o.gauge_pressure_pa:+.1f}} Pa",
+    broken=lambda o, c: abs(o.reading.{FIELD} - o.gauge_pressure_pa) > 50.0,
+    unseen=lambda o: math.isnan(o.reading.{FIELD}),
+)
 """
 BENCH = Path(__file__).with_name("sensor_role_bench.py")
 EXAMPLE = ROOT / "membrane_ctrl" / "examples" / "all-serial.toml"
@@ -52,11 +57,12 @@ def source(tmp_path_factory: pytest.TempPathFactory) -> ChangedSource:
     """The product with a second gauge: three places differ."""
     source = ChangedSource.copy_to(tmp_path_factory.mktemp("gauge"))
     source.copy_more("tests", "docs", "benchmarks")
-    source.replace("firmware_iface/roles.py", "\n    interlocks_open: int = 0\n", IN_ROLES)
-    source.replace(
-        "membrane_ctrl/model/columns.py", "    ambient_pressure_pa: float = column(", IN_COLUMNS
+    source.add_field("firmware_iface/roles.py", "BenchReading", IN_ROLES)
+    source.add_field(
+        "membrane_ctrl/model/columns.py", "ColumnValues", IN_COLUMNS, before="ambient_pressure_pa"
     )
-    source.replace("membrane_ctrl/controller/safety.py", "TABLE: tuple[Rule, ...] = (\n", IN_SAFETY)
+    source.add_row("membrane_ctrl/controller/safety.py", "TABLE", IN_SAFETY)
+    assert source.count_places() == 3
     return source
 
 

@@ -139,7 +139,8 @@ def changed(
     """The product with another number of terms: one line differs."""
     terms: int = request.param
     source = ChangedSource.copy_to(tmp_path_factory.mktemp(f"terms{terms}"))
-    source.replace(CONSTANT, f"\nZERNIKE_TERMS = {ZERNIKE_TERMS}\n", f"\nZERNIKE_TERMS = {terms}\n")
+    source.set_constant(CONSTANT, "ZERNIKE_TERMS", terms)
+    assert source.count_places() == 1
     return Product(terms, source, sets)
 
 
