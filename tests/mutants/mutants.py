@@ -66,6 +66,7 @@ COMPARISONS = (
 )
 # ... and this one waits for real devices' time-outs: on a busy machine it fails without a mutation.
 _OF_TIME = ("test_examples.py",)
+_LAYOUT = re.compile(r"\s|,(?=\s*[)\]}])")  # space, line ends, last commas
 _LEAVE = shutil.ignore_patterns(
     ".git", ".venv", "__pycache__", ".mypy_cache", ".ruff_cache", "logs", "images"
 )
@@ -88,8 +89,11 @@ class Mutant:
 
     @property
     def digest(self) -> str:
-        """Of the mutation's text: a result of another text says nothing."""
-        return hashlib.sha256(f"{self.find}\0{self.replace}".encode()).hexdigest()[:16]
+        """Hash of the mutation's text without its layout: a result belongs to this text alone, and
+        remains valid when the formatter breaks lines elsewhere.
+        """
+        text = _LAYOUT.sub("", f"{self.find}\0{self.replace}")
+        return hashlib.sha256(text.encode()).hexdigest()[:16]
 
     def place(self, root: Path) -> Path:
         """The file that holds the text. Raises LookupError unless it is there exactly once."""
@@ -163,25 +167,29 @@ def make_rule_mutants(root: Path, lives: Mapping[str, str]) -> list[Mutant]:
         In the order of the table.
     """
     text = (root / SAFETY.relative_to(ROOT)).read_text(encoding="utf-8")
-    rows = (node for node in ast.walk(ast.parse(text)) if isinstance(node, ast.Call))
     found = []
-    for row in rows:
-        if not (isinstance(row.func, ast.Name) and row.func.id == "Rule"):
-            continue
-        arguments = {keyword.arg: keyword.value for keyword in row.keywords}
-        rule = str(ast.literal_eval(arguments["name"]))
-        broken = ast.get_source_segment(text, arguments["broken"])
+    for rule, row in _rows_of_rules(text):
+        (broken,) = (keyword.value for keyword in row.keywords if keyword.arg == "broken")
+        condition = ast.get_source_segment(text, broken)
         found.append(
             Mutant(
                 what=f"{rule} never trips",
                 area="safety",
-                find=f"broken={broken}",
+                find=f"broken={condition}",
                 replace="broken=lambda o, c: False",
                 lives=lives.get(rule, ""),
                 rule=rule,
             )
         )
     return found
+
+
+def _rows_of_rules(text: str) -> Iterator[tuple[str, ast.Call]]:
+    """Name and row of each rule in the text of the safety table."""
+    for node in ast.walk(ast.parse(text)):
+        if isinstance(node, ast.Call) and ast.unparse(node.func) == "Rule":
+            (name,) = (keyword.value for keyword in node.keywords if keyword.arg == "name")
+            yield str(ast.literal_eval(name)), node
 
 
 def _paths_of_tests(root: Path, names: Sequence[str]) -> tuple[str, ...]:
@@ -372,15 +380,10 @@ def removes(mutant: Mutant) -> str:
     if mutant.guard or mutant.rule:
         return mutant.guard or mutant.rule
     text = SAFETY.read_text(encoding="utf-8")
-    place = text.find(mutant.find)
-    if not 0 <= place < text.index("# fmt: on"):
-        return ""
-    rows = [
-        row
-        for row in re.finditer(r'code=\d+, name="(\w+)"', text)
-        if row.start() < place + len(mutant.find)
-    ]
-    return rows[-1][1] if rows else ""
+    for rule, row in _rows_of_rules(text):
+        if mutant.find in (ast.get_source_segment(text, row) or ""):
+            return rule
+    return ""
 
 
 def sample(mutants: Sequence[Mutant], number: int) -> list[Mutant]:
