@@ -22,12 +22,14 @@ from membrane_ctrl.config.schema import (
 )
 from membrane_ctrl.control.experiments.trial import ExperimentSpec, PumpStep
 from membrane_ctrl.controller.commands import Command
+from membrane_ctrl.controller.snapshot import continue_from, take_snapshot
 from membrane_ctrl.controller.state import ControllerState
 from membrane_ctrl.controller.tick import TickInputs, TickOutputs
 from membrane_ctrl.hold.virtual_run import TruthShape, VirtualRun
 from membrane_ctrl.metrology.optics.film_law import zernike_projection
 from membrane_ctrl.model.lock import Lock
 from membrane_ctrl.sim.plant import Plant
+from membrane_ctrl.sim.surroundings import BenchEvent
 from membrane_ctrl.sim.virtual_bench import VirtualBench, Wrong
 from membrane_ctrl.sim.virtual_interlocks import VirtualInterlocks
 
@@ -47,11 +49,17 @@ class Story:
         default_factory=dict
     )
     shape_s: float | None = None
+    surroundings: tuple[BenchEvent, ...] = ()
+    actions: Mapping[float, Callable[[VirtualBench], None]] = field(default_factory=dict)
+    continued_at_s: tuple[
+        float, ...
+    ] = ()  # the controller is replaced by one made from its snapshot
 
 
 def switched(name: str, value: float | bool) -> Callable[[Wrong, bool], None]:
-    """Set a failure while it lasts."""
-    return lambda wrong, fails: setattr(wrong, name, value if fails else type(value)(0))
+    """Set a failure while it lasts, and its default otherwise."""
+    default = getattr(Wrong(), name)
+    return lambda wrong, fails: setattr(wrong, name, value if fails else default)
 
 
 def _trial(kind: str, **changed: Any) -> Command:
@@ -216,16 +224,28 @@ def record_story(story: Story) -> tuple[Ticks, ControllerState]:
     """
     config = story.config
     circuits = VirtualInterlocks(config.interlocks)
-    bench = VirtualBench(Plant(config.twin, config.pump), interlocks=circuits)
+    bench = VirtualBench(Plant(config.twin, config.pump, story.surroundings), interlocks=circuits)
     source = None if story.shape_s is None else TruthShape(bench, config, 3, 0.036)
     run = VirtualRun(config, bench, zernike_projection(), source)
     if story.shape_s is not None:
         run._shape_period_s = story.shape_s
     waiting = dict(story.commands)
+    actions = dict(story.actions)
+    continuations = list(story.continued_at_s)
+    active: set[tuple[float, float]] = set()
     ticks: Ticks = []
     while run.now_s < story.until_s and run.finished is None:
-        for (begin_s, end_s), fail in story.failures.items():
-            fail(bench.wrong, begin_s <= run.now_s < end_s)
+        for window, fail in story.failures.items():
+            fails = window[0] <= run.now_s < window[1]
+            if fails != (window in active):
+                fail(bench.wrong, fails)
+                active ^= {window}
+        for time_s in [time_s for time_s in actions if time_s <= run.now_s]:
+            actions.pop(time_s)(bench)
+        if continuations and continuations[0] <= run.now_s:
+            continuations.pop(0)
+            snapshot = take_snapshot(run._supervisor._controller)
+            run._supervisor._controller = continue_from(snapshot, config, zernike_projection())
         due = [time_s for time_s in waiting if time_s <= run.now_s + 1e-9]
         tick = run.tick(tuple(waiting.pop(time_s) for time_s in due))
         if tick is not None:
