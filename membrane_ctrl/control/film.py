@@ -22,7 +22,9 @@ from membrane_ctrl.model.state_tree import Count, StateNode
 SMOOTH_S = 10.0
 # A mean of 50 of the gauge's readings is good to 1.4 µm; ten-second means of fewer are not much
 # better when warm.
-_KNOWN_S, _KNOWN_READINGS, WARM_S = 5.0, 50, 3 * SMOOTH_S
+_KNOWN_S = 5.0
+_KNOWN_READINGS = 50
+WARM_S = 3 * SMOOTH_S
 # Creep of 10 µm/min is 20 µm ahead of this reference; the 2 µm/min of a mount that warms up are 4
 # µm.
 SINCE_MINUTES_S = 120.0

@@ -167,10 +167,18 @@ class DriftTracker(StateNode):
 
 _MEMORY_S = 200.0
 _LIMIT = 3.0  # an innovation beyond this many standard deviations counts as this many
-_READING_BOUND, _WALK_BOUND = math.log(5.0**2), math.log(30.0**2)
-_SLACK, _STEEPEST, _SHORTEST_S = 0.5, 4.0, 0.02  # of a ramp: two bad readings are none
-# information in a noise that comes with the reading, in a configured one, and in a configured walk
-_STATED, _CONFIGURED, _UNREST = 250.0, 25.0, 4.0
+# A factor's logarithm stays within these bounds
+_READING_BOUND = math.log(5.0**2)
+_WALK_BOUND = math.log(30.0**2)
+# Of a ramp, in standard deviations: the drift that each cumulative sum tolerates, and the most that
+# one innovation counts, so that two bad readings are no ramp
+_SLACK = 0.5
+_STEEPEST = 4.0
+_SHORTEST_S = 0.02  # shortest duration of a ramp
+# Information with which learning starts
+_STATED_INFORMATION = 250.0  # a noise that comes with the reading
+_CONFIGURED_INFORMATION = 25.0  # a configured noise of a reading
+_WALK_INFORMATION = 4.0  # a configured walk
 
 
 @dataclass(slots=True)
@@ -193,13 +201,13 @@ class LearnedFactor(StateNode):
         The logarithm stays within +- `bound`.
         """
         # at least that: a few readings must not overturn a level that has hardly shown for long
-        self.information = max(_UNREST, self.information + information - forget * self.information)
+        self.information = max(_WALK_INFORMATION, self.information + information - forget * self.information)
         self.log = min(max(self.log + slope / self.information, -bound), bound)
 
 
 def configured_walk() -> LearnedFactor:
     """The factor on a configured walk, to be learned."""
-    return LearnedFactor(_UNREST)
+    return LearnedFactor(_WALK_INFORMATION)
 
 
 @dataclass(slots=True)
@@ -219,7 +227,7 @@ class ReadingNoise(StateNode):
     @classmethod
     def of_reading(cls, stated: bool) -> "ReadingNoise":
         """The factor to be learned; `stated`: the noise comes with each reading."""
-        return cls(LearnedFactor(_STATED if stated else _CONFIGURED))
+        return cls(LearnedFactor(_STATED_INFORMATION if stated else _CONFIGURED_INFORMATION))
 
     @property
     def factor(self) -> float:

@@ -195,7 +195,8 @@ class PumpCurve:
 
 # Neither weather nor a door (slammed: 100 Pa) changes this much between ticks, but a failed sensor
 # does, such as one that reads 85 or -127 C
-_STEP_MAX_PA, _STEP_MAX_K = 500.0, 2.0
+_STEP_MAX_PA = 500.0
+_STEP_MAX_K = 2.0
 # Any workplace from 5000 m to a mine; hPa, mmHg and psi are far outside, and so are K for C
 _PRESSURE_PA = (50e3, 110e3)
 _TEMPERATURE_C = (-20.0, 60.0)

@@ -35,7 +35,8 @@ from membrane_ctrl.model.zernike_terms import ZERNIKE_TERMS
 SHAPES = 5
 # Figures of single frames come faster than the laser's noise averages out: as many readings as five
 # cycles have.
-TRACKED_SHAPES, TRACKED_EVERY_S = 25, 0.4
+TRACKED_SHAPES = 25
+TRACKED_EVERY_S = 0.4
 
 
 _Coefficients = Annotated[FloatArray, ArrayShape((ZERNIKE_TERMS,))]

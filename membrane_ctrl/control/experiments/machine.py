@@ -16,8 +16,6 @@ from membrane_ctrl.control import gas
 from membrane_ctrl.control.filters import LowPass
 from membrane_ctrl.model.state_tree import Count, StateNode
 
-# An experiment's view of a tick.
-
 
 @dataclass(frozen=True, slots=True)
 class BenchSample:
@@ -28,13 +26,13 @@ class BenchSample:
     air_temperature_c: float = float("nan")
 
 
-FAST_S, SLOW_S = (
-    0.1,
-    0.4,
-)  # of the two filters whose difference is the speed, for a reading with little noise
+# Time constants of the two filters whose difference is the speed, for a reading with little noise
+FAST_S = 0.1
+SLOW_S = 0.4
 # A moving mirror continues for the pump's delay and lag after the flow is reduced: 0.24 s, up to
-# twice that on a slow bench, unless more is known; pulses turn within the longest
-_LATE_S, _LATE_MOST_S = 0.4, 1.0
+# twice that on a slow bench, unless more is known
+_LATE_S = 0.4
+_LATE_MOST_S = 1.0  # pulses turn within this time
 _LOST_MAX_S = 0.3  # as long as the safety table tolerates a stale reading
 
 
