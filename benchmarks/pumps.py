@@ -17,7 +17,7 @@ from unittest.mock import patch
 
 import numpy as np
 
-from membrane_ctrl.control.gas import PumpCurve
+from membrane_ctrl.control.pump_curve import PumpCurve
 from membrane_ctrl.model.telemetry import State
 from tests.support import second_world
 from tuning import pump_trial

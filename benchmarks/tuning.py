@@ -16,7 +16,7 @@ import numpy as np
 
 from benchmarks.minimum_variance import least_std_um
 from membrane_ctrl.config.schema import LoopConfig, PumpConfig, TwinConfig
-from membrane_ctrl.control.experiments.machine import BenchSample
+from membrane_ctrl.control.experiments.experiment import BenchSample
 from membrane_ctrl.sim.plant import STEP_S, Plant
 from membrane_ctrl.sim.surroundings import BenchEvent
 from tuning.identification.characterise import Characterised, characterise

@@ -8,7 +8,7 @@ from pathlib import Path
 from statistics import fmean
 
 from membrane_ctrl.config.schema import Config, LoopConfig
-from membrane_ctrl.control.film_health import TOO_TIGHT_UM_PER_S
+from membrane_ctrl.control.leak_estimate import TOO_TIGHT_UM_PER_S
 from membrane_ctrl.model.errors import DeviceError, Exit, InputError, RejectedError, writing
 from membrane_ctrl.sessions import folder as plain
 from membrane_ctrl.sessions.folder import STEPS, SessionFolder

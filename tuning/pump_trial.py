@@ -9,8 +9,9 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from membrane_ctrl.config import schema
-from membrane_ctrl.control import gas
-from membrane_ctrl.control.experiments import machine, trial
+from membrane_ctrl.control.experiments import operating_point
+from membrane_ctrl.control.experiments.spec import PumpStep
+from membrane_ctrl.control.pump_curve import PumpCurve
 from membrane_ctrl.model import errors, telemetry
 from membrane_ctrl.sessions import folder
 from tuning.gains_file import MS_MAX
@@ -103,8 +104,8 @@ def _calmed(rig: HoldRig, limit_um: float) -> None:
     """
     around = rig.around(rig.hold(_BEFORE_S), limit_um)
     rig.set_gains(rig.loop.model_copy(update=_CAUTIOUS), "pump map", _MAP_S)
-    mean = trial.PumpStep(
-        fraction=gas.PumpCurve(rig.pump).fraction(around.holding_flow_um_per_s), duration_s=0.1
+    mean = PumpStep(
+        fraction=PumpCurve(rig.pump).fraction(around.holding_flow_um_per_s), duration_s=0.1
     )
     rig.performed(
         characterise.spec_of("pump_map", around, 600.0).model_copy(update={"steps": (mean,)})
@@ -114,11 +115,11 @@ def _calmed(rig: HoldRig, limit_um: float) -> None:
 def _surveyed(rig: HoldRig, limit_um: float) -> pump_map.PumpMap:
     _brought_back(rig)
     around = rig.around(rig.hold(_BEFORE_S), limit_um)
-    holding = gas.PumpCurve(rig.pump).fraction(around.holding_flow_um_per_s)
+    holding = PumpCurve(rig.pump).fraction(around.holding_flow_um_per_s)
     survey = pump_survey.PumpSurvey(holding, around.limit_um, around.laser_um)
     held = True
     while held and (steps := survey.steps()):
-        if flow_um_per_s := gas.PumpCurve(rig.pump).flow(
+        if flow_um_per_s := PumpCurve(rig.pump).flow(
             survey.holding
         ):  # none, on a curve far from the true
             around = replace(around, holding_flow_um_per_s=flow_um_per_s)
@@ -141,7 +142,7 @@ def _surveyed(rig: HoldRig, limit_um: float) -> pump_map.PumpMap:
 
 def _holds(found: pump_map.PumpMap) -> bool:
     """Whether a curve that is not finished already reaches from below the leak to well above it."""
-    curve = gas.PumpCurve(found.pump)
+    curve = PumpCurve(found.pump)
     return curve.least_flow_um_per_s < found.leak_um_per_s < found.pump.flow_full_um_per_s / _LIFTS
 
 
@@ -187,7 +188,7 @@ def _checked(rig: HoldRig, late_s: float) -> tuple[float, float]:
         _returned(rig)
         rig.hold(_CHECK_AFTER_S)
         around = replace(rig.around(rig.hold(_CHECK_BEFORE_S)), late_s=late_s)
-        machine.room(around)
+        operating_point.room(around)
         record, _ = rig.perform(characterise.spec_of("steps", around, steps_s))
         found = identify.identify(record.followed_by(rig.hold(_CHECK_AFTER_S)))
         gain, sigma = found.model.gain, found.sigma.gain

@@ -11,8 +11,9 @@ from typing import Protocol
 import numpy as np
 
 from membrane_ctrl.config.schema import Config, LoopConfig, PumpConfig
-from membrane_ctrl.control import gas, inner_loop
-from membrane_ctrl.control.experiments import machine, trial
+from membrane_ctrl.control import inner_loop, pump_curve
+from membrane_ctrl.control.experiments import experiment, operating_point, trial
+from membrane_ctrl.control.experiments.spec import ExperimentSpec
 from membrane_ctrl.controller.commands import Command
 from membrane_ctrl.model import events, shape_estimate, telemetry
 from membrane_ctrl.sessions.live_hold import HoldError, HoldLink
@@ -22,7 +23,7 @@ from tuning.identification.loop_model import Record, Series
 class DrivenBench(Protocol):
     """The bench a rig drives: the twin, a fitted model, or a live hold in its `tune` state."""
 
-    def exchange(self, pump_fraction: float, vent_fraction: float) -> machine.BenchSample:
+    def exchange(self, pump_fraction: float, vent_fraction: float) -> experiment.BenchSample:
         """Write the commands, wait for the next tick and return its reading."""
         ...
 
@@ -38,7 +39,9 @@ class Rig:
         self._loop = inner_loop.InnerLoop(loop, pump)
         self.dt_s = 1 / loop.rate_hz
         fraction = (
-            gas.PumpCurve(pump).command(leak_um_per_s, self.dt_s) if leak_um_per_s > 0 else 0.0
+            pump_curve.PumpCurve(pump).command(leak_um_per_s, self.dt_s)
+            if leak_um_per_s > 0
+            else 0.0
         )
         self._last = bench.exchange(fraction, loop.bleed_fraction)
         self._loop.start(self._last.displacement_um, leak_um_per_s)
@@ -51,7 +54,7 @@ class Rig:
     def hold(self, duration_s: float, target_um: float = 0.0) -> Record:
         """Hold at a target."""
         flows: list[float] = []
-        samples: list[machine.BenchSample] = []
+        samples: list[experiment.BenchSample] = []
         for _ in range(round(duration_s / self.dt_s)):
             out = self._loop.step(self._given(target_um), self.dt_s)
             flows.append(out.flow_um_per_s)
@@ -59,19 +62,19 @@ class Rig:
             self._last = self._bench.exchange(out.pump_fraction, self._config.bleed_fraction)
         return Record.from_samples(self.dt_s, flows, samples)
 
-    def perform(self, spec: trial.ExperimentSpec) -> tuple[Record, machine.Finished]:
+    def perform(self, spec: ExperimentSpec) -> tuple[Record, experiment.Finished]:
         """Run an experiment about 0 until it finishes; the loop can hold afterwards."""
         begun = trial.begin_trial(spec, self._config, self._pump, 0.0)
         return self._run(trial.Trial(begun, self._config.rate_hz), spec.holding_flow_um_per_s)
 
     def _run(
-        self, guard: machine.Experiment, holding_flow_um_per_s: float
-    ) -> tuple[Record, machine.Finished]:
+        self, guard: experiment.Experiment, holding_flow_um_per_s: float
+    ) -> tuple[Record, experiment.Finished]:
         flows: list[float] = []
-        samples: list[machine.BenchSample] = []
+        samples: list[experiment.BenchSample] = []
         while True:
             wanted = guard.step(self._last, self.dt_s)
-            if isinstance(wanted, machine.Finished):
+            if isinstance(wanted, experiment.Finished):
                 self._loop.resume(self._given(0.0), holding_flow_um_per_s, self.dt_s)
                 return Record.from_samples(self.dt_s, flows, samples), wanted
             out = self._loop.follow(self._given(0.0), wanted, self.dt_s)
@@ -79,7 +82,7 @@ class Rig:
             samples.append(self._last)
             self._last = self._bench.exchange(out.pump_fraction, self._config.bleed_fraction)
 
-    def around(self, held: Record, limit_um: float = 10.0) -> machine.Around:
+    def around(self, held: Record, limit_um: float = 10.0) -> operating_point.Around:
         """Operating point of an experiment, from the hold before it."""
         return around_of(held, self._config, self._pump, limit_um)
 
@@ -90,11 +93,13 @@ class Rig:
         )
 
 
-def around_of(held: Record, loop: LoopConfig, pump: PumpConfig, limit_um: float) -> machine.Around:
+def around_of(
+    held: Record, loop: LoopConfig, pump: PumpConfig, limit_um: float
+) -> operating_point.Around:
     """Operating point of an experiment, from the hold before it and the pump's range."""
-    return machine.Around(
+    return operating_point.Around(
         holding_flow_um_per_s=float(held.flow_um_per_s.mean()),
-        least_flow_um_per_s=gas.PumpCurve(pump).least_flow_um_per_s,
+        least_flow_um_per_s=pump_curve.PumpCurve(pump).least_flow_um_per_s,
         full_flow_um_per_s=loop.flow_most_um_per_s(pump),
         laser_um=laser_noise_um(held),
         limit_um=limit_um,
@@ -225,11 +230,11 @@ class HoldRig:
         setpoints = np.interp(read, ticks, [row.setpoint_um for row in rows])
         return record, setpoints
 
-    def around(self, held: Record, limit_um: float = 10.0) -> machine.Around:
+    def around(self, held: Record, limit_um: float = 10.0) -> operating_point.Around:
         """Operating point of an experiment, from the hold before it."""
         return around_of(held, self.loop, self.pump, limit_um)
 
-    def perform(self, spec: trial.ExperimentSpec) -> tuple[Record, machine.Finished]:
+    def perform(self, spec: ExperimentSpec) -> tuple[Record, experiment.Finished]:
         """Let the controller run an experiment; the record ends with the tick that returns to hold.
 
         Raises HoldError if the experiment is refused or ends in a state other than hold.
@@ -238,8 +243,8 @@ class HoldRig:
         return self.record(rows), finished
 
     def performed(
-        self, spec: trial.ExperimentSpec
-    ) -> tuple[list[telemetry.TelemetryRow], machine.Finished]:
+        self, spec: ExperimentSpec
+    ) -> tuple[list[telemetry.TelemetryRow], experiment.Finished]:
         """As `perform`, with the ticks instead of a record."""
         self._events.clear()
         self._link.ask(Command("tune", self._who, f"tuning session: {spec.kind}", experiment=spec))
@@ -251,7 +256,7 @@ class HoldRig:
             if not begun and len(rows) > _ANSWER_TICKS:
                 raise HoldError("the hold accepted the experiment but did not begin it")
         told = self._experiment_ended()
-        return rows, machine.Finished(machine.ExperimentEnd(told.end), told.reason)
+        return rows, experiment.Finished(experiment.ExperimentEnd(told.end), told.reason)
 
     def set_gains(
         self,
@@ -320,7 +325,7 @@ class HoldRig:
         ):
             rows.append(self._next_held())
         flows: list[float] = []
-        samples: list[machine.BenchSample] = []
+        samples: list[experiment.BenchSample] = []
         flow = next((row.flow_um_per_s for row in rows if math.isfinite(row.flow_um_per_s)), 0.0)
         tick = rows[0].tick + rows[0].missed_ticks if rows else 0.0
         for row in rows:
@@ -328,12 +333,12 @@ class HoldRig:
             gap = max(0, round(place - tick))
             flows += [flow] * gap
             samples += [
-                machine.BenchSample(math.nan, row.ambient_pressure_pa, row.air_temperature_c)
+                experiment.BenchSample(math.nan, row.ambient_pressure_pa, row.air_temperature_c)
             ] * gap
             flow = row.flow_um_per_s if math.isfinite(row.flow_um_per_s) else flow
             flows.append(flow)
             samples.append(
-                machine.BenchSample(
+                experiment.BenchSample(
                     row.displacement_um, row.ambient_pressure_pa, row.air_temperature_c
                 )
             )

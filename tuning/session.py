@@ -10,7 +10,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from membrane_ctrl.config import schema
-from membrane_ctrl.control.experiments import machine
+from membrane_ctrl.control.experiments import experiment, operating_point
 from membrane_ctrl.model import errors, files
 from membrane_ctrl.sessions import folder, live_hold
 from tuning.gains_file import (
@@ -39,10 +39,10 @@ _SPARE_S = 120.0
 class ExperimentsHead:
     """`experiments.json`: the contents of `characterise.Experiments` except its record."""
 
-    around: machine.Around
+    around: operating_point.Around
     relays_s: float
     pulses_s: tuple[float, float]
-    finished: machine.Finished
+    finished: experiment.Finished
 
 
 @dataclass(frozen=True, slots=True)

@@ -204,7 +204,8 @@ class LimitsConfig(Section):
     noisier gauge."""
     laser_gauge_drift_max_um: Annotated[float, Field(gt=0, le=10000)] = 120.0
     """The same within an hour: a day of +-2 K and +-10 % relative humidity moves the film by up to
-    99 µm against an hour before (control/film.py). Raise it for a room that changes faster."""
+    99 µm against an hour before (control/film_monitor.py). Raise it for a room that changes
+    faster."""
     laser_gauge_day_max_um: Annotated[float, Field(gt=0, le=10000)] = 700.0
     """The same within a day: such a climate moves the film by up to 624 µm. The true centre may be
     off by as much. Lower it for a room with a steady climate; a third of it raises the notice
@@ -312,7 +313,7 @@ class ShapeConfig(Section):
     """
     time_constant_s: Annotated[float, Field(ge=1, le=1e5)] = 40.0
     """Memory of the trim's tracker: a mount that starts to drift at 2 µm/min is followed within 0.5
-    µm (control/filters.py). Change it with `tune outer`; noisier frames need a longer one."""
+    µm (control/drift_tracker.py). Change it with `tune outer`; noisier frames need a longer one."""
     trim_rate_max_um_per_s: Annotated[float, Field(gt=0, le=10)] = 0.1
     """Fastest trim. Raise it for a mount that moves faster."""
     trim_max_um: Annotated[float, Field(gt=0, le=1000)] = 100.0

@@ -9,7 +9,7 @@ from statistics import fmean, pstdev
 
 from membrane_ctrl.config.schema import Config
 from membrane_ctrl.console.why import duration, go_on, number, why
-from membrane_ctrl.control.film_health import JUDGE_S, TOO_TIGHT_UM_PER_S
+from membrane_ctrl.control.leak_estimate import JUDGE_S, TOO_TIGHT_UM_PER_S
 from membrane_ctrl.model import events, run_events, run_status, shape_estimate, telemetry
 from membrane_ctrl.model.lock import describe_lock
 

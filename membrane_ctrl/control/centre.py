@@ -19,23 +19,19 @@ import numpy as np
 from pydantic import Field
 
 from membrane_ctrl.config.control import EstimatorConfig, LoopConfig
-from membrane_ctrl.control import centre_estimate
+from membrane_ctrl.control import gas_transit
 from membrane_ctrl.control.centre_estimate import (
     FRESH_S,
     CentreEstimate,
     CentreReadings,
     Sensor,
     SensorView,
-    Transit,
 )
-from membrane_ctrl.control.filters import (
-    LearnedFactor,
-    Ramp,
-    ReadingNoise,
-    configured_walk,
-    smoothing,
-)
-from membrane_ctrl.control.gas import believed_weather
+from membrane_ctrl.control.filters import smoothing
+from membrane_ctrl.control.gas_transit import Transit
+from membrane_ctrl.control.innovation_ramp import Ramp
+from membrane_ctrl.control.noise_learning import LearnedFactor, ReadingNoise, configured_walk
+from membrane_ctrl.control.weather_limits import believed_weather
 from membrane_ctrl.model.arrays import FloatArray
 from membrane_ctrl.model.state_tree import ArrayShape, Count, StateNode
 
@@ -125,7 +121,7 @@ class CentreState(StateNode):
     ramps: Annotated[list[Ramp], Field(min_length=len(_RUN), max_length=len(_RUN))] = field(
         default_factory=lambda: [Ramp() for _ in _RUN]
     )
-    transit: centre_estimate.TransitState = field(default_factory=centre_estimate.TransitState)
+    transit: gas_transit.TransitState = field(default_factory=gas_transit.TransitState)
     frames: Count = 0  # of the optics since lock
     frame_interval_s: float = FRESH_S[Sensor.OPTICS]
     last_frame_s: float = -math.inf

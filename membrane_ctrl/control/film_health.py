@@ -1,99 +1,19 @@
-"""Slow changes that lead to a failure, detected early in hourly means. Pure.
+"""Slow changes of the film that lead to a failure, detected early in hourly means. Pure.
 
 leak      mean loss of gas; an opening seam makes it grow until the pump cannot keep up
 reserve   the pump's flow in excess of the leak
-tight     a mirror that loses too little gas cannot be lowered (control/film_health.py)
-creep     at a held sag p J = const (Hencky, J the compliance): as the film gives the pressure falls, dJ/J = -dp/p
-"""  # noqa: E501
+tight     a mirror that loses too little gas cannot be lowered (control/leak_estimate.py)
+creep     at a held sag p J = const (Hencky, J the compliance): as the film gives, the pressure
+          falls, dJ/J = -dp/p
+"""
 
 import math
 from collections import deque
 from dataclasses import dataclass, field
 
-from membrane_ctrl.control.pump_drift import PumpScale
-from membrane_ctrl.model.state_tree import Count, StateNode
-
-# The mirror's loss of gas, from the pump's flow and the motion of the centre.
-#
-# Balance of gas, as speed of the centre:  dy/dt = v - leak + w,  and the feed-forward is -w as far
-# as it is known, so
-#
-#     leak = mean of (v - feed-forward - dy/dt)
-#
-# The mean of dy/dt is a difference of two readings: the laser's noise falls with the window, not
-# with its root.
-
-# Long compared with the loop (6.5 s), short compared with a leak that somebody opens.
-WINDOW_S = 60.0
-
-# Before this the readings' noise and the pump's lag are a tenth of the leak.
-FIRST_S = 10.0
-
-# The loop moves the flow by 0.15 µm/s (standard deviation) and the pump's least running flow is 0.3
-# µm/s: with less than this to make up for, the pump stops and starts, and in the end the band of 2
-# µm is lost
-# (docs/explanation/control.md).
-TOO_TIGHT_UM_PER_S = 0.4
-
-# A warning stands until the leak is clearly above the limit again.
-TOO_TIGHT_END_UM_PER_S = 0.45
-
-# With a shorter mean, weather alone could cause the warning.
-JUDGE_S = 30.0
-
-# A reading so far from its filtered value is a jump of film or laser: no gas moves the film so
-# fast.
-JUMP_UM = 10.0
-
-
-@dataclass(slots=True)
-class LeakEstimate(StateNode):
-    """Mean loss of gas (leak and bleed together) over the last minute, or over a shorter record."""
-
-    mean_um_per_s: float = 0.0
-    elapsed_s: float = 0.0
-    last_um: float = math.nan
-    warned: bool = False
-
-    @property
-    def leak_um_per_s(self) -> float:
-        """Estimate; NaN until there is one, and while nothing is seen."""
-        return (
-            self.mean_um_per_s
-            if self.elapsed_s >= FIRST_S and math.isfinite(self.last_um)
-            else math.nan
-        )
-
-    @property
-    def too_tight(self) -> bool:
-        """Whether the mirror loses too little gas to be held within the band."""
-        if self.elapsed_s >= JUDGE_S:
-            self.warned = self.mean_um_per_s < (
-                TOO_TIGHT_END_UM_PER_S if self.warned else TOO_TIGHT_UM_PER_S
-            )
-        return self.warned
-
-    def update(
-        self, pumped_um_per_s: float, displacement_um: float, filtered_um: float, dt_s: float
-    ) -> None:
-        """Take a step: the flow without the feed-forward's share, and the reading, as read and
-        filtered.
-        """
-        jumps = abs(displacement_um - filtered_um) > JUMP_UM
-        if math.isfinite(self.last_um) and not jumps:
-            self.take(pumped_um_per_s - (filtered_um - self.last_um) / dt_s, filtered_um, dt_s)
-        self.last_um = displacement_um if jumps else filtered_um  # where the filter will be
-
-    def take(self, loss_um_per_s: float, centre_um: float, dt_s: float) -> None:
-        """Take a step's loss that is known, and where it ends."""
-        self.elapsed_s = min(self.elapsed_s + dt_s, WINDOW_S)
-        self.mean_um_per_s += dt_s / self.elapsed_s * (loss_um_per_s - self.mean_um_per_s)
-        self.last_um = centre_um
-
-    def pause(self) -> None:
-        """Skip a step without a reading."""
-        self.last_um = math.nan
-
+from membrane_ctrl.control.leak_estimate import TOO_TIGHT_UM_PER_S
+from membrane_ctrl.control.maintenance_notice import BETTER, FilmWarning
+from membrane_ctrl.model.state_tree import StateNode
 
 HOUR_S = 3600.0
 DAY_HOURS = 24
@@ -104,8 +24,6 @@ RESERVE_SHARE = 0.6
 # Both films' creep laws give 0.7 % on the first day and 0.15 % on the second; more than this is not
 # regular creep.
 CREEP_PER_DAY = 0.01
-# Warn again only after a clear improvement.
-BETTER = 0.9
 
 
 @dataclass(frozen=True, slots=True)
@@ -114,15 +32,6 @@ class Hour(StateNode):
 
     leak_um_per_s: float
     pressure_pa: float
-
-
-@dataclass(frozen=True, slots=True)
-class FilmWarning:
-    """A maintenance notice; it no longer applies if it is not `bad`."""
-
-    name: str
-    message: str
-    bad: bool = True
 
 
 @dataclass(slots=True)
@@ -238,52 +147,3 @@ class FilmHealth:
             return 0.0
         first, last = kept[0].pressure_pa, kept[-1].pressure_pa
         return (first - last) / first * DAY_HOURS / hours
-
-
-_PUMP_EVERY = 10  # segments of a minute between reports
-_PUMP_SIGMAS = 3.0
-
-
-@dataclass(slots=True)
-class PumpHealthState(StateNode):
-    """Segments so far, and whether the warning applies."""
-
-    count: Count = 0
-    warned: bool = False
-
-
-class PumpHealth:
-    """Reports what a hold has learned of its pump, and warns once of
-    a drift beyond `change_max`.
-    """
-
-    def __init__(self, change_max: float, memory: PumpHealthState | None = None) -> None:
-        self._change_max = change_max
-        self.memory = memory or PumpHealthState()
-
-    def set_pump(self, change_max: float) -> None:
-        """Another curve is in force, with this limit of its drift."""
-        self._change_max = change_max
-
-    def step(self, known: PumpScale) -> tuple[bool, tuple[FilmWarning, ...]]:
-        """Take a segment's estimate; returns whether to report it,
-        and a new or withdrawn warning.
-        """
-        memory = self.memory
-        memory.count += 1
-        change = known.scale - 1.0
-        bad = abs(change) > max(self._change_max, _PUMP_SIGMAS * known.sigma) * (
-            BETTER if memory.warned else 1.0
-        )
-        says = (
-            f"the pump gives {100 * abs(change):.0f} % {'less' if change < 0 else 'more'} than "
-            "its curve"
-        )
-        says += f" (+- {100 * known.sigma:.0f} %): check it, then `tune pump`"
-        news = (
-            (FilmWarning("pump_drift", says if bad else "no longer so", bad),)
-            if bad != memory.warned
-            else ()
-        )
-        memory.warned = bad
-        return bool(news) or memory.count % _PUMP_EVERY == 0, news

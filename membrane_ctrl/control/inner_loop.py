@@ -11,8 +11,19 @@ import math
 from dataclasses import dataclass, field, replace
 
 from membrane_ctrl.config.schema import EstimatorConfig, LoopConfig, PumpConfig
-from membrane_ctrl.control import film_health, filters, gas, pid, pump_drift
+from membrane_ctrl.control import (
+    filters,
+    flow_limiter,
+    leak_estimate,
+    loop_margins,
+    pid,
+    pump_curve,
+    pump_drift,
+    setpoint_ramp,
+    setpoint_weight,
+)
 from membrane_ctrl.control.centre_estimate import CentreEstimate
+from membrane_ctrl.control.feedforward import FeedForward, FeedForwardState
 from membrane_ctrl.model.state_tree import StateNode
 
 
@@ -63,14 +74,16 @@ class InnerLoopState(StateNode):
     measured: filters.LowPass = field(default_factory=filters.LowPass)
     # The setpoint passes the same lag as the measurement: a ramp is then no error of its own.
     matched: filters.LowPass = field(default_factory=filters.LowPass)
-    ramp: pid.SetpointRampState = field(default_factory=pid.SetpointRampState)
-    weight: pid.SetpointWeightState = field(default_factory=pid.SetpointWeightState)
+    ramp: setpoint_ramp.SetpointRampState = field(default_factory=setpoint_ramp.SetpointRampState)
+    weight: setpoint_weight.SetpointWeightState = field(
+        default_factory=setpoint_weight.SetpointWeightState
+    )
     integrator: pid.PidState = field(default_factory=pid.PidState)
-    feedforward: gas.FeedForwardState = field(default_factory=gas.FeedForwardState)
-    limiter: pid.FlowState = field(default_factory=pid.FlowState)
-    curve: gas.PumpCurveState = field(default_factory=gas.PumpCurveState)
+    feedforward: FeedForwardState = field(default_factory=FeedForwardState)
+    limiter: flow_limiter.FlowState = field(default_factory=flow_limiter.FlowState)
+    curve: pump_curve.PumpCurveState = field(default_factory=pump_curve.PumpCurveState)
     drift: pump_drift.PumpDriftState = field(default_factory=pump_drift.PumpDriftState)
-    leak: film_health.LeakEstimate = field(default_factory=film_health.LeakEstimate)
+    leak: leak_estimate.LeakEstimate = field(default_factory=leak_estimate.LeakEstimate)
     learned: bool = False  # the last tick has ended a segment that told something of the pump
 
 
@@ -103,16 +116,22 @@ class InnerLoop:
         self._due_gain = (1 - lag_s * slow_per_s) * (1 - lag_s * fast_per_s)
         self._flow_full_um_per_s = pump.flow_full_um_per_s
         flow_max_um_per_s = loop.flow_most_um_per_s(pump)
-        self._ramp = pid.SetpointRamp(loop.setpoint_ramp_um_per_s, flow_max_um_per_s, memory.ramp)
-        self._weight = pid.SetpointWeight(loop.setpoint_weight, loop.ti_s, memory.weight)
+        self._ramp = setpoint_ramp.SetpointRamp(
+            loop.setpoint_ramp_um_per_s, flow_max_um_per_s, memory.ramp
+        )
+        self._weight = setpoint_weight.SetpointWeight(
+            loop.setpoint_weight, loop.ti_s, memory.weight
+        )
         self._pid = pid.Pid(_gains(loop), flow_max_um_per_s, memory.integrator)
-        self._feedforward = gas.FeedForward(loop, memory.feedforward)
-        self._limiter = pid.FlowLimiter(
+        self._feedforward = FeedForward(loop, memory.feedforward)
+        self._limiter = flow_limiter.FlowLimiter(
             flow_max_um_per_s, loop.flow_rate_limit_um_per_s2, memory.limiter
         )
-        self._curve = gas.PumpCurve(pump, memory.curve)
+        self._curve = pump_curve.PumpCurve(pump, memory.curve)
         self._probe_um = pump.probe_um
-        self._drift = pump_drift.PumpDrift(pid.DEAD_S, pid.PUMP_LAG_S, memory.drift)
+        self._drift = pump_drift.PumpDrift(
+            loop_margins.DEAD_S, loop_margins.PUMP_LAG_S, memory.drift
+        )
         self.may_probe = True  # not while gains are judged
 
     @property
@@ -346,10 +365,12 @@ class InnerLoop:
         mean_fraction = self._curve.fraction(self._pid.integral_um_per_s / self._drift.correction)
         self._flow_full_um_per_s = pump.flow_full_um_per_s
         self._probe_um = pump.probe_um
-        self.memory.curve = gas.PumpCurveState()
-        self._curve = gas.PumpCurve(pump, self.memory.curve)
+        self.memory.curve = pump_curve.PumpCurveState()
+        self._curve = pump_curve.PumpCurve(pump, self.memory.curve)
         self.memory.drift = pump_drift.PumpDriftState()
-        self._drift = pump_drift.PumpDrift(pid.DEAD_S, pid.PUMP_LAG_S, self.memory.drift)
+        self._drift = pump_drift.PumpDrift(
+            loop_margins.DEAD_S, loop_margins.PUMP_LAG_S, self.memory.drift
+        )
         self.set_gains(self._loop)
         self._pid.place(self._limiter.place(self._curve.flow(mean_fraction)))
         self.memory.leak.pause()

@@ -15,128 +15,17 @@ that could become unstable: there is only a tracker to tune.
 import math
 from dataclasses import dataclass, field
 from enum import StrEnum
-from typing import Annotated
 
 import numpy as np
 
 from membrane_ctrl.config.schema import ShapeConfig
-from membrane_ctrl.control.filters import DriftTracker
+from membrane_ctrl.control.drift_tracker import DriftTracker
+from membrane_ctrl.control.sag_change import NO_CHANGE, SagChange, sag_change
+from membrane_ctrl.control.shape_reference import ReferenceMean
 from membrane_ctrl.model import shape_estimate, telemetry
 from membrane_ctrl.model.arrays import FloatArray
 from membrane_ctrl.model.reason import NO_REASON, Reason, make_reason
-from membrane_ctrl.model.state_tree import ArrayShape, StateNode
-from membrane_ctrl.model.zernike_terms import ZERNIKE_TERMS
-
-# The reference of the shape loop: the mean of the first shapes.
-
-
-# An error of the reference remains as an offset of the figure: the mean has less than half the
-# scatter of one shape, at the price of a few cycles without the trim.
-SHAPES = 5
-# Figures of single frames come faster than the laser's noise averages out: as many readings as five
-# cycles have.
-TRACKED_SHAPES = 25
-TRACKED_EVERY_S = 0.4
-
-
-_Coefficients = Annotated[FloatArray, ArrayShape((ZERNIKE_TERMS,))]
-
-
-@dataclass(frozen=True, slots=True)
-class ReferenceShape(StateNode):
-    """One of the shapes that make a reference."""
-
-    time_s: float
-    displacement_um: float
-    coeffs_um: _Coefficients
-    of_frame: bool  # tracked in a single frame
-
-
-@dataclass(slots=True)
-class ReferenceMean(StateNode):
-    """Mean coefficients, laser reading and time of a few shapes."""
-
-    taken: list[ReferenceShape] = field(default_factory=list)
-    coeffs_um: _Coefficients = field(default_factory=lambda: np.full(ZERNIKE_TERMS, math.nan))
-    displacement_um: float = math.nan
-    time_s: float = math.nan
-
-    @property
-    def wanted(self) -> int:
-        """Number of shapes that make a reference."""
-        return TRACKED_SHAPES if self.taken and self.taken[-1].of_frame else SHAPES
-
-    @property
-    def count(self) -> int:
-        """Number taken."""
-        return len(self.taken)
-
-    @property
-    def complete(self) -> bool:
-        """Whether there are enough."""
-        return self.count >= self.wanted
-
-    def take(self, estimate: shape_estimate.ShapeEstimate) -> None:
-        """Take one more; of single frames, one per `TRACKED_EVERY_S`."""
-        of_frame = estimate.kind == "track"
-        if self.taken and of_frame and estimate.time_s < self.taken[-1].time_s + TRACKED_EVERY_S:
-            return
-        coeffs_um = np.array(estimate.coeffs_um, dtype=float)
-        self.taken.append(
-            ReferenceShape(estimate.time_s, estimate.displacement_um, coeffs_um, of_frame)
-        )
-        self.coeffs_um = np.mean([shape.coeffs_um for shape in self.taken], axis=0)
-        self.displacement_um = float(np.mean([shape.displacement_um for shape in self.taken]))
-        self.time_s = float(np.mean([shape.time_s for shape in self.taken]))
-
-
-# Change of sag from the change of a Zernike vector.
-#
-# A change of sag moves the coefficients along a known direction s (the sensitivity, µm per µm).
-# With the change dc = c - c_ref and its covariance C the best linear unbiased estimate and its
-# variance are (Gauss-Markov)
-#
-#     d = (s' W dc) / (s' W s),    var d = 1 / (s' W s),    W = (C + f^2 I)^-1
-#
-# C comes from pixel noise: nanometres, and nearly singular where terms are hard to separate. Alone
-# it would put all weight on a few terms whose *model* error (the film's motion between frames,
-# geometry, gamma) is far larger. f stands for that: it is the same for every term, and bounds the
-# condition of W.
-
-
-# Standard deviation of a coefficient's model error (assumed; a bench shows it as the scatter of the
-# estimates): 0.05 µm RMS over the disc is 0.17 µm of sag, which is what a cycle gives.
-MODEL_FLOOR_UM = 0.05
-
-MEASURED = slice(1, None)  # all but piston, which is set by the surface being 0 at the vertex
-
-
-@dataclass(frozen=True, slots=True)
-class SagChange(StateNode):
-    """Change of sag in µm, positive when the bowl deepens, and its standard deviation."""
-
-    change_um: float
-    sigma_um: float
-
-
-def sag_change(
-    coeffs_um: FloatArray,
-    reference_um: FloatArray,
-    covariance_um2: FloatArray,
-    sensitivity: FloatArray,
-) -> SagChange:
-    """Sag now minus sag at the reference, from coefficients (terms,) and their covariance (terms,
-    terms).
-
-    The reference is constant, hence no noise of the change. `sensitivity` (terms,) is the
-    coefficients' change per µm of sag.
-    """
-    s = sensitivity[MEASURED]
-    covariance = covariance_um2[MEASURED, MEASURED] + MODEL_FLOOR_UM**2 * np.eye(s.size)
-    weighted = np.linalg.solve(covariance, s)
-    information = float(weighted @ s)
-    change_um = float(weighted @ (coeffs_um - reference_um)[MEASURED]) / information
-    return SagChange(change_um, information**-0.5)
+from membrane_ctrl.model.state_tree import StateNode
 
 
 class ShapeCode(StrEnum):
@@ -186,7 +75,7 @@ class ShapeLoopMemory(StateNode):
     base_um: float = 0.0  # the trim at lock
     reference: ReferenceMean = field(default_factory=ReferenceMean)
     drift: DriftTracker = field(default_factory=DriftTracker)
-    change: SagChange = SagChange(math.nan, math.nan)  # as last admitted
+    change: SagChange = NO_CHANGE  # as last admitted
     admitted_s: float = math.nan
     seen_s: float = math.nan
     settled_since_s: float = math.inf
@@ -226,7 +115,7 @@ class ShapeLoop:
         memory.state = telemetry.ShapeState.WAITING
         memory.reason = make_reason(ShapeCode.WAITING, "waiting for the first shape")
         memory.reference = ReferenceMean()
-        memory.change = SagChange(math.nan, math.nan)
+        memory.change = NO_CHANGE
         memory.admitted_s = math.nan
         memory.seen_s = now_s
 

@@ -17,7 +17,7 @@ from datetime import UTC, datetime
 from typing import Any
 
 from membrane_ctrl.config import port, schema, toml_file
-from membrane_ctrl.control.experiments.trial import ExperimentSpec
+from membrane_ctrl.control.experiments.spec import ExperimentSpec
 from membrane_ctrl.control_port import protocol, sockets
 from membrane_ctrl.control_port.commander import Commander, CommandSession
 from membrane_ctrl.control_port.endpoint import Endpoint, LetIn, Refusals, Welcome

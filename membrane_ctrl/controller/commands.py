@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 from typing import Literal
 
 from membrane_ctrl.config.schema import Config, LoopConfig, PumpConfig
-from membrane_ctrl.control.experiments.trial import ExperimentSpec
+from membrane_ctrl.control.experiments.spec import ExperimentSpec
 from membrane_ctrl.controller.safety import MOVING
 from membrane_ctrl.model.events import CommandTaken
 from membrane_ctrl.model.lock import Lock

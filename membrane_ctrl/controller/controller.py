@@ -15,7 +15,8 @@ from numpy.linalg import LinAlgError
 from firmware_iface.roles import ALL_FAULTS, BenchCommand
 from membrane_ctrl.config.schema import Config, LoopConfig, PumpConfig
 from membrane_ctrl.control import inner_loop, shape_loop
-from membrane_ctrl.control.experiments import machine, trial
+from membrane_ctrl.control.experiments import trial
+from membrane_ctrl.control.experiments.experiment import ExperimentEnd, Finished
 from membrane_ctrl.controller import (
     commands,
     interlocks,
@@ -475,7 +476,7 @@ class Controller:
         """Report how the experiment ended: by itself, or because the state changed."""
         experiment = self._scene.trial
         assert experiment is not None
-        ended = self._scene.trial_ended or machine.Finished(machine.ExperimentEnd.INTERRUPTED, why)
+        ended = self._scene.trial_ended or Finished(ExperimentEnd.INTERRUPTED, why)
         events.append(
             told.ExperimentEnded(
                 experiment.spec.kind, ended.completed, ended.reason, ended.end.value

@@ -17,7 +17,7 @@ from firmware_iface.register_map import default_map
 from firmware_iface.roles import BenchIdentity
 from firmware_iface.settings import ModbusInputConfig, VaisalaPtb330Config
 from membrane_ctrl.config.schema import Config, DevicesConfig
-from membrane_ctrl.control import gas
+from membrane_ctrl.control import pump_curve
 from membrane_ctrl.controller import (
     cross_check_bridges,
     cross_check_interlocks,
@@ -308,7 +308,7 @@ def _board(config: Config, board: BenchIdentity, say: cross_check_plant.ConfigFi
         "lower it to that",
     )
     limit = board.pump_limit_fraction
-    needed = gas.PumpCurve(config.pump).fraction(cross_check_plant.flow_um_per_s(config))
+    needed = pump_curve.PumpCurve(config.pump).fraction(cross_check_plant.flow_um_per_s(config))
     most = f"and the board limits the pump to {limit:g}"
     remedy = "lower it, or raise the board's limit"
     say.error(

@@ -10,7 +10,7 @@ from firmware_iface.roles import BenchIdentity
 from firmware_iface.settings import ModbusMapConfig, Optoncdt1420Config
 from membrane_ctrl.config import sight
 from membrane_ctrl.config.schema import Config, LoopConfig, OpticsConfig
-from membrane_ctrl.control import film, gas, pid
+from membrane_ctrl.control import film_monitor, leak_growth, loop_margins, pump_curve
 from membrane_ctrl.controller import pump_obeys, safety
 
 Severity = Literal["error", "warning"]
@@ -25,7 +25,7 @@ _STORM_PA = 5.0  # effect on the gauge of 250 Pa of weather at once
 _TRACK_LEAST_HZ = 5.0
 # Differences between a sound laser and gauge: the gauge's noise at 1 Hz and a mount that warms up;
 # the creep of a fresh film within hours, and with a day of +-1 K and +-5 % of relative humidity
-# (control/film.py)
+# (control/film_monitor.py)
 _APART_UM, _CREEP_UM, _CLIMATE_UM = 7.0, 31.0, 220.0
 
 
@@ -95,7 +95,7 @@ def judge_pump(config: Config, say: ConfigFindings) -> None:
             "measure it",
         )
     else:
-        least_um_per_s = gas.PumpCurve(pump).least_flow_um_per_s
+        least_um_per_s = pump_curve.PumpCurve(pump).least_flow_um_per_s
         why = (
             f"a running pump gives at least {least_um_per_s:.2f} µm/s: it would only switch on "
             "and off"
@@ -166,7 +166,7 @@ def _leak_estimate(config: Config) -> str:
 
 def weak_gains(loop: LoopConfig) -> tuple[Severity, str] | None:
     """What is wrong with the gains of a loop on the nominal pump, if anything."""
-    sensitivity = pid.peak_sensitivity(loop)
+    sensitivity = loop_margins.peak_sensitivity(loop)
     gains = (
         f"with Ti {loop.ti_s:g} s, Td {loop.td_s:g} s, a filter of {loop.measurement_filter_s:g} s"
     )
@@ -211,9 +211,9 @@ def judge_loop(config: Config, say: ConfigFindings) -> None:
     say.warn(
         loop.setpoint_ramp_um_per_s > full_um_per_s, "loop.setpoint_ramp_um_per_s", why, "lower it"
     )
-    bleed_um_per_s = loop.bleed_fraction * gas.VENT_FULL_UM_PER_S
+    bleed_um_per_s = loop.bleed_fraction * pump_curve.VENT_FULL_UM_PER_S
     why = f"the vent would take about {bleed_um_per_s:.0f} µm/s, half of the pump's flow or more"
-    remedy = f"set less than {0.5 * full_um_per_s / gas.VENT_FULL_UM_PER_S:.3f}"
+    remedy = f"set less than {0.5 * full_um_per_s / pump_curve.VENT_FULL_UM_PER_S:.3f}"
     say.error(bleed_um_per_s > 0.5 * full_um_per_s, "loop.bleed_fraction", why, remedy)
     swing_s = full_um_per_s / loop.flow_rate_limit_um_per_s2
     why = f"the pump needs {swing_s:.0f} s from none to full: the loop would swing"
@@ -354,15 +354,15 @@ def judge_gauge(config: Config, say: ConfigFindings) -> None:
 def judge_film(config: Config, say: ConfigFindings) -> None:
     """Judge the film's data, which serve to judge gas, laser and gauge."""
     limits, mirror = config.limits, config.optics.mirror
-    most = 1.0 + flow_um_per_s(config) / film.LEAK_LEAST_UM_PER_S
+    most = 1.0 + flow_um_per_s(config) / leak_growth.LEAK_LEAST_UM_PER_S
     growth, why = (
         "limits.leak_growth_max",
         f"can never trip: the pump gives {flow_um_per_s(config):g} µm/s",
     )
     say.error(limits.leak_growth_max >= most, growth, why, f"set less than {most:.1f}")
-    least = f"set at least {film.CONTRADICTED_MOST:g}"
+    least = f"set at least {leak_growth.CONTRADICTED_MOST:g}"
     say.error(
-        limits.leak_growth_max < film.CONTRADICTED_MOST,
+        limits.leak_growth_max < leak_growth.CONTRADICTED_MOST,
         growth,
         "the weather's effect on a leak trips it",
         least,
@@ -383,10 +383,13 @@ def judge_film(config: Config, say: ConfigFindings) -> None:
     )
     pressure, why = (
         "optics.mirror.pressure_pa",
-        f"laser and gauge are not compared below {film.TAUT_PA:g} Pa",
+        f"laser and gauge are not compared below {film_monitor.TAUT_PA:g} Pa",
     )
     say.warn(
-        0.0 < mirror.pressure_pa <= film.TAUT_PA, pressure, why, "measure it with the film taut"
+        0.0 < mirror.pressure_pa <= film_monitor.TAUT_PA,
+        pressure,
+        why,
+        "measure it with the film taut",
     )
     why = "unknown: a gauge in the wrong unit would go unnoticed"
     say.warn(mirror.pressure_pa == 0.0, pressure, why, "set the gauge's reading at displacement 0")

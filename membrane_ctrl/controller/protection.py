@@ -73,7 +73,8 @@ class Guard(Enum):
 
     MANUAL_RANGE = "a pause or manual flow ends beyond `states.manual_range_um` (`scene.py`)"
     EXPERIMENT = (
-        "an experiment ends near its limit, and brings the mirror back (`experiments/machine.py`)"
+        "an experiment ends near its limit, and brings the mirror back "
+        "(`experiments/excursion_guard.py`)"
     )
     RAMP_WAITS = (
         "the setpoint's ramp waits for a mirror that lags by `states.inflate_pause_um` "

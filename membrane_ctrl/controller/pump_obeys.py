@@ -12,8 +12,8 @@ from dataclasses import dataclass, field, replace
 
 from firmware_iface.roles import BenchReading
 from membrane_ctrl.config.schema import LoopConfig, PumpConfig, StatesConfig
-from membrane_ctrl.control import gas
-from membrane_ctrl.control.filters import Slope
+from membrane_ctrl.control import pump_curve
+from membrane_ctrl.control.line_slope import Slope
 from membrane_ctrl.model.state_tree import Count, StateNode
 
 # A flow controller's zero and a tachometer's last count are below this; no pump moves gas below 0.1
@@ -374,7 +374,7 @@ class ActuatorTest:
             vent_um_per_s = speeds["off"] - speeds["vent"]
             if vent_um_per_s < vent_least_um_per_s:
                 return f"the vent lets the mirror down by only {vent_um_per_s:.1f} µm/s"
-        expected_um_per_s = gas.PumpCurve(self.memory.pump).flow(PARTS[-1].pump_fraction)
+        expected_um_per_s = pump_curve.PumpCurve(self.memory.pump).flow(PARTS[-1].pump_fraction)
         rise_um_per_s = speeds["pump"] - speeds["off"]
         if not pump_least_share <= rise_um_per_s / expected_um_per_s <= _PUMP_MOST_SHARE:
             return (

@@ -8,9 +8,9 @@ from typing import Any, Literal
 
 from firmware_iface.roles import NO_READING
 from membrane_ctrl.config.schema import Config, LoopConfig, PumpConfig
-from membrane_ctrl.control import filters, inner_loop, shape_loop
+from membrane_ctrl.control import inner_loop, line_slope, shape_loop
 from membrane_ctrl.control.centre_estimate import CentreEstimate
-from membrane_ctrl.control.experiments.machine import Finished
+from membrane_ctrl.control.experiments.experiment import Finished
 from membrane_ctrl.control.experiments.trial import Trial, TrialState
 from membrane_ctrl.controller import commands, interlocks, pump_obeys, safe_levels, safety, tick
 from membrane_ctrl.controller.observer import Observer
@@ -47,8 +47,8 @@ class SceneState(StateNode):
     last_good_s: float = math.nan  # in `check`
     highest_um: float = math.nan  # filtered reading, in `inflate`
     highest_s: float = math.nan  # when the mirror was last rising
-    sinking: filters.Slope = field(
-        default_factory=filters.Slope
+    sinking: line_slope.Slope = field(
+        default_factory=line_slope.Slope
     )  # of the mirror with the pump off, in `check`
     test_memory: pump_obeys.ActuatorTestState | None = None  # of the actuator test, in `check`
     ramp_from_fraction: float = 0.0

@@ -8,15 +8,28 @@ from collections.abc import Collection
 from dataclasses import dataclass, field, replace
 
 from membrane_ctrl.config.schema import Config, LoopConfig, PumpConfig, ShapeConfig
-from membrane_ctrl.control import centre_estimate, film, film_health, gas, inner_loop
-from membrane_ctrl.control.centre import LOCK_FRAMES, CentreFilter, CentreState
-from membrane_ctrl.control.centre_estimate import (
-    CentreEstimate,
-    CentreReadings,
-    Sensor,
-    StandGrowth,
+from membrane_ctrl.control import (
+    camera_mount,
+    film_health,
+    film_monitor,
+    inner_loop,
+    leak_growth,
+    maintenance_notice,
+    pump_health,
+    weather_limits,
 )
+from membrane_ctrl.control.camera_mount import StandGrowth
+from membrane_ctrl.control.centre import LOCK_FRAMES, CentreFilter, CentreState
+from membrane_ctrl.control.centre_estimate import CentreEstimate, CentreReadings, Sensor
 from membrane_ctrl.control.filters import LowPass
+from membrane_ctrl.control.plausibility import (
+    LASER_GAP_S,
+    REFERENCE_S,
+    SLOW_REFERENCE_S,
+    Liar,
+    PlausibilityCheck,
+    PlausibilityState,
+)
 from membrane_ctrl.control.shape_loop import ShapeCode
 from membrane_ctrl.controller import safety
 from membrane_ctrl.controller.protection import FilmSensor
@@ -41,10 +54,10 @@ _WEATHER_STANDS_S = 10.0  # a single bad answer is not reported
 # No two cycles have the same noise; a shape that appears twice may be a repeated message
 _REPEATS = 3
 _FAULTY = {
-    film.Liar.NOBODY: FaultySensor.NONE,
-    film.Liar.UNSURE: FaultySensor.UNKNOWN,
-    film.Liar.LASER: FaultySensor.LASER,
-    film.Liar.OPTICS: FaultySensor.OPTICS,
+    Liar.NOBODY: FaultySensor.NONE,
+    Liar.UNSURE: FaultySensor.UNKNOWN,
+    Liar.LASER: FaultySensor.LASER,
+    Liar.OPTICS: FaultySensor.OPTICS,
 }
 
 
@@ -136,20 +149,22 @@ class SensorConsistencyState(StateNode):
 
     setpoint_um: float  # as last commanded
     bleed_fraction: float
-    plausibility: film.PlausibilityState = field(default_factory=film.PlausibilityState)
+    plausibility: PlausibilityState = field(default_factory=PlausibilityState)
     health: film_health.FilmHealthState = field(default_factory=film_health.FilmHealthState)
-    pump: film_health.PumpHealthState = field(default_factory=film_health.PumpHealthState)
-    laser_film: film.FilmMonitorState = field(default_factory=film.FilmMonitorState)
-    optics_film: film.FilmMonitorState = field(default_factory=film.FilmMonitorState)
+    pump: pump_health.PumpHealthState = field(default_factory=pump_health.PumpHealthState)
+    laser_film: film_monitor.FilmMonitorState = field(default_factory=film_monitor.FilmMonitorState)
+    optics_film: film_monitor.FilmMonitorState = field(
+        default_factory=film_monitor.FilmMonitorState
+    )
     redundancy: RedundancyState = field(default_factory=RedundancyState)
-    growth: film.LeakGrowth = field(default_factory=film.LeakGrowth)
+    growth: leak_growth.LeakGrowth = field(default_factory=leak_growth.LeakGrowth)
     laser_missing_s: float = 0.0
     doubted: bool = False
     drift_noticed: bool = False
     camera_s: float = -math.inf  # the newest figure
     sag_um: float = math.nan  # by it
     repeats: Count = 0  # of the same sag, to the last bit
-    liar: film.Liar = film.Liar.NOBODY
+    liar: Liar = Liar.NOBODY
     lies_s: float = 0.0
     laser_verdicts: RecentCount = field(default_factory=RecentCount)
     weather_s: float = 0.0
@@ -179,7 +194,7 @@ class SensorConsistency:
             config.loop.setpoint_um, config.loop.bleed_fraction
         )
         memory = self.memory
-        self._plausibility = film.PlausibilityCheck(
+        self._plausibility = PlausibilityCheck(
             config.shape.disagreement_max_um,
             1e3 * config.optics.mirror.sag_mm,
             _find_figure_lag_s(config),
@@ -189,10 +204,10 @@ class SensorConsistency:
         self._health = film_health.FilmHealth(
             config.loop.flow_most_um_per_s(config.pump), memory.health
         )
-        self._pump = film_health.PumpHealth(config.pump.change_max, memory.pump)
+        self._pump = pump_health.PumpHealth(config.pump.change_max, memory.pump)
         limits, mirror = config.limits, config.optics.mirror
-        self._laser_film = film.FilmMonitor(limits, mirror, "laser", memory.laser_film)
-        self._optics_film = film.FilmMonitor(limits, mirror, "optics", memory.optics_film)
+        self._laser_film = film_monitor.FilmMonitor(limits, mirror, "laser", memory.laser_film)
+        self._optics_film = film_monitor.FilmMonitor(limits, mirror, "optics", memory.optics_film)
         self._nominal_sag_um = 1e3 * config.optics.mirror.sag_mm
         self._by_optics = config.by_optics
         self._follows_optics = config.estimator.process_value != "laser"
@@ -260,18 +275,18 @@ class SensorConsistency:
         blind = not inputs.now_s - self.memory.camera_s <= self._fresh_s
         liar = self._plausibility.step(dt_s, laser_um, gauge_pa, held.figure, blind)
         self.memory.lies_s = (
-            self.memory.lies_s + dt_s if liar == film.Liar.LASER and held.optics_hold else 0.0
+            self.memory.lies_s + dt_s if liar == Liar.LASER and held.optics_hold else 0.0
         )
         # A knock is over: the estimate knows the laser's new place. A laser that is knocked again
         # and again is not.
         self.laser_moved = (
-            self.memory.lies_s > film.WARM_S
+            self.memory.lies_s > film_monitor.WARM_S
             and not self.memory.laser_verdicts.too_many(inputs.now_s, _VERDICTS_MAX)
         )
         if self.laser_moved:
             self._plausibility.rebase()
-            liar = film.Liar.NOBODY
-        if liar == film.Liar.LASER and self.memory.liar != film.Liar.LASER:
+            liar = Liar.NOBODY
+        if liar == Liar.LASER and self.memory.liar != Liar.LASER:
             self.memory.laser_verdicts.add(inputs.now_s, _VERDICTS_MAX)
         events += self._judge(liar)
         if moves or state == State.SETTLE:
@@ -287,7 +302,7 @@ class SensorConsistency:
     @property
     def agree(self) -> bool:
         """Laser and camera do not contradict each other, as far as is known."""
-        return self.memory.liar == film.Liar.NOBODY and not self.camera_lies
+        return self.memory.liar == Liar.NOBODY and not self.camera_lies
 
     @property
     def camera_drifts(self) -> bool:
@@ -321,12 +336,12 @@ class SensorConsistency:
         self.memory.growth.moves()
         self.memory.gas_excess = ""
         self._plausibility.reset()
-        return self._judge(film.Liar.NOBODY)
+        return self._judge(Liar.NOBODY)
 
     @property
     def _optics_alone(self) -> bool:
         """Whether the optics show the film in the laser's place."""
-        missing = self.memory.laser_missing_s > film.LASER_GAP_S
+        missing = self.memory.laser_missing_s > LASER_GAP_S
         return self._by_optics or (self._follows_optics and missing)
 
     def _compare_with_gauge(self, state: State, dt_s: float, held: HoldStatus) -> None:
@@ -347,7 +362,7 @@ class SensorConsistency:
         self.memory.laser_gauge_apart = by_optics if self._optics_alone else by_laser
 
     @property
-    def _film_in_use(self) -> film.FilmMonitor:
+    def _film_in_use(self) -> film_monitor.FilmMonitor:
         return self._optics_film if self._optics_alone else self._laser_film
 
     def _notice_drift(self, state: State) -> list[Event]:
@@ -418,14 +433,16 @@ class SensorConsistency:
             return self._leak_growth_max
         if not inputs.now_s - self.memory.camera_s <= self._fresh_s:
             return self._leak_growth_max
-        return math.inf if self.memory.liar == film.Liar.NOBODY else film.CONTRADICTED_MOST
+        return math.inf if self.memory.liar == Liar.NOBODY else leak_growth.CONTRADICTED_MOST
 
     def _judge_weather(self, inputs: TickInputs, dt_s: float) -> list[Event]:
         """Report once that a barometer or thermometer is implausible; the loop ignores it."""
         reading = inputs.reading
         if reading is None:
             return []
-        failure = gas.weather_fault(reading.ambient_pressure_pa, reading.air_temperature_c)
+        failure = weather_limits.weather_fault(
+            reading.ambient_pressure_pa, reading.air_temperature_c
+        )
         self.memory.weather_s = (
             self.memory.weather_s + dt_s if bool(failure) != self.memory.weather_told else 0.0
         )
@@ -439,15 +456,13 @@ class SensorConsistency:
             )
         ]
 
-    def _judge(self, liar: film.Liar) -> list[Event]:
+    def _judge(self, liar: Liar) -> list[Event]:
         repeats = self.memory.repeats >= _REPEATS
-        seen = (
-            str(self._plausibility.changes) if liar in (film.Liar.LASER, film.Liar.OPTICS) else ""
-        )
-        self.memory.laser_lies = seen if liar == film.Liar.LASER else ""
+        seen = str(self._plausibility.changes) if liar in (Liar.LASER, Liar.OPTICS) else ""
+        self.memory.laser_lies = seen if liar == Liar.LASER else ""
         if repeats:
             self.memory.camera_lies = "the camera repeats one shape to the last bit: restart it"
-        elif liar != film.Liar.OPTICS:
+        elif liar != Liar.OPTICS:
             self.memory.camera_lies = ""
         elif not self.camera_lies:  # changed numbers do not make a new reason
             self.memory.camera_lies = f"laser and gauge agree that the camera is wrong: {seen}"
@@ -462,7 +477,7 @@ class SensorConsistency:
         return [Plausibility(_FAULTY[liar], seen)]
 
 
-def _of_warning(warning: film_health.FilmWarning) -> Event:
+def _of_warning(warning: maintenance_notice.FilmWarning) -> Event:
     return (Maintenance if warning.bad else MaintenanceOver)(warning.name, warning.message)
 
 
@@ -561,9 +576,7 @@ class HoldersState(StateNode):
     agreed_mount: LowPass = field(default_factory=LowPass)
     slowly_agreed_mount: LowPass = field(default_factory=LowPass)
     mount_drift: MountDriftState = field(default_factory=MountDriftState)
-    stand: centre_estimate.StandGrowthState = field(
-        default_factory=centre_estimate.StandGrowthState
-    )
+    stand: camera_mount.StandGrowthState = field(default_factory=camera_mount.StandGrowthState)
     stand_told: bool = False
     told: tuple[int, ...] | None = None  # the sensors, as reported
     news_s: float = math.nan
@@ -639,7 +652,9 @@ class Holders:
         figure = self._select_figure(self._filter, figures.accepted, scene.dt_s, shape, consistency)
         reading = inputs.reading
         self._stand.step(
-            gas.believed_weather(math.nan, reading.air_temperature_c)[1] if reading else math.nan,
+            weather_limits.believed_weather(math.nan, reading.air_temperature_c)[1]
+            if reading
+            else math.nan,
             scene.dt_s,
         )
         if self._filter.frames < LOCK_FRAMES:
@@ -724,8 +739,8 @@ class Holders:
             self._mount_drift.start(memory.estimate.mount_um if memory.estimate else 0.0)
         memory.locking = off
         if consistency.agree and memory.estimate is not None:
-            memory.agreed_mount.update(memory.estimate.mount_um, dt_s, film.REFERENCE_S)
-            memory.slowly_agreed_mount.update(memory.estimate.mount_um, dt_s, film.SLOW_REFERENCE_S)
+            memory.agreed_mount.update(memory.estimate.mount_um, dt_s, REFERENCE_S)
+            memory.slowly_agreed_mount.update(memory.estimate.mount_um, dt_s, SLOW_REFERENCE_S)
         elif consistency.camera_lies and centre.frames and not self._by_optics:
             agreed = (
                 memory.slowly_agreed_mount if consistency.camera_drifts else memory.agreed_mount

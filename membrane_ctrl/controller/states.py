@@ -9,7 +9,7 @@ from collections.abc import Callable
 
 from membrane_ctrl.control import inner_loop
 from membrane_ctrl.control.centre_estimate import Sensor
-from membrane_ctrl.control.experiments.machine import BenchSample, ExperimentEnd, Finished
+from membrane_ctrl.control.experiments.experiment import BenchSample, ExperimentEnd, Finished
 from membrane_ctrl.controller import commands, pump_obeys
 from membrane_ctrl.controller.scene import Scene
 from membrane_ctrl.model.errors import Exit

@@ -40,7 +40,7 @@ from membrane_ctrl.config.schema import (
     ShapeConfig,
     StatesConfig,
 )
-from membrane_ctrl.control.experiments.trial import ExperimentSpec
+from membrane_ctrl.control.experiments.spec import ExperimentSpec
 from membrane_ctrl.controller import states
 from membrane_ctrl.controller.commands import Command, Kind
 from membrane_ctrl.controller.scene import Scene

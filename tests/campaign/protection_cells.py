@@ -26,7 +26,7 @@ from membrane_ctrl.config.schema import (
     StatesConfig,
     TwinConfig,
 )
-from membrane_ctrl.control.experiments.trial import ExperimentKind, ExperimentSpec, PumpStep
+from membrane_ctrl.control.experiments.spec import ExperimentKind, ExperimentSpec, PumpStep
 from membrane_ctrl.controller.commands import Command
 from membrane_ctrl.controller.protection import Activity, Failure, FilmSensor, ProcessValue
 from membrane_ctrl.hold.virtual_run import TruthShape, VirtualRun

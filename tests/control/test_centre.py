@@ -16,9 +16,11 @@ from benchmarks.centre import Optics, Sensors, hold
 from membrane_ctrl.config.schema import EstimatorConfig, LoopConfig, PumpConfig, TwinConfig
 from membrane_ctrl.control import centre
 from membrane_ctrl.control.centre import CentreFilter
-from membrane_ctrl.control.centre_estimate import CentreEstimate, CentreReadings, Sensor, Transit
-from membrane_ctrl.control.filters import LearnedFactor, Ramp, ReadingNoise, configured_walk
+from membrane_ctrl.control.centre_estimate import CentreEstimate, CentreReadings, Sensor
+from membrane_ctrl.control.gas_transit import Transit
 from membrane_ctrl.control.inner_loop import InnerLoop
+from membrane_ctrl.control.innovation_ramp import Ramp
+from membrane_ctrl.control.noise_learning import LearnedFactor, ReadingNoise, configured_walk
 from tests.support.second_world import ForeignPlant, ForeignPump
 
 LOOP = LoopConfig()

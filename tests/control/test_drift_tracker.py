@@ -7,7 +7,7 @@ import math
 import numpy as np
 import pytest
 
-from membrane_ctrl.control.filters import DriftTracker
+from membrane_ctrl.control.drift_tracker import DriftTracker
 
 MEMORY_S, STEP_S = 60.0, 2.0
 

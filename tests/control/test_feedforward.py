@@ -8,7 +8,8 @@ import numpy as np
 import pytest
 
 from membrane_ctrl.config.schema import LoopConfig
-from membrane_ctrl.control.gas import FeedForward, weather_fault
+from membrane_ctrl.control.feedforward import FeedForward
+from membrane_ctrl.control.weather_limits import weather_fault
 
 DT_S = 0.02
 

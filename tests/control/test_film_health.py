@@ -7,7 +7,8 @@ from collections.abc import Callable
 
 import pytest
 
-from membrane_ctrl.control.film_health import FilmHealth, FilmWarning
+from membrane_ctrl.control.film_health import FilmHealth
+from membrane_ctrl.control.maintenance_notice import FilmWarning
 
 STEP_S = 60.0
 HOURS = Callable[[float], float]

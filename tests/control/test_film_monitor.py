@@ -11,7 +11,8 @@ import numpy as np
 import pytest
 
 from membrane_ctrl.config.schema import LimitsConfig, MirrorConfig
-from membrane_ctrl.control.film import CONTRADICTED_MOST, FilmMonitor, LeakGrowth
+from membrane_ctrl.control.film_monitor import FilmMonitor
+from membrane_ctrl.control.leak_growth import CONTRADICTED_MOST, LeakGrowth
 
 RATE_HZ = 10.0
 SAG_UM, PRESSURE_PA = 37_100.0, 600.0

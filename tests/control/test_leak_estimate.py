@@ -7,8 +7,8 @@ import math
 import numpy as np
 import pytest
 
-from membrane_ctrl.control.film_health import FIRST_S, JUDGE_S, LeakEstimate
 from membrane_ctrl.control.filters import LowPass
+from membrane_ctrl.control.leak_estimate import FIRST_S, JUDGE_S, LeakEstimate
 
 DT_S = 0.02
 

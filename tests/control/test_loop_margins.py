@@ -11,7 +11,7 @@ import pytest
 
 from membrane_ctrl.config.schema import LoopConfig
 from membrane_ctrl.control.filters import smoothing
-from membrane_ctrl.control.pid import DEAD_S, PUMP_LAG_S, open_loop, peak_sensitivity
+from membrane_ctrl.control.loop_margins import DEAD_S, PUMP_LAG_S, open_loop, peak_sensitivity
 
 
 @pytest.mark.parametrize("rate_hz", [20.0, 50.0, 100.0])

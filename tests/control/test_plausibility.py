@@ -10,7 +10,7 @@ from collections.abc import Callable
 import numpy as np
 import pytest
 
-from membrane_ctrl.control.film import Liar, PlausibilityCheck
+from membrane_ctrl.control.plausibility import Liar, PlausibilityCheck
 from membrane_ctrl.model.shape_estimate import ShapeEstimate
 from membrane_ctrl.model.zernike_terms import ZERNIKE_TERMS
 

@@ -12,7 +12,7 @@ from pydantic import ValidationError
 from scipy.interpolate import PchipInterpolator
 
 from membrane_ctrl.config.schema import PumpConfig
-from membrane_ctrl.control.gas import KICK_S, PumpCurve
+from membrane_ctrl.control.pump_curve import KICK_S, PumpCurve
 from membrane_ctrl.sim.plant import PumpModel
 from tests.support.second_world import CURVES, ForeignPump
 

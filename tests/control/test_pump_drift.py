@@ -11,7 +11,6 @@ import numpy as np
 import pytest
 
 from membrane_ctrl.config.schema import LoopConfig, PumpConfig
-from membrane_ctrl.control.film_health import PumpHealth
 from membrane_ctrl.control.inner_loop import InnerLoop, LoopInput
 from membrane_ctrl.control.pump_drift import (
     PROBE_RAD_PER_S,
@@ -20,6 +19,7 @@ from membrane_ctrl.control.pump_drift import (
     PumpDrift,
     PumpScale,
 )
+from membrane_ctrl.control.pump_health import PumpHealth
 
 DT_S = 0.2
 LASER_UM = 0.32  # as 1 µm at 50 Hz

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from membrane_ctrl.control.shape_loop import MODEL_FLOOR_UM, sag_change
+from membrane_ctrl.control.sag_change import MODEL_FLOOR_UM, sag_change
 from membrane_ctrl.model.zernike_terms import ZERNIKE_TERMS
 
 S = np.zeros(ZERNIKE_TERMS)

@@ -6,7 +6,8 @@ import numpy as np
 import pytest
 
 from membrane_ctrl.control.filters import LowPass
-from membrane_ctrl.control.pid import RAMP_SHARE, SetpointRamp, SetpointWeight
+from membrane_ctrl.control.setpoint_ramp import RAMP_SHARE, SetpointRamp
+from membrane_ctrl.control.setpoint_weight import SetpointWeight
 
 
 def ramped(

@@ -11,14 +11,8 @@ import pytest
 
 from benchmarks.shape_loop import SENSITIVITY, estimate_of
 from membrane_ctrl.config.schema import ShapeConfig
-from membrane_ctrl.control.shape_loop import (
-    SHAPES,
-    TRACKED_EVERY_S,
-    TRACKED_SHAPES,
-    ShapeCode,
-    ShapeLoop,
-    ShapeOutput,
-)
+from membrane_ctrl.control.shape_loop import ShapeCode, ShapeLoop, ShapeOutput
+from membrane_ctrl.control.shape_reference import SHAPES, TRACKED_EVERY_S, TRACKED_SHAPES
 from membrane_ctrl.model.reason import NO_REASON, Reason
 from membrane_ctrl.model.shape_estimate import ShapeEstimate
 from membrane_ctrl.model.telemetry import ShapeState

@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from membrane_ctrl.control.experiments.trial import ExperimentSpec
+from membrane_ctrl.control.experiments.spec import ExperimentSpec
 from membrane_ctrl.control_port.protocol import (
     MESSAGE_BYTES,
     TEXT_BYTES,

@@ -13,7 +13,7 @@ import pytest
 
 from firmware_iface.roles import BenchReading
 from membrane_ctrl.config.schema import Config, LoopConfig, ShapeConfig, StatesConfig
-from membrane_ctrl.control.experiments.trial import ExperimentSpec
+from membrane_ctrl.control.experiments.spec import ExperimentSpec
 from membrane_ctrl.controller.commands import DOWN, TABLE, Command, Kind, in_order
 from membrane_ctrl.controller.controller import Controller
 from membrane_ctrl.controller.safety import MOVING

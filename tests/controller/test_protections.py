@@ -20,7 +20,7 @@ from membrane_ctrl.config.schema import (
     StatesConfig,
     TwinConfig,
 )
-from membrane_ctrl.control.experiments.trial import ExperimentSpec
+from membrane_ctrl.control.experiments.spec import ExperimentSpec
 from membrane_ctrl.controller.commands import Command
 from membrane_ctrl.hold.virtual_run import TruthShape, VirtualRun, VirtualTick
 from membrane_ctrl.metrology.optics.film_law import zernike_projection

@@ -14,7 +14,7 @@ import pytest
 from pydantic import ValidationError
 
 from membrane_ctrl.config.schema import Config, LoopConfig, PumpConfig, ShapeConfig, TwinConfig
-from membrane_ctrl.control.experiments.trial import ExperimentSpec
+from membrane_ctrl.control.experiments.spec import ExperimentSpec
 from membrane_ctrl.control.pump_drift import PumpScale
 from membrane_ctrl.controller.commands import Command, refusal
 from membrane_ctrl.controller.controller import Controller

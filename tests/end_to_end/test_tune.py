@@ -14,7 +14,7 @@ import pytest
 from patience import slow_machine
 
 from membrane_ctrl.config.schema import PumpConfig
-from membrane_ctrl.control.experiments.trial import ExperimentSpec
+from membrane_ctrl.control.experiments.spec import ExperimentSpec
 from membrane_ctrl.control_port.client import PortClient
 from membrane_ctrl.model.errors import DeviceError, InputError
 from membrane_ctrl.model.telemetry import State

@@ -21,7 +21,7 @@ from tornado.httpclient import HTTPClientError, HTTPRequest
 from tornado.websocket import websocket_connect
 
 from membrane_ctrl.config.schema import Config, LoopConfig, PumpConfig
-from membrane_ctrl.control.experiments import machine
+from membrane_ctrl.control.experiments import experiment, operating_point
 from membrane_ctrl.model.arrays import FloatArray
 from membrane_ctrl.model.errors import InputError
 from membrane_ctrl.sessions import folder
@@ -116,10 +116,13 @@ def template(tmp_path_factory: pytest.TempPathFactory) -> Path:
     )
     record = synthetic.record(PLANT, samples=6000)
     loop_model.save_record(opened.file("experiments.npz"), record)
-    around = machine.Around(PLANT.holding_flow_um_per_s, 0.4, 5.3, 1.0)
+    around = operating_point.Around(PLANT.holding_flow_um_per_s, 0.4, 5.3, 1.0)
     ends_s = record.duration_s
     head = session.ExperimentsHead(
-        around, ends_s, (ends_s, ends_s), machine.Finished(machine.ExperimentEnd.COMPLETED, "done")
+        around,
+        ends_s,
+        (ends_s, ends_s),
+        experiment.Finished(experiment.ExperimentEnd.COMPLETED, "done"),
     )
     folder.write(opened.file("experiments.json"), head)
     session.identify_step(opened)

@@ -16,8 +16,8 @@ from benchmarks.pumps import worst_share
 from membrane_ctrl.cli import run
 from membrane_ctrl.config.schema import Config, LoopConfig, PumpConfig
 from membrane_ctrl.config.toml_file import dump, load
-from membrane_ctrl.control.experiments.trial import ExperimentSpec, PumpStep
-from membrane_ctrl.control.gas import PumpCurve
+from membrane_ctrl.control.experiments.spec import ExperimentSpec, PumpStep
+from membrane_ctrl.control.pump_curve import PumpCurve
 from membrane_ctrl.controller.cross_check import cross_check
 from membrane_ctrl.model.errors import Exit, RejectedError
 from membrane_ctrl.model.telemetry import State

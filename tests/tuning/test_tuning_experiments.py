@@ -12,17 +12,12 @@ import pytest
 
 from benchmarks.tuning import Case, TwinBench
 from membrane_ctrl.config.schema import PumpConfig
-from membrane_ctrl.control.experiments.machine import (
-    Around,
-    BenchSample,
-    ExcursionGuard,
-    Experiment,
-    Finished,
-    Patterned,
-    Relay,
-    quieted,
-)
-from membrane_ctrl.control.experiments.trial import doublets, multisine, steps
+from membrane_ctrl.control.experiments.excursion_guard import ExcursionGuard
+from membrane_ctrl.control.experiments.experiment import BenchSample, Experiment, Finished
+from membrane_ctrl.control.experiments.operating_point import Around, quieted
+from membrane_ctrl.control.experiments.patterned import Patterned
+from membrane_ctrl.control.experiments.patterns import doublets, multisine, steps
+from membrane_ctrl.control.experiments.relay import Relay
 from membrane_ctrl.sim.surroundings import AmbientChange, LaserDropout
 from tuning.identification.characterise import ExperimentError, characterise
 from tuning.identification.loop_model import Record

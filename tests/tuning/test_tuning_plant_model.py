@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from synthetic import telegraph, way_um
 
-from membrane_ctrl.control.experiments.machine import BenchSample
+from membrane_ctrl.control.experiments.experiment import BenchSample
 from tuning.identification.loop_model import PlantModel, Record, driven_um
 
 

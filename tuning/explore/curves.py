@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from membrane_ctrl.config.schema import LoopConfig
-from membrane_ctrl.control import pid
+from membrane_ctrl.control import loop_margins
 from membrane_ctrl.model import arrays, errors, telemetry
 from membrane_ctrl.run_files.run import open_run
 from membrane_ctrl.sessions import folder
@@ -109,7 +109,7 @@ def _plant_for(logs: Path, leak_um_per_s: float) -> tuple[loop_model.PlantModel,
         return session.found_of(newest).identified.model, f"plant of the session {newest.path.name}"
     except errors.InputError:
         leak = leak_um_per_s if math.isfinite(leak_um_per_s) else 0.0
-        plant = loop_model.PlantModel(1.0, pid.DEAD_S, pid.PUMP_LAG_S, leak)
+        plant = loop_model.PlantModel(1.0, loop_margins.DEAD_S, loop_margins.PUMP_LAG_S, leak)
         return plant, "plant as the configuration assumes it (no session has identified it)"
 
 

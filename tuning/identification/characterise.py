@@ -7,7 +7,9 @@ from typing import Literal, Protocol
 
 import numpy as np
 
-from membrane_ctrl.control.experiments import machine, trial
+from membrane_ctrl.control.experiments import operating_point
+from membrane_ctrl.control.experiments.experiment import ExperimentEnd, Finished
+from membrane_ctrl.control.experiments.spec import ExperimentKind, ExperimentSpec
 from tuning.identification.disturbance import SLOWEST_S
 from tuning.identification.identify import (
     Identified,
@@ -213,11 +215,11 @@ class ExperimentRig(Protocol):
         """Hold for a time."""
         ...
 
-    def around(self, held: Record, limit_um: float) -> machine.Around:
+    def around(self, held: Record, limit_um: float) -> operating_point.Around:
         """Operating point of an experiment."""
         ...
 
-    def perform(self, spec: trial.ExperimentSpec) -> tuple[Record, machine.Finished]:
+    def perform(self, spec: ExperimentSpec) -> tuple[Record, Finished]:
         """Run an experiment."""
         ...
 
@@ -226,11 +228,11 @@ class ExperimentRig(Protocol):
 class Experiments:
     """Raw results of the experiments."""
 
-    around: machine.Around  # holding flow, laser noise, limits
+    around: operating_point.Around  # holding flow, laser noise, limits
     record: Record  # relays, the holds between, doublets, without a gap
     relays_s: float  # duration of the relays with the holds after them
     pulses_s: tuple[float, float]  # start and end of the longest doublets
-    finished: machine.Finished  # how the last relay ended
+    finished: Finished  # how the last relay ended
     held: Record | None = None  # the hold before them; None if read from a file
 
 
@@ -255,12 +257,12 @@ class ExperimentError(Exception):
 
 
 def spec_of(
-    kind: trial.ExperimentKind, around: machine.Around, duration_s: float, gain: float = 1.0
-) -> trial.ExperimentSpec:
+    kind: ExperimentKind, around: operating_point.Around, duration_s: float, gain: float = 1.0
+) -> ExperimentSpec:
     """The specification of an experiment at an operating point. Raises pydantic.ValidationError out
     of bounds.
     """
-    return trial.ExperimentSpec(
+    return ExperimentSpec(
         kind=kind,
         duration_s=duration_s,
         limit_um=around.limit_um,
@@ -289,7 +291,7 @@ def experiment(rig: ExperimentRig, limit_um: float = 10.0, plan: Plan = FULL) ->
         rig.hold(plan.settle_s)
     held = rig.hold(plan.quiet_s)
     around = rig.around(held, limit_um)
-    machine.room(around)  # without room a relay would only report that it was stopped
+    operating_point.room(around)  # without room a relay would only report that it was stopped
     relays, finished = _relays(rig, around, plan)
     found = identify(relays)
     around, gain = replace(around, late_s=found.model.delay_s), found.model.gain
@@ -318,20 +320,20 @@ def fitted(done: Experiments) -> Characterised:
 
 
 def _relays(
-    rig: ExperimentRig, around: machine.Around, plan: Plan
-) -> tuple[Record, machine.Finished]:
+    rig: ExperimentRig, around: operating_point.Around, plan: Plan
+) -> tuple[Record, Finished]:
     """Relays until the gain is known, or the data ask for the pump's map, each followed by a hold.
 
     One that the guard stopped tells as much of its time as another, unless the mirror jumped: gusts
     and a laser's noise stop sound experiments, too.
     """
     done: Record | None = None
-    finished = machine.Finished(machine.ExperimentEnd.INTERRUPTED, "")
+    finished = Finished(ExperimentEnd.INTERRUPTED, "")
     for _ in range(plan.relays):
         relay, finished = rig.perform(spec_of("relay", around, plan.relay_s))
         relay = relay.followed_by(rig.hold(_BETWEEN_S))
         done = relay if done is None else done.followed_by(relay)
-        if finished.end is machine.ExperimentEnd.NO_RESPONSE:
+        if finished.end is ExperimentEnd.NO_RESPONSE:
             otherwise = f"{finished.reason}; if that is not the cause, {MAP_THE_PUMP}"
             raise ExperimentError(otherwise, pump_suspected=True)
         try:
@@ -349,7 +351,7 @@ def _relays(
         ):
             break
     if done is None or not _enough(done, plan):
-        stopped_near = finished.end is machine.ExperimentEnd.STOPPED_BY_GUARD
+        stopped_near = finished.end is ExperimentEnd.STOPPED_BY_GUARD
         raise ExperimentError(finished.reason + (f": {_FURTHER}" if stopped_near else ""))
     return done, finished
 

@@ -27,7 +27,7 @@ import numpy as np
 from scipy.signal import lfilter
 
 from membrane_ctrl.config.schema import LoopConfig
-from membrane_ctrl.control.experiments.machine import BenchSample
+from membrane_ctrl.control.experiments.experiment import BenchSample
 from membrane_ctrl.model import errors, files
 from membrane_ctrl.model.arrays import ComplexArray, FloatArray
 

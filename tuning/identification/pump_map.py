@@ -7,8 +7,8 @@ from itertools import product
 import numpy as np
 
 from membrane_ctrl.config.schema import PumpConfig
-from membrane_ctrl.control.experiments.machine import bleed_open
-from membrane_ctrl.control.experiments.trial import LIMIT_MAX_UM
+from membrane_ctrl.control.experiments.operating_point import bleed_open
+from membrane_ctrl.control.experiments.spec import LIMIT_MAX_UM
 from membrane_ctrl.model.arrays import FloatArray
 from tuning.identification.pump_curve import BLOCK_S, PumpFit
 

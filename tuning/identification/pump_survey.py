@@ -11,8 +11,8 @@ from itertools import pairwise
 
 import numpy as np
 
-from membrane_ctrl.control.experiments.trial import PumpStep
-from membrane_ctrl.control.gas import STALL_MARGIN
+from membrane_ctrl.control.experiments.spec import PumpStep
+from membrane_ctrl.control.pump_curve import STALL_MARGIN
 from membrane_ctrl.model.arrays import FloatArray
 from tuning.identification.pump_curve import NO_FIT, Level, PumpFit, PumpRun, fit
 from tuning.identification.pump_map import (

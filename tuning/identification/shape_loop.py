@@ -16,8 +16,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from membrane_ctrl.control.filters import DriftTracker
-from membrane_ctrl.control.shape_loop import sag_change
+from membrane_ctrl.control.drift_tracker import DriftTracker
+from membrane_ctrl.control.sag_change import sag_change
 from membrane_ctrl.model.arrays import FloatArray
 from membrane_ctrl.model.shape_estimate import ShapeEstimate
 from membrane_ctrl.model.telemetry import ShapeState

@@ -17,8 +17,8 @@ from scipy.linalg import expm, solve_discrete_are
 from scipy.special import ndtr
 
 from membrane_ctrl.config.schema import LoopConfig, PumpConfig
-from membrane_ctrl.control import gas
-from membrane_ctrl.control.experiments.machine import BenchSample
+from membrane_ctrl.control import pump_curve
+from membrane_ctrl.control.experiments.experiment import BenchSample
 from membrane_ctrl.model.arrays import FloatArray
 from tuning.identification import loop_model
 from tuning.identification.disturbance import DisturbanceModel
@@ -251,7 +251,7 @@ class _Driven:
         self, model: loop_model.PlantModel, pump: PumpConfig, flow_um_per_s: float, dt_s: float
     ) -> None:
         self._model, self._pump = model, pump
-        self._curve = gas.branch(pump, pump.curve_um_per_s)
+        self._curve = pump_curve.branch(pump, pump.curve_um_per_s)
         self._step_s = dt_s / _SUBSTEPS
         self._tube = deque([flow_um_per_s] * (1 + round(model.dead_time_s / self._step_s)))
         self._arriving = flow_um_per_s

@@ -8,7 +8,7 @@ from datetime import datetime
 from pathlib import Path
 from typing import Any, Literal
 
-from membrane_ctrl.control import gas
+from membrane_ctrl.control import pump_curve
 from membrane_ctrl.model import events, program
 from membrane_ctrl.model.run_status import RunStatus
 from membrane_ctrl.model.telemetry import State
@@ -231,8 +231,8 @@ def pump_history(newest: Path) -> list[PumpSeen]:
                 continue
             learned, pump = told[0], config.with_gains(told[1]).pump
             latest = latest or pump
-            fraction = gas.PumpCurve(latest).fraction(0.5 * latest.flow_full_um_per_s)
-            share = gas.PumpCurve(pump).flow(fraction) / (0.5 * latest.flow_full_um_per_s)
+            fraction = pump_curve.PumpCurve(latest).fraction(0.5 * latest.flow_full_um_per_s)
+            share = pump_curve.PumpCurve(pump).flow(fraction) / (0.5 * latest.flow_full_um_per_s)
             leak = _finite((run_folder.read_summary(folder, []) or {}).get("leak_um_per_s"))
             seen = (share * _finite(learned.scale), share * _finite(learned.sigma), leak)
             if seen[0] > 0 and seen[1] > 0:

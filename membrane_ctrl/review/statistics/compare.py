@@ -6,7 +6,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy import stats
 
-from membrane_ctrl.control.shape_loop import SHAPES
+from membrane_ctrl.control.shape_reference import SHAPES
 from membrane_ctrl.model.arrays import Column
 from membrane_ctrl.model.telemetry import ShapeState, State
 from membrane_ctrl.review.statistics.analysis import Analysis, ErrorSeries

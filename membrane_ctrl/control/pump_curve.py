@@ -1,35 +1,30 @@
-"""The pump: command for a flow, and the flow a command gives.
+"""The pump: command for a flow, and the flow a command gives. Pure.
 
-    q = q_full (d - dead) / (1 - dead)   while it runs; starts at `start`, stalls below `stall`   (docs/explanation/physics.md)
+    q = q_full (d - dead) / (1 - dead)   while it runs; starts at `start`, stalls below `stall`
 
-or a measured curve through any number of points, with a second branch for falling commands if there
-is hysteresis.
+(docs/explanation/physics.md), or a measured curve through any number of points, with a second branch for
+falling commands if there is hysteresis.
 
 There is no flow between rest and the least running flow: a wanted flow in that gap goes to the
 nearer end, so that the error of the gap has no fixed sign. (Always running would add gas that
 nothing removes, always stopping would lose the least flow: each is a bias.) The rest is left to the
 integrator, which does not know about the gap, but sees the resulting error.
-"""  # noqa: E501
+"""
 
-import math
 from bisect import bisect_right
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from itertools import pairwise
 
-from membrane_ctrl.config.schema import LoopConfig, PumpConfig
-from membrane_ctrl.control.filters import LagRate
+from membrane_ctrl.config.schema import PumpConfig
 from membrane_ctrl.model.state_tree import StateNode
 
 # Margin above the stall command, so that a rounded register or a cold pump does not stall.
 STALL_MARGIN = 0.005
-
 # A stopped pump gets the start command for this long: about its lag (0.15 s), in which it adds less
 # than 0.1 µm.
 KICK_S = 0.1
-
 VENT_FULL_UM_PER_S = 100.0  # of an open vent at the nominal pressure
-
 _PER_INTERVAL = 16  # chords of the cubic between two points: within 0.1 % of its rise
 
 
@@ -181,92 +176,3 @@ class PumpCurve:
             fraction = max(fraction, self._start_fraction)
         memory.flow_um_per_s = self.flow(fraction)
         return fraction
-
-
-# Flow that answers the weather before the laser sees it.
-#
-# Ambient pressure moves the centre by g_p (µm/Pa) at once, gas temperature by g_T (µm/K), and the
-# gas follows the air with a lag T_g. The speed that cancels them is
-#
-#     v = -g_p d/dt lag(p, T_f) - g_T d/dt lag(T_air, T_g)
-#
-# T_f only keeps the barometer's noise from the pump; T_g is physical and needs no further filter.
-
-
-# Neither weather nor a door (slammed: 100 Pa) changes this much between ticks, but a failed sensor
-# does, such as one that reads 85 or -127 C
-_STEP_MAX_PA = 500.0
-_STEP_MAX_K = 2.0
-# Any workplace from 5000 m to a mine; hPa, mmHg and psi are far outside, and so are K for C
-_PRESSURE_PA = (50e3, 110e3)
-_TEMPERATURE_C = (-20.0, 60.0)
-
-
-def weather_fault(ambient_pressure_pa: float, air_temperature_c: float) -> str:
-    """Name the sensor with an impossible reading; absent ones (NaN) do not count."""
-    if not _believed(ambient_pressure_pa, _PRESSURE_PA):
-        return (
-            f"the barometer reads {ambient_pressure_pa:g} Pa: check its unit; the feed-forward "
-            "does without it"
-        )
-    if not _believed(air_temperature_c, _TEMPERATURE_C):
-        return (
-            f"the air thermometer reads {air_temperature_c:g} C: check its unit; the "
-            "feed-forward does without it"
-        )
-    return ""
-
-
-def believed_weather(ambient_pressure_pa: float, air_temperature_c: float) -> tuple[float, float]:
-    """The readings, an impossible one as NaN."""
-    return (
-        ambient_pressure_pa if _believed(ambient_pressure_pa, _PRESSURE_PA) else math.nan,
-        air_temperature_c if _believed(air_temperature_c, _TEMPERATURE_C) else math.nan,
-    )
-
-
-def _believed(value: float, within: tuple[float, float]) -> bool:
-    return math.isnan(value) or within[0] <= value <= within[1]
-
-
-@dataclass(slots=True)
-class FeedForwardState(StateNode):
-    """Rates of change of pressure and temperature."""
-
-    pressure: LagRate = field(default_factory=LagRate)
-    temperature: LagRate = field(default_factory=LagRate)
-
-
-class FeedForward:
-    """Feed-forward from barometer and air thermometer; either may be switched off, or drop out
-    (NaN), at any time.
-
-    A value that jumps further than weather can, or is outside the range of any workplace, is a
-    sensor fault and has no effect.
-    """
-
-    def __init__(self, loop: LoopConfig, memory: FeedForwardState | None = None) -> None:
-        self._loop = loop
-        self.memory = memory or FeedForwardState()
-
-    def set_gains(self, loop: LoopConfig) -> None:
-        """Set gains, switches and time constants; a channel switched
-        off decays like a lost sensor.
-        """
-        self._loop = loop
-
-    def update(self, ambient_pressure_pa: float, air_temperature_c: float, dt_s: float) -> float:
-        """Flow in µm/s; NaN for a missing quantity."""
-        loop = self._loop
-        pressure_pa, temperature_c = believed_weather(ambient_pressure_pa, air_temperature_c)
-        pressure_pa = pressure_pa if loop.feedforward_barometer else math.nan
-        temperature_c = temperature_c if loop.feedforward_temperature else math.nan
-        pa_per_s = self.memory.pressure.update(
-            pressure_pa, dt_s, loop.feedforward_filter_s, _STEP_MAX_PA
-        )
-        k_per_s = self.memory.temperature.update(
-            temperature_c, dt_s, loop.gas_follows_air_s, _STEP_MAX_K
-        )
-        pressure_um_per_s = loop.barometer_gain_um_per_pa * pa_per_s
-        temperature_um_per_s = loop.temperature_gain_um_per_k * k_per_s
-        return -(pressure_um_per_s + temperature_um_per_s)

@@ -1,0 +1,57 @@
+"""Thermal growth of the camera mount, which changes the measured sag. Pure."""
+
+import math
+from dataclasses import dataclass, field
+
+from membrane_ctrl.config.control import EstimatorConfig
+from membrane_ctrl.control.filters import LowPass
+from membrane_ctrl.model.state_tree import StateNode
+
+
+@dataclass(slots=True)
+class StandGrowthState(StateNode):
+    """Temperatures of the stand: the present one, and at the lock."""
+
+    stand_c: LowPass = field(default_factory=LowPass)
+    locked_c: float = math.nan
+
+
+class StandGrowth:
+    """The sag that the optics see too much because their stand has become warmer since the lock.
+
+    Nothing on the bench sees it: laser and optics differ by the laser's mount, too, and a gauge's
+    zero drifts more. What is known of it comes from the air's temperature, which the stand follows
+    late.
+    """
+
+    def __init__(self, config: EstimatorConfig, memory: StandGrowthState | None = None) -> None:
+        self._um_per_k, self._sigma_um_per_k = config.stand_um_per_k, config.stand_sigma_um_per_k
+        self._follows_air_s = config.stand_follows_air_s
+        self.memory = memory or StandGrowthState()
+
+    def lock(self) -> None:
+        """From now on the present temperature is that of the reference."""
+        self.memory.locked_c = self.memory.stand_c.value
+
+    def step(self, air_c: float, dt_s: float) -> None:
+        """Follow the air's temperature; NaN without a good reading."""
+        if math.isfinite(air_c):
+            self.memory.stand_c.update(air_c, dt_s, self._follows_air_s)
+            if math.isnan(self.memory.locked_c):
+                self.lock()
+
+    @property
+    def warmed_k(self) -> float:
+        """By how much the stand is warmer than at the lock; 0 if unknown."""
+        locked_c = self.memory.locked_c
+        return 0.0 if math.isnan(locked_c) else self.memory.stand_c.value - locked_c
+
+    @property
+    def um(self) -> float:
+        """What the sag shows too much."""
+        return self._um_per_k * self.warmed_k
+
+    @property
+    def sigma_um(self) -> float:
+        """Standard deviation of that."""
+        return self._sigma_um_per_k * abs(self.warmed_k)

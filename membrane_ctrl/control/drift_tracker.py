@@ -1,0 +1,52 @@
+"""Tracker of a slow drift in noisy readings: value and rate, with fading memory. Pure.
+
+Least squares of a straight line through all readings, each weighted by exp(-age / T). For readings
+a step dt apart, with beta = exp(-dt / T) and r = reading - prediction (Morrison, Introduction to
+Sequential Smoothing and Prediction, 1969, degree-1 polynomial with fading memory):
+
+    value += (1 - beta^2) r,    rate += (1 - beta)^2 r / dt
+
+Both poles lie at beta: critically damped. A steady drift is tracked without error (a single lag
+would trail by rate x T). After a sudden onset of a drift v the tracker trails by v t exp(-t / T):
+at most v T / e. Noise of standard deviation sigma per reading becomes sigma sqrt(1.25 dt / T).
+"""
+
+import math
+from dataclasses import dataclass
+
+from membrane_ctrl.model.state_tree import StateNode
+
+
+@dataclass(slots=True)
+class DriftTracker(StateNode):
+    """Value and rate of a drift that is initially 0; the memory T (`memory_s`) may change."""
+
+    time_s: float = math.nan
+    value_um: float = 0.0
+    rate_um_per_s: float = 0.0
+
+    def begin(self, time_s: float) -> None:
+        """Set drift and rate to 0 at this time.
+
+        An initially short memory would find an old drift sooner, but its noise would move a still
+        mirror.
+        """
+        self.time_s = time_s
+        self.value_um = 0.0
+        self.rate_um_per_s = 0.0
+
+    def at(self, time_s: float, memory_s: float) -> float:
+        """Value in µm expected at a time (not before the last reading's); a rate is believed for
+        one memory.
+        """
+        return self.value_um + self.rate_um_per_s * min(time_s - self.time_s, memory_s)
+
+    def take(self, reading_um: float, time_s: float, memory_s: float) -> None:
+        """Take a reading, later than the last one, into the memory."""
+        dt_s = time_s - self.time_s
+        beta = math.exp(-dt_s / memory_s)
+        expected_um = self.at(time_s, memory_s)
+        residual_um = reading_um - expected_um
+        self.value_um = expected_um + (1.0 - beta**2) * residual_um
+        self.rate_um_per_s += (1.0 - beta) ** 2 * residual_um / dt_s
+        self.time_s = time_s

@@ -1,0 +1,59 @@
+"""Patterns of flow in time, sized so that the mirror stays within a few µm. Pure.
+
+Each takes the identified gain, so that the excursion is the same on a strong and a weak pump.
+"""
+
+import math
+from collections.abc import Callable
+
+import numpy as np
+
+from membrane_ctrl.control.experiments import operating_point
+
+Pattern = Callable[[float], float]
+_SHARE = 0.25  # of the excursion limit: the weather, the pull and the laser's noise need the rest
+
+
+def steps(around: operating_point.Around, gain: float, hold_s: float = 2.0) -> Pattern:
+    """Up, back, down, back, each for `hold_s`: easy to judge by eye."""
+    up, down = operating_point.room(around)
+    size = min(up, down, _SHARE * around.limit_um / (gain * hold_s))
+    levels = (size, 0.0, -size, 0.0)
+    return lambda time_s: levels[int(time_s / hold_s) % 4]
+
+
+def doublets(around: operating_point.Around, gain: float, pulse_s: float = 0.3) -> Pattern:
+    """Short pulses up, each followed by an equal one down: many steep edges, which separate dead
+    time from lag.
+
+    The downward flow is limited by the leak, so it takes longer; the mean flow is the holding flow.
+    """
+    up, down = operating_point.room(around)
+    size = min(up, _SHARE * around.limit_um / (gain * pulse_s))
+    down = min(down, size)
+    period_s = pulse_s * (1 + size / down)
+    return lambda time_s: size if time_s % period_s < pulse_s else -down
+
+
+def multisine(
+    around: operating_point.Around,
+    gain: float,
+    slowest_rad_per_s: float = 0.3,
+    fastest_rad_per_s: float = 6.0,
+    tones: int = 12,
+) -> Pattern:
+    """Sines evenly spaced in the logarithm of frequency, of equal excursion up to the pump's room.
+
+    Phases by Schroeder (1970), -pi n (n - 1) / N, which keep the peak low.
+    """
+    w = np.geomspace(slowest_rad_per_s, fastest_rad_per_s, tones)
+    phases = -math.pi * np.arange(tones) * np.arange(1, tones + 1) / tones
+    amplitudes = np.sqrt(w)  # flow between equal flow and equal excursion
+    time_s = np.arange(0.0, 4 * math.pi / slowest_rad_per_s, 0.05)[:, None]
+    flow = (amplitudes * np.sin(w * time_s + phases)).sum(axis=1)
+    way = (amplitudes / w * np.cos(w * time_s + phases)).sum(axis=1)
+    scale = min(
+        min(operating_point.room(around)) / np.abs(flow).max(),
+        _SHARE * around.limit_um / (gain * np.abs(way).max()),
+    )
+    return lambda now_s: float(scale * (amplitudes * np.sin(w * now_s + phases)).sum())

@@ -1,0 +1,235 @@
+"""Compares the film's displacement, by laser or optics, with the gauge pressure. Pure.
+
+Two comparisons are made:
+
+gauge     w ~ p^(1/3) (Hencky), so a change of gauge pressure is a change of sag. Both are the
+          film's own: weather, temperature and leak move laser and gauge together, so a difference
+          comes from a sensor or its mount.
+nominal   the pressure that a mirror of this kind has at the laser's reading, known within a factor:
+          units and scale.
+"""
+
+import math
+from dataclasses import dataclass, field
+
+from membrane_ctrl.config.schema import LimitsConfig, MirrorConfig
+from membrane_ctrl.control.filters import LowPass, smoothing
+from membrane_ctrl.model.state_tree import Count, StateNode
+
+# 0.5 Pa of noise per sample are then 0.7 µm at 10 Hz and 2.3 µm at 1 Hz
+SMOOTH_S = 10.0
+# A mean of 50 of the gauge's readings is good to 1.4 µm; ten-second means of fewer are not much
+# better when warm.
+_KNOWN_S = 5.0
+_KNOWN_READINGS = 50
+WARM_S = 3 * SMOOTH_S
+# Creep of 10 µm/min is 20 µm ahead of this reference; the 2 µm/min of a mount that warms up are 4
+# µm.
+SINCE_MINUTES_S = 120.0
+# Climate moves the gauge against laser and optics: a day of +-10 % relative humidity by +-235 µm,
+# of +-2 K by +-41 µm of the gauge's zero (1 Pa/K) and +-114 µm of a film that follows the air
+# before its ring does. All of it in phase, +-390 µm, is 99 µm ahead of a reference of an hour. A
+# drift must be faster than
+# 0.033 µm/s to
+# reach 120 µm there.
+SINCE_HOUR_S = 3600.0
+# That climate is up to 624 µm ahead of this reference (from the day's highest to its lowest); so is
+# any drift faster than 29 µm/h, which therefore ends at 700 µm and somewhat more.
+SINCE_DAY_S = 86_400.0
+# Of the limit within a day: the climate of a controlled laboratory (+-1 K, +-5 %, 220 µm) stays
+# below it.
+DRIFTING_SHARE = 1 / 3
+# A notice ends only when the two are clearly nearer again.
+DRIFTING_OVER_SHARE = 0.8 * DRIFTING_SHARE
+# Of the limit within minutes: gusts, doors and setpoints use 0.17 of it in hours, 0.1 K of the
+# gauge 0.1 more
+_DOUBTED_SHARE = 0.35
+# On a long way the sag's own uncertainty matters (pre-strain, an offset of the laser's zero).
+LAW_SHARE = 0.3
+# Film, laser's zero and Young's modulus are known well enough for this; a wrong unit is off by ten.
+NOMINAL_FACTOR = 2.0
+NOMINAL_SLACK_PA = 20.0
+NOMINAL_S = 1.0
+# Below this the film is slack, and the gauge's zero is a large part of its reading.
+TAUT_PA = 100.0
+
+
+def are_means_known(seen_s: float, readings: int) -> bool:
+    """Whether the means are good enough for a reference: until there is one, nothing tells what a
+    jump was.
+    """
+    return seen_s >= WARM_S or (seen_s >= _KNOWN_S and readings >= _KNOWN_READINGS)
+
+
+@dataclass(slots=True)
+class SinceState(StateNode):
+    """A reference of laser, trim and gauge that follows slowly while laser and gauge agree."""
+
+    laser_um: float = math.nan
+    trim_um: float = 0.0
+    root: float = math.nan  # cube root of the gauge pressure
+    share: float = 0.0  # of what may be between them
+
+
+@dataclass(frozen=True, slots=True)
+class _Since:
+    """Compares changes of sag against such a reference."""
+
+    sensor: str  # of the displacement
+    follow_s: float
+    limit_um: float
+
+    def apart(
+        self,
+        memory: SinceState,
+        laser_um: float,
+        trim_um: float,
+        root: float,
+        sag_um: float,
+        dt_s: float,
+    ) -> str:
+        """Both readings, if they contradict each other; `root` is the cube root of the gauge
+        pressure.
+        """
+        if math.isnan(memory.laser_um):
+            memory.laser_um = laser_um
+            memory.trim_um = trim_um
+            memory.root = root
+        by_laser_um, trimmed_um = laser_um - memory.laser_um, trim_um - memory.trim_um
+        by_gauge_um = (sag_um - by_laser_um) * (root / memory.root - 1)
+        # A laser drift that the shape loop has compensated has not moved the film.
+        apart_um = min(abs(by_laser_um - by_gauge_um), abs(by_laser_um - trimmed_um - by_gauge_um))
+        memory.share = apart_um / (
+            self.limit_um + LAW_SHARE * min(abs(by_laser_um), abs(by_gauge_um))
+        )
+        if memory.share > 1.0:
+            return f"{self.sensor} {by_laser_um:+.0f} µm, gauge {by_gauge_um:+.0f} µm"
+        share = smoothing(dt_s, self.follow_s)
+        memory.laser_um += share * by_laser_um
+        memory.trim_um += share * trimmed_um
+        memory.root += share * (root - memory.root)
+        return ""
+
+
+@dataclass(slots=True)
+class FilmMonitorState(StateNode):
+    """Means of one displacement, trim and gauge, and the references that they are compared with."""
+
+    laser: LowPass = field(default_factory=LowPass.with_early_mean)
+    trim: LowPass = field(default_factory=LowPass.with_early_mean)
+    root: LowPass = field(
+        default_factory=LowPass.with_early_mean
+    )  # of the cube root of the gauge pressure
+    seen_s: float = 0.0
+    readings: Count = 0
+    minutes: SinceState = field(default_factory=SinceState)
+    hour: SinceState = field(default_factory=SinceState)
+    day: SinceState = field(default_factory=SinceState)
+    # sensor and gauge have moved apart over hours, as by climate or a slow drift
+    drifting: bool = False
+
+
+class FilmMonitor:
+    """Compares one displacement, by the laser or by the optics, with the gauge on every tick with a
+    driven pump.
+
+    Parameters
+    ----------
+    limits : LimitsConfig
+    mirror : MirrorConfig
+    sensor : str
+        The displacement's sensor, for the message.
+    memory : FilmMonitorState, optional
+    """
+
+    def __init__(
+        self,
+        limits: LimitsConfig,
+        mirror: MirrorConfig,
+        sensor: str = "laser",
+        memory: FilmMonitorState | None = None,
+    ) -> None:
+        self.memory = memory or FilmMonitorState()
+        self._limits = limits
+        self._sag_um, self._pressure_pa = 1e3 * mirror.sag_mm, mirror.pressure_pa
+        self._minutes = _Since(sensor, SINCE_MINUTES_S, limits.laser_gauge_apart_max_um)
+        self._hour = _Since(sensor, SINCE_HOUR_S, limits.laser_gauge_drift_max_um)
+        self._day = _Since(sensor, SINCE_DAY_S, limits.laser_gauge_day_max_um)
+
+    def reset(self) -> None:
+        """Forget everything."""
+        self.memory.start_afresh()
+
+    def step(self, dt_s: float, laser_um: float, trim_um: float, gauge_pressure_pa: float) -> str:
+        """Process one tick and return both readings if they contradict each other. NaN without a
+        good reading.
+
+        `trim_um` is the shape loop's addition to the setpoint: the laser's drift as seen by the
+        camera.
+        """
+        # Both or none: two means that started together do not differ because of the film's motion.
+        if not (math.isfinite(laser_um) and math.isfinite(gauge_pressure_pa)):
+            return ""
+        memory = self.memory
+        laser_um = memory.laser.update(laser_um, dt_s, SMOOTH_S)
+        trim_um = memory.trim.update(
+            trim_um, dt_s, SMOOTH_S
+        )  # a knock that the optics have found moves both alike
+        # The mean of the root always follows the mean of the sag; the mean of the pressure does
+        # not.
+        root = memory.root.update(math.cbrt(gauge_pressure_pa), dt_s, SMOOTH_S)
+        memory.seen_s += dt_s
+        memory.readings += 1
+        if strange := self._not_nominal(laser_um, root**3):
+            return strange
+        sag_um = self._sag_um + laser_um
+        if not are_means_known(memory.seen_s, memory.readings) or not (
+            self._taut or root**3 > TAUT_PA
+        ):
+            return ""
+        spans = (
+            (self._minutes, memory.minutes),
+            (self._hour, memory.hour),
+            (self._day, memory.day),
+        )
+        contradictions = [
+            since.apart(kept, laser_um, trim_um, root, sag_um, dt_s) for since, kept in spans
+        ]
+        memory.drifting = memory.day.share > (
+            DRIFTING_OVER_SHARE if memory.drifting else DRIFTING_SHARE
+        )
+        return next(filter(None, contradictions), "")
+
+    @property
+    def drifting(self) -> bool:
+        """Sensor and gauge have moved apart over hours, as by climate or a slow drift."""
+        return self.memory.drifting
+
+    @property
+    def doubted(self) -> bool:
+        """Laser and gauge are further apart than by noise or drift, though within the limit."""
+        return self.memory.minutes.share > _DOUBTED_SHARE
+
+    @property
+    def drift_um(self) -> float:
+        """How far sensor and gauge have moved apart within a day, µm; 0 without a reference."""
+        return self.memory.day.share * self._limits.laser_gauge_day_max_um
+
+    @property
+    def _taut(self) -> bool:
+        """There is a reference: from now on, a gauge that falls to
+        zero does not mean a slack film.
+        """
+        return math.isfinite(self.memory.minutes.root)
+
+    def _not_nominal(self, laser_um: float, gauge_pa: float) -> str:
+        if self._pressure_pa == 0.0 or self.memory.seen_s < NOMINAL_S:
+            return ""
+        wanted_pa = self._pressure_pa * max(1 + laser_um / self._sag_um, 0.0) ** 3
+        if (
+            wanted_pa / NOMINAL_FACTOR - NOMINAL_SLACK_PA
+            <= gauge_pa
+            <= NOMINAL_FACTOR * wanted_pa + NOMINAL_SLACK_PA
+        ):
+            return ""
+        return f"the gauge reads {gauge_pa:.0f} Pa; this sag needs about {wanted_pa:.0f} Pa"

@@ -1,0 +1,69 @@
+"""Gas in transit between pump and mirror: a dead time, then a lag. Pure."""
+
+from collections import deque
+from dataclasses import dataclass, field
+from itertools import islice
+
+from membrane_ctrl.control.filters import smoothing
+from membrane_ctrl.model.state_tree import StateNode
+
+
+@dataclass(slots=True)
+class TransitState(StateNode):
+    """The gas on its way."""
+
+    flows: deque[float] = field(default_factory=deque)  # of the last ticks, newest first
+    arriving: float = 0.0
+
+
+class Transit:
+    """Gas between pump and mirror: a dead time, then a lag, in ticks of `period_s`."""
+
+    def __init__(
+        self, delay_s: float, lag_s: float, period_s: float, memory: TransitState | None = None
+    ) -> None:
+        self._ticks = int(delay_s / period_s + 1e-9)
+        self._rest = max(0.0, delay_s / period_s - self._ticks)
+        self._delay_s, self._lag_s, self._period_s = delay_s, lag_s, period_s
+        self.memory = memory or TransitState()
+        if not self.memory.flows:
+            self.memory.flows.extend([0.0] * (self._ticks + 2))
+
+    def place(self, flow_um_per_s: float) -> None:
+        """Everything flows at this rate."""
+        for place in range(len(self.memory.flows)):
+            self.memory.flows[place] = flow_um_per_s
+        self.memory.arriving = flow_um_per_s
+
+    def advance(self, flow_um_per_s: float, dt_s: float) -> float:
+        """Pump at a rate for a step; returns the rise of the centre in it, µm."""
+        memory = self.memory
+        for _ in range(max(1, round(dt_s / self._period_s))):
+            memory.flows.appendleft(flow_um_per_s)
+            memory.flows.pop()
+        late = (1 - self._rest) * memory.flows[self._ticks] + self._rest * memory.flows[
+            self._ticks + 1
+        ]
+        moved = smoothing(dt_s, self._lag_s) * (late - memory.arriving)
+        memory.arriving += moved
+        return late * dt_s - self._lag_s * moved
+
+    def coming_um(self, drift_um_per_s: float) -> float:
+        """Rise still to come, if from now on the pump gives the drift."""
+        flows = self.memory.flows
+        pending = self._period_s * (
+            sum(islice(flows, self._ticks)) + self._rest * flows[self._ticks]
+        )
+        return (
+            pending
+            - drift_um_per_s * self._delay_s
+            + self._lag_s * (self.memory.arriving - drift_um_per_s)
+        )
+
+    def due_um_per_s(self) -> float:
+        """Flow at the end of the dead time: what the pump now receives comes on top of it."""
+        flow = self.memory.arriving
+        for late in range(self._ticks, -1, -1):
+            step_s = self._period_s * (self._rest if late == self._ticks else 1.0)
+            flow += smoothing(step_s, self._lag_s) * (self.memory.flows[late] - flow)
+        return flow

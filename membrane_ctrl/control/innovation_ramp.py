@@ -1,0 +1,51 @@
+"""Detects innovations that grow to one side: two cumulative sums (Page 1954). Pure."""
+
+import math
+from dataclasses import dataclass, field
+
+from membrane_ctrl.model.state_tree import Count, StateNode
+
+# Of a ramp, in standard deviations: the drift that each cumulative sum tolerates, and the most that
+# one innovation counts, so that two bad readings are no ramp
+_SLACK = 0.5
+_STEEPEST = 4.0
+_SHORTEST_S = 0.02  # shortest duration of a ramp
+
+
+@dataclass(slots=True)
+class CumulativeSum(StateNode):
+    """One side of a `Ramp`."""
+
+    total: float = 0.0
+    count: Count = 0
+    began_s: float = math.nan
+
+
+@dataclass(slots=True)
+class Ramp(StateNode):
+    """Finds innovations that run away to one side: two cumulative sums (Page 1954)."""
+
+    up: CumulativeSum = field(default_factory=CumulativeSum)
+    down: CumulativeSum = field(default_factory=CumulativeSum)
+    last_s: float = math.nan
+    since_s: float = math.nan  # when the last ramp began
+    slope: float = math.nan  # of the last ramp: its rise per second
+
+    def update(self, innovation: float, taken_s: float, limit: float) -> bool:
+        """Take an innovation in standard deviations; returns whether a ramp is found."""
+        found = False
+        innovation = min(max(innovation, -_STEEPEST), _STEEPEST)
+        for side, sign in ((self.up, 1.0), (self.down, -1.0)):
+            if side.total == 0.0:
+                side.began_s = self.last_s
+                side.count = 0
+            side.count += 1
+            side.total = max(0.0, side.total + sign * innovation - _SLACK)
+            if side.total > limit:
+                mean = sign * (side.total / side.count + _SLACK)
+                self.since_s = side.began_s
+                self.slope = 2 * mean / max(taken_s - self.since_s, _SHORTEST_S)
+                found = math.isfinite(self.since_s)
+                side.total = 0.0
+        self.last_s = taken_s
+        return found

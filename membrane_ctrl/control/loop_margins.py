@@ -1,0 +1,60 @@
+"""Margins of the linear inner loop, from the frequency response of the sampled loop. Pure.
+
+The response is that of the difference equations as they run, with exact dead times, at every
+frequency up to the sampling limit.
+"""
+
+import math
+
+import numpy as np
+
+from membrane_ctrl.config.control import LoopConfig
+from membrane_ctrl.control.filters import smoothing
+from membrane_ctrl.model.arrays import ComplexArray, FloatArray
+
+# docs/explanation/physics.md, inner loop; the tick itself takes 5 ms from sample to write
+PUMP_LAG_S = 0.15
+DEAD_S = 0.075 + 0.005
+# Below the corner frequencies of the controller by this factor, L is a double integrator
+_FAR_BELOW = 0.01
+_POINTS = 2000
+_ALIASES = 3  # they fall with the third power of the frequency
+
+
+def open_loop(loop: LoopConfig, omega: FloatArray) -> ComplexArray:
+    """Return L of the sampled loop: PID and filter as difference equations, hold, dead time, pump
+    lag, mirror.
+    """
+    dt_s = 1 / loop.rate_hz
+    z = np.exp(1j * omega * dt_s)
+    share = smoothing(dt_s, loop.measurement_filter_s)
+    measurement_filter = share / (1 - (1 - share) / z)
+    derivative = loop.td_s * (1 - 1 / z) / dt_s
+    pi = loop.kp_per_s * (
+        1 + dt_s / loop.ti_s / (z - 1) + derivative
+    )  # the integrator moves after the output
+    mirror = np.zeros_like(z)
+    for k in range(-_ALIASES, _ALIASES + 1):  # what the samples fold back; at 1 Hz it decides
+        s = 1j * (omega + 2 * math.pi * k / dt_s)
+        mirror += (1 - 1 / z) / (s * dt_s) * np.exp(-s * DEAD_S) / (1 + s * PUMP_LAG_S) / s
+    return np.asarray(pi * measurement_filter * mirror)
+
+
+def peak_sensitivity(loop: LoopConfig) -> float:
+    """Return the largest amplification of a disturbance at any frequency; infinity for an unstable
+    loop.
+
+    The defaults stay below 1.4. NaN for a loop with `kp_per_s` 0.
+    """
+    if loop.kp_per_s == 0.0:
+        return math.nan
+    low = _FAR_BELOW * min(loop.kp_per_s, 1 / loop.ti_s)
+    omega = np.geomspace(low, math.pi * loop.rate_hz * 0.999, _POINTS)
+    difference = 1 + open_loop(loop, omega)
+    # Nyquist: L has two poles at the origin and none outside, so 1 + L must turn by half a turn
+    # from far below to the sampling limit; each further encirclement of -1 is a pair of unstable
+    # poles.
+    turned = float(np.unwrap(np.angle(difference))[-1] - np.angle(difference)[0])
+    if abs(turned - math.pi) > math.pi / 2:
+        return math.inf
+    return float(np.max(1 / np.abs(difference)))

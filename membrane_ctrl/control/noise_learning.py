@@ -1,0 +1,102 @@
+"""Noise levels of sensors and walks, learned from a Kalman filter's innovations. Pure.
+
+Each level is a factor on a configured variance. It moves slowly, weighted by the information in the
+readings so far, and stays within bounds of the configured value.
+"""
+
+import math
+from dataclasses import dataclass
+
+from membrane_ctrl.model.state_tree import StateNode
+
+_MEMORY_S = 200.0
+_LIMIT = 3.0  # an innovation beyond this many standard deviations counts as this many
+# A factor's logarithm stays within these bounds
+_READING_BOUND = math.log(5.0**2)
+_WALK_BOUND = math.log(30.0**2)
+# Information with which learning starts
+_STATED_INFORMATION = 250.0  # a noise that comes with the reading
+_CONFIGURED_INFORMATION = 25.0  # a configured noise of a reading
+_WALK_INFORMATION = 4.0  # a configured walk
+
+
+@dataclass(slots=True)
+class LearnedFactor(StateNode):
+    """A factor on a variance; its logarithm follows the likelihood's slope over the information so
+    far.
+    """
+
+    information: float
+    log: float = 0.0
+
+    @property
+    def factor(self) -> float:
+        """Present factor."""
+        return math.exp(self.log)
+
+    def learn(self, slope: float, information: float, forget: float, bound: float) -> None:
+        """Take the slope of the log-likelihood from one reading, and the information that it bears.
+
+        The logarithm stays within +- `bound`.
+        """
+        # at least that: a few readings must not overturn a level that has hardly shown for long
+        self.information = max(
+            _WALK_INFORMATION, self.information + information - forget * self.information
+        )
+        self.log = min(max(self.log + slope / self.information, -bound), bound)
+
+
+def configured_walk() -> LearnedFactor:
+    """The factor on a configured walk, to be learned."""
+    return LearnedFactor(_WALK_INFORMATION)
+
+
+@dataclass(slots=True)
+class ReadingNoise(StateNode):
+    """The factor on the variance of a sensor's readings; corrects the walks that the sensor sees,
+    too.
+
+    The innovations are to be of unit variance, which sets the scale of noise and walks, and white,
+    which sets their
+    ratio: they correlate positively where the filter follows too slowly, negatively where it
+    follows noise.
+    """
+
+    level: LearnedFactor
+    past: float = 0.0  # how the past innovations would have moved the state, of unit variance
+
+    @classmethod
+    def of_reading(cls, stated: bool) -> "ReadingNoise":
+        """The factor to be learned; `stated`: the noise comes with each reading."""
+        return cls(LearnedFactor(_STATED_INFORMATION if stated else _CONFIGURED_INFORMATION))
+
+    @property
+    def factor(self) -> float:
+        """Present factor."""
+        return self.level.factor
+
+    def learn(
+        self,
+        innovation: float,
+        share: float,
+        dt_s: float,
+        walks: tuple[tuple[LearnedFactor, float], ...],
+    ) -> None:
+        """Take an innovation in standard deviations, and the share of its variance that is the
+        state's.
+
+        `walks`: what moves the state, and its part in that; none for a sensor that does not lead.
+        """
+        forget = min(1.0, dt_s / _MEMORY_S)
+        innovation, known = min(max(innovation, -_LIMIT), _LIMIT), share / 8
+        size, runs = (innovation**2 - 1) / 2, math.sqrt(known) * innovation * self.past
+        by_noise = (
+            1 - share / 2
+        )  # change of the innovations' variance with the noise, both as logarithms
+        leads = bool(walks)
+        information = by_noise**2 / 2 + leads * known
+        self.level.learn(by_noise * size - leads * runs, information, forget, _READING_BOUND)
+        for walk, part in walks:
+            slope = part * (share / 2 * size + runs)
+            walk.learn(slope, part**2 * (share**2 / 8 + known), forget, _WALK_BOUND)
+        self.past = (1 - share) * self.past + math.sqrt(share * (2 - share)) * innovation

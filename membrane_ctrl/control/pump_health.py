@@ -1,0 +1,55 @@
+"""Reports the learned state of the pump, and warns of a drift beyond its limit. Pure."""
+
+from dataclasses import dataclass
+
+from membrane_ctrl.control.maintenance_notice import BETTER, FilmWarning
+from membrane_ctrl.control.pump_drift import PumpScale
+from membrane_ctrl.model.state_tree import Count, StateNode
+
+_PUMP_EVERY = 10  # segments of a minute between reports
+_PUMP_SIGMAS = 3.0
+
+
+@dataclass(slots=True)
+class PumpHealthState(StateNode):
+    """Segments so far, and whether the warning applies."""
+
+    count: Count = 0
+    warned: bool = False
+
+
+class PumpHealth:
+    """Reports what a hold has learned of its pump, and warns once of
+    a drift beyond `change_max`.
+    """
+
+    def __init__(self, change_max: float, memory: PumpHealthState | None = None) -> None:
+        self._change_max = change_max
+        self.memory = memory or PumpHealthState()
+
+    def set_pump(self, change_max: float) -> None:
+        """Another curve is in force, with this limit of its drift."""
+        self._change_max = change_max
+
+    def step(self, known: PumpScale) -> tuple[bool, tuple[FilmWarning, ...]]:
+        """Take a segment's estimate; returns whether to report it,
+        and a new or withdrawn warning.
+        """
+        memory = self.memory
+        memory.count += 1
+        change = known.scale - 1.0
+        bad = abs(change) > max(self._change_max, _PUMP_SIGMAS * known.sigma) * (
+            BETTER if memory.warned else 1.0
+        )
+        says = (
+            f"the pump gives {100 * abs(change):.0f} % {'less' if change < 0 else 'more'} than "
+            "its curve"
+        )
+        says += f" (+- {100 * known.sigma:.0f} %): check it, then `tune pump`"
+        news = (
+            (FilmWarning("pump_drift", says if bad else "no longer so", bad),)
+            if bad != memory.warned
+            else ()
+        )
+        memory.warned = bad
+        return bool(news) or memory.count % _PUMP_EVERY == 0, news

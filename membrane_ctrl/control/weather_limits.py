@@ -1,0 +1,34 @@
+"""Limits beyond which a reading of the weather is a sensor fault. Pure."""
+
+import math
+
+# Any workplace from 5000 m to a mine; hPa, mmHg and psi are far outside, and so are K for C
+_PRESSURE_PA = (50e3, 110e3)
+_TEMPERATURE_C = (-20.0, 60.0)
+
+
+def weather_fault(ambient_pressure_pa: float, air_temperature_c: float) -> str:
+    """Name the sensor with an impossible reading; absent ones (NaN) do not count."""
+    if not _believed(ambient_pressure_pa, _PRESSURE_PA):
+        return (
+            f"the barometer reads {ambient_pressure_pa:g} Pa: check its unit; the feed-forward "
+            "does without it"
+        )
+    if not _believed(air_temperature_c, _TEMPERATURE_C):
+        return (
+            f"the air thermometer reads {air_temperature_c:g} C: check its unit; the "
+            "feed-forward does without it"
+        )
+    return ""
+
+
+def believed_weather(ambient_pressure_pa: float, air_temperature_c: float) -> tuple[float, float]:
+    """The readings, an impossible one as NaN."""
+    return (
+        ambient_pressure_pa if _believed(ambient_pressure_pa, _PRESSURE_PA) else math.nan,
+        air_temperature_c if _believed(air_temperature_c, _TEMPERATURE_C) else math.nan,
+    )
+
+
+def _believed(value: float, within: tuple[float, float]) -> bool:
+    return math.isnan(value) or within[0] <= value <= within[1]
