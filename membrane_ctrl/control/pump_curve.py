@@ -2,8 +2,8 @@
 
     q = q_full (d - dead) / (1 - dead)   while it runs; starts at `start`, stalls below `stall`
 
-(docs/explanation/physics.md), or a measured curve through any number of points, with a second branch for
-falling commands if there is hysteresis.
+(docs/explanation/physics.md), or a measured curve through any number of points, with a second
+branch for falling commands if there is hysteresis.
 
 There is no flow between rest and the least running flow: a wanted flow in that gap goes to the
 nearer end, so that the error of the gap has no fixed sign. (Always running would add gas that
