@@ -93,6 +93,12 @@ def faults_picture(folder: Path) -> dict[str, bytes]:
     return {"review-faults": _tab(folder, run, "--tab", "faults")}
 
 
+def tutorial_picture(folder: Path) -> dict[str, bytes]:
+    """The review of the fault that the tutorial plays."""
+    command("twin", "play", "laser_knocked", "--logs", folder)
+    return {"tutorial-fault": _tab(folder, next(folder.glob("*-laser_knocked")))}
+
+
 def bowed_picture(folder: Path) -> dict[str, bytes]:
     """Residuals of the calibration of a bowed screen, stated as flat."""
     bowed, flat = folder / "bowed.toml", folder / "flat.toml"
@@ -228,6 +234,7 @@ MAKERS: dict[tuple[str, ...], Callable[[Path], dict[str, bytes]]] = {
     ("review-overview", "review-loop", "review-shape", "review-tuning", "report"): review_pictures,
     ("review-faults",): faults_picture,
     ("review-catalogue",): catalogue_picture,
+    ("tutorial-fault",): tutorial_picture,
     ("calibration-bowed-screen",): bowed_picture,
     ("web", "web-phone"): page_pictures,
     ("web-fleet",): fleet_picture,
