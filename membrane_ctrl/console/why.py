@@ -124,9 +124,9 @@ def _outside(row: TelemetryRow) -> str:
 def _balance(row: TelemetryRow) -> str:
     """Contributions to the flow, largest first."""
     parts = {
-        "leak": row.i_um_per_s,  # on average the integrator supplies the leak
-        "error": row.p_um_per_s,
-        "its speed": row.d_um_per_s,
+        "integral": row.i_um_per_s,  # on average it balances the leak
+        "proportional": row.p_um_per_s,
+        "derivative": row.d_um_per_s,
         "feed-forward": row.feedforward_um_per_s,
     }
     least = _WORTH_NAMING * max(abs(row.flow_um_per_s), abs(row.i_um_per_s))

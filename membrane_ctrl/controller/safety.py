@@ -371,7 +371,8 @@ TABLE: tuple[Rule, ...] = (
         code=18,
         name="laser_gauge_apart",
         cause="laser (or optics, without a laser) and gauge contradict each other",
-        limit="limits.laser_gauge_apart_max_um, limits.laser_gauge_drift_max_um",
+        limit="limits.laser_gauge_apart_max_um (2 min), laser_gauge_drift_max_um (1 h), "
+        "laser_gauge_day_max_um (24 h); pressure within a factor of 2 of the sag's",
         safe_level=SafeLevel.RAMP_DOWN,
         states=CONNECTED,
         remedy="find which of them is wrong: laser mount, gauge hose, units; for another film set "

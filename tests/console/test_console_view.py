@@ -49,7 +49,7 @@ def test_everything_a_person_wants_is_there() -> None:
     page = "\n".join(drawn(held()))
     for words in (
         "hold for 1:15",
-        "pump gives 1.14 µm/s: +1.24 leak, -0.11 feed-forward",
+        "pump gives 1.14 µm/s: +1.24 integral, -0.11 feed-forward",
         "within ±2",
         "truth +0.03 µm (laser",
         "29 %, 1.140 of 5.3 µm/s",

@@ -20,9 +20,9 @@ def line(told: str = "", fault: str = "", **changes: float) -> str:
 
 
 def test_hold_names_what_the_flow_is_made_of_largest_first() -> None:
-    assert line() == "pump gives 1.14 µm/s: +1.24 leak, -0.11 feed-forward"
+    assert line() == "pump gives 1.14 µm/s: +1.24 integral, -0.11 feed-forward"
     assert line(p_um_per_s=-2.0, flow_um_per_s=0.0) == (
-        "pump is at 0: -2.00 error, +1.24 leak, -0.11 feed-forward"
+        "pump is at 0: -2.00 proportional, +1.24 integral, -0.11 feed-forward"
     )
 
 

@@ -100,7 +100,9 @@ def faults_page() -> str:
     after = {
         SafeLevel.HOLD_FLOW: "`states.hold_flow_max_s`; used time recovers at the same rate",
         SafeLevel.RAMP_DOWN: "`states.ramp_down_s`",
-        SafeLevel.PUMP_OFF: "`states.pump_off_max_s`",
+        SafeLevel.PUMP_OFF: "`states.pump_off_max_s`, if the run continues: with "
+        "`states.stay_after_trip`, or while the fault may resume. Otherwise the run ends once the "
+        "pump is at rest, and the vent stays closed",
     }
     lines += [
         f"| {safe_level.name.lower()} | {does} | {after.get(safe_level, '-')} |"
