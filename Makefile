@@ -29,8 +29,8 @@ lint: $(STAMP)
 	$(BIN)/ruff format --check .
 	$(BIN)/ruff check .
 	$(BIN)/vulture
-	$(BIN)/python -m benchmarks.house
-	$(BIN)/python -m benchmarks.text_decisions
+	$(BIN)/python -m tests.lint.package_order
+	$(BIN)/python -m tests.lint.text_decisions
 	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --quiet --strict
 
 docs: $(STAMP)  ## the documentation as a site, on http://127.0.0.1:8000

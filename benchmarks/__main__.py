@@ -17,49 +17,49 @@ from typing import Any
 
 from rich.console import Console
 
-from benchmarks.figures import as_json, machine, show
-from benchmarks.page import page
+from benchmarks.figures_page import page
+from tests.support.figures import as_json, machine, show
 
-# those that need a quiet machine first, those that take long last
-NAMES = (
-    "hold_live",
-    "ticks",
-    "snapshots",
-    "viewers",
-    "live_cycle",
-    "tracking",
-    "measure_full",
-    "monte_carlo",
-    "acquisition",
-    "tracking_live",
-    "virtual_time",
-    "held",
-    "centre",
-    "laser_drift",
-    "report_month",
-    "events_found",
-    "links",
-    "calibration",
-    "calibration_time",
-    "coverage",
-    "calibration_coverage",
-    "benches",
-    "recording",
-    "recording_tracked",
-    "memory",
-    "tracking_long",
-    "soak",
-)
+# Name and package. Those that need a quiet machine first, those that take long last.
+BENCHMARKS = {
+    "hold_live": "benchmarks.control",
+    "ticks": "benchmarks.control",
+    "snapshots": "benchmarks.control",
+    "viewers": "benchmarks.interfaces",
+    "live_cycle": "benchmarks.metrology",
+    "tracking": "benchmarks.metrology",
+    "measure_full": "benchmarks.metrology",
+    "monte_carlo": "benchmarks.metrology",
+    "acquisition": "benchmarks.metrology",
+    "tracking_live": "benchmarks.metrology",
+    "virtual_time": "benchmarks.control",
+    "held": "benchmarks.control",
+    "centre": "benchmarks.control",
+    "laser_drift": "benchmarks.control",
+    "report_month": "benchmarks.records",
+    "events_found": "benchmarks.records",
+    "links": "benchmarks.interfaces",
+    "calibration": "benchmarks.metrology",
+    "calibration_time": "benchmarks.metrology",
+    "coverage": "benchmarks.metrology",
+    "calibration_coverage": "benchmarks.metrology",
+    "benches": "benchmarks.tuning",
+    "recording": "benchmarks.records",
+    "recording_tracked": "benchmarks.records",
+    "memory": "benchmarks.records",
+    "tracking_long": "benchmarks.metrology",
+    "soak": "benchmarks.control",
+}
 OUT = Path("docs/measurements/bench.json")
 PAGE = Path("docs/measurements/bench.md")
 
 
 def main(names: list[str]) -> int:
     """Run the named benchmarks, all by default; 1 if a target was missed."""
-    unknown = [name for name in names if name not in NAMES]
+    unknown = [name for name in names if name not in BENCHMARKS]
     if unknown:
         print(
-            f"benchmarks: unknown {', '.join(unknown)}; known are {', '.join(NAMES)}",
+            f"benchmarks: unknown {', '.join(unknown)}; known are {', '.join(BENCHMARKS)}",
             file=sys.stderr,
         )
         return 2
@@ -68,12 +68,12 @@ def main(names: list[str]) -> int:
     ):  # each in a process of its own: memory and compiled code of one are no figure of another
         command = [sys.executable, "-m", "benchmarks"]
         return max(
-            subprocess.run([*command, name], check=False).returncode for name in names or NAMES
+            subprocess.run([*command, name], check=False).returncode for name in names or BENCHMARKS
         )
     (name,) = names
     about = machine()
     Console(width=150).print(", ".join(f"{key} {value}" for key, value in about.items()))
-    figures = importlib.import_module(f"benchmarks.{name}").run()
+    figures = importlib.import_module(f"{BENCHMARKS[name]}.{name}").run()
     show(name, figures)
     _record(
         name,
@@ -90,7 +90,7 @@ def main(names: list[str]) -> int:
 def _record(name: str, entry: dict[str, Any]) -> None:
     report = json.loads(OUT.read_text(encoding="utf-8")) if OUT.exists() else {}
     report[name] = entry
-    ordered = {known: report[known] for known in NAMES if known in report}
+    ordered = {known: report[known] for known in BENCHMARKS if known in report}
     OUT.write_text(json.dumps(ordered, indent=1) + "\n", encoding="utf-8")
     PAGE.write_text(page(ordered), encoding="utf-8")
 

@@ -11,7 +11,16 @@ from pathlib import Path
 
 import pytest
 
-from benchmarks.house import ROOT, TOPS, circle_of, floors, imported, module_of, modules, rooms
+from tests.lint.package_order import (
+    ROOT,
+    TOPS,
+    circle_of,
+    floors,
+    imported,
+    module_of,
+    modules,
+    rooms,
+)
 
 IO = {
     "asyncio",

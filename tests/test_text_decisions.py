@@ -7,8 +7,8 @@ import textwrap
 
 import pytest
 
-from benchmarks import text_decisions
-from benchmarks.text_decisions import EXCEPTIONS, decisions, decisions_in
+from tests.lint import text_decisions
+from tests.lint.text_decisions import EXCEPTIONS, decisions, decisions_in
 
 
 def expressions_in(source: str) -> list[str]:

@@ -14,7 +14,7 @@ from membrane_ctrl.calibration.camera import fringe_error_mm, lines_of, measured
 from membrane_ctrl.cli import run
 from membrane_ctrl.config.schema import PatternConfig
 from membrane_ctrl.metrology.phase import mm_per_rad
-from tests.support.panel import PanelResponse
+from tests.worlds.panel import PanelResponse
 
 
 class OpenedBench(Bench):

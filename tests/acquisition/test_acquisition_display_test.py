@@ -11,7 +11,7 @@ from acquisition_fakes import VirtualClock
 
 from firmware_iface.roles import Frame
 from membrane_ctrl.acquisition.optical_bench import DisplayTest, told
-from tests.support.panel import EmulatedPanel, PanelResponse
+from tests.worlds.panel import EmulatedPanel, PanelResponse
 
 EXPOSURE_S, TRANSFER_S = 0.01, 0.005
 WIDTH_PX, HEIGHT_PX = 320, 240

@@ -25,8 +25,8 @@ from membrane_ctrl.processes.frames import FrameRing
 from membrane_ctrl.processes.ring import RingReader, ring
 from membrane_ctrl.sim.optics.camera import OpticsRenderer
 from membrane_ctrl.sim.optics.film_shape import typical_film
-from tests.support.gige_camera import GigeCameraEmulator, gige_camera
 from tests.support.virtual_display import screenshot, virtual_display
+from tests.worlds.gige_camera import GigeCameraEmulator, gige_camera
 
 pytestmark = pytest.mark.real_time
 

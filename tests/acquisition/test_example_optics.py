@@ -19,8 +19,8 @@ from firmware_iface.emulators.pump_board import BoardSample
 from membrane_ctrl.config.schema import Config, DevicesConfig
 from membrane_ctrl.config.toml_file import dump, load
 from membrane_ctrl.sim.lab import Lab
-from tests.support.gige_camera import GigeCameraEmulator, gige_camera
 from tests.support.virtual_display import screenshot, virtual_display
+from tests.worlds.gige_camera import GigeCameraEmulator, gige_camera
 
 pytestmark = pytest.mark.real_time
 

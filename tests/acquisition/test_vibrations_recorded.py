@@ -40,8 +40,8 @@ from membrane_ctrl.sim.optics.camera import OpticsRenderer
 from membrane_ctrl.sim.optics.disturbances import DRUM_MODES
 from tests.metrology.test_track_live import FILM, OPTICS, held_um
 from tests.support.rrd_reading import reader, scalars, strings
-from tests.support.synthetic_run import STARTED_UTC, message_of, rows_of, shape_of
-from tests.support.vibrating_mirror import watched
+from tests.worlds.synthetic_run import STARTED_UTC, message_of, rows_of, shape_of
+from tests.worlds.vibrating_mirror import watched
 
 DAY_S = 86400.0
 FEWER_HZ = (12.0, 12 / 1.09, 12 / 1.17)

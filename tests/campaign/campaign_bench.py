@@ -24,7 +24,7 @@ import psutil
 from membrane_ctrl.config.schema import PumpConfig, TwinConfig
 from membrane_ctrl.model.clock import RunClock
 from membrane_ctrl.sim.bench import BenchSpec, LiveBench
-from tests.support.faulty_board import PumpBoardEmulator
+from tests.worlds.faulty_board import PumpBoardEmulator
 
 PATIENCE_S = 60.0
 WATCHDOG_S = 0.5

@@ -1,7 +1,7 @@
 """Twenty holds, their page in a real Chromium, and `ctl fleet`: both stay usable, and no tick is
 touched.
 
-The holds run in slowed time (tests/support/slowed_holds.py), a quarter of the real one: two
+The holds run in slowed time (tests/worlds/slowed_holds.py), a quarter of the real one: two
 processors have no room for twenty at 50 Hz with all their processes. Page, browser and terminal are
 real, and as fast as ever.
 """
@@ -21,12 +21,12 @@ import numpy as np
 import psutil
 import pytest
 
-from benchmarks.figures import Figure, at_most, show
 from tests.support.browser import Tab, browser_tab
+from tests.support.figures import Figure, at_most, show
 from tests.support.machine_needs import needs
-from tests.support.slowed_holds import slowed_holds
 from tests.web.test_fleet import fleet_file
 from tests.web.test_page import served
+from tests.worlds.slowed_holds import slowed_holds
 
 pytestmark = [pytest.mark.real_time, pytest.mark.campaign, needs("chromium")]
 NAMES = [f"mirror{number}" for number in range(20)]

@@ -13,9 +13,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from benchmarks import viewers
-from benchmarks.figures import at_most, show
+from benchmarks.interfaces import viewers
 from tests.support.browser import browser_tab
+from tests.support.figures import at_most, show
 from tests.support.machine_needs import needs
 
 pytestmark = [

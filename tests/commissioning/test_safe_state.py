@@ -23,7 +23,7 @@ from membrane_ctrl.config.schema import Config, DevicesConfig, RecordingConfig
 from membrane_ctrl.instruments.bench import device_names, locked, pump_board
 from membrane_ctrl.instruments.lock_store import VARIABLE, LockStore, device_keys
 from membrane_ctrl.model.errors import DeviceError
-from tests.support.faulty_board import PumpBoardEmulator
+from tests.worlds.faulty_board import PumpBoardEmulator
 
 STOPPED, WATCHDOG = 0b100, 0b001
 

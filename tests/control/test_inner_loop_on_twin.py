@@ -8,7 +8,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from benchmarks.inner_loop import answer, hold, lost_reading, run, start_up, steady
+from benchmarks.control.inner_loop import answer, hold, lost_reading, run, start_up, steady
 from membrane_ctrl.config.schema import LoopConfig, PumpConfig, TwinConfig
 from membrane_ctrl.sim.surroundings import AmbientChange, LeakChange
 

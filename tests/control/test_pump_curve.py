@@ -14,7 +14,7 @@ from scipy.interpolate import PchipInterpolator
 from membrane_ctrl.config.schema import PumpConfig
 from membrane_ctrl.control.pump_curve import KICK_S, PumpCurve
 from membrane_ctrl.sim.plant import PumpModel
-from tests.support.second_world import CURVES, ForeignPump
+from tests.worlds.foreign_plant import CURVES, ForeignPump
 
 PUMP = PumpConfig()
 DT_S = 0.02

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from benchmarks.shape_loop import SENSITIVITY, estimate_of
+from benchmarks.control.shape_loop import SENSITIVITY, estimate_of
 from membrane_ctrl.config.schema import ShapeConfig
 from membrane_ctrl.control.shape_loop import ShapeCode, ShapeLoop, ShapeOutput
 from membrane_ctrl.control.shape_reference import SHAPES, TRACKED_EVERY_S, TRACKED_SHAPES

@@ -6,7 +6,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from benchmarks.shape_loop import ON_S, SHAPE, track
+from benchmarks.control.shape_loop import ON_S, SHAPE, track
 from membrane_ctrl.config.schema import TwinConfig
 from membrane_ctrl.model.telemetry import ShapeState
 

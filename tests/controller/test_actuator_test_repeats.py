@@ -13,7 +13,7 @@ from membrane_ctrl.metrology.optics.film_law import zernike_projection
 from membrane_ctrl.model.telemetry import State
 from membrane_ctrl.sim.plant import Plant
 from membrane_ctrl.sim.virtual_bench import VirtualBench
-from tests.support.virtual_record import run_virtual
+from tests.worlds.virtual_record import run_virtual
 
 
 @pytest.mark.parametrize(

@@ -20,7 +20,7 @@ from membrane_ctrl.model.events import EventLine, Why
 from membrane_ctrl.model.telemetry import SafeLevel, State
 from membrane_ctrl.sim.plant import Plant
 from membrane_ctrl.sim.virtual_bench import VirtualBench
-from tests.support.virtual_record import run_virtual
+from tests.worlds.virtual_record import run_virtual
 
 CALM = Config(twin=TwinConfig(scenario="calm", laser_noise_um=0.3))
 Alter = Callable[[float, BenchReading], BenchReading | None]

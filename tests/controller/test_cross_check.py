@@ -24,7 +24,7 @@ from membrane_ctrl.config.toml_file import load, parse
 from membrane_ctrl.controller.cross_check import cross_check
 from membrane_ctrl.controller.safety import TABLE
 from membrane_ctrl.model.errors import InputError
-from tests.support.faulty_board import PumpBoardEmulator
+from tests.worlds.faulty_board import PumpBoardEmulator
 
 EXAMPLES = Path(__file__).parents[2] / "membrane_ctrl" / "examples"
 BOARD = {"board": "tcp://127.0.0.1:1"}

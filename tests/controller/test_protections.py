@@ -35,7 +35,7 @@ from membrane_ctrl.model.shape_estimate import ShapeEstimate
 from membrane_ctrl.model.telemetry import SafeLevel, State
 from membrane_ctrl.sim.plant import Plant
 from membrane_ctrl.sim.virtual_bench import VirtualBench, Wrong
-from tests.support.copied_bench import Originals
+from tests.worlds.copied_bench import Originals
 
 RATE_HZ = 10.0
 Spoil = Callable[

@@ -29,9 +29,9 @@ from membrane_ctrl.model.errors import Exit
 from membrane_ctrl.model.state_tree import find_differences
 from membrane_ctrl.model.telemetry import State
 from membrane_ctrl.replay.replay import RecordedTick, replay
-from tests.support.controller_runs import STORIES, record_story
 from tests.support.incidents import check_incident, read_incident
-from tests.support.virtual_record import CONFIG, kept_ticks, laser_lost, snapshot_at, write_record
+from tests.worlds.controller_runs import STORIES, record_story
+from tests.worlds.virtual_record import CONFIG, kept_ticks, laser_lost, snapshot_at, write_record
 
 TICKS = kept_ticks(20.0, laser_lost)
 MIDDLE = 650  # 13 s: held, the laser is lost a second later

@@ -16,7 +16,7 @@ from typing import Any
 
 import pytest
 
-from benchmarks.doors import lines
+from benchmarks.interfaces.bridges import lines
 from membrane_ctrl.doors.names import TABLE
 from tests.control_port.port_run import PortRun, port_run
 from tests.support.machine_needs import needs, program_path
@@ -406,7 +406,7 @@ async def test_a_client_and_its_door_may_be_killed(tmp_path: Path, kind: str) ->
     part = (
         sys.executable,
         "-m",
-        "benchmarks.doors",
+        "benchmarks.interfaces.bridges",
         str(tmp_path),
         "--part",
         kind,

@@ -8,7 +8,7 @@ import pytest
 from counting_plant import CountingPlant, ManualClock
 
 from firmware_iface.register_map import default_map, known_maps
-from tests.support.faulty_board import PumpBoardEmulator
+from tests.worlds.faulty_board import PumpBoardEmulator
 
 
 @pytest.fixture

@@ -40,14 +40,14 @@ from firmware_iface.emulators.serial_device import PtyWire
 from firmware_iface.links.modbus_rtu import RtuBus
 from firmware_iface.links.serial_port import SerialSettings
 from firmware_iface.roles import DeviceRefusedError, LinkDownError, LinkError
-from tests.support.faulty_devices import (
+from tests.support.virtual_time import run_virtual
+from tests.worlds.faulty_devices import (
     MemoryWire,
     ProparDevice,
     RtuBusEmulator,
     SerialDevice,
     SerialFaults,
 )
-from tests.support.virtual_time import run_virtual
 
 LINE = SerialSettings(38_400)
 Made = tuple[SerialDevice, Callable[[], ParameterPort], MemoryWire]

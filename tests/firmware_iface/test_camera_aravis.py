@@ -25,8 +25,8 @@ from firmware_iface.roles import (
     SensorFormat,
 )
 from firmware_iface.settings import AravisCameraConfig
-from tests.support.gige_camera import GigeCameraEmulator, gige_camera
 from tests.support.machine_needs import program_path
+from tests.worlds.gige_camera import GigeCameraEmulator, gige_camera
 
 pytestmark = pytest.mark.real_time
 

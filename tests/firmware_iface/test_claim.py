@@ -24,7 +24,7 @@ from firmware_iface.roles import (
     LinkDownError,
     LinkError,
 )
-from tests.support.faulty_board import PumpBoardEmulator
+from tests.worlds.faulty_board import PumpBoardEmulator
 
 WATCHDOG_S = 0.5
 ON, OFF = BenchCommand(0.5, 0.25), BenchCommand(0.0, 0.0)

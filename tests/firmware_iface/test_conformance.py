@@ -21,8 +21,8 @@ from firmware_iface.links.modbus_tcp import GuardedModbusTcp
 from firmware_iface.links.serial_port import SerialSettings
 from firmware_iface.register_map import known_maps
 from firmware_iface.roles import BenchCommand, DeviceBusyError, LinkError
-from tests.support.faulty_board import PumpBoardEmulator
-from tests.support.faulty_devices import RtuBusEmulator
+from tests.worlds.faulty_board import PumpBoardEmulator
+from tests.worlds.faulty_devices import RtuBusEmulator
 
 PUMP, VENT, HEARTBEAT = 56, 57, 58
 DELIVERED = StoredSettings()

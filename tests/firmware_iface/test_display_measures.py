@@ -25,7 +25,7 @@ from firmware_iface.display import (
     share_left,
 )
 from firmware_iface.roles import Pattern
-from tests.support.panel import EmulatedPanel, PanelResponse
+from tests.worlds.panel import EmulatedPanel, PanelResponse
 
 RASTER = ScreenRaster(341, 257, 0.25, periods=4, period_mm=14.0)
 

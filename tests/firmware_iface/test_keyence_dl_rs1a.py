@@ -18,8 +18,8 @@ from firmware_iface.drivers.keyence_dl_rs1a import (
 from firmware_iface.emulators.serial_device import PtyWire
 from firmware_iface.roles import DeviceRefusedError, LinkDownError, LinkError
 from firmware_iface.settings import KeyenceDlRs1aConfig
-from tests.support.faulty_devices import KeyenceDlRs1aEmulator, MemoryWire, SerialFaults
 from tests.support.virtual_time import run_virtual
+from tests.worlds.faulty_devices import KeyenceDlRs1aEmulator, MemoryWire, SerialFaults
 
 
 class Bench:

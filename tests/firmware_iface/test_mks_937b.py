@@ -15,8 +15,8 @@ from firmware_iface.emulators.serial_device import PtyWire
 from firmware_iface.links.serial_port import SerialSettings
 from firmware_iface.roles import DeviceRefusedError, LinkDownError, LinkError
 from firmware_iface.settings import Mks937bConfig
-from tests.support.faulty_devices import MemoryWire, Mks937bEmulator, SerialDevice, SerialFaults
 from tests.support.virtual_time import run_virtual
+from tests.worlds.faulty_devices import MemoryWire, Mks937bEmulator, SerialDevice, SerialFaults
 
 
 class Bench:

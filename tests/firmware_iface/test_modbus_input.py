@@ -14,8 +14,8 @@ from firmware_iface.links.modbus_rtu import RtuBus, rtu_frame, take_reply
 from firmware_iface.links.modbus_tcp import GuardedModbusTcp
 from firmware_iface.links.serial_port import SerialSettings
 from firmware_iface.roles import DeviceRefusedError, LinkDownError, LinkError
-from tests.support.faulty_devices import MemoryWire, RtuBusEmulator
 from tests.support.virtual_time import run_virtual
+from tests.worlds.faulty_devices import MemoryWire, RtuBusEmulator
 
 BITS = [("discrete", 3), ("coil", 3), ("discrete", 11)]
 

@@ -15,8 +15,8 @@ from firmware_iface.links.modbus_rtu import RtuBus
 from firmware_iface.links.serial_port import SerialSettings
 from firmware_iface.roles import DeviceRefusedError, LinkError
 from membrane_ctrl.sim.lab import MapDevice, respond_to_input
-from tests.support.faulty_devices import MemoryWire, RtuBusEmulator
 from tests.support.virtual_time import run_virtual
+from tests.worlds.faulty_devices import MemoryWire, RtuBusEmulator
 
 LINE = SerialSettings(9600)
 PUMP, _ = make_map({"address": 0, "value": [0.0, 1.0]}, "waveshare_ao8")

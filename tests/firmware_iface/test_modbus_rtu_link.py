@@ -16,8 +16,8 @@ from firmware_iface.emulators.modbus_server import bitwise_crc, respond
 from firmware_iface.links.modbus_rtu import RtuBus, crc16, parse_rtu_url, rtu_frame, take_reply
 from firmware_iface.links.serial_port import SerialSettings
 from firmware_iface.roles import DeviceRefusedError, LinkDownError, LinkError
-from tests.support.faulty_devices import MemoryWire, RtuBusEmulator, SerialFaults
 from tests.support.virtual_time import run_virtual, stand_still
+from tests.worlds.faulty_devices import MemoryWire, RtuBusEmulator, SerialFaults
 
 LINE = SerialSettings(115_200)
 TIMEOUT_S = 0.05

@@ -18,8 +18,8 @@ from firmware_iface.emulators.serial_device import PtyWire
 from firmware_iface.links.exchange import StepGate
 from firmware_iface.roles import DeviceRefusedError, LinkDownError, LinkError
 from firmware_iface.settings import Optoncdt1420Config
-from tests.support.faulty_devices import MemoryWire, Optoncdt1420Emulator
 from tests.support.virtual_time import run_virtual, stand_still
+from tests.worlds.faulty_devices import MemoryWire, Optoncdt1420Emulator
 
 STEP_UM = 50_000 * 1.02 / 65_520  # a digital step at 50 mm range
 

@@ -12,13 +12,13 @@ from firmware_iface.drivers.keyence_dl_rs1a import KeyenceDlRs1a
 from firmware_iface.drivers.optoncdt1420 import Optoncdt1420
 from firmware_iface.drivers.ventus import Ventus
 from firmware_iface.settings import KeyenceDlRs1aConfig, Optoncdt1420Config, VentusConfig
-from tests.support.faulty_devices import (
+from tests.support.virtual_time import run_virtual
+from tests.worlds.faulty_devices import (
     KeyenceDlRs1aEmulator,
     MemoryWire,
     Optoncdt1420Emulator,
     VentusEmulator,
 )
-from tests.support.virtual_time import run_virtual
 
 BANNER = b"\r\nboot 1.2 \x00\xff ready\r\n"
 

@@ -24,7 +24,7 @@ from firmware_iface.roles import (
     LinkDownError,
     LinkError,
 )
-from tests.support.faulty_board import Faults, PumpBoardEmulator
+from tests.worlds.faulty_board import Faults, PumpBoardEmulator
 
 WATCHDOG_S = 0.5
 OFF = BenchCommand(0.0, 0.0)

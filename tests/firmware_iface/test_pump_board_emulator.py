@@ -11,7 +11,7 @@ from pymodbus.client import AsyncModbusTcpClient
 
 from firmware_iface.generate import DOCS_PATH
 from firmware_iface.register_map import default_map
-from tests.support.faulty_board import PumpBoardEmulator
+from tests.worlds.faulty_board import PumpBoardEmulator
 
 DOCS = DOCS_PATH.read_text(encoding="utf-8")
 ROW = re.compile(r"\| (\d+) \| `(\w+)` \| (\w\d\d) \| \S+ \| (\d+) \|")

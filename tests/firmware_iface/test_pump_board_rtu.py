@@ -17,8 +17,8 @@ from firmware_iface.emulators.serial_device import PtyWire
 from firmware_iface.links.serial_port import SerialSettings
 from firmware_iface.register_map import default_map
 from firmware_iface.roles import BenchCommand, LinkDownError
-from tests.support.faulty_board import PumpBoardEmulator
-from tests.support.faulty_devices import RtuBusEmulator
+from tests.worlds.faulty_board import PumpBoardEmulator
+from tests.worlds.faulty_devices import RtuBusEmulator
 
 SETTINGS = SerialSettings(115_200, parity="E")
 

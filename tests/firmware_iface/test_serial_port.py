@@ -21,7 +21,7 @@ from firmware_iface.links.serial_port import (
     serial_ports,
 )
 from firmware_iface.roles import DeviceRefusedError, LinkDownError, LinkError
-from tests.support.faulty_devices import RtuBusEmulator, SerialDevice
+from tests.worlds.faulty_devices import RtuBusEmulator, SerialDevice
 
 LINE = SerialSettings(115_200)
 GUARD_S = 5.0

@@ -15,8 +15,8 @@ from firmware_iface.drivers.vaisala_ptb330 import VaisalaPtb330
 from firmware_iface.emulators.serial_device import PtyWire
 from firmware_iface.roles import DeviceRefusedError, LinkDownError, LinkError
 from firmware_iface.settings import VaisalaPtb330Config
-from tests.support.faulty_devices import MemoryWire, SerialFaults, VaisalaPtb330Emulator
 from tests.support.virtual_time import run_virtual
+from tests.worlds.faulty_devices import MemoryWire, SerialFaults, VaisalaPtb330Emulator
 
 
 class Bench:

@@ -13,8 +13,8 @@ from firmware_iface.drivers.ventus import Ventus
 from firmware_iface.emulators.serial_device import PtyWire
 from firmware_iface.roles import DeviceRefusedError, LinkDownError, LinkError
 from firmware_iface.settings import VentusConfig
-from tests.support.faulty_devices import MemoryWire, SerialFaults, VentusEmulator
 from tests.support.virtual_time import run_virtual
+from tests.worlds.faulty_devices import MemoryWire, SerialFaults, VentusEmulator
 
 
 class Bench:

@@ -19,7 +19,7 @@ from membrane_ctrl.model.zernike_terms import ZERNIKE_TERMS
 from membrane_ctrl.recorder.rerun_streams import TelemetryStreams
 from membrane_ctrl.recorder.sink import LAYOUT, Recording
 from membrane_ctrl.run_files.summary import Summary
-from tests.support.virtual_record import CONFIG, kept_ticks, snapshot_at, write_record
+from tests.worlds.virtual_record import CONFIG, kept_ticks, snapshot_at, write_record
 
 RUN = "20261121T010203Z-night"
 TUNING = "20261121T010203Z-session"

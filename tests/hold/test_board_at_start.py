@@ -18,7 +18,7 @@ from membrane_ctrl.hold.start import BoardAtStart, HoldOptions, _identify, _latc
 from membrane_ctrl.instruments.bench import connect, open_bench
 from membrane_ctrl.model.errors import DeviceError, FindingsError
 from membrane_ctrl.run_files.latched_fault import NAME, LatchedFile, ResumeLog
-from tests.support.faulty_board import PumpBoardEmulator
+from tests.worlds.faulty_board import PumpBoardEmulator
 
 WATCHDOG, OVER_PRESSURE = (default_map().fault_mask(name) for name in ("watchdog", "over_pressure"))
 

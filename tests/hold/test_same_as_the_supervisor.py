@@ -25,8 +25,8 @@ from membrane_ctrl.model.telemetry import FIELDS, ROW_BYTES
 from membrane_ctrl.processes.ring import RingReader, RingWriter, ring
 from membrane_ctrl.sim.plant import Plant
 from membrane_ctrl.sim.virtual_bench import VirtualBench
-from tests.support.loop_bench import LoopBench
 from tests.support.virtual_time import run_virtual as in_virtual_time
+from tests.worlds.loop_bench import LoopBench
 
 # a power of two, so that the supervisor's sum of periods is exact and both tick at the same
 # instants to the bit

@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from benchmarks.coverage import BentRays, answers
+from benchmarks.metrology.coverage import BentRays, answers
 from membrane_ctrl.config.optics import (
     CameraConfig,
     CameraPoseConfig,

@@ -24,8 +24,7 @@ from membrane_ctrl.metrology.track.fit import FrameFit, FrameFitter, _split, ste
 from membrane_ctrl.metrology.track.scene import CrossedScene, scene_of
 from membrane_ctrl.metrology.track.tracker import Tracker
 from membrane_ctrl.model.zernike_terms import NOLL_INDICES, ZERNIKE_TERMS
-from tests.support.crossed_world import CROSSED, RADIUS_MM, SIDE_MM, Array, CrossedWorld, Waves
-from tests.support.tracked_errors import (
+from tests.studies.tracked_errors import (
     CLEAN,
     MOVING,
     SIZE,
@@ -34,6 +33,7 @@ from tests.support.tracked_errors import (
     errors_of,
     rms,
 )
+from tests.worlds.crossed_fringes import CROSSED, RADIUS_MM, SIDE_MM, Array, CrossedWorld, Waves
 
 EFFECTS: dict[str, dict[str, float]] = {
     "still": {},

@@ -17,8 +17,8 @@ from membrane_ctrl.cli import run
 from membrane_ctrl.metrology.frames.bands import without_bands
 from membrane_ctrl.metrology.frames.frame_stack import FrameStack, bin_frames, pixel_phases
 from membrane_ctrl.metrology.motion import combine_steps
-from tests.support.crossed_world import CrossedWorld
-from tests.support.tracked_errors import CLEAN, SIZE
+from tests.studies.tracked_errors import CLEAN, SIZE
+from tests.worlds.crossed_fringes import CrossedWorld
 
 Array = NDArray[np.float64]
 HEIGHT, WIDTH = 256, 240

@@ -10,11 +10,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from benchmarks.effects import EFFECTS, Effect, answer
+from benchmarks.metrology.effects import EFFECTS, Effect, answer
 from membrane_ctrl.cli import run
 from membrane_ctrl.model.errors import Exit
-from tests.support.crossed_world import CrossedWorld
-from tests.support.tracked_errors import CLEAN, SIZE
+from tests.studies.tracked_errors import CLEAN, SIZE
+from tests.worlds.crossed_fringes import CrossedWorld
 
 BY_NAME = {effect.says: effect for effect in EFFECTS}
 

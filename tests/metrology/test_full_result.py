@@ -11,7 +11,7 @@ import pytest
 from metrology_truth import cone, v_fold
 from rendered_sets import FILM, bench, good_set, patterns, stack_of
 
-from benchmarks import coverage
+from benchmarks.metrology import coverage
 from membrane_ctrl.config.schema import OpticsConfig
 from membrane_ctrl.metrology.checked import check
 from membrane_ctrl.metrology.frames.frame_stack import FrameStack
@@ -27,7 +27,7 @@ from membrane_ctrl.metrology.reconstruct import HeightFunction, parabola
 from membrane_ctrl.model.zernike_terms import ZERNIKE_TERMS
 from membrane_ctrl.sim.optics.camera import OpticsRenderer
 from membrane_ctrl.sim.optics.film_shape import Bump, FilmShape, Ripple
-from tests.support.tracked_errors import rms
+from tests.studies.tracked_errors import rms
 
 X, Y = np.meshgrid(*[np.linspace(-475, 475, 81)] * 2)
 INSIDE = np.hypot(X, Y) <= 475

@@ -15,7 +15,7 @@ from membrane_ctrl.metrology.track.modes import VibrationMode, find_modes
 from membrane_ctrl.model.events import Event, Maintenance, MaintenanceOver
 from membrane_ctrl.model.run_events import Vibrations, from_dict
 from membrane_ctrl.model.zernike_terms import ZERNIKE_TERMS
-from tests.support.vibrating_mirror import watched
+from tests.worlds.vibrating_mirror import watched
 
 
 @pytest.mark.parametrize("seed", [1, 2])

@@ -33,7 +33,7 @@ from membrane_ctrl.sim.optics.disturbances import DRUM_MODES
 from membrane_ctrl.sim.optics.film_shape import typical_film
 from membrane_ctrl.sim.optics.shade import Light
 from membrane_ctrl.sim.plant import Plant
-from tests.support.virtual_record import run_virtual
+from tests.worlds.virtual_record import run_virtual
 
 SHRINK = 8
 OPTICS = OpticsConfig(

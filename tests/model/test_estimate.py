@@ -16,7 +16,7 @@ import pytest
 
 from membrane_ctrl.model.shape_estimate import ShapeEstimate, pack_estimate, unpack_estimate
 from membrane_ctrl.model.zernike_terms import COVARIANCE_UPPER_SIZE, ZERNIKE_TERMS
-from tests.support.synthetic_shape import shape_at
+from tests.worlds.synthetic_shape import shape_at
 
 ESTIMATE = unpack_estimate(pack_estimate(shape_at(3.0)))
 BYTES = pack_estimate(ESTIMATE)

@@ -17,7 +17,7 @@ from membrane_ctrl.model.zernike_terms import (
     zernike_columns,
     zernike_labels,
 )
-from tests.support.synthetic_shape import shape_at
+from tests.worlds.synthetic_shape import shape_at
 
 
 @pytest.mark.parametrize(

@@ -36,7 +36,7 @@ from membrane_ctrl.model.arithmetic import describe_arithmetic
 from membrane_ctrl.model.events import Event
 from membrane_ctrl.replay.numbers import NUMBERS_WITHIN
 from tests.recorded_scenarios.scenarios import SCENARIOS
-from tests.support.controller_runs import Story, Ticks, record_story
+from tests.worlds.controller_runs import Story, Ticks, record_story
 
 PATH = Path(__file__).with_name("expected.npz")
 BLOCK_TICKS = 100

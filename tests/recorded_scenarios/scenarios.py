@@ -30,7 +30,7 @@ from membrane_ctrl.sim.surroundings import (
     LeakChange,
 )
 from membrane_ctrl.sim.virtual_bench import MemoryLink, VirtualBench, at_once
-from tests.support.controller_runs import STORIES, Story, switched
+from tests.worlds.controller_runs import STORIES, Story, switched
 
 # Ten ticks a second and no test of the actuators: a hold begins after some 5 s
 _LOOP = LoopConfig(rate_hz=10.0)

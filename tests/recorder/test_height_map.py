@@ -17,7 +17,7 @@ from membrane_ctrl.run_files.shapes import (
     uncertainty_map_um,
     without_terms,
 )
-from tests.support.synthetic_run import shape_of
+from tests.worlds.synthetic_run import shape_of
 
 # pixel centres on the unit disc, row 0 on top
 AXIS = (np.arange(MAP_PX) + 0.5) * 2 / MAP_PX - 1

@@ -31,7 +31,7 @@ from membrane_ctrl.run_files.inputs_file import InputsReader
 from membrane_ctrl.run_files.run_folder import write_heads
 from membrane_ctrl.run_files.table_store.disk import Disk
 from tests.support.rrd_reading import scalars
-from tests.support.synthetic_run import STARTED_UTC, message_of, rows_of, shape_of
+from tests.worlds.synthetic_run import STARTED_UTC, message_of, rows_of, shape_of
 
 
 class HandClock(RunClock):

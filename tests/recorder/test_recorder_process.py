@@ -34,7 +34,7 @@ from membrane_ctrl.recorder.process import RecorderSpec, recorder_main
 from membrane_ctrl.run_files.run_folder import create_run_folder
 from membrane_ctrl.run_files.streams import STREAMS
 from tests.support.rrd_reading import has_footer, scalars, strings
-from tests.support.synthetic_run import message_of, rows_of, shape_of
+from tests.worlds.synthetic_run import message_of, rows_of, shape_of
 
 pytestmark = pytest.mark.real_time
 
@@ -234,7 +234,7 @@ import os, signal, sys
 sys.path.insert(0, {tests!r})
 from pathlib import Path
 import multiprocessing
-from tests.support.synthetic_run import message_of, rows_of
+from tests.worlds.synthetic_run import message_of, rows_of
 from membrane_ctrl.model.clock import RunClock
 from membrane_ctrl.config.schema import Config
 from membrane_ctrl.processes.ring import Ring, RingWriter

@@ -13,7 +13,6 @@ from typing import Any
 import numpy as np
 import pytest
 
-from benchmarks.recorded_hold import ring_trip
 from membrane_ctrl.config.schema import Config, RecordingConfig
 from membrane_ctrl.controller.tick import MESSAGE_BYTES
 from membrane_ctrl.model.clock import RunClock
@@ -28,7 +27,8 @@ from membrane_ctrl.recorder.recorder import Recorder
 from membrane_ctrl.recorder.sink import EventsFile, Recording, is_whole
 from membrane_ctrl.run_files.disk_budget import DetailLevel
 from tests.support.rrd_reading import has_footer, reader, recorded_rows, scalars, strings
-from tests.support.synthetic_run import STARTED_UTC, message_of, rows_of, shape_of
+from tests.worlds.recorded_hold import ring_trip
+from tests.worlds.synthetic_run import STARTED_UTC, message_of, rows_of, shape_of
 
 ROWS = rows_of(12.0)
 

@@ -14,7 +14,7 @@ from membrane_ctrl.model.zernike_terms import ZERNIKE_TERMS
 from membrane_ctrl.recorder.rerun_streams import ShapeStreams, _legend
 from membrane_ctrl.recorder.sink import Recording
 from tests.support.rrd_reading import scalars, strings
-from tests.support.synthetic_run import shape_of
+from tests.worlds.synthetic_run import shape_of
 
 
 def test_both_error_bars_of_the_sag_are_told_apart() -> None:

@@ -10,7 +10,7 @@ from membrane_ctrl.model.run_status import RunStatus
 from membrane_ctrl.model.telemetry import unpack
 from membrane_ctrl.recorder.blueprint import summary_page
 from membrane_ctrl.run_files.summary import Summary
-from tests.support.synthetic_run import rows_of, shape_of
+from tests.worlds.synthetic_run import rows_of, shape_of
 
 FAULT = events.Fault(
     33, "board_fault", "a cause", "bits 0x4", "must be 0", "pump_off", True, "a remedy"

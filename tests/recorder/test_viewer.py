@@ -15,7 +15,7 @@ from membrane_ctrl.recorder.rerun_streams import ShapeStreams, TelemetryStreams,
 from membrane_ctrl.recorder.sink import Recording
 from membrane_ctrl.review.viewer.viewer import screenshot
 from tests.support.machine_needs import needs
-from tests.support.synthetic_run import rows_of, shape_of
+from tests.worlds.synthetic_run import rows_of, shape_of
 
 pytestmark = [pytest.mark.viewer, needs("vulkan")]
 

@@ -24,7 +24,7 @@ from membrane_ctrl.replay import replay as replays
 from membrane_ctrl.replay.numbers import RecordedRows
 from membrane_ctrl.run_files.inputs_file import InputsReader
 from membrane_ctrl.run_files.run_tables import as_recorded
-from tests.support.virtual_record import kept_ticks, laser_lost, snapshot_at, write_record
+from tests.worlds.virtual_record import kept_ticks, laser_lost, snapshot_at, write_record
 
 TICKS = kept_ticks(16.0, laser_lost)
 SNAPSHOTS = {500: snapshot_at(TICKS, 500)}

@@ -11,14 +11,14 @@ from pathlib import Path
 import pyarrow.parquet as pq
 import pytest
 
-from benchmarks.nights import batch_of
 from membrane_ctrl.cli import run
 from membrane_ctrl.model.errors import Exit, InputError
 from membrane_ctrl.model.telemetry import unpack
 from membrane_ctrl.replay.repair import rebuild_summary, repair
 from membrane_ctrl.run_files.run_tables import RunTables
 from membrane_ctrl.run_files.summary import Summary
-from tests.support.virtual_record import CONFIG, kept_ticks, write_record
+from tests.worlds.nights import batch_of
+from tests.worlds.virtual_record import CONFIG, kept_ticks, write_record
 
 TICKS = kept_ticks(26.0)
 ROWS = unpack([outputs.row.pack() for _, outputs in TICKS])

@@ -14,7 +14,6 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
 
-from benchmarks.recorded_hold import ring_trip
 from membrane_ctrl.cli import run
 from membrane_ctrl.config import toml_file as config_file
 from membrane_ctrl.config.schema import LoopConfig
@@ -38,8 +37,9 @@ from membrane_ctrl.replay.replay import Gap, RecordedTick, recorded_ticks, repla
 from membrane_ctrl.run_files import table_specs
 from membrane_ctrl.run_files.inputs_file import InputsReader
 from tests.support.incidents import check_incident, read_incident
-from tests.support.synthetic_shape import shape_at
-from tests.support.virtual_record import CONFIG, kept_ticks, laser_lost, write_record
+from tests.worlds.recorded_hold import ring_trip
+from tests.worlds.synthetic_shape import shape_at
+from tests.worlds.virtual_record import CONFIG, kept_ticks, laser_lost, write_record
 
 TICKS = kept_ticks(20.0, laser_lost)
 

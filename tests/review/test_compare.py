@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 from scipy import signal
 
-from benchmarks.comparison import rates
+from benchmarks.records.comparison import rates
 from membrane_ctrl.review import open_run
 from membrane_ctrl.review.statistics.analysis import Analysis, analyse
 from membrane_ctrl.review.statistics.compare import compare

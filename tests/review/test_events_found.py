@@ -7,8 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from benchmarks.events_found import matched
-from benchmarks.nights import DOOR, GLITCH, JUMP, LATE, LEAK, LOST, Planted, night
+from benchmarks.records.events_found import matched
 from membrane_ctrl.metrology.optics.film_law import zernike_projection
 from membrane_ctrl.model.telemetry import COLUMN, Rows, State, column
 from membrane_ctrl.review.events.found import (
@@ -19,7 +18,8 @@ from membrane_ctrl.review.events.found import (
 )
 from membrane_ctrl.review.events.steps import FoundEvent, confidence, steps
 from membrane_ctrl.run_files.levels import TICK_FIELDS, Columns, first_level
-from tests.support.synthetic_shape import from_estimates
+from tests.worlds.nights import DOOR, GLITCH, JUMP, LATE, LEAK, LOST, Planted, night
+from tests.worlds.synthetic_shape import from_estimates
 
 HOURS = 2.0
 

@@ -5,12 +5,12 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from benchmarks.nights import DOOR, Planted, night
 from membrane_ctrl.model.telemetry import COLUMN, Rows, column
 from membrane_ctrl.review.events.found import find_events
 from membrane_ctrl.review.events.steps import FoundEvent
 from membrane_ctrl.run_files.levels import TICK_FIELDS, first_level
-from tests.support.synthetic_shape import from_estimates
+from tests.worlds.nights import DOOR, Planted, night
+from tests.worlds.synthetic_shape import from_estimates
 
 BAND_UM = 2.0
 AT_S = 1500.0

@@ -9,12 +9,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from benchmarks.nights import CONFIG, night, write_run
 from membrane_ctrl.model.telemetry import COLUMN, Rows, State, column
 from membrane_ctrl.review import open_run
 from membrane_ctrl.review.report.json import report_table, verdict
 from membrane_ctrl.review.statistics.analysis import analyse
 from membrane_ctrl.review.statistics.spectra import HeldTime
+from tests.worlds.nights import CONFIG, night, write_run
 
 HOURS = 0.1
 

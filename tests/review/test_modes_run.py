@@ -16,7 +16,7 @@ from membrane_ctrl.cli import run as command_line
 from membrane_ctrl.model.errors import Exit
 from membrane_ctrl.model.zernike_terms import ZERNIKE_TERMS
 from membrane_ctrl.review.statistics import modes_run
-from tests.support.vibrating_mirror import THREE_RATES, Planted, watched
+from tests.worlds.vibrating_mirror import THREE_RATES, Planted, watched
 
 CALM = 1e-3 * np.random.default_rng(0).normal(size=(900, ZERNIKE_TERMS))
 

@@ -11,7 +11,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from benchmarks.nights import Planted, night, write_run
 from membrane_ctrl.cli import run as command
 from membrane_ctrl.model import plain_json
 from membrane_ctrl.model.errors import InputError
@@ -31,6 +30,7 @@ from membrane_ctrl.review.statistics.compare import compare
 from membrane_ctrl.review.statistics.spectra import WithoutFeedforward
 from membrane_ctrl.run_files.hold_parts import HoldParts
 from tests.support.review_runs import same, written
+from tests.worlds.nights import Planted, night, write_run
 
 HOURS = 0.5
 

@@ -15,11 +15,11 @@ import pyarrow as pa
 import pyarrow.parquet
 import pytest
 
-from benchmarks.nights import Planted
 from membrane_ctrl.cli import run as command
 from membrane_ctrl.model.zernike_terms import NOLL_INDICES, ZERNIKE_DEGREE
 from tests.support.review_runs import written
 from tests.support.undrawn import undrawn_figures
+from tests.worlds.nights import Planted
 
 RATE_HZ = 10.0
 SETTLED_AFTER_S = 5.0

@@ -7,12 +7,12 @@ from pathlib import Path
 
 import pytest
 
-from benchmarks.nights import night, write_run
 from membrane_ctrl.cli import run as command
 from membrane_ctrl.model.telemetry import COLUMN, column
 from membrane_ctrl.review import open_run
 from membrane_ctrl.review.statistics.analysis import analyse
 from tests.support.review_runs import written
+from tests.worlds.nights import night, write_run
 
 HOURS = 0.1
 

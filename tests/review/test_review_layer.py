@@ -12,7 +12,6 @@ import numpy as np
 import pytest
 from rerun.chunk import RrdReader
 
-from benchmarks.nights import Planted
 from membrane_ctrl.config.schema import Config
 from membrane_ctrl.recorder.blueprint import learned
 from membrane_ctrl.review import open_run
@@ -20,6 +19,7 @@ from membrane_ctrl.review.viewer.blueprints import ReviewBlueprint, labels_of
 from membrane_ctrl.review.viewer.command import ReviewOptions, make_review
 from membrane_ctrl.run_files import shapes
 from tests.support.review_runs import set_summary, written
+from tests.worlds.nights import Planted
 
 FIGURES = {
     "duration_s": 360.0,

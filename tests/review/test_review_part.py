@@ -12,11 +12,11 @@ import numpy as np
 import pytest
 from rerun.chunk import RrdReader
 
-from benchmarks.nights import Planted
 from membrane_ctrl.review import open_run
 from membrane_ctrl.review.viewer import viewer
 from membrane_ctrl.review.viewer.command import ReviewOptions, make_review
 from tests.support.review_runs import written
+from tests.worlds.nights import Planted
 
 
 @pytest.fixture(scope="module")

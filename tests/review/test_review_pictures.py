@@ -11,11 +11,11 @@ import cv2
 import numpy as np
 import pytest
 
-from benchmarks.nights import Planted
 from membrane_ctrl.cli import run as command
 from membrane_ctrl.review.viewer.blueprints import TABS
 from tests.support.machine_needs import needs, program_path
 from tests.support.review_runs import written
+from tests.worlds.nights import Planted
 
 ERROR_BLUE = (86, 180, 233)
 

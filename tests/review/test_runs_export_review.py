@@ -21,7 +21,6 @@ import pyarrow.parquet
 import pytest
 from rerun.chunk import RrdReader
 
-from benchmarks.nights import Planted, night
 from membrane_ctrl.cli import run as command
 from membrane_ctrl.config.schema import LoopConfig
 from membrane_ctrl.model.errors import DeviceError, InputError
@@ -46,6 +45,7 @@ from membrane_ctrl.review.viewer.command import ReviewOptions, make_review
 from membrane_ctrl.review.viewer.viewer import follow
 from membrane_ctrl.run_files.segments import first_message_after
 from tests.support.review_runs import same, segment, set_summary, written
+from tests.worlds.nights import Planted, night
 
 Capsys = pytest.CaptureFixture[str]
 ORIGIN = datetime(2026, 11, 21, 18, 0, 30, tzinfo=UTC)

@@ -9,7 +9,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from benchmarks.nights import CONFIG, night, write_run
 from membrane_ctrl.hold.closing_words import _headline
 from membrane_ctrl.model.telemetry import COLUMN, Rows, columns, true_error_um
 from membrane_ctrl.review import open_run
@@ -18,6 +17,7 @@ from membrane_ctrl.review.statistics.analysis import analyse
 from membrane_ctrl.run_files.summary import Summary
 from tests.support.review_runs import segment
 from tests.support.rrd_reading import scalars
+from tests.worlds.nights import CONFIG, night, write_run
 
 SHALLOW_UM = 0.75  # the bowl is so much less deep than it should be
 

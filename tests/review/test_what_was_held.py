@@ -10,7 +10,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from benchmarks.nights import write_run
 from membrane_ctrl.cli import run as command
 from membrane_ctrl.model import plain_json
 from membrane_ctrl.model.telemetry import Rows, columns, unpack
@@ -21,6 +20,7 @@ from membrane_ctrl.review.statistics.analysis import analyse
 from membrane_ctrl.run_files.hold_parts import HoldParts
 from membrane_ctrl.run_files.summary import Summary
 from tests.support.scenario import CheckedScenario, play
+from tests.worlds.nights import write_run
 
 RATE_HZ = 10.0
 

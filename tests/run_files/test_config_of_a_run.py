@@ -7,13 +7,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from benchmarks.nights import night
 from membrane_ctrl.model.telemetry import COLUMN
 from membrane_ctrl.review import open_run
 from membrane_ctrl.review.statistics.analysis import analyse
 from membrane_ctrl.run_files.recorded_rate import recorded_rate_hz
 from membrane_ctrl.run_files.run_folder import understood
 from tests.support.review_runs import tables, written
+from tests.worlds.nights import night
 
 HOURS = 0.05
 

@@ -11,11 +11,11 @@ import numpy as np
 import pyarrow as pa
 import pytest
 
-from benchmarks.nights import night
 from membrane_ctrl.cli import run as cli
 from membrane_ctrl.model.plain_json import dumps_checked, with_comment
 from membrane_ctrl.review import open_run
 from tests.support.review_runs import segment, set_summary, written
+from tests.worlds.nights import night
 
 HOURS = 0.1
 FLIP = 3  # bytes

@@ -8,7 +8,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from benchmarks.nights import night
 from membrane_ctrl.model.errors import InputError
 from membrane_ctrl.model.telemetry import FIELDS, column
 from membrane_ctrl.review import open_run
@@ -22,6 +21,7 @@ from membrane_ctrl.run_files.levels import (
 )
 from membrane_ctrl.run_files.table_store.spec import PART_S
 from tests.support.review_runs import same, set_summary, tables, written
+from tests.worlds.nights import night
 
 
 def level_of(rows: np.ndarray) -> dict[str, np.ndarray]:

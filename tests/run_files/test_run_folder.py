@@ -12,7 +12,7 @@ from membrane_ctrl.config.schema import Config, RecordingConfig
 from membrane_ctrl.model.errors import DeviceError, InputError
 from membrane_ctrl.model.files import write_text_atomic
 from membrane_ctrl.run_files import run_folder
-from tests.support.synthetic_run import STARTED_UTC
+from tests.worlds.synthetic_run import STARTED_UTC
 
 
 def test_folder_is_named_by_utc_and_name(tmp_path: Path) -> None:

@@ -30,7 +30,7 @@ from membrane_ctrl.run_files.streams import (
     overview_um,
 )
 from tests.support.rrd_reading import scalars
-from tests.support.synthetic_run import rows_of, shape_of
+from tests.worlds.synthetic_run import rows_of, shape_of
 
 
 def test_every_field_is_in_one_stream_and_one_only() -> None:

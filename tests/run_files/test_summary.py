@@ -16,7 +16,7 @@ from membrane_ctrl.model.state_tree import decode_state, encode_state
 from membrane_ctrl.model.telemetry import SETTLED_AFTER_S, Rows, State, TelemetryRow, column, unpack
 from membrane_ctrl.run_files.hold_parts import held_at
 from membrane_ctrl.run_files.summary import SCHEMA, Summary
-from tests.support.synthetic_run import RATE_HZ, rows_of, shape_of
+from tests.worlds.synthetic_run import RATE_HZ, rows_of, shape_of
 
 HOLD_FROM_S = 6.0
 

@@ -10,13 +10,13 @@ import pyarrow as pa
 import pyarrow.csv
 import pytest
 
-from benchmarks.nights import night
 from membrane_ctrl.model.telemetry import FIELDS, SafeLevel, State
 from membrane_ctrl.review import open_run
 from membrane_ctrl.review.runs import export
 from membrane_ctrl.run_files.run import Run
 from membrane_ctrl.run_files.streams import named_table
 from tests.support.review_runs import tables
+from tests.worlds.nights import night
 
 ORIGIN = datetime(2026, 11, 21, 18, 0, 0, 250_000, tzinfo=UTC)
 

@@ -8,11 +8,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from benchmarks.nights import batch_of
 from membrane_ctrl.model.telemetry import Rows, unpack
 from membrane_ctrl.run_files.run import open_run
 from membrane_ctrl.run_files.run_tables import RunTables
-from tests.support.synthetic_run import rows_of, shape_of
+from tests.worlds.nights import batch_of
+from tests.worlds.synthetic_run import rows_of, shape_of
 
 ROWS: Rows = unpack([row.pack() for row in rows_of(200.0)])
 SECONDS = range(200)

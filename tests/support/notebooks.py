@@ -12,8 +12,8 @@ from pathlib import Path
 import nbformat
 from nbclient import NotebookClient
 
-from benchmarks.nights import GLITCH, Planted
 from tests.support.review_runs import written
+from tests.worlds.nights import GLITCH, Planted
 
 ROOT = Path(__file__).parents[2]
 FOLDER = ROOT / "docs" / "notebooks"

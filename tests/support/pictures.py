@@ -22,16 +22,16 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from benchmarks.nights import DOOR, GLITCH, JUMP, LEAK, Planted
 from firmware_iface.roles import BenchReading
 from membrane_ctrl.model.arrays import AnyArray
 from membrane_ctrl.review.viewer.viewer import screenshot
 from tests.support.browser import browser_tab
 from tests.support.review_runs import written
-from tests.support.slowed_holds import slowed_holds
-from tests.support.virtual_record import kept_ticks, write_record
 from tests.web.test_fleet import fleet_file
 from tests.web.test_page import PRESS, served
+from tests.worlds.nights import DOOR, GLITCH, JUMP, LEAK, Planted
+from tests.worlds.slowed_holds import slowed_holds
+from tests.worlds.virtual_record import kept_ticks, write_record
 
 IMAGES = Path(__file__).parents[2] / "docs" / "images"
 _WIDTH_PX = 1280  # of a tab of the review, beside others on its page

@@ -7,13 +7,13 @@ from pathlib import Path
 
 import numpy as np
 
-from benchmarks.nights import CONFIG, Planted, batch_of, night, write_run
 from membrane_ctrl.model.clock import RunClock
 from membrane_ctrl.model.shape_estimate import ShapeEstimate
 from membrane_ctrl.model.telemetry import Rows
 from membrane_ctrl.recorder.rerun_streams import TelemetryStreams
 from membrane_ctrl.recorder.sink import Recording
 from membrane_ctrl.run_files.run_tables import RunTables
+from tests.worlds.nights import CONFIG, Planted, batch_of, night, write_run
 
 NAME = "20261121T180000Z-night"
 _SYNC_ROWS = 120

@@ -15,7 +15,7 @@ from membrane_ctrl.cli import run
 from membrane_ctrl.config.schema import Config
 from membrane_ctrl.config.toml_file import dump
 from membrane_ctrl.model.errors import Exit
-from tests.support.second_world import ForeignPlant, ForeignPump, foreign_bench, foreign_config
+from tests.worlds.foreign_plant import ForeignPlant, ForeignPump, foreign_bench, foreign_config
 from tuning import opening
 from tuning.identification.characterise import experiment, fitted
 from tuning.opening import TwinHold

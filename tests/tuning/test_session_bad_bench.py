@@ -19,7 +19,7 @@ from membrane_ctrl.model.telemetry import ShapeState, State
 from membrane_ctrl.sessions.folder import create_session
 from membrane_ctrl.sessions.live_hold import HoldError, News
 from membrane_ctrl.sim.surroundings import AmbientChange, BenchEvent
-from tests.support.second_world import ForeignPlant, ForeignPump, foreign_bench, foreign_config
+from tests.worlds.foreign_plant import ForeignPlant, ForeignPump, foreign_bench, foreign_config
 from tuning import opening, session
 from tuning.identification import shape_loop
 from tuning.identification.characterise import ExperimentError, characterise, spec_of

@@ -17,7 +17,7 @@ from membrane_ctrl.model.errors import InputError
 from membrane_ctrl.model.shape_estimate import ShapeEstimate
 from membrane_ctrl.model.telemetry import ShapeState
 from membrane_ctrl.sessions import folder as plain
-from tests.support.second_world import ForeignPlant, ForeignPump, foreign_bench, foreign_config
+from tests.worlds.foreign_plant import ForeignPlant, ForeignPump, foreign_bench, foreign_config
 from tuning import gains_file as journal
 from tuning.gains_file import GainsFile, PlantSection
 from tuning.identification.disturbance import DisturbanceModel, Noise, WeatherGain, observe

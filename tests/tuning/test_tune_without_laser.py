@@ -17,7 +17,7 @@ from membrane_ctrl.model.shape_estimate import ShapeEstimate
 from membrane_ctrl.model.telemetry import FIELDS, TelemetryRow
 from membrane_ctrl.model.zernike_terms import ZERNIKE_TERMS
 from membrane_ctrl.sessions.folder import SessionFolder, create_session
-from tests.support.second_world import ForeignPlant, ForeignPump, foreign_bench, foreign_config
+from tests.worlds.foreign_plant import ForeignPlant, ForeignPump, foreign_bench, foreign_config
 from tuning import pump_trial, session
 from tuning.identification import characterise
 from tuning.identification.loop_model import Record

@@ -10,7 +10,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from benchmarks.tuning import Case, TwinBench
+from benchmarks.tuning.sessions import Case, TwinBench
 from membrane_ctrl.config.schema import PumpConfig
 from membrane_ctrl.control.experiments.excursion_guard import ExcursionGuard
 from membrane_ctrl.control.experiments.experiment import BenchSample, Experiment, Finished

@@ -12,8 +12,8 @@ import pytest
 import scipy.optimize
 from scipy.signal import lfilter
 
-from benchmarks.minimum_variance import least_std_um as least_of_the_twin
 from membrane_ctrl.config.schema import LoopConfig, PumpConfig, TwinConfig
+from tests.studies.minimum_variance import least_std_um as least_of_the_twin
 from tuning.identification.disturbance import DisturbanceModel, Noise, WeatherGain
 from tuning.identification.loop_model import (
     RECOVERED_UM,

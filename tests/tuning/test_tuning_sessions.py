@@ -1,5 +1,5 @@
-"""Whole sessions on the twin: what they must reach, with few seeds; `benchmarks.tuning` has
-sixteen.
+"""Whole sessions on the twin: what they must reach, with few seeds; `benchmarks.tuning.sessions`
+has sixteen.
 """
 
 from __future__ import annotations
@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 import tuning
-from benchmarks.tuning import SESSIONS, Case, TwinBench, session
+from benchmarks.tuning.sessions import SESSIONS, Case, TwinBench, session
 from membrane_ctrl.config.schema import LoopConfig, PumpConfig
 from tuning.identification.characterise import FitQuality, characterise
 from tuning.identification.disturbance import observe

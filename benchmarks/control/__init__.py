@@ -1,0 +1,1 @@
+"""Benchmarks of the loops, the controller and whole holds."""

@@ -1,0 +1,1 @@
+"""Benchmarks of device links, bridges and the web page."""

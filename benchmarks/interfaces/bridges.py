@@ -1,0 +1,488 @@
+"""Doors beside a real `hold --twin`: ticks, memory, and how old the values are while every other
+side restarts.
+
+python -m benchmarks.interfaces.bridges FOLDER [--minutes 30] [--apart-minutes 10] [--raised]
+
+Phases: without doors, with doors, without doors. With doors, a client of each kind (mosquitto with
+aiomqtt, asyncua, caproto for Channel Access, p4p for PV Access) reads all names twice a second.
+Broker and clients are killed and started again four times each, then the door three times. A bare
+loop of the hold's rate, in a process of its own, tells what the machine does to any such loop.
+FOLDER gets the raw lines; `--tell` prints the figures from them again.
+"""
+
+from __future__ import annotations
+
+import argparse
+import asyncio
+import itertools
+import json
+import os
+import shutil
+import signal
+import socket
+import subprocess
+import sys
+import threading
+import time
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from membrane_ctrl.doors.names import TABLE
+from tests.support.figures import Figure, at_least, at_most, show
+
+NAMES = [each.name for each in TABLE]
+CLIENTS = ("mqtt", "opcua", "ca", "pva")
+SWEEP_S, FRESH_S, RATE_HZ, SAMPLE_S = 0.5, 2.0, 50.0, 5.0
+BETWEEN_S = 20.0  # at least, from a return to the next end
+WARM_S = 60.0  # memory is compared from here on
+RAISED = "-5"  # of the session, against everything else on the machine
+CONFIG = """[twin]
+port = 0
+[doors.mqtt]
+port = {mqtt}
+[doors.opcua]
+port = {opcua}
+[doors.epics]
+ca_port = {ca}
+pva_port = {pva}
+"""
+
+Line = dict[str, Any]
+Read = Callable[[], Iterable[float]]  # UTC seconds at which each name's value was made
+
+
+def lines(path: Path) -> list[Line]:
+    """The complete lines of a file of JSON lines; none if it is not there."""
+    if not path.exists():
+        return []
+    return [
+        json.loads(line)
+        for line in path.read_text(encoding="utf-8").splitlines(keepends=True)
+        if line[-1] == "\n"
+    ]
+
+
+class Told:
+    """Appends JSON lines with their time to a file."""
+
+    def __init__(self, path: Path) -> None:
+        self._file = path.open("a", encoding="utf-8", buffering=1)
+
+    def __call__(self, **line: Any) -> None:
+        self._file.write(json.dumps({"utc_s": round(time.time(), 3)} | line) + "\n")
+
+
+# The clients: each a process that says in every sweep how old the oldest of all names is, or what
+# failed.
+
+
+def _sweeps(tell: Told, read: Read) -> None:
+    tell(ready=True)  # its libraries are loaded
+    while True:
+        try:
+            made_s = list(read())
+        except Exception as error:  # whatever the library raises: the client goes on
+            tell(failed=f"{type(error).__name__}: {error}"[:200])
+        else:
+            tell(names=len(made_s), oldest_s=round(time.time() - min(made_s), 3))
+        time.sleep(SWEEP_S)
+
+
+def _mqtt(tell: Told, ports: dict[str, int]) -> None:
+    from datetime import datetime
+
+    import aiomqtt
+
+    newest: Line = {}
+
+    async def follow() -> None:
+        while True:
+            try:
+                async with aiomqtt.Client("127.0.0.1", ports["mqtt"]) as client:
+                    await client.subscribe("membrane/mirror/values")
+                    async for message in client.messages:
+                        newest.update(json.loads(message.payload))
+            except aiomqtt.MqttError as error:
+                newest["problem"] = str(error)
+            await asyncio.sleep(0.2)
+
+    def read() -> list[float]:
+        made_s = datetime.fromisoformat(newest["time_utc"]).timestamp()
+        return [made_s for name in NAMES if name in newest]
+
+    threading.Thread(target=lambda: asyncio.run(follow()), daemon=True).start()
+    _sweeps(tell, read)
+
+
+def _opcua(tell: Told, ports: dict[str, int]) -> None:
+    from asyncua import ua
+    from asyncua.sync import Client
+
+    open_one: list[Client] = []
+
+    def opened() -> Client:
+        if not open_one:
+            client = Client(f"opc.tcp://127.0.0.1:{ports['opcua']}/membrane_ctrl", timeout=2)
+            client.connect()
+            open_one.append(client)
+        return open_one[0]
+
+    def read() -> list[float]:
+        from datetime import UTC
+
+        try:
+            client = opened()
+            space = client.get_namespace_index("urn:membrane-ctrl:mirror")
+            ids = [ua.NodeId(f"mirror.{name}", space) for name in NAMES]
+            wait = client.tloop.post(
+                client.aio_obj.uaclient.read_attributes(ids, ua.AttributeIds.Value)
+            )
+            return [value.SourceTimestamp.replace(tzinfo=UTC).timestamp() for value in wait]
+        except Exception:
+            if open_one:
+                open_one.pop().tloop.stop()
+            raise
+
+    _sweeps(tell, read)
+
+
+def _ca(tell: Told, ports: dict[str, int]) -> None:
+    """Channel Access, in pure Python."""
+    os.environ.update(EPICS_CA_ADDR_LIST="127.0.0.1", EPICS_CA_AUTO_ADDR_LIST="NO")
+    os.environ["EPICS_CA_SERVER_PORT"] = str(ports["ca"])
+    from caproto.threading.client import Context
+
+    context = Context(timeout=2.0)
+    pvs = context.get_pvs(*(f"mirror:{name}" for name in NAMES))
+    _sweeps(tell, lambda: [pv.read(timeout=2.0, data_type="time").metadata.timestamp for pv in pvs])
+
+
+def _pva(tell: Told, _: dict[str, int]) -> None:
+    # as in a lab; through a TCP name server it would look again every 10 s only
+    # (benchmarks/interfaces/epics_return.py)
+    os.environ.setdefault("EPICS_PVA_ADDR_LIST", "127.0.0.1")
+    os.environ["EPICS_PVA_AUTO_ADDR_LIST"] = "NO"
+    from p4p.client.thread import Context
+
+    context, names = Context("pva"), [f"mirror:{name}" for name in NAMES]
+    _sweeps(tell, lambda: [value.timestamp for value in context.get(names, timeout=2.0)])
+
+
+def _bare(tell: Told, _: dict[str, int]) -> None:
+    """A loop of the hold's rate that does nothing: how late it is, and what it misses, every ten
+    seconds.
+    """
+    deadline_s, late_ms, missed = time.monotonic(), [], 0
+    while True:
+        deadline_s += 1 / RATE_HZ
+        time.sleep(max(0.0, deadline_s - time.monotonic()))
+        late_s = time.monotonic() - deadline_s
+        late_ms.append(round(1e3 * late_s, 2))
+        skipped = int(late_s * RATE_HZ)
+        missed, deadline_s = missed + skipped, deadline_s + skipped / RATE_HZ
+        if len(late_ms) == round(10 * RATE_HZ):
+            tell(late_ms=late_ms, missed=missed)
+            late_ms, missed = [], 0
+
+
+PARTS = {"mqtt": _mqtt, "opcua": _opcua, "ca": _ca, "pva": _pva, "bare": _bare}
+
+
+# The bench: starts and kills everything.
+
+
+@dataclass(frozen=True)
+class Restart:
+    """Kills `who` at a time of the phase with doors, and starts it again `away_s` later."""
+
+    at_s: float
+    who: str
+    away_s: float
+
+
+def restarts(span_s: float) -> list[Restart]:
+    """Broker and clients in turn, away for a few seconds or for 20; then the door."""
+    turns = [(number, who) for number in range(4) for who in ("broker", *CLIENTS[1:])]
+    found = [
+        Restart(span_s * (0.04 + 0.0375 * place), who, 20.0 if number % 2 else 3.0)
+        for place, (number, who) in enumerate(turns)
+    ]
+    return [*found, *(Restart(span_s * share, "door", 3.0) for share in (0.70, 0.80, 0.90))]
+
+
+def _free_port() -> int:
+    with socket.create_server(("127.0.0.1", 0)) as server:
+        return int(server.getsockname()[1])
+
+
+class Bench:
+    """The processes, by name, and the file that says what happened to them."""
+
+    def __init__(self, folder: Path, raised: bool) -> None:
+        self._folder, self._raised = folder, raised
+        self.tell = Told(folder / "bench.jsonl")
+        self._ports = {name: _free_port() for name in CLIENTS}
+        self._running: dict[str, subprocess.Popen[bytes]] = {}
+        (folder / "lab.toml").write_text(CONFIG.format(**self._ports), encoding="utf-8")
+
+    def start(self, who: str, *more: str) -> None:
+        """Start a part and wait until it serves, as far as it serves anybody."""
+        part = [
+            sys.executable,
+            "-m",
+            "benchmarks.interfaces.bridges",
+            str(self._folder),
+            "--part",
+            who,
+        ]
+        part += ["--ports", json.dumps(self._ports)]
+        config = ["--config", str(self._folder / "lab.toml"), "--logs", str(self._folder / "logs")]
+        broker = shutil.which("mosquitto") or "/usr/sbin/mosquitto"
+        command = {
+            "hold": [
+                sys.executable,
+                "-m",
+                "membrane_ctrl",
+                "hold",
+                "--twin",
+                *config,
+                "--json",
+                *more,
+            ],
+            "door": [sys.executable, "-m", "membrane_ctrl", "doors", *config],
+            "broker": [broker, "-p", str(self._ports["mqtt"])],
+        }.get(who, part)
+        out = self._folder / f"{who}.log"
+        with out.open("ab") as log:
+            begin = log.tell()
+            process = subprocess.Popen(
+                command, stdout=log, stderr=log, stdin=subprocess.DEVNULL, start_new_session=True
+            )
+        self._running[who] = process
+        if self._raised and who in ("hold", "bare"):
+            Path(f"/proc/{process.pid}/autogroup").write_text(RAISED, encoding="utf-8")
+        while process.poll() is None and not self._serves(who, out, begin):
+            time.sleep(0.05)
+        self.tell(started=who, pid=process.pid)
+
+    def _serves(self, who: str, out: Path, begin: int) -> bool:
+        if who == "broker":
+            with socket.socket() as probe:
+                return probe.connect_ex(("127.0.0.1", self._ports["mqtt"])) == 0
+        if who == "hold":
+            return (self._folder / "logs" / "control.sock").exists()
+        said = out.read_bytes()[begin:].decode()
+        return who != "door" or all(f"{name}:" in said for name in ("opcua", "epics"))
+
+    def kill(self, who: str, number: int = signal.SIGKILL) -> None:
+        """End a part at once, or with another signal, and its children with it."""
+        self.tell(killed=who)
+        process = self._running.pop(who)
+        process.send_signal(number)
+        process.wait()
+
+    def sample(self) -> None:
+        """Note the memory of door and hold, and the machine's load."""
+        rss_mb = {}
+        for who in {"door", "hold"} & set(self._running):
+            pages = (
+                Path(f"/proc/{self._running[who].pid}/statm").read_text(encoding="utf-8").split()[1]
+            )
+            rss_mb[who] = round(int(pages) * os.sysconf("SC_PAGE_SIZE") / 1e6, 2)
+        self.tell(rss_mb=rss_mb, load=os.getloadavg()[0])
+
+    def wait(self, until_s: float) -> None:
+        """Sample until a monotonic time."""
+        while (left_s := until_s - time.monotonic()) > 0:
+            self.sample()
+            time.sleep(min(SAMPLE_S, left_s))
+
+    def close(self) -> None:
+        """End everything; the hold as Ctrl-C does."""
+        for who in sorted(self._running, key=lambda who: who == "hold"):
+            self.kill(who, signal.SIGINT if who == "hold" else signal.SIGKILL)
+
+
+def measure(folder: Path, minutes: float, apart_minutes: float, raised: bool) -> None:
+    """Run all phases; everything that was seen is in the folder's files."""
+    bench = Bench(folder, raised)
+    try:
+        bench.start("bare")
+        bench.start("hold")
+        bench.wait(time.monotonic() + 30.0)  # until it holds
+        bench.tell(phase="apart")
+        bench.wait(time.monotonic() + 60.0 * apart_minutes)
+        bench.start("broker")
+        bench.start("door")
+        for name in CLIENTS:
+            bench.start(name)
+        bench.tell(phase="doors")
+        begin_s = time.monotonic()
+        for restart in restarts(60.0 * minutes):
+            bench.wait(max(begin_s + restart.at_s, time.monotonic() + BETWEEN_S))
+            bench.kill(restart.who)
+            bench.wait(time.monotonic() + restart.away_s)
+            bench.start(restart.who)
+        bench.wait(begin_s + 60.0 * minutes)
+        for who in (*CLIENTS, "door", "broker"):
+            bench.kill(who)
+        bench.tell(phase="apart again")
+        bench.wait(time.monotonic() + 60.0 * apart_minutes)
+        bench.tell(phase="")
+    finally:
+        bench.close()
+
+
+# The figures, from the files.
+
+
+def _phases(told: list[Line]) -> list[tuple[str, float, float]]:
+    marks = [(line["phase"], line["utc_s"]) for line in told if "phase" in line]
+    return [(name, begin, end) for (name, begin), (_, end) in itertools.pairwise(marks)]
+
+
+def tick_figures(folder: Path, told: list[Line]) -> list[Figure]:
+    """Lateness and missed ticks of the hold in each phase, beside those of the bare loop."""
+    from membrane_ctrl.run_files.run import open_run
+
+    (run_folder,) = (
+        path for path in (folder / "logs").iterdir() if (path / "config.toml").exists()
+    )
+    run = open_run(run_folder)
+    ticks = run.ticks(["time_s", "lateness_ms", "missed_ticks"])
+    utc_s = ticks.column("time_s").to_numpy() + run.origin_utc.timestamp()
+    late_ms, missed = (ticks.column(name).to_numpy() for name in ("lateness_ms", "missed_ticks"))
+    bare, loads = lines(folder / "bare.jsonl"), [line for line in told if "load" in line]
+    found = []
+    for name, begin, end in _phases(told):
+        within = (utc_s >= begin) & (utc_s < end)
+        beside = [line for line in bare if begin <= line["utc_s"] < end]
+        beside_ms = np.concatenate([line["late_ms"] for line in beside])
+        load = float(np.mean([line["load"] for line in loads if begin <= line["utc_s"] < end]))
+        lost, bare_lost = (
+            int(missed[within][-1] - missed[within][0]),
+            sum(line["missed"] for line in beside),
+        )
+        p99_ms, bare_p99_ms = (
+            float(np.percentile(late_ms[within], 99)),
+            float(np.percentile(beside_ms, 99)),
+        )
+        found += [
+            at_most(
+                f"{name}: missed of {within.sum()} ticks", lost, "", None, "bare loop", bare_lost
+            ),
+            at_most(f"{name}: tick lateness p99", p99_ms, "ms", None, "bare loop", bare_p99_ms),
+            at_most(f"{name}: load", load, ""),
+        ]
+    return found
+
+
+def _affected(who: str) -> tuple[str, ...]:
+    return {"broker": ("mqtt",), "door": CLIENTS}.get(who, (who,))
+
+
+def _good(sweep: Line) -> bool:
+    return sweep.get("names") == len(NAMES) and bool(sweep["oldest_s"] <= FRESH_S)
+
+
+def age_figures(folder: Path, told: list[Line]) -> list[Figure]:
+    """How soon each client has all names anew after a restart, and how old they become between
+    restarts.
+    """
+    ((_, begin_s, end_s),) = (each for each in _phases(told) if each[0] == "doors")
+    found = []
+    for name in CLIENTS:
+        sweeps = [
+            line for line in lines(folder / f"{name}.jsonl") if begin_s <= line["utc_s"] < end_s
+        ]
+        back_s, between, first = [], [], True
+        events = [line for line in told if begin_s < line["utc_s"] < end_s]
+        returns = [line["utc_s"] for line in events if name in _affected(line.get("started", ""))]
+        kills = [line["utc_s"] for line in events if name in _affected(line.get("killed", ""))]
+        for at_s, until_s in zip([begin_s, *returns], [*kills, end_s], strict=False):
+            part = [line for line in sweeps if at_s <= line["utc_s"] < until_s]
+            started_s = next((line["utc_s"] for line in part if "ready" in line), at_s)
+            fresh_s = next((line["utc_s"] for line in part if _good(line)), None)
+            if fresh_s is None:
+                back_s.append(float("inf"))
+                continue
+            if not first:
+                back_s.append(fresh_s - started_s)
+            first = False
+            between += [line for line in part if line["utc_s"] >= fresh_s]
+        old_s = max(line.get("oldest_s", float("inf")) for line in between)
+        bad = sum(not _good(line) for line in between)
+        found += [
+            at_most(
+                f"{name}: slowest of {len(back_s)} returns to all names", max(back_s), "s", FRESH_S
+            ),
+            at_most(
+                f"{name}: oldest value between restarts, {len(between)} sweeps", old_s, "s", FRESH_S
+            ),
+            at_most(f"{name}: sweeps with a failure or an older value", bad, "", 0),
+        ]
+    return found
+
+
+def memory_figures(told: list[Line]) -> list[Figure]:
+    """Memory of the door in its longest life, and of the hold."""
+    starts = [line["utc_s"] for line in told if line.get("started") == "door"]
+    ends = [line["utc_s"] for line in told if line.get("killed") == "door"]
+    begin_s, end_s = max(zip(starts, ends, strict=True), key=lambda life: life[1] - life[0])
+    found = []
+    for who in ("door", "hold"):
+        at = [
+            (line["utc_s"], line["rss_mb"][who]) for line in told if who in line.get("rss_mb", {})
+        ]
+        part = [mb for utc_s, mb in at if begin_s + WARM_S <= utc_s < end_s]
+        minutes = (end_s - begin_s - WARM_S) / 60
+        name = f"{who}: memory at the end of {minutes:.0f} min with doors"
+        found.append(
+            at_most(name, part[-1], "MB", round(1.05 * part[0], 1), "first minute", part[0])
+        )
+    return found
+
+
+def figures(folder: Path) -> list[Figure]:
+    """All figures of a measured folder."""
+    told = lines(folder / "bench.jsonl")
+    ((_, begin_s, end_s),) = (each for each in _phases(told) if each[0] == "doors")
+    span = at_least("minutes with doors", (end_s - begin_s) / 60, "min", 0.0)
+    return [span, *tick_figures(folder, told), *age_figures(folder, told), *memory_figures(told)]
+
+
+def main() -> int:
+    """The command line."""
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("folder", type=Path)
+    parser.add_argument("--minutes", type=float, default=30.0)
+    parser.add_argument("--apart-minutes", type=float, default=10.0)
+    parser.add_argument(
+        "--raised",
+        action="store_true",
+        help="raise hold and bare loop above the machine's other work",
+    )
+    parser.add_argument(
+        "--tell", action="store_true", help="only the figures of a folder that was measured"
+    )
+    parser.add_argument("--part", choices=PARTS, help=argparse.SUPPRESS)
+    parser.add_argument("--ports", type=json.loads, help=argparse.SUPPRESS)
+    options = parser.parse_args()
+    if options.part:
+        PARTS[options.part](Told(options.folder / f"{options.part}.jsonl"), options.ports)
+    options.folder.mkdir(parents=True, exist_ok=True)
+    signal.signal(signal.SIGTERM, lambda *_: sys.exit(1))  # ends what was started, too
+    if not options.tell:
+        measure(options.folder.resolve(), options.minutes, options.apart_minutes, options.raised)
+    show("doors", figures(options.folder))
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,1 @@
+"""Benchmarks of cameras, frames, reconstruction, calibration and tracking."""

@@ -1,0 +1,1 @@
+"""Benchmarks of the recorder and of the review of runs."""

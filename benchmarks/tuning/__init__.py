@@ -1,0 +1,1 @@
+"""Benchmarks of tuning sessions and pump surveys."""
