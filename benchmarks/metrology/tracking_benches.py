@@ -36,7 +36,7 @@ from tests.worlds.crossed_fringes import RADIUS_MM, Array, CrossedWorld
 ANSWERS = Path("logs/tracking_benches.jsonl")
 FAR_SIGMAS, FAR_UM, WIDTHS = 5.0, 0.1, (245, 300, 345, 400)
 PIXEL_RAD = 2.3  # of the crossed fringes, in 95 % of the pixels
-# Largest sizes of what disturbs, each present in half of the benches; docs/how-to/tracking.md
+# Largest sizes of what disturbs, each present in half of the benches; docs/measurements/tracking.md
 DISTURBANCES = {
     "drift_um_per_s": 0.01,
     "swing_um": 0.3,
