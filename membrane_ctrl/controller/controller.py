@@ -156,6 +156,7 @@ class Controller:
             gas_excess=consistency.gas_excess,
             optics_hold=self._holders.optics_hold or scene.observer.optics_replace_laser,
             displacement_valid=self._displacement_suffices(),
+            unseen_film=self._explain_unseen_film(),
             open_interlocks=scene.interlocks.judged_mask,
             interlock_level=scene.interlocks.safe_level,
             interlock_words=scene.interlocks.describe_open(scene.interlocks.judged_mask),
@@ -196,7 +197,7 @@ class Controller:
         must not replace a lost laser.
         """
         if self._config.by_optics:
-            return True
+            return not self._holders.optics_left_out
         return (
             self._shape.on
             and not self._consistency.camera_lies
@@ -215,8 +216,20 @@ class Controller:
             return math.isfinite(observer.laser_um) or self._holders.optics_hold
         if self.state == State.MANUAL or scene.paused:
             return math.isfinite(observer.guard_um)
+        if self._holders.blind:
+            return False
         estimated = self.state in (State.SETTLE, State.HOLD) and self._holders.optics_hold
         return math.isfinite(observer.displacement_um) or estimated
+
+    def _explain_unseen_film(self) -> str:
+        """Why a bench without a laser cannot be held by its optics; empty if it can."""
+        if not self._config.by_optics:
+            return ""
+        if self._holders.optics_left_out:
+            return "the sag jumps again and again"
+        if self._holders.blind:
+            return "the figures do not fit the estimate"
+        return self._scene.observer.figures.explain_unseen().text
 
     def _begin(self, inputs: TickInputs, events: list[told.Event]) -> None:
         scene = self._scene

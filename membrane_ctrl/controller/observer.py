@@ -62,6 +62,9 @@ class Observer:
     guard_um : float
         The displacement by which range and limits are judged: like `displacement_um`, with figures
         of a few seconds ago as well.
+    optics_guard_um : float
+        The displacement by figures of a few seconds ago, beside a laser as well; NaN unless the
+        loop may follow the optics.
     gauge_pressure_pa : float
         The gauge reading; NaN without one or for a jump. The limits judge jumps too.
     optics_replace_laser : bool
@@ -82,6 +85,7 @@ class Observer:
         self._laser_same_s = 0.0
         self.reading: BenchReading | None = None
         self.laser_um = self.displacement_um = self.guard_um = self.gauge_pressure_pa = math.nan
+        self.optics_guard_um = math.nan
         self.optics_replace_laser = False
 
     def wrote(self, command: BenchCommand) -> None:
@@ -119,8 +123,9 @@ class Observer:
         self.figures.take(now_s, inputs.estimate, self.moving_laser_um)
         self.displacement_um = self.guard_um = self.laser_um
         self.optics_replace_laser = False
-        replaceable = self._follows_optics and may_follow_optics
-        if replaceable and math.isnan(self.moving_laser_um):
+        may_follow = self._follows_optics and may_follow_optics
+        self.optics_guard_um = self.figures.guard_um if may_follow else math.nan
+        if may_follow and math.isnan(self.moving_laser_um):
             self._replace_laser_by_optics()
         gauge_pa = reading.gauge_pressure_pa if reading else math.nan
         self.gauge_pressure_pa = (
@@ -175,7 +180,6 @@ class Observer:
             displacement_um=self.displacement_um if self._by_optics else _good_quality_um(reading),
             guard_um=self.guard_um,
             laser_stuck=self.laser_stuck,
-            unseen_film=self.figures.explain_unseen().text if self._by_optics else "",
             displacement_valid=math.isfinite(self.displacement_um),
             jumps=self.memory.laser_jumps.count,
             error_um=error_um,

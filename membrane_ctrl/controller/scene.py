@@ -114,9 +114,14 @@ class Scene(SceneState):
 
     @property
     def strayed(self) -> bool:
-        """Whether the mirror has moved too far from its setpoint while no loop holds it."""
-        away_um = abs(self.observer.guard_um - self.setpoint_um - self.trim_um)
-        return away_um > self.config.states.manual_range_um
+        """Whether the mirror has moved too far from its setpoint while no loop holds it.
+
+        By laser or optics, whichever shows more: one of them may be frozen.
+        """
+        target_um = self.setpoint_um + self.trim_um
+        shown_um = (self.observer.guard_um, self.observer.optics_guard_um)
+        # false for a sensor without a reading
+        return any(abs(um - target_um) > self.config.states.manual_range_um for um in shown_um)
 
     def stay_good(self, good: bool) -> float:
         """How long `good` has been true without a break, in seconds."""

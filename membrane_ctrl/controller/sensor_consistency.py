@@ -492,7 +492,15 @@ _UNSTEADY_MESSAGE = (
     "Look for vibration, reflections or a loose camera, then `ctl shape off` and `on` use "
     "them again"
 )
+_UNSTEADY_ALONE_MESSAGE = (
+    "the optics have jumped again and again, and no laser shows which jumps are the film's; they "
+    "are left out. Look for vibration, reflections, a loose camera or wrong times of its frames, "
+    "then restart the hold"
+)
 _JUMP_TAKES_S = 2.0  # until the estimate has followed a jump of the laser
+# So long may the estimate be held by pump, gas and weather alone, beyond the time in which a sensor
+# counts as fresh: a start without a figure yet. At the pump's full flow the film moves by 5 µm.
+_BLIND_S = 1.0
 
 
 @dataclass(slots=True)
@@ -515,8 +523,11 @@ class MountDrift:
     to be the laser's is no drift.
     """
 
-    def __init__(self, shape: ShapeConfig, memory: MountDriftState | None = None) -> None:
+    def __init__(
+        self, shape: ShapeConfig, memory: MountDriftState | None = None, by_optics: bool = False
+    ) -> None:
         self._most_um = shape.trim_max_um
+        self._by_optics = by_optics
         self.memory = memory or MountDriftState()
 
     def start(self, mount_um: float) -> None:
@@ -548,7 +559,8 @@ class MountDrift:
             memory.optics_jumps.add(now_s, _OPTICS_JUMPS_MAX)
             if memory.optics_jumps.too_many(now_s, _OPTICS_JUMPS_MAX):
                 memory.beyond_limit = True
-                return [Maintenance("optics_unsteady", _UNSTEADY_MESSAGE)]
+                message = _UNSTEADY_ALONE_MESSAGE if self._by_optics else _UNSTEADY_MESSAGE
+                return [Maintenance("optics_unsteady", message)]
         laser_jumped = Sensor.LASER in jumped
         memory.jump_left_s = _JUMP_TAKES_S if laser_jumped else max(0.0, memory.jump_left_s - dt_s)
         if memory.jump_left_s == 0.0:
@@ -581,6 +593,8 @@ class HoldersState(StateNode):
     told: tuple[int, ...] | None = None  # the sensors, as reported
     news_s: float = math.nan
     estimate: CentreEstimate | None = None
+    blind_since_s: float = math.nan  # the estimate follows neither laser nor optics since then
+    blind: bool = False  # it has done so for too long
 
 
 class Holders:
@@ -598,7 +612,7 @@ class Holders:
             None if centre is None else CentreFilter(config.estimator, config.loop, centre)
         )
         self._tracks = config.shape.mode == "track"
-        self._mount_drift = MountDrift(config.shape, self.memory.mount_drift)
+        self._mount_drift = MountDrift(config.shape, self.memory.mount_drift, config.by_optics)
         self._stand = StandGrowth(config.estimator, self.memory.stand)
         self._stand_most_um = _STAND_SHARE * config.limits.band_um
 
@@ -613,6 +627,13 @@ class Holders:
         if self.memory.estimate is None or self._filter is None:
             return False
         return self._filter.frames >= LOCK_FRAMES and self._sees(Sensor.OPTICS)
+
+    @property
+    def blind(self) -> bool:
+        """Whether the estimate has followed neither laser nor optics for a second: it then only
+        predicts the centre by pump and weather, and nothing may be held by it.
+        """
+        return self.memory.blind
 
     @property
     def optics_left_out(self) -> bool:
@@ -639,6 +660,8 @@ class Holders:
         figures = scene.observer.figures
         if not self._wanted or state not in safety.ESTIMATED or not math.isfinite(flow_um_per_s):
             self._stop()
+            if self._by_optics and state not in safety.MOVING:
+                self._mount_drift.start(0.0)  # a resumed hold judges the optics by itself
             return []
         laser_um = math.nan if consistency.laser_lies else scene.observer.moving_laser_um
         if self._filter is None:
@@ -671,6 +694,7 @@ class Holders:
             judged=consistency.judges,
         )
         self.memory.estimate = estimate = self._filter.step(readings, scene.dt_s)
+        self._note_blindness(inputs.now_s)
         scene.trim_um = estimate.mount_um
         news = [*self._news(inputs.now_s, estimate.jumped), *self._told_of_stand()]
         news += self._mount_drift.step(
@@ -686,6 +710,18 @@ class Holders:
         self.memory.centre = None
         self.memory.estimate = None
         self.memory.told = None
+        self.memory.blind_since_s = math.nan
+        self.memory.blind = False
+
+    def _note_blindness(self, now_s: float) -> None:
+        """Note since when neither laser nor optics correct the estimate."""
+        memory = self.memory
+        if self._sees(Sensor.LASER) or self._sees(Sensor.OPTICS):
+            memory.blind_since_s = math.nan
+        elif math.isnan(memory.blind_since_s):
+            memory.blind_since_s = now_s
+        # false while `blind_since_s` is NaN
+        memory.blind = now_s - memory.blind_since_s > _BLIND_S
 
     def _start(self, start_um: float, scene: Scene) -> CentreFilter:
         """Begin an estimate at a displacement."""

@@ -72,7 +72,7 @@ def test_a_quantity_has_its_unit() -> None:
         if name in ("rotation", "s_x", "s_y", "distortion", "raw", "value", "limits")
     }
     assert {name for name, unit in numbers.items() if not unit} == WITHOUT_UNIT | vectors
-    assert numbers["flow_rate_limit_um_per_s2"] == "um/s2"
+    assert numbers["flow_rate_limit_um_per_s2"] == "µm/s2"
     assert numbers["kp_per_s"] == "1/s"
     assert reference.unit_of("most_per_day") == "1/day"
 

@@ -490,3 +490,56 @@ def test_a_figure_that_the_shape_loop_cannot_use_is_a_fault_and_no_exception() -
         lambda since_s, figure: replace(figure, coeffs_um=figure.coeffs_um[:5]),
     ).fail(5.0)
     assert held.faults == ["tick_error"]
+
+
+def noisy_with_a_small_sigma() -> Spoil:
+    rng = np.random.default_rng(6)
+    return lambda since_s, figure: replace(
+        figure, sag_um=figure.sag_um + 2.0 * rng.standard_normal(), sag_sigma_um=1e-3
+    )
+
+
+@pytest.mark.parametrize("process_value", ["estimate", "optics"])
+def test_optics_that_are_left_out_as_unsteady_count_as_missing_without_a_laser(
+    process_value: str,
+) -> None:
+    held = settled(config_of(process_value), noisy_with_a_small_sigma()).fail(80.0, lose_laser)
+    first = {"estimate": "displacement_missing", "optics": "film_unseen"}[process_value]
+    assert held.faults[0] == first
+    assert "optics_unsteady" in held.notices
+    assert held.moved_um < 65.0
+    assert held.state == State.FAULT
+
+
+def test_the_fault_of_unsteady_optics_without_a_laser_names_them() -> None:
+    held = settled(config_of("optics"), noisy_with_a_small_sigma()).fail(60.0)
+    fault = held.told(Fault)[0]
+    assert "jumps again and again" in fault.sentence  # type: ignore[attr-defined]
+    assert "laser reading" not in fault.sentence  # type: ignore[attr-defined]
+
+
+@pytest.mark.parametrize("flow_um_per_s", [None, 0.0, 5.0])
+def test_figures_with_late_times_never_leave_the_mirror_to_the_prediction_alone(
+    flow_um_per_s: float | None,
+) -> None:
+    def late(since_s: float, figure: ShapeEstimate) -> ShapeEstimate:
+        return replace(figure, time_s=figure.time_s - 0.5)
+
+    held = settled(config_of("optics"), late)
+    if flow_um_per_s is not None:
+        held.command(Command("manual", "a test", value=flow_um_per_s))
+    held.fail(200.0)
+    assert held.moved_um < 65.0
+
+
+def test_manual_flow_ends_by_healthy_optics_while_the_laser_shows_its_last_place() -> None:
+    held = settled(config_of("estimate"))
+    held.command(Command("manual", "a test", value=5.0))
+    rng = np.random.default_rng(7)
+
+    def freeze_with_noise(wrong: Wrong, since_s: float) -> None:
+        moved_um = held.bench.plant.truth().displacement_um - held.start_um
+        wrong.laser_offset_um = rng.standard_normal() - moved_um
+
+    held.fail(60.0, freeze_with_noise)
+    assert held.moved_um < 65.0
