@@ -30,7 +30,7 @@ PLAIN = set(re.findall(r'Sign\("(\w+)"', SOURCES)) | OF_EVENTS
 MAINTENANCE = re.findall(
     r'^ +\(?"(\w+)",', Path(film_health.__file__).read_text(encoding="utf-8"), re.MULTILINE
 )
-VIBRATIONS = re.findall(r'_notice\("(\w+)"', Path(live.__file__).read_text(encoding="utf-8"))
+VIBRATIONS = re.findall(r'_notice\(\s*"(\w+)"', Path(live.__file__).read_text(encoding="utf-8"))
 RULES = [rule.name for rule in Config().alarms.rules]
 CHILDREN = [
     NoticeKey(Topic.CHILD, child).alarm for child in (run_events.RECORDER, "acquisition", "screen")
