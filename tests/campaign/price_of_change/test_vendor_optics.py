@@ -21,7 +21,7 @@ import pytest
 
 from tests.support.studio_package import SOURCE
 
-pytestmark = [pytest.mark.campaign, pytest.mark.real_time]
+pytestmark = [pytest.mark.campaign, pytest.mark.real_time, pytest.mark.timeout(1800)]
 
 ROOT = Path(__file__).parents[3]
 PATIENCE_S = 900.0  # of a busy machine that compiles the kernels
