@@ -1,8 +1,9 @@
 """Another number of Zernike terms costs one changed line: the product works with the fewest and
 with the most.
 
-The line is changed in copies of the source. All copies see the same frames of a film that the
-fewest terms represent, so that sag and low terms must agree within their own error bars.
+The line is changed in copies of the source. These and the source itself see the same frames of a
+film that the fewest terms represent, so that sag and low terms must agree within their own error
+bars.
 """
 
 from __future__ import annotations
@@ -17,7 +18,7 @@ from typing import Any
 import numpy as np
 import pyarrow.parquet as pq
 import pytest
-from changed_source import ChangedSource
+from changed_source import ROOT, ChangedSource
 from numpy.typing import NDArray
 from zernike_bench import FILM, MOVED_UM, OPTICS
 
@@ -92,11 +93,24 @@ frame_interval_s = 0.02
 
 @dataclass
 class Product:
-    """The product with a number of terms, and what it makes of the benches."""
+    """The product with a number of terms, and what it makes of the benches.
+
+    Attributes
+    ----------
+    terms : int
+        The number.
+    source : ChangedSource
+        The product's source.
+    sets : Path
+        Folder of the capture sets that it measures.
+    folder : Path
+        Where it writes.
+    """
 
     terms: int
     source: ChangedSource
     sets: Path
+    folder: Path
 
     @cached_property
     def bench(self) -> dict[str, Any]:
@@ -118,11 +132,6 @@ class Product:
             )
         )
         return found
-
-    @property
-    def folder(self) -> Path:
-        """Where it writes."""
-        return self.source.folder
 
     @cached_property
     def calibration(self) -> dict[str, Any]:
@@ -205,8 +214,8 @@ def sets(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture(scope="module")
 def usual(sets: Path, tmp_path_factory: pytest.TempPathFactory) -> Product:
-    """The product as it is."""
-    return Product(ZERNIKE_TERMS, ChangedSource.copy_to(tmp_path_factory.mktemp("usual")), sets)
+    """The product as it is, not copied."""
+    return Product(ZERNIKE_TERMS, ChangedSource(ROOT), sets, tmp_path_factory.mktemp("usual"))
 
 
 @pytest.fixture(scope="module", params=[FEWEST, MOST])
@@ -218,7 +227,7 @@ def changed(
     source = ChangedSource.copy_to(tmp_path_factory.mktemp(f"terms{terms}"))
     source.set_constant(CONSTANT, "ZERNIKE_TERMS", terms)
     assert source.count_places() == 1
-    return Product(terms, source, sets)
+    return Product(terms, source, sets, source.folder)
 
 
 def low_terms(figure: dict[str, Any], name: str = "coeffs_um") -> NDArray[np.float64]:
