@@ -8,6 +8,7 @@ import os
 import shutil
 import subprocess
 import sys
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -43,101 +44,121 @@ class ChangedSource:
                 ROOT / name, self.folder / name, ignore=shutil.ignore_patterns("__pycache__")
             )
 
-    def add_field(self, path: str, owner: str, text: str, before: str = "") -> None:
-        """Add a field or a method to a class.
+    def add_field(self, owner: str, text: str, before: str = "") -> None:
+        """Add a field or a property to a class.
 
         Parameters
         ----------
-        path : str
-            Of the module, relative to the folder.
         owner : str
-            Name of the class.
+            Name of the class, of which the packages have one.
         text : str
             Lines of the field, without indentation.
         before : str
             The field that follows it; without one it is the last.
         """
-        (body,) = (
-            node.body
-            for node in ast.walk(self._parse(path))
-            if isinstance(node, ast.ClassDef) and node.name == owner
-        )
-        indentation = " " * body[0].col_offset
+
+        def owns_fields(node: ast.AST) -> bool:
+            return isinstance(node, ast.ClassDef) and node.name == owner
+
+        file, found = self._find_node(f"class {owner}", owns_fields)
+        assert isinstance(found, ast.ClassDef)
+        indentation = " " * found.body[0].col_offset
         lines = "".join(f"{indentation}{line}\n" if line else "\n" for line in text.splitlines())
         if not before:
-            end_line = body[-1].end_lineno
+            end_line = found.body[-1].end_lineno
             assert end_line is not None
-            self._insert(path, end_line + 1, 0, lines)
+            _insert(file, end_line + 1, 0, lines)
             return
         (line,) = (
             node.lineno
-            for node in body
+            for node in found.body
             if isinstance(node, ast.AnnAssign) and ast.unparse(node.target) == before
         )
-        self._insert(path, line, 0, lines)
+        _insert(file, line, 0, lines)
 
-    def add_argument(self, path: str, beside: str, text: str) -> None:
-        """Add an argument in front of the keyword argument `beside=...`, which must be passed in
-        one place of the module.
+    def add_argument(self, called: str, beside: str, text: str) -> None:
+        """Add an argument to the one call of `called` that has the keyword argument `beside=...`,
+        in front of that.
         """
-        (keyword,) = (
-            node
-            for node in ast.walk(self._parse(path))
-            if isinstance(node, ast.keyword) and node.arg == beside
-        )
+
+        def passes_beside(node: ast.AST) -> bool:
+            return (
+                isinstance(node, ast.Call)
+                and ast.unparse(node.func).split(".")[-1] == called
+                and any(keyword.arg == beside for keyword in node.keywords)
+            )
+
+        file, found = self._find_node(f"{called}(", passes_beside)
+        assert isinstance(found, ast.Call)
+        (keyword,) = (each for each in found.keywords if each.arg == beside)
         indentation = " " * keyword.col_offset
-        self._insert(path, keyword.lineno, keyword.col_offset, f"{text},\n{indentation}")
+        _insert(file, keyword.lineno, keyword.col_offset, f"{text},\n{indentation}")
 
-    def add_row(self, path: str, table: str, text: str) -> None:
-        """Add the first row of a table: of the tuple that is assigned to the name `table`."""
-        (rows,) = (
-            node.value.elts
-            for node in self._parse(path).body
-            if isinstance(node, ast.AnnAssign)
-            and ast.unparse(node.target) == table
-            and isinstance(node.value, ast.Tuple)
-        )
-        self._insert(path, rows[0].lineno, rows[0].col_offset, f"{text.strip()},\n    ")
+    def add_row(self, rows_of: str, text: str) -> None:
+        """Add the first row to the one table with the annotation `tuple[rows_of, ...]`."""
 
-    def set_constant(self, path: str, name: str, value: int) -> None:
-        """Give a constant of a module another value."""
-        (literal,) = (
-            node.value
-            for node in self._parse(path).body
-            if isinstance(node, ast.Assign) and ast.unparse(node.targets[0]) == name
-        )
+        def is_table(node: ast.AST) -> bool:
+            return (
+                isinstance(node, ast.AnnAssign)
+                and ast.unparse(node.annotation) == f"tuple[{rows_of}, ...]"
+                and isinstance(node.value, ast.Tuple)
+            )
+
+        file, found = self._find_node(f"tuple[{rows_of}, ...]", is_table)
+        assert isinstance(found, ast.AnnAssign)
+        assert isinstance(found.value, ast.Tuple)
+        row = found.value.elts[0]
+        _insert(file, row.lineno, row.col_offset, f"{text.strip()},\n{' ' * row.col_offset}")
+
+    def set_constant(self, name: str, value: int) -> None:
+        """Give the one constant of this name another value."""
+
+        def is_constant(node: ast.AST) -> bool:
+            return isinstance(node, ast.Assign) and ast.unparse(node.targets[0]) == name
+
+        file, found = self._find_node(f"{name} = ", is_constant)
+        assert isinstance(found, ast.Assign)
+        literal = found.value
         assert isinstance(literal, ast.Constant)
         assert literal.end_col_offset is not None
         length = literal.end_col_offset - literal.col_offset
-        self._insert(path, literal.lineno, literal.col_offset, str(value), replaced=length)
+        _insert(file, literal.lineno, literal.col_offset, str(value), replaced=length)
+
+    def _find_node(
+        self, contained: str, condition: Callable[[ast.AST], bool]
+    ) -> tuple[Path, ast.AST]:
+        """The one node of the packages that fulfils a condition, and its module, whose text
+        contains the text `contained`.
+        """
+        found = []
+        for file in self._modules():
+            text = file.read_text(encoding="utf-8")
+            if contained in text:
+                found += [(file, node) for node in ast.walk(ast.parse(text)) if condition(node)]
+        assert len(found) == 1, f"{contained!r}: {len(found)} places"
+        return found[0]
+
+    def _modules(self) -> list[Path]:
+        """All modules of the packages."""
+        return [
+            file for package in PACKAGES for file in sorted((self.folder / package).rglob("*.py"))
+        ]
 
     def count_places(self) -> int:
         """Return the number of places at which the packages differ from the repository's: runs of
         changed lines.
         """
         count = 0
-        for package in PACKAGES:
-            for file in sorted((self.folder / package).rglob("*.py")):
-                original = ROOT / file.relative_to(self.folder)
-                matcher = difflib.SequenceMatcher(
-                    None,
-                    original.read_text(encoding="utf-8").splitlines(),
-                    file.read_text(encoding="utf-8").splitlines(),
-                    autojunk=False,
-                )
-                count += sum(tag != "equal" for tag, *_ in matcher.get_opcodes())
+        for file in self._modules():
+            original = ROOT / file.relative_to(self.folder)
+            matcher = difflib.SequenceMatcher(
+                None,
+                original.read_text(encoding="utf-8").splitlines(),
+                file.read_text(encoding="utf-8").splitlines(),
+                autojunk=False,
+            )
+            count += sum(tag != "equal" for tag, *_ in matcher.get_opcodes())
         return count
-
-    def _parse(self, path: str) -> ast.Module:
-        return ast.parse((self.folder / path).read_bytes())
-
-    def _insert(self, path: str, line: int, byte: int, text: str, replaced: int = 0) -> None:
-        """Insert a text at a byte of a line (from 1), in place of `replaced` bytes."""
-        file = self.folder / path
-        lines = file.read_bytes().splitlines(keepends=True)
-        start = sum(len(each) for each in lines[: line - 1]) + byte
-        content = b"".join(lines)
-        file.write_bytes(content[:start] + text.encode() + content[start + replaced :])
 
     def run_python(self, *words: object) -> str:
         """Run the interpreter on the changed source; returns its standard output. Fails unless it
@@ -155,3 +176,11 @@ class ChangedSource:
     def run_program(self, *words: object) -> str:
         """Run `membrane-ctrl` of the changed source, as `run_python`."""
         return self.run_python("-m", "membrane_ctrl", *words)
+
+
+def _insert(file: Path, line: int, byte: int, text: str, replaced: int = 0) -> None:
+    """Insert a text at a byte of a line (from 1), in place of `replaced` bytes."""
+    lines = file.read_bytes().splitlines(keepends=True)
+    start = sum(len(each) for each in lines[: line - 1]) + byte
+    content = b"".join(lines)
+    file.write_bytes(content[:start] + text.encode() + content[start + replaced :])

@@ -66,8 +66,8 @@ def source(tmp_path_factory: pytest.TempPathFactory) -> ChangedSource:
     """The product with one more column: two places differ."""
     source = ChangedSource.copy_to(tmp_path_factory.mktemp("column"))
     source.copy_more("tests", "docs", "benchmarks")
-    source.add_field("membrane_ctrl/model/columns.py", "ColumnValues", ROW, before="error_um")
-    source.add_argument("membrane_ctrl/controller/scene.py", "trim_um", COMPUTED)
+    source.add_field("ColumnValues", ROW, before="error_um")
+    source.add_argument("TelemetryRow", "trim_um", COMPUTED)
     assert source.count_places() == 2
     return source
 

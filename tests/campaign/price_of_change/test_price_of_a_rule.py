@@ -22,7 +22,6 @@ RULE, CAUSE, REMEDY = (
     "the gas is hotter than the film stands",
     "find what heats the mirror",
 )
-SAFETY = "membrane_ctrl/controller/safety.py"
 FIELD = '''\
 
 @property
@@ -47,8 +46,8 @@ def source(tmp_path_factory: pytest.TempPathFactory) -> ChangedSource:
     """The product with one more rule: two places differ."""
     source = ChangedSource.copy_to(tmp_path_factory.mktemp("rule"))
     source.copy_more("tests", "docs", "benchmarks")
-    source.add_field(SAFETY, "Observation", FIELD)
-    source.add_row(SAFETY, "TABLE", ROW)
+    source.add_field("Observation", FIELD)
+    source.add_row("Rule", ROW)
     assert source.count_places() == 2
     return source
 
@@ -91,7 +90,8 @@ def test_the_fault_matrix_lists_it(shown: dict[str, Any]) -> None:
 
 
 def test_the_mutants_list_removes_it(shown: dict[str, Any]) -> None:
-    assert shown["mutant"] == {"what": f"{RULE} never trips", "place": SAFETY}
+    assert shown["mutant"]["what"] == f"{RULE} never trips"
+    assert Path(shown["mutant"]["place"]).name == "safety.py"
 
 
 def test_the_evidence_that_a_person_must_write_is_missed(source: ChangedSource) -> None:

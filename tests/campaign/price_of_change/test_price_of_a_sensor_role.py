@@ -57,11 +57,9 @@ def source(tmp_path_factory: pytest.TempPathFactory) -> ChangedSource:
     """The product with a second gauge: three places differ."""
     source = ChangedSource.copy_to(tmp_path_factory.mktemp("gauge"))
     source.copy_more("tests", "docs", "benchmarks")
-    source.add_field("firmware_iface/roles.py", "BenchReading", IN_ROLES)
-    source.add_field(
-        "membrane_ctrl/model/columns.py", "ColumnValues", IN_COLUMNS, before="ambient_pressure_pa"
-    )
-    source.add_row("membrane_ctrl/controller/safety.py", "TABLE", IN_SAFETY)
+    source.add_field("BenchReading", IN_ROLES)
+    source.add_field("ColumnValues", IN_COLUMNS, before="ambient_pressure_pa")
+    source.add_row("Rule", IN_SAFETY)
     assert source.count_places() == 3
     return source
 

@@ -30,7 +30,6 @@ from membrane_ctrl.sim.optics.simulation_spec import Motion, SimulationSpec
 
 pytestmark = [pytest.mark.campaign, pytest.mark.real_time, pytest.mark.timeout(3600)]
 
-CONSTANT = "membrane_ctrl/model/zernike_terms.py"
 FEWEST, MOST = 21, 66
 BENCH = Path(__file__).with_name("zernike_bench.py")
 ALIKE_SIGMAS = 3.0  # between two numbers of terms: both fit the same noise
@@ -225,7 +224,7 @@ def changed(
     """The product with another number of terms: one line differs."""
     terms: int = request.param
     source = ChangedSource.copy_to(tmp_path_factory.mktemp(f"terms{terms}"))
-    source.set_constant(CONSTANT, "ZERNIKE_TERMS", terms)
+    source.set_constant("ZERNIKE_TERMS", terms)
     assert source.count_places() == 1
     return Product(terms, source, sets, source.folder)
 
