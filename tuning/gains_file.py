@@ -10,15 +10,16 @@ from collections.abc import Iterator
 from dataclasses import asdict, astuple, dataclass
 from datetime import UTC, datetime
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated, Final, Literal
 
 import tomli_w
 from pydantic import Field
 
 from firmware_iface.settings import Section
 from membrane_ctrl.config import toml_file as config_file
+from membrane_ctrl.config.origin import OriginSection
 from membrane_ctrl.config.schema import LoopConfig
-from membrane_ctrl.model import errors, files, plain_json
+from membrane_ctrl.model import errors, files, plain_json, program
 from membrane_ctrl.sessions import folder as plain
 from tuning.identification import identify, loop_model
 
@@ -50,10 +51,13 @@ class PlantSection(Section):
         return loop_model.PlantModel(self.gain, self.dead_time_s, self.lag_s, self.leak_um_per_s)
 
 
-class GainsFile(Section):
+SCHEMA: Final = "membrane-gains/1"
+
+
+class GainsFile(OriginSection):
     """`gains.toml`."""
 
-    format: Literal["membrane-gains/1"] = "membrane-gains/1"
+    schema_: Annotated[Literal["membrane-gains/1"], Field(alias="schema")] = SCHEMA
     author: str
     date_utc: str
     reason: str
@@ -68,8 +72,9 @@ class GainsFile(Section):
 
 def save_gains(path: Path, gains: GainsFile) -> None:
     """Write a gains file atomically, without the setpoint, which belongs to the hold."""
-    text = tomli_w.dumps(gains.model_dump(mode="json", exclude={"loop": {"setpoint_um"}}))
-    files.write_text_atomic(files.users(path), text)
+    origin = program.file_origin(SCHEMA)
+    table = gains.model_dump(mode="json", by_alias=True, exclude={"loop": {"setpoint_um"}})
+    files.write_text_atomic(files.users(path), tomli_w.dumps({**table, **origin}))
 
 
 def load_gains(path: Path) -> GainsFile:

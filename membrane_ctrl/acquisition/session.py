@@ -19,6 +19,7 @@ from membrane_ctrl.metrology.track.live import Heard, LiveTracker, Stethoscope
 from membrane_ctrl.model import files, plain_json
 from membrane_ctrl.model.clock import RunClock, pause_s
 from membrane_ctrl.model.events import Event
+from membrane_ctrl.model.program import file_origin, remove_origin
 from membrane_ctrl.model.shape_estimate import ShapeEstimate, pack_estimate
 from membrane_ctrl.model.state_tree import decode_state, encode_state
 from membrane_ctrl.processes import child, frames, ring
@@ -202,6 +203,7 @@ def run(spec: process.AcquisitionSpec, remote: process.Remote) -> None:
 
 
 _HEARD = "vibrations.json"  # in the run's folder
+_HEARD_SCHEMA = "membrane-vibrations/1"
 _HEARD_BYTES_MAX = 1 << 20  # usually 10 kB
 
 
@@ -221,7 +223,9 @@ def listener(
         told = stethoscope.after(estimate)
         if told and run_dir is not None:
             with suppress(OSError):  # a full disk: the recorder says so
-                text = plain_json.dumps_checked(json.loads(encode_state(stethoscope.heard)))
+                heard = json.loads(encode_state(stethoscope.heard))
+                table = {**file_origin(_HEARD_SCHEMA), "heard": heard}
+                text = plain_json.dumps_checked(table)
                 files.write_text_atomic(run_dir / _HEARD, text + "\n")
         return told
 
@@ -236,13 +240,19 @@ def _heard_before(config: Config, run_dir: Path) -> Heard | None:
         ):
             continue
         with suppress(OSError, ValueError, RecursionError):  # damaged: take an older one
-            table = plain_json.loads(files.read_text(path, _HEARD_BYTES_MAX))
-            if isinstance(table, dict) and plain_json.take_checksum(table):
-                heard = decode_state(json.dumps(table).encode(), Heard, _HEARD_BYTES_MAX)
-                return (
-                    heard if run == run_dir else replace(heard, said=[])
-                )  # those were another run's
+            heard = _read_heard(path)
+            # what another run has reported, this one has not
+            return heard if run == run_dir else replace(heard, said=[])
     return None
+
+
+def _read_heard(path: Path) -> Heard:
+    """Read what an acquisition has heard. Raises OSError; ValueError for a damaged file."""
+    table = plain_json.loads(files.read_text(path, _HEARD_BYTES_MAX))
+    if not isinstance(table, dict) or not plain_json.take_checksum(table):
+        raise ValueError(f"{path}: damaged")
+    remove_origin(table, _HEARD_SCHEMA)
+    return decode_state(json.dumps(table.get("heard")).encode(), Heard, _HEARD_BYTES_MAX)
 
 
 def _bench_name(config: Config) -> str:

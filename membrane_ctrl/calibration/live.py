@@ -80,9 +80,7 @@ def take_sets(
         else:
             reach, sets = sessions.reach_of(held, link.config), options.sets or USUAL_SETS
             wanted = sessions.setpoints_um(held, reach, options.range_um, sets)
-            head = CalibrationHead(
-                sessions.FORMAT, link.name, now_utc(), held.setpoint_um, held.shape_on, wanted
-            )
+            head = CalibrationHead(link.name, now_utc(), held.setpoint_um, held.shape_on, wanted)
             missing = tuple(range(sets))
         procedure.check(head)
         minutes = sum(procedure.times_s(head, missing)) / 60

@@ -19,14 +19,13 @@ from membrane_ctrl.metrology.optics.geometry import Geometry
 from membrane_ctrl.model import errors, files
 from membrane_ctrl.sessions.folder import begin_session, read_session
 
-FORMAT = "membrane-live-calibration/1"
+SCHEMA = "membrane-live-calibration/1"
 
 
 @dataclass(frozen=True, slots=True)
 class CalibrationHead:
     """`session.json`."""
 
-    format: str
     source: str  # the run it started on
     created_utc: str
     # Setpoint to return to; the measurements by hand are assumed valid there
@@ -81,12 +80,14 @@ def begin(
     """Begin a session. Raises errors.InputError for a bad name, DeviceError if it cannot be
     written.
     """
-    return CalibrationSession(begin_session(logs / "calibration", name, head, config), head, config)
+    return CalibrationSession(
+        begin_session(logs / "calibration", name, head, config, SCHEMA), head, config
+    )
 
 
 def resume(path: Path) -> CalibrationSession:
     """Open an existing session. Raises errors.InputError if it is not one."""
-    return CalibrationSession(path, *read_session(path, CalibrationHead, FORMAT))
+    return CalibrationSession(path, *read_session(path, CalibrationHead, SCHEMA))
 
 
 # Comparison of old and new geometry, and the exchange of the files.

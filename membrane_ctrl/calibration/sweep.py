@@ -272,7 +272,7 @@ class Procedure:
             self.sweep.go(head.start_um, back_s)
         except KeyboardInterrupt:
             off = "; then switch the shape loop on (ctl shape on)" if head.shape_on else ""
-            self.progress.say(f"left: the hold continues its ramp to {head.start_um:g} um{off}")
+            self.progress.say(f"left: the hold continues its ramp to {head.start_um:g} µm{off}")
             raise
         if head.shape_on:
             self.sweep.shape_loop(True)

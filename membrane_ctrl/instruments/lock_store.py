@@ -27,6 +27,7 @@ from membrane_ctrl.instruments import bench
 from membrane_ctrl.model import files
 from membrane_ctrl.model.errors import DeviceError, os_reason
 from membrane_ctrl.model.lock import WORDS, Lock, describe_locks, distinct_word, word_of_number
+from membrane_ctrl.model.program import file_origin
 
 VARIABLE = "MEMBRANE_CTRL_LOCKS"
 MACHINE_FOLDER = Path("/var/lib/membrane-ctrl/locks")
@@ -120,7 +121,7 @@ class LockStore:
         """
         stamp = datetime.now(UTC).strftime("%Y%m%dT%H%M%S.%f")
         name = f"{stamp}-{lock.word}-{secrets.token_hex(4)}{_SUFFIX}"
-        table = {"schema": SCHEMA, "devices": sorted(devices), **asdict(lock)}
+        table = {**file_origin(SCHEMA), "devices": sorted(devices), **asdict(lock)}
         data = (json.dumps(table, indent=1) + "\n").encode()
         first_error: OSError | None = None
         for folder in self._folders:

@@ -48,6 +48,27 @@ def file_origin(schema: str) -> dict[str, str]:
     return {"schema": schema, "program": f"{NAME} {__version__}", "commit": program_commit()}
 
 
+def remove_origin(table: dict[str, Any], schema: str) -> None:
+    """Remove the members of `file_origin` from a file's members.
+
+    Parameters
+    ----------
+    table : dict
+    schema : str
+        Format with version that the file must have.
+
+    Raises
+    ------
+    ValueError
+        The file is of another format.
+    """
+    stated = table.pop("schema", None)
+    if stated != schema:
+        raise ValueError(f"format {str(stated)[:40]!r}, expected {schema!r}")
+    table.pop("program", None)
+    table.pop("commit", None)
+
+
 def stated_program(table: Mapping[str, Any]) -> str:
     """Program and commit stated in a file's members, as `program_identity`; empty if none is
     stated.

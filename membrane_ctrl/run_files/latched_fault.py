@@ -13,9 +13,12 @@ from dataclasses import asdict, dataclass
 from datetime import datetime, timedelta
 from pathlib import Path
 
+from membrane_ctrl.model.program import file_origin, remove_origin
+
 NAME = "latched-fault.json"
 SCHEMA = "membrane-latched-fault/1"
 RESUMES_NAME = "resumes.json"
+RESUMES_SCHEMA = "membrane-resumes/1"
 _DAY_S = 86_400.0
 _RESUMES_MOST = 1000  # per day, the upper limit of `resume.most_per_day`
 # More than a fault takes; the smallest unit of a disk.
@@ -58,17 +61,16 @@ class LatchedFile:
             if content is None:
                 return None
             table = json.loads(content)
-            if table.pop("schema") != SCHEMA or not all(
-                isinstance(value, str) for value in table.values()
-            ):
-                raise ValueError("another schema")
+            remove_origin(table, SCHEMA)
+            if not all(isinstance(value, str) for value in table.values()):
+                raise ValueError("a value that is no text")
             return LatchedFault(**table)
         except (OSError, ValueError, KeyError, TypeError, AttributeError, RecursionError) as error:
             return self._unreadable(f"{type(error).__name__}: {error}")
 
     def write(self, fault: LatchedFault) -> None:
         """Latch, in place of an older fault. Raises OSError."""
-        text = json.dumps({"schema": SCHEMA, **asdict(fault)}, indent=1) + "\n"
+        text = json.dumps({**file_origin(SCHEMA), **asdict(fault)}, indent=1) + "\n"
         self._fill(text.encode())
         self._reserve.replace(self.path)
         with contextlib.suppress(OSError):
@@ -138,9 +140,9 @@ class ResumeLog:
         """
         try:
             content = _content(self.path)
-            stamps = [] if content is None else json.loads(content)
+            stamps = [] if content is None else _read_stamps(content)
             ages_s = [(now - datetime.fromisoformat(stamp)).total_seconds() for stamp in stamps]
-        except (OSError, ValueError, TypeError, RecursionError):
+        except (OSError, ValueError, KeyError, TypeError, AttributeError, RecursionError):
             return (0.0,) * _RESUMES_MOST
         # a future one (the clock was set back) counts as just now
         return tuple(sorted((max(0.0, age_s) for age_s in ages_s if age_s < _DAY_S), reverse=True))
@@ -149,10 +151,17 @@ class ResumeLog:
         """Add one and drop those older than a day. Raises OSError."""
         kept = [when - timedelta(seconds=age_s) for age_s in self.ages_s(when)][-_RESUMES_MOST:]
         scratch = self.path.with_name(f".{self.path.name}.new")
-        scratch.write_text(
-            json.dumps([stamp.isoformat() for stamp in (*kept, when)]) + "\n", encoding="utf-8"
-        )
+        stamps = [stamp.isoformat() for stamp in (*kept, when)]
+        table = {**file_origin(RESUMES_SCHEMA), "resumed_utc": stamps}
+        scratch.write_text(json.dumps(table, indent=1) + "\n", encoding="utf-8")
         scratch.replace(self.path)
+
+
+def _read_stamps(content: bytes) -> list[str]:
+    table = json.loads(content)
+    remove_origin(table, RESUMES_SCHEMA)
+    stamps: list[str] = table["resumed_utc"]
+    return stamps
 
 
 def _content(path: Path) -> bytes | None:

@@ -25,7 +25,7 @@ import numpy as np
 from pydantic import BaseModel, ValidationError
 
 from membrane_ctrl.config import schema, toml_file
-from membrane_ctrl.model import errors, files, plain_json
+from membrane_ctrl.model import errors, files, plain_json, program
 
 T = TypeVar("T")
 _LARGEST = 1e60  # no quantity is near it; its fourth power is still finite
@@ -86,17 +86,45 @@ def _built(kind: Any, data: Any) -> Any:
     return value
 
 
-def write(path: Path, value: Any) -> None:
-    """Write a result atomically."""
-    files.write_text_atomic(
-        files.users(path), json.dumps(plain(value), indent=1, allow_nan=False) + "\n"
-    )
+SCHEMA = "membrane-session/1"  # of all JSON files of a tuning session
 
 
-def read(path: Path, kind: type[T]) -> T:
-    """Read a result. Raises InputError (one line) if it is missing or invalid."""
+def write(path: Path, value: Any, schema: str = SCHEMA) -> None:
+    """Write a JSON file of a session atomically.
+
+    Parameters
+    ----------
+    path : Path
+    value : dataclass or dict
+    schema : str
+        Format with version, which the file states beside the program that writes it.
+    """
+    table = {**program.file_origin(schema), **plain(value)}
+    files.write_text_atomic(files.users(path), json.dumps(table, indent=1, allow_nan=False) + "\n")
+
+
+def read(path: Path, kind: type[T], schema: str = SCHEMA) -> T:
+    """Read a JSON file of a session.
+
+    Parameters
+    ----------
+    path : Path
+    kind : type
+        Of the dataclass that was written.
+    schema : str
+        Format with version that the file must have.
+
+    Raises
+    ------
+    InputError
+        One line: the file is missing, of another format, or invalid.
+    """
     try:
-        return built(kind, plain_json.loads(files.read_text(files.users(path), _PLAIN_BYTES_MAX)))
+        table = plain_json.loads(files.read_text(files.users(path), _PLAIN_BYTES_MAX))
+        if not isinstance(table, dict):
+            raise ValueError("no JSON object")
+        program.remove_origin(table, schema)
+        return built(kind, table)
     except FileNotFoundError:
         raise errors.InputError(f"{path}: no such file") from None
     except (OSError, ValueError, TypeError, KeyError, ValidationError) as error:
@@ -105,7 +133,6 @@ def read(path: Path, kind: type[T]) -> T:
         ) from None
 
 
-FORMAT = "membrane-session/1"
 STEPS = ("characterise", "identify", "observe", "design", "preview", "apply", "verify")
 # The results of a step; the first file marks it as done.
 FILES: dict[str, tuple[str, ...]] = {
@@ -125,7 +152,6 @@ _NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]{0,63}")
 class SessionHead:
     """`session.json`."""
 
-    format: str
     name: str
     author: str
     source: str  # a run folder, or the twin
@@ -233,11 +259,6 @@ class Head(Protocol):
     """The fields common to every kind of `session.json`."""
 
     @property
-    def format(self) -> str:
-        """Kind of session, and version."""
-        ...
-
-    @property
     def created_utc(self) -> str:
         """ISO 8601."""
         ...
@@ -246,24 +267,25 @@ class Head(Protocol):
 H = TypeVar("H", bound=Head)
 
 
-def begin_session(parent: Path, name: str, head: Head, config: schema.Config) -> Path:
-    """Make the folder of a session. Raises InputError for a bad name, DeviceError if it cannot be
-    written.
+def begin_session(
+    parent: Path, name: str, head: Head, config: schema.Config, head_schema: str = SCHEMA
+) -> Path:
+    """Make the folder of a session; `head_schema`: format with version of its `session.json`.
+
+    Raises InputError for a bad name, DeviceError if it cannot be written.
     """
     path = fresh_folder(parent, name, datetime.fromisoformat(head.created_utc))
     with errors.writing(path, errors.DeviceError):
         files.write_text_atomic(path / "config.toml", toml_file.dump(config))
-        write(path / "session.json", head)
+        write(path / "session.json", head, head_schema)
     return path
 
 
-def read_session(path: Path, kind: type[H], known: str) -> tuple[H, schema.Config]:
-    """Read head and configuration of a session of the `known` format. Raises InputError if it is
-    not one.
+def read_session(path: Path, kind: type[H], head_schema: str = SCHEMA) -> tuple[H, schema.Config]:
+    """Read head and configuration of a session whose `session.json` has the format `head_schema`.
+    Raises InputError if it is not one.
     """
-    head = read(path / "session.json", kind)
-    if head.format != known:
-        raise errors.InputError(f"{path}/session.json: format {head.format!r}, expected {known!r}")
+    head = read(path / "session.json", kind, head_schema)
     return head, toml_file.load(path / "config.toml", schema.Config)
 
 
@@ -281,13 +303,13 @@ def create_session(
     before: schema.LoopConfig,
 ) -> SessionFolder:
     """Start a tuning session; raises like `begin_session`."""
-    head = SessionHead(FORMAT, name, author, source, now_utc(), before)
+    head = SessionHead(name, author, source, now_utc(), before)
     return SessionFolder(begin_session(logs / "tuning", name, head, config), head, config)
 
 
 def open_session(path: Path) -> SessionFolder:
     """Open an existing tuning session. Raises InputError if it is not one."""
-    return SessionFolder(path, *read_session(path, SessionHead, FORMAT))
+    return SessionFolder(path, *read_session(path, SessionHead))
 
 
 def newest_session(logs: Path) -> SessionFolder:

@@ -30,6 +30,7 @@ from membrane_ctrl.metrology.optics.film_law import zernike_projection
 from membrane_ctrl.metrology.track.live import LiveTracker
 from membrane_ctrl.model import run_events
 from membrane_ctrl.model.clock import RunClock
+from membrane_ctrl.model.program import program_identity, stated_program
 from membrane_ctrl.model.shape_estimate import ShapeEstimate, pack_estimate
 from membrane_ctrl.model.telemetry import FIELDS, TelemetryRow
 from membrane_ctrl.processes.ring import RingReader, RingWriter, ring
@@ -208,6 +209,9 @@ def test_a_shift_over_a_restart_of_the_hold_is_told_everywhere(
     first.restart_acquisition()
     minutes(first, 400.0, 2, 48.0)
     first.end()
+    kept = json.loads((first.folder / "vibrations.json").read_text())
+    assert kept["schema"] == "membrane-vibrations/1"
+    assert stated_program(kept) == program_identity()
     assert [(line["kind"], line["name"]) for line in first.told] == [
         ("maintenance", "pump_resonance")
     ]

@@ -14,6 +14,7 @@ from membrane_ctrl.cli import run
 from membrane_ctrl.config.toml_file import dump
 from membrane_ctrl.model.clock import RunClock
 from membrane_ctrl.model.plain_json import dumps_checked, with_comment
+from membrane_ctrl.model.program import file_origin
 from membrane_ctrl.model.telemetry import unpack
 from membrane_ctrl.model.zernike_terms import ZERNIKE_TERMS
 from membrane_ctrl.recorder.rerun_streams import TelemetryStreams
@@ -123,7 +124,7 @@ def good_live(folder: Path, sets: Path) -> None:
     for number in (0, 1):
         shutil.copytree(sets / f"{number:04d}", folder / "sets" / f"set-{number + 1}")
     head = {
-        "format": "membrane-live-calibration/1",
+        **file_origin("membrane-live-calibration/1"),
         "source": "night",
         "created_utc": "2026-11-21T01:02:03+00:00",
         "start_um": 0.0,

@@ -20,6 +20,7 @@ from membrane_ctrl.instruments.lock_store import (
 )
 from membrane_ctrl.model.errors import DeviceError
 from membrane_ctrl.model.lock import Lock
+from membrane_ctrl.model.program import program_identity, stated_program
 
 ANN = Lock(
     "bofak", "hands inside", "unix:ann", "unix:ann", "process 7", "2026-01-02T03:04:05+00:00"
@@ -61,6 +62,12 @@ def test_equal_words_are_told_apart_again(store: LockStore) -> None:
     store.write_lock(ANN, BENCH)
     store.write_lock(ANN, BENCH)
     assert len({lock.word for lock in found(store, BENCH)}) == 2
+
+
+def test_a_file_states_the_program_that_wrote_it(store: LockStore) -> None:
+    stated = json.loads(store.write_lock(ANN, BENCH).read_text())
+    assert stated["schema"] == lock_store.SCHEMA
+    assert stated_program(stated) == program_identity()
 
 
 def test_without_a_folder_nothing_is_locked(store: LockStore) -> None:

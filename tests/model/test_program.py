@@ -11,7 +11,13 @@ import pytest
 
 from membrane_ctrl import __version__
 from membrane_ctrl.model import program
-from membrane_ctrl.model.program import file_origin, find_commit, program_identity, stated_program
+from membrane_ctrl.model.program import (
+    file_origin,
+    find_commit,
+    program_identity,
+    remove_origin,
+    stated_program,
+)
 
 
 def git(folder: Path, *words: str) -> str:
@@ -96,6 +102,15 @@ def test_a_file_states_format_program_and_commit() -> None:
     origin = file_origin("membrane-test/1")
     assert list(origin) == ["schema", "program", "commit"]
     assert stated_program(origin) == program_identity()
+
+
+def test_the_origin_of_a_file_is_checked_and_removed() -> None:
+    table: dict[str, object] = {**file_origin("membrane-test/1"), "value": 3}
+    remove_origin(table, "membrane-test/1")
+    assert table == {"value": 3}
+    for other in ({}, {"schema": "membrane-test/2"}, {"schema": None}):
+        with pytest.raises(ValueError, match="expected 'membrane-test/1'"):
+            remove_origin(dict(other), "membrane-test/1")
 
 
 @pytest.mark.parametrize(

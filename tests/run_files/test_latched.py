@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import os
 from dataclasses import replace
 from datetime import UTC, datetime, timedelta
@@ -13,11 +14,13 @@ from firmware_iface.roles import BenchCommand
 from membrane_ctrl.controller.tick import TickOutputs
 from membrane_ctrl.hold.listeners import FaultLatch
 from membrane_ctrl.model.events import CommandTaken, Event, Fault, Resumed, StateEntered
+from membrane_ctrl.model.program import file_origin, program_identity, stated_program
 from membrane_ctrl.model.run_events import LatchFailed, LatchWritten
 from membrane_ctrl.model.telemetry import FIELDS, TelemetryRow
 from membrane_ctrl.run_files.latched_fault import (
     NAME,
     RESUMES_NAME,
+    RESUMES_SCHEMA,
     LatchedFault,
     LatchedFile,
     ResumeLog,
@@ -46,6 +49,8 @@ def test_it_comes_back_as_it_was_and_goes_when_cleared(tmp_path: Path) -> None:
     assert file.read() is None
     file.write(FAULT)
     file.sync()
+    stated = json.loads(file.path.read_text())
+    assert stated_program(stated) == program_identity()
     assert LatchedFile(tmp_path).read() == FAULT
     assert "801 Pa" in str(FAULT)
     file.clear()
@@ -227,10 +232,30 @@ def test_resumes_are_counted_for_a_day_and_beyond_a_restart(tmp_path: Path) -> N
     for hours in (30.0, 5.0, -1.0):  # the last one after the clock was set back
         ResumeLog(tmp_path).add(NOW - timedelta(hours=hours))
     assert ResumeLog(tmp_path).ages_s(NOW) == (18_000.0, 0.0)
+    stated = json.loads((tmp_path / RESUMES_NAME).read_text())
+    assert (stated["schema"], stated_program(stated)) == (RESUMES_SCHEMA, program_identity())
+
+
+def _with_stamps(stamps: object) -> bytes:
+    return json.dumps({**file_origin(RESUMES_SCHEMA), "resumed_utc": stamps}).encode()
 
 
 @pytest.mark.parametrize(
-    "content", [b"", b"{", b"\xff", b"3", b"[3]", b'["tomorrow"]', b'["2026-01-02T11:00:00"]']
+    "content",
+    [
+        b"",
+        b"{",
+        b"\xff",
+        b"3",
+        b"[3]",
+        b"{}",
+        json.dumps({**file_origin("other/1"), "resumed_utc": []}).encode(),
+        json.dumps(file_origin(RESUMES_SCHEMA)).encode(),
+        _with_stamps(3),
+        _with_stamps([3]),
+        _with_stamps(["tomorrow"]),
+        _with_stamps(["2026-01-02T11:00:00"]),  # without a zone
+    ],
 )
 def test_a_count_of_resumes_that_cannot_be_read_is_full(tmp_path: Path, content: bytes) -> None:
     (tmp_path / RESUMES_NAME).write_bytes(content)

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import json
 import math
+import tomllib
 from dataclasses import dataclass, replace
 from functools import cache
 from pathlib import Path
@@ -14,6 +16,7 @@ import pytest
 from membrane_ctrl.config.schema import Config, LoopConfig, PumpConfig
 from membrane_ctrl.metrology.optics.film_law import zernike_projection
 from membrane_ctrl.model.errors import InputError
+from membrane_ctrl.model.program import program_identity, stated_program
 from membrane_ctrl.model.shape_estimate import ShapeEstimate
 from membrane_ctrl.model.telemetry import ShapeState
 from membrane_ctrl.sessions import folder as plain
@@ -430,9 +433,38 @@ def test_the_journal_follows_no_link(tmp_path: Path, place: str) -> None:
     assert (elsewhere / "journal.jsonl").read_text() == "theirs\n"
 
 
+def test_each_json_file_of_a_session_states_format_and_program(tmp_path: Path) -> None:
+    opened = plain.create_session(tmp_path, "night", "ann", "twin", Config(), LOOP)
+    plain.write(opened.file("applied.json"), {"trial_s": 3.0})
+    for name in ("session.json", "applied.json"):
+        table = json.loads(opened.file(name).read_text())
+        assert table["schema"] == plain.SCHEMA
+        assert stated_program(table) == program_identity()
+    assert plain.open_session(opened.path).head == opened.head
+
+
+def test_a_gains_file_states_format_and_program(tmp_path: Path) -> None:
+    path = tmp_path / "gains.toml"
+    journal.save_gains(path, gains_file(PLANT))
+    table = tomllib.loads(path.read_text())
+    assert table["schema"] == journal.SCHEMA
+    assert stated_program(table) == program_identity()
+    path.write_text(path.read_text().replace("membrane-gains/1", "membrane-gains/2"))
+    with pytest.raises(InputError, match="schema"):
+        journal.load_gains(path)
+
+
+@pytest.mark.parametrize("content", ["{}", "[]", "3", '{"schema": "membrane-live-calibration/1"}'])
+def test_a_session_of_another_format_is_refused(tmp_path: Path, content: str) -> None:
+    opened = plain.create_session(tmp_path, "night", "ann", "twin", Config(), LOOP)
+    opened.file("session.json").write_text(content)
+    with pytest.raises(InputError, match=r"session\.json: damaged"):
+        plain.open_session(opened.path)
+
+
 def test_a_folder_in_place_of_a_result_is_one_line(tmp_path: Path) -> None:
     (tmp_path / "proposal.json").mkdir()
-    session = plain.SessionFolder(tmp_path, plain.SessionHead("", "", "", "", "", LOOP), Config())
+    session = plain.SessionFolder(tmp_path, plain.SessionHead("", "", "", "", LOOP), Config())
     with pytest.raises(InputError, match="cannot be removed"):
         session.begin("design")
 
