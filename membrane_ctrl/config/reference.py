@@ -262,7 +262,7 @@ def _range(field: Any) -> str:
     if kind == "boolean":
         return "true, false"
     if "pattern" in field:
-        return f"text like {field['pattern']}"
+        return f"text like `{field['pattern']}`"
     return (
         "a table"
         if "$ref" in field or "oneOf" in field

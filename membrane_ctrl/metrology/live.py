@@ -58,8 +58,10 @@ class LiveReconstructor:
         How well the geometry is known; with it the first full cycle computes
         `common_covariance_um2`.
 
-    Raises ValueError if the phase steps do not determine a phase, or are not the pattern's in
-    number.
+    Raises
+    ------
+    ValueError
+        If the phase steps do not determine a phase, or their number is not the pattern's.
     """
 
     def __init__(

@@ -164,7 +164,10 @@ class Run:
         window_s : float
             Of `overview`.
 
-        Raises InputError if pandas is missing.
+        Raises
+        ------
+        InputError
+            If pandas is missing.
         """
         return labelled.make_frame(self._named(table, names, start_s, end_s, window_s))
 

@@ -126,7 +126,10 @@ def analyse(run: Run, start_s: float = -math.inf, end_s: float = math.inf) -> An
     start_s, end_s : float
         Seconds of the run.
 
-    Raises InputError if the part has no ticks.
+    Raises
+    ------
+    InputError
+        If the part has no ticks.
     """
     seconds = run.level(1.0, start_s, end_s, LEVEL_COLUMNS)
     if not seconds["time_s"].size:
