@@ -1,7 +1,7 @@
 """The inner loop on the simulated bench, in virtual time: the true motion of the centre.
 
 `run()` gives the figures, `python -m benchmarks.control.inner_loop` prints them as the tables of
-docs/explanation/control.md.
+docs/measurements/control.md.
 """
 
 from __future__ import annotations

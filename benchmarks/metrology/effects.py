@@ -4,7 +4,7 @@ The benches are those of `benchmarks.metrology.coverage`, rendered by the twin's
 but for the one effect; four films each, an eighth of the resolution. Effects of the light and of
 the film have sigmas of a hundredth, so that the bar is not that of the geometry. Sets have a laser
 unless said. `python -m benchmarks.metrology.effects` prints the table of
-docs/how-to/uncertainty.md; it takes a minute.
+docs/measurements/uncertainty.md; it takes a minute.
 """
 
 from __future__ import annotations

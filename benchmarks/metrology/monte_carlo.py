@@ -66,7 +66,8 @@ def run() -> list[Figure]:
 def _papers(
     benches: list[TrialBench], trials: np.ndarray, linear: np.ndarray, swing_adu: float
 ) -> list[Figure]:
-    """The paper's figures beside ours (docs/how-to/uncertainty.md explains the differences)."""
+    """The paper's figures beside ours (docs/measurements/uncertainty.md explains the
+    differences)."""
     many = run_trials(benches[:1], PAPER_SPREAD, 2, range(1000))[:, 0]
     absolute = 1e3 * GRID.sigma(trial_covariance(many))
     pair = 1e3 * GRID.sigma(trial_covariance(trials[:, -1] - trials[:, 0]))

@@ -4,7 +4,7 @@ what it kept.
 The benches share no physics with the twin (`tests/worlds/foreign_plant.py`). The session knows of
 them what a lab knows: the rate, and which sensors there are. `python -m benchmarks.tuning.benches
 --benches 200` examines them, one line each in `build/benches.jsonl`; a second call goes on where
-the first ended. It prints the tables of docs/how-to/tuning.md.
+the first ended. It prints the tables of docs/measurements/tuning.md.
 """
 
 from __future__ import annotations
@@ -304,7 +304,7 @@ def outcome(row: dict[str, Any]) -> str:
 
 
 def table(rows: Sequence[dict[str, Any]]) -> str:
-    """The tables of docs/how-to/tuning.md."""
+    """The tables of docs/measurements/tuning.md."""
     kept = [row for row in rows if "tuned_um" in row]
     ratio = np.array([row["tuned_um"] / row["least_um"] for row in kept])
     said = np.array([row["predicted_um"] / row["tuned_um"] for row in kept])
@@ -347,7 +347,7 @@ def _too_far(row: dict[str, Any]) -> bool:
 
 def run(count: int = FRESH) -> list[Figure]:
     """Figures of `make bench`: benches that nobody has seen, beside the stored table of
-    docs/how-to/tuning.md.
+    docs/measurements/tuning.md.
     """
     first = 1000 + FRESH * datetime.now(UTC).toordinal()
     rows = [_one(seed) for seed in range(first, first + count)]

@@ -2,7 +2,7 @@
 excursion.
 
 `python -m benchmarks.tuning.pumps --pumps 40` prints a line for each and the table of
-docs/how-to/tuning.md; 5 s of CPU for each. `--first 28 --pumps 1` looks at one, `--shape root
+docs/measurements/tuning.md; 5 s of CPU for each. `--first 28 --pumps 1` looks at one, `--shape root
 --full-um-per-s 3.1
 --leak-um-per-s 2.1` at pumps of a kind.
 """
@@ -177,7 +177,8 @@ def _levels_off(made: Sequence[PumpSurvey], pump: foreign_plant.ForeignPump) -> 
 
 
 def table(rows: Sequence[SurveyedPump]) -> str:
-    """The table of docs/how-to/tuning.md, and the pumps that are off, far, or refused, by name."""
+    """The table of docs/measurements/tuning.md, and the pumps that are off, far, or refused, by
+    name."""
     found = [row for row in rows if not row.refused]
     off = np.array([100 * row.off_share for row in found] or [math.nan])
     far = np.array([row.excursion_um for row in rows])

@@ -2,7 +2,7 @@
 figures.
 
 `run()` gives the figures, `python -m benchmarks.tuning.sessions` prints them as the tables of
-docs/how-to/tuning.md.
+docs/measurements/tuning.md.
 """
 
 from __future__ import annotations
