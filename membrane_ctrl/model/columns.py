@@ -36,6 +36,9 @@ UNIT_SUFFIXES: dict[str, str] = {
     "_um": "µm",
     "_pa": "Pa",
     "_c": "°C",
+    "_urad": "µrad",
+    "_adu": "ADU",
+    "_hz": "Hz",
     "_ms": "ms",
     "_s": "s",
     "_innovation": "σ",
@@ -131,7 +134,7 @@ RECORD = Plot("Record", Group.RECORD)
 
 @dataclass(frozen=True, slots=True)
 class TelemetryColumn:
-    """A column of telemetry.
+    """A column of telemetry, or of measured figures (`figure_columns`).
 
     Attributes
     ----------
@@ -145,7 +148,7 @@ class TelemetryColumn:
         Where it is drawn, which also says to which group it belongs.
     entity : str
         Rerun entity. Columns that are known together share one: m scalars of one entity cost the
-        writer and the viewer far less than m entities. Empty: a time axis.
+        writer and the viewer far less than m entities. Empty: not drawn, or a time axis.
     colour : tuple of int
         Red, green, blue.
     width : float
@@ -625,5 +628,9 @@ def plot_title(plot: Plot, detail: str = "") -> str:
     str
         Such as `Flow and leak, mean of each second, µm/s`.
     """
-    unit = columns_of(plot)[0].unit
-    return ", ".join(part for part in (plot.title, detail, unit) if part)
+    return title_with_unit(plot.title, detail, columns_of(plot)[0].unit)
+
+
+def title_with_unit(title: str, detail: str, unit: str) -> str:
+    """Return a title, a detail and a unit with commas between them; any of them may be empty."""
+    return ", ".join(part for part in (title, detail, unit) if part)

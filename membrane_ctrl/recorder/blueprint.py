@@ -11,8 +11,9 @@ import rerun.blueprint as rrb
 from rerun.blueprint.encodings import TimelineColumn
 
 from membrane_ctrl.config.schema import Config
-from membrane_ctrl.model import columns, zernike_terms
+from membrane_ctrl.model import columns, figure_columns, zernike_terms
 from membrane_ctrl.model.columns import Group, Plot, plot_title, plots_of
+from membrane_ctrl.model.figure_columns import figure_plot_title
 from membrane_ctrl.model.prose import for_people
 from membrane_ctrl.model.run_status import RunStatus, gains_words
 from membrane_ctrl.run_files import shapes, streams
@@ -66,6 +67,11 @@ def _plot(
 def _ticks(plot: Plot, detail: str = "") -> rrb.TimeSeriesView:
     """Plot columns as they are recorded: every tick around events, else one a second."""
     return _plot(plot_title(plot, detail), *streams.entities_of(plot))
+
+
+def _figure_plot(plot: Plot) -> rrb.TimeSeriesView:
+    """Plot columns of the measured figures."""
+    return _plot(figure_plot_title(plot), figure_columns.figure_columns_of(plot)[0].entity)
 
 
 def _means(plot: Plot) -> rrb.TimeSeriesView:
@@ -141,7 +147,7 @@ def learned(config: Config) -> dict[str, tuple[str, ...]]:
     """Plots of what a loop of this configuration learns: the paths of each, by name."""
     found: dict[str, tuple[str, ...]] = {}
     if config.pump.probe_um:
-        found["Pump against its curve"] = (streams.PUMP.path,)
+        found[figure_plot_title(figure_columns.PUMP_CURVE)] = (streams.PUMP.path,)
     if config.estimator.process_value != "laser":
         found |= {plot_title(plot): streams.entities_of(plot) for plot in plots_of(Group.ESTIMATE)}
     return found
@@ -193,15 +199,15 @@ def _shape(config: Config) -> rrb.Vertical:
         maps,
         rrb.Horizontal(
             _plot(
-                "Sag change by camera and laser, trim, µm",
-                "/shape/sag_change",
+                figure_plot_title(figure_columns.SAG_CHANGE, "trim"),
+                streams.SAG.path,
                 *streams.entities_of(columns.TRIM),
                 span=(-band_um, band_um),
                 marks=True,
             ),
             _plot(
-                "Low orders, change since hold began ± 1σ, µm",
-                "/shape/change",
+                figure_plot_title(figure_columns.LOW_ORDERS, "since the hold began"),
+                streams.CHANGE.path,
                 span=(-band_um / 4, band_um / 4),
             ),
             rrb.BarChartView(
@@ -211,16 +217,16 @@ def _shape(config: Config) -> rrb.Vertical:
             ),
         ),
         rrb.Horizontal(
-            _plot("Slope residual, µrad", "/shape/residual"),
-            _plot("Fringe quality", "/shape/quality"),
-            _plot("Last frame to result, ms", "/shape/latency"),
+            _figure_plot(figure_columns.SLOPE_RESIDUAL),
+            _figure_plot(figure_columns.FRINGE_QUALITY),
+            _figure_plot(figure_columns.LATENCY),
             *(_ticks(plot) for plot in plots_of(Group.SHAPE) if plot != columns.TRIM),
         ),
     ]
     if config.shape.mode == "track":
         terms = f"Z{zernike_terms.FIRST_FIGURE_INDEX} (top) to Z{zernike_terms.ZERNIKE_TERMS}"
         fall = f"{terms}, change since hold began; a column a second, now on the right"
-        heard = _plot("Vibrations heard in each minute, Hz", streams.VIBRATIONS.path)
+        heard = _figure_plot(figure_columns.VIBRATIONS)
         rows.insert(
             2, rrb.Horizontal(rrb.Spatial2DView(name=fall, origin=shapes.WATERFALL_PATH), heard)
         )
@@ -237,7 +243,7 @@ def _shape(config: Config) -> rrb.Vertical:
 
 def _timing() -> rrb.Vertical:
     ticks = [_ticks(plot, _TICKS) for plot in plots_of(Group.TIMING)]
-    return rrb.Vertical(*ticks, _plot("Last frame to result, ms", "/shape/latency"), name="Timing")
+    return rrb.Vertical(*ticks, _figure_plot(figure_columns.LATENCY), name="Timing")
 
 
 # State lanes: the words of a lane, their colours, and the meaning of a row's codes.

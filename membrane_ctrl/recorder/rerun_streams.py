@@ -12,6 +12,7 @@ from membrane_ctrl.model import shape_estimate, telemetry
 from membrane_ctrl.model.arrays import AnyArray, FloatArray
 from membrane_ctrl.model.columns import COLUMNS, Kind
 from membrane_ctrl.model.events import EventLine, PumpLearned
+from membrane_ctrl.model.figure_columns import LOW_ORDER_COLUMNS, VIBRATIONS_MOST
 from membrane_ctrl.model.prose import for_people
 from membrane_ctrl.model.run_events import Vibrations, from_dict
 from membrane_ctrl.recorder import blueprint, sink
@@ -49,8 +50,8 @@ def send_events(recording: sink.Recording, events: Sequence[EventLine]) -> None:
     for at_s, event in timed:
         if isinstance(event, Vibrations):
             heard = [math.nan if value is None else value for value in event.frequency_hz]
-            most = len(streams.VIBRATIONS.lines)
-            values = np.array([(heard + most * [math.nan])[:most]])
+            padded = [*heard, *VIBRATIONS_MOST * [math.nan]]
+            values = np.array([padded[:VIBRATIONS_MOST]])
             recording.scalars(streams.VIBRATIONS.path, np.array([at_s]), values)
 
 
@@ -400,7 +401,7 @@ def _changes(
         estimate.sag_um - reference.sag_um,
         estimate.displacement_um - reference.displacement_um,
     ]
-    terms = [j - 1 for j in streams.LOW_ORDERS]
+    terms = [j - 1 for j in LOW_ORDER_COLUMNS]
     return {
         streams.CHANGE: (change_um[terms].tolist(), variances_um2[terms].tolist()),
         streams.SAG: (sag_um, [estimate.sag_sigma_um**2, 0.0]),

@@ -16,7 +16,7 @@ import pyarrow as pa
 from numpy.typing import NDArray
 
 from membrane_ctrl.controller import safety
-from membrane_ctrl.model import telemetry, zernike_terms
+from membrane_ctrl.model import figure_columns, telemetry
 from membrane_ctrl.model.arrays import Column, FloatArray
 from membrane_ctrl.model.colours import (
     BLUE,
@@ -97,12 +97,19 @@ def mean_path(entity: str) -> str:
 
 # Computed here from the rows, so that plots need no arithmetic.
 TRUE_ERROR = Stream(TRUE_ERROR_COLUMN.entity, (_line(TRUE_ERROR_COLUMN),))
+_ERROR = COLUMNS["error_um"]
+
+
+def _line_of_second(what: str, colour: Colour, width: float) -> Line:
+    return Line("", f"{_ERROR.label}, {what} of a second {_ERROR.unit}", colour, width)
+
+
 OVERVIEW = Stream(
     mean_path("/loop/error"),
     (
-        Line("", "error, least of a second µm", GREY, 1.0),
-        Line("", "error, mean of a second µm", BLUE, 2.0),
-        Line("", "error, greatest of a second µm", GREY, 1.0),
+        _line_of_second("least", GREY, 1.0),
+        _line_of_second("mean", BLUE, 2.0),
+        _line_of_second("greatest", GREY, 1.0),
     ),
 )
 # A point per second all over the run: the others have every tick around events and one per second
@@ -118,43 +125,23 @@ DERIVED: tuple[Stream, ...] = (TRUE_ERROR, OVERVIEW, *MEANS, TRUE_MEAN)
 
 def band(band_um: float) -> Stream:
     """The area in which the error is to stay, drawn as the deviation of a line without width."""
-    return Stream("/loop/band", (Line("", f"band ±{band_um:g} µm", GREEN, 0.0),))
+    return Stream("/loop/band", (Line("", f"band ±{band_um:g} {_ERROR.unit}", GREEN, 0.0),))
 
 
-# Low orders that a film shows, each worth a line. Noll index to name.
-LOW_ORDERS = {
-    4: ("defocus Z4 µm", BLUE),
-    5: ("astigmatism Z5 µm", ORANGE),
-    6: ("astigmatism Z6 µm", YELLOW),
-    7: ("coma Z7 µm", GREEN),
-    8: ("coma Z8 µm", VIOLET),
-    9: ("trefoil Z9 µm", GREY),
-    10: ("trefoil Z10 µm", WHITE),
-    11: ("spherical Z11 µm", RED),
-}
+def _figure_stream(plot: Plot) -> Stream:
+    shown = figure_columns.figure_columns_of(plot)
+    return Stream(shown[0].entity, tuple(map(_line, shown)))
 
-ZERNIKE = Stream(
-    "/shape/zernike",
-    tuple(Line("", f"{label} µm", GREY) for label in zernike_terms.zernike_labels()),
-)
-CHANGE = Stream(
-    "/shape/change", tuple(Line("", name, colour) for name, colour in LOW_ORDERS.values())
-)
-PUMP = Stream(
-    "/pump/scale",
-    (Line("", "flow against its curve ± 1σ", BLUE, 2.0), Line("", "scale in use", ORANGE)),
-)
-VIBRATIONS = Stream("/shape/vibrations", tuple(Line("", f"mode {k} Hz", GREY) for k in range(1, 9)))
-SAG = Stream(
-    "/shape/sag_change",
-    (Line("", "sag change ± 1σ µm", BLUE, 2.0), Line("", "laser change µm", ORANGE)),
-)
-RESIDUAL = Stream("/shape/residual", (Line("", "slope residual µrad", BLUE),))
-QUALITY = Stream(
-    "/shape/quality", (Line("", "valid fraction", GREEN, 2.0), Line("", "saturated fraction", RED))
-)
-MODULATION = Stream("/shape/modulation", (Line("", "modulation ADU", BLUE),))
-LATENCY = Stream("/shape/latency", (Line("", "last frame to result ms", BLUE),))
+
+ZERNIKE = _figure_stream(figure_columns.TERMS)
+CHANGE = _figure_stream(figure_columns.LOW_ORDERS)
+PUMP = _figure_stream(figure_columns.PUMP_CURVE)
+VIBRATIONS = _figure_stream(figure_columns.VIBRATIONS)
+SAG = _figure_stream(figure_columns.SAG_CHANGE)
+RESIDUAL = _figure_stream(figure_columns.SLOPE_RESIDUAL)
+QUALITY = _figure_stream(figure_columns.FRINGE_QUALITY)
+MODULATION = _figure_stream(figure_columns.MODULATION)
+LATENCY = _figure_stream(figure_columns.LATENCY)
 SHAPE_STREAMS: tuple[Stream, ...] = (ZERNIKE, RESIDUAL, QUALITY, MODULATION, LATENCY)
 
 

@@ -10,6 +10,7 @@ from membrane_ctrl.controller.tick import RECORD, SAME
 from membrane_ctrl.model import shape_estimate
 from membrane_ctrl.model.arithmetic import describe_arithmetic
 from membrane_ctrl.model.columns import COLUMNS, TRUE_ERROR_COLUMN, Kind, TelemetryColumn, unit_of
+from membrane_ctrl.model.figure_columns import RECORDED_COLUMNS
 from membrane_ctrl.model.program import file_origin
 from membrane_ctrl.model.zernike_terms import COVARIANCE_UPPER_SIZE, ZERNIKE_TERMS
 from membrane_ctrl.run_files import levels
@@ -117,25 +118,11 @@ SNAPSHOTS = _spec(
     group_rows=_SNAPSHOT_GROUP_ROWS,
 )
 
-_SHAPE_TEXTS = {
-    "time_s": "middle of the exposures",
-    "hencky_um": "amplitude of the part of a Hencky bowl that the Zernike terms lack, as sag",
-    "sag_um": "height at the rim above the vertex",
-    "sag_sigma_um": "standard deviation of changes of the sag",
-    "displacement_um": "mean reading of the laser during the exposures",
-    "slope_residual_urad": "RMS of measured minus fitted slopes",
-    "valid_fraction": "share of the aperture with a slope",
-    "modulation_median_adu": "median modulation of the fringes",
-    "saturated_fraction": "share of saturated pixels",
-    "latency_s": "from the last frame to the result",
-    "geometry_sag_sigma_um": "standard deviation of the sag that all cycles share",
-}
-
 
 def _shape_fields() -> list[pa.Field]:
     return [
         *(
-            _field(name, pa.float64(), _SHAPE_TEXTS.get(name, ""))
+            _field(name, pa.float64(), RECORDED_COLUMNS[name].description)
             for name in shape_estimate.NUMBERS
         ),
         _field("cycle", pa.int64(), "number of the cycle or frame"),

@@ -10,7 +10,7 @@ from rerun.blueprint.components import AbsoluteTimeRange
 from rerun.blueprint.encodings import TimelineColumn
 
 from membrane_ctrl.config.schema import Config
-from membrane_ctrl.model import columns
+from membrane_ctrl.model import columns, figure_columns
 from membrane_ctrl.model.columns import Group, Plot, plot_title, plots_of
 from membrane_ctrl.recorder import blueprint
 from membrane_ctrl.review.viewer.layer import overview_streams, prefix_of
@@ -89,6 +89,10 @@ class ReviewBlueprint:
 
     def _level(self, plot: Plot) -> rrb.TimeSeriesView:
         return self._plot(plot_title(plot), *(stream.path for stream in overview_streams(plot)))
+
+    def _figures(self, plot: Plot) -> rrb.TimeSeriesView:
+        shown = figure_columns.figure_columns_of(plot)
+        return self._plot(figure_columns.figure_plot_title(plot), shown[0].entity)
 
     def _around_band(self, name: str, *paths: str) -> rrb.TimeSeriesView:
         """A plot of the error, with lines where something happened: these would stretch an axis of
@@ -182,13 +186,11 @@ class ReviewBlueprint:
         rows = [self._maps(label) for label in self.labels]
         plots = [
             rrb.Horizontal(
-                self._plot(
-                    "Change of the centre by camera (± 1σ) and laser, µm", "/shape/sag_change"
-                ),
-                self._plot("Low orders, change ± 1σ, µm", "/shape/change"),
+                self._figures(figure_columns.SAG_CHANGE),
+                self._figures(figure_columns.LOW_ORDERS),
             ),
             rrb.Horizontal(
-                self._plot("Slope residual, µrad", "/shape/residual"),
+                self._figures(figure_columns.SLOPE_RESIDUAL),
                 *map(self._level, plots_of(Group.SHAPE)),
             ),
         ]

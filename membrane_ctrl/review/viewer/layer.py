@@ -16,6 +16,7 @@ from membrane_ctrl.model import events
 from membrane_ctrl.model.arrays import AnyArray, BoolArray, Column
 from membrane_ctrl.model.colours import BLUE, GREEN, GREY, ORANGE, RED, VIOLET, Colour
 from membrane_ctrl.model.columns import DRAWN, Plot, aggregated_of, plots_of
+from membrane_ctrl.model.figure_columns import LOW_ORDER_COLUMNS
 from membrane_ctrl.model.prose import for_people
 from membrane_ctrl.model.run_status import RunStatus
 from membrane_ctrl.model.telemetry import FIELDS, changes
@@ -144,7 +145,7 @@ class Layer:
         for stream in OVERVIEWS:
             values = np.column_stack([level[line.field] for line in stream.lines])
             if np.isfinite(values).any():
-                self._style(stream.path, [(line.name, line.colour) for line in stream.lines])
+                self._style(stream.path, _names_and_colours(stream))
                 self._scalars(stream.path, level["time_s"], values)
         ends = level["time_s"][[0, -1]] if level["time_s"].size else np.empty(0)
         band = streams.band(band_um)
@@ -163,7 +164,7 @@ class Layer:
             for stream in streams.STREAMS:
                 values = np.column_stack([block[line.field] for line in stream.lines])
                 if np.isfinite(values).any():
-                    self._style(stream.path, [(line.name, line.colour) for line in stream.lines])
+                    self._style(stream.path, _names_and_colours(stream))
                     self._scalars(stream.path, block["mono_s"], values)
 
     def _lanes(self, level: Block) -> None:
@@ -197,15 +198,13 @@ class Layer:
         for stream, time_s, values in streams.mark_lines(
             [(each.mono_s, each.event) for each in run.log]
         ):
-            self._style(
-                stream.path, [(line.name, line.colour) for line in stream.lines], 2.0, vertical=True
-            )
+            self._style(stream.path, _names_and_colours(stream), 2.0, vertical=True)
             self._columns(stream.path, time_s, rr.Scalars.columns(scalars=values))
         pump = [(e.mono_s, e.event) for e in run.log if isinstance(e.event, events.PumpLearned)]
         if pump:
             values = np.array([(told.scale, told.correction) for _, told in pump])
             variances = np.array([(told.sigma**2, 0.0) for _, told in pump])
-            lines = [(line.name, line.colour) for line in streams.PUMP.lines]
+            lines = _names_and_colours(streams.PUMP)
             self._measured(
                 streams.PUMP.path, lines, np.array([at_s for at_s, _ in pump]), values, variances
             )
@@ -245,11 +244,11 @@ class Layer:
             return
         shown = good.select(_some(len(good), SHAPES_MOST))
         parameters = shown.parameters_um() - shown.parameters_um()[0]
-        terms = [j - 1 for j in streams.LOW_ORDERS]
+        terms = [j - 1 for j in LOW_ORDER_COLUMNS]
         variances = _variances(shown)[:, terms]
         self._measured(
-            "/shape/change",
-            streams.LOW_ORDERS.values(),
+            streams.CHANGE.path,
+            _names_and_colours(streams.CHANGE),
             shown.time_s,
             parameters[:, terms],
             variances,
@@ -258,10 +257,11 @@ class Layer:
             (shown.sag_um - shown.sag_um[0], shown.displacement_um - shown.displacement_um[0])
         )
         variances = np.nan_to_num(np.column_stack((shown.sag_sigma_um**2, np.zeros(len(shown)))))
-        lines = [(line.name, line.colour) for line in streams.SAG.lines]
-        self._measured("/shape/sag_change", lines, shown.time_s, change, variances)
-        self._style("/shape/residual", [("slope residual µrad", BLUE)])
-        self._scalars("/shape/residual", shown.time_s, shown.slope_residual_urad[:, np.newaxis])
+        sag = streams.SAG
+        self._measured(sag.path, _names_and_colours(sag), shown.time_s, change, variances)
+        residual_urad = shown.slope_residual_urad[:, np.newaxis]
+        self._style(streams.RESIDUAL.path, _names_and_colours(streams.RESIDUAL))
+        self._scalars(streams.RESIDUAL.path, shown.time_s, residual_urad)
         seen = (shown.time_s >= part_s[0]) & (shown.time_s <= part_s[1])
         seen |= ~seen.any()  # nothing measured there: show all rather than no map
         self._maps(shown.time_s[seen], parameters[seen])
@@ -363,6 +363,10 @@ class Layer:
             rr.TimeColumn("utc", timestamp=self._origin + _nanoseconds(time_s)),
         ]
         self._stream.send_columns(self._prefix + path, indexes=indexes, columns=columns)
+
+
+def _names_and_colours(stream: streams.Stream) -> list[tuple[str, Colour]]:
+    return [(line.name, line.colour) for line in stream.lines]
 
 
 def prefix_of(label: str) -> str:
