@@ -6,6 +6,7 @@ from __future__ import annotations
 
 import re
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -23,6 +24,12 @@ def wrapped(periods: list[float], sigma: float = 0.0, seed: int = 1) -> np.ndarr
     return np.angle(np.exp(2j * np.pi * turns)) + np.random.default_rng(seed).normal(
         0, sigma, turns.shape
     )
+
+
+def page_blocks() -> list[str]:
+    """The code of docs/how-to/library.md, block by block."""
+    page = Path(__file__).parents[2] / "docs" / "how-to" / "library.md"
+    return re.findall("```python\n(.*?)```", page.read_text(), re.S)
 
 
 @pytest.mark.parametrize(
@@ -86,12 +93,21 @@ def test_crossed_fringes_are_told_apart() -> None:
         phase.crossed_phasors(frames, steps, steps)
 
 
+def test_the_blocks_of_the_page_run_alone() -> None:
+    names: dict[str, Any] = {}
+    for block in page_blocks():
+        exec(block, names)
+    assert names["known"].mean() > 0.99
+    assert names["fit"].converged
+    assert names["fit"].surface.sag_mm == pytest.approx(37.1, abs=0.02)
+    assert np.median(names["residual_urad"]) < 100
+
+
 def test_the_example_of_the_page_measures_another_bench() -> None:
     """A camera and a screen side by side before a 1.7 m sphere; fringes of two periods in five
-    steps.
+    steps. The first block of the page makes its own frames and is left out.
     """
-    text = (Path(__file__).parents[2] / "docs" / "how-to" / "library.md").read_text()
-    code = re.findall("```python\n(.*?)```", text, re.S)
+    _, *code = page_blocks()
     camera, screen = np.array([120.0, 30.0, 1650.0]), np.array([-140.0, 10.0, 1700.0])
     forward = -camera / np.linalg.norm(camera)
     right = np.cross(forward, [0, 1, 0]) / np.linalg.norm(np.cross(forward, [0, 1, 0]))
@@ -120,9 +136,12 @@ def test_the_example_of_the_page_measures_another_bench() -> None:
     in_camera = rotation @ seen.rays
     column, row = 3000 * in_camera[:2] / in_camera[2] + [[319.5], [239.5]]
     names = {
+        "np": np,
+        "Geometry": Geometry,
         "frames": frames,
         "shifts_rad": shifts,
         "periods_mm": periods,
+        "sigma_rad": 0.05,
         "camera_mm": camera,
         "rotation": rotation,
         "focal_px": 3000.0,
