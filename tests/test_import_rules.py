@@ -239,6 +239,16 @@ def unsafe(path: Path) -> set[str]:
     return found
 
 
+def test_tests_do_not_import_benchmarks() -> None:
+    """What both use is in `tests/worlds` (simulated benches) and `tests/studies` (runs on them)."""
+    users = {
+        str(file.relative_to(ROOT))
+        for file in files_of("tests")
+        if any(module.split(".")[0] == "benchmarks" for module in imports_of(file))
+    }
+    assert users == set()
+
+
 @pytest.mark.parametrize("folder", ["membrane_ctrl", "firmware_iface", "tuning", "benchmarks"])
 def test_no_data_is_run_or_unpickled(folder: str) -> None:
     assert {str(file): what for file in files_of(folder) if (what := unsafe(file))} == {}

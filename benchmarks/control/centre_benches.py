@@ -18,12 +18,12 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from benchmarks.control.centre import Optics
 from benchmarks.tuning.benches import DrawnBench, drawn
 from membrane_ctrl.config.schema import EstimatorConfig, LoopConfig, PumpConfig
 from membrane_ctrl.control.centre import CentreFilter
 from membrane_ctrl.control.centre_estimate import CentreReadings
 from membrane_ctrl.control.inner_loop import InnerLoop, LoopInput
+from tests.studies.held_centre import Optics
 from tests.worlds.foreign_plant import CURVES
 
 SETTLED_S, LOCK_S = 60.0, 5.0

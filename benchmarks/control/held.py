@@ -7,7 +7,7 @@ The reference is the least standard deviation any controller could reach with th
 
 from __future__ import annotations
 
-from benchmarks.control.inner_loop import SENSORS, steady
+from tests.studies.inner_loop import SENSORS, steady
 from tests.support.figures import Figure, at_least, at_most
 
 SEEDS = range(1, 5)

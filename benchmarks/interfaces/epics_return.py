@@ -23,8 +23,8 @@ import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
-from benchmarks.interfaces.bridges import Told, lines
 from tests.control_port.port_run import port_run
+from tests.studies.bridge_clients import Told, lines
 from tests.support.figures import Figure, at_most, show
 from tests.web.test_page import free_port, ticking
 

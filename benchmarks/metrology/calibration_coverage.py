@@ -25,16 +25,6 @@ import cv2
 import numpy as np
 
 from benchmarks.metrology.calibration import errors_um
-from benchmarks.metrology.coverage import (
-    BentRays,
-    DirectRays,
-    FloatArray,
-    Room,
-    answers,
-    stated_bench,
-    stated_sigmas,
-    true_bench,
-)
 from membrane_ctrl.calibration.sets import (
     Bundle,
     CalibrateOptions,
@@ -59,7 +49,17 @@ from membrane_ctrl.sim.optics.film_shape import FilmShape, typical_film
 from membrane_ctrl.sim.optics.shade import Light
 from membrane_ctrl.sim.optics.simulation_spec import leaning
 from membrane_ctrl.sim.optics.trace import camera_pose
+from tests.studies.resumable_answers import answers
 from tests.support.figures import Figure, at_most
+from tests.worlds.misstated_bench import (
+    BentRays,
+    DirectRays,
+    FloatArray,
+    Room,
+    stated_bench,
+    stated_sigmas,
+    true_bench,
+)
 
 ANSWERS = Path("logs/calibration-coverage.jsonl")
 BENCHES = 40

@@ -17,12 +17,11 @@ from unittest.mock import patch
 
 import numpy as np
 
-from membrane_ctrl.control.pump_curve import PumpCurve
 from membrane_ctrl.model.telemetry import State
+from tests.studies.pump_curve_error import worst_share
 from tests.worlds import foreign_plant
 from tuning import pump_trial
 from tuning.identification.characterise import ExperimentError
-from tuning.identification.pump_map import PumpMap
 from tuning.identification.pump_survey import PumpSurvey
 from tuning.opening import TwinHold
 from tuning.rig import HoldRig
@@ -105,14 +104,6 @@ def drawn(seed: int) -> DrawnPump:
         gusts=bool(rng.random() < 0.3),
         laser_um=log(0.3, 1.5),
     )
-
-
-def worst_share(found: PumpMap, pump: foreign_plant.ForeignPump) -> float:
-    """Largest error of the flow over the curve, from the start on, as a share of the full flow."""
-    curve = PumpCurve(found.pump)
-    low = max(found.pump.start_fraction, found.pump.curve_fraction[0])
-    commands = np.linspace(low, found.pump.curve_fraction[-1], 100)
-    return max(abs(curve._rising.flow(d) - pump.settled(d)) for d in commands) / pump.full_um_per_s
 
 
 @dataclass(frozen=True)

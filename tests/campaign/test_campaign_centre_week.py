@@ -6,7 +6,7 @@ from __future__ import annotations
 
 import pytest
 
-from benchmarks.control.centre_week import BUMP_UM, days
+from tests.studies.centre_week import BUMP_UM, days
 
 DAYS = 0.12  # 50 s of CPU time
 

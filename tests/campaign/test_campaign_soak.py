@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from benchmarks.control.soak import dropout_excursions_um, everything, soak
+from tests.studies.soak import dropout_excursions_um, everything, soak
 
 
 def test_ten_seconds_without_a_laser() -> None:

@@ -13,7 +13,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from benchmarks.interfaces import viewers
+from tests.studies import viewers
 from tests.support.browser import browser_tab
 from tests.support.figures import at_most, show
 from tests.support.machine_needs import needs
@@ -76,7 +76,7 @@ class Chromium:
 def test_fifty_viewers_and_a_stalled_one(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.delenv("PYTEST_CURRENT_TEST")  # NiceGUI looks for it
     chromium = Chromium(tmp_path)
-    figures = viewers.run(viewers.VIEWERS - 1, 2, chromium.opened)
+    figures = viewers.measure_viewers(viewers.VIEWERS - 1, 2, chromium.opened)
     gap = at_most("longest time without an update, Chromium", max(chromium.gaps_s), "s", 5.0)
     loads = at_most("pages that Chromium loaded", sum(chromium.loads), "", 2, "cycles", 2)
     show("viewers", [*figures, gap, loads])

@@ -12,7 +12,6 @@ from dataclasses import dataclass
 import numpy as np
 import pytest
 
-from benchmarks.control.centre import Optics, Sensors, hold
 from membrane_ctrl.config.schema import EstimatorConfig, LoopConfig, PumpConfig, TwinConfig
 from membrane_ctrl.control import centre
 from membrane_ctrl.control.centre import CentreFilter
@@ -21,6 +20,7 @@ from membrane_ctrl.control.gas_transit import Transit
 from membrane_ctrl.control.inner_loop import InnerLoop
 from membrane_ctrl.control.innovation_ramp import Ramp
 from membrane_ctrl.control.noise_learning import LearnedFactor, ReadingNoise, configured_walk
+from tests.studies.held_centre import Optics, Sensors, hold
 from tests.worlds.foreign_plant import ForeignPlant, ForeignPump
 
 LOOP = LoopConfig()

@@ -8,9 +8,9 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from benchmarks.control.inner_loop import answer, hold, lost_reading, run, start_up, steady
 from membrane_ctrl.config.schema import LoopConfig, PumpConfig, TwinConfig
 from membrane_ctrl.sim.surroundings import AmbientChange, LeakChange
+from tests.studies.inner_loop import answer, hold, lost_reading, run, start_up, steady
 
 SEEDS = (1, 2, 3)
 ALL = "barometer and thermometer"

@@ -9,7 +9,6 @@ from typing import Any
 import numpy as np
 import pytest
 
-from benchmarks.control.shape_loop import SENSITIVITY, estimate_of
 from membrane_ctrl.config.schema import ShapeConfig
 from membrane_ctrl.control.shape_loop import ShapeCode, ShapeLoop, ShapeOutput
 from membrane_ctrl.control.shape_reference import SHAPES, TRACKED_EVERY_S, TRACKED_SHAPES
@@ -17,6 +16,7 @@ from membrane_ctrl.model.reason import NO_REASON, Reason
 from membrane_ctrl.model.shape_estimate import ShapeEstimate
 from membrane_ctrl.model.telemetry import ShapeState
 from membrane_ctrl.model.zernike_terms import ZERNIKE_TERMS
+from tests.studies.shape_loop import SENSITIVITY, estimate_of
 
 CONFIG = ShapeConfig(time_constant_s=60.0)
 PERIOD_S, DT_S = 2.0, 0.1

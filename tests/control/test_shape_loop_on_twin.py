@@ -6,9 +6,9 @@ from __future__ import annotations
 
 import numpy as np
 
-from benchmarks.control.shape_loop import ON_S, SHAPE, track
 from membrane_ctrl.config.schema import TwinConfig
 from membrane_ctrl.model.telemetry import ShapeState
+from tests.studies.shape_loop import ON_S, SHAPE, track
 
 DRIFTING = TwinConfig(laser_drift_um_per_min=2.0, start_error_um=0.0)
 

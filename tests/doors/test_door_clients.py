@@ -16,9 +16,9 @@ from typing import Any
 
 import pytest
 
-from benchmarks.interfaces.bridges import lines
 from membrane_ctrl.doors.names import TABLE
 from tests.control_port.port_run import PortRun, port_run
+from tests.studies.bridge_clients import lines
 from tests.support.machine_needs import needs, program_path
 from tests.web.test_page import free_port, ticking
 
@@ -406,11 +406,9 @@ async def test_a_client_and_its_door_may_be_killed(tmp_path: Path, kind: str) ->
     part = (
         sys.executable,
         "-m",
-        "benchmarks.interfaces.bridges",
+        "tests.studies.bridge_clients",
         str(tmp_path),
-        "--part",
         kind,
-        "--ports",
         json.dumps(ports),
     )
     seen, settings = tmp_path / f"{kind}.jsonl", SERVERS.format(**ports)

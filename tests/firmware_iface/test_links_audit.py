@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from benchmarks.interfaces.links import LINKS, audit
+from tests.studies.link_audit import LINKS, audit
 
 
 @pytest.mark.parametrize("count", [2_500, pytest.param(10_000, marks=pytest.mark.campaign)])

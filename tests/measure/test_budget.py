@@ -13,7 +13,6 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from benchmarks.metrology.coverage import BentRays, answers
 from membrane_ctrl.config.optics import (
     CameraConfig,
     CameraPoseConfig,
@@ -35,6 +34,8 @@ from membrane_ctrl.model.zernike_terms import ZERNIKE_TERMS
 from membrane_ctrl.sim.optics.camera import OpticsRenderer
 from membrane_ctrl.sim.optics.film_shape import FilmShape, typical_film
 from membrane_ctrl.sim.optics.shade import pattern_sequence
+from tests.studies.resumable_answers import answers
+from tests.worlds.misstated_bench import BentRays
 
 SHRINK = 8
 CAMERA = CameraConfig(width_px=2448 // SHRINK, height_px=2048 // SHRINK, pixel_um=3.45 * SHRINK)

@@ -10,9 +10,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from benchmarks.metrology.effects import EFFECTS, Effect, answer
 from membrane_ctrl.cli import run
 from membrane_ctrl.model.errors import Exit
+from tests.studies.effects_alone import EFFECTS, Effect, answer
 from tests.studies.tracked_errors import CLEAN, SIZE
 from tests.worlds.crossed_fringes import CrossedWorld
 

@@ -11,7 +11,6 @@ import pytest
 from metrology_truth import cone, v_fold
 from rendered_sets import FILM, bench, good_set, patterns, stack_of
 
-from benchmarks.metrology import coverage
 from membrane_ctrl.config.schema import OpticsConfig
 from membrane_ctrl.metrology.checked import check
 from membrane_ctrl.metrology.frames.frame_stack import FrameStack
@@ -27,6 +26,7 @@ from membrane_ctrl.metrology.reconstruct import HeightFunction, parabola
 from membrane_ctrl.model.zernike_terms import ZERNIKE_TERMS
 from membrane_ctrl.sim.optics.camera import OpticsRenderer
 from membrane_ctrl.sim.optics.film_shape import Bump, FilmShape, Ripple
+from tests.studies import measured_sets
 from tests.studies.tracked_errors import rms
 
 X, Y = np.meshgrid(*[np.linspace(-475, 475, 81)] * 2)
@@ -173,7 +173,7 @@ def test_noisy_pictures_move_no_film_and_hide_no_motion(
                 math.hypot(film.x_to_y_sigma_um, told_um[0].mean() - film.told_um[0].mean())
             )
             left_um += [np.std(one) for one in off]
-        budget = coverage.measured(stack, optics)[1].budget
+        budget = measured_sets.measured(stack, optics)[1].budget
         film_um.append(next(source.sigma for source in budget.sources if source.name == "film_um"))
     assert rms(off_um) <= most_um
     assert rms(np.divide(off_um, sigma_um)) <= 1.45

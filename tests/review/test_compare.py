@@ -11,11 +11,11 @@ import numpy as np
 import pytest
 from scipy import signal
 
-from benchmarks.records.comparison import rates
 from membrane_ctrl.review import open_run
 from membrane_ctrl.review.statistics.analysis import Analysis, analyse
 from membrane_ctrl.review.statistics.compare import compare
 from membrane_ctrl.review.statistics.drift import mean_p, spread_p, windowed
+from tests.studies.comparison_rates import rates
 from tests.support.review_runs import written
 
 HOURS = 0.5

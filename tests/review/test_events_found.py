@@ -7,7 +7,6 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from benchmarks.records.events_found import matched
 from membrane_ctrl.metrology.optics.film_law import zernike_projection
 from membrane_ctrl.model.telemetry import COLUMN, Rows, State, column
 from membrane_ctrl.review.events.found import (
@@ -18,6 +17,7 @@ from membrane_ctrl.review.events.found import (
 )
 from membrane_ctrl.review.events.steps import FoundEvent, confidence, steps
 from membrane_ctrl.run_files.levels import TICK_FIELDS, Columns, first_level
+from tests.studies.events_found import matched
 from tests.worlds.nights import DOOR, GLITCH, JUMP, LATE, LEAK, LOST, Planted, night
 from tests.worlds.synthetic_shape import from_estimates
 

@@ -12,7 +12,6 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from benchmarks.tuning.pumps import worst_share
 from membrane_ctrl.cli import run
 from membrane_ctrl.config.schema import Config, LoopConfig, PumpConfig
 from membrane_ctrl.config.toml_file import dump, load
@@ -22,6 +21,7 @@ from membrane_ctrl.controller.cross_check import cross_check
 from membrane_ctrl.model.errors import Exit, RejectedError
 from membrane_ctrl.model.telemetry import State
 from membrane_ctrl.sessions.folder import SessionFolder, create_session, open_session
+from tests.studies.pump_curve_error import worst_share
 from tests.worlds.foreign_plant import (
     CURVES,
     ForeignPlant,

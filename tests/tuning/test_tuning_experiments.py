@@ -10,7 +10,6 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from benchmarks.tuning.sessions import Case, TwinBench
 from membrane_ctrl.config.schema import PumpConfig
 from membrane_ctrl.control.experiments.excursion_guard import ExcursionGuard
 from membrane_ctrl.control.experiments.experiment import BenchSample, Experiment, Finished
@@ -19,6 +18,7 @@ from membrane_ctrl.control.experiments.patterned import Patterned
 from membrane_ctrl.control.experiments.patterns import doublets, multisine, steps
 from membrane_ctrl.control.experiments.relay import Relay
 from membrane_ctrl.sim.surroundings import AmbientChange, LaserDropout
+from tests.studies.tuning_sessions import Case, TwinBench
 from tuning.identification.characterise import ExperimentError, characterise
 from tuning.identification.loop_model import Record
 from tuning.rig import Rig, laser_noise_um

@@ -11,8 +11,8 @@ import numpy as np
 import pytest
 
 import tuning
-from benchmarks.tuning.sessions import SESSIONS, Case, TwinBench, session
 from membrane_ctrl.config.schema import LoopConfig, PumpConfig
+from tests.studies.tuning_sessions import SESSIONS, Case, TwinBench, session
 from tuning.identification.characterise import FitQuality, characterise
 from tuning.identification.disturbance import observe
 from tuning.identification.loop_model import Gains
