@@ -29,13 +29,14 @@ class RerunOutput:
         config: Config,
         errors: sink.RecorderErrors,
         summary: Callable[[], str],
+        overview_every_s: float = rerun_streams.OVERVIEW_EVERY_S,
     ) -> None:
         self._recording = recording
         self._segment_s = config.recording.segment_s
         self._errors = errors
         self._summary = summary
         self._next_summary_s = -math.inf
-        self._telemetry = rerun_streams.TelemetryStreams(recording, config)
+        self._telemetry = rerun_streams.TelemetryStreams(recording, config, overview_every_s)
         self.shapes = rerun_streams.ShapeStreams(recording)
         self.state = math.nan  # the controller's, in the last row
         self.closed: list[Path] = []  # closed segments, until taken from here

@@ -106,14 +106,29 @@ class QuietFilter:
         return quiet
 
 
-_OVERVIEW_EVERY_S = 5.0
+# In a file, a chunk costs more than a row.
+OVERVIEW_EVERY_S = 5.0
 
 
 class TelemetryStreams:
-    """Sends rows to a recording; remembers the codes of the last row."""
+    """Sends rows to a recording; remembers the codes of the last row.
 
-    def __init__(self, recording: sink.Recording, config: Config) -> None:
+    Parameters
+    ----------
+    recording : Recording
+    config : Config
+    overview_every_s : float
+        Seconds whose means are sent together.
+    """
+
+    def __init__(
+        self,
+        recording: sink.Recording,
+        config: Config,
+        overview_every_s: float = OVERVIEW_EVERY_S,
+    ) -> None:
         self._recording = recording
+        self._overview_every_s = overview_every_s
         self._band_um = config.limits.band_um
         self._band = streams.band(self._band_um)
         self._quiet = QuietFilter(config.loop.rate_hz, config.recording.quiet_hz, self._band_um)
@@ -138,9 +153,7 @@ class TelemetryStreams:
             self._send_overview(self._rest[:0], last=True)
 
     def _send_overview(self, rows: telemetry.Rows, last: bool = False) -> None:
-        """Send a row for each second, some seconds at a time, as a chunk costs more than a row; and
-        the band.
-        """
+        """Send a row for each second, some seconds at a time, and the band."""
         waiting_s = telemetry.column(self._rest, "mono_s")
         fresh = telemetry.column(rows, "mono_s") > waiting_s.max(
             initial=-math.inf
@@ -148,7 +161,7 @@ class TelemetryStreams:
         self._rest = rows = np.concatenate((self._rest, rows[fresh]))
         time_s = telemetry.column(rows, "mono_s")
         second = np.floor(time_s)
-        if second[-1] - second[0] < _OVERVIEW_EVERY_S and not last:
+        if second[-1] - second[0] < self._overview_every_s and not last:
             return
         whole = np.split(rows, np.flatnonzero(np.diff(second)) + 1)
         self._rest = rows[:0] if last else whole.pop()

@@ -82,6 +82,7 @@ class Recording:
         path = self._run_dir / f"{self._run_name}-{self.segments:03d}.rrd"
         try:
             self._stream.save(path)
+            self._lay_out()
             self._send_statics()
             self._stream.flush(timeout_sec=_FLUSH_TIMEOUT_S)
         except (RuntimeError, OSError) as error:
@@ -103,13 +104,18 @@ class Recording:
         self._stream = self._new_stream()
         self.path = None
 
+    def _lay_out(self) -> None:
+        """Send the blueprint with the first segment, and write its own file."""
+        if self._laid_out:
+            return
+        self._laid_out = True  # even on failure: a full disk is retried every few seconds
+        blueprint = run_blueprint(self._config)
+        self._stream.send_blueprint(blueprint)
+        blueprint.save(APPLICATION, str(self._run_dir / LAYOUT))
+
     def _send_statics(self) -> None:
+        """Send what holds for the whole run: names, colours, lanes, masks of maps."""
         stream = self._stream
-        if not self._laid_out:
-            self._laid_out = True  # even on failure: a full disk is retried every few seconds
-            blueprint = run_blueprint(self._config)
-            stream.send_blueprint(blueprint)
-            blueprint.save(APPLICATION, str(self._run_dir / LAYOUT))
         stream.send_recording_name(self._run_dir.name)
         origin: dict[str, Any] = {"name": self._run_name, "started_utc": str(self._origin)}
         origin |= file_origin("membrane-recording/1")

@@ -13,8 +13,8 @@ from membrane_ctrl.model.clock import RunClock
 from membrane_ctrl.model.telemetry import unpack
 from membrane_ctrl.recorder.rerun_streams import ShapeStreams, TelemetryStreams, send_events
 from membrane_ctrl.recorder.sink import Recording
-from membrane_ctrl.review.viewer.viewer import screenshot
 from tests.support.machine_needs import needs
+from tests.support.recording_picture import screenshot
 from tests.worlds.synthetic_run import rows_of, shape_of
 
 pytestmark = [pytest.mark.viewer, needs("vulkan")]
@@ -57,13 +57,3 @@ def test_shape_tab_shows_maps_in_colour(run_dir: Path) -> None:
     colourful = (picture.max(axis=2) - picture.min(axis=2)) > 100
     top = colourful[: picture.shape[0] * 2 // 5]
     assert top.mean() > 0.15  # three maps fill much of the upper part
-
-
-def test_an_unknown_tab_is_refused(run_dir: Path) -> None:
-    with pytest.raises(ValueError, match="no tab 'Nonsense'"):
-        screenshot(run_dir, "Nonsense")
-
-
-def test_a_folder_without_a_recording_is_refused(tmp_path: Path) -> None:
-    with pytest.raises(FileNotFoundError, match=r"no \.rrd file"):
-        screenshot(tmp_path)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import io
 import json
 import os
 import shutil
@@ -40,11 +39,8 @@ from membrane_ctrl.review.catalogue import (
 from membrane_ctrl.review.report import html
 from membrane_ctrl.review.report.json import pump_change, pump_history
 from membrane_ctrl.review.runs import export
-from membrane_ctrl.review.viewer import viewer
 from membrane_ctrl.review.viewer.command import ReviewOptions, make_review
-from membrane_ctrl.review.viewer.viewer import follow
-from membrane_ctrl.run_files.segments import first_message_after
-from tests.support.review_runs import same, segment, set_summary, written
+from tests.support.review_runs import same, set_summary, written
 from tests.worlds.nights import Planted, night
 
 Capsys = pytest.CaptureFixture[str]
@@ -447,41 +443,3 @@ def test_around_finds_events_and_what_was_found(tmp_path: Path) -> None:
         cursor = make_review([run], options, tmp_path / "r.rrd")
         assert cursor is not None
         assert cursor.nanos / 1e9 == pytest.approx(run.origin_utc.timestamp() + at_s, abs=2.0)
-
-
-def test_following_a_long_run_begins_some_minutes_back(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    whole = segment(tmp_path, night(1, 0.2, "typical", [])[0]).read_bytes()
-    (tmp_path / "night-000.rrd").write_bytes(whole)
-    (tmp_path / "summary.json").touch()
-    monkeypatch.setattr(viewer, "_RECENT_BYTES", len(whole) // 4)
-    monkeypatch.setattr(viewer, "_STYLE_BYTES", len(whole) // 8)
-    out = io.BytesIO()
-    follow(tmp_path, out, lambda: True)
-    followed = out.getvalue()
-    assert whole.startswith(followed[: len(whole) // 8])
-    assert whole.endswith(followed[-len(whole) // 5 :])
-    assert len(followed) < len(whole) // 2
-    (tmp_path / "shorter.rrd").write_bytes(followed)
-    end = first_message_after(tmp_path / "shorter.rrd", len(followed))
-    assert followed[end : end + 8] == bytes(
-        8
-    )  # from message to message up to the one that ends a file
-
-
-def test_following_copies_what_grows_until_the_run_is_over(tmp_path: Path) -> None:
-    whole = segment(tmp_path, night(1, 0.01, "typical", [])[0]).read_bytes()
-    (tmp_path / "night-000.rrd").write_bytes(whole[:5000])
-    out = io.BytesIO()
-
-    def grow(_: float) -> None:
-        if out.tell() < len(whole):
-            (tmp_path / "night-000.rrd").write_bytes(whole)
-        elif not (tmp_path / "night-001.rrd").exists():
-            (tmp_path / "night-001.rrd").write_bytes(b"next")
-        else:
-            (tmp_path / "summary.json").touch()
-
-    follow(tmp_path, out, lambda: True, grow)
-    assert out.getvalue() == whole + b"next"

@@ -59,7 +59,7 @@ def review_command(options: ReviewOptions) -> int:
         tempfile.TemporaryDirectory(prefix="membrane-review-") as folder,
     ):
         if options.live:
-            return viewer.live(runs[0].folder, options.web, options.port)
+            return viewer.live(runs[0], options.web, options.port)
         for target in (options.save, options.screenshot):
             if target is not None:
                 _require_writable(target, runs)

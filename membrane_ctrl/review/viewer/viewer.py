@@ -11,7 +11,7 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
-from typing import IO, TypeAlias
+from typing import TypeAlias
 from urllib.parse import quote, urlsplit
 
 import numpy as np
@@ -19,21 +19,19 @@ import rerun_cli  # type: ignore[import-untyped]
 from rerun.experimental import ViewerClient
 
 from membrane_ctrl.model import errors
-from membrane_ctrl.model.files import open_plain
-from membrane_ctrl.run_files.segments import first_message_after, segments
+from membrane_ctrl.review.viewer.live_view import LiveRecording, LiveView, follow_run
+from membrane_ctrl.run_files.run import Run
 
 # Work to do while a viewer is open, until the question whether it is still open is answered with
 # no.
 Meanwhile: TypeAlias = Callable[[Callable[[], bool]], None]
 
-# The recorder flushes every second.
-_FOLLOW_S = 0.5
 # A window opens in a few seconds, with a software driver in ten.
 _CURSOR_S = 30.0
 _CURSOR_AGAIN_S = 0.2
-_CHUNK_BYTES = 1 << 20
-_RECENT_BYTES = 20 << 20  # ten minutes at 50 Hz, as recorded
-_STYLE_BYTES = 1 << 20  # blueprint, colours and names come first, in a tenth of this
+# The server starts in a second.
+_SERVER_S = 30.0
+_SERVER_AGAIN_S = 0.05
 
 
 @dataclass(frozen=True, slots=True)
@@ -123,15 +121,14 @@ def serve(source: Path | str, bind: str, port: int, meanwhile: Meanwhile = lambd
     )
 
 
-def live(folder: Path, web: bool, port: int = 0) -> int:
-    """Show a run in progress by reading its files, without affecting the run.
+def live(run: Run, web: bool, port: int = 0) -> int:
+    """Show a run in progress, made from its tables, without affecting the run.
 
-    The segments are piped into a separate server, to which the viewer (or, with `web`, a browser)
-    connects: a viewer that reads its standard input itself draws nothing before the input ends.
+    The view is sent to a separate server, to which the viewer (or, with `web`, a browser) connects.
     """
     data_port, port = free_port(), port or free_port()
     kind = ["--serve-web", "--web-viewer-port", str(port)] if web else ["--serve-grpc"]
-    server = viewer_command(*kind, "--bind", "127.0.0.1", "--port", str(data_port), "-")
+    server = viewer_command(*kind, "--bind", "127.0.0.1", "--port", str(data_port))
     proxy = _proxy("127.0.0.1", data_port)
     if web:
         _require_listening("127.0.0.1", port)
@@ -139,16 +136,17 @@ def live(folder: Path, web: bool, port: int = 0) -> int:
     else:
         _require_screen()
     try:
-        with subprocess.Popen(server, stdin=subprocess.PIPE, env=_environment()) as served:
+        with subprocess.Popen(server, env=_environment()) as served:
+            _wait_for_server(served, data_port)
             viewer = viewer_command(
                 "--bind", "127.0.0.1", "--port", str(free_port()), "--connect", proxy
             )
             watched = served if web else subprocess.Popen(viewer, env=_environment())
-            assert served.stdin is not None
             try:
-                follow(folder, served.stdin, lambda: watched.poll() is None)
+                view = LiveView(run, LiveRecording(run, proxy))
+                follow_run(view, run.folder, lambda: watched.poll() is None)
                 watched.wait()
-            except (BrokenPipeError, KeyboardInterrupt):
+            except KeyboardInterrupt:
                 pass
             finally:
                 watched.terminate()
@@ -156,6 +154,18 @@ def live(folder: Path, web: bool, port: int = 0) -> int:
     except OSError as error:
         raise errors.DeviceError(f"the viewer did not start: {error}") from None
     return 0
+
+
+def _wait_for_server(served: subprocess.Popen[bytes], port: int) -> None:
+    """Wait until the server listens. Raises OSError if it has ended or takes too long."""
+    until_s = time.monotonic() + _SERVER_S
+    while served.poll() is None and time.monotonic() < until_s:
+        with socket.socket() as probe:
+            if probe.connect_ex(("127.0.0.1", port)) == 0:
+                return
+        time.sleep(_SERVER_AGAIN_S)
+    served.terminate()
+    raise OSError("its server does not listen")
 
 
 def _require_screen() -> None:
@@ -187,63 +197,6 @@ def _say_where(bind: str, port: int, url: str) -> None:
             f"{socket.gethostname()}"
         )
         print(f"from another machine first: {tunnel}", file=sys.stderr)
-
-
-def follow(
-    folder: Path,
-    out: IO[bytes],
-    wanted: Callable[[], bool],
-    sleep: Callable[[float], None] = time.sleep,
-) -> None:
-    """Copy a growing run, segment by segment, until it has its summary or the viewer closes.
-
-    It starts a few minutes back: a browser reads only a few times faster than a run grows, and
-    would be hours behind after a night. The start of the segment precedes that, as it defines how
-    to draw everything.
-
-    Raises BrokenPipeError when the reader has gone.
-    """
-    for data in _grown(folder, wanted, sleep):
-        out.write(data)
-        out.flush()
-
-
-def _grown(
-    folder: Path, wanted: Callable[[], bool], sleep: Callable[[float], None]
-) -> Iterator[bytes]:
-    number, place, style = _recent(segments(folder))
-    yield style
-    while wanted():
-        over = (folder / "summary.json").exists()
-        files = segments(folder)
-        data = b""
-        if number < len(files):
-            with open_plain(files[number]) as file:
-                file.seek(place)
-                data = file.read(_CHUNK_BYTES)
-        if data:
-            place += len(data)
-            yield data
-        elif number + 1 < len(files):
-            number, place = number + 1, 0
-        elif over:
-            return
-        else:
-            sleep(_FOLLOW_S)
-
-
-def _recent(files: list[Path]) -> tuple[int, int, bytes]:
-    """The first segment's number, the position in it, and the bytes that must precede it."""
-    sizes = [file.lstat().st_size for file in files]
-    number = max(0, len(files) - 1)
-    if number > 0 and sizes[number] < _RECENT_BYTES:
-        number -= 1
-    if not files or sizes[number] < _RECENT_BYTES + _STYLE_BYTES:
-        return number, 0, b""
-    style_ends = first_message_after(files[number], _STYLE_BYTES)
-    place = first_message_after(files[number], sizes[number] - _RECENT_BYTES)
-    with open_plain(files[number]) as file:
-        return number, place, file.read(style_ends) if place else b""
 
 
 def _require_listening(bind: str, port: int) -> None:
@@ -294,27 +247,11 @@ _WAIT_S = 60.0
 _BETWEEN_S = 0.5
 
 
-def screenshot(run_dir: Path, tab: str = "Overview") -> bytes:
-    """PNG of the whole run, at its end.
-
-    Raises FileNotFoundError if the folder has no recording; ValueError if the recording has no such
-    tab; RuntimeError if the viewer does not start (no Vulkan driver) or its picture keeps changing.
-    Opens all segments of the run; `tab` is the name of a tab of the blueprint.
-    """
-    files = [str(path.resolve()) for path in segments(run_dir)]
-    if not files:
-        raise FileNotFoundError(f"{run_dir}: contains no .rrd file")
-    with _headless() as viewer:
-        viewer.open(files)
-        _show_tab(viewer, tab)
-        viewer.set_time("utc", play_state="following")
-        return _at_rest(viewer)
-
-
 def screenshot_of(source: Path | str, at: CursorTime | None = None) -> bytes:
     """PNG of a recording as it opens, at a moment or its end, or of a server's page.
 
-    Raises RuntimeError as `screenshot`.
+    Raises RuntimeError if the viewer does not start (no Vulkan driver) or its picture keeps
+    changing.
     """
     with _headless() as viewer:
         viewer.open(source if isinstance(source, str) else str(source.resolve()))
@@ -325,26 +262,6 @@ def screenshot_of(source: Path | str, at: CursorTime | None = None) -> bytes:
         else:
             _put(viewer, at)
         return _at_rest(viewer)
-
-
-def _show_tab(viewer: ViewerClient, name: str) -> None:
-    blueprint = viewer.get_blueprint().blueprint
-    containers = {
-        path.removeprefix("/"): parts["ContainerBlueprint"]
-        for path, parts in blueprint.items()
-        if "ContainerBlueprint" in parts
-    }
-    wanted = next(
-        (path for path, container in containers.items() if container.get("display_name") == name),
-        None,
-    )
-    tabs = next(
-        (container for container in containers.values() if wanted in container["contents"]), None
-    )
-    if tabs is None:
-        raise ValueError(f"no tab {name!r} in the recording")
-    tabs["active_tab"] = wanted
-    viewer.set_blueprint(blueprint, "recording")
 
 
 def _at_rest(viewer: ViewerClient) -> bytes:
