@@ -31,7 +31,7 @@ from benchmarks.records.memory_acquisition import acquisition_figures
 from membrane_ctrl.alarms.process import AlarmsSpec, watch
 from membrane_ctrl.config.schema import Config, LoopConfig, RecordingConfig, ShapeConfig
 from membrane_ctrl.console.process import ConsoleSpec, console_main
-from membrane_ctrl.controller.tick import MESSAGE_BYTES, RECORD, TICK
+from membrane_ctrl.controller.tick_codec import MESSAGE_BYTES, RECORD, TICK
 from membrane_ctrl.model.clock import RunClock
 from membrane_ctrl.model.shape_estimate import pack_estimate, unpack_estimate
 from membrane_ctrl.model.telemetry import FIELDS, ROW_BYTES

@@ -15,7 +15,7 @@ from datetime import UTC, datetime
 from pathlib import Path
 
 from membrane_ctrl.config.schema import Config
-from membrane_ctrl.controller.tick import MESSAGE_BYTES
+from membrane_ctrl.controller.tick_codec import MESSAGE_BYTES
 from membrane_ctrl.model.clock import RunClock
 from membrane_ctrl.processes.ring import RingReader, RingWriter, ring
 from membrane_ctrl.recorder.housekeeping import Optimizer

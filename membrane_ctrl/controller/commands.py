@@ -53,6 +53,11 @@ _OVERRULED: frozenset[str] = frozenset({"hold", "manual", "tune", "resume", "ack
 
 ANY = frozenset(State)
 RUNNING = MOVING | {State.STANDBY, State.CHECK}
+_HOLD, _PARKED, _FLOW = (
+    {State.HOLD},
+    {State.STANDBY, State.MANUAL, State.TUNE},
+    {State.SETTLE, State.HOLD, State.MANUAL},
+)
 
 
 @dataclass(frozen=True, slots=True)
@@ -94,12 +99,6 @@ class CommandRule:
     needs: tuple[str, ...] = ()  # required fields of the request
     takes: tuple[str, ...] = ()  # optional fields
 
-
-_HOLD, _PARKED, _FLOW = (
-    {State.HOLD},
-    {State.STANDBY, State.MANUAL, State.TUNE},
-    {State.SETTLE, State.HOLD, State.MANUAL},
-)
 
 TABLE: dict[Kind, CommandRule] = {
     "setpoint": CommandRule(

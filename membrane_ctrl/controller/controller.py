@@ -18,7 +18,9 @@ from membrane_ctrl.control import inner_loop, shape_loop
 from membrane_ctrl.control.experiments import trial
 from membrane_ctrl.control.experiments.experiment import ExperimentEnd, Finished
 from membrane_ctrl.controller import (
+    centre_estimation,
     commands,
+    hold_status,
     interlocks,
     locks,
     pump_obeys,
@@ -84,7 +86,7 @@ class Controller:
             self._scene.trial = trial.Trial(memory.scene.trial_memory, config.loop.rate_hz)
         self._resume = safe_levels.ResumeRule(config.resume, config.limits, memory.resume)
         self._consistency = sensor_consistency.SensorConsistency(config, memory.consistency)
-        self._holders = sensor_consistency.Holders(config, memory.holders)
+        self._holders = centre_estimation.CentreEstimation(config, memory.holders)
         self._holders.set_gains(in_force.loop)
         self._consistency.set_gains(in_force.loop, in_force.pump)
         self._answers: list[tuple[int, str]] = []
@@ -137,7 +139,7 @@ class Controller:
             inputs,
             self.state,
             scene.dt_s,
-            sensor_consistency.hold_status(
+            hold_status.hold_status(
                 scene, last, self._holders.optics_hold, self._may_follow_optics()
             ),
         )

@@ -13,6 +13,18 @@ from enum import Enum
 from membrane_ctrl.config.schema import Config
 from membrane_ctrl.model.telemetry import State
 
+# The pump moves the film by 5.3 µm/s at most: means over ten seconds find that after 53 µm, and
+# some µm more are gone until the pump is off.
+_FAST_MOTION_UM = 65.0
+# The hour's limit is judged by a lagging mean, and a stretched film hides a part of a drift: if 30
+# % of its pressure is linear in the sag, the gauge shows 80 %. A drift of 0.05 µm/s then passes the
+# limit by little and late: the protection campaign measured 313 µm after 1.7 h.
+_DRIFT_FACTOR = 3.0
+# As much further goes a drift while the day's reference follows it.
+_DAY_FACTOR = 1.3
+# Until the estimate no longer follows the optics.
+_TRIM_FACTOR = 1.1
+
 
 class FilmSensor(Enum):
     """The sensors that show where the film is; the value is what people call them."""
@@ -196,19 +208,6 @@ class Bound:
 
     sensor: FilmSensor
     distance_um: float
-
-
-# The pump moves the film by 5.3 µm/s at most: means over ten seconds find that after 53 µm, and
-# some µm more are gone until the pump is off.
-_FAST_MOTION_UM = 65.0
-# The hour's limit is judged by a lagging mean, and a stretched film hides a part of a drift: if 30
-# % of its pressure is linear in the sag, the gauge shows 80 %. A drift of 0.05 µm/s then passes the
-# limit by little and late: the protection campaign measured 313 µm after 1.7 h.
-_DRIFT_FACTOR = 3.0
-# As much further goes a drift while the day's reference follows it.
-_DAY_FACTOR = 1.3
-# Until the estimate no longer follows the optics.
-_TRIM_FACTOR = 1.1
 
 
 def find_bound(

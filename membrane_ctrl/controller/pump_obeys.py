@@ -34,6 +34,12 @@ _WEATHER_BLOCKS = 120
 # 2.2 µm/s)
 _REST_BLOCKS = 5
 _REST_RISE_MAX_UM = 6.0
+_RATE_HZ = 50.0  # tick rate of the parts' times
+# At 50 Hz and with 1 µm of noise the vent's speed has a standard deviation of 1.4 µm/s, the pump's
+# 0.6 µm/s, and the means of two 1.0 and 0.4 µm/s. Three of them are clear; two and a half decide in
+# the end.
+_VENT_CLEAR_UM_PER_S, _VENT_LEAST_UM_PER_S = 4.5, 2.5
+_PUMP_CLEAR_SHARE, _PUMP_LEAST_SHARE, _PUMP_MOST_SHARE = 0.5, 0.3, 3.0
 
 
 @dataclass(frozen=True, slots=True)
@@ -256,12 +262,6 @@ PARTS = (
     Part("vent", 0.0, 0.08, 0.35, 0.5),
     Part("pump", 0.8, 0.0, 0.5, 1.0),
 )
-_RATE_HZ = 50.0  # tick rate of the parts' times
-# At 50 Hz and with 1 µm of noise the vent's speed has a standard deviation of 1.4 µm/s, the pump's
-# 0.6 µm/s, and the means of two 1.0 and 0.4 µm/s. Three of them are clear; two and a half decide in
-# the end.
-_VENT_CLEAR_UM_PER_S, _VENT_LEAST_UM_PER_S = 4.5, 2.5
-_PUMP_CLEAR_SHARE, _PUMP_LEAST_SHARE, _PUMP_MOST_SHARE = 0.5, 0.3, 3.0
 
 
 @dataclass(slots=True)

@@ -15,6 +15,12 @@ from membrane_ctrl.controller.safety import Observation, Rule
 from membrane_ctrl.model.state_tree import StateNode
 from membrane_ctrl.model.telemetry import SafeLevel
 
+DAY_S = 86_400.0
+WATCHDOG_MASK = default_map().fault_mask("watchdog")
+# A bleed, the actuator test and `lower` open the vent at most this far; a board that vents by
+# itself opens it fully
+VENTED_FRACTION = 0.5
+
 
 @dataclass(slots=True)
 class SafeLevelsState(StateNode):
@@ -74,13 +80,6 @@ class SafeLevels:
         if limit_s is not None and self.age_s(now_s) > limit_s:
             self.enter(SafeLevel(self.safe_level + 1), now_s)
         return self.safe_level
-
-
-DAY_S = 86_400.0
-WATCHDOG_MASK = default_map().fault_mask("watchdog")
-# A bleed, the actuator test and `lower` open the vent at most this far; a board that vents by
-# itself opens it fully
-VENTED_FRACTION = 0.5
 
 
 @dataclass(slots=True)

@@ -24,6 +24,17 @@ CONNECTED = MOVING | {State.CHECK}
 GAS_MOVES = CONNECTED | {State.LOWER}
 ALWAYS = frozenset(State)
 NOT_YET_FAULT = ALWAYS - {State.FAULT}
+_FOREIGN = {
+    FOREIGN_CLAIM: "another claim is in force",
+    FOREIGN_PERIOD: "another watchdog period is in force",
+}
+# One bit error must not vent a mirror that takes two hours to fill; in two ticks the pump moves the
+# film by 0.2 µm
+_TWICE = (2, 3)
+# The pump follows with its lag (0.15 s) and a tick or two; the loop's noise hides a constant
+# difference in some ticks
+_FOLLOWED = (40, 50)
+_A_FEW = (3, 3)  # one repeated sample of a busy device is not a fault
 
 
 @dataclass(frozen=True, slots=True)
@@ -156,18 +167,6 @@ class Rule:
             remedy=self.remedy,
         )
 
-
-_FOREIGN = {
-    FOREIGN_CLAIM: "another claim is in force",
-    FOREIGN_PERIOD: "another watchdog period is in force",
-}
-# One bit error must not vent a mirror that takes two hours to fill; in two ticks the pump moves the
-# film by 0.2 µm
-_TWICE = (2, 3)
-# The pump follows with its lag (0.15 s) and a tick or two; the loop's noise hides a constant
-# difference in some ticks
-_FOLLOWED = (40, 50)
-_A_FEW = (3, 3)  # one repeated sample of a busy device is not a fault
 
 TABLE: tuple[Rule, ...] = (
     Rule(

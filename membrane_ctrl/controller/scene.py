@@ -12,12 +12,23 @@ from membrane_ctrl.control import inner_loop, line_slope, shape_loop
 from membrane_ctrl.control.centre_estimate import CentreEstimate
 from membrane_ctrl.control.experiments.experiment import Finished
 from membrane_ctrl.control.experiments.trial import Trial, TrialState
-from membrane_ctrl.controller import commands, interlocks, pump_obeys, safe_levels, safety, tick
+from membrane_ctrl.controller import (
+    commands,
+    interlocks,
+    pump_obeys,
+    safe_levels,
+    safety,
+    tick,
+    tick_codec,
+)
 from membrane_ctrl.controller.observer import Observer
 from membrane_ctrl.model import errors, telemetry
 from membrane_ctrl.model.lock import Lock
 from membrane_ctrl.model.reason import NO_REASON, Reason, WhyCode, make_reason
 from membrane_ctrl.model.state_tree import StateNode
+
+# the operator's line names the sender of these commands
+_MOVES = frozenset({"hold", "stop", "pause", "manual", "tune", "ack", "lower", "vent"})
 
 
 @dataclass(slots=True)
@@ -138,10 +149,6 @@ def values_of(memory: SceneState) -> dict[str, Any]:
     return {field.name: getattr(memory, field.name) for field in fields(SceneState)}
 
 
-# the operator's line names the sender of these commands
-_MOVES = frozenset({"hold", "stop", "pause", "manual", "tune", "ack", "lower", "vent"})
-
-
 def obey(scene: Scene, command: commands.Command, state: telemetry.State) -> None:
     """Take an accepted command's request into the scene; the controller does the rest."""
     match command.kind:
@@ -227,7 +234,7 @@ def telemetry_row(
         truth_laser_bias_um=inputs.truth_laser_bias_um,
         interlocks_open=_interlocks_open(scene.interlocks),
         **seen,
-        **{name: getattr(reading, name) for name in tick.AS_READ},
+        **{name: getattr(reading, name) for name in tick_codec.AS_READ},
     )
 
 

@@ -9,7 +9,7 @@ from membrane_ctrl.config.schema import Config
 from membrane_ctrl.controller import safety
 from membrane_ctrl.controller.controller import Controller
 from membrane_ctrl.controller.state import ControllerState
-from membrane_ctrl.controller.tick import SNAPSHOT_BYTES_MAX
+from membrane_ctrl.controller.tick_codec import SNAPSHOT_BYTES_MAX
 from membrane_ctrl.model.arrays import FloatArray
 from membrane_ctrl.model.state_tree import StateError, decode_state, encode_state
 

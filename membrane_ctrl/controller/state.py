@@ -10,6 +10,7 @@ from dataclasses import dataclass, field
 from membrane_ctrl.config.schema import Config
 from membrane_ctrl.control.inner_loop import InnerLoopState
 from membrane_ctrl.control.shape_loop import ShapeLoopMemory
+from membrane_ctrl.controller.centre_estimation import CentreEstimationState
 from membrane_ctrl.controller.commands import GainsInForce, GainsState
 from membrane_ctrl.controller.interlocks import InterlocksState
 from membrane_ctrl.controller.observer import ObserverState
@@ -17,7 +18,7 @@ from membrane_ctrl.controller.pump_obeys import StandstillState
 from membrane_ctrl.controller.safe_levels import ResumeState, SafeLevelsState
 from membrane_ctrl.controller.safety import SafetyState
 from membrane_ctrl.controller.scene import SceneState
-from membrane_ctrl.controller.sensor_consistency import HoldersState, SensorConsistencyState
+from membrane_ctrl.controller.sensor_consistency import SensorConsistencyState
 from membrane_ctrl.model.state_tree import Count, StateNode
 from membrane_ctrl.model.telemetry import ShapeState, State
 
@@ -56,7 +57,7 @@ class ControllerState(StateNode):
     interlocks: InterlocksState = field(default_factory=InterlocksState)
     loop: InnerLoopState = field(default_factory=InnerLoopState)
     shape: ShapeLoopMemory = field(default_factory=ShapeLoopMemory)
-    holders: HoldersState = field(default_factory=HoldersState)
+    holders: CentreEstimationState = field(default_factory=CentreEstimationState)
 
 
 def first_state(config: Config) -> ControllerState:

@@ -11,7 +11,7 @@ from pathlib import Path
 
 from membrane_ctrl.config.port import WebConfig
 from membrane_ctrl.config.schema import Config
-from membrane_ctrl.controller.tick import MESSAGE_BYTES, SNAPSHOT_MESSAGE_BYTES
+from membrane_ctrl.controller.tick_codec import MESSAGE_BYTES, SNAPSHOT_MESSAGE_BYTES
 from membrane_ctrl.model import clock, events, run_events, telemetry
 from membrane_ctrl.model.shape_estimate import ESTIMATE_BYTES_MAX
 from membrane_ctrl.processes.child import Child, Program, pipe

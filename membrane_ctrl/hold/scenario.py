@@ -19,7 +19,7 @@ from pydantic import Field, model_validator
 from firmware_iface.settings import Section
 from membrane_ctrl.config import schema, toml_file
 from membrane_ctrl.console import process, why
-from membrane_ctrl.controller import tick
+from membrane_ctrl.controller import tick_codec
 from membrane_ctrl.controller.commands import Command, Kind
 from membrane_ctrl.hold import scenario, scenarios
 from membrane_ctrl.hold.closing_words import Closing, report
@@ -300,8 +300,8 @@ def _sizes(config: schema.Config) -> dict[str, tuple[int, int]]:
     ticks = round(2 * _ROUND_S * config.loop.rate_hz)
     return {
         "telemetry": (ticks, telemetry.ROW_BYTES),
-        "inputs": (_MESSAGES_A_TICK * ticks, tick.MESSAGE_BYTES),
-        "snapshots": (4, tick.SNAPSHOT_MESSAGE_BYTES),
+        "inputs": (_MESSAGES_A_TICK * ticks, tick_codec.MESSAGE_BYTES),
+        "snapshots": (4, tick_codec.SNAPSHOT_MESSAGE_BYTES),
         "events": (4096, 4096),
         "shapes": (256, 1 << 16),
     }

@@ -23,13 +23,8 @@ from firmware_iface.roles import (
 from membrane_ctrl.controller.commands import AT_END, Command
 from membrane_ctrl.controller.controller import Controller
 from membrane_ctrl.controller.snapshot import take_snapshot
-from membrane_ctrl.controller.tick import (
-    TickInputs,
-    TickOutputs,
-    pack_row,
-    pack_snapshot,
-    pack_tick,
-)
+from membrane_ctrl.controller.tick import TickInputs, TickOutputs
+from membrane_ctrl.controller.tick_codec import pack_row, pack_snapshot, pack_tick
 from membrane_ctrl.model import clock, errors, run_events, shape_estimate
 from membrane_ctrl.model.events import Event, EventLine
 from membrane_ctrl.processes.ring import RingReader, RingWriter

@@ -6,7 +6,7 @@ from functools import partial
 from pathlib import Path
 
 from membrane_ctrl.config.schema import Config
-from membrane_ctrl.controller.tick import TickAssembler
+from membrane_ctrl.controller.tick_assembler import TickAssembler
 from membrane_ctrl.model import files, plain_json, run_events, shape_estimate
 from membrane_ctrl.model.clock import RunClock
 from membrane_ctrl.model.events import Event, EventLine

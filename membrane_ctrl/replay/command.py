@@ -21,7 +21,9 @@ import tomli_w
 from membrane_ctrl.config import toml_file
 from membrane_ctrl.config.schema import Config
 from membrane_ctrl.controller.snapshot import UnknownSnapshotError
-from membrane_ctrl.controller.tick import ColumnChoice, Records, TickBatch
+from membrane_ctrl.controller.tick_assembler import TickBatch
+from membrane_ctrl.controller.tick_checksum import ColumnChoice
+from membrane_ctrl.controller.tick_codec import Records
 from membrane_ctrl.metrology.optics.film_law import zernike_projection
 from membrane_ctrl.model import files, plain_json, run_events, shape_estimate, telemetry
 from membrane_ctrl.model.arithmetic import describe_arithmetic

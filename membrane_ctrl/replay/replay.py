@@ -18,13 +18,9 @@ from membrane_ctrl.config.schema import Config
 from membrane_ctrl.controller.controller import Controller
 from membrane_ctrl.controller.snapshot import UnknownSnapshotError, continue_from, decode_snapshot
 from membrane_ctrl.controller.state import ControllerState
-from membrane_ctrl.controller.tick import (
-    ColumnChoice,
-    TickInputs,
-    TickOutputs,
-    output_crc,
-    unpack_tick,
-)
+from membrane_ctrl.controller.tick import TickInputs, TickOutputs
+from membrane_ctrl.controller.tick_checksum import ColumnChoice, output_crc
+from membrane_ctrl.controller.tick_codec import unpack_tick
 from membrane_ctrl.model import errors, shape_estimate, telemetry
 from membrane_ctrl.model.arrays import FloatArray
 from membrane_ctrl.model.events import Cleared, Event, Fault, ShapeLoopState, StateEntered

@@ -11,7 +11,7 @@ from typing import Generic, TypeVar
 import numpy as np
 import pyarrow as pa
 
-from membrane_ctrl.controller.tick import RECORD, SAME, Records
+from membrane_ctrl.controller.tick_codec import RECORD, SAME, Records
 from membrane_ctrl.model import shape_estimate, telemetry
 from membrane_ctrl.model.arrays import AnyArray
 from membrane_ctrl.model.program import stated_program

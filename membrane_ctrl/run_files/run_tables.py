@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 import pyarrow as pa
 
-from membrane_ctrl.controller.tick import TickBatch
+from membrane_ctrl.controller.tick_assembler import TickBatch
 from membrane_ctrl.model import shape_estimate, telemetry
 from membrane_ctrl.model.arrays import Column
 from membrane_ctrl.model.columns import COLUMNS, Kind

@@ -6,7 +6,7 @@ from dataclasses import replace
 
 import pyarrow as pa
 
-from membrane_ctrl.controller.tick import RECORD, SAME
+from membrane_ctrl.controller.tick_codec import RECORD, SAME
 from membrane_ctrl.model import shape_estimate
 from membrane_ctrl.model.arithmetic import describe_arithmetic
 from membrane_ctrl.model.columns import COLUMNS, TRUE_ERROR_COLUMN, Kind, TelemetryColumn, unit_of

@@ -22,7 +22,7 @@ from membrane_ctrl.cli import run as command_line
 from membrane_ctrl.config.port import AlarmsConfig
 from membrane_ctrl.config.schema import Config
 from membrane_ctrl.controller.controller import Controller
-from membrane_ctrl.controller.tick import MESSAGE_BYTES
+from membrane_ctrl.controller.tick_codec import MESSAGE_BYTES
 from membrane_ctrl.hold.supervisor import Supervisor, Wiring
 from membrane_ctrl.metrology import phase
 from membrane_ctrl.metrology.live import LiveReconstructor

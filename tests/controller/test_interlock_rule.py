@@ -16,7 +16,9 @@ from membrane_ctrl.config.schema import Config, DevicesConfig, ResumeConfig, Sta
 from membrane_ctrl.controller.commands import Command
 from membrane_ctrl.controller.controller import Controller
 from membrane_ctrl.controller.snapshot import continue_from, take_snapshot
-from membrane_ctrl.controller.tick import TickAssembler, output_crc, pack_tick, unpack_tick
+from membrane_ctrl.controller.tick_assembler import TickAssembler
+from membrane_ctrl.controller.tick_checksum import output_crc
+from membrane_ctrl.controller.tick_codec import pack_tick, unpack_tick
 from membrane_ctrl.hold.virtual_run import VirtualRun, VirtualTick
 from membrane_ctrl.metrology.optics.film_law import zernike_projection
 from membrane_ctrl.model.events import (

@@ -14,14 +14,9 @@ from test_command_precedence import CONFIG, Mirror, in_state
 from membrane_ctrl.controller import locks
 from membrane_ctrl.controller.commands import AT_START, TABLE, Command, Kind
 from membrane_ctrl.controller.snapshot import continue_from, take_snapshot
-from membrane_ctrl.controller.tick import (
-    MESSAGE_BYTES,
-    TickAssembler,
-    TickInputs,
-    TickOutputs,
-    pack_tick,
-    unpack_tick,
-)
+from membrane_ctrl.controller.tick import TickInputs, TickOutputs
+from membrane_ctrl.controller.tick_assembler import TickAssembler
+from membrane_ctrl.controller.tick_codec import MESSAGE_BYTES, pack_tick, unpack_tick
 from membrane_ctrl.metrology.optics.film_law import zernike_projection
 from membrane_ctrl.model.events import CommandTaken, LockRemoved, LockSet
 from membrane_ctrl.model.lock import (

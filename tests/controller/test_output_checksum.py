@@ -9,7 +9,8 @@ from dataclasses import replace
 import pytest
 
 from firmware_iface.roles import BenchCommand
-from membrane_ctrl.controller.tick import ColumnChoice, TickOutputs, output_crc
+from membrane_ctrl.controller.tick import TickOutputs
+from membrane_ctrl.controller.tick_checksum import ColumnChoice, output_crc
 from membrane_ctrl.model.errors import Exit
 from membrane_ctrl.model.events import Fault, StateEntered, Why
 from membrane_ctrl.model.telemetry import FIELDS, TelemetryRow

@@ -8,7 +8,8 @@ import numpy as np
 
 from firmware_iface.roles import BenchReading
 from membrane_ctrl.config.schema import Config, EstimatorConfig
-from membrane_ctrl.controller.sensor_consistency import HoldStatus, SensorConsistency
+from membrane_ctrl.controller.hold_status import HoldStatus
+from membrane_ctrl.controller.sensor_consistency import SensorConsistency
 from membrane_ctrl.controller.tick import TickInputs
 from membrane_ctrl.model.events import Event
 from membrane_ctrl.model.shape_estimate import ShapeEstimate

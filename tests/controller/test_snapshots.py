@@ -23,7 +23,7 @@ from membrane_ctrl.controller.snapshot import (
     decode_snapshot,
     take_snapshot,
 )
-from membrane_ctrl.controller.tick import SNAPSHOT_BYTES_MAX
+from membrane_ctrl.controller.tick_codec import SNAPSHOT_BYTES_MAX
 from membrane_ctrl.metrology.optics.film_law import zernike_projection
 from membrane_ctrl.model.errors import Exit
 from membrane_ctrl.model.state_tree import find_differences

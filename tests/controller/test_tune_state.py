@@ -19,7 +19,9 @@ from membrane_ctrl.control.pump_drift import PumpScale
 from membrane_ctrl.controller.commands import Command, refusal
 from membrane_ctrl.controller.controller import Controller
 from membrane_ctrl.controller.snapshot import continue_from, take_snapshot
-from membrane_ctrl.controller.tick import TickAssembler, TickInputs, pack_tick, unpack_tick
+from membrane_ctrl.controller.tick import TickInputs
+from membrane_ctrl.controller.tick_assembler import TickAssembler
+from membrane_ctrl.controller.tick_codec import pack_tick, unpack_tick
 from membrane_ctrl.hold.virtual_run import VirtualRun
 from membrane_ctrl.metrology.optics.film_law import zernike_projection
 from membrane_ctrl.model.events import EventLine

@@ -13,7 +13,8 @@ from firmware_iface.roles import BenchCommand, BenchIdentity, BenchReading
 from membrane_ctrl.config.schema import Config
 from membrane_ctrl.controller.controller import Controller
 from membrane_ctrl.controller.snapshot import continue_from
-from membrane_ctrl.controller.tick import MESSAGE_BYTES, SNAPSHOT_MESSAGE_BYTES, TickAssembler
+from membrane_ctrl.controller.tick_assembler import TickAssembler
+from membrane_ctrl.controller.tick_codec import MESSAGE_BYTES, SNAPSHOT_MESSAGE_BYTES
 from membrane_ctrl.hold.supervisor import Supervisor, Wiring, newest_of
 from membrane_ctrl.metrology.optics.film_law import zernike_projection
 from membrane_ctrl.model.clock import RunClock

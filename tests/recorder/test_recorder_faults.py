@@ -18,7 +18,7 @@ import pytest
 
 from membrane_ctrl.config import toml_file as config_file
 from membrane_ctrl.config.schema import Config, RecordingConfig
-from membrane_ctrl.controller.tick import MESSAGE_BYTES
+from membrane_ctrl.controller.tick_codec import MESSAGE_BYTES
 from membrane_ctrl.model.clock import RunClock
 from membrane_ctrl.model.plain_json import dumps_checked
 from membrane_ctrl.model.shape_estimate import pack_estimate

@@ -22,7 +22,7 @@ import numpy as np
 import pytest
 
 from membrane_ctrl.config.schema import Config
-from membrane_ctrl.controller.tick import MESSAGE_BYTES
+from membrane_ctrl.controller.tick_codec import MESSAGE_BYTES
 from membrane_ctrl.model.clock import RunClock
 from membrane_ctrl.model.run_events import RecorderError
 from membrane_ctrl.model.shape_estimate import pack_estimate

@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 
 from membrane_ctrl.config.schema import Config, RecordingConfig
-from membrane_ctrl.controller.tick import MESSAGE_BYTES
+from membrane_ctrl.controller.tick_codec import MESSAGE_BYTES
 from membrane_ctrl.model.clock import RunClock
 from membrane_ctrl.model.events import Event
 from membrane_ctrl.model.plain_json import dumps_checked

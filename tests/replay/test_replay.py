@@ -19,14 +19,9 @@ from membrane_ctrl.config import toml_file as config_file
 from membrane_ctrl.config.schema import LoopConfig
 from membrane_ctrl.controller.commands import Command
 from membrane_ctrl.controller.controller import Controller
-from membrane_ctrl.controller.tick import (
-    MESSAGE_BYTES,
-    TickAssembler,
-    TickInputs,
-    TickOutputs,
-    pack_tick,
-    unpack_tick,
-)
+from membrane_ctrl.controller.tick import TickInputs, TickOutputs
+from membrane_ctrl.controller.tick_assembler import TickAssembler
+from membrane_ctrl.controller.tick_codec import MESSAGE_BYTES, pack_tick, unpack_tick
 from membrane_ctrl.metrology.optics.film_law import zernike_projection
 from membrane_ctrl.model.errors import Exit
 from membrane_ctrl.model.events import Fault

@@ -21,7 +21,8 @@ from numpy.typing import NDArray
 
 from membrane_ctrl.config import toml_file as config_file
 from membrane_ctrl.config.schema import Config, LoopConfig
-from membrane_ctrl.controller.tick import RECORD, TICK, TickBatch
+from membrane_ctrl.controller.tick_assembler import TickBatch
+from membrane_ctrl.controller.tick_codec import RECORD, TICK
 from membrane_ctrl.model.shape_estimate import ShapeEstimate
 from membrane_ctrl.model.telemetry import COLUMN, FIELDS, Rows, ShapeState, State
 from membrane_ctrl.model.zernike_terms import ZERNIKE_TERMS

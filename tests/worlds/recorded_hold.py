@@ -12,7 +12,7 @@ import numpy as np
 
 from membrane_ctrl.config.schema import Config
 from membrane_ctrl.controller.commands import Command
-from membrane_ctrl.controller.tick import pack_tick
+from membrane_ctrl.controller.tick_codec import pack_tick
 from membrane_ctrl.hold.virtual_run import TruthShape, VirtualRun, VirtualTick
 from membrane_ctrl.metrology.optics.film_law import zernike_projection
 from membrane_ctrl.model.shape_estimate import ShapeEstimate, pack_estimate, unpack_estimate

@@ -14,14 +14,9 @@ from membrane_ctrl.config.schema import Config, TwinConfig
 from membrane_ctrl.controller.commands import Command
 from membrane_ctrl.controller.controller import Controller
 from membrane_ctrl.controller.snapshot import take_snapshot
-from membrane_ctrl.controller.tick import (
-    TickAssembler,
-    TickBatch,
-    TickInputs,
-    TickOutputs,
-    pack_snapshot,
-    pack_tick,
-)
+from membrane_ctrl.controller.tick import TickInputs, TickOutputs
+from membrane_ctrl.controller.tick_assembler import TickAssembler, TickBatch
+from membrane_ctrl.controller.tick_codec import pack_snapshot, pack_tick
 from membrane_ctrl.hold.virtual_run import Alter, ShapeSource, VirtualRun, VirtualTick
 from membrane_ctrl.metrology.optics.film_law import zernike_projection
 from membrane_ctrl.model.arrays import FloatArray

@@ -1,0 +1,291 @@
+"""Runs the estimate of the centre beside the states, if `estimator.process_value` asks for it."""
+
+import math
+from collections.abc import Collection
+from dataclasses import dataclass, field, replace
+
+from membrane_ctrl.config.schema import Config, LoopConfig
+from membrane_ctrl.control import (
+    camera_mount,
+    inner_loop,
+    weather_limits,
+)
+from membrane_ctrl.control.camera_mount import StandGrowth
+from membrane_ctrl.control.centre import LOCK_FRAMES, CentreFilter, CentreState
+from membrane_ctrl.control.centre_estimate import CentreEstimate, CentreReadings, Sensor
+from membrane_ctrl.control.filters import LowPass
+from membrane_ctrl.control.plausibility import (
+    REFERENCE_S,
+    SLOW_REFERENCE_S,
+)
+from membrane_ctrl.controller import safety
+from membrane_ctrl.controller.mount_drift import MountDrift, MountDriftState
+from membrane_ctrl.controller.scene import Scene
+from membrane_ctrl.controller.sensor_consistency import SensorConsistency
+from membrane_ctrl.controller.tick import TickInputs
+from membrane_ctrl.model.events import (
+    Event,
+    HeldBy,
+    Maintenance,
+    MaintenanceOver,
+)
+from membrane_ctrl.model.shape_estimate import ShapeEstimate
+from membrane_ctrl.model.state_tree import StateNode
+from membrane_ctrl.model.telemetry import ShapeState, State
+
+_STAND_SHARE = 0.25  # of the band: a growth of the optics' stand that may be this large is told
+# a sensor that comes and goes within this, as a slower camera does at first, is not reported
+_STANDS_S = 1.5
+# So long may the estimate be held by pump, gas and weather alone, beyond the time in which a sensor
+# counts as fresh: a start without a figure yet. At the pump's full flow the film moves by 5 µm.
+_BLIND_S = 1.0
+
+
+@dataclass(slots=True)
+class CentreEstimationState(StateNode):
+    """What the estimate remembers from tick to tick."""
+
+    centre: CentreState | None = None  # None while the estimate does not run
+    locking: bool = False
+    # Means of the mount while laser and camera agree: what the filter gave to the mount after that
+    # was the film's. The slow one serves if a slow drift of the camera is to be undone.
+    agreed_mount: LowPass = field(default_factory=LowPass)
+    slowly_agreed_mount: LowPass = field(default_factory=LowPass)
+    mount_drift: MountDriftState = field(default_factory=MountDriftState)
+    stand: camera_mount.StandGrowthState = field(default_factory=camera_mount.StandGrowthState)
+    stand_told: bool = False
+    told: tuple[int, ...] | None = None  # the sensors, as reported
+    news_s: float = math.nan
+    estimate: CentreEstimate | None = None
+    blind_since_s: float = math.nan  # the estimate follows neither laser nor optics since then
+    blind: bool = False  # it has done so for too long
+
+
+class CentreEstimation:
+    """Runs the estimate beside the states if `estimator.process_value` asks for it."""
+
+    def __init__(self, config: Config, memory: CentreEstimationState | None = None) -> None:
+        self.memory = memory or CentreEstimationState()
+        self._config = config.estimator
+        self._loop = config.loop
+        self._wanted = config.estimator.process_value != "laser"
+        self._by_optics = config.by_optics
+        self._sag_zero_um = 1e3 * config.optics.mirror.sag_mm if config.by_optics else math.nan
+        centre = self.memory.centre
+        self._filter = (
+            None if centre is None else CentreFilter(config.estimator, config.loop, centre)
+        )
+        self._tracks = config.shape.mode == "track"
+        self._mount_drift = MountDrift(config.shape, self.memory.mount_drift, config.by_optics)
+        self._stand = StandGrowth(config.estimator, self.memory.stand)
+        self._stand_most_um = _STAND_SHARE * config.limits.band_um
+
+    @property
+    def estimate(self) -> CentreEstimate | None:
+        """The newest estimate; None while it does not run."""
+        return self.memory.estimate
+
+    @property
+    def optics_hold(self) -> bool:
+        """Whether the mirror is held without a laser: the optics see it."""
+        if self.memory.estimate is None or self._filter is None:
+            return False
+        return self._filter.frames >= LOCK_FRAMES and self._sees(Sensor.OPTICS)
+
+    @property
+    def blind(self) -> bool:
+        """Whether the estimate has followed neither laser nor optics for a second: it then only
+        predicts the centre by pump and weather, and nothing may be held by it.
+        """
+        return self.memory.blind
+
+    @property
+    def optics_left_out(self) -> bool:
+        """Whether figures are not used until a person accepts the optics again."""
+        return self._mount_drift.beyond_limit
+
+    def set_gains(self, loop: LoopConfig) -> None:
+        """Take the feed-forward's gains from other settings."""
+        self._loop = loop
+        if self._filter is not None:
+            self._filter.set_gains(loop)
+
+    def step(
+        self,
+        inputs: TickInputs,
+        state: State,
+        scene: Scene,
+        last: inner_loop.LoopOutput,
+        shape: ShapeState,
+        consistency: SensorConsistency,
+    ) -> list[Event]:
+        """One tick, after the sensors were judged; returns what is news."""
+        flow_um_per_s, seen_um = last.flow_um_per_s, scene.observer.displacement_um
+        figures = scene.observer.figures
+        if not self._wanted or state not in safety.ESTIMATED or not math.isfinite(flow_um_per_s):
+            self._stop()
+            if self._by_optics and state not in safety.MOVING:
+                self._mount_drift.start(0.0)  # a resumed hold judges the optics by itself
+            return []
+        laser_um = math.nan if consistency.laser_lies else scene.observer.moving_laser_um
+        if self._filter is None:
+            start_um = last.filtered_um if math.isfinite(last.filtered_um) else seen_um
+            if not math.isfinite(start_um):
+                return []
+            self._filter = self._start(start_um, scene)
+        if self._is_anchor(inputs.estimate):
+            # another anchor shows the same film up to a micrometre higher or lower
+            self._filter.relock()
+        figure = self._select_figure(self._filter, figures.accepted, scene.dt_s, shape, consistency)
+        reading = inputs.reading
+        self._stand.step(
+            weather_limits.believed_weather(math.nan, reading.air_temperature_c)[1]
+            if reading
+            else math.nan,
+            scene.dt_s,
+        )
+        if self._filter.frames < LOCK_FRAMES:
+            self._stand.lock()
+        readings = CentreReadings(
+            now_s=inputs.now_s,
+            flow_um_per_s=flow_um_per_s,
+            laser_um=laser_um,
+            ambient_pressure_pa=reading.ambient_pressure_pa if reading else math.nan,
+            air_temperature_c=reading.air_temperature_c if reading else math.nan,
+            sag_um=figure.sag_um - self._stand.um if figure else math.nan,
+            sag_sigma_um=figure.sag_sigma_um if figure else math.nan,
+            sag_time_s=figure.time_s if figure else math.nan,
+            judged=consistency.judges,
+        )
+        self.memory.estimate = estimate = self._filter.step(readings, scene.dt_s)
+        self._note_blindness(inputs.now_s)
+        scene.trim_um = estimate.mount_um
+        news = [*self._news(inputs.now_s, estimate.jumped), *self._told_of_stand()]
+        news += self._mount_drift.step(
+            estimate.mount_um, estimate.jumped_sensors, inputs.now_s, scene.dt_s
+        )
+        if self._sees(Sensor.OPTICS):
+            sigma_um = math.hypot(estimate.sigma_um, self._stand.sigma_um)
+            self.memory.estimate = replace(estimate, sigma_um=sigma_um)
+        return news
+
+    def _stop(self) -> None:
+        self._filter = None
+        self.memory.centre = None
+        self.memory.estimate = None
+        self.memory.told = None
+        self.memory.blind_since_s = math.nan
+        self.memory.blind = False
+
+    def _note_blindness(self, now_s: float) -> None:
+        """Note since when neither laser nor optics correct the estimate."""
+        memory = self.memory
+        if self._sees(Sensor.LASER) or self._sees(Sensor.OPTICS):
+            memory.blind_since_s = math.nan
+        elif math.isnan(memory.blind_since_s):
+            memory.blind_since_s = now_s
+        # false while `blind_since_s` is NaN
+        memory.blind = now_s - memory.blind_since_s > _BLIND_S
+
+    def _start(self, start_um: float, scene: Scene) -> CentreFilter:
+        """Begin an estimate at a displacement."""
+        memory = self.memory
+        memory.centre = CentreState()
+        begun = CentreFilter(self._config, self._loop, memory.centre)
+        begun.start(
+            start_um, scene.loop.mean_flow_um_per_s, scene.trim_um, self._find_sag_zero_um(scene)
+        )
+        memory.agreed_mount.reset(scene.trim_um)
+        memory.slowly_agreed_mount.reset(scene.trim_um)
+        self._mount_drift.start(scene.trim_um)
+        self._stand.lock()
+        return begun
+
+    def _find_sag_zero_um(self, scene: Scene) -> float:
+        """Sag at true centre 0, where the optics replace the laser; NaN where they are to be
+        locked.
+        """
+        if self._by_optics:
+            return self._sag_zero_um
+        observer = scene.observer
+        return (
+            observer.figures.zero_um + scene.trim_um if observer.optics_replace_laser else math.nan
+        )
+
+    def _is_anchor(self, figure: ShapeEstimate | None) -> bool:
+        """Whether a figure is a full set that the tracking's next frames count from."""
+        return (
+            figure is not None
+            and self._tracks
+            and figure.kind == "full"
+            and figure.verdict != "rejected"
+        )
+
+    def _select_figure(
+        self,
+        centre: CentreFilter,
+        figure: ShapeEstimate | None,
+        dt_s: float,
+        shape: ShapeState,
+        consistency: SensorConsistency,
+    ) -> ShapeEstimate | None:
+        """The tick's figure if the filter may use it; locks the filter again where its reference
+        ended.
+        """
+        memory = self.memory
+        off = shape == ShapeState.OFF and not self._by_optics
+        if memory.locking and not off:
+            centre.relock()
+            self._mount_drift.start(memory.estimate.mount_um if memory.estimate else 0.0)
+        memory.locking = off
+        if consistency.agree and memory.estimate is not None:
+            memory.agreed_mount.update(memory.estimate.mount_um, dt_s, REFERENCE_S)
+            memory.slowly_agreed_mount.update(memory.estimate.mount_um, dt_s, SLOW_REFERENCE_S)
+        elif consistency.camera_lies and centre.frames and not self._by_optics:
+            agreed = (
+                memory.slowly_agreed_mount if consistency.camera_drifts else memory.agreed_mount
+            )
+            centre.blame_optics(agreed.value)
+        unusable = off or bool(consistency.camera_lies) or self._mount_drift.beyond_limit
+        return None if unusable else figure
+
+    def _told_of_stand(self) -> list[Event]:
+        """Report once that the optics may be off by the growth of their stand, and once that a new
+        lock ended it.
+        """
+        sigma_um, warmed_k = self._stand.sigma_um, self._stand.warmed_k
+        memory = self.memory
+        far = sigma_um > self._stand_most_um / (2 if memory.stand_told else 1)
+        if far == memory.stand_told:
+            return []
+        memory.stand_told = far
+        stands = f"the optics' stand is {warmed_k:+.1f} K from the reference"
+        if not far:
+            return [MaintenanceOver("stand_growth", stands)]
+        anew = (
+            "calibrate the optics anew" if self._by_optics else "`ctl shape off` and `on` accept it"
+        )
+        return [
+            Maintenance(
+                "stand_growth", f"{stands}: the figure may be off by {sigma_um:.1f} µm; {anew}"
+            )
+        ]
+
+    def _sees(self, sensor: Sensor) -> bool:
+        estimate = self.memory.estimate
+        return estimate is not None and estimate.sensors[sensor].fresh
+
+    def _news(self, now_s: float, jumped: Collection[str]) -> list[Event]:
+        """Report the sensors once they have stood for a second, and every jump."""
+        seeing = tuple(int(sensor) for sensor in Sensor if self._sees(sensor))
+        memory = self.memory
+        if seeing == memory.told:
+            memory.news_s = math.nan
+        elif math.isnan(memory.news_s):
+            memory.news_s = now_s
+        stands = not math.isnan(memory.news_s) and now_s - memory.news_s >= _STANDS_S
+        if not stands and not jumped:
+            return []
+        memory.told = seeing
+        memory.news_s = math.nan
+        return [HeldBy(tuple(Sensor(n).name.lower() for n in seeing), tuple(jumped))]
