@@ -20,9 +20,9 @@ from membrane_ctrl.control.plausibility import (
 )
 from membrane_ctrl.controller import safety
 from membrane_ctrl.controller.mount_drift import MountDrift, MountDriftState
-from membrane_ctrl.controller.scene import Scene
 from membrane_ctrl.controller.sensor_consistency import SensorConsistency
 from membrane_ctrl.controller.tick import TickInputs
+from membrane_ctrl.controller.tick_context import TickContext
 from membrane_ctrl.model.events import (
     Event,
     HeldBy,
@@ -114,35 +114,37 @@ class CentreEstimation:
         self,
         inputs: TickInputs,
         state: State,
-        scene: Scene,
+        context: TickContext,
         last: inner_loop.LoopOutput,
         shape: ShapeState,
         consistency: SensorConsistency,
     ) -> list[Event]:
         """One tick, after the sensors were judged; returns what is news."""
-        flow_um_per_s, seen_um = last.flow_um_per_s, scene.observer.displacement_um
-        figures = scene.observer.figures
+        flow_um_per_s, seen_um = last.flow_um_per_s, context.observer.displacement_um
+        figures = context.observer.figures
         if not self._wanted or state not in safety.ESTIMATED or not math.isfinite(flow_um_per_s):
             self._stop()
             if self._by_optics and state not in safety.MOVING:
                 self._mount_drift.start(0.0)  # a resumed hold judges the optics by itself
             return []
-        laser_um = math.nan if consistency.laser_lies else scene.observer.moving_laser_um
+        laser_um = math.nan if consistency.laser_lies else context.observer.moving_laser_um
         if self._filter is None:
             start_um = last.filtered_um if math.isfinite(last.filtered_um) else seen_um
             if not math.isfinite(start_um):
                 return []
-            self._filter = self._start(start_um, scene)
+            self._filter = self._start(start_um, context)
         if self._is_anchor(inputs.estimate):
             # another anchor shows the same film up to a micrometre higher or lower
             self._filter.relock()
-        figure = self._select_figure(self._filter, figures.accepted, scene.dt_s, shape, consistency)
+        figure = self._select_figure(
+            self._filter, figures.accepted, context.dt_s, shape, consistency
+        )
         reading = inputs.reading
         self._stand.step(
             weather_limits.believed_weather(math.nan, reading.air_temperature_c)[1]
             if reading
             else math.nan,
-            scene.dt_s,
+            context.dt_s,
         )
         if self._filter.frames < LOCK_FRAMES:
             self._stand.lock()
@@ -157,12 +159,12 @@ class CentreEstimation:
             sag_time_s=figure.time_s if figure else math.nan,
             judged=consistency.judges,
         )
-        self.memory.estimate = estimate = self._filter.step(readings, scene.dt_s)
+        self.memory.estimate = estimate = self._filter.step(readings, context.dt_s)
         self._note_blindness(inputs.now_s)
-        scene.trim_um = estimate.mount_um
+        context.trim_um = estimate.mount_um
         news = [*self._news(inputs.now_s, estimate.jumped), *self._told_of_stand()]
         news += self._mount_drift.step(
-            estimate.mount_um, estimate.jumped_sensors, inputs.now_s, scene.dt_s
+            estimate.mount_um, estimate.jumped_sensors, inputs.now_s, context.dt_s
         )
         if self._sees(Sensor.OPTICS):
             sigma_um = math.hypot(estimate.sigma_um, self._stand.sigma_um)
@@ -187,29 +189,34 @@ class CentreEstimation:
         # false while `blind_since_s` is NaN
         memory.blind = now_s - memory.blind_since_s > _BLIND_S
 
-    def _start(self, start_um: float, scene: Scene) -> CentreFilter:
+    def _start(self, start_um: float, context: TickContext) -> CentreFilter:
         """Begin an estimate at a displacement."""
         memory = self.memory
         memory.centre = CentreState()
         begun = CentreFilter(self._config, self._loop, memory.centre)
         begun.start(
-            start_um, scene.loop.mean_flow_um_per_s, scene.trim_um, self._find_sag_zero_um(scene)
+            start_um,
+            context.loop.mean_flow_um_per_s,
+            context.trim_um,
+            self._find_sag_zero_um(context),
         )
-        memory.agreed_mount.reset(scene.trim_um)
-        memory.slowly_agreed_mount.reset(scene.trim_um)
-        self._mount_drift.start(scene.trim_um)
+        memory.agreed_mount.reset(context.trim_um)
+        memory.slowly_agreed_mount.reset(context.trim_um)
+        self._mount_drift.start(context.trim_um)
         self._stand.lock()
         return begun
 
-    def _find_sag_zero_um(self, scene: Scene) -> float:
+    def _find_sag_zero_um(self, context: TickContext) -> float:
         """Sag at true centre 0, where the optics replace the laser; NaN where they are to be
         locked.
         """
         if self._by_optics:
             return self._sag_zero_um
-        observer = scene.observer
+        observer = context.observer
         return (
-            observer.figures.zero_um + scene.trim_um if observer.optics_replace_laser else math.nan
+            observer.figures.zero_um + context.trim_um
+            if observer.optics_replace_laser
+            else math.nan
         )
 
     def _is_anchor(self, figure: ShapeEstimate | None) -> bool:

@@ -4,7 +4,7 @@ one table for every user.
 
 import math
 from collections.abc import Collection, Iterable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Literal
 
 from membrane_ctrl.config.schema import Config, LoopConfig, PumpConfig
@@ -12,7 +12,6 @@ from membrane_ctrl.control.experiments.spec import ExperimentSpec
 from membrane_ctrl.controller.safety import MOVING
 from membrane_ctrl.model.events import CommandTaken
 from membrane_ctrl.model.lock import Lock
-from membrane_ctrl.model.state_tree import StateNode
 from membrane_ctrl.model.telemetry import State
 
 Kind = Literal[
@@ -140,7 +139,7 @@ TABLE: dict[Kind, CommandRule] = {
 }
 
 
-def in_order(commands: Iterable[Command]) -> list[Command]:
+def sort_commands(commands: Iterable[Command]) -> list[Command]:
     """Commands of a tick, safest first, the others in order of arrival."""
     return sorted(
         commands,
@@ -148,7 +147,7 @@ def in_order(commands: Iterable[Command]) -> list[Command]:
     )
 
 
-def overruled(command: Command, obeyed: Collection[str]) -> str:
+def explain_overruled(command: Command, obeyed: Collection[str]) -> str:
     """Refusal naming the command of the same tick that overrules this one; empty if none does."""
     winner = next((kind for kind in DOWN if kind in obeyed), "")
     if command.kind not in _OVERRULED or not winner:
@@ -156,7 +155,7 @@ def overruled(command: Command, obeyed: Collection[str]) -> str:
     return f"{winner} came at the same time and takes precedence; send again"
 
 
-def refusal(command: Command, state: State, config: Config) -> str:
+def explain_refusal(command: Command, state: State, config: Config) -> str:
     """Why a command cannot be executed now; empty if it can."""
     if command.kind == "resumed" or command.kind == "latched":
         return (
@@ -201,7 +200,7 @@ def refusal(command: Command, state: State, config: Config) -> str:
     return ""
 
 
-def taken(command: Command, refused: str) -> CommandTaken:
+def make_command_event(command: Command, refused: str) -> CommandTaken:
     """The event of a command: its sender, reason and settings, and why it was refused (empty: it
     was not).
     """
@@ -233,85 +232,3 @@ def _settings(command: Command) -> dict[str, object] | None:
     return command.loop.model_dump() | (
         {} if command.pump is None else {"pump": command.pump.model_dump()}
     )
-
-
-@dataclass(frozen=True, slots=True)
-class GainsInForce(StateNode):
-    """All settings that a `gains` command changes."""
-
-    loop: LoopConfig
-    shape_time_constant_s: float
-    pump: PumpConfig
-
-
-@dataclass(slots=True)
-class GainsState(StateNode):
-    """The settings in force, and those that a trial goes back to."""
-
-    good: GainsInForce
-    tried: GainsInForce
-    until_s: float = math.nan  # end of the trial; NaN: there is none
-    setpoint_step_um: float = (
-        math.nan
-    )  # part of the trial; NaN: the setpoint and the shape loop are not
-
-
-class GainsTrial:
-    """Gains, and the pump's curve, on trial revert to the last good ones unless kept in time; a
-    run's first are good.
-
-    The client that tries them may lose its connection or be killed: the loop must not keep
-    unverified gains (docs/decisions/78-gains-on-trial.md).
-    """
-
-    def __init__(self, memory: GainsState) -> None:
-        self.memory = memory
-
-    @property
-    def on_trial(self) -> bool:
-        """The present gains are not kept yet."""
-        return math.isfinite(self.memory.until_s)
-
-    def begin(self, loop: LoopConfig, command: Command, now_s: float) -> None:
-        """Set a command's gains for as many seconds as its value, or permanently if that is NaN."""
-        memory = self.memory
-        tried = replace(memory.tried, loop=loop)
-        if command.pump is not None:
-            tried = replace(tried, pump=command.pump)
-        if math.isfinite(command.shape_time_constant_s):
-            tried = replace(tried, shape_time_constant_s=command.shape_time_constant_s)
-        memory.tried = tried
-        memory.setpoint_step_um = command.setpoint_step_um
-        memory.until_s = now_s + command.value
-        if not self.on_trial:
-            self.keep()
-
-    @property
-    def in_force(self) -> GainsInForce:
-        """The present settings."""
-        return self.memory.tried
-
-    @property
-    def setpoint_step_um(self) -> float:
-        """The trial's step of the setpoint; NaN: the setpoint and the
-        shape loop are no part of it.
-        """
-        return self.memory.setpoint_step_um
-
-    def keep(self) -> None:
-        """Keep the present gains."""
-        self.memory.good = self.memory.tried
-        self._end()
-
-    def overdue(self, now_s: float) -> bool:
-        """The trial has ended without `keep`."""
-        return now_s >= self.memory.until_s
-
-    def revert(self) -> None:
-        """Restore the last good settings."""
-        self.memory.tried = self.memory.good
-        self._end()
-
-    def _end(self) -> None:
-        self.memory.until_s = math.nan
-        self.memory.setpoint_step_um = math.nan

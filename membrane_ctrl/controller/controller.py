@@ -20,19 +20,22 @@ from membrane_ctrl.control.experiments.experiment import ExperimentEnd, Finished
 from membrane_ctrl.controller import (
     centre_estimation,
     commands,
+    gains_trial,
     hold_status,
     interlocks,
     locks,
-    pump_obeys,
+    resume_rule,
     safe_levels,
     safety,
     sensor_consistency,
+    standstill,
     states,
 )
 from membrane_ctrl.controller.observer import Observer
-from membrane_ctrl.controller.scene import Scene, obey, telemetry_row, values_of
 from membrane_ctrl.controller.state import ControllerState, ReportedShape, first_state
+from membrane_ctrl.controller.telemetry_row import make_telemetry_row
 from membrane_ctrl.controller.tick import TickInputs, TickOutputs
+from membrane_ctrl.controller.tick_context import TickContext, apply_command, collect_state_fields
 from membrane_ctrl.model import arrays, errors
 from membrane_ctrl.model import events as told
 from membrane_ctrl.model.lock import describe_locks
@@ -65,26 +68,26 @@ class Controller:
     ) -> None:
         self._config = config
         self.memory = memory = memory or first_state(config)
-        self._gains = commands.GainsTrial(memory.gains)
+        self._gains = gains_trial.GainsTrial(memory.gains)
         in_force = self._in_force
         self._safety = safety.SafetyTable(config.limits, memory=memory.safety)
         self._shape = shape_loop.ShapeLoop(config.shape, sag_sensitivity, memory.shape)
         self._shape.set_memory(self._gains.in_force.shape_time_constant_s)
-        self._scene = Scene(
+        self._context = TickContext(
             config=config,
             loop_config=in_force.loop,
             pump_config=in_force.pump,
             loop=inner_loop.InnerLoop(in_force.loop, in_force.pump, config.estimator, memory.loop),
             observer=Observer(config, memory.observer),
             levels=safe_levels.SafeLevels(config.states, memory.levels),
-            standstill=pump_obeys.Standstill(config.loop, config.states, memory.standstill),
+            standstill=standstill.Standstill(config.loop, config.states, memory.standstill),
             interlocks=interlocks.Interlocks(config.interlocks, memory.interlocks),
-            **values_of(memory.scene),
+            **collect_state_fields(memory.context),
         )
-        memory.scene = self._scene
-        if memory.scene.trial_memory is not None:
-            self._scene.trial = trial.Trial(memory.scene.trial_memory, config.loop.rate_hz)
-        self._resume = safe_levels.ResumeRule(config.resume, config.limits, memory.resume)
+        memory.context = self._context
+        if memory.context.trial_memory is not None:
+            self._context.trial = trial.Trial(memory.context.trial_memory, config.loop.rate_hz)
+        self._resume = resume_rule.ResumeRule(config.resume, config.limits, memory.resume)
         self._consistency = sensor_consistency.SensorConsistency(config, memory.consistency)
         self._holders = centre_estimation.CentreEstimation(config, memory.holders)
         self._holders.set_gains(in_force.loop)
@@ -109,12 +112,12 @@ class Controller:
     @property
     def loop_config(self) -> LoopConfig:
         """The loop's present settings."""
-        return self._scene.loop_config
+        return self._context.loop_config
 
     @property
     def pump_config(self) -> PumpConfig:
         """The pump's curve in force."""
-        return self._scene.pump_config
+        return self._context.pump_config
 
     @property
     def _in_force(self) -> Config:
@@ -125,71 +128,71 @@ class Controller:
         """Run one tick. Never raises: an exception in a handler
         becomes a fault in the next tick.
         """
-        scene = self._scene
+        context = self._context
         events: list[told.Event] = []
         self._begin(inputs, events)
-        last = scene.output or inner_loop.NO_OUTPUT
+        last = context.output or inner_loop.NO_OUTPUT
         judged = (
-            self.state in safety.MOVING and not scene.paused
+            self.state in safety.MOVING and not context.paused
         )  # nothing follows a setpoint in a pause
         error_um = last.error_um if judged else math.nan
-        scene.observer.look(inputs, self._may_follow_optics())
+        context.observer.look(inputs, self._may_follow_optics())
         consistency = self._consistency
         events += consistency.ask(
             inputs,
             self.state,
-            scene.dt_s,
+            context.dt_s,
             hold_status.hold_status(
-                scene, last, self._holders.optics_hold, self._may_follow_optics()
+                context, last, self._holders.optics_hold, self._may_follow_optics()
             ),
         )
-        stand = scene.standstill
-        stand.look(inputs.now_s, inputs.reading, scene.observer.commanded, inputs.link_up)
+        stand = context.standstill
+        stand.look(inputs.now_s, inputs.reading, context.observer.commanded, inputs.link_up)
         observation = replace(
-            scene.observer.observe(inputs, error_um),
+            context.observer.observe(inputs, error_um),
             tick_error=self.memory.tick_error,
-            overdue=scene.overdue,
-            unfit=scene.unfit,
+            overdue=context.overdue,
+            unfit=context.unfit,
             laser_lies=consistency.laser_lies,
             runs_on=stand.runs_on,
             inflow=stand.inflow,
-            locked=describe_locks(scene.locks, _LOCKS_SHOWN),
+            locked=describe_locks(context.locks, _LOCKS_SHOWN),
             laser_gauge_apart=consistency.laser_gauge_apart,
             gas_excess=consistency.gas_excess,
-            optics_hold=self._holders.optics_hold or scene.observer.optics_replace_laser,
+            optics_hold=self._holders.optics_hold or context.observer.optics_replace_laser,
             displacement_valid=self._displacement_suffices(),
             unseen_film=self._explain_unseen_film(),
-            open_interlocks=scene.interlocks.judged_mask,
-            interlock_level=scene.interlocks.safe_level,
-            interlock_words=scene.interlocks.describe_open(scene.interlocks.judged_mask),
+            open_interlocks=context.interlocks.judged_mask,
+            interlock_level=context.interlocks.safe_level,
+            interlock_words=context.interlocks.describe_open(context.interlocks.judged_mask),
         )
         verdict = self._safety.judge(self.state, observation)
         self._apply(verdict, events)
         self._consider_resuming(observation)
         shape = self._step_shape(inputs, events)
-        events += self._holders.step(inputs, self.state, scene, last, shape.state, consistency)
+        events += self._holders.step(inputs, self.state, context, last, shape.state, consistency)
         if (estimate := self._holders.estimate) is not None:
             shape = replace(shape, trim_um=estimate.mount_um)
-        scene.laser_doubted = bool(consistency.laser_lies)
-        scene.estimate = estimate if self.state in (State.SETTLE, State.HOLD) else None
+        context.laser_doubted = bool(consistency.laser_lies)
+        context.estimate = estimate if self.state in (State.SETTLE, State.HOLD) else None
         if math.isnan(self.memory.state_since_s):  # the verdict has just changed the state
             self.memory.state_since_s = inputs.now_s
-            scene.state_age_s = 0.0
+            context.state_age_s = 0.0
         self._act(events)
-        if scene.loop.learned and self.state == State.HOLD:
-            events += self._consistency.told_of_pump(scene.loop)
-        command = BenchCommand(scene.pump_fraction, scene.vent_fraction)
-        scene.observer.wrote(command)
-        scene.last_pump_fraction = scene.pump_fraction
+        if context.loop.learned and self.state == State.HOLD:
+            events += self._consistency.told_of_pump(context.loop)
+        command = BenchCommand(context.pump_fraction, context.vent_fraction)
+        context.observer.wrote(command)
+        context.last_pump_fraction = context.pump_fraction
         self._tell_why(events)
         fault = self.fault.code if self.fault else 0
         return TickOutputs(
             command=command,
-            row=telemetry_row(
-                scene, self.state, fault, self.memory.ticks, inputs, observation, shape
+            row=make_telemetry_row(
+                context, self.state, fault, self.memory.ticks, inputs, observation, shape
             ),
             events=tuple(events),
-            finished=scene.finished,
+            finished=context.finished,
             answers=tuple(self._answers),
             clear_mask=self._clear_mask,
         )
@@ -213,10 +216,10 @@ class Controller:
         that a person has set, and a pause, need only what their range is judged by. An experiment
         measures with the laser.
         """
-        scene, observer = self._scene, self._scene.observer
+        context, observer = self._context, self._context.observer
         if self.state == State.TUNE and not self._config.by_optics:
             return math.isfinite(observer.laser_um) or self._holders.optics_hold
-        if self.state == State.MANUAL or scene.paused:
+        if self.state == State.MANUAL or context.paused:
             return math.isfinite(observer.guard_um)
         if self._holders.blind:
             return False
@@ -231,82 +234,82 @@ class Controller:
             return "the sag jumps again and again"
         if self._holders.blind:
             return "the figures do not fit the estimate"
-        return self._scene.observer.figures.explain_unseen().text
+        return self._context.observer.figures.explain_unseen().text
 
     def _begin(self, inputs: TickInputs, events: list[told.Event]) -> None:
-        scene = self._scene
+        context = self._context
         self.memory.ticks += 1
         nominal_s = 1.0 / self._config.loop.rate_hz
-        scene.now_s = inputs.now_s
-        scene.dt_s = min(max(inputs.dt_s, _DT_RANGE[0] * nominal_s), _DT_RANGE[1] * nominal_s)
+        context.now_s = inputs.now_s
+        context.dt_s = min(max(inputs.dt_s, _DT_RANGE[0] * nominal_s), _DT_RANGE[1] * nominal_s)
         if self.memory.ticks == 1:
             self._shape.switch(self._config.shape.enabled, inputs.now_s)
         if math.isnan(self.memory.state_since_s):  # the state's first tick
             self.memory.state_since_s = inputs.now_s
-        scene.state_age_s = inputs.now_s - self.memory.state_since_s
-        events += scene.interlocks.look(inputs.reading, self.state)
+        context.state_age_s = inputs.now_s - self.memory.state_since_s
+        events += context.interlocks.look(inputs.reading, self.state)
         self._answers, self._clear_mask = [], 0
         obeyed: set[str] = set()
-        for command in commands.in_order(inputs.commands):
+        for command in commands.sort_commands(inputs.commands):
             if self._obey(command, obeyed, events):
                 obeyed.add(command.kind)
-        if self._gains.overdue(scene.now_s):
+        if self._gains.overdue(context.now_s):
             self._revert_gains("nobody kept them in time", events)
-        scene.loop.may_probe = not self._gains.on_trial
+        context.loop.may_probe = not self._gains.on_trial
 
     def _obey(
         self, command: commands.Command, obeyed: Collection[str], events: list[told.Event]
     ) -> bool:
         """Execute or refuse a command; either way, record its sender and reason."""
         refused = (
-            commands.overruled(command, obeyed)
-            or locks.refuse_while_locked(command, self._scene.locks)
-            or commands.refusal(command, self.state, self._in_force)
+            commands.explain_overruled(command, obeyed)
+            or locks.refuse_while_locked(command, self._context.locks)
+            or commands.explain_refusal(command, self.state, self._in_force)
             or self._prepare(command)
         )
         self._answers.append((command.number, refused))
-        events.append(commands.taken(command, refused))
+        events.append(commands.make_command_event(command, refused))
         if not refused:
             self._do(command, events)
         return not refused
 
     def _do(self, command: commands.Command, events: list[told.Event]) -> None:
-        scene = self._scene
+        context = self._context
         match command.kind:
             case "setpoint" if math.isfinite(self.memory.setpoint_back_um):  # it stays
                 self.memory.setpoint_back_um = command.value
             case "gains":
                 assert command.loop is not None  # checked by `refusal`
-                self._gains.begin(command.loop, command, scene.now_s)
+                self._gains.begin(command.loop, command, context.now_s)
                 self._set_gains(command.loop)
             case "keep":
                 self._gains.keep()
                 self._step_setpoint()
             case "shape_on" | "shape_off":
-                self._shape.switch(command.kind == "shape_on", scene.now_s)
+                self._shape.switch(command.kind == "shape_on", context.now_s)
                 self.memory.shape_back = command.kind == "shape_on"
             case "resumed":
-                self._resume.resumed(scene.now_s - command.value)
+                self._resume.resumed(context.now_s - command.value)
             case "ack":
                 self._clear_mask = ALL_FAULTS
             case "latch":
                 self._set_lock(command, events)
             case "unlock":
                 self._remove_lock(command, events)
-        obey(scene, command, self.state)
+        apply_command(context, command, self.state)
 
     def _set_lock(self, command: commands.Command, events: list[told.Event]) -> None:
-        lock = locks.make_lock(command, self._scene.locks)
+        lock = locks.make_lock(command, self._context.locks)
         if lock is not None:
-            self._scene.locks = (*self._scene.locks, lock)
+            self._context.locks = (*self._context.locks, lock)
             events.append(told.LockSet(**asdict(lock), number=command.number))
 
     def _remove_lock(self, command: commands.Command, events: list[told.Event]) -> None:
-        scene = self._scene
-        unlocking = locks.decide_unlock(command, scene.locks)
+        context = self._context
+        unlocking = locks.decide_unlock(command, context.locks)
         lock = unlocking.lock
         assert lock is not None  # checked by `refuse_while_locked`
-        scene.locks = tuple(each for each in scene.locks if each != lock)
+        context.locks = tuple(each for each in context.locks if each != lock)
         event = told.LockRemoved(
             word=lock.word,
             text=lock.text,
@@ -322,38 +325,40 @@ class Controller:
         """Prepare the experiment of a `tune`; returns why the command is refused,
         or an empty text.
         """
-        scene, spec = self._scene, command.experiment
-        if command.kind == "hold" and scene.latched:
-            return f"a fault is latched: {scene.latched}; acknowledge it first"
-        if command.kind == "hold" and self.state == State.STANDBY and scene.interlocks.last_mask:
-            return f"{scene.interlocks.describe_open(scene.interlocks.last_mask)}; close it first"
-        if command.kind in ("manual", "tune") and scene.levels.safe_level != SafeLevel.NONE:
+        context, spec = self._context, command.experiment
+        if command.kind == "hold" and context.latched:
+            return f"a fault is latched: {context.latched}; acknowledge it first"
+        if command.kind == "hold" and self.state == State.STANDBY and context.interlocks.last_mask:
+            return (
+                f"{context.interlocks.describe_open(context.interlocks.last_mask)}; close it first"
+            )
+        if command.kind in ("manual", "tune") and context.levels.safe_level != SafeLevel.NONE:
             return "the safety table holds the mean flow"
         if math.isfinite(command.setpoint_step_um):
             now_um = (
                 self.memory.setpoint_back_um
                 if math.isfinite(self.memory.setpoint_back_um)
-                else scene.setpoint_um
+                else context.setpoint_um
             )
             stepped = replace(command, kind="setpoint", value=now_um + command.setpoint_step_um)
-            return commands.refusal(stepped, self.state, self._in_force)
+            return commands.explain_refusal(stepped, self.state, self._in_force)
         if command.kind != "tune" or spec is None:
             return ""
-        centre_um = scene.setpoint_um + scene.trim_um
+        centre_um = context.setpoint_um + context.trim_um
         try:
-            begun = trial.begin_trial(spec, scene.loop_config, scene.pump_config, centre_um)
-            scene.begin_trial(trial.Trial(begun, self._config.loop.rate_hz))
+            begun = trial.begin_trial(spec, context.loop_config, context.pump_config, centre_um)
+            context.begin_trial(trial.Trial(begun, self._config.loop.rate_hz))
         except ValueError as error:
             return str(error)
-        scene.hold_wanted = False
+        context.hold_wanted = False
         return ""
 
     def _set_gains(self, loop: LoopConfig) -> None:
-        scene, pump = self._scene, self._gains.in_force.pump
-        if pump != scene.pump_config:
-            scene.loop.set_pump(pump)
-        scene.loop_config, scene.pump_config = loop, pump
-        scene.loop.set_gains(loop)
+        context, pump = self._context, self._gains.in_force.pump
+        if pump != context.pump_config:
+            context.loop.set_pump(pump)
+        context.loop_config, context.pump_config = loop, pump
+        context.loop.set_gains(loop)
         self._holders.set_gains(loop)
         self._consistency.set_gains(loop, pump)
         self._shape.set_memory(self._gains.in_force.shape_time_constant_s)
@@ -363,18 +368,18 @@ class Controller:
         """Step the setpoint as the trial asks, with the shape loop off; after the trial both are as
         before it.
         """
-        scene, step_um = self._scene, self._gains.setpoint_step_um
+        context, step_um = self._context, self._gains.setpoint_step_um
         stepped = math.isfinite(self.memory.setpoint_back_um)
         if math.isfinite(step_um):
             if not stepped:
-                self.memory.setpoint_back_um = scene.setpoint_um
+                self.memory.setpoint_back_um = context.setpoint_um
                 self.memory.shape_back = self._shape.on
-                self._shape.switch(False, scene.now_s)
-            scene.setpoint_um = self.memory.setpoint_back_um + step_um
+                self._shape.switch(False, context.now_s)
+            context.setpoint_um = self.memory.setpoint_back_um + step_um
         elif stepped:
-            scene.setpoint_um = self.memory.setpoint_back_um
+            context.setpoint_um = self.memory.setpoint_back_um
             self.memory.setpoint_back_um = math.nan
-            self._shape.switch(self.memory.shape_back, scene.now_s)
+            self._shape.switch(self.memory.shape_back, context.now_s)
 
     def _revert_gains(self, why: str, events: list[told.Event]) -> None:
         self._gains.revert()
@@ -383,35 +388,35 @@ class Controller:
 
     def _consider_resuming(self, observation: safety.Observation) -> None:
         """Decide whether a latched fault may clear automatically (`resume`)."""
-        scene, resume = self._scene, self._resume
+        context, resume = self._context, self._resume
         if self.state != State.FAULT or self.fault is None:
             resume.forget()
-            scene.may_resume = scene.resume_possible = False
+            context.may_resume = context.resume_possible = False
             return
-        scene.may_resume = resume.due(self.fault, scene.levels, observation, scene.now_s)
-        scene.resume_possible = resume.possible
+        context.may_resume = resume.due(self.fault, context.levels, observation, context.now_s)
+        context.resume_possible = resume.possible
         self._clear_mask |= resume.clear_mask
 
     def _apply(self, verdict: safety.Verdict, events: list[told.Event]) -> None:
         """Enter the safe level of the verdict; every level below HOLD_FLOW latches the fault."""
-        scene, levels = self._scene, self._scene.levels
+        context, levels = self._context, self._context.levels
         rule = verdict.rule
         if rule is None:
             if levels.safe_level == SafeLevel.HOLD_FLOW:
-                levels.clear(scene.now_s)
+                levels.clear(context.now_s)
                 events.append(told.Cleared(self.fault.name if self.fault else ""))
                 self.fault = None
             return
         if self.fault is None or (verdict.safe_level > SafeLevel.HOLD_FLOW >= levels.safe_level):
             self.fault = rule
             events.append(rule.fault(verdict.seen, verdict.safe_level))
-        levels.enter(verdict.safe_level, scene.now_s)
-        if levels.step(scene.now_s) > SafeLevel.HOLD_FLOW and self.state != State.FAULT:
+        levels.enter(verdict.safe_level, context.now_s)
+        if levels.step(context.now_s) > SafeLevel.HOLD_FLOW and self.state != State.FAULT:
             self._go(State.FAULT, f"{self.fault.name}: {self.fault.cause}", events)
 
     def _step_shape(self, inputs: TickInputs, events: list[told.Event]) -> shape_loop.ShapeOutput:
-        scene = self._scene
-        settled = self.state == State.HOLD and scene.levels.safe_level == SafeLevel.NONE
+        context = self._context
+        settled = self.state == State.HOLD and context.levels.safe_level == SafeLevel.NONE
         if self._consistency.laser_moved and self._shape.on:
             self._shape.lock(inputs.now_s)
         distrust = self._consistency.camera_distrust
@@ -420,16 +425,16 @@ class Controller:
         try:
             shape = self._shape.step(
                 inputs.now_s,
-                scene.dt_s,
+                context.dt_s,
                 inputs.estimate,
-                scene.observer.displacement_um,
+                context.observer.displacement_um,
                 settled,
                 distrust,
             )
         except (ValueError, ArithmeticError, LinAlgError) as error:
             self.memory.tick_error = f"shape loop: {type(error).__name__}: {error}"
             shape = self._shape.output(inputs.now_s)
-        scene.trim_um = shape.trim_um if self.state in safety.MOVING else 0.0
+        context.trim_um = shape.trim_um if self.state in safety.MOVING else 0.0
         reported = ReportedShape(shape.state, shape.reason.code)
         if reported != self.memory.reported_shape:
             self.memory.reported_shape = reported
@@ -440,58 +445,60 @@ class Controller:
 
     def _act(self, events: list[told.Event]) -> None:
         """Run the state's handler; everything is off unless it sets it."""
-        scene = self._scene
-        scene.output, scene.pump_fraction, scene.vent_fraction = None, 0.0, 0.0
+        context = self._context
+        context.output, context.pump_fraction, context.vent_fraction = None, 0.0, 0.0
         try:
-            wanted = states.run_state(self.state, scene)
+            wanted = states.run_state(self.state, context)
         except Exception as error:
             self.memory.tick_error = f"{type(error).__name__}: {error}"
             # an error must not close an open vent
-            vents = scene.venting or scene.levels.safe_level == SafeLevel.VENT
-            scene.output, scene.pump_fraction, scene.vent_fraction = None, 0.0, float(vents)
+            vents = context.venting or context.levels.safe_level == SafeLevel.VENT
+            context.output, context.pump_fraction, context.vent_fraction = None, 0.0, float(vents)
             if self.state == State.FAULT:  # no safer state is left
-                scene.finished = errors.Exit.SAFETY_TRIP
+                context.finished = errors.Exit.SAFETY_TRIP
             return
-        for name, fraction in (("pump", scene.pump_fraction), ("vent", scene.vent_fraction)):
+        for name, fraction in (("pump", context.pump_fraction), ("vent", context.vent_fraction)):
             if not 0.0 <= fraction <= 1.0:
                 self.memory.tick_error = (
                     f"{name} command {fraction} from state {self.state.name.lower()}"
                 )
-                scene.pump_fraction, scene.vent_fraction = 0.0, 0.0
+                context.pump_fraction, context.vent_fraction = 0.0, 0.0
         if wanted != self.state:
-            self._go(wanted, scene.why.text, events)
+            self._go(wanted, context.why.text, events)
 
     def _go(self, state: State, why: str, events: list[told.Event]) -> None:
-        scene = self._scene
+        context = self._context
         events.append(told.StateEntered(state.name.lower(), self.state.name.lower(), why))
         if self.state == State.TUNE:
             self._tell_trial(why, events)
         if state != State.TUNE:
-            scene.end_trial()
+            context.end_trial()
         if state == State.FAULT and self._gains.on_trial:
             self._revert_gains("a fault occurred during the trial", events)
         if self.state == State.FAULT:  # acknowledged, or may resume
-            if not scene.acknowledged and self.fault is not None:
-                self._resume.resumed(scene.now_s)
+            if not context.acknowledged and self.fault is not None:
+                self._resume.resumed(context.now_s)
                 events.append(told.Resumed(self.fault.name))
             self.fault = None
             self.memory.tick_error = ""
-            scene.levels.leave()
-            scene.acknowledged = False
+            context.levels.leave()
+            context.acknowledged = False
         if state == State.STANDBY:
-            scene.venting = False
-        scene.manual_wanted = scene.paused = False  # they end with their hold
+            context.venting = False
+        context.manual_wanted = context.paused = False  # they end with their hold
         self.memory.state = state
         self.memory.state_since_s = math.nan
-        scene.good_since_s = scene.last_good_s = scene.highest_um = scene.highest_s = math.nan
-        scene.overdue = scene.unfit = ""
-        scene.test_memory = None
+        context.good_since_s = context.last_good_s = context.highest_um = context.highest_s = (
+            math.nan
+        )
+        context.overdue = context.unfit = ""
+        context.test_memory = None
 
     def _tell_trial(self, why: str, events: list[told.Event]) -> None:
         """Report how the experiment ended: by itself, or because the state changed."""
-        experiment = self._scene.trial
+        experiment = self._context.trial
         assert experiment is not None
-        ended = self._scene.trial_ended or Finished(ExperimentEnd.INTERRUPTED, why)
+        ended = self._context.trial_ended or Finished(ExperimentEnd.INTERRUPTED, why)
         events.append(
             told.ExperimentEnded(
                 experiment.spec.kind, ended.completed, ended.reason, ended.end.value
@@ -500,11 +507,11 @@ class Controller:
 
     def _tell_why(self, events: list[told.Event]) -> None:
         """Report the operator's line once its reason (not its numbers) has changed durably."""
-        scene, memory = self._scene, self.memory
-        code = scene.why.code
+        context, memory = self._context, self.memory
+        code = context.why.code
         if code != memory.why_code:
             memory.why_code = code
-            memory.why_since_s = scene.now_s
-        if code != memory.reported_why_code and scene.now_s - memory.why_since_s >= _WHY_STANDS_S:
+            memory.why_since_s = context.now_s
+        if code != memory.reported_why_code and context.now_s - memory.why_since_s >= _WHY_STANDS_S:
             memory.reported_why_code = code
-            events.append(told.Why(scene.why.text, code))
+            events.append(told.Why(context.why.text, code))

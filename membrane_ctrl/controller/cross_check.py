@@ -19,10 +19,10 @@ from firmware_iface.settings import ModbusInputConfig, VaisalaPtb330Config
 from membrane_ctrl.config.schema import Config, DevicesConfig
 from membrane_ctrl.control import pump_curve
 from membrane_ctrl.controller import (
+    actuator_test,
     cross_check_bridges,
     cross_check_interlocks,
     cross_check_plant,
-    pump_obeys,
     safety,
 )
 from membrane_ctrl.model.errors import FindingsError
@@ -221,7 +221,7 @@ def _states(config: Config, say: cross_check_plant.ConfigFindings) -> None:
         )
     needed_s = states.check_s
     if states.actuator_test:
-        needed_s = pump_obeys.ActuatorTest(config.pump, True, config.loop.rate_hz).duration_s
+        needed_s = actuator_test.ActuatorTest(config.pump, True, config.loop.rate_hz).duration_s
     why, least = (
         f"too short: the check takes {needed_s:.1f} s",
         f"set at least {2.0 * needed_s:.0f} s",
@@ -317,7 +317,7 @@ def _board(config: Config, board: BenchIdentity, say: cross_check_plant.ConfigFi
         f"takes a command of {needed:.2f}, {most}",
         remedy,
     )
-    test = max(part.pump_fraction for part in pump_obeys.PARTS)
+    test = max(part.pump_fraction for part in actuator_test.PARTS)
     refused = config.states.actuator_test and test > limit + 1e-9
     remedy = "raise the board's limit, or omit the test"
     say.error(refused, "states.actuator_test", f"commands {test:g}, {most}", remedy)

@@ -11,7 +11,7 @@ from firmware_iface.settings import ModbusMapConfig, Optoncdt1420Config
 from membrane_ctrl.config import sight
 from membrane_ctrl.config.schema import Config, LoopConfig, OpticsConfig
 from membrane_ctrl.control import film_monitor, leak_growth, loop_margins, pump_curve
-from membrane_ctrl.controller import pump_obeys, safety
+from membrane_ctrl.controller import actuator_test, safety
 
 Severity = Literal["error", "warning"]
 
@@ -79,7 +79,7 @@ def judge_pump(config: Config, say: ConfigFindings) -> None:
     why = f"must lie between dead_fraction ({least:g}) and start_fraction ({pump.start_fraction:g})"
     ordered = least <= pump.stall_fraction <= pump.start_fraction
     say.error(not ordered, "pump.stall_fraction", why, "measure all three")
-    test_fraction = max(part.pump_fraction for part in pump_obeys.PARTS)
+    test_fraction = max(part.pump_fraction for part in actuator_test.PARTS)
     if pump.start_fraction >= test_fraction:
         why = f"the actuator test commands {test_fraction:g}, which would not start the pump"
         say.error(

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from membrane_ctrl.control import (
     inner_loop,
 )
-from membrane_ctrl.controller.scene import Scene
+from membrane_ctrl.controller.tick_context import TickContext
 from membrane_ctrl.model.shape_estimate import ShapeEstimate
 
 
@@ -34,22 +34,22 @@ class HoldStatus:
 
 
 def hold_status(
-    scene: Scene, last: inner_loop.LoopOutput, optics_hold: bool, optics_usable: bool = True
+    context: TickContext, last: inner_loop.LoopOutput, optics_hold: bool, optics_usable: bool = True
 ) -> HoldStatus:
     """The mirror after the tick's reading was taken; `last` is what the loop gave in the tick
     before.
     """
     return HoldStatus(
-        laser_um=scene.observer.moving_laser_um,
-        gauge_pressure_pa=scene.observer.gauge_pressure_pa,
-        setpoint_um=scene.setpoint_um,
-        trim_um=scene.trim_um,
-        ramp_left_um=scene.setpoint_um + scene.trim_um - last.setpoint_um,
+        laser_um=context.observer.moving_laser_um,
+        gauge_pressure_pa=context.observer.gauge_pressure_pa,
+        setpoint_um=context.setpoint_um,
+        trim_um=context.trim_um,
+        ramp_left_um=context.setpoint_um + context.trim_um - last.setpoint_um,
         leak_um_per_s=last.leak_um_per_s,
         flow_um_per_s=last.flow_um_per_s,
-        bleed_fraction=scene.loop_config.bleed_fraction,
+        bleed_fraction=context.loop_config.bleed_fraction,
         optics_hold=optics_hold,
-        sag_um=scene.observer.figures.sag_um,
-        figure=scene.observer.figures.accepted,
+        sag_um=context.observer.figures.sag_um,
+        figure=context.observer.figures.accepted,
         optics_usable=optics_usable,
     )

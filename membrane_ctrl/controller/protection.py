@@ -83,7 +83,7 @@ class Duty(Enum):
 class Guard(Enum):
     """Protections beside the rules of the safety table; the value is a sentence for people."""
 
-    MANUAL_RANGE = "a pause or manual flow ends beyond `states.manual_range_um` (`scene.py`)"
+    MANUAL_RANGE = "a pause or manual flow ends beyond `states.manual_range_um` (`tick_context.py`)"
     EXPERIMENT = (
         "an experiment ends near its limit, and brings the mirror back "
         "(`experiments/excursion_guard.py`)"

@@ -11,14 +11,15 @@ from membrane_ctrl.config.schema import Config
 from membrane_ctrl.control.inner_loop import InnerLoopState
 from membrane_ctrl.control.shape_loop import ShapeLoopMemory
 from membrane_ctrl.controller.centre_estimation import CentreEstimationState
-from membrane_ctrl.controller.commands import GainsInForce, GainsState
+from membrane_ctrl.controller.gains_trial import GainsInForce, GainsState
 from membrane_ctrl.controller.interlocks import InterlocksState
 from membrane_ctrl.controller.observer import ObserverState
-from membrane_ctrl.controller.pump_obeys import StandstillState
-from membrane_ctrl.controller.safe_levels import ResumeState, SafeLevelsState
+from membrane_ctrl.controller.resume_rule import ResumeState
+from membrane_ctrl.controller.safe_levels import SafeLevelsState
 from membrane_ctrl.controller.safety import SafetyState
-from membrane_ctrl.controller.scene import SceneState
 from membrane_ctrl.controller.sensor_consistency import SensorConsistencyState
+from membrane_ctrl.controller.standstill import StandstillState
+from membrane_ctrl.controller.tick_context import TickContextState
 from membrane_ctrl.model.state_tree import Count, StateNode
 from membrane_ctrl.model.telemetry import ShapeState, State
 
@@ -36,7 +37,7 @@ class ControllerState(StateNode):
     """All that a tick needs of the ticks before it."""
 
     gains: GainsState
-    scene: SceneState
+    context: TickContextState
     consistency: SensorConsistencyState
     ticks: Count = 0
     state: State = State.STANDBY
@@ -65,6 +66,6 @@ def first_state(config: Config) -> ControllerState:
     gains = GainsInForce(config.loop, config.shape.time_constant_s, config.pump)
     return ControllerState(
         gains=GainsState(good=gains, tried=gains),
-        scene=SceneState(config.loop.setpoint_um),
+        context=TickContextState(config.loop.setpoint_um),
         consistency=SensorConsistencyState(config.loop.setpoint_um, config.loop.bleed_fraction),
     )

@@ -3,8 +3,8 @@ descriptions.
 
 Each field of `ColumnValues` is a column, and its `column(...)` is the column's row of the table. To
 add a column, add a field here, and its value where the controller makes the row
-(`controller/scene.py`). The recording, the run's tables, the viewer's plots, page, console, `ctl
-status`, bridges, report, Grafana dashboard and docs/reference/telemetry.md are made from this
+(`controller/telemetry_row.py`). The recording, the run's tables, the viewer's plots, page, console,
+`ctl status`, bridges, report, Grafana dashboard and docs/reference/telemetry.md are made from this
 table.
 
 An identifier ends in its unit (`error_um`), people read the unit as usual (µm): `unit_of` gives one

@@ -43,7 +43,7 @@ from membrane_ctrl.config.schema import (
 from membrane_ctrl.control.experiments.spec import ExperimentSpec
 from membrane_ctrl.controller import states
 from membrane_ctrl.controller.commands import Command, Kind
-from membrane_ctrl.controller.scene import Scene
+from membrane_ctrl.controller.tick_context import TickContext
 from membrane_ctrl.hold.virtual_run import TruthShape, VirtualRun
 from membrane_ctrl.metrology.optics.film_law import zernike_projection
 from membrane_ctrl.model.telemetry import SafeLevel, State
@@ -279,10 +279,10 @@ def _raising(case: Case, injection: Injection) -> Iterator[None]:
     before = dict(states.HANDLERS)
 
     def breaking(state: State) -> None:
-        def handler(scene: Scene) -> State:
+        def handler(context: TickContext) -> State:
             if not math.isnan(injection.started_s) and state != State.FAULT:
                 raise ZeroDivisionError("injected")
-            return before[state](scene)
+            return before[state](context)
 
         states.HANDLERS[state] = handler
 

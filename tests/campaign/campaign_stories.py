@@ -15,7 +15,7 @@ from campaign_world import World
 
 from membrane_ctrl.controller import states
 from membrane_ctrl.controller.commands import Command, Kind
-from membrane_ctrl.controller.scene import Scene
+from membrane_ctrl.controller.tick_context import TickContext
 from membrane_ctrl.model.telemetry import State
 
 
@@ -271,8 +271,8 @@ def a_handler_that_gives_nonsense() -> list[str]:
     for nonsense in (math.nan, 2.0, -1.0, math.inf):
         stage = Stage().held()
 
-        def wrong(scene: Scene, value: float = nonsense) -> State:
-            scene.pump_fraction = value
+        def wrong(context: TickContext, value: float = nonsense) -> State:
+            context.pump_fraction = value
             return State.HOLD
 
         states.HANDLERS[State.HOLD] = wrong

@@ -18,7 +18,7 @@ from membrane_ctrl.config.schema import Config, LoopConfig, PumpConfig
 from membrane_ctrl.control_port.protocol import Peer
 from membrane_ctrl.control_port.server import Port, RunHooks
 from membrane_ctrl.control_port.sockets import Listeners, UnixListener, listeners_for
-from membrane_ctrl.controller.commands import Command, refusal
+from membrane_ctrl.controller.commands import Command, explain_refusal
 from membrane_ctrl.controller.tick import TickOutputs
 from membrane_ctrl.model.events import Event, EventLine
 from membrane_ctrl.model.telemetry import FIELDS, State, TelemetryRow
@@ -87,7 +87,7 @@ class PortRun:
             asyncio.get_running_loop().call_soon(self._tick, command)
 
     def _tick(self, command: Command) -> None:
-        answer = (command.number, refusal(command, self.state, self.config))
+        answer = (command.number, explain_refusal(command, self.state, self.config))
         self.tick(answers=(answer,))
 
     def tick(

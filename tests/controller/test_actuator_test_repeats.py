@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from membrane_ctrl.config.schema import Config, LoopConfig, PumpConfig, ShapeConfig, TwinConfig
+from membrane_ctrl.controller.actuator_test import ActuatorTest
 from membrane_ctrl.controller.commands import Command
-from membrane_ctrl.controller.pump_obeys import ActuatorTest
 from membrane_ctrl.hold.virtual_run import VirtualRun
 from membrane_ctrl.metrology.optics.film_law import zernike_projection
 from membrane_ctrl.model.telemetry import State

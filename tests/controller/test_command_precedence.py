@@ -14,7 +14,7 @@ import pytest
 from firmware_iface.roles import BenchReading
 from membrane_ctrl.config.schema import Config, LoopConfig, ShapeConfig, StatesConfig
 from membrane_ctrl.control.experiments.spec import ExperimentSpec
-from membrane_ctrl.controller.commands import DOWN, TABLE, Command, Kind, in_order
+from membrane_ctrl.controller.commands import DOWN, TABLE, Command, Kind, sort_commands
 from membrane_ctrl.controller.controller import Controller
 from membrane_ctrl.controller.safety import MOVING
 from membrane_ctrl.controller.tick import TickInputs, TickOutputs
@@ -244,5 +244,5 @@ def test_a_vent_in_the_tick_of_a_fault_opens_the_vent() -> None:
 
 def test_the_order_is_the_one_of_the_table_and_else_as_they_came() -> None:
     kinds: tuple[Kind, ...] = ("hold", "lower", "mark", "stop", "vent", "latch", "ack")
-    ordered = [made.kind for made in in_order(command(kind) for kind in kinds)]
+    ordered = [made.kind for made in sort_commands(command(kind) for kind in kinds)]
     assert ordered == [*DOWN, "hold", "mark", "ack"]

@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 
 from membrane_ctrl.config.schema import Config, ShapeConfig
-from membrane_ctrl.controller.commands import TABLE, Command, refusal
+from membrane_ctrl.controller.commands import TABLE, Command, explain_refusal
 from membrane_ctrl.model.telemetry import State
 
 WITHOUT_SHAPE = Config(shape=ShapeConfig(enabled=False))
@@ -14,10 +14,10 @@ WITHOUT_SHAPE = Config(shape=ShapeConfig(enabled=False))
 @pytest.mark.parametrize("state", sorted(TABLE["capture"].states))
 def test_no_picture_is_promised_where_nothing_measures(state: State) -> None:
     capture = Command("capture", "tester")
-    assert "no shape measurement" in refusal(capture, state, WITHOUT_SHAPE)
-    assert refusal(capture, state, Config()) == ""
+    assert "no shape measurement" in explain_refusal(capture, state, WITHOUT_SHAPE)
+    assert explain_refusal(capture, state, Config()) == ""
 
 
 @pytest.mark.parametrize("state", sorted(set(State) - {State.STANDBY, State.FAULT}))
 def test_nothing_is_acknowledged_where_nothing_is_latched(state: State) -> None:
-    assert "ack is not allowed" in refusal(Command("ack", "anybody"), state, Config())
+    assert "ack is not allowed" in explain_refusal(Command("ack", "anybody"), state, Config())

@@ -219,7 +219,7 @@ def test_missing_sensors_never_start_the_pump() -> None:
 def test_an_error_in_the_control_code_stops_the_pump(monkeypatch: pytest.MonkeyPatch) -> None:
     from membrane_ctrl.controller import states
 
-    def broken(scene: states.Scene) -> State:
+    def broken(context: states.TickContext) -> State:
         raise ZeroDivisionError("x / 0")
 
     monkeypatch.setitem(states.HANDLERS, State.HOLD, broken)
@@ -277,9 +277,9 @@ def test_a_command_that_no_bench_takes_is_an_error_of_the_control_code(
 ) -> None:
     from membrane_ctrl.controller import states
 
-    def broken(scene: states.Scene) -> State:
-        scene.pump_fraction = 0.5
-        setattr(scene, field, value)
+    def broken(context: states.TickContext) -> State:
+        context.pump_fraction = 0.5
+        setattr(context, field, value)
         return State.STANDBY
 
     monkeypatch.setitem(states.HANDLERS, State.STANDBY, broken)
@@ -291,7 +291,7 @@ def test_a_command_that_no_bench_takes_is_an_error_of_the_control_code(
 def test_an_error_in_a_vented_fault_leaves_the_vent_open(monkeypatch: pytest.MonkeyPatch) -> None:
     from membrane_ctrl.controller import states
 
-    def broken(scene: states.Scene) -> State:
+    def broken(context: states.TickContext) -> State:
         raise ZeroDivisionError("x / 0")
 
     monkeypatch.setitem(states.HANDLERS, State.FAULT, broken)

@@ -57,7 +57,7 @@ def refusals(outputs: TickOutputs) -> list[str]:
 
 
 def words(mirror: Mirror) -> list[str]:
-    return [each.word for each in mirror.controller._scene.locks]
+    return [each.word for each in mirror.controller._context.locks]
 
 
 def locked(*of: Lock, state: State = State.STANDBY) -> Mirror:
@@ -110,9 +110,9 @@ def test_a_lock_set_during_a_fault_is_kept_after_its_ack() -> None:
 
 def test_a_hold_that_was_wanted_already_does_not_begin_with_a_lock() -> None:
     mirror = in_state(State.STANDBY)
-    mirror.controller._scene.hold_wanted = True
+    mirror.controller._context.hold_wanted = True
     give(mirror, lock(ANN))
-    mirror.controller._scene.hold_wanted = True  # as the resume rule does
+    mirror.controller._context.hold_wanted = True  # as the resume rule does
     for _ in range(5):
         assert mirror.tick().row.state == State.STANDBY
 
@@ -229,7 +229,7 @@ def test_a_replay_of_the_recorded_inputs_decides_the_same() -> None:
         (record,) = taken.records
         replayed = again.controller.tick(unpack_tick(record, taken.tails[mirror.ticks], {}))
         assert replayed.events == outputs.events
-        assert again.controller._scene.locks == mirror.controller._scene.locks
+        assert again.controller._context.locks == mirror.controller._context.locks
     assert words(mirror) == []
 
 
@@ -253,7 +253,7 @@ def test_inputs_of_earlier_versions_have_neither_lock_nor_account() -> None:
 def test_the_locks_are_part_of_the_controllers_memory() -> None:
     mirror = locked(ANN, BOB)
     again = continue_from(take_snapshot(mirror.controller), CONFIG, zernike_projection())
-    assert again.memory.scene.locks == (ANN, BOB)
+    assert again.memory.context.locks == (ANN, BOB)
 
 
 def test_the_status_has_the_locks_until_each_is_removed() -> None:
@@ -261,7 +261,7 @@ def test_the_status_has_the_locks_until_each_is_removed() -> None:
     for batch in ((lock(ANN), lock(BOB)), (unlock("bofak"),)):
         for event in give(mirror, *batch).events:
             status = status.after_event(event)
-        assert status.locks == mirror.controller._scene.locks
+        assert status.locks == mirror.controller._context.locks
     assert status.locks == (BOB,)
 
 

@@ -19,7 +19,8 @@ from membrane_ctrl.config.schema import (
     StatesConfig,
 )
 from membrane_ctrl.controller.commands import AT_START, Command
-from membrane_ctrl.controller.safe_levels import ResumeRule, SafeLevels
+from membrane_ctrl.controller.resume_rule import ResumeRule
+from membrane_ctrl.controller.safe_levels import SafeLevels
 from membrane_ctrl.controller.safety import TABLE, Observation
 from membrane_ctrl.hold.scenario import At
 from membrane_ctrl.hold.virtual_run import VirtualRun

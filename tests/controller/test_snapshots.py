@@ -102,9 +102,12 @@ def test_two_controllers_are_compared_field_by_field() -> None:
     one, other = resume(SNAPSHOT), resume(SNAPSHOT)
     assert find_differences(one.memory, other.memory) == []
     other.memory.loop.integrator.error_um += 1.0
-    other.memory.scene.asked_by = "ann"
+    other.memory.context.asked_by = "ann"
     found = find_differences(one.memory, other.memory)
-    assert [each.split(":")[0] for each in found] == ["scene.asked_by", "loop.integrator.error_um"]
+    assert [each.split(":")[0] for each in found] == [
+        "context.asked_by",
+        "loop.integrator.error_um",
+    ]
 
 
 def test_a_snapshot_is_small_and_needs_no_other_file() -> None:
@@ -156,7 +159,7 @@ def test_what_is_no_snapshot_is_refused(snapshot: bytes) -> None:
         ("ticks", -1),
         ("ticks", 2**63),
         ("ticks", None),
-        ("scene.paused", 1),
+        ("context.paused", 1),
         ("tick_error", None),
         ("why_since_s", "nan"),
         ("why_since_s", [0.0]),
@@ -168,10 +171,10 @@ def test_what_is_no_snapshot_is_refused(snapshot: bytes) -> None:
         ("gains.good.loop", "loop"),
         ("gains.tried.loop", {"rate_hz": "fast"}),
         ("gains.tried.loop.kp_per_s", -1e9),
-        ("scene.way_down", "sideways"),
-        ("scene.trial_memory", {"spec": {}}),
-        ("scene.test_memory", {"pump": {}}),
-        ("scene.output", {"setpoint_um": 0.0}),
+        ("context.way_down", "sideways"),
+        ("context.trial_memory", {"spec": {}}),
+        ("context.test_memory", {"pump": {}}),
+        ("context.output", {"setpoint_um": 0.0}),
         ("observer.stamp", [1]),
         ("observer.stamp", [1, 2.0, 3]),
         ("safety.history", {"over_pressure": 1}),
@@ -270,7 +273,7 @@ def test_numbers_words_and_containers_come_back_as_they_were() -> None:
 
 def test_a_value_of_a_wrong_type_in_the_memory_is_an_error_of_the_program() -> None:
     controller = fresh()
-    controller.memory.scene.asked_by = lambda: None  # type: ignore[assignment]
+    controller.memory.context.asked_by = lambda: None  # type: ignore[assignment]
     with pytest.raises(ValueError, match="serialize"):
         take_snapshot(controller)
 

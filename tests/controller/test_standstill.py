@@ -9,7 +9,7 @@ import pytest
 
 from firmware_iface.roles import BenchReading
 from membrane_ctrl.config.schema import Config, LoopConfig, TwinConfig
-from membrane_ctrl.controller.pump_obeys import Standstill
+from membrane_ctrl.controller.standstill import Standstill
 from membrane_ctrl.sim.plant import Plant
 
 CONFIG = Config()

@@ -16,7 +16,7 @@ from pydantic import ValidationError
 from membrane_ctrl.config.schema import Config, LoopConfig, PumpConfig, ShapeConfig, TwinConfig
 from membrane_ctrl.control.experiments.spec import ExperimentSpec
 from membrane_ctrl.control.pump_drift import PumpScale
-from membrane_ctrl.controller.commands import Command, refusal
+from membrane_ctrl.controller.commands import Command, explain_refusal
 from membrane_ctrl.controller.controller import Controller
 from membrane_ctrl.controller.snapshot import continue_from, take_snapshot
 from membrane_ctrl.controller.tick import TickInputs
@@ -219,9 +219,11 @@ def test_an_experiment_asked_for_in_the_tick_of_a_fault_never_runs() -> None:
 
 
 def test_it_runs_in_hold_only() -> None:
-    assert "in hold" in refusal(tune(), State.SETTLE, CONFIG)
-    assert refusal(tune(), State.HOLD, CONFIG) == ""
-    assert refusal(Command("tune", "tester"), State.HOLD, CONFIG) == "tune: experiment missing"
+    assert "in hold" in explain_refusal(tune(), State.SETTLE, CONFIG)
+    assert explain_refusal(tune(), State.HOLD, CONFIG) == ""
+    assert (
+        explain_refusal(Command("tune", "tester"), State.HOLD, CONFIG) == "tune: experiment missing"
+    )
 
 
 def test_without_room_for_it_the_command_is_refused_with_the_remedy() -> None:
@@ -308,7 +310,7 @@ def test_the_shape_loop_s_time_constant_goes_on_trial_with_the_gains() -> None:
     assert told(gains(0.3))[1] == 90.0  # gains alone leave it
     assert told(tried(60.0, 1.0))[1] == 60.0
     assert told()[1] == 90.0
-    assert "outside" in refusal(tried(0.5), State.HOLD, CONFIG)
+    assert "outside" in explain_refusal(tried(0.5), State.HOLD, CONFIG)
 
 
 class Stepped:
@@ -327,7 +329,7 @@ class Stepped:
             TickInputs(now_s=self.now_s, dt_s=0.02, reading=None, commands=commands)
         )
         assert not any(refused for _, refused in out.answers), out.answers
-        return self.controller._scene.setpoint_um, self.controller._shape.on
+        return self.controller._context.setpoint_um, self.controller._shape.on
 
 
 def stepped(step_um: float, trial_s: float = 10.0) -> Command:
@@ -366,7 +368,7 @@ def test_a_fault_ends_a_step() -> None:
     held.go(2.0, stepped(5.0, 600.0))
     held.bench.wrong.gauge_offset_pa = 500.0
     held.go(1.0)
-    assert held._run._supervisor._controller._scene.setpoint_um == 0.0
+    assert held._run._supervisor._controller._context.setpoint_um == 0.0
 
 
 def test_a_step_survives_in_the_memory_of_a_controller() -> None:
@@ -377,7 +379,7 @@ def test_a_step_survives_in_the_memory_of_a_controller() -> None:
 
 
 def test_a_step_without_a_trial_or_beyond_the_limits_is_refused() -> None:
-    assert "for a trial" in refusal(stepped(5.0, math.nan), State.HOLD, CONFIG)
+    assert "for a trial" in explain_refusal(stepped(5.0, math.nan), State.HOLD, CONFIG)
     assert "outside the limits" in Stepped().controller._prepare(stepped(1e6))
 
 
@@ -418,7 +420,7 @@ def test_a_curve_that_is_kept_stays_with_later_gains_and_its_memory_can_be_recal
     assert controller.pump_config == TWICE
     again = continue_from(take_snapshot(controller), CONFIG, zernike_projection())
     assert again.pump_config == TWICE
-    assert again._scene.loop._curve.flow(1.0) == 10.6
+    assert again._context.loop._curve.flow(1.0) == 10.6
 
 
 def test_the_flow_of_the_curve_in_force_bounds_what_a_person_may_ask_for() -> None:
@@ -460,7 +462,7 @@ def test_the_events_of_older_commands_have_no_new_keys() -> None:
 
 
 def test_a_trial_of_no_time_is_refused() -> None:
-    assert "on trial" in refusal(gains(0.3, 0.0), State.HOLD, CONFIG)
+    assert "on trial" in explain_refusal(gains(0.3, 0.0), State.HOLD, CONFIG)
 
 
 def test_the_command_survives_its_record() -> None:

@@ -6,20 +6,17 @@ import math
 from dataclasses import dataclass, field, fields
 from typing import Any, Literal
 
-from firmware_iface.roles import NO_READING
 from membrane_ctrl.config.schema import Config, LoopConfig, PumpConfig
-from membrane_ctrl.control import inner_loop, line_slope, shape_loop
+from membrane_ctrl.control import inner_loop, line_slope
 from membrane_ctrl.control.centre_estimate import CentreEstimate
 from membrane_ctrl.control.experiments.experiment import Finished
 from membrane_ctrl.control.experiments.trial import Trial, TrialState
 from membrane_ctrl.controller import (
+    actuator_test,
     commands,
     interlocks,
-    pump_obeys,
     safe_levels,
-    safety,
-    tick,
-    tick_codec,
+    standstill,
 )
 from membrane_ctrl.controller.observer import Observer
 from membrane_ctrl.model import errors, telemetry
@@ -32,7 +29,7 @@ _MOVES = frozenset({"hold", "stop", "pause", "manual", "tune", "ack", "lower", "
 
 
 @dataclass(slots=True)
-class SceneState(StateNode):
+class TickContextState(StateNode):
     """Requests, the states' own memory, and what the next tick needs of the last one."""
 
     setpoint_um: float
@@ -61,7 +58,7 @@ class SceneState(StateNode):
     sinking: line_slope.Slope = field(
         default_factory=line_slope.Slope
     )  # of the mirror with the pump off, in `check`
-    test_memory: pump_obeys.ActuatorTestState | None = None  # of the actuator test, in `check`
+    test_memory: actuator_test.ActuatorTestState | None = None  # of the actuator test, in `check`
     ramp_from_fraction: float = 0.0
     # of the last tick
     last_pump_fraction: float = 0.0
@@ -76,7 +73,7 @@ class SceneState(StateNode):
 
 
 @dataclass(slots=True, kw_only=True)
-class Scene(SceneState):
+class TickContext(TickContextState):
     """Data that the handlers share: their memory, the loop, the facts of this tick, and the
     decisions.
     """
@@ -87,7 +84,7 @@ class Scene(SceneState):
     loop: inner_loop.InnerLoop
     observer: Observer
     levels: safe_levels.SafeLevels
-    standstill: pump_obeys.Standstill
+    standstill: standstill.Standstill
     interlocks: interlocks.Interlocks
     trial: Trial | None = None  # an experiment, until its end is reported
     # this tick
@@ -144,100 +141,39 @@ class Scene(SceneState):
         return self.now_s - self.good_since_s
 
 
-def values_of(memory: SceneState) -> dict[str, Any]:
-    """The fields of a memory by name, to make a `Scene` of."""
-    return {field.name: getattr(memory, field.name) for field in fields(SceneState)}
+def collect_state_fields(memory: TickContextState) -> dict[str, Any]:
+    """The fields of a memory by name, to make a `TickContext` of."""
+    return {field.name: getattr(memory, field.name) for field in fields(TickContextState)}
 
 
-def obey(scene: Scene, command: commands.Command, state: telemetry.State) -> None:
-    """Take an accepted command's request into the scene; the controller does the rest."""
+def apply_command(context: TickContext, command: commands.Command, state: telemetry.State) -> None:
+    """Take an accepted command's request into the context; the controller does the rest."""
     match command.kind:
         case "hold":
-            scene.hold_wanted = True
+            context.hold_wanted = True
         case "manual":
-            scene.manual_wanted, scene.manual_um_per_s = True, command.value
-            scene.manual_since_s = scene.now_s
+            context.manual_wanted, context.manual_um_per_s = True, command.value
+            context.manual_since_s = context.now_s
         case "pause" | "resume":
-            scene.paused = command.kind == "pause"
+            context.paused = command.kind == "pause"
         case "setpoint":
-            scene.setpoint_um = command.value
+            context.setpoint_um = command.value
         case "latched":
-            scene.latched = command.text
+            context.latched = command.text
         case "latch":
-            scene.hold_wanted = scene.acknowledged = False
+            context.hold_wanted = context.acknowledged = False
         case "ack":
-            scene.latched = ""
-            scene.acknowledged = state == telemetry.State.FAULT
+            context.latched = ""
+            context.acknowledged = state == telemetry.State.FAULT
         case "stop":
-            scene.way_down = "stop"
-            scene.stop_exit = (
+            context.way_down = "stop"
+            context.stop_exit = (
                 errors.Exit.DONE if command.who == commands.AT_END else errors.Exit.INTERRUPTED
             )
         case "vent" if state == telemetry.State.FAULT:
-            scene.levels.enter(telemetry.SafeLevel.VENT, scene.now_s)
+            context.levels.enter(telemetry.SafeLevel.VENT, context.now_s)
         case "lower" | "vent":
-            scene.way_down = scene.way_down or "lower"
-            scene.venting |= command.kind == "vent"
+            context.way_down = context.way_down or "lower"
+            context.venting |= command.kind == "vent"
     if command.kind in _MOVES:
-        scene.asked_by = command.who
-
-
-def telemetry_row(
-    scene: Scene,
-    state: telemetry.State,
-    fault: int,
-    number: int,
-    inputs: tick.TickInputs,
-    observation: safety.Observation,
-    shape: shape_loop.ShapeOutput,
-) -> telemetry.TelemetryRow:
-    """The row of tick `number`; `fault` is the standing fault's code, 0 for none."""
-    reading = inputs.reading or NO_READING
-    out = scene.output or inner_loop.NO_OUTPUT
-    seen = scene.estimate.telemetry() if scene.estimate else {}
-    return telemetry.TelemetryRow(
-        mono_s=inputs.now_s,
-        tick=number,
-        dt_s=scene.dt_s,
-        lateness_ms=inputs.lateness_ms,
-        missed_ticks=inputs.missed_ticks,
-        state=state,
-        shape_state=shape.state,
-        safe_level=scene.levels.safe_level,
-        fault=fault,
-        target_um=scene.setpoint_um,
-        setpoint_um=out.setpoint_um,
-        displacement_um=observation.displacement_um,
-        filtered_um=out.filtered_um,
-        error_um=out.error_um,
-        p_um_per_s=out.p_um_per_s,
-        i_um_per_s=out.i_um_per_s,
-        d_um_per_s=out.d_um_per_s,
-        feedforward_um_per_s=out.feedforward_um_per_s,
-        flow_wanted_um_per_s=out.flow_wanted_um_per_s,
-        flow_um_per_s=out.flow_um_per_s,
-        pump_fraction=scene.pump_fraction,
-        vent_fraction=scene.vent_fraction,
-        pump_readback_fraction=reading.pump_fraction,
-        vent_readback_fraction=reading.vent_fraction,
-        gauge_pressure_pa=observation.gauge_pressure_pa,
-        gas_temperature_c=reading.gas_temperature_c,
-        # of the laser's readings: rows without one must not pass for such
-        displacement_quality=math.nan
-        if scene.config.by_optics or not inputs.reading
-        else reading.displacement_quality,
-        sample_counter=reading.sample_counter if inputs.reading else math.nan,
-        device_time_s=reading.device_time_s,
-        leak_um_per_s=out.leak_um_per_s,
-        trim_um=shape.trim_um,
-        truth_displacement_um=inputs.truth_displacement_um,
-        truth_laser_bias_um=inputs.truth_laser_bias_um,
-        interlocks_open=_interlocks_open(scene.interlocks),
-        **seen,
-        **{name: getattr(reading, name) for name in tick_codec.AS_READ},
-    )
-
-
-def _interlocks_open(found: interlocks.Interlocks) -> float:
-    """The mask for the record; NaN without interlocks, and in a tick without a reading."""
-    return float(found.open_mask) if found.any_configured and found.seen else math.nan
+        context.asked_by = command.who

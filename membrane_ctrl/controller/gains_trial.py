@@ -1,0 +1,90 @@
+"""Gains on trial: they revert to the last good ones unless they are kept in time."""
+
+import math
+from dataclasses import dataclass, replace
+
+from membrane_ctrl.config.schema import LoopConfig, PumpConfig
+from membrane_ctrl.controller.commands import Command
+from membrane_ctrl.model.state_tree import StateNode
+
+
+@dataclass(frozen=True, slots=True)
+class GainsInForce(StateNode):
+    """All settings that a `gains` command changes."""
+
+    loop: LoopConfig
+    shape_time_constant_s: float
+    pump: PumpConfig
+
+
+@dataclass(slots=True)
+class GainsState(StateNode):
+    """The settings in force, and those that a trial goes back to."""
+
+    good: GainsInForce
+    tried: GainsInForce
+    until_s: float = math.nan  # end of the trial; NaN: there is none
+    setpoint_step_um: float = (
+        math.nan
+    )  # part of the trial; NaN: the setpoint and the shape loop are not
+
+
+class GainsTrial:
+    """Gains, and the pump's curve, on trial revert to the last good ones unless kept in time; a
+    run's first are good.
+
+    The client that tries them may lose its connection or be killed: the loop must not keep
+    unverified gains (docs/decisions/78-gains-on-trial.md).
+    """
+
+    def __init__(self, memory: GainsState) -> None:
+        self.memory = memory
+
+    @property
+    def on_trial(self) -> bool:
+        """The present gains are not kept yet."""
+        return math.isfinite(self.memory.until_s)
+
+    def begin(self, loop: LoopConfig, command: Command, now_s: float) -> None:
+        """Set a command's gains for as many seconds as its value, or permanently if that is NaN."""
+        memory = self.memory
+        tried = replace(memory.tried, loop=loop)
+        if command.pump is not None:
+            tried = replace(tried, pump=command.pump)
+        if math.isfinite(command.shape_time_constant_s):
+            tried = replace(tried, shape_time_constant_s=command.shape_time_constant_s)
+        memory.tried = tried
+        memory.setpoint_step_um = command.setpoint_step_um
+        memory.until_s = now_s + command.value
+        if not self.on_trial:
+            self.keep()
+
+    @property
+    def in_force(self) -> GainsInForce:
+        """The present settings."""
+        return self.memory.tried
+
+    @property
+    def setpoint_step_um(self) -> float:
+        """The trial's step of the setpoint; NaN: the setpoint and the
+        shape loop are no part of it.
+        """
+        return self.memory.setpoint_step_um
+
+    def keep(self) -> None:
+        """Keep the present gains."""
+        self.memory.good = self.memory.tried
+        self._end()
+
+    def overdue(self, now_s: float) -> bool:
+        """The trial has ended without `keep`."""
+        return now_s >= self.memory.until_s
+
+    def revert(self) -> None:
+        """Restore the last good settings."""
+        self.memory.tried = self.memory.good
+        self._end()
+
+    def _end(self) -> None:
+        self.memory.until_s = math.nan
+        self.memory.setpoint_step_um = math.nan
