@@ -73,7 +73,7 @@ _TEXTS = (
         is_text=True,
     ),
     Published("figure_verdict", "verdict on the newest figure", is_text=True),
-    Published("answer", "what became of the last command of any door", is_text=True),
+    Published("answer", "result of the last command", is_text=True),
 )
 TABLE = (*_TEXTS, *_TICK, *_FIGURE)
 
