@@ -207,7 +207,7 @@ def _watch(
     ],
     ids=["all, gusts", "optics alone, gusts", "all, calm", "optics alone, calm"],
 )
-def test_its_sigma_is_honest_in_a_second_world(laser: bool, gusts: bool) -> None:
+def test_sigma_matches_the_error_on_a_foreign_plant(laser: bool, gusts: bool) -> None:
     ratios, misses = [], []
     for seed in (3,):
         plant = ForeignPlant(ForeignPump(delay_s=0.1, lag_s=0.1), seed, gusts=gusts)
@@ -275,7 +275,7 @@ def test_single_bad_readings_have_no_effect(name: str) -> None:
     assert np.abs(_centres(_still(8.0, alter), 6.0)).max() < 0.15
 
 
-def test_a_knocked_laser_is_the_mount_s_doing_if_the_optics_see_nothing() -> None:
+def test_a_jump_that_only_the_laser_shows_is_attributed_to_its_mount() -> None:
     estimates = _still(
         10.0, lambda now_s, given: _changed(given, laser_um=12.0 if now_s > 6 else 0.0)
     )
@@ -298,7 +298,7 @@ def test_a_film_that_moves_is_followed_within_a_few_frames(um: float) -> None:
     assert _centres(estimates, 8.0) == pytest.approx(um, abs=0.4)
 
 
-def test_a_door_that_the_barometer_sees_is_followed_at_once() -> None:
+def test_a_pressure_step_of_the_barometer_moves_the_estimate_at_once() -> None:
     by_um = 20 * LOOP.barometer_gain_um_per_pa
     estimates = _still(
         7.0,
@@ -310,7 +310,7 @@ def test_a_door_that_the_barometer_sees_is_followed_at_once() -> None:
     assert _centres(estimates, 6.3) == pytest.approx(by_um, abs=0.25)
 
 
-def test_a_false_door_is_undone() -> None:
+def test_a_pressure_step_that_other_sensors_contradict_is_reverted() -> None:
     estimates = _still(
         8.0, lambda now_s, given: _changed(given, ambient_pressure_pa=20.0 if now_s > 6 else 0.0)
     )
@@ -340,7 +340,7 @@ def test_a_drifting_mount_does_not_move_the_centre() -> None:
 
 
 @pytest.mark.parametrize("um", [1.5, 8.0])
-def test_optics_that_are_back_undo_what_the_laser_s_mount_did_meanwhile(um: float) -> None:
+def test_returning_optics_remove_the_mount_motion_of_the_gap(um: float) -> None:
     def alter(now_s: float, given: CentreReadings) -> CentreReadings:
         given = _changed(given, laser_um=um * min(max(now_s - 6, 0.0) / 10, 1.0))
         return _changed(given, sag_um=math.nan) if 6 < now_s < 17 else given
@@ -352,7 +352,7 @@ def test_optics_that_are_back_undo_what_the_laser_s_mount_did_meanwhile(um: floa
     assert np.abs(centres_um[round(12.0 / DT_S) :]).max() < 0.15
 
 
-def test_each_sensor_alone_and_none() -> None:
+def test_the_estimate_works_with_each_single_sensor_and_with_none() -> None:
     nothing = {"laser_um": math.nan, "sag_um": math.nan}
     lost = _still(20.0, lambda now_s, given: _changed(given, **(nothing if now_s > 8 else {})))
     assert lost[-1].sigma_um > 5 * lost[350].sigma_um  # it says that it does not know
@@ -371,7 +371,7 @@ def test_each_sensor_alone_and_none() -> None:
     assert abs(no_camera[-1].um) < 4 * no_camera[-1].sigma_um
 
 
-def test_random_rubbish_never_makes_it_infinite() -> None:
+def test_random_readings_never_make_the_estimate_infinite() -> None:
     rng = np.random.default_rng(9)
     rubbish = [math.nan, math.inf, -math.inf, 1e308, -1e308, 0.0, 1e-308, 4e3]
 
@@ -497,7 +497,7 @@ def test_learned_noise_stays_within_its_bounds() -> None:
         assert 0.999 / 900 <= level.factor <= 900 * 1.001
 
 
-def test_a_level_that_hardly_showed_for_long_is_not_overturned_by_a_few_readings() -> None:
+def test_few_readings_do_not_overturn_a_long_learned_noise_level() -> None:
     level, bound = configured_walk(), math.log(900.0)
     for _ in range(5000):
         level.learn(0.0, 1e-4, 0.01, bound)
@@ -506,7 +506,7 @@ def test_a_level_that_hardly_showed_for_long_is_not_overturned_by_a_few_readings
     assert math.log(level.factor) < 5.1
 
 
-def test_a_ramp_is_found_with_its_begin_and_slope_and_white_noise_is_none() -> None:
+def test_a_ramp_is_found_with_start_and_slope_and_white_noise_gives_none() -> None:
     ramp, noise = Ramp(), np.random.default_rng(3).standard_normal(2000)
     assert not any(ramp.update(float(value), 0.05 * k, 8.0) for k, value in enumerate(noise[:1000]))
     for k, value in enumerate(noise[1000:].tolist()):

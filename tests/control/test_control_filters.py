@@ -47,7 +47,7 @@ def test_first_value_is_no_rate() -> None:
     assert LagRate().update(101_325.0, 0.02, LAG_S) == 0.0
 
 
-def test_absence_dies_away_and_return_is_no_bump() -> None:
+def test_a_lost_input_decays_and_its_return_causes_no_step() -> None:
     rate = LagRate()
     for k in range(100):
         rate.update(0.02 * k, 0.02, LAG_S)
@@ -59,5 +59,5 @@ def test_absence_dies_away_and_return_is_no_bump() -> None:
     assert rate.update(500.0, 0.02, LAG_S) == pytest.approx(gone[-1])
 
 
-def test_never_seen_is_no_rate() -> None:
+def test_an_input_that_was_never_valid_gives_no_rate() -> None:
     assert LagRate().update(math.nan, 0.02, LAG_S) == 0.0

@@ -37,7 +37,7 @@ def test_late_onset_is_behind_by_rate_times_memory_over_e() -> None:
     assert behind[-1] == pytest.approx(0.0, abs=1e-3)
 
 
-def test_noise_comes_through_as_derived() -> None:
+def test_output_noise_matches_the_derivation() -> None:
     rng, tracker, seen = np.random.default_rng(5), DriftTracker(), []
     tracker.begin(0.0)
     for k in range(1, 20_000):
@@ -57,7 +57,7 @@ def test_first_readings_are_damped() -> None:
     assert np.std(first) < 0.5
 
 
-def test_after_a_long_gap_the_reading_is_believed() -> None:
+def test_after_a_long_gap_the_first_reading_is_used() -> None:
     tracker = DriftTracker()
     tracker.begin(0.0)
     tracker.take(0.0, 2.0, MEMORY_S)
@@ -66,7 +66,7 @@ def test_after_a_long_gap_the_reading_is_believed() -> None:
     assert tracker.at(2010.0, MEMORY_S) == pytest.approx(5.0, abs=0.05)
 
 
-def test_rate_is_believed_for_one_memory() -> None:
+def test_the_rate_is_extrapolated_for_one_memory_time() -> None:
     """A bump taken for a drift must not run away while there are no readings."""
     tracker = DriftTracker()
     tracker.begin(0.0)

@@ -21,14 +21,14 @@ def answered(loop: LoopConfig, pressure_pa: np.ndarray, air_c: np.ndarray) -> np
     )
 
 
-def test_pressure_step_is_made_good() -> None:
+def test_pressure_step_is_compensated() -> None:
     """+20 Pa flatten the bowl by 7.16 µm; the feed-forward adds as much."""
     pressure_pa = np.where(np.arange(1000) < 10, 101_325.0, 101_345.0)
     flow = answered(LoopConfig(), pressure_pa, np.full(1000, 20.0))
     assert flow.sum() * DT_S == pytest.approx(20 * 0.358)
 
 
-def test_temperature_step_is_made_good_as_the_gas_follows() -> None:
+def test_temperature_step_is_compensated_at_the_speed_of_the_gas() -> None:
     """+0.1 K swells the gas by 12.3 µm, 63 % of it within the gas's lag."""
     air_c = np.where(np.arange(10_000) < 1, 20.0, 20.1)
     given = np.cumsum(answered(LoopConfig(), np.full(10_000, math.nan), air_c)) * DT_S
@@ -36,7 +36,7 @@ def test_temperature_step_is_made_good_as_the_gas_follows() -> None:
     assert given[600] == pytest.approx(-12.3 * (1 - math.exp(-1)), rel=0.01)
 
 
-def test_nothing_without_sensors() -> None:
+def test_without_sensors_there_is_no_feedforward() -> None:
     nothing = np.full(10, math.nan)
     assert not answered(LoopConfig(), nothing, nothing).any()
 
@@ -47,7 +47,7 @@ def test_switched_off() -> None:
 
 
 @pytest.mark.parametrize("lost", ["pressure", "temperature"])
-def test_sensor_that_comes_and_goes_is_no_bump(lost: str) -> None:
+def test_intermittent_sensor_causes_no_step(lost: str) -> None:
     """However far the value went meanwhile."""
     ramp = np.arange(600) * DT_S
     pressure_pa, air_c = 101_325.0 + 1.0 * ramp, 20.0 + 0.01 * ramp
@@ -71,7 +71,7 @@ def test_a_sensor_that_fails_to_a_value_moves_nothing(
     assert not answered(LoopConfig(), pressure_pa, air_c).any()
 
 
-def test_switching_at_run_time_is_no_bump() -> None:
+def test_switching_feedforward_at_run_time_causes_no_step() -> None:
     feedforward, ramp = FeedForward(LoopConfig()), iter(range(10_000))
     flows = []
     for barometer in (True, False, True):
@@ -87,7 +87,7 @@ def test_switching_at_run_time_is_no_bump() -> None:
 @pytest.mark.parametrize(
     ("pressure_pa", "air_c"), [(1013.25, 20.0), (101_325.0, 293.15), (14.7, math.nan)]
 )
-def test_a_weather_sensor_in_another_unit_moves_nothing_and_is_named(
+def test_a_weather_sensor_in_a_wrong_unit_is_ignored_and_reported(
     pressure_pa: float, air_c: float
 ) -> None:
     wave = np.sin(np.arange(200) / 10)
@@ -101,5 +101,5 @@ def test_a_weather_sensor_in_another_unit_moves_nothing_and_is_named(
 @pytest.mark.parametrize(
     ("pressure_pa", "air_c"), [(101_325.0, 20.0), (54_000.0, -5.0), (math.nan, math.nan)]
 )
-def test_weather_of_places_where_people_work_is_believed(pressure_pa: float, air_c: float) -> None:
+def test_weather_within_habitable_ranges_is_accepted(pressure_pa: float, air_c: float) -> None:
     assert weather_fault(pressure_pa, air_c) == ""

@@ -29,11 +29,11 @@ def creeping(hour: float) -> float:
     return 600.0 / (1 + 0.005 * math.log10(1 + hour / 24))
 
 
-def test_a_healthy_month_is_silent() -> None:
+def test_a_healthy_month_gives_no_warning() -> None:
     assert days(lambda h: 1.24 + 0.1 * math.sin(h / 4), creeping, 30) == []
 
 
-def test_a_seam_that_opens_is_told_days_before_the_pump_gives_up() -> None:
+def test_an_opening_seam_is_reported_days_before_the_pump_saturates() -> None:
     found = days(lambda h: 1.24 + 0.6 * h / 24, creeping, 6)
     assert [warning.name for _, warning in found] == ["leak_growth", "pump_reserve"]
     hour, warning = found[0]
@@ -43,14 +43,14 @@ def test_a_seam_that_opens_is_told_days_before_the_pump_gives_up() -> None:
     assert truly_left_days > 4
 
 
-def test_a_tight_mirror_and_one_that_yields_are_told_once() -> None:
+def test_a_tight_film_and_a_yielding_film_are_each_reported_once() -> None:
     assert [w.name for _, w in days(lambda h: 0.2, creeping, 3)] == ["too_tight"]
     assert [w.name for _, w in days(lambda h: 1.24, lambda h: 600.0 * (1 - 0.02 * h / 24), 3)] == [
         "creep"
     ]
 
 
-def test_a_warning_comes_again_only_after_better_times() -> None:
+def test_a_warning_repeats_only_after_the_value_has_recovered() -> None:
     comes_and_goes = days(lambda h: 0.2 if h % 20 < 10 else 1.2, creeping, 2)
     assert [w.bad for _, w in comes_and_goes if w.name == "too_tight"] == [True, False] * 2 + [True]
     assert all("no longer" in w.message for _, w in comes_and_goes if not w.bad)
@@ -58,7 +58,7 @@ def test_a_warning_comes_again_only_after_better_times() -> None:
     assert [w.name for _, w in near] == ["too_tight"]
 
 
-def test_hours_without_readings_and_another_setpoint_count_for_nothing() -> None:
+def test_gaps_and_setpoint_changes_do_not_affect_film_health() -> None:
     health = FilmHealth(5.3)
     assert not any(health.step(STEP_S, math.nan, 600.0) for _ in range(200))
     for hour in range(48):

@@ -69,12 +69,12 @@ def test_a_laser_that_creeps_is_contradicted_by_the_gauge(rate_um_per_s: float) 
     assert (at_s - 100.0) * abs(rate_um_per_s) < 45.0  # µm by which the film was led astray
 
 
-def test_what_a_knocked_laser_moves_the_film_by_is_seen_within_half_a_minute() -> None:
+def test_film_motion_after_a_laser_jump_is_detected_within_30_s() -> None:
     _, at_s = told(lambda t: (-30.0 * (t >= 100.0), 30.0 * (t >= 100.0), 0.0, 0.0), 300.0)
     assert 100.0 < at_s < 130.0
 
 
-def test_a_gauge_that_drifts_or_sees_nothing_of_a_way_is_found() -> None:
+def test_a_drifting_or_insensitive_gauge_is_detected() -> None:
     said, at_s = told(lambda t: (0.0, 0.0, -0.1 * max(t - 100.0, 0.0), 0.0), 300.0)
     assert said
     assert at_s < 130.0
@@ -92,7 +92,7 @@ def test_a_gauge_that_drifts_or_sees_nothing_of_a_way_is_found() -> None:
     ("drift_um_per_s", "noticed_um", "stopped_um"),
     [(0.1, 240.0, 160.0), (0.05, 240.0, 220.0), (1 / 30, 245.0, 740.0), (0.02, 255.0, 900.0)],
 )
-def test_slow_drift_of_the_laser_is_noticed_and_then_stopped_at_a_stated_distance(
+def test_slow_laser_drift_raises_a_notice_and_then_stops_at_its_limit(
     drift_um_per_s: float, noticed_um: float, stopped_um: float
 ) -> None:
     """The loop holds the reading, so the film goes the other way; slower than the climate only days
@@ -124,7 +124,7 @@ def _climate_gauge_pa(time_s: float, phase: float) -> float:
 
 
 @pytest.mark.parametrize("phase", [0.0, 1.6, 3.1, 4.7])
-def test_a_week_of_climate_is_no_contradiction_and_raises_a_notice(phase: float) -> None:
+def test_a_week_of_weather_raises_a_notice_but_no_contradiction(phase: float) -> None:
     rng = np.random.default_rng(2)
     monitor = FilmMonitor(LimitsConfig(), MirrorConfig())
     noticed = False
@@ -137,19 +137,19 @@ def test_a_week_of_climate_is_no_contradiction_and_raises_a_notice(phase: float)
 
 
 @pytest.mark.parametrize("sign", [-1.0, 1.0])
-def test_drift_that_the_camera_has_taken_out_is_no_lie(sign: float) -> None:
+def test_drift_corrected_by_the_camera_raises_no_contradiction(sign: float) -> None:
     drifted: Story = lambda t: (0.0, sign * min(t / 15, 200.0), 0.0, sign * min(t / 15, 200.0))  # noqa: E731
     assert told(drifted, 4000.0, rate_hz=2.0)[0] == ""
 
 
-def test_a_camera_that_drifts_moves_film_and_laser_alike() -> None:
+def test_a_drifting_camera_moves_film_and_laser_by_the_same_amount() -> None:
     assert (
         told(lambda t: (min(t / 15, 200.0), 0.0, 0.0, min(t / 15, 200.0)), 4000.0, rate_hz=2.0)[0]
         == ""
     )
 
 
-def test_a_laser_that_shows_twice_the_way_is_found_on_it() -> None:
+def test_a_laser_with_double_scale_is_detected_during_a_move() -> None:
     said, at_s = told(lambda t: (1.75 * t, 1.75 * t, 0.0, 0.0), 300.0)
     assert said
     assert 1.75 * at_s < 250.0
@@ -157,12 +157,12 @@ def test_a_laser_that_shows_twice_the_way_is_found_on_it() -> None:
 
 @pytest.mark.parametrize("law", [hencky, tense])
 @pytest.mark.parametrize("speed_um_per_s", [-1.2, 3.5])
-def test_a_long_way_is_no_lie_whatever_the_film(law: Law, speed_um_per_s: float) -> None:
+def test_a_long_move_raises_no_contradiction_for_any_film(law: Law, speed_um_per_s: float) -> None:
     assert told(lambda t: (speed_um_per_s * t, 0.0, 0.0, 0.0), 1000.0, law)[0] == ""
 
 
 @pytest.mark.parametrize("law", [hencky, tense])
-def test_a_way_there_and_back_is_no_lie(law: Law) -> None:
+def test_a_move_and_its_return_raise_no_contradiction(law: Law) -> None:
     # the reference is a mean over the motion: with a curved law it is no point of the film's curve
     assert (
         told(lambda t: (2000.0 - abs(20.0 * t % 4000.0 - 2000.0), 0.0, 0.0, 0.0), 1000.0, law)[0]
@@ -170,21 +170,21 @@ def test_a_way_there_and_back_is_no_lie(law: Law) -> None:
     )
 
 
-def test_a_fill_from_flat_is_no_lie() -> None:
+def test_an_inflation_from_flat_raises_no_contradiction() -> None:
     assert told(lambda t: (-SAG_UM + 20.0 * t, 0.0, 0.0, 0.0), SAG_UM / 20.0)[0] == ""
 
 
-def test_the_first_samples_of_a_noisy_gauge_are_no_reference() -> None:
+def test_the_first_samples_of_a_noisy_gauge_are_not_used_as_reference() -> None:
     assert {told(lambda t: (0.0, 0.0, 0.0, 0.0), 60.0, seed=seed)[0] for seed in range(40)} == {""}
 
 
 @pytest.mark.parametrize("by", [0.6, 1.7])
-def test_a_film_of_another_thickness_is_no_wrong_unit(by: float) -> None:
+def test_a_film_of_another_thickness_is_not_mistaken_for_a_wrong_unit(by: float) -> None:
     assert told(lambda t: (0.0, 0.0, 0.0, 0.0), 60.0, lambda share: by * share**3)[0] == ""
 
 
 @pytest.mark.parametrize("rate_hz", [1.0, 10.0, 50.0])
-def test_noise_is_no_lie_at_any_rate(rate_hz: float) -> None:
+def test_noise_raises_no_contradiction_at_any_rate(rate_hz: float) -> None:
     assert (
         told(lambda t: (8 * math.sin(t / 30), 0.0, 0.0, 0.0), 20_000.0 / rate_hz, rate_hz=rate_hz)[
             0
@@ -194,18 +194,18 @@ def test_noise_is_no_lie_at_any_rate(rate_hz: float) -> None:
 
 
 @pytest.mark.parametrize("by", [10.0, 0.1, 1000.0, 0.001, -1.0])
-def test_a_wrong_unit_of_the_gauge_is_found_in_seconds(by: float) -> None:
+def test_a_gauge_in_a_wrong_unit_is_detected_within_seconds(by: float) -> None:
     said, at_s = told(lambda t: (0.0, 0.0, (by - 1) * PRESSURE_PA, 0.0), 60.0)
     assert "600 Pa" in said
     assert at_s < 5.0
 
 
-def test_a_mirror_whose_pressure_is_not_known_has_no_nominal_one() -> None:
+def test_without_a_known_pressure_there_is_no_nominal_pressure() -> None:
     unknown = MirrorConfig(pressure_pa=0.0)
     assert told(lambda t: (0.0, 0.0, -0.9 * PRESSURE_PA, 0.0), 60.0, mirror=unknown)[0] == ""
 
 
-def test_a_gap_of_the_laser_during_which_the_film_goes_is_no_lie() -> None:
+def test_film_motion_during_a_laser_gap_raises_no_contradiction() -> None:
     def story(time_s: float) -> tuple[float, float, float, float]:
         lost = 100.0 <= time_s < 130.0
         return -max(time_s - 100.0, 0.0), math.nan if lost else 0.0, 0.0, 0.0
@@ -230,21 +230,21 @@ def grown(
     return math.nan
 
 
-def test_a_leak_that_doubles_is_a_leak_and_one_that_more_than_doubles_is_told_in_a_minute() -> None:
+def test_a_doubled_leak_is_accepted_and_a_larger_one_is_reported_within_a_minute() -> None:
     assert math.isnan(grown(lambda t: 1.24 * (2.0 if t > 600 else 1.0), 2.2, 7200))
     assert 600 < grown(lambda t: 1.24 * (2.3 if t > 600 else 1.0), 2.2, 7200) <= 720
 
 
-def test_gas_that_agrees_with_a_dissenting_camera_is_told_early() -> None:
+def test_gas_consumption_that_agrees_with_a_contradicting_camera_is_reported_earlier() -> None:
     assert grown(lambda t: 1.24 + 0.4 * (t > 600), CONTRADICTED_MOST, 7200) <= 690
     assert math.isnan(grown(lambda t: 1.24 + 0.2 * (t > 600), CONTRADICTED_MOST, 7200))
 
 
-def test_a_burst_of_flow_is_nothing() -> None:
+def test_a_burst_of_flow_is_ignored() -> None:
     assert math.isnan(grown(lambda t: 5.0 if 600 < t < 650 else 1.2, 2.2, 1200))
 
 
-def test_what_it_used_to_take_is_learnt_only_after_the_ramps_mean_is_over() -> None:
+def test_usual_gas_consumption_is_learned_only_after_a_ramp_has_left_the_mean() -> None:
     growth = LeakGrowth()
     for _ in range(59):
         assert growth.step(0.0, 5.0, 2.2, 1.0) == ""
@@ -252,32 +252,32 @@ def test_what_it_used_to_take_is_learnt_only_after_the_ramps_mean_is_over() -> N
         assert growth.step(1.2, 1.2, 2.2, 1.0) == ""
 
 
-def test_a_leak_that_grows_slowly_is_told_when_it_has_grown_too_far() -> None:
+def test_a_slowly_growing_leak_is_reported_at_its_limit() -> None:
     at_s = grown(lambda t: 1.2 + t / 600, 2.2, 7200)
     assert 2.2 * 1.2 < 1.2 + at_s / 600 < 4.5  # the former consumption is a mean over an hour
 
 
-def test_bursts_do_not_add_up() -> None:
+def test_repeated_bursts_of_flow_do_not_accumulate() -> None:
     assert math.isnan(grown(lambda t: 5.0 if t > 300 and t % 60 < 40 else 1.2, 2.2, 3600))
 
 
-def test_several_times_next_to_nothing_is_still_next_to_nothing() -> None:
+def test_a_multiple_of_a_negligible_leak_is_not_reported() -> None:
     assert math.isnan(grown(lambda t: 0.05 if t < 300 else 0.5, 2.2, 3600))
 
 
-def test_a_thermometer_that_lies_takes_no_gas_and_a_room_that_cools_takes_what_it_must() -> None:
+def test_a_wrong_thermometer_does_not_count_as_gas_but_real_cooling_does() -> None:
     # the feed-forward asks for 2 µm/s less, and the integrator gives them back
     assert math.isnan(grown(lambda t: 3.2 if t > 600 else 1.2, 2.2, 3600, lambda t: 1.2))
     # the gas shrinks by 2 µm/s, and the feed-forward knows it
     assert math.isnan(grown(lambda t: 1.2, 2.2, 3600, lambda t: 3.2 if t > 600 else 1.2))
 
 
-def test_what_it_used_to_take_is_no_matter_of_a_gust() -> None:
+def test_a_gust_does_not_change_the_usual_gas_consumption() -> None:
     # the pump gives little while the hold begins, and afterwards no more than the leak
     assert math.isnan(
         grown(lambda t: 1.24, CONTRADICTED_MOST, 3600, lambda t: 0.3 if t < 100 else 1.24)
     )
 
 
-def test_a_thermometer_that_has_lied_does_not_make_the_usual_look_like_an_excess() -> None:
+def test_usual_consumption_after_a_thermometer_fault_is_not_an_excess() -> None:
     assert math.isnan(grown(lambda t: -10.0 if 200 < t < 1200 else 1.24, 2.2, 3600, lambda t: 1.24))

@@ -66,7 +66,7 @@ def test_ramp_feeds_its_speed_forward() -> None:
 @pytest.mark.parametrize(
     ("displacement_um", "saturated"), [(50.0, True), (-50.0, True), (0.1, False), (-0.1, False)]
 )
-def test_saturation_is_told(displacement_um: float, saturated: bool) -> None:
+def test_saturation_is_reported(displacement_um: float, saturated: bool) -> None:
     inner, _ = settled()
     for _ in range(50):
         out = inner.step(given_at(displacement_um), DT_S)
@@ -74,7 +74,7 @@ def test_saturation_is_told(displacement_um: float, saturated: bool) -> None:
 
 
 @pytest.mark.parametrize("missing", [math.nan, math.inf, -math.inf])
-def test_missing_reading_puts_out_the_mean_flow(missing: float) -> None:
+def test_missing_reading_gives_the_mean_flow(missing: float) -> None:
     inner, _ = settled()
     for _ in range(50):
         out = inner.step(given_at(missing), DT_S)
@@ -82,7 +82,7 @@ def test_missing_reading_puts_out_the_mean_flow(missing: float) -> None:
     assert (out.p_um_per_s, out.d_um_per_s, out.feedforward_um_per_s) == (0.0, 0.0, 0.0)
 
 
-def test_reading_that_comes_back_goes_on_from_the_mean_flow() -> None:
+def test_returning_reading_continues_from_the_mean_flow() -> None:
     inner, _ = settled()
     for _ in range(500):
         inner.stale(given_at(math.nan), DT_S)
@@ -90,7 +90,7 @@ def test_reading_that_comes_back_goes_on_from_the_mean_flow() -> None:
     assert out.flow_wanted_um_per_s == pytest.approx(1.24)
 
 
-def test_manual_puts_out_what_it_is_given() -> None:
+def test_manual_outputs_the_given_flow() -> None:
     inner, _ = settled()
     assert inner.follow(given_at(0.0), 2.5, DT_S).flow_um_per_s == pytest.approx(2.5)
     assert inner.follow(given_at(0.0), 99.0, DT_S).pump_fraction == pytest.approx(1.0)
@@ -149,7 +149,7 @@ def test_gain_change_is_bumpless_off_the_setpoint() -> None:
     assert after.flow_wanted_um_per_s == pytest.approx(before.flow_wanted_um_per_s, abs=0.05)
 
 
-def test_new_limits_are_obeyed_at_once() -> None:
+def test_new_limits_apply_at_once() -> None:
     inner, _ = settled(flow=3.0)
     inner.set_gains(
         LOOP.model_copy(update={"flow_max_um_per_s": 2.0, "flow_rate_limit_um_per_s2": 1000.0})
@@ -162,7 +162,7 @@ def test_new_limits_are_obeyed_at_once() -> None:
 @pytest.mark.parametrize(
     "loop", [LOOP.model_copy(update={"setpoint_weight": b}) for b in (0.0, 0.5, 1.0)]
 )
-def test_large_standing_displacement_needs_no_integrator(loop: LoopConfig) -> None:
+def test_a_large_constant_displacement_needs_no_integrator(loop: LoopConfig) -> None:
     """The zero of the laser is arbitrary: far from it nothing is different."""
     _, out = settled(loop, displacement_um=-1900.0)
     assert out.i_um_per_s == pytest.approx(1.24)
@@ -184,7 +184,9 @@ calls = st.tuples(
 
 @settings(max_examples=60)
 @given(st.lists(calls, max_size=80))
-def test_whatever_comes_the_command_is_sane(run: list[tuple[str, LoopInput, float]]) -> None:
+def test_the_command_is_finite_and_in_range_for_any_input(
+    run: list[tuple[str, LoopInput, float]],
+) -> None:
     inner = InnerLoop(LoopConfig(td_s=0.3), PUMP)
     for call, reading, dt_s in run:
         if call == "start":
@@ -204,7 +206,7 @@ def test_whatever_comes_the_command_is_sane(run: list[tuple[str, LoopInput, floa
 
 @settings(max_examples=40)
 @given(st.lists(st.tuples(inputs, st.floats(1e-3, 0.1)), min_size=2, max_size=50))
-def test_flow_changes_no_faster_than_told(run: list[tuple[LoopInput, float]]) -> None:
+def test_flow_changes_no_faster_than_its_rate_limit(run: list[tuple[LoopInput, float]]) -> None:
     inner, _ = settled(flow=2.0)
     for reading, dt_s in run:
         before = inner._limiter.flow_um_per_s

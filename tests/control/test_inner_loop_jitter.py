@@ -29,7 +29,7 @@ def true_centre_um(steps_s: np.ndarray) -> np.ndarray:
     return np.array(centre_um)
 
 
-def test_irregular_ticks_cost_little() -> None:
+def test_irregular_ticks_increase_the_error_only_slightly() -> None:
     steps_s = np.random.default_rng(2).choice([0.01, 0.015, 0.02, 0.025, 0.06, 0.1], 4000)
     settled_um = true_centre_um(steps_s)[1000:]
     assert settled_um.std() < 0.25

@@ -25,7 +25,7 @@ def test_typical_weather(sensors: str, std_um: float) -> None:
     assert figures["least_std_um"] < figures["std_um"]
 
 
-def test_gusts_bring_no_bias() -> None:
+def test_gusts_cause_no_bias() -> None:
     """The pump cuts them on one side only."""
     figures = steady(ALL, "gusty", SEEDS, 200.0)
     assert figures["worst_bias_um"] <= 0.1
@@ -46,7 +46,7 @@ def test_doubled_leak_stays_in_the_band() -> None:
 
 
 @pytest.mark.parametrize("change_pa", [20.0, -20.0])
-def test_door(change_pa: float) -> None:
+def test_a_door_stays_within_its_peak(change_pa: float) -> None:
     """7 µm at once, which nothing can prevent; then back as fast as pump or leak allow, without
     wind-up.
     """
@@ -73,13 +73,13 @@ def test_setpoint_change_down_is_as_fast_as_the_leak() -> None:
     assert np.abs(held.true_um - held.setpoint_um)[held.time_s > 5].max() < 2.0
 
 
-def test_tight_mirror_is_warned_of() -> None:
+def test_a_tight_mirror_raises_a_warning() -> None:
     tight = steady(ALL, "typical", (1, 2), 60.0, leak_time_constant_s=5e4)
     sound = steady(ALL, "typical", (1, 2), 60.0)
     assert (tight["too_tight_fraction"], sound["too_tight_fraction"]) == (1.0, 0.0)
 
 
-def test_leak_estimate_finds_the_truth() -> None:
+def test_leak_estimate_converges_to_the_true_leak() -> None:
     held = hold(LoopConfig(), TwinConfig(start_error_um=0.0), 150.0, [LeakChange(0.0, 2.0)])
     assert held.leak_um_per_s[-1] == pytest.approx(2 * 1.235, rel=0.05)
 
@@ -95,7 +95,7 @@ def test_leak_estimate_finds_the_truth() -> None:
     ],
     ids=str,
 )
-def test_other_settings_hold_too(change: dict[str, float]) -> None:
+def test_other_settings_hold_the_mirror_too(change: dict[str, float]) -> None:
     """A loop this mild must not depend on details."""
     held = hold(LoopConfig(**change), TwinConfig(start_error_um=0.0), 100.0)
     assert held.after(40.0).std() < 0.35
@@ -112,7 +112,7 @@ def test_other_settings_hold_too(change: dict[str, float]) -> None:
     ],
     ids=["weak", "strong", "early", "sticky"],
 )
-def test_pump_it_was_not_told_of(true_pump: PumpConfig) -> None:
+def test_a_pump_that_differs_from_its_configuration_still_holds(true_pump: PumpConfig) -> None:
     """The integrator corrects the pump curve's error."""
     held = hold(LoopConfig(), TwinConfig(start_error_um=-10.0), 100.0, true_pump=true_pump)
     assert held.after(40.0).std() < 0.25
@@ -120,7 +120,7 @@ def test_pump_it_was_not_told_of(true_pump: PumpConfig) -> None:
 
 
 @pytest.mark.campaign
-def test_benchmark_has_every_figure() -> None:
+def test_the_benchmark_returns_every_figure() -> None:
     figures = run(seeds=1, duration_s=20.0)
     assert (
         figures["steady"]["typical"][ALL]["std_um"]

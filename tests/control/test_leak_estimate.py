@@ -28,13 +28,13 @@ def run(
 
 
 @pytest.mark.parametrize(("flow", "weather"), [(1.24, 0.0), (0.0, 0.0), (3.0, 0.2)])
-def test_leak_is_found_whatever_the_pump_does(flow: float, weather: float) -> None:
+def test_leak_is_estimated_at_any_pump_flow(flow: float, weather: float) -> None:
     estimate = LeakEstimate()
     run(estimate, 1.24, 60.0, flow, weather)
     assert estimate.leak_um_per_s == pytest.approx(1.24, abs=0.02)
 
 
-def test_no_estimate_at_first() -> None:
+def test_there_is_no_leak_estimate_at_the_start() -> None:
     estimate = LeakEstimate()
     run(estimate, 1.24, FIRST_S - 1.0)
     assert math.isnan(estimate.leak_um_per_s)
@@ -59,7 +59,7 @@ def test_too_tight_is_judged_late_and_with_hysteresis() -> None:
     assert not estimate.too_tight
 
 
-def test_gap_is_left_out() -> None:
+def test_a_gap_in_the_readings_is_left_out() -> None:
     """Motion of the centre during the gap is no rate."""
     estimate = LeakEstimate()
     run(estimate, 1.0, 60.0)
@@ -69,7 +69,7 @@ def test_gap_is_left_out() -> None:
 
 
 @pytest.mark.parametrize("by_um", [40.0, -40.0])
-def test_a_jump_is_no_loss_of_gas(by_um: float) -> None:
+def test_a_jump_of_the_reading_is_not_counted_as_leak(by_um: float) -> None:
     """Within 0.1 s, behind the reading's filter; the leak is the flow."""
     estimate, measured, rng = LeakEstimate(), LowPass(), np.random.default_rng(5)
     for k in range(round(90.0 / DT_S)):

@@ -59,7 +59,9 @@ def excursion(loop: LoopConfig, last_s: float = 60.0) -> float:
         ({"rate_hz": 1.0, "kp_per_s": 6.0, "measurement_filter_s": 0.0}, False),
     ],
 )
-def test_an_unstable_loop_is_one_that_runs_away(change: dict[str, float], stable: bool) -> None:
+def test_margins_call_a_loop_unstable_exactly_if_it_diverges(
+    change: dict[str, float], stable: bool
+) -> None:
     loop = LoopConfig(**change)  # type: ignore[arg-type]
     assert math.isfinite(peak_sensitivity(loop)) == stable
     assert (excursion(loop) < 1.0) == stable

@@ -40,7 +40,7 @@ def test_gain_change_is_bumpless(
         assert now.sum_um_per_s == pytest.approx(wanted, abs=1e-9)
 
 
-def test_integral_action_has_its_time() -> None:
+def test_integral_action_has_its_time_constant() -> None:
     """After Ti the integral of a steady error has repeated the proportional term."""
     pid = Pid(PidGains(0.5, 4.0, 0.7), V_MAX)
     pid.place(1.0)
@@ -55,7 +55,7 @@ def test_derivative_brakes_a_rising_measurement() -> None:
 
 
 @pytest.mark.parametrize("error_um", [100.0, -100.0])
-def test_no_wind_up(error_um: float) -> None:
+def test_the_integrator_does_not_wind_up(error_um: float) -> None:
     """An hour at the limit is forgotten as fast as ten seconds: the sum leaves the limit when the
     error does.
     """
@@ -91,7 +91,7 @@ def test_back_calculation_goes_to_the_limit_with_the_integral_time(
     assert pid.integral_um_per_s == pytest.approx(2.0 + (limit_um_per_s - 2.0) * 0.02 / 6.5)
 
 
-def test_what_is_placed_is_the_whole_output_until_the_next_error() -> None:
+def test_a_preset_output_is_the_whole_output_until_the_next_error() -> None:
     """An earlier error, of another state, must not return with a change of gains."""
     pid = Pid(PidGains(0.5, 4.0, 0.5), V_MAX)
     pid.terms(3.0, 1.0)

@@ -67,14 +67,14 @@ def after(start_s: float, value: float) -> Callable[[float], float]:
 
 
 @pytest.mark.parametrize("seed", range(5))
-def test_in_peace_nobody_is_accused(seed: int) -> None:
+def test_consistent_sensors_raise_no_suspicion(seed: int) -> None:
     wander: Story = lambda t: (8 * math.sin(t / 30), 0.0, 0.0)  # noqa: E731
     assert set(told(wander, 1200.0, seed)) == {Liar.NOBODY}
 
 
 @pytest.mark.parametrize("seed", range(5))
 @pytest.mark.parametrize("size_um", [-40.0, -20.0, 20.0, 40.0])
-def test_a_laser_that_was_knocked_is_found_within_a_minute(size_um: float, seed: int) -> None:
+def test_a_displaced_laser_is_identified_within_a_minute(size_um: float, seed: int) -> None:
     # the loop returns the reading to its setpoint, and moves the mirror off it
     said = told(lambda t: (-after(200.0, size_um)(t), after(200.0, size_um)(t), 0.0), seed=seed)
     found = said.index(Liar.LASER) / RATE_HZ
@@ -84,34 +84,34 @@ def test_a_laser_that_was_knocked_is_found_within_a_minute(size_um: float, seed:
 
 @pytest.mark.parametrize("seed", range(5))
 @pytest.mark.parametrize("size_um", [-40.0, -20.0, 20.0, 40.0])
-def test_a_camera_that_was_knocked_is_found_within_a_minute(size_um: float, seed: int) -> None:
+def test_a_displaced_camera_is_identified_within_a_minute(size_um: float, seed: int) -> None:
     said = told(lambda t: (0.0, 0.0, after(200.0, size_um)(t)), seed=seed)
     found = said.index(Liar.OPTICS) / RATE_HZ
     assert 200.0 < found < 260.0
     assert Liar.LASER not in said
 
 
-def test_a_lie_that_ends_is_forgiven() -> None:
+def test_a_sensor_error_that_ends_is_cleared() -> None:
     said = told(lambda t: (0.0, 0.0, 30.0 if 100 <= t < 200 else 0.0))
     assert Liar.OPTICS in said
     assert set(said[-500:]) == {Liar.NOBODY}
 
 
-def test_slow_drifts_are_no_lies() -> None:
+def test_slow_drifts_raise_no_suspicion() -> None:
     assert set(told(lambda t: (0.0, 2.0 * t / 60, 0.0), 900.0)) == {
         Liar.NOBODY
     }  # the laser's mount
     assert set(told(lambda t: (0.0, 0.0, 0.0), 900.0, gauge_drift_pa_per_s=0.01)) == {Liar.NOBODY}
 
 
-def test_a_gauge_that_drifts_off_accuses_nobody_falsely() -> None:
+def test_a_drifting_gauge_does_not_blame_another_sensor() -> None:
     # 0.1 Pa a minute, far more than a gauge's zero moves
     said = told(lambda t: (0.0, after(200.0, 30.0)(t), 0.0), gauge_drift_pa_per_s=0.1 / 60)
     assert Liar.LASER in said
     assert Liar.OPTICS not in said
 
 
-def test_without_a_camera_or_a_gauge_nothing_is_said() -> None:
+def test_without_camera_or_gauge_there_is_no_verdict() -> None:
     judge = PlausibilityCheck(10.0, 37_100.0)
     for tick in range(2000):
         assert judge.step(0.1, 500.0 * (tick > 1000), 600.0, None) == Liar.NOBODY
@@ -122,7 +122,7 @@ def test_without_a_camera_or_a_gauge_nothing_is_said() -> None:
         judge.reset()
 
 
-def test_a_rejected_shape_is_no_evidence() -> None:
+def test_a_rejected_shape_is_not_used_as_evidence() -> None:
     judge = PlausibilityCheck(10.0, 37_100.0)
     for tick in range(3000):
         bad = estimate(tick * 0.1, SAG_UM + 500.0, "rejected") if tick % 20 == 10 else None
@@ -150,14 +150,14 @@ def settled(laser_um: float, camera_um: float, gauge_um: float) -> tuple[Plausib
     return judge, time_s
 
 
-def test_who_is_found_stays_accused_whatever_the_gauge_says_then() -> None:
+def test_an_identified_sensor_stays_faulty_for_any_later_gauge_reading() -> None:
     judge, time_s = settled(30.0, 0.0, 0.0)
     assert judge.liar == Liar.LASER
     for second in range(1, 121):  # the gauge now agrees with the laser
         assert shown(judge, time_s + second, 30.0, 0.0, 30.0) == Liar.LASER
 
 
-def test_who_is_found_is_believed_again_only_below_half_the_limit() -> None:
+def test_an_identified_sensor_is_cleared_only_below_half_the_limit() -> None:
     judge, time_s = settled(30.0, 0.0, 0.0)
     for second in range(1, 121):
         said = shown(judge, time_s + second, 7.0, 0.0, 0.0)
@@ -167,7 +167,7 @@ def test_who_is_found_is_believed_again_only_below_half_the_limit() -> None:
     assert said == Liar.NOBODY
 
 
-def test_two_that_part_with_the_gauge_between_them_leave_it_unsure() -> None:
+def test_if_the_gauge_lies_between_laser_and_camera_the_verdict_is_unsure() -> None:
     judge, time_s = settled(20.0, 0.0, 10.0)
     assert judge.liar == Liar.UNSURE
     for second in range(1, 121):  # it is not settled: a later verdict of the gauge counts

@@ -30,7 +30,7 @@ def delivered(flows_um_per_s: list[float]) -> np.ndarray:
 
 
 @given(st.lists(st.floats(-10, 10), min_size=1, max_size=60))
-def test_command_is_one_the_pump_can_take(flows: list[float]) -> None:
+def test_the_command_is_within_the_pump_range(flows: list[float]) -> None:
     curve = PumpCurve(PUMP)
     for flow in flows:
         command = curve.command(flow, DT_S)
@@ -38,7 +38,7 @@ def test_command_is_one_the_pump_can_take(flows: list[float]) -> None:
 
 
 @pytest.mark.parametrize("flow", [0.35, 0.6, 1.24, 5.3])
-def test_pump_gives_what_was_wanted(flow: float) -> None:
+def test_the_pump_gives_the_wanted_flow(flow: float) -> None:
     assert delivered([flow] * 100)[-1] == pytest.approx(flow, rel=1e-4)
 
 
@@ -48,14 +48,14 @@ def test_small_flow_from_rest_starts_the_pump() -> None:
     assert abs(added_um) < 0.1
 
 
-def test_kick_comes_once() -> None:
+def test_the_start_kick_is_given_once() -> None:
     curve = PumpCurve(PUMP)
     commands = [curve.command(0.35, DT_S) for _ in range(20)]
     assert commands.count(PUMP.start_fraction) == round(KICK_S / DT_S)
     assert commands[-1] < PUMP.start_fraction
 
 
-def test_kick_again_after_a_stop() -> None:
+def test_the_start_kick_is_repeated_after_a_stop() -> None:
     curve = PumpCurve(PUMP)
     for _ in range(20):
         curve.command(0.35, DT_S)
@@ -64,7 +64,7 @@ def test_kick_again_after_a_stop() -> None:
 
 
 @pytest.mark.parametrize(("share", "runs"), [(0.49, False), (0.51, True)])
-def test_gap_goes_to_the_nearer_end(share: float, runs: bool) -> None:
+def test_a_flow_in_the_gap_goes_to_the_nearer_end(share: float, runs: bool) -> None:
     curve = PumpCurve(PUMP)
     for _ in range(20):
         curve.command(1.0, DT_S)
@@ -110,7 +110,7 @@ def test_a_measured_curve_is_scipys_cubic() -> None:
 
 
 @pytest.mark.parametrize("shape", ["quadratic", "root", "s-shaped", "dead zone"])
-def test_a_curved_pump_gives_what_was_wanted(shape: str) -> None:
+def test_a_pump_with_a_curved_characteristic_gives_the_wanted_flow(shape: str) -> None:
     curve, pump = PumpCurve(measured(shape)), ForeignPump(shape, 7.0)
     for flow in np.linspace(
         2.3 if shape == "root" else 0.3, 6.9, 40
@@ -121,7 +121,7 @@ def test_a_curved_pump_gives_what_was_wanted(shape: str) -> None:
 
 
 @given(st.lists(st.floats(0.2, 6.5), min_size=2, max_size=30))
-def test_a_pump_with_play_gives_what_was_wanted(flows: list[float]) -> None:
+def test_a_pump_with_hysteresis_gives_the_wanted_flow(flows: list[float]) -> None:
     """Up and down in any order; one branch alone would be wrong by 0.04 of the command,
     0.3 µm/s.
     """
@@ -193,7 +193,7 @@ NAN = float("nan")
         ),
     ],
 )
-def test_a_curve_that_is_none_is_refused(table: dict[str, object], says: str) -> None:
+def test_an_invalid_curve_is_refused(table: dict[str, object], says: str) -> None:
     with pytest.raises(ValidationError, match=says):
         PumpConfig.model_validate(table)
 

@@ -80,7 +80,7 @@ class Bench:
     ],
     ids=["noise alone", "gusts", "a lift in step", "a slow pump", "a wrong curve"],
 )
-def test_a_pump_that_does_not_drift_stays_within_its_error_bar(bench: Bench) -> None:
+def test_a_constant_pump_stays_within_its_error_bar(bench: Bench) -> None:
     drift = bench.run()
     known = drift.known
     assert known.sigma < 0.12
@@ -88,7 +88,7 @@ def test_a_pump_that_does_not_drift_stays_within_its_error_bar(bench: Bench) -> 
     assert abs(drift.correction - 1.0) <= abs(bench.ends_at - 1.0) + 0.05
 
 
-def test_a_pump_that_loses_a_fifth_in_a_night_is_followed_and_told() -> None:
+def test_a_loss_of_20_percent_in_a_night_is_followed_and_reported() -> None:
     drift = Bench(hours=8.0, ends_at=0.8, seed=8).run()
     assert drift.known.scale == pytest.approx(0.8, abs=2 * drift.known.sigma)
     assert drift.correction < 0.95
@@ -111,7 +111,7 @@ def told(bench: Bench) -> bool:
 
 
 @pytest.mark.campaign
-def test_every_night_in_which_a_pump_loses_a_fifth_is_told_and_no_other() -> None:
+def test_exactly_the_nights_with_a_loss_of_20_percent_are_reported() -> None:
     assert all(told(Bench(hours=8.0, ends_at=0.8, seed=seed)) for seed in range(200, 208))
     assert not any(told(Bench(hours=8.0, seed=seed)) for seed in range(300, 308))
 
@@ -133,7 +133,7 @@ def test_without_a_probe_nothing_is_learned() -> None:
     assert drift.correction == 1.0
 
 
-def test_a_segment_with_a_gap_teaches_nothing() -> None:
+def test_a_probe_segment_with_a_gap_is_discarded() -> None:
     drift = PumpDrift(0.1, 0.15)
     for k in range(round(20 * SEGMENT_S / DT_S)):
         if k % 200 == 0:
@@ -142,7 +142,7 @@ def test_a_segment_with_a_gap_teaches_nothing() -> None:
     assert drift.known == PumpScale()
 
 
-def test_a_drift_is_told_once_and_so_is_its_end() -> None:
+def test_a_pump_drift_and_its_end_are_each_reported_once() -> None:
     health = PumpHealth(change_max=0.15)
     told = []
     for scale in (1.0, 0.9, 0.84, 0.84, 0.86, 0.9, 0.95):
@@ -156,7 +156,7 @@ def test_a_drift_is_told_once_and_so_is_its_end() -> None:
     assert PumpHealth(0.15).step(PumpScale(0.8, 0.1))[1] == ()  # may be noise
 
 
-def test_it_is_reported_every_ten_segments() -> None:
+def test_the_pump_scale_is_reported_every_ten_segments() -> None:
     health = PumpHealth(0.15)
     assert [health.step(PumpScale())[0] for _ in range(20)] == ([False] * 9 + [True]) * 2
 
@@ -173,7 +173,7 @@ def commands(probe_um: float, may_probe: bool) -> list[float]:
     ]
 
 
-def test_the_loop_probes_only_if_it_is_asked_to_and_may() -> None:
+def test_the_loop_probes_only_if_configured_and_permitted() -> None:
     still = commands(0.0, may_probe=True)
     assert commands(0.1, may_probe=False) == still
     moved = np.array(commands(0.1, may_probe=True)) - still

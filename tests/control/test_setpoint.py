@@ -25,7 +25,7 @@ def test_ramp_arrives_without_overshoot(target_um: float) -> None:
     assert np.all(np.diff(way_um) * np.sign(target_um) >= 0)
 
 
-def test_ramp_is_no_faster_than_told() -> None:
+def test_the_ramp_is_no_faster_than_its_setting() -> None:
     assert np.diff(ramped(25.0, 1.24, 100)) == pytest.approx(3.0 * 0.02)
 
 
@@ -41,7 +41,7 @@ def test_slow_ticks_do_not_overshoot() -> None:
     assert ramped(1.0, 1.24, 5, dt_s=2.0).max() <= 1.0
 
 
-def test_weight_is_that_of_the_textbook() -> None:
+def test_the_setpoint_weight_matches_the_textbook_formula() -> None:
     """PI on the filtered setpoint equals PI with weight b on the setpoint (K = 1, the measurement
     at 0).
     """

@@ -88,12 +88,12 @@ def test_single_frames_make_a_reference_of_as_many_readings() -> None:
     assert bench.loop.step(12.0, 0.05, None, 0.0, True).reason == NO_REASON
 
 
-def test_nothing_is_learnt_before_the_loop_is_settled() -> None:
+def test_no_reference_is_taken_before_the_loop_has_settled() -> None:
     out = Bench().run(60.0, settled=False)
     assert (out.state, out.reason.code) == (ShapeState.WAITING, ShapeCode.NOT_SETTLED)
 
 
-def test_trim_goes_to_the_lasers_drift(tracking: Bench) -> None:
+def test_the_trim_converges_to_the_laser_drift(tracking: Bench) -> None:
     """The laser reads 3 µm too much, the camera sees no change:
     the setpoint must be 3 µm higher.
     """
@@ -104,7 +104,7 @@ def test_trim_goes_to_the_lasers_drift(tracking: Bench) -> None:
     assert out.age_s == pytest.approx(0.5)
 
 
-def test_changed_setpoint_is_not_taken_for_drift(tracking: Bench) -> None:
+def test_a_changed_setpoint_is_not_mistaken_for_drift(tracking: Bench) -> None:
     tracking.sag_um = 5.0
     out = tracking.run(300.0)
     assert out.trim_um == pytest.approx(0.0, abs=1e-9)
@@ -117,7 +117,7 @@ def test_trim_is_bounded_in_rate(tracking: Bench) -> None:
     assert np.abs(np.diff(tracking.trims_um)).max() <= CONFIG.trim_rate_max_um_per_s * DT_S + 1e-12
 
 
-def test_trim_is_bounded_in_range_and_says_so() -> None:
+def test_the_trim_is_limited_in_range_and_reports_it() -> None:
     bench = Bench(CONFIG.model_copy(update={"trim_max_um": 2.0}))
     bench.run(30.0)
     bench.bias_um = 5.0
@@ -156,7 +156,7 @@ def test_suspended_with_a_reason_and_the_trim_held(
     assert tracking.run(2 * PERIOD_S).state == ShapeState.TRACKING
 
 
-def test_agreement_edge(tracking: Bench) -> None:
+def test_laser_and_optics_agree_up_to_the_limit(tracking: Bench) -> None:
     limit_um = CONFIG.disagreement_max_um
     assert (
         tracking.run(PERIOD_S, coeffs_um=SENSITIVITY * (limit_um - 0.01)).state
@@ -174,7 +174,7 @@ def test_degraded_shape_is_used(tracking: Bench) -> None:
     assert tracking.run(30.0, verdict="degraded").state == ShapeState.TRACKING
 
 
-def test_no_shapes_is_noticed(tracking: Bench) -> None:
+def test_missing_shapes_suspend_the_loop(tracking: Bench) -> None:
     assert tracking.run(CONFIG.fresh_s - 1.0, shapes=False).state == ShapeState.TRACKING
     out = tracking.run(5.0, shapes=False)
     assert (out.state, out.reason) == (
@@ -198,7 +198,7 @@ def test_repeated_shape_is_not_used_twice(tracking: Bench) -> None:
     assert (out.state, out.reason.code) == (ShapeState.SUSPENDED, ShapeCode.NOT_NEWER)
 
 
-def test_off_holds_the_trim_and_on_goes_on_from_it(tracking: Bench) -> None:
+def test_switching_off_keeps_the_trim_and_switching_on_continues_from_it(tracking: Bench) -> None:
     tracking.bias_um = 2.0
     held_um = tracking.run(600.0).trim_um
     tracking.loop.switch(False, tracking.now_s)

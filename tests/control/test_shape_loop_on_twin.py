@@ -24,12 +24,12 @@ def test_drifting_laser_does_not_move_the_figure() -> None:
     assert moved_um(run.time_s, run.true_um) < 1.0
 
 
-def test_without_the_shape_loop_it_moves_by_the_drift() -> None:
+def test_without_the_shape_loop_the_figure_moves_by_the_drift() -> None:
     run = track(DRIFTING, 300.0, shape=SHAPE.model_copy(update={"enabled": False}))
     assert 9.0 < moved_um(run.time_s, run.true_um) < 11.0
 
 
-def test_trim_brings_little_noise() -> None:
+def test_the_trim_adds_little_noise() -> None:
     run = track(TwinConfig(start_error_um=0.0), 600.0, sag_noise_um=0.2)
     assert run.trim_um[run.time_s > 240.0].std() < 0.06
     assert run.true_um[run.time_s > 240.0].std() < 0.15

@@ -82,7 +82,7 @@ def noisy_test(
 
 
 @pytest.mark.parametrize("rate_hz", [10.0, 50.0])
-def test_noise_alone_complains_hardly_ever_and_asks_twice_rarely(rate_hz: float) -> None:
+def test_noise_alone_rarely_fails_the_actuator_test_or_repeats_it(rate_hz: float) -> None:
     tests = [noisy_test(rate_hz, seed) for seed in range(300)]
     assert not [test for test in tests if test.failure()]
     assert sum(test.is_second for test in tests) <= 9  # 3 %
@@ -95,7 +95,7 @@ def test_noise_alone_complains_hardly_ever_and_asks_twice_rarely(rate_hz: float)
 @pytest.mark.parametrize(
     ("pump_share", "vent_um_per_s"), [(0.0, 100.0), (1.0, 0.0)], ids=["pump", "vent"]
 )
-def test_noise_alone_hides_a_dead_actuator_hardly_ever(
+def test_noise_alone_rarely_hides_a_dead_actuator(
     rate_hz: float, pump_share: float, vent_um_per_s: float
 ) -> None:
     passed = sum(
@@ -104,7 +104,7 @@ def test_noise_alone_hides_a_dead_actuator_hardly_ever(
     assert passed <= 5  # two in a thousand of a pump, six of a vent, are to be expected
 
 
-def test_something_in_the_beam_during_the_first_does_not_spoil_the_second() -> None:
+def test_an_obstructed_beam_in_the_first_test_does_not_affect_the_second() -> None:
     pump = PumpConfig()
     test = ActuatorTest(pump, True, 50.0)
     height_um = 0.0

@@ -175,7 +175,7 @@ def test_after_a_latch_an_unlock_and_an_ack_let_the_mirror_be_held_again(state: 
     assert mirror.tick().command.pump_fraction > 0.0
 
 
-def test_a_latch_undoes_an_ack_that_is_still_waiting_for_the_pump_to_stand() -> None:
+def test_a_latch_cancels_an_ack_that_still_waits_for_the_pump_to_stop() -> None:
     mirror = in_state(State.HOLD)
     mirror.tick(latched_faults=4)
     mirror.tick("ack", pump_fraction=0.5)
@@ -198,7 +198,7 @@ def test_a_latch_ends_a_ramp_down_at_once() -> None:
 
 
 @pytest.mark.parametrize("state", State, ids=lambda state: state.name)
-def test_what_goes_down_wins_over_what_lifts_in_either_order(state: State) -> None:
+def test_a_lowering_command_overrules_a_lifting_one_in_either_order(state: State) -> None:
     for down, lifting in itertools.product(("vent", "stop", "lower"), LIFTING):
         answers = []
         for batch in orders(down, lifting):  # type: ignore[arg-type]  # literals of the table
@@ -242,7 +242,7 @@ def test_a_vent_in_the_tick_of_a_fault_opens_the_vent() -> None:
     assert mirror.tick().command.vent_fraction == 1.0
 
 
-def test_the_order_is_the_one_of_the_table_and_else_as_they_came() -> None:
+def test_commands_follow_the_table_and_otherwise_their_arrival() -> None:
     kinds: tuple[Kind, ...] = ("hold", "lower", "mark", "stop", "vent", "latch", "ack")
     ordered = [made.kind for made in sort_commands(command(kind) for kind in kinds)]
     assert ordered == [*DOWN, "hold", "mark", "ack"]

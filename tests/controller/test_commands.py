@@ -12,12 +12,12 @@ WITHOUT_SHAPE = Config(shape=ShapeConfig(enabled=False))
 
 
 @pytest.mark.parametrize("state", sorted(TABLE["capture"].states))
-def test_no_picture_is_promised_where_nothing_measures(state: State) -> None:
+def test_a_capture_is_refused_where_nothing_measures(state: State) -> None:
     capture = Command("capture", "tester")
     assert "no shape measurement" in explain_refusal(capture, state, WITHOUT_SHAPE)
     assert explain_refusal(capture, state, Config()) == ""
 
 
 @pytest.mark.parametrize("state", sorted(set(State) - {State.STANDBY, State.FAULT}))
-def test_nothing_is_acknowledged_where_nothing_is_latched(state: State) -> None:
+def test_an_ack_is_refused_without_a_latched_fault(state: State) -> None:
     assert "ack is not allowed" in explain_refusal(Command("ack", "anybody"), state, Config())

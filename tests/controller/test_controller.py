@@ -61,7 +61,7 @@ def after(
     return lambda now_s, reading: change(reading) if start_s <= now_s < until_s else reading
 
 
-def test_a_good_run_goes_through_its_states_and_ends_with_the_pump_off() -> None:
+def test_a_normal_run_passes_its_states_and_ends_with_the_pump_off() -> None:
     run = Run(Config(), 40.0)
     assert run.states == ["check", "inflate", "settle", "hold", "lower"]
     assert run.of("state")[3]["mono_s"] <= 15.0
@@ -73,13 +73,13 @@ def test_a_good_run_goes_through_its_states_and_ends_with_the_pump_off() -> None
 
 
 @pytest.mark.parametrize("state", [State.STANDBY, State.LOWER])
-def test_the_pump_stands_in_states_that_do_not_hold(state: State) -> None:
+def test_the_pump_is_off_in_states_that_do_not_hold(state: State) -> None:
     run = Run()
     pump = run.value("pump_fraction")[run.value("state") == state]
     assert np.all(pump == 0.0)
 
 
-def test_ten_seconds_without_a_laser_are_held_on_the_mean_flow_and_forgiven() -> None:
+def test_ten_seconds_without_a_laser_are_held_on_the_mean_flow_without_a_latched_fault() -> None:
     lost = after(25.0, 35.0, lambda r: replace(r, displacement_um=math.nan, displacement_quality=1))
     run = Run(CALM, 45.0, lost)
     assert [f["name"] for f in run.of("fault")] == ["displacement_missing"]
@@ -106,7 +106,7 @@ def test_the_pump_is_handed_over_to_a_person_and_back_without_a_gap() -> None:
     assert min(row.pump_fraction for row in rows[990:]) > 0.2
 
 
-def test_the_line_that_says_why_names_who_asked_for_that_and_nobody_else() -> None:
+def test_the_operator_line_names_the_sender_of_the_command_only() -> None:
     run = VirtualRun(CALM, VirtualBench(Plant(CALM.twin, CALM.pump), 0.5), zernike_projection())
     asked = {
         1: Command("hold", "ann"),
@@ -123,7 +123,7 @@ def test_the_line_that_says_why_names_who_asked_for_that_and_nobody_else() -> No
     assert said[-1].startswith("paused by ann")
 
 
-def test_a_repeated_sample_or_two_are_no_fault() -> None:
+def test_one_or_two_repeated_samples_are_no_fault() -> None:
     held: list[BenchReading] = []
 
     def repeat_two(now_s: float, reading: BenchReading) -> BenchReading:
@@ -135,7 +135,7 @@ def test_a_repeated_sample_or_two_are_no_fault() -> None:
     assert run.finished == Exit.DONE
 
 
-def test_a_laser_that_stays_away_leads_down_the_safe_levels() -> None:
+def test_a_lasting_laser_loss_escalates_through_the_safe_levels() -> None:
     lost = after(
         25.0, math.inf, lambda r: replace(r, displacement_um=math.nan, displacement_quality=1)
     )
@@ -182,7 +182,7 @@ def test_each_latching_fault_enters_its_safe_level_within_two_ticks_of_its_windo
     assert entered.vent_fraction == (1.0 if safe_level == SafeLevel.VENT else 0.0)
 
 
-def test_a_frozen_sensor_is_seen_although_it_answers() -> None:
+def test_a_frozen_sensor_is_detected_although_it_answers() -> None:
     frozen: list[BenchReading] = []
 
     def freeze(now_s: float, reading: BenchReading) -> BenchReading:
@@ -196,7 +196,7 @@ def test_a_frozen_sensor_is_seen_although_it_answers() -> None:
     assert run.finished == Exit.SAFETY_TRIP
 
 
-def test_one_wild_reading_is_passed_over() -> None:
+def test_a_single_outlier_is_ignored() -> None:
     wild = after(25.0, 25.02, lambda r: replace(r, displacement_um=r.displacement_um + 300.0))
     run = Run(CALM, 40.0, wild)
     assert run.finished == Exit.DONE
@@ -232,7 +232,7 @@ def test_an_error_in_the_control_code_stops_the_pump(monkeypatch: pytest.MonkeyP
     assert np.all(run.value("pump_fraction")[first_error:] == 0.0)
 
 
-def test_a_mirror_that_cannot_follow_is_given_up() -> None:
+def test_a_mirror_that_cannot_follow_its_setpoint_is_a_fault() -> None:
     config = CALM.model_copy(update={"limits": LimitsConfig(following_error_max_um=5.0)})
     moved = after(25.0, math.inf, lambda r: replace(r, displacement_um=r.displacement_um - 20.0))
     run = Run(config, 60.0, moved)
@@ -240,7 +240,7 @@ def test_a_mirror_that_cannot_follow_is_given_up() -> None:
 
 
 @pytest.mark.campaign
-def test_a_flat_mirror_is_filled_in_hours_and_held() -> None:
+def test_a_flat_mirror_is_inflated_within_hours_and_held() -> None:
     twin = TwinConfig(scenario="calm", laser_noise_um=0.3, from_flat=True)
     loop = LoopConfig(rate_hz=2.0, measurement_filter_s=0.25)
     limits = LimitsConfig(displacement_min_um=-40_000.0)
@@ -255,7 +255,7 @@ def vent_stuck(reading: BenchReading) -> BenchReading:
     return replace(reading, displacement_um=-25.0 + 1e-3 * (reading.sample_counter % 7))
 
 
-def test_a_film_that_does_not_answer_is_not_inflated() -> None:
+def test_a_film_that_does_not_respond_is_not_inflated() -> None:
     run = Run(CALM, 30.0, lambda now_s, r: vent_stuck(r))
     assert run.finished == Exit.SAFETY_TRIP
     assert [f["name"] for f in run.of("fault")] == ["actuator_test"]
@@ -272,7 +272,7 @@ def test_the_same_seed_gives_the_same_run() -> None:
 
 @pytest.mark.parametrize("field", ["pump_fraction", "vent_fraction"])
 @pytest.mark.parametrize("value", [math.nan, math.inf, -0.1, 1.1])
-def test_a_command_that_no_bench_takes_is_an_error_of_the_control_code(
+def test_an_invalid_bench_command_counts_as_an_error_of_the_control_code(
     monkeypatch: pytest.MonkeyPatch, field: str, value: float
 ) -> None:
     from membrane_ctrl.controller import states

@@ -126,7 +126,7 @@ MORE: dict[str, dict[str, Any]] = {
 
 
 @pytest.mark.parametrize(("field", "dangerous", "sound"), FIELDS)
-def test_each_danger_is_an_error_and_its_neighbour_none(
+def test_each_dangerous_value_is_an_error_and_the_nearest_safe_value_is_not(
     field: str, dangerous: Any, sound: Any
 ) -> None:
     more = MORE.get(field, {})
@@ -148,7 +148,7 @@ WARNINGS: list[tuple[str, Any, Any]] = [
 
 
 @pytest.mark.parametrize(("field", "odd", "sound"), WARNINGS)
-def test_what_is_only_odd_is_a_warning(field: str, odd: Any, sound: Any) -> None:
+def test_an_unusual_but_safe_value_is_a_warning(field: str, odd: Any, sound: Any) -> None:
     assert severity_of(config_of({field: odd}), field) == "warning"
     assert severity_of(config_of({field: sound}), field) == ""
 
@@ -176,7 +176,7 @@ def test_each_danger_of_a_device_is_an_error(
     assert severity_of(config_of({field: sound}, devices), field) == ""
 
 
-def test_a_slow_tick_and_a_short_watchdog() -> None:
+def test_a_watchdog_shorter_than_some_ticks_is_an_error() -> None:
     config = config_of(
         {"devices.watchdog_s": 0.1, "devices.timeout_s": 0.05, "loop.rate_hz": 2.5}, BOARD
     )
@@ -220,7 +220,7 @@ def test_the_range_of_a_laser_about_its_zero(zero: float, sound: bool) -> None:
     assert (severity_of(deep, "limits.displacement_max_um") == "") == sound
 
 
-def test_the_boards_own_limits_are_the_last_word() -> None:
+def test_limits_beyond_those_of_the_board_are_errors() -> None:
     strict = BenchIdentity("board", 1, "1.0.0", 0.5, 700.0, 0.7)
     fields = {finding.field for finding in cross_check(Config(), strict)}
     assert fields == {
@@ -281,7 +281,7 @@ def test_a_setpoint_whose_trim_reaches_the_limit(room: tuple[str, float]) -> Non
     )
 
 
-def test_a_misspelt_fault_is_told_what_was_meant() -> None:
+def test_a_misspelt_fault_gets_the_nearest_name() -> None:
     (finding,) = cross_check(config_of({"resume.faults": ["link_lost", "watchdog_triped"]}))
     assert (finding.severity, finding.field, finding.remedy) == (
         "error",
@@ -345,7 +345,7 @@ def test_a_camera_behind_the_mirror() -> None:
     )
 
 
-def test_what_a_program_put_in_is_no_number_either() -> None:
+def test_values_set_by_a_program_must_be_numbers_too() -> None:
     config = Config()
     broken = config.model_copy(
         update={"loop": config.loop.model_copy(update={"ti_s": math.nan, "td_s": math.inf})}
@@ -363,7 +363,7 @@ def test_what_a_program_put_in_is_no_number_either() -> None:
         "[devices.pump]\ndriver = 'ventus'\nport = 'x'\ntimeout_s = true\n",
     ],
 )
-def test_true_is_no_number(text: str) -> None:
+def test_true_is_not_accepted_as_a_number(text: str) -> None:
     with pytest.raises(InputError, match=r"true.* is neither a number nor a text"):
         parse(tomllib.loads(text), Config, "lab.toml")
     assert (
@@ -379,7 +379,7 @@ DANGEROUS = (
 
 
 @pytest.mark.parametrize("command", [["check"], ["hold", "--twin", "--duration", "1s", "--config"]])
-def test_every_finding_is_a_line_and_nothing_is_made(
+def test_every_finding_is_a_line_and_no_file_is_written(
     command: list[str],
     tmp_path: Path,
     capsys: pytest.CaptureFixture[str],
@@ -411,7 +411,7 @@ class StillPlant:
 
 
 @pytest.mark.parametrize("command", [["check"], ["hold", "--config"]])
-async def test_a_limit_beyond_the_boards_own_is_refused_by_whoever_asks_it(
+async def test_a_limit_beyond_that_of_the_board_is_refused_after_reading_the_board(
     command: list[str], tmp_path: Path
 ) -> None:
     plant = StillPlant()

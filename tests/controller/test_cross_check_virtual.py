@@ -164,13 +164,13 @@ def judged(seeds: range, passing: bool = True) -> tuple[int, int, list[str]]:
     return drawn, looked_at, found
 
 
-def test_what_passes_holds_and_ends_safely() -> None:
+def test_a_configuration_that_passes_holds_and_ends_safely() -> None:
     drawn, passed, found = judged(range(14))
     assert found == []
     assert 0.2 * drawn < passed < 0.8 * drawn  # it neither refuses nor accepts everything
 
 
-def test_the_onlooker_is_not_blind() -> None:
+def test_the_observer_of_the_virtual_runs_detects_violations() -> None:
     """Many refused ones only lack a guard that this story does not need; but not all."""
     _, refused, found = judged(range(16), passing=False)
     assert len({line.split(":")[0] for line in found}) >= refused // 5 >= 1
@@ -178,7 +178,7 @@ def test_the_onlooker_is_not_blind() -> None:
 
 @pytest.mark.campaign
 @pytest.mark.timeout(1200)
-def test_what_passes_of_five_hundred_holds_and_ends_safely() -> None:
+def test_configurations_of_five_hundred_that_pass_hold_and_end_safely() -> None:
     drawn, passed, found = judged(range(1000, 1500))
     print(f"{drawn} configurations drawn, {passed} let pass, {len(found)} failures")
     assert found == []

@@ -20,7 +20,7 @@ def test_every_rule_is_on_both_pages() -> None:
         )
 
 
-def test_a_page_that_is_old_is_said_and_not_touched(
+def test_an_outdated_page_is_reported_and_not_changed(
     tmp_path: object, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     from pathlib import Path
@@ -35,6 +35,6 @@ def test_a_page_that_is_old_is_said_and_not_touched(
     assert old.read_text() == faults_page.faults_page()
 
 
-def test_a_runbook_without_marks_is_not_written_over() -> None:
+def test_a_runbook_without_markers_is_not_overwritten() -> None:
     with pytest.raises(ValueError, match="substring"):
         faults_page.operations_page("# Operations\n")

@@ -181,12 +181,12 @@ def judged(bench: Bench, exit_code: Exit, name: str) -> None:
     assert bench.pump.value == 0.0
 
 
-def test_without_anything_broken_the_hold_ends_as_asked(bench: Bench) -> None:
+def test_without_a_fault_the_hold_ends_as_requested(bench: Bench) -> None:
     assert bench.hold(lambda bench: None) == Exit.DONE
     assert not [event for event in bench.events if event["kind"] == "fault"]
 
 
-def test_a_start_tells_the_controller_of_the_days_resumes(bench: Bench) -> None:
+def test_a_start_passes_the_resumes_of_the_day_to_the_controller(bench: Bench) -> None:
     for hours in (30.0, 2.0, 1.0):
         ResumeLog(bench.folder).add(datetime.now(UTC) - timedelta(hours=hours))
     bench.hold(lambda bench: None)
@@ -212,12 +212,12 @@ def test_a_listener_that_raises_is_a_fault(
     judged(bench, exit_code, f"{name} (RuntimeError: broken)")
 
 
-def test_children_that_cannot_be_looked_after_are_a_fault(bench: Bench) -> None:
+def test_an_error_in_the_supervision_of_children_is_a_fault(bench: Bench) -> None:
     exit_code = bench.hold(lambda bench: setattr(bench, "reports", raises))
     judged(bench, exit_code, "children (RuntimeError: broken)")
 
 
-def test_whatever_ends_the_run_the_last_command_is_pump_off_with_the_vent_as_it_was() -> None:
+def test_the_last_command_of_every_run_is_pump_off_with_the_vent_unchanged() -> None:
     """An error that nothing catches, in the middle of a hold."""
     commands: list[BenchCommand] = []
 
@@ -247,7 +247,7 @@ def test_whatever_ends_the_run_the_last_command_is_pump_off_with_the_vent_as_it_
     assert commands == [BenchCommand(0.7, 0.3)] * 3 + [BenchCommand(0.0, 0.3)]
 
 
-def test_a_thread_that_raises_tells_of_it(tmp_path: Path) -> None:
+def test_a_thread_that_raises_is_reported(tmp_path: Path) -> None:
     """Nobody sees what a thread raises: any error is reported as a disk error is."""
     told: list[EventLine] = []
     with FaultLatch(
@@ -257,7 +257,7 @@ def test_a_thread_that_raises_tells_of_it(tmp_path: Path) -> None:
     assert told[0] == LatchFailed("broken")
 
 
-def test_missed_deadlines_are_skipped_and_lateness_is_told_in_milliseconds() -> None:
+def test_missed_deadlines_are_skipped_and_lateness_is_reported_in_milliseconds() -> None:
     """The third reading of a run at 10 Hz takes 0.35 s."""
     seen: list[TickInputs] = []
 
@@ -293,7 +293,7 @@ def test_missed_deadlines_are_skipped_and_lateness_is_told_in_milliseconds() -> 
     assert [inputs.missed_ticks for inputs in seen] == [0, 0, 0, 2, 2, 2]
 
 
-def test_why_a_lost_link_does_not_come_back_is_told_once() -> None:
+def test_the_reason_for_a_failing_reconnection_is_reported_once() -> None:
     """The link breaks in the third tick; then another program holds the board, and leaves it."""
     reads, opened = 0, 0
 

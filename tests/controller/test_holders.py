@@ -87,7 +87,7 @@ def set_to(name: str, value: float | bool) -> Callable[[Wrong, bool], None]:
     ],
     ids=["no laser", "stuck laser", "no camera", "no barometer", "knocked laser"],
 )
-def test_a_lost_sensor_makes_no_bump_and_no_fault(
+def test_a_lost_sensor_causes_neither_a_step_nor_a_fault(
     fail: Callable[[Wrong, bool], None], holders: list[str]
 ) -> None:
     ticks = held(fail)
@@ -105,7 +105,7 @@ def test_a_lost_sensor_makes_no_bump_and_no_fault(
 
 
 @pytest.mark.campaign
-def test_without_laser_and_optics_the_flow_is_held_until_one_is_back() -> None:
+def test_without_laser_and_optics_the_flow_is_held_until_one_returns() -> None:
     def fail(wrong: Wrong, fails: bool) -> None:
         wrong.no_light = wrong.camera_lost = fails
 
@@ -115,7 +115,7 @@ def test_without_laser_and_optics_the_flow_is_held_until_one_is_back() -> None:
     assert safe_levels[-1] == SafeLevel.NONE
 
 
-def test_the_loop_holds_the_laser_as_ever_by_default() -> None:
+def test_by_default_the_loop_controls_the_laser_reading() -> None:
     ticks = held(set_to("no_light", True), Config(twin=CONFIG.twin), until_s=19.0)
     assert told(ticks) == []
     assert ticks[-1].row.safe_level == SafeLevel.HOLD_FLOW

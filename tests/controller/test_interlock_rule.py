@@ -144,7 +144,7 @@ def test_an_open_circuit_enters_its_own_level_in_the_tick_that_shows_it_and_is_n
 @pytest.mark.parametrize(
     "state", [State.CHECK, State.INFLATE, State.SETTLE, State.HOLD, State.MANUAL, State.LOWER]
 )
-def test_it_is_judged_in_every_state_in_which_gas_moves(state: State) -> None:
+def test_an_interlock_is_judged_in_every_state_in_which_gas_moves(state: State) -> None:
     rig = Rig()
     rig.until(State.HOLD if state in (State.MANUAL, State.LOWER) else state, hold())
     if state == State.MANUAL:
@@ -157,7 +157,7 @@ def test_it_is_judged_in_every_state_in_which_gas_moves(state: State) -> None:
     assert rig.faults[-1:] == ["interlock_open"]
 
 
-def test_in_standby_it_is_no_fault_but_no_hold_begins_and_none_begins_by_itself() -> None:
+def test_an_open_interlock_in_standby_is_no_fault_but_prevents_a_hold() -> None:
     rig = Rig()
     rig.go(1.0)
     rig.circuits.open_names = {"door"}
@@ -195,7 +195,7 @@ def test_the_program_can_be_ended_in_standby_while_a_door_is_open() -> None:
     assert rig.run.finished.name == "INTERRUPTED"
 
 
-def test_one_that_opens_on_the_way_down_from_standby_counts_again() -> None:
+def test_an_interlock_that_opens_while_lowering_from_standby_is_a_fault() -> None:
     rig = Rig()
     rig.circuits.open_names = {"door"}
     rig.go(1.0)
@@ -234,7 +234,7 @@ def test_a_deeper_interlock_during_a_fault_deepens_the_level_and_a_milder_one_do
     assert len(rig.faults) == 1
 
 
-def test_of_several_open_at_once_the_deepest_level_is_entered_and_all_are_named() -> None:
+def test_several_open_interlocks_enter_the_deepest_level_and_are_all_named() -> None:
     rig = Rig()
     rig.until(State.HOLD, hold())
     rig.circuits.lost_names = {"supply"}
@@ -248,7 +248,7 @@ def test_of_several_open_at_once_the_deepest_level_is_entered_and_all_are_named(
     assert "interlock stop_button is open" in fault.seen
 
 
-def test_one_that_opens_as_a_fault_resumes_cancels_the_hold() -> None:
+def test_an_interlock_that_opens_during_a_resume_cancels_the_hold() -> None:
     rig = Rig()
     rig.until(State.HOLD, hold())
     rig.bench.wrong.unreachable = True
@@ -262,7 +262,7 @@ def test_one_that_opens_as_a_fault_resumes_cancels_the_hold() -> None:
     assert State(int(rig.go(5.0).row.state)) == State.STANDBY
 
 
-def test_it_deepens_a_fault_of_another_cause_which_then_never_resumes() -> None:
+def test_an_interlock_deepens_another_fault_which_then_never_resumes() -> None:
     rig = Rig()
     rig.until(State.HOLD, hold())
     rig.bench.wrong.unreachable = True
@@ -287,9 +287,7 @@ def test_the_same_fault_without_an_interlock_resumes() -> None:
     assert len(rig.of(Resumed)) == 1
 
 
-def test_it_never_resumes_by_itself_and_an_acknowledgement_while_it_is_open_leads_to_standby_only() -> (  # noqa: E501
-    None
-):
+def test_an_interlock_never_resumes_automatically_and_an_ack_while_open_leads_to_standby() -> None:
     rig = Rig()
     rig.until(State.HOLD, hold())
     rig.circuits.open_names = {"door"}
@@ -410,7 +408,7 @@ def test_the_mask_is_part_of_the_checksum() -> None:
     assert output_crc(outputs, outputs.row.pack()) != output_crc(outputs, other.pack())
 
 
-def test_a_memory_remembers_what_was_open_since_standby() -> None:
+def test_a_snapshot_contains_the_interlocks_open_since_standby() -> None:
     rig = Rig()
     rig.circuits.open_names = {"door"}
     rig.go(1.0)

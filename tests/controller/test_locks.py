@@ -73,7 +73,7 @@ def test_a_lock_has_text_author_time_and_word_in_its_event() -> None:
 
 
 @pytest.mark.parametrize("state", State, ids=lambda state: state.name)
-def test_in_every_state_a_lock_stops_the_pump_in_its_tick_and_for_good(state: State) -> None:
+def test_in_every_state_a_lock_stops_the_pump_in_its_tick_permanently(state: State) -> None:
     mirror = in_state(state)
     assert give(mirror, lock(ANN)).command.pump_fraction == 0.0
     for kind in ("ack", "hold", "manual", "resume", "ack", "vent", "lower", "ack", "hold", "hold"):
@@ -92,7 +92,7 @@ def test_no_other_command_removes_a_lock(kind: Kind) -> None:
 
 
 @pytest.mark.parametrize("kind", ["hold", "manual", "tune", "resume"])
-def test_what_lets_gas_in_is_refused_with_text_author_time_and_word(kind: Kind) -> None:
+def test_commands_that_admit_gas_are_refused_with_the_fields_of_the_lock(kind: Kind) -> None:
     outputs = locked(ANN).tick(kind)
     (refused,) = refusals(outputs)
     for part in ("hands inside", "unix:ann", ANN.set_utc, "bofak", "unlock"):
@@ -108,7 +108,7 @@ def test_a_lock_set_during_a_fault_is_kept_after_its_ack() -> None:
     assert mirror.controller.state == State.STANDBY
 
 
-def test_a_hold_that_was_wanted_already_does_not_begin_with_a_lock() -> None:
+def test_a_pending_hold_does_not_begin_with_a_lock() -> None:
     mirror = in_state(State.STANDBY)
     mirror.controller._context.hold_wanted = True
     give(mirror, lock(ANN))
@@ -163,14 +163,14 @@ def test_a_refused_unlock_changes_nothing_and_is_recorded(asked: Command, says: 
     assert words(mirror) == ["bofak", "tarep"]
 
 
-def test_a_lock_without_a_login_has_no_author_and_goes_by_its_word() -> None:
+def test_a_lock_without_a_login_has_no_author_and_is_removed_by_its_word() -> None:
     mirror = locked(LINK)
     assert refusals(give(mirror, unlock())) != [""]
     (removed,) = [e for e in give(mirror, unlock("tarep")).events if isinstance(e, LockRemoved)]
     assert removed.how == "word"
 
 
-def test_an_author_of_two_locks_names_the_one() -> None:
+def test_an_author_of_two_locks_must_name_one() -> None:
     second = replace(ANN, word="dinof", text="still inside")
     mirror = locked(ANN, second)
     assert "several" in refusals(give(mirror, unlock(account="unix:ann")))[0]
@@ -196,14 +196,14 @@ def test_locks_of_people_are_never_merged_and_a_program_that_repeats_itself_sets
     assert len(words(mirror)) == 3
 
 
-def test_an_unlock_never_undoes_a_lock_of_its_own_tick() -> None:
+def test_an_unlock_never_removes_a_lock_of_the_same_tick() -> None:
     for batch in itertools.permutations((lock(ANN), unlock("bofak", "unix:ann"))):
         mirror = in_state(State.STANDBY)
         give(mirror, *batch)
         assert words(mirror) == ["bofak"]
 
 
-def test_there_is_a_bound_but_not_for_those_of_earlier_runs() -> None:
+def test_the_number_of_locks_is_limited_except_those_of_earlier_runs() -> None:
     mirror = in_state(State.STANDBY)
     give(mirror, *(lock(replace(ANN, word="")) for _ in range(LOCKS_MOST)))
     assert "the most there may be" in refusals(give(mirror, lock(BOB)))[0]

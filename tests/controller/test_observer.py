@@ -33,7 +33,7 @@ def test_a_sample_is_new_only_when_counter_and_time_have_both_advanced() -> None
     assert valid == [True, False, False, True]
 
 
-def test_a_jump_is_believed_after_ten_refusals() -> None:
+def test_a_jump_is_accepted_after_ten_refused_readings() -> None:
     observer = Observer(Config())
     look(observer, 1, 0.0, 1, 0.02)
     valid = [
@@ -60,19 +60,19 @@ def test_a_gauge_that_repeats_itself_is_timed_and_any_change_ends_it() -> None:
     assert math.isclose(gauge(observer, 13, math.nan).gauge_same_s, 0.0)
 
 
-def test_the_gauge_of_a_slack_film_may_stand_at_its_zero() -> None:
+def test_the_gauge_of_a_slack_film_may_repeat_its_zero() -> None:
     observer = Observer(Config())
     assert {gauge(observer, tick, 0.0).gauge_same_s for tick in range(1, 100)} == {0.0}
 
 
-def test_a_gauge_that_jumps_is_believed_after_ten_refusals() -> None:
+def test_a_jump_of_the_gauge_is_accepted_after_ten_refused_readings() -> None:
     observer = Observer(Config())
     gauge(observer, 1, 600.0)
     jumps = [gauge(observer, tick, 500.0 + 0.1 * tick).gauge_jumps for tick in range(2, 14)]
     assert jumps == [*range(1, 11), 0, 0]
 
 
-def test_a_gauge_that_jumps_is_no_evidence_and_is_judged_by_its_limits_nevertheless() -> None:
+def test_a_jumping_gauge_is_not_compared_but_still_checked_against_its_limits() -> None:
     observer = Observer(Config())
     gauge(observer, 1, 600.0)
     seen = gauge(observer, 2, 2000.0)
@@ -82,7 +82,7 @@ def test_a_gauge_that_jumps_is_no_evidence_and_is_judged_by_its_limits_neverthel
     assert observer.gauge_pressure_pa == 600.5
 
 
-def test_a_read_back_that_is_no_number_does_not_follow_its_command() -> None:
+def test_a_read_back_of_nan_counts_as_a_mismatch() -> None:
     observer = Observer(Config())
     reading = BenchReading(0.0, 0, 600.0, 101325.0, 23.0, 23.0, 0.0, 0.0, 1, 0.02, False, 0)
     for tick, (pump, mismatch) in enumerate(((0.0, 0.0), (0.3, 0.3), (math.nan, math.inf)), 1):

@@ -67,16 +67,16 @@ def test_another_decision_or_number_is_another_checksum(other: TickOutputs) -> N
         replace(OUTPUTS, events=(replace(FAULT, name="no_laser"), Why("holding"))),
     ],
 )
-def test_names_and_sentences_have_no_part_in_it(other: TickOutputs) -> None:
+def test_names_and_sentences_do_not_affect_the_checksum(other: TickOutputs) -> None:
     assert crc(other) == crc(OUTPUTS)
 
 
-def test_a_refusal_in_other_words_is_the_same() -> None:
+def test_a_reworded_refusal_gives_the_same_checksum() -> None:
     refused = replace(OUTPUTS, answers=((7, "not now"),))
     assert crc(refused) == crc(replace(OUTPUTS, answers=((7, "later, please"),)))
 
 
-def test_a_column_that_the_run_did_not_record_has_no_part_in_it() -> None:
+def test_a_column_that_the_run_did_not_record_does_not_affect_the_checksum() -> None:
     recorded = tuple(name for name in FIELDS if name != "leak_um_per_s")
     other = replace(OUTPUTS, row=replace(ROW, leak_um_per_s=9e9))
     assert crc(OUTPUTS, recorded) == crc(other, recorded)

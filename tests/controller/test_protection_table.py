@@ -33,7 +33,7 @@ def test_every_state_in_which_the_pump_may_run_has_a_row() -> None:
 
 
 @pytest.mark.parametrize(("value", "activity", "duty"), CELLS, ids=lambda part: part.name.lower())
-def test_every_duty_has_a_keeper_that_is_judged_there(
+def test_every_protection_goal_has_a_rule_that_applies_in_its_state(
     value: ProcessValue, activity: Activity, duty: Duty
 ) -> None:
     keepers = find_keepers(value, activity, duty)
@@ -43,7 +43,7 @@ def test_every_duty_has_a_keeper_that_is_judged_there(
             assert activity.state in RULES[keeper].states, keeper
 
 
-def test_every_guard_is_named_somewhere() -> None:
+def test_every_guard_appears_in_the_table() -> None:
     named = {
         keeper for cell in CELLS for keeper in find_keepers(*cell) if isinstance(keeper, Guard)
     }

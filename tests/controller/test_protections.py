@@ -238,7 +238,7 @@ def test_the_loss_of_the_laser_is_reported_at_once_and_its_return_too() -> None:
     assert held.faults == []
 
 
-def test_a_laser_that_blinks_is_not_reported() -> None:
+def test_short_laser_dropouts_are_not_reported() -> None:
     def blink(wrong: Wrong, since_s: float) -> None:
         wrong.no_light = since_s % 10.0 < 1.0
 
@@ -315,7 +315,7 @@ def test_an_experiment_ends_when_the_laser_that_it_measures_with_is_lost() -> No
     assert held.state == State.HOLD
 
 
-def test_gas_that_the_film_takes_is_judged_while_only_the_optics_show_it_standing() -> None:
+def test_gas_consumption_is_judged_while_only_the_optics_show_the_film_at_rest() -> None:
     limits = LimitsConfig(laser_gauge_apart_max_um=400.0)
 
     def fail(wrong: Wrong, since_s: float) -> None:
@@ -395,7 +395,7 @@ def test_figures_of_another_mirror_count_as_missing() -> None:
 @pytest.mark.parametrize("undertaking", list(UNDERTAKINGS))
 @pytest.mark.parametrize("shape", [ShapeConfig(mode="track", track_rate_hz=RATE_HZ), ShapeConfig()])
 @pytest.mark.parametrize("process_value", ["laser", "estimate"])
-def test_sound_sensors_contradict_each_other_nowhere(
+def test_sensors_without_faults_never_contradict_each_other(
     undertaking: str, shape: ShapeConfig, process_value: str
 ) -> None:
     held = settled(config_of(process_value, shape=shape))
@@ -425,7 +425,7 @@ def outlying(um: float, one_in: int) -> Spoil:
 @pytest.mark.parametrize(
     "spoil", [alternating(10.0, 2.0), outlying(15.0, 6)], ids=["alternating", "1 in 6"]
 )
-def test_optics_that_jump_again_and_again_are_left_out(spoil: Spoil) -> None:
+def test_optics_that_jump_repeatedly_are_excluded(spoil: Spoil) -> None:
     """Each step looks like a knock of the laser; together they led the mirror by hundreds of
     micrometres.
     """
@@ -435,7 +435,7 @@ def test_optics_that_jump_again_and_again_are_left_out(spoil: Spoil) -> None:
     assert held.faults == []
 
 
-def test_a_laser_that_is_knocked_again_and_again_does_not_lead_the_film() -> None:
+def test_a_repeatedly_displaced_laser_does_not_move_the_film() -> None:
     def knock(wrong: Wrong, since_s: float) -> None:
         wrong.laser_offset_um = 45.0 if since_s % 20.0 < 10.0 else 0.0
 
@@ -471,7 +471,7 @@ def test_optics_that_were_outvoted_replace_no_laser() -> None:
     assert held.moved_um < 30.0
 
 
-def test_a_laser_that_answers_now_and_then_counts_as_missing() -> None:
+def test_an_intermittent_laser_counts_as_missing() -> None:
     ticks = 0
 
     def seldom(wrong: Wrong, since_s: float) -> None:
@@ -532,7 +532,7 @@ def test_figures_with_late_times_never_leave_the_mirror_to_the_prediction_alone(
     assert held.moved_um < 65.0
 
 
-def test_manual_flow_ends_by_healthy_optics_while_the_laser_shows_its_last_place() -> None:
+def test_healthy_optics_end_manual_flow_while_the_laser_is_frozen() -> None:
     held = settled(config_of("estimate"))
     held.command(Command("manual", "a test", value=5.0))
     rng = np.random.default_rng(7)

@@ -70,14 +70,14 @@ class Fault:
         return self.rule.due(self.fault, self.levels, observation, now_s)
 
 
-def test_only_what_is_listed_is_possible() -> None:
+def test_only_listed_faults_may_resume() -> None:
     for name, possible in (("link_lost", True), ("late", False)):
         fault = Fault(name)
         fault.due(0.0)
         assert fault.rule.possible is possible
 
 
-def test_what_never_resumes_is_not_possible_although_it_is_listed() -> None:
+def test_a_fault_that_never_resumes_does_not_even_if_listed() -> None:
     config = ResumeConfig(faults=tuple(RULES), wait_s=10.0)
     never = {name for name, rule in RULES.items() if not rule.may_resume}
     assert {
@@ -105,7 +105,7 @@ def test_what_never_resumes_is_not_possible_although_it_is_listed() -> None:
         replace(GONE, foreign=1),
     ],
 )
-def test_one_sight_of_a_latch_or_an_open_vent_decides_for_the_whole_fault(
+def test_one_observed_latch_or_open_vent_excludes_a_resume_for_the_whole_fault(
     seen: Observation,
 ) -> None:
     fault = Fault()
@@ -122,13 +122,13 @@ def test_one_sight_of_a_latch_or_an_open_vent_decides_for_the_whole_fault(
     assert fault.rule.possible
 
 
-def test_what_has_vented_is_not_possible() -> None:
+def test_a_vented_fault_may_not_resume() -> None:
     fault = Fault(safe_level=SafeLevel.VENT)
     assert not any(fault.due(float(second)) for second in range(60))
     assert not fault.rule.possible
 
 
-def test_the_watchdogs_own_bit_is_all_that_is_cleared() -> None:
+def test_only_the_watchdog_bit_is_cleared() -> None:
     fault = Fault()
     fault.due(0.0, LOST)
     fault.due(1.0, replace(GONE, board_faults=WATCHDOG))
@@ -137,7 +137,7 @@ def test_the_watchdogs_own_bit_is_all_that_is_cleared() -> None:
     assert fault.rule.clear_mask == 0
 
 
-def test_the_cause_must_stay_away_for_the_whole_wait() -> None:
+def test_the_cause_must_be_absent_for_the_whole_wait() -> None:
     fault = Fault()
     assert not fault.due(1000.0)  # the cause was not seen to go: the wait begins now
     assert not fault.due(1001.0, LOST)
@@ -146,7 +146,7 @@ def test_the_cause_must_stay_away_for_the_whole_wait() -> None:
     assert [fault.due(now_s) for now_s in (1012.0, 1021.9, 1022.0)] == [False, False, True]
 
 
-def test_the_days_number_is_used_up_and_comes_back_a_day_after() -> None:
+def test_the_daily_number_of_resumes_is_limited_and_restored_after_a_day() -> None:
     fault = Fault()
     fault.rule.resumed(-50_000.0)  # of an earlier run
     fault.rule.resumed(10.0)
@@ -168,7 +168,7 @@ def scenario(*at: At, duration_s: float, faults: tuple[str, ...]) -> CheckedScen
 
 
 @pytest.mark.parametrize("wrong", ["unreachable", "silent"])
-def test_a_cause_that_comes_back_during_the_wait_is_waited_for_from_its_end(wrong: str) -> None:
+def test_a_cause_that_returns_restarts_the_wait(wrong: str) -> None:
     """Gone at 22 s, back from 24 s to 40 s: nothing may resume before 50 s."""
     steps = (At(time_s=20.0, wrong=wrong, for_s=2.0), At(time_s=24.0, wrong=wrong, for_s=16.0))
     outcome = play(scenario(*steps, duration_s=55.0, faults=("link_lost", "device_silent")))
@@ -180,7 +180,7 @@ def test_a_cause_that_comes_back_during_the_wait_is_waited_for_from_its_end(wron
 @pytest.mark.parametrize(
     ("wrong", "fault"), [("no_light", "displacement_missing"), ("gauge_lost", "pressure_missing")]
 )
-def test_a_cause_that_stays_is_waited_out(wrong: str, fault: str) -> None:
+def test_a_lasting_cause_is_waited_for(wrong: str, fault: str) -> None:
     """The link is there all the time, the sensor comes back at 100 s: nothing may resume before 110
     s.
     """
@@ -193,7 +193,7 @@ def test_a_cause_that_stays_is_waited_out(wrong: str, fault: str) -> None:
     assert 110.0 <= resumed[0] < 112.0
 
 
-def test_a_wait_does_not_count_in_the_next_fault() -> None:
+def test_the_wait_starts_at_zero_for_the_next_fault() -> None:
     """Acknowledged after 8 s of the wait; the next fault waits its own 10 s."""
     steps = (
         At(time_s=20.0, wrong="stalled", for_s=1.0),
@@ -207,7 +207,7 @@ def test_a_wait_does_not_count_in_the_next_fault() -> None:
     assert left[1] >= 56.0
 
 
-def test_a_flaky_link_does_not_keep_the_mirror_down() -> None:
+def test_an_intermittent_link_does_not_prevent_a_resume() -> None:
     steps = (
         At(time_s=20.0, wrong="unreachable", for_s=2.0),
         At(time_s=22.5, wrong="lost_every", value=7),
@@ -235,7 +235,7 @@ def test_a_board_that_has_vented_while_the_link_was_down_stays_down() -> None:
     assert (last.row.vent_readback_fraction, last.row.pump_readback_fraction) == (1.0, 0.0)
 
 
-def test_a_resume_is_told_and_the_days_number_ends_it() -> None:
+def test_a_resume_is_reported_and_limited_by_the_daily_number() -> None:
     steps = tuple(At(time_s=20.0 + 40.0 * k, wrong="unreachable", for_s=2.0) for k in range(4))
     outcome = play(scenario(*steps, duration_s=180.0, faults=("link_lost",)))
     assert [event["name"] for event in outcome.of("resumed")] == ["link_lost"] * 3
@@ -244,7 +244,7 @@ def test_a_resume_is_told_and_the_days_number_ends_it() -> None:
 
 
 @pytest.mark.parametrize(("who", "possible"), [(AT_START, False), ("unix:ann", True)])
-def test_a_start_tells_of_earlier_resumes_and_nobody_else_does(who: str, possible: bool) -> None:
+def test_only_the_start_of_a_run_reports_earlier_resumes(who: str, possible: bool) -> None:
     config = Config(
         loop=LoopConfig(rate_hz=10.0),
         shape=ShapeConfig(enabled=False),

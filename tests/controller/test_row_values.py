@@ -48,7 +48,7 @@ def test_a_pause_shows_the_present_error(rows: list[TelemetryRow]) -> None:
     assert paused[-1].error_um - paused[0].error_um == pytest.approx(-moved_um, abs=1.5)
 
 
-def test_what_is_not_computed_is_absent(rows: list[TelemetryRow]) -> None:
+def test_values_that_are_not_computed_are_nan(rows: list[TelemetryRow]) -> None:
     for row in rows:
         if math.isnan(row.displacement_um):
             assert all(math.isnan(getattr(row, name)) for name in (*SEEN, "error_um"))
@@ -59,6 +59,6 @@ def test_what_is_not_computed_is_absent(rows: list[TelemetryRow]) -> None:
 
 
 @pytest.mark.parametrize("name", ["error_um", *SEEN])
-def test_nothing_is_held(rows: list[TelemetryRow], name: str) -> None:
+def test_no_value_is_repeated_from_the_tick_before(rows: list[TelemetryRow], name: str) -> None:
     values = [getattr(row, name) for row in rows]
     assert not [row for row, (a, b) in zip(rows, pairwise(values), strict=False) if a == b]

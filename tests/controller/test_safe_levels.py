@@ -11,7 +11,7 @@ from membrane_ctrl.model.telemetry import SafeLevel
 CONFIG = StatesConfig(hold_flow_max_s=10.0, ramp_down_s=5.0, pump_off_max_s=100.0)
 
 
-def test_each_safe_level_gives_way_to_the_next_after_its_time() -> None:
+def test_each_safe_level_escalates_to_the_next_after_its_time() -> None:
     levels = SafeLevels(CONFIG)
     levels.enter(SafeLevel.HOLD_FLOW, 50.0)
     times_s = (60.0, 60.5, 65.5, 66.0, 166.0, 166.5, 1e6)
@@ -27,7 +27,7 @@ def test_each_safe_level_gives_way_to_the_next_after_its_time() -> None:
     ]
 
 
-def test_a_safe_level_further_up_is_not_entered() -> None:
+def test_a_milder_safe_level_is_not_entered() -> None:
     levels = SafeLevels(CONFIG)
     levels.enter(SafeLevel.PUMP_OFF, 0.0)
     levels.enter(SafeLevel.HOLD_FLOW, 1.0)
@@ -38,7 +38,7 @@ def test_a_safe_level_further_up_is_not_entered() -> None:
 @pytest.mark.parametrize(
     ("clear_s", "left_s"), [(0.5, 2.5), (6.0, 8.0), (8.0, 10.0), (1000.0, 10.0)]
 )
-def test_the_time_of_the_first_safe_level_comes_back_only_as_fast_as_it_went(
+def test_the_time_of_hold_flow_recovers_as_slowly_as_it_was_used(
     clear_s: float, left_s: float
 ) -> None:
     levels = SafeLevels(CONFIG)
@@ -50,7 +50,7 @@ def test_the_time_of_the_first_safe_level_comes_back_only_as_fast_as_it_went(
     assert levels.step(again_s + left_s + 0.01) == SafeLevel.RAMP_DOWN
 
 
-def test_after_an_acknowledged_fault_the_time_is_whole_again() -> None:
+def test_after_an_acknowledged_fault_the_full_time_is_available() -> None:
     levels = SafeLevels(CONFIG)
     levels.enter(SafeLevel.HOLD_FLOW, 0.0)
     levels.clear(9.0)

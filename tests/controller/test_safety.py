@@ -78,14 +78,14 @@ def test_codes_and_names_are_unique() -> None:
 
 
 @pytest.mark.parametrize("state", State)
-def test_a_good_observation_trips_nothing(state: State) -> None:
+def test_a_normal_observation_trips_no_rule(state: State) -> None:
     table = SafetyTable(LIMITS)
     for _ in range(200):
         assert table.judge(state, GOOD).rule is None
 
 
 @pytest.mark.parametrize("rule", TABLE, ids=lambda rule: rule.name)
-def test_one_less_than_needed_is_nothing_and_needed_is_the_fault(rule: Rule) -> None:
+def test_a_rule_trips_at_exactly_the_needed_number_of_ticks(rule: Rule) -> None:
     table = judge_alone(rule)
     state = State.HOLD if State.HOLD in rule.states else next(iter(rule.states))
     for _ in range(rule.needed - 1):
@@ -95,7 +95,7 @@ def test_one_less_than_needed_is_nothing_and_needed_is_the_fault(rule: Rule) -> 
 
 
 @pytest.mark.parametrize("rule", [r for r in TABLE if r.needed > 1], ids=lambda rule: rule.name)
-def test_bad_ticks_further_apart_than_the_window_are_nothing(rule: Rule) -> None:
+def test_bad_ticks_outside_one_window_do_not_trip(rule: Rule) -> None:
     table = judge_alone(rule)
     for _ in range(3 * rule.needed):
         assert table.judge(State.HOLD, BAD[rule.name]).rule is None
@@ -123,7 +123,7 @@ def test_the_first_row_of_the_table_wins() -> None:
     assert rule.name == "over_pressure"
 
 
-def test_not_a_number_is_never_fine() -> None:
+def test_nan_is_never_accepted_as_safe() -> None:
     table = SafetyTable(LIMITS)
     lost = replace(GOOD, displacement_um=math.nan, displacement_valid=False)
     rules = [table.judge(State.HOLD, lost).rule for _ in range(3)]
@@ -131,7 +131,7 @@ def test_not_a_number_is_never_fine() -> None:
     assert rules[-1].safe_level == SafeLevel.HOLD_FLOW
 
 
-def test_what_the_operator_is_told_carries_the_value() -> None:
+def test_the_sentence_for_the_operator_contains_the_value() -> None:
     table = SafetyTable(LIMITS)
     table.judge(State.HOLD, BAD["over_pressure"])
     assert table.judge(State.HOLD, BAD["over_pressure"]).seen == "750.1 Pa"
@@ -149,7 +149,7 @@ def test_what_the_operator_is_told_carries_the_value() -> None:
         ),
     ],
 )
-def test_a_board_that_is_not_as_it_was_set_is_a_fault_in_the_same_tick(
+def test_changed_board_settings_are_a_fault_in_the_same_tick(
     state: State, foreign: int, seen: str
 ) -> None:
     verdict = SafetyTable(LIMITS).judge(state, replace(GOOD, foreign=foreign))
@@ -171,7 +171,7 @@ UNSEEN = {
 
 
 @pytest.mark.parametrize("name", UNSEEN)
-def test_ticks_that_show_nothing_are_left_out_of_the_window(name: str) -> None:
+def test_ticks_without_an_observation_are_left_out_of_the_window(name: str) -> None:
     rule = next(rule for rule in TABLE if rule.name == name)
     table = judge_alone(rule)
     for _ in range(rule.needed - 1):
@@ -181,7 +181,7 @@ def test_ticks_that_show_nothing_are_left_out_of_the_window(name: str) -> None:
     assert table.judge(State.HOLD, BAD[name]).rule is rule
 
 
-def test_a_visit_to_another_state_forgets_what_was_seen_before() -> None:
+def test_entering_another_state_clears_the_history_of_a_rule() -> None:
     table = SafetyTable(LIMITS)
     rule = next(rule for rule in TABLE if rule.name == "following_error")
     for _ in range(rule.needed - 1):
@@ -192,7 +192,7 @@ def test_a_visit_to_another_state_forgets_what_was_seen_before() -> None:
 
 @pytest.mark.parametrize("state", State)
 @pytest.mark.parametrize("name", ["over_pressure", "over_displacement"])
-def test_what_must_never_be_passed_opens_the_vent_in_every_state(name: str, state: State) -> None:
+def test_the_hard_limits_open_the_vent_in_every_state(name: str, state: State) -> None:
     table = SafetyTable(LIMITS)
     table.judge(state, BAD[name])
     rule = table.judge(state, BAD[name]).rule
@@ -201,7 +201,7 @@ def test_what_must_never_be_passed_opens_the_vent_in_every_state(name: str, stat
 
 
 @pytest.mark.parametrize("side", [-1.0, 1.0])
-def test_the_mirror_may_be_far_from_its_setpoint_on_neither_side(side: float) -> None:
+def test_following_error_is_judged_in_both_directions(side: float) -> None:
     table = SafetyTable(LIMITS)
     far = replace(GOOD, error_um=side * (LIMITS.following_error_max_um + 0.1))
     assert any(table.judge(State.HOLD, far).rule is not None for _ in range(100))
@@ -222,7 +222,7 @@ def test_an_open_interlock_enters_its_own_level_in_one_tick(state: State, level:
     assert verdict.rule.fault(verdict.seen, verdict.safe_level).safe_level == level.name.lower()
 
 
-def test_an_open_interlock_whose_level_is_not_known_stops_the_pump_at_least_slowly() -> None:
+def test_an_open_interlock_without_a_known_level_ramps_the_pump_down() -> None:
     verdict = SafetyTable(LIMITS).judge(
         State.HOLD, replace(BAD["interlock_open"], interlock_level=SafeLevel.NONE)
     )

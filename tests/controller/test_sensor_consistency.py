@@ -79,7 +79,7 @@ class Seconds:
         )
 
 
-def test_gas_that_nobody_explains_is_told_and_forgotten_with_the_hold() -> None:
+def test_unexplained_gas_consumption_is_reported_until_the_hold_ends() -> None:
     mirror = Seconds()
     mirror.pass_by(600)
     mirror.pass_by(90, leak_um_per_s=3.0)
@@ -90,14 +90,14 @@ def test_gas_that_nobody_explains_is_told_and_forgotten_with_the_hold() -> None:
     assert mirror.consistency.gas_excess == ""
 
 
-def test_a_bleed_that_somebody_opens_explains_the_gas() -> None:
+def test_an_opened_bleed_explains_the_gas_consumption() -> None:
     mirror = Seconds()
     mirror.pass_by(600)
     mirror.pass_by(600, leak_um_per_s=3.0, bleed=0.02)
     assert mirror.consistency.gas_excess == ""
 
 
-def test_a_camera_that_sees_the_film_stand_still_explains_it_until_it_is_gone() -> None:
+def test_a_camera_that_shows_the_film_at_rest_explains_the_gas_until_it_is_lost() -> None:
     mirror = Seconds()
     mirror.pass_by(600)
     mirror.pass_by(300, leak_um_per_s=3.0, camera=True)
@@ -106,7 +106,7 @@ def test_a_camera_that_sees_the_film_stand_still_explains_it_until_it_is_gone() 
     assert mirror.consistency.gas_excess != ""
 
 
-def test_a_camera_that_holds_the_mirror_by_itself_is_no_witness_of_its_gas() -> None:
+def test_a_camera_used_as_process_value_does_not_explain_the_gas() -> None:
     """Optics that drift make the loop pump against them, as a laser that creeps does."""
     mirror = Seconds(Config(estimator=EstimatorConfig(process_value="optics")))
     mirror.pass_by(600, camera=True)
@@ -126,7 +126,7 @@ def test_laser_and_gauge_are_compared_wherever_the_pump_may_run() -> None:
         assert mirror.consistency.laser_gauge_apart == ""
 
 
-def test_a_barometer_in_another_unit_is_told_once_and_taken_back_once() -> None:
+def test_a_barometer_in_a_wrong_unit_is_reported_once_and_cleared_once() -> None:
     mirror = Seconds()
     mirror.pass_by(100, ambient_pa=1013.25)
     mirror.pass_by(100)
@@ -137,7 +137,7 @@ def test_a_barometer_in_another_unit_is_told_once_and_taken_back_once() -> None:
     assert kinds == ["maintenance", "maintenance_over"]
 
 
-def test_a_camera_that_repeats_one_shape_is_believed_neither_in_the_shape_nor_in_the_gas() -> None:
+def test_a_frozen_camera_is_used_neither_for_the_shape_nor_for_the_gas() -> None:
     mirror = Seconds()
     mirror.pass_by(600, camera=True)
     assert mirror.consistency.camera_lies == ""

@@ -69,7 +69,7 @@ def with_value(path: str, value: object) -> bytes:
 @pytest.mark.parametrize(
     "tick", [2, 150, MIDDLE, 720, LATER]
 )  # in check, inflate, hold, without a laser
-def test_what_follows_is_the_same_to_the_last_bit(tick: int) -> None:
+def test_a_controller_from_a_snapshot_continues_bit_by_bit(tick: int) -> None:
     controller = resume(snapshot_at(TICKS, tick))
     for inputs, outputs in TICKS[tick - 1 :]:
         again = controller.tick(inputs)
@@ -145,7 +145,7 @@ def test_another_layout_is_refused_by_name() -> None:
     ],
     ids=range(11),
 )
-def test_what_is_no_snapshot_is_refused(snapshot: bytes) -> None:
+def test_damaged_or_foreign_data_is_refused_as_snapshot(snapshot: bytes) -> None:
     with pytest.raises(UnknownSnapshotError, match=r"^the snapshot cannot be used: .+$"):
         resume(snapshot)
 
@@ -196,7 +196,9 @@ def test_every_value_is_checked_against_its_type(path: str, value: object) -> No
     ("path", "value"),
     [("fault", 9999), ("gains.tried.loop.rate_hz", 200.0), ("gains.good.loop.rate_hz", 200.0)],
 )
-def test_what_does_not_fit_the_configuration_is_refused(path: str, value: object) -> None:
+def test_a_snapshot_that_does_not_fit_the_configuration_is_refused(
+    path: str, value: object
+) -> None:
     with pytest.raises(UnknownSnapshotError, match="does not fit the configuration"):
         resume(with_value(path, value))
 
@@ -307,14 +309,14 @@ def test_a_replay_begins_with_the_last_snapshot_before(
         (("--from", "9s", "--to", "8s"), "--from 9s is not before --to 8s"),
     ],
 )
-def test_a_part_that_the_run_has_not_is_one_line(
+def test_a_part_outside_the_run_is_a_one_line_error(
     record: Path, window: tuple[str, ...], says: str, capsys: pytest.CaptureFixture[str]
 ) -> None:
     assert run(["replay", str(record), *window]) == Exit.BAD_INPUT
     assert says in capsys.readouterr().err
 
 
-def test_a_snapshot_of_another_layout_is_told_and_the_replay_begins_with_the_run(
+def test_a_snapshot_of_another_layout_is_reported_and_the_replay_begins_with_the_run(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     write_record(tmp_path, TICKS, snapshots={MIDDLE: as_snapshot({})})
@@ -348,7 +350,7 @@ def _refuse(*_: object) -> None:
 
 
 @pytest.mark.parametrize("layout", ["today's", "another"])
-def test_behind_a_gap_the_next_snapshot_is_taken_up_and_compared_from_there(
+def test_after_a_gap_the_replay_continues_from_the_next_snapshot(
     tmp_path: Path, layout: str, capsys: pytest.CaptureFixture[str]
 ) -> None:
     snapshot = SNAPSHOT if layout == "today's" else as_snapshot({})
@@ -372,7 +374,7 @@ def test_no_incident_is_made_across_a_gap(
 
 
 @pytest.mark.parametrize("left", [b"", b"noise" * 100])
-def test_inputs_of_which_nothing_can_be_read_are_said_to_be_so(
+def test_unreadable_inputs_are_reported(
     record: Path, left: bytes, capsys: pytest.CaptureFixture[str]
 ) -> None:
     (record / "inputs" / "inputs-0000.parquet").write_bytes(left)

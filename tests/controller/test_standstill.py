@@ -44,7 +44,7 @@ class Watched:
 
 
 @pytest.mark.parametrize("readback", [0.03, 1.0, math.nan, math.inf])
-def test_a_pump_not_seen_to_stand_within_the_time_runs_on(readback: float) -> None:
+def test_a_pump_without_a_read_back_of_zero_in_time_counts_as_running(readback: float) -> None:
     watched = Watched()
     on = replace(STILL, pump_fraction=readback)
     for _ in range(30):
@@ -57,13 +57,13 @@ def test_a_pump_not_seen_to_stand_within_the_time_runs_on(readback: float) -> No
     assert not watched.stand.runs_on
 
 
-def test_one_look_at_a_pump_that_stands_begins_the_time_anew() -> None:
+def test_one_read_back_of_zero_restarts_the_time() -> None:
     watched = Watched()
     for tick in range(100):
         assert not watched.look(replace(STILL, pump_fraction=1.0 if tick % 25 else 0.0)).runs_on
 
 
-def test_what_a_lost_link_has_not_carried_is_not_held_against_the_pump() -> None:
+def test_commands_lost_with_the_link_do_not_count_against_the_pump() -> None:
     """A lost answer proves nothing; a lost link means that the command has not arrived."""
     on = replace(STILL, pump_fraction=1.0)
     lost, cut = Watched(), Watched()
@@ -100,7 +100,7 @@ def test_the_last_of_two_commands_must_be_off_as_well() -> None:
     assert stand.silent_s == pytest.approx(0.1)
 
 
-def test_a_mirror_that_rises_shows_a_pump_whose_read_back_lies() -> None:
+def test_a_rising_mirror_reveals_a_pump_with_a_wrong_read_back() -> None:
     watched = Watched()
     seen = watched.rises(2.0, 0.13)
     assert seen.startswith("+40 µm")
@@ -108,7 +108,7 @@ def test_a_mirror_that_rises_shows_a_pump_whose_read_back_lies() -> None:
     assert not Watched().rises(1.4, 0.09)  # below the limit: 28 µm in 20 s
 
 
-def test_laser_and_gauge_must_both_see_it_and_each_decides_without_the_other() -> None:
+def test_a_rise_must_show_in_laser_and_gauge_or_in_the_only_one_available() -> None:
     assert not Watched().rises(4.0, 0.0)
     assert not Watched().rises(0.0, 0.3)
     assert Watched().rises(4.0, 0.0, gauge_pressure_pa=math.nan)
@@ -116,7 +116,7 @@ def test_laser_and_gauge_must_both_see_it_and_each_decides_without_the_other() -
     assert not Watched().rises(4.0, 0.3, displacement_quality=1, gauge_pressure_pa=math.nan)
 
 
-def test_warm_air_and_a_falling_barometer_are_allowed_for() -> None:
+def test_warming_air_and_falling_pressure_are_not_mistaken_for_inflow() -> None:
     """1 K of warmer air lifts the mirror by 123 µm, 100 Pa less of ambient pressure by 36 µm."""
     for change in ({"air_temperature_c": 24.0}, {"ambient_pressure_pa": 101225.0}):
         watched = Watched()
@@ -127,7 +127,7 @@ def test_warm_air_and_a_falling_barometer_are_allowed_for() -> None:
         )
 
 
-def test_at_rest_is_seen_after_two_seconds_and_not_while_the_mirror_rises() -> None:
+def test_rest_is_detected_after_two_seconds_but_not_while_the_mirror_rises() -> None:
     watched = Watched()
     rests = [watched.look().at_rest for _ in range(40)]
     assert rests.index(True) == pytest.approx(25, abs=2)
@@ -139,7 +139,7 @@ def test_at_rest_is_seen_after_two_seconds_and_not_while_the_mirror_rises() -> N
     assert any(blind.look(replace(STILL, displacement_quality=1)).at_rest for _ in range(40))
 
 
-def test_weather_on_films_that_lose_no_gas_is_no_pump() -> None:
+def test_weather_on_leakless_films_is_not_mistaken_for_inflow() -> None:
     twin = TwinConfig(scenario="gusty", seed=3, leak_time_constant_s=1e7)
     plant = Plant(twin, CONFIG.pump)
     plant.actuate(0.0, 0.0)

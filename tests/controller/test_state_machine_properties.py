@@ -171,7 +171,7 @@ def test_no_order_of_commands_alone_trips_a_healthy_mirror(warm: int, asked: lis
         assert driver.controller.state != State.FAULT, command
 
 
-def test_what_is_generated_goes_everywhere() -> None:
+def test_the_generated_sequences_reach_every_state() -> None:
     """The properties above would not cover states that their examples never reach."""
     seen: set[State] = set()
 

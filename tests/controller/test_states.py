@@ -36,7 +36,7 @@ def changes(outcome: Outcome, state: str) -> list[float]:
     return [event["mono_s"] for event in outcome.of("state") if event["state"] == state]
 
 
-def test_an_acknowledged_fault_is_left_only_when_the_pump_is_seen_to_be_off() -> None:
+def test_an_acknowledged_fault_ends_only_when_the_read_back_shows_the_pump_off() -> None:
     """The read-back says 0.5 from 22 s to 35 s."""
     outcome = played(
         {"time_s": 20.0, "wrong": "gauge_lost"},
@@ -48,7 +48,7 @@ def test_an_acknowledged_fault_is_left_only_when_the_pump_is_seen_to_be_off() ->
     assert 35.0 <= standby_s < 35.3
 
 
-def test_a_resume_waits_for_the_pump_to_be_seen_off() -> None:
+def test_a_resume_waits_until_the_read_back_shows_the_pump_off() -> None:
     outcome = played(
         {"time_s": 20.0, "wrong": "unreachable", "for_s": 2.0},
         {"time_s": 22.0, "wrong": "readback_fraction", "value": 0.5, "for_s": 15.0},
@@ -70,7 +70,7 @@ def test_the_ramp_down_is_a_straight_line() -> None:
             )
 
 
-def test_a_pause_that_nobody_ends_ends_itself() -> None:
+def test_a_pause_ends_after_its_longest_time() -> None:
     outcome = played({"time_s": 20.0, "command": "pause"}, states={"pause_max_s": 15.0})
     paused = [
         tick.row.mono_s
@@ -91,7 +91,7 @@ def test_a_pause_that_nobody_ends_ends_itself() -> None:
     ],
 )
 @pytest.mark.parametrize("wish", [{"command": "manual", "value": 3.0}, {"command": "pause"}])
-def test_what_was_asked_of_a_hold_is_not_asked_of_the_next(
+def test_the_requests_of_a_hold_do_not_apply_to_the_next(
     wish: dict[str, Any], at: list[dict[str, Any]], config: dict[str, Any]
 ) -> None:
     outcome = played({"time_s": 20.0, **wish}, *at, **config)
@@ -100,7 +100,7 @@ def test_what_was_asked_of_a_hold_is_not_asked_of_the_next(
     assert "paused" not in [event["why"] for event in outcome.of("why")][-1]
 
 
-def test_what_is_called_hold_has_been_inside_the_band_for_settle_s() -> None:
+def test_hold_begins_after_settle_s_inside_the_band() -> None:
     outcome = played(states={"settle_s": 6.0}, duration_s=40.0)
     settle_s, hold_s = changes(outcome, "settle")[0], changes(outcome, "hold")[0]
     assert hold_s - settle_s >= 6.0
@@ -110,7 +110,7 @@ def test_what_is_called_hold_has_been_inside_the_band_for_settle_s() -> None:
     assert max(map(abs, errors_um)) < 2.0
 
 
-def test_venting_without_a_gauge_goes_on() -> None:
+def test_venting_continues_without_a_gauge() -> None:
     outcome = played(
         {"time_s": 20.0, "wrong": "gauge_lost"},
         {"time_s": 20.0, "command": "vent"},
@@ -121,7 +121,7 @@ def test_venting_without_a_gauge_goes_on() -> None:
     assert {row.vent_fraction for row in rows} == {1.0}
 
 
-def test_a_vent_that_does_not_empty_the_bowl_is_told_of() -> None:
+def test_a_vent_that_does_not_empty_the_mirror_is_reported() -> None:
     outcome = played(
         {"time_s": 20.0, "wrong": "gauge_lost"},
         {"time_s": 20.0, "command": "vent"},
@@ -132,7 +132,7 @@ def test_a_vent_that_does_not_empty_the_bowl_is_told_of() -> None:
     assert not changes(outcome, "standby")
 
 
-def test_a_stop_is_the_last_word() -> None:
+def test_a_stop_cannot_be_undone() -> None:
     """A `lower` in the same tick does not turn the stop into standby."""
     outcome = played(
         {"time_s": 19.0, "wrong": "readback_fraction", "value": 0.5, "for_s": 2.5},
@@ -144,7 +144,7 @@ def test_a_stop_is_the_last_word() -> None:
     assert not changes(outcome, "standby")
 
 
-def test_a_board_that_has_latched_a_fault_is_not_held_with() -> None:
+def test_no_hold_begins_with_a_latched_board() -> None:
     """Its own limit is 800 Pa; here ours is higher, and the check has to see the board's bit."""
     outcome = played(
         {"time_s": 0.5, "wrong": "gauge_offset_pa", "value": 300.0, "for_s": 1.0},
@@ -155,7 +155,7 @@ def test_a_board_that_has_latched_a_fault_is_not_held_with() -> None:
     assert [event["name"] for event in outcome.of("fault")] == ["board_fault"]
 
 
-def test_manual_lapses_and_the_loop_takes_the_mirror_back() -> None:
+def test_manual_ends_after_its_longest_time_and_the_loop_returns() -> None:
     outcome = played(
         {"time_s": 20.0, "command": "manual", "value": 1.2},
         {"time_s": 30.0, "command": "manual", "value": 1.1},
@@ -197,7 +197,7 @@ def test_manual_without_a_laser_gives_the_mean_flow_of_the_hold_before_it() -> N
     assert State.HOLD in {row.state for row in rows if row.mono_s > 50.0}
 
 
-def test_nobody_takes_the_pump_while_the_mean_flow_is_held() -> None:
+def test_manual_is_refused_while_the_mean_flow_is_held() -> None:
     outcome = played(
         {"time_s": 20.0, "wrong": "no_light", "for_s": 5.0},
         {"time_s": 22.0, "command": "manual", "value": 5.3},
@@ -219,7 +219,7 @@ def test_a_pause_ends_where_the_mirror_strays_too_far() -> None:
     assert "paused" not in [event["why"] for event in outcome.of("why")][-1]
 
 
-def test_a_stop_of_a_pump_that_runs_on_is_no_success() -> None:
+def test_stopping_with_a_running_pump_is_not_a_success() -> None:
     """The pump stays at full flow and reports it; the vent opens, and the exit code shows it."""
     outcome = played(
         {"time_s": 20.0, "wrong": "pump_stuck_fraction", "value": 1.0},
@@ -281,7 +281,7 @@ def test_a_stop_waits_for_a_mirror_that_still_rises_and_ends_as_a_fault() -> Non
 SAYS_HALF = {"wrong": "readback_fraction", "value": 0.5}  # the read-back, while it lasts
 
 
-def test_a_way_down_is_over_only_when_the_pump_is_seen_to_be_off() -> None:
+def test_lowering_ends_only_when_the_read_back_shows_the_pump_off() -> None:
     outcome = played(
         {"time_s": 20.0, "command": "lower"},
         {"time_s": 20.0, **SAYS_HALF, "for_s": 10.0},
@@ -291,7 +291,7 @@ def test_a_way_down_is_over_only_when_the_pump_is_seen_to_be_off() -> None:
 
 
 @pytest.mark.parametrize("stop", [(), ({"time_s": 21.0, "command": "stop"},)])
-def test_a_fault_ends_the_run_only_when_the_pump_is_seen_to_be_off(
+def test_a_fault_ends_the_run_only_when_the_read_back_shows_the_pump_off(
     stop: tuple[dict[str, Any], ...],
 ) -> None:
     """Whether the run ends by itself after a trip or by a stop."""
@@ -308,13 +308,13 @@ def test_a_fault_ends_the_run_only_when_the_pump_is_seen_to_be_off(
     )  # the mirror has rested long before
 
 
-def test_a_stop_of_a_bench_that_is_gone_is_no_success() -> None:
+def test_stopping_without_a_connection_is_not_a_success() -> None:
     outcome = played({"time_s": 20.0, "command": "stop"}, {"time_s": 20.3, "wrong": "unreachable"})
     assert outcome.ticks[-1].outputs.finished == Exit.DEVICE_FAILED
     assert outcome.ticks[-1].row.mono_s == pytest.approx(23.3, abs=0.4)
 
 
-def test_a_latch_between_a_resume_and_its_hold_is_for_good() -> None:
+def test_a_latch_between_a_resume_and_its_hold_cancels_the_hold() -> None:
     """In that one tick of standby the hold is already requested;
     a later `ack` revives no request.
     """
@@ -338,7 +338,7 @@ def test_a_stop_wins_over_a_resume() -> None:
     assert outcome.ticks[-1].outputs.finished == Exit.SAFETY_TRIP
 
 
-def test_an_ack_clears_what_the_board_has_latched() -> None:
+def test_an_ack_clears_the_latches_of_the_board() -> None:
     outcome = played(
         {"time_s": 20.0, "wrong": "gauge_offset_pa", "value": 300.0, "for_s": 1.0},
         {"time_s": 25.0, "command": "ack"},
@@ -356,12 +356,12 @@ def test_an_ack_clears_what_the_board_has_latched() -> None:
 
 
 @pytest.mark.parametrize("way", ["lower", "stop", "vent"])
-def test_a_way_down_stops_the_pump_in_its_first_tick(way: str) -> None:
+def test_lowering_stops_the_pump_in_its_first_tick(way: str) -> None:
     outcome = played({"time_s": 25.0, "command": way}, duration_s=40.0)
     assert {tick.row.pump_fraction for tick in outcome.ticks if tick.row.mono_s > 25.05} == {0.0}
 
 
-def test_readings_that_the_table_distrusts_do_not_drive_the_pump() -> None:
+def test_readings_rejected_by_the_safety_table_do_not_drive_the_pump() -> None:
     outcome = played(
         {"time_s": 25.0, "wrong": "laser_stuck"}, limits={"stuck_s": 2.0}, duration_s=38.0
     )
@@ -371,7 +371,7 @@ def test_readings_that_the_table_distrusts_do_not_drive_the_pump() -> None:
     assert {row.p_um_per_s for row in distrusted} == {0.0}
 
 
-def test_a_fill_that_takes_too_long_is_given_up() -> None:
+def test_an_inflation_that_takes_too_long_is_a_fault() -> None:
     outcome = played(
         {"time_s": 8.0, "wrong": "vent_stuck_fraction", "value": 0.1},
         states={"inflate_timeout_s": 20.0},
@@ -379,7 +379,7 @@ def test_a_fill_that_takes_too_long_is_given_up() -> None:
     assert [event["name"] for event in outcome.of("fault")] == ["overdue"]
 
 
-def test_after_an_acknowledged_fault_nobody_holds_unasked() -> None:
+def test_after_an_acknowledged_fault_a_hold_needs_a_command() -> None:
     outcome = played(
         {"time_s": 20.0, "wrong": "gauge_lost", "for_s": 2.0},
         {"time_s": 30.0, "command": "ack"},
@@ -392,7 +392,7 @@ def test_after_an_acknowledged_fault_nobody_holds_unasked() -> None:
 @pytest.mark.parametrize(
     "again", [(), ({"time_s": 32.0, "command": "ack"},)], ids=["once", "in standby as well"]
 )
-def test_an_acknowledgement_acknowledges_no_fault_to_come(
+def test_an_ack_does_not_acknowledge_a_later_fault(
     again: tuple[dict[str, Any], ...],
 ) -> None:
     outcome = played(
@@ -408,7 +408,7 @@ def test_an_acknowledgement_acknowledges_no_fault_to_come(
     assert len(changes(outcome, "standby")) == 1
 
 
-def test_the_ramp_waits_for_a_mirror_that_lags() -> None:
+def test_the_ramp_waits_for_a_lagging_mirror() -> None:
     """A pump of 65 % lifts the mirror more slowly than the ramp; the setpoint stays within reach of
     the mirror.
     """
@@ -419,14 +419,14 @@ def test_the_ramp_waits_for_a_mirror_that_lags() -> None:
     assert changes(outcome, "hold")
 
 
-def test_a_mirror_that_keeps_up_needs_no_wait() -> None:
+def test_the_ramp_does_not_wait_for_a_mirror_that_keeps_up() -> None:
     outcome = played(**_FAR_BELOW)
     assert not any("the ramp waits" in event["why"] for event in outcome.of("why"))
     assert changes(outcome, "hold")
 
 
 @pytest.mark.parametrize("pump_share", [0.0, 0.3])  # dead, and too weak for the leak
-def test_a_mirror_that_the_pump_does_not_lift_is_given_up(pump_share: float) -> None:
+def test_a_mirror_that_does_not_rise_is_a_fault(pump_share: float) -> None:
     outcome = played({"time_s": 15.0, "wrong": "pump_share", "value": pump_share}, **_FAR_BELOW)
     (told,) = outcome.of("fault")
     assert told["name"] == "overdue"

@@ -93,7 +93,7 @@ class Held:
 
 
 @pytest.mark.parametrize("kind", ["relay", "steps", "doublets", "multisine"])
-def test_an_experiment_moves_the_mirror_within_its_limit_and_gives_it_back(kind: str) -> None:
+def test_an_experiment_moves_the_mirror_within_its_limit_and_returns_to_hold(kind: str) -> None:
     held = Held()
     held.go(0.1, tune(kind=kind))
     assert held.state == State.TUNE
@@ -119,7 +119,7 @@ STEPS = [
 ]
 
 
-def test_a_pump_map_gives_its_commands_until_the_heights() -> None:
+def test_a_pump_map_gives_each_command_until_its_height() -> None:
     """Down 3 µm at 1.24 µm/s, up 5 µm at 1.7 µm/s, then a second at the holding command."""
     held = Held()
     held.go(0.1, tune(kind="pump_map", duration_s=60.0, steps=STEPS))
@@ -153,7 +153,7 @@ def test_a_pump_map_without_steps_is_refused() -> None:
     assert held.state == State.HOLD
 
 
-def test_a_door_ends_it_and_the_mirror_is_held() -> None:
+def test_a_pressure_step_ends_an_experiment_and_the_hold_continues() -> None:
     held = Held(twin_events=(AmbientChange(BEGIN_S + 5.0, -30.0),))
     held.go(0.1, tune())
     held.until_hold(30.0)
@@ -163,7 +163,7 @@ def test_a_door_ends_it_and_the_mirror_is_held() -> None:
     assert held.furthest_um(held.rows[-1].mono_s - 5.0) < 2.0
 
 
-def test_a_lost_laser_ends_it_at_the_holding_flow() -> None:
+def test_a_lost_laser_ends_an_experiment_at_the_holding_flow() -> None:
     held = Held()
     held.go(5.0, tune())
     held.bench.wrong.no_light = True
@@ -176,7 +176,7 @@ def test_a_lost_laser_ends_it_at_the_holding_flow() -> None:
     assert held.furthest_um(held.rows[-1].mono_s - 5.0) < 2.0
 
 
-def test_a_laser_that_is_distrusted_ends_it_although_it_reads() -> None:
+def test_a_laser_found_faulty_ends_an_experiment_although_it_reads() -> None:
     held = Held()
     held.go(5.0, tune(duration_s=60.0))
     held.bench.wrong.laser_stuck = True
@@ -188,7 +188,7 @@ def test_a_laser_that_is_distrusted_ends_it_although_it_reads() -> None:
 @pytest.mark.parametrize(
     ("kind", "state"), [("hold", State.HOLD), ("lower", State.STANDBY), ("vent", State.LOWER)]
 )
-def test_whoever_operates_ends_it(kind: Any, state: State) -> None:
+def test_every_operating_command_ends_an_experiment(kind: Any, state: State) -> None:
     held = Held()
     held.go(4.0, tune())
     held.go(3.0, Command(kind, "operator"))
@@ -198,7 +198,7 @@ def test_whoever_operates_ends_it(kind: Any, state: State) -> None:
     assert held.state != State.TUNE  # it does not come back by itself
 
 
-def test_a_fault_ends_it_and_it_is_not_resumed() -> None:
+def test_a_fault_ends_an_experiment_which_is_not_resumed() -> None:
     held = Held()
     held.go(4.0, tune())
     held.bench.wrong.gauge_offset_pa = 500.0
@@ -218,7 +218,7 @@ def test_an_experiment_asked_for_in_the_tick_of_a_fault_never_runs() -> None:
     assert not held.of("experiment")
 
 
-def test_it_runs_in_hold_only() -> None:
+def test_an_experiment_runs_in_hold_only() -> None:
     assert "in hold" in explain_refusal(tune(), State.SETTLE, CONFIG)
     assert explain_refusal(tune(), State.HOLD, CONFIG) == ""
     assert (
@@ -226,7 +226,7 @@ def test_it_runs_in_hold_only() -> None:
     )
 
 
-def test_without_room_for_it_the_command_is_refused_with_the_remedy() -> None:
+def test_an_experiment_near_a_limit_is_refused_with_the_remedy() -> None:
     held = Held()
     held.go(0.1, tune(kind="doublets", holding_flow_um_per_s=0.1))
     assert held.state == State.HOLD
@@ -243,7 +243,7 @@ def test_without_room_for_it_the_command_is_refused_with_the_remedy() -> None:
         {"version": 2},
     ],
 )
-def test_an_experiment_without_bounds_does_not_exist(changed: dict[str, Any]) -> None:
+def test_every_experiment_has_bounds(changed: dict[str, Any]) -> None:
     with pytest.raises(ValidationError):
         spec(**changed)
 
@@ -260,7 +260,7 @@ def kp_of(held: Held) -> float:
     return float(np.median([row.p_um_per_s / row.error_um for row in rows]))
 
 
-def test_gains_on_trial_go_back_by_themselves() -> None:
+def test_gains_on_trial_revert_after_their_time() -> None:
     held = Held()
     held.go(10.0, gains(0.3, 12.0))
     assert kp_of(held) == pytest.approx(0.3, rel=0.02)
@@ -269,7 +269,7 @@ def test_gains_on_trial_go_back_by_themselves() -> None:
     assert kp_of(held) == pytest.approx(CONFIG.loop.kp_per_s, rel=0.02)
 
 
-def test_gains_that_are_kept_stay_and_are_what_the_next_trial_goes_back_to() -> None:
+def test_kept_gains_stay_and_the_next_trial_reverts_to_them() -> None:
     held = Held()
     held.go(5.0, gains(0.3, 6.0))
     held.go(5.0, Command("keep", "tester"))
@@ -278,7 +278,7 @@ def test_gains_that_are_kept_stay_and_are_what_the_next_trial_goes_back_to() -> 
     assert kp_of(held) == pytest.approx(0.3, rel=0.02)
 
 
-def test_a_fault_takes_gains_on_trial_back() -> None:
+def test_a_fault_reverts_gains_on_trial() -> None:
     held = Held()
     held.go(2.0, gains(0.3, 600.0))
     held.bench.wrong.gauge_offset_pa = 500.0
@@ -336,7 +336,7 @@ def stepped(step_um: float, trial_s: float = 10.0) -> Command:
     return replace(gains(0.3, trial_s), setpoint_step_um=step_um)
 
 
-def test_a_setpoint_stepped_on_trial_and_the_shape_loop_come_back_by_themselves() -> None:
+def test_setpoint_step_and_shape_loop_revert_after_the_trial() -> None:
     run = Stepped()
     assert run.told(stepped(0.0)) == (2.1, False)
     assert run.told(stepped(5.0)) == (7.1, False)
@@ -353,7 +353,7 @@ def test_a_step_ends_with_its_trial_also_when_gains_stay(ends: Command) -> None:
     assert run.controller.loop_config.kp_per_s == 0.3
 
 
-def test_what_a_person_sets_during_a_step_stays() -> None:
+def test_a_setpoint_set_during_a_step_stays() -> None:
     run = Stepped()
     run.told(stepped(5.0))
     assert run.told(Command("setpoint", "tester", value=-1.0), Command("shape_off", "tester")) == (
@@ -371,7 +371,7 @@ def test_a_fault_ends_a_step() -> None:
     assert held._run._supervisor._controller._context.setpoint_um == 0.0
 
 
-def test_a_step_survives_in_the_memory_of_a_controller() -> None:
+def test_a_setpoint_step_is_part_of_the_snapshot() -> None:
     run = Stepped()
     run.told(stepped(5.0))
     run.controller = continue_from(take_snapshot(run.controller), CONFIG, zernike_projection())
@@ -396,9 +396,7 @@ def mean_flow(held: Held) -> float:
     return float(np.mean([row.flow_um_per_s for row in held.rows[-300:]]))
 
 
-def test_a_curve_on_trial_changes_what_the_flow_means_not_the_mirror_and_goes_back_by_itself() -> (
-    None
-):
+def test_a_curve_on_trial_rescales_the_flow_without_moving_the_mirror_and_reverts() -> None:
     held = Held()
     held.go(8.0, on_curve(TWICE, 10.0))
     assert mean_flow(held) == pytest.approx(2 * 1.24, rel=0.15)
@@ -410,7 +408,7 @@ def test_a_curve_on_trial_changes_what_the_flow_means_not_the_mirror_and_goes_ba
     assert held.furthest_um(BEGIN_S) < 2.0
 
 
-def test_a_curve_that_is_kept_stays_with_later_gains_and_its_memory_can_be_recalled() -> None:
+def test_a_kept_curve_stays_with_later_gains_and_is_in_the_snapshot() -> None:
     held = Held()
     held.go(2.0, on_curve(TWICE, 60.0))
     held.go(2.0, Command("keep", "tester"))
@@ -423,7 +421,7 @@ def test_a_curve_that_is_kept_stays_with_later_gains_and_its_memory_can_be_recal
     assert again._context.loop._curve.flow(1.0) == 10.6
 
 
-def test_the_flow_of_the_curve_in_force_bounds_what_a_person_may_ask_for() -> None:
+def test_the_present_curve_limits_the_manual_flow() -> None:
     held = Held()
     asked = Command("manual", "tester", value=8.0)
     held.go(0.1, asked)
@@ -437,7 +435,7 @@ def test_the_flow_of_the_curve_in_force_bounds_what_a_person_may_ask_for() -> No
     assert held.of("command")[-1]["refused"] == "flow 8 µm/s is outside 0 .. 5.3 µm/s"
 
 
-def test_the_reserve_is_judged_by_the_curve_in_force() -> None:
+def test_the_flow_reserve_is_judged_by_the_present_curve() -> None:
     held = Held()
     consistency = held._run._supervisor._controller._consistency
     weak = on_curve(TWICE.model_copy(update={"flow_full_um_per_s": 2.0, "change_max": 0.3}), 10.0)
@@ -461,11 +459,11 @@ def test_the_events_of_older_commands_have_no_new_keys() -> None:
     assert "steps" not in experiment
 
 
-def test_a_trial_of_no_time_is_refused() -> None:
+def test_a_trial_without_duration_is_refused() -> None:
     assert "on trial" in explain_refusal(gains(0.3, 0.0), State.HOLD, CONFIG)
 
 
-def test_the_command_survives_its_record() -> None:
+def test_the_command_is_recorded_without_loss() -> None:
     """A replay gets the experiment that the run got."""
     held = Held()
     tick = held._run.tick((tune(), gains(0.3, 5.0)))

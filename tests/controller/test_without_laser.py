@@ -96,7 +96,7 @@ def states(ticks: list[VirtualTick]) -> list[State]:
 # Without a laser.
 
 
-def test_a_bench_without_a_laser_starts_settles_and_holds_the_sag_it_was_told() -> None:
+def test_a_bench_without_a_laser_starts_settles_and_holds_its_sag() -> None:
     ticks = held(28.0)
     assert states(ticks) == [State.CHECK, State.INFLATE, State.SETTLE, State.HOLD]
     assert not told(ticks, Fault)
@@ -115,7 +115,7 @@ def test_a_bench_without_a_laser_starts_settles_and_holds_the_sag_it_was_told() 
     assert math.isnan(row.displacement_quality)  # nobody takes it for a laser's
 
 
-def test_a_laser_that_is_there_has_no_part_in_it() -> None:
+def test_an_existing_laser_is_not_used_when_the_optics_are_the_process_value() -> None:
     def knock(wrong: Wrong, now_s: float) -> None:
         wrong.laser_offset_um = 80.0 if now_s > 20.0 else 0.0
 
@@ -126,7 +126,7 @@ def test_a_laser_that_is_there_has_no_part_in_it() -> None:
 
 
 @pytest.mark.parametrize(("for_s", "most_um"), [(0.3, 0.1), (6.0, 0.3)], ids=["blink", "6 s"])
-def test_optics_that_are_lost_and_back_make_no_bump(for_s: float, most_um: float) -> None:
+def test_lost_and_returning_optics_cause_no_step(for_s: float, most_um: float) -> None:
     def lose(wrong: Wrong, now_s: float) -> None:
         wrong.camera_lost = 20.0 < now_s < 20.0 + for_s
 
@@ -137,7 +137,7 @@ def test_optics_that_are_lost_and_back_make_no_bump(for_s: float, most_um: float
     assert ticks[-1].row.safe_level == SafeLevel.NONE
 
 
-def test_optics_that_are_lost_for_good_end_in_the_safe_state_with_one_line() -> None:
+def test_a_lasting_loss_of_the_optics_ends_in_the_safe_state_with_one_event() -> None:
     def lose(wrong: Wrong, now_s: float) -> None:
         wrong.camera_lost = now_s > 16.0
 
@@ -152,7 +152,7 @@ def test_optics_that_are_lost_for_good_end_in_the_safe_state_with_one_line() -> 
 
 
 @pytest.mark.parametrize(("wait_s", "starts"), [(900.0, True), (5.0, False)])
-def test_a_start_waits_for_a_camera_that_prepares(
+def test_a_start_waits_for_a_preparing_camera(
     wait_s: float, starts: bool, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """A cold machine compiles for a minute; but it does not wait for ever."""
@@ -167,7 +167,7 @@ def test_a_start_waits_for_a_camera_that_prepares(
     assert [fault.seen for fault in told(ticks, Fault)] == ([] if starts else [why])
 
 
-def test_figures_that_come_and_go_end_the_check_with_the_reason() -> None:
+def test_intermittent_figures_end_the_check_with_a_reason() -> None:
     """A machine too busy to track: the actuator test begins again after every gap."""
 
     def busy(wrong: Wrong, now_s: float) -> None:
@@ -236,9 +236,7 @@ def test_figures_that_come_and_go_end_the_check_with_the_reason() -> None:
         "rejected",
     ],
 )
-def test_a_figure_counts_only_if_it_shows_the_film_now(
-    spoil: Callable[[Any, int], Any], seen: str
-) -> None:
+def test_a_figure_counts_only_if_it_is_recent(spoil: Callable[[Any, int], Any], seen: str) -> None:
     figures = TruthShape(VirtualBench(Plant(TWIN, BY_OPTICS.pump)), BY_OPTICS, 3, 0.036)
     watching = observer.Observer(BY_OPTICS)
     why: list[str] = []
@@ -260,7 +258,7 @@ def _with(figure: Any, **changes: Any) -> Any:
     return replace(figure, **changes)
 
 
-def test_a_camera_that_stood_still_does_not_take_its_zero_with_it() -> None:
+def test_a_camera_that_returns_after_a_freeze_keeps_its_zero() -> None:
     """A door that no barometer sees moves the film meanwhile; afterwards the mirror is where it
     was.
     """
@@ -288,7 +286,7 @@ def test_a_camera_that_stood_still_does_not_take_its_zero_with_it() -> None:
 @pytest.mark.parametrize(
     "config", [BY_OPTICS, pytest.param(BY_TRACKS, marks=pytest.mark.campaign)], ids=["alone", "all"]
 )
-def test_another_anchor_of_the_tracking_does_not_move_the_mirror(config: Config) -> None:
+def test_a_new_anchor_of_the_tracking_does_not_move_the_mirror(config: Config) -> None:
     """Two anchors of one film differ by up to a micrometre; here by three."""
     bench = VirtualBench(Plant(config.twin, config.pump))
     figures = TruthShape(bench, config, 3, 0.036)
@@ -362,13 +360,13 @@ def _judge_knock(um: float, until_s: float) -> None:
     )  # no gas went anywhere
 
 
-def test_a_knocked_laser_is_told_once_and_the_optics_hold_on() -> None:
+def test_a_displaced_laser_is_reported_once_and_the_optics_continue_the_hold() -> None:
     _judge_knock(60.0, 73.0)
 
 
 @pytest.mark.campaign
 @pytest.mark.parametrize("seed", range(12))
-def test_a_knock_of_any_size_is_told_once(seed: int) -> None:
+def test_a_laser_displacement_of_any_size_is_reported_once(seed: int) -> None:
     rng = np.random.default_rng(seed)
     _judge_knock(
         float(np.exp(rng.uniform(math.log(14.0), math.log(400.0))) * rng.choice([-1.0, 1.0])), 120.0
@@ -376,7 +374,7 @@ def test_a_knock_of_any_size_is_told_once(seed: int) -> None:
 
 
 @pytest.mark.parametrize("shape_off", [False, pytest.param(True, marks=pytest.mark.campaign)])
-def test_a_laser_whose_mount_drifts_takes_over_where_the_mirror_is(shape_off: bool) -> None:
+def test_a_drifting_laser_takes_over_at_the_present_position(shape_off: bool) -> None:
     """The camera goes after four minutes of drift by 2 µm/min: half a minute later the mirror is 1
     µm off, not 7.
     """
@@ -439,7 +437,7 @@ def _judge_jump(um: float, seen: bool) -> None:
     [pytest.param(True, marks=pytest.mark.campaign), False],
     ids=["seen", "unseen by the camera"],
 )
-def test_a_film_that_jumps_is_brought_back_whatever_the_camera_says(seen: bool) -> None:
+def test_a_jump_of_the_film_is_corrected_for_any_camera_reading(seen: bool) -> None:
     """The gauge is the third witness: it sides with the laser, and what the mount was blamed for is
     undone.
     """
@@ -471,7 +469,7 @@ def _early(
 
 @pytest.mark.parametrize("jump_s", [12.0, 20.0, 30.0])
 @pytest.mark.parametrize("config", [BY_ALL, BY_LASER], ids=["all", "laser"])
-def test_a_jump_at_the_start_that_the_camera_misses_is_brought_back(
+def test_a_jump_at_the_start_that_the_camera_misses_is_corrected(
     config: Config, jump_s: float
 ) -> None:
     """The gauge is asked from the fifth second of settling on;
@@ -481,7 +479,7 @@ def test_a_jump_at_the_start_that_the_camera_misses_is_brought_back(
     assert (verdict, off_um) == ("optics", pytest.approx(0.0, abs=2.0))
 
 
-def test_before_the_gauge_can_judge_a_jump_the_laser_is_believed() -> None:
+def test_before_the_gauge_can_judge_a_jump_the_laser_is_used() -> None:
     assert abs(_early(BY_ALL, 10.3, -25.0, _blind(-25.0, 10.3))[1]) < 2.0
 
 
@@ -490,14 +488,14 @@ def test_a_jump_at_the_start_that_optics_alone_miss_ends_in_the_safe_state() -> 
 
 
 @pytest.mark.parametrize("um", [-14.0, 20.0])
-def test_a_smaller_jump_that_optics_alone_miss_is_told(um: float) -> None:
+def test_a_smaller_jump_that_optics_alone_miss_is_reported(um: float) -> None:
     config = BY_OPTICS.model_copy(update=AT_10_HZ)
     ticks = held(60.0, _blind(um, 20.0), config, AmbientChange(20.0, um / -0.358, 0.1), None, 0.2)
     assert [notice.name for notice in told(ticks, Maintenance)] == ["sag_doubted"]
     assert not told(ticks, Fault)
 
 
-def test_doors_and_setpoints_raise_no_doubt_of_the_optics() -> None:
+def test_pressure_steps_and_setpoint_changes_do_not_flag_the_optics() -> None:
     moves = {
         600: Command("setpoint", "a test", "", 30.0),
         1200: Command("setpoint", "a test", "", -20.0),
@@ -511,7 +509,7 @@ def test_doors_and_setpoints_raise_no_doubt_of_the_optics() -> None:
 @pytest.mark.parametrize(
     "config", [BY_ALL, pytest.param(BY_LASER, marks=pytest.mark.campaign)], ids=["all", "laser"]
 )
-def test_a_camera_that_is_away_is_not_accused_of_a_jump_that_it_did_not_see(config: Config) -> None:
+def test_a_lost_camera_is_not_blamed_for_a_jump(config: Config) -> None:
     """Laser and gauge see the film jump and come back; the camera is away before and after it."""
 
     def lose(wrong: Wrong, now_s: float) -> None:
@@ -526,7 +524,7 @@ def test_a_camera_that_is_away_is_not_accused_of_a_jump_that_it_did_not_see(conf
 
 
 @pytest.mark.parametrize("config", [BY_ALL, BY_LASER], ids=["all", "laser"])
-def test_a_knock_at_the_start_that_the_camera_cannot_see_ends_in_the_safe_state(
+def test_a_laser_displacement_at_the_start_without_a_camera_ends_in_the_safe_state(
     config: Config,
 ) -> None:
     def fail(wrong: Wrong, now_s: float) -> None:
@@ -536,7 +534,7 @@ def test_a_knock_at_the_start_that_the_camera_cannot_see_ends_in_the_safe_state(
     assert _early(config, 20.0, 0.0, fail)[0] == "laser_gauge_apart"
 
 
-def test_knock_and_jump_at_once_are_told_apart() -> None:
+def test_simultaneous_laser_displacement_and_film_jump_are_distinguished() -> None:
     def fail(wrong: Wrong, now_s: float) -> None:
         wrong.laser_offset_um = 60.0 if now_s > 20.0 else 0.0
 
@@ -546,7 +544,7 @@ def test_knock_and_jump_at_once_are_told_apart() -> None:
 @pytest.mark.campaign
 @pytest.mark.parametrize("config", [BY_ALL, BY_LASER, BY_OPTICS], ids=["all", "laser", "optics"])
 @pytest.mark.parametrize("seed", range(15))
-def test_no_jump_of_the_first_minute_stays_unnoticed(config: Config, seed: int) -> None:
+def test_every_jump_of_the_first_minute_is_detected(config: Config, seed: int) -> None:
     """Below 10 µm the optics prevail in the trim; 20 µm and a third are what optics alone and gauge
     may be apart.
     """
@@ -561,7 +559,7 @@ def test_no_jump_of_the_first_minute_stays_unnoticed(config: Config, seed: int) 
 @pytest.mark.campaign
 @pytest.mark.parametrize("seed", range(8))
 @pytest.mark.parametrize("seen", [True, False])
-def test_a_jump_of_any_size_is_brought_back(seed: int, seen: bool) -> None:
+def test_a_film_jump_of_any_size_is_corrected(seed: int, seen: bool) -> None:
     rng = np.random.default_rng(seed)
     _judge_jump(
         float(np.exp(rng.uniform(math.log(15.0), math.log(50.0))) * rng.choice([-1.0, 1.0])), seen
@@ -571,7 +569,7 @@ def test_a_jump_of_any_size_is_brought_back(seed: int, seen: bool) -> None:
 @pytest.mark.parametrize(
     "config", [BY_ALL, pytest.param(BY_LASER, marks=pytest.mark.campaign)], ids=["all", "laser"]
 )
-def test_a_jump_that_the_camera_missed_is_no_leak(config: Config) -> None:
+def test_a_jump_that_the_camera_missed_is_not_counted_as_leak(config: Config) -> None:
     """Before the usual consumption is known, a jump upwards must not make the later one look like a
     seam.
     """
@@ -625,7 +623,7 @@ def _warmed(
 @pytest.mark.parametrize(
     ("told_um_per_k", "most_um"), [(0.0, 0.9), (0.34, 0.25)], ids=["unknown", "taken out"]
 )
-def test_a_stand_that_warms_by_a_kelvin_an_hour_is_told_and_bounded(
+def test_a_camera_mount_warming_by_1_k_per_hour_is_reported_and_bounded(
     told_um_per_k: float, most_um: float
 ) -> None:
     """It truly grows by 0.44 µm/K: what is known of it is 30 % wrong."""
@@ -644,7 +642,7 @@ def test_a_stand_that_warms_by_a_kelvin_an_hour_is_told_and_bounded(
     assert growing.um > 0.7
 
 
-def test_what_a_stand_is_known_to_grow_does_not_move_the_mirror() -> None:
+def test_known_thermal_growth_of_the_camera_mount_does_not_move_the_mirror() -> None:
     """A stand of straw: 20 µm/K, and follows within seconds; a new lock ends the notice."""
     growing = Growing(20.0, 4.0, lambda now_s: 0.1 if now_s > 18.0 else 0.0)
     estimator = EstimatorConfig(

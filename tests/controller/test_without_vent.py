@@ -79,7 +79,7 @@ def test_the_command_vent_states_that_only_the_leak_lowers_the_mirror() -> None:
     assert re.fullmatch(r"venting: \d+ Pa left", said[-1])
 
 
-def test_check_warns_of_it_with_the_time_and_its_basis() -> None:
+def test_check_warns_of_a_missing_vent_with_the_time_to_lower() -> None:
     assert "devices.vent" not in {finding.field for finding in cross_check(config(vent=True))}
     assert "devices.vent" not in {finding.field for finding in cross_check(Config())}
     (finding,) = (

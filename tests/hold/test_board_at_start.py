@@ -58,11 +58,11 @@ async def identified(
     return await _identify(open_bench(devices), config, asked, log)
 
 
-async def test_a_board_without_faults_is_taken(board: PumpBoardEmulator) -> None:
+async def test_a_board_without_faults_is_accepted(board: PumpBoardEmulator) -> None:
     assert await identified(board, options()) == BoardAtStart()
 
 
-async def test_a_latched_board_is_refused_and_in_standby_waited_for(
+async def test_a_latched_board_is_refused_and_standby_waits_for_it(
     board: PumpBoardEmulator,
 ) -> None:
     board.state._latch(OVER_PRESSURE)
@@ -105,7 +105,7 @@ async def test_a_watchdog_that_stopped_a_venting_board_is_not_cleared(
         await identified(board, options(), ("watchdog_tripped",))
 
 
-async def test_starts_that_clear_the_watchdog_use_up_the_number(
+async def test_starts_that_clear_the_watchdog_count_as_resumes(
     board: PumpBoardEmulator, tmp_path: Path
 ) -> None:
     for _ in range(2):
@@ -118,7 +118,7 @@ async def test_starts_that_clear_the_watchdog_use_up_the_number(
         await identified(board, options(), ("watchdog_tripped",), ResumeLog(tmp_path))
 
 
-async def test_a_clearing_that_cannot_be_counted_is_not_done(
+async def test_the_watchdog_is_not_cleared_if_it_cannot_be_counted(
     board: PumpBoardEmulator, tmp_path: Path
 ) -> None:
     board.state._latch(WATCHDOG)
@@ -140,7 +140,7 @@ def test_a_latched_fault_that_cannot_be_cleared_is_refused_in_one_line(tmp_path:
         _latched(Config(), tmp_path, options(clear_faults=True))
 
 
-async def test_a_board_that_is_not_there_is_told_by_why_it_could_not_be_reached(
+async def test_an_unreachable_board_is_reported_with_the_reason(
     monkeypatch: pytest.MonkeyPatch, unused_tcp_port: int
 ) -> None:
     monkeypatch.setattr("membrane_ctrl.instruments.bench._PATIENCE_S", 0.05)
@@ -153,7 +153,7 @@ async def test_a_board_that_is_not_there_is_told_by_why_it_could_not_be_reached(
 
 
 @pytest.mark.parametrize("content", ["{", '{"schema": "another"}'])
-def test_a_latched_fault_keeps_the_next_hold_down_and_standby_waits(
+def test_a_latched_fault_prevents_the_next_hold_and_standby_waits(
     tmp_path: Path, content: str
 ) -> None:
     (tmp_path / NAME).write_text(content)
@@ -173,7 +173,7 @@ class Door(Still):
         return replace(super().sample(), interlock_inputs=0xFFFF & ~(1 << 3))
 
 
-async def test_an_open_interlock_is_refused_and_in_standby_waited_for() -> None:
+async def test_an_open_interlock_is_refused_and_standby_waits_for_it() -> None:
     emulator = PumpBoardEmulator(Door())
     await emulator.start()
     devices = DevicesConfig.model_validate(

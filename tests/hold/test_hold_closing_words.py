@@ -31,7 +31,7 @@ def test_a_folder_that_is_gone_is_not_offered(
     assert "are readable" not in said
 
 
-def test_a_folder_begun_anew_says_from_when(
+def test_a_recreated_folder_states_when_it_begins(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     (tmp_path / "summary.json").write_text(json.dumps({"recorder": {"folder_anew_s": 13.44}}))
@@ -83,7 +83,7 @@ FAULT = Fault(
         (Exit.INTERRUPTED, None, []),
     ],
 )
-def test_a_run_that_ends_in_a_fault_says_so_first(
+def test_a_run_that_ends_in_a_fault_states_the_fault_first(
     exit_: Exit,
     fault: Fault | None,
     says: list[str],
@@ -101,7 +101,7 @@ def test_a_run_that_ends_in_a_fault_says_so_first(
     assert lines[count].startswith("missed ticks:")
 
 
-def test_a_fault_is_said_without_a_disk_and_beside_json(
+def test_the_fault_is_printed_without_a_disk_and_with_json(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     for as_json in (False, True):
@@ -111,7 +111,7 @@ def test_a_fault_is_said_without_a_disk_and_beside_json(
         assert printed.out == ("{}\n" if as_json else "")
 
 
-def test_which_fault_stands() -> None:
+def test_the_closing_words_name_the_fault_that_is_still_latched() -> None:
     def standing(*events: Event) -> Fault | None:
         fault: Fault | None = None
         for event in events:

@@ -63,7 +63,7 @@ def words(folder: Path) -> list[str]:
     return [each.lock.word for each in LockStore([folder]).find_locks()]
 
 
-def test_a_lock_is_on_the_disk_when_its_outcome_is_there_and_a_removal_likewise(
+def test_a_lock_or_its_removal_is_on_the_disk_before_its_outcome(
     tmp_path: Path,
 ) -> None:
     with keeper(tmp_path, []) as kept:

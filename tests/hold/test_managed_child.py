@@ -55,14 +55,14 @@ def make_managed() -> tuple[ManagedChild, Agency]:
     return managed, agency
 
 
-def test_what_the_child_says_is_handed_on() -> None:
+def test_the_messages_of_the_child_are_passed_on() -> None:
     managed, agency = make_managed()
     agency.theirs[0].send({"kind": "disk_low", "what": "disk", "message": "full"})
     assert managed.look(0.0) == [DiskLow("disk", "full")]
     assert managed.look(0.5) == []
 
 
-def test_a_word_reaches_the_child_that_is_there_and_no_other() -> None:
+def test_a_message_reaches_the_present_child_only() -> None:
     managed, agency = make_managed()
     assert managed.send("capture")
     assert agency.theirs[0].recv() == "capture"
@@ -70,7 +70,7 @@ def test_a_word_reaches_the_child_that_is_there_and_no_other() -> None:
     assert not managed.send("capture")
 
 
-def test_a_dead_child_is_replaced_at_once_and_told() -> None:
+def test_a_dead_child_is_replaced_at_once_and_reported() -> None:
     managed, agency = make_managed()
     agency.theirs[0].send({"kind": "last words"})
     managed.child.kill()
@@ -81,7 +81,7 @@ def test_a_dead_child_is_replaced_at_once_and_told() -> None:
     assert kinds(managed.look(3.5)) == ["hello"]
 
 
-def test_the_next_ones_come_later_and_later_and_no_more_than_ten_an_hour() -> None:
+def test_replacements_are_delayed_increasingly_and_limited_to_ten_an_hour() -> None:
     managed, _ = make_managed()
     said: list[str] = []
     restarted_s = []
@@ -111,7 +111,7 @@ def test_after_an_hour_it_is_tried_again() -> None:
     assert kinds(managed.look(3700.0)) == ["child_restarted"]
 
 
-def test_a_child_that_breaks_its_word_is_killed_and_replaced() -> None:
+def test_a_child_that_stops_its_heartbeat_is_killed_and_replaced() -> None:
     managed, agency = make_managed()
     agency.theirs[0].send(Alive(5.0).to_dict())
     assert managed.look(10.0) == []
@@ -124,12 +124,14 @@ def test_a_child_that_breaks_its_word_is_killed_and_replaced() -> None:
 
 
 @pytest.mark.parametrize(("moment_s", "said"), [(59.0, []), (61.0, ["child_silent"])])
-def test_a_child_that_never_says_a_word_is_not_waited_for(moment_s: float, said: list[str]) -> None:
+def test_a_child_that_never_sends_a_heartbeat_is_not_waited_for(
+    moment_s: float, said: list[str]
+) -> None:
     managed, _ = make_managed()
     assert kinds(managed.look(moment_s)) == said
 
 
-def test_who_cannot_be_replaced_any_more_is_not_killed_and_may_come_back() -> None:
+def test_a_child_beyond_its_replacements_is_not_killed_and_may_recover() -> None:
     managed, agency = make_managed()
     for second in range(0, 1200, 2):
         if len(agency.numbers) <= 10 and managed.child.alive:
@@ -146,7 +148,7 @@ def test_who_cannot_be_replaced_any_more_is_not_killed_and_may_come_back() -> No
     assert kinds(managed.look(1214.0)) == ["child_silent"]
 
 
-def test_a_program_may_be_silent_and_its_end_is_told_once() -> None:
+def test_a_program_may_be_silent_and_its_end_is_reported_once() -> None:
     agency = Agency()
     page = ManagedChild(agency.make, reports=False)
     page.start(0.0)

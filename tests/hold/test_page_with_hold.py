@@ -29,7 +29,7 @@ WAITS = (
 )
 
 
-def test_it_gets_what_the_settings_say(tmp_path: Path) -> None:
+def test_the_page_gets_its_settings(tmp_path: Path) -> None:
     (tmp_path / "lab.toml").write_text(
         "[web]\nhost = '0.0.0.0'\nport = 7481\nnames = ['bench.lab']\n"
         "users_file = 'users'\ncertificate_file = 'bench.pem'\nkey_file = 'bench.key'\n"
@@ -58,13 +58,13 @@ def test_it_gets_what_the_settings_say(tmp_path: Path) -> None:
         ("[web]\n[port]\nenabled = false\n", "set port.enabled = true"),
     ],
 )
-def test_settings_that_cannot_be(tmp_path: Path, text: str, says: str) -> None:
+def test_impossible_page_settings_are_refused(tmp_path: Path, text: str, says: str) -> None:
     (tmp_path / "lab.toml").write_text(text)
     with pytest.raises(InputError, match=says):
         configured(tmp_path / "lab.toml")
 
 
-def test_without_its_library_no_hold_begins(
+def test_without_the_library_of_the_page_no_hold_begins(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     monkeypatch.setattr("importlib.util.find_spec", lambda name: None)
@@ -82,7 +82,7 @@ def test_without_its_library_no_hold_begins(
     assert not (tmp_path / "logs").exists()
 
 
-def test_it_ends_when_its_parent_has_died() -> None:
+def test_the_page_ends_when_its_parent_dies() -> None:
     with subprocess.Popen([sys.executable, "-c", WAITS], stdin=subprocess.PIPE) as page:
         assert page.stdin is not None
         page.stdin.close()

@@ -76,7 +76,7 @@ def test_a_played_scenario_is_a_run_for_every_reader(
     assert "identical" in capsys.readouterr().out
 
 
-def test_names_come_with_titles_and_a_dash_is_as_good_as_an_underscore(
+def test_names_have_titles_and_accept_dashes_for_underscores(
     capsys: pytest.CaptureFixture[str],
 ) -> None:
     assert cli.run(["twin", "play"]) == Exit.DONE

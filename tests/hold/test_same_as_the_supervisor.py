@@ -161,7 +161,7 @@ def test_a_virtual_run_is_the_supervisors(name: str) -> None:
     assert (len(theirs), their_exit) == (len(ours), our_exit)
 
 
-def test_the_upsets_do_upset() -> None:
+def test_the_disturbances_of_the_comparison_have_an_effect() -> None:
     quiet = [output.row.pack() for output in virtual(UPSETS["nothing"])[0]]
     for name in UPSETS.keys() - {"nothing"}:
         assert [output.row.pack() for output in virtual(UPSETS[name])[0]] != quiet, name

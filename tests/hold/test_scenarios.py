@@ -70,7 +70,7 @@ def test_a_bad_file_is_one_line(tmp_path: Path, text: str, words: list[str]) -> 
     assert all(word in message for word in words), message
 
 
-def test_what_does_not_come_is_complained_of(tmp_path: Path) -> None:
+def test_missing_expectations_are_reported(tmp_path: Path) -> None:
     path = tmp_path / "wrong.toml"
     bounds = '[[expect.bounds]]\nfield = "truth_displacement_um"\nhigh = -1e3\n'
     expect = '[expect]\nexit = "safety_trip"\nstates = []\nfaults = ["late"]\nevents = ["party"]\n'
@@ -83,7 +83,7 @@ def test_what_does_not_come_is_complained_of(tmp_path: Path) -> None:
     )
 
 
-def test_a_process_that_never_runs_is_complained_of(tmp_path: Path) -> None:
+def test_a_process_that_never_runs_is_reported(tmp_path: Path) -> None:
     path = tmp_path / "stalled.toml"
     path.write_text(GOOD + '[[at]]\ntime_s = 0.0\nwrong = "stalled"\n[expect]\nexit = "done"\n')
     scenario = load_scenario(path, CheckedScenario)

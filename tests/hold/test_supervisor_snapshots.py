@@ -99,7 +99,7 @@ def test_an_event_that_is_too_long_for_its_slot_is_cut() -> None:
     assert json.loads(told)["name"] == "tick_error"
 
 
-async def test_a_shape_that_cannot_be_read_is_told_once_and_the_hold_goes_on() -> None:
+async def test_an_unreadable_shape_is_reported_once_and_the_hold_continues() -> None:
     with ExitStack() as stack:
         addresses = {
             name: stack.enter_context(ring(64, 4096)) for name in ("telemetry", "events", "shapes")

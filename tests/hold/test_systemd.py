@@ -92,7 +92,7 @@ def test_trouble_with_the_recording_is_in_the_status_until_it_is_over(
     assert messages[1] == ["WATCHDOG=1", "STATUS=hold"]
 
 
-def test_without_systemd_or_with_one_that_is_gone_nothing_happens(
+def test_without_systemd_or_after_its_end_nothing_happens(
     monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
     monkeypatch.delenv("NOTIFY_SOCKET", raising=False)

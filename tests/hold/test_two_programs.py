@@ -75,7 +75,7 @@ def test_a_second_program_is_refused_as_long_as_the_hold_feeds_the_watchdog() ->
     assert story.bench.board.pump_fraction == 0.0  # what was refused has not fed the watchdog
 
 
-def test_a_hold_that_lost_its_board_sees_it_in_its_next_tick_and_never_takes_it_back() -> None:
+def test_a_hold_that_lost_its_board_detects_it_in_the_next_tick_and_never_reclaims_it() -> None:
     story = Story()
     story.stall(1.0)
     assert intrude(story.bench, 0.2) == ""
@@ -94,7 +94,7 @@ def test_a_hold_that_lost_its_board_sees_it_in_its_next_tick_and_never_takes_it_
     assert story.bench.board.pump_fraction == 0.0
 
 
-def test_a_stop_by_anybody_is_a_fault_in_the_next_tick_and_never_resumes() -> None:
+def test_a_stop_by_any_program_is_a_fault_in_the_next_tick_and_never_resumes() -> None:
     story = Story()
     story.bench.board.write(story.bench.board.registers.register("stop").address, [1])
     assert story.bench.board.pump_fraction == 0.0

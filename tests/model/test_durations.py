@@ -20,7 +20,7 @@ from membrane_ctrl.model.errors import InputError
         ("0.5", 0.5),
     ],
 )
-def test_understood(text: str, seconds: float) -> None:
+def test_durations_are_parsed(text: str, seconds: float) -> None:
     assert parse_duration_s(text) == seconds
 
 

@@ -62,7 +62,7 @@ def test_an_estimate_that_was_sent_comes_back_to_the_last_bit(estimate: ShapeEst
     assert bits(replace(sent, covariance_um2=estimate.covariance_um2)) == bits(estimate)
 
 
-def test_the_covariance_crosses_in_singles_and_the_message_is_small() -> None:
+def test_the_covariance_is_sent_in_single_precision_and_the_message_is_small() -> None:
     sent = shape_at(3.0)
     assert ESTIMATE.covariance_um2 == pytest.approx(sent.covariance_um2, rel=1e-7)
     assert np.array_equal(ESTIMATE.covariance_um2, sent.covariance_um2.astype(np.float32))
@@ -105,7 +105,7 @@ def test_the_covariance_crosses_in_singles_and_the_message_is_small() -> None:
     ],
     ids=range(26),
 )
-def test_what_is_no_estimate_is_refused(message: bytes) -> None:
+def test_invalid_messages_are_refused_as_estimate(message: bytes) -> None:
     with pytest.raises(ValueError):  # JSON's own words are as good as ours
         unpack_estimate(message)
 

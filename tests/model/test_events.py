@@ -25,7 +25,7 @@ def test_keys_stay_in_the_order_of_the_format() -> None:
     assert line == '{"kind": "state", "state": "hold", "from": "settle", "why": "inside the band"}'
 
 
-def test_what_there_is_nothing_to_say_of_is_left_out_but_nobody_is_somebody() -> None:
+def test_empty_fields_are_left_out_but_a_missing_commander_is_kept() -> None:
     assert CommandTaken("ack", "ann", "").to_dict() == {
         "kind": "command",
         "command": "ack",
@@ -42,7 +42,7 @@ def test_what_there_is_nothing_to_say_of_is_left_out_but_nobody_is_somebody() ->
 
 
 @pytest.mark.parametrize("cls", KINDS.values())
-def test_every_kind_comes_back_from_its_line(cls: type[Event]) -> None:
+def test_every_event_class_is_restored_from_its_line(cls: type[Event]) -> None:
     event = from_dict({"kind": cls.line_kind})
     assert type(event) is cls
     again = from_dict(json.loads(json.dumps(event.to_dict())))
@@ -60,7 +60,7 @@ def test_every_kind_comes_back_from_its_line(cls: type[Event]) -> None:
         {"kind": "state", "state": None},
     ],
 )
-def test_what_is_not_understood_is_kept_as_it_is(line: dict[str, Any]) -> None:
+def test_unknown_event_lines_are_kept_unchanged(line: dict[str, Any]) -> None:
     event = from_dict(line)
     assert isinstance(event, UnknownEvent)
     assert event.to_dict() == line
@@ -100,7 +100,7 @@ def test_codes_come_back_as_their_class_and_count_among_the_numbers() -> None:
     assert isinstance(from_dict({"kind": "plausibility", "faulty": "of tomorrow"}), UnknownEvent)
 
 
-def test_lists_come_back_as_they_were() -> None:
+def test_lists_are_restored_unchanged() -> None:
     held = HeldBy(("laser", "optics"), ("laser +12 µm",))
     assert from_dict(json.loads(json.dumps(held.to_dict()))) == held
     assert held.sentence == "The mirror is held by laser, optics; jumped: laser +12 µm"

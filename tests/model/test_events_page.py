@@ -23,7 +23,7 @@ def test_every_kind_of_a_run_is_on_the_page_with_its_keys() -> None:
             assert f"`{key}` " in row
 
 
-def test_a_page_that_is_old_is_reported_and_not_touched(
+def test_an_outdated_page_is_reported_and_not_changed(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     old = tmp_path / "events.md"

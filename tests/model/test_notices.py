@@ -51,7 +51,7 @@ def keys_after(*told: Event) -> list[NoticeKey]:
     return list(status_after(*told).notices)
 
 
-def test_a_notice_stands_until_the_event_that_closes_its_subject() -> None:
+def test_a_notice_stays_open_until_the_event_that_closes_its_subject() -> None:
     door, gate = (InterlockOpened(name, "text", "vent") for name in ("door", "gate"))
     assert keys_after(door, gate) == [
         NoticeKey(Topic.INTERLOCK, "door"),
@@ -85,13 +85,13 @@ def test_a_latched_fault_is_one_notice() -> None:
     assert keys_after(LATCHED, StateEntered("fault", "hold", "")) == [NoticeKey(Topic.FAULT)]
 
 
-def test_a_removed_lock_takes_the_notice_on_its_storage_along() -> None:
+def test_a_removed_lock_closes_the_notice_on_its_storage() -> None:
     lock = LockSet("bofak", "hands", "ann", "", "", "", 1)
     removed = LockRemoved("bofak", "hands", "ann", "", "ann", "author", 2)
     assert keys_after(lock, LockNotStored("bofak", "full"), removed) == []
 
 
-def test_a_new_recorder_ends_what_the_former_one_reported_and_another_child_does_not() -> None:
+def test_a_new_recorder_closes_the_notices_of_the_previous_one_only() -> None:
     before = (
         RecorderError("disk", "full"),
         RecorderError("tables", "x"),

@@ -58,7 +58,7 @@ def test_round_terms_are_those_without_azimuthal_order() -> None:
     assert film_law.BEYOND[-1] < film_law.EXCESS_TERMS
 
 
-def test_excess_takes_the_place_of_piston() -> None:
+def test_the_excess_replaces_piston() -> None:
     assert len(NOLL_INDICES[1:]) + 1 == PARAMETERS
 
 

@@ -46,7 +46,7 @@ def without_git(checkout: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     return checkout
 
 
-def test_a_clean_checkout_has_its_commit_and_a_changed_one_says_so(checkout: Path) -> None:
+def test_a_clean_checkout_has_its_commit_and_a_modified_one_is_marked(checkout: Path) -> None:
     commit = git(checkout, "rev-parse", "HEAD")[:12]
     assert find_commit(checkout) == commit
     (checkout / "file").write_text("two")

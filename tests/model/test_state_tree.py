@@ -90,7 +90,7 @@ def decoded(data: bytes) -> Tree:
     return decode_state(data, Tree, MOST_BYTES)
 
 
-def test_everything_comes_back_to_the_last_bit() -> None:
+def test_a_state_is_restored_bit_by_bit() -> None:
     was, now = full(), decoded(encode_state(full()))
     assert find_differences(was, now) == []
     assert encode_state(now) == encode_state(was)
@@ -167,7 +167,7 @@ def test_the_spelling_of_the_values_does_not_matter() -> None:
         {"more": 1},
     ],
 )
-def test_what_is_not_declared_is_refused(values: dict[str, object]) -> None:
+def test_undeclared_fields_are_refused(values: dict[str, object]) -> None:
     with pytest.raises(StateError, match=rf"{next(iter(values))}|another layout"):
         decoded(changed(**values))
 
@@ -200,7 +200,7 @@ def test_a_missing_field_of_a_part_is_named_with_its_place() -> None:
         encode_state(full()) + b"]",
     ],
 )
-def test_what_is_no_tree_is_refused(data: bytes) -> None:
+def test_data_that_is_no_tree_is_refused(data: bytes) -> None:
     with pytest.raises(StateError):
         decoded(data)
 

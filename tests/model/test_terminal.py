@@ -51,7 +51,7 @@ def test_json_that_is_printed_keeps_its_meaning(capsys: pytest.CaptureFixture[st
     assert printed.removesuffix("\n").isprintable()
 
 
-def test_both_streams_are_covered_and_given_back(capsys: pytest.CaptureFixture[str]) -> None:
+def test_both_streams_are_wrapped_and_restored(capsys: pytest.CaptureFixture[str]) -> None:
     before = sys.stdout, sys.stderr
     with only_text():
         print(HOSTILE, end="")
@@ -61,7 +61,7 @@ def test_both_streams_are_covered_and_given_back(capsys: pytest.CaptureFixture[s
     assert capsys.readouterr() == (ESCAPED * 2, ESCAPED)
 
 
-def test_a_table_keeps_its_colours_and_loses_what_its_cells_say(
+def test_a_table_keeps_its_colours_and_escapes_its_cells(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     terminal = Terminal()
@@ -110,7 +110,7 @@ def test_without_a_terminal_there_is_no_bar(capsys: pytest.CaptureFixture[str]) 
     assert capsys.readouterr() == ("", "")
 
 
-def test_what_a_live_screen_draws_is_looked_through_too() -> None:
+def test_the_output_of_a_live_screen_is_filtered_too() -> None:
     console = table_console(width=200)
     drawn = "".join(
         segment.text for segment in console.render(Plain(Text(HOSTILE))) if not segment.control
@@ -128,12 +128,12 @@ def test_an_error_is_one_line_without_control_bytes(capsys: pytest.CaptureFixtur
     assert "no\\u001b[31msuch run" in said
 
 
-def test_help_is_as_it_was(capsys: pytest.CaptureFixture[str]) -> None:
+def test_the_help_text_is_unchanged(capsys: pytest.CaptureFixture[str]) -> None:
     assert run(["repair", "--help"]) == 0
     assert "--in-place" in capsys.readouterr().out
 
 
-def test_nobody_else_makes_a_console() -> None:
+def test_no_other_module_creates_a_console() -> None:
     """Rich writes past the edge: every console has to be of `table_console`, or draw no text of
     others.
     """
