@@ -78,7 +78,6 @@ def report_table(analysis: Analysis) -> dict[str, Any]:
         "faults_s": ticks.faults_s,
         "paused_s": ticks.paused_s,
         "moving_s": ticks.moving_s,
-        "held_without_every_tick_s": ticks.thin_s,
         "held_without_reading_s": ticks.unread_s,
         "ticks": ticks.ticks,
         "ticks_settled": ticks.settled,

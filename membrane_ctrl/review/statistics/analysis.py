@@ -269,12 +269,6 @@ _IN_BAND_LEAST = 0.999
 _BIAS_MOST_UM = 0.1
 _LATE_P99_MOST_MS = 5.0
 _REJECTED_MOST = 0.02
-_THIN = (
-    "without every tick: means are those of the 1 s level; single readings, their histogram, "
-    "spectrum, Allan "
-    "deviation and pump are those of the existing ticks, and the benefit of the feed-forward "
-    "is unknown"
-)
 # Every hold waits a few seconds for its first cycles.
 _TRACKING_LEAST = 0.8
 _UNTRACKED_MOST_S = 60.0
@@ -327,14 +321,6 @@ def _anomalies(
     if ticks.missed_ticks:
         odd.append(
             Anomaly("missed ticks", f"{ticks.missed_ticks} of {ticks.ticks + ticks.missed_ticks}")
-        )
-    if ticks.thin_s:
-        odd.append(Anomaly("thinned ticks", f"{span(ticks.thin_s)} held {_THIN}"))
-    if ticks.uncovered_s:
-        odd.append(
-            Anomaly(
-                "thinned ticks", f"{span(ticks.uncovered_s)} held not counted: few ticks, no level"
-            )
         )
     if ticks.lateness_ms.quantile(0.99) > _LATE_P99_MOST_MS:
         odd.append(Anomaly("late ticks", f"p99 is {ticks.lateness_ms.quantile(0.99):.1f} ms"))

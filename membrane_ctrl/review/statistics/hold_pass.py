@@ -4,102 +4,17 @@ memory.
 
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 
 from membrane_ctrl.model import telemetry
-from membrane_ctrl.model.arrays import BoolArray, Column, IntArray, Singles
+from membrane_ctrl.model.arrays import Column, IntArray, Singles
 from membrane_ctrl.model.run_status import RunStatus
 from membrane_ctrl.model.telemetry import State
 from membrane_ctrl.review.statistics import spectra
 from membrane_ctrl.run_files import hold_parts, run_statistics
-from membrane_ctrl.run_files.run import Block, Run
-
-# Seconds with incomplete ticks (segments in quiet times), whose means come from the 1 s level.
-
-LEVEL_COLUMNS = ("state", "mean_displacement_um", "mean_true_error_um")
-
-
-class ThinSeconds:
-    """Finds thin seconds, over blocks in order of time."""
-
-    def __init__(self, rate_hz: float) -> None:
-        self._least = run_statistics.least_ticks(1.0, rate_hz)
-        self._parts: list[tuple[spectra.Seconds, Column]] = []
-
-    def add(self, time_s: Column, setpoint_um: Column, settled: BoolArray) -> None:
-        """Add (n,) times, setpoints and whether each tick is settled."""
-        if not time_s.size:
-            return
-        second = np.floor(time_s + 1e-9).astype(np.int32)
-        starts = spectra.group_starts(second)
-        rows = np.stack((np.ones(time_s.size), settled.astype(np.float64), setpoint_um))
-        sums = np.add.reduceat(rows, starts, axis=1)
-        # a second shared by two blocks is thin in both
-        thin = (sums[0] < self._least) & (sums[1] > 0)
-        self._parts.append((second[starts][thin], sums[:, thin]))
-
-    def result(self) -> tuple[spectra.Seconds, Column]:
-        """(k,) thin seconds with all ticks settled, (k,) their mean setpoint in µm."""
-        if not self._parts:
-            return np.empty(0, dtype=np.int32), np.empty(0)
-        second = np.concatenate([part[0] for part in self._parts])
-        if not second.size:
-            return second, np.empty(0)
-        starts = spectra.group_starts(second)
-        ticks, settled, setpoint_um = np.add.reduceat(
-            np.hstack([part[1] for part in self._parts]), starts, axis=1
-        )
-        thin = (ticks < self._least) & (settled == ticks)
-        return second[starts][thin], setpoint_um[thin] / ticks[thin]
-
-
-@dataclass(frozen=True, slots=True)
-class LevelMeans:
-    """Means of (k,) thin seconds from the level: their ticks, errors in µm, NaN where missing."""
-
-    second: spectra.Seconds
-    ticks: Column
-    reading_um: Column
-    true_um: Column
-
-
-def level_means(run: Run, second: spectra.Seconds, setpoint_um: Column) -> LevelMeans:
-    """Means of thin seconds from the 1 s level, as far as the level's are complete."""
-    level: Block = run.level(1.0, float(second[0]), float(second[-1]) + 1.0, LEVEL_COLUMNS)
-    _, place, row = np.intersect1d(
-        second, np.rint(level["time_s"]).astype(np.int32), return_indices=True
-    )
-    whole = (level["rows"][row] >= run_statistics.least_ticks(1.0, run.config.loop.rate_hz)) & (
-        level["state"][row] == State.HOLD
-    )
-    place, row = place[whole], row[whole]
-    reading_um = setpoint_um[place] - level["mean_displacement_um"][row]
-    return LevelMeans(
-        second[place], level["rows"][row], reading_um, level["mean_true_error_um"][row]
-    )
-
-
-def filled(seconds: spectra.SecondsOf, means: LevelMeans, error_um: Column) -> spectra.SecondsOf:
-    """Sums over seconds, replacing thin ones by the level's.
-
-    The error prevented by the feed-forward (the second row) needs every earlier tick: it is then
-    unknown.
-    """
-    there = np.isfinite(error_um)
-    second, counts, sums = seconds
-    kept = ~np.isin(second, means.second[there])
-    ticks = means.ticks[there].astype(np.float32)
-    joined = np.concatenate((second[kept], means.second[there]))
-    order = np.argsort(joined, kind="stable")
-    errors_um = np.concatenate((sums[0][kept], error_um[there] * ticks))[order]
-    return (
-        joined[order],
-        np.concatenate((counts[kept], ticks))[order],
-        np.stack((errors_um, errors_um * np.nan)),
-    )
-
+from membrane_ctrl.run_files.run import Run
 
 NAMES = (
     *hold_parts.FIELDS,
@@ -117,8 +32,6 @@ ERROR, KEPT_AWAY = range(2)
 # The histogram extends this many bands to each side, in bins of a fiftieth of a band.
 _HISTOGRAM_BANDS = 5
 _HISTOGRAM_BINS = 500
-# A few seconds lose ticks to a damaged batch or a slow machine: those are omitted, the rest kept.
-_THIN_FROM = 0.05
 # A wanted flow that exceeds the pump's range by less than this is a rounding error of single
 # precision.
 _SATURATED_UM_PER_S = 1e-3
@@ -151,8 +64,6 @@ class HoldPass:
     faults_s: float
     paused_s: float
     moving_s: float  # the setpoint on its way, or not yet settled
-    thin_s: float  # settled seconds with incomplete ticks, whose means come from the level
-    uncovered_s: float  # those missing in the level too: no statistics cover them
     # (n,) each: setpoint minus laser reading, target minus true centre; on a grid of ticks, NaN
     # where not settled
     reading_um: Singles
@@ -180,24 +91,7 @@ def hold_pass(
     collected = _Collector(run, span_s, math.isfinite(part_s[0]))
     for block in run.tick_blocks(NAMES, *part_s):
         collected.add(block)
-    ticks = collected.result()
-    thin, setpoint_um = collected.thin.result()
-    within = (thin >= part_s[0]) & (thin + 1 <= part_s[1])
-    if np.count_nonzero(within) <= _THIN_FROM * ticks.seconds[READING][0].size:
-        return ticks
-    means = level_means(run, thin[within], setpoint_um[within])
-    return replace(
-        _with_level(ticks, means), uncovered_s=float(np.count_nonzero(within) - means.second.size)
-    )
-
-
-def _with_level(ticks: HoldPass, means: LevelMeans) -> HoldPass:
-    """Means of seconds with incomplete ticks, from the level."""
-    reading, true = ticks.seconds
-    if means.second.size <= _THIN_FROM * reading[0].size:
-        return ticks
-    seconds = filled(reading, means, means.reading_um), filled(true, means, means.true_um)
-    return replace(ticks, seconds=seconds, thin_s=float(means.second.size))
+    return collected.result()
 
 
 class _Collector:
@@ -218,11 +112,7 @@ class _Collector:
         self._lateness = run_statistics.LogHistogram()
         self._pump = _PumpSums(run)
         self._ticks = self._counted = self._unread = self._inside = 0
-        self._times = {
-            name: spectra.HeldTime(run.config.recording.quiet_hz)
-            for name in ("hold", *hold_parts.PARTS)
-        }
-        self.thin = ThinSeconds(loop.rate_hz)
+        self._times = {name: spectra.HeldTime() for name in ("hold", *hold_parts.PARTS)}
         # the running count at the start: for a part that of its first tick, which includes earlier
         # ones
         self._missed_before = math.nan if from_within else 0.0
@@ -241,7 +131,6 @@ class _Collector:
         )
         for name, part in {"hold": block["state"] == State.HOLD, **parts}.items():
             self._times[name].add(time_s, part)
-        self.thin.add(time_s, block["setpoint_um"], mask)
         missed = block["missed_ticks"][np.isfinite(block["missed_ticks"])]
         if missed.size:
             self._missed_before = (
@@ -289,8 +178,6 @@ class _Collector:
             faults_s=times_s["faults"],
             paused_s=times_s["paused"],
             moving_s=times_s["moving"],
-            thin_s=0.0,
-            uncovered_s=0.0,
             reading_um=self._reading,
             true_um=self._true,
             seconds=(reading, true),

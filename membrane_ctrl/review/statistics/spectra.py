@@ -109,19 +109,13 @@ def describe(means_um: Column, window_s: float, band_um: float) -> WindowStatist
     )
 
 
-# In quiet times segments have a few rows per second, some of them late.
-_ROWS_APART = 2.0
-_LEAST_GAP_S = 2.0
+_LONGEST_S = 2.0  # between two ticks; a longer gap is a loss
 
 
 class HeldTime:
-    """Sum of the tick intervals that start in a hold, over consecutive blocks.
+    """Sum of the tick intervals that start in a hold, over consecutive blocks."""
 
-    `quiet_hz` is the lowest rate of recorded rows. A gap longer than two of its periods is a loss.
-    """
-
-    def __init__(self, quiet_hz: float) -> None:
-        self._longest_s = max(_LEAST_GAP_S, _ROWS_APART / quiet_hz)
+    def __init__(self) -> None:
         self._last = (math.nan, False)
         self.held_s = 0.0
 
@@ -131,7 +125,7 @@ class HeldTime:
             return
         lasted_s = np.diff(np.concatenate(([self._last[0]], time_s)))
         first = np.concatenate(([self._last[1]], held[:-1]))
-        self.held_s += float(lasted_s[first & (lasted_s <= self._longest_s)].clip(0.0).sum())
+        self.held_s += float(lasted_s[first & (lasted_s <= _LONGEST_S)].clip(0.0).sum())
         self._last = float(time_s[-1]), bool(held[-1])
 
     def result_s(self, period_s: float) -> float:
