@@ -240,7 +240,7 @@ def _lines(table: dict[str, Any], figures: list[film_fit.FilmFigure]) -> list[st
             f"E t        {stiffness['value'] / 1e3:.2f} +- {stiffness['sigma'] / 1e3:.2g} kN/m"
         )
     for wave in table["ring"]:
-        unit, scale = ("um/m", 1e6) if wave["cause"] == "prestrain" else ("mm", 1.0)
+        unit, scale = ("µm/m", 1e6) if wave["cause"] == "prestrain" else ("mm", 1.0)
         what = {"prestrain": "pre-strain varies", "flat": "not flat", "round": "not round"}[
             wave["cause"]
         ]

@@ -1,6 +1,4 @@
-"""Texts for people, made where they are shown: templates with optional parts, and units as people
-read them.
-"""
+"""Texts for people, made where they are shown: templates with optional parts."""
 
 import re
 from collections.abc import Mapping
@@ -10,8 +8,8 @@ _FIELD = re.compile(r"{(\w+)")
 
 
 def for_people(text: str) -> str:
-    """Return a text of ours as people read it: `µm` for `um`, `±` for `+-`, in one line."""
-    return " ".join(re.sub(r"\bu(m|rad)\b", r"µ\1", text).replace("+-", "±").split())
+    """Return a text as people read it: `±` for `+-`, in one line."""
+    return " ".join(text.replace("+-", "±").split())
 
 
 def fields_of(template: str) -> frozenset[str]:

@@ -28,5 +28,5 @@ def test_the_fields_of_a_template() -> None:
     assert fields_of("{a}[ ({b})][ {c:.3f}]") == {"a", "b", "c"}
 
 
-def test_units_as_people_read_them() -> None:
-    assert for_people("drum µm umbrella +-3 µm,\n  1 µrad") == "drum µm umbrella ±3 µm, 1 µrad"
+def test_a_text_for_people_is_one_line() -> None:
+    assert for_people("drum +-3 µm,\n  1 µrad") == "drum ±3 µm, 1 µrad"

@@ -310,7 +310,7 @@ def _anomalies(
         if seconds.count and abs(seconds.mean_um) > _BIAS_MOST_UM:
             odd.append(Anomaly("bias", f"{seconds.mean_um:+.3f} µm on average"))
         if series.drift.significant:
-            odd.append(Anomaly("drift", _of(series.drift, "um/h")))
+            odd.append(Anomaly("drift", _of(series.drift, "µm/h")))
     if ticks.paused_s:
         odd.append(
             Anomaly(
@@ -352,7 +352,7 @@ def _anomalies(
         if shape.rejected > _REJECTED_MOST * shape.cycles:
             odd.append(Anomaly("rejected cycles", f"{shape.rejected} of {shape.cycles}"))
         if shape.disagreement.significant:
-            odd.append(Anomaly("camera and laser diverge", _of(shape.disagreement, "um/h")))
+            odd.append(Anomaly("camera and laser diverge", _of(shape.disagreement, "µm/h")))
     counts = Counter(event.kind for event in found)
     odd += [Anomaly(kind, f"{count} found") for kind, count in counts.most_common()]
     return tuple(odd)
