@@ -1,9 +1,9 @@
 """How often `report --compare` calls alike runs different, and how often it finds a known
 difference.
 
-`python -m benchmarks.records.comparison` prints the tables of docs/how-to/review.md. Series are 1 s
-means with a standard deviation of 1 and an exponential autocorrelation; those with excursions step
-away for 20 s, twice an hour on average, by up to six times that.
+`python -m benchmarks.records.comparison` prints the tables of docs/measurements/review.md. Series
+are 1 s means with a standard deviation of 1 and an exponential autocorrelation; those with
+excursions step away for 20 s, twice an hour on average, by up to six times that.
 """
 
 from __future__ import annotations
