@@ -148,7 +148,7 @@ class VaisalaPtb330Config(Section):
     """Interval between requests; a message takes 80 ms at 4800 baud. Raise it at lower baud rates.
     """
     age_max_s: Annotated[float, Field(gt=0, le=600)] = 3.0
-    """Age from which a value is no longer used. Raise it for a slow measurement."""
+    """Age from which a value is not used. Raise it for a slow measurement."""
     timeout_s: Timeout = 0.3
 
 
@@ -280,7 +280,7 @@ class ExternalSection(Section):
 
 
 class ExternalConfig(ExternalSection):
-    """An instrument whose driver is a package of its own (docs/how-to/new-device.md). The driver
+    """An instrument whose driver is a separate package (docs/how-to/new-device.md). The driver
     defines more keys.
 
     Reading a configuration never loads that package: only opening or emulating the devices does.
@@ -357,7 +357,7 @@ class PolledInterlockConfig(InterlockConfig):
     period_s: Annotated[float, Field(ge=0.01, le=10)] = 0.1
     """Interval between requests. Lower it for a contact that may open for a moment only."""
     age_max_s: Annotated[float, Field(ge=0.05, le=30)] = 0.5
-    """Age from which an answer no longer counts: the circuit is then open. Raise it for a slow
+    """Age from which an answer does not count: the circuit is then open. Raise it for a slow
     line.
     """
 
@@ -389,8 +389,7 @@ class GpioLineConfig(PolledInterlockConfig):
     """What the closed contact connects the line to. Set it as wired; a cut wire then reads as open.
     """
     pull: Literal["internal", "external"] = "internal"
-    """Resistor that defines the level of an open contact. Set it to external if the chip has none
-    of its own.
+    """Resistor that defines the level of an open contact. Set it to external if the chip has none.
     """
 
 
@@ -487,7 +486,7 @@ class FolderCameraConfig(CameraSection):
 
 
 class ExternalCameraConfig(CameraSection, ExternalSection):
-    """A camera whose driver is a package of its own (docs/how-to/new-camera.md). The driver defines
+    """A camera whose driver is a separate package (docs/how-to/new-camera.md). The driver defines
     more keys.
 
     Reading a configuration never loads that package: only opening or emulating the camera does.
@@ -518,7 +517,7 @@ class ScreenSection(Section):
     """(column, row) of O'; the screen's middle when absent. Set it if the pattern must be shifted.
     """
     settle_ms: Annotated[float, Field(ge=0, le=5000)] | None = None
-    """Time until a new picture stands; measured at the start when absent. Set it to save that
+    """Time until a new picture is complete; measured at the start when absent. Set it to save that
     measurement.
     """
     linearise: bool = True
@@ -538,7 +537,7 @@ class PygameScreenConfig(ScreenSection):
 
 
 class ExternalScreenConfig(ScreenSection, ExternalSection):
-    """A screen whose driver is a package of its own (docs/how-to/new-camera.md). The driver defines
+    """A screen whose driver is a separate package (docs/how-to/new-camera.md). The driver defines
     more keys.
 
     Reading a configuration never loads that package: only opening or emulating the screen does.

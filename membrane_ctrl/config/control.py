@@ -115,8 +115,8 @@ class PumpConfig(Section):
     that varies.
     """
     stroke_hz: Annotated[float, Field(ge=0, le=100)] = 0.0
-    """Strokes a second in a usual hold; one that tracks tells when they meet a vibration of the
-    mirror. 0: unknown. Set it for a diaphragm pump."""
+    """Strokes a second in a usual hold; a tracking hold warns when they coincide with a mirror
+    vibration. 0: unknown. Set it for a diaphragm pump."""
 
     @model_validator(mode="before")
     @classmethod
@@ -211,8 +211,8 @@ class LimitsConfig(Section):
     off by as much. Lower it for a room with a steady climate; a third of it raises the notice
     `slow_drift`."""
     leak_growth_max: Annotated[float, Field(gt=1, le=1000)] = 2.2
-    """Factor by which the gas taken may grow unseen by a camera: a doubled leak is a leak, more may
-    be a runaway. Raise it for a film whose leak varies."""
+    """Factor by which the gas consumption may grow while no camera sees the film: a doubled leak is
+    a leak, more may be a runaway. Raise it for a film whose leak varies."""
     following_error_max_um: Annotated[float, Field(gt=0, le=10000)] = 60.0
     """Largest distance from the setpoint. Raise it where gusts move the mirror farther."""
     band_um: Annotated[float, Field(gt=0, le=1e4)] = 2.0
@@ -300,9 +300,9 @@ class ShapeConfig(Section):
     enabled: bool = True
     """Measure the shape and trim the setpoint. Set it to false on a bench without a camera."""
     mode: Literal["cycle", "track"] = "cycle"
-    """`cycle` takes the frames of a figure one pattern after the other; `track` lets crossed
-    fringes stand still, so that every frame is a figure. Set it to `track` for a figure at the
-    camera's rate (docs/how-to/tracking.md)."""
+    """`cycle` takes the frames of a figure one pattern after the other; `track` shows crossed
+    fringes that do not change, so that every frame gives a figure. Set it to `track` for a figure
+    at the camera's rate (docs/how-to/tracking.md)."""
     period_s: Annotated[float, Field(ge=0.2, le=3600)] = 2.0
     """Interval between cycles. Raise it for a camera or machine that needs longer."""
     frame_interval_s: Annotated[float, Field(ge=0.0, le=10)] = 0.1
@@ -329,8 +329,8 @@ class ShapeConfig(Section):
     """Periods of the crossed fringes over the pattern; the mirror must show nine at least. Lower it
     for a camera with few pixels; raise it where the screen's light wanders over short distances."""
     track_step_s: Annotated[float, Field(ge=1, le=3600)] = 10.0
-    """Interval between steps of the crossed fringes; five steps measure the light anew. Lower it
-    for a screen whose light wanders within a minute."""
+    """Interval between steps of the crossed fringes; five steps measure the light again. Lower it
+    for a screen whose light changes within a minute."""
 
 
 class EstimatorConfig(Section):
@@ -365,26 +365,29 @@ class EstimatorConfig(Section):
     thermometer's.
     """
     pressure_walk_pa_per_root_s: Annotated[float, Field(gt=0, le=100)] = 0.3
-    """Unrest of the air pressure; learned from a barometer. Change it for a bench without one."""
+    """Random walk of the air pressure; learned from a barometer. Change it for a bench without
+    one."""
     air_walk_k_per_root_s: Annotated[float, Field(gt=0, le=10)] = 0.004
-    """Unrest of the air's temperature; learned from a thermometer. Change it for a bench without
-    one.
+    """Random walk of the air's temperature; learned from a thermometer. Change it for a bench
+    without one.
     """
     centre_walk_um_per_root_s: Annotated[float, Field(gt=0, le=100)] = 0.02
-    """Unrest of the centre that no weather explains; a hold learns it. Raise it for a shaken bench.
+    """Random walk of the centre that no weather explains; a hold learns it. Raise it for a shaken
+    bench.
     """
     leak_walk_um_per_s_per_root_s: Annotated[float, Field(gt=0, le=10)] = 0.015
-    """Unrest of the leak between its sudden changes, which the filter finds. Raise it for a leak
-    that changes slowly: it then follows sooner and passes more noise."""
+    """Random walk of the leak between its sudden changes, which the filter detects. Raise it for a
+    leak that changes slowly: it then follows sooner and passes more noise."""
     stand_um_per_k: Annotated[float, Field(ge=-100, le=100)] = 0.0
-    """Sag that the optics see too much for each kelvin by which their stand is warmer; it is taken
-    out. Set it to the measured one: a steel stand is near 0.34 at 2.7 m, invar near 0.03."""
+    """Apparent change of sag for each kelvin by which the camera mount is warmer; it is subtracted.
+    Set it to the measured one: a steel mount has about 0.34 at 2.7 m, invar near 0.03."""
     stand_sigma_um_per_k: Annotated[float, Field(ge=0, le=100)] = 0.4
-    """How far that may be wrong, 1 sigma; it is part of the estimate's. Lower it for a stand that
+    """How far that may be wrong, 1 sigma; it is part of the estimate's. Lower it for a mount that
     was measured.
     """
     stand_follows_air_s: Annotated[float, Field(ge=0, le=1e5)] = 1800.0
-    """Time constant with which the stand follows the air. Change it for a lighter or heavier stand.
+    """Time constant with which the camera mount follows the air. Change it for a lighter or heavier
+    mount.
     """
     mount_walk_um_per_root_s: Annotated[float, Field(ge=0, le=10)] = 0.0033
     """Walk of the laser's mount: 0.2 µm in an hour. Change it to your mount's."""

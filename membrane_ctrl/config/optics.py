@@ -337,7 +337,7 @@ class DisturbancesConfig(Section):
     camera's.
     """
     stand_k: Annotated[float, Field(ge=0, le=20)] = 0.0
-    """Swing of the temperature of the camera's stand, which grows by 60 µm/K. Raise it to see the
+    """Swing of the temperature of the camera's mount, which grows by 60 µm/K. Raise it to see the
     sag follow it.
     """
     seeing_um: Annotated[float, Field(ge=0, le=1000)] = 0.0

@@ -239,13 +239,13 @@ class EpicsConfig(Section):
 
 
 class DoorsConfig(Section):
-    """Doors for the lab's other systems (docs/how-to/bridges.md), opened by `membrane-ctrl
+    """Bridges to the lab's other systems (docs/how-to/bridges.md), started by `membrane-ctrl
     doors`."""
 
     name: Annotated[str, Field(pattern=r"^[a-z][a-z0-9_]{0,30}$")] = "mirror"
     """First part of every published name. Change it where there are several mirrors."""
     role: Literal["read", "operate", "tune"] = "read"
-    """What may be asked through the doors at most. Change it to let other systems act."""
+    """Highest role of a command from a bridge. Change it to let other systems act."""
     period_s: Annotated[float, Field(ge=0.5, le=60)] = 1.0
     """Interval between values. Raise it for a slow network."""
     mqtt: MqttConfig | None = None
@@ -323,8 +323,8 @@ class AlarmsConfig(Section):
     none are sent.
     """
     escalation_urls_file: str | None = None
-    """The same for those who are notified when nobody acknowledges. Set it if there is a second
-    person to tell.
+    """The same for those who are notified when no one acknowledges. Set it if there is a second
+    person to notify.
     """
     escalate_after_s: Annotated[float, Field(ge=1, le=1e6)] = 900.0
     """Time without acknowledgement before that. Lower it where minutes count."""
@@ -335,7 +335,7 @@ class AlarmsConfig(Section):
     flickers.
     """
     silent_s: Annotated[float, Field(ge=1, le=3600)] = 5.0
-    """Time without a tick that is an alarm of its own. Leave it, except on a machine that pauses.
+    """Time without a tick that raises an alarm. Leave it, except on a machine that pauses.
     """
     rules: tuple[AlarmRule, ...] = _RULES
     """Alarms on telemetry. Change it to add your own; a list replaces the default rules."""

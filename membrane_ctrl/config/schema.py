@@ -297,11 +297,12 @@ class RecordingConfig(Section):
     space.
     """
     keep_gb: Annotated[float, Field(ge=0.1, le=1e6)] | None = None
-    """Delete the oldest runs beyond this total; absent: never. Set it on a machine that nobody
-    clears.
+    """Delete the oldest runs beyond this total; absent: never. Set it on a machine whose disk is
+    not cleared by hand.
     """
     keep_days: Annotated[float, Field(ge=0.1, le=1e5)] | None = None
-    """Delete runs older than this; absent: never. Set it on a machine that nobody clears."""
+    """Delete runs older than this; absent: never. Set it on a machine whose disk is not cleared by
+    hand."""
 
 
 class Config(Section):
