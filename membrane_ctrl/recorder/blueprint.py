@@ -231,14 +231,20 @@ def _shape(config: Config) -> rrb.Vertical:
             2, rrb.Horizontal(rrb.Spatial2DView(name=fall, origin=shapes.WATERFALL_PATH), heard)
         )
     if config.recording.thumbnails:
-        names = [f"{axis}_sin_{k}" for axis in "xy" for k in (0, 1)]
-        names = ["crossed"] if config.shape.mode == "track" else names
+        names = frame_names(config)
         rows.append(
             rrb.Horizontal(
                 *(rrb.Spatial2DView(name=name, origin=f"/frames/{name}") for name in names)
             )
         )
     return rrb.Vertical(*rows, row_shares=[4, 3, 2, 3, 3][: len(rows)], name="Shape")
+
+
+def frame_names(config: Config) -> tuple[str, ...]:
+    """Return the patterns of which a run has the thumbnails that are shown."""
+    if config.shape.mode == "track":
+        return ("crossed",)
+    return tuple(f"{axis}_sin_{k}" for axis in "xy" for k in (0, 1))
 
 
 def _timing() -> rrb.Vertical:

@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import pyarrow as pa
+import pyarrow.compute
 
 from membrane_ctrl.config.schema import Config
 from membrane_ctrl.model import events, run_events
@@ -41,6 +42,7 @@ _WAY_DOWN_S = 60.0
 # Shorter gaps of a level had nothing to record.
 _HOLE_S = 30.0
 _PARTS_MAX = 100_000  # ten years of hours
+_PLACE_OF_THUMBNAIL = ("number", "time_s", "pattern")
 # Damaged lines may hold impossible times, and dates have a limit.
 _YEARS = range(1970, 2200)
 _RUN_MAX_S = 1e9
@@ -306,6 +308,48 @@ class Run:
             for spec in (table_specs.SHAPES, table_specs.TRACKED)
         )
         return shapes.from_tables(figures, self._table(table_specs.COVARIANCES).tables())
+
+    def thumbnails(
+        self, most: int, start_s: float = -np.inf, end_s: float = np.inf
+    ) -> list[dict[str, Any]]:
+        """Pictures of camera frames, evenly spaced.
+
+        Parameters
+        ----------
+        most : int
+            Of each pattern.
+        start_s, end_s : float
+            Part of the run to read.
+
+        Returns
+        -------
+        list of dict
+            `time_s`, `pattern` and `jpeg` of each, in order.
+        """
+        places = list(self._table(table_specs.THUMBNAILS).tables(_PLACE_OF_THUMBNAIL))
+        whole = [table for table in places if table.column_names == list(_PLACE_OF_THUMBNAIL)]
+        if not whole:
+            return []
+        joined = pa.concat_tables(whole)
+        time_s, patterns = joined["time_s"].to_numpy(), joined["pattern"].to_numpy()
+        within = (time_s >= start_s) & (time_s < end_s) & (np.abs(time_s) < _RUN_MAX_S)
+        numbers: list[int] = []
+        for pattern in dict.fromkeys(patterns[within].tolist()):
+            of_pattern = joined["number"].to_numpy()[within & (patterns == pattern)]
+            numbers += of_pattern[:: max(1, -(-of_pattern.size // most))].tolist()
+        return list(self._pictures(numbers))
+
+    def _pictures(self, numbers: Sequence[int]) -> Iterator[dict[str, Any]]:
+        """Rows of the table of thumbnails by their numbers, without damaged ones."""
+        if not numbers:
+            return
+        names = (*_PLACE_OF_THUMBNAIL, "jpeg")
+        wanted = pa.array(sorted(numbers))
+        reader = self._table(table_specs.THUMBNAILS)
+        for table in reader.tables(names, float(min(numbers)), float(max(numbers)) + 1):
+            if table.column_names == list(names):
+                chosen = table.filter(pa.compute.is_in(table["number"], wanted)).drop_null()
+                yield from chosen.select(names[1:]).to_pylist()
 
     def look_through(self) -> None:
         """Check every file of every table, so that `notes` names all damage."""

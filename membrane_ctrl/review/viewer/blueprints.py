@@ -16,7 +16,7 @@ from membrane_ctrl.recorder import blueprint
 from membrane_ctrl.review.viewer.layer import overview_streams, prefix_of
 from membrane_ctrl.run_files import streams
 
-TABS = ("overview", "loop", "environment", "shape", "faults", "tuning")
+TABS = ("overview", "loop", "environment", "shape", "frames", "faults", "tuning")
 
 
 # Of the coarse review of a run in the catalogue, which has no ticks.
@@ -51,6 +51,7 @@ class ReviewBlueprint:
             "loop": self._loop,
             "environment": self._environment,
             "shape": self._shape,
+            "frames": self._frames,
             "faults": self._faults,
             "tuning": self._tuning,
         }
@@ -214,6 +215,23 @@ class ReviewBlueprint:
             rrb.TextDocumentView(name="Colours", origin=f"{prefix_of(label)}/shape/legend"),
             column_shares=[1, 1, 1, 0.8],
         )
+
+    def _frames(self) -> rrb.Vertical:
+        """Thumbnails of the camera's frames, a row for each run."""
+        names = blueprint.frame_names(self.config)
+        rows = [
+            rrb.Horizontal(
+                *(
+                    rrb.Spatial2DView(
+                        name=f"{label} {name}".strip(),
+                        origin=f"{prefix_of(label)}/frames/{name}",
+                    )
+                    for name in names
+                )
+            )
+            for label in self.labels
+        ]
+        return rrb.Vertical(*rows, name="frames")
 
     def _faults(self) -> rrb.Vertical:
         return rrb.Vertical(

@@ -36,6 +36,7 @@ LEVEL_ROWS_MOST = 50_000
 OVERVIEW_ROWS_MOST = 5_000
 SHAPES_MOST = 20_000
 MAPS_MOST = 40
+THUMBNAILS_MOST = 40  # of each pattern
 _RUN_COLOURS: tuple[Colour, ...] = (BLUE, ORANGE, GREEN, VIOLET, RED)
 
 
@@ -140,6 +141,8 @@ class Layer:
         self._lanes(level)
         self._events(run, found, part_s)
         self._figure(cycles.select(hold_parts.held_at(level, cycles.time_s)), part_s)
+        if not self._overview_only:
+            self._thumbnails(run, part_s)
 
     def _overviews(self, level: Block, band_um: float) -> None:
         for stream in OVERVIEWS:
@@ -292,6 +295,20 @@ class Layer:
         )
         self._page("/shape/legend", f"| map | colours |\n|---|---|\n{rows}\n{_COLOUR_WORDS}")
 
+    def _thumbnails(self, run: Run, part_s: tuple[float, float]) -> None:
+        """Pictures of camera frames, each from its moment on."""
+        for each in run.thumbnails(THUMBNAILS_MOST, *part_s):
+            self._set_time(each["time_s"])
+            picture = rr.EncodedImage(contents=each["jpeg"], media_type="image/jpeg")
+            name = rr.escape_entity_path_part(each["pattern"])
+            self._stream.log(f"{self._prefix}/frames/{name}", picture)
+
+    def _set_time(self, at_s: float) -> None:
+        """Set the moment of the run for what is logged next."""
+        since = _nanoseconds(np.array([at_s - self._shift_s, at_s]))
+        self._stream.set_time("run_time", duration=since[0])
+        self._stream.set_time("utc", timestamp=self._origin + since[1])
+
     def _map(
         self, kind: str, values: shapes.Map, span: tuple[float, float], at_s: float | None = None
     ) -> None:
@@ -300,9 +317,7 @@ class Layer:
         outside = rr.SegmentationImage(shapes.outside_disc(), opacity=1.0, draw_order=1.0)
         self._stream.log(f"{path}/outside", outside, static=True)
         if at_s is not None:
-            since = _nanoseconds(np.array([at_s - self._shift_s, at_s]))
-            self._stream.set_time("run_time", duration=since[0])
-            self._stream.set_time("utc", timestamp=self._origin + since[1])
+            self._set_time(at_s)
         self._stream.log(path, rerun_streams.map_picture(picture, span), static=at_s is None)
 
     def _page(self, path: str, text: str) -> None:
