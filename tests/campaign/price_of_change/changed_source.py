@@ -164,11 +164,14 @@ class ChangedSource:
         """Run the interpreter on the changed source; returns its standard output. Fails unless it
         ends with 0.
         """
-        environment = os.environ | {"PYTHONPATH": str(self.folder)}
-        environment.pop("NUMBA_CACHE_DIR", None)  # compiled code stays in the copy
         command = [sys.executable, *(str(word) for word in words)]
         done = subprocess.run(
-            command, cwd=self.folder, env=environment, capture_output=True, text=True, check=False
+            command,
+            cwd=self.folder,
+            env=self._make_environment(),
+            capture_output=True,
+            text=True,
+            check=False,
         )
         assert done.returncode == 0, f"{command}\n{done.stdout}{done.stderr}"
         return done.stdout
@@ -176,6 +179,24 @@ class ChangedSource:
     def run_program(self, *words: object) -> str:
         """Run `membrane-ctrl` of the changed source, as `run_python`."""
         return self.run_python("-m", "membrane_ctrl", *words)
+
+    def start_program(self, *words: object, printed: Path) -> subprocess.Popen[bytes]:
+        """Start `membrane-ctrl` of the changed source; what it prints goes to a file."""
+        command = [sys.executable, "-m", "membrane_ctrl", *(str(word) for word in words)]
+        with printed.open("wb") as output:
+            return subprocess.Popen(
+                command,
+                cwd=self.folder,
+                env=self._make_environment(),
+                stdout=output,
+                stderr=subprocess.STDOUT,
+            )
+
+    def _make_environment(self) -> dict[str, str]:
+        """Environment in which the changed source is imported."""
+        environment = os.environ | {"PYTHONPATH": str(self.folder)}
+        environment.pop("NUMBA_CACHE_DIR", None)  # compiled code stays in the copy
+        return environment
 
 
 def _insert(file: Path, line: int, byte: int, text: str, replaced: int = 0) -> None:
