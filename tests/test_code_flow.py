@@ -11,7 +11,7 @@ import pytest
 ROOT = Path(__file__).parent.parent
 TOPS = ("membrane_ctrl", "firmware_iface", "tuning", "tests", "benchmarks")
 PAGE = (ROOT / "docs" / "explanation" / "code-flow.md").read_text()
-WALKS = {part[0]: part for part in re.split(r"^## ", PAGE, flags=re.MULTILINE)[1:]}
+WALKS = {part[0]: part for part in re.split(r"^## (?=\w\. )", PAGE, flags=re.MULTILINE)[1:]}
 COUNTS = dict(re.findall(r"^\| \[(\w)\. .*?\]\(.*?\) \| (\d+)", PAGE, re.MULTILINE))
 STEP = re.compile(r"^\| (\d+) \| `([^`]+)` \| (.+?) \|", re.MULTILINE)
 
