@@ -240,7 +240,7 @@ from membrane_ctrl.config.schema import Config
 from membrane_ctrl.processes.ring import Ring, RingWriter
 from membrane_ctrl.processes.child import STOP
 from membrane_ctrl.recorder.process import RecorderSpec, recorder_main
-from membrane_ctrl.controller.tick import MESSAGE_BYTES
+from membrane_ctrl.controller.tick_codec import MESSAGE_BYTES
 
 if __name__ == "__main__":
     inputs, events = Ring(2000, MESSAGE_BYTES), Ring(64, 4000)

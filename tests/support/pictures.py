@@ -24,8 +24,8 @@ import numpy as np
 
 from firmware_iface.roles import BenchReading
 from membrane_ctrl.model.arrays import AnyArray
-from membrane_ctrl.review.viewer.viewer import screenshot
 from tests.support.browser import browser_tab
+from tests.support.recording_picture import screenshot
 from tests.support.review_runs import written
 from tests.web.test_fleet import fleet_file
 from tests.web.test_page import PRESS, served
