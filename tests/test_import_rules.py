@@ -14,12 +14,12 @@ import pytest
 from tests.lint.package_order import (
     ROOT,
     TOPS,
-    circle_of,
-    floors,
+    cycles_of,
     imported,
+    imports_between_packages,
+    layers_of,
     module_of,
     modules,
-    rooms,
 )
 
 IO = {
@@ -41,9 +41,9 @@ NOT_PLAIN = {
     "membrane_ctrl.config.toml_file",
 }  # I/O
 
-# Each room with its floor: it imports from lower floors only. A new room is entered here and in
-# docs/explanation/architecture.md.
-FLOORS = {
+# Each package with its layer: it imports from lower layers only. A new package is entered here and
+# in docs/explanation/architecture.md.
+LAYERS = {
     1: {"firmware_iface", "membrane_ctrl/__init__", "membrane_ctrl/model"},
     2: {"membrane_ctrl/config"},
     3: {
@@ -117,16 +117,18 @@ def allowed(module: str, prefixes: set[str]) -> bool:
     return any(module == prefix or module.startswith(prefix + ".") for prefix in prefixes)
 
 
-def test_rooms_import_downwards_and_never_in_a_circle() -> None:
-    edges = rooms(modules())
-    assert {room: circle for room, circle in circle_of(edges).items() if len(circle) > 1} == {}
-    assert floors(edges) == {room: floor for floor, names in FLOORS.items() for room in names}
+def test_packages_import_from_lower_layers_and_never_in_a_cycle() -> None:
+    edges = imports_between_packages(modules())
+    assert {package: cycle for package, cycle in cycles_of(edges).items() if len(cycle) > 1} == {}
+    assert layers_of(edges) == {
+        package: layer for layer, names in LAYERS.items() for package in names
+    }
 
 
-def test_a_circle_is_seen() -> None:
+def test_a_cycle_is_found() -> None:
     edges = {"a": {"b"}, "b": {"c"}, "c": {"b"}, "d": {"a"}}
-    assert circle_of(edges)["b"] == {"b", "c"}
-    assert floors(edges) == {"a": 2, "b": 1, "c": 1, "d": 3}
+    assert cycles_of(edges)["b"] == {"b", "c"}
+    assert layers_of(edges) == {"a": 2, "b": 1, "c": 1, "d": 3}
 
 
 def test_a_class_name_means_one_thing() -> None:

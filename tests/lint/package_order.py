@@ -1,10 +1,10 @@
-"""Figures of the house: its size and its order; `python -m tests.lint.package_order` prints both
-and judges the order.
+"""Size and order of the code: `python -m tests.lint.package_order` prints them.
 
-A *room* is a package directly under `membrane_ctrl`, a loose module there, `firmware_iface` or
-`tuning`. A room's
-*floor* is one above the highest floor that it imports from; rooms that import each other in a
-circle share one.
+The exit code is 1 if a limit of the order is exceeded.
+
+A *package* is here a package directly under `membrane_ctrl`, a single module there,
+`firmware_iface` or `tuning`. Its *layer* is one above the highest layer that it imports from;
+packages that import each other in a cycle have the same layer.
 """
 
 from __future__ import annotations
@@ -44,7 +44,7 @@ class Module:
     imports: frozenset[str]
 
     @property
-    def room(self) -> str:
+    def package(self) -> str:
         """Where it lives: `membrane_ctrl/<package or loose module>`,
         `firmware_iface` or `tuning`.
         """
@@ -53,7 +53,7 @@ class Module:
 
 
 @dataclass(frozen=True)
-class HouseFigures:
+class CodeFigures:
     """Size and order of the code."""
 
     modules: int
@@ -61,17 +61,15 @@ class HouseFigures:
     largest_folder: int
     import_percent: float
     loose: int
-    floors: int
-    largest_circle: int
+    layers: int
+    largest_cycle: int
 
 
-# The size has no limit: a module is as large as its concept. The order has: rooms must not import
-# each other in a circle, `docs/explanation/architecture.md` explains nine floors, and a loose
-# module belongs to no room. More than 6 % of the lines as imports means that concepts are spread
-# over too many modules; a concept a
-# module
-# has 5 %.
-ORDER_LIMITS = {"import_percent": 6.0, "loose": 3, "floors": 9, "largest_circle": 1}
+# The size has no limit: a module is as large as its concept. The order has limits: packages must
+# not import each other in a cycle, `docs/explanation/architecture.md` explains nine layers, and a
+# loose module belongs to no package. If imports are more than 6 % of the lines, concepts are spread
+# over too many modules; with one concept a module they are 5 %.
+ORDER_LIMITS = {"import_percent": 6.0, "loose": 3, "layers": 9, "largest_cycle": 1}
 
 
 def import_nodes(tree: ast.AST) -> Iterator[ast.Import | ast.ImportFrom]:
@@ -119,19 +117,19 @@ def modules(root: Path = ROOT) -> dict[str, Module]:
     return found
 
 
-def rooms(found: dict[str, Module]) -> dict[str, set[str]]:
-    """Return the rooms that each room imports from."""
+def imports_between_packages(found: dict[str, Module]) -> dict[str, set[str]]:
+    """Return the packages that each package imports from."""
     edges: dict[str, set[str]] = {
-        module.room: set() for module in found.values() if "__init__" not in module.room
+        module.package: set() for module in found.values() if "__init__" not in module.package
     }
     for module in found.values():
-        targets = {found[name].room for name in module.imports} - {module.room}
-        edges.setdefault(module.room, set()).update(t for t in targets if "__init__" not in t)
+        targets = {found[name].package for name in module.imports} - {module.package}
+        edges.setdefault(module.package, set()).update(t for t in targets if "__init__" not in t)
     return edges
 
 
-def circle_of(edges: dict[str, set[str]]) -> dict[str, frozenset[str]]:
-    """Return each room's circle: the rooms that it reaches and that reach it, itself included."""
+def cycles_of(edges: dict[str, set[str]]) -> dict[str, frozenset[str]]:
+    """Return each package's cycle: itself and the packages that it reaches and that reach it."""
 
     def reached(start: str) -> set[str]:
         seen, todo = set[str](), [start]
@@ -141,47 +139,49 @@ def circle_of(edges: dict[str, set[str]]) -> dict[str, frozenset[str]]:
                 todo.append(target)
         return seen
 
-    reach = {room: reached(room) for room in edges}
+    reach = {package: reached(package) for package in edges}
     return {
-        room: frozenset({room} | {other for other in reach[room] if room in reach[other]})
-        for room in edges
+        package: frozenset(
+            {package} | {other for other in reach[package] if package in reach[other]}
+        )
+        for package in edges
     }
 
 
-def floors(edges: dict[str, set[str]]) -> dict[str, int]:
-    """Return each room's floor, 1 for one that imports nothing."""
-    circles = circle_of(edges)
+def layers_of(edges: dict[str, set[str]]) -> dict[str, int]:
+    """Return each package's layer, 1 for one that imports nothing."""
+    cycles = cycles_of(edges)
 
     @cache
-    def floor(circle: frozenset[str]) -> int:
+    def layer(cycle: frozenset[str]) -> int:
         return 1 + max(
-            (floor(circles[t]) for room in circle for t in edges[room] - circle), default=0
+            (layer(cycles[t]) for package in cycle for t in edges[package] - cycle), default=0
         )
 
-    return {room: floor(circle) for room, circle in circles.items()}
+    return {package: layer(cycle) for package, cycle in cycles.items()}
 
 
-def figures(root: Path = ROOT) -> HouseFigures:
-    """Measure the house."""
+def measure_code(root: Path = ROOT) -> CodeFigures:
+    """Measure size and order of the code."""
     found = modules(root)
-    edges = rooms(found)
+    edges = imports_between_packages(found)
     plain = [module for module in found.values() if module.path.name != "__init__.py"]
     lines = sum(module.lines for module in found.values())
-    return HouseFigures(
+    return CodeFigures(
         modules=len(plain),
         lines=lines,
         import_percent=100 * sum(module.import_lines for module in found.values()) / lines,
         loose=len(list((root / "membrane_ctrl").glob("*.py"))),
         largest_folder=max(Counter(module.path.parent for module in plain).values()),
-        floors=max(floors(edges).values()),
-        largest_circle=max(map(len, circle_of(edges).values())),
+        layers=max(layers_of(edges).values()),
+        largest_cycle=max(map(len, cycles_of(edges).values())),
     )
 
 
 def main() -> int:
     """Print each figure, beside its limit if it has one; return 1 if one is above it."""
     exceeded = False
-    for name, value in vars(figures()).items():
+    for name, value in vars(measure_code()).items():
         line = f"{name.replace('_', ' '):16} {value:10.6g}"
         if name in ORDER_LIMITS:
             limit = ORDER_LIMITS[name]
