@@ -1,5 +1,5 @@
-"""The centre held by everything that sees it, in virtual time on the twin: its true motion, and the
-filter's honesty.
+"""The centre held by its estimate, in virtual time on the twin: true motion, and whether the
+filter's sigma matches its error.
 
 `run()` gives the figures, `python -m benchmarks.control.centre` prints them one by one.
 """

@@ -1,10 +1,7 @@
-"""Days of a mirror held by the estimate of its centre, in virtual time, in which everything happens
-to its sensors.
+"""Days of a mirror held by the estimate of its centre, in virtual time, while its sensors change.
 
-Sensors are lost and come back, the laser is knocked and drifts, its mount and the optics' stand
-move with the day's temperature, the leak changes, the camera tracks, measures in cycles, or is
-switched off. Each change is judged by
-itself: how far the mirror moved, what was told.
+Each change of `tests/studies/centre_week.py` is judged separately: how far the mirror moved, and
+which events were reported.
 
 python -m benchmarks.control.centre_week [--days 1] [--seeds 3]
 """

@@ -1,5 +1,5 @@
-"""The laser's mount drifts 2 µm/min for ten minutes: with the shape loop on rendered full-size
-frames, and without.
+"""A laser mount that drifts 2 µm/min for ten minutes, with and without the shape loop on full-size
+frames.
 
 Virtual time: the same controller, the same camera frames, the same reconstruction, without waiting.
 """

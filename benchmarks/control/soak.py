@@ -1,5 +1,5 @@
-"""Days of simulated hold: weather, a day's temperature, creep, and faults at random; memory must
-stay flat.
+"""Days of simulated hold with weather, daily temperature, creep and random faults; memory must not
+grow.
 
 python -m benchmarks.control.soak [--days 30] [--seed 1]
 """

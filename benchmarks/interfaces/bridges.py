@@ -1,5 +1,5 @@
-"""Doors beside a real `hold --twin`: ticks, memory, and how old the values are while every other
-side restarts.
+"""Bridges beside a real `hold --twin`: ticks, memory, and the age of the values while the other
+parts restart.
 
 python -m benchmarks.interfaces.bridges FOLDER [--minutes 30] [--apart-minutes 10] [--raised]
 

@@ -1,4 +1,4 @@
-"""How soon clients of EPICS have values again after the door was killed and started again.
+"""The time until EPICS clients have values again after the bridge was killed and restarted.
 
 python -m benchmarks.interfaces.epics_return [--restarts 8] [--repeater]
 

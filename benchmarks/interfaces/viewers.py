@@ -1,4 +1,4 @@
-"""A hold with its page, fifty viewers and one that has stopped reading: do its ticks notice?"""
+"""The ticks of a hold whose page has fifty viewers, one of which has stopped reading."""
 
 from __future__ import annotations
 

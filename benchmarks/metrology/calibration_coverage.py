@@ -1,5 +1,5 @@
-"""Do the error bars of `calibrate` hold the truth? Random benches, wrong in everything that the
-budget names.
+"""Coverage of the error bars of `calibrate` on random benches with an error in every input of the
+budget.
 
 As in `benchmarks.metrology.coverage`, whose rays and rooms these are: poses, lens, screen and laser
 drawn from the sigmas that are stated, glass, air, growth, gamma, light, blur, motion, dust, stale

@@ -1,4 +1,5 @@
-"""Do the error bars hold the truth? Random benches, wrong in every input of the budget at once.
+"""Coverage of the error bars of `measure` on random benches with an error in every input of the
+budget.
 
 A bench is drawn from the sigmas that `measure` states; the ray tracer of the twin, which shares no
 code with the metrology, renders two sets minutes apart, and `measure`'s own steps measure them with

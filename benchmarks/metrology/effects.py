@@ -1,4 +1,4 @@
-"""One effect at a time that `measure` is not told of: true error, error bar and verdict.
+"""One effect at a time that `measure` does not know: true error, error bar and verdict.
 
 The benches are those of `benchmarks.metrology.coverage`, rendered by the twin's ray tracer, exact
 but for the one effect; four films each, an eighth of the resolution. Effects of the light and of

@@ -1,5 +1,4 @@
-"""Do tracked figures hold on benches that nobody tuned them to? Random ones, with disturbances and
-planted faults.
+"""Accuracy of tracked figures on random benches with disturbances and planted faults.
 
 The number of a bench gives its geometry, film, camera, pattern, disturbances and timing. The
 pictures are those of a world that shares no code with the product

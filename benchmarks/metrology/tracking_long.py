@@ -1,5 +1,5 @@
-"""Half an hour of tracking with everything that disturbs it, on a clean screen, and with a stand
-that grows.
+"""Half an hour of tracking with all disturbances, with a clean screen, and with a camera mount that
+expands.
 
 The pictures are those of a world that shares no code with the product
 (`tests/worlds/crossed_fringes.py`). Each pixel is the mean of 10 x 10 of the real sensor: 16 bits,

@@ -1,4 +1,4 @@
-"""How often `report --compare` calls alike runs different, and how often it finds a known
+"""How often `report --compare` calls equivalent runs different, and how often it finds a known
 difference.
 
 `python -m benchmarks.records.comparison` prints the tables of docs/measurements/review.md. Series

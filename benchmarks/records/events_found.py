@@ -1,4 +1,4 @@
-"""Events found by machine in simulated nights with known ones."""
+"""Known events of simulated nights that the review finds."""
 
 from __future__ import annotations
 

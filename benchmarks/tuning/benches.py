@@ -1,5 +1,5 @@
-"""Benches drawn at random in the second world: a hold with defaults, a whole session, a hold with
-what it kept.
+"""Random benches of another physics: a hold with the defaults, a whole session, and a hold with its
+result.
 
 The benches share no physics with the twin (`tests/worlds/foreign_plant.py`). The session knows of
 them what a lab knows: the rate, and which sensors there are. `python -m benchmarks.tuning.benches

@@ -1,5 +1,4 @@
-"""Pumps drawn at random in the second world, each surveyed: a curve or a refusal, its error, the
-excursion.
+"""Surveys of random pumps of another physics: curve or refusal, its error, and the excursion.
 
 `python -m benchmarks.tuning.pumps --pumps 40` prints a line for each and the table of
 docs/measurements/tuning.md; 5 s of CPU for each. `--first 28 --pumps 1` looks at one, `--shape root

@@ -1,4 +1,4 @@
-"""The estimate of the centre: against a batch solution of its own code, in a second world, with bad
+"""The estimate of the centre: compared with a batch solution, on a foreign plant, and with faulty
 sensors.
 """
 

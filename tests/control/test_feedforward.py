@@ -1,4 +1,4 @@
-"""Feed-forward: sign, size, and sensors that come and go."""
+"""Feed-forward: sign, size, and intermittent sensors."""
 
 from __future__ import annotations
 

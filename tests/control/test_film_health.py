@@ -1,4 +1,4 @@
-"""Slow deterioration is announced early, once; good days bring no warning."""
+"""Slow deterioration is reported early and once; healthy days give no warning."""
 
 from __future__ import annotations
 

@@ -1,5 +1,5 @@
-"""Laser, gauge and gas: disagreement is reported in a stated time; weather, ramps, drift and
-another film are not.
+"""Disagreement of laser, gauge and gas is reported in a stated time; weather, ramps, drift and
+another film give no report.
 """
 
 from __future__ import annotations

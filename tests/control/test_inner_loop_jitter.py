@@ -1,4 +1,4 @@
-"""Ticks that come early, late or not at all: the loop gets the true time step."""
+"""Early, late and missing ticks: the loop gets the true time step."""
 
 from __future__ import annotations
 

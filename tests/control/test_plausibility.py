@@ -1,6 +1,4 @@
-"""The third sensor finds the wrong one, within a stated time and from a stated size; no false
-accusation.
-"""
+"""The third sensor identifies the faulty one, within a stated time and from a stated size."""
 
 from __future__ import annotations
 

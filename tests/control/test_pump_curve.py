@@ -1,6 +1,4 @@
-"""Command for a flow: the straight line against the twin's pump, measured curves against the second
-world's.
-"""
+"""Command for a flow: the straight line on the twin's pump, measured curves on foreign pumps."""
 
 from __future__ import annotations
 

@@ -1,6 +1,4 @@
-"""The pump's drift, on a bench of its own: a loop, a film and a weather that share no code with the
-product.
-"""
+"""The pump's drift, on a bench whose loop, film and weather share no code with the product."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The shape loop: what it admits, how it moves the trim, and why it does not."""
+"""The shape loop: which shapes it uses, how it moves the trim, and why it is suspended."""
 
 from __future__ import annotations
 

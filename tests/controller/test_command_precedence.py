@@ -1,4 +1,4 @@
-"""Commands that come in one tick: the safest wins, in every order and in every state."""
+"""Commands of one tick: the safest is executed, in every order and in every state."""
 
 from __future__ import annotations
 

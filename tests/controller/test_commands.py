@@ -1,4 +1,4 @@
-"""Why commands are refused, before anything is done."""
+"""Commands are refused with a reason before anything is done."""
 
 from __future__ import annotations
 

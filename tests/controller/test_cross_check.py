@@ -1,6 +1,4 @@
-"""The whole configuration against itself and the board: each dangerous value is named, its sound
-neighbour passes.
-"""
+"""Cross-check of the configuration and the board: dangerous values are named, safe ones pass."""
 
 from __future__ import annotations
 

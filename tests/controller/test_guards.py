@@ -1,4 +1,4 @@
-"""Every guard of the program is itself guarded: its end is a fault of the running hold."""
+"""The end of each guard of the program is a fault of the running hold."""
 
 from __future__ import annotations
 

@@ -1,6 +1,4 @@
-"""Interlocks in the tick: what an open circuit does in each state, and that a replay decides the
-same.
-"""
+"""Interlocks in the tick: the effect of an open circuit in each state, and an identical replay."""
 
 from __future__ import annotations
 

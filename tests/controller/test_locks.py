@@ -1,6 +1,4 @@
-"""Locks in the tick: only `unlock` removes one, and while one is set no command, resume or state
-lets gas in.
-"""
+"""Locks in the tick: only `unlock` removes one; until then nothing admits gas."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What counts as a new reading, and when a jump is believed."""
+"""Which readings count as new, and when a jump is accepted."""
 
 from __future__ import annotations
 

@@ -1,6 +1,4 @@
-"""The checksum of a tick's outputs: what it covers, and what may
-change without another checksum.
-"""
+"""The checksum of a tick's outputs: what it covers and what it leaves out."""
 
 from __future__ import annotations
 

@@ -1,5 +1,5 @@
-"""The protection table is complete, names rules that exist, and no bound rests on the sensor that
-failed.
+"""The protection table is complete, names existing rules, and no bound depends on the failed
+sensor.
 """
 
 from __future__ import annotations

@@ -1,6 +1,4 @@
-"""Protections follow whichever sensor shows the film: one fails in virtual time, and the true
-mirror is judged.
-"""
+"""A sensor fails in virtual time: protections use the others, and the true mirror is judged."""
 
 from __future__ import annotations
 

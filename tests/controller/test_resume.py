@@ -1,5 +1,5 @@
-"""The resume rule: only listed faults, only after the whole wait, only so often a day; never after
-a vent.
+"""The resume rule: listed faults only, after the whole wait, a limited number a day, never after a
+vent.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""A row's values are its own tick's: computed in every state, or absent (NaN), never held."""
+"""The values of a row belong to its own tick: computed in every state, or NaN, never repeated."""
 
 from __future__ import annotations
 

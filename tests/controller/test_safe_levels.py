@@ -1,4 +1,4 @@
-"""The safe levels: their times, and that a cause that comes and goes gains none."""
+"""The safe levels: their times, which an intermittent cause does not extend."""
 
 from __future__ import annotations
 

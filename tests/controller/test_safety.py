@@ -1,6 +1,4 @@
-"""Every row of the safety table: one tick short of its N of M nothing happens, at N the fault
-trips.
-"""
+"""Every row of the safety table: at N - 1 of M ticks it does not trip, at N it does."""
 
 from __future__ import annotations
 

@@ -1,5 +1,5 @@
-"""Snapshots of the controller: a replay that begins with one is identical to the last bit; others
-are refused.
+"""Snapshots of the controller: a replay from one is identical to the last bit; other data is
+refused.
 """
 
 from __future__ import annotations

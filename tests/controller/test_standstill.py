@@ -1,4 +1,4 @@
-"""A pump that is commanded off: seen off, running on, or giving gas that only the mirror shows."""
+"""A pump that is commanded off: read-back off, running on, or inflow that only the mirror shows."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What each state waits for, on the virtual bench at 10 Hz."""
+"""Conditions of each state's transitions, on the virtual bench at 10 Hz."""
 
 from __future__ import annotations
 

@@ -1,5 +1,5 @@
-"""A bench held by its optics alone, and a laser that is knocked while the optics see the film; in
-virtual time.
+"""A bench held by its optics alone, and a displaced laser while the optics measure, in virtual
+time.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""A bench without a vent: what it is said to do, and how long its mirror takes to go down."""
+"""A bench without a vent: its messages, and the time to lower its mirror."""
 
 from __future__ import annotations
 

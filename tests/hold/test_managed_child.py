@@ -1,4 +1,4 @@
-"""A child process is replaced: at once, then after growing pauses, not for ever."""
+"""A child process is replaced at once, then after growing pauses, a limited number of times."""
 
 from __future__ import annotations
 

@@ -1,6 +1,4 @@
-"""A hold with `[web]`: the page is a program beside it, and nothing that becomes of it reaches the
-hold.
-"""
+"""A hold with `[web]`: the page is a separate program whose failures do not reach the hold."""
 
 from __future__ import annotations
 

@@ -1,6 +1,4 @@
-"""The supervisor takes a snapshot of the controller now and then,
-and a replay can begin with it.
-"""
+"""The supervisor takes snapshots of the controller, and a replay can begin with one."""
 
 from __future__ import annotations
 

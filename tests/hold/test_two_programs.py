@@ -1,4 +1,4 @@
-"""A second program on the board of a running hold: what it may do, and how the hold reacts."""
+"""A second program on the board of a running hold: what is permitted, and how the hold reacts."""
 
 from __future__ import annotations
 

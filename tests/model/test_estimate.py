@@ -1,6 +1,4 @@
-"""A shape estimate crosses in plain bytes: exact to the last bit, and nothing else is taken for
-one.
-"""
+"""A shape estimate as bytes: exact to the last bit, and other bytes are refused."""
 
 from __future__ import annotations
 

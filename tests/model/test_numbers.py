@@ -1,6 +1,4 @@
-"""A number has one reading: what Python's `float` accepts beyond
-plain decimal notation is refused.
-"""
+"""Numbers in plain decimal notation; other notations that Python's `float` accepts are refused."""
 
 from __future__ import annotations
 

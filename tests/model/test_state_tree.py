@@ -1,4 +1,4 @@
-"""State trees: exact both ways, and nothing is decoded that is not declared."""
+"""State trees: exact in both directions, and only declared fields are decoded."""
 
 from __future__ import annotations
 

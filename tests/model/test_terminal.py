@@ -1,4 +1,4 @@
-"""No stranger's control byte reaches a terminal, and JSON stays JSON."""
+"""Control bytes of foreign texts do not reach a terminal, and JSON stays JSON."""
 
 from __future__ import annotations
 

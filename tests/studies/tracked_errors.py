@@ -1,5 +1,5 @@
-"""Errors of tracked figures in the second world, against the figure that `measure` gives of the
-reference.
+"""Errors of tracked figures of simulated crossed fringes, against the reference measured by
+`measure`.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""A hold with its page, fifty viewers and one that has stopped reading: do its ticks notice?
+"""The ticks of a hold whose page has fifty viewers, one of which has stopped reading.
 
 Phases without and with viewers alternate in one hold; the page runs in all of them. A viewer speaks
 socket.io as a browser does and fetches the charts and maps that it is told to. `python -m

@@ -1,5 +1,4 @@
-"""Copies of a virtual bench with its controller: tests that begin from the same held mirror compute
-it once.
+"""Copies of a virtual bench with its controller, so that tests share one computed start of a hold.
 
 A copy goes on exactly as the original would, and neither changes the other.
 """

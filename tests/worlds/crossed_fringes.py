@@ -1,4 +1,4 @@
-"""A second world of crossed fringes: rays, film, panel, light and air share no code with the
+"""A simulation of crossed fringes whose rays, film, panel, light and air share no code with the
 product.
 
 Film: a height function of its own, moving with time; rays by fixed-point steps, normals by

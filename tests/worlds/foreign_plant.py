@@ -1,4 +1,4 @@
-"""A second world: a bench whose physics share no code and no assumption with `membrane_ctrl.sim`.
+"""A bench whose physics share no code and no assumption with `membrane_ctrl.sim`.
 
 Film: tension and stretch, p = a w + b w^3. Gas: ideal, isothermal, its volume proportional to the
 sag, solved by Newton's method. Leak: an orifice, its flow proportional to the root of the pressure.

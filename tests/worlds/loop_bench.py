@@ -1,5 +1,5 @@
-"""The virtual bench as the supervisor's: whoever asks it something finds it at the event loop's
-time.
+"""The virtual bench as the bench of a supervisor: it advances to the event loop's time when it is
+read.
 """
 
 import asyncio

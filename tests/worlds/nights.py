@@ -1,5 +1,4 @@
-"""Simulated nights with known events, far faster than the twin: for judging the review, not the
-control.
+"""Simulated nights with known events, much faster than the twin, for tests of the review.
 
 The film as an integrator of pump flow, leak, air pressure and gas temperature with the numbers of
 docs/explanation/physics.md and of the twin's scenarios; a 10 Hz PI loop with filter, feed-forward,

@@ -1,4 +1,4 @@
-"""Shape estimates of a bowl at rest, with numbers that use all their bits."""
+"""Shape estimates of a bowl at rest, with numbers that use all bits of a double."""
 
 from __future__ import annotations
 

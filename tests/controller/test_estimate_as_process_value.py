@@ -1,4 +1,4 @@
-"""The mirror held by the estimate of its centre, in virtual time: sensors come and go."""
+"""A mirror held by the estimate of its centre, in virtual time, with intermittent sensors."""
 
 from __future__ import annotations
 
