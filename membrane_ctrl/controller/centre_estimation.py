@@ -53,9 +53,9 @@ class CentreEstimationState(StateNode):
     slowly_agreed_mount: LowPass = field(default_factory=LowPass)
     mount_drift: MountDriftState = field(default_factory=MountDriftState)
     stand: camera_mount.StandGrowthState = field(default_factory=camera_mount.StandGrowthState)
-    stand_told: bool = False
-    told: tuple[int, ...] | None = None  # the sensors, as reported
-    news_s: float = math.nan
+    mount_growth_reported: bool = False
+    reported_sensors: tuple[int, ...] | None = None  # the sensors, as reported
+    sensors_changed_s: float = math.nan
     estimate: CentreEstimate | None = None
     blind_since_s: float = math.nan  # the estimate follows neither laser nor optics since then
     blind: bool = False  # it has done so for too long
@@ -86,11 +86,11 @@ class CentreEstimation:
         return self.memory.estimate
 
     @property
-    def optics_hold(self) -> bool:
+    def held_by_optics(self) -> bool:
         """Whether the mirror is held without a laser: the optics see it."""
         if self.memory.estimate is None or self._filter is None:
             return False
-        return self._filter.frames >= LOCK_FRAMES and self._sees(Sensor.OPTICS)
+        return self._filter.frames >= LOCK_FRAMES and self._follows(Sensor.OPTICS)
 
     @property
     def blind(self) -> bool:
@@ -123,16 +123,16 @@ class CentreEstimation:
         flow_um_per_s, seen_um = last.flow_um_per_s, context.observer.displacement_um
         figures = context.observer.figures
         if not self._wanted or state not in safety.ESTIMATED or not math.isfinite(flow_um_per_s):
-            self._stop()
+            self._stop_estimate()
             if self._by_optics and state not in safety.MOVING:
                 self._mount_drift.start(0.0)  # a resumed hold judges the optics by itself
             return []
-        laser_um = math.nan if consistency.laser_lies else context.observer.moving_laser_um
+        laser_um = math.nan if consistency.laser_fault_text else context.observer.moving_laser_um
         if self._filter is None:
             start_um = last.filtered_um if math.isfinite(last.filtered_um) else seen_um
             if not math.isfinite(start_um):
                 return []
-            self._filter = self._start(start_um, context)
+            self._filter = self._start_estimate(start_um, context)
         if self._is_anchor(inputs.estimate):
             # another anchor shows the same film up to a micrometre higher or lower
             self._filter.relock()
@@ -157,39 +157,42 @@ class CentreEstimation:
             sag_um=figure.sag_um - self._stand.um if figure else math.nan,
             sag_sigma_um=figure.sag_sigma_um if figure else math.nan,
             sag_time_s=figure.time_s if figure else math.nan,
-            judged=consistency.judges,
+            judged=consistency.compares_sensors,
         )
         self.memory.estimate = estimate = self._filter.step(readings, context.dt_s)
         self._note_blindness(inputs.now_s)
         context.trim_um = estimate.mount_um
-        news = [*self._news(inputs.now_s, estimate.jumped), *self._told_of_stand()]
+        news = [
+            *self._report_sensors_in_use(inputs.now_s, estimate.jumped),
+            *self._report_mount_growth(),
+        ]
         news += self._mount_drift.step(
             estimate.mount_um, estimate.jumped_sensors, inputs.now_s, context.dt_s
         )
-        if self._sees(Sensor.OPTICS):
+        if self._follows(Sensor.OPTICS):
             sigma_um = math.hypot(estimate.sigma_um, self._stand.sigma_um)
             self.memory.estimate = replace(estimate, sigma_um=sigma_um)
         return news
 
-    def _stop(self) -> None:
+    def _stop_estimate(self) -> None:
         self._filter = None
         self.memory.centre = None
         self.memory.estimate = None
-        self.memory.told = None
+        self.memory.reported_sensors = None
         self.memory.blind_since_s = math.nan
         self.memory.blind = False
 
     def _note_blindness(self, now_s: float) -> None:
         """Note since when neither laser nor optics correct the estimate."""
         memory = self.memory
-        if self._sees(Sensor.LASER) or self._sees(Sensor.OPTICS):
+        if self._follows(Sensor.LASER) or self._follows(Sensor.OPTICS):
             memory.blind_since_s = math.nan
         elif math.isnan(memory.blind_since_s):
             memory.blind_since_s = now_s
         # false while `blind_since_s` is NaN
         memory.blind = now_s - memory.blind_since_s > _BLIND_S
 
-    def _start(self, start_um: float, context: TickContext) -> CentreFilter:
+    def _start_estimate(self, start_um: float, context: TickContext) -> CentreFilter:
         """Begin an estimate at a displacement."""
         memory = self.memory
         memory.centre = CentreState()
@@ -245,27 +248,27 @@ class CentreEstimation:
             centre.relock()
             self._mount_drift.start(memory.estimate.mount_um if memory.estimate else 0.0)
         memory.locking = off
-        if consistency.agree and memory.estimate is not None:
+        if consistency.sensors_agree and memory.estimate is not None:
             memory.agreed_mount.update(memory.estimate.mount_um, dt_s, REFERENCE_S)
             memory.slowly_agreed_mount.update(memory.estimate.mount_um, dt_s, SLOW_REFERENCE_S)
-        elif consistency.camera_lies and centre.frames and not self._by_optics:
+        elif consistency.camera_fault_text and centre.frames and not self._by_optics:
             agreed = (
                 memory.slowly_agreed_mount if consistency.camera_drifts else memory.agreed_mount
             )
             centre.blame_optics(agreed.value)
-        unusable = off or bool(consistency.camera_lies) or self._mount_drift.beyond_limit
+        unusable = off or bool(consistency.camera_fault_text) or self._mount_drift.beyond_limit
         return None if unusable else figure
 
-    def _told_of_stand(self) -> list[Event]:
+    def _report_mount_growth(self) -> list[Event]:
         """Report once that the optics may be off by the growth of their stand, and once that a new
         lock ended it.
         """
         sigma_um, warmed_k = self._stand.sigma_um, self._stand.warmed_k
         memory = self.memory
-        far = sigma_um > self._stand_most_um / (2 if memory.stand_told else 1)
-        if far == memory.stand_told:
+        far = sigma_um > self._stand_most_um / (2 if memory.mount_growth_reported else 1)
+        if far == memory.mount_growth_reported:
             return []
-        memory.stand_told = far
+        memory.mount_growth_reported = far
         stands = f"the optics' stand is {warmed_k:+.1f} K from the reference"
         if not far:
             return [MaintenanceOver("stand_growth", stands)]
@@ -278,21 +281,24 @@ class CentreEstimation:
             )
         ]
 
-    def _sees(self, sensor: Sensor) -> bool:
+    def _follows(self, sensor: Sensor) -> bool:
         estimate = self.memory.estimate
         return estimate is not None and estimate.sensors[sensor].fresh
 
-    def _news(self, now_s: float, jumped: Collection[str]) -> list[Event]:
+    def _report_sensors_in_use(self, now_s: float, jumped: Collection[str]) -> list[Event]:
         """Report the sensors once they have stood for a second, and every jump."""
-        seeing = tuple(int(sensor) for sensor in Sensor if self._sees(sensor))
+        seeing = tuple(int(sensor) for sensor in Sensor if self._follows(sensor))
         memory = self.memory
-        if seeing == memory.told:
-            memory.news_s = math.nan
-        elif math.isnan(memory.news_s):
-            memory.news_s = now_s
-        stands = not math.isnan(memory.news_s) and now_s - memory.news_s >= _STANDS_S
+        if seeing == memory.reported_sensors:
+            memory.sensors_changed_s = math.nan
+        elif math.isnan(memory.sensors_changed_s):
+            memory.sensors_changed_s = now_s
+        stands = (
+            not math.isnan(memory.sensors_changed_s)
+            and now_s - memory.sensors_changed_s >= _STANDS_S
+        )
         if not stands and not jumped:
             return []
-        memory.told = seeing
-        memory.news_s = math.nan
+        memory.reported_sensors = seeing
+        memory.sensors_changed_s = math.nan
         return [HeldBy(tuple(Sensor(n).name.lower() for n in seeing), tuple(jumped))]

@@ -72,7 +72,7 @@ class Controller:
         in_force = self._in_force
         self._safety = safety.SafetyTable(config.limits, memory=memory.safety)
         self._shape = shape_loop.ShapeLoop(config.shape, sag_sensitivity, memory.shape)
-        self._shape.set_memory(self._gains.in_force.shape_time_constant_s)
+        self._shape.set_memory(self._gains.present.shape_time_constant_s)
         self._context = TickContext(
             config=config,
             loop_config=in_force.loop,
@@ -121,7 +121,7 @@ class Controller:
 
     @property
     def _in_force(self) -> Config:
-        gains = self._gains.in_force
+        gains = self._gains.present
         return self._config.model_copy(update={"loop": gains.loop, "pump": gains.pump})
 
     def tick(self, inputs: TickInputs) -> TickOutputs:
@@ -130,36 +130,38 @@ class Controller:
         """
         context = self._context
         events: list[told.Event] = []
-        self._begin(inputs, events)
+        self._begin_tick(inputs, events)
         last = context.output or inner_loop.NO_OUTPUT
         judged = (
             self.state in safety.MOVING and not context.paused
         )  # nothing follows a setpoint in a pause
         error_um = last.error_um if judged else math.nan
-        context.observer.look(inputs, self._may_follow_optics())
+        context.observer.observe_inputs(inputs, self._may_follow_optics())
         consistency = self._consistency
-        events += consistency.ask(
+        events += consistency.compare_sensors(
             inputs,
             self.state,
             context.dt_s,
             hold_status.hold_status(
-                context, last, self._holders.optics_hold, self._may_follow_optics()
+                context, last, self._holders.held_by_optics, self._may_follow_optics()
             ),
         )
         stand = context.standstill
-        stand.look(inputs.now_s, inputs.reading, context.observer.commanded, inputs.link_up)
+        stand.observe_reading(
+            inputs.now_s, inputs.reading, context.observer.commanded, inputs.link_up
+        )
         observation = replace(
-            context.observer.observe(inputs, error_um),
+            context.observer.make_observation(inputs, error_um),
             tick_error=self.memory.tick_error,
             overdue=context.overdue,
             unfit=context.unfit,
-            laser_lies=consistency.laser_lies,
+            laser_fault_text=consistency.laser_fault_text,
             runs_on=stand.runs_on,
             inflow=stand.inflow,
             locked=describe_locks(context.locks, _LOCKS_SHOWN),
             laser_gauge_apart=consistency.laser_gauge_apart,
             gas_excess=consistency.gas_excess,
-            optics_hold=self._holders.optics_hold or context.observer.optics_replace_laser,
+            held_by_optics=self._holders.held_by_optics or context.observer.optics_replace_laser,
             displacement_valid=self._displacement_suffices(),
             unseen_film=self._explain_unseen_film(),
             open_interlocks=context.interlocks.judged_mask,
@@ -167,24 +169,24 @@ class Controller:
             interlock_words=context.interlocks.describe_open(context.interlocks.judged_mask),
         )
         verdict = self._safety.judge(self.state, observation)
-        self._apply(verdict, events)
+        self._apply_verdict(verdict, events)
         self._consider_resuming(observation)
         shape = self._step_shape(inputs, events)
         events += self._holders.step(inputs, self.state, context, last, shape.state, consistency)
         if (estimate := self._holders.estimate) is not None:
             shape = replace(shape, trim_um=estimate.mount_um)
-        context.laser_doubted = bool(consistency.laser_lies)
+        context.laser_doubted = bool(consistency.laser_fault_text)
         context.estimate = estimate if self.state in (State.SETTLE, State.HOLD) else None
         if math.isnan(self.memory.state_since_s):  # the verdict has just changed the state
             self.memory.state_since_s = inputs.now_s
             context.state_age_s = 0.0
-        self._act(events)
+        self._run_state(events)
         if context.loop.learned and self.state == State.HOLD:
-            events += self._consistency.told_of_pump(context.loop)
+            events += self._consistency.report_pump_curve(context.loop)
         command = BenchCommand(context.pump_fraction, context.vent_fraction)
-        context.observer.wrote(command)
+        context.observer.note_command(command)
         context.last_pump_fraction = context.pump_fraction
-        self._tell_why(events)
+        self._report_reason(events)
         fault = self.fault.code if self.fault else 0
         return TickOutputs(
             command=command,
@@ -205,7 +207,7 @@ class Controller:
             return not self._holders.optics_left_out
         return (
             self._shape.on
-            and not self._consistency.camera_lies
+            and not self._consistency.camera_fault_text
             and not self._holders.optics_left_out
         )
 
@@ -218,12 +220,12 @@ class Controller:
         """
         context, observer = self._context, self._context.observer
         if self.state == State.TUNE and not self._config.by_optics:
-            return math.isfinite(observer.laser_um) or self._holders.optics_hold
+            return math.isfinite(observer.laser_um) or self._holders.held_by_optics
         if self.state == State.MANUAL or context.paused:
             return math.isfinite(observer.guard_um)
         if self._holders.blind:
             return False
-        estimated = self.state in (State.SETTLE, State.HOLD) and self._holders.optics_hold
+        estimated = self.state in (State.SETTLE, State.HOLD) and self._holders.held_by_optics
         return math.isfinite(observer.displacement_um) or estimated
 
     def _explain_unseen_film(self) -> str:
@@ -236,7 +238,7 @@ class Controller:
             return "the figures do not fit the estimate"
         return self._context.observer.figures.explain_unseen().text
 
-    def _begin(self, inputs: TickInputs, events: list[told.Event]) -> None:
+    def _begin_tick(self, inputs: TickInputs, events: list[told.Event]) -> None:
         context = self._context
         self.memory.ticks += 1
         nominal_s = 1.0 / self._config.loop.rate_hz
@@ -247,17 +249,17 @@ class Controller:
         if math.isnan(self.memory.state_since_s):  # the state's first tick
             self.memory.state_since_s = inputs.now_s
         context.state_age_s = inputs.now_s - self.memory.state_since_s
-        events += context.interlocks.look(inputs.reading, self.state)
+        events += context.interlocks.observe_reading(inputs.reading, self.state)
         self._answers, self._clear_mask = [], 0
         obeyed: set[str] = set()
         for command in commands.sort_commands(inputs.commands):
-            if self._obey(command, obeyed, events):
+            if self._take_command(command, obeyed, events):
                 obeyed.add(command.kind)
-        if self._gains.overdue(context.now_s):
+        if self._gains.is_overdue(context.now_s):
             self._revert_gains("nobody kept them in time", events)
         context.loop.may_probe = not self._gains.on_trial
 
-    def _obey(
+    def _take_command(
         self, command: commands.Command, obeyed: Collection[str], events: list[told.Event]
     ) -> bool:
         """Execute or refuse a command; either way, record its sender and reason."""
@@ -265,15 +267,15 @@ class Controller:
             commands.explain_overruled(command, obeyed)
             or locks.refuse_while_locked(command, self._context.locks)
             or commands.explain_refusal(command, self.state, self._in_force)
-            or self._prepare(command)
+            or self._prepare_experiment(command)
         )
         self._answers.append((command.number, refused))
         events.append(commands.make_command_event(command, refused))
         if not refused:
-            self._do(command, events)
+            self._execute_command(command, events)
         return not refused
 
-    def _do(self, command: commands.Command, events: list[told.Event]) -> None:
+    def _execute_command(self, command: commands.Command, events: list[told.Event]) -> None:
         context = self._context
         match command.kind:
             case "setpoint" if math.isfinite(self.memory.setpoint_back_um):  # it stays
@@ -321,7 +323,7 @@ class Controller:
         )
         events.append(event)
 
-    def _prepare(self, command: commands.Command) -> str:
+    def _prepare_experiment(self, command: commands.Command) -> str:
         """Prepare the experiment of a `tune`; returns why the command is refused,
         or an empty text.
         """
@@ -354,14 +356,14 @@ class Controller:
         return ""
 
     def _set_gains(self, loop: LoopConfig) -> None:
-        context, pump = self._context, self._gains.in_force.pump
+        context, pump = self._context, self._gains.present.pump
         if pump != context.pump_config:
             context.loop.set_pump(pump)
         context.loop_config, context.pump_config = loop, pump
         context.loop.set_gains(loop)
         self._holders.set_gains(loop)
         self._consistency.set_gains(loop, pump)
-        self._shape.set_memory(self._gains.in_force.shape_time_constant_s)
+        self._shape.set_memory(self._gains.present.shape_time_constant_s)
         self._step_setpoint()
 
     def _step_setpoint(self) -> None:
@@ -383,7 +385,7 @@ class Controller:
 
     def _revert_gains(self, why: str, events: list[told.Event]) -> None:
         self._gains.revert()
-        self._set_gains(self._gains.in_force.loop)
+        self._set_gains(self._gains.present.loop)
         events.append(told.GainsReverted(why))
 
     def _consider_resuming(self, observation: safety.Observation) -> None:
@@ -393,11 +395,11 @@ class Controller:
             resume.forget()
             context.may_resume = context.resume_possible = False
             return
-        context.may_resume = resume.due(self.fault, context.levels, observation, context.now_s)
+        context.may_resume = resume.is_due(self.fault, context.levels, observation, context.now_s)
         context.resume_possible = resume.possible
         self._clear_mask |= resume.clear_mask
 
-    def _apply(self, verdict: safety.Verdict, events: list[told.Event]) -> None:
+    def _apply_verdict(self, verdict: safety.Verdict, events: list[told.Event]) -> None:
         """Enter the safe level of the verdict; every level below HOLD_FLOW latches the fault."""
         context, levels = self._context, self._context.levels
         rule = verdict.rule
@@ -412,7 +414,7 @@ class Controller:
             events.append(rule.fault(verdict.seen, verdict.safe_level))
         levels.enter(verdict.safe_level, context.now_s)
         if levels.step(context.now_s) > SafeLevel.HOLD_FLOW and self.state != State.FAULT:
-            self._go(State.FAULT, f"{self.fault.name}: {self.fault.cause}", events)
+            self._enter_state(State.FAULT, f"{self.fault.name}: {self.fault.cause}", events)
 
     def _step_shape(self, inputs: TickInputs, events: list[told.Event]) -> shape_loop.ShapeOutput:
         context = self._context
@@ -443,7 +445,7 @@ class Controller:
             )
         return shape
 
-    def _act(self, events: list[told.Event]) -> None:
+    def _run_state(self, events: list[told.Event]) -> None:
         """Run the state's handler; everything is off unless it sets it."""
         context = self._context
         context.output, context.pump_fraction, context.vent_fraction = None, 0.0, 0.0
@@ -464,13 +466,13 @@ class Controller:
                 )
                 context.pump_fraction, context.vent_fraction = 0.0, 0.0
         if wanted != self.state:
-            self._go(wanted, context.why.text, events)
+            self._enter_state(wanted, context.why.text, events)
 
-    def _go(self, state: State, why: str, events: list[told.Event]) -> None:
+    def _enter_state(self, state: State, why: str, events: list[told.Event]) -> None:
         context = self._context
         events.append(told.StateEntered(state.name.lower(), self.state.name.lower(), why))
         if self.state == State.TUNE:
-            self._tell_trial(why, events)
+            self._report_experiment(why, events)
         if state != State.TUNE:
             context.end_trial()
         if state == State.FAULT and self._gains.on_trial:
@@ -494,7 +496,7 @@ class Controller:
         context.overdue = context.unfit = ""
         context.test_memory = None
 
-    def _tell_trial(self, why: str, events: list[told.Event]) -> None:
+    def _report_experiment(self, why: str, events: list[told.Event]) -> None:
         """Report how the experiment ended: by itself, or because the state changed."""
         experiment = self._context.trial
         assert experiment is not None
@@ -505,7 +507,7 @@ class Controller:
             )
         )
 
-    def _tell_why(self, events: list[told.Event]) -> None:
+    def _report_reason(self, events: list[told.Event]) -> None:
         """Report the operator's line once its reason (not its numbers) has changed durably."""
         context, memory = self._context, self.memory
         code = context.why.code

@@ -82,7 +82,7 @@ class FigureGate:
         This tick's figure, if it can be used.
     sag_um : float
         Sag by the newest figure; NaN if that is older than range and limits may be judged by.
-    unseen : FilmUnseen or None
+    unseen_reason : FilmUnseen or None
         Why there is no displacement for the loop; None if there is one.
     """
 
@@ -102,7 +102,7 @@ class FigureGate:
         self._step_max_um = config.limits.step_max_um
         self.accepted: ShapeEstimate | None = None
 
-    def take(self, now_s: float, figure: ShapeEstimate | None, laser_um: float) -> None:
+    def judge_figure(self, now_s: float, figure: ShapeEstimate | None, laser_um: float) -> None:
         """Judge this tick's figure, if there is one; `laser_um` is NaN without a good reading."""
         self.memory.now_s = now_s
         self.accepted = None
@@ -134,8 +134,8 @@ class FigureGate:
         if not figure.time_s <= now_s or figure.time_s <= self.memory.newest_s:
             return FigureDefect.TIME
         if now_s - self.memory.newest_s > _GUARD_AGE_S and math.isfinite(laser_um):
-            self.memory.jumps.forget()  # the film may have moved meanwhile; the laser judges
-        if self.memory.jumps.refuse(figure.sag_um, self._step_max_um):
+            self.memory.jumps.reset()  # the film may have moved meanwhile; the laser judges
+        if self.memory.jumps.is_jump(figure.sag_um, self._step_max_um):
             self.memory.defect_detail = f"by {figure.sag_um - self.memory.newest_sag_um:+.0f} µm"
             return FigureDefect.JUMP
         return None
@@ -197,7 +197,7 @@ class FigureGate:
         return self.guard_um if self.newest_age_s <= self._loop_age_s else math.nan
 
     @property
-    def unseen(self) -> FilmUnseen | None:
+    def unseen_reason(self) -> FilmUnseen | None:
         """Why `loop_um` is NaN; None if it is not."""
         if math.isfinite(self.loop_um):
             return None
@@ -213,7 +213,7 @@ class FigureGate:
 
     def explain_unseen(self) -> Reason:
         """Why `loop_um` is NaN; `NO_REASON` if it is not."""
-        unseen, defect = self.unseen, self.memory.defect
+        unseen, defect = self.unseen_reason, self.memory.defect
         if unseen is None:
             return NO_REASON
         defect_name = "" if defect is None else defect.name.lower()

@@ -60,7 +60,7 @@ class GainsTrial:
             self.keep()
 
     @property
-    def in_force(self) -> GainsInForce:
+    def present(self) -> GainsInForce:
         """The present settings."""
         return self.memory.tried
 
@@ -76,7 +76,7 @@ class GainsTrial:
         self.memory.good = self.memory.tried
         self._end()
 
-    def overdue(self, now_s: float) -> bool:
+    def is_overdue(self, now_s: float) -> bool:
         """The trial has ended without `keep`."""
         return now_s >= self.memory.until_s
 

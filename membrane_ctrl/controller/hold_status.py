@@ -27,7 +27,7 @@ class HoldStatus:
     flow_um_per_s: float  # of the pump; NaN without
     bleed_fraction: float  # of the vent, held open on purpose
     # they see the centre, and its estimate is held: a laser that moved is known
-    optics_hold: bool = False
+    held_by_optics: bool = False
     sag_um: float = math.nan  # by the newest figure; NaN without a usable one
     optics_usable: bool = True  # the estimate, or the shape loop, uses the figures
     figure: ShapeEstimate | None = None  # that arrived in this tick and may be used
@@ -48,7 +48,7 @@ def hold_status(
         leak_um_per_s=last.leak_um_per_s,
         flow_um_per_s=last.flow_um_per_s,
         bleed_fraction=context.loop_config.bleed_fraction,
-        optics_hold=optics_hold,
+        held_by_optics=optics_hold,
         sag_um=context.observer.figures.sag_um,
         figure=context.observer.figures.accepted,
         optics_usable=optics_usable,

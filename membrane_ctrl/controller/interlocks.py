@@ -56,7 +56,7 @@ class Interlocks:
         """Those that were open in the last reading, which may be of an earlier tick."""
         return self.memory.last_mask
 
-    def look(self, reading: BenchReading | None, state: State) -> list[Event]:
+    def observe_reading(self, reading: BenchReading | None, state: State) -> list[Event]:
         """Take the reading of a tick in a state; returns the events of circuits that have opened or
         closed.
         """

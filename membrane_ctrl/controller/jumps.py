@@ -18,7 +18,7 @@ class JumpGate(StateNode):
     good: float = math.nan
     count: Count = 0  # refused in a row
 
-    def refuse(self, value: float, step_max: float) -> bool:
+    def is_jump(self, value: float, step_max: float) -> bool:
         """Whether a value is a jump; NaN is not.
 
         Parameters
@@ -36,6 +36,6 @@ class JumpGate(StateNode):
         self.good = value
         return False
 
-    def forget(self) -> None:
+    def reset(self) -> None:
         """Accept the next value, wherever it is."""
         self.good = math.nan

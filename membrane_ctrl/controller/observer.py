@@ -88,7 +88,7 @@ class Observer:
         self.optics_guard_um = math.nan
         self.optics_replace_laser = False
 
-    def wrote(self, command: BenchCommand) -> None:
+    def note_command(self, command: BenchCommand) -> None:
         """Note the tick's command for comparison with the next read-backs."""
         self.memory.commanded = (command.pump_fraction, self.memory.commanded[0])
 
@@ -97,7 +97,7 @@ class Observer:
         """The last two pump commands, newest first."""
         return self.memory.commanded
 
-    def look(self, inputs: tick.TickInputs, may_follow_optics: bool = True) -> None:
+    def observe_inputs(self, inputs: tick.TickInputs, may_follow_optics: bool = True) -> None:
         """Take the tick's reading and find what is new or a jump.
 
         `may_follow_optics`: the estimate uses the figures; otherwise they replace no laser.
@@ -120,7 +120,7 @@ class Observer:
         self.laser_um = self._gate(reading, fresh=memory.last_advance_s == now_s and uses_laser)
         same_s = memory.laser_repeats.same_s(self.laser_um, now_s)
         self._laser_same_s = same_s if math.isfinite(self.laser_um) else 0.0
-        self.figures.take(now_s, inputs.estimate, self.moving_laser_um)
+        self.figures.judge_figure(now_s, inputs.estimate, self.moving_laser_um)
         self.displacement_um = self.guard_um = self.laser_um
         self.optics_replace_laser = False
         may_follow = self._follows_optics and may_follow_optics
@@ -129,7 +129,7 @@ class Observer:
             self._replace_laser_by_optics()
         gauge_pa = reading.gauge_pressure_pa if reading else math.nan
         self.gauge_pressure_pa = (
-            math.nan if memory.gauge_jumps.refuse(gauge_pa, self._gauge_step_max_pa) else gauge_pa
+            math.nan if memory.gauge_jumps.is_jump(gauge_pa, self._gauge_step_max_pa) else gauge_pa
         )
 
     def _replace_laser_by_optics(self) -> None:
@@ -150,7 +150,7 @@ class Observer:
         return math.nan if self.laser_stuck else self.laser_um
 
     @property
-    def unseen(self) -> Reason:
+    def missing_reason(self) -> Reason:
         """Why there is no displacement in this tick; `NO_REASON` if there is one."""
         if math.isfinite(self.displacement_um):
             return NO_REASON
@@ -166,9 +166,9 @@ class Observer:
         """
         return self.figures.waited_s if self._by_optics else 0.0
 
-    def observe(self, inputs: tick.TickInputs, error_um: float) -> safety.Observation:
-        """Return what the inputs show, after `look`; the control code fills in what it knows
-        itself.
+    def make_observation(self, inputs: tick.TickInputs, error_um: float) -> safety.Observation:
+        """Return what the inputs show, after `observe_inputs`; the control code fills in what it
+        knows itself.
         """
         reading, now_s = self.reading, inputs.now_s
         gauge_pa = reading.gauge_pressure_pa if reading else math.nan
@@ -203,7 +203,7 @@ class Observer:
         if (
             not fresh
             or not math.isfinite(value_um)
-            or self.memory.laser_jumps.refuse(value_um, self._step_max_um)
+            or self.memory.laser_jumps.is_jump(value_um, self._step_max_um)
         ):
             return math.nan
         return value_um

@@ -48,7 +48,9 @@ class ResumeRule:
         self.possible = False
         self.clear_mask = 0
 
-    def due(self, fault: Rule, levels: SafeLevels, observation: Observation, now_s: float) -> bool:
+    def is_due(
+        self, fault: Rule, levels: SafeLevels, observation: Observation, now_s: float
+    ) -> bool:
         """Observe a tick of a fault; True once its cause has been absent for long enough.
 
         Sets `possible` (the fault may still clear automatically) and `clear_mask` (the board's

@@ -66,7 +66,7 @@ class Observation:
     overdue: str = ""  # what the present state has waited for too long, if anything
     unfit: str = ""  # what the actuator test found, if anything
     same_s: float = 0.0  # how long the valid readings have been bit-identical
-    laser_lies: str = ""  # readings of laser, gauge and camera, if the laser is wrong
+    laser_fault_text: str = ""  # readings of laser, gauge and camera, if the laser is wrong
     runs_on: str = ""  # the read-back of a pump that should have stopped
     inflow: str = ""  # how the mirror rises although the pump is commanded off
     locked: str = ""  # the locks that people have set, in words
@@ -75,7 +75,7 @@ class Observation:
     gauge_jumps: int = 0  # consecutive readings that no film can cause
     # readings of laser (or optics) and gauge, if they contradict each other
     laser_gauge_apart: str = ""
-    optics_hold: bool = False  # the optics show the centre, or must: the laser may be missing
+    held_by_optics: bool = False  # the optics show the centre, or must: the laser may be missing
     unseen_film: str = ""  # on a bench held without a laser: why the film is not seen, if so
     guard_um: float = (
         math.nan
@@ -133,12 +133,12 @@ class Rule:
     deepens: Callable[[Observation], SafeLevel] = lambda o: SafeLevel.NONE
     enters: str = ""  # empty: always `safe_level`
 
-    def level_of(self, observation: Observation) -> SafeLevel:
+    def find_safe_level(self, observation: Observation) -> SafeLevel:
         """The safe level that the rule enters if it trips on this observation."""
         return max(self.safe_level, self.deepens(observation))
 
     @property
-    def needed(self) -> int:
+    def needed_ticks(self) -> int:
         """Ticks of the window that must show the cause."""
         return self.seen_in[0]
 
@@ -363,8 +363,8 @@ TABLE: tuple[Rule, ...] = (
         states=ESTIMATED,
         remedy="look for a knocked laser mount; then take a new reference with `ctl shape off` and "
         "`ctl shape on`",
-        seen=lambda o: o.laser_lies,
-        broken=lambda o, c: bool(o.laser_lies) and not o.optics_hold,
+        seen=lambda o: o.laser_fault_text,
+        broken=lambda o, c: bool(o.laser_fault_text) and not o.held_by_optics,
     ),
     Rule(
         code=18,
@@ -422,7 +422,7 @@ TABLE: tuple[Rule, ...] = (
         safe_level=SafeLevel.HOLD_FLOW,
         remedy="restart the sensor; with coarse steps and a calm mirror raise limits.stuck_s",
         seen=lambda o: f"{o.same_s:.1f} s",
-        broken=lambda o, c: o.displacement_valid and o.same_s > c.stuck_s and not o.optics_hold,
+        broken=lambda o, c: o.displacement_valid and o.same_s > c.stuck_s and not o.held_by_optics,
     ),
     Rule(
         code=13,
@@ -433,7 +433,7 @@ TABLE: tuple[Rule, ...] = (
         seen_in=(5, 10),
         may_resume=True,
         remedy="look for something in the beam or a bumped laser",
-        broken=lambda o, c: o.jumps > 0 and not o.optics_hold,
+        broken=lambda o, c: o.jumps > 0 and not o.held_by_optics,
     ),
     Rule(
         code=10,
@@ -575,7 +575,7 @@ class SafetyTable:
             history = ((histories.pop(rule.code, 0) << 1) | broken) & ((1 << rule.window) - 1)
             if history:
                 histories[rule.code] = history
-            safe_level = rule.level_of(observation)
-            if history.bit_count() >= rule.needed and safe_level > deepest:
+            safe_level = rule.find_safe_level(observation)
+            if history.bit_count() >= rule.needed_ticks and safe_level > deepest:
                 tripped, deepest = rule, safe_level
         return Verdict(tripped, tripped.seen(observation) if tripped else "", deepest)

@@ -86,13 +86,13 @@ class SensorConsistencyState(StateNode):
     camera_s: float = -math.inf  # the newest figure
     sag_um: float = math.nan  # by it
     repeats: Count = 0  # of the same sag, to the last bit
-    liar: Liar = Liar.NOBODY
-    lies_s: float = 0.0
+    faulty_sensor: Liar = Liar.NOBODY
+    laser_fault_s: float = 0.0
     laser_verdicts: RecentCount = field(default_factory=RecentCount)
     weather_s: float = 0.0
-    weather_told: bool = False
-    laser_lies: str = ""
-    camera_lies: str = ""
+    weather_fault_reported: bool = False
+    laser_fault_text: str = ""
+    camera_fault_text: str = ""
     laser_gauge_apart: str = ""
     gas_excess: str = ""
 
@@ -139,9 +139,9 @@ class SensorConsistency:
         self.laser_moved = False
 
     @property
-    def laser_lies(self) -> str:
+    def laser_fault_text(self) -> str:
         """As in `Observation`."""
-        return self.memory.laser_lies
+        return self.memory.laser_fault_text
 
     @property
     def laser_gauge_apart(self) -> str:
@@ -154,21 +154,23 @@ class SensorConsistency:
         return self.memory.gas_excess
 
     @property
-    def camera_lies(self) -> str:
+    def camera_fault_text(self) -> str:
         """Readings of laser, gauge and camera, if the camera is wrong."""
-        return self.memory.camera_lies
+        return self.memory.camera_fault_text
 
     @property
     def camera_distrust(self) -> Reason:
         """Why the shape loop must not follow the camera; `NO_REASON` if it may."""
-        if not self.camera_lies:
+        if not self.camera_fault_text:
             return NO_REASON
         code = (
             ShapeCode.CAMERA_REPEATS if self.memory.repeats >= _REPEATS else ShapeCode.CAMERA_WRONG
         )
-        return make_reason(code, self.camera_lies)
+        return make_reason(code, self.camera_fault_text)
 
-    def ask(self, inputs: TickInputs, state: State, dt_s: float, held: HoldStatus) -> list[Event]:
+    def compare_sensors(
+        self, inputs: TickInputs, state: State, dt_s: float, held: HoldStatus
+    ) -> list[Event]:
         """Observe a tick and return its new events; judges only a held mirror."""
         laser_um, gauge_pa = held.laser_um, held.gauge_pressure_pa
         if held.setpoint_um != self.memory.setpoint_um:
@@ -196,19 +198,19 @@ class SensorConsistency:
         events += self._judge_weather(inputs, dt_s)
         blind = not inputs.now_s - self.memory.camera_s <= self._fresh_s
         liar = self._plausibility.step(dt_s, laser_um, gauge_pa, held.figure, blind)
-        self.memory.lies_s = (
-            self.memory.lies_s + dt_s if liar == Liar.LASER and held.optics_hold else 0.0
+        self.memory.laser_fault_s = (
+            self.memory.laser_fault_s + dt_s if liar == Liar.LASER and held.held_by_optics else 0.0
         )
         # A knock is over: the estimate knows the laser's new place. A laser that is knocked again
         # and again is not.
         self.laser_moved = (
-            self.memory.lies_s > film_monitor.WARM_S
+            self.memory.laser_fault_s > film_monitor.WARM_S
             and not self.memory.laser_verdicts.too_many(inputs.now_s, _VERDICTS_MAX)
         )
         if self.laser_moved:
             self._plausibility.rebase()
             liar = Liar.NOBODY
-        if liar == Liar.LASER and self.memory.liar != Liar.LASER:
+        if liar == Liar.LASER and self.memory.faulty_sensor != Liar.LASER:
             self.memory.laser_verdicts.add(inputs.now_s, _VERDICTS_MAX)
         events += self._judge(liar)
         if moves or state == State.SETTLE:
@@ -222,9 +224,9 @@ class SensorConsistency:
         return events
 
     @property
-    def agree(self) -> bool:
+    def sensors_agree(self) -> bool:
         """Laser and camera do not contradict each other, as far as is known."""
-        return self.memory.liar == Liar.NOBODY and not self.camera_lies
+        return self.memory.faulty_sensor == Liar.NOBODY and not self.camera_fault_text
 
     @property
     def camera_drifts(self) -> bool:
@@ -232,7 +234,7 @@ class SensorConsistency:
         return self._plausibility.slow_wrong
 
     @property
-    def judges(self) -> bool:
+    def compares_sensors(self) -> bool:
         """Laser, camera and gauge are compared: a jump of one of them will be judged."""
         return self._plausibility.judges
 
@@ -241,7 +243,7 @@ class SensorConsistency:
         self._health.set_pump(loop.flow_most_um_per_s(pump))
         self._pump.set_pump(pump.change_max)
 
-    def told_of_pump(self, loop: inner_loop.InnerLoop) -> list[Event]:
+    def report_pump_curve(self, loop: inner_loop.InnerLoop) -> list[Event]:
         """Events on what a segment of probing has told of the pump."""
         report, warnings = self._pump.step(loop.pump_known)
         events: list[Event] = [_of_warning(warning) for warning in warnings]
@@ -253,7 +255,7 @@ class SensorConsistency:
 
     def _rest(self) -> list[Event]:
         """Reset: the mirror is not held, or not yet at its setpoint."""
-        self.memory.lies_s = 0.0
+        self.memory.laser_fault_s = 0.0
         self.laser_moved = False
         self.memory.growth.moves()
         self.memory.gas_excess = ""
@@ -311,7 +313,7 @@ class SensorConsistency:
         """Report a lost sensor of the film while the pump is driven."""
         present = {
             FilmSensor.LASER: math.isfinite(held.laser_um),
-            FilmSensor.OPTICS: held.optics_hold
+            FilmSensor.OPTICS: held.held_by_optics
             or (held.optics_usable and math.isfinite(held.sag_um)),
             FilmSensor.GAUGE: math.isfinite(held.gauge_pressure_pa),
         }
@@ -355,7 +357,9 @@ class SensorConsistency:
             return self._leak_growth_max
         if not inputs.now_s - self.memory.camera_s <= self._fresh_s:
             return self._leak_growth_max
-        return math.inf if self.memory.liar == Liar.NOBODY else leak_growth.CONTRADICTED_MOST
+        return (
+            math.inf if self.memory.faulty_sensor == Liar.NOBODY else leak_growth.CONTRADICTED_MOST
+        )
 
     def _judge_weather(self, inputs: TickInputs, dt_s: float) -> list[Event]:
         """Report once that a barometer or thermometer is implausible; the loop ignores it."""
@@ -366,11 +370,13 @@ class SensorConsistency:
             reading.ambient_pressure_pa, reading.air_temperature_c
         )
         self.memory.weather_s = (
-            self.memory.weather_s + dt_s if bool(failure) != self.memory.weather_told else 0.0
+            self.memory.weather_s + dt_s
+            if bool(failure) != self.memory.weather_fault_reported
+            else 0.0
         )
         if self.memory.weather_s < _WEATHER_STANDS_S:
             return []
-        self.memory.weather_told = bool(failure)
+        self.memory.weather_fault_reported = bool(failure)
         self.memory.weather_s = 0.0
         return [
             (Maintenance if failure else MaintenanceOver)(
@@ -381,16 +387,20 @@ class SensorConsistency:
     def _judge(self, liar: Liar) -> list[Event]:
         repeats = self.memory.repeats >= _REPEATS
         seen = str(self._plausibility.changes) if liar in (Liar.LASER, Liar.OPTICS) else ""
-        self.memory.laser_lies = seen if liar == Liar.LASER else ""
+        self.memory.laser_fault_text = seen if liar == Liar.LASER else ""
         if repeats:
-            self.memory.camera_lies = "the camera repeats one shape to the last bit: restart it"
+            self.memory.camera_fault_text = (
+                "the camera repeats one shape to the last bit: restart it"
+            )
         elif liar != Liar.OPTICS:
-            self.memory.camera_lies = ""
-        elif not self.camera_lies:  # changed numbers do not make a new reason
-            self.memory.camera_lies = f"laser and gauge agree that the camera is wrong: {seen}"
-        if liar == self.memory.liar:
+            self.memory.camera_fault_text = ""
+        elif not self.camera_fault_text:  # changed numbers do not make a new reason
+            self.memory.camera_fault_text = (
+                f"laser and gauge agree that the camera is wrong: {seen}"
+            )
+        if liar == self.memory.faulty_sensor:
             return []
-        self.memory.liar = liar
+        self.memory.faulty_sensor = liar
         seen = (
             str(self._plausibility.changes)
             if self._plausibility.watching

@@ -129,7 +129,7 @@ class Standstill:
         rise_um = blocks[-1].displacement_um - blocks[-_REST_BLOCKS].displacement_um
         return not rise_um > _REST_RISE_MAX_UM  # without a laser the read-back alone decides
 
-    def look(
+    def observe_reading(
         self,
         now_s: float,
         reading: BenchReading | None,

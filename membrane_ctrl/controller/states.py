@@ -61,7 +61,7 @@ def check(context: TickContext) -> State:
         context.last_good_s = context.now_s
     # occasional lost answers do not make a bad sensor
     gone = not context.now_s - context.last_good_s <= context.config.limits.stale_s
-    good_s = context.stay_good(not gone)
+    good_s = context.measure_good_time_s(not gone)
     if context.state_age_s > context.config.states.check_timeout_s + context.observer.waited_s:
         why = missing.text or "readings come and go, or the actuator test is not done"
         context.overdue = (
@@ -89,7 +89,7 @@ def inflate(context: TickContext) -> State:
     lag = abs(context.loop.lag_um) / states.inflate_pause_um
     output = _drive(context, context.loop.ramp_um if lag > 1.0 else context.setpoint_um)
     to_go_um = context.setpoint_um - output.filtered_um
-    unseen = NO_REASON if math.isfinite(to_go_um) else context.observer.unseen
+    unseen = NO_REASON if math.isfinite(to_go_um) else context.observer.missing_reason
     to_go = f"{to_go_um:.1f} µm to go" if math.isfinite(to_go_um) else unseen.text or "no reading"
     # A waiting ramp starts and stops at the limit, several times a second: the reason must not.
     waits = lag > 0.8
@@ -119,7 +119,9 @@ def settle(context: TickContext) -> State:
     """Stay within the band for a while before `hold` begins."""
     output = _drive(context, context.setpoint_um)
     band_um = context.config.limits.band_um
-    settled_s = context.stay_good(not abs(output.error_um) >= band_um)  # a lost reading is no error
+    settled_s = context.measure_good_time_s(
+        not abs(output.error_um) >= band_um
+    )  # a lost reading is no error
     context.explain(WhyCode.SETTLING, f"settling: inside the band for {settled_s:.0f} s")
     if settled_s >= context.config.states.settle_s:
         context.explain(WhyCode.SETTLED, f"inside +-{band_um:g} µm for {settled_s:.1f} s")
@@ -135,11 +137,14 @@ def settle(context: TickContext) -> State:
 def hold(context: TickContext) -> State:
     """Hold the mirror at its setpoint."""
     if context.paused:
-        context.give(context.loop.stale(_given(context, context.setpoint_um), context.dt_s))
+        context.drive_by(context.loop.stale(_given(context, context.setpoint_um), context.dt_s))
         context.explain(
             WhyCode.PAUSED, f"paused by {context.asked_by}: the pump keeps its mean flow"
         )
-        if context.stay_good(True) > context.config.states.pause_max_s or context.strayed:
+        if (
+            context.measure_good_time_s(True) > context.config.states.pause_max_s
+            or context.beyond_manual_range
+        ):
             context.paused = False
         return State.HOLD
     context.good_since_s = math.nan
@@ -157,7 +162,7 @@ def manual(context: TickContext) -> State:
         return State.INFLATE
     over = _manual_over(context)
     flow_um_per_s = context.mean_flow_um_per_s if over else context.manual_um_per_s
-    context.give(
+    context.drive_by(
         context.loop.follow(_given(context, context.setpoint_um), flow_um_per_s, context.dt_s)
     )
     if over:
@@ -186,12 +191,12 @@ def tune(context: TickContext) -> State:
     else:
         wanted = trial.step(measurement, context.dt_s)
     if isinstance(wanted, Finished):
-        context.give(context.loop.resume(given, trial.spec.holding_flow_um_per_s, context.dt_s))
+        context.drive_by(context.loop.resume(given, trial.spec.holding_flow_um_per_s, context.dt_s))
         context.trial_ended = wanted
         ended = f"{trial.spec.kind} {'done' if wanted.completed else 'stopped'}: {wanted.reason}"
         context.explain(WhyCode.EXPERIMENT_ENDED, ended, trial.spec.kind, wanted.completed)
         return State.HOLD
-    context.give(
+    context.drive_by(
         (context.loop.follow_raw if trial.raw else context.loop.follow)(given, wanted, context.dt_s)
     )
     tuning = f"tuning: {trial.spec.kind} requested by {context.asked_by}"
@@ -331,7 +336,7 @@ def _manual_over(context: TickContext) -> str:
     states = context.config.states
     if context.levels.safe_level != SafeLevel.NONE:
         return "the safety table holds the mean flow"
-    if context.strayed:
+    if context.beyond_manual_range:
         return f"more than {states.manual_range_um:g} µm from the setpoint"
     if context.now_s - context.manual_since_s > states.manual_max_s:
         return f"no flow was set for {states.manual_max_s:g} s"
@@ -409,7 +414,7 @@ def _drive(context: TickContext, target_um: float) -> inner_loop.LoopOutput:
     """Let the loop drive the pump: automatic with a valid reading, held mean flow without one."""
     drive = context.loop.step if context.levels.safe_level == SafeLevel.NONE else context.loop.stale
     output = drive(_given(context, target_um), context.dt_s)
-    context.give(output)
+    context.drive_by(output)
     return output
 
 
@@ -430,7 +435,7 @@ def _missing(context: TickContext) -> Reason:
     reading = context.observer.reading
     if reading is None:
         return make_reason(WhyCode.NO_ANSWER, "no answer from the device")
-    unseen = context.observer.unseen
+    unseen = context.observer.missing_reason
     if unseen != NO_REASON:
         return unseen
     if not math.isfinite(reading.gauge_pressure_pa):

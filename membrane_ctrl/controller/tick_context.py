@@ -110,7 +110,7 @@ class TickContext(TickContextState):
         """Set why the pump is as it is; details, as who asked, make it another reason."""
         self.why = make_reason(code, text, *details)
 
-    def give(self, output: inner_loop.LoopOutput) -> None:
+    def drive_by(self, output: inner_loop.LoopOutput) -> None:
         """Let the loop's output drive the pump, with the bleed open."""
         self.output, self.pump_fraction = output, output.pump_fraction
         self.vent_fraction = self.loop_config.bleed_fraction
@@ -121,7 +121,7 @@ class TickContext(TickContextState):
         self.vent_fraction = self.loop_config.bleed_fraction
 
     @property
-    def strayed(self) -> bool:
+    def beyond_manual_range(self) -> bool:
         """Whether the mirror has moved too far from its setpoint while no loop holds it.
 
         By laser or optics, whichever shows more: one of them may be frozen.
@@ -131,7 +131,7 @@ class TickContext(TickContextState):
         # false for a sensor without a reading
         return any(abs(um - target_um) > self.config.states.manual_range_um for um in shown_um)
 
-    def stay_good(self, good: bool) -> float:
+    def measure_good_time_s(self, good: bool) -> float:
         """How long `good` has been true without a break, in seconds."""
         if not good:
             self.good_since_s = math.nan

@@ -306,7 +306,7 @@ async def _identify(
 def _require_closed(config: Config, reading: BenchReading) -> None:
     """Refuse a start that would hold the mirror while an interlock is open. Raises DeviceError."""
     circuits = interlocks.Interlocks(config.interlocks)
-    circuits.look(reading, telemetry.State.STANDBY)
+    circuits.observe_reading(reading, telemetry.State.STANDBY)
     if circuits.open_mask:
         raise errors.DeviceError(
             f"{circuits.describe_open(circuits.open_mask)}; close it, or start with "

@@ -19,8 +19,8 @@ def look(
         displacement_um, 0, 600.0, 101325.0, 23.0, 23.0, 0.0, 0.0, counter, device_time_s, False, 0
     )
     inputs = TickInputs(now_s=0.02 * tick, dt_s=0.02, reading=reading, link_up=True)
-    observer.look(inputs)
-    return observer.observe(inputs, math.nan)
+    observer.observe_inputs(inputs)
+    return observer.make_observation(inputs, math.nan)
 
 
 def test_a_sample_is_new_only_when_counter_and_time_have_both_advanced() -> None:
@@ -47,8 +47,8 @@ def gauge(observer: Observer, tick: int, gauge_pa: float) -> Observation:
         0.1 * (tick % 2), 0, gauge_pa, 101325.0, 23.0, 23.0, 0.0, 0.0, tick, 0.1 * tick, False, 0
     )
     inputs = TickInputs(now_s=0.1 * tick, dt_s=0.1, reading=reading, link_up=True)
-    observer.look(inputs)
-    return observer.observe(inputs, math.nan)
+    observer.observe_inputs(inputs)
+    return observer.make_observation(inputs, math.nan)
 
 
 def test_a_gauge_that_repeats_itself_is_timed_and_any_change_ends_it() -> None:
@@ -87,5 +87,5 @@ def test_a_read_back_of_nan_counts_as_a_mismatch() -> None:
     reading = BenchReading(0.0, 0, 600.0, 101325.0, 23.0, 23.0, 0.0, 0.0, 1, 0.02, False, 0)
     for tick, (pump, mismatch) in enumerate(((0.0, 0.0), (0.3, 0.3), (math.nan, math.inf)), 1):
         inputs = TickInputs(0.02 * tick, 0.02, replace(reading, pump_fraction=pump))
-        observer.look(inputs)
-        assert observer.observe(inputs, math.nan).pump_mismatch == mismatch
+        observer.observe_inputs(inputs)
+        assert observer.make_observation(inputs, math.nan).pump_mismatch == mismatch

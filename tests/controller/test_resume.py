@@ -67,7 +67,7 @@ class Fault:
         self.levels.enter(safe_level, 0.0)
 
     def due(self, now_s: float, observation: Observation = GONE) -> bool:
-        return self.rule.due(self.fault, self.levels, observation, now_s)
+        return self.rule.is_due(self.fault, self.levels, observation, now_s)
 
 
 def test_only_listed_faults_may_resume() -> None:

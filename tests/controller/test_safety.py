@@ -40,7 +40,7 @@ BAD = {
     "pump_mismatch": replace(GOOD, pump_mismatch=0.2),
     "displacement_frozen": replace(GOOD, advance_age_s=LIMITS.stale_s + 0.01),
     "film_unseen": replace(GOOD, unseen_film="no figure of the mirror for 0.6 s"),
-    "laser_implausible": replace(GOOD, laser_lies="laser +30 µm, camera 0 µm, gauge 0 µm"),
+    "laser_implausible": replace(GOOD, laser_fault_text="laser +30 µm, camera 0 µm, gauge 0 µm"),
     "displacement_stuck": replace(GOOD, same_s=LIMITS.stuck_s + 0.01),
     "laser_gauge_apart": replace(GOOD, laser_gauge_apart="laser +0 µm, gauge +40 µm"),
     "gauge_stuck": replace(GOOD, gauge_same_s=LIMITS.gauge_stuck_s + 0.01),
@@ -86,16 +86,18 @@ def test_a_normal_observation_trips_no_rule(state: State) -> None:
 def test_a_rule_trips_at_exactly_the_needed_number_of_ticks(rule: Rule) -> None:
     table = judge_alone(rule)
     state = State.HOLD if State.HOLD in rule.states else next(iter(rule.states))
-    for _ in range(rule.needed - 1):
+    for _ in range(rule.needed_ticks - 1):
         assert table.judge(state, BAD[rule.name]).rule is None
     verdict = table.judge(state, BAD[rule.name])
     assert verdict.rule is rule
 
 
-@pytest.mark.parametrize("rule", [r for r in TABLE if r.needed > 1], ids=lambda rule: rule.name)
+@pytest.mark.parametrize(
+    "rule", [r for r in TABLE if r.needed_ticks > 1], ids=lambda rule: rule.name
+)
 def test_bad_ticks_outside_one_window_do_not_trip(rule: Rule) -> None:
     table = judge_alone(rule)
-    for _ in range(3 * rule.needed):
+    for _ in range(3 * rule.needed_ticks):
         assert table.judge(State.HOLD, BAD[rule.name]).rule is None
         for _ in range(rule.window):
             assert table.judge(State.HOLD, GOOD).rule is None
@@ -172,7 +174,7 @@ UNSEEN = {
 def test_ticks_without_an_observation_are_left_out_of_the_window(name: str) -> None:
     rule = next(rule for rule in TABLE if rule.name == name)
     table = judge_alone(rule)
-    for _ in range(rule.needed - 1):
+    for _ in range(rule.needed_ticks - 1):
         assert table.judge(State.HOLD, BAD[name]).rule is None
         for _ in range(rule.window):
             assert table.judge(State.HOLD, UNSEEN[name]).rule is None
@@ -182,7 +184,7 @@ def test_ticks_without_an_observation_are_left_out_of_the_window(name: str) -> N
 def test_entering_another_state_clears_the_history_of_a_rule() -> None:
     table = SafetyTable(LIMITS)
     rule = next(rule for rule in TABLE if rule.name == "following_error")
-    for _ in range(rule.needed - 1):
+    for _ in range(rule.needed_ticks - 1):
         table.judge(State.HOLD, BAD[rule.name])
     table.judge(State.STANDBY, GOOD)
     assert table.judge(State.HOLD, BAD[rule.name]).rule is None

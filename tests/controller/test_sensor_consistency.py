@@ -57,7 +57,7 @@ class Seconds:
                 sag_um=math.nan if figure is None else figure.sag_um,
                 figure=figure,
             )
-            self.events += self.consistency.ask(inputs, state, 1.0, held)
+            self.events += self.consistency.compare_sensors(inputs, state, 1.0, held)
 
     def _shape(self) -> ShapeEstimate:
         nothing = np.zeros(ZERNIKE_TERMS)
@@ -140,14 +140,14 @@ def test_a_barometer_in_a_wrong_unit_is_reported_once_and_cleared_once() -> None
 def test_a_frozen_camera_is_used_neither_for_the_shape_nor_for_the_gas() -> None:
     mirror = Seconds()
     mirror.pass_by(600, camera=True)
-    assert mirror.consistency.camera_lies == ""
+    assert mirror.consistency.camera_fault_text == ""
     mirror.camera_stuck = True
     mirror.pass_by(100, leak_um_per_s=6.7, camera=True)
-    assert "repeats" in mirror.consistency.camera_lies
+    assert "repeats" in mirror.consistency.camera_fault_text
     assert mirror.consistency.gas_excess != ""
     mirror.camera_stuck = False
     mirror.pass_by(2, camera=True)
-    assert mirror.consistency.camera_lies == ""
+    assert mirror.consistency.camera_fault_text == ""
 
 
 def test_a_gauge_that_drifts_for_hours_against_the_laser_raises_one_notice_and_its_end() -> None:

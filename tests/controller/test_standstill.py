@@ -28,7 +28,7 @@ class Watched:
         self, reading: BenchReading | None = STILL, commanded: float = 0.0, link_up: bool = True
     ) -> Standstill:
         self.now_s += DT_S
-        self.stand.look(self.now_s, reading, (commanded, commanded), link_up)
+        self.stand.observe_reading(self.now_s, reading, (commanded, commanded), link_up)
         return self.stand
 
     def rises(self, um_per_s: float, pa_per_s: float, seconds: float = 30.0, **wrong: float) -> str:
@@ -91,9 +91,9 @@ def test_a_command_to_run_ends_the_watch() -> None:
 
 def test_the_last_of_two_commands_must_be_off_as_well() -> None:
     stand = Standstill(CONFIG.loop, CONFIG.states)
-    stand.look(0.1, STILL, (0.0, 0.5), True)
+    stand.observe_reading(0.1, STILL, (0.0, 0.5), True)
     assert not stand.seen_off
-    stand.look(0.2, STILL, (0.0, 0.0), True)
+    stand.observe_reading(0.2, STILL, (0.0, 0.0), True)
     assert stand.seen_off
     stand.look(0.3, None, (0.0, 0.0), True)
     assert not stand.seen_off
@@ -155,7 +155,7 @@ def test_weather_on_leakless_films_is_not_mistaken_for_inflow() -> None:
             ambient_pressure_pa=sample.ambient_pressure_pa,
             air_temperature_c=sample.air_temperature_c,
         )
-        stand.look(0.2 * tick, reading, (0.0, 0.0), True)
+        stand.observe_reading(0.2 * tick, reading, (0.0, 0.0), True)
         assert not stand.inflow
         rests += stand.at_rest
     assert rests > 5900

@@ -245,10 +245,10 @@ def test_a_figure_counts_only_if_it_is_recent(spoil: Callable[[Any, int], Any], 
         figure = None if n % 3 else figures(now_s)  # as good ones are: until 0.48 s
         if n > 24 and figure is not None:
             figure = spoil(figure, n // 3)
-        watching.look(TickInputs(now_s=now_s, dt_s=0.02, reading=None, estimate=figure))
-        if watching.unseen:
+        watching.observe_inputs(TickInputs(now_s=now_s, dt_s=0.02, reading=None, estimate=figure))
+        if watching.missing_reason:
             assert math.isnan(watching.displacement_um)
-            why.append(watching.unseen.text)
+            why.append(watching.missing_reason.text)
         else:
             assert abs(watching.displacement_um) < 20 or why
     assert why == [] if not seen else why[0].startswith(seen)

@@ -190,7 +190,7 @@ def _row(rule: Rule) -> str:
         str(rule.code),
         f"`{rule.name}`",
         rule.cause,
-        f"{rule.needed} / {rule.window}",
+        f"{rule.needed_ticks} / {rule.window}",
         _limit(rule.limit),
         rule.enters or rule.safe_level.name.lower(),
         "yes" if rule.latching else "when it times out",
