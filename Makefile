@@ -57,7 +57,7 @@ unit: fast real_time
 shake: $(STAMP)  ## the same tests on a machine that pauses for a second, again and again; SEED=2 for other moments
 	$(BIN)/python tests/shake.py --seed $(or $(SEED),1) $(MAKE) unit
 
-pictures: $(STAMP)  ## the pictures of README and documentation, taken anew; ONLY='run-*' for some of them
+pictures: $(STAMP)  ## takes the pictures of README and documentation; ONLY='run-*' for some of them
 	$(BIN)/python -m tests.support.pictures $(ONLY)
 
 bench: $(STAMP)  ## measured figures, each against a reference of the same run

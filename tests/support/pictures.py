@@ -1,4 +1,4 @@
-"""The pictures of README and documentation, taken anew: `make pictures`, or `python -m
+"""Takes the pictures of README and documentation: `make pictures`, or `python -m
 tests.support.pictures run-*`.
 
 Needs a Vulkan driver (`apt-get install mesa-vulkan-drivers libvulkan1`) and, for report and page,
