@@ -72,11 +72,15 @@ def set_to(name: str, value: float | bool) -> Callable[[Wrong, bool], None]:
     return lambda wrong, fails: setattr(wrong, name, value if fails else type(value)(0))
 
 
+LASER_LOST = set_to("no_light", True)
+LASER_STUCK = set_to("laser_stuck", True)
+
+
 @pytest.mark.parametrize(
     ("fail", "holders"),
     [
-        (set_to("no_light", True), [ALL, "optics, barometer, thermometer", ALL]),
-        pytest.param(set_to("laser_stuck", True), [ALL], marks=pytest.mark.campaign),
+        (LASER_LOST, [ALL, "optics, barometer, thermometer", ALL]),
+        pytest.param(LASER_STUCK, [ALL], marks=pytest.mark.campaign),
         (set_to("camera_lost", True), [ALL, "laser, barometer, thermometer", ALL]),
         pytest.param(
             set_to("barometer_lost", True),
@@ -100,7 +104,9 @@ def test_a_lost_sensor_causes_neither_a_step_nor_a_fault(
         for event in tick.events
         if isinstance(event, Why) and "optics alone" in event.why
     ]
-    assert len(alone) == sum("laser" not in sensors for sensors in holders)
+    # A stuck laser is left out as well, for less time than the list of sensors waits.
+    laser_is_left_out = fail in (LASER_LOST, LASER_STUCK)
+    assert len(alone) == int(laser_is_left_out)
     assert ticks[-1].row.state == State.HOLD
 
 
