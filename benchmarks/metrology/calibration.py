@@ -22,15 +22,27 @@ from membrane_ctrl.config.optics import (
     OpticsConfig,
     ScreenPoseConfig,
 )
-from membrane_ctrl.metrology.calibrate.diagnose import suspects
-from membrane_ctrl.metrology.calibrate.parameters import ALL, NAMES, BenchGeometry, bench_at, sigmas
-from membrane_ctrl.metrology.calibrate.residuals import SetPhases, residual_mm
-from membrane_ctrl.metrology.calibrate.separable import References
-from membrane_ctrl.metrology.calibrate.solve import Problem, Solution, first_states, fit_on, solve
-from membrane_ctrl.metrology.checked import check
-from membrane_ctrl.metrology.frames.frame_stack import FrameStack
-from membrane_ctrl.metrology.optics.geometry import Geometry
-from membrane_ctrl.metrology.optics.surface import Surface
+from membrane_ctrl.metrology.calibration.model_tests import suspects
+from membrane_ctrl.metrology.calibration.normal_equations import References
+from membrane_ctrl.metrology.calibration.solver import (
+    Problem,
+    Solution,
+    first_states,
+    fit_on,
+    solve,
+)
+from membrane_ctrl.metrology.frame_checks.checked_set import check
+from membrane_ctrl.metrology.phase.frame_stack import FrameStack
+from membrane_ctrl.metrology.rays.bench_parameters import (
+    ALL,
+    NAMES,
+    BenchGeometry,
+    bench_at,
+    sigmas,
+)
+from membrane_ctrl.metrology.rays.forward_model import SetPhases, residual_mm
+from membrane_ctrl.metrology.rays.geometry import Geometry
+from membrane_ctrl.metrology.rays.surface import Surface
 from membrane_ctrl.sim.optics.camera import OpticsRenderer
 from membrane_ctrl.sim.optics.film_shape import FilmShape, typical_film
 from membrane_ctrl.sim.optics.shade import pattern_sequence

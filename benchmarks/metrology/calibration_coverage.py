@@ -36,14 +36,14 @@ from membrane_ctrl.calibration.sets import (
 from membrane_ctrl.config.optics import CameraConfig, OpticsConfig, ScreenPoseConfig
 from membrane_ctrl.geometry.file import ScreenMovedTable, origin_of, screen_elsewhere
 from membrane_ctrl.measure.capture_set import CaptureHead, CaptureSet
-from membrane_ctrl.metrology.calibrate import propagate, verdict
-from membrane_ctrl.metrology.calibrate.parameters import NAMES, pose_derivatives
-from membrane_ctrl.metrology.calibrate.residuals import MOTION, SetPhases, chunks
-from membrane_ctrl.metrology.calibrate.ring_pose import find_edges
-from membrane_ctrl.metrology.calibrate.solve import Solution, fit_on, solve
-from membrane_ctrl.metrology.checked import Checked, RejectedSetError, check
-from membrane_ctrl.metrology.frames.frame_stack import FrameStack
-from membrane_ctrl.metrology.optics.surface import Artefact, Surface
+from membrane_ctrl.metrology.calibration import figure_uncertainty, verdict
+from membrane_ctrl.metrology.calibration.ring_pose import find_edges
+from membrane_ctrl.metrology.calibration.solver import Solution, fit_on, solve
+from membrane_ctrl.metrology.frame_checks.checked_set import Checked, RejectedSetError, check
+from membrane_ctrl.metrology.phase.frame_stack import FrameStack
+from membrane_ctrl.metrology.rays.bench_parameters import NAMES, pose_derivatives
+from membrane_ctrl.metrology.rays.forward_model import MOTION, SetPhases, chunks
+from membrane_ctrl.metrology.rays.surface import Artefact, Surface
 from membrane_ctrl.model.zernike_terms import ZERNIKE_TERMS
 from membrane_ctrl.sim.optics.film_shape import FilmShape, typical_film
 from membrane_ctrl.sim.optics.shade import Light
@@ -306,7 +306,7 @@ def bench(seed: int) -> dict[str, Any]:
     middle = solution.problem.middle
     phases = _still(solution, middle)
     surface = fit_on(solution.bench, phases, 500.0, -1e-3 * phases.displacement_um).surface
-    claim = propagate.propagate(solution, middle, 475.0)
+    claim = figure_uncertainty.propagate(solution, middle, 475.0)
     sag_um, figure_um = errors_um(surface, drawn.film, true_um[middle])
     z = [(solution.values[k] - drawn.off.get(name, 0.0)) / s for k, (name, s) in _free(solution)]
     return answer | {

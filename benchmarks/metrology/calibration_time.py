@@ -11,7 +11,7 @@ from pathlib import Path
 
 from membrane_ctrl.calibration.sets import CalibrateOptions, problem_of, read_sets
 from membrane_ctrl.config.schema import CameraConfig, GeometryConfig, OpticsConfig
-from membrane_ctrl.metrology.calibrate.solve import solve
+from membrane_ctrl.metrology.calibration.solver import solve
 from membrane_ctrl.sim.optics.film_shape import typical_film
 from membrane_ctrl.sim.optics.simulate import simulate_set
 from membrane_ctrl.sim.optics.simulation_spec import Motion, SimulationSpec

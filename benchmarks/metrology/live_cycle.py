@@ -12,9 +12,9 @@ import numpy as np
 
 from benchmarks.metrology import reference_pmd
 from membrane_ctrl.config.schema import OpticsConfig
-from membrane_ctrl.metrology.live import LiveReconstructor
-from membrane_ctrl.metrology.optics.geometry import Geometry
-from membrane_ctrl.metrology.phase import fringe_sequence, full_sequence
+from membrane_ctrl.metrology.cycle.live_reconstructor import LiveReconstructor
+from membrane_ctrl.metrology.phase.phase_steps import fringe_sequence, full_sequence
+from membrane_ctrl.metrology.rays.geometry import Geometry
 from membrane_ctrl.model.zernike_terms import ZERNIKE_TERMS
 from membrane_ctrl.sim.optics.camera import OpticsRenderer
 from membrane_ctrl.sim.optics.film_shape import FilmShape

@@ -10,9 +10,9 @@ import time
 import numpy as np
 
 from membrane_ctrl.config.schema import OpticsConfig
-from membrane_ctrl.metrology.checked import check
-from membrane_ctrl.metrology.frames.frame_stack import FrameStack
-from membrane_ctrl.metrology.full import FullResult, measure_pixels, reconstruct_full
+from membrane_ctrl.metrology.figure.pixel_figure import FullResult, measure_pixels, reconstruct_full
+from membrane_ctrl.metrology.frame_checks.checked_set import check
+from membrane_ctrl.metrology.phase.frame_stack import FrameStack
 from membrane_ctrl.sim.optics.camera import OpticsRenderer
 from membrane_ctrl.sim.optics.film_shape import typical_film
 from membrane_ctrl.sim.optics.shade import pattern_sequence

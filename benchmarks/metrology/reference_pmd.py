@@ -12,8 +12,8 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from membrane_ctrl.metrology.optics import zernike
-from membrane_ctrl.metrology.optics.geometry import Geometry
+from membrane_ctrl.metrology.numerics import zernike
+from membrane_ctrl.metrology.rays.geometry import Geometry
 from membrane_ctrl.model.zernike_terms import ZERNIKE_TERMS
 
 FloatArray = NDArray[np.float64]

@@ -14,9 +14,9 @@ import numpy as np
 from firmware_iface.roles import Pattern
 from membrane_ctrl.config.schema import OpticsConfig
 from membrane_ctrl.measure.measurement import Figures
-from membrane_ctrl.metrology.optics.surface import PARAMETERS, Surface
-from membrane_ctrl.metrology.track.scene import CrossedScene, scene_of
-from membrane_ctrl.metrology.track.tracker import Tracker
+from membrane_ctrl.metrology.rays.surface import PARAMETERS, Surface
+from membrane_ctrl.metrology.tracking.crossed_scene import CrossedScene, scene_of
+from membrane_ctrl.metrology.tracking.tracker import Tracker
 from membrane_ctrl.model.arrays import FloatArray
 from membrane_ctrl.model.zernike_terms import ZERNIKE_TERMS
 from membrane_ctrl.sim.optics.camera import OpticsRenderer

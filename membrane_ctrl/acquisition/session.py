@@ -14,8 +14,9 @@ from firmware_iface.roles import LinkError
 from membrane_ctrl.acquisition import cycle, exposures, optical_bench, process, raw_frames
 from membrane_ctrl.config.schema import Config, OpticsConfig, TwinConfig
 from membrane_ctrl.geometry import file, spread_file
-from membrane_ctrl.metrology import live, phase
-from membrane_ctrl.metrology.track.live import Heard, LiveTracker, Stethoscope
+from membrane_ctrl.metrology.cycle import live_reconstructor
+from membrane_ctrl.metrology.phase import phase_steps
+from membrane_ctrl.metrology.tracking.live_tracker import Heard, LiveTracker, Stethoscope
 from membrane_ctrl.model import files, plain_json
 from membrane_ctrl.model.clock import RunClock, pause_s
 from membrane_ctrl.model.events import Event
@@ -263,7 +264,9 @@ def _plan(config: Config, optics: OpticsConfig) -> cycle.CyclePlan:
     """The patterns of the cycles."""
     pattern = optics.pattern
     return cycle.CyclePlan(
-        phase.full_sequence(pattern), phase.fringe_sequence(pattern), config.shape.frame_interval_s
+        phase_steps.full_sequence(pattern),
+        phase_steps.fringe_sequence(pattern),
+        config.shape.frame_interval_s,
     )
 
 
@@ -278,7 +281,7 @@ def _reconstructor(
     shape = spec.config.shape
     kept = None if spec.run_dir is None else spec.run_dir / file.KEPT
     spread, _ = spread_file.spread_of(optics, kept if kept is not None and kept.exists() else None)
-    cycles = live.LiveReconstructor(optics, shape.bin_px, spread=spread)
+    cycles = live_reconstructor.LiveReconstructor(optics, shape.bin_px, spread=spread)
     if shape.mode == "cycle":
         return cycles, plan, lambda: shape.period_s
     exposure_s = optical_bench.exposure_s(spec.config) if spec.truth is None else 0.0
@@ -313,7 +316,7 @@ def _warm_up(
     config: Config, plan: cycle.CyclePlan, position: FilmPosition, clock: WaitingClock
 ) -> None:
     coarse = small(config.optics)
-    cycles = live.LiveReconstructor(coarse, config.shape.bin_px)
+    cycles = live_reconstructor.LiveReconstructor(coarse, config.shape.bin_px)
     warm_up(cycles, coarse, plan, position, clock)
     if config.shape.mode == "track":
         tracker = LiveTracker(

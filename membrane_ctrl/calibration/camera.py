@@ -20,13 +20,20 @@ from membrane_ctrl.geometry.file import read_geometry
 from membrane_ctrl.geometry.spread_file import read_prior, write_prior
 from membrane_ctrl.measure import capture_set, measurement
 from membrane_ctrl.measure.images import IMAGE_BYTES_MAX, decoded_image
-from membrane_ctrl.metrology import full, reconstruct
-from membrane_ctrl.metrology.calibrate import ring_pose, solve
-from membrane_ctrl.metrology.calibrate.lens import Board, BoardView, Lens, calibrate_lens, on_screen
-from membrane_ctrl.metrology.calibrate.parameters import usual_sigma
-from membrane_ctrl.metrology.checked import RejectedSetError, check
-from membrane_ctrl.metrology.optics.geometry import Geometry, find_outline
-from membrane_ctrl.metrology.phase import mm_per_rad
+from membrane_ctrl.metrology.calibration import ring_pose, solver
+from membrane_ctrl.metrology.calibration.board_lens import (
+    Board,
+    BoardView,
+    Lens,
+    calibrate_lens,
+    on_screen,
+)
+from membrane_ctrl.metrology.figure import pixel_figure
+from membrane_ctrl.metrology.frame_checks.checked_set import RejectedSetError, check
+from membrane_ctrl.metrology.phase.phase_steps import mm_per_rad
+from membrane_ctrl.metrology.rays.bench_parameters import usual_sigma
+from membrane_ctrl.metrology.rays.geometry import Geometry, find_outline
+from membrane_ctrl.metrology.reconstruction import surface_fit
 from membrane_ctrl.model import errors, files
 from membrane_ctrl.model.arrays import FloatArray
 from membrane_ctrl.model.clock import RunClock
@@ -207,7 +214,7 @@ def calibrate_pose(options: PoseOptions) -> int:
         raise errors.RejectedError(f"{options.folder}: {error}") from None
     sigmas = dict(zip(ring_pose.POSE_NAMES, pose.sigmas.tolist(), strict=True))
     tables = {
-        "geometry": solve.general_form(pose.bench(stated), optics).model_dump(exclude_none=True),
+        "geometry": solver.general_form(pose.bench(stated), optics).model_dump(exclude_none=True),
         "sigmas": sigmas,
     }
     write_prior(options.out, tables, "calibrate-pose", [options.folder.name], pose.rms_px)
@@ -240,7 +247,7 @@ def _light(capture: capture_set.CaptureSet) -> FloatArray:
     return np.asarray(white - black)
 
 
-def _rim(capture: capture_set.CaptureSet) -> tuple[reconstruct.HeightFunction, float]:
+def _rim(capture: capture_set.CaptureSet) -> tuple[surface_fit.HeightFunction, float]:
     """Height of the film at the rim in world, and its mean. Raises RejectedError for a set without
     a figure.
     """
@@ -249,7 +256,10 @@ def _rim(capture: capture_set.CaptureSet) -> tuple[reconstruct.HeightFunction, f
         checked = check(measurement.stack_of(capture), optics)
     except RejectedSetError as error:
         raise errors.RejectedError(f"{capture.head.folder}: rejected: {error}") from None
-    surface, vertex_mm = full.bin_figure(optics, checked).fit.surface, checked.tracer.vertex_z_mm
+    surface, vertex_mm = (
+        pixel_figure.bin_figure(optics, checked).fit.surface,
+        checked.tracer.vertex_z_mm,
+    )
 
     def height(x: FloatArray, y: FloatArray) -> FloatArray:
         share = surface.radius_mm / np.maximum(

@@ -16,15 +16,14 @@ from matplotlib.figure import Figure
 
 from membrane_ctrl.config.schema import OpticsConfig
 from membrane_ctrl.measure.results import write_figure
-from membrane_ctrl.metrology.calibrate import (
+from membrane_ctrl.metrology.calibration import (
     advice,
-    diagnose,
-    parameters,
-    propagate,
-    residuals,
-    solve,
+    figure_uncertainty,
+    model_tests,
+    solver,
     verdict,
 )
+from membrane_ctrl.metrology.rays import bench_parameters, forward_model
 from membrane_ctrl.model import errors, program
 from membrane_ctrl.model.arrays import FloatArray
 from membrane_ctrl.model.files import users, write_text_atomic
@@ -33,7 +32,7 @@ _SOME_LASER = 0.5  # sigma of the laser's scale without any reading: 1
 
 
 def report_of(
-    solution: solve.Solution | None,
+    solution: solver.Solution | None,
     findings: Sequence[verdict.CalibrationFinding],
     analysis_radius_mm: float,
 ) -> dict[str, Any]:
@@ -46,12 +45,12 @@ def report_of(
     if solution is None or not solution.converged:
         return table
     middle = solution.problem.middle
-    claim = propagate.propagate(solution, middle, analysis_radius_mm)
-    scale, number = diagnose.laser_scale(solution), advice.number_advice(solution, middle)
+    claim = figure_uncertainty.propagate(solution, middle, analysis_radius_mm)
+    scale, number = model_tests.laser_scale(solution), advice.number_advice(solution, middle)
     artefact = advice.artefact_advice(solution, middle)
     return table | {
         "iterations": len(solution.changes),
-        "condition": propagate.condition_number(solution),
+        "condition": figure_uncertainty.condition_number(solution),
         "parameters": [_parameter(solution, name) for name in solution.free],
         "not_determined": [
             {
@@ -60,7 +59,7 @@ def report_of(
                 "figure_um": each.figure_um,
                 "says": each.words,
             }
-            for each in propagate.weak_combinations(solution, middle, analysis_radius_mm)
+            for each in figure_uncertainty.weak_combinations(solution, middle, analysis_radius_mm)
         ],
         "uncertainty": {
             "height_rms_um": claim.height_rms_um,
@@ -78,8 +77,8 @@ def report_of(
     }
 
 
-def _parameter(solution: solve.Solution, name: str) -> dict[str, Any]:
-    k = parameters.NAMES.index(name)
+def _parameter(solution: solver.Solution, name: str) -> dict[str, Any]:
+    k = bench_parameters.NAMES.index(name)
     return {
         "name": name,
         "value": float(solution.values[k]),
@@ -88,7 +87,7 @@ def _parameter(solution: solve.Solution, name: str) -> dict[str, Any]:
     }
 
 
-def _sets(solution: solve.Solution) -> list[dict[str, Any]]:
+def _sets(solution: solver.Solution) -> list[dict[str, Any]]:
     """Per set: its noise relative to the camera's, its residuals, and the test against the other
     sets.
     """
@@ -109,7 +108,7 @@ def _sets(solution: solve.Solution) -> list[dict[str, Any]]:
             solution.problem.sets,
             solution.states,
             solution.equations,
-            diagnose.left_out(solution),
+            model_tests.left_out(solution),
             strict=True,
         )
     ]
@@ -134,7 +133,7 @@ def lines_of(report: dict[str, Any]) -> list[str]:
         return lines
     lines.append("what           stated wrong by   +-        known before")
     for row in report["parameters"]:
-        says = parameters.ALL[parameters.NAMES.index(row["name"])].says
+        says = bench_parameters.ALL[bench_parameters.NAMES.index(row["name"])].says
         lines.append(
             f"{row['name']:<18}{row['value']:>+11.4f}  {row['sigma']:<9.4f} "
             f"{row['sigma_before']:<8.4g} {says}"
@@ -157,7 +156,7 @@ def lines_of(report: dict[str, Any]) -> list[str]:
         f"with its tilt +- {claim['height_rms_um']:.1f} µm RMS"
     )
     if (number := report["advice"]) is not None:
-        unit = parameters.ALL[parameters.NAMES.index(number["name"])].unit
+        unit = bench_parameters.ALL[bench_parameters.NAMES.index(number["name"])].unit
         known = f"{number['sigma']:.2g} {unit}".strip()
         lines.append(
             f"best next: {number['name']} known to {known} would give sag +- "
@@ -199,7 +198,7 @@ _DPI = 110
 _CELLS = 24  # across the picture: each averages enough points to show a pattern below the noise
 
 
-def draw_residuals(path: Path, solution: solve.Solution) -> None:
+def draw_residuals(path: Path, solution: solver.Solution) -> None:
     """Draw the mean s_x and s_y residuals of all sets over the camera's picture, on a common scale.
 
     Raises OSError if the file cannot be written.
@@ -225,7 +224,7 @@ def draw_residuals(path: Path, solution: solve.Solution) -> None:
     write_figure(users(path), figure, _DPI)
 
 
-def _edges(solution: solve.Solution) -> tuple[FloatArray, FloatArray]:
+def _edges(solution: solver.Solution) -> tuple[FloatArray, FloatArray]:
     """Columns and rows of the boundaries of square cells."""
     column = np.concatenate([phases.column_px for phases in solution.problem.sets])
     row = np.concatenate([phases.row_px for phases in solution.problem.sets])
@@ -235,7 +234,7 @@ def _edges(solution: solve.Solution) -> tuple[FloatArray, FloatArray]:
 
 
 def _means(
-    solution: solve.Solution, index: int, axis: int, edges: tuple[FloatArray, FloatArray]
+    solution: solver.Solution, index: int, axis: int, edges: tuple[FloatArray, FloatArray]
 ) -> FloatArray:
     """Weighted means over cells, (rows, columns); NaN in cells without points."""
     phases, linear = solution.problem.sets[index], solution.equations[index]
@@ -250,8 +249,8 @@ def _means(
 
 def write_geometry(
     path: Path,
-    solution: solve.Solution,
-    problem: solve.Problem,
+    solution: solver.Solution,
+    problem: solver.Problem,
     optics: OpticsConfig,
     findings: Sequence[verdict.CalibrationFinding],
 ) -> str:
@@ -264,28 +263,30 @@ def write_geometry(
         )
         for state, phases in films
     ]
-    origin = solve.Origin(
+    origin = solver.Origin(
         date_utc=datetime.now(UTC).isoformat(timespec="seconds"),
         sets=tuple(phases.name for phases in problem.sets),
         screen_residual_um=1e3
         * float(np.median([each.residual_rms_mm for each in solution.equations])),
         slope_residual_urad=1e6 * float(np.median(slopes)),
         slope_noise_urad=float(np.median(noises)),
-        condition=propagate.condition_number(solution),
+        condition=figure_uncertainty.condition_number(solution),
         notes=tuple(finding.says for finding in findings),
     )
-    tables = solve.tables_of(solution, optics, origin)
+    tables = solver.tables_of(solution, optics, origin)
     with errors.writing(path):
         path.parent.mkdir(parents=True, exist_ok=True)
         write_text_atomic(users(path), tomli_w.dumps(tables))  # never half a geometry
     return str(tables["calibration"]["hash"])
 
 
-def _slope_residual(solution: solve.Solution, phases: residuals.SetPhases, index: int) -> float:
+def _slope_residual(
+    solution: solver.Solution, phases: forward_model.SetPhases, index: int
+) -> float:
     """RMS of measured minus fitted slopes of one set's bins on the calibrated bench, as a live
     cycle states it.
     """
-    fit = solve.fit_on(
+    fit = solver.fit_on(
         solution.bench, phases, solution.problem.radius_mm, solution.states[index].vertex_z_mm
     )
     return float(np.hypot(fit.residual_x, fit.residual_y) / np.sqrt(2))

@@ -14,8 +14,8 @@ import numpy as np
 from membrane_ctrl.config import schema
 from membrane_ctrl.control.setpoint_ramp import RAMP_SHARE
 from membrane_ctrl.geometry.file import GeometryFile, GeometryOrigin, read_geometry
-from membrane_ctrl.metrology.calibrate.verdict import GOOD_SPREAD_UM, LEAST_SPREAD_UM
-from membrane_ctrl.metrology.optics.geometry import Geometry
+from membrane_ctrl.metrology.calibration.verdict import GOOD_SPREAD_UM, LEAST_SPREAD_UM
+from membrane_ctrl.metrology.rays.geometry import Geometry
 from membrane_ctrl.model import errors, files
 from membrane_ctrl.sessions.folder import begin_session, read_session
 

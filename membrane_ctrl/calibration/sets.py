@@ -18,17 +18,18 @@ from membrane_ctrl.config.schema import OpticsConfig
 from membrane_ctrl.geometry import file, spread_file
 from membrane_ctrl.measure.capture_set import CaptureSet, read_head, read_set
 from membrane_ctrl.measure.measurement import Figures, SetFigure, stack_of
-from membrane_ctrl.metrology import phase
-from membrane_ctrl.metrology.bins import BinGrid, pixel_sigma_adu
-from membrane_ctrl.metrology.calibrate import lens, residuals, ring_pose, separable, verdict
-from membrane_ctrl.metrology.calibrate.parameters import LASER, NAMES, sigmas, usual_sigma
-from membrane_ctrl.metrology.calibrate.ring_pose import RADIUS_SIGMA_MM, Rim
-from membrane_ctrl.metrology.calibrate.solve import Problem, solve
-from membrane_ctrl.metrology.checked import Checked, absolute_phases
-from membrane_ctrl.metrology.frames import evidence
-from membrane_ctrl.metrology.frames.frame_stack import bin_frames
-from membrane_ctrl.metrology.full import FilmMotion, bin_figure
-from membrane_ctrl.metrology.optics.geometry import Geometry
+from membrane_ctrl.metrology.calibration import board_lens, normal_equations, ring_pose, verdict
+from membrane_ctrl.metrology.calibration.ring_pose import RADIUS_SIGMA_MM, Rim
+from membrane_ctrl.metrology.calibration.solver import Problem, solve
+from membrane_ctrl.metrology.figure.pixel_figure import FilmMotion, bin_figure
+from membrane_ctrl.metrology.frame_checks import frame_evidence
+from membrane_ctrl.metrology.frame_checks.checked_set import Checked, absolute_phases
+from membrane_ctrl.metrology.phase import phase_steps
+from membrane_ctrl.metrology.phase.frame_stack import bin_frames
+from membrane_ctrl.metrology.rays import forward_model
+from membrane_ctrl.metrology.rays.bench_parameters import LASER, NAMES, sigmas, usual_sigma
+from membrane_ctrl.metrology.rays.geometry import Geometry
+from membrane_ctrl.metrology.reconstruction.bin_grid import BinGrid, pixel_sigma_adu
 from membrane_ctrl.model import errors, terminal
 from membrane_ctrl.model.arrays import FloatArray
 
@@ -41,7 +42,7 @@ _SAME_FILM_UM = 20.0  # apart: a film's change of figure is then known to a tent
 _MOTION_UNSEEN_UM = 100.0  # without a laser; the fringes find it to some micrometres
 
 
-def phases_of(name: str, checked: Checked, optics: OpticsConfig) -> residuals.SetPhases:
+def phases_of(name: str, checked: Checked, optics: OpticsConfig) -> forward_model.SetPhases:
     """The bins within the analysis radius that the set's own fit kept, corrected for the film's
     motion.
 
@@ -56,7 +57,7 @@ def phases_of(name: str, checked: Checked, optics: OpticsConfig) -> residuals.Se
         optics, checked, replace(film, told_um=(x_um - x_um.mean(), y_um - y_um.mean()))
     )
     grid = BinGrid(checked.tracer.geometry, optics.camera, checked.binned.bin_px)
-    return residuals.SetPhases(
+    return forward_model.SetPhases(
         name=name,
         column_px=grid.column_px[figure.index],
         row_px=grid.row_px[figure.index],
@@ -99,7 +100,7 @@ class CalibrateOptions:
     # first set's
     reference_um: float | None = None
     priors: Sequence[Path] = ()  # results of auxiliary calibrations; the last one wins
-    film: separable.FilmModel = "free"
+    film: normal_equations.FilmModel = "free"
     radius_sigma_mm: float = RADIUS_SIGMA_MM  # of the ring, whose edge is seen
 
 
@@ -109,7 +110,7 @@ class Bundle:
     and defects of single frames.
     """
 
-    sets: tuple[residuals.SetPhases, ...]
+    sets: tuple[forward_model.SetPhases, ...]
     optics: OpticsConfig
     reference_um: float
     notes: tuple[str, ...] = ()
@@ -214,10 +215,10 @@ def read_sets(
         raise errors.InputError(
             f"{next(f for f in folders if list(folders).count(f) > 1)}: given twice"
         )
-    sets: list[residuals.SetPhases] = []
+    sets: list[forward_model.SetPhases] = []
     benches: list[OpticsConfig] = []
     used: list[Path] = []
-    elsewhere: list[tuple[Path, residuals.SetPhases, file.ScreenMovedTable]] = []
+    elsewhere: list[tuple[Path, forward_model.SetPhases, file.ScreenMovedTable]] = []
     notes: list[str] = []
     edges: list[FloatArray] = []
     heads = {folder: read_head(folder, stated) for folder in folders}
@@ -275,38 +276,40 @@ def read_sets(
     return Bundle(tuple(sets), benches[films[0]], reference_um, tuple(notes), apart, tuple(edges))
 
 
-def phases_of_screen(capture: CaptureSet) -> residuals.SetPhases:
+def phases_of_screen(capture: CaptureSet) -> forward_model.SetPhases:
     """The bins that see the screen itself. Raises RejectedError if they show none."""
     head, stack = capture.head, stack_of(capture)
     binned = bin_frames(stack, 2**head.optics.camera.bits - 1)
     pattern, geometry = head.optics.pattern, Geometry.from_config(head.optics)
     try:
-        view = evidence.look(stack, binned, set(stack.unusable))
+        view = frame_evidence.look(stack, binned, set(stack.unusable))
         phase_rad = absolute_phases(stack, binned, view, pattern)
         index = np.flatnonzero(np.isfinite(phase_rad).all(axis=0))
         grid, screen_mm = (
             BinGrid(geometry, head.optics.camera, binned.bin_px),
-            phase.screen_mm(phase_rad, pattern),
+            phase_steps.screen_mm(phase_rad, pattern),
         )
         place = grid.column_px[index], grid.row_px[index], screen_mm.reshape(2, -1)[:, index]
-        screen = lens.screen_seen(geometry, *place)
-    except (ValueError, evidence.NoFigureError) as error:
+        screen = board_lens.screen_seen(geometry, *place)
+    except (ValueError, frame_evidence.NoFigureError) as error:
         raise errors.RejectedError(f"{head.folder}: rejected: {error}") from None
     noise = pixel_sigma_adu(head.optics.camera.noise_adu) / binned.bin_px
-    shares = [phase.phase_sigma_rad(stack.shifts_rad(used), noise, 1.0) for used in view.used]
+    shares = [phase_steps.phase_sigma_rad(stack.shifts_rad(used), noise, 1.0) for used in view.used]
     swing = view.swing_adu.reshape(2, -1)[:, index]
     sigma_mm = (
-        phase.mm_per_rad(pattern) * np.hypot(*(np.array(shares)[:, None] / swing)) / math.sqrt(2)
+        phase_steps.mm_per_rad(pattern)
+        * np.hypot(*(np.array(shares)[:, None] / swing))
+        / math.sqrt(2)
     )
-    name, where = head.folder.name, (residuals.ANYWHERE,)
+    name, where = head.folder.name, (forward_model.ANYWHERE,)
     known: dict[str, Any] = {"artefact": screen, "elsewhere": where, "period_mm": pattern.period_mm}
-    return residuals.SetPhases(name, *place, sigma_mm, math.nan, **known)
+    return forward_model.SetPhases(name, *place, sigma_mm, math.nan, **known)
 
 
 def join(
-    sets: list[residuals.SetPhases],
+    sets: list[forward_model.SetPhases],
     folder: Path,
-    phases: residuals.SetPhases,
+    phases: forward_model.SetPhases,
     moved: file.ScreenMovedTable,
 ) -> None:
     """Add what was seen with the screen elsewhere to the set of the same film. Raises InputError if
@@ -322,7 +325,7 @@ def join(
         )
     k = films[int(np.nanargmin(apart_um))]
     base, deeper_um = sets[k], phases.displacement_um - sets[k].displacement_um
-    known = residuals.Elsewhere(
+    known = forward_model.Elsewhere(
         moved.shift_mm,
         moved.shift_sigma_mm,
         moved.turn_sigma_deg,
@@ -344,7 +347,7 @@ def with_priors(bundle: Bundle, priors: Sequence[spread_file.Prior]) -> Bundle:
 
 
 def _reference_um(
-    sets: Sequence[residuals.SetPhases], benches: Sequence[OpticsConfig], known_um: float | None
+    sets: Sequence[forward_model.SetPhases], benches: Sequence[OpticsConfig], known_um: float | None
 ) -> float:
     """Reading at which the vertex is the world's origin: as all sets state, else as given, else the
     first one.
@@ -410,7 +413,7 @@ def problem_of(bundle: Bundle, free: dict[str, float], options: CalibrateOptions
         geometry = Geometry.from_config(bundle.optics)
     except ValueError as error:
         raise errors.InputError(str(error)) from None
-    references = separable.References(
+    references = normal_equations.References(
         bundle.reference_um, options.laser_sigma_um, film=options.film
     )
     radius_mm = bundle.optics.mirror.radius_mm

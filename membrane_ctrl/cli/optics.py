@@ -185,7 +185,7 @@ def film(
 
         return film_run_command(folders, prestrain, poisson, out, pictures, json)
     from membrane_ctrl.measure.film import FilmOptions, film_command
-    from membrane_ctrl.metrology.film_fit import Gauge
+    from membrane_ctrl.metrology.film.material_fit import Gauge
 
     gauge = Gauge(gauge_noise_pa, gauge_offset_pa, gauge_scale)
     return film_command(FilmOptions(tuple(folders), geometry, gauge, out, json, pictures))

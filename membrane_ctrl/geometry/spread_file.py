@@ -22,7 +22,7 @@ from membrane_ctrl.config import schema, toml_file
 from membrane_ctrl.config.optics import SigmasConfig
 from membrane_ctrl.config.origin import OriginSection
 from membrane_ctrl.geometry.file import LensTable
-from membrane_ctrl.metrology.calibrate.parameters import NAMES
+from membrane_ctrl.metrology.rays.bench_parameters import NAMES
 from membrane_ctrl.metrology.uncertainty.geometry_spread import (
     OPTIONAL_NAMES,
     PAPER_SPREAD,

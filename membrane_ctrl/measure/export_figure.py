@@ -18,8 +18,9 @@ import numpy as np
 
 from membrane_ctrl.measure.export_fits import fits_bytes
 from membrane_ctrl.measure.results import read_arrays
-from membrane_ctrl.metrology.figure import LEAST_CELLS
-from membrane_ctrl.metrology.optics import surface, zernike
+from membrane_ctrl.metrology.figure.quantities import LEAST_CELLS
+from membrane_ctrl.metrology.numerics import zernike
+from membrane_ctrl.metrology.rays import surface
 from membrane_ctrl.model import errors, files, plain_json
 from membrane_ctrl.model.arrays import BoolArray, FloatArray, IntArray
 from membrane_ctrl.model.zernike_terms import ZERNIKE_TERMS

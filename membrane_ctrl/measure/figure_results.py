@@ -16,7 +16,7 @@ import numpy as np
 
 from membrane_ctrl.measure.measurement import Measurement
 from membrane_ctrl.measure.results import ErrorBars, number_or_null, write_arrays
-from membrane_ctrl.metrology.figure import (
+from membrane_ctrl.metrology.figure.quantities import (
     LEAST_CELLS,
     Figure,
     FigureBars,
@@ -26,7 +26,8 @@ from membrane_ctrl.metrology.figure import (
     figure_bars,
     power_spectrum,
 )
-from membrane_ctrl.metrology.optics import surface, zernike
+from membrane_ctrl.metrology.numerics import zernike
+from membrane_ctrl.metrology.rays import surface
 from membrane_ctrl.model.errors import InputError
 from membrane_ctrl.model.files import write_bytes_atomic, write_text_atomic
 from membrane_ctrl.model.terminal import plain

@@ -11,9 +11,9 @@ import numpy as np
 from membrane_ctrl.geometry import file, spread_file
 from membrane_ctrl.measure.measurement import Figures, SetFigure
 from membrane_ctrl.measure.results import write_figure, write_json
-from membrane_ctrl.metrology import film_fit
-from membrane_ctrl.metrology.optics.film_law import FilmLaw
-from membrane_ctrl.metrology.optics.surface import Surface
+from membrane_ctrl.metrology.film import material_fit
+from membrane_ctrl.metrology.film.film_law import FilmLaw
+from membrane_ctrl.metrology.rays.surface import Surface
 from membrane_ctrl.metrology.uncertainty import monte_carlo
 from membrane_ctrl.model import errors, files, program, terminal
 from membrane_ctrl.model.arrays import FloatArray
@@ -30,7 +30,7 @@ class FilmOptions:
 
     folders: tuple[Path, ...]
     geometry: Path | None
-    gauge: film_fit.Gauge
+    gauge: material_fit.Gauge
     out: Path | None
     as_json: bool
     pictures: bool
@@ -71,7 +71,9 @@ def film_command(options: FilmOptions) -> int:
             )
     figures, source = _figures(sets, options.geometry)
     try:
-        fit = film_fit.fit_film(figures, mirror.radius_mm, mirror.analysis_radius_mm, options.gauge)
+        fit = material_fit.fit_film(
+            figures, mirror.radius_mm, mirror.analysis_radius_mm, options.gauge
+        )
     except ValueError as error:
         raise errors.RejectedError(f"film: {error}") from None
     departure = _departure(figures, fit, mirror.analysis_radius_mm)
@@ -88,7 +90,9 @@ def film_command(options: FilmOptions) -> int:
     return 0
 
 
-def _figures(sets: list[SetFigure], geometry: Path | None) -> tuple[list[film_fit.FilmFigure], str]:
+def _figures(
+    sets: list[SetFigure], geometry: Path | None
+) -> tuple[list[material_fit.FilmFigure], str]:
     """The sets' figures with their errors, and where the geometry's spread comes from."""
     spread, source = spread_file.spread_of(sets[0].head.optics, geometry)
     out = []
@@ -100,7 +104,7 @@ def _figures(sets: list[SetFigure], geometry: Path | None) -> tuple[list[film_fi
         )
         name, pressure = one.head.folder.name, one.head.pressure_pa
         out.append(
-            film_fit.FilmFigure(
+            material_fit.FilmFigure(
                 name, surface.parameters, noise, geometric, pressure, surface.sag_mm
             )
         )
@@ -108,7 +112,7 @@ def _figures(sets: list[SetFigure], geometry: Path | None) -> tuple[list[film_fi
 
 
 def _departure(
-    figures: list[film_fit.FilmFigure], fit: film_fit.FilmFit, reach_mm: float
+    figures: list[material_fit.FilmFigure], fit: material_fit.FilmFit, reach_mm: float
 ) -> _Departure:
     radius = np.linspace(0.0, reach_mm, 96)
     seen, left = [], []
@@ -133,7 +137,7 @@ def _profile_mm(parameters_mm: FloatArray, radius_mm: float, at_mm: FloatArray) 
 
 
 def _notes(
-    figures: list[film_fit.FilmFigure], fit: film_fit.FilmFit, departure: _Departure
+    figures: list[material_fit.FilmFigure], fit: material_fit.FilmFit, departure: _Departure
 ) -> list[str]:
     """What these sets cannot tell, in words."""
     gauged = [figure.pressure_pa for figure in figures if np.isfinite(figure.pressure_pa)]
@@ -143,9 +147,9 @@ def _notes(
             "E t is not determined: no set states pressure_pa; pre-strain and nu need none"
         )
     strain, poisson, _ = fit.sigmas
-    if strain > film_fit.PRESTRAIN_SIGMA / 2:
+    if strain > material_fit.PRESTRAIN_SIGMA / 2:
         notes.append("the pre-strain is not determined: its bar is what was known before")
-    if poisson > film_fit.POISSON_SIGMA / 2:
+    if poisson > material_fit.POISSON_SIGMA / 2:
         notes.append(
             "nu is not determined: its bar is what was known before; take sets at other pressures"
         )
@@ -166,8 +170,8 @@ def _notes(
 
 
 def _table(
-    figures: list[film_fit.FilmFigure],
-    fit: film_fit.FilmFit,
+    figures: list[material_fit.FilmFigure],
+    fit: material_fit.FilmFit,
     departure: _Departure,
     source: str,
     notes: list[str],
@@ -226,7 +230,7 @@ def _paper_prestrain(poisson: float, stiffness: FloatArray | float) -> float:
     return float(np.interp(_PAPER_EDGE_MM, float(hencky.sag_mm) - sags, strains))
 
 
-def _lines(table: dict[str, Any], figures: list[film_fit.FilmFigure]) -> list[str]:
+def _lines(table: dict[str, Any], figures: list[material_fit.FilmFigure]) -> list[str]:
     strain, poisson, stiffness = table["prestrain"], table["poisson"], table["stiffness_n_per_m"]
     sags = [figure.sag_mm for figure in figures]
     lines = [
@@ -262,7 +266,10 @@ def _lines(table: dict[str, Any], figures: list[film_fit.FilmFigure]) -> list[st
 
 
 def _draw(
-    path: Path, figures: list[film_fit.FilmFigure], fit: film_fit.FilmFit, departure: _Departure
+    path: Path,
+    figures: list[material_fit.FilmFigure],
+    fit: material_fit.FilmFit,
+    departure: _Departure,
 ) -> None:
     from matplotlib.figure import Figure
 

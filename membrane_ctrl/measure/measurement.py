@@ -8,17 +8,23 @@ import numpy as np
 
 from membrane_ctrl.geometry.file import GeometryFile, require_plausible
 from membrane_ctrl.measure.capture_set import CaptureHead, CaptureSet, anchored, read_set
-from membrane_ctrl.metrology.checked import Anchor, Checked, RejectedSetError, check
-from membrane_ctrl.metrology.frames import frame_stack, integrity
-from membrane_ctrl.metrology.frequencies import check_frequencies
-from membrane_ctrl.metrology.full import (
+from membrane_ctrl.metrology.figure.pixel_figure import (
     BinFigure,
     FullResult,
     bin_figure,
     measure_pixels,
     reconstruct_full,
 )
-from membrane_ctrl.metrology.optics.surface import Artefact
+from membrane_ctrl.metrology.frame_checks import frame_faults
+from membrane_ctrl.metrology.frame_checks.checked_set import (
+    Anchor,
+    Checked,
+    RejectedSetError,
+    check,
+)
+from membrane_ctrl.metrology.frame_checks.multi_frequency import check_frequencies
+from membrane_ctrl.metrology.phase import frame_stack
+from membrane_ctrl.metrology.rays.surface import Artefact
 from membrane_ctrl.metrology.uncertainty.monte_carlo import TrialBench
 from membrane_ctrl.model import errors, shape_estimate
 
@@ -46,7 +52,7 @@ class Measurement:
     head: CaptureHead
     verdict: shape_estimate.Verdict
     reason: str
-    flags: tuple[integrity.Flag, ...]
+    flags: tuple[frame_faults.Flag, ...]
     checked: Checked | None
     full: FullResult | None
     displacement_um: float
@@ -121,7 +127,7 @@ def stack_of(capture: CaptureSet) -> frame_stack.FrameStack:
     an incomplete set deserves no trust.
     """
     if capture.lost:
-        flags = tuple(integrity.flag_unreadable(k, capture.unusable[k]) for k in capture.lost)
+        flags = tuple(frame_faults.flag_unreadable(k, capture.unusable[k]) for k in capture.lost)
         first = capture.lost[0]
         raise RejectedSetError(f"{capture.head.files[first]} is {capture.unusable[first]}", flags)
     return frame_stack.FrameStack(

@@ -14,9 +14,9 @@ from matplotlib.figure import Figure
 from membrane_ctrl.measure.figure_results import ENERGY_SHARES, MeasuredFigure
 from membrane_ctrl.measure.measurement import Measurement
 from membrane_ctrl.measure.results import ErrorBars, write_figure
-from membrane_ctrl.metrology.figure import SurfaceMap
-from membrane_ctrl.metrology.full import FullResult
-from membrane_ctrl.metrology.optics import geometry, surface
+from membrane_ctrl.metrology.figure.pixel_figure import FullResult
+from membrane_ctrl.metrology.figure.quantities import SurfaceMap
+from membrane_ctrl.metrology.rays import geometry, surface
 from membrane_ctrl.model.arrays import FloatArray
 from membrane_ctrl.model.files import move, scratch_folder
 from membrane_ctrl.model.terminal import plain

@@ -18,11 +18,11 @@ from numpy.typing import NDArray
 
 from membrane_ctrl.geometry.spread_file import spread_of
 from membrane_ctrl.measure.measurement import Measurement, noise_seen_adu
-from membrane_ctrl.metrology import bins, consistency
-from membrane_ctrl.metrology.full import FullResult
-from membrane_ctrl.metrology.optics import surface
-from membrane_ctrl.metrology.optics.geometry import Outline
-from membrane_ctrl.metrology.uncertainty import monte_carlo
+from membrane_ctrl.metrology.figure.pixel_figure import FullResult
+from membrane_ctrl.metrology.rays import surface
+from membrane_ctrl.metrology.rays.geometry import Outline
+from membrane_ctrl.metrology.reconstruction import bin_grid
+from membrane_ctrl.metrology.uncertainty import monte_carlo, set_budget
 from membrane_ctrl.metrology.uncertainty.budget import Budget
 from membrane_ctrl.model import errors, program, zernike_terms
 from membrane_ctrl.model.arrays import FloatArray
@@ -94,10 +94,10 @@ def error_bars(
         return None
     spread, source = spread_of(optics, geometry)
     noise_adu = float(
-        np.nanmax([bins.pixel_sigma_adu(optics.camera.noise_adu), noise_seen_adu(measurement)])
+        np.nanmax([bin_grid.pixel_sigma_adu(optics.camera.noise_adu), noise_seen_adu(measurement)])
     )
     try:
-        seen = consistency.examine(optics, checked, full, spread, noise_adu, outline)
+        seen = set_budget.examine(optics, checked, full, spread, noise_adu, outline)
     except ArithmeticError:
         raise errors.InputError(
             f"{source}: too wide: the figure does not follow from such a geometry"

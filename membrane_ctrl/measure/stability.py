@@ -18,7 +18,7 @@ import numpy as np
 from membrane_ctrl.geometry.file import read_geometry
 from membrane_ctrl.geometry.spread_file import spread_of
 from membrane_ctrl.measure import capture_set, measurement, results, stability_results
-from membrane_ctrl.metrology.optics.surface import PARAMETERS, parameter_to_coeffs
+from membrane_ctrl.metrology.rays.surface import PARAMETERS, parameter_to_coeffs
 from membrane_ctrl.metrology.uncertainty import geometry_spread, monte_carlo, stability
 from membrane_ctrl.model import errors, files, program, terminal
 from membrane_ctrl.model.arrays import FloatArray

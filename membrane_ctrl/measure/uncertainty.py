@@ -18,7 +18,7 @@ from membrane_ctrl.geometry import file, spread_file
 from membrane_ctrl.measure.measure import light_and_rim
 from membrane_ctrl.measure.measurement import Figures, SetFigure, measure_set
 from membrane_ctrl.measure.results import error_bars, write_arrays, write_json
-from membrane_ctrl.metrology.optics.surface import parameter_to_coeffs, sag_gradient
+from membrane_ctrl.metrology.rays.surface import parameter_to_coeffs, sag_gradient
 from membrane_ctrl.metrology.uncertainty import geometry_spread, monte_carlo
 from membrane_ctrl.model import errors, files, program, terminal
 from membrane_ctrl.model.arrays import FloatArray

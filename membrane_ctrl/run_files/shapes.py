@@ -14,8 +14,8 @@ import numpy as np
 import pyarrow as pa
 from numpy.typing import NDArray
 
-from membrane_ctrl.metrology.optics import zernike
-from membrane_ctrl.metrology.optics.surface import Surface
+from membrane_ctrl.metrology.numerics import zernike
+from membrane_ctrl.metrology.rays.surface import Surface
 from membrane_ctrl.model import shape_estimate
 from membrane_ctrl.model.arrays import AnyArray, Column
 from membrane_ctrl.model.zernike_terms import FIRST_FIGURE_INDEX, ZERNIKE_TERMS, zernike_columns

@@ -21,8 +21,8 @@ from membrane_ctrl.acquisition import driver_check, optical_bench
 from membrane_ctrl.acquisition.cycle import CycleDone, CycleFailed, CyclePlan, ShapeCycle
 from membrane_ctrl.config.schema import Config
 from membrane_ctrl.config.toml_file import dump, load
-from membrane_ctrl.metrology.live import LiveReconstructor
-from membrane_ctrl.metrology.phase import fringe_sequence, full_sequence
+from membrane_ctrl.metrology.cycle.live_reconstructor import LiveReconstructor
+from membrane_ctrl.metrology.phase.phase_steps import fringe_sequence, full_sequence
 from membrane_ctrl.model.errors import InputError
 from membrane_ctrl.model.shape_estimate import ShapeEstimate
 from membrane_ctrl.processes.frames import FrameRing, FrameWriter

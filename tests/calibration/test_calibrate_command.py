@@ -19,7 +19,7 @@ from membrane_ctrl.calibration import sets
 from membrane_ctrl.cli import run
 from membrane_ctrl.config.schema import CameraConfig, GeometryConfig, MirrorConfig, OpticsConfig
 from membrane_ctrl.geometry.file import screen_elsewhere
-from membrane_ctrl.metrology.calibrate.verdict import CalibrationFinding
+from membrane_ctrl.metrology.calibration.verdict import CalibrationFinding
 from membrane_ctrl.sim.optics.film_shape import FilmShape, typical_film
 from membrane_ctrl.sim.optics.simulate import simulate_set
 from membrane_ctrl.sim.optics.simulation_spec import Motion, SimulationSpec, leaning

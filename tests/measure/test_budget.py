@@ -21,15 +21,15 @@ from membrane_ctrl.config.optics import (
     ScreenPoseConfig,
 )
 from membrane_ctrl.geometry.spread_file import spread_of
-from membrane_ctrl.metrology.calibrate.parameters import NAMES, bench_at
-from membrane_ctrl.metrology.checked import check
-from membrane_ctrl.metrology.consistency import Examined, examine
-from membrane_ctrl.metrology.frames.frame_stack import FrameStack
-from membrane_ctrl.metrology.full import measure_pixels, reconstruct_full
-from membrane_ctrl.metrology.optics.geometry import Geometry, find_outline
-from membrane_ctrl.metrology.reconstruct import Points, Tracer, parabola, solve
+from membrane_ctrl.metrology.figure.pixel_figure import measure_pixels, reconstruct_full
+from membrane_ctrl.metrology.frame_checks.checked_set import check
+from membrane_ctrl.metrology.phase.frame_stack import FrameStack
+from membrane_ctrl.metrology.rays.bench_parameters import NAMES, bench_at
+from membrane_ctrl.metrology.rays.geometry import Geometry, find_outline
+from membrane_ctrl.metrology.reconstruction.surface_fit import Points, Tracer, parabola, solve
 from membrane_ctrl.metrology.uncertainty.budget import Budget, Source
 from membrane_ctrl.metrology.uncertainty.monte_carlo import height_matrix
+from membrane_ctrl.metrology.uncertainty.set_budget import Examined, examine
 from membrane_ctrl.model.zernike_terms import ZERNIKE_TERMS
 from membrane_ctrl.sim.optics.camera import OpticsRenderer
 from membrane_ctrl.sim.optics.film_shape import FilmShape, typical_film

@@ -10,12 +10,18 @@ import numpy as np
 from numpy.typing import NDArray
 
 from membrane_ctrl.config.schema import OpticsConfig
-from membrane_ctrl.metrology.calibrate.parameters import ALL, NAMES, BenchGeometry, bench_at, sigmas
-from membrane_ctrl.metrology.calibrate.residuals import SetPhases, residual_mm
-from membrane_ctrl.metrology.calibrate.separable import References
-from membrane_ctrl.metrology.calibrate.solve import Problem, Solution, first_states, fit_on
-from membrane_ctrl.metrology.optics.geometry import Geometry
-from membrane_ctrl.metrology.optics.surface import Surface
+from membrane_ctrl.metrology.calibration.normal_equations import References
+from membrane_ctrl.metrology.calibration.solver import Problem, Solution, first_states, fit_on
+from membrane_ctrl.metrology.rays.bench_parameters import (
+    ALL,
+    NAMES,
+    BenchGeometry,
+    bench_at,
+    sigmas,
+)
+from membrane_ctrl.metrology.rays.forward_model import SetPhases, residual_mm
+from membrane_ctrl.metrology.rays.geometry import Geometry
+from membrane_ctrl.metrology.rays.surface import Surface
 from membrane_ctrl.sim.optics.film_shape import FilmShape, typical_film
 from membrane_ctrl.sim.optics.trace import CameraPose, ScreenPose, trace
 

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from firmware_iface.roles import Pattern
 from membrane_ctrl.config.schema import CameraConfig, OpticsConfig, PatternConfig
-from membrane_ctrl.metrology.frames.frame_stack import FrameStack
+from membrane_ctrl.metrology.phase.frame_stack import FrameStack
 from membrane_ctrl.sim.optics.camera import OpticsRenderer
 from membrane_ctrl.sim.optics.film_shape import FilmShape, typical_film
 from membrane_ctrl.sim.optics.shade import Light, pattern_sequence

@@ -14,9 +14,9 @@ from numpy.typing import NDArray
 
 from firmware_iface.roles import Pattern
 from membrane_ctrl.cli import run
-from membrane_ctrl.metrology.frames.bands import without_bands
-from membrane_ctrl.metrology.frames.frame_stack import FrameStack, bin_frames, pixel_phases
-from membrane_ctrl.metrology.motion import combine_steps
+from membrane_ctrl.metrology.frame_checks.backlight_bands import without_bands
+from membrane_ctrl.metrology.phase.frame_stack import FrameStack, bin_frames, pixel_phases
+from membrane_ctrl.metrology.reconstruction.film_motion import combine_steps
 from tests.studies.tracked_errors import CLEAN, SIZE
 from tests.worlds.crossed_fringes import CrossedWorld
 

@@ -13,15 +13,15 @@ import tomli_w
 from calibration_truth import OPTICS, make
 
 from membrane_ctrl.config.optics import GeometryConfig, OpticsConfig, ScreenPoseConfig
-from membrane_ctrl.metrology.calibrate.parameters import NAMES, bench_at, sigmas
-from membrane_ctrl.metrology.calibrate.solve import (
+from membrane_ctrl.metrology.calibration.solver import (
     Origin,
     Solution,
     general_covariance,
     solve,
     tables_of,
 )
-from membrane_ctrl.metrology.optics.geometry import Geometry
+from membrane_ctrl.metrology.rays.bench_parameters import NAMES, bench_at, sigmas
+from membrane_ctrl.metrology.rays.geometry import Geometry
 from membrane_ctrl.metrology.uncertainty.geometry_spread import (
     GENERAL_NAMES,
     GeometrySpread,

@@ -10,9 +10,14 @@ import pytest
 from calibration_truth import PIXEL_SIGMA_MM, STATED, FloatArray, Truth, calibrated_errors_um, make
 from scipy.spatial.transform import Rotation
 
-from membrane_ctrl.metrology.calibrate.advice import screen_advice
-from membrane_ctrl.metrology.calibrate.lens import screen_seen
-from membrane_ctrl.metrology.calibrate.parameters import (
+from membrane_ctrl.metrology.calibration.advice import screen_advice
+from membrane_ctrl.metrology.calibration.board_lens import screen_seen
+from membrane_ctrl.metrology.calibration.figure_uncertainty import propagate
+from membrane_ctrl.metrology.calibration.normal_equations import averaged
+from membrane_ctrl.metrology.calibration.ring_pose import Rim
+from membrane_ctrl.metrology.calibration.solver import Problem, Solution, solve
+from membrane_ctrl.metrology.calibration.verdict import after
+from membrane_ctrl.metrology.rays.bench_parameters import (
     NAMES,
     OPTICAL,
     bench_at,
@@ -20,8 +25,7 @@ from membrane_ctrl.metrology.calibrate.parameters import (
     sigmas,
     usual_sigma,
 )
-from membrane_ctrl.metrology.calibrate.propagate import propagate
-from membrane_ctrl.metrology.calibrate.residuals import (
+from membrane_ctrl.metrology.rays.forward_model import (
     ANYWHERE,
     COLUMNS,
     LOCAL,
@@ -31,12 +35,8 @@ from membrane_ctrl.metrology.calibrate.residuals import (
     residual_mm,
     views,
 )
-from membrane_ctrl.metrology.calibrate.ring_pose import Rim
-from membrane_ctrl.metrology.calibrate.separable import averaged
-from membrane_ctrl.metrology.calibrate.solve import Problem, Solution, solve
-from membrane_ctrl.metrology.calibrate.verdict import after
-from membrane_ctrl.metrology.optics.geometry import project
-from membrane_ctrl.metrology.optics.surface import Surface
+from membrane_ctrl.metrology.rays.geometry import project
+from membrane_ctrl.metrology.rays.surface import Surface
 from membrane_ctrl.sim.optics.trace import CameraPose, ScreenPose, trace
 
 # a screen whose pitch is known from its data sheet, moved along a rail

@@ -11,16 +11,21 @@ import pytest
 from calibration_truth import SAGS_MM, STATED, Truth, calibrated_errors_um, make
 from metrology_truth import hencky_depth
 
-from membrane_ctrl.metrology.calibrate.advice import number_advice
-from membrane_ctrl.metrology.calibrate.parameters import NAMES, bench_at, sigmas
-from membrane_ctrl.metrology.calibrate.propagate import propagate
-from membrane_ctrl.metrology.calibrate.residuals import SetPhases
-from membrane_ctrl.metrology.calibrate.ring_pose import Rim
-from membrane_ctrl.metrology.calibrate.separable import FilmModel, Trust, beyond_of, less_trust
-from membrane_ctrl.metrology.calibrate.solve import Solution, solve
-from membrane_ctrl.metrology.calibrate.verdict import after
-from membrane_ctrl.metrology.optics.film_law import FilmLaw, excess_rms
-from membrane_ctrl.metrology.optics.geometry import project
+from membrane_ctrl.metrology.calibration.advice import number_advice
+from membrane_ctrl.metrology.calibration.figure_uncertainty import propagate
+from membrane_ctrl.metrology.calibration.normal_equations import (
+    FilmModel,
+    Trust,
+    beyond_of,
+    less_trust,
+)
+from membrane_ctrl.metrology.calibration.ring_pose import Rim
+from membrane_ctrl.metrology.calibration.solver import Solution, solve
+from membrane_ctrl.metrology.calibration.verdict import after
+from membrane_ctrl.metrology.film.film_law import FilmLaw, excess_rms
+from membrane_ctrl.metrology.rays.bench_parameters import NAMES, bench_at, sigmas
+from membrane_ctrl.metrology.rays.forward_model import SetPhases
+from membrane_ctrl.metrology.rays.geometry import project
 
 SIGMAS = sigmas()
 VALUES = 0.7 * SIGMAS * np.random.default_rng(8).normal(size=len(NAMES))

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from membrane_ctrl.config.schema import CameraConfig, OpticsConfig
-from membrane_ctrl.metrology.calibrate.parameters import sigmas
-from membrane_ctrl.metrology.calibrate.propagate import foresee
+from membrane_ctrl.metrology.calibration.figure_uncertainty import foresee
+from membrane_ctrl.metrology.rays.bench_parameters import sigmas
 
 
 # docs/how-to/calibration.md: claims of calibrations of the twin's film, sag and figure in µm

@@ -9,7 +9,7 @@ import pytest
 from board_photograph import Photographer, photographs
 
 from membrane_ctrl.config.schema import CameraConfig
-from membrane_ctrl.metrology.calibrate.lens import (
+from membrane_ctrl.metrology.calibration.board_lens import (
     LEAST_VIEWS,
     Board,
     BoardView,

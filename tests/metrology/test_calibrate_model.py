@@ -9,7 +9,8 @@ import pytest
 from calibration_truth import OPTICS, STATED, make
 
 from membrane_ctrl.config.schema import CameraConfig, GeometryConfig, OpticsConfig
-from membrane_ctrl.metrology.calibrate.parameters import (
+from membrane_ctrl.metrology.calibration.normal_equations import SetState, averaged, rim_harmonics
+from membrane_ctrl.metrology.rays.bench_parameters import (
     ALL,
     NAMES,
     OPTICAL,
@@ -20,7 +21,7 @@ from membrane_ctrl.metrology.calibrate.parameters import (
     poses_at,
     sigmas,
 )
-from membrane_ctrl.metrology.calibrate.residuals import (
+from membrane_ctrl.metrology.rays.forward_model import (
     BEYOND,
     COLUMNS,
     LOCAL,
@@ -29,9 +30,8 @@ from membrane_ctrl.metrology.calibrate.residuals import (
     chunks,
     residual_mm,
 )
-from membrane_ctrl.metrology.calibrate.separable import SetState, averaged, rim_harmonics
-from membrane_ctrl.metrology.optics.geometry import Geometry
-from membrane_ctrl.metrology.optics.surface import PARAMETERS, Surface
+from membrane_ctrl.metrology.rays.geometry import Geometry
+from membrane_ctrl.metrology.rays.surface import PARAMETERS, Surface
 
 RNG = np.random.default_rng(1)
 LENS = Geometry.from_config(

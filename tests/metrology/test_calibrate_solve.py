@@ -21,15 +21,15 @@ from calibration_truth import (
 
 from membrane_ctrl.calibration.sets import known_sigmas
 from membrane_ctrl.config.optics import SigmasConfig
-from membrane_ctrl.metrology.calibrate.parameters import NAMES, sigmas
-from membrane_ctrl.metrology.calibrate.propagate import (
+from membrane_ctrl.metrology.calibration.figure_uncertainty import (
     condition_number,
     propagate,
     weak_combinations,
 )
-from membrane_ctrl.metrology.calibrate.separable import without_waves
-from membrane_ctrl.metrology.calibrate.solve import Solution, solve
-from membrane_ctrl.metrology.calibrate.verdict import after
+from membrane_ctrl.metrology.calibration.normal_equations import without_waves
+from membrane_ctrl.metrology.calibration.solver import Solution, solve
+from membrane_ctrl.metrology.calibration.verdict import after
+from membrane_ctrl.metrology.rays.bench_parameters import NAMES, sigmas
 
 SIGMAS = sigmas()
 SEEDS = range(12)

@@ -10,17 +10,17 @@ import numpy as np
 import pytest
 from calibration_truth import SAGS_MM, Truth, make
 
-from membrane_ctrl.metrology.calibrate.diagnose import bumps, left_out, suspects
-from membrane_ctrl.metrology.calibrate.parameters import NAMES, sigmas
-from membrane_ctrl.metrology.calibrate.residuals import SetPhases
-from membrane_ctrl.metrology.calibrate.solve import solve
-from membrane_ctrl.metrology.calibrate.verdict import (
+from membrane_ctrl.metrology.calibration.model_tests import bumps, left_out, suspects
+from membrane_ctrl.metrology.calibration.solver import solve
+from membrane_ctrl.metrology.calibration.verdict import (
     CYCLES,
     CalibrationFinding,
     DriftMonitor,
     after,
     before,
 )
+from membrane_ctrl.metrology.rays.bench_parameters import NAMES, sigmas
+from membrane_ctrl.metrology.rays.forward_model import SetPhases
 
 SIGMAS = sigmas()
 VALUES = SIGMAS * np.random.default_rng(3).normal(size=len(NAMES))

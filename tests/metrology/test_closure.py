@@ -3,8 +3,12 @@
 import numpy as np
 import pytest
 
-from membrane_ctrl.metrology.frames.integrity import closure, closure_with_level, closure_with_phase
-from membrane_ctrl.metrology.phase import equal_shifts
+from membrane_ctrl.metrology.frame_checks.frame_faults import (
+    closure,
+    closure_with_level,
+    closure_with_phase,
+)
+from membrane_ctrl.metrology.phase.phase_steps import equal_shifts
 
 PIXELS = 4000
 NOISE_ADU = 0.5

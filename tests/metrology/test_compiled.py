@@ -8,18 +8,18 @@ from pathlib import Path
 import numba
 import pytest
 
-from membrane_ctrl.metrology.optics import compiled
+from membrane_ctrl.metrology.numerics import compiled
 
 KERNELS = """
 from cached_steps import added
-from membrane_ctrl.metrology.optics.compiled import kernel
+from membrane_ctrl.metrology.numerics.compiled import kernel
 
 @kernel
 def total(point):
     return added(point.x, point.y)
 """
 STEPS = """
-from membrane_ctrl.metrology.optics.compiled import step
+from membrane_ctrl.metrology.numerics.compiled import step
 
 @step
 def added(x, y):

@@ -13,8 +13,9 @@ from prysm import interferogram
 from prysm.polynomials import ansi_j_to_nm, fringe_to_nm, noll_to_nm, zernike_nm
 from scipy.optimize import least_squares, minimize_scalar
 
-from membrane_ctrl.metrology import figure
-from membrane_ctrl.metrology.optics import surface, zernike
+from membrane_ctrl.metrology.figure import quantities
+from membrane_ctrl.metrology.numerics import zernike
+from membrane_ctrl.metrology.rays import surface
 from membrane_ctrl.model.zernike_terms import NOLL_INDICES, ZERNIKE_TERMS
 
 APERTURE = 475.0
@@ -25,11 +26,11 @@ INSIDE = R <= APERTURE
 ABERRATED = {5: 0.004, 6: -0.3, 7: 0.1, 10: -0.05, 11: 0.02, 22: 0.004, 33: 0.003}
 
 
-def seen(height_mm: np.ndarray, hole: bool = False) -> figure.SurfaceMap:
+def seen(height_mm: np.ndarray, hole: bool = False) -> quantities.SurfaceMap:
     """A measured map, optionally with a hole."""
     measured = INSIDE & ~(hole & (np.hypot(X - 90, Y + 40) < 60))
     slope_y, slope_x = np.gradient(height_mm, float(AXIS[1] - AXIS[0]), edge_order=2)
-    return figure.SurfaceMap(AXIS, np.where(measured, height_mm, np.nan), slope_x, slope_y)
+    return quantities.SurfaceMap(AXIS, np.where(measured, height_mm, np.nan), slope_x, slope_y)
 
 
 def height_of(film: TrueFilm) -> np.ndarray:
@@ -37,17 +38,17 @@ def height_of(film: TrueFilm) -> np.ndarray:
     return film.height(X.ravel(), Y.ravel()).reshape(X.shape)
 
 
-def of(surface_map: figure.SurfaceMap) -> figure.Figure:
+def of(surface_map: quantities.SurfaceMap) -> quantities.Figure:
     """Its figure."""
-    return figure.FigureOf(surface_map, APERTURE)(surface_map)
+    return quantities.FigureOf(surface_map, APERTURE)(surface_map)
 
 
 def bars_of(
-    some: figure.SurfaceMap, covariance: np.ndarray, cell_slope: float = 0.0
-) -> figure.FigureBars:
+    some: quantities.SurfaceMap, covariance: np.ndarray, cell_slope: float = 0.0
+) -> quantities.FigureBars:
     """Its error bars."""
-    evaluate = figure.FigureOf(some, APERTURE)
-    return figure.figure_bars(evaluate, some, evaluate(some), 500.0, covariance, cell_slope)
+    evaluate = quantities.FigureOf(some, APERTURE)
+    return quantities.figure_bars(evaluate, some, evaluate(some), 500.0, covariance, cell_slope)
 
 
 def ball(radius_mm: float, tilt_x: float = 0.0, tilt_y: float = 0.0) -> np.ndarray:
@@ -175,8 +176,8 @@ def test_the_spectrum_is_prysms_and_sees_a_ripple() -> None:
     x, y = np.meshgrid(axis, axis)
     inside = np.hypot(x, y) <= APERTURE
     height = np.where(inside, 1e-3 * np.cos(2 * np.pi * x / 50), np.nan)
-    ripple = of(figure.SurfaceMap(axis, height, 0 * x, 0 * x))
-    found = figure.power_spectrum(ripple, axis, APERTURE)
+    ripple = of(quantities.SurfaceMap(axis, height, 0 * x, 0 * x))
+    found = quantities.power_spectrum(ripple, axis, APERTURE)
     assert 1 / found.frequency_per_mm[np.argmax(found.density_um2_mm2)] == pytest.approx(
         50, rel=0.03
     )
@@ -200,7 +201,7 @@ def test_error_bars_are_the_scatter_of_disturbed_surfaces() -> None:
     true = replace(
         bowl, coeffs_mm=bowl.coeffs_mm + 0.1 * np.eye(ZERNIKE_TERMS)[[4, 5, 6, 9]].sum(axis=0)
     )
-    evaluate = figure.FigureOf(seen(true.height(X, Y)), APERTURE)
+    evaluate = quantities.FigureOf(seen(true.height(X, Y)), APERTURE)
     nominal = np.array(astuple(evaluate(seen(true.height(X, Y))).numbers))
     bars = bars_of(seen(true.height(X, Y)), root @ root.T)
     off = []
@@ -237,7 +238,7 @@ def test_a_covariance_that_is_unknown_gives_no_error_bar() -> None:
 )
 def test_a_figure_of_any_part_of_a_mirror(part: np.ndarray) -> None:
     height = np.where(part & INSIDE, ball(3400.0), np.nan)
-    some = figure.SurfaceMap(AXIS, height, X / 3400, Y / 3400)
+    some = quantities.SurfaceMap(AXIS, height, X / 3400, Y / 3400)
     assert of(some).numbers.radius_of_curvature_mm == pytest.approx(3400, rel=1e-6)
     bars = bars_of(some, 1e-12 * np.eye(ZERNIKE_TERMS), 1e-6)
     assert np.isfinite(astuple(bars.numbers)).all()

@@ -9,7 +9,7 @@ import pytest
 from film_world import FloatArray, MinimalFilm, Ring
 from metrology_truth import film_solution, hencky_depth
 
-from membrane_ctrl.metrology.optics.film_law import FilmLaw, HarmonicCause
+from membrane_ctrl.metrology.film.film_law import FilmLaw, HarmonicCause
 
 RHO = np.linspace(0, 1, 41)
 STIFFNESS = 2.05e5  # 50 µm of 4.1 GPa

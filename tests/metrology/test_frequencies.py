@@ -8,10 +8,10 @@ import numpy as np
 import pytest
 
 from membrane_ctrl.config.optics import CameraConfig, GeometryConfig, OpticsConfig
-from membrane_ctrl.metrology.checked import Checked, RejectedSetError
-from membrane_ctrl.metrology.frames.frame_stack import FrameStack
-from membrane_ctrl.metrology.frequencies import check_frequencies
-from membrane_ctrl.metrology.full import bin_figure
+from membrane_ctrl.metrology.figure.pixel_figure import bin_figure
+from membrane_ctrl.metrology.frame_checks.checked_set import Checked, RejectedSetError
+from membrane_ctrl.metrology.frame_checks.multi_frequency import check_frequencies
+from membrane_ctrl.metrology.phase.frame_stack import FrameStack
 from membrane_ctrl.sim.optics.camera import OpticsRenderer
 from membrane_ctrl.sim.optics.film_shape import typical_film
 from membrane_ctrl.sim.optics.shade import Light, pattern_sequence

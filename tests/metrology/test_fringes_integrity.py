@@ -9,9 +9,9 @@ import pytest
 from rendered_sets import FILM, bench, faulty_set, good_set
 
 from membrane_ctrl.config.schema import CameraConfig, OpticsConfig
-from membrane_ctrl.metrology.checked import Anchor, RejectedSetError, check
-from membrane_ctrl.metrology.frames.frame_stack import FrameStack
-from membrane_ctrl.metrology.optics.surface import Surface
+from membrane_ctrl.metrology.frame_checks.checked_set import Anchor, RejectedSetError, check
+from membrane_ctrl.metrology.phase.frame_stack import FrameStack
+from membrane_ctrl.metrology.rays.surface import Surface
 
 X, Y = np.meshgrid(*[np.linspace(-475, 475, 61)] * 2)
 INSIDE = np.hypot(X, Y) <= 475

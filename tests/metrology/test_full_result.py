@@ -12,17 +12,17 @@ from metrology_truth import cone, v_fold
 from rendered_sets import FILM, bench, good_set, patterns, stack_of
 
 from membrane_ctrl.config.schema import OpticsConfig
-from membrane_ctrl.metrology.checked import check
-from membrane_ctrl.metrology.frames.frame_stack import FrameStack
-from membrane_ctrl.metrology.full import (
+from membrane_ctrl.metrology.figure.pixel_figure import (
     FilmMotion,
     FullResult,
     measure_pixels,
     reconstruct_full,
     tukey,
 )
-from membrane_ctrl.metrology.optics.surface import Surface
-from membrane_ctrl.metrology.reconstruct import HeightFunction, parabola
+from membrane_ctrl.metrology.frame_checks.checked_set import check
+from membrane_ctrl.metrology.phase.frame_stack import FrameStack
+from membrane_ctrl.metrology.rays.surface import Surface
+from membrane_ctrl.metrology.reconstruction.surface_fit import HeightFunction, parabola
 from membrane_ctrl.model.zernike_terms import ZERNIKE_TERMS
 from membrane_ctrl.sim.optics.camera import OpticsRenderer
 from membrane_ctrl.sim.optics.film_shape import Bump, FilmShape, Ripple

@@ -13,7 +13,7 @@ from membrane_ctrl.config.optics import (
     OpticsConfig,
     ScreenPoseConfig,
 )
-from membrane_ctrl.metrology.optics.geometry import Geometry
+from membrane_ctrl.metrology.rays.geometry import Geometry
 
 OPTICS = OpticsConfig()
 GEOMETRY = Geometry.from_config(OPTICS)

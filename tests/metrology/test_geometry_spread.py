@@ -11,7 +11,7 @@ from membrane_ctrl.config.optics import (
     OpticsConfig,
     ScreenPoseConfig,
 )
-from membrane_ctrl.metrology.optics.geometry import Geometry
+from membrane_ctrl.metrology.rays.geometry import Geometry
 from membrane_ctrl.metrology.uncertainty.geometry_spread import (
     GENERAL_NAMES,
     PAPER_SPREAD,

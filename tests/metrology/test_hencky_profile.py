@@ -6,9 +6,10 @@ import numpy as np
 import pytest
 from metrology_truth import hencky_depth
 
-from membrane_ctrl.metrology.optics import film_law, zernike
-from membrane_ctrl.metrology.optics.film_law import FilmLaw
-from membrane_ctrl.metrology.optics.surface import Surface
+from membrane_ctrl.metrology.film import film_law
+from membrane_ctrl.metrology.film.film_law import FilmLaw
+from membrane_ctrl.metrology.numerics import zernike
+from membrane_ctrl.metrology.rays.surface import Surface
 from membrane_ctrl.model.zernike_terms import ZERNIKE_TERMS
 
 RHO = np.linspace(0, 1, 101)

@@ -16,12 +16,12 @@ from metrology_truth import SMALL
 
 from membrane_ctrl.config.optics import SigmasConfig
 from membrane_ctrl.config.schema import OpticsConfig, PatternConfig
-from membrane_ctrl.metrology.calibrate.parameters import NAMES, bench_at
-from membrane_ctrl.metrology.calibrate.solve import general_form
-from membrane_ctrl.metrology.frames import bands
-from membrane_ctrl.metrology.live import LiveReconstructor
-from membrane_ctrl.metrology.optics.geometry import Geometry
-from membrane_ctrl.metrology.phase import fringe_sequence, full_sequence
+from membrane_ctrl.metrology.calibration.solver import general_form
+from membrane_ctrl.metrology.cycle.live_reconstructor import LiveReconstructor
+from membrane_ctrl.metrology.frame_checks import backlight_bands
+from membrane_ctrl.metrology.phase.phase_steps import fringe_sequence, full_sequence
+from membrane_ctrl.metrology.rays.bench_parameters import NAMES, bench_at
+from membrane_ctrl.metrology.rays.geometry import Geometry
 from membrane_ctrl.metrology.uncertainty.geometry_spread import (
     PAPER_SPREAD,
     GeometrySpread,
@@ -455,7 +455,7 @@ def test_bands_that_cannot_be_explained_degrade_the_cycle(monkeypatch: pytest.Mo
     """They stayed in a cycle called ok."""
     live = _live()
     live._bands_rad = np.array([0.3])
-    monkeypatch.setattr(bands, "_UNEXPLAINED", -1.0)
+    monkeypatch.setattr(backlight_bands, "_UNEXPLAINED", -1.0)
     found = live.fringes(*_render("fringes"))
     assert (found.verdict, found.reason[:34]) == ("degraded", "bands of the backlight could not b")
     assert live._bands_rad.size == 1  # looked for again in the next

@@ -9,10 +9,10 @@ import pytest
 from rendered_sets import FILM, bench, patterns, stack_of
 
 from membrane_ctrl.config.schema import OpticsConfig
-from membrane_ctrl.metrology.checked import Checked, check
-from membrane_ctrl.metrology.frames.frame_stack import FrameStack
-from membrane_ctrl.metrology.full import BinFigure, bin_figure
-from membrane_ctrl.metrology.optics.surface import Surface
+from membrane_ctrl.metrology.figure.pixel_figure import BinFigure, bin_figure
+from membrane_ctrl.metrology.frame_checks.checked_set import Checked, check
+from membrane_ctrl.metrology.phase.frame_stack import FrameStack
+from membrane_ctrl.metrology.rays.surface import Surface
 from membrane_ctrl.metrology.uncertainty.geometry_spread import (
     PAPER_SPREAD,
     GeometrySpread,

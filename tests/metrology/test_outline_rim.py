@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 from rendered_sets import FILM, bench, good_set
 
-from membrane_ctrl.metrology.optics import film_law
-from membrane_ctrl.metrology.optics.geometry import Geometry, find_outline, project
-from membrane_ctrl.metrology.optics.surface import pressure_pa, radial_profile
+from membrane_ctrl.metrology.film import film_law
+from membrane_ctrl.metrology.rays.geometry import Geometry, find_outline, project
+from membrane_ctrl.metrology.rays.surface import pressure_pa, radial_profile
 
 
 def white_minus_black() -> np.ndarray:

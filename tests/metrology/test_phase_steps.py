@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from membrane_ctrl.metrology import phase
+from membrane_ctrl.metrology.phase import phase_steps
 
 PHASES = np.linspace(-np.pi, np.pi, 102)[1:-1]  # the end itself may come out on either side
 
@@ -16,20 +16,26 @@ def _frames(shifts: np.ndarray) -> np.ndarray:
 
 @pytest.mark.parametrize("steps", [3, 4, 5, 7, 12])
 def test_equal_steps(steps: int) -> None:
-    z = phase.phasors(_frames(phase.equal_shifts(steps)), phase.equal_shifts(steps))
+    z = phase_steps.phasors(
+        _frames(phase_steps.equal_shifts(steps)), phase_steps.equal_shifts(steps)
+    )
     assert np.angle(z) == pytest.approx(PHASES, abs=1e-12)
     assert np.abs(z) == pytest.approx(70)
 
 
 def test_four_steps_are_the_papers_equation_1() -> None:
-    shifts = phase.equal_shifts(4)
+    shifts = phase_steps.equal_shifts(4)
     i1, i2, i3, i4 = frames = _frames(shifts) + np.random.default_rng(1).normal(0, 3, (4, 100))
-    assert np.angle(phase.phasors(frames, shifts)) == pytest.approx(np.arctan2(i4 - i2, i1 - i3))
+    assert np.angle(phase_steps.phasors(frames, shifts)) == pytest.approx(
+        np.arctan2(i4 - i2, i1 - i3)
+    )
 
 
 def test_unequal_steps_in_any_order() -> None:
     shifts = np.array([4.1, 0.3, 2.2, 1.0, 5.5])
-    assert np.angle(phase.phasors(_frames(shifts), shifts)) == pytest.approx(PHASES, abs=1e-12)
+    assert np.angle(phase_steps.phasors(_frames(shifts), shifts)) == pytest.approx(
+        PHASES, abs=1e-12
+    )
 
 
 @pytest.mark.parametrize(
@@ -37,20 +43,20 @@ def test_unequal_steps_in_any_order() -> None:
 )
 def test_steps_that_determine_nothing_are_refused(shifts: list[float]) -> None:
     with pytest.raises(ValueError, match="do not determine a phase"):
-        phase.step_weights(shifts)
+        phase_steps.step_weights(shifts)
 
 
 def test_residual_names_the_disturbed_frame() -> None:
-    shifts = phase.equal_shifts(5)
+    shifts = phase_steps.equal_shifts(5)
     frames = _frames(shifts)
-    assert phase.step_residual(frames, shifts) == pytest.approx(0, abs=1e-11)
+    assert phase_steps.step_residual(frames, shifts) == pytest.approx(0, abs=1e-11)
     frames[2] += 10
-    assert np.argmax(np.abs(phase.step_residual(frames, shifts)).mean(axis=1)) == 2
+    assert np.argmax(np.abs(phase_steps.step_residual(frames, shifts)).mean(axis=1)) == 2
 
 
-@pytest.mark.parametrize("shifts", [phase.equal_shifts(4), np.array([0.0, 1.2, 2.9, 4.0])])
+@pytest.mark.parametrize("shifts", [phase_steps.equal_shifts(4), np.array([0.0, 1.2, 2.9, 4.0])])
 def test_predicted_noise_is_the_scatter_seen(shifts: np.ndarray) -> None:
     noise = np.random.default_rng(2).normal(0, 0.5, (len(shifts), 400, 100))
-    seen = np.angle(phase.phasors(_frames(shifts)[:, None] + noise, shifts)) - PHASES
+    seen = np.angle(phase_steps.phasors(_frames(shifts)[:, None] + noise, shifts)) - PHASES
     scatter = np.sqrt(np.mean(np.angle(np.exp(1j * seen)) ** 2))
-    assert phase.phase_sigma_rad(shifts, 0.5, 70) == pytest.approx(scatter, rel=0.02)
+    assert phase_steps.phase_sigma_rad(shifts, 0.5, 70) == pytest.approx(scatter, rel=0.02)

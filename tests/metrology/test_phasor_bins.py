@@ -7,10 +7,10 @@ import math
 import numpy as np
 import pytest
 
-from membrane_ctrl.metrology.motion import combine_steps, worth_correcting
-from membrane_ctrl.metrology.optics.compiled import kernel
-from membrane_ctrl.metrology.phase import equal_shifts, step_weights
-from membrane_ctrl.metrology.phasor import FOLLOWED_ROWS, Binner, arctan2, track
+from membrane_ctrl.metrology.numerics.compiled import kernel
+from membrane_ctrl.metrology.phase.bin_phasors import FOLLOWED_ROWS, Binner, arctan2, track
+from membrane_ctrl.metrology.phase.phase_steps import equal_shifts, step_weights
+from membrane_ctrl.metrology.reconstruction.film_motion import combine_steps, worth_correcting
 
 RNG = np.random.default_rng(7)
 

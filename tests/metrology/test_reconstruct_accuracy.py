@@ -14,12 +14,19 @@ from membrane_ctrl.config.optics import (
     OpticsConfig,
     ScreenPoseConfig,
 )
-from membrane_ctrl.metrology.bins import parameter_covariance, slope_per_screen
-from membrane_ctrl.metrology.optics.geometry import Geometry
-from membrane_ctrl.metrology.optics.kernels import invert
-from membrane_ctrl.metrology.optics.surface import Surface, sag_gradient
-from membrane_ctrl.metrology.optics.zernike import gradients
-from membrane_ctrl.metrology.reconstruct import Fit, NormalMatrix, Points, Tracer, parabola, solve
+from membrane_ctrl.metrology.numerics.zernike import gradients
+from membrane_ctrl.metrology.rays.geometry import Geometry
+from membrane_ctrl.metrology.rays.kernels import invert
+from membrane_ctrl.metrology.rays.surface import Surface, sag_gradient
+from membrane_ctrl.metrology.reconstruction.bin_grid import parameter_covariance, slope_per_screen
+from membrane_ctrl.metrology.reconstruction.surface_fit import (
+    Fit,
+    NormalMatrix,
+    Points,
+    Tracer,
+    parabola,
+    solve,
+)
 from membrane_ctrl.model.zernike_terms import NOLL_INDICES, ZERNIKE_TERMS
 
 GEOMETRY = Geometry.from_config(OPTICS)

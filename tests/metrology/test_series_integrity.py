@@ -9,8 +9,12 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from membrane_ctrl.metrology.frames.series_integrity import AxisSeries, SeriesCheck, check_series
-from membrane_ctrl.metrology.phase import equal_shifts
+from membrane_ctrl.metrology.frame_checks.frequency_series import (
+    AxisSeries,
+    SeriesCheck,
+    check_series,
+)
+from membrane_ctrl.metrology.phase.phase_steps import equal_shifts
 
 PERIODS = np.array([0.9, 3.9, 15.9])
 SHIFTS = -equal_shifts(4)

@@ -10,9 +10,17 @@ import pytest
 
 from membrane_ctrl.measure import measure as sofast
 from membrane_ctrl.measure.measure import SHIFTS_RAD, lit_pixels, series_of
-from membrane_ctrl.metrology.frames.integrity import closure, closure_with_level, closure_with_phase
-from membrane_ctrl.metrology.frames.series_integrity import check_series, predicted_phase, unwrap
-from membrane_ctrl.metrology.phase import phasors
+from membrane_ctrl.metrology.frame_checks.frame_faults import (
+    closure,
+    closure_with_level,
+    closure_with_phase,
+)
+from membrane_ctrl.metrology.frame_checks.frequency_series import (
+    check_series,
+    predicted_phase,
+    unwrap,
+)
+from membrane_ctrl.metrology.phase.phase_steps import phasors
 from tests.support import sofast_facet
 from tests.support.facet import measure_on, solve_facet
 from tests.support.sofast_facet import decode, sight, wrapped_phases

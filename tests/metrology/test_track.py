@@ -13,9 +13,9 @@ from numpy.typing import NDArray
 from firmware_iface.roles import Pattern
 from membrane_ctrl.config.schema import CameraConfig, OpticsConfig
 from membrane_ctrl.measure.measurement import Figures, SetFigure
-from membrane_ctrl.metrology.track.scene import CrossedScene, scene_of
-from membrane_ctrl.metrology.track.tracked import Jumps, LostOrders, TrackedFrame, steadied
-from membrane_ctrl.metrology.track.tracker import Tracker
+from membrane_ctrl.metrology.tracking.crossed_scene import CrossedScene, scene_of
+from membrane_ctrl.metrology.tracking.tracked_frame import Jumps, LostOrders, TrackedFrame, steadied
+from membrane_ctrl.metrology.tracking.tracker import Tracker
 from membrane_ctrl.model.zernike_terms import NOLL_INDICES, ZERNIKE_TERMS
 from membrane_ctrl.sim.optics.camera import OpticsRenderer
 from membrane_ctrl.sim.optics.film_shape import FilmShape, noll_orders, typical_film

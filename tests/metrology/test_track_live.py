@@ -13,10 +13,10 @@ from numpy.typing import NDArray
 
 from firmware_iface.roles import Pattern
 from membrane_ctrl.config.schema import CameraConfig, Config, OpticsConfig
-from membrane_ctrl.metrology import phase
-from membrane_ctrl.metrology.live import LiveReconstructor
-from membrane_ctrl.metrology.optics.film_law import zernike_projection
-from membrane_ctrl.metrology.track.live import (
+from membrane_ctrl.metrology.cycle.live_reconstructor import LiveReconstructor
+from membrane_ctrl.metrology.film.film_law import zernike_projection
+from membrane_ctrl.metrology.phase import phase_steps
+from membrane_ctrl.metrology.tracking.live_tracker import (
     COVARIANCE_S,
     LOST_S,
     REJECTED_S,
@@ -24,7 +24,7 @@ from membrane_ctrl.metrology.track.live import (
     Stethoscope,
     _estimate,
 )
-from membrane_ctrl.metrology.track.tracked import rejected_frame
+from membrane_ctrl.metrology.tracking.tracked_frame import rejected_frame
 from membrane_ctrl.model.run_events import Vibrations
 from membrane_ctrl.model.shape_estimate import ShapeEstimate, pack_estimate, unpack_estimate
 from membrane_ctrl.model.zernike_terms import ZERNIKE_TERMS
@@ -59,7 +59,9 @@ class Bench:
         self.picture: NDArray[np.uint8] = np.zeros(0, np.uint8)
 
     def full(self, moved_um: float = 0.0) -> ShapeEstimate:
-        frames = [self.renderer.render(p, moved_um) for p in phase.full_sequence(OPTICS.pattern)]
+        frames = [
+            self.renderer.render(p, moved_um) for p in phase_steps.full_sequence(OPTICS.pattern)
+        ]
         self.time_s += 2.0
         return self.tracker.full(frames, self.time_s + 0.1 * np.arange(18), np.full(18, moved_um))
 
@@ -239,7 +241,9 @@ def test_a_hold_hears_the_films_vibrations_and_no_others() -> None:
     modes = tuple(replace(mode, amplitude_nm=20.0) for mode in DRUM_MODES)
     renderer = OpticsRenderer(optics, FILM, seed=3, modes=modes)
     film_um, listener, told = held_um(126.0), Stethoscope(), []
-    still = [renderer.render(p, float(film_um[0])) for p in phase.full_sequence(optics.pattern)]
+    still = [
+        renderer.render(p, float(film_um[0])) for p in phase_steps.full_sequence(optics.pattern)
+    ]
     assert tracker.full(still, 0.1 * np.arange(18), np.full(18, math.nan)).verdict == "ok"
     time_s = 2.0
     while time_s < 125.0:

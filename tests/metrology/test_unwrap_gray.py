@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from membrane_ctrl.config.schema import PatternConfig
-from membrane_ctrl.metrology import phase as unwrap
+from membrane_ctrl.metrology.phase import phase_steps as unwrap
 
 S = np.linspace(0, 8, 4001)[:-1] + 1e-4  # place on the pattern in periods, from its low edge
 

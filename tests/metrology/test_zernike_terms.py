@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from prysm.polynomials import noll_to_nm, zernike_nm
 
-from membrane_ctrl.metrology.optics import zernike
+from membrane_ctrl.metrology.numerics import zernike
 from membrane_ctrl.model.zernike_terms import NOLL_INDICES, ZERNIKE_DEGREE, ZERNIKE_TERMS
 
 RNG = np.random.default_rng(3)

@@ -5,8 +5,10 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from membrane_ctrl.metrology.optics import film_law, kernels, zernike
-from membrane_ctrl.metrology.optics.surface import PARAMETERS
+from membrane_ctrl.metrology.film import film_law
+from membrane_ctrl.metrology.numerics import zernike
+from membrane_ctrl.metrology.rays import kernels
+from membrane_ctrl.metrology.rays.surface import PARAMETERS
 from membrane_ctrl.model.shape_estimate import ESTIMATE_BYTES_MAX, pack_estimate
 from membrane_ctrl.model.zernike_terms import (
     COVARIANCE_UPPER_SIZE,

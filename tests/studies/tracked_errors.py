@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from membrane_ctrl.cli import run
-from membrane_ctrl.metrology.optics import zernike
+from membrane_ctrl.metrology.numerics import zernike
 from tests.worlds.crossed_fringes import RADIUS_MM, Array, CrossedWorld
 
 # One change of the world each; 0 switches an effect off.

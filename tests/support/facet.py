@@ -15,7 +15,7 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from membrane_ctrl.metrology.optics.geometry import Geometry
+from membrane_ctrl.metrology.rays.geometry import Geometry
 
 # A general paraboloid from slopes: plain least squares, or robust against glints, dust and
 # turned-down edges.

@@ -23,9 +23,9 @@ from membrane_ctrl.measure.measure import (
     item,
     open_file,
 )
-from membrane_ctrl.metrology.frames.series_integrity import Unwrapped, unwrap
-from membrane_ctrl.metrology.optics.geometry import Face, Geometry
-from membrane_ctrl.metrology.phase import phasors
+from membrane_ctrl.metrology.frame_checks.frequency_series import Unwrapped, unwrap
+from membrane_ctrl.metrology.phase.phase_steps import phasors
+from membrane_ctrl.metrology.rays.geometry import Face, Geometry
 from tests.support.facet import Sight
 
 FloatArray = NDArray[np.float64]

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.signal import lfilter
 
-from membrane_ctrl.metrology.track.modes import VibrationMode
+from membrane_ctrl.metrology.vibrations.mode_search import VibrationMode
 from membrane_ctrl.model.zernike_terms import NOLL_INDICES, ZERNIKE_DEGREE, ZERNIKE_TERMS
 
 FloatArray = NDArray[np.float64]

@@ -10,8 +10,8 @@ from __future__ import annotations
 import numpy as np
 
 from membrane_ctrl.config.schema import Config
-from membrane_ctrl.metrology.live import LiveReconstructor
-from membrane_ctrl.metrology.phase import fringe_sequence, full_sequence
+from membrane_ctrl.metrology.cycle.live_reconstructor import LiveReconstructor
+from membrane_ctrl.metrology.phase.phase_steps import fringe_sequence, full_sequence
 from membrane_ctrl.model.shape_estimate import ShapeEstimate
 from membrane_ctrl.sim.optics.camera import TwinOptics
 from membrane_ctrl.sim.plant import Plant

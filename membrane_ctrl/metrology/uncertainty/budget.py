@@ -15,21 +15,23 @@ from typing import Any
 import numpy as np
 
 from membrane_ctrl.config.optics import OpticsConfig, SigmasConfig
-from membrane_ctrl.metrology import motion, phase
-from membrane_ctrl.metrology.calibrate import parameters, propagate, residuals
-from membrane_ctrl.metrology.full import FullResult
-from membrane_ctrl.metrology.optics.geometry import Geometry
-from membrane_ctrl.metrology.optics.surface import (
+from membrane_ctrl.metrology.calibration import figure_uncertainty
+from membrane_ctrl.metrology.figure.pixel_figure import FullResult
+from membrane_ctrl.metrology.phase import phase_steps
+from membrane_ctrl.metrology.rays import bench_parameters, forward_model
+from membrane_ctrl.metrology.rays.geometry import Geometry
+from membrane_ctrl.metrology.rays.surface import (
     PARAMETERS,
     Surface,
     parameter_to_coeffs,
     sag_gradient,
 )
-from membrane_ctrl.metrology.reconstruct import Points, Tracer
+from membrane_ctrl.metrology.reconstruction import film_motion
+from membrane_ctrl.metrology.reconstruction.surface_fit import Points, Tracer
+from membrane_ctrl.metrology.reconstruction.zonal_map import ResidualGrid
 from membrane_ctrl.metrology.uncertainty import monte_carlo
 from membrane_ctrl.metrology.uncertainty.geometry_spread import GENERAL_NAMES, GeometrySpread
 from membrane_ctrl.metrology.uncertainty.monte_carlo import TrialBench
-from membrane_ctrl.metrology.zonal import ResidualGrid
 from membrane_ctrl.model.arrays import FloatArray
 
 _GLASS_INDEX = 1.5
@@ -141,8 +143,11 @@ def _products(disc: float) -> dict[str, FloatArray]:
     """Means (parameters, parameters) over a disc of products of what two parameters do to sag,
     height and figure.
     """
-    heights, plane = propagate.disc(disc)
-    basis = {"height_rms_um": heights, "figure_rms_um": propagate.without_plane(heights, plane)}
+    heights, plane = figure_uncertainty.disc(disc)
+    basis = {
+        "height_rms_um": heights,
+        "figure_rms_um": figure_uncertainty.without_plane(heights, plane),
+    }
     return {"sag_um": np.outer(sag_gradient(), sag_gradient())} | {
         n: b.T @ b / len(b) for n, b in basis.items()
     }
@@ -156,7 +161,7 @@ def geometry_sources(
     """
     jacobian = widened * monte_carlo.geometry_jacobian(bench, spread)
     linked = np.count_nonzero(spread.covariance, axis=1) > 1
-    says = {parameter.name: parameter.says for parameter in parameters.ALL}
+    says = {parameter.name: parameter.says for parameter in bench_parameters.ALL}
     if linked.any():
         names = [name for name, is_linked in zip(spread.names, linked, strict=True) if is_linked]
         several = "calibrated" if set(names) & set(GENERAL_NAMES) else ", ".join(names)
@@ -190,13 +195,15 @@ def bench_sources(bench: TrialBench, sigmas: SigmasConfig) -> Iterator[Source]:
     yield _disturbed(
         bench, "air_k_per_m", "vertical temperature gradient of the air", sigmas.air_k_per_m, air_mm
     )
-    grown, values = _STEEL_PER_K * sigmas.temperature_k, np.zeros(len(parameters.NAMES))
+    grown, values = _STEEL_PER_K * sigmas.temperature_k, np.zeros(len(bench_parameters.NAMES))
     for name, length in (
         ("a_mm", nominal.geometry.pinhole_mm),
         ("b_mm", nominal.geometry.screen_origin_mm),
     ):
-        values[parameters.NAMES.index(name)] = grown * float(np.linalg.norm(length))
-    effect = bench.solve(parameters.bench_at(nominal.geometry, values)) - bench.surface.parameters
+        values[bench_parameters.NAMES.index(name)] = grown * float(np.linalg.norm(length))
+    effect = (
+        bench.solve(bench_parameters.bench_at(nominal.geometry, values)) - bench.surface.parameters
+    )
     says = "growth of the frame since its distances were measured"
     yield Source("temperature_k", says, sigmas.temperature_k, effect[:, None])
 
@@ -270,11 +277,11 @@ def moved_film(bench: TrialBench, displacement_um: float) -> TrialBench:
 def moves_mm(bench: TrialBench) -> FloatArray:
     """Change (2, n) of the screen points per µm of the film's displacement."""
     tracer, points = _stand(bench, bench.geometry().geometry)
-    return motion.sensitivity_mm_per_um(tracer, points, bench.surface)
+    return film_motion.sensitivity_mm_per_um(tracer, points, bench.surface)
 
 
 def predicted_mm(
-    bench: TrialBench, there: parameters.BenchGeometry, surface: Surface
+    bench: TrialBench, there: bench_parameters.BenchGeometry, surface: Surface
 ) -> FloatArray:
     """Where (2, n) a surface on another bench sends the rays of the points."""
     tracer, points = _stand(bench, there.geometry)
@@ -336,12 +343,12 @@ def frame_effects(
     """Of single frames; `light` (2, n) and `harmonics` (2, 2), second and third of x and y, over
     the amplitude.
     """
-    scale, moves = phase.mm_per_rad(optics.pattern), moves_mm(bench)
+    scale, moves = phase_steps.mm_per_rad(optics.pattern), moves_mm(bench)
     light, orders = np.broadcast_to(light, bench.screen_mm.shape), (2, 3)
     effects: tuple[list[FloatArray], ...] = ([], [], [], [])
     for axis, shifts in enumerate(shifts_rad):
-        angle = bench.screen_mm[axis] / scale + phase.centre_phase_rad(optics.pattern)
-        _, cosine, sine = phase.step_weights(shifts)
+        angle = bench.screen_mm[axis] / scale + phase_steps.centre_phase_rad(optics.pattern)
+        _, cosine, sine = phase_steps.step_weights(shifts)
         for k, shift in enumerate(shifts):
             # the frame's error over the fringes' amplitude turns the phasor
             turned = -scale * (cosine[k] * np.sin(angle) - sine[k] * np.cos(angle))
@@ -449,6 +456,6 @@ class Patches:
         The patches are those of the mirror, whatever was seen: two sets of a bench have the same
         ones. `inverse` is that of the fit's normal matrix.
         """
-        _, of_x, of_y = residuals.basis(*self.places_mm / radius_mm)
+        _, of_x, of_y = forward_model.basis(*self.places_mm / radius_mm)
         x, y = self.count * self.slopes
         return np.asarray(inverse @ ((of_x * x + of_y * y) / radius_mm))

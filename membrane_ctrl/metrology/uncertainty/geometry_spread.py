@@ -12,12 +12,14 @@ import cv2
 import numpy as np
 
 from membrane_ctrl.config.optics import CameraPoseConfig, GeometryConfig, OpticsConfig, Vector3
-from membrane_ctrl.metrology.calibrate import parameters
-from membrane_ctrl.metrology.optics.geometry import Geometry
+from membrane_ctrl.metrology.rays import bench_parameters
+from membrane_ctrl.metrology.rays.geometry import Geometry
 from membrane_ctrl.model.arrays import ArrayLike, FloatArray
 
-POSE_NAMES = tuple(parameter.name for parameter in parameters.POSE)
-OPTIONAL_NAMES = tuple(parameter.name for parameter in parameters.OPTIONAL)  # lens, bow, pitch
+POSE_NAMES = tuple(parameter.name for parameter in bench_parameters.POSE)
+OPTIONAL_NAMES = tuple(
+    parameter.name for parameter in bench_parameters.OPTIONAL
+)  # lens, bow, pitch
 SHORT_NAMES = POSE_NAMES[:3]
 GENERAL_NAMES = tuple(
     f"{thing}_{move}_{axis}_{unit}"
@@ -145,7 +147,7 @@ def changed(geometry: GeometryConfig, names: tuple[str, ...], change: ArrayLike)
 
 def moved_bench(
     optics: OpticsConfig, names: tuple[str, ...], change: ArrayLike
-) -> parameters.BenchGeometry:
+) -> bench_parameters.BenchGeometry:
     """The bench with its poses, lens, bow and pitch changed by (k,) amounts.
 
     Raises ValueError if the names belong to another form of geometry.
@@ -153,8 +155,8 @@ def moved_bench(
     amounts = dict(zip(names, np.asarray(change, float).tolist(), strict=True))
     general = tuple(name for name in names if name in GENERAL_NAMES)
     geometry = changed(optics.geometry, general, [amounts.pop(name) for name in general])
-    values = np.array([amounts.get(name, 0.0) for name in parameters.NAMES])
-    return parameters.bench_at(
+    values = np.array([amounts.get(name, 0.0) for name in bench_parameters.NAMES])
+    return bench_parameters.bench_at(
         Geometry.from_config(optics.model_copy(update={"geometry": geometry})), values
     )
 

@@ -18,12 +18,14 @@ from dataclasses import dataclass
 import numpy as np
 
 from membrane_ctrl.config.schema import OpticsConfig
-from membrane_ctrl.metrology import bins, full, reconstruct
-from membrane_ctrl.metrology.calibrate.parameters import BenchGeometry
-from membrane_ctrl.metrology.checked import Checked
-from membrane_ctrl.metrology.optics import film_law, zernike
-from membrane_ctrl.metrology.optics.geometry import Geometry
-from membrane_ctrl.metrology.optics.surface import PARAMETERS, Surface, parameter_to_coeffs
+from membrane_ctrl.metrology.figure import pixel_figure
+from membrane_ctrl.metrology.film import film_law
+from membrane_ctrl.metrology.frame_checks.checked_set import Checked
+from membrane_ctrl.metrology.numerics import zernike
+from membrane_ctrl.metrology.rays.bench_parameters import BenchGeometry
+from membrane_ctrl.metrology.rays.geometry import Geometry
+from membrane_ctrl.metrology.rays.surface import PARAMETERS, Surface, parameter_to_coeffs
+from membrane_ctrl.metrology.reconstruction import bin_grid, surface_fit
 from membrane_ctrl.metrology.uncertainty.geometry_spread import GeometrySpread, moved_bench
 from membrane_ctrl.model.arrays import ArrayLike, BoolArray, FloatArray
 
@@ -47,14 +49,14 @@ class TrialBench:
     sigma_mm: FloatArray  # (2, n): 1 sigma of noise there
     t_mm: FloatArray  # (n,): lengths of their rays
     surface: Surface
-    normal: reconstruct.NormalMatrix
+    normal: surface_fit.NormalMatrix
 
     @classmethod
     def of(
         cls,
         optics: OpticsConfig,
         checked: Checked,
-        figure: full.BinFigure,
+        figure: pixel_figure.BinFigure,
         count: int = TRIAL_POINTS,
     ) -> "TrialBench":
         """Of a set's figure, its points thinned to about `count`."""
@@ -73,9 +75,9 @@ class TrialBench:
     def of_points(
         cls,
         optics: OpticsConfig,
-        tracer: reconstruct.Tracer,
+        tracer: surface_fit.Tracer,
         surface: Surface,
-        points: reconstruct.Points,
+        points: surface_fit.Points,
         place_px: FloatArray,
         sigma_mm: FloatArray,
         count: int,
@@ -113,11 +115,11 @@ class TrialBench:
         one.
         """
         geometry, screen_mm = there.geometry, there.pitch * (self.screen_mm + disturbance_mm)
-        tracer = reconstruct.Tracer(geometry, self.surface.radius_mm, self.vertex_z_mm)
-        points = reconstruct.Points.of(geometry.rays(self.column_px, self.row_px), screen_mm)
+        tracer = surface_fit.Tracer(geometry, self.surface.radius_mm, self.vertex_z_mm)
+        points = surface_fit.Points.of(geometry.rays(self.column_px, self.row_px), screen_mm)
         points.t_mm[:] = self.t_mm
         tracer.intersect(points, self.surface, newton=3)
-        steps = 1 if linear else reconstruct.MAX_ITERATIONS
+        steps = 1 if linear else surface_fit.MAX_ITERATIONS
         with np.errstate(
             over="ignore", invalid="ignore"
         ):  # of a fit that diverges, which is reported below
@@ -125,7 +127,7 @@ class TrialBench:
             # centimetres
             try:
                 normal = tracer.normal_matrix(points)
-                fit = reconstruct.solve(
+                fit = surface_fit.solve(
                     tracer, points, self.surface, normal=normal, max_iterations=steps
                 )
             except ValueError:
@@ -140,7 +142,7 @@ class TrialBench:
 
     def slope_variance(self) -> FloatArray:
         """(2,) variance of an x and of a y slope from the noise."""
-        gain = bins.slope_per_screen(
+        gain = bin_grid.slope_per_screen(
             Geometry.from_config(self.optics), self.surface.radius_mm, self.surface.sag_mm
         )
         return np.asarray(gain @ np.mean(np.square(self.sigma_mm), axis=1))
@@ -269,7 +271,7 @@ def geometry_jacobian(bench: TrialBench, spread: GeometrySpread) -> FloatArray:
 
 def noise_covariance(bench: TrialBench) -> FloatArray:
     """Covariance (parameters, parameters) in mm^2 from the noise of the pixels."""
-    return bins.parameter_covariance(bench.normal, bench.slope_variance())
+    return bin_grid.parameter_covariance(bench.normal, bench.slope_variance())
 
 
 def geometry_covariance(jacobian: FloatArray, spread: GeometrySpread) -> FloatArray:

@@ -25,7 +25,7 @@ from typing import Any
 import numpy as np
 
 from membrane_ctrl.measure.results import write_figure, write_json
-from membrane_ctrl.metrology.optics.film_law import FilmLaw
+from membrane_ctrl.metrology.film.film_law import FilmLaw
 from membrane_ctrl.model import errors, files, program
 from membrane_ctrl.model.arrays import FloatArray
 from membrane_ctrl.run_files.run import Run, open_run

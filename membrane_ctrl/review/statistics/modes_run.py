@@ -12,8 +12,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from membrane_ctrl.measure.results import read_arrays, write_figure, write_json
-from membrane_ctrl.metrology.optics import zernike
-from membrane_ctrl.metrology.track.modes import (
+from membrane_ctrl.metrology.numerics import zernike
+from membrane_ctrl.metrology.vibrations.mode_search import (
     LEAST_RATE_HZ,
     LEAST_S,
     MOVED,

@@ -1,0 +1,1 @@
+"""Self-calibration: the bench's geometry from capture sets of the mirror."""

@@ -1,0 +1,321 @@
+"""Is the model right, and do the sets belong together? All of it from the equations at the
+solution.
+
+Every test is the same: by how much does the sum of squares fall if more is free? With good data the
+fall is a chi-square with as many degrees of freedom. Freed in turn: a parameter that was held (a
+bent screen, a lens that distorts), the camera's pose for some of the sets, everything for one set.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from scipy.stats import chi2
+
+from membrane_ctrl.metrology.calibration import figure_uncertainty, normal_equations, solver
+from membrane_ctrl.metrology.rays import bench_parameters, forward_model
+from membrane_ctrl.model.arrays import FloatArray, IntArray
+
+SURE = 1e-6  # probability that good data look as bad
+_CAMERA = tuple(
+    bench_parameters.NAMES.index(name)
+    for name in ("camera_yaw_deg", "camera_pitch_deg", "camera_roll_deg")
+)
+_CAMERA_SIGMA_DEG = 1.0  # of a bump: a hand on the mount
+_CREEP_SIGMA_MM = 1.0
+_LEAST_TO_CREEP = 3  # sets
+_LASER_SIGMA = 1.0  # of its scale when the optics alone determine it
+
+
+@dataclass(frozen=True)
+class Suspect:
+    """A held parameter that the sets want to move."""
+
+    name: str
+    value: float  # its value if it were free
+    sigma: float
+    fall: float  # of the sum of squares
+    figure_um: float  # effect of freeing it on a surface, RMS without the best plane
+
+    @property
+    def sure(self) -> bool:
+        """Whether noise hardly ever causes as large a fall."""
+        return bool(chi2.sf(self.fall, 1) < SURE)
+
+
+@dataclass(frozen=True)
+class LaserScale:
+    """Scale of the laser and its sigma by the optics alone (1: good); the fall is against the
+    prior.
+    """
+
+    value: float
+    sigma: float
+    fall: float
+
+    @property
+    def sure(self) -> bool:
+        """As for `Suspect`: whether it is off by more than its data sheet allows."""
+        return bool(
+            chi2.sf(((self.value - 1) / np.hypot(self.sigma, bench_parameters.LASER.sigma)) ** 2, 1)
+            < SURE
+        )
+
+
+@dataclass(frozen=True)
+class CameraBump:
+    """The camera's pose differs for some of the sets."""
+
+    sets: tuple[int, ...]
+    turned_deg: tuple[float, float, float]
+    fall: float
+
+    @property
+    def sure(self) -> bool:
+        """As for `Suspect`."""
+        return bool(chi2.sf(self.fall, len(_CAMERA)) < SURE)
+
+
+@dataclass(frozen=True)
+class MountCreep:
+    """Camera or screen moved evenly from the first set to the last."""
+
+    name: str  # of the parameter that explains most of it alone
+    amount: float  # by which that one changed
+    fall: float
+    freedom: int
+
+    @property
+    def sure(self) -> bool:
+        """As for `Suspect`."""
+        return bool(chi2.sf(self.fall, self.freedom) < SURE)
+
+
+@dataclass(frozen=True)
+class LeftOut:
+    """One set against the geometry of all others."""
+
+    index: int  # of the set
+    fall: float  # of the sum of squares, when this set has a geometry and a ring of its own
+    freedom: int  # numbers that the set then determines by itself
+
+    @property
+    def disagrees(self) -> bool:
+        """As for `Suspect.sure`."""
+        return bool(chi2.sf(self.fall, self.freedom) < SURE)
+
+
+def suspects(solution: solver.Solution) -> tuple[Suspect, ...]:
+    """Held optical parameters that would remove more than noise from the residuals, the strongest
+    first.
+    """
+    sums = np.sum(_reduced(solution), axis=0)
+    response = figure_uncertainty.surface_response(solution, solution.problem.middle)[:, :-1]
+    flat = figure_uncertainty.without_plane(*figure_uncertainty.disc(1.0))
+    out = []
+    for name in bench_parameters.NAMES[len(bench_parameters.POSE) : bench_parameters.OPTICAL]:
+        if name in solution.free:
+            continue
+        k = bench_parameters.NAMES.index(name)
+        freed = solution.problem.sigmas.copy()
+        freed[k] = bench_parameters.usual_sigma(name)
+        moved = solver.step(sums + solution.known(freed), freed)
+        fall = _squares(sums, solution) - moved.squares
+        sigma = float(np.sqrt(moved.covariance[k, k]))
+        figure_um = 1e3 * float(np.std(flat @ (response @ moved.delta[: bench_parameters.OPTICAL])))
+        out.append(Suspect(name, float(moved.delta[k]), sigma, fall, figure_um))
+    return tuple(sorted((s for s in out if s.sure), key=lambda s: -s.fall))
+
+
+def laser_scale(solution: solver.Solution) -> LaserScale:
+    """The laser's scale without a prior."""
+    k = bench_parameters.NAMES.index(bench_parameters.LASER.name)
+    free = solution.problem.sigmas.copy()
+    free[k] = _LASER_SIGMA
+    sums = np.sum(_reduced(solution), axis=0)
+    moved = solver.step(sums + solution.known(free), free)
+    fall = _squares(sums, solution) - moved.squares
+    return LaserScale(
+        1 + float(solution.common[k] + moved.delta[k]), float(np.sqrt(moved.covariance[k, k])), fall
+    )
+
+
+def left_out(solution: solver.Solution) -> tuple[LeftOut, ...]:
+    """Each set against the others."""
+    reduced, sigmas = _reduced(solution), solution.problem.sigmas
+    own = solution.known(sigmas)
+    everything = solver.step(np.sum(reduced, axis=0) + own, sigmas).squares
+    out = []
+    for k, this in enumerate(reduced):
+        others = np.sum([r for j, r in enumerate(reduced) if j != k], axis=0) + own
+        alone, freedom = _alone(this, sigmas)
+        fall = everything - solver.step(others, sigmas).squares - alone
+        out.append(LeftOut(k, float(fall), freedom))
+    return tuple(out)
+
+
+def elsewhere(solution: solver.Solution) -> list[tuple[int, float]]:
+    """Sets beside which the screen was moved, but not as stated: each with the fall if that place
+    is free.
+    """
+    reduced, out = _reduced(solution), []
+    everything, moved = (
+        _squares(np.sum(reduced, axis=0), solution),
+        np.arange(bench_parameters.SCREEN_MOVE),
+    )
+    for k, each in enumerate(solution.equations):
+        free = each.sums.copy()
+        phases, state = solution.problem.sets[k], solution.states[k]
+        for sums, known, move in zip(
+            each.elsewhere, phases.elsewhere, state.elsewhere, strict=True
+        ):
+            told, sigmas = known.known(solution.problem.references.laser_sigma_um)[:, moved]
+            hand = np.hstack([np.eye(moved.size), (told - move[moved])[:, None]]) / sigmas[:, None]
+            own, without_hand = np.append(moved, len(sums) - 1), sums.copy()
+            without_hand[np.ix_(own, own)] -= hand.T @ hand
+            free += normal_equations.without(
+                without_hand, forward_model.MOVED
+            ) - normal_equations.without(sums, forward_model.MOVED)
+        others = [*reduced[:k], replace(each, sums=free).reduced(), *reduced[k + 1 :]]
+        fall = everything - _squares(np.sum(others, axis=0), solution)
+        if chi2.sf(fall, moved.size) < SURE:
+            out.append((k, float(fall)))
+    return out
+
+
+def bumps(solution: solver.Solution) -> tuple[CameraBump, ...]:
+    """Turns of the camera for one set, or from one set on; only sure ones, the strongest first."""
+    count = len(solution.states)
+    groups = {(k,) for k in range(count)} | {tuple(range(k, count)) for k in range(1, count)}
+    out = []
+    for group in sorted(groups):
+        share = np.isin(np.arange(count), group).astype(float)
+        amounts, fall = _moved_by(
+            solution, _CAMERA, share, np.full(len(_CAMERA), _CAMERA_SIGMA_DEG)
+        )
+        yaw, pitch, roll = amounts
+        out.append(CameraBump(group, (yaw, pitch, roll), fall))
+    return tuple(sorted((bump for bump in out if bump.sure), key=lambda bump: -bump.fall))
+
+
+def creep(solution: solver.Solution) -> MountCreep | None:
+    """Whether camera or screen crept from the first set to the last, and what changed most; None if
+    not sure.
+    """
+    count, poses = len(solution.states), tuple(range(len(bench_parameters.POSE)))
+    if count < _LEAST_TO_CREEP:
+        return None
+    share = np.linspace(-0.5, 0.5, count)
+    sigmas = np.array(
+        [_CAMERA_SIGMA_DEG if p.unit == "deg" else _CREEP_SIGMA_MM for p in bench_parameters.POSE]
+    )
+    whole = _moved_by(solution, poses, share, sigmas)[1]
+    single = [_moved_by(solution, (k,), share, sigmas[[k]]) for k in poses]
+    most = max(poses, key=lambda k: single[k][1])
+    found = MountCreep(bench_parameters.NAMES[most], single[most][0][0], whole, len(poses))
+    return found if found.sure else None
+
+
+def _moved_by(
+    solution: solver.Solution, columns: tuple[int, ...], share: FloatArray, sigmas: FloatArray
+) -> tuple[tuple[float, ...], float]:
+    """Amounts by which parameters moved in the sets, each by its share, and the fall of the sum of
+    squares.
+    """
+    reduced, hand = _reduced(solution), solution.problem.sigmas
+    sums = np.sum(
+        [_with_more(each, columns, part) for each, part in zip(reduced, share, strict=True)], axis=0
+    )
+    known = _with_more(solution.known(hand), columns, 0.0)
+    extra = np.arange(normal_equations.COMMON, normal_equations.COMMON + len(columns))
+    known[extra, extra] += 1 / sigmas**2
+    kept = np.append(
+        hand > 0,
+        np.ones(normal_equations.COMMON - len(bench_parameters.NAMES) + len(columns), bool),
+    )
+    delta, squares = _solved(sums + known, np.flatnonzero(kept))
+    return tuple(delta[-len(columns) :].tolist()), _squares(
+        np.sum(reduced, axis=0), solution
+    ) - squares
+
+
+def without(solution: solver.Solution, index: int) -> solver.Solution:
+    """The solution without one set, to first order: its equations and state are left out, the
+    unknowns moved.
+    """
+    keep = [k for k in range(len(solution.states)) if k != index]
+    problem = replace(solution.problem, sets=tuple(solution.problem.sets[k] for k in keep))
+    linear = tuple(solution.equations[k] for k in keep)
+    sigmas = problem.sigmas
+    moved = solver.step(
+        np.sum([each.reduced() for each in linear], axis=0) + solution.known(sigmas), sigmas
+    )
+    common = solution.common + moved.delta
+    return replace(
+        solution,
+        problem=problem,
+        values=common[: len(bench_parameters.NAMES)],
+        common=common,
+        states=tuple(solution.states[k] for k in keep),
+        equations=linear,
+        covariance=moved.covariance,
+    )
+
+
+def _reduced(solution: solver.Solution) -> list[FloatArray]:
+    return [each.reduced() for each in solution.equations]
+
+
+def film_rise(solution: solver.Solution, film: normal_equations.FilmModel) -> float:
+    """By how much the sum of squares of a solution with a free film
+    rises if the film is like that.
+    """
+    bound = []
+    films = solution.problem.films
+    for k, (each, state) in enumerate(zip(solution.equations, solution.states, strict=True)):
+        rows = normal_equations.film_rows(state.surface, film)
+        told = each.sums + rows.T @ rows if k in films else each.sums
+        bound.append(replace(each, sums=told).reduced())
+    return _squares(np.sum(bound, axis=0), solution) - _squares(
+        np.sum(_reduced(solution), axis=0), solution
+    )
+
+
+def _squares(sums: FloatArray, solution: solver.Solution) -> float:
+    sigmas = solution.problem.sigmas
+    return solver.step(sums + solution.known(sigmas), sigmas).squares
+
+
+def _alone(reduced: FloatArray, sigmas: FloatArray) -> tuple[float, int]:
+    """Least sum of squares of one set by itself, and how many numbers it determines; no prior."""
+    free = np.flatnonzero(
+        np.append(sigmas > 0, np.ones(normal_equations.COMMON - len(bench_parameters.NAMES), bool))
+    )
+    matrix, right = reduced[np.ix_(free, free)], reduced[free, -1]
+    scale = 1 / np.sqrt(np.maximum(np.diag(matrix), 1e-300))
+    values, vectors = np.linalg.eigh(matrix * np.outer(scale, scale))
+    good = values > 1e-10
+    along = vectors.T @ (right * scale)
+    return float(reduced[-1, -1] - np.sum(along[good] ** 2 / values[good])), int(
+        np.count_nonzero(good)
+    )
+
+
+def _with_more(sums: FloatArray, columns: Sequence[int], share: float) -> FloatArray:
+    """The sums with more unknowns before the residual, which act as some of the parameters do,
+    times a share.
+    """
+    order: Sequence[int] = [*range(normal_equations.COMMON), *columns, normal_equations.COMMON]
+    out = sums[np.ix_(order, order)].copy()
+    out[normal_equations.COMMON : -1, :] *= share
+    out[:, normal_equations.COMMON : -1] *= share
+    return np.asarray(out)
+
+
+def _solved(sums: FloatArray, free: IntArray) -> tuple[FloatArray, float]:
+    matrix, right = sums[np.ix_(free, free)], sums[free, -1]
+    scale = 1 / np.sqrt(np.diag(matrix))
+    found = scale * np.linalg.solve(matrix * np.outer(scale, scale), scale * right)
+    delta = np.zeros(len(sums) - 1)
+    delta[free] = found
+    return delta, float(sums[-1, -1] - right @ found)

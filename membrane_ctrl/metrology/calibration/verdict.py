@@ -1,0 +1,413 @@
+"""May a solution be used, and for how long? The objections, one line each, the cause before its
+consequences.
+"""
+
+from collections import deque
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+from scipy.stats import chi2
+
+from membrane_ctrl.metrology.calibration import model_tests, normal_equations
+from membrane_ctrl.metrology.calibration.normal_equations import rim_harmonics
+from membrane_ctrl.metrology.calibration.solver import Problem, Solution, first_states, solve
+from membrane_ctrl.metrology.film import film_law
+from membrane_ctrl.metrology.rays import bench_parameters
+from membrane_ctrl.metrology.rays.geometry import Geometry
+from membrane_ctrl.metrology.rays.surface import Surface
+from membrane_ctrl.metrology.reconstruction.bin_grid import slope_per_screen
+from membrane_ctrl.model.arrays import FloatArray
+
+# Sets closer together than this add nothing to one set: the sag's sigma is then twice that of sets
+# 8 mm apart
+LEAST_SPREAD_UM = 1000.0
+GOOD_SPREAD_UM = 8000.0
+# A wrong geometry changes the sag's slope against the laser by some per cent at most; a wrong unit
+# or sign by more
+_SLOPE_OFF = 0.2
+_LASER_SIGMAS = 10.0  # of one reading: below, the fringes are as likely to be wrong
+_FEW_POINTS = 500  # of a set: ten times its unknowns
+_SCATTER = 3.0  # times the others' noise
+# with noise of nanometres, effects are significant that nobody needs to know: a figure needs 5 µm
+_HARMLESS_UM = 2.5
+# a correction leaves some hundredths of the motion: in a blurred picture more than the noise
+_STEADY_UM = 4.0
+
+
+@dataclass(frozen=True)
+class CalibrationFinding:
+    """Something that is wrong."""
+
+    fatal: bool  # whether the old geometry stays in force
+    says: str  # one line for a person
+    sets: tuple[int, ...] = ()  # sets it is about; empty for all of them
+
+
+def before(problem: Problem) -> tuple[CalibrationFinding, ...]:
+    """Findings without solving: sets too close together, a laser with another scale or sign."""
+    states = first_states(problem)
+    moved = np.array([problem.sets[k].displacement_um for k in problem.films])
+    known = np.isfinite(moved)
+    sag_um = np.array([1e3 * states[k].surface.sag_mm for k in problem.films])
+    spread_um = float(np.ptp(moved[known])) if known.any() else 0.0
+    seen_um = float(np.ptp(sag_um))
+    if max(spread_um, seen_um) < LEAST_SPREAD_UM:
+        if problem.with_artefact:
+            return ()  # the artefacts add what the film does not
+        says = (
+            f"the sets are only {max(spread_um, seen_um):.0f} µm apart: they add nothing to "
+            "one of them; "
+            f"at least {LEAST_SPREAD_UM / 1000:.0f} mm are needed, "
+            f"{GOOD_SPREAD_UM / 1000:.0f} mm are good"
+        )
+        return (CalibrationFinding(True, says),)
+    if np.count_nonzero(known) < 2:
+        return ()  # nothing to compare
+    slope = float(np.polyfit(moved[known], sag_um[known], 1)[0]) if spread_um > 0 else np.inf
+    if slope < 0:
+        return (
+            CalibrationFinding(
+                True, "the laser counts the wrong way: its reading falls as the bowl deepens"
+            ),
+        )
+    if abs(slope - 1) > _SLOPE_OFF:
+        says = f"its readings are {spread_um:.4g} µm apart, the sags {seen_um:.4g} µm"
+        return (
+            CalibrationFinding(True, f"the laser's unit or scale is wrong, or it is stuck: {says}"),
+        )
+    return ()
+
+
+def after(solution: Solution) -> tuple[CalibrationFinding, ...]:
+    """Findings from the solution about sets and model.
+
+    One error makes many things look wrong. Of all explanations, the one that removes most from the
+    sum of squares, less two for each number it frees (Akaike's rule), is the cause; the others wait
+    until it is gone.
+    """
+    film = _film(solution)
+    if not solution.converged:
+        return (film[0][1] if film else _astray(solution),)
+    causes = [*film, *_elsewhere(solution), *_sets(solution), *_laser(solution), *_model(solution)]
+    cause = [_of_still_sets(solution, max(causes, key=lambda each: each[0])[1])] if causes else []
+    return (*cause, *([] if causes else _scatter(solution)), *_spread(solution))
+
+
+def _elsewhere(solution: Solution) -> list[tuple[float, CalibrationFinding]]:
+    """A screen that stood elsewhere than a set states, with the share that it explains."""
+    says = "the screen was not where screen_moved says beside {}: correct shift_mm, or its sigmas"
+    names = [phases.name for phases in solution.problem.sets]
+    return [
+        (
+            fall - 2 * bench_parameters.SCREEN_MOVE,
+            CalibrationFinding(True, says.format(names[k]), (k,)),
+        )
+        for k, fall in model_tests.elsewhere(solution)
+    ]
+
+
+def _of_still_sets(solution: Solution, finding: CalibrationFinding) -> CalibrationFinding:
+    """The finding; where the film moved much in some sets, that of the others, or its motion if
+    they have none.
+    """
+    sets = solution.problem.sets
+    moved = [k for k, phases in enumerate(sets) if phases.moved_um >= _STEADY_UM]
+    if not moved:
+        return finding
+    causes, rest = [], solution
+    if len(solution.problem.films) - len(moved) > 1:
+        for k in reversed(moved):
+            rest = model_tests.without(rest, k)
+        causes = [*_sets(rest), *_laser(rest), *_model(rest)]
+    if causes:
+        return replace(max(causes, key=lambda each: each[0])[1], sets=())
+    most = sets[max(moved, key=lambda k: sets[k].moved_um)]
+    says = (
+        f"the film moved by {most.moved_um:.0f} µm RMS while {most.name} was taken: hold it "
+        "still, and take it anew"
+    )
+    return CalibrationFinding(True, says, tuple(moved))
+
+
+def _film(solution: Solution) -> list[tuple[float, CalibrationFinding]]:
+    """A film that is not as the calibration was told, by a solution that knows nothing of it."""
+    film_kind, problem = solution.problem.references.film, solution.problem
+    if film_kind == "free":
+        return []
+    free = replace(problem, references=replace(problem.references, film="free"))
+    try:
+        other = solve(free, start=solution if solution.converged else None)
+    except ValueError:
+        return []
+    freedom = len(film_law.BEYOND) * len(problem.sets)
+    fall = model_tests.film_rise(other, film_kind)
+    if not other.converged or chi2.sf(fall, freedom) > model_tests.SURE:
+        return []
+    name = {
+        "hencky": "Hencky's without pre-strain and nu = 0.3",
+        "prestressed": "of the law, whatever its pre-strain",
+    }
+    says = f"the film's figure is not {name[film_kind]}: use --film free"
+    return [(fall - 2 * freedom, CalibrationFinding(True, says))]
+
+
+def _sets(solution: Solution) -> list[tuple[float, CalibrationFinding]]:
+    """A bumped camera, a bad set, sets that do not belong together, each with the share that it
+    explains.
+    """
+    names = [phases.name for phases in solution.problem.sets]
+    out = [
+        (
+            np.inf,
+            CalibrationFinding(
+                True,
+                f"{names[k]} disagrees with all the others: {_doubt(solution.problem, k)}",
+                (k,),
+            ),
+        )
+        for k in _of_others(solution)[:1]
+    ]
+    for bump in model_tests.bumps(solution)[:1]:
+        yaw, pitch, roll = bump.turned_deg
+        where = (
+            f"in {names[bump.sets[0]]}" if len(bump.sets) == 1 else f"from {names[bump.sets[0]]} on"
+        )
+        says = (
+            f"the camera had moved {where}: yaw {yaw:+.3f}, pitch {pitch:+.3f}, roll {roll:+.3f} "
+            "degrees"
+        )
+        out.append((bump.fall - 2 * 3, CalibrationFinding(True, says, bump.sets)))
+    if (crept := model_tests.creep(solution)) is not None:
+        parameter = bench_parameters.ALL[bench_parameters.NAMES.index(crept.name)]
+        says = (
+            f"camera or screen crept from {names[0]} to {names[-1]}, as if by "
+            f"{crept.amount:+.2g} {parameter.unit} "
+            f"of {crept.name} ({parameter.says}): let the mounts settle, and take the sets anew"
+        )
+        out.append((crept.fall - 2 * crept.freedom, CalibrationFinding(True, says)))
+    worst = max(model_tests.left_out(solution), key=lambda each: each.fall)
+    if worst.disagrees:
+        explained = worst.fall - 2 * worst.freedom
+        if len(names) > 2 and not any(
+            each.disagrees
+            for each in model_tests.left_out(model_tests.without(solution, worst.index))
+        ):
+            says = (
+                f"{names[worst.index]} disagrees with all the others: {_why(solution, worst.index)}"
+            )
+            out.append((explained, CalibrationFinding(True, says, (worst.index,))))
+        else:
+            says = (
+                "the sets contradict each other: they are not of one bench, or several of them "
+                "are bad"
+            )
+            out.append((explained, CalibrationFinding(True, says)))
+    return out
+
+
+def _doubt(problem: Problem, index: int) -> str:
+    artefact = problem.sets[index].artefact
+    return "it is of another bench" if artefact is None else artefact.doubt
+
+
+def _of_others(solution: Solution) -> list[int]:
+    """Sets whose fringes show a bench of their own: they hardly count, and by a pattern, not by
+    noise.
+    """
+    ratios = np.array([(np.sqrt(each.variance), each.trust.alike) for each in solution.equations])
+    return [
+        int(k) for k in np.flatnonzero((ratios > _SCATTER * np.median(ratios, axis=0)).all(axis=1))
+    ]
+
+
+def _astray(solution: Solution) -> CalibrationFinding:
+    """No common geometry was found: is there one without one of the sets, or for those before and
+    after a moment?
+    """
+    problem, count = solution.problem, len(solution.problem.sets)
+    for k in range(count if count > 2 else 0):
+        if _agree(replace(problem, sets=problem.sets[:k] + problem.sets[k + 1 :])):
+            says = f"{problem.sets[k].name} disagrees with all the others: {_doubt(problem, k)}"
+            return CalibrationFinding(True, says, (k,))
+    for k in range(2, count - 1):
+        if all(
+            _agree(replace(problem, sets=part)) for part in (problem.sets[:k], problem.sets[k:])
+        ):
+            says = (
+                f"the bench was changed between {problem.sets[k - 1].name} and "
+                f"{problem.sets[k].name}"
+            )
+            return CalibrationFinding(True, says, tuple(range(k, count)))
+    says = (
+        "the sets do not show one bench: they are of different benches, or several of them are bad"
+    )
+    return CalibrationFinding(True, says)
+
+
+def _agree(problem: Problem) -> bool:
+    """Whether the sets share one bench; a few points of each are
+    enough to show that they do not.
+    """
+    few = replace(problem, sets=tuple(phases.thinned(_FEW_POINTS) for phases in problem.sets))
+    try:
+        solution = solve(few)
+    except ValueError:
+        return False
+    return solution.converged and not any(each.disagrees for each in model_tests.left_out(solution))
+
+
+def _why(solution: Solution, index: int) -> str:
+    """Whether it is one set's laser reading that is wrong, or its fringes."""
+    rest, phases = model_tests.without(solution, index), solution.problem.sets[index]
+    if phases.artefact is not None:
+        return phases.artefact.doubt
+    rim_mm = normal_equations.rim_of(replace(solution.states[index], vertex_z_mm=0.0))[0]
+    vertex_um = 1e3 * (rest.common[len(bench_parameters.NAMES)] - rim_mm)
+    moved_um = phases.displacement_um - solution.problem.references.reference_um
+    miss_um = moved_um + vertex_um / (
+        1 + rest.values[bench_parameters.NAMES.index(bench_parameters.LASER.name)]
+    )
+    if abs(miss_um) > _LASER_SIGMAS * solution.problem.references.laser_sigma_um:
+        return f"its laser reads {miss_um:+.1f} µm against the optics"
+    return "its fringes show another bench"
+
+
+def _scatter(solution: Solution) -> list[CalibrationFinding]:
+    """Sets that hardly count beside the others, because their fringes are so much worse."""
+    ratios = np.sqrt([each.variance for each in solution.equations])
+    worse = np.flatnonzero(ratios > _SCATTER * np.median(ratios))
+    names = [phases.name for phases in solution.problem.sets]
+    says = "{} scatters {:.1f} times as much as its camera should"
+    return [CalibrationFinding(False, says.format(names[k], ratios[k]), (int(k),)) for k in worse]
+
+
+def _laser(solution: Solution) -> list[tuple[float, CalibrationFinding]]:
+    laser = model_tests.laser_scale(solution)
+    if not laser.sure:
+        return []
+    says = (
+        f"the laser's scale is wrong: the optics see {laser.value:.4f} +- {laser.sigma:.4f} µm "
+        "per µm of it"
+    )
+    return [(laser.fall - 2, CalibrationFinding(True, says))]
+
+
+def _model(solution: Solution) -> list[tuple[float, CalibrationFinding]]:
+    found = model_tests.suspects(solution)
+    if not found:
+        return []
+    first, *others = found
+    parameter = bench_parameters.ALL[bench_parameters.NAMES.index(first.name)]
+    unit = f" {parameter.unit}" if parameter.unit else ""
+    also = f" (or {', '.join(other.name for other in others)})" if others else ""
+    says = (
+        f"the residuals have the pattern of {first.name} = {first.value:.3g} +- "
+        f"{first.sigma:.2g}{unit} "
+        f"({parameter.says}){also}, {first.figure_um:.1f} µm of figure: free it with --free "
+        f"{first.name}"
+    )
+    return [(first.fall - 2, CalibrationFinding(first.figure_um > _HARMLESS_UM, says))]
+
+
+def _spread(solution: Solution) -> tuple[CalibrationFinding, ...]:
+    """What other sets would have determined."""
+    problem = solution.problem
+    moved = np.array([problem.sets[k].displacement_um for k in problem.films])
+    if problem.with_artefact:
+        return ()  # the sag rests on the artefacts
+    if np.count_nonzero(np.isfinite(moved)) < 2:
+        says = "fewer than two sets carry a laser reading: the sag rests on fringes and ring alone"
+        return (CalibrationFinding(False, says),)
+    spread_um = float(np.ptp(moved[np.isfinite(moved)]))
+    if spread_um >= GOOD_SPREAD_UM / 2:
+        return ()
+    says = (
+        f"the sets are {spread_um / 1000:.1f} mm apart; {GOOD_SPREAD_UM / 1000:.0f} mm would "
+        "determine the sag better"
+    )
+    return (CalibrationFinding(False, says),)
+
+
+# When to calibrate again: the fit's residual now, against that of the calibration. A wrong geometry
+# bends the fringes as no surface can (a camera that rolls), or as one can (a camera that turns):
+# the ring, which cannot have tilted, shows the latter. Only what noise leaves is compared: live
+# cycles have other bins and light. One bad cycle is no drift (a door, a hand before the screen);
+# the median of many
+# is.
+
+CYCLES = 60  # two minutes of cycles
+GROWN = 1.25  # times the expected residual: 0.75 of it more, added in squares
+FINE = 1.1  # times the expected residual: a warning ends here
+# The required accuracy. A camera turned by 0.02 degrees moves the ring by 5.6 µm and bends the
+# figure by 4
+RING_MOVED_UM = 5.0
+RING_BACK_UM = 3.0
+
+
+def noise_urad(geometry: Geometry, surface: Surface, screen_sigma_mm: float) -> float:
+    """RMS of the slopes of points whose screen coordinates have this noise."""
+    gain = slope_per_screen(geometry, surface.radius_mm, surface.sag_mm)
+    return 1e6 * screen_sigma_mm * float(np.sqrt(gain.sum() / 2))
+
+
+@dataclass
+class DriftMonitor:
+    """Monitors the live residual; `[calibration]` of the geometry has both arguments, as
+    `slope_...`.
+    """
+
+    calibrated_urad: float
+    calibrated_noise_urad: float
+    says: str = ""  # why it is time to calibrate again; empty while it is not
+    _seen: deque[tuple[float, float]] = field(default_factory=lambda: deque(maxlen=CYCLES))
+
+    def add(self, residual_urad: float, live_noise_urad: float) -> None:
+        """Take one cycle's residual and the camera's share of it; cycles without a figure (NaN) do
+        not count.
+        """
+        if np.isfinite(residual_urad) and np.isfinite(live_noise_urad):
+            self._seen.append((residual_urad, live_noise_urad))
+        if len(self._seen) < CYCLES:
+            return
+        now_urad, live_urad = (float(v) for v in np.median(np.array(self._seen), axis=0))
+        model_urad = np.sqrt(max(0.0, self.calibrated_urad**2 - self.calibrated_noise_urad**2))
+        ratio = now_urad / float(np.hypot(model_urad, live_urad))
+        if ratio < FINE:
+            self.says = ""
+        elif ratio > GROWN and not self.says:
+            self.says = (
+                f"calibrate again: the fit leaves {now_urad:.2f} µrad of slope, "
+                f"the calibrated geometry predicts {now_urad / ratio:.2f}"
+            )
+
+
+def ring_um(surface: Surface) -> FloatArray:
+    """Harmonics (14,) of the rim's height without its mean: cosines 1 to 7, then sines."""
+    return np.asarray(1e3 * (rim_harmonics() @ surface.parameters)[1:])
+
+
+@dataclass
+class RingMonitor:
+    """Monitors the ring's position in the live cycles against `ring_um` (14,) of the geometry's
+    `[calibration]`.
+    """
+
+    calibrated_um: FloatArray
+    says: str = ""  # as for `DriftMonitor`
+    _seen: deque[FloatArray] = field(default_factory=lambda: deque(maxlen=CYCLES))
+
+    def add(self, surface: Surface) -> None:
+        """Take one cycle's surface."""
+        self._seen.append(ring_um(surface))
+        if len(self._seen) < CYCLES:
+            return
+        change = np.median(np.array(self._seen), axis=0) - self.calibrated_um
+        moved_um = float(np.sqrt(np.sum(change**2) / 2))  # RMS around the rim
+        if moved_um < RING_BACK_UM:
+            self.says = ""
+        elif moved_um > RING_MOVED_UM and not self.says:
+            self.says = (
+                f"calibrate again: the ring is seen {moved_um:.1f} µm RMS from where it was "
+                "when the geometry was "
+                "calibrated; camera or screen has moved"
+            )

@@ -1,0 +1,1 @@
+"""The live cycle: frames in memory to a figure every two seconds."""

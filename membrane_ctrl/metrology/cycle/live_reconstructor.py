@@ -1,0 +1,410 @@
+"""The live cycle: frames in memory to the figure with its covariance, the last cycle's solution as
+the start.
+
+A full cycle finds the fringe orders and the points that see the pattern. A fringes-only cycle
+follows each point's phase from the last accepted one, which is unambiguous while no phase moved by
+half a period (4.34 mrad of slope), and needs one or two Gauss-Newton steps with the normal matrix
+of the full cycle.
+"""
+
+import math
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+
+from membrane_ctrl.config.schema import OpticsConfig
+from membrane_ctrl.metrology.film import film_law
+from membrane_ctrl.metrology.frame_checks import backlight_bands
+from membrane_ctrl.metrology.phase import bin_phasors, phase_steps
+from membrane_ctrl.metrology.phase.frame_stack import Binned, FrameStack
+from membrane_ctrl.metrology.rays import geometry, surface
+from membrane_ctrl.metrology.reconstruction import bin_grid, film_motion, surface_fit
+from membrane_ctrl.metrology.uncertainty import cycle_errors, geometry_spread
+from membrane_ctrl.model.arrays import AnyArray, ArrayLike, BoolArray, FloatArray, Image
+from membrane_ctrl.model.shape_estimate import Kind, Quality, ShapeEstimate, judge
+from membrane_ctrl.model.zernike_terms import ZERNIKE_TERMS
+
+# Beyond this change of phase a point may have been taken for its neighbour a period away. 0.9 of
+# half a period, so that a field which passes half a period anywhere shows points in the band before
+# it.
+GUARD_RAD = 0.9 * math.pi
+LOST_SHARE = 0.002  # more points than dust and glints beyond the guard
+# A film that changes its shape moves as many phases up as down. If all of them move one way, the
+# mount was knocked, perhaps by a whole period: phase alone cannot tell a tilt of 7 mrad from one of
+# -1.7.
+TILT_GUARD_RAD = 0.3 * math.pi
+NOTHING_TO_FOLLOW = "tracking lost: no accepted full cycle to follow"
+# With this share of its points the full cycle's normal matrix still contracts a hundredfold a step.
+MATRIX_KEPT_SHARE = 0.99
+# the plane z = 0 is crossed this far at most from where a ray meets the film
+_FILM_BESIDE_PLANE_MM = 25.0
+_SURELY = 1.2  # times the expected variance of the phases' change: more than they scatter by chance
+
+
+class LiveReconstructor:
+    """Figure of the mirror from cycles of frames.
+
+    Parameters
+    ----------
+    optics : OpticsConfig
+        Geometry, camera, pattern and mirror.
+    bin_px : int
+        Side of the bins whose phasors are used.
+    laser_noise_um : float
+        Noise of one displacement as given (an average over an exposure has less than a sample);
+        motion is corrected only if it is clearly above this.
+    shifts_rad : (N,) or (2, N) array, optional
+        Phase steps, of x and y if they differ; equal ones if not given.
+    spread : GeometrySpread, optional
+        How well the geometry is known; with it the first full cycle computes
+        `common_covariance_um2`.
+
+    Raises
+    ------
+    ValueError
+        If the phase steps do not determine a phase, or their number is not the pattern's.
+    """
+
+    def __init__(
+        self,
+        optics: OpticsConfig,
+        bin_px: int = 4,
+        *,
+        laser_noise_um: float = 0.3,
+        shifts_rad: ArrayLike | None = None,
+        spread: geometry_spread.GeometrySpread | None = None,
+    ) -> None:
+        self._optics = optics
+        self._geometry = geometry.Geometry.from_config(optics)
+        self._bin_px = bin_px
+        self._laser_noise_um = laser_noise_um
+        given = (
+            phase_steps.equal_shifts(optics.pattern.steps)
+            if shifts_rad is None
+            else np.asarray(shifts_rad, float)
+        )
+        self._shifts_rad = np.broadcast_to(given, (2, optics.pattern.steps))
+        self._weights = [phase_steps.step_weights(shifts) for shifts in self._shifts_rad]
+        self._slots = phase_steps.FullSlots(optics.pattern.steps)
+        told = zip(
+            phase_steps.fringe_sequence(optics.pattern), self._shifts_rad.ravel(), strict=True
+        )
+        self._patterns = tuple(replace(pattern, shift_rad=float(shift)) for pattern, shift in told)
+        self._bands_rad, self._doubt = np.zeros(0), ""
+        self._full_scale_adu = 2**optics.camera.bits - 1
+        size = (optics.camera.height_px, optics.camera.width_px)
+        self._binner = bin_phasors.Binner(*size, bin_px, self._full_scale_adu, self._slots.count)
+        self._grid = bin_grid.BinGrid(self._geometry, optics.camera, bin_px)
+        self._near = np.flatnonzero(
+            self._grid.near_mirror(optics.mirror.analysis_radius_mm + _FILM_BESIDE_PLANE_MM)
+        )
+        self._reference_um = optics.geometry.reference_displacement_um
+        self._mm_per_rad = phase_steps.mm_per_rad(optics.pattern)
+        self._pixel_sigma_adu = bin_grid.pixel_sigma_adu(optics.camera.noise_adu)
+        self._tracked: film_motion.TrackedPoints | None = None
+        bench = (optics, self._grid, self._binner.saturated.shape, bin_px)
+        self._watch = cycle_errors.ErrorWatch(*bench, self._shifts_rad, laser_noise_um, spread)
+
+    def full(
+        self, frames: Sequence[Image], time_s: ArrayLike, displacement_um: ArrayLike
+    ) -> ShapeEstimate:
+        """One full cycle. Raises ValueError for a wrong number, size or type of frames.
+
+        Parameters
+        ----------
+        frames : sequence of (height, width) uint8 or uint16 arrays
+            In the order of `phase.full_sequence`.
+        time_s, displacement_um : (frames,) arrays
+            Of each exposure; NaN where there is no laser reading.
+
+        Returns
+        -------
+        ShapeEstimate
+            Verdict "rejected" with the reason when the images give no figure.
+        """
+        times, readings = _per_frame(frames, time_s, displacement_um, self._slots.count, "full")
+        sinusoids = np.r_[self._slots.sinusoids].tolist()
+        if self._reference_um is None and np.isfinite(readings).any():
+            self._reference_um = float(readings[np.isfinite(readings)][0])
+        self._binner.clear()
+        self._binner.add(frames, range(len(frames)), watched=sinusoids)
+        self._take_bands(np.zeros(0))
+        optics = self._optics
+        images = self._binner.sums.reshape(self._slots.count, -1)[:, self._near] / self._bin_px**2
+        phase_rad = phase_steps.decode_full(images, optics.pattern, self._shifts_rad)
+        phase_rad[:, self._binner.saturated.ravel()[self._near] > 0] = np.nan
+        times, readings = times[sinusoids], readings[sinusoids]
+        self._tracked = None  # until this cycle is accepted
+        tracer, analysis_mm = self._tracer(readings), optics.mirror.analysis_radius_mm
+        try:
+            state = film_motion.establish(
+                self._grid, tracer, self._near, phase_rad, optics.pattern, analysis_mm
+            )
+        except ValueError as error:
+            return rejected("full", times, readings, str(error))
+        self._watch.begin(state)
+        return self._follow("full", state, times, readings)
+
+    def fringes(
+        self, frames: Sequence[Image], time_s: ArrayLike, displacement_um: ArrayLike
+    ) -> ShapeEstimate:
+        """One fringes-only cycle of 2 N frames, in the order of `phase.fringe_sequence`; else as
+        `full`.
+
+        An estimate with `tracking_lost` asks for a full cycle.
+        """
+        times, readings = _per_frame(
+            frames, time_s, displacement_um, 2 * self._slots.steps, "fringes"
+        )
+        if self._tracked is None:
+            return rejected("fringes", times, readings, NOTHING_TO_FOLLOW, tracking_lost=True)
+        self._binner.clear()
+        self._binner.add(frames, np.r_[self._slots.sinusoids].tolist())
+        if self._bands_rad.size:
+            self._take_bands(self._bands_rad)
+        return self._follow("fringes", self._tracked, times, readings)
+
+    def prepare(self) -> None:
+        """A cycle needs nothing ahead."""
+
+    def height_map(
+        self, coeffs_um: FloatArray, hencky_um: float, n: int = 256
+    ) -> tuple[FloatArray, FloatArray, FloatArray]:
+        """A figure as a picture: x_mm (n,), y_mm (n,), h_mm (n, n) with rows along y; NaN outside
+        the analysis.
+        """
+        mirror = self._optics.mirror
+        axis = np.linspace(-mirror.radius_mm, mirror.radius_mm, n)
+        x, y = np.meshgrid(axis, axis)
+        h = surface.Surface(np.asarray(coeffs_um) / 1e3, hencky_um / 1e3, mirror.radius_mm).height(
+            x, y
+        )
+        h[x**2 + y**2 > mirror.analysis_radius_mm**2] = np.nan
+        return axis, axis.copy(), h
+
+    @property
+    def common_covariance_um2(self) -> FloatArray:
+        """Covariance (terms, terms) of the coefficients that all cycles share: geometry, lens,
+        screen, air, blur.
+
+        Add it to a cycle's own for a single figure, not for changes. NaN before the first full
+        cycle and without a spread.
+        """
+        to_coeffs = surface.parameter_to_coeffs()
+        return np.asarray(1e6 * to_coeffs @ self._watch.common_mm2 @ to_coeffs.T)
+
+    def sag_sensitivity(self) -> FloatArray:
+        """Change of the coefficients (terms,) in µm per µm of sag of a Hencky bowl."""
+        return film_law.zernike_projection().copy()
+
+    def _tracer(self, readings_um: FloatArray) -> surface_fit.Tracer:
+        """The bench with the vertex where the laser saw it, on average over the frames."""
+        mean = _finite_mean(readings_um)
+        known = self._reference_um is not None and math.isfinite(mean)
+        z = -(mean - self._reference_um) * 1e-3 if known and self._reference_um is not None else 0.0
+        return surface_fit.Tracer(self._geometry, self._optics.mirror.radius_mm, z)
+
+    def _follow(
+        self, kind: Kind, state: film_motion.TrackedPoints, times: FloatArray, readings: FloatArray
+    ) -> ShapeEstimate:
+        """Phases of the points against the last accepted ones, and the figure from them."""
+        self._track_phases(state, readings)
+        # every 16th point: the median costs more than the fit
+        modulation_adu = float(np.median(state.fresh[:, 4, ::16]))
+        saturated = self._binner.saturated.ravel()[state.index] > 0
+        usable = ~saturated & (
+            state.fresh[:, 4].min(axis=0) > phase_steps.FRINGE_SHARE * modulation_adu
+        )
+        if reason := _lost(state.fresh[:, 3], usable):
+            return rejected(kind, times, readings, reason, tracking_lost=True)
+        fit = self._fit(state, usable, readings)
+        cycle = cycle_errors.Cycle(self._tracer(readings), state, fit, self._sums(), readings)
+        errors = self._watch.look(cycle)
+        exact = fit.surface.parameters - errors.correction_mm
+        fit = replace(fit, surface=surface.Surface.from_parameters(exact, fit.surface.radius_mm))
+        area = math.pi * self._optics.mirror.analysis_radius_mm**2
+        quality = Quality(
+            modulation_share=modulation_adu / self._full_scale_adu,
+            saturated_fraction=float(np.mean(saturated)),
+            valid_fraction=min(1.0, float(np.sum(state.area_mm2[usable])) / area),
+            residual_urad=1e6 * math.hypot(fit.residual_x, fit.residual_y) / math.sqrt(2),
+            converged=fit.converged,
+        )
+        estimate = self._estimate(kind, fit, errors, quality, times, readings)
+        if estimate.verdict == "rejected":
+            self._tracer(readings).start(
+                state.points, state.surface.height
+            )  # back onto the last good surface
+        else:
+            state.accept(fit.surface, usable)
+            self._tracked = state
+        return estimate
+
+    def _take_bands(self, known: FloatArray) -> None:
+        """Take bands of the backlight out of the sums; fringes-only cycles have those of the full
+        one.
+        """
+        slots = np.r_[self._slots.sinusoids]
+        means = (self._binner.sums[slots] / self._bin_px**2).astype(np.float32)
+        binned = Binned(
+            self._bin_px, means, np.broadcast_to(self._binner.saturated > 0, means.shape)
+        )
+        none = np.empty(
+            (len(slots), self._optics.camera.height_px, 0), np.uint8
+        )  # the bins are enough
+        stack = FrameStack(none, self._patterns, np.full(len(slots), math.nan), {})
+        stack, binned, found = backlight_bands.without_bands(stack, binned, known)
+        self._bands_rad, self._doubt = (
+            found if not known.size else known,
+            backlight_bands.doubt(stack.gain),
+        )
+        if known.size and not found.size:
+            self._doubt = (
+                "bands of the backlight could not be told from what else changed in this cycle"
+            )
+        elif found.size:
+            self._binner.sums[slots] = np.rint(binned.means * self._bin_px**2)
+
+    def _sums(self) -> list[AnyArray]:
+        """Bin sums (N, bins) of the sinusoids of x and of y."""
+        return [
+            self._binner.sums[slots].reshape(self._slots.steps, -1)
+            for slots in self._slots.sinusoids
+        ]
+
+    def _track_phases(self, state: film_motion.TrackedPoints, readings: FloatArray) -> None:
+        """Fresh phases from the bin sums, corrected for the film's motion between the frames."""
+        moved = film_motion.worth_correcting(readings, self._laser_noise_um)
+        motion_um = np.reshape(readings - np.mean(readings), (2, -1)) if moved else None
+        combined = []
+        for axis in range(2):
+            part = None if motion_um is None else motion_um[axis]
+            combined.append(
+                film_motion.combine_steps(
+                    self._weights[axis], self._shifts_rad[axis], self._bin_px, part
+                )
+            )
+        bin_phasors.track(
+            self._sums(),
+            state.index,
+            combined,
+            state.sensitivity_rad_per_um,
+            state.accepted,
+            state.fresh,
+        )
+
+    def _fit(
+        self, state: film_motion.TrackedPoints, usable: BoolArray, readings: FloatArray
+    ) -> surface_fit.Fit:
+        """One or two steps from the last surface; the full cycle's normal matrix while its points
+        are there.
+        """
+        state.points.weights[:] = usable
+        np.multiply(state.fresh[:, 0], self._mm_per_rad, out=state.points.screen_mm)
+        state.points.screen_mm -= state.offset_mm
+        complete = np.count_nonzero(usable) > MATRIX_KEPT_SHARE * usable.size
+        normal = state.normal if complete else None
+        return surface_fit.solve(self._tracer(readings), state.points, state.surface, normal=normal)
+
+    def _estimate(
+        self,
+        kind: Kind,
+        fit: surface_fit.Fit,
+        errors: cycle_errors.CycleErrors,
+        quality: Quality,
+        times: FloatArray,
+        readings: FloatArray,
+    ) -> ShapeEstimate:
+        """The result in micrometres, with its covariance and verdict."""
+        modulation_adu = quality.modulation_share * self._full_scale_adu
+        sigmas_rad = [
+            phase_steps.phase_sigma_rad(d, self._pixel_sigma_adu, modulation_adu)
+            for d in self._shifts_rad
+        ]
+        noise_rad2 = np.square(sigmas_rad) / self._bin_px**2
+        # slopes that changed by more than noise: one error for each point that was asked
+        changed_rad2 = np.maximum(errors.changed_rad2 - _SURELY * 2 * noise_rad2, 0.0)
+        changed_rad2 *= fit.weight_sum / max(errors.asked, 1)
+        gain = bin_grid.slope_per_screen(self._geometry, fit.surface.radius_mm, fit.surface.sag_mm)
+        slope_variance = gain @ (self._mm_per_rad**2 * (noise_rad2 + changed_rad2))
+        covariance = bin_grid.parameter_covariance(fit.normal, slope_variance) + errors.own_mm2
+        to_coeffs = surface.parameter_to_coeffs()
+        gradient = surface.sag_gradient()
+        verdict, reason = judge(quality)
+        if verdict == "ok" and self._doubt:
+            verdict, reason = "degraded", self._doubt
+        return ShapeEstimate(
+            time_s=_finite_mean(times),
+            kind=kind,
+            coeffs_um=1e3 * fit.surface.coeffs_mm,
+            hencky_um=1e3 * fit.surface.hencky_mm,
+            covariance_um2=1e6 * to_coeffs @ covariance @ to_coeffs.T,
+            sag_um=1e3 * fit.surface.sag_mm,
+            sag_sigma_um=1e3 * math.sqrt(gradient @ covariance @ gradient),
+            geometry_sag_sigma_um=1e3 * math.sqrt(gradient @ self._watch.common_mm2 @ gradient),
+            displacement_um=_finite_mean(readings),
+            slope_residual_urad=quality.residual_urad,
+            valid_fraction=quality.valid_fraction,
+            modulation_median_adu=modulation_adu,
+            saturated_fraction=quality.saturated_fraction,
+            verdict=verdict,
+            reason=reason,
+        )
+
+
+def _per_frame(
+    frames: Sequence[Image], time_s: ArrayLike, displacement_um: ArrayLike, count: int, kind: Kind
+) -> tuple[FloatArray, FloatArray]:
+    """Times and readings as arrays. Raises ValueError unless there is one of each for each of
+    `count` frames.
+    """
+    times, readings = np.asarray(time_s, float), np.asarray(displacement_um, float)
+    if not len(frames) == times.size == readings.size == count:
+        found = f"{len(frames)} frames, {times.size} times and {readings.size} displacements"
+        raise ValueError(
+            f"a {kind} cycle has {count} frames with a time and a displacement each; got {found}"
+        )
+    return times, readings
+
+
+def _lost(change_rad: FloatArray, usable: BoolArray) -> str:
+    """Why the phases (2, n) cannot be followed; empty if they can."""
+    seen = max(1, int(np.count_nonzero(usable)))
+    beyond = int(np.count_nonzero(usable & (np.abs(change_rad).max(axis=0) > GUARD_RAD)))
+    if beyond > LOST_SHARE * seen:
+        return (
+            f"tracking lost: the phase moved by half a period at {beyond / seen:.1%} of the points"
+        )
+    if np.abs(np.median(change_rad[:, ::16], axis=1)).max() > TILT_GUARD_RAD:
+        return "tracking lost: the whole mirror tilted"
+    return ""
+
+
+def _finite_mean(values: FloatArray) -> float:
+    finite = values[np.isfinite(values)]
+    return float(finite.mean()) if finite.size else float("nan")
+
+
+def rejected(
+    kind: Kind, times: FloatArray, readings: FloatArray, reason: str, tracking_lost: bool = False
+) -> ShapeEstimate:
+    """A cycle without a figure."""
+    nan = float("nan")
+    return ShapeEstimate(
+        time_s=_finite_mean(times),
+        kind=kind,
+        coeffs_um=np.full(ZERNIKE_TERMS, nan),
+        hencky_um=nan,
+        covariance_um2=np.full((ZERNIKE_TERMS, ZERNIKE_TERMS), nan),
+        sag_um=nan,
+        sag_sigma_um=nan,
+        displacement_um=_finite_mean(readings),
+        slope_residual_urad=nan,
+        valid_fraction=0.0,
+        modulation_median_adu=nan,
+        saturated_fraction=nan,
+        verdict="rejected",
+        reason=reason,
+        tracking_lost=tracking_lost,
+    )

@@ -1,0 +1,1 @@
+"""The figure of a capture set, and the numbers that describe it."""

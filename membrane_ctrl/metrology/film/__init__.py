@@ -1,0 +1,1 @@
+"""The law of the membrane under pressure, and a film's material from its figures."""

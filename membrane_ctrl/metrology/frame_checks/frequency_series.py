@@ -1,0 +1,338 @@
+"""Which frames of a multi-frequency set do not belong, and what can be done without them.
+
+A set is two axes of some frequencies of four steps, and white and black. It is judged against
+itself: how large a disagreement is too large follows from the other series of the set, so that a
+display's gamma, which all share, is no fault. Three checks:
+
+- equal pictures: no two frames of a set should be the same (a stale frame, however little it
+  matters);
+- the closure I0 - I1 + I2 - I3 of each series and, with the phase or the level known, the frame at
+  fault;
+- the frequencies against each other: exchanging steps 0 and 2, or 1 and 3, keeps the closure but
+  reverses the phase, which then contradicts the other frequencies.
+
+One of four steps can be replaced: the phase of the other three gives I0 = I1 + I3 - I2, and
+likewise for the others.
+"""
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from itertools import combinations
+
+import numpy as np
+
+from membrane_ctrl.metrology.frame_checks.frame_faults import (
+    Closure,
+    closure,
+    closure_with_level,
+    closure_with_phase,
+)
+from membrane_ctrl.metrology.phase.phase_steps import phasors
+from membrane_ctrl.model.arrays import BoolArray, FloatArray
+from membrane_ctrl.model.shape_estimate import Verdict
+
+# Absolute phase in time: fringes of several frequencies, coarse to fine, each pixel by itself.
+#
+# The coarsest pattern has at most one period on the screen, so its phase is a position; each finer
+# one is put into the period that lies nearest to what is known so far. With x the position in
+# screens, p the periods a screen and w = phi / (2 pi p) the wrapped position,
+#
+#     x_f = w_f + rint((x_(f-1) - w_f) p_f) / p_f.
+#
+# The distance before rounding, e = (x_f - x_(f-1)) p_f in periods, is at most 1/2 by construction
+# and should be near 0: it is the coarser phase's error seen through the finer fringe. Near 1/2 the
+# order is uncertain.
+
+# A wrong order begins at half a period; for a pixel half way there, twice its error would be wrong.
+CONSISTENT_PERIODS = 0.25
+
+
+@dataclass(frozen=True)
+class Unwrapped:
+    """Positions on the screen from all frequencies."""
+
+    screens: (
+        FloatArray  # (...): position along the axis, 0 to 1 over the screen, from the finest fringe
+    )
+    step_periods: (
+        FloatArray  # (F - 1, ...): e of each step, in periods of the finer fringe, within +-1/2
+    )
+    consistent: (
+        BoolArray  # (...): all |e| below `CONSISTENT_PERIODS` and the position on the screen
+    )
+
+
+def unwrap(wrapped_rad: FloatArray, periods: Sequence[float] | FloatArray) -> Unwrapped:
+    """Unwrap in time. Raises ValueError if the periods are not rising from at most one, or do not
+    match the phases.
+
+    Parameters
+    ----------
+    wrapped_rad : (F, ...) array
+        Phase of each frequency, any branch; zero where position 0 is.
+    periods : (F,) array
+        Periods a screen, rising; the first at most 1.
+    """
+    counts = np.asarray(periods, float)
+    if counts.ndim != 1 or len(counts) != len(wrapped_rad):
+        raise ValueError(f"{len(wrapped_rad)} phases for periods {counts.tolist()}")
+    if not (0 < counts[0] <= 1 and np.all(np.diff(counts) > 0)):
+        raise ValueError(f"periods {counts.tolist()} must rise from at most one a screen")
+    position = np.mod(wrapped_rad[0], 2 * math.pi) / (2 * math.pi * counts[0])
+    steps = np.empty((len(counts) - 1, *position.shape))
+    for k in range(1, len(counts)):
+        fine = wrapped_rad[k] / (2 * math.pi * counts[k])
+        fine = fine + np.rint((position - fine) * counts[k]) / counts[k]
+        steps[k - 1] = (fine - position) * counts[k]
+        position = fine
+    agree = np.all(np.abs(steps) < CONSISTENT_PERIODS, axis=0) & (position >= 0) & (position <= 1)
+    return Unwrapped(position, steps, agree)
+
+
+def predicted_phase(
+    wrapped_rad: FloatArray, periods: Sequence[float] | FloatArray, index: int
+) -> FloatArray:
+    """Phase that the other frequencies expect of frequency `index`, (...), not wrapped.
+
+    The chain always needs the coarsest; in the coarsest's own prediction it only chooses the order.
+    """
+    counts = np.asarray(periods, float)
+    keep = np.array([k for k in range(len(counts)) if k != index or k == 0])
+    return np.asarray(2 * math.pi * counts[index] * unwrap(wrapped_rad[keep], counts[keep]).screens)
+
+
+# Shares of the fringes' amplitude. Good real series close to 0.02 to 0.04; a stale frame leaves
+# 0.25 or more.
+CLOSURE_SHARE = 0.05
+CLOSURE_TIMES = 3.0  # of the median of the other series of the set
+# Two frames of different steps differ by 0.7 of the amplitude or more where a quarter of a period
+# is seen.
+SAME_SHARE = 0.15
+LEFT_TIMES = 2.0  # of the limit: how far the others may disagree once the bad frame is left out
+GAIN = 2.0  # good frames reach 1.4, a stale one gives 6.8 or more
+INCONSISTENT_SHARE = 0.1  # pixels whose frequencies disagree; none do in a good set
+BEYOND_SHARE = 0.05  # of pixels that a frame shows brighter than white, or darker than black
+
+
+@dataclass(frozen=True)
+class AxisSeries:
+    """One axis of a set."""
+
+    axis: str  # "x" or "y"
+    frames: FloatArray  # (F, 4, n): frequency, step, pixel
+    periods: FloatArray  # (F,): periods a screen, rising
+    shifts_rad: FloatArray  # (4,): phase steps
+
+    def phases_rad(self) -> FloatArray:
+        """Wrapped phases (F, n)."""
+        return np.stack([np.angle(phasors(steps, self.shifts_rad)) for steps in self.frames])
+
+    def inconsistent_share(self) -> float:
+        """Share of the pixels whose frequencies disagree."""
+        return float(np.mean(~unwrap(self.phases_rad(), self.periods).consistent))
+
+    def with_frames(self, index: int, steps: FloatArray) -> "AxisSeries":
+        """The same with other frames of one frequency."""
+        frames = self.frames.copy()
+        frames[index] = steps
+        return replace(self, frames=frames)
+
+
+@dataclass(frozen=True)
+class SeriesFlag:
+    """A frame that does not belong: axis ("x", "y", "white", "black"), frequency and step (0 for
+    white), and why.
+    """
+
+    axis: str
+    index: int
+    step: int
+    reason: str
+
+
+@dataclass(frozen=True)
+class SeriesCheck:
+    """Result: verdict and reason, flags, and both axes with what could be repaired."""
+
+    verdict: Verdict
+    reason: str
+    flags: tuple[SeriesFlag, ...]
+    axes: tuple[AxisSeries, ...]
+
+
+def check_series(axes: tuple[AxisSeries, ...], black: FloatArray, white: FloatArray) -> SeriesCheck:
+    """Check the axes of a set, in the order in which they were taken.
+
+    Raises ValueError if there are no pixels or not four steps.
+
+    Parameters
+    ----------
+    axes : AxisSeries
+        Four steps each.
+    black, white : (n,) arrays
+        Of the same pixels.
+    """
+    limits = _closure_limits(axes)
+    flags: list[SeriesFlag] = _flat_flags(axes, black, white)
+    mended, failures = [], []
+    for axis in axes:
+        for index in range(len(axis.periods)):
+            found, axis = _mend(axis, index, limits[axis.axis][index], axes)
+            flags += found
+        mended.append(axis)
+        bad = [
+            k for k in range(len(axis.periods)) if _closure_share(axis, k) > limits[axis.axis][k]
+        ]
+        if bad:
+            failures.append(
+                f"{axis.axis}, {axis.periods[bad[0]]:g} periods: the steps do not agree"
+            )
+        elif axis.inconsistent_share() > INCONSISTENT_SHARE:
+            failures.append(
+                f"{axis.axis}: the frequencies disagree at {axis.inconsistent_share():.0%} "
+                "of the pixels"
+            )
+    if failures:
+        return SeriesCheck("rejected", failures[0], tuple(flags), tuple(mended))
+    if flags:
+        return SeriesCheck(
+            "degraded", f"{len(flags)} frame(s) flagged and left out", tuple(flags), tuple(mended)
+        )
+    return SeriesCheck("ok", "", (), tuple(mended))
+
+
+def _amplitude(steps: FloatArray, shifts_rad: FloatArray) -> float:
+    return max(float(np.median(np.abs(phasors(steps, shifts_rad)))), 1e-9)
+
+
+def _closure_share(axis: AxisSeries, index: int) -> float:
+    """Of one series, over its amplitude."""
+    steps = axis.frames[index]
+    return closure(steps, axis.shifts_rad).rms_adu / _amplitude(steps, axis.shifts_rad)
+
+
+def _closure_limits(axes: tuple[AxisSeries, ...]) -> dict[str, list[float]]:
+    """For each series, from all the others."""
+    shares = {
+        (axis.axis, k): _closure_share(axis, k) for axis in axes for k in range(len(axis.periods))
+    }
+
+    def limit(own: tuple[str, int]) -> float:
+        others = [share for key, share in shares.items() if key != own]
+        return (
+            max(CLOSURE_SHARE, CLOSURE_TIMES * float(np.median(others)))
+            if others
+            else CLOSURE_SHARE
+        )
+
+    return {axis.axis: [limit((axis.axis, k)) for k in range(len(axis.periods))] for axis in axes}
+
+
+def _mend(
+    axis: AxisSeries, index: int, limit: float, axes: tuple[AxisSeries, ...]
+) -> tuple[list[SeriesFlag], AxisSeries]:
+    """Flags of one series, and the axis with the series repaired as far as possible."""
+    disagree = _closure_share(axis, index) > limit
+    if not disagree and axis.inconsistent_share() <= INCONSISTENT_SHARE:
+        return [], axis
+    swapped = _exchange(axis, index, limit)
+    if swapped is not None:
+        (a, b), better = swapped
+        flags = [
+            SeriesFlag(axis.axis, index, k, f"swapped with step {j}") for k, j in ((a, b), (b, a))
+        ]
+        return flags, better
+    if not disagree:
+        return [], axis
+    closures = _closures(axis, index)
+    clearest = max(closures, key=lambda found: found.gain)
+    step, reason = clearest.suspect, "does not agree with the other steps"
+    twin = _twin(axis, index, axes)
+    if twin is not None:
+        step, reason = twin
+    elif step is None or clearest.gain < GAIN:
+        return [], axis
+    flags = [SeriesFlag(axis.axis, index, step, reason)]
+    if index + 1 == len(axis.periods):  # a wrong coarser one makes the next disagree; this has none
+        left = min(float(found.without_rms_adu[step]) for found in closures)
+        if left > LEFT_TIMES * limit * _amplitude(axis.frames[index], axis.shifts_rad):
+            return flags, axis  # it is not the only one
+    steps = axis.frames[index].copy()
+    count = len(steps)
+    steps[step] = steps[(step + 1) % count] + steps[(step - 1) % count] - steps[(step + 2) % count]
+    return flags, axis.with_frames(index, steps)
+
+
+def _closures(axis: AxisSeries, index: int) -> tuple[Closure, Closure]:
+    """Closures that can name a frame: with the other frequencies' phase known, and with the level
+    of the next.
+    """
+    neighbour = index - 1 if index + 1 == len(axis.periods) else index + 1
+    steps, near = axis.frames[index], axis.frames[neighbour]
+    amplitude = np.abs(phasors(near, axis.shifts_rad))
+    # a finer fringe is blurred: the same all over the picture to a good approximation
+    amplitude *= _amplitude(steps, axis.shifts_rad) / max(float(np.median(amplitude)), 1e-9)
+    expected = predicted_phase(axis.phases_rad(), axis.periods, index)
+    return (
+        closure_with_phase(steps, axis.shifts_rad, expected),
+        closure_with_level(steps, axis.shifts_rad, near.mean(axis=0), amplitude),
+    )
+
+
+def _exchange(
+    axis: AxisSeries, index: int, limit: float
+) -> tuple[tuple[int, int], AxisSeries] | None:
+    """The only exchange of two steps after which they agree, among themselves and with the other
+    frequencies.
+    """
+    found = []
+    for a, b in combinations(range(len(axis.shifts_rad)), 2):
+        steps = axis.frames[index].copy()
+        steps[[a, b]] = steps[[b, a]]
+        other = axis.with_frames(index, steps)
+        if (
+            _closure_share(other, index) <= limit
+            and other.inconsistent_share() <= INCONSISTENT_SHARE
+        ):
+            found.append(((a, b), other))
+    return found[0] if len(found) == 1 else None
+
+
+def _twin(axis: AxisSeries, index: int, axes: tuple[AxisSeries, ...]) -> tuple[int, str] | None:
+    """A step that shows the picture of an earlier frame, and which one."""
+    earlier: list[tuple[str, FloatArray]] = []
+    amplitude = _amplitude(axis.frames[index], axis.shifts_rad)
+    for series in axes:
+        for k, steps in enumerate(series.frames):
+            for step, frame in enumerate(steps):
+                here = series.axis == axis.axis and k == index
+                if here:
+                    for name, other in reversed(earlier):
+                        if math.sqrt(float(np.mean((frame - other) ** 2))) < SAME_SHARE * amplitude:
+                            return step, f"stale: the same picture as {name}"
+                earlier.append(
+                    (f"{series.axis}, {series.periods[k]:g} periods, step {step}", frame)
+                )
+            if series.axis == axis.axis and k == index:
+                return None
+    return None
+
+
+def _flat_flags(
+    axes: tuple[AxisSeries, ...], black: FloatArray, white: FloatArray
+) -> list[SeriesFlag]:
+    """White and black must enclose all that the fringes show."""
+    frames = np.concatenate([axis.frames.reshape(-1, black.size) for axis in axes])
+    margin = 0.1 * np.ptp(np.percentile(frames, [5, 95]))
+    typical_high, typical_low = np.percentile(frames, [90, 10], axis=0)
+    white_share = float(np.mean(typical_high > white + margin))
+    black_share = float(np.mean(typical_low < black - margin))
+    return [
+        SeriesFlag(name, 0, 0, f"not {word} than the fringes at {share:.0%} of the pixels")
+        for name, word, share in (
+            ("white", "brighter", white_share),
+            ("black", "darker", black_share),
+        )
+        if share > BEYOND_SHARE
+    ]

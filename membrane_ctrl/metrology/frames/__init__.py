@@ -1,1 +1,0 @@
-"""Frames of a set, and whether they belong together."""

@@ -1,0 +1,1 @@
+"""Compiled loops and the Zernike polynomials that all steps use."""

@@ -1,1 +1,0 @@
-"""Rays, surfaces and the screen: the geometry behind every measurement."""

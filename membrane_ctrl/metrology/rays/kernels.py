@@ -1,0 +1,368 @@
+"""Compiled loops over points: ray to surface, surface to screen, sums for the least squares.
+
+Lengths are in mm; x and y in the polynomials are divided by the radius. A point is a ray from the
+pinhole, P = F + t d, and what the camera saw there, a screen point S. All loops are linear in the
+number of points and work on a range of them, so that threads can share them.
+
+Arguments shared by the loops: `rays` (3, n) unit vectors d, `t` (n,) their lengths to the surface
+(updated in place by Newton steps), `pinhole` (3,), `plane` (4, 3) = O', s_x, s_y and the normal of
+the screen, `face` the `Face` that deviates from it, `poly` (degree + 1, degree + 1) the Zernike
+part, `excess` (15,) the Hencky excess of unit RMS and `amplitude` its size.
+"""
+
+import math
+
+import numpy as np
+
+from membrane_ctrl.metrology.film import film_law
+from membrane_ctrl.metrology.numerics.compiled import kernel, step
+from membrane_ctrl.metrology.rays import geometry
+from membrane_ctrl.model.zernike_terms import ZERNIKE_DEGREE
+
+FACE_STEPS = 6  # see `_onto_face`
+_BLOCK = 256  # points whose intermediate values stay in the first-level cache
+
+SLOPE_MONOMIALS = ZERNIKE_DEGREE * (ZERNIKE_DEGREE + 1) // 2  # x^p y^q with p + q < degree
+SUMS = (
+    2 * SLOPE_MONOMIALS + 5
+)  # moments of r_x and of r_y, two for the excess, sum w r_x^2, sum w r_y^2, sum w
+PRODUCT_DEGREE = 2 * (ZERNIKE_DEGREE - 1)
+PRODUCT_MONOMIALS = (PRODUCT_DEGREE + 1) * (PRODUCT_DEGREE + 2) // 2  # p + q <= PRODUCT_DEGREE
+PRODUCTS = PRODUCT_MONOMIALS + 2 * SLOPE_MONOMIALS + 2
+
+
+@step
+def evaluate(poly, excess, amplitude, x, y):  # type: ignore[no-untyped-def]
+    """Height, dh/dx, dh/dy and the excess' own d/dv at a point in
+    radii (Horner's rule in x and y).
+    """
+    h = 0.0
+    hx = 0.0
+    hy = 0.0
+    for i in range(ZERNIKE_DEGREE, -1, -1):
+        row = 0.0
+        slope = 0.0
+        for j in range(ZERNIKE_DEGREE - i, -1, -1):
+            slope = slope * y + row
+            row = row * y + poly[i, j]
+        hx = hx * x + h
+        h = h * x + row
+        hy = hy * x + slope
+    v = x * x + y * y
+    e = 0.0
+    ev = 0.0
+    for k in range(film_law.EXCESS_TERMS - 1, -1, -1):
+        ev = ev * v + e
+        e = e * v + excess[k]
+    return h + amplitude * e, hx + 2 * amplitude * ev * x, hy + 2 * amplitude * ev * y, ev
+
+
+@kernel
+def _load(rays, t, first, count, block):  # type: ignore[no-untyped-def]
+    for p in range(count):
+        block[0, p] = rays[0, first + p]
+        block[1, p] = rays[1, first + p]
+        block[2, p] = rays[2, first + p]
+        block[3, p] = t[first + p]
+
+
+@kernel
+def _newton(block, count, pinhole, poly, excess, amplitude, radius, vertex_z):  # type: ignore[no-untyped-def]
+    """One Newton step on F_z + t d_z = vertex_z + h(x, y); rows of `block` are d_x, d_y, d_z, t.
+
+    The derivative along the ray is d_z - h_x d_x - h_y d_y: never 0 for a ray that is steeper than
+    the film.
+    """
+    fx, fy, fz = pinhole[0], pinhole[1], pinhole[2]
+    for p in range(count):
+        dx, dy, dz, t = block[0, p], block[1, p], block[2, p], block[3, p]
+        h, hx, hy, _ev = evaluate(
+            poly, excess, amplitude, (fx + t * dx) / radius, (fy + t * dy) / radius
+        )
+        block[3, p] = t - (fz + t * dz - vertex_z - h) / (dz - (hx * dx + hy * dy) / radius)
+
+
+@kernel
+def intersect(rays, t, pinhole, poly, excess, amplitude, radius, vertex_z, newton, start, stop):  # type: ignore[no-untyped-def]
+    """Newton steps towards the surface, in place in `t`."""
+    block = np.empty((4, _BLOCK))
+    for first in range(start, stop, _BLOCK):
+        count = min(_BLOCK, stop - first)
+        _load(rays, t, first, count, block)
+        for _ in range(newton):
+            _newton(block, count, pinhole, poly, excess, amplitude, radius, vertex_z)
+        t[first : first + count] = block[3, :count]
+
+
+@step
+def bisector(dx, dy, dz, qx, qy, qz):  # type: ignore[no-untyped-def]
+    """Slopes of the mirror that turns the ray d towards q: its normal halves the angle between -d
+    and q.
+    """
+    scale = 1 / math.sqrt(qx * qx + qy * qy + qz * qz)
+    nz = qz * scale - dz
+    return -(qx * scale - dx) / nz, -(qy * scale - dy) / nz
+
+
+@step
+def measured_slope(rays, t, screen, w, pinhole, plane, p):  # type: ignore[no-untyped-def]
+    """x, y and both measured slopes at point p, from exact vectors; the screen point is w off the
+    plane.
+    """
+    dx, dy, dz = rays[0, p], rays[1, p], rays[2, p]
+    x = pinhole[0] + t[p] * dx
+    y = pinhole[1] + t[p] * dy
+    z = pinhole[2] + t[p] * dz
+    a, b = screen[0, p], screen[1, p]
+    gx, gy = bisector(
+        dx,
+        dy,
+        dz,
+        plane[0, 0] + a * plane[1, 0] + b * plane[2, 0] + w * plane[3, 0] - x,
+        plane[0, 1] + a * plane[1, 1] + b * plane[2, 1] + w * plane[3, 1] - y,
+        plane[0, 2] + a * plane[1, 2] + b * plane[2, 2] + w * plane[3, 2] - z,
+    )
+    return x, y, gx, gy
+
+
+@kernel
+def _lift(screen, face, first, count, out):  # type: ignore[no-untyped-def]
+    """Deviation of the face at some points, in a separate loop: a look-up prevents vector
+    instructions.
+    """
+    if geometry.is_plane(face):
+        out[:count] = 0.0
+        return
+    for k in range(count):
+        out[k], _wa, _wb = geometry.face_height(face, screen[0, first + k], screen[1, first + k])
+
+
+@kernel
+def _add_moments(values, x, powers_y, count, sums, first):  # type: ignore[no-untyped-def]
+    """sums[first + k] += sum over points of values x^p y^q, p outer, q inner, p + q < rows of
+    powers_y.
+
+    `values` is used up: it is multiplied by x from power to power.
+    """
+    k = first
+    size = powers_y.shape[0]
+    for i in range(size):
+        for j in range(size - i):
+            total = 0.0
+            for p in range(count):
+                total += values[p] * powers_y[j, p]
+            sums[k] += total
+            k += 1
+        for p in range(count):
+            values[p] *= x[p]
+
+
+@kernel
+def _powers(y, powers_y, count):  # type: ignore[no-untyped-def]
+    for p in range(count):
+        powers_y[0, p] = 1.0
+    for j in range(1, powers_y.shape[0]):
+        for p in range(count):
+            powers_y[j, p] = powers_y[j - 1, p] * y[p]
+
+
+@kernel
+def residual_sums(  # type: ignore[no-untyped-def]
+    rays, t, screen, weights, pinhole, plane, face, poly, excess, amplitude, radius, start, stop
+):
+    """Moments of the weighted slope residual g - D a: all that the right-hand side of the least
+    squares needs.
+
+    Returns (SUMS,): sum w r_x x^p y^q (SLOPE_MONOMIALS), as many of r_y, sum w r_x x e'(v) and sum
+    w r_y y e'(v) for the excess, sum w r_x^2, sum w r_y^2, sum w.
+    """
+    sums = np.zeros(SUMS)
+    block = np.empty((5, _BLOCK))
+    xs, ys, rx, ry, off = block[0], block[1], block[2], block[3], block[4]
+    powers_y = np.empty((ZERNIKE_DEGREE, _BLOCK))
+    for first in range(start, stop, _BLOCK):
+        count = min(_BLOCK, stop - first)
+        x_excess = 0.0
+        y_excess = 0.0
+        x_square = 0.0
+        y_square = 0.0
+        w_sum = 0.0
+        _lift(screen, face, first, count, off)
+        for k in range(count):
+            x, y, gx, gy = measured_slope(rays, t, screen, off[k], pinhole, plane, first + k)
+            xs[k] = x / radius
+            ys[k] = y / radius
+            _h, hx, hy, ev = evaluate(poly, excess, amplitude, xs[k], ys[k])
+            w = weights[first + k]
+            ax = gx - hx / radius
+            ay = gy - hy / radius
+            rx[k] = w * ax
+            ry[k] = w * ay
+            x_excess += rx[k] * xs[k] * ev
+            y_excess += ry[k] * ys[k] * ev
+            x_square += rx[k] * ax
+            y_square += ry[k] * ay
+            w_sum += w
+        sums[2 * SLOPE_MONOMIALS] += x_excess
+        sums[2 * SLOPE_MONOMIALS + 1] += y_excess
+        sums[2 * SLOPE_MONOMIALS + 2] += x_square
+        sums[2 * SLOPE_MONOMIALS + 3] += y_square
+        sums[2 * SLOPE_MONOMIALS + 4] += w_sum
+        _powers(ys, powers_y, count)
+        _add_moments(rx, xs, powers_y, count, sums, 0)
+        _add_moments(ry, xs, powers_y, count, sums, SLOPE_MONOMIALS)
+    return sums
+
+
+@kernel
+def product_sums(rays, t, weights, pinhole, excess, radius, start, stop):  # type: ignore[no-untyped-def]
+    """Moments from which the normal matrix is made.
+
+    Returns (PRODUCTS,): sum w x^p y^q of PRODUCT_MONOMIALS, sum w e' x x^p y^q and sum w e' y x^p
+    y^q with SLOPE_MONOMIALS each, sum w (e' x)^2, sum w (e' y)^2.
+    """
+    sums = np.zeros(PRODUCTS)
+    block = np.empty((5, _BLOCK))
+    xs, ys, ws, ex, ey = block[0], block[1], block[2], block[3], block[4]
+    powers_y = np.empty((PRODUCT_DEGREE + 1, _BLOCK))
+    flat = np.zeros((ZERNIKE_DEGREE + 1, ZERNIKE_DEGREE + 1))
+    for first in range(start, stop, _BLOCK):
+        count = min(_BLOCK, stop - first)
+        for k in range(count):
+            p = first + k
+            xs[k] = (pinhole[0] + t[p] * rays[0, p]) / radius
+            ys[k] = (pinhole[1] + t[p] * rays[1, p]) / radius
+            _h, _hx, _hy, ev = evaluate(flat, excess, 0.0, xs[k], ys[k])
+            ws[k] = weights[p]
+            ex[k] = weights[p] * ev * xs[k]
+            ey[k] = weights[p] * ev * ys[k]
+            sums[PRODUCTS - 2] += ex[k] * ev * xs[k]
+            sums[PRODUCTS - 1] += ey[k] * ev * ys[k]
+        _powers(ys, powers_y, count)
+        _add_moments(ws, xs, powers_y, count, sums, 0)
+        _add_moments(ex, xs, powers_y[:ZERNIKE_DEGREE], count, sums, PRODUCT_MONOMIALS)
+        _add_moments(
+            ey, xs, powers_y[:ZERNIKE_DEGREE], count, sums, PRODUCT_MONOMIALS + SLOPE_MONOMIALS
+        )
+    return sums
+
+
+@kernel
+def invert(matrix):  # type: ignore[no-untyped-def]
+    """Inverse of a symmetric positive matrix in place by Gauss-Jordan; False, and no usable result,
+    if it is not one.
+
+    A 36 x 36 matrix takes some 20 us here; on a busy machine the linear algebra library may wait a
+    thousand times longer for its threads. A positive matrix needs no pivoting: each pivot is a
+    Schur complement, and one below 1e-13 of its diagonal element is only rounding.
+    """
+    size = matrix.shape[0]
+    diagonal = np.diag(matrix).copy()
+    for k in range(size):
+        pivot = matrix[k, k]
+        if not pivot > 1e-13 * diagonal[k]:
+            return False
+        matrix[k, k] = 1.0
+        for j in range(size):
+            matrix[k, j] /= pivot
+        for i in range(size):
+            if i != k:
+                factor = matrix[i, k]
+                matrix[i, k] = 0.0
+                for j in range(size):
+                    matrix[i, j] -= factor * matrix[k, j]
+    return True
+
+
+@kernel
+def slope_field(  # type: ignore[no-untyped-def]
+    rays, t, screen, pinhole, plane, face, poly, excess, amplitude, radius, out, start, stop
+):
+    """x, y, measured g_x, g_y and fitted h_x, h_y of each point into `out` (6, n)."""
+    off = np.empty(_BLOCK)
+    for first in range(start, stop, _BLOCK):
+        count = min(_BLOCK, stop - first)
+        _lift(screen, face, first, count, off)
+        for k in range(count):
+            p = first + k
+            x, y, gx, gy = measured_slope(rays, t, screen, off[k], pinhole, plane, p)
+            _h, hx, hy, _ev = evaluate(poly, excess, amplitude, x / radius, y / radius)
+            out[0, p] = x
+            out[1, p] = y
+            out[2, p] = gx
+            out[3, p] = gy
+            out[4, p] = hx / radius
+            out[5, p] = hy / radius
+
+
+@kernel
+def predict_screen(  # type: ignore[no-untyped-def]
+    rays, t, pinhole, plane, face, poly, excess, amplitude, radius, out, start, stop
+):
+    """Where the surface sends each ray on the screen, s_x and s_y into `out` (2, n); t must be on
+    it.
+    """
+    tangents = np.empty((2, _BLOCK))
+    for first in range(start, stop, _BLOCK):
+        count = min(_BLOCK, stop - first)
+        for k in range(count):
+            p = first + k
+            dx, dy, dz = rays[0, p], rays[1, p], rays[2, p]
+            x = pinhole[0] + t[p] * dx
+            y = pinhole[1] + t[p] * dy
+            z = pinhole[2] + t[p] * dz
+            _h, hx, hy, _ev = evaluate(poly, excess, amplitude, x / radius, y / radius)
+            nx, ny = -hx / radius, -hy / radius
+            turn = 2 * (dx * nx + dy * ny + dz) / (nx * nx + ny * ny + 1)
+            ux, uy, uz = dx - turn * nx, dy - turn * ny, dz - turn
+            across = 1 / (ux * plane[3, 0] + uy * plane[3, 1] + uz * plane[3, 2])
+            ox, oy, oz = plane[0, 0] - x, plane[0, 1] - y, plane[0, 2] - z
+            reach = (ox * plane[3, 0] + oy * plane[3, 1] + oz * plane[3, 2]) * across
+            fx, fy, fz = reach * ux - ox, reach * uy - oy, reach * uz - oz
+            out[0, p] = fx * plane[1, 0] + fy * plane[1, 1] + fz * plane[1, 2]
+            out[1, p] = fx * plane[2, 0] + fy * plane[2, 1] + fz * plane[2, 2]
+            tangents[0, k] = (ux * plane[1, 0] + uy * plane[1, 1] + uz * plane[1, 2]) * across
+            tangents[1, k] = (ux * plane[2, 0] + uy * plane[2, 1] + uz * plane[2, 2]) * across
+        _onto_face(out, tangents, face, first, count)
+
+
+@kernel
+def _onto_face(out, tangents, face, first, count):  # type: ignore[no-untyped-def]
+    """From where rays cross the plane to where they meet the face, by Newton's steps on w = face(s
+    + w tangent).
+
+    A step leaves the square of the miss times the face's curvature: 1 mm of bow 200 mm wide is met
+    to rounding after three, a map of a few millimetres after four or five.
+    """
+    if geometry.is_plane(face):
+        return
+    for k in range(count):
+        a, b, ta, tb = out[0, first + k], out[1, first + k], tangents[0, k], tangents[1, k]
+        w = 0.0
+        for _ in range(FACE_STEPS):
+            height, wa, wb = geometry.face_height(face, a + w * ta, b + w * tb)
+            w -= (w - height) / (1 - wa * ta - wb * tb)
+        out[0, first + k] = a + w * ta
+        out[1, first + k] = b + w * tb
+
+
+@step
+def cos_sin(x):  # type: ignore[no-untyped-def]
+    """Cosine and sine of a phase in single precision, to 1e-6 within three turns.
+
+    Taylor's series about the nearest quarter of a turn: unlike a library's functions, they run on
+    vector units.
+    """
+    quarter = np.rint(x * np.float32(2 / math.pi))
+    y = x - quarter * np.float32(math.pi / 2)
+    z = y * y
+    c = np.float32(1 / 720) - z * np.float32(1 / 40320)
+    c = np.float32(1) - z * (np.float32(1 / 2) - z * (np.float32(1 / 24) - z * c))
+    s = np.float32(1 / 5040) - z * np.float32(1 / 362880)
+    s = y - y * z * (np.float32(1 / 6) - z * (np.float32(1 / 120) - z * s))
+    k = np.int32(quarter)
+    if k & 1:
+        c, s = -s, c
+    if k & 2:
+        c, s = -c, -s
+    return c, s

@@ -1,1 +1,0 @@
-"""The figure from every frame of a crossed pattern that stands still (docs/how-to/tracking.md)."""

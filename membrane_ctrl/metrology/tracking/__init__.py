@@ -1,0 +1,1 @@
+"""The figure from every frame of a crossed pattern (docs/tracking.md)."""

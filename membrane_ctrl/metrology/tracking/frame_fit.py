@@ -1,0 +1,375 @@
+"""The fit of one frame: Gauss-Newton on the light of its bins, for the surface and for what changes
+smoothly.
+
+With J the derivatives of the bins' light by the parameters of the surface and of the maps of level
+and swings, W weights, 0 for outliers and fading where the bins end, and r the residual, a step is
+(J^T W J)^-1 J^T W r. The matrix is kept from step to step and from frame to frame: where J^T W r
+vanishes is the solution whatever matrix led there. It is made anew where steps shrink too slowly. J
+of a bin is fringes times what changes slowly over the mirror (derivatives of the phases, Noll
+terms): the latter is a plane over a cell of bins, so that products take a fifth.
+
+Steps of the pattern give level, swings and phases of each bin without orders and without
+smoothness. With the phases that the fits of the single frames give, I_k = A l_k + Re[z_x b_k exp(i
+(phi_xk + d_xk))] + the same of y is linear in A, z_x, z_y of a bin; l and b are the maps that the
+fits found. The angles of z are shape that the surface lacks: what the terms can represent moves the
+surface, the rest stays with the bin.
+"""
+
+import math
+from dataclasses import dataclass, field, replace
+from functools import cached_property
+from itertools import product
+
+import numpy as np
+
+from membrane_ctrl.metrology.frame_checks.backlight_bands import Bands, fitted_waves
+from membrane_ctrl.metrology.numerics.compiled import sums_by
+from membrane_ctrl.metrology.rays import kernels
+from membrane_ctrl.metrology.rays.surface import PARAMETERS, Surface, height_probe
+from membrane_ctrl.metrology.tracking.crossed_scene import CrossedScene, light_left, light_waves
+from membrane_ctrl.model.arrays import AnyArray, FloatArray, Singles
+from membrane_ctrl.model.zernike_terms import ZERNIKE_TERMS
+
+# last change of height at the rim, of which a seventh is left: 0.4 nm there, 0.04 of the terms
+TOLERANCE_MM = 3e-6
+_MAX_STEPS = 10
+_MAX_MATRICES = 2  # new ones for a frame: one that needs more is lost
+# Largest last change of a frame that is not lost: at the rim, where it is ten times that of the
+# terms. Steps shrink slowly where the weights of many bins change with them.
+_SETTLED_MM = 1e-5
+_ALL_ADU = np.float32(1e6)  # a reach beyond which no bin is
+_ASTRAY_MM = 2.0  # a step beyond which nothing is linear
+# at the rim; between two exact traces phases follow their derivatives: 0.3 nm off at most
+_LINEAR_MM = 1e-3
+_SLOW = 0.3  # a step that shrinks less than this asks for a new matrix
+Shifts = tuple[float, float]  # phase steps of x and y
+_UNKNOWNS = PARAMETERS + 3 * ZERNIKE_TERMS
+# Of the unknowns that turn each wave
+_STARTS = 0, 0, PARAMETERS, PARAMETERS + ZERNIKE_TERMS, PARAMETERS + 2 * ZERNIKE_TERMS
+# Squares along the mirror's diameter whose errors count as independent: 2.3 fringes each. In
+# smaller ones light that wanders leaves more than it does in all.
+_BLOCKS = 14
+ENOUGH_STEPS = 5  # they separate level, two swings and two phases
+_STRAY_SIGMAS = 8.0  # robust ones; phases beyond it are those of dust, and move no surface
+# Mean weights of a bin in a step: one that fits now and fails then has changed, and has no weight
+# until five steps agree. With its former light it moved the frames of each step by up to 30 nm of
+# sag.
+_FITS, _FAILS = 0.95, 0.05
+
+
+@dataclass(frozen=True)
+class FrameFit:
+    """Solution of one frame."""
+
+    surface: Surface
+    # (3, terms): relative change of level and swings against the scene's, as Noll terms
+    light: FloatArray
+    residual_adu: Singles  # (n,): light less the model's
+    weights: Singles  # (n,): 1, falling to 0 for outliers
+    converged: bool
+    bands: FloatArray = field(
+        default_factory=lambda: np.zeros(0)
+    )  # (2 k,): relative amplitudes of the rows' waves
+
+    @cached_property
+    def scale_adu(self) -> float:
+        """Robust sigma of the residual."""
+        return 1.4826 * float(np.median(np.abs(self.residual_adu[::3])))
+
+
+class FrameFitter:
+    """Fits frame after frame of a scene; a `jacobian` (2, parameters, 3, N) of the same bins and
+    surface need not be made."""
+
+    def __init__(self, scene: CrossedScene, bands: Bands, jacobian: Singles | None = None) -> None:
+        self.scene, self.bands = scene, bands
+        self._cells = scene.cells
+        self.jacobian = (
+            self._cells.planes(scene.jacobian(scene.surface)) if jacobian is None else jacobian
+        )
+        self._basis = self._cells.planes(scene.basis)
+        self.light_adu = scene.light_adu.astype(np.float32)
+        self._traced = scene.surface
+        self._base = _reduced(scene.phase_rad(scene.surface))
+        self._inverse: FloatArray | None = None
+        self._out = np.empty((4, scene.index.size), np.float32)
+        self._slow, self._pull = (
+            self._cells.blocks(*self.jacobian, self._basis),
+            np.empty((4, PARAMETERS)),
+        )
+        self._response = scene.response.astype(np.float32)
+
+    def fit(
+        self, seen_adu: Singles, shifts_rad: Shifts, start: FrameFit, reach_adu: Singles
+    ) -> FrameFit:
+        """Fit a frame, means `seen_adu` (n,) over the bins, from the last solution.
+
+        From a residual of `reach_adu` (n,) on a bin has no weight; 0 leaves it out.
+        """
+        if self._inverse is not None and len(self._inverse) != _UNKNOWNS + len(self.bands.waves):
+            self._inverse = None
+        inherited = self._inverse is not None
+        found = self._descend(seen_adu, shifts_rad, start, reach_adu, patient=False)
+        if not found.converged and inherited:  # perhaps the matrix is of another frame
+            self._inverse = None
+            found = self._descend(seen_adu, shifts_rad, start, reach_adu, patient=True)
+        if not found.converged:
+            self._inverse = None
+        return found
+
+    def prepare(self, shifts_rad: Shifts, start: FrameFit) -> None:
+        """Make the matrix for frames with these phase steps that will be fitted from `start`."""
+        self._inverse = self._inverted(shifts_rad, start.surface, start.light, start.weights)
+
+    def _descend(
+        self, seen_adu: Singles, shifts_rad: Shifts, start: FrameFit, reach: Singles, patient: bool
+    ) -> FrameFit:
+        """Take steps until they vanish, lead astray or need too many matrices; small steps may if
+        `patient`.
+        """
+        shape, light, change, matrices = start.surface, start.light.copy(), math.inf, 0
+        bands = np.zeros(len(self.bands.waves))
+        if bands.size:  # each frame has others: without them, much would be an outlier at first
+            self._evaluate(seen_adu, shifts_rad, shape, light, bands, _ALL_ADU * (reach > 0))
+            bands = fitted_waves(self.bands.waves, self.rows())
+        for _ in range(_MAX_STEPS):
+            self._evaluate(seen_adu, shifts_rad, shape, light, bands, reach)
+            if self._inverse is None:
+                self._inverse = self._inverted(shifts_rad, shape, light, self._out[1])
+                matrices, change = (
+                    matrices + 1,
+                    math.inf,
+                )  # its first step is not judged by an old one's last
+            if self._inverse is None:
+                break
+            delta, last = self._inverse @ self._right(), change
+            shape = Surface.from_parameters(shape.parameters + delta[:PARAMETERS], shape.radius_mm)
+            light += delta[PARAMETERS:_UNKNOWNS].reshape(3, ZERNIKE_TERMS)
+            bands = bands + delta[_UNKNOWNS:]
+            change = float(np.max(np.abs(height_probe() @ delta[:PARAMETERS])))
+            if not TOLERANCE_MM < change < _ASTRAY_MM:
+                break
+            if change > _SLOW * last and (
+                matrices < _MAX_MATRICES or (patient and change < _LINEAR_MM)
+            ):
+                self._inverse = None
+        residual, weights = self._out[:2].copy()
+        return FrameFit(shape, light, residual, weights, change <= _SETTLED_MM, bands)
+
+    def _evaluate(
+        self,
+        seen: Singles,
+        shifts_rad: Shifts,
+        shape: Surface,
+        light: FloatArray,
+        bands: FloatArray,
+        reach: Singles,
+    ) -> None:
+        """Residual, weights and what the right side is made of, at a surface, maps of light and
+        bands.
+        """
+        known = self.scene.edge, self.bands.gain(bands)
+        light_left(
+            *self._shown(shifts_rad, shape, light), *known, seen, reach, self._pull, self._out
+        )
+
+    def rows(self) -> FloatArray:
+        """Sums (2, R) of the last evaluation over the picture's rows, for `Bands`."""
+        return self.bands.sums(self._out[2:])
+
+    def _shown(self, shifts_rad: Shifts, shape: Surface, light: FloatArray) -> tuple[AnyArray, ...]:
+        """What the kernels take a frame's light from."""
+        moved = shape.parameters - self._traced.parameters
+        if np.max(np.abs(height_probe() @ moved)) > _LINEAR_MM:
+            self._traced, moved = shape, np.zeros(PARAMETERS)
+            self._base = _reduced(self.scene.phase_rad(shape))
+        changes, shifts = (
+            np.vstack([moved, light]).astype(np.float32),
+            np.array(shifts_rad, np.float32),
+        )
+        return (
+            self._base,
+            self.light_adu,
+            self._slow,
+            self._cells.offset,
+            self._response,
+            changes,
+            shifts,
+        )
+
+    def _right(self) -> FloatArray:
+        """J^T W r (144 + 2 k,) of the last evaluation."""
+        bands = self.bands.waves @ self.rows()[0] if len(self.bands.waves) else np.zeros(0)
+        return np.concatenate([self._pull.ravel(), bands])
+
+    def _waves(self, shifts_rad: Shifts, shape: Surface, light: FloatArray) -> Singles:
+        """Rows (6, n): dI by phi_x, by phi_y, by relative changes of A, B_x, B_y,
+        and of all light.
+        """
+        waves = np.empty((6, self.scene.index.size), np.float32)
+        light_waves(*self._shown(shifts_rad, shape, light), waves)
+        return waves
+
+    def _inverted(
+        self, shifts_rad: Shifts, shape: Surface, light: FloatArray, weights: Singles
+    ) -> FloatArray | None:
+        """(J^T W J)^-1; None if the bins do not determine the unknowns."""
+        *waves, shown = self._waves(shifts_rad, shape, light)
+        slow = [
+            planes[:, 0] for planes in (*self.jacobian, *[self._basis] * 3)
+        ]  # it need not be exact
+        bands, weights = shown * self.bands.waves[:, self.bands.row], weights * self.scene.edge
+        matrix = np.zeros((_UNKNOWNS + len(bands),) * 2)
+        for i, j in product(range(len(slow)), repeat=2):
+            rows, columns = (slice(start, start + PARAMETERS) for start in (_STARTS[i], _STARTS[j]))
+            both = self._cells.sums(waves[i] * waves[j] * weights)
+            matrix[rows, columns] += (slow[i] * both) @ slow[j].T
+        for start, planes, wave in zip(_STARTS, slow, waves, strict=True):
+            matrix[start : start + PARAMETERS, _UNKNOWNS:] += (
+                planes @ self._cells.sums(bands * wave * weights).T
+            )
+        matrix[_UNKNOWNS:, :_UNKNOWNS] = matrix[:_UNKNOWNS, _UNKNOWNS:].T
+        matrix[_UNKNOWNS:, _UNKNOWNS:] = (bands * weights) @ bands.T
+        scale = 1 / np.sqrt(np.maximum(np.diag(matrix), 1e-30))
+        matrix *= np.outer(scale, scale)
+        if not kernels.invert(matrix):
+            return None
+        return np.asarray(matrix * np.outer(scale, scale))
+
+    def covariance_mm2(self, fit: FrameFit, shifts_rad: Shifts, noise_adu: float) -> FloatArray:
+        """Covariance (parameters, parameters) of the parameters from what the fit leaves, or from
+        the noise where that is larger.
+
+        Errors of neighbouring bins belong together (light that wanders): what a square contributes
+        to the solution counts as one error, and the squares as independent. Maps of light are
+        refitted with the surface, so that their errors are in it.
+        """
+        if self._inverse is None or len(self._inverse) != _UNKNOWNS + len(
+            self.bands.waves
+        ):  # the last was refused
+            self._inverse = self._inverted(shifts_rad, fit.surface, fit.light, fit.weights)
+        if self._inverse is None:
+            return np.full((PARAMETERS, PARAMETERS), math.nan)
+        gain = self._inverse[:PARAMETERS].astype(np.float32)
+        parts = zip(_STARTS, (*self.jacobian, *[self._basis] * 3), strict=True)
+        slow = np.stack(
+            [np.tensordot(gain[:, at : at + PARAMETERS], planes, 1) for at, planes in parts], axis=1
+        )
+        waves = self._waves(shifts_rad, fit.surface, fit.light)[
+            :5
+        ]  # what bands pull changes errors by a thousandth
+        sums = self.in_squares(slow, waves * (self.scene.edge * fit.weights * fit.residual_adu))
+        used = int(np.count_nonzero(np.any(sums != 0, axis=0)))
+        seen = sums @ sums.T * (used / max(used - PARAMETERS, 1))
+        grown = np.sqrt(
+            np.maximum(1.0, noise_adu**2 * np.diag(gain[:, :PARAMETERS]) / np.diag(seen))
+        )
+        return np.asarray(seen * np.outer(grown, grown))
+
+    def in_squares(self, slow: Singles, values: AnyArray) -> FloatArray:
+        """Sums (rows, squares) over squares of the mirror whose errors count as independent.
+
+        `slow` (rows, k, 3, N) are what values (k, n) are multiplied by. Squares of 2.3 fringes fade
+        into their
+        neighbours: what cancels over whole fringes cancels in each. Their sums are as large as
+        those of squares that do not overlap.
+        """
+        place = (self.scene.position_mm / self.scene.surface.radius_mm + 1) / 2 * _BLOCKS
+        low = np.floor(self._cells.planes(place)[:, 0]).astype(int)
+        upper = np.sin(np.pi / 2 * np.clip(place - self._cells.each(low), 0, 1)) ** 2
+        (left, right), (below, above) = np.stack([1 - upper, upper], axis=1)
+        side = _BLOCKS + 2
+        number, total = low[1] * side + low[0], np.zeros((len(slow), side**2))
+        for share, on in (
+            (left * below, 0),
+            (right * below, 1),
+            (left * above, side),
+            (right * above, side + 1),
+        ):
+            pull = np.einsum("pkiq,kiq->pq", slow, self._cells.moments(share * values))
+            total += sums_by(number + on, pull, side**2)
+        return np.asarray(total / 0.75)  # mean of the squares of the four shares: 0.75^2
+
+    def period_um(self) -> FloatArray:
+        """Change (2, parameters) of the parameters that looks like one period along x, along y, in
+        all of the mirror."""
+        means = self.jacobian[:, :, 0].astype(float)
+        matrix = sum(j @ j.T for j in means)
+        return np.stack([1e3 * np.linalg.solve(matrix, 2 * math.pi * j.sum(axis=1)) for j in means])
+
+
+def _reduced(phase_rad: FloatArray) -> Singles:
+    """Phases within one turn, where single precision is worth 1e-7 rad."""
+    return np.asarray(np.remainder(phase_rad, 2 * math.pi), np.float32)
+
+
+def separable(shifts_rad: FloatArray) -> bool:
+    """Whether steps (N, 2) of x and y separate the two axes."""
+    design = _design(np.zeros((2, len(shifts_rad))), np.asarray(shifts_rad).T)
+    return len(design) >= ENOUGH_STEPS and bool(np.linalg.cond(design) < 10)
+
+
+def _design(phase_rad: FloatArray, shifts_rad: FloatArray) -> FloatArray:
+    """Rows (..., 5) of level, cosine and sine of x, of y; phases and shifts are (2, ...)."""
+    x, y = phase_rad + shifts_rad
+    return np.stack([np.ones_like(x), np.cos(x), -np.sin(x), np.cos(y), -np.sin(y)], axis=-1)
+
+
+def stepped(
+    fitter: FrameFitter, fits: list[FrameFit], seen_adu: Singles, shifts_rad: FloatArray
+) -> tuple[CrossedScene, FloatArray, FloatArray]:
+    """The scene as the steps saw it; by how much that moves the surface's parameters (parameters,),
+    and their variance.
+
+    `fits` are those of the N single frames, `seen_adu` (N, n) their bins, `shifts_rad` (N, 2) their
+    steps.
+    """
+    scene = fitter.scene
+    design = np.empty((scene.index.size, len(fits), 5))
+    rest = np.empty((scene.index.size, len(fits)))
+    for k, (fit, shifts) in enumerate(zip(fits, shifts_rad, strict=True)):
+        phases = scene.phase_rad(fit.surface)
+        maps = 1 + fit.light @ scene.basis
+        design[:, k] = _design(phases, shifts[:, None]) * maps[[0, 1, 1, 2, 2]].T
+        rest[:, k] = seen_adu[k] - scene.harmonics_adu(phases + shifts[:, None])
+    turned = np.swapaxes(design, 1, 2)
+    solved = np.linalg.solve(turned @ design, turned @ rest[..., None])[..., 0]
+    swing = np.hypot(solved[:, 1::2], solved[:, 2::2]).T
+    off_rad = np.arctan2(solved[:, 2::2], solved[:, 1::2]).T
+    weights = np.stack([fit.weights for fit in fits])
+    good = (weights > _FITS).all(axis=0) | (weights < _FAILS).all(axis=0)
+    good &= (swing > 0.2 * np.median(swing, axis=1)[:, None]).all(axis=0)
+    moved, variance, left_rad = _split(fitter, off_rad, swing * good * np.sqrt(scene.taper))
+    light = np.stack([solved[:, 0], *swing])
+    light = np.where(good, light, scene.light_adu)
+    beyond_mm = scene.beyond_mm + good * left_rad / scene.rad_per_mm
+    return (
+        replace(scene, light_adu=light, beyond_mm=beyond_mm, edge=scene.taper * good),
+        moved,
+        variance,
+    )
+
+
+def _split(
+    fitter: FrameFitter, off_rad: FloatArray, weight: FloatArray
+) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Phases (2, n) as a change of the surface's parameters (parameters,), its variance, and what
+    is left of them.
+    """
+    weight, slow, cells = weight**2, fitter.jacobian, fitter.scene.cells
+    weighted = (
+        slow[:, :, 0] * cells.sums(weight)[:, None]
+    )  # it need not be exact: what is left is solved again
+    matrix: FloatArray = np.sum(weighted @ slow[:, :, 0].transpose(0, 2, 1), axis=0, dtype=float)
+    moved, left_rad, fits = np.zeros(PARAMETERS), off_rad, weight
+    for _ in range(3):
+        right = np.einsum("apiq,aiq->p", slow, cells.moments(fits * left_rad), dtype=float)
+        moved += np.linalg.solve(matrix, right)
+        left_rad = off_rad - cells.spread(np.tensordot(moved, slow, (0, 1)))
+        reach_rad = _STRAY_SIGMAS * 1.4826 * np.median(np.abs(left_rad[weight > 0]))
+        fits = weight * (np.abs(left_rad) <= reach_rad).all(axis=0)
+    pull = fitter.in_squares(
+        slow.swapaxes(0, 1), fits * left_rad
+    )  # light that changed between the steps
+    errors = np.linalg.solve(matrix, pull)
+    return moved, np.asarray(np.sum(errors**2, axis=1)), left_rad

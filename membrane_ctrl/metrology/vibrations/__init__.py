@@ -1,0 +1,1 @@
+"""Vibrations of the mirror, from tracked figures."""
