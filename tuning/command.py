@@ -145,7 +145,7 @@ def outer(options: TuneOptions) -> int:
     """Measure sag sensitivity, noise and drift of the figure; try the shape loop's time constant
     that follows.
     """
-    from membrane_ctrl.metrology.film.film_law import zernike_projection
+    from membrane_ctrl.metrology.film.hencky_bowl import zernike_projection
     from tuning.identification import shape_loop
 
     assumed = zernike_projection()

@@ -12,7 +12,7 @@ from membrane_ctrl.config.schema import Config
 from membrane_ctrl.control_port.ctl import Where
 from membrane_ctrl.controller.commands import Command
 from membrane_ctrl.hold.virtual_run import ShapeSource, TruthShape, VirtualRun
-from membrane_ctrl.metrology.film.film_law import zernike_projection
+from membrane_ctrl.metrology.film.hencky_bowl import zernike_projection
 from membrane_ctrl.model import shape_estimate, telemetry
 from membrane_ctrl.model.errors import DeviceError, InputError, writing
 from membrane_ctrl.model.events import CommandTaken, Event

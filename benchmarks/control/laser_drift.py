@@ -11,7 +11,7 @@ from collections.abc import Callable
 import numpy as np
 
 from membrane_ctrl.config.schema import Config, ShapeConfig, TwinConfig
-from membrane_ctrl.metrology.film.film_law import zernike_projection
+from membrane_ctrl.metrology.film.hencky_bowl import zernike_projection
 from membrane_ctrl.model.telemetry import State
 from membrane_ctrl.sim.plant import Plant
 from tests.support.figures import Figure, at_most

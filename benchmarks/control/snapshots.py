@@ -22,7 +22,7 @@ from membrane_ctrl.controller.controller import Controller
 from membrane_ctrl.controller.snapshot import continue_from, take_snapshot
 from membrane_ctrl.controller.tick_codec import SNAPSHOT_MESSAGE_BYTES, pack_snapshot
 from membrane_ctrl.hold.virtual_run import TruthShape, VirtualRun, VirtualTick
-from membrane_ctrl.metrology.film.film_law import zernike_projection
+from membrane_ctrl.metrology.film.hencky_bowl import zernike_projection
 from membrane_ctrl.processes.ring import RingWriter, ring
 from membrane_ctrl.sim.plant import Plant
 from membrane_ctrl.sim.virtual_bench import VirtualBench

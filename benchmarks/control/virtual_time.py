@@ -12,7 +12,7 @@ from pathlib import Path
 
 from membrane_ctrl.config.schema import Config, LoopConfig, ShapeConfig
 from membrane_ctrl.hold.virtual_run import TruthShape, VirtualRun
-from membrane_ctrl.metrology.film.film_law import zernike_projection
+from membrane_ctrl.metrology.film.hencky_bowl import zernike_projection
 from membrane_ctrl.sim.plant import Plant
 from membrane_ctrl.sim.virtual_bench import VirtualBench
 from tests.support.figures import Figure, at_least, at_most

@@ -33,7 +33,7 @@ from membrane_ctrl.acquisition.optical_bench import DisplayTest
 from membrane_ctrl.acquisition.session import WaitingClock
 from membrane_ctrl.config.schema import OpticsConfig
 from membrane_ctrl.metrology.cycle.live_reconstructor import LiveReconstructor
-from membrane_ctrl.metrology.phase.phase_steps import fringe_sequence, full_sequence
+from membrane_ctrl.metrology.phase.pattern_sequence import fringe_sequence, full_sequence
 from membrane_ctrl.model.clock import RunClock
 from membrane_ctrl.processes.frames import FrameRing, FrameWriter
 from membrane_ctrl.sim.optics.camera import OpticsRenderer

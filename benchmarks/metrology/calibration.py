@@ -23,7 +23,7 @@ from membrane_ctrl.config.optics import (
     ScreenPoseConfig,
 )
 from membrane_ctrl.metrology.calibration.model_tests import suspects
-from membrane_ctrl.metrology.calibration.normal_equations import References
+from membrane_ctrl.metrology.calibration.set_state import References
 from membrane_ctrl.metrology.calibration.solver import (
     Problem,
     Solution,
@@ -33,15 +33,11 @@ from membrane_ctrl.metrology.calibration.solver import (
 )
 from membrane_ctrl.metrology.frame_checks.checked_set import check
 from membrane_ctrl.metrology.phase.frame_stack import FrameStack
-from membrane_ctrl.metrology.rays.bench_parameters import (
-    ALL,
-    NAMES,
-    BenchGeometry,
-    bench_at,
-    sigmas,
-)
-from membrane_ctrl.metrology.rays.forward_model import SetPhases, residual_mm
+from membrane_ctrl.metrology.rays.bench_parameters import ALL, NAMES, sigmas
+from membrane_ctrl.metrology.rays.bench_poses import BenchGeometry, bench_at
+from membrane_ctrl.metrology.rays.forward_model import residual_mm
 from membrane_ctrl.metrology.rays.geometry import Geometry
+from membrane_ctrl.metrology.rays.set_phases import SetPhases
 from membrane_ctrl.metrology.rays.surface import Surface
 from membrane_ctrl.sim.optics.camera import OpticsRenderer
 from membrane_ctrl.sim.optics.film_shape import FilmShape, typical_film

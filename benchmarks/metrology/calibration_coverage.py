@@ -37,13 +37,16 @@ from membrane_ctrl.config.optics import CameraConfig, OpticsConfig, ScreenPoseCo
 from membrane_ctrl.geometry.file import ScreenMovedTable, origin_of, screen_elsewhere
 from membrane_ctrl.measure.capture_set import CaptureHead, CaptureSet
 from membrane_ctrl.metrology.calibration import figure_uncertainty, verdict
-from membrane_ctrl.metrology.calibration.ring_pose import find_edges
+from membrane_ctrl.metrology.calibration.rim_edges import find_edges
 from membrane_ctrl.metrology.calibration.solver import Solution, fit_on, solve
 from membrane_ctrl.metrology.frame_checks.checked_set import Checked, RejectedSetError, check
 from membrane_ctrl.metrology.phase.frame_stack import FrameStack
-from membrane_ctrl.metrology.rays.bench_parameters import NAMES, pose_derivatives
-from membrane_ctrl.metrology.rays.forward_model import MOTION, SetPhases, chunks
-from membrane_ctrl.metrology.rays.surface import Artefact, Surface
+from membrane_ctrl.metrology.rays.artefacts import Artefact
+from membrane_ctrl.metrology.rays.bench_parameters import NAMES
+from membrane_ctrl.metrology.rays.bench_poses import pose_derivatives
+from membrane_ctrl.metrology.rays.forward_model import MOTION, chunks
+from membrane_ctrl.metrology.rays.set_phases import SetPhases
+from membrane_ctrl.metrology.rays.surface import Surface
 from membrane_ctrl.model.zernike_terms import ZERNIKE_TERMS
 from membrane_ctrl.sim.optics.film_shape import FilmShape, typical_film
 from membrane_ctrl.sim.optics.shade import Light

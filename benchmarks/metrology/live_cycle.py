@@ -13,7 +13,7 @@ import numpy as np
 from benchmarks.metrology import reference_pmd
 from membrane_ctrl.config.schema import OpticsConfig
 from membrane_ctrl.metrology.cycle.live_reconstructor import LiveReconstructor
-from membrane_ctrl.metrology.phase.phase_steps import fringe_sequence, full_sequence
+from membrane_ctrl.metrology.phase.pattern_sequence import fringe_sequence, full_sequence
 from membrane_ctrl.metrology.rays.geometry import Geometry
 from membrane_ctrl.model.zernike_terms import ZERNIKE_TERMS
 from membrane_ctrl.sim.optics.camera import OpticsRenderer

@@ -11,9 +11,10 @@ import numpy as np
 
 from membrane_ctrl.config.schema import OpticsConfig
 from membrane_ctrl.measure.measurement import Figures
-from membrane_ctrl.metrology.phase.phase_steps import equal_shifts, mm_per_rad, phase_sigma_rad
+from membrane_ctrl.metrology.phase.phase_steps import equal_shifts, phase_sigma_rad
+from membrane_ctrl.metrology.phase.screen_scale import mm_per_rad
 from membrane_ctrl.metrology.rays.geometry import Geometry
-from membrane_ctrl.metrology.reconstruction.bin_grid import pixel_sigma_adu, slope_per_screen
+from membrane_ctrl.metrology.reconstruction.slope_noise import pixel_sigma_adu, slope_per_screen
 from membrane_ctrl.metrology.uncertainty.geometry_spread import PAPER_SPREAD
 from membrane_ctrl.metrology.uncertainty.monte_carlo import (
     HeightMap,

@@ -27,7 +27,7 @@ from membrane_ctrl.acquisition.cycle import CycleDone, CyclePlan, ShapeCycle
 from membrane_ctrl.acquisition.session import WaitingClock
 from membrane_ctrl.config.schema import OpticsConfig
 from membrane_ctrl.metrology.cycle.live_reconstructor import LiveReconstructor
-from membrane_ctrl.metrology.phase.phase_steps import fringe_sequence, full_sequence
+from membrane_ctrl.metrology.phase.pattern_sequence import fringe_sequence, full_sequence
 from membrane_ctrl.metrology.tracking.live_tracker import LiveTracker, crossed_patterns
 from membrane_ctrl.model.clock import RunClock
 from membrane_ctrl.processes.frames import FrameRing, FrameWriter

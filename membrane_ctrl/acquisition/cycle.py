@@ -18,11 +18,11 @@ import numpy as np
 from firmware_iface.roles import Camera, Pattern, Pixels, Screen
 from membrane_ctrl.acquisition import exposures, process
 from membrane_ctrl.geometry.file import InForce
-from membrane_ctrl.metrology.calibration.verdict import DriftMonitor, RingMonitor, noise_urad
-from membrane_ctrl.metrology.phase import phase_steps
+from membrane_ctrl.metrology.cycle.geometry_monitors import DriftMonitor, RingMonitor, noise_urad
+from membrane_ctrl.metrology.phase import phase_steps, screen_scale
 from membrane_ctrl.metrology.rays.geometry import Geometry
 from membrane_ctrl.metrology.rays.surface import Surface
-from membrane_ctrl.metrology.reconstruction import bin_grid
+from membrane_ctrl.metrology.reconstruction import slope_noise
 from membrane_ctrl.model import events, run_events, shape_estimate
 from membrane_ctrl.model.arrays import FloatArray
 from membrane_ctrl.model.clock import pause_s
@@ -334,10 +334,10 @@ class LiveDrift:
         self._geometry, self._radius_mm = Geometry.from_config(optics), optics.mirror.radius_mm
         shifts = phase_steps.equal_shifts(optics.pattern.steps)
         sigma_rad = phase_steps.phase_sigma_rad(
-            shifts, bin_grid.pixel_sigma_adu(optics.camera.noise_adu), 1.0
+            shifts, slope_noise.pixel_sigma_adu(optics.camera.noise_adu), 1.0
         )
         self._sigma_mm_adu = (
-            phase_steps.mm_per_rad(optics.pattern) * sigma_rad / bin_px
+            screen_scale.mm_per_rad(optics.pattern) * sigma_rad / bin_px
         )  # over the modulation
         known = geometry.calibration
         self._monitors: tuple[DriftMonitor, RingMonitor] | None = None

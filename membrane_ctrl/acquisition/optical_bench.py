@@ -13,7 +13,7 @@ from firmware_iface.settings import ExternalCameraConfig, ExternalScreenConfig, 
 from membrane_ctrl.acquisition.exposures import CycleClock
 from membrane_ctrl.config.schema import Config
 from membrane_ctrl.instruments import driver_loading
-from membrane_ctrl.metrology.phase.phase_steps import full_sequence
+from membrane_ctrl.metrology.phase.pattern_sequence import full_sequence
 from membrane_ctrl.metrology.tracking.live_tracker import crossed_patterns
 from membrane_ctrl.model.errors import InputError
 from membrane_ctrl.sim.optics.camera import TwinOptics

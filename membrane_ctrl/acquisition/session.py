@@ -15,7 +15,7 @@ from membrane_ctrl.acquisition import cycle, exposures, optical_bench, process, 
 from membrane_ctrl.config.schema import Config, OpticsConfig, TwinConfig
 from membrane_ctrl.geometry import file, spread_file
 from membrane_ctrl.metrology.cycle import live_reconstructor
-from membrane_ctrl.metrology.phase import phase_steps
+from membrane_ctrl.metrology.phase import pattern_sequence
 from membrane_ctrl.metrology.tracking.live_tracker import Heard, LiveTracker, Stethoscope
 from membrane_ctrl.model import files, plain_json
 from membrane_ctrl.model.clock import RunClock, pause_s
@@ -264,8 +264,8 @@ def _plan(config: Config, optics: OpticsConfig) -> cycle.CyclePlan:
     """The patterns of the cycles."""
     pattern = optics.pattern
     return cycle.CyclePlan(
-        phase_steps.full_sequence(pattern),
-        phase_steps.fringe_sequence(pattern),
+        pattern_sequence.full_sequence(pattern),
+        pattern_sequence.fringe_sequence(pattern),
         config.shape.frame_interval_s,
     )
 

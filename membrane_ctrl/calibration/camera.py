@@ -20,20 +20,16 @@ from membrane_ctrl.geometry.file import read_geometry
 from membrane_ctrl.geometry.spread_file import read_prior, write_prior
 from membrane_ctrl.measure import capture_set, measurement
 from membrane_ctrl.measure.images import IMAGE_BYTES_MAX, decoded_image
-from membrane_ctrl.metrology.calibration import ring_pose, solver
-from membrane_ctrl.metrology.calibration.board_lens import (
-    Board,
-    BoardView,
-    Lens,
-    calibrate_lens,
-    on_screen,
-)
+from membrane_ctrl.metrology.calibration import geometry_tables, ring_pose
+from membrane_ctrl.metrology.calibration.board import Board, on_screen
+from membrane_ctrl.metrology.calibration.board_lens import BoardView, Lens, calibrate_lens
 from membrane_ctrl.metrology.figure import pixel_figure
 from membrane_ctrl.metrology.frame_checks.checked_set import RejectedSetError, check
-from membrane_ctrl.metrology.phase.phase_steps import mm_per_rad
+from membrane_ctrl.metrology.phase.screen_scale import mm_per_rad
+from membrane_ctrl.metrology.rays import ray_tracing
 from membrane_ctrl.metrology.rays.bench_parameters import usual_sigma
-from membrane_ctrl.metrology.rays.geometry import Geometry, find_outline
-from membrane_ctrl.metrology.reconstruction import surface_fit
+from membrane_ctrl.metrology.rays.geometry import Geometry
+from membrane_ctrl.metrology.rays.rim_outline import find_outline
 from membrane_ctrl.model import errors, files
 from membrane_ctrl.model.arrays import FloatArray
 from membrane_ctrl.model.clock import RunClock
@@ -214,7 +210,9 @@ def calibrate_pose(options: PoseOptions) -> int:
         raise errors.RejectedError(f"{options.folder}: {error}") from None
     sigmas = dict(zip(ring_pose.POSE_NAMES, pose.sigmas.tolist(), strict=True))
     tables = {
-        "geometry": solver.general_form(pose.bench(stated), optics).model_dump(exclude_none=True),
+        "geometry": geometry_tables.general_form(pose.bench(stated), optics).model_dump(
+            exclude_none=True
+        ),
         "sigmas": sigmas,
     }
     write_prior(options.out, tables, "calibrate-pose", [options.folder.name], pose.rms_px)
@@ -247,7 +245,7 @@ def _light(capture: capture_set.CaptureSet) -> FloatArray:
     return np.asarray(white - black)
 
 
-def _rim(capture: capture_set.CaptureSet) -> tuple[surface_fit.HeightFunction, float]:
+def _rim(capture: capture_set.CaptureSet) -> tuple[ray_tracing.HeightFunction, float]:
     """Height of the film at the rim in world, and its mean. Raises RejectedError for a set without
     a figure.
     """

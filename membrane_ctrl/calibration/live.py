@@ -17,7 +17,7 @@ from membrane_ctrl.control_port.ctl import Where
 from membrane_ctrl.geometry.file import GeometryOrigin, geometry_of_run, origin_of, read_geometry
 from membrane_ctrl.geometry.spread_file import read_prior
 from membrane_ctrl.measure.capture_set import read_head
-from membrane_ctrl.metrology.calibration import figure_uncertainty, verdict
+from membrane_ctrl.metrology.calibration import figure_uncertainty, foresight, verdict
 from membrane_ctrl.metrology.rays import bench_parameters
 from membrane_ctrl.model.errors import DeviceError, Exit, InputError
 from membrane_ctrl.sessions.folder import now_utc
@@ -196,9 +196,7 @@ def _foreseen(
     known = bench_parameters.sigmas(known_sigmas(optics, freed(solving.free)))
     sags_mm = [held.sag_at_mm(each) for each in sorted(setpoints)]
     try:
-        return figure_uncertainty.foresee(
-            optics, known, sags_mm, held.swing_adu, solving.laser_sigma_um
-        )
+        return foresight.foresee(optics, known, sags_mm, held.swing_adu, solving.laser_sigma_um)
     except ValueError as error:
         raise InputError(f"{link.name}: {error}; does [optics] describe this bench?") from None
 

@@ -18,12 +18,17 @@ from membrane_ctrl.config.schema import OpticsConfig
 from membrane_ctrl.measure.results import write_figure
 from membrane_ctrl.metrology.calibration import (
     advice,
+    artefact_advice,
     figure_uncertainty,
+    geometry_tables,
     model_tests,
+    screen_advice,
     solver,
     verdict,
+    weak_combinations,
 )
-from membrane_ctrl.metrology.rays import bench_parameters, forward_model
+from membrane_ctrl.metrology.cycle import geometry_monitors
+from membrane_ctrl.metrology.rays import bench_parameters, set_phases
 from membrane_ctrl.model import errors, program
 from membrane_ctrl.model.arrays import FloatArray
 from membrane_ctrl.model.files import users, write_text_atomic
@@ -47,10 +52,10 @@ def report_of(
     middle = solution.problem.middle
     claim = figure_uncertainty.propagate(solution, middle, analysis_radius_mm)
     scale, number = model_tests.laser_scale(solution), advice.number_advice(solution, middle)
-    artefact = advice.artefact_advice(solution, middle)
+    artefact = artefact_advice.artefact_advice(solution, middle)
     return table | {
         "iterations": len(solution.changes),
-        "condition": figure_uncertainty.condition_number(solution),
+        "condition": weak_combinations.condition_number(solution),
         "parameters": [_parameter(solution, name) for name in solution.free],
         "not_determined": [
             {
@@ -59,7 +64,7 @@ def report_of(
                 "figure_um": each.figure_um,
                 "says": each.words,
             }
-            for each in figure_uncertainty.weak_combinations(solution, middle, analysis_radius_mm)
+            for each in weak_combinations.weak_combinations(solution, middle, analysis_radius_mm)
         ],
         "uncertainty": {
             "height_rms_um": claim.height_rms_um,
@@ -69,7 +74,7 @@ def report_of(
         },
         "advice": None if number is None else asdict(number),
         "artefact_advice": None if artefact is None else asdict(artefact),
-        "screen_advice": [asdict(each) for each in advice.screen_advice(solution, middle)],
+        "screen_advice": [asdict(each) for each in screen_advice.screen_advice(solution, middle)],
         "film": solution.problem.references.film,
         "rim": solution.problem.rim is not None,
         "laser": {"scale": scale.value, "sigma": scale.sigma},
@@ -119,7 +124,7 @@ _SCREENS = {
     "sides",
     "screen_moved": "see a film again with the screen {:.0f} mm further from the mirror, known to {:g} mm",  # noqa: E501
 }
-_SCREEN_KNOWN = {"screen": advice.TILT_DEG, "screen_moved": advice.RAIL_SIGMA_MM}
+_SCREEN_KNOWN = {"screen": screen_advice.TILT_DEG, "screen_moved": screen_advice.RAIL_SIGMA_MM}
 
 
 def lines_of(report: dict[str, Any]) -> list[str]:
@@ -258,31 +263,29 @@ def write_geometry(
     films = [(solution.states[k], problem.sets[k]) for k in problem.films]
     slopes = [_slope_residual(solution, problem.sets[k], k) for k in problem.films]
     noises = [
-        verdict.noise_urad(
+        geometry_monitors.noise_urad(
             solution.bench.geometry, state.surface, float(np.sqrt(np.mean(phases.sigma_mm**2)))
         )
         for state, phases in films
     ]
-    origin = solver.Origin(
+    origin = geometry_tables.Origin(
         date_utc=datetime.now(UTC).isoformat(timespec="seconds"),
         sets=tuple(phases.name for phases in problem.sets),
         screen_residual_um=1e3
         * float(np.median([each.residual_rms_mm for each in solution.equations])),
         slope_residual_urad=1e6 * float(np.median(slopes)),
         slope_noise_urad=float(np.median(noises)),
-        condition=figure_uncertainty.condition_number(solution),
+        condition=weak_combinations.condition_number(solution),
         notes=tuple(finding.says for finding in findings),
     )
-    tables = solver.tables_of(solution, optics, origin)
+    tables = geometry_tables.tables_of(solution, optics, origin)
     with errors.writing(path):
         path.parent.mkdir(parents=True, exist_ok=True)
         write_text_atomic(users(path), tomli_w.dumps(tables))  # never half a geometry
     return str(tables["calibration"]["hash"])
 
 
-def _slope_residual(
-    solution: solver.Solution, phases: forward_model.SetPhases, index: int
-) -> float:
+def _slope_residual(solution: solver.Solution, phases: set_phases.SetPhases, index: int) -> float:
     """RMS of measured minus fitted slopes of one set's bins on the calibrated bench, as a live
     cycle states it.
     """

@@ -18,18 +18,20 @@ from membrane_ctrl.config.schema import OpticsConfig
 from membrane_ctrl.geometry import file, spread_file
 from membrane_ctrl.measure.capture_set import CaptureSet, read_head, read_set
 from membrane_ctrl.measure.measurement import Figures, SetFigure, stack_of
-from membrane_ctrl.metrology.calibration import board_lens, normal_equations, ring_pose, verdict
-from membrane_ctrl.metrology.calibration.ring_pose import RADIUS_SIGMA_MM, Rim
+from membrane_ctrl.metrology.calibration import rim_edges, screen_pose, set_state, verdict
+from membrane_ctrl.metrology.calibration.rim_edges import RADIUS_SIGMA_MM
+from membrane_ctrl.metrology.calibration.rim_equations import Rim
 from membrane_ctrl.metrology.calibration.solver import Problem, solve
 from membrane_ctrl.metrology.figure.pixel_figure import FilmMotion, bin_figure
 from membrane_ctrl.metrology.frame_checks import frame_evidence
 from membrane_ctrl.metrology.frame_checks.checked_set import Checked, absolute_phases
-from membrane_ctrl.metrology.phase import phase_steps
+from membrane_ctrl.metrology.phase import phase_steps, screen_scale
 from membrane_ctrl.metrology.phase.frame_stack import bin_frames
-from membrane_ctrl.metrology.rays import forward_model
+from membrane_ctrl.metrology.rays import set_phases
 from membrane_ctrl.metrology.rays.bench_parameters import LASER, NAMES, sigmas, usual_sigma
 from membrane_ctrl.metrology.rays.geometry import Geometry
-from membrane_ctrl.metrology.reconstruction.bin_grid import BinGrid, pixel_sigma_adu
+from membrane_ctrl.metrology.reconstruction.bin_grid import BinGrid
+from membrane_ctrl.metrology.reconstruction.slope_noise import pixel_sigma_adu
 from membrane_ctrl.model import errors, terminal
 from membrane_ctrl.model.arrays import FloatArray
 
@@ -42,7 +44,7 @@ _SAME_FILM_UM = 20.0  # apart: a film's change of figure is then known to a tent
 _MOTION_UNSEEN_UM = 100.0  # without a laser; the fringes find it to some micrometres
 
 
-def phases_of(name: str, checked: Checked, optics: OpticsConfig) -> forward_model.SetPhases:
+def phases_of(name: str, checked: Checked, optics: OpticsConfig) -> set_phases.SetPhases:
     """The bins within the analysis radius that the set's own fit kept, corrected for the film's
     motion.
 
@@ -57,7 +59,7 @@ def phases_of(name: str, checked: Checked, optics: OpticsConfig) -> forward_mode
         optics, checked, replace(film, told_um=(x_um - x_um.mean(), y_um - y_um.mean()))
     )
     grid = BinGrid(checked.tracer.geometry, optics.camera, checked.binned.bin_px)
-    return forward_model.SetPhases(
+    return set_phases.SetPhases(
         name=name,
         column_px=grid.column_px[figure.index],
         row_px=grid.row_px[figure.index],
@@ -82,7 +84,7 @@ def edges_of(figure: SetFigure) -> FloatArray | None:
     white, black = (stack.frames[names.index(name)].astype(float) for name in ("white", "black"))
     rim_z_mm = figure.checked.tracer.vertex_z_mm + figure.figure.fit.surface.sag_mm
     radius_mm = figure.head.optics.mirror.radius_mm
-    return ring_pose.find_edges(white - black, figure.checked.tracer.geometry, radius_mm, rim_z_mm)
+    return rim_edges.find_edges(white - black, figure.checked.tracer.geometry, radius_mm, rim_z_mm)
 
 
 @dataclass(frozen=True)
@@ -100,7 +102,7 @@ class CalibrateOptions:
     # first set's
     reference_um: float | None = None
     priors: Sequence[Path] = ()  # results of auxiliary calibrations; the last one wins
-    film: normal_equations.FilmModel = "free"
+    film: set_state.FilmModel = "free"
     radius_sigma_mm: float = RADIUS_SIGMA_MM  # of the ring, whose edge is seen
 
 
@@ -110,7 +112,7 @@ class Bundle:
     and defects of single frames.
     """
 
-    sets: tuple[forward_model.SetPhases, ...]
+    sets: tuple[set_phases.SetPhases, ...]
     optics: OpticsConfig
     reference_um: float
     notes: tuple[str, ...] = ()
@@ -215,10 +217,10 @@ def read_sets(
         raise errors.InputError(
             f"{next(f for f in folders if list(folders).count(f) > 1)}: given twice"
         )
-    sets: list[forward_model.SetPhases] = []
+    sets: list[set_phases.SetPhases] = []
     benches: list[OpticsConfig] = []
     used: list[Path] = []
-    elsewhere: list[tuple[Path, forward_model.SetPhases, file.ScreenMovedTable]] = []
+    elsewhere: list[tuple[Path, set_phases.SetPhases, file.ScreenMovedTable]] = []
     notes: list[str] = []
     edges: list[FloatArray] = []
     heads = {folder: read_head(folder, stated) for folder in folders}
@@ -276,7 +278,7 @@ def read_sets(
     return Bundle(tuple(sets), benches[films[0]], reference_um, tuple(notes), apart, tuple(edges))
 
 
-def phases_of_screen(capture: CaptureSet) -> forward_model.SetPhases:
+def phases_of_screen(capture: CaptureSet) -> set_phases.SetPhases:
     """The bins that see the screen itself. Raises RejectedError if they show none."""
     head, stack = capture.head, stack_of(capture)
     binned = bin_frames(stack, 2**head.optics.camera.bits - 1)
@@ -287,29 +289,29 @@ def phases_of_screen(capture: CaptureSet) -> forward_model.SetPhases:
         index = np.flatnonzero(np.isfinite(phase_rad).all(axis=0))
         grid, screen_mm = (
             BinGrid(geometry, head.optics.camera, binned.bin_px),
-            phase_steps.screen_mm(phase_rad, pattern),
+            screen_scale.screen_mm(phase_rad, pattern),
         )
         place = grid.column_px[index], grid.row_px[index], screen_mm.reshape(2, -1)[:, index]
-        screen = board_lens.screen_seen(geometry, *place)
+        screen = screen_pose.screen_seen(geometry, *place)
     except (ValueError, frame_evidence.NoFigureError) as error:
         raise errors.RejectedError(f"{head.folder}: rejected: {error}") from None
     noise = pixel_sigma_adu(head.optics.camera.noise_adu) / binned.bin_px
     shares = [phase_steps.phase_sigma_rad(stack.shifts_rad(used), noise, 1.0) for used in view.used]
     swing = view.swing_adu.reshape(2, -1)[:, index]
     sigma_mm = (
-        phase_steps.mm_per_rad(pattern)
+        screen_scale.mm_per_rad(pattern)
         * np.hypot(*(np.array(shares)[:, None] / swing))
         / math.sqrt(2)
     )
-    name, where = head.folder.name, (forward_model.ANYWHERE,)
+    name, where = head.folder.name, (set_phases.ANYWHERE,)
     known: dict[str, Any] = {"artefact": screen, "elsewhere": where, "period_mm": pattern.period_mm}
-    return forward_model.SetPhases(name, *place, sigma_mm, math.nan, **known)
+    return set_phases.SetPhases(name, *place, sigma_mm, math.nan, **known)
 
 
 def join(
-    sets: list[forward_model.SetPhases],
+    sets: list[set_phases.SetPhases],
     folder: Path,
-    phases: forward_model.SetPhases,
+    phases: set_phases.SetPhases,
     moved: file.ScreenMovedTable,
 ) -> None:
     """Add what was seen with the screen elsewhere to the set of the same film. Raises InputError if
@@ -325,7 +327,7 @@ def join(
         )
     k = films[int(np.nanargmin(apart_um))]
     base, deeper_um = sets[k], phases.displacement_um - sets[k].displacement_um
-    known = forward_model.Elsewhere(
+    known = set_phases.Elsewhere(
         moved.shift_mm,
         moved.shift_sigma_mm,
         moved.turn_sigma_deg,
@@ -347,7 +349,7 @@ def with_priors(bundle: Bundle, priors: Sequence[spread_file.Prior]) -> Bundle:
 
 
 def _reference_um(
-    sets: Sequence[forward_model.SetPhases], benches: Sequence[OpticsConfig], known_um: float | None
+    sets: Sequence[set_phases.SetPhases], benches: Sequence[OpticsConfig], known_um: float | None
 ) -> float:
     """Reading at which the vertex is the world's origin: as all sets state, else as given, else the
     first one.
@@ -413,7 +415,7 @@ def problem_of(bundle: Bundle, free: dict[str, float], options: CalibrateOptions
         geometry = Geometry.from_config(bundle.optics)
     except ValueError as error:
         raise errors.InputError(str(error)) from None
-    references = normal_equations.References(
+    references = set_state.References(
         bundle.reference_um, options.laser_sigma_um, film=options.film
     )
     radius_mm = bundle.optics.mirror.radius_mm

@@ -16,7 +16,7 @@ from firmware_iface.settings import Section
 from membrane_ctrl.config import sight, toml_file
 from membrane_ctrl.config.optics import CameraPoseConfig, ScreenPoseConfig
 from membrane_ctrl.config.schema import CameraConfig, Config, GeometryConfig, OpticsConfig
-from membrane_ctrl.metrology.rays.surface import Artefact
+from membrane_ctrl.metrology.rays.artefacts import Artefact
 from membrane_ctrl.model import errors, files, plain_json
 from membrane_ctrl.model.arrays import FloatArray
 

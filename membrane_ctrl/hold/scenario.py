@@ -24,7 +24,7 @@ from membrane_ctrl.controller.commands import Command, Kind
 from membrane_ctrl.hold import scenario, scenarios
 from membrane_ctrl.hold.closing_words import Closing, report
 from membrane_ctrl.hold.virtual_run import Rings, TruthShape, VirtualRun, VirtualTick
-from membrane_ctrl.metrology.film.film_law import zernike_projection
+from membrane_ctrl.metrology.film.hencky_bowl import zernike_projection
 from membrane_ctrl.model import clock, program, run_events, telemetry, terminal
 from membrane_ctrl.processes import child, ring
 from membrane_ctrl.recorder.process import prepare_rerun

@@ -347,7 +347,7 @@ async def _run(
     ] = (_STORES_NONE),
 ) -> None:
     """Run the ticks; `closing` gets the exit code and the fault in which the run ends."""
-    from membrane_ctrl.metrology.film.film_law import zernike_projection
+    from membrane_ctrl.metrology.film.hencky_bowl import zernike_projection
 
     assert config.devices is not None
     with contextlib.ExitStack() as stack:

@@ -17,7 +17,7 @@ from firmware_iface import roles
 from membrane_ctrl.config.schema import Config
 from membrane_ctrl.controller import commands, controller, tick
 from membrane_ctrl.hold.supervisor import Supervisor, Wiring
-from membrane_ctrl.metrology.film.film_law import zernike_projection
+from membrane_ctrl.metrology.film.hencky_bowl import zernike_projection
 from membrane_ctrl.model import arrays, clock, errors, events, run_events, shape_estimate, telemetry
 from membrane_ctrl.processes import ring
 from membrane_ctrl.sim import virtual_bench

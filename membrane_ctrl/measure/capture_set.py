@@ -31,8 +31,8 @@ from membrane_ctrl.geometry.file import (
     screen_elsewhere,
 )
 from membrane_ctrl.measure.images import IMAGE_BYTES_MAX, decoded_image
-from membrane_ctrl.metrology.phase.phase_steps import fringe_sequence, full_sequence
-from membrane_ctrl.metrology.rays.surface import Artefact
+from membrane_ctrl.metrology.phase.pattern_sequence import fringe_sequence, full_sequence
+from membrane_ctrl.metrology.rays.artefacts import Artefact
 from membrane_ctrl.model.arrays import FloatArray, Image
 from membrane_ctrl.model.errors import InputError
 from membrane_ctrl.model.files import read_bytes

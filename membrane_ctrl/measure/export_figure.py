@@ -18,9 +18,9 @@ import numpy as np
 
 from membrane_ctrl.measure.export_fits import fits_bytes
 from membrane_ctrl.measure.results import read_arrays
+from membrane_ctrl.metrology.figure import best_sphere
 from membrane_ctrl.metrology.figure.quantities import LEAST_CELLS
-from membrane_ctrl.metrology.numerics import zernike
-from membrane_ctrl.metrology.rays import surface
+from membrane_ctrl.metrology.numerics import grid_fit, zernike
 from membrane_ctrl.model import errors, files, plain_json
 from membrane_ctrl.model.arrays import BoolArray, FloatArray, IntArray
 from membrane_ctrl.model.zernike_terms import ZERNIKE_TERMS
@@ -144,9 +144,9 @@ def read_result(folder: Path) -> tuple[ExportedMap, dict[str, Any]]:
     return ExportedMap(x, y, height, radius), table if isinstance(table, dict) else {}
 
 
-def _fit(seen: ExportedMap, terms: int) -> zernike.GridFit:
+def _fit(seen: ExportedMap, terms: int) -> grid_fit.GridFit:
     axes = seen.x_mm / seen.radius_mm, seen.y_mm / seen.radius_mm
-    return zernike.GridFit(
+    return grid_fit.GridFit(
         axes[0], seen.measured, [zernike.fringe(j + 1) for j in range(terms)], axes[1]
     )
 
@@ -162,7 +162,7 @@ def removed(seen: ExportedMap, names: list[str]) -> ExportedMap:
         rows, columns = np.nonzero(measured)
         points = np.stack([seen.x_mm[columns], seen.y_mm[rows], height[measured]])
         height = np.full(height.shape, np.nan)
-        height[measured] = surface.best_sphere(points).deviation(points)[0]
+        height[measured] = best_sphere.best_sphere(points).deviation(points)[0]
     places = [place for name in names for place in _REMOVABLE.get(name, ())]
     if places:
         fit = _fit(seen, 4)

@@ -16,6 +16,7 @@ import numpy as np
 
 from membrane_ctrl.measure.measurement import Measurement
 from membrane_ctrl.measure.results import ErrorBars, number_or_null, write_arrays
+from membrane_ctrl.metrology.figure import best_sphere
 from membrane_ctrl.metrology.figure.quantities import (
     LEAST_CELLS,
     Figure,
@@ -55,7 +56,9 @@ class MeasuredFigure:
         """
         if self.nominal_radius_mm is None:
             return None
-        nominal = surface.Sphere(0.0, 0.0, 0.0, 1 / self.nominal_radius_mm).sag_mm(self.aperture_mm)
+        nominal = best_sphere.Sphere(0.0, 0.0, 0.0, 1 / self.nominal_radius_mm).sag_mm(
+            self.aperture_mm
+        )
         found, *bars = (
             one.numbers.sphere_sag_mm for one in (self.figure, self.noise, self.geometry)
         )

@@ -12,14 +12,14 @@ import numpy as np
 from membrane_ctrl.geometry.file import read_geometry
 from membrane_ctrl.measure import figure_results, results
 from membrane_ctrl.measure.measurement import Measurement, measure_set
+from membrane_ctrl.metrology.figure.radial_profile import RadialProfile, radial_profile
 from membrane_ctrl.metrology.frame_checks.frequency_series import (
     AxisSeries,
     SeriesFlag,
     check_series,
 )
 from membrane_ctrl.metrology.phase.phase_steps import equal_shifts, phasors
-from membrane_ctrl.metrology.rays.geometry import Outline, find_outline
-from membrane_ctrl.metrology.rays.surface import RadialProfile, radial_profile
+from membrane_ctrl.metrology.rays.rim_outline import Outline, find_outline
 from membrane_ctrl.model import errors
 from membrane_ctrl.model.arrays import BoolArray, FloatArray
 from membrane_ctrl.model.files import open_plain

@@ -24,7 +24,7 @@ from membrane_ctrl.metrology.frame_checks.checked_set import (
 )
 from membrane_ctrl.metrology.frame_checks.multi_frequency import check_frequencies
 from membrane_ctrl.metrology.phase import frame_stack
-from membrane_ctrl.metrology.rays.surface import Artefact
+from membrane_ctrl.metrology.rays.artefacts import Artefact
 from membrane_ctrl.metrology.uncertainty.monte_carlo import TrialBench
 from membrane_ctrl.model import errors, shape_estimate
 

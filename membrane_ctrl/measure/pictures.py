@@ -14,9 +14,10 @@ from matplotlib.figure import Figure
 from membrane_ctrl.measure.figure_results import ENERGY_SHARES, MeasuredFigure
 from membrane_ctrl.measure.measurement import Measurement
 from membrane_ctrl.measure.results import ErrorBars, write_figure
+from membrane_ctrl.metrology.figure import radial_profile
 from membrane_ctrl.metrology.figure.pixel_figure import FullResult
 from membrane_ctrl.metrology.figure.quantities import SurfaceMap
-from membrane_ctrl.metrology.rays import geometry, surface
+from membrane_ctrl.metrology.rays import rim_outline
 from membrane_ctrl.model.arrays import FloatArray
 from membrane_ctrl.model.files import move, scratch_folder
 from membrane_ctrl.model.terminal import plain
@@ -37,8 +38,8 @@ def draw_all(
     out: Path,
     measurement: Measurement,
     light: FloatArray,
-    profile: surface.RadialProfile | None,
-    outline: geometry.Outline | None,
+    profile: radial_profile.RadialProfile | None,
+    outline: rim_outline.Outline | None,
     bars: ErrorBars | None,
     figure: MeasuredFigure | None,
 ) -> list[Path]:
@@ -232,7 +233,10 @@ def _slopes(full: FullResult, seen: SurfaceMap) -> Figure:
 
 
 def _modulation(
-    measurement: Measurement, full: FullResult, light: FloatArray, outline: geometry.Outline | None
+    measurement: Measurement,
+    full: FullResult,
+    light: FloatArray,
+    outline: rim_outline.Outline | None,
 ) -> Figure:
     """Draw the fringe amplitude in the camera's picture beside the light with the detected rim."""
     camera = measurement.head.optics.camera
@@ -269,7 +273,7 @@ def _frames(measurement: Measurement) -> Figure:
     return figure
 
 
-def _profile(profile: surface.RadialProfile) -> Figure:
+def _profile(profile: radial_profile.RadialProfile) -> Figure:
     figure, (upper, lower) = sheet(7, 6, 2, 1)
     upper.fill_between(
         profile.radius_mm, profile.low_mm, profile.high_mm, alpha=0.4, label="95 % of the ring"

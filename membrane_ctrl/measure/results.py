@@ -18,10 +18,11 @@ from numpy.typing import NDArray
 
 from membrane_ctrl.geometry.spread_file import spread_of
 from membrane_ctrl.measure.measurement import Measurement, noise_seen_adu
+from membrane_ctrl.metrology.figure import radial_profile
 from membrane_ctrl.metrology.figure.pixel_figure import FullResult
 from membrane_ctrl.metrology.rays import surface
-from membrane_ctrl.metrology.rays.geometry import Outline
-from membrane_ctrl.metrology.reconstruction import bin_grid
+from membrane_ctrl.metrology.rays.rim_outline import Outline
+from membrane_ctrl.metrology.reconstruction import slope_noise
 from membrane_ctrl.metrology.uncertainty import monte_carlo, set_budget
 from membrane_ctrl.metrology.uncertainty.budget import Budget
 from membrane_ctrl.model import errors, program, zernike_terms
@@ -94,7 +95,9 @@ def error_bars(
         return None
     spread, source = spread_of(optics, geometry)
     noise_adu = float(
-        np.nanmax([bin_grid.pixel_sigma_adu(optics.camera.noise_adu), noise_seen_adu(measurement)])
+        np.nanmax(
+            [slope_noise.pixel_sigma_adu(optics.camera.noise_adu), noise_seen_adu(measurement)]
+        )
     )
     try:
         seen = set_budget.examine(optics, checked, full, spread, noise_adu, outline)
@@ -184,7 +187,7 @@ def _fit_table(full: FullResult | None) -> dict[str, Any]:
 
 def details_table(
     measurement: Measurement,
-    profile: surface.RadialProfile | None,
+    profile: radial_profile.RadialProfile | None,
     outline: Outline | None,
     bars: ErrorBars | None,
 ) -> dict[str, Any]:

@@ -10,8 +10,8 @@ import pytest
 from membrane_ctrl.acquisition.cycle import LiveDrift, geometry_event
 from membrane_ctrl.config.schema import OpticsConfig
 from membrane_ctrl.geometry.file import CalibrationTable, InForce, origin_of
-from membrane_ctrl.metrology.calibration.verdict import CYCLES, ring_um
-from membrane_ctrl.metrology.film.film_law import zernike_projection
+from membrane_ctrl.metrology.cycle.geometry_monitors import CYCLES, ring_um
+from membrane_ctrl.metrology.film.hencky_bowl import zernike_projection
 from membrane_ctrl.metrology.rays.surface import Surface
 from membrane_ctrl.model.shape_estimate import ShapeEstimate
 from membrane_ctrl.model.zernike_terms import ZERNIKE_TERMS

@@ -17,7 +17,7 @@ from membrane_ctrl.acquisition.process import AcquisitionSpec, acquisition_main
 from membrane_ctrl.acquisition.session import small
 from membrane_ctrl.config.schema import CameraConfig, Config, OpticsConfig, ShapeConfig
 from membrane_ctrl.geometry.file import origin_of
-from membrane_ctrl.metrology.phase.phase_steps import fringe_sequence
+from membrane_ctrl.metrology.phase.pattern_sequence import fringe_sequence
 from membrane_ctrl.model.clock import RunClock
 from membrane_ctrl.model.shape_estimate import ShapeEstimate, unpack_estimate
 from membrane_ctrl.model.telemetry import FIELDS, ROW_BYTES, TelemetryRow

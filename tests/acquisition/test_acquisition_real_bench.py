@@ -17,7 +17,7 @@ from membrane_ctrl.acquisition.process import AcquisitionSpec, acquisition_main
 from membrane_ctrl.cli import run as command
 from membrane_ctrl.config.schema import Config
 from membrane_ctrl.config.toml_file import dump
-from membrane_ctrl.metrology.phase.phase_steps import full_sequence
+from membrane_ctrl.metrology.phase.pattern_sequence import full_sequence
 from membrane_ctrl.model.clock import RunClock
 from membrane_ctrl.model.shape_estimate import ShapeEstimate, unpack_estimate
 from membrane_ctrl.model.telemetry import ROW_BYTES

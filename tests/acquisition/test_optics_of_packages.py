@@ -22,7 +22,7 @@ from membrane_ctrl.acquisition.cycle import CycleDone, CycleFailed, CyclePlan, S
 from membrane_ctrl.config.schema import Config
 from membrane_ctrl.config.toml_file import dump, load
 from membrane_ctrl.metrology.cycle.live_reconstructor import LiveReconstructor
-from membrane_ctrl.metrology.phase.phase_steps import fringe_sequence, full_sequence
+from membrane_ctrl.metrology.phase.pattern_sequence import fringe_sequence, full_sequence
 from membrane_ctrl.model.errors import InputError
 from membrane_ctrl.model.shape_estimate import ShapeEstimate
 from membrane_ctrl.processes.frames import FrameRing, FrameWriter

@@ -25,8 +25,8 @@ from membrane_ctrl.controller.controller import Controller
 from membrane_ctrl.controller.tick_codec import MESSAGE_BYTES
 from membrane_ctrl.hold.supervisor import Supervisor, Wiring
 from membrane_ctrl.metrology.cycle.live_reconstructor import LiveReconstructor
-from membrane_ctrl.metrology.film.film_law import zernike_projection
-from membrane_ctrl.metrology.phase import phase_steps
+from membrane_ctrl.metrology.film.hencky_bowl import zernike_projection
+from membrane_ctrl.metrology.phase import pattern_sequence
 from membrane_ctrl.metrology.tracking.live_tracker import LiveTracker
 from membrane_ctrl.model import run_events
 from membrane_ctrl.model.clock import RunClock
@@ -256,7 +256,7 @@ class Film:
         hold.ticks(at_s)
         still = [
             renderer.render(p, float(self.moved_um[0]))
-            for p in phase_steps.full_sequence(self.optics.pattern)
+            for p in pattern_sequence.full_sequence(self.optics.pattern)
         ]
         full = self.tracker.full(still, at_s + 13.0 + 0.1 * np.arange(18), np.full(18, np.nan))
         assert full.verdict == "ok", full.reason

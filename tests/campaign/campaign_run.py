@@ -45,7 +45,7 @@ from membrane_ctrl.controller import states
 from membrane_ctrl.controller.commands import Command, Kind
 from membrane_ctrl.controller.tick_context import TickContext
 from membrane_ctrl.hold.virtual_run import TruthShape, VirtualRun
-from membrane_ctrl.metrology.film.film_law import zernike_projection
+from membrane_ctrl.metrology.film.hencky_bowl import zernike_projection
 from membrane_ctrl.model.telemetry import SafeLevel, State
 from membrane_ctrl.sim.surroundings import AmbientChange, LeakChange
 from membrane_ctrl.sim.virtual_bench import VirtualBench, Wrong

@@ -27,7 +27,7 @@ from membrane_ctrl.config.schema import (
 from membrane_ctrl.controller.commands import Command
 from membrane_ctrl.controller.protection import ProcessValue
 from membrane_ctrl.hold.virtual_run import TruthShape, VirtualRun
-from membrane_ctrl.metrology.film.film_law import zernike_projection
+from membrane_ctrl.metrology.film.hencky_bowl import zernike_projection
 from membrane_ctrl.model.events import Fault, Maintenance
 from membrane_ctrl.sim.film import NOMINAL_SAG_MM
 from membrane_ctrl.sim.plant import STEP_S, Plant, Truth

@@ -22,7 +22,7 @@ from membrane_ctrl.controller.commands import Command
 from membrane_ctrl.controller.controller import Controller
 from membrane_ctrl.controller.tick import TickOutputs
 from membrane_ctrl.hold.supervisor import Supervisor, Wiring
-from membrane_ctrl.metrology.film.film_law import zernike_projection
+from membrane_ctrl.metrology.film.hencky_bowl import zernike_projection
 from membrane_ctrl.model.clock import RunClock
 from membrane_ctrl.model.errors import Exit
 from membrane_ctrl.model.events import Event

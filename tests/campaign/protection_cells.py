@@ -30,7 +30,7 @@ from membrane_ctrl.control.experiments.spec import ExperimentKind, ExperimentSpe
 from membrane_ctrl.controller.commands import Command
 from membrane_ctrl.controller.protection import Activity, Failure, FilmSensor, ProcessValue
 from membrane_ctrl.hold.virtual_run import TruthShape, VirtualRun
-from membrane_ctrl.metrology.film.film_law import zernike_projection
+from membrane_ctrl.metrology.film.hencky_bowl import zernike_projection
 from membrane_ctrl.model.events import Fault, Maintenance, Plausibility
 from membrane_ctrl.model.shape_estimate import ShapeEstimate
 from membrane_ctrl.model.telemetry import SafeLevel, State

@@ -20,7 +20,7 @@ from membrane_ctrl.control.shape_loop import ShapeCode
 from membrane_ctrl.controller.commands import Command
 from membrane_ctrl.controller.safety import TABLE
 from membrane_ctrl.hold.virtual_run import TruthShape, VirtualRun
-from membrane_ctrl.metrology.film.film_law import zernike_projection
+from membrane_ctrl.metrology.film.hencky_bowl import zernike_projection
 from membrane_ctrl.model import events
 from membrane_ctrl.model.shape_estimate import ShapeEstimate
 from membrane_ctrl.model.telemetry import SafeLevel, State, TelemetryRow

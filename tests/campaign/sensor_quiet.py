@@ -11,7 +11,7 @@ from sensor_faults import Lying, LyingPlant
 from membrane_ctrl.config.schema import Config, LoopConfig, PumpConfig, TwinConfig
 from membrane_ctrl.controller.commands import Command
 from membrane_ctrl.hold.virtual_run import TruthShape, VirtualRun
-from membrane_ctrl.metrology.film.film_law import zernike_projection
+from membrane_ctrl.metrology.film.hencky_bowl import zernike_projection
 from membrane_ctrl.model.events import Fault
 from membrane_ctrl.sim import film as film_module
 from membrane_ctrl.sim import plant as plant_module

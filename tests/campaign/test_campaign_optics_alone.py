@@ -21,8 +21,8 @@ from membrane_ctrl.config.schema import (
 from membrane_ctrl.controller.commands import Command
 from membrane_ctrl.hold.virtual_run import VirtualRun
 from membrane_ctrl.metrology.cycle.live_reconstructor import LiveReconstructor
-from membrane_ctrl.metrology.film.film_law import zernike_projection
-from membrane_ctrl.metrology.phase import phase_steps
+from membrane_ctrl.metrology.film.hencky_bowl import zernike_projection
+from membrane_ctrl.metrology.phase import pattern_sequence
 from membrane_ctrl.metrology.tracking.live_tracker import LiveTracker
 from membrane_ctrl.model.events import Fault, HeldBy
 from membrane_ctrl.model.shape_estimate import ShapeEstimate
@@ -54,7 +54,7 @@ class Rendered:
         self._tracker = LiveTracker(
             OPTICS, LiveReconstructor(OPTICS, 1), CONFIG.shape.track_periods, 10.0
         )
-        self._cycle = list(phase_steps.full_sequence(OPTICS.pattern))
+        self._cycle = list(pattern_sequence.full_sequence(OPTICS.pattern))
         self._frames: list[np.ndarray] = []
         self._times_s: list[float] = []
         self._done: ShapeEstimate | None = None

@@ -9,7 +9,7 @@ from membrane_ctrl.config.schema import Config, LoopConfig, PumpConfig, ShapeCon
 from membrane_ctrl.controller.actuator_test import ActuatorTest
 from membrane_ctrl.controller.commands import Command
 from membrane_ctrl.hold.virtual_run import VirtualRun
-from membrane_ctrl.metrology.film.film_law import zernike_projection
+from membrane_ctrl.metrology.film.hencky_bowl import zernike_projection
 from membrane_ctrl.model.telemetry import State
 from membrane_ctrl.sim.plant import Plant
 from membrane_ctrl.sim.virtual_bench import VirtualBench

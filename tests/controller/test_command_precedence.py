@@ -18,7 +18,7 @@ from membrane_ctrl.controller.commands import DOWN, TABLE, Command, Kind, sort_c
 from membrane_ctrl.controller.controller import Controller
 from membrane_ctrl.controller.safety import MOVING
 from membrane_ctrl.controller.tick import TickInputs, TickOutputs
-from membrane_ctrl.metrology.film.film_law import zernike_projection
+from membrane_ctrl.metrology.film.hencky_bowl import zernike_projection
 from membrane_ctrl.model.events import CommandTaken
 from membrane_ctrl.model.telemetry import SafeLevel, State
 

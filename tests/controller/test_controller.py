@@ -14,7 +14,7 @@ from firmware_iface.roles import BenchCommand, BenchReading
 from membrane_ctrl.config.schema import Config, LimitsConfig, LoopConfig, StatesConfig, TwinConfig
 from membrane_ctrl.controller.commands import Command
 from membrane_ctrl.hold.virtual_run import VirtualRun, VirtualTick
-from membrane_ctrl.metrology.film.film_law import zernike_projection
+from membrane_ctrl.metrology.film.hencky_bowl import zernike_projection
 from membrane_ctrl.model.errors import Exit
 from membrane_ctrl.model.events import EventLine, Why
 from membrane_ctrl.model.telemetry import SafeLevel, State

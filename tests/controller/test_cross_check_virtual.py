@@ -19,7 +19,7 @@ from membrane_ctrl.config.toml_file import parse
 from membrane_ctrl.controller.commands import Command
 from membrane_ctrl.controller.cross_check import cross_check
 from membrane_ctrl.hold.virtual_run import VirtualRun
-from membrane_ctrl.metrology.film.film_law import zernike_projection
+from membrane_ctrl.metrology.film.hencky_bowl import zernike_projection
 from membrane_ctrl.model.errors import InputError
 from membrane_ctrl.model.events import Fault
 from membrane_ctrl.model.telemetry import State

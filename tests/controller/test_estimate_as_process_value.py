@@ -12,7 +12,7 @@ from membrane_ctrl.controller.commands import Command
 from membrane_ctrl.controller.controller import Controller
 from membrane_ctrl.controller.snapshot import continue_from, take_snapshot
 from membrane_ctrl.hold.virtual_run import TruthShape, VirtualRun, VirtualTick
-from membrane_ctrl.metrology.film.film_law import zernike_projection
+from membrane_ctrl.metrology.film.hencky_bowl import zernike_projection
 from membrane_ctrl.model.events import Fault, HeldBy, Why
 from membrane_ctrl.model.telemetry import SafeLevel, State
 from membrane_ctrl.sim.plant import Plant

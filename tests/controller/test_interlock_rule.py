@@ -18,7 +18,7 @@ from membrane_ctrl.controller.tick_assembler import TickAssembler
 from membrane_ctrl.controller.tick_checksum import output_crc
 from membrane_ctrl.controller.tick_codec import pack_tick, unpack_tick
 from membrane_ctrl.hold.virtual_run import VirtualRun, VirtualTick
-from membrane_ctrl.metrology.film.film_law import zernike_projection
+from membrane_ctrl.metrology.film.hencky_bowl import zernike_projection
 from membrane_ctrl.model.events import (
     CommandTaken,
     Event,

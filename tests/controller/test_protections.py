@@ -21,7 +21,7 @@ from membrane_ctrl.config.schema import (
 from membrane_ctrl.control.experiments.spec import ExperimentSpec
 from membrane_ctrl.controller.commands import Command
 from membrane_ctrl.hold.virtual_run import TruthShape, VirtualRun, VirtualTick
-from membrane_ctrl.metrology.film.film_law import zernike_projection
+from membrane_ctrl.metrology.film.hencky_bowl import zernike_projection
 from membrane_ctrl.model.events import (
     ExperimentEnded,
     Fault,

@@ -24,7 +24,7 @@ from membrane_ctrl.controller.safe_levels import SafeLevels
 from membrane_ctrl.controller.safety import TABLE, Observation
 from membrane_ctrl.hold.scenario import At
 from membrane_ctrl.hold.virtual_run import VirtualRun
-from membrane_ctrl.metrology.film.film_law import zernike_projection
+from membrane_ctrl.metrology.film.hencky_bowl import zernike_projection
 from membrane_ctrl.model.telemetry import SafeLevel, State
 from membrane_ctrl.sim.plant import Plant
 from membrane_ctrl.sim.virtual_bench import VirtualBench

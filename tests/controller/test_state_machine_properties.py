@@ -16,7 +16,7 @@ from membrane_ctrl.controller.commands import TABLE, Command
 from membrane_ctrl.controller.controller import Controller
 from membrane_ctrl.controller.safety import MOVING
 from membrane_ctrl.controller.tick import TickInputs, TickOutputs
-from membrane_ctrl.metrology.film.film_law import zernike_projection
+from membrane_ctrl.metrology.film.hencky_bowl import zernike_projection
 from membrane_ctrl.model.telemetry import SafeLevel, State
 
 DT_S = 0.1

@@ -23,7 +23,7 @@ from membrane_ctrl.controller.tick import TickInputs
 from membrane_ctrl.controller.tick_assembler import TickAssembler
 from membrane_ctrl.controller.tick_codec import pack_tick, unpack_tick
 from membrane_ctrl.hold.virtual_run import VirtualRun
-from membrane_ctrl.metrology.film.film_law import zernike_projection
+from membrane_ctrl.metrology.film.hencky_bowl import zernike_projection
 from membrane_ctrl.model.events import EventLine
 from membrane_ctrl.model.telemetry import State
 from membrane_ctrl.sim.plant import Plant

@@ -18,7 +18,7 @@ from membrane_ctrl.controller.commands import Command
 from membrane_ctrl.controller.cross_check import cross_check
 from membrane_ctrl.controller.tick import TickInputs
 from membrane_ctrl.hold.virtual_run import TruthShape, VirtualRun, VirtualTick
-from membrane_ctrl.metrology.film.film_law import zernike_projection
+from membrane_ctrl.metrology.film.hencky_bowl import zernike_projection
 from membrane_ctrl.model import errors
 from membrane_ctrl.model.events import (
     CommandTaken,

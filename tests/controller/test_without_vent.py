@@ -13,7 +13,7 @@ from membrane_ctrl.config.schema import Config
 from membrane_ctrl.controller.commands import Command
 from membrane_ctrl.controller.cross_check import cross_check
 from membrane_ctrl.hold.virtual_run import VirtualRun
-from membrane_ctrl.metrology.film.film_law import zernike_projection
+from membrane_ctrl.metrology.film.hencky_bowl import zernike_projection
 from membrane_ctrl.model.events import Why
 from membrane_ctrl.model.telemetry import SafeLevel, State
 from membrane_ctrl.sim.plant import Plant

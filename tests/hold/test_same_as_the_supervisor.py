@@ -17,7 +17,7 @@ from membrane_ctrl.controller.controller import Controller
 from membrane_ctrl.controller.tick import TickOutputs
 from membrane_ctrl.hold.supervisor import Supervisor, Wiring, newest_of
 from membrane_ctrl.hold.virtual_run import TruthShape, VirtualRun
-from membrane_ctrl.metrology.film.film_law import zernike_projection
+from membrane_ctrl.metrology.film.hencky_bowl import zernike_projection
 from membrane_ctrl.model.clock import RunClock
 from membrane_ctrl.model.errors import Exit
 from membrane_ctrl.model.shape_estimate import ShapeEstimate, pack_estimate, unpack_estimate

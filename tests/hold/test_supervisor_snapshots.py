@@ -14,7 +14,7 @@ from membrane_ctrl.controller.snapshot import continue_from
 from membrane_ctrl.controller.tick_assembler import TickAssembler
 from membrane_ctrl.controller.tick_codec import MESSAGE_BYTES, SNAPSHOT_MESSAGE_BYTES
 from membrane_ctrl.hold.supervisor import Supervisor, Wiring, newest_of
-from membrane_ctrl.metrology.film.film_law import zernike_projection
+from membrane_ctrl.metrology.film.hencky_bowl import zernike_projection
 from membrane_ctrl.model.clock import RunClock
 from membrane_ctrl.model.errors import Exit
 from membrane_ctrl.model.run_events import from_dict

@@ -7,7 +7,7 @@ from firmware_iface.drivers.pump_board import PumpBoard
 from membrane_ctrl.config.schema import Config, LoopConfig, ResumeConfig, ShapeConfig, StatesConfig
 from membrane_ctrl.controller.commands import Command
 from membrane_ctrl.hold.virtual_run import VirtualRun, VirtualTick
-from membrane_ctrl.metrology.film.film_law import zernike_projection
+from membrane_ctrl.metrology.film.hencky_bowl import zernike_projection
 from membrane_ctrl.model.events import Fault
 from membrane_ctrl.model.telemetry import State
 from membrane_ctrl.sim.plant import Plant

@@ -24,9 +24,12 @@ from membrane_ctrl.geometry.spread_file import spread_of
 from membrane_ctrl.metrology.figure.pixel_figure import measure_pixels, reconstruct_full
 from membrane_ctrl.metrology.frame_checks.checked_set import check
 from membrane_ctrl.metrology.phase.frame_stack import FrameStack
-from membrane_ctrl.metrology.rays.bench_parameters import NAMES, bench_at
-from membrane_ctrl.metrology.rays.geometry import Geometry, find_outline
-from membrane_ctrl.metrology.reconstruction.surface_fit import Points, Tracer, parabola, solve
+from membrane_ctrl.metrology.rays.bench_parameters import NAMES
+from membrane_ctrl.metrology.rays.bench_poses import bench_at
+from membrane_ctrl.metrology.rays.geometry import Geometry
+from membrane_ctrl.metrology.rays.ray_tracing import Points, Tracer, parabola
+from membrane_ctrl.metrology.rays.rim_outline import find_outline
+from membrane_ctrl.metrology.reconstruction.surface_fit import solve
 from membrane_ctrl.metrology.uncertainty.budget import Budget, Source
 from membrane_ctrl.metrology.uncertainty.monte_carlo import height_matrix
 from membrane_ctrl.metrology.uncertainty.set_budget import Examined, examine

@@ -10,17 +10,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from membrane_ctrl.config.schema import OpticsConfig
-from membrane_ctrl.metrology.calibration.normal_equations import References
+from membrane_ctrl.metrology.calibration.set_state import References
 from membrane_ctrl.metrology.calibration.solver import Problem, Solution, first_states, fit_on
-from membrane_ctrl.metrology.rays.bench_parameters import (
-    ALL,
-    NAMES,
-    BenchGeometry,
-    bench_at,
-    sigmas,
-)
-from membrane_ctrl.metrology.rays.forward_model import SetPhases, residual_mm
+from membrane_ctrl.metrology.rays.bench_parameters import ALL, NAMES, sigmas
+from membrane_ctrl.metrology.rays.bench_poses import BenchGeometry, bench_at
+from membrane_ctrl.metrology.rays.forward_model import residual_mm
 from membrane_ctrl.metrology.rays.geometry import Geometry
+from membrane_ctrl.metrology.rays.set_phases import SetPhases
 from membrane_ctrl.metrology.rays.surface import Surface
 from membrane_ctrl.sim.optics.film_shape import FilmShape, typical_film
 from membrane_ctrl.sim.optics.trace import CameraPose, ScreenPose, trace

@@ -16,7 +16,7 @@ from scipy.integrate import solve_ivp
 from scipy.optimize import brentq
 
 from membrane_ctrl.config.schema import CameraConfig, OpticsConfig
-from membrane_ctrl.metrology.reconstruction.surface_fit import HeightFunction
+from membrane_ctrl.metrology.rays.ray_tracing import HeightFunction
 
 FloatArray = NDArray[np.float64]
 RADIUS_MM = 500.0

@@ -13,14 +13,14 @@ import tomli_w
 from calibration_truth import OPTICS, make
 
 from membrane_ctrl.config.optics import GeometryConfig, OpticsConfig, ScreenPoseConfig
-from membrane_ctrl.metrology.calibration.solver import (
+from membrane_ctrl.metrology.calibration.geometry_tables import (
     Origin,
-    Solution,
     general_covariance,
-    solve,
     tables_of,
 )
-from membrane_ctrl.metrology.rays.bench_parameters import NAMES, bench_at, sigmas
+from membrane_ctrl.metrology.calibration.solver import Solution, solve
+from membrane_ctrl.metrology.rays.bench_parameters import NAMES, sigmas
+from membrane_ctrl.metrology.rays.bench_poses import bench_at
 from membrane_ctrl.metrology.rays.geometry import Geometry
 from membrane_ctrl.metrology.uncertainty.geometry_spread import (
     GENERAL_NAMES,

@@ -10,32 +10,18 @@ import pytest
 from calibration_truth import PIXEL_SIGMA_MM, STATED, FloatArray, Truth, calibrated_errors_um, make
 from scipy.spatial.transform import Rotation
 
-from membrane_ctrl.metrology.calibration.advice import screen_advice
-from membrane_ctrl.metrology.calibration.board_lens import screen_seen
 from membrane_ctrl.metrology.calibration.figure_uncertainty import propagate
-from membrane_ctrl.metrology.calibration.normal_equations import averaged
-from membrane_ctrl.metrology.calibration.ring_pose import Rim
+from membrane_ctrl.metrology.calibration.point_averages import averaged
+from membrane_ctrl.metrology.calibration.rim_equations import Rim
+from membrane_ctrl.metrology.calibration.screen_advice import screen_advice
+from membrane_ctrl.metrology.calibration.screen_pose import screen_seen
 from membrane_ctrl.metrology.calibration.solver import Problem, Solution, solve
 from membrane_ctrl.metrology.calibration.verdict import after
-from membrane_ctrl.metrology.rays.bench_parameters import (
-    NAMES,
-    OPTICAL,
-    bench_at,
-    pose_derivatives,
-    sigmas,
-    usual_sigma,
-)
-from membrane_ctrl.metrology.rays.forward_model import (
-    ANYWHERE,
-    COLUMNS,
-    LOCAL,
-    Elsewhere,
-    SetPhases,
-    chunks,
-    residual_mm,
-    views,
-)
+from membrane_ctrl.metrology.rays.bench_parameters import NAMES, sigmas, usual_sigma
+from membrane_ctrl.metrology.rays.bench_poses import OPTICAL, bench_at, pose_derivatives
+from membrane_ctrl.metrology.rays.forward_model import COLUMNS, LOCAL, chunks, residual_mm, views
 from membrane_ctrl.metrology.rays.geometry import project
+from membrane_ctrl.metrology.rays.set_phases import ANYWHERE, Elsewhere, SetPhases
 from membrane_ctrl.metrology.rays.surface import Surface
 from membrane_ctrl.sim.optics.trace import CameraPose, ScreenPose, trace
 

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from membrane_ctrl.config.schema import CameraConfig, OpticsConfig
-from membrane_ctrl.metrology.calibration.figure_uncertainty import foresee
+from membrane_ctrl.metrology.calibration.foresight import foresee
 from membrane_ctrl.metrology.rays.bench_parameters import sigmas
 
 

@@ -9,28 +9,27 @@ import pytest
 from calibration_truth import OPTICS, STATED, make
 
 from membrane_ctrl.config.schema import CameraConfig, GeometryConfig, OpticsConfig
-from membrane_ctrl.metrology.calibration.normal_equations import SetState, averaged, rim_harmonics
-from membrane_ctrl.metrology.rays.bench_parameters import (
-    ALL,
-    NAMES,
+from membrane_ctrl.metrology.calibration.point_averages import averaged
+from membrane_ctrl.metrology.calibration.set_state import SetState
+from membrane_ctrl.metrology.rays.bench_parameters import ALL, NAMES, POSE, sigmas
+from membrane_ctrl.metrology.rays.bench_poses import (
     OPTICAL,
-    POSE,
     BenchGeometry,
     bench_at,
     pose_derivatives,
     poses_at,
-    sigmas,
 )
 from membrane_ctrl.metrology.rays.forward_model import (
     BEYOND,
     COLUMNS,
     LOCAL,
     MOTION,
-    SetPhases,
     chunks,
     residual_mm,
 )
 from membrane_ctrl.metrology.rays.geometry import Geometry
+from membrane_ctrl.metrology.rays.rim_harmonics import rim_harmonics
+from membrane_ctrl.metrology.rays.set_phases import SetPhases
 from membrane_ctrl.metrology.rays.surface import PARAMETERS, Surface
 
 RNG = np.random.default_rng(1)

@@ -9,8 +9,10 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from membrane_ctrl.config.schema import CameraConfig, OpticsConfig
-from membrane_ctrl.metrology.calibration.ring_pose import POSE_NAMES, RingPose, rim_edges, ring_pose
-from membrane_ctrl.metrology.rays.geometry import Geometry, find_outline
+from membrane_ctrl.metrology.calibration.rim_edges import rim_edges
+from membrane_ctrl.metrology.calibration.ring_pose import POSE_NAMES, RingPose, ring_pose
+from membrane_ctrl.metrology.rays.geometry import Geometry
+from membrane_ctrl.metrology.rays.rim_outline import find_outline
 
 FloatArray = NDArray[np.float64]
 

@@ -21,14 +21,14 @@ from calibration_truth import (
 
 from membrane_ctrl.calibration.sets import known_sigmas
 from membrane_ctrl.config.optics import SigmasConfig
-from membrane_ctrl.metrology.calibration.figure_uncertainty import (
-    condition_number,
-    propagate,
-    weak_combinations,
-)
-from membrane_ctrl.metrology.calibration.normal_equations import without_waves
+from membrane_ctrl.metrology.calibration.figure_uncertainty import propagate
+from membrane_ctrl.metrology.calibration.fringe_waves import without_waves
 from membrane_ctrl.metrology.calibration.solver import Solution, solve
 from membrane_ctrl.metrology.calibration.verdict import after
+from membrane_ctrl.metrology.calibration.weak_combinations import (
+    condition_number,
+    weak_combinations,
+)
 from membrane_ctrl.metrology.rays.bench_parameters import NAMES, sigmas
 
 SIGMAS = sigmas()

@@ -11,15 +11,17 @@ import pytest
 from calibration_truth import PIXEL_SIGMA_MM, STATED, FloatArray, Truth, calibrated_errors_um, make
 from scipy.spatial.transform import Rotation
 
-from membrane_ctrl.metrology.calibration.advice import artefact_advice
+from membrane_ctrl.metrology.calibration.artefact_advice import artefact_advice
 from membrane_ctrl.metrology.calibration.figure_uncertainty import propagate
-from membrane_ctrl.metrology.calibration.ring_pose import Rim
+from membrane_ctrl.metrology.calibration.rim_equations import Rim
 from membrane_ctrl.metrology.calibration.solver import Problem, Solution, solve
 from membrane_ctrl.metrology.calibration.verdict import after, before
-from membrane_ctrl.metrology.rays.bench_parameters import NAMES, bench_at, sigmas, usual_sigma
-from membrane_ctrl.metrology.rays.forward_model import SetPhases
+from membrane_ctrl.metrology.rays.artefacts import Artefact
+from membrane_ctrl.metrology.rays.bench_parameters import NAMES, sigmas, usual_sigma
+from membrane_ctrl.metrology.rays.bench_poses import bench_at
 from membrane_ctrl.metrology.rays.geometry import project
-from membrane_ctrl.metrology.rays.surface import Artefact, Surface
+from membrane_ctrl.metrology.rays.set_phases import SetPhases
+from membrane_ctrl.metrology.rays.surface import Surface
 from membrane_ctrl.model.zernike_terms import ZERNIKE_TERMS
 from membrane_ctrl.sim.optics.simulation_spec import leaning
 from membrane_ctrl.sim.optics.trace import CameraPose, ScreenPose, trace

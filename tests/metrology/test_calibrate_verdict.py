@@ -12,15 +12,10 @@ from calibration_truth import SAGS_MM, Truth, make
 
 from membrane_ctrl.metrology.calibration.model_tests import bumps, left_out, suspects
 from membrane_ctrl.metrology.calibration.solver import solve
-from membrane_ctrl.metrology.calibration.verdict import (
-    CYCLES,
-    CalibrationFinding,
-    DriftMonitor,
-    after,
-    before,
-)
+from membrane_ctrl.metrology.calibration.verdict import CalibrationFinding, after, before
+from membrane_ctrl.metrology.cycle.geometry_monitors import CYCLES, DriftMonitor
 from membrane_ctrl.metrology.rays.bench_parameters import NAMES, sigmas
-from membrane_ctrl.metrology.rays.forward_model import SetPhases
+from membrane_ctrl.metrology.rays.set_phases import SetPhases
 
 SIGMAS = sigmas()
 VALUES = SIGMAS * np.random.default_rng(3).normal(size=len(NAMES))

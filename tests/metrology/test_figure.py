@@ -13,7 +13,7 @@ from prysm import interferogram
 from prysm.polynomials import ansi_j_to_nm, fringe_to_nm, noll_to_nm, zernike_nm
 from scipy.optimize import least_squares, minimize_scalar
 
-from membrane_ctrl.metrology.figure import quantities
+from membrane_ctrl.metrology.figure import best_sphere, quantities
 from membrane_ctrl.metrology.numerics import zernike
 from membrane_ctrl.metrology.rays import surface
 from membrane_ctrl.model.zernike_terms import NOLL_INDICES, ZERNIKE_TERMS
@@ -87,7 +87,7 @@ def test_the_sphere_has_the_least_squares_of_the_distances() -> None:
     best = least_squares(
         distances, [0, 0, 3400, 3400], x_scale=[1, 1, 1e3, 1e3], xtol=1e-15, ftol=1e-15, gtol=1e-15
     )
-    found = surface.best_sphere(cloud)
+    found = best_sphere.best_sphere(cloud)
     assert 1 / found.curvature_per_mm == pytest.approx(best.x[3], rel=1e-7)
     np.testing.assert_allclose(found.deviation(cloud)[0], -distances(best.x), atol=1e-6)
 

@@ -12,7 +12,7 @@ from metrology_truth import FloatArray
 from numpy.polynomial import Legendre, Polynomial
 from prysm.polynomials import noll_to_nm, zernike_nm
 
-from membrane_ctrl.metrology.film import film_law, material_fit
+from membrane_ctrl.metrology.film import hencky_bowl, material_fit
 from membrane_ctrl.metrology.film.film_law import FilmLaw
 from membrane_ctrl.model.zernike_terms import NOLL_INDICES, ZERNIKE_TERMS
 from membrane_ctrl.sim.film import stretched
@@ -76,7 +76,7 @@ def _round_terms(height_mm: Polynomial) -> FloatArray:
         np.sqrt(2 * k + 1) * Legendre.basis(k, domain=[0, 1]).deriv()(rho**2)
         for k in range(1, len(ROUND))
     ]
-    slopes.append(Polynomial(film_law.excess()).deriv()(rho**2) / film_law.excess_rms())
+    slopes.append(Polynomial(hencky_bowl.excess()).deriv()(rho**2) / hencky_bowl.excess_rms())
     design = np.stack([2 * rho * slope for slope in slopes], axis=1)
     return np.linalg.lstsq(design, 2 * rho * height_mm.deriv()(rho**2), rcond=None)[0]
 

@@ -7,7 +7,9 @@ import math
 import numpy as np
 import pytest
 
-from membrane_ctrl.metrology.phase.fringe_orders import gray_bit, orders, tear_share, unwrap_regions
+from membrane_ctrl.metrology.phase.fringe_orders import orders
+from membrane_ctrl.metrology.phase.gray_code import gray_bit
+from membrane_ctrl.metrology.phase.region_unwrap import tear_share, unwrap_regions
 
 ROWS, COLUMNS = np.mgrid[0:60, 0:90].astype(float)
 PHASE = 0.3 * math.pi + COLUMNS * 0.15 * math.pi + 0.01 * ROWS  # 6.7 periods across

@@ -21,8 +21,8 @@ from membrane_ctrl.metrology.figure.pixel_figure import (
 )
 from membrane_ctrl.metrology.frame_checks.checked_set import check
 from membrane_ctrl.metrology.phase.frame_stack import FrameStack
+from membrane_ctrl.metrology.rays.ray_tracing import HeightFunction, parabola
 from membrane_ctrl.metrology.rays.surface import Surface
-from membrane_ctrl.metrology.reconstruction.surface_fit import HeightFunction, parabola
 from membrane_ctrl.model.zernike_terms import ZERNIKE_TERMS
 from membrane_ctrl.sim.optics.camera import OpticsRenderer
 from membrane_ctrl.sim.optics.film_shape import Bump, FilmShape, Ripple

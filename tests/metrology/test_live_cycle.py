@@ -16,11 +16,12 @@ from metrology_truth import SMALL
 
 from membrane_ctrl.config.optics import SigmasConfig
 from membrane_ctrl.config.schema import OpticsConfig, PatternConfig
-from membrane_ctrl.metrology.calibration.solver import general_form
+from membrane_ctrl.metrology.calibration.geometry_tables import general_form
 from membrane_ctrl.metrology.cycle.live_reconstructor import LiveReconstructor
 from membrane_ctrl.metrology.frame_checks import backlight_bands
-from membrane_ctrl.metrology.phase.phase_steps import fringe_sequence, full_sequence
-from membrane_ctrl.metrology.rays.bench_parameters import NAMES, bench_at
+from membrane_ctrl.metrology.phase.pattern_sequence import fringe_sequence, full_sequence
+from membrane_ctrl.metrology.rays.bench_parameters import NAMES
+from membrane_ctrl.metrology.rays.bench_poses import bench_at
 from membrane_ctrl.metrology.rays.geometry import Geometry
 from membrane_ctrl.metrology.uncertainty.geometry_spread import (
     PAPER_SPREAD,

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from membrane_ctrl.metrology.frame_checks.frequency_series import predicted_phase, unwrap
+from membrane_ctrl.metrology.phase.temporal_unwrap import predicted_phase, unwrap
 
 PERIODS = [0.9, 3.9, 15.9, 63.9]
 

@@ -12,8 +12,9 @@ import numpy as np
 import pytest
 from metrology_truth import TrueFilm, look
 
-from membrane_ctrl.metrology.phase import phase_steps
-from membrane_ctrl.metrology.rays.geometry import Face, Geometry
+from membrane_ctrl.metrology.phase import crossed_fringes, gray_code, multi_period
+from membrane_ctrl.metrology.rays.geometry import Geometry
+from membrane_ctrl.metrology.rays.screen_face import Face
 
 PLACE = np.random.default_rng(5).uniform(-210, 190, 4000)
 
@@ -36,14 +37,14 @@ def page_blocks() -> list[str]:
     "periods", [[420.5, 49.8], [17.0, 19.0, 23.0], [13.3, 40.0, 131.0, 401.0], [61.3, 37.9]]
 )
 def test_any_periods_give_the_place(periods: list[float]) -> None:
-    found = phase_steps.places_mm(wrapped(periods), periods, (-210, 190), sigma_rad=0.02)
+    found = multi_period.places_mm(wrapped(periods), periods, (-210, 190), sigma_rad=0.02)
     np.testing.assert_allclose(found.place_mm, PLACE, atol=1e-9)
     assert found.misfit.max() < 1e-9
 
 
 def test_noise_gives_no_wrong_order_and_the_misfit_that_it_should() -> None:
     periods = [17.0, 19.0, 23.0]
-    found = phase_steps.places_mm(wrapped(periods, 0.03), periods, (-210, 190), sigma_rad=0.03)
+    found = multi_period.places_mm(wrapped(periods, 0.03), periods, (-210, 190), sigma_rad=0.03)
     sure = np.isfinite(found.place_mm)
     assert sure.mean() > 0.9
     assert np.abs(found.place_mm - PLACE)[sure].max() < 1.0
@@ -53,11 +54,11 @@ def test_noise_gives_no_wrong_order_and_the_misfit_that_it_should() -> None:
 
 
 def test_places_that_two_orders_explain_are_not_given() -> None:
-    found = phase_steps.places_mm(wrapped([30.0, 60.0]), [30.0, 60.0], (-210, 190), sigma_rad=0.05)
+    found = multi_period.places_mm(wrapped([30.0, 60.0]), [30.0, 60.0], (-210, 190), sigma_rad=0.05)
     assert np.isnan(found.place_mm).all()  # repeats every 60 mm
     broken = wrapped([420.5, 49.8])
     broken[0] += 0.39  # half of the shorter period
-    given = np.isfinite(phase_steps.places_mm(broken, [420.5, 49.8], (-210, 190), 0.02).place_mm)
+    given = np.isfinite(multi_period.places_mm(broken, [420.5, 49.8], (-210, 190), 0.02).place_mm)
     assert given.mean() < 0.01  # 26 mm beyond one end looks like the other end, 420 mm away
 
 
@@ -69,14 +70,14 @@ def test_places_refuse_what_they_cannot_use() -> None:
         ([1.0, 2.0], (1, 1)),
     ):
         with pytest.raises(ValueError, match="at least two"):
-            phase_steps.places_mm(np.zeros((2, 3) if len(periods) > 1 else (1, 3)), periods, span)
+            multi_period.places_mm(np.zeros((2, 3) if len(periods) > 1 else (1, 3)), periods, span)
 
 
 @pytest.mark.parametrize("bits", [2, 4, 7])
 def test_a_gray_code_of_any_length(bits: int) -> None:
     half = np.arange(2**bits)
     code = half ^ (half >> 1)
-    k1, k2 = phase_steps.code_orders((code >> np.arange(bits)[::-1, None]) & 1 == 1)
+    k1, k2 = gray_code.code_orders((code >> np.arange(bits)[::-1, None]) & 1 == 1)
     np.testing.assert_array_equal(k1, half // 2)
     np.testing.assert_array_equal(k2, (half + 1) // 2)
 
@@ -86,11 +87,11 @@ def test_crossed_fringes_are_told_apart() -> None:
     phi_x, phi_y = random.uniform(-np.pi, np.pi, (2, 500))
     steps = 2 * np.pi * np.arange(5) / 5
     frames = [100 + 40 * np.cos(phi_x + d) + 30 * np.cos(phi_y + 2 * d) for d in steps]
-    x, y = phase_steps.crossed_phasors(frames, steps, 2 * steps)
+    x, y = crossed_fringes.crossed_phasors(frames, steps, 2 * steps)
     np.testing.assert_allclose(x, 40 * np.exp(1j * phi_x), atol=1e-10)
     np.testing.assert_allclose(y, 30 * np.exp(1j * phi_y), atol=1e-10)
     with pytest.raises(ValueError, match="crossed fringes"):
-        phase_steps.crossed_phasors(frames, steps, steps)
+        crossed_fringes.crossed_phasors(frames, steps, steps)
 
 
 def test_the_blocks_of_the_page_run_alone() -> None:

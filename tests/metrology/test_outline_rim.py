@@ -6,9 +6,10 @@ import numpy as np
 import pytest
 from rendered_sets import FILM, bench, good_set
 
-from membrane_ctrl.metrology.film import film_law
-from membrane_ctrl.metrology.rays.geometry import Geometry, find_outline, project
-from membrane_ctrl.metrology.rays.surface import pressure_pa, radial_profile
+from membrane_ctrl.metrology.figure.radial_profile import pressure_pa, radial_profile
+from membrane_ctrl.metrology.film import hencky_bowl
+from membrane_ctrl.metrology.rays.geometry import Geometry, project
+from membrane_ctrl.metrology.rays.rim_outline import find_outline
 
 
 def white_minus_black() -> np.ndarray:
@@ -85,7 +86,7 @@ def test_profile_of_a_hencky_bowl() -> None:
     axis = np.linspace(-475, 475, 191)
     x, y = np.meshgrid(axis, axis)
     r = np.hypot(x, y)
-    height = 37.1 * film_law.profile(np.minimum(r / 500, 1.0)) + 0.1 * x / 475
+    height = 37.1 * hencky_bowl.profile(np.minimum(r / 500, 1.0)) + 0.1 * x / 475
     profile = radial_profile(axis, np.where(r <= 475, height, np.nan), 500.0)
     assert profile.sag_mm == pytest.approx(37.1, abs=1e-6)
     assert profile.pressure_pa == pytest.approx(600, rel=0.005)

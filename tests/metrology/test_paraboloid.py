@@ -6,7 +6,8 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from membrane_ctrl.metrology.rays.geometry import Face, Geometry
+from membrane_ctrl.metrology.rays.geometry import Geometry
+from membrane_ctrl.metrology.rays.screen_face import Face
 from tests.support.facet import Paraboloid, Sight, fit_slopes, measure_on, solve_facet, turned
 
 TRUE = Paraboloid(1e-3, -2e-3, 1 / 240e3, -3e-7, 1 / 218e3)

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from membrane_ctrl.config.schema import PatternConfig
-from membrane_ctrl.metrology.phase.phase_steps import FullSlots, fringe_sequence, full_sequence
+from membrane_ctrl.metrology.phase.pattern_sequence import FullSlots, fringe_sequence, full_sequence
 
 
 def test_the_papers_18_images() -> None:

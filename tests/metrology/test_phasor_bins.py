@@ -8,8 +8,10 @@ import numpy as np
 import pytest
 
 from membrane_ctrl.metrology.numerics.compiled import kernel
-from membrane_ctrl.metrology.phase.bin_phasors import FOLLOWED_ROWS, Binner, arctan2, track
+from membrane_ctrl.metrology.phase.bin_sums import FOLLOWED_ROWS, Binner
+from membrane_ctrl.metrology.phase.phase_change import track
 from membrane_ctrl.metrology.phase.phase_steps import equal_shifts, step_weights
+from membrane_ctrl.metrology.phase.phasor_kernels import arctan2
 from membrane_ctrl.metrology.reconstruction.film_motion import combine_steps, worth_correcting
 
 RNG = np.random.default_rng(7)

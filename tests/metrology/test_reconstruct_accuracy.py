@@ -14,19 +14,17 @@ from membrane_ctrl.config.optics import (
     OpticsConfig,
     ScreenPoseConfig,
 )
+from membrane_ctrl.metrology.numerics.matrix_inverse import invert
 from membrane_ctrl.metrology.numerics.zernike import gradients
 from membrane_ctrl.metrology.rays.geometry import Geometry
-from membrane_ctrl.metrology.rays.kernels import invert
+from membrane_ctrl.metrology.rays.ray_tracing import Points, Tracer, parabola
 from membrane_ctrl.metrology.rays.surface import Surface, sag_gradient
-from membrane_ctrl.metrology.reconstruction.bin_grid import parameter_covariance, slope_per_screen
-from membrane_ctrl.metrology.reconstruction.surface_fit import (
-    Fit,
-    NormalMatrix,
-    Points,
-    Tracer,
-    parabola,
-    solve,
+from membrane_ctrl.metrology.reconstruction.normal_matrix import NormalMatrix
+from membrane_ctrl.metrology.reconstruction.slope_noise import (
+    parameter_covariance,
+    slope_per_screen,
 )
+from membrane_ctrl.metrology.reconstruction.surface_fit import Fit, solve
 from membrane_ctrl.model.zernike_terms import NOLL_INDICES, ZERNIKE_TERMS
 
 GEOMETRY = Geometry.from_config(OPTICS)
@@ -112,7 +110,7 @@ def test_kept_normal_matrix_has_the_same_end() -> None:
     points = _points(_seen("bowl"))
     renewed = solve(TRACER, points, START, tolerance_mm=1e-12)
     TRACER.start(points, START)
-    of_the_start = TRACER.normal_matrix(points)
+    of_the_start = NormalMatrix.from_points(TRACER, points)
     kept = solve(TRACER, points, START, normal=of_the_start, tolerance_mm=1e-12)
     assert kept.surface.parameters == pytest.approx(renewed.surface.parameters, abs=1e-10)
 

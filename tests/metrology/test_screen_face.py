@@ -17,11 +17,13 @@ from membrane_ctrl.config.optics import (
 from membrane_ctrl.metrology.cycle.live_reconstructor import LiveReconstructor
 from membrane_ctrl.metrology.figure.pixel_figure import measure_pixels, reconstruct_full
 from membrane_ctrl.metrology.frame_checks.checked_set import check
-from membrane_ctrl.metrology.rays.bench_parameters import BenchGeometry
-from membrane_ctrl.metrology.rays.forward_model import SetPhases, residual_mm
-from membrane_ctrl.metrology.rays.geometry import Face, Geometry
+from membrane_ctrl.metrology.rays.bench_poses import BenchGeometry
+from membrane_ctrl.metrology.rays.forward_model import residual_mm
+from membrane_ctrl.metrology.rays.geometry import Geometry
+from membrane_ctrl.metrology.rays.ray_tracing import Points, Tracer
+from membrane_ctrl.metrology.rays.screen_face import Face
+from membrane_ctrl.metrology.rays.set_phases import SetPhases
 from membrane_ctrl.metrology.rays.surface import Surface
-from membrane_ctrl.metrology.reconstruction.surface_fit import Points, Tracer
 from membrane_ctrl.metrology.uncertainty.geometry_spread import GENERAL_NAMES, changed
 from membrane_ctrl.sim.optics.film_shape import FilmShape
 from membrane_ctrl.sim.optics.trace import camera_pose, screen_pose, trace

@@ -15,12 +15,9 @@ from membrane_ctrl.metrology.frame_checks.frame_faults import (
     closure_with_level,
     closure_with_phase,
 )
-from membrane_ctrl.metrology.frame_checks.frequency_series import (
-    check_series,
-    predicted_phase,
-    unwrap,
-)
+from membrane_ctrl.metrology.frame_checks.frequency_series import check_series
 from membrane_ctrl.metrology.phase.phase_steps import phasors
+from membrane_ctrl.metrology.phase.temporal_unwrap import predicted_phase, unwrap
 from tests.support import sofast_facet
 from tests.support.facet import measure_on, solve_facet
 from tests.support.sofast_facet import decode, sight, wrapped_phases

@@ -14,8 +14,8 @@ from numpy.typing import NDArray
 from firmware_iface.roles import Pattern
 from membrane_ctrl.config.schema import CameraConfig, Config, OpticsConfig
 from membrane_ctrl.metrology.cycle.live_reconstructor import LiveReconstructor
-from membrane_ctrl.metrology.film.film_law import zernike_projection
-from membrane_ctrl.metrology.phase import phase_steps
+from membrane_ctrl.metrology.film.hencky_bowl import zernike_projection
+from membrane_ctrl.metrology.phase import pattern_sequence
 from membrane_ctrl.metrology.tracking.live_tracker import (
     COVARIANCE_S,
     LOST_S,
@@ -60,7 +60,8 @@ class Bench:
 
     def full(self, moved_um: float = 0.0) -> ShapeEstimate:
         frames = [
-            self.renderer.render(p, moved_um) for p in phase_steps.full_sequence(OPTICS.pattern)
+            self.renderer.render(p, moved_um)
+            for p in pattern_sequence.full_sequence(OPTICS.pattern)
         ]
         self.time_s += 2.0
         return self.tracker.full(frames, self.time_s + 0.1 * np.arange(18), np.full(18, moved_um))
@@ -242,7 +243,8 @@ def test_a_hold_hears_the_films_vibrations_and_no_others() -> None:
     renderer = OpticsRenderer(optics, FILM, seed=3, modes=modes)
     film_um, listener, told = held_um(126.0), Stethoscope(), []
     still = [
-        renderer.render(p, float(film_um[0])) for p in phase_steps.full_sequence(optics.pattern)
+        renderer.render(p, float(film_um[0]))
+        for p in pattern_sequence.full_sequence(optics.pattern)
     ]
     assert tracker.full(still, 0.1 * np.arange(18), np.full(18, math.nan)).verdict == "ok"
     time_s = 2.0

@@ -5,12 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from membrane_ctrl.metrology.reconstruction.zonal_map import (
-    MaskedLaplacian,
-    ResidualGrid,
-    integrate,
-    residual_grid,
-)
+from membrane_ctrl.metrology.reconstruction.masked_laplacian import MaskedLaplacian
+from membrane_ctrl.metrology.reconstruction.zonal_map import ResidualGrid, integrate, residual_grid
 
 AXIS = np.linspace(-100.0, 100.0, 101)
 X, Y = np.meshgrid(AXIS, AXIS)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from membrane_ctrl.metrology.film import film_law
+from membrane_ctrl.metrology.film import hencky_bowl, terms_beyond_fit
 from membrane_ctrl.metrology.numerics import zernike
 from membrane_ctrl.metrology.rays import kernels
 from membrane_ctrl.metrology.rays.surface import PARAMETERS
@@ -55,9 +55,9 @@ def test_an_estimate_fits_into_its_message() -> None:
 
 
 def test_round_terms_are_those_without_azimuthal_order() -> None:
-    assert list(film_law.ROUND_NOLL) == [j for j in NOLL_INDICES if zernike.noll(j)[1] == 0]
-    assert film_law.BEYOND[0] == film_law.EXCESS_DEGREE + 1
-    assert film_law.BEYOND[-1] < film_law.EXCESS_TERMS
+    assert list(hencky_bowl.ROUND_NOLL) == [j for j in NOLL_INDICES if zernike.noll(j)[1] == 0]
+    assert terms_beyond_fit.BEYOND[0] == hencky_bowl.EXCESS_DEGREE + 1
+    assert terms_beyond_fit.BEYOND[-1] < hencky_bowl.EXCESS_TERMS
 
 
 def test_the_excess_replaces_piston() -> None:

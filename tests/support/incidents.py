@@ -8,7 +8,7 @@ from pathlib import Path
 from membrane_ctrl.config import toml_file as config_file
 from membrane_ctrl.config.schema import Config
 from membrane_ctrl.controller.snapshot import UnknownSnapshotError
-from membrane_ctrl.metrology.film.film_law import zernike_projection
+from membrane_ctrl.metrology.film.hencky_bowl import zernike_projection
 from membrane_ctrl.model import errors
 from membrane_ctrl.replay.replay import Decision, recorded_ticks, replay, unmatched
 from membrane_ctrl.run_files import inputs_file

@@ -23,9 +23,10 @@ from membrane_ctrl.measure.measure import (
     item,
     open_file,
 )
-from membrane_ctrl.metrology.frame_checks.frequency_series import Unwrapped, unwrap
 from membrane_ctrl.metrology.phase.phase_steps import phasors
-from membrane_ctrl.metrology.rays.geometry import Face, Geometry
+from membrane_ctrl.metrology.phase.temporal_unwrap import Unwrapped, unwrap
+from membrane_ctrl.metrology.rays.geometry import Geometry
+from membrane_ctrl.metrology.rays.screen_face import Face
 from tests.support.facet import Sight
 
 FloatArray = NDArray[np.float64]

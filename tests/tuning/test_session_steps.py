@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 
 from membrane_ctrl.config.schema import Config, LoopConfig, PumpConfig
-from membrane_ctrl.metrology.film.film_law import zernike_projection
+from membrane_ctrl.metrology.film.hencky_bowl import zernike_projection
 from membrane_ctrl.model.errors import InputError
 from membrane_ctrl.model.program import program_identity, stated_program
 from membrane_ctrl.model.shape_estimate import ShapeEstimate

@@ -26,7 +26,7 @@ from membrane_ctrl.controller.snapshot import continue_from, take_snapshot
 from membrane_ctrl.controller.state import ControllerState
 from membrane_ctrl.controller.tick import TickInputs, TickOutputs
 from membrane_ctrl.hold.virtual_run import TruthShape, VirtualRun
-from membrane_ctrl.metrology.film.film_law import zernike_projection
+from membrane_ctrl.metrology.film.hencky_bowl import zernike_projection
 from membrane_ctrl.model.lock import Lock
 from membrane_ctrl.sim.plant import Plant
 from membrane_ctrl.sim.surroundings import BenchEvent

@@ -14,7 +14,7 @@ from membrane_ctrl.config.schema import Config
 from membrane_ctrl.controller.commands import Command
 from membrane_ctrl.controller.tick_codec import pack_tick
 from membrane_ctrl.hold.virtual_run import TruthShape, VirtualRun, VirtualTick
-from membrane_ctrl.metrology.film.film_law import zernike_projection
+from membrane_ctrl.metrology.film.hencky_bowl import zernike_projection
 from membrane_ctrl.model.shape_estimate import ShapeEstimate, pack_estimate, unpack_estimate
 from membrane_ctrl.model.zernike_terms import ZERNIKE_TERMS
 from membrane_ctrl.processes.ring import RingWriter

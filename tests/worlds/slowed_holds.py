@@ -34,7 +34,7 @@ from membrane_ctrl.controller.controller import Controller
 from membrane_ctrl.controller.tick import TickOutputs
 from membrane_ctrl.hold.supervisor import Supervisor, Wiring
 from membrane_ctrl.hold.virtual_run import TruthShape, VirtualClock
-from membrane_ctrl.metrology.film.film_law import zernike_projection
+from membrane_ctrl.metrology.film.hencky_bowl import zernike_projection
 from membrane_ctrl.model.shape_estimate import ESTIMATE_BYTES_MAX, ShapeEstimate, pack_estimate
 from membrane_ctrl.model.telemetry import ROW_BYTES
 from membrane_ctrl.processes import ring

@@ -11,7 +11,7 @@ import numpy as np
 
 from membrane_ctrl.config.schema import Config
 from membrane_ctrl.metrology.cycle.live_reconstructor import LiveReconstructor
-from membrane_ctrl.metrology.phase.phase_steps import fringe_sequence, full_sequence
+from membrane_ctrl.metrology.phase.pattern_sequence import fringe_sequence, full_sequence
 from membrane_ctrl.model.shape_estimate import ShapeEstimate
 from membrane_ctrl.sim.optics.camera import TwinOptics
 from membrane_ctrl.sim.plant import Plant

@@ -18,7 +18,7 @@ from membrane_ctrl.controller.tick import TickInputs, TickOutputs
 from membrane_ctrl.controller.tick_assembler import TickAssembler, TickBatch
 from membrane_ctrl.controller.tick_codec import pack_snapshot, pack_tick
 from membrane_ctrl.hold.virtual_run import Alter, ShapeSource, VirtualRun, VirtualTick
-from membrane_ctrl.metrology.film.film_law import zernike_projection
+from membrane_ctrl.metrology.film.hencky_bowl import zernike_projection
 from membrane_ctrl.model.arrays import FloatArray
 from membrane_ctrl.model.shape_estimate import ShapeEstimate
 from membrane_ctrl.run_files.run_tables import RunTables

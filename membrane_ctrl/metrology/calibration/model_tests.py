@@ -12,8 +12,14 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy.stats import chi2
 
-from membrane_ctrl.metrology.calibration import figure_uncertainty, normal_equations, solver
-from membrane_ctrl.metrology.rays import bench_parameters, forward_model
+from membrane_ctrl.metrology.calibration import (
+    figure_uncertainty,
+    normal_equations,
+    reference_rows,
+    set_state,
+    solver,
+)
+from membrane_ctrl.metrology.rays import bench_parameters, bench_poses, disc_heights, set_phases
 from membrane_ctrl.model.arrays import FloatArray, IntArray
 
 SURE = 1e-6  # probability that good data look as bad
@@ -111,9 +117,9 @@ def suspects(solution: solver.Solution) -> tuple[Suspect, ...]:
     """
     sums = np.sum(_reduced(solution), axis=0)
     response = figure_uncertainty.surface_response(solution, solution.problem.middle)[:, :-1]
-    flat = figure_uncertainty.without_plane(*figure_uncertainty.disc(1.0))
+    flat = disc_heights.without_plane(*disc_heights.disc(1.0))
     out = []
-    for name in bench_parameters.NAMES[len(bench_parameters.POSE) : bench_parameters.OPTICAL]:
+    for name in bench_parameters.NAMES[len(bench_parameters.POSE) : bench_poses.OPTICAL]:
         if name in solution.free:
             continue
         k = bench_parameters.NAMES.index(name)
@@ -122,7 +128,7 @@ def suspects(solution: solver.Solution) -> tuple[Suspect, ...]:
         moved = solver.step(sums + solution.known(freed), freed)
         fall = _squares(sums, solution) - moved.squares
         sigma = float(np.sqrt(moved.covariance[k, k]))
-        figure_um = 1e3 * float(np.std(flat @ (response @ moved.delta[: bench_parameters.OPTICAL])))
+        figure_um = 1e3 * float(np.std(flat @ (response @ moved.delta[: bench_poses.OPTICAL])))
         out.append(Suspect(name, float(moved.delta[k]), sigma, fall, figure_um))
     return tuple(sorted((s for s in out if s.sure), key=lambda s: -s.fall))
 
@@ -161,7 +167,7 @@ def elsewhere(solution: solver.Solution) -> list[tuple[int, float]]:
     reduced, out = _reduced(solution), []
     everything, moved = (
         _squares(np.sum(reduced, axis=0), solution),
-        np.arange(bench_parameters.SCREEN_MOVE),
+        np.arange(bench_poses.SCREEN_MOVE),
     )
     for k, each in enumerate(solution.equations):
         free = each.sums.copy()
@@ -174,8 +180,8 @@ def elsewhere(solution: solver.Solution) -> list[tuple[int, float]]:
             own, without_hand = np.append(moved, len(sums) - 1), sums.copy()
             without_hand[np.ix_(own, own)] -= hand.T @ hand
             free += normal_equations.without(
-                without_hand, forward_model.MOVED
-            ) - normal_equations.without(sums, forward_model.MOVED)
+                without_hand, set_phases.MOVED
+            ) - normal_equations.without(sums, set_phases.MOVED)
         others = [*reduced[:k], replace(each, sums=free).reduced(), *reduced[k + 1 :]]
         fall = everything - _squares(np.sum(others, axis=0), solution)
         if chi2.sf(fall, moved.size) < SURE:
@@ -227,11 +233,11 @@ def _moved_by(
         [_with_more(each, columns, part) for each, part in zip(reduced, share, strict=True)], axis=0
     )
     known = _with_more(solution.known(hand), columns, 0.0)
-    extra = np.arange(normal_equations.COMMON, normal_equations.COMMON + len(columns))
+    extra = np.arange(set_state.COMMON, set_state.COMMON + len(columns))
     known[extra, extra] += 1 / sigmas**2
     kept = np.append(
         hand > 0,
-        np.ones(normal_equations.COMMON - len(bench_parameters.NAMES) + len(columns), bool),
+        np.ones(set_state.COMMON - len(bench_parameters.NAMES) + len(columns), bool),
     )
     delta, squares = _solved(sums + known, np.flatnonzero(kept))
     return tuple(delta[-len(columns) :].tolist()), _squares(
@@ -266,14 +272,14 @@ def _reduced(solution: solver.Solution) -> list[FloatArray]:
     return [each.reduced() for each in solution.equations]
 
 
-def film_rise(solution: solver.Solution, film: normal_equations.FilmModel) -> float:
+def film_rise(solution: solver.Solution, film: set_state.FilmModel) -> float:
     """By how much the sum of squares of a solution with a free film
     rises if the film is like that.
     """
     bound = []
     films = solution.problem.films
     for k, (each, state) in enumerate(zip(solution.equations, solution.states, strict=True)):
-        rows = normal_equations.film_rows(state.surface, film)
+        rows = reference_rows.film_rows(state.surface, film)
         told = each.sums + rows.T @ rows if k in films else each.sums
         bound.append(replace(each, sums=told).reduced())
     return _squares(np.sum(bound, axis=0), solution) - _squares(
@@ -289,7 +295,7 @@ def _squares(sums: FloatArray, solution: solver.Solution) -> float:
 def _alone(reduced: FloatArray, sigmas: FloatArray) -> tuple[float, int]:
     """Least sum of squares of one set by itself, and how many numbers it determines; no prior."""
     free = np.flatnonzero(
-        np.append(sigmas > 0, np.ones(normal_equations.COMMON - len(bench_parameters.NAMES), bool))
+        np.append(sigmas > 0, np.ones(set_state.COMMON - len(bench_parameters.NAMES), bool))
     )
     matrix, right = reduced[np.ix_(free, free)], reduced[free, -1]
     scale = 1 / np.sqrt(np.maximum(np.diag(matrix), 1e-300))
@@ -305,10 +311,10 @@ def _with_more(sums: FloatArray, columns: Sequence[int], share: float) -> FloatA
     """The sums with more unknowns before the residual, which act as some of the parameters do,
     times a share.
     """
-    order: Sequence[int] = [*range(normal_equations.COMMON), *columns, normal_equations.COMMON]
+    order: Sequence[int] = [*range(set_state.COMMON), *columns, set_state.COMMON]
     out = sums[np.ix_(order, order)].copy()
-    out[normal_equations.COMMON : -1, :] *= share
-    out[:, normal_equations.COMMON : -1] *= share
+    out[set_state.COMMON : -1, :] *= share
+    out[:, set_state.COMMON : -1] *= share
     return np.asarray(out)
 
 

@@ -1,39 +1,33 @@
 """The one least-squares problem: Gauss-Newton on the common unknowns, surfaces eliminated
-(`separable`).
-
-`tables_of` gives the solution as the tables of `geometry.toml`. `[geometry]` is what every command
-reads. `[covariance]` is what error bars and a Monte Carlo use: shifts and turns of camera and
-screen in world, twelve of them, made from the eleven parameters (the twelfth direction, a turn of
-everything about z, has no variance: it defines x), and the parameters of lens, bow and pitch that
-were free. `[parameters]` are the calibration's own, `[calibration]` states the origin of all that.
-The screen's bow is in `[geometry.screen]`. `[camera]` and `[pattern]` are there if the lens or the
-screen's pitch were calibrated; a measurement with such a file needs them too.
+(`normal_equations`).
 """
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from typing import Any
 
 import numpy as np
 
-from membrane_ctrl.config.optics import (
-    CameraPoseConfig,
-    GeometryConfig,
-    OpticsConfig,
-    ScreenPoseConfig,
-    Vector3,
+from membrane_ctrl.metrology.calibration import (
+    fringe_waves,
+    normal_equations,
+    point_averages,
+    robust_weights,
+    set_state,
 )
-from membrane_ctrl.metrology.calibration import normal_equations
-from membrane_ctrl.metrology.calibration.ring_pose import Rim
-from membrane_ctrl.metrology.film import film_law
-from membrane_ctrl.metrology.rays import bench_parameters, forward_model
-from membrane_ctrl.metrology.rays.geometry import BOW_RADIUS_MM, Geometry
-from membrane_ctrl.metrology.rays.surface import PARAMETERS, Artefact, SeenScreen, Surface
+from membrane_ctrl.metrology.calibration.rim_equations import Rim
+from membrane_ctrl.metrology.film import terms_beyond_fit
+from membrane_ctrl.metrology.rays import (
+    bench_parameters,
+    bench_poses,
+    forward_model,
+    ray_tracing,
+    set_phases,
+)
+from membrane_ctrl.metrology.rays.artefacts import Artefact, SeenScreen
+from membrane_ctrl.metrology.rays.geometry import Geometry
+from membrane_ctrl.metrology.rays.surface import PARAMETERS, Surface
 from membrane_ctrl.metrology.reconstruction import surface_fit
-from membrane_ctrl.metrology.uncertainty.geometry_spread import GENERAL_NAMES
 from membrane_ctrl.model.arrays import FloatArray
-from membrane_ctrl.model.plain_json import SCHEMA, content_hash
-from membrane_ctrl.model.program import file_origin
 
 MAX_ITERATIONS = 40
 _SETTLED = 1e-2  # of each parameter's own standard deviation: less is invisible in the result
@@ -50,9 +44,9 @@ class Problem:
     """The problem to solve."""
 
     stated: Geometry  # as measured by hand
-    sets: tuple[forward_model.SetPhases, ...]  # at different sags
+    sets: tuple[set_phases.SetPhases, ...]  # at different sags
     sigmas: FloatArray  # (len(NAMES),): of the hand's measurements; 0 holds a parameter
-    references: normal_equations.References  # laser and ring
+    references: set_state.References  # laser and ring
     radius_mm: float  # of the ring
     rim: Rim | None = None  # the light's edge, where it is seen
 
@@ -81,7 +75,7 @@ class Solution:
     problem: Problem  # as given, many bins averaged
     values: FloatArray  # (len(NAMES),): parameters, 0 for the stated bench
     common: FloatArray  # (COMMON,): parameters and ring
-    states: tuple[normal_equations.SetState, ...]  # surface and vertex of each set
+    states: tuple[set_state.SetState, ...]  # surface and vertex of each set
     equations: tuple[normal_equations.Equations, ...]  # of each set, at the end
     at_rim: FloatArray  # (COMMON + 1, squared): the rim's equations
     covariance: FloatArray  # (COMMON, COMMON): of the common unknowns; zeros for what was held
@@ -89,9 +83,9 @@ class Solution:
     converged: bool  # whether the last step was too small to matter
 
     @property
-    def bench(self) -> bench_parameters.BenchGeometry:
+    def bench(self) -> bench_poses.BenchGeometry:
         """The calibrated bench."""
-        return bench_parameters.bench_at(self.problem.stated, self.values)
+        return bench_poses.bench_at(self.problem.stated, self.values)
 
     def known(self, sigmas: FloatArray) -> FloatArray:
         """What is known besides the sets, as sums (COMMON + 1, squared), with these sigmas of the
@@ -116,10 +110,8 @@ class Solution:
 
 def prior(sigmas: FloatArray, common: FloatArray) -> FloatArray:
     """The knowledge without the sets, as sums (COMMON + 1, squared) about the present unknowns."""
-    wide = np.append(
-        sigmas, np.full(normal_equations.COMMON - len(bench_parameters.NAMES), _FREE_RING_MM)
-    )
-    weight = np.divide(1, wide**2, out=np.zeros(normal_equations.COMMON), where=wide > 0)
+    wide = np.append(sigmas, np.full(set_state.COMMON - len(bench_parameters.NAMES), _FREE_RING_MM))
+    weight = np.divide(1, wide**2, out=np.zeros(set_state.COMMON), where=wide > 0)
     rows = np.hstack([np.diag(np.sqrt(weight)), -(np.sqrt(weight) * common)[:, None]])
     return np.asarray(rows.T @ rows)
 
@@ -136,7 +128,7 @@ class SolverStep:
 def step(sums: FloatArray, sigmas: FloatArray) -> SolverStep:
     """Solve for the free unknowns. `sums` (COMMON + 1, squared) hold the sets and the prior."""
     free = np.flatnonzero(
-        np.append(sigmas > 0, np.ones(normal_equations.COMMON - len(bench_parameters.NAMES), bool))
+        np.append(sigmas > 0, np.ones(set_state.COMMON - len(bench_parameters.NAMES), bool))
     )
     matrix, right = sums[np.ix_(free, free)], sums[free, -1]
     scale = 1 / np.sqrt(
@@ -144,8 +136,8 @@ def step(sums: FloatArray, sigmas: FloatArray) -> SolverStep:
     )  # parameters have units of their own: the scaled matrix loses fewer digits
     inverse = np.linalg.inv(matrix * np.outer(scale, scale)) * np.outer(scale, scale)
     delta, covariance = (
-        np.zeros(normal_equations.COMMON),
-        np.zeros((normal_equations.COMMON, normal_equations.COMMON)),
+        np.zeros(set_state.COMMON),
+        np.zeros((set_state.COMMON, set_state.COMMON)),
     )
     delta[free] = inverse @ right
     covariance[np.ix_(free, free)] = inverse
@@ -178,21 +170,21 @@ def _solve(
         start = _solve(some, progress, None)
         if not start.converged:
             return start  # means about a diverged bench would be meaningless
-        clean = normal_equations.without_waves(start.bench, problem.sets, start.states)
+        clean = fringe_waves.without_waves(start.bench, problem.sets, start.states)
         pairs = zip(clean, start.states, strict=True)
         problem = replace(
             problem,
-            sets=tuple(normal_equations.averaged(start.bench, *pair, _FEW) for pair in pairs),
+            sets=tuple(point_averages.averaged(start.bench, *pair, _FEW) for pair in pairs),
         )
     states = start.states if start is not None else first_states(problem)
     # the parameters as stated, and the ring as the first surfaces have it
-    ring = np.mean([normal_equations.rim_of(states[k]) for k in problem.films], axis=0)
+    ring = np.mean([set_state.rim_of(states[k]) for k in problem.films], axis=0)
     common = (
         start.common
         if start is not None
         else np.append(np.zeros(len(bench_parameters.NAMES)), ring)
     )
-    trust = tuple(normal_equations.Trust.full(phases) for phases in problem.sets)
+    trust = tuple(robust_weights.Trust.full(phases) for phases in problem.sets)
     free = problem.sigmas > 0
     changes: list[float] = []
     # the step before was the first with new weights; they stay; a solution was near
@@ -224,7 +216,7 @@ def _solve(
             # not before: far from the solution a wrong bench looks like a film, and both would be
             # believed in turn
             trust, final, settled = (
-                normal_equations.less_trust(problem.sets, left, trust),
+                robust_weights.less_trust(problem.sets, left, trust),
                 True,
                 False,
             )
@@ -258,20 +250,20 @@ def _solve(
         weighed = not final and (changes[-1] < _NEARLY or (far > _FURTHEST and not near))
         if weighed:
             trust = tuple(
-                normal_equations.Trust.seen(*pair) for pair in zip(problem.sets, left, strict=True)
+                robust_weights.Trust.seen(*pair) for pair in zip(problem.sets, left, strict=True)
             )
 
 
 def _linearise(
     problem: Problem,
-    states: Sequence[normal_equations.SetState],
+    states: Sequence[set_state.SetState],
     common: FloatArray,
-    trust: Sequence[normal_equations.Trust],
+    trust: Sequence[robust_weights.Trust],
 ) -> tuple[normal_equations.Equations, ...]:
     values = common[: len(bench_parameters.NAMES)]
     bench, turns = (
-        bench_parameters.bench_at(problem.stated, values),
-        bench_parameters.pose_derivatives(problem.stated, values),
+        bench_poses.bench_at(problem.stated, values),
+        bench_poses.pose_derivatives(problem.stated, values),
     )
     return tuple(
         normal_equations.equations(
@@ -282,14 +274,14 @@ def _linearise(
 
 
 def _moved(
-    state: normal_equations.SetState, linear: normal_equations.Equations, common_step: FloatArray
-) -> normal_equations.SetState:
+    state: set_state.SetState, linear: normal_equations.Equations, common_step: FloatArray
+) -> set_state.SetState:
     own = linear.local_step(common_step)
     surface = Surface.from_parameters(
         state.surface.parameters + own[:PARAMETERS], state.surface.radius_mm
     )
     beyond_mm = (
-        np.array(state.surface.beyond_mm or [0.0] * len(film_law.BEYOND))
+        np.array(state.surface.beyond_mm or [0.0] * len(terms_beyond_fit.BEYOND))
         + own[forward_model.BEYOND]
     )
     surface = replace(surface, beyond_mm=tuple(beyond_mm.tolist()))
@@ -299,32 +291,32 @@ def _moved(
     )
     steps = linear.moved(own, common_step)
     elsewhere = tuple(move + step for move, step in zip(state.elsewhere, steps, strict=True))
-    return normal_equations.SetState(surface, float(vertex_z_mm), float(motion_mm), elsewhere)
+    return set_state.SetState(surface, float(vertex_z_mm), float(motion_mm), elsewhere)
 
 
-def first_states(problem: Problem) -> tuple[normal_equations.SetState, ...]:
+def first_states(problem: Problem) -> tuple[set_state.SetState, ...]:
     """The sets' surfaces with the stated geometry. Raises ValueError if there is none."""
     return tuple(_first(problem, phases) for phases in problem.sets)
 
 
-def _first(problem: Problem, phases: forward_model.SetPhases) -> normal_equations.SetState:
+def _first(problem: Problem, phases: set_phases.SetPhases) -> set_state.SetState:
     moved_um, artefact = phases.displacement_um - problem.references.reference_um, phases.artefact
     vertex_z_mm = -moved_um * 1e-3 if np.isfinite(moved_um) else 0.0
     radius_mm = problem.radius_mm
     elsewhere = tuple(each.known(problem.references.laser_sigma_um)[0] for each in phases.elsewhere)
     if isinstance(artefact, SeenScreen):
-        return normal_equations.SetState(
+        return set_state.SetState(
             Surface.from_parameters(np.zeros(PARAMETERS), radius_mm), 0.0, elsewhere=elsewhere
         )
     if artefact is not None:
         vertex_z_mm, radius_mm = artefact.vertex_mm, artefact.radius_mm
-    fit = fit_on(bench_parameters.BenchGeometry(problem.stated), phases, radius_mm, vertex_z_mm)
-    return normal_equations.SetState(fit.surface, vertex_z_mm, elsewhere=elsewhere)
+    fit = fit_on(bench_poses.BenchGeometry(problem.stated), phases, radius_mm, vertex_z_mm)
+    return set_state.SetState(fit.surface, vertex_z_mm, elsewhere=elsewhere)
 
 
 def fit_on(
-    bench: bench_parameters.BenchGeometry,
-    phases: forward_model.SetPhases,
+    bench: bench_poses.BenchGeometry,
+    phases: set_phases.SetPhases,
     radius_mm: float,
     vertex_z_mm: float,
 ) -> surface_fit.Fit:
@@ -332,143 +324,8 @@ def fit_on(
     none.
     """
     phases = phases.subset(phases.seen_with(0))
-    tracer = surface_fit.Tracer(bench.geometry, radius_mm, vertex_z_mm)
-    points = surface_fit.Points.of(
+    tracer = ray_tracing.Tracer(bench.geometry, radius_mm, vertex_z_mm)
+    points = ray_tracing.Points.of(
         forward_model.camera_rays(bench.geometry, phases), phases.screen_mm * bench.pitch
     )
-    return surface_fit.solve(tracer, points, surface_fit.parabola(_START_SAG_MM, radius_mm))
-
-
-_LENS = ("focal_relative", "principal_x_px", "principal_y_px", "k1", "k2", "p1", "p2")
-
-
-@dataclass(frozen=True)
-class Origin:
-    """Origin of a geometry, as `[calibration]` states it."""
-
-    date_utc: str
-    sets: tuple[str, ...]
-    screen_residual_um: (
-        float  # median over the sets of the RMS of seen minus predicted screen points
-    )
-    # Median over the sets of the RMS that `measure` states with this geometry: the reference for a
-    # drift
-    slope_residual_urad: float
-    slope_noise_urad: float  # share of the camera's noise in it
-    condition: float  # see `propagate.condition_number`
-    notes: tuple[str, ...] = ()  # findings of the calibration
-
-
-def tables_of(solution: Solution, optics: OpticsConfig, origin: Origin) -> dict[str, Any]:
-    """The content of `geometry.toml`; `optics` is the stated bench."""
-    free = [bench_parameters.NAMES.index(name) for name in solution.free]
-    tables: dict[str, Any] = {
-        **file_origin(SCHEMA),
-        "geometry": geometry_of(solution, optics).model_dump(exclude_none=True),
-        "covariance": {
-            "names": [*GENERAL_NAMES, *_optional(solution)],
-            "matrix": general_covariance(solution).tolist(),
-        },
-        "parameters": {
-            "names": [bench_parameters.NAMES[k] for k in free],
-            "values": solution.values[free].tolist(),
-            "sigmas": solution.sigmas[free].tolist(),
-            "covariance": solution.covariance[np.ix_(free, free)].tolist(),
-        },
-    }
-    bench = solution.bench
-    if set(solution.free) & set(_LENS):
-        of_camera = {
-            key: getattr(optics.camera, key) for key in ("width_px", "height_px", "pixel_um")
-        }
-        tables["camera"] = of_camera | {
-            "focal_mm": bench.geometry.focal_px * optics.camera.pixel_um * 1e-3,
-            "principal_px": list(bench.geometry.principal_px),
-            "distortion": list(bench.geometry.distortion),
-        }
-    if "pitch_relative" in solution.free:
-        tables["pattern"] = {"period_mm": optics.pattern.period_mm * bench.pitch}
-    tables["calibration"] = {
-        "date_utc": origin.date_utc,
-        "sets": list(origin.sets),
-        "screen_residual_um": origin.screen_residual_um,
-        "slope_residual_urad": origin.slope_residual_urad,
-        "slope_noise_urad": origin.slope_noise_urad,
-        "ring_um": (1e3 * solution.common[len(bench_parameters.NAMES) + 1 :]).tolist(),
-        "condition": origin.condition,
-        "notes": list(origin.notes),
-        "hash": content_hash(tables),
-    }
-    return tables
-
-
-def geometry_of(solution: Solution, optics: OpticsConfig) -> GeometryConfig:
-    """The calibrated geometry in the general form; the screen's
-    height map is the stated bench's.
-    """
-    reference = {"reference_displacement_um": solution.problem.references.reference_um}
-    return general_form(solution.bench.geometry, optics).model_copy(update=reference)
-
-
-def general_form(geometry: Geometry, optics: OpticsConfig) -> GeometryConfig:
-    """A geometry as two poses; the height map and the reference displacement are the stated
-    bench's.
-    """
-    stated = optics.geometry.screen
-    right, down, forward = (_vector(row) for row in geometry.rotation)
-    return GeometryConfig(
-        reference_displacement_um=optics.geometry.reference_displacement_um,
-        camera=CameraPoseConfig(
-            position_mm=_vector(geometry.pinhole_mm), rotation=(right, down, forward)
-        ),
-        screen=ScreenPoseConfig(
-            origin_mm=_vector(geometry.screen_origin_mm),
-            s_x=_vector(geometry.screen_s_x),
-            s_y=_vector(geometry.screen_s_y),
-            bow_mm=geometry.face.bow_per_mm * BOW_RADIUS_MM**2,
-            height_map=None if stated is None else stated.height_map,
-        ),
-    )
-
-
-def general_covariance(solution: Solution) -> FloatArray:
-    """Covariance (12 + k, 12 + k) of `GENERAL_NAMES` and of the k free parameters of lens, bow and
-    pitch.
-
-    Rows r of a body turned by a small w become r + w x r, so that C^T dC is minus the cross-product
-    matrix of w.
-    """
-    geometry = solution.bench.geometry
-    columns = []
-    for turn in bench_parameters.pose_derivatives(solution.problem.stated, solution.values):
-        turns = (
-            _turn_vector(geometry.rotation.T @ turn.camera),
-            _turn_vector(geometry.screen_axes.T @ turn.screen),
-        )
-        columns.append(np.concatenate([turn.pinhole_mm, turns[0], turn.origin_mm, turns[1]]))
-    poses = np.stack(columns, axis=1)
-    optional = [bench_parameters.NAMES.index(name) for name in _optional(solution)]
-    used = [*range(len(bench_parameters.POSE)), *optional]
-    matrix = np.eye(
-        len(poses) + len(optional), len(used), k=len(bench_parameters.POSE) - len(poses)
-    )
-    matrix[: len(poses), : len(bench_parameters.POSE)] = poses
-    covariance = matrix @ solution.covariance[np.ix_(used, used)] @ matrix.T
-    return np.asarray((covariance + covariance.T) / 2)
-
-
-def _optional(solution: Solution) -> list[str]:
-    return [
-        parameter.name for parameter in bench_parameters.OPTIONAL if parameter.name in solution.free
-    ]
-
-
-def _turn_vector(cross: FloatArray) -> FloatArray:
-    return (
-        -np.array([cross[2, 1] - cross[1, 2], cross[0, 2] - cross[2, 0], cross[1, 0] - cross[0, 1]])
-        / 2
-    )
-
-
-def _vector(values: FloatArray) -> Vector3:
-    return float(values[0]), float(values[1]), float(values[2])
+    return surface_fit.solve(tracer, points, ray_tracing.parabola(_START_SAG_MM, radius_mm))

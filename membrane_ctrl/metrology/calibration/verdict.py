@@ -1,22 +1,16 @@
-"""May a solution be used, and for how long? The objections, one line each, the cause before its
+"""Whether a solution may be used: the objections, one line each, the cause before its
 consequences.
 """
 
-from collections import deque
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy.stats import chi2
 
-from membrane_ctrl.metrology.calibration import model_tests, normal_equations
-from membrane_ctrl.metrology.calibration.normal_equations import rim_harmonics
+from membrane_ctrl.metrology.calibration import model_tests, set_state
 from membrane_ctrl.metrology.calibration.solver import Problem, Solution, first_states, solve
-from membrane_ctrl.metrology.film import film_law
-from membrane_ctrl.metrology.rays import bench_parameters
-from membrane_ctrl.metrology.rays.geometry import Geometry
-from membrane_ctrl.metrology.rays.surface import Surface
-from membrane_ctrl.metrology.reconstruction.bin_grid import slope_per_screen
-from membrane_ctrl.model.arrays import FloatArray
+from membrane_ctrl.metrology.film import terms_beyond_fit
+from membrane_ctrl.metrology.rays import bench_parameters, bench_poses
 
 # Sets closer together than this add nothing to one set: the sag's sigma is then twice that of sets
 # 8 mm apart
@@ -99,7 +93,7 @@ def _elsewhere(solution: Solution) -> list[tuple[float, CalibrationFinding]]:
     names = [phases.name for phases in solution.problem.sets]
     return [
         (
-            fall - 2 * bench_parameters.SCREEN_MOVE,
+            fall - 2 * bench_poses.SCREEN_MOVE,
             CalibrationFinding(True, says.format(names[k]), (k,)),
         )
         for k, fall in model_tests.elsewhere(solution)
@@ -139,7 +133,7 @@ def _film(solution: Solution) -> list[tuple[float, CalibrationFinding]]:
         other = solve(free, start=solution if solution.converged else None)
     except ValueError:
         return []
-    freedom = len(film_law.BEYOND) * len(problem.sets)
+    freedom = len(terms_beyond_fit.BEYOND) * len(problem.sets)
     fall = model_tests.film_rise(other, film_kind)
     if not other.converged or chi2.sf(fall, freedom) > model_tests.SURE:
         return []
@@ -261,7 +255,7 @@ def _why(solution: Solution, index: int) -> str:
     rest, phases = model_tests.without(solution, index), solution.problem.sets[index]
     if phases.artefact is not None:
         return phases.artefact.doubt
-    rim_mm = normal_equations.rim_of(replace(solution.states[index], vertex_z_mm=0.0))[0]
+    rim_mm = set_state.rim_of(replace(solution.states[index], vertex_z_mm=0.0))[0]
     vertex_um = 1e3 * (rest.common[len(bench_parameters.NAMES)] - rim_mm)
     moved_um = phases.displacement_um - solution.problem.references.reference_um
     miss_um = moved_um + vertex_um / (
@@ -326,88 +320,3 @@ def _spread(solution: Solution) -> tuple[CalibrationFinding, ...]:
         "determine the sag better"
     )
     return (CalibrationFinding(False, says),)
-
-
-# When to calibrate again: the fit's residual now, against that of the calibration. A wrong geometry
-# bends the fringes as no surface can (a camera that rolls), or as one can (a camera that turns):
-# the ring, which cannot have tilted, shows the latter. Only what noise leaves is compared: live
-# cycles have other bins and light. One bad cycle is no drift (a door, a hand before the screen);
-# the median of many
-# is.
-
-CYCLES = 60  # two minutes of cycles
-GROWN = 1.25  # times the expected residual: 0.75 of it more, added in squares
-FINE = 1.1  # times the expected residual: a warning ends here
-# The required accuracy. A camera turned by 0.02 degrees moves the ring by 5.6 µm and bends the
-# figure by 4
-RING_MOVED_UM = 5.0
-RING_BACK_UM = 3.0
-
-
-def noise_urad(geometry: Geometry, surface: Surface, screen_sigma_mm: float) -> float:
-    """RMS of the slopes of points whose screen coordinates have this noise."""
-    gain = slope_per_screen(geometry, surface.radius_mm, surface.sag_mm)
-    return 1e6 * screen_sigma_mm * float(np.sqrt(gain.sum() / 2))
-
-
-@dataclass
-class DriftMonitor:
-    """Monitors the live residual; `[calibration]` of the geometry has both arguments, as
-    `slope_...`.
-    """
-
-    calibrated_urad: float
-    calibrated_noise_urad: float
-    says: str = ""  # why it is time to calibrate again; empty while it is not
-    _seen: deque[tuple[float, float]] = field(default_factory=lambda: deque(maxlen=CYCLES))
-
-    def add(self, residual_urad: float, live_noise_urad: float) -> None:
-        """Take one cycle's residual and the camera's share of it; cycles without a figure (NaN) do
-        not count.
-        """
-        if np.isfinite(residual_urad) and np.isfinite(live_noise_urad):
-            self._seen.append((residual_urad, live_noise_urad))
-        if len(self._seen) < CYCLES:
-            return
-        now_urad, live_urad = (float(v) for v in np.median(np.array(self._seen), axis=0))
-        model_urad = np.sqrt(max(0.0, self.calibrated_urad**2 - self.calibrated_noise_urad**2))
-        ratio = now_urad / float(np.hypot(model_urad, live_urad))
-        if ratio < FINE:
-            self.says = ""
-        elif ratio > GROWN and not self.says:
-            self.says = (
-                f"calibrate again: the fit leaves {now_urad:.2f} µrad of slope, "
-                f"the calibrated geometry predicts {now_urad / ratio:.2f}"
-            )
-
-
-def ring_um(surface: Surface) -> FloatArray:
-    """Harmonics (14,) of the rim's height without its mean: cosines 1 to 7, then sines."""
-    return np.asarray(1e3 * (rim_harmonics() @ surface.parameters)[1:])
-
-
-@dataclass
-class RingMonitor:
-    """Monitors the ring's position in the live cycles against `ring_um` (14,) of the geometry's
-    `[calibration]`.
-    """
-
-    calibrated_um: FloatArray
-    says: str = ""  # as for `DriftMonitor`
-    _seen: deque[FloatArray] = field(default_factory=lambda: deque(maxlen=CYCLES))
-
-    def add(self, surface: Surface) -> None:
-        """Take one cycle's surface."""
-        self._seen.append(ring_um(surface))
-        if len(self._seen) < CYCLES:
-            return
-        change = np.median(np.array(self._seen), axis=0) - self.calibrated_um
-        moved_um = float(np.sqrt(np.sum(change**2) / 2))  # RMS around the rim
-        if moved_um < RING_BACK_UM:
-            self.says = ""
-        elif moved_um > RING_MOVED_UM and not self.says:
-            self.says = (
-                f"calibrate again: the ring is seen {moved_um:.1f} µm RMS from where it was "
-                "when the geometry was "
-                "calibrated; camera or screen has moved"
-            )

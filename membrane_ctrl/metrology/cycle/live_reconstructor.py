@@ -14,12 +14,25 @@ from dataclasses import replace
 import numpy as np
 
 from membrane_ctrl.config.schema import OpticsConfig
-from membrane_ctrl.metrology.film import film_law
+from membrane_ctrl.metrology.film import hencky_bowl
 from membrane_ctrl.metrology.frame_checks import backlight_bands
-from membrane_ctrl.metrology.phase import bin_phasors, phase_steps
+from membrane_ctrl.metrology.phase import (
+    bin_sums,
+    full_decoder,
+    pattern_sequence,
+    phase_change,
+    phase_steps,
+    screen_scale,
+)
 from membrane_ctrl.metrology.phase.frame_stack import Binned, FrameStack
-from membrane_ctrl.metrology.rays import geometry, surface
-from membrane_ctrl.metrology.reconstruction import bin_grid, film_motion, surface_fit
+from membrane_ctrl.metrology.rays import geometry, ray_tracing, surface
+from membrane_ctrl.metrology.reconstruction import (
+    bin_grid,
+    film_motion,
+    slope_noise,
+    surface_fit,
+    tracked_points,
+)
 from membrane_ctrl.metrology.uncertainty import cycle_errors, geometry_spread
 from membrane_ctrl.model.arrays import AnyArray, ArrayLike, BoolArray, FloatArray, Image
 from membrane_ctrl.model.shape_estimate import Kind, Quality, ShapeEstimate, judge
@@ -86,23 +99,23 @@ class LiveReconstructor:
         )
         self._shifts_rad = np.broadcast_to(given, (2, optics.pattern.steps))
         self._weights = [phase_steps.step_weights(shifts) for shifts in self._shifts_rad]
-        self._slots = phase_steps.FullSlots(optics.pattern.steps)
+        self._slots = pattern_sequence.FullSlots(optics.pattern.steps)
         told = zip(
-            phase_steps.fringe_sequence(optics.pattern), self._shifts_rad.ravel(), strict=True
+            pattern_sequence.fringe_sequence(optics.pattern), self._shifts_rad.ravel(), strict=True
         )
         self._patterns = tuple(replace(pattern, shift_rad=float(shift)) for pattern, shift in told)
         self._bands_rad, self._doubt = np.zeros(0), ""
         self._full_scale_adu = 2**optics.camera.bits - 1
         size = (optics.camera.height_px, optics.camera.width_px)
-        self._binner = bin_phasors.Binner(*size, bin_px, self._full_scale_adu, self._slots.count)
+        self._binner = bin_sums.Binner(*size, bin_px, self._full_scale_adu, self._slots.count)
         self._grid = bin_grid.BinGrid(self._geometry, optics.camera, bin_px)
         self._near = np.flatnonzero(
             self._grid.near_mirror(optics.mirror.analysis_radius_mm + _FILM_BESIDE_PLANE_MM)
         )
         self._reference_um = optics.geometry.reference_displacement_um
-        self._mm_per_rad = phase_steps.mm_per_rad(optics.pattern)
-        self._pixel_sigma_adu = bin_grid.pixel_sigma_adu(optics.camera.noise_adu)
-        self._tracked: film_motion.TrackedPoints | None = None
+        self._mm_per_rad = screen_scale.mm_per_rad(optics.pattern)
+        self._pixel_sigma_adu = slope_noise.pixel_sigma_adu(optics.camera.noise_adu)
+        self._tracked: tracked_points.TrackedPoints | None = None
         bench = (optics, self._grid, self._binner.saturated.shape, bin_px)
         self._watch = cycle_errors.ErrorWatch(*bench, self._shifts_rad, laser_noise_um, spread)
 
@@ -132,13 +145,13 @@ class LiveReconstructor:
         self._take_bands(np.zeros(0))
         optics = self._optics
         images = self._binner.sums.reshape(self._slots.count, -1)[:, self._near] / self._bin_px**2
-        phase_rad = phase_steps.decode_full(images, optics.pattern, self._shifts_rad)
+        phase_rad = full_decoder.decode_full(images, optics.pattern, self._shifts_rad)
         phase_rad[:, self._binner.saturated.ravel()[self._near] > 0] = np.nan
         times, readings = times[sinusoids], readings[sinusoids]
         self._tracked = None  # until this cycle is accepted
         tracer, analysis_mm = self._tracer(readings), optics.mirror.analysis_radius_mm
         try:
-            state = film_motion.establish(
+            state = tracked_points.establish(
                 self._grid, tracer, self._near, phase_rad, optics.pattern, analysis_mm
             )
         except ValueError as error:
@@ -196,17 +209,21 @@ class LiveReconstructor:
 
     def sag_sensitivity(self) -> FloatArray:
         """Change of the coefficients (terms,) in µm per µm of sag of a Hencky bowl."""
-        return film_law.zernike_projection().copy()
+        return hencky_bowl.zernike_projection().copy()
 
-    def _tracer(self, readings_um: FloatArray) -> surface_fit.Tracer:
+    def _tracer(self, readings_um: FloatArray) -> ray_tracing.Tracer:
         """The bench with the vertex where the laser saw it, on average over the frames."""
         mean = _finite_mean(readings_um)
         known = self._reference_um is not None and math.isfinite(mean)
         z = -(mean - self._reference_um) * 1e-3 if known and self._reference_um is not None else 0.0
-        return surface_fit.Tracer(self._geometry, self._optics.mirror.radius_mm, z)
+        return ray_tracing.Tracer(self._geometry, self._optics.mirror.radius_mm, z)
 
     def _follow(
-        self, kind: Kind, state: film_motion.TrackedPoints, times: FloatArray, readings: FloatArray
+        self,
+        kind: Kind,
+        state: tracked_points.TrackedPoints,
+        times: FloatArray,
+        readings: FloatArray,
     ) -> ShapeEstimate:
         """Phases of the points against the last accepted ones, and the figure from them."""
         self._track_phases(state, readings)
@@ -214,7 +231,7 @@ class LiveReconstructor:
         modulation_adu = float(np.median(state.fresh[:, 4, ::16]))
         saturated = self._binner.saturated.ravel()[state.index] > 0
         usable = ~saturated & (
-            state.fresh[:, 4].min(axis=0) > phase_steps.FRINGE_SHARE * modulation_adu
+            state.fresh[:, 4].min(axis=0) > full_decoder.FRINGE_SHARE * modulation_adu
         )
         if reason := _lost(state.fresh[:, 3], usable):
             return rejected(kind, times, readings, reason, tracking_lost=True)
@@ -273,7 +290,7 @@ class LiveReconstructor:
             for slots in self._slots.sinusoids
         ]
 
-    def _track_phases(self, state: film_motion.TrackedPoints, readings: FloatArray) -> None:
+    def _track_phases(self, state: tracked_points.TrackedPoints, readings: FloatArray) -> None:
         """Fresh phases from the bin sums, corrected for the film's motion between the frames."""
         moved = film_motion.worth_correcting(readings, self._laser_noise_um)
         motion_um = np.reshape(readings - np.mean(readings), (2, -1)) if moved else None
@@ -285,7 +302,7 @@ class LiveReconstructor:
                     self._weights[axis], self._shifts_rad[axis], self._bin_px, part
                 )
             )
-        bin_phasors.track(
+        phase_change.track(
             self._sums(),
             state.index,
             combined,
@@ -295,7 +312,7 @@ class LiveReconstructor:
         )
 
     def _fit(
-        self, state: film_motion.TrackedPoints, usable: BoolArray, readings: FloatArray
+        self, state: tracked_points.TrackedPoints, usable: BoolArray, readings: FloatArray
     ) -> surface_fit.Fit:
         """One or two steps from the last surface; the full cycle's normal matrix while its points
         are there.
@@ -326,9 +343,11 @@ class LiveReconstructor:
         # slopes that changed by more than noise: one error for each point that was asked
         changed_rad2 = np.maximum(errors.changed_rad2 - _SURELY * 2 * noise_rad2, 0.0)
         changed_rad2 *= fit.weight_sum / max(errors.asked, 1)
-        gain = bin_grid.slope_per_screen(self._geometry, fit.surface.radius_mm, fit.surface.sag_mm)
+        gain = slope_noise.slope_per_screen(
+            self._geometry, fit.surface.radius_mm, fit.surface.sag_mm
+        )
         slope_variance = gain @ (self._mm_per_rad**2 * (noise_rad2 + changed_rad2))
-        covariance = bin_grid.parameter_covariance(fit.normal, slope_variance) + errors.own_mm2
+        covariance = slope_noise.parameter_covariance(fit.normal, slope_variance) + errors.own_mm2
         to_coeffs = surface.parameter_to_coeffs()
         gradient = surface.sag_gradient()
         verdict, reason = judge(quality)

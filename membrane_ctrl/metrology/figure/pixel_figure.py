@@ -10,11 +10,19 @@ import numpy as np
 from membrane_ctrl.config.schema import OpticsConfig
 from membrane_ctrl.metrology.figure.quantities import SurfaceMap
 from membrane_ctrl.metrology.frame_checks.checked_set import Checked
-from membrane_ctrl.metrology.phase import bin_phasors, phase_steps
-from membrane_ctrl.metrology.phase.frame_stack import PixelPhases, pixel_phases
+from membrane_ctrl.metrology.phase import (
+    full_decoder,
+    pattern_sequence,
+    phase_change,
+    phase_steps,
+    screen_scale,
+)
+from membrane_ctrl.metrology.phase.pixel_phases import PixelPhases, pixel_phases
+from membrane_ctrl.metrology.rays import ray_tracing
 from membrane_ctrl.metrology.rays.geometry import Geometry
 from membrane_ctrl.metrology.rays.surface import Surface
-from membrane_ctrl.metrology.reconstruction import bin_grid, film_motion, surface_fit, zonal_map
+from membrane_ctrl.metrology.reconstruction import film_motion, slope_noise, surface_fit, zonal_map
+from membrane_ctrl.metrology.reconstruction.normal_matrix import NormalMatrix
 from membrane_ctrl.model.arrays import FloatArray, IntArray, Singles
 from membrane_ctrl.model.shape_estimate import Quality
 
@@ -66,11 +74,11 @@ class FullResult:
         """
         swing = self.quality.modulation_share * (2**optics.camera.bits - 1)
         sigma_mm = [
-            phase_steps.mm_per_rad(optics.pattern)
+            screen_scale.mm_per_rad(optics.pattern)
             * phase_steps.phase_sigma_rad(d, noise_adu, swing)
             for d in shifts_rad
         ]
-        gain = bin_grid.slope_per_screen(
+        gain = slope_noise.slope_per_screen(
             Geometry.from_config(optics), self.surface.radius_mm, self.surface.sag_mm
         )
         return np.asarray(gain @ np.square(sigma_mm))
@@ -161,7 +169,7 @@ class PixelPoints:
     """Pixels that see the pattern, with their screen points."""
 
     index: IntArray
-    points: surface_fit.Points
+    points: ray_tracing.Points
     swing_adu: Singles
     rest_adu: Singles
     moved: bool
@@ -178,7 +186,7 @@ def measure_pixels(optics: OpticsConfig, checked: Checked) -> PixelPoints:
     index = row * stack.size_px[1] + column
     in_bin = row // bin_px * columns + column // bin_px
     tracer, surface = checked.tracer, checked.state.surface
-    points = surface_fit.Points.of(_rays(tracer.geometry, column, row), np.empty((2, index.size)))
+    points = ray_tracing.Points.of(_rays(tracer.geometry, column, row), np.empty((2, index.size)))
     del row, column
     points.t_mm[:] = (tracer.vertex_z_mm - tracer.geometry.pinhole_mm[2]) / points.rays[2]
     tracer.intersect(points, surface, newton=4)
@@ -187,13 +195,13 @@ def measure_pixels(optics: OpticsConfig, checked: Checked) -> PixelPoints:
     if moved:
         sensitivity = film_motion.sensitivity_mm_per_um(
             tracer, points, surface
-        ) / phase_steps.mm_per_rad(optics.pattern)
+        ) / screen_scale.mm_per_rad(optics.pattern)
     told_um = film.told_um if moved else (None, None)
     axes = [
         _axis_phases(optics, checked, k, index, in_bin, sensitivity[k], told_um[k])
         for k in range(2)
     ]
-    points.screen_mm[:] = phase_steps.screen_mm(
+    points.screen_mm[:] = screen_scale.screen_mm(
         np.stack([a.phase_rad for a in axes]), optics.pattern
     )
     swing = np.minimum(axes[0].swing_adu, axes[1].swing_adu)
@@ -201,7 +209,7 @@ def measure_pixels(optics: OpticsConfig, checked: Checked) -> PixelPoints:
     keep = (x**2 + y**2 <= optics.mirror.analysis_radius_mm**2) & ~(
         axes[0].saturated | axes[1].saturated
     )
-    keep &= swing > phase_steps.FRINGE_SHARE * checked.view.light.reshape(-1)[in_bin]
+    keep &= swing > full_decoder.FRINGE_SHARE * checked.view.light.reshape(-1)[in_bin]
     rest = np.hypot(axes[0].rest_adu, axes[1].rest_adu)[keep]
     index, swing = index[keep], swing[keep]
     del (
@@ -234,7 +242,7 @@ def _axis_phases(
 ) -> PixelPhases:
     stack, used = checked.stack, checked.view.used[axis]
     combined = _combination(checked, axis, told_um)
-    every = stack.sinusoids(phase_steps.AXES[axis])
+    every = stack.sinusoids(pattern_sequence.AXES[axis])
     # a slice does not copy the frames; a list does
     frames = stack.frames[every[0] : every[-1] + 1] if used == every else stack.frames[used]
     reference = checked.phase_rad[axis].reshape(-1)[in_bin]
@@ -255,7 +263,7 @@ def reconstruct_full(
     optics: OpticsConfig,
     checked: Checked,
     pixels: PixelPoints,
-    start: surface_fit.HeightFunction | None = None,
+    start: ray_tracing.HeightFunction | None = None,
 ) -> FullResult:
     """Fit the pixels and integrate the residual.
 
@@ -265,12 +273,16 @@ def reconstruct_full(
     # the bins solve from the start; the pixels continue where that has nearly converged
     rough_points = checked.state.points.subset(np.ones(checked.state.index.size, bool))
     tolerance = _LAST_CHANGE_MM * surface_fit.CONTRACTION
-    begin = start or surface_fit.parabola(_START_SAG_MM, tracer.radius_mm)
+    begin = start or ray_tracing.parabola(_START_SAG_MM, tracer.radius_mm)
     rough = surface_fit.solve(tracer, rough_points, begin, tolerance_mm=tolerance)
     tracer.intersect(points, rough.surface, newton=2)
     points.weights[:] = tukey(_slopes_left(tracer, points, rough.surface)[1])
     fit = surface_fit.solve(
-        tracer, points, rough.surface, normal=tracer.normal_matrix(points), tolerance_mm=tolerance
+        tracer,
+        points,
+        rough.surface,
+        normal=NormalMatrix.from_points(tracer, points),
+        tolerance_mm=tolerance,
     )
     tracer.intersect(points, fit.surface)
     field, left = _slopes_left(tracer, points, fit.surface)
@@ -291,7 +303,7 @@ def reconstruct_full(
 
 
 def _slopes_left(
-    tracer: surface_fit.Tracer, points: surface_fit.Points, surface: Surface
+    tracer: ray_tracing.Tracer, points: ray_tracing.Points, surface: Surface
 ) -> tuple[FloatArray, FloatArray]:
     """Slopes (6, n) of `Tracer.slope_field`, and how far (n,) the measured ones are from the
     surface's.
@@ -335,7 +347,7 @@ class BinFigure:
     """Surface through the bins of one set."""
 
     fit: surface_fit.Fit  # Hencky excess and Zernike terms
-    points: surface_fit.Points  # the bins' rays and screen points, standing on the surface
+    points: ray_tracing.Points  # the bins' rays and screen points, standing on the surface
     index: IntArray  # (n,): their bins
     sigma_mm: FloatArray  # (2, n): 1 sigma of the screen points from the noise of the pixels
     quality: Quality  # for the verdict
@@ -350,16 +362,16 @@ def bin_figure(optics: OpticsConfig, checked: Checked, film: FilmMotion | None =
     followed = np.empty_like(state.accepted)
     # the loop takes any numbers: here means over the bins, hence a bin side of 1 in the
     # combinations
-    bin_phasors.track(
+    phase_change.track(
         sums, state.index, steps, state.sensitivity_rad_per_um, state.accepted, followed
     )
-    scale = phase_steps.mm_per_rad(optics.pattern)
+    scale = screen_scale.mm_per_rad(optics.pattern)
     points = state.points.subset(np.ones(state.index.size, bool))
     points.screen_mm[:] = followed[:, 0] * scale - state.offset_mm
     fit = surface_fit.solve(checked.tracer, points, state.surface)
     checked.tracer.intersect(points, fit.surface)
     swing = followed[:, 4]
-    noise = bin_grid.pixel_sigma_adu(optics.camera.noise_adu) / checked.binned.bin_px
+    noise = slope_noise.pixel_sigma_adu(optics.camera.noise_adu) / checked.binned.bin_px
     shifts = [stack.shifts_rad(used) for used in checked.view.used]
     sigma = np.stack(
         [phase_steps.phase_sigma_rad(d, noise, 1.0) / b for d, b in zip(shifts, swing, strict=True)]
@@ -370,7 +382,7 @@ def bin_figure(optics: OpticsConfig, checked: Checked, film: FilmMotion | None =
 
 def _combination(
     checked: Checked, axis: int, motion_um: FloatArray | None
-) -> bin_phasors.StepCombination:
+) -> phase_change.StepCombination:
     """How the means of the usable frames of an axis combine, whose film moved so."""
     used = checked.view.used[axis]
     shifts = checked.stack.shifts_rad(used)

@@ -14,7 +14,8 @@ from dataclasses import astuple, dataclass, fields
 
 import numpy as np
 
-from membrane_ctrl.metrology.numerics import zernike
+from membrane_ctrl.metrology.figure import best_sphere
+from membrane_ctrl.metrology.numerics import grid_fit, zernike
 from membrane_ctrl.metrology.rays import surface
 from membrane_ctrl.metrology.reconstruction import zonal_map
 from membrane_ctrl.model.arrays import FloatArray
@@ -80,7 +81,7 @@ class Figure:
     """A figure: its numbers, and what they were taken from."""
 
     numbers: Quantities
-    sphere: surface.Sphere
+    sphere: best_sphere.Sphere
     deviation_um: (
         FloatArray  # (n, n): from the best sphere, along its normal; NaN where not measured
     )
@@ -108,8 +109,8 @@ class FigureOf:
         self.aperture_mm = aperture_mm
         self._mask = np.isfinite(seen.height_mm)
         axis = seen.axis_mm / aperture_mm
-        self.fringe = zernike.GridFit(axis, self._mask, _FRINGE)
-        self._pvr = zernike.GridFit(axis, self._mask, _FRINGE[:_PVR_TERMS])
+        self.fringe = grid_fit.GridFit(axis, self._mask, _FRINGE)
+        self._pvr = grid_fit.GridFit(axis, self._mask, _FRINGE[:_PVR_TERMS])
         rows, columns = np.nonzero(self._mask)
         r = np.hypot(seen.axis_mm[rows], seen.axis_mm[columns])
         self._rings = _Rings(r, max(2, min(_RINGS, len(axis) // 4)))
@@ -117,7 +118,7 @@ class FigureOf:
     def __call__(self, seen: SurfaceMap) -> Figure:
         """The figure of a surface."""
         mask, points = self._mask, seen.points()
-        sphere = surface.best_sphere(points)
+        sphere = best_sphere.best_sphere(points)
         deviation, normals = sphere.deviation(points)
         deviation = 1e3 * (deviation - deviation.mean())
         rotational = self._rings.invariant(deviation)
@@ -183,7 +184,7 @@ class _Rings:
 
 
 def _spot(
-    sphere: surface.Sphere, points_mm: FloatArray, normals: FloatArray
+    sphere: best_sphere.Sphere, points_mm: FloatArray, normals: FloatArray
 ) -> tuple[float, FloatArray]:
     """Best focus above the origin in mm, and the distances (n,) of the rays from their middle
     there.

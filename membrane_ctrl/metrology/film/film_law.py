@@ -8,9 +8,10 @@ materials. The ring holds the hoop's strain at the pre-strain e:
 
     n(0) ((1 - nu) F(s) + 2 s F'(s)) = e / q^(2/3)
 
-so that a film is one number s, the slackness: 0 is a drum (N constant, a paraboloid), 12.5 Hencky's
-film without pre-strain (nu = 0.3). It follows from the pressure, or, without stiffness and
-pressure, from the sag. F's nearest singularity, a film without stress at its ring, is at s = 30.6.
+so that a film is one number s, the slackness: 0 is a drum (N constant, a paraboloid), 12.5
+Hencky's film without pre-strain (nu = 0.3). It follows from the pressure, or, without stiffness
+and pressure, from the sag. F's nearest singularity, a film without stress at its ring, is at s =
+30.6.
 
 What varies with azimuth (pre-strain, a ring that is not flat or not round) is a small disturbance
 cos(m theta) of that film. Of all displacements that meet the ring's, the true one has the least
@@ -19,8 +20,8 @@ energy (Ritz, `Bowl.harmonic`).
 All that is Foeppl's: small slopes, pressure along z. It misses 1 % of the slopes at 37 mm of sag,
 which would be taken for a Poisson ratio that is lower by 0.05; `finite_rise_mm` does not.
 
-Sources: H. Hencky, Z. Math. Phys. 63, 311 (1915); J. D. Campbell, Quart. J. Mech. Appl. Math. 9, 84
-(1956).
+Sources: H. Hencky, Z. Math. Phys. 63, 311 (1915); J. D. Campbell, Quart. J. Mech. Appl. Math. 9,
+84 (1956).
 """
 
 from collections.abc import Callable
@@ -29,11 +30,10 @@ from functools import cache
 from typing import Literal
 
 import numpy as np
-from numpy.polynomial import Chebyshev, Legendre, Polynomial, chebyshev, legendre
+from numpy.polynomial import Legendre, legendre
 from numpy.polynomial import polynomial as series
 
 from membrane_ctrl.model.arrays import AnyArray, FloatArray
-from membrane_ctrl.model.zernike_terms import ZERNIKE_DEGREE, ZERNIKE_TERMS
 
 SLACKEST = 21.0  # the series' last term is then below 1e-12; a slacker film wrinkles at its ring
 _USUAL = 3.0  # slackness of a film that is stretched by half a per cent under 600 Pa
@@ -41,7 +41,6 @@ _SERIES_TERMS = 80
 _WAVE_TERMS = 14  # of a disturbance: it converges tenfold a term
 _NODES = 48
 _COMPLEX_STEP = 1e-30  # small enough that its square is nothing beside 1
-
 HarmonicCause = Literal["prestrain", "flat", "round"]
 
 
@@ -250,172 +249,3 @@ def _powers(rho: FloatArray, power: int) -> tuple[FloatArray, FloatArray]:
     x, table = 2 * rho**2 - 1, np.eye(_WAVE_TERMS)
     value, slope = legendre.legval(x, table), legendre.legval(x, legendre.legder(table))
     return value * rho**power, power * rho ** (power - 1) * value + 4 * rho ** (power + 1) * slope
-
-
-# The film without small slopes: Green's strains, and pressure normal to the film where it is.
-#
-# With u = r U(v) outward and S, H the second Piola-Kirchhoff forces over E t, the balance along z
-# integrates to h' = q r (1 + U)^2 / (2 S). Outward it is (r S (1 + u'))' = H (1 + U) - q r (1 + U)
-# h', and Hooke's law says S (1 - nu^2) = e + u' + (u'^2 + h'^2) / 2 + nu (e + U + U^2 / 2).
-
-_FINITE_TERMS = 14  # of U: 1e-12 of the slopes
-
-
-def finite_rise_mm(law: FilmLaw, load: float, rho: FloatArray) -> FloatArray:
-    """dh / drho (n,) at radii rho of the deformed film, of one film under one load. Raises
-    ValueError as `under`.
-    """
-    v, outward, grows, slope = _finite_tables()
-    bowl, poisson = law.loaded(np.asarray(load)), float(law.poisson)
-    film = float(law.prestrain), poisson, load
-    radial, hoop = bowl.stresses(np.sqrt(v))
-    unknowns = np.linalg.lstsq(outward, hoop - poisson * radial - film[0], rcond=None)[0]
-    steps = _COMPLEX_STEP * 1j * np.eye(unknowns.size + 1)[:, 1:].T  # the first column stays
-    for _ in range(20):
-        near = unknowns[:, None] + steps
-        force, around, along, wide = _finite_forces(film, v, outward @ near, grows @ near, radial)
-        pull = force * along
-        left = (
-            pull
-            + 2 * v[:, None] * (slope @ pull)
-            - around * wide
-            + load**2 * v[:, None] * wide**3 / (2 * force)
-        )
-        step = np.linalg.solve(left[:, 1:].imag / _COMPLEX_STEP, -left[:, 0].real)
-        unknowns = unknowns + step
-        if np.max(np.abs(step)) < 1e-14:
-            break
-    at = rho**2
-    for _ in range(8):  # from where the film is to where it was: it moved by some 1e-3
-        at = rho**2 / (1 + _finite_basis(at)[0] @ unknowns) ** 2
-    there, climbs = (table @ unknowns[:, None] for table in _finite_basis(at))
-    force, _, along, wide = _finite_forces(film, at, there, climbs, bowl.stresses(rho)[0])
-    return np.asarray(law.radius_mm * load * np.sqrt(at) * (wide**2 / (2 * force * along))[:, 0])
-
-
-def _finite_forces(
-    film: tuple[float, float, float],
-    v: FloatArray,
-    outward: AnyArray,
-    grows: AnyArray,
-    near: FloatArray,
-) -> tuple[AnyArray, AnyArray, AnyArray, AnyArray]:
-    """S, H, 1 + u' and 1 + U, (n, m), from U and dU/dv; S is the positive root of a cubic, by
-    Newton from `near`.
-    """
-    prestrain, poisson, load = film
-    u_r, hoop = outward + 2 * v[:, None] * grows, prestrain + outward + outward**2 / 2
-    flat = prestrain + u_r + u_r**2 / 2 + poisson * hoop
-    climb = load**2 * v[:, None] * (1 + outward) ** 4 / 8
-    force = near[:, None] + 0 * outward
-    for _ in range(40):
-        miss = (1 - poisson**2) * force - flat - climb / force**2
-        force = force - miss / (1 - poisson**2 + 2 * climb / force**3)
-    return force, hoop + poisson * force, 1 + u_r, 1 + outward
-
-
-def _finite_basis(v: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """U and dU/dv (n, terms) of U = (1 - v) T_k(2 v - 1): the ring holds the film."""
-    eye = np.eye(_FINITE_TERMS)
-    value, slope = (
-        chebyshev.chebval(2 * v - 1, eye).T,
-        2 * chebyshev.chebval(2 * v - 1, chebyshev.chebder(eye)).T,
-    )
-    return (1 - v)[:, None] * value, (1 - v)[:, None] * slope - value
-
-
-@cache
-def _finite_tables() -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
-    """Places v (n,), U and dU/dv there, and the derivatives (n, n) from values there."""
-    v, eye = (chebyshev.chebpts1(_FINITE_TERMS) + 1) / 2, np.eye(_FINITE_TERMS)
-    slope = 2 * chebyshev.chebval(2 * v - 1, chebyshev.chebder(eye)).T
-    return v, *_finite_basis(v), slope @ np.linalg.inv(chebyshev.chebval(2 * v - 1, eye).T)
-
-
-# Hencky's bowl: the law without pre-strain, as a polynomial in v.
-#
-# Over the unit disc the rotationally symmetric Zernike terms are sqrt(2k + 1) P_k(2v - 1) with
-# Legendre's P_k, so the Legendre series of the profile *is* its Zernike expansion: P_0, P_1, P_2,
-# ... are Noll 1, 4, 11, ... What lies above the degree of the fit is the "excess", with 36 terms
-# some micrometres of a 37
-# mm bowl.
-
-POISSON_RATIO = 0.3
-# Legendre degree 14; the coefficients fall sevenfold a degree: what is cut off is below 1e-13 of
-# the sag
-EXCESS_TERMS = 15
-# Noll indices of the round terms that the fit has, by Legendre degree: the first of order n = 2k
-# has (n^2 + n) / 2 terms before it, and its m = 0
-ROUND_NOLL = tuple(k * (2 * k + 1) + 1 for k in range(ZERNIKE_DEGREE // 2 + 1))
-EXCESS_DEGREE = len(ROUND_NOLL)  # Legendre degree of the excess' largest part
-
-
-@cache
-def profile_legendre() -> Legendre:
-    """Depth H(v) of a bowl of unit sag, 0 at the vertex and 1 at the rim, as Legendre series on v
-    in [0, 1].
-    """
-    bowl = FilmLaw(0.0, POISSON_RATIO, 1.0, 1.0).with_sag(1.0)
-    return legendre_series(bowl, EXCESS_TERMS + 8).truncate(EXCESS_TERMS)
-
-
-def legendre_series(bowl: Bowl, degree: int) -> Legendre:
-    """A bowl's depth in mm as a series on v in [0, 1]."""
-    depth = Chebyshev.interpolate(lambda v: bowl.height_mm(np.sqrt(v)), degree, domain=[0, 1])
-    return depth.convert(domain=[0, 1], kind=Legendre)
-
-
-@cache
-def zernike_projection() -> FloatArray:
-    """Noll coefficients (terms,) of a Hencky bowl of unit sag;
-    also their change per unit of sag.
-    """
-    out = np.zeros(ZERNIKE_TERMS)
-    for degree, j in enumerate(ROUND_NOLL):
-        out[j - 1] = profile_legendre().coef[degree] / np.sqrt(2 * degree + 1)
-    out.setflags(write=False)
-    return out
-
-
-@cache
-def excess() -> FloatArray:
-    """Power series in v of the part of a bowl of unit sag that the terms cannot represent."""
-    coef = profile_legendre().coef.copy()
-    coef[:EXCESS_DEGREE] = 0.0
-    out = Legendre(coef, domain=[0, 1]).convert(kind=Polynomial).coef
-    out.setflags(write=False)
-    return np.asarray(out)
-
-
-# Round terms beyond the fit's that a calibration does not take from Hencky: three Legendre degrees,
-# of unit RMS
-BEYOND = (EXCESS_DEGREE + 1, EXCESS_DEGREE + 2, EXCESS_DEGREE + 3)
-
-
-@cache
-def beyond() -> FloatArray:
-    """Power series in v, (len(BEYOND), EXCESS_TERMS), of the round terms beyond the fit's, each 0
-    at the vertex.
-    """
-    out = np.zeros((len(BEYOND), EXCESS_TERMS))
-    for row, degree in zip(out, BEYOND, strict=True):
-        power = (
-            np.sqrt(2 * degree + 1)
-            * Legendre.basis(degree, domain=[0, 1]).convert(kind=Polynomial).coef
-        )
-        row[1 : degree + 1] = power[1:]
-    out.setflags(write=False)
-    return out
-
-
-@cache
-def excess_rms() -> float:
-    """RMS over the disc of the excess of a bowl of unit sag."""
-    coef: FloatArray = np.asarray(profile_legendre().coef).astype(np.float64)
-    squares = coef**2 / (2 * np.arange(EXCESS_TERMS) + 1)
-    return float(np.sqrt(np.sum(squares[EXCESS_DEGREE:])))
-
-
-def profile(rho: FloatArray) -> FloatArray:
-    """Depth of a bowl of unit sag at rho = r / R, 0 at the vertex and 1 at the rim."""
-    return np.asarray(profile_legendre()(np.square(rho)))

@@ -19,7 +19,7 @@ from functools import cache
 import numpy as np
 from numpy.polynomial import legendre, polynomial
 
-from membrane_ctrl.metrology.film import film_law
+from membrane_ctrl.metrology.film import finite_slopes, hencky_bowl
 from membrane_ctrl.metrology.film.film_law import Bowl, FilmLaw, HarmonicCause
 from membrane_ctrl.metrology.rays.surface import PARAMETERS
 from membrane_ctrl.model.arrays import FloatArray, IntArray
@@ -30,7 +30,7 @@ from membrane_ctrl.model.zernike_terms import ZERNIKE_DEGREE, ZERNIKE_TERMS
 PRESTRAIN_SIGMA, POISSON, POISSON_SIGMA = 3e-3, 0.35, 0.1
 _RING_SIGMAS: dict[HarmonicCause, float] = {"prestrain": 1e-3, "flat": 1.0, "round": 2.0}  # mm
 _ROUND = np.array(
-    [*(j - 2 for j in film_law.ROUND_NOLL[1:]), PARAMETERS - 1]
+    [*(j - 2 for j in hencky_bowl.ROUND_NOLL[1:]), PARAMETERS - 1]
 )  # places among a figure's parameters
 _FREEDOM = np.append(
     np.ones(_ROUND.size - 1), 0.1
@@ -156,7 +156,7 @@ def _finite_terms_mm(law: FilmLaw, bowls: Bowl, reach: float) -> FloatArray:
     numbers.
     """
     rho, weight, onto = _round_projection(reach)
-    rises = [film_law.finite_rise_mm(law, float(load), rho) for load in bowls.load.ravel()]
+    rises = [finite_slopes.finite_rise_mm(law, float(load), rho) for load in bowls.load.ravel()]
     return np.asarray((rises - bowls.rise_mm(rho)) * weight @ onto.T)
 
 
@@ -165,7 +165,7 @@ def _round_projection(reach: float) -> tuple[FloatArray, FloatArray, FloatArray]
     """Radii, weights, and the least squares of slopes there onto these terms."""
     rho, weight = _radii(reach)
     x = 2 * rho**2 - 1
-    round_degrees = [*enumerate(np.eye(film_law.EXCESS_DEGREE))][1:]
+    round_degrees = [*enumerate(np.eye(hencky_bowl.EXCESS_DEGREE))][1:]
     slopes = [
         np.sqrt(2 * k + 1) * 4 * rho * legendre.legval(x, legendre.legder(unit))
         for k, unit in round_degrees
@@ -173,8 +173,8 @@ def _round_projection(reach: float) -> tuple[FloatArray, FloatArray, FloatArray]
     excess = (
         2
         * rho
-        * polynomial.polyval(rho**2, polynomial.polyder(film_law.excess()))
-        / film_law.excess_rms()
+        * polynomial.polyval(rho**2, polynomial.polyder(hencky_bowl.excess()))
+        / hencky_bowl.excess_rms()
     )
     return rho, weight, np.asarray(np.linalg.pinv((np.stack([*slopes, excess]) * weight).T))
 

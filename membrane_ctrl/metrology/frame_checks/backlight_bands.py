@@ -16,9 +16,10 @@ from dataclasses import replace
 import numpy as np
 from scipy import ndimage
 
-from membrane_ctrl.metrology.numerics.compiled import sums_by
+from membrane_ctrl.metrology.numerics.grouped_sums import sums_by
 from membrane_ctrl.metrology.phase.frame_stack import Binned, FrameStack
-from membrane_ctrl.metrology.phase.phase_steps import AXES, CONTRAST_SHARE
+from membrane_ctrl.metrology.phase.full_decoder import CONTRAST_SHARE
+from membrane_ctrl.metrology.phase.pattern_sequence import AXES
 from membrane_ctrl.model.arrays import FloatArray, IntArray, Singles
 
 _LEAST_BANDS = 4  # in the picture: maps of the terms follow wider ones

@@ -15,15 +15,13 @@ import numpy as np
 from membrane_ctrl.config.schema import OpticsConfig, PatternConfig
 from membrane_ctrl.metrology.frame_checks import backlight_bands, frame_evidence, frame_faults
 from membrane_ctrl.metrology.phase import frame_stack
-from membrane_ctrl.metrology.phase.fringe_orders import gray_bit, orders
-from membrane_ctrl.metrology.phase.phase_steps import (
-    AXES,
-    centre_phase_rad,
-    inside_pattern,
-    mm_per_rad,
-)
+from membrane_ctrl.metrology.phase.fringe_orders import orders
+from membrane_ctrl.metrology.phase.gray_code import gray_bit
+from membrane_ctrl.metrology.phase.pattern_sequence import AXES
+from membrane_ctrl.metrology.phase.screen_scale import centre_phase_rad, inside_pattern, mm_per_rad
+from membrane_ctrl.metrology.rays import ray_tracing
 from membrane_ctrl.metrology.rays.geometry import Geometry
-from membrane_ctrl.metrology.reconstruction import bin_grid, film_motion, surface_fit
+from membrane_ctrl.metrology.reconstruction import bin_grid, tracked_points
 from membrane_ctrl.model.arrays import BoolArray, FloatArray, IntArray
 from membrane_ctrl.model.shape_estimate import RESIDUAL_REJECTED_URAD, Verdict
 
@@ -62,8 +60,8 @@ class Checked:
     view: frame_evidence.BinView  # evidence from the usable frames
     phase_rad: FloatArray  # (2, rows, columns): absolute phases of the bins
     near: BoolArray  # (rows, columns): bins that may see the mirror
-    tracer: surface_fit.Tracer  # the bench, with the vertex where the laser saw it
-    state: film_motion.TrackedPoints  # the bins' points with their surface
+    tracer: ray_tracing.Tracer  # the bench, with the vertex where the laser saw it
+    state: tracked_points.TrackedPoints  # the bins' points with their surface
     flags: tuple[frame_faults.Flag, ...]  # frames that do not belong
     # (n,): of the used sinusoids, x and then y: where the fringes put the film, about its mean
     film_um: FloatArray
@@ -286,8 +284,8 @@ def _check(
 class _Attempt:
     view: frame_evidence.BinView
     phase_rad: FloatArray
-    tracer: surface_fit.Tracer
-    state: film_motion.TrackedPoints
+    tracer: ray_tracing.Tracer
+    state: tracked_points.TrackedPoints
     scene: frame_evidence.SampledBins
 
 
@@ -304,14 +302,14 @@ def _attempt(
     """Fit the bins without the excluded frames. Raises NoFigureError
     or ValueError if that fails.
     """
-    tracer = surface_fit.Tracer(
+    tracer = ray_tracing.Tracer(
         geometry, optics.mirror.radius_mm, vertex_z_mm(optics, stack.mean_reading_um)
     )
     view = frame_evidence.look(stack, binned, excluded, None if anchor is None else anchor.light)
     phase = _absolute(stack, binned, view, anchor, optics)
     candidates = np.flatnonzero(near)
     flat = phase.reshape(2, -1)[:, candidates]
-    state = film_motion.establish(
+    state = tracked_points.establish(
         grid, tracer, candidates, flat, optics.pattern, optics.mirror.analysis_radius_mm
     )
     predicted = tracer.predict_screen(state.points, state.surface) / mm_per_rad(optics.pattern)

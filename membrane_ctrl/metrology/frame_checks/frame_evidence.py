@@ -19,8 +19,9 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from membrane_ctrl.metrology.phase.frame_stack import Binned, FrameStack
-from membrane_ctrl.metrology.phase.fringe_orders import gray_bit
-from membrane_ctrl.metrology.phase.phase_steps import AXES, CONTRAST_SHARE, FRINGE_SHARE
+from membrane_ctrl.metrology.phase.full_decoder import CONTRAST_SHARE, FRINGE_SHARE
+from membrane_ctrl.metrology.phase.gray_code import gray_bit
+from membrane_ctrl.metrology.phase.pattern_sequence import AXES
 from membrane_ctrl.model.arrays import BoolArray, FloatArray, IntArray
 
 _SAMPLE = 6_000

@@ -32,7 +32,8 @@ import numpy as np
 
 from membrane_ctrl.metrology.frame_checks.frame_evidence import Evidence
 from membrane_ctrl.metrology.phase.frame_stack import Binned, FrameStack
-from membrane_ctrl.metrology.phase.phase_steps import AXES, step_residual, step_weights
+from membrane_ctrl.metrology.phase.pattern_sequence import AXES
+from membrane_ctrl.metrology.phase.phase_steps import step_residual, step_weights
 from membrane_ctrl.model.arrays import ArrayLike, FloatArray
 
 _TINY = 1e-9  # share of a frame that the model does not explain; below this it explains any frame

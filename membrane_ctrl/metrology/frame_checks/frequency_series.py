@@ -5,18 +5,17 @@ itself: how large a disagreement is too large follows from the other series of t
 display's gamma, which all share, is no fault. Three checks:
 
 - equal pictures: no two frames of a set should be the same (a stale frame, however little it
-  matters);
+  matters),
 - the closure I0 - I1 + I2 - I3 of each series and, with the phase or the level known, the frame at
   fault;
 - the frequencies against each other: exchanging steps 0 and 2, or 1 and 3, keeps the closure but
   reverses the phase, which then contradicts the other frequencies.
 
 One of four steps can be replaced: the phase of the other three gives I0 = I1 + I3 - I2, and
-likewise for the others.
+correspondingly for the others.
 """
 
 import math
-from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from itertools import combinations
 
@@ -29,78 +28,9 @@ from membrane_ctrl.metrology.frame_checks.frame_faults import (
     closure_with_phase,
 )
 from membrane_ctrl.metrology.phase.phase_steps import phasors
-from membrane_ctrl.model.arrays import BoolArray, FloatArray
+from membrane_ctrl.metrology.phase.temporal_unwrap import predicted_phase, unwrap
+from membrane_ctrl.model.arrays import FloatArray
 from membrane_ctrl.model.shape_estimate import Verdict
-
-# Absolute phase in time: fringes of several frequencies, coarse to fine, each pixel by itself.
-#
-# The coarsest pattern has at most one period on the screen, so its phase is a position; each finer
-# one is put into the period that lies nearest to what is known so far. With x the position in
-# screens, p the periods a screen and w = phi / (2 pi p) the wrapped position,
-#
-#     x_f = w_f + rint((x_(f-1) - w_f) p_f) / p_f.
-#
-# The distance before rounding, e = (x_f - x_(f-1)) p_f in periods, is at most 1/2 by construction
-# and should be near 0: it is the coarser phase's error seen through the finer fringe. Near 1/2 the
-# order is uncertain.
-
-# A wrong order begins at half a period; for a pixel half way there, twice its error would be wrong.
-CONSISTENT_PERIODS = 0.25
-
-
-@dataclass(frozen=True)
-class Unwrapped:
-    """Positions on the screen from all frequencies."""
-
-    screens: (
-        FloatArray  # (...): position along the axis, 0 to 1 over the screen, from the finest fringe
-    )
-    step_periods: (
-        FloatArray  # (F - 1, ...): e of each step, in periods of the finer fringe, within +-1/2
-    )
-    consistent: (
-        BoolArray  # (...): all |e| below `CONSISTENT_PERIODS` and the position on the screen
-    )
-
-
-def unwrap(wrapped_rad: FloatArray, periods: Sequence[float] | FloatArray) -> Unwrapped:
-    """Unwrap in time. Raises ValueError if the periods are not rising from at most one, or do not
-    match the phases.
-
-    Parameters
-    ----------
-    wrapped_rad : (F, ...) array
-        Phase of each frequency, any branch; zero where position 0 is.
-    periods : (F,) array
-        Periods a screen, rising; the first at most 1.
-    """
-    counts = np.asarray(periods, float)
-    if counts.ndim != 1 or len(counts) != len(wrapped_rad):
-        raise ValueError(f"{len(wrapped_rad)} phases for periods {counts.tolist()}")
-    if not (0 < counts[0] <= 1 and np.all(np.diff(counts) > 0)):
-        raise ValueError(f"periods {counts.tolist()} must rise from at most one a screen")
-    position = np.mod(wrapped_rad[0], 2 * math.pi) / (2 * math.pi * counts[0])
-    steps = np.empty((len(counts) - 1, *position.shape))
-    for k in range(1, len(counts)):
-        fine = wrapped_rad[k] / (2 * math.pi * counts[k])
-        fine = fine + np.rint((position - fine) * counts[k]) / counts[k]
-        steps[k - 1] = (fine - position) * counts[k]
-        position = fine
-    agree = np.all(np.abs(steps) < CONSISTENT_PERIODS, axis=0) & (position >= 0) & (position <= 1)
-    return Unwrapped(position, steps, agree)
-
-
-def predicted_phase(
-    wrapped_rad: FloatArray, periods: Sequence[float] | FloatArray, index: int
-) -> FloatArray:
-    """Phase that the other frequencies expect of frequency `index`, (...), not wrapped.
-
-    The chain always needs the coarsest; in the coarsest's own prediction it only chooses the order.
-    """
-    counts = np.asarray(periods, float)
-    keep = np.array([k for k in range(len(counts)) if k != index or k == 0])
-    return np.asarray(2 * math.pi * counts[index] * unwrap(wrapped_rad[keep], counts[keep]).screens)
-
 
 # Shares of the fringes' amplitude. Good real series close to 0.02 to 0.04; a stale frame leaves
 # 0.25 or more.

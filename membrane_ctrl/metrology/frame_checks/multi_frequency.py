@@ -22,7 +22,14 @@ from membrane_ctrl.metrology.frame_checks.checked_set import (
 )
 from membrane_ctrl.metrology.frame_checks.frame_faults import Flag, FrameDefect
 from membrane_ctrl.metrology.frame_checks.frequency_series import CLOSURE_SHARE, CLOSURE_TIMES, GAIN
-from membrane_ctrl.metrology.phase import fringe_orders, phase_steps
+from membrane_ctrl.metrology.phase import (
+    fringe_orders,
+    full_decoder,
+    multi_period,
+    pattern_sequence,
+    phase_steps,
+    screen_scale,
+)
 from membrane_ctrl.metrology.phase.frame_stack import Binned, FrameStack, bin_frames
 from membrane_ctrl.model.arrays import BoolArray, FloatArray
 
@@ -110,14 +117,14 @@ def check_frequencies(stack: FrameStack, optics: OpticsConfig) -> Checked:
 def _fringes(stack: FrameStack, binned: Binned) -> BoolArray:
     """Bins (rows, columns) where all periods swing, the median of their swings at least."""
     swings = []
-    for axis in phase_steps.AXES:
+    for axis in pattern_sequence.AXES:
         for period in sorted({pattern.period_mm for pattern in stack.patterns}):
             frames = _steps(stack, axis, period, ())
             shifts = stack.shifts_rad(frames)
             swings.append(np.abs(phase_steps.phasors(binned.means[frames], shifts)))
     swing = np.median(swings, axis=0)
     return np.asarray(
-        (swing > phase_steps.CONTRAST_SHARE * np.percentile(swing, 95))
+        (swing > full_decoder.CONTRAST_SHARE * np.percentile(swing, 95))
         & ~binned.saturated.any(axis=0)
     )
 
@@ -140,7 +147,7 @@ def _all_series(
     """All series, without the frames left out. Raises RejectedSetError if too few steps remain of
     one.
     """
-    for k, axis in enumerate(phase_steps.AXES):
+    for k, axis in enumerate(pattern_sequence.AXES):
         for period in sorted({pattern.period_mm for pattern in stack.patterns}):
             frames = _steps(stack, axis, period, left_out)
             shifts, period_mm = stack.shifts_rad(frames), period or optics.pattern.period_mm
@@ -166,7 +173,9 @@ def _places(series: list[_Series], axis: int, optics: OpticsConfig) -> FloatArra
     )
     found = []
     for sigma_rad in _SIGMAS_RAD:
-        found.append(phase_steps.places_mm(wrapped, periods_mm, (0.0, side_mm), sigma_rad).place_mm)
+        found.append(
+            multi_period.places_mm(wrapped, periods_mm, (0.0, side_mm), sigma_rad).place_mm
+        )
         if np.mean(np.isfinite(found[-1])) > _MOST:
             break
     return max(found, key=lambda place_mm: np.count_nonzero(np.isfinite(place_mm)))
@@ -218,10 +227,11 @@ def _absolute(
     coded[mask] = wrapped[mask] + 2 * np.pi * np.rint((coarse - wrapped[mask]) / (2 * np.pi))
     found = fringe_orders.by_votes(np.nan_to_num(wrapped), coded, mask)
     if found.torn or not np.mean(np.isfinite(place_mm)) > _LEAST_KNOWN:
-        said = (
-            f"the phases of the {phase_steps.AXES[axis]} periods do not agree on the fringe orders"
+        raise RejectedSetError(
+            f"the phases of the {pattern_sequence.AXES[axis]} periods do not agree on the fringe "
+            "orders: check period_mm, axis and index of these frames",
+            flags,
         )
-        raise RejectedSetError(f"{said}: check period_mm, axis and index of these frames", flags)
     return np.where(
-        phase_steps.inside_pattern(found.phase_rad, optics.pattern), found.phase_rad, np.nan
+        screen_scale.inside_pattern(found.phase_rad, optics.pattern), found.phase_rad, np.nan
     )

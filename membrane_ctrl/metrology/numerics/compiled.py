@@ -1,14 +1,11 @@
-"""How the package's loops are compiled."""
+"""How the package's loops are compiled: options, and a cache that notices changed sources."""
 
 import zlib
 from collections.abc import Callable
-from concurrent.futures import ThreadPoolExecutor
 from functools import cache
-from itertools import pairwise
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any
 
-import numpy as np
 from numba import njit
 
 from membrane_ctrl.model.zernike_terms import ZERNIKE_TERMS
@@ -66,44 +63,3 @@ def _sources(folder: Path) -> int:
     """Checksum of the kernels in a folder."""
     texts = [path.read_bytes() for path in sorted(folder.rglob("*.py"))]
     return zlib.crc32(b"".join(text for text in texts if b"@kernel" in text or b"@step" in text))
-
-
-# Two threads of our own for kernels that release the interpreter lock: plain compiled loops over
-# [start, stop). Splitting them here, instead of in the compiler's parallel loops, keeps idle
-# threads asleep (the control loop shares the machine), avoids a library that only one thread may
-# enter, and adds partial sums in a fixed order, so that results repeat to the last bit.
-
-T = TypeVar("T")
-WORKERS = 2
-FEW = 4096  # points: waking a thread takes longer
-
-
-@cache
-def _pool() -> ThreadPoolExecutor:
-    return ThreadPoolExecutor(WORKERS - 1, thread_name_prefix="metrology")
-
-
-def split(run: Callable[[int, int], T], count: int, fewest: int = 0) -> list[T]:
-    """`run(start, stop)` over [0, count) in WORKERS pieces; results in order. The caller's thread
-    takes one.
-
-    A count below `fewest` is not split.
-    """
-    if count < fewest:
-        return [run(0, count)]
-    edges = [count * k // WORKERS for k in range(WORKERS + 1)]
-    others = [_pool().submit(run, start, stop) for start, stop in pairwise(edges[1:])]
-    first = run(edges[0], edges[1])
-    return [first, *(other.result() for other in others)]
-
-
-@kernel
-def sums_by(number, values, count):  # type: ignore[no-untyped-def]
-    """Sums (k, count) of values (k, n) over the columns of each `number` (n,), which is below
-    `count`.
-    """
-    out = np.zeros((values.shape[0], count))
-    for k in range(values.shape[0]):
-        for p in range(number.size):
-            out[k, number[p]] += values[k, p]
-    return out

@@ -1,15 +1,14 @@
-"""The frames of one set in memory, and their means over bins."""
+"""The frames of one capture set in memory, and their means over bins."""
 
-import math
 from dataclasses import dataclass, replace
 
 import numpy as np
 
 from firmware_iface.roles import Pattern
-from membrane_ctrl.metrology.numerics.compiled import kernel, split
-from membrane_ctrl.metrology.phase.bin_phasors import Binner, StepCombination, arctan2, still
-from membrane_ctrl.metrology.phase.phase_steps import AXES, step_design, step_weights
-from membrane_ctrl.model.arrays import BoolArray, FloatArray, Image, IntArray, Singles
+from membrane_ctrl.metrology.phase.bin_sums import Binner
+from membrane_ctrl.metrology.phase.pattern_sequence import AXES
+from membrane_ctrl.metrology.phase.phase_steps import step_design, step_weights
+from membrane_ctrl.model.arrays import BoolArray, FloatArray, Image, Singles
 
 _ENOUGH_BINS = 50_000  # for the terms and for the checks of the frames; more only cost time
 _LARGEST_BIN_PX = 4  # curvature of the phase over a larger bin is no longer small
@@ -112,111 +111,3 @@ def bin_frames(stack: FrameStack, full_scale_adu: int) -> Binned:
         np.multiply(binner.sums[0], 1 / bin_px**2, out=means[k], casting="unsafe")
         saturated[k] = binner.saturated > 0
     return Binned(bin_px, means, saturated)
-
-
-# Phase, modulation and closure of every pixel: the full result's pass over the frames.
-
-
-@dataclass(frozen=True)
-class PixelPhases:
-    """One axis at n pixels."""
-
-    phase_rad: FloatArray  # (n,): absolute phase, the period nearest to the reference
-    swing_adu: Singles  # (n,): fringe amplitude
-    rest_adu: (
-        Singles  # (n,): root of the sum of squares that the sinusoid leaves; 0 for three frames
-    )
-    saturated: BoolArray  # (n,): whether a frame is saturated there
-
-
-@kernel
-def _phases(  # type: ignore[no-untyped-def]
-    frames, index, fade, weights, design, turn, mirror, slope, reference, limit, out, start, stop
-):
-    """Rows of `out` (2, n): swing (negative where saturated) and rest; `reference` (n,) is replaced
-    by the phase.
-    """
-    steps, height = fade.shape
-    for p in range(start, stop):
-        place = index[p]
-        row = place // (frames.shape[1] // height)
-        mean = 0.0
-        c = 0.0
-        s = 0.0
-        top = 0.0
-        for k in range(steps):
-            value = float(frames[k, place])
-            top = max(top, value)
-            value *= fade[k, row]
-            mean += weights[0, k] * value
-            c += weights[1, k] * value
-            s += weights[2, k] * value
-        rest = 0.0
-        for k in range(steps):
-            left = (
-                float(frames[k, place]) * fade[k, row]
-                - mean * design[k, 0]
-                - c * design[k, 1]
-                - s * design[k, 2]
-            )
-            rest += left * left
-        c, s = still(c, s, slope[p], turn, mirror)
-        wrapped = arctan2(s, c)
-        reference[p] = wrapped + 2 * math.pi * math.floor(
-            (reference[p] - wrapped) / (2 * math.pi) + 0.5
-        )
-        swing = math.sqrt(c * c + s * s)
-        out[0, p] = -swing if top >= limit else swing
-        out[1, p] = math.sqrt(rest)
-
-
-def pixel_phases(
-    frames: Image,
-    design: FloatArray,
-    combined: StepCombination,
-    index: IntArray,
-    sensitivity_rad_per_um: FloatArray,
-    reference_rad: FloatArray,
-    full_scale_adu: int,
-    gain: FloatArray | None = None,
-) -> PixelPhases:
-    """Phases of one axis.
-
-    Parameters
-    ----------
-    frames : (N, height, width) array
-        The axis' usable sinusoids.
-    design : (N, 3) array
-        Their steps and light (`phase.step_design`).
-    combined : StepCombination
-        Motion of the film between them (`motion.combine_steps` for bins of one pixel).
-    index : (n,) int array
-        Pixels, counted row by row.
-    sensitivity_rad_per_um : (n,) array
-        Change of phase per µm of displacement; zeros if no motion is corrected.
-    reference_rad : (n,) array
-        Absolute phase to within half a period; not changed.
-    gain : (N, height) array, optional
-        Of the light of the rows of each frame.
-    """
-    flat = frames.reshape(len(frames), -1)
-    phase = reference_rad.copy()
-    out = np.empty((2, index.size), np.float32)
-    fade = np.ones(frames.shape[:2]) if gain is None else 1 / gain
-    fixed = (fade, np.linalg.pinv(design), design, combined.turn, combined.mirror)
-
-    def run(start: int, stop: int) -> None:
-        _phases(
-            flat,
-            index,
-            *fixed,
-            sensitivity_rad_per_um,
-            phase,
-            float(full_scale_adu),
-            out,
-            start,
-            stop,
-        )
-
-    split(run, index.size)
-    return PixelPhases(phase, np.abs(out[0]), out[1], np.signbit(out[0]))

@@ -1,28 +1,15 @@
-"""Possible errors of a bench, as one vector of named parameters around the stated values.
+"""Possible errors of a bench, as one vector of named parameters, all 0 for the stated bench.
 
-All are 0 for the stated bench. With hinge = F x O' / |F x O'| (world -y for the paper's bench),
-R(n, w) the turn by w about n, and the stated pinhole F0, camera rows C0, screen origin O0 and
-screen rows X0 (s_x, s_y, normal):
-
-    F = (1 + a / |F0|) R(hinge, alpha) F0           C = R(x, pitch) R(y, yaw) R(z, roll) C0 R(hinge, alpha)^T
-    O' = R(hinge, -alpha) ((1 + b / |O0|) O0 + x s_x + y s_y)
-    X = R(s_x, turn_x) R(s_y, turn_y) R(normal, turn_z) X0 R(hinge, -alpha)^T
-
-so that a, b and alpha are the paper's. A turn of everything about z is unobservable: the camera's
-azimuth is therefore not a parameter and defines the direction of x. The other rigid motions are
-parameters: two shifts, which the fixed ring determines, and two tilts, which only hand measurements
-determine.
-"""  # noqa: E501
+The poses are defined in `bench_poses`; lens, bow and pitch follow them, the laser's scale is last.
+"""
 
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
-from typing import Any
+from dataclasses import dataclass
 
 import numpy as np
 
 from membrane_ctrl.config.optics import SigmasConfig
-from membrane_ctrl.metrology.rays.geometry import BOW_RADIUS_MM, Geometry
-from membrane_ctrl.model.arrays import AnyArray, FloatArray
+from membrane_ctrl.model.arrays import FloatArray
 
 # a, b and alpha: the paper's; the principal point: of the paper's camera
 _BY_HAND = {
@@ -33,7 +20,6 @@ _BY_HAND = {
     "principal_y_px": 20.0,
 }
 _BY_HAND |= SigmasConfig().model_dump()
-_COMPLEX_STEP = 1e-30  # small enough that its square is nothing beside 1
 
 
 @dataclass(frozen=True)
@@ -68,6 +54,8 @@ POSE = (
     Parameter("camera_pitch_deg", "turn of the camera up"),
     Parameter("camera_roll_deg", "turn of the camera about its axis"),
 )
+
+
 OPTIONAL = (
     Parameter("focal_relative", "focal length, natural logarithm"),
     Parameter("principal_x_px", "principal point, column"),
@@ -79,12 +67,15 @@ OPTIONAL = (
     Parameter("bow_mm", "bow of the screen, 200 mm from its middle, towards the mirror"),
     Parameter("pitch_relative", "pixel pitch of the screen, relative"),
 )
+
+
 LASER = Parameter("laser_relative", "scale of the laser, relative")
+
+
 ALL = (*POSE, *OPTIONAL, LASER)
+
+
 NAMES = tuple(parameter.name for parameter in ALL)
-OPTICAL = len(POSE) + len(
-    OPTIONAL
-)  # those that the fringes depend on; the laser's scale comes after them
 
 
 def sigmas(free: Mapping[str, float] | None = None) -> FloatArray:
@@ -107,134 +98,3 @@ def sigmas(free: Mapping[str, float] | None = None) -> FloatArray:
 def usual_sigma(name: str) -> float:
     """The sigma that a parameter has when it is freed without one."""
     return ALL[NAMES.index(name)].sigma
-
-
-@dataclass(frozen=True)
-class BenchGeometry:
-    """A geometry with what `Geometry` does not hold."""
-
-    geometry: Geometry  # camera and screen
-    pitch: float = 1.0  # true length of the screen's nominal millimetre
-
-
-@dataclass(frozen=True)
-class Poses:
-    """Pinhole (3,), camera rows (3, 3), screen origin (3,) and screen rows (3, 3): s_x, s_y,
-    normal.
-    """
-
-    pinhole_mm: AnyArray
-    camera: AnyArray
-    origin_mm: AnyArray
-    screen: AnyArray
-
-
-def bench_at(stated: Geometry, values: FloatArray) -> BenchGeometry:
-    """The bench whose parameters, in the order of `NAMES`, are `values`."""
-    poses = poses_at(stated, values)
-    focal, column, row, k1, k2, p1, p2, bow_mm, pitch = values[len(POSE) : OPTICAL]
-    lens = np.array((*stated.distortion, *[0.0] * 4)[: max(4, len(stated.distortion))])
-    lens[:4] += (k1, k2, p1, p2)
-    geometry = replace(
-        stated,
-        pinhole_mm=poses.pinhole_mm,
-        rotation=poses.camera,
-        focal_px=stated.focal_px * float(np.exp(focal)),
-        principal_px=(stated.principal_px[0] + column, stated.principal_px[1] + row),
-        distortion=tuple(float(k) for k in lens) if lens.any() else (),
-        screen_origin_mm=poses.origin_mm,
-        screen_s_x=poses.screen[0],
-        screen_s_y=poses.screen[1],
-        face=stated.face._replace(bow_per_mm=stated.face.bow_per_mm + bow_mm / BOW_RADIUS_MM**2),
-    )
-    return BenchGeometry(geometry, 1 + pitch)
-
-
-def poses_at(stated: Geometry, values: AnyArray) -> Poses:
-    """Poses of a parameter vector (real, or complex for `pose_derivatives`); only the first eleven
-    count.
-    """
-    in_radians = [np.pi / 180 if parameter.unit == "deg" else 1.0 for parameter in POSE]
-    a, b, alpha, x, y, turn_x, turn_y, turn_z, yaw, pitch, roll = values[: len(POSE)] * in_radians
-    f0, o0 = stated.pinhole_mm, stated.screen_origin_mm
-    hinge = _hinge(f0, o0)
-    up, back = _turn(hinge, alpha), _turn(hinge, -alpha)
-    rows = stated.screen_axes
-    return Poses(
-        pinhole_mm=(1 + a / np.linalg.norm(f0)) * (up @ f0),
-        camera=_turns(pitch, yaw, roll) @ stated.rotation @ up.T,
-        origin_mm=back @ ((1 + b / np.linalg.norm(o0)) * o0 + x * rows[0] + y * rows[1]),
-        screen=_turns(turn_x, turn_y, turn_z) @ rows @ back.T,
-    )
-
-
-def pose_derivatives(stated: Geometry, values: FloatArray) -> list[Poses]:
-    """d poses / d parameter, one for each of the eleven, exact to rounding.
-
-    All of `poses_at` is analytic, so Im f(p + i h) / h is its derivative, without the loss of a
-    difference.
-    """
-    out = []
-    for k in range(len(POSE)):
-        there = values.astype(complex)
-        there[k] += 1j * _COMPLEX_STEP
-        poses = poses_at(stated, there)
-        parts = (poses.pinhole_mm, poses.camera, poses.origin_mm, poses.screen)
-        out.append(Poses(*(np.asarray(part.imag / _COMPLEX_STEP) for part in parts)))
-    return out
-
-
-# numbers of a screen put elsewhere: its shift along s_x, s_y and normal, mm, turns about them,
-# degrees
-SCREEN_MOVE = 6
-
-
-def screen_elsewhere(
-    bench: BenchGeometry, turns: list[Poses], move: FloatArray
-) -> tuple[BenchGeometry, list[Poses]]:
-    """The bench with its screen moved by `move` (6,), and d poses by the parameters of `turns` and
-    by the six.
-    """
-    there, rows = bench.geometry, bench.geometry.screen_axes
-    origin_mm, screen = _moved(there.screen_origin_mm, rows, move)
-    by_turn = screen @ rows.T
-    derivatives = [
-        replace(
-            turn, origin_mm=turn.origin_mm + turn.screen.T @ move[:3], screen=by_turn @ turn.screen
-        )
-        for turn in turns
-    ]
-    for step in 1j * _COMPLEX_STEP * np.eye(SCREEN_MOVE):
-        parts = (
-            part.imag / _COMPLEX_STEP for part in _moved(there.screen_origin_mm, rows, move + step)
-        )
-        derivatives.append(Poses(np.zeros(3), np.zeros((3, 3)), *parts))
-    moved = replace(there, screen_origin_mm=origin_mm, screen_s_x=screen[0], screen_s_y=screen[1])
-    return replace(bench, geometry=moved), derivatives
-
-
-def _moved(origin_mm: FloatArray, rows: FloatArray, move: AnyArray) -> tuple[AnyArray, AnyArray]:
-    """A screen's origin and rows after a move."""
-    return origin_mm + rows.T @ move[:3], _turns(*np.pi / 180 * move[3:]) @ rows
-
-
-def _hinge(pinhole_mm: FloatArray, origin_mm: FloatArray) -> FloatArray:
-    """Unit vector about which alpha turns."""
-    across = np.cross(pinhole_mm, origin_mm)
-    length = float(np.linalg.norm(across))
-    if length < 1e-6 * float(np.linalg.norm(pinhole_mm) * np.linalg.norm(origin_mm)):
-        raise ValueError("camera and screen are in line with the vertex: alpha is undefined")
-    return across / length
-
-
-def _turns(x: Any, y: Any, z: Any) -> AnyArray:
-    """Turns about x, y and z, the last one first."""
-    i, j, k = np.eye(3)
-    return np.asarray(_turn(i, x) @ _turn(j, y) @ _turn(k, z))
-
-
-def _turn(axis: FloatArray, angle: Any) -> AnyArray:
-    """Rodrigues' matrix of a turn about a unit vector."""
-    x, y, z = axis
-    cross = np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
-    return np.asarray(np.eye(3) + np.sin(angle) * cross + (1 - np.cos(angle)) * (cross @ cross))

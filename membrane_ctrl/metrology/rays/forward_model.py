@@ -2,142 +2,59 @@
 derivatives.
 
 A ray P = F + t d meets the film at F_z + t d_z = z + h(x, y), with n = (-h_x, -h_y, 1) its normal
-there; it leaves as u = d - 2 (d n) / (n n) n and meets the screen at S = P + k u. For small changes
-of anything (chain rule):
+there; it leaves as u = d - 2 (d n) / (n n) n and meets the screen at S = P + k u. For small
+changes of anything (chain rule):
 
-    dP = G (dF + t dd) + d / (n d) (dz + dh)             G = 1 - d n^T / (n d)
-    dn = -(dh_x, dh_y, 0) - H dP                         H = second derivatives of h, bordered by zeros
-    du = (1 - 2 n n^T / (n n)) dd + B dn                 B = -2 / (n n) (n d^T + (d n) 1 - 2 (d n) / (n n) n n^T)
-    ds = T (dP + k du - dO' + X^T dX (S - O')) + (E u) s^2 dc / (N u)
+    dP = G (dF + t dd) + d / (n d) (dz + dh)                            (1)
+    dn = -(dh_x, dh_y, 0) - H dP                                        (2)
+    du = (1 - 2 n n^T / (n n)) dd + B dn                                (3)
+    ds = T (dP + k du - dO' + X^T dX (S - O')) + (E u) s^2 dc / (N u)   (4)
 
-with X the screen's rows, E the first two, N = (third row) - w_x e_x - w_y e_y the normal of a face
-that deviates by w = c s^2 + map (see `optics.geometry`) and T = E (1 - u N^T / (N u)), which lets
-the ray run to the face.
-"""  # noqa: E501
+with
+
+    G = 1 - d n^T / (n d)
+    H = second derivatives of h, bordered by zeros
+    B = -2 / (n n) (n d^T + (d n) 1 - 2 (d n) / (n n) n n^T)
+    T = E (1 - u N^T / (N u)), which lets the ray run to the face
+
+where X are the screen's rows, E the first two, and N = (third row) - w_x e_x - w_y e_y the normal
+of a face that deviates by w = c s^2 + map (`screen_face`).
+"""
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import cache
-from typing import Any
 
 import numpy as np
-from numpy.polynomial import polynomial as series
 
-from membrane_ctrl.metrology.calibration.board_lens import lens_derivatives
-from membrane_ctrl.metrology.film import film_law
-from membrane_ctrl.metrology.numerics import zernike
+from membrane_ctrl.metrology.film import terms_beyond_fit
 from membrane_ctrl.metrology.rays import kernels
-from membrane_ctrl.metrology.rays.bench_parameters import (
+from membrane_ctrl.metrology.rays.artefacts import SeenScreen
+from membrane_ctrl.metrology.rays.bench_parameters import POSE
+from membrane_ctrl.metrology.rays.bench_poses import (
     OPTICAL,
-    POSE,
     SCREEN_MOVE,
     BenchGeometry,
     Poses,
     screen_elsewhere,
 )
-from membrane_ctrl.metrology.rays.geometry import BOW_RADIUS_MM, Geometry
-from membrane_ctrl.metrology.rays.surface import PARAMETERS, Artefact, SeenScreen, Surface
-from membrane_ctrl.metrology.reconstruction.surface_fit import Points, Tracer, parabola
-from membrane_ctrl.model.arrays import BoolArray, FloatArray, IntArray
-from membrane_ctrl.model.zernike_terms import ZERNIKE_DEGREE
+from membrane_ctrl.metrology.rays.geometry import Geometry
+from membrane_ctrl.metrology.rays.lens_derivatives import lens_derivatives
+from membrane_ctrl.metrology.rays.ray_tracing import Points, Tracer, parabola
+from membrane_ctrl.metrology.rays.screen_face import BOW_RADIUS_MM
+from membrane_ctrl.metrology.rays.set_phases import SetPhases
+from membrane_ctrl.metrology.rays.surface import PARAMETERS, Surface
+from membrane_ctrl.metrology.rays.surface_basis import basis, round_basis
+from membrane_ctrl.model.arrays import BoolArray, FloatArray
 
 # of one set: its surface's parameters, the height of its vertex, its round terms beyond them, and
 # by how much the film was deeper in the x frames than in the y frames
-BEYOND = slice(PARAMETERS + 1, PARAMETERS + 1 + len(film_law.BEYOND))
+BEYOND = slice(PARAMETERS + 1, PARAMETERS + 1 + len(terms_beyond_fit.BEYOND))
 MOTION = BEYOND.stop
 LOCAL = MOTION + 1
 COLUMNS = LOCAL + OPTICAL
-MOVED = (
-    SCREEN_MOVE + 2
-)  # of a screen elsewhere: its move, by how much the film was deeper, and in x than in y
-STILL_UM = 1e-3  # of a film that does not move
 _CHUNK = 8192  # points whose derivatives are in memory at a time: 8 MB
-
-
-@dataclass(frozen=True)
-class Elsewhere:
-    """What is known, besides the fringes, of the same film seen with the screen put elsewhere."""
-
-    shift_mm: tuple[float, float, float]  # of the screen along s_x, s_y and towards the mirror
-    shift_sigma_mm: float  # of its length
-    turn_sigma_deg: float  # of its direction, and of the screen's turns
-    deeper_um: float  # by how much the film was deeper then, by the laser
-    motion_um: float  # in the x frames than in the y frames
-    motion_sigma_um: float
-    glass_sigma_mm: float = 0.0  # of a screen seen directly, in place of a film that is deeper
-
-    def known(self, laser_sigma_um: float) -> FloatArray:
-        """Values and sigmas (2, MOVED), in mm and degrees: the move, the film deeper, deeper in x
-        than in y.
-        """
-        deeper_mm = 1e-3 * np.array([self.deeper_um, self.motion_um])
-        told = np.concatenate([self.shift_mm, np.zeros(3), deeper_mm])
-        deeper_sigma_mm = self.glass_sigma_mm or 1e-3 * np.sqrt(2) * laser_sigma_um
-        film_mm = np.array([deeper_sigma_mm, 1e-3 * max(self.motion_sigma_um, STILL_UM)])
-        # a rail is as parallel to the screen's normal as the screen is to itself after the move
-        across_mm = np.sqrt(
-            np.sum(np.square(self.shift_mm)) - np.square(self.shift_mm)
-        ) * np.radians(self.turn_sigma_deg)
-        shift_mm = np.hypot(self.shift_sigma_mm, across_mm)
-        return np.stack(
-            [told, np.concatenate([shift_mm, np.full(3, self.turn_sigma_deg), film_mm])]
-        )
-
-
-# of the screen seen directly: nothing is known of its place, and its pixels may lie behind some mm
-# of glass
-ANYWHERE = Elsewhere((0.0, 0.0, 0.0), 1e3, 1e2, 0.0, 0.0, 0.0, glass_sigma_mm=3.0)
 _GLASS_INDEX = 1.52
-_PER_POINT = ("column_px", "row_px", "screen_mm", "sigma_mm")  # the last axis: points
-
-
-@dataclass(frozen=True)
-class SetPhases:
-    """One capture set as screen points of bins, and those of the same film with the screen put
-    elsewhere.
-    """
-
-    name: str
-    column_px: FloatArray  # (n,): centres of the bins
-    row_px: FloatArray  # (n,)
-    screen_mm: FloatArray  # (2, n): s_x, s_y seen there
-    sigma_mm: FloatArray  # (n,): expected noise of each of the two
-    displacement_um: float  # mean laser reading of the set; NaN without
-    # by how much deeper the film was in the x frames than in the y frames, as told; a sigma of 0:
-    # not at all
-    motion_um: float = 0.0
-    motion_sigma_um: float = 0.0
-    # RMS motion of the film during the set; that from frame to frame of an axis is corrected
-    moved_um: float = 0.0
-    artefact: Artefact | SeenScreen | None = None  # what is seen instead of the film
-    elsewhere: tuple[Elsewhere, ...] = ()
-    # (n,): with which of them a point was seen, from 1; 0, or None, in its place
-    screen: IntArray | None = None
-    # of the fringes; 0: unknown, and nothing that repeats with them is taken out
-    period_mm: float = 0.0
-
-    def seen_with(self, screen: int) -> BoolArray:
-        """Which points (n,) were seen with the screen in that place."""
-        return np.full(self.sigma_mm.size, True) if self.screen is None else self.screen == screen
-
-    def thinned(self, most: int) -> "SetPhases":
-        """Every k-th bin, so that at most `most` are left."""
-        return self.subset(slice(None, None, -(-self.column_px.size // most)))
-
-    def subset(self, keep: slice | BoolArray) -> "SetPhases":
-        """Some of the bins."""
-        parts = {name: getattr(self, name)[..., keep] for name in _PER_POINT}
-        return replace(self, **parts, screen=None if self.screen is None else self.screen[keep])
-
-    def beside(self, again: "SetPhases", known: Elsewhere) -> "SetPhases":
-        """The set with the points of the same film, seen again with the screen elsewhere."""
-        before = np.zeros(self.sigma_mm.size, int) if self.screen is None else self.screen
-        screen = np.append(before, np.full(again.sigma_mm.size, len(self.elsewhere) + 1))
-        parts: Any = {
-            name: np.concatenate([getattr(k, name) for k in (self, again)], -1)
-            for name in _PER_POINT
-        }
-        return replace(self, **parts, elsewhere=(*self.elsewhere, known), screen=screen)
 
 
 @dataclass(frozen=True)
@@ -361,58 +278,3 @@ def _deeper() -> FloatArray:
     much.
     """
     return Surface.hencky_bowl(1.0, 1.0).parameters
-
-
-def basis(x: FloatArray, y: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Heights and slopes (parameters, n) of the surface's parameters in radii, each 0 at the
-    vertex.
-    """
-    v = x * x + y * y
-    excess = film_law.excess() / film_law.excess_rms()
-    bowl = series.polyval(v, excess) - excess[0]
-    grows = 2 * series.polyval(v, series.polyder(excess))
-    powers, tables = _monomials(x, y), _tables()
-    heights, slopes_x, slopes_y = (table @ powers for table in tables)
-    heights -= zernike.at_vertex()[1:, None]
-    return (
-        np.vstack([heights, bowl]),
-        np.vstack([slopes_x, grows * x]),
-        np.vstack([slopes_y, grows * y]),
-    )
-
-
-def round_basis(x: FloatArray, y: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Heights and slopes (k, n) of the terms of `film_law.BEYOND` in radii,
-    each 0 at the vertex.
-    """
-    v, terms = x * x + y * y, film_law.beyond()
-    heights = [series.polyval(v, term) for term in terms]
-    grows = np.array([2 * series.polyval(v, series.polyder(term)) for term in terms])
-    return np.array(heights), grows * x, grows * y
-
-
-def _monomials(x: FloatArray, y: FloatArray) -> FloatArray:
-    """x^p y^q, p + q <= ZERNIKE_DEGREE, p outer, (terms, n)."""
-    out, column = [], np.ones_like(x)
-    for p in range(ZERNIKE_DEGREE + 1):
-        term = column
-        for _ in range(ZERNIKE_DEGREE + 1 - p):
-            out.append(term)
-            term = term * y
-        column = column * x
-    return np.stack(out)
-
-
-@cache
-def _tables() -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Z_j, dZ_j/dx and dZ_j/dy, j = 2, 3, ..., as coefficients (terms - 1,
-    terms) of `_monomials`.
-    """
-    p, q = np.array(
-        [(p, q) for p in range(ZERNIKE_DEGREE + 1) for q in range(ZERNIKE_DEGREE + 1 - p)]
-    ).T
-    table = zernike.monomial_table()
-    height, of_x, of_y = (
-        t[1:, p, q] for t in (table, *(zernike.differentiate(table, axis) for axis in (1, 2)))
-    )
-    return np.ascontiguousarray(height), np.ascontiguousarray(of_x), np.ascontiguousarray(of_y)

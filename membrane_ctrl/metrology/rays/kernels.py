@@ -14,14 +14,13 @@ import math
 
 import numpy as np
 
-from membrane_ctrl.metrology.film import film_law
+from membrane_ctrl.metrology.film import hencky_bowl
 from membrane_ctrl.metrology.numerics.compiled import kernel, step
-from membrane_ctrl.metrology.rays import geometry
+from membrane_ctrl.metrology.rays import screen_face
 from membrane_ctrl.model.zernike_terms import ZERNIKE_DEGREE
 
 FACE_STEPS = 6  # see `_onto_face`
 _BLOCK = 256  # points whose intermediate values stay in the first-level cache
-
 SLOPE_MONOMIALS = ZERNIKE_DEGREE * (ZERNIKE_DEGREE + 1) // 2  # x^p y^q with p + q < degree
 SUMS = (
     2 * SLOPE_MONOMIALS + 5
@@ -51,7 +50,7 @@ def evaluate(poly, excess, amplitude, x, y):  # type: ignore[no-untyped-def]
     v = x * x + y * y
     e = 0.0
     ev = 0.0
-    for k in range(film_law.EXCESS_TERMS - 1, -1, -1):
+    for k in range(hencky_bowl.EXCESS_TERMS - 1, -1, -1):
         ev = ev * v + e
         e = e * v + excess[k]
     return h + amplitude * e, hx + 2 * amplitude * ev * x, hy + 2 * amplitude * ev * y, ev
@@ -130,11 +129,11 @@ def _lift(screen, face, first, count, out):  # type: ignore[no-untyped-def]
     """Deviation of the face at some points, in a separate loop: a look-up prevents vector
     instructions.
     """
-    if geometry.is_plane(face):
+    if screen_face.is_plane(face):
         out[:count] = 0.0
         return
     for k in range(count):
-        out[k], _wa, _wb = geometry.face_height(face, screen[0, first + k], screen[1, first + k])
+        out[k], _wa, _wb = screen_face.face_height(face, screen[0, first + k], screen[1, first + k])
 
 
 @kernel
@@ -248,33 +247,6 @@ def product_sums(rays, t, weights, pinhole, excess, radius, start, stop):  # typ
 
 
 @kernel
-def invert(matrix):  # type: ignore[no-untyped-def]
-    """Inverse of a symmetric positive matrix in place by Gauss-Jordan; False, and no usable result,
-    if it is not one.
-
-    A 36 x 36 matrix takes some 20 us here; on a busy machine the linear algebra library may wait a
-    thousand times longer for its threads. A positive matrix needs no pivoting: each pivot is a
-    Schur complement, and one below 1e-13 of its diagonal element is only rounding.
-    """
-    size = matrix.shape[0]
-    diagonal = np.diag(matrix).copy()
-    for k in range(size):
-        pivot = matrix[k, k]
-        if not pivot > 1e-13 * diagonal[k]:
-            return False
-        matrix[k, k] = 1.0
-        for j in range(size):
-            matrix[k, j] /= pivot
-        for i in range(size):
-            if i != k:
-                factor = matrix[i, k]
-                matrix[i, k] = 0.0
-                for j in range(size):
-                    matrix[i, j] -= factor * matrix[k, j]
-    return True
-
-
-@kernel
 def slope_field(  # type: ignore[no-untyped-def]
     rays, t, screen, pinhole, plane, face, poly, excess, amplitude, radius, out, start, stop
 ):
@@ -334,35 +306,13 @@ def _onto_face(out, tangents, face, first, count):  # type: ignore[no-untyped-de
     A step leaves the square of the miss times the face's curvature: 1 mm of bow 200 mm wide is met
     to rounding after three, a map of a few millimetres after four or five.
     """
-    if geometry.is_plane(face):
+    if screen_face.is_plane(face):
         return
     for k in range(count):
         a, b, ta, tb = out[0, first + k], out[1, first + k], tangents[0, k], tangents[1, k]
         w = 0.0
         for _ in range(FACE_STEPS):
-            height, wa, wb = geometry.face_height(face, a + w * ta, b + w * tb)
+            height, wa, wb = screen_face.face_height(face, a + w * ta, b + w * tb)
             w -= (w - height) / (1 - wa * ta - wb * tb)
         out[0, first + k] = a + w * ta
         out[1, first + k] = b + w * tb
-
-
-@step
-def cos_sin(x):  # type: ignore[no-untyped-def]
-    """Cosine and sine of a phase in single precision, to 1e-6 within three turns.
-
-    Taylor's series about the nearest quarter of a turn: unlike a library's functions, they run on
-    vector units.
-    """
-    quarter = np.rint(x * np.float32(2 / math.pi))
-    y = x - quarter * np.float32(math.pi / 2)
-    z = y * y
-    c = np.float32(1 / 720) - z * np.float32(1 / 40320)
-    c = np.float32(1) - z * (np.float32(1 / 2) - z * (np.float32(1 / 24) - z * c))
-    s = np.float32(1 / 5040) - z * np.float32(1 / 362880)
-    s = y - y * z * (np.float32(1 / 6) - z * (np.float32(1 / 120) - z * s))
-    k = np.int32(quarter)
-    if k & 1:
-        c, s = -s, c
-    if k & 2:
-        c, s = -c, -s
-    return c, s

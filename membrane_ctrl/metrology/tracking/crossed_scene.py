@@ -18,11 +18,12 @@ from membrane_ctrl.metrology.figure import pixel_figure
 from membrane_ctrl.metrology.frame_checks.checked_set import Checked
 from membrane_ctrl.metrology.numerics import zernike
 from membrane_ctrl.metrology.numerics.compiled import kernel
-from membrane_ctrl.metrology.phase import phase_steps
-from membrane_ctrl.metrology.rays.kernels import cos_sin
+from membrane_ctrl.metrology.numerics.fast_cosine import cos_sin
+from membrane_ctrl.metrology.phase import screen_scale
+from membrane_ctrl.metrology.rays import ray_tracing
 from membrane_ctrl.metrology.rays.surface import PARAMETERS, Surface
-from membrane_ctrl.metrology.reconstruction import bin_grid, surface_fit
-from membrane_ctrl.metrology.reconstruction.bin_grid import (
+from membrane_ctrl.metrology.reconstruction import bin_grid
+from membrane_ctrl.metrology.tracking.bin_cells import (
     BLOCK_BINS,
     BLOCK_CELLS,
     CELL_BINS,
@@ -71,13 +72,13 @@ class CrossedScene:
     cell.
     """
 
-    tracer: surface_fit.Tracer  # the bench with the vertex of the reference
+    tracer: ray_tracing.Tracer  # the bench with the vertex of the reference
     surface: Surface  # of the reference
     bin_px: int
     index: IntArray  # (n,): bins, counted row by row
     row: IntArray  # (n,): of the picture, that each is in
     cells: Cells
-    points: surface_fit.Points  # their rays; `t_mm` moves with the surface that was traced last
+    points: ray_tracing.Points  # their rays; `t_mm` moves with the surface that was traced last
     beyond_mm: FloatArray  # (2, n): screen points of the reference less the traced ones
     light_adu: FloatArray  # (3, n): mean level and swings of x and y
     basis: Singles  # (terms, n): Noll's order at the bins, for what changes smoothly
@@ -96,7 +97,7 @@ class CrossedScene:
         The ring does not move: a deeper bowl has its vertex lower.
         """
         lower_mm = shape.sag_mm - self.surface.sag_mm
-        bench = surface_fit.Tracer(
+        bench = ray_tracing.Tracer(
             self.tracer.geometry, shape.radius_mm, self.tracer.vertex_z_mm - lower_mm
         )
         bench.intersect(self.points, shape, newton=2)
@@ -261,10 +262,10 @@ def scene_of(
         )
     bin_px = _bin_px(checked, figure, traced * rad_per_mm)
     response, level_range = _response(
-        checked, figure, traced, phase_steps.mm_per_rad(optics.pattern), optics
+        checked, figure, traced, screen_scale.mm_per_rad(optics.pattern), optics
     )
     fine = _pictures(
-        checked, figure, traced, phase_steps.mm_per_rad(optics.pattern), level_range, contrast
+        checked, figure, traced, screen_scale.mm_per_rad(optics.pattern), level_range, contrast
     )
     coarse = _coarser(fine, bin_px // fine_px)
     rows, columns = camera.height_px // bin_px, camera.width_px // bin_px
@@ -272,7 +273,7 @@ def scene_of(
     known = np.isfinite(coarse).all(axis=0)
     index, counted, cells = Cells.of(np.flatnonzero(known), columns)
     grid = bin_grid.BinGrid(tracer.geometry, camera, bin_px)
-    points = surface_fit.Points.of(grid.rays[:, index], np.zeros((2, index.size)))
+    points = ray_tracing.Points.of(grid.rays[:, index], np.zeros((2, index.size)))
     tracer.start(points, shape.height)
     bias = grid.averaging_bias_mm(tracer, points, shape, index)
     position = tracer.position_mm(points)
@@ -394,7 +395,7 @@ def _response(
     low, high = (checked.binned.means[k].reshape(-1)[index].astype(float) for k in (black, white))
     shown, seen, levels = [], [], []
     for axis, used in enumerate(checked.view.used):
-        phases = traced_mm[axis] / mm_per_rad + phase_steps.centre_phase_rad(optics.pattern)
+        phases = traced_mm[axis] / mm_per_rad + screen_scale.centre_phase_rad(optics.pattern)
         for frame in used:
             shown.append((1 + np.cos(phases + stack.patterns[frame].shift_rad)) / 2)
             seen.append((checked.binned.means[frame].reshape(-1)[index] - low) / (high - low))

@@ -23,8 +23,8 @@ from itertools import product
 import numpy as np
 
 from membrane_ctrl.metrology.frame_checks.backlight_bands import Bands, fitted_waves
-from membrane_ctrl.metrology.numerics.compiled import sums_by
-from membrane_ctrl.metrology.rays import kernels
+from membrane_ctrl.metrology.numerics import matrix_inverse
+from membrane_ctrl.metrology.numerics.grouped_sums import sums_by
 from membrane_ctrl.metrology.rays.surface import PARAMETERS, Surface, height_probe
 from membrane_ctrl.metrology.tracking.crossed_scene import CrossedScene, light_left, light_waves
 from membrane_ctrl.model.arrays import AnyArray, FloatArray, Singles
@@ -232,7 +232,7 @@ class FrameFitter:
         matrix[_UNKNOWNS:, _UNKNOWNS:] = (bands * weights) @ bands.T
         scale = 1 / np.sqrt(np.maximum(np.diag(matrix), 1e-30))
         matrix *= np.outer(scale, scale)
-        if not kernels.invert(matrix):
+        if not matrix_inverse.invert(matrix):
             return None
         return np.asarray(matrix * np.outer(scale, scale))
 

@@ -17,8 +17,8 @@ from membrane_ctrl.config.schema import OpticsConfig
 from membrane_ctrl.metrology.cycle import live_reconstructor
 from membrane_ctrl.metrology.figure import pixel_figure
 from membrane_ctrl.metrology.frame_checks import checked_set, frame_evidence
-from membrane_ctrl.metrology.phase import frame_stack, phase_steps
-from membrane_ctrl.metrology.reconstruction import bin_grid
+from membrane_ctrl.metrology.phase import frame_stack, pattern_sequence
+from membrane_ctrl.metrology.reconstruction import slope_noise
 from membrane_ctrl.metrology.tracking.crossed_scene import scene_of
 from membrane_ctrl.metrology.tracking.frame_fit import ENOUGH_STEPS
 from membrane_ctrl.metrology.tracking.tracked_frame import TrackedFrame
@@ -162,13 +162,13 @@ class LiveTracker:
                 update={"reference_displacement_um": float(known[0])}
             )
             optics = self._optics = optics.model_copy(update={"geometry": geometry})
-        patterns = tuple(phase_steps.full_sequence(optics.pattern))
+        patterns = tuple(pattern_sequence.full_sequence(optics.pattern))
         pictures: Any = np.asarray(frames)  # of one kind, as the frames are
         stack = frame_stack.FrameStack(pictures, patterns, displacement_um, {})
         seen = checked_set.check(stack, optics)
         period_mm = optics.pattern.periods * optics.pattern.period_mm / self.pattern.index
         scene = scene_of(optics, seen, pixel_figure.bin_figure(optics, seen), period_mm)
-        gain = bin_grid.slope_per_screen(
+        gain = slope_noise.slope_per_screen(
             scene.tracer.geometry, scene.surface.radius_mm, scene.surface.sag_mm
         )
         self._urad_per_rad = 1e6 * float(np.sqrt(np.sum(gain) / 2)) / scene.rad_per_mm

@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from membrane_ctrl.metrology.numerics.compiled import sums_by
+from membrane_ctrl.metrology.numerics.grouped_sums import sums_by
 from membrane_ctrl.metrology.rays import surface
 from membrane_ctrl.metrology.tracking.crossed_scene import CrossedScene
 from membrane_ctrl.metrology.tracking.frame_fit import ENOUGH_STEPS, FrameFit, FrameFitter

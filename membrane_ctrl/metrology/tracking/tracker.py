@@ -13,7 +13,7 @@ from dataclasses import replace
 import numpy as np
 
 from membrane_ctrl.metrology.frame_checks.backlight_bands import Bands
-from membrane_ctrl.metrology.phase.bin_phasors import Binner
+from membrane_ctrl.metrology.phase.bin_sums import Binner
 from membrane_ctrl.metrology.rays import surface
 from membrane_ctrl.metrology.tracking import tracked_frame
 from membrane_ctrl.metrology.tracking.crossed_scene import CrossedScene

@@ -15,11 +15,11 @@ from typing import Any
 import numpy as np
 
 from membrane_ctrl.config.optics import OpticsConfig, SigmasConfig
-from membrane_ctrl.metrology.calibration import figure_uncertainty
 from membrane_ctrl.metrology.figure.pixel_figure import FullResult
-from membrane_ctrl.metrology.phase import phase_steps
-from membrane_ctrl.metrology.rays import bench_parameters, forward_model
+from membrane_ctrl.metrology.phase import phase_steps, screen_scale
+from membrane_ctrl.metrology.rays import bench_parameters, bench_poses, disc_heights, surface_basis
 from membrane_ctrl.metrology.rays.geometry import Geometry
+from membrane_ctrl.metrology.rays.ray_tracing import Points, Tracer
 from membrane_ctrl.metrology.rays.surface import (
     PARAMETERS,
     Surface,
@@ -27,7 +27,6 @@ from membrane_ctrl.metrology.rays.surface import (
     sag_gradient,
 )
 from membrane_ctrl.metrology.reconstruction import film_motion
-from membrane_ctrl.metrology.reconstruction.surface_fit import Points, Tracer
 from membrane_ctrl.metrology.reconstruction.zonal_map import ResidualGrid
 from membrane_ctrl.metrology.uncertainty import monte_carlo
 from membrane_ctrl.metrology.uncertainty.geometry_spread import GENERAL_NAMES, GeometrySpread
@@ -143,10 +142,10 @@ def _products(disc: float) -> dict[str, FloatArray]:
     """Means (parameters, parameters) over a disc of products of what two parameters do to sag,
     height and figure.
     """
-    heights, plane = figure_uncertainty.disc(disc)
+    heights, plane = disc_heights.disc(disc)
     basis = {
         "height_rms_um": heights,
-        "figure_rms_um": figure_uncertainty.without_plane(heights, plane),
+        "figure_rms_um": disc_heights.without_plane(heights, plane),
     }
     return {"sag_um": np.outer(sag_gradient(), sag_gradient())} | {
         n: b.T @ b / len(b) for n, b in basis.items()
@@ -201,9 +200,7 @@ def bench_sources(bench: TrialBench, sigmas: SigmasConfig) -> Iterator[Source]:
         ("b_mm", nominal.geometry.screen_origin_mm),
     ):
         values[bench_parameters.NAMES.index(name)] = grown * float(np.linalg.norm(length))
-    effect = (
-        bench.solve(bench_parameters.bench_at(nominal.geometry, values)) - bench.surface.parameters
-    )
+    effect = bench.solve(bench_poses.bench_at(nominal.geometry, values)) - bench.surface.parameters
     says = "growth of the frame since its distances were measured"
     yield Source("temperature_k", says, sigmas.temperature_k, effect[:, None])
 
@@ -281,7 +278,7 @@ def moves_mm(bench: TrialBench) -> FloatArray:
 
 
 def predicted_mm(
-    bench: TrialBench, there: bench_parameters.BenchGeometry, surface: Surface
+    bench: TrialBench, there: bench_poses.BenchGeometry, surface: Surface
 ) -> FloatArray:
     """Where (2, n) a surface on another bench sends the rays of the points."""
     tracer, points = _stand(bench, there.geometry)
@@ -343,11 +340,11 @@ def frame_effects(
     """Of single frames; `light` (2, n) and `harmonics` (2, 2), second and third of x and y, over
     the amplitude.
     """
-    scale, moves = phase_steps.mm_per_rad(optics.pattern), moves_mm(bench)
+    scale, moves = screen_scale.mm_per_rad(optics.pattern), moves_mm(bench)
     light, orders = np.broadcast_to(light, bench.screen_mm.shape), (2, 3)
     effects: tuple[list[FloatArray], ...] = ([], [], [], [])
     for axis, shifts in enumerate(shifts_rad):
-        angle = bench.screen_mm[axis] / scale + phase_steps.centre_phase_rad(optics.pattern)
+        angle = bench.screen_mm[axis] / scale + screen_scale.centre_phase_rad(optics.pattern)
         _, cosine, sine = phase_steps.step_weights(shifts)
         for k, shift in enumerate(shifts):
             # the frame's error over the fringes' amplitude turns the phasor
@@ -456,6 +453,6 @@ class Patches:
         The patches are those of the mirror, whatever was seen: two sets of a bench have the same
         ones. `inverse` is that of the fit's normal matrix.
         """
-        _, of_x, of_y = forward_model.basis(*self.places_mm / radius_mm)
+        _, of_x, of_y = surface_basis.basis(*self.places_mm / radius_mm)
         x, y = self.count * self.slopes
         return np.asarray(inverse @ ((of_x * x + of_y * y) / radius_mm))

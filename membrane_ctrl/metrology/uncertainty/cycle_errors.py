@@ -15,9 +15,15 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from membrane_ctrl.config.optics import OpticsConfig, SigmasConfig
-from membrane_ctrl.metrology.phase import phase_steps
+from membrane_ctrl.metrology.phase import phase_steps, screen_scale
+from membrane_ctrl.metrology.rays import ray_tracing
 from membrane_ctrl.metrology.rays.surface import PARAMETERS
-from membrane_ctrl.metrology.reconstruction import bin_grid, film_motion, surface_fit
+from membrane_ctrl.metrology.reconstruction import (
+    bin_grid,
+    film_motion,
+    surface_fit,
+    tracked_points,
+)
 from membrane_ctrl.metrology.uncertainty import budget, geometry_spread, monte_carlo, set_budget
 from membrane_ctrl.model.arrays import AnyArray, FloatArray, IntArray
 
@@ -170,8 +176,8 @@ def _of_geometry(
 class Cycle:
     """The fitted points of one cycle."""
 
-    tracer: surface_fit.Tracer
-    state: film_motion.TrackedPoints  # with the fresh phases
+    tracer: ray_tracing.Tracer
+    state: tracked_points.TrackedPoints  # with the fresh phases
     fit: surface_fit.Fit
     sums: Sequence[AnyArray]  # two (N, bins): bin sums of the sinusoids
     readings_um: FloatArray  # (2 N,)
@@ -234,7 +240,7 @@ class ErrorWatch:
             else self._errors.common_mm2
         )
 
-    def begin(self, state: film_motion.TrackedPoints) -> None:
+    def begin(self, state: tracked_points.TrackedPoints) -> None:
         """Choose from the points of a full cycle those that are asked."""
         places_px = self._places_px[:, state.index]
         self._asked = np.flatnonzero(
@@ -244,7 +250,7 @@ class ErrorWatch:
     def look(self, cycle: Cycle) -> CycleErrors:
         """The errors of a cycle; the first one's determine the sensitivities."""
         state, asked = cycle.state, self._asked[cycle.state.points.weights[self._asked] > 0]
-        scale = phase_steps.mm_per_rad(self._optics.pattern)
+        scale = screen_scale.mm_per_rad(self._optics.pattern)
         predicted_mm = cycle.tracer.predict_screen(state.points.subset(asked), cycle.fit.surface)
         phase_rad, index = (predicted_mm + state.offset_mm[:, asked]) / scale, state.index[asked]
         told_um = np.zeros(self._shifts_rad.shape)

@@ -12,7 +12,7 @@ import cv2
 import numpy as np
 
 from membrane_ctrl.config.optics import CameraPoseConfig, GeometryConfig, OpticsConfig, Vector3
-from membrane_ctrl.metrology.rays import bench_parameters
+from membrane_ctrl.metrology.rays import bench_parameters, bench_poses
 from membrane_ctrl.metrology.rays.geometry import Geometry
 from membrane_ctrl.model.arrays import ArrayLike, FloatArray
 
@@ -147,7 +147,7 @@ def changed(geometry: GeometryConfig, names: tuple[str, ...], change: ArrayLike)
 
 def moved_bench(
     optics: OpticsConfig, names: tuple[str, ...], change: ArrayLike
-) -> bench_parameters.BenchGeometry:
+) -> bench_poses.BenchGeometry:
     """The bench with its poses, lens, bow and pitch changed by (k,) amounts.
 
     Raises ValueError if the names belong to another form of geometry.
@@ -156,7 +156,7 @@ def moved_bench(
     general = tuple(name for name in names if name in GENERAL_NAMES)
     geometry = changed(optics.geometry, general, [amounts.pop(name) for name in general])
     values = np.array([amounts.get(name, 0.0) for name in bench_parameters.NAMES])
-    return bench_parameters.bench_at(
+    return bench_poses.bench_at(
         Geometry.from_config(optics.model_copy(update={"geometry": geometry})), values
     )
 

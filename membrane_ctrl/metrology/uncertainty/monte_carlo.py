@@ -19,13 +19,15 @@ import numpy as np
 
 from membrane_ctrl.config.schema import OpticsConfig
 from membrane_ctrl.metrology.figure import pixel_figure
-from membrane_ctrl.metrology.film import film_law
+from membrane_ctrl.metrology.film import hencky_bowl
 from membrane_ctrl.metrology.frame_checks.checked_set import Checked
 from membrane_ctrl.metrology.numerics import zernike
-from membrane_ctrl.metrology.rays.bench_parameters import BenchGeometry
+from membrane_ctrl.metrology.rays import ray_tracing
+from membrane_ctrl.metrology.rays.bench_poses import BenchGeometry
 from membrane_ctrl.metrology.rays.geometry import Geometry
 from membrane_ctrl.metrology.rays.surface import PARAMETERS, Surface, parameter_to_coeffs
-from membrane_ctrl.metrology.reconstruction import bin_grid, surface_fit
+from membrane_ctrl.metrology.reconstruction import normal_matrix, slope_noise, surface_fit
+from membrane_ctrl.metrology.reconstruction.normal_matrix import NormalMatrix
 from membrane_ctrl.metrology.uncertainty.geometry_spread import GeometrySpread, moved_bench
 from membrane_ctrl.model.arrays import ArrayLike, BoolArray, FloatArray
 
@@ -49,7 +51,7 @@ class TrialBench:
     sigma_mm: FloatArray  # (2, n): 1 sigma of noise there
     t_mm: FloatArray  # (n,): lengths of their rays
     surface: Surface
-    normal: surface_fit.NormalMatrix
+    normal: normal_matrix.NormalMatrix
 
     @classmethod
     def of(
@@ -75,9 +77,9 @@ class TrialBench:
     def of_points(
         cls,
         optics: OpticsConfig,
-        tracer: surface_fit.Tracer,
+        tracer: ray_tracing.Tracer,
         surface: Surface,
-        points: surface_fit.Points,
+        points: ray_tracing.Points,
         place_px: FloatArray,
         sigma_mm: FloatArray,
         count: int,
@@ -100,7 +102,7 @@ class TrialBench:
             sigma_mm=sigma_mm[:, chosen] / np.sqrt(thinning),
             t_mm=points.t_mm,
             surface=surface,
-            normal=tracer.normal_matrix(points),
+            normal=NormalMatrix.from_points(tracer, points),
         )
 
     def solve(
@@ -115,8 +117,8 @@ class TrialBench:
         one.
         """
         geometry, screen_mm = there.geometry, there.pitch * (self.screen_mm + disturbance_mm)
-        tracer = surface_fit.Tracer(geometry, self.surface.radius_mm, self.vertex_z_mm)
-        points = surface_fit.Points.of(geometry.rays(self.column_px, self.row_px), screen_mm)
+        tracer = ray_tracing.Tracer(geometry, self.surface.radius_mm, self.vertex_z_mm)
+        points = ray_tracing.Points.of(geometry.rays(self.column_px, self.row_px), screen_mm)
         points.t_mm[:] = self.t_mm
         tracer.intersect(points, self.surface, newton=3)
         steps = 1 if linear else surface_fit.MAX_ITERATIONS
@@ -126,7 +128,7 @@ class TrialBench:
             # the nominal points' matrix would not do: a turn of the camera moves them by
             # centimetres
             try:
-                normal = tracer.normal_matrix(points)
+                normal = NormalMatrix.from_points(tracer, points)
                 fit = surface_fit.solve(
                     tracer, points, self.surface, normal=normal, max_iterations=steps
                 )
@@ -142,7 +144,7 @@ class TrialBench:
 
     def slope_variance(self) -> FloatArray:
         """(2,) variance of an x and of a y slope from the noise."""
-        gain = bin_grid.slope_per_screen(
+        gain = slope_noise.slope_per_screen(
             Geometry.from_config(self.optics), self.surface.radius_mm, self.surface.sag_mm
         )
         return np.asarray(gain @ np.mean(np.square(self.sigma_mm), axis=1))
@@ -237,7 +239,8 @@ def height_matrix(x_mm: FloatArray, y_mm: FloatArray, radius_mm: float) -> Float
     x, y = np.asarray(x_mm) / radius_mm, np.asarray(y_mm) / radius_mm
     out = np.asarray(zernike.values(x, y).T @ parameter_to_coeffs())
     out[:, -1] += (
-        np.polynomial.polynomial.polyval(x * x + y * y, film_law.excess()) / film_law.excess_rms()
+        np.polynomial.polynomial.polyval(x * x + y * y, hencky_bowl.excess())
+        / hencky_bowl.excess_rms()
     )
     return out
 
@@ -271,7 +274,7 @@ def geometry_jacobian(bench: TrialBench, spread: GeometrySpread) -> FloatArray:
 
 def noise_covariance(bench: TrialBench) -> FloatArray:
     """Covariance (parameters, parameters) in mm^2 from the noise of the pixels."""
-    return bin_grid.parameter_covariance(bench.normal, bench.slope_variance())
+    return slope_noise.parameter_covariance(bench.normal, bench.slope_variance())
 
 
 def geometry_covariance(jacobian: FloatArray, spread: GeometrySpread) -> FloatArray:

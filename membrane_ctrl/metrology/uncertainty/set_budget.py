@@ -17,8 +17,9 @@ from membrane_ctrl.metrology.figure.pixel_figure import (
     motion_share,
 )
 from membrane_ctrl.metrology.frame_checks.checked_set import Checked
-from membrane_ctrl.metrology.rays import forward_model
-from membrane_ctrl.metrology.rays.geometry import Outline, project
+from membrane_ctrl.metrology.rays import surface_basis
+from membrane_ctrl.metrology.rays.geometry import project
+from membrane_ctrl.metrology.rays.rim_outline import Outline
 from membrane_ctrl.metrology.rays.surface import PARAMETERS, Surface, sag_gradient
 from membrane_ctrl.metrology.reconstruction import film_motion
 from membrane_ctrl.metrology.uncertainty import budget, monte_carlo
@@ -184,10 +185,10 @@ def _alike() -> FloatArray:
     x, y = (a.ravel() for a in np.meshgrid(*[np.linspace(-1, 1, 41)] * 2))
     inside = np.hypot(x, y) <= 1
     rows, (heights, _, _) = (
-        forward_model.basis(x[inside], y[inside])[0].T,
-        forward_model.round_basis(x[inside], y[inside]),
+        surface_basis.basis(x[inside], y[inside])[0].T,
+        surface_basis.round_basis(x[inside], y[inside]),
     )
-    rim = forward_model.round_basis(np.ones(1), np.zeros(1))[0]
+    rim = surface_basis.round_basis(np.ones(1), np.zeros(1))[0]
     table = np.vstack([rows, _HEAVY * sag_gradient()])
     return np.asarray(np.linalg.lstsq(table, np.vstack([heights.T, _HEAVY * rim.T]), rcond=None)[0])
 
@@ -205,8 +206,8 @@ def law_effect(
     sag.
     """
     x, y = patches.places_mm / radius_mm
-    _, *of = forward_model.basis(x, y)
-    _, *beyond = forward_model.round_basis(x, y)
+    _, *of = surface_basis.basis(x, y)
+    _, *beyond = surface_basis.round_basis(x, y)
     absorbed = (
         inverse
         @ sum((a * patches.count) @ b.T for a, b in zip(of, beyond, strict=True))

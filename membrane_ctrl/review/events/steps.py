@@ -6,7 +6,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy import ndimage, special
 
-from membrane_ctrl.metrology.film.film_law import zernike_projection
+from membrane_ctrl.metrology.film.hencky_bowl import zernike_projection
 from membrane_ctrl.model.arrays import BoolArray, Column, FloatArray
 from membrane_ctrl.model.telemetry import State
 from membrane_ctrl.run_files.shapes import Shapes

@@ -15,7 +15,7 @@ import numpy as np
 
 from membrane_ctrl.config.schema import CameraConfig, OpticsConfig
 from membrane_ctrl.metrology.cycle.live_reconstructor import LiveReconstructor
-from membrane_ctrl.metrology.phase.phase_steps import fringe_sequence, full_sequence
+from membrane_ctrl.metrology.phase.pattern_sequence import fringe_sequence, full_sequence
 from membrane_ctrl.metrology.tracking.live_tracker import LiveTracker
 from membrane_ctrl.model.shape_estimate import ShapeEstimate, pack_estimate, unpack_estimate
 from membrane_ctrl.sim.optics.camera import OpticsRenderer

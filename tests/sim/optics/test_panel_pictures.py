@@ -11,7 +11,7 @@ from firmware_iface.display import ScreenRaster, checkerboard, linear_response, 
 from firmware_iface.roles import Pattern
 from membrane_ctrl.config.optics import CameraConfig, DisturbancesConfig, OpticsConfig
 from membrane_ctrl.config.schema import TwinConfig
-from membrane_ctrl.metrology.phase.phase_steps import full_sequence
+from membrane_ctrl.metrology.phase.pattern_sequence import full_sequence
 from membrane_ctrl.model.arrays import FloatArray
 from membrane_ctrl.sim.optics.camera import OpticsRenderer, TwinOptics
 from membrane_ctrl.sim.optics.film_shape import typical_film

@@ -13,7 +13,8 @@ from numpy.polynomial.polynomial import polyder, polyval
 from scipy.integrate import quad
 from scipy.special import jn_zeros, jv
 
-from membrane_ctrl.metrology.film.film_law import FilmLaw, finite_rise_mm
+from membrane_ctrl.metrology.film.film_law import FilmLaw
+from membrane_ctrl.metrology.film.finite_slopes import finite_rise_mm
 from membrane_ctrl.model.zernike_terms import ZERNIKE_DEGREE, ZERNIKE_TERMS
 from membrane_ctrl.sim import film as hencky
 from membrane_ctrl.sim.optics.disturbances import DRUM_MODES, DrumMode

@@ -1,0 +1,165 @@
+"""The solution as the tables of `geometry.toml`.
+
+`[geometry]` is what every command reads. `[covariance]` is what error bars and a Monte Carlo use:
+shifts and turns of camera and screen in world, twelve of them, made from the eleven parameters
+(the twelfth direction, a turn of everything about z, has no variance: it defines x), and the
+parameters of lens, bow and pitch that were free. `[parameters]` are the calibration's own,
+`[calibration]` states the origin of all that. The screen's bow is in `[geometry.screen]`.
+`[camera]` and `[pattern]` are there if the lens or the screen's pitch were calibrated; a
+measurement with such a file needs them too.
+"""
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from membrane_ctrl.config.optics import (
+    CameraPoseConfig,
+    GeometryConfig,
+    OpticsConfig,
+    ScreenPoseConfig,
+    Vector3,
+)
+from membrane_ctrl.metrology.calibration.solver import Solution
+from membrane_ctrl.metrology.rays import bench_parameters, bench_poses
+from membrane_ctrl.metrology.rays.geometry import Geometry
+from membrane_ctrl.metrology.rays.screen_face import BOW_RADIUS_MM
+from membrane_ctrl.metrology.uncertainty.geometry_spread import GENERAL_NAMES
+from membrane_ctrl.model.arrays import FloatArray
+from membrane_ctrl.model.plain_json import SCHEMA, content_hash
+from membrane_ctrl.model.program import file_origin
+
+_LENS = ("focal_relative", "principal_x_px", "principal_y_px", "k1", "k2", "p1", "p2")
+
+
+@dataclass(frozen=True)
+class Origin:
+    """Origin of a geometry, as `[calibration]` states it."""
+
+    date_utc: str
+    sets: tuple[str, ...]
+    screen_residual_um: (
+        float  # median over the sets of the RMS of seen minus predicted screen points
+    )
+    # Median over the sets of the RMS that `measure` states with this geometry: the reference for a
+    # drift
+    slope_residual_urad: float
+    slope_noise_urad: float  # share of the camera's noise in it
+    condition: float  # see `propagate.condition_number`
+    notes: tuple[str, ...] = ()  # findings of the calibration
+
+
+def tables_of(solution: Solution, optics: OpticsConfig, origin: Origin) -> dict[str, Any]:
+    """The content of `geometry.toml`; `optics` is the stated bench."""
+    free = [bench_parameters.NAMES.index(name) for name in solution.free]
+    tables: dict[str, Any] = {
+        **file_origin(SCHEMA),
+        "geometry": geometry_of(solution, optics).model_dump(exclude_none=True),
+        "covariance": {
+            "names": [*GENERAL_NAMES, *_optional(solution)],
+            "matrix": general_covariance(solution).tolist(),
+        },
+        "parameters": {
+            "names": [bench_parameters.NAMES[k] for k in free],
+            "values": solution.values[free].tolist(),
+            "sigmas": solution.sigmas[free].tolist(),
+            "covariance": solution.covariance[np.ix_(free, free)].tolist(),
+        },
+    }
+    bench = solution.bench
+    if set(solution.free) & set(_LENS):
+        of_camera = {
+            key: getattr(optics.camera, key) for key in ("width_px", "height_px", "pixel_um")
+        }
+        tables["camera"] = of_camera | {
+            "focal_mm": bench.geometry.focal_px * optics.camera.pixel_um * 1e-3,
+            "principal_px": list(bench.geometry.principal_px),
+            "distortion": list(bench.geometry.distortion),
+        }
+    if "pitch_relative" in solution.free:
+        tables["pattern"] = {"period_mm": optics.pattern.period_mm * bench.pitch}
+    tables["calibration"] = {
+        "date_utc": origin.date_utc,
+        "sets": list(origin.sets),
+        "screen_residual_um": origin.screen_residual_um,
+        "slope_residual_urad": origin.slope_residual_urad,
+        "slope_noise_urad": origin.slope_noise_urad,
+        "ring_um": (1e3 * solution.common[len(bench_parameters.NAMES) + 1 :]).tolist(),
+        "condition": origin.condition,
+        "notes": list(origin.notes),
+        "hash": content_hash(tables),
+    }
+    return tables
+
+
+def geometry_of(solution: Solution, optics: OpticsConfig) -> GeometryConfig:
+    """The calibrated geometry in the general form; the screen's
+    height map is the stated bench's.
+    """
+    reference = {"reference_displacement_um": solution.problem.references.reference_um}
+    return general_form(solution.bench.geometry, optics).model_copy(update=reference)
+
+
+def general_form(geometry: Geometry, optics: OpticsConfig) -> GeometryConfig:
+    """A geometry as two poses; the height map and the reference displacement are the stated
+    bench's.
+    """
+    stated = optics.geometry.screen
+    right, down, forward = (_vector(row) for row in geometry.rotation)
+    return GeometryConfig(
+        reference_displacement_um=optics.geometry.reference_displacement_um,
+        camera=CameraPoseConfig(
+            position_mm=_vector(geometry.pinhole_mm), rotation=(right, down, forward)
+        ),
+        screen=ScreenPoseConfig(
+            origin_mm=_vector(geometry.screen_origin_mm),
+            s_x=_vector(geometry.screen_s_x),
+            s_y=_vector(geometry.screen_s_y),
+            bow_mm=geometry.face.bow_per_mm * BOW_RADIUS_MM**2,
+            height_map=None if stated is None else stated.height_map,
+        ),
+    )
+
+
+def general_covariance(solution: Solution) -> FloatArray:
+    """Covariance (12 + k, 12 + k) of `GENERAL_NAMES` and of the k free parameters of lens, bow and
+    pitch.
+
+    Rows r of a body turned by a small w become r + w x r, so that C^T dC is minus the cross-product
+    matrix of w.
+    """
+    geometry = solution.bench.geometry
+    columns = []
+    for turn in bench_poses.pose_derivatives(solution.problem.stated, solution.values):
+        turns = (
+            _turn_vector(geometry.rotation.T @ turn.camera),
+            _turn_vector(geometry.screen_axes.T @ turn.screen),
+        )
+        columns.append(np.concatenate([turn.pinhole_mm, turns[0], turn.origin_mm, turns[1]]))
+    poses = np.stack(columns, axis=1)
+    optional = [bench_parameters.NAMES.index(name) for name in _optional(solution)]
+    used = [*range(len(bench_parameters.POSE)), *optional]
+    matrix = np.eye(
+        len(poses) + len(optional), len(used), k=len(bench_parameters.POSE) - len(poses)
+    )
+    matrix[: len(poses), : len(bench_parameters.POSE)] = poses
+    covariance = matrix @ solution.covariance[np.ix_(used, used)] @ matrix.T
+    return np.asarray((covariance + covariance.T) / 2)
+
+
+def _optional(solution: Solution) -> list[str]:
+    return [
+        parameter.name for parameter in bench_parameters.OPTIONAL if parameter.name in solution.free
+    ]
+
+
+def _turn_vector(cross: FloatArray) -> FloatArray:
+    return (
+        -np.array([cross[2, 1] - cross[1, 2], cross[0, 2] - cross[2, 0], cross[1, 0] - cross[0, 1]])
+        / 2
+    )
+
+
+def _vector(values: FloatArray) -> Vector3:
+    return float(values[0]), float(values[1]), float(values[2])

@@ -1,0 +1,93 @@
+"""The rim's equations in the calibration: it shows the size of everything that is seen.
+
+Seen from the true bench, the radii at which the edges' rays meet the ring are the ring's: their
+mean, their place and their ovalness are five observations. Their errors are the ring's own and the
+edge's, which all edges share; the noise of single edges is negligible beside them.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from membrane_ctrl.metrology.calibration.rim_edges import EDGE_SIGMA_PX, RADIUS_SIGMA_MM, on_rim
+from membrane_ctrl.metrology.rays import bench_parameters, bench_poses
+from membrane_ctrl.metrology.rays.geometry import Geometry
+from membrane_ctrl.model.arrays import FloatArray
+
+_CENTRE_MM = 0.5  # the film's axis, by its clamp, against the edge that is seen
+_OVAL_MM = 0.3  # a welded or turned ring of a metre, each of two directions
+_STEP = 1e-3  # of a parameter's sigma by hand
+_RING = slice(len(bench_parameters.NAMES), None)
+_OF_SCREEN = {
+    name for name in bench_parameters.NAMES if name.startswith(("b_", "screen_", "bow_", "pitch_"))
+}
+
+
+@dataclass(frozen=True)
+class Rim:
+    """Edges of the light at the ring."""
+
+    edges_px: FloatArray  # (2, n): column and row
+    radius_mm: float
+    radius_sigma_mm: float = RADIUS_SIGMA_MM
+
+    @classmethod
+    def of(
+        cls, edges_px: Sequence[FloatArray], radius_mm: float, radius_sigma_mm: float
+    ) -> "Rim | None":
+        """The edges of several sets together; None without any."""
+        return (
+            cls(np.concatenate(edges_px, axis=1), radius_mm, radius_sigma_mm) if edges_px else None
+        )
+
+    def sums(self, stated: Geometry, common: FloatArray) -> FloatArray:
+        """Normal equations (COMMON + 1, squared) of the five
+        observations at the common unknowns.
+        """
+        now = self._seen_mm(stated, common)
+        columns = [np.zeros(now.size)] * common.size
+        optical = [
+            k
+            for k, name in enumerate(bench_parameters.NAMES[: bench_poses.OPTICAL])
+            if name not in _OF_SCREEN
+        ]
+        for k in (*optical, *range(len(bench_parameters.NAMES), common.size)):
+            step = _STEP * (
+                bench_parameters.ALL[k].sigma if k < len(bench_parameters.NAMES) else 1.0
+            )
+            there = common.copy()
+            there[k] += step
+            columns[k] = (self._seen_mm(stated, there) - now) / step
+        rows = np.column_stack([*columns, -now]) / self._sigmas_mm(stated)[:, None]
+        return np.asarray(rows.T @ rows)
+
+    def _sigmas_mm(self, stated: Geometry) -> FloatArray:
+        edge_mm = EDGE_SIGMA_PX * float(np.linalg.norm(stated.pinhole_mm)) / stated.focal_px
+        own = np.array([self.radius_sigma_mm, _CENTRE_MM, _CENTRE_MM, _OVAL_MM, _OVAL_MM])
+        return np.asarray(np.hypot(own, edge_mm))
+
+    def _seen_mm(self, stated: Geometry, common: FloatArray) -> FloatArray:
+        """Mean radius less the ring's, place (2,) and ovalness (2,) of the edges."""
+        geometry, ring = (
+            bench_poses.bench_at(stated, common[: len(bench_parameters.NAMES)]).geometry,
+            common[_RING],
+        )
+        orders = np.arange(1, ring.size // 2 + 1)
+
+        def height(x: FloatArray, y: FloatArray) -> FloatArray:
+            turns = np.outer(orders, np.arctan2(y, x))
+            return np.asarray(ring[0] + np.concatenate([np.cos(turns), np.sin(turns)]).T @ ring[1:])
+
+        x, y = on_rim(geometry, self.edges_px, height)
+        theta = np.arctan2(y, x)
+        waves = [
+            np.ones_like(theta),
+            np.cos(theta),
+            np.sin(theta),
+            np.cos(2 * theta),
+            np.sin(2 * theta),
+        ]
+        return np.asarray(
+            np.linalg.lstsq(np.stack(waves, axis=1), np.hypot(x, y) - self.radius_mm, rcond=None)[0]
+        )

@@ -1,0 +1,63 @@
+"""The radial profile of a height map against Hencky's bowl, and the pressure that belongs to it."""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from membrane_ctrl.metrology.film import hencky_bowl
+from membrane_ctrl.model.arrays import FloatArray
+
+# The paper's mirror film (PET, 50 µm): its sag gives the pressure, p = E t / a (w0 / (0.653 a))^3
+_YOUNG_PA = 4.1e9
+_THICKNESS_MM = 0.05
+_CENTRE = 0.65344  # w0 / (a q^(1/3)) for a Poisson ratio of 0.3
+_RINGS = 48
+
+
+@dataclass(frozen=True)
+class RadialProfile:
+    """Height over radius."""
+
+    radius_mm: FloatArray  # (n,): middle of the rings
+    mean_mm: FloatArray  # (n,): mean over azimuth
+    low_mm: FloatArray  # (n,): ends of the band that holds 95 % of the ring
+    high_mm: FloatArray  # (n,)
+    hencky_mm: FloatArray  # (n,): Hencky's bowl of the sag that fits best
+    sag_mm: float  # that sag, at the rim
+    pressure_pa: float  # gauge pressure that bends the paper's film to that sag
+
+
+def radial_profile(axis_mm: FloatArray, height_mm: FloatArray, rim_mm: float) -> RadialProfile:
+    """Profile of a height map (n, n) on `axis_mm`, NaN where not measured, of a film with its rim
+    at `rim_mm`.
+    """
+    x, y = np.meshgrid(axis_mm, axis_mm)
+    seen = np.isfinite(height_mm)
+    r, h = np.hypot(x[seen], y[seen]), height_mm[seen]
+    shape = hencky_bowl.profile(r / rim_mm)
+    shape_mean, h_mean = shape.mean(), h.mean()
+    # least squares with a free offset: a dimple at the vertex must not shift the whole comparison
+    sag = float(np.sum((shape - shape_mean) * (h - h_mean)) / np.sum((shape - shape_mean) ** 2))
+    left = h - (sag * (shape - shape_mean) + h_mean)
+    edges = np.linspace(0.0, float(r.max()), _RINGS + 1)
+    ring = np.clip(np.digitize(r, edges) - 1, 0, _RINGS - 1)
+    rows = []
+    for k in range(_RINGS):
+        inside = ring == k
+        if np.any(inside):
+            # of the difference to the bowl: across a ring the bowl itself climbs by millimetres
+            rows.append(
+                (r[inside].mean(), left[inside].mean(), *np.percentile(left[inside], [2.5, 97.5]))
+            )
+    radius, mean, low, high = np.array(rows).T
+    bowl = sag * hencky_bowl.profile(radius / rim_mm) + h_mean - sag * shape_mean
+    return RadialProfile(
+        radius, bowl + mean, bowl + low, bowl + high, bowl, sag, pressure_pa(sag, rim_mm)
+    )
+
+
+def pressure_pa(sag_mm: float, rim_mm: float) -> float:
+    """Gauge pressure under a film of the paper's kind with that sag:
+    (w0 / (0.65344 a))^3 E t / a.
+    """
+    return (sag_mm / (_CENTRE * rim_mm)) ** 3 * _YOUNG_PA * _THICKNESS_MM / rim_mm

@@ -1,0 +1,54 @@
+"""Least squares of Zernike terms over the cells of a grid that a mask selects."""
+
+from collections.abc import Sequence
+
+import numpy as np
+from numpy.polynomial.legendre import legvander, poly2leg
+
+from membrane_ctrl.metrology.numerics.zernike import term
+from membrane_ctrl.model.arrays import BoolArray, FloatArray
+
+
+class GridFit:
+    """Least squares of terms over the cells of a grid that a mask selects.
+
+    Parameters
+    ----------
+    x, mask : (W,), (H, W) arrays
+        Middle of the cells, in radii of the disc, and the cells to use; rows along y.
+    orders : sequence of (n, m)
+        Terms, without normalisation.
+    y : (H,) array, optional
+        As `x`, which it is by default.
+    """
+
+    def __init__(
+        self,
+        x: FloatArray,
+        mask: BoolArray,
+        orders: Sequence[tuple[int, int]],
+        y: FloatArray | None = None,
+    ) -> None:
+        degree = max(n for n, _ in orders)
+        to_legendre = np.stack(
+            [np.pad(p, (0, degree + 1 - p.size)) for p in map(poly2leg, np.eye(degree + 1))]
+        )
+        self._terms = np.stack(
+            [to_legendre.T @ term(n, m, degree) @ to_legendre for n, m in orders]
+        )
+        self._x, self._y = legvander(x, degree), legvander(x if y is None else y, degree)
+        self._mask = mask
+        pairs_y, pairs_x = (np.einsum("ia,ib->iab", along, along) for along in (self._y, self._x))
+        moments = np.einsum("iac,ij,jbd->acbd", pairs_y, mask.astype(float), pairs_x, optimize=True)
+        self._gram = np.einsum("kba,acbd,ldc->kl", self._terms, moments, self._terms, optimize=True)
+
+    def coefficients(self, values: FloatArray) -> FloatArray:
+        """Coefficients (terms,) of a map (H, W); cells outside the mask are not read."""
+        moments = self._y.T @ np.where(self._mask, values, 0.0) @ self._x
+        right = np.einsum("kba,ab->k", self._terms, moments)
+        return np.asarray(np.linalg.lstsq(self._gram, right, rcond=1e-12)[0])
+
+    def values(self, coefficients: FloatArray) -> FloatArray:
+        """Map (H, W) of the terms, also outside the mask."""
+        inner = np.tensordot(coefficients, self._terms, axes=1).T
+        return np.asarray(self._y @ inner @ self._x.T)

@@ -1,0 +1,17 @@
+"""Sums over groups of columns, compiled."""
+
+import numpy as np
+
+from membrane_ctrl.metrology.numerics.compiled import kernel
+
+
+@kernel
+def sums_by(number, values, count):  # type: ignore[no-untyped-def]
+    """Sums (k, count) of values (k, n) over the columns of each `number` (n,), which is below
+    `count`.
+    """
+    out = np.zeros((values.shape[0], count))
+    for k in range(values.shape[0]):
+        for p in range(number.size):
+            out[k, number[p]] += values[k, p]
+    return out

@@ -1,0 +1,67 @@
+"""Fringe orders and absolute phase from a complementary Gray code (the paper's eq. 2).
+
+The wrapped phase starts at -pi on each period's low edge, so that the order K1 = floor(s / T)
+jumps exactly where the phase does and is unreliable there. K2, from the last bit, jumps half a
+period away. Eq. 2 uses K2 near the ends of a period and K1 in the middle: each is used only where
+it is a quarter period away from its jumps.
+"""
+
+import math
+
+import numpy as np
+
+from membrane_ctrl.model.arrays import ArrayLike, BoolArray, FloatArray, IntArray
+
+pass
+
+
+def gray_orders(gray: ArrayLike, white: ArrayLike, black: ArrayLike) -> tuple[IntArray, IntArray]:
+    """Fringe orders from the Gray-code frames.
+
+    Parameters
+    ----------
+    gray : (n, ...) array
+        Intensities of the bits, most significant first; the last is for half a period.
+    white, black : (...) array
+        Highest and lowest level at each pixel; the threshold is their mean, pixel by pixel.
+
+    Returns
+    -------
+    k1, k2 : (...) int arrays
+        floor(s / T) from all bits but the last, and floor((V2 + 1) / 2) from all, V2 = floor(2 s /
+        T).
+    """
+    threshold = (np.asarray(white, float) + np.asarray(black, float)) / 2
+    return code_orders(np.asarray(gray, float) > threshold)
+
+
+def code_orders(bits: BoolArray) -> tuple[IntArray, IntArray]:
+    """The same from bits (n, ...) of any number, the last of them for half a period."""
+    binary = np.bitwise_xor.accumulate(
+        bits.astype(np.int64), axis=0
+    )  # each bit is the xor of all above it
+    half_periods = np.tensordot(1 << np.arange(len(binary))[::-1], binary, axes=1)
+    return half_periods // 2, (half_periods + 1) // 2
+
+
+def absolute_phase(wrapped_rad: FloatArray, k1: IntArray, k2: IntArray) -> FloatArray:
+    """The paper's eq. 2: phase counted from the low edge's -pi."""
+    order = np.where(
+        wrapped_rad <= -math.pi / 2, k2, np.where(wrapped_rad >= math.pi / 2, k2 - 1, k1)
+    )
+    return wrapped_rad + 2 * math.pi * order
+
+
+def gray_bit(phase_rad: FloatArray, bit: int) -> tuple[BoolArray, FloatArray]:
+    """What Gray frame `bit` (1..4) shows at an absolute phase, and the distance in rad to where
+    that bit changes.
+
+    V2 = floor(2 s / T) with s / T = (phase + pi) / (2 pi). Bit b of the code changes at V2 =
+    2^(4-b) (odd number).
+    """
+    half_periods = (phase_rad + math.pi) / math.pi
+    v2 = np.floor(np.nan_to_num(half_periods)).astype(np.int64)
+    shown = ((v2 ^ (v2 >> 1)) >> (4 - bit)) & 1
+    spacing = 2 ** (4 - bit)
+    from_edge = np.abs(half_periods % (2 * spacing) - spacing)
+    return shown.astype(bool), from_edge * math.pi

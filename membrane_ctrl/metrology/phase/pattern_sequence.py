@@ -1,0 +1,49 @@
+"""The images of a measurement cycle, in their order on the screen and in memory.
+
+A full cycle is, for x and then for y, N sinusoids and 4 Gray-code bits, then white and black: 18
+images for N = 4. A fringes-only cycle is the 2 N sinusoids, x first.
+"""
+
+import math
+
+from firmware_iface.roles import Pattern
+from membrane_ctrl.config.schema import PatternConfig
+
+GRAY_BITS = 4  # 16 half periods: enough for the 8 periods a configuration may ask for
+AXES = ("x", "y")
+
+
+def sinusoids(axis: str, steps: int) -> tuple[Pattern, ...]:
+    """The N phase steps of one axis: I = A + B cos(phi + 2 pi k / N), k = 0..N-1 (N = 4: the
+    paper's eq. 1).
+    """
+    return tuple(Pattern("sin", axis, k, 2 * math.pi * k / steps) for k in range(steps))
+
+
+def gray_codes(axis: str) -> tuple[Pattern, ...]:
+    """The Gray-code bits of one axis, most significant first; bits count from 1."""
+    return tuple(Pattern("gray", axis, bit) for bit in range(1, GRAY_BITS + 1))
+
+
+def full_sequence(pattern: PatternConfig) -> tuple[Pattern, ...]:
+    """All images of a full cycle: 2 (N + 4) + 2."""
+    by_axis = (
+        image for axis in AXES for image in (*sinusoids(axis, pattern.steps), *gray_codes(axis))
+    )
+    return (*by_axis, Pattern("white"), Pattern("black"))
+
+
+def fringe_sequence(pattern: PatternConfig) -> tuple[Pattern, ...]:
+    """The images of a fringes-only cycle: 2 N."""
+    return tuple(image for axis in AXES for image in sinusoids(axis, pattern.steps))
+
+
+class FullSlots:
+    """Positions of the images in the sequence of a full cycle."""
+
+    def __init__(self, steps: int) -> None:
+        second = steps + GRAY_BITS
+        self.steps, self.count = steps, 2 * second + 2
+        self.sinusoids = slice(0, steps), slice(second, second + steps)  # of x and y
+        self.gray = slice(steps, second), slice(second + steps, 2 * second)
+        self.white, self.black = 2 * second, 2 * second + 1  # highest and lowest level

@@ -1,0 +1,110 @@
+"""Phase of each bin against the last cycle: the phase steps combined, then the change of angle."""
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from membrane_ctrl.metrology.numerics.compiled import kernel
+from membrane_ctrl.metrology.numerics.threads import split
+from membrane_ctrl.metrology.phase.phasor_kernels import arctan2, still
+from membrane_ctrl.model.arrays import AnyArray, ComplexArray, FloatArray, IntArray
+
+_BLOCK = 512
+
+
+@dataclass(frozen=True)
+class StepCombination:
+    """How the frames of one axis become a phasor."""
+
+    # (N,): weights of the frames' bin sums for C and S (per pixel: divided by the bin's area)
+    cosine: FloatArray
+    sine: FloatArray  # (N,)
+    # (2,) first and second moment of the film's motion (see `motion`); 0 without
+    turn: ComplexArray = field(default_factory=lambda: np.zeros(2, complex))
+    mirror: ComplexArray = field(default_factory=lambda: np.zeros(2, complex))
+
+
+@kernel
+def _combine(sums, index, weights, first, out):  # type: ignore[no-untyped-def]
+    """out[p] = sum over frames of weight times bin sum."""
+    for p in range(out.size):
+        out[p] = 0.0
+    for k in range(weights.size):
+        weight = weights[k]
+        for p in range(out.size):
+            out[p] += weight * sums[k, index[first + p]]
+
+
+@kernel
+def _still(c, s, slope, turn, mirror):  # type: ignore[no-untyped-def]
+    for p in range(c.size):
+        c[p], s[p] = still(c[p], s[p], slope[p], turn, mirror)
+
+
+@kernel
+def _angle(c, s, last_cos, last_sin, change, size):  # type: ignore[no-untyped-def]
+    """Angle of c + i s relative to the last phase, and its length;
+    normalises c + i s to length 1.
+    """
+    for p in range(c.size):
+        length = math.sqrt(c[p] * c[p] + s[p] * s[p])
+        scale = 1 / (length + 1e-300)
+        x, y = c[p] * scale, s[p] * scale
+        change[p] = arctan2(y * last_cos[p] - x * last_sin[p], x * last_cos[p] + y * last_sin[p])
+        size[p] = length
+        c[p] = x
+        s[p] = y
+
+
+@kernel
+def _track(sums, index, cosine, sine, turn, mirror, slope, last, out, start, stop):  # type: ignore[no-untyped-def]
+    """Phase of each point, counted from the last one, in blocks that
+    stay in the first-level cache.
+    """
+    for first in range(start, stop, _BLOCK):
+        end = min(first + _BLOCK, stop)
+        c, s = out[1, first:end], out[2, first:end]
+        _combine(sums, index, cosine, first, c)
+        _combine(sums, index, sine, first, s)
+        if turn[1] != 0:
+            _still(c, s, slope[first:end], turn, mirror)
+        _angle(c, s, last[1, first:end], last[2, first:end], out[3, first:end], out[4, first:end])
+        for p in range(first, end):
+            out[0, p] = last[0, p] + out[3, p]
+
+
+def track(
+    sums: Sequence[AnyArray],
+    index: IntArray,
+    combined: Sequence[StepCombination],
+    sensitivity_rad_per_um: FloatArray,
+    last: FloatArray,
+    out: FloatArray,
+) -> None:
+    """Phases of the points against the last ones, for x and y.
+
+    Parameters
+    ----------
+    sums : two (N, bins) uint32 arrays
+        Bin sums of the N frames of each axis.
+    index : (n,) int array
+        Bin of each point.
+    combined : two StepCombination
+        How the frames of each axis combine.
+    sensitivity_rad_per_um : (2, n) array
+        Change of phase per µm of displacement.
+    last, out : (2, FOLLOWED_ROWS, n) arrays
+        Rows of the cycle before, from which the change is counted (unambiguous below pi), and of
+        this one.
+    """
+
+    def run(start: int, stop: int) -> None:
+        for k, steps in enumerate(combined):
+            weights = (steps.cosine, steps.sine, steps.turn, steps.mirror)
+            _track(
+                sums[k], index, *weights, sensitivity_rad_per_um[k], last[k], out[k], start, stop
+            )
+
+    split(run, index.size)

@@ -1,0 +1,42 @@
+"""Compiled steps on a single phasor: its angle, and the correction for the film's motion."""
+
+import math
+
+from membrane_ctrl.metrology.numerics.compiled import step
+
+
+@step
+def arctan2(y, x):  # type: ignore[no-untyped-def]
+    """Angle in [-pi, pi] without a branch, so that loops over it use vector units; (0, 0) gives 0.
+
+    The ratio of the smaller to the larger is halved in angle once, tan(a/2) = t / (1 + sqrt(1 +
+    t^2)), which leaves
+    |t| <= tan(pi/8), where 15 terms of the series of arctan leave less than 1e-13.
+    """
+    ax, ay = abs(x), abs(y)
+    low, high = min(ax, ay), max(ax, ay)
+    ratio = low / (high + 1e-300)
+    t = ratio / (1 + math.sqrt(1 + ratio * ratio))
+    square = t * t
+    series = 0.0
+    for k in range(15, -1, -1):
+        series = 1.0 / (2 * k + 1) - square * series
+    angle = 2 * t * series
+    angle = math.pi / 2 - angle if ay > ax else angle
+    angle = math.pi - angle if x < 0 else angle
+    return -angle if y < 0 else angle
+
+
+@step
+def still(c, s, q, turn, mirror):  # type: ignore[no-untyped-def]
+    """The phasor c + i s without the film's motion, to second order (see `motion`)."""
+    half = q * q / 2
+    t_re, t_im = 1 - q * turn[0].imag - half * turn[1].real, q * turn[0].real - half * turn[1].imag
+    m_re, m_im = (
+        q * mirror[0].imag - half * mirror[1].real,
+        -q * mirror[0].real - half * mirror[1].imag,
+    )
+    scale = 1 / (t_re * t_re + t_im * t_im - m_re * m_re - m_im * m_im)
+    return scale * ((t_re - m_re) * c + (t_im - m_im) * s), scale * (
+        (t_re + m_re) * s - (t_im + m_im) * c
+    )

@@ -1,0 +1,70 @@
+"""The wrapped phase made continuous over connected regions of a picture."""
+
+import math
+
+import numpy as np
+
+from membrane_ctrl.metrology.numerics.compiled import kernel
+from membrane_ctrl.model.arrays import BoolArray, FloatArray, IntArray
+
+
+@kernel
+def _flood(phase, mask, out, region, queue):  # type: ignore[no-untyped-def]
+    """Breadth-first: each pixel takes the period nearest to the neighbour that reached it. Returns
+    the regions.
+    """
+    height, width = phase.shape
+    count = 0
+    for seed in range(height * width):
+        if not mask[seed // width, seed % width] or region[seed // width, seed % width] >= 0:
+            continue
+        head, tail = 0, 1
+        queue[0] = seed
+        region[seed // width, seed % width] = count
+        out[seed // width, seed % width] = phase[seed // width, seed % width]
+        while head < tail:
+            row, column = queue[head] // width, queue[head] % width
+            head += 1
+            for k in range(4):
+                r = row + (k == 0) - (k == 1)
+                c = column + (k == 2) - (k == 3)
+                if (
+                    r < 0
+                    or c < 0
+                    or r >= height
+                    or c >= width
+                    or not mask[r, c]
+                    or region[r, c] >= 0
+                ):
+                    continue
+                step = phase[r, c] - out[row, column]
+                out[r, c] = phase[r, c] - 2 * math.pi * math.floor(step / (2 * math.pi) + 0.5)
+                region[r, c] = count
+                queue[tail] = r * width + c
+                tail += 1
+        count += 1
+    return count
+
+
+def unwrap_regions(wrapped_rad: FloatArray, mask: BoolArray) -> tuple[FloatArray, IntArray]:
+    """Continuous phase (H, W) of each connected region, up to whole periods, and the number (H, W)
+    of the region.
+
+    `mask` (H, W) is where the phase is trusted; outside they are NaN and -1. Neighbours must differ
+    by less than half a period.
+    """
+    out = np.full(wrapped_rad.shape, np.nan)
+    region = np.full(wrapped_rad.shape, -1, np.int64)
+    _flood(np.ascontiguousarray(wrapped_rad), mask, out, region, np.empty(mask.size, np.int64))
+    return out, region
+
+
+def tear_share(phase_rad: FloatArray) -> float:
+    """Share of neighbours whose continuous phases differ by more than half a period; NaN is left
+    out.
+
+    0 if the phase is the same whichever way the walk went.
+    """
+    steps = np.concatenate([np.diff(phase_rad, axis=0).ravel(), np.diff(phase_rad, axis=1).ravel()])
+    steps = steps[np.isfinite(steps)]
+    return float(np.mean(np.abs(steps) > math.pi)) if steps.size else 0.0

@@ -1,0 +1,96 @@
+"""What a calibration may see instead of the film: a flat, a sphere, or the screen itself."""
+
+import math
+from dataclasses import dataclass
+from functools import cache
+
+import numpy as np
+from numpy.polynomial import polynomial as series
+
+from membrane_ctrl.metrology.film import hencky_bowl, terms_beyond_fit
+from membrane_ctrl.metrology.numerics import zernike
+from membrane_ctrl.metrology.rays.surface import PARAMETERS, parameter_to_coeffs
+from membrane_ctrl.model.arrays import FloatArray
+
+
+@cache
+def _from_heights() -> tuple[FloatArray, FloatArray, FloatArray]:
+    """x and y (n,) over the unit disc, and least squares (parameters + 3, n) from heights there to
+    the parameters and `BEYOND`."""
+    k = np.arange(1024)
+    rho, theta = np.sqrt((k + 0.5) / k.size), k * np.pi * (3 - np.sqrt(5))
+    x, y = rho * np.cos(theta), rho * np.sin(theta)
+    excess = series.polyval(rho**2, hencky_bowl.excess()) / hencky_bowl.excess_rms()
+    own = zernike.values(x, y).T @ parameter_to_coeffs() + np.outer(excess, np.eye(PARAMETERS)[-1])
+    beyond = series.polyval(rho**2, terms_beyond_fit.beyond().T).T
+    return x, y, np.linalg.pinv(np.hstack([own, beyond]))
+
+
+@dataclass(frozen=True)
+class Artefact:
+    """A surface of known form that stands in the mirror's place: a flat, or a concave sphere."""
+
+    curvature_per_mm: float  # 0: flat
+    curvature_sigma_per_mm: float
+    form_sigma_mm: float  # of each of its terms
+    vertex_mm: float  # height of its vertex in world
+    vertex_sigma_mm: float
+    radius_mm: float  # of its disc
+
+    @property
+    def name(self) -> str:
+        """For a person."""
+        return "sphere" if self.curvature_per_mm else "flat"
+
+    @property
+    def doubt(self) -> str:
+        """What is wrong if it disagrees with the other sets."""
+        return (
+            f"it is not the {self.name} that its file states, it stood elsewhere, or it was out "
+            "of focus"
+        )
+
+    def terms_mm(self, tilt_x: float = 0.0, tilt_y: float = 0.0) -> FloatArray:
+        """Parameters (parameters,) of the surface with these slopes at its vertex, and its terms
+        `BEYOND`.
+        """
+        x, y, onto = _from_heights()
+        return np.asarray(onto @ self._heights_mm(self.curvature_per_mm, x, y, tilt_x, tilt_y))
+
+    def covariance_mm2(self) -> FloatArray:
+        """Covariance of `terms_mm` by curvature and form."""
+        x, y, onto = _from_heights()
+        step = 1e-9  # per mm: the sag is linear in so little
+        change = self._heights_mm(self.curvature_per_mm + step, x, y) - self._heights_mm(
+            self.curvature_per_mm, x, y
+        )
+        by_curvature = onto @ change / step * self.curvature_sigma_per_mm
+        return np.asarray(
+            np.outer(by_curvature, by_curvature) + self.form_sigma_mm**2 * np.eye(len(onto))
+        )
+
+    def _heights_mm(
+        self,
+        curvature: float,
+        x: FloatArray,
+        y: FloatArray,
+        tilt_x: float = 0.0,
+        tilt_y: float = 0.0,
+    ) -> FloatArray:
+        """The sphere c |P|^2 = 2 n P through the origin with the normal n, at points (n,) of the
+        unit disc.
+        """
+        x, y = x * self.radius_mm, y * self.radius_mm
+        across = 1 / math.sqrt(1 + tilt_x**2 + tilt_y**2)
+        q = curvature * (x * x + y * y) + 2 * across * (tilt_x * x + tilt_y * y)
+        return np.asarray(q / (across + np.sqrt(across**2 - curvature * q)))
+
+
+@dataclass(frozen=True)
+class SeenScreen:
+    """The screen itself, seen without the mirror, anywhere: it shows lens and bow."""
+
+    origin_mm: FloatArray  # (3,): O' in the camera's frame, about
+    axes: FloatArray  # (3, 3): rows s_x, s_y and normal there
+    name = "screen"
+    doubt = "it shows another lens, another screen, or it was out of focus"

@@ -1,0 +1,178 @@
+"""Measured points, and a bench that traces their rays to the surface and on to the screen."""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+
+from membrane_ctrl.metrology.film import hencky_bowl
+from membrane_ctrl.metrology.numerics import threads
+from membrane_ctrl.metrology.rays import kernels
+from membrane_ctrl.metrology.rays.geometry import Geometry
+from membrane_ctrl.metrology.rays.surface import Surface
+from membrane_ctrl.model.arrays import BoolArray, FloatArray, IntArray
+
+HeightFunction = Callable[[FloatArray, FloatArray], FloatArray]  # x_mm, y_mm -> h_mm
+_EXCESS = hencky_bowl.excess() / hencky_bowl.excess_rms()
+
+
+@dataclass
+class Points:
+    """What was measured, on any set of points: binned or every pixel."""
+
+    rays: FloatArray  # (3, n): unit vectors in world, from the pinhole
+    screen_mm: FloatArray  # (2, n): s_x, s_y seen there, from O'
+    weights: FloatArray  # (n,): of both slopes of a point; 0 leaves it out
+    # (n,): length of each ray to the surface; kept between solutions as the start of the next
+    t_mm: FloatArray
+
+    @classmethod
+    def of(
+        cls, rays: FloatArray, screen_mm: FloatArray, weights: FloatArray | None = None
+    ) -> "Points":
+        """Points with unit weights unless given."""
+        count = rays.shape[1]
+        weights = np.ones(count) if weights is None else weights
+        return cls(
+            np.ascontiguousarray(rays), np.ascontiguousarray(screen_mm), weights, np.zeros(count)
+        )
+
+    def subset(self, keep: BoolArray | IntArray) -> "Points":
+        """Those points where `keep` is set, or those at these places."""
+        return Points(
+            np.ascontiguousarray(self.rays[:, keep]),
+            np.ascontiguousarray(self.screen_mm[:, keep]),
+            self.weights[keep],
+            self.t_mm[keep],
+        )
+
+
+class Tracer:
+    """A geometry with the vertex at a height, over a disc: runs the kernels on points."""
+
+    def __init__(self, geometry: Geometry, radius_mm: float, vertex_z_mm: float = 0.0) -> None:
+        self.geometry = geometry
+        self.radius_mm = radius_mm
+        self.vertex_z_mm = vertex_z_mm
+        self._pinhole = geometry.pinhole_mm
+        self._plane = np.vstack([geometry.screen_origin_mm, geometry.screen_axes])
+        self._face = geometry.face
+
+    def start(self, points: Points, height: HeightFunction) -> None:
+        """Put the points on a starting shape, by t <- (vertex_z + h - F_z) / d_z.
+
+        Contracts by slope times inclination of the ray (below 0.1), so that kinks of a cone do no
+        harm.
+        """
+        f, d = self._pinhole, points.rays
+        points.t_mm[:] = (self.vertex_z_mm - f[2]) / d[2]
+        for _ in range(12):
+            h = height(f[0] + points.t_mm * d[0], f[1] + points.t_mm * d[1])
+            points.t_mm[:] = (self.vertex_z_mm + h - f[2]) / d[2]
+
+    def intersect(self, points: Points, surface: Surface, newton: int = 1) -> None:
+        """Put the points on a surface, from where they are, by Newton steps."""
+        shape = surface.polynomial, surface.excess, 1.0, self.radius_mm
+
+        def run(start: int, stop: int) -> None:
+            kernels.intersect(
+                points.rays,
+                points.t_mm,
+                self._pinhole,
+                *shape,
+                self.vertex_z_mm,
+                newton,
+                start,
+                stop,
+            )
+
+        threads.split(run, points.t_mm.size, threads.FEW)
+
+    def residual_sums(self, points: Points, surface: Surface, newton: int = 0) -> FloatArray:
+        """Moments of the slope residual (see `kernels.residual_sums`), after Newton steps towards
+        the surface.
+        """
+        shape = self._shape(surface)
+
+        def run(start: int, stop: int) -> FloatArray:
+            rays, t = points.rays, points.t_mm
+            kernels.intersect(rays, t, self._pinhole, *shape, self.vertex_z_mm, newton, start, stop)
+            fixed = (
+                rays,
+                t,
+                points.screen_mm,
+                points.weights,
+                self._pinhole,
+                self._plane,
+                self._face,
+            )
+            return np.asarray(kernels.residual_sums(*fixed, *shape, start, stop))
+
+        return np.asarray(np.sum(threads.split(run, points.t_mm.size, threads.FEW), axis=0))
+
+    def product_sums(self, points: Points) -> FloatArray:
+        """Moments (PRODUCTS,) of the slope basis at the points (see `kernels.product_sums`)."""
+
+        def run(start: int, stop: int) -> FloatArray:
+            fixed = (
+                points.rays,
+                points.t_mm,
+                points.weights,
+                self._pinhole,
+                _EXCESS,
+                self.radius_mm,
+            )
+            return np.asarray(kernels.product_sums(*fixed, start, stop))
+
+        parts = threads.split(run, points.t_mm.size, threads.FEW)
+        return np.asarray(np.sum(parts, axis=0))
+
+    def slope_field(self, points: Points, surface: Surface) -> FloatArray:
+        """(6, n): x, y in mm, measured dh/dx, dh/dy, fitted dh/dx, dh/dy at the points."""
+        shape = self._shape(surface)
+        out = np.empty((6, points.t_mm.size))
+
+        def run(start: int, stop: int) -> None:
+            fixed = (
+                points.rays,
+                points.t_mm,
+                points.screen_mm,
+                self._pinhole,
+                self._plane,
+                self._face,
+            )
+            kernels.slope_field(*fixed, *shape, out, start, stop)
+
+        threads.split(run, points.t_mm.size, threads.FEW)
+        return out
+
+    def predict_screen(self, points: Points, surface: Surface) -> FloatArray:
+        """Screen points (2, n) in mm that the surface would send the rays to; the points must be on
+        it.
+        """
+        shape = self._shape(surface)
+        out = np.empty((2, points.t_mm.size))
+
+        def run(start: int, stop: int) -> None:
+            fixed = (points.rays, points.t_mm, self._pinhole, self._plane, self._face)
+            kernels.predict_screen(*fixed, *shape, out, start, stop)
+
+        threads.split(run, points.t_mm.size, threads.FEW)
+        return out
+
+    def position_mm(self, points: Points) -> FloatArray:
+        """x and y (2, n) of the points."""
+        return np.asarray(self._pinhole[:2, None] + points.t_mm * points.rays[:2])
+
+    def _shape(self, surface: Surface) -> tuple[FloatArray, FloatArray, float, float]:
+        return (
+            surface.polynomial,
+            _EXCESS,
+            surface.hencky_mm * hencky_bowl.excess_rms(),
+            self.radius_mm,
+        )
+
+
+def parabola(sag_mm: float, radius_mm: float) -> HeightFunction:
+    """The paper's starting shape."""
+    return lambda x, y: sag_mm * (x * x + y * y) / radius_mm**2

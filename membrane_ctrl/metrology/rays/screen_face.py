@@ -1,0 +1,124 @@
+"""The screen's face: its deviation from its plane, w(s_x, s_y), towards the mirror.
+
+w = c (s_x^2 + s_y^2) + map(s_x, s_y): a bow, and a bicubic spline through the nodes of a measured
+grid, counted along s_x x s_y. The spline is kept as its polynomial in each cell, sum of C[m, n]
+v^m u^n with u and v from 0 to 1 across the cell, so that a loop needs one look-up and a Horner
+scheme. Beyond the grid the height of its edge continues.
+"""
+
+import math
+from typing import NamedTuple
+
+import numpy as np
+
+from membrane_ctrl.config.optics import HeightMapConfig, ScreenPoseConfig
+from membrane_ctrl.metrology.numerics.compiled import kernel, step
+from membrane_ctrl.model.arrays import FloatArray
+
+BOW_RADIUS_MM = 200.0  # where `bow_mm` is counted: half the paper's pattern, rounded
+_ORDER = 4  # coefficients of a cubic
+
+
+class Face(NamedTuple):
+    """A face; a named tuple, since compiled loops take one as it is."""
+
+    bow_per_mm: float  # c, in 1/mm
+    # (rows, columns, 4, 4): polynomials of the map's cells, along s_y and s_x; without cells there
+    # is no map
+    cells_mm: FloatArray
+    low_mm: FloatArray  # (2,): first node along s_x and s_y
+    pitch_mm: FloatArray  # (2,): distance of the nodes
+
+    @classmethod
+    def of(cls, screen: ScreenPoseConfig | None) -> "Face":
+        """The face that a configuration describes; a plane for None."""
+        bow_mm = 0.0 if screen is None else screen.bow_mm
+        cells, low, pitch = _cells(None if screen is None else screen.height_map)
+        return cls(bow_mm / BOW_RADIUS_MM**2, cells, low, pitch)
+
+    @property
+    def is_plane(self) -> bool:
+        """Whether nothing stands off."""
+        return bool(is_plane(self))
+
+    def heights(self, screen_mm: FloatArray) -> FloatArray:
+        """w, dw/ds_x and dw/ds_y, (3, ...), in mm and without unit, at screen coordinates (2, ...)
+        in mm.
+        """
+        flat = np.ascontiguousarray(screen_mm.reshape(2, -1))
+        out = np.empty((3, flat.shape[1]))
+        _heights(self, flat, out)
+        return out.reshape(3, *screen_mm.shape[1:])
+
+
+def _cells(config: HeightMapConfig | None) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Cells, first nodes and distances of the nodes of a map."""
+    if config is None:
+        return np.zeros((0, 0, _ORDER, _ORDER)), np.zeros(2), np.ones(2)
+    along_y = _taylor(np.array(config.heights_mm), np.array(config.s_y_mm))
+    both = _taylor(along_y.transpose(2, 0, 1), np.array(config.s_x_mm))  # column, n, row, m
+    ends = np.array([(axis[0], axis[-1], len(axis) - 1) for axis in (config.s_x_mm, config.s_y_mm)])
+    cells = np.ascontiguousarray(both.transpose(2, 0, 3, 1))
+    return cells, ends[:, 0].copy(), (ends[:, 1] - ends[:, 0]) / ends[:, 2]
+
+
+def _taylor(values: FloatArray, nodes_mm: FloatArray) -> FloatArray:
+    """Coefficients (cells, 4, ...) of the spline through values (nodes, ...), in powers of the
+    share of a cell.
+    """
+    from scipy.interpolate import (
+        make_interp_spline,
+    )  # loads for a third of a second; most screens have no map
+
+    degree = min(_ORDER, nodes_mm.size) - 1
+    spline = make_interp_spline(nodes_mm, values, k=degree)
+    pitch = (nodes_mm[-1] - nodes_mm[0]) / (nodes_mm.size - 1)
+    out = np.zeros((nodes_mm.size - 1, _ORDER, *values.shape[1:]))
+    for m in range(degree + 1):
+        out[:, m] = spline(nodes_mm[:-1], nu=m) * (pitch**m / math.factorial(m))
+    return out
+
+
+@step
+def is_plane(face):  # type: ignore[no-untyped-def]
+    """Whether nothing stands off."""
+    return face.bow_per_mm == 0 and face.cells_mm.shape[0] == 0
+
+
+@step
+def face_height(face, a, b):  # type: ignore[no-untyped-def]
+    """w, dw/ds_x and dw/ds_y at a point."""
+    w = face.bow_per_mm * (a * a + b * b)
+    wa = 2 * face.bow_per_mm * a
+    wb = 2 * face.bow_per_mm * b
+    rows, columns = face.cells_mm.shape[0], face.cells_mm.shape[1]
+    if rows > 0:
+        u = (a - face.low_mm[0]) / face.pitch_mm[0]
+        v = (b - face.low_mm[1]) / face.pitch_mm[1]
+        inside_u, inside_v = 0.0 <= u <= columns, 0.0 <= v <= rows
+        u, v = min(max(u, 0.0), float(columns)), min(max(v, 0.0), float(rows))
+        column, row = min(int(u), columns - 1), min(int(v), rows - 1)
+        u -= column
+        v -= row
+        h = 0.0
+        hu = 0.0
+        hv = 0.0
+        for m in range(3, -1, -1):
+            line = 0.0
+            slope = 0.0
+            for n in range(3, -1, -1):
+                slope = slope * u + line
+                line = line * u + face.cells_mm[row, column, m, n]
+            hv = hv * v + h
+            h = h * v + line
+            hu = hu * v + slope
+        w += h
+        wa += hu / face.pitch_mm[0] if inside_u else 0.0
+        wb += hv / face.pitch_mm[1] if inside_v else 0.0
+    return w, wa, wb
+
+
+@kernel
+def _heights(face, screen_mm, out):  # type: ignore[no-untyped-def]
+    for p in range(screen_mm.shape[1]):
+        out[0, p], out[1, p], out[2, p] = face_height(face, screen_mm[0, p], screen_mm[1, p])

@@ -1,0 +1,125 @@
+"""Normal equations of the slope fit, made from moments (the paper's eqs. for D, G and A).
+
+With D the derivatives of the basis at the points and g the measured slopes, A = (D^T D)^-1 D^T g.
+All derivatives of the Zernike terms are polynomials of one degree less in x and y, so D^T g and
+D^T D follow exactly from sums of monomials over the points; no matrix of 2N rows is ever built. As
+printed, D^T D is singular: piston has no slope. Here the Hencky excess replaces piston's column,
+scaled to unit RMS like the others.
+"""
+
+from dataclasses import dataclass
+from functools import cache
+
+import numpy as np
+
+from membrane_ctrl.metrology.numerics import matrix_inverse, zernike
+from membrane_ctrl.metrology.rays import kernels
+from membrane_ctrl.metrology.rays.ray_tracing import Points, Tracer
+from membrane_ctrl.metrology.rays.surface import PARAMETERS
+from membrane_ctrl.model.arrays import FloatArray, IntArray
+from membrane_ctrl.model.zernike_terms import ZERNIKE_DEGREE
+
+_M = kernels.SLOPE_MONOMIALS
+_POWERS = [
+    (p, q) for p in range(ZERNIKE_DEGREE) for q in range(ZERNIKE_DEGREE - p)
+]  # in the kernels' order
+_PRODUCT_POWERS = [
+    (p, q) for p in range(kernels.PRODUCT_DEGREE + 1) for q in range(kernels.PRODUCT_DEGREE + 1 - p)
+]
+
+
+@cache
+def slope_tables() -> tuple[FloatArray, FloatArray]:
+    """dZ_j/dx and dZ_j/dy for j = 2, 3, ... as monomial coefficients, (terms - 1, SLOPE_MONOMIALS)
+    each, on the unit disc."""
+    rows, columns = np.array(_POWERS).T
+    tables = [
+        zernike.differentiate(zernike.monomial_table(), axis)[1:, rows, columns] for axis in (1, 2)
+    ]
+    return tables[0], tables[1]
+
+
+@cache
+def _product_index() -> IntArray:
+    """Index of the product of monomials k and l among the product moments, a square matrix."""
+    place = {power: k for k, power in enumerate(_PRODUCT_POWERS)}
+    return np.array([[place[a[0] + b[0], a[1] + b[1]] for b in _POWERS] for a in _POWERS])
+
+
+@dataclass(frozen=True)
+class NormalMatrix:
+    """D^T W D, separately for x and y slopes, and the inverse of their sum."""
+
+    # (parameters, parameters): shares of the x and of the y slopes, in 1/mm^2 times weight
+    x: FloatArray
+    y: FloatArray  # (parameters, parameters)
+    # (parameters, parameters), of their sum; the condition number is below 1000, and the next step
+    # corrects what rounding leaves
+    inverse: FloatArray
+
+    @classmethod
+    def from_points(cls, tracer: Tracer, points: Points) -> "NormalMatrix":
+        """D^T W D at the present places of the points. Raises ValueError as `from_products`."""
+        return cls.from_products(tracer.product_sums(points), tracer.radius_mm)
+
+    @classmethod
+    def from_products(cls, products: FloatArray, radius_mm: float) -> "NormalMatrix":
+        """From the moments of `kernels.product_sums`. Raises ValueError if the points do not
+        determine a surface.
+        """
+        x, y = _assemble(products, radius_mm)
+        inverse = x + y
+        if not matrix_inverse.invert(inverse):
+            raise ValueError(
+                f"the measured points do not determine the {PARAMETERS} parameters of the surface"
+            )
+        return cls(x, y, inverse)
+
+    def solve(self, right: FloatArray) -> FloatArray:
+        """(D^T W D)^-1 times `right`."""
+        return np.asarray(self.inverse @ right)
+
+
+def _assemble(products: FloatArray, radius_mm: float) -> tuple[FloatArray, FloatArray]:
+    count = kernels.PRODUCT_MONOMIALS
+    hankel = products[:count][_product_index()]
+    crosses = products[count : count + _M], products[count + _M : count + 2 * _M]
+    out = []
+    # the excess' slopes are 2 x e'(v) / R and 2 y e'(v) / R
+    for table, cross, square in zip(slope_tables(), crosses, products[-2:], strict=True):
+        matrix = np.empty((PARAMETERS, PARAMETERS))
+        matrix[:-1, :-1] = table @ hankel @ table.T
+        matrix[-1, :-1] = matrix[:-1, -1] = 2 * (table @ cross)
+        matrix[-1, -1] = 4 * square
+        out.append(matrix / radius_mm**2)
+    return out[0], out[1]
+
+
+def right_side(sums: FloatArray, radius_mm: float) -> FloatArray:
+    """D^T W r of the x and of the y slopes, (2, parameters), from the moments of
+    `kernels.residual_sums`.
+    """
+    out = np.empty((2, PARAMETERS))
+    for axis, table in enumerate(slope_tables()):
+        out[axis, :-1] = table @ sums[axis * _M : (axis + 1) * _M]
+        out[axis, -1] = 2 * sums[2 * _M + axis]
+    return out / radius_mm
+
+
+def residual_rms(
+    sums: FloatArray, right: FloatArray, normal: NormalMatrix, delta: FloatArray
+) -> tuple[float, float]:
+    """RMS of the x and of the y slopes' residual after the step `delta`, without another pass over
+    the points.
+
+    |r - D delta|^2 = |r|^2 - 2 delta D^T r + delta D^T D delta, each sum weighted.
+    """
+    weight = sums[-1]
+    if not weight > 0:
+        return float("nan"), float("nan")
+    squares = [
+        sums[2 * _M + 2 + axis] - 2 * delta @ right[axis] + delta @ matrix @ delta
+        for axis, matrix in enumerate((normal.x, normal.y))
+    ]
+    x, y = (float(np.sqrt(max(square, 0.0) / weight)) for square in squares)
+    return x, y

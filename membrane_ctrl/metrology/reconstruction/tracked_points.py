@@ -1,0 +1,115 @@
+"""The points that a full cycle passes on to the fringes-only cycles after it, with the data of
+each.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from membrane_ctrl.config.schema import PatternConfig
+from membrane_ctrl.metrology.phase import bin_sums, screen_scale
+from membrane_ctrl.metrology.rays import ray_tracing
+from membrane_ctrl.metrology.rays.surface import Surface
+from membrane_ctrl.metrology.reconstruction import bin_grid, normal_matrix, surface_fit
+from membrane_ctrl.metrology.reconstruction.film_motion import sensitivity_mm_per_um
+from membrane_ctrl.model.arrays import BoolArray, FloatArray, IntArray
+
+_START_SAG_MM = 40.0  # the paper's starting parabola; any other leads to the same result
+_OUTLIER_SIGMAS = 8.0  # of the slopes' robust scatter: dust and glints, never noise
+_MIN_POINTS = 1000  # far more than the unknowns, far fewer than any real view of the mirror
+
+
+@dataclass
+class TrackedPoints:
+    """Points inside the analysis radius, with the last accepted phase of each."""
+
+    index: IntArray  # (n,): bin of each point
+    points: ray_tracing.Points  # rays, screen points, weights
+    # (2, n): subtracted from T phi / (2 pi): the phase at O', and what averaging over a bin adds
+    offset_mm: FloatArray
+    sensitivity_rad_per_um: FloatArray  # (2, n): change of phase per µm of displacement
+    area_mm2: FloatArray  # (n,): area of the mirror that a bin sees
+    surface: Surface  # last solution
+    normal: normal_matrix.NormalMatrix
+    # (2, FOLLOWED_ROWS, n): rows of `phasor.track` for x and y of the last accepted cycle
+    accepted: FloatArray
+    fresh: FloatArray  # memory for the next
+
+    def accept(self, surface: Surface, usable: BoolArray) -> None:
+        """Make the fresh phases the reference; points that gave none keep theirs."""
+        blind = np.flatnonzero(~usable)
+        self.fresh[:, :, blind] = self.accepted[:, :, blind]
+        self.accepted, self.fresh = self.fresh, self.accepted
+        self.surface = surface
+
+
+def establish(
+    grid: bin_grid.BinGrid,
+    tracer: ray_tracing.Tracer,
+    candidates: IntArray,
+    phase_rad: FloatArray,
+    pattern: PatternConfig,
+    analysis_radius_mm: float,
+) -> TrackedPoints:
+    """Choose the points of a full cycle, fit their surface and compute the data of each.
+
+    Raises ValueError if too few bins see the pattern in the mirror to fit a surface.
+
+    Parameters
+    ----------
+    candidates : (n,) int array
+        Bins that may see the mirror.
+    phase_rad : (2, n) array
+        Their absolute phases; NaN where a bin is not usable.
+    """
+    finite = np.isfinite(phase_rad).all(axis=0)
+    index, phase_rad = candidates[finite], phase_rad[:, finite]
+    if index.size < _MIN_POINTS:
+        raise ValueError(f"only {index.size} bins see the pattern in the mirror")
+    points = ray_tracing.Points.of(grid.rays[:, index], screen_scale.screen_mm(phase_rad, pattern))
+    fit = surface_fit.solve(tracer, points, ray_tracing.parabola(_START_SAG_MM, tracer.radius_mm))
+    for wanted in (_inside_radius, _without_outliers):
+        keep = wanted(tracer, points, fit.surface, analysis_radius_mm)
+        points, index, phase_rad = points.subset(keep), index[keep], phase_rad[:, keep]
+        if index.size < _MIN_POINTS:
+            raise ValueError(f"only {index.size} bins see the pattern inside the analysis radius")
+        fit = surface_fit.solve(tracer, points, fit.surface)
+    tracer.intersect(points, fit.surface)
+    field = tracer.slope_field(points, fit.surface)
+    # area of the mirror, seen from above, in a bundle of rays: solid angle t^2 / |d . (-h_x, -h_y,
+    # 1)|
+    facing = np.abs(points.rays[2] - field[4] * points.rays[0] - field[5] * points.rays[1])
+    scale = screen_scale.mm_per_rad(pattern)
+    accepted = np.zeros((2, bin_sums.FOLLOWED_ROWS, index.size))
+    accepted[:, 0] = phase_rad
+    accepted[:, 1], accepted[:, 2] = np.cos(accepted[:, 0]), np.sin(accepted[:, 0])
+    return TrackedPoints(
+        index=index,
+        points=points,
+        offset_mm=grid.averaging_bias_mm(tracer, points, fit.surface, index)
+        + screen_scale.centre_phase_rad(pattern) * scale,
+        sensitivity_rad_per_um=sensitivity_mm_per_um(tracer, points, fit.surface) / scale,
+        area_mm2=grid.solid_angle(index) * points.t_mm**2 / facing,
+        surface=fit.surface,
+        normal=fit.normal,
+        accepted=accepted,
+        fresh=np.zeros_like(accepted),
+    )
+
+
+def _inside_radius(
+    tracer: ray_tracing.Tracer, points: ray_tracing.Points, _surface: Surface, radius_mm: float
+) -> BoolArray:
+    x, y = tracer.position_mm(points)
+    return np.asarray(x**2 + y**2 <= radius_mm**2)
+
+
+def _without_outliers(
+    tracer: ray_tracing.Tracer, points: ray_tracing.Points, surface: Surface, _radius_mm: float
+) -> BoolArray:
+    """Slopes within some robust sigmas of the fit, in both directions."""
+    field = tracer.slope_field(points, surface)
+    residual = np.hypot(field[2] - field[4], field[3] - field[5])
+    # median of a Rayleigh distribution: 1.177 sigma; the floor is the rounding of a noise-free set
+    sigma = max(float(np.median(residual)) / 1.177, 1e-9)
+    return np.asarray(residual <= _OUTLIER_SIGMAS * sigma)
