@@ -31,7 +31,7 @@ from membrane_ctrl.metrology.calibration.solver import (
     fit_on,
     solve,
 )
-from membrane_ctrl.metrology.frame_checks.checked_set import check
+from membrane_ctrl.metrology.frame_checks.set_check import check
 from membrane_ctrl.metrology.phase.frame_stack import FrameStack
 from membrane_ctrl.metrology.rays.bench_parameters import ALL, NAMES, sigmas
 from membrane_ctrl.metrology.rays.bench_poses import BenchGeometry, bench_at

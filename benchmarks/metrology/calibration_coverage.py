@@ -39,7 +39,8 @@ from membrane_ctrl.measure.capture_set import CaptureHead, CaptureSet
 from membrane_ctrl.metrology.calibration import figure_uncertainty, verdict
 from membrane_ctrl.metrology.calibration.rim_edges import find_edges
 from membrane_ctrl.metrology.calibration.solver import Solution, fit_on, solve
-from membrane_ctrl.metrology.frame_checks.checked_set import Checked, RejectedSetError, check
+from membrane_ctrl.metrology.frame_checks.checked_set import Checked, RejectedSetError
+from membrane_ctrl.metrology.frame_checks.set_check import check
 from membrane_ctrl.metrology.phase.frame_stack import FrameStack
 from membrane_ctrl.metrology.rays.artefacts import Artefact
 from membrane_ctrl.metrology.rays.bench_parameters import NAMES

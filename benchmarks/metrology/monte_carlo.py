@@ -16,13 +16,10 @@ from membrane_ctrl.metrology.phase.screen_scale import mm_per_rad
 from membrane_ctrl.metrology.rays.geometry import Geometry
 from membrane_ctrl.metrology.reconstruction.slope_noise import pixel_sigma_adu, slope_per_screen
 from membrane_ctrl.metrology.uncertainty.geometry_spread import PAPER_SPREAD
-from membrane_ctrl.metrology.uncertainty.monte_carlo import (
-    HeightMap,
-    TrialBench,
-    linear_covariance,
-    run_trials,
-    trial_covariance,
-)
+from membrane_ctrl.metrology.uncertainty.height_map import HeightMap
+from membrane_ctrl.metrology.uncertainty.linear_covariance import linear_covariance
+from membrane_ctrl.metrology.uncertainty.monte_carlo import run_trials, trial_covariance
+from membrane_ctrl.metrology.uncertainty.trial_bench import TrialBench
 from membrane_ctrl.sim.optics.film_shape import typical_film
 from membrane_ctrl.sim.optics.simulate import simulate_run
 from membrane_ctrl.sim.optics.simulation_spec import Motion, SimulationSpec

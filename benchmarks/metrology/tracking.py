@@ -15,7 +15,8 @@ from firmware_iface.roles import Pattern
 from membrane_ctrl.config.schema import OpticsConfig
 from membrane_ctrl.measure.measurement import Figures
 from membrane_ctrl.metrology.rays.surface import PARAMETERS, Surface
-from membrane_ctrl.metrology.tracking.crossed_scene import CrossedScene, scene_of
+from membrane_ctrl.metrology.tracking.crossed_scene import CrossedScene
+from membrane_ctrl.metrology.tracking.scene_from_reference import scene_of
 from membrane_ctrl.metrology.tracking.tracker import Tracker
 from membrane_ctrl.model.arrays import FloatArray
 from membrane_ctrl.model.zernike_terms import ZERNIKE_TERMS

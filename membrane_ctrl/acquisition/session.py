@@ -16,7 +16,8 @@ from membrane_ctrl.config.schema import Config, OpticsConfig, TwinConfig
 from membrane_ctrl.geometry import file, spread_file
 from membrane_ctrl.metrology.cycle import live_reconstructor
 from membrane_ctrl.metrology.phase import pattern_sequence
-from membrane_ctrl.metrology.tracking.live_tracker import Heard, LiveTracker, Stethoscope
+from membrane_ctrl.metrology.tracking.live_tracker import LiveTracker
+from membrane_ctrl.metrology.vibrations.mode_follower import Heard, Stethoscope
 from membrane_ctrl.model import files, plain_json
 from membrane_ctrl.model.clock import RunClock, pause_s
 from membrane_ctrl.model.events import Event

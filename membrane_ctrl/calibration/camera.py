@@ -23,8 +23,9 @@ from membrane_ctrl.measure.images import IMAGE_BYTES_MAX, decoded_image
 from membrane_ctrl.metrology.calibration import geometry_tables, ring_pose
 from membrane_ctrl.metrology.calibration.board import Board, on_screen
 from membrane_ctrl.metrology.calibration.board_lens import BoardView, Lens, calibrate_lens
-from membrane_ctrl.metrology.figure import pixel_figure
-from membrane_ctrl.metrology.frame_checks.checked_set import RejectedSetError, check
+from membrane_ctrl.metrology.figure import bin_figure
+from membrane_ctrl.metrology.frame_checks.checked_set import RejectedSetError
+from membrane_ctrl.metrology.frame_checks.set_check import check
 from membrane_ctrl.metrology.phase.screen_scale import mm_per_rad
 from membrane_ctrl.metrology.rays import ray_tracing
 from membrane_ctrl.metrology.rays.bench_parameters import usual_sigma
@@ -255,7 +256,7 @@ def _rim(capture: capture_set.CaptureSet) -> tuple[ray_tracing.HeightFunction, f
     except RejectedSetError as error:
         raise errors.RejectedError(f"{capture.head.folder}: rejected: {error}") from None
     surface, vertex_mm = (
-        pixel_figure.bin_figure(optics, checked).fit.surface,
+        bin_figure.bin_figure(optics, checked).fit.surface,
         checked.tracer.vertex_z_mm,
     )
 

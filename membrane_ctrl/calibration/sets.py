@@ -22,9 +22,11 @@ from membrane_ctrl.metrology.calibration import rim_edges, screen_pose, set_stat
 from membrane_ctrl.metrology.calibration.rim_edges import RADIUS_SIGMA_MM
 from membrane_ctrl.metrology.calibration.rim_equations import Rim
 from membrane_ctrl.metrology.calibration.solver import Problem, solve
-from membrane_ctrl.metrology.figure.pixel_figure import FilmMotion, bin_figure
-from membrane_ctrl.metrology.frame_checks import frame_evidence
-from membrane_ctrl.metrology.frame_checks.checked_set import Checked, absolute_phases
+from membrane_ctrl.metrology.figure.bin_figure import bin_figure
+from membrane_ctrl.metrology.figure.set_motion import FilmMotion
+from membrane_ctrl.metrology.frame_checks import bin_view
+from membrane_ctrl.metrology.frame_checks.bin_orders import absolute_phases
+from membrane_ctrl.metrology.frame_checks.checked_set import Checked
 from membrane_ctrl.metrology.phase import phase_steps, screen_scale
 from membrane_ctrl.metrology.phase.frame_stack import bin_frames
 from membrane_ctrl.metrology.rays import set_phases
@@ -284,7 +286,7 @@ def phases_of_screen(capture: CaptureSet) -> set_phases.SetPhases:
     binned = bin_frames(stack, 2**head.optics.camera.bits - 1)
     pattern, geometry = head.optics.pattern, Geometry.from_config(head.optics)
     try:
-        view = frame_evidence.look(stack, binned, set(stack.unusable))
+        view = bin_view.look(stack, binned, set(stack.unusable))
         phase_rad = absolute_phases(stack, binned, view, pattern)
         index = np.flatnonzero(np.isfinite(phase_rad).all(axis=0))
         grid, screen_mm = (
@@ -293,7 +295,7 @@ def phases_of_screen(capture: CaptureSet) -> set_phases.SetPhases:
         )
         place = grid.column_px[index], grid.row_px[index], screen_mm.reshape(2, -1)[:, index]
         screen = screen_pose.screen_seen(geometry, *place)
-    except (ValueError, frame_evidence.NoFigureError) as error:
+    except (ValueError, bin_view.NoFigureError) as error:
         raise errors.RejectedError(f"{head.folder}: rejected: {error}") from None
     noise = pixel_sigma_adu(head.optics.camera.noise_adu) / binned.bin_px
     shares = [phase_steps.phase_sigma_rad(stack.shifts_rad(used), noise, 1.0) for used in view.used]

@@ -19,7 +19,7 @@ import numpy as np
 from membrane_ctrl.measure.export_fits import fits_bytes
 from membrane_ctrl.measure.results import read_arrays
 from membrane_ctrl.metrology.figure import best_sphere
-from membrane_ctrl.metrology.figure.quantities import LEAST_CELLS
+from membrane_ctrl.metrology.figure.error_bars import LEAST_CELLS
 from membrane_ctrl.metrology.numerics import grid_fit, zernike
 from membrane_ctrl.model import errors, files, plain_json
 from membrane_ctrl.model.arrays import BoolArray, FloatArray, IntArray

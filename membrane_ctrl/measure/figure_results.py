@@ -17,16 +17,10 @@ import numpy as np
 from membrane_ctrl.measure.measurement import Measurement
 from membrane_ctrl.measure.results import ErrorBars, number_or_null, write_arrays
 from membrane_ctrl.metrology.figure import best_sphere
-from membrane_ctrl.metrology.figure.quantities import (
-    LEAST_CELLS,
-    Figure,
-    FigureBars,
-    FigureOf,
-    PowerSpectrum,
-    SurfaceMap,
-    figure_bars,
-    power_spectrum,
-)
+from membrane_ctrl.metrology.figure.error_bars import LEAST_CELLS, FigureBars, figure_bars
+from membrane_ctrl.metrology.figure.power_spectrum import PowerSpectrum, power_spectrum
+from membrane_ctrl.metrology.figure.quantities import Figure, FigureOf
+from membrane_ctrl.metrology.figure.surface_map import SurfaceMap
 from membrane_ctrl.metrology.numerics import zernike
 from membrane_ctrl.metrology.rays import surface
 from membrane_ctrl.model.errors import InputError

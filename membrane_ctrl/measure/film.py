@@ -11,10 +11,10 @@ import numpy as np
 from membrane_ctrl.geometry import file, spread_file
 from membrane_ctrl.measure.measurement import Figures, SetFigure
 from membrane_ctrl.measure.results import write_figure, write_json
-from membrane_ctrl.metrology.film import material_fit
+from membrane_ctrl.metrology.film import film_figure, material_fit
 from membrane_ctrl.metrology.film.film_law import FilmLaw
 from membrane_ctrl.metrology.rays.surface import Surface
-from membrane_ctrl.metrology.uncertainty import monte_carlo
+from membrane_ctrl.metrology.uncertainty import linear_covariance
 from membrane_ctrl.model import errors, files, program, terminal
 from membrane_ctrl.model.arrays import FloatArray
 
@@ -92,19 +92,19 @@ def film_command(options: FilmOptions) -> int:
 
 def _figures(
     sets: list[SetFigure], geometry: Path | None
-) -> tuple[list[material_fit.FilmFigure], str]:
+) -> tuple[list[film_figure.FilmFigure], str]:
     """The sets' figures with their errors, and where the geometry's spread comes from."""
     spread, source = spread_file.spread_of(sets[0].head.optics, geometry)
     out = []
     for one in sets:
         bench, surface = one.bench(), one.figure.fit.surface
         noise, geometric = (
-            monte_carlo.noise_covariance(bench),
-            monte_carlo.geometry_jacobian(bench, spread) @ spread.root(),
+            linear_covariance.noise_covariance(bench),
+            linear_covariance.geometry_jacobian(bench, spread) @ spread.root(),
         )
         name, pressure = one.head.folder.name, one.head.pressure_pa
         out.append(
-            material_fit.FilmFigure(
+            film_figure.FilmFigure(
                 name, surface.parameters, noise, geometric, pressure, surface.sag_mm
             )
         )
@@ -112,7 +112,7 @@ def _figures(
 
 
 def _departure(
-    figures: list[material_fit.FilmFigure], fit: material_fit.FilmFit, reach_mm: float
+    figures: list[film_figure.FilmFigure], fit: material_fit.FilmFit, reach_mm: float
 ) -> _Departure:
     radius = np.linspace(0.0, reach_mm, 96)
     seen, left = [], []
@@ -137,7 +137,7 @@ def _profile_mm(parameters_mm: FloatArray, radius_mm: float, at_mm: FloatArray) 
 
 
 def _notes(
-    figures: list[material_fit.FilmFigure], fit: material_fit.FilmFit, departure: _Departure
+    figures: list[film_figure.FilmFigure], fit: material_fit.FilmFit, departure: _Departure
 ) -> list[str]:
     """What these sets cannot tell, in words."""
     gauged = [figure.pressure_pa for figure in figures if np.isfinite(figure.pressure_pa)]
@@ -170,7 +170,7 @@ def _notes(
 
 
 def _table(
-    figures: list[material_fit.FilmFigure],
+    figures: list[film_figure.FilmFigure],
     fit: material_fit.FilmFit,
     departure: _Departure,
     source: str,
@@ -230,7 +230,7 @@ def _paper_prestrain(poisson: float, stiffness: FloatArray | float) -> float:
     return float(np.interp(_PAPER_EDGE_MM, float(hencky.sag_mm) - sags, strains))
 
 
-def _lines(table: dict[str, Any], figures: list[material_fit.FilmFigure]) -> list[str]:
+def _lines(table: dict[str, Any], figures: list[film_figure.FilmFigure]) -> list[str]:
     strain, poisson, stiffness = table["prestrain"], table["poisson"], table["stiffness_n_per_m"]
     sags = [figure.sag_mm for figure in figures]
     lines = [
@@ -267,7 +267,7 @@ def _lines(table: dict[str, Any], figures: list[material_fit.FilmFigure]) -> lis
 
 def _draw(
     path: Path,
-    figures: list[material_fit.FilmFigure],
+    figures: list[film_figure.FilmFigure],
     fit: material_fit.FilmFit,
     departure: _Departure,
 ) -> None:

@@ -8,24 +8,15 @@ import numpy as np
 
 from membrane_ctrl.geometry.file import GeometryFile, require_plausible
 from membrane_ctrl.measure.capture_set import CaptureHead, CaptureSet, anchored, read_set
-from membrane_ctrl.metrology.figure.pixel_figure import (
-    BinFigure,
-    FullResult,
-    bin_figure,
-    measure_pixels,
-    reconstruct_full,
-)
+from membrane_ctrl.metrology.figure.bin_figure import BinFigure, bin_figure
+from membrane_ctrl.metrology.figure.pixel_figure import FullResult, measure_pixels, reconstruct_full
 from membrane_ctrl.metrology.frame_checks import frame_faults
-from membrane_ctrl.metrology.frame_checks.checked_set import (
-    Anchor,
-    Checked,
-    RejectedSetError,
-    check,
-)
+from membrane_ctrl.metrology.frame_checks.checked_set import Anchor, Checked, RejectedSetError
 from membrane_ctrl.metrology.frame_checks.multi_frequency import check_frequencies
+from membrane_ctrl.metrology.frame_checks.set_check import check
 from membrane_ctrl.metrology.phase import frame_stack
 from membrane_ctrl.metrology.rays.artefacts import Artefact
-from membrane_ctrl.metrology.uncertainty.monte_carlo import TrialBench
+from membrane_ctrl.metrology.uncertainty.trial_bench import TrialBench
 from membrane_ctrl.model import errors, shape_estimate
 
 

@@ -23,7 +23,7 @@ from membrane_ctrl.metrology.figure.pixel_figure import FullResult
 from membrane_ctrl.metrology.rays import surface
 from membrane_ctrl.metrology.rays.rim_outline import Outline
 from membrane_ctrl.metrology.reconstruction import slope_noise
-from membrane_ctrl.metrology.uncertainty import monte_carlo, set_budget
+from membrane_ctrl.metrology.uncertainty import height_map, set_budget
 from membrane_ctrl.metrology.uncertainty.budget import Budget
 from membrane_ctrl.model import errors, program, zernike_terms
 from membrane_ctrl.model.arrays import FloatArray
@@ -47,7 +47,7 @@ class ErrorBars:
     budget: Budget
     source: str  # source of the geometry's covariance
     doubts: tuple[str, ...]  # what the set says of its own errors, and what to do
-    grid: monte_carlo.HeightMap  # grid of `maps_um`
+    grid: height_map.HeightMap  # grid of `maps_um`
     # 1 sigma of the mean slope of a cell of the height map, from pixel noise
     cell_slope: float = 0.0
     zonal_um: float = 0.0  # and of the map's height over the fit
@@ -105,7 +105,7 @@ def error_bars(
         raise errors.InputError(
             f"{source}: too wide: the figure does not follow from such a geometry"
         ) from None
-    grid = monte_carlo.HeightMap.over(optics.mirror.analysis_radius_mm, optics.mirror.radius_mm)
+    grid = height_map.HeightMap.over(optics.mirror.analysis_radius_mm, optics.mirror.radius_mm)
     shifts_rad = [checked.stack.shifts_rad(used) for used in checked.view.used]
     variance = full.slope_variance(optics, shifts_rad, noise_adu)
     cell_slope = math.sqrt(

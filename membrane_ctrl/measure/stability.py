@@ -19,7 +19,13 @@ from membrane_ctrl.geometry.file import read_geometry
 from membrane_ctrl.geometry.spread_file import spread_of
 from membrane_ctrl.measure import capture_set, measurement, results, stability_results
 from membrane_ctrl.metrology.rays.surface import PARAMETERS, parameter_to_coeffs
-from membrane_ctrl.metrology.uncertainty import geometry_spread, monte_carlo, stability
+from membrane_ctrl.metrology.uncertainty import (
+    figure_pairs,
+    geometry_spread,
+    height_map,
+    monte_carlo,
+    running_statistics,
+)
 from membrane_ctrl.model import errors, files, program, terminal
 from membrane_ctrl.model.arrays import FloatArray
 
@@ -58,19 +64,20 @@ class StabilityRun:
         self._open = contextlib.ExitStack()
         self._series = self._table(SERIES, stability_results.series_head(points_mm))
         self._pair_rows = self._table("pairs.csv", _PAIR_HEAD)
-        self._grid: monte_carlo.HeightMap | None = None
+        self._grid: height_map.HeightMap | None = None
         self._point_matrix: FloatArray = np.zeros((len(points_mm), PARAMETERS))
         self._spread: geometry_spread.GeometrySpread | None = None
         self._source = ""
         self._origin: dict[str, str | None] = {}
-        self._parameters = stability.RunningCovariance(PARAMETERS)
-        self._heights = {name: stability.Tally() for name in points_mm}
-        self._rmse, self._time = stability.Tally(), stability.Tally()
-        self._finder = stability.PairFinder()
+        self._parameters = running_statistics.RunningCovariance(PARAMETERS)
+        self._heights = {name: running_statistics.Tally() for name in points_mm}
+        self._rmse, self._time = running_statistics.Tally(), running_statistics.Tally()
+        self._finder = figure_pairs.PairFinder()
         self._pairs = {
-            lag: (stability.Tally(), stability.Tally()) for lag in stability.LAGS_S
+            lag: (running_statistics.Tally(), running_statistics.Tally())
+            for lag in figure_pairs.LAGS_S
         }  # change, RMSE
-        self._shown: dict[float, stability.FigurePair] = {}
+        self._shown: dict[float, figure_pairs.FigurePair] = {}
         self._bad: list[dict[str, str]] = []
         self._bad_count = 0
         self.degraded = 0
@@ -140,7 +147,7 @@ class StabilityRun:
         )
         cells = (f"{value:.12g}" for value in (*numbers, *heights_um, *(1e3 * surface.coeffs_mm)))
         self._series.writerow((name, one.verdict, one.reason, *cells))
-        for pair in self._finder.add(stability.Moment(name, one.time_s, parameters, trials)):
+        for pair in self._finder.add(figure_pairs.Moment(name, one.time_s, parameters, trials)):
             self._add_pair(grid, pair)
 
     def table(self) -> dict[str, Any]:
@@ -159,7 +166,7 @@ class StabilityRun:
             "duration_s": self._time.high - self._time.low if self._time.count else None,
             "sd_um": {"mean": float(sd_um.mean()), "max": float(sd_um.max())},
             "points": self._point_table(),
-            "pairs": [self._pair_table(lag) for lag in stability.LAGS_S],
+            "pairs": [self._pair_table(lag) for lag in figure_pairs.LAGS_S],
             "rmse_um": {"mean": self._rmse.mean, "min": self._rmse.low, "max": self._rmse.high},
             "zernike": {
                 "index": "noll",
@@ -225,12 +232,12 @@ class StabilityRun:
             times = np.arange(len(times), dtype=float)
         return times, heights, coeffs
 
-    def _grid_for(self, one: measurement.SetFigure) -> monte_carlo.HeightMap:
+    def _grid_for(self, one: measurement.SetFigure) -> height_map.HeightMap:
         if self._grid is None:
             mirror = one.head.optics.mirror
-            self._grid = monte_carlo.HeightMap.over(mirror.analysis_radius_mm, mirror.radius_mm)
+            self._grid = height_map.HeightMap.over(mirror.analysis_radius_mm, mirror.radius_mm)
             x, y = np.array(list(self._points_mm.values())).T
-            self._point_matrix = monte_carlo.height_matrix(x, y, mirror.radius_mm)
+            self._point_matrix = height_map.height_matrix(x, y, mirror.radius_mm)
         return self._grid
 
     def _spread_for(self, one: measurement.SetFigure) -> geometry_spread.GeometrySpread:
@@ -245,7 +252,7 @@ class StabilityRun:
             return np.zeros(1)
         return 1e3 * self._grid.sigma(self._parameters.covariance)
 
-    def _add_pair(self, grid: monte_carlo.HeightMap, pair: stability.FigurePair) -> None:
+    def _add_pair(self, grid: height_map.HeightMap, pair: figure_pairs.FigurePair) -> None:
         rmse_um = 1e3 * grid.sigma(pair.covariance)
         change_um = float(1e3 * np.sqrt(np.mean(np.square(grid.matrix @ pair.change))))
         for tally, value in zip(
@@ -387,7 +394,7 @@ def points_mm(given: tuple[str, ...], analysis_radius_mm: float) -> dict[str, tu
             within = f"within {analysis_radius_mm:g} mm of the vertex"
             raise errors.InputError(f"--point {text}: needs a name and a place {within}")
         points[name] = (x, y)
-    return points or stability.default_points_mm(analysis_radius_mm)
+    return points or running_statistics.default_points_mm(analysis_radius_mm)
 
 
 def _analyse(folders: list[Path], figures: measurement.Figures, run: StabilityRun) -> None:

@@ -23,9 +23,10 @@ from membrane_ctrl.geometry.file import GeometryFile, read_geometry
 from membrane_ctrl.measure.capture_set import read_image, reference_of, require_inside
 from membrane_ctrl.measure.measurement import Figures, SetFigure
 from membrane_ctrl.measure.results import write_arrays, write_figure
-from membrane_ctrl.metrology.figure.pixel_figure import BinFigure, measure_pixels, reconstruct_full
-from membrane_ctrl.metrology.tracking.crossed_scene import scene_of
-from membrane_ctrl.metrology.tracking.frame_fit import ENOUGH_STEPS, separable
+from membrane_ctrl.metrology.figure.bin_figure import BinFigure
+from membrane_ctrl.metrology.figure.pixel_figure import measure_pixels, reconstruct_full
+from membrane_ctrl.metrology.tracking.scene_from_reference import scene_of
+from membrane_ctrl.metrology.tracking.step_solution import ENOUGH_STEPS, separable
 from membrane_ctrl.metrology.tracking.tracked_frame import TrackedFrame, rejected_frame
 from membrane_ctrl.metrology.tracking.tracker import Tracker
 from membrane_ctrl.model import errors, files, program, terminal

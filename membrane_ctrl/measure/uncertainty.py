@@ -19,7 +19,13 @@ from membrane_ctrl.measure.measure import light_and_rim
 from membrane_ctrl.measure.measurement import Figures, SetFigure, measure_set
 from membrane_ctrl.measure.results import error_bars, write_arrays, write_json
 from membrane_ctrl.metrology.rays.surface import parameter_to_coeffs, sag_gradient
-from membrane_ctrl.metrology.uncertainty import geometry_spread, monte_carlo
+from membrane_ctrl.metrology.uncertainty import (
+    geometry_spread,
+    height_map,
+    linear_covariance,
+    monte_carlo,
+    trial_bench,
+)
 from membrane_ctrl.model import errors, files, program, terminal
 from membrane_ctrl.model.arrays import FloatArray
 from membrane_ctrl.processes.child import results_of
@@ -35,7 +41,7 @@ _WORTH_PROCESSES = 5000
 
 
 def run_everywhere(
-    benches: Sequence[monte_carlo.TrialBench],
+    benches: Sequence[trial_bench.TrialBench],
     spread: geometry_spread.GeometrySpread,
     seed: int,
     trials: int,
@@ -117,7 +123,7 @@ def uncertainty_command(options: UncertaintyOptions) -> int:
     seconds = time.perf_counter() - begin
     result = _spread(benches, spread, parameters, _budget(folders, given, options.geometry))
     mirror = sets[0].head.optics.mirror
-    grid = monte_carlo.HeightMap.over(mirror.analysis_radius_mm, mirror.radius_mm)
+    grid = height_map.HeightMap.over(mirror.analysis_radius_mm, mirror.radius_mm)
     table = _table(options, sets, spread, source, result, grid) | {"timing_s": {"trials": seconds}}
     out = options.out.resolve() if options.out else options.folder / "uncertainty"
     own, *other = (one.figure.fit.surface.parameters for one in sets)
@@ -148,17 +154,17 @@ def _budget(
 
 
 def _spread(
-    benches: list[monte_carlo.TrialBench],
+    benches: list[trial_bench.TrialBench],
     spread: geometry_spread.GeometrySpread,
     parameters: FloatArray,
     budget: FloatArray,
 ) -> Spread:
     """Spread of the only set, or of the first minus the second, trial by trial."""
     own = parameters[:, 0] if len(benches) == 1 else parameters[:, 0] - parameters[:, 1]
-    noise = np.sum([monte_carlo.noise_covariance(bench) for bench in benches], axis=0)
+    noise = np.sum([linear_covariance.noise_covariance(bench) for bench in benches], axis=0)
     return Spread(
         monte_carlo.trial_covariance(own),
-        monte_carlo.linear_covariance(benches, spread),
+        linear_covariance.linear_covariance(benches, spread),
         noise,
         budget,
     )
@@ -170,7 +176,7 @@ def _table(
     spread: geometry_spread.GeometrySpread,
     source: str,
     result: Spread,
-    grid: monte_carlo.HeightMap,
+    grid: height_map.HeightMap,
 ) -> dict[str, Any]:
     spreads = result.covariance, result.linear, result.noise, result.budget
     rmse, linear, noise, budget = (1e3 * grid.sigma(c) for c in spreads)
@@ -199,7 +205,7 @@ def _table(
 
 def _write(
     out: Path,
-    grid: monte_carlo.HeightMap,
+    grid: height_map.HeightMap,
     result: Spread,
     height_um: FloatArray,
     table: dict[str, Any],

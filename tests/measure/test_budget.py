@@ -22,7 +22,7 @@ from membrane_ctrl.config.optics import (
 )
 from membrane_ctrl.geometry.spread_file import spread_of
 from membrane_ctrl.metrology.figure.pixel_figure import measure_pixels, reconstruct_full
-from membrane_ctrl.metrology.frame_checks.checked_set import check
+from membrane_ctrl.metrology.frame_checks.set_check import check
 from membrane_ctrl.metrology.phase.frame_stack import FrameStack
 from membrane_ctrl.metrology.rays.bench_parameters import NAMES
 from membrane_ctrl.metrology.rays.bench_poses import bench_at
@@ -31,7 +31,7 @@ from membrane_ctrl.metrology.rays.ray_tracing import Points, Tracer, parabola
 from membrane_ctrl.metrology.rays.rim_outline import find_outline
 from membrane_ctrl.metrology.reconstruction.surface_fit import solve
 from membrane_ctrl.metrology.uncertainty.budget import Budget, Source
-from membrane_ctrl.metrology.uncertainty.monte_carlo import height_matrix
+from membrane_ctrl.metrology.uncertainty.height_map import height_matrix
 from membrane_ctrl.metrology.uncertainty.set_budget import Examined, examine
 from membrane_ctrl.model.zernike_terms import ZERNIKE_TERMS
 from membrane_ctrl.sim.optics.camera import OpticsRenderer

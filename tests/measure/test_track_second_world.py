@@ -16,12 +16,14 @@ import pytest
 
 from membrane_ctrl.cli import run
 from membrane_ctrl.measure.measurement import Figures
-from membrane_ctrl.metrology.figure.pixel_figure import FilmMotion
+from membrane_ctrl.metrology.figure.set_motion import FilmMotion
 from membrane_ctrl.metrology.frame_checks.backlight_bands import Bands
 from membrane_ctrl.metrology.numerics import zernike
 from membrane_ctrl.metrology.rays.surface import Surface, sag_gradient
-from membrane_ctrl.metrology.tracking.crossed_scene import CrossedScene, scene_of
-from membrane_ctrl.metrology.tracking.frame_fit import FrameFit, FrameFitter, _split, stepped
+from membrane_ctrl.metrology.tracking.crossed_scene import CrossedScene
+from membrane_ctrl.metrology.tracking.frame_fit import FrameFit, FrameFitter
+from membrane_ctrl.metrology.tracking.scene_from_reference import scene_of
+from membrane_ctrl.metrology.tracking.step_solution import _split, stepped
 from membrane_ctrl.metrology.tracking.tracker import Tracker
 from membrane_ctrl.model.zernike_terms import NOLL_INDICES, ZERNIKE_TERMS
 from tests.studies.tracked_errors import (

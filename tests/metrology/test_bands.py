@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from firmware_iface.roles import Pattern
 from membrane_ctrl.cli import run
-from membrane_ctrl.metrology.frame_checks.backlight_bands import without_bands
+from membrane_ctrl.metrology.frame_checks.band_removal import without_bands
 from membrane_ctrl.metrology.phase.frame_stack import FrameStack, bin_frames
 from membrane_ctrl.metrology.phase.pixel_phases import pixel_phases
 from membrane_ctrl.metrology.reconstruction.film_motion import combine_steps

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from membrane_ctrl.metrology.frame_checks.frame_faults import (
+from membrane_ctrl.metrology.frame_checks.closure import (
     closure,
     closure_with_level,
     closure_with_phase,

@@ -13,7 +13,13 @@ from prysm import interferogram
 from prysm.polynomials import ansi_j_to_nm, fringe_to_nm, noll_to_nm, zernike_nm
 from scipy.optimize import least_squares, minimize_scalar
 
-from membrane_ctrl.metrology.figure import best_sphere, quantities
+from membrane_ctrl.metrology.figure import (
+    best_sphere,
+    error_bars,
+    power_spectrum,
+    quantities,
+    surface_map,
+)
 from membrane_ctrl.metrology.numerics import zernike
 from membrane_ctrl.metrology.rays import surface
 from membrane_ctrl.model.zernike_terms import NOLL_INDICES, ZERNIKE_TERMS
@@ -26,11 +32,11 @@ INSIDE = R <= APERTURE
 ABERRATED = {5: 0.004, 6: -0.3, 7: 0.1, 10: -0.05, 11: 0.02, 22: 0.004, 33: 0.003}
 
 
-def seen(height_mm: np.ndarray, hole: bool = False) -> quantities.SurfaceMap:
+def seen(height_mm: np.ndarray, hole: bool = False) -> surface_map.SurfaceMap:
     """A measured map, optionally with a hole."""
     measured = INSIDE & ~(hole & (np.hypot(X - 90, Y + 40) < 60))
     slope_y, slope_x = np.gradient(height_mm, float(AXIS[1] - AXIS[0]), edge_order=2)
-    return quantities.SurfaceMap(AXIS, np.where(measured, height_mm, np.nan), slope_x, slope_y)
+    return surface_map.SurfaceMap(AXIS, np.where(measured, height_mm, np.nan), slope_x, slope_y)
 
 
 def height_of(film: TrueFilm) -> np.ndarray:
@@ -38,17 +44,17 @@ def height_of(film: TrueFilm) -> np.ndarray:
     return film.height(X.ravel(), Y.ravel()).reshape(X.shape)
 
 
-def of(surface_map: quantities.SurfaceMap) -> quantities.Figure:
+def of(shown: surface_map.SurfaceMap) -> quantities.Figure:
     """Its figure."""
-    return quantities.FigureOf(surface_map, APERTURE)(surface_map)
+    return quantities.FigureOf(shown, APERTURE)(shown)
 
 
 def bars_of(
-    some: quantities.SurfaceMap, covariance: np.ndarray, cell_slope: float = 0.0
-) -> quantities.FigureBars:
+    some: surface_map.SurfaceMap, covariance: np.ndarray, cell_slope: float = 0.0
+) -> error_bars.FigureBars:
     """Its error bars."""
     evaluate = quantities.FigureOf(some, APERTURE)
-    return quantities.figure_bars(evaluate, some, evaluate(some), 500.0, covariance, cell_slope)
+    return error_bars.figure_bars(evaluate, some, evaluate(some), 500.0, covariance, cell_slope)
 
 
 def ball(radius_mm: float, tilt_x: float = 0.0, tilt_y: float = 0.0) -> np.ndarray:
@@ -176,8 +182,8 @@ def test_the_spectrum_is_prysms_and_sees_a_ripple() -> None:
     x, y = np.meshgrid(axis, axis)
     inside = np.hypot(x, y) <= APERTURE
     height = np.where(inside, 1e-3 * np.cos(2 * np.pi * x / 50), np.nan)
-    ripple = of(quantities.SurfaceMap(axis, height, 0 * x, 0 * x))
-    found = quantities.power_spectrum(ripple, axis, APERTURE)
+    ripple = of(surface_map.SurfaceMap(axis, height, 0 * x, 0 * x))
+    found = power_spectrum.power_spectrum(ripple, axis, APERTURE)
     assert 1 / found.frequency_per_mm[np.argmax(found.density_um2_mm2)] == pytest.approx(
         50, rel=0.03
     )
@@ -238,7 +244,7 @@ def test_a_covariance_that_is_unknown_gives_no_error_bar() -> None:
 )
 def test_a_figure_of_any_part_of_a_mirror(part: np.ndarray) -> None:
     height = np.where(part & INSIDE, ball(3400.0), np.nan)
-    some = quantities.SurfaceMap(AXIS, height, X / 3400, Y / 3400)
+    some = surface_map.SurfaceMap(AXIS, height, X / 3400, Y / 3400)
     assert of(some).numbers.radius_of_curvature_mm == pytest.approx(3400, rel=1e-6)
     bars = bars_of(some, 1e-12 * np.eye(ZERNIKE_TERMS), 1e-6)
     assert np.isfinite(astuple(bars.numbers)).all()

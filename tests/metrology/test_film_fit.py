@@ -12,7 +12,7 @@ from metrology_truth import FloatArray
 from numpy.polynomial import Legendre, Polynomial
 from prysm.polynomials import noll_to_nm, zernike_nm
 
-from membrane_ctrl.metrology.film import hencky_bowl, material_fit
+from membrane_ctrl.metrology.film import film_figure, hencky_bowl, material_fit
 from membrane_ctrl.metrology.film.film_law import FilmLaw
 from membrane_ctrl.model.zernike_terms import NOLL_INDICES, ZERNIKE_TERMS
 from membrane_ctrl.sim.film import stretched
@@ -37,7 +37,7 @@ class World:
     scale: float = 0.0  # 1 sigma of an error of the geometry that makes every height larger
     gauge: bool = True
 
-    def figures(self, seed: int) -> list[material_fit.FilmFigure]:
+    def figures(self, seed: int) -> list[film_figure.FilmFigure]:
         """One draw."""
         rng = np.random.default_rng(seed)
         common, wrong = (
@@ -57,7 +57,7 @@ class World:
             seen = true + common + gain * error + rng.normal(0, 3e-6, ZERNIKE_TERMS)
             pressure = load * STIFFNESS / 0.5 * (1 + 1e-3 * scale) + offset_pa + rng.normal(0, 0.3)
             out.append(
-                material_fit.FilmFigure(
+                film_figure.FilmFigure(
                     f"set{k}",
                     seen,
                     9e-12 * np.eye(ZERNIKE_TERMS),
@@ -81,7 +81,7 @@ def _round_terms(height_mm: Polynomial) -> FloatArray:
     return np.linalg.lstsq(design, 2 * rho * height_mm.deriv()(rho**2), rcond=None)[0]
 
 
-def _fit(figures: list[material_fit.FilmFigure]) -> material_fit.FilmFit:
+def _fit(figures: list[film_figure.FilmFigure]) -> material_fit.FilmFit:
     return material_fit.fit_film(figures, RADIUS_MM, 475.0, material_fit.Gauge())
 
 

@@ -11,8 +11,9 @@ import pytest
 from rendered_sets import FILM, bench, faulty_set, good_set, patterns
 
 from membrane_ctrl.config.schema import OpticsConfig, PatternConfig
-from membrane_ctrl.metrology.frame_checks.checked_set import RejectedSetError, check
-from membrane_ctrl.metrology.frame_checks.frame_faults import identical_frames
+from membrane_ctrl.metrology.frame_checks.checked_set import RejectedSetError
+from membrane_ctrl.metrology.frame_checks.frame_inspection import identical_frames
+from membrane_ctrl.metrology.frame_checks.set_check import check
 from membrane_ctrl.metrology.rays.surface import Surface
 from membrane_ctrl.sim.optics.film_shape import Bump, FilmShape, Ripple, Wrinkle, typical_film
 from membrane_ctrl.sim.optics.shade import Light

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from membrane_ctrl.config.optics import CameraConfig, GeometryConfig, OpticsConfig
-from membrane_ctrl.metrology.figure.pixel_figure import bin_figure
+from membrane_ctrl.metrology.figure.bin_figure import bin_figure
 from membrane_ctrl.metrology.frame_checks.checked_set import Checked, RejectedSetError
 from membrane_ctrl.metrology.frame_checks.multi_frequency import check_frequencies
 from membrane_ctrl.metrology.phase.frame_stack import FrameStack

@@ -9,7 +9,8 @@ import pytest
 from rendered_sets import FILM, bench, faulty_set, good_set
 
 from membrane_ctrl.config.schema import CameraConfig, OpticsConfig
-from membrane_ctrl.metrology.frame_checks.checked_set import Anchor, RejectedSetError, check
+from membrane_ctrl.metrology.frame_checks.checked_set import Anchor, RejectedSetError
+from membrane_ctrl.metrology.frame_checks.set_check import check
 from membrane_ctrl.metrology.phase.frame_stack import FrameStack
 from membrane_ctrl.metrology.rays.surface import Surface
 

@@ -13,13 +13,13 @@ from rendered_sets import FILM, bench, good_set, patterns, stack_of
 
 from membrane_ctrl.config.schema import OpticsConfig
 from membrane_ctrl.metrology.figure.pixel_figure import (
-    FilmMotion,
     FullResult,
     measure_pixels,
     reconstruct_full,
     tukey,
 )
-from membrane_ctrl.metrology.frame_checks.checked_set import check
+from membrane_ctrl.metrology.figure.set_motion import FilmMotion
+from membrane_ctrl.metrology.frame_checks.set_check import check
 from membrane_ctrl.metrology.phase.frame_stack import FrameStack
 from membrane_ctrl.metrology.rays.ray_tracing import HeightFunction, parabola
 from membrane_ctrl.metrology.rays.surface import Surface

@@ -18,7 +18,7 @@ from membrane_ctrl.config.optics import SigmasConfig
 from membrane_ctrl.config.schema import OpticsConfig, PatternConfig
 from membrane_ctrl.metrology.calibration.geometry_tables import general_form
 from membrane_ctrl.metrology.cycle.live_reconstructor import LiveReconstructor
-from membrane_ctrl.metrology.frame_checks import backlight_bands
+from membrane_ctrl.metrology.frame_checks import band_removal
 from membrane_ctrl.metrology.phase.pattern_sequence import fringe_sequence, full_sequence
 from membrane_ctrl.metrology.rays.bench_parameters import NAMES
 from membrane_ctrl.metrology.rays.bench_poses import bench_at
@@ -456,7 +456,7 @@ def test_bands_that_cannot_be_explained_degrade_the_cycle(monkeypatch: pytest.Mo
     """They stayed in a cycle called ok."""
     live = _live()
     live._bands_rad = np.array([0.3])
-    monkeypatch.setattr(backlight_bands, "_UNEXPLAINED", -1.0)
+    monkeypatch.setattr(band_removal, "_UNEXPLAINED", -1.0)
     found = live.fringes(*_render("fringes"))
     assert (found.verdict, found.reason[:34]) == ("degraded", "bands of the backlight could not b")
     assert live._bands_rad.size == 1  # looked for again in the next

@@ -8,8 +8,9 @@ import numpy as np
 import pytest
 
 from membrane_ctrl.metrology.uncertainty import set_budget
-from membrane_ctrl.metrology.uncertainty.budget import FrameEffects
-from membrane_ctrl.metrology.uncertainty.cycle_errors import FramesSeen, LiveErrors
+from membrane_ctrl.metrology.uncertainty.cycle_errors import LiveErrors
+from membrane_ctrl.metrology.uncertainty.cycle_frames import FramesSeen
+from membrane_ctrl.metrology.uncertainty.frame_effects import FrameEffects
 
 TERMS, FRAMES = 2, 8
 

@@ -9,8 +9,8 @@ import math
 import numpy as np
 import pytest
 
-from membrane_ctrl.metrology.tracking import live_tracker
-from membrane_ctrl.metrology.tracking.live_tracker import Heard, Stethoscope
+from membrane_ctrl.metrology.vibrations import mode_follower
+from membrane_ctrl.metrology.vibrations.mode_follower import Heard, Stethoscope
 from membrane_ctrl.metrology.vibrations.mode_search import VibrationMode, find_modes
 from membrane_ctrl.model.events import Event, Maintenance, MaintenanceOver
 from membrane_ctrl.model.run_events import Vibrations, from_dict
@@ -227,7 +227,7 @@ def heard(
     told: list[list[Event]] = []
     for minute, found in enumerate(lines):
         modes = tuple(VibrationMode(hz, 0.01, 5.0, SHAPES[k], 100.0) for k, hz in found.items())
-        monkeypatch.setattr(live_tracker, "find_modes", lambda *_, modes=modes: modes)
+        monkeypatch.setattr(mode_follower, "find_modes", lambda *_, modes=modes: modes)
         told.append(
             listener.search(
                 day * DAY_S + 60.0 * minute + np.arange(0.0, 60.0, 0.05),

@@ -9,8 +9,9 @@ import pytest
 from rendered_sets import FILM, bench, patterns, stack_of
 
 from membrane_ctrl.config.schema import OpticsConfig
-from membrane_ctrl.metrology.figure.pixel_figure import BinFigure, bin_figure
-from membrane_ctrl.metrology.frame_checks.checked_set import Checked, check
+from membrane_ctrl.metrology.figure.bin_figure import BinFigure, bin_figure
+from membrane_ctrl.metrology.frame_checks.checked_set import Checked
+from membrane_ctrl.metrology.frame_checks.set_check import check
 from membrane_ctrl.metrology.phase.frame_stack import FrameStack
 from membrane_ctrl.metrology.rays.surface import Surface
 from membrane_ctrl.metrology.uncertainty.geometry_spread import (
@@ -18,16 +19,15 @@ from membrane_ctrl.metrology.uncertainty.geometry_spread import (
     GeometrySpread,
     changed,
 )
-from membrane_ctrl.metrology.uncertainty.monte_carlo import (
-    HeightMap,
-    TrialBench,
+from membrane_ctrl.metrology.uncertainty.height_map import HeightMap
+from membrane_ctrl.metrology.uncertainty.linear_covariance import (
     geometry_covariance,
     geometry_jacobian,
     linear_covariance,
     noise_covariance,
-    run_trials,
-    trial_covariance,
 )
+from membrane_ctrl.metrology.uncertainty.monte_carlo import run_trials, trial_covariance
+from membrane_ctrl.metrology.uncertainty.trial_bench import TrialBench
 from membrane_ctrl.sim.optics.camera import OpticsRenderer
 
 OPTICS = bench()

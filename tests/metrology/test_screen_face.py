@@ -16,7 +16,7 @@ from membrane_ctrl.config.optics import (
 )
 from membrane_ctrl.metrology.cycle.live_reconstructor import LiveReconstructor
 from membrane_ctrl.metrology.figure.pixel_figure import measure_pixels, reconstruct_full
-from membrane_ctrl.metrology.frame_checks.checked_set import check
+from membrane_ctrl.metrology.frame_checks.set_check import check
 from membrane_ctrl.metrology.rays.bench_poses import BenchGeometry
 from membrane_ctrl.metrology.rays.forward_model import residual_mm
 from membrane_ctrl.metrology.rays.geometry import Geometry

@@ -10,7 +10,7 @@ import pytest
 
 from membrane_ctrl.measure import measure as sofast
 from membrane_ctrl.measure.measure import SHIFTS_RAD, lit_pixels, series_of
-from membrane_ctrl.metrology.frame_checks.frame_faults import (
+from membrane_ctrl.metrology.frame_checks.closure import (
     closure,
     closure_with_level,
     closure_with_phase,

@@ -10,9 +10,8 @@ import tracemalloc
 import numpy as np
 import pytest
 
-from membrane_ctrl.metrology.uncertainty.stability import (
-    Moment,
-    PairFinder,
+from membrane_ctrl.metrology.uncertainty.figure_pairs import Moment, PairFinder
+from membrane_ctrl.metrology.uncertainty.running_statistics import (
     RunningCovariance,
     Tally,
     default_points_mm,

@@ -13,8 +13,12 @@ from numpy.typing import NDArray
 from firmware_iface.roles import Pattern
 from membrane_ctrl.config.schema import CameraConfig, OpticsConfig
 from membrane_ctrl.measure.measurement import Figures, SetFigure
-from membrane_ctrl.metrology.tracking.crossed_scene import CrossedScene, scene_of
-from membrane_ctrl.metrology.tracking.tracked_frame import Jumps, LostOrders, TrackedFrame, steadied
+from membrane_ctrl.metrology.tracking.crossed_scene import CrossedScene
+from membrane_ctrl.metrology.tracking.lost_orders import LostOrders
+from membrane_ctrl.metrology.tracking.scene_from_reference import scene_of
+from membrane_ctrl.metrology.tracking.step_jumps import Jumps
+from membrane_ctrl.metrology.tracking.step_means import steadied
+from membrane_ctrl.metrology.tracking.tracked_frame import TrackedFrame
 from membrane_ctrl.metrology.tracking.tracker import Tracker
 from membrane_ctrl.model.zernike_terms import NOLL_INDICES, ZERNIKE_TERMS
 from membrane_ctrl.sim.optics.camera import OpticsRenderer

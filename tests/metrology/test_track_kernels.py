@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from membrane_ctrl.metrology.numerics.grouped_sums import sums_by
 from membrane_ctrl.metrology.tracking.bin_cells import Cells
-from membrane_ctrl.metrology.tracking.crossed_scene import light_left, light_waves
+from membrane_ctrl.metrology.tracking.light_kernels import light_left, light_waves
 from membrane_ctrl.model.zernike_terms import ZERNIKE_TERMS
 
 Array = NDArray[np.float64]

@@ -9,7 +9,7 @@ from membrane_ctrl.metrology.calibration.solver import Solution, step
 from membrane_ctrl.metrology.rays import bench_parameters
 
 _BETTER = 5.0  # times: what another instrument may give
-_WORTH = 0.9  # of the sag's sigma: less of a gain is not worth the trouble
+WORTHWHILE_SHARE = 0.9  # of the sag's sigma: less of a gain is not worth the trouble
 
 
 @dataclass(frozen=True)
@@ -42,6 +42,7 @@ def number_advice(solution: Solution, index: int) -> Advice | None:
     best = min(found, key=lambda each: each.sag_um, default=None)
     return (
         best
-        if best is not None and best.sag_um < _WORTH * sag_um(surface_covariance(solution, index))
+        if best is not None
+        and best.sag_um < WORTHWHILE_SHARE * sag_um(surface_covariance(solution, index))
         else None
     )

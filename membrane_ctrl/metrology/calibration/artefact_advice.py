@@ -5,7 +5,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from membrane_ctrl.metrology.calibration import robust_weights, set_state
-from membrane_ctrl.metrology.calibration.advice import _WORTH
+from membrane_ctrl.metrology.calibration.advice import WORTHWHILE_SHARE
 from membrane_ctrl.metrology.calibration.figure_uncertainty import sag_um, surface_covariance
 from membrane_ctrl.metrology.calibration.foreseen_sets import foreseen_equations, with_equations
 from membrane_ctrl.metrology.calibration.solver import Solution
@@ -70,7 +70,7 @@ def artefact_advice(solution: Solution, index: int) -> ArtefactAdvice | None:
     )
     then = with_equations(solution, (*solution.equations, more))
     then_um, now_um = (sag_um(surface_covariance(each, index)) for each in (then, solution))
-    if not then_um < _WORTH * now_um:
+    if not then_um < WORTHWHILE_SHARE * now_um:
         return None
     worst = max(
         weak_combinations(solution, index, surface.radius_mm),

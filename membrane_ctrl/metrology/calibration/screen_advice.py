@@ -7,7 +7,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from membrane_ctrl.metrology.calibration import robust_weights, set_state
-from membrane_ctrl.metrology.calibration.advice import _WORTH
+from membrane_ctrl.metrology.calibration.advice import WORTHWHILE_SHARE
 from membrane_ctrl.metrology.calibration.figure_uncertainty import sag_um, surface_covariance
 from membrane_ctrl.metrology.calibration.foreseen_sets import (
     foreseen_equations,
@@ -59,7 +59,7 @@ def screen_advice(solution: Solution, index: int) -> tuple[ScreenAdvice, ...]:
             name: sag_um(surface_covariance(then, index)) for name, (then, _) in tried.items()
         }
         name = min(claims, key=lambda each: claims[each])
-        if not claims[name] < _WORTH * sag_um(surface_covariance(found, index)):
+        if not claims[name] < WORTHWHILE_SHARE * sag_um(surface_covariance(found, index)):
             break
         found, distance_mm = tried[name]
         out.append(ScreenAdvice(name, distance_mm, claims[name]))

@@ -15,7 +15,7 @@ import numpy as np
 
 from membrane_ctrl.config.schema import OpticsConfig
 from membrane_ctrl.metrology.film import hencky_bowl
-from membrane_ctrl.metrology.frame_checks import backlight_bands
+from membrane_ctrl.metrology.frame_checks import band_removal
 from membrane_ctrl.metrology.phase import (
     bin_sums,
     full_decoder,
@@ -271,10 +271,10 @@ class LiveReconstructor:
             (len(slots), self._optics.camera.height_px, 0), np.uint8
         )  # the bins are enough
         stack = FrameStack(none, self._patterns, np.full(len(slots), math.nan), {})
-        stack, binned, found = backlight_bands.without_bands(stack, binned, known)
+        stack, binned, found = band_removal.without_bands(stack, binned, known)
         self._bands_rad, self._doubt = (
             found if not known.size else known,
-            backlight_bands.doubt(stack.gain),
+            band_removal.doubt(stack.gain),
         )
         if known.size and not found.size:
             self._doubt = (

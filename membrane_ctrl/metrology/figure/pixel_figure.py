@@ -1,19 +1,19 @@
-"""The full result of a checked set: slopes at every pixel, robust fit, and the zonal map of the
+"""The figure of a checked set from every pixel: slopes, robust fit, and the zonal map of the
 residual.
 """
 
-import math
 from dataclasses import dataclass, replace
 
 import numpy as np
 
 from membrane_ctrl.config.schema import OpticsConfig
-from membrane_ctrl.metrology.figure.quantities import SurfaceMap
+from membrane_ctrl.metrology.figure.set_motion import FilmMotion, combine_axis_steps
+from membrane_ctrl.metrology.figure.set_quality import set_quality
+from membrane_ctrl.metrology.figure.surface_map import SurfaceMap
 from membrane_ctrl.metrology.frame_checks.checked_set import Checked
 from membrane_ctrl.metrology.phase import (
     full_decoder,
     pattern_sequence,
-    phase_change,
     phase_steps,
     screen_scale,
 )
@@ -26,12 +26,6 @@ from membrane_ctrl.metrology.reconstruction.normal_matrix import NormalMatrix
 from membrane_ctrl.model.arrays import FloatArray, IntArray, Singles
 from membrane_ctrl.model.shape_estimate import Quality
 
-LASER_NOISE_UM = 1.0  # repeatability of the bench's laser
-# standard deviation of the film's place: less is hardly seen, and leaves 0.06 µm in the figure
-_STILL_UM = 0.2
-# motion from x to y over its RMS among the frames of an axis: 3.3 for a random walk, 7.2 for a
-# drift, of four steps
-X_TO_Y = 5.0
 _START_SAG_MM = 40.0  # the paper's starting parabola
 # Solutions from different starts agree to a hundredth of the last change: 1e-9 mm
 _LAST_CHANGE_MM = 1e-7
@@ -96,72 +90,6 @@ class FullResult:
         return SurfaceMap(
             grid.axis_mm, height + self.residual_mm, slope_x + grid.slope_x, slope_y + grid.slope_y
         )
-
-
-def motion_share(within_um: float, noise_um: float) -> float:
-    """Share of what a laser tells of the motion from x to y that is motion, if it is so large
-    within an axis.
-    """
-    return (X_TO_Y * within_um) ** 2 / ((X_TO_Y * within_um) ** 2 + noise_um**2)
-
-
-@dataclass(frozen=True)
-class FilmMotion:
-    """The film during a set, as laser and fringes tell it."""
-
-    told_um: tuple[
-        FloatArray, FloatArray
-    ]  # at the used sinusoids of x and of y, about the mean of both
-    x_to_y_sigma_um: (
-        float  # 1 sigma of the difference between the means of x and of y; NaN without a laser
-    )
-    noise_um: float  # 1 sigma of the fringes' part in each of these places
-
-    @classmethod
-    def of(cls, checked: Checked) -> "FilmMotion":
-        """Of a checked set.
-
-        The fringes see the motion from frame to frame of one axis, to a tenth of a micrometre,
-        where the laser's noise is one. Of a difference between the axes they make a figure: there
-        the laser counts, as far as a film that moves so much from frame to frame moves from one
-        axis to the other. What the fringes tell is in part
-        noise: only what their scatter has beyond it is motion.
-        """
-        x, y = checked.view.used
-        seen = [axis - axis.mean() for axis in np.split(checked.film_um, [len(x)])]
-        within_um2 = float(np.var(np.concatenate(seen)))
-        noise_um2 = checked.film_noise_um**2 * (
-            1 - 2 / (len(x) + len(y))
-        )  # the means of both axes are taken off
-        moving = max(1 - noise_um2 / max(within_um2, 1e-12), 0.0)
-        readings_um, laser_um = (
-            checked.stack.displacement_um,
-            LASER_NOISE_UM * math.sqrt(1 / len(x) + 1 / len(y)),
-        )
-        x_to_y_um = float(readings_um[x].mean() - readings_um[y].mean())
-        least, most = (
-            motion_share(math.sqrt(part * within_um2), laser_um) for part in (moving, 1.0)
-        )
-        # noise may hide a motion, which the laser tells by itself where it is beyond 2 sigma
-        share = float(np.clip(1 - (2 * laser_um) ** 2 / max(x_to_y_um**2, 1e-12), least, most))
-        # the figure is that of all readings' mean, also where a frame is left out
-        about_um = readings_um[[*x, *y]].mean() - checked.stack.mean_reading_um
-        parts = np.nan_to_num(
-            about_um + share * x_to_y_um * np.array([len(y), -len(x)]) / (len(x) + len(y))
-        )
-        told_um = (moving * seen[0] + parts[0], moving * seen[1] + parts[1])
-        sigma_um = math.hypot(math.sqrt(most) * laser_um, (most - share) * x_to_y_um)
-        return cls(told_um, sigma_um, checked.film_noise_um)
-
-    @property
-    def moved_um(self) -> float:
-        """RMS motion."""
-        return float(np.std(np.concatenate(self.told_um)))
-
-    @property
-    def worth_correcting(self) -> bool:
-        """Whether the film moved."""
-        return self.moved_um > _STILL_UM
 
 
 @dataclass(frozen=True)
@@ -241,7 +169,7 @@ def _axis_phases(
     told_um: FloatArray | None,
 ) -> PixelPhases:
     stack, used = checked.stack, checked.view.used[axis]
-    combined = _combination(checked, axis, told_um)
+    combined = combine_axis_steps(checked, axis, told_um)
     every = stack.sinusoids(pattern_sequence.AXES[axis])
     # a slice does not copy the frames; a list does
     frames = stack.frames[every[0] : every[-1] + 1] if used == every else stack.frames[used]
@@ -297,7 +225,7 @@ def reconstruct_full(
         rest_adu=pixels.rest_adu,
         grid=grid,
         residual_mm=zonal_map.integrate(grid),
-        quality=_quality(optics, checked, fit, float(np.median(pixels.swing_adu))),
+        quality=set_quality(optics, checked, fit, float(np.median(pixels.swing_adu))),
         moved=pixels.moved,
     )
 
@@ -320,70 +248,3 @@ def tukey(residual: FloatArray) -> FloatArray:
     # set
     reach = _TUKEY_SIGMAS * max(float(np.median(residual[::7])) / 1.177, 1e-9)
     return np.asarray(np.square(np.maximum(1 - np.square(residual / reach), 0.0)))
-
-
-def _quality(
-    optics: OpticsConfig, checked: Checked, fit: surface_fit.Fit, swing_adu: float
-) -> Quality:
-    area = math.pi * optics.mirror.analysis_radius_mm**2
-    used = [k for axis in checked.view.used for k in axis]
-    saturated = checked.binned.saturated[used].any(axis=0) & checked.near
-    seen = (checked.view.mask & checked.near) | saturated
-    return Quality(
-        modulation_share=swing_adu / (2**optics.camera.bits - 1),
-        saturated_fraction=float(np.mean(saturated[seen])) if seen.any() else 0.0,
-        valid_fraction=min(1.0, float(np.sum(checked.state.area_mm2)) / area),
-        residual_urad=1e6 * math.hypot(fit.residual_x, fit.residual_y) / math.sqrt(2),
-        converged=fit.converged,
-    )
-
-
-# The figure of a checked set from its bins, for the analysis of many sets: for Zernike terms the
-# bins carry as much as the pixels, at a sixteenth of the cost (decision 41).
-
-
-@dataclass(frozen=True)
-class BinFigure:
-    """Surface through the bins of one set."""
-
-    fit: surface_fit.Fit  # Hencky excess and Zernike terms
-    points: ray_tracing.Points  # the bins' rays and screen points, standing on the surface
-    index: IntArray  # (n,): their bins
-    sigma_mm: FloatArray  # (2, n): 1 sigma of the screen points from the noise of the pixels
-    quality: Quality  # for the verdict
-
-
-def bin_figure(optics: OpticsConfig, checked: Checked, film: FilmMotion | None = None) -> BinFigure:
-    """Phases of the bins, corrected for the film's motion, and the surface fitted to them."""
-    stack, state, film = checked.stack, checked.state, film or FilmMotion.of(checked)
-    sums = [checked.binned.means[used].reshape(len(used), -1) for used in checked.view.used]
-    told_um = film.told_um if film.worth_correcting else (None, None)
-    steps = [_combination(checked, axis, told) for axis, told in enumerate(told_um)]
-    followed = np.empty_like(state.accepted)
-    # the loop takes any numbers: here means over the bins, hence a bin side of 1 in the
-    # combinations
-    phase_change.track(
-        sums, state.index, steps, state.sensitivity_rad_per_um, state.accepted, followed
-    )
-    scale = screen_scale.mm_per_rad(optics.pattern)
-    points = state.points.subset(np.ones(state.index.size, bool))
-    points.screen_mm[:] = followed[:, 0] * scale - state.offset_mm
-    fit = surface_fit.solve(checked.tracer, points, state.surface)
-    checked.tracer.intersect(points, fit.surface)
-    swing = followed[:, 4]
-    noise = slope_noise.pixel_sigma_adu(optics.camera.noise_adu) / checked.binned.bin_px
-    shifts = [stack.shifts_rad(used) for used in checked.view.used]
-    sigma = np.stack(
-        [phase_steps.phase_sigma_rad(d, noise, 1.0) / b for d, b in zip(shifts, swing, strict=True)]
-    )
-    quality = _quality(optics, checked, fit, float(np.median(swing.min(axis=0))))
-    return BinFigure(fit, points, state.index, scale * sigma, quality)
-
-
-def _combination(
-    checked: Checked, axis: int, motion_um: FloatArray | None
-) -> phase_change.StepCombination:
-    """How the means of the usable frames of an axis combine, whose film moved so."""
-    used = checked.view.used[axis]
-    shifts = checked.stack.shifts_rad(used)
-    return film_motion.combine_steps(checked.stack.weights(used), shifts, 1, motion_um)

@@ -40,7 +40,7 @@ _USUAL = 3.0  # slackness of a film that is stretched by half a per cent under 6
 _SERIES_TERMS = 80
 _WAVE_TERMS = 14  # of a disturbance: it converges tenfold a term
 _NODES = 48
-_COMPLEX_STEP = 1e-30  # small enough that its square is nothing beside 1
+COMPLEX_STEP = 1e-30  # small enough that its square is nothing beside 1
 HarmonicCause = Literal["prestrain", "flat", "round"]
 
 
@@ -86,8 +86,8 @@ def _slackness(falls: Callable[[AnyArray], AnyArray], wanted: FloatArray) -> Flo
     usual = np.all(falls(np.asarray(_USUAL)) > wanted)
     s = np.full(np.shape(wanted), _USUAL if usual else 1e-15)
     for _ in range(80):
-        value = falls(s + 1j * _COMPLEX_STEP)
-        step = (wanted - value.real) / (value.imag / _COMPLEX_STEP)
+        value = falls(s + 1j * COMPLEX_STEP)
+        step = (wanted - value.real) / (value.imag / COMPLEX_STEP)
         s = np.minimum(s + step, SLACKEST)
         if np.all(np.abs(step) <= 1e-15 * s):
             break

@@ -11,7 +11,7 @@ from functools import cache
 import numpy as np
 from numpy.polynomial import chebyshev
 
-from membrane_ctrl.metrology.film.film_law import _COMPLEX_STEP, FilmLaw
+from membrane_ctrl.metrology.film.film_law import COMPLEX_STEP, FilmLaw
 from membrane_ctrl.model.arrays import AnyArray, FloatArray
 
 _FINITE_TERMS = 14  # of U: 1e-12 of the slopes
@@ -26,7 +26,7 @@ def finite_rise_mm(law: FilmLaw, load: float, rho: FloatArray) -> FloatArray:
     film = float(law.prestrain), poisson, load
     radial, hoop = bowl.stresses(np.sqrt(v))
     unknowns = np.linalg.lstsq(outward, hoop - poisson * radial - film[0], rcond=None)[0]
-    steps = _COMPLEX_STEP * 1j * np.eye(unknowns.size + 1)[:, 1:].T  # the first column stays
+    steps = COMPLEX_STEP * 1j * np.eye(unknowns.size + 1)[:, 1:].T  # the first column stays
     for _ in range(20):
         near = unknowns[:, None] + steps
         force, around, along, wide = _finite_forces(film, v, outward @ near, grows @ near, radial)
@@ -37,7 +37,7 @@ def finite_rise_mm(law: FilmLaw, load: float, rho: FloatArray) -> FloatArray:
             - around * wide
             + load**2 * v[:, None] * wide**3 / (2 * force)
         )
-        step = np.linalg.solve(left[:, 1:].imag / _COMPLEX_STEP, -left[:, 0].real)
+        step = np.linalg.solve(left[:, 1:].imag / COMPLEX_STEP, -left[:, 0].real)
         unknowns = unknowns + step
         if np.max(np.abs(step)) < 1e-14:
             break

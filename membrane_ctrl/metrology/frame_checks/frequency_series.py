@@ -21,7 +21,7 @@ from itertools import combinations
 
 import numpy as np
 
-from membrane_ctrl.metrology.frame_checks.frame_faults import (
+from membrane_ctrl.metrology.frame_checks.closure import (
     Closure,
     closure,
     closure_with_level,

@@ -13,15 +13,11 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from membrane_ctrl.config.schema import OpticsConfig
-from membrane_ctrl.metrology.frame_checks import frame_faults
-from membrane_ctrl.metrology.frame_checks.checked_set import (
-    Anchor,
-    Checked,
-    RejectedSetError,
-    check,
-)
+from membrane_ctrl.metrology.frame_checks import closure, frame_faults
+from membrane_ctrl.metrology.frame_checks.checked_set import Anchor, Checked, RejectedSetError
 from membrane_ctrl.metrology.frame_checks.frame_faults import Flag, FrameDefect
 from membrane_ctrl.metrology.frame_checks.frequency_series import CLOSURE_SHARE, CLOSURE_TIMES, GAIN
+from membrane_ctrl.metrology.frame_checks.set_check import check
 from membrane_ctrl.metrology.phase import (
     fringe_orders,
     full_decoder,
@@ -60,7 +56,7 @@ class _Series:
         always agree.
         """
         return (
-            self._over_amplitude(frame_faults.closure(self.seen, self.shifts_rad).rms_adu)
+            self._over_amplitude(closure.closure(self.seen, self.shifts_rad).rms_adu)
             if len(self.frames) > 3
             else np.nan
         )
@@ -68,15 +64,15 @@ class _Series:
     def _over_amplitude(self, rms_adu: float) -> float:
         return rms_adu / max(float(np.median(np.abs(self.phasor))), 1e-9)
 
-    def blamed(self, place_mm: FloatArray) -> frame_faults.Closure:
+    def blamed(self, place_mm: FloatArray) -> closure.Closure:
         """The closure that can name a frame: of five steps, or with the phase by the other periods'
         place.
         """
         if len(self.frames) > 4:
-            return frame_faults.closure(self.seen, self.shifts_rad)
+            return closure.closure(self.seen, self.shifts_rad)
         known = np.isfinite(place_mm)
         expected = 2 * np.pi * place_mm[known] / self.period_mm - np.pi
-        return frame_faults.closure_with_phase(self.seen[:, known], self.shifts_rad, expected)
+        return closure.closure_with_phase(self.seen[:, known], self.shifts_rad, expected)
 
 
 def check_frequencies(stack: FrameStack, optics: OpticsConfig) -> Checked:

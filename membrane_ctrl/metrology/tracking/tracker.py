@@ -15,16 +15,19 @@ import numpy as np
 from membrane_ctrl.metrology.frame_checks.backlight_bands import Bands
 from membrane_ctrl.metrology.phase.bin_sums import Binner
 from membrane_ctrl.metrology.rays import surface
-from membrane_ctrl.metrology.tracking import tracked_frame
-from membrane_ctrl.metrology.tracking.crossed_scene import CrossedScene
-from membrane_ctrl.metrology.tracking.frame_fit import (
-    ENOUGH_STEPS,
-    FrameFit,
-    FrameFitter,
-    separable,
-    stepped,
+from membrane_ctrl.metrology.tracking import (
+    frame_verdict,
+    light_squares,
+    lost_orders,
+    step_jumps,
+    step_means,
+    tracked_frame,
 )
-from membrane_ctrl.metrology.tracking.tracked_frame import Finding, TrackedFrame
+from membrane_ctrl.metrology.tracking.crossed_scene import CrossedScene
+from membrane_ctrl.metrology.tracking.frame_fit import FrameFit, FrameFitter
+from membrane_ctrl.metrology.tracking.frame_verdict import Finding
+from membrane_ctrl.metrology.tracking.step_solution import ENOUGH_STEPS, separable, stepped
+from membrane_ctrl.metrology.tracking.tracked_frame import TrackedFrame
 from membrane_ctrl.model.arrays import BoolArray, FloatArray, Image, Singles
 from membrane_ctrl.model.zernike_terms import ZERNIKE_TERMS
 
@@ -74,11 +77,11 @@ class Tracker:
         self._noise_adu = math.hypot(noise_adu, math.sqrt(1 / 12)) / scene.bin_px
         self._bands = Bands(scene.row)
         self._fitter = FrameFitter(scene, self._bands)
-        self._jumps = tracked_frame.Jumps()
+        self._jumps = step_jumps.Jumps()
         self._begin(scene, scene.surface, np.zeros((3, ZERNIKE_TERMS)))
         self._last_time_s, self._last_displacement_um = math.nan, displacement_um
         self._anchor_light = math.nan
-        self._orders = tracked_frame.LostOrders(self._fitter)
+        self._orders = lost_orders.LostOrders(self._fitter)
         self._orders.require_telling()
         self._knocked = ""
         # its time, parameters: of the last five steps
@@ -100,9 +103,9 @@ class Tracker:
         self._last = FrameFit(shape, light, none, all_bins, True)
         self._light, self._shown_rad = math.nan, (math.nan, math.nan)
         self._errors_due: tuple[FrameFit, tuple[float, float]] | None = None
-        self._squares = tracked_frame.Squares(scene)
+        self._squares = light_squares.Squares(scene)
         self._jumps.begin()
-        self._steps: list[tracked_frame.StandingFrames] = []
+        self._steps: list[step_means.StandingFrames] = []
 
     def anchor(
         self,
@@ -160,7 +163,7 @@ class Tracker:
         drifted_mm = np.outer(
             time_s, self._drift_mm_per_s(float(np.mean(time_s)), fitted.mean(axis=0))
         )
-        seen_at, place_mm2 = tracked_frame.steadied(fitted, np.array(variance_mm2), drifted_mm)
+        seen_at, place_mm2 = step_means.steadied(fitted, np.array(variance_mm2), drifted_mm)
         places = [surface.Surface.from_parameters(place, radius_mm) for place in seen_at]
         fits = [replace(fit, surface=place) for fit, place in zip(fits, places, strict=True)]
         scene, moved, moved_mm2 = stepped(self._fitter, fits, seen_adu, np.array(shifts_rad))
@@ -193,7 +196,7 @@ class Tracker:
         if not self._steps or self._steps[-1].shifts_rad != shifts_rad:
             self._steps = [
                 *self._steps[1 - ENOUGH_STEPS :],
-                tracked_frame.StandingFrames(shifts_rad),
+                step_means.StandingFrames(shifts_rad),
             ]
         self._steps[-1].add(seen_adu, fit, time_s)
 
@@ -274,8 +277,8 @@ class Tracker:
             )
         saturated = self._binner.saturated.ravel()[index] > 0
         light, covered = self._squares.look(seen)
-        faults = tracked_frame.light_faults(float(np.mean(saturated)), light, covered)
-        faults += tracked_frame.light_changes(light, self._light, self._anchor_light)
+        faults = frame_verdict.light_faults(float(np.mean(saturated)), light, covered)
+        faults += frame_verdict.light_changes(light, self._light, self._anchor_light)
         rejected = next((f for f in faults if f.verdict == "rejected"), None)
         if rejected is not None:
             return tracked_frame.rejected_frame(time_s, rejected.reason)
@@ -374,14 +377,14 @@ class Tracker:
 
     def _lost(self, fit: FrameFit) -> bool:
         return (
-            not fit.converged or self._scale_of(fit) > tracked_frame.REST_REJECTED * self._swing_adu
+            not fit.converged or self._scale_of(fit) > frame_verdict.REST_REJECTED * self._swing_adu
         )
 
     def _doubt(
         self, fit: FrameFit, rest: float, out: float, time_s: float, displacement_um: float
     ) -> Finding | None:
         """Whether the solution is the next one of this mirror."""
-        failed = tracked_frame.fit_fault(fit, rest, out)
+        failed = frame_verdict.fit_fault(fit, rest, out)
         if failed is not None:
             return failed
         change_um = 1e3 * (fit.surface.parameters - self._last.surface.parameters)

@@ -1,5 +1,5 @@
-"""Errors of live cycles beyond the noise of the pixels: what the frames show of them, and what that
-leaves.
+"""Errors of live cycles beyond the noise of the pixels: what the frames show of them, and what
+that leaves.
 
 The sensitivities are those of the budget of `measure`, computed once, with the first full cycle.
 Each cycle then asks some of its points what light each frame had and where the film was (see
@@ -24,7 +24,17 @@ from membrane_ctrl.metrology.reconstruction import (
     surface_fit,
     tracked_points,
 )
-from membrane_ctrl.metrology.uncertainty import budget, geometry_spread, monte_carlo, set_budget
+from membrane_ctrl.metrology.uncertainty import (
+    bench_sources,
+    film_shape_error,
+    frame_effects,
+    geometry_spread,
+    image_blur,
+    laser_errors,
+    residual_patches,
+    trial_bench,
+)
+from membrane_ctrl.metrology.uncertainty.cycle_frames import FramesSeen, frames_seen
 from membrane_ctrl.model.arrays import AnyArray, FloatArray, IntArray
 
 # Some points determine light and place of a frame to 1e-4 and 20 nm, a tenth of what they leave
@@ -35,8 +45,6 @@ _LEFT = 0.03
 # Waves of uneven light nearly cancel over the mirror: the few points that show them would not show
 # what is left
 _WAVE_POINTS = 20_000
-_COLUMNS = 6  # of a frame, see `frames_seen`
-_DIFFERS = np.array([1.0, 1.0, 0.0, 1.0, 1.0, 1.0])  # of these columns, all but the phase step
 _SECOND_ORDER = 0.01
 _FAR_UM = 300.0  # displacement over which the sensitivities are compared
 # A film this far from the reference cycle makes a new one: changes are stated within a hold, not
@@ -45,25 +53,10 @@ _REFERENCE_UM = 100.0
 
 
 @dataclass(frozen=True)
-class FramesSeen:
-    """Light and film of the 2 N frames of a cycle, x frames first,
-    each about the mean of its axis.
-    """
-
-    level: FloatArray  # (2 N,): relative
-    swing: FloatArray  # (2 N,): relative
-    told_um: FloatArray  # (2 N,): the film, as the phases were corrected for
-    moved_um: FloatArray  # (2 N,): the film beyond that
-    # (2, 2): second and third of x and of y over the amplitude: the display's response
-    harmonics: FloatArray
-    waves_rad: FloatArray  # (2, n): what all that adds to the phases of the points
-
-
-@dataclass(frozen=True)
 class LiveErrors:
     """Sensitivities of the surface's parameters, in mm."""
 
-    frames: budget.FrameEffects
+    frames: frame_effects.FrameEffects
     vertex: FloatArray  # (parameters,): per µm of the vertex' place
     # (parameters, parameters): covariance of what all cycles share; NaN if the spread is unknown or
     # too wide
@@ -78,8 +71,8 @@ class LiveErrors:
     @classmethod
     def of(
         cls,
-        bench: monte_carlo.TrialBench,
-        waves: monte_carlo.TrialBench,
+        bench: trial_bench.TrialBench,
+        waves: trial_bench.TrialBench,
         shifts_rad: FloatArray,
         light: FloatArray,
         seen: FramesSeen,
@@ -92,16 +85,18 @@ class LiveErrors:
         `light` (2, n) is that of the latter over the amplitude of their fringes, and `left`
         (parameters, k) the effects of the slopes that the fit leaves.
         """
-        frames = budget.frame_effects(waves, bench.optics, shifts_rad, light, seen.harmonics)
-        vertex = budget.vertex_source(bench, 1.0, "").effects_mm[:, 0]
+        frames = frame_effects.frame_effects(waves, bench.optics, shifts_rad, light, seen.harmonics)
+        vertex = bench_sources.vertex_source(bench, 1.0, "").effects_mm[:, 0]
         none = np.zeros((vertex.size, vertex.size))
         if spread is None:
             return cls(frames, vertex, none + np.nan, none, none)
         try:
             here = _shared(bench, spread, blur_px)
-            per_um = (_shared(budget.moved_film(bench, _FAR_UM), spread, blur_px) - here) / _FAR_UM
+            per_um = (
+                _shared(trial_bench.moved_film(bench, _FAR_UM), spread, blur_px) - here
+            ) / _FAR_UM
             x_mm, y_mm = (
-                budget.moved_film(bench, sign * _FAR_UM / 2).screen_mm for sign in (1, -1)
+                trial_bench.moved_film(bench, sign * _FAR_UM / 2).screen_mm for sign in (1, -1)
             )
             told = _of_geometry(replace(bench, screen_mm=np.stack([x_mm[0], y_mm[1]])), spread)
             told = (told - here[:, : told.shape[1]]) / _FAR_UM
@@ -133,8 +128,8 @@ class LiveErrors:
         light, film_um = _LEFT * _rms(seen.level, seen.swing), _LEFT * _rms(seen.moved_um)
         if np.isfinite(readings_um).all():  # motion is taken out to first order
             film_um += _SECOND_ORDER * float(np.std(readings_um))
-        x_to_y_um = set_budget.left_by_laser_um(readings_um, _rms(seen.moved_um), laser_noise_um)
-        vertex_um = set_budget.vertex_um(readings_um, laser_noise_um)
+        x_to_y_um = laser_errors.left_by_laser_um(readings_um, _rms(seen.moved_um), laser_noise_um)
+        vertex_um = laser_errors.vertex_um(readings_um, laser_noise_um)
         if not np.isfinite(readings_um).all():  # half of that motion is in the frames' mean
             vertex_um = math.hypot(vertex_um, x_to_y_um / 2)
         effects = [
@@ -150,14 +145,14 @@ class LiveErrors:
 
 
 def _shared(
-    bench: monte_carlo.TrialBench, spread: geometry_spread.GeometrySpread, blur_px: float
+    bench: trial_bench.TrialBench, spread: geometry_spread.GeometrySpread, blur_px: float
 ) -> FloatArray:
     """Effects (parameters, k) of what all cycles share. Raises ArithmeticError if a fit at the
     spread's end fails.
     """
     sources = [
-        *budget.bench_sources(bench, bench.optics.geometry.sigmas or SigmasConfig()),
-        budget.blur_source(bench, blur_px),
+        *bench_sources.bench_sources(bench, bench.optics.geometry.sigmas or SigmasConfig()),
+        image_blur.blur_source(bench, blur_px),
     ]
     return np.concatenate(
         [_of_geometry(bench, spread), *(source.effects_mm for source in sources)], axis=1
@@ -165,10 +160,10 @@ def _shared(
 
 
 def _of_geometry(
-    bench: monte_carlo.TrialBench, spread: geometry_spread.GeometrySpread
+    bench: trial_bench.TrialBench, spread: geometry_spread.GeometrySpread
 ) -> FloatArray:
     return np.concatenate(
-        [source.effects_mm for source in budget.geometry_sources(bench, spread)], axis=1
+        [source.effects_mm for source in bench_sources.geometry_sources(bench, spread)], axis=1
     )
 
 
@@ -244,7 +239,7 @@ class ErrorWatch:
         """Choose from the points of a full cycle those that are asked."""
         places_px = self._places_px[:, state.index]
         self._asked = np.flatnonzero(
-            monte_carlo.spread_evenly(places_px, self._optics.camera.width_px, POINTS)
+            trial_bench.spread_evenly(places_px, self._optics.camera.width_px, POINTS)
         )
 
     def look(self, cycle: Cycle) -> CycleErrors:
@@ -288,8 +283,8 @@ class ErrorWatch:
         tracer, state, fit = cycle.tracer, cycle.state, cycle.fit
         field = tracer.slope_field(state.points, fit.surface)
         reach_mm, slopes = self._optics.mirror.analysis_radius_mm, field[2:4] - field[4:6]
-        patches = budget.Patches.of(field[:2], state.points.weights, slopes, reach_mm)
-        law, _ = set_budget.law_effect(patches, tracer.radius_mm, fit.normal.inverse)
+        patches = residual_patches.Patches.of(field[:2], state.points.weights, slopes, reach_mm)
+        law, _ = film_shape_error.law_effect(patches, tracer.radius_mm, fit.normal.inverse)
         left = np.column_stack([patches.effects(tracer.radius_mm, fit.normal.inverse), law])
         levels = [
             w[0] @ sums[:, state.index] for w, sums in zip(self._weights, cycle.sums, strict=True)
@@ -297,15 +292,15 @@ class ErrorWatch:
         light = np.stack(levels) / self._bin_px**2 / state.fresh[:, 4]
         phases = np.full((2, self._places_px.shape[1]), np.nan)
         phases[:, state.index] = state.fresh[:, 0]
-        blur_px = set_budget.blur_px(
+        blur_px = image_blur.blur_px(
             phases.reshape(2, *self._shape), 1 / light, state.index, self._bin_px
         )
         places_px, width_px = self._places_px[:, state.index], self._optics.camera.width_px
-        many = np.flatnonzero(monte_carlo.spread_evenly(places_px, width_px, _WAVE_POINTS))
+        many = np.flatnonzero(trial_bench.spread_evenly(places_px, width_px, _WAVE_POINTS))
 
-        def bench(at: IntArray) -> monte_carlo.TrialBench:
+        def bench(at: IntArray) -> trial_bench.TrialBench:
             some, exact = state.points.subset(at), np.zeros((2, at.size))
-            return monte_carlo.TrialBench.of_points(
+            return trial_bench.TrialBench.of_points(
                 self._optics, tracer, fit.surface, some, places_px[:, at], exact, at.size
             )
 
@@ -319,74 +314,6 @@ class ErrorWatch:
             blur_px,
             left,
         )
-
-
-def frames_seen(
-    means: FloatArray,
-    shifts_rad: FloatArray,
-    weights: FloatArray,
-    phase_rad: FloatArray,
-    told_um: FloatArray,
-    sensitivity_rad_per_um: FloatArray,
-) -> FramesSeen:
-    """Light and film of each frame from points whose phases are known without any single frame.
-
-    Parameters
-    ----------
-    means : (2, N, n) array
-        What the frames of each axis show at the points.
-    shifts_rad : (2, N) array
-        Phase steps; `weights` (2, 3, N) are their `phase.step_weights`.
-    phase_rad : (2, n) array
-        Phases of the fitted surface at the points, film at its mean place.
-    told_um : (2, N) array
-        Place of the film about its mean, as the phases were corrected for.
-    sensitivity_rad_per_um : (2, n) array
-        Change of phase per µm of displacement.
-    """
-    scenes, out, waves = weights @ means, [], []
-    for axis, frames in enumerate(means):
-        # of the other axis: uneven light leaves waves in the scene of its own frames, which would
-        # hide half of it
-        level, cosine, sine = scenes[1 - axis]
-        swing, slope = np.hypot(cosine, sine), sensitivity_rad_per_um[axis]
-        wave = np.exp(
-            1j * (shifts_rad[axis][:, None] + phase_rad[axis] + told_um[axis][:, None] * slope)
-        )
-        # level, swing, step, film, the display's harmonics (`frames.evidence`), and the frame
-        table = np.empty((len(frames), _COLUMNS + 1, level.size))
-        table[:, 0], table[:, 1], table[:, 2] = level, swing * wave.real, swing * wave.imag
-        table[:, 3] = (slope.mean() - slope) * table[:, 2]
-        square = wave * wave
-        table[:, 4], table[:, 5] = swing * square.real, swing * (square * wave).real
-        table[:, 6] = frames
-        gram = table @ table.transpose(0, 2, 1)
-        scale = np.sqrt(np.maximum(np.diagonal(gram, axis1=1, axis2=2), 1e-30))
-        gram = gram / (scale[:, :, None] * scale[:, None, :])
-        solved = np.linalg.solve(gram[:, :-1, :-1] + 1e-9 * np.eye(_COLUMNS), gram[:, :-1, -1:])[
-            :, :, 0
-        ]
-        found = solved * scale[:, -1:] / scale[:, :-1]
-        # of errors of light and place alone: what differs from frame to frame
-        differs = (found - found.mean(axis=0)) * _DIFFERS
-        amplitude = np.hypot(found[:, 1], found[:, 2])
-        relative = found[:, 3:] / np.maximum(amplitude, 1e-9)[:, None]
-        # and of the harmonics, which move with the film as well
-        second, third = relative[:, 1:].mean(axis=0)
-        display = -(2 * second * square.imag + 3 * third * (square * wave).imag) * swing * slope
-        errors = np.einsum("kp,kpn->kn", differs, table[:, :-1]) + told_um[axis][:, None] * display
-        added = weights[axis, 1:] @ errors
-        unit = np.exp(1j * phase_rad[axis])
-        waves.append(
-            (added[1] * unit.real - added[0] * unit.imag) / (swing * abs(found[:, 1].mean()))
-        )
-        out.append(np.stack([found[:, 0], amplitude, *relative.T]))
-    shown = np.stack(out, axis=1)  # (5, 2, N): level, swing, film, harmonics
-    means = shown.mean(axis=2)
-    about = shown[:3] - means[:3, :, None]
-    about[:2] /= means[:2, :, None]
-    level, swing, moved_um = about.reshape(3, -1)
-    return FramesSeen(level, swing, told_um.ravel(), moved_um, means[3:].T, np.stack(waves))
 
 
 def _rms(*parts: FloatArray) -> float:

@@ -1,0 +1,116 @@
+"""Error bars of a figure's numbers, by trials.
+
+The fit's parameters have two covariances, from noise and from the geometry; the cells have their
+own noise besides. Figures of disturbed surfaces differ from the measured one: the RMS of these
+differences is 1 sigma. It holds also where a quantity is not linear, such as an RMS near zero,
+which any disturbance raises.
+"""
+
+from collections.abc import Iterator
+from dataclasses import astuple, dataclass, fields
+
+import numpy as np
+
+from membrane_ctrl.metrology.figure.quantities import ENERGY_SHARES, Figure, FigureOf, Quantities
+from membrane_ctrl.metrology.figure.surface_map import SurfaceMap
+from membrane_ctrl.metrology.numerics import zernike
+from membrane_ctrl.metrology.rays import surface
+from membrane_ctrl.metrology.reconstruction import zonal_map
+from membrane_ctrl.model.arrays import FloatArray
+
+LEAST_CELLS = 4 * zernike.FRINGE_TERMS  # fewer give no figure
+_TRIALS = 32  # 1 sigma to 12 %
+_TRIAL_CELLS = 96  # a side, at least
+_WHITE_TRIALS = 4  # on every cell: a mean over thinned cells would be too noisy; to 35 %
+_TILE = 256  # cells
+_EDGE = 0.03  # of the rays, on either side
+
+
+@dataclass(frozen=True)
+class FigureBars:
+    """1 sigma of a figure's numbers and Fringe terms."""
+
+    numbers: Quantities
+    fringe_um: FloatArray  # (37,)
+
+
+def figure_bars(
+    evaluate: FigureOf,
+    seen: SurfaceMap,
+    found: Figure,
+    disc_mm: float,
+    covariance_mm2: FloatArray,
+    cell_slope: float = 0.0,
+) -> FigureBars:
+    """1 sigma of a figure `found` = `evaluate(seen)`.
+
+    Parameters
+    ----------
+    disc_mm : float
+        Radius of the fit's Zernike disc.
+    covariance_mm2 : (parameters, parameters) array
+        Covariance of the fit's parameters, in mm^2. Not finite: no error bar, all NaN.
+    cell_slope : float
+        1 sigma of the mean slope of a cell by white noise.
+    """
+    thin = seen.part(max(1, seen.axis_mm.size // _TRIAL_CELLS))
+    if (
+        np.count_nonzero(np.isfinite(thin.height_mm)) < LEAST_CELLS
+    ):  # a map with few cells, here and there
+        thin = seen
+    if not np.isfinite(covariance_mm2).all():
+        nothing = Quantities(*[np.nan] * len(fields(Quantities)))
+        return FigureBars(nothing, np.full(zernike.FRINGE_TERMS, np.nan))
+    rough = FigureOf(thin, evaluate.aperture_mm)
+    random = np.random.default_rng(1)  # the same set has the same error bars
+    values, vectors = np.linalg.eigh(covariance_mm2)
+    root = vectors * np.sqrt(np.maximum(values, 0.0))
+    modes = np.stack(
+        [surface.Surface.from_parameters(k, disc_mm).on_grid(thin.axis_mm) for k in root.T]
+    )
+    nominal = rough(thin)
+    squares = np.zeros(len(fields(Quantities)))
+    for _ in range(_TRIALS):
+        change = np.tensordot(random.normal(size=len(root)), modes, axes=1)
+        squares += _change(nominal, rough(thin.plus(change))) ** 2 / _TRIALS
+    for change in _white(seen, evaluate.aperture_mm, cell_slope, random) if cell_slope > 0 else ():
+        moved = np.array(astuple(evaluate(seen.plus(change)).numbers))
+        squares += (moved - astuple(found.numbers)) ** 2 / _WHITE_TRIALS
+    terms = np.stack([1e3 * rough.fringe.coefficients(mode[0]) for mode in modes])
+    return FigureBars(Quantities(*np.sqrt(squares)), np.sqrt(np.sum(terms**2, axis=0)))
+
+
+def _change(nominal: Figure, moved: Figure) -> FloatArray:
+    """Change of all numbers; of an encircled share, the mean over its neighbours, since few rays
+    make it jump.
+    """
+    change = np.subtract(astuple(moved.numbers), astuple(nominal.numbers))
+    farther = np.sort(moved.spot_mm) - np.sort(nominal.spot_mm)
+    for place, share in zip(range(-len(ENERGY_SHARES), 0), ENERGY_SHARES, strict=True):
+        change[place] = farther[
+            int((share - _EDGE) * farther.size) : int((share + _EDGE) * farther.size) + 1
+        ].mean()
+    return np.asarray(change)
+
+
+def _white(
+    seen: SurfaceMap, aperture_mm: float, cell_slope: float, random: np.random.Generator
+) -> Iterator[FloatArray]:
+    """What white noise of the cells' slopes does to height and slopes, (3, n, n).
+
+    Integrated once on a periodic tile of cells, of which each draw takes another place.
+    """
+    step = float(seen.axis_mm[1] - seen.axis_mm[0])
+    k = 2 * np.pi * np.fft.fftfreq(_TILE, step)
+    k_x, k_y = np.meshgrid(k, k)
+    square = k_x**2 + k_y**2
+    slopes = random.normal(0, cell_slope, (2, _TILE, _TILE))
+    spectrum = np.fft.fft2(slopes)
+    fast = square > (np.pi * zonal_map.FIT_CYCLES / aperture_mm) ** 2
+    height = np.where(
+        fast, -1j * (k_x * spectrum[0] + k_y * spectrum[1]) / np.where(fast, square, 1.0), 0
+    )
+    tiles = np.stack([np.fft.ifft2(height).real, *slopes])
+    for _ in range(_WHITE_TRIALS):
+        down, right = np.arange(seen.axis_mm.size) + random.integers(_TILE, size=(2, 1))
+        yield tiles[:, (down % _TILE)[:, None], right % _TILE]

@@ -1,0 +1,26 @@
+"""Quality numbers of a set's figure, from which its verdict follows."""
+
+import math
+
+import numpy as np
+
+from membrane_ctrl.config.schema import OpticsConfig
+from membrane_ctrl.metrology.frame_checks.checked_set import Checked
+from membrane_ctrl.metrology.reconstruction import surface_fit
+from membrane_ctrl.model.shape_estimate import Quality
+
+
+def set_quality(
+    optics: OpticsConfig, checked: Checked, fit: surface_fit.Fit, swing_adu: float
+) -> Quality:
+    area = math.pi * optics.mirror.analysis_radius_mm**2
+    used = [k for axis in checked.view.used for k in axis]
+    saturated = checked.binned.saturated[used].any(axis=0) & checked.near
+    seen = (checked.view.mask & checked.near) | saturated
+    return Quality(
+        modulation_share=swing_adu / (2**optics.camera.bits - 1),
+        saturated_fraction=float(np.mean(saturated[seen])) if seen.any() else 0.0,
+        valid_fraction=min(1.0, float(np.sum(checked.state.area_mm2)) / area),
+        residual_urad=1e6 * math.hypot(fit.residual_x, fit.residual_y) / math.sqrt(2),
+        converged=fit.converged,
+    )

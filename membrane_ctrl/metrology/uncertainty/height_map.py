@@ -1,0 +1,60 @@
+"""From the covariance of the parameters to the standard deviation of the height at every point.
+
+The fitted height is linear in the parameters, h = P a, so that sigma^2 = diag(P C P^T) with their
+covariance C. With C the sample covariance of the trials that is, to the last bit of rounding, the
+standard deviation over the trials' heights: the paper's RMSE map.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from membrane_ctrl.metrology.film import hencky_bowl
+from membrane_ctrl.metrology.numerics import zernike
+from membrane_ctrl.metrology.rays.surface import parameter_to_coeffs
+from membrane_ctrl.model.arrays import BoolArray, FloatArray
+
+MAP_SIDE = 101  # points across a map: 10 mm a cell, far below what the terms can change over
+
+
+@dataclass(frozen=True)
+class HeightMap:
+    """Points of a square grid inside a radius, and the matrix that makes heights of parameters
+    there.
+    """
+
+    axis_mm: FloatArray  # (n,): of x and of y
+    inside: BoolArray  # (n, n): rows along y
+    matrix: FloatArray  # (points, parameters): heights, 0 at the vertex, of the points inside
+
+    @classmethod
+    def over(cls, analysis_radius_mm: float, radius_mm: float, side: int = MAP_SIDE) -> "HeightMap":
+        """A grid over the analysis radius; `radius_mm` is that of the Zernike disc."""
+        axis = np.linspace(-analysis_radius_mm, analysis_radius_mm, side)
+        x, y = np.meshgrid(axis, axis)
+        inside = np.hypot(x, y) <= analysis_radius_mm
+        return cls(axis, inside, height_matrix(x[inside], y[inside], radius_mm))
+
+    def picture(self, heights: FloatArray) -> FloatArray:
+        """(n, n) of values at the points inside; NaN outside."""
+        out = np.full(self.inside.shape, np.nan)
+        out[self.inside] = heights
+        return out
+
+    def sigma(self, covariance: FloatArray) -> FloatArray:
+        """(points,) standard deviation for a covariance (parameters, parameters) of the parameters,
+        in its unit.
+        """
+        variance = np.einsum("pi,pi->p", self.matrix @ covariance, self.matrix)
+        return np.asarray(np.sqrt(np.maximum(variance, 0.0)))
+
+
+def height_matrix(x_mm: FloatArray, y_mm: FloatArray, radius_mm: float) -> FloatArray:
+    """Matrix (points, parameters) from parameters to heights, 0 at the vertex."""
+    x, y = np.asarray(x_mm) / radius_mm, np.asarray(y_mm) / radius_mm
+    out = np.asarray(zernike.values(x, y).T @ parameter_to_coeffs())
+    out[:, -1] += (
+        np.polynomial.polynomial.polyval(x * x + y * y, hencky_bowl.excess())
+        / hencky_bowl.excess_rms()
+    )
+    return out

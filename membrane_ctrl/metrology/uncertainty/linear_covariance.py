@@ -1,0 +1,63 @@
+"""The linear covariance of the parameters, beside the Monte Carlo: C = J S J^T + C_noise.
+
+S is the covariance of the geometry and J the change of the parameters with it, from two solutions
+a number (some ms each). J hardly changes while the film moves by micrometres, so the live cycle
+computes it once a full cycle.
+"""
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from membrane_ctrl.metrology.rays.surface import PARAMETERS
+from membrane_ctrl.metrology.reconstruction import slope_noise
+from membrane_ctrl.metrology.uncertainty.geometry_spread import GeometrySpread
+from membrane_ctrl.metrology.uncertainty.trial_bench import TrialBench
+from membrane_ctrl.model.arrays import FloatArray
+
+
+def geometry_jacobian(bench: TrialBench, spread: GeometrySpread) -> FloatArray:
+    """Change (parameters, k) of the parameters in mm with each number of the geometry, by central
+    differences of one sigma.
+
+    The difference is as wide as the spread itself, so that curvature counts as it does in the
+    spread.
+    """
+    columns = []
+    for k, sigma in enumerate(spread.sigmas):
+        if sigma == 0:
+            columns.append(np.zeros(PARAMETERS))
+            continue
+        step = np.zeros(len(spread.names))
+        step[k] = sigma
+        ends = [
+            bench.solve(bench.geometry(spread.names, sign * step), linear=True)
+            for sign in (1.0, -1.0)
+        ]
+        columns.append((ends[0] - ends[1]) / (2 * sigma))
+    return np.stack(columns, axis=1) if columns else np.zeros((PARAMETERS, 0))
+
+
+def noise_covariance(bench: TrialBench) -> FloatArray:
+    """Covariance (parameters, parameters) in mm^2 from the noise of the pixels."""
+    return slope_noise.parameter_covariance(bench.normal, bench.slope_variance())
+
+
+def geometry_covariance(jacobian: FloatArray, spread: GeometrySpread) -> FloatArray:
+    """Covariance (parameters, parameters) in mm^2 from the geometry; the live cycle reports it
+    beside its own.
+    """
+    return np.asarray(jacobian @ spread.covariance @ jacobian.T)
+
+
+def linear_covariance(benches: Sequence[TrialBench], spread: GeometrySpread) -> FloatArray:
+    """What the Monte Carlo finds, without it: (parameters, parameters) in mm^2.
+
+    With two benches the covariance is that of the change between them: they share the geometry, not
+    the noise.
+    """
+    jacobian = geometry_jacobian(benches[0], spread)
+    if len(benches) > 1:
+        jacobian = jacobian - geometry_jacobian(benches[1], spread)
+    noise: FloatArray = np.sum([noise_covariance(bench) for bench in benches], axis=0)
+    return geometry_covariance(jacobian, spread) + noise

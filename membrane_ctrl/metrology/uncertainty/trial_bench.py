@@ -1,0 +1,192 @@
+"""A thinned set on its bench, which solves for the surface when an input is disturbed.
+
+All sensitivities and Monte Carlo trials use it: a few thousand points, and one to three
+Gauss-Newton steps from the fitted surface to the disturbed one.
+"""
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from membrane_ctrl.config.schema import OpticsConfig
+from membrane_ctrl.metrology.figure import bin_figure
+from membrane_ctrl.metrology.frame_checks.checked_set import Checked
+from membrane_ctrl.metrology.rays import bench_poses, ray_tracing
+from membrane_ctrl.metrology.rays.bench_poses import BenchGeometry
+from membrane_ctrl.metrology.rays.geometry import Geometry
+from membrane_ctrl.metrology.rays.ray_tracing import Points, Tracer
+from membrane_ctrl.metrology.rays.surface import Surface
+from membrane_ctrl.metrology.reconstruction import (
+    film_motion,
+    normal_matrix,
+    slope_noise,
+    surface_fit,
+)
+from membrane_ctrl.metrology.reconstruction.normal_matrix import NormalMatrix
+from membrane_ctrl.metrology.uncertainty.geometry_spread import moved_bench
+from membrane_ctrl.model.arrays import ArrayLike, BoolArray, FloatArray
+
+pass
+
+# 170 a parameter: errors of a geometry are smooth and need fewer; a trial then takes about a
+# millisecond
+TRIAL_POINTS = 6000
+
+
+@dataclass(frozen=True)
+class TrialBench:
+    """All that the trials of one set need; half a megabyte, so that it can be sent to where they
+    run.
+    """
+
+    optics: OpticsConfig  # with the nominal geometry
+    vertex_z_mm: float  # position of the vertex
+    column_px: FloatArray  # (n,): the points in the picture
+    row_px: FloatArray  # (n,)
+    screen_mm: FloatArray  # (2, n): where the fitted surface sends them
+    residual_mm: FloatArray  # (2, n): where they were seen, less that
+    sigma_mm: FloatArray  # (2, n): 1 sigma of noise there
+    t_mm: FloatArray  # (n,): lengths of their rays
+    surface: Surface
+    normal: normal_matrix.NormalMatrix
+
+    @classmethod
+    def of(
+        cls,
+        optics: OpticsConfig,
+        checked: Checked,
+        figure: bin_figure.BinFigure,
+        count: int = TRIAL_POINTS,
+    ) -> "TrialBench":
+        """Of a set's figure, its points thinned to about `count`."""
+        places_px = checked.places_px(figure.index)
+        return cls.of_points(
+            optics,
+            checked.tracer,
+            figure.fit.surface,
+            figure.points,
+            places_px,
+            figure.sigma_mm,
+            count,
+        )
+
+    @classmethod
+    def of_points(
+        cls,
+        optics: OpticsConfig,
+        tracer: ray_tracing.Tracer,
+        surface: Surface,
+        points: ray_tracing.Points,
+        place_px: FloatArray,
+        sigma_mm: FloatArray,
+        count: int,
+    ) -> "TrialBench":
+        """Of points that stand on a surface, seen at `place_px` (2, n),
+        thinned to about `count`.
+        """
+        chosen = spread_evenly(place_px, optics.camera.width_px, count)
+        thinning = points.t_mm.size / np.count_nonzero(chosen)
+        points = points.subset(chosen)
+        column_px, row_px = place_px[:, chosen]
+        predicted_mm = tracer.predict_screen(points, surface)
+        return cls(
+            optics=optics,
+            vertex_z_mm=tracer.vertex_z_mm,
+            column_px=column_px,
+            row_px=row_px,
+            screen_mm=predicted_mm,
+            residual_mm=points.screen_mm - predicted_mm,
+            sigma_mm=sigma_mm[:, chosen] / np.sqrt(thinning),
+            t_mm=points.t_mm,
+            surface=surface,
+            normal=NormalMatrix.from_points(tracer, points),
+        )
+
+    def solve(
+        self, there: BenchGeometry, disturbance_mm: FloatArray | float = 0.0, linear: bool = False
+    ) -> FloatArray:
+        """Parameters (parameters,) in mm of the surface on another bench, the screen points (2, n)
+        off by a disturbance.
+
+        One step suffices for a `linear` answer: the next would change it by 1/300.
+
+        Raises ArithmeticError if the fit does not converge: the geometry is not near the nominal
+        one.
+        """
+        geometry, screen_mm = there.geometry, there.pitch * (self.screen_mm + disturbance_mm)
+        tracer = ray_tracing.Tracer(geometry, self.surface.radius_mm, self.vertex_z_mm)
+        points = ray_tracing.Points.of(geometry.rays(self.column_px, self.row_px), screen_mm)
+        points.t_mm[:] = self.t_mm
+        tracer.intersect(points, self.surface, newton=3)
+        steps = 1 if linear else surface_fit.MAX_ITERATIONS
+        with np.errstate(
+            over="ignore", invalid="ignore"
+        ):  # of a fit that diverges, which is reported below
+            # the nominal points' matrix would not do: a turn of the camera moves them by
+            # centimetres
+            try:
+                normal = NormalMatrix.from_points(tracer, points)
+                fit = surface_fit.solve(
+                    tracer, points, self.surface, normal=normal, max_iterations=steps
+                )
+            except ValueError:
+                fit = None
+        if fit is None or not (fit.converged or (linear and np.isfinite(fit.changes_mm[-1]))):
+            raise ArithmeticError("a trial did not converge: the geometry's spread is too wide")
+        return fit.surface.parameters
+
+    def geometry(self, names: tuple[str, ...] = (), change: ArrayLike = ()) -> BenchGeometry:
+        """The nominal bench, or changed."""
+        return moved_bench(self.optics, names, change)
+
+    def slope_variance(self) -> FloatArray:
+        """(2,) variance of an x and of a y slope from the noise."""
+        gain = slope_noise.slope_per_screen(
+            Geometry.from_config(self.optics), self.surface.radius_mm, self.surface.sag_mm
+        )
+        return np.asarray(gain @ np.mean(np.square(self.sigma_mm), axis=1))
+
+
+def spread_evenly(place_px: FloatArray, width_px: int, count: int) -> BoolArray:
+    """About `count` of the points at `place_px` (2, n) by a golden-ratio sequence: even along rows
+    and columns alike.
+
+    A place is chosen in every set or in none, so that sets of one bench can be compared.
+    """
+    size = place_px.shape[1]
+    if size <= count:
+        return np.ones(size, bool)
+    turn = ((np.rint(place_px[1]) * width_px + np.rint(place_px[0])) * ((np.sqrt(5) - 1) / 2)) % 1
+    return np.asarray(turn < count / size)
+
+
+def moved_film(bench: TrialBench, displacement_um: float) -> TrialBench:
+    """The bench with the film's bowl deeper by a displacement, and the ring in its place."""
+    deeper_mm, surface = displacement_um * 1e-3, bench.surface
+    bowl = Surface.hencky_bowl(deeper_mm, surface.radius_mm)
+    surface = Surface.from_parameters(surface.parameters + bowl.parameters, surface.radius_mm)
+    there = replace(bench, surface=surface, vertex_z_mm=bench.vertex_z_mm - deeper_mm)
+    return replace(there, screen_mm=predicted_mm(there, bench.geometry(), surface))
+
+
+def moves_mm(bench: TrialBench) -> FloatArray:
+    """Change (2, n) of the screen points per µm of the film's displacement."""
+    tracer, points = traced_points(bench, bench.geometry().geometry)
+    return film_motion.sensitivity_mm_per_um(tracer, points, bench.surface)
+
+
+def predicted_mm(
+    bench: TrialBench, there: bench_poses.BenchGeometry, surface: Surface
+) -> FloatArray:
+    """Where (2, n) a surface on another bench sends the rays of the points."""
+    tracer, points = traced_points(bench, there.geometry)
+    tracer.intersect(points, surface, newton=3)
+    return tracer.predict_screen(points, surface) / there.pitch
+
+
+def traced_points(
+    bench: TrialBench, geometry: Geometry, bent: FloatArray | float = 0.0
+) -> tuple[Tracer, Points]:
+    points = Points.of(geometry.rays(bench.column_px, bench.row_px) + bent, bench.screen_mm)
+    points.t_mm[:] = bench.t_mm
+    return Tracer(geometry, bench.surface.radius_mm, bench.vertex_z_mm), points
