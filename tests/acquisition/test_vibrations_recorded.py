@@ -39,7 +39,7 @@ from membrane_ctrl.recorder.sink import Recording
 from membrane_ctrl.run_files.run_folder import create_run_folder
 from membrane_ctrl.sim.optics.camera import OpticsRenderer
 from membrane_ctrl.sim.optics.disturbances import DRUM_MODES
-from tests.metrology.test_track_live import FILM, OPTICS, held_um
+from tests.metrology.tracking.test_track_live import FILM, OPTICS, held_um
 from tests.support.rrd_reading import reader, scalars, strings
 from tests.worlds.synthetic_run import STARTED_UTC, message_of, rows_of, shape_of
 from tests.worlds.vibrating_mirror import watched

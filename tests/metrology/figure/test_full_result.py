@@ -8,8 +8,8 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from metrology_truth import cone, v_fold
-from rendered_sets import FILM, bench, good_set, patterns, stack_of
+from tests.support.metrology_truth import cone, v_fold
+from tests.support.rendered_sets import FILM, bench, good_set, patterns, stack_of
 
 from membrane_ctrl.config.schema import OpticsConfig
 from membrane_ctrl.metrology.figure.pixel_figure import (

@@ -8,12 +8,9 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from calibration_truth import SAGS_MM, STATED, Truth, calibrated_errors_um, make
-from metrology_truth import hencky_depth
 
 from membrane_ctrl.metrology.calibration.advice import number_advice
 from membrane_ctrl.metrology.calibration.figure_uncertainty import propagate
-from membrane_ctrl.metrology.calibration.normal_equations import beyond_of
 from membrane_ctrl.metrology.calibration.rim_equations import Rim
 from membrane_ctrl.metrology.calibration.robust_weights import Trust, less_trust
 from membrane_ctrl.metrology.calibration.set_state import FilmModel
@@ -21,10 +18,13 @@ from membrane_ctrl.metrology.calibration.solver import Solution, solve
 from membrane_ctrl.metrology.calibration.verdict import after
 from membrane_ctrl.metrology.film.film_law import FilmLaw
 from membrane_ctrl.metrology.film.hencky_bowl import excess_rms
+from membrane_ctrl.metrology.film.terms_beyond_fit import beyond_of
 from membrane_ctrl.metrology.rays.bench_parameters import NAMES, sigmas
 from membrane_ctrl.metrology.rays.bench_poses import bench_at
 from membrane_ctrl.metrology.rays.geometry import project
 from membrane_ctrl.metrology.rays.set_phases import SetPhases
+from tests.support.calibration_truth import SAGS_MM, STATED, Truth, calibrated_errors_um, make
+from tests.support.metrology_truth import hencky_depth
 
 SIGMAS = sigmas()
 VALUES = 0.7 * SIGMAS * np.random.default_rng(8).normal(size=len(NAMES))

@@ -10,7 +10,6 @@ import tomllib
 import numpy as np
 import pytest
 import tomli_w
-from calibration_truth import OPTICS, make
 
 from membrane_ctrl.config.optics import GeometryConfig, OpticsConfig, ScreenPoseConfig
 from membrane_ctrl.metrology.calibration.geometry_tables import (
@@ -28,6 +27,7 @@ from membrane_ctrl.metrology.uncertainty.geometry_spread import (
     changed,
 )
 from membrane_ctrl.model.plain_json import content_hash
+from tests.support.calibration_truth import OPTICS, make
 
 ORIGIN = Origin("2026-01-01T00:00:00+00:00", ("a", "b"), 1.0, 2.0, 1.5, 3.0, ("a note",))
 FREE = sigmas({"bow_mm": 1.5, "k1": 0.02, "pitch_relative": 1e-3})

@@ -6,7 +6,6 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from calibration_truth import OPTICS, STATED, make
 
 from membrane_ctrl.config.schema import CameraConfig, GeometryConfig, OpticsConfig
 from membrane_ctrl.metrology.calibration.point_averages import averaged
@@ -31,6 +30,7 @@ from membrane_ctrl.metrology.rays.geometry import Geometry
 from membrane_ctrl.metrology.rays.rim_harmonics import rim_harmonics
 from membrane_ctrl.metrology.rays.set_phases import SetPhases
 from membrane_ctrl.metrology.rays.surface import PARAMETERS, Surface
+from tests.support.calibration_truth import OPTICS, STATED, make
 
 RNG = np.random.default_rng(1)
 LENS = Geometry.from_config(

@@ -8,7 +8,6 @@ import math
 
 import numpy as np
 import pytest
-from rendered_sets import FILM, bench, faulty_set, good_set, patterns
 
 from membrane_ctrl.config.schema import OpticsConfig, PatternConfig
 from membrane_ctrl.metrology.frame_checks.checked_set import RejectedSetError
@@ -17,6 +16,7 @@ from membrane_ctrl.metrology.frame_checks.set_check import check
 from membrane_ctrl.metrology.rays.surface import Surface
 from membrane_ctrl.sim.optics.film_shape import Bump, FilmShape, Ripple, Wrinkle, typical_film
 from membrane_ctrl.sim.optics.shade import Light
+from tests.support.rendered_sets import FILM, bench, faulty_set, good_set, patterns
 
 NAMES = [p.name for p in patterns(bench())]
 SINUSOIDS = [name for name in NAMES if "sin" in name]

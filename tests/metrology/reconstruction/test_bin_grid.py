@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from metrology_truth import RADIUS_MM
 
 from membrane_ctrl.config.schema import CameraConfig, OpticsConfig
 from membrane_ctrl.metrology.rays.geometry import Geometry
 from membrane_ctrl.metrology.rays.ray_tracing import Points, Tracer
 from membrane_ctrl.metrology.rays.surface import Surface
 from membrane_ctrl.metrology.reconstruction.bin_grid import BinGrid
+from tests.support.metrology_truth import RADIUS_MM
 
 # 16 pixels of the paper's camera in one: bins of 4 pixels are 9 mm on the mirror, and the bias is
 # large

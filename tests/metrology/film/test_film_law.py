@@ -6,10 +6,10 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from film_world import FloatArray, MinimalFilm, Ring
-from metrology_truth import film_solution, hencky_depth
 
 from membrane_ctrl.metrology.film.film_law import FilmLaw, HarmonicCause
+from tests.support.film_world import FloatArray, MinimalFilm, Ring
+from tests.support.metrology_truth import film_solution, hencky_depth
 
 RHO = np.linspace(0, 1, 41)
 STIFFNESS = 2.05e5  # 50 µm of 4.1 GPa

@@ -8,7 +8,6 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 import pytest
-from metrology_truth import FloatArray
 from numpy.polynomial import Legendre, Polynomial
 from prysm.polynomials import noll_to_nm, zernike_nm
 
@@ -16,6 +15,7 @@ from membrane_ctrl.metrology.film import film_figure, hencky_bowl, material_fit
 from membrane_ctrl.metrology.film.film_law import FilmLaw
 from membrane_ctrl.model.zernike_terms import NOLL_INDICES, ZERNIKE_TERMS
 from membrane_ctrl.sim.film import stretched
+from tests.support.metrology_truth import FloatArray
 
 RADIUS_MM, REACH = 500.0, 0.95
 ROUND = [j - 2 for j in NOLL_INDICES[1:] if noll_to_nm(j)[1] == 0] + [

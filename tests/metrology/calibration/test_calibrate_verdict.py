@@ -8,7 +8,6 @@ from functools import cache
 
 import numpy as np
 import pytest
-from calibration_truth import SAGS_MM, Truth, make
 
 from membrane_ctrl.metrology.calibration.model_tests import bumps, left_out, suspects
 from membrane_ctrl.metrology.calibration.solver import solve
@@ -16,6 +15,7 @@ from membrane_ctrl.metrology.calibration.verdict import CalibrationFinding, afte
 from membrane_ctrl.metrology.cycle.geometry_monitors import CYCLES, DriftMonitor
 from membrane_ctrl.metrology.rays.bench_parameters import NAMES, sigmas
 from membrane_ctrl.metrology.rays.set_phases import SetPhases
+from tests.support.calibration_truth import SAGS_MM, Truth, make
 
 SIGMAS = sigmas()
 VALUES = SIGMAS * np.random.default_rng(3).normal(size=len(NAMES))

@@ -12,7 +12,6 @@ from functools import cache
 import cv2
 import numpy as np
 import pytest
-from metrology_truth import SMALL
 
 from membrane_ctrl.config.optics import SigmasConfig
 from membrane_ctrl.config.schema import OpticsConfig, PatternConfig
@@ -33,6 +32,7 @@ from membrane_ctrl.model.zernike_terms import ZERNIKE_TERMS
 from membrane_ctrl.sim.optics.camera import OpticsRenderer
 from membrane_ctrl.sim.optics.film_shape import FilmShape
 from membrane_ctrl.sim.optics.shade import Light
+from tests.support.metrology_truth import SMALL
 
 OPTICS = OpticsConfig(camera=SMALL)
 ZERNIKE_UM = (0, 0, 0, 0, 800, -500, 300, 0, 400, 0, 0, 0, 50, *[0] * 23)

@@ -8,7 +8,6 @@ from dataclasses import astuple, replace
 
 import numpy as np
 import pytest
-from metrology_truth import TrueFilm
 from prysm import interferogram
 from prysm.polynomials import ansi_j_to_nm, fringe_to_nm, noll_to_nm, zernike_nm
 from scipy.optimize import least_squares, minimize_scalar
@@ -23,6 +22,7 @@ from membrane_ctrl.metrology.figure import (
 from membrane_ctrl.metrology.numerics import zernike
 from membrane_ctrl.metrology.rays import surface
 from membrane_ctrl.model.zernike_terms import NOLL_INDICES, ZERNIKE_TERMS
+from tests.support.metrology_truth import TrueFilm
 
 APERTURE = 475.0
 AXIS = np.linspace(-APERTURE, APERTURE, 125)

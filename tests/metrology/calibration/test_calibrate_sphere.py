@@ -8,7 +8,6 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from calibration_truth import PIXEL_SIGMA_MM, STATED, FloatArray, Truth, calibrated_errors_um, make
 from scipy.spatial.transform import Rotation
 
 from membrane_ctrl.metrology.calibration.artefact_advice import artefact_advice
@@ -25,6 +24,14 @@ from membrane_ctrl.metrology.rays.surface import Surface
 from membrane_ctrl.model.zernike_terms import ZERNIKE_TERMS
 from membrane_ctrl.sim.optics.simulation_spec import leaning
 from membrane_ctrl.sim.optics.trace import CameraPose, ScreenPose, trace
+from tests.support.calibration_truth import (
+    PIXEL_SIGMA_MM,
+    STATED,
+    FloatArray,
+    Truth,
+    calibrated_errors_um,
+    make,
+)
 
 SIGMAS = sigmas({name: usual_sigma(name) for name in NAMES})
 SAGS_MM = (33.0, 35.0, 37.0)

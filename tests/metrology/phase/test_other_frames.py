@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from metrology_truth import TrueFilm, look
+from tests.support.metrology_truth import TrueFilm, look
 
 from membrane_ctrl.metrology.phase import crossed_fringes, gray_code, multi_period
 from membrane_ctrl.metrology.rays.geometry import Geometry

@@ -10,12 +10,12 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
-from board_photograph import Photographer, photographs
 
 from membrane_ctrl.cli import run
 from membrane_ctrl.config.schema import CameraConfig, OpticsConfig
 from membrane_ctrl.geometry.spread_file import read_prior
 from membrane_ctrl.model.errors import InputError
+from tests.support.board_photograph import Photographer, photographs
 
 CONFIG = """
 [optics.camera]

@@ -6,13 +6,13 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from rendered_sets import FILM, bench, faulty_set, good_set
 
 from membrane_ctrl.config.schema import CameraConfig, OpticsConfig
 from membrane_ctrl.metrology.frame_checks.checked_set import Anchor, RejectedSetError
 from membrane_ctrl.metrology.frame_checks.set_check import check
 from membrane_ctrl.metrology.phase.frame_stack import FrameStack
 from membrane_ctrl.metrology.rays.surface import Surface
+from tests.support.rendered_sets import FILM, bench, faulty_set, good_set
 
 X, Y = np.meshgrid(*[np.linspace(-475, 475, 61)] * 2)
 INSIDE = np.hypot(X, Y) <= 475

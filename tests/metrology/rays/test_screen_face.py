@@ -4,8 +4,6 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from metrology_truth import SMALL, pixel_grid
-from rendered_sets import FILM, bench, good_set
 
 from membrane_ctrl.config.optics import (
     CameraPoseConfig,
@@ -27,6 +25,8 @@ from membrane_ctrl.metrology.rays.surface import Surface
 from membrane_ctrl.metrology.uncertainty.geometry_spread import GENERAL_NAMES, changed
 from membrane_ctrl.sim.optics.film_shape import FilmShape
 from membrane_ctrl.sim.optics.trace import camera_pose, screen_pose, trace
+from tests.support.metrology_truth import SMALL, pixel_grid
+from tests.support.rendered_sets import FILM, bench, good_set
 
 RNG = np.random.default_rng(5)
 NODES_X, NODES_Y = np.linspace(-250, 250, 6), np.linspace(-210, 240, 5)

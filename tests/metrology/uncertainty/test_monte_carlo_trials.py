@@ -6,7 +6,6 @@ from functools import cache
 
 import numpy as np
 import pytest
-from rendered_sets import FILM, bench, patterns, stack_of
 
 from membrane_ctrl.config.schema import OpticsConfig
 from membrane_ctrl.metrology.figure.bin_figure import BinFigure, bin_figure
@@ -29,6 +28,7 @@ from membrane_ctrl.metrology.uncertainty.linear_covariance import (
 from membrane_ctrl.metrology.uncertainty.monte_carlo import run_trials, trial_covariance
 from membrane_ctrl.metrology.uncertainty.trial_bench import TrialBench
 from membrane_ctrl.sim.optics.camera import OpticsRenderer
+from tests.support.rendered_sets import FILM, bench, patterns, stack_of
 
 OPTICS = bench()
 MAP = HeightMap.over(475.0, 500.0, 41)

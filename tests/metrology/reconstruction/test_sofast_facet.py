@@ -22,7 +22,7 @@ from tests.support import sofast_facet
 from tests.support.facet import measure_on, solve_facet
 from tests.support.sofast_facet import decode, sight, wrapped_phases
 
-DATA = Path(__file__).parents[2].parent / "shared" / "data" / "sofast"
+DATA = Path(__file__).parents[3].parent / "shared" / "data" / "sofast"
 pytestmark = pytest.mark.skipif(not DATA.is_dir(), reason=f"no measured facet in {DATA}")
 
 SCREENS = {

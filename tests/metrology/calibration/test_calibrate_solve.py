@@ -9,15 +9,6 @@ from functools import cache
 
 import numpy as np
 import pytest
-from calibration_truth import (
-    OPTICS,
-    Truth,
-    calibrated_errors_um,
-    errors_um,
-    make,
-    plain,
-    stated_errors_um,
-)
 
 from membrane_ctrl.calibration.sets import known_sigmas
 from membrane_ctrl.config.optics import SigmasConfig
@@ -30,6 +21,15 @@ from membrane_ctrl.metrology.calibration.weak_combinations import (
     weak_combinations,
 )
 from membrane_ctrl.metrology.rays.bench_parameters import NAMES, sigmas
+from tests.support.calibration_truth import (
+    OPTICS,
+    Truth,
+    calibrated_errors_um,
+    errors_um,
+    make,
+    plain,
+    stated_errors_um,
+)
 
 SIGMAS = sigmas()
 SEEDS = range(12)

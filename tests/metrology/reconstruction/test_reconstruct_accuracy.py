@@ -6,7 +6,6 @@ from functools import cache
 
 import numpy as np
 import pytest
-from metrology_truth import OPTICS, RADIUS_MM, SMALL, Seen, TrueFilm, cone, look, pixel_grid, v_fold
 
 from membrane_ctrl.config.optics import (
     CameraPoseConfig,
@@ -26,6 +25,17 @@ from membrane_ctrl.metrology.reconstruction.slope_noise import (
 )
 from membrane_ctrl.metrology.reconstruction.surface_fit import Fit, solve
 from membrane_ctrl.model.zernike_terms import NOLL_INDICES, ZERNIKE_TERMS
+from tests.support.metrology_truth import (
+    OPTICS,
+    RADIUS_MM,
+    SMALL,
+    Seen,
+    TrueFilm,
+    cone,
+    look,
+    pixel_grid,
+    v_fold,
+)
 
 GEOMETRY = Geometry.from_config(OPTICS)
 TRACER = Tracer(GEOMETRY, RADIUS_MM)

@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from metrology_truth import hencky_depth
 
 from membrane_ctrl.metrology.film import hencky_bowl
 from membrane_ctrl.metrology.film.film_law import FilmLaw
 from membrane_ctrl.metrology.numerics import zernike
 from membrane_ctrl.metrology.rays.surface import Surface
 from membrane_ctrl.model.zernike_terms import ZERNIKE_TERMS
+from tests.support.metrology_truth import hencky_depth
 
 RHO = np.linspace(0, 1, 101)
 

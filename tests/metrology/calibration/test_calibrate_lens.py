@@ -6,11 +6,11 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from board_photograph import Photographer, photographs
 
 from membrane_ctrl.config.schema import CameraConfig
 from membrane_ctrl.metrology.calibration.board import Board, on_screen
 from membrane_ctrl.metrology.calibration.board_lens import LEAST_VIEWS, BoardView, calibrate_lens
+from tests.support.board_photograph import Photographer, photographs
 
 STATED = CameraConfig(width_px=408, height_px=342, pixel_um=20.7, focal_mm=16.0)  # 773 px
 TRUE = Photographer(408, 342, 781.3, (206.9, 167.4), (-0.12, 0.08, 4e-4, -6e-4))

@@ -7,7 +7,7 @@ import math
 import numpy as np
 import pytest
 
-from membrane_ctrl.metrology.uncertainty import set_budget
+from membrane_ctrl.metrology.figure import set_motion
 from membrane_ctrl.metrology.uncertainty.cycle_errors import LiveErrors
 from membrane_ctrl.metrology.uncertainty.cycle_frames import FramesSeen
 from membrane_ctrl.metrology.uncertainty.frame_effects import FrameEffects
@@ -32,7 +32,7 @@ def vertex_sigma_um(moved_um: float, reading_um: float) -> float:
 def test_a_film_that_moves_without_a_laser_leaves_the_vertex_unknown_by_half_its_motion() -> None:
     resting_um, moving_um = vertex_sigma_um(0.0, math.nan), vertex_sigma_um(100.0, math.nan)
     beyond_um = math.sqrt(moving_um**2 - resting_um**2)
-    assert beyond_um == pytest.approx(set_budget.X_TO_Y * 100.0 / 2)
+    assert beyond_um == pytest.approx(set_motion.X_TO_Y * 100.0 / 2)
 
 
 def test_a_laser_tells_where_the_vertex_was() -> None:

@@ -4,12 +4,12 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from rendered_sets import FILM, bench, good_set
 
 from membrane_ctrl.metrology.figure.radial_profile import pressure_pa, radial_profile
 from membrane_ctrl.metrology.film import hencky_bowl
 from membrane_ctrl.metrology.rays.geometry import Geometry, project
 from membrane_ctrl.metrology.rays.rim_outline import find_outline
+from tests.support.rendered_sets import FILM, bench, good_set
 
 
 def white_minus_black() -> np.ndarray:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from board_photograph import Photographer
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
@@ -13,6 +12,7 @@ from membrane_ctrl.metrology.calibration.rim_edges import rim_edges
 from membrane_ctrl.metrology.calibration.ring_pose import POSE_NAMES, RingPose, ring_pose
 from membrane_ctrl.metrology.rays.geometry import Geometry
 from membrane_ctrl.metrology.rays.rim_outline import find_outline
+from tests.support.board_photograph import Photographer
 
 FloatArray = NDArray[np.float64]
 

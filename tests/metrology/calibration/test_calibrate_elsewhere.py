@@ -4,10 +4,8 @@ from __future__ import annotations
 
 from dataclasses import replace
 
-import calibration_truth
 import numpy as np
 import pytest
-from calibration_truth import PIXEL_SIGMA_MM, STATED, FloatArray, Truth, calibrated_errors_um, make
 from scipy.spatial.transform import Rotation
 
 from membrane_ctrl.metrology.calibration.figure_uncertainty import propagate
@@ -24,6 +22,15 @@ from membrane_ctrl.metrology.rays.geometry import project
 from membrane_ctrl.metrology.rays.set_phases import ANYWHERE, Elsewhere, SetPhases
 from membrane_ctrl.metrology.rays.surface import Surface
 from membrane_ctrl.sim.optics.trace import CameraPose, ScreenPose, trace
+from tests.support import calibration_truth
+from tests.support.calibration_truth import (
+    PIXEL_SIGMA_MM,
+    STATED,
+    FloatArray,
+    Truth,
+    calibrated_errors_um,
+    make,
+)
 
 # a screen whose pitch is known from its data sheet, moved along a rail
 SIGMAS = sigmas({name: usual_sigma(name) for name in NAMES} | {"pitch_relative": 1e-4})
