@@ -13,7 +13,7 @@ from membrane_ctrl.acquisition.optical_bench import OpticalBench
 from membrane_ctrl.calibration.camera import fringe_error_mm, lines_of, measured, report_of
 from membrane_ctrl.cli import run
 from membrane_ctrl.config.schema import PatternConfig
-from membrane_ctrl.metrology.phase.phase_steps import mm_per_rad
+from membrane_ctrl.metrology.phase.screen_scale import mm_per_rad
 from tests.worlds.panel import PanelResponse
 
 

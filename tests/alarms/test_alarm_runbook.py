@@ -10,7 +10,7 @@ import pytest
 from membrane_ctrl import alarms
 from membrane_ctrl.config.schema import Config
 from membrane_ctrl.control import film_health
-from membrane_ctrl.metrology.tracking import live_tracker
+from membrane_ctrl.metrology.vibrations import mode_follower
 from membrane_ctrl.model import run_events
 from membrane_ctrl.model.event_base import KINDS
 from membrane_ctrl.model.notices import NoticeKey, Topic
@@ -30,7 +30,9 @@ PLAIN = set(re.findall(r'Sign\("(\w+)"', SOURCES)) | OF_EVENTS
 MAINTENANCE = re.findall(
     r'^ +\(?"(\w+)",', Path(film_health.__file__).read_text(encoding="utf-8"), re.MULTILINE
 )
-VIBRATIONS = re.findall(r'_notice\(\s*"(\w+)"', Path(live_tracker.__file__).read_text(encoding="utf-8"))
+VIBRATIONS = re.findall(
+    r'_notice\(\s*"(\w+)"', Path(mode_follower.__file__).read_text(encoding="utf-8")
+)
 RULES = [rule.name for rule in Config().alarms.rules]
 CHILDREN = [
     NoticeKey(Topic.CHILD, child).alarm for child in (run_events.RECORDER, "acquisition", "screen")

@@ -2,8 +2,8 @@
 
 Rays are followed from a bowl at each depth to the screen, and the problem is solved from there,
 linear and without noise. Its solution is the bowl itself, and its covariance is within a tenth of
-that claimed by sets of a mounted film (docs/calibration.md). The bowl has the figure of a film
-that is clamped by hand: a smooth one would claim a fifth more.
+that claimed by sets of a mounted film (docs/how-to/calibration.md). The bowl has the figure of a
+film that is clamped by hand: a smooth one would claim a fifth more.
 """
 
 from collections.abc import Sequence

@@ -1,4 +1,4 @@
-"""Phases of the x and of the y fringes from frames that show both at once (docs/library.md)."""
+"""Phases of the x and of the y fringes from frames that show both (docs/how-to/library.md)."""
 
 import numpy as np
 

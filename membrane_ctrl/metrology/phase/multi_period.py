@@ -1,4 +1,4 @@
-"""Places on the screen from the phases of fringes of several periods (docs/library.md)."""
+"""Places on the screen from the phases of fringes of several periods (docs/how-to/library.md)."""
 
 import math
 from collections.abc import Sequence

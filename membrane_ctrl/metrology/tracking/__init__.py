@@ -1,1 +1,1 @@
-"""The figure from every frame of a crossed pattern (docs/tracking.md)."""
+"""The figure from every frame of a crossed pattern (docs/how-to/tracking.md)."""

@@ -55,7 +55,7 @@ def scene_of(
     period_mm : float
         Of the crossed fringes.
     contrast : float
-        Of the pattern, c in docs/interfaces.md.
+        Of the pattern, c in docs/reference/interfaces.md.
 
     Raises ValueError if the camera cannot resolve such fringes, or the mirror shows too few.
     """

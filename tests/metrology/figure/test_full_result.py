@@ -8,8 +8,6 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from tests.support.metrology_truth import cone, v_fold
-from tests.support.rendered_sets import FILM, bench, good_set, patterns, stack_of
 
 from membrane_ctrl.config.schema import OpticsConfig
 from membrane_ctrl.metrology.figure.pixel_figure import (
@@ -28,6 +26,8 @@ from membrane_ctrl.sim.optics.camera import OpticsRenderer
 from membrane_ctrl.sim.optics.film_shape import Bump, FilmShape, Ripple
 from tests.studies import measured_sets
 from tests.studies.tracked_errors import rms
+from tests.support.metrology_truth import cone, v_fold
+from tests.support.rendered_sets import FILM, bench, good_set, patterns, stack_of
 
 X, Y = np.meshgrid(*[np.linspace(-475, 475, 81)] * 2)
 INSIDE = np.hypot(X, Y) <= 475
