@@ -19,12 +19,10 @@ from typing import Any
 import numpy as np
 
 from membrane_ctrl.geometry.spread_file import spread_of
-from membrane_ctrl.metrology.checked import RejectedSetError
-from membrane_ctrl.metrology.frames.frame_stack import FrameStack
-from membrane_ctrl.metrology.full import (
-    LASER_NOISE_UM,
-)
-from membrane_ctrl.metrology.live import LiveReconstructor
+from membrane_ctrl.metrology.cycle.live_reconstructor import LiveReconstructor
+from membrane_ctrl.metrology.figure.set_motion import LASER_NOISE_UM
+from membrane_ctrl.metrology.frame_checks.checked_set import RejectedSetError
+from membrane_ctrl.metrology.phase.frame_stack import FrameStack
 from membrane_ctrl.sim.optics.film_shape import typical_film
 from membrane_ctrl.sim.optics.shade import Light
 from tests.studies.measured_sets import TERMS, measured, quantities, truth_of

@@ -24,7 +24,7 @@ from membrane_ctrl.controller.snapshot import UnknownSnapshotError
 from membrane_ctrl.controller.tick_assembler import TickBatch
 from membrane_ctrl.controller.tick_checksum import ColumnChoice
 from membrane_ctrl.controller.tick_codec import Records
-from membrane_ctrl.metrology.optics.film_law import zernike_projection
+from membrane_ctrl.metrology.film.hencky_bowl import zernike_projection
 from membrane_ctrl.model import files, plain_json, run_events, shape_estimate, telemetry
 from membrane_ctrl.model.arithmetic import describe_arithmetic
 from membrane_ctrl.model.errors import Exit, InputError

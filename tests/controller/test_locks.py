@@ -15,7 +15,7 @@ from membrane_ctrl.controller.snapshot import continue_from, take_snapshot
 from membrane_ctrl.controller.tick import TickInputs, TickOutputs
 from membrane_ctrl.controller.tick_assembler import TickAssembler
 from membrane_ctrl.controller.tick_codec import MESSAGE_BYTES, pack_tick, unpack_tick
-from membrane_ctrl.metrology.optics.film_law import zernike_projection
+from membrane_ctrl.metrology.film.hencky_bowl import zernike_projection
 from membrane_ctrl.model.events import CommandTaken, LockRemoved, LockSet
 from membrane_ctrl.model.lock import (
     LOCKS_MOST,

@@ -24,7 +24,7 @@ from membrane_ctrl.controller.snapshot import (
     take_snapshot,
 )
 from membrane_ctrl.controller.tick_codec import SNAPSHOT_BYTES_MAX
-from membrane_ctrl.metrology.optics.film_law import zernike_projection
+from membrane_ctrl.metrology.film.hencky_bowl import zernike_projection
 from membrane_ctrl.model.errors import Exit
 from membrane_ctrl.model.state_tree import find_differences
 from membrane_ctrl.model.telemetry import State

@@ -22,7 +22,7 @@ from membrane_ctrl.controller.controller import Controller
 from membrane_ctrl.controller.tick import TickInputs, TickOutputs
 from membrane_ctrl.controller.tick_assembler import TickAssembler
 from membrane_ctrl.controller.tick_codec import MESSAGE_BYTES, pack_tick, unpack_tick
-from membrane_ctrl.metrology.optics.film_law import zernike_projection
+from membrane_ctrl.metrology.film.hencky_bowl import zernike_projection
 from membrane_ctrl.model.errors import Exit
 from membrane_ctrl.model.events import Fault
 from membrane_ctrl.model.plain_json import with_comment

@@ -15,7 +15,7 @@ import numpy as np
 from membrane_ctrl.config.schema import Config, EstimatorConfig, LoopConfig, TwinConfig
 from membrane_ctrl.controller.commands import Command
 from membrane_ctrl.hold.virtual_run import TruthShape, VirtualRun, VirtualTick
-from membrane_ctrl.metrology.optics.film_law import zernike_projection
+from membrane_ctrl.metrology.film.hencky_bowl import zernike_projection
 from membrane_ctrl.model.events import Event, Fault, HeldBy, Maintenance, Plausibility
 from membrane_ctrl.model.telemetry import State
 from membrane_ctrl.sim.plant import Plant

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from membrane_ctrl.metrology.checked import RejectedSetError
+from membrane_ctrl.metrology.frame_checks.checked_set import RejectedSetError
 from membrane_ctrl.sim.optics.film_shape import Ripple, typical_film
 from membrane_ctrl.sim.optics.shade import Light
 from tests.studies.measured_sets import measured, quantities, truth_of

@@ -8,17 +8,13 @@ from membrane_ctrl.config.optics import (
     OpticsConfig,
 )
 from membrane_ctrl.geometry.spread_file import spread_of
-from membrane_ctrl.metrology.checked import check
-from membrane_ctrl.metrology.consistency import Examined, examine
-from membrane_ctrl.metrology.frames.frame_stack import FrameStack
-from membrane_ctrl.metrology.full import (
-    FullResult,
-    measure_pixels,
-    reconstruct_full,
-)
-from membrane_ctrl.metrology.optics.geometry import find_outline
-from membrane_ctrl.metrology.optics.surface import parameter_to_coeffs, sag_gradient
-from membrane_ctrl.metrology.uncertainty.monte_carlo import height_matrix
+from membrane_ctrl.metrology.figure.pixel_figure import FullResult, measure_pixels, reconstruct_full
+from membrane_ctrl.metrology.frame_checks.set_check import check
+from membrane_ctrl.metrology.phase.frame_stack import FrameStack
+from membrane_ctrl.metrology.rays.rim_outline import find_outline
+from membrane_ctrl.metrology.rays.surface import parameter_to_coeffs, sag_gradient
+from membrane_ctrl.metrology.uncertainty.height_map import height_matrix
+from membrane_ctrl.metrology.uncertainty.set_budget import Examined, examine
 from membrane_ctrl.model.shape_estimate import judge
 from membrane_ctrl.sim.optics.film_shape import FilmShape
 from tests.worlds.misstated_bench import (

@@ -20,12 +20,11 @@ from membrane_ctrl.config.optics import (
     SigmasConfig,
 )
 from membrane_ctrl.geometry.spread_file import spread_of
-from membrane_ctrl.metrology.calibrate.parameters import NAMES, bench_at
-from membrane_ctrl.metrology.frames.frame_stack import FrameStack
-from membrane_ctrl.metrology.full import (
-    LASER_NOISE_UM,
-)
-from membrane_ctrl.metrology.optics.geometry import Geometry
+from membrane_ctrl.metrology.figure.set_motion import LASER_NOISE_UM
+from membrane_ctrl.metrology.phase.frame_stack import FrameStack
+from membrane_ctrl.metrology.rays.bench_parameters import NAMES
+from membrane_ctrl.metrology.rays.bench_poses import bench_at
+from membrane_ctrl.metrology.rays.geometry import Geometry
 from membrane_ctrl.sim.optics.camera import OpticsRenderer
 from membrane_ctrl.sim.optics.shade import pattern_sequence
 from membrane_ctrl.sim.optics.trace import Trace

@@ -10,11 +10,11 @@ from typing import Any
 
 import numpy as np
 import pytest
-from tests.support.metrology_truth import TrueFilm, look
 
 from membrane_ctrl.metrology.phase import crossed_fringes, gray_code, multi_period
 from membrane_ctrl.metrology.rays.geometry import Geometry
 from membrane_ctrl.metrology.rays.screen_face import Face
+from tests.support.metrology_truth import TrueFilm, look
 
 PLACE = np.random.default_rng(5).uniform(-210, 190, 4000)
 
@@ -29,7 +29,7 @@ def wrapped(periods: list[float], sigma: float = 0.0, seed: int = 1) -> np.ndarr
 
 def page_blocks() -> list[str]:
     """The code of docs/how-to/library.md, block by block."""
-    page = Path(__file__).parents[2] / "docs" / "how-to" / "library.md"
+    page = Path(__file__).parents[3] / "docs" / "how-to" / "library.md"
     return re.findall("```python\n(.*?)```", page.read_text(), re.S)
 
 
