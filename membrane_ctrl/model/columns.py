@@ -309,7 +309,7 @@ class ColumnValues:
         kind=Kind.CODE,
     )
     safe_level: float = column(
-        "safe level", "safe level in force", CODES, "/tick/record", colour=YELLOW, kind=Kind.CODE
+        "safe level", "active safe level", CODES, "/tick/record", colour=YELLOW, kind=Kind.CODE
     )
     fault: float = column(
         "fault",

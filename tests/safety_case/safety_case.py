@@ -231,7 +231,7 @@ rule is tested, not that it suffices.
 - *Slow drifts* within what a room's climate does are found late (C9; [protection](../measurements/protection.md) has the distances).
 - *Interlocks*: a welded contact or a short circuit of its wires is not found. *Locks* are known on one machine.
 - *The actuator test* in `check` runs the pump for less than two seconds, with all sensors good.
-- Whoever may reach page, control port or a bridge with the role `operate` may command; [operations](../how-to/operations.md)
+- Everyone who may reach page, control port or a bridge with the role `operate` may command; [operations](../how-to/operations.md)
   has the roles. Locks and interlocks apply to all of them.
 
 **How it is proved.** Each rule has tests, and at least one *mutant*: the rule is removed on purpose, and a test
