@@ -11,7 +11,7 @@ import typer
 from membrane_ctrl.model import clock, errors
 
 if TYPE_CHECKING:
-    from tuning.opening import TuneOptions
+    from tuning.options import TuneOptions
 
 
 app = typer.Typer(
@@ -104,16 +104,16 @@ def _step(name: str) -> None:
     ) -> int:
         from membrane_ctrl.config import schema, toml_file
         from membrane_ctrl.control_port.ctl import Where
-        from tuning import opening
+        from tuning.options import TuneOptions, find_author_name
 
-        options = opening.TuneOptions(
+        options = TuneOptions(
             config=schema.Config() if config is None else toml_file.load(config, schema.Config),
             twin=twin,
             where=Where(socket, run, logs=logs),
             logs=logs,
             session=session,
             name=session_name,
-            author=author or opening.author_name(),
+            author=author or find_author_name(),
             reason=reason,
             limit_um=limit_um,
             observe_s=clock.parse_duration_s(observe),
@@ -132,16 +132,17 @@ def _step(name: str) -> None:
 
 
 def _run(name: str, options: TuneOptions) -> int:
-    from tuning import command as tune
+    from tuning.commands import map_pump, roll_back, shape_loop, watch
+    from tuning.commands.run import run_session, run_step
 
     whole = {
-        "run": tune.run_session,
-        "pump": tune.map_pump,
-        "outer": tune.outer,
-        "watch": tune.watch,
-        "rollback": tune.rollback,
+        "run": run_session,
+        "pump": map_pump.run_map_pump,
+        "outer": shape_loop.tune_shape_loop,
+        "watch": watch.watch_hold,
+        "rollback": roll_back.roll_back,
     }
-    return whole[name](options) if name in whole else tune.one_step(name, options)
+    return whole[name](options) if name in whole else run_step(name, options)
 
 
 for _name in _STEPS:
@@ -154,10 +155,10 @@ def history(logs: LogsOption = Path("logs"), json: JsonOption = False) -> int:
     import json as json_module
 
     from membrane_ctrl.sessions.folder import plain
-    from tuning.gains_file import entries, history_table
+    from tuning.journal import format_history, read_entries
 
-    found = entries(logs)
-    print(json_module.dumps(plain(found)) if json else history_table(found))
+    found = read_entries(logs)
+    print(json_module.dumps(plain(found)) if json else format_history(found))
     return 0
 
 
@@ -176,9 +177,10 @@ def save(
     """Save the kept gains of a session into a configuration, so that the next hold starts with
     them.
     """
-    from tuning import choice, opening
+    from tuning.commands import save
+    from tuning.options import find_author_name
 
-    return choice.save(config, session, logs, author or opening.author_name(), yes)
+    return save.save_to_configuration(config, session, logs, author or find_author_name(), yes)
 
 
 @app.command()
@@ -188,9 +190,9 @@ def compare(
 ) -> int:
     """Compare two sessions: the gains of each on the plant and weather of each."""
     from membrane_ctrl.sessions.folder import open_session
-    from tuning.choice import compared
+    from tuning.commands.compare import compare_sessions
 
-    print(compared(open_session(a), open_session(b)))
+    print(compare_sessions(open_session(a), open_session(b)))
     return 0
 
 
@@ -206,11 +208,11 @@ def explore(
     """Explore gains by hand: a page with sliders, on the fitted plant in the recorded weather; a
     session live.
     """
-    from tuning.command import NEEDS_BOKEH
-    from tuning.opening import author_name
+    from tuning.commands.live_page import NEEDS_BOKEH
+    from tuning.options import find_author_name
 
     try:
         from tuning.explore.page import explore
     except ModuleNotFoundError:
         raise errors.InputError(NEEDS_BOKEH.format("tune explore")) from None
-    return explore(folder, logs, port, author or author_name())
+    return explore(folder, logs, port, author or find_author_name())

@@ -35,8 +35,12 @@ from membrane_ctrl.sessions.folder import newest_session
 from membrane_ctrl.sessions.live_hold import HoldError
 from tests.support.figures import Figure, at_least, at_most
 from tests.worlds import foreign_plant
-from tuning import command, gains_file, opening, report, session
-from tuning.opening import TuneOptions, TwinHold
+from tuning import gains_file, twin_hold
+from tuning.commands.run import run_session
+from tuning.options import TuneOptions
+from tuning.report import page
+from tuning.steps import design, observe, verify
+from tuning.twin_hold import TwinHold
 
 DEFAULT_FILE = Path("build/benches.jsonl")
 SETTLE_S, HOLD_S = 120.0, 600.0
@@ -205,13 +209,13 @@ def _session(bench: DrawnBench, config: Config, limit_um: float, short: bool) ->
     found: dict[str, Any] = {}
     with (
         tempfile.TemporaryDirectory() as folder,
-        patch.object(opening, "TwinHold", opened),
-        patch.object(report, "write_report"),  # its pictures take as long as the session
+        patch.object(twin_hold, "TwinHold", opened),
+        patch.object(page, "write_report"),  # its pictures take as long as the session
     ):
         told = io.StringIO()
         try:
             with contextlib.redirect_stderr(told), contextlib.redirect_stdout(told):
-                found["exit"] = command.run_session(_options(config, Path(folder), limit_um, short))
+                found["exit"] = run_session(_options(config, Path(folder), limit_um, short))
         except CommandError as error:
             found |= {"exit": int(error.exit), "refused": "; ".join(error.lines)}
         except Exception as error:
@@ -239,7 +243,7 @@ def _options(config: Config, logs: Path, limit_um: float, short: bool = False) -
         author="benchmark",
         reason="drawn bench",
         limit_um=limit_um,
-        observe_s=session.OBSERVE_S,
+        observe_s=observe.OBSERVE_S,
         verify_s=300.0 if short else 600.0,
         take_over=False,
         yes=not short,
@@ -251,9 +255,9 @@ def _options(config: Config, logs: Path, limit_um: float, short: bool = False) -
 
 def _kept(bench: DrawnBench, logs: Path, config: Config) -> dict[str, Any]:
     folder = newest_session(logs)
-    done = session.verified_of(folder)
+    done = verify.load_verified(folder)
     gains = gains_file.load_gains(folder.file("gains.toml"))
-    sigma = session.offered(folder)[1].sigma
+    sigma = design.load_candidates(folder)[1].sigma
     found: dict[str, Any] = {
         "kept": done.kept,
         "reason": done.reason,

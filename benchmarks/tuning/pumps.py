@@ -19,11 +19,12 @@ import numpy as np
 from membrane_ctrl.model.telemetry import State
 from tests.studies.pump_curve_error import worst_share
 from tests.worlds import foreign_plant
-from tuning import pump_trial
-from tuning.identification.characterise import ExperimentError
+from tuning.identification import pump_survey
+from tuning.identification.experiments import ExperimentError
 from tuning.identification.pump_survey import PumpSurvey
-from tuning.opening import TwinHold
-from tuning.rig import HoldRig
+from tuning.rigs.hold_rig import HoldRig
+from tuning.steps import map_pump
+from tuning.twin_hold import TwinHold
 
 RATE_HZ = 20.0
 SETTLED_S = 60.0
@@ -131,7 +132,7 @@ def surveyed(pump: DrawnPump, limit_um: float = 10.0) -> SurveyedPump:
     )
     rig = HoldRig(link, "benchmark")
     rig.hold(SETTLED_S)
-    pump_trial._calmed(rig, limit_um)
+    map_pump._calmed(rig, limit_um)
     before, made = len(link.rows), list[PumpSurvey]()
 
     def survey(*given: float) -> PumpSurvey:
@@ -139,9 +140,9 @@ def surveyed(pump: DrawnPump, limit_um: float = 10.0) -> SurveyedPump:
         return made[-1]
 
     off, refused = math.nan, ""
-    with patch.object(pump_trial.pump_survey, "PumpSurvey", survey):
+    with patch.object(pump_survey, "PumpSurvey", survey):
         try:
-            off = worst_share(pump_trial._surveyed(rig, limit_um), plant.pump)
+            off = worst_share(map_pump._surveyed(rig, limit_um), plant.pump)
         except (ExperimentError, ValueError) as error:
             refused = str(error)
     rows = [row for row in link.rows[before:] if row.state in (State.HOLD, State.TUNE)]

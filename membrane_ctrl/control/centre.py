@@ -40,17 +40,19 @@ _PLANT = 7  # states before the clones
 CLONES = 64  # 1.3 s at 50 Hz
 _CLONE_S = 0.02  # least time between clones
 _GAIN_ERROR = 0.2  # share of the barometer's effect that its configured gain may miss
-_HUBER2, _FAR2, _FAR_COUNT = (
-    9.0,
-    25.0,
-    3,
-)  # squared sigmas: weighed less beyond the first, dropped beyond the second
+# squared sigmas: weighed less beyond the first, dropped beyond the second
+_HUBER2 = 9.0
+_FAR2 = 25.0
+_FAR_COUNT = 3
 LOCK_FRAMES = 5
 _FRAMES_LOST = 3  # after this many missing frames the optics are gone
 _INTERVAL_SHARE = 0.2  # of a new interval in their mean
 _IMPOSSIBLE = 1e4  # µm, Pa or K: no film, weather or mount moves that far in a hold
 _UNKNOWN_UM2 = 1e6  # variance of the optics' zero before lock
-_LEAK_STD_UM_PER_S, _WARMTH_STD_K, _AMBIENT_STD_PA = 0.3, 0.02, 1.0  # at the start
+# at the start
+_LEAK_STD_UM_PER_S = 0.3
+_WARMTH_STD_K = 0.02
+_AMBIENT_STD_PA = 1.0
 _SHARE_S = 2.0  # memory of the sensors' weights
 # Of a leak's ramp in laser or optics, in standard deviations: seldom by chance where the noise is
 # large

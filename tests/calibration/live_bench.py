@@ -28,7 +28,7 @@ from membrane_ctrl.sessions.live_hold import News
 from membrane_ctrl.sim.optics.film_shape import typical_film
 from membrane_ctrl.sim.optics.simulate import simulate_set
 from membrane_ctrl.sim.optics.simulation_spec import Motion, SimulationSpec
-from tuning.opening import TwinHold
+from tuning.twin_hold import TwinHold
 
 # 16-bit frames of large pixels with the noise of the 144 that each stands for
 SHRINK = 12

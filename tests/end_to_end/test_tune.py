@@ -19,7 +19,7 @@ from membrane_ctrl.control_port.client import PortClient
 from membrane_ctrl.model.errors import DeviceError, InputError
 from membrane_ctrl.model.telemetry import State
 from membrane_ctrl.sessions.live_hold import HoldError, LiveHold
-from tuning.rig import HoldRig
+from tuning.rigs.hold_rig import HoldRig
 
 pytestmark = pytest.mark.real_time
 
@@ -115,13 +115,14 @@ import sys
 from pathlib import Path
 from membrane_ctrl.control_port.client import PortClient
 from membrane_ctrl.sessions.live_hold import LiveHold
-from tuning.identification import shape_loop
-from tuning.rig import HoldRig
+from tuning.identification import shape_loop_fit
+from tuning.rigs.hold_rig import HoldRig
 
 logs = Path(sys.argv[1])
 client = PortClient.unix(logs / "control.sock", print)
-shape_loop._SETTLE_S, shape_loop._LEVEL_S, shape_loop._LATE_S = 0.5, 2.0, 2.0
-shape_loop.step_experiment(HoldRig(LiveHold(client, logs / client.greeting["run"]), "doomed"))
+shape_loop_fit._SETTLE_S, shape_loop_fit._LEVEL_S, shape_loop_fit._LATE_S = 0.5, 2.0, 2.0
+link = LiveHold(client, logs / client.greeting["run"])
+shape_loop_fit.run_step_experiment(HoldRig(link, "doomed"))
 """
 
 

@@ -12,11 +12,15 @@ from membrane_ctrl.control.experiments.experiment import BenchSample
 from membrane_ctrl.sim.plant import STEP_S, Plant
 from membrane_ctrl.sim.surroundings import BenchEvent
 from tests.studies.minimum_variance import least_std_um
-from tuning.identification.characterise import Characterised, characterise
-from tuning.identification.disturbance import observe
-from tuning.proposal.candidates import amigo, simc, ziegler_nichols
-from tuning.proposal.design import propose, relay_ultimate
-from tuning.rig import Rig
+from tuning.identification.disturbance import observe_disturbance
+from tuning.identification.experiments import Characterised, fit_experiments, run_experiments
+from tuning.proposal.design import compute_relay_ultimate, propose_gains
+from tuning.proposal.tuning_rules import (
+    make_amigo_gains,
+    make_simc_gains,
+    make_ziegler_nichols_gains,
+)
+from tuning.rigs.bench_rig import Rig
 
 SETTLE_S = 40.0
 OBSERVE_S = 600.0
@@ -91,7 +95,7 @@ def identified(case: Case, seed: int) -> dict[str, float]:
     """One session's identification against the truth."""
     bench = TwinBench(case, seed)
     rig = Rig(bench, case.loop(), PumpConfig(), case.holding_flow_um_per_s)
-    return _identified(case, bench, characterise(rig))
+    return _identified(case, bench, fit_experiments(run_experiments(rig)))
 
 
 def _identified(case: Case, bench: TwinBench, done: Characterised) -> dict[str, float]:
@@ -125,12 +129,12 @@ def session(
     """
     bench, before = TwinBench(case, seed), case.loop()
     rig = Rig(bench, before, PumpConfig(), case.holding_flow_um_per_s)
-    done = characterise(rig)
+    done = fit_experiments(run_experiments(rig))
     found = done.identified
     figures = _identified(case, bench, done)
     rig.hold(SETTLE_S)
-    disturbance = observe(rig.hold(OBSERVE_S), found.model, before)
-    proposal = propose(found, disturbance, before, PumpConfig(), done.quality)
+    disturbance = observe_disturbance(rig.hold(OBSERVE_S), found.model, before)
+    proposal = propose_gains(found, disturbance, before, PumpConfig(), done.quality)
     least_um = least_std_um(before, case.twin(seed))
     assert proposal.chosen.predicted is not None
     figures |= {
@@ -150,9 +154,9 @@ def session(
         dt_s = 1 / before.rate_hz
         for name, gains in (
             ("default", None),
-            ("simc", simc(found.model, dt_s, 0.2)),
-            ("amigo", amigo(found.model, dt_s, 0.2)),
-            ("zn", ziegler_nichols(*relay_ultimate(found.model, dt_s))),
+            ("simc", make_simc_gains(found.model, dt_s, 0.2)),
+            ("amigo", make_amigo_gains(found.model, dt_s, 0.2)),
+            ("zn", make_ziegler_nichols_gains(*compute_relay_ultimate(found.model, dt_s))),
         ):
             loop = gains.applied_to(before) if gains else before
             figures |= achieved(name, loop, case, seed, least_um, judge_s)

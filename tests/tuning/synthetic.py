@@ -7,7 +7,8 @@ from __future__ import annotations
 import numpy as np
 from scipy.signal import lfilter
 
-from tuning.identification.loop_model import PlantModel, Record, Series
+from tuning.identification.plant_model import PlantModel
+from tuning.identification.record import Record, Series
 
 FINE = 40
 

@@ -29,27 +29,31 @@ from membrane_ctrl.sessions.live_hold import HoldError
 from tests.support import review_runs
 from tests.support.browser import browser_tab
 from tests.support.machine_needs import needs
-from tuning import gains_file, session
+from tuning import gains_file
 from tuning.explore.curves import Sliders, Workpiece, curves, of_path, responded
 from tuning.explore.page import saver
-from tuning.identification import disturbance, loop_model
-from tuning.identification.characterise import SHORT
-from tuning.proposal import prediction
-from tuning.proposal.verify import Stage
-from tuning.rig import Rig
+from tuning.identification import disturbance, noise_spectrum, plant_model, record_file
+from tuning.identification.closed_loop import Gains
+from tuning.identification.experiments import SHORT
+from tuning.identification.record import Record
+from tuning.proposal import model_bench, verification
+from tuning.proposal.preview import preview_loop
+from tuning.proposal.verification import Stage
+from tuning.rigs.bench_rig import Rig
+from tuning.steps import apply, characterise, design, identify, observe, preview, verify
 
-PLANT = loop_model.PlantModel(0.9, 0.4, 0.3, 1.2)
-CALM = disturbance.Noise(1.0, 0.01, 0.01, 12.0, 0.02)
+PLANT = plant_model.PlantModel(0.9, 0.4, 0.3, 1.2)
+CALM = noise_spectrum.Noise(1.0, 0.01, 0.01, 12.0, 0.02)
 LOOP = LoopConfig(feedforward_barometer=False, feedforward_temperature=False)
 MADE = Workpiece("made up", PLANT, disturbance.DisturbanceModel(CALM, None, None), LOOP, None, None)
 GAINS = (
-    loop_model.Gains(0.3, 9.0, 0.0, 0.2),
-    loop_model.Gains(0.5, 6.0, 0.0, 0.05),
-    loop_model.Gains(0.4, 6.0, 0.2, 0.1),
+    Gains(0.3, 9.0, 0.0, 0.2),
+    Gains(0.5, 6.0, 0.0, 0.05),
+    Gains(0.4, 6.0, 0.2, 0.1),
 )
 
 
-def closed_loop(gains: loop_model.Gains, output: str) -> control.TransferFunction:
+def closed_loop(gains: Gains, output: str) -> control.TransferFunction:
     """From setpoint (T) or from the leak to the centre, with the delay as a Pade approximation of
     order 8.
     """
@@ -65,9 +69,7 @@ def closed_loop(gains: loop_model.Gains, output: str) -> control.TransferFunctio
 
 @pytest.mark.parametrize("gains", GAINS)
 @pytest.mark.parametrize("output", ["step", "load"])
-def test_the_responses_are_those_of_another_implementation(
-    gains: loop_model.Gains, output: str
-) -> None:
+def test_the_responses_are_those_of_another_implementation(gains: Gains, output: str) -> None:
     """The D term sees the measurement alone, so for a setpoint step
     only PI loops are comparable.
     """
@@ -83,26 +85,26 @@ def test_the_load_peak_is_that_of_the_real_loop() -> None:
     gains = GAINS[0]
     shown = curves("yours", gains, MADE, 60.0)
     loop = gains.applied_to(LOOP)
-    seen = prediction.preview(loop, PumpConfig(), PLANT, MADE.weather, duration_s=40.0)
+    seen = preview_loop(loop, PumpConfig(), PLANT, MADE.weather, duration_s=40.0)
     assert np.abs(shown.load_um).max() == pytest.approx(seen.load_peak_um, rel=0.05)
 
 
 def test_an_unstable_loop_has_no_response_and_says_so() -> None:
-    shown = curves("yours", loop_model.Gains(5.0, 1.0, 0.0, 0.0), MADE, 60.0)
+    shown = curves("yours", Gains(5.0, 1.0, 0.0, 0.0), MADE, 60.0)
     assert not shown.figures.margins.stable
     assert shown.time_s.size == shown.load_um.size == 0
 
 
 def test_the_sliders_begin_where_the_gains_are() -> None:
-    for gains in (*GAINS[:2], loop_model.Gains(0.1, 40.0, 0.0, 0.03)):
+    for gains in (*GAINS[:2], Gains(0.1, 40.0, 0.0, 0.03)):
         again = Sliders.near(gains, PLANT, CALM.dt_s).gains(PLANT, CALM.dt_s)
         assert (again.kp_per_s, again.ti_s, again.filter_s) == pytest.approx(
             (gains.kp_per_s, gains.ti_s, gains.filter_s), rel=1e-9
         )
 
 
-def quiet_hold(seed: int = 3) -> loop_model.Record:
-    bench = prediction.ModelBench(PLANT, MADE.weather, PumpConfig(), seed)
+def quiet_hold(seed: int = 3) -> Record:
+    bench = model_bench.ModelBench(PLANT, MADE.weather, PumpConfig(), seed)
     rig = Rig(bench, LOOP, PumpConfig(), PLANT.holding_flow_um_per_s)
     rig.hold(30.0)
     return rig.hold(260.0)
@@ -115,22 +117,24 @@ def template(tmp_path_factory: pytest.TempPathFactory) -> Path:
         tmp_path_factory.mktemp("logs"), "made", "tester", "made up", Config(loop=LOOP), LOOP
     )
     record = synthetic.record(PLANT, samples=6000)
-    loop_model.save_record(opened.file("experiments.npz"), record)
+    record_file.save_record(opened.file("experiments.npz"), record)
     around = operating_point.Around(PLANT.holding_flow_um_per_s, 0.4, 5.3, 1.0)
     ends_s = record.duration_s
-    head = session.ExperimentsHead(
+    head = characterise.ExperimentsHead(
         around,
         ends_s,
         (ends_s, ends_s),
         experiment.Finished(experiment.ExperimentEnd.COMPLETED, "done"),
     )
     folder.write(opened.file("experiments.json"), head)
-    session.identify_step(opened)
+    identify.run_identify(opened)
     quiet = quiet_hold()
-    loop_model.save_record(opened.file("quiet.npz"), quiet)
-    found = session.found_of(opened).identified.model
-    folder.write(opened.file("disturbance.json"), disturbance.observe(quiet, found, LOOP))
-    session.design_step(opened)
+    record_file.save_record(opened.file("quiet.npz"), quiet)
+    found = identify.load_identified(opened).identified.model
+    folder.write(
+        opened.file("disturbance.json"), disturbance.observe_disturbance(quiet, found, LOOP)
+    )
+    design.run_design(opened)
     return opened.path
 
 
@@ -142,9 +146,7 @@ def test_a_session_gives_plant_weather_and_proposal(template: Path, tmp_path: Pa
     opened = copy_of(template, tmp_path)
     found = of_path(opened.path, tmp_path)
     assert found.model.gain == pytest.approx(PLANT.gain, rel=0.05)
-    assert found.proposed == loop_model.Gains.of(
-        gains_file.load_gains(opened.file("gains.toml")).loop
-    )
+    assert found.proposed == Gains.of(gains_file.load_gains(opened.file("gains.toml")).loop)
     opened.begin("design")
     assert of_path(opened.path, tmp_path).proposed is None
 
@@ -154,9 +156,9 @@ def test_a_short_session_takes_the_weather_from_before_its_experiments(
 ) -> None:
     """The hold is not asked for more."""
     opened = copy_of(template, tmp_path)
-    before = session.disturbance_of(opened)
+    before = observe.load_disturbance(opened)
     shutil.copy(opened.file("quiet.npz"), opened.file("held.npz"))
-    assert session.observe_step(opened, SimpleNamespace(loop=LOOP)) == before  # type: ignore[arg-type]
+    assert observe.run_observe(opened, SimpleNamespace(loop=LOOP)) == before  # type: ignore[arg-type]
     assert SHORT.typical_s == pytest.approx(300.0, abs=1.0)
     opened.begin("characterise")
     assert not opened.file("held.npz").exists()
@@ -179,7 +181,7 @@ def test_a_hold_lost_in_the_verification_is_what_is_told(template: Path, tmp_pat
             raise HoldError("the mirror is not held (state lower)")
 
     with pytest.raises(HoldError, match="the mirror is not held"):
-        session.verify_step(opened, Lost())  # type: ignore[arg-type]
+        verify.run_verify(opened, Lost())  # type: ignore[arg-type]
     assert not opened.done("verify")
 
 
@@ -220,9 +222,9 @@ def test_a_close_verification_goes_on_for_as_long_again(
         reason = "grown" if growth > growth_max else ""
         return Stage(float(setpoint_um.size), growth, 1.0, growth, growth_max, 1.3, 0.0, reason)
 
-    monkeypatch.setattr(session.verify, "look", look)
-    monkeypatch.setattr(session.loop_model, "save_record", lambda path, record: None)
-    done = session.verify_step(opened, rig)  # type: ignore[arg-type]
+    monkeypatch.setattr(verification, "judge_stage", look)
+    monkeypatch.setattr(record_file, "save_record", lambda path, record: None)
+    done = verify.run_verify(opened, rig)  # type: ignore[arg-type]
     assert (done.kept, done.stages[-1].time_s, told) == (kept, until_s, ["keep"] * kept)
 
 
@@ -246,21 +248,17 @@ def test_a_folder_that_cannot_be_explored_is_refused(tmp_path: Path) -> None:
 
 def test_saved_gains_are_the_next_to_be_applied(template: Path, tmp_path: Path) -> None:
     opened = copy_of(template, tmp_path)
-    folder.write(opened.file("preview.json"), session.Previewed((), ()))
+    folder.write(opened.file("preview.json"), preview.Previewed((), ()))
     save = saver(of_path(opened.path, tmp_path), "ada")
     assert save is not None
     assert "tune apply" in save(GAINS[0])
-    assert loop_model.Gains.of(session.checked_gains(opened)) == GAINS[0]
+    assert Gains.of(apply.load_checked_gains(opened)) == GAINS[0]
     assert gains_file.load_gains(opened.file("gains.toml")).author == "ada"
     assert not opened.done("preview")  # it was of other gains
 
 
-@pytest.mark.parametrize(
-    "gains", [loop_model.Gains(9.0, 1.0, 0.0, 0.1), loop_model.Gains(1.2, 4.0, 0.0, 0.1)]
-)
-def test_gains_without_margin_are_not_saved(
-    gains: loop_model.Gains, template: Path, tmp_path: Path
-) -> None:
+@pytest.mark.parametrize("gains", [Gains(9.0, 1.0, 0.0, 0.1), Gains(1.2, 4.0, 0.0, 0.1)])
+def test_gains_without_margin_are_not_saved(gains: Gains, template: Path, tmp_path: Path) -> None:
     opened = copy_of(template, tmp_path)
     before = opened.file("gains.toml").read_bytes()
     save = saver(of_path(opened.path, tmp_path), "ada")

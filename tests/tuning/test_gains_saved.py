@@ -14,11 +14,11 @@ from membrane_ctrl.config.schema import Config, LoopConfig, PumpConfig
 from membrane_ctrl.config.toml_file import load
 from membrane_ctrl.model.errors import Exit
 from membrane_ctrl.sessions import folder as plain
-from tuning import choice
-from tuning.gains_file import What, entries, entry, note
+from tuning import same_bench
 from tuning.identification.pump_map import PumpMap
-from tuning.pump_trial import MappedPump
-from tuning.session import Verified
+from tuning.journal import What, append_entry, make_entry, read_entries
+from tuning.steps.map_pump import MappedPump
+from tuning.steps.verify import Verified
 
 BEFORE = LoopConfig()
 GAINS = {
@@ -48,9 +48,11 @@ def kept_session(logs: Path, kept: bool = True, config: Config | None = None) ->
     session = plain.create_session(logs, "s1", "eve", "a-run", config or Config(), BEFORE)
     reason = "" if kept else "the readings show a sensitivity of 2.3"
     plain.write(session.file("verified.json"), Verified(kept, reason, (), BEFORE, AFTER))
-    note(
+    append_entry(
         logs,
-        entry("kept" if kept else "taken_back", session.path.name, "eve", "why", BEFORE, AFTER),
+        make_entry(
+            "kept" if kept else "taken_back", session.path.name, "eve", "why", BEFORE, AFTER
+        ),
     )
     return session.path
 
@@ -80,7 +82,7 @@ def test_the_next_hold_starts_with_the_kept_gains_and_comments_stay(
     assert "-kp_per_s = 0.61   # 1/s" in said
     assert "+kp_per_s = 0.448   # 1/s" in said
     assert path.stat().st_mode & 0o777 == 0o600
-    last = entries(tmp_path / "logs")[-1]
+    last = read_entries(tmp_path / "logs")[-1]
     assert (last.what, last.session, last.reason) == ("saved", session.name, str(path))
     assert run(["tune", "save", "--config", str(path), str(session)]) == Exit.DONE
     assert "already has the gains" in capsys.readouterr().out
@@ -188,7 +190,7 @@ def test_gains_that_were_not_kept_or_were_rolled_back_are_not_saved(
     assert saved(path, str(failed), "--yes") == Exit.BAD_INPUT
     assert "its gains were not kept: the readings show" in capsys.readouterr().err
     undone = kept_session(logs)
-    note(logs, entry("rolled_back", undone.name, "ann", "too slow", BEFORE, AFTER))
+    append_entry(logs, make_entry("rolled_back", undone.name, "ann", "too slow", BEFORE, AFTER))
     assert saved(path, str(undone), "--yes") == Exit.BAD_INPUT
     assert "(too slow)" in capsys.readouterr().err
     unfinished = plain.create_session(logs, "s2", "eve", "a-run", Config(), BEFORE).path
@@ -233,7 +235,7 @@ def test_what_cannot_be_edited_says_what_to_set(
     kept_session(tmp_path / "logs")
     assert saved(tmp_path / "lab.toml", "--yes") == Exit.BAD_INPUT
     assert "set in [loop]: kp_per_s = 0.448, ti_s = 8.79" in capsys.readouterr().err
-    assert set(choice.GAIN_KEYS) <= set(LoopConfig.model_fields)
+    assert set(same_bench.GAIN_KEYS) <= set(LoopConfig.model_fields)
 
 
 CURVE = PumpConfig(
@@ -272,7 +274,9 @@ def test_a_hold_by_the_estimate_is_given_the_curve_with_what_was_measured_of_the
 ) -> None:
     text = TEXT + '[estimator]\nprocess_value = "estimate"\n'
     session, path = mapped_session(tmp_path, text), tmp_path / "lab.toml"
-    monkeypatch.setattr("tuning.session.estimator_of", lambda folder: {"pump_delay_s": 1.1})
+    monkeypatch.setattr(
+        "tuning.estimator_levels.derive_estimator_levels", lambda folder: {"pump_delay_s": 1.1}
+    )
     assert saved(path, str(session), "--yes", text=text) == Exit.DONE
     now = load(path, Config)
     assert (now.estimator.pump_delay_s, now.pump, now.loop.flow_max_um_per_s) == (1.1, CURVE, 6.0)
@@ -286,7 +290,9 @@ def test_a_hold_by_the_estimate_is_given_the_curve_with_what_was_measured_of_the
 def kept_time_constant(logs: Path, name: str = "outer", what: What = "kept") -> Path:
     """A session that tried a time constant of the shape loop and measured nothing else."""
     session = plain.create_session(logs, name, "eve", "a-run", Config(), BEFORE)
-    note(logs, entry(what, session.path.name, "eve", "why", BEFORE, BEFORE, None, (40.0, 62.5)))
+    append_entry(
+        logs, make_entry(what, session.path.name, "eve", "why", BEFORE, BEFORE, None, (40.0, 62.5))
+    )
     return session.path
 
 
@@ -319,7 +325,10 @@ def test_a_time_constant_that_was_not_kept_or_rolled_back_is_not_saved(tmp_path:
     session = kept_time_constant(logs, what="taken_back")
     assert saved(path, str(session), "--yes") == saved(path, "--yes") == Exit.BAD_INPUT
     session = kept_time_constant(logs, "second")
-    note(logs, entry("rolled_back", session.name, "eve", "why", BEFORE, BEFORE, None, (40.0, 62.5)))
+    append_entry(
+        logs,
+        make_entry("rolled_back", session.name, "eve", "why", BEFORE, BEFORE, None, (40.0, 62.5)),
+    )
     assert saved(path, "--yes") == Exit.BAD_INPUT
     assert path.read_text() == TEXT
 

@@ -27,7 +27,7 @@ from membrane_ctrl.sessions.live_log import (
     Progressed,
     give_answer,
 )
-from tuning import choice
+from tuning import same_bench
 from tuning.explore.live_page import LivePage, status
 
 RATE_HZ = 50.0
@@ -203,14 +203,14 @@ def test_a_session_goes_on_with_a_later_hold_of_the_same_bench(
     config = config.model_copy(update={"pump": config.pump.model_copy(update=pump)})
     link = SimpleNamespace(config=config, name="a-later-run")
     if not refused:
-        going_on = choice.for_hold(opened, link)  # type: ignore[arg-type]
+        going_on = same_bench.continue_on_hold(opened, link)  # type: ignore[arg-type]
         bleed = {"bleed_fraction": running.bleed_fraction}  # what a refusal may have asked for
         assert going_on == replace(
             opened, head=replace(opened.head, before=RUNNING.model_copy(update=bleed))
         )
         return
     with pytest.raises(InputError, match=refused):
-        choice.for_hold(opened, link)  # type: ignore[arg-type]
+        same_bench.continue_on_hold(opened, link)  # type: ignore[arg-type]
 
 
 @pytest.fixture

@@ -15,6 +15,7 @@ import pytest
 from membrane_ctrl.cli import run
 from membrane_ctrl.config.schema import Config, LoopConfig, PumpConfig
 from membrane_ctrl.config.toml_file import dump, load
+from membrane_ctrl.control.experiments import operating_point
 from membrane_ctrl.control.experiments.spec import ExperimentSpec, PumpStep
 from membrane_ctrl.control.pump_curve import PumpCurve
 from membrane_ctrl.controller.cross_check import cross_check
@@ -29,14 +30,19 @@ from tests.worlds.foreign_plant import (
     foreign_bench,
     foreign_config,
 )
-from tuning import command as tune
-from tuning import pump_trial
-from tuning.identification.loop_model import Gains, PlantModel, margins
-from tuning.identification.pump_curve import FlowAt, Level, PumpFit, PumpRun, fit
-from tuning.identification.pump_map import Branch, PumpMap, first_jump, smoothed
+from tuning import twin_hold
+from tuning.identification import experiments, fit_quality, plant_fit, pump_survey
+from tuning.identification.closed_loop import Gains
+from tuning.identification.curve_shape import Branch, find_first_jump, smooth_flows
+from tuning.identification.margins import compute_margins
+from tuning.identification.plant_model import PlantModel
+from tuning.identification.pump_fit import FlowAt, PumpFit, fit_pump
+from tuning.identification.pump_map import PumpMap
+from tuning.identification.pump_run import Level, PumpRun
 from tuning.identification.pump_survey import PumpSurvey
-from tuning.opening import TwinHold
-from tuning.rig import HoldRig
+from tuning.rigs.hold_rig import HoldRig
+from tuning.steps import map_pump
+from tuning.twin_hold import TwinHold
 
 DT_S = 0.1
 
@@ -77,7 +83,7 @@ def test_the_flow_at_each_command_behind_any_dead_time_and_lag(
         (1.0, 1.0),
         (0.0, 4.0),
     ]
-    found = fit([measured_run(pump, 4 * cycle, seed) for seed in (1, 2)])
+    found = fit_pump([measured_run(pump, 4 * cycle, seed) for seed in (1, 2)])
     for command in (0.4, 0.6, 0.8, 1.0):
         at = found.levels[Level(command)]
         assert at.flow_um_per_s == pytest.approx(
@@ -91,14 +97,14 @@ def test_the_flow_at_each_command_behind_any_dead_time_and_lag(
 def test_a_level_reached_from_above_is_another_one() -> None:
     pump = ForeignPump("hysteretic", 6.0, play=0.05)
     cycle = [(0.0, 4.0), (0.5, 3.0), (0.0, 4.0), (0.8, 0.5), (0.5, 2.0)]
-    found = fit([measured_run(pump, 6 * cycle)])
+    found = fit_pump([measured_run(pump, 6 * cycle)])
     more = found.levels[Level(0.5, False)].flow_um_per_s - found.levels[Level(0.5)].flow_um_per_s
     assert more == pytest.approx(pump.settled(0, 0.55) - pump.settled(0, 0.45), abs=0.2)
 
 
 def test_runs_without_readings_are_refused() -> None:
     with pytest.raises(ValueError, match="without readings"):
-        fit([PumpRun(DT_S, np.full(100, 0.3), np.full(100, math.nan), np.full(100, math.nan))])
+        fit_pump([PumpRun(DT_S, np.full(100, 0.3), np.full(100, math.nan), np.full(100, math.nan))])
 
 
 def started(
@@ -117,7 +123,7 @@ def started(
 def mapped(tmp_path: Path, plant: ForeignPlant) -> tuple[PumpMap, TwinHold]:
     """A session's pump map."""
     link, rig, folder = started(tmp_path, plant)
-    done, folder = pump_trial.map_pump(folder, rig)
+    done, folder = map_pump.map_pump(folder, rig)
     assert (folder.head.before, folder.config.pump) == (rig.loop, done.found.pump)
     return done.found, link
 
@@ -165,8 +171,8 @@ def test_a_survey_holds_the_mirror_on_what_it_knows_so_far(tmp_path: Path) -> No
     """
     pump = ForeignPump("root", 29.4, 0.25, 0.45)
     link, rig, _ = started(tmp_path, ForeignPlant(pump, 25, 1.0, 2.0, laser_um=0.4))
-    pump_trial._calmed(rig, 10.0)
-    assert worst_share(pump_trial._surveyed(rig, 10.0), pump) < 0.03
+    map_pump._calmed(rig, 10.0)
+    assert worst_share(map_pump._surveyed(rig, 10.0), pump) < 0.03
     late = [
         row for row in link.rows[len(link.rows) // 2 :] if row.state in (State.HOLD, State.TUNE)
     ]
@@ -206,7 +212,7 @@ class ForeignHold(TwinHold):
 
 def tuned(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, *words: str) -> int:
     """Exit code of `tune` on that hold."""
-    monkeypatch.setattr(tune.opening, "TwinHold", ForeignHold)
+    monkeypatch.setattr(twin_hold, "TwinHold", ForeignHold)
     config = tmp_path / "foreign.toml"
     config.write_text(dump(foreign_config(rate_hz=20.0)))
     return run(["tune", *words, "--twin", "--config", str(config), "--logs", str(tmp_path)])
@@ -338,7 +344,7 @@ def test_the_smoothed_flows_are_as_wrong_as_they_say(shape: str, share: float) -
     off = []
     for _ in range(40):
         flows = true + np.linalg.cholesky(noise) @ rng.standard_normal(true.size)
-        mean, covariance = smoothed(commands, flows, noise)
+        mean, covariance = smooth_flows(commands, flows, noise)
         off.append((mean - true)[1:] / np.hypot(np.sqrt(np.diag(covariance))[1:], 0.005))
     assert np.mean(np.abs(off) < 2) > share
     assert np.max(np.abs(off)) < 3.6
@@ -415,7 +421,7 @@ def test_a_start_behind_noise_is_a_jump_and_a_slope_is_none(
     branch = Branch(
         np.array([0.0, 0.087, high]), np.array([0.0, before, 1.4]), np.array([0.001, 0.25, 0.03])
     )
-    assert first_jump(branch, 6.0) == ((0.087, high) if jump else None)
+    assert find_first_jump(branch, 6.0) == ((0.087, high) if jump else None)
 
 
 @pytest.mark.parametrize("late_s", [0.1, 0.9])
@@ -424,8 +430,8 @@ def test_the_guard_of_a_round_knows_how_late_the_pump_is(
 ) -> None:
     """It looked 0.4 s ahead of a pump that answers after 1.1 s, and the mirror sank by 10.8 µm."""
     survey = survey_of([0.2, 0.4], [0.5, 3.5], 1.2, delay_s=late_s)
-    monkeypatch.setattr(pump_trial.pump_survey, "PumpSurvey", lambda *given: survey)
-    monkeypatch.setattr(pump_trial, "_brought_back", lambda rig: True)
+    monkeypatch.setattr(pump_survey, "PumpSurvey", lambda *given: survey)
+    monkeypatch.setattr(map_pump, "_brought_back", lambda rig: True)
     given: list[ExperimentSpec] = []
 
     def performed(spec: ExperimentSpec) -> None:
@@ -434,12 +440,12 @@ def test_the_guard_of_a_round_knows_how_late_the_pump_is(
 
     rig = SimpleNamespace(
         hold=lambda seconds: None,
-        around=lambda held, limit_um: pump_trial.machine.Around(1.2, 0.3, 5.0, 0.5),
+        around=lambda held, limit_um: operating_point.Around(1.2, 0.3, 5.0, 0.5),
         pump=PumpConfig(),
         performed=performed,
     )
     with pytest.raises(ValueError, match="enough"):
-        pump_trial._surveyed(rig, 10.0)  # type: ignore[arg-type]
+        map_pump._surveyed(rig, 10.0)  # type: ignore[arg-type]
     assert given[0].late_s == pytest.approx(max(0.4, late_s + 0.1))
 
 
@@ -449,9 +455,9 @@ def test_slow_gains_begin_at_the_mean_flow_of_a_loop_that_swings(tmp_path: Path)
     _, rig, _ = started(tmp_path, ForeignPlant(pump, 3161, 1.0, 2.7, laser_um=0.3))
     for _ in range(3):  # at any moment of the swing
         rig.hold(11.3)
-        pump_trial._calmed(rig, 10.0)
+        map_pump._calmed(rig, 10.0)
         rows = rig.ticks(20.0)
-        assert rig.loop.kp_per_s == pump_trial._CAUTIOUS["kp_per_s"]
+        assert rig.loop.kp_per_s == map_pump._CAUTIOUS["kp_per_s"]
         assert max(abs(row.truth_displacement_um) for row in rows) < 10.0
         rig.go_back()
 
@@ -491,9 +497,9 @@ class Standing:
 
 def test_a_round_begins_only_when_the_mirror_is_back_at_the_end_of_its_ramp() -> None:
     back = Standing(-9.0, 0.5)
-    assert pump_trial._returned(back)  # type: ignore[arg-type]
+    assert map_pump._returned(back)  # type: ignore[arg-type]
     assert back.at_um > -2.0
-    assert not pump_trial._returned(Standing(-9.0, 0.0))  # type: ignore[arg-type]
+    assert not map_pump._returned(Standing(-9.0, 0.0))  # type: ignore[arg-type]
 
 
 @pytest.mark.parametrize(
@@ -505,7 +511,7 @@ def test_a_curve_that_ends_near_the_leak_does_not_hold_the_mirror_meanwhile(
     pump = PumpConfig.model_validate(
         {"curve_fraction": [0.1, 0.9], "curve_um_per_s": [least, full]}
     )
-    assert pump_trial._holds(replace(flat_map(pump), leak_um_per_s=2.46)) == holds
+    assert map_pump._holds(replace(flat_map(pump), leak_um_per_s=2.46)) == holds
 
 
 @pytest.mark.parametrize(("above_um", "back"), [(5.0, True), (-5.0, False)])
@@ -531,7 +537,7 @@ def test_a_mirror_that_slow_gains_leave_above_gets_its_own(above_um: float, back
         def set_gains(self, loop: LoopConfig, *_: object) -> None:
             given.append(loop)
 
-    assert pump_trial._brought_back(Rig(0.0, 0.0)) == back  # type: ignore[arg-type]
+    assert map_pump._brought_back(Rig(0.0, 0.0)) == back  # type: ignore[arg-type]
     assert [(loop.kp_per_s, loop.flow_max_um_per_s) for loop in given] == [(0.5, 3.0)] * back
 
 
@@ -556,28 +562,28 @@ def test_steps_that_see_little_or_contradict_the_curve_are_repeated_for_longer(
     record = SimpleNamespace(followed_by=lambda more: left.pop(0))
     rig = SimpleNamespace(
         hold=lambda seconds: record,
-        around=lambda held: pump_trial.machine.Around(1.2, 0.3, 5.0, 0.5),
+        around=lambda held: operating_point.Around(1.2, 0.3, 5.0, 0.5),
         perform=lambda seconds: (done_s.append(seconds) or record, None),
     )
-    monkeypatch.setattr(pump_trial, "_returned", lambda rig: True)
-    monkeypatch.setattr(pump_trial.machine, "room", lambda around: None)
-    monkeypatch.setattr(pump_trial.characterise, "spec_of", lambda kind, around, seconds: seconds)
+    monkeypatch.setattr(map_pump, "_returned", lambda rig: True)
+    monkeypatch.setattr(operating_point, "room", lambda around: None)
+    monkeypatch.setattr(experiments, "make_spec", lambda kind, around, seconds: seconds)
     bent = {gain: told for gain, _, told in seen}
     monkeypatch.setattr(
-        pump_trial.identify,
-        "identify",
+        plant_fit,
+        "identify_plant",
         lambda at: SimpleNamespace(
             model=SimpleNamespace(gain=at[0]), sigma=SimpleNamespace(gain=at[1])
         ),
     )
     monkeypatch.setattr(
-        pump_trial.characterise, "bent", lambda record, found: ["bent"] * bent[found.model.gain]
+        fit_quality, "find_bent_curve", lambda record, found: ["bent"] * bent[found.model.gain]
     )
     if kept:
-        assert pump_trial._checked(rig, 0.3) == seen[-1][:2]  # type: ignore[arg-type]
+        assert map_pump._checked(rig, 0.3) == seen[-1][:2]  # type: ignore[arg-type]
     else:
         with pytest.raises(ValueError, match="contradict the curve"):
-            pump_trial._checked(rig, 0.3)  # type: ignore[arg-type]
+            map_pump._checked(rig, 0.3)  # type: ignore[arg-type]
     assert done_s == lasted_s
 
 
@@ -637,10 +643,10 @@ def test_only_a_curve_that_steps_of_the_flow_confirm_is_kept(
     wrong = PumpConfig(
         curve_fraction=(0.1, 1.0), curve_um_per_s=(0.0, full), flow_full_um_per_s=full
     )
-    monkeypatch.setattr(pump_trial, "_surveyed", lambda rig, limit_um: flat_map(wrong))
+    monkeypatch.setattr(map_pump, "_surveyed", lambda rig, limit_um: flat_map(wrong))
     before = rig.loop, rig.pump
     if strength == 1.0:
-        done, _ = pump_trial.map_pump(folder, rig)
+        done, _ = map_pump.map_pump(folder, rig)
         assert done.gain == pytest.approx(1.0, abs=0.1)
         assert done.before == before[1]
         assert rig.pump == wrong
@@ -648,9 +654,9 @@ def test_only_a_curve_that_steps_of_the_flow_confirm_is_kept(
         with pytest.raises(
             RejectedError, match=r"steps of the flow contradict the curve .* run `tune pump` again"
         ):
-            pump_trial.map_pump(folder, rig)
+            map_pump.map_pump(folder, rig)
         assert (rig.loop, rig.pump) == before
-        assert not pump_trial.mapped(folder)
+        assert not map_pump.has_pump_map(folder)
         assert open_session(folder.path).config == link.config
     rig.hold(40.0)
     assert all(abs(row.truth_displacement_um) < 3.0 for row in link.rows[-400:])
@@ -659,11 +665,11 @@ def test_only_a_curve_that_steps_of_the_flow_confirm_is_kept(
 def test_gains_too_fast_for_the_measured_actuator_become_slower() -> None:
     loop = LoopConfig(feedforward_barometer=False)
     quick, late = flat_map(PumpConfig()), replace(flat_map(PumpConfig()), delay_s=1.2, lag_s=0.3)
-    assert pump_trial._safe(loop, quick) == loop
-    safe = pump_trial._safe(loop, late)
+    assert map_pump._safe(loop, quick) == loop
+    safe = map_pump._safe(loop, late)
     model = PlantModel(1.0, 1.2, 0.3, 1.24)
-    assert margins(Gains.of(safe), model, 0.02).ms < 1.75
-    assert not margins(Gains.of(loop), model, 0.02).ms < 1.75
+    assert compute_margins(Gains.of(safe), model, 0.02).ms < 1.75
+    assert not compute_margins(Gains.of(loop), model, 0.02).ms < 1.75
 
 
 @pytest.mark.parametrize(
@@ -680,7 +686,7 @@ def test_the_limit_of_the_flow_comes_with_the_curve_unless_somebody_set_a_lower_
 ) -> None:
     loop = LoopConfig(flow_max_um_per_s=limit, flow_rate_limit_um_per_s2=rate_limit)
     pump = PumpConfig(curve_fraction=(0.1, 1.0), curve_um_per_s=(0.0, full))
-    freed = pump_trial._freed(loop, PumpConfig(), pump)
+    freed = map_pump._freed(loop, PumpConfig(), pump)
     assert freed == loop.model_copy(update={"flow_max_um_per_s": after})
     found = cross_check(Config(loop=freed, pump=pump))
     assert not [each for each in found if each.severity == "error" and "flow" in each.field]
@@ -704,8 +710,8 @@ def test_a_leak_above_the_configured_flow_is_held_on_the_measured_curve(
         stall_fraction=0.1,
     )
     rig.pump = rig.pump.model_copy(update={"probe_um": 0.1, "change_max": 0.3})
-    monkeypatch.setattr(pump_trial, "_surveyed", lambda rig, limit_um: flat_map(true))
-    done, folder = pump_trial.map_pump(folder, rig)
+    monkeypatch.setattr(map_pump, "_surveyed", lambda rig, limit_um: flat_map(true))
+    done, folder = map_pump.map_pump(folder, rig)
     assert (done.found.pump.probe_um, done.found.pump.change_max) == (0.1, 0.3)
     assert folder.config.loop.flow_max_um_per_s == rig.loop.flow_max_um_per_s == 15.9
     rig.hold(60.0)

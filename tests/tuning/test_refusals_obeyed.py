@@ -16,10 +16,10 @@ from membrane_ctrl.config.schema import Config
 from membrane_ctrl.config.toml_file import dump
 from membrane_ctrl.model.errors import Exit
 from tests.worlds.foreign_plant import ForeignPlant, ForeignPump, foreign_bench, foreign_config
-from tuning import opening
-from tuning.identification.characterise import experiment, fitted
-from tuning.opening import TwinHold
-from tuning.rig import HoldRig
+from tuning import twin_hold
+from tuning.identification.experiments import fit_experiments, run_experiments
+from tuning.rigs.hold_rig import HoldRig
+from tuning.twin_hold import TwinHold
 
 
 @dataclass(frozen=True)
@@ -116,7 +116,7 @@ def obeyed(
     capsys: pytest.CaptureFixture[str],
 ) -> None:
     """Ask, be refused, do what the refusal says, and get it."""
-    monkeypatch.setattr(opening, "TwinHold", Hold)
+    monkeypatch.setattr(twin_hold, "TwinHold", Hold)
     monkeypatch.setattr(Hold, "refusal", refusal, raising=False)
     loop = {"rate_hz": 10.0}
     config = logs / "lab.toml"
@@ -154,8 +154,8 @@ def test_relays_that_noise_and_weather_stop_tell_the_gain(seed: int, weather: fl
         foreign_config(rate_hz=10.0),
         bench=foreign_bench(straight(seed=seed, weather=weather, laser_um=3.0)()),
     )
-    done = experiment(HoldRig(hold, "test"))
-    found = fitted(done)
+    done = run_experiments(HoldRig(hold, "test"))
+    found = fit_experiments(done)
     model, sigma = found.identified.model, found.identified.sigma
     assert not done.finished.completed or done.relays_s > 300.0
     assert found.quality.verdict != "refused"

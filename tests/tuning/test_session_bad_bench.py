@@ -20,11 +20,17 @@ from membrane_ctrl.sessions.folder import create_session
 from membrane_ctrl.sessions.live_hold import HoldError, News
 from membrane_ctrl.sim.surroundings import AmbientChange, BenchEvent
 from tests.worlds.foreign_plant import ForeignPlant, ForeignPump, foreign_bench, foreign_config
-from tuning import opening, session
-from tuning.identification import shape_loop
-from tuning.identification.characterise import ExperimentError, characterise, spec_of
-from tuning.opening import TwinHold
-from tuning.rig import HoldRig
+from tuning import twin_hold
+from tuning.identification import shape_loop_fit
+from tuning.identification.experiments import (
+    ExperimentError,
+    fit_experiments,
+    make_spec,
+    run_experiments,
+)
+from tuning.rigs.hold_rig import HoldRig
+from tuning.steps.characterise import run_characterise
+from tuning.twin_hold import TwinHold
 
 
 def held(events: Sequence[BenchEvent] = (), **twin: object) -> tuple[TwinHold, HoldRig]:
@@ -45,7 +51,7 @@ def still_held(link: TwinHold) -> bool:
 @pytest.mark.campaign
 def test_a_door_in_the_first_relay_costs_that_relay_only() -> None:
     link, rig = held([AmbientChange(120.0, -20.0)])
-    done = characterise(rig)
+    done = fit_experiments(run_experiments(rig))
     assert done.quality.verdict != "refused"
     assert done.identified.model.gain == pytest.approx(1.0, abs=0.06)
     assert max(abs(row.truth_displacement_um) for row in link.rows[3000:]) < 10.0 + 7.2  # the door
@@ -65,7 +71,7 @@ def test_a_lost_laser_ends_the_relay_by_name() -> None:
         return seen[-1]
 
     link.news = dark_later  # type: ignore[method-assign]
-    record, finished = rig.perform(spec_of("relay", around, 60.0))
+    record, finished = rig.perform(make_spec("relay", around, 60.0))
     assert not finished.completed
     assert "laser" in finished.reason or "safety table" in finished.reason
     assert record.duration_s < 15.0
@@ -77,7 +83,7 @@ def test_a_pump_that_ceases_in_the_relay_is_named() -> None:
     rig.hold(20.0)
     around = rig.around(rig.hold(20.0), 10.0)
     link.bench.wrong.pump_share = 0.0
-    _, finished = rig.perform(spec_of("relay", around, 60.0))
+    _, finished = rig.perform(make_spec("relay", around, 60.0))
     assert not finished.completed
     assert "stopped at -" in finished.reason
 
@@ -86,7 +92,7 @@ def test_a_mirror_too_tight_is_told_to_open_the_bleed(tmp_path: Path) -> None:
     link, rig = held(leak_time_constant_s=8e4, scenario="calm", laser_noise_um=0.3)
     folder = create_session(tmp_path, "tight", "tester", link.name, link.config, rig.loop)
     with pytest.raises(RejectedError, match="open the bleed"):
-        session.characterise_step(folder, rig)
+        run_characterise(folder, rig)
     assert link.rows[-1].state == State.HOLD
 
 
@@ -162,10 +168,10 @@ def test_an_interrupted_outer_restores_setpoint_shape_loop_and_time_constant(
     lost: bool,
     back_s: float,
 ) -> None:
-    monkeypatch.setattr(opening, "TwinHold", Outer)
+    monkeypatch.setattr(twin_hold, "TwinHold", Outer)
     monkeypatch.setattr(Outer, "when", when)
     monkeypatch.setattr(Outer, "lost", lost)
-    monkeypatch.setattr(shape_loop, "_LEVEL_S", 20.0)
+    monkeypatch.setattr(shape_loop_fit, "_LEVEL_S", 20.0)
     (tmp_path / "lab.toml").write_text("[loop]\nrate_hz = 10.0\n[twin]\nstart_error_um = -3.0\n")
     words = ["--observe", "20s", "--verify", "30s", "--yes", "--config", f"{tmp_path}/lab.toml"]
     code = run(["tune", "outer", "--twin", *words, "--logs", str(tmp_path)])
@@ -206,7 +212,7 @@ def test_the_map_is_asked_for_by_the_first_relay_that_shows_the_need(
     )
     rig, before_s = HoldRig(link, "tester"), link.rows[-1].mono_s
     try:
-        said = "; ".join(characterise(rig).quality.reasons)
+        said = "; ".join(fit_experiments(run_experiments(rig)).quality.reasons)
     except ExperimentError as error:
         said = str(error)
     assert words in said

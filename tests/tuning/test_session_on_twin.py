@@ -24,15 +24,18 @@ from membrane_ctrl.model.errors import Exit, InputError, RejectedError
 from membrane_ctrl.model.telemetry import State
 from membrane_ctrl.sessions.folder import FILES, STEPS, SessionFolder, create_session, open_session
 from membrane_ctrl.sessions.live_hold import Progress
-from tuning import command as tune
-from tuning import gains_file as journal
-from tuning import report, session
-from tuning.choice import compared as compare
+from tuning import connection, estimator_levels, journal, twin_hold
+from tuning.commands import run
+from tuning.commands.compare import compare_sessions as compare
 from tuning.gains_file import load_gains
-from tuning.identification.loop_model import Gains, margins
-from tuning.opening import TwinHold
-from tuning.proposal.design import NAMES, against
-from tuning.rig import HoldRig
+from tuning.identification.closed_loop import Gains
+from tuning.identification.margins import compute_margins
+from tuning.proposal.candidate import NAMES
+from tuning.proposal.candidate_table import describe_change
+from tuning.report import page, pictures
+from tuning.rigs.hold_rig import HoldRig
+from tuning.steps import apply, characterise, design, identify, observe, preview, verify
+from tuning.twin_hold import TwinHold
 
 CONFIG = """
 [twin]
@@ -97,13 +100,13 @@ def logs(killed: Killed) -> Path:
 
 
 LOADED: dict[str, Callable[[SessionFolder], object]] = {
-    "characterise": session.experiments_of,
-    "identify": session.found_of,
-    "observe": session.disturbance_of,
-    "design": session.offered,
-    "preview": session.preview_of,
-    "apply": session.checked_gains,
-    "verify": session.verified_of,
+    "characterise": characterise.load_experiments,
+    "identify": identify.load_identified,
+    "observe": observe.load_disturbance,
+    "design": design.load_candidates,
+    "preview": preview.load_preview,
+    "apply": apply.load_checked_gains,
+    "verify": verify.load_verified,
 }
 
 
@@ -132,8 +135,10 @@ def test_a_session_killed_before_its_journal_is_complete_when_resumed(
     (path / "session.rrd").unlink()
     before = {file.name: file.stat().st_mtime_ns for file in path.glob("*.npz")}
     assert tune_twin(copied, "run", "--resume", str(path), "--yes") == Exit.DONE
-    tune._note_verified(open_session(path), copied, "once more")
-    assert [(line.what, line.session) for line in journal.entries(copied)] == [("kept", path.name)]
+    run._note_verified(open_session(path), copied, "once more")
+    assert [(line.what, line.session) for line in journal.read_entries(copied)] == [
+        ("kept", path.name)
+    ]
     assert {file.name: file.stat().st_mtime_ns for file in path.glob("*.npz")} == before
     assert (path / "session.rrd").exists()
     assert "characterise" not in capsys.readouterr().err
@@ -155,8 +160,8 @@ def test_a_session_killed_in_any_step_goes_on_with_it(
     assert tune_twin(tmp_path, "run", "--resume", str(path), "--yes", *TIMES) == Exit.DONE
     opened = open_session(path)
     assert all(opened.done(each) for each in STEPS)
-    assert session.verified_of(opened).kept
-    assert [line.what for line in journal.entries(tmp_path)] == ["kept"]
+    assert verify.load_verified(opened).kept
+    assert [line.what for line in journal.read_entries(tmp_path)] == ["kept"]
     done = [name for each in STEPS[: STEPS.index(step)] for name in FILES[each] if name in kept]
     assert all((path / name).stat().st_mtime_ns == kept[name] for name in done)
 
@@ -170,18 +175,18 @@ def done(logs: Path, tmp_path: Path) -> SessionFolder:
 
 def test_it_leaves_gains_that_are_kept_and_justified(done: SessionFolder) -> None:
     assert all(done.done(step) for step in STEPS)
-    verified = session.verified_of(done)
+    verified = verify.load_verified(done)
     assert verified.kept, verified.reason
     assert all(stage.growth < stage.growth_max for stage in verified.stages)
     gains = load_gains(done.file("gains.toml"))
     assert (gains.author, gains.reason) == ("eve", "new film")
-    assert gains.data_sha256 == session.experiments_of(done).record.sha256()
+    assert gains.data_sha256 == characterise.load_experiments(done).record.sha256()
     assert gains.plant.gain == pytest.approx(1.0, abs=0.06)
     assert gains.plant.model.delay_s == pytest.approx(0.225, abs=0.05)
     assert gains.predicted_std_um < 1.2 * gains.least_std_um
     assert gains.predicted_std_um < 0.98 * next(
         row.predicted.std_um
-        for row in session.design_of(done).candidates
+        for row in design.load_design(done).candidates
         if row.name == "present" and row.predicted
     )
     assert verified.stages[-1].std_um == pytest.approx(gains.predicted_std_um, rel=0.3)
@@ -209,26 +214,26 @@ def test_the_report_stands_alone_and_the_recording_is_there(done: SessionFolder)
 def test_a_picture_is_drawn_anew_when_what_it_shows_is(
     done: SessionFolder, monkeypatch: pytest.MonkeyPatch, renewed: str | None, drawn: set[str]
 ) -> None:
-    pictures = {"experiments.png", "weather.png", "candidates.png", "verify.png"}
-    for name in pictures:
+    names = {"experiments.png", "weather.png", "candidates.png", "verify.png"}
+    for name in names:
         os.utime(done.file(name), ns=(10**18, 2 * 10**18))
-    for path in set(done.path.iterdir()) - {done.file(name) for name in pictures}:
+    for path in set(done.path.iterdir()) - {done.file(name) for name in names}:
         os.utime(path, ns=(10**18, 10**18))
-    if renewed in pictures:
+    if renewed in names:
         done.file(renewed).unlink()
     elif renewed is not None:
         os.utime(
             done.file(renewed), ns=(10**18, 2 * 10**18)
         )  # at the same moment: which was first is not known
     seen: set[str] = set()
-    monkeypatch.setattr(report, "write_figure", lambda path, figure, dpi: seen.add(path.name))
-    report.draw(done)
+    monkeypatch.setattr(pictures, "write_figure", lambda path, figure, dpi: seen.add(path.name))
+    page.draw_pictures(done)
     assert seen == drawn
 
 
 def test_calculating_steps_can_be_repeated_without_a_hold(done: SessionFolder) -> None:
     before = load_gains(done.file("gains.toml"))
-    found = session.identify_step(done)
+    found = identify.run_identify(done)
     assert not done.done("observe")  # what stood on the old fit is gone
     assert found.identified.model.gain == pytest.approx(before.plant.gain, rel=1e-6)
 
@@ -238,14 +243,14 @@ def test_a_step_whose_data_are_missing_names_the_step_to_run(done: SessionFolder
     with pytest.raises(
         InputError, match="observe is missing; run `membrane-ctrl tune observe` first"
     ):
-        session.design_step(done)
+        design.run_design(done)
 
 
 def test_the_estimate_is_told_what_the_session_measured(
     done: SessionFolder, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     """The twin's own numbers; its laser rounds to 0.1 µm."""
-    twin, found = TwinConfig(), session.estimator_of(done)
+    twin, found = TwinConfig(), estimator_levels.derive_estimator_levels(done)
     assert found["pump_delay_s"] + found["pump_lag_s"] == pytest.approx(
         twin.pump_delay_s + twin.pump_lag_s, abs=0.04
     )
@@ -273,10 +278,10 @@ def test_gains_are_not_designed_for_a_loop_that_has_none(
 ) -> None:
     config = Config(estimator=EstimatorConfig(process_value="estimate"))
     made = create_session(tmp_path, "s", "eve", "a-run", config, config.loop)
-    tune._do_all(["design", "apply"], made, None, None, Progress())  # type: ignore[arg-type]  # are not reached
+    run._run_steps(["design", "apply"], made, None, None, Progress())  # type: ignore[arg-type]  # are not reached
     assert f"`membrane-ctrl tune save {made.path} --config FILE`" in capsys.readouterr().err
     with pytest.raises(RejectedError, match="apply: the hold follows the estimate"):
-        tune._do_all(["apply"], made, None, None, Progress())  # type: ignore[arg-type]
+        run._run_steps(["apply"], made, None, None, Progress())  # type: ignore[arg-type]
 
 
 BY_OPTICS = (
@@ -318,7 +323,7 @@ def test_without_a_laser_there_is_no_shape_loop_to_tune(
 def test_damaged_files_are_named(done: SessionFolder, name: str) -> None:
     path = done.file(name)
     path.write_bytes(path.read_bytes()[:-200])
-    step = session.found_of if name == "identified.json" else session.identify_step
+    step = identify.load_identified if name == "identified.json" else identify.run_identify
     with pytest.raises(InputError, match=f"{name}: damaged"):
         step(done)
 
@@ -332,7 +337,7 @@ def test_an_identified_plant_of_other_experiments_is_refused(done: SessionFolder
         with pytest.raises(
             InputError, match=r"identified\.json comes from other experiments; run identify again"
         ):
-            session.found_of(done)
+            identify.load_identified(done)
 
 
 @pytest.mark.parametrize("white", [1e200, 1e20, -1.0, "nan"])
@@ -345,7 +350,7 @@ def test_noise_that_is_no_number_ends_the_design_in_one_line(
     with pytest.raises(
         (RejectedError, InputError), match=r"^(design: |.*disturbance\.json: damaged)"
     ):
-        session.design_step(done)
+        design.run_design(done)
 
 
 def edited(done: SessionFolder, **changed: float) -> None:
@@ -374,7 +379,7 @@ def test_a_gains_file_edited_to_something_bad_is_not_applied(
 ) -> None:
     edited(done, **changed)
     with pytest.raises(InputError, match=words) as told:
-        session.checked_gains(done)
+        apply.load_checked_gains(done)
     assert "gains.toml" in str(told.value)
 
 
@@ -388,10 +393,10 @@ def test_gains_that_are_worse_are_taken_back_by_themselves(
         tune_twin(tmp_path, word, "--session", str(done.path), "--yes", *TIMES) for word in words
     ]
     assert codes == [Exit.DONE, Exit.REJECTED]
-    verified = session.verified_of(done)
+    verified = verify.load_verified(done)
     assert not verified.kept
     assert "times that of the previous gains" in verified.reason
-    (noted,) = journal.entries(tmp_path)
+    (noted,) = journal.read_entries(tmp_path)
     assert noted.what == "taken_back"
 
 
@@ -419,7 +424,7 @@ class Kept(TwinHold):
 def test_an_interrupt_gives_the_mirror_back_with_the_last_good_gains(
     done: SessionFolder, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, step: str, after_s: float
 ) -> None:
-    class Interrupted(tune.opening.Progress):
+    class Interrupted(connection.Progress):
         heard_s = 0.0
 
         def __call__(self, seconds: float) -> None:
@@ -427,8 +432,8 @@ def test_an_interrupt_gives_the_mirror_back_with_the_last_good_gains(
             self.interrupted = self.interrupted or after_s < self.heard_s < after_s + 0.05
             super().__call__(seconds)
 
-    monkeypatch.setattr(tune.opening, "TwinHold", Kept)
-    monkeypatch.setattr(tune.opening, "Progress", Interrupted)
+    monkeypatch.setattr(twin_hold, "TwinHold", Kept)
+    monkeypatch.setattr(connection, "Progress", Interrupted)
     code = tune_twin(tmp_path, step, "--session", str(done.path), *TIMES)
     assert code == Exit.INTERRUPTED
     for _ in range(20):
@@ -446,9 +451,9 @@ def test_history_rollback_and_comparison(
 ) -> None:
     copied = tmp_path / "logs"
     shutil.copytree(logs, copied)
-    monkeypatch.setattr(tune.opening, "TwinHold", Kept)
+    monkeypatch.setattr(twin_hold, "TwinHold", Kept)
     assert tune_twin(copied, "rollback", "--reason", "did not like it") == Exit.DONE
-    assert [line.what for line in journal.entries(copied)] == ["kept", "rolled_back"]
+    assert [line.what for line in journal.read_entries(copied)] == ["kept", "rolled_back"]
     assert tune_twin(copied, "rollback") == Exit.BAD_INPUT
     capsys.readouterr()
     assert command_line(["tune", "history", "--logs", str(copied), "--json"]) == Exit.DONE
@@ -458,7 +463,7 @@ def test_history_rollback_and_comparison(
     assert kept["traded"]["before"]["std_um"] > kept["traded"]["after"]["std_um"]
     assert (
         f"| least-variance | {kept['traded']['before']['std_um']:.3f} -> "
-        in journal.history_table(journal.entries(copied))
+        in journal.format_history(journal.read_entries(copied))
     )
 
 
@@ -475,7 +480,7 @@ def test_rolling_back_sets_the_gains_of_before(
 ) -> None:
     copied = tmp_path / "logs"
     shutil.copytree(logs, copied)
-    monkeypatch.setattr(tune.opening, "TwinHold", Kept)
+    monkeypatch.setattr(twin_hold, "TwinHold", Kept)
     config = CONFIG + "kp_per_s = 0.3\n"
     assert tune_twin(copied, "rollback", config=config) == Exit.DONE
     for _ in range(12):
@@ -501,7 +506,7 @@ def asked(
 ) -> tuple[int, float]:
     """Exit code of `tune apply` answered so, and the gain that then holds the mirror."""
     monkeypatch.setattr(sys, "stdin", Terminal(answers))
-    monkeypatch.setattr(tune.opening, "TwinHold", Kept)
+    monkeypatch.setattr(twin_hold, "TwinHold", Kept)
     done.begin("apply")
     code = tune_twin(tmp_path, "apply", "--session", str(done.path), *words)
     for _ in range(20):
@@ -519,12 +524,12 @@ def test_the_candidate_that_a_person_chooses_is_the_one_that_is_applied(
     code, kp_per_s = asked(
         done, tmp_path, monkeypatch, "fast\nziegler-nichols\npresent\nsimc-slow\n"
     )
-    chosen = next(row for row in session.design_of(done).candidates if row.name == "simc-slow")
+    chosen = next(row for row in design.load_design(done).candidates if row.name == "simc-slow")
     gains = load_gains(done.file("gains.toml"))
     assert code == Exit.DONE
     assert kp_per_s == pytest.approx(chosen.gains.kp_per_s, rel=0.02)
     assert (gains.candidate, gains.loop.kp_per_s) == ("simc-slow", chosen.gains.kp_per_s)
-    assert session.preview_of(done).proposed[0].load_peak_um == pytest.approx(
+    assert preview.load_preview(done).proposed[0].load_peak_um == pytest.approx(
         chosen.load_peak_um, rel=0.05
     )
     said = capsys.readouterr().err
@@ -571,10 +576,10 @@ def test_the_proposal_is_the_same_load_where_it_answers_a_load_no_worse(
     """`hold --autotune` asks for `same-load`, which is designed only where the proposal answers a
     load worse.
     """
-    rows = [row for row in session.offered(done)[0] if row.name != "same-load"]
+    rows = [row for row in design.load_candidates(done)[0] if row.name != "same-load"]
     opened = open_session(Path(shutil.copytree(done.path, tmp_path / "copy")))
-    monkeypatch.setattr(session, "offered", lambda folder: (tuple(rows), rows[0]))
-    session.choose(opened, "same-load")
+    monkeypatch.setattr(design, "load_candidates", lambda folder: (tuple(rows), rows[0]))
+    apply.select_candidate(opened, "same-load")
     assert load_gains(opened.file("gains.toml")).candidate == "least-variance"
 
 
@@ -621,20 +626,20 @@ def test_a_hold_is_watched_without_leaving_anything(
 
 
 def test_edited_gains_are_a_candidate_of_their_own(done: SessionFolder) -> None:
-    assert session.offered(done)[1].name == "least-variance"
+    assert design.load_candidates(done)[1].name == "least-variance"
     edited(done, kp_per_s=0.2)
-    rows, now = session.offered(done)
+    rows, now = design.load_candidates(done)
     assert (now.name, now.gains.kp_per_s, len(rows)) == (
         "edited",
         0.2,
-        1 + len(session.design_of(done).candidates),
+        1 + len(design.load_design(done).candidates),
     )
-    assert "worse: " in against(now, next(row for row in rows if row.name == "present"))
+    assert "worse: " in describe_change(now, next(row for row in rows if row.name == "present"))
 
 
 def test_margins_of_what_is_kept(done: SessionFolder) -> None:
     gains = load_gains(done.file("gains.toml"))
-    found = margins(Gains.of(gains.loop), gains.plant.model, 0.02)
+    found = compute_margins(Gains.of(gains.loop), gains.plant.model, 0.02)
     assert found.stable
     assert found.ms < 1.45
 

@@ -21,23 +21,32 @@ from membrane_ctrl.model.shape_estimate import ShapeEstimate
 from membrane_ctrl.model.telemetry import ShapeState
 from membrane_ctrl.sessions import folder as plain
 from tests.worlds.foreign_plant import ForeignPlant, ForeignPump, foreign_bench, foreign_config
-from tuning import gains_file as journal
-from tuning.gains_file import GainsFile, PlantSection
-from tuning.identification.disturbance import DisturbanceModel, Noise, WeatherGain, observe
-from tuning.identification.loop_model import Gains, PlantModel, Record, load_record, save_record
-from tuning.identification.shape_loop import STEP_UM, evaluate, trial, unfit
-from tuning.opening import TuneOptions, TwinHold
-from tuning.proposal.prediction import ModelBench, predict
-from tuning.proposal.verify import (
+from tuning import journal
+from tuning.gains_file import SCHEMA, GainsFile, PlantSection, load_gains, save_gains
+from tuning.identification.closed_loop import Gains
+from tuning.identification.disturbance import DisturbanceModel, observe_disturbance
+from tuning.identification.noise_spectrum import Noise
+from tuning.identification.plant_model import PlantModel
+from tuning.identification.record import Record
+from tuning.identification.record_file import load_record, save_record
+from tuning.identification.shape_loop_fit import STEP_UM, find_unfit_reason, fit_shape_loop
+from tuning.identification.shape_loop_trial import try_time_constant
+from tuning.identification.weather_gains import WeatherGain
+from tuning.options import TuneOptions
+from tuning.proposal.loop_health import judge_health
+from tuning.proposal.model_bench import ModelBench
+from tuning.proposal.prediction import predict_loop
+from tuning.proposal.verification import (
     SETTLE_LEAST_S,
     STAGES,
     VerificationTrial,
-    centre_std_um,
-    health,
-    look,
-    settle_s,
+    estimate_centre_std_um,
+    judge_stage,
+    settling_time_s,
 )
-from tuning.rig import HoldRig, Rig
+from tuning.rigs.bench_rig import Rig
+from tuning.rigs.hold_rig import HoldRig
+from tuning.twin_hold import TwinHold
 
 PLANT = PlantModel(1.0, 0.08, 0.15, 1.24)
 WEATHER = DisturbanceModel(Noise(1.0, 0.01, 0.01, 12.0, 0.02), None, None)
@@ -62,26 +71,29 @@ def test_the_centre_s_deviation_is_seen_through_ten_times_the_noise() -> None:
     record, bench = held(LOOP)
     true_um = float(np.std(bench.true_um[1500:]))
     trial = VerificationTrial(PLANT, WEATHER, LOOP, LOOP)
-    assert centre_std_um(record.displacement_um, trial, WEATHER, LOOP) == pytest.approx(
+    assert estimate_centre_std_um(record.displacement_um, trial, WEATHER, LOOP) == pytest.approx(
         true_um, rel=0.2
     )
 
 
 def test_a_slow_loop_is_given_longer_to_forget_the_change() -> None:
-    assert settle_s(LOOP) == SETTLE_LEAST_S
+    assert settling_time_s(LOOP) == SETTLE_LEAST_S
     slow = LOOP.model_copy(update={"kp_per_s": 0.247, "ti_s": 19.94})
     # the slowest root of s^2 + 0.247 s + 0.01239 is at 0.0701 per s
-    assert settle_s(slow) == pytest.approx(4 / 0.0701, rel=0.01)
-    assert settle_s(slow.model_copy(update={"ti_s": 3600.0})) <= 120.0
+    assert settling_time_s(slow) == pytest.approx(4 / 0.0701, rel=0.01)
+    assert settling_time_s(slow.model_copy(update={"ti_s": 3600.0})) <= 120.0
 
 
 def test_a_look_passes_good_gains_and_names_what_is_wrong_with_bad_ones() -> None:
     record, _ = held(LOOP)
     about_um = np.zeros(len(record))
-    assert look(record, about_um, VerificationTrial(PLANT, WEATHER, LOOP, LOOP), 1.5).reason == ""
+    assert (
+        judge_stage(record, about_um, VerificationTrial(PLANT, WEATHER, LOOP, LOOP), 1.5).reason
+        == ""
+    )
     slow = LOOP.model_copy(update={"kp_per_s": 0.1, "ti_s": 60.0})
     record, _ = held(slow)
-    stage = look(record, about_um, VerificationTrial(PLANT, WEATHER, LOOP, slow), 1.1)
+    stage = judge_stage(record, about_um, VerificationTrial(PLANT, WEATHER, LOOP, slow), 1.1)
     assert stage.growth > 1.3
     assert "times that of the previous gains" in stage.reason
 
@@ -95,7 +107,7 @@ def test_a_deviation_that_was_predicted_and_accepted_is_no_failure(
     """Gains chosen knowing what they cost; those that cost more than was predicted still fail."""
     chosen = LOOP.model_copy(update={"kp_per_s": 0.1, "ti_s": 60.0})
     record, _ = held(LOOP.model_copy(update={"kp_per_s": kp_per_s, "ti_s": 60.0}))
-    stage = look(
+    stage = judge_stage(
         record,
         np.zeros(len(record)),
         VerificationTrial(PLANT, WEATHER, LOOP, chosen, accepted=True),
@@ -111,7 +123,7 @@ def test_a_plant_with_less_margin_than_designed_shows_in_the_readings() -> None:
     loop = LOOP.model_copy(update={"kp_per_s": 1.0, "ti_s": 8.0, "measurement_filter_s": 0.1})
     changed = replace(PLANT, gain=2.0, dead_time_s=0.35, leak_um_per_s=2.48)
     record, _ = held(loop, changed)
-    stage = look(
+    stage = judge_stage(
         record, np.zeros(len(record)), VerificationTrial(PLANT, WEATHER, loop, loop), 100.0
     )
     assert stage.ms > 2.0
@@ -147,12 +159,12 @@ def test_the_gains_before_are_judged_in_the_very_weather_of_the_new_ones() -> No
     after = before.model_copy(update={"kp_per_s": 0.35, "ti_s": 20.0})
     record, after_um = in_a_storm(after)
     _, before_um = in_a_storm(before)
-    weather = observe(record, STORM_MODEL, after)
+    weather = observe_disturbance(record, STORM_MODEL, after)
     trial = VerificationTrial(STORM_MODEL, weather, before, after, pump=STORM_PUMP)
-    stage = look(record, np.zeros(len(record)), trial, 1.1)
+    stage = judge_stage(record, np.zeros(len(record)), trial, 1.1)
     assert stage.std_um == pytest.approx(after_um, rel=0.05)
     assert stage.before_um == pytest.approx(before_um, rel=0.05)
-    assert predict(Gains.of(before), STORM_MODEL, weather, before).std_um < 0.5 * before_um
+    assert predict_loop(Gains.of(before), STORM_MODEL, weather, before).std_um < 0.5 * before_um
 
 
 @pytest.mark.parametrize(
@@ -172,10 +184,10 @@ def test_a_setpoint_that_moved_is_no_deviation() -> None:
     walk_um = 5.0 * np.sin(np.arange(len(record)) * 1e-4)
     moved = replace(record, displacement_um=record.displacement_um + walk_um)
     trial = VerificationTrial(PLANT, WEATHER, LOOP, LOOP)
-    plain_um = centre_std_um(record.displacement_um, trial, WEATHER, LOOP)
-    assert centre_std_um(moved.displacement_um - walk_um, trial, WEATHER, LOOP) == pytest.approx(
-        plain_um, rel=1e-9
-    )
+    plain_um = estimate_centre_std_um(record.displacement_um, trial, WEATHER, LOOP)
+    assert estimate_centre_std_um(
+        moved.displacement_um - walk_um, trial, WEATHER, LOOP
+    ) == pytest.approx(plain_um, rel=1e-9)
 
 
 def shapes(
@@ -215,7 +227,7 @@ def test_the_shape_loop_s_sensitivity_noise_and_time_constant() -> None:
     drift = (
         np.cumsum(np.random.default_rng(5).standard_normal(2000)) * 0.05 * math.sqrt(2.0)
     )  # 0.05 µm/sqrt(s)
-    found = evaluate(levels, shapes(2000, 0.0, 37_100.0, 0.3, drift), zernike_projection())
+    found = fit_shape_loop(levels, shapes(2000, 0.0, 37_100.0, 0.3, drift), zernike_projection())
     assert found.agreement == pytest.approx(1.0)
     assert found.scale == pytest.approx(1.0, abs=0.05)
     assert found.sigma_um == pytest.approx(0.3, rel=0.1)
@@ -230,7 +242,7 @@ def test_a_drift_that_is_not_seen_asks_for_minutes() -> None:
         shapes(40, 10_000.0 + 200 * k, 37_100.0 + at, 1.0, still)
         for k, at in enumerate((0.0, STEP_UM, 0.0))
     ]
-    found = evaluate(levels, shapes(400, 0.0, 37_100.0, 1.0, still), zernike_projection())
+    found = fit_shape_loop(levels, shapes(400, 0.0, 37_100.0, 1.0, still), zernike_projection())
     assert not found.drift_seen
     assert found.drift_um_per_sqrt_h < 2.0
     assert found.time_constant_s > 60.0
@@ -280,7 +292,7 @@ def test_a_time_constant_is_kept_if_it_predicts_the_shapes(
     drift_um = um_per_min / 60 * 2.0 * np.arange(400)
     earlier = shapes(100, 0.0, 37_100.0, 0.3, drift_um[:100])
     rig = OuterRig(shapes(300, 200.0, 37_100.0, 0.3, drift_um[100:]), tracking)
-    done = trial(rig, (40.0, after_s), earlier, zernike_projection(), 600.0)  # type: ignore[arg-type]
+    done = try_time_constant(rig, (40.0, after_s), earlier, zernike_projection(), 600.0)  # type: ignore[arg-type]
     assert words in done.reason
     assert bool(words) == bool(done.reason)
     assert rig.told[0] == (720.0, after_s)
@@ -295,24 +307,25 @@ def test_a_figure_that_does_not_answer_the_setpoint_is_not_tuned_on() -> None:
         shapes(40, 10_000.0 + 200 * k, 37_100.0 + at, 0.3, still)
         for k, at in enumerate((0.0, STEP_UM, 0.0))
     ]
-    found = evaluate(levels, shapes(400, 0.0, 37_100.0, 0.3, still), zernike_projection())
-    assert unfit(found) == ""
-    assert "calibrate the camera first" in unfit(replace(found, scale=0.7))
-    assert "calibrate the camera first" in unfit(replace(found, agreement=0.5))
+    found = fit_shape_loop(levels, shapes(400, 0.0, 37_100.0, 0.3, still), zernike_projection())
+    assert find_unfit_reason(found) == ""
+    assert "calibrate the camera first" in find_unfit_reason(replace(found, scale=0.7))
+    assert "calibrate the camera first" in find_unfit_reason(replace(found, agreement=0.5))
 
 
 def test_a_rolled_back_time_constant_leaves_the_gains_of_its_session(tmp_path: Path) -> None:
-    journal.note(tmp_path, journal.entry("kept", "s1", "eve", "why", LOOP, LOOP))
-    journal.note(
-        tmp_path, journal.entry("kept", "s1", "eve", "why", LOOP, LOOP, None, (40.0, 62.0))
+    journal.append_entry(tmp_path, journal.make_entry("kept", "s1", "eve", "why", LOOP, LOOP))
+    journal.append_entry(
+        tmp_path, journal.make_entry("kept", "s1", "eve", "why", LOOP, LOOP, None, (40.0, 62.0))
     )
-    assert journal.to_roll_back(tmp_path).shape_s == (40.0, 62.0)
-    assert journal.to_roll_back(tmp_path, gains_only=True).shape_s is None
-    journal.note(
-        tmp_path, journal.entry("rolled_back", "s1", "eve", "why", LOOP, LOOP, None, (40.0, 62.0))
+    assert journal.find_roll_back(tmp_path).shape_s == (40.0, 62.0)
+    assert journal.find_roll_back(tmp_path, gains_only=True).shape_s is None
+    journal.append_entry(
+        tmp_path,
+        journal.make_entry("rolled_back", "s1", "eve", "why", LOOP, LOOP, None, (40.0, 62.0)),
     )
-    assert journal.to_roll_back(tmp_path).shape_s is None
-    assert "shape loop 62 -> 40 s" in journal.history_table(journal.entries(tmp_path))
+    assert journal.find_roll_back(tmp_path).shape_s is None
+    assert "shape loop 62 -> 40 s" in journal.format_history(journal.read_entries(tmp_path))
 
 
 def gains_file(plant: PlantModel) -> GainsFile:
@@ -340,11 +353,11 @@ def gains_file(plant: PlantModel) -> GainsFile:
 def test_a_loop_in_order_suggests_nothing_and_an_aged_one_says_why() -> None:
     record, _ = held(LOOP)
     about_um = np.zeros(len(record))
-    fresh = health(record, about_um, LOOP, gains_file(PLANT))
+    fresh = judge_health(record, about_um, LOOP, gains_file(PLANT))
     assert fresh.suggestions == ()
     assert fresh.leak_um_per_s == pytest.approx(1.24, abs=0.1)
     assert fresh.gain == pytest.approx(1.0, abs=3 * fresh.gain_sigma)
-    leaky = health(record, about_um, LOOP, gains_file(replace(PLANT, leak_um_per_s=0.8)))
+    leaky = judge_health(record, about_um, LOOP, gains_file(replace(PLANT, leak_um_per_s=0.8)))
     assert any("leak" in suggestion for suggestion in leaky.suggestions)
 
 
@@ -360,7 +373,7 @@ def test_the_gain_is_seen_although_the_feed_forward_cancels_the_weather(gain: fl
     )
     loop = LoopConfig(kp_per_s=0.25, ti_s=20.0)
     record, _ = held(loop, replace(PLANT, gain=gain), weather=weather)
-    found = health(record, np.zeros(len(record)), loop, gains_file(PLANT))
+    found = judge_health(record, np.zeros(len(record)), loop, gains_file(PLANT))
     assert found.gain == pytest.approx(gain, abs=0.12)
     assert any(suggestion.startswith("k is") for suggestion in found.suggestions) == (gain < 1)
 
@@ -368,7 +381,7 @@ def test_the_gain_is_seen_although_the_feed_forward_cancels_the_weather(gain: fl
 def test_a_glance_is_too_short_to_judge() -> None:
     record, _ = held(LOOP, duration_s=60.0)
     with pytest.raises(ValueError, match="too short"):
-        health(record, np.zeros(len(record)), LOOP, gains_file(PLANT))
+        judge_health(record, np.zeros(len(record)), LOOP, gains_file(PLANT))
 
 
 @dataclass(frozen=True, slots=True)
@@ -411,11 +424,11 @@ def test_a_record_with_any_wrong_byte_is_one_line(tmp_path: Path) -> None:
 
 
 def test_the_journal_survives_a_torn_line(tmp_path: Path) -> None:
-    journal.note(tmp_path, journal.entry("kept", "s1", "eve", "why", LOOP, LOOP))
+    journal.append_entry(tmp_path, journal.make_entry("kept", "s1", "eve", "why", LOOP, LOOP))
     with (tmp_path / "tuning" / "journal.jsonl").open("a") as file:
         file.write('{"time_utc": "2026')
-    assert [line.session for line in journal.entries(tmp_path)] == ["s1"]
-    assert journal.to_roll_back(tmp_path).session == "s1"
+    assert [line.session for line in journal.read_entries(tmp_path)] == ["s1"]
+    assert journal.find_roll_back(tmp_path).session == "s1"
 
 
 @pytest.mark.parametrize("place", ["tuning", "tuning/journal.jsonl"])
@@ -427,9 +440,11 @@ def test_the_journal_follows_no_link(tmp_path: Path, place: str) -> None:
     link.parent.mkdir(parents=True)
     link.symlink_to(elsewhere if place == "tuning" else elsewhere / "journal.jsonl")
     with pytest.raises(InputError, match="link"):
-        journal.note(tmp_path / "logs", journal.entry("kept", "s1", "eve", "why", LOOP, LOOP))
+        journal.append_entry(
+            tmp_path / "logs", journal.make_entry("kept", "s1", "eve", "why", LOOP, LOOP)
+        )
     with pytest.raises(InputError, match="link"):
-        journal.entries(tmp_path / "logs")
+        journal.read_entries(tmp_path / "logs")
     assert (elsewhere / "journal.jsonl").read_text() == "theirs\n"
 
 
@@ -445,13 +460,13 @@ def test_each_json_file_of_a_session_states_format_and_program(tmp_path: Path) -
 
 def test_a_gains_file_states_format_and_program(tmp_path: Path) -> None:
     path = tmp_path / "gains.toml"
-    journal.save_gains(path, gains_file(PLANT))
+    save_gains(path, gains_file(PLANT))
     table = tomllib.loads(path.read_text())
-    assert table["schema"] == journal.SCHEMA
+    assert table["schema"] == SCHEMA
     assert stated_program(table) == program_identity()
     path.write_text(path.read_text().replace("membrane-gains/1", "membrane-gains/2"))
     with pytest.raises(InputError, match="schema"):
-        journal.load_gains(path)
+        load_gains(path)
 
 
 @pytest.mark.parametrize("content", ["{}", "[]", "3", '{"schema": "membrane-live-calibration/1"}'])
@@ -471,4 +486,4 @@ def test_a_folder_in_place_of_a_result_is_one_line(tmp_path: Path) -> None:
 
 def test_nothing_to_roll_back_is_said(tmp_path: Path) -> None:
     with pytest.raises(InputError, match="no kept gains"):
-        journal.to_roll_back(tmp_path)
+        journal.find_roll_back(tmp_path)

@@ -18,11 +18,13 @@ from membrane_ctrl.model.telemetry import FIELDS, TelemetryRow
 from membrane_ctrl.model.zernike_terms import ZERNIKE_TERMS
 from membrane_ctrl.sessions.folder import SessionFolder, create_session
 from tests.worlds.foreign_plant import ForeignPlant, ForeignPump, foreign_bench, foreign_config
-from tuning import pump_trial, session
-from tuning.identification import characterise
-from tuning.identification.loop_model import Record
-from tuning.opening import TwinHold
-from tuning.rig import HoldRig, TicksByFigures
+from tuning import estimator_levels
+from tuning.identification import experiments
+from tuning.identification.record import Record
+from tuning.rigs.hold_rig import HoldRig
+from tuning.rigs.ticks_by_figures import TicksByFigures
+from tuning.steps import characterise, identify, map_pump, observe
+from tuning.twin_hold import TwinHold
 
 SIGMA_UM = 0.036
 
@@ -88,14 +90,14 @@ def test_the_pump_is_identified_by_figures_that_come_late(tmp_path: Path) -> Non
     """Counted from their arrival, the delay would be 0.12 s longer, 7 standard errors."""
     plant = ForeignPlant(ForeignPump(delay_s=0.3, lag_s=0.2), 2, 0.7)
     link, rig, folder = started(tmp_path, by_optics(20.0, rate_hz=25.0), plant, 0.12)
-    session.characterise_step(folder, rig, plan=characterise.SHORT)
-    found = session.identify_step(folder).identified
-    session.observe_step(folder, rig)
+    characterise.run_characterise(folder, rig, plan=experiments.SHORT)
+    found = identify.run_identify(folder).identified
+    observe.run_observe(folder, rig)
     assert found.sigma.delay_s < 0.025
     assert found.model.delay_s == pytest.approx(0.5, abs=0.05)
     assert abs(found.model.gain - 1) < 4 * found.sigma.gain + 0.03
     assert max(abs(row.truth_displacement_um) for row in link.rows[500:]) < 10.0
-    saved = session.estimator_of(folder)
+    saved = estimator_levels.derive_estimator_levels(folder)
     assert saved["pump_delay_s"] + saved["pump_lag_s"] == pytest.approx(0.5, abs=0.05)
     assert "laser_noise_um" not in saved  # there is none, and a figure states its own
 
@@ -206,22 +208,22 @@ def test_a_bench_of_which_nothing_is_known_is_held_better_by_what_was_identified
 
     config = by_optics(figures_hz, full_um_per_s)
     link, rig, folder = started(tmp_path, config, plant(seed), late_s)
-    session.characterise_step(folder, rig)
-    found = session.identify_step(folder)
+    characterise.run_characterise(folder, rig)
+    found = identify.run_identify(folder)
     if found.quality.verdict == "refused":
         assert found.quality.pump_unknown  # which is true: its curve is not straight
-        folder = pump_trial.map_pump(folder, rig)[1]
+        folder = map_pump.map_pump(folder, rig)[1]
         config = folder.config
-        session.characterise_step(folder, rig)
-        found = session.identify_step(folder)
-    session.observe_step(folder, rig)
+        characterise.run_characterise(folder, rig)
+        found = identify.run_identify(folder)
+    observe.run_observe(folder, rig)
     identified = found.identified
     assert identified.model.delay_s == pytest.approx(
         delay_s + lag_s, abs=max(0.03, 3 * identified.sigma.delay_s)
     )
     assert max(abs(tick.truth_displacement_um) for tick in link.rows[2000:]) < 10.0
     told = EstimatorConfig.model_validate(
-        config.estimator.model_dump() | session.estimator_of(folder)
+        config.estimator.model_dump() | estimator_levels.derive_estimator_levels(folder)
     )
     before_um = held_std_um(config, plant(seed + 50), late_s)
     after_um = held_std_um(config.model_copy(update={"estimator": told}), plant(seed + 50), late_s)

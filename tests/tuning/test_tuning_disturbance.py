@@ -8,8 +8,11 @@ import numpy as np
 import pytest
 
 from membrane_ctrl.config.schema import LoopConfig
-from tuning.identification.disturbance import WeatherGain, fit_noise, fit_weather, lagged, observe
-from tuning.identification.loop_model import PlantModel, Record
+from tuning.identification.disturbance import observe_disturbance
+from tuning.identification.noise_spectrum import fit_noise
+from tuning.identification.plant_model import PlantModel
+from tuning.identification.record import Record
+from tuning.identification.weather_gains import WeatherGain, fit_weather, lag_series
 
 DT_S = 0.02
 N = 30_000
@@ -28,7 +31,7 @@ W = np.geomspace(0.15, 3.0, 8)  # where it matters to a loop
 
 def test_both_walks_are_told_from_noise() -> None:
     rng = np.random.default_rng(2)
-    series = walk(rng, 0.05) + lagged(walk(rng, 1.0), 12.0, DT_S) + 0.5 * rng.standard_normal(N)
+    series = walk(rng, 0.05) + lag_series(walk(rng, 1.0), 12.0, DT_S) + 0.5 * rng.standard_normal(N)
     found = fit_noise(series, DT_S, 12.0)
     assert found.white == pytest.approx(0.5, rel=0.02)
     assert found.moving_psd(W) == pytest.approx((0.05 + 1 / (1 + (W * 12) ** 2)) / W**2, rel=0.35)
@@ -72,7 +75,7 @@ def test_weather_that_comes_and_goes_widens_the_prediction() -> None:
     steady = coloured(rng, COLOURS["1/f, no higher than 1 Hz"])
     gust = np.where(np.arange(N) % N < N // 5, 4.0, 1.0)
     found = [
-        observe(
+        observe_disturbance(
             Record(
                 DT_S, np.full(N, 1.2), x + 0.1 * rng.standard_normal(N), *np.full((2, N), np.nan)
             ),
@@ -114,7 +117,7 @@ def weather_record(seed: int, sensor_pa: float) -> Record:
     pressure, air = walk(rng, 0.1), walk(rng, 2e-5)
     y = (
         -0.36 * pressure
-        + 120.0 * lagged(air, 12.0, DT_S)
+        + 120.0 * lag_series(air, 12.0, DT_S)
         + walk(rng, 1e-4)
         + rng.standard_normal(N)
     )

@@ -19,9 +19,10 @@ from membrane_ctrl.control.experiments.patterns import doublets, multisine, step
 from membrane_ctrl.control.experiments.relay import Relay
 from membrane_ctrl.sim.surroundings import AmbientChange, LaserDropout
 from tests.studies.tuning_sessions import Case, TwinBench
-from tuning.identification.characterise import ExperimentError, characterise
-from tuning.identification.loop_model import Record
-from tuning.rig import Rig, laser_noise_um
+from tuning.identification.experiments import ExperimentError, fit_experiments, run_experiments
+from tuning.identification.record import Record
+from tuning.rigs.bench_rig import Rig
+from tuning.rigs.operating_point import estimate_laser_noise_um
 
 AROUND = Around(1.24, 0.32, 5.3, 1.0)
 
@@ -132,7 +133,9 @@ def test_characterising_gives_up_by_name_when_no_relay_can_be_completed() -> Non
     bench = StuckPump(case, 1)
     bench.stuck_from_s = 60.0
     with pytest.raises(ExperimentError, match="did not"):
-        characterise(Rig(bench, case.loop(), PumpConfig(), case.holding_flow_um_per_s))
+        fit_experiments(
+            run_experiments(Rig(bench, case.loop(), PumpConfig(), case.holding_flow_um_per_s))
+        )
 
 
 @pytest.mark.parametrize("most_fraction", [pytest.param(0.38, marks=pytest.mark.campaign), 0.6])
@@ -142,7 +145,7 @@ def test_a_saturating_pump_is_no_weak_one(most_fraction: float) -> None:
     bench = SaturatingPump(case, 1)
     bench.most_fraction = most_fraction
     rig = Rig(bench, case.loop(), PumpConfig(), case.holding_flow_um_per_s)
-    found = characterise(rig).quality
+    found = fit_experiments(run_experiments(rig)).quality
     assert found.verdict == "refused"
     assert any(
         "the pump saturates" in reason and "run `tune pump`" in reason for reason in found.reasons
@@ -217,7 +220,7 @@ def test_patterns_run_on_the_twin_within_the_limit(make: object) -> None:
 def test_laser_noise_is_measured_while_the_weather_moves_the_mirror() -> None:
     case = Case("gusty", laser_noise_um=0.7)
     rig = Rig(TwinBench(case, 2), case.loop(), PumpConfig(), case.holding_flow_um_per_s)
-    assert laser_noise_um(rig.hold(40.0)) == pytest.approx(0.7, rel=0.05)
+    assert estimate_laser_noise_um(rig.hold(40.0)) == pytest.approx(0.7, rel=0.05)
 
 
 def test_handing_over_between_loop_and_experiment_is_bumpless() -> None:

@@ -8,15 +8,18 @@ import numpy as np
 import pytest
 from synthetic import record, way_um
 
-from tuning.identification.characterise import judge, validate
-from tuning.identification.identify import identify, independence, two_gains, whiteness
-from tuning.identification.loop_model import PlantModel, Record
+from tuning.identification.fit_quality import judge_fit, validate_fit
+from tuning.identification.plant_fit import identify_plant
+from tuning.identification.plant_model import PlantModel
+from tuning.identification.record import Record
+from tuning.identification.residual_tests import compute_independence_p, compute_whiteness_p
+from tuning.identification.two_gains import fit_two_gains
 
 TRUTH = PlantModel(0.8, 0.09, 0.15, 1.1)
 
 
 def test_recovers_a_plant_from_nearly_clean_data() -> None:
-    found = identify(record(TRUTH, laser_um=0.02, walk_um2_per_s=1e-6))
+    found = identify_plant(record(TRUTH, laser_um=0.02, walk_um2_per_s=1e-6))
     assert found.model.gain == pytest.approx(TRUTH.gain, rel=2e-3)
     assert found.model.dead_time_s == pytest.approx(TRUTH.dead_time_s, abs=3e-3)
     assert found.model.lag_s == pytest.approx(TRUTH.lag_s, abs=4e-3)
@@ -27,7 +30,7 @@ def test_error_bars_are_honest() -> None:
     """Of 16 fits, at 2 sigma 95 % should hold the truth; fewer than 13 would be a chance of 1 in
     150.
     """
-    fits = [identify(record(TRUTH, seed=seed, samples=2000)) for seed in range(16)]
+    fits = [identify_plant(record(TRUTH, seed=seed, samples=2000)) for seed in range(16)]
     gain = [abs(f.model.gain - TRUTH.gain) <= 2 * f.sigma.gain for f in fits]
     delay = [abs(f.model.delay_s - TRUTH.delay_s) <= 2 * f.sigma.delay_s for f in fits]
     assert sum(gain) >= 13
@@ -36,7 +39,7 @@ def test_error_bars_are_honest() -> None:
 
 
 def test_residuals_of_the_true_structure_are_white_and_know_nothing_of_the_flow() -> None:
-    found = identify(record(TRUTH, seed=5))
+    found = identify_plant(record(TRUTH, seed=5))
     assert found.whiteness_p > 1e-3
     assert found.independence_p > 1e-3
 
@@ -44,32 +47,32 @@ def test_residuals_of_the_true_structure_are_white_and_know_nothing_of_the_flow(
 def test_whiteness_and_independence_see_what_they_are_for() -> None:
     rng = np.random.default_rng(1)
     e, u = rng.standard_normal(4000), rng.standard_normal(4000)
-    assert whiteness(np.convolve(e, [1.0, 0.3], "same")) < 1e-6
-    assert independence(e, u) > 1e-3
-    assert independence(e[3:] + 0.2 * u[:-3], u[3:]) < 1e-6
+    assert compute_whiteness_p(np.convolve(e, [1.0, 0.3], "same")) < 1e-6
+    assert compute_independence_p(e, u) > 1e-3
+    assert compute_independence_p(e[3:] + 0.2 * u[:-3], u[3:]) < 1e-6
 
 
 def test_a_short_or_silent_record_is_refused() -> None:
     whole = record(TRUTH)
     with pytest.raises(ValueError, match="too short"):
-        identify(whole.part(0.0, 1.0))
+        identify_plant(whole.part(0.0, 1.0))
     with pytest.raises(ValueError, match="tune characterise"):
-        identify(replace(whole, flow_um_per_s=np.ones(len(whole))))
+        identify_plant(replace(whole, flow_um_per_s=np.ones(len(whole))))
 
 
 def test_good_data_are_ok_and_hold_on_fresh_data() -> None:
     whole = record(TRUTH, samples=5000)
-    fitted = identify(whole.part(0.0, 70.0))
-    checked = validate(fitted, whole.part(70.0, 100.0))
+    fitted = identify_plant(whole.part(0.0, 70.0))
+    checked = validate_fit(fitted, whole.part(70.0, 100.0))
     assert checked.innovation_ratio == pytest.approx(1.0, abs=0.1)
-    assert judge(whole, fitted, checked).verdict == "ok"
+    assert judge_fit(whole, fitted, checked).verdict == "ok"
 
 
 def test_a_bench_that_changed_is_seen_on_fresh_data() -> None:
-    fitted = identify(record(TRUTH, laser_um=0.1))
-    checked = validate(fitted, record(replace(TRUTH, gain=1.6), laser_um=0.1, seed=2))
+    fitted = identify_plant(record(TRUTH, laser_um=0.1))
+    checked = validate_fit(fitted, record(replace(TRUTH, gain=1.6), laser_um=0.1, seed=2))
     assert checked.independence_p < 1e-4
-    assert judge(record(TRUTH, laser_um=0.1), fitted, checked).verdict == "degraded"
+    assert judge_fit(record(TRUTH, laser_um=0.1), fitted, checked).verdict == "degraded"
 
 
 def test_a_slammed_door_is_named_with_its_time() -> None:
@@ -77,14 +80,14 @@ def test_a_slammed_door_is_named_with_its_time() -> None:
     jumped = replace(
         whole, displacement_um=whole.displacement_um + 12.0 * (np.arange(3000) >= 1500)
     )
-    found = judge(jumped, identify(jumped))
+    found = judge_fit(jumped, identify_plant(jumped))
     assert found.verdict == "refused"
     assert any("30.0 s" in reason and "relay" in reason for reason in found.reasons)
 
 
 def test_a_pump_that_does_nothing_is_named() -> None:
     dead = record(replace(TRUTH, gain=1e-9))
-    found = judge(dead, identify(dead))
+    found = judge_fit(dead, identify_plant(dead))
     assert found.verdict == "refused"
     assert "run `tune pump`" in found.reasons[0]
 
@@ -96,7 +99,9 @@ def test_only_a_strong_pump_beside_which_something_swings_is_mapped(
     """One that starts with more than the leak can only pulse: no gains hold it without swinging."""
     whole = record(replace(TRUTH, gain=gain), laser_um=0.1)
     swing_um = 0.1 * np.sin(2 * np.pi * 1.3 * whole.dt_s * np.arange(len(whole)))
-    found = judge(whole, identify(replace(whole, displacement_um=whole.displacement_um + swing_um)))
+    found = judge_fit(
+        whole, identify_plant(replace(whole, displacement_um=whole.displacement_um + swing_um))
+    )
     assert (found.verdict, found.pump_unknown) == (verdict, verdict == "refused")
     assert any("coloured" in reason for reason in found.reasons)
 
@@ -106,14 +111,14 @@ def test_a_blinking_laser_is_refused() -> None:
     reading = whole.displacement_um.copy()
     reading[::20] = np.nan
     blinking = replace(whole, displacement_um=reading)
-    found = judge(blinking, identify(blinking))
+    found = judge_fit(blinking, identify_plant(blinking))
     assert found.verdict == "refused"
     assert "laser" in found.reasons[0]
 
 
 def test_too_little_excitation_is_refused_with_the_experiment_that_helps() -> None:
     whole = record(TRUTH, samples=400, laser_um=4.0, walk_um2_per_s=0.5)
-    found = judge(whole, identify(whole))
+    found = judge_fit(whole, identify_plant(whole))
     assert found.verdict == "refused"
     assert any(
         "tune characterise" in reason or "longer" in reason or "tune pump" in reason
@@ -131,7 +136,7 @@ def test_a_pump_that_saturates_is_told_from_a_straight_one() -> None:
         came = np.minimum(flow, most)
         y = way_um(came, TRUTH, dt_s) + rng.standard_normal(flow.size)
         found = Record(dt_s, flow, y, absent, absent)
-        gains[most] = two_gains(found, identify(found))
+        gains[most] = fit_two_gains(found, identify_plant(found))
     straight, bent = gains[10.0], gains[2.2]
     assert abs(straight.above - straight.below) < 4 * straight.difference_sigma
     assert bent.below - bent.above > 5 * bent.difference_sigma

@@ -14,26 +14,27 @@ from scipy.signal import lfilter
 
 from membrane_ctrl.config.schema import LoopConfig, PumpConfig, TwinConfig
 from tests.studies.minimum_variance import least_std_um as least_of_the_twin
-from tuning.identification.disturbance import DisturbanceModel, Noise, WeatherGain
-from tuning.identification.loop_model import (
-    RECOVERED_UM,
-    Gains,
-    PlantModel,
-    load_step,
-    margins,
-    sensitivity_peak,
-)
-from tuning.proposal.candidates import (
+from tuning.identification.closed_loop import Gains
+from tuning.identification.disturbance import DisturbanceModel
+from tuning.identification.load_step import RECOVERED_UM, simulate_load_step
+from tuning.identification.margins import compute_margins, find_sensitivity_peak
+from tuning.identification.noise_spectrum import Noise
+from tuning.identification.plant_model import PlantModel
+from tuning.identification.weather_gains import WeatherGain
+from tuning.proposal.candidate import evaluate_candidate, find_refusal
+from tuning.proposal.candidate_table import format_cells
+from tuning.proposal.design import compute_designs
+from tuning.proposal.disturbance_states import Walks
+from tuning.proposal.gain_search import (
     Demands,
-    amigo,
-    lambda_tuned,
-    least_variance,
-    load_peak_um,
-    max_ki,
-    simc,
+    bound_load_peak_um,
+    search_least_variance,
+    search_max_ki,
 )
-from tuning.proposal.design import candidate, cells, designs, refusal
-from tuning.proposal.prediction import Walks, _clipped, least_std_um, predict, preview
+from tuning.proposal.lower_bound import compute_least_std_um
+from tuning.proposal.prediction import _clipped, predict_loop
+from tuning.proposal.preview import preview_loop
+from tuning.proposal.tuning_rules import make_amigo_gains, make_lambda_gains, make_simc_gains
 
 DT_S = 1e-3
 DELAY = PlantModel(1.0, 0.3, 1e-4, 1.24)  # as good as a pure delay
@@ -42,7 +43,7 @@ PUMP = PlantModel(1.0, 0.075, 0.15, 1.24)
 
 def test_proportional_control_of_an_integrator_with_delay() -> None:
     """GM = pi / (2 k K d), PM = 90 deg - K d, delay margin = PM / K."""
-    found = margins(Gains(1.0, 1e6), DELAY, DT_S)
+    found = compute_margins(Gains(1.0, 1e6), DELAY, DT_S)
     delay_s = DELAY.delay_s + DT_S / 2
     assert found.stable
     assert found.gain_margin == pytest.approx(math.pi / 2 / delay_s, rel=0.01)
@@ -53,14 +54,14 @@ def test_proportional_control_of_an_integrator_with_delay() -> None:
 @pytest.mark.parametrize("factor", [0.9, 1.1])
 def test_stability_is_told_on_both_sides_of_the_gain_margin(factor: float) -> None:
     gains = Gains(2.0, 5.0)
-    edge = margins(gains, PUMP, 0.02).gain_margin
+    edge = compute_margins(gains, PUMP, 0.02).gain_margin
     scaled = Gains(2.0 * edge * factor, 5.0)
-    assert margins(scaled, PUMP, 0.02).stable == (factor < 1)
-    assert math.isfinite(sensitivity_peak(scaled, PUMP, 0.02)) == (factor < 1)
+    assert compute_margins(scaled, PUMP, 0.02).stable == (factor < 1)
+    assert math.isfinite(find_sensitivity_peak(scaled, PUMP, 0.02)) == (factor < 1)
 
 
 def test_an_integrator_that_is_too_fast_is_unstable() -> None:
-    assert not margins(Gains(0.1, 0.2), PUMP, 0.02).stable
+    assert not compute_margins(Gains(0.1, 0.2), PUMP, 0.02).stable
 
 
 def test_margins_agree_with_a_high_order_pade() -> None:
@@ -71,7 +72,7 @@ def test_margins_agree_with_a_high_order_pade() -> None:
     )
     gain_margin, phase_margin, _, _, _, _ = control.stability_margins(loop)
     disk, _, _ = control.disk_margins(loop, np.geomspace(1e-3, 100, 2000))
-    found = margins(Gains(0.9, 7.0, 0.0, 0.1), PUMP, 0.02)
+    found = compute_margins(Gains(0.9, 7.0, 0.0, 0.1), PUMP, 0.02)
     assert found.gain_margin == pytest.approx(gain_margin, rel=0.01)
     assert found.phase_margin_deg == pytest.approx(phase_margin, abs=0.5)
     assert found.disk_margin == pytest.approx(disk, rel=0.01)
@@ -79,18 +80,18 @@ def test_margins_agree_with_a_high_order_pade() -> None:
 
 
 def test_rules_are_the_published_ones() -> None:
-    assert simc(DELAY, 0.0, 0.0).kp_per_s == pytest.approx(1 / (2 * DELAY.delay_s))
-    assert simc(DELAY, 0.0, 0.0).ti_s == pytest.approx(8 * DELAY.delay_s)
-    assert amigo(DELAY, 0.0, 0.0).kp_per_s == pytest.approx(0.35 / DELAY.delay_s)
-    slow = lambda_tuned(DELAY, 0.0, 0.0, factor=3.0)
+    assert make_simc_gains(DELAY, 0.0, 0.0).kp_per_s == pytest.approx(1 / (2 * DELAY.delay_s))
+    assert make_simc_gains(DELAY, 0.0, 0.0).ti_s == pytest.approx(8 * DELAY.delay_s)
+    assert make_amigo_gains(DELAY, 0.0, 0.0).kp_per_s == pytest.approx(0.35 / DELAY.delay_s)
+    slow = make_lambda_gains(DELAY, 0.0, 0.0, factor=3.0)
     assert slow.ti_s == pytest.approx(7 * DELAY.delay_s)
     assert slow.kp_per_s == pytest.approx(7 / (16 * DELAY.delay_s))
 
 
 def test_max_ki_sits_on_its_sensitivity_and_beats_simc() -> None:
-    best = max_ki(PUMP, 0.02, 0.1, 1.4)
-    assert margins(best, PUMP, 0.02).ms == pytest.approx(1.4, abs=0.02)
-    slow = simc(PUMP, 0.02, 0.1, 1.0)
+    best = search_max_ki(PUMP, 0.02, 0.1, 1.4)
+    assert compute_margins(best, PUMP, 0.02).ms == pytest.approx(1.4, abs=0.02)
+    slow = make_simc_gains(PUMP, 0.02, 0.1, 1.0)
     assert best.kp_per_s / best.ti_s > slow.kp_per_s / slow.ti_s
 
 
@@ -102,9 +103,9 @@ def test_a_load_step_against_simulation(ti_s: float) -> None:
     t = np.linspace(0, 60, 6001)
     system = control.tf([1.0, 0.0], [1.0, 0.8, 0.8 / ti_s])
     _, y = control.step_response(0.6 * system, t)
-    found = load_step(gains, model, 0.6, 1e-9)
+    found = simulate_load_step(gains, model, 0.6, 1e-9)
     assert found.peak_um == pytest.approx(float(np.max(y)), rel=0.01)
-    assert load_peak_um(gains, model, 0.6) == pytest.approx(float(np.max(y)), rel=0.01)
+    assert bound_load_peak_um(gains, model, 0.6) == pytest.approx(float(np.max(y)), rel=0.01)
     assert RECOVERED_UM == 0.5
     last_s = float(t[np.flatnonzero(np.abs(y) > 0.5)[-1]]) if np.max(np.abs(y)) > 0.5 else 0.0
     assert found.recovery_s == pytest.approx(last_s, abs=0.1)
@@ -113,11 +114,11 @@ def test_a_load_step_against_simulation(ti_s: float) -> None:
 def test_a_load_step_with_delay_and_filter_is_that_of_the_loop_tick_by_tick() -> None:
     loop = LoopConfig(feedforward_barometer=False, feedforward_temperature=False)
     calm = DisturbanceModel(Noise(1e-3, 0.0, 0.0, 12.0, 0.02), None, None)
-    held = preview(loop, PumpConfig(), PUMP, calm, duration_s=1.0)
-    found = load_step(Gains.of(loop), PUMP, 0.6, 0.02)
+    held = preview_loop(loop, PumpConfig(), PUMP, calm, duration_s=1.0)
+    found = simulate_load_step(Gains.of(loop), PUMP, 0.6, 0.02)
     assert found.peak_um == pytest.approx(held.load_peak_um, rel=0.02)
     assert found.recovery_s == pytest.approx(held.recovery_s, abs=0.2)
-    assert found.peak_um < load_peak_um(Gains.of(loop), PUMP, 0.6) < 1.5 * found.peak_um
+    assert found.peak_um < bound_load_peak_um(Gains.of(loop), PUMP, 0.6) < 1.5 * found.peak_um
 
 
 def test_load_recovery_of_a_double_root_and_of_a_loop_that_never_comes_back() -> None:
@@ -125,26 +126,28 @@ def test_load_recovery_of_a_double_root_and_of_a_loop_that_never_comes_back() ->
     never.
     """
     model = PlantModel(1.0, 0.0, 0.0, 1.0)
-    assert load_step(Gains(1.0, 4.0), model, 1.0, 1e-9).recovery_s == pytest.approx(4.31, abs=0.1)
-    assert load_step(Gains(1e-6, 1e6), model, 1.0, 1e-9).recovery_s == math.inf
-    assert load_step(Gains(20.0, 0.1), model, 1.0, 1e-9).recovery_s == 0.0
+    assert simulate_load_step(Gains(1.0, 4.0), model, 1.0, 1e-9).recovery_s == pytest.approx(
+        4.31, abs=0.1
+    )
+    assert simulate_load_step(Gains(1e-6, 1e6), model, 1.0, 1e-9).recovery_s == math.inf
+    assert simulate_load_step(Gains(20.0, 0.1), model, 1.0, 1e-9).recovery_s == 0.0
 
 
 def test_the_same_answer_to_a_load_is_to_be_had_with_less_noise() -> None:
     """The designs that keep the present loop's answer, and nothing worse in it."""
     loop = LoopConfig()
-    named = designs(PUMP, typical(loop), loop, Demands())
+    named = compute_designs(PUMP, typical(loop), loop, Demands())
     present, kept = (
-        load_step(gains, PUMP, 0.6, 0.02) for gains in (Gains.of(loop), named["same-load"])
+        simulate_load_step(gains, PUMP, 0.6, 0.02) for gains in (Gains.of(loop), named["same-load"])
     )
     assert kept.peak_um <= 1.01 * present.peak_um
     assert kept.recovery_s <= present.recovery_s + 0.1
     stds = [
-        predict(gains, PUMP, typical(loop), loop).std_um
+        predict_loop(gains, PUMP, typical(loop), loop).std_um
         for gains in (Gains.of(loop), named["same-load"])
     ]
     assert stds[1] < stds[0]
-    assert "same-load" not in designs(
+    assert "same-load" not in compute_designs(
         PUMP, typical(loop), loop.model_copy(update={"kp_per_s": 0.05}), Demands()
     )
 
@@ -155,14 +158,14 @@ def test_what_a_pump_that_only_switches_would_do_is_not_known(name: str, known: 
     where 0.9 came.
     """
     loop = LoopConfig()
-    gains = designs(PUMP, typical(loop), loop, Demands())[name]
-    row = candidate(name, gains, PUMP, typical(loop), loop, Demands())
+    gains = compute_designs(PUMP, typical(loop), loop, Demands())[name]
+    row = evaluate_candidate(name, gains, PUMP, typical(loop), loop, Demands())
     wide = loop.model_copy(update={"flow_max_um_per_s": 5000.0})
-    other = candidate("other", gains, PUMP, typical(loop), wide, Demands())
+    other = evaluate_candidate("other", gains, PUMP, typical(loop), wide, Demands())
     assert math.isfinite(row.figures.std_um) == known
     assert math.isfinite(other.figures.std_um)
-    assert ("not known" in cells((row,))[0]) == (not known)
-    assert bool(refusal(row)) == (not known)
+    assert ("not known" in format_cells((row,))[0]) == (not known)
+    assert bool(find_refusal(row)) == (not known)
 
 
 def typical(loop: LoopConfig) -> DisturbanceModel:
@@ -181,7 +184,7 @@ def test_the_bound_is_that_of_the_twin(feedforward: bool, agreement: float) -> N
     """
     loop = LoopConfig(feedforward_barometer=feedforward, feedforward_temperature=feedforward)
     twin = TwinConfig(laser_noise_um=1.0)
-    assert least_std_um(PUMP, typical(loop), loop, write_s=0.005) == pytest.approx(
+    assert compute_least_std_um(PUMP, typical(loop), loop, write_s=0.005) == pytest.approx(
         least_of_the_twin(loop, twin), rel=agreement
     )
 
@@ -201,13 +204,17 @@ def test_weather_over_a_delay_of_many_of_its_lags_is_that_of_single_steps() -> N
 def test_nothing_predicted_is_below_the_bound_and_the_search_comes_near_it() -> None:
     loop = LoopConfig(feedforward_barometer=False, feedforward_temperature=False)
     weather = typical(loop)
-    best = least_variance(PUMP, weather, loop, Demands())
-    least_um = least_std_um(PUMP, weather, loop)
-    found_um = predict(best, PUMP, weather, loop).std_um
+    best = search_least_variance(PUMP, weather, loop, Demands())
+    least_um = compute_least_std_um(PUMP, weather, loop)
+    found_um = predict_loop(best, PUMP, weather, loop).std_um
     assert least_um < found_um < 1.15 * least_um
-    assert margins(best, PUMP, 1 / loop.rate_hz).ms <= 1.42
-    for other in (Gains.of(loop), simc(PUMP, 0.02, 0.2), amigo(PUMP, 0.02, 0.2)):
-        assert found_um < predict(other, PUMP, weather, loop).std_um
+    assert compute_margins(best, PUMP, 1 / loop.rate_hz).ms <= 1.42
+    for other in (
+        Gains.of(loop),
+        make_simc_gains(PUMP, 0.02, 0.2),
+        make_amigo_gains(PUMP, 0.02, 0.2),
+    ):
+        assert found_um < predict_loop(other, PUMP, weather, loop).std_um
 
 
 def test_demands_hold_where_the_weather_asks_for_nothing() -> None:
@@ -215,10 +222,12 @@ def test_demands_hold_where_the_weather_asks_for_nothing() -> None:
     loop off.
     """
     loop, demands = LoopConfig(), Demands()
-    gains = least_variance(PUMP, typical(loop), loop, demands)
-    assert load_peak_um(gains, PUMP, demands.load_step_um_per_s) <= 1.01 * demands.load_peak_um
+    gains = search_least_variance(PUMP, typical(loop), loop, demands)
+    assert (
+        bound_load_peak_um(gains, PUMP, demands.load_step_um_per_s) <= 1.01 * demands.load_peak_um
+    )
     assert 3 * gains.ti_s <= 1.01 * demands.recovery_s
-    assert margins(gains, PUMP, 0.02).stable
+    assert compute_margins(gains, PUMP, 0.02).stable
 
 
 def test_feed_forward_leaves_less_of_the_weather() -> None:
@@ -249,12 +258,13 @@ def test_the_prediction_counts_what_the_pumps_limits_cut(gains: Gains, cut: floa
         flow_full_um_per_s=2.3, dead_fraction=0.0, start_fraction=0.0, stall_fraction=0.0
     )
     held = [
-        preview(loop, pump, model, weather, seed, duration_s=300.0).std_um for seed in (1, 2, 3)
+        preview_loop(loop, pump, model, weather, seed, duration_s=300.0).std_um
+        for seed in (1, 2, 3)
     ]
-    found_um = predict(gains, model, weather, loop).std_um
+    found_um = predict_loop(gains, model, weather, loop).std_um
     assert found_um == pytest.approx(np.mean(held), rel=0.15)  # 2 % with less cut, 11 % with most
     # a plant that loses ten times as much has room for all of it
-    free_um = predict(gains, PlantModel(1.0, 0.13, 0.3, 8.0), weather, wide).std_um
+    free_um = predict_loop(gains, PlantModel(1.0, 0.13, 0.3, 8.0), weather, wide).std_um
     assert found_um > cut * free_um
 
 
@@ -276,7 +286,7 @@ def test_a_noisy_laser_gets_a_filter_with_which_a_hold_settles() -> None:
     loop = LoopConfig(rate_hz=20.0)
     noise = Noise(2.3, 0.0, 0.0, 12.0, 0.05)
     weather = DisturbanceModel(noise, None, None)
-    gains = least_variance(PlantModel(1.0, 0.23, 0.97, 1.75), weather, loop, Demands())
+    gains = search_least_variance(PlantModel(1.0, 0.23, 0.97, 1.75), weather, loop, Demands())
     share = -math.expm1(-0.05 / gains.filter_s)
     read = np.random.default_rng(1).normal(0.0, 2.3, 200_000)
     assert np.std(lfilter([share], [1.0, share - 1.0], read)) < 1.25

@@ -7,7 +7,8 @@ import pytest
 from synthetic import telegraph, way_um
 
 from membrane_ctrl.control.experiments.experiment import BenchSample
-from tuning.identification.loop_model import PlantModel, Record, driven_um
+from tuning.identification.plant_model import PlantModel, compute_driven_um
+from tuning.identification.record import Record
 
 
 @pytest.mark.parametrize("dead_time_s", [0.0, 0.02, 0.0755, 0.313])
@@ -15,18 +16,20 @@ from tuning.identification.loop_model import PlantModel, Record, driven_um
 def test_response_is_exact_for_any_dead_time(dead_time_s: float, lag_s: float) -> None:
     flow = telegraph(np.random.default_rng(3), 400, 0.3, 5.0, hold=15)
     truth = way_um(flow, PlantModel(1.0, dead_time_s, lag_s, 0.0), 0.02)
-    assert driven_um(flow, dead_time_s, lag_s, 0.02) == pytest.approx(truth, abs=2e-3)
+    assert compute_driven_um(flow, dead_time_s, lag_s, 0.02) == pytest.approx(truth, abs=2e-3)
 
 
 def test_a_ramp_comes_late_by_dead_time_and_lag() -> None:
     flow = np.concatenate((np.zeros(50), np.ones(950)))
-    way = driven_um(flow, 0.1, 0.2, 0.02)
+    way = compute_driven_um(flow, 0.1, 0.2, 0.02)
     assert way[-1] == pytest.approx(950 * 0.02 - 0.02 - 0.3, abs=1e-9)
 
 
 def test_without_lag_only_the_dead_time_is_left() -> None:
     flow = np.concatenate((np.zeros(5), np.ones(20)))
-    assert driven_um(flow, 0.04, 0.0, 0.02)[-1] == pytest.approx(19 * 0.02 - 0.04, abs=1e-12)
+    assert compute_driven_um(flow, 0.04, 0.0, 0.02)[-1] == pytest.approx(
+        19 * 0.02 - 0.04, abs=1e-12
+    )
 
 
 def test_holding_flow_is_the_leak_in_commands() -> None:

@@ -13,20 +13,17 @@ import pytest
 import tuning
 from membrane_ctrl.config.schema import LoopConfig, PumpConfig
 from tests.studies.tuning_sessions import SESSIONS, Case, TwinBench, session
-from tuning.identification.characterise import FitQuality, characterise
-from tuning.identification.disturbance import observe
-from tuning.identification.loop_model import Gains
-from tuning.proposal.design import (
-    NAMES,
-    PRESENT,
-    RefusedError,
-    propose,
-    robustness,
-    sampled_plants,
-    table,
-)
-from tuning.proposal.prediction import ModelBench, preview
-from tuning.rig import Rig
+from tuning.identification.closed_loop import Gains
+from tuning.identification.disturbance import observe_disturbance
+from tuning.identification.experiments import fit_experiments, run_experiments
+from tuning.identification.fit_quality import FitQuality
+from tuning.proposal.candidate import NAMES, PRESENT
+from tuning.proposal.candidate_table import format_markdown
+from tuning.proposal.design import RefusedError, propose_gains
+from tuning.proposal.model_bench import ModelBench
+from tuning.proposal.preview import preview_loop
+from tuning.proposal.robustness import evaluate_robustness, sample_plants
+from tuning.rigs.bench_rig import Rig
 
 RATIO_MAX = {
     "quiet, 1 µm": 1.15,
@@ -77,21 +74,21 @@ def designed():  # type: ignore[no-untyped-def]
     case = Case()
     bench = TwinBench(case, 4)
     rig = Rig(bench, case.loop(), PumpConfig(), case.holding_flow_um_per_s)
-    found = characterise(rig).identified
+    found = fit_experiments(run_experiments(rig)).identified
     rig.hold(30.0)
-    return found, observe(rig.hold(300.0), found.model, case.loop()), case.loop()
+    return found, observe_disturbance(rig.hold(300.0), found.model, case.loop()), case.loop()
 
 
 def test_a_proposal_is_complete_and_its_table_readable(designed) -> None:  # type: ignore[no-untyped-def]
     found, weather, loop = designed
-    proposal = propose(found, weather, loop, PumpConfig(), FitQuality("ok", ()))
+    proposal = propose_gains(found, weather, loop, PumpConfig(), FitQuality("ok", ()))
     assert proposal.chosen is proposal.candidates[0]
     assert {row.name for row in proposal.candidates} <= {*NAMES, PRESENT}
     assert proposal.robustness.stable_fraction == 1.0
     assert proposal.robustness.ms_p95 < 1.6
     assert proposal.loop.kp_per_s == proposal.chosen.gains.kp_per_s
     assert 0.2 < proposal.preview.load_peak_um < 2.5
-    text = table(proposal.candidates)
+    text = format_markdown(proposal.candidates)
     assert len(text.splitlines()) == 2 + len(proposal.candidates)
     assert len({line.count("|") for line in text.splitlines()}) == 1
     assert "ziegler-nichols" in text
@@ -100,25 +97,29 @@ def test_a_proposal_is_complete_and_its_table_readable(designed) -> None:  # typ
 def test_refused_data_are_not_designed_on(designed) -> None:  # type: ignore[no-untyped-def]
     found, weather, loop = designed
     with pytest.raises(RefusedError, match="run the relay again"):
-        propose(found, weather, loop, PumpConfig(), FitQuality("refused", ("run the relay again",)))
+        propose_gains(
+            found, weather, loop, PumpConfig(), FitQuality("refused", ("run the relay again",))
+        )
 
 
 def test_a_leak_beyond_the_pump_is_refused(designed) -> None:  # type: ignore[no-untyped-def]
     found, weather, loop = designed
     with pytest.raises(RefusedError, match="leak"):
-        propose(found, weather, loop, PumpConfig(flow_full_um_per_s=0.5), FitQuality("ok", ()))
+        propose_gains(
+            found, weather, loop, PumpConfig(flow_full_um_per_s=0.5), FitQuality("ok", ())
+        )
 
 
 def test_hand_made_gains_that_are_unstable_are_seen_in_preview_and_robustness(designed) -> None:  # type: ignore[no-untyped-def]
     found, weather, loop = designed
     wild = LoopConfig.model_validate(loop.model_dump() | {"kp_per_s": 12.0, "ti_s": 0.5})
-    assert robustness(Gains.of(wild), found, weather, wild).stable_fraction == 0.0
-    assert preview(wild, PumpConfig(), found.model, weather, duration_s=30.0).std_um > 0.5
+    assert evaluate_robustness(Gains.of(wild), found, weather, wild).stable_fraction == 0.0
+    assert preview_loop(wild, PumpConfig(), found.model, weather, duration_s=30.0).std_um > 0.5
 
 
 def test_sampled_plants_have_the_fit_s_scatter(designed) -> None:  # type: ignore[no-untyped-def]
     found, _, _ = designed
-    gains = np.array([plant.gain for plant in sampled_plants(found, 400)])
+    gains = np.array([plant.gain for plant in sample_plants(found, 400)])
     assert gains.std() == pytest.approx(found.sigma.gain, rel=0.15)
     assert gains.mean() == pytest.approx(found.model.gain, abs=0.2 * found.sigma.gain)
 

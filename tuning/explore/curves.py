@@ -13,13 +13,15 @@ from membrane_ctrl.control import loop_margins
 from membrane_ctrl.model import arrays, errors, telemetry
 from membrane_ctrl.run_files.run import open_run
 from membrane_ctrl.sessions import folder
-from tuning import gains_file, session
-from tuning.identification import disturbance, loop_model
-from tuning.proposal import candidates, design
+from tuning import gains_file
+from tuning.identification import closed_loop, disturbance, noise_spectrum, plant_model
+from tuning.identification.record import Record
+from tuning.proposal import candidate, gain_search, tuning_rules
+from tuning.steps import identify, observe
 
 # An hour is a hundred times the slowest motion that the fit uses; two of its periods are the least
 # it accepts.
-_LONGEST_S, _SHORTEST_S = 3600.0, 2.0 * disturbance.SLOWEST_S
+_LONGEST_S, _SHORTEST_S = 3600.0, 2.0 * noise_spectrum.SLOWEST_S
 _COLUMNS = ("flow_um_per_s", "displacement_um", "ambient_pressure_pa", "air_temperature_c")
 
 
@@ -28,10 +30,10 @@ class Workpiece:
     """A loop to explore."""
 
     source: str  # where plant and weather come from, for the page
-    model: loop_model.PlantModel
+    model: plant_model.PlantModel
     weather: disturbance.DisturbanceModel
     loop: LoopConfig  # in force when plant and weather were recorded
-    proposed: loop_model.Gains | None  # of the session
+    proposed: closed_loop.Gains | None  # of the session
     session: folder.SessionFolder | None  # receives the gains that a person saves
 
 
@@ -50,10 +52,13 @@ def of_path(path: Path, logs: Path) -> Workpiece:
 
 def of_session(opened: folder.SessionFolder) -> Workpiece:
     """Plant and weather as identified and observed in a session."""
-    model, weather = session.found_of(opened).identified.model, session.disturbance_of(opened)
+    model, weather = (
+        identify.load_identified(opened).identified.model,
+        observe.load_disturbance(opened),
+    )
     proposed = None
     if opened.done("design"):
-        proposed = loop_model.Gains.of(gains_file.load_gains(opened.file("gains.toml")).loop)
+        proposed = closed_loop.Gains.of(gains_file.load_gains(opened.file("gains.toml")).loop)
     source = f"Plant and weather of the session {opened.path.name}."
     return Workpiece(source, model, weather, opened.head.before, proposed, opened)
 
@@ -79,9 +84,9 @@ def of_run(path: Path, logs: Path) -> Workpiece:
             f"{path}: no undisturbed hold of {_SHORTEST_S:.0f} s; choose another run or a session"
         )
     model, whose = _plant_for(logs, float(np.nanmedian(columns["leak_um_per_s"][part])))
-    record = loop_model.Record(dt_s, *(columns[name][part].astype(float) for name in _COLUMNS))
+    record = Record(dt_s, *(columns[name][part].astype(float) for name in _COLUMNS))
     try:
-        weather = disturbance.observe(record, model, loop)
+        weather = disturbance.observe_disturbance(record, model, loop)
     except ValueError as error:
         raise errors.InputError(f"{path}: {error}") from None
     minutes = record.duration_s / 60
@@ -100,16 +105,18 @@ def _longest(good: arrays.BoolArray, at_most: int) -> slice:
     return slice(max(int(starts[best]), int(ends[best]) - at_most), int(ends[best]))
 
 
-def _plant_for(logs: Path, leak_um_per_s: float) -> tuple[loop_model.PlantModel, str]:
+def _plant_for(logs: Path, leak_um_per_s: float) -> tuple[plant_model.PlantModel, str]:
     """The newest identified plant, else the assumed one with the run's own leak;
     and whose it is.
     """
     try:
         newest = folder.newest_session(logs)
-        return session.found_of(newest).identified.model, f"plant of the session {newest.path.name}"
+        return identify.load_identified(
+            newest
+        ).identified.model, f"plant of the session {newest.path.name}"
     except errors.InputError:
         leak = leak_um_per_s if math.isfinite(leak_um_per_s) else 0.0
-        plant = loop_model.PlantModel(1.0, loop_margins.DEAD_S, loop_margins.PUMP_LAG_S, leak)
+        plant = plant_model.PlantModel(1.0, loop_margins.DEAD_S, loop_margins.PUMP_LAG_S, leak)
         return plant, "plant as the configuration assumes it (no session has identified it)"
 
 
@@ -132,18 +139,20 @@ class Sliders:
     damping: float  # integral time over (closed-loop time constant + delay)
     filter_s: float
 
-    def gains(self, model: loop_model.PlantModel, dt_s: float) -> loop_model.Gains:
+    def gains(self, model: plant_model.PlantModel, dt_s: float) -> closed_loop.Gains:
         """PI gains, K = 1 / (k (tc + d)), Ti = c (tc + d): SIMC for c = 4 (Skogestad 2003)."""
-        slowed_s = self.closed_loop_s + candidates.effective_delay_s(model, dt_s, self.filter_s)
-        return loop_model.Gains(
+        slowed_s = self.closed_loop_s + tuning_rules.effective_delay_s(model, dt_s, self.filter_s)
+        return closed_loop.Gains(
             1 / (model.gain * slowed_s), self.damping * slowed_s, 0.0, self.filter_s
         )
 
     @classmethod
-    def near(cls, gains: loop_model.Gains, model: loop_model.PlantModel, dt_s: float) -> "Sliders":
+    def near(
+        cls, gains: closed_loop.Gains, model: plant_model.PlantModel, dt_s: float
+    ) -> "Sliders":
         """The setting of the sliders that gives these gains, as far as they reach."""
         slowed_s = 1 / (model.gain * max(gains.kp_per_s, 1e-9))
-        delay_s = candidates.effective_delay_s(model, dt_s, gains.filter_s)
+        delay_s = tuning_rules.effective_delay_s(model, dt_s, gains.filter_s)
         within = min(max(slowed_s - delay_s, DELAYS[0] * delay_s), DELAYS[1] * delay_s)
         damping = gains.ti_s / (within + delay_s)
         return cls(within, min(max(damping, DAMPINGS[0]), DAMPINGS[1]), gains.filter_s)
@@ -153,7 +162,7 @@ class Sliders:
 class Curves:
     """Responses of one set of gains; a loop that is unstable has none over time."""
 
-    figures: design.Candidate
+    figures: candidate.Candidate
     time_s: arrays.FloatArray  # (n,)
     step_um: arrays.FloatArray  # (n,): the centre after a setpoint step of `STEP_UM`
     load_um: arrays.FloatArray  # (n,): the centre after a step of the leak
@@ -164,13 +173,13 @@ class Curves:
     )  # (m,): two-sided spectrum of the true centre in the recorded weather
 
 
-def curves(name: str, gains: loop_model.Gains, of: Workpiece, duration_s: float) -> Curves:
+def curves(name: str, gains: closed_loop.Gains, of: Workpiece, duration_s: float) -> Curves:
     """Everything the page draws of a set of gains."""
     dt_s = of.weather.rest.dt_s
-    demands = candidates.Demands()
-    figures = design.candidate(name, gains, of.model, of.weather, of.loop, demands)
-    w = loop_model.frequencies(dt_s)
-    response = loop_model.loop_response(gains, of.model, w, dt_s)
+    demands = gain_search.Demands()
+    figures = candidate.evaluate_candidate(name, gains, of.model, of.weather, of.loop, demands)
+    w = closed_loop.make_frequencies(dt_s)
+    response = closed_loop.loop_response(gains, of.model, w, dt_s)
     sensitivity = 1 / (1 + response)
     moving, noise = of.weather.psd(w, of.model, of.loop), of.weather.rest.white_psd
     centre = np.abs(sensitivity) ** 2 * moving + np.abs(1 - sensitivity) ** 2 * noise
@@ -181,13 +190,13 @@ def curves(name: str, gains: loop_model.Gains, of: Workpiece, duration_s: float)
     return Curves(figures, time_s, step_um, load_um, w, response, centre)
 
 
-def shown_s(gains: loop_model.Gains, model: loop_model.PlantModel) -> float:
+def shown_s(gains: closed_loop.Gains, model: plant_model.PlantModel) -> float:
     """How long the responses of the gains are worth a look."""
     return _SETTLINGS * (model.delay_s + gains.filter_s + 0.2 * gains.ti_s)
 
 
 def responded(
-    gains: loop_model.Gains,
+    gains: closed_loop.Gains,
     of: Workpiece,
     duration_s: float,
     setpoint_um: float,

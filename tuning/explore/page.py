@@ -17,7 +17,7 @@ from bokeh.server.server import Server
 
 from membrane_ctrl.model import errors
 from membrane_ctrl.sessions import folder
-from tuning import gains_file, session
+from tuning import gains_file
 from tuning.explore.curves import (
     DAMPINGS,
     DELAYS,
@@ -30,8 +30,9 @@ from tuning.explore.curves import (
     shown_s,
 )
 from tuning.explore.live_page import LivePage
-from tuning.identification import loop_model
-from tuning.proposal import candidates, design
+from tuning.identification import closed_loop
+from tuning.proposal import candidate, gain_search, tuning_rules
+from tuning.steps.design import EDITED
 
 _HOST = "127.0.0.1"
 _COLOURS = {"present": "#888888", "proposed": "#1f77b4", "yours": "#d95f02"}
@@ -65,7 +66,7 @@ _STYLE = (
     "</style>"
 )
 
-Save = Callable[[loop_model.Gains], str]
+Save = Callable[[closed_loop.Gains], str]
 
 
 class Page:
@@ -78,7 +79,7 @@ class Page:
     def __init__(self, of: Workpiece, save: Save | None) -> None:
         self._of, self._save = of, save
         self._dt_s = of.weather.rest.dt_s
-        self._fixed = {"present": loop_model.Gains.of(of.loop)}
+        self._fixed = {"present": closed_loop.Gains.of(of.loop)}
         if of.proposed is not None:
             self._fixed["proposed"] = of.proposed
         self._duration_s = max(shown_s(gains, of.model) for gains in self._fixed.values())
@@ -135,7 +136,7 @@ class Page:
     def _make_sliders(self) -> None:
         of = self._of
         at = Sliders.near(self._gains, of.model, self._dt_s)
-        delay_s = candidates.effective_delay_s(of.model, self._dt_s, 0.0)
+        delay_s = tuning_rules.effective_delay_s(of.model, self._dt_s, 0.0)
         low, high = (math.log10(share * delay_s) for share in DELAYS)
         self._start = widgets.Select(
             title="start from",
@@ -196,7 +197,7 @@ class Page:
         at = Sliders(10.0**self._speed.value, self._damping.value, 10.0**self._filter.value)
         self._show(at.gains(self._of.model, self._dt_s))
 
-    def _show(self, gains: loop_model.Gains) -> None:
+    def _show(self, gains: closed_loop.Gains) -> None:
         self._gains = gains
         found = curves("yours", gains, self._of, self._duration_s)
         self._fill("yours", found)
@@ -233,7 +234,7 @@ class Page:
         self._said.text = html.escape(self._save(self._gains))
 
     def _plots(self) -> list[models.Row]:
-        times, over, demands = self._over_time, self._over_frequency, candidates.Demands()
+        times, over, demands = self._over_time, self._over_frequency, gain_search.Demands()
         seconds, hertz = ("time_s", "time (s)"), ("hertz", "frequency (Hz)")
         step = self._plot(
             f"setpoint step of {STEP_UM:g} µm", times, seconds, ("step_um", "centre (µm)")
@@ -337,17 +338,17 @@ def saver(of: Workpiece, author: str) -> Save | None:
     if opened is None or of.proposed is None:
         return None
 
-    def save(gains: loop_model.Gains) -> str:
+    def save(gains: closed_loop.Gains) -> str:
         path = opened.file("gains.toml")
         try:
             loop = gains.applied_to(gains_file.load_gains(path).loop)
-            found = design.candidate(
-                session.EDITED, gains, of.model, of.weather, loop, candidates.Demands()
+            found = candidate.evaluate_candidate(
+                EDITED, gains, of.model, of.weather, loop, gain_search.Demands()
             )
             std_um = found.predicted.std_um if found.predicted is not None else math.nan
             edits = {
                 "author": author,
-                "candidate": session.EDITED,
+                "candidate": EDITED,
                 "predicted_std_um": std_um,
                 "loop": loop,
             }

@@ -1,8 +1,7 @@
-"""The curve that a survey of the pump says, or why there is none to hold a mirror with."""
+"""The pump's curve from a survey, or the reason why there is none to hold a mirror with."""
 
 import math
 from dataclasses import dataclass
-from itertools import product
 
 import numpy as np
 
@@ -10,21 +9,18 @@ from membrane_ctrl.config.schema import PumpConfig
 from membrane_ctrl.control.experiments.operating_point import bleed_open
 from membrane_ctrl.control.experiments.spec import LIMIT_MAX_UM
 from membrane_ctrl.model.arrays import FloatArray
-from tuning.identification.pump_curve import BLOCK_S, PumpFit
+from tuning.identification.curve_shape import Branch, find_first_jump
+from tuning.identification.pump_fit import BLOCK_S, PumpFit
 
 _USEFUL_SHARE = 0.02  # standard error of a level, of the full flow; beyond it there is no curve
-_STUCK_LEAKS, _STUCK_UM_PER_S = 0.3, 0.2  # a pump that surely gives less than both, at any command
+# a pump that surely gives less than both, at any command
+_STUCK_LEAKS = 0.3
+_STUCK_UM_PER_S = 0.2
 _REACHES_LEAKS = 1.2
 _FEW_S = 300.0  # of experiments: fewer say nothing of the noise
-_STEP_LEAKS, _STEP_MOST = (
-    4.0,
-    0.105,
-)  # a pump that starts with more than the mirror loses, between two commands
-_NONE_SHARE, JUMP_SHARE = 0.02, 0.05  # flow at which a pump starts or stalls at once
-_EDGE_MOST, _EDGE_NOISY = (
-    0.1,
-    0.005,
-)  # between the commands of a jump, and of one that begins in noise
+# a pump that starts with more than the mirror loses, between two commands
+_STEP_LEAKS = 4.0
+_STEP_MOST = 0.105
 _ASTRAY = (
     "the mirror did not come back to its setpoint within three minutes, with slow gains: the "
     "weather is too strong, "
@@ -32,30 +28,6 @@ _ASTRAY = (
     "weather, or open the bleed "
     "(loop.bleed_fraction)"
 )
-_ROUGH = np.geomspace(
-    0.02, 2e4, 8
-)  # of the curve: square of its second derivative, of the full flow
-_KINKED = (0.0, 0.01, 0.1, 1.0)  # likewise: square of the change of its slope ...
-_AT_ONCE = (0.0, 0.1)  # ... square of the flow with which it starts ...
-_SLOPE = 10.0  # ... and of its slope there
-_CLEAR = 3.0  # standard errors: a flow beyond doubt
-
-
-@dataclass(frozen=True, slots=True)
-class Branch:
-    """Flows in µm/s of the commands reached from below, or of those from above, arrays (n,)."""
-
-    fractions: FloatArray
-    flows: FloatArray
-    sigmas: FloatArray
-
-    @property
-    def columns(self) -> tuple[FloatArray, FloatArray, FloatArray]:
-        """All three."""
-        return self.fractions, self.flows, self.sigmas
-
-
-NO_BRANCH = Branch(np.empty(0), np.empty(0), np.empty(0))
 
 
 @dataclass(frozen=True, slots=True)
@@ -101,11 +73,11 @@ class Surveyed:
                 "µm/s: find the leak, or "
                 "take a stronger pump, then run `tune pump` again"
             )
-        start, above = first_jump(rising, full), self.falling.columns
+        start, above = find_first_jump(rising, full), self.falling.columns
         begin = stall = 0.0 if from_bottom else float(rising.fractions[0])
         if start is not None:
             begin = stall = start[1]
-            stalls = first_jump(self.falling, full)
+            stalls = find_first_jump(self.falling, full)
             stall = min(begin, stalls[1]) if stalls is not None else begin
         falling = {
             f: v
@@ -177,7 +149,7 @@ class Surveyed:
             raise ValueError(f"the experiments were stopped too early: {self._further()}")
         fractions, flows, sigmas = self.rising.columns
         leak, last = self.fit.leak_um_per_s, int(np.argmin(sigmas[1:])) + 1
-        if stuck(self.fit, self.rising):
+        if is_stuck(self.fit, self.rising):
             raise ValueError(
                 f"the mirror moves alike at every command ({flows[last]:.2f} +- "
                 f"{sigmas[last]:.2f} µm/s more at "
@@ -236,7 +208,7 @@ class Surveyed:
             )
 
 
-def stuck(fit: PumpFit, rising: Branch) -> bool:
+def is_stuck(fit: PumpFit, rising: Branch) -> bool:
     """Whether no command so far gives what would matter, beyond doubt."""
     # a pump that is stuck at what leaks makes the mirror look tight
     matters_um_per_s = max(_STUCK_LEAKS * fit.leak_um_per_s, _STUCK_UM_PER_S)
@@ -248,66 +220,5 @@ def stuck(fit: PumpFit, rising: Branch) -> bool:
     return bool((flows + 3 * sigmas < matters_um_per_s).all())
 
 
-def first_jump(branch: Branch, full: float) -> tuple[float, float] | None:
-    """Commands just below and at the first clear flow, if that is a jump."""
-    fractions, flows, sigmas = branch.columns
-    clear = np.flatnonzero(flows - 2 * sigmas > _NONE_SHARE * full)
-    if not clear.size or not clear[0]:
-        return None
-    low, high = fractions[clear[0] - 1 : clear[0] + 1].tolist()
-    before, after = flows[clear[0] - 1 : clear[0] + 1] / full
-    # noise may be more than none, but a slope of that height takes more of the command
-    widest = _EDGE_MOST if before < _NONE_SHARE else _EDGE_NOISY
-    return (low, high) if before < JUMP_SHARE < after and high - low <= widest else None
-
-
 def _tuple(values: FloatArray) -> tuple[float, ...]:
     return tuple(round(value, 4) for value in values.tolist())
-
-
-def smoothed(
-    fractions: FloatArray, flows: FloatArray, noise: FloatArray
-) -> tuple[FloatArray, FloatArray]:
-    """Noisy flows, made as smooth as they look, and the covariance of the result; `noise` is that
-    of the flows.
-
-    The first is at command 0. The average over curves by their likelihood: nothing up to one of the
-    commands, then perhaps at once a flow, then a cubic or linear smoothing spline (Wahba 1978), as
-    most curves are smooth and some have kinks. A spline from command 0 would carry its certainty of
-    no flow into a dead zone.
-    """
-    full = max(float(flows.max()), 1e-3)
-    y, noise = flows / full, noise / full**2
-    none = int(
-        np.argmax(np.append(y - _CLEAR * np.sqrt(np.diag(noise)) > 0, True))
-    )  # the first certain flow
-    found: list[tuple[float, FloatArray, FloatArray]] = []
-    for last in range(max(none, 1)):
-        x = np.maximum(fractions - fractions[last], 0.0)
-        low, high = np.minimum.outer(x, x), np.maximum.outer(x, x)
-        bend, jump = low**2 * (3 * high - low) / 6, np.outer(x > 0, x > 0)
-        for rough, kinked, at_once in product(_ROUGH, _KINKED, _AT_ONCE):
-            free = _SLOPE * np.outer(x, x) + rough * bend + kinked * low + at_once * jump
-            weights = np.linalg.solve(free + noise, free).T
-            cost = float(y @ np.linalg.solve(free + noise, y) + np.linalg.slogdet(free + noise)[1])
-            found.append((cost, weights @ y, free - weights @ free))
-    costs, means, covariances = (np.array(column) for column in zip(*found, strict=True))
-    share = np.exp(-0.5 * (costs - costs.min()))
-    share /= share.sum()
-    mean = share @ means
-    apart = means - mean
-    spread = np.tensordot(share, covariances, 1) + (share[:, None] * apart).T @ apart
-    return full * mean, full**2 * spread
-
-
-def may_bend(fractions: FloatArray, flows: FloatArray) -> FloatArray:
-    """By how much the flow may be off the straight line in each interval: where the chords beside
-    it would meet.
-
-    There is no flow below the first command, and perhaps no more of it beyond the last.
-    """
-    widths = np.diff(fractions)
-    slopes = np.diff(flows) / widths
-    before, after = np.append(0.0, slopes[:-1]) - slopes, np.append(slopes[1:], 0.0) - slopes
-    across = np.where(before * after < 0, before * after, 0.0)
-    return np.abs(across * widths / np.where(across, before - after, 1.0))

@@ -14,31 +14,35 @@ import numpy as np
 from membrane_ctrl.control.experiments.spec import PumpStep
 from membrane_ctrl.control.pump_curve import STALL_MARGIN
 from membrane_ctrl.model.arrays import FloatArray
-from tuning.identification.pump_curve import NO_FIT, Level, PumpFit, PumpRun, fit
-from tuning.identification.pump_map import (
+from tuning.identification.curve_shape import (
     JUMP_SHARE,
     NO_BRANCH,
     Branch,
-    PumpMap,
-    Surveyed,
-    first_jump,
-    may_bend,
-    smoothed,
-    stuck,
+    bound_bend,
+    find_first_jump,
+    smooth_flows,
 )
+from tuning.identification.pump_fit import NO_FIT, PumpFit, fit_pump
+from tuning.identification.pump_map import PumpMap, Surveyed, is_stuck
+from tuning.identification.pump_run import Level, PumpRun
 
 _KNOWN_SHARE = 0.009  # standard error of a level, of the full flow
 _BENT_SHARE = 0.02  # of the full flow, by which a kink between two levels may be hidden
 # Likewise of the leak, in flows up to so many leaks: the loop's gain there is the slope of the
 # curve
-_BENT_LEAKS, _ABOUT_LEAKS, _SURE = 0.15, 2.0, 3.0
+_BENT_LEAKS = 0.15
+_ABOUT_LEAKS = 2.0
+_SURE = 3.0
 _PLAY_SHARE = 0.03  # hysteresis that is worth a second branch
-_EDGE, _NEAREST = 0.02, 0.04  # commands between which a jump lies; levels for a bend
-_FINE_EDGE, _TOO_MUCH = (
-    0.002,
-    0.6,
-)  # a jump to more than this share of the leak may be a steep rise through it
-_MOST_ROUNDS, _MOST_S, _ROUND_S = 40, 1500.0, 120.0
+# commands between which a jump lies; levels for a bend
+_EDGE = 0.02
+_NEAREST = 0.04
+# a jump to more than this share of the leak may be a steep rise through it
+_FINE_EDGE = 0.002
+_TOO_MUCH = 0.6
+_MOST_ROUNDS = 40
+_MOST_S = 1500.0
+_ROUND_S = 120.0
 TYPICAL_S = 900.0  # of a survey, with the holds between its rounds
 _LEAST_S = 1.5  # of a run
 _TRAVEL_UM = 6.0  # of a run, in an excursion limit of 10
@@ -47,14 +51,15 @@ _HIGHEST = 0.25  # of the limit, where a run begins at most
 _CAUGHT = 0.55
 _SHARE_LEAST = 0.4  # of the travel: shorter runs see little but noise, and gusts stop them as well
 _NONE_UM_PER_S = 1e-3  # at command 0
-_SHORTEST_S, _PULSE_S, _LONGEST_S = 0.05, 0.2, 20.0
+_SHORTEST_S = 0.05
+_PULSE_S = 0.2
+_LONGEST_S = 20.0
 _MOST_VISITS = 6
 _ABOVE = 0.15
 _SCOUTS = (0.25, 0.5, 0.75, 1.0)
-_FIRST_ROUNDS, _FIRST_RISE = (
-    5,
-    0.2,
-)  # rounds without any flow; share of the limit at most, by a first pulse
+# rounds without any flow; share of the limit at most, by a first pulse
+_FIRST_ROUNDS = 5
+_FIRST_RISE = 0.2
 _FIRST_PULSES_S = (0.3, 0.6, 1.2, 2.4, 2.4, 2.4, 2.4)
 
 
@@ -104,7 +109,9 @@ class PumpSurvey:
             self.runs.append(run)
         self.dark = self.dark + 1 if np.isnan(run.displacement_um[-1:]).any() else 0
         if self.runs:
-            self.fit = fit(self.runs, self.fit if self._rounds > 3 and self.fit.levels else None)
+            self.fit = fit_pump(
+                self.runs, self.fit if self._rounds > 3 and self.fit.levels else None
+            )
             self._branches = {rising: self._branch(rising) for rising in (True, False)}
 
     def steps(self) -> tuple[PumpStep, ...]:
@@ -112,7 +119,7 @@ class PumpSurvey:
         if self._rounds >= _MOST_ROUNDS or self.duration_s > _MOST_S:
             return ()
         if self._scarce:
-            hopeless = stuck(self.fit, self._branches.get(True, NO_BRANCH))
+            hopeless = is_stuck(self.fit, self._branches.get(True, NO_BRANCH))
             if self._rounds >= (1 if hopeless else 3) * _FIRST_ROUNDS:
                 return ()
             first = min(1.0, self.holding_fraction + 0.1 * (1 + self._rounds % _FIRST_ROUNDS))
@@ -184,7 +191,7 @@ class PumpSurvey:
         noise = np.zeros((fractions.size,) * 2)
         noise[0, 0] = _NONE_UM_PER_S**2
         noise[1:, 1:] = self.fit.covariance[np.ix_(own, own)]
-        flows, noise = smoothed(fractions, flows, noise)
+        flows, noise = smooth_flows(fractions, flows, noise)
         sigmas = np.sqrt(np.maximum(np.diag(noise), 0.0))
         return Branch(fractions, np.asarray(isotonic_regression(np.maximum(flows, 0.0)).x), sigmas)
 
@@ -192,7 +199,7 @@ class PumpSurvey:
         """The command at which a standing pump starts with a flow at once, and the one below it, if
         it does.
         """
-        return first_jump(self._branches[True], self.full_um_per_s)
+        return find_first_jump(self._branches[True], self.full_um_per_s)
 
     def hysteretic(self) -> bool:
         """A level gives more when it is reached from above, beyond doubt."""
@@ -251,7 +258,7 @@ class PumpSurvey:
         if not rising:
             return found
         leak_um_per_s = self.fit.leak_um_per_s
-        for i, off in enumerate(may_bend(fractions, flows).tolist()):
+        for i, off in enumerate(bound_bend(fractions, flows).tolist()):
             low, high = fractions[i : i + 2].tolist()
             about = flows[i] < _ABOUT_LEAKS * leak_um_per_s < _ABOUT_LEAKS**2 * flows[i + 1]
             sure = off > _SURE * math.hypot(sigmas[i], sigmas[i + 1])

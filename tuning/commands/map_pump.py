@@ -1,0 +1,48 @@
+"""`tune pump`: measure the pump's curve and apply it."""
+
+from membrane_ctrl.control.leak_estimate import TOO_TIGHT_UM_PER_S
+from membrane_ctrl.sessions.folder import SessionFolder
+from membrane_ctrl.sessions.live_hold import Progress
+from tuning import connection
+from tuning.commands.conclusion import conclude
+from tuning.identification.pump_survey import TYPICAL_S as PUMP_TYPICAL_S
+from tuning.options import TuneOptions
+from tuning.rigs.hold_rig import HoldRig
+from tuning.sentences import TOO_TIGHT, describe_gains
+from tuning.steps import map_pump
+
+
+def run_map_pump(options: TuneOptions) -> int:
+    """Measure the pump's curve and apply it; the session begins anew on it."""
+    with connection.open_on_hold(options) as (folder, rig, progress):
+        folder = measure_pump(folder, rig, options.limit_um, progress)
+    return conclude(folder, options)
+
+
+def measure_pump(
+    folder: SessionFolder, rig: HoldRig, limit_um: float, progress: Progress
+) -> SessionFolder:
+    progress.begin("pump", PUMP_TYPICAL_S, 0.0)
+    mapped, folder = map_pump.map_pump(folder, rig, limit_um)
+    found, pump = mapped.found, mapped.found.pump
+    progress.say(
+        f"pump: {len(pump.curve_fraction)} points from {pump.curve_um_per_s[0]:.2f} µm/s at "
+        f"{pump.curve_fraction[0]:.3f} to {pump.flow_full_um_per_s:.2f} µm/s at "
+        f"{pump.curve_fraction[-1]:.3f}, "
+        f"known to {max(found.sigma_um_per_s[1:]):.2f} "
+        f"µm/s{'' if found.known else ' (the time is over)'}; "
+        f"starts at {pump.start_fraction:.3f}, stalls at {pump.stall_fraction:.3f}"
+        f"{', with hysteresis' if pump.curve_falling_um_per_s else ''}; answers after "
+        f"{found.delay_s:.2f} s "
+        f"with a lag of {found.lag_s:.2f} s; leak {found.leak_um_per_s:.2f} µm/s"
+    )
+    progress.say(
+        f"pump: steps of the flow on this curve give k {mapped.gain:.2f} +- "
+        f"{mapped.gain_sigma:.2f}; curve and gains "
+        f"({describe_gains(rig.loop)}) stay until the hold ends; `membrane-ctrl tune save "
+        f"{folder.path} --config FILE` "
+        "saves them for the next one"
+    )
+    if found.leak_um_per_s < TOO_TIGHT_UM_PER_S:
+        progress.say(TOO_TIGHT)
+    return folder

@@ -1,0 +1,48 @@
+"""`tune rollback`: restore the gains from before the last kept session."""
+
+import math
+
+from membrane_ctrl.model.errors import DeviceError, Exit
+from membrane_ctrl.sessions.live_hold import HoldError, Progress
+from tuning import connection, gains_file, journal
+from tuning.options import TuneOptions
+from tuning.rigs.hold_rig import HoldRig
+
+
+def roll_back(options: TuneOptions) -> int:
+    """Restore the gains from before the last kept session."""
+    kept = journal.find_roll_back(options.logs)
+    progress = Progress()
+    with connection.connect_to_hold(options) as link:
+        rig = HoldRig(link, options.author, progress)
+        try:
+            shape_s = kept.shape_s[0] if kept.shape_s else math.nan
+            loop = gains_file.adapt_to_hold(kept.before, rig.loop)
+            rig.set_gains(
+                loop, f"rollback of {kept.session}: {options.reason}"[:250], shape_s=shape_s
+            )
+        except HoldError as error:
+            raise DeviceError(str(error)) from None
+    told_of = (
+        kept.session,
+        options.author,
+        options.reason,
+        kept.before,
+        kept.after,
+        None,
+        kept.shape_s,
+    )
+    told = journal.make_entry("rolled_back", *told_of)
+    journal.append_entry(options.logs, told)
+    progress.say(
+        (
+            f"back to the gains before {kept.session}: K {kept.before.kp_per_s:g} 1/s, Ti "
+            f"{kept.before.ti_s:g} s"
+        )
+        + (f", time constant of the shape loop {kept.shape_s[0]:.0f} s" if kept.shape_s else "")
+    )
+    for saved in {
+        line.reason for line in journal.read_entries(options.logs) if line.what == "saved"
+    }:
+        progress.say(f"{saved} was saved with gains of a session: check its [loop]")
+    return Exit.DONE

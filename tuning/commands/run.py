@@ -1,0 +1,185 @@
+"""`tune run` and the commands of single steps."""
+
+from pathlib import Path
+from types import ModuleType
+
+from membrane_ctrl.model.errors import DeviceError, RejectedError, writing
+from membrane_ctrl.sessions.folder import STEPS, SessionFolder
+from membrane_ctrl.sessions.live_hold import Progress
+from tuning import connection, journal
+from tuning.commands import choose
+from tuning.commands.conclusion import conclude
+from tuning.commands.live_page import serve_live_page
+from tuning.commands.map_pump import measure_pump
+from tuning.options import TuneOptions
+from tuning.proposal.verification import SETTLE_LEAST_S, Stage
+from tuning.report import page
+from tuning.rigs.hold_rig import HoldRig
+from tuning.steps import apply, characterise, design, identify, map_pump, observe, preview, verify
+
+_MODULES: dict[str, ModuleType] = {
+    "characterise": characterise,
+    "identify": identify,
+    "observe": observe,
+    "design": design,
+    "preview": preview,
+    "apply": apply,
+    "verify": verify,
+}
+_NO_GAINS = (
+    "the hold follows the estimate, whose loop has no gains to design: `membrane-ctrl tune "
+    "save {} --config FILE` "
+    "hands pump and noise levels to [estimator]"
+)
+_OF_GAINS = frozenset({"design", "preview", "apply", "verify"})
+_MOVES = frozenset({"characterise", "observe", "apply", "verify"})
+
+
+def run_session(options: TuneOptions) -> int:
+    """Run all steps that are not done yet and return the exit code; raises like `run_step`."""
+    choose.require_answer(options.yes, options.choose)
+    with connection.open_on_hold(options) as (folder, rig, progress):
+        if options.page:
+            progress.say(f"live page: {serve_live_page(folder, options)}session")
+        try:
+            _run_steps(
+                [step for step in STEPS if not folder.done(step)], folder, rig, options, progress
+            )
+        except characterise.PumpUnknownError as error:
+            if map_pump.has_pump_map(folder):
+                raise
+            progress.say(str(error))
+            folder = measure_pump(folder, rig, options.limit_um, progress)
+            _run_steps(list(STEPS), folder, rig, options, progress)
+        _note_verified(
+            folder, options.logs, options.reason
+        )  # if the session was killed before it did
+        page.write_report(folder)
+    return conclude(folder, options)
+
+
+def run_step(step: str, options: TuneOptions) -> int:
+    """Run one step of the named or newest session; `characterise` starts a new one.
+
+    Raises InputError, DeviceError or RejectedError, and then holds the mirror with the last good
+    gains.
+    """
+    if step == "apply":
+        choose.require_answer(options.yes, options.choose)
+    if step not in _MOVES:
+        folder = connection.find_session(options, None)
+        with writing(folder.path, DeviceError):
+            _run_anywhere(step, folder, options)
+            _report(step, folder, Progress())
+    else:
+        fresh = step == "characterise" and options.session is None
+        with connection.open_on_hold(options, fresh) as (folder, rig, progress):
+            _run_steps([step], folder, rig, options, progress)
+    return conclude(folder, options)
+
+
+def _run_steps(
+    steps: list[str], folder: SessionFolder, rig: HoldRig, options: TuneOptions, progress: Progress
+) -> None:
+    """Run steps in their order, until one is refused or a person wants no new gains."""
+    for number, step in enumerate(steps):
+        if step in _OF_GAINS and folder.config.estimator.process_value != "laser":
+            no_gains = _NO_GAINS.format(folder.path)
+            if steps == [step]:
+                raise RejectedError(f"{step}: {no_gains}")
+            progress.say(no_gains)
+            return
+        candidate = ""
+        if step == "apply":
+            chosen = choose.choose_candidate(folder, options.yes, options.choose, progress)
+            if chosen is None:
+                progress.say(
+                    f"nothing is applied; `membrane-ctrl tune apply --session {folder.path}` "
+                    "applies a candidate later"
+                )
+                return
+            candidate = chosen
+        _announce(progress, options, step, steps[number + 1 :])
+        _run_on_hold(step, folder, rig, options, progress, candidate)
+        _report(step, folder, progress)
+        if step == "identify":
+            identify.require_known_pump(folder)
+
+
+def _run_on_hold(
+    step: str,
+    folder: SessionFolder,
+    rig: HoldRig,
+    options: TuneOptions,
+    progress: Progress,
+    candidate: str,
+) -> None:
+    """Run one step of a session that has a hold; `candidate` is for `apply`."""
+
+    def report_stage(stage: Stage) -> None:
+        progress.say(
+            f"  after {stage.time_s:.0f} s: std {stage.std_um:.3f} µm, "
+            f"{stage.growth:.2f} of the previous gains"
+        )
+
+    match step:
+        case "characterise":
+            characterise.run_characterise(folder, rig, options.limit_um, options.plan)
+        case "observe":
+            observe.run_observe(folder, rig, options.observe_s)
+        case "apply":
+            apply.run_apply(folder, rig, candidate)
+        case "verify":
+            verify.run_verify(folder, rig, report_stage, options.stages)
+            _note_verified(folder, options.logs, options.reason, again=True)
+        case _:
+            _run_anywhere(step, folder, options)
+
+
+def _run_anywhere(step: str, folder: SessionFolder, options: TuneOptions) -> None:
+    """Run a step that needs no hold."""
+    match step:
+        case "identify":
+            identify.run_identify(folder)
+        case "design":
+            design.run_design(folder, options.reason)
+        case "preview":
+            preview.run_preview(folder)
+
+
+def _report(step: str, folder: SessionFolder, progress: Progress) -> None:
+    """Update the report and print the step's result in one line."""
+    page.write_report(folder)
+    progress.say(f"{step}: {_MODULES[step].describe_result(folder)}")
+
+
+def _note_verified(folder: SessionFolder, logs: Path, reason: str, again: bool = False) -> None:
+    """Note the verification in the journal, unless it is there; `again` if it was repeated."""
+    name = folder.path.name
+    if not folder.done("verify"):
+        return
+    if not again and any(
+        line.session == name and line.shape_s is None for line in journal.read_entries(logs)
+    ):
+        return
+    done = verify.load_verified(folder)
+    entry = journal.make_entry(
+        "kept" if done.kept else "taken_back",
+        name,
+        folder.head.author,
+        reason if done.kept else done.reason,
+        done.before,
+        done.after,
+        design.compare_with_present(folder),
+    )
+    journal.append_entry(logs, entry)
+
+
+def _announce(progress: Progress, options: TuneOptions, step: str, after: list[str]) -> None:
+    """Show the step and the time that it and the later ones are expected to take."""
+    planned = {
+        "characterise": options.plan.typical_s,
+        "observe": 0.0 if options.short else options.observe_s,
+        "verify": SETTLE_LEAST_S + options.verify_s,
+    }
+    progress.begin(step, planned.get(step, 0.0), sum(planned.get(later, 0.0) for later in after))

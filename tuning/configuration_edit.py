@@ -1,0 +1,78 @@
+"""Edits a configuration file in place; comments stay."""
+
+import difflib
+import json
+import sys
+import tomllib
+from collections.abc import Collection
+from pathlib import Path
+from typing import Any
+
+from firmware_iface.settings import Section
+from membrane_ctrl.model import errors, files
+from membrane_ctrl.model.errors import InputError
+from membrane_ctrl.sessions.folder import SessionFolder
+from membrane_ctrl.sessions.live_hold import Progress
+
+
+def confirm_and_replace(
+    path: Path, before: str, after: str, folder: SessionFolder, yes: bool
+) -> bool:
+    """Show the difference and ask, unless `yes`; whether the file was written."""
+    shown = difflib.unified_diff(
+        before.splitlines(), after.splitlines(), str(path), folder.path.name, lineterm="", n=1
+    )
+    print("\n".join(shown))
+    if not yes and not (
+        sys.stdin.isatty() and Progress().ask(f"save to {path}? [y/N]").lower() in ("y", "yes")
+    ):
+        print(f"{path} is unchanged; --yes saves without asking", file=sys.stderr)
+        return False
+    _replace(path, before, after)
+    return True
+
+
+def list_changes(old: Section, new: Section, keys: Collection[str] = ()) -> dict[str, Any]:
+    """Settings of a table that differ, all or some, as plain values."""
+    plain = new.model_dump(mode="json", include=set(keys) or None)
+    return {key: value for key, value in plain.items() if getattr(new, key) != getattr(old, key)}
+
+
+def edit_text(text: str, changed: dict[str, dict[str, Any]], path: Path) -> str:
+    """The configuration's text with these keys of its tables; nothing else changes, or InputError
+    is raised.
+    """
+    import tomlkit
+    from tomlkit.exceptions import TOMLKitError
+
+    wanted = tomllib.loads(text)
+    changed = {name: keys for name, keys in changed.items() if keys}
+    wanted |= {name: wanted.get(name, {}) | keys for name, keys in changed.items()}
+    try:
+        document = tomlkit.parse(text)
+        for name, keys in changed.items():
+            document.setdefault(name, tomlkit.table()).update(keys)
+        edited = tomlkit.dumps(document)
+        if tomllib.loads(edited) == wanted:
+            return edited
+    except (TOMLKitError, ValueError):
+        pass
+    lines = "; ".join(
+        f"set in [{name}]: "
+        + ", ".join(f"{key} = {json.dumps(value)}" for key, value in keys.items())
+        for name, keys in changed.items()
+    )
+    raise InputError(f"{path}: cannot be edited by a program; {lines}")
+
+
+def _replace(path: Path, before: str, after: str) -> None:
+    """Write the file a link leads to, with its permissions. Raises InputError also if it has
+    changed meanwhile.
+    """
+    target = path.resolve()
+    with errors.writing(path):
+        mode = target.stat().st_mode
+        if files.read_text(target) != before:
+            raise InputError(f"{path}: has changed meanwhile; repeat `tune save`")
+        files.write_text_atomic(target, after)
+        target.chmod(mode)

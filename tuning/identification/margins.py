@@ -1,0 +1,67 @@
+"""Stability margins of a loop, from its exact frequency response."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import control
+import numpy as np
+
+from membrane_ctrl.model.arrays import ComplexArray
+from tuning.identification.closed_loop import Gains, loop_response, make_frequencies
+from tuning.identification.plant_model import PlantModel
+
+_POINTS = 3000  # 0.3 % apart: margins to better than 1 %
+_FINE_DT_S = 1e-3
+
+
+@dataclass(frozen=True, slots=True)
+class Margins:
+    """Margins of a loop."""
+
+    ms: float  # largest sensitivity, max |1 / (1 + L)|
+    gain_margin: float  # factor on the gain at which the loop oscillates
+    phase_margin_deg: float
+    delay_margin_s: float  # additional dead time at which the loop oscillates
+    # balanced disk margin, 2 / max |S - T|: gain and phase may change together within that disk
+    disk_margin: float
+    stable: bool  # by Nyquist's criterion; if false, the other figures mean nothing
+
+
+def compute_margins(gains: Gains, model: PlantModel, dt_s: float) -> Margins:
+    """Margins of a loop sampled every `dt_s`.
+
+    L has two poles at the origin (mirror and integrator) and none to the right, so that the loop is
+    stable if and only if the phase at every gain crossing is above -180 deg. Stability is read from
+    the number of turns of 1 + L about 0, which also sees loops with several crossings.
+    """
+    w = np.geomspace(1e-4, max(np.pi / dt_s, 20 / max(model.delay_s, _FINE_DT_S)), _POINTS)
+    response = loop_response(gains, model, w, dt_s)
+    sensitivity = 1 / (1 + response)
+    frd = control.FrequencyResponseData(response, w, smooth=True)
+    gain_margin, phase_margin_deg, _, _, crossing, _ = control.stability_margins(frd)
+    return Margins(
+        ms=float(np.max(np.abs(sensitivity))),
+        gain_margin=float(gain_margin),
+        phase_margin_deg=float(phase_margin_deg),
+        delay_margin_s=math.radians(float(phase_margin_deg)) / float(crossing)
+        if crossing > 0
+        else math.inf,
+        disk_margin=float(1 / np.max(np.abs(sensitivity - 0.5))),
+        stable=is_stable(response),
+    )
+
+
+def is_stable(response: ComplexArray) -> bool:
+    """From the double pole at the origin 1 + L starts at -180 deg (just above it if stable) and
+    must end at 0.
+    """
+    turned = float(np.sum(np.angle((1 + response)[1:] / (1 + response)[:-1])))
+    return abs(float(np.angle(1 + response[0])) % (-2 * math.pi) + turned) < math.pi / 2
+
+
+def find_sensitivity_peak(gains: Gains, model: PlantModel, dt_s: float) -> float:
+    """Ms on a coarse grid (to 1 %), for searches; infinite for an unstable loop."""
+    response = loop_response(gains, model, make_frequencies(dt_s), dt_s)
+    return float(np.max(1 / np.abs(1 + response))) if is_stable(response) else math.inf

@@ -1,0 +1,83 @@
+"""The mirror as tuning sees it: an integrator behind the pump's transport delay and lag.
+
+    dy/dt = k q(t) - leak + disturbance,    T dq/dt = v(t - theta) - q
+
+v is the commanded flow on the pump's nominal curve, as speed of the centre: k = 1 on a bench as
+configured.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.signal import lfilter
+
+from tuning.identification.record import Record, Series
+
+
+@dataclass(frozen=True, slots=True)
+class PlantModel:
+    """Gain, delay and leak."""
+
+    gain: float  # k, speed of the centre per commanded flow
+    # theta, from a reading's tick to the first gas in the mirror (half a sample of holding comes on
+    # top)
+    dead_time_s: float
+    lag_s: float  # T
+    leak_um_per_s: float  # loss through leak and bleed
+
+    @property
+    def delay_s(self) -> float:
+        """Dead time plus lag, the delay of a ramp."""
+        return self.dead_time_s + self.lag_s
+
+    @property
+    def holding_flow_um_per_s(self) -> float:
+        """Commanded flow that balances the leak."""
+        return self.leak_um_per_s / self.gain
+
+
+def delay_series(series: Series, delay_s: float, dt_s: float) -> Series:
+    """Values `delay_s` ago, linear between samples; the first value before the record."""
+    if delay_s == 0:
+        return series
+    ticks = np.arange(series.size, dtype=float)
+    return np.asarray(np.interp(ticks - delay_s / dt_s, ticks, series), dtype=float)
+
+
+def compute_driven_um(
+    flow_um_per_s: Series, dead_time_s: float, lag_s: float, dt_s: float
+) -> Series:
+    """Path of the centre for unit gain, at each reading, for a flow held between readings; exact.
+
+    From T dq/dt = v - q follows the integral of q = integral of v - T q (+ constant). The integral
+    of a held flow is a broken line, so interpolating it between samples is exact for any delay.
+    Within a sample the delayed flow changes once, after the share f of the sample: q[i+1] = a q[i]
+    + b1 v[i-m-1] + b2 v[i-m]. The flow before the record is assumed equal to its first value; the
+    path is 0 at the first reading.
+    """
+    first = flow_um_per_s[0]
+    change = flow_um_per_s - first
+    way = np.concatenate(([0.0], np.cumsum(change[:-1]) * dt_s))
+    way = delay_series(way, dead_time_s, dt_s)
+    if lag_s > 0:
+        whole = math.floor(dead_time_s / dt_s)
+        left_s = (1.0 - (dead_time_s / dt_s - whole)) * dt_s
+        late, now = (
+            math.exp(-left_s / lag_s) - math.exp(-dt_s / lag_s),
+            -math.expm1(-left_s / lag_s),
+        )
+        weights = np.concatenate((np.zeros(whole + 1), [now, late]))
+        way = way - lag_s * np.asarray(lfilter(weights, [1.0, -math.exp(-dt_s / lag_s)], change))
+    return np.asarray(way + first * dt_s * np.arange(flow_um_per_s.size), dtype=float)
+
+
+def compute_pump_share_um(record: Record, model: PlantModel) -> Series:
+    """Motion of the centre due to pump and leak alone, with the mean of a record's readings,
+    (n,).
+    """
+    x = compute_driven_um(record.flow_um_per_s, model.dead_time_s, model.lag_s, record.dt_s)
+    way = model.gain * x - model.leak_um_per_s * np.arange(len(record)) * record.dt_s
+    return way + float(np.mean(record.filled_displacement_um() - way))

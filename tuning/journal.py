@@ -1,0 +1,158 @@
+"""`<logs>/tuning/journal.jsonl`: which gains were kept, reverted or rolled back."""
+
+import json
+from collections.abc import Iterator
+from dataclasses import astuple, dataclass
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import Literal
+
+from membrane_ctrl.config.schema import LoopConfig
+from membrane_ctrl.model import errors, files, plain_json
+from membrane_ctrl.sessions import folder as plain
+from tuning.identification import loop_figures
+
+_FILE = "journal.jsonl"
+What = Literal["kept", "taken_back", "rolled_back", "saved"]
+
+
+@dataclass(frozen=True, slots=True)
+class Traded:
+    """The name of a candidate, and the figures before and with it."""
+
+    candidate: str
+    before: loop_figures.LoopFigures
+    after: loop_figures.LoopFigures
+
+    @property
+    def words(self) -> tuple[str, ...]:
+        """Standard deviation in µm, load peak in µm, recovery in s, Ms: each before and after."""
+        pairs = zip(astuple(self.before), astuple(self.after), (3, 2, 1, 2), strict=True)
+        return tuple(
+            f"{before:.{digits}f} -> {after:.{digits}f}" for before, after, digits in pairs
+        )
+
+    def __str__(self) -> str:
+        std, peak, recovery, ms = self.words
+        return f"std {std} µm, load peak {peak} µm, recovery {recovery} s, Ms {ms}"
+
+
+@dataclass(frozen=True, slots=True)
+class GainsEntry:
+    """One line of the journal."""
+
+    time_utc: str
+    # "kept": verified; "taken_back": the verification failed; "rolled_back", "saved": by a person
+    what: What
+    session: str
+    author: str
+    reason: str
+    before: LoopConfig  # gains before and with it; after "taken_back" the former are in force again
+    after: LoopConfig
+    traded: Traded | None = None
+    # time constant of the shape loop before and after, if that was tried
+    shape_s: tuple[float, float] | None = None
+
+
+def make_entry(
+    what: What,
+    session: str,
+    author: str,
+    reason: str,
+    before: LoopConfig,
+    after: LoopConfig,
+    traded: Traded | None = None,
+    shape_s: tuple[float, float] | None = None,
+) -> GainsEntry:
+    """Return an entry stamped with the present time."""
+    now_utc = datetime.now(UTC).isoformat(timespec="seconds")
+    return GainsEntry(now_utc, what, session, author, reason, before, after, traded, shape_s)
+
+
+def append_entry(logs: Path, what: GainsEntry) -> None:
+    """Append an entry. Raises InputError if it cannot be written;
+    symbolic links are not followed.
+    """
+    path = logs / "tuning" / _FILE
+    with errors.writing(path):
+        files.make_folder(path.parent)
+        files.append_text(path, json.dumps(plain.plain(what), allow_nan=False) + "\n")
+        files.sync_data(path)
+
+
+def read_entries(logs: Path) -> list[GainsEntry]:
+    """All entries, oldest first, without truncated lines. Raises InputError if it is not a regular
+    file.
+    """
+    path = logs / "tuning" / _FILE
+    try:
+        text = files.read_text(path, errors="replace")
+    except FileNotFoundError:
+        return []
+    except OSError as error:
+        raise errors.InputError(f"{path}: {errors.os_reason(error)}") from None
+    found: list[GainsEntry] = []
+    for line in text.splitlines():
+        try:
+            found.append(plain.built(GainsEntry, plain_json.loads(line)))
+        except (ValueError, TypeError, KeyError):
+            continue
+    return found
+
+
+def find_roll_back(logs: Path, gains_only: bool = False) -> GainsEntry:
+    """The newest gains kept and not rolled back since. Raises InputError if there are none.
+
+    A time constant of the shape loop counts too, unless `gains_only`.
+    """
+    for found in _in_force(logs):
+        if found.shape_s is None or not gains_only:
+            return found
+    raise errors.InputError(f"{logs / 'tuning' / _FILE}: no kept gains")
+
+
+def find_kept_shape_s(logs: Path, session: str = "") -> float | None:
+    """The shape loop's time constant kept last, by any or this session,
+    and not rolled back since.
+    """
+    of_it = (line.shape_s for line in _in_force(logs) if session in ("", line.session))
+    return next((shape_s[1] for shape_s in of_it if shape_s is not None), None)
+
+
+def _in_force(logs: Path) -> Iterator[GainsEntry]:
+    """What was kept and not rolled back since, newest first."""
+    undone: set[tuple[str, bool]] = set()
+    for found in reversed(read_entries(logs)):
+        of = (found.session, found.shape_s is None)
+        if found.what == "rolled_back":
+            undone.add(of)
+        elif found.what == "kept" and of not in undone:
+            yield found
+
+
+def format_history(found: list[GainsEntry]) -> str:
+    """The journal as a Markdown table."""
+    lines = [
+        "| time | what | session | author | K 1/s | Ti s | filter s | candidate | std µm | "
+        "load peak µm | recovery s "
+        "| Ms | reason |",
+        "|---|---|---|---|---:|---:|---:|---|---:|---:|---:|---:|---|",
+    ]
+    for line in found:
+        loop = line.before if line.what == "rolled_back" else line.after
+        traded = (
+            (line.traded.candidate, *line.traded.words) if line.traded is not None else [""] * 5
+        )
+        reason = line.reason
+        if line.shape_s is not None:
+            before_s, after_s = (
+                reversed(line.shape_s) if line.what == "rolled_back" else line.shape_s
+            )
+            reason = f"shape loop {before_s:.0f} -> {after_s:.0f} s: {reason}"
+        lines.append(
+            f"| {line.time_utc} | {line.what} | {line.session} | {line.author} | "
+            f"{loop.kp_per_s:.3f} "
+            f"| {loop.ti_s:.2f} | {loop.measurement_filter_s:.2f} | {' | '.join(traded)} | "
+            f"{reason} |"
+        )
+    return "\n".join(lines)

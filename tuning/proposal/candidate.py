@@ -1,0 +1,94 @@
+"""One candidate: gains with their margins, figures and cost."""
+
+import math
+from dataclasses import dataclass, replace
+
+from pydantic import ValidationError
+
+from membrane_ctrl.config.schema import LoopConfig
+from tuning.gains_file import MS_MAX
+from tuning.identification import closed_loop, load_step, loop_figures, plant_model
+from tuning.identification.disturbance import DisturbanceModel
+from tuning.identification.margins import Margins, compute_margins
+from tuning.proposal import gain_search, lower_bound, prediction
+
+# What `tune run --choose` accepts; `SAME_LOAD` is there if the proposal answers a step of the leak
+# worse than the present gains.
+PRESENT = "present"
+SAME_LOAD = "same-load"
+NAMES = (
+    "least-variance",
+    SAME_LOAD,
+    "simc",
+    "simc-slow",
+    "amigo",
+    "lambda",
+    "max-ki",
+    "ziegler-nichols",
+)
+
+
+@dataclass(frozen=True, slots=True)
+class Candidate:
+    """One row of the table."""
+
+    name: str
+    gains: closed_loop.Gains
+    margins: Margins
+    predicted: prediction.Predicted | None  # None for an unstable loop
+    ratio: float  # predicted standard deviation over the least possible
+    # After the demanded step of the leak: largest excursion, and duration
+    load_peak_um: float
+    load_recovery_s: float
+    # Of the figures, from the fit's covariance; of the standard deviation, also from how steady the
+    # weather was
+    sigma: loop_figures.LoopFigures | None = None
+
+    @property
+    def figures(self) -> loop_figures.LoopFigures:
+        """What is compared with the other candidates."""
+        std_um = self.predicted.std_um if self.predicted is not None else math.inf
+        return loop_figures.LoopFigures(
+            std_um, self.load_peak_um, self.load_recovery_s, self.margins.ms
+        )
+
+
+def evaluate_candidate(
+    name: str,
+    gains: closed_loop.Gains,
+    model: plant_model.PlantModel,
+    disturbance: DisturbanceModel,
+    loop: LoopConfig,
+    demands: gain_search.Demands,
+) -> Candidate:
+    """One row."""
+    found = compute_margins(gains, model, disturbance.rest.dt_s)
+    predicted = prediction.predict_loop(gains, model, disturbance, loop) if found.stable else None
+    if predicted is not None and predicted.flow_std_um_per_s > loop.flow_max_um_per_s:
+        predicted = replace(
+            predicted, std_um=math.nan
+        )  # the pump only switches: no linear loop describes that
+    ratio = (
+        predicted.std_um / lower_bound.compute_least_std_um(model, disturbance, loop)
+        if predicted is not None
+        else math.inf
+    )
+    answer = load_step.simulate_load_step(
+        gains, model, demands.load_step_um_per_s, disturbance.rest.dt_s
+    )
+    return Candidate(name, gains, found, predicted, ratio, answer.peak_um, answer.recovery_s)
+
+
+def find_refusal(row: Candidate) -> str:
+    """Why these gains must not be applied; empty if they may."""
+    if row.predicted is None:
+        return "unstable"
+    if row.margins.ms > MS_MAX:
+        return f"Ms {row.margins.ms:.2f}, the limit is {MS_MAX:g}"
+    if math.isnan(row.predicted.std_um):
+        return "the pump would only switch"
+    try:
+        row.gains.applied_to(LoopConfig())
+    except ValidationError:
+        return "outside the range of the configuration"
+    return ""

@@ -1,0 +1,57 @@
+"""A proposal on the plants that the data permit, drawn from the covariance of the fit."""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from membrane_ctrl.config.schema import LoopConfig
+from tuning.identification import closed_loop, margins, plant_fit, plant_model
+from tuning.identification.disturbance import DisturbanceModel
+from tuning.proposal import prediction
+
+
+@dataclass(frozen=True, slots=True)
+class Robustness:
+    """Over the sampled plants: 95 % quantiles of sensitivity and standard deviation, and share of
+    stable loops.
+    """
+
+    ms_p95: float
+    std_p95_um: float
+    stable_fraction: float
+
+
+def sample_plants(
+    identified: plant_fit.Identified, count: int, seed: int = 1
+) -> list[plant_model.PlantModel]:
+    """Plants drawn from the fit's covariance; times and gain stay positive."""
+    model = identified.model
+    centre = np.array([model.gain, model.dead_time_s, model.lag_s, model.leak_um_per_s])
+    draws = np.random.default_rng(seed).multivariate_normal(centre, identified.covariance, count)
+    floor = np.array([0.05 * model.gain, 0.0, 1e-3, 0.0])
+    return [plant_model.PlantModel(*row) for row in np.maximum(draws, floor).tolist()]
+
+
+def evaluate_robustness(
+    gains: closed_loop.Gains,
+    identified: plant_fit.Identified,
+    disturbance: DisturbanceModel,
+    loop: LoopConfig,
+    count: int = 60,
+) -> Robustness:
+    """Evaluate gains on sampled plants; an unstable one counts as infinitely bad."""
+    plants = sample_plants(identified, count)
+    dt_s = disturbance.rest.dt_s
+    peaks = np.array([margins.find_sensitivity_peak(gains, plant, dt_s) for plant in plants])
+    stable = np.isfinite(peaks)
+    stds = np.array(
+        [
+            prediction.predict_loop(gains, p, disturbance, loop).std_um if ok else np.inf
+            for p, ok in zip(plants, stable, strict=True)
+        ]
+    )
+    # the next value above: interpolating between a number and infinity is impossible
+    peak_p95, std_p95 = (
+        float(np.quantile(values, 0.95, method="higher")) for values in (peaks, stds)
+    )
+    return Robustness(peak_p95, std_p95, float(stable.mean()))

@@ -1,0 +1,53 @@
+"""Gains from a model by published rules.
+
+All treat lags as dead time (delay = theta + T + filter + half a sample): the rules are made for an
+integrator with delay, and the pump's lag of a tenth of the loop's time constant does not justify a
+D term.
+"""
+
+from tuning.identification import closed_loop, plant_model
+
+
+def effective_delay_s(model: plant_model.PlantModel, dt_s: float, filter_s: float) -> float:
+    """Delay of the integrator-with-delay that stands for the loop."""
+    return model.delay_s + dt_s / 2 + filter_s
+
+
+def make_simc_gains(
+    model: plant_model.PlantModel, dt_s: float, filter_s: float, closed_loop_s: float | None = None
+) -> closed_loop.Gains:
+    """SIMC PI: K = 1 / (k (tc + d)), Ti = 4 (tc + d), tc = d unless given (Skogestad 2003)."""
+    delay_s = effective_delay_s(model, dt_s, filter_s)
+    slowed_s = (delay_s if closed_loop_s is None else closed_loop_s) + delay_s
+    return closed_loop.Gains(1 / (model.gain * slowed_s), 4 * slowed_s, 0.0, filter_s)
+
+
+def make_amigo_gains(
+    model: plant_model.PlantModel, dt_s: float, filter_s: float
+) -> closed_loop.Gains:
+    """AMIGO PI for an integrating process: K = 0.35 / (k d), Ti = 13.4 d (Astrom and Hagglund 2006,
+    eq. 7.3).
+    """
+    delay_s = effective_delay_s(model, dt_s, filter_s)
+    return closed_loop.Gains(0.35 / (model.gain * delay_s), 13.4 * delay_s, 0.0, filter_s)
+
+
+def make_lambda_gains(
+    model: plant_model.PlantModel, dt_s: float, filter_s: float, factor: float = 3.0
+) -> closed_loop.Gains:
+    """Lambda PI, lambda = factor x delay: Ti = 2 lambda + d, K = Ti / (k (lambda + d)^2)."""
+    delay_s = effective_delay_s(model, dt_s, filter_s)
+    lambda_s = factor * delay_s
+    ti_s = 2 * lambda_s + delay_s
+    return closed_loop.Gains(ti_s / (model.gain * (lambda_s + delay_s) ** 2), ti_s, 0.0, filter_s)
+
+
+def make_ziegler_nichols_gains(
+    ultimate_gain_per_s: float, ultimate_period_s: float
+) -> closed_loop.Gains:
+    """The Ziegler-Nichols PID from a relay: K = 0.6 Ku, Ti = Tu / 2, Td = Tu / 8,
+    no filter on D.
+    """
+    return closed_loop.Gains(
+        0.6 * ultimate_gain_per_s, ultimate_period_s / 2, ultimate_period_s / 8, 0.0
+    )

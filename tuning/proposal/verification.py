@@ -1,0 +1,184 @@
+"""Verifies new gains: ten minutes of hold, judged in stages, against the previous gains.
+
+The true centre is unknown, and the laser's noise is ten times its motion. The correlation of
+readings over lags of up to a second is nearly all motion; the model gives the loop's response to
+noise:
+
+    var x = var x predicted + mean of (cov(y[i], y[i + l]) seen - predicted),  0 < l dt <= 1 s.
+
+The weather of these ten minutes differs from that of the hour before. So the comparison is with the
+*old* gains in the same weather: what the pump did not cause in the same record is given to the old
+loop, with the limits of its pump (docs/decisions/78-gains-on-trial.md). In the first minutes the
+weather of the session is assumed.
+"""
+
+import math
+from dataclasses import dataclass, field
+
+import numpy as np
+from scipy.signal import welch
+
+from membrane_ctrl.config.schema import LoopConfig, PumpConfig
+from tuning.identification import closed_loop, disturbance, margins, plant_model
+from tuning.identification.record import Record, Series
+from tuning.proposal.prediction import linearise_limits, predict_loop
+from tuning.proposal.record_replay import replay_um
+
+# Time of a stage, and growth that ends the trial there: early on only plain failures, as a minute
+# of weather scatters by a third; at the end the required 10 %.
+STAGES = ((60.0, 2.0), (180.0, 1.5), (300.0, 1.3), (600.0, 1.10))
+SETTLE_LEAST_S = 20.0
+_SETTLE_MOST_S = 120.0
+# of the loop's slowest mode: 2 % of the transient from the change of gains is left
+_SETTLE_TIME_CONSTANTS = 4.0
+MS_MAX = 2.0  # sensitivity seen; its estimate scatters by a tenth
+_CLOSE = 1.13  # of the largest growth
+_SEGMENT_S = 20.0
+# 17 half-overlapping segments: power to a quarter. Before that the session's weather is assumed: a
+# plant that has changed would look like weather, in which the old gains do no better
+_REPLAY_LEAST_S = 180.0
+_OBSERVE_LEAST_S = 300.0  # of a spectrum of the weather
+# shorter than the centre's memory (2 s and more), with 50 times as many pairs as one lag
+_LAGS_S = 1.0
+_POINTS = 3000
+_BAND = 1.3  # width of a band in frequency, as a factor
+
+
+@dataclass(frozen=True, slots=True)
+class Stage:
+    """One stage's result."""
+
+    time_s: float
+    std_um: float  # of the centre, from the record
+    before_um: (
+        float  # of the old gains: predicted, or after three minutes replayed in this very weather
+    )
+    growth: float  # ratio of the two
+    growth_max: float  # the limit
+    ms: float  # sensitivity seen; NaN while the record is too short
+    lost_fraction: float  # readings lost
+    reason: str  # why it fails; empty if it passes
+
+    @property
+    def close(self) -> bool:
+        """Whether it fails by less than the standard deviation of ten minutes scatters."""
+        return self.growth_max < self.growth < _CLOSE * self.growth_max
+
+
+def settling_time_s(loop: LoopConfig) -> float:
+    """Settling time of the centre after the change to these gains.
+
+    Without delay and filter the loop around the film's integral is s^2 + K s + K / Ti = 0 (Td is
+    small beside both); its slowest root has the real part (K - sqrt(K^2 - 4 K / Ti)) / 2, or K / 2
+    where it swings.
+    """
+    k, ti_s = loop.kp_per_s, loop.ti_s
+    slowest_per_s = (k - math.sqrt(max(0.0, k * k - 4 * k / ti_s))) / 2
+    slowest_s = 1 / slowest_per_s if slowest_per_s > 0 else math.inf
+    return min(max(SETTLE_LEAST_S, _SETTLE_TIME_CONSTANTS * slowest_s), _SETTLE_MOST_S)
+
+
+@dataclass(frozen=True, slots=True)
+class VerificationTrial:
+    """The data of the comparison."""
+
+    model: plant_model.PlantModel
+    weather: disturbance.DisturbanceModel
+    before: LoopConfig
+    after: LoopConfig
+    # a person chose these gains knowing that a larger deviation is predicted
+    accepted: bool = False
+    pump: PumpConfig = field(default_factory=PumpConfig)
+
+
+def estimate_centre_std_um(
+    off_um: Series,
+    trial: VerificationTrial,
+    weather: disturbance.DisturbanceModel,
+    loop: LoopConfig,
+) -> float:
+    """Standard deviation of the centre without the laser's noise; 0 if the estimate is negative.
+
+    `off_um` (n,) are readings less setpoint under `loop`; they correct the prediction for this
+    weather.
+    """
+    dt_s = weather.rest.dt_s
+    off = off_um - off_um.mean()
+    lags = np.arange(1, round(_LAGS_S / dt_s) + 1)
+    seen = np.array([off[lag:] @ off[:-lag] / (off.size - lag) for lag in lags])
+    gains = closed_loop.Gains.of(loop)
+    w = closed_loop.make_frequencies(dt_s, _POINTS)
+    model, moving = linearise_limits(gains, trial.model, weather, loop, w)
+    sensitivity = np.abs(1 / (1 + closed_loop.loop_response(gains, model, w, dt_s))) ** 2
+    noise = weather.rest.white_psd
+    coloured = sensitivity * (moving + noise) - noise
+    expected = np.trapezoid(coloured * np.cos(np.outer(lags * dt_s, w)), w, axis=1) / np.pi
+    predicted_um = predict_loop(gains, trial.model, weather, loop).std_um
+    return math.sqrt(max(0.0, predicted_um**2 + float(np.mean(seen - expected))))
+
+
+def estimate_sensitivity(
+    off_um: Series, trial: VerificationTrial, weather: disturbance.DisturbanceModel
+) -> float:
+    """Largest sensitivity, from the excess of the spectrum over the model's prediction.
+
+    Increased gain or delay of the plant shows as a peak near the crossover. The level of the
+    weather does not
+    matter: only the shape is compared, each band with the median band.
+    """
+    gains, dt_s = closed_loop.Gains.of(trial.after), weather.rest.dt_s
+    frequency_hz, power = welch(
+        off_um, 1 / dt_s, nperseg=round(_SEGMENT_S / dt_s), detrend="constant"
+    )
+    w: Series = 2 * np.pi * frequency_hz
+    fastest = math.pi / (2 * (trial.model.delay_s + gains.filter_s + dt_s))
+    used = (w > 2 * np.pi * 3 / _SEGMENT_S) & (w < 2 * fastest)
+    w, power = w[used], power[used]
+    model, moving = linearise_limits(gains, trial.model, weather, trial.after, w)
+    s = np.abs(1 / (1 + closed_loop.loop_response(gains, model, w, dt_s))) ** 2
+    peak = s >= min(
+        1.0, s.max()
+    )  # slower motion that exceeds the prediction is weather, or a limit of the pump
+    excess, bands = power[peak] / (s * (moving + weather.rest.white_psd))[peak], w[peak]
+    bands = np.floor(np.log(bands / w[0]) / math.log(_BAND)).astype(int)
+    means = np.array([excess[bands == band].mean() for band in np.unique(bands)])
+    model_ms = margins.compute_margins(gains, trial.model, dt_s).ms
+    return float(model_ms * math.sqrt(max(1.0, means.max() / np.median(means))))
+
+
+def judge_stage(
+    record: Record, setpoint_um: Series, trial: VerificationTrial, growth_max: float
+) -> Stage:
+    """Judge the record so far, comparing the centre with each sample's setpoint."""
+    off_um = record.filled_displacement_um() - setpoint_um
+    weather = trial.weather
+    replayed = record.duration_s >= _REPLAY_LEAST_S
+    if record.duration_s >= _OBSERVE_LEAST_S:
+        weather = disturbance.observe_disturbance(record, trial.model, trial.after)
+    std_um = estimate_centre_std_um(off_um, trial, weather, trial.after)
+    before_um, after_um = (
+        predict_loop(closed_loop.Gains.of(loop), trial.model, weather, loop).std_um
+        for loop in (trial.before, trial.after)
+    )
+    predicted_growth = after_um / before_um
+    if replayed:
+        would_um = replay_um(record, off_um, trial.model, trial.before, trial.pump)
+        before_um = estimate_centre_std_um(would_um, trial, weather, trial.before)
+    if trial.accepted:
+        growth_max *= max(1.0, predicted_growth)
+    growth = std_um / before_um
+    ms = estimate_sensitivity(off_um, trial, weather) if replayed else math.nan
+    reason = ""
+    if growth > growth_max:
+        reason = (
+            f"the standard deviation is {std_um:.3f} µm, {growth:.2f} times that of the previous "
+            "gains"
+        )
+    elif ms > MS_MAX:
+        reason = (
+            f"the readings show a sensitivity of {ms:.1f} (limit {MS_MAX:g}): less margin than "
+            "designed"
+        )
+    return Stage(
+        record.duration_s, std_um, before_um, growth, growth_max, ms, record.lost_fraction, reason
+    )

@@ -1,0 +1,27 @@
+"""Saves the pictures of a report, and decides which are older than what they show."""
+
+from pathlib import Path
+
+from matplotlib.figure import Figure
+
+from membrane_ctrl.measure.results import write_figure
+from membrane_ctrl.model.files import users
+from membrane_ctrl.sessions.folder import FILES, SessionFolder
+
+SPECTRUM_SEGMENT_S = 40.0
+_DPI = 100
+
+
+def save_figure(path: Path, figure: Figure) -> None:
+    """Write a picture to a file of the session."""
+    write_figure(users(path), figure, _DPI)
+
+
+def is_outdated(folder: SessionFolder, picture: str, *steps: str) -> bool:
+    """Whether the picture is no file, or older than a result of one of the steps."""
+    path = folder.file(picture)
+    if path.is_symlink() or not path.is_file():
+        return True
+    results = [folder.file(name) for step in steps for name in FILES[step]]
+    newest_ns = max(each.stat().st_mtime_ns for each in results if each.exists())
+    return newest_ns >= path.stat().st_mtime_ns

@@ -1,0 +1,1 @@
+"""Benches and holds that a session drives."""

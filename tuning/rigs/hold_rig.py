@@ -1,0 +1,227 @@
+"""A running hold under the tuner's control; its ticks are the record.
+
+The supervisor stays in charge.
+
+Successive records have no gap: each starts with the tick after the last one taken, so that what
+happens in between (a fit takes a second) is in the next record and not lost.
+"""
+
+import math
+from collections import deque
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+
+import numpy as np
+
+from membrane_ctrl.config.schema import LoopConfig, PumpConfig
+from membrane_ctrl.control.experiments import experiment, operating_point
+from membrane_ctrl.control.experiments.spec import ExperimentSpec
+from membrane_ctrl.controller.commands import Command
+from membrane_ctrl.model import events, shape_estimate, telemetry
+from membrane_ctrl.sessions.live_hold import HoldError, HoldLink
+from tuning.identification.record import Record, Series
+from tuning.rigs.operating_point import make_operating_point
+from tuning.rigs.ticks_by_figures import TicksByFigures
+
+_WITHIN = 0.1  # of a tick: figures of about its time
+Progress = Callable[[float], None]  # seconds of hold recorded since the last call
+_HELD = frozenset({telemetry.State.HOLD, telemetry.State.TUNE})
+_ANSWER_TICKS = 500  # for the state to change after a command: 10 s at 50 Hz
+
+
+class HoldRig:
+    """Runs holds and experiments and sets gains on a running hold; every command is recorded with
+    `who`.
+    """
+
+    def __init__(self, link: HoldLink, who: str, progress: Progress = lambda seconds: None) -> None:
+        self._link, self._who, self._progress = link, who, progress
+        self.seen: Callable[[telemetry.TelemetryRow], None] = lambda row: None  # each recorded tick
+        self._rows: deque[telemetry.TelemetryRow] = deque()
+        self._events: deque[events.Event] = deque()
+        self._figures = TicksByFigures(link.config) if link.config.by_optics else None
+        self._every = 0  # ticks of a reading; 0: not known yet
+        self._state = math.nan  # of the newest tick
+        self.loop, self.pump = link.config.loop, link.config.pump  # as last set
+        self.good = self.loop, self.pump  # to go back to
+        self.dt_s = 1 / self.loop.rate_hz
+        self.shapes: list[shape_estimate.ShapeEstimate] = []  # all so far
+
+    def hold(self, duration_s: float) -> Record:
+        """Record the next seconds of hold. Raises HoldError if the
+        mirror is not held throughout.
+        """
+        return self.record(self.ticks(duration_s))
+
+    def ticks(self, duration_s: float) -> list[telemetry.TelemetryRow]:
+        """As `hold`, but the ticks themselves."""
+        return [self._next_held() for _ in range(round(duration_s / self.dt_s))]
+
+    def hold_about(self, duration_s: float) -> tuple[Record, Series]:
+        """As `hold`, with each sample's setpoint in µm, because the shape loop moves setpoint and
+        mirror.
+        """
+        rows = self.ticks(duration_s)
+        record = self.record(rows)
+        ticks = np.array([row.tick + row.missed_ticks for row in rows])
+        read = ticks[0] + self._every * np.arange(len(record))
+        setpoints = np.interp(read, ticks, [row.setpoint_um for row in rows])
+        return record, setpoints
+
+    def around(self, held: Record, limit_um: float = 10.0) -> operating_point.Around:
+        """Operating point of an experiment, from the hold before it."""
+        return make_operating_point(held, self.loop, self.pump, limit_um)
+
+    def perform(self, spec: ExperimentSpec) -> tuple[Record, experiment.Finished]:
+        """Let the controller run an experiment; the record ends with the tick that returns to hold.
+
+        Raises HoldError if the experiment is refused or ends in a state other than hold.
+        """
+        rows, finished = self.performed(spec)
+        return self.record(rows), finished
+
+    def performed(
+        self, spec: ExperimentSpec
+    ) -> tuple[list[telemetry.TelemetryRow], experiment.Finished]:
+        """As `perform`, with the ticks instead of a record."""
+        self._events.clear()
+        self._link.ask(Command("tune", self._who, f"tuning session: {spec.kind}", experiment=spec))
+        rows: list[telemetry.TelemetryRow] = []
+        begun = False
+        while not begun or rows[-1].state == telemetry.State.TUNE:
+            rows.append(self._next_held())
+            begun = begun or rows[-1].state == telemetry.State.TUNE
+            if not begun and len(rows) > _ANSWER_TICKS:
+                raise HoldError("the hold accepted the experiment but did not begin it")
+        told = self._experiment_ended()
+        return rows, experiment.Finished(experiment.ExperimentEnd(told.end), told.reason)
+
+    def set_gains(
+        self,
+        loop: LoopConfig,
+        why: str = "tuning session",
+        trial_s: float = math.nan,
+        shape_s: float = math.nan,
+        pump: PumpConfig | None = None,
+        setpoint_step_um: float = math.nan,
+    ) -> None:
+        """Set gains without a bump; on trial, the hold restores the old ones unless `keep` follows.
+
+        `shape_s`: time constant of the shape loop, `pump`: the pump's curve; NaN and None leave
+        them. With `setpoint_step_um` the trial moves the setpoint too, with the shape loop off.
+        """
+        told = Command(
+            "gains", self._who, why, trial_s, loop=loop, shape_time_constant_s=shape_s, pump=pump
+        )
+        self._link.ask(replace(told, setpoint_step_um=setpoint_step_um))
+        self.loop, self.pump = loop, pump or self.pump
+
+    def keep(self) -> None:
+        """Keep the gains that are on trial."""
+        self._link.ask(Command("keep", self._who, "verified"))
+
+    def go_back(self) -> None:
+        """End any running experiment and set the last good gains and curve."""
+        self.end_experiment()
+        if self.good != (self.loop, self.pump):
+            self.set_gains(self.good[0], "back to the last good gains", pump=self.good[1])
+
+    def end_experiment(self) -> None:
+        """End the experiment that runs, perhaps that of a session that was killed, and discard its
+        ticks.
+        """
+        self._take()
+        if self._state != telemetry.State.TUNE:
+            return
+        self._link.ask(Command("hold", self._who, "tuning session interrupted"))
+        while not self._rows or self._rows[-1].state == telemetry.State.TUNE:
+            self._rows.clear()
+            self._take()
+        while self._rows[0].state == telemetry.State.TUNE:
+            self._rows.popleft()
+
+    def catch_up(self) -> None:
+        """Discard the ticks so far: while a person thinks, nothing is recorded."""
+        self._take()
+        self._rows.clear()
+
+    def record(self, rows: Sequence[telemetry.TelemetryRow]) -> Record:
+        """Return ticks as an evenly sampled record; a skipped tick has no reading and keeps the
+        flow.
+
+        Without a laser there is a reading for each figure, and further ticks are taken until they
+        are whole ones.
+        """
+        self._every = self._every or self._ticks_of_a_figure()
+        rows = list(rows)
+        while (
+            rows
+            and round(
+                rows[-1].tick + rows[-1].missed_ticks - rows[0].tick - rows[0].missed_ticks + 1
+            )
+            % self._every
+        ):
+            rows.append(self._next_held())
+        flows: list[float] = []
+        samples: list[experiment.BenchSample] = []
+        flow = next((row.flow_um_per_s for row in rows if math.isfinite(row.flow_um_per_s)), 0.0)
+        tick = rows[0].tick + rows[0].missed_ticks if rows else 0.0
+        for row in rows:
+            place = row.tick + row.missed_ticks
+            gap = max(0, round(place - tick))
+            flows += [flow] * gap
+            samples += [
+                experiment.BenchSample(math.nan, row.ambient_pressure_pa, row.air_temperature_c)
+            ] * gap
+            flow = row.flow_um_per_s if math.isfinite(row.flow_um_per_s) else flow
+            flows.append(flow)
+            samples.append(
+                experiment.BenchSample(
+                    row.displacement_um, row.ambient_pressure_pa, row.air_temperature_c
+                )
+            )
+            tick = place + 1
+        return Record.from_samples(self.dt_s, flows, samples).every(self._every)
+
+    def _ticks_of_a_figure(self) -> int:
+        return (
+            1
+            if self._figures is None
+            else max(1, math.ceil(self._figures.interval_s / self.dt_s - _WITHIN))
+        )
+
+    def _next_held(self) -> telemetry.TelemetryRow:
+        while not self._rows:
+            self._take()
+        row = self._rows[0]
+        if row.state not in _HELD:
+            raise HoldError(
+                "the mirror is not held (state "
+                f"{telemetry.State(int(row.state)).name.lower()}): {self._why()}; "
+                "start or resume the hold, then repeat this step"
+            )
+        self._progress(self.dt_s)
+        self.seen(row)
+        return self._rows.popleft()
+
+    def _take(self) -> None:
+        news = self._link.news()
+        self._state = news.rows[-1].state if news.rows else self._state
+        self._rows.extend(
+            news.rows if self._figures is None else self._figures.take(news.rows, news.shapes)
+        )
+        self._events.extend(news.events)
+        self.shapes += news.shapes
+
+    def _experiment_ended(self) -> events.ExperimentEnded:
+        """Return the newest end event, which may come a moment after its tick."""
+        for _ in range(20):
+            found = [event for event in self._events if isinstance(event, events.ExperimentEnded)]
+            if found:
+                return found[-1]
+            self._take()
+        raise HoldError("the hold did not report the end of the experiment")
+
+    def _why(self) -> str:
+        said = [event.why for event in self._events if isinstance(event, events.StateEntered)]
+        return said[-1] if said else "no reason was given"

@@ -1,0 +1,1 @@
+"""The steps of a session: each with its function and its file."""

@@ -1,0 +1,218 @@
+"""Fourth step of a session: compute the candidates and propose gains."""
+
+import html
+import math
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from matplotlib.figure import Figure
+
+from membrane_ctrl.model import errors, files
+from membrane_ctrl.sessions import folder
+from tuning.gains_file import (
+    GainsFile,
+    PlantSection,
+    load_gains,
+    save_gains,
+)
+from tuning.identification import closed_loop, plant_model
+from tuning.journal import Traded
+from tuning.proposal import candidate, candidate_table, design, gain_search
+from tuning.proposal.preview import Preview
+from tuning.proposal.robustness import Robustness
+from tuning.report.html import embed_picture, make_table
+from tuning.report.pictures import is_outdated, save_figure
+from tuning.sentences import describe_gains
+from tuning.steps.identify import load_identified
+from tuning.steps.observe import load_disturbance, load_quiet_record
+
+EDITED = "edited"  # name of gains in a file that was edited by hand
+_PICTURE = "candidates.png"
+
+
+@dataclass(frozen=True, slots=True)
+class Design:
+    """`proposal.json`: a `design.Proposal` without its loop, which is in the gains file."""
+
+    candidates: tuple[candidate.Candidate, ...]
+    least_std_um: float
+    preview: Preview
+    robustness: Robustness
+
+
+def run_design(session: folder.SessionFolder, reason: str = "tuning session") -> GainsFile:
+    """Compute the candidates and propose gains. Raises RejectedError if the data do not support a
+    proposal.
+    """
+    found, disturbance = load_identified(session), load_disturbance(session)
+    session.begin("design")
+    before = session.head.before
+    try:
+        made = design.propose_gains(
+            found.identified, disturbance, before, session.config.pump, found.quality
+        )
+    except design.RefusedError as error:
+        raise errors.RejectedError(f"design: {error}") from None
+    assert made.chosen.predicted is not None  # a proposal keeps its margins
+    if not math.isfinite(made.chosen.predicted.std_um + made.least_std_um):
+        raise errors.RejectedError(
+            "design: cannot predict a std from this noise and weather: observe again"
+        )
+    gains = GainsFile(
+        author=session.head.author,
+        date_utc=session.head.created_utc,
+        reason=reason,
+        source=f"{session.head.source}; session {session.path.name}",
+        data_sha256=found.data_sha256,
+        predicted_std_um=made.chosen.predicted.std_um,
+        least_std_um=made.least_std_um,
+        plant=PlantSection.of(found.identified),
+        loop=made.loop,
+    )
+    files.write_text_atomic(
+        files.users(session.file("candidates.md")),
+        candidate_table.format_markdown(made.candidates) + "\n",
+    )
+    kept = Design(made.candidates, made.least_std_um, made.preview, made.robustness)
+    folder.write(session.file("proposal.json"), kept)
+    save_gains(session.file("gains.toml"), gains)
+    return gains
+
+
+def load_design(session: folder.SessionFolder) -> Design:
+    """The candidates."""
+    return session.result("design", "proposal.json", Design)
+
+
+def load_candidates(
+    session: folder.SessionFolder,
+) -> tuple[tuple[candidate.Candidate, ...], candidate.Candidate]:
+    """The candidates, and the one in `gains.toml`, which is a further one if that was edited by
+    hand.
+    """
+    rows, loop = load_design(session).candidates, load_gains(session.file("gains.toml")).loop
+    gains = closed_loop.Gains.of(loop)
+    for row in rows:
+        if row.gains == gains:
+            return rows, row
+    model = load_identified(session).identified.model
+    edited = candidate.evaluate_candidate(
+        EDITED, gains, model, load_disturbance(session), loop, gain_search.Demands()
+    )
+    return (*rows, edited), edited
+
+
+def list_applicable(session: folder.SessionFolder) -> tuple[str, ...]:
+    """Names of the candidates that may be applied, the proposed one first."""
+    rows, now = load_candidates(session)
+    ordered = sorted(rows, key=lambda row: row is not now)
+    return tuple(
+        row.name
+        for row in ordered
+        if row.name != candidate.PRESENT and not candidate.find_refusal(row)
+    )
+
+
+def find_candidate(session: folder.SessionFolder, name: str) -> candidate.Candidate:
+    """The candidate of this name. Raises InputError if it is unknown or must not be applied."""
+    rows, _ = load_candidates(session)
+    known = {row.name: row for row in rows if row.name != candidate.PRESENT}
+    if name == candidate.SAME_LOAD and name not in known:
+        name = candidate.NAMES[0]  # its response to a step of the leak is no worse
+    if name not in known:
+        raise errors.InputError(
+            f"{name}: not a candidate of {session.path.name}; known: {', '.join(known)}"
+        )
+    refusal = candidate.find_refusal(known[name])
+    if refusal:
+        raise errors.InputError(f"{name}: is not applied: {refusal}")
+    return known[name]
+
+
+def compare_with_present(session: folder.SessionFolder) -> Traded:
+    """What the gains in `gains.toml` give and cost."""
+    rows, now = load_candidates(session)
+    present = [row.figures for row in rows if row.name == candidate.PRESENT]
+    if not present:
+        raise errors.InputError(f"{session.path}: proposal.json is damaged; run design again")
+    return Traded(now.name, present[0], now.figures)
+
+
+def describe_result(session: folder.SessionFolder) -> str:
+    """The gains in `gains.toml` in one line."""
+    gains = load_gains(session.file("gains.toml"))
+    ratio = gains.predicted_std_um / gains.least_std_um
+    return (
+        f"{describe_gains(gains.loop)}: {compare_with_present(session)}; "
+        f"{ratio:.2f} of the lower bound"
+    )
+
+
+def make_report_part(session: folder.SessionFolder) -> list[str]:
+    """The candidates, for the report."""
+    if not session.done("design"):
+        return []
+    kept = load_design(session)
+    gains = load_gains(session.file("gains.toml"))
+    loop = gains.loop
+    traded = compare_with_present(session)
+    by = "chosen" if gains.candidate else "proposed"
+    lines = session.candidates().splitlines()
+    cells = [[cell.strip() for cell in line.strip("|").split("|")] for line in lines]
+    return [
+        "<h2>Candidates</h2>",
+        make_table(cells[0], cells[2:]),
+        embed_picture(session, _PICTURE),
+        f"<p>{html.escape(traded.candidate)} is {by}: K {loop.kp_per_s:.3f} 1/s, "
+        f"Ti {loop.ti_s:.2f} s, filter {loop.measurement_filter_s:.2f} s. Present and new gains: "
+        f"{html.escape(str(traded))}. Lower bound of the std: {gains.least_std_um:.3f} µm. "
+        "The proposal over plants drawn from the fit: "
+        f"Ms {kept.robustness.ms_p95:.2f}, std {kept.robustness.std_p95_um:.3f} µm at 95 %, "
+        f"{kept.robustness.stable_fraction:.0%} stable.</p>",
+    ]
+
+
+def draw_picture(session: folder.SessionFolder) -> None:
+    """Draw the candidates side by side, unless the picture is up to date."""
+    if session.done("design") and is_outdated(session, _PICTURE, "identify", "observe", "design"):
+        model = load_identified(session).identified.model
+        dt_s = load_quiet_record(session).dt_s
+        _draw_candidates(session.file(_PICTURE), load_design(session), model, dt_s)
+
+
+def _draw_candidates(path: Path, kept: Design, model: plant_model.PlantModel, dt_s: float) -> None:
+    """Draw all candidates: predicted standard deviation, Ms, load peak, recovery, pump activity,
+    |S|.
+    """
+    sound = [(row, row.predicted) for row in kept.candidates if row.predicted is not None]
+    rows, names = [row for row, _ in sound], [row.name for row, _ in sound]
+    stds, flows = ([getattr(p, name) for _, p in sound] for name in ("std_um", "flow_std_um_per_s"))
+    figure = Figure(figsize=(12, 8), layout="constrained")
+    (a, b, c), (d, e, f) = figure.subplots(2, 3)
+    places = np.arange(len(names))
+    for axes, values, title, limit in (
+        (a, stds, "predicted std (µm)", kept.least_std_um),
+        (b, [row.margins.ms for row in rows], "Ms", 1.4),
+        (c, [row.load_peak_um for row in rows], "load peak (µm)", math.nan),
+        (
+            d,
+            np.minimum([row.load_recovery_s for row in rows], 60.0),
+            "recovery (s, cut at 60)",
+            math.nan,
+        ),
+        (e, np.minimum(flows, 3.0), "flow std (µm/s, cut at 3)", math.nan),
+    ):
+        axes.barh(places, values, color=["tab:green"] + ["tab:blue"] * (len(names) - 1))
+        axes.set_yticks(places, names, fontsize=7)
+        axes.invert_yaxis()
+        axes.set_title(title, fontsize=9)
+        if math.isfinite(limit):
+            axes.axvline(limit, color="tab:red", linestyle="--")
+    w = closed_loop.make_frequencies(dt_s)
+    for row in rows:
+        size = np.abs(1 / (1 + closed_loop.loop_response(row.gains, model, w, dt_s)))
+        f.semilogx(w, size, linewidth=2 if row is rows[0] else 0.8, label=row.name)
+    f.set(xlim=(0.05, w[-1]), xlabel="rad/s", title="|S|")
+    f.legend(loc="best", fontsize=6)
+    save_figure(path, figure)

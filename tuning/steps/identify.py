@@ -1,0 +1,136 @@
+"""Second step of a session: fit the plant to the experiments and judge the fit."""
+
+import html
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from matplotlib.figure import Figure
+
+from membrane_ctrl.control.leak_estimate import TOO_TIGHT_UM_PER_S
+from membrane_ctrl.model import errors
+from membrane_ctrl.sessions import folder
+from tuning.identification import experiments, fit_quality, plant_fit, plant_model
+from tuning.identification.record import Record
+from tuning.report.html import embed_picture, make_table
+from tuning.report.pictures import is_outdated, save_figure
+from tuning.sentences import TOO_TIGHT
+from tuning.steps.characterise import PumpUnknownError, load_experiments
+
+_PICTURE = "experiments.png"
+
+
+@dataclass(frozen=True, slots=True)
+class IdentifiedPlant:
+    """`identified.json`."""
+
+    identified: plant_fit.Identified
+    quality: fit_quality.FitQuality
+    data_sha256: str
+
+
+def run_identify(session: folder.SessionFolder) -> IdentifiedPlant:
+    """Fit the model and judge it; a refused fit is kept too, for the report."""
+    done = load_experiments(session)
+    session.begin("identify")
+    try:
+        all_of_it = experiments.fit_experiments(done)
+    except ValueError as error:
+        raise errors.RejectedError(f"identify: {error}") from None
+    found = IdentifiedPlant(all_of_it.identified, all_of_it.quality, done.record.sha256())
+    folder.write(session.file("identified.json"), found)
+    return found
+
+
+def load_identified(session: folder.SessionFolder) -> IdentifiedPlant:
+    """The identified plant. Raises InputError also if it comes from other data."""
+    found = session.result("identify", "identified.json", IdentifiedPlant)
+    record = load_experiments(session).record
+    steps = len(record) - 1
+    if found.data_sha256 != record.sha256() or found.identified.residual_um.shape != (steps,):
+        raise errors.InputError(
+            f"{session.path}: identified.json comes from other experiments; run identify again"
+        )
+    return found
+
+
+def require_known_pump(session: folder.SessionFolder) -> None:
+    """Raises PumpUnknownError if the fit was refused because of the pump's curve."""
+    if load_identified(session).quality.pump_unknown:
+        raise PumpUnknownError("identify: the pump does not match its configured curve")
+
+
+def describe_result(session: folder.SessionFolder) -> str:
+    """The fitted plant in one line."""
+    found = load_identified(session)
+    model = found.identified.model
+    sigma = found.identified.sigma
+    reasons = "".join(f"; {reason}" for reason in found.quality.reasons)
+    too_tight = model.leak_um_per_s < TOO_TIGHT_UM_PER_S
+    return (
+        f"k {model.gain:.3f} +- {sigma.gain:.3f}, "
+        f"delay {model.delay_s:.3f} +- {sigma.delay_s:.3f} s "
+        f"(dead time {model.dead_time_s:.3f} +- {sigma.dead_time_s:.3f} s), "
+        f"leak {model.leak_um_per_s:.2f} µm/s: {found.quality.verdict}{reasons}"
+        + (f"; {TOO_TIGHT}" if too_tight else "")
+    )
+
+
+def make_report_part(session: folder.SessionFolder) -> list[str]:
+    """Experiments and fit, for the report; the experiments alone before they are fitted."""
+    parts = ["<h2>Experiments and fit</h2>", embed_picture(session, _PICTURE)]
+    if not session.done("identify"):
+        return parts
+    found = load_identified(session)
+    fit = found.identified
+    model, sigma = fit.model, fit.sigma
+    colour = "refused" if found.quality.verdict == "refused" else "ok"
+    reasons = "; ".join(found.quality.reasons)
+    parts.append(f"<p class={colour}>Data: {found.quality.verdict}. {html.escape(reasons)}</p>")
+    rows = [
+        ("gain k", f"{model.gain:.3f}", f"{sigma.gain:.3f}"),
+        ("dead time (s)", f"{model.dead_time_s:.3f}", f"{sigma.dead_time_s:.3f}"),
+        ("lag (s)", f"{model.lag_s:.3f}", f"{sigma.lag_s:.3f}"),
+        ("delay, both (s)", f"{model.delay_s:.3f}", f"{sigma.delay_s:.3f}"),
+        ("leak (µm/s)", f"{model.leak_um_per_s:.2f}", f"{sigma.leak_um_per_s:.2f}"),
+    ]
+    parts.append(make_table(("", "value", "1 sigma"), rows))
+    parts.append(
+        f"<p>Residuals: whiteness p = {fit.whiteness_p:.3g}, independence of the flow p = "
+        f"{fit.independence_p:.3g}, largest {fit.largest_residual:.1f} sigma. "
+        f"Data {found.data_sha256[:16]}.</p>"
+    )
+    return parts
+
+
+def draw_picture(session: folder.SessionFolder) -> None:
+    """Draw the experiments and, once fitted, the model's response, unless they are up to date."""
+    if session.done("characterise") and is_outdated(session, _PICTURE, "characterise", "identify"):
+        fit = load_identified(session).identified if session.done("identify") else None
+        _draw_experiments(session.file(_PICTURE), load_experiments(session).record, fit)
+
+
+def _draw_experiments(path: Path, record: Record, found: plant_fit.Identified | None) -> None:
+    """Draw flow and readings and, once fitted, the model's response
+    to the flow with the residuals.
+    """
+    figure = Figure(figsize=(11, 7), layout="constrained")
+    upper, middle, lower = figure.subplots(3, 1, sharex=True)
+    time_s = np.arange(len(record)) * record.dt_s
+    upper.step(time_s, record.flow_um_per_s, where="post", linewidth=0.8)
+    upper.set(ylabel="flow (µm/s)")
+    middle.plot(
+        time_s, record.displacement_um, ".", markersize=1, color="tab:gray", label="reading"
+    )
+    if found is not None:
+        middle.plot(
+            time_s,
+            plant_model.compute_pump_share_um(record, found.model),
+            linewidth=1,
+            label="response to the pump (model)",
+        )
+        lower.plot(time_s[1:], found.residual_um, linewidth=0.4)
+    middle.set(ylabel="centre (µm)")
+    middle.legend(loc="upper right")
+    lower.set(ylabel="prediction error (µm)", xlabel="time (s)")
+    save_figure(path, figure)

@@ -1,0 +1,179 @@
+"""Last step of a session: judge the gains on trial; keep them or restore the previous ones."""
+
+import html
+import math
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from matplotlib.figure import Figure
+from scipy.signal import welch
+
+from membrane_ctrl.config import schema
+from membrane_ctrl.sessions import folder, live_hold
+from tuning.gains_file import load_gains
+from tuning.identification import closed_loop, plant_model, record_file
+from tuning.identification.record import Record
+from tuning.proposal import verification
+from tuning.report.html import embed_picture, make_table
+from tuning.report.pictures import SPECTRUM_SEGMENT_S, is_outdated, save_figure
+from tuning.rigs.hold_rig import HoldRig
+from tuning.steps.apply import load_checked_gains
+from tuning.steps.design import load_candidates
+from tuning.steps.identify import load_identified
+from tuning.steps.observe import load_disturbance, load_quiet_record
+
+_SPARE_S = 120.0
+_PICTURE = "verify.png"
+
+
+@dataclass(frozen=True, slots=True)
+class Verified:
+    """`verified.json`."""
+
+    kept: bool  # the new gains stay
+    reason: str
+    stages: tuple[verification.Stage, ...]
+    before: schema.LoopConfig
+    after: schema.LoopConfig
+
+
+def run_verify(
+    session: folder.SessionFolder,
+    rig: HoldRig,
+    told: Callable[[verification.Stage], None] = lambda stage: None,
+    stages: tuple[tuple[float, float], ...] = verification.STAGES,
+) -> Verified:
+    """Hold with the new gains and judge them in stages; keep them,
+    or restore the old ones at once.
+    """
+    session.require("apply")
+    after, before = load_checked_gains(session), session.head.before
+    accepted = load_gains(session.file("gains.toml")).candidate == load_candidates(session)[1].name
+    session.begin("verify")
+    model, weather = load_identified(session).identified.model, load_disturbance(session)
+    trial = verification.VerificationTrial(model, weather, before, after, accepted, rig.pump)
+    trial_s = verification.settling_time_s(after) + 2 * stages[-1][0] + _SPARE_S
+    rig.set_gains(after, f"session {session.path.name}: verification", trial_s)
+    looks: list[verification.Stage] = []
+    record: Record | None = None
+    setpoint_um, reason = np.empty(0), ""
+    try:
+        rig.hold(verification.settling_time_s(after))
+        for until_s, growth_max in (*stages, (2 * stages[-1][0], stages[-1][1])):
+            more, about_um = rig.hold_about(until_s - setpoint_um.size * rig.dt_s)
+            record = more if record is None else record.followed_by(more)
+            setpoint_um = np.concatenate((setpoint_um, about_um))
+            looks.append(verification.judge_stage(record, setpoint_um, trial, growth_max))
+            told(looks[-1])
+            reason = looks[-1].reason
+            if until_s == stages[-1][0] and looks[-1].close:
+                continue  # as likely the weather as the gains: as long again decides
+            if reason or until_s == stages[-1][0]:
+                break
+    except live_hold.HoldError as error:
+        reason = str(error)
+    if reason:
+        try:
+            rig.set_gains(before, f"verification failed: {reason}"[:250])
+        except live_hold.HoldError:  # the hold has gone, and takes them back by itself
+            raise live_hold.HoldError(reason) from None
+    else:
+        rig.keep()
+    done = Verified(not reason, reason, tuple(looks), before, after)
+    if record is not None:
+        record_file.save_record(session.file("verify.npz"), record)
+    folder.write(session.file("verified.json"), done)
+    return done
+
+
+def load_verified(session: folder.SessionFolder) -> Verified:
+    """Result of the verification."""
+    return session.result("verify", "verified.json", Verified)
+
+
+def describe_result(session: folder.SessionFolder) -> str:
+    """The verdict in one line."""
+    done = load_verified(session)
+    if not done.kept:
+        return f"the previous gains are back: {done.reason}"
+    return (
+        "kept until the hold ends; `membrane-ctrl tune save --config FILE` saves them for the "
+        "next one"
+    )
+
+
+def make_report_part(session: folder.SessionFolder) -> list[str]:
+    """The verification, for the report."""
+    if not session.done("verify"):
+        return []
+    done = load_verified(session)
+    verdict = "kept" if done.kept else f"reverted: {done.reason}"
+    colour = "ok" if done.kept else "refused"
+    rows = [
+        (
+            f"{stage.time_s:.0f} s",
+            f"{stage.std_um:.3f}",
+            f"{stage.before_um:.3f}",
+            f"{stage.growth:.2f}",
+            f"{stage.ms:.2f}" if math.isfinite(stage.ms) else "record too short",
+            stage.reason,
+        )
+        for stage in done.stages
+    ]
+    heads = ("after", "std µm", "previous µm", "ratio", "observed sensitivity", "")
+    return [
+        f"<h2>Verification</h2><p class={colour}>{html.escape(verdict)}</p>",
+        make_table(heads, rows),
+        embed_picture(session, _PICTURE),
+    ]
+
+
+def draw_picture(session: folder.SessionFolder) -> None:
+    """Draw the spectra before and after, and each stage, unless the picture is up to date."""
+    if session.done("verify") and is_outdated(session, _PICTURE, "identify", "observe", "verify"):
+        path = session.file("verify.npz")
+        after = record_file.load_record(path) if path.exists() else None
+        before = load_quiet_record(session)
+        model = load_identified(session).identified.model
+        _draw_verification(session.file(_PICTURE), before, after, model, load_verified(session))
+
+
+def _draw_verification(
+    path: Path, before: Record, after: Record | None, model: plant_model.PlantModel, done: Verified
+) -> None:
+    """Draw the readings' spectra before and after, and the ratio of
+    standard deviations per stage.
+    """
+    figure = Figure(figsize=(11, 4.5), layout="constrained")
+    left, right = figure.subplots(1, 2)
+    dt_s = before.dt_s
+    for record, loop, name in ((before, done.before, "before"), (after, done.after, "after")):
+        if record is None:
+            continue
+        readings = record.filled_displacement_um()
+        f, power = welch(
+            readings - readings.mean(),
+            1 / dt_s,
+            nperseg=min(readings.size, round(SPECTRUM_SEGMENT_S / dt_s)),
+        )
+        response = closed_loop.loop_response(
+            closed_loop.Gains.of(loop), model, closed_loop.make_frequencies(dt_s), dt_s
+        )
+        ms = float(np.max(np.abs(1 / (1 + response))))
+        left.loglog(f[1:], power[1:], linewidth=0.8, label=f"{name}, Ms {ms:.2f}")
+    left.set(xlabel="frequency (Hz)", ylabel="readings (µm^2/Hz)")
+    left.legend(loc="best")
+    times = [stage.time_s for stage in done.stages]
+    right.plot(
+        times,
+        [stage.growth for stage in done.stages],
+        "o-",
+        label="std relative to the previous gains",
+    )
+    right.plot(times, [stage.growth_max for stage in done.stages], "r--", label="limit")
+    right.set(xlabel="time (s)", title="kept" if done.kept else f"reverted: {done.reason}"[:90])
+    right.title.set_fontsize(8)
+    right.legend(loc="best")
+    save_figure(path, figure)
