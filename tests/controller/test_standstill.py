@@ -95,7 +95,7 @@ def test_the_last_of_two_commands_must_be_off_as_well() -> None:
     assert not stand.seen_off
     stand.observe_reading(0.2, STILL, (0.0, 0.0), True)
     assert stand.seen_off
-    stand.look(0.3, None, (0.0, 0.0), True)
+    stand.observe_reading(0.3, None, (0.0, 0.0), True)
     assert not stand.seen_off
     assert stand.silent_s == pytest.approx(0.1)
 
