@@ -4,15 +4,21 @@ from __future__ import annotations
 
 import ast
 import difflib
+import json
 import os
 import shutil
+import signal
 import subprocess
 import sys
+import time
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 ROOT = Path(__file__).parents[3]
+PATIENCE_S = 1200.0  # of a busy machine
+INTERRUPTED = 130  # exit code
 PACKAGES = ("membrane_ctrl", "firmware_iface", "tuning")
 
 
@@ -180,17 +186,60 @@ class ChangedSource:
         """Run `membrane-ctrl` of the changed source, as `run_python`."""
         return self.run_python("-m", "membrane_ctrl", *words)
 
-    def start_program(self, *words: object, printed: Path) -> subprocess.Popen[bytes]:
-        """Start `membrane-ctrl` of the changed source; what it prints goes to a file."""
-        command = [sys.executable, "-m", "membrane_ctrl", *(str(word) for word in words)]
+    def hold_until(
+        self,
+        happened: Callable[[list[dict[str, Any]]], bool],
+        logs: Path,
+        name: str,
+        *words: object,
+        more_s: float,
+    ) -> Path:
+        """Hold the twin, for `more_s` seconds after its recorded events fulfil a condition: a slow
+        machine takes longer.
+
+        Parameters
+        ----------
+        happened : callable
+            Whether these events are enough.
+        logs : Path
+            Folder of the runs.
+        name : str
+            Of the run.
+        *words : object
+            Further arguments of `hold`.
+        more_s : float
+            Time from then to the interrupt.
+
+        Returns
+        -------
+        Path
+            Folder of the run.
+        """
+        printed = self.folder / f"{name}.txt"
+        command = [sys.executable, "-m", "membrane_ctrl", "hold", "--twin"]
+        command += map(str, ("--logs", logs, "--name", name, *words))
         with printed.open("wb") as output:
-            return subprocess.Popen(
+            process = subprocess.Popen(
                 command,
                 cwd=self.folder,
                 env=self._make_environment(),
                 stdout=output,
                 stderr=subprocess.STDOUT,
             )
+        try:
+            give_up_s = time.monotonic() + PATIENCE_S
+            while not happened(_read_events(logs, name)):
+                assert time.monotonic() < give_up_s, printed.read_text()[-2000:]
+                assert process.poll() is None, printed.read_text()[-2000:]
+                time.sleep(0.5)
+            time.sleep(more_s)
+            process.send_signal(signal.SIGINT)
+            assert process.wait(PATIENCE_S) == INTERRUPTED, printed.read_text()[-2000:]
+        finally:
+            process.kill()
+            process.wait()
+        (run,) = logs.glob(f"*-{name}")
+        return run
 
     def _make_environment(self) -> dict[str, str]:
         """Environment in which the changed source is imported."""
@@ -205,3 +254,13 @@ def _insert(file: Path, line: int, byte: int, text: str, replaced: int = 0) -> N
     start = sum(len(each) for each in lines[: line - 1]) + byte
     content = b"".join(lines)
     file.write_bytes(content[:start] + text.encode() + content[start + replaced :])
+
+
+def _read_events(logs: Path, name: str) -> list[dict[str, Any]]:
+    """Events so far of the run of this name."""
+    return [
+        json.loads(line)
+        for path in logs.glob(f"*-{name}/events.jsonl")
+        for line in path.read_text(encoding="utf-8").splitlines()
+        if line.endswith("}")
+    ]

@@ -13,7 +13,8 @@ from typing import Any
 
 import pyarrow.parquet as pq
 import pytest
-from changed_source import ROOT, ChangedSource
+from changed_source import ChangedSource
+from patient_instruments import INSTRUMENTS
 
 pytestmark = [pytest.mark.campaign, pytest.mark.real_time, pytest.mark.timeout(1800)]
 
@@ -44,11 +45,11 @@ Rule(
 )
 """
 BENCH = Path(__file__).with_name("sensor_role_bench.py")
-EXAMPLE = ROOT / "membrane_ctrl" / "examples" / "all-serial.toml"
 TABLE = f"""
 [devices.{ROLE}]
 driver = "mks_937b"
 port = "/dev/ttyUSB3"
+timeout_s = 0.9
 """
 
 
@@ -68,7 +69,7 @@ def source(tmp_path_factory: pytest.TempPathFactory) -> ChangedSource:
 def lab(source: ChangedSource) -> Path:
     """A configuration of single instruments, with two gauges."""
     path = source.folder / "lab.toml"
-    path.write_text(EXAMPLE.read_text().replace("metrics_port", "# metrics_port") + TABLE)
+    path.write_text(INSTRUMENTS + TABLE)
     return path
 
 
@@ -89,12 +90,14 @@ def test_the_rule_judges_it(found: dict[str, Any]) -> None:
     assert (found["same"], found["other"], found["missing"]) == ("", "gauges_apart", "")
 
 
+def mirror_is_held(events: list[dict[str, Any]]) -> bool:
+    """Whether the controller has reached the state `hold`."""
+    return any(event["kind"] == "state" and event["state"] == "hold" for event in events)
+
+
 def test_a_hold_records_and_replays_it(source: ChangedSource, lab: Path) -> None:
     logs = source.folder / "logs"
-    source.run_program(
-        "hold", "--twin", "--devices", lab, "--duration", "20s", "--logs", logs, "--name", "gauges"
-    )
-    (run_dir,) = logs.glob("*-gauges")
+    run_dir = source.hold_until(mirror_is_held, logs, "gauges", "--devices", lab, more_s=10.0)
     source.run_program("export", run_dir)
     ticks = pq.read_table(run_dir / "export" / "ticks.parquet").to_pydict()
     pairs = zip(ticks[FIELD], ticks["gauge_pressure_pa"], strict=True)

@@ -10,8 +10,6 @@ from __future__ import annotations
 
 import json
 import math
-import signal
-import time
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -37,9 +35,7 @@ BENCH = Path(__file__).with_name("zernike_bench.py")
 ALIKE_SIGMAS = 3.0  # between two numbers of terms: both fit the same noise
 TRUE_SIGMAS = 5.0  # from the truth: the largest of 200 normal errors is at 3
 FRAMES = 8
-PATIENCE_S = 1200.0  # of a busy machine
 MORE_CYCLES_S = 20.0  # of a hold whose figure is tracked
-INTERRUPTED = 130
 COMPARED = slice(3, FEWEST)  # Noll 4 and all above that every number of terms has
 ROUND = np.isin(np.arange(1, FEWEST + 1), (4, 11))  # terms of the bowl, whose truth is in no list
 # 16-bit frames of large pixels, each with the noise of the 256 of the paper's camera that it stands
@@ -182,43 +178,13 @@ class Product:
         _ = self.bench  # compiles, so that the hold need not
         config = self.folder / f"{mode}.toml"
         config.write_text(HOLD.replace("MODE", mode))
-        printed = self.folder / f"{mode}.txt"
-        process = self.source.start_program(
-            "hold",
-            "--twin",
-            "--config",
-            config,
-            "--logs",
-            logs,
-            "--name",
-            mode,
-            printed=printed,
+        return self.source.hold_until(
+            shape_is_tracked, logs, mode, "--config", config, more_s=MORE_CYCLES_S
         )
-        try:
-            give_up_s = time.monotonic() + PATIENCE_S
-            while not shape_is_tracked(logs, mode):
-                assert time.monotonic() < give_up_s, printed.read_text()[-2000:]
-                assert process.poll() is None, printed.read_text()[-2000:]
-                time.sleep(0.5)
-            time.sleep(MORE_CYCLES_S)
-            process.send_signal(signal.SIGINT)
-            assert process.wait(PATIENCE_S) == INTERRUPTED, printed.read_text()[-2000:]
-        finally:
-            process.kill()
-            process.wait()
-        (run,) = logs.glob(f"*-{mode}")
-        return run
 
 
-def shape_is_tracked(logs: Path, name: str) -> bool:
-    """Whether the shape loop of the run of this name follows figures."""
-    lines = [
-        line
-        for path in logs.glob(f"*-{name}/events.jsonl")
-        for line in path.read_text().splitlines()
-        if line.endswith("}")
-    ]
-    events = [json.loads(line) for line in lines]
+def shape_is_tracked(events: list[dict[str, Any]]) -> bool:
+    """Whether the shape loop follows figures."""
     return any(event["kind"] == "shape" and event["state"] == "tracking" for event in events)
 
 

@@ -18,6 +18,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from patient_instruments import INSTRUMENTS
 
 from tests.support.studio_package import SOURCE
 
@@ -40,48 +41,11 @@ pixel_mm = 0.4
 {screen}
 """
 QUICK_SCREEN = "settle_ms = 10.0\nlinearise = false\nself_test = false\n"
-# patient: the machine may pause
-INSTRUMENTS = """
-[limits]
-stale_s = 2.0
-lateness_max_ms = 1900.0
-
-[devices]
-watchdog_s = 2.0
-
-[loop]
-rate_hz = 20.0
-feedforward_barometer = false
-feedforward_temperature = false
-
-[pump]
-dead_fraction = 0.0
-start_fraction = 0.0
-stall_fraction = 0.0
-
+CAMERA = """
 [optics.camera]
 width_px = 306
 height_px = 256
 pixel_um = 27.6
-
-[devices.displacement]
-driver = "optoncdt1420"
-port = "/dev/ttyUSB0"
-range_mm = 50
-rate_khz = 2
-timeout_s = 0.9
-
-[devices.pump]
-driver = "bronkhorst_modbus"
-link = "rtu:///dev/ttyUSB1?baud=115200&parity=E"
-unit_id = 3
-timeout_s = 0.9
-
-[devices.gauge_pressure]
-driver = "bronkhorst_modbus"
-link = "rtu:///dev/ttyUSB1?baud=115200&parity=E"
-unit_id = 5
-timeout_s = 0.9
 """
 # in the room the camera's pixels are 10 x 10 of the screen's
 IN_THE_ROOM = """
@@ -175,7 +139,7 @@ class Hold:
     def __init__(self, site: Path, folder: Path, camera: str = "") -> None:
         self._logs = folder / "logs"
         config = folder / "lab.toml"
-        config.write_text(INSTRUMENTS + OPTICS.format(camera=camera, screen=QUICK_SCREEN))
+        config.write_text(INSTRUMENTS + CAMERA + OPTICS.format(camera=camera, screen=QUICK_SCREEN))
         words = ["hold", "--twin", "--devices", config, "--logs", self._logs, "--json"]
         self._console = folder / "console.txt"
         with self._console.open("w") as console:
