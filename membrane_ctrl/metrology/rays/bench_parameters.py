@@ -79,11 +79,20 @@ NAMES = tuple(parameter.name for parameter in ALL)
 
 
 def sigmas(free: Mapping[str, float] | None = None) -> FloatArray:
-    """Prior standard deviations in the order of `NAMES`; 0 holds a parameter where it is.
+    """Prior standard deviations (len(NAMES),) in the order of `NAMES`; 0 holds a parameter.
 
-    Raises ValueError for a name that is not a parameter, or a sigma below 0. `free` has changes:
-    another sigma, 0 to hold, more than 0 to free. Without it the poses and the laser's scale are
-    free.
+    Without `free` only the poses and the laser's scale are free. The command `calibrate` passes a
+    sigma for every parameter (`calibration.sets.known_sigmas`), so that all of them are free there.
+
+    Parameters
+    ----------
+    free : mapping of str to float, optional
+        Other sigmas by name, in the unit of the name: 0 to hold, more than 0 to free.
+
+    Raises
+    ------
+    ValueError
+        For a name that is not a parameter, or a sigma below 0.
     """
     own = {p.name: p.sigma for p in (*POSE, LASER)}
     for name, sigma in (free or {}).items():
