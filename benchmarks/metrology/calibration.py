@@ -22,7 +22,7 @@ from membrane_ctrl.config.optics import (
     OpticsConfig,
     ScreenPoseConfig,
 )
-from membrane_ctrl.metrology.calibration.model_tests import suspects
+from membrane_ctrl.metrology.calibration.model_tests import find_suspects
 from membrane_ctrl.metrology.calibration.set_state import References
 from membrane_ctrl.metrology.calibration.solver import (
     Problem,
@@ -31,7 +31,7 @@ from membrane_ctrl.metrology.calibration.solver import (
     fit_on,
     solve,
 )
-from membrane_ctrl.metrology.frame_checks.set_check import check
+from membrane_ctrl.metrology.frame_checks.set_check import check_set
 from membrane_ctrl.metrology.phase.frame_stack import FrameStack
 from membrane_ctrl.metrology.rays.bench_parameters import ALL, NAMES, sigmas
 from membrane_ctrl.metrology.rays.bench_poses import BenchGeometry, bench_at
@@ -99,7 +99,7 @@ def _rendered(
         frames = np.stack([renderer.render(pattern, moved_um) for pattern in shown])
         reading_um = moved_um / (1 + values[NAMES.index("laser_relative")]) + rng.normal(0, 1.0)
         stack = FrameStack(frames, tuple(shown), np.full(len(shown), reading_um), {})
-        sets.append(phases_of(f"{k}", check(stack, stated), stated))
+        sets.append(phases_of(f"{k}", check_set(stack, stated), stated))
     return film, tuple(sets)
 
 
@@ -229,7 +229,7 @@ def _bowed() -> list[Figure]:
         film, sets = _rendered(seed, bow_mm=1.0)
         solution = solve(_problem(sets))
         held.append(_measured(solution, film))
-        told += bool(suspects(solution)) and suspects(solution)[0].name == "bow_mm"
+        told += bool(find_suspects(solution)) and find_suspects(solution)[0].name == "bow_mm"
         solution = solve(_problem(sets, {"bow_mm": 1.5}))
         freed.append(errors_um(solution.states[2].surface, film, MOVED_UM[2]))
     return [

@@ -40,12 +40,12 @@ from membrane_ctrl.metrology.calibration import figure_uncertainty, verdict
 from membrane_ctrl.metrology.calibration.rim_edges import find_edges
 from membrane_ctrl.metrology.calibration.solver import Solution, fit_on, solve
 from membrane_ctrl.metrology.frame_checks.checked_set import Checked, RejectedSetError
-from membrane_ctrl.metrology.frame_checks.set_check import check
+from membrane_ctrl.metrology.frame_checks.set_check import check_set
 from membrane_ctrl.metrology.phase.frame_stack import FrameStack
 from membrane_ctrl.metrology.rays.artefacts import Artefact
 from membrane_ctrl.metrology.rays.bench_parameters import NAMES
 from membrane_ctrl.metrology.rays.bench_poses import pose_derivatives
-from membrane_ctrl.metrology.rays.forward_model import MOTION, chunks
+from membrane_ctrl.metrology.rays.forward_model import MOTION, linearise_points
 from membrane_ctrl.metrology.rays.set_phases import SetPhases
 from membrane_ctrl.metrology.rays.surface import Surface
 from membrane_ctrl.model.zernike_terms import ZERNIKE_TERMS
@@ -187,7 +187,7 @@ class DrawnBench:
         room = replace(self.room, moves_um=0.0, laser=False)
         stack = room.stack(partial(self.render, renderer, 0.0), rng, CAMERA)
         stated = self.stated.model_copy(update={"mirror": mirror})
-        return replace(phases_of("sphere", check(stack, stated), stated), artefact=SPHERE)
+        return replace(phases_of("sphere", check_set(stack, stated), stated), artefact=SPHERE)
 
     def on_rail(self, seed: int) -> OpticsConfig:
         """The bench with its screen at the rail's other end, about as stated."""
@@ -265,7 +265,7 @@ def _with_more_screens(drawn: DrawnBench, sets: list[SetPhases], seed: int) -> N
     stated = drawn.stated.model_copy(update={"geometry": geometry})
     for k, moved_um in enumerate(TWO_UM):
         stack, _ = drawn.set_at(moved_um, seed + k, there)
-        join(sets, Path(f"far{k}"), phases_of(f"far{k}", check(stack, stated), stated), RAIL)
+        join(sets, Path(f"far{k}"), phases_of(f"far{k}", check_set(stack, stated), stated), RAIL)
     sets += [drawn.screen_set(f"screen{k}", k * math.pi / 2, seed + 5 + k) for k in range(2)]
 
 
@@ -276,7 +276,7 @@ def calibrated(drawn: DrawnBench, seed: int) -> tuple[Solution, list[float]]:
     kind, sets, edges, true_um = seed % len(KINDS), [], [], []
     for k, moved_um in enumerate(TWO_UM if kind == 3 else MOVED_UM):
         stack, mean_um = drawn.set_at(moved_um, 100 * seed + k)
-        found = check(stack, drawn.stated)
+        found = check_set(stack, drawn.stated)
         sets.append(phases_of(f"set{k}", found, drawn.stated))
         if (seen := _edges(found, found.state.surface)) is not None:
             edges.append(seen)
@@ -302,7 +302,7 @@ def bench(seed: int) -> dict[str, Any]:
     }
     try:
         solution, true_um = calibrated(drawn, seed)
-        findings = verdict.after(solution)
+        findings = verdict.check_solution(solution)
     except (ValueError, RejectedSetError) as error:
         return answer | {"refused": str(error)}
     if fatal := [finding.says for finding in findings if finding.fatal]:
@@ -330,7 +330,7 @@ def _still(solution: Solution, index: int) -> SetPhases:
         phases.subset(phases.seen_with(0)),
         pose_derivatives(solution.problem.stated, solution.values),
     )
-    parts = chunks(solution.bench, turns, phases, state.surface, state.vertex_z_mm)
+    parts = linearise_points(solution.bench, turns, phases, state.surface, state.vertex_z_mm)
     by_motion = np.concatenate([part.derivatives[:, MOTION] for part in parts], axis=1)
     return replace(phases, screen_mm=phases.screen_mm - state.motion_mm * by_motion)
 

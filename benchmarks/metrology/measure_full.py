@@ -11,7 +11,7 @@ import numpy as np
 
 from membrane_ctrl.config.schema import OpticsConfig
 from membrane_ctrl.metrology.figure.pixel_figure import FullResult, measure_pixels, reconstruct_full
-from membrane_ctrl.metrology.frame_checks.set_check import check
+from membrane_ctrl.metrology.frame_checks.set_check import check_set
 from membrane_ctrl.metrology.phase.frame_stack import FrameStack
 from membrane_ctrl.sim.optics.camera import OpticsRenderer
 from membrane_ctrl.sim.optics.film_shape import typical_film
@@ -65,7 +65,7 @@ def _measured(shrink: int) -> tuple[FullResult, float, float]:
 
 
 def _measure(stack: FrameStack, optics: OpticsConfig) -> FullResult:
-    checked = check(stack, optics)
+    checked = check_set(stack, optics)
     return reconstruct_full(optics, checked, measure_pixels(optics, checked))
 
 

@@ -16,7 +16,7 @@ from membrane_ctrl.config.schema import OpticsConfig
 from membrane_ctrl.measure.measurement import Figures
 from membrane_ctrl.metrology.rays.surface import PARAMETERS, Surface
 from membrane_ctrl.metrology.tracking.crossed_scene import CrossedScene
-from membrane_ctrl.metrology.tracking.scene_from_reference import scene_of
+from membrane_ctrl.metrology.tracking.scene_from_reference import make_scene
 from membrane_ctrl.metrology.tracking.tracker import Tracker
 from membrane_ctrl.model.arrays import FloatArray
 from membrane_ctrl.model.zernike_terms import ZERNIKE_TERMS
@@ -37,7 +37,7 @@ def run() -> list[Figure]:
     with tempfile.TemporaryDirectory() as folder:
         simulate_set(Path(folder) / "full", SimulationSpec(OPTICS, FILM))
         reference = Figures().of(Path(folder) / "full")
-    scene = scene_of(reference.head.optics, reference.checked, reference.figure, 12.455)
+    scene = make_scene(reference.head.optics, reference.checked, reference.figure, 12.455)
     camera = OPTICS.camera
     tracker = Tracker(scene, (camera.height_px, camera.width_px), 255, camera.noise_adu)
     renderer = OpticsRenderer(OPTICS, FILM, seed=2)

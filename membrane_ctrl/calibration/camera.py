@@ -25,7 +25,7 @@ from membrane_ctrl.metrology.calibration.board import Board, on_screen
 from membrane_ctrl.metrology.calibration.board_lens import BoardView, Lens, calibrate_lens
 from membrane_ctrl.metrology.figure import bin_figure
 from membrane_ctrl.metrology.frame_checks.checked_set import RejectedSetError
-from membrane_ctrl.metrology.frame_checks.set_check import check
+from membrane_ctrl.metrology.frame_checks.set_check import check_set
 from membrane_ctrl.metrology.phase.screen_scale import mm_per_rad
 from membrane_ctrl.metrology.rays import ray_tracing
 from membrane_ctrl.metrology.rays.bench_parameters import usual_sigma
@@ -252,7 +252,7 @@ def _rim(capture: capture_set.CaptureSet) -> tuple[ray_tracing.HeightFunction, f
     """
     optics = capture.head.optics
     try:
-        checked = check(measurement.stack_of(capture), optics)
+        checked = check_set(measurement.stack_of(capture), optics)
     except RejectedSetError as error:
         raise errors.RejectedError(f"{capture.head.folder}: rejected: {error}") from None
     surface, vertex_mm = (

@@ -113,7 +113,7 @@ def _sets(solution: solver.Solution) -> list[dict[str, Any]]:
             solution.problem.sets,
             solution.states,
             solution.equations,
-            model_tests.left_out(solution),
+            model_tests.compare_left_out_sets(solution),
             strict=True,
         )
     ]

@@ -149,11 +149,11 @@ def calibrate_command(options: CalibrateOptions) -> int:
     bundle = with_priors(read_sets(options.folders, options.geometry, options.reference_um), priors)
     read = time.perf_counter()
     problem = problem_of(bundle, free, options)
-    findings, solution = verdict.before(problem), None
+    findings, solution = verdict.check_before_solving(problem), None
     if not findings:
         try:
             solution = solve(problem, _progress())
-            findings = _judged(verdict.after(solution), bundle)
+            findings = _judged(verdict.check_solution(solution), bundle)
         except ValueError as error:
             findings = (verdict.CalibrationFinding(True, str(error)),)
     timing = {"read": read - begin, "solve": time.perf_counter() - read}
@@ -286,7 +286,7 @@ def phases_of_screen(capture: CaptureSet) -> set_phases.SetPhases:
     binned = bin_frames(stack, 2**head.optics.camera.bits - 1)
     pattern, geometry = head.optics.pattern, Geometry.from_config(head.optics)
     try:
-        view = bin_view.look(stack, binned, set(stack.unusable))
+        view = bin_view.combine_frames(stack, binned, set(stack.unusable))
         phase_rad = absolute_phases(stack, binned, view, pattern)
         index = np.flatnonzero(np.isfinite(phase_rad).all(axis=0))
         grid, screen_mm = (

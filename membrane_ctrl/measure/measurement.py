@@ -13,7 +13,7 @@ from membrane_ctrl.metrology.figure.pixel_figure import FullResult, measure_pixe
 from membrane_ctrl.metrology.frame_checks import frame_faults
 from membrane_ctrl.metrology.frame_checks.checked_set import Anchor, Checked, RejectedSetError
 from membrane_ctrl.metrology.frame_checks.multi_frequency import check_frequencies
-from membrane_ctrl.metrology.frame_checks.set_check import check
+from membrane_ctrl.metrology.frame_checks.set_check import check_set
 from membrane_ctrl.metrology.phase import frame_stack
 from membrane_ctrl.metrology.rays.artefacts import Artefact
 from membrane_ctrl.metrology.uncertainty.trial_bench import TrialBench
@@ -132,7 +132,7 @@ def checked_set(capture: CaptureSet, anchor: Anchor | None) -> Checked:
     return (
         check_frequencies(stack, optics)
         if capture.head.kind == "frequencies"
-        else check(stack, optics, anchor)
+        else check_set(stack, optics, anchor)
     )
 
 

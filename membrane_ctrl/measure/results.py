@@ -100,7 +100,7 @@ def error_bars(
         )
     )
     try:
-        seen = set_budget.examine(optics, checked, full, spread, noise_adu, outline)
+        seen = set_budget.assemble_budget(optics, checked, full, spread, noise_adu, outline)
     except ArithmeticError:
         raise errors.InputError(
             f"{source}: too wide: the figure does not follow from such a geometry"

@@ -25,8 +25,8 @@ from membrane_ctrl.measure.measurement import Figures, SetFigure
 from membrane_ctrl.measure.results import write_arrays, write_figure
 from membrane_ctrl.metrology.figure.bin_figure import BinFigure
 from membrane_ctrl.metrology.figure.pixel_figure import measure_pixels, reconstruct_full
-from membrane_ctrl.metrology.tracking.scene_from_reference import scene_of
-from membrane_ctrl.metrology.tracking.step_solution import ENOUGH_STEPS, separable
+from membrane_ctrl.metrology.tracking.scene_from_reference import make_scene
+from membrane_ctrl.metrology.tracking.step_solution import ENOUGH_STEPS, are_steps_separable
 from membrane_ctrl.metrology.tracking.tracked_frame import TrackedFrame, rejected_frame
 from membrane_ctrl.metrology.tracking.tracker import Tracker
 from membrane_ctrl.model import errors, files, program, terminal
@@ -122,7 +122,7 @@ def track_set(folder: Path, geometry: GeometryFile | None = None) -> Track:
     crossed, optics = content.pattern.crossed, reference.head.optics
     size = (optics.camera.height_px, optics.camera.width_px)
     try:
-        scene = scene_of(
+        scene = make_scene(
             optics, reference.checked, _measured(reference), crossed.period_mm, crossed.contrast
         )
         tracker = Tracker(
@@ -143,7 +143,9 @@ def track_set(folder: Path, geometry: GeometryFile | None = None) -> Track:
         [math.nan if row.displacement_um is None else row.displacement_um for row in content.frames]
     )
     found: list[TrackedFrame] = []
-    first = list(islice(pictures, ENOUGH_STEPS if separable(shifts[:ENOUGH_STEPS]) else 0))
+    first = list(
+        islice(pictures, ENOUGH_STEPS if are_steps_separable(shifts[:ENOUGH_STEPS]) else 0)
+    )
     good = [picture for picture in first if not isinstance(picture, str)]
     if stepped := bool(good) and len(good) == len(first):
         part = slice(0, ENOUGH_STEPS)

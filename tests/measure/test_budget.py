@@ -22,7 +22,7 @@ from membrane_ctrl.config.optics import (
 )
 from membrane_ctrl.geometry.spread_file import spread_of
 from membrane_ctrl.metrology.figure.pixel_figure import measure_pixels, reconstruct_full
-from membrane_ctrl.metrology.frame_checks.set_check import check
+from membrane_ctrl.metrology.frame_checks.set_check import check_set
 from membrane_ctrl.metrology.phase.frame_stack import FrameStack
 from membrane_ctrl.metrology.rays.bench_parameters import NAMES
 from membrane_ctrl.metrology.rays.bench_poses import bench_at
@@ -32,7 +32,7 @@ from membrane_ctrl.metrology.rays.rim_outline import find_outline
 from membrane_ctrl.metrology.reconstruction.surface_fit import solve
 from membrane_ctrl.metrology.uncertainty.budget import Budget, Source
 from membrane_ctrl.metrology.uncertainty.height_map import height_matrix
-from membrane_ctrl.metrology.uncertainty.set_budget import Examined, examine
+from membrane_ctrl.metrology.uncertainty.set_budget import SetBudget, assemble_budget
 from membrane_ctrl.model.zernike_terms import ZERNIKE_TERMS
 from membrane_ctrl.sim.optics.camera import OpticsRenderer
 from membrane_ctrl.sim.optics.film_shape import FilmShape, typical_film
@@ -58,7 +58,7 @@ class Outcome:
 
     height_um: float
     sag_um: float
-    examined: Examined
+    examined: SetBudget
 
     @property
     def stated(self) -> dict[str, float]:
@@ -112,7 +112,7 @@ def measured(
     if blur_px:
         frames = np.stack([cv2.GaussianBlur(frame, (0, 0), blur_px) for frame in frames])
     readings: NDArray[np.float64] = np.full(len(shown), np.nan if y_moved_um is not None else 0.0)
-    checked = check(FrameStack(frames, tuple(shown), readings, {}), STATED)
+    checked = check_set(FrameStack(frames, tuple(shown), readings, {}), STATED)
     full = reconstruct_full(STATED, checked, measure_pixels(STATED, checked))
     light = (
         checked.binned.means[[k for used in checked.view.used for k in used]]
@@ -124,7 +124,7 @@ def measured(
     angle = np.linspace(0, 2 * np.pi, 72, endpoint=False)
     rim = 500 * np.cos(angle), 500 * np.sin(angle)
     sag_um = 1e3 * float(np.mean(full.surface.height(*rim) - film.height_mm(*rim, 0.0)))
-    examined = examine(STATED, checked, full, spread_of(STATED, None)[0], 0.5, outline)
+    examined = assemble_budget(STATED, checked, full, spread_of(STATED, None)[0], 0.5, outline)
     return Outcome(float(np.sqrt(np.mean(error_um**2))), sag_um, examined)
 
 

@@ -22,8 +22,8 @@ from membrane_ctrl.metrology.numerics import zernike
 from membrane_ctrl.metrology.rays.surface import Surface, sag_gradient
 from membrane_ctrl.metrology.tracking.crossed_scene import CrossedScene
 from membrane_ctrl.metrology.tracking.frame_fit import FrameFit, FrameFitter
-from membrane_ctrl.metrology.tracking.scene_from_reference import scene_of
-from membrane_ctrl.metrology.tracking.step_solution import _split, stepped
+from membrane_ctrl.metrology.tracking.scene_from_reference import make_scene
+from membrane_ctrl.metrology.tracking.step_solution import _split, solve_steps
 from membrane_ctrl.metrology.tracking.tracker import Tracker
 from membrane_ctrl.model.zernike_terms import NOLL_INDICES, ZERNIKE_TERMS
 from tests.studies.tracked_errors import (
@@ -229,7 +229,9 @@ def still(tmp_path_factory: pytest.TempPathFactory) -> Still:
     folder = tmp_path_factory.mktemp("still") / "full"
     CrossedWorld(seed=1, **SIZE | CLEAN).write_reference(folder)  # type: ignore[arg-type]
     reference = Figures().of(folder)
-    scene = scene_of(reference.head.optics, reference.checked, reference.figure, SIDE_MM / CROSSED)
+    scene = make_scene(
+        reference.head.optics, reference.checked, reference.figure, SIDE_MM / CROSSED
+    )
     none = np.zeros(scene.index.size, np.float32)
     start = FrameFit(scene.surface, np.zeros((3, ZERNIKE_TERMS)), none, none, True)
     everything = np.full(scene.index.size, 1e6)
@@ -277,7 +279,7 @@ def test_steps_in_light_that_wanders_give_their_own_frames_again(still: Still) -
         fits.append(
             replace(still.fitter.fit(picture, shown, free, reach), surface=still.scene.surface)
         )
-    renewed, moved_mm, _ = stepped(still.fitter, fits, np.stack(seen), np.array(shifts))
+    renewed, moved_mm, _ = solve_steps(still.fitter, fits, np.stack(seen), np.array(shifts))
     assert 0.005 < np.mean((renewed.edge == 0) & (renewed.taper > 0)) < 0.5
     at = Surface.from_parameters(still.scene.surface.parameters + moved_mm, RADIUS_MM)
     off_um = []
@@ -501,7 +503,7 @@ def test_jumps_lose_no_order_silently(
     still.write_reference(tmp_path / "full")
     reference = Figures().of(tmp_path / "full")
     optics = reference.head.optics
-    scene = scene_of(optics, reference.checked, reference.figure, SIDE_MM / CROSSED)
+    scene = make_scene(optics, reference.checked, reference.figure, SIDE_MM / CROSSED)
     tracker = Tracker(scene, (205, 245), 255, optics.camera.noise_adu)
     first = tracker.follow(still.crossed(0.0), (0.0, 0.0), 0.0)
     random, seen, wrong = np.random.default_rng(8), Counter[str](), []

@@ -9,12 +9,12 @@ from membrane_ctrl.config.optics import (
 )
 from membrane_ctrl.geometry.spread_file import spread_of
 from membrane_ctrl.metrology.figure.pixel_figure import FullResult, measure_pixels, reconstruct_full
-from membrane_ctrl.metrology.frame_checks.set_check import check
+from membrane_ctrl.metrology.frame_checks.set_check import check_set
 from membrane_ctrl.metrology.phase.frame_stack import FrameStack
 from membrane_ctrl.metrology.rays.rim_outline import find_outline
 from membrane_ctrl.metrology.rays.surface import parameter_to_coeffs, sag_gradient
 from membrane_ctrl.metrology.uncertainty.height_map import height_matrix
-from membrane_ctrl.metrology.uncertainty.set_budget import Examined, examine
+from membrane_ctrl.metrology.uncertainty.set_budget import SetBudget, assemble_budget
 from membrane_ctrl.model.shape_estimate import judge
 from membrane_ctrl.sim.optics.film_shape import FilmShape
 from tests.worlds.misstated_bench import (
@@ -24,16 +24,16 @@ from tests.worlds.misstated_bench import (
 TERMS = range(3, 11)  # Noll 4..11
 
 
-def measured(stack: FrameStack, stated: OpticsConfig) -> tuple[FullResult, Examined, str]:
+def measured(stack: FrameStack, stated: OpticsConfig) -> tuple[FullResult, SetBudget, str]:
     """As `measure` does. Raises RejectedSetError."""
-    checked = check(stack, stated)
+    checked = check_set(stack, stated)
     full = reconstruct_full(stated, checked, measure_pixels(stated, checked))
     used = [k for axis in checked.view.used for k in axis]
     light = checked.binned.means[used].mean(axis=0).astype(float)
     outline = find_outline(
         light, checked.tracer.geometry, 500.0, checked.tracer.vertex_z_mm + full.surface.sag_mm
     )
-    examined = examine(stated, checked, full, spread_of(stated, None)[0], 0.5, outline)
+    examined = assemble_budget(stated, checked, full, spread_of(stated, None)[0], 0.5, outline)
     verdict = judge(full.quality)[0]
     if verdict == "ok" and (checked.flags or examined.doubts):
         verdict = "degraded"

@@ -24,7 +24,7 @@ from membrane_ctrl.measure.measure import (
     open_file,
 )
 from membrane_ctrl.metrology.phase.phase_steps import phasors
-from membrane_ctrl.metrology.phase.temporal_unwrap import Unwrapped, unwrap
+from membrane_ctrl.metrology.phase.temporal_unwrap import Unwrapped, unwrap_in_time
 from membrane_ctrl.metrology.rays.geometry import Geometry
 from membrane_ctrl.metrology.rays.screen_face import Face
 from tests.support.facet import Sight
@@ -295,7 +295,10 @@ def decode(
 ) -> Decoded:
     """Screen positions of the pixels in `mask`, in reading order."""
     along_x, along_y = wrapped_phases(measurement, mask, response)
-    return Decoded(unwrap(along_x, measurement.periods_x), unwrap(along_y, measurement.periods_y))
+    return Decoded(
+        unwrap_in_time(along_x, measurement.periods_x),
+        unwrap_in_time(along_y, measurement.periods_y),
+    )
 
 
 def sight(

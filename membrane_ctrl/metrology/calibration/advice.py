@@ -5,7 +5,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from membrane_ctrl.metrology.calibration.figure_uncertainty import sag_um, surface_covariance
-from membrane_ctrl.metrology.calibration.solver import Solution, step
+from membrane_ctrl.metrology.calibration.solver import Solution, solve_step
 from membrane_ctrl.metrology.rays import bench_parameters
 
 _BETTER = 5.0  # times: what another instrument may give
@@ -31,7 +31,9 @@ def number_advice(solution: Solution, index: int) -> Advice | None:
     for k in np.flatnonzero(own > 0):
         better = own.copy()
         better[k] /= _BETTER
-        moved = replace(solution, covariance=step(sums + solution.known(better), better).covariance)
+        moved = replace(
+            solution, covariance=solve_step(sums + solution.known(better), better).covariance
+        )
         found.append(
             Advice(
                 bench_parameters.NAMES[k],

@@ -66,7 +66,7 @@ def artefact_advice(solution: Solution, index: int) -> ArtefactAdvice | None:
         seen, screen_mm=seen.screen_mm - forward_model.residual_mm(bench, seen, shape, 0.0)
     )
     more = foreseen_equations(
-        solution, seen, set_state.SetState(shape, 0.0), robust_weights.Trust.full(seen)
+        solution, seen, set_state.SetState(shape, 0.0), robust_weights.RobustWeights.full(seen)
     )
     then = with_equations(solution, (*solution.equations, more))
     then_um, now_um = (sag_um(surface_covariance(each, index)) for each in (then, solution))

@@ -11,7 +11,7 @@ import numpy as np
 
 from membrane_ctrl.metrology.calibration.solver import Solution
 from membrane_ctrl.metrology.rays import bench_poses, forward_model
-from membrane_ctrl.metrology.rays.disc_heights import disc, without_plane
+from membrane_ctrl.metrology.rays.disc_heights import heights_over_disc, remove_plane
 from membrane_ctrl.metrology.rays.surface import (
     PARAMETERS,
     parameter_to_coeffs,
@@ -51,8 +51,8 @@ def surface_covariance(solution: Solution, index: int) -> FloatArray:
 def propagate(solution: Solution, index: int, analysis_radius_mm: float) -> Propagated:
     """Propagate to the quantities of a figure like that of one set."""
     covariance = surface_covariance(solution, index)
-    heights, plane = disc(analysis_radius_mm / solution.problem.radius_mm)
-    flat = without_plane(heights, plane)
+    heights, plane = heights_over_disc(analysis_radius_mm / solution.problem.radius_mm)
+    flat = remove_plane(heights, plane)
     to_coeffs = parameter_to_coeffs()
     return Propagated(
         height_rms_um=_rms_um(heights, covariance),

@@ -9,7 +9,7 @@ from dataclasses import replace
 import numpy as np
 
 from membrane_ctrl.metrology.calibration import normal_equations, robust_weights, set_state
-from membrane_ctrl.metrology.calibration.solver import Solution, step
+from membrane_ctrl.metrology.calibration.solver import Solution, solve_step
 from membrane_ctrl.metrology.rays import bench_poses, forward_model, set_phases
 from membrane_ctrl.model.arrays import FloatArray
 
@@ -34,11 +34,11 @@ def foreseen_equations(
     solution: Solution,
     phases: set_phases.SetPhases,
     state: set_state.SetState,
-    trust: robust_weights.Trust,
+    trust: robust_weights.RobustWeights,
 ) -> normal_equations.Equations:
     turns = bench_poses.pose_derivatives(solution.problem.stated, solution.values)
     references = solution.problem.references
-    return normal_equations.equations(
+    return normal_equations.linearise_set(
         solution.bench, turns, phases, state, solution.common, references, trust
     )
 
@@ -48,5 +48,5 @@ def with_equations(solution: Solution, linear: tuple[normal_equations.Equations,
     return replace(
         solution,
         equations=linear,
-        covariance=step(sums + solution.known(sigmas), sigmas).covariance,
+        covariance=solve_step(sums + solution.known(sigmas), sigmas).covariance,
     )

@@ -8,7 +8,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from membrane_ctrl.metrology.calibration.robust_weights import Trust, across_px
+from membrane_ctrl.metrology.calibration.robust_weights import RobustWeights, across_px
 from membrane_ctrl.metrology.calibration.set_state import SetState
 from membrane_ctrl.metrology.rays import bench_poses, forward_model, set_phases
 from membrane_ctrl.model.arrays import FloatArray
@@ -22,7 +22,7 @@ _WAVES_SEEN, _OUTSTANDING = (
 )  # of a point's noise, and of the usual set's: smaller ones are part of the scatter
 
 
-def without_waves(
+def remove_fringe_waves(
     bench: bench_poses.BenchGeometry,
     sets: Sequence[set_phases.SetPhases],
     states: Sequence[SetState],
@@ -55,7 +55,7 @@ def _waves_mm(
         bench, phases, state.surface, state.vertex_z_mm, state.elsewhere
     )
     root, turn = (
-        np.sqrt(Trust.seen(phases, left).weights) / phases.sigma_mm,
+        np.sqrt(RobustWeights.seen(phases, left).weights) / phases.sigma_mm,
         2 * np.pi / phases.period_mm,
     )
     for there in range(1 if phases.screen is None else len(phases.elsewhere) + 1):

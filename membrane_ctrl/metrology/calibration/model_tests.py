@@ -111,13 +111,13 @@ class LeftOut:
         return bool(chi2.sf(self.fall, self.freedom) < SURE)
 
 
-def suspects(solution: solver.Solution) -> tuple[Suspect, ...]:
+def find_suspects(solution: solver.Solution) -> tuple[Suspect, ...]:
     """Held optical parameters that would remove more than noise from the residuals, the strongest
     first.
     """
     sums = np.sum(_reduced(solution), axis=0)
     response = figure_uncertainty.surface_response(solution, solution.problem.middle)[:, :-1]
-    flat = disc_heights.without_plane(*disc_heights.disc(1.0))
+    flat = disc_heights.remove_plane(*disc_heights.heights_over_disc(1.0))
     out = []
     for name in bench_parameters.NAMES[len(bench_parameters.POSE) : bench_poses.OPTICAL]:
         if name in solution.free:
@@ -125,7 +125,7 @@ def suspects(solution: solver.Solution) -> tuple[Suspect, ...]:
         k = bench_parameters.NAMES.index(name)
         freed = solution.problem.sigmas.copy()
         freed[k] = bench_parameters.usual_sigma(name)
-        moved = solver.step(sums + solution.known(freed), freed)
+        moved = solver.solve_step(sums + solution.known(freed), freed)
         fall = _squares(sums, solution) - moved.squares
         sigma = float(np.sqrt(moved.covariance[k, k]))
         figure_um = 1e3 * float(np.std(flat @ (response @ moved.delta[: bench_poses.OPTICAL])))
@@ -139,23 +139,23 @@ def laser_scale(solution: solver.Solution) -> LaserScale:
     free = solution.problem.sigmas.copy()
     free[k] = _LASER_SIGMA
     sums = np.sum(_reduced(solution), axis=0)
-    moved = solver.step(sums + solution.known(free), free)
+    moved = solver.solve_step(sums + solution.known(free), free)
     fall = _squares(sums, solution) - moved.squares
     return LaserScale(
         1 + float(solution.common[k] + moved.delta[k]), float(np.sqrt(moved.covariance[k, k])), fall
     )
 
 
-def left_out(solution: solver.Solution) -> tuple[LeftOut, ...]:
+def compare_left_out_sets(solution: solver.Solution) -> tuple[LeftOut, ...]:
     """Each set against the others."""
     reduced, sigmas = _reduced(solution), solution.problem.sigmas
     own = solution.known(sigmas)
-    everything = solver.step(np.sum(reduced, axis=0) + own, sigmas).squares
+    everything = solver.solve_step(np.sum(reduced, axis=0) + own, sigmas).squares
     out = []
     for k, this in enumerate(reduced):
         others = np.sum([r for j, r in enumerate(reduced) if j != k], axis=0) + own
         alone, freedom = _alone(this, sigmas)
-        fall = everything - solver.step(others, sigmas).squares - alone
+        fall = everything - solver.solve_step(others, sigmas).squares - alone
         out.append(LeftOut(k, float(fall), freedom))
     return tuple(out)
 
@@ -179,9 +179,9 @@ def elsewhere(solution: solver.Solution) -> list[tuple[int, float]]:
             hand = np.hstack([np.eye(moved.size), (told - move[moved])[:, None]]) / sigmas[:, None]
             own, without_hand = np.append(moved, len(sums) - 1), sums.copy()
             without_hand[np.ix_(own, own)] -= hand.T @ hand
-            free += normal_equations.without(
+            free += normal_equations.eliminate_first(
                 without_hand, set_phases.MOVED
-            ) - normal_equations.without(sums, set_phases.MOVED)
+            ) - normal_equations.eliminate_first(sums, set_phases.MOVED)
         others = [*reduced[:k], replace(each, sums=free).reduced(), *reduced[k + 1 :]]
         fall = everything - _squares(np.sum(others, axis=0), solution)
         if chi2.sf(fall, moved.size) < SURE:
@@ -189,7 +189,7 @@ def elsewhere(solution: solver.Solution) -> list[tuple[int, float]]:
     return out
 
 
-def bumps(solution: solver.Solution) -> tuple[CameraBump, ...]:
+def find_camera_bumps(solution: solver.Solution) -> tuple[CameraBump, ...]:
     """Turns of the camera for one set, or from one set on; only sure ones, the strongest first."""
     count = len(solution.states)
     groups = {(k,) for k in range(count)} | {tuple(range(k, count)) for k in range(1, count)}
@@ -204,7 +204,7 @@ def bumps(solution: solver.Solution) -> tuple[CameraBump, ...]:
     return tuple(sorted((bump for bump in out if bump.sure), key=lambda bump: -bump.fall))
 
 
-def creep(solution: solver.Solution) -> MountCreep | None:
+def find_mount_creep(solution: solver.Solution) -> MountCreep | None:
     """Whether camera or screen crept from the first set to the last, and what changed most; None if
     not sure.
     """
@@ -245,7 +245,7 @@ def _moved_by(
     ) - squares
 
 
-def without(solution: solver.Solution, index: int) -> solver.Solution:
+def leave_set_out(solution: solver.Solution, index: int) -> solver.Solution:
     """The solution without one set, to first order: its equations and state are left out, the
     unknowns moved.
     """
@@ -253,7 +253,7 @@ def without(solution: solver.Solution, index: int) -> solver.Solution:
     problem = replace(solution.problem, sets=tuple(solution.problem.sets[k] for k in keep))
     linear = tuple(solution.equations[k] for k in keep)
     sigmas = problem.sigmas
-    moved = solver.step(
+    moved = solver.solve_step(
         np.sum([each.reduced() for each in linear], axis=0) + solution.known(sigmas), sigmas
     )
     common = solution.common + moved.delta
@@ -289,7 +289,7 @@ def film_rise(solution: solver.Solution, film: set_state.FilmModel) -> float:
 
 def _squares(sums: FloatArray, solution: solver.Solution) -> float:
     sigmas = solution.problem.sigmas
-    return solver.step(sums + solution.known(sigmas), sigmas).squares
+    return solver.solve_step(sums + solution.known(sigmas), sigmas).squares
 
 
 def _alone(reduced: FloatArray, sigmas: FloatArray) -> tuple[float, int]:

@@ -17,7 +17,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from membrane_ctrl.metrology.calibration.reference_rows import reference_rows
-from membrane_ctrl.metrology.calibration.robust_weights import Trust
+from membrane_ctrl.metrology.calibration.robust_weights import RobustWeights
 from membrane_ctrl.metrology.calibration.set_state import COMMON, References, SetState
 from membrane_ctrl.metrology.rays import bench_poses, forward_model, set_phases
 from membrane_ctrl.model.arrays import FloatArray
@@ -31,7 +31,7 @@ class Equations:
     # one more column: normal matrix, right side and sum of squares in one
     sums: FloatArray
     residual_mm: FloatArray  # (2, n): seen minus predicted screen points
-    trust: Trust  # the points' weights
+    trust: RobustWeights  # the points' weights
     residual_rms_mm: float  # RMS of one component, each point counting by its weight
     # of each screen elsewhere, (MOVED + LOCAL + COMMON + 1, squared): its own unknowns first, which
     # `sums` eliminates
@@ -59,34 +59,36 @@ class Equations:
 
     def reduced(self) -> FloatArray:
         """Schur complement over the set's own unknowns, (COMMON + 1, squared)."""
-        return without(self.sums, forward_model.LOCAL)
+        return eliminate_first(self.sums, forward_model.LOCAL)
 
 
-def without(sums: FloatArray, first: int) -> FloatArray:
+def eliminate_first(sums: FloatArray, first: int) -> FloatArray:
     """Schur complement over the first unknowns."""
     mixed = sums[:first, first:]
     left = sums[first:, first:] - mixed.T @ np.linalg.solve(sums[:first, :first], mixed)
     return np.asarray((left + left.T) / 2)
 
 
-def equations(
+def linearise_set(
     bench: bench_poses.BenchGeometry,
     turns: list[bench_poses.Poses],
     phases: set_phases.SetPhases,
     state: SetState,
     common: FloatArray,
     references: References,
-    trust: Trust,
+    trust: RobustWeights,
 ) -> Equations:
     """Linearise one set; `common` (COMMON,) are parameters and ring."""
     root = np.sqrt(trust.weights / trust.variance) / phases.sigma_mm
     residual, elsewhere = np.empty_like(phases.screen_mm), []
     rows = reference_rows(phases, state, common, references)
     sums = rows.T @ rows
-    for k, there, poses, some in forward_model.views(bench, turns, phases, state.elsewhere):
+    for k, there, poses, some in forward_model.screen_views(bench, turns, phases, state.elsewhere):
         move = state.elsewhere[k - 1] if k else np.array([0.0, state.motion_mm])
         seen, film_mm = phases.subset(some), (move[-1], move[-2])
-        parts = forward_model.chunks(there, poses, seen, state.surface, state.vertex_z_mm, *film_mm)
+        parts = forward_model.linearise_points(
+            there, poses, seen, state.surface, state.vertex_z_mm, *film_mm
+        )
         found, residual[:, some] = _fringes(parts, root[some], k > 0)
         if k:
             told, sigmas = phases.elsewhere[k - 1].known(references.laser_sigma_um)
@@ -94,7 +96,7 @@ def equations(
             own = np.append(np.arange(set_phases.MOVED), len(found) - 1)
             found[np.ix_(own, own)] += hand.T @ hand
             elsewhere.append(found)
-            found = without(found, set_phases.MOVED)
+            found = eliminate_first(found, set_phases.MOVED)
         sums = sums + found
     weights = trust.weights / phases.sigma_mm**2
     rms = float(np.sqrt(np.mean(residual**2 @ weights) / np.sum(weights)))
@@ -118,7 +120,7 @@ def _fringes(
             derivatives[:, forward_model.MOTION] = 0.0  # its own
             columns = [
                 derivatives[:, forward_model.COLUMNS :],
-                forward_model.deeper(motion)[:, None],
+                forward_model.depth_derivative(motion)[:, None],
                 motion[:, None],
             ]
             derivatives = np.concatenate(

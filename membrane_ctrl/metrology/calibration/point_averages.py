@@ -9,12 +9,12 @@ from dataclasses import replace
 
 import numpy as np
 
-from membrane_ctrl.metrology.calibration.robust_weights import Trust
+from membrane_ctrl.metrology.calibration.robust_weights import RobustWeights
 from membrane_ctrl.metrology.calibration.set_state import SetState
 from membrane_ctrl.metrology.rays import bench_poses, forward_model, set_phases
 
 
-def averaged(
+def average_points(
     bench: bench_poses.BenchGeometry,
     phases: set_phases.SetPhases,
     state: SetState,
@@ -23,7 +23,7 @@ def averaged(
     """The set reduced to about that many points; robust, each with the noise of its mean."""
     shape = state.surface, state.vertex_z_mm, state.elsewhere
     left = forward_model.residual_mm(bench, phases, *shape)
-    weights = Trust.seen(phases, left).weights / phases.sigma_mm**2
+    weights = RobustWeights.seen(phases, left).weights / phases.sigma_mm**2
     width, height = np.ptp(phases.column_px), np.ptp(phases.row_px)
     cell_px = max(
         float(np.sqrt(width * height * np.pi / 4 / about)), 1.0

@@ -87,7 +87,7 @@ def _artefact_rows(artefact: Artefact, state: SetState) -> FloatArray:
     # the tilt at the vertex is the surface's own, and its form follows: 5 µm of coma for a
     # milliradian
     leans = (
-        np.stack([part[:, 0] for part in surface_basis.basis(origin, origin)[1:]])
+        np.stack([part[:, 0] for part in surface_basis.evaluate_basis(origin, origin)[1:]])
         / surface.radius_mm
     )
     tilt = leans @ surface.parameters

@@ -17,7 +17,7 @@ _HUBER = 1.9
 
 
 @dataclass(frozen=True)
-class Trust:
+class RobustWeights:
     """Robust weights (n,) of points, 1 for a good one, and their variance over the expected one."""
 
     weights: FloatArray
@@ -25,12 +25,12 @@ class Trust:
     alike: float = 1.0  # part of the variance from residuals that neighbours share: a pattern
 
     @classmethod
-    def full(cls, phases: set_phases.SetPhases) -> "Trust":
+    def full(cls, phases: set_phases.SetPhases) -> "RobustWeights":
         """Every point with the weight of its noise."""
         return cls(np.ones(phases.sigma_mm.size), 1.0)
 
     @classmethod
-    def seen(cls, phases: set_phases.SetPhases, residual_mm: FloatArray) -> "Trust":
+    def seen(cls, phases: set_phases.SetPhases, residual_mm: FloatArray) -> "RobustWeights":
         """From residuals (2, n): Huber's weights against their own scatter."""
         length = np.hypot(*residual_mm) / phases.sigma_mm
         # the median of a Rayleigh distribution is 1.177 sigma; less noise than the camera must have
@@ -39,10 +39,12 @@ class Trust:
         return cls(_HUBER / np.maximum(length / np.sqrt(variance), _HUBER), variance)
 
 
-def less_trust(
-    sets: Sequence[set_phases.SetPhases], left_mm: Sequence[FloatArray], trust: Sequence[Trust]
-) -> tuple[Trust, ...]:
-    """Trust in the points of all sets, from their residuals (2, n) at a solution.
+def reduce_weights(
+    sets: Sequence[set_phases.SetPhases],
+    left_mm: Sequence[FloatArray],
+    trust: Sequence[RobustWeights],
+) -> tuple[RobustWeights, ...]:
+    """Robust weights of the points of all sets, from their residuals (2, n) at a solution.
 
     What a film has beyond the model is alike in neighbouring points, and in all sets: it does not
     average out as noise does. So the means over patches of the picture are compared with what
@@ -74,7 +76,7 @@ def across_px(phases: set_phases.SetPhases) -> float:
 
 
 def _patch_means(
-    phases: set_phases.SetPhases, left_mm: FloatArray, trust: Trust, side_px: float
+    phases: set_phases.SetPhases, left_mm: FloatArray, trust: RobustWeights, side_px: float
 ) -> FloatArray:
     """Residuals' means over patches in units of their noise, (2, patches, patches); NaN with few
     points.

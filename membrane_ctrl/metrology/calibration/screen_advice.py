@@ -93,7 +93,9 @@ def _with_screens(solution: Solution, index: int, half_mm: FloatArray) -> tuple[
         )
         phases = replace(film, artefact=SeenScreen(distance_mm * middle, facing.T))
         seen = foreseen_set(solution, phases, state, half_mm)
-        more.append(foreseen_equations(solution, seen, state, robust_weights.Trust.full(seen)))
+        more.append(
+            foreseen_equations(solution, seen, state, robust_weights.RobustWeights.full(seen))
+        )
     return with_equations(solution, (*solution.equations, *more)), distance_mm
 
 

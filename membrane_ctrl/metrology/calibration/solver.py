@@ -125,7 +125,7 @@ class SolverStep:
     squares: float
 
 
-def step(sums: FloatArray, sigmas: FloatArray) -> SolverStep:
+def solve_step(sums: FloatArray, sigmas: FloatArray) -> SolverStep:
     """Solve for the free unknowns. `sums` (COMMON + 1, squared) hold the sets and the prior."""
     free = np.flatnonzero(
         np.append(sigmas > 0, np.ones(set_state.COMMON - len(bench_parameters.NAMES), bool))
@@ -170,11 +170,11 @@ def _solve(
         start = _solve(some, progress, None)
         if not start.converged:
             return start  # means about a diverged bench would be meaningless
-        clean = fringe_waves.without_waves(start.bench, problem.sets, start.states)
+        clean = fringe_waves.remove_fringe_waves(start.bench, problem.sets, start.states)
         pairs = zip(clean, start.states, strict=True)
         problem = replace(
             problem,
-            sets=tuple(point_averages.averaged(start.bench, *pair, _FEW) for pair in pairs),
+            sets=tuple(point_averages.average_points(start.bench, *pair, _FEW) for pair in pairs),
         )
     states = start.states if start is not None else first_states(problem)
     # the parameters as stated, and the ring as the first surfaces have it
@@ -184,7 +184,7 @@ def _solve(
         if start is not None
         else np.append(np.zeros(len(bench_parameters.NAMES)), ring)
     )
-    trust = tuple(robust_weights.Trust.full(phases) for phases in problem.sets)
+    trust = tuple(robust_weights.RobustWeights.full(phases) for phases in problem.sets)
     free = problem.sigmas > 0
     changes: list[float] = []
     # the step before was the first with new weights; they stay; a solution was near
@@ -201,7 +201,7 @@ def _solve(
             + prior(problem.sigmas, common)
             + at_rim
         )
-        moved = step(sums, problem.sigmas)
+        moved = solve_step(sums, problem.sigmas)
         sigmas = np.sqrt(np.diag(moved.covariance))
         if not (np.isfinite(moved.delta).all() and np.isfinite(sigmas).all()):
             raise ValueError("the calibration diverges: the sets do not show the stated bench")
@@ -216,7 +216,7 @@ def _solve(
             # not before: far from the solution a wrong bench looks like a film, and both would be
             # believed in turn
             trust, final, settled = (
-                robust_weights.less_trust(problem.sets, left, trust),
+                robust_weights.reduce_weights(problem.sets, left, trust),
                 True,
                 False,
             )
@@ -250,7 +250,8 @@ def _solve(
         weighed = not final and (changes[-1] < _NEARLY or (far > _FURTHEST and not near))
         if weighed:
             trust = tuple(
-                robust_weights.Trust.seen(*pair) for pair in zip(problem.sets, left, strict=True)
+                robust_weights.RobustWeights.seen(*pair)
+                for pair in zip(problem.sets, left, strict=True)
             )
 
 
@@ -258,7 +259,7 @@ def _linearise(
     problem: Problem,
     states: Sequence[set_state.SetState],
     common: FloatArray,
-    trust: Sequence[robust_weights.Trust],
+    trust: Sequence[robust_weights.RobustWeights],
 ) -> tuple[normal_equations.Equations, ...]:
     values = common[: len(bench_parameters.NAMES)]
     bench, turns = (
@@ -266,7 +267,7 @@ def _linearise(
         bench_poses.pose_derivatives(problem.stated, values),
     )
     return tuple(
-        normal_equations.equations(
+        normal_equations.linearise_set(
             bench, turns, phases, state, common, problem.references, believed
         )
         for phases, state, believed in zip(problem.sets, states, trust, strict=True)

@@ -37,7 +37,7 @@ class CalibrationFinding:
     sets: tuple[int, ...] = ()  # sets it is about; empty for all of them
 
 
-def before(problem: Problem) -> tuple[CalibrationFinding, ...]:
+def check_before_solving(problem: Problem) -> tuple[CalibrationFinding, ...]:
     """Findings without solving: sets too close together, a laser with another scale or sign."""
     states = first_states(problem)
     moved = np.array([problem.sets[k].displacement_um for k in problem.films])
@@ -72,7 +72,7 @@ def before(problem: Problem) -> tuple[CalibrationFinding, ...]:
     return ()
 
 
-def after(solution: Solution) -> tuple[CalibrationFinding, ...]:
+def check_solution(solution: Solution) -> tuple[CalibrationFinding, ...]:
     """Findings from the solution about sets and model.
 
     One error makes many things look wrong. Of all explanations, the one that removes most from the
@@ -111,7 +111,7 @@ def _of_still_sets(solution: Solution, finding: CalibrationFinding) -> Calibrati
     causes, rest = [], solution
     if len(solution.problem.films) - len(moved) > 1:
         for k in reversed(moved):
-            rest = model_tests.without(rest, k)
+            rest = model_tests.leave_set_out(rest, k)
         causes = [*_sets(rest), *_laser(rest), *_model(rest)]
     if causes:
         return replace(max(causes, key=lambda each: each[0])[1], sets=())
@@ -161,7 +161,7 @@ def _sets(solution: Solution) -> list[tuple[float, CalibrationFinding]]:
         )
         for k in _of_others(solution)[:1]
     ]
-    for bump in model_tests.bumps(solution)[:1]:
+    for bump in model_tests.find_camera_bumps(solution)[:1]:
         yaw, pitch, roll = bump.turned_deg
         where = (
             f"in {names[bump.sets[0]]}" if len(bump.sets) == 1 else f"from {names[bump.sets[0]]} on"
@@ -171,7 +171,7 @@ def _sets(solution: Solution) -> list[tuple[float, CalibrationFinding]]:
             "degrees"
         )
         out.append((bump.fall - 2 * 3, CalibrationFinding(True, says, bump.sets)))
-    if (crept := model_tests.creep(solution)) is not None:
+    if (crept := model_tests.find_mount_creep(solution)) is not None:
         parameter = bench_parameters.ALL[bench_parameters.NAMES.index(crept.name)]
         says = (
             f"camera or screen crept from {names[0]} to {names[-1]}, as if by "
@@ -179,12 +179,14 @@ def _sets(solution: Solution) -> list[tuple[float, CalibrationFinding]]:
             f"of {crept.name} ({parameter.says}): let the mounts settle, and take the sets anew"
         )
         out.append((crept.fall - 2 * crept.freedom, CalibrationFinding(True, says)))
-    worst = max(model_tests.left_out(solution), key=lambda each: each.fall)
+    worst = max(model_tests.compare_left_out_sets(solution), key=lambda each: each.fall)
     if worst.disagrees:
         explained = worst.fall - 2 * worst.freedom
         if len(names) > 2 and not any(
             each.disagrees
-            for each in model_tests.left_out(model_tests.without(solution, worst.index))
+            for each in model_tests.compare_left_out_sets(
+                model_tests.leave_set_out(solution, worst.index)
+            )
         ):
             says = (
                 f"{names[worst.index]} disagrees with all the others: {_why(solution, worst.index)}"
@@ -247,12 +249,14 @@ def _agree(problem: Problem) -> bool:
         solution = solve(few)
     except ValueError:
         return False
-    return solution.converged and not any(each.disagrees for each in model_tests.left_out(solution))
+    return solution.converged and not any(
+        each.disagrees for each in model_tests.compare_left_out_sets(solution)
+    )
 
 
 def _why(solution: Solution, index: int) -> str:
     """Whether it is one set's laser reading that is wrong, or its fringes."""
-    rest, phases = model_tests.without(solution, index), solution.problem.sets[index]
+    rest, phases = model_tests.leave_set_out(solution, index), solution.problem.sets[index]
     if phases.artefact is not None:
         return phases.artefact.doubt
     rim_mm = set_state.rim_of(replace(solution.states[index], vertex_z_mm=0.0))[0]
@@ -287,7 +291,7 @@ def _laser(solution: Solution) -> list[tuple[float, CalibrationFinding]]:
 
 
 def _model(solution: Solution) -> list[tuple[float, CalibrationFinding]]:
-    found = model_tests.suspects(solution)
+    found = model_tests.find_suspects(solution)
     if not found:
         return []
     first, *others = found

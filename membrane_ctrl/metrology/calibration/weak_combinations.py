@@ -13,7 +13,7 @@ import numpy as np
 from membrane_ctrl.metrology.calibration.figure_uncertainty import surface_response
 from membrane_ctrl.metrology.calibration.solver import Solution
 from membrane_ctrl.metrology.rays import bench_parameters, bench_poses, surface_basis
-from membrane_ctrl.metrology.rays.disc_heights import disc, without_plane
+from membrane_ctrl.metrology.rays.disc_heights import heights_over_disc, remove_plane
 from membrane_ctrl.model.arrays import FloatArray, IntArray
 
 WEAK = 0.5  # of the hand's sigma: the sets have not even doubled the knowledge
@@ -85,9 +85,9 @@ def _described(
 ) -> Combination:
     optical = free < bench_poses.OPTICAL
     change = surface_response(solution, index)[:, free[optical]] @ amounts[optical]
-    heights, plane = disc(radius_mm / solution.problem.radius_mm)
+    heights, plane = heights_over_disc(radius_mm / solution.problem.radius_mm)
     moved_um = 1e3 * heights @ change
-    figure_um = without_plane(moved_um, plane)
+    figure_um = remove_plane(moved_um, plane)
     height, figure = (float(np.sqrt(np.mean(part**2))) for part in (moved_um, figure_um))
     named = [
         (bench_parameters.ALL[bench_parameters.NAMES.index(name)], amount) for name, amount in parts
@@ -114,7 +114,7 @@ def _effect(
         return f"a tilt of the surface by {np.hypot(*slope):.2g} µm at the rim{kept}"
     x, y = plane[:, 1], plane[:, 2]
     surface = solution.states[index].surface.parameters
-    height, by_x, by_y = (part.T @ surface for part in surface_basis.basis(x, y))
+    height, by_x, by_y = (part.T @ surface for part in surface_basis.evaluate_basis(x, y))
     for name, field in (
         ("a scale of the surface", height),
         ("a turn about z", x * by_y - y * by_x),

@@ -151,7 +151,7 @@ class LiveReconstructor:
         self._tracked = None  # until this cycle is accepted
         tracer, analysis_mm = self._tracer(readings), optics.mirror.analysis_radius_mm
         try:
-            state = tracked_points.establish(
+            state = tracked_points.select_points(
                 self._grid, tracer, self._near, phase_rad, optics.pattern, analysis_mm
             )
         except ValueError as error:
@@ -271,10 +271,10 @@ class LiveReconstructor:
             (len(slots), self._optics.camera.height_px, 0), np.uint8
         )  # the bins are enough
         stack = FrameStack(none, self._patterns, np.full(len(slots), math.nan), {})
-        stack, binned, found = band_removal.without_bands(stack, binned, known)
+        stack, binned, found = band_removal.remove_bands(stack, binned, known)
         self._bands_rad, self._doubt = (
             found if not known.size else known,
-            band_removal.doubt(stack.gain),
+            band_removal.describe_bands(stack.gain),
         )
         if known.size and not found.size:
             self._doubt = (
@@ -302,7 +302,7 @@ class LiveReconstructor:
                     self._weights[axis], self._shifts_rad[axis], self._bin_px, part
                 )
             )
-        phase_change.track(
+        phase_change.update_phases(
             self._sums(),
             state.index,
             combined,

@@ -43,7 +43,7 @@ def bin_figure(optics: OpticsConfig, checked: Checked, film: FilmMotion | None =
     followed = np.empty_like(state.accepted)
     # the loop takes any numbers: here means over the bins, hence a bin side of 1 in the
     # combinations
-    phase_change.track(
+    phase_change.update_phases(
         sums, state.index, steps, state.sensitivity_rad_per_um, state.accepted, followed
     )
     scale = screen_scale.mm_per_rad(optics.pattern)

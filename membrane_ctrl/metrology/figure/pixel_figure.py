@@ -224,7 +224,7 @@ def reconstruct_full(
         swing_adu=pixels.swing_adu,
         rest_adu=pixels.rest_adu,
         grid=grid,
-        residual_mm=zonal_map.integrate(grid),
+        residual_mm=zonal_map.integrate_residual(grid),
         quality=set_quality(optics, checked, fit, float(np.median(pixels.swing_adu))),
         moved=pixels.moved,
     )

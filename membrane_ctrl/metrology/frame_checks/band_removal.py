@@ -131,7 +131,7 @@ class _Steps:
         return self.unexplained
 
 
-def without_bands(
+def remove_bands(
     stack: FrameStack, binned: Binned, known: FloatArray = _NONE
 ) -> tuple[FrameStack, Binned, FloatArray]:
     """A set with the gain of its rows known, its bins without bands, and the bands' frequencies,
@@ -164,7 +164,7 @@ def without_bands(
     return replace(stack, gain=gain), replace(binned, means=means), found
 
 
-def doubt(gain: FloatArray | None) -> str:
+def describe_bands(gain: FloatArray | None) -> str:
     """Why a set with such gains (frames, rows) is degraded; empty if it is not."""
     most = 0.0 if gain is None else float(np.abs(gain - 1).max())
     return f"bands of {most:.0%} of the light along the rows: expose for whole backlight pulses" * (

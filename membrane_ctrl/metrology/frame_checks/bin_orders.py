@@ -8,7 +8,7 @@ from membrane_ctrl.config.schema import OpticsConfig, PatternConfig
 from membrane_ctrl.metrology.frame_checks import bin_view, frame_faults
 from membrane_ctrl.metrology.frame_checks.checked_set import Anchor, RejectedSetError
 from membrane_ctrl.metrology.phase import frame_stack
-from membrane_ctrl.metrology.phase.fringe_orders import orders
+from membrane_ctrl.metrology.phase.fringe_orders import resolve_orders
 from membrane_ctrl.metrology.phase.gray_code import gray_bit
 from membrane_ctrl.metrology.phase.pattern_sequence import AXES
 from membrane_ctrl.metrology.phase.screen_scale import inside_pattern
@@ -46,7 +46,7 @@ def absolute_phases(
     for k, axis in enumerate(AXES):
         # the fringes' mean is half the light, which no single frame can spoil
         bits = binned.means[stack.gray(axis)] > view.light
-        phase = orders(view.phase_rad[k], bits, view.mask).phase_rad
+        phase = resolve_orders(view.phase_rad[k], bits, view.mask).phase_rad
         out[k] = np.where(inside_pattern(phase, pattern), phase, np.nan)
     return out
 

@@ -35,7 +35,7 @@ class BinView:
     mask: BoolArray  # bins that see the pattern in the mirror
 
 
-def look(
+def combine_frames(
     stack: FrameStack, binned: Binned, excluded: Collection[int], estimate: FloatArray | None = None
 ) -> BinView:
     """Combine the frames that are not excluded.

@@ -47,7 +47,7 @@ class Checked:
                 "degraded",
                 f"{len(self.flags)} frame(s) flagged; the figure excludes the affected data",
             )
-        doubt = band_removal.doubt(self.stack.gain)
+        doubt = band_removal.describe_bands(self.stack.gain)
         return ("degraded", doubt) if doubt else ("ok", "")
 
     def places_px(self, index: IntArray) -> FloatArray:

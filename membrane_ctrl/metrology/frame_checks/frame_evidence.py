@@ -53,7 +53,7 @@ class SampledBins:
 
 
 @dataclass(frozen=True)
-class Evidence:
+class FrameEvidence:
     """One frame; units of light are those of `SampledBins.light`."""
 
     level: float  # m of a sinusoid, hi of a Gray frame, the level of white and black
@@ -69,9 +69,9 @@ class Evidence:
     lit: float = 1.0
 
 
-def gather(
+def measure_frames(
     stack: FrameStack, binned: Binned, scene: SampledBins, readable: list[int]
-) -> dict[int, Evidence]:
+) -> dict[int, FrameEvidence]:
     """Evidence of all readable frames."""
     scene = scene.thinned()
     readings = np.nan_to_num(stack.displacement_um - np.nan_to_num(stack.mean_reading_um))
@@ -87,7 +87,7 @@ def gather(
     return out
 
 
-def light_and_film(
+def estimate_light_and_film(
     stack: FrameStack,
     binned: Binned,
     scene: SampledBins,
@@ -192,19 +192,21 @@ def _solve(
 
 def _evidence(
     seen: FloatArray, template: _Template, light: FloatArray, saturated: float, shows: int
-) -> Evidence:
+) -> FrameEvidence:
     solved, sigma, rest = _solve(seen, template, light)
     if template.role == "sin":
         swing = float(np.hypot(solved[1], solved[2]))
         step = float(np.arctan2(solved[2], solved[1]))
         moved_um, sigma_um = (float(each[3]) / max(swing, 1e-9) for each in (solved, sigma))
-        return Evidence(float(solved[0]), swing, step, moved_um, sigma_um, rest, saturated, shows)
+        return FrameEvidence(
+            float(solved[0]), swing, step, moved_um, sigma_um, rest, saturated, shows
+        )
     if template.role == "gray":
         lit = float(np.mean(template.columns[1][template.sure]))
-        return Evidence(
+        return FrameEvidence(
             float(solved.sum()), float(solved[1]), 0.0, 0.0, 0.0, rest, saturated, shows, lit
         )
-    return Evidence(float(solved[0]), 0.0, 0.0, 0.0, 0.0, rest, saturated, shows)
+    return FrameEvidence(float(solved[0]), 0.0, 0.0, 0.0, 0.0, rest, saturated, shows)
 
 
 def _best(

@@ -9,7 +9,7 @@ from collections.abc import Collection
 
 import numpy as np
 
-from membrane_ctrl.metrology.frame_checks.frame_evidence import Evidence
+from membrane_ctrl.metrology.frame_checks.frame_evidence import FrameEvidence
 from membrane_ctrl.metrology.frame_checks.frame_faults import Flag, FrameDefect
 from membrane_ctrl.metrology.phase.frame_stack import Binned, FrameStack
 from membrane_ctrl.metrology.phase.pattern_sequence import AXES
@@ -39,7 +39,7 @@ _SCATTERS = 6.0  # of the good frames' scatter
 _DARK = 0.4  # less than this share of the light is no flicker
 
 
-def identical_frames(stack: FrameStack) -> dict[int, int]:
+def find_identical_frames(stack: FrameStack) -> dict[int, int]:
     """Frames that are byte for byte an earlier one of the sequence, and which:
     noise never repeats.
     """
@@ -58,7 +58,7 @@ def identical_frames(stack: FrameStack) -> dict[int, int]:
     return out
 
 
-def obvious(stack: FrameStack, binned: Binned) -> list[Flag]:
+def find_obvious_faults(stack: FrameStack, binned: Binned) -> list[Flag]:
     """Sinusoids that are bad without a prediction: far darker than the others, or burnt out."""
     frames = [k for axis in AXES for k in stack.sinusoids(axis) if k not in stack.unusable]
     if not frames:
@@ -79,8 +79,8 @@ def obvious(stack: FrameStack, binned: Binned) -> list[Flag]:
     return flags
 
 
-def inspect(
-    stack: FrameStack, evidence: dict[int, Evidence], excluded: Collection[int]
+def inspect_frames(
+    stack: FrameStack, evidence: dict[int, FrameEvidence], excluded: Collection[int]
 ) -> list[Flag]:
     """Judge all readable frames, worst first.
 
@@ -89,13 +89,13 @@ def inspect(
     """
     trusted = {k: e for k, e in evidence.items() if k not in excluded}
     flags = [*_judge_sinusoids(stack, evidence, trusted), *_judge_gray(stack, evidence, trusted)]
-    twins = identical_frames(stack)
+    twins = find_identical_frames(stack)
     flags = [_named(stack, flag, evidence, twins) for flag in flags]
     return sorted(flags, key=lambda flag: -flag.severity)
 
 
 def _judge_sinusoids(
-    stack: FrameStack, evidence: dict[int, Evidence], trusted: dict[int, Evidence]
+    stack: FrameStack, evidence: dict[int, FrameEvidence], trusted: dict[int, FrameEvidence]
 ) -> list[Flag]:
     """Judge each against the others, itself left out, so that it cannot widen its own limit."""
     flags = []
@@ -111,10 +111,10 @@ def _judge_sinusoids(
 
 def _judge_sinusoid(
     frame: int,
-    e: Evidence,
-    same: list[Evidence],
-    every: list[Evidence],
-    trusted: dict[int, Evidence],
+    e: FrameEvidence,
+    same: list[FrameEvidence],
+    every: list[FrameEvidence],
+    trusted: dict[int, FrameEvidence],
 ) -> list[Flag]:
     """One sinusoid against those of its axis and, for the light, against those of both."""
     step_limit, step = _limit([o.step_rad for o in same], STEP_RAD)
@@ -139,7 +139,7 @@ def _judge_sinusoid(
 
 
 def _sinusoid_defect(
-    kind: str, e: Evidence, level: float, moved_um: float
+    kind: str, e: FrameEvidence, level: float, moved_um: float
 ) -> tuple[FrameDefect, str]:
     light = e.level / max(level, 1e-9)
     if e.saturated > 10 * SATURATED_SHARE or kind == "saturated":
@@ -163,7 +163,7 @@ def _sinusoid_defect(
 
 
 def _judge_gray(
-    stack: FrameStack, evidence: dict[int, Evidence], trusted: dict[int, Evidence]
+    stack: FrameStack, evidence: dict[int, FrameEvidence], trusted: dict[int, FrameEvidence]
 ) -> list[Flag]:
     """Gray frames against each other, white against them, black against white."""
     gray = [k for axis in AXES for k in stack.gray(axis) if k in evidence]
@@ -195,7 +195,7 @@ def _judge_gray(
     return flags
 
 
-def _gray_defect(e: Evidence, bright: float, content: bool) -> tuple[FrameDefect, str]:
+def _gray_defect(e: FrameEvidence, bright: float, content: bool) -> tuple[FrameDefect, str]:
     light = e.level / max(bright, 1e-9)
     if light < _DARK and e.swing < _DARK * bright:
         return FrameDefect.DARK, f"dark: {light:.2f} of the light of the others"
@@ -206,7 +206,7 @@ def _gray_defect(e: Evidence, bright: float, content: bool) -> tuple[FrameDefect
     return defect, f"{defect.name.lower()}: {light:.3f} of the light of the others"
 
 
-def _judge_flat(frame: int, e: Evidence, bright: float, white: bool) -> list[Flag]:
+def _judge_flat(frame: int, e: FrameEvidence, bright: float, white: bool) -> list[Flag]:
     light = e.level / max(bright, 1e-9)
     rest = e.rest / (FLAT_REST * bright)
     off = abs(light - 1) / WHITE_SHARE if white else light / 0.5
@@ -224,7 +224,7 @@ def _judge_flat(frame: int, e: Evidence, bright: float, white: bool) -> list[Fla
 
 
 def _named(
-    stack: FrameStack, flag: Flag, evidence: dict[int, Evidence], twins: dict[int, int]
+    stack: FrameStack, flag: Flag, evidence: dict[int, FrameEvidence], twins: dict[int, int]
 ) -> Flag:
     """Add the frame whose picture it is, if that is known."""
     k = flag.frame

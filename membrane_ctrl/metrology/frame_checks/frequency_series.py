@@ -28,7 +28,7 @@ from membrane_ctrl.metrology.frame_checks.closure import (
     closure_with_phase,
 )
 from membrane_ctrl.metrology.phase.phase_steps import phasors
-from membrane_ctrl.metrology.phase.temporal_unwrap import predicted_phase, unwrap
+from membrane_ctrl.metrology.phase.temporal_unwrap import predict_phase, unwrap_in_time
 from membrane_ctrl.model.arrays import FloatArray
 from membrane_ctrl.model.shape_estimate import Verdict
 
@@ -60,7 +60,7 @@ class AxisSeries:
 
     def inconsistent_share(self) -> float:
         """Share of the pixels whose frequencies disagree."""
-        return float(np.mean(~unwrap(self.phases_rad(), self.periods).consistent))
+        return float(np.mean(~unwrap_in_time(self.phases_rad(), self.periods).consistent))
 
     def with_frames(self, index: int, steps: FloatArray) -> "AxisSeries":
         """The same with other frames of one frequency."""
@@ -203,7 +203,7 @@ def _closures(axis: AxisSeries, index: int) -> tuple[Closure, Closure]:
     amplitude = np.abs(phasors(near, axis.shifts_rad))
     # a finer fringe is blurred: the same all over the picture to a good approximation
     amplitude *= _amplitude(steps, axis.shifts_rad) / max(float(np.median(amplitude)), 1e-9)
-    expected = predicted_phase(axis.phases_rad(), axis.periods, index)
+    expected = predict_phase(axis.phases_rad(), axis.periods, index)
     return (
         closure_with_phase(steps, axis.shifts_rad, expected),
         closure_with_level(steps, axis.shifts_rad, near.mean(axis=0), amplitude),

@@ -17,7 +17,7 @@ from membrane_ctrl.metrology.frame_checks import closure, frame_faults
 from membrane_ctrl.metrology.frame_checks.checked_set import Anchor, Checked, RejectedSetError
 from membrane_ctrl.metrology.frame_checks.frame_faults import Flag, FrameDefect
 from membrane_ctrl.metrology.frame_checks.frequency_series import CLOSURE_SHARE, CLOSURE_TIMES, GAIN
-from membrane_ctrl.metrology.frame_checks.set_check import check
+from membrane_ctrl.metrology.frame_checks.set_check import check_set
 from membrane_ctrl.metrology.phase import (
     fringe_orders,
     full_decoder,
@@ -104,7 +104,7 @@ def check_frequencies(stack: FrameStack, optics: OpticsConfig) -> Checked:
         {k: reason for k, reason in stack.unusable.items() if k < count},
     )
     try:
-        checked = check(fine, optics, Anchor(absolute, light))
+        checked = check_set(fine, optics, Anchor(absolute, light))
     except RejectedSetError as error:
         raise RejectedSetError(str(error), error.flags + named) from None
     return replace(checked, flags=checked.flags + named)
@@ -221,7 +221,7 @@ def _absolute(
     wrapped[mask] = np.angle(finest.phasor)
     coarse = 2 * np.pi * place_mm / finest.period_mm - np.pi
     coded[mask] = wrapped[mask] + 2 * np.pi * np.rint((coarse - wrapped[mask]) / (2 * np.pi))
-    found = fringe_orders.by_votes(np.nan_to_num(wrapped), coded, mask)
+    found = fringe_orders.resolve_orders_by_votes(np.nan_to_num(wrapped), coded, mask)
     if found.torn or not np.mean(np.isfinite(place_mm)) > _LEAST_KNOWN:
         raise RejectedSetError(
             f"the phases of the {pattern_sequence.AXES[axis]} periods do not agree on the fringe "

@@ -48,7 +48,7 @@ _LIGHT_KNOWN = 3e-4  # what another round would change, once it is not even
 _FILM_BESIDE_PLANE_MM = 25.0
 
 
-def check(
+def check_set(
     stack: frame_stack.FrameStack, optics: OpticsConfig, anchor: Anchor | None = None
 ) -> Checked:
     """Check the frames and fit the bins. Raises RejectedSetError if the frames do not give a
@@ -57,7 +57,7 @@ def check(
     `anchor` gives a set without Gray code its fringe orders; `camera.bits` of the optics sets
     saturation.
     """
-    stack, binned, _ = band_removal.without_bands(
+    stack, binned, _ = band_removal.remove_bands(
         stack, frame_stack.bin_frames(stack, 2**optics.camera.bits - 1)
     )
     try:
@@ -153,7 +153,7 @@ def _check(
         frame: frame_faults.flag_unreadable(frame, reason)
         for frame, reason in stack.unusable.items()
     }
-    known |= {flag.frame: flag for flag in frame_inspection.obvious(stack, binned)}
+    known |= {flag.frame: flag for flag in frame_inspection.find_obvious_faults(stack, binned)}
     excluded = set(known)
     flags: list[frame_faults.Flag] = []
     for done in range(rounds + 1):
@@ -162,8 +162,8 @@ def _check(
         except (bin_view.NoFigureError, ValueError) as error:
             raise RejectedSetError(str(error), _merged(_believable(stack, flags), known)) from None
         readable = [k for k in range(len(stack.patterns)) if k not in stack.unusable]
-        seen = frame_evidence.gather(stack, binned, attempt.scene, readable)
-        flags = frame_inspection.inspect(stack, seen, excluded)
+        seen = frame_evidence.measure_frames(stack, binned, attempt.scene, readable)
+        flags = frame_inspection.inspect_frames(stack, seen, excluded)
         fresh = [flag for flag in flags if flag.frame not in excluded]
         if not fresh:
             inner = np.all(
@@ -171,7 +171,7 @@ def _check(
             )
             scene = attempt.scene.part(inner) if np.mean(inner) > 1 / 2 else attempt.scene
             flat = attempt.phase_rad.reshape(2, -1)
-            light, film_um, noise_um = frame_evidence.light_and_film(
+            light, film_um, noise_um = frame_evidence.estimate_light_and_film(
                 stack, binned, scene, attempt.view.used, flat
             )
             left = light - (1.0 if stack.light is None else stack.light)
@@ -246,11 +246,13 @@ def _attempt(
     tracer = ray_tracing.Tracer(
         geometry, optics.mirror.radius_mm, vertex_z_mm(optics, stack.mean_reading_um)
     )
-    view = bin_view.look(stack, binned, excluded, None if anchor is None else anchor.light)
+    view = bin_view.combine_frames(
+        stack, binned, excluded, None if anchor is None else anchor.light
+    )
     phase = absolute_phases_of_bins(stack, binned, view, anchor, optics)
     candidates = np.flatnonzero(near)
     flat = phase.reshape(2, -1)[:, candidates]
-    state = tracked_points.establish(
+    state = tracked_points.select_points(
         grid, tracer, candidates, flat, optics.pattern, optics.mirror.analysis_radius_mm
     )
     predicted = tracer.predict_screen(state.points, state.surface) / mm_per_rad(optics.pattern)

@@ -22,7 +22,7 @@ def _pool() -> ThreadPoolExecutor:
     return ThreadPoolExecutor(WORKERS - 1, thread_name_prefix="metrology")
 
 
-def split(run: Callable[[int, int], T], count: int, fewest: int = 0) -> list[T]:
+def split_over_threads(run: Callable[[int, int], T], count: int, fewest: int = 0) -> list[T]:
     """`run(start, stop)` over [0, count) in WORKERS pieces; results in order. The caller's thread
     takes one.
 

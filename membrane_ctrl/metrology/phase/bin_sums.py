@@ -14,7 +14,7 @@ from collections.abc import Container, Sequence
 import numpy as np
 
 from membrane_ctrl.metrology.numerics.compiled import kernel
-from membrane_ctrl.metrology.numerics.threads import split
+from membrane_ctrl.metrology.numerics.threads import split_over_threads
 from membrane_ctrl.model.arrays import Image
 
 _NEVER = np.uint32(2**32 - 1)  # above any pixel
@@ -157,4 +157,4 @@ class Binner:
                 )
 
         # waking a thread costs more than half a frame
-        split(run, self.sums.shape[1], self._size[0] + 1 if len(frames) == 1 else 0)
+        split_over_threads(run, self.sums.shape[1], self._size[0] + 1 if len(frames) == 1 else 0)

@@ -33,7 +33,7 @@ class Orders:
     torn: bool
 
 
-def orders(wrapped_rad: FloatArray, bits: BoolArray, mask: BoolArray) -> Orders:
+def resolve_orders(wrapped_rad: FloatArray, bits: BoolArray, mask: BoolArray) -> Orders:
     """Absolute phase of one axis.
 
     Parameters
@@ -45,10 +45,12 @@ def orders(wrapped_rad: FloatArray, bits: BoolArray, mask: BoolArray) -> Orders:
     mask : (H, W) bool array
         Pixels that see the pattern.
     """
-    return by_votes(wrapped_rad, absolute_phase(wrapped_rad, *code_orders(bits)), mask)
+    return resolve_orders_by_votes(
+        wrapped_rad, absolute_phase(wrapped_rad, *code_orders(bits)), mask
+    )
 
 
-def by_votes(wrapped_rad: FloatArray, coded: FloatArray, mask: BoolArray) -> Orders:
+def resolve_orders_by_votes(wrapped_rad: FloatArray, coded: FloatArray, mask: BoolArray) -> Orders:
     """As `orders`, from absolute phases (H, W) that each pixel has by itself; NaN where it has
     none.
     """

@@ -7,7 +7,7 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from membrane_ctrl.metrology.numerics.compiled import kernel
-from membrane_ctrl.metrology.numerics.threads import split
+from membrane_ctrl.metrology.numerics.threads import split_over_threads
 from membrane_ctrl.metrology.phase.phasor_kernels import arctan2, still
 from membrane_ctrl.model.arrays import AnyArray, ComplexArray, FloatArray, IntArray
 
@@ -75,7 +75,7 @@ def _track(sums, index, cosine, sine, turn, mirror, slope, last, out, start, sto
             out[0, p] = last[0, p] + out[3, p]
 
 
-def track(
+def update_phases(
     sums: Sequence[AnyArray],
     index: IntArray,
     combined: Sequence[StepCombination],
@@ -107,4 +107,4 @@ def track(
                 sums[k], index, *weights, sensitivity_rad_per_um[k], last[k], out[k], start, stop
             )
 
-    split(run, index.size)
+    split_over_threads(run, index.size)

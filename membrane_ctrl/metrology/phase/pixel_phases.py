@@ -6,7 +6,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from membrane_ctrl.metrology.numerics.compiled import kernel
-from membrane_ctrl.metrology.numerics.threads import split
+from membrane_ctrl.metrology.numerics.threads import split_over_threads
 from membrane_ctrl.metrology.phase.phase_change import StepCombination
 from membrane_ctrl.metrology.phase.phasor_kernels import arctan2, still
 from membrane_ctrl.model.arrays import BoolArray, FloatArray, Image, IntArray, Singles
@@ -113,5 +113,5 @@ def pixel_phases(
             stop,
         )
 
-    split(run, index.size)
+    split_over_threads(run, index.size)
     return PixelPhases(phase, np.abs(out[0]), out[1], np.signbit(out[0]))

@@ -32,7 +32,7 @@ class Unwrapped:
     )
 
 
-def unwrap(wrapped_rad: FloatArray, periods: Sequence[float] | FloatArray) -> Unwrapped:
+def unwrap_in_time(wrapped_rad: FloatArray, periods: Sequence[float] | FloatArray) -> Unwrapped:
     """Unwrap in time. Raises ValueError if the periods are not rising from at most one, or do not
     match the phases.
 
@@ -59,7 +59,7 @@ def unwrap(wrapped_rad: FloatArray, periods: Sequence[float] | FloatArray) -> Un
     return Unwrapped(position, steps, agree)
 
 
-def predicted_phase(
+def predict_phase(
     wrapped_rad: FloatArray, periods: Sequence[float] | FloatArray, index: int
 ) -> FloatArray:
     """Phase that the other frequencies expect of frequency `index`, (...), not wrapped.
@@ -68,4 +68,6 @@ def predicted_phase(
     """
     counts = np.asarray(periods, float)
     keep = np.array([k for k in range(len(counts)) if k != index or k == 0])
-    return np.asarray(2 * math.pi * counts[index] * unwrap(wrapped_rad[keep], counts[keep]).screens)
+    return np.asarray(
+        2 * math.pi * counts[index] * unwrap_in_time(wrapped_rad[keep], counts[keep]).screens
+    )

@@ -6,16 +6,18 @@ from membrane_ctrl.metrology.rays import surface_basis
 from membrane_ctrl.model.arrays import FloatArray
 
 
-def disc(radius: float) -> tuple[FloatArray, FloatArray]:
+def heights_over_disc(radius: float) -> tuple[FloatArray, FloatArray]:
     """Heights (n, parameters) of a surface over a disc of some radii, and the plane's columns (n,
     3).
     """
     x, y = (a.ravel() for a in np.meshgrid(*[np.linspace(-radius, radius, 41)] * 2))
     inside = np.hypot(x, y) <= radius
     x, y = x[inside], y[inside]
-    return np.asarray(surface_basis.basis(x, y)[0].T), np.stack([np.ones_like(x), x, y], axis=1)
+    return np.asarray(surface_basis.evaluate_basis(x, y)[0].T), np.stack(
+        [np.ones_like(x), x, y], axis=1
+    )
 
 
-def without_plane(heights: FloatArray, plane: FloatArray) -> FloatArray:
+def remove_plane(heights: FloatArray, plane: FloatArray) -> FloatArray:
     """Heights (n, ...) less their best plane."""
     return np.asarray(heights - plane @ np.linalg.lstsq(plane, heights, rcond=None)[0])

@@ -44,7 +44,7 @@ from membrane_ctrl.metrology.rays.ray_tracing import Points, Tracer, parabola
 from membrane_ctrl.metrology.rays.screen_face import BOW_RADIUS_MM
 from membrane_ctrl.metrology.rays.set_phases import SetPhases
 from membrane_ctrl.metrology.rays.surface import PARAMETERS, Surface
-from membrane_ctrl.metrology.rays.surface_basis import basis, round_basis
+from membrane_ctrl.metrology.rays.surface_basis import evaluate_basis, evaluate_round_basis
 from membrane_ctrl.model.arrays import BoolArray, FloatArray
 
 # of one set: its surface's parameters, the height of its vertex, its round terms beyond them, and
@@ -95,7 +95,7 @@ def residual_mm(
     moves (MOVED,) of the screen.
     """
     out = np.empty_like(phases.screen_mm)
-    for _, there, _, some in views(bench, [], phases, elsewhere):
+    for _, there, _, some in screen_views(bench, [], phases, elsewhere):
         part = phases.subset(some)
         shape = None if isinstance(phases.artefact, SeenScreen) else surface
         points = place_rays(there, part, surface, vertex_z_mm)
@@ -104,7 +104,7 @@ def residual_mm(
     return out
 
 
-def views(
+def screen_views(
     bench: BenchGeometry, turns: list[Poses], phases: SetPhases, moves: Sequence[FloatArray]
 ) -> Iterator[tuple[int, BenchGeometry, list[Poses], BoolArray]]:
     """Each place of the screen: its number, the bench and its `turns` there, and which points (n,)
@@ -126,7 +126,7 @@ def views(
         yield k, *screen_elsewhere(bench, turns, move[:SCREEN_MOVE]), phases.seen_with(k)
 
 
-def chunks(
+def linearise_points(
     bench: BenchGeometry,
     turns: list[Poses],
     phases: SetPhases,
@@ -149,7 +149,9 @@ def chunks(
         # both are small enough to be linear
         by_motion = derivatives[:, MOTION]
         predicted = (
-            meet.screen_mm / bench.pitch + motion_mm * by_motion + deeper_mm * deeper(by_motion)
+            meet.screen_mm / bench.pitch
+            + motion_mm * by_motion
+            + deeper_mm * depth_derivative(by_motion)
         )
         yield Chunk(part, phases.screen_mm[:, part] - predicted, derivatives)
 
@@ -223,7 +225,7 @@ def _derivatives(
     out[:, COLUMNS - 2] = across * square / onto / BOW_RADIUS_MM**2
     if surface is None:  # by 1 mm of glass over the pixels, which bends rays that lean
         sine = across / np.linalg.norm(m.leaves, axis=0) / _GLASS_INDEX
-        out[:, MOTION] = deeper(sine / np.sqrt(1 - np.sum(sine**2, axis=0))) / 4
+        out[:, MOTION] = depth_derivative(sine / np.sqrt(1 - np.sum(sine**2, axis=0))) / 4
     out /= bench.pitch
     out[:, COLUMNS - 1] = -m.screen_mm / bench.pitch**2
     return out
@@ -253,7 +255,8 @@ def _by_surface(
         1 / surface.radius_mm,
     )
     height, height_x, height_y = (
-        np.vstack(parts) for parts in zip(basis(x, y), round_basis(x, y), strict=True)
+        np.vstack(parts)
+        for parts in zip(evaluate_basis(x, y), evaluate_round_basis(x, y), strict=True)
     )
     for axis in range(2):
         slope = (by_normal[axis, 0] * height_x + by_normal[axis, 1] * height_y) * scale
@@ -265,7 +268,7 @@ def _by_surface(
     return by_pinhole, by_ray
 
 
-def deeper(by_motion: FloatArray) -> FloatArray:
+def depth_derivative(by_motion: FloatArray) -> FloatArray:
     """Change (2, m) of the screen points by 1 mm of depth in all frames, from that by 1 mm from x
     to y.
     """

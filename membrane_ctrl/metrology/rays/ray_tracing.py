@@ -86,7 +86,7 @@ class Tracer:
                 stop,
             )
 
-        threads.split(run, points.t_mm.size, threads.FEW)
+        threads.split_over_threads(run, points.t_mm.size, threads.FEW)
 
     def residual_sums(self, points: Points, surface: Surface, newton: int = 0) -> FloatArray:
         """Moments of the slope residual (see `kernels.residual_sums`), after Newton steps towards
@@ -108,7 +108,9 @@ class Tracer:
             )
             return np.asarray(kernels.residual_sums(*fixed, *shape, start, stop))
 
-        return np.asarray(np.sum(threads.split(run, points.t_mm.size, threads.FEW), axis=0))
+        return np.asarray(
+            np.sum(threads.split_over_threads(run, points.t_mm.size, threads.FEW), axis=0)
+        )
 
     def product_sums(self, points: Points) -> FloatArray:
         """Moments (PRODUCTS,) of the slope basis at the points (see `kernels.product_sums`)."""
@@ -124,7 +126,7 @@ class Tracer:
             )
             return np.asarray(kernels.product_sums(*fixed, start, stop))
 
-        parts = threads.split(run, points.t_mm.size, threads.FEW)
+        parts = threads.split_over_threads(run, points.t_mm.size, threads.FEW)
         return np.asarray(np.sum(parts, axis=0))
 
     def slope_field(self, points: Points, surface: Surface) -> FloatArray:
@@ -143,7 +145,7 @@ class Tracer:
             )
             kernels.slope_field(*fixed, *shape, out, start, stop)
 
-        threads.split(run, points.t_mm.size, threads.FEW)
+        threads.split_over_threads(run, points.t_mm.size, threads.FEW)
         return out
 
     def predict_screen(self, points: Points, surface: Surface) -> FloatArray:
@@ -157,7 +159,7 @@ class Tracer:
             fixed = (points.rays, points.t_mm, self._pinhole, self._plane, self._face)
             kernels.predict_screen(*fixed, *shape, out, start, stop)
 
-        threads.split(run, points.t_mm.size, threads.FEW)
+        threads.split_over_threads(run, points.t_mm.size, threads.FEW)
         return out
 
     def position_mm(self, points: Points) -> FloatArray:

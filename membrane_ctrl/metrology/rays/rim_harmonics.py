@@ -19,7 +19,7 @@ def rim_harmonics() -> FloatArray:
     vertex.
     """
     theta = 2 * np.pi * np.arange(4 * RING) / (4 * RING)
-    heights = surface_basis.basis(np.cos(theta), np.sin(theta))[0]
+    heights = surface_basis.evaluate_basis(np.cos(theta), np.sin(theta))[0]
     orders = np.outer(np.arange(1, ZERNIKE_DEGREE + 1), theta)
     waves = np.vstack([np.full((1, theta.size), 0.5), np.cos(orders), np.sin(orders)])
     return np.asarray(waves @ heights.T * 2 / theta.size)

@@ -11,7 +11,7 @@ from membrane_ctrl.model.arrays import FloatArray
 from membrane_ctrl.model.zernike_terms import ZERNIKE_DEGREE
 
 
-def basis(x: FloatArray, y: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
+def evaluate_basis(x: FloatArray, y: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
     """Heights and slopes (parameters, n) of the surface's parameters in radii, each 0 at the
     vertex.
     """
@@ -29,7 +29,7 @@ def basis(x: FloatArray, y: FloatArray) -> tuple[FloatArray, FloatArray, FloatAr
     )
 
 
-def round_basis(x: FloatArray, y: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
+def evaluate_round_basis(x: FloatArray, y: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
     """Heights and slopes (k, n) of the terms of `film_law.BEYOND` in radii,
     each 0 at the vertex.
     """

@@ -43,7 +43,7 @@ class TrackedPoints:
         self.surface = surface
 
 
-def establish(
+def select_points(
     grid: bin_grid.BinGrid,
     tracer: ray_tracing.Tracer,
     candidates: IntArray,

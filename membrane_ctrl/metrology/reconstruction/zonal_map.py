@@ -13,7 +13,7 @@ import cv2
 import numpy as np
 
 from membrane_ctrl.metrology.numerics.compiled import kernel
-from membrane_ctrl.metrology.numerics.threads import split
+from membrane_ctrl.metrology.numerics.threads import split_over_threads
 from membrane_ctrl.metrology.reconstruction.masked_laplacian import MaskedLaplacian
 from membrane_ctrl.model.arrays import FloatArray
 
@@ -91,7 +91,7 @@ def residual_grid(field: FloatArray, weights: FloatArray, radius_mm: float) -> R
         _scatter(field, weights, axis[0], axis[1] - axis[0], sums, start, stop)
         return sums
 
-    sums, *others = split(run, field.shape[1])
+    sums, *others = split_over_threads(run, field.shape[1])
     for other in others:  # in place: here a measurement takes the most memory
         sums += other
     count, x, y = sums
@@ -99,7 +99,7 @@ def residual_grid(field: FloatArray, weights: FloatArray, radius_mm: float) -> R
     return ResidualGrid(axis, x / safe, y / safe, count)
 
 
-def integrate(grid: ResidualGrid) -> FloatArray:
+def integrate_residual(grid: ResidualGrid) -> FloatArray:
     """Height (n, n) in mm of the residual, 0 at the vertex; NaN where nothing was measured.
 
     Slopes cannot tell the relative height of parts that are not connected (a hair across the

@@ -19,7 +19,7 @@ from membrane_ctrl.metrology.figure import bin_figure
 from membrane_ctrl.metrology.frame_checks import bin_view, set_check
 from membrane_ctrl.metrology.phase import frame_stack, pattern_sequence
 from membrane_ctrl.metrology.reconstruction import slope_noise
-from membrane_ctrl.metrology.tracking.scene_from_reference import scene_of
+from membrane_ctrl.metrology.tracking.scene_from_reference import make_scene
 from membrane_ctrl.metrology.tracking.step_solution import ENOUGH_STEPS
 from membrane_ctrl.metrology.tracking.tracked_frame import TrackedFrame
 from membrane_ctrl.metrology.tracking.tracker import Tracker
@@ -151,9 +151,9 @@ class LiveTracker:
         patterns = tuple(pattern_sequence.full_sequence(optics.pattern))
         pictures: Any = np.asarray(frames)  # of one kind, as the frames are
         stack = frame_stack.FrameStack(pictures, patterns, displacement_um, {})
-        seen = set_check.check(stack, optics)
+        seen = set_check.check_set(stack, optics)
         period_mm = optics.pattern.periods * optics.pattern.period_mm / self.pattern.index
-        scene = scene_of(optics, seen, bin_figure.bin_figure(optics, seen), period_mm)
+        scene = make_scene(optics, seen, bin_figure.bin_figure(optics, seen), period_mm)
         gain = slope_noise.slope_per_screen(
             scene.tracer.geometry, scene.surface.radius_mm, scene.surface.sag_mm
         )

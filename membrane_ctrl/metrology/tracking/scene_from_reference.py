@@ -37,7 +37,7 @@ _USUAL = 0.75  # quantile of the changes of phase, half of which are across the 
 _RIPPLES = 8  # harmonics of the reference's fringes in the mean of its steps
 
 
-def scene_of(
+def make_scene(
     optics: OpticsConfig,
     checked: Checked,
     figure: bin_figure.BinFigure,

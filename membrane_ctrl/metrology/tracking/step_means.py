@@ -63,7 +63,7 @@ class StandingFrames:
         return FrameFit(shape, self._light / self.count, left, weights, True)
 
 
-def steadied(
+def estimate_step_places(
     places_mm: FloatArray, variance_mm2: FloatArray, drifted_mm: FloatArray
 ) -> tuple[FloatArray, FloatArray]:
     """Where the mirror was in each of N steps, (N, parameters) parameters and their variance, from

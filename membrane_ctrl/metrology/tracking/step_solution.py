@@ -24,7 +24,7 @@ _STRAY_SIGMAS = 8.0  # robust ones; phases beyond it are those of dust, and move
 _FITS, _FAILS = 0.95, 0.05
 
 
-def separable(shifts_rad: FloatArray) -> bool:
+def are_steps_separable(shifts_rad: FloatArray) -> bool:
     """Whether steps (N, 2) of x and y separate the two axes."""
     design = _design(np.zeros((2, len(shifts_rad))), np.asarray(shifts_rad).T)
     return len(design) >= ENOUGH_STEPS and bool(np.linalg.cond(design) < 10)
@@ -36,7 +36,7 @@ def _design(phase_rad: FloatArray, shifts_rad: FloatArray) -> FloatArray:
     return np.stack([np.ones_like(x), np.cos(x), -np.sin(x), np.cos(y), -np.sin(y)], axis=-1)
 
 
-def stepped(
+def solve_steps(
     fitter: FrameFitter, fits: list[FrameFit], seen_adu: Singles, shifts_rad: FloatArray
 ) -> tuple[CrossedScene, FloatArray, FloatArray]:
     """The scene as the steps saw it; by how much that moves the surface's parameters (parameters,),

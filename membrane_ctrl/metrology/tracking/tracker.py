@@ -26,7 +26,11 @@ from membrane_ctrl.metrology.tracking import (
 from membrane_ctrl.metrology.tracking.crossed_scene import CrossedScene
 from membrane_ctrl.metrology.tracking.frame_fit import FrameFit, FrameFitter
 from membrane_ctrl.metrology.tracking.frame_verdict import Finding
-from membrane_ctrl.metrology.tracking.step_solution import ENOUGH_STEPS, separable, stepped
+from membrane_ctrl.metrology.tracking.step_solution import (
+    ENOUGH_STEPS,
+    are_steps_separable,
+    solve_steps,
+)
 from membrane_ctrl.metrology.tracking.tracked_frame import TrackedFrame
 from membrane_ctrl.model.arrays import BoolArray, FloatArray, Image, Singles
 from membrane_ctrl.model.zernike_terms import ZERNIKE_TERMS
@@ -163,10 +167,12 @@ class Tracker:
         drifted_mm = np.outer(
             time_s, self._drift_mm_per_s(float(np.mean(time_s)), fitted.mean(axis=0))
         )
-        seen_at, place_mm2 = step_means.steadied(fitted, np.array(variance_mm2), drifted_mm)
+        seen_at, place_mm2 = step_means.estimate_step_places(
+            fitted, np.array(variance_mm2), drifted_mm
+        )
         places = [surface.Surface.from_parameters(place, radius_mm) for place in seen_at]
         fits = [replace(fit, surface=place) for fit, place in zip(fits, places, strict=True)]
-        scene, moved, moved_mm2 = stepped(self._fitter, fits, seen_adu, np.array(shifts_rad))
+        scene, moved, moved_mm2 = solve_steps(self._fitter, fits, seen_adu, np.array(shifts_rad))
         self._mean_place = float(np.mean(time_s)), seen_at.mean(axis=0) + moved
         self._places_mm2 = dict(zip(shifts_rad, place_mm2 + moved_mm2, strict=True))
         self._anchor_light /= float(
@@ -227,7 +233,7 @@ class Tracker:
         errors_mm2 = np.diag(self._fitter.covariance_mm2(last, steps[-1].shifts_rad, noise_adu))
         steps[-1].variance_mm2 = errors_mm2 + self._place_mm2(steps[-1].shifts_rad)
         shown = [step.shifts_rad for step in steps]
-        if separable(np.array(shown)):
+        if are_steps_separable(np.array(shown)):
             fits, variance_mm2 = (
                 [step.fit(radius_mm) for step in steps],
                 [step.variance_mm2 for step in steps],

@@ -121,10 +121,10 @@ def _products(disc: float) -> dict[str, FloatArray]:
     """Means (parameters, parameters) over a disc of products of what two parameters do to sag,
     height and figure.
     """
-    heights, plane = disc_heights.disc(disc)
+    heights, plane = disc_heights.heights_over_disc(disc)
     basis = {
         "height_rms_um": heights,
-        "figure_rms_um": disc_heights.without_plane(heights, plane),
+        "figure_rms_um": disc_heights.remove_plane(heights, plane),
     }
     return {"sag_um": np.outer(sag_gradient(), sag_gradient())} | {
         n: b.T @ b / len(b) for n, b in basis.items()

@@ -34,7 +34,7 @@ from membrane_ctrl.metrology.uncertainty import (
     residual_patches,
     trial_bench,
 )
-from membrane_ctrl.metrology.uncertainty.cycle_frames import FramesSeen, frames_seen
+from membrane_ctrl.metrology.uncertainty.cycle_frames import FrameErrors, estimate_frame_errors
 from membrane_ctrl.model.arrays import AnyArray, FloatArray, IntArray
 
 # Some points determine light and place of a frame to 1e-4 and 20 nm, a tenth of what they leave
@@ -75,7 +75,7 @@ class LiveErrors:
         waves: trial_bench.TrialBench,
         shifts_rad: FloatArray,
         light: FloatArray,
-        seen: FramesSeen,
+        seen: FrameErrors,
         spread: geometry_spread.GeometrySpread | None,
         blur_px: float,
         left: FloatArray,
@@ -104,7 +104,7 @@ class LiveErrors:
             return cls(frames, vertex, none + np.nan, none, none)
         return cls(frames, vertex, here @ here.T + left @ left.T, per_um @ per_um.T, told @ told.T)
 
-    def correction_mm(self, seen: FramesSeen) -> FloatArray:
+    def correction_mm(self, seen: FrameErrors) -> FloatArray:
         """(parameters,) that the errors of the frames added to the parameters."""
         effects = self.frames
         # the phases were corrected for the told motion as if the fringes were pure sinusoids
@@ -117,7 +117,7 @@ class LiveErrors:
         )
 
     def own_mm2(
-        self, seen: FramesSeen, readings_um: FloatArray, laser_noise_um: float, moved_um: float
+        self, seen: FrameErrors, readings_um: FloatArray, laser_noise_um: float, moved_um: float
     ) -> FloatArray:
         """Covariance (parameters, parameters) in mm^2 of what the reference cycle does not share,
         without slopes and pixels.
@@ -253,7 +253,9 @@ class ErrorWatch:
             told_um = np.reshape(cycle.readings_um - np.mean(cycle.readings_um), told_um.shape)
         means = np.stack([sums[:, index] for sums in cycle.sums]) / self._bin_px**2
         sensitivity = state.sensitivity_rad_per_um[:, asked]
-        seen = frames_seen(means, self._shifts_rad, self._weights, phase_rad, told_um, sensitivity)
+        seen = estimate_frame_errors(
+            means, self._shifts_rad, self._weights, phase_rad, told_um, sensitivity
+        )
         if self._errors is None:
             self._errors = self._sensitivities(cycle, asked, seen)
         moved_um = self._moved_um(cycle.readings_um)
@@ -279,7 +281,7 @@ class ErrorWatch:
         self._reference_um = mean_um
         return math.nan
 
-    def _sensitivities(self, cycle: Cycle, asked: IntArray, seen: FramesSeen) -> LiveErrors:
+    def _sensitivities(self, cycle: Cycle, asked: IntArray, seen: FrameErrors) -> LiveErrors:
         tracer, state, fit = cycle.tracer, cycle.state, cycle.fit
         field = tracer.slope_field(state.points, fit.surface)
         reach_mm, slopes = self._optics.mirror.analysis_radius_mm, field[2:4] - field[4:6]
@@ -292,7 +294,7 @@ class ErrorWatch:
         light = np.stack(levels) / self._bin_px**2 / state.fresh[:, 4]
         phases = np.full((2, self._places_px.shape[1]), np.nan)
         phases[:, state.index] = state.fresh[:, 0]
-        blur_px = image_blur.blur_px(
+        blur_px = image_blur.estimate_blur_px(
             phases.reshape(2, *self._shape), 1 / light, state.index, self._bin_px
         )
         places_px, width_px = self._places_px[:, state.index], self._optics.camera.width_px

@@ -11,7 +11,7 @@ _DIFFERS = np.array([1.0, 1.0, 0.0, 1.0, 1.0, 1.0])  # of these columns, all but
 
 
 @dataclass(frozen=True)
-class FramesSeen:
+class FrameErrors:
     """Light and film of the 2 N frames of a cycle, x frames first,
     each about the mean of its axis.
     """
@@ -25,14 +25,14 @@ class FramesSeen:
     waves_rad: FloatArray  # (2, n): what all that adds to the phases of the points
 
 
-def frames_seen(
+def estimate_frame_errors(
     means: FloatArray,
     shifts_rad: FloatArray,
     weights: FloatArray,
     phase_rad: FloatArray,
     told_um: FloatArray,
     sensitivity_rad_per_um: FloatArray,
-) -> FramesSeen:
+) -> FrameErrors:
     """Light and film of each frame from points whose phases are known without any single frame.
 
     Parameters
@@ -90,4 +90,4 @@ def frames_seen(
     about = shown[:3] - means[:3, :, None]
     about[:2] /= means[:2, :, None]
     level, swing, moved_um = about.reshape(3, -1)
-    return FramesSeen(level, swing, told_um.ravel(), moved_um, means[3:].T, np.stack(waves))
+    return FrameErrors(level, swing, told_um.ravel(), moved_um, means[3:].T, np.stack(waves))

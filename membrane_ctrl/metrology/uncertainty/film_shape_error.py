@@ -22,10 +22,10 @@ def _alike() -> FloatArray:
     x, y = (a.ravel() for a in np.meshgrid(*[np.linspace(-1, 1, 41)] * 2))
     inside = np.hypot(x, y) <= 1
     rows, (heights, _, _) = (
-        surface_basis.basis(x[inside], y[inside])[0].T,
-        surface_basis.round_basis(x[inside], y[inside]),
+        surface_basis.evaluate_basis(x[inside], y[inside])[0].T,
+        surface_basis.evaluate_round_basis(x[inside], y[inside]),
     )
-    rim = surface_basis.round_basis(np.ones(1), np.zeros(1))[0]
+    rim = surface_basis.evaluate_round_basis(np.ones(1), np.zeros(1))[0]
     table = np.vstack([rows, _HEAVY * sag_gradient()])
     return np.asarray(np.linalg.lstsq(table, np.vstack([heights.T, _HEAVY * rim.T]), rcond=None)[0])
 
@@ -46,8 +46,8 @@ def law_effect(
     sag.
     """
     x, y = patches.places_mm / radius_mm
-    _, *of = surface_basis.basis(x, y)
-    _, *beyond = surface_basis.round_basis(x, y)
+    _, *of = surface_basis.evaluate_basis(x, y)
+    _, *beyond = surface_basis.evaluate_round_basis(x, y)
     absorbed = (
         inverse
         @ sum((a * patches.count) @ b.T for a, b in zip(of, beyond, strict=True))

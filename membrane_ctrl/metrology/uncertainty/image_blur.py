@@ -28,7 +28,9 @@ def blur_source(bench: TrialBench, sigma_px: float) -> Source:
     return Source("blur_px", "blur of the picture", sigma_px, effect[:, None])
 
 
-def blur_px(phase_rad: FloatArray, contrasts: FloatArray, index: IntArray, bin_px: int) -> float:
+def estimate_blur_px(
+    phase_rad: FloatArray, contrasts: FloatArray, index: IntArray, bin_px: int
+) -> float:
     """Width of the blur, a Gauss's sigma in pixels: the contrast falls with the fringes' frequency.
 
     log(swing / light) = const - sigma^2 |grad phase|^2 / 2, for x and y each with its own constant.

@@ -73,6 +73,6 @@ class Patches:
         The patches are those of the mirror, whatever was seen: two sets of a bench have the same
         ones. `inverse` is that of the fit's normal matrix.
         """
-        _, of_x, of_y = surface_basis.basis(*self.places_mm / radius_mm)
+        _, of_x, of_y = surface_basis.evaluate_basis(*self.places_mm / radius_mm)
         x, y = self.count * self.slopes
         return np.asarray(inverse @ ((of_x * x + of_y * y) / radius_mm))

@@ -23,11 +23,11 @@ from membrane_ctrl.metrology.uncertainty import (
 )
 from membrane_ctrl.metrology.uncertainty.film_shape_error import film_shape_source
 from membrane_ctrl.metrology.uncertainty.geometry_spread import GeometrySpread
-from membrane_ctrl.metrology.uncertainty.image_blur import blur_px
+from membrane_ctrl.metrology.uncertainty.image_blur import estimate_blur_px
 from membrane_ctrl.metrology.uncertainty.laser_errors import vertex_um
 from membrane_ctrl.metrology.uncertainty.rim_check import rim_failed, rim_widening
 from membrane_ctrl.metrology.uncertainty.trial_bench import TrialBench
-from membrane_ctrl.metrology.uncertainty.unseen_motion import unseen_motion
+from membrane_ctrl.metrology.uncertainty.unseen_motion import estimate_unseen_motion
 
 _BLUR_UM = 0.5  # RMS of the height: a picture is out of focus, not only seen through a lens
 # the fringes' error in the film's place at a frame, the share of a motion within an axis that its
@@ -36,21 +36,21 @@ _SEEN_UM, _SEEN_SHARE, _TOLD_SHARE = 0.1, 0.05, 0.02
 
 
 @dataclass(frozen=True)
-class Examined:
+class SetBudget:
     """Budget of a figure, and what makes it doubtful."""
 
     budget: budget.Budget
     doubts: tuple[str, ...]
 
 
-def examine(
+def assemble_budget(
     optics: OpticsConfig,
     checked: Checked,
     full: FullResult,
     spread: GeometrySpread,
     noise_adu: float,
     outline: Outline | None,
-) -> Examined:
+) -> SetBudget:
     """The budget, widened by what the set says of itself. Raises ArithmeticError if the spread is
     too wide.
     """
@@ -95,13 +95,13 @@ def examine(
         ),
         *residual_patches.pixel_sources(full, slope_variance, noise_adu),
     ]
-    return Examined(budget.Budget(tuple(sources), disc), tuple(doubts))
+    return SetBudget(budget.Budget(tuple(sources), disc), tuple(doubts))
 
 
 def _blur_px(checked: Checked) -> float:
     index, light = checked.state.index, checked.view.light.reshape(-1)
     contrasts = checked.view.swing_adu.reshape(2, -1)[:, index] / light[index]
-    return blur_px(checked.phase_rad, contrasts, index, checked.binned.bin_px)
+    return estimate_blur_px(checked.phase_rad, contrasts, index, checked.binned.bin_px)
 
 
 def _vertex(
@@ -138,7 +138,7 @@ def _film(
         )
         says = "motion of the film from x to y, by the laser"
         return [bench_sources.film_source(bench, (sigma_um,), says, paired=False)], []
-    moved = unseen_motion(bench, spread)
+    moved = estimate_unseen_motion(bench, spread)
     says = "motion of the film from x to y, without a laser"
     source = bench_sources.film_source(bench, (moved.moved_um, moved.shared_um), says, paired=True)
     says = "noise of the fringes that show the film's motion from x to y"

@@ -38,7 +38,7 @@ class UnseenMotion:
         return math.sqrt(max(self.sigma_um**2 - self.noise_um**2, 0.0))
 
 
-def unseen_motion(bench: TrialBench, spread: GeometrySpread) -> UnseenMotion:
+def estimate_unseen_motion(bench: TrialBench, spread: GeometrySpread) -> UnseenMotion:
     """Ask the fringes whether the film moved between the x and the y frames.
 
     Slopes in x of one bowl and slopes in y of another do not integrate to a surface. Least squares

@@ -9,15 +9,21 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from membrane_ctrl.metrology.calibration.figure_uncertainty import propagate
-from membrane_ctrl.metrology.calibration.point_averages import averaged
+from membrane_ctrl.metrology.calibration.point_averages import average_points
 from membrane_ctrl.metrology.calibration.rim_equations import Rim
 from membrane_ctrl.metrology.calibration.screen_advice import screen_advice
 from membrane_ctrl.metrology.calibration.screen_pose import screen_seen
 from membrane_ctrl.metrology.calibration.solver import Problem, Solution, solve
-from membrane_ctrl.metrology.calibration.verdict import after
+from membrane_ctrl.metrology.calibration.verdict import check_solution
 from membrane_ctrl.metrology.rays.bench_parameters import NAMES, sigmas, usual_sigma
 from membrane_ctrl.metrology.rays.bench_poses import OPTICAL, bench_at, pose_derivatives
-from membrane_ctrl.metrology.rays.forward_model import COLUMNS, LOCAL, chunks, residual_mm, views
+from membrane_ctrl.metrology.rays.forward_model import (
+    COLUMNS,
+    LOCAL,
+    linearise_points,
+    residual_mm,
+    screen_views,
+)
 from membrane_ctrl.metrology.rays.geometry import project
 from membrane_ctrl.metrology.rays.set_phases import ANYWHERE, Elsewhere, SetPhases
 from membrane_ctrl.metrology.rays.surface import Surface
@@ -133,7 +139,7 @@ def seen_directly(
 
 def assert_true(solution: Solution, values: FloatArray, truth: Truth, index: int) -> None:
     """Nothing is found wrong, the film of 37 mm is within the claim, and so are all parameters."""
-    assert not any(finding.fatal for finding in after(solution))
+    assert not any(finding.fatal for finding in check_solution(solution))
     claim = propagate(solution, index, 475.0)
     only = replace(solution.problem, sets=(solution.problem.sets[index],))
     # `calibration_truth` counts the film of 37 mm as set 2
@@ -214,7 +220,7 @@ def test_a_screen_that_stood_elsewhere_than_stated_is_named() -> None:
     first, second = problem.sets
     moved = with_moved_screen(values, truth, second, 4, off_mm=3.0)
     solution = solve(replace(problem, sets=(seen_directly(values, (0.0, 25.0), 4), first, moved)))
-    (finding,) = (each for each in after(solution) if each.fatal)
+    (finding,) = (each for each in check_solution(solution) if each.fatal)
     assert finding.says.startswith("the screen was not where screen_moved says beside set1")
 
 
@@ -227,7 +233,7 @@ def test_a_screen_seen_through_another_lens_is_named() -> None:
     wrong = seen_directly(other, (-20.0, 10.0), 7, "later")
     says = [
         each.says
-        for each in after(solve(replace(problem, sets=(*known, *problem.sets, wrong))))
+        for each in check_solution(solve(replace(problem, sets=(*known, *problem.sets, wrong))))
         if each.fatal
     ]
     assert says == [
@@ -262,9 +268,11 @@ def test_derivatives_of_moved_and_seen_screens_are_those_of_the_rays() -> None:
     for phases in (film, direct):
         move = np.array([3.0, -2.0, -250.0, 0.7, -1.0, 2.0, 0.0, 0.0])
 
-        places = views(bench_at(STATED, values), pose_derivatives(STATED, values), phases, [move])
+        places = screen_views(
+            bench_at(STATED, values), pose_derivatives(STATED, values), phases, [move]
+        )
         *_, (_, bench, turns, last) = places
-        (chunk,) = chunks(bench, turns, phases.subset(last), surface, 0.1)
+        (chunk,) = linearise_points(bench, turns, phases.subset(last), surface, 0.1)
         for k, step in enumerate(1e-4 * np.eye(6)):
             whole = np.append(step, [0.0, 0.0])
             by = (
@@ -288,7 +296,7 @@ def test_means_of_many_points_keep_the_places_of_the_screen_apart() -> None:
     values, truth, problem = bench_of(6)
     moved = with_moved_screen(values, truth, problem.sets[1], 6)
     solution = solve(replace(problem, sets=(problem.sets[0], moved)))
-    few = averaged(solution.bench, moved, solution.states[1], 300)
+    few = average_points(solution.bench, moved, solution.states[1], 300)
     assert few.screen is not None
     assert 150 < np.count_nonzero(few.screen == 0) < 450
     assert 150 < np.count_nonzero(few.screen == 1) < 450

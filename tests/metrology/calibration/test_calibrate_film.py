@@ -12,10 +12,10 @@ import pytest
 from membrane_ctrl.metrology.calibration.advice import number_advice
 from membrane_ctrl.metrology.calibration.figure_uncertainty import propagate
 from membrane_ctrl.metrology.calibration.rim_equations import Rim
-from membrane_ctrl.metrology.calibration.robust_weights import Trust, less_trust
+from membrane_ctrl.metrology.calibration.robust_weights import RobustWeights, reduce_weights
 from membrane_ctrl.metrology.calibration.set_state import FilmModel
 from membrane_ctrl.metrology.calibration.solver import Solution, solve
-from membrane_ctrl.metrology.calibration.verdict import after
+from membrane_ctrl.metrology.calibration.verdict import check_solution
 from membrane_ctrl.metrology.film.film_law import FilmLaw
 from membrane_ctrl.metrology.film.hencky_bowl import excess_rms
 from membrane_ctrl.metrology.film.terms_beyond_fit import beyond_of
@@ -38,11 +38,11 @@ def solved(truth: Truth, film: FilmModel, rim: Rim | None = None) -> Solution:
 @pytest.mark.campaign
 def test_a_film_that_is_not_henckys_is_refused_and_the_advice_holds() -> None:
     truth = make(VALUES, 4, points=600, prestrain=1e-3, poisson=0.35)
-    (finding,) = after(solved(truth, "hencky"))
+    (finding,) = check_solution(solved(truth, "hencky"))
     assert finding.fatal
     assert finding.says.endswith("use --film free")
     obeyed = solved(truth, "free")
-    assert after(obeyed) == ()
+    assert check_solution(obeyed) == ()
     sag_um, figure_um = calibrated_errors_um(obeyed, truth)
     claim = propagate(obeyed, 2, 475.0)
     assert abs(sag_um) < 3 * claim.sag_um < 20
@@ -71,7 +71,7 @@ def test_the_terms_beyond_follow_the_excess_of_any_film_of_the_law() -> None:
 
 def test_a_mount_that_creeps_is_named() -> None:
     moved = {k: VALUES + 0.1 * k * (np.array(NAMES) == "screen_x_mm") for k in range(len(SAGS_MM))}
-    (finding,) = after(solved(make(VALUES, 5, points=600, bumped=moved), "free"))
+    (finding,) = check_solution(solved(make(VALUES, 5, points=600, bumped=moved), "free"))
     assert finding.fatal
     assert finding.says.startswith("camera or screen crept from set0 to set4")
 
@@ -101,7 +101,7 @@ def test_residuals_that_neighbours_share_lower_the_trust_and_noise_does_not() ->
     pattern = np.sin(column / 90) * np.cos(row / 70)
     for shared, least, most in ((0.0, 1.0, 1.2), (0.8, 1.5, 12.0)):
         left = list(noise + shared * pattern)
-        found = less_trust([phases] * 3, left, [Trust.full(phases)] * 3)
+        found = reduce_weights([phases] * 3, left, [RobustWeights.full(phases)] * 3)
         assert all(least <= trust.variance <= most for trust in found), shared
 
 
@@ -123,5 +123,5 @@ def test_a_film_that_moved_from_the_x_to_the_y_frames_is_found_to_have_moved() -
             replace(both, screen_mm=np.stack([x.screen_mm[0, :size], y.screen_mm[1, :size]]))
         )
     solution = solve(there.problem(SIGMAS, tuple(sets)))
-    assert after(solution) == ()
+    assert check_solution(solution) == ()
     assert [1e3 * state.motion_mm for state in solution.states] == pytest.approx(moved_um, abs=0.3)

@@ -13,9 +13,9 @@ import pytest
 from membrane_ctrl.calibration.sets import known_sigmas
 from membrane_ctrl.config.optics import SigmasConfig
 from membrane_ctrl.metrology.calibration.figure_uncertainty import propagate
-from membrane_ctrl.metrology.calibration.fringe_waves import without_waves
+from membrane_ctrl.metrology.calibration.fringe_waves import remove_fringe_waves
 from membrane_ctrl.metrology.calibration.solver import Solution, solve
-from membrane_ctrl.metrology.calibration.verdict import after
+from membrane_ctrl.metrology.calibration.verdict import check_solution
 from membrane_ctrl.metrology.calibration.weak_combinations import (
     condition_number,
     weak_combinations,
@@ -142,7 +142,7 @@ def test_a_set_whose_light_differed_between_its_frames_is_not_of_another_bench()
     truth = make(drawn(9), seed=9, points=30_000)
     spoilt = with_waves(truth, 6 * float(truth.sets[3].sigma_mm.mean()))
     solution = solve(spoilt.problem(sigmas()))
-    assert not [finding.says for finding in after(solution) if finding.fatal]
+    assert not [finding.says for finding in check_solution(solution) if finding.fatal]
     clean = np.sqrt([each.variance for each in solution.equations])
     assert clean[3] < 2.5 * np.median(clean)  # second order is left
     unknown = solve(
@@ -162,13 +162,13 @@ def test_waves_that_all_sets_have_and_what_is_no_wave_stay() -> None:
         for p, t in zip(sets, turns, strict=True)
     ]
     for some in (sets, alike):
-        kept = without_waves(solution.bench, some, solution.states)
+        kept = remove_fringe_waves(solution.bench, some, solution.states)
         assert all(a.screen_mm is b.screen_mm for a, b in zip(kept, some, strict=True))
     bowl_mm = (
         1e-5 * sets[3].screen_mm * np.hypot(*sets[3].screen_mm)
     )  # as of another bench: 40 sigma
     sets[3] = replace(sets[3], screen_mm=sets[3].screen_mm + bowl_mm)
-    kept = without_waves(solution.bench, sets, solution.states)
+    kept = remove_fringe_waves(solution.bench, sets, solution.states)
     assert np.std(kept[3].screen_mm - truth.sets[3].screen_mm - bowl_mm) < 0.05 * np.std(bowl_mm)
 
 

@@ -14,7 +14,7 @@ from membrane_ctrl.metrology.calibration.artefact_advice import artefact_advice
 from membrane_ctrl.metrology.calibration.figure_uncertainty import propagate
 from membrane_ctrl.metrology.calibration.rim_equations import Rim
 from membrane_ctrl.metrology.calibration.solver import Problem, Solution, solve
-from membrane_ctrl.metrology.calibration.verdict import after, before
+from membrane_ctrl.metrology.calibration.verdict import check_before_solving, check_solution
 from membrane_ctrl.metrology.rays.artefacts import Artefact
 from membrane_ctrl.metrology.rays.bench_parameters import NAMES, sigmas, usual_sigma
 from membrane_ctrl.metrology.rays.bench_poses import bench_at
@@ -94,7 +94,7 @@ def looked_at(
 def with_known(problem: Problem, *known: SetPhases) -> Solution:
     """The solution with artefacts, first in the list."""
     more = replace(problem, sets=(*known, *problem.sets))
-    assert before(more) == ()
+    assert check_before_solving(more) == ()
     return solve(more)
 
 
@@ -131,7 +131,7 @@ def test_the_sphere_that_is_advised_gives_what_was_promised(seed: int) -> None:
     obeyed = with_known(
         problem, looked_at(values, stated, curvature, advice.vertex_sigma_mm * rng.normal(), seed)
     )
-    assert after(obeyed) == ()
+    assert check_solution(obeyed) == ()
     claim = propagate(obeyed, 3, 475.0)
     assert claim.sag_um == pytest.approx(advice.sag_um, rel=0.1)
     sag_um, figure_um = middle_errors_um(obeyed, truth)
@@ -148,7 +148,7 @@ def test_a_sphere_that_is_not_as_stated_is_refused_by_its_name() -> None:
     values = drawn(4)
     _, problem = bench_of(values, 4)
     stated = sphere(200.0, 3400.0, 1e-4, 0.05)
-    (finding,) = after(with_known(problem, looked_at(values, stated, 1 / 3460.0, 0.0, 4)))
+    (finding,) = check_solution(with_known(problem, looked_at(values, stated, 1 / 3460.0, 0.0, 4)))
     assert finding.fatal
     assert finding.says == (
         "known disagrees with all the others: it is not the sphere that its file states, it "
@@ -170,7 +170,7 @@ def test_one_set_of_the_film_is_enough_beside_a_sphere_and_a_flat_is_true_but_ad
     }
     beside = with_known(problem, looked_at(values, flat, 0.0, 0.0, 6))
     claims["flat"] = propagate(beside, 3, 475.0).sag_um
-    assert after(one) == after(beside) == ()
+    assert check_solution(one) == check_solution(beside) == ()
     assert claims["sphere"] < 7
     assert 0.8 * claims["film"] < claims["flat"] < claims["film"]
     assert abs(middle_errors_um(beside, truth)[0]) < 3 * claims["flat"]
@@ -214,5 +214,5 @@ def test_a_sphere_with_the_form_error_that_is_stated_is_believed() -> None:
     seen = np.stack([met.s_x_mm, met.s_y_mm])[:, inside] / bench_at(STATED, values).pitch
     known = SetPhases("known", column[inside], row[inside], seen, sigma, np.nan, artefact=stated)
     solution = with_known(problem, known)
-    assert after(solution) == ()
+    assert check_solution(solution) == ()
     assert abs(middle_errors_um(solution, truth)[0]) < 3 * propagate(solution, 3, 475.0).sag_um < 18

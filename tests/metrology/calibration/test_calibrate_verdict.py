@@ -9,9 +9,17 @@ from functools import cache
 import numpy as np
 import pytest
 
-from membrane_ctrl.metrology.calibration.model_tests import bumps, left_out, suspects
+from membrane_ctrl.metrology.calibration.model_tests import (
+    compare_left_out_sets,
+    find_camera_bumps,
+    find_suspects,
+)
 from membrane_ctrl.metrology.calibration.solver import solve
-from membrane_ctrl.metrology.calibration.verdict import CalibrationFinding, after, before
+from membrane_ctrl.metrology.calibration.verdict import (
+    CalibrationFinding,
+    check_before_solving,
+    check_solution,
+)
 from membrane_ctrl.metrology.cycle.geometry_monitors import CYCLES, DriftMonitor
 from membrane_ctrl.metrology.rays.bench_parameters import NAMES, sigmas
 from membrane_ctrl.metrology.rays.set_phases import SetPhases
@@ -37,7 +45,7 @@ def judged(
     truth: Truth, sets: tuple[SetPhases, ...] | None = None
 ) -> tuple[CalibrationFinding, ...]:
     problem = truth.problem(SIGMAS, sets)
-    return before(problem) or after(solve(problem))
+    return check_before_solving(problem) or check_solution(solve(problem))
 
 
 def edited(edit: Edit, *which: int) -> tuple[SetPhases, ...]:
@@ -54,9 +62,9 @@ ALL_SETS = tuple(range(len(SAGS_MM)))
 def test_good_sets_have_nothing_against_them() -> None:
     assert judged(good()) == ()
     solution = solve(good().problem(SIGMAS))
-    assert suspects(solution) == ()
-    assert bumps(solution) == ()
-    assert all(each.fall < 3 * each.freedom for each in left_out(solution))
+    assert find_suspects(solution) == ()
+    assert find_camera_bumps(solution) == ()
+    assert all(each.fall < 3 * each.freedom for each in compare_left_out_sets(solution))
 
 
 @pytest.mark.parametrize(
@@ -117,7 +125,7 @@ def test_without_a_laser_fringes_and_ring_say_it() -> None:
     silent = edited(reading(lambda d: float("nan")), 1, 2, 3, 4)
     held = good().problem(sigmas({"laser_relative": 0.0}), silent)
     solution = solve(held)
-    (finding,) = before(held) or after(solution)
+    (finding,) = check_before_solving(held) or check_solution(solution)
     assert not finding.fatal
     assert "the sag rests on fringes and ring alone" in finding.says
     error = (solution.values - VALUES)[:11] / solution.sigmas[:11]
@@ -179,7 +187,7 @@ def test_a_bow_is_told_by_its_pattern() -> None:
     assert "the pattern of bow_mm = " in finding.says
     assert "--free bow_mm" in finding.says
     solution = solve(bent.problem(SIGMAS))
-    assert suspects(solution)[0].value == pytest.approx(1.0, abs=0.15)
+    assert find_suspects(solution)[0].value == pytest.approx(1.0, abs=0.15)
     # a tenth of a hundredth is seen by nobody
     assert judged(make(VALUES, 3, points=600, bow_mm=0.001)) == ()
 

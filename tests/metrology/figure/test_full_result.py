@@ -17,7 +17,7 @@ from membrane_ctrl.metrology.figure.pixel_figure import (
     tukey,
 )
 from membrane_ctrl.metrology.figure.set_motion import FilmMotion
-from membrane_ctrl.metrology.frame_checks.set_check import check
+from membrane_ctrl.metrology.frame_checks.set_check import check_set
 from membrane_ctrl.metrology.phase.frame_stack import FrameStack
 from membrane_ctrl.metrology.rays.ray_tracing import HeightFunction, parabola
 from membrane_ctrl.metrology.rays.surface import Surface
@@ -37,7 +37,7 @@ def measured(
     stack: FrameStack, optics: OpticsConfig, start: HeightFunction | None = None
 ) -> FullResult:
     """Frames to the full result."""
-    checked = check(stack, optics)
+    checked = check_set(stack, optics)
     return reconstruct_full(optics, checked, measure_pixels(optics, checked), start)
 
 
@@ -55,7 +55,7 @@ def map_error_um(result: FullResult, film: FilmShape) -> np.ndarray:
 
 def exact_pixels(film: FilmShape, optics: OpticsConfig) -> FullResult:
     """The full result from exact screen points instead of frames."""
-    checked = check(good_set(optics, film), optics)
+    checked = check_set(good_set(optics, film), optics)
     pixels = measure_pixels(optics, checked)
     traced = OpticsRenderer(optics, film, exact=True).trace_pixels(0.0)
     pixels.points.screen_mm[:] = np.stack([traced.s_x_mm, traced.s_y_mm])[:, pixels.index]
@@ -96,7 +96,7 @@ def test_a_hencky_bowl_with_millimetres_of_figure() -> None:
 def test_all_starts_agree(start: HeightFunction) -> None:
     optics = bench()
     stack = good_set(optics)
-    checked = check(stack, optics)
+    checked = check_set(stack, optics)
     first = reconstruct_full(optics, checked, measure_pixels(optics, checked))
     other = reconstruct_full(optics, checked, measure_pixels(optics, checked), start)
     assert np.max(np.abs((first.surface.height(X, Y) - other.surface.height(X, Y))[INSIDE])) <= 1e-9
@@ -158,7 +158,7 @@ def test_noisy_pictures_move_no_film_and_hide_no_motion(
     )
     for seed in (1, 2, 3):
         stack = good_set(optics, motion_um=motion_um, seed=seed)
-        checked, place_um = check(stack, optics), stack.displacement_um
+        checked, place_um = check_set(stack, optics), stack.displacement_um
         for _ in range(30):
             noisy = replace(
                 checked.stack, displacement_um=place_um + rng.standard_normal(place_um.size)
@@ -197,7 +197,7 @@ def test_the_frames_say_what_light_they_had_and_where_the_film_was(
     frames = [
         renderer.render(*one, gain=gain) for *one, gain in zip(shown, place_um, gains, strict=True)
     ]
-    checked = check(stack_of(np.stack(frames), shown), optics)
+    checked = check_set(stack_of(np.stack(frames), shown), optics)
     light = np.ones((2, len(gains))) if checked.stack.light is None else checked.stack.light
     for used, seen_um in zip(checked.view.used, np.split(checked.film_um, 2), strict=True):
         assert light[1, used] == pytest.approx(
@@ -265,7 +265,7 @@ def test_tukey_keeps_noise_and_drops_outliers() -> None:
 def test_fringes_lean_on_their_reference() -> None:
     optics = bench()
     full = good_set(optics)
-    anchor = check(full, optics).anchor()
+    anchor = check_set(full, optics).anchor()
     sinusoids = [k for k, p in enumerate(full.patterns) if p.role == "sin"]
     moved = good_set(optics, motion_um=lambda _t: 30.0, seed=2)
     stack = FrameStack(
@@ -276,6 +276,6 @@ def test_fringes_lean_on_their_reference() -> None:
     )
     geometry = optics.geometry.model_copy(update={"reference_displacement_um": 0.0})
     optics = optics.model_copy(update={"geometry": geometry})
-    checked = check(stack, optics, anchor)
+    checked = check_set(stack, optics, anchor)
     result = reconstruct_full(optics, checked, measure_pixels(optics, checked))
     assert float(np.std(surface_error_um(result.surface, FILM, 30.0))) <= 0.1

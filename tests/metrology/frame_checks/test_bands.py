@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from firmware_iface.roles import Pattern
 from membrane_ctrl.cli import run
-from membrane_ctrl.metrology.frame_checks.band_removal import without_bands
+from membrane_ctrl.metrology.frame_checks.band_removal import remove_bands
 from membrane_ctrl.metrology.phase.frame_stack import FrameStack, bin_frames
 from membrane_ctrl.metrology.phase.pixel_phases import pixel_phases
 from membrane_ctrl.metrology.reconstruction.film_motion import combine_steps
@@ -100,7 +100,7 @@ def slow_error_rad(stack: FrameStack, gain: Array | None, turned: bool = False) 
 )
 def test_bands_leave_the_phases(change: dict[str, float], turned: bool, share: float) -> None:
     stack = stack_of(turned=turned, **change)  # type: ignore[arg-type]
-    found, binned, _ = without_bands(stack, bin_frames(stack, 4095))
+    found, binned, _ = remove_bands(stack, bin_frames(stack, 4095))
     assert found.gain is not None
     before, after = (slow_error_rad(stack, gain, turned) for gain in (None, found.gain))
     assert after < share * before
@@ -128,7 +128,7 @@ def test_what_looks_like_bands_changes_nothing(change: dict[str, float]) -> None
     """
     stack = stack_of(**change)  # type: ignore[arg-type]
     binned = bin_frames(stack, 4095)
-    found, same, _ = without_bands(stack, binned)
+    found, same, _ = remove_bands(stack, binned)
     assert found.gain is None
     assert same is binned
 
@@ -139,7 +139,7 @@ def test_both_axes_have_the_same_light_afterwards(bands_across: float, flicker: 
     seems to move.
     """
     stack = stack_of(bands=0.01, shared=0.02, bands_across=bands_across, flicker=flicker)
-    _, binned, _ = without_bands(stack, bin_frames(stack, 4095))
+    _, binned, _ = remove_bands(stack, bin_frames(stack, 4095))
     x, y = binned.means[:4].mean(axis=0), binned.means[4:].mean(axis=0)
     apart = [np.median((y / x)[row][INSIDE[row]]) for row in range(20, 236)]
     assert np.std(apart) < 2e-3
@@ -153,10 +153,10 @@ def test_bands_are_those_of_the_pixels_rows() -> None:
     turns = 15 * (row - ROW[:, 0].repeat(4)) / HEIGHT
     assert np.abs(turns).max() < 0.03  # the bands of a large pixel are those of its rows
     fine = replace(stack, frames=frames)
-    found, binned, _ = without_bands(fine, bin_frames(fine, 4095))
+    found, binned, _ = remove_bands(fine, bin_frames(fine, 4095))
     assert binned.bin_px == 4
     assert found.gain is not None
-    coarse = without_bands(stack, bin_frames(stack, 4095))[0].gain
+    coarse = remove_bands(stack, bin_frames(stack, 4095))[0].gain
     expected = np.array([np.interp(row, ROW[:, 0], one) for one in np.asarray(coarse)])
     np.testing.assert_allclose(found.gain[:, 8:-8], expected[:, 8:-8], atol=1e-3)
 
@@ -165,7 +165,7 @@ def test_a_frame_without_a_picture_has_no_part_in_the_bands() -> None:
     stack = stack_of(steps=5)
     stack.frames[1] = 0
     stack = replace(stack, unusable={1: "unreadable"})
-    found, *_ = without_bands(stack, bin_frames(stack, 4095))
+    found, *_ = remove_bands(stack, bin_frames(stack, 4095))
     assert found.gain is not None
     np.testing.assert_array_equal(found.gain[1], 1)
     assert np.ptp(found.gain[[0, *range(2, 10)]], axis=1).min() > 0.01
@@ -173,7 +173,7 @@ def test_a_frame_without_a_picture_has_no_part_in_the_bands() -> None:
 
 def test_pixels_are_measured_without_the_bands() -> None:
     stack = stack_of(bands=0.02, noise_adu=0.0)
-    gain = without_bands(stack, bin_frames(stack, 4095))[0].gain
+    gain = remove_bands(stack, bin_frames(stack, 4095))[0].gain
     assert gain is not None
     index, phase = np.flatnonzero(INSIDE), phases()[1]
     still = combine_steps(stack.weights([4, 5, 6, 7]), stack.shifts_rad([4, 5, 6, 7]), 1)
@@ -202,12 +202,12 @@ def test_wrong_pictures_are_no_bands(fault: str, turned: bool) -> None:
         stack.frames[[1, 5]] = stack.frames[[5, 1]]
     else:
         stack.frames[:] = 20
-    assert without_bands(stack, bin_frames(stack, 4095))[0].gain is None
+    assert remove_bands(stack, bin_frames(stack, 4095))[0].gain is None
 
 
 def test_the_gain_goes_with_the_picture() -> None:
     stack = stack_of()
-    found, *_ = without_bands(stack, bin_frames(stack, 4095))
+    found, *_ = remove_bands(stack, bin_frames(stack, 4095))
     order = [1, 0, *range(2, 8)]
     assert found.gain is not None
     moved = found.reordered(order).gain

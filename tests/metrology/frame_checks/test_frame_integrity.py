@@ -11,8 +11,8 @@ import pytest
 
 from membrane_ctrl.config.schema import OpticsConfig, PatternConfig
 from membrane_ctrl.metrology.frame_checks.checked_set import RejectedSetError
-from membrane_ctrl.metrology.frame_checks.frame_inspection import identical_frames
-from membrane_ctrl.metrology.frame_checks.set_check import check
+from membrane_ctrl.metrology.frame_checks.frame_inspection import find_identical_frames
+from membrane_ctrl.metrology.frame_checks.set_check import check_set
 from membrane_ctrl.metrology.rays.surface import Surface
 from membrane_ctrl.sim.optics.film_shape import Bump, FilmShape, Ripple, Wrinkle, typical_film
 from membrane_ctrl.sim.optics.shade import Light
@@ -41,7 +41,7 @@ def named(
     """Frames flagged, reasons, and the figure's error in µm (None if rejected)."""
     stack = faulty_set(kind, frame, steps, gamma)
     try:
-        checked = check(stack, bench(steps))
+        checked = check_set(stack, bench(steps))
     except RejectedSetError as error:
         flags, wrong = error.flags, None
     else:
@@ -65,7 +65,7 @@ def test_a_twentieth_of_the_frame_before_is_seen(frame: str) -> None:
     place = NAMES.index(frame)
     before, own = stack.frames[place - 1 : place + 1].astype(float)
     stack.frames[place] = np.rint(0.95 * own + 0.05 * before)  # 4 µm of figure if nobody notices
-    checked = check(stack, bench())
+    checked = check_set(stack, bench())
     assert [NAMES[flag.frame] for flag in checked.flags] == [frame]
     assert error_um(checked.state.surface) < 0.05
 
@@ -154,21 +154,21 @@ def _coarse(periods: int) -> OpticsConfig:
 
 @pytest.mark.parametrize("periods", [1, 4])
 def test_no_alarm_for_a_gray_frame_without_an_edge(periods: int) -> None:
-    assert check(good_set(_coarse(periods)), _coarse(periods)).flags == ()
+    assert check_set(good_set(_coarse(periods)), _coarse(periods)).flags == ()
 
 
 def test_a_wrong_picture_instead_of_a_gray_frame_without_an_edge_is_named() -> None:
     stack = good_set(_coarse(4))
     frame = NAMES.index("x_gray_1")
     stack.frames[frame] = stack.frames[frame - 1] + np.uint8(1)  # the same to the eye alone
-    assert [flag.frame for flag in check(stack, _coarse(4)).flags] == [frame]
+    assert [flag.frame for flag in check_set(stack, _coarse(4)).flags] == [frame]
 
 
 @pytest.mark.parametrize("steps", [3, 4, 5, 8])
 @pytest.mark.parametrize("gamma", [1.0, 2.2])
 def test_no_alarm_for_any_number_of_steps_and_gamma(steps: int, gamma: float) -> None:
     optics = bench(steps)
-    assert check(good_set(optics, light=Light(gamma=gamma)), optics).flags == ()
+    assert check_set(good_set(optics, light=Light(gamma=gamma)), optics).flags == ()
 
 
 @pytest.mark.parametrize(
@@ -184,13 +184,13 @@ def test_no_alarm_for_any_number_of_steps_and_gamma(steps: int, gamma: float) ->
 )
 def test_no_alarm_for_any_light(light: Light) -> None:
     optics = bench()
-    assert check(good_set(optics, light=light), optics).flags == ()
+    assert check_set(good_set(optics, light=light), optics).flags == ()
 
 
 @pytest.mark.parametrize(("bits", "noise_adu"), [(8, 4.0), (12, 4.0), (16, 0.0), (16, 100.0)])
 def test_no_alarm_for_any_depth_and_noise(bits: int, noise_adu: float) -> None:
     optics = bench(bits=bits, noise_adu=noise_adu)
-    assert check(good_set(optics), optics).flags == ()
+    assert check_set(good_set(optics), optics).flags == ()
 
 
 @pytest.mark.parametrize("told", [True, False])
@@ -202,7 +202,7 @@ def test_no_alarm_for_a_film_that_moves(steps: int, told: bool) -> None:
         stack = type(stack)(
             stack.frames, stack.patterns, np.full(len(stack.patterns), math.nan), {}
         )
-    assert check(stack, optics).flags == ()
+    assert check_set(stack, optics).flags == ()
 
 
 @pytest.mark.parametrize(
@@ -218,7 +218,7 @@ def test_no_alarm_for_a_film_that_moves(steps: int, told: bool) -> None:
 )
 def test_no_alarm_for_any_film(film: FilmShape) -> None:
     optics = bench()
-    assert check(good_set(optics, film), optics).flags == ()
+    assert check_set(good_set(optics, film), optics).flags == ()
 
 
 def test_no_alarm_for_dust_and_glints() -> None:
@@ -227,14 +227,14 @@ def test_no_alarm_for_dust_and_glints() -> None:
     for row, column in zip(rng.integers(0, 250, 80), rng.integers(0, 300, 80), strict=True):
         stack.frames[:, row : row + 4, column : column + 4] //= 6
         stack.frames[:, row, column] = 255
-    checked = check(stack, optics)
+    checked = check_set(stack, optics)
     assert checked.flags == ()
     assert error_um(checked.state.surface) < 0.05
 
 
 def test_unequal_steps_are_no_fault() -> None:
     optics = bench(5)
-    checked = check(good_set(optics, shifts_rad=(0.0, 1.0, 2.2, 3.9, 5.0)), optics)
+    checked = check_set(good_set(optics, shifts_rad=(0.0, 1.0, 2.2, 3.9, 5.0)), optics)
     assert checked.flags == ()
     assert error_um(checked.state.surface) < 0.05
 
@@ -243,14 +243,14 @@ def test_two_bad_frames_of_one_axis_leave_too_few() -> None:
     stack = faulty_set("stale", "x_sin_1")
     stack.frames[2] = stack.frames[2] // 2
     with pytest.raises(RejectedSetError, match="phase steps are usable"):
-        check(stack, bench())
+        check_set(stack, bench())
 
 
 def test_identical_frames_are_found_whichever_they_are() -> None:
     stack = good_set(bench())
-    assert identical_frames(stack) == {}
+    assert find_identical_frames(stack) == {}
     stack.frames[9] = stack.frames[2]
-    assert identical_frames(stack) == {9: 2}
+    assert find_identical_frames(stack) == {9: 2}
 
 
 def test_geometry_that_sees_no_mirror_is_rejected() -> None:
@@ -263,11 +263,11 @@ def test_geometry_that_sees_no_mirror_is_rejected() -> None:
     stack = good_set(optics)
     stack.frames[:] = 7
     with pytest.raises(RejectedSetError):
-        check(stack, blind)
+        check_set(stack, blind)
 
 
 def test_a_picture_upside_down_is_asked_about() -> None:
     stack = good_set(bench())
     stack.frames[:] = stack.frames[:, ::-1].copy()
     with pytest.raises(RejectedSetError, match="check the geometry"):
-        check(stack, bench())
+        check_set(stack, bench())

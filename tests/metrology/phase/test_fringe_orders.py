@@ -7,7 +7,7 @@ import math
 import numpy as np
 import pytest
 
-from membrane_ctrl.metrology.phase.fringe_orders import orders
+from membrane_ctrl.metrology.phase.fringe_orders import resolve_orders
 from membrane_ctrl.metrology.phase.gray_code import gray_bit
 from membrane_ctrl.metrology.phase.region_unwrap import tear_share, unwrap_regions
 
@@ -22,7 +22,7 @@ def true_bits() -> np.ndarray:
 
 
 def test_the_orders_are_the_codes() -> None:
-    found = orders(WRAPPED, true_bits(), EVERYWHERE)
+    found = resolve_orders(WRAPPED, true_bits(), EVERYWHERE)
     assert found.phase_rad == pytest.approx(PHASE)
     assert found.agreement == 1.0
     assert not found.torn
@@ -33,7 +33,7 @@ def test_the_orders_are_the_codes() -> None:
 def test_one_wrong_gray_frame_is_outvoted(bit: int, content: int) -> None:
     bits = true_bits()
     bits[bit] = bool(content)
-    found = orders(WRAPPED, bits, EVERYWHERE)
+    found = resolve_orders(WRAPPED, bits, EVERYWHERE)
     assert found.phase_rad == pytest.approx(PHASE)
     assert found.agreement < 0.95
 
@@ -43,7 +43,7 @@ def test_islands_vote_for_themselves_and_specks_are_dropped() -> None:
     mask[:, 40:43] = False
     mask[:, 80:] = False
     mask[30, 85] = True
-    found = orders(WRAPPED, true_bits(), mask)
+    found = resolve_orders(WRAPPED, true_bits(), mask)
     known = np.isfinite(found.phase_rad)
     assert np.array_equal(known, mask & (COLUMNS < 80))
     assert found.phase_rad[known] == pytest.approx(PHASE[known])
@@ -52,7 +52,7 @@ def test_islands_vote_for_themselves_and_specks_are_dropped() -> None:
 def test_a_torn_phase_is_left_to_the_code() -> None:
     torn = np.where(np.sin(PHASE) > 0, 0.01, math.pi - 0.01) + 0.3 * np.sin(7 * ROWS)
     wrapped = np.angle(np.exp(1j * torn))
-    assert orders(wrapped, true_bits(), EVERYWHERE).torn
+    assert resolve_orders(wrapped, true_bits(), EVERYWHERE).torn
 
 
 def test_continuity_goes_around_holes() -> None:

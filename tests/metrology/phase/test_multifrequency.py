@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from membrane_ctrl.metrology.phase.temporal_unwrap import predicted_phase, unwrap
+from membrane_ctrl.metrology.phase.temporal_unwrap import predict_phase, unwrap_in_time
 
 PERIODS = [0.9, 3.9, 15.9, 63.9]
 
@@ -16,7 +16,7 @@ def wrapped(position, periods=PERIODS, noise_rad=0.0, seed=1):
 
 def test_exact_phases_give_the_position_to_rounding():
     position = np.linspace(0.001, 0.999, 997).reshape(-1, 1)
-    out = unwrap(wrapped(position), PERIODS)
+    out = unwrap_in_time(wrapped(position), PERIODS)
     np.testing.assert_allclose(out.screens, position, atol=1e-14)
     np.testing.assert_allclose(out.step_periods, 0, atol=1e-11)
     assert out.consistent.all()
@@ -25,7 +25,7 @@ def test_exact_phases_give_the_position_to_rounding():
 
 def test_noise_of_the_finest_phase_is_all_that_is_left():
     position = np.random.default_rng(2).uniform(0.05, 0.95, 20_000)
-    out = unwrap(wrapped(position, noise_rad=0.05), PERIODS)
+    out = unwrap_in_time(wrapped(position, noise_rad=0.05), PERIODS)
     assert np.std(out.screens - position) == pytest.approx(0.05 / (2 * np.pi * 63.9), rel=0.03)
     # e of a step is the coarser phase's noise through the finer fringe, with the finer one's own
     expected = 0.05 / (2 * np.pi) * np.hypot(3.9 / 0.9, 1)
@@ -39,19 +39,19 @@ def test_a_wrong_coarse_phase_is_flagged():
     phases[0, 1] += (
         2 * np.pi * 0.9 * 0.4 / 3.9
     )  # shifts the coarse position by 0.4 of the next period
-    out = unwrap(phases, PERIODS)
+    out = unwrap_in_time(phases, PERIODS)
     assert out.consistent.tolist() == [True, False, True]
     assert abs(out.step_periods[0, 1]) == pytest.approx(0.4)
 
 
 def test_a_position_off_the_screen_is_flagged():
-    assert not unwrap(wrapped(np.array([1.05])), PERIODS).consistent.any()
+    assert not unwrap_in_time(wrapped(np.array([1.05])), PERIODS).consistent.any()
 
 
 def test_a_stuck_order_is_one_whole_fine_period():
     phases = wrapped(np.array([0.3]))
     phases[2] += np.pi  # half a period of frequency 2 is two periods of frequency 3
-    out = unwrap(phases, PERIODS)
+    out = unwrap_in_time(phases, PERIODS)
     assert (out.screens[0] - 0.3) * 63.9 == pytest.approx(
         round((out.screens[0] - 0.3) * 63.9), abs=1e-9
     )
@@ -64,7 +64,7 @@ def test_prediction_does_not_look_at_the_frequency_it_predicts(index):
     position = np.linspace(0.1, 0.9, 50)
     phases = wrapped(position)
     phases[index] = 1.234
-    predicted = predicted_phase(phases, PERIODS, index)
+    predicted = predict_phase(phases, PERIODS, index)
     np.testing.assert_allclose(predicted, 2 * np.pi * PERIODS[index] * position, atol=1e-9)
 
 
@@ -73,7 +73,7 @@ def test_prediction_of_the_coarsest_takes_it_for_the_order_only():
     phases = wrapped(position)
     phases[0] += 0.1
     np.testing.assert_allclose(
-        predicted_phase(phases, PERIODS, 0), 2 * np.pi * 0.9 * position, atol=1e-9
+        predict_phase(phases, PERIODS, 0), 2 * np.pi * 0.9 * position, atol=1e-9
     )
 
 
@@ -82,4 +82,4 @@ def test_prediction_of_the_coarsest_takes_it_for_the_order_only():
 )
 def test_periods_that_cannot_be_unwrapped_are_refused(periods, count):
     with pytest.raises(ValueError, match="periods"):
-        unwrap(np.zeros((count, 4)), periods)
+        unwrap_in_time(np.zeros((count, 4)), periods)

@@ -9,7 +9,7 @@ import pytest
 
 from membrane_ctrl.metrology.numerics.compiled import kernel
 from membrane_ctrl.metrology.phase.bin_sums import FOLLOWED_ROWS, Binner
-from membrane_ctrl.metrology.phase.phase_change import track
+from membrane_ctrl.metrology.phase.phase_change import update_phases
 from membrane_ctrl.metrology.phase.phase_steps import equal_shifts, step_weights
 from membrane_ctrl.metrology.phase.phasor_kernels import arctan2
 from membrane_ctrl.metrology.reconstruction.film_motion import combine_steps, worth_correcting
@@ -91,7 +91,9 @@ def _followed(
     out = np.zeros_like(last)
     combined = combine_steps(step_weights(shifts), shifts, 1, motion)
     sums = np.rint(intensity * 1000).astype(np.uint32)
-    track([sums] * 2, np.arange(count), [combined] * 2, np.stack([sensitivity] * 2), last, out)
+    update_phases(
+        [sums] * 2, np.arange(count), [combined] * 2, np.stack([sensitivity] * 2), last, out
+    )
     assert np.array_equal(out[0], out[1])
     return out[0]
 

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from membrane_ctrl.config.schema import CameraConfig, GeometryConfig, OpticsConfig
-from membrane_ctrl.metrology.calibration.point_averages import averaged
+from membrane_ctrl.metrology.calibration.point_averages import average_points
 from membrane_ctrl.metrology.calibration.set_state import SetState
 from membrane_ctrl.metrology.rays.bench_parameters import ALL, NAMES, POSE, sigmas
 from membrane_ctrl.metrology.rays.bench_poses import (
@@ -23,7 +23,7 @@ from membrane_ctrl.metrology.rays.forward_model import (
     COLUMNS,
     LOCAL,
     MOTION,
-    chunks,
+    linearise_points,
     residual_mm,
 )
 from membrane_ctrl.metrology.rays.geometry import Geometry
@@ -57,7 +57,11 @@ def test_derivatives_are_those_of_the_model() -> None:
         return -residual_mm(bench_at(LENS, values), phases, surface, z)
 
     chunk = next(
-        iter(chunks(bench_at(LENS, VALUES), pose_derivatives(LENS, VALUES), phases, SURFACE, z_mm))
+        iter(
+            linearise_points(
+                bench_at(LENS, VALUES), pose_derivatives(LENS, VALUES), phases, SURFACE, z_mm
+            )
+        )
     )
     assert chunk.derivatives.shape == (2, COLUMNS, 200)
     for column in range(COLUMNS):
@@ -182,7 +186,7 @@ def test_averaged_points_say_what_the_bins_say() -> None:
     truth = make(np.zeros(len(NAMES)), seed=2, points=20_000)
     phases, bench = truth.sets[2], BenchGeometry(STATED)
     state = SetState(SURFACE, 0.0)
-    few = averaged(bench, phases, state, 1000)
+    few = average_points(bench, phases, state, 1000)
     assert 700 < few.column_px.size < 1600
     # all the information is kept, and so is the residual's mean
     assert np.sum(1 / few.sigma_mm**2) == pytest.approx(np.sum(1 / phases.sigma_mm**2), rel=0.2)

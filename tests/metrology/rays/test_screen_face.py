@@ -14,7 +14,7 @@ from membrane_ctrl.config.optics import (
 )
 from membrane_ctrl.metrology.cycle.live_reconstructor import LiveReconstructor
 from membrane_ctrl.metrology.figure.pixel_figure import measure_pixels, reconstruct_full
-from membrane_ctrl.metrology.frame_checks.set_check import check
+from membrane_ctrl.metrology.frame_checks.set_check import check_set
 from membrane_ctrl.metrology.rays.bench_poses import BenchGeometry
 from membrane_ctrl.metrology.rays.forward_model import residual_mm
 from membrane_ctrl.metrology.rays.geometry import Geometry
@@ -149,7 +149,7 @@ def test_the_full_result_needs_the_face_and_gets_it() -> None:
     stack = good_set(truth)
     errors = []
     for optics in (truth, _optics(None)):
-        checked = check(stack, optics)
+        checked = check_set(stack, optics)
         full = reconstruct_full(optics, checked, measure_pixels(optics, checked))
         errors.append(_error_um(full.surface))
     assert errors[0] < 0.1  # µm: rounding to 8 bits at a 64th of the pixels

@@ -17,7 +17,7 @@ from membrane_ctrl.metrology.frame_checks.closure import (
 )
 from membrane_ctrl.metrology.frame_checks.frequency_series import check_series
 from membrane_ctrl.metrology.phase.phase_steps import phasors
-from membrane_ctrl.metrology.phase.temporal_unwrap import predicted_phase, unwrap
+from membrane_ctrl.metrology.phase.temporal_unwrap import predict_phase, unwrap_in_time
 from tests.support import sofast_facet
 from tests.support.facet import measure_on, solve_facet
 from tests.support.sofast_facet import decode, sight, wrapped_phases
@@ -176,7 +176,7 @@ def named(frames, periods, index):
         level = neighbour.mean(axis=0), np.abs(phasors(neighbour, SHIFTS_RAD))
         return closure_with_level(frames[0], SHIFTS_RAD, *level)
     wrapped = np.angle(np.stack([phasors(steps, SHIFTS_RAD) for steps in frames]))
-    return closure_with_phase(frames[index], SHIFTS_RAD, predicted_phase(wrapped, periods, index))
+    return closure_with_phase(frames[index], SHIFTS_RAD, predict_phase(wrapped, periods, index))
 
 
 @pytest.mark.parametrize("axis", ["x", "y"])
@@ -205,9 +205,9 @@ def test_unwrapping_alone_does_not_notice_a_stale_frame_of_the_finest_fringe(mea
     frames[3, 1] = frames[3, 0]
     stale = good.copy()
     stale[3] = np.angle(phasors(frames[3], SHIFTS_RAD))
-    position = unwrap(stale, periods)
+    position = unwrap_in_time(stale, periods)
     assert position.consistent.all()
-    error_mm = 8727 * (position.screens - unwrap(good, periods).screens)
+    error_mm = 8727 * (position.screens - unwrap_in_time(good, periods).screens)
     assert np.sqrt(np.mean(error_mm**2)) > 5
 
 
@@ -263,7 +263,9 @@ def test_a_stale_frame_of_the_finest_fringe_costs_nothing_once_it_is_known(measu
         axes[1].frames[3, 1] = axes[1].frames[3, 0]
 
     mended = series(measurement, stale).axes[1]
-    position, truth = (unwrap(axis.phases_rad(), axis.periods).screens for axis in (mended, good))
+    position, truth = (
+        unwrap_in_time(axis.phases_rad(), axis.periods).screens for axis in (mended, good)
+    )
     # 5 mm and more when it is not noticed (see above); the second harmonic, which three steps
     # alias, is what is left
     assert 8727 * np.sqrt(np.mean((position - truth) ** 2)) < 0.5

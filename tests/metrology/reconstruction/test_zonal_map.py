@@ -6,7 +6,11 @@ import numpy as np
 import pytest
 
 from membrane_ctrl.metrology.reconstruction.masked_laplacian import MaskedLaplacian
-from membrane_ctrl.metrology.reconstruction.zonal_map import ResidualGrid, integrate, residual_grid
+from membrane_ctrl.metrology.reconstruction.zonal_map import (
+    ResidualGrid,
+    integrate_residual,
+    residual_grid,
+)
 
 AXIS = np.linspace(-100.0, 100.0, 101)
 X, Y = np.meshgrid(AXIS, AXIS)
@@ -25,21 +29,21 @@ def test_a_quadratic_comes_back_whatever_the_mask(hole_mm: float) -> None:
     seen = (radius <= 95) & ((radius >= hole_mm) | (radius == 0))
     # the vertex alone in the hole would be a part of its own
     seen &= (radius > 0) | (hole_mm == 0)
-    height = integrate(bowl_grid(seen))
+    height = integrate_residual(bowl_grid(seen))
     assert np.array_equal(np.isfinite(height), seen)
     error = (height - 1e-6 * (X**2 + X * Y))[seen]
     assert np.ptp(error) < 1e-4 * np.ptp(height[seen])
 
 
 def test_the_vertex_is_zero() -> None:
-    height = integrate(bowl_grid(np.hypot(X, Y) <= 95))
+    height = integrate_residual(bowl_grid(np.hypot(X, Y) <= 95))
     assert height[50, 50] == 0.0
 
 
 def test_parts_that_do_not_hang_together_lie_on_the_fit() -> None:
     seen = np.hypot(X, Y) <= 95
     seen[:, 60:63] = False
-    height = integrate(ResidualGrid(AXIS, 1e-6 * seen, 0.0 * seen, seen.astype(float)))
+    height = integrate_residual(ResidualGrid(AXIS, 1e-6 * seen, 0.0 * seen, seen.astype(float)))
     left, right = height[:, :60], height[:, 63:]
     assert np.nanmean(left) == pytest.approx(np.nanmean(right), abs=1e-9)
     assert np.nanmax(height) - np.nanmin(height) < 1e-6 * 160
@@ -47,7 +51,7 @@ def test_parts_that_do_not_hang_together_lie_on_the_fit() -> None:
 
 def test_nothing_measured_is_nan() -> None:
     empty = np.zeros((101, 101))
-    assert np.isnan(integrate(ResidualGrid(AXIS, empty, empty, empty))).all()
+    assert np.isnan(integrate_residual(ResidualGrid(AXIS, empty, empty, empty))).all()
 
 
 def test_pixels_are_averaged_in_their_cell_and_weights_count() -> None:

@@ -15,9 +15,9 @@ from membrane_ctrl.config.schema import CameraConfig, OpticsConfig
 from membrane_ctrl.measure.measurement import Figures, SetFigure
 from membrane_ctrl.metrology.tracking.crossed_scene import CrossedScene
 from membrane_ctrl.metrology.tracking.lost_orders import LostOrders
-from membrane_ctrl.metrology.tracking.scene_from_reference import scene_of
+from membrane_ctrl.metrology.tracking.scene_from_reference import make_scene
 from membrane_ctrl.metrology.tracking.step_jumps import Jumps
-from membrane_ctrl.metrology.tracking.step_means import steadied
+from membrane_ctrl.metrology.tracking.step_means import estimate_step_places
 from membrane_ctrl.metrology.tracking.tracked_frame import TrackedFrame
 from membrane_ctrl.metrology.tracking.tracker import Tracker
 from membrane_ctrl.model.zernike_terms import NOLL_INDICES, ZERNIKE_TERMS
@@ -84,12 +84,12 @@ def test_fringes_that_tell_nothing_are_refused(
     reference: SetFigure, periods: int, why: str
 ) -> None:
     with pytest.raises(ValueError, match=why):
-        scene_of(reference.head.optics, reference.checked, reference.figure, 398.56 / periods)
+        make_scene(reference.head.optics, reference.checked, reference.figure, 398.56 / periods)
 
 
 @pytest.fixture(scope="module")
 def prepared(reference: SetFigure) -> Bench:
-    scene = scene_of(reference.head.optics, reference.checked, reference.figure, 12.455)
+    scene = make_scene(reference.head.optics, reference.checked, reference.figure, 12.455)
     return Bench(scene, Tracker(scene, SIZE, 255, OPTICS.camera.noise_adu))
 
 
@@ -159,12 +159,12 @@ def test_a_drift_is_no_error_of_the_steps_and_errors_are_no_motion() -> None:
     drifted = np.outer(step_s, np.eye(ZERNIKE_TERMS)[0] * 2e-6)
     places = drifted + random.normal(0, 2e-5, (5, ZERNIKE_TERMS))
     variance = np.full((5, ZERNIKE_TERMS), 1.6e-9)  # twice the scatter: all of it is error
-    found, left = steadied(places, variance, drifted)
+    found, left = estimate_step_places(places, variance, drifted)
     assert np.ptp(found[:, 0]) == pytest.approx(8e-5)
     assert np.ptp(found[:, 1]) == 0
     assert np.allclose(found.mean(axis=0), places.mean(axis=0))
     assert (left < variance).all()
-    moved, _ = steadied(
+    moved, _ = estimate_step_places(
         places, variance / 1e6, 0 * drifted
     )  # errors that explain nothing: it is motion
     assert np.allclose(moved, places, atol=1e-7)

@@ -9,7 +9,7 @@ import pytest
 
 from membrane_ctrl.metrology.figure import set_motion
 from membrane_ctrl.metrology.uncertainty.cycle_errors import LiveErrors
-from membrane_ctrl.metrology.uncertainty.cycle_frames import FramesSeen
+from membrane_ctrl.metrology.uncertainty.cycle_frames import FrameErrors
 from membrane_ctrl.metrology.uncertainty.frame_effects import FrameEffects
 
 TERMS, FRAMES = 2, 8
@@ -25,7 +25,7 @@ def vertex_sigma_um(moved_um: float, reading_um: float) -> float:
     )
     quiet = np.zeros(FRAMES)
     film = moved_um * np.tile([1.0, -1.0], FRAMES // 2)
-    seen = FramesSeen(quiet, quiet, quiet, film, np.zeros((2, 2)), np.zeros((2, 1)))
+    seen = FrameErrors(quiet, quiet, quiet, film, np.zeros((2, 2)), np.zeros((2, 1)))
     return math.sqrt(errors.own_mm2(seen, np.full(FRAMES, reading_um), 1.0, 0.0)[1, 1])
 
 

@@ -10,7 +10,7 @@ import pytest
 from membrane_ctrl.config.schema import OpticsConfig
 from membrane_ctrl.metrology.figure.bin_figure import BinFigure, bin_figure
 from membrane_ctrl.metrology.frame_checks.checked_set import Checked
-from membrane_ctrl.metrology.frame_checks.set_check import check
+from membrane_ctrl.metrology.frame_checks.set_check import check_set
 from membrane_ctrl.metrology.phase.frame_stack import FrameStack
 from membrane_ctrl.metrology.rays.surface import Surface
 from membrane_ctrl.metrology.uncertainty.geometry_spread import (
@@ -49,14 +49,14 @@ def _stack(displacement_um: float = 0.0, frames: str = "full") -> FrameStack:
 
 @cache
 def _first() -> tuple[Checked, BinFigure]:
-    checked = check(_stack(), OPTICS)
+    checked = check_set(_stack(), OPTICS)
     return checked, bin_figure(OPTICS, checked)
 
 
 def _bench(displacement_um: float = 0.0) -> TrialBench:
     checked, figure = _first()
     if displacement_um:
-        checked = check(_stack(displacement_um, "fringes"), _anchored(), checked.anchor())
+        checked = check_set(_stack(displacement_um, "fringes"), _anchored(), checked.anchor())
         figure = bin_figure(_anchored(), checked)
     return TrialBench.of(OPTICS, checked, figure)
 
@@ -88,7 +88,7 @@ def test_figure_of_a_moving_film() -> None:
     errors = {}
     for laser in (True, False):
         stack = stack_of(frames, shown, where_um if laser else None)
-        figure = bin_figure(_anchored(), check(stack, _anchored(), _first()[0].anchor()))
+        figure = bin_figure(_anchored(), check_set(stack, _anchored(), _first()[0].anchor()))
         truth = FILM.height_mm(x, y, float(where_um.mean()))[MAP.inside]
         errors[laser] = np.sqrt(
             np.mean(np.square(1e3 * (MAP.matrix @ figure.fit.surface.parameters - truth)))
@@ -105,7 +105,7 @@ def test_noise_is_that_of_whole_measurements() -> None:
     anchor = _first()[0].anchor()
     whole = []
     for _ in range(24):
-        checked = check(_stack(frames="fringes"), OPTICS, anchor)
+        checked = check_set(_stack(frames="fringes"), OPTICS, anchor)
         whole.append(bin_figure(OPTICS, checked).fit.surface.parameters)
     cheap = run_trials([_bench()], NO_SPREAD, 3, range(600))[:, 0]
     ratio = np.var(whole, axis=0, ddof=1) / np.var(cheap, axis=0, ddof=1)
@@ -136,7 +136,7 @@ def test_geometry_is_that_of_a_whole_measurement() -> None:
     )
     checked, figure = _first()
     there = (
-        bin_figure(other, check(checked.stack, other)).fit.surface.parameters
+        bin_figure(other, check_set(checked.stack, other)).fit.surface.parameters
         - figure.fit.surface.parameters
     )
     trial = _bench()
