@@ -9,14 +9,14 @@ from membrane_ctrl.model.state_tree import StateNode
 
 
 @dataclass(slots=True)
-class StandGrowthState(StateNode):
+class CameraMountState(StateNode):
     """Temperatures of the stand: the present one, and at the lock."""
 
     stand_c: LowPass = field(default_factory=LowPass)
     locked_c: float = math.nan
 
 
-class StandGrowth:
+class CameraMountGrowth:
     """The sag that the optics see too much because their stand has become warmer since the lock.
 
     Nothing on the bench sees it: laser and optics differ by the laser's mount, too, and a gauge's
@@ -24,10 +24,10 @@ class StandGrowth:
     late.
     """
 
-    def __init__(self, config: EstimatorConfig, memory: StandGrowthState | None = None) -> None:
+    def __init__(self, config: EstimatorConfig, memory: CameraMountState | None = None) -> None:
         self._um_per_k, self._sigma_um_per_k = config.stand_um_per_k, config.stand_sigma_um_per_k
         self._follows_air_s = config.stand_follows_air_s
-        self.memory = memory or StandGrowthState()
+        self.memory = memory or CameraMountState()
 
     def lock(self) -> None:
         """From now on the present temperature is that of the reference."""

@@ -29,9 +29,9 @@ from membrane_ctrl.control.centre_estimate import (
 )
 from membrane_ctrl.control.filters import smoothing
 from membrane_ctrl.control.gas_transit import Transit
-from membrane_ctrl.control.innovation_ramp import Ramp
+from membrane_ctrl.control.innovation_ramp import InnovationRamp
 from membrane_ctrl.control.noise_learning import LearnedFactor, ReadingNoise, configured_walk
-from membrane_ctrl.control.weather_limits import believed_weather
+from membrane_ctrl.control.weather_limits import discard_impossible_weather
 from membrane_ctrl.model.arrays import FloatArray
 from membrane_ctrl.model.state_tree import ArrayShape, Count, StateNode
 
@@ -120,8 +120,8 @@ class CentreState(StateNode):
         default_factory=lambda: [configured_walk() for _ in range(4)]
     )
     # of laser and optics
-    ramps: Annotated[list[Ramp], Field(min_length=len(_RUN), max_length=len(_RUN))] = field(
-        default_factory=lambda: [Ramp() for _ in _RUN]
+    ramps: Annotated[list[InnovationRamp], Field(min_length=len(_RUN), max_length=len(_RUN))] = (
+        field(default_factory=lambda: [InnovationRamp() for _ in _RUN])
     )
     transit: gas_transit.TransitState = field(default_factory=gas_transit.TransitState)
     frames: Count = 0  # of the optics since lock
@@ -228,7 +228,9 @@ class CentreFilter:
         self._clone(given.now_s)
         for watch in self.memory.watches:
             watch.pull *= math.exp(-dt_s / _SHARE_S)
-        pressure_pa, air_c = believed_weather(given.ambient_pressure_pa, given.air_temperature_c)
+        pressure_pa, air_c = discard_impossible_weather(
+            given.ambient_pressure_pa, given.air_temperature_c
+        )
         config, origin = self._config, self.memory.origin
         uses_pressure, uses_air = self._uses
         if uses_pressure and math.isfinite(pressure_pa):
@@ -461,7 +463,7 @@ class CentreFilter:
         """The states may have jumped by some such amounts."""
         self.memory.p += jump[:, None] * jump
 
-    def _widen_leak(self, ramp: Ramp, now_s: float, sigma_um: float) -> None:
+    def _widen_leak(self, ramp: InnovationRamp, now_s: float, sigma_um: float) -> None:
         """The leak may have changed when the innovations began to run away."""
         jump = (now_s - ramp.since_s) * _ONE[_GAS] - _ONE[_LEAK]
         jump[_PLANT:] = np.maximum(self.memory.times - ramp.since_s, 0.0)

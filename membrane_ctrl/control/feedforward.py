@@ -13,7 +13,7 @@ from dataclasses import dataclass, field
 
 from membrane_ctrl.config.schema import LoopConfig
 from membrane_ctrl.control.filters import LagRate
-from membrane_ctrl.control.weather_limits import believed_weather
+from membrane_ctrl.control.weather_limits import discard_impossible_weather
 from membrane_ctrl.model.state_tree import StateNode
 
 # Neither weather nor a door (slammed: 100 Pa) changes this much between ticks, but a failed sensor
@@ -51,7 +51,9 @@ class FeedForward:
     def update(self, ambient_pressure_pa: float, air_temperature_c: float, dt_s: float) -> float:
         """Flow in µm/s; NaN for a missing quantity."""
         loop = self._loop
-        pressure_pa, temperature_c = believed_weather(ambient_pressure_pa, air_temperature_c)
+        pressure_pa, temperature_c = discard_impossible_weather(
+            ambient_pressure_pa, air_temperature_c
+        )
         pressure_pa = pressure_pa if loop.feedforward_barometer else math.nan
         temperature_c = temperature_c if loop.feedforward_temperature else math.nan
         pa_per_s = self.memory.pressure.update(

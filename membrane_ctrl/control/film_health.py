@@ -12,7 +12,7 @@ from collections import deque
 from dataclasses import dataclass, field
 
 from membrane_ctrl.control.leak_estimate import TOO_TIGHT_UM_PER_S
-from membrane_ctrl.control.maintenance_notice import BETTER, FilmWarning
+from membrane_ctrl.control.maintenance_notice import WITHDRAWN_BELOW, MaintenanceNotice
 from membrane_ctrl.model.state_tree import StateNode
 
 HOUR_S = 3600.0
@@ -61,7 +61,7 @@ class FilmHealth:
 
     def step(
         self, dt_s: float, leak_um_per_s: float, gauge_pressure_pa: float
-    ) -> tuple[FilmWarning, ...]:
+    ) -> tuple[MaintenanceNotice, ...]:
         """Process one tick of a held mirror; at the end of an hour, return new and withdrawn
         warnings.
         """
@@ -91,7 +91,7 @@ class FilmHealth:
         self.memory.leak_um = 0.0
         self.memory.pressure_pa_s = 0.0
 
-    def _news(self, hour: Hour, first: Hour) -> list[FilmWarning]:
+    def _news(self, hour: Hour, first: Hour) -> list[MaintenanceNotice]:
         leak, most = hour.leak_um_per_s, self._flow_max_um_per_s
         creep = self._creep_per_day()
         found = (
@@ -117,11 +117,13 @@ class FilmHealth:
             ),
         )
         warned = self.memory.warned
-        bad = [name for name, over, _ in found if over > (BETTER if name in warned else 1.0)]
+        bad = [
+            name for name, over, _ in found if over > (WITHDRAWN_BELOW if name in warned else 1.0)
+        ]
         changed = set(bad) ^ set(warned)
         self.memory.warned = bad
         return [
-            FilmWarning(name, says if name in bad else "no longer so", name in bad)
+            MaintenanceNotice(name, says if name in bad else "no longer so", name in bad)
             for name, _, says in found
             if name in changed
         ]

@@ -14,7 +14,7 @@ _SHORTEST_S = 0.02  # shortest duration of a ramp
 
 @dataclass(slots=True)
 class CumulativeSum(StateNode):
-    """One side of a `Ramp`."""
+    """One side of a `InnovationRamp`."""
 
     total: float = 0.0
     count: Count = 0
@@ -22,7 +22,7 @@ class CumulativeSum(StateNode):
 
 
 @dataclass(slots=True)
-class Ramp(StateNode):
+class InnovationRamp(StateNode):
     """Finds innovations that run away to one side: two cumulative sums (Page 1954)."""
 
     up: CumulativeSum = field(default_factory=CumulativeSum)

@@ -3,11 +3,11 @@
 from dataclasses import dataclass
 
 # Warn again only after a clear improvement.
-BETTER = 0.9
+WITHDRAWN_BELOW = 0.9
 
 
 @dataclass(frozen=True, slots=True)
-class FilmWarning:
+class MaintenanceNotice:
     """A maintenance notice; it no longer applies if it is not `bad`."""
 
     name: str

@@ -12,10 +12,10 @@ it.
 
 import math
 from dataclasses import dataclass, field
-from enum import IntEnum
 
 from membrane_ctrl.control.film_monitor import SMOOTH_S, are_means_known
 from membrane_ctrl.control.filters import LowPass, smoothing
+from membrane_ctrl.model.events import FaultySensor
 from membrane_ctrl.model.shape_estimate import ShapeEstimate
 from membrane_ctrl.model.state_tree import Count, StateNode
 
@@ -38,17 +38,8 @@ LASER_GAP_S = 2.0
 SPEED_S = 2.0
 
 
-class Liar(IntEnum):
-    """Which sensor contradicts the others."""
-
-    NOBODY = 0
-    UNSURE = 1
-    LASER = 2
-    OPTICS = 3
-
-
 @dataclass(frozen=True, slots=True)
-class Changes(StateNode):
+class SagChanges(StateNode):
     """Changes of sag since the reference, as seen by the three, µm."""
 
     laser_um: float
@@ -62,7 +53,7 @@ class Changes(StateNode):
             f"{self.gauge_um:+.1f} µm"
         )
 
-    def judge(self) -> Liar:
+    def judge(self) -> FaultySensor:
         """Which of laser and optics the gauge contradicts: it must be clearly nearer to the other
         one.
         """
@@ -71,10 +62,10 @@ class Changes(StateNode):
             abs(self.gauge_um - self.optics_um),
         )
         if to_optics_um * CLEARER < to_laser_um:
-            return Liar.LASER
+            return FaultySensor.LASER
         if to_laser_um * CLEARER < to_optics_um:
-            return Liar.OPTICS
-        return Liar.UNSURE
+            return FaultySensor.OPTICS
+        return FaultySensor.UNKNOWN
 
 
 @dataclass(slots=True)
@@ -105,14 +96,14 @@ class ReferenceMeans(StateNode):
         self.optics_um += share * (means[1] - self.optics_um)
         self.gauge_pa += share * (means[2] - self.gauge_pa)
 
-    def changes(self, means: tuple[float, float, float], sag_um: float) -> Changes:
+    def changes(self, means: tuple[float, float, float], sag_um: float) -> SagChanges:
         """Changes of sag since the reference; the gauge's by Hencky's law: the sag goes with the
         cube root.
 
         `sag_um` is that of the mirror at displacement 0.
         """
         gauge_um = (sag_um + self.laser_um) * (math.cbrt(means[2] / self.gauge_pa) - 1)
-        return Changes(means[0] - self.laser_um, means[1] - self.optics_um, gauge_um)
+        return SagChanges(means[0] - self.laser_um, means[1] - self.optics_um, gauge_um)
 
 
 @dataclass(slots=True)
@@ -132,12 +123,12 @@ class PlausibilityState(StateNode):
     figure_s: float = math.nan
     laser_gap_s: float = 0.0
     slow_wrong: bool = False  # the verdict is the slow reference's
-    liar: Liar = Liar.NOBODY
-    changes: Changes = Changes(math.nan, math.nan, math.nan)
+    faulty: FaultySensor = FaultySensor.NONE
+    changes: SagChanges = SagChanges(math.nan, math.nan, math.nan)
 
 
 class PlausibilityCheck:
-    """Judges on every tick, also while the film moves; NOBODY without a camera, as two sensors can
+    """Judges on every tick, also while the film moves; NONE without a camera, as two sensors can
     only disagree.
 
     Laser and camera may be `limit_um` apart (`shape.disagreement_max_um`) within minutes, and
@@ -167,12 +158,12 @@ class PlausibilityCheck:
         self.memory = memory or PlausibilityState()
 
     @property
-    def liar(self) -> Liar:
+    def faulty(self) -> FaultySensor:
         """The verdict."""
-        return self.memory.liar
+        return self.memory.faulty
 
     @property
-    def changes(self) -> Changes:
+    def changes(self) -> SagChanges:
         """Changes of sag by which it was reached."""
         return self.memory.changes
 
@@ -194,7 +185,7 @@ class PlausibilityCheck:
         self._clear_verdict()
 
     def _clear_verdict(self) -> None:
-        self.memory.liar = Liar.NOBODY
+        self.memory.faulty = FaultySensor.NONE
         self.memory.slow_wrong = False
 
     @property
@@ -221,7 +212,7 @@ class PlausibilityCheck:
         gauge_pa: float,
         estimate: ShapeEstimate | None,
         blind: bool = False,
-    ) -> Liar:
+    ) -> FaultySensor:
         """Process one tick of a held mirror; NaN without a good reading; the estimate only in its
         tick of arrival.
 
@@ -245,7 +236,7 @@ class PlausibilityCheck:
             memory.age_s += dt_s
             memory.readings += 1
             self._judge(means, dt_s)
-        return memory.liar
+        return memory.faulty
 
     def _take_laser(self, displacement_um: float, dt_s: float) -> None:
         """Update the laser's mean; after a gap it begins with the first reading, for the film may
@@ -273,7 +264,7 @@ class PlausibilityCheck:
         for reference in (memory.fast, memory.slow):
             if not reference.known:
                 reference.begin(means)
-        if memory.liar in (Liar.LASER, Liar.OPTICS):
+        if memory.faulty in (FaultySensor.LASER, FaultySensor.OPTICS):
             # The verdict stands until the two clearly agree again: a drifting gauge must not accuse
             # the other.
             judged = memory.slow if memory.slow_wrong else memory.fast
@@ -283,9 +274,9 @@ class PlausibilityCheck:
                 self._clear_verdict()
         else:
             self._judge_fast(means)
-            if memory.liar == Liar.NOBODY:
+            if memory.faulty == FaultySensor.NONE:
                 self._judge_slowly(means)
-        if memory.liar == Liar.NOBODY:
+        if memory.faulty == FaultySensor.NONE:
             memory.fast.follow(means, dt_s, REFERENCE_S)
             memory.slow.follow(means, dt_s, SLOW_REFERENCE_S)
 
@@ -293,10 +284,10 @@ class PlausibilityCheck:
         memory = self.memory
         memory.changes = changes = memory.fast.changes(means, self._sag_um)
         limit_um = (
-            self._limit_um if memory.liar == Liar.NOBODY else self._limit_um / 2
+            self._limit_um if memory.faulty == FaultySensor.NONE else self._limit_um / 2
         )  # and back only when clearly so
         agree = abs(changes.laser_um - changes.optics_um) <= limit_um + self._lag_um
-        memory.liar = Liar.NOBODY if agree else changes.judge()
+        memory.faulty = FaultySensor.NONE if agree else changes.judge()
 
     def _judge_slowly(self, means: tuple[float, float, float]) -> None:
         """Find a camera that drifts slowly; a laser's slow drift is its mount's,
@@ -305,7 +296,7 @@ class PlausibilityCheck:
         memory = self.memory
         changes = memory.slow.changes(means, self._sag_um)
         apart = abs(changes.laser_um - changes.optics_um) > self._slow_limit_um + self._lag_um
-        if apart and changes.judge() == Liar.OPTICS:
-            memory.liar = Liar.OPTICS
+        if apart and changes.judge() == FaultySensor.OPTICS:
+            memory.faulty = FaultySensor.OPTICS
             memory.changes = changes
             memory.slow_wrong = True

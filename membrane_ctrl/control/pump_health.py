@@ -2,7 +2,7 @@
 
 from dataclasses import dataclass
 
-from membrane_ctrl.control.maintenance_notice import BETTER, FilmWarning
+from membrane_ctrl.control.maintenance_notice import WITHDRAWN_BELOW, MaintenanceNotice
 from membrane_ctrl.control.pump_drift import PumpScale
 from membrane_ctrl.model.state_tree import Count, StateNode
 
@@ -31,7 +31,7 @@ class PumpHealth:
         """Another curve is in force, with this limit of its drift."""
         self._change_max = change_max
 
-    def step(self, known: PumpScale) -> tuple[bool, tuple[FilmWarning, ...]]:
+    def step(self, known: PumpScale) -> tuple[bool, tuple[MaintenanceNotice, ...]]:
         """Take a segment's estimate; returns whether to report it,
         and a new or withdrawn warning.
         """
@@ -39,7 +39,7 @@ class PumpHealth:
         memory.count += 1
         change = known.scale - 1.0
         bad = abs(change) > max(self._change_max, _PUMP_SIGMAS * known.sigma) * (
-            BETTER if memory.warned else 1.0
+            WITHDRAWN_BELOW if memory.warned else 1.0
         )
         says = (
             f"the pump gives {100 * abs(change):.0f} % {'less' if change < 0 else 'more'} than "
@@ -47,7 +47,7 @@ class PumpHealth:
         )
         says += f" (+- {100 * known.sigma:.0f} %): check it, then `tune pump`"
         news = (
-            (FilmWarning("pump_drift", says if bad else "no longer so", bad),)
+            (MaintenanceNotice("pump_drift", says if bad else "no longer so", bad),)
             if bad != memory.warned
             else ()
         )

@@ -9,12 +9,12 @@ _TEMPERATURE_C = (-20.0, 60.0)
 
 def weather_fault(ambient_pressure_pa: float, air_temperature_c: float) -> str:
     """Name the sensor with an impossible reading; absent ones (NaN) do not count."""
-    if not _believed(ambient_pressure_pa, _PRESSURE_PA):
+    if not _is_possible(ambient_pressure_pa, _PRESSURE_PA):
         return (
             f"the barometer reads {ambient_pressure_pa:g} Pa: check its unit; the feed-forward "
             "does without it"
         )
-    if not _believed(air_temperature_c, _TEMPERATURE_C):
+    if not _is_possible(air_temperature_c, _TEMPERATURE_C):
         return (
             f"the air thermometer reads {air_temperature_c:g} C: check its unit; the "
             "feed-forward does without it"
@@ -22,13 +22,15 @@ def weather_fault(ambient_pressure_pa: float, air_temperature_c: float) -> str:
     return ""
 
 
-def believed_weather(ambient_pressure_pa: float, air_temperature_c: float) -> tuple[float, float]:
+def discard_impossible_weather(
+    ambient_pressure_pa: float, air_temperature_c: float
+) -> tuple[float, float]:
     """The readings, an impossible one as NaN."""
     return (
-        ambient_pressure_pa if _believed(ambient_pressure_pa, _PRESSURE_PA) else math.nan,
-        air_temperature_c if _believed(air_temperature_c, _TEMPERATURE_C) else math.nan,
+        ambient_pressure_pa if _is_possible(ambient_pressure_pa, _PRESSURE_PA) else math.nan,
+        air_temperature_c if _is_possible(air_temperature_c, _TEMPERATURE_C) else math.nan,
     )
 
 
-def _believed(value: float, within: tuple[float, float]) -> bool:
+def _is_possible(value: float, within: tuple[float, float]) -> bool:
     return math.isnan(value) or within[0] <= value <= within[1]

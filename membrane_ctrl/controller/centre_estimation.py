@@ -10,7 +10,7 @@ from membrane_ctrl.control import (
     inner_loop,
     weather_limits,
 )
-from membrane_ctrl.control.camera_mount import StandGrowth
+from membrane_ctrl.control.camera_mount import CameraMountGrowth
 from membrane_ctrl.control.centre import LOCK_FRAMES, CentreFilter, CentreState
 from membrane_ctrl.control.centre_estimate import CentreEstimate, CentreReadings, Sensor
 from membrane_ctrl.control.filters import LowPass
@@ -52,7 +52,7 @@ class CentreEstimationState(StateNode):
     agreed_mount: LowPass = field(default_factory=LowPass)
     slowly_agreed_mount: LowPass = field(default_factory=LowPass)
     mount_drift: MountDriftState = field(default_factory=MountDriftState)
-    stand: camera_mount.StandGrowthState = field(default_factory=camera_mount.StandGrowthState)
+    stand: camera_mount.CameraMountState = field(default_factory=camera_mount.CameraMountState)
     mount_growth_reported: bool = False
     reported_sensors: tuple[int, ...] | None = None  # the sensors, as reported
     sensors_changed_s: float = math.nan
@@ -77,7 +77,7 @@ class CentreEstimation:
         )
         self._tracks = config.shape.mode == "track"
         self._mount_drift = MountDrift(config.shape, self.memory.mount_drift, config.by_optics)
-        self._stand = StandGrowth(config.estimator, self.memory.stand)
+        self._stand = CameraMountGrowth(config.estimator, self.memory.stand)
         self._stand_most_um = _STAND_SHARE * config.limits.band_um
 
     @property
@@ -141,7 +141,7 @@ class CentreEstimation:
         )
         reading = inputs.reading
         self._stand.step(
-            weather_limits.believed_weather(math.nan, reading.air_temperature_c)[1]
+            weather_limits.discard_impossible_weather(math.nan, reading.air_temperature_c)[1]
             if reading
             else math.nan,
             context.dt_s,

@@ -15,7 +15,6 @@ from membrane_ctrl.control import (
 )
 from membrane_ctrl.control.plausibility import (
     LASER_GAP_S,
-    Liar,
     PlausibilityCheck,
     PlausibilityState,
 )
@@ -42,12 +41,6 @@ from membrane_ctrl.model.telemetry import State
 _WEATHER_STANDS_S = 10.0  # a single bad answer is not reported
 # No two cycles have the same noise; a shape that appears twice may be a repeated message
 _REPEATS = 3
-_FAULTY = {
-    Liar.NOBODY: FaultySensor.NONE,
-    Liar.UNSURE: FaultySensor.UNKNOWN,
-    Liar.LASER: FaultySensor.LASER,
-    Liar.OPTICS: FaultySensor.OPTICS,
-}
 
 # A figure is made of frames of up to a cycle ago, and takes this long to compute and arrive.
 _FIGURE_TAKES_S = 0.5
@@ -86,7 +79,7 @@ class SensorConsistencyState(StateNode):
     camera_s: float = -math.inf  # the newest figure
     sag_um: float = math.nan  # by it
     repeats: Count = 0  # of the same sag, to the last bit
-    faulty_sensor: Liar = Liar.NOBODY
+    faulty_sensor: FaultySensor = FaultySensor.NONE
     laser_fault_s: float = 0.0
     laser_verdicts: RecentCount = field(default_factory=RecentCount)
     weather_s: float = 0.0
@@ -197,9 +190,11 @@ class SensorConsistency:
         self._look_at_camera(held.figure)
         events += self._judge_weather(inputs, dt_s)
         blind = not inputs.now_s - self.memory.camera_s <= self._fresh_s
-        liar = self._plausibility.step(dt_s, laser_um, gauge_pa, held.figure, blind)
+        faulty = self._plausibility.step(dt_s, laser_um, gauge_pa, held.figure, blind)
         self.memory.laser_fault_s = (
-            self.memory.laser_fault_s + dt_s if liar == Liar.LASER and held.held_by_optics else 0.0
+            self.memory.laser_fault_s + dt_s
+            if faulty == FaultySensor.LASER and held.held_by_optics
+            else 0.0
         )
         # A knock is over: the estimate knows the laser's new place. A laser that is knocked again
         # and again is not.
@@ -209,24 +204,24 @@ class SensorConsistency:
         )
         if self.laser_moved:
             self._plausibility.rebase()
-            liar = Liar.NOBODY
-        if liar == Liar.LASER and self.memory.faulty_sensor != Liar.LASER:
+            faulty = FaultySensor.NONE
+        if faulty == FaultySensor.LASER and self.memory.faulty_sensor != FaultySensor.LASER:
             self.memory.laser_verdicts.add(inputs.now_s, _VERDICTS_MAX)
-        events += self._judge(liar)
+        events += self._judge(faulty)
         if moves or state == State.SETTLE:
             return events
         self.memory.gas_excess = self.memory.growth.step(
             held.leak_um_per_s, held.flow_um_per_s, self._most_growth(inputs), dt_s
         )
         events += [
-            _of_warning(each) for each in self._health.step(dt_s, held.leak_um_per_s, gauge_pa)
+            _to_event(each) for each in self._health.step(dt_s, held.leak_um_per_s, gauge_pa)
         ]
         return events
 
     @property
     def sensors_agree(self) -> bool:
         """Laser and camera do not contradict each other, as far as is known."""
-        return self.memory.faulty_sensor == Liar.NOBODY and not self.camera_fault_text
+        return self.memory.faulty_sensor == FaultySensor.NONE and not self.camera_fault_text
 
     @property
     def camera_drifts(self) -> bool:
@@ -246,7 +241,7 @@ class SensorConsistency:
     def report_pump_curve(self, loop: inner_loop.InnerLoop) -> list[Event]:
         """Events on what a segment of probing has told of the pump."""
         report, warnings = self._pump.step(loop.pump_known)
-        events: list[Event] = [_of_warning(warning) for warning in warnings]
+        events: list[Event] = [_to_event(warning) for warning in warnings]
         if report:
             known = loop.pump_known
             scales = (round(value, 4) for value in (known.scale, known.sigma, loop.pump_correction))
@@ -260,7 +255,7 @@ class SensorConsistency:
         self.memory.growth.moves()
         self.memory.gas_excess = ""
         self._plausibility.reset()
-        return self._judge(Liar.NOBODY)
+        return self._judge(FaultySensor.NONE)
 
     @property
     def _optics_alone(self) -> bool:
@@ -358,7 +353,9 @@ class SensorConsistency:
         if not inputs.now_s - self.memory.camera_s <= self._fresh_s:
             return self._leak_growth_max
         return (
-            math.inf if self.memory.faulty_sensor == Liar.NOBODY else leak_growth.CONTRADICTED_MOST
+            math.inf
+            if self.memory.faulty_sensor == FaultySensor.NONE
+            else leak_growth.CONTRADICTED_MOST
         )
 
     def _judge_weather(self, inputs: TickInputs, dt_s: float) -> list[Event]:
@@ -384,30 +381,34 @@ class SensorConsistency:
             )
         ]
 
-    def _judge(self, liar: Liar) -> list[Event]:
+    def _judge(self, faulty: FaultySensor) -> list[Event]:
         repeats = self.memory.repeats >= _REPEATS
-        seen = str(self._plausibility.changes) if liar in (Liar.LASER, Liar.OPTICS) else ""
-        self.memory.laser_fault_text = seen if liar == Liar.LASER else ""
+        seen = (
+            str(self._plausibility.changes)
+            if faulty in (FaultySensor.LASER, FaultySensor.OPTICS)
+            else ""
+        )
+        self.memory.laser_fault_text = seen if faulty == FaultySensor.LASER else ""
         if repeats:
             self.memory.camera_fault_text = (
                 "the camera repeats one shape to the last bit: restart it"
             )
-        elif liar != Liar.OPTICS:
+        elif faulty != FaultySensor.OPTICS:
             self.memory.camera_fault_text = ""
         elif not self.camera_fault_text:  # changed numbers do not make a new reason
             self.memory.camera_fault_text = (
                 f"laser and gauge agree that the camera is wrong: {seen}"
             )
-        if liar == self.memory.faulty_sensor:
+        if faulty == self.memory.faulty_sensor:
             return []
-        self.memory.faulty_sensor = liar
+        self.memory.faulty_sensor = faulty
         seen = (
             str(self._plausibility.changes)
             if self._plausibility.watching
             else "compared anew from here on"
         )
-        return [Plausibility(_FAULTY[liar], seen)]
+        return [Plausibility(faulty, seen)]
 
 
-def _of_warning(warning: maintenance_notice.FilmWarning) -> Event:
+def _to_event(warning: maintenance_notice.MaintenanceNotice) -> Event:
     return (Maintenance if warning.bad else MaintenanceOver)(warning.name, warning.message)

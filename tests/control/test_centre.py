@@ -18,7 +18,7 @@ from membrane_ctrl.control.centre import CentreFilter
 from membrane_ctrl.control.centre_estimate import CentreEstimate, CentreReadings, Sensor
 from membrane_ctrl.control.gas_transit import Transit
 from membrane_ctrl.control.inner_loop import InnerLoop
-from membrane_ctrl.control.innovation_ramp import Ramp
+from membrane_ctrl.control.innovation_ramp import InnovationRamp
 from membrane_ctrl.control.noise_learning import LearnedFactor, ReadingNoise, configured_walk
 from tests.studies.held_centre import Optics, Sensors, hold
 from tests.worlds.foreign_plant import ForeignPlant, ForeignPump
@@ -100,7 +100,7 @@ MOUNT, STAND = np.eye(7)[5], np.eye(7)[6]
 def fixed_noises(monkeypatch: pytest.MonkeyPatch) -> None:
     """Nothing is learned."""
     monkeypatch.setattr(LearnedFactor, "learn", lambda *_: None)
-    monkeypatch.setattr(Ramp, "update", lambda *_: False)
+    monkeypatch.setattr(InnovationRamp, "update", lambda *_: False)
     monkeypatch.setattr(centre, "FRESH_S", dict.fromkeys(Sensor, -1.0))
     monkeypatch.setattr(centre, "_HUBER2", math.inf)
     monkeypatch.setattr(centre, "_FAR2", math.inf)
@@ -507,7 +507,7 @@ def test_few_readings_do_not_overturn_a_long_learned_noise_level() -> None:
 
 
 def test_a_ramp_is_found_with_start_and_slope_and_white_noise_gives_none() -> None:
-    ramp, noise = Ramp(), np.random.default_rng(3).standard_normal(2000)
+    ramp, noise = InnovationRamp(), np.random.default_rng(3).standard_normal(2000)
     assert not any(ramp.update(float(value), 0.05 * k, 8.0) for k, value in enumerate(noise[:1000]))
     for k, value in enumerate(noise[1000:].tolist()):
         if ramp.update(value - 0.4 * k, 50.0 + 0.05 * k, 8.0):

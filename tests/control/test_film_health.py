@@ -8,13 +8,13 @@ from collections.abc import Callable
 import pytest
 
 from membrane_ctrl.control.film_health import FilmHealth
-from membrane_ctrl.control.maintenance_notice import FilmWarning
+from membrane_ctrl.control.maintenance_notice import MaintenanceNotice
 
 STEP_S = 60.0
 HOURS = Callable[[float], float]
 
 
-def days(leak: HOURS, pressure: HOURS, count: float) -> list[tuple[float, FilmWarning]]:
+def days(leak: HOURS, pressure: HOURS, count: float) -> list[tuple[float, MaintenanceNotice]]:
     """Warnings with their hour."""
     health = FilmHealth(5.3)
     found = []

@@ -118,7 +118,7 @@ def template(tmp_path_factory: pytest.TempPathFactory) -> Path:
     )
     record = synthetic.record(PLANT, samples=6000)
     record_file.save_record(opened.file("experiments.npz"), record)
-    around = operating_point.Around(PLANT.holding_flow_um_per_s, 0.4, 5.3, 1.0)
+    around = operating_point.OperatingPoint(PLANT.holding_flow_um_per_s, 0.4, 5.3, 1.0)
     ends_s = record.duration_s
     head = characterise.ExperimentsHead(
         around,

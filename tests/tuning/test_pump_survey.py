@@ -440,7 +440,7 @@ def test_the_guard_of_a_round_knows_how_late_the_pump_is(
 
     rig = SimpleNamespace(
         hold=lambda seconds: None,
-        around=lambda held, limit_um: operating_point.Around(1.2, 0.3, 5.0, 0.5),
+        around=lambda held, limit_um: operating_point.OperatingPoint(1.2, 0.3, 5.0, 0.5),
         pump=PumpConfig(),
         performed=performed,
     )
@@ -562,11 +562,11 @@ def test_steps_that_see_little_or_contradict_the_curve_are_repeated_for_longer(
     record = SimpleNamespace(followed_by=lambda more: left.pop(0))
     rig = SimpleNamespace(
         hold=lambda seconds: record,
-        around=lambda held: operating_point.Around(1.2, 0.3, 5.0, 0.5),
+        around=lambda held: operating_point.OperatingPoint(1.2, 0.3, 5.0, 0.5),
         perform=lambda seconds: (done_s.append(seconds) or record, None),
     )
     monkeypatch.setattr(map_pump, "_returned", lambda rig: True)
-    monkeypatch.setattr(operating_point, "room", lambda around: None)
+    monkeypatch.setattr(operating_point, "require_room", lambda around: None)
     monkeypatch.setattr(experiments, "make_spec", lambda kind, around, seconds: seconds)
     bent = {gain: told for gain, _, told in seen}
     monkeypatch.setattr(

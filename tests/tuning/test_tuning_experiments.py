@@ -13,7 +13,7 @@ import pytest
 from membrane_ctrl.config.schema import PumpConfig
 from membrane_ctrl.control.experiments.excursion_guard import ExcursionGuard
 from membrane_ctrl.control.experiments.experiment import BenchSample, Experiment, Finished
-from membrane_ctrl.control.experiments.operating_point import Around, quieted
+from membrane_ctrl.control.experiments.operating_point import OperatingPoint, choose_filters
 from membrane_ctrl.control.experiments.patterned import Patterned
 from membrane_ctrl.control.experiments.patterns import doublets, multisine, steps
 from membrane_ctrl.control.experiments.relay import Relay
@@ -24,7 +24,7 @@ from tuning.identification.record import Record
 from tuning.rigs.bench_rig import Rig
 from tuning.rigs.operating_point import estimate_laser_noise_um
 
-AROUND = Around(1.24, 0.32, 5.3, 1.0)
+AROUND = OperatingPoint(1.24, 0.32, 5.3, 1.0)
 
 
 class SaturatingPump(TwinBench):
@@ -55,7 +55,7 @@ class Constant:
         return self.FLOW_UM_PER_S
 
 
-def run(rig: Rig, experiment: Experiment, around: Around) -> tuple[Record, Finished]:
+def run(rig: Rig, experiment: Experiment, around: OperatingPoint) -> tuple[Record, Finished]:
     """An experiment about 0 inside its guard."""
     guard = ExcursionGuard(experiment, around, 0.0, 1 / rig.dt_s)
     return rig._run(guard, around.holding_flow_um_per_s)
@@ -177,7 +177,7 @@ def test_the_guard_keeps_more_in_hand_where_readings_are_few(
 
 
 def test_a_limit_within_the_noise_is_refused() -> None:
-    around = Around(1.24, 0.32, 5.3, 3.0)
+    around = OperatingPoint(1.24, 0.32, 5.3, 3.0)
     with pytest.raises(ValueError, match="noise alone takes 13"):
         ExcursionGuard(Patterned(around, lambda _: 0.0, 60.0, 0.0), around, 0.0, 10.0)
 
@@ -240,7 +240,7 @@ def test_handing_over_between_loop_and_experiment_is_bumpless() -> None:
 @pytest.mark.parametrize("laser_um", [0.3, 1.0, 2.0])
 def test_noise_alone_stops_no_experiment_at_any_rate(rate_hz: float, laser_um: float) -> None:
     """A sound relay turns the centre at 4.5 µm in a limit of 10; two minutes of noise there."""
-    around = quieted(replace(AROUND, laser_um=laser_um), rate_hz)
+    around = choose_filters(replace(AROUND, laser_um=laser_um), rate_hz)
     guard = ExcursionGuard(Patterned(around, lambda _: 0.0, 1e9, 0.0), around, 0.0, rate_hz)
     noise_um = laser_um * np.random.default_rng(2).standard_normal(round(120 * rate_hz))
     noise_um[0] = 0.0  # the filters start there
@@ -306,7 +306,7 @@ def test_what_is_known_of_the_delay_stops_a_moving_mirror_earlier_unless_the_noi
     None
 ):
     def stopped_um(laser_um: float, late_s: float) -> float:
-        around = quieted(replace(AROUND, laser_um=laser_um, late_s=late_s), 50.0)
+        around = choose_filters(replace(AROUND, laser_um=laser_um, late_s=late_s), 50.0)
         guard = ExcursionGuard(Constant(), around, 0.0, 50.0)
         way_um = np.arange(0.0, 10.0, 0.06)  # 3 µm/s
         return next(

@@ -67,7 +67,7 @@ class ExperimentRig(Protocol):
         """Hold for a time."""
         ...
 
-    def around(self, held: Record, limit_um: float) -> operating_point.Around:
+    def around(self, held: Record, limit_um: float) -> operating_point.OperatingPoint:
         """Operating point of an experiment."""
         ...
 
@@ -80,7 +80,7 @@ class ExperimentRig(Protocol):
 class Experiments:
     """Raw results of the experiments."""
 
-    around: operating_point.Around  # holding flow, laser noise, limits
+    around: operating_point.OperatingPoint  # holding flow, laser noise, limits
     record: Record  # relays, the holds between, doublets, without a gap
     relays_s: float  # duration of the relays with the holds after them
     pulses_s: tuple[float, float]  # start and end of the longest doublets
@@ -109,7 +109,10 @@ class ExperimentError(Exception):
 
 
 def make_spec(
-    kind: ExperimentKind, around: operating_point.Around, duration_s: float, gain: float = 1.0
+    kind: ExperimentKind,
+    around: operating_point.OperatingPoint,
+    duration_s: float,
+    gain: float = 1.0,
 ) -> ExperimentSpec:
     """The specification of an experiment at an operating point. Raises pydantic.ValidationError out
     of bounds.
@@ -138,7 +141,9 @@ def run_experiments(rig: ExperimentRig, limit_um: float = 10.0, plan: Plan = FUL
         rig.hold(plan.settle_s)
     held = rig.hold(plan.quiet_s)
     around = rig.around(held, limit_um)
-    operating_point.room(around)  # without room a relay would only report that it was stopped
+    operating_point.require_room(
+        around
+    )  # without room a relay would only report that it was stopped
     relays, finished = _relays(rig, around, plan)
     found = identify_plant(relays)
     around, gain = replace(around, late_s=found.model.delay_s), found.model.gain
@@ -167,7 +172,7 @@ def fit_experiments(done: Experiments) -> Characterised:
 
 
 def _relays(
-    rig: ExperimentRig, around: operating_point.Around, plan: Plan
+    rig: ExperimentRig, around: operating_point.OperatingPoint, plan: Plan
 ) -> tuple[Record, Finished]:
     """Relays until the gain is known, or the data ask for the pump's map, each followed by a hold.
 

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from membrane_ctrl.config.schema import PumpConfig
-from membrane_ctrl.control.experiments.operating_point import bleed_open
+from membrane_ctrl.control.experiments.operating_point import describe_bleed_remedy
 from membrane_ctrl.control.experiments.spec import LIMIT_MAX_UM
 from membrane_ctrl.model.arrays import FloatArray
 from tuning.identification.curve_shape import Branch, find_first_jump
@@ -201,10 +201,9 @@ class Surveyed:
         ):
             raise ValueError(
                 f"{said}: the flow rises from {flows[below]:.1f} µm/s at a command of "
-                f"{fractions[below]:.2f} to "
-                f"{flows[above]:.1f} µm/s at {fractions[above]:.2f}, and the mirror loses "
-                f"{leak:.1f} µm/s: throttle "
-                f"the pump, or {bleed_open(leak, flows[above])}, then run `tune pump` again"
+                f"{fractions[below]:.2f} to {flows[above]:.1f} µm/s at {fractions[above]:.2f}, "
+                f"and the mirror loses {leak:.1f} µm/s: throttle the pump, or "
+                f"{describe_bleed_remedy(leak, flows[above])}, then run `tune pump` again"
             )
 
 

@@ -72,7 +72,7 @@ class Rig:
             samples.append(self._last)
             self._last = self._bench.exchange(out.pump_fraction, self._config.bleed_fraction)
 
-    def around(self, held: Record, limit_um: float = 10.0) -> operating_point.Around:
+    def around(self, held: Record, limit_um: float = 10.0) -> operating_point.OperatingPoint:
         """Operating point of an experiment, from the hold before it."""
         return make_operating_point(held, self._config, self._pump, limit_um)
 

@@ -68,7 +68,7 @@ class HoldRig:
         setpoints = np.interp(read, ticks, [row.setpoint_um for row in rows])
         return record, setpoints
 
-    def around(self, held: Record, limit_um: float = 10.0) -> operating_point.Around:
+    def around(self, held: Record, limit_um: float = 10.0) -> operating_point.OperatingPoint:
         """Operating point of an experiment, from the hold before it."""
         return make_operating_point(held, self.loop, self.pump, limit_um)
 

@@ -12,9 +12,9 @@ from tuning.identification.record import Record
 
 def make_operating_point(
     held: Record, loop: LoopConfig, pump: PumpConfig, limit_um: float
-) -> operating_point.Around:
+) -> operating_point.OperatingPoint:
     """Operating point of an experiment, from the hold before it and the pump's range."""
-    return operating_point.Around(
+    return operating_point.OperatingPoint(
         holding_flow_um_per_s=float(held.flow_um_per_s.mean()),
         least_flow_um_per_s=pump_curve.PumpCurve(pump).least_flow_um_per_s,
         full_flow_um_per_s=loop.flow_most_um_per_s(pump),

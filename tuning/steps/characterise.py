@@ -15,7 +15,7 @@ HELD_RECORD = "held.npz"  # the quiet hold of a short session, recorded before t
 class ExperimentsHead:
     """`experiments.json`: an `experiments.Experiments` without its record."""
 
-    around: operating_point.Around
+    around: operating_point.OperatingPoint
     relays_s: float
     pulses_s: tuple[float, float]
     finished: experiment.Finished

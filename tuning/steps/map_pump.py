@@ -194,7 +194,7 @@ def _checked(rig: HoldRig, late_s: float) -> tuple[float, float]:
         _returned(rig)
         rig.hold(_CHECK_AFTER_S)
         around = replace(rig.around(rig.hold(_CHECK_BEFORE_S)), late_s=late_s)
-        operating_point.room(around)
+        operating_point.require_room(around)
         record, _ = rig.perform(experiments.make_spec("steps", around, steps_s))
         found = plant_fit.identify_plant(record.followed_by(rig.hold(_CHECK_AFTER_S)))
         gain, sigma = found.model.gain, found.sigma.gain

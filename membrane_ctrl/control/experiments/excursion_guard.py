@@ -12,7 +12,7 @@ from membrane_ctrl.control.experiments.experiment import (
 from membrane_ctrl.control.experiments.operating_point import (
     NOISE_MARGIN_SIGMAS,
     PULL_PER_S,
-    Around,
+    OperatingPoint,
 )
 from membrane_ctrl.model.state_tree import StateNode
 
@@ -49,7 +49,7 @@ class ExcursionGuard:
     def __init__(
         self,
         experiment: Experiment,
-        around: Around,
+        around: OperatingPoint,
         centre_um: float,
         rate_hz: float,
         raw: bool = False,

@@ -16,7 +16,7 @@ PULL_PER_S = 0.15  # stable on a pump three times as strong as configured, and 2
 
 
 @dataclass(frozen=True, slots=True)
-class Around(StateNode):
+class OperatingPoint(StateNode):
     """The operating point of an experiment."""
 
     holding_flow_um_per_s: float  # mean flow of the loop before it
@@ -25,14 +25,14 @@ class Around(StateNode):
     laser_um: float  # standard deviation of a reading
     limit_um: float = 10.0  # largest excursion of the centre from where it stood
     late_s: float = USUAL_LATE_S  # delay and lag of the pump, if known
-    stretch: float = 1.0  # of the filters, for a noisy laser with few readings (`quieted`)
+    stretch: float = 1.0  # of the filters, for a noisy laser with few readings (`choose_filters`)
 
     def within(self, flow_um_per_s: float) -> float:
         """The nearest flow of a running pump."""
         return min(max(flow_um_per_s, self.least_flow_um_per_s), self.full_flow_um_per_s)
 
 
-def quieted(around: Around, rate_hz: float) -> Around:
+def choose_filters(around: OperatingPoint, rate_hz: float) -> OperatingPoint:
     """With filters that leave the noise its share of the limit; if none does, the longest for the
     usual delay.
     """
@@ -43,7 +43,7 @@ def quieted(around: Around, rate_hz: float) -> Around:
     return replace(around, late_s=late_s, stretch=stretch)
 
 
-def room(around: Around) -> tuple[float, float]:
+def require_room(around: OperatingPoint) -> tuple[float, float]:
     """Flow above and below the holding flow. Raises ValueError without any: the mirror is too tight
     or too leaky.
     """
@@ -55,7 +55,7 @@ def room(around: Around) -> tuple[float, float]:
             "the pump's range of "
             f"{around.least_flow_um_per_s:.2f} .. {around.full_flow_um_per_s:.2f} µm/s: "
             + (
-                bleed_open(around.holding_flow_um_per_s, around.least_flow_um_per_s)
+                describe_bleed_remedy(around.holding_flow_um_per_s, around.least_flow_um_per_s)
                 if down <= 0
                 else "find the leak"
             )
@@ -63,7 +63,7 @@ def room(around: Around) -> tuple[float, float]:
     return up, down
 
 
-def bleed_open(loss_um_per_s: float, least_um_per_s: float = 0.0) -> str:
+def describe_bleed_remedy(loss_um_per_s: float, least_um_per_s: float = 0.0) -> str:
     """What to do where a mirror loses too little gas for the least flow of its pump."""
     more_um_per_s = max(0.3, 1.5 * least_um_per_s - loss_um_per_s)
     share = more_um_per_s / pump_curve.VENT_FULL_UM_PER_S

@@ -5,7 +5,7 @@ from dataclasses import dataclass, field
 
 from membrane_ctrl.control.experiments.centre_motion import CentreMotion, MotionState
 from membrane_ctrl.control.experiments.experiment import BenchSample, ExperimentEnd, Finished
-from membrane_ctrl.control.experiments.operating_point import PULL_PER_S, Around
+from membrane_ctrl.control.experiments.operating_point import PULL_PER_S, OperatingPoint
 from membrane_ctrl.model.state_tree import StateNode
 
 
@@ -28,7 +28,7 @@ class Patterned:
 
     def __init__(
         self,
-        around: Around,
+        around: OperatingPoint,
         pattern: Callable[[float], float],
         duration_s: float,
         centre_um: float,

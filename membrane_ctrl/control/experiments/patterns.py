@@ -14,21 +14,21 @@ Pattern = Callable[[float], float]
 _SHARE = 0.25  # of the excursion limit: the weather, the pull and the laser's noise need the rest
 
 
-def steps(around: operating_point.Around, gain: float, hold_s: float = 2.0) -> Pattern:
+def steps(around: operating_point.OperatingPoint, gain: float, hold_s: float = 2.0) -> Pattern:
     """Up, back, down, back, each for `hold_s`: easy to judge by eye."""
-    up, down = operating_point.room(around)
+    up, down = operating_point.require_room(around)
     size = min(up, down, _SHARE * around.limit_um / (gain * hold_s))
     levels = (size, 0.0, -size, 0.0)
     return lambda time_s: levels[int(time_s / hold_s) % 4]
 
 
-def doublets(around: operating_point.Around, gain: float, pulse_s: float = 0.3) -> Pattern:
+def doublets(around: operating_point.OperatingPoint, gain: float, pulse_s: float = 0.3) -> Pattern:
     """Short pulses up, each followed by an equal one down: many steep edges, which separate dead
     time from lag.
 
     The downward flow is limited by the leak, so it takes longer; the mean flow is the holding flow.
     """
-    up, down = operating_point.room(around)
+    up, down = operating_point.require_room(around)
     size = min(up, _SHARE * around.limit_um / (gain * pulse_s))
     down = min(down, size)
     period_s = pulse_s * (1 + size / down)
@@ -36,7 +36,7 @@ def doublets(around: operating_point.Around, gain: float, pulse_s: float = 0.3) 
 
 
 def multisine(
-    around: operating_point.Around,
+    around: operating_point.OperatingPoint,
     gain: float,
     slowest_rad_per_s: float = 0.3,
     fastest_rad_per_s: float = 6.0,
@@ -53,7 +53,7 @@ def multisine(
     flow = (amplitudes * np.sin(w * time_s + phases)).sum(axis=1)
     way = (amplitudes / w * np.cos(w * time_s + phases)).sum(axis=1)
     scale = min(
-        min(operating_point.room(around)) / np.abs(flow).max(),
+        min(operating_point.require_room(around)) / np.abs(flow).max(),
         _SHARE * around.limit_um / (gain * np.abs(way).max()),
     )
     return lambda now_s: float(scale * (amplitudes * np.sin(w * now_s + phases)).sum())

@@ -11,7 +11,7 @@ from dataclasses import dataclass, field
 
 from membrane_ctrl.control.experiments.centre_motion import CentreMotion, MotionState
 from membrane_ctrl.control.experiments.experiment import BenchSample, ExperimentEnd, Finished
-from membrane_ctrl.control.experiments.operating_point import Around, bleed_open
+from membrane_ctrl.control.experiments.operating_point import OperatingPoint, describe_bleed_remedy
 from membrane_ctrl.model.state_tree import Count, StateNode
 
 THRESHOLD_SHARE = 0.25  # of the excursion limit
@@ -51,7 +51,7 @@ class RelayState(StateNode):
         return 1 if self.rises else -1
 
 
-def begin_relay(around: Around) -> RelayState:
+def begin_relay(around: OperatingPoint) -> RelayState:
     """The state of a relay that begins."""
     first = min(around.holding_flow_um_per_s, _FIRST_MAX_UM_PER_S)
     return RelayState(HalfCycle(first, first), HalfCycle(first, first))
@@ -64,7 +64,7 @@ class Relay:
 
     def __init__(
         self,
-        around: Around,
+        around: OperatingPoint,
         centre_um: float,
         duration_s: float = 120.0,
         memory: RelayState | None = None,
@@ -101,7 +101,9 @@ class Relay:
             self._switch()
         elif memory.since_switch_s > _PATIENCE_S:
             way = "rise" if memory.rises else "sink"
-            open_bleed = bleed_open(around.holding_flow_um_per_s, around.least_flow_um_per_s)
+            open_bleed = describe_bleed_remedy(
+                around.holding_flow_um_per_s, around.least_flow_um_per_s
+            )
             remedy = "check the pump, its tube and the leak" if memory.rises else open_bleed
             still = (
                 f"the mirror did not {way} by {self._threshold_um:g} µm in {_PATIENCE_S:g} s: "

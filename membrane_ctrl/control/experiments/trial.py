@@ -24,7 +24,7 @@ class TrialState(StateNode):
     """An experiment in progress: what it was made of, and where it is."""
 
     spec: ExperimentSpec
-    around: operating_point.Around
+    around: operating_point.OperatingPoint
     centre_um: float
     left_s: float
     guard: excursion_guard.GuardState = field(default_factory=excursion_guard.GuardState)
@@ -38,7 +38,7 @@ def begin_trial(
     spec: ExperimentSpec, loop: LoopConfig, pump: PumpConfig, centre_um: float
 ) -> TrialState:
     """The state of an experiment that begins about `centre_um`."""
-    around = operating_point.Around(
+    around = operating_point.OperatingPoint(
         holding_flow_um_per_s=spec.holding_flow_um_per_s,
         least_flow_um_per_s=PumpCurve(pump).least_flow_um_per_s,
         full_flow_um_per_s=loop.flow_most_um_per_s(pump),
@@ -46,7 +46,7 @@ def begin_trial(
         limit_um=spec.limit_um,
         late_s=spec.late_s,
     )
-    around = operating_point.quieted(around, loop.rate_hz)
+    around = operating_point.choose_filters(around, loop.rate_hz)
     begun = TrialState(spec, around, centre_um, spec.duration_s)
     match spec.kind:
         case "relay":
