@@ -6,7 +6,7 @@ from collections.abc import Awaitable, Callable, Sequence
 from functools import partial
 
 from firmware_iface import register_map, roles
-from firmware_iface.links.modbus_tcp import ModbusLink
+from firmware_iface.links.modbus_link import ModbusLink
 from firmware_iface.requirement import ConformanceError, require
 
 PUMP_FRACTION = 0.05  # below what starts a diaphragm pump

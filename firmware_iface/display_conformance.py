@@ -10,7 +10,7 @@ from contextlib import contextmanager
 
 import numpy as np
 
-from firmware_iface.display import checkerboard
+from firmware_iface.display_patterns import checkerboard
 from firmware_iface.requirement import require, require_error
 from firmware_iface.roles import DeviceRefusedError, Display, Levels, LinkDownError, LinkError
 

@@ -8,7 +8,8 @@ not when it is lit: `wait` lasts for the settle time, which `firmware_iface.disp
 from collections.abc import Sequence
 from typing import Any
 
-from firmware_iface.display import DisplayResponse, ScreenRaster, linear_response, pattern_light
+from firmware_iface.display_patterns import ScreenRaster, pattern_light
+from firmware_iface.display_response import DisplayResponse, linear_response
 from firmware_iface.driver_calls import call_driver, close_driver
 from firmware_iface.roles import DeviceIdentity, Display, DriverClock, Levels, LinkError, Pattern
 

@@ -4,6 +4,22 @@ from typing import Annotated, Any, Literal, get_args
 
 from pydantic import BaseModel, ConfigDict, Field, model_validator
 
+# what means the same for every device says so here
+_PORT = "Serial port, /dev/ttyUSB0 or usb:VID:PID[:SERIAL]. Set it to the one that `devices` lists."
+_LINK = "Modbus line, tcp://HOST:PORT or rtu:///dev/ttyUSB0?baud=115200&parity=E. Set it as wired."
+MODBUS_URL_PATTERN = r"^(tcp|rtu)://."
+_UNIT = "Modbus address of the device. Set it as stored in the device."
+_SERIAL = "Serial number; empty: whichever answers. Set it to refuse any other instrument."
+_TIMEOUT = "Longest wait for an answer. Raise it on a slow line or machine."
+_BAUD = "Baud rate as stored in the device. Change it if the device was set to another."
+_DIRECTION = (
+    "Sign of the reading; -1: the laser is behind the mirror. Set it to 1 for a laser in front."
+)
+_STEP = (
+    "Readings farther than this from both previous ones are rejected. Raise it at low tick rates."
+)
+BOARD_INPUTS = 16
+
 
 class Section(BaseModel):
     """A configuration table: immutable, no unknown keys, no NaN or infinity, no `true` in place of
@@ -56,27 +72,13 @@ Micrometres = Annotated[float, Field(ge=-1e7, le=1e7)]  # ten metres
 Number = Annotated[float, Field(ge=-1e12, le=1e12)]
 Distance = Annotated[float, Field(ge=-1e4, le=1e4)]
 Word = Annotated[int, Field(ge=0, le=0xFFFF)]
-# what means the same for every device says so here
-_PORT = "Serial port, /dev/ttyUSB0 or usb:VID:PID[:SERIAL]. Set it to the one that `devices` lists."
 Port = Annotated[str, Field(min_length=1, description=_PORT)]
-_LINK = "Modbus line, tcp://HOST:PORT or rtu:///dev/ttyUSB0?baud=115200&parity=E. Set it as wired."
-MODBUS_URL_PATTERN = r"^(tcp|rtu)://."
 ModbusUrl = Annotated[str, Field(pattern=MODBUS_URL_PATTERN, description=_LINK)]
-_UNIT = "Modbus address of the device. Set it as stored in the device."
 UnitId = Annotated[int, Field(ge=1, le=247, description=_UNIT)]
-_SERIAL = "Serial number; empty: whichever answers. Set it to refuse any other instrument."
 Serial = Annotated[str, Field(max_length=80, description=_SERIAL)]
-_TIMEOUT = "Longest wait for an answer. Raise it on a slow line or machine."
 Timeout = Annotated[float, Field(gt=0, le=5, description=_TIMEOUT)]
-_BAUD = "Baud rate as stored in the device. Change it if the device was set to another."
 Baud = Annotated[int, Field(ge=300, le=1_000_000, description=_BAUD)]
-_DIRECTION = (
-    "Sign of the reading; -1: the laser is behind the mirror. Set it to 1 for a laser in front."
-)
 Direction = Annotated[Literal[-1, 1], Field(description=_DIRECTION)]
-_STEP = (
-    "Readings farther than this from both previous ones are rejected. Raise it at low tick rates."
-)
 StepMax = Annotated[float, Field(gt=0, le=10_000, description=_STEP)]
 
 
@@ -320,9 +322,6 @@ SENSOR_DRIVERS: dict[str, Any] = {
 }
 ON_MODBUS = (BronkhorstModbusConfig, ModbusMapConfig)  # have a `link`, the others a `port`
 AnyDriver = DisplacementDriver | PumpDriver | PressureDriver | BarometerDriver
-
-
-BOARD_INPUTS = 16
 
 
 class InterlockConfig(Section):

@@ -9,7 +9,7 @@ from membrane_ctrl.metrology.film.hencky_bowl import zernike_projection
 from membrane_ctrl.model import shape_estimate, telemetry
 from membrane_ctrl.model.events import CommandTaken, Event
 from membrane_ctrl.sessions.live_hold import HoldError, News
-from membrane_ctrl.sim import plant, surroundings, virtual_bench
+from membrane_ctrl.sim import bench_events, plant, virtual_bench
 
 _NEWS_S = 0.5
 _HELD_WITHIN_S = 120.0
@@ -42,7 +42,7 @@ class TwinHold:
     def __init__(
         self,
         config: Config,
-        events: Sequence[surroundings.BenchEvent] = (),
+        events: Sequence[bench_events.BenchEvent] = (),
         bench: virtual_bench.VirtualBench | None = None,
         figures: ShapeSource | None = None,
     ) -> None:

@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 
 from membrane_ctrl.config.schema import EstimatorConfig, LoopConfig, PumpConfig, TwinConfig
-from membrane_ctrl.sim.surroundings import LeakChange
+from membrane_ctrl.sim.bench_events import LeakChange
 from tests.studies.held_centre import Optics, Sensors, hold
 from tests.studies.minimum_variance import least_std_um
 from tests.support.figures import Figure, at_most

@@ -17,7 +17,7 @@ from pathlib import Path
 import numpy as np
 
 from firmware_iface.drivers.pump_board import PumpBoard
-from firmware_iface.emulators.modbus_server import respond
+from firmware_iface.emulators.modbus_pdu import respond
 from firmware_iface.emulators.pump_board import BoardSample
 from firmware_iface.emulators.serial_device import PtyWire
 from firmware_iface.links.serial_port import SerialSettings

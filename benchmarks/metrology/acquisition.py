@@ -21,16 +21,17 @@ from typing import Any
 import cv2
 import numpy as np
 
-from firmware_iface.display import ScreenRaster
+from firmware_iface.display_patterns import ScreenRaster
 from firmware_iface.drivers.camera_aravis import AravisCamera
 from firmware_iface.drivers.screen_pygame import PygameDisplay
 from firmware_iface.guarded_camera import GuardedCamera
 from firmware_iface.pattern_screen import PatternScreen
 from firmware_iface.roles import DriverClock, Pattern, SensorFormat
 from firmware_iface.settings import AravisCameraConfig, PygameScreenConfig
-from membrane_ctrl.acquisition.cycle import CycleDone, CyclePlan, ShapeCycle
+from membrane_ctrl.acquisition.cycle import CycleDone, ShapeCycle
+from membrane_ctrl.acquisition.cycle_plan import CyclePlan
 from membrane_ctrl.acquisition.optical_bench import DisplayTest
-from membrane_ctrl.acquisition.session import WaitingClock
+from membrane_ctrl.acquisition.waiting_clock import WaitingClock
 from membrane_ctrl.config.schema import OpticsConfig
 from membrane_ctrl.metrology.cycle.live_reconstructor import LiveReconstructor
 from membrane_ctrl.metrology.phase.pattern_sequence import fringe_sequence, full_sequence

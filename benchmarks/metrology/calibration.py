@@ -39,10 +39,11 @@ from membrane_ctrl.metrology.rays.forward_model import residual_mm
 from membrane_ctrl.metrology.rays.geometry import Geometry
 from membrane_ctrl.metrology.rays.set_phases import SetPhases
 from membrane_ctrl.metrology.rays.surface import Surface
+from membrane_ctrl.sim.optics.bench_poses import CameraPose, ScreenError, ScreenPose
 from membrane_ctrl.sim.optics.camera import OpticsRenderer
 from membrane_ctrl.sim.optics.film_shape import FilmShape, typical_film
-from membrane_ctrl.sim.optics.shade import pattern_sequence
-from membrane_ctrl.sim.optics.trace import CameraPose, ScreenError, ScreenPose, trace
+from membrane_ctrl.sim.optics.pattern_levels import pattern_sequence
+from membrane_ctrl.sim.optics.trace import trace
 from tests.support.figures import Figure, at_least, at_most
 
 FloatArray = NDArray[np.float64]

@@ -34,7 +34,8 @@ from membrane_ctrl.calibration.sets import (
     problem_of,
 )
 from membrane_ctrl.config.optics import CameraConfig, OpticsConfig, ScreenPoseConfig
-from membrane_ctrl.geometry.file import ScreenMovedTable, origin_of, screen_elsewhere
+from membrane_ctrl.geometry.file import stated_origin
+from membrane_ctrl.geometry.set_tables import ScreenMovedTable, move_screen
 from membrane_ctrl.measure.capture_set import CaptureHead, CaptureSet
 from membrane_ctrl.metrology.calibration import figure_uncertainty, verdict
 from membrane_ctrl.metrology.calibration.rim_edges import find_edges
@@ -49,10 +50,10 @@ from membrane_ctrl.metrology.rays.forward_model import MOTION, linearise_points
 from membrane_ctrl.metrology.rays.set_phases import SetPhases
 from membrane_ctrl.metrology.rays.surface import Surface
 from membrane_ctrl.model.zernike_terms import ZERNIKE_TERMS
+from membrane_ctrl.sim.optics.bench_poses import camera_pose
 from membrane_ctrl.sim.optics.film_shape import FilmShape, typical_film
-from membrane_ctrl.sim.optics.shade import Light
+from membrane_ctrl.sim.optics.pattern_levels import Light
 from membrane_ctrl.sim.optics.simulation_spec import leaning
-from membrane_ctrl.sim.optics.trace import camera_pose
 from tests.studies.resumable_answers import answers
 from tests.support.figures import Figure, at_most
 from tests.worlds.misstated_bench import (
@@ -197,7 +198,7 @@ class DrawnBench:
         )
         x, y, z = (rail @ shift_mm + RAIL.shift_sigma_mm * rng.standard_normal(3)).tolist()
         return self.there.model_copy(
-            update={"geometry": screen_elsewhere(self.there.geometry, (x, y, z), turn)}
+            update={"geometry": move_screen(self.there.geometry, (x, y, z), turn)}
         )
 
     def screen_set(self, name: str, side_rad: float, seed: int) -> SetPhases:
@@ -237,7 +238,7 @@ class DrawnBench:
             none,
             math.nan,
             (),
-            origin_of(self.stated),
+            stated_origin(self.stated),
         )
         return phases_of_screen(CaptureSet(head, stack.frames, {}))
 
@@ -261,7 +262,7 @@ def _edges(checked: Checked, surface: Surface) -> FloatArray | None:
 def _with_more_screens(drawn: DrawnBench, sets: list[SetPhases], seed: int) -> None:
     """Add the films seen with the screen on its rail, and two sets of the screen itself."""
     there = drawn.on_rail(seed)
-    geometry = screen_elsewhere(drawn.stated.geometry, RAIL.shift_mm)
+    geometry = move_screen(drawn.stated.geometry, RAIL.shift_mm)
     stated = drawn.stated.model_copy(update={"geometry": geometry})
     for k, moved_um in enumerate(TWO_UM):
         stack, _ = drawn.set_at(moved_um, seed + k, there)

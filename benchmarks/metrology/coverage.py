@@ -18,13 +18,13 @@ from typing import Any
 
 import numpy as np
 
-from membrane_ctrl.geometry.spread_file import spread_of
+from membrane_ctrl.geometry.spread_file import geometry_spread
 from membrane_ctrl.metrology.cycle.live_reconstructor import LiveReconstructor
 from membrane_ctrl.metrology.figure.set_motion import LASER_NOISE_UM
 from membrane_ctrl.metrology.frame_checks.checked_set import RejectedSetError
 from membrane_ctrl.metrology.phase.frame_stack import FrameStack
 from membrane_ctrl.sim.optics.film_shape import typical_film
-from membrane_ctrl.sim.optics.shade import Light
+from membrane_ctrl.sim.optics.pattern_levels import Light
 from tests.studies.measured_sets import TERMS, measured, quantities, truth_of
 from tests.studies.resumable_answers import answers
 from tests.support.figures import Figure, at_most
@@ -84,7 +84,7 @@ def bench(seed: int) -> dict[str, Any]:
     points_mm = np.stack([radius * np.cos(angle), radius * np.sin(angle)])
     rows = quantities(points_mm)
     found, answer = [], {"seed": seed, "calibrated": bool(seed % 2), "causes": room.causes()}
-    spread, _ = spread_of(stated, None)
+    spread, _ = geometry_spread(stated, None)
     live, seen_live = (
         LiveReconstructor(stated, LIVE_BIN_PX, laser_noise_um=LASER_NOISE_UM, spread=spread),
         [],

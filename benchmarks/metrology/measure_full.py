@@ -15,7 +15,7 @@ from membrane_ctrl.metrology.frame_checks.set_check import check_set
 from membrane_ctrl.metrology.phase.frame_stack import FrameStack
 from membrane_ctrl.sim.optics.camera import OpticsRenderer
 from membrane_ctrl.sim.optics.film_shape import typical_film
-from membrane_ctrl.sim.optics.shade import pattern_sequence
+from membrane_ctrl.sim.optics.pattern_levels import pattern_sequence
 from tests.support.figures import Figure, at_most
 from tests.support.peak_memory import peak_mb
 

@@ -23,8 +23,9 @@ from firmware_iface.drivers.camera_aravis import AravisCamera
 from firmware_iface.guarded_camera import GuardedCamera
 from firmware_iface.roles import DriverClock, Pattern, SensorFormat
 from firmware_iface.settings import AravisCameraConfig
-from membrane_ctrl.acquisition.cycle import CycleDone, CyclePlan, ShapeCycle
-from membrane_ctrl.acquisition.session import WaitingClock
+from membrane_ctrl.acquisition.cycle import CycleDone, ShapeCycle
+from membrane_ctrl.acquisition.cycle_plan import CyclePlan
+from membrane_ctrl.acquisition.waiting_clock import WaitingClock
 from membrane_ctrl.config.schema import OpticsConfig
 from membrane_ctrl.metrology.cycle.live_reconstructor import LiveReconstructor
 from membrane_ctrl.metrology.phase.pattern_sequence import fringe_sequence, full_sequence

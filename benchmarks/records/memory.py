@@ -35,7 +35,8 @@ from membrane_ctrl.controller.tick_codec import MESSAGE_BYTES, RECORD, TICK
 from membrane_ctrl.model.clock import RunClock
 from membrane_ctrl.model.shape_estimate import pack_estimate, unpack_estimate
 from membrane_ctrl.model.telemetry import FIELDS, ROW_BYTES
-from membrane_ctrl.processes.child import Child, pipe
+from membrane_ctrl.processes.child import Child
+from membrane_ctrl.processes.event_pipe import pipe
 from membrane_ctrl.processes.ring import RingAddress, RingWriter, ring
 from membrane_ctrl.recorder import process
 from membrane_ctrl.recorder.process import RecorderSpec

@@ -8,14 +8,15 @@ from dataclasses import fields, replace
 
 import psutil
 
-from membrane_ctrl.acquisition.process import AcquisitionSpec
+from membrane_ctrl.acquisition.spec import AcquisitionSpec
 from membrane_ctrl.config.schema import CameraConfig, Config, OpticsConfig, ShapeConfig
 from membrane_ctrl.model.clock import RunClock
 from membrane_ctrl.model.telemetry import FIELDS, ROW_BYTES, TelemetryRow
-from membrane_ctrl.processes.child import Child, pipe
+from membrane_ctrl.processes.child import Child
+from membrane_ctrl.processes.event_pipe import pipe
 from membrane_ctrl.processes.frames import FrameRing
 from membrane_ctrl.processes.ring import RingReader, RingWriter, ring
-from membrane_ctrl.sim.plant import TRUTH_BYTES, Truth
+from membrane_ctrl.sim.truth import TRUTH_BYTES, Truth
 from tests.support.figures import Figure, at_most
 
 WARM_CYCLES, CYCLES = 200, 1500

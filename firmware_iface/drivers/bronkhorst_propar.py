@@ -40,6 +40,14 @@ STATUS_TEXT = {
     12: "general communication error",
     13: "read only parameter",
 }
+MANUAL = "Bronkhorst 9.17.027, sections 3.4 to 3.6"
+_QUIET_S = 0.1
+_ANSWER_BYTES = 50  # the longest: a text of 16 characters, or three floats, with every byte doubled
+# With errors in a tenth of the messages, the same bit flips in two copies once in a million
+_COPIES = 3
+_REFUSALS = (3, 4, 5, 6, 13)  # status: the request itself is wrong for this instrument
+_SEQUENCES = 256
+_FORMATS = {"u8": ">B", "u16": ">H", "f32": ">f"}
 
 
 @dataclass(frozen=True, slots=True)
@@ -149,16 +157,6 @@ def values(data: bytes) -> list[tuple[int, int, bytes]]:
     if chained or not found or not last_group:
         raise ValueError("a parameter is missing")
     return found
-
-
-MANUAL = "Bronkhorst 9.17.027, sections 3.4 to 3.6"
-_QUIET_S = 0.1
-_ANSWER_BYTES = 50  # the longest: a text of 16 characters, or three floats, with every byte doubled
-# With errors in a tenth of the messages, the same bit flips in two copies once in a million
-_COPIES = 3
-_REFUSALS = (3, 4, 5, 6, 13)  # status: the request itself is wrong for this instrument
-_SEQUENCES = 256
-_FORMATS = {"u8": ">B", "u16": ">H", "f32": ">f"}
 
 
 class ProparParameters:

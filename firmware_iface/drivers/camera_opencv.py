@@ -22,12 +22,13 @@ from firmware_iface import roles, settings
 _STALE_FRAMES = 2
 _REAL_TIME = roles.DriverClock()
 _EXPOSURE_MANUAL = 1.0  # V4L2's number; 3 is automatic
+_SUFFIXES = (".png", ".tif", ".tiff", ".bmp", ".pgm")
 
 
 class VideoCapture(Protocol):
     """The part of cv2.VideoCapture that is used."""
 
-    def isOpened(self) -> bool:  # noqa: N802 (OpenCV's name)
+    def isOpened(self) -> bool:  # noqa: N802
         """There is a camera."""
 
     def read(self) -> tuple[bool, Any]:
@@ -137,9 +138,6 @@ class UvcCamera:
             "settings": f"{self._size[0]} x {self._size[1]}, exposure {config.exposure:g}, gain "
             f"{config.gain:g}",
         }
-
-
-_SUFFIXES = (".png", ".tif", ".tiff", ".bmp", ".pgm")
 
 
 class FolderCamera:

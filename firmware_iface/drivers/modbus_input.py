@@ -7,7 +7,7 @@ its supply read 0, which must mean "open".
 from collections.abc import Sequence
 from typing import Literal
 
-from firmware_iface.links.modbus_tcp import ModbusBitLink
+from firmware_iface.links.modbus_link import ModbusBitLink
 from firmware_iface.roles import DeviceIdentity
 
 BitFunction = Literal["discrete", "coil"]

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from firmware_iface.links.modbus_tcp import ModbusLink
+from firmware_iface.links.modbus_link import ModbusLink
 from firmware_iface.roles import (
     Clock,
     DeviceIdentity,

@@ -7,7 +7,7 @@ from collections.abc import Mapping
 from dataclasses import replace
 
 from firmware_iface import register_map, roles
-from firmware_iface.links import modbus_rtu, modbus_tcp
+from firmware_iface.links import modbus_link, modbus_rtu
 
 _KIND = "membrane pump board"
 # of a board of map version 1, for people
@@ -47,7 +47,7 @@ class PumpBoard:
         unit_id: int = 1,
         timeout_s: float = 0.2,
         watchdog_s: float = 0.5,
-        link: modbus_tcp.ModbusLink | None = None,
+        link: modbus_link.ModbusLink | None = None,
     ) -> None:
         if link is None:
             link = modbus_rtu.ModbusLinks().link(url, unit_id, timeout_s)

@@ -7,7 +7,7 @@ Source: Modbus application protocol 1.1b3, sections 6.1 (read coils) and 6.2 (re
 import struct
 from collections.abc import Callable, Mapping
 
-from firmware_iface.emulators import modbus_server
+from firmware_iface.emulators import modbus_pdu
 
 READ_COILS, READ_DISCRETE = 1, 2
 _BITS_MAX = 2000  # in one transaction
@@ -37,15 +37,15 @@ class InputModule:
         if table is None:
             return None
         if self.broken:
-            return modbus_server.exception_pdu(pdu, modbus_server.DEVICE_FAILURE)
+            return modbus_pdu.exception_pdu(pdu, modbus_pdu.DEVICE_FAILURE)
         if len(pdu) != 5:
-            return modbus_server.exception_pdu(pdu, modbus_server.ILLEGAL_VALUE)
+            return modbus_pdu.exception_pdu(pdu, modbus_pdu.ILLEGAL_VALUE)
         address, count = struct.unpack(">HH", pdu[1:])
         if not 1 <= count <= _BITS_MAX:
-            return modbus_server.exception_pdu(pdu, modbus_server.ILLEGAL_VALUE)
+            return modbus_pdu.exception_pdu(pdu, modbus_pdu.ILLEGAL_VALUE)
         places = range(address, address + count)
         if not all(place in table for place in places):
-            return modbus_server.exception_pdu(pdu, modbus_server.ILLEGAL_ADDRESS)
+            return modbus_pdu.exception_pdu(pdu, modbus_pdu.ILLEGAL_ADDRESS)
         packed = 0
         for position, place in enumerate(places):
             if self.powered and table[place]():

@@ -12,6 +12,9 @@ from firmware_iface.emulators.serial_device import LineDevice, Sensor, Transmit
 
 _SYNTAX, _ARGUMENT = "160", "169"
 _PASCALS = {"TORR": 133.322368, "MBAR": 100.0, "PASCAL": 1.0, "MICRON": 0.133322368}
+_PERIOD_S = 0.1  # of its measurements
+_WORD = re.compile(r'"[^"]*"|\S+')
+_DEFAULT_FORMAT = '"P= " 4.2 P " " U3 #r #n'
 
 
 class Mks937bEmulator(LineDevice):
@@ -66,11 +69,6 @@ class Mks937bEmulator(LineDevice):
             mantissa, _, exponent = f"{value:.3E}".partition("E")
             self._held = "OVER" if math.isnan(value) else f"{mantissa}E{int(exponent):+d}"
         return self._held
-
-
-_PERIOD_S = 0.1  # of its measurements
-_WORD = re.compile(r'"[^"]*"|\S+')
-_DEFAULT_FORMAT = '"P= " 4.2 P " " U3 #r #n'
 
 
 class VaisalaPtb330Emulator(LineDevice):

@@ -11,8 +11,8 @@ from dataclasses import dataclass
 from typing import Protocol
 
 from firmware_iface.board_settings import GAUGE_FROZEN_S, GAUGE_TIMEOUT_S
-from firmware_iface.emulators import modbus_server
-from firmware_iface.emulators.modbus_server import (
+from firmware_iface.emulators import modbus_pdu, modbus_server
+from firmware_iface.emulators.modbus_pdu import (
     BUSY,
     ILLEGAL_ADDRESS,
     ILLEGAL_VALUE,
@@ -31,6 +31,9 @@ _SECRETS = dict.fromkeys(
 )  # registers that read as 0
 # the register of a block that carries the claim's secret; a block without one needs no claim
 _KEYS = {"settings": "claim_key", "command": "command_key", "reset": "clear_key"}
+# the board's own loop; the pump is off at most this and one wake-up after the watchdog period
+_PERIOD_S = 0.01
+_GATEWAY_NO_RESPONSE = 11
 
 
 @dataclass(frozen=True, slots=True)
@@ -338,11 +341,6 @@ class BoardState:
         }
 
 
-# the board's own loop; the pump is off at most this and one wake-up after the watchdog period
-_PERIOD_S = 0.01
-_GATEWAY_NO_RESPONSE = 11
-
-
 class BoardPlant(Protocol):
     """The plant on the board's wires."""
 
@@ -439,12 +437,12 @@ class PumpBoardEmulator:
 
     def _handle(self, unit: int, pdu: bytes) -> modbus_server.Answer:
         if unit != self._unit_id:
-            return modbus_server.Answer(modbus_server.exception_pdu(pdu, _GATEWAY_NO_RESPONSE))
+            return modbus_server.Answer(modbus_pdu.exception_pdu(pdu, _GATEWAY_NO_RESPONSE))
         return self.answer(pdu)
 
     def answer(self, pdu: bytes) -> modbus_server.Answer:
         """Carry out a request."""
         self._advance()
-        reply = modbus_server.respond(pdu, self.state)
+        reply = modbus_pdu.respond(pdu, self.state)
         self._actuate()
         return modbus_server.Answer(reply)

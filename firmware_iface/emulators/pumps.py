@@ -9,8 +9,8 @@ import re
 import struct
 from collections.abc import Callable, Sequence
 
-from firmware_iface.drivers import bronkhorst, bronkhorst_propar
-from firmware_iface.emulators import modbus_server, serial_device
+from firmware_iface.drivers import bronkhorst, bronkhorst_modbus, bronkhorst_propar
+from firmware_iface.emulators import modbus_pdu, serial_device
 from firmware_iface.emulators.serial_device import Drive, LineDevice, Transmit
 from firmware_iface.links.serial_port import SerialSettings
 
@@ -32,6 +32,15 @@ _DEFAULTS = {
     39: 0.0,
 }
 _STREAM_PERIOD_S = 0.02
+ANALOG_INPUT = 1  # control mode after power-up: not the bus
+_COUNTS_MAX = 41_942
+_NODE_ANY = 128
+_PARAMETER_ERROR, _TYPE_ERROR, _VALUE_ERROR, _COMMAND_ERROR, _READ_ONLY = 4, 5, 6, 2, 13
+_BY_PLACE = {(parameter.process, parameter.number): parameter for parameter in bronkhorst.ALL}
+_FORMATS = {"u8": ">B", "u16": ">H", "f32": ">f"}
+_TYPES = {"u8": 0x00, "u16": 0x20, "f32": 0x40, "text": 0x60}
+WRITABLE = (bronkhorst.SETPOINT, bronkhorst.FSETPOINT, bronkhorst.CONTROL_MODE)
+_HEARD_BYTES_MAX = 4096  # of messages that have not ended
 
 
 class VentusEmulator(LineDevice):
@@ -107,15 +116,6 @@ class VentusEmulator(LineDevice):
                 )
             )
             self._act()
-
-
-ANALOG_INPUT = 1  # control mode after power-up: not the bus
-_COUNTS_MAX = 41_942
-_NODE_ANY = 128
-_PARAMETER_ERROR, _TYPE_ERROR, _VALUE_ERROR, _COMMAND_ERROR, _READ_ONLY = 4, 5, 6, 2, 13
-_BY_PLACE = {(parameter.process, parameter.number): parameter for parameter in bronkhorst.ALL}
-_FORMATS = {"u8": ">B", "u16": ">H", "f32": ">f"}
-_TYPES = {"u8": 0x00, "u16": 0x20, "f32": 0x40, "text": 0x60}
 
 
 class Instrument:
@@ -201,9 +201,6 @@ class Instrument:
         return True
 
 
-WRITABLE = (bronkhorst.SETPOINT, bronkhorst.FSETPOINT, bronkhorst.CONTROL_MODE)
-
-
 class BronkhorstRegisters:
     """The instrument as Modbus registers: a `RegisterTable` for any server."""
 
@@ -214,7 +211,7 @@ class BronkhorstRegisters:
         """Words. Raises RegisterRefusal."""
         words: dict[int, int] = {}
         for parameter in bronkhorst.ALL:
-            first, length = bronkhorst.register_of(parameter)
+            first, length = bronkhorst_modbus.register_of(parameter)
             if first < address + count and address < first + length:
                 raw = self._instrument.raw(parameter).rjust(2, b"\0")
                 raw += b"\0" * (2 * length - len(raw))
@@ -222,24 +219,21 @@ class BronkhorstRegisters:
         try:
             return [words[at] for at in range(address, address + count)]
         except KeyError:
-            raise modbus_server.RegisterRefusal(modbus_server.ILLEGAL_ADDRESS) from None
+            raise modbus_pdu.RegisterRefusal(modbus_pdu.ILLEGAL_ADDRESS) from None
 
     def write(self, address: int, words: Sequence[int]) -> None:
         """One parameter. Raises RegisterRefusal."""
         for parameter in WRITABLE:
-            if bronkhorst.register_of(parameter) == (address, len(words)):
+            if bronkhorst_modbus.register_of(parameter) == (address, len(words)):
                 raw = struct.pack(f">{len(words)}H", *words)
                 if parameter.kind == "u8" and raw[0]:
-                    raise modbus_server.RegisterRefusal(modbus_server.ILLEGAL_VALUE)
+                    raise modbus_pdu.RegisterRefusal(modbus_pdu.ILLEGAL_VALUE)
                 if not self._instrument.write(
                     parameter, raw[1:] if parameter.kind == "u8" else raw
                 ):
-                    raise modbus_server.RegisterRefusal(modbus_server.ILLEGAL_VALUE)
+                    raise modbus_pdu.RegisterRefusal(modbus_pdu.ILLEGAL_VALUE)
                 return
-        raise modbus_server.RegisterRefusal(modbus_server.ILLEGAL_ADDRESS)
-
-
-_HEARD_BYTES_MAX = 4096  # of messages that have not ended
+        raise modbus_pdu.RegisterRefusal(modbus_pdu.ILLEGAL_ADDRESS)
 
 
 class ProparDevice(serial_device.SerialDevice):

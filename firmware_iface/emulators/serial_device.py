@@ -15,6 +15,9 @@ from firmware_iface.links.serial_port import SerialSettings
 Sensor = Callable[[], float]  # a device's measured value
 Drive = Callable[[float], None]  # takes an actuator's fraction
 Transmit = Callable[[bytes], None]
+_LINE_BYTES_MAX = 1024  # of a line that has not ended
+_READ_BYTES = 65_536
+_SPEED = 4  # index of the input speed in tcgetattr's list; the output speed follows
 
 
 class SerialDevice:
@@ -85,9 +88,6 @@ class SerialDevice:
         self._due.add(timer)
 
 
-_LINE_BYTES_MAX = 1024  # of a line that has not ended
-
-
 class LineDevice(SerialDevice):
     """A device that answers lines of text; a device overrides `line`."""
 
@@ -111,10 +111,6 @@ class LineDevice(SerialDevice):
     def line(self, text: str) -> None:
         """One line arrived."""
         raise NotImplementedError
-
-
-_READ_BYTES = 65_536
-_SPEED = 4  # index of the input speed in tcgetattr's list; the output speed follows
 
 
 class PtyWire:

@@ -105,6 +105,7 @@ _SIGNATURES: dict[str, tuple[Any, tuple[Any, ...]]] = {
     "arv_fake_camera_set_trigger_frequency": (None, (c_void_p, c_double)),
     "arv_fake_camera_set_fill_pattern": (None, (c_void_p, c_void_p, c_void_p)),
 }
+_G_TYPE_INT, _G_TYPE_DOUBLE = 6 << 2, 15 << 2  # gobject/gtype.h
 
 
 class AravisError(LinkError):
@@ -177,9 +178,6 @@ class Aravis:
         self.call("g_value_init", ctypes.byref(holder), kind)
         self.call(setter, ctypes.byref(holder), value)
         self.call("g_object_set_property", instance, name.encode(), ctypes.byref(holder))
-
-
-_G_TYPE_INT, _G_TYPE_DOUBLE = 6 << 2, 15 << 2  # gobject/gtype.h
 
 
 @dataclass(frozen=True, slots=True)

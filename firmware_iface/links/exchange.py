@@ -27,6 +27,8 @@ _FAILURES_MAX = 5
 # bytes beyond the longest answer: noise before it; a device that sends without end must not fill
 # the memory
 _EXTRA_BYTES_MAX = 4096
+_SHOWN_CHARS = 60
+_LINE_ENDS = b"\r\n"
 
 
 @dataclass(frozen=True, slots=True)
@@ -215,9 +217,6 @@ class SerialExchange:
 
 
 # One device that answers lines of text.
-
-_SHOWN_CHARS = 60
-_LINE_ENDS = b"\r\n"
 
 
 @dataclass(frozen=True, slots=True)

@@ -13,7 +13,7 @@ import struct
 from collections.abc import Sequence
 from urllib.parse import parse_qsl, urlsplit
 
-from firmware_iface.links import exchange, modbus_tcp, serial_port
+from firmware_iface.links import exchange, modbus_link, modbus_tcp, serial_port
 from firmware_iface.roles import LinkError
 
 DEFAULT_PORT = 502  # of Modbus TCP
@@ -21,8 +21,8 @@ DEFAULT_BAUD = 19_200  # section 2.5.1: the default of the standard
 _FAST_BAUD = 19_200
 _FAST_GAP_S = 1.75e-3  # above 19200 baud the standard fixes the silence between frames
 _EXCEPTION_BYTES, _WRITE_BYTES = 5, 8
-_READS_REGISTERS = (modbus_tcp.READ_HOLDING, modbus_tcp.READ_INPUT)
-_READS_BITS = (modbus_tcp.READ_COILS, modbus_tcp.READ_DISCRETE)
+_READS_REGISTERS = (modbus_link.READ_HOLDING, modbus_link.READ_INPUT)
+_READS_BITS = (modbus_link.READ_COILS, modbus_link.READ_DISCRETE)
 _TOKENS = 2**16
 
 
@@ -141,26 +141,26 @@ class GuardedModbusRtu:
         """Read holding registers (function code 3). Raises LinkError, LinkDownError,
         DeviceRefusedError.
         """
-        return await self._read(modbus_tcp.READ_HOLDING, address, count)
+        return await self._read(modbus_link.READ_HOLDING, address, count)
 
     async def read_input(self, address: int, count: int) -> list[int]:
         """Read input registers (function code 4). Raises as `read_holding`."""
-        return await self._read(modbus_tcp.READ_INPUT, address, count)
+        return await self._read(modbus_link.READ_INPUT, address, count)
 
     async def read_coils(self, address: int, count: int) -> list[bool]:
         """Read coils (function code 1). Raises as `read_holding`."""
-        return await self._read_bits(modbus_tcp.READ_COILS, address, count)
+        return await self._read_bits(modbus_link.READ_COILS, address, count)
 
     async def read_discrete(self, address: int, count: int) -> list[bool]:
         """Read discrete inputs (function code 2). Raises as `read_holding`."""
-        return await self._read_bits(modbus_tcp.READ_DISCRETE, address, count)
+        return await self._read_bits(modbus_link.READ_DISCRETE, address, count)
 
     async def write_register(self, address: int, word: int) -> None:
         """Write one holding register (function code 6) and check the echo. Raises as
         `read_holding`.
         """
         what = f"{self.name}: writing {address}"
-        pdu = struct.pack(">BHH", modbus_tcp.WRITE_SINGLE, address, word)
+        pdu = struct.pack(">BHH", modbus_link.WRITE_SINGLE, address, word)
         if (await self._transact(pdu, _WRITE_BYTES, what)) != pdu:
             raise LinkError(f"{what}: the reply confirms another write")
 
@@ -174,7 +174,7 @@ class GuardedModbusRtu:
         what = f"{self.name}: writing {address}..{address + len(words) - 1}"
         pdu = struct.pack(
             f">BHHB{len(words)}H",
-            modbus_tcp.WRITE_MULTIPLE,
+            modbus_link.WRITE_MULTIPLE,
             address,
             len(words),
             2 * len(words),
@@ -193,7 +193,7 @@ class GuardedModbusRtu:
 
     async def _read_bits(self, function_code: int, address: int, count: int) -> list[bool]:
         what = f"{self.name}: reading bits {address}..{address + count - 1}"
-        answer_bytes = 5 + modbus_tcp.bytes_of_bits(count)
+        answer_bytes = 5 + modbus_link.bytes_of_bits(count)
         reply = await self._transact(
             struct.pack(">BHH", function_code, address, count), answer_bytes, what
         )
@@ -207,14 +207,14 @@ class GuardedModbusRtu:
         reply = await self._bus.exchange.ask(
             question, self._timeout_s, self._fence_question(), self._unit_id
         )
-        if reply[0] & modbus_tcp.EXCEPTION_FLAG:
-            raise modbus_tcp.exception_error(what, reply[1])
+        if reply[0] & modbus_link.EXCEPTION_FLAG:
+            raise modbus_link.exception_error(what, reply[1])
         return reply
 
     def _fence_question(self) -> exchange.Question | None:
         if not self._fence:
             return None
-        pdu = struct.pack(">BHH", modbus_tcp.DIAGNOSTICS, 0, self._bus.next_token())
+        pdu = struct.pack(">BHH", modbus_link.DIAGNOSTICS, 0, self._bus.next_token())
         return self._question(
             pdu, _WRITE_BYTES, f"{self.name}: echo test after a loss (function 8)", pdu
         )
@@ -228,7 +228,7 @@ class GuardedModbusRtu:
                 exactly
                 and reply is not None
                 and reply != exactly
-                and not reply[0] & modbus_tcp.EXCEPTION_FLAG
+                and not reply[0] & modbus_link.EXCEPTION_FLAG
             ):
                 raise LinkError(f"{what}: the echo differs from what was sent")
             return reply
@@ -244,7 +244,7 @@ class ModbusLinks:
 
     def link(
         self, url: str, unit_id: int, timeout_s: float, fence: bool = True
-    ) -> modbus_tcp.AnyModbusLink:
+    ) -> modbus_link.AnyModbusLink:
         """The device `unit_id` at `tcp://HOST[:PORT]` or `rtu://PORT[?baud=..&parity=..]`, not yet
         connected.
 
@@ -291,7 +291,7 @@ def take_reply(
         raise LinkError(f"{what}: answer from unit {heard[0]}, expected unit {unit_id}")
     if len(heard) < 3:
         return None
-    if heard[1] == function_code | modbus_tcp.EXCEPTION_FLAG:
+    if heard[1] == function_code | modbus_link.EXCEPTION_FLAG:
         length = _EXCEPTION_BYTES
     elif heard[1] == function_code:
         length = answer_bytes

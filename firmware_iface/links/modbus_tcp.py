@@ -9,111 +9,28 @@ import asyncio
 import logging
 import time
 from collections.abc import Awaitable, Callable, Sequence
-from typing import Protocol
 
 from pymodbus.client import AsyncModbusTcpClient
 from pymodbus.exceptions import ConnectionException, ModbusIOException
 from pymodbus.pdu import ExceptionResponse, ModbusPDU
 
 from firmware_iface.links import serial_port
+from firmware_iface.links.modbus_link import (
+    READ_COILS,
+    READ_DISCRETE,
+    READ_HOLDING,
+    READ_INPUT,
+    WRITE_MULTIPLE,
+    WRITE_SINGLE,
+    bytes_of_bits,
+    exception_error,
+)
 from firmware_iface.roles import (
     Clock,
-    DeviceBusyError,
-    DeviceRefusedError,
     LinkDownError,
     LinkError,
     LinkWaitsError,
 )
-
-# Modbus semantics, independent of the transport.
-
-READ_COILS, READ_DISCRETE = 1, 2
-READ_HOLDING, READ_INPUT, WRITE_SINGLE, DIAGNOSTICS, WRITE_MULTIPLE = 3, 4, 6, 8, 16
-EXCEPTION_FLAG = 0x80
-EXCEPTIONS = {
-    1: "illegal function",
-    2: "illegal address",
-    3: "illegal value",
-    4: "device failure",
-    5: "acknowledged, not done",
-    6: "device busy",
-    10: "gateway path unavailable",
-    11: "no device behind the gateway",
-}
-_REFUSALS = (1, 2, 3)  # the request itself is wrong for this device; the others may be temporary
-_BUSY = 6
-
-
-class ModbusLink(Protocol):
-    """One Modbus device over any wire: what the drivers need. All raise LinkError kinds."""
-
-    @property
-    def name(self) -> str:
-        """For messages."""
-
-    @property
-    def connected(self) -> bool:
-        """Whether the connection is up."""
-
-    async def connect(self) -> None:
-        """Connect again."""
-
-    async def read_holding(self, address: int, count: int) -> list[int]:
-        """Function code 3."""
-
-    async def read_input(self, address: int, count: int) -> list[int]:
-        """Function code 4."""
-
-    async def write_register(self, address: int, word: int) -> None:
-        """Function code 6; the echo is checked."""
-
-    async def write_registers(self, address: int, words: Sequence[int]) -> None:
-        """Function code 16; the echo is checked."""
-
-    async def close(self) -> None:
-        """Close; a request in flight fails at once."""
-
-
-class ModbusBitLink(Protocol):
-    """One Modbus device with coils or discrete inputs. All raise LinkError kinds."""
-
-    @property
-    def name(self) -> str:
-        """For messages."""
-
-    @property
-    def connected(self) -> bool:
-        """Whether the connection is up."""
-
-    async def connect(self) -> None:
-        """Connect again."""
-
-    async def read_coils(self, address: int, count: int) -> list[bool]:
-        """Function code 1."""
-
-    async def read_discrete(self, address: int, count: int) -> list[bool]:
-        """Function code 2."""
-
-    async def close(self) -> None:
-        """Close; a request in flight fails at once."""
-
-
-class AnyModbusLink(ModbusLink, ModbusBitLink, Protocol):
-    """One Modbus device with registers, coils and discrete inputs."""
-
-
-def bytes_of_bits(count: int) -> int:
-    """Number of bytes in which so many coils or discrete inputs are sent."""
-    return (count + 7) // 8
-
-
-def exception_error(what: str, code: int) -> LinkError:
-    """The error for an exception answer."""
-    kind = (
-        DeviceRefusedError if code in _REFUSALS else DeviceBusyError if code == _BUSY else LinkError
-    )
-    return kind(f"{what}: exception {code} ({EXCEPTIONS.get(code, 'unknown')})")
-
 
 # the library also logs what it raises; without a handler that would go to the console
 logging.getLogger("pymodbus").addHandler(logging.NullHandler())

@@ -8,25 +8,34 @@ import asyncio
 import contextlib
 import errno
 import os
-import re
 import termios
 import time
-from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Protocol
 
 import serial
-from serial.tools import list_ports
 
+from firmware_iface.links.port_names import check_port_name, port_path
 from firmware_iface.roles import Clock, DeviceRefusedError, LinkDownError, LinkError, LinkWaitsError
-
-# Waits between failed attempts to connect to a device.
-
 
 # fast enough for a replugged cable, slow enough not to hammer a server that accepts and hangs up
 FIRST_S = 0.1
 LONGEST_S = 5.0
+_READ_BYTES = 65_536
+# a missing port costs only one look-up: no reason to back off, and a replug must be found at once
+_ABSENT_S = 0.1
+_REMEDIES = {
+    errno.EACCES: "no permission; add yourself to the port's group (dialout) and log in again",
+    errno.EPERM: "no permission; add yourself to the port's group (dialout) and log in again",
+    errno.EAGAIN: "in use by another program; close that one first",
+    errno.EBUSY: "in use by another program; close that one first",
+    errno.ENOENT: "there is no such port; is the adapter plugged in?",
+    errno.ENODEV: "there is no such port; is the adapter plugged in?",
+    errno.ENXIO: "there is no such port; is the adapter plugged in?",
+    errno.ENOTTY: "this is not a serial port",
+    errno.EISDIR: "this is not a serial port",
+}
 
 
 class BackOff:
@@ -53,22 +62,6 @@ class BackOff:
         """Note a valid answer: the next attempt may follow at once."""
         self._wait_s = 0.0
         self._earliest_s = float("-inf")
-
-
-_READ_BYTES = 65_536
-# a missing port costs only one look-up: no reason to back off, and a replug must be found at once
-_ABSENT_S = 0.1
-_REMEDIES = {
-    errno.EACCES: "no permission; add yourself to the port's group (dialout) and log in again",
-    errno.EPERM: "no permission; add yourself to the port's group (dialout) and log in again",
-    errno.EAGAIN: "in use by another program; close that one first",
-    errno.EBUSY: "in use by another program; close that one first",
-    errno.ENOENT: "there is no such port; is the adapter plugged in?",
-    errno.ENODEV: "there is no such port; is the adapter plugged in?",
-    errno.ENXIO: "there is no such port; is the adapter plugged in?",
-    errno.ENOTTY: "this is not a serial port",
-    errno.EISDIR: "this is not a serial port",
-}
 
 
 @dataclass(frozen=True, slots=True)
@@ -277,69 +270,3 @@ def _drop_wrong_parity(descriptor: int) -> None:
     attributes = termios.tcgetattr(descriptor)
     attributes[0] |= termios.INPCK | termios.IGNPAR
     termios.tcsetattr(descriptor, termios.TCSANOW, attributes)
-
-
-# Serial ports by USB identity instead of by socket.
-
-_USB_NAME = re.compile(r"usb:([0-9A-Fa-f]{4}):([0-9A-Fa-f]{4})(?::(.+))?")
-
-
-@dataclass(frozen=True, slots=True)
-class PortInfo:
-    """A serial port of this machine: its path, the name that survives a replug, its own
-    description.
-    """
-
-    path: str
-    usb_name: str
-    description: str
-
-
-def serial_ports(comports: Callable[[], Iterable[Any]] = list_ports.comports) -> list[PortInfo]:
-    """The serial ports of this machine, by path; `usb_name` is empty
-    when the port is not on USB.
-    """
-    return sorted((_info(port) for port in comports()), key=lambda port: port.path)
-
-
-def check_port_name(name: str) -> str:
-    """The name itself, when it is a path or `usb:VID:PID[:SERIAL]`. Raises ValueError."""
-    if name.startswith("/") or _USB_NAME.fullmatch(name):
-        return name
-    raise ValueError(
-        f"port {name!r}: expected a path (/dev/ttyUSB0) or usb:VID:PID[:SERIAL] "
-        "(usb:0403:6001:A50285BI)"
-    )
-
-
-def port_path(name: str, comports: Callable[[], Iterable[Any]] = list_ports.comports) -> str:
-    """Present path of the port with this name.
-
-    Raises LinkDownError (not plugged in), DeviceRefusedError (several adapters have the name).
-    """
-    wanted = _USB_NAME.fullmatch(name)
-    if wanted is None:
-        return name
-    vid, pid, serial = int(wanted[1], 16), int(wanted[2], 16), wanted[3]
-    found = [
-        port
-        for port in comports()
-        if (port.vid, port.pid) == (vid, pid) and (serial is None or port.serial_number == serial)
-    ]
-    if not found:
-        raise LinkDownError(f"{name}: no such USB adapter is plugged in")
-    if len(found) > 1:
-        choice = ", ".join(sorted(_info(port).usb_name for port in found))
-        raise DeviceRefusedError(
-            f"{name}: {len(found)} adapters match; name one by its serial number: {choice}"
-        )
-    return str(found[0].device)
-
-
-def _info(port: Any) -> PortInfo:
-    usb_name = ""
-    if port.vid is not None:
-        usb_name = f"usb:{port.vid:04X}:{port.pid:04X}" + (
-            f":{port.serial_number}" if port.serial_number else ""
-        )
-    return PortInfo(str(port.device), usb_name, str(port.description))

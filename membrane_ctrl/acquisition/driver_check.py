@@ -12,7 +12,7 @@ from firmware_iface import drivers, settings
 from membrane_ctrl.config.schema import DevicesConfig
 from membrane_ctrl.instruments import driver_loading
 from membrane_ctrl.model.errors import CommandError, InputError
-from membrane_ctrl.processes import child
+from membrane_ctrl.processes import child, event_pipe
 
 _LOADED_S = 60.0  # a large package on a busy machine
 _NICE = 0
@@ -29,7 +29,7 @@ def require_optics(devices: DevicesConfig) -> None:
         isinstance(table, settings.ExternalSection) for table in (devices.camera, devices.screen)
     ):
         return
-    ours, theirs = child.pipe()
+    ours, theirs = event_pipe.pipe()
     loading = child.Child("driver check", f"{__name__}:report_problem", (devices, theirs), _NICE)
     loading.start()
     theirs.close()

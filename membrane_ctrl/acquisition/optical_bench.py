@@ -6,7 +6,15 @@ from typing import Any
 
 import numpy as np
 
-from firmware_iface import display, drivers, roles
+from firmware_iface import (
+    checkerboard_check,
+    display_patterns,
+    display_response,
+    display_settling,
+    drivers,
+    exposure_check,
+    roles,
+)
 from firmware_iface.guarded_camera import GuardedCamera
 from firmware_iface.pattern_screen import PatternScreen
 from firmware_iface.settings import ExternalCameraConfig, ExternalScreenConfig, ScreenSection
@@ -48,16 +56,16 @@ class DisplayTest:
     def exposure(self, full_scale_adu: int, exposure_ms: float) -> str:
         """Any problem with the camera's exposure, else empty."""
         white, black = self._still(self._grey(255)), self._still(self._grey(0))
-        return display.exposure_problem(white, black, full_scale_adu, exposure_ms)
+        return exposure_check.exposure_problem(white, black, full_scale_adu, exposure_ms)
 
     def checkerboard(self) -> str:
         """Any problem with pixel-for-pixel display, else empty."""
         white, black = self._still(self._grey(255)), self._still(self._grey(0))
-        return display.checkerboard_problem(
-            self._still(display.checkerboard(self._size[1], self._size[0])), white, black
+        return checkerboard_check.checkerboard_problem(
+            self._still(display_patterns.checkerboard(self._size[1], self._size[0])), white, black
         )
 
-    def settling(self) -> display.Settling:
+    def settling(self) -> display_settling.Settling:
         """Time from a command to the light, over steps both ways between black, white and two
         greys.
 
@@ -70,25 +78,27 @@ class DisplayTest:
         for one, other in ((0, 255), (64, 160)):
             pictures = {level: _thin(self._still(self._grey(level))) for level in (one, other)}
             again = _thin(self._still(self._grey(one)))
-            noise = max(noise, display.share_left(again, pictures[other], pictures[one]))
+            noise = max(noise, display_settling.share_left(again, pictures[other], pictures[one]))
             for before, after in ((one, other), (other, one)) * _TIMES:
                 self._still(self._grey(before))
                 for delay_s, pixels in list(
                     self._follow(self._grey(after))
                 ):  # evaluated afterwards
                     delays_s.append(delay_s)
-                    left.append(display.share_left(pixels, pictures[before], pictures[after]))
-        found = display.settling(delays_s, left, noise)
+                    left.append(
+                        display_settling.share_left(pixels, pictures[before], pictures[after])
+                    )
+        found = display_settling.settling(delays_s, left, noise)
         self.settle_s = found.settle_s
         return found
 
-    def response(self) -> display.DisplayResponse:
+    def response(self) -> display_response.DisplayResponse:
         """Light against level. Raises ValueError if the camera sees no ramp."""
-        frames = [self._still(self._grey(level)) for level in display.RAMP_LEVELS]
+        frames = [self._still(self._grey(level)) for level in display_response.RAMP_LEVELS]
         swing = frames[-1].astype(np.float64) - frames[0]
         lit = swing > 0.5 * np.quantile(swing, 0.99)
-        return display.measured_response(
-            display.RAMP_LEVELS, [float(np.mean(frame[lit])) for frame in frames]
+        return display_response.measured_response(
+            display_response.RAMP_LEVELS, [float(np.mean(frame[lit])) for frame in frames]
         )
 
     def _still(self, levels: roles.Levels) -> roles.Pixels:
@@ -213,11 +223,11 @@ def _screen(config: Config, section: Any, clock: CycleClock, *library: Any) -> P
     return PatternScreen(shown, _raster(config, section), patterns, waits, name)
 
 
-def _raster(config: Config, screen: ScreenSection) -> display.ScreenRaster:
+def _raster(config: Config, screen: ScreenSection) -> display_patterns.ScreenRaster:
     """The screen's pixels and the pattern region. Raises LinkError if the region does not fit."""
     pattern = config.optics.pattern
     try:
-        return display.ScreenRaster(
+        return display_patterns.ScreenRaster(
             screen.width_px,
             screen.height_px,
             screen.pixel_mm,

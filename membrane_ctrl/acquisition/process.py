@@ -5,175 +5,15 @@ be set before NumPy is loaded.
 """
 
 import os
-import select
 import signal
-import time
 import traceback
-from dataclasses import dataclass
 from multiprocessing.connection import Connection
-from pathlib import Path
-from typing import Literal
 
-from membrane_ctrl.config.schema import Config
-from membrane_ctrl.model import events, run_events
-from membrane_ctrl.model.clock import RunClock
-from membrane_ctrl.processes import child, ring
-
-# Limits this process's numerical threads: the control process's tick needs a core.
-
-
-# The kernels use two threads of their own (metrology.threads). Matrices are small here, terms x
-# terms: more than one thread would only spin.
-_LIMITS = {
-    "NUMBA_NUM_THREADS": "2",
-    "OMP_NUM_THREADS": "1",
-    "OPENBLAS_NUM_THREADS": "1",
-    "MKL_NUM_THREADS": "1",
-    "OPENCV_FOR_THREADS_NUM": "1",
-}
-
-
-def limit_threads() -> None:
-    """Set the limits. Call before importing NumPy, OpenCV and numba, which read them only at
-    import.
-    """
-    os.environ.update(_LIMITS)
-
-
-# The connection to the parent process: commands in, reports and signs of life out.
-
-AcquisitionState = Literal["preparing", "running", "paused", "retrying", "failed", "stopped"]
-
-_PARENT_CHECK_S = 0.2  # interval of checking for a dead parent
-_ALIVE_EVERY_S = 1.0
-# Between two checks of the line: one exposure (up to 10 s), one reconstruction, reopening a camera
-_STEP_S = 60.0
-# Compiling kernels on a slow machine and the self-test of a real screen and camera do not check it
-# at all
-_PREPARING_S = 900.0
-
-
-class Remote:
-    """Commands "pause", "resume", "full", "capture" and "stop" over a Connection; reports as dicts.
-
-    `stop` and `paused` reflect the last commands; the parent's death also sets `stop`.
-    """
-
-    def __init__(self, control: Connection) -> None:
-        self._control = control
-        self._full = self._capture = False
-        self._said = ("", "")
-        self._step_s = _PREPARING_S
-        self._alive_due_s = 0.0
-        self.stop = False
-        self.paused = False
-
-    def listen(self, timeout_s: float = 0.0) -> None:
-        """Take pending commands; if there are none, wait up to `timeout_s` (at most 0.2 s)."""
-        if not child.parent_lives():
-            self.stop = True
-            return
-        self._say_alive()
-        try:
-            while self._control.poll(min(timeout_s, _PARENT_CHECK_S)):
-                self._obey(self._control.recv())
-                timeout_s = 0.0
-        except (EOFError, OSError):  # the other end is closed
-            self.stop = True
-
-    def interrupts(self) -> bool:
-        """Whether a running cycle should end now."""
-        self.listen()
-        return self.stop or self.paused
-
-    def end(self) -> None:
-        """Stop, as if commanded."""
-        self.stop = True
-
-    def take_full(self) -> bool:
-        """Whether a full cycle was requested since the last call."""
-        wanted, self._full = self._full, False
-        return wanted
-
-    def take_capture(self) -> bool:
-        """Whether a full cycle to keep on disk was requested since the last call."""
-        wanted, self._capture = self._capture, False
-        return wanted
-
-    def report(
-        self,
-        state: AcquisitionState,
-        message: str = "",
-        cycle: int | None = None,
-        traceback: str | None = None,
-    ) -> None:
-        """Send a report that differs from the last one: in weeks of recording, good cycles need no
-        reports.
-
-        It is dropped if the other end does not read: the cycle must never wait.
-        """
-        if (state, message) == self._said:
-            return
-        self._said = (state, message)
-        self._send(run_events.AcquisitionState(state, message, cycle, traceback))
-
-    def tell(self, event: events.Event) -> None:
-        """Record an event; it may be dropped like a report."""
-        self._send(event)
-
-    def prepared(self) -> None:
-        """From now on, the line is checked between any two exposures."""
-        self._step_s = _STEP_S
-        self._alive_due_s = 0.0
-        self._say_alive()
-
-    def _say_alive(self) -> None:
-        if time.monotonic() >= self._alive_due_s:
-            self._alive_due_s = time.monotonic() + _ALIVE_EVERY_S
-            self._send(run_events.Alive(self._step_s))
-
-    def _send(self, event: events.Event) -> None:
-        try:
-            if select.select([], [self._control.fileno()], [], 0)[1]:
-                self._control.send(event.to_dict())
-        except OSError:
-            self.stop = True
-
-    def _obey(self, command: object) -> None:
-        match command:
-            case "pause":
-                self.paused = True
-            case "resume":
-                self.paused = False
-            case "full":
-                self._full = True
-            case "capture":
-                self._capture = True
-            case "stop":
-                self.stop = True
-            case _:
-                self.report(
-                    "running",
-                    f"unknown command {command!r}: use pause, resume, full, capture or stop",
-                )
-
+from membrane_ctrl.acquisition.remote import Remote
+from membrane_ctrl.acquisition.spec import AcquisitionSpec
+from membrane_ctrl.acquisition.threads import limit_threads
 
 _NICENESS = 10  # behind the tick, the recorder and the screen
-
-
-@dataclass(frozen=True, slots=True)
-class AcquisitionSpec:
-    """What the acquisition needs to know about the run."""
-
-    config: Config
-    clock: RunClock
-    telemetry: ring.RingAddress  # source of the laser readings
-    shapes: ring.RingAddress  # destination of the estimates (`estimate.pack_estimate`)
-    truth: (
-        ring.RingAddress | None
-    )  # the twin's truth, which its camera renders; None on a real bench
-    frames: ring.FrameAddress
-    run_dir: Path | None = None  # folder of the run, for kept frames
 
 
 def acquisition_main(spec: AcquisitionSpec, control: Connection) -> None:
@@ -188,9 +28,9 @@ def acquisition_main(spec: AcquisitionSpec, control: Connection) -> None:
     limit_threads()
     remote = Remote(control)
     try:
-        from membrane_ctrl.acquisition.session import run
+        from membrane_ctrl.acquisition.session import run_acquisition
 
-        run(spec, remote)
+        run_acquisition(spec, remote)
     except Exception as error:
         remote.report(
             "failed", f"{type(error).__name__}: {error}", traceback=traceback.format_exc()

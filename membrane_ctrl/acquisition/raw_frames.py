@@ -17,12 +17,13 @@ import cv2
 import tomli_w
 
 from firmware_iface.roles import Pattern, Pixels
-from membrane_ctrl.acquisition.cycle import CyclePlan
+from membrane_ctrl.acquisition.cycle_plan import CyclePlan
 from membrane_ctrl.config.schema import OpticsConfig, RecordingConfig
 from membrane_ctrl.model import events, program, run_events, telemetry
 from membrane_ctrl.model.shape_estimate import ShapeEstimate
+from membrane_ctrl.processes.frame_address import FrameAddress
 from membrane_ctrl.processes.frames import FrameHead, FrameReader
-from membrane_ctrl.processes.ring import FrameAddress, RingAddress, RingReader
+from membrane_ctrl.processes.ring import RingAddress, RingReader
 from membrane_ctrl.run_files.disk_budget import PICTURES_FROM
 
 # If the disk is slower than the cycles, sets beyond this queue are omitted

@@ -25,13 +25,23 @@ from membrane_ctrl.model.clock import RunClock, pause_s
 from membrane_ctrl.model.events import CommandTaken, Event, EventLine
 from membrane_ctrl.model.run_status import RunStatus
 from membrane_ctrl.model.telemetry import TelemetryRow
-from membrane_ctrl.processes import child, ring
+from membrane_ctrl.processes import child, event_pipe, ring
 
 Send = Callable[[AlarmMessage], bool]
 
 _AGAIN_S, _AGAIN_MOST_S = 10.0, 300.0
 # a day without a network must not end in a thousand mails
 _KEPT = 50
+_MISSING = "alarms.urls_file: Apprise is not installed; pip install 'membrane-ctrl[alarms]'"
+_TYPES = {"raised": "", "escalated": "failure", "reminder": "", "cleared": "success"}
+# before its first tick a run connects its devices, with time-outs of its own
+_STARTS_S = 30.0
+_LOOK_S = 0.5
+# After the run's end, for the last messages; longer would delay a service manager's restart
+_LAST_S = 8.0
+_SENDING_S = 300.0  # a list of mail servers, each with a minute of time-out
+_TO = ("urls_file", "escalation_urls_file")  # of the configuration, in the order of the senders
+_IDLE_S = 15.0  # with nothing to send; a process that hangs then could not send an alarm
 
 
 class Outbox:
@@ -71,10 +81,6 @@ class Outbox:
                 return
             self._waiting.popleft()
             self.failures = 0
-
-
-_MISSING = "alarms.urls_file: Apprise is not installed; pip install 'membrane-ctrl[alarms]'"
-_TYPES = {"raised": "", "escalated": "failure", "reminder": "", "cleared": "success"}
 
 
 def read_urls(path: Path) -> list[str]:
@@ -172,10 +178,6 @@ def send_test_alarm(config: schema.Config, source: str, escalated: bool, as_json
     return errors.Exit.DONE
 
 
-# before its first tick a run connects its devices, with time-outs of its own
-_STARTS_S = 30.0
-
-
 class Watcher:
     """Turns rows and events into alarm messages; the first outbox gets all, the second only the
     escalated ones.
@@ -244,14 +246,6 @@ class Watcher:
             outbox.step(now_s)
 
 
-_LOOK_S = 0.5
-# After the run's end, for the last messages; longer would delay a service manager's restart
-_LAST_S = 8.0
-_SENDING_S = 300.0  # a list of mail servers, each with a minute of time-out
-_TO = ("urls_file", "escalation_urls_file")  # of the configuration, in the order of the senders
-_IDLE_S = 15.0  # with nothing to send; a process that hangs then could not send an alarm
-
-
 @dataclass(frozen=True, slots=True)
 class AlarmsSpec:
     """What the process needs to know about the run."""
@@ -271,7 +265,7 @@ def alarms_main(spec: AlarmsSpec, status: Any) -> None:
     child.leave_at_stop()
     senders = apprise_senders(spec.config, spec.run)
     with limited_memory():
-        watch(spec, senders, child.reporter(status), child.parent_lives)
+        watch(spec, senders, event_pipe.event_sender(status), child.parent_lives)
 
 
 def watch(

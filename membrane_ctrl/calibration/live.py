@@ -9,13 +9,17 @@ from pathlib import Path
 import numpy as np
 
 from membrane_ctrl.calibration import session as sessions
-from membrane_ctrl.calibration.session import CalibrationHead, CalibrationSession, adopt, compared
+from membrane_ctrl.calibration.adopt import adopt_geometry, compare_geometries
+from membrane_ctrl.calibration.procedure import Procedure
+from membrane_ctrl.calibration.session import CalibrationHead, CalibrationSession
+from membrane_ctrl.calibration.setpoints import HeldMirror, plan_setpoints_um, setpoint_reach
 from membrane_ctrl.calibration.sets import CalibrateOptions, calibrate_command, freed, known_sigmas
-from membrane_ctrl.calibration.sweep import CaptureLink, Procedure, Sweep
+from membrane_ctrl.calibration.sweep import CaptureLink, Sweep
 from membrane_ctrl.config.schema import CameraConfig, GeometryConfig, OpticsConfig
 from membrane_ctrl.control_port.ctl import Where
-from membrane_ctrl.geometry.file import GeometryOrigin, geometry_of_run, origin_of, read_geometry
-from membrane_ctrl.geometry.spread_file import read_prior
+from membrane_ctrl.geometry.file import GeometryOrigin, read_geometry, stated_origin
+from membrane_ctrl.geometry.prior_file import read_prior
+from membrane_ctrl.geometry.run_geometry import read_run_geometry
 from membrane_ctrl.measure.capture_set import read_head
 from membrane_ctrl.metrology.calibration import figure_uncertainty, foresight, verdict
 from membrane_ctrl.metrology.rays import bench_parameters
@@ -42,7 +46,9 @@ class LiveOptions:
 
 
 def calibrate_live(options: LiveOptions) -> int:
-    """Take a session's missing sets, solve, and adopt if a person agrees. Returns the exit code."""
+    """Take a session's missing sets, solve, and adopt the result if a person agrees.
+
+    Returns the exit code."""
     freed(options.solving.free)  # check these before the mirror moves
     for path in options.solving.priors:
         read_prior(path)
@@ -50,7 +56,7 @@ def calibrate_live(options: LiveOptions) -> int:
     if options.session is not None:
         if options.range_um is not None or options.sets is not None:
             raise InputError("--session has its own setpoints: omit --range-um and --sets")
-        session = sessions.resume(options.session)
+        session = sessions.resume_session(options.session)
     if session is None or session.missing:
         with live_hold(
             options.where,
@@ -79,8 +85,8 @@ def take_sets(
             head, missing = session.head, session.missing
             _same_bench(link, session)
         else:
-            reach, sets = sessions.reach_of(held, link.config), options.sets or USUAL_SETS
-            wanted = sessions.setpoints_um(held, reach, options.range_um, sets)
+            reach, sets = setpoint_reach(held, link.config), options.sets or USUAL_SETS
+            wanted = plan_setpoints_um(held, reach, options.range_um, sets)
             head = CalibrationHead(link.name, now_utc(), held.setpoint_um, held.shape_on, wanted)
             missing = tuple(range(sets))
         procedure.check(head)
@@ -89,7 +95,9 @@ def take_sets(
         progress.say(_worth(link, head, held, options))
         _agree(f"move the mirror through {len(missing)} setpoints?", options.yes)
         sweep.claim(held.setpoint_um)
-        session = session or sessions.begin(options.where.logs, options.name, head, link.config)
+        session = session or sessions.begin_session(
+            options.where.logs, options.name, head, link.config
+        )
         progress.say(f"session: {session.path}")
         procedure.take(session)
     except HoldError as error:
@@ -108,7 +116,9 @@ def solve_and_adopt(session: CalibrationSession, options: LiveOptions) -> int:
     if code != Exit.DONE:
         return code
     optics, place = read_head(session.sets[0]).optics, session.config.optics.geometry_file
-    for line in compared(optics, _origin(session, place), read_geometry(session.geometry)):
+    for line in compare_geometries(
+        optics, _origin(session, place), read_geometry(session.geometry)
+    ):
         _say(line)
     if place is None:
         _say(
@@ -121,7 +131,7 @@ def solve_and_adopt(session: CalibrationSession, options: LiveOptions) -> int:
             "adopts it"
         )
     else:
-        kept = adopt(session.geometry, place)
+        kept = adopt_geometry(session.geometry, place)
         before = f"; the previous one is {kept}" if kept else ""
         _say(f"adopted: {place}{before}; the next hold uses it")
     return code
@@ -129,7 +139,7 @@ def solve_and_adopt(session: CalibrationSession, options: LiveOptions) -> int:
 
 def _same_bench(link: CaptureLink, session: CalibrationSession) -> None:
     """Raises InputError if the hold's geometry differs from that of the sets so far."""
-    now = geometry_of_run(link.run_dir, link.config).optics
+    now = read_run_geometry(link.run_dir, link.config).optics
     for folder in session.sets:
         if not folder.exists():
             continue
@@ -149,7 +159,7 @@ def _written_out(optics: OpticsConfig) -> tuple[GeometryConfig, CameraConfig]:
     return optics.geometry.model_copy(update={"reference_displacement_um": None}), camera
 
 
-def _plan(head: CalibrationHead, missing: int, held: sessions.HeldMirror, minutes: float) -> str:
+def _plan(head: CalibrationHead, missing: int, held: HeldMirror, minutes: float) -> str:
     low_um, high_um = min(head.setpoints_um), max(head.setpoints_um)
     return (
         f"{missing} of {len(head.setpoints_um)} sets from {low_um:g} to {high_um:g} µm "
@@ -161,9 +171,7 @@ def _plan(head: CalibrationHead, missing: int, held: sessions.HeldMirror, minute
     )
 
 
-def _worth(
-    link: CaptureLink, head: CalibrationHead, held: sessions.HeldMirror, options: LiveOptions
-) -> str:
+def _worth(link: CaptureLink, head: CalibrationHead, held: HeldMirror, options: LiveOptions) -> str:
     """How well the sets will determine the geometry, and how much better a wider range would."""
     here = _foreseen(link, held, head.setpoints_um, options)
     line = (
@@ -178,7 +186,7 @@ def _worth(
         (low_um + high_um + verdict.GOOD_SPREAD_UM) / 2,
     )
     best = _foreseen(link, held, np.linspace(*ends, len(head.setpoints_um)).tolist(), options)
-    reach = sessions.reach_of(held, link.config)
+    reach = setpoint_reach(held, link.config)
     return (
         f"{line}; {verdict.GOOD_SPREAD_UM:.0f} µm of range would give {best.sag_um:.1f} and "
         f"{best.figure_rms_um:.1f} ({reach.low_why} and {reach.high_why} allow "
@@ -187,9 +195,9 @@ def _worth(
 
 
 def _foreseen(
-    link: CaptureLink, held: sessions.HeldMirror, setpoints: Sequence[float], options: LiveOptions
+    link: CaptureLink, held: HeldMirror, setpoints: Sequence[float], options: LiveOptions
 ) -> figure_uncertainty.Propagated:
-    optics = geometry_of_run(link.run_dir, link.config).optics
+    optics = read_run_geometry(link.run_dir, link.config).optics
     solving = options.solving
     if solving.geometry is not None:
         optics = read_geometry(solving.geometry).over(optics)
@@ -209,7 +217,7 @@ def _origin(session: CalibrationSession, place: Path | None) -> GeometryOrigin:
             file = read_geometry(place)
             if file.geometry == optics.geometry:
                 return file.origin
-    return origin_of(optics)
+    return stated_origin(optics)
 
 
 def _agree(question: str, yes: bool) -> None:

@@ -1,42 +1,34 @@
-"""Results of a calibration, as a table for JSON, as lines for people,
-and as the geometry's file.
-"""
+"""Results of a calibration, as a table for JSON and as lines for people."""
 
 from collections.abc import Sequence
 from dataclasses import asdict
-from datetime import UTC, datetime
-from pathlib import Path
 from typing import Any
 
 import numpy as np
-import tomli_w
-from matplotlib.cm import ScalarMappable
-from matplotlib.colors import Normalize
-from matplotlib.figure import Figure
 
-from membrane_ctrl.config.schema import OpticsConfig
-from membrane_ctrl.measure.results import write_figure
 from membrane_ctrl.metrology.calibration import (
     advice,
     artefact_advice,
     figure_uncertainty,
-    geometry_tables,
     model_tests,
     screen_advice,
     solver,
     verdict,
     weak_combinations,
 )
-from membrane_ctrl.metrology.cycle import geometry_monitors
-from membrane_ctrl.metrology.rays import bench_parameters, set_phases
-from membrane_ctrl.model import errors, program
-from membrane_ctrl.model.arrays import FloatArray
-from membrane_ctrl.model.files import users, write_text_atomic
+from membrane_ctrl.metrology.rays import bench_parameters
+from membrane_ctrl.model import program
 
 _SOME_LASER = 0.5  # sigma of the laser's scale without any reading: 1
+_SCREENS = {
+    "screen": "stand the screen itself {:.0f} mm before the camera, tilted by {:.0f} degrees to two "  # noqa: E501
+    "sides",
+    "screen_moved": "see a film again with the screen {:.0f} mm further from the mirror, known to {:g} mm",  # noqa: E501
+}
+_SCREEN_KNOWN = {"screen": screen_advice.TILT_DEG, "screen_moved": screen_advice.RAIL_SIGMA_MM}
 
 
-def report_of(
+def calibration_report(
     solution: solver.Solution | None,
     findings: Sequence[verdict.CalibrationFinding],
     analysis_radius_mm: float,
@@ -56,7 +48,7 @@ def report_of(
     return table | {
         "iterations": len(solution.changes),
         "condition": weak_combinations.condition_number(solution),
-        "parameters": [_parameter(solution, name) for name in solution.free],
+        "parameters": [_parameter_row(solution, name) for name in solution.free],
         "not_determined": [
             {
                 "sigma_left": each.left,
@@ -78,11 +70,11 @@ def report_of(
         "film": solution.problem.references.film,
         "rim": solution.problem.rim is not None,
         "laser": {"scale": scale.value, "sigma": scale.sigma},
-        "sets": _sets(solution),
+        "sets": _set_rows(solution),
     }
 
 
-def _parameter(solution: solver.Solution, name: str) -> dict[str, Any]:
+def _parameter_row(solution: solver.Solution, name: str) -> dict[str, Any]:
     k = bench_parameters.NAMES.index(name)
     return {
         "name": name,
@@ -92,7 +84,7 @@ def _parameter(solution: solver.Solution, name: str) -> dict[str, Any]:
     }
 
 
-def _sets(solution: solver.Solution) -> list[dict[str, Any]]:
+def _set_rows(solution: solver.Solution) -> list[dict[str, Any]]:
     """Per set: its noise relative to the camera's, its residuals, and the test against the other
     sets.
     """
@@ -119,15 +111,7 @@ def _sets(solution: solver.Solution) -> list[dict[str, Any]]:
     ]
 
 
-_SCREENS = {
-    "screen": "stand the screen itself {:.0f} mm before the camera, tilted by {:.0f} degrees to two "  # noqa: E501
-    "sides",
-    "screen_moved": "see a film again with the screen {:.0f} mm further from the mirror, known to {:g} mm",  # noqa: E501
-}
-_SCREEN_KNOWN = {"screen": screen_advice.TILT_DEG, "screen_moved": screen_advice.RAIL_SIGMA_MM}
-
-
-def lines_of(report: dict[str, Any]) -> list[str]:
+def format_report(report: dict[str, Any]) -> list[str]:
     """Format the report for a terminal."""
     lines = [f"verdict: {report['verdict']}"]
     lines += [
@@ -194,102 +178,3 @@ def lines_of(report: dict[str, Any]) -> list[str]:
     if report.get("out"):
         lines.append(f"written: {report['out']} (hash {report['hash']})")
     return lines
-
-
-# Residuals of the seen screen points, set by set: noise if the model is right, a pattern if not.
-
-_INCHES = 2.6  # a panel
-_DPI = 110
-_CELLS = 24  # across the picture: each averages enough points to show a pattern below the noise
-
-
-def draw_residuals(path: Path, solution: solver.Solution) -> None:
-    """Draw the mean s_x and s_y residuals of all sets over the camera's picture, on a common scale.
-
-    Raises OSError if the file cannot be written.
-    """
-    count = len(solution.states)
-    edges = _edges(solution)
-    maps = [[_means(solution, k, axis, edges) for k in range(count)] for axis in range(2)]
-    reach = (
-        float(np.nanpercentile(np.abs(maps), 98)) or 1.0
-    )  # single cells at the edge must not set the scale
-    colours = ScalarMappable(Normalize(-reach, reach), "RdBu_r")
-    figure = Figure(figsize=(_INCHES * count, 2 * _INCHES), layout="constrained")
-    panels = figure.subplots(2, count, squeeze=False, sharex=True, sharey=True)
-    for axis, name in enumerate(("s_x", "s_y")):
-        for k, phases in enumerate(solution.problem.sets):
-            panel = panels[axis][k]
-            panel.pcolormesh(*edges, maps[axis][k], cmap=colours.cmap, norm=colours.norm)
-            panel.set_aspect("equal")
-            panel.set_title(f"{phases.name}: {name}", fontsize=8, parse_math=False)
-            panel.tick_params(labelsize=6)
-    panels[0][0].invert_yaxis()  # rows count downwards; the axes are shared
-    figure.colorbar(colours, ax=panels, label="seen minus predicted, µm on the screen")
-    write_figure(users(path), figure, _DPI)
-
-
-def _edges(solution: solver.Solution) -> tuple[FloatArray, FloatArray]:
-    """Columns and rows of the boundaries of square cells."""
-    column = np.concatenate([phases.column_px for phases in solution.problem.sets])
-    row = np.concatenate([phases.row_px for phases in solution.problem.sets])
-    side = max(float(np.ptp(column)), float(np.ptp(row)), 1.0) / _CELLS
-    across, down = (np.arange(part.min(), part.max() + side, side) for part in (column, row))
-    return across, down
-
-
-def _means(
-    solution: solver.Solution, index: int, axis: int, edges: tuple[FloatArray, FloatArray]
-) -> FloatArray:
-    """Weighted means over cells, (rows, columns); NaN in cells without points."""
-    phases, linear = solution.problem.sets[index], solution.equations[index]
-    weights = linear.trust.weights / phases.sigma_mm**2
-    bins = (edges[1], edges[0])
-    total = np.histogram2d(phases.row_px, phases.column_px, bins, weights=weights)[0]
-    summed = np.histogram2d(
-        phases.row_px, phases.column_px, bins, weights=weights * linear.residual_mm[axis]
-    )[0]
-    return np.divide(1e3 * summed, total, out=np.full_like(total, np.nan), where=total > 0)
-
-
-def write_geometry(
-    path: Path,
-    solution: solver.Solution,
-    problem: solver.Problem,
-    optics: OpticsConfig,
-    findings: Sequence[verdict.CalibrationFinding],
-) -> str:
-    """Write `geometry.toml`; returns its hash. Raises InputError if it cannot be written."""
-    films = [(solution.states[k], problem.sets[k]) for k in problem.films]
-    slopes = [_slope_residual(solution, problem.sets[k], k) for k in problem.films]
-    noises = [
-        geometry_monitors.noise_urad(
-            solution.bench.geometry, state.surface, float(np.sqrt(np.mean(phases.sigma_mm**2)))
-        )
-        for state, phases in films
-    ]
-    origin = geometry_tables.Origin(
-        date_utc=datetime.now(UTC).isoformat(timespec="seconds"),
-        sets=tuple(phases.name for phases in problem.sets),
-        screen_residual_um=1e3
-        * float(np.median([each.residual_rms_mm for each in solution.equations])),
-        slope_residual_urad=1e6 * float(np.median(slopes)),
-        slope_noise_urad=float(np.median(noises)),
-        condition=weak_combinations.condition_number(solution),
-        notes=tuple(finding.says for finding in findings),
-    )
-    tables = geometry_tables.tables_of(solution, optics, origin)
-    with errors.writing(path):
-        path.parent.mkdir(parents=True, exist_ok=True)
-        write_text_atomic(users(path), tomli_w.dumps(tables))  # never half a geometry
-    return str(tables["calibration"]["hash"])
-
-
-def _slope_residual(solution: solver.Solution, phases: set_phases.SetPhases, index: int) -> float:
-    """RMS of measured minus fitted slopes of one set's bins on the calibrated bench, as a live
-    cycle states it.
-    """
-    fit = solver.fit_on(
-        solution.bench, phases, solution.problem.radius_mm, solution.states[index].vertex_z_mm
-    )
-    return float(np.hypot(fit.residual_x, fit.residual_y) / np.sqrt(2))

@@ -13,9 +13,11 @@ from typing import Any
 
 import numpy as np
 
-from membrane_ctrl.calibration.report import draw_residuals, lines_of, report_of, write_geometry
+from membrane_ctrl.calibration.geometry_writer import write_geometry
+from membrane_ctrl.calibration.report import calibration_report, format_report
+from membrane_ctrl.calibration.residual_picture import draw_residuals
 from membrane_ctrl.config.schema import OpticsConfig
-from membrane_ctrl.geometry import file, spread_file
+from membrane_ctrl.geometry import file, prior_file, set_tables, spread_file
 from membrane_ctrl.measure.capture_set import CaptureSet, read_head, read_set
 from membrane_ctrl.measure.measurement import Figures, SetFigure, stack_of
 from membrane_ctrl.metrology.calibration import rim_edges, screen_pose, set_state, verdict
@@ -141,7 +143,7 @@ def _judged(
 
 def calibrate_command(options: CalibrateOptions) -> int:
     """Read, solve, judge, write. Returns the exit code; raises CommandError for invalid sets."""
-    priors = [spread_file.read_prior(path) for path in options.priors]
+    priors = [prior_file.read_prior(path) for path in options.priors]
     free = {
         name: sigma for prior in priors for name, sigma in prior.content.sigmas.items()
     } | freed(options.free)
@@ -168,13 +170,13 @@ def calibrate_command(options: CalibrateOptions) -> int:
         with errors.writing(path):  # also for a refused solution, where it helps most
             path.parent.mkdir(parents=True, exist_ok=True)
             draw_residuals(path, solution)
-    report = report_of(solution, findings, bundle.optics.mirror.analysis_radius_mm)
+    report = calibration_report(solution, findings, bundle.optics.mirror.analysis_radius_mm)
     report |= {
         "out": str(options.out) if usable else None,
         "hash": written or None,
         "timing_s": timing,
     }
-    print(json.dumps(report) if options.as_json else "\n".join(lines_of(report)))
+    print(json.dumps(report) if options.as_json else "\n".join(format_report(report)))
     if not usable:
         print(
             f"calibrate: rejected; {options.out} is not written, the old geometry stays in force",
@@ -222,7 +224,7 @@ def read_sets(
     sets: list[set_phases.SetPhases] = []
     benches: list[OpticsConfig] = []
     used: list[Path] = []
-    elsewhere: list[tuple[Path, set_phases.SetPhases, file.ScreenMovedTable]] = []
+    elsewhere: list[tuple[Path, set_phases.SetPhases, set_tables.ScreenMovedTable]] = []
     notes: list[str] = []
     edges: list[FloatArray] = []
     heads = {folder: read_head(folder, stated) for folder in folders}
@@ -314,7 +316,7 @@ def join(
     sets: list[set_phases.SetPhases],
     folder: Path,
     phases: set_phases.SetPhases,
-    moved: file.ScreenMovedTable,
+    moved: set_tables.ScreenMovedTable,
 ) -> None:
     """Add what was seen with the screen elsewhere to the set of the same film. Raises InputError if
     there is none.
@@ -340,7 +342,7 @@ def join(
     sets[k] = base.beside(phases, known)
 
 
-def with_priors(bundle: Bundle, priors: Sequence[spread_file.Prior]) -> Bundle:
+def with_priors(bundle: Bundle, priors: Sequence[prior_file.Prior]) -> Bundle:
     """The sets with the bench as found by auxiliary calibrations. Raises InputError for a different
     camera.
     """
@@ -402,11 +404,11 @@ def known_sigmas(optics: OpticsConfig, free: Mapping[str, float]) -> dict[str, f
     if stated.sigmas is not None:
         given[LASER.name] = stated.sigmas.laser_relative
     unstated = optics.model_copy(update={"geometry": stated.model_copy(update={"sigmas": None})})
-    usual = spread_file.sigmas_of(unstated) | {
+    usual = spread_file.stated_sigmas(unstated) | {
         name: usual_sigma(name) for name in (*given, LASER.name)
     }
     return usual | {
-        name: s for name, s in {**spread_file.sigmas_of(optics), **given, **free}.items() if s
+        name: s for name, s in {**spread_file.stated_sigmas(optics), **given, **free}.items() if s
     }
 
 

@@ -5,6 +5,7 @@ from typing import Annotated, Literal
 
 import typer
 
+from membrane_ctrl.calibration import camera_pose
 from membrane_ctrl.cli.options import (
     ConfigArgument,
     ConfigOption,
@@ -87,15 +88,16 @@ def calibrate_pose(
     json: JsonOption = False,
 ) -> int:
     """Determine the pose of the camera from the ring's ellipse in a full set."""
-    from membrane_ctrl.calibration import camera
 
-    options = camera.PoseOptions(folder, geometry, tuple(prior or ()), radius_sigma_mm, out, json)
-    return camera.calibrate_pose(options)
+    options = camera_pose.PoseOptions(
+        folder, geometry, tuple(prior or ()), radius_sigma_mm, out, json
+    )
+    return camera_pose.calibrate_pose(options)
 
 
 def calibrate_display(config: ConfigArgument, json: JsonOption = False) -> int:
     """Measure settle time and gamma of the screen with the camera."""
-    from membrane_ctrl.calibration.camera import calibrate_display as run
+    from membrane_ctrl.calibration.display import calibrate_display as run
 
     return run(configured(config), str(config), json)
 

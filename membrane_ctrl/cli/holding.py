@@ -88,7 +88,8 @@ def hold(
     settings = _started(_with_devices(config, devices, twin), from_flat)
     duration_s = None if duration is None else clock.parse_duration_s(duration)
     terminal.progress("loading the control program")
-    from membrane_ctrl.hold.start import HoldOptions, hold_mirror
+    from membrane_ctrl.hold.hold_options import HoldOptions
+    from membrane_ctrl.hold.start import hold_mirror
 
     options = HoldOptions(
         config=settings,
@@ -121,7 +122,7 @@ def twin(
     """
     if context.invoked_subcommand is not None:
         return errors.Exit.DONE
-    from membrane_ctrl.sim.bench import serve_twin
+    from membrane_ctrl.sim.twin_command import serve_twin
 
     return serve_twin(_started(configured(config), from_flat), speed)
 
@@ -146,7 +147,7 @@ def play(
 
         return list_scenarios()
     terminal.progress("loading the simulated bench")
-    from membrane_ctrl.hold.scenario import play_scenario
+    from membrane_ctrl.hold.play import play_scenario
 
     return play_scenario(scenario, logs, name, real_time)
 
@@ -357,6 +358,6 @@ def init(
     ] = False,
 ) -> int:
     """Write a first configuration, with what is connected; on a terminal, ask for the devices."""
-    from membrane_ctrl.commissioning.devices import write_first
+    from membrane_ctrl.commissioning.first_config import write_first_config
 
-    return write_first(file, twin, ask=typer.get_text_stream("stdin").isatty() and not twin)
+    return write_first_config(file, twin, ask=typer.get_text_stream("stdin").isatty() and not twin)

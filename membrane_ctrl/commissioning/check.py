@@ -17,7 +17,7 @@ from rich.table import Table
 
 from firmware_iface import conformance, role_bench, roles
 from firmware_iface.drivers.pump_board import NO_CLAIM, PumpBoard
-from membrane_ctrl.acquisition import driver_check, optical_bench, session
+from membrane_ctrl.acquisition import driver_check, optical_bench, waiting_clock
 from membrane_ctrl.alarms.process import require_sendable
 from membrane_ctrl.commissioning import interlock_check
 from membrane_ctrl.config.bridge_access import describe_bridges
@@ -25,14 +25,23 @@ from membrane_ctrl.config.port import SOCKET_NAME, AlarmsConfig, PortConfig
 from membrane_ctrl.config.schema import Config, DevicesConfig
 from membrane_ctrl.control_port import sockets
 from membrane_ctrl.controller.cross_check import cross_check, require_sound
-from membrane_ctrl.geometry.file import geometry_in_force
-from membrane_ctrl.instruments import bench, driver_loading, lock_store
+from membrane_ctrl.geometry.run_geometry import read_configured_geometry
+from membrane_ctrl.instruments import (
+    bench,
+    device_claim,
+    device_names,
+    driver_loading,
+    lock_keys,
+    lock_store,
+    role_drivers,
+)
 from membrane_ctrl.model import errors, plain_json, run_status, terminal
 from membrane_ctrl.model.clock import RunClock
 
 _READS = 100
 _LONGEST_S = 2.0  # slow devices get fewer reads
 _BACK_OFF_S = 0.2  # pause on a bus after a device that could not be opened
+_GRABS = 10
 
 
 @dataclass(frozen=True, slots=True)
@@ -58,7 +67,7 @@ def check_config(config: Config, source: str, as_json: bool) -> int:
     """
     findings = dict.fromkeys(require_sound(config, source))  # before touching any device
     if config.devices is not None:
-        bench.require_places(config.devices)
+        bench.require_separate_ports(config.devices)
         driver_check.require_optics(config.devices)
     probes, circuits = _probed(config)
     for probe in probes:
@@ -108,7 +117,7 @@ def _probed(config: Config) -> tuple[list[DeviceProbe], list[interlock_check.Int
         return probe_optics(config), []
     with contextlib.ExitStack() as stack:
         try:
-            stack.enter_context(bench.locked(bench.device_names(devices)))
+            stack.enter_context(device_claim.claim_devices(device_names.device_names(devices)))
         except errors.DeviceError as error:
             return [
                 DeviceProbe(
@@ -122,8 +131,10 @@ def _probed(config: Config) -> tuple[list[DeviceProbe], list[interlock_check.Int
 
 async def _probes(devices: DevicesConfig, laser: bool) -> list[DeviceProbe]:
     if devices.board is not None:
-        return [await probe_board(bench.pump_board(devices, devices.board), devices.board, laser)]
-    return await probe_roles(bench.role_devices(devices))
+        return [
+            await probe_board(bench.make_pump_board(devices, devices.board), devices.board, laser)
+        ]
+    return await probe_roles(role_drivers.make_role_devices(devices))
 
 
 def _show(
@@ -214,7 +225,7 @@ def _locks(config: Config) -> str:
     """The locks that keep a hold down."""
     if config.devices is None:
         return "none"
-    found = lock_store.LockStore.of_machine().find_locks(lock_store.device_keys(config.devices))
+    found = lock_store.LockStore.of_machine().find_locks(lock_keys.device_keys(config.devices))
     return lock_store.locked_line([each.lock for each in found]) if found else "none"
 
 
@@ -228,7 +239,7 @@ def _alarms(alarms: AlarmsConfig) -> str:
 
 def _geometry(config: Config) -> str:
     """The geometry that cycles would use. Raises InputError for an unusable file."""
-    there = geometry_in_force(config)
+    there = read_configured_geometry(config)
     origin = there.origin
     if there.note or not origin.file:
         return there.note or "as stated in [optics.geometry]"
@@ -335,16 +346,13 @@ async def _timed(read: Callable[[], Awaitable[Any]]) -> tuple[Any, float, float]
     return value, float(np.percentile(took_ms, 50)), float(np.percentile(took_ms, 99))
 
 
-_GRABS = 10
-
-
 def probe_optics(config: Config) -> list[DeviceProbe]:
     """Probe camera and screen together; no probe without a camera.
     Call from the main thread only.
     """
     if config.devices is None or config.devices.camera is None:
         return []
-    clock = session.WaitingClock(RunClock.start())
+    clock = waiting_clock.WaitingClock(RunClock.start())
     name = driver_loading.name_of(config.devices.camera)
     try:
         optics = optical_bench.configured_bench(config, clock)
@@ -386,9 +394,9 @@ def run_conformance(url: str, unit_id: int, as_json: bool) -> int:
     program uses it.
     """
     try:
-        with bench.locked(bench.modbus_names(url, unit_id)):
+        with device_claim.claim_devices(device_names.modbus_names(url, unit_id)):
             lock_store.require_unlocked(
-                lock_store.LockStore.of_machine(), lock_store.modbus_keys(url, unit_id)
+                lock_store.LockStore.of_machine(), lock_keys.modbus_keys(url, unit_id)
             )
             findings = asyncio.run(conformance.examine(url, unit_id))
     except ValueError as error:

@@ -67,7 +67,7 @@ async def _board_circuits(devices: DevicesConfig) -> dict[int, InterlockProbe]:
     inputs = bench.board_inputs(devices)
     if not inputs or devices.board is None:
         return {}
-    board = bench.pump_board(devices, devices.board)
+    board = bench.make_pump_board(devices, devices.board)
     open_mask, problem = 0, ""
     try:
         await board.identify()

@@ -12,7 +12,7 @@ from pathlib import Path
 
 from membrane_ctrl.controller.commands import Command
 from membrane_ctrl.controller.locks import decide_unlock
-from membrane_ctrl.instruments import bench, lock_store
+from membrane_ctrl.instruments import device_claim, lock_store
 from membrane_ctrl.model import files
 from membrane_ctrl.model.errors import DeviceError, Exit, InputError, os_reason
 from membrane_ctrl.model.lock import describe_lock
@@ -97,7 +97,7 @@ def _require_no_hold(stored: lock_store.StoredLock, stack: contextlib.ExitStack)
     unlock`.
     """
     try:
-        stack.enter_context(bench.locked(stored.devices))
+        stack.enter_context(device_claim.claim_devices(stored.devices))
     except DeviceError as error:
         raise DeviceError(
             f"{error}; or remove the lock there: `membrane-ctrl ctl unlock`"

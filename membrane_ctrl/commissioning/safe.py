@@ -16,7 +16,14 @@ from pathlib import Path
 from firmware_iface.drivers.pump_board import PumpBoard
 from firmware_iface.roles import BenchReading, LinkError
 from membrane_ctrl.config.schema import Config, DevicesConfig
-from membrane_ctrl.instruments import bench, lock_store
+from membrane_ctrl.instruments import (
+    bench,
+    device_claim,
+    device_names,
+    lock_keys,
+    lock_store,
+    role_drivers,
+)
 from membrane_ctrl.model.errors import DeviceError, Exit, InputError, os_reason
 from membrane_ctrl.model.lock import Lock
 
@@ -36,7 +43,7 @@ def make_safe(config: Config, source: str, logs_dir: Path | None = None, latch: 
     if config.devices is None:
         raise InputError(f"{source}: devices: missing; nothing to make safe")
     if not latch:
-        with bench.locked(bench.device_names(config.devices)):
+        with device_claim.claim_devices(device_names.device_names(config.devices)):
             print(asyncio.run(_after_a_run(config.devices)), file=sys.stderr)
         return Exit.DONE
     folder = logs_dir or Path(config.recording.logs_dir)
@@ -74,9 +81,9 @@ async def _stop(devices: DevicesConfig) -> _Stopped:
     """Stop the pump at the device. Raises DeviceError."""
     if devices.board is None:
         return await _stop_instrument(devices)
-    board = bench.pump_board(devices, devices.board)
+    board = bench.make_pump_board(devices, devices.board)
     try:
-        identity = await bench.patiently(board.identify, devices.board)
+        identity = await bench.retry_connecting(board.identify, devices.board)
         await board.stop()
         reading = await board.read()
     except LinkError as error:
@@ -88,9 +95,9 @@ async def _stop(devices: DevicesConfig) -> _Stopped:
 
 async def _stop_instrument(devices: DevicesConfig) -> _Stopped:
     """Stop the pump alone: an unplugged laser must not keep it running."""
-    pump = bench.role_devices(devices).pump
+    pump = role_drivers.make_role_devices(devices).pump
     try:
-        await bench.patiently(pump.open, "pump")
+        await bench.retry_connecting(pump.open, "pump")
         await pump.set_pump(0.0)
         fraction = await pump.pump_fraction()
     except LinkError as error:
@@ -115,9 +122,9 @@ async def _after_a_run(devices: DevicesConfig) -> str:
     """
     if devices.board is None:
         return (await _stop_instrument(devices)).words
-    board = bench.pump_board(devices, devices.board)
+    board = bench.make_pump_board(devices, devices.board)
     try:
-        identity = await bench.patiently(board.identify, devices.board)
+        identity = await bench.retry_connecting(board.identify, devices.board)
         if identity.map_version == 1:
             await board.stop()
         return _words(devices, await _standing(board, devices.watchdog_s))
@@ -175,7 +182,7 @@ def _store_lock(devices: DevicesConfig) -> None:
     """Store a lock on the devices, which keeps every command down until a person removes it. Raises
     DeviceError.
     """
-    store, keys = lock_store.LockStore.of_machine(), lock_store.device_keys(devices)
+    store, keys = lock_store.LockStore.of_machine(), lock_keys.device_keys(devices)
     account = f"unix:{getpass.getuser()}"
     word = lock_store.draw_word({each.lock.word for each in store.find_locks()})
     set_utc = datetime.now(UTC).isoformat(timespec="seconds")

@@ -17,6 +17,7 @@ MINUTE_S = 60
 TREND_S = 240  # the widest terminal shows this much
 _EVENTS_KEPT = 60
 _NOT_LISTED = events.Why | run_events.Alive  # the headline shows the first
+SILENT_S = 1.0  # the control process hangs if no row comes for this long
 
 
 class Trend:
@@ -51,9 +52,6 @@ class Trend:
             return []
         oldest = self._seconds[-1][0] - MINUTE_S + 1
         return [value for second, values in self._seconds if second >= oldest for value in values]
-
-
-SILENT_S = 1.0  # the control process hangs if no row comes for this long
 
 
 @dataclass(frozen=True, slots=True)

@@ -18,11 +18,17 @@ from rich.live import Live
 
 from membrane_ctrl.config.port import SOCKET_NAME
 from membrane_ctrl.config.schema import Config
-from membrane_ctrl.console import keys, model, why
+from membrane_ctrl.console import key_reader, keys, model, requests, why
 from membrane_ctrl.console.view import ConsolePage
 from membrane_ctrl.model import clock, run_events, shape_estimate, telemetry, terminal
 from membrane_ctrl.model.events import EventLine
-from membrane_ctrl.processes import child, ring
+from membrane_ctrl.processes import child, event_pipe, ring
+
+_SOCKET = Path("logs", SOCKET_NAME)  # where `ctl` looks
+_LOOK_S = 0.2  # as fast as people read changing figures
+_PLAIN_S = 1.0
+# A round takes some ms; a stopped terminal (Ctrl-S, a dead ssh) buffers writes for a while
+_HANGS_S = 15.0
 
 
 def line(view: model.ConsoleView) -> str:
@@ -57,13 +63,6 @@ def _shape_words(view: model.ConsoleView) -> str:
     return f"{shape.state.name.lower()} {shape.estimate.verdict} {why.duration(shape.age_s)}"
 
 
-_SOCKET = Path("logs", SOCKET_NAME)  # where `ctl` looks
-_LOOK_S = 0.2  # as fast as people read changing figures
-_PLAIN_S = 1.0
-# A round takes some ms; a stopped terminal (Ctrl-S, a dead ssh) buffers writes for a while
-_HANGS_S = 15.0
-
-
 @dataclass(frozen=True, slots=True)
 class ConsoleSpec:
     """What the console needs to know about the run."""
@@ -77,7 +76,7 @@ class ConsoleSpec:
     duration_s: float | None = None
     socket: Path | None = None  # of the control port; None if it is off
     # None unless stdin is the terminal that the console draws on
-    keyboard: keys.Keyboard | None = None
+    keyboard: key_reader.Keyboard | None = None
     since_s: float = -math.inf  # an earlier console has shown the events before
 
 
@@ -91,7 +90,7 @@ def console_main(spec: ConsoleSpec, status: Connection | None = None) -> None:
     signal.signal(
         signal.SIGTTOU, signal.SIG_IGN
     )  # it may restore a terminal that has passed to the shell
-    report = child.reporter(status)
+    report = event_pipe.event_sender(status)
     with closing(_Feed(spec)) as feed:
 
         def rounds(show: Callable[[], object]) -> None:
@@ -116,7 +115,7 @@ def _draw(spec: ConsoleSpec, feed: _Feed, rounds: Callable[[Callable[[], object]
         rounds(show)
 
 
-def give_back_terminal(keyboard: keys.Keyboard | None = None) -> None:
+def give_back_terminal(keyboard: key_reader.Keyboard | None = None) -> None:
     """Restore the terminal's main page, cursor and modes after a killed console."""
     if keyboard is not None:
         keyboard.restore()
@@ -197,13 +196,13 @@ def _live(console: Console, spec: ConsoleSpec, feed: _Feed) -> Iterator[Callable
 
 
 @contextmanager
-def _keys(spec: ConsoleSpec) -> Iterator[tuple[keys.KeyReader | None, keys.Desk]]:
+def _keys(spec: ConsoleSpec) -> Iterator[tuple[key_reader.KeyReader | None, keys.Desk]]:
     """The keyboard, if there is one and the control port takes what it asks for."""
-    desk = keys.Desk(keys.sender(spec.socket or _SOCKET, spec.run_dir.name))
+    desk = keys.Desk(requests.request_sender(spec.socket or _SOCKET, spec.run_dir.name))
     reader = None
     if spec.keyboard is not None and spec.socket is not None:
         with suppress(OSError):  # the terminal belongs to another user: `su`
-            reader = keys.KeyReader(spec.keyboard)
+            reader = key_reader.KeyReader(spec.keyboard)
     try:
         yield reader, desk
     finally:

@@ -24,6 +24,39 @@ from membrane_ctrl.model.run_events import from_dict
 _LOCKS_SHOWN = 3  # a low terminal needs room for the figures; `ctl status` lists all
 _NOTICES_SHOWN = 3
 _EIGHTHS = " ▁▂▃▄▅▆▇█"
+_STATE_STYLES = {
+    telemetry.State.HOLD: "bold green",
+    telemetry.State.FAULT: "bold white on red",
+    telemetry.State.LOWER: "bold yellow",
+}
+_SHAPE_STYLES = {telemetry.ShapeState.TRACKING: "green", telemetry.ShapeState.SUSPENDED: "yellow"}
+_VERDICT_STYLES = {"ok": "green", "degraded": "yellow", "rejected": "red"}
+_BAR_WIDTH = 10
+_CALM = 0.25  # of the band: on a finer scale noise would look like trouble
+_LABELS = 8  # characters
+_EDGES = 5 + _LABELS  # borders, padding and labels beside a trend
+_BAR_ROWS_MAX = 6
+_EVENTS_MIN = 4  # lines with their heading: fewer are not worth a list
+_LEVEL_STYLES = {LogLevel.ERROR: "bold red", LogLevel.WARNING: "yellow"}
+# in a low terminal these are omitted first
+_DISPENSABLE = ("", "gains", "flow", "lateness", "cycle", "gas", "mirror", "trend", "shape", "pump")
+# Published columns that the lines below show each in its own way; a line shows the others of its
+# group behind them.
+_PLACED = frozenset(
+    {
+        "error_um",
+        "displacement_um",
+        "setpoint_um",
+        "target_um",
+        "pump_fraction",
+        "vent_fraction",
+        "flow_um_per_s",
+        "leak_um_per_s",
+        "trim_um",
+        "lateness_ms",
+        "missed_ticks",
+    }
+)
 
 
 def level_bar(fraction: float, width: int, style: str = "cyan") -> Text:
@@ -70,24 +103,6 @@ def full_scale(values: Sequence[float], least: float) -> float:
     return next(
         step * decade for step in (1.0, 2.0, 5.0, 10.0) if largest <= step * decade * (1 + 1e-9)
     )
-
-
-_STATE_STYLES = {
-    telemetry.State.HOLD: "bold green",
-    telemetry.State.FAULT: "bold white on red",
-    telemetry.State.LOWER: "bold yellow",
-}
-_SHAPE_STYLES = {telemetry.ShapeState.TRACKING: "green", telemetry.ShapeState.SUSPENDED: "yellow"}
-_VERDICT_STYLES = {"ok": "green", "degraded": "yellow", "rejected": "red"}
-_BAR_WIDTH = 10
-_CALM = 0.25  # of the band: on a finer scale noise would look like trouble
-
-
-_LABELS = 8  # characters
-_EDGES = 5 + _LABELS  # borders, padding and labels beside a trend
-_BAR_ROWS_MAX = 6
-_EVENTS_MIN = 4  # lines with their heading: fewer are not worth a list
-_LEVEL_STYLES = {LogLevel.ERROR: "bold red", LogLevel.WARNING: "yellow"}
 
 
 class ConsolePage:
@@ -227,10 +242,6 @@ def _headline(view: ConsoleView, config: Config) -> Text:
     return line.append(f"\n{view.go_on}", style="default") if view.go_on else line
 
 
-# in a low terminal these are omitted first
-_DISPENSABLE = ("", "gains", "flow", "lateness", "cycle", "gas", "mirror", "trend", "shape", "pump")
-
-
 def _figures(
     view: ConsoleView, config: Config, trend: Sequence[tuple[str, Text]], omitted: Sequence[str]
 ) -> Table:
@@ -290,25 +301,6 @@ def _trend(view: ConsoleView, config: Config, seconds: int, rows: int) -> list[t
     full_um = full_scale(shown, config.limits.band_um * _CALM)
     labels = [f"+{full_um:g} µm", *[" "] * (2 * rows - 2), f"-{full_um:g} µm"]
     return list(zip(labels, signed_bars(shown, full_um, config.limits.band_um, rows), strict=True))
-
-
-# Published columns that the lines below show each in its own way; a line shows the others of its
-# group behind them.
-_PLACED = frozenset(
-    {
-        "error_um",
-        "displacement_um",
-        "setpoint_um",
-        "target_um",
-        "pump_fraction",
-        "vent_fraction",
-        "flow_um_per_s",
-        "leak_um_per_s",
-        "trim_um",
-        "lateness_ms",
-        "missed_ticks",
-    }
-)
 
 
 def _others(row: telemetry.TelemetryRow, *groups: columns.Group) -> str:

@@ -17,7 +17,7 @@ from typing import Any
 from membrane_ctrl.config.port import EpicsConfig
 from membrane_ctrl.doors.epics_search import require_unserved
 from membrane_ctrl.doors.names import TABLE, Door, Published, Value
-from membrane_ctrl.instruments import bench
+from membrane_ctrl.instruments import device_claim
 from membrane_ctrl.model import errors, files
 from membrane_ctrl.web.access import Action
 
@@ -33,7 +33,7 @@ async def serve(config: EpicsConfig, door: Door) -> None:
     """Serve until cancelled. Raises DeviceError if the address is taken, or another server has
     these records.
     """
-    with bench.locked([f"EPICS records {door.settings.name}:*"]):
+    with device_claim.claim_devices([f"EPICS records {door.settings.name}:*"]):
         await _serve_records(config, door)
 
 

@@ -12,10 +12,14 @@ from pathlib import Path
 from membrane_ctrl.config.port import WebConfig
 from membrane_ctrl.config.schema import Config
 from membrane_ctrl.controller.tick_codec import MESSAGE_BYTES, SNAPSHOT_MESSAGE_BYTES
-from membrane_ctrl.model import clock, events, run_events, telemetry
+from membrane_ctrl.model import events, run_events, telemetry
+from membrane_ctrl.model.clock import RunClock, pause_s
 from membrane_ctrl.model.shape_estimate import ESTIMATE_BYTES_MAX
-from membrane_ctrl.processes.child import Child, Program, pipe
-from membrane_ctrl.processes.ring import FrameAddress, RingAddress, ring
+from membrane_ctrl.processes.child import Child
+from membrane_ctrl.processes.command_process import CommandProcess
+from membrane_ctrl.processes.event_pipe import pipe
+from membrane_ctrl.processes.frame_address import FrameAddress
+from membrane_ctrl.processes.ring import RingAddress, ring
 
 # Restarting does not help a child that ends more often
 _MOST_PER_HOUR = 10
@@ -23,7 +27,14 @@ _HOUR_S = 3600.0
 # Until the first report: the interpreter may start on a busy machine
 _STARTS_S = 60.0
 
-Make = Callable[[int], tuple[Child | Program, Connection]]
+Make = Callable[[int], tuple[Child | CommandProcess, Connection]]
+_TELEMETRY_KEPT_S = 60.0  # a recorder busy for this long (a slow disk) loses nothing
+_EVENTS_KEPT, EVENT_BYTES = 1024, 8192  # with all of the longest request
+_SHAPES_KEPT = 64
+_SNAPSHOTS_KEPT = 4
+_RECORDER_CLOSES_S = 30.0
+_CHILD_STOPS_S = 3.0
+_ALARMS_LEAVE_S = 10.0  # the process allows itself 8 s for the last notices
 
 
 class ManagedChild:
@@ -81,7 +92,7 @@ class ManagedChild:
             return said
         # at once, then at growing intervals: a child that dies at its start must not keep the
         # machine busy
-        if now_s - self._ended_s >= clock.pause_s(len(self._replaced_s)):
+        if now_s - self._ended_s >= pause_s(len(self._replaced_s)):
             self.replace(now_s)
             said.append(run_events.ChildRestarted(name, self._count))
         return said
@@ -127,15 +138,6 @@ class ManagedChild:
         return said
 
 
-_TELEMETRY_KEPT_S = 60.0  # a recorder busy for this long (a slow disk) loses nothing
-_EVENTS_KEPT, EVENT_BYTES = 1024, 8192  # with all of the longest request
-_SHAPES_KEPT = 64
-_SNAPSHOTS_KEPT = 4
-_RECORDER_CLOSES_S = 30.0
-_CHILD_STOPS_S = 3.0
-_ALARMS_LEAVE_S = 10.0  # the process allows itself 8 s for the last notices
-
-
 @dataclass(frozen=True, slots=True)
 class Rings:
     """The shared memory of a run (docs/explanation/architecture.md)."""
@@ -179,14 +181,14 @@ class ChildProcesses:
     def __init__(
         self,
         config: Config,
-        clock: clock.RunClock,
+        clock: RunClock,
         rings: Rings,
         run_dir: Path,
         name: str,
         duration_s: float | None,
         socket: Path | None,
     ) -> None:
-        from membrane_ctrl.console.keys import Keyboard
+        from membrane_ctrl.console.key_reader import Keyboard
         from membrane_ctrl.console.process import ConsoleSpec
         from membrane_ctrl.recorder.process import RecorderSpec
 
@@ -228,7 +230,7 @@ class ChildProcesses:
         )
         self._acquisition = self._alarms = None
         if rings.shapes is not None and rings.frames is not None:
-            from membrane_ctrl.acquisition.process import AcquisitionSpec
+            from membrane_ctrl.acquisition.spec import AcquisitionSpec
 
             cycles = AcquisitionSpec(
                 config, clock, rings.telemetry, rings.shapes, rings.truth, rings.frames, run_dir
@@ -245,7 +247,7 @@ class ChildProcesses:
         if config.web is not None and socket is not None:
             words = _page_words(config.web, run_dir, socket)
             self._page = ManagedChild(
-                lambda _: (Program("page", words, run_dir / "web.log", 10), pipe()[0]), False
+                lambda _: (CommandProcess("page", words, run_dir / "web.log", 10), pipe()[0]), False
             )
 
     @property

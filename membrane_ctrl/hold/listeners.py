@@ -19,6 +19,8 @@ from membrane_ctrl.model import events, run_events, telemetry
 from membrane_ctrl.model.run_status import RunStatus
 from membrane_ctrl.run_files.latched_fault import LatchedFault, LatchedFile, ResumeLog
 
+_NOTIFY_S = 0.5  # far below any sensible WatchdogSec=, and cheap
+
 
 class FaultLatch:
     """Keeps the latched-fault file in step with the controller; waits for the disk only on exit,
@@ -134,9 +136,6 @@ class FaultLatch:
     def _report(self) -> None:
         while self._news:
             self._tell(self._news.popleft())
-
-
-_NOTIFY_S = 0.5  # far below any sensible WatchdogSec=, and cheap
 
 
 class SystemdNotify:

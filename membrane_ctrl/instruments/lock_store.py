@@ -20,10 +20,6 @@ from dataclasses import asdict, dataclass, fields, replace
 from datetime import UTC, datetime
 from pathlib import Path
 
-from firmware_iface import settings
-from firmware_iface.links import modbus_rtu
-from membrane_ctrl.config.schema import DevicesConfig
-from membrane_ctrl.instruments import bench
 from membrane_ctrl.model import files
 from membrane_ctrl.model.errors import DeviceError, os_reason
 from membrane_ctrl.model.lock import WORDS, Lock, describe_locks, distinct_word, word_of_number
@@ -35,9 +31,9 @@ SCHEMA = "membrane-lock/1"
 LOG_NAME = "removed.log"  # what `membrane-ctrl locks remove` removed, one JSON object a line
 _SUFFIX = ".json"
 _FILE_BYTES_MOST = 16_384
-_FOLDER_MODE, _FILE_MODE = 0o755, 0o644
+_FOLDER_MODE = 0o755
+_FILE_MODE = 0o644
 _TEXTS = frozenset(field.name for field in fields(Lock))
-_BY_ID = Path("/dev/serial/by-id")
 _UNKNOWN = "unknown"
 
 
@@ -163,53 +159,6 @@ class LockStore:
                     yield _read_file(path)
 
 
-def device_keys(devices: DevicesConfig) -> frozenset[str]:
-    """Return the names by which a bench's devices are known to the lock store.
-
-    Besides the present names (`bench.device_names`), by which programs exclude each other, these
-    are the configured ones and those of `/dev/serial/by-id`: a USB adapter or an address may get
-    another name while a lock is set.
-
-    Parameters
-    ----------
-    devices : DevicesConfig
-
-    Returns
-    -------
-    frozenset of str
-    """
-    if devices.board is not None:
-        return modbus_keys(devices.board, devices.unit_id)
-    keys: set[str] = set()
-    for section in devices.roles().values():
-        if isinstance(section, settings.ON_MODBUS):
-            keys |= modbus_keys(section.link, section.unit_id)
-        else:
-            keys |= _serial_keys(section.port)
-    return frozenset(keys | bench.device_names(devices))
-
-
-def modbus_keys(url: str, unit_id: int) -> frozenset[str]:
-    """Return the names of a Modbus device, as `device_keys` does.
-
-    Parameters
-    ----------
-    url : str
-    unit_id : int
-
-    Returns
-    -------
-    frozenset of str
-    """
-    names = bench.modbus_names(url, unit_id)
-    if url.startswith("rtu:"):
-        return frozenset(names | _serial_keys(url.removeprefix("rtu://").partition("?")[0]))
-    with contextlib.suppress(ValueError):
-        host, port = modbus_rtu.parse_tcp_url(url)
-        names = names | {f"{host.lower()} port {port} unit {unit_id}"}
-    return frozenset(names)
-
-
 def require_unlocked(store: LockStore, devices: Collection[str], remedy: str = "") -> None:
     """Refuse to go on if a device is locked. Every command that can move gas calls this after it
     has the devices.
@@ -275,15 +224,6 @@ def _own_state_folder() -> Path | None:
         return Path.home() / ".local" / "state" / "membrane-ctrl" / "locks"
     except RuntimeError:
         return None
-
-
-def _serial_keys(port: str) -> set[str]:
-    """Return a serial port's names: as configured, its present path, and its names by identity."""
-    present = os.path.realpath(port)
-    keys = {port, present}
-    with contextlib.suppress(OSError):
-        keys |= {str(link) for link in _BY_ID.iterdir() if os.path.realpath(link) == present}
-    return keys
 
 
 def _is_lock_name(name: str) -> bool:

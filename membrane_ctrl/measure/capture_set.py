@@ -22,14 +22,8 @@ from firmware_iface.roles import Pattern
 from firmware_iface.settings import Section
 from membrane_ctrl.config import schema, toml_file
 from membrane_ctrl.config.origin import OriginSection
-from membrane_ctrl.geometry.file import (
-    ArtefactTable,
-    GeometryFile,
-    GeometryOrigin,
-    ScreenMovedTable,
-    origin_of,
-    screen_elsewhere,
-)
+from membrane_ctrl.geometry.file import GeometryFile, GeometryOrigin, stated_origin
+from membrane_ctrl.geometry.set_tables import ArtefactTable, ScreenMovedTable, move_screen
 from membrane_ctrl.measure.images import IMAGE_BYTES_MAX, decoded_image
 from membrane_ctrl.metrology.phase.pattern_sequence import fringe_sequence, full_sequence
 from membrane_ctrl.metrology.rays.artefacts import Artefact
@@ -168,7 +162,7 @@ def read_head(folder: str | Path, geometry: GeometryFile | None = None) -> Captu
     )
     before, moved = optics.geometry, content.screen_moved
     if moved is not None:
-        optics = optics.model_copy(update={"geometry": screen_elsewhere(before, moved.shift_mm)})
+        optics = optics.model_copy(update={"geometry": move_screen(before, moved.shift_mm)})
     return CaptureHead(
         folder=folder,
         kind=content.kind,
@@ -181,7 +175,7 @@ def read_head(folder: str | Path, geometry: GeometryFile | None = None) -> Captu
         displacement_um=_column([row.displacement_um for row, _ in rows]),
         pressure_pa=math.nan if content.pressure_pa is None else content.pressure_pa,
         ignored=ignored,
-        geometry=origin_of(optics) if geometry is None else geometry.origin,
+        geometry=stated_origin(optics) if geometry is None else geometry.origin,
         artefact=None
         if content.artefact is None
         else content.artefact.artefact(content.mirror.radius_mm, path),

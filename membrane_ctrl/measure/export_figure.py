@@ -17,7 +17,7 @@ from typing import Any
 import numpy as np
 
 from membrane_ctrl.measure.export_fits import fits_bytes
-from membrane_ctrl.measure.results import read_arrays
+from membrane_ctrl.measure.result_files import read_arrays
 from membrane_ctrl.metrology.figure import best_sphere
 from membrane_ctrl.metrology.figure.error_bars import LEAST_CELLS
 from membrane_ctrl.metrology.numerics import grid_fit, zernike
@@ -28,6 +28,12 @@ from membrane_ctrl.model.zernike_terms import ZERNIKE_TERMS
 _REMOVABLE = {"piston": (0,), "tilt": (1, 2), "power": (3,)}  # places in the Fringe set
 _CELLS_MAX = 4_000_000
 _HEIGHT_MAX_MM = 1e4
+_WAVELENGTH_M = float(
+    np.float32(632.8e-9)
+)  # a scale, which the formats require: no light was measured
+_NO_DATA = 2147483640
+_RESOLUTIONS = {1: 32768, 0: 4096}  # code in the file, counts per wavelength
+_CODEV_MOST, _CODEV_MISSING = 32767, -32768
 
 
 @dataclass(frozen=True)
@@ -214,12 +220,6 @@ Written = tuple[
     bytes, float | None
 ]  # a file's content, and the step of its heights in mm if they are whole numbers
 
-_WAVELENGTH_M = float(
-    np.float32(632.8e-9)
-)  # a scale, which the formats require: no light was measured
-_NO_DATA = 2147483640
-_RESOLUTIONS = {1: 32768, 0: 4096}  # code in the file, counts per wavelength
-
 
 def _zygo_dat(seen: ExportedMap, _: object) -> Written:
     """MetroPro's binary file, version 1: a header of 834 bytes and big-endian counts."""
@@ -284,9 +284,6 @@ def _zygo_xyz(seen: ExportedMap, _: object) -> Written:
         for j, value in enumerate(row)
     )
     return ("\n".join([*head, *points]) + "\n#\n").encode(), 1e-9
-
-
-_CODEV_MOST, _CODEV_MISSING = 32767, -32768
 
 
 def _codev_int(seen: ExportedMap, _: object) -> Written:

@@ -2,20 +2,16 @@
 maps, report.
 """
 
-import io
 import math
-from base64 import b64encode
-from collections.abc import Sequence
 from dataclasses import dataclass
-from html import escape
 from pathlib import Path
-from textwrap import wrap
 from typing import Any
 
 import numpy as np
 
 from membrane_ctrl.measure.measurement import Measurement
-from membrane_ctrl.measure.results import ErrorBars, number_or_null, write_arrays
+from membrane_ctrl.measure.result_files import number_or_null, write_arrays
+from membrane_ctrl.measure.results import ErrorBars
 from membrane_ctrl.metrology.figure import best_sphere
 from membrane_ctrl.metrology.figure.error_bars import LEAST_CELLS, FigureBars, figure_bars
 from membrane_ctrl.metrology.figure.power_spectrum import PowerSpectrum, power_spectrum
@@ -24,8 +20,6 @@ from membrane_ctrl.metrology.figure.surface_map import SurfaceMap
 from membrane_ctrl.metrology.numerics import zernike
 from membrane_ctrl.metrology.rays import surface
 from membrane_ctrl.model.errors import InputError
-from membrane_ctrl.model.files import write_bytes_atomic, write_text_atomic
-from membrane_ctrl.model.terminal import plain
 from membrane_ctrl.model.zernike_terms import ZERNIKE_TERMS
 
 ENERGY_SHARES = np.linspace(0.01, 1.0, 100)
@@ -221,143 +215,3 @@ def with_bar(value: float, sigma: float) -> str:
         return f"{value:.6g}"
     digits = max(0, 1 - math.floor(math.log10(sigma)))
     return f"{value:.{digits}f} +- {sigma:.{digits}f}"
-
-
-# The report: one HTML page that loads nothing from elsewhere, and the same as PDF.
-
-_STYLE = """
-body{max-width:1080px;margin:0 auto;padding:28px;color:#20242b;font:15px/1.5 system-ui,sans-serif}
-h1,h2{overflow-wrap:anywhere}h2{font-size:17px;margin-top:28px;border-bottom:1px solid #e3e7ed}
-table{border-collapse:collapse;font-variant-numeric:tabular-nums}th{text-align:left;color:#667}
-td,th{border-bottom:1px solid #eef0f4;padding:3px 18px 3px 0}pre{white-space:pre-wrap;overflow-wrap:anywhere}
-img{max-width:100%}@media print{figure,tr{break-inside:avoid}}
-"""  # noqa: E501
-_POLICY = "default-src 'none'; img-src data:; style-src 'unsafe-inline'"
-_PAGE = (8.27, 11.69)  # A4, inches
-_LINES_A_PAGE = 64
-
-
-def write_report(
-    out: Path, name: str, lines: Sequence[str], result: dict[str, Any], drawn: Sequence[Path]
-) -> None:
-    """Write `report.html` and `report.pdf` of a measurement: its lines, numbers, terms and
-    pictures. Raises OSError.
-
-    `name` is for the title; `result` is the content of `result.json`; `drawn` are the pictures'
-    files.
-    """
-    title = plain(f"Measurement of {name}")
-    tables = [] if result["figure"] is None else _report_tables(result["figure"])
-    images = [(file.stem, file.read_bytes()) for file in drawn]
-    write_text_atomic(
-        out / "report.html", _page(title, [plain(line) for line in lines], tables, images)
-    )
-    write_bytes_atomic(
-        out / "report.pdf", _pdf(title, [plain(line) for line in lines], tables, images)
-    )
-
-
-ReportTable = tuple[str, list[tuple[str, ...]]]  # heading, rows; the first names the columns
-
-
-def _report_tables(figure: dict[str, Any]) -> list[ReportTable]:
-    """The numbers of the block `figure`, what it does not give, and its sets of terms."""
-
-    def cell(value: float | None) -> str:
-        return "unknown" if value is None else f"{value:.6g}"
-
-    rows: list[tuple[str, ...]] = [("number", "value", "1 sigma, noise", "1 sigma, geometry")]
-    rows += [(key, *(cell(item[part]) for part in item)) for key, item in figure["numbers"].items()]
-    where = (
-        f"aperture: radius {figure['aperture_radius_mm']:g} mm about the vertex; cells of "
-        f"{figure['cell_mm']:.3g} mm"
-    )
-    tables: list[ReportTable] = [(f"Figure ({where})", rows)]
-    if figure["not_given"]:
-        tables.append(("Not given", [("number", "reason"), *figure["not_given"].items()]))
-    for terms in figure["zernike"]:
-        rows = [("j", "coefficient, µm", "1 sigma, noise", "1 sigma, geometry")]
-        columns = (terms[key] for key in ("coeffs_um", "sigma_noise_um", "sigma_geometry_um"))
-        rows += [
-            (str(j), *map(cell, row))
-            for j, row in enumerate(zip(*columns, strict=True), terms["first"])
-        ]
-        heading = (
-            f"Zernike terms, {terms['index']}, {terms['normalisation']} 1 over "
-            f"{terms['radius_mm']:g} mm"
-        )
-        tables.append((heading, rows))
-    return tables
-
-
-def _page(
-    title: str,
-    lines: Sequence[str],
-    tables: Sequence[ReportTable],
-    images: Sequence[tuple[str, bytes]],
-) -> str:
-    parts = [
-        "<!doctype html><html lang='en'><meta charset='utf-8'>",
-        f'<meta http-equiv="Content-Security-Policy" content="{_POLICY}">',
-        f"<title>{escape(title)}</title><style>{_STYLE}</style><h1>{escape(title)}</h1>",
-        f"<pre>{escape(chr(10).join(lines))}</pre>",
-    ]
-    for heading, rows in tables[:2]:
-        parts.append(_html_table(heading, rows))
-    for name, data in images:
-        text = b64encode(data).decode()
-        parts.append(
-            f"<h2>{name}</h2><figure><img alt='{name}' src='data:image/png;base64,{text}'></figure>"
-        )
-    parts += [_html_table(heading, rows) for heading, rows in tables[2:]]
-    return "\n".join(parts) + "</html>\n"
-
-
-def _html_table(heading: str, rows: Sequence[tuple[str, ...]]) -> str:
-    head, *body = [[escape(text) for text in row] for row in rows]
-    marked = ["<th>" + "<th>".join(head), *("<td>" + "<td>".join(row) for row in body)]
-    return (
-        f"<h2>{escape(heading)}</h2><table>"
-        + "\n".join(f"<tr>{row}" for row in marked)
-        + "</table>"
-    )
-
-
-def _pdf(
-    title: str,
-    lines: Sequence[str],
-    tables: Sequence[ReportTable],
-    images: Sequence[tuple[str, bytes]],
-) -> bytes:
-    """Pages of text, then two pictures on each."""
-    from matplotlib import figure, image
-    from matplotlib.backends.backend_pdf import PdfPages
-
-    text = [title, "", *(part for line in lines for part in wrap(line, 100) or [""])]
-    for heading, rows in tables:
-        text += ["", heading]
-        text += [part for row in rows for part in wrap("".join(f"{cell:26}" for cell in row), 104)]
-    file = io.BytesIO()
-    with PdfPages(file) as pages:
-        for first in range(0, len(text), _LINES_A_PAGE):
-            page = figure.Figure(figsize=_PAGE)
-            part = "\n".join(text[first : first + _LINES_A_PAGE])
-            page.text(
-                0.07,
-                0.96,
-                part,
-                va="top",
-                family="monospace",
-                fontsize=7.5,
-                linespacing=1.5,
-                parse_math=False,
-            )
-            pages.savefig(page)
-        for first in range(0, len(images), 2):
-            page = figure.Figure(figsize=_PAGE)
-            for place, (_, data) in enumerate(images[first : first + 2]):
-                axes = page.add_axes((0.05, 0.51 - 0.48 * place, 0.9, 0.46))
-                axes.imshow(image.imread(io.BytesIO(data)))
-                axes.set_axis_off()
-            pages.savefig(page)
-    return file.getvalue()

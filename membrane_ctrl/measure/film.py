@@ -10,7 +10,7 @@ import numpy as np
 
 from membrane_ctrl.geometry import file, spread_file
 from membrane_ctrl.measure.measurement import Figures, SetFigure
-from membrane_ctrl.measure.results import write_figure, write_json
+from membrane_ctrl.measure.result_files import write_json, write_picture
 from membrane_ctrl.metrology.film import film_figure, material_fit
 from membrane_ctrl.metrology.film.film_law import FilmLaw
 from membrane_ctrl.metrology.rays.surface import Surface
@@ -94,7 +94,7 @@ def _figures(
     sets: list[SetFigure], geometry: Path | None
 ) -> tuple[list[film_figure.FilmFigure], str]:
     """The sets' figures with their errors, and where the geometry's spread comes from."""
-    spread, source = spread_file.spread_of(sets[0].head.optics, geometry)
+    spread, source = spread_file.geometry_spread(sets[0].head.optics, geometry)
     out = []
     for one in sets:
         bench, surface = one.bench(), one.figure.fit.surface
@@ -294,4 +294,4 @@ def _draw(
     both.plot(1e6 * centre[0], centre[1], "+", color="black")
     both.set(title="pre-strain and Poisson ratio", xlabel="pre-strain (µm/m)", ylabel="nu")
     both.legend(fontsize=8)
-    write_figure(path, drawing)
+    write_picture(path, drawing)

@@ -6,7 +6,8 @@ from pathlib import Path
 
 import numpy as np
 
-from membrane_ctrl.geometry.file import GeometryFile, require_plausible
+from membrane_ctrl.geometry.file import GeometryFile
+from membrane_ctrl.geometry.run_geometry import require_plausible
 from membrane_ctrl.measure.capture_set import CaptureHead, CaptureSet, anchored, read_set
 from membrane_ctrl.metrology.figure.bin_figure import BinFigure, bin_figure
 from membrane_ctrl.metrology.figure.pixel_figure import FullResult, measure_pixels, reconstruct_full

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -13,19 +11,18 @@ from matplotlib.figure import Figure
 
 from membrane_ctrl.measure.figure_results import ENERGY_SHARES, MeasuredFigure
 from membrane_ctrl.measure.measurement import Measurement
-from membrane_ctrl.measure.results import ErrorBars, write_figure
+from membrane_ctrl.measure.result_files import write_picture
+from membrane_ctrl.measure.results import ErrorBars
 from membrane_ctrl.metrology.figure import radial_profile
 from membrane_ctrl.metrology.figure.pixel_figure import FullResult
 from membrane_ctrl.metrology.figure.surface_map import SurfaceMap
 from membrane_ctrl.metrology.rays import rim_outline
 from membrane_ctrl.model.arrays import FloatArray
-from membrane_ctrl.model.files import move, scratch_folder
 from membrane_ctrl.model.terminal import plain
-from membrane_ctrl.model.zernike_terms import NOLL_INDICES
 
 if TYPE_CHECKING:  # half a second to load, and most measurements make no recording
-    import rerun as rr
-    import rerun.blueprint as rrb
+    pass
+
 
 _SHOWN_PX = 600  # side of pixel maps
 _MAP_CELLS = 450
@@ -34,7 +31,7 @@ _STEEP = 3.0
 _SHOWN_ROWS = 16  # of the budget: the rest adds nothing
 
 
-def draw_all(
+def draw_measurement(
     out: Path,
     measurement: Measurement,
     light: FloatArray,
@@ -46,33 +43,33 @@ def draw_all(
     """Draw all pictures; returns the files. `light` (H, W), of any size, is the white frame or the
     fringes' mean.
     """
-    files = [write_figure(out / "frames.png", _frames(measurement))]
+    files = [write_picture(out / "frames.png", _draw_frames(measurement))]
     full = measurement.full
     if full is None or profile is None:
         return files
     axis, height = full.grid.axis_mm, full.height_mm()
     residual_um = 1e3 * full.residual_mm
     files += [
-        write_figure(out / "sag.png", _map("height (mm)", axis, height, "viridis")),
-        write_figure(
+        write_picture(out / "sag.png", _map_axes("height (mm)", axis, height, "viridis")),
+        write_picture(
             out / "residual.png",
-            _map("height over the fit (µm)", axis, residual_um, "RdBu_r", even=True),
+            _map_axes("height over the fit (µm)", axis, residual_um, "RdBu_r", even=True),
         ),
-        write_figure(
-            out / "slopes.png", _slopes(full, full.map() if figure is None else figure.seen)
+        write_picture(
+            out / "slopes.png", _draw_slopes(full, full.map() if figure is None else figure.seen)
         ),
-        write_figure(out / "modulation.png", _modulation(measurement, full, light, outline)),
-        write_figure(out / "profile.png", _profile(profile)),
-        write_figure(out / "convergence.png", _convergence(full)),
+        write_picture(out / "modulation.png", _draw_modulation(measurement, full, light, outline)),
+        write_picture(out / "profile.png", _draw_profile(profile)),
+        write_picture(out / "convergence.png", _draw_convergence(full)),
     ]
     if bars is not None:
-        files.append(write_figure(out / "uncertainty.png", _uncertainty(bars)))
+        files.append(write_picture(out / "uncertainty.png", _draw_uncertainty(bars)))
     if figure is not None:
-        files.append(write_figure(out / "figure.png", _figure(figure)))
+        files.append(write_picture(out / "figure.png", _draw_figure(figure)))
     return files
 
 
-def sheet(width: float, height: float, rows: int = 1, columns: int = 1) -> tuple[Figure, Any]:
+def new_sheet(width: float, height: float, rows: int = 1, columns: int = 1) -> tuple[Figure, Any]:
     """A figure of so many inches and its axes, with fixed margins: fitted ones double the time of a
     picture.
     """
@@ -90,9 +87,9 @@ def _plain_powers(*axes: Any) -> None:
         axis.set_minor_formatter("")
 
 
-def _figure(found: MeasuredFigure) -> Figure:
+def _draw_figure(found: MeasuredFigure) -> Figure:
     """Draw what deviates from the best sphere, its spectrum, and the encircled energy."""
-    figure, ((whole, rest), (spectrum, energy)) = sheet(12, 10, 2, 2)
+    figure, ((whole, rest), (spectrum, energy)) = new_sheet(12, 10, 2, 2)
     axis, deviation_um = found.seen.axis_mm, found.figure.deviation_um
     radius_mm = found.figure.numbers.radius_of_curvature_mm
     show_map(
@@ -138,9 +135,9 @@ def _figure(found: MeasuredFigure) -> Figure:
     return figure
 
 
-def _uncertainty(bars: ErrorBars) -> Figure:
+def _draw_uncertainty(bars: ErrorBars) -> Figure:
     """Draw 1 sigma from the set itself and from the geometry, and the budget."""
-    figure, (left, middle, right) = sheet(17, 4.8, 1, 3)
+    figure, (left, middle, right) = new_sheet(17, 4.8, 1, 3)
     of_noise, of_geometry = bars.maps_um()
     show_map(
         left, "1 sigma from this set: noise, film, light (µm)", bars.grid.axis_mm, of_noise, "magma"
@@ -162,10 +159,10 @@ def _uncertainty(bars: ErrorBars) -> Figure:
     return figure
 
 
-def _map(
+def _map_axes(
     title: str, axis: FloatArray, values: FloatArray, colours: str, even: bool = False
 ) -> Figure:
-    figure, axes = sheet(6.4, 5.4)
+    figure, axes = new_sheet(6.4, 5.4)
     show_map(axes, title, axis, values, colours, even)
     return figure
 
@@ -213,9 +210,9 @@ def _local_mean(values: FloatArray) -> FloatArray:
     return np.asarray(squares.mean(axis=(1, 3)))
 
 
-def _slopes(full: FullResult, seen: SurfaceMap) -> Figure:
+def _draw_slopes(full: FullResult, seen: SurfaceMap) -> Figure:
     """Draw the measured slopes and the residuals of the fit."""
-    figure, axes = sheet(11, 9, 2, 2)
+    figure, axes = new_sheet(11, 9, 2, 2)
     grid = full.grid
     for place, slope, name in (
         (axes[0, 0], seen.slope_x, "dh/dx"),
@@ -232,7 +229,7 @@ def _slopes(full: FullResult, seen: SurfaceMap) -> Figure:
     return figure
 
 
-def _modulation(
+def _draw_modulation(
     measurement: Measurement,
     full: FullResult,
     light: FloatArray,
@@ -243,7 +240,7 @@ def _modulation(
     swing = np.full(camera.width_px * camera.height_px, np.nan, np.float32)
     swing[full.index] = full.swing_adu
     step = max(1, camera.height_px // _SHOWN_PX)
-    figure, (left, right) = sheet(12, 5, 1, 2)
+    figure, (left, right) = new_sheet(12, 5, 1, 2)
     extent = (-0.5, camera.width_px - 0.5, camera.height_px - 0.5, -0.5)
     picture = swing.reshape(camera.height_px, camera.width_px)[::step, ::step]
     figure.colorbar(left.imshow(picture, extent=extent), ax=left, shrink=0.85)
@@ -255,11 +252,11 @@ def _modulation(
     return figure
 
 
-def _frames(measurement: Measurement) -> Figure:
+def _draw_frames(measurement: Measurement) -> Figure:
     """Draw one tile per frame, the flagged ones with their reason."""
     names = [pattern.name for pattern in measurement.head.patterns]
     reasons = {flag.frame: plain(flag.reason) for flag in measurement.flags}
-    figure, axes = sheet(9, 0.28 * len(names) + 1.2)
+    figure, axes = new_sheet(9, 0.28 * len(names) + 1.2)
     colours = ["tab:red" if k in reasons else "tab:green" for k in range(len(names))]
     axes.barh(range(len(names)), 1.0, color=colours, alpha=0.5)
     for k in range(len(names)):
@@ -273,8 +270,8 @@ def _frames(measurement: Measurement) -> Figure:
     return figure
 
 
-def _profile(profile: radial_profile.RadialProfile) -> Figure:
-    figure, (upper, lower) = sheet(7, 6, 2, 1)
+def _draw_profile(profile: radial_profile.RadialProfile) -> Figure:
+    figure, (upper, lower) = new_sheet(7, 6, 2, 1)
     upper.fill_between(
         profile.radius_mm, profile.low_mm, profile.high_mm, alpha=0.4, label="95 % of the ring"
     )
@@ -297,8 +294,8 @@ def _profile(profile: radial_profile.RadialProfile) -> Figure:
     return figure
 
 
-def _convergence(full: FullResult) -> Figure:
-    figure, axes = sheet(6, 4)
+def _draw_convergence(full: FullResult) -> Figure:
+    figure, axes = new_sheet(6, 4)
     changes = full.fit.changes_mm
     axes.semilogy(range(1, len(changes) + 1), np.maximum(changes, 1e-16), "o-")
     axes.axhline(1e-6, linestyle="--", color="tab:red")
@@ -309,64 +306,3 @@ def _convergence(full: FullResult) -> Figure:
     )
     _plain_powers(axes.yaxis)
     return figure
-
-
-@contextmanager
-def result_recording(
-    path: Path, application: str, blueprint: rrb.Blueprint | None = None
-) -> Iterator[rr.RecordingStream]:
-    """Write a Rerun recording to a file `path` (.rrd), overwriting it. Raises OSError if that
-    fails.
-    """
-    import rerun as rr
-
-    recording = rr.RecordingStream(application)
-    with scratch_folder(path.parent, ".recording-") as folder:
-        try:
-            recording.save(folder / path.name, default_blueprint=blueprint)
-            yield recording
-            recording.flush()  # logging never reports a full disk, this does
-        except RuntimeError as error:
-            raise OSError(f"{path.name}: {error}") from None
-        finally:
-            recording.disconnect()
-        try:
-            move(folder / path.name, path)
-        except OSError as error:
-            raise OSError(f"{path.name}: {error.strerror}") from None
-
-
-def log_pictures(recording: rr.RecordingStream, entity: str, pictures: Sequence[Path]) -> None:
-    """Log every picture below an entity, by file name."""
-    import rerun as rr
-
-    for picture in pictures:
-        recording.log(f"{entity}/{picture.stem}", rr.EncodedImage(path=picture), static=True)
-
-
-def log_measurement(path: Path, measurement: Measurement, pictures: Sequence[Path]) -> None:
-    """Write maps, coefficients, verdict and pictures as a recording `path` (.rrd).
-    Raises OSError.
-    """
-    import rerun as rr
-
-    words = [f"verdict: {measurement.verdict} {measurement.reason}"]
-    words += [f"{item['file']}: {item['reason']}" for item in measurement.flagged_files()]
-    full = measurement.full
-    with result_recording(path, "membrane_ctrl_measure") as recording:
-        recording.log("measure/verdict", rr.TextDocument("\n".join(words)), static=True)
-        if full is not None:
-            coeffs_um = 1e3 * full.surface.coeffs_mm
-            recording.log(
-                "measure/zernike_um",
-                rr.BarChart(coeffs_um[1:], abscissa=NOLL_INDICES[1:]),
-                static=True,
-            )
-            # row 0 of a picture is at the top, i.e. at +y
-            height = full.height_mm()[::-1].astype(np.float32)
-            residual = (1e3 * full.residual_mm)[::-1].astype(np.float32)
-            recording.log("measure/height_mm", rr.Tensor(height, dim_names=["y", "x"]), static=True)
-            recording.log(
-                "measure/residual_um", rr.Tensor(residual, dim_names=["y", "x"]), static=True
-            )
-        log_pictures(recording, "measure/pictures", pictures)

@@ -4,19 +4,14 @@ and `details.json`.
 
 from __future__ import annotations
 
-import io
-import json
 import math
-import zipfile
-import zlib
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from numpy.typing import NDArray
 
-from membrane_ctrl.geometry.spread_file import spread_of
+from membrane_ctrl.geometry.spread_file import geometry_spread
 from membrane_ctrl.measure.measurement import Measurement, noise_seen_adu
 from membrane_ctrl.metrology.figure import radial_profile
 from membrane_ctrl.metrology.figure.pixel_figure import FullResult
@@ -27,15 +22,11 @@ from membrane_ctrl.metrology.uncertainty import height_map, set_budget
 from membrane_ctrl.metrology.uncertainty.budget import Budget
 from membrane_ctrl.model import errors, program, zernike_terms
 from membrane_ctrl.model.arrays import FloatArray
-from membrane_ctrl.model.files import make_folder, read_bytes, write_bytes_atomic, write_text_atomic
+from membrane_ctrl.model.files import make_folder
 
 if TYPE_CHECKING:  # matplotlib takes a second to load
-    from matplotlib.figure import Figure
-
-
-# Uncertainty of a measured height without trials: every part is linear
-# (`metrology.uncertainty.budget`), some hundred solutions of thinned points. The Monte Carlo of the
-# `uncertainty` command agrees within 10 %.
+    pass
+from membrane_ctrl.measure.result_files import number_or_null, write_arrays, write_json
 
 
 @dataclass(frozen=True)
@@ -93,7 +84,7 @@ def error_bars(
     full, checked, optics = measurement.full, measurement.checked, measurement.head.optics
     if full is None or checked is None:
         return None
-    spread, source = spread_of(optics, geometry)
+    spread, source = geometry_spread(optics, geometry)
     noise_adu = float(
         np.nanmax(
             [slope_noise.pixel_sigma_adu(optics.camera.noise_adu), noise_seen_adu(measurement)]
@@ -115,7 +106,7 @@ def error_bars(
     return ErrorBars(seen.budget, source, seen.doubts, grid, cell_slope, zonal_um)
 
 
-def with_doubts(measurement: Measurement, bars: ErrorBars | None) -> Measurement:
+def degrade_doubtful(measurement: Measurement, bars: ErrorBars | None) -> Measurement:
     """The measurement with the verdict that its error bars allow: a doubt degrades an `ok`."""
     if bars is None or not bars.doubts or measurement.verdict == "rejected":
         return measurement
@@ -249,69 +240,3 @@ def write_result(
             write_arrays(
                 file, x_mm=axis, y_mm=axis, sigma_um=np.hypot(of_noise, of_geometry), **maps
             )
-
-
-def write_json(path: Path, table: dict[str, Any]) -> None:
-    """Write strict JSON: no NaN."""
-    write_text_atomic(path, json.dumps(table, indent=1, allow_nan=False) + "\n")
-
-
-def write_arrays(path: Path, **arrays: NDArray[Any]) -> None:
-    """Write an `.npz`. Raises OSError."""
-    file = io.BytesIO()
-    np.savez(file, allow_pickle=False, **arrays)
-    write_bytes_atomic(path, file.getvalue())
-
-
-_ARRAYS_BYTES = 100_000_000
-
-
-def read_arrays(path: Path, names: tuple[str, ...], most: int) -> list[FloatArray]:
-    """The named arrays of an untrusted `.npz`, each of 64-bit floats and at most `most` of them.
-
-    Raises OSError, or ValueError if it is not such a file. Nothing larger is allocated.
-    """
-    try:
-        with zipfile.ZipFile(io.BytesIO(read_bytes(path, _ARRAYS_BYTES))) as archive:
-            return [_array(archive, name, most) for name in names]
-    except (
-        zipfile.BadZipFile,
-        zlib.error,
-        KeyError,
-        NotImplementedError,
-        RuntimeError,
-        EOFError,
-    ) as error:
-        raise ValueError(f"{path.name} is damaged or lacks an array ({error})") from None
-
-
-def _array(archive: zipfile.ZipFile, name: str, most: int) -> FloatArray:
-    with archive.open(f"{name}.npy") as packed:
-        data = io.BytesIO(packed.read(8 * most + 1024))  # whatever size the archive claims
-    version = np.lib.format.read_magic(data)
-    read_header = (
-        np.lib.format.read_array_header_1_0
-        if version == (1, 0)
-        else np.lib.format.read_array_header_2_0
-    )
-    shape, by_columns, kind = read_header(data)
-    left = data.getbuffer().nbytes - data.tell()
-    if kind != np.dtype("<f8") or math.prod(shape) * kind.itemsize != left:
-        raise ValueError(f"{name} is not an array of at most {most} 64-bit floats")
-    return np.frombuffer(data.read(), np.float64).reshape(shape, order="F" if by_columns else "C")
-
-
-def write_figure(path: Path, figure: Figure, dpi: int = 110) -> Path:
-    """Write a figure as PNG; returns its path. Raises OSError."""
-    from matplotlib.backends.backend_agg import FigureCanvasAgg
-
-    picture = io.BytesIO()
-    FigureCanvasAgg(figure).print_figure(
-        picture, format="png", dpi=dpi, pil_kwargs={"compress_level": 3}
-    )
-    write_bytes_atomic(path, picture.getvalue())
-    return path
-
-
-def number_or_null(value: float) -> float | None:
-    return value if math.isfinite(value) else None

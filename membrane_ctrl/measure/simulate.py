@@ -12,10 +12,17 @@ import numpy as np
 from membrane_ctrl.config import sight
 from membrane_ctrl.config.optics import ScreenPoseConfig
 from membrane_ctrl.config.schema import Config, OpticsConfig
-from membrane_ctrl.geometry.file import read_geometry, screen_elsewhere
+from membrane_ctrl.geometry.file import read_geometry
+from membrane_ctrl.geometry.set_tables import move_screen
 from membrane_ctrl.model import errors, terminal
 from membrane_ctrl.model.arrays import FloatArray
-from membrane_ctrl.sim.optics import film_shape, shade, simulate, simulation_spec
+from membrane_ctrl.sim.optics import film_shape, pattern_levels, simulate, simulation_spec
+
+_USED = 0.95  # of the artefact's radius, as of the mirror's
+_LEANS = 2e-3  # a hand puts it down to some tenths of a millimetre
+_RADIUS_KNOWN, _VERTEX_KNOWN_MM, _FORM_KNOWN_UM = 1e-4, 0.05, 0.05  # what the file states
+_SHIFT_KNOWN_MM, _TURN_KNOWN_DEG = 0.05, 0.5  # of a screen on a rail
+_TILTED_RAD = np.radians(25.0)
 
 
 @dataclass(frozen=True)
@@ -115,16 +122,11 @@ def _bare(
         kind="frequencies" if options.coarser_mm else "full",
         coarser_mm=options.coarser_mm,
         stated_geometry=None if options.stated is None else read_geometry(options.stated).geometry,
-        light=shade.Light(gamma=options.gamma),
+        light=pattern_levels.Light(gamma=options.gamma),
         exact=options.exact,
         seed=options.seed,
         faults=tuple(simulation_spec.FrameFault.parse(text) for text in options.faults),
     )
-
-
-_USED = 0.95  # of the artefact's radius, as of the mirror's
-_LEANS = 2e-3  # a hand puts it down to some tenths of a millimetre
-_RADIUS_KNOWN, _VERTEX_KNOWN_MM, _FORM_KNOWN_UM = 1e-4, 0.05, 0.05  # what the file states
 
 
 def _of_artefact(options: SimulateOptions, optics: OpticsConfig) -> simulation_spec.SimulationSpec:
@@ -158,9 +160,6 @@ def _of_artefact(options: SimulateOptions, optics: OpticsConfig) -> simulation_s
     return replace(spec, artefact=table, laser=False)
 
 
-_SHIFT_KNOWN_MM, _TURN_KNOWN_DEG = 0.05, 0.5  # of a screen on a rail
-
-
 def _with_screen_moved(
     options: SimulateOptions, optics: OpticsConfig
 ) -> simulation_spec.SimulationSpec:
@@ -175,14 +174,11 @@ def _with_screen_moved(
     rng = np.random.default_rng(int(abs(options.screen_moved_mm)))
     rail, turn = (_turn(np.radians(_TURN_KNOWN_DEG) * rng.normal(size=3)) for _ in range(2))
     x, y, z = rail @ shift_mm + _SHIFT_KNOWN_MM * rng.normal(size=3)
-    there = screen_elsewhere(optics.geometry, (x, y, z), turn)
+    there = move_screen(optics.geometry, (x, y, z), turn)
     spec = _of_film(options, optics.model_copy(update={"geometry": there}))
     return replace(
         spec, screen_moved=table, stated_geometry=spec.stated_geometry or optics.geometry
     )
-
-
-_TILTED_RAD = np.radians(25.0)
 
 
 def _of_screen(options: SimulateOptions, optics: OpticsConfig) -> simulation_spec.SimulationSpec:
@@ -206,7 +202,7 @@ def _of_screen(options: SimulateOptions, optics: OpticsConfig) -> simulation_spe
     screen = (optics.geometry.screen or ScreenPoseConfig()).model_copy(
         update={name: tuple(value.tolist()) for name, value in before.items()}
     )
-    there = screen_elsewhere(optics.geometry, (0.0, 0.0, 0.0)).model_copy(update={"screen": screen})
+    there = move_screen(optics.geometry, (0.0, 0.0, 0.0)).model_copy(update={"screen": screen})
     shape = simulation_spec.leaning(math.inf, optics.mirror.radius_mm, 0.0, 0.0)
     spec = _bare(options, optics.model_copy(update={"geometry": there}), shape)
     stated = spec.stated_geometry or optics.geometry

@@ -15,9 +15,15 @@ from typing import Any
 
 import numpy as np
 
+from membrane_ctrl.geometry import spread_file
 from membrane_ctrl.geometry.file import read_geometry
-from membrane_ctrl.geometry.spread_file import spread_of
-from membrane_ctrl.measure import capture_set, measurement, results, stability_results
+from membrane_ctrl.measure import (
+    capture_set,
+    measurement,
+    result_files,
+    stability_pictures,
+    stability_results,
+)
 from membrane_ctrl.metrology.rays.surface import PARAMETERS, parameter_to_coeffs
 from membrane_ctrl.metrology.uncertainty import (
     figure_pairs,
@@ -186,7 +192,7 @@ class StabilityRun:
 
     def lines(self) -> list[str]:
         """The result as lines of text."""
-        return stability_results.lines_of(self.table())
+        return stability_results.format_stability(self.table())
 
     def draw(self) -> list[Path]:
         """Write the SD map and the pictures and return the latter; the series must be closed.
@@ -196,11 +202,11 @@ class StabilityRun:
         if grid is None:
             return []
         axis, sd = grid.axis_mm, grid.picture(self._sd_um())
-        results.write_arrays(self._out / "sd.npz", x_mm=axis, y_mm=axis, sd_um=sd)
+        result_files.write_arrays(self._out / "sd.npz", x_mm=axis, y_mm=axis, sd_um=sd)
         times, heights, coeffs = self._followed()
         drawn = [self._out / f"{name}.png" for name in ("stability", "zernike", "pairs")]
-        stability_results.draw_stability(drawn[0], axis, sd, times, self._points_mm, heights)
-        stability_results.draw_zernike(drawn[1], times, coeffs)
+        stability_pictures.draw_stability(drawn[0], axis, sd, times, self._points_mm, heights)
+        stability_pictures.draw_zernike(drawn[1], times, coeffs)
         if not self._shown:
             return drawn[:2]
         maps = {
@@ -210,7 +216,7 @@ class StabilityRun:
             )
             for lag, pair in self._shown.items()
         }
-        stability_results.draw_pairs(drawn[2], axis, maps)
+        stability_pictures.draw_pairs(drawn[2], axis, maps)
         return drawn
 
     def record(self, pictures: list[Path]) -> None:
@@ -219,7 +225,7 @@ class StabilityRun:
             return
         sd_um = self._grid.picture(self._sd_um())
         followed = (list(self._points_mm), *self._followed())
-        stability_results.log_stability(
+        stability_pictures.log_stability(
             self._out / "stability.rrd", *followed, sd_um, self.lines(), pictures
         )
 
@@ -242,7 +248,9 @@ class StabilityRun:
 
     def _spread_for(self, one: measurement.SetFigure) -> geometry_spread.GeometrySpread:
         if self._spread is None:
-            self._spread, self._source = spread_of(one.head.optics, self._geometry)
+            self._spread, self._source = spread_file.geometry_spread(
+                one.head.optics, self._geometry
+            )
             self._origin = one.head.geometry.table()
         return self._spread
 
@@ -323,7 +331,7 @@ def stability_command(options: StabilityOptions) -> int:
             "run": str(options.folder),
             "size_px": size_px,
         } | run.table()
-        results.write_json(out / "stability.json", table)
+        result_files.write_json(out / "stability.json", table)
         pictures = run.draw()
         if options.rerun:
             run.record(pictures)

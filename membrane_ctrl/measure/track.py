@@ -22,7 +22,7 @@ from membrane_ctrl.config.origin import OriginSection
 from membrane_ctrl.geometry.file import GeometryFile, read_geometry
 from membrane_ctrl.measure.capture_set import read_image, reference_of, require_inside
 from membrane_ctrl.measure.measurement import Figures, SetFigure
-from membrane_ctrl.measure.results import write_arrays, write_figure
+from membrane_ctrl.measure.result_files import write_arrays, write_picture
 from membrane_ctrl.metrology.figure.bin_figure import BinFigure
 from membrane_ctrl.metrology.figure.pixel_figure import measure_pixels, reconstruct_full
 from membrane_ctrl.metrology.tracking.scene_from_reference import make_scene
@@ -290,7 +290,7 @@ def _show(out: Path, track: Track, lines: Sequence[str]) -> None:
     """Write `track.png` and `track.rrd`. Raises OSError."""
     import rerun as rr
 
-    from membrane_ctrl.measure.pictures import log_pictures, result_recording
+    from membrane_ctrl.measure.rerun_recording import log_pictures, open_recording
 
     columns = track.columns()
     time_s, sag_um, sigma_um = columns["time_s"], columns["sag_um"], columns["sag_sigma_um"]
@@ -300,7 +300,7 @@ def _show(out: Path, track: Track, lines: Sequence[str]) -> None:
         else None
     )
     drawn = [_draw(out / "track.png", columns, change_um, track.residual_adu)]
-    with result_recording(out / "track.rrd", "membrane_ctrl_track") as recording:
+    with open_recording(out / "track.rrd", "membrane_ctrl_track") as recording:
         recording.log("track/report", rr.TextDocument("\n".join(lines)), static=True)
         at = [rr.TimeColumn("run_time", duration=time_s)]
         recording.send_columns(
@@ -324,9 +324,9 @@ def _draw(
     path: Path, columns: dict[str, Any], change_um: FloatArray | None, residual_adu: FloatArray
 ) -> Path:
     """Draw the terms over time, the sag with its band, and what the fits left."""
-    from membrane_ctrl.measure.pictures import sheet
+    from membrane_ctrl.measure.pictures import new_sheet
 
-    figure, (terms, sag, left) = sheet(9, 13, 3, 1)
+    figure, (terms, sag, left) = new_sheet(9, 13, 3, 1)
     every = max(1, len(columns["time_s"]) // _SHOWN_FRAMES)
     time_s, sag_um, sigma_um = (
         columns[name][::every] for name in ("time_s", "sag_um", "sag_sigma_um")
@@ -354,4 +354,4 @@ def _draw(
     left.set(
         title="mean light that the fits leave (ADU)", xlabel="column of bins", ylabel="row of bins"
     )
-    return write_figure(path, figure)
+    return write_picture(path, figure)

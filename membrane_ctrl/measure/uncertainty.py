@@ -17,7 +17,8 @@ import numpy as np
 from membrane_ctrl.geometry import file, spread_file
 from membrane_ctrl.measure.measure import light_and_rim
 from membrane_ctrl.measure.measurement import Figures, SetFigure, measure_set
-from membrane_ctrl.measure.results import error_bars, write_arrays, write_json
+from membrane_ctrl.measure.result_files import write_arrays, write_json
+from membrane_ctrl.measure.results import error_bars
 from membrane_ctrl.metrology.rays.surface import parameter_to_coeffs, sag_gradient
 from membrane_ctrl.metrology.uncertainty import (
     geometry_spread,
@@ -28,7 +29,7 @@ from membrane_ctrl.metrology.uncertainty import (
 )
 from membrane_ctrl.model import errors, files, program, terminal
 from membrane_ctrl.model.arrays import FloatArray
-from membrane_ctrl.processes.child import results_of
+from membrane_ctrl.processes.worker_pool import run_jobs
 
 # Runs Monte Carlo trials: in this process, on all cores, or on a Dask cluster: the same numbers to
 # twelve digits.
@@ -62,7 +63,7 @@ def run_everywhere(
     if workers is None:
         workers = (os.cpu_count() or 1) if trials * len(benches) >= _WORTH_PROCESSES else 1
     try:
-        with results_of(job, batches, min(workers, len(batches)), scheduler) as results:
+        with run_jobs(job, batches, min(workers, len(batches)), scheduler) as results:
             return np.concatenate(list(terminal.counted(results, "trials", len(batches))))
     except ArithmeticError as error:
         raise errors.InputError(f"uncertainty: {error}") from None
@@ -104,7 +105,7 @@ def uncertainty_command(options: UncertaintyOptions) -> int:
         [folder for folder in (options.folder, options.against) if folder is not None],
     )
     sets = [figures.of(folder) for folder in folders]
-    spread, source = spread_file.spread_of(sets[0].head.optics, options.geometry)
+    spread, source = spread_file.geometry_spread(sets[0].head.optics, options.geometry)
     print(f"geometry: {source}", file=sys.stderr)
     benches = [one.bench() for one in sets]
     if len({bench.optics.geometry for bench in benches}) > 1:
@@ -210,9 +211,7 @@ def _write(
     height_um: FloatArray,
     table: dict[str, Any],
 ) -> None:
-    from membrane_ctrl.measure.stability_results import (
-        draw_uncertainty,
-    )  # matplotlib takes a second to load
+    from membrane_ctrl.measure.stability_pictures import draw_uncertainty
 
     rmse, whole = (grid.picture(1e3 * grid.sigma(c)) for c in (result.covariance, result.budget))
     with errors.writing(out):

@@ -20,7 +20,7 @@ import numpy as np
 
 from firmware_iface.roles import Pixels
 from membrane_ctrl.config.schema import OpticsConfig
-from membrane_ctrl.processes.ring import FrameAddress
+from membrane_ctrl.processes.frame_address import FrameAddress
 
 _ALIGN_BYTES = 64  # a cache line: pixels start on one, and the write counter has one of its own
 _HEAD = struct.Struct("<QddQ24s")  # sequence, time_s, displacement_um, cycle, pattern name in ASCII

@@ -21,9 +21,11 @@ from membrane_ctrl.config.schema import Config
 from membrane_ctrl.model.clock import RunClock
 from membrane_ctrl.model.events import Event, EventLine
 from membrane_ctrl.model.run_events import Alive, Ended
-from membrane_ctrl.processes.child import STOP, parent_lives, reporter
+from membrane_ctrl.processes.child import STOP, parent_lives
+from membrane_ctrl.processes.event_pipe import event_sender
+from membrane_ctrl.processes.frame_address import FrameAddress
 from membrane_ctrl.processes.frames import FrameHead, FrameReader
-from membrane_ctrl.processes.ring import FrameAddress, RingAddress, RingReader
+from membrane_ctrl.processes.ring import RingAddress, RingReader
 
 # Rings are emptied this often; the ring of ticks must hold a few intervals.
 POLL_S = 0.25
@@ -67,7 +69,7 @@ def recorder_main(spec: RecorderSpec, status: Connection | None = None) -> None:
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     signal.signal(STOP, lambda *_: asked.set())
     prepare_rerun()
-    if not _record(spec, reporter(status), asked.is_set, lambda: not parent_lives()):
+    if not _record(spec, event_sender(status), asked.is_set, lambda: not parent_lives()):
         os._exit(0)  # everything is written; Rerun's exit handler would wait for a dead writer
 
 

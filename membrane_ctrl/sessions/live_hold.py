@@ -25,7 +25,7 @@ from membrane_ctrl.control_port.status import lock_lines
 from membrane_ctrl.controller.commands import Command
 from membrane_ctrl.model import errors, run_events, shape_estimate, telemetry, terminal
 from membrane_ctrl.model.events import Event
-from membrane_ctrl.processes.ring import attach
+from membrane_ctrl.processes.published_rings import attach_rings
 from membrane_ctrl.sessions.live_log import LiveLog
 
 _S = TypeVar("_S", bound=BaseModel)
@@ -113,7 +113,7 @@ class LiveHold:
         if session:
             self._claim(session)
         try:
-            self._readers = attach(run_dir)
+            self._readers = attach_rings(run_dir)
         except (OSError, ValueError) as error:
             raise errors.InputError(
                 f"{run_dir}: its rings cannot be read ({error}); is it on this machine?"

@@ -6,16 +6,15 @@ import errno
 import os
 import signal
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from multiprocessing.connection import Connection
 
-from firmware_iface import settings
 from firmware_iface.emulators import pump_board
-from membrane_ctrl.config.schema import Config, DevicesConfig, PumpConfig, TwinConfig
-from membrane_ctrl.model import clock, errors, terminal
-from membrane_ctrl.processes import child, ring
-from membrane_ctrl.sim import lab, plant, surroundings
+from membrane_ctrl.config.schema import DevicesConfig, PumpConfig, TwinConfig
+from membrane_ctrl.model import clock, errors
+from membrane_ctrl.processes import child, priority, ring
+from membrane_ctrl.sim import bench_events, lab, plant
 
 _PERIOD_S = 0.004  # below the sensors' 5 ms, so that each sample is on time
 # some 10 ms of work: after a stall, clients are answered while the plant catches up
@@ -37,7 +36,7 @@ class BenchSpec:
     # how long the bench outlives the process that started it, so that the tripped watchdog can be
     # observed
     linger_s: float = 5.0
-    events: tuple[surroundings.BenchEvent, ...] = ()  # events in plant time (0 at the start)
+    events: tuple[bench_events.BenchEvent, ...] = ()  # events in plant time (0 at the start)
     lab: DevicesConfig | None = None  # serve these instruments instead of the pump board
 
 
@@ -67,7 +66,7 @@ def serve(spec: BenchSpec, ready: Connection) -> None:
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     if spec.speed <= 1.0:
         # it stands for devices with processors of their own; faster, it may use a whole core
-        child.raise_priority()
+        priority.raise_priority()
     asyncio.run(_serve(spec, ready))
 
 
@@ -189,120 +188,3 @@ class LiveBench:
             )
         sample = mirror.sample()
         return replace(sample, sample_counter=round(sample.device_time_s / plant.STEP_S) + 1)
-
-
-# The twin as a process beside the hold: its start, its port, and its truth for the record.
-
-_TRUTHS_KEPT = 64
-_READY_S = 60.0  # importing on a busy machine; a fresh one compiles first
-
-
-def _started(spec: BenchSpec, stack: contextlib.ExitStack) -> BenchReport:
-    """Start the bench process, which the stack ends, and wait until it listens; print where. Raises
-    DeviceError.
-    """
-    terminal.progress(f"starting the twin: waiting until it listens, at most {_READY_S:g} s")
-    ours, theirs = child.pipe()
-    process = child.Child("twin", "membrane_ctrl.sim.bench:serve", (spec, theirs), nice=0)
-    stack.callback(process.stop, 2.0)
-    process.start()
-    report: BenchReport = (
-        ours.recv() if ours.poll(_READY_S) else BenchReport(error="the twin did not start")
-    )
-    if report.error:
-        raise errors.DeviceError(report.error)
-    if spec.lab is None:
-        moved = f" (port {spec.port} is taken)" if spec.port not in (0, report.port) else ""
-        terminal.progress(f"the twin listens on {report.url}{moved}, Modbus unit 1")
-    return report
-
-
-def _spec(config: Config, clock: clock.RunClock) -> BenchSpec:
-    """The bench of a configuration; the default port may be another twin's, a configured one is
-    meant.
-    """
-    twin = config.twin
-    return BenchSpec(
-        twin, config.pump, clock, twin.port, only_there="port" in twin.model_fields_set
-    )
-
-
-@dataclass(frozen=True, slots=True)
-class TwinProcess:
-    """A running simulated bench."""
-
-    config: Config  # the run's configuration with the twin's own address as its device
-    truth: ring.RingAddress  # where the twin publishes its mirror's true state
-
-    @classmethod
-    def started(
-        cls, config: Config, clock: clock.RunClock, stack: contextlib.ExitStack, lab: bool = False
-    ) -> "TwinProcess":
-        """Start the twin and wait until it listens; the stack ends it. Raises DeviceError, e.g. for
-        a busy port.
-
-        With `lab` it answers as the configured instruments, else as the pump board.
-        """
-        if len(config.interlocks) > settings.BOARD_INPUTS and not lab:
-            raise errors.InputError(
-                f"devices.interlocks: {len(config.interlocks)} of them; the twin's pump board has "
-                f"{settings.BOARD_INPUTS} inputs: use --devices, or fewer"
-            )
-        truth = stack.enter_context(ring.ring(_TRUTHS_KEPT, plant.TRUTH_BYTES))
-        spec = replace(_spec(config, clock), truth=truth, lab=config.devices if lab else None)
-        report = _started(spec, stack)
-        watchdog = (
-            {}
-            if config.devices is None
-            else config.devices.model_dump(include={"timeout_s", "watchdog_s"})
-        )
-        devices = report.lab or DevicesConfig(
-            board=report.url, interlocks=_at_board_inputs(config.interlocks), **watchdog
-        )
-        return cls(config.model_copy(update={"devices": devices}), truth)
-
-    def truth_reader(self) -> Callable[[], tuple[float, float]]:
-        """A function that returns the newest true displacement and laser bias, in µm."""
-        reader = ring.RingReader(self.truth)
-
-        def newest() -> tuple[float, float]:
-            message = reader.latest()
-            if message is None:
-                return float("nan"), float("nan")
-            truth = plant.Truth.unpack(message)
-            return truth.displacement_um, truth.laser_bias_um
-
-        return newest
-
-
-def _at_board_inputs(
-    interlocks: tuple[settings.InterlockDriver, ...],
-) -> tuple[settings.InterlockDriver, ...]:
-    """The interlocks with the inputs of the twin's board in place of their sources, in order."""
-    return tuple(
-        settings.BoardInputConfig(
-            driver="board_input",
-            name=interlock.name,
-            text=interlock.text,
-            safe_level=interlock.safe_level,
-            input=index,
-        )
-        for index, interlock in enumerate(interlocks)
-    )
-
-
-# `twin`: the simulated bench on its real protocol, for any client.
-
-_STOPS = {signal.SIGINT, signal.SIGTERM}
-
-
-def serve_twin(config: Config, speed: float) -> int:
-    """Serve until SIGINT or SIGTERM; print the address on stderr. Raises DeviceError, e.g. for a
-    busy port.
-    """
-    with contextlib.ExitStack() as stack:
-        _started(replace(_spec(config, clock.RunClock.start()), speed=speed, linger_s=0.0), stack)
-        terminal.progress("stop it with Ctrl-C")
-        signal.pthread_sigmask(signal.SIG_BLOCK, _STOPS)
-        stopped = signal.sigwait(_STOPS)
-    return errors.Exit.INTERRUPTED if stopped == signal.SIGINT else errors.Exit.DONE

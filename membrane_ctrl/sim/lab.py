@@ -14,17 +14,20 @@ from firmware_iface import drivers, settings
 from firmware_iface.drivers.modbus_map import ValueMap, make_map, preset
 from firmware_iface.emulators import (
     input_module,
-    lasers,
+    keyence_dl_rs1a,
+    modbus_pdu,
     modbus_server,
+    optoncdt1420,
     pressure_gauges,
     pump_board,
     pumps,
+    rtu_bus,
     serial_device,
 )
 from firmware_iface.links import modbus_rtu, serial_port
 from firmware_iface.roles import ROLES
 from membrane_ctrl.config.schema import DevicesConfig
-from membrane_ctrl.instruments import bench, driver_loading
+from membrane_ctrl.instruments import driver_loading, role_drivers
 
 _GATEWAY_NO_RESPONSE = 11
 _PRESSURE_FULL_MBAR = 10.0  # an EL-PRESS of 1 kPa suits the mirror's 600 Pa
@@ -46,7 +49,7 @@ class Lab:
         self._outputs = {"pump": 0.0, "vent": 0.0}
         self._folder: tempfile.TemporaryDirectory[str] | None = None
         self._servers: dict[str, modbus_server.ModbusTcpServer] = {}
-        self._tables: defaultdict[str, dict[int, modbus_server.RegisterTable]] = defaultdict(dict)
+        self._tables: defaultdict[str, dict[int, modbus_pdu.RegisterTable]] = defaultdict(dict)
         for role, section in devices.roles().items():
             if isinstance(section, settings.BronkhorstModbusConfig):
                 self._tables[section.link][section.unit_id] = pumps.BronkhorstRegisters(
@@ -65,7 +68,7 @@ class Lab:
             if url.startswith("rtu:"):
                 _, line = modbus_rtu.parse_rtu_url(url)
                 handlers = {unit: partial(self._respond, url, unit) for unit in self._units(url)}
-                self.serial[url] = modbus_server.RtuBusEmulator(line, handlers)
+                self.serial[url] = rtu_bus.RtuBusEmulator(line, handlers)
 
     async def start(self) -> DevicesConfig:
         """Plug everything in; returns the configuration with the emulators' addresses. Raises
@@ -144,12 +147,12 @@ class Lab:
             return found
         table = self._tables.get(url, {}).get(unit)
         if table is None:
-            return modbus_server.exception_pdu(pdu, modbus_server.ILLEGAL_FUNCTION)
+            return modbus_pdu.exception_pdu(pdu, modbus_pdu.ILLEGAL_FUNCTION)
         return respond_to_input(pdu, table)
 
     def _answer(self, url: str, unit: int, pdu: bytes) -> modbus_server.Answer:
         if unit not in self._units(url):
-            return modbus_server.Answer(modbus_server.exception_pdu(pdu, _GATEWAY_NO_RESPONSE))
+            return modbus_server.Answer(modbus_pdu.exception_pdu(pdu, _GATEWAY_NO_RESPONSE))
         return modbus_server.Answer(self._respond(url, unit, pdu))
 
     def _add_modules(self) -> None:
@@ -180,14 +183,14 @@ class Lab:
     def _device(self, role: str, section: settings.AnyDriver) -> serial_device.SerialDevice:
         match section:
             case settings.Optoncdt1420Config():
-                return lasers.Optoncdt1420Emulator(
+                return optoncdt1420.Optoncdt1420Emulator(
                     self._sensor(role),
                     round(section.range_mm or 50),
                     section.direction,
                     section.baud,
                 )
             case settings.KeyenceDlRs1aConfig():
-                return lasers.KeyenceDlRs1aEmulator(
+                return keyence_dl_rs1a.KeyenceDlRs1aEmulator(
                     self._sensor(role),
                     section.direction,
                     section.baud,
@@ -233,7 +236,7 @@ class Lab:
             constants: dict[int, int] = {}
             raw_limits = (0, 0xFFFF)
             for role, section in members:
-                value_map, _ = make_map(bench.map_keys(section), section.preset)
+                value_map, _ = make_map(role_drivers.map_keys(section), section.preset)
                 if value_map.version_address is not None:
                     constants[value_map.version_address] = _VERSION
                 if value_map.identity is not None:
@@ -323,15 +326,15 @@ class MapDevice:
         try:
             return [words[at] for at in range(address, address + count)]
         except KeyError:
-            raise modbus_server.RegisterRefusal(modbus_server.ILLEGAL_ADDRESS) from None
+            raise modbus_pdu.RegisterRefusal(modbus_pdu.ILLEGAL_ADDRESS) from None
 
     def write(self, address: int, words: Sequence[int]) -> None:
         """All or nothing. Raises RegisterRefusal."""
         places = range(address, address + len(words))
         if not all(at in self._written for at in places):
-            raise modbus_server.RegisterRefusal(modbus_server.ILLEGAL_ADDRESS)
+            raise modbus_pdu.RegisterRefusal(modbus_pdu.ILLEGAL_ADDRESS)
         if not all(self._raw_limits[0] <= word <= self._raw_limits[1] for word in words):
-            raise modbus_server.RegisterRefusal(modbus_server.ILLEGAL_VALUE)
+            raise modbus_pdu.RegisterRefusal(modbus_pdu.ILLEGAL_VALUE)
         self._written.update(zip(places, words, strict=True))
         for found, tell in self._outputs.items():
             self._tell(found, tell)
@@ -342,9 +345,9 @@ class MapDevice:
         tell(value if found.allows(value) else 0.0)
 
 
-def respond_to_input(pdu: bytes, table: modbus_server.RegisterTable) -> bytes:
+def respond_to_input(pdu: bytes, table: modbus_pdu.RegisterTable) -> bytes:
     """`respond`, and "read input registers" (function 4) answered from the same registers."""
     if pdu[0] != _READ_INPUT:
-        return modbus_server.respond(pdu, table)
-    reply = modbus_server.respond(bytes([modbus_server.READ_HOLDING]) + pdu[1:], table)
-    return bytes([reply[0] - modbus_server.READ_HOLDING + _READ_INPUT]) + reply[1:]
+        return modbus_pdu.respond(pdu, table)
+    reply = modbus_pdu.respond(bytes([modbus_pdu.READ_HOLDING]) + pdu[1:], table)
+    return bytes([reply[0] - modbus_pdu.READ_HOLDING + _READ_INPUT]) + reply[1:]

@@ -13,8 +13,8 @@ from typing import Any, TypeVar
 
 from firmware_iface import register_map, roles
 from firmware_iface.drivers.pump_board import PumpBoard
-from firmware_iface.emulators import modbus_server, pump_board
-from firmware_iface.links.modbus_tcp import exception_error
+from firmware_iface.emulators import modbus_pdu, pump_board
+from firmware_iface.links.modbus_link import exception_error
 from membrane_ctrl.sim.plant import Plant
 from membrane_ctrl.sim.virtual_interlocks import VirtualInterlocks
 
@@ -201,7 +201,7 @@ def _refusals(name: str) -> Iterator[None]:
     """A refusal of the board, as the link's error."""
     try:
         yield
-    except modbus_server.RegisterRefusal as refusal:
+    except modbus_pdu.RegisterRefusal as refusal:
         raise exception_error(name, refusal.code) from None
 
 

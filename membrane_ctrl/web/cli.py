@@ -60,7 +60,7 @@ def web(
     from membrane_ctrl.config.port import WebConfig
     from membrane_ctrl.config.toml_file import parse
     from membrane_ctrl.control_port import ctl
-    from membrane_ctrl.processes.child import end_with_parent
+    from membrane_ctrl.processes.command_process import end_with_parent
 
     try:
         from membrane_ctrl.web.server import serve

@@ -26,7 +26,7 @@ from membrane_ctrl.model import errors, shape_estimate, telemetry
 from membrane_ctrl.model.arrays import Column
 from membrane_ctrl.model.columns import PUBLISHED
 from membrane_ctrl.model.run_events import Mark
-from membrane_ctrl.processes import ring
+from membrane_ctrl.processes import published_rings, ring
 from membrane_ctrl.review import catalogue
 from membrane_ctrl.run_files.run import open_run
 from membrane_ctrl.run_files.run_folder import logged
@@ -202,7 +202,7 @@ class HoldFeed:
         if folder is None:
             return {}
         with suppress(OSError, ValueError):
-            return ring.attach(folder)
+            return published_rings.attach_rings(folder)
         return {}
 
     def _take(self, message: Message, greeting: Message, rings: dict[str, ring.RingReader]) -> None:

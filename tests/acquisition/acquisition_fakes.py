@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from firmware_iface.roles import Frame, LinkError, Pattern, Pixels
-from membrane_ctrl.acquisition.cycle import CyclePlan
+from membrane_ctrl.acquisition.cycle_plan import CyclePlan
 from membrane_ctrl.model.shape_estimate import ShapeEstimate, Verdict
 from membrane_ctrl.model.zernike_terms import ZERNIKE_TERMS
 

@@ -8,9 +8,14 @@ import numpy as np
 import pytest
 from test_acquisition_display_test import HEIGHT_PX, WIDTH_PX, Bench
 
-from firmware_iface.display import RAMP_LEVELS, measured_response
+from firmware_iface.display_response import RAMP_LEVELS, measured_response
 from membrane_ctrl.acquisition.optical_bench import OpticalBench
-from membrane_ctrl.calibration.camera import fringe_error_mm, lines_of, measured, report_of
+from membrane_ctrl.calibration.display import (
+    display_report,
+    format_display_report,
+    fringe_error_mm,
+    measure_display,
+)
 from membrane_ctrl.cli import run
 from membrane_ctrl.config.schema import PatternConfig
 from membrane_ctrl.metrology.phase.screen_scale import mm_per_rad
@@ -28,11 +33,13 @@ def power_law(gamma: float) -> np.ndarray:
 
 def test_a_panel_is_measured_and_its_worth_said() -> None:
     bench = OpenedBench(PanelResponse(tau_s=0.012), gamma=2.2)
-    settling, response = measured(OpticalBench(bench, bench), bench.clock, WIDTH_PX, HEIGHT_PX)
-    report = report_of(settling, response, PatternConfig())
+    settling, response = measure_display(
+        OpticalBench(bench, bench), bench.clock, WIDTH_PX, HEIGHT_PX
+    )
+    report = display_report(settling, response, PatternConfig())
     assert report["gamma"] == pytest.approx(2.2, rel=0.03)
     assert report["settle_ms"] == pytest.approx(1e3 * settling.settle_s)
-    lines = lines_of(report)
+    lines = format_display_report(report)
     assert f"settle_ms = {report['settle_ms']:.0f}" in lines
     assert lines[0].endswith("gamma 2.20")
 

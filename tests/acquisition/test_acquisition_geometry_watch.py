@@ -7,9 +7,10 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from membrane_ctrl.acquisition.cycle import LiveDrift, geometry_event
+from membrane_ctrl.acquisition.geometry_watch import GeometryWatch, geometry_event
 from membrane_ctrl.config.schema import OpticsConfig
-from membrane_ctrl.geometry.file import CalibrationTable, InForce, origin_of
+from membrane_ctrl.geometry.file import CalibrationTable, stated_origin
+from membrane_ctrl.geometry.run_geometry import RunGeometry
 from membrane_ctrl.metrology.cycle.geometry_monitors import CYCLES, ring_um
 from membrane_ctrl.metrology.film.hencky_bowl import zernike_projection
 from membrane_ctrl.metrology.rays.surface import Surface
@@ -43,12 +44,12 @@ CALIBRATION = CalibrationTable(
 )
 
 
-def in_force(calibration: CalibrationTable | None = CALIBRATION) -> InForce:
-    return InForce(OPTICS, origin_of(OPTICS), calibration)
+def in_force(calibration: CalibrationTable | None = CALIBRATION) -> RunGeometry:
+    return RunGeometry(OPTICS, stated_origin(OPTICS), calibration)
 
 
 def test_a_residual_that_has_grown_is_said_once_and_its_end_too() -> None:
-    drift = LiveDrift(in_force(), 4)
+    drift = GeometryWatch(in_force(), 4)
     told = []
     for residual_urad in (2.9, 4.5, 2.9):
         cycle = replace(CYCLE, slope_residual_urad=residual_urad)
@@ -59,7 +60,7 @@ def test_a_residual_that_has_grown_is_said_once_and_its_end_too() -> None:
 
 
 def test_a_ring_that_seems_to_tilt_is_said_and_a_deeper_bowl_is_not() -> None:
-    drift = LiveDrift(in_force(), 4)
+    drift = GeometryWatch(in_force(), 4)
     deeper = replace(CYCLE, coeffs_um=CYCLE.coeffs_um + 2000.0 * zernike_projection())
     assert not any(drift.after(deeper) for _ in range(CYCLES))
     tilted = CYCLE.coeffs_um.copy()
@@ -74,7 +75,7 @@ def test_a_ring_that_seems_to_tilt_is_said_and_a_deeper_bowl_is_not() -> None:
 
 
 def test_the_noise_of_weaker_fringes_is_no_drift() -> None:
-    weak = LiveDrift(in_force(), 4)
+    weak = GeometryWatch(in_force(), 4)
     # 2.83 µrad of film, and 1.5 µrad of noise that was 1.0 at the calibration and grows as the
     # light fades
     faded = replace(CYCLE, modulation_median_adu=4.0)
@@ -86,9 +87,9 @@ def test_the_noise_of_weaker_fringes_is_no_drift() -> None:
 
 def test_rejected_cycles_and_stated_geometries_say_nothing() -> None:
     rejected = replace(CYCLE, verdict="rejected", slope_residual_urad=900.0)
-    drift = LiveDrift(in_force(), 4)
+    drift = GeometryWatch(in_force(), 4)
     assert not any(drift.after(rejected) for _ in range(2 * CYCLES))
-    by_hand = LiveDrift(in_force(None), 4)
+    by_hand = GeometryWatch(in_force(None), 4)
     assert not any(
         by_hand.after(replace(CYCLE, slope_residual_urad=50.0)) for _ in range(2 * CYCLES)
     )
@@ -98,7 +99,7 @@ def test_the_record_names_the_geometry() -> None:
     event = geometry_event(in_force())
     assert event.to_dict() == {
         "kind": "geometry",
-        "hash": origin_of(OPTICS).hash,
+        "hash": stated_origin(OPTICS).hash,
         "file": None,
         "calibrated_utc": None,
         "message": "",

@@ -10,7 +10,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from membrane_ctrl.acquisition.cycle import HALF_WINDOW_S, LaserHistory
+from membrane_ctrl.acquisition.laser_history import HALF_WINDOW_S, LaserHistory
 from membrane_ctrl.model.telemetry import FIELDS, ROW_BYTES, TelemetryRow
 from membrane_ctrl.processes.ring import RingAddress, RingWriter, ring
 

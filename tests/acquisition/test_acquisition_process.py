@@ -13,10 +13,11 @@ from typing import Any
 import numpy as np
 import pytest
 
-from membrane_ctrl.acquisition.process import AcquisitionSpec, acquisition_main
-from membrane_ctrl.acquisition.session import small
+from membrane_ctrl.acquisition.process import acquisition_main
+from membrane_ctrl.acquisition.spec import AcquisitionSpec
+from membrane_ctrl.acquisition.warm_up import coarse_optics
 from membrane_ctrl.config.schema import CameraConfig, Config, OpticsConfig, ShapeConfig
-from membrane_ctrl.geometry.file import origin_of
+from membrane_ctrl.geometry.file import stated_origin
 from membrane_ctrl.metrology.phase.pattern_sequence import fringe_sequence
 from membrane_ctrl.model.clock import RunClock
 from membrane_ctrl.model.shape_estimate import ShapeEstimate, unpack_estimate
@@ -24,7 +25,7 @@ from membrane_ctrl.model.telemetry import FIELDS, ROW_BYTES, TelemetryRow
 from membrane_ctrl.processes.child import STOP
 from membrane_ctrl.processes.frames import FrameReader, FrameRing
 from membrane_ctrl.processes.ring import RingReader, RingWriter, ring
-from membrane_ctrl.sim.plant import TRUTH_BYTES, Truth
+from membrane_ctrl.sim.truth import TRUTH_BYTES, Truth
 
 pytestmark = pytest.mark.real_time
 
@@ -116,7 +117,7 @@ def test_measures_the_twin_follows_a_jump_and_stops_when_told(stack: ExitStack) 
     run.until(lambda: len(run.estimates) >= 4)
     assert run.states()[0] == "preparing"
     (geometry,) = [report for report in run.reports if report["kind"] == "geometry"]
-    assert (geometry["hash"], geometry["file"]) == (origin_of(CONFIG.optics).hash, None)
+    assert (geometry["hash"], geometry["file"]) == (stated_origin(CONFIG.optics).hash, None)
     assert [e.kind for e in run.estimates[:3]] == ["full", "fringes", "fringes"]
     assert [e.cycle for e in run.estimates[:3]] == [1, 2, 3]
     assert all(
@@ -176,10 +177,10 @@ def test_without_a_camera_it_says_so_and_ends(stack: ExitStack) -> None:
 
 def test_small_sensor_sees_the_same_field() -> None:
     full = OpticsConfig()
-    coarse = small(full)
+    coarse = coarse_optics(full)
     assert (coarse.camera.width_px, coarse.camera.height_px) == (408, 341)
     for optics in (full, coarse):
         camera = optics.camera
         edge_mm = (np.array([-0.5, -0.5]) - camera.principal) * camera.pixel_um / 1000.0
         np.testing.assert_allclose(edge_mm, [-4.2228, -3.5328])
-    assert small(CONFIG.optics).camera.width_px == 306
+    assert coarse_optics(CONFIG.optics).camera.width_px == 306

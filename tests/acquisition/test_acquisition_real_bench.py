@@ -12,8 +12,9 @@ from typing import Any
 import numpy as np
 import pytest
 
-from firmware_iface.display import ScreenRaster, pattern_light
-from membrane_ctrl.acquisition.process import AcquisitionSpec, acquisition_main
+from firmware_iface.display_patterns import ScreenRaster, pattern_light
+from membrane_ctrl.acquisition.process import acquisition_main
+from membrane_ctrl.acquisition.spec import AcquisitionSpec
 from membrane_ctrl.cli import run as command
 from membrane_ctrl.config.schema import Config
 from membrane_ctrl.config.toml_file import dump

@@ -10,8 +10,9 @@ from pathlib import Path
 import pytest
 from acquisition_fakes import VirtualClock, estimate
 
-from membrane_ctrl.acquisition.cycle import CycleDone, CycleFailed, keep_cycling, next_deadline_s
-from membrane_ctrl.acquisition.process import Remote
+from membrane_ctrl.acquisition.cycle import CycleDone, CycleFailed
+from membrane_ctrl.acquisition.cycle_loop import keep_cycling, next_deadline_s
+from membrane_ctrl.acquisition.remote import Remote
 from membrane_ctrl.model.events import Event
 from membrane_ctrl.model.shape_estimate import ShapeEstimate
 from membrane_ctrl.processes import child

@@ -18,7 +18,8 @@ from firmware_iface.drivers.camera_opencv import FolderCamera
 from firmware_iface.guarded_camera import GuardedCamera
 from firmware_iface.pattern_screen import PatternScreen
 from membrane_ctrl.acquisition import driver_check, optical_bench
-from membrane_ctrl.acquisition.cycle import CycleDone, CycleFailed, CyclePlan, ShapeCycle
+from membrane_ctrl.acquisition.cycle import CycleDone, CycleFailed, ShapeCycle
+from membrane_ctrl.acquisition.cycle_plan import CyclePlan
 from membrane_ctrl.config.schema import Config
 from membrane_ctrl.config.toml_file import dump, load
 from membrane_ctrl.metrology.cycle.live_reconstructor import LiveReconstructor

@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from membrane_ctrl.acquisition.session import listener
+from membrane_ctrl.acquisition.vibrations import vibration_listener
 from membrane_ctrl.alarms.book import AlarmMessage
 from membrane_ctrl.alarms.process import Outbox, Watcher
 from membrane_ctrl.cli import run as command_line
@@ -38,7 +38,7 @@ from membrane_ctrl.recorder.recorder import Recorder
 from membrane_ctrl.recorder.sink import Recording
 from membrane_ctrl.run_files.run_folder import create_run_folder
 from membrane_ctrl.sim.optics.camera import OpticsRenderer
-from membrane_ctrl.sim.optics.disturbances import DRUM_MODES
+from membrane_ctrl.sim.optics.drum_modes import DRUM_MODES
 from tests.metrology.tracking.test_track_live import FILM, OPTICS, held_um
 from tests.support.rrd_reading import reader, scalars, strings
 from tests.worlds.synthetic_run import STARTED_UTC, message_of, rows_of, shape_of
@@ -107,7 +107,7 @@ class Hold:
         return True
 
     def restart_acquisition(self) -> None:
-        self.hear = listener(self.config, self.clock, self.folder)
+        self.hear = vibration_listener(self.config, self.clock, self.folder)
 
     def ticks(self, at_s: float) -> None:
         """Six seconds of telemetry."""

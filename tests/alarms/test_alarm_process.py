@@ -31,7 +31,7 @@ from membrane_ctrl.model.errors import DeviceError, InputError
 from membrane_ctrl.model.events import Event, EventLine
 from membrane_ctrl.model.run_events import AlarmTold
 from membrane_ctrl.model.telemetry import FIELDS, ROW_BYTES, TelemetryRow
-from membrane_ctrl.processes.child import reporter
+from membrane_ctrl.processes.event_pipe import event_sender
 from membrane_ctrl.processes.ring import RingWriter, ring
 
 CONFIG = AlarmsConfig(silent_s=5.0)
@@ -192,7 +192,7 @@ def test_a_control_process_that_vanishes_is_told() -> None:
     theirs, ours = Pipe()
     theirs.close()
     with ring(16, ROW_BYTES) as telemetry, ring(16, 4096) as events:
-        watch(spec(telemetry, events), [sender], reporter(ours), lambda: False)
+        watch(spec(telemetry, events), [sender], event_sender(ours), lambda: False)
     assert told(sender) == [("control_gone", "raised")]
 
 

@@ -15,14 +15,14 @@ import sys
 from collections.abc import AsyncIterator
 from pathlib import Path
 
-from firmware_iface.emulators.modbus_server import RtuBusEmulator
 from firmware_iface.emulators.pump_board import PumpBoardEmulator
+from firmware_iface.emulators.rtu_bus import RtuBusEmulator
 from firmware_iface.emulators.serial_device import PtyWire
 from firmware_iface.links.serial_port import SerialSettings
 from membrane_ctrl.config.schema import PumpConfig, TwinConfig
 from membrane_ctrl.model.clock import RunClock
 from membrane_ctrl.sim.bench import BenchSpec, LiveBench
-from membrane_ctrl.sim.plant import Truth
+from membrane_ctrl.sim.truth import Truth
 from tests.board.film_wire import FilmWire
 from tests.board.qemu_board import built_image, qemu_board
 

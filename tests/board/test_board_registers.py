@@ -13,7 +13,7 @@ import pytest
 
 from firmware_iface.board_settings import record
 from firmware_iface.emulators import pump_board
-from firmware_iface.emulators.modbus_server import respond
+from firmware_iface.emulators.modbus_pdu import respond
 from firmware_iface.register_map import Block, default_map
 from tests.board.virtual_board import NO_VALUE, SETTINGS, VirtualBoard
 

@@ -28,7 +28,7 @@ import pytest
 from firmware_iface import conformance, roles
 from firmware_iface.board_settings import record
 from firmware_iface.drivers.pump_board import PumpBoard
-from firmware_iface.emulators.lasers import three_bytes
+from firmware_iface.emulators.optoncdt1420 import three_bytes
 from tests.board.gdb_wire import StoppedBoard, stopped
 from tests.board.qemu_board import addresses
 from tests.support.machine_needs import require

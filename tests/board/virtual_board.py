@@ -10,8 +10,8 @@ from pathlib import Path
 from typing import Any
 
 from firmware_iface.board_settings import record
-from firmware_iface.emulators.modbus_server import bitwise_crc
-from firmware_iface.links.modbus_tcp import exception_error
+from firmware_iface.emulators.rtu_bus import bitwise_crc
+from firmware_iface.links.modbus_link import exception_error
 
 NO_VALUE = -(2**31)
 AT_REST = (0, 0, 101_325_000, 210_000, 220_000, 0)  # raw values of all channels with a flat film

@@ -18,12 +18,12 @@ import tomli_w
 from membrane_ctrl.calibration import sets
 from membrane_ctrl.cli import run
 from membrane_ctrl.config.schema import CameraConfig, GeometryConfig, MirrorConfig, OpticsConfig
-from membrane_ctrl.geometry.file import screen_elsewhere
+from membrane_ctrl.geometry.set_tables import move_screen
 from membrane_ctrl.metrology.calibration.verdict import CalibrationFinding
+from membrane_ctrl.sim.optics.bench_poses import ScreenError
 from membrane_ctrl.sim.optics.film_shape import FilmShape, typical_film
 from membrane_ctrl.sim.optics.simulate import simulate_set
 from membrane_ctrl.sim.optics.simulation_spec import Motion, SimulationSpec, leaning
-from membrane_ctrl.sim.optics.trace import ScreenError
 
 # 16-bit frames of large pixels, each with the noise of the 256 of the paper's camera that it stands
 # for
@@ -422,7 +422,7 @@ def far_and_near(tmp_path_factory: pytest.TempPathFactory) -> list[Path]:
         {"shift_mm": list(SHIFT_MM), "shift_sigma_mm": 0.05},
     )
     stated = STATED.model_copy(update={"reference_displacement_um": 0.0})
-    there = screen_elsewhere(TRUE, (0.03, -0.04, -299.95))
+    there = move_screen(TRUE, (0.03, -0.04, -299.95))
     spec = SimulationSpec(
         OpticsConfig(geometry=there, camera=CAMERA),
         FILM,

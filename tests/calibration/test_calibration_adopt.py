@@ -7,9 +7,9 @@ from pathlib import Path
 
 import pytest
 
-from membrane_ctrl.calibration.session import adopt, compared
+from membrane_ctrl.calibration.adopt import adopt_geometry, compare_geometries
 from membrane_ctrl.config.schema import GeometryConfig, OpticsConfig
-from membrane_ctrl.geometry.file import origin_of, read_geometry
+from membrane_ctrl.geometry.file import read_geometry, stated_origin
 from membrane_ctrl.model.errors import DeviceError
 
 NEW = "a_mm = 2674.0\nb_mm = 2869.0\nalpha_deg = 81.2\n"
@@ -24,7 +24,7 @@ def new(tmp_path: Path) -> Path:
 
 def test_where_there_was_none(new: Path, tmp_path: Path) -> None:
     place = tmp_path / "lab" / "bench.toml"
-    assert adopt(new, place) is None
+    assert adopt_geometry(new, place) is None
     assert place.read_text() == NEW
 
 
@@ -37,7 +37,7 @@ def test_the_old_one_is_kept_with_its_date_twice_if_need_be(
     for _ in range(2):
         place.write_text(old)
         os.utime(place, (1e9, 1e9))
-        kept.append(adopt(new, place))
+        kept.append(adopt_geometry(new, place))
     assert [path.name for path in kept if path] == [
         "bench-20010909T014640Z.toml",
         "bench-20010909T014640Z-2.toml",
@@ -49,12 +49,12 @@ def test_the_old_one_is_kept_with_its_date_twice_if_need_be(
 def test_a_place_that_cannot_be_written(new: Path, tmp_path: Path) -> None:
     (tmp_path / "file").write_text("")
     with pytest.raises(DeviceError, match=r"file/bench\.toml: cannot be written"):
-        adopt(new, tmp_path / "file" / "bench.toml")
+        adopt_geometry(new, tmp_path / "file" / "bench.toml")
 
 
 def test_old_beside_new_as_a_tape_would_have_it(new: Path) -> None:
     optics = OpticsConfig(geometry=GeometryConfig(a_mm=2672.0, b_mm=2871.0, alpha_deg=80.9))
-    lines = compared(optics, origin_of(optics), read_geometry(new))
+    lines = compare_geometries(optics, stated_origin(optics), read_geometry(new))
     assert lines[0].startswith("in force: by hand, hash ")
     assert [line.split()[-2:] for line in lines[2:]] == [
         ["2672.000", "2674.000"],

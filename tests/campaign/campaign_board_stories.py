@@ -11,7 +11,7 @@ from campaign_stage import OldBoard, Stage, another_client
 from campaign_times import BOARD_PRESSURE_MAX_PA, TICK_S, WATCHDOG_S
 from campaign_world import WatchedPlant
 
-from firmware_iface.emulators.modbus_server import RegisterRefusal
+from firmware_iface.emulators.modbus_pdu import RegisterRefusal
 from firmware_iface.register_map import default_map
 from firmware_iface.roles import BenchCommand, LinkError
 from membrane_ctrl.model.telemetry import State

@@ -21,7 +21,8 @@ from campaign_times import HOLD_FLOW_S, RAMP_S, RATE_HZ, TICK_S, WATCHDOG_S
 from campaign_world import WatchedPlant, World
 from hold_rig import BoardBench, HoldRig, LoopClock, a_hold, board_of, on_board
 
-from firmware_iface.drivers.bronkhorst import BronkhorstFlow, ModbusParameters
+from firmware_iface.drivers.bronkhorst import BronkhorstFlow
+from firmware_iface.drivers.bronkhorst_modbus import ModbusParameters
 from firmware_iface.emulators.pumps import BronkhorstRegisters, Instrument
 from firmware_iface.roles import Bench, BenchCommand, DeviceRefusedError
 from membrane_ctrl.config.schema import Config
@@ -143,7 +144,8 @@ async def faults_that_outlive_the_run() -> list[str]:
     """A trip is in the file; an unreadable file is a fault; a refused acknowledgement clears
     nothing.
     """
-    from membrane_ctrl.hold.start import HoldOptions, _latched
+    from membrane_ctrl.hold.hold_options import HoldOptions
+    from membrane_ctrl.hold.start_checks import open_latched_fault
 
     with tempfile.TemporaryDirectory() as folder:
         file = LatchedFile(Path(folder))
@@ -151,7 +153,7 @@ async def faults_that_outlive_the_run() -> list[str]:
 
         def refused() -> bool:
             try:
-                _latched(Config(), Path(folder), options)
+                open_latched_fault(Config(), Path(folder), options)
             except DeviceError:
                 return True
             return False
@@ -197,7 +199,8 @@ class _Told:
 async def a_board_that_is_latched_at_the_start() -> list[str]:
     """The resume rule may clear a watchdog's trip at the start, and nothing else."""
     from membrane_ctrl.config.schema import DevicesConfig, ResumeConfig
-    from membrane_ctrl.hold.start import HoldOptions, _identify
+    from membrane_ctrl.hold.hold_options import HoldOptions
+    from membrane_ctrl.hold.start_checks import identify_board
 
     config, devices = Config(), DevicesConfig(board="tcp://127.0.0.1:1")
     asked = config.model_copy(
@@ -210,7 +213,7 @@ async def a_board_that_is_latched_at_the_start() -> list[str]:
     bench.now()
     bench.virtual.wrong.gauge_offset_pa = 0.0
     try:
-        await _identify(bench, asked, options)
+        await identify_board(bench, asked, options)
     except DeviceError:
         return []
     return ["a hold starts on a board that has latched over-pressure"]

@@ -9,9 +9,10 @@ from typing import Any
 from campaign_times import WATCHDOG_S
 from campaign_world import WatchedPlant
 
-from firmware_iface.drivers.bronkhorst import BronkhorstFlow, BronkhorstPressure, ModbusParameters
+from firmware_iface.drivers.bronkhorst import BronkhorstFlow, BronkhorstPressure
+from firmware_iface.drivers.bronkhorst_modbus import ModbusParameters
 from firmware_iface.drivers.modbus_map import ModbusValue, make_map
-from firmware_iface.emulators.modbus_server import RegisterRefusal, RegisterTable
+from firmware_iface.emulators.modbus_pdu import RegisterRefusal, RegisterTable
 from firmware_iface.emulators.pumps import BronkhorstRegisters, Instrument
 from firmware_iface.role_bench import RoleBench, RoleDevices
 from firmware_iface.roles import DeviceRefusedError, LinkDownError, LinkError

@@ -47,7 +47,7 @@ from membrane_ctrl.controller.tick_context import TickContext
 from membrane_ctrl.hold.virtual_run import TruthShape, VirtualRun
 from membrane_ctrl.metrology.film.hencky_bowl import zernike_projection
 from membrane_ctrl.model.telemetry import SafeLevel, State
-from membrane_ctrl.sim.surroundings import AmbientChange, LeakChange
+from membrane_ctrl.sim.bench_events import AmbientChange, LeakChange
 from membrane_ctrl.sim.virtual_bench import VirtualBench, Wrong
 
 AFTERMATH_S = 45.0

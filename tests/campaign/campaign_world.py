@@ -9,8 +9,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from membrane_ctrl.config.schema import PumpConfig, TwinConfig
+from membrane_ctrl.sim.bench_events import BenchEvent
 from membrane_ctrl.sim.plant import STEP_S, Plant
-from membrane_ctrl.sim.surroundings import BenchEvent
 
 SCENARIOS = ("calm", "quiet", "typical", "gusty")
 NOMINAL_SEEDS = range(1, 3)  # the twin as it is; all other seeds draw a mirror

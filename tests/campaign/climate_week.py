@@ -29,9 +29,10 @@ from membrane_ctrl.controller.protection import ProcessValue
 from membrane_ctrl.hold.virtual_run import TruthShape, VirtualRun
 from membrane_ctrl.metrology.film.hencky_bowl import zernike_projection
 from membrane_ctrl.model.events import Fault, Maintenance
+from membrane_ctrl.sim.bench_events import BenchEvent, DailyTemperature
 from membrane_ctrl.sim.film import NOMINAL_SAG_MM
-from membrane_ctrl.sim.plant import STEP_S, Plant, Truth
-from membrane_ctrl.sim.surroundings import BenchEvent, DailyTemperature
+from membrane_ctrl.sim.plant import STEP_S, Plant
+from membrane_ctrl.sim.truth import Truth
 from membrane_ctrl.sim.virtual_bench import VirtualBench
 
 DAY_S = 86_400.0

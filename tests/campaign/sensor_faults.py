@@ -24,9 +24,10 @@ from membrane_ctrl.metrology.film.hencky_bowl import zernike_projection
 from membrane_ctrl.model import events
 from membrane_ctrl.model.shape_estimate import ShapeEstimate
 from membrane_ctrl.model.telemetry import SafeLevel, State, TelemetryRow
+from membrane_ctrl.sim.bench_events import AmbientChange, BenchEvent
 from membrane_ctrl.sim.film import NOMINAL_PRESSURE_PA
-from membrane_ctrl.sim.plant import Plant, Truth
-from membrane_ctrl.sim.surroundings import AmbientChange, BenchEvent
+from membrane_ctrl.sim.plant import Plant
+from membrane_ctrl.sim.truth import Truth
 from membrane_ctrl.sim.virtual_bench import VirtualBench
 
 RATE_HZ = 10.0

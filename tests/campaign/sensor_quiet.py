@@ -14,9 +14,8 @@ from membrane_ctrl.hold.virtual_run import TruthShape, VirtualRun
 from membrane_ctrl.metrology.film.hencky_bowl import zernike_projection
 from membrane_ctrl.model.events import Fault
 from membrane_ctrl.sim import film as film_module
-from membrane_ctrl.sim import plant as plant_module
-from membrane_ctrl.sim.film import Film
-from membrane_ctrl.sim.surroundings import (
+from membrane_ctrl.sim import sensors
+from membrane_ctrl.sim.bench_events import (
     AmbientChange,
     BenchEvent,
     DailyTemperature,
@@ -25,6 +24,7 @@ from membrane_ctrl.sim.surroundings import (
     LeakChange,
     PressureWeather,
 )
+from membrane_ctrl.sim.film import Film
 from membrane_ctrl.sim.virtual_bench import VirtualBench
 
 _DROPOUT = "displacement_missing"  # five seconds without light are a true alarm
@@ -59,7 +59,7 @@ def quiet_hours(seed: int, other_world: bool, hours: float, rate_hz: float = 5.0
     thin = Film(thickness_um=42.0, creep_per_decade=0.02)
     with (
         patch.object(film_module, "MIRROR_FILM", thin),
-        patch.object(plant_module, "GAUGE_NOISE_PA", 1.0),
+        patch.object(sensors, "GAUGE_NOISE_PA", 1.0),
     ):
         return _quiet_hours(
             seed, hours, rate_hz, PumpConfig(flow_full_um_per_s=5.3 * 1.25), twin, 0.3

@@ -12,7 +12,7 @@ from patience import patient_check
 from test_examples import StillPlant
 
 from membrane_ctrl.cli import run
-from membrane_ctrl.commissioning import devices
+from membrane_ctrl.commissioning import devices, first_config
 from membrane_ctrl.config.schema import Config
 from membrane_ctrl.config.toml_file import load
 from membrane_ctrl.sim.lab import Lab
@@ -22,7 +22,7 @@ FOUND = [devices.FoundDevice("port", "/dev/ttyUSB0: FTDI", 'port = "usb:0403:600
 
 @pytest.fixture(autouse=True)
 def connected(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(devices, "_connected", lambda: FOUND)
+    monkeypatch.setattr(first_config, "_find_connected", lambda: FOUND)
 
 
 def answered(monkeypatch: pytest.MonkeyPatch, path: Path, *answers: str) -> int:

@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 from firmware_iface.links import aravis
-from firmware_iface.links.serial_port import PortInfo
+from firmware_iface.links.port_names import PortInfo
 from membrane_ctrl.cli import run
 from membrane_ctrl.commissioning import devices
 from membrane_ctrl.config.toml_file import read_toml

@@ -13,8 +13,9 @@ import pytest
 from membrane_ctrl.cli import run
 from membrane_ctrl.commissioning.check import _what_would_happen, run_conformance
 from membrane_ctrl.config.schema import Config, DevicesConfig
-from membrane_ctrl.instruments.bench import locked
-from membrane_ctrl.instruments.lock_store import LockStore, modbus_keys
+from membrane_ctrl.instruments.device_claim import claim_devices
+from membrane_ctrl.instruments.lock_keys import modbus_keys
+from membrane_ctrl.instruments.lock_store import LockStore
 from membrane_ctrl.model.errors import DeviceError
 from membrane_ctrl.model.lock import Lock
 from membrane_ctrl.sessions.live_hold import _require_unlocked
@@ -89,7 +90,7 @@ def test_while_a_program_has_the_devices_a_lock_is_removed_there(
     capsys: pytest.CaptureFixture[str],
 ) -> None:
     LockStore.of_machine().write_lock(OWN, KEYS)
-    with locked(KEYS):
+    with claim_devices(KEYS):
         assert run(["locks", "remove"]) == 4
     assert "ctl unlock" in capsys.readouterr().err
     assert len(LockStore.of_machine().find_locks()) == 1

@@ -21,7 +21,7 @@ from firmware_iface.emulators.pump_board import BoardSample
 from membrane_ctrl.cli import run
 from membrane_ctrl.config.schema import Config
 from membrane_ctrl.config.toml_file import dump, load
-from membrane_ctrl.instruments import bench
+from membrane_ctrl.instruments import role_drivers
 from membrane_ctrl.model.errors import InputError
 from membrane_ctrl.sim.lab import Lab
 
@@ -185,7 +185,7 @@ def refusal(**keys: object) -> str:
     devices = configured(**keys).devices
     assert devices is not None
     with pytest.raises(InputError) as caught:
-        bench.role_devices(devices)
+        role_drivers.make_role_devices(devices)
     (line,) = caught.value.lines
     assert "\n" not in line
     assert line.startswith("devices.gauge_pressure")

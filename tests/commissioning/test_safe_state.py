@@ -20,8 +20,11 @@ from firmware_iface.roles import BenchCommand, BenchReading
 from membrane_ctrl.commissioning.check import probe_board
 from membrane_ctrl.commissioning.safe import make_safe
 from membrane_ctrl.config.schema import Config, DevicesConfig, RecordingConfig
-from membrane_ctrl.instruments.bench import device_names, locked, pump_board
-from membrane_ctrl.instruments.lock_store import VARIABLE, LockStore, device_keys
+from membrane_ctrl.instruments.bench import make_pump_board
+from membrane_ctrl.instruments.device_claim import claim_devices
+from membrane_ctrl.instruments.device_names import device_names
+from membrane_ctrl.instruments.lock_keys import device_keys
+from membrane_ctrl.instruments.lock_store import VARIABLE, LockStore
 from membrane_ctrl.model.errors import DeviceError
 from tests.worlds.faulty_board import PumpBoardEmulator
 
@@ -124,7 +127,7 @@ def test_a_board_with_claims_keeps_it_stopped_until_the_holder_clears_it(bench: 
 
 
 def test_it_waits_for_no_lock(bench: Bench) -> None:
-    with locked(device_names(bench.devices)):
+    with claim_devices(device_names(bench.devices)):
         assert make_safe(bench.config, "lab.toml") == 0
     assert bench.read().pump_fraction == 0.0
 
@@ -170,7 +173,10 @@ def test_a_pump_that_the_watchdog_leaves_on_is_stopped_after_all(
 
 
 def test_without_a_latch_a_running_program_is_left_alone(bench: Bench) -> None:
-    with locked(device_names(bench.devices)), pytest.raises(DeviceError, match="in use by process"):
+    with (
+        claim_devices(device_names(bench.devices)),
+        pytest.raises(DeviceError, match="in use by process"),
+    ):
         make_safe(bench.config, "lab.toml", latch=False)
     assert bench.read().pump_fraction == 0.5
 
@@ -192,7 +198,7 @@ def test_a_check_beside_a_holder_writes_nothing(bench: Bench, version: int) -> N
     """
     before = bench.board.state.read(48, 2) + bench.board.state.read(56, 3)
     slow = bench.devices.model_copy(update={"watchdog_s": 10.0})
-    probe = asyncio.run(probe_board(pump_board(slow, str(slow.board)), "board"))
+    probe = asyncio.run(probe_board(make_pump_board(slow, str(slow.board)), "board"))
     assert probe.problem == ""
     assert ("has no claim" in probe.notes) == (version == 1)
     assert bench.board.state.read(48, 2) + bench.board.state.read(56, 3) == before

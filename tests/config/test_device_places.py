@@ -6,7 +6,7 @@ from typing import Any
 
 import pytest
 
-from firmware_iface.drivers import bronkhorst
+from firmware_iface.drivers import bronkhorst, bronkhorst_modbus
 from membrane_ctrl.config import device_places
 from membrane_ctrl.config.schema import Config
 from membrane_ctrl.config.toml_file import parse
@@ -235,11 +235,11 @@ def test_at_the_start_two_names_of_one_host_are_one_device() -> None:
     )
     assert config.devices is not None
     with pytest.raises(InputError, match=r"devices\.pump\.address and devices\.vent\.address"):
-        bench.open_bench(config.devices)
+        bench.make_bench(config.devices)
 
 
 def test_the_registers_of_a_bronkhorst_are_those_of_its_driver() -> None:
     used = (bronkhorst.MEASURE, bronkhorst.SETPOINT, bronkhorst.CONTROL_MODE, bronkhorst.FMEASURE)
     for parameter in used:
-        address, _ = bronkhorst.register_of(parameter)
+        address, _ = bronkhorst_modbus.register_of(parameter)
         assert address in device_places._BRONKHORST_REGISTERS

@@ -14,8 +14,9 @@ from membrane_ctrl.config.schema import Config, GeometryConfig, OpticsConfig, Pa
 from membrane_ctrl.config.sight import doubt, poses, sight
 from membrane_ctrl.config.toml_file import parse
 from membrane_ctrl.controller.cross_check import cross_check
+from membrane_ctrl.sim.optics.bench_poses import camera_pose, screen_pose
 from membrane_ctrl.sim.optics.film_shape import FilmShape
-from membrane_ctrl.sim.optics.trace import camera_pose, screen_pose, trace
+from membrane_ctrl.sim.optics.trace import trace
 
 SHORT = {"a_mm": 2672.0, "b_mm": 2871.0, "alpha_deg": 80.9}
 

@@ -15,7 +15,9 @@ from pathlib import Path
 
 import pytest
 
-from membrane_ctrl.console.keys import Desk, Keyboard, KeyReader, Request, ask
+from membrane_ctrl.console.key_reader import Keyboard, KeyReader
+from membrane_ctrl.console.keys import Desk
+from membrane_ctrl.console.requests import Request, send_request
 from membrane_ctrl.model import terminal
 
 
@@ -219,10 +221,10 @@ def test_a_request_goes_to_the_port_of_the_own_run_only(
     tmp_path: Path, run: str, answer: dict[str, object], said: str, requests: int
 ) -> None:
     thread, taken = serve_once(tmp_path / "sock", run, answer)
-    assert said in ask(tmp_path / "sock", "demo", {"do": "hold"})
+    assert said in send_request(tmp_path / "sock", "demo", {"do": "hold"})
     thread.join()
     assert taken == [{"do": "hold", "why": "key", "number": 1}] * requests
 
 
 def test_no_hold_there_is_a_line_and_no_error(tmp_path: Path) -> None:
-    assert ask(tmp_path / "sock", "demo", {"do": "stop"}).startswith("stop: ")
+    assert send_request(tmp_path / "sock", "demo", {"do": "stop"}).startswith("stop: ")

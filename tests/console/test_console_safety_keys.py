@@ -6,7 +6,7 @@ import json
 import socket
 from pathlib import Path
 
-from membrane_ctrl.console.keys import sender
+from membrane_ctrl.console.requests import request_sender
 
 GREETING = b'{"membrane_ctrl": 1, "run": "the-run", "you": "unix:ann", "role": "tune"}\n'
 
@@ -17,7 +17,7 @@ def test_a_stop_is_sent_while_another_key_waits_for_its_answer(tmp_path: Path) -
         hold.bind(str(path))
         hold.listen(8)
         hold.settimeout(5.0)
-        send = sender(path, "the-run")
+        send = request_sender(path, "the-run")
         first = send({"do": "hold"})
         waiting, _ = hold.accept()  # and never answered
         stopped = send({"do": "stop"})

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from membrane_ctrl.config.schema import LoopConfig, PumpConfig, TwinConfig
-from membrane_ctrl.sim.surroundings import AmbientChange, LeakChange
+from membrane_ctrl.sim.bench_events import AmbientChange, LeakChange
 from tests.studies.inner_loop import answer, hold, lost_reading, run, start_up, steady
 
 SEEDS = (1, 2, 3)

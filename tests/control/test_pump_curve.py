@@ -11,7 +11,7 @@ from scipy.interpolate import PchipInterpolator
 
 from membrane_ctrl.config.schema import PumpConfig
 from membrane_ctrl.control.pump_curve import KICK_S, PumpCurve
-from membrane_ctrl.sim.plant import PumpModel
+from membrane_ctrl.sim.pump_model import PumpModel
 from tests.worlds.foreign_plant import CURVES, ForeignPump
 
 PUMP = PumpConfig()

@@ -32,9 +32,12 @@ from membrane_ctrl.controller.controller import Controller
 from membrane_ctrl.controller.tick import TickInputs, TickOutputs
 from membrane_ctrl.hold.child_processes import ChildProcesses, rings_for
 from membrane_ctrl.hold.closing_words import Closing
+from membrane_ctrl.hold.hold_options import HoldOptions
 from membrane_ctrl.hold.listeners import FaultLatch, SystemdNotify
-from membrane_ctrl.hold.start import BoardAtStart, HoldOptions, _run
+from membrane_ctrl.hold.lock_keeper import LockKeeper
+from membrane_ctrl.hold.start_checks import BoardAtStart
 from membrane_ctrl.hold.supervisor import Supervisor, Wiring
+from membrane_ctrl.hold.tick_run import HoldResources, run_ticks
 from membrane_ctrl.model.clock import RunClock
 from membrane_ctrl.model.errors import Exit
 from membrane_ctrl.model.events import Event, EventLine
@@ -120,19 +123,20 @@ class Bench:
                 asyncio.get_running_loop().call_later(BREAKS_S, breaks, self)
                 children, clock = cast(ChildProcesses, self.children), cast(RunClock, LoopClock())
                 closing = Closing()
-                await _run(
-                    self.bench,
-                    CONFIG,
-                    options,
-                    clock,
-                    rings,
-                    children,
-                    None,
-                    port,
-                    latched,
-                    BoardAtStart(),
-                    closing,
+                parts = HoldResources(
+                    bench=self.bench,
+                    config=CONFIG,
+                    options=options,
+                    clock=clock,
+                    rings=rings,
+                    children=children,
+                    twin=None,
+                    board=BoardAtStart(),
+                    make_port=port,
+                    make_latch=latched,
+                    make_keeper=partial(LockKeeper, None),
                 )
+                await run_ticks(parts, closing)
                 assert closing.exit is not None
                 return closing.exit
 
@@ -143,7 +147,7 @@ class Bench:
 
 @pytest.fixture
 def bench(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Bench:
-    monkeypatch.setattr("membrane_ctrl.processes.child.raise_priority", lambda: "ordinary")
+    monkeypatch.setattr("membrane_ctrl.processes.priority.raise_priority", lambda: "ordinary")
     return Bench(tmp_path)
 
 

@@ -22,7 +22,7 @@ from membrane_ctrl.controller.commands import AT_START, Command
 from membrane_ctrl.controller.resume_rule import ResumeRule
 from membrane_ctrl.controller.safe_levels import SafeLevels
 from membrane_ctrl.controller.safety import TABLE, Observation
-from membrane_ctrl.hold.scenario import At
+from membrane_ctrl.hold.scenario_file import ScenarioStep
 from membrane_ctrl.hold.virtual_run import VirtualRun
 from membrane_ctrl.metrology.film.hencky_bowl import zernike_projection
 from membrane_ctrl.model.telemetry import SafeLevel, State
@@ -155,7 +155,7 @@ def test_the_daily_number_of_resumes_is_limited_and_restored_after_a_day() -> No
         assert fault.rule.possible is possible, now_s
 
 
-def scenario(*at: At, duration_s: float, faults: tuple[str, ...]) -> CheckedScenario:
+def scenario(*at: ScenarioStep, duration_s: float, faults: tuple[str, ...]) -> CheckedScenario:
     return CheckedScenario.model_validate(
         {
             "title": "resume",
@@ -170,7 +170,10 @@ def scenario(*at: At, duration_s: float, faults: tuple[str, ...]) -> CheckedScen
 @pytest.mark.parametrize("wrong", ["unreachable", "silent"])
 def test_a_cause_that_returns_restarts_the_wait(wrong: str) -> None:
     """Gone at 22 s, back from 24 s to 40 s: nothing may resume before 50 s."""
-    steps = (At(time_s=20.0, wrong=wrong, for_s=2.0), At(time_s=24.0, wrong=wrong, for_s=16.0))
+    steps = (
+        ScenarioStep(time_s=20.0, wrong=wrong, for_s=2.0),
+        ScenarioStep(time_s=24.0, wrong=wrong, for_s=16.0),
+    )
     outcome = play(scenario(*steps, duration_s=55.0, faults=("link_lost", "device_silent")))
     resumed = [event["mono_s"] for event in outcome.of("state") if event["from"] == "fault"]
     assert len(resumed) == 1
@@ -185,7 +188,9 @@ def test_a_lasting_cause_is_waited_for(wrong: str, fault: str) -> None:
     s.
     """
     outcome = play(
-        scenario(At(time_s=20.0, wrong=wrong, for_s=80.0), duration_s=115.0, faults=(fault,))
+        scenario(
+            ScenarioStep(time_s=20.0, wrong=wrong, for_s=80.0), duration_s=115.0, faults=(fault,)
+        )
     )
     assert [event["name"] for event in outcome.of("fault")] == [fault]
     resumed = [event["mono_s"] for event in outcome.of("state") if event["from"] == "fault"]
@@ -196,10 +201,10 @@ def test_a_lasting_cause_is_waited_for(wrong: str, fault: str) -> None:
 def test_the_wait_starts_at_zero_for_the_next_fault() -> None:
     """Acknowledged after 8 s of the wait; the next fault waits its own 10 s."""
     steps = (
-        At(time_s=20.0, wrong="stalled", for_s=1.0),
-        At(time_s=29.0, command="ack"),
-        At(time_s=29.5, command="hold"),
-        At(time_s=45.0, wrong="stalled", for_s=1.0),
+        ScenarioStep(time_s=20.0, wrong="stalled", for_s=1.0),
+        ScenarioStep(time_s=29.0, command="ack"),
+        ScenarioStep(time_s=29.5, command="hold"),
+        ScenarioStep(time_s=45.0, wrong="stalled", for_s=1.0),
     )
     outcome = play(scenario(*steps, duration_s=60.0, faults=("watchdog_tripped",)))
     left = [event["mono_s"] for event in outcome.of("state") if event["from"] == "fault"]
@@ -209,8 +214,8 @@ def test_the_wait_starts_at_zero_for_the_next_fault() -> None:
 
 def test_an_intermittent_link_does_not_prevent_a_resume() -> None:
     steps = (
-        At(time_s=20.0, wrong="unreachable", for_s=2.0),
-        At(time_s=22.5, wrong="lost_every", value=7),
+        ScenarioStep(time_s=20.0, wrong="unreachable", for_s=2.0),
+        ScenarioStep(time_s=22.5, wrong="lost_every", value=7),
     )
     outcome = play(scenario(*steps, duration_s=40.0, faults=("link_lost",)))
     left = [event["mono_s"] for event in outcome.of("state") if event["from"] == "fault"]
@@ -223,8 +228,8 @@ def test_a_board_that_has_vented_while_the_link_was_down_stays_down() -> None:
     should be.
     """
     steps = (
-        At(time_s=20.0, wrong="unreachable", for_s=5.0),
-        At(time_s=21.0, wrong="gauge_offset_pa", value=300.0, for_s=2.0),
+        ScenarioStep(time_s=20.0, wrong="unreachable", for_s=5.0),
+        ScenarioStep(time_s=21.0, wrong="gauge_offset_pa", value=300.0, for_s=2.0),
     )
     outcome = play(scenario(*steps, duration_s=60.0, faults=("link_lost",)))
     assert [event["name"] for event in outcome.of("fault")] == ["link_lost"]
@@ -236,7 +241,9 @@ def test_a_board_that_has_vented_while_the_link_was_down_stays_down() -> None:
 
 
 def test_a_resume_is_reported_and_limited_by_the_daily_number() -> None:
-    steps = tuple(At(time_s=20.0 + 40.0 * k, wrong="unreachable", for_s=2.0) for k in range(4))
+    steps = tuple(
+        ScenarioStep(time_s=20.0 + 40.0 * k, wrong="unreachable", for_s=2.0) for k in range(4)
+    )
     outcome = play(scenario(*steps, duration_s=180.0, faults=("link_lost",)))
     assert [event["name"] for event in outcome.of("resumed")] == ["link_lost"] * 3
     assert {tick.outputs.clear_mask for tick in outcome.ticks} == {0, WATCHDOG}

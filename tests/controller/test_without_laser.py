@@ -30,13 +30,13 @@ from membrane_ctrl.model.events import (
     ShapeLoopState,
 )
 from membrane_ctrl.model.telemetry import SafeLevel, State
-from membrane_ctrl.sim.plant import Plant
-from membrane_ctrl.sim.surroundings import (
+from membrane_ctrl.sim.bench_events import (
     AirTemperatureChange,
     AmbientChange,
     BenchEvent,
     LaserDrift,
 )
+from membrane_ctrl.sim.plant import Plant
 from membrane_ctrl.sim.virtual_bench import VirtualBench, Wrong
 
 TWIN = TwinConfig(laser=False, start_error_um=-5.0, scenario="quiet")

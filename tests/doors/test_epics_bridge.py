@@ -14,7 +14,7 @@ import pytest
 from membrane_ctrl.config.port import EpicsConfig
 from membrane_ctrl.doors import epics
 from membrane_ctrl.doors.epics_search import find_server, require_unserved
-from membrane_ctrl.instruments import bench
+from membrane_ctrl.instruments import device_claim
 from membrane_ctrl.model.errors import DeviceError
 from tests.control_port.port_run import port_run
 from tests.doors.test_door_clients import SERVERS, doors, held, program
@@ -24,7 +24,7 @@ from tests.web.test_page import free_port
 
 async def test_a_second_bridge_of_the_same_records_on_this_machine_is_refused() -> None:
     with (
-        bench.locked(["EPICS records mirror:*"]),
+        device_claim.claim_devices(["EPICS records mirror:*"]),
         pytest.raises(DeviceError, match=r"EPICS records mirror:\*: in use by"),
     ):
         await epics.serve(EpicsConfig(ca_port=free_port(), pva_port=free_port()), door_with())

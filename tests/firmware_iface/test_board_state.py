@@ -8,7 +8,7 @@ from typing import Any
 
 import pytest
 
-from firmware_iface.emulators.modbus_server import RegisterRefusal
+from firmware_iface.emulators.modbus_pdu import RegisterRefusal
 from firmware_iface.emulators.pump_board import (
     GAUGE_PRESSURE_LIMIT_PA,
     BoardSample,

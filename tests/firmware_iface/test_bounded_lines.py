@@ -9,7 +9,7 @@ import re
 
 import pytest
 
-from firmware_iface.emulators.modbus_server import RtuBusEmulator
+from firmware_iface.emulators.rtu_bus import RtuBusEmulator
 from firmware_iface.emulators.serial_device import LineDevice
 from firmware_iface.links.exchange import Question, SerialExchange
 from firmware_iface.links.serial_port import SerialSettings

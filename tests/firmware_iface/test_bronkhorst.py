@@ -21,10 +21,9 @@ from firmware_iface.drivers.bronkhorst import (
     TEMPERATURE,
     BronkhorstFlow,
     BronkhorstPressure,
-    ModbusParameters,
     ParameterPort,
-    register_of,
 )
+from firmware_iface.drivers.bronkhorst_modbus import ModbusParameters, register_of
 from firmware_iface.drivers.bronkhorst_propar import (
     ProparMessage,
     ProparParameters,
@@ -34,7 +33,7 @@ from firmware_iface.drivers.bronkhorst_propar import (
     split_binary,
     values,
 )
-from firmware_iface.emulators.modbus_server import respond
+from firmware_iface.emulators.modbus_pdu import respond
 from firmware_iface.emulators.pumps import ANALOG_INPUT, BronkhorstRegisters, Instrument
 from firmware_iface.emulators.serial_device import PtyWire
 from firmware_iface.links.modbus_rtu import RtuBus

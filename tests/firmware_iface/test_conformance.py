@@ -14,7 +14,7 @@ from counting_plant import CountingPlant, ManualClock
 
 from firmware_iface.conformance import CheckResult, Conformance, examine
 from firmware_iface.drivers.pump_board import PumpBoard
-from firmware_iface.emulators.modbus_server import ILLEGAL_VALUE, RegisterRefusal, respond
+from firmware_iface.emulators.modbus_pdu import ILLEGAL_VALUE, RegisterRefusal, respond
 from firmware_iface.emulators.pump_board import BoardSample, BoardState, StoredSettings
 from firmware_iface.emulators.serial_device import PtyWire
 from firmware_iface.links.modbus_tcp import GuardedModbusTcp

@@ -12,18 +12,11 @@ import pytest
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
-from firmware_iface.display import (
-    RAMP_LEVELS,
-    ScreenRaster,
-    checkerboard,
-    checkerboard_problem,
-    exposure_problem,
-    linear_response,
-    measured_response,
-    pattern_light,
-    settling,
-    share_left,
-)
+from firmware_iface.checkerboard_check import checkerboard_problem
+from firmware_iface.display_patterns import ScreenRaster, checkerboard, pattern_light
+from firmware_iface.display_response import RAMP_LEVELS, linear_response, measured_response
+from firmware_iface.display_settling import settling, share_left
+from firmware_iface.exposure_check import exposure_problem
 from firmware_iface.roles import Pattern
 from tests.worlds.panel import EmulatedPanel, PanelResponse
 

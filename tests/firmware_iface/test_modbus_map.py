@@ -10,7 +10,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from firmware_iface.drivers.modbus_map import ModbusValue, ValueMap, make_map
-from firmware_iface.emulators.modbus_server import bitwise_crc
+from firmware_iface.emulators.rtu_bus import bitwise_crc
 from firmware_iface.links.modbus_rtu import RtuBus
 from firmware_iface.links.serial_port import SerialSettings
 from firmware_iface.roles import DeviceRefusedError, LinkError

@@ -12,7 +12,8 @@ from typing import Any
 
 import pytest
 
-from firmware_iface.emulators.modbus_server import bitwise_crc, respond
+from firmware_iface.emulators.modbus_pdu import respond
+from firmware_iface.emulators.rtu_bus import bitwise_crc
 from firmware_iface.links.modbus_rtu import RtuBus, crc16, parse_rtu_url, rtu_frame, take_reply
 from firmware_iface.links.serial_port import SerialSettings
 from firmware_iface.roles import DeviceRefusedError, LinkDownError, LinkError

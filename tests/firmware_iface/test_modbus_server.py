@@ -8,7 +8,8 @@ from collections.abc import Sequence
 
 import pytest
 
-from firmware_iface.emulators.modbus_server import Answer, ModbusTcpServer, RegisterRefusal, respond
+from firmware_iface.emulators.modbus_pdu import RegisterRefusal, respond
+from firmware_iface.emulators.modbus_server import Answer, ModbusTcpServer
 
 
 class Table:

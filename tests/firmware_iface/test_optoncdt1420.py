@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 
 from firmware_iface.drivers.optoncdt1420 import Optoncdt1420, StreamParser, distance_mm, middle
-from firmware_iface.emulators.lasers import NO_PEAK, three_bytes
+from firmware_iface.emulators.optoncdt1420 import NO_PEAK, three_bytes
 from firmware_iface.emulators.serial_device import PtyWire
 from firmware_iface.links.exchange import StepGate
 from firmware_iface.roles import DeviceRefusedError, LinkDownError, LinkError

@@ -9,7 +9,8 @@ from typing import Any
 import numpy as np
 import pytest
 
-from firmware_iface.display import DisplayResponse, ScreenRaster, pattern_light
+from firmware_iface.display_patterns import ScreenRaster, pattern_light
+from firmware_iface.display_response import DisplayResponse
 from firmware_iface.pattern_screen import SETTLE_S, PatternScreen
 from firmware_iface.roles import DeviceIdentity, DriverClock, LinkDownError, LinkError, Pattern
 

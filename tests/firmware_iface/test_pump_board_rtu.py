@@ -12,7 +12,7 @@ from counting_plant import CountingPlant, ManualClock
 from pymodbus.client import ModbusSerialClient
 
 from firmware_iface.drivers.pump_board import PumpBoard
-from firmware_iface.emulators.modbus_server import respond
+from firmware_iface.emulators.modbus_pdu import respond
 from firmware_iface.emulators.serial_device import PtyWire
 from firmware_iface.links.serial_port import SerialSettings
 from firmware_iface.register_map import default_map

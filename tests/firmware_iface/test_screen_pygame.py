@@ -11,7 +11,8 @@ import numpy as np
 import pytest
 
 from firmware_iface import display_conformance
-from firmware_iface.display import DisplayResponse, ScreenRaster, checkerboard, pattern_light
+from firmware_iface.display_patterns import ScreenRaster, checkerboard, pattern_light
+from firmware_iface.display_response import DisplayResponse
 from firmware_iface.drivers.screen_pygame import PygameDisplay
 from firmware_iface.pattern_screen import PatternScreen
 from firmware_iface.roles import DeviceRefusedError, DriverClock, LinkError, Pattern

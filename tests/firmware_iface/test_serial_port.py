@@ -13,13 +13,8 @@ import pytest
 
 from firmware_iface.emulators.serial_device import PtyWire
 from firmware_iface.links.modbus_rtu import RtuBus
-from firmware_iface.links.serial_port import (
-    SerialPort,
-    SerialSettings,
-    check_port_name,
-    port_path,
-    serial_ports,
-)
+from firmware_iface.links.port_names import check_port_name, port_path, serial_ports
+from firmware_iface.links.serial_port import SerialPort, SerialSettings
 from firmware_iface.roles import DeviceRefusedError, LinkDownError, LinkError
 from tests.worlds.faulty_devices import RtuBusEmulator, SerialDevice
 

@@ -14,12 +14,11 @@ from membrane_ctrl.config.schema import (
     OpticsConfig,
     PatternConfig,
 )
-from membrane_ctrl.geometry.file import (
-    KEPT,
-    geometry_in_force,
-    geometry_of_run,
-    origin_of,
-    read_geometry,
+from membrane_ctrl.geometry.file import read_geometry, stated_origin
+from membrane_ctrl.geometry.run_geometry import (
+    GEOMETRY_COPY,
+    read_configured_geometry,
+    read_run_geometry,
 )
 from membrane_ctrl.model.errors import InputError
 from membrane_ctrl.model.plain_json import SCHEMA, content_hash
@@ -102,19 +101,19 @@ def test_a_stated_geometry_has_a_name_of_its_own() -> None:
     optics = OpticsConfig()
     moved = OpticsConfig(geometry=GeometryConfig(a_mm=2673.0, b_mm=2871.0, alpha_deg=80.9))
     referred = optics.geometry.model_copy(update={"reference_displacement_um": 5.0})
-    assert origin_of(optics).hash != origin_of(moved).hash
+    assert stated_origin(optics).hash != stated_origin(moved).hash
     # where the film stood is not where camera and screen stand
-    assert origin_of(optics) == origin_of(OpticsConfig(geometry=referred))
+    assert stated_origin(optics) == stated_origin(OpticsConfig(geometry=referred))
 
 
 def test_a_run_measures_with_the_file_as_it_was_at_its_start(tmp_path: Path) -> None:
     path = calibrated(tmp_path / "g.toml")
     config = Config(optics=OpticsConfig(geometry_file=path))
-    begun = geometry_in_force(config)
+    begun = read_configured_geometry(config)
     begun.keep(tmp_path)
     assert begun.optics.geometry.a_mm == 2674.0
     path.unlink()
-    kept = geometry_of_run(tmp_path, config)
+    kept = read_run_geometry(tmp_path, config)
     assert kept.optics == begun.optics
     assert kept.origin.hash == begun.origin.hash
     assert kept.calibration == begun.calibration
@@ -138,25 +137,25 @@ def test_a_height_map_beside_the_file_is_kept_with_the_run(tmp_path: Path) -> No
     covariance = {"names": ["a_mm"], "matrix": [[4.0]]}
     (lab / "g.toml").write_text(tomli_w.dumps({**tables, "covariance": covariance}))
     config = Config(optics=OpticsConfig(geometry_file=lab / "g.toml"))
-    begun = geometry_in_force(config)
+    begun = read_configured_geometry(config)
     begun.keep(run_dir)
-    kept = geometry_of_run(run_dir, config)
+    kept = read_run_geometry(run_dir, config)
     assert kept.optics == begun.optics
     assert kept.origin.hash == begun.origin.hash
     assert "covariance" in kept.text
     (lab / "screen.txt").write_text("0.1 0.0 0.1\n0.2 0.1 0.3\n")
-    assert geometry_in_force(config).origin.hash != begun.origin.hash
+    assert read_configured_geometry(config).origin.hash != begun.origin.hash
 
 
 def test_without_a_file_yet_the_hand_counts_and_it_is_said(tmp_path: Path) -> None:
     config = Config(optics=OpticsConfig(geometry_file=tmp_path / "g.toml"))
-    there = geometry_in_force(config)
+    there = read_configured_geometry(config)
     assert there.optics == config.optics
     assert "g.toml does not exist yet: [optics.geometry] is used" in there.note
     there.keep(tmp_path)
-    assert not (tmp_path / KEPT).exists()
-    assert geometry_of_run(tmp_path, config).note == there.note
-    assert geometry_in_force(Config()).note == ""
+    assert not (tmp_path / GEOMETRY_COPY).exists()
+    assert read_run_geometry(tmp_path, config).note == there.note
+    assert read_configured_geometry(Config()).note == ""
 
 
 def test_a_file_with_which_the_mirror_cannot_be_measured_is_refused(tmp_path: Path) -> None:
@@ -165,10 +164,10 @@ def test_a_file_with_which_the_mirror_cannot_be_measured_is_refused(tmp_path: Pa
     with pytest.raises(
         InputError, match=r"g\.toml: geometry\.alpha_deg: the pattern .* in 28% of the mirror"
     ):
-        geometry_in_force(Config(optics=OpticsConfig(geometry_file=path)))
+        read_configured_geometry(Config(optics=OpticsConfig(geometry_file=path)))
 
 
 def test_a_file_that_cannot_be_used_is_no_missing_one(tmp_path: Path) -> None:
     (tmp_path / "g.toml").write_text("[geometry]\na_mm = 3\n")
     with pytest.raises(InputError, match=r"g\.toml: a_mm"):
-        geometry_in_force(Config(optics=OpticsConfig(geometry_file=tmp_path / "g.toml")))
+        read_configured_geometry(Config(optics=OpticsConfig(geometry_file=tmp_path / "g.toml")))

@@ -11,7 +11,7 @@ from pathlib import Path
 import pytest
 
 from membrane_ctrl.cli import run
-from membrane_ctrl.hold import start
+from membrane_ctrl.hold import autotune
 from membrane_ctrl.model.errors import Exit
 
 
@@ -27,7 +27,7 @@ def test_it_starts_a_session_and_ends_it_with_the_hold(
         return popen([sys.executable, "-c", "import time; time.sleep(600)"], **given)  # type: ignore[call-overload]
 
     monkeypatch.setattr(subprocess, "Popen", started)
-    end = start._autotune(tmp_path / "control.sock", tmp_path)
+    end = autotune.start_autotune(tmp_path / "control.sock", tmp_path)
     end()
     assert words[2:5] == ["membrane_ctrl", "tune", "run"]
     assert {"--short", "--wait", "same-load", str(tmp_path / "control.sock")} <= set(words)

@@ -14,8 +14,9 @@ import pytest_asyncio
 from firmware_iface.emulators.pump_board import BoardSample
 from firmware_iface.register_map import default_map, known_maps
 from membrane_ctrl.config.schema import Config, DevicesConfig, ResumeConfig
-from membrane_ctrl.hold.start import BoardAtStart, HoldOptions, _identify, _latched
-from membrane_ctrl.instruments.bench import connect, open_bench
+from membrane_ctrl.hold.hold_options import HoldOptions
+from membrane_ctrl.hold.start_checks import BoardAtStart, identify_board, open_latched_fault
+from membrane_ctrl.instruments.bench import connect_bench, make_bench
 from membrane_ctrl.model.errors import DeviceError, FindingsError
 from membrane_ctrl.run_files.latched_fault import NAME, LatchedFile, ResumeLog
 from tests.worlds.faulty_board import PumpBoardEmulator
@@ -55,7 +56,7 @@ async def identified(
 ) -> BoardAtStart:
     devices = DevicesConfig(board=f"tcp://127.0.0.1:{board.port}")
     config = Config(devices=devices, resume=ResumeConfig(faults=resumes, most_per_day=2))
-    return await _identify(open_bench(devices), config, asked, log)
+    return await identify_board(make_bench(devices), config, asked, log)
 
 
 async def test_a_board_without_faults_is_accepted(board: PumpBoardEmulator) -> None:
@@ -129,7 +130,7 @@ async def test_the_watchdog_is_not_cleared_if_it_cannot_be_counted(
 @pytest.mark.parametrize("standby", [False, True])
 def test_clear_faults_clears_the_file_in_standby_as_well(tmp_path: Path, standby: bool) -> None:
     (tmp_path / NAME).write_text("{")
-    file = _latched(Config(), tmp_path, options(standby, clear_faults=True))
+    file = open_latched_fault(Config(), tmp_path, options(standby, clear_faults=True))
     assert file is not None
     assert LatchedFile(tmp_path).read() is None
 
@@ -137,7 +138,7 @@ def test_clear_faults_clears_the_file_in_standby_as_well(tmp_path: Path, standby
 def test_a_latched_fault_that_cannot_be_cleared_is_refused_in_one_line(tmp_path: Path) -> None:
     (tmp_path / NAME).mkdir()
     with pytest.raises(DeviceError, match=r"cannot be cleared.*by hand"):
-        _latched(Config(), tmp_path, options(clear_faults=True))
+        open_latched_fault(Config(), tmp_path, options(clear_faults=True))
 
 
 async def test_an_unreachable_board_is_reported_with_the_reason(
@@ -147,7 +148,7 @@ async def test_an_unreachable_board_is_reported_with_the_reason(
     monkeypatch.setattr("membrane_ctrl.instruments.bench._PAUSE_S", 0.0)
     devices = DevicesConfig(board=f"tcp://127.0.0.1:{unused_tcp_port}")
     with pytest.raises(DeviceError) as caught:
-        await connect(open_bench(devices), devices)
+        await connect_bench(make_bench(devices), devices)
     reason = "no connection; is the device on, and is this its address?"
     assert str(caught.value) == f"tcp://127.0.0.1:{unused_tcp_port}: {reason}"
 
@@ -158,8 +159,8 @@ def test_a_latched_fault_prevents_the_next_hold_and_standby_waits(
 ) -> None:
     (tmp_path / NAME).write_text(content)
     with pytest.raises(DeviceError, match=r"a fault is latched.*--clear-faults"):
-        _latched(Config(), tmp_path, options())
-    assert _latched(Config(), tmp_path, options(standby=True)) is not None
+        open_latched_fault(Config(), tmp_path, options())
+    assert open_latched_fault(Config(), tmp_path, options(standby=True)) is not None
     assert (tmp_path / NAME).read_text() == content
 
 
@@ -182,15 +183,17 @@ async def test_an_open_interlock_is_refused_and_standby_waits_for_it() -> None:
     with pytest.raises(
         DeviceError, match=r"interlock door is open: shut the door; close it.*--standby"
     ):
-        await _identify(open_bench(devices), Config(devices=devices), options())
+        await identify_board(make_bench(devices), Config(devices=devices), options())
     assert (
-        await _identify(open_bench(devices), Config(devices=devices), options(standby=True))
+        await identify_board(make_bench(devices), Config(devices=devices), options(standby=True))
         == BoardAtStart()
     )
     other = DevicesConfig.model_validate(
         {**devices.model_dump(), "interlocks": [DOOR | {"input": 2}]}
     )
-    assert await _identify(open_bench(other), Config(devices=other), options()) == BoardAtStart()
+    assert (
+        await identify_board(make_bench(other), Config(devices=other), options()) == BoardAtStart()
+    )
     await emulator.stop()
 
 
@@ -201,5 +204,5 @@ async def test_an_input_of_a_board_of_an_earlier_map_is_refused() -> None:
         {"board": f"tcp://127.0.0.1:{emulator.port}", "interlocks": [DOOR]}
     )
     with pytest.raises(FindingsError, match="register map 2"):
-        await _identify(open_bench(devices), Config(devices=devices), options(standby=True))
+        await identify_board(make_bench(devices), Config(devices=devices), options(standby=True))
     await emulator.stop()

@@ -18,9 +18,12 @@ from membrane_ctrl.config.schema import Config, DevicesConfig, StatesConfig
 from membrane_ctrl.controller.commands import AT_START, Command
 from membrane_ctrl.controller.tick import TickOutputs
 from membrane_ctrl.hold import lock_keeper
+from membrane_ctrl.hold.hold_options import HoldOptions
 from membrane_ctrl.hold.lock_keeper import LockKeeper, LockStorage
-from membrane_ctrl.hold.start import BoardAtStart, HoldOptions, _ask_first, _find_locks
-from membrane_ctrl.instruments.lock_store import LockStore, device_keys
+from membrane_ctrl.hold.start_checks import BoardAtStart, find_locks
+from membrane_ctrl.hold.tick_run import _send_first_commands
+from membrane_ctrl.instruments.lock_keys import device_keys
+from membrane_ctrl.instruments.lock_store import LockStore
 from membrane_ctrl.model.errors import DeviceError
 from membrane_ctrl.model.events import Event, LockRemoved, LockSet
 from membrane_ctrl.model.lock import Lock
@@ -193,14 +196,14 @@ def options(config: Config, **changes: Any) -> HoldOptions:
 
 @pytest.mark.parametrize("changes", [{}, {"clear_faults": True}, {"logs_dir": Path("elsewhere")}])
 def test_a_hold_does_not_start_on_a_locked_device(changes: dict[str, Any]) -> None:
-    assert _find_locks(BOARD, options(BOARD, **changes)) is not None
+    assert find_locks(BOARD, options(BOARD, **changes)) is not None
     LockStore.of_machine().write_lock(
         Lock("bofak", "hands inside", "unix:ann"), device_keys(BOARD.devices or no())
     )
     with pytest.raises(DeviceError, match="hands inside"):
-        _find_locks(BOARD, options(BOARD, **changes))
+        find_locks(BOARD, options(BOARD, **changes))
     other = Config(devices=DevicesConfig(board="tcp://10.0.0.6:502"))
-    assert _find_locks(other, options(other, **changes)) is not None
+    assert find_locks(other, options(other, **changes)) is not None
 
 
 def no() -> DevicesConfig:
@@ -211,7 +214,7 @@ def test_in_standby_it_starts_with_the_locks() -> None:
     LockStore.of_machine().write_lock(
         Lock("bofak", "hands inside", "unix:ann"), device_keys(BOARD.devices or no())
     )
-    storage = _find_locks(BOARD, options(BOARD, standby=True))
+    storage = find_locks(BOARD, options(BOARD, standby=True))
     assert storage is not None
     assert [each.lock.word for each in storage.locks] == ["bofak"]
 
@@ -226,7 +229,9 @@ def test_a_run_in_standby_begins_with_its_locks_and_its_latched_fault_as_command
     asked: list[Command] = []
     supervisor, latch = cast(Any, SimpleNamespace(ask=asked.append)), cast(Any, Latch())
     lock = Lock("bofak", "hands inside", "unix:ann", "unix:ann")
-    _ask_first(supervisor, True, latch, BoardAtStart(latched="the board has latched"), (lock,))
+    _send_first_commands(
+        supervisor, True, latch, BoardAtStart(latched="the board has latched"), (lock,)
+    )
     first, second = asked
     assert (first.kind, first.who, first.lock) == ("latch", AT_START, lock)
     assert (second.kind, second.who) == ("latched", AT_START)
@@ -234,11 +239,11 @@ def test_a_run_in_standby_begins_with_its_locks_and_its_latched_fault_as_command
 
 
 def test_the_twin_has_locks_of_earlier_runs_only_if_configured() -> None:
-    assert _find_locks(BOARD, options(BOARD, twin=True)) is None
+    assert find_locks(BOARD, options(BOARD, twin=True)) is None
     practice = BOARD.model_copy(update={"states": StatesConfig(latch_twin_faults=True)})
-    storage = _find_locks(practice, options(practice, twin=True))
+    storage = find_locks(practice, options(practice, twin=True))
     assert storage is not None
     storage.store.write_lock(Lock("bofak", "hands inside", "unix:ann"), storage.devices)
     with pytest.raises(DeviceError, match="hands inside"):
-        _find_locks(practice, options(practice, twin=True))
-    assert _find_locks(BOARD, options(BOARD)) is not None  # a twin's lock locks no bench
+        find_locks(practice, options(practice, twin=True))
+    assert find_locks(BOARD, options(BOARD)) is not None  # a twin's lock locks no bench

@@ -18,7 +18,7 @@ from membrane_ctrl.cli import run
 from membrane_ctrl.cli.options import configured
 from membrane_ctrl.hold.child_processes import _page_words
 from membrane_ctrl.model.errors import Exit, InputError
-from membrane_ctrl.processes.child import Program
+from membrane_ctrl.processes.command_process import CommandProcess
 from tests.web.test_page import free_port
 
 WAITS = (
@@ -94,7 +94,7 @@ def test_a_program_that_cannot_start_has_ended(
         raise OSError("no more processes")
 
     monkeypatch.setattr(subprocess, "Popen", refuse)
-    page = Program("page", ["web", "--with-hold"], tmp_path / "gone" / "web.log", 10)
+    page = CommandProcess("page", ["web", "--with-hold"], tmp_path / "gone" / "web.log", 10)
     page.start()
     assert (page.alive, page.exit_code) == (False, None)
     page.kill()

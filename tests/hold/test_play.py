@@ -9,8 +9,9 @@ import pytest
 
 from membrane_ctrl import cli
 from membrane_ctrl.config.schema import RecordingConfig
-from membrane_ctrl.hold import scenario
-from membrane_ctrl.hold.scenario import Scenario, ScenarioRun, load_scenario
+from membrane_ctrl.hold import play
+from membrane_ctrl.hold.scenario_file import Scenario, load_scenario
+from membrane_ctrl.hold.scenario_run import ScenarioRun
 from membrane_ctrl.hold.scenarios import find_scenario, shipped
 from membrane_ctrl.model.clock import RunClock
 from membrane_ctrl.model.errors import Exit, InputError
@@ -122,7 +123,7 @@ def test_in_real_time_each_tick_comes_at_its_time(monkeypatch: pytest.MonkeyPatc
     monkeypatch.setattr(time, "monotonic", lambda: now_s[0])
     monkeypatch.setattr(time, "sleep", lambda pause_s: now_s.__setitem__(0, now_s[0] + pause_s))
     run, seen = short_run(), []
-    for _ in scenario._paced(run, run.ticks(), RunClock.start()):
+    for _ in play._pace_ticks(run, run.ticks(), RunClock.start()):
         seen.append(now_s[0] - 1000.0 - run.virtual.now_s)
         now_s[0] += 0.25 if len(seen) == 20 else 0.01
         if len(seen) == 40:

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from membrane_ctrl.hold.scenario import load_scenario
+from membrane_ctrl.hold.scenario_file import load_scenario
 from membrane_ctrl.hold.scenarios import shipped
 from membrane_ctrl.model.errors import InputError
 from tests.support.scenario import CheckedScenario, failures, play

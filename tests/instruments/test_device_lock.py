@@ -13,13 +13,14 @@ from pathlib import Path
 import pytest
 
 from membrane_ctrl.config.schema import DevicesConfig
-from membrane_ctrl.instruments.bench import device_names, locked, modbus_names
+from membrane_ctrl.instruments.device_claim import claim_devices
+from membrane_ctrl.instruments.device_names import device_names, modbus_names
 from membrane_ctrl.model.errors import DeviceError
 
 HOLDS = """
 import sys
-from membrane_ctrl.instruments.bench import locked
-with locked([sys.argv[1]]):
+from membrane_ctrl.instruments.device_claim import claim_devices
+with claim_devices([sys.argv[1]]):
     print("held", flush=True)
     sys.stdin.read()
 """
@@ -45,7 +46,7 @@ def other(device: str) -> Iterator[subprocess.Popen[str]]:
 
 
 def refused(device: str) -> str:
-    with pytest.raises(DeviceError) as caught, locked([device]):
+    with pytest.raises(DeviceError) as caught, claim_devices([device]):
         pass
     return str(caught.value)
 
@@ -65,7 +66,7 @@ def test_a_process_that_ended_anyhow_leaves_nothing(
 ) -> None:
     other.send_signal(number)
     other.wait()
-    with locked([device]):
+    with claim_devices([device]):
         pass
 
 
@@ -76,18 +77,18 @@ def test_a_stopped_process_keeps_its_devices(device: str, other: subprocess.Pope
 
 def test_it_is_given_back_and_may_be_had_again(device: str) -> None:
     for _ in range(2):
-        with locked([device]):
+        with claim_devices([device]):
             assert f"process {os.getpid()}" in refused(device)
 
 
 def test_of_several_devices_none_is_kept_when_one_is_refused(device: str) -> None:
-    with locked([f"{device} b"]):
+    with claim_devices([f"{device} b"]):
         with (
             pytest.raises(DeviceError, match=" b: in use"),
-            locked([f"{device} a", f"{device} b", f"{device} c"]),
+            claim_devices([f"{device} a", f"{device} b", f"{device} c"]),
         ):
             pass
-        with locked([f"{device} a", f"{device} c"]):
+        with claim_devices([f"{device} a", f"{device} c"]):
             pass
 
 

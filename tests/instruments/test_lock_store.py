@@ -10,14 +10,9 @@ from pathlib import Path
 import pytest
 
 from membrane_ctrl.config.schema import DevicesConfig
-from membrane_ctrl.instruments import lock_store
-from membrane_ctrl.instruments.lock_store import (
-    LockStore,
-    StoredLock,
-    device_keys,
-    modbus_keys,
-    require_unlocked,
-)
+from membrane_ctrl.instruments import lock_keys, lock_store
+from membrane_ctrl.instruments.lock_keys import device_keys, modbus_keys
+from membrane_ctrl.instruments.lock_store import LockStore, StoredLock, require_unlocked
 from membrane_ctrl.model.errors import DeviceError
 from membrane_ctrl.model.lock import Lock
 from membrane_ctrl.model.program import program_identity, stated_program
@@ -218,7 +213,7 @@ def test_a_device_is_known_by_every_name_it_may_get(
     by_id.mkdir()
     (tmp_path / "ttyUSB0").write_text("")
     (by_id / "usb-ACME_123").symlink_to(tmp_path / "ttyUSB0")
-    monkeypatch.setattr(lock_store, "_BY_ID", by_id)
+    monkeypatch.setattr(lock_keys, "_BY_ID", by_id)
     before = modbus_keys(f"rtu://{tmp_path}/ttyUSB0?baud=115200", 1)
     (by_id / "usb-ACME_123").unlink()
     (tmp_path / "ttyUSB1").write_text("")

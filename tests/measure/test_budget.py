@@ -20,7 +20,7 @@ from membrane_ctrl.config.optics import (
     OpticsConfig,
     ScreenPoseConfig,
 )
-from membrane_ctrl.geometry.spread_file import spread_of
+from membrane_ctrl.geometry.spread_file import geometry_spread
 from membrane_ctrl.metrology.figure.pixel_figure import measure_pixels, reconstruct_full
 from membrane_ctrl.metrology.frame_checks.set_check import check_set
 from membrane_ctrl.metrology.phase.frame_stack import FrameStack
@@ -36,7 +36,7 @@ from membrane_ctrl.metrology.uncertainty.set_budget import SetBudget, assemble_b
 from membrane_ctrl.model.zernike_terms import ZERNIKE_TERMS
 from membrane_ctrl.sim.optics.camera import OpticsRenderer
 from membrane_ctrl.sim.optics.film_shape import FilmShape, typical_film
-from membrane_ctrl.sim.optics.shade import pattern_sequence
+from membrane_ctrl.sim.optics.pattern_levels import pattern_sequence
 from tests.studies.resumable_answers import answers
 from tests.worlds.misstated_bench import BentRays
 
@@ -124,7 +124,9 @@ def measured(
     angle = np.linspace(0, 2 * np.pi, 72, endpoint=False)
     rim = 500 * np.cos(angle), 500 * np.sin(angle)
     sag_um = 1e3 * float(np.mean(full.surface.height(*rim) - film.height_mm(*rim, 0.0)))
-    examined = assemble_budget(STATED, checked, full, spread_of(STATED, None)[0], 0.5, outline)
+    examined = assemble_budget(
+        STATED, checked, full, geometry_spread(STATED, None)[0], 0.5, outline
+    )
     return Outcome(float(np.sqrt(np.mean(error_um**2))), sag_um, examined)
 
 

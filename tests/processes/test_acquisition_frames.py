@@ -14,8 +14,8 @@ import numpy as np
 import pytest
 
 from membrane_ctrl.config.schema import CameraConfig, OpticsConfig, PatternConfig
+from membrane_ctrl.processes.frame_address import FrameAddress
 from membrane_ctrl.processes.frames import FrameReader, FrameRing, FrameWriter
-from membrane_ctrl.processes.ring import FrameAddress
 
 SLOTS = 3
 

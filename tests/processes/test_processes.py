@@ -8,7 +8,8 @@ from multiprocessing.context import SpawnProcess
 
 import pytest
 
-from membrane_ctrl.processes.child import Child, pipe
+from membrane_ctrl.processes.child import Child
+from membrane_ctrl.processes.event_pipe import pipe
 
 
 def test_what_is_sent_to_the_whole_group_is_not_for_the_children() -> None:

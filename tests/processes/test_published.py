@@ -13,7 +13,8 @@ from pathlib import Path
 
 import pytest
 
-from membrane_ctrl.processes.ring import RingAddress, RingError, RingWriter, attach, publish, ring
+from membrane_ctrl.processes.published_rings import attach_rings, publish_rings
+from membrane_ctrl.processes.ring import RingAddress, RingError, RingWriter, ring
 
 
 @pytest.fixture
@@ -25,8 +26,8 @@ def address() -> Iterator[RingAddress]:
 def test_a_session_reads_on_from_the_newest_message(tmp_path: Path, address: RingAddress) -> None:
     writer = RingWriter(address)
     writer.put(b"before")
-    publish(tmp_path, {"telemetry": address, "shapes": None})
-    readers = attach(tmp_path)
+    publish_rings(tmp_path, {"telemetry": address, "shapes": None})
+    readers = attach_rings(tmp_path)
     writer.put(b"after")
     assert {name: reader.drain() for name, reader in readers.items()} == {"telemetry": [b"after"]}
     readers["telemetry"].close()
@@ -34,8 +35,8 @@ def test_a_session_reads_on_from_the_newest_message(tmp_path: Path, address: Rin
 
 
 def test_a_reader_cannot_write(tmp_path: Path, address: RingAddress) -> None:
-    publish(tmp_path, {"telemetry": address})
-    reader = attach(tmp_path)["telemetry"]
+    publish_rings(tmp_path, {"telemetry": address})
+    reader = attach_rings(tmp_path)["telemetry"]
     with pytest.raises(TypeError, match="read-only"):
         reader._slots.words[0] = 1
     reader.close()
@@ -70,7 +71,7 @@ def test_another_address_is_refused_in_one_line(
 ) -> None:
     named(tmp_path, **{"name": address.name, "slots": 4, "slot_bytes": 16} | changed)
     with pytest.raises(RingError) as refused:
-        attach(tmp_path)
+        attach_rings(tmp_path)
     assert "\n" not in str(refused.value)
 
 
@@ -81,37 +82,37 @@ def test_another_address_is_refused_in_one_line(
 def test_a_damaged_file_is_refused(tmp_path: Path, text: bytes) -> None:
     (tmp_path / "rings.json").write_bytes(text)
     with pytest.raises((RingError, OSError)):
-        attach(tmp_path)
+        attach_rings(tmp_path)
 
 
 def test_a_pipe_in_place_of_the_file_hangs_nobody(tmp_path: Path) -> None:
     os.mkfifo(tmp_path / "rings.json")
     with pytest.raises(OSError, match="plain file"):
-        attach(tmp_path)
+        attach_rings(tmp_path)
 
 
 def test_a_link_in_place_of_the_file_is_not_followed(tmp_path: Path, address: RingAddress) -> None:
-    publish(tmp_path, {"telemetry": address})
+    publish_rings(tmp_path, {"telemetry": address})
     (tmp_path / "rings.json").rename(tmp_path / "other.json")
     (tmp_path / "rings.json").symlink_to("other.json")
     with pytest.raises(OSError, match=r"rings\.json"):
-        attach(tmp_path)
+        attach_rings(tmp_path)
 
 
 def test_shared_memory_of_another_user_is_refused(
     tmp_path: Path, address: RingAddress, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    publish(tmp_path, {"telemetry": address})
+    publish_rings(tmp_path, {"telemetry": address})
     monkeypatch.setattr(os, "geteuid", lambda: os.getuid() + 1)
     with pytest.raises(RingError, match=f"belongs to user {os.getuid()}"):
-        attach(tmp_path)
+        attach_rings(tmp_path)
 
 
 def test_shared_memory_of_another_size_is_refused(tmp_path: Path) -> None:
     with ring(8, 16) as larger:
         named(tmp_path, name=larger.name, slots=4, slot_bytes=16)
         with pytest.raises(RingError, match="bytes, not the"):
-            attach(tmp_path)
+            attach_rings(tmp_path)
 
 
 def test_shared_memory_that_is_no_ring_is_refused(tmp_path: Path) -> None:
@@ -120,7 +121,7 @@ def test_shared_memory_that_is_no_ring_is_refused(tmp_path: Path) -> None:
         memory.buf[:] = random.Random(1).randbytes(len(memory.buf))
         named(tmp_path, name=memory.name, slots=4, slot_bytes=16)
         with pytest.raises(RingError, match="not the expected ring"):
-            attach(tmp_path)
+            attach_rings(tmp_path)
     finally:
         memory.close()
         memory.unlink()
@@ -128,6 +129,6 @@ def test_shared_memory_that_is_no_ring_is_refused(tmp_path: Path) -> None:
 
 def test_a_run_that_is_over_has_none(tmp_path: Path) -> None:
     with ring(4, 16) as address:
-        publish(tmp_path, {"telemetry": address})
+        publish_rings(tmp_path, {"telemetry": address})
     with pytest.raises(FileNotFoundError):
-        attach(tmp_path)
+        attach_rings(tmp_path)

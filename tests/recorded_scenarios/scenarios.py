@@ -22,7 +22,7 @@ from membrane_ctrl.config.schema import (
 )
 from membrane_ctrl.controller.commands import AT_START, Command
 from membrane_ctrl.model.lock import Lock
-from membrane_ctrl.sim.surroundings import (
+from membrane_ctrl.sim.bench_events import (
     AirTemperatureChange,
     AmbientChange,
     LaserDrift,

@@ -15,7 +15,7 @@ import pytest
 from membrane_ctrl.config.schema import Config
 from membrane_ctrl.model.errors import RejectedError
 from membrane_ctrl.review.statistics import film_run
-from membrane_ctrl.sim.film import stretched
+from membrane_ctrl.sim.stretched_film import solve_stretched_film
 
 HOUR_S, RADIUS_MM, PRESTRAIN, POISSON = 3600.0, 500.0, 4e-4, 0.36
 
@@ -30,7 +30,7 @@ def sag_mm(pressure_pa: float, stiffness: float) -> float:
     low, high = 30.0, 45.0
     for _ in range(50):
         middle = (low + high) / 2
-        load = stretched(middle / RADIUS_MM, PRESTRAIN, POISSON)[0]
+        load = solve_stretched_film(middle / RADIUS_MM, PRESTRAIN, POISSON)[0]
         low, high = (
             (middle, high) if load * stiffness / (RADIUS_MM * 1e-3) < pressure_pa else (low, middle)
         )
@@ -40,7 +40,7 @@ def sag_mm(pressure_pa: float, stiffness: float) -> float:
 def run_of(folder: Path, hours: float) -> SimpleNamespace:
     """A hold at one sag: the pressure falls as the film gives way."""
     time_s = np.linspace(0, hours * HOUR_S, 60)
-    load = stretched(37.0 / RADIUS_MM, PRESTRAIN, POISSON)[0]
+    load = solve_stretched_film(37.0 / RADIUS_MM, PRESTRAIN, POISSON)[0]
     pressure_pa = load * stiffness_n_per_m(time_s) / (RADIUS_MM * 1e-3)
     pressure_pa += np.random.default_rng(1).normal(0, 0.02, time_s.size)
     shapes = SimpleNamespace(time_s=time_s, sag_um=np.full(60, 37e3), verdict=np.full(60, "ok"))
@@ -63,7 +63,9 @@ def test_tomorrow_is_within_its_interval(
     table = json.loads(capsys.readouterr().out)
     times_s = np.array([48.0, 72.0]) * HOUR_S
     pressure_pa = (
-        stretched(37.0 / RADIUS_MM, PRESTRAIN, POISSON)[0] * stiffness_n_per_m(times_s[:1])[0] / 0.5
+        solve_stretched_film(37.0 / RADIUS_MM, PRESTRAIN, POISSON)[0]
+        * stiffness_n_per_m(times_s[:1])[0]
+        / 0.5
     )
     now, then = (sag_mm(pressure_pa, float(stiffness)) for stiffness in stiffness_n_per_m(times_s))
     drift = table["tomorrow_um"]

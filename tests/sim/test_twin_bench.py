@@ -22,8 +22,8 @@ from membrane_ctrl.model.clock import RunClock
 from membrane_ctrl.processes.child import STOP
 from membrane_ctrl.processes.ring import RingReader, RingWriter, ring
 from membrane_ctrl.sim.bench import BenchReport, BenchSpec, LiveBench, serve
-from membrane_ctrl.sim.plant import TRUTH_BYTES, Truth
-from membrane_ctrl.sim.surroundings import AmbientChange
+from membrane_ctrl.sim.bench_events import AmbientChange
+from membrane_ctrl.sim.truth import TRUTH_BYTES, Truth
 
 pytestmark = pytest.mark.real_time
 

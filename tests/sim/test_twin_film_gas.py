@@ -10,9 +10,10 @@ import pytest
 
 from membrane_ctrl.config.schema import PumpConfig, TwinConfig
 from membrane_ctrl.sim import film, plant
-from membrane_ctrl.sim.film import filled, solve
+from membrane_ctrl.sim.bench_events import AirTemperatureChange, AmbientChange, LeakChange
+from membrane_ctrl.sim.gas import fill_gas
+from membrane_ctrl.sim.hencky import solve_hencky
 from membrane_ctrl.sim.plant import Plant
-from membrane_ctrl.sim.surroundings import AirTemperatureChange, AmbientChange, LeakChange
 
 TIGHT_S = 1e8  # trapped gas: the leak moves the centre 0.1 nm/s
 
@@ -34,8 +35,8 @@ def moved_um(bench: Plant, duration_s: float) -> float:
 
 
 def test_hencky_coefficients() -> None:
-    assert solve(0.3).sag == pytest.approx(0.65344, abs=5e-6)
-    assert solve(0.3).volume == pytest.approx(0.5214, abs=5e-5)
+    assert solve_hencky(0.3).sag == pytest.approx(0.65344, abs=5e-6)
+    assert solve_hencky(0.3).volume == pytest.approx(0.5214, abs=5e-5)
 
 
 @pytest.mark.parametrize(("poisson", "b0"), [(0.2, 1.6827), (0.3, 1.7244), (0.4, 1.7769)])
@@ -43,13 +44,13 @@ def test_hencky_against_the_published_power_series(poisson: float, b0: float) ->
     # Hencky's series with its published first coefficient b0; the terms beyond the seventh add 1e-4
     series = [1, 1 / 2, 5 / 9, 55 / 72, 7 / 6, 205 / 108, 17051 / 5292]
     total = sum(term * b0 ** -(3 * k + 1) for k, term in enumerate(series))
-    assert solve(poisson).sag == pytest.approx(total, rel=2e-4)
+    assert solve_hencky(poisson).sag == pytest.approx(total, rel=2e-4)
 
 
 @pytest.mark.parametrize("poisson", [-0.1, 0.6])
 def test_hencky_refuses_impossible_material(poisson: float) -> None:
     with pytest.raises(ValueError, match="poisson"):
-        solve(poisson)
+        solve_hencky(poisson)
 
 
 def test_sag_volume_and_compliance_of_the_nominal_mirror() -> None:
@@ -83,7 +84,7 @@ def test_centre_per_pascal_and_per_ml_of_gas() -> None:
 @pytest.mark.parametrize("gauge_pa", [300.0, 900.0])
 def test_centre_per_ml_hardly_depends_on_pressure(gauge_pa: float) -> None:
     volume = float(film.MIRROR_FILM.volume_m3_per_root_pa(film.SETTLED_S) * (1 + 63.4 / 37.1))
-    gas = filled(gauge_pa, 296.15, 101_325.0, volume)
+    gas = fill_gas(gauge_pa, 296.15, 101_325.0, volume)
     coefficient_um = 1e3 * float(film.MIRROR_FILM.sag_mm_per_root_pa(film.SETTLED_S))
     before_um = coefficient_um * gas.root_pa
     for _ in range(10):

@@ -11,10 +11,10 @@ from firmware_iface.emulators.pump_board import BoardSample
 from firmware_iface.roles import BenchReading
 from firmware_iface.settings import BoardInputConfig, ModbusInputConfig
 from membrane_ctrl.config.schema import Config, DevicesConfig
-from membrane_ctrl.instruments.bench import open_bench
+from membrane_ctrl.instruments.bench import make_bench
 from membrane_ctrl.model.clock import RunClock
 from membrane_ctrl.model.errors import InputError
-from membrane_ctrl.sim import bench
+from membrane_ctrl.sim import twin_process
 from membrane_ctrl.sim.lab import Lab
 from membrane_ctrl.sim.virtual_interlocks import VirtualInterlocks
 from tests.config.test_device_places import roles
@@ -45,7 +45,7 @@ class Still:
 
 
 async def reading_of(devices: DevicesConfig) -> BenchReading:
-    made = open_bench(devices)
+    made = make_bench(devices)
     await made.open()
     try:
         return await made.read()
@@ -108,7 +108,7 @@ async def test_single_instruments_have_interlocks_as_well() -> None:
 
 def test_the_twins_board_takes_the_place_of_every_source_in_order() -> None:
     config = Config.model_validate({"devices": {"board": "tcp://b", "interlocks": SOURCES}})
-    moved = bench._at_board_inputs(config.interlocks)
+    moved = twin_process._at_board_inputs(config.interlocks)
     assert [(one.name, one.text, one.safe_level) for one in moved] == [
         ("door", "x", "vent"),
         ("air", "y", "pump_off"),
@@ -126,7 +126,7 @@ def test_more_than_the_twins_board_has_inputs_are_refused() -> None:
         contextlib.ExitStack() as stack,
         pytest.raises(InputError, match="17 of them; the twin's pump board has 16"),
     ):
-        bench.TwinProcess.started(config, RunClock.start(), stack)
+        twin_process.TwinProcess.started(config, RunClock.start(), stack)
 
 
 def test_virtual_circuits_open_and_lose_their_signals_as_their_sources_do() -> None:

@@ -9,14 +9,10 @@ import numpy as np
 import pytest
 
 from membrane_ctrl.config.schema import PumpConfig, TwinConfig
-from membrane_ctrl.sim.plant import TRUTH_BYTES, Plant, Truth
-from membrane_ctrl.sim.surroundings import (
-    SCENARIOS,
-    AmbientChange,
-    LaserDrift,
-    LaserDropout,
-    OrnsteinUhlenbeck,
-)
+from membrane_ctrl.sim.bench_events import AmbientChange, LaserDrift, LaserDropout
+from membrane_ctrl.sim.plant import Plant
+from membrane_ctrl.sim.surroundings import SCENARIOS, OrnsteinUhlenbeck
+from membrane_ctrl.sim.truth import TRUTH_BYTES, Truth
 
 PUMP = PumpConfig()
 

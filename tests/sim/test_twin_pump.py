@@ -7,7 +7,8 @@ import math
 import pytest
 
 from membrane_ctrl.config.schema import PumpConfig, TwinConfig
-from membrane_ctrl.sim.plant import STEP_S, Plant, PumpModel
+from membrane_ctrl.sim.plant import STEP_S, Plant
+from membrane_ctrl.sim.pump_model import PumpModel
 
 FULL_ML_PER_S = 6.0
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from membrane_ctrl.sim.surroundings import (
+from membrane_ctrl.sim.bench_events import (
     BenchEvent,
     DailyTemperature,
     PressureWeather,

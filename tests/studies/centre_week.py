@@ -18,8 +18,8 @@ from membrane_ctrl.hold.virtual_run import TruthShape, VirtualRun, VirtualTick
 from membrane_ctrl.metrology.film.hencky_bowl import zernike_projection
 from membrane_ctrl.model.events import Event, Fault, HeldBy, Maintenance, Plausibility
 from membrane_ctrl.model.telemetry import State
+from membrane_ctrl.sim.bench_events import DailyTemperature, LaserDrift, LeakChange, PressureWeather
 from membrane_ctrl.sim.plant import Plant
-from membrane_ctrl.sim.surroundings import DailyTemperature, LaserDrift, LeakChange, PressureWeather
 from membrane_ctrl.sim.virtual_bench import VirtualBench
 
 DAY_S, RATE_HZ, TRACK_S, CYCLE_S = 86_400.0, 10.0, 0.2, 2.0

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from membrane_ctrl.metrology.frame_checks.checked_set import RejectedSetError
 from membrane_ctrl.sim.optics.film_shape import Ripple, typical_film
-from membrane_ctrl.sim.optics.shade import Light
+from membrane_ctrl.sim.optics.pattern_levels import Light
 from tests.studies.measured_sets import measured, quantities, truth_of
 from tests.worlds.misstated_bench import BentRays, Room, bench_off_by, stated_bench
 

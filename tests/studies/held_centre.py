@@ -14,8 +14,8 @@ from membrane_ctrl.config.schema import EstimatorConfig, LoopConfig, PumpConfig,
 from membrane_ctrl.control.centre import CentreFilter
 from membrane_ctrl.control.centre_estimate import CentreReadings
 from membrane_ctrl.control.inner_loop import InnerLoop, LoopInput
+from membrane_ctrl.sim.bench_events import BenchEvent
 from membrane_ctrl.sim.plant import Plant
-from membrane_ctrl.sim.surroundings import BenchEvent
 
 LOCK_S = 5.0  # from when on the optics are used
 Array = NDArray[np.float64]
@@ -61,7 +61,7 @@ def hold(
     events: Sequence[BenchEvent] = (),
     config: EstimatorConfig = EstimatorConfig(),  # noqa: B008 (frozen)
     loop: LoopConfig = LoopConfig(),  # noqa: B008
-    true_pump: PumpConfig = PumpConfig(),  # noqa: B008
+    true_pump: PumpConfig = PumpConfig(),  # noqa: B008 (frozen)
     shake: tuple[float, float] = (0.0, 0.0),
 ) -> HeldCentre:
     """Hold the simulated mirror on the estimate; a laser is there for the first 10 s, then if

@@ -11,8 +11,8 @@ from numpy.typing import NDArray
 
 from membrane_ctrl.config.schema import LoopConfig, PumpConfig, TwinConfig
 from membrane_ctrl.control.inner_loop import InnerLoop, LoopInput, LoopOutput
+from membrane_ctrl.sim.bench_events import AmbientChange, BenchEvent, LeakChange
 from membrane_ctrl.sim.plant import Plant
-from membrane_ctrl.sim.surroundings import AmbientChange, BenchEvent, LeakChange
 from tests.studies.minimum_variance import WRITE_S, least_std_um
 
 SETTLED_S = 40.0

@@ -22,10 +22,12 @@ from firmware_iface.drivers.keyence_dl_rs1a import KeyenceDlRs1a
 from firmware_iface.drivers.optoncdt1420 import Optoncdt1420
 from firmware_iface.drivers.vaisala_ptb330 import VaisalaPtb330
 from firmware_iface.drivers.ventus import Ventus
-from firmware_iface.emulators.modbus_server import Answer, ModbusTcpServer, respond
+from firmware_iface.emulators.modbus_pdu import respond
+from firmware_iface.emulators.modbus_server import Answer, ModbusTcpServer
 from firmware_iface.emulators.pumps import Instrument
+from firmware_iface.links.modbus_link import ModbusLink
 from firmware_iface.links.modbus_rtu import RtuBus
-from firmware_iface.links.modbus_tcp import GuardedModbusTcp, ModbusLink
+from firmware_iface.links.modbus_tcp import GuardedModbusTcp
 from firmware_iface.links.serial_port import SerialSettings
 from firmware_iface.roles import Device, DisplacementSensor, LinkDownError, LinkError, Pump
 from firmware_iface.settings import (

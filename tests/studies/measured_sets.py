@@ -7,7 +7,7 @@ import numpy as np
 from membrane_ctrl.config.optics import (
     OpticsConfig,
 )
-from membrane_ctrl.geometry.spread_file import spread_of
+from membrane_ctrl.geometry.spread_file import geometry_spread
 from membrane_ctrl.metrology.figure.pixel_figure import FullResult, measure_pixels, reconstruct_full
 from membrane_ctrl.metrology.frame_checks.set_check import check_set
 from membrane_ctrl.metrology.phase.frame_stack import FrameStack
@@ -33,7 +33,9 @@ def measured(stack: FrameStack, stated: OpticsConfig) -> tuple[FullResult, SetBu
     outline = find_outline(
         light, checked.tracer.geometry, 500.0, checked.tracer.vertex_z_mm + full.surface.sag_mm
     )
-    examined = assemble_budget(stated, checked, full, spread_of(stated, None)[0], 0.5, outline)
+    examined = assemble_budget(
+        stated, checked, full, geometry_spread(stated, None)[0], 0.5, outline
+    )
     verdict = judge(full.quality)[0]
     if verdict == "ok" and (checked.flags or examined.doubts):
         verdict = "degraded"

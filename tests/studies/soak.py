@@ -17,13 +17,13 @@ from membrane_ctrl.controller.commands import Command
 from membrane_ctrl.hold.virtual_run import TruthShape, VirtualRun, VirtualTick
 from membrane_ctrl.metrology.film.hencky_bowl import zernike_projection
 from membrane_ctrl.model.telemetry import State
-from membrane_ctrl.sim.plant import Plant
-from membrane_ctrl.sim.surroundings import (
+from membrane_ctrl.sim.bench_events import (
     BenchEvent,
     DailyTemperature,
     LaserDropout,
     PressureWeather,
 )
+from membrane_ctrl.sim.plant import Plant
 from membrane_ctrl.sim.virtual_bench import VirtualBench
 
 DAY_S = 86_400.0

@@ -9,8 +9,8 @@ import numpy as np
 
 from membrane_ctrl.config.schema import LoopConfig, PumpConfig, TwinConfig
 from membrane_ctrl.control.experiments.experiment import BenchSample
+from membrane_ctrl.sim.bench_events import BenchEvent
 from membrane_ctrl.sim.plant import STEP_S, Plant
-from membrane_ctrl.sim.surroundings import BenchEvent
 from tests.studies.minimum_variance import least_std_um
 from tuning.identification.disturbance import observe_disturbance
 from tuning.identification.experiments import Characterised, fit_experiments, run_experiments

@@ -18,8 +18,9 @@ from membrane_ctrl.metrology.rays.forward_model import residual_mm
 from membrane_ctrl.metrology.rays.geometry import Geometry
 from membrane_ctrl.metrology.rays.set_phases import SetPhases
 from membrane_ctrl.metrology.rays.surface import Surface
+from membrane_ctrl.sim.optics.bench_poses import CameraPose, ScreenPose
 from membrane_ctrl.sim.optics.film_shape import FilmShape, typical_film
-from membrane_ctrl.sim.optics.trace import CameraPose, ScreenPose, trace
+from membrane_ctrl.sim.optics.trace import trace
 
 FloatArray = NDArray[np.float64]
 

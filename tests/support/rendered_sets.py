@@ -14,7 +14,7 @@ from membrane_ctrl.config.schema import CameraConfig, OpticsConfig, PatternConfi
 from membrane_ctrl.metrology.phase.frame_stack import FrameStack
 from membrane_ctrl.sim.optics.camera import OpticsRenderer
 from membrane_ctrl.sim.optics.film_shape import FilmShape, typical_film
-from membrane_ctrl.sim.optics.shade import Light, pattern_sequence
+from membrane_ctrl.sim.optics.pattern_levels import Light, pattern_sequence
 
 FILM = typical_film(37.1, 500.0, seed=1)
 GAINS = {"saturated": 2.0, "dark": 0.05, "flicker": 0.8}

@@ -10,7 +10,8 @@ import numpy as np
 from pydantic import Field, model_validator
 
 from firmware_iface.settings import Section
-from membrane_ctrl.hold.scenario import Scenario, ScenarioRun
+from membrane_ctrl.hold.scenario_file import Scenario
+from membrane_ctrl.hold.scenario_run import ScenarioRun
 from membrane_ctrl.hold.virtual_run import VirtualTick
 from membrane_ctrl.model.events import EventLine
 from membrane_ctrl.model.telemetry import FIELDS

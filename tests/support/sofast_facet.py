@@ -15,13 +15,13 @@ from numpy.typing import NDArray
 from scipy.interpolate import LinearNDInterpolator
 from scipy.spatial.transform import Rotation
 
-from membrane_ctrl.measure.measure import (
+from membrane_ctrl.measure.sofast_file import (
     MM_PER_M,
     SHIFTS_RAD,
     SofastMeasurement,
-    floats,
-    item,
-    open_file,
+    open_hdf5,
+    read_floats,
+    read_item,
 )
 from membrane_ctrl.metrology.phase.phase_steps import phasors
 from membrane_ctrl.metrology.phase.temporal_unwrap import Unwrapped, unwrap_in_time
@@ -190,9 +190,9 @@ def read_camera(path: Path) -> SofastCamera:
     """Intrinsics. The matrix' last element is not used: downsampling divides it along with the
     others.
     """
-    with open_file(path) as file:
-        matrix = floats(file, "Camera/intrinsic_mat")
-        distortion = floats(file, "Camera/distortion_coef")
+    with open_hdf5(path) as file:
+        matrix = read_floats(file, "Camera/intrinsic_mat")
+        distortion = read_floats(file, "Camera/distortion_coef")
     return SofastCamera(
         (float(matrix[0, 0]), float(matrix[1, 1])),
         (float(matrix[0, 2]), float(matrix[1, 2])),
@@ -202,17 +202,17 @@ def read_camera(path: Path) -> SofastCamera:
 
 def read_screen(path: Path) -> ScreenShape:
     """The screen as a rectangle or as measured points, as the file says."""
-    with open_file(path) as file:
-        model = item(file, "DisplayShape/screen_model").decode()
+    with open_hdf5(path) as file:
+        model = read_item(file, "DisplayShape/screen_model").decode()
         if model == "rectangular2D":
             width_m, height_m = (
-                float(floats(file, f"DisplayShape/screen_{axis}").item()) for axis in "xy"
+                float(read_floats(file, f"DisplayShape/screen_{axis}").item()) for axis in "xy"
             )
             return RectangularScreen(width_m * MM_PER_M, height_m * MM_PER_M)
         if model == "distorted2D":
-            points_m = floats(file, "DisplayShape/xy_screen_coords")
+            points_m = read_floats(file, "DisplayShape/xy_screen_coords")
             return MeasuredScreen(
-                floats(file, "DisplayShape/xy_screen_fraction"), points_m * MM_PER_M
+                read_floats(file, "DisplayShape/xy_screen_fraction"), points_m * MM_PER_M
             )
     raise ValueError(
         f"{path}: DisplayShape/screen_model is {model!r}, known are rectangular2D and distorted2D"
@@ -221,38 +221,39 @@ def read_screen(path: Path) -> ScreenShape:
 
 def read_response(path: Path) -> DisplayResponse:
     """Grey value shown against grey value seen."""
-    with open_file(path) as file:
+    with open_hdf5(path) as file:
         group = "ImageCalibration"
         return DisplayResponse(
-            floats(file, f"{group}/camera_values"), floats(file, f"{group}/display_values")
+            read_floats(file, f"{group}/camera_values"),
+            read_floats(file, f"{group}/display_values"),
         )
 
 
 def read_result(path: Path) -> SofastResult:
     """SOFAST's own result for a single facet."""
-    with open_file(path) as file:
+    with open_hdf5(path) as file:
         geometry = f"{_FACET}/CalculationDataGeometryFacet"
         pose = f"{geometry}/SpatialOrientation"
         slopes = f"{_FACET}/SlopeSolverData"
         r_cam_optic, r_cam_screen = (
-            Rotation.from_rotvec(floats(file, f"{pose}/{name}").ravel()).as_matrix()
+            Rotation.from_rotvec(read_floats(file, f"{pose}/{name}").ravel()).as_matrix()
             for name in ("r_cam_optic", "r_cam_screen")
         )
         return SofastResult(
-            mask=floats(file, f"{_FACET}/CalculationImageProcessingFacet/mask_processed").astype(
-                bool
-            ),
+            mask=read_floats(
+                file, f"{_FACET}/CalculationImageProcessingFacet/mask_processed"
+            ).astype(bool),
             r_cam_optic=r_cam_optic,
             r_cam_screen=r_cam_screen,
-            v_cam_optic_mm=floats(file, f"{pose}/v_cam_optic_cam").ravel() * MM_PER_M,
-            v_cam_screen_mm=floats(file, f"{pose}/v_cam_screen_cam").ravel() * MM_PER_M,
-            rays=floats(file, f"{geometry}/u_pixel_pointing_facet"),
-            screens=floats(file, f"{geometry}/v_screen_points_fractional_screens"),
-            screen_points_mm=floats(file, f"{geometry}/v_screen_points_facet") * MM_PER_M,
-            alignment=floats(file, f"{slopes}/trans_alignment")[:3, :3],
-            points_mm=floats(file, f"{slopes}/v_surf_points_facet") * MM_PER_M,
-            slopes=floats(file, f"{slopes}/slopes_facet_xy"),
-            coefficients=floats(file, f"{slopes}/surf_coefs_facet"),
+            v_cam_optic_mm=read_floats(file, f"{pose}/v_cam_optic_cam").ravel() * MM_PER_M,
+            v_cam_screen_mm=read_floats(file, f"{pose}/v_cam_screen_cam").ravel() * MM_PER_M,
+            rays=read_floats(file, f"{geometry}/u_pixel_pointing_facet"),
+            screens=read_floats(file, f"{geometry}/v_screen_points_fractional_screens"),
+            screen_points_mm=read_floats(file, f"{geometry}/v_screen_points_facet") * MM_PER_M,
+            alignment=read_floats(file, f"{slopes}/trans_alignment")[:3, :3],
+            points_mm=read_floats(file, f"{slopes}/v_surf_points_facet") * MM_PER_M,
+            slopes=read_floats(file, f"{slopes}/slopes_facet_xy"),
+            coefficients=read_floats(file, f"{slopes}/surf_coefs_facet"),
         )
 
 

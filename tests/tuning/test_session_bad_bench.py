@@ -18,7 +18,7 @@ from membrane_ctrl.model.errors import Exit, RejectedError
 from membrane_ctrl.model.telemetry import ShapeState, State
 from membrane_ctrl.sessions.folder import create_session
 from membrane_ctrl.sessions.live_hold import HoldError, News
-from membrane_ctrl.sim.surroundings import AmbientChange, BenchEvent
+from membrane_ctrl.sim.bench_events import AmbientChange, BenchEvent
 from tests.worlds.foreign_plant import ForeignPlant, ForeignPump, foreign_bench, foreign_config
 from tuning import twin_hold
 from tuning.identification import shape_loop_fit

@@ -226,7 +226,7 @@ def test_a_picture_is_drawn_anew_when_what_it_shows_is(
             done.file(renewed), ns=(10**18, 2 * 10**18)
         )  # at the same moment: which was first is not known
     seen: set[str] = set()
-    monkeypatch.setattr(pictures, "write_figure", lambda path, figure, dpi: seen.add(path.name))
+    monkeypatch.setattr(pictures, "write_picture", lambda path, figure, dpi: seen.add(path.name))
     page.draw_pictures(done)
     assert seen == drawn
 

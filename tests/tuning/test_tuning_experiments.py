@@ -17,7 +17,7 @@ from membrane_ctrl.control.experiments.operating_point import OperatingPoint, ch
 from membrane_ctrl.control.experiments.patterned import Patterned
 from membrane_ctrl.control.experiments.patterns import doublets, multisine, steps
 from membrane_ctrl.control.experiments.relay import Relay
-from membrane_ctrl.sim.surroundings import AmbientChange, LaserDropout
+from membrane_ctrl.sim.bench_events import AmbientChange, LaserDropout
 from tests.studies.tuning_sessions import Case, TwinBench
 from tuning.identification.experiments import ExperimentError, fit_experiments, run_experiments
 from tuning.identification.record import Record

@@ -28,8 +28,8 @@ from membrane_ctrl.controller.tick import TickInputs, TickOutputs
 from membrane_ctrl.hold.virtual_run import TruthShape, VirtualRun
 from membrane_ctrl.metrology.film.hencky_bowl import zernike_projection
 from membrane_ctrl.model.lock import Lock
+from membrane_ctrl.sim.bench_events import BenchEvent
 from membrane_ctrl.sim.plant import Plant
-from membrane_ctrl.sim.surroundings import BenchEvent
 from membrane_ctrl.sim.virtual_bench import VirtualBench, Wrong
 from membrane_ctrl.sim.virtual_interlocks import VirtualInterlocks
 

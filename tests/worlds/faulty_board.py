@@ -7,7 +7,8 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 from firmware_iface.emulators import pump_board
-from firmware_iface.emulators.modbus_server import Answer, exception_pdu
+from firmware_iface.emulators.modbus_pdu import exception_pdu
+from firmware_iface.emulators.modbus_server import Answer
 from firmware_iface.emulators.pump_board import BoardSample
 
 

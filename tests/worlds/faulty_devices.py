@@ -7,7 +7,15 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
-from firmware_iface.emulators import lasers, modbus_server, pressure_gauges, pumps, serial_device
+from firmware_iface.emulators import (
+    keyence_dl_rs1a,
+    modbus_pdu,
+    optoncdt1420,
+    pressure_gauges,
+    pumps,
+    rtu_bus,
+    serial_device,
+)
 from firmware_iface.links.serial_port import Receiver, SerialPort
 from firmware_iface.roles import LinkDownError
 
@@ -76,11 +84,11 @@ class SerialDevice(serial_device.SerialDevice):
         return self.faults if self.draw_faults is None else self.draw_faults()
 
 
-class KeyenceDlRs1aEmulator(SerialDevice, lasers.KeyenceDlRs1aEmulator):
+class KeyenceDlRs1aEmulator(SerialDevice, keyence_dl_rs1a.KeyenceDlRs1aEmulator):
     pass
 
 
-class Optoncdt1420Emulator(SerialDevice, lasers.Optoncdt1420Emulator):
+class Optoncdt1420Emulator(SerialDevice, optoncdt1420.Optoncdt1420Emulator):
     """With noise of a single value; one byte in `lose_bytes_every` is lost from the stream (0:
     none).
     """
@@ -116,7 +124,7 @@ class ProparDevice(SerialDevice, pumps.ProparDevice):
     pass
 
 
-class RtuBusEmulator(SerialDevice, modbus_server.RtuBusEmulator):
+class RtuBusEmulator(SerialDevice, rtu_bus.RtuBusEmulator):
     """A bus whose answers carry the next unit id, the next function code, or an exception (0:
     off).
     """
@@ -126,7 +134,7 @@ class RtuBusEmulator(SerialDevice, modbus_server.RtuBusEmulator):
 
     def answer(self, unit: int, pdu: bytes) -> bytes:
         if self.exception_code:
-            return bytes([unit]) + modbus_server.exception_pdu(pdu, self.exception_code)
+            return bytes([unit]) + modbus_pdu.exception_pdu(pdu, self.exception_code)
         if not (body := super().answer(unit, pdu)):
             return b""
         return bytes([body[0] + self.wrong_unit, body[1] + self.wrong_function]) + body[2:]

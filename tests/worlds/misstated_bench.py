@@ -19,14 +19,14 @@ from membrane_ctrl.config.optics import (
     ScreenPoseConfig,
     SigmasConfig,
 )
-from membrane_ctrl.geometry.spread_file import spread_of
+from membrane_ctrl.geometry.spread_file import geometry_spread
 from membrane_ctrl.metrology.figure.set_motion import LASER_NOISE_UM
 from membrane_ctrl.metrology.phase.frame_stack import FrameStack
 from membrane_ctrl.metrology.rays.bench_parameters import NAMES
 from membrane_ctrl.metrology.rays.bench_poses import bench_at
 from membrane_ctrl.metrology.rays.geometry import Geometry
 from membrane_ctrl.sim.optics.camera import OpticsRenderer
-from membrane_ctrl.sim.optics.shade import pattern_sequence
+from membrane_ctrl.sim.optics.pattern_levels import pattern_sequence
 from membrane_ctrl.sim.optics.trace import Trace
 
 FloatArray = NDArray[np.float64]
@@ -143,7 +143,7 @@ def true_bench(
     """The bench as it really is, grown since it was measured; and by how much each input was stated
     wrong.
     """
-    spread, _ = spread_of(stated, None)
+    spread, _ = geometry_spread(stated, None)
     off = dict(zip(spread.names, spread.draw(rng), strict=True))
     grown = 1 + STEEL_PER_K * stated_sigmas(stated).temperature_k * rng.standard_normal()
     return bench_off_by(stated, off, grown), off

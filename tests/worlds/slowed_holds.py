@@ -37,7 +37,7 @@ from membrane_ctrl.hold.virtual_run import TruthShape, VirtualClock
 from membrane_ctrl.metrology.film.hencky_bowl import zernike_projection
 from membrane_ctrl.model.shape_estimate import ESTIMATE_BYTES_MAX, ShapeEstimate, pack_estimate
 from membrane_ctrl.model.telemetry import ROW_BYTES
-from membrane_ctrl.processes import ring
+from membrane_ctrl.processes import published_rings, ring
 from tests.worlds.loop_bench import LoopBench
 
 _START_S = 180.0
@@ -87,7 +87,7 @@ async def hold(logs: Path, number: int) -> None:
             name: stack.enter_context(contextlib.closing(ring.RingWriter(each)))
             for name, each in rings.items()
         }
-        ring.publish(run, rings)
+        published_rings.publish_rings(run, rings)
         clock = VirtualClock(0.0, utc, lambda: loop.time() - begin_s)
         shape, due_s = TruthShape(board.virtual, config, number), 0.0
 

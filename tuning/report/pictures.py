@@ -4,7 +4,7 @@ from pathlib import Path
 
 from matplotlib.figure import Figure
 
-from membrane_ctrl.measure.results import write_figure
+from membrane_ctrl.measure.result_files import write_picture
 from membrane_ctrl.model.files import users
 from membrane_ctrl.sessions.folder import FILES, SessionFolder
 
@@ -14,7 +14,7 @@ _DPI = 100
 
 def save_figure(path: Path, figure: Figure) -> None:
     """Write a picture to a file of the session."""
-    write_figure(users(path), figure, _DPI)
+    write_picture(users(path), figure, _DPI)
 
 
 def is_outdated(folder: SessionFolder, picture: str, *steps: str) -> bool:

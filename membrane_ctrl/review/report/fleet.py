@@ -14,7 +14,7 @@ from typing import Any
 from urllib.parse import quote
 
 from membrane_ctrl.model import errors, events, files, plain_json, program, run_events, terminal
-from membrane_ctrl.processes.child import results_of
+from membrane_ctrl.processes.worker_pool import run_jobs
 from membrane_ctrl.review import catalogue
 from membrane_ctrl.review.catalogue import beside, number, part_s, span, sparkline
 from membrane_ctrl.review.report.html import html_page, html_table, render, write_report
@@ -131,7 +131,7 @@ def fleet_command(options: FleetOptions) -> int:
     job, rows, lines = partial(run_report, options.start, options.end), [], []
     with (
         errors.writing(out, errors.DeviceError, "; choose another folder with --out"),
-        results_of(job, folders, workers, options.scheduler) as results,
+        run_jobs(job, folders, workers, options.scheduler) as results,
     ):
         counted = terminal.counted(results, "runs", len(folders))
         for folder, report in zip(folders, counted, strict=True):

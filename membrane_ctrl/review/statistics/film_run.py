@@ -24,7 +24,7 @@ from typing import Any
 
 import numpy as np
 
-from membrane_ctrl.measure.results import write_figure, write_json
+from membrane_ctrl.measure.result_files import write_json, write_picture
 from membrane_ctrl.metrology.film.film_law import FilmLaw
 from membrane_ctrl.model import errors, files, program
 from membrane_ctrl.model.arrays import FloatArray
@@ -229,4 +229,4 @@ def _draw(path: Path, hours: FloatArray, stiffness_kn_per_m: FloatArray) -> None
     panel = drawing.subplots()
     panel.plot(hours, stiffness_kn_per_m, ".", markersize=2)
     panel.set(title="Stiffness that sag and pressure show", xlabel="hours", ylabel="E t (kN/m)")
-    write_figure(path, drawing)
+    write_picture(path, drawing)

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from membrane_ctrl.measure.results import read_arrays, write_figure, write_json
+from membrane_ctrl.measure.result_files import read_arrays, write_json, write_picture
 from membrane_ctrl.metrology.numerics import zernike
 from membrane_ctrl.metrology.vibrations.mode_search import (
     LEAST_RATE_HZ,
@@ -256,10 +256,10 @@ def _show(out: Path, modes: Sequence[SeenMode], begin_s: float, lines: Sequence[
     """Write `modes.png` and `modes.rrd`. Raises OSError."""
     import rerun as rr
 
-    from membrane_ctrl.measure.pictures import log_pictures, result_recording
+    from membrane_ctrl.measure.rerun_recording import log_pictures, open_recording
 
     picture = _draw(out / "modes.png", modes, begin_s)
-    with result_recording(
+    with open_recording(
         out / "modes.rrd", "membrane_ctrl_modes", _layout(len(modes), picture)
     ) as recording:
         recording.log("modes/report", rr.TextDocument("\n".join(lines)), static=True)
@@ -318,10 +318,10 @@ def _layout(count: int, picture: Path) -> "rrb.Blueprint":
 
 def _draw(path: Path, modes: Sequence[SeenMode], begin_s: float) -> Path:
     """Draw the frequencies over time and the shapes of the strongest modes."""
-    from membrane_ctrl.measure.pictures import sheet
+    from membrane_ctrl.measure.pictures import new_sheet
 
     shown = modes[:_SHOWN]
-    figure, axes = sheet(11, 3 * len(shown), len(shown), 2)
+    figure, axes = new_sheet(11, 3 * len(shown), len(shown), 2)
     side = np.linspace(-1, 1, 121)
     x, y = np.meshgrid(side, side)
     for mode, (over_time, shape) in zip(shown, np.reshape(axes, (-1, 2)), strict=True):
@@ -341,4 +341,4 @@ def _draw(path: Path, modes: Sequence[SeenMode], begin_s: float) -> Path:
             height, cmap="RdBu_r", vmin=-most, vmax=most, origin="lower", extent=(-1, 1, -1, 1)
         )
         shape.set(title=f"shape at {mode.frequency_hz:.2f} Hz", xticks=[], yticks=[])
-    return write_figure(path, figure)
+    return write_picture(path, figure)

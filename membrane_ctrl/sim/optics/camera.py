@@ -11,33 +11,27 @@ from typing import Protocol
 
 import numpy as np
 
-from firmware_iface.display import ScreenRaster
+from firmware_iface.display_patterns import ScreenRaster
 from firmware_iface.roles import Frame, Levels, LinkError, Pattern, Pixels
 from membrane_ctrl.config.schema import DisturbancesConfig, OpticsConfig, TwinConfig
 from membrane_ctrl.model.arrays import FloatArray
-from membrane_ctrl.sim.optics.disturbances import Disturber, DrumMode, Nodes, drummed
-from membrane_ctrl.sim.optics.film_shape import FilmShape, FilmTerms, typical_film
-from membrane_ctrl.sim.optics.shade import (
-    Light,
-    PanelPicture,
-    cubic_weights,
-    level_table,
-    node_positions,
-    noise_bank,
-    normal_quantiles,
-    shade,
-    shade_crossed,
-    shade_panel,
-    vignetting,
-)
-from membrane_ctrl.sim.optics.trace import (
+from membrane_ctrl.sim.optics.bench_poses import (
     ScreenError,
-    Trace,
     camera_pose,
     pixel_directions,
     screen_pose,
-    trace,
 )
+from membrane_ctrl.sim.optics.disturbances import Disturber, Nodes
+from membrane_ctrl.sim.optics.drum_modes import DrumMode, drum_modes
+from membrane_ctrl.sim.optics.film_shape import FilmShape, typical_film
+from membrane_ctrl.sim.optics.film_terms import FilmTerms
+from membrane_ctrl.sim.optics.node_interpolation import cubic_weights, node_positions
+from membrane_ctrl.sim.optics.pattern_levels import Light, level_table
+from membrane_ctrl.sim.optics.pixel_noise import noise_bank, normal_quantiles
+from membrane_ctrl.sim.optics.shade import shade, vignetting
+from membrane_ctrl.sim.optics.shade_crossed import shade_crossed
+from membrane_ctrl.sim.optics.shade_panel import PanelPicture, shade_panel
+from membrane_ctrl.sim.optics.trace import Trace, trace
 
 # Nodes this far apart on the mirror put a typical film's phase < 1e-4 rad off the exact trace
 # (asserted in the tests)
@@ -344,7 +338,7 @@ def _second_hand() -> ThreadPoolExecutor:
 
 
 class FilmPosition(Protocol):
-    """True position of the film; `membrane_ctrl.sim.plant.Truth` is one."""
+    """True position of the film; `membrane_ctrl.sim.truth.Truth` is one."""
 
     @property
     def displacement_um(self) -> float:
@@ -437,7 +431,7 @@ class TwinOptics:
                 film,
                 reference_um=reference_um,
                 seed=self._seed,
-                modes=drummed(self._twin.drum_nm),
+                modes=drum_modes(self._twin.drum_nm),
                 disturbances=self._twin.disturbances,
             )
         return self._renderer

@@ -7,127 +7,34 @@ spots, and times, are not.
 """
 
 import math
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
-import cv2
 import numpy as np
 
 from firmware_iface.roles import Pattern
 from membrane_ctrl.config.optics import DisturbancesConfig
 from membrane_ctrl.model.arrays import FloatArray
-from membrane_ctrl.sim.optics.film_shape import FilmShape, FilmTerms
+from membrane_ctrl.sim.optics.random_field import RandomField
 
-_BRIGHT_MM, _BRIGHT_S = 75.0, 60.0  # lengths of the waves on the screen, and memory
-_AIR_MM, _AIR_S = 400.0, 0.5  # of cells of warm air over the mirror
-_WAVES, _NODES_A_WAVE = 40, 16  # a smooth field needs no more
+_BRIGHT_MM = 75.0  # lengths of the waves on the screen, and memory
+_BRIGHT_S = 60.0
+_AIR_MM = 400.0  # of cells of warm air over the mirror
+_AIR_S = 0.5
 _DUST_S, _DUST_MM, _DUST_LOSS = (
     25.0,
     6.0,
     0.6,
 )  # how long it lies; radius and loss of light of a spot
-_EXPOSURE_S, _LIT_SHARE = 0.02, 0.7  # of a pulse of the backlight
+_EXPOSURE_S = 0.02  # of a pulse of the backlight
+_LIT_SHARE = 0.7
 _STICKING_S = 3600.0  # a panel's memory
 _GROWTH_MM_PER_K, _WARMS_S = (
     0.060,
     1200.0,
 )  # of an aluminium stand of 2.6 m; period of an air conditioner
-_SLOPE, _SWING, _SWING_S = 0.3, 0.2, 120.0  # of the room's light: across the mirror, and in time
-
-
-@dataclass(frozen=True, slots=True)
-class DrumMode:
-    """A vibration: J_m(z r / radius) cos(m theta), z the n-th zero of J_m."""
-
-    frequency_hz: float
-    lobes: int  # m
-    circles: int  # n
-    amplitude_nm: float = 1.0  # RMS over the mirror
-
-    def swing_um(self, time_s: FloatArray) -> FloatArray:
-        """RMS over the mirror at a time, or at each of an array."""
-        return np.asarray(
-            1e-3 * self.amplitude_nm * np.sin(2 * math.pi * self.frequency_hz * time_s + self.lobes)
-        )
-
-    def moved(self, film: FilmShape) -> FilmTerms:
-        """The film displaced by 1 µm RMS, its ring at rest."""
-        from scipy import special
-
-        m, terms, zero = (
-            self.lobes,
-            film.terms_at(0.0),
-            special.jn_zeros(self.lobes, self.circles)[-1],
-        )
-        rms = abs(special.jv(m + 1, zero)) * (math.sqrt(0.5) if m else 1.0)
-        poly_mm = np.zeros((2 * _SERIES + m + 1,) * 2)
-        poly_mm[: terms.poly_mm.shape[0], : terms.poly_mm.shape[1]] = terms.poly_mm
-        for k in range(_SERIES + 1):
-            part_mm = (
-                1e-3
-                / rms
-                * (-1) ** k
-                * (zero / 2) ** (2 * k + m)
-                / (math.factorial(k) * math.factorial(k + m))
-            )
-            for p, q in np.ndindex(k + 1, m // 2 + 1):  # (x^2 + y^2)^k Re (x + i y)^m
-                poly_mm[2 * (k - p + m // 2 - q) + m % 2, 2 * (p + q)] += (
-                    part_mm * math.comb(k, p) * math.comb(m, 2 * q) * (-1) ** q
-                )
-        return terms._replace(poly_mm=poly_mm)
-
-
-_SERIES = 12  # powers of (r / radius)^2: J_0 and J_2 to 1e-6 beyond their second zeros
-DRUM_MODES = (
-    DrumMode(27.0, 0, 1),
-    DrumMode(48.0, 1, 1),
-    DrumMode(57.0, 2, 1),
-    DrumMode(61.0, 0, 2),
-)
-
-
-def drummed(amplitude_nm: float) -> tuple[DrumMode, ...]:
-    """The film's vibrations of this amplitude; none of 0."""
-    return tuple(replace(mode, amplitude_nm=amplitude_nm) for mode in DRUM_MODES if amplitude_nm)
-
-
-class Waves:
-    """A random field of unit RMS on a square: plane waves about `length_mm` long, each with a
-    memory.
-    """
-
-    def __init__(
-        self, length_mm: float, memory_s: float, half_side_mm: float, rng: np.random.Generator
-    ) -> None:
-        self._rng, self._memory_s = rng, memory_s
-        count = max(8, math.ceil(2 * half_side_mm / length_mm * _NODES_A_WAVE))
-        self._half_side_mm, self._per_mm = half_side_mm, (count - 1) / (2 * half_side_mm)
-        along = np.linspace(-half_side_mm, half_side_mm, count)
-        across, down = np.meshgrid(along, along)
-        lengths_mm, turns = (
-            length_mm * rng.lognormal(0.0, 0.3, _WAVES),
-            rng.uniform(0.0, 2 * math.pi, _WAVES),
-        )
-        ways = [
-            np.multiply.outer(2 * math.pi / lengths_mm * part, place)
-            for part, place in ((np.cos(turns), across), (np.sin(turns), down))
-        ]
-        self._basis = np.concatenate([np.cos(sum(ways)), np.sin(sum(ways))]) / math.sqrt(_WAVES)
-        self._amplitudes = rng.standard_normal(2 * _WAVES)
-        self._time_s = -math.inf
-
-    def at(self, time_s: float, x_mm: FloatArray, y_mm: FloatArray) -> FloatArray:
-        """The field at places of the square; beyond it that of its edge."""
-        if time_s > self._time_s:
-            keep = math.exp(-(time_s - self._time_s) / self._memory_s)
-            fresh = self._rng.standard_normal(2 * _WAVES)
-            self._amplitudes = keep * self._amplitudes + math.sqrt(1.0 - keep * keep) * fresh
-            self._time_s = time_s
-        field = np.tensordot(self._amplitudes, self._basis, 1).astype(np.float32)
-        column, row = (
-            ((p + self._half_side_mm) * self._per_mm).astype(np.float32) for p in (x_mm, y_mm)
-        )
-        moved = cv2.remap(field, column, row, cv2.INTER_CUBIC, borderMode=cv2.BORDER_REPLICATE)
-        return np.asarray(moved, dtype=float)
+_SLOPE = 0.3  # of the room's light: across the mirror, and in time
+_SWING = 0.2
+_SWING_S = 120.0
 
 
 @dataclass(frozen=True)
@@ -153,8 +60,8 @@ class Disturber:
     def __init__(self, wanted: DisturbancesConfig, nodes: Nodes, seed: int) -> None:
         self._wanted, self._nodes, self._seed = wanted, nodes, seed
         rngs = [np.random.default_rng([seed, k]) for k in range(3)]
-        self._bright = Waves(_BRIGHT_MM, _BRIGHT_S, nodes.side_mm / 2, rngs[0])
-        self._air = [Waves(_AIR_MM, _AIR_S, nodes.radius_mm, rng) for rng in rngs[1:]]
+        self._bright = RandomField(_BRIGHT_MM, _BRIGHT_S, nodes.side_mm / 2, rngs[0])
+        self._air = [RandomField(_AIR_MM, _AIR_S, nodes.radius_mm, rng) for rng in rngs[1:]]
         self._dust = (-1, np.ones_like(nodes.x_mm))  # since which change, and what it lets through
         self._burnt, self._shown_s = np.zeros(2, complex), 0.0
 

@@ -14,12 +14,22 @@ from firmware_iface import roles, settings
 from membrane_ctrl.model.arrays import FloatArray
 from membrane_ctrl.model.program import file_origin
 from membrane_ctrl.sim.optics.camera import OpticsRenderer
-from membrane_ctrl.sim.optics.disturbances import drummed
+from membrane_ctrl.sim.optics.drum_modes import drum_modes
+from membrane_ctrl.sim.optics.screen_face import project_onto_face
 from membrane_ctrl.sim.optics.simulation_spec import SimulationSpec
-from membrane_ctrl.sim.optics.trace import Trace, onto_face
+from membrane_ctrl.sim.optics.trace import Trace
 
 # The `capture.toml` of a simulated set, and its truth.
 _GRID = 201  # odd, so that the vertex is a point of the truth's map
+# noise does not compress: higher levels cost time and save nothing
+_PNG_SPEED = (
+    cv2.IMWRITE_PNG_COMPRESSION,
+    1,
+    cv2.IMWRITE_PNG_STRATEGY,
+    cv2.IMWRITE_PNG_STRATEGY_RLE,
+)
+_CROSSED_PERIODS = 32
+_STEPS = 5  # of the first frames: 72 degrees in x, twice that in y
 
 
 def capture_table(spec: SimulationSpec, readings_um: FloatArray) -> dict[str, Any]:
@@ -134,15 +144,6 @@ def _frame_row(spec: SimulationSpec, frame: int, reading_um: float) -> dict[str,
     return row
 
 
-# noise does not compress: higher levels cost time and save nothing
-_PNG_SPEED = (
-    cv2.IMWRITE_PNG_COMPRESSION,
-    1,
-    cv2.IMWRITE_PNG_STRATEGY,
-    cv2.IMWRITE_PNG_STRATEGY_RLE,
-)
-
-
 @dataclass(frozen=True, slots=True)
 class _Exposure:
     """The true exposure behind one file."""
@@ -198,10 +199,6 @@ def simulate_run(
         _write_set(Path(folder) / f"{number:04d}", this, renderer)
         if on_set is not None:
             on_set(number + 1)
-
-
-_CROSSED_PERIODS = 32
-_STEPS = 5  # of the first frames: 72 degrees in x, twice that in y
 
 
 def simulate_track(
@@ -297,7 +294,7 @@ class _SeenDirectly(OpticsRenderer):
             directions @ axes.T,
         )
         tangents = along[:, :2].T / along[:, 2]
-        seen_mm = onto_face(
+        seen_mm = project_onto_face(
             start[:2, None] - start[2] * tangents, tangents, screen.bow_per_mm, screen.height_map
         )
         return Trace(np.zeros(len(along)), np.zeros(len(along)), *seen_mm)
@@ -313,7 +310,7 @@ def _renderer(spec: SimulationSpec) -> OpticsRenderer:
         spec.screen_error,
         exact=spec.exact,
         seed=spec.seed,
-        modes=drummed(spec.drum_nm),
+        modes=drum_modes(spec.drum_nm),
         disturbances=spec.disturbances,
     )
 

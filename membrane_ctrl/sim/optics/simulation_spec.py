@@ -11,7 +11,7 @@ from firmware_iface.roles import Pattern
 from membrane_ctrl.config.schema import DisturbancesConfig, GeometryConfig, OpticsConfig
 from membrane_ctrl.model.arrays import FloatArray
 from membrane_ctrl.sim import film as gas_film
-from membrane_ctrl.sim.optics import film_shape, shade, trace
+from membrane_ctrl.sim.optics import bench_poses, film_shape, pattern_levels, zernike_polynomials
 
 # Faults of single frames on a real bench, for simulated sets.
 
@@ -35,6 +35,9 @@ _DEFAULT_AMOUNT: dict[FaultKind, float] = {
     "flicker": 0.8,
     "moved": 200.0,
 }
+# Of a sphere that leans: its coma is of micrometres, its terms above radial order 7 far below a
+# nanometre.
+_LEANING_TERMS = 36
 
 
 @dataclass(frozen=True, slots=True)
@@ -99,11 +102,6 @@ class Motion:
         return self.start_um + self.drift_um_per_s * time_s + swing
 
 
-# Of a sphere that leans: its coma is of micrometres, its terms above radial order 7 far below a
-# nanometre.
-_LEANING_TERMS = 36
-
-
 def leaning(
     curvature_mm: float,
     radius_mm: float,
@@ -122,7 +120,7 @@ def leaning(
         return film_shape.FilmShape(0.0, radius_mm, "paraboloid", tuple(coeffs_um.tolist()))
     rho, theta = np.meshgrid(np.sqrt((np.arange(40) + 0.5) / 40), 2 * pi * np.arange(40) / 40)
     x, y = (rho * np.cos(theta)).ravel(), (rho * np.sin(theta)).ravel()
-    terms = [film_shape.polynomial(row) for row in np.eye(coeffs_um.size)]
+    terms = [zernike_polynomials.polynomial(row) for row in np.eye(coeffs_um.size)]
     design = np.stack([np.polynomial.polynomial.polyval2d(x, y, term) for term in terms], axis=1)
     # the centre is at R (-lean_x, -lean_y, 1) / length
     centre = curvature_mm * np.array([-lean_x, -lean_y, 1.0]) / sqrt(1 + lean_x**2 + lean_y**2)
@@ -160,8 +158,8 @@ class SimulationSpec:
     laser: bool = True  # whether the frames carry the laser's reading
     laser_noise_um: float = 0.0  # standard deviation of that reading
     stated_geometry: GeometryConfig | None = None  # geometry in `capture.toml` if not the true one
-    light: shade.Light = field(default_factory=shade.Light)
-    screen_error: trace.ScreenError | None = None
+    light: pattern_levels.Light = field(default_factory=pattern_levels.Light)
+    screen_error: bench_poses.ScreenError | None = None
     disturbances: DisturbancesConfig = field(default_factory=DisturbancesConfig)
     drum_nm: float = 0.0  # amplitude of each of the film's vibrations
     exact: bool = False
@@ -228,7 +226,7 @@ class SimulationSpec:
     @property
     def patterns(self) -> list[Pattern]:
         """The patterns, frame by frame."""
-        return shade.pattern_sequence(
+        return pattern_levels.pattern_sequence(
             self.kind, self.optics.pattern, self.shifts_rad, self.coarser_mm
         )
 

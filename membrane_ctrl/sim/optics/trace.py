@@ -3,200 +3,14 @@ Newton on the true surface.
 """
 
 from dataclasses import dataclass
-from math import cos, radians, sin
 
 import numpy as np
 from numba import njit
-from scipy.interpolate import RectBivariateSpline
 
-from membrane_ctrl.config.optics import (
-    CameraConfig,
-    GeometryConfig,
-    HeightMapConfig,
-    ScreenPoseConfig,
-)
 from membrane_ctrl.model.arrays import BoolArray, FloatArray
-from membrane_ctrl.sim.optics.film_shape import FilmTerms, height_and_slopes
-
-# Camera and screen of the twin as exact poses: rays from the pinhole, and the plane in which they
-# end.
-#
-# World: origin at the mirror's vertex, x horizontal, y up, z out of the reflective side; mm.
-_UNDISTORT_STEPS = 200  # each gains about a digit with a usual lens
-_UNDISTORT_TOLERANCE = 1e-14  # tangent of the ray's angle
-
-
-@dataclass(frozen=True, slots=True)
-class CameraPose:
-    """Pinhole `position_mm` (3,); rows of `rotation` (3, 3): camera x (right), y (down), z
-    (forward) in world.
-    """
-
-    position_mm: FloatArray
-    rotation: FloatArray
-
-
-@dataclass(frozen=True, slots=True)
-class ScreenPose:
-    """O' as `origin_mm` and the unit vectors of `s_x` and `s_y`, each (3,), in world; bow and
-    height map of the face.
-
-    The face departs from the plane by bow_per_mm (s_x^2 + s_y^2) and the map, towards s_x x s_y,
-    which points at the mirror.
-    """
-
-    origin_mm: FloatArray
-    s_x: FloatArray
-    s_y: FloatArray
-    bow_per_mm: float = 0.0
-    height_map: HeightMapConfig | None = None
-
-
-@dataclass(frozen=True, slots=True)
-class ScreenError:
-    """Deviation of a screen from its nominal pose.
-
-    `tilt_about_x_deg` and `tilt_about_y_deg` turn it about its own s_x and s_y axes (right-handed);
-    `bow_mm` is how far the face stands towards the mirror 200 mm away from O' (paraboloid; s_x and
-    s_y count along the flat plane).
-    """
-
-    tilt_about_x_deg: float = 0.0
-    tilt_about_y_deg: float = 0.0
-    bow_mm: float = 0.0
-
-
-_BOW_RADIUS_MM = 200.0  # half side of the paper's pattern region, rounded
-
-
-def camera_pose(geometry: GeometryConfig) -> CameraPose:
-    """Pose of the camera: as given, or F = a (cos alpha, 0,
-    sin alpha) looking at O without roll.
-    """
-    if geometry.camera is not None:
-        return CameraPose(np.array(geometry.camera.position_mm), np.array(geometry.camera.rotation))
-    a_mm, _, alpha = _short(geometry)
-    forward = np.array([-cos(alpha), 0.0, -sin(alpha)])
-    right = np.array([sin(alpha), 0.0, -cos(alpha)])  # world +x as far as it is across the axis
-    return CameraPose(-a_mm * forward, np.stack([right, np.cross(forward, right), forward]))
-
-
-def screen_pose(geometry: GeometryConfig, error: ScreenError | None = None) -> ScreenPose:
-    """Pose of the screen: as given, or O' = b (-cos alpha, 0, sin alpha) and perpendicular to OO';
-    then the error.
-    """
-    face = geometry.screen or ScreenPoseConfig()
-    given = face.pose
-    if given is not None:
-        origin, s_x, s_y = (np.array(vector) for vector in given)
-    else:
-        _, b_mm, alpha = _short(geometry)
-        origin = b_mm * np.array([-cos(alpha), 0.0, sin(alpha)])
-        s_x, s_y = np.array([-sin(alpha), 0.0, -cos(alpha)]), np.array([0.0, 1.0, 0.0])
-    error = error or ScreenError()
-    s_y = _turned(s_y, s_x, radians(error.tilt_about_x_deg))
-    s_x = _turned(s_x, s_y, radians(error.tilt_about_y_deg))
-    return ScreenPose(
-        origin, s_x, s_y, (face.bow_mm + error.bow_mm) / _BOW_RADIUS_MM**2, face.height_map
-    )
-
-
-def pixel_directions(
-    camera: CameraConfig, pose: CameraPose, columns: FloatArray, rows: FloatArray
-) -> FloatArray:
-    """Unit vectors in world (N, 3) of the rays through the given pixel positions (N,), lens
-    distortion undone.
-    """
-    focal_px = camera.focal_mm * 1000.0 / camera.pixel_um
-    c0, r0 = camera.principal
-    x, y = _undistorted((columns - c0) / focal_px, (rows - r0) / focal_px, camera.distortion)
-    in_world = np.stack([x, y, np.ones_like(x)], axis=1) @ pose.rotation
-    return np.asarray(in_world / np.linalg.norm(in_world, axis=1, keepdims=True), dtype=np.float64)
-
-
-def _undistorted(
-    x_d: FloatArray, y_d: FloatArray, distortion: tuple[float, ...]
-) -> tuple[FloatArray, FloatArray]:
-    """Undo OpenCV's lens model, x_d = x radial(r^2) + tangential(x, y), by fixed-point iteration to
-    the last bit.
-    """
-    if not distortion:
-        return x_d, y_d
-    k1, k2, p1, p2, k3, k4, k5, k6 = (*distortion, *[0.0] * 8)[:8]
-    x, y = x_d, y_d
-    for _ in range(_UNDISTORT_STEPS):
-        r2 = x * x + y * y
-        radial = (1.0 + r2 * (k1 + r2 * (k2 + r2 * k3))) / (1.0 + r2 * (k4 + r2 * (k5 + r2 * k6)))
-        x_next = (x_d - 2.0 * p1 * x * y - p2 * (r2 + 2.0 * x * x)) / radial
-        y_next = (y_d - p1 * (r2 + 2.0 * y * y) - 2.0 * p2 * x * y) / radial
-        change = max(float(np.abs(x_next - x).max()), float(np.abs(y_next - y).max()))
-        x, y = x_next, y_next
-        if change < _UNDISTORT_TOLERANCE:
-            return x, y
-    raise ValueError(
-        f"camera.distortion = {distortion} folds the picture: it cannot be undone at its edge"
-    )
-
-
-def _short(geometry: GeometryConfig) -> tuple[float, float, float]:
-    """a in mm, b in mm, alpha in rad; the configuration ensures that one of the two forms is
-    complete.
-    """
-    if geometry.a_mm is None or geometry.b_mm is None or geometry.alpha_deg is None:
-        raise ValueError("geometry: neither a_mm, b_mm, alpha_deg nor camera and screen poses")
-    return geometry.a_mm, geometry.b_mm, radians(geometry.alpha_deg)
-
-
-def _turned(vector: FloatArray, axis: FloatArray, angle_rad: float) -> FloatArray:
-    """A vector across the unit `axis`, turned about it (Rodrigues,
-    whose third term vanishes here).
-    """
-    return vector * cos(angle_rad) + np.cross(axis, vector) * sin(angle_rad)
-
-
-# The twin's screen face: rays continued from the screen's plane to the true face.
-#
-# A ray that crosses the plane at (u, v) with tangents (a, b) to its normal is at (u + a w, v + b w)
-# at a distance w from the plane. On the face w = c (u^2 + v^2) + map(u, v): solved by fixed-point
-# iteration, each step of which gains the product of the face's slope and the tangents, a factor of
-# 50 or more.
-
-_TOLERANCE_MM = 1e-11
-_FACE_MAX_STEPS = 50  # a grazing ray may never converge
-
-
-def onto_face(
-    place_mm: FloatArray,
-    tangents: FloatArray,
-    bow_per_mm: float,
-    height_map: HeightMapConfig | None,
-) -> FloatArray:
-    """s_x and s_y (2, N) on the face of rays that cross the plane at `place_mm` (2, N) with
-    `tangents` (2, N).
-    """
-    if bow_per_mm == 0.0 and height_map is None:
-        return place_mm
-    spline = None if height_map is None else _spline(height_map)
-    found = place_mm
-    for _ in range(_FACE_MAX_STEPS):
-        off_mm = bow_per_mm * np.sum(found**2, axis=0)
-        if spline is not None:
-            off_mm = off_mm + spline.ev(found[1], found[0])
-        last, found = found, place_mm + off_mm * tangents
-        if not np.nanmax(np.abs(found - last), initial=0.0) > _TOLERANCE_MM:
-            break
-    return found
-
-
-def _spline(height_map: HeightMapConfig) -> RectBivariateSpline:
-    """Through the nodes, cubic along an axis with four or more of them; beyond the grid its edge's
-    height goes on.
-    """
-    rows, columns = (min(3, len(axis) - 1) for axis in (height_map.s_y_mm, height_map.s_x_mm))
-    return RectBivariateSpline(
-        height_map.s_y_mm, height_map.s_x_mm, height_map.heights_mm, kx=rows, ky=columns
-    )
-
+from membrane_ctrl.sim.optics.bench_poses import CameraPose, ScreenPose
+from membrane_ctrl.sim.optics.film_terms import FilmTerms, height_and_slopes
+from membrane_ctrl.sim.optics.screen_face import TOLERANCE_MM, project_onto_face
 
 _BEYOND = 1.1  # rays beyond this share of the radius are not traced: polynomials diverge there
 _MAX_STEPS = 20  # Newton needs 4 on any bowl; a grazing ray may never converge
@@ -242,7 +56,7 @@ def trace(
         screen.origin_mm,
         np.stack([screen.s_x, screen.s_y, np.cross(screen.s_x, screen.s_y)]),
     )
-    s_x_mm, s_y_mm = onto_face(hits[2:4], hits[4:6], screen.bow_per_mm, screen.height_map)
+    s_x_mm, s_y_mm = project_onto_face(hits[2:4], hits[4:6], screen.bow_per_mm, screen.height_map)
     return Trace(hits[0], hits[1], s_x_mm, s_y_mm)
 
 
@@ -267,7 +81,7 @@ def _film_distance(
         miss = start[2] + t * direction[2] - vertex_z_mm - h
         step = miss / (direction[2] - hx * direction[0] - hy * direction[1])
         t -= step
-        if abs(step) < _TOLERANCE_MM:
+        if abs(step) < TOLERANCE_MM:
             return float(t)
     return float(np.nan)
 

@@ -17,7 +17,7 @@ from pathlib import Path
 from firmware_iface.emulators.pump_board import BoardSample
 from firmware_iface.roles import NO_READING
 from membrane_ctrl.cli import run
-from membrane_ctrl.commissioning import devices as wizard
+from membrane_ctrl.commissioning import first_config as wizard
 from membrane_ctrl.config.schema import Config, DevicesConfig, LimitsConfig
 from membrane_ctrl.config.toml_file import dump, load
 from membrane_ctrl.controller.safety import SafetyTable
@@ -79,7 +79,7 @@ def questions() -> list[str]:
 
     wizard.typer.prompt = prompt  # type: ignore[assignment]
     path = Path("first.toml")
-    wizard.write_first(path, twin=False, ask=True)
+    wizard.write_first_config(path, twin=False, ask=True)
     return asked
 
 

@@ -13,7 +13,7 @@ import pytest
 
 from membrane_ctrl.cli import run
 from membrane_ctrl.config.schema import CameraConfig, OpticsConfig
-from membrane_ctrl.geometry.spread_file import read_prior
+from membrane_ctrl.geometry.prior_file import read_prior
 from membrane_ctrl.model.errors import InputError
 from tests.support.board_photograph import Photographer, photographs
 

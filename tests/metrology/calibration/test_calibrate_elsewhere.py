@@ -27,7 +27,8 @@ from membrane_ctrl.metrology.rays.forward_model import (
 from membrane_ctrl.metrology.rays.geometry import project
 from membrane_ctrl.metrology.rays.set_phases import ANYWHERE, Elsewhere, SetPhases
 from membrane_ctrl.metrology.rays.surface import Surface
-from membrane_ctrl.sim.optics.trace import CameraPose, ScreenPose, trace
+from membrane_ctrl.sim.optics.bench_poses import CameraPose, ScreenPose
+from membrane_ctrl.sim.optics.trace import trace
 from tests.support import calibration_truth
 from tests.support.calibration_truth import (
     PIXEL_SIGMA_MM,

@@ -22,8 +22,9 @@ from membrane_ctrl.metrology.rays.geometry import project
 from membrane_ctrl.metrology.rays.set_phases import SetPhases
 from membrane_ctrl.metrology.rays.surface import Surface
 from membrane_ctrl.model.zernike_terms import ZERNIKE_TERMS
+from membrane_ctrl.sim.optics.bench_poses import CameraPose, ScreenPose
 from membrane_ctrl.sim.optics.simulation_spec import leaning
-from membrane_ctrl.sim.optics.trace import CameraPose, ScreenPose, trace
+from membrane_ctrl.sim.optics.trace import trace
 from tests.support.calibration_truth import (
     PIXEL_SIGMA_MM,
     STATED,

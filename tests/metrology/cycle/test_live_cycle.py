@@ -31,7 +31,7 @@ from membrane_ctrl.model.shape_estimate import ShapeEstimate
 from membrane_ctrl.model.zernike_terms import ZERNIKE_TERMS
 from membrane_ctrl.sim.optics.camera import OpticsRenderer
 from membrane_ctrl.sim.optics.film_shape import FilmShape
-from membrane_ctrl.sim.optics.shade import Light
+from membrane_ctrl.sim.optics.pattern_levels import Light
 from tests.support.metrology_truth import SMALL
 
 OPTICS = OpticsConfig(camera=SMALL)

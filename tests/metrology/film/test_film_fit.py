@@ -14,7 +14,7 @@ from prysm.polynomials import noll_to_nm, zernike_nm
 from membrane_ctrl.metrology.film import film_figure, hencky_bowl, material_fit
 from membrane_ctrl.metrology.film.film_law import FilmLaw
 from membrane_ctrl.model.zernike_terms import NOLL_INDICES, ZERNIKE_TERMS
-from membrane_ctrl.sim.film import stretched
+from membrane_ctrl.sim.stretched_film import solve_stretched_film
 from tests.support.metrology_truth import FloatArray
 
 RADIUS_MM, REACH = 500.0, 0.95
@@ -48,7 +48,7 @@ class World:
         gain, offset_pa, scale = rng.normal(size=3)
         out = []
         for k, sag_mm in enumerate(self.sags_mm):
-            load, profile = stretched(sag_mm / RADIUS_MM, self.prestrain, self.poisson)
+            load, profile = solve_stretched_film(sag_mm / RADIUS_MM, self.prestrain, self.poisson)
             true = np.zeros(ZERNIKE_TERMS)
             true[ROUND] = (
                 _round_terms(sag_mm * Polynomial(profile)) + wrong * (sag_mm / 36) ** self.power

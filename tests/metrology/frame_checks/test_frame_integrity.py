@@ -15,7 +15,7 @@ from membrane_ctrl.metrology.frame_checks.frame_inspection import find_identical
 from membrane_ctrl.metrology.frame_checks.set_check import check_set
 from membrane_ctrl.metrology.rays.surface import Surface
 from membrane_ctrl.sim.optics.film_shape import Bump, FilmShape, Ripple, Wrinkle, typical_film
-from membrane_ctrl.sim.optics.shade import Light
+from membrane_ctrl.sim.optics.pattern_levels import Light
 from tests.support.rendered_sets import FILM, bench, faulty_set, good_set, patterns
 
 NAMES = [p.name for p in patterns(bench())]

@@ -14,7 +14,7 @@ from membrane_ctrl.metrology.frame_checks.multi_frequency import check_frequenci
 from membrane_ctrl.metrology.phase.frame_stack import FrameStack
 from membrane_ctrl.sim.optics.camera import OpticsRenderer
 from membrane_ctrl.sim.optics.film_shape import typical_film
-from membrane_ctrl.sim.optics.shade import Light, pattern_sequence
+from membrane_ctrl.sim.optics.pattern_levels import Light, pattern_sequence
 
 FILM = typical_film(37.1, 500.0, 4)
 X, Y = np.meshgrid(*[np.linspace(-330, 330, 21)] * 2)

@@ -7,7 +7,7 @@ import h5py
 import numpy as np
 import pytest
 
-from membrane_ctrl.measure import measure as sofast
+from membrane_ctrl.measure import sofast_file
 from tests.support import sofast_facet
 
 
@@ -32,7 +32,7 @@ def measurement(path, frames=32):
 
 
 def test_frames_are_sorted_by_axis_frequency_and_step(tmp_path):
-    read = sofast.read_measurement(measurement(tmp_path / "m.h5"))
+    read = sofast_file.read_sofast_file(measurement(tmp_path / "m.h5"))
     assert read.frames_y.shape == read.frames_x.shape == (4, 4, 3, 5)
     assert read.frames_y[1, 2, 0, 0] == 6  # y comes first in the file
     assert read.frames_x[1, 2, 0, 0] == 22
@@ -42,7 +42,7 @@ def test_frames_are_sorted_by_axis_frequency_and_step(tmp_path):
 
 def test_a_missing_frame_is_counted(tmp_path):
     with pytest.raises(ValueError, match=r"m\.h5: .*fringe_images has 31 frames"):
-        sofast.read_measurement(measurement(tmp_path / "m.h5", frames=31))
+        sofast_file.read_sofast_file(measurement(tmp_path / "m.h5", frames=31))
 
 
 def test_a_missing_item_a_missing_file_and_a_wrong_file_are_named(tmp_path):
@@ -130,4 +130,4 @@ def test_what_leads_out_of_the_file_or_is_too_large_is_refused(tmp_path):
 def test_a_pipe_in_place_of_a_file_is_not_waited_for(tmp_path):
     os.mkfifo(tmp_path / "p.h5")
     with pytest.raises(ValueError, match=r"p\.h5: not an HDF5 file .*not a plain file"):
-        sofast.read_measurement(tmp_path / "p.h5")
+        sofast_file.read_sofast_file(tmp_path / "p.h5")

@@ -23,8 +23,9 @@ from membrane_ctrl.metrology.rays.screen_face import Face
 from membrane_ctrl.metrology.rays.set_phases import SetPhases
 from membrane_ctrl.metrology.rays.surface import Surface
 from membrane_ctrl.metrology.uncertainty.geometry_spread import GENERAL_NAMES, changed
+from membrane_ctrl.sim.optics.bench_poses import camera_pose, screen_pose
 from membrane_ctrl.sim.optics.film_shape import FilmShape
-from membrane_ctrl.sim.optics.trace import camera_pose, screen_pose, trace
+from membrane_ctrl.sim.optics.trace import trace
 from tests.support.metrology_truth import SMALL, pixel_grid
 from tests.support.rendered_sets import FILM, bench, good_set
 

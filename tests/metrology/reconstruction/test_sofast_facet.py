@@ -8,8 +8,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from membrane_ctrl.measure import measure as sofast
-from membrane_ctrl.measure.measure import SHIFTS_RAD, lit_pixels, series_of
+from membrane_ctrl.measure import sofast_file
+from membrane_ctrl.measure.sofast_file import SHIFTS_RAD, axis_series, lit_pixels
 from membrane_ctrl.metrology.frame_checks.closure import (
     closure,
     closure_with_level,
@@ -33,7 +33,7 @@ SCREENS = {
 
 @pytest.fixture(scope="module")
 def measurement():
-    return sofast.read_measurement(DATA / "measurement_facet.h5")
+    return sofast_file.read_sofast_file(DATA / "measurement_facet.h5")
 
 
 @pytest.fixture(scope="module")
@@ -216,7 +216,7 @@ def series(measurement, change=None):
     result.
     """
     pixels = lit_pixels(measurement)
-    axes = series_of(measurement, pixels)
+    axes = axis_series(measurement, pixels)
     if change is not None:
         change(axes)
     return check_series(axes, measurement.black[pixels], measurement.white[pixels])

@@ -22,9 +22,10 @@ from membrane_ctrl.metrology.tracking.tracked_frame import TrackedFrame
 from membrane_ctrl.metrology.tracking.tracker import Tracker
 from membrane_ctrl.model.zernike_terms import NOLL_INDICES, ZERNIKE_TERMS
 from membrane_ctrl.sim.optics.camera import OpticsRenderer
-from membrane_ctrl.sim.optics.film_shape import FilmShape, noll_orders, typical_film
+from membrane_ctrl.sim.optics.film_shape import FilmShape, typical_film
 from membrane_ctrl.sim.optics.simulate import simulate_set
 from membrane_ctrl.sim.optics.simulation_spec import SimulationSpec
+from membrane_ctrl.sim.optics.zernike_polynomials import noll_orders
 
 Frames = list[NDArray[np.uint8]]
 SHRINK = 10

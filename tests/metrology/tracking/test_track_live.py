@@ -29,9 +29,9 @@ from membrane_ctrl.model.run_events import Vibrations
 from membrane_ctrl.model.shape_estimate import ShapeEstimate, pack_estimate, unpack_estimate
 from membrane_ctrl.model.zernike_terms import ZERNIKE_TERMS
 from membrane_ctrl.sim.optics.camera import OpticsRenderer
-from membrane_ctrl.sim.optics.disturbances import DRUM_MODES
+from membrane_ctrl.sim.optics.drum_modes import DRUM_MODES
 from membrane_ctrl.sim.optics.film_shape import typical_film
-from membrane_ctrl.sim.optics.shade import Light
+from membrane_ctrl.sim.optics.pattern_levels import Light
 from membrane_ctrl.sim.plant import Plant
 from tests.worlds.virtual_record import run_virtual
 

@@ -16,9 +16,10 @@ from membrane_ctrl.cli import run
 from membrane_ctrl.config.schema import CameraConfig, DisturbancesConfig, OpticsConfig
 from membrane_ctrl.model.errors import Exit
 from membrane_ctrl.sim.optics.camera import OpticsRenderer
-from membrane_ctrl.sim.optics.disturbances import DRUM_MODES, Waves, drummed
+from membrane_ctrl.sim.optics.drum_modes import DRUM_MODES, drum_modes
 from membrane_ctrl.sim.optics.film_shape import FilmShape
-from membrane_ctrl.sim.optics.shade import Light
+from membrane_ctrl.sim.optics.pattern_levels import Light
+from membrane_ctrl.sim.optics.random_field import RandomField
 
 PLAIN = Light(dark_fraction=0.0, white_fraction=0.5, leak=0.0, vignetting=0.0)
 WHITE, BLACK = Pattern("white"), Pattern("black")
@@ -37,7 +38,7 @@ def bench(
 ) -> OpticsRenderer:
     disturbances = DisturbancesConfig.model_validate(wanted)
     return OpticsRenderer(
-        optics, film, PLAIN, seed=5, modes=drummed(drum_nm), disturbances=disturbances
+        optics, film, PLAIN, seed=5, modes=drum_modes(drum_nm), disturbances=disturbances
     )
 
 
@@ -71,7 +72,7 @@ def test_brightness_wanders_in_space_and_within_minutes(film: FilmShape) -> None
 
 @pytest.mark.parametrize("length_mm", [75.0, 400.0])
 def test_waves_are_as_long_as_asked_and_forget_themselves(length_mm: float) -> None:
-    field = Waves(length_mm, 10.0, 500.0, np.random.default_rng(1))
+    field = RandomField(length_mm, 10.0, 500.0, np.random.default_rng(1))
     x = np.linspace(-490.0, 490.0, 400)
     lines = np.array(
         [field.at(50.0 * k, x[None], np.full((1, 400), 20.0 * k - 400))[0] for k in range(40)]

@@ -7,7 +7,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from firmware_iface.display import ScreenRaster, checkerboard, linear_response, pattern_light
+from firmware_iface.display_patterns import ScreenRaster, checkerboard, pattern_light
+from firmware_iface.display_response import linear_response
 from firmware_iface.roles import Pattern
 from membrane_ctrl.config.optics import CameraConfig, DisturbancesConfig, OpticsConfig
 from membrane_ctrl.config.schema import TwinConfig
@@ -15,7 +16,7 @@ from membrane_ctrl.metrology.phase.pattern_sequence import full_sequence
 from membrane_ctrl.model.arrays import FloatArray
 from membrane_ctrl.sim.optics.camera import OpticsRenderer, TwinOptics
 from membrane_ctrl.sim.optics.film_shape import typical_film
-from membrane_ctrl.sim.optics.shade import PanelPicture
+from membrane_ctrl.sim.optics.shade_panel import PanelPicture
 
 OPTICS = OpticsConfig(
     camera=CameraConfig(width_px=204, height_px=171, pixel_um=41.4, noise_adu=0.0)

@@ -7,7 +7,8 @@ import pytest
 from numpy.polynomial.polynomial import polyval2d
 from prysm.polynomials import noll_to_nm, zernike_nm
 
-from membrane_ctrl.sim.optics.film_shape import MAX_FILM_TERMS, noll_orders, polynomial
+from membrane_ctrl.sim.optics.film_shape import MAX_FILM_TERMS
+from membrane_ctrl.sim.optics.zernike_polynomials import noll_orders, polynomial
 
 FILM_INDICES = range(1, MAX_FILM_TERMS + 1)
 

@@ -11,7 +11,7 @@ from firmware_iface.roles import Pattern
 from membrane_ctrl.config.schema import CameraConfig, OpticsConfig, PatternConfig
 from membrane_ctrl.sim.optics.camera import OpticsRenderer
 from membrane_ctrl.sim.optics.film_shape import FilmShape, Ripple
-from membrane_ctrl.sim.optics.shade import Light, pattern_sequence
+from membrane_ctrl.sim.optics.pattern_levels import Light, pattern_sequence
 from membrane_ctrl.sim.optics.trace import Trace
 
 LINEAR = Light(dark_fraction=0.0, white_fraction=1.0, leak=0.0, vignetting=0.0)

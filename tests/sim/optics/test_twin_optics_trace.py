@@ -13,17 +13,16 @@ from membrane_ctrl.config.optics import (
     OpticsConfig,
     ScreenPoseConfig,
 )
-from membrane_ctrl.sim.optics.camera import OpticsRenderer
-from membrane_ctrl.sim.optics.film_shape import FilmShape
-from membrane_ctrl.sim.optics.trace import (
+from membrane_ctrl.sim.optics.bench_poses import (
     ScreenError,
     ScreenPose,
-    Trace,
     camera_pose,
     pixel_directions,
     screen_pose,
-    trace,
 )
+from membrane_ctrl.sim.optics.camera import OpticsRenderer
+from membrane_ctrl.sim.optics.film_shape import FilmShape
+from membrane_ctrl.sim.optics.trace import Trace, trace
 
 A_MM, B_MM, ALPHA = 2672.0, 2871.0, np.radians(80.9)
 GEOMETRY = OpticsConfig().geometry

@@ -1,0 +1,107 @@
+"""Patterns as the pixels of a screen (docs/reference/interfaces.md section 2)."""
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from firmware_iface.arrays import FloatArray
+from firmware_iface.roles import Pattern
+
+_GRAY_BITS = 4
+
+
+@dataclass(frozen=True, slots=True)
+class ScreenRaster:
+    """The screen's pixels, and the pattern region on them: a square centred on O'.
+
+    Raises ValueError if the region does not fit on the screen.
+    """
+
+    width_px: int
+    height_px: int
+    pixel_mm: float  # pitch
+    periods: int
+    period_mm: float
+    # (column, row) of O'; None: the middle of the screen
+    centre_px: tuple[float, float] | None = None
+
+    def __post_init__(self) -> None:
+        (column, row), half_px = self.centre, self.half_side_mm / self.pixel_mm
+        room_px = min(
+            column + 0.5, row + 0.5, self.width_px - 0.5 - column, self.height_px - 0.5 - row
+        )
+        if half_px > room_px:
+            raise ValueError(
+                f"the pattern of {self.periods} x {self.period_mm:g} mm needs "
+                f"{2 * half_px:.0f} pixels of "
+                f"{self.pixel_mm:g} mm, the screen has {2 * room_px:.0f}; lower period_mm or "
+                "periods"
+            )
+
+    @property
+    def centre(self) -> tuple[float, float]:
+        """O' as (column, row); pixel centres are at integers."""
+        return self.centre_px or ((self.width_px - 1) / 2, (self.height_px - 1) / 2)
+
+    @property
+    def half_side_mm(self) -> float:
+        """Half the side of the pattern region."""
+        return self.periods * self.period_mm / 2
+
+    def from_low_edge_mm(self, axis: str) -> FloatArray:
+        """Distance s from the low edge of the region, of each column ("x") or row ("y": s grows
+        upward).
+        """
+        column, row = self.centre
+        if axis == "x":
+            pixels = np.arange(self.width_px, dtype=np.float64) - column
+        else:
+            pixels = row - np.arange(self.height_px, dtype=np.float64)
+        return np.asarray(pixels * self.pixel_mm + self.half_side_mm, np.float64)
+
+
+def pattern_light(pattern: Pattern, raster: ScreenRaster) -> NDArray[np.float32]:
+    """Light (0..1) of every pixel, (height, width); dark outside the region.
+
+    Raises ValueError for a role or Gray bit that is unknown.
+    """
+    inside = {
+        axis: _inside(raster.from_low_edge_mm(axis), 2 * raster.half_side_mm) for axis in "xy"
+    }
+    lit = {axis: inside[axis].astype(np.float32) for axis in "xy"}
+    if pattern.role in ("white", "black"):
+        return np.outer(lit["y"], lit["x"]) * np.float32(pattern.role == "white")
+    if pattern.role == "crossed":
+        period_mm = 2 * raster.half_side_mm / pattern.index
+        for axis, shift_rad in (("x", pattern.shift_rad), ("y", pattern.shift_y_rad)):
+            wave = _profile(
+                Pattern("sin", axis, shift_rad=shift_rad), raster.from_low_edge_mm(axis), period_mm
+            )
+            lit[axis] = 0.5 * wave.astype(np.float32)
+        return np.add.outer(lit["y"], lit["x"]) * np.outer(inside["y"], inside["x"])
+    profile = _profile(pattern, raster.from_low_edge_mm(pattern.axis), raster.period_mm)
+    lit[pattern.axis] *= profile.astype(np.float32)
+    return np.outer(lit["y"], lit["x"])
+
+
+def checkerboard(width_px: int, height_px: int) -> NDArray[np.uint8]:
+    """Black and white pixel by pixel, which no scaler reproduces."""
+    return np.asarray(np.indices((height_px, width_px)).sum(axis=0) % 2 * 255, np.uint8)
+
+
+def _inside(s_mm: FloatArray, side_mm: float) -> NDArray[np.bool_]:
+    return (s_mm >= 0) & (s_mm < side_mm)
+
+
+def _profile(pattern: Pattern, s_mm: FloatArray, period_mm: float) -> FloatArray:
+    if pattern.role == "sin":  # phi = 2 pi s / T - pi
+        phi = 2 * math.pi * s_mm / period_mm - math.pi
+        return np.asarray(0.5 + 0.5 * np.cos(phi + pattern.shift_rad))
+    if pattern.role == "gray" and 1 <= pattern.index <= _GRAY_BITS:
+        v2 = np.floor(2 * s_mm / period_mm).astype(np.int64)
+        return np.asarray((v2 ^ (v2 >> 1)) >> (_GRAY_BITS - pattern.index) & 1, np.float64)
+    raise ValueError(
+        f"pattern {pattern.name!r}: role must be sin, gray (bit 1..{_GRAY_BITS}), white or black"
+    )

@@ -1,0 +1,87 @@
+"""Emulator of Keyence laser amplifiers behind a DL-RS1A on its serial line."""
+
+import math
+
+from firmware_iface.emulators.serial_device import LineDevice, Sensor
+
+_WRITABLE = ("001",)
+
+
+class KeyenceDlRs1aEmulator(LineDevice):
+    """One amplifier that measures the mirror (NaN: it is in error), and others that measure nothing
+    of interest.
+
+    `error_state` is data number 033 of all amplifiers, `zero_shift_mm` that of the judgment value.
+    """
+
+    end = b"\r"
+
+    def __init__(
+        self,
+        displacement_um: Sensor,
+        direction: int = -1,
+        baud: int = 9600,
+        parity: str = "N",
+        amplifiers: int = 1,
+    ) -> None:
+        super().__init__(baud, parity=parity)
+        self.error_state = 0
+        self.zero_shift_mm = 0.0
+        self._displacement_um = displacement_um
+        self._direction = direction
+        self._amplifiers = amplifiers
+        self._value_mm = math.nan
+
+    def line(self, text: str) -> None:
+        """One command."""
+        if text:  # of CR LF, the LF is left over
+            self.say(self._answer(text).encode("ascii", "replace") + b"\r\n")
+
+    def _answer(self, text: str) -> str:
+        command, *parameters = text.split(",")
+        if command == "M0":
+            return "M0," + ",".join(self._judged(number) for number in range(self._amplifiers))
+        if command not in ("SR", "SW"):
+            return f"ER,{command[:2]},00"
+        if len(parameters) != {"SR": 2, "SW": 3}[command]:
+            return f"ER,{command},21"
+        amplifier, number = parameters[:2]
+        if not amplifier.isdigit() or int(amplifier) >= self._amplifiers:
+            return f"ER,{command},65"
+        return (
+            self._read(amplifier, number)
+            if command == "SR"
+            else self._write(amplifier, number, parameters[2])
+        )
+
+    def _read(self, amplifier: str, number: str) -> str:
+        values = {
+            "033": f"{self.error_state:05d}",
+            "037": self._judged(int(amplifier)),
+            "038": _text(self._measured_mm(int(amplifier))),
+        }
+        return f"SR,{amplifier},{number},{values[number]}" if number in values else "ER,SR,22"
+
+    def _write(self, amplifier: str, number: str, value: str) -> str:
+        if number not in _WRITABLE or value not in ("0", "1"):
+            return "ER,SW,22"
+        if value == "1":
+            self.zero_shift_mm = self._measured_mm(0)
+        return f"SW,{amplifier},{number}"
+
+    def _judged(self, amplifier: int) -> str:
+        return _text(self._measured_mm(amplifier) - self.zero_shift_mm)
+
+    def _measured_mm(self, amplifier: int) -> float:
+        if amplifier:
+            return 10.0 + amplifier
+        if not self.frozen:
+            self._value_mm = self._direction * self._displacement_um() / 1000
+        return self._value_mm
+
+
+def _text(value_mm: float) -> str:
+    """Page 11: sign, two digits, three decimals; page 12 without a value."""
+    if math.isnan(value_mm):
+        return "+EE.EEE"
+    return f"{max(-99.999, min(99.999, value_mm)):+07.3f}"

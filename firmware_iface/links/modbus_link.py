@@ -1,0 +1,104 @@
+"""What the drivers need of a Modbus device over any wire, and the protocol's codes."""
+
+from collections.abc import Sequence
+from typing import Protocol
+
+from firmware_iface.roles import (
+    DeviceBusyError,
+    DeviceRefusedError,
+    LinkError,
+)
+
+# Modbus semantics, independent of the transport.
+
+READ_COILS = 1
+READ_DISCRETE = 2
+READ_HOLDING = 3
+READ_INPUT = 4
+WRITE_SINGLE = 6
+DIAGNOSTICS = 8
+WRITE_MULTIPLE = 16
+EXCEPTION_FLAG = 0x80
+EXCEPTIONS = {
+    1: "illegal function",
+    2: "illegal address",
+    3: "illegal value",
+    4: "device failure",
+    5: "acknowledged, not done",
+    6: "device busy",
+    10: "gateway path unavailable",
+    11: "no device behind the gateway",
+}
+_REFUSALS = (1, 2, 3)  # the request itself is wrong for this device; the others may be temporary
+_BUSY = 6
+
+
+class ModbusLink(Protocol):
+    """One Modbus device over any wire: what the drivers need. All raise LinkError kinds."""
+
+    @property
+    def name(self) -> str:
+        """For messages."""
+
+    @property
+    def connected(self) -> bool:
+        """Whether the connection is up."""
+
+    async def connect(self) -> None:
+        """Connect again."""
+
+    async def read_holding(self, address: int, count: int) -> list[int]:
+        """Function code 3."""
+
+    async def read_input(self, address: int, count: int) -> list[int]:
+        """Function code 4."""
+
+    async def write_register(self, address: int, word: int) -> None:
+        """Function code 6; the echo is checked."""
+
+    async def write_registers(self, address: int, words: Sequence[int]) -> None:
+        """Function code 16; the echo is checked."""
+
+    async def close(self) -> None:
+        """Close; a request in flight fails at once."""
+
+
+class ModbusBitLink(Protocol):
+    """One Modbus device with coils or discrete inputs. All raise LinkError kinds."""
+
+    @property
+    def name(self) -> str:
+        """For messages."""
+
+    @property
+    def connected(self) -> bool:
+        """Whether the connection is up."""
+
+    async def connect(self) -> None:
+        """Connect again."""
+
+    async def read_coils(self, address: int, count: int) -> list[bool]:
+        """Function code 1."""
+
+    async def read_discrete(self, address: int, count: int) -> list[bool]:
+        """Function code 2."""
+
+    async def close(self) -> None:
+        """Close; a request in flight fails at once."""
+
+
+class AnyModbusLink(ModbusLink, ModbusBitLink, Protocol):
+    """One Modbus device with registers, coils and discrete inputs."""
+
+
+def bytes_of_bits(count: int) -> int:
+    """Number of bytes in which so many coils or discrete inputs are sent."""
+    return (count + 7) // 8
+
+
+def exception_error(what: str, code: int) -> LinkError:
+    """The error for an exception answer."""
+    kind = (
+        DeviceRefusedError if code in _REFUSALS else DeviceBusyError if code == _BUSY else LinkError
+    )
+    return kind(f"{what}: exception {code} ({EXCEPTIONS.get(code, 'unknown')})")

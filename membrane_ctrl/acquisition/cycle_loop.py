@@ -1,0 +1,93 @@
+"""Takes a cycle at each deadline, publishes the estimates and reports failures."""
+
+import math
+from collections.abc import Callable
+from pathlib import Path
+
+from membrane_ctrl.acquisition import exposures
+from membrane_ctrl.acquisition.cycle import CycleDone, CycleFailed, ShapeCycle
+from membrane_ctrl.acquisition.remote import Remote
+from membrane_ctrl.model import run_events, shape_estimate
+
+
+def keep_cycling(
+    taking: ShapeCycle,
+    remote: Remote,
+    publish: Callable[[shape_estimate.ShapeEstimate], None],
+    clock: exposures.CycleClock,
+    period_s: Callable[[], float],
+    keep: Callable[[shape_estimate.ShapeEstimate], Path],
+) -> None:
+    """Take cycles until stopped.
+
+    A cycle must end early when `remote.interrupts()`; one longer than `period_s()` skips the
+    deadlines it covers. `publish` gets every estimate, whatever its verdict. `keep` writes the
+    frames of a cycle and returns the set's folder, or raises OSError with the reason.
+    """
+    due_s = clock.now()
+    while not remote.stop:
+        if remote.paused:
+            remote.report("paused", "until told to resume")
+            while remote.paused and not remote.stop:
+                remote.listen(math.inf)
+            due_s = clock.now()
+            continue
+        remaining_s = due_s - clock.now()
+        if remaining_s > 0:
+            remote.listen(remaining_s)
+            continue
+        captures = remote.take_capture()
+        if remote.take_full() or captures:
+            taking.want_full()
+        result = taking.take()
+        _report_result(result, remote, publish)
+        if captures:
+            remote.tell(_capture_event(result, keep))
+        pause_s = result.pause_s if result is not None else 0.0
+        due_s = next_deadline_s(due_s, period_s(), clock.now() + pause_s)
+        taking.prepare()
+
+
+def next_deadline_s(last_s: float, period_s: float, earliest_s: float) -> float:
+    """The first of `last_s + k period_s`, k >= 1, that is not before `earliest_s`."""
+    return last_s + max(1, math.ceil((earliest_s - last_s) / period_s)) * period_s
+
+
+def _capture_event(
+    result: CycleDone | CycleFailed | None, keep: Callable[[shape_estimate.ShapeEstimate], Path]
+) -> run_events.Capture:
+    """Result of a requested set; a rejected one is not kept."""
+    match result:
+        case None:
+            return run_events.Capture(failed="the cycle was stopped")
+        case CycleFailed(number, stage, message, _):
+            return run_events.Capture(number, failed=f"{stage}: {message}")
+    estimate = result.estimate
+    if estimate.verdict == "rejected":
+        return run_events.Capture(estimate.cycle, failed=f"rejected: {estimate.reason}")
+    try:
+        folder = keep(estimate)
+    except OSError as error:
+        return run_events.Capture(estimate.cycle, failed=error.strerror or str(error))
+    moved_um = estimate.displacement_um if math.isfinite(estimate.displacement_um) else None
+    name = f"{folder.parent.name}/{folder.name}"
+    return run_events.Capture(estimate.cycle, name, moved_um, estimate.verdict, estimate.reason)
+
+
+def _report_result(
+    result: CycleDone | CycleFailed | None,
+    remote: Remote,
+    publish: Callable[[shape_estimate.ShapeEstimate], None],
+) -> None:
+    match result:
+        case CycleDone(estimate, pause_s):
+            publish(estimate)
+            later = f"; next in {pause_s:g} s" if pause_s else ""
+            verdict = (
+                f"{estimate.verdict}: {estimate.reason}{later}"
+                if estimate.reason
+                else estimate.verdict
+            )
+            remote.report("running", verdict, cycle=estimate.cycle)
+        case CycleFailed(number, stage, message, pause_s):
+            remote.report("retrying", f"{stage}: {message}; again in {pause_s:g} s", cycle=number)

@@ -1,0 +1,67 @@
+"""Reports when the calibrated geometry of a run does not fit its cycles."""
+
+import numpy as np
+
+from membrane_ctrl.geometry.run_geometry import RunGeometry
+from membrane_ctrl.metrology.cycle.geometry_monitors import DriftMonitor, RingMonitor, noise_urad
+from membrane_ctrl.metrology.phase import phase_steps, screen_scale
+from membrane_ctrl.metrology.rays.geometry import Geometry
+from membrane_ctrl.metrology.rays.surface import Surface
+from membrane_ctrl.metrology.reconstruction import slope_noise
+from membrane_ctrl.model import events, run_events, shape_estimate
+
+
+def geometry_event(geometry: RunGeometry) -> run_events.GeometryInForce:
+    """The event that records the geometry."""
+    origin = geometry.origin
+    return run_events.GeometryInForce(
+        origin.hash, origin.file or None, origin.calibrated_utc or None, geometry.note
+    )
+
+
+class GeometryWatch:
+    """Compares residual and ring of each cycle with the calibrated ones; silent without a
+    calibration.
+    """
+
+    def __init__(self, geometry: RunGeometry, bin_px: int) -> None:
+        optics = geometry.optics
+        self._geometry, self._radius_mm = Geometry.from_config(optics), optics.mirror.radius_mm
+        shifts = phase_steps.equal_shifts(optics.pattern.steps)
+        sigma_rad = phase_steps.phase_sigma_rad(
+            shifts, slope_noise.pixel_sigma_adu(optics.camera.noise_adu), 1.0
+        )
+        self._sigma_mm_adu = (
+            screen_scale.mm_per_rad(optics.pattern) * sigma_rad / bin_px
+        )  # over the modulation
+        known = geometry.calibration
+        self._monitors: tuple[DriftMonitor, RingMonitor] | None = None
+        if known is not None:
+            residual = DriftMonitor(known.slope_residual_urad, known.slope_noise_urad)
+            self._monitors = residual, RingMonitor(np.array(known.ring_um))
+        self._said = False
+
+    def noise_urad(self, estimate: shape_estimate.ShapeEstimate) -> float:
+        """The camera noise's share of a cycle's residual."""
+        return noise_urad(
+            self._geometry,
+            self._surface(estimate),
+            self._sigma_mm_adu / estimate.modulation_median_adu,
+        )
+
+    def after(self, estimate: shape_estimate.ShapeEstimate) -> events.Event | None:
+        """Returns a notice when a new calibration becomes due, and when no longer."""
+        if self._monitors is None or estimate.verdict == "rejected" or estimate.kind == "track":
+            return None
+        residual, ring = self._monitors
+        residual.add(estimate.slope_residual_urad, self.noise_urad(estimate))
+        ring.add(self._surface(estimate))
+        says = ring.says or residual.says
+        if bool(says) == self._said:
+            return None
+        self._said = not self._said
+        news = events.Maintenance if self._said else events.MaintenanceOver
+        return news("calibrate", says or "the geometry fits again")
+
+    def _surface(self, estimate: shape_estimate.ShapeEstimate) -> Surface:
+        return Surface(estimate.coeffs_um / 1e3, estimate.hencky_um / 1e3, self._radius_mm)

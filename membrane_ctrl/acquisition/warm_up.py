@@ -1,0 +1,78 @@
+"""Runs every kernel of the cycle once, on a small sensor.
+
+A fresh machine compiles them here, for many seconds.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from membrane_ctrl.acquisition import (
+    cycle,
+    cycle_plan,
+    exposures,
+)
+from membrane_ctrl.config.schema import OpticsConfig, TwinConfig
+from membrane_ctrl.sim.optics.camera import FilmPosition, TwinOptics
+
+_SMALL_PX = 300  # still enough points for the fit of the terms, at a hundredth of the work
+
+
+@dataclass(frozen=True, slots=True)
+class _StandingFilm:
+    """A film at its usual sag."""
+
+    displacement_um: float
+    sag_mm: float
+
+
+# A real film's sag is unknown before the measurement; a metre of film at the usual pressure has
+# this one
+TYPICAL_FILM: FilmPosition = _StandingFilm(0.0, 37.1)
+
+
+def coarse_optics(optics: OpticsConfig) -> OpticsConfig:
+    """The same view on a sensor with larger pixels."""
+    camera = optics.camera
+    larger = max(1, min(camera.width_px, camera.height_px) // _SMALL_PX)
+    column_px, row_px = (
+        (p + 0.5) / larger - 0.5 for p in camera.principal
+    )  # pixel centres are at integers
+    coarse = camera.model_copy(
+        update={
+            "width_px": camera.width_px // larger,
+            "height_px": camera.height_px // larger,
+            "pixel_um": camera.pixel_um * larger,
+            "principal_px": (column_px, row_px),
+        }
+    )
+    return optics.model_copy(update={"camera": coarse})
+
+
+def warm_up(
+    reconstructor: cycle.Reconstructor,
+    optics: OpticsConfig,
+    plan: cycle_plan.CyclePlan,
+    position: FilmPosition,
+    clock: exposures.CycleClock,
+) -> None:
+    """Run a full cycle and two fringes-only cycles, with and without known motion, of a film at
+    rest.
+
+    `reconstructor` is one for this call alone; it and `optics` are those of `coarse_optics`.
+    """
+    bench = TwinOptics(optics, TwinConfig(), lambda: position, clock)
+    # displacements that differ by more than noise trigger the kernels that correct the film's
+    # motion
+    still, moving = np.zeros(1), np.array([-10.0, 10.0])
+    for full, reconstruct, motion_um in (
+        (True, reconstructor.full, moving),
+        (False, reconstructor.fringes, moving),
+        (False, reconstructor.fringes, still),
+    ):
+        taken = []
+        for pattern in plan.patterns(full):
+            bench.screen.show(pattern)
+            taken.append(bench.camera.grab().pixels)
+        displacement_um = position.displacement_um + np.resize(motion_um, len(taken))
+        reconstruct(taken, 0.1 * np.arange(len(taken), dtype=np.float64), displacement_um)

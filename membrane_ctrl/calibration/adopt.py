@@ -1,0 +1,75 @@
+"""Compares a new geometry with the one in use, and puts it in its place."""
+
+from datetime import UTC, datetime
+from pathlib import Path
+
+import numpy as np
+
+from membrane_ctrl.config import schema
+from membrane_ctrl.geometry.file import GeometryFile, GeometryOrigin, read_geometry
+from membrane_ctrl.metrology.rays.geometry import Geometry
+from membrane_ctrl.model import errors, files
+
+
+def compare_geometries(
+    optics: schema.OpticsConfig, origin: GeometryOrigin, new: GeometryFile
+) -> list[str]:
+    """The geometry in force (`optics`, `origin`) beside the new one, in numbers that a tape measure
+    can check.
+    """
+    old = "by hand" if not origin.calibrated_utc else f"calibrated {origin.calibrated_utc}"
+    lines = [
+        f"in force: {old}, hash {origin.hash}; new: hash {new.origin.hash}",
+        f"{'':<28}{'in force':>12}{'new':>12}",
+    ]
+    rows = zip(
+        _tape_lengths(Geometry.from_config(optics)),
+        _tape_lengths(Geometry.from_config(new.over(optics))),
+        strict=True,
+    )
+    lines += [f"{name:<28}{before:>12.3f}{after:>12.3f}" for (name, before), (_, after) in rows]
+    return lines
+
+
+def _tape_lengths(geometry: Geometry) -> list[tuple[str, float]]:
+    pinhole, screen = geometry.pinhole_mm, geometry.screen_origin_mm
+    facing = np.cross(geometry.screen_s_x, geometry.screen_s_y)
+    leans = np.degrees(np.arccos(np.clip(abs(facing @ screen) / np.linalg.norm(screen), -1.0, 1.0)))
+    return [
+        ("a, vertex to pinhole, mm", float(np.linalg.norm(pinhole))),
+        ("b, vertex to screen, mm", float(np.linalg.norm(screen))),
+        (
+            "alpha of the camera, deg",
+            float(np.degrees(np.arctan2(pinhole[2], np.hypot(pinhole[0], pinhole[1])))),
+        ),
+        ("the screen leans by, deg", float(leans)),
+    ]
+
+
+def adopt_geometry(new: Path, place: Path) -> Path | None:
+    """Put a geometry where the configuration looks for it; returns where the previous one is kept.
+
+    Raises DeviceError if it cannot be written; the old one then stays in place.
+    """
+    with errors.writing(place, errors.DeviceError):
+        place.parent.mkdir(parents=True, exist_ok=True)
+        place = files.users(place)
+        kept = _backup_path(place) if place.exists() else None
+        if kept is not None:
+            files.write_bytes_atomic(kept, files.read_bytes(place, files.SMALL_BYTES, follow=True))
+        files.write_text_atomic(place, files.read_text(new))
+    return kept
+
+
+def _backup_path(place: Path) -> Path:
+    """A free name with the date of the calibration, or of the file if a person wrote it."""
+    try:
+        written = datetime.fromisoformat(read_geometry(place).origin.calibrated_utc)
+    except (errors.InputError, ValueError):
+        written = datetime.fromtimestamp(place.stat().st_mtime, UTC)
+    stem = f"{place.stem}-{written.astimezone(UTC):%Y%m%dT%H%M%SZ}"
+    for number in range(1, 1000):
+        kept = place.with_name(f"{stem}{'' if number == 1 else f'-{number}'}{place.suffix}")
+        if not kept.exists():
+            return kept
+    raise OSError(f"a thousand files {stem} exist")

@@ -1,0 +1,134 @@
+"""The command `calibrate-pose`: the camera's pose, from the ring in the white frame of a set."""
+
+import json
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from membrane_ctrl.geometry.file import read_geometry
+from membrane_ctrl.geometry.prior_file import read_prior, write_prior
+from membrane_ctrl.measure import capture_set, measurement
+from membrane_ctrl.metrology.calibration import geometry_tables, ring_pose
+from membrane_ctrl.metrology.figure import bin_figure
+from membrane_ctrl.metrology.frame_checks.checked_set import RejectedSetError
+from membrane_ctrl.metrology.frame_checks.set_check import check_set
+from membrane_ctrl.metrology.rays import ray_tracing
+from membrane_ctrl.metrology.rays.bench_parameters import usual_sigma
+from membrane_ctrl.metrology.rays.geometry import Geometry
+from membrane_ctrl.metrology.rays.rim_outline import find_outline
+from membrane_ctrl.model import errors
+from membrane_ctrl.model.arrays import FloatArray
+
+
+@dataclass(frozen=True)
+class PoseOptions:
+    """Options of the command."""
+
+    folder: Path
+    geometry: Path | None
+    priors: Sequence[Path]
+    radius_sigma_mm: float
+    out: Path
+    as_json: bool
+
+
+def calibrate_pose(options: PoseOptions) -> int:
+    """Measure the set, find the rim, fit the pose, write the prior and report.
+    Raises CommandError.
+    """
+    geometry = None if options.geometry is None else read_geometry(options.geometry)
+    capture = capture_set.read_set(options.folder, geometry)
+    optics = capture.head.optics
+    for path in options.priors:
+        optics = read_prior(path).over(optics)
+    capture = replace(capture, head=replace(capture.head, optics=optics))
+    stated = Geometry.from_config(optics)
+    light, (rim_z, rim_mean_mm) = _white_minus_black(capture), _rim_height(capture)
+    radius_mm = optics.mirror.radius_mm
+    outline = find_outline(light, stated, radius_mm, rim_mean_mm)
+    if outline is None:
+        raise errors.RejectedError(f"{options.folder}: the rim is not in the picture")
+    try:
+        pose = ring_pose.ring_pose(
+            light, stated, outline.rim_px, radius_mm, rim_z, options.radius_sigma_mm
+        )
+    except ValueError as error:
+        raise errors.RejectedError(f"{options.folder}: {error}") from None
+    sigmas = dict(zip(ring_pose.POSE_NAMES, pose.sigmas.tolist(), strict=True))
+    tables = {
+        "geometry": geometry_tables.general_form(pose.bench(stated), optics).model_dump(
+            exclude_none=True
+        ),
+        "sigmas": sigmas,
+    }
+    write_prior(options.out, tables, "calibrate-pose", [options.folder.name], pose.rms_px)
+    report: dict[str, Any] = {
+        "schema": "membrane-calibrate-pose/1",
+        "out": str(options.out),
+        "rms_px": pose.rms_px,
+        "edges": pose.points,
+        "values": dict(zip(ring_pose.POSE_NAMES, pose.values.tolist(), strict=True)),
+        "sigmas": sigmas,
+    }
+    print(json.dumps(report) if options.as_json else "\n".join(_format_pose(pose, options.out)))
+    return int(errors.Exit.DONE)
+
+
+def _white_minus_black(capture: capture_set.CaptureSet) -> FloatArray:
+    """White minus black. Raises errors.InputError for a set without them."""
+    names = [pattern.name for pattern in capture.head.patterns]
+    if "white" not in names:
+        raise errors.InputError(
+            f"{capture.head.folder / 'capture.toml'}: kind: a full set is needed, for its "
+            "white frame"
+        )
+    for name in ("white", "black"):
+        if (k := names.index(name)) in capture.unusable:
+            raise errors.RejectedError(
+                f"{capture.head.folder}: {capture.head.files[k]}: {capture.unusable[k]}"
+            )
+    white, black = (capture.frames[names.index(name)].astype(float) for name in ("white", "black"))
+    return np.asarray(white - black)
+
+
+def _rim_height(capture: capture_set.CaptureSet) -> tuple[ray_tracing.HeightFunction, float]:
+    """Height of the film at the rim in world, and its mean. Raises RejectedError for a set without
+    a figure.
+    """
+    optics = capture.head.optics
+    try:
+        checked = check_set(measurement.stack_of(capture), optics)
+    except RejectedSetError as error:
+        raise errors.RejectedError(f"{capture.head.folder}: rejected: {error}") from None
+    surface, vertex_mm = (
+        bin_figure.bin_figure(optics, checked).fit.surface,
+        checked.tracer.vertex_z_mm,
+    )
+
+    def height(x: FloatArray, y: FloatArray) -> FloatArray:
+        share = surface.radius_mm / np.maximum(
+            np.hypot(x, y), 1.0
+        )  # the terms diverge beyond the rim
+        return np.asarray(vertex_mm + surface.height(x * share, y * share))
+
+    return height, vertex_mm + surface.sag_mm
+
+
+def _format_pose(pose: ring_pose.RingPose, out: Path) -> list[str]:
+    lines = ["what              stated wrong by   +-        known before"]
+    lines += [
+        f"{name:<18}{value:>+13.4f}  {sigma:<9.4f} {usual_sigma(name):.3g}"
+        for name, value, sigma in zip(ring_pose.POSE_NAMES, pose.values, pose.sigmas, strict=True)
+    ]
+    better = max(
+        usual_sigma(name) / sigma
+        for name, sigma in zip(ring_pose.POSE_NAMES, pose.sigmas, strict=True)
+    )
+    lines.append(
+        f"edges left {pose.rms_px:.3f} px RMS at {pose.points} points, at best {better:.0f} "
+        "times better"
+    )
+    return [*lines, f"written: {out}; use it with calibrate --prior {out}"]

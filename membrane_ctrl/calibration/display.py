@@ -1,0 +1,97 @@
+"""The command `calibrate-display`: settling and response of the screen."""
+
+import json
+
+import numpy as np
+
+from firmware_iface.display_response import DisplayResponse
+from firmware_iface.display_settling import Settling
+from firmware_iface.roles import LinkError
+from membrane_ctrl.acquisition import exposures, optical_bench, waiting_clock
+from membrane_ctrl.config.schema import Config, PatternConfig
+from membrane_ctrl.metrology.phase.screen_scale import mm_per_rad
+from membrane_ctrl.model import errors
+from membrane_ctrl.model.clock import RunClock
+
+_PHASES = 720  # per period, to include the worst one
+
+
+def calibrate_display(config: Config, source: str, as_json: bool) -> int:
+    """Open camera and screen, measure, and report the resulting error. Raises CommandError.
+
+    Call from the main thread only (because of the screen).
+    """
+    if config.devices is None or config.devices.camera is None or config.devices.screen is None:
+        raise errors.InputError(
+            f"{source}: devices.camera and devices.screen are both needed to measure the screen"
+        )
+    section, clock = config.devices.screen, waiting_clock.WaitingClock(RunClock.start())
+    try:
+        bench = optical_bench.configured_bench(config, clock)
+        try:
+            settling, response = measure_display(bench, clock, section.width_px, section.height_px)
+        finally:
+            bench.close()
+    except LinkError as error:
+        raise errors.DeviceError(f"{source}: {error}") from None
+    except ValueError as error:
+        raise errors.DeviceError(f"{source}: screen: {error}") from None
+    report = display_report(settling, response, config.optics.pattern)
+    print(json.dumps(report) if as_json else "\n".join(format_display_report(report)))
+    return int(errors.Exit.DONE)
+
+
+def measure_display(
+    bench: optical_bench.OpticalBench, clock: exposures.CycleClock, width_px: int, height_px: int
+) -> tuple[Settling, DisplayResponse]:
+    """Open the bench and measure its screen. Raises LinkError, or ValueError if the camera cannot
+    see the screen.
+    """
+    bench.camera.open()
+    bench.screen.open()
+    test = optical_bench.DisplayTest(bench.screen, bench.camera, clock, width_px, height_px)
+    return test.settling(), test.response()
+
+
+def display_report(
+    settling: Settling, response: DisplayResponse, pattern: PatternConfig
+) -> dict[str, object]:
+    """The findings, schema membrane-calibrate-display/1."""
+    bare, corrected = (fringe_error_mm(response, pattern, linear) for linear in (False, True))
+    return {
+        "schema": "membrane-calibrate-display/1",
+        "settle_ms": 1e3 * settling.settle_s,
+        "latency_ms": 1e3 * settling.latency_s if np.isfinite(settling.latency_s) else None,
+        "time_constant_ms": 1e3 * settling.tau_s if np.isfinite(settling.tau_s) else None,
+        "gamma": response.gamma,
+        "fringe_error_um": {"as_sent": 1e3 * bare, "corrected": 1e3 * corrected},
+    }
+
+
+def format_display_report(report: dict[str, object]) -> list[str]:
+    """Format the report for people, with the lines for the configuration."""
+    error = report["fringe_error_um"]
+    assert isinstance(error, dict)
+    return [
+        f"settles in {report['settle_ms']:.0f} ms, gamma {report['gamma']:.2f}",
+        f"fringe error on the screen: {error['as_sent']:.1f} µm RMS as sent, "
+        f"{error['corrected']:.1f} µm corrected, from the rounding of its levels",
+        "for the configuration (otherwise every start measures both):",
+        "[devices.screen]",
+        f"settle_ms = {report['settle_ms']:.0f}",
+        "linearise = true",
+    ]
+
+
+def fringe_error_mm(response: DisplayResponse, pattern: PatternConfig, corrected: bool) -> float:
+    """RMS error of a screen coordinate from this display's sinusoids, whose harmonics appear as
+    phase.
+    """
+    phase = 2 * np.pi * np.arange(_PHASES) / _PHASES
+    shifts = 2 * np.pi * np.arange(pattern.steps) / pattern.steps
+    wanted = (1 + np.cos(phase + shifts[:, None])) / 2
+    levels = response.levels_of(wanted) if corrected else np.rint(255 * wanted)
+    light = np.interp(levels, response.levels, response.light)
+    seen = np.arctan2(-np.sin(shifts) @ light, np.cos(shifts) @ light)
+    error = np.angle(np.exp(1j * (seen - phase)))
+    return float(mm_per_rad(pattern) * np.std(error))

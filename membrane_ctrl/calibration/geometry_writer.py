@@ -1,0 +1,58 @@
+"""Writes the result of a calibration as `geometry.toml`."""
+
+from collections.abc import Sequence
+from datetime import UTC, datetime
+from pathlib import Path
+
+import numpy as np
+import tomli_w
+
+from membrane_ctrl.config.schema import OpticsConfig
+from membrane_ctrl.metrology.calibration import geometry_tables, solver, verdict, weak_combinations
+from membrane_ctrl.metrology.cycle import geometry_monitors
+from membrane_ctrl.metrology.rays import set_phases
+from membrane_ctrl.model import errors
+from membrane_ctrl.model.files import users, write_text_atomic
+
+
+def write_geometry(
+    path: Path,
+    solution: solver.Solution,
+    problem: solver.Problem,
+    optics: OpticsConfig,
+    findings: Sequence[verdict.CalibrationFinding],
+) -> str:
+    """Write `geometry.toml`; returns its hash. Raises InputError if it cannot be written."""
+    films = [(solution.states[k], problem.sets[k]) for k in problem.films]
+    slopes = [_slope_residual(solution, problem.sets[k], k) for k in problem.films]
+    noises = [
+        geometry_monitors.noise_urad(
+            solution.bench.geometry, state.surface, float(np.sqrt(np.mean(phases.sigma_mm**2)))
+        )
+        for state, phases in films
+    ]
+    origin = geometry_tables.Origin(
+        date_utc=datetime.now(UTC).isoformat(timespec="seconds"),
+        sets=tuple(phases.name for phases in problem.sets),
+        screen_residual_um=1e3
+        * float(np.median([each.residual_rms_mm for each in solution.equations])),
+        slope_residual_urad=1e6 * float(np.median(slopes)),
+        slope_noise_urad=float(np.median(noises)),
+        condition=weak_combinations.condition_number(solution),
+        notes=tuple(finding.says for finding in findings),
+    )
+    tables = geometry_tables.tables_of(solution, optics, origin)
+    with errors.writing(path):
+        path.parent.mkdir(parents=True, exist_ok=True)
+        write_text_atomic(users(path), tomli_w.dumps(tables))  # never half a geometry
+    return str(tables["calibration"]["hash"])
+
+
+def _slope_residual(solution: solver.Solution, phases: set_phases.SetPhases, index: int) -> float:
+    """RMS of measured minus fitted slopes of one set's bins on the calibrated bench, as a live
+    cycle states it.
+    """
+    fit = solver.fit_on(
+        solution.bench, phases, solution.problem.radius_mm, solution.states[index].vertex_z_mm
+    )
+    return float(np.hypot(fit.residual_x, fit.residual_y) / np.sqrt(2))

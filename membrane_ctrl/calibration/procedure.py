@@ -1,0 +1,115 @@
+"""The procedure of a live calibration: moves the mirror and takes a set at each setpoint."""
+
+import contextlib
+from collections.abc import Iterator
+from dataclasses import dataclass
+from itertools import pairwise
+
+from membrane_ctrl.calibration.session import CalibrationHead, CalibrationSession
+from membrane_ctrl.calibration.setpoints import (
+    HeldMirror,
+    move_and_set_s,
+    ramp_s,
+    setpoint_reach,
+)
+from membrane_ctrl.calibration.sweep import CaptureLink, Sweep
+from membrane_ctrl.model import errors
+from membrane_ctrl.sessions.live_hold import HoldError, Progress
+
+
+@dataclass(frozen=True, slots=True)
+class Procedure:
+    """Moves the mirror for a calibration."""
+
+    link: CaptureLink
+    sweep: Sweep  # the hold under control
+    held: HeldMirror  # the mirror before the first move
+    progress: Progress
+
+    def times_s(self, head: CalibrationHead, missing: tuple[int, ...]) -> list[float]:
+        """Duration of each step: the missing sets, and the return."""
+        stops = [self.held.setpoint_um, *(head.setpoints_um[k] for k in missing), head.start_um]
+        return [move_and_set_s(self.held, a, b, self.link.config) for a, b in pairwise(stops)]
+
+    def check(self, head: CalibrationHead) -> None:
+        """Raises InputError if the setpoints are out of reach, or the mirror cannot be moved both
+        ways.
+        """
+        held, config = self.held, self.link.config
+        low_um, high_um = min(head.setpoints_um), max(head.setpoints_um)
+        reach = setpoint_reach(held, config)
+        if low_um < reach.low_um or high_um > reach.high_um:
+            raise errors.InputError(
+                f"the sets from {low_um:g} to {high_um:g} µm are beyond {reach.low_um:.0f} "
+                f"to {reach.high_um:.0f}, "
+                f"which {reach.low_why} and {reach.high_why} allow"
+            )
+        if ramp_s(held, low_um, high_um, config) + ramp_s(held, high_um, low_um, config) == float(
+            "inf"
+        ):
+            raise errors.InputError(
+                f"the mirror loses {held.leak_um_per_s:.2f} µm/s: it cannot be moved both ways; "
+                "open the bleed (loop.bleed_fraction), or give the pump more reserve"
+            )
+
+    def take(self, session: CalibrationSession) -> None:
+        """Take the missing sets and move the mirror back.
+
+        Raises HoldError if the mirror is no longer held or someone else moves it (it is then left
+        alone); DeviceError, RejectedError or KeyboardInterrupt after the mirror has moved back.
+        """
+        with self.progress.catching(), self._coming_back(session):
+            self.sweep.shape_loop(False)
+            times_s = self.times_s(session.head, session.missing)
+            for number, index in enumerate(session.missing):
+                self._take(session, index, times_s[number], sum(times_s[number + 1 :]))
+
+    def _take(
+        self, session: CalibrationSession, index: int, expected_s: float, after_s: float
+    ) -> None:
+        setpoint_um = session.head.setpoints_um[index]
+        what = f"set {index + 1} of {len(session.sets)} at {setpoint_um:+g} µm"
+        self.progress.begin(what, expected_s, after_s)
+        self.sweep.go(setpoint_um, expected_s)
+        event = self.sweep.take()
+        session.keep(index, self.link.run_dir / str(event.set))
+        self.progress.say(
+            f"{what}: {event.verdict}" + (f" ({event.reason})" if event.reason else "")
+        )
+
+    @contextlib.contextmanager
+    def _coming_back(self, session: CalibrationSession) -> Iterator[None]:
+        say = self.progress.say
+        try:
+            yield
+        except HoldError:
+            off = "; the shape loop is off (ctl shape on)" if session.head.shape_on else ""
+            say(
+                f"the mirror is left to whoever has command{off}; continue with --session "
+                f"{session.path}"
+            )
+            raise
+        except BaseException:
+            self.progress.interrupted = False
+            say(
+                f"stopped with {len(session.missing)} sets missing; continue with --session "
+                f"{session.path}"
+            )
+            with contextlib.suppress(HoldError, errors.DeviceError):
+                self._come_back(session)
+            raise
+        self._come_back(session)
+
+    def _come_back(self, session: CalibrationSession) -> None:
+        head = session.head
+        far_um = max(head.setpoints_um, key=lambda each: abs(each - head.start_um))
+        back_s = move_and_set_s(self.held, far_um, head.start_um, self.link.config)
+        self.progress.begin(f"back to {head.start_um:g} µm (Ctrl-C stops waiting)", back_s, 0.0)
+        try:
+            self.sweep.go(head.start_um, back_s)
+        except KeyboardInterrupt:
+            off = "; then switch the shape loop on (ctl shape on)" if head.shape_on else ""
+            self.progress.say(f"left: the hold continues its ramp to {head.start_um:g} µm{off}")
+            raise
+        if head.shape_on:
+            self.sweep.shape_loop(True)

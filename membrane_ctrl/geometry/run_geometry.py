@@ -1,0 +1,78 @@
+"""The geometry that a run uses: that of `optics.geometry_file`, copied to the run's folder."""
+
+from dataclasses import dataclass
+from pathlib import Path
+
+from membrane_ctrl.config import sight
+from membrane_ctrl.config.schema import Config, OpticsConfig
+from membrane_ctrl.geometry.file import (
+    CalibrationTable,
+    GeometryOrigin,
+    read_geometry,
+    stated_origin,
+)
+from membrane_ctrl.model import errors, files
+
+GEOMETRY_COPY = "geometry.toml"  # in the run's folder
+
+
+@dataclass(frozen=True)
+class RunGeometry:
+    """The geometry used by the cycles of a run."""
+
+    optics: OpticsConfig  # the configuration's, with the calibrated geometry if there is one
+    origin: GeometryOrigin  # its origin
+    calibration: CalibrationTable | None = None  # reference for drift
+    text: str = ""  # content of the file; empty without one
+    note: str = ""  # why the stated geometry is used although the configuration names a file
+
+    def keep(self, run_dir: Path) -> None:
+        """Copy the file to the run's folder, for its cycles and later reviews.
+        Raises InputError.
+        """
+        if not self.text:
+            return
+        with errors.writing(run_dir / GEOMETRY_COPY):
+            files.write_text_atomic(run_dir / GEOMETRY_COPY, self.text)
+
+
+def read_configured_geometry(config: Config) -> RunGeometry:
+    """Read the file named in the configuration.
+
+    A missing file is not an error: the first calibration of a bench has to use the geometry
+    measured by hand. The note says so.
+
+    Raises InputError if the file exists but cannot be used.
+    """
+    there = _read_if_present(config.optics.geometry_file, config)
+    if there.origin.file:
+        require_plausible(there.optics, Path(there.origin.file))
+    return there
+
+
+def read_run_geometry(run_dir: Path | None, config: Config) -> RunGeometry:
+    """The geometry in force of a started run, from its folder."""
+    return _read_if_present(None if run_dir is None else run_dir / GEOMETRY_COPY, config)
+
+
+def _read_if_present(path: Path | None, config: Config) -> RunGeometry:
+    optics = config.optics
+    if path is None or not path.exists():
+        wanted = optics.geometry_file
+        note = (
+            f"{wanted} does not exist yet: [optics.geometry] is used, as measured by hand"
+            if wanted
+            else ""
+        )
+        return RunGeometry(optics, stated_origin(optics), note=note)
+    file = read_geometry(path)
+    return RunGeometry(file.over(optics), file.origin, file.calibration, file.text)
+
+
+def require_plausible(optics: OpticsConfig, where: Path, depth_known: bool = True) -> None:
+    """Raises InputError for a geometry from `where` with which less than half of the mirror can be
+    measured.
+    """
+    found = sight.doubt(optics, depth_known)
+    if found is not None and found.hopeless:
+        raise errors.InputError(f"{where}: geometry.{found.key}: {found.why}; {found.remedy}")

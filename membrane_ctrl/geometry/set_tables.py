@@ -1,0 +1,83 @@
+"""Tables of `capture.toml` beyond the geometry: an artefact, and a screen that was moved."""
+
+from pathlib import Path
+from typing import Annotated, Literal
+
+import numpy as np
+from pydantic import Field
+
+from firmware_iface.settings import Section
+from membrane_ctrl.config import sight
+from membrane_ctrl.config.optics import CameraPoseConfig, ScreenPoseConfig
+from membrane_ctrl.config.schema import GeometryConfig
+from membrane_ctrl.metrology.rays.artefacts import Artefact
+from membrane_ctrl.model import errors
+from membrane_ctrl.model.arrays import FloatArray
+
+_Length = Annotated[float, Field(gt=0, le=1e6)]
+
+
+class ArtefactTable(Section):
+    """The `[artefact]` table: what is seen instead of the film."""
+
+    form: Literal["flat", "sphere", "screen"]
+    curvature_radius_mm: _Length | None = None  # of a concave sphere
+    curvature_radius_sigma_mm: _Length | None = None
+    form_sigma_um: Annotated[float, Field(ge=1e-3, le=1e3)] = 0.1  # of each Zernike term
+    # above the film's vertex at the reference displacement
+    vertex_mm: Annotated[float, Field(ge=-1e3, le=1e3)] = 0.0
+    vertex_sigma_mm: _Length = 1.0
+
+    def artefact(self, radius_mm: float, path: Path) -> Artefact | Literal["screen"]:
+        """The surface, over its disc, or the screen itself. Raises InputError."""
+        if self.form == "screen":
+            if len(self.model_fields_set) > 1:
+                raise errors.InputError(
+                    f"{path}: artefact: the screen itself needs nothing but its form"
+                )
+            return self.form
+        curvature, spread = self.curvature_radius_mm, self.curvature_radius_sigma_mm
+        for name, value in (
+            ("curvature_radius_mm", curvature),
+            ("curvature_radius_sigma_mm", spread),
+        ):
+            if (value is None) != (self.form == "flat"):
+                says = "a sphere needs it" if value is None else "a flat has none"
+                raise errors.InputError(f"{path}: artefact.{name}: {says}")
+        known = {"form_sigma_mm": 1e-3 * self.form_sigma_um, "vertex_mm": self.vertex_mm}
+        known |= {"vertex_sigma_mm": self.vertex_sigma_mm, "radius_mm": radius_mm}
+        if curvature is None or spread is None:
+            return Artefact(0.0, 0.0, **known)
+        if curvature <= radius_mm:
+            raise errors.InputError(
+                f"{path}: artefact.curvature_radius_mm = {curvature:g} must exceed mirror.radius_mm"
+            )
+        return Artefact(1 / curvature, spread / curvature**2, **known)
+
+
+class ScreenMovedTable(Section):
+    """The `[screen_moved]` table: the screen stood elsewhere than `[geometry]` says."""
+
+    shift_mm: tuple[float, float, float]  # along s_x, along s_y, towards the mirror, as measured
+    shift_sigma_mm: _Length = 1.0  # of its length
+    # of its direction; and how parallel the screen stayed
+    turn_sigma_deg: Annotated[float, Field(gt=0, le=30)] = 0.5
+
+
+def move_screen(
+    geometry: GeometryConfig, shift_mm: tuple[float, float, float], turn: FloatArray | None = None
+) -> GeometryConfig:
+    """The bench with its screen shifted in its own axes, and then turned by a matrix (3, 3) from
+    world to world.
+    """
+    pinhole, rotation, origin, s_x, s_y = sight.poses(geometry)
+    origin = origin + np.array(shift_mm) @ np.stack([s_x, s_y, np.cross(s_x, s_y)])
+    if turn is not None:
+        s_x, s_y = turn @ s_x, turn @ s_y
+    vectors = {"origin_mm": origin, "s_x": s_x, "s_y": s_y}
+    screen = (geometry.screen or ScreenPoseConfig()).model_copy(
+        update={name: tuple(value.tolist()) for name, value in vectors.items()}
+    )
+    camera = CameraPoseConfig(position_mm=pinhole.tolist(), rotation=rotation.tolist())
+    short = dict.fromkeys(("a_mm", "b_mm", "alpha_deg"))
+    return geometry.model_copy(update={**short, "camera": camera, "screen": screen})

@@ -1,0 +1,168 @@
+"""Checks before a hold creates anything: devices, latched faults, locks, interlocks."""
+
+from dataclasses import dataclass
+from datetime import UTC, datetime
+from pathlib import Path
+
+from firmware_iface.roles import ALL_FAULTS, Bench, BenchReading, LinkError
+from firmware_iface.settings import GpioLineConfig
+from membrane_ctrl.config.schema import Config, DevicesConfig
+from membrane_ctrl.controller import cross_check, interlocks, safe_levels
+from membrane_ctrl.hold.hold_options import HoldOptions
+from membrane_ctrl.hold.lock_keeper import LockStorage
+from membrane_ctrl.instruments.bench import connect_bench, make_bench, require_separate_ports
+from membrane_ctrl.instruments.lock_keys import device_keys
+from membrane_ctrl.instruments.lock_store import LockStore, require_unlocked
+from membrane_ctrl.model import errors, telemetry
+from membrane_ctrl.run_files import latched_fault
+
+_UNLOCKS = (
+    "start with --standby, then `membrane-ctrl ctl unlock WORD`; or `membrane-ctrl locks remove "
+    "WORD`"
+)
+
+
+def require_possible(devices: DevicesConfig, lab: bool) -> None:
+    """End with InputError for impossible settings, before anything is started.
+
+    An emulated lab needs no package for GPIO: it stands for these lines by a Modbus module.
+    """
+    gpio = tuple(found for found in devices.interlocks if isinstance(found, GpioLineConfig))
+    emulated = (
+        tuple(found for found in devices.interlocks if found not in gpio)
+        if lab
+        else devices.interlocks
+    )
+    require_separate_ports(devices)
+    make_bench(devices.model_copy(update={"interlocks": emulated}))
+
+
+def open_latched_fault(
+    config: Config, logs_dir: Path, options: HoldOptions
+) -> latched_fault.LatchedFile | None:
+    """The file of a latched fault, which outlives a run; the twin has one only if configured.
+
+    Raises DeviceError if a fault is latched, unless it is to be cleared or the run starts in
+    standby.
+    """
+    if options.twin and not config.states.latch_twin_faults:
+        return None
+    file = latched_fault.LatchedFile(logs_dir)
+    fault = file.read()
+    if fault is not None and options.clear_faults:
+        try:
+            file.clear()
+        except OSError as error:
+            reason = errors.os_reason(error)
+            raise errors.DeviceError(
+                f"{file.path}: cannot be cleared ({reason}); remove it by hand"
+            ) from None
+    elif fault is not None and not options.standby:
+        raise errors.DeviceError(
+            f"a fault is latched: {fault}; {fault.remedy}, then start with --clear-faults"
+        )
+    return file
+
+
+def find_locks(config: Config, options: HoldOptions) -> LockStorage | None:
+    """Return where the run keeps its locks, with those that are set; the twin keeps them only if
+    configured.
+
+    Raises DeviceError if there are any, unless the run starts in standby, where a person can remove
+    them.
+    """
+    if options.twin and not config.states.latch_twin_faults:
+        return None
+    assert config.devices is not None
+    store = LockStore.of_machine()
+    # the twin's own port may be another one at each start
+    devices = (
+        frozenset({f"twin port {options.config.twin.port}"})
+        if options.twin
+        else device_keys(config.devices)
+    )
+    if not options.standby:
+        require_unlocked(store, devices, _UNLOCKS)
+    return LockStorage(store, devices, tuple(store.find_locks(devices)))
+
+
+@dataclass(frozen=True, slots=True)
+class BoardAtStart:
+    """Faults that the board itself had latched before this run."""
+
+    latched: str = ""  # still latched, as the run starts in standby
+    cleared: str = ""  # cleared under the resume rule
+
+
+async def identify_board(
+    bench: Bench,
+    config: Config,
+    options: HoldOptions,
+    resumes: latched_fault.ResumeLog | None = None,
+) -> BoardAtStart:
+    """Identify the devices and check their fitness before making a run folder. Raises DeviceError
+    or InputError.
+    """
+    devices = config.devices
+    assert devices is not None
+    try:
+        identity = await connect_bench(bench, devices)
+        cross_check.require_sound(config, options.source, identity)
+        if options.clear_faults:
+            await bench.clear_faults(ALL_FAULTS)
+        reading = await bench.read()
+        if not options.standby:
+            _require_closed(config, reading)
+        faults = reading.latched_faults
+        if not faults:
+            return BoardAtStart()
+        what = (
+            f"{devices.name}: the board has latched faults {faults:#x} "
+            "(docs/reference/registers.md)"
+        )
+        # the last controller was killed, and nothing else happened if no other fault is latched and
+        # nobody vented
+        vented = reading.vent_fraction > safe_levels.VENTED_FRACTION
+        if (
+            faults == safe_levels.WATCHDOG_MASK
+            and not vented
+            and _may_resume("watchdog_tripped", config, resumes)
+        ):
+            await bench.clear_faults(safe_levels.WATCHDOG_MASK)
+            return BoardAtStart(
+                cleared="its watchdog had stopped the pump; cleared under resume.faults"
+            )
+    except LinkError as error:
+        raise errors.DeviceError(f"{devices.name}: {error}") from None
+    finally:
+        await bench.close()
+    if not options.standby:
+        raise errors.DeviceError(f"{what}; find the cause, then start with --clear-faults")
+    return BoardAtStart(latched=what)
+
+
+def _require_closed(config: Config, reading: BenchReading) -> None:
+    """Refuse a start that would hold the mirror while an interlock is open. Raises DeviceError."""
+    circuits = interlocks.Interlocks(config.interlocks)
+    circuits.observe_reading(reading, telemetry.State.STANDBY)
+    if circuits.open_mask:
+        raise errors.DeviceError(
+            f"{circuits.describe_open(circuits.open_mask)}; close it, or start with "
+            "--standby and hold later"
+        )
+
+
+def _may_resume(name: str, config: Config, resumes: latched_fault.ResumeLog | None) -> bool:
+    """Apply the resume rule at a start; a resume that cannot be counted is not allowed."""
+    if name not in config.resume.faults:
+        return False
+    if resumes is None:
+        return True  # the twin, which keeps no latch
+    now = datetime.now(UTC)
+    if len(resumes.ages_s(now)) >= config.resume.most_per_day:
+        return False
+    try:
+        resumes.add(now)
+    except OSError:
+        return False
+    return True

@@ -1,0 +1,197 @@
+"""Runs the ticks of a hold: connects the controller to bench, listeners and processes."""
+
+import asyncio
+import contextlib
+import gc
+import signal
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
+from functools import partial
+
+from firmware_iface.drivers.pump_board import NO_CLAIM
+from firmware_iface.roles import Bench, LinkError
+from membrane_ctrl.config.schema import Config
+from membrane_ctrl.control_port import server
+from membrane_ctrl.controller import commands, tick
+from membrane_ctrl.controller.controller import Controller
+from membrane_ctrl.hold import child_processes
+from membrane_ctrl.hold.closing_words import Closing
+from membrane_ctrl.hold.hold_options import HoldOptions
+from membrane_ctrl.hold.listeners import FaultLatch, SystemdNotify
+from membrane_ctrl.hold.lock_keeper import LockKeeper
+from membrane_ctrl.hold.start_checks import BoardAtStart
+from membrane_ctrl.hold.supervisor import Supervisor, Wiring, newest_of
+from membrane_ctrl.instruments.bench import connect_bench
+from membrane_ctrl.model import errors, events, run_events
+from membrane_ctrl.model.clock import RunClock
+from membrane_ctrl.model.lock import Lock
+from membrane_ctrl.model.program import program_identity
+from membrane_ctrl.processes import priority, ring
+from membrane_ctrl.sim.twin_process import TwinProcess
+
+
+@dataclass(frozen=True, slots=True)
+class HoldResources:
+    """What the ticks of a hold work with, made before the first tick.
+
+    Port, latch and lock keeper need the supervisor, so their makers are given.
+    """
+
+    bench: Bench
+    config: Config
+    options: HoldOptions
+    clock: RunClock
+    rings: child_processes.Rings
+    children: child_processes.ChildProcesses
+    twin: TwinProcess | None
+    board: BoardAtStart
+    make_port: Callable[[server.RunHooks], server.Port]
+    make_latch: Callable[[Callable[[events.Event], None]], FaultLatch]
+    make_keeper: Callable[
+        [Callable[[events.Event], None], Callable[[commands.Command], None]], LockKeeper
+    ]
+
+
+async def run_ticks(parts: HoldResources, closing: Closing) -> None:
+    """Run the ticks; `closing` gets the exit code and the fault in which the run ends."""
+    from membrane_ctrl.metrology.film.hencky_bowl import zernike_projection
+
+    bench, config, options = parts.bench, parts.config, parts.options
+    clock, children = parts.clock, parts.children
+    assert config.devices is not None
+    with contextlib.ExitStack() as stack:
+        wiring = _make_wiring(parts, stack)
+        controller = Controller(config, zernike_projection())
+        supervisor = Supervisor(controller, wiring, clock, config.loop.rate_hz)
+        settings = (lambda: controller.loop_config, lambda: controller.pump_config)
+        keeper = parts.make_keeper(
+            lambda event: _record_and_notify(event, supervisor, wiring), supervisor.ask
+        )
+        hooks = server.RunHooks(
+            supervisor.ask, supervisor.tell, clock.now, *settings, keeper.outcome
+        )
+        port = parts.make_port(hooks)
+        latch = parts.make_latch(supervisor.tell)
+        systemd = SystemdNotify()
+        wiring.heard = {
+            "locks": keeper.heard,  # before the port, which asks for the outcome
+            "control port": port.heard,
+            "latched-fault file": latch.heard,
+            "systemd": systemd.heard,
+            "capture": partial(_forward_captures, children, supervisor.tell),
+            "closing words": closing.heard,
+        }
+        wiring.told = {"control port": port.told, "systemd": systemd.told}
+        started = (
+            config.devices.name,
+            priority.raise_priority(),
+            parts.board.cleared,
+            program_identity(),
+        )
+        supervisor.tell(run_events.Started(*started))
+        exit_code = errors.Exit.DEVICE_FAILED
+        try:
+            _send_first_commands(supervisor, options.standby, latch, parts.board, keeper.at_start)
+            gc.collect()
+            gc.freeze()  # the collector need not visit objects that live for the whole run
+            async with port.open():
+                with _stop_on_signals(supervisor), latch, keeper, systemd:
+                    # last: the board's watchdog runs from here on
+                    if (await connect_bench(bench, config.devices)).map_version == 1:
+                        supervisor.tell(run_events.NoClaim(NO_CLAIM))
+                    closing.exit = exit_code = await supervisor.run(options.duration_s)
+        except asyncio.CancelledError:  # a signal before the first tick
+            exit_code = errors.Exit.INTERRUPTED if closing.exit is None else exit_code
+            raise
+        except LinkError as error:
+            supervisor.tell(run_events.Link(str(error), up=False))
+            raise errors.DeviceError(str(error)) from None
+        finally:
+            await bench.close()
+            ticks, missed_ticks = supervisor.ticks, supervisor.missed_ticks
+            supervisor.tell(
+                run_events.Ended(exit_code.name.lower(), int(exit_code), ticks, missed_ticks)
+            )
+
+
+def _record_and_notify(event: events.Event, supervisor: Supervisor, wiring: Wiring) -> None:
+    """Record an event, and pass it on as a child's report."""
+    supervisor.tell(event)
+    for told in wiring.told.values():
+        told(event)
+
+
+def _make_wiring(parts: HoldResources, stack: contextlib.ExitStack) -> Wiring:
+    """What the tick reads and writes, without listeners; the rings are closed with the stack."""
+    rings = parts.rings
+    rows, events, inputs, snapshots = (
+        stack.enter_context(contextlib.closing(ring.RingWriter(address)))
+        for address in (rings.telemetry, rings.events, rings.inputs, rings.snapshots)
+    )
+    shapes = (
+        stack.enter_context(contextlib.closing(ring.RingReader(rings.shapes)))
+        if rings.shapes
+        else None
+    )
+    truth = parts.twin.truth_reader() if parts.twin else None
+    newest_shape = newest_of(shapes) if shapes else None
+    reports = parts.children.reports
+    return Wiring(parts.bench, rows, events, inputs, snapshots, newest_shape, truth, reports)
+
+
+def _send_first_commands(
+    supervisor: Supervisor,
+    standby: bool,
+    latch: FaultLatch,
+    board: BoardAtStart,
+    locks: Sequence[Lock] = (),
+) -> None:
+    """The first tick's commands: hold, unless the run starts in standby; locks, faults, resumes of
+    earlier runs.
+    """
+    for lock in locks:
+        supervisor.ask(commands.Command("latch", commands.AT_START, text=lock.text, lock=lock))
+    if not standby:
+        supervisor.ask(commands.Command("hold", commands.AT_START))
+    elif latched := "; ".join(part for part in (latch.latched, board.latched) if part):
+        supervisor.ask(commands.Command("latched", commands.AT_START, text=latched))
+    for age_s in latch.resumes_s:
+        supervisor.ask(commands.Command("resumed", commands.AT_START, value=age_s))
+
+
+def _forward_captures(
+    children: child_processes.ChildProcesses,
+    tell: Callable[[events.Event], None],
+    outputs: tick.TickOutputs,
+) -> None:
+    """Pass accepted requests for a capture set to the acquisition."""
+    for event in outputs.events:
+        match event:
+            case events.CommandTaken(command="capture", refused=None) if (
+                failed := children.capture()
+            ) is not None:
+                tell(failed)
+
+
+@contextlib.contextmanager
+def _stop_on_signals(supervisor: Supervisor) -> Iterator[None]:
+    """Turn SIGINT, SIGTERM and a closed terminal into a clean stop, which begins with the safe
+    state; no Ctrl-Z.
+    """
+    loop = asyncio.get_running_loop()
+    numbers = [signal.SIGINT, signal.SIGTERM]
+    if signal.getsignal(signal.SIGHUP) != signal.SIG_IGN:  # `nohup`: continue without the terminal
+        numbers.append(signal.SIGHUP)
+    before = {number: signal.getsignal(number) for number in [*numbers, signal.SIGTSTP]}
+    for number in numbers:
+        loop.add_signal_handler(number, supervisor.ask, commands.Command("stop", number.name))
+    signal.signal(
+        signal.SIGTSTP, signal.SIG_IGN
+    )  # Ctrl-Z: without ticks the board's watchdog stops the pump
+    try:
+        yield
+    finally:
+        for number in numbers:
+            loop.remove_signal_handler(number)
+        for number, handler in before.items():
+            signal.signal(number, handler)  # asyncio leaves the default: an end without clean-up

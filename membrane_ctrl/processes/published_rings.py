@@ -1,0 +1,75 @@
+"""Publishes a run's rings: their addresses stand in a file of the run's folder."""
+
+import json
+import os
+import re
+from collections.abc import Mapping
+from contextlib import ExitStack
+from dataclasses import asdict
+from mmap import PROT_READ, mmap
+from pathlib import Path
+from typing import Any
+
+from membrane_ctrl.model.files import open_plain, read_bytes, write_text_atomic
+from membrane_ctrl.processes.ring import RingAddress, RingError, RingReader
+
+_FILE = "rings.json"
+_FILE_BYTES_MAX = 4096  # three rings take 250
+_NAME = re.compile(r"psm_[0-9a-f]{8}")  # the names that Python's `SharedMemory` gives
+_RINGS = frozenset({"telemetry", "events", "shapes"})
+_SHARED_MEMORY_FOLDER = Path("/dev/shm")
+
+
+def publish_rings(run_dir: Path, rings: Mapping[str, RingAddress | None]) -> None:
+    """Write the addresses of the existing rings. Raises OSError."""
+    found = {name: asdict(address) for name, address in rings.items() if address is not None}
+    write_text_atomic(run_dir / _FILE, json.dumps(found, indent=1) + "\n")
+
+
+def attach_rings(run_dir: Path) -> dict[str, RingReader]:
+    """Return readers of a run's rings, each at its newest message.
+
+    Raises FileNotFoundError if the run has published none or is over; OSError or RingError for
+    foreign rings.
+    """
+    readers: dict[str, RingReader] = {}
+    with ExitStack() as stack:
+        for name, address in _addresses(run_dir / _FILE).items():
+            readers[name] = RingReader(address, _mapped(address))
+            stack.callback(readers[name].close)
+            readers[name].latest()
+        stack.pop_all()
+    return readers
+
+
+def _addresses(path: Path) -> dict[str, RingAddress]:
+    text = read_bytes(path, _FILE_BYTES_MAX)
+    try:
+        return {name: _address(name, values) for name, values in json.loads(text).items()}
+    except (ValueError, TypeError, AttributeError, KeyError, RecursionError) as error:
+        raise RingError(f"{_FILE} is damaged: {error}") from None
+
+
+def _address(ring: str, values: dict[str, Any]) -> RingAddress:
+    name, slots, slot_bytes = values["name"], values["slots"], values["slot_bytes"]
+    if (
+        ring not in _RINGS
+        or not _NAME.fullmatch(name)
+        or type(slots) is not int
+        or type(slot_bytes) is not int
+    ):
+        raise RingError(f"{ring!r:.40} is not the address of a ring")
+    return RingAddress(name, slots, slot_bytes)
+
+
+def _mapped(address: RingAddress) -> mmap:
+    """Map the ring's memory read-only. Raises OSError, RingError."""
+    with open_plain(_SHARED_MEMORY_FOLDER / address.name) as file:
+        found, size_bytes = os.fstat(file.fileno()), address.size_bytes
+        if found.st_uid != os.geteuid():
+            raise RingError(f"{address.name} belongs to user {found.st_uid}: run as that user")
+        if found.st_size != size_bytes:
+            raise RingError(
+                f"{address.name} has {found.st_size} bytes, not the {size_bytes} of the ring"
+            )
+        return mmap(file.fileno(), size_bytes, prot=PROT_READ)

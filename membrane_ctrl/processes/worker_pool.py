@@ -1,0 +1,61 @@
+"""Runs a job for many items: in this process, on several processes, or on a Dask cluster."""
+
+import contextlib
+import importlib
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from typing import Any, TypeVar
+
+from membrane_ctrl.model import errors
+from membrane_ctrl.processes.child import SPAWN_CONTEXT
+
+_CONNECT_S = 30
+
+_Item = TypeVar("_Item")
+_Result = TypeVar("_Result")
+
+
+@contextlib.contextmanager
+def run_jobs(
+    job: Callable[[_Item], _Result],
+    items: Sequence[_Item],
+    workers: int = 1,
+    scheduler: str | None = None,
+) -> Iterator[Iterable[_Result]]:
+    """Results of a job for each item, in order: in this process, on processes, or on a Dask cluster
+    instead.
+
+    Raises InputError if Dask is not installed or its address is wrong, DeviceError if it does not
+    answer or a worker was killed.
+    """
+    if scheduler is not None:
+        with _dask_client(scheduler) as client:
+            yield (future.result() for future in client.map(job, items, pure=False))
+    elif workers > 1:
+        from concurrent.futures.process import BrokenProcessPool, ProcessPoolExecutor
+
+        try:
+            with ProcessPoolExecutor(workers, mp_context=SPAWN_CONTEXT) as pool:
+                yield pool.map(job, items)
+        except BrokenProcessPool:
+            raise errors.DeviceError(
+                "a worker was killed, perhaps for want of memory; use fewer --workers"
+            ) from None
+    else:
+        yield map(job, items)
+
+
+def _dask_client(address: str) -> Any:
+    try:
+        distributed = importlib.import_module("distributed")
+    except ImportError:
+        text = (
+            "--scheduler: Dask is not installed; install the extra `dask` (pip install "
+            "'membrane-ctrl[dask]')"
+        )
+        raise errors.InputError(text) from None
+    try:
+        return distributed.Client(address, timeout=_CONNECT_S)
+    except ValueError as error:
+        raise errors.InputError(f"--scheduler {address}: {error}") from None
+    except OSError as error:  # includes time-outs
+        raise errors.DeviceError(f"--scheduler {address}: does not answer ({error})") from None

@@ -1,0 +1,88 @@
+"""The film as plain numbers, and the compiled functions that give its height and slopes."""
+
+from math import cos, exp, sin
+from typing import NamedTuple
+
+import numpy as np
+from numba import njit
+
+from membrane_ctrl.model.arrays import FloatArray
+
+
+class FilmTerms(NamedTuple):
+    """A film as plain numbers; heights in mm above the vertex, which `offset_mm` puts at 0.
+
+    `bowl[k]` multiplies (r/radius)^(2k) and the sag; `poly_mm[i, k]` multiplies (x/radius)^i
+    (y/radius)^k. Rows of `ripples`: amplitude_mm, k_x and k_y in rad/mm, phase_rad; of `wrinkles`:
+    amplitude_mm, lobes, phase_rad; of `bumps`: amplitude_mm, x_mm, y_mm, sigma_mm.
+    """
+
+    radius_mm: float
+    offset_mm: float
+    bowl: FloatArray
+    poly_mm: FloatArray
+    ripples: FloatArray
+    wrinkles: FloatArray
+    bumps: FloatArray
+
+
+@njit(cache=True)
+def height_and_slopes(
+    terms: FilmTerms, sag_mm: float, x_mm: float, y_mm: float
+) -> tuple[float, float, float]:
+    """Height above the vertex (mm) and its derivatives along x and y."""
+    X, Y = x_mm / terms.radius_mm, y_mm / terms.radius_mm
+    u = X * X + Y * Y
+    bowl, bowl_u = 0.0, 0.0  # value and derivative to u, Horner
+    for k in range(len(terms.bowl) - 1, -1, -1):
+        bowl_u = bowl_u * u + bowl
+        bowl = bowl * u + terms.bowl[k]
+    h = sag_mm * bowl - terms.offset_mm
+    hx, hy = 2.0 * X * sag_mm * bowl_u, 2.0 * Y * sag_mm * bowl_u
+
+    degree = terms.poly_mm.shape[0] - 1
+    value, value_x, value_y = 0.0, 0.0, 0.0
+    for i in range(degree, -1, -1):
+        row, row_y = 0.0, 0.0
+        for k in range(degree - i, -1, -1):
+            row_y = row_y * Y + row
+            row = row * Y + terms.poly_mm[i, k]
+        value_x = value_x * X + value
+        value_y = value_y * X + row_y
+        value = value * X + row
+    h, hx, hy = h + value, hx + value_x, hy + value_y
+
+    for n in range(terms.wrinkles.shape[0]):
+        # amplitude Re((X + iY)^m e^(i phase)): m lobes at the rim
+        amplitude, phase = terms.wrinkles[n, 0], terms.wrinkles[n, 2]
+        below, order = complex(cos(phase), sin(phase)), int(terms.wrinkles[n, 1])
+        for _ in range(order - 1):
+            below *= complex(X, Y)
+        h += amplitude * (below * complex(X, Y)).real
+        hx += amplitude * order * below.real
+        hy -= amplitude * order * below.imag
+    hx, hy = hx / terms.radius_mm, hy / terms.radius_mm
+
+    for n in range(terms.ripples.shape[0]):
+        amplitude, kx, ky, phase = terms.ripples[n]
+        angle = kx * x_mm + ky * y_mm + phase
+        h += amplitude * cos(angle)
+        hx -= amplitude * kx * sin(angle)
+        hy -= amplitude * ky * sin(angle)
+    for n in range(terms.bumps.shape[0]):
+        amplitude, x0, y0, sigma = terms.bumps[n]
+        dx, dy = x_mm - x0, y_mm - y0
+        bump = amplitude * exp(-(dx * dx + dy * dy) / (2.0 * sigma * sigma))
+        h += bump
+        hx -= bump * dx / (sigma * sigma)
+        hy -= bump * dy / (sigma * sigma)
+    return h, hx, hy
+
+
+@njit(cache=True)
+def heights(terms: FilmTerms, sag_mm: float, x_mm: FloatArray, y_mm: FloatArray) -> FloatArray:
+    """Heights in mm above the vertex at the points (x, y), all (n,)."""
+    h_mm = np.empty(x_mm.size)
+    for n in range(x_mm.size):
+        h_mm[n] = height_and_slopes(terms, sag_mm, x_mm[n], y_mm[n])[0]
+    return h_mm

@@ -1,0 +1,120 @@
+"""The diaphragm pump: adds gas only, sticks at low commands, responds late."""
+
+import math
+from bisect import bisect_left
+from collections import deque
+from collections.abc import Callable
+
+import numpy as np
+
+from membrane_ctrl.config.schema import PumpConfig, TwinConfig
+from membrane_ctrl.model.arrays import FloatArray
+
+_LEVELS = 4096  # of a tabulated curve: 12 bits
+_PLAY_FRACTION = 0.04  # of the hysteretic pump, either way
+# Share of the full flow against the share of the command beyond `dead_fraction`
+_SHAPES: dict[str, Callable[[FloatArray], FloatArray]] = {
+    "quadratic": np.square,
+    "root": np.sqrt,
+    "s-shaped": lambda x: x**2 * (3 - 2 * x),
+    "saturating": lambda x: np.minimum(x / 0.6, 1.0),
+    "hysteretic": lambda x: x,
+    "pwm": lambda x: np.floor(x * 255) / 255,
+}
+
+
+class PumpModel:
+    """q = q_full (d - dead) / (1 - dead) once running; starts at `start_fraction`, stalls below
+    `stall_fraction`.
+
+    Or a curve through the configuration's points, or of `twin.pump_shape`; two branches give the
+    flow play. Raises ValueError if the pump delivers nothing at any command.
+    """
+
+    def __init__(
+        self,
+        config: PumpConfig,
+        flow_full_ml_per_s: float,
+        step_s: float,
+        twin: TwinConfig | None = None,
+    ) -> None:
+        if config.dead_fraction >= 1:
+            raise ValueError(
+                "pump.dead_fraction = 1: a pump that never delivers; it must be below 1"
+            )
+        twin = twin or TwinConfig()
+        self._dead = config.dead_fraction
+        self._start = config.start_fraction
+        self._stall = config.stall_fraction
+        self._ml_per_s_per_fraction = flow_full_ml_per_s / (1 - config.dead_fraction)
+        self._branches = _branches(config, twin.pump_shape, flow_full_ml_per_s)
+        self._play_ml_per_s = 0.0
+        self._follow = -math.expm1(-step_s / twin.pump_lag_s)
+        self._running = False
+        self._flow_ml_per_s = 0.0
+        self._tube = deque([0.0] * round(twin.pump_delay_s / step_s))
+
+    def hold(self, flow_ml_per_s: float) -> float:
+        """Settle at the command that delivers this flow, and return it.
+
+        The pump stays off if the flow is too small to keep it running.
+        """
+        command = self._dead + flow_ml_per_s / self._ml_per_s_per_fraction
+        if self._branches is not None:
+            rising = self._branches[0]
+            command = bisect_left(rising, flow_ml_per_s) / _LEVELS
+        self._running = self._stall <= command <= 1
+        self._flow_ml_per_s = self._play_ml_per_s = flow_ml_per_s if self._running else 0.0
+        self._tube = deque([self._flow_ml_per_s] * len(self._tube))
+        return command if self._running else 0.0
+
+    def step(self, command: float) -> float:
+        """One time step with the command 0..1; the flow that reaches the films in it, mL/s."""
+        self._running = command >= (self._stall if self._running else self._start)
+        if self._branches is None:
+            delivers = self._running and command > self._dead
+            target = self._ml_per_s_per_fraction * (command - self._dead) if delivers else 0.0
+        else:
+            rising, falling = self._branches
+            level = round(command * _LEVELS)
+            target = (
+                min(max(self._play_ml_per_s, rising[level]), falling[level])
+                if self._running
+                else 0.0
+            )
+            self._play_ml_per_s = target
+        self._flow_ml_per_s += (target - self._flow_ml_per_s) * self._follow
+        self._tube.append(self._flow_ml_per_s)
+        return self._tube.popleft()
+
+
+def _branches(
+    config: PumpConfig, shape: str, full_ml_per_s: float
+) -> tuple[list[float], list[float]] | None:
+    """Flow in mL/s at each level of the command, rising and falling; None for the straight line."""
+    command = np.arange(_LEVELS + 1) / _LEVELS
+    if shape != "configured":
+        play = _PLAY_FRACTION if shape == "hysteretic" else 0.0
+        shares = [
+            (command + shift - config.dead_fraction) / (1 - config.dead_fraction)
+            for shift in (-play, play)
+        ]
+        rising, falling = (
+            full_ml_per_s * _SHAPES[shape](np.clip(share, 0.0, 1.0)) for share in shares
+        )
+        falling[0] = 0.0
+        return rising.tolist(), falling.tolist()
+    if not config.curve_fraction:
+        return None
+    from scipy.interpolate import PchipInterpolator
+
+    points = np.array(config.curve_fraction)
+    scale = full_ml_per_s / config.flow_full_um_per_s
+    within = np.clip(command, points[0], points[-1])
+    rising, falling = (
+        np.where(
+            command < points[0], 0.0, scale * PchipInterpolator(points, np.array(flows))(within)
+        )
+        for flows in (config.curve_um_per_s, config.curve_falling_um_per_s or config.curve_um_per_s)
+    )
+    return rising.tolist(), falling.tolist()

@@ -1,0 +1,46 @@
+"""The sensors of the simulated bench: their noise, their resolution and the laser's dropouts."""
+
+import numpy as np
+
+from firmware_iface.emulators.pump_board import BoardSample
+from membrane_ctrl.config.schema import TwinConfig
+from membrane_ctrl.sim.truth import Truth
+
+GAUGE_NOISE_PA = 0.5  # a +-1 kPa differential sensor (assumed): 10 µm of centre, so a monitor only
+LASER_GOOD = 0
+LASER_NO_LIGHT = 1
+
+
+class Sensors:
+    """Laser, barometer, gauge and thermometers with independent noise in each sample."""
+
+    def __init__(self, config: TwinConfig, rng: np.random.Generator) -> None:
+        self._config = config
+        self._rng = rng
+        self._counter = 0
+
+    def read(self, truth: Truth) -> BoardSample:
+        """A new sample; the counter advances by one. Without light the displacement is NaN, its
+        quality not 0.
+        """
+        config = self._config
+        laser, gauge, ambient, air, gas = self._rng.standard_normal(5).tolist()
+        lost = truth.laser_lost > 0 or not config.laser
+        reading_um = truth.displacement_um + truth.laser_bias_um + config.laser_noise_um * laser
+        self._counter += 1
+        return BoardSample(
+            displacement_um=float("nan")
+            if lost
+            else _quantised(reading_um, config.laser_resolution_um),
+            displacement_quality=LASER_NO_LIGHT if lost else LASER_GOOD,
+            gauge_pressure_pa=truth.gauge_pressure_pa + GAUGE_NOISE_PA * gauge,
+            ambient_pressure_pa=truth.ambient_pressure_pa + config.barometer_noise_pa * ambient,
+            air_temperature_c=truth.air_temperature_c + config.thermometer_noise_k * air,
+            gas_temperature_c=truth.gas_temperature_c + config.thermometer_noise_k * gas,
+            sample_counter=self._counter,
+            device_time_s=truth.time_s,
+        )
+
+
+def _quantised(value: float, resolution: float) -> float:
+    return round(value / resolution) * resolution if resolution > 0 else value

@@ -1,0 +1,25 @@
+"""The command `twin`: the simulated bench on its real protocol, for any client."""
+
+import contextlib
+import signal
+from dataclasses import replace
+
+from membrane_ctrl.config.schema import Config
+from membrane_ctrl.model import clock, errors, terminal
+from membrane_ctrl.sim.twin_process import bench_spec, start_bench
+
+_STOPS = {signal.SIGINT, signal.SIGTERM}
+
+
+def serve_twin(config: Config, speed: float) -> int:
+    """Serve until SIGINT or SIGTERM; print the address on stderr. Raises DeviceError, e.g. for a
+    busy port.
+    """
+    with contextlib.ExitStack() as stack:
+        start_bench(
+            replace(bench_spec(config, clock.RunClock.start()), speed=speed, linger_s=0.0), stack
+        )
+        terminal.progress("stop it with Ctrl-C")
+        signal.pthread_sigmask(signal.SIG_BLOCK, _STOPS)
+        stopped = signal.sigwait(_STOPS)
+    return errors.Exit.INTERRUPTED if stopped == signal.SIGINT else errors.Exit.DONE
