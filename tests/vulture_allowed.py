@@ -144,3 +144,4 @@ _.sent  # of an event, written as a whole
 _.writable  # of a file that Arrow writes to
 Barometer, Thermometer  # contracts of drivers, which packages of others fill
 _.reason_code  # compared with the rest of its dataclass
+attr  # the first argument of a Bokeh callback
