@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from membrane_ctrl.model import clock, errors
+from membrane_ctrl.model import durations, errors
 
 if TYPE_CHECKING:
     from tuning.options import TuneOptions
@@ -116,8 +116,8 @@ def _step(name: str) -> None:
             author=author or find_author_name(),
             reason=reason,
             limit_um=limit_um,
-            observe_s=clock.parse_duration_s(observe),
-            verify_s=min(clock.parse_duration_s(verify), 300.0 if short else math.inf),
+            observe_s=durations.parse_duration_s(observe),
+            verify_s=min(durations.parse_duration_s(verify), 300.0 if short else math.inf),
             take_over=take_over,
             yes=yes,
             choose=choose,

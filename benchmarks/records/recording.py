@@ -18,9 +18,9 @@ from membrane_ctrl.config.schema import Config
 from membrane_ctrl.controller.tick_codec import MESSAGE_BYTES
 from membrane_ctrl.model.clock import RunClock
 from membrane_ctrl.processes.ring import RingReader, RingWriter, ring
-from membrane_ctrl.recorder.housekeeping import Optimizer
 from membrane_ctrl.recorder.recorder import Recorder
-from membrane_ctrl.recorder.sink import Recording
+from membrane_ctrl.recorder.rerun_recording import Recording
+from membrane_ctrl.recorder.segment_optimizer import Optimizer
 from membrane_ctrl.run_files import table_specs
 from membrane_ctrl.run_files.run_folder import create_run_folder
 from membrane_ctrl.run_files.table_store import writer as table_writer

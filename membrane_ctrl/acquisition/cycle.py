@@ -15,7 +15,7 @@ from firmware_iface.roles import Camera, Pixels, Screen
 from membrane_ctrl.acquisition import exposures
 from membrane_ctrl.acquisition.cycle_plan import CyclePlan
 from membrane_ctrl.model.arrays import FloatArray
-from membrane_ctrl.model.clock import pause_s
+from membrane_ctrl.model.durations import pause_s
 from membrane_ctrl.model.shape_estimate import ShapeEstimate
 from membrane_ctrl.processes.frames import FrameWriter
 

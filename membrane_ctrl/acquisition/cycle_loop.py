@@ -7,7 +7,7 @@ from pathlib import Path
 from membrane_ctrl.acquisition import exposures
 from membrane_ctrl.acquisition.cycle import CycleDone, CycleFailed, ShapeCycle
 from membrane_ctrl.acquisition.remote import Remote
-from membrane_ctrl.model import run_events, shape_estimate
+from membrane_ctrl.model import acquisition_events, shape_estimate
 
 
 def keep_cycling(
@@ -55,23 +55,25 @@ def next_deadline_s(last_s: float, period_s: float, earliest_s: float) -> float:
 
 def _capture_event(
     result: CycleDone | CycleFailed | None, keep: Callable[[shape_estimate.ShapeEstimate], Path]
-) -> run_events.Capture:
+) -> acquisition_events.Capture:
     """Result of a requested set; a rejected one is not kept."""
     match result:
         case None:
-            return run_events.Capture(failed="the cycle was stopped")
+            return acquisition_events.Capture(failed="the cycle was stopped")
         case CycleFailed(number, stage, message, _):
-            return run_events.Capture(number, failed=f"{stage}: {message}")
+            return acquisition_events.Capture(number, failed=f"{stage}: {message}")
     estimate = result.estimate
     if estimate.verdict == "rejected":
-        return run_events.Capture(estimate.cycle, failed=f"rejected: {estimate.reason}")
+        return acquisition_events.Capture(estimate.cycle, failed=f"rejected: {estimate.reason}")
     try:
         folder = keep(estimate)
     except OSError as error:
-        return run_events.Capture(estimate.cycle, failed=error.strerror or str(error))
+        return acquisition_events.Capture(estimate.cycle, failed=error.strerror or str(error))
     moved_um = estimate.displacement_um if math.isfinite(estimate.displacement_um) else None
     name = f"{folder.parent.name}/{folder.name}"
-    return run_events.Capture(estimate.cycle, name, moved_um, estimate.verdict, estimate.reason)
+    return acquisition_events.Capture(
+        estimate.cycle, name, moved_um, estimate.verdict, estimate.reason
+    )
 
 
 def _report_result(

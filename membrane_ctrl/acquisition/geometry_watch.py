@@ -8,13 +8,13 @@ from membrane_ctrl.metrology.phase import phase_steps, screen_scale
 from membrane_ctrl.metrology.rays.geometry import Geometry
 from membrane_ctrl.metrology.rays.surface import Surface
 from membrane_ctrl.metrology.reconstruction import slope_noise
-from membrane_ctrl.model import events, run_events, shape_estimate
+from membrane_ctrl.model import acquisition_events, events, shape_estimate
 
 
-def geometry_event(geometry: RunGeometry) -> run_events.GeometryInForce:
+def geometry_event(geometry: RunGeometry) -> acquisition_events.GeometryInForce:
     """The event that records the geometry."""
     origin = geometry.origin
-    return run_events.GeometryInForce(
+    return acquisition_events.GeometryInForce(
         origin.hash, origin.file or None, origin.calibrated_utc or None, geometry.note
     )
 

@@ -19,12 +19,12 @@ import tomli_w
 from firmware_iface.roles import Pattern, Pixels
 from membrane_ctrl.acquisition.cycle_plan import CyclePlan
 from membrane_ctrl.config.schema import OpticsConfig, RecordingConfig
-from membrane_ctrl.model import events, program, run_events, telemetry
+from membrane_ctrl.model import acquisition_events, events, program, telemetry
 from membrane_ctrl.model.shape_estimate import ShapeEstimate
 from membrane_ctrl.processes.frame_address import FrameAddress
 from membrane_ctrl.processes.frames import FrameHead, FrameReader
 from membrane_ctrl.processes.ring import RingAddress, RingReader
-from membrane_ctrl.run_files.disk_budget import PICTURES_FROM
+from membrane_ctrl.run_files.detail_level import PICTURES_FROM
 
 # If the disk is slower than the cycles, sets beyond this queue are omitted
 _WAITING_SETS = 3
@@ -177,7 +177,9 @@ class RawFrames:
         self.left_out += 1
         if why and why != self._told:
             self._told = why
-            self._tell(run_events.FramesLeftOut(self.left_out, f"frames are omitted: {why}"))
+            self._tell(
+                acquisition_events.FramesLeftOut(self.left_out, f"frames are omitted: {why}")
+            )
 
     def _collect(self) -> None:
         """Collect finished writes; drop a failed set, to which no other may refer."""

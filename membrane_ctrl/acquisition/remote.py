@@ -5,7 +5,7 @@ import time
 from multiprocessing.connection import Connection
 from typing import Literal
 
-from membrane_ctrl.model import events, run_events
+from membrane_ctrl.model import acquisition_events, child_events, events
 from membrane_ctrl.processes import child
 
 AcquisitionState = Literal["preparing", "running", "paused", "retrying", "failed", "stopped"]
@@ -81,7 +81,7 @@ class Remote:
         if (state, message) == self._said:
             return
         self._said = (state, message)
-        self._send(run_events.AcquisitionState(state, message, cycle, traceback))
+        self._send(acquisition_events.AcquisitionState(state, message, cycle, traceback))
 
     def tell(self, event: events.Event) -> None:
         """Record an event; it may be dropped like a report."""
@@ -96,7 +96,7 @@ class Remote:
     def _say_alive(self) -> None:
         if time.monotonic() >= self._alive_due_s:
             self._alive_due_s = time.monotonic() + _ALIVE_EVERY_S
-            self._send(run_events.Alive(self._step_s))
+            self._send(child_events.Alive(self._step_s))
 
     def _send(self, event: events.Event) -> None:
         try:

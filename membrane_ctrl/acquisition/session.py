@@ -27,7 +27,7 @@ from membrane_ctrl.geometry import run_geometry, spread_file
 from membrane_ctrl.metrology.cycle import live_reconstructor
 from membrane_ctrl.metrology.phase import pattern_sequence
 from membrane_ctrl.metrology.tracking.live_tracker import LiveTracker
-from membrane_ctrl.model.clock import pause_s
+from membrane_ctrl.model.durations import pause_s
 from membrane_ctrl.model.shape_estimate import ShapeEstimate, pack_estimate
 from membrane_ctrl.processes import child, frames, ring
 from membrane_ctrl.sim.optics.camera import FilmPosition, TwinOptics

@@ -8,13 +8,13 @@ from pathlib import Path
 
 from membrane_ctrl.config.schema import Config
 from membrane_ctrl.metrology.vibrations.mode_follower import Heard, Stethoscope
-from membrane_ctrl.model import files, plain_json
+from membrane_ctrl.model import file_checksums, files, plain_json
 from membrane_ctrl.model.clock import RunClock
 from membrane_ctrl.model.events import Event
 from membrane_ctrl.model.program import file_origin, remove_origin
 from membrane_ctrl.model.shape_estimate import ShapeEstimate
 from membrane_ctrl.model.state_tree import decode_state, encode_state
-from membrane_ctrl.run_files import run_folder
+from membrane_ctrl.run_files import run_config
 
 _VIBRATIONS_FILE = "vibrations.json"  # in the run's folder
 _HEARD_SCHEMA = "membrane-vibrations/1"
@@ -39,7 +39,7 @@ def vibration_listener(
             with suppress(OSError):  # a full disk: the recorder says so
                 heard = json.loads(encode_state(stethoscope.heard))
                 table = {**file_origin(_HEARD_SCHEMA), "heard": heard}
-                text = plain_json.dumps_checked(table)
+                text = file_checksums.dumps_checked(table)
                 files.write_text_atomic(run_dir / _VIBRATIONS_FILE, text + "\n")
         return told
 
@@ -49,7 +49,7 @@ def vibration_listener(
 def _read_earlier(config: Config, run_dir: Path) -> Heard | None:
     for path in sorted(run_dir.parent.glob(f"*/{_VIBRATIONS_FILE}"), reverse=True):
         run = path.parent
-        if run.name > run_dir.name or _bench_name(run_folder.read_config(run, [])) != _bench_name(
+        if run.name > run_dir.name or _bench_name(run_config.read_config(run, [])) != _bench_name(
             config
         ):
             continue
@@ -63,7 +63,7 @@ def _read_earlier(config: Config, run_dir: Path) -> Heard | None:
 def _read_heard(path: Path) -> Heard:
     """Read what an acquisition has heard. Raises OSError; ValueError for a damaged file."""
     table = plain_json.loads(files.read_text(path, _FILE_BYTES_MAX))
-    if not isinstance(table, dict) or not plain_json.take_checksum(table):
+    if not isinstance(table, dict) or not file_checksums.take_checksum(table):
         raise ValueError(f"{path}: damaged")
     remove_origin(table, _HEARD_SCHEMA)
     return decode_state(json.dumps(table.get("heard")).encode(), Heard, _FILE_BYTES_MAX)

@@ -20,8 +20,9 @@ from membrane_ctrl.alarms.book import AlarmBook, AlarmMessage, Sign, sign_of_val
 from membrane_ctrl.alarms.sending import Service, limited_memory, send_to_all
 from membrane_ctrl.config import schema
 from membrane_ctrl.config.port import AlarmsConfig
-from membrane_ctrl.model import errors, files, run_events
-from membrane_ctrl.model.clock import RunClock, pause_s
+from membrane_ctrl.model import child_events, errors, event_lines, files, port_events
+from membrane_ctrl.model.clock import RunClock
+from membrane_ctrl.model.durations import pause_s
 from membrane_ctrl.model.events import CommandTaken, Event, EventLine
 from membrane_ctrl.model.run_status import RunStatus
 from membrane_ctrl.model.telemetry import TelemetryRow
@@ -213,11 +214,11 @@ class Watcher:
         self._send(now_s)
 
     def _take_event(self, line: EventLine, now_s: float) -> None:
-        event = run_events.from_dict(line)
+        event = event_lines.from_dict(line)
         signs = signs_of(event.notice_changes(self._status.notices))
         self._status = self._status.after_event(event)
         match event:
-            case run_events.AlarmsAcknowledged() | CommandTaken(command="ack"):
+            case port_events.AlarmsAcknowledged() | CommandTaken(command="ack"):
                 # whoever sends `ack` has seen the alarms, even if the hold refuses it
                 self._book.acknowledge()
         for sign in signs:
@@ -290,11 +291,11 @@ def watch(
             lives = (
                 parent_lives()
             )  # before the rings: a dying parent has written its last message first
-            report(run_events.Alive(_SENDING_S))
+            report(child_events.Alive(_SENDING_S))
             watcher.look(telemetry.drain(), events.drain(), clock.now())
             if watcher.ended or not lives:
                 break
-            report(run_events.Alive(_IDLE_S))
+            report(child_events.Alive(_IDLE_S))
             time.sleep(_LOOK_S)
         if not watcher.ended:
             watcher.orphaned(clock.now())
@@ -309,7 +310,7 @@ def _reporting(send: Send, to: str, report: Callable[[Event], None]) -> Send:
     def sending(message: AlarmMessage) -> bool:
         through = send(message)
         report(
-            run_events.AlarmTold(
+            port_events.AlarmTold(
                 alarm=message.name,
                 what=message.kind,
                 severity=message.severity,

@@ -14,7 +14,7 @@ from membrane_ctrl.calibration.setpoints import (
 )
 from membrane_ctrl.config.schema import LimitsConfig
 from membrane_ctrl.controller.commands import Command, Kind
-from membrane_ctrl.model import errors, events, run_events, telemetry
+from membrane_ctrl.model import acquisition_events, errors, events, telemetry
 from membrane_ctrl.sessions.live_hold import HoldError, HoldLink, News
 
 WHY = "calibration of the optics"
@@ -110,7 +110,7 @@ class Sweep:
                     "s; paused, or too tight?"
                 )
 
-    def take(self) -> run_events.Capture:
+    def take(self) -> acquisition_events.Capture:
         """Request a set; repeat a bad one once.
 
         Raises HoldError if the hold refuses or the mirror is no longer held; RejectedError if both
@@ -128,14 +128,18 @@ class Sweep:
         """Switch the shape loop."""
         self._ask("shape_on" if on else "shape_off")
 
-    def _capture(self) -> run_events.Capture:
+    def _capture(self) -> acquisition_events.Capture:
         self._ask("capture")
         begin_s = self._last_s
         while self._last_s - begin_s < _SET_WITHIN_S:
-            told = [event for event in self._news().events if isinstance(event, run_events.Capture)]
+            told = [
+                event
+                for event in self._news().events
+                if isinstance(event, acquisition_events.Capture)
+            ]
             if told:
                 return told[-1]
-        return run_events.Capture(failed=f"no set within {_SET_WITHIN_S:.0f} s")
+        return acquisition_events.Capture(failed=f"no set within {_SET_WITHIN_S:.0f} s")
 
     def _inside(self, rows: deque[telemetry.TelemetryRow]) -> bool:
         last = [row.error_um for row in rows if rows[-1].mono_s - row.mono_s <= _MEAN_S]

@@ -11,7 +11,7 @@ import typer
 from typer.core import TyperGroup
 
 from membrane_ctrl.cli.options import JsonOption
-from membrane_ctrl.model import clock
+from membrane_ctrl.model import durations
 from membrane_ctrl.model.numbers import parse_number
 
 WhyOption = Annotated[str, typer.Option(help="Reason, recorded with the command.")]
@@ -160,7 +160,9 @@ def _manual(flow: FlowArgument) -> dict[str, Any]:
 def _gains(loop: GainsArgument, trial: TrialOption = "") -> dict[str, Any]:
     from membrane_ctrl.control_port.ctl import loop_keys
 
-    return {"loop": loop_keys(loop)} | ({"value": clock.parse_duration_s(trial)} if trial else {})
+    return {"loop": loop_keys(loop)} | (
+        {"value": durations.parse_duration_s(trial)} if trial else {}
+    )
 
 
 def _mark(text: TextArgument) -> dict[str, Any]:
@@ -180,7 +182,7 @@ def _shape(on: OnArgument) -> dict[str, Any]:
 
 
 def _watch(every: EveryOption = "1s") -> dict[str, Any]:
-    return {"period_s": clock.parse_duration_s(every)}
+    return {"period_s": durations.parse_duration_s(every)}
 
 
 _OWN: dict[str, Callable[..., dict[str, Any]]] = {

@@ -9,7 +9,7 @@ import typer
 
 from membrane_ctrl.cli.ctl import ctl_app
 from membrane_ctrl.cli.options import ConfigArgument, ConfigOption, JsonOption, configured
-from membrane_ctrl.model import clock, errors, terminal
+from membrane_ctrl.model import durations, errors, terminal
 
 if TYPE_CHECKING:
     from membrane_ctrl.config.schema import Config
@@ -86,7 +86,7 @@ def hold(
 ) -> int:
     """Hold the mirror until told to stop."""
     settings = _started(_with_devices(config, devices, twin), from_flat)
-    duration_s = None if duration is None else clock.parse_duration_s(duration)
+    duration_s = None if duration is None else durations.parse_duration_s(duration)
     terminal.progress("loading the control program")
     from membrane_ctrl.hold.hold_options import HoldOptions
     from membrane_ctrl.hold.start import hold_mirror

@@ -8,7 +8,8 @@ from typing import Annotated
 import typer
 
 from membrane_ctrl.cli.options import FromOption, JsonOption, RunArgument, ToOption
-from membrane_ctrl.model import errors
+from membrane_ctrl.model import durations, errors
+from membrane_ctrl.review import run_times
 
 LogsOption = Annotated[Path, typer.Option("--logs", help="Folder of the runs.")]
 
@@ -67,7 +68,7 @@ def review(
     """
     runs = runs or []
     if runs[:1] == ["mark"]:  # what follows is text, too, and a path would lose its double slashes
-        from membrane_ctrl.review.runs import mark_command
+        from membrane_ctrl.review.mark import mark_command
 
         return mark_command(runs[1:], at)
     from membrane_ctrl.review.viewer.command import ReviewOptions, review_command
@@ -148,7 +149,7 @@ def report(
         raise errors.InputError(f"{runs[1]}: one run at a time; --fleet makes one page of several")
     if workers is not None or scheduler is not None:
         raise errors.InputError("--workers and --scheduler are for --fleet")
-    from membrane_ctrl.review.report.html import report_command
+    from membrane_ctrl.review.report.command import report_command
 
     return report_command(runs[0], out, compare, start, end, json)
 
@@ -171,7 +172,7 @@ def export_run(
     ] = None,
 ) -> int:
     """Export a run's columns for other programs."""
-    from membrane_ctrl.review.runs import export_command
+    from membrane_ctrl.review.export import export_command
 
     return export_command(run, form, out, streams or [], start, end)
 
@@ -204,7 +205,6 @@ def list_runs(
     json: JsonOption = False,
 ) -> int:
     """List the runs of one folder or more, oldest first."""
-    from membrane_ctrl.model import clock
     from membrane_ctrl.review.catalogue import Filter
     from membrane_ctrl.review.runs import list_command
 
@@ -221,7 +221,7 @@ def list_runs(
                 f"{told} in front of `{context.invoked_subcommand}` belongs after it"
             )
         return 0
-    least_s = None if longer is None else clock.parse_duration_s(longer)
+    least_s = None if longer is None else durations.parse_duration_s(longer)
     wanted = Filter(
         least_s=least_s,
         most_std_um=std_um,
@@ -285,7 +285,7 @@ def replay(
 
     with _files_of_the_run():
         folder = catalogue.resolve(run_dir)
-        from_s, to_s = catalogue.part_s(open_run(folder).origin_utc, start, end)
+        from_s, to_s = run_times.part_s(open_run(folder).origin_utc, start, end)
         return replay_command(folder, max(0.0, from_s), to_s, to_test, json, state)
 
 

@@ -10,7 +10,7 @@ from contextlib import suppress
 from dataclasses import dataclass
 from typing import Any
 
-from membrane_ctrl.model import terminal
+from membrane_ctrl.model import job_control
 
 _LINE_MODES = 3  # of what `termios.tcgetattr` returns
 _CONTROL_CHARACTERS = 6
@@ -37,7 +37,7 @@ class Keyboard:
     def restore(self) -> None:
         """Restore the modes after a killed console; in the background they are the shell's."""
         with suppress(OSError, termios.error):
-            if terminal.in_foreground(0):
+            if job_control.in_foreground(0):
                 termios.tcsetattr(0, termios.TCSANOW, self.modes)
 
 
@@ -53,7 +53,7 @@ class KeyReader:
 
     def read(self) -> str:
         """What was typed since the last call; empty in the background."""
-        if not terminal.in_foreground(self._handle):
+        if not job_control.in_foreground(self._handle):
             return ""
         with suppress(OSError, termios.error):  # nothing was typed, or the terminal has gone
             if not self._is_ours():  # also after the shell had the terminal

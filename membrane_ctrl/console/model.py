@@ -10,13 +10,21 @@ from statistics import fmean, pstdev
 from membrane_ctrl.config.schema import Config
 from membrane_ctrl.console.why import duration, go_on, number, why
 from membrane_ctrl.control.leak_estimate import JUDGE_S, TOO_TIGHT_UM_PER_S
-from membrane_ctrl.model import events, run_events, run_status, shape_estimate, telemetry
+from membrane_ctrl.model import (
+    acquisition_events,
+    child_events,
+    event_lines,
+    events,
+    run_status,
+    shape_estimate,
+    telemetry,
+)
 from membrane_ctrl.model.lock import describe_lock
 
 MINUTE_S = 60
 TREND_S = 240  # the widest terminal shows this much
 _EVENTS_KEPT = 60
-_NOT_LISTED = events.Why | run_events.Alive  # the headline shows the first
+_NOT_LISTED = events.Why | child_events.Alive  # the headline shows the first
 SILENT_S = 1.0  # the control process hangs if no row comes for this long
 
 
@@ -142,7 +150,7 @@ class ConsoleModel:
 
     def take_event(self, line: events.EventLine) -> None:
         """Take one event, a line of `events.jsonl`."""
-        event = run_events.from_dict(line)
+        event = event_lines.from_dict(line)
         self._status = self._status.after_event(event, line.get("mono_s", math.nan))
         if not isinstance(event, _NOT_LISTED):
             self._events.append(line)
@@ -242,7 +250,7 @@ class ConsoleModel:
         )
 
 
-def _acquisition_words(said: run_events.AcquisitionState | None) -> str:
+def _acquisition_words(said: acquisition_events.AcquisitionState | None) -> str:
     return (
         ""
         if said is None or said.state == "running"
@@ -260,4 +268,4 @@ def fault_words(fault: events.Fault | None) -> str:
 
 def event_line(line: events.EventLine) -> str:
     """Format an event as one line of a log."""
-    return f"{number(line.get('mono_s', math.nan), 1):>9} s  {run_events.from_dict(line).sentence}"
+    return f"{number(line.get('mono_s', math.nan), 1):>9} s  {event_lines.from_dict(line).sentence}"

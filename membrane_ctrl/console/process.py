@@ -20,7 +20,15 @@ from membrane_ctrl.config.port import SOCKET_NAME
 from membrane_ctrl.config.schema import Config
 from membrane_ctrl.console import key_reader, keys, model, requests, why
 from membrane_ctrl.console.view import ConsolePage
-from membrane_ctrl.model import clock, run_events, shape_estimate, telemetry, terminal
+from membrane_ctrl.model import (
+    child_events,
+    clock,
+    event_lines,
+    job_control,
+    shape_estimate,
+    telemetry,
+    terminal,
+)
 from membrane_ctrl.model.events import EventLine
 from membrane_ctrl.processes import child, event_pipe, ring
 
@@ -96,7 +104,7 @@ def console_main(spec: ConsoleSpec, status: Connection | None = None) -> None:
         def rounds(show: Callable[[], object]) -> None:
             while not feed.model.ended and child.parent_lives():
                 show()
-                report(run_events.Alive(_HANGS_S))
+                report(child_events.Alive(_HANGS_S))
                 time.sleep(_LOOK_S)
 
         try:
@@ -176,7 +184,7 @@ def _live(console: Console, spec: ConsoleSpec, feed: _Feed) -> Iterator[Callable
 
         def show() -> None:
             feed.update()
-            if not terminal.in_foreground(handle):
+            if not job_control.in_foreground(handle):
                 live.stop()
                 return
             view = feed.model.view(spec.clock.now())
@@ -220,7 +228,8 @@ def _plain(spec: ConsoleSpec, feed: _Feed) -> Iterator[Callable[[], None]]:
         lines = [
             model.event_line(event)
             for event in feed.update()
-            if run_events.from_dict(event).notable and event.get("mono_s", math.inf) >= spec.since_s
+            if event_lines.from_dict(event).notable
+            and event.get("mono_s", math.inf) >= spec.since_s
         ]
         now_s = spec.clock.now()
         if now_s >= due_s:

@@ -18,8 +18,8 @@ from membrane_ctrl.console.why import duration, holders, number, percent
 from membrane_ctrl.model import columns, telemetry
 from membrane_ctrl.model.columns import COLUMNS, MISSING, PUBLISHED, TERMS, columns_of
 from membrane_ctrl.model.event_base import Event, LogLevel
+from membrane_ctrl.model.event_lines import from_dict
 from membrane_ctrl.model.events import StateEntered
-from membrane_ctrl.model.run_events import from_dict
 
 _LOCKS_SHOWN = 3  # a low terminal needs room for the figures; `ctl status` lists all
 _NOTICES_SHOWN = 3

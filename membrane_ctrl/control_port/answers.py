@@ -182,7 +182,7 @@ class StatusPart(_Part):
 
 
 class EventPart(_Part):
-    """An event; its other keys depend on its kind (`run_events.from_dict` checks them)."""
+    """An event; its other keys depend on its kind (`event_lines.from_dict` checks them)."""
 
     kind: _Name
     mono_s: _Number | None = None

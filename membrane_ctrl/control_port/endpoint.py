@@ -15,7 +15,7 @@ import struct
 from collections import Counter, OrderedDict
 from collections.abc import Awaitable, Callable
 
-from membrane_ctrl.model import clock, events, run_events
+from membrane_ctrl.model import durations, events, port_events
 
 BACKLOG = 64  # connections that may wait; the kernel refuses more
 _INSIDE_MOST = 32
@@ -110,13 +110,13 @@ class Endpoint:
                 came_in = await self._accept(turns)
             except Exception as error:
                 failures += 1
-                again_s = clock.pause_s(failures, _AGAIN_S)
-                self._tell(run_events.PortFailed(self._name, str(error), again_s))
+                again_s = durations.pause_s(failures, _AGAIN_S)
+                self._tell(port_events.PortFailed(self._name, str(error), again_s))
                 await asyncio.sleep(again_s)
                 continue
             if failures:
                 failures = 0
-                self._tell(run_events.PortOpen(self._name))
+                self._tell(port_events.PortOpen(self._name))
             await asyncio.sleep(_PAUSE_S if came_in else _TURN_AWAY_S)
 
     async def _accept(self, turns: Turns) -> bool:
@@ -167,7 +167,7 @@ class Endpoint:
         try:
             await self._welcome(connection, lambda: self._strangers.pop(task, None))
         except Exception as error:  # one client's error must not affect the others
-            self._tell(run_events.PortFailed(self._name, f"{type(error).__name__}: {error}"))
+            self._tell(port_events.PortFailed(self._name, f"{type(error).__name__}: {error}"))
         finally:
             connection.close()
 
@@ -198,6 +198,6 @@ class Refusals:
             return
         self._left -= 1.0
         self._tell(
-            run_events.Refused(who, command, why, reason, and_unrecorded=self._unsaid or None)
+            port_events.Refused(who, command, why, reason, and_unrecorded=self._unsaid or None)
         )
         self._unsaid = 0

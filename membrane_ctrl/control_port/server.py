@@ -28,7 +28,7 @@ from membrane_ctrl.control_port.session import PortSession
 from membrane_ctrl.control_port.status import status_table
 from membrane_ctrl.controller import commands, cross_check_plant, tick
 from membrane_ctrl.instruments.lock_store import draw_word
-from membrane_ctrl.model import errors, events, run_events, telemetry
+from membrane_ctrl.model import errors, events, port_events, telemetry
 from membrane_ctrl.model.columns import COLUMNS
 from membrane_ctrl.model.lock import Lock
 from membrane_ctrl.model.run_status import RunStatus
@@ -118,7 +118,7 @@ class Port:
         for endpoint in endpoints:
             endpoint.open()
         if endpoints:
-            self._tell(run_events.PortAddresses(**listeners.addresses))
+            self._tell(port_events.PortAddresses(**listeners.addresses))
         try:
             yield
         finally:
@@ -191,7 +191,7 @@ class Port:
             self._sessions.remove(session)
             if (ended := self._commander.end_session(session.id)) is not None:
                 self._tell(
-                    run_events.CommanderChanged(None, ended.describe(), "its connection is closed")
+                    port_events.CommanderChanged(None, ended.describe(), "its connection is closed")
                 )
             if expiry is not None:
                 expiry.cancel()
@@ -296,7 +296,7 @@ class Port:
             return refusal
         name = who if present is None else present.describe()
         former_name = former if former_session is None else former_session.describe()
-        self._tell(run_events.CommanderChanged(name, former_name or None, request.why))
+        self._tell(port_events.CommanderChanged(name, former_name or None, request.why))
         reason = f": {request.why}" if request.why else ""
         for other in self._sessions:
             of_session = former_session is not None and other.id == former_session.id
@@ -314,7 +314,7 @@ class Port:
             case "release":
                 self._release_command(session, request.why)
             case "quiet":
-                self._tell(run_events.AlarmsAcknowledged(sender.who, request.why))
+                self._tell(port_events.AlarmsAcknowledged(sender.who, request.why))
         return {
             "ok": True,
             "status": self.status(),
@@ -328,7 +328,7 @@ class Port:
             return  # another session's
         self._commander.release(who, session.id)
         former = who if in_command is None else in_command.describe()
-        self._tell(run_events.CommanderChanged(None, former, why))
+        self._tell(port_events.CommanderChanged(None, former, why))
 
     def _command(self, sender: Sender, request: protocol.Request) -> commands.Command:
         """The command of a request. Raises InputError for invalid

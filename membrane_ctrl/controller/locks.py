@@ -9,7 +9,8 @@ from dataclasses import dataclass, replace
 from enum import StrEnum
 
 from membrane_ctrl.controller.commands import AT_START, Command
-from membrane_ctrl.model.lock import LOCKS_MOST, Lock, describe_locks, distinct_word
+from membrane_ctrl.model.lock import LOCKS_MOST, Lock, describe_locks
+from membrane_ctrl.model.lock_words import distinct_word
 
 # These let gas into the mirror; while a lock is set they are refused
 LIFTING = frozenset({"hold", "manual", "tune", "resume"})

@@ -13,7 +13,7 @@ import tomli_w
 from firmware_iface.settings import Section
 from membrane_ctrl.config import toml_file
 from membrane_ctrl.config.schema import CameraConfig, GeometryConfig, OpticsConfig
-from membrane_ctrl.model import errors, plain_json
+from membrane_ctrl.model import errors, geometry_hash
 
 Table = TypeVar("Table", bound=Section)
 
@@ -105,10 +105,10 @@ def read_geometry(path: str | Path) -> GeometryFile:
     """
     path = Path(path)
     tables = toml_file.read_toml(path)
-    calibrated = tables.get("schema") == plain_json.SCHEMA
+    calibrated = tables.get("schema") == geometry_hash.SCHEMA
     table = tables.get("geometry", tables)
     toml_file.with_height_map(table, path)
-    hashed = plain_json.content_hash(tables if "geometry" in tables else {"geometry": tables})
+    hashed = geometry_hash.content_hash(tables if "geometry" in tables else {"geometry": tables})
     text = tomli_w.dumps(tables)
     if isinstance(table, dict):
         toml_file.prune(table, GeometryConfig)
@@ -143,7 +143,7 @@ def stated_origin(optics: OpticsConfig) -> GeometryOrigin:
         "camera": {**lens, "principal_px": optics.camera.principal},
         "pattern": {"period_mm": optics.pattern.period_mm},
     }
-    return GeometryOrigin(plain_json.content_hash(tables))
+    return GeometryOrigin(geometry_hash.content_hash(tables))
 
 
 def _optional_table(

@@ -12,8 +12,15 @@ from pathlib import Path
 from membrane_ctrl.config.port import WebConfig
 from membrane_ctrl.config.schema import Config
 from membrane_ctrl.controller.tick_codec import MESSAGE_BYTES, SNAPSHOT_MESSAGE_BYTES
-from membrane_ctrl.model import events, run_events, telemetry
-from membrane_ctrl.model.clock import RunClock, pause_s
+from membrane_ctrl.model import (
+    acquisition_events,
+    child_events,
+    event_lines,
+    events,
+    telemetry,
+)
+from membrane_ctrl.model.clock import RunClock
+from membrane_ctrl.model.durations import pause_s
 from membrane_ctrl.model.shape_estimate import ESTIMATE_BYTES_MAX
 from membrane_ctrl.processes.child import Child
 from membrane_ctrl.processes.command_process import CommandProcess
@@ -41,9 +48,9 @@ class ManagedChild:
     """A child process that is replaced when it ends or falls silent; `child` is the current one.
 
     A child reports about once a second that it is alive, and how long it may now be silent
-    (`run_events.Alive`). A stopped or hung child breaks that promise and is killed. `make` gets the
-    number of earlier children and returns the next one, not yet started, with our end of its pipe.
-    A program reports nothing (`reports` is false): only its end is noticed.
+    (`child_events.Alive`). A stopped or hung child breaks that promise and is killed. `make` gets
+    the number of earlier children and returns the next one, not yet started, with our end of its
+    pipe. A program reports nothing (`reports` is false): only its end is noticed.
     """
 
     def __init__(self, make: Make, reports: bool = True) -> None:
@@ -84,17 +91,17 @@ class ManagedChild:
         name = self.child.name
         if self._ended_s is None:
             self._ended_s = now_s
-            said.append(run_events.ChildEnded(name, self.child.exit_code))
+            said.append(child_events.ChildEnded(name, self.child.exit_code))
         if self._used_up(now_s):
             if not self._given_up:
                 self._given_up = True
-                said.append(run_events.ChildGivenUp(name, len(self._replaced_s)))
+                said.append(child_events.ChildGivenUp(name, len(self._replaced_s)))
             return said
         # at once, then at growing intervals: a child that dies at its start must not keep the
         # machine busy
         if now_s - self._ended_s >= pause_s(len(self._replaced_s)):
             self.replace(now_s)
-            said.append(run_events.ChildRestarted(name, self._count))
+            said.append(child_events.ChildRestarted(name, self._count))
         return said
 
     def replace(self, now_s: float) -> None:
@@ -116,7 +123,7 @@ class ManagedChild:
         killed = not self._used_up(now_s)
         if killed:
             self.child.kill()
-        return run_events.ChildSilent(self.child.name, late_s, killed)
+        return child_events.ChildSilent(self.child.name, late_s, killed)
 
     def _used_up(self, now_s: float) -> bool:
         """Whether this hour's replacements are spent."""
@@ -128,8 +135,8 @@ class ManagedChild:
         said: list[events.Event] = []
         try:
             while self._line.poll():
-                event = run_events.from_dict(self._line.recv())
-                if isinstance(event, run_events.Alive):
+                event = event_lines.from_dict(self._line.recv())
+                if isinstance(event, child_events.Alive):
                     self._expected_s, self._silent = now_s + event.for_s, False
                 else:
                     said.append(event)
@@ -279,9 +286,9 @@ class ChildProcesses:
         impossible.
         """
         if self._acquisition is None:
-            return run_events.Capture(failed="no shape measurement in this run")
+            return acquisition_events.Capture(failed="no shape measurement in this run")
         if not self._acquisition.send("capture"):
-            return run_events.Capture(
+            return acquisition_events.Capture(
                 failed="the acquisition does not answer; it may be restarting"
             )
         return None

@@ -20,7 +20,8 @@ from membrane_ctrl.controller.commands import AT_START, Command
 from membrane_ctrl.instruments.lock_store import LockStore, StoredLock
 from membrane_ctrl.model import events, run_events
 from membrane_ctrl.model.errors import os_reason
-from membrane_ctrl.model.lock import Lock, distinct_word
+from membrane_ctrl.model.lock import Lock
+from membrane_ctrl.model.lock_words import distinct_word
 
 _LOOK_S = 1.0  # for locks that other programs store
 _RETRY_S = 10.0  # of a write that failed

@@ -15,6 +15,7 @@ from membrane_ctrl.hold import scenario_file, scenario_run, scenarios
 from membrane_ctrl.hold.closing_words import report
 from membrane_ctrl.model import clock, program, run_events, telemetry, terminal
 from membrane_ctrl.processes import child, ring
+from membrane_ctrl.recorder import rerun_recording
 from membrane_ctrl.recorder.process import prepare_rerun
 from membrane_ctrl.run_files.run_folder import create_run_folder
 
@@ -87,7 +88,7 @@ def _record(
 ) -> None:
     """Run all ticks and record them, in this process: virtual time waits for the disk."""
     prepare_rerun()
-    from membrane_ctrl.recorder import recorder, sink
+    from membrane_ctrl.recorder import recorder
 
     virtual, config = run.virtual, run.config
     recorded = ("inputs", "snapshots", "events", "shapes")
@@ -96,7 +97,7 @@ def _record(
             n: stack.enter_context(contextlib.closing(ring.RingReader(addresses[n])))
             for n in recorded
         }
-        recording = sink.Recording(run_dir, name, virtual.clock, config)
+        recording = rerun_recording.Recording(run_dir, name, virtual.clock, config)
         files = recorder.Recorder(
             run_dir, virtual.clock, config, readers, recording, None, virtual.tell
         )

@@ -33,7 +33,7 @@ from membrane_ctrl.hold.tick_run import HoldResources, run_ticks
 from membrane_ctrl.instruments.bench import make_bench
 from membrane_ctrl.instruments.device_claim import claim_devices
 from membrane_ctrl.instruments.device_names import device_names
-from membrane_ctrl.model import errors, terminal
+from membrane_ctrl.model import errors, job_control, terminal
 from membrane_ctrl.model.clock import RunClock
 from membrane_ctrl.processes import published_rings
 from membrane_ctrl.run_files import latched_fault, run_folder
@@ -62,7 +62,7 @@ def hold_mirror(options: HoldOptions) -> int:
     geometry = read_configured_geometry(options.config)
     clock = RunClock.start()
     # SIGTERM before and after the ticks cleans up as well
-    with terminal.ends_as_by_ctrl_c(), contextlib.ExitStack() as stack:
+    with job_control.ends_as_by_ctrl_c(), contextlib.ExitStack() as stack:
         logs_dir = options.logs_dir or Path(options.config.recording.logs_dir)
         # a second hold ends here, devices untouched
         listeners = sockets.listeners_for(options.config.port, logs_dir, stack)

@@ -22,7 +22,8 @@ from pathlib import Path
 
 from membrane_ctrl.model import files
 from membrane_ctrl.model.errors import DeviceError, os_reason
-from membrane_ctrl.model.lock import WORDS, Lock, describe_locks, distinct_word, word_of_number
+from membrane_ctrl.model.lock import Lock, describe_locks
+from membrane_ctrl.model.lock_words import WORDS, distinct_word, word_of_number
 from membrane_ctrl.model.program import file_origin
 
 VARIABLE = "MEMBRANE_CTRL_LOCKS"

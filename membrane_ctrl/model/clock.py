@@ -6,13 +6,9 @@ reads the same everywhere. UTC is read once at the start: a stepped wall clock h
 
 from __future__ import annotations
 
-import re
 import time
 from dataclasses import dataclass
 from datetime import UTC, datetime, timedelta
-
-from membrane_ctrl.model.errors import InputError
-from membrane_ctrl.model.numbers import parse_number
 
 
 @dataclass(frozen=True, slots=True)
@@ -34,33 +30,3 @@ class RunClock:
     def utc(self, mono_s: float) -> datetime:
         """UTC of a moment on the run's axis."""
         return self.origin_utc + timedelta(seconds=mono_s)
-
-
-def pause_s(failures: int, first_s: float = 1.0, longest_s: float = 60.0) -> float:
-    """Wait after a number of consecutive failures: `first_s`, doubled with each; 0 without a
-    failure.
-    """
-    return 0.0 if failures < 1 else min(longest_s, first_s * 2.0 ** min(failures - 1, 32))
-
-
-_SECONDS = {"d": 86400.0, "h": 3600.0, "m": 60.0, "s": 1.0}
-_PART = re.compile(r"([0-9]+(?:\.[0-9]+)?)([dhms])")
-
-
-def parse_duration_s(text: str) -> float:
-    """Seconds of a positive duration such as `90`, `40s`, `3m`, `2h30m` or `1d`.
-    Raises InputError.
-    """
-    compact = text.strip().lower().replace(" ", "")
-    try:
-        seconds = parse_number(compact)
-    except ValueError:
-        parts = _PART.findall(compact)
-        if not parts or "".join(number + unit for number, unit in parts) != compact:
-            raise InputError(
-                f"duration {text!r} is not valid; write it like 90s, 3m or 2h30m"
-            ) from None
-        seconds = sum(float(number) * _SECONDS[unit] for number, unit in parts)
-    if not 0 < seconds < 1e9:
-        raise InputError(f"duration {text!r} must be more than 0")
-    return seconds

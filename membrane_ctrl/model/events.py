@@ -1,4 +1,4 @@
-"""Events of the controller, one class per kind; `run_events` has those of the other processes."""
+"""Events of the controller, one class per kind; `event_lines` reads all kinds."""
 
 from enum import StrEnum
 from typing import Any

@@ -4,13 +4,10 @@ Locks are separate from faults. Each has its author and a word. The author remov
 who types the displayed word: that is a deliberate act, which a click or a program's routine is not.
 """
 
-from collections.abc import Collection, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 LOCKS_MOST = 100  # at once: status messages and memory are bounded
-_CONSONANTS, _VOWELS = "bdfgklmnprstvz", "aeiou"
-_SHAPE = (_CONSONANTS, _VOWELS, _CONSONANTS, _VOWELS, _CONSONANTS)
-WORDS = len(_CONSONANTS) ** 3 * len(_VOWELS) ** 2  # number of different words
 
 
 @dataclass(frozen=True, slots=True)
@@ -60,44 +57,3 @@ def describe_locks(locks: Sequence[Lock], most: int = LOCKS_MOST) -> str:
     if len(locks) > most:
         lines.append(f"and {len(locks) - most} more")
     return "; ".join(lines)
-
-
-def word_of_number(number: int) -> str:
-    """Return the pronounceable word with this number (modulo `WORDS`).
-
-    Parameters
-    ----------
-    number : int
-
-    Returns
-    -------
-    str
-        Five letters, such as `bofak`.
-    """
-    letters = []
-    for choice in _SHAPE:
-        number, place = divmod(number, len(choice))
-        letters.append(choice[place])
-    return "".join(letters)
-
-
-def distinct_word(word: str, taken: Collection[str]) -> str:
-    """Return the word, or the next one in their order that is not taken.
-
-    Parameters
-    ----------
-    word : str
-        Empty: the first word.
-    taken : collection of str
-        At most `WORDS` - 1 words.
-
-    Returns
-    -------
-    str
-    """
-    if word and word not in taken:
-        return word
-    number = 0
-    while (candidate := word_of_number(number)) in taken:
-        number += 1
-    return candidate

@@ -5,7 +5,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from typing import Any
 
-from membrane_ctrl.model import events, run_events
+from membrane_ctrl.model import acquisition_events, child_events, events, run_events
 from membrane_ctrl.model.lock import Lock
 from membrane_ctrl.model.notices import (
     SHOWN_WITH_DETAILS,
@@ -33,8 +33,8 @@ class RunStatus:
     faults: int = 0  # so far in the run
     notices: Notices = field(default_factory=dict)
     shape_reason: str = ""  # of the shape loop
-    acquisition: run_events.AcquisitionState | None = None  # the acquisition's last report
-    geometry: run_events.GeometryInForce | None = None  # used by the cycles
+    acquisition: acquisition_events.AcquisitionState | None = None  # the acquisition's last report
+    geometry: acquisition_events.GeometryInForce | None = None  # used by the cycles
     # gains set during the run; None: those of the configuration
     loop: Mapping[str, Any] | None = None
     kept_loop: Mapping[str, Any] | None = None  # what a trial goes back to
@@ -121,9 +121,9 @@ class RunStatus:
                 return replace(self, unstored=_without(self.unstored, event.word))
             case events.GainsReverted():
                 return replace(self, loop=self.kept_loop, trial_ends_s=math.nan)
-            case run_events.GeometryInForce():
+            case acquisition_events.GeometryInForce():
                 return replace(self, geometry=event)
-            case run_events.AcquisitionState():
+            case acquisition_events.AcquisitionState():
                 return replace(self, acquisition=event)
             case run_events.Ended():
                 return replace(self, ended=True)
@@ -158,7 +158,7 @@ def gains_words(loop: Mapping[str, Any], trial_left_s: float | None) -> str:
 
 
 def _concerns_recording(key: NoticeKey) -> bool:
-    return key.topic is Topic.RECORDING or key == NoticeKey(Topic.CHILD, run_events.RECORDER)
+    return key.topic is Topic.RECORDING or key == NoticeKey(Topic.CHILD, child_events.RECORDER)
 
 
 def _without(standing: Mapping[str, str], name: str) -> Mapping[str, str]:

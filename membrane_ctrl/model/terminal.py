@@ -8,8 +8,6 @@ stays JSON and keeps its meaning.
 from __future__ import annotations
 
 import contextlib
-import os
-import signal
 import sys
 import unicodedata
 from collections.abc import Iterable, Iterator
@@ -137,38 +135,7 @@ def _escape(letter: str) -> str:
     return "".join(f"\\u{int.from_bytes(units[k : k + 2]):04x}" for k in range(0, len(units), 2))
 
 
-def in_foreground(handle: int) -> bool:
-    """Whether this process may use an open terminal now; job control covers only the controlling
-    one.
-    """
-    try:
-        return os.tcgetpgrp(handle) == os.getpgrp()
-    except OSError:
-        return True
-
-
 def progress(words: str) -> None:
     """Print a line of progress on stderr; a reader that has gone is no error."""
     with contextlib.suppress(OSError):
         print(words, file=sys.stderr, flush=True)
-
-
-@contextlib.contextmanager
-def ends_as_by_ctrl_c() -> Iterator[None]:
-    """SIGTERM and SIGHUP raise KeyboardInterrupt inside, so that the command cleans up.
-
-    An ignored SIGHUP stays ignored: `nohup` means to continue without the terminal.
-    """
-    before = {number: signal.getsignal(number) for number in (signal.SIGTERM, signal.SIGHUP)}
-    for number, handler in before.items():
-        if handler != signal.SIG_IGN:
-            signal.signal(number, _interrupt)
-    try:
-        yield
-    finally:
-        for number, handler in before.items():
-            signal.signal(number, handler)
-
-
-def _interrupt(number: int, frame: object) -> None:
-    raise KeyboardInterrupt

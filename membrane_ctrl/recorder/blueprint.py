@@ -1,10 +1,4 @@
-"""How a run opens in the viewer: one tab per question, and the page of its figures so far."""
-
-import math
-from collections.abc import Mapping
-from dataclasses import dataclass
-from datetime import timedelta
-from typing import Any
+"""How a run opens in the viewer: one tab per question."""
 
 import rerun as rr
 import rerun.blueprint as rrb
@@ -14,13 +8,8 @@ from membrane_ctrl.config.schema import Config
 from membrane_ctrl.model import columns, figure_columns, zernike_terms
 from membrane_ctrl.model.columns import Group, Plot, plot_title, plots_of
 from membrane_ctrl.model.figure_columns import figure_plot_title
-from membrane_ctrl.model.prose import for_people
-from membrane_ctrl.model.run_status import RunStatus, gains_words
-from membrane_ctrl.run_files import shapes, streams
-
-SUMMARY_PATH = "/summary"
-# Each page is 0.7 kB. In the first minutes somebody is watching.
-SUMMARY_INTERVAL_S, SUMMARY_EARLY_INTERVAL_S, SUMMARY_EARLY_S = 60.0, 10.0, 300.0
+from membrane_ctrl.recorder.summary_page import SUMMARY_PATH
+from membrane_ctrl.run_files import plot_marks, shapes, streams
 
 
 def run_blueprint(config: Config) -> rrb.Blueprint:
@@ -53,7 +42,7 @@ def _plot(
     """Plot entities; lines of commands and faults only with a span, as they would stretch any other
     axis.
     """
-    lines = [stream.path for stream in streams.MARKS] if marks else []
+    lines = [stream.path for stream in plot_marks.MARKS] if marks else []
     return rrb.TimeSeriesView(
         name=name,
         origin="/",
@@ -250,137 +239,3 @@ def frame_names(config: Config) -> tuple[str, ...]:
 def _timing() -> rrb.Vertical:
     ticks = [_ticks(plot, _TICKS) for plot in plots_of(Group.TIMING)]
     return rrb.Vertical(*ticks, _figure_plot(figure_columns.LATENCY), name="Timing")
-
-
-# State lanes: the words of a lane, their colours, and the meaning of a row's codes.
-
-
-@dataclass(frozen=True, slots=True)
-class Lane:
-    """One row of the state timeline.
-
-    Attributes
-    ----------
-    path : str
-        Rerun entity.
-    field : str
-        Telemetry field that holds the code; empty if the lane does not come from telemetry.
-    words : dict
-        Code to word.
-    colours : dict
-        Word to 0xRRGGBBAA; a word without one gets the viewer's choice.
-    """
-
-    path: str
-    field: str
-    words: dict[int, str]
-    colours: dict[str, int]
-
-    def word(self, code: int) -> str:
-        """The word for a code; an unknown code is shown as a number."""
-        return self.words.get(code, f"code {code}")
-
-
-_CALM, _BUSY, _GOOD, _WARN, _BAD = 0x5A5A5AFF, 0x56B4E9FF, 0x009E73FF, 0xE69F00FF, 0xD55E00FF
-
-
-STATE = Lane(
-    "/state/controller",
-    "state",
-    streams.WORDS["state"],
-    {
-        "standby": _CALM,
-        "check": _BUSY,
-        "inflate": _BUSY,
-        "settle": _WARN,
-        "hold": _GOOD,
-        "manual": 0xCC79A7FF,
-        "tune": 0xF0E442FF,
-        "lower": _WARN,
-        "fault": _BAD,
-    },
-)
-SHAPE = Lane(
-    "/state/shape_loop",
-    "shape_state",
-    streams.WORDS["shape_state"],
-    {"off": _CALM, "waiting": _BUSY, "tracking": _GOOD, "suspended": _WARN},
-)
-SAFE_LEVEL = Lane(
-    "/state/safe_level",
-    "safe_level",
-    streams.WORDS["safe_level"],
-    {"none": _CALM, "hold_flow": _WARN, "ramp_down": _WARN, "pump_off": _BAD, "vent": _BAD},
-)
-_FAULTS = streams.WORDS["fault"]
-FAULT = Lane(
-    "/state/fault", "fault", _FAULTS, dict.fromkeys(_FAULTS.values(), _BAD) | {"none": _CALM}
-)
-VERDICT = Lane("/state/verdict", "", {}, {"ok": _GOOD, "degraded": _WARN, "rejected": _BAD})
-
-TELEMETRY_LANES: tuple[Lane, ...] = (STATE, SHAPE, SAFE_LEVEL, FAULT)
-LANES: tuple[Lane, ...] = (*TELEMETRY_LANES, VERDICT)
-
-
-def summary_page(summary: Mapping[str, Any], status: RunStatus, config: Config) -> str:
-    """The figures of the run so far as a page of the recording.
-
-    Parameters
-    ----------
-    summary : mapping
-        The content of `summary.json` so far, or when read back: with None for NaN.
-    status : RunStatus
-        What follows from the events so far.
-    config : Config
-        Of the run.
-    """
-    held, states = summary["held"], summary["states"]
-    faults_s, whole_s = held["faults_s"], max(summary["duration_s"], 1e-9)
-    rows = {
-        "held": _span(held["held_s"]),
-        f"std of 1 s means, {'true centre' if held['of'] == 'true' else 'reading'}": _um(
-            held["std_um"]
-        ),
-        "mean error": _um(held["mean_um"], "+"),
-        f"1 s means within ±{config.limits.band_um:g} µm": _share(held["in_band"]),
-        "faults": str(summary["fault_count"] or "none"),
-        "last fault": str(summary["faults"][-1].get("name", "")) if summary["faults"] else "",
-        "time in faults": f"{_span(faults_s)} ({_share(faults_s / whole_s)})" if faults_s else "",
-        "paused": _span(held["paused_s"]) if held["paused_s"] >= 1.0 else "",
-        "leak": _um(summary["leak_um_per_s"], unit="µm/s"),
-        "shape cycles": f"{summary['cycles']}, {summary['cycles_rejected']} rejected"
-        if summary["cycles"]
-        else "",
-        "geometry": _geometry(summary["geometry"]),
-        "gains": gains_words(
-            status.loop or vars(config.loop), status.trial_ends_s - summary["duration_s"]
-        ),
-        "ticks missed": f"{summary['missed_ticks']} of {summary['ticks']}",
-        "not recorded": "; ".join(status.recording_problems),
-    }
-    state = states[-1]["state"] if states else "not started"
-    lines = [f"| {name} | {_cell(words)} |" for name, words in rows.items() if words]
-    return "\n".join((f"| {state} | {_cell(status.why)} |", "|---|---|", *lines)) + "\n"
-
-
-def _geometry(geometry: Mapping[str, Any]) -> str:
-    words = [str(geometry[key]) for key in ("hash", "file") if geometry.get(key)]
-    calibrated = geometry.get("calibrated_utc")
-    return ", ".join([*words, f"calibrated {calibrated}"] if calibrated else words)
-
-
-def _um(value: float | None, sign: str = "", unit: str = "µm") -> str:
-    return f"{value:{sign}.3g} {unit}" if value is not None and math.isfinite(value) else ""
-
-
-def _share(value: float | None) -> str:
-    return f"{100 * value:.4g} %" if value is not None and math.isfinite(value) else ""
-
-
-def _span(seconds: float) -> str:
-    """As `0:09:12`."""
-    return str(timedelta(seconds=round(seconds)))
-
-
-def _cell(words: str) -> str:
-    return for_people(words).replace("|", "/")

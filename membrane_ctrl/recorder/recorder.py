@@ -7,12 +7,27 @@ from pathlib import Path
 
 from membrane_ctrl.config.schema import Config
 from membrane_ctrl.controller.tick_assembler import TickAssembler
-from membrane_ctrl.model import files, plain_json, run_events, shape_estimate
+from membrane_ctrl.model import (
+    event_lines,
+    file_checksums,
+    files,
+    recorder_events,
+    run_events,
+    shape_estimate,
+)
 from membrane_ctrl.model.clock import RunClock
 from membrane_ctrl.model.events import Event, EventLine
 from membrane_ctrl.model.run_status import RunStatus
 from membrane_ctrl.processes.ring import RingReader
-from membrane_ctrl.recorder import blueprint, housekeeping, rerun_output, sink
+from membrane_ctrl.recorder import (
+    events_file,
+    folder_watch,
+    housekeeping,
+    recorder_errors,
+    rerun_output,
+    rerun_recording,
+    summary_page,
+)
 from membrane_ctrl.recorder.feed import Feed
 from membrane_ctrl.recorder.handover import (
     RecorderState,
@@ -20,9 +35,9 @@ from membrane_ctrl.recorder.handover import (
     remove_state,
     save_state,
 )
-from membrane_ctrl.recorder.process import Thumbnail, Thumbnails
-from membrane_ctrl.run_files import run_folder
-from membrane_ctrl.run_files.disk_budget import DetailLevel
+from membrane_ctrl.recorder.thumbnails import Thumbnail, Thumbnails
+from membrane_ctrl.run_files import event_log
+from membrane_ctrl.run_files.detail_level import DetailLevel
 from membrane_ctrl.run_files.run_tables import RunTables
 from membrane_ctrl.run_files.summary import Summary
 
@@ -56,33 +71,33 @@ class Recorder:
         clock: RunClock,
         config: Config,
         rings: dict[str, RingReader],
-        recording: sink.Recording,
+        recording: rerun_recording.Recording,
         thumbnails: Thumbnails | None,
-        report: sink.Report,
+        report: recorder_errors.Report,
         resumes: int = 0,
     ) -> None:
         handed_on = load_state(run_dir) if resumes else None
         before = handed_on or RecorderState(Summary.for_config(config))
         self._run_dir = run_dir
         self._config = config
-        self._folder = housekeeping.FolderWatch(run_dir)
+        self._folder = folder_watch.FolderWatch(run_dir)
         self._folder_anew_s = before.folder_anew_s
         self._clock = clock
         self._feeds = {
             name: Feed(ring, before.positions.get(name, 0), before.dropped.get(name, 0))
             for name, ring in rings.items()
         }
-        self._errors = sink.RecorderErrors(report, before.errors)
+        self._errors = recorder_errors.RecorderErrors(report, before.errors)
         self._housekeeping = housekeeping.Housekeeping(
             run_dir, clock, config.recording, self._errors
         )
         self._rerun = rerun_output.RerunOutput(recording, config, self._errors, self._summary_page)
         self._rerun.shapes.reference, self._rerun.state = before.reference, before.state
-        self._events_file = sink.EventsFile(run_dir / "events.jsonl", resumed=resumes > 0)
+        self._events_file = events_file.EventsFile(run_dir / "events.jsonl", resumed=resumes > 0)
         self._events_lost = before.events_lost
         self._summary = before.summary
         self._status = RunStatus()
-        for told in run_folder.read_events(run_dir, []) if resumes else ():
+        for told in event_log.read_events(run_dir, []) if resumes else ():
             self._status = self._status.after_event(told.event, told.mono_s)
         self._tables = RunTables(run_dir, clock.origin_utc, before.windows if resumes else None)
         self._input_ticks_lost = before.input_ticks_lost
@@ -107,12 +122,12 @@ class Recorder:
         if "shapes" in self._feeds:
             for message in self._feeds["shapes"].drain():
                 self._errors.guarded("shape estimate", partial(self._take_shape, message))
-        self.take_events([run_events.parse(message) for message in self._feeds["events"].drain()])
+        self.take_events([event_lines.parse(message) for message in self._feeds["events"].drain()])
 
     def take_events(self, new: list[EventLine]) -> None:
         """Take events; an "end" among them ends the run."""
         for line in new:
-            event = run_events.from_dict(line)
+            event = event_lines.from_dict(line)
             self._summary.add_event(line)
             self._errors.guarded(
                 "status", partial(self._follow, event, float(line.get("mono_s") or 0.0))
@@ -165,7 +180,7 @@ class Recorder:
             self._tables.add_thumbnail(each.time_s, each.pattern, each.jpeg)
 
     def _summary_page(self) -> str:
-        return blueprint.summary_page(
+        return summary_page.summary_page(
             self._summary.as_dict(self._dropped(), {}), self._status, self._config
         )
 
@@ -228,7 +243,7 @@ class Recorder:
             "partial": self._began_anew and self._feeds["inputs"].dropped > 0,
         }
         text = (
-            plain_json.dumps_checked(self._summary.as_dict(self._dropped(), account), indent=2)
+            file_checksums.dumps_checked(self._summary.as_dict(self._dropped(), account), indent=2)
             + "\n"
         )
         guarded(
@@ -242,4 +257,4 @@ class Recorder:
         if not in_haste:
             self._housekeeping.finish(closed)
         self._housekeeping.close()
-        self._errors.report(run_events.RecorderDone(self._dropped(), **account))
+        self._errors.report(recorder_events.RecorderDone(self._dropped(), **account))

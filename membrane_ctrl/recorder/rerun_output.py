@@ -8,11 +8,18 @@ import rerun as rr
 
 from membrane_ctrl.config.schema import Config
 from membrane_ctrl.model import shape_estimate, telemetry
+from membrane_ctrl.model.event_lines import from_dict
 from membrane_ctrl.model.events import EventLine
-from membrane_ctrl.model.run_events import from_dict
-from membrane_ctrl.recorder import blueprint, rerun_streams, sink
-from membrane_ctrl.recorder.process import Thumbnail
-from membrane_ctrl.run_files.disk_budget import DetailLevel
+from membrane_ctrl.recorder import (
+    recorder_errors,
+    rerun_events,
+    rerun_recording,
+    rerun_shapes,
+    rerun_telemetry,
+    summary_page,
+)
+from membrane_ctrl.recorder.thumbnails import Thumbnail
+from membrane_ctrl.run_files.detail_level import DetailLevel
 
 # A full disk is retried this often, so that recording continues soon after a person makes room.
 RETRY_S = 10.0
@@ -25,19 +32,19 @@ class RerunOutput:
 
     def __init__(
         self,
-        recording: sink.Recording,
+        recording: rerun_recording.Recording,
         config: Config,
-        errors: sink.RecorderErrors,
+        errors: recorder_errors.RecorderErrors,
         summary: Callable[[], str],
-        overview_every_s: float = rerun_streams.OVERVIEW_EVERY_S,
+        overview_every_s: float = rerun_telemetry.OVERVIEW_EVERY_S,
     ) -> None:
         self._recording = recording
         self._segment_s = config.recording.segment_s
         self._errors = errors
         self._summary = summary
         self._next_summary_s = -math.inf
-        self._telemetry = rerun_streams.TelemetryStreams(recording, config, overview_every_s)
-        self.shapes = rerun_streams.ShapeStreams(recording)
+        self._telemetry = rerun_telemetry.TelemetryStreams(recording, config, overview_every_s)
+        self.shapes = rerun_shapes.ShapeStreams(recording)
         self.state = math.nan  # the controller's, in the last row
         self.closed: list[Path] = []  # closed segments, until taken from here
         self._alive = False
@@ -71,14 +78,14 @@ class RerunOutput:
                 return False
             self._errors.guarded("telemetry streams", lambda: self._telemetry.send(rows))
             self._errors.guarded(
-                "event streams", lambda: rerun_streams.send_events(self._recording, events)
+                "event streams", lambda: rerun_events.send_events(self._recording, events)
             )
             self._errors.guarded("shape streams", lambda: self._send_shapes(shapes))
             self._errors.guarded("thumbnails", lambda: self._send_thumbnails(thumbnails))
             self._errors.guarded("summary page", lambda: self._send_summary(now_s, events))
             try:
                 self._recording.flush()
-            except sink.RecordingError as error:
+            except rerun_recording.RecordingError as error:
                 self._alive = False
                 self._errors.report_error("recording", str(error))
             else:
@@ -107,11 +114,11 @@ class RerunOutput:
     def _send_summary(self, now_s: float, events: list[EventLine]) -> None:
         if now_s < self._next_summary_s and not any(from_dict(event).notable for event in events):
             return
-        early = now_s < blueprint.SUMMARY_EARLY_S
+        early = now_s < summary_page.SUMMARY_EARLY_S
         self._next_summary_s = now_s + (
-            blueprint.SUMMARY_EARLY_INTERVAL_S if early else blueprint.SUMMARY_INTERVAL_S
+            summary_page.SUMMARY_EARLY_INTERVAL_S if early else summary_page.SUMMARY_INTERVAL_S
         )
-        self._recording.page(blueprint.SUMMARY_PATH, now_s, self._summary())
+        self._recording.page(summary_page.SUMMARY_PATH, now_s, self._summary())
 
     def _begin_segment(self, now_s: float) -> bool:
         if now_s < self._retry_s:
@@ -119,7 +126,7 @@ class RerunOutput:
         before = self._recording.path
         try:
             self._recording.next_segment()
-        except sink.RecordingError as error:
+        except rerun_recording.RecordingError as error:
             self._alive = False
             self._retry_s = now_s + RETRY_S
             self._errors.report_error("recording", str(error))

@@ -25,14 +25,21 @@ from membrane_ctrl.controller.tick_assembler import TickBatch
 from membrane_ctrl.controller.tick_checksum import ColumnChoice
 from membrane_ctrl.controller.tick_codec import Records
 from membrane_ctrl.metrology.film.hencky_bowl import zernike_projection
-from membrane_ctrl.model import files, plain_json, run_events, shape_estimate, telemetry
+from membrane_ctrl.model import (
+    file_checksums,
+    files,
+    plain_json,
+    run_events,
+    shape_estimate,
+    telemetry,
+)
 from membrane_ctrl.model.arithmetic import describe_arithmetic
 from membrane_ctrl.model.errors import Exit, InputError
 from membrane_ctrl.model.program import file_origin
 from membrane_ctrl.model.state_tree import describe, to_plain
 from membrane_ctrl.replay import replay as replays
 from membrane_ctrl.replay.numbers import NUMBERS_WITHIN, RecordedRows
-from membrane_ctrl.run_files import inputs_file, run_folder, table_specs
+from membrane_ctrl.run_files import event_log, inputs_file, run_config, table_specs
 from membrane_ctrl.run_files.run import open_run
 from membrane_ctrl.run_files.run_tables import RunTables, as_recorded
 
@@ -94,12 +101,12 @@ def open_recorded(folder: Path) -> RecordedRun:
     inputs = inputs_file.InputsReader(folder)
     if not inputs.exists:
         raise InputError(f"{folder}: no recorded inputs (no table `inputs`)")
-    log = run_folder.read_events(folder, [])
+    log = event_log.read_events(folder, [])
     cut = not any(isinstance(each.event, run_events.Ended) for each in log)
     decisions = replays.decisions_of((each.mono_s, each.event) for each in log)
     told_until_s = max((each.mono_s for each in log), default=0.0) if cut else math.inf
-    config = run_folder.exact_config(folder)
-    right = plain_json.comment_is_right(files.read_text(folder / "config.toml"))
+    config = run_config.exact_config(folder)
+    right = file_checksums.comment_is_right(files.read_text(folder / "config.toml"))
     damage = "" if right else "config.toml: checksum mismatch (damaged or edited)"
     return RecordedRun(folder, config, inputs, decisions, told_until_s, damage)
 

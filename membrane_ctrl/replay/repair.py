@@ -12,8 +12,8 @@ from typing import Any
 
 import numpy as np
 
-from membrane_ctrl.model import errors, files, plain_json, telemetry
-from membrane_ctrl.run_files import inputs_file, run, run_folder, table_specs
+from membrane_ctrl.model import errors, file_checksums, files, plain_json, telemetry
+from membrane_ctrl.run_files import event_log, inputs_file, run, run_config, run_folder, table_specs
 from membrane_ctrl.run_files.summary import Summary
 from membrane_ctrl.run_files.table_store.reader import TableReader
 from membrane_ctrl.run_files.table_store.spec import JOURNAL_SUFFIX
@@ -104,7 +104,7 @@ def _repair_events(run_dir: Path, in_place: bool) -> list[FileFinding]:
     path = run_dir / "events.jsonl"
     if not path.exists():
         return [FileFinding(path.name, "missing", "the run had no events, or the log was lost")]
-    data = files.read_bytes(path, run_folder.EVENTS_BYTES_MAX)
+    data = files.read_bytes(path, event_log.EVENTS_BYTES_MAX)
     good, torn = _split_events(data)
     if not torn:
         return [FileFinding(path.name, "whole", "")]
@@ -125,7 +125,7 @@ def _split_events(data: bytes) -> tuple[bytes, bytes]:
     torn: list[bytes] = []
     for line in data.splitlines(keepends=True):
         whole = (
-            line.endswith(b"\n") and run_folder.event_of(line.decode(errors="replace")) is not None
+            line.endswith(b"\n") and event_log.event_of(line.decode(errors="replace")) is not None
         )
         (good if whole else torn).append(line)
     return b"".join(good), b"".join(torn)
@@ -136,7 +136,7 @@ def _is_whole_object(data: bytes) -> bool:
         table = plain_json.loads(data.decode())
     except ValueError:
         return False
-    return isinstance(table, dict) and plain_json.take_checksum(table)
+    return isinstance(table, dict) and file_checksums.take_checksum(table)
 
 
 def _seal_journals(run_dir: Path, in_place: bool) -> list[FileFinding]:
@@ -184,7 +184,7 @@ def _look_at_inputs(run_dir: Path) -> list[FileFinding]:
 def _look_at_config(run_dir: Path) -> list[FileFinding]:
     """Report only: a rebuilt summary uses defaults for settings that cannot be read."""
     notes: list[str] = []
-    run_folder.read_config(run_dir, notes)
+    run_config.read_config(run_dir, notes)
     return [FileFinding("config.toml", "damaged", "; ".join(notes))] if notes else []
 
 
@@ -204,7 +204,7 @@ def _repair_summary(run_dir: Path, in_place: bool) -> FileFinding:
 
 def rebuild_summary(run_dir: Path) -> dict[str, Any]:
     """Rebuild `summary.json` from the files on disk, marked `"rebuilt": true`."""
-    summary = Summary.for_config(run_folder.read_config(run_dir, []))
+    summary = Summary.for_config(run_config.read_config(run_dir, []))
     path = run_dir / "events.jsonl"
     last_s = -np.inf
     for rows in _all_rows(run_dir):
@@ -218,12 +218,12 @@ def rebuild_summary(run_dir: Path) -> dict[str, Any]:
         for estimate in frame.estimates.values():
             summary.add_shape(estimate)
     good, _ = (
-        _split_events(files.read_bytes(path, run_folder.EVENTS_BYTES_MAX))
+        _split_events(files.read_bytes(path, event_log.EVENTS_BYTES_MAX))
         if path.exists()
         else (b"", b"")
     )
     for line in good.splitlines():
-        summary.add_event(run_folder.event_of(line.decode()) or {})
+        summary.add_event(event_log.event_of(line.decode()) or {})
     table = summary.as_dict({}, {})
     table["ticks"] = max(table["ticks"], ticks)
     return {**table, "exit": table["exit"] or "crashed", "rebuilt": True}

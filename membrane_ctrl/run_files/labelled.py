@@ -13,7 +13,7 @@ import pyarrow as pa
 
 from membrane_ctrl.model.optional import import_optional
 from membrane_ctrl.model.zernike_terms import NOLL_INDICES
-from membrane_ctrl.run_files import shapes, streams, table_specs
+from membrane_ctrl.run_files import named_tables, shapes, table_specs
 from membrane_ctrl.run_files.table_store.spec import TableSpec
 
 if TYPE_CHECKING:
@@ -39,7 +39,7 @@ def labels_of(spec: TableSpec) -> Labels:
 
 
 def make_frame(table: pa.Table) -> pd.DataFrame:
-    """A table for people (`streams.named_table`) with its UTC as index; names of codes are
+    """A table for people (`named_tables.named_table`) with its UTC as index; names of codes are
     categories.
     """
     import_optional("pandas", "data")
@@ -52,7 +52,7 @@ def make_dataset(table: pa.Table, labels: Labels, about: Mapping[str, str]) -> x
     Parameters
     ----------
     table : pyarrow.Table
-        As made by `streams.named_table`.
+        As made by `named_tables.named_table`.
     labels : mapping
         Unit and description by column.
     about : mapping
@@ -66,7 +66,7 @@ def make_dataset(table: pa.Table, labels: Labels, about: Mapping[str, str]) -> x
     xarray = import_optional("xarray", "data")
     times = _naive_utc(table.column("time_utc"))
     coordinates = {_TIME: times, "time_s": (_TIME, _values(table.column("time_s")), {"units": "s"})}
-    names = [name for name in table.column_names if name not in streams.TIMES]
+    names = [name for name in table.column_names if name not in named_tables.TIMES]
     variables = {
         name: (_TIME, _values(table.column(name)), dict(labels.get(name, {}))) for name in names
     }

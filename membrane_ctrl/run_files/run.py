@@ -19,12 +19,15 @@ from membrane_ctrl.model import events, run_events
 from membrane_ctrl.model.arrays import Column
 from membrane_ctrl.model.telemetry import FIELDS
 from membrane_ctrl.run_files import (
+    event_log,
     labelled,
     levels,
+    named_tables,
+    run_config,
     run_folder,
     run_head,
     shapes,
-    streams,
+    summary_file,
     table_specs,
 )
 from membrane_ctrl.run_files.recorded_rate import at_recorded_rate
@@ -71,7 +74,7 @@ class Run:
 
     folder: Path
     config: Config
-    log: tuple[run_folder.LoggedEvent, ...]
+    log: tuple[event_log.LoggedEvent, ...]
     summary: dict[str, Any] | None
     origin_utc: datetime
     notes: list[str] = field(default_factory=list)
@@ -91,7 +94,7 @@ class Run:
         """UTC of a time of the run; an impossible time, as in damaged tables, gives the start."""
         return self.origin_utc + timedelta(seconds=mono_s if abs(mono_s) < _RUN_MAX_S else 0.0)
 
-    def log_between(self, start_s: float, end_s: float) -> tuple[run_folder.LoggedEvent, ...]:
+    def log_between(self, start_s: float, end_s: float) -> tuple[event_log.LoggedEvent, ...]:
         """The log of a part of the run."""
         return tuple(each for each in self.log if start_s <= each.mono_s < end_s)
 
@@ -113,11 +116,11 @@ class Run:
             `time_s` (seconds of the run), `time_utc` and the fields; codes are names, absent values
             null.
         """
-        wanted = _with_time([name for name in names or FIELDS if name not in streams.TIMES])
+        wanted = _with_time([name for name in names or FIELDS if name not in named_tables.TIMES])
         blocks = list(self.tick_blocks(wanted, start_s, end_s)) or [
             {name: np.empty(0) for name in wanted}
         ]
-        parts = [streams.named_table(block, self.origin_utc) for block in blocks]
+        parts = [named_tables.named_table(block, self.origin_utc) for block in blocks]
         return pa.concat_tables(parts, promote_options="permissive").unify_dictionaries()
 
     def overview(
@@ -134,7 +137,7 @@ class Run:
         ticks, `state` the state at its end, `mean_error_um` the mean of a signal.
         """
         level = self.level(window_s, start_s, end_s, names or levels.NAMES)
-        return streams.named_table(level, self.origin_utc)
+        return named_tables.named_table(level, self.origin_utc)
 
     def cycles(self, start_s: float = -np.inf, end_s: float = np.inf) -> pa.Table:
         """The measured figure, one row per cycle: times, `z1_um` and all other terms, sag, quality,
@@ -142,7 +145,7 @@ class Run:
         """
         found = self.shapes()
         wanted = (found.time_s >= start_s) & (found.time_s < end_s)
-        return streams.named_table(found.select(wanted).columns(), self.origin_utc)
+        return named_tables.named_table(found.select(wanted).columns(), self.origin_utc)
 
     def to_pandas(
         self,
@@ -369,8 +372,8 @@ def open_run(path: str | Path) -> Run:
     folder = run_folder.find_folder(Path(path))
     notes: list[str] = []
     head = run_head.read_run_head(folder, notes)
-    log = run_folder.read_events(folder, notes)
-    summary = run_folder.read_summary(folder, notes)
+    log = event_log.read_events(folder, notes)
+    summary = summary_file.read_summary(folder, notes)
     if (
         summary
         and summary.get("exit")
@@ -381,7 +384,7 @@ def open_run(path: str | Path) -> Run:
             "end event"
         )
     notes += _missing(folder, summary)
-    config = at_recorded_rate(run_folder.read_config(folder, notes), folder, notes)
+    config = at_recorded_rate(run_config.read_config(folder, notes), folder, notes)
     return Run(folder, config, log, summary, origin_of(folder, log), notes, head.recorded_by)
 
 
@@ -403,7 +406,7 @@ def _count(value: object) -> int:
     return value if isinstance(value, int) and 0 <= value <= _PARTS_MAX else 0
 
 
-def origin_of(folder: Path, log: Sequence[run_folder.LoggedEvent]) -> datetime:
+def origin_of(folder: Path, log: Sequence[event_log.LoggedEvent]) -> datetime:
     """UTC at 0 s of a run: from its first event with both times, else from the folder's name or
     age.
     """

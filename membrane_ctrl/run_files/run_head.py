@@ -8,7 +8,7 @@ import re
 from dataclasses import dataclass
 from pathlib import Path
 
-from membrane_ctrl.model import files, plain_json
+from membrane_ctrl.model import file_checksums, files, plain_json
 from membrane_ctrl.model.program import file_origin, stated_program
 
 HEAD_FILE = "run.json"
@@ -29,7 +29,7 @@ class RunHead:
 
 def write_run_head(run_dir: Path) -> None:
     """Write `run.json`. Raises OSError."""
-    text = plain_json.dumps_checked(file_origin(f"membrane-run/{FORMAT}"), indent=2)
+    text = file_checksums.dumps_checked(file_origin(f"membrane-run/{FORMAT}"), indent=2)
     files.write_text_atomic(run_dir / HEAD_FILE, text + "\n")
 
 
@@ -43,7 +43,7 @@ def read_run_head(folder: Path, notes: list[str]) -> RunHead:
         notes.append(f"{HEAD_FILE}: cannot be read ({error})")
         return RunHead()
     found = _SCHEMA.fullmatch(str(table.get("schema"))) if isinstance(table, dict) else None
-    if found is None or not plain_json.take_checksum(table):
+    if found is None or not file_checksums.take_checksum(table):
         notes.append(f"{HEAD_FILE}: damaged or edited; it is not used")
         return RunHead()
     head = RunHead(int(found[1]), stated_program(table))

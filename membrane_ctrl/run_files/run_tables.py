@@ -14,9 +14,9 @@ from membrane_ctrl.controller.tick_assembler import TickBatch
 from membrane_ctrl.model import shape_estimate, telemetry
 from membrane_ctrl.model.arrays import Column
 from membrane_ctrl.model.columns import COLUMNS, Kind
+from membrane_ctrl.model.event_lines import from_dict
 from membrane_ctrl.model.events import EventLine
-from membrane_ctrl.model.run_events import from_dict
-from membrane_ctrl.run_files import levels, run_folder, table_specs
+from membrane_ctrl.run_files import event_log, levels, table_specs
 from membrane_ctrl.run_files.table_store.spec import TableSpec
 from membrane_ctrl.run_files.table_store.writer import TableWriter
 
@@ -108,7 +108,7 @@ class RunTables:
         marks = [
             row
             for row, line in zip(rows, lines, strict=True)
-            if run_folder.logged(line).line["kind"] == "mark"
+            if event_log.logged(line).line["kind"] == "mark"
         ]
         self._add_dicts(table_specs.MARKS, marks)
 

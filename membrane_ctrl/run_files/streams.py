@@ -1,32 +1,19 @@
-"""Telemetry as the viewer gets it: the Rerun entities of the table of columns, lines for events,
-tables with UTC.
+"""Rerun entities of the telemetry columns: their lines, names and colours.
 
-The signals of one plot share one entity: m scalars of one cost the writer and the viewer far less
-than m entities of one. `SeriesLines` sets the names of the lines once.
+The signals of one plot share one entity: m scalars of one entity cost the writer and the viewer far
+less than m entities of one. `SeriesLines` sets the names of the lines once.
 """
 
-from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
-from datetime import datetime
-from enum import IntEnum
-from typing import Any
 
 import numpy as np
-import pyarrow as pa
-from numpy.typing import NDArray
 
-from membrane_ctrl.controller import safety
-from membrane_ctrl.model import figure_columns, telemetry
-from membrane_ctrl.model.arrays import Column, FloatArray
+from membrane_ctrl.model import figure_columns
+from membrane_ctrl.model.arrays import FloatArray
 from membrane_ctrl.model.colours import (
     BLUE,
     GREEN,
     GREY,
-    ORANGE,
-    RED,
-    VIOLET,
-    WHITE,
-    YELLOW,
     Colour,
 )
 from membrane_ctrl.model.columns import (
@@ -35,13 +22,11 @@ from membrane_ctrl.model.columns import (
     POSITION,
     TRUE_ERROR_COLUMN,
     Group,
-    Kind,
     Plot,
     TelemetryColumn,
     columns_of,
     plots_of,
 )
-from membrane_ctrl.model.events import Event
 from membrane_ctrl.model.telemetry import Rows, column
 
 
@@ -145,38 +130,6 @@ LATENCY = _figure_stream(figure_columns.LATENCY)
 SHAPE_STREAMS: tuple[Stream, ...] = (ZERNIKE, RESIDUAL, QUALITY, MODULATION, LATENCY)
 
 
-# Vertical lines across plots of a fixed height, interrupted by NaN; an entity each, as a legend
-# lists only those with data.
-MARKS: tuple[Stream, ...] = (
-    Stream("/marks/fault", (Line("fault", "fault", RED, 2.0),)),
-    Stream("/marks/pause", (Line("pause", "pause, resume", YELLOW),)),
-    Stream("/marks/setpoint", (Line("setpoint", "setpoint", ORANGE),)),
-    Stream("/marks/command", (Line("command", "command", VIOLET),)),
-    Stream("/marks/mark", (Line("mark", "mark", WHITE),)),
-)
-_MARK_HALF_HEIGHT = 1e3  # in the units of any plot that has them
-
-
-def mark_lines(
-    events: Sequence[tuple[float, Event]],
-) -> Iterator[tuple[Stream, Column, FloatArray]]:
-    """Each stream of `MARKS` with events, times (3 n,) and values (3 n, 1) that draw a vertical
-    line for each.
-
-    `events` are those of a run with their times.
-    """
-    for stream in MARKS:
-        found = [mono_s for mono_s, event in events if event.plot_mark == stream.lines[0].field]
-        if found:
-            yield stream, *vertical_lines(np.array(found))
-
-
-def vertical_lines(time_s: Column) -> tuple[Column, FloatArray]:
-    """Times (3 n,) and values (3 n, 1) that draw a vertical line at each of n times."""
-    values = np.tile([-_MARK_HALF_HEIGHT, _MARK_HALF_HEIGHT, np.nan], time_s.size)
-    return (time_s[:, np.newaxis] + [0.0, 0.0, 1e-9]).ravel(), values[:, np.newaxis]
-
-
 def overview_um(rows: Rows) -> FloatArray:
     """(1, 3) least, mean and greatest error of the rows; NaN if no row has an error."""
     error = column(rows, "error_um")
@@ -194,78 +147,3 @@ def mean_row(rows: Rows) -> Rows:
             axis=0, keepdims=True
         )
     return mean
-
-
-# Tables for people: times in UTC, names for codes, nulls for absent values.
-
-
-TIMES = ("mono_s", "time_s", "time_utc")
-_COUNTS = ("rows", *(each.name for each in COLUMNS.values() if each.kind is Kind.COUNT))
-_TIME_MAX_S = 1e9  # thirty years: a damaged file may hold any time
-
-
-def _words(codes: type[IntEnum]) -> dict[int, str]:
-    return {int(code): code.name.lower() for code in codes}
-
-
-# By column: the name of each code.
-WORDS: dict[str, dict[int, str]] = {
-    "state": _words(telemetry.State),
-    "shape_state": _words(telemetry.ShapeState),
-    "safe_level": _words(telemetry.SafeLevel),
-    "fault": {0: "none"} | {rule.code: rule.name for rule in safety.TABLE},
-}
-
-
-def named_table(columns: Mapping[str, NDArray[Any]], origin_utc: datetime) -> pa.Table:
-    """Arrow table of columns.
-
-    Parameters
-    ----------
-    columns : dict of (n,) array
-        One of them is `mono_s` or `time_s`: seconds of the run. NaN: no value.
-    origin_utc : datetime
-        UTC at 0 s of the run.
-
-    Returns
-    -------
-    pyarrow.Table
-        `time_s` and `time_utc` (timestamps to the microsecond), then the other columns: numbers,
-        counts as integers, the codes of `WORDS` as dictionary-encoded names. An absent value is
-        null.
-    """
-    time_s = np.asarray(
-        columns["mono_s"] if "mono_s" in columns else columns["time_s"], dtype=np.float64
-    )
-    table = {"time_s": _nullable(time_s), "time_utc": _utc(time_s, origin_utc)}
-    for name, values in columns.items():
-        if name in WORDS:
-            table[name] = _named(values, WORDS[name])
-        elif name not in TIMES:
-            table[name] = (
-                _nullable(values).cast(pa.int64(), safe=False)
-                if name in _COUNTS
-                else _nullable(values)
-            )
-    return pa.table(table)
-
-
-def _nullable(values: NDArray[Any]) -> pa.Array:
-    return pa.array(values, from_pandas=True)  # NaN is null
-
-
-def _utc(time_s: Column, origin_utc: datetime) -> pa.Array:
-    possible = np.abs(time_s) < _TIME_MAX_S
-    since_us = np.rint(np.where(possible, time_s, 0.0) * 1e6).astype("timedelta64[us]")
-    origin = np.datetime64(round(origin_utc.timestamp() * 1e6), "us")
-    return pa.array(origin + since_us, pa.timestamp("us", "UTC"), mask=~possible)
-
-
-def _named(codes: Column, words: Mapping[int, str]) -> pa.Array:
-    """Names of codes; one that this version does not know is `code 99`."""
-    there = np.isfinite(codes)
-    found, places = np.unique(np.where(there, codes, 0.0), return_inverse=True)
-    names = [words.get(int(code), f"code {code:g}") for code in found]
-    return pa.DictionaryArray.from_arrays(
-        pa.array(places.astype(np.int32), mask=~there), pa.array(names, pa.string())
-    )

@@ -7,7 +7,15 @@ from typing import Any
 import numpy as np
 
 from membrane_ctrl.config.schema import Config
-from membrane_ctrl.model import events, program, run_events, shape_estimate, telemetry
+from membrane_ctrl.model import (
+    acquisition_events,
+    event_lines,
+    events,
+    program,
+    run_events,
+    shape_estimate,
+    telemetry,
+)
 from membrane_ctrl.model.events import EventLine
 from membrane_ctrl.model.standing_fault import fault_of_end, standing_fault_after
 from membrane_ctrl.model.state_tree import Count, StateNode
@@ -100,7 +108,7 @@ class Summary(StateNode):
         """Add one event; only those of faults and states, the geometry and the end of the run
         matter.
         """
-        event = run_events.from_dict(line)
+        event = event_lines.from_dict(line)
         standing = standing_fault_after(self._read_standing_fault(), event)
         self.standing_fault = None if standing is None else standing.to_dict()
         match event:
@@ -108,7 +116,7 @@ class Summary(StateNode):
                 self.fault_count += 1
                 if len(self.faults) < _LISTED_MAX:
                     self.faults.append(line)
-            case run_events.GeometryInForce():
+            case acquisition_events.GeometryInForce():
                 self.geometry = {key: line.get(key) for key in ("hash", "file", "calibrated_utc")}
             case run_events.Ended():
                 self.end = line
@@ -116,7 +124,7 @@ class Summary(StateNode):
     def _read_standing_fault(self) -> events.Fault | None:
         if self.standing_fault is None:
             return None
-        event = run_events.from_dict(self.standing_fault)
+        event = event_lines.from_dict(self.standing_fault)
         return event if isinstance(event, events.Fault) else None
 
     def add_shape(self, estimate: shape_estimate.ShapeEstimate) -> None:

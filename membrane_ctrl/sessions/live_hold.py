@@ -23,7 +23,7 @@ from membrane_ctrl.control_port.client import PortClient
 from membrane_ctrl.control_port.ctl import Where, socket_path
 from membrane_ctrl.control_port.status import lock_lines
 from membrane_ctrl.controller.commands import Command
-from membrane_ctrl.model import errors, run_events, shape_estimate, telemetry, terminal
+from membrane_ctrl.model import errors, event_lines, shape_estimate, telemetry, terminal
 from membrane_ctrl.model.events import Event
 from membrane_ctrl.processes.published_rings import attach_rings
 from membrane_ctrl.sessions.live_log import LiveLog
@@ -185,7 +185,7 @@ class LiveHold:
                 telemetry.TelemetryRow.unpack(message) for message in messages.get("telemetry", ())
             ),
             events=tuple(
-                run_events.from_dict(run_events.parse(message))
+                event_lines.from_dict(event_lines.parse(message))
                 for message in messages.get("events", ())
             ),
             shapes=tuple(

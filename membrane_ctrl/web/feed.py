@@ -28,8 +28,8 @@ from membrane_ctrl.model.columns import PUBLISHED
 from membrane_ctrl.model.run_events import Mark
 from membrane_ctrl.processes import published_rings, ring
 from membrane_ctrl.review import catalogue
+from membrane_ctrl.run_files.event_log import logged
 from membrane_ctrl.run_files.run import open_run
-from membrane_ctrl.run_files.run_folder import logged
 
 PERIOD_S = 0.5  # as fast as people read changing figures
 SILENT_S = 5.0  # without a status, the hold hangs or the connection is lost

@@ -20,7 +20,7 @@ from membrane_ctrl.controller.commands import Role
 from membrane_ctrl.model import errors
 from membrane_ctrl.model.columns import COLUMNS
 from membrane_ctrl.review import catalogue
-from membrane_ctrl.review.catalogue import sparkline
+from membrane_ctrl.review.sparkline import sparkline
 from membrane_ctrl.run_files.run import open_run
 from membrane_ctrl.sessions import folder as folders
 from membrane_ctrl.sessions.live_log import ANSWER, LiveReader, PageAnswer, Progressed, give_answer

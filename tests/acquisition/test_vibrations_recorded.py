@@ -28,14 +28,14 @@ from membrane_ctrl.metrology.cycle.live_reconstructor import LiveReconstructor
 from membrane_ctrl.metrology.film.hencky_bowl import zernike_projection
 from membrane_ctrl.metrology.phase import pattern_sequence
 from membrane_ctrl.metrology.tracking.live_tracker import LiveTracker
-from membrane_ctrl.model import run_events
+from membrane_ctrl.model import event_lines, run_events
 from membrane_ctrl.model.clock import RunClock
 from membrane_ctrl.model.program import program_identity, stated_program
 from membrane_ctrl.model.shape_estimate import ShapeEstimate, pack_estimate
 from membrane_ctrl.model.telemetry import FIELDS, TelemetryRow
 from membrane_ctrl.processes.ring import RingReader, RingWriter, ring
 from membrane_ctrl.recorder.recorder import Recorder
-from membrane_ctrl.recorder.sink import Recording
+from membrane_ctrl.recorder.rerun_recording import Recording
 from membrane_ctrl.run_files.run_folder import create_run_folder
 from membrane_ctrl.sim.optics.camera import OpticsRenderer
 from membrane_ctrl.sim.optics.drum_modes import DRUM_MODES
@@ -121,7 +121,7 @@ class Hold:
         HandClock.moment_s = estimate.time_s
         self.rings["shapes"].put(pack_estimate(estimate))
         for event in self.hear(estimate):
-            self.supervisor.tell(run_events.from_dict(event.to_dict()))
+            self.supervisor.tell(event_lines.from_dict(event.to_dict()))
         self.taken += 1
         if self.taken % 50 == 0:
             self.recorder.drain()

@@ -8,10 +8,11 @@ from hypothesis import strategies as st
 
 from membrane_ctrl.alarms.book import AlarmBook, AlarmMessage, Sign, signs_of
 from membrane_ctrl.config.port import AlarmsConfig
+from membrane_ctrl.model.child_events import ChildRestarted
 from membrane_ctrl.model.events import Event
-from membrane_ctrl.model.run_events import ChildRestarted, DiskLow
+from membrane_ctrl.model.recorder_events import DiskLow
 from membrane_ctrl.model.run_status import RunStatus
-from membrane_ctrl.recorder.sink import RecorderErrors
+from membrane_ctrl.recorder.recorder_errors import RecorderErrors
 
 LOW = "Disk almost full: less than 500 MB free"
 NOT_RECORDED = "Not recorded: state file: x. Do: check the disk and the folder of the run"

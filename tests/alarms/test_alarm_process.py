@@ -29,7 +29,7 @@ from membrane_ctrl.config.port import AlarmsConfig
 from membrane_ctrl.model.clock import RunClock
 from membrane_ctrl.model.errors import DeviceError, InputError
 from membrane_ctrl.model.events import Event, EventLine
-from membrane_ctrl.model.run_events import AlarmTold
+from membrane_ctrl.model.port_events import AlarmTold
 from membrane_ctrl.model.telemetry import FIELDS, ROW_BYTES, TelemetryRow
 from membrane_ctrl.processes.event_pipe import event_sender
 from membrane_ctrl.processes.ring import RingWriter, ring

@@ -11,8 +11,8 @@ from membrane_ctrl import alarms
 from membrane_ctrl.config.schema import Config
 from membrane_ctrl.control import film_health
 from membrane_ctrl.metrology.vibrations import mode_follower
-from membrane_ctrl.model import run_events
-from membrane_ctrl.model.event_base import KINDS
+from membrane_ctrl.model import child_events
+from membrane_ctrl.model.event_lines import KINDS
 from membrane_ctrl.model.notices import NoticeKey, Topic
 
 RUNBOOK = (Path(__file__).parents[2] / "docs" / "how-to" / "operations.md").read_text(
@@ -35,7 +35,8 @@ VIBRATIONS = re.findall(
 )
 RULES = [rule.name for rule in Config().alarms.rules]
 CHILDREN = [
-    NoticeKey(Topic.CHILD, child).alarm for child in (run_events.RECORDER, "acquisition", "screen")
+    NoticeKey(Topic.CHILD, child).alarm
+    for child in (child_events.RECORDER, "acquisition", "screen")
 ]
 
 

@@ -7,8 +7,8 @@ from membrane_ctrl.config.port import AlarmRule
 from membrane_ctrl.config.schema import Config
 from membrane_ctrl.config.toml_file import parse
 from membrane_ctrl.model.errors import InputError
+from membrane_ctrl.model.event_lines import from_dict
 from membrane_ctrl.model.events import EventLine
-from membrane_ctrl.model.run_events import from_dict
 
 HIGH = AlarmRule(name="high", field="error_um", raise_at=10.0, clear_at=3.0, magnitude=True)
 LOW = AlarmRule(name="low", field="gauge_pressure_pa", raise_at=100.0, clear_at=200.0)

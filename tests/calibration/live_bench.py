@@ -22,8 +22,8 @@ from membrane_ctrl.config.schema import (
     TwinConfig,
 )
 from membrane_ctrl.controller.commands import Command
+from membrane_ctrl.model.acquisition_events import Capture
 from membrane_ctrl.model.events import Event
-from membrane_ctrl.model.run_events import Capture
 from membrane_ctrl.sessions.live_hold import News
 from membrane_ctrl.sim.optics.film_shape import typical_film
 from membrane_ctrl.sim.optics.simulate import simulate_set

@@ -18,7 +18,7 @@ import pytest
 from membrane_ctrl.console.key_reader import Keyboard, KeyReader
 from membrane_ctrl.console.keys import Desk
 from membrane_ctrl.console.requests import Request, send_request
-from membrane_ctrl.model import terminal
+from membrane_ctrl.model import job_control
 
 
 class Port:
@@ -148,11 +148,11 @@ def test_in_the_background_the_terminal_is_left_alone(
 ) -> None:
     ours, theirs = terminal_ends
     with closing(KeyReader(keyboard(theirs))) as reader:
-        monkeypatch.setattr(terminal, "in_foreground", lambda handle: False)
+        monkeypatch.setattr(job_control, "in_foreground", lambda handle: False)
         os.write(ours, b"h\n")
         assert reader.read() == ""
         assert echoes(theirs)
-        monkeypatch.setattr(terminal, "in_foreground", lambda handle: True)
+        monkeypatch.setattr(job_control, "in_foreground", lambda handle: True)
         reader.read()
         assert not echoes(theirs)
 

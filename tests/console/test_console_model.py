@@ -10,8 +10,8 @@ from console_feed import FAULT, HOLDING, event, rows, shape
 
 from membrane_ctrl.config.schema import Config
 from membrane_ctrl.console.model import TREND_S, ConsoleModel, Trend, fault_words
+from membrane_ctrl.model.event_lines import from_dict
 from membrane_ctrl.model.events import Fault
-from membrane_ctrl.model.run_events import from_dict
 from membrane_ctrl.model.telemetry import SETTLED_AFTER_S, SafeLevel, ShapeState, State
 
 

@@ -15,7 +15,7 @@ from membrane_ctrl.console.model import ConsoleModel, event_line
 from membrane_ctrl.console.process import line
 from membrane_ctrl.console.view import ConsolePage, full_scale, level_bar, signed_bars
 from membrane_ctrl.console.why import duration, number, percent
-from membrane_ctrl.model.run_events import from_dict
+from membrane_ctrl.model.event_lines import from_dict
 from membrane_ctrl.model.telemetry import SafeLevel, ShapeState, State
 
 CONFIG = Config()

@@ -15,8 +15,9 @@ from membrane_ctrl.control_port import protocol
 from membrane_ctrl.control_port.ctl import Where, socket_path, status_lines
 from membrane_ctrl.control_port.status import status_table
 from membrane_ctrl.controller.commands import SAME_AS, TABLE
+from membrane_ctrl.model.acquisition_events import GeometryInForce
+from membrane_ctrl.model.event_lines import from_dict
 from membrane_ctrl.model.events import MaintenanceOver
-from membrane_ctrl.model.run_events import GeometryInForce, from_dict
 from membrane_ctrl.model.run_status import RunStatus
 from membrane_ctrl.model.telemetry import State
 

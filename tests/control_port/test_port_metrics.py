@@ -11,7 +11,7 @@ from port_run import ROW, port_run
 
 from membrane_ctrl.config.port import PortConfig
 from membrane_ctrl.control_port.server import metrics_text
-from membrane_ctrl.model.run_events import DiskLow
+from membrane_ctrl.model.recorder_events import DiskLow
 from membrane_ctrl.model.run_status import RunStatus
 from membrane_ctrl.model.telemetry import FIELDS
 

@@ -20,7 +20,7 @@ from membrane_ctrl.control_port.client import PortClient
 from membrane_ctrl.control_port.protocol import MESSAGE_BYTES, Peer
 from membrane_ctrl.controller.commands import Command
 from membrane_ctrl.model.errors import DeviceError
-from membrane_ctrl.model.run_events import from_dict
+from membrane_ctrl.model.event_lines import from_dict
 from membrane_ctrl.model.telemetry import State
 
 ANN, BOB, EVE = Peer("unix:ann", "operate"), Peer("unix:bob", "operate"), Peer("unix:eve", "read")

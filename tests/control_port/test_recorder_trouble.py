@@ -1,15 +1,10 @@
 from __future__ import annotations
 
+from membrane_ctrl.model.child_events import ChildEnded, ChildGivenUp, ChildRestarted
 from membrane_ctrl.model.events import Event
-from membrane_ctrl.model.run_events import (
-    ChildEnded,
-    ChildGivenUp,
-    ChildRestarted,
-    DiskLow,
-    RecorderError,
-)
+from membrane_ctrl.model.recorder_events import DiskLow, RecorderError
 from membrane_ctrl.model.run_status import RunStatus
-from membrane_ctrl.recorder.sink import RecorderErrors
+from membrane_ctrl.recorder.recorder_errors import RecorderErrors
 
 
 class Trouble:

@@ -17,14 +17,8 @@ from membrane_ctrl.controller.tick_assembler import TickAssembler
 from membrane_ctrl.controller.tick_codec import MESSAGE_BYTES, pack_tick, unpack_tick
 from membrane_ctrl.metrology.film.hencky_bowl import zernike_projection
 from membrane_ctrl.model.events import CommandTaken, LockRemoved, LockSet
-from membrane_ctrl.model.lock import (
-    LOCKS_MOST,
-    WORDS,
-    Lock,
-    describe_locks,
-    distinct_word,
-    word_of_number,
-)
+from membrane_ctrl.model.lock import LOCKS_MOST, Lock, describe_locks
+from membrane_ctrl.model.lock_words import WORDS, distinct_word, word_of_number
 from membrane_ctrl.model.run_status import RunStatus
 from membrane_ctrl.model.telemetry import State
 

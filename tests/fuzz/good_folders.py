@@ -13,12 +13,12 @@ import numpy as np
 from membrane_ctrl.cli import run
 from membrane_ctrl.config.toml_file import dump
 from membrane_ctrl.model.clock import RunClock
-from membrane_ctrl.model.plain_json import dumps_checked, with_comment
+from membrane_ctrl.model.file_checksums import dumps_checked, with_comment
 from membrane_ctrl.model.program import file_origin
 from membrane_ctrl.model.telemetry import unpack
 from membrane_ctrl.model.zernike_terms import ZERNIKE_TERMS
-from membrane_ctrl.recorder.rerun_streams import TelemetryStreams
-from membrane_ctrl.recorder.sink import LAYOUT, Recording
+from membrane_ctrl.recorder.rerun_recording import LAYOUT, Recording
+from membrane_ctrl.recorder.rerun_telemetry import TelemetryStreams
 from membrane_ctrl.run_files.summary import Summary
 from tests.worlds.virtual_record import CONFIG, kept_ticks, snapshot_at, write_record
 

@@ -21,7 +21,7 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 import tomli_w
 
-from membrane_ctrl.model.plain_json import KEY, dumps_checked, with_comment
+from membrane_ctrl.model.file_checksums import KEY, dumps_checked, with_comment
 from membrane_ctrl.run_files.table_store.journal import MAGIC
 
 CANARY = "canary.txt"  # beside the folder: what nobody may read, change or remove

@@ -25,8 +25,8 @@ from fuzz_folders import Case, Room, case
 from good_folders import RUN, good_run, good_sets
 
 from membrane_ctrl.cli import run
-from membrane_ctrl.model.plain_json import dumps_checked
-from membrane_ctrl.run_files import run_folder
+from membrane_ctrl.model.file_checksums import dumps_checked
+from membrane_ctrl.run_files import run_config
 from membrane_ctrl.run_files.table_specs import TICKS
 from tests.support.peak_memory import peak_mb, reset_peak
 
@@ -427,7 +427,7 @@ def test_a_folder_that_may_not_be_looked_into_costs_its_line(
         return exists(path)
 
     monkeypatch.setattr(Path, "exists", guarded)
-    monkeypatch.setattr(run_folder, "read_config", _closed(run_folder.read_config))
+    monkeypatch.setattr(run_config, "read_config", _closed(run_config.read_config))
     assert run(["runs", "--logs", str(folder.parent)]) == 0
     out = capsys.readouterr().out
     assert RUN in out

@@ -21,7 +21,7 @@ from membrane_ctrl.geometry.run_geometry import (
     read_run_geometry,
 )
 from membrane_ctrl.model.errors import InputError
-from membrane_ctrl.model.plain_json import SCHEMA, content_hash
+from membrane_ctrl.model.geometry_hash import SCHEMA, content_hash
 
 CAMERA = CameraConfig(width_px=306, height_px=256, pixel_um=27.6)
 LENS = {

@@ -10,8 +10,9 @@ from typing import Any
 import pytest
 
 from membrane_ctrl.hold.child_processes import ManagedChild
+from membrane_ctrl.model.child_events import Alive, ChildSilent
 from membrane_ctrl.model.events import Event
-from membrane_ctrl.model.run_events import Alive, ChildSilent, DiskLow
+from membrane_ctrl.model.recorder_events import DiskLow
 
 
 class FakeChild:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from membrane_ctrl.model.clock import parse_duration_s
+from membrane_ctrl.model.durations import parse_duration_s
 from membrane_ctrl.model.errors import InputError
 
 

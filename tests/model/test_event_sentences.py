@@ -5,8 +5,8 @@ from __future__ import annotations
 import pytest
 
 from membrane_ctrl.model import prose
-from membrane_ctrl.model.event_base import KINDS, Event, EventLine
-from membrane_ctrl.model.run_events import from_dict
+from membrane_ctrl.model.event_base import Event, EventLine
+from membrane_ctrl.model.event_lines import KINDS, from_dict
 
 FAULT = {
     "time_utc": "x",

@@ -8,7 +8,9 @@ from typing import Any
 
 import pytest
 
-from membrane_ctrl.model.event_base import KINDS, Event, UnknownEvent
+from membrane_ctrl.model.acquisition_events import Capture
+from membrane_ctrl.model.event_base import Event, UnknownEvent
+from membrane_ctrl.model.event_lines import KINDS, from_dict
 from membrane_ctrl.model.events import (
     CommandTaken,
     Fault,
@@ -17,7 +19,7 @@ from membrane_ctrl.model.events import (
     Plausibility,
     StateEntered,
 )
-from membrane_ctrl.model.run_events import Capture, CommanderChanged, from_dict
+from membrane_ctrl.model.port_events import CommanderChanged
 
 
 def test_keys_stay_in_the_order_of_the_format() -> None:

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from membrane_ctrl.model.event_base import KINDS
+from membrane_ctrl.model.event_lines import KINDS
 from tests.support import events_page
 
 

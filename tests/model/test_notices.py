@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import pytest
 
-from membrane_ctrl.model.event_base import KINDS, Event
+from membrane_ctrl.model.child_events import ChildEnded, ChildRestarted
+from membrane_ctrl.model.event_base import Event
+from membrane_ctrl.model.event_lines import KINDS
 from membrane_ctrl.model.events import (
     Cleared,
     Fault,
@@ -17,14 +19,8 @@ from membrane_ctrl.model.events import (
     StateEntered,
 )
 from membrane_ctrl.model.notices import NoticeKey, Topic
-from membrane_ctrl.model.run_events import (
-    ChildEnded,
-    ChildRestarted,
-    DiskLow,
-    Link,
-    LockNotStored,
-    RecorderError,
-)
+from membrane_ctrl.model.recorder_events import DiskLow, RecorderError
+from membrane_ctrl.model.run_events import Link, LockNotStored
 from membrane_ctrl.model.run_status import RunStatus
 
 HOLDS_FLOW = Fault(

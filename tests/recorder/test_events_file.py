@@ -10,11 +10,12 @@ from pathlib import Path
 import pytest
 
 from membrane_ctrl.model.event_base import UnknownEvent
+from membrane_ctrl.model.event_lines import parse
 from membrane_ctrl.model.events import Event
-from membrane_ctrl.model.run_events import Mark, parse
-from membrane_ctrl.recorder import sink
-from membrane_ctrl.recorder.sink import EventsFile
-from membrane_ctrl.run_files.run_folder import logged
+from membrane_ctrl.model.run_events import Mark
+from membrane_ctrl.recorder import events_file
+from membrane_ctrl.recorder.events_file import EventsFile
+from membrane_ctrl.run_files.event_log import logged
 
 
 def lines(path: Path) -> list[dict[str, object]]:
@@ -57,7 +58,7 @@ def test_a_disk_that_was_full_tears_no_line(
         room[0] -= written
         return written
 
-    monkeypatch.setattr(sink.os, "write", write)
+    monkeypatch.setattr(events_file.os, "write", write)
     file = EventsFile(tmp_path / "events.jsonl")
     with pytest.raises(OSError):
         file.append([{"kind": "state", "number": k} for k in range(3)])
@@ -72,7 +73,7 @@ def test_a_disk_that_was_full_tears_no_line(
 def test_too_many_waiting_events_are_counted_as_lost(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(sink, "_WAITING_MAX", 5)
+    monkeypatch.setattr(events_file, "_WAITING_MAX", 5)
     file = EventsFile(tmp_path / "missing" / "events.jsonl")
     with pytest.raises(OSError):
         file.append([{"number": k} for k in range(8)])

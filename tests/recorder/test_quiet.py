@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from membrane_ctrl.model.telemetry import COLUMN, FIELDS, Rows
-from membrane_ctrl.recorder.rerun_streams import QuietFilter
+from membrane_ctrl.recorder.quiet_filter import QuietFilter
 
 
 def second(number: int, state: float = 4.0, error_um: float = 0.1) -> Rows:

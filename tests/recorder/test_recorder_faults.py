@@ -20,13 +20,13 @@ from membrane_ctrl.config import toml_file as config_file
 from membrane_ctrl.config.schema import Config, RecordingConfig
 from membrane_ctrl.controller.tick_codec import MESSAGE_BYTES
 from membrane_ctrl.model.clock import RunClock
-from membrane_ctrl.model.plain_json import dumps_checked
+from membrane_ctrl.model.file_checksums import dumps_checked
 from membrane_ctrl.model.shape_estimate import pack_estimate
 from membrane_ctrl.processes.ring import RingReader, RingWriter, ring
-from membrane_ctrl.recorder import sink
+from membrane_ctrl.recorder import events_file
 from membrane_ctrl.recorder.recorder import Recorder
 from membrane_ctrl.recorder.rerun_output import RETRY_S
-from membrane_ctrl.recorder.sink import Recording, RecordingError
+from membrane_ctrl.recorder.rerun_recording import Recording, RecordingError
 from membrane_ctrl.run_files.inputs_file import InputsReader
 from membrane_ctrl.run_files.run_folder import write_heads
 from membrane_ctrl.run_files.table_store.disk import Disk
@@ -268,16 +268,16 @@ def test_a_broken_shape_is_reported_and_the_next_one_taken(bench: Bench) -> None
 def test_events_that_cannot_be_written_are_reported_and_come_later(
     bench: Bench, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    real_open = sink.os.open
+    real_open = events_file.os.open
 
     def full(*_: Any) -> int:
         raise OSError(errno.ENOSPC, "No space left on device")
 
-    monkeypatch.setattr(sink.os, "open", full)
+    monkeypatch.setattr(events_file.os, "open", full)
     bench.writers["events"].put(b'{"kind": "fault", "mono_s": 0.5}')
     bench.second(0)
     assert "events.jsonl: [Errno 28] No space left on device" in bench.reports[0]["message"]
-    monkeypatch.setattr(sink.os, "open", real_open)
+    monkeypatch.setattr(events_file.os, "open", real_open)
     bench.second(1)
     bench.recorder.finish(in_haste=True)
     text = (bench.run_dir / "events.jsonl").read_text()

@@ -24,7 +24,7 @@ import pytest
 from membrane_ctrl.config.schema import Config
 from membrane_ctrl.controller.tick_codec import MESSAGE_BYTES
 from membrane_ctrl.model.clock import RunClock
-from membrane_ctrl.model.run_events import RecorderError
+from membrane_ctrl.model.recorder_events import RecorderError
 from membrane_ctrl.model.shape_estimate import pack_estimate
 from membrane_ctrl.model.telemetry import COLUMN, unpack
 from membrane_ctrl.model.zernike_terms import ZERNIKE_TERMS

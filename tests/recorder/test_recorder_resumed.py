@@ -17,15 +17,16 @@ from membrane_ctrl.config.schema import Config, RecordingConfig
 from membrane_ctrl.controller.tick_codec import MESSAGE_BYTES
 from membrane_ctrl.model.clock import RunClock
 from membrane_ctrl.model.events import Event
-from membrane_ctrl.model.plain_json import dumps_checked
+from membrane_ctrl.model.file_checksums import dumps_checked
 from membrane_ctrl.model.shape_estimate import pack_estimate
 from membrane_ctrl.model.state_tree import find_differences
 from membrane_ctrl.processes.ring import RingAddress, RingReader, RingWriter, ring
+from membrane_ctrl.recorder.events_file import EventsFile
 from membrane_ctrl.recorder.handover import load_state, save_state
-from membrane_ctrl.recorder.housekeeping import Optimizer
 from membrane_ctrl.recorder.recorder import Recorder
-from membrane_ctrl.recorder.sink import EventsFile, Recording, is_whole
-from membrane_ctrl.run_files.disk_budget import DetailLevel
+from membrane_ctrl.recorder.rerun_recording import Recording, is_whole
+from membrane_ctrl.recorder.segment_optimizer import Optimizer
+from membrane_ctrl.run_files.detail_level import DetailLevel
 from tests.support.rrd_reading import has_footer, reader, recorded_rows, scalars, strings
 from tests.worlds.recorded_hold import ring_trip
 from tests.worlds.synthetic_run import STARTED_UTC, message_of, rows_of, shape_of

@@ -11,8 +11,8 @@ import pytest
 from membrane_ctrl.config.schema import Config
 from membrane_ctrl.model.clock import RunClock
 from membrane_ctrl.model.zernike_terms import ZERNIKE_TERMS
-from membrane_ctrl.recorder.rerun_streams import ShapeStreams, _legend
-from membrane_ctrl.recorder.sink import Recording
+from membrane_ctrl.recorder.rerun_recording import Recording
+from membrane_ctrl.recorder.rerun_shapes import ShapeStreams, _legend
 from tests.support.rrd_reading import scalars, strings
 from tests.worlds.synthetic_run import shape_of
 

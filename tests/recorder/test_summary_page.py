@@ -5,10 +5,10 @@ from __future__ import annotations
 import numpy as np
 
 from membrane_ctrl.config.schema import Config
-from membrane_ctrl.model import events, run_events
+from membrane_ctrl.model import acquisition_events, events
 from membrane_ctrl.model.run_status import RunStatus
 from membrane_ctrl.model.telemetry import unpack
-from membrane_ctrl.recorder.blueprint import summary_page
+from membrane_ctrl.recorder.summary_page import summary_page
 from membrane_ctrl.run_files.summary import Summary
 from tests.worlds.synthetic_run import rows_of, shape_of
 
@@ -36,7 +36,10 @@ def test_figures_are_those_of_the_summary() -> None:
     summary = Summary.for_config(Config())
     summary.add_rows(unpack([row.pack() for row in rows_of(30.0)]))
     summary.add_shape(shape_of(20.0, 1, verdict="rejected"))
-    for event in (FAULT, run_events.GeometryInForce("0f93", "bench.toml", "2026-11-21", "")):
+    for event in (
+        FAULT,
+        acquisition_events.GeometryInForce("0f93", "bench.toml", "2026-11-21", ""),
+    ):
         summary.add_event(event.to_dict())
     gains = dict(vars(Config().loop)) | {"kp_per_s": 0.8}
     status = RunStatus(why="inside +-2 µm | so far").after_event(

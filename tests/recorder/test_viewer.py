@@ -11,8 +11,10 @@ import pytest
 from membrane_ctrl.config.schema import Config
 from membrane_ctrl.model.clock import RunClock
 from membrane_ctrl.model.telemetry import unpack
-from membrane_ctrl.recorder.rerun_streams import ShapeStreams, TelemetryStreams, send_events
-from membrane_ctrl.recorder.sink import Recording
+from membrane_ctrl.recorder.rerun_events import send_events
+from membrane_ctrl.recorder.rerun_recording import Recording
+from membrane_ctrl.recorder.rerun_shapes import ShapeStreams
+from membrane_ctrl.recorder.rerun_telemetry import TelemetryStreams
 from tests.support.machine_needs import needs
 from tests.support.recording_picture import screenshot
 from tests.worlds.synthetic_run import rows_of, shape_of

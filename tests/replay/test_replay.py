@@ -25,7 +25,7 @@ from membrane_ctrl.controller.tick_codec import MESSAGE_BYTES, pack_tick, unpack
 from membrane_ctrl.metrology.film.hencky_bowl import zernike_projection
 from membrane_ctrl.model.errors import Exit
 from membrane_ctrl.model.events import Fault
-from membrane_ctrl.model.plain_json import with_comment
+from membrane_ctrl.model.file_checksums import with_comment
 from membrane_ctrl.model.shape_estimate import pack_estimate, unpack_estimate
 from membrane_ctrl.replay import replay as replay_module
 from membrane_ctrl.replay.replay import Gap, RecordedTick, recorded_ticks, replay

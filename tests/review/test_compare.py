@@ -14,7 +14,7 @@ from scipy import signal
 from membrane_ctrl.review import open_run
 from membrane_ctrl.review.statistics.analysis import Analysis, analyse
 from membrane_ctrl.review.statistics.compare import compare
-from membrane_ctrl.review.statistics.drift import mean_p, spread_p, windowed
+from membrane_ctrl.review.statistics.difference_tests import mean_p, spread_p, windowed
 from tests.studies.comparison_rates import rates
 from tests.support.review_runs import written
 

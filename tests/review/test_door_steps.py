@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 
 from membrane_ctrl.model.telemetry import COLUMN, Rows, column
+from membrane_ctrl.review.events.door_steps import quantum, update_s
 from membrane_ctrl.review.events.found import pressure_steps
-from membrane_ctrl.review.events.laser_and_door import quantum, update_s
-from membrane_ctrl.review.events.steps import FoundEvent
+from membrane_ctrl.review.events.found_event import FoundEvent
 from membrane_ctrl.run_files.levels import TICK_FIELDS, first_level
 from tests.worlds.nights import DOOR, Planted, night
 

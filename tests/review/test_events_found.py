@@ -15,7 +15,8 @@ from membrane_ctrl.review.events.found import (
     noise_changes,
     weather_losses,
 )
-from membrane_ctrl.review.events.steps import FoundEvent, confidence, steps
+from membrane_ctrl.review.events.found_event import FoundEvent
+from membrane_ctrl.review.events.steps import confidence, steps
 from membrane_ctrl.run_files.levels import TICK_FIELDS, Columns, first_level
 from tests.studies.events_found import matched
 from tests.worlds.nights import DOOR, GLITCH, JUMP, LATE, LEAK, LOST, Planted, night

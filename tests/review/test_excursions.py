@@ -7,7 +7,7 @@ import pytest
 
 from membrane_ctrl.model.telemetry import COLUMN, Rows, column
 from membrane_ctrl.review.events.found import find_events
-from membrane_ctrl.review.events.steps import FoundEvent
+from membrane_ctrl.review.events.found_event import FoundEvent
 from membrane_ctrl.run_files.levels import TICK_FIELDS, first_level
 from tests.worlds.nights import DOOR, Planted, night
 from tests.worlds.synthetic_shape import from_estimates

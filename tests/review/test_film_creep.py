@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from membrane_ctrl.review.statistics.film_run import fit_creep
+from membrane_ctrl.review.statistics.film_creep import fit_creep
 
 DAY_S = 86_400.0
 

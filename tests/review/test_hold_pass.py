@@ -12,7 +12,7 @@ from membrane_ctrl.model.telemetry import COLUMN, column
 from membrane_ctrl.review import open_run
 from membrane_ctrl.review.report.json import report_table, verdict
 from membrane_ctrl.review.statistics.analysis import analyse
-from membrane_ctrl.review.statistics.spectra import HeldTime
+from membrane_ctrl.review.statistics.held_time import HeldTime
 from tests.worlds.nights import CONFIG, night, write_run
 
 HOURS = 0.1

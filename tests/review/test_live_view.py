@@ -11,7 +11,7 @@ import pytest
 from membrane_ctrl.model.clock import RunClock
 from membrane_ctrl.model.telemetry import Rows, column, unpack
 from membrane_ctrl.recorder.handover import RecorderState, save_state
-from membrane_ctrl.recorder.sink import Recording
+from membrane_ctrl.recorder.rerun_recording import Recording
 from membrane_ctrl.review import open_run
 from membrane_ctrl.review.viewer.live_view import LOOK_S, RECENT_S, LiveView, follow_run
 from membrane_ctrl.run_files.run_folder import create_run_folder

@@ -25,9 +25,10 @@ from membrane_ctrl.model.telemetry import (
 from membrane_ctrl.review import open_run
 from membrane_ctrl.review.report.html import render
 from membrane_ctrl.review.report.json import report_table
-from membrane_ctrl.review.statistics.analysis import analyse, fill_short_gaps
+from membrane_ctrl.review.statistics.analysis import analyse
 from membrane_ctrl.review.statistics.compare import compare
-from membrane_ctrl.review.statistics.spectra import WithoutFeedforward
+from membrane_ctrl.review.statistics.error_series import fill_short_gaps
+from membrane_ctrl.review.statistics.without_feedforward import WithoutFeedforward
 from membrane_ctrl.run_files.hold_parts import HoldParts
 from tests.support.review_runs import same, written
 from tests.worlds.nights import Planted, night, write_run

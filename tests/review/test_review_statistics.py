@@ -7,15 +7,10 @@ import numpy as np
 import pytest
 from scipy import signal
 
-from membrane_ctrl.review.statistics.analysis import slow_spectrum
+from membrane_ctrl.review.statistics.allan_deviation import allan_deviation
 from membrane_ctrl.review.statistics.drift import slope
-from membrane_ctrl.review.statistics.spectra import (
-    Spectrum,
-    allan_deviation,
-    bands,
-    power_spectrum,
-    unseen_s,
-)
+from membrane_ctrl.review.statistics.error_series import slow_spectrum
+from membrane_ctrl.review.statistics.power_spectrum import Spectrum, bands, power_spectrum, unseen_s
 
 RATE_HZ = 10.0
 

@@ -26,19 +26,13 @@ from membrane_ctrl.model.errors import DeviceError, InputError
 from membrane_ctrl.model.telemetry import column
 from membrane_ctrl.model.zernike_terms import NOLL_INDICES
 from membrane_ctrl.review import open_run
-from membrane_ctrl.review.catalogue import (
-    Filter,
-    entries,
-    moment_s,
-    number,
-    one_line,
-    resolve,
-    span,
-    to_prune,
-)
+from membrane_ctrl.review.catalogue import Filter, entries, resolve
+from membrane_ctrl.review.export import export
+from membrane_ctrl.review.formatting import number, one_line, span
+from membrane_ctrl.review.prune import to_prune
 from membrane_ctrl.review.report import html
-from membrane_ctrl.review.report.json import pump_change, pump_history
-from membrane_ctrl.review.runs import export
+from membrane_ctrl.review.report.pump_history import pump_change, pump_history
+from membrane_ctrl.review.run_times import moment_s
 from membrane_ctrl.review.viewer.command import ReviewOptions, make_review
 from tests.support.review_runs import same, set_summary, written
 from tests.worlds.nights import Planted, night

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from membrane_ctrl.cli import run as command
-from membrane_ctrl.model import plain_json
+from membrane_ctrl.model import file_checksums
 from membrane_ctrl.model.telemetry import Rows, columns, unpack
 from membrane_ctrl.review import open_run
 from membrane_ctrl.review.catalogue import entry
@@ -53,7 +53,7 @@ def folder(rows: Rows, tmp_path_factory: pytest.TempPathFactory) -> Path:
     summary = Summary.for_config(config)
     for first in range(0, len(rows), 33):
         summary.add_rows(rows[first : first + 33])
-    (run / "summary.json").write_text(plain_json.dumps_checked(summary.as_dict({}, {})))
+    (run / "summary.json").write_text(file_checksums.dumps_checked(summary.as_dict({}, {})))
     return run
 
 

@@ -11,7 +11,7 @@ from membrane_ctrl.model.telemetry import COLUMN
 from membrane_ctrl.review import open_run
 from membrane_ctrl.review.statistics.analysis import analyse
 from membrane_ctrl.run_files.recorded_rate import recorded_rate_hz
-from membrane_ctrl.run_files.run_folder import understood
+from membrane_ctrl.run_files.run_config import understood
 from tests.support.review_runs import tables, written
 from tests.worlds.nights import night
 

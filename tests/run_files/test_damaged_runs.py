@@ -12,7 +12,7 @@ import pyarrow as pa
 import pytest
 
 from membrane_ctrl.cli import run as cli
-from membrane_ctrl.model.plain_json import dumps_checked, with_comment
+from membrane_ctrl.model.file_checksums import dumps_checked, with_comment
 from membrane_ctrl.review import open_run
 from tests.support.review_runs import segment, set_summary, written
 from tests.worlds.nights import night

@@ -11,17 +11,11 @@ import pytest
 from membrane_ctrl.config.schema import RecordingConfig
 from membrane_ctrl.model.clock import RunClock
 from membrane_ctrl.model.events import Event
-from membrane_ctrl.model.run_events import RecorderError, RecorderRecovered
+from membrane_ctrl.model.recorder_events import RecorderError, RecorderRecovered
 from membrane_ctrl.recorder.housekeeping import RETENTION_INTERVAL_S, Housekeeping
-from membrane_ctrl.recorder.sink import RecorderErrors
-from membrane_ctrl.run_files.disk_budget import (
-    DetailLevel,
-    OldRun,
-    deletable_runs,
-    delete_run,
-    detail_level,
-    expired,
-)
+from membrane_ctrl.recorder.recorder_errors import RecorderErrors
+from membrane_ctrl.run_files.detail_level import DetailLevel, detail_level
+from membrane_ctrl.run_files.retention import OldRun, deletable_runs, delete_run, expired
 
 NOW = datetime(2026, 11, 21, 12, tzinfo=UTC)
 

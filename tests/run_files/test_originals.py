@@ -8,9 +8,9 @@ from pathlib import Path
 import pytest
 
 from membrane_ctrl.cli import run as command
-from membrane_ctrl.review.runs import export
+from membrane_ctrl.review.export import export
+from membrane_ctrl.run_files.annotations import ANNOTATIONS_FILE
 from membrane_ctrl.run_files.run import open_run
-from membrane_ctrl.run_files.run_folder import ANNOTATIONS_FILE
 from tests.support.review_runs import written
 
 Capsys = pytest.CaptureFixture[str]
@@ -94,7 +94,7 @@ def test_a_run_that_cannot_be_deleted_keeps_no_other(
             raise PermissionError(13, "Permission denied")
         rename(source, target, **folders)
 
-    monkeypatch.setattr("membrane_ctrl.run_files.disk_budget.os.rename", refused)
+    monkeypatch.setattr("membrane_ctrl.run_files.retention.os.rename", refused)
     assert command(["runs", "prune", "--logs", str(tmp_path), "--keep-gb", "0", "--delete"]) == 4
     said = capsys.readouterr()
     assert f"{first}: cannot be deleted" in said.err

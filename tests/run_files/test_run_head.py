@@ -10,7 +10,7 @@ import pytest
 
 from membrane_ctrl.config.schema import Config
 from membrane_ctrl.config.toml_file import load
-from membrane_ctrl.model.plain_json import dumps_checked
+from membrane_ctrl.model.file_checksums import dumps_checked
 from membrane_ctrl.model.program import program_identity, stated_program
 from membrane_ctrl.run_files.run_folder import create_run_folder
 from membrane_ctrl.run_files.run_head import FORMAT, HEAD_FILE, RunHead, read_run_head

@@ -13,22 +13,16 @@ import pytest
 
 from membrane_ctrl.config.schema import Config
 from membrane_ctrl.model.clock import RunClock
-from membrane_ctrl.model.run_events import from_dict
+from membrane_ctrl.model.event_lines import from_dict
 from membrane_ctrl.model.telemetry import COLUMN, FIELDS, changes, column, unpack
 from membrane_ctrl.processes.frames import FrameRing, FrameWriter
-from membrane_ctrl.recorder.blueprint import FAULT, STATE
-from membrane_ctrl.recorder.process import THUMBNAIL_INTERVAL_S, Thumbnails
-from membrane_ctrl.recorder.rerun_streams import ShapeStreams, TelemetryStreams
-from membrane_ctrl.recorder.sink import Recording
-from membrane_ctrl.run_files.streams import (
-    DERIVED,
-    MARKS,
-    SHAPE_STREAMS,
-    STREAMS,
-    mark_lines,
-    mean_row,
-    overview_um,
-)
+from membrane_ctrl.recorder.rerun_recording import Recording
+from membrane_ctrl.recorder.rerun_shapes import ShapeStreams
+from membrane_ctrl.recorder.rerun_telemetry import TelemetryStreams
+from membrane_ctrl.recorder.state_lanes import FAULT, STATE
+from membrane_ctrl.recorder.thumbnails import THUMBNAIL_INTERVAL_S, Thumbnails
+from membrane_ctrl.run_files.plot_marks import MARKS, mark_lines
+from membrane_ctrl.run_files.streams import DERIVED, SHAPE_STREAMS, STREAMS, mean_row, overview_um
 from tests.support.rrd_reading import scalars
 from tests.worlds.synthetic_run import rows_of, shape_of
 

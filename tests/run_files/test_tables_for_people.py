@@ -12,9 +12,9 @@ import pytest
 
 from membrane_ctrl.model.telemetry import FIELDS, SafeLevel, State
 from membrane_ctrl.review import open_run
-from membrane_ctrl.review.runs import export
+from membrane_ctrl.review.export import export
+from membrane_ctrl.run_files.named_tables import named_table
 from membrane_ctrl.run_files.run import Run
-from membrane_ctrl.run_files.streams import named_table
 from tests.support.review_runs import tables
 from tests.worlds.nights import night
 

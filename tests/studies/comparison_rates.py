@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import signal
 
-from membrane_ctrl.review.statistics.drift import mean_p, spread_p
+from membrane_ctrl.review.statistics.difference_tests import mean_p, spread_p
 
 LEVEL = 0.05
 EXCURSION_S, EXCURSIONS_PER_S = 20, 2 / 3600

@@ -7,7 +7,7 @@ import numpy as np
 from membrane_ctrl.config.schema import Config
 from membrane_ctrl.model.telemetry import column
 from membrane_ctrl.review.events.found import find_events
-from membrane_ctrl.review.events.steps import FoundEvent
+from membrane_ctrl.review.events.found_event import FoundEvent
 from membrane_ctrl.run_files.levels import TICK_FIELDS, first_level
 from membrane_ctrl.run_files.shapes import Shapes
 from tests.worlds.nights import DOOR, GLITCH, JUMP, LATE, LEAK, LOST, Planted, night, planted

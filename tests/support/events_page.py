@@ -11,8 +11,9 @@ from pathlib import Path
 from types import NoneType, UnionType
 from typing import Any
 
-from membrane_ctrl.model import events, run_events
-from membrane_ctrl.model.event_base import KINDS, Event
+from membrane_ctrl.model import events
+from membrane_ctrl.model.event_base import Event
+from membrane_ctrl.model.event_lines import KINDS
 from membrane_ctrl.model.notices import NoticeKey, Topic
 
 PAGE = Path(__file__).parents[2] / "docs" / "reference" / "events.md"
@@ -27,8 +28,7 @@ _TYPES = {
 }
 _BY_SUBJECT = {Topic.CHILD: "CHILD_ended", Topic.MAINTENANCE: "maintenance_NAME"}
 _INTRODUCTION = """\
-Generated from `membrane_ctrl/model/events.py` and `run_events.py` (`make generate`). An event is one class; its lines
-in `events.jsonl` have the keys `time_utc`, `mono_s` (second of the run), `kind`, those listed here, and `crc32`. A
+Generated from the classes of events in `membrane_ctrl/model` (`make generate`). An event is one class; its lines in `events.jsonl` have the keys `time_utc`, `mono_s` (second of the run), `kind`, those listed here, and `crc32`. A
 key in brackets is left out if it has no value. A program that does not know a kind can show its `message`, if it has
 one, or its keys. The sentence is what console, page, timeline, report and alarms show; a part in brackets is left
 out if one of its keys has no value.
@@ -40,7 +40,7 @@ list a notice until it ends. [Operations](../how-to/operations.md) has what to d
 def events_page() -> str:
     """All kinds of events as Markdown."""
     lines = ["# Events", "", *_INTRODUCTION]
-    for heading, module in (("Of the controller", events), ("Of the other processes", run_events)):
+    for heading, of_controller in (("Of the controller", True), ("Of the other processes", False)):
         lines += [
             "",
             f"## {heading}",
@@ -48,7 +48,11 @@ def events_page() -> str:
             "| kind | meaning | keys | level | notice | sentence |",
             "|---|---|---|---|---|---|",
         ]
-        kinds = {kind: cls for kind, cls in KINDS.items() if cls.__module__ == module.__name__}
+        kinds = {
+            kind: cls
+            for kind, cls in KINDS.items()
+            if (cls.__module__ == events.__name__) == of_controller
+        }
         lines += [
             _row(kind, cls) for kind, cls in sorted(kinds.items()) if kind not in _NOT_RECORDED
         ]

@@ -6,7 +6,7 @@ from pathlib import Path
 
 from rerun.experimental import ViewerClient
 
-from membrane_ctrl.review.viewer.viewer import _at_rest, _headless
+from membrane_ctrl.review.viewer.screenshot import _at_rest, _headless
 
 
 def screenshot(run_dir: Path, tab: str = "Overview") -> bytes:

@@ -10,8 +10,8 @@ import numpy as np
 from membrane_ctrl.model.clock import RunClock
 from membrane_ctrl.model.shape_estimate import ShapeEstimate
 from membrane_ctrl.model.telemetry import Rows
-from membrane_ctrl.recorder.rerun_streams import TelemetryStreams
-from membrane_ctrl.recorder.sink import Recording
+from membrane_ctrl.recorder.rerun_recording import Recording
+from membrane_ctrl.recorder.rerun_telemetry import TelemetryStreams
 from membrane_ctrl.run_files.run_tables import RunTables
 from tests.worlds.nights import CONFIG, Planted, batch_of, night, write_run
 

@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 
 from membrane_ctrl.control_port.ctl import Where
-from membrane_ctrl.review.catalogue import sparkline
+from membrane_ctrl.review.sparkline import sparkline
 from membrane_ctrl.web import figures
 from membrane_ctrl.web.feed import HoldFeed, Seconds, Series, history, marks, thinned
 

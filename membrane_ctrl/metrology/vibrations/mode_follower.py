@@ -12,7 +12,7 @@ from membrane_ctrl.metrology.vibrations.mode_search import (
     VibrationMode,
     find_modes,
 )
-from membrane_ctrl.model import events, run_events
+from membrane_ctrl.model import acquisition_events, events
 from membrane_ctrl.model.arrays import FloatArray
 from membrane_ctrl.model.shape_estimate import ShapeEstimate
 from membrane_ctrl.model.state_tree import Count, StateNode
@@ -85,7 +85,7 @@ class Stethoscope:
         told = ", ".join(
             f"{line.frequency_hz:.2f} Hz {line.amplitude_nm:.1f} nm" for line in lines if line
         )
-        heard = run_events.Vibrations(
+        heard = acquisition_events.Vibrations(
             [None if line is None else round(line.frequency_hz, 4) for line in lines],
             [None if line is None else round(line.amplitude_nm, 2) for line in lines],
             told or "none",

@@ -6,8 +6,14 @@ import numpy as np
 
 from membrane_ctrl.model.arrays import BoolArray
 from membrane_ctrl.model.telemetry import State
-from membrane_ctrl.review.events import laser_and_door as doors
-from membrane_ctrl.review.events import steps
+from membrane_ctrl.review.events import (
+    door_steps,
+    excursions,
+    found_event,
+    reading_glitches,
+    shape_jumps,
+    steps,
+)
 from membrane_ctrl.run_files import hold_parts, levels
 from membrane_ctrl.run_files.shapes import Shapes
 
@@ -53,7 +59,9 @@ SPREAD_LEAST_SIGMAS = 6.0
 SPREAD_HALF_MIN = 10
 
 
-def find_events(level: steps.Level, shapes: Shapes, band_um: float) -> list[steps.FoundEvent]:
+def find_events(
+    level: found_event.Level, shapes: Shapes, band_um: float
+) -> list[found_event.FoundEvent]:
     """All events of a run, in order of time.
 
     Parameters
@@ -65,10 +73,10 @@ def find_events(level: steps.Level, shapes: Shapes, band_um: float) -> list[step
     band_um : float
         The run's `limits.band_um`: leaving it without another cause is an excursion.
     """
-    found: list[steps.FoundEvent] = []
+    found: list[found_event.FoundEvent] = []
     if level["time_s"].size:
         even = _even(level)
-        finders: Iterable[Callable[[steps.Level], list[steps.FoundEvent]]] = (
+        finders: Iterable[Callable[[found_event.Level], list[found_event.FoundEvent]]] = (
             pressure_steps,
             leak_steps,
             laser_glitches,
@@ -79,27 +87,27 @@ def find_events(level: steps.Level, shapes: Shapes, band_um: float) -> list[step
         )
         for finder in finders:
             found += finder(even)
-        found += steps.excursions(even, band_um, found)
-    found += steps.shape_jumps(shapes, hold_parts.held_at(level, shapes.time_s))
+        found += excursions.excursions(even, band_um, found)
+    found += shape_jumps.shape_jumps(shapes, hold_parts.held_at(level, shapes.time_s))
     return sorted(found, key=lambda event: event.time_s)
 
 
-def pressure_steps(level: steps.Level) -> list[steps.FoundEvent]:
+def pressure_steps(level: found_event.Level) -> list[found_event.FoundEvent]:
     """Doors: steps of the air pressure within a few seconds."""
     values = level["mean_ambient_pressure_pa"]
-    found = doors.door_steps(
+    found = door_steps.door_steps(
         values, level["min_ambient_pressure_pa"], DOOR_LEAST_PA, DOOR_LEAST_SIGMAS
     )
-    places = values.size * len(doors.LAGS)
+    places = values.size * len(door_steps.LAGS)
     return [
-        steps.event_around(
+        found_event.event_around(
             "pressure step", level, s.row, 1, s.size, "Pa", steps.confidence(s.sigmas, places)
         )
         for s in found
     ]
 
 
-def leak_steps(level: steps.Level) -> list[steps.FoundEvent]:
+def leak_steps(level: found_event.Level) -> list[found_event.FoundEvent]:
     """Steps of the holding flow that the weather (the feed-forward) does not explain."""
     minutes = levels.coarser_level(_held(level), 60.0)
     whole = minutes["rows"] > 0.5 * np.nanmedian(minutes["rows"])
@@ -112,7 +120,7 @@ def leak_steps(level: steps.Level) -> list[steps.FoundEvent]:
     )
     before = [float(np.nanmean(leak[max(0, s.row - LEAK_HALF_MIN) : s.row])) for s in found]
     return [
-        steps.event_around(
+        found_event.event_around(
             "leak step",
             minutes,
             s.row,
@@ -126,23 +134,23 @@ def leak_steps(level: steps.Level) -> list[steps.FoundEvent]:
     ]
 
 
-def laser_glitches(level: steps.Level) -> list[steps.FoundEvent]:
+def laser_glitches(level: found_event.Level) -> list[found_event.FoundEvent]:
     """Readings that jump and jump back, not explained by air pressure or a lost laser."""
     lost = level["max_displacement_quality"] > 0
     barometer = level["mean_ambient_pressure_pa"]
     stepped = np.zeros(lost.size, dtype=bool)
     stepped[[round(step.time_s - level["time_s"][0]) for step in pressure_steps(level)]] = True
     # a slow barometer shows a door late
-    slow_s = doors.update_s(barometer)
-    stepped = steps.widened(stepped, DOOR_MOVES_S + (slow_s if slow_s > 1 else 0))
-    usable = (level["state"] == State.HOLD) & ~stepped & ~steps.widened(lost, LOST_MOVES_S)
-    calm = ~steps.widened(~np.isfinite(barometer), DOOR_MOVES_S)
+    slow_s = door_steps.update_s(barometer)
+    stepped = found_event.widened(stepped, DOOR_MOVES_S + (slow_s if slow_s > 1 else 0))
+    usable = (level["state"] == State.HOLD) & ~stepped & ~found_event.widened(lost, LOST_MOVES_S)
+    calm = ~found_event.widened(~np.isfinite(barometer), DOOR_MOVES_S)
     low_um, mean_um, high_um = (level[f"{kind}_displacement_um"] for kind in ("min", "mean", "max"))
-    found = doors.glitches(low_um, mean_um, high_um, usable, calm)
+    found = reading_glitches.glitches(low_um, mean_um, high_um, usable, calm)
     time_s = level["time_s"]
     spans = [(float(time_s[g.first]), float(time_s[g.last])) for g in found]
     return [
-        steps.FoundEvent(
+        found_event.FoundEvent(
             "laser glitch",
             a_s,
             a_s - 30,
@@ -155,7 +163,7 @@ def laser_glitches(level: steps.Level) -> list[steps.FoundEvent]:
     ]
 
 
-def laser_losses(level: steps.Level) -> list[steps.FoundEvent]:
+def laser_losses(level: found_event.Level) -> list[found_event.FoundEvent]:
     """The laser flagged its reading as bad, or gave none; on a bench held without one,
     the optics.
     """
@@ -166,32 +174,34 @@ def laser_losses(level: steps.Level) -> list[steps.FoundEvent]:
     return _losses("optics lost" if by_optics else "laser lost", bad, level, 1)
 
 
-def weather_losses(level: steps.Level) -> list[steps.FoundEvent]:
+def weather_losses(level: found_event.Level) -> list[found_event.FoundEvent]:
     """A barometer or thermometer stops giving values: the feed-forward then misses the weather."""
-    found: list[steps.FoundEvent] = []
+    found: list[found_event.FoundEvent] = []
     for name, kind in _WEATHER.items():
         there = np.isfinite(level[name])
         found += _losses(kind, ~there & (np.cumsum(there) > 0) & (level["rows"] > 0), level, 5)
     return found
 
 
-def _losses(kind: str, lost: BoolArray, level: steps.Level, join: int) -> list[steps.FoundEvent]:
+def _losses(
+    kind: str, lost: BoolArray, level: found_event.Level, join: int
+) -> list[found_event.FoundEvent]:
     time_s = level["time_s"]
     return [
-        steps.FoundEvent(
+        found_event.FoundEvent(
             kind, float(time_s[a]), time_s[a] - 5, time_s[b] + 6, b - a + 1.0, "s", 1.0
         )
-        for a, b in steps.runs(lost, join)
+        for a, b in found_event.runs(lost, join)
     ]
 
 
-def lateness_bursts(level: steps.Level) -> list[steps.FoundEvent]:
+def lateness_bursts(level: found_event.Level) -> list[found_event.FoundEvent]:
     """Several late ticks close together; single ones occur on any machine."""
     worst = level["max_lateness_ms"]
     usual = float(np.nanmedian(worst)) if np.isfinite(worst).any() else 0.0
     late = worst > max(LATE_LEAST_MS, LATE_LEAST_RATIO * usual)
     return [
-        steps.FoundEvent(
+        found_event.FoundEvent(
             "lateness burst",
             float(level["time_s"][a]),
             level["time_s"][a] - 5,
@@ -200,12 +210,12 @@ def lateness_bursts(level: steps.Level) -> list[steps.FoundEvent]:
             "ms",
             1.0,
         )
-        for a, b in steps.runs(late, int(LATE_BURST_S))
+        for a, b in found_event.runs(late, int(LATE_BURST_S))
         if int(late[a : b + 1].sum()) >= LATE_BURST_LEAST
     ]
 
 
-def noise_changes(level: steps.Level) -> list[steps.FoundEvent]:
+def noise_changes(level: found_event.Level) -> list[found_event.FoundEvent]:
     """The spread of the error changes for minutes."""
     held = _held(level)
     minute = np.floor(held["time_s"] / 60).astype(int)
@@ -224,7 +234,7 @@ def noise_changes(level: steps.Level) -> list[steps.FoundEvent]:
     )
     time_s = {"time_s": (first + np.arange(size)) * 60.0}
     return [
-        steps.event_around(
+        found_event.event_around(
             "noise change",
             time_s,
             s.row,
@@ -237,7 +247,7 @@ def noise_changes(level: steps.Level) -> list[steps.FoundEvent]:
     ]
 
 
-def _held(level: steps.Level) -> steps.Level:
+def _held(level: found_event.Level) -> found_event.Level:
     """The level with NaN where the mirror was not held,
     so that the start of a hold is not a step.
     """
@@ -249,14 +259,14 @@ def _held(level: steps.Level) -> steps.Level:
     }
 
 
-def _even(level: steps.Level) -> steps.Level:
+def _even(level: found_event.Level) -> found_event.Level:
     """The level with a row for every second; NaN for missing ones."""
     second = np.rint(level["time_s"]).astype(np.int64)
     place = second - second[0]
     size = int(place[-1]) + 1
     if size == second.size:
         return level
-    even: steps.Level = {}
+    even: found_event.Level = {}
     for name, values in level.items():
         even[name] = np.full(size, np.nan)
         even[name][place] = values

@@ -25,9 +25,10 @@ from membrane_ctrl.model.columns import (
     plots_of,
 )
 from membrane_ctrl.model.telemetry import State
-from membrane_ctrl.review.catalogue import one_line, span
-from membrane_ctrl.review.report.json import PumpSeen, timeline
-from membrane_ctrl.review.statistics import shape_review, spectra
+from membrane_ctrl.review.formatting import one_line, span
+from membrane_ctrl.review.report.json import timeline
+from membrane_ctrl.review.report.pump_history import PumpSeen
+from membrane_ctrl.review.statistics import power_spectrum, shape_review
 from membrane_ctrl.review.statistics.analysis import Analysis
 from membrane_ctrl.run_files.shapes import without_terms
 
@@ -310,7 +311,7 @@ def distributions(analysis: Analysis) -> str:
                 allan.loglog(
                     series.allan.tau_s, series.allan.deviation, "o-", ms=3, color=colour, label=name
                 )
-            frequency_hz, power = spectra.density(series.spectrum, series.slow)
+            frequency_hz, power = power_spectrum.density(series.spectrum, series.slow)
             if np.isfinite(power).any():
                 spectrum.loglog(frequency_hz, np.sqrt(power), color=colour, lw=0.8, label=name)
         allan.set(title="Overlapping Allan deviation", xlabel="τ, s", ylabel="µm")

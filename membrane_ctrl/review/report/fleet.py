@@ -13,12 +13,24 @@ from pathlib import Path
 from typing import Any
 from urllib.parse import quote
 
-from membrane_ctrl.model import errors, events, files, plain_json, program, run_events, terminal
+from membrane_ctrl.model import (
+    errors,
+    events,
+    files,
+    plain_json,
+    port_events,
+    program,
+    terminal,
+)
 from membrane_ctrl.processes.worker_pool import run_jobs
 from membrane_ctrl.review import catalogue
-from membrane_ctrl.review.catalogue import beside, number, part_s, span, sparkline
-from membrane_ctrl.review.report.html import html_page, html_table, render, write_report
-from membrane_ctrl.review.report.json import pump_history, report_table, timeline
+from membrane_ctrl.review.formatting import beside, number, span
+from membrane_ctrl.review.report.command import write_report
+from membrane_ctrl.review.report.html import html_page, html_table, render
+from membrane_ctrl.review.report.json import report_table, timeline
+from membrane_ctrl.review.report.pump_history import pump_history
+from membrane_ctrl.review.run_times import part_s
+from membrane_ctrl.review.sparkline import sparkline
 from membrane_ctrl.review.statistics.analysis import Analysis, analyse
 from membrane_ctrl.run_files.run import open_run
 
@@ -91,7 +103,7 @@ def _line(analysis: Analysis, table: dict[str, Any]) -> dict[str, Any]:
     alarms = {
         event.alarm
         for event in log
-        if isinstance(event, run_events.AlarmTold) and event.what == "raised"
+        if isinstance(event, port_events.AlarmTold) and event.what == "raised"
     }
     return {
         **{name: table[name] for name in _SAME},

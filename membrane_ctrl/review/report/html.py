@@ -4,27 +4,16 @@ which writes it.
 
 import html
 import shlex
-import sys
-import time
 from collections.abc import Iterable, Sequence
-from dataclasses import asdict
-from pathlib import Path
 
-from membrane_ctrl.model import errors, files, plain_json, program
-from membrane_ctrl.review import catalogue
-from membrane_ctrl.review.catalogue import beside, number, part_s, span
+from membrane_ctrl.model import program
+from membrane_ctrl.review.formatting import beside, number, span
 from membrane_ctrl.review.report import figures
-from membrane_ctrl.review.report.json import (
-    PumpSeen,
-    pump_change,
-    pump_history,
-    report_table,
-    timeline,
-    verdict,
-)
-from membrane_ctrl.review.statistics import compare, drift, shape_review, spectra
-from membrane_ctrl.review.statistics.analysis import Analysis, ErrorSeries, analyse
-from membrane_ctrl.run_files.run import Run, open_run
+from membrane_ctrl.review.report.json import timeline, verdict
+from membrane_ctrl.review.report.pump_history import PumpSeen, pump_change
+from membrane_ctrl.review.statistics import compare, drift, power_spectrum, shape_review
+from membrane_ctrl.review.statistics.analysis import Analysis
+from membrane_ctrl.review.statistics.error_series import ErrorSeries
 
 STYLE = """
 :root{color-scheme:light}
@@ -56,10 +45,10 @@ footer{margin-top:30px;color:#889;font-size:12px}
 @media print{body{background:#fff}main{padding:0}section,figure{break-inside:avoid}}
 """  # noqa: E501
 
-
 # A month has thousands of lines; the JSON report has them all.
 _LINES_MOST = 200
-READING, TRUE = "reading (in the loop)", "true centre (twin)"
+READING = "reading (in the loop)"
+TRUE = "true centre (twin)"
 
 
 def render(
@@ -192,12 +181,15 @@ def _details(analysis: Analysis) -> str:
 
 def _bands(series: ErrorSeries) -> str:
     there = [
-        band for band in spectra.bands(series.spectrum, series.slow) if band.rms_um == band.rms_um
+        band
+        for band in power_spectrum.bands(series.spectrum, series.slow)
+        if band.rms_um == band.rms_um
     ]
     if not there:
         return "too short to say"
     said = [f"{number(b.from_hz)}–{number(b.high_hz)} Hz: {number(b.rms_um)} µm" for b in there]
-    return f"{'; '.join(said)}; not resolved: motion slower than {span(spectra.unseen_s(there))}"
+    unresolved = span(power_spectrum.unseen_s(there))
+    return f"{'; '.join(said)}; not resolved: motion slower than {unresolved}"
 
 
 def _pump(analysis: Analysis) -> str:
@@ -350,84 +342,3 @@ def html_table(head: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
 
 def _text(text: str) -> str:
     return html.escape(text)
-
-
-# `membrane-ctrl report RUN`: the page, the JSON beside it, and the verdict on the terminal.
-
-# A terminal shows no more at once; the page has them all.
-_SHOWN_MOST = 20
-
-
-def report_command(
-    run: Path,
-    out: Path | None,
-    compare_with: Path | None,
-    start: str | None,
-    end: str | None,
-    json: bool,
-) -> int:
-    """Write `report.html` and `report.json`; see `membrane-ctrl report --help`."""
-    began_s = time.monotonic()
-    opened = open_run(catalogue.resolve(run))
-    analysis = analyse(opened, *part_s(opened.origin_utc, start, end))
-    other = (
-        None
-        if compare_with is None
-        else _other(open_run(catalogue.resolve(compare_with)), start, end)
-    )
-    differences = [] if other is None else compare.compare(analysis, other)
-    history = pump_history(opened.folder)
-    table = report_table(analysis) | {"pump_over_runs": [asdict(seen) for seen in history]}
-    if other is not None:
-        table["compared_with"] = {
-            "run": other.run.name,
-            "whole_run": not other.is_part,
-            "report": report_table(other),
-            "differences": [
-                asdict(difference) | {"said": difference.said} for difference in differences
-            ],
-        }
-    folder = out.resolve() if out else opened.folder / "report"  # follow a link that the user names
-    text = plain_json.dumps(table, indent=1)
-    page = render(analysis, other, differences, history)
-    with errors.writing(folder, errors.DeviceError, "; choose another folder with --out"):
-        write_report(folder, text, page)
-    if json:
-        print(text)
-        return 0
-    _say(analysis, other, folder, time.monotonic() - began_s)
-    if said := pump_change(history, opened.config.pump.change_max):
-        print(f"note: {said}", file=sys.stderr)
-    return 0
-
-
-def write_report(folder: Path, text: str, page: str) -> None:
-    """Write a report's JSON and its page into a folder, which is made. Raises OSError."""
-    files.make_folder(folder)
-    files.write_text_atomic(folder / "report.json", text + "\n")
-    files.write_text_atomic(folder / "report.html", page)
-
-
-def _other(run: Run, start: str | None, end: str | None) -> Analysis:
-    """The run to compare with: the same part if counted from the start, else all, as times of day
-    differ.
-    """
-    from_start = all(text is None or text.strip().startswith("+") for text in (start, end))
-    return analyse(run, *part_s(run.origin_utc, start, end)) if from_start else analyse(run)
-
-
-def _say(analysis: Analysis, other: Analysis | None, folder: Path, took_s: float) -> None:
-    for note in analysis.run.notes:
-        print(f"note: {note}", file=sys.stderr)
-    print(verdict(analysis)[1])
-    for event in analysis.found[:_SHOWN_MOST]:
-        print(
-            f"  {analysis.run.utc(event.time_s):%Y-%m-%d %H:%M:%S}  {event.kind}, "
-            f"{event.size:.3g} {event.unit}"
-        )
-    if len(analysis.found) > _SHOWN_MOST:
-        print(f"  and {len(analysis.found) - _SHOWN_MOST} more in the report")
-    if other is not None:
-        part = "" if not analysis.is_part else ", same part" if other.is_part else ", all of it"
-        print(f"against {other.run.name}{part}: {verdict(other)[1]}")
-    print(f"{folder / 'report.html'} ({took_s:.1f} s)")

@@ -1,23 +1,16 @@
 """The report for programs: plain data, units in the names."""
 
-import contextlib
 import math
-from collections.abc import Sequence
-from dataclasses import asdict, dataclass
-from datetime import datetime
-from pathlib import Path
+from dataclasses import asdict
 from typing import Any, Literal
 
-from membrane_ctrl.control import pump_curve
 from membrane_ctrl.model import events, program
-from membrane_ctrl.model.run_status import RunStatus
 from membrane_ctrl.model.telemetry import State
-from membrane_ctrl.review.catalogue import beside, span
-from membrane_ctrl.review.statistics import drift, shape_review, spectra
-from membrane_ctrl.review.statistics.analysis import Analysis, ErrorSeries
-from membrane_ctrl.run_files import run_folder
-from membrane_ctrl.run_files.run import origin_of
-from membrane_ctrl.run_files.run_folder import LoggedEvent, logged
+from membrane_ctrl.review.formatting import beside, span
+from membrane_ctrl.review.statistics import drift, power_spectrum, shape_review
+from membrane_ctrl.review.statistics.analysis import Analysis
+from membrane_ctrl.review.statistics.error_series import ErrorSeries
+from membrane_ctrl.run_files.event_log import LoggedEvent, logged
 
 Word = Literal["good", "look", "bad"]
 
@@ -138,7 +131,9 @@ def _series(series: ErrorSeries | None) -> dict[str, Any] | None:
             "deviation_um": list(series.allan.deviation),
             "windows": [int(n) for n in series.allan.windows],
         },
-        "bands_rms_um": [asdict(band) for band in spectra.bands(series.spectrum, series.slow)],
+        "bands_rms_um": [
+            asdict(band) for band in power_spectrum.bands(series.spectrum, series.slow)
+        ],
         "spectrum_segments": series.spectrum.segments,
         "slow_spectrum_segments": series.slow.segments,
     }
@@ -171,85 +166,3 @@ def _shape(shape: shape_review.ShapeReview) -> dict[str, Any]:
             for pair in shape.pairs
         ],
     }
-
-
-# The pump over the weeks, as the runs of one bench have learned it by their probe
-# (`pump.probe_um`).
-
-_LOOKED_BACK = 400  # runs
-_CERTAIN_SIGMAS = 3.0
-
-
-@dataclass(frozen=True, slots=True)
-class PumpSeen:
-    """What a run had learned of the pump at its end."""
-
-    run: str
-    started_utc: datetime
-    scale: float  # flow at half the full flow, relative to the curve of the newest run
-    sigma: float
-    leak_um_per_s: float  # with any offset of the curve; NaN without a summary
-    same_curve: bool  # as the newest run's
-
-
-def pump_change(history: Sequence[PumpSeen], change_max: float) -> str:
-    """Words for a certain change beyond the limit since the first run on the present curve; empty
-    without one.
-    """
-    if not history:
-        return ""
-    newest, first = history[-1], next(seen for seen in history if seen.same_curve)
-    change, sigma = (
-        newest.scale / first.scale - 1,
-        math.hypot(newest.sigma, first.sigma) / first.scale,
-    )
-    if abs(change) <= max(change_max, _CERTAIN_SIGMAS * sigma):
-        return ""
-    return (
-        f"the pump gives {100 * abs(change):.0f} % {'less' if change < 0 else 'more'} than "
-        f"in {first.run} "
-        f"(+- {100 * sigma:.0f} %): check it, then `tune pump`"
-    )
-
-
-def pump_history(newest: Path) -> list[PumpSeen]:
-    """The pump in a run and in earlier ones of its folder with the same devices, oldest first.
-
-    Runs that have learned nothing are omitted.
-    """
-    devices, latest = run_folder.read_config(newest, []).devices, None
-    found: list[PumpSeen] = []
-    folders = [folder for folder in sorted(newest.parent.iterdir()) if folder.name <= newest.name]
-    for folder in reversed(folders[-_LOOKED_BACK:]):
-        with contextlib.suppress(OSError):
-            if folder.name.startswith(".") or not run_folder.is_run(folder):
-                continue
-            log, config = run_folder.read_events(folder, []), run_folder.read_config(folder, [])
-            told = _last_learned(log)
-            if told is None or config.devices != devices:
-                continue
-            learned, pump = told[0], config.with_gains(told[1]).pump
-            latest = latest or pump
-            fraction = pump_curve.PumpCurve(latest).fraction(0.5 * latest.flow_full_um_per_s)
-            share = pump_curve.PumpCurve(pump).flow(fraction) / (0.5 * latest.flow_full_um_per_s)
-            leak = _finite((run_folder.read_summary(folder, []) or {}).get("leak_um_per_s"))
-            seen = (share * _finite(learned.scale), share * _finite(learned.sigma), leak)
-            if seen[0] > 0 and seen[1] > 0:
-                watched = {"probe_um", "change_max"}
-                same = pump.model_dump(exclude=watched) == latest.model_dump(exclude=watched)
-                found.append(PumpSeen(folder.name, origin_of(folder, log), *seen, same))
-    return found[::-1]
-
-
-def _last_learned(log: Sequence[LoggedEvent]) -> tuple[events.PumpLearned, dict[str, Any]] | None:
-    """What a run told last of its pump, and the gains and curve then set."""
-    status, told = RunStatus(), None
-    for each in log:
-        status = status.after_event(each.event, each.mono_s)
-        if isinstance(each.event, events.PumpLearned):
-            told = each.event, dict(status.loop or {})
-    return told
-
-
-def _finite(value: object) -> float:
-    return float(value) if isinstance(value, int | float) else math.nan

@@ -9,8 +9,10 @@ from scipy import stats
 from membrane_ctrl.control.shape_reference import SHAPES
 from membrane_ctrl.model.arrays import Column
 from membrane_ctrl.model.telemetry import ShapeState, State
-from membrane_ctrl.review.statistics.analysis import Analysis, ErrorSeries
-from membrane_ctrl.review.statistics.drift import FittedSlope, mean_p, spread_p, windowed
+from membrane_ctrl.review.statistics.analysis import Analysis
+from membrane_ctrl.review.statistics.difference_tests import mean_p, spread_p, windowed
+from membrane_ctrl.review.statistics.drift import FittedSlope
+from membrane_ctrl.review.statistics.error_series import ErrorSeries
 
 _SIGNIFICANT = 0.01
 _SHORT = "no test: too short"

@@ -2,14 +2,12 @@
 correlation.
 """
 
-import math
 from dataclasses import dataclass
 
 import numpy as np
-from scipy import special, stats
+from scipy import stats
 
 from membrane_ctrl.model.arrays import Column
-from membrane_ctrl.review.statistics.spectra import group_starts
 
 # Iterations of g and of the variance absorbed by the line: three give short records the right
 # coverage; more leave the shortest records no degree of freedom, and so a meaningless interval.
@@ -66,10 +64,10 @@ def slope(time_s: Column, values: Column) -> FittedSlope:
 
 def correlation_time(residual: Column) -> float:
     """1 + 2 sum of the autocorrelation, in samples; at least 1."""
-    return _times(residual)[0]
+    return correlation_times(residual)[0]
 
 
-def _times(residual: Column) -> tuple[float, float]:
+def correlation_times(residual: Column) -> tuple[float, float]:
     """1 + 2 sum of the autocorrelation, and of its square, which tells of a variance; in samples,
     at least 1.
     """
@@ -88,125 +86,3 @@ def _times(residual: Column) -> tuple[float, float]:
         sums = np.minimum.accumulate(pairs[:count]).sum(), (correlation[: 2 * count] ** 2).sum()
         factor, of_square = (float(np.clip(2 * total - 1, 1.0, size / 3)) for total in sums)
     return factor, of_square
-
-
-# Tests whether two series differ, using blocks of time that count as independent.
-# After five minutes the effects of weather (30 s) and air (300 s) have decayed enough for
-# independence; a short run is cut into eight blocks, which makes its test a rough one.
-_BLOCK_S = 300.0
-_LEAST_BLOCKS = 8
-# Least number of values in a block for a variance.
-_LEAST_VALUES = 5
-# Fewer blocks have no usable variance.
-_LEAST_TESTED = 3
-
-
-def block_s(a_s: Column, b_s: Column, window_s: float) -> float:
-    """Common block length of two series at these times: unequal blocks would include different
-    motion.
-    """
-    spans_s = [float(np.ptp(time_s)) if time_s.size else 0.0 for time_s in (a_s, b_s)]
-    return max(min(_BLOCK_S, min(spans_s) / _LEAST_BLOCKS), _LEAST_VALUES * window_s)
-
-
-def blocks(time_s: Column, values: Column, length_s: float) -> tuple[Column, Column]:
-    """Mean and log variance of each block; the logarithm is corrected for its bias from the number
-    of values.
-    """
-    there = np.isfinite(values)
-    time_s, values = time_s[there], values[there]
-    if values.size < _LEAST_TESTED or length_s <= 0:
-        return np.empty(0), np.empty(0)
-    number = np.floor((time_s - time_s[0]) / length_s).astype(np.int64)
-    number = np.minimum(number, max(0, int(np.ptp(time_s) / length_s) - 1))
-    count = np.bincount(number)
-    mean = np.bincount(number, values) / np.maximum(count, 1)
-    freedom = np.maximum(count - 1, 1)
-    variance = np.bincount(number, (values - mean[number]) ** 2) / freedom
-    kept = count >= 0.5 * np.median(count[count > 0])
-    varies = kept & (variance > 0)
-    bias = special.digamma(freedom / 2) - np.log(freedom / 2)
-    return np.asarray(mean[kept], dtype=np.float64), np.log(variance[varies]) - bias[varies]
-
-
-def windowed(time_s: Column, values: Column, window_s: float) -> tuple[Column, Column]:
-    """Middles and means of longer windows, those with nine tenths of their seconds."""
-    if not time_s.size:
-        return time_s, values
-    number = np.floor(time_s / window_s).astype(np.int64)
-    starts = group_starts(number)
-    count = np.diff(np.append(starts, number.size))
-    whole = count >= 0.9 * window_s
-    middles_s = np.asarray((number[starts][whole] + 0.5) * window_s, dtype=np.float64)
-    return middles_s, np.add.reduceat(values, starts)[whole] / count[whole]
-
-
-def spread_p(a: Column, b: Column, window_s: float = 1.0) -> float:
-    """Chance of spreads as different between alike series (2, n) of times and values; NaN: too
-    short.
-
-    Two tests, each of half the level. Within blocks: Welch's of log variances, which sees any
-    difference of the usual motion. Of the whole: the ratio of the variances against F with their
-    effective degrees of freedom, the fewer of n / (1 + 2 sum r_k^2) and what the scatter of the
-    squares says; it sees what is slower or rarer than a block.
-    """
-    length_s = block_s(a[0], b[0], window_s)
-    within = welch_p(blocks(a[0], a[1], length_s)[1], blocks(b[0], b[1], length_s)[1])
-    both = [p for p in (within, _variances_p(a[1], b[1])) if math.isfinite(p)]
-    return min(1.0, len(both) * min(both)) if both else math.nan
-
-
-def _variances_p(a: Column, b: Column) -> float:
-    """The test of the whole of `spread_p`."""
-    variances, freedoms = [], []
-    for values in (a[np.isfinite(a)], b[np.isfinite(b)]):
-        if values.size < _LEAST_BLOCKS:
-            return math.nan
-        residual = values - values.mean()
-        square = float((residual**2).mean())
-        if square <= 0:
-            return math.nan
-        excess = residual**2 - square
-        # of a Gaussian series (Bartlett 1946), and of its squares as they are: rare excursions make
-        # them few
-        gaussian = 1 / _times(residual)[1]
-        seen = 2 * square**2 / (max(float(excess.var()), 1e-300) * correlation_time(excess))
-        freedoms.append(max(values.size * min(gaussian, seen) - 1, 1.0))
-        variances.append(square)
-    ratio = variances[0] / variances[1]
-    return 2 * float(min(stats.f.cdf(ratio, *freedoms), stats.f.sf(ratio, *freedoms)))
-
-
-def mean_p(a: Column, b: Column, window_s: float = 1.0, offset: float = 0.0) -> float:
-    """Probability of means this different between equal series (times and values); NaN: too short.
-
-    Parameters
-    ----------
-    window_s : float
-        Length of a value's window.
-    offset : float
-        Standard deviation of the difference common to all blocks of a run, in addition to that
-        between blocks.
-    """
-    length_s = block_s(a[0], b[0], window_s)
-    return welch_p(
-        blocks(a[0], a[1], length_s)[0], blocks(b[0], b[1], length_s)[0], offset, correlated=True
-    )
-
-
-def welch_p(a: Column, b: Column, offset: float = 0.0, correlated: bool = False) -> float:
-    """Welch's t test of two sets of blocks; correlated ones count for fewer. `offset` as in
-    `mean_p`.
-    """
-    if min(a.size, b.size) < _LEAST_TESTED:
-        return math.nan
-    variance, weights = offset**2, 0.0
-    for part in (a, b):
-        size = part.size / (correlation_time(part - part.mean()) if correlated else 1.0)
-        own = float(part.var(ddof=1)) / size
-        variance += own
-        weights += own**2 / max(size - 1, 1.0)
-    if variance <= 0:  # what never varies differs, or does not
-        return float(a.mean() == b.mean())
-    freedom = variance**2 / weights if weights > 0 else math.inf
-    return float(2 * stats.t.sf(abs(a.mean() - b.mean()) / math.sqrt(variance), freedom))

@@ -10,9 +10,9 @@ import numpy as np
 
 from membrane_ctrl.model import telemetry
 from membrane_ctrl.model.arrays import Column, IntArray, Singles
-from membrane_ctrl.model.run_status import RunStatus
 from membrane_ctrl.model.telemetry import State
-from membrane_ctrl.review.statistics import spectra
+from membrane_ctrl.review.statistics import held_time, window_means, without_feedforward
+from membrane_ctrl.review.statistics.pump_activity import PumpActivity, PumpSums
 from membrane_ctrl.run_files import hold_parts, run_statistics
 from membrane_ctrl.run_files.run import Run
 
@@ -32,21 +32,6 @@ ERROR, KEPT_AWAY = range(2)
 # The histogram extends this many bands to each side, in bins of a fiftieth of a band.
 _HISTOGRAM_BANDS = 5
 _HISTOGRAM_BINS = 500
-# A wanted flow that exceeds the pump's range by less than this is a rounding error of single
-# precision.
-_SATURATED_UM_PER_S = 1e-3
-
-
-@dataclass(frozen=True, slots=True)
-class PumpActivity:
-    """Activity of the pump while the mirror was held."""
-
-    mean_fraction: float
-    std_fraction: float
-    travel_per_hour: float  # sum of its command's changes, a measure of wear
-    starts_per_hour: float
-    running_share: float
-    saturated_share: float  # of ticks that wanted less than zero or more than full flow
 
 
 @dataclass(frozen=True, slots=True)
@@ -72,7 +57,7 @@ class HoldPass:
     # (`TRUE`): rows of sums are the error (`ERROR`) and what the feed-forward kept away
     # (`KEPT_AWAY`: of the true
     # centre, if known)
-    seconds: tuple[spectra.SecondsOf, spectra.SecondsOf]
+    seconds: tuple[window_means.SecondsOf, window_means.SecondsOf]
     raw_reading: run_statistics.Moments
     raw_true: run_statistics.Moments
     raw_in_band: float  # share of settled readings within the band
@@ -99,20 +84,22 @@ class _Collector:
         loop, self._band_um = run.config.loop, run.config.limits.band_um
         self._period_s = 1 / loop.rate_hz
         self._parts = hold_parts.HoldParts(self._band_um)
-        self._without = spectra.WithoutFeedforward(loop.kp_per_s, loop.ti_s, self._period_s)
+        self._without = without_feedforward.WithoutFeedforward(
+            loop.kp_per_s, loop.ti_s, self._period_s
+        )
         self._grid_s = span_s[0]
         size = max(0, math.ceil((span_s[1] - span_s[0]) / self._period_s) + 2)
         self._reading = np.full(size, np.nan, dtype=np.float32)
         self._true = np.full(size, np.nan, dtype=np.float32)
-        self._seconds = spectra.SecondSums(2), spectra.SecondSums(2)
+        self._seconds = window_means.SecondSums(2), window_means.SecondSums(2)
         self._raw_reading, self._raw_true = run_statistics.Moments(), run_statistics.Moments()
         reach_um = _HISTOGRAM_BANDS * self._band_um
         self._edges_um = np.linspace(-reach_um, reach_um, _HISTOGRAM_BINS + 1)
         self._histogram = np.zeros(_HISTOGRAM_BINS, dtype=np.int64)
         self._lateness = run_statistics.LogHistogram()
-        self._pump = _PumpSums(run)
+        self._pump = PumpSums(run)
         self._ticks = self._counted = self._unread = self._inside = 0
-        self._times = {name: spectra.HeldTime() for name in ("hold", *hold_parts.PARTS)}
+        self._times = {name: held_time.HeldTime() for name in ("hold", *hold_parts.PARTS)}
         # the running count at the start: for a part that of its first tick, which includes earlier
         # ones
         self._missed_before = math.nan if from_within else 0.0
@@ -189,57 +176,3 @@ class _Collector:
             lateness_ms=self._lateness,
             pump=self._pump.result(self._period_s),
         )
-
-
-class _PumpSums:
-    """Sums behind `PumpActivity`."""
-
-    def __init__(self, run: Run) -> None:
-        self._since_s, self._most_um_per_s = _flow_limits(run)
-        self._fraction = run_statistics.Moments()
-        self._travel = 0.0
-        self._starts = self._running = self._saturated = 0
-
-    def add(self, held: Mapping[str, Column]) -> None:
-        pump = np.nan_to_num(held["pump_fraction"])
-        self._fraction.add(pump)
-        running = pump > 0
-        self._travel += float(np.abs(np.diff(pump)).sum())
-        self._starts += int((running[1:] & ~running[:-1]).sum())
-        self._running += int(running.sum())
-        wanted, since = (
-            held["flow_wanted_um_per_s"],
-            np.searchsorted(self._since_s, held["mono_s"], "right"),
-        )
-        most = self._most_um_per_s[since - 1] + _SATURATED_UM_PER_S
-        self._saturated += int(((wanted < -_SATURATED_UM_PER_S) | (wanted > most)).sum())
-
-    def result(self, period_s: float) -> PumpActivity:
-        count = self._fraction.count
-        hours = count * period_s / 3600
-        per_hour = 1 / hours if hours else math.nan
-        share = 1 / count if count else math.nan
-        return PumpActivity(
-            mean_fraction=self._fraction.mean if count else math.nan,
-            std_fraction=self._fraction.std,
-            travel_per_hour=self._travel * per_hour,
-            starts_per_hour=self._starts * per_hour,
-            running_share=self._running * share,
-            saturated_share=self._saturated * share,
-        )
-
-
-def _flow_limits(run: Run) -> tuple[Column, Column]:
-    """Times from which a largest flow was in force, and those flows: they change with a curve of
-    the pump.
-    """
-    found = [(-math.inf, run.config)]
-    status = RunStatus()
-    for each in run.log:
-        before, status = status.loop, status.after_event(each.event, each.mono_s)
-        if status.loop is not before:
-            found.append((each.mono_s, run.config.with_gains(status.loop)))
-    since_s, most = np.array(
-        [(at_s, config.loop.flow_most_um_per_s(config.pump)) for at_s, config in found]
-    ).T
-    return since_s, most

@@ -12,7 +12,7 @@ from rerun.blueprint.encodings import TimelineColumn
 from membrane_ctrl.config.schema import Config
 from membrane_ctrl.model import columns, figure_columns
 from membrane_ctrl.model.columns import Group, Plot, plot_title, plots_of
-from membrane_ctrl.recorder import blueprint
+from membrane_ctrl.recorder import blueprint, summary_page
 from membrane_ctrl.review.viewer.layer import overview_streams, prefix_of
 from membrane_ctrl.run_files import streams
 
@@ -137,7 +137,7 @@ class ReviewBlueprint:
     def _pages(self) -> rrb.Tabs:
         """A page of figures for each run."""
         names = [label or "Summary" for label in self.labels]
-        origins = [prefix_of(label) + blueprint.SUMMARY_PATH for label in self.labels]
+        origins = [prefix_of(label) + summary_page.SUMMARY_PATH for label in self.labels]
         return rrb.Tabs(
             *(rrb.TextDocumentView(name=n, origin=o) for n, o in zip(names, origins, strict=True)),
             active_tab=0,

@@ -16,9 +16,9 @@ from rerun.blueprint.table import Column, SortBy, TableBlueprint, TableLayout
 from rerun_bindings import CatalogClientInternal
 
 from membrane_ctrl.config.schema import Config
-from membrane_ctrl.model import errors, events, telemetry, terminal
-from membrane_ctrl.review import catalogue
-from membrane_ctrl.review.viewer import blueprints, viewer
+from membrane_ctrl.model import errors, events, job_control, telemetry
+from membrane_ctrl.review import catalogue, run_times
+from membrane_ctrl.review.viewer import blueprints, screenshot, viewer
 from membrane_ctrl.review.viewer.layer import ALL, APPLICATION, Layer
 from membrane_ctrl.run_files.run import Run, open_run
 
@@ -55,7 +55,7 @@ def review_command(options: ReviewOptions) -> int:
         return _show_every_run(options)
     runs = [open_run(catalogue.resolve(path)) for path in options.runs]
     with (
-        terminal.ends_as_by_ctrl_c(),
+        job_control.ends_as_by_ctrl_c(),
         tempfile.TemporaryDirectory(prefix="membrane-review-") as folder,
     ):
         if options.live:
@@ -86,7 +86,7 @@ def _show(file: Path, options: ReviewOptions, cursor: viewer.CursorTime | None) 
 
 def _picture(target: Path, source: Path | str, cursor: viewer.CursorTime | None = None) -> int:
     try:
-        target.write_bytes(viewer.screenshot_of(source, cursor))
+        target.write_bytes(screenshot.screenshot_of(source, cursor))
     except RuntimeError as error:
         raise errors.DeviceError(f"no picture: {error}") from None
     return 0
@@ -97,7 +97,7 @@ def _show_every_run(options: ReviewOptions) -> int:
     if not found:
         raise errors.InputError(f"{options.logs}: contains no run")
     with (
-        terminal.ends_as_by_ctrl_c(),
+        job_control.ends_as_by_ctrl_c(),
         tempfile.TemporaryDirectory(prefix="membrane-review-") as folder,
     ):
         served = RunCatalogue(found, Path(folder))
@@ -209,7 +209,7 @@ def make_review(
 
 def _with_telemetry(runs: Sequence[Run]) -> list[Run]:
     """The runs that can be shown; adds a note to the others."""
-    there = [run for run in runs if catalogue.end_s(run)]
+    there = [run for run in runs if run_times.end_s(run)]
     if not there:
         raise errors.InputError(
             f"{', '.join(str(run.folder) for run in runs)}: no readable telemetry"
@@ -223,18 +223,18 @@ def _with_telemetry(runs: Sequence[Run]) -> list[Run]:
 def _span(run: Run, options: ReviewOptions) -> tuple[float, float] | None:
     """The requested part of the run, in seconds."""
     if options.start is not None or options.end is not None:
-        start_s, end_s = catalogue.part_s(run.origin_utc, options.start, options.end)
-        if start_s >= catalogue.end_s(run):
-            raise catalogue.not_in(run, f"--from {options.start}")
+        start_s, end_s = run_times.part_s(run.origin_utc, options.start, options.end)
+        if start_s >= run_times.end_s(run):
+            raise run_times.not_in(run, f"--from {options.start}")
         if end_s <= 0:
-            raise catalogue.not_in(run, f"--to {options.end}")
+            raise run_times.not_in(run, f"--to {options.end}")
         return (0.0 if options.start is None else start_s), (
-            catalogue.end_s(run) if options.end is None else end_s
+            run_times.end_s(run) if options.end is None else end_s
         )
     if options.at is not None:
-        at_s = catalogue.moment_s(options.at, run.origin_utc)
-        if not -_AROUND_S <= at_s <= catalogue.end_s(run) + _AROUND_S:
-            raise catalogue.not_in(run, f"--at {options.at}")
+        at_s = run_times.moment_s(options.at, run.origin_utc)
+        if not -_AROUND_S <= at_s <= run_times.end_s(run) + _AROUND_S:
+            raise run_times.not_in(run, f"--at {options.at}")
     elif options.around is not None:
         at_s = _around(run, options.around)
     else:

@@ -20,13 +20,14 @@ from membrane_ctrl.model.figure_columns import LOW_ORDER_COLUMNS
 from membrane_ctrl.model.prose import for_people
 from membrane_ctrl.model.run_status import RunStatus
 from membrane_ctrl.model.telemetry import FIELDS, changes
-from membrane_ctrl.recorder import rerun_streams
-from membrane_ctrl.recorder.blueprint import SUMMARY_PATH, TELEMETRY_LANES, summary_page
-from membrane_ctrl.review.catalogue import end_s
+from membrane_ctrl.recorder import rerun_shapes
+from membrane_ctrl.recorder.state_lanes import TELEMETRY_LANES
+from membrane_ctrl.recorder.summary_page import SUMMARY_PATH, summary_page
 from membrane_ctrl.review.events.found import LEVEL_COLUMNS, find_events
-from membrane_ctrl.review.events.steps import FoundEvent
+from membrane_ctrl.review.events.found_event import FoundEvent
 from membrane_ctrl.review.report.figures import broken_at_gaps
-from membrane_ctrl.run_files import hold_parts, shapes, streams
+from membrane_ctrl.review.run_times import end_s
+from membrane_ctrl.run_files import hold_parts, plot_marks, shapes, streams
 from membrane_ctrl.run_files.run import Block, Run
 
 APPLICATION = "membrane_review"
@@ -198,7 +199,7 @@ class Layer:
             levels = [each.event.level.value for each in told]
             texts = [each.event.sentence for each in told]
             self._log(run, "/events", np.array([each.mono_s for each in told]), texts, levels)
-        for stream, time_s, values in streams.mark_lines(
+        for stream, time_s, values in plot_marks.mark_lines(
             [(each.mono_s, each.event) for each in run.log]
         ):
             self._style(stream.path, _names_and_colours(stream), 2.0, vertical=True)
@@ -225,7 +226,7 @@ class Layer:
             name = f"{kind}, {ends}" if len(alike) == 1 else f"{len(alike)} of {kind}, {ends}"
             path = f"/found/lines/{kind.replace(' ', '_')}"
             self._style(path, [(name, _FOUND_COLOURS.get(kind, _OTHER_FOUND))], 1.0, vertical=True)
-            time_s, values = streams.vertical_lines(np.array([f.time_s for f in alike]))
+            time_s, values = plot_marks.vertical_lines(np.array([f.time_s for f in alike]))
             self._columns(path, time_s, rr.Scalars.columns(scalars=values))
 
     def _log(
@@ -278,14 +279,14 @@ class Layer:
         colours = {}
         if time_s.size > 1:
             deviation = shapes.deviation_map_um(parameters)
-            span = rerun_streams.colour_span(deviation, None)
+            span = rerun_shapes.colour_span(deviation, None)
             self._map("scatter", deviation, span)
             colours["scatter"] = f"0 to {span[1]:.2g} µm"
         wanted = np.flatnonzero(_some(time_s.size, MAPS_MOST))
         whole = [shapes.change_map_um(parameters[row]) for row in wanted]
-        for kind, (terms, least_um) in rerun_streams.CHANGES.items():
+        for kind, (terms, least_um) in rerun_shapes.CHANGES.items():
             changes = [shapes.without_terms(change, terms) for change in whole]
-            span = rerun_streams.colour_span(np.stack(changes), least_um)
+            span = rerun_shapes.colour_span(np.stack(changes), least_um)
             colours[kind] = f"±{span[1]:.2g} µm"
             for row, change in zip(wanted, changes, strict=True):
                 self._map(kind, change, span, float(time_s[row]))
@@ -318,7 +319,7 @@ class Layer:
         self._stream.log(f"{path}/outside", outside, static=True)
         if at_s is not None:
             self._set_time(at_s)
-        self._stream.log(path, rerun_streams.map_picture(picture, span), static=at_s is None)
+        self._stream.log(path, rerun_shapes.map_picture(picture, span), static=at_s is None)
 
     def _page(self, path: str, text: str) -> None:
         self._stream.log(

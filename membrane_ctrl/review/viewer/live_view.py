@@ -16,16 +16,16 @@ import pyarrow as pa
 
 from membrane_ctrl.model import plain_json, telemetry
 from membrane_ctrl.model.clock import RunClock
+from membrane_ctrl.model.event_lines import from_dict
 from membrane_ctrl.model.events import Event, EventLine
-from membrane_ctrl.model.run_events import from_dict
 from membrane_ctrl.model.run_status import RunStatus
 from membrane_ctrl.model.shape_estimate import ShapeEstimate
-from membrane_ctrl.recorder import blueprint, sink
+from membrane_ctrl.recorder import blueprint, recorder_errors, rerun_recording, summary_page
 from membrane_ctrl.recorder.handover import load_state
-from membrane_ctrl.recorder.process import Thumbnail
 from membrane_ctrl.recorder.rerun_output import RerunOutput
+from membrane_ctrl.recorder.thumbnails import Thumbnail
 from membrane_ctrl.run_files import shapes, table_specs
-from membrane_ctrl.run_files.disk_budget import DetailLevel
+from membrane_ctrl.run_files.detail_level import DetailLevel
 from membrane_ctrl.run_files.run import Run
 from membrane_ctrl.run_files.table_store.follower import TableFollower
 from membrane_ctrl.run_files.table_store.reader import TableReader
@@ -38,7 +38,7 @@ RECENT_S = 600.0
 _RECENT_THUMBNAILS = 16
 
 
-class LiveRecording(sink.Recording):
+class LiveRecording(rerun_recording.Recording):
     """A recording that goes to a viewer's server instead of files.
 
     Parameters
@@ -78,11 +78,11 @@ class LiveView:
         Where it is sent.
     """
 
-    def __init__(self, run: Run, recording: sink.Recording) -> None:
+    def __init__(self, run: Run, recording: rerun_recording.Recording) -> None:
         self._folder = run.folder
         self._config = run.config
         self._status = RunStatus()
-        errors = sink.RecorderErrors(_print_error)
+        errors = recorder_errors.RecorderErrors(_print_error)
         self._output = RerunOutput(
             recording, run.config, errors, self._summary_page, overview_every_s=1.0
         )
@@ -130,7 +130,7 @@ class LiveView:
             self._summary = state.summary.as_dict(state.dropped, {})
         if not self._summary:
             return "The recorder has not stated any figures yet.\n"
-        return blueprint.summary_page(self._summary, self._status, self._config)
+        return summary_page.summary_page(self._summary, self._status, self._config)
 
 
 def follow_run(

@@ -7,8 +7,7 @@ import socket
 import subprocess
 import sys
 import time
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TypeAlias
@@ -42,7 +41,7 @@ class CursorTime:
     nanos: int
 
 
-def _put(client: ViewerClient, at: CursorTime) -> None:
+def place_cursor(client: ViewerClient, at: CursorTime) -> None:
     if at.timeline == "utc":
         client.set_time(at.timeline, timestamp=np.datetime64(at.nanos, "ns"), play_state="paused")
     else:
@@ -85,8 +84,8 @@ def put_cursor(
     until_s = time.monotonic() + most_s
     while time.monotonic() < until_s and process.poll() is None:
         try:
-            client = ViewerClient.connect(_proxy("127.0.0.1", port))
-            _put(client, at)
+            client = ViewerClient.connect(proxy_url("127.0.0.1", port))
+            place_cursor(client, at)
             if any(opened.current_time == at.nanos for opened in client.get_state().recordings):
                 return
         except (RuntimeError, ConnectionError):
@@ -104,7 +103,7 @@ def serve(source: Path | str, bind: str, port: int, meanwhile: Meanwhile = lambd
     port = port or free_port()
     _require_listening(bind, port)
     data_port = free_port()
-    url = source if isinstance(source, str) else _proxy(_host(bind), data_port)
+    url = source if isinstance(source, str) else proxy_url(_host(bind), data_port)
     _say_where(bind, port, url)
     options = [
         "--serve-web",
@@ -129,19 +128,19 @@ def live(run: Run, web: bool, port: int = 0) -> int:
     data_port, port = free_port(), port or free_port()
     kind = ["--serve-web", "--web-viewer-port", str(port)] if web else ["--serve-grpc"]
     server = viewer_command(*kind, "--bind", "127.0.0.1", "--port", str(data_port))
-    proxy = _proxy("127.0.0.1", data_port)
+    proxy = proxy_url("127.0.0.1", data_port)
     if web:
         _require_listening("127.0.0.1", port)
         _say_where("127.0.0.1", port, proxy)
     else:
         _require_screen()
     try:
-        with subprocess.Popen(server, env=_environment()) as served:
+        with subprocess.Popen(server, env=viewer_environment()) as served:
             _wait_for_server(served, data_port)
             viewer = viewer_command(
                 "--bind", "127.0.0.1", "--port", str(free_port()), "--connect", proxy
             )
-            watched = served if web else subprocess.Popen(viewer, env=_environment())
+            watched = served if web else subprocess.Popen(viewer, env=viewer_environment())
             try:
                 view = LiveView(run, LiveRecording(run, proxy))
                 follow_run(view, run.folder, lambda: watched.poll() is None)
@@ -181,7 +180,7 @@ def _host(bind: str) -> str:
     return "127.0.0.1" if bind == "127.0.0.1" else socket.gethostname()
 
 
-def _proxy(host: str, port: int) -> str:
+def proxy_url(host: str, port: int) -> str:
     return f"rerun+http://{host}:{port}/proxy"
 
 
@@ -223,7 +222,7 @@ def _run(
     command: list[str], started: Callable[[subprocess.Popen[bytes]], None] = lambda _: None
 ) -> int:
     try:
-        with subprocess.Popen(command, env=_environment()) as viewer:
+        with subprocess.Popen(command, env=viewer_environment()) as viewer:
             try:
                 started(viewer)
                 return 0 if viewer.wait() == 0 else 4
@@ -234,78 +233,5 @@ def _run(
         raise errors.DeviceError(f"the viewer did not start: {error}") from None
 
 
-def _environment() -> dict[str, str]:
+def viewer_environment() -> dict[str, str]:
     return {**os.environ, "RUST_LOG": os.environ.get("RUST_LOG", "error")}
-
-
-# A picture of a run as the viewer opens it, without a screen; needs a Vulkan driver, e.g. Mesa's
-# software one.
-
-# The viewer is ready when two consecutive pictures are equal, about 7 s for a short run on two
-# cores.
-_WAIT_S = 60.0
-_BETWEEN_S = 0.5
-
-
-def screenshot_of(source: Path | str, at: CursorTime | None = None) -> bytes:
-    """PNG of a recording as it opens, at a moment or its end, or of a server's page.
-
-    Raises RuntimeError if the viewer does not start (no Vulkan driver) or its picture keeps
-    changing.
-    """
-    with _headless() as viewer:
-        viewer.open(source if isinstance(source, str) else str(source.resolve()))
-        if isinstance(source, str):
-            pass
-        elif at is None:
-            viewer.set_time(play_state="following")
-        else:
-            _put(viewer, at)
-        return _at_rest(viewer)
-
-
-def _at_rest(viewer: ViewerClient) -> bytes:
-    until_s = time.monotonic() + _WAIT_S
-    before = b""
-    while time.monotonic() < until_s:
-        picture = viewer.take_screenshot()
-        if picture == before:
-            return picture
-        before = picture
-        time.sleep(_BETWEEN_S)
-    raise RuntimeError(f"the viewer's picture still changes after {_WAIT_S:.0f} s")
-
-
-@contextmanager
-def _headless() -> Iterator[ViewerClient]:
-    """A headless viewer reachable only from this machine; `ViewerClient.spawn` would listen on
-    every interface.
-    """
-    port = free_port()
-    command = viewer_command(
-        "--headless", "--bind", "127.0.0.1", "--port", str(port), "--hide-welcome-screen"
-    )
-    with subprocess.Popen(
-        command, env=_environment(), stdout=subprocess.DEVNULL, stderr=subprocess.PIPE
-    ) as process:
-        try:
-            yield _connect(port, process)
-        finally:
-            process.terminate()
-
-
-def _connect(port: int, process: subprocess.Popen[bytes]) -> ViewerClient:
-    until_s = time.monotonic() + _WAIT_S
-    while time.monotonic() < until_s and process.poll() is None:
-        try:
-            viewer = ViewerClient.connect(_proxy("127.0.0.1", port))
-            viewer.take_screenshot(max_size=16)
-        except (RuntimeError, ConnectionError):
-            time.sleep(_BETWEEN_S)
-        else:
-            return viewer
-    process.terminate()
-    reason = process.stderr.read().decode(errors="replace").strip() if process.stderr else ""
-    raise RuntimeError(
-        f"the headless viewer did not start (Vulkan driver installed?): {reason[-300:]}"
-    )

@@ -16,7 +16,7 @@ from typing import Annotated
 
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
-from membrane_ctrl.model import plain_json
+from membrane_ctrl.model import file_checksums, plain_json
 from membrane_ctrl.model.files import read_bytes, read_text
 from membrane_ctrl.run_files.table_store.disk import Disk
 from membrane_ctrl.run_files.table_store.spec import MANIFEST
@@ -81,7 +81,7 @@ def append_entry(disk: Disk, folder: Path, entry: PartEntry) -> None:
     is then cut off.
     """
     path = folder / MANIFEST
-    line = plain_json.dumps_checked(entry.model_dump()) + "\n"
+    line = file_checksums.dumps_checked(entry.model_dump()) + "\n"
     size_bytes, whole_bytes = _sizes(path)
     descriptor = disk.open_to_append(path)
     try:
@@ -127,7 +127,7 @@ def read_manifest(folder: Path, notes: list[str]) -> dict[int, PartEntry]:
 def _entry_of(line: str) -> PartEntry | None:
     try:
         value = plain_json.loads(line)
-        if not isinstance(value, dict) or not plain_json.take_checksum(value):
+        if not isinstance(value, dict) or not file_checksums.take_checksum(value):
             return None
         entry = PartEntry.model_validate(value)
     except (ValueError, ValidationError):

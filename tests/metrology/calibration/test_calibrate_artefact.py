@@ -26,7 +26,7 @@ from membrane_ctrl.metrology.uncertainty.geometry_spread import (
     GeometrySpread,
     changed,
 )
-from membrane_ctrl.model.plain_json import content_hash
+from membrane_ctrl.model.geometry_hash import content_hash
 from tests.support.calibration_truth import OPTICS, make
 
 ORIGIN = Origin("2026-01-01T00:00:00+00:00", ("a", "b"), 1.0, 2.0, 1.5, 3.0, ("a note",))

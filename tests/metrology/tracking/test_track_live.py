@@ -25,7 +25,7 @@ from membrane_ctrl.metrology.tracking.live_tracker import (
 )
 from membrane_ctrl.metrology.tracking.tracked_frame import rejected_frame
 from membrane_ctrl.metrology.vibrations.mode_follower import Stethoscope
-from membrane_ctrl.model.run_events import Vibrations
+from membrane_ctrl.model.acquisition_events import Vibrations
 from membrane_ctrl.model.shape_estimate import ShapeEstimate, pack_estimate, unpack_estimate
 from membrane_ctrl.model.zernike_terms import ZERNIKE_TERMS
 from membrane_ctrl.sim.optics.camera import OpticsRenderer

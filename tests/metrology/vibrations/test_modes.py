@@ -12,8 +12,9 @@ import pytest
 from membrane_ctrl.metrology.vibrations import mode_follower
 from membrane_ctrl.metrology.vibrations.mode_follower import Heard, Stethoscope
 from membrane_ctrl.metrology.vibrations.mode_search import VibrationMode, find_modes
+from membrane_ctrl.model.acquisition_events import Vibrations
+from membrane_ctrl.model.event_lines import from_dict
 from membrane_ctrl.model.events import Event, Maintenance, MaintenanceOver
-from membrane_ctrl.model.run_events import Vibrations, from_dict
 from membrane_ctrl.model.zernike_terms import ZERNIKE_TERMS
 from tests.worlds.vibrating_mirror import watched
 

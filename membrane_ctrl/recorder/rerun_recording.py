@@ -1,23 +1,18 @@
-"""What the recorder writes to: `events.jsonl`, a line as soon as known, and the Rerun file.
-
-The Rerun file has segments, time axes, statics, and a flush that reports a dead writer.
+"""The Rerun file of a run: segments, time axes, statics, and a flush that reports a dead writer.
 
 Rerun facts behind this module (0.41, all reproduced): on a full disk `log` and `send_columns`
 continue silently, only `flush` raises; `save` on a healthy stream starts a new file at once and
 loses no row; statics and properties must be sent again after each `save`, as must the blueprint,
 but sending one leaks 3 MB (0.5 GB in a week of hourly segments): it goes into the first file, and
-into the others when they are optimised (`housekeeping`); segments with the same recording id are
-one recording in the viewer. If the writer dies between taking a flush and answering it, `flush`
+into the others when they are optimised (`segment_optimizer`); segments with the same recording id
+are one recording in the viewer. If the writer dies between taking a flush and answering it, `flush`
 times out, and then `save`, `disconnect`, the stream's destructor and Rerun's own exit handler wait
 forever: such a stream is kept untouched, and the process must end without exit handlers.
 """
 
 import contextlib
-import os
-import traceback
 import warnings
-from collections import deque
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
 from typing import Any
 
@@ -28,14 +23,12 @@ from rerun.chunk import RrdReader
 from membrane_ctrl.config.schema import Config
 from membrane_ctrl.model.arrays import FloatArray
 from membrane_ctrl.model.clock import RunClock
-from membrane_ctrl.model.events import Event, EventLine
 from membrane_ctrl.model.files import sync_data
-from membrane_ctrl.model.plain_json import dumps_checked
 from membrane_ctrl.model.program import file_origin
-from membrane_ctrl.model.run_events import DiskLow, RecorderError, RecorderRecovered, from_dict
 from membrane_ctrl.model.zernike_terms import NOLL_INDICES, ZERNIKE_TERMS
-from membrane_ctrl.recorder.blueprint import LANES, run_blueprint
-from membrane_ctrl.run_files import shapes, streams
+from membrane_ctrl.recorder.blueprint import run_blueprint
+from membrane_ctrl.recorder.state_lanes import LANES
+from membrane_ctrl.run_files import plot_marks, shapes, streams
 
 APPLICATION = "membrane_ctrl"
 RUN_TIME = "run_time"
@@ -45,7 +38,6 @@ LAYOUT = ".layout.rbl"  # the blueprint's own file, during the recording
 
 # A disk that needs longer than this for a second of data (tens of kB) is as good as gone.
 _FLUSH_TIMEOUT_S = 5.0
-
 
 # Held by the module, so that no destructor runs.
 _abandoned: list[rr.RecordingStream] = []
@@ -134,7 +126,7 @@ class Recording:
             streams.PUMP,
         ):
             stream.log(block.path, _styled(rr.Measurements.from_fields, block), static=True)
-        for block in streams.MARKS:  # the average of the lines in a pixel would be none
+        for block in plot_marks.MARKS:  # the average of the lines in a pixel would be none
             stream.log(
                 block.path, _styled(rr.SeriesLines, block, aggregation_policy="Off"), static=True
             )
@@ -266,151 +258,3 @@ def _styled(
         *((line.name, line.colour, line.width) for line in stream.lines), strict=True
     )
     return archetype(names=names, colors=colours, widths=widths, **more)
-
-
-# Errors of the recorder: each is reported once until it changes, and none ends the recorder.
-
-
-Report = Callable[[Event], None]
-
-
-class RecorderErrors:
-    """Runs calls that may fail and reports failures; `errors` counts all `RecorderError`s, also
-    predecessors'.
-    """
-
-    def __init__(self, report: Report, errors: int = 0) -> None:
-        self.report = report
-        self.errors = errors
-        self._trouble: dict[str, str] = {}
-
-    def guarded(self, what: str, action: Callable[[], None]) -> None:
-        """Run a call; report its failure and let the recorder continue."""
-        try:
-            action()
-        except (OSError, RecordingError) as error:
-            self.report_error(what, f"{what}: {error}")
-        except Exception as error:
-            place = traceback.extract_tb(error.__traceback__)[-1]
-            self.report_error(
-                what,
-                f"{what}: {type(error).__name__}: {error} "
-                f"({Path(place.filename).name}:{place.lineno})",
-            )
-        else:
-            self.recovered(what)
-
-    def report_error(
-        self, what: str, message: str, as_: type[RecorderError | DiskLow] = RecorderError
-    ) -> None:
-        """Report an error once until it changes; `what` identifies it for `recovered`."""
-        if self._trouble.get(what) != message:
-            self._trouble[what] = message
-            self.errors += as_ is RecorderError
-            self.report(as_(what, message))
-
-    def recovered(self, what: str) -> None:
-        """Report that `what` works again, if it had failed."""
-        if self._trouble.pop(what, None) is not None:
-            self.report(RecorderRecovered(what, f"{what} works again"))
-
-    def forget(self, prefix: str, but: set[str]) -> None:
-        """Report as over all errors that start with `prefix` and are not in `but`: their cause has
-        gone.
-        """
-        for what in [what for what in self._trouble if what.startswith(prefix) and what not in but]:
-            self.recovered(what)
-
-
-# Events that wait while the disk is full; a fault campaign makes a few hundred.
-_WAITING_MAX = 10_000
-
-
-class EventsFile:
-    """Appends events; after a failed write nothing is lost or torn, and the next call continues.
-
-    Parameters
-    ----------
-    path : Path
-    resumed : bool
-        After a killed recorder: remove a torn last line, and do not repeat existing lines.
-
-    Attributes
-    ----------
-    lost : int
-        Events dropped because too many waited on a full disk.
-    """
-
-    def __init__(self, path: Path, resumed: bool = False) -> None:
-        self._path = path
-        self._written = _mend_tail(path) if resumed else frozenset()
-        self._waiting: deque[bytes] = deque()
-        self._sync = False
-        self._descriptor: int | None = None
-        self.lost = 0
-
-    def unwritten(self, events: Sequence[EventLine]) -> list[EventLine]:
-        """The events that no earlier recorder of the run has written."""
-        return [
-            event for event in events if dumps_checked(event).encode() + b"\n" not in self._written
-        ]
-
-    def append(self, events: Sequence[EventLine]) -> None:
-        """Write events, after those still waiting. Raises OSError (full disk)."""
-        for event in events:
-            line = dumps_checked(event).encode() + b"\n"
-            if line in self._written:
-                continue
-            self._waiting.append(line)
-            self._sync |= from_dict(event).urgent
-        while len(self._waiting) > _WAITING_MAX:
-            # the first line may already be half written: keep it, drop the second
-            del self._waiting[1]
-            self.lost += 1
-        self._write()
-
-    def _write(self) -> None:
-        if self._waiting and self._descriptor is None:
-            self._descriptor = os.open(self._path, os.O_WRONLY | os.O_CREAT | os.O_APPEND, 0o644)
-        while self._waiting and self._descriptor is not None:
-            written = os.write(self._descriptor, self._waiting[0])
-            rest = self._waiting[0][written:]
-            if rest:
-                self._waiting[0] = rest
-            else:
-                self._waiting.popleft()
-        if self._sync and self._descriptor is not None:
-            os.fsync(self._descriptor)
-            self._sync = False
-
-    def begin_anew(self, recent: Sequence[EventLine]) -> None:
-        """Start a new file after the old one's removal, with the events written to it meanwhile.
-        Raises OSError.
-        """
-        gone = self._descriptor is not None  # not opened yet: nothing was lost
-        self.close()
-        self.append(recent if gone else [])
-
-    def close(self) -> None:
-        """Close the file."""
-        if self._descriptor is not None:
-            os.close(self._descriptor)
-            self._descriptor = None
-
-
-# A killed recorder saved its progress up to a second earlier: at most this many events may come
-# twice.
-_TAIL_BYTES = 1_000_000
-
-
-def _mend_tail(path: Path) -> frozenset[bytes]:
-    """Cut a torn line off the end; return the last whole lines."""
-    if not path.exists():
-        return frozenset()
-    with path.open("r+b") as file:
-        size = file.seek(0, os.SEEK_END)
-        file.seek(max(0, size - _TAIL_BYTES))
-        tail = file.read()
-        whole = tail[: tail.rfind(b"\n") + 1]
-        file.truncate(size - len(tail) + len(whole))
-    return frozenset(whole.splitlines(keepends=True))

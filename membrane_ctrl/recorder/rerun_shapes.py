@@ -1,220 +1,30 @@
-"""Telemetry rows to Rerun: one block of columns per stream, lanes where a code changed."""
+"""Shape estimates to Rerun: Zernike terms, maps, figures of quality, a waterfall of terms."""
 
 import math
 from collections import deque
-from collections.abc import Sequence
 
 import numpy as np
 import rerun as rr
 
-from membrane_ctrl.config.schema import Config
-from membrane_ctrl.model import shape_estimate, telemetry
+from membrane_ctrl.model import shape_estimate
 from membrane_ctrl.model.arrays import AnyArray, FloatArray
-from membrane_ctrl.model.columns import COLUMNS, Kind
-from membrane_ctrl.model.events import EventLine, PumpLearned
-from membrane_ctrl.model.figure_columns import LOW_ORDER_COLUMNS, VIBRATIONS_MOST
+from membrane_ctrl.model.figure_columns import LOW_ORDER_COLUMNS
 from membrane_ctrl.model.prose import for_people
-from membrane_ctrl.model.run_events import Vibrations, from_dict
-from membrane_ctrl.recorder import blueprint, sink
+from membrane_ctrl.recorder import rerun_recording, state_lanes
 from membrane_ctrl.run_files import shapes, streams
-
-# Events to Rerun: the text log, and lines across plots.
-
-
-EVENTS_PATH = "/events"
-
-
-def send_events(recording: sink.Recording, events: Sequence[EventLine]) -> None:
-    """Send events in order: a sentence each, and vertical lines across plots."""
-    if not events:
-        return
-    timed = [(float(line.get("mono_s") or 0.0), from_dict(line)) for line in events]
-    time_s = np.array([at_s for at_s, _ in timed])
-    # the log's own column of times is too narrow to read
-    clock_times = [str(line.get("time_utc", ""))[11:19] for line in events]
-    texts = [
-        f"{clock} {event.sentence}".strip()
-        for clock, (_, event) in zip(clock_times, timed, strict=True)
-    ]
-    levels = [event.level.value for _, event in timed]
-    recording.columns(EVENTS_PATH, time_s, rr.TextLog.columns(text=texts, level=levels))
-    for stream, marks_s, values in streams.mark_lines(timed):
-        recording.scalars(stream.path, marks_s, values)
-    of_pump = [(at_s, event) for at_s, event in timed if isinstance(event, PumpLearned)]
-    if of_pump:
-        values = np.array([[event.scale, event.correction] for _, event in of_pump])
-        squares = np.array([[event.sigma**2, 0.0] for _, event in of_pump])
-        recording.measurements(
-            streams.PUMP.path, np.array([at_s for at_s, _ in of_pump]), values, squares
-        )
-    for at_s, event in timed:
-        if isinstance(event, Vibrations):
-            heard = [math.nan if value is None else value for value in event.frequency_hz]
-            padded = [*heard, *VIBRATIONS_MOST * [math.nan]]
-            values = np.array([padded[:VIBRATIONS_MOST]])
-            recording.scalars(streams.VIBRATIONS.path, np.array([at_s]), values)
-
-
-# Fewer rows for the viewer while nothing happens; every tick is in the other files
-# (docs/reference/recording.md).
-
-
-# Every tick is recorded around a change of these, and while the error is outside the band.
-_CODES = tuple(each.name for each in COLUMNS.values() if each.kind is Kind.CODE)
-_AFTER_S = 60.0
-_BEFORE_S = 10.0
-
-
-class QuietFilter:
-    """Every tick for a minute after a change and ten seconds before it; otherwise `quiet_hz`.
-
-    An error beyond `band_um` is not quiet.
-    """
-
-    def __init__(self, rate_hz: float, quiet_hz: float, band_um: float) -> None:
-        self._every = max(1, round(rate_hz / quiet_hz))
-        self._band_um = band_um
-        self._codes = np.full(len(_CODES), math.nan)
-        self._lively_until_s = math.inf
-        self._held: list[telemetry.Rows] = []
-
-    def take(self, rows: telemetry.Rows) -> telemetry.Rows:
-        """The rows to send now, in order of time; rows held back follow when something happens."""
-        if self._every == 1 or not len(rows):
-            return rows
-        codes = rows[:, [telemetry.COLUMN[name] for name in _CODES]]
-        before = np.vstack((self._codes, codes[:-1]))
-        lively = (codes != before).any(axis=1) | (
-            np.abs(telemetry.column(rows, "error_um")) > self._band_um
-        )
-        self._codes = codes[-1]
-        if lively.any():
-            self._lively_until_s = float(telemetry.column(rows, "mono_s")[lively][-1]) + _AFTER_S
-            held, self._held = self._held, []
-            return np.concatenate((*held, rows))
-        now_s = float(rows[-1, telemetry.COLUMN["mono_s"]])
-        if now_s < self._lively_until_s:
-            return rows
-        kept = telemetry.column(rows, "tick") % self._every == 0
-        self._held.append(rows[~kept])
-        self._held = [
-            part
-            for part in self._held
-            if len(part) and part[-1, telemetry.COLUMN["mono_s"]] > now_s - _BEFORE_S
-        ]
-        quiet: telemetry.Rows = rows[kept]
-        return quiet
-
-
-# In a file, a chunk costs more than a row.
-OVERVIEW_EVERY_S = 5.0
-
-
-class TelemetryStreams:
-    """Sends rows to a recording; remembers the codes of the last row.
-
-    Parameters
-    ----------
-    recording : Recording
-    config : Config
-    overview_every_s : float
-        Seconds whose means are sent together.
-    """
-
-    def __init__(
-        self,
-        recording: sink.Recording,
-        config: Config,
-        overview_every_s: float = OVERVIEW_EVERY_S,
-    ) -> None:
-        self._recording = recording
-        self._overview_every_s = overview_every_s
-        self._band_um = config.limits.band_um
-        self._band = streams.band(self._band_um)
-        self._quiet = QuietFilter(config.loop.rate_hz, config.recording.quiet_hz, self._band_um)
-        self._codes: dict[str, float] = {}
-        self._rest = np.empty((0, len(telemetry.FIELDS)))  # not in the overview yet
-
-    def start_segment(self) -> None:
-        """Restart every lane: a new file does not know the last state of the previous one."""
-        self._codes.clear()
-
-    def send(self, rows: telemetry.Rows) -> None:
-        """Send (n, len(FIELDS)) rows; omit streams without any finite value."""
-        if not len(rows):
-            return
-        self._send_streams(self._quiet.take(rows))
-        self._send_overview(rows)
-        self._send_lanes(rows)
-
-    def finish(self) -> None:
-        """Send what waits for its time."""
-        if len(self._rest):
-            self._send_overview(self._rest[:0], last=True)
-
-    def _send_overview(self, rows: telemetry.Rows, last: bool = False) -> None:
-        """Send a row for each second, some seconds at a time, and the band."""
-        waiting_s = telemetry.column(self._rest, "mono_s")
-        fresh = telemetry.column(rows, "mono_s") > waiting_s.max(
-            initial=-math.inf
-        )  # not if sent again after a failure
-        self._rest = rows = np.concatenate((self._rest, rows[fresh]))
-        time_s = telemetry.column(rows, "mono_s")
-        second = np.floor(time_s)
-        if second[-1] - second[0] < self._overview_every_s and not last:
-            return
-        whole = np.split(rows, np.flatnonzero(np.diff(second)) + 1)
-        self._rest = rows[:0] if last else whole.pop()
-        square = np.full((2, 1), self._band_um**2)
-        self._recording.measurements(
-            self._band.path, time_s[[0, -1]], np.zeros_like(square), square
-        )
-        means = np.concatenate([streams.mean_row(part) for part in whole])
-        errors_um = np.concatenate([streams.overview_um(part) for part in whole])
-        true_um = telemetry.true_error_um(telemetry.columns(means))[:, np.newaxis]
-        blocks = [(stream.path, stream.values(means)) for stream in streams.MEANS]
-        blocks += [(streams.OVERVIEW.path, errors_um), (streams.TRUE_MEAN.path, true_um)]
-        for path, values in blocks:
-            there = np.isfinite(values).any(axis=1)
-            if there.any():
-                self._recording.scalars(
-                    path, telemetry.column(means, "mono_s")[there], values[there]
-                )
-
-    def _send_streams(self, rows: telemetry.Rows) -> None:
-        time_s = telemetry.column(rows, "mono_s")
-        blocks = [(stream.path, stream.values(rows)) for stream in streams.STREAMS]
-        true_um = telemetry.true_error_um(telemetry.columns(rows))
-        blocks.append((streams.TRUE_ERROR.path, true_um[:, np.newaxis]))
-        for path, values in blocks:
-            if np.isfinite(values).any():
-                self._recording.scalars(path, time_s, values)
-
-    def _send_lanes(self, rows: telemetry.Rows) -> None:
-        time_s = telemetry.column(rows, "mono_s")
-        for lane in blueprint.TELEMETRY_LANES:
-            codes = telemetry.column(rows, lane.field)
-            found = telemetry.changes(codes, self._codes.get(lane.field, math.nan))
-            if found:
-                words = [lane.word(code) for _, code in found]
-                self._recording.columns(
-                    lane.path,
-                    time_s[[row for row, _ in found]],
-                    rr.StateChange.columns(state=words),
-                )
-            self._codes[lane.field] = float(codes[-1])
-
 
 # Three maps of the change a minute are 60 MB a day. Nothing is lost, as any map can be rebuilt from
 # the coefficients of its cycle. In the first minutes somebody is watching.
 DIFFERENCE_INTERVAL_S = 60.0
-DIFFERENCE_EARLY_S, EARLY_S = 10.0, 300.0
+DIFFERENCE_EARLY_S = 10.0
+EARLY_S = 300.0
 MAP_INTERVAL_S = 600.0
 # Of the figures of single frames the timeline has one a second; the table has all.
 FRAME_INTERVAL_S = 1.0
 # The water-fall: a column for each of these, 8 kB.
 WATERFALL_COLUMNS = 120
-WATERFALL_INTERVAL_S, WATERFALL_EARLY_S = 20.0, 2.0
+WATERFALL_INTERVAL_S = 20.0
+WATERFALL_EARLY_S = 2.0
 WATERFALL_LEAST_UM = 0.05
 # Colours span nearly all of a map: a few pixels at the edge must not hide the rest.
 _NEARLY_ALL = 0.99
@@ -247,7 +57,7 @@ class ShapeStreams:
     good one that `rebase` lets be.
     """
 
-    def __init__(self, recording: sink.Recording) -> None:
+    def __init__(self, recording: rerun_recording.Recording) -> None:
         self._recording = recording
         self.reference: shape_estimate.ShapeEstimate | None = None
         self.pictures = True
@@ -290,7 +100,7 @@ class ShapeStreams:
         if estimate.verdict != self._verdict:
             self._verdict = estimate.verdict
             self._recording.columns(
-                blueprint.VERDICT.path, time_s, rr.StateChange.columns(state=[estimate.verdict])
+                state_lanes.VERDICT.path, time_s, rr.StateChange.columns(state=[estimate.verdict])
             )
         if estimate.verdict == "rejected":
             return

@@ -1,0 +1,73 @@
+"""Events of the acquisition: its state, the geometry in use, captures, vibrations, frames."""
+
+from typing import Any
+
+from membrane_ctrl.model.event_base import Event, LogLevel
+
+
+class AcquisitionState(Event, kind="acquisition", sentence="Acquisition {state}[: {message}]"):
+    """The acquisition's state, in words."""
+
+    state: str
+    message: str
+    cycle: int | None = None
+    traceback: str | None = None
+
+    @property
+    def level(self) -> LogLevel:
+        """A failure is an error; a camera that does not answer yet is a warning."""
+        return {"failed": LogLevel.ERROR, "retrying": LogLevel.WARNING}.get(
+            self.state, LogLevel.INFO
+        )
+
+    @property
+    def notable(self) -> bool:
+        """Whether it differs from the usual state."""
+        return self.state != "running"
+
+
+class GeometryInForce(
+    Event,
+    kind="geometry",
+    sentence="Geometry {hash}[ from {file}][, calibrated {calibrated_utc}][; {message}]",
+    notable=True,
+):
+    """The geometry that the cycles use."""
+
+    hash: str
+    file: str | None
+    calibrated_utc: str | None
+    message: str
+
+
+class Capture(
+    Event,
+    kind="capture",
+    sentence="Capture[ of cycle {cycle}][ in {set}][, {verdict}][: {reason}][. Failed: {failed}]",
+    notable=True,
+):
+    """The result of `capture`: the set's folder, or the reason for its absence."""
+
+    cycle: int | None = None
+    set: str | None = None
+    displacement_um: float | None = None
+    verdict: str | None = None
+    reason: str | None = None
+    failed: str | None = None
+
+
+class Vibrations(Event, kind="vibrations", sentence="Vibrations of the mirror: {message}"):
+    """The mirror's vibrations in a minute of tracked frames; a mode keeps its place, None where it
+    was not heard.
+    """
+
+    frequency_hz: Any  # list of numbers and None
+    amplitude_nm: Any  # as above, RMS over the mirror
+    message: str
+
+
+class FramesLeftOut(Event, kind="raw_frames", level=LogLevel.WARNING):
+    """Frames around a fault are not kept."""
+
+    left_out: int
+    message: str

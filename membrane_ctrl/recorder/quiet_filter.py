@@ -1,0 +1,57 @@
+"""Fewer rows for the viewer while nothing happens.
+
+The tables and inputs of the run have every tick (docs/reference/recording.md).
+"""
+
+import math
+
+import numpy as np
+
+from membrane_ctrl.model import telemetry
+from membrane_ctrl.model.columns import COLUMNS, Kind
+
+# Every tick is recorded around a change of these, and while the error is outside the band.
+_CODES = tuple(each.name for each in COLUMNS.values() if each.kind is Kind.CODE)
+_AFTER_S = 60.0
+_BEFORE_S = 10.0
+
+
+class QuietFilter:
+    """Every tick for a minute after a change and ten seconds before it; otherwise `quiet_hz`.
+
+    An error beyond `band_um` is not quiet.
+    """
+
+    def __init__(self, rate_hz: float, quiet_hz: float, band_um: float) -> None:
+        self._every = max(1, round(rate_hz / quiet_hz))
+        self._band_um = band_um
+        self._codes = np.full(len(_CODES), math.nan)
+        self._lively_until_s = math.inf
+        self._held: list[telemetry.Rows] = []
+
+    def take(self, rows: telemetry.Rows) -> telemetry.Rows:
+        """The rows to send now, in order of time; rows held back follow when something happens."""
+        if self._every == 1 or not len(rows):
+            return rows
+        codes = rows[:, [telemetry.COLUMN[name] for name in _CODES]]
+        before = np.vstack((self._codes, codes[:-1]))
+        lively = (codes != before).any(axis=1) | (
+            np.abs(telemetry.column(rows, "error_um")) > self._band_um
+        )
+        self._codes = codes[-1]
+        if lively.any():
+            self._lively_until_s = float(telemetry.column(rows, "mono_s")[lively][-1]) + _AFTER_S
+            held, self._held = self._held, []
+            return np.concatenate((*held, rows))
+        now_s = float(rows[-1, telemetry.COLUMN["mono_s"]])
+        if now_s < self._lively_until_s:
+            return rows
+        kept = telemetry.column(rows, "tick") % self._every == 0
+        self._held.append(rows[~kept])
+        self._held = [
+            part
+            for part in self._held
+            if len(part) and part[-1, telemetry.COLUMN["mono_s"]] > now_s - _BEFORE_S
+        ]
+        quiet: telemetry.Rows = rows[kept]
+        return quiet

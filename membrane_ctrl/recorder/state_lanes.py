@@ -1,0 +1,75 @@
+"""State lanes: the words of a lane, their colours, and the meaning of a row's codes."""
+
+from dataclasses import dataclass
+
+from membrane_ctrl.run_files import named_tables
+
+
+@dataclass(frozen=True, slots=True)
+class Lane:
+    """One row of the state timeline.
+
+    Attributes
+    ----------
+    path : str
+        Rerun entity.
+    field : str
+        Telemetry field that holds the code; empty if the lane does not come from telemetry.
+    words : dict
+        Code to word.
+    colours : dict
+        Word to 0xRRGGBBAA; a word without one gets the viewer's choice.
+    """
+
+    path: str
+    field: str
+    words: dict[int, str]
+    colours: dict[str, int]
+
+    def word(self, code: int) -> str:
+        """The word for a code; an unknown code is shown as a number."""
+        return self.words.get(code, f"code {code}")
+
+
+_CALM = 0x5A5A5AFF
+_BUSY = 0x56B4E9FF
+_GOOD = 0x009E73FF
+_WARN = 0xE69F00FF
+_BAD = 0xD55E00FF
+
+STATE = Lane(
+    "/state/controller",
+    "state",
+    named_tables.WORDS["state"],
+    {
+        "standby": _CALM,
+        "check": _BUSY,
+        "inflate": _BUSY,
+        "settle": _WARN,
+        "hold": _GOOD,
+        "manual": 0xCC79A7FF,
+        "tune": 0xF0E442FF,
+        "lower": _WARN,
+        "fault": _BAD,
+    },
+)
+SHAPE = Lane(
+    "/state/shape_loop",
+    "shape_state",
+    named_tables.WORDS["shape_state"],
+    {"off": _CALM, "waiting": _BUSY, "tracking": _GOOD, "suspended": _WARN},
+)
+SAFE_LEVEL = Lane(
+    "/state/safe_level",
+    "safe_level",
+    named_tables.WORDS["safe_level"],
+    {"none": _CALM, "hold_flow": _WARN, "ramp_down": _WARN, "pump_off": _BAD, "vent": _BAD},
+)
+_FAULTS = named_tables.WORDS["fault"]
+FAULT = Lane(
+    "/state/fault", "fault", _FAULTS, dict.fromkeys(_FAULTS.values(), _BAD) | {"none": _CALM}
+)
+VERDICT = Lane("/state/verdict", "", {}, {"ok": _GOOD, "degraded": _WARN, "rejected": _BAD})
+
+TELEMETRY_LANES: tuple[Lane, ...] = (STATE, SHAPE, SAFE_LEVEL, FAULT)
+LANES: tuple[Lane, ...] = (*TELEMETRY_LANES, VERDICT)

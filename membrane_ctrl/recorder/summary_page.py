@@ -1,0 +1,80 @@
+"""The page of a recording with the figures of the run so far."""
+
+import math
+from collections.abc import Mapping
+from datetime import timedelta
+from typing import Any
+
+from membrane_ctrl.config.schema import Config
+from membrane_ctrl.model.prose import for_people
+from membrane_ctrl.model.run_status import RunStatus, gains_words
+
+SUMMARY_PATH = "/summary"
+# Each page is 0.7 kB. In the first minutes somebody is watching.
+SUMMARY_INTERVAL_S = 60.0
+SUMMARY_EARLY_INTERVAL_S = 10.0
+SUMMARY_EARLY_S = 300.0
+
+
+def summary_page(summary: Mapping[str, Any], status: RunStatus, config: Config) -> str:
+    """The figures of the run so far as a page of the recording.
+
+    Parameters
+    ----------
+    summary : mapping
+        The content of `summary.json` so far, or when read back: with None for NaN.
+    status : RunStatus
+        What follows from the events so far.
+    config : Config
+        Of the run.
+    """
+    held, states = summary["held"], summary["states"]
+    faults_s, whole_s = held["faults_s"], max(summary["duration_s"], 1e-9)
+    rows = {
+        "held": _span(held["held_s"]),
+        f"std of 1 s means, {'true centre' if held['of'] == 'true' else 'reading'}": _um(
+            held["std_um"]
+        ),
+        "mean error": _um(held["mean_um"], "+"),
+        f"1 s means within ±{config.limits.band_um:g} µm": _share(held["in_band"]),
+        "faults": str(summary["fault_count"] or "none"),
+        "last fault": str(summary["faults"][-1].get("name", "")) if summary["faults"] else "",
+        "time in faults": f"{_span(faults_s)} ({_share(faults_s / whole_s)})" if faults_s else "",
+        "paused": _span(held["paused_s"]) if held["paused_s"] >= 1.0 else "",
+        "leak": _um(summary["leak_um_per_s"], unit="µm/s"),
+        "shape cycles": f"{summary['cycles']}, {summary['cycles_rejected']} rejected"
+        if summary["cycles"]
+        else "",
+        "geometry": _geometry(summary["geometry"]),
+        "gains": gains_words(
+            status.loop or vars(config.loop), status.trial_ends_s - summary["duration_s"]
+        ),
+        "ticks missed": f"{summary['missed_ticks']} of {summary['ticks']}",
+        "not recorded": "; ".join(status.recording_problems),
+    }
+    state = states[-1]["state"] if states else "not started"
+    lines = [f"| {name} | {_cell(words)} |" for name, words in rows.items() if words]
+    return "\n".join((f"| {state} | {_cell(status.why)} |", "|---|---|", *lines)) + "\n"
+
+
+def _geometry(geometry: Mapping[str, Any]) -> str:
+    words = [str(geometry[key]) for key in ("hash", "file") if geometry.get(key)]
+    calibrated = geometry.get("calibrated_utc")
+    return ", ".join([*words, f"calibrated {calibrated}"] if calibrated else words)
+
+
+def _um(value: float | None, sign: str = "", unit: str = "µm") -> str:
+    return f"{value:{sign}.3g} {unit}" if value is not None and math.isfinite(value) else ""
+
+
+def _share(value: float | None) -> str:
+    return f"{100 * value:.4g} %" if value is not None and math.isfinite(value) else ""
+
+
+def _span(seconds: float) -> str:
+    """As `0:09:12`."""
+    return str(timedelta(seconds=round(seconds)))
+
+
+def _cell(words: str) -> str:
+    return for_people(words).replace("|", "/")

@@ -1,0 +1,53 @@
+"""What a detected event is, and the stretches of flags that make one."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from scipy import ndimage
+
+from membrane_ctrl.model.arrays import BoolArray, FloatArray
+
+Level = dict[str, FloatArray]
+
+
+@dataclass(frozen=True, slots=True)
+class FoundEvent:
+    """A detected event."""
+
+    # "pressure step", "leak step", "laser glitch", "laser lost", "optics lost", "barometer lost",
+    # "thermometer lost", "lateness burst", "noise change", "shape jump" or "excursion"
+    kind: str
+    time_s: float  # time of the event
+    start_s: float  # time range of the run that shows it
+    end_s: float
+    size: float  # in `unit`
+    unit: str
+    confidence: (
+        float  # 1 minus the probability that noise alone looks like this somewhere in the run
+    )
+
+
+def event_around(
+    kind: str, table: Level, row: int, half_s: float, size: float, unit: str, sure: float
+) -> FoundEvent:
+    """An event with a time range of several detection windows around it."""
+    time_s = float(table["time_s"][row])
+    return FoundEvent(
+        kind, time_s, time_s - 30 * half_s**0.5, time_s + 30 * half_s**0.5, size, unit, sure
+    )
+
+
+def widened(flags: BoolArray, rows: int) -> BoolArray:
+    """True flags, widened by `rows` on each side."""
+    return np.asarray(
+        ndimage.maximum_filter1d(flags, 2 * rows + 1, mode="constant", cval=0), dtype=bool
+    )
+
+
+def runs(flags: BoolArray, join: int) -> list[tuple[int, int]]:
+    """First and last row of each stretch of true rows, joining those at most `join` apart."""
+    rows = np.flatnonzero(flags)
+    if not rows.size:
+        return []
+    parts = np.split(rows, np.flatnonzero(np.diff(rows) > join) + 1)
+    return [(int(part[0]), int(part[-1])) for part in parts]

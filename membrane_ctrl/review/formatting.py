@@ -1,0 +1,51 @@
+"""Durations, numbers and texts as commands and reports print them."""
+
+import math
+
+
+def span(seconds: float) -> str:
+    """A duration: `41 s`, `30 min 5 s`, `7 h 59 min`, `30 d 4 h`."""
+    if not math.isfinite(seconds):
+        return "?"
+    whole = round(seconds)
+    for large, small, unit, part in (
+        (86400, 3600, "d", "h"),
+        (3600, 60, "h", "min"),
+        (60, 1, "min", "s"),
+    ):
+        if whole >= large:
+            rest = whole % large // small
+            return f"{whole // large} {unit}" + (f" {rest} {part}" if rest else "")
+    return f"{whole} s"
+
+
+def number(value: float | None, digits: int = 3) -> str:
+    """A number to the given digits; a dash for none."""
+    if value is None or not math.isfinite(value):
+        return "–"
+    return f"{value:.{digits}g}" if abs(value) < 10**digits else f"{value:.0f}"
+
+
+def one_line(text: str) -> str:
+    """A person's text in one line: spaces replace line ends and other unprintable characters."""
+    return "".join(letter if letter.isprintable() else " " for letter in text)
+
+
+# Every hold starts with some seconds that do not count; more means a ramping setpoint.
+_MOVING_LEAST_S = 60.0
+
+
+def beside(faults_s: float, paused_s: float, moving_s: float, whole_s: float) -> list[str]:
+    """What there was beside the hold, with its share of the whole time; NaN where that is not
+    known.
+    """
+    parts = (
+        ("faults", faults_s, 0.0),
+        ("paused", paused_s, 0.0),
+        ("moving or settling", moving_s, _MOVING_LEAST_S),
+    )
+    told = [(name, time_s) for name, time_s, least_s in parts if time_s > least_s]
+    return [
+        f"{name} {span(time_s)} ({100 * time_s / max(whole_s, time_s):.3g} %)"
+        for name, time_s in told
+    ]

@@ -1,0 +1,33 @@
+"""Deletes old runs by the recorder's retention rule."""
+
+from collections.abc import Sequence
+from datetime import datetime
+from pathlib import Path
+
+from membrane_ctrl.model import errors
+from membrane_ctrl.review.catalogue import require_folder
+from membrane_ctrl.run_files import retention
+
+
+def to_prune(
+    logs_dir: Path, now_utc: datetime, keep_days: float | None, keep_gb: float | None
+) -> list[tuple[retention.OldRun, str]]:
+    """The runs that the recorder's retention rule (`retention`) would delete, and why; oldest
+    first.
+    """
+    require_folder(logs_dir)
+    if keep_days is None and keep_gb is None:
+        raise errors.InputError("runs prune: give --keep-days, --keep-gb or both")
+    runs = retention.deletable_runs(logs_dir, logs_dir / "none", now_utc)
+    return retention.expired(runs, 0, keep_gb, keep_days, now_utc)
+
+
+def prune(runs: Sequence[retention.OldRun]) -> dict[Path, str]:
+    """Delete the folders of runs, skipping undeletable ones. Returns those that stay, and why."""
+    stay: dict[Path, str] = {}
+    for run in runs:
+        try:
+            retention.delete_run(run)
+        except OSError as error:
+            stay[run.folder] = errors.os_reason(error)
+    return stay

@@ -1,0 +1,97 @@
+"""The pump's flow over weeks, from the runs of one bench.
+
+Each run measures it by its probe (`pump.probe_um`).
+"""
+
+import contextlib
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from datetime import datetime
+from pathlib import Path
+from typing import Any
+
+from membrane_ctrl.control import pump_curve
+from membrane_ctrl.model import events
+from membrane_ctrl.model.run_status import RunStatus
+from membrane_ctrl.run_files import event_log, run_config, run_folder, summary_file
+from membrane_ctrl.run_files.event_log import LoggedEvent
+from membrane_ctrl.run_files.run import origin_of
+
+_LOOKED_BACK = 400  # runs
+_CERTAIN_SIGMAS = 3.0
+
+
+@dataclass(frozen=True, slots=True)
+class PumpSeen:
+    """What a run had learned of the pump at its end."""
+
+    run: str
+    started_utc: datetime
+    scale: float  # flow at half the full flow, relative to the curve of the newest run
+    sigma: float
+    leak_um_per_s: float  # with any offset of the curve; NaN without a summary
+    same_curve: bool  # as the newest run's
+
+
+def pump_change(history: Sequence[PumpSeen], change_max: float) -> str:
+    """Words for a certain change beyond the limit since the first run on the present curve; empty
+    without one.
+    """
+    if not history:
+        return ""
+    newest, first = history[-1], next(seen for seen in history if seen.same_curve)
+    change, sigma = (
+        newest.scale / first.scale - 1,
+        math.hypot(newest.sigma, first.sigma) / first.scale,
+    )
+    if abs(change) <= max(change_max, _CERTAIN_SIGMAS * sigma):
+        return ""
+    return (
+        f"the pump gives {100 * abs(change):.0f} % {'less' if change < 0 else 'more'} than "
+        f"in {first.run} "
+        f"(+- {100 * sigma:.0f} %): check it, then `tune pump`"
+    )
+
+
+def pump_history(newest: Path) -> list[PumpSeen]:
+    """The pump in a run and in earlier ones of its folder with the same devices, oldest first.
+
+    Runs that have learned nothing are omitted.
+    """
+    devices, latest = run_config.read_config(newest, []).devices, None
+    found: list[PumpSeen] = []
+    folders = [folder for folder in sorted(newest.parent.iterdir()) if folder.name <= newest.name]
+    for folder in reversed(folders[-_LOOKED_BACK:]):
+        with contextlib.suppress(OSError):
+            if folder.name.startswith(".") or not run_folder.is_run(folder):
+                continue
+            log, config = event_log.read_events(folder, []), run_config.read_config(folder, [])
+            told = _last_learned(log)
+            if told is None or config.devices != devices:
+                continue
+            learned, pump = told[0], config.with_gains(told[1]).pump
+            latest = latest or pump
+            fraction = pump_curve.PumpCurve(latest).fraction(0.5 * latest.flow_full_um_per_s)
+            share = pump_curve.PumpCurve(pump).flow(fraction) / (0.5 * latest.flow_full_um_per_s)
+            leak = _finite((summary_file.read_summary(folder, []) or {}).get("leak_um_per_s"))
+            seen = (share * _finite(learned.scale), share * _finite(learned.sigma), leak)
+            if seen[0] > 0 and seen[1] > 0:
+                watched = {"probe_um", "change_max"}
+                same = pump.model_dump(exclude=watched) == latest.model_dump(exclude=watched)
+                found.append(PumpSeen(folder.name, origin_of(folder, log), *seen, same))
+    return found[::-1]
+
+
+def _last_learned(log: Sequence[LoggedEvent]) -> tuple[events.PumpLearned, dict[str, Any]] | None:
+    """What a run told last of its pump, and the gains and curve then set."""
+    status, told = RunStatus(), None
+    for each in log:
+        status = status.after_event(each.event, each.mono_s)
+        if isinstance(each.event, events.PumpLearned):
+            told = each.event, dict(status.loop or {})
+    return told
+
+
+def _finite(value: object) -> float:
+    return float(value) if isinstance(value, int | float) else math.nan

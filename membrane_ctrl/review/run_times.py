@@ -1,0 +1,71 @@
+"""Times of a run as people write them: `03:12`, ISO 8601, `+90m`."""
+
+import contextlib
+import math
+import re
+from datetime import datetime, timedelta
+
+from membrane_ctrl.model import errors
+from membrane_ctrl.model.durations import parse_duration_s
+from membrane_ctrl.run_files.run import Run
+
+_END_LEVEL_S = 60.0
+
+
+def moment_s(text: str, origin_utc: datetime) -> float:
+    """Seconds of the run for a written time: `03:12[:30]` (UTC), ISO 8601, or `+90s`, `+1h5m` from
+    its start.
+
+    A time of day means its first occurrence after the start of the run. The plus sign may be
+    omitted.
+
+    Raises InputError if it is none of these.
+    """
+    text = text.strip()
+    if re.fullmatch(r"\+? *0+[dhms]?", text):  # the start, which is not a valid duration
+        return 0.0
+    if text.startswith("+"):
+        return parse_duration_s(text[1:])
+    clock = re.fullmatch(r"(\d{1,2}):(\d{2})(?::([0-5]\d(?:\.\d+)?))?", text)
+    try:
+        if clock:
+            day = origin_utc.replace(
+                hour=int(clock[1]), minute=int(clock[2]), second=0, microsecond=0
+            )
+            moment = day + timedelta(seconds=float(clock[3] or 0))
+            # this means the minute in which the run began, not the one of the next day
+            if moment < origin_utc - timedelta(seconds=60):
+                moment += timedelta(days=1)
+        else:
+            moment = datetime.fromisoformat(text)
+            moment = moment if moment.tzinfo else moment.replace(tzinfo=origin_utc.tzinfo)
+    except ValueError:
+        with contextlib.suppress(errors.InputError):
+            return parse_duration_s(text)
+        raise errors.InputError(
+            f"time {text!r}: write 03:12, 2026-11-21T03:12:00 or +90m from the start (UTC)"
+        ) from None
+    return (moment - origin_utc).total_seconds()
+
+
+def part_s(origin_utc: datetime, start: str | None, end: str | None) -> tuple[float, float]:
+    """The part of a run between two written times; None: unlimited. Raises InputError."""
+    start_s = -math.inf if start is None else moment_s(start, origin_utc)
+    until_s = math.inf if end is None else moment_s(end, origin_utc)
+    if not start_s < until_s:
+        raise errors.InputError(f"--from {start} is not before --to {end}")
+    return start_s, until_s
+
+
+def end_s(run: Run) -> float:
+    """End of a run's data, in seconds from its start, rounded up to whole minutes;
+    0 without data.
+    """
+    time_s = run.level(_END_LEVEL_S, names=("rows",))["time_s"]
+    return float(time_s[-1]) + _END_LEVEL_S if time_s.size else 0.0
+
+
+def not_in(run: Run, asked: str) -> errors.InputError:
+    """The error for a time outside a run."""
+    went = f"{run.utc(0):%Y-%m-%d %H:%M} to {run.utc(end_s(run)):%Y-%m-%d %H:%M} UTC"
+    return errors.InputError(f"{asked}: not in the run, which lasted from {went}")

@@ -1,0 +1,69 @@
+"""Overlapping Allan deviation of a series with gaps."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from numba import njit
+
+from membrane_ctrl.model.arrays import AnyArray, Column, IntArray
+
+
+@dataclass(frozen=True, slots=True)
+class Allan:
+    """Overlapping Allan deviation."""
+
+    tau_s: Column  # (k,): averaging times
+    deviation: Column  # (k,): same unit as the series
+    windows: IntArray  # (k,): number of differences of neighbouring means
+
+
+def allan_deviation(values: AnyArray, period_s: float, lengths: IntArray | None = None) -> Allan:
+    """Overlapping Allan deviation of equally spaced values.
+
+    With x the running sum of y and m the samples in tau,
+
+        sigma^2(tau) = < (x[i + 2m] - 2 x[i + m] + x[i])^2 > / (2 m^2)
+
+    (IEEE 1139; Riley, NIST SP 1065, eq. 10 with y for frequency). Triples with gaps are omitted.
+
+    Parameters
+    ----------
+    values : (n,) array
+        NaN in gaps.
+    period_s : float
+        Time between values.
+    lengths : (k,) array of int, optional
+        Samples in each tau; by default powers of two up to a quarter of the series, which leaves
+        about four independent means.
+    """
+    there = np.isfinite(values)
+    count = int(there.sum())
+    if lengths is None:
+        lengths = 2 ** np.arange(max(0, int(np.log2(max(values.size, 4) / 4)) + 1))
+    if count < 3:
+        return Allan(np.empty(0), np.empty(0), np.empty(0, dtype=np.int64))
+    mean = float(values[there].mean(dtype=np.float64))
+    total = np.zeros(values.size + 1)
+    np.cumsum(np.where(there, values - mean, 0.0), out=total[1:])
+    gaps = np.zeros(values.size + 1, dtype=np.int32)
+    np.cumsum(~there, out=gaps[1:])
+    found = [_second_differences(total, gaps, int(m)) for m in lengths if 2 * m <= values.size]
+    tau = np.array([m * period_s for m in lengths if 2 * m <= values.size])
+    windows = np.array([pairs for _, pairs in found], dtype=np.int64)
+    samples = np.array([m for m in lengths if 2 * m <= values.size], dtype=np.float64)
+    squares = np.array([square for square, _ in found])
+    kept = windows > 0
+    deviation = np.sqrt(squares[kept] / windows[kept] / 2) / samples[kept]
+    return Allan(tau[kept], deviation, windows[kept])
+
+
+@njit(cache=True)
+def _second_differences(total: Column, gaps: AnyArray, m: int) -> tuple[float, int]:
+    square = 0.0
+    count = 0
+    for i in range(total.size - 2 * m):
+        if gaps[i + 2 * m] == gaps[i]:
+            difference = total[i + 2 * m] - 2.0 * total[i + m] + total[i]
+            square += difference * difference
+            count += 1
+    return square, count

@@ -1,0 +1,124 @@
+"""Anomalies of a run, by name and with the figure that shows them."""
+
+from collections import Counter
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+from membrane_ctrl.model import events
+from membrane_ctrl.review.events.found_event import FoundEvent
+from membrane_ctrl.review.formatting import span
+from membrane_ctrl.review.statistics import shape_review
+from membrane_ctrl.review.statistics.drift import FittedSlope
+from membrane_ctrl.review.statistics.error_series import ErrorSeries
+from membrane_ctrl.review.statistics.hold_pass import (
+    HoldPass,
+)
+from membrane_ctrl.run_files.run import Run
+
+
+@dataclass(frozen=True, slots=True)
+class Anomaly:
+    """One anomaly: its name and the observation."""
+
+    name: str
+    seen: str
+
+
+# Noise alone leaves 95 % of single ticks in the band; a hold keeps all of its seconds there.
+_IN_BAND_LEAST = 0.999
+_BIAS_MOST_UM = 0.1
+_LATE_P99_MOST_MS = 5.0
+_REJECTED_MOST = 0.02
+# Every hold waits a few seconds for its first cycles.
+_TRACKING_LEAST = 0.8
+_UNTRACKED_MOST_S = 60.0
+# Below this a one-sided pump loses the band (docs/explanation/physics.md).
+_LEAK_LEAST_UM_PER_S = 0.4
+# A one-sided pump is at 0 now and then in typical weather (2 % on the twin).
+_SATURATED_MOST = 0.05
+
+
+def find_anomalies(
+    run: Run,
+    part_s: tuple[float, float],
+    ticks: HoldPass,
+    reading: ErrorSeries | None,
+    true: ErrorSeries | None,
+    leak_um_per_s: float,
+    tracking_share: float,
+    found: Sequence[FoundEvent],
+    shape: shape_review.ShapeReview | None,
+) -> tuple[Anomaly, ...]:
+    """All anomalies of a part of a run, the gravest first."""
+    odd = [Anomaly("incomplete recording", note) for note in run.notes]
+    names = Counter(
+        each.event.name for each in run.log_between(*part_s) if isinstance(each.event, events.Fault)
+    )
+    odd += [
+        Anomaly("fault", f"{name}, {count} time{'s' * (count > 1)}")
+        for name, count in names.most_common()
+    ]
+    if reading is None:
+        odd.append(Anomaly("never settled", "no tick counts as held: there are no hold statistics"))
+    series = true or reading
+    if series is not None:
+        seconds = series.windows[0]
+        if seconds.count and not seconds.in_band >= _IN_BAND_LEAST:
+            odd.append(
+                Anomaly("band left", f"{100 * seconds.in_band:.3g} % of 1 s means within the band")
+            )
+        if seconds.count and abs(seconds.mean_um) > _BIAS_MOST_UM:
+            odd.append(Anomaly("bias", f"{seconds.mean_um:+.3f} µm on average"))
+        if series.drift.significant:
+            odd.append(Anomaly("drift", _describe_slope(series.drift, "µm/h")))
+    if ticks.paused_s:
+        odd.append(
+            Anomaly(
+                "paused",
+                f"{span(ticks.paused_s)}: the pump gave its mean flow, nothing held the mirror",
+            )
+        )
+    if ticks.missed_ticks:
+        odd.append(
+            Anomaly("missed ticks", f"{ticks.missed_ticks} of {ticks.ticks + ticks.missed_ticks}")
+        )
+    if ticks.lateness_ms.quantile(0.99) > _LATE_P99_MOST_MS:
+        odd.append(Anomaly("late ticks", f"p99 is {ticks.lateness_ms.quantile(0.99):.1f} ms"))
+    if leak_um_per_s < _LEAK_LEAST_UM_PER_S:
+        odd.append(
+            Anomaly(
+                "too tight", f"a leak of {leak_um_per_s:.2f} µm/s leaves the pump no way to lower"
+            )
+        )
+    if ticks.pump.saturated_share > _SATURATED_MOST:
+        odd.append(
+            Anomaly(
+                "saturation",
+                f"{100 * ticks.pump.saturated_share:.1f} % of ticks at a limit of the flow",
+            )
+        )
+    untracked_s = (1 - tracking_share) * ticks.hold_s
+    if (
+        run.config.shape.enabled
+        and tracking_share < _TRACKING_LEAST
+        and untracked_s > _UNTRACKED_MOST_S
+    ):
+        seen = (
+            f"tracked {100 * tracking_share:.0f} % of the time held; else the centre follows the "
+            "laser's mount"
+        )
+        odd.append(Anomaly("shape loop", seen))
+    if shape is not None:
+        if shape.rejected > _REJECTED_MOST * shape.cycles:
+            odd.append(Anomaly("rejected cycles", f"{shape.rejected} of {shape.cycles}"))
+        if shape.disagreement.significant:
+            odd.append(
+                Anomaly("camera and laser diverge", _describe_slope(shape.disagreement, "µm/h"))
+            )
+    counts = Counter(event.kind for event in found)
+    odd += [Anomaly(kind, f"{count} found") for kind, count in counts.most_common()]
+    return tuple(odd)
+
+
+def _describe_slope(drift: FittedSlope, unit: str) -> str:
+    return f"{drift.per_hour:+.3g} {unit} (95 %: {drift.low:+.3g} to {drift.high:+.3g})"

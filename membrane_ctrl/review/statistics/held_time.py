@@ -1,0 +1,30 @@
+"""The time that a mirror was held, from the times of ticks."""
+
+import math
+
+import numpy as np
+
+from membrane_ctrl.model.arrays import BoolArray, Column
+
+_LONGEST_S = 2.0  # between two ticks; a longer gap is a loss
+
+
+class HeldTime:
+    """Sum of the tick intervals that start in a hold, over consecutive blocks."""
+
+    def __init__(self) -> None:
+        self._last = (math.nan, False)
+        self.held_s = 0.0
+
+    def add(self, time_s: Column, held: BoolArray) -> None:
+        """Take in (n,) times and whether the mirror was held."""
+        if not time_s.size:
+            return
+        lasted_s = np.diff(np.concatenate(([self._last[0]], time_s)))
+        first = np.concatenate(([self._last[1]], held[:-1]))
+        self.held_s += float(lasted_s[first & (lasted_s <= _LONGEST_S)].clip(0.0).sum())
+        self._last = float(time_s[-1]), bool(held[-1])
+
+    def result_s(self, period_s: float) -> float:
+        """Seconds held; the last tick lasts for one more period."""
+        return self.held_s + (period_s if self._last[1] else 0.0)

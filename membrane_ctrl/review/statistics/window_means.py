@@ -1,0 +1,104 @@
+"""Means of a series over windows of seconds, and their statistics."""
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+
+from membrane_ctrl.model.arrays import AnyArray, Column, IntArray, Singles
+from membrane_ctrl.run_files.run_statistics import least_ticks
+
+# A month has millions: single precision, which counts ticks exactly.
+Seconds = AnyArray
+Counts = Singles
+SecondsOf = tuple[Seconds, Counts, Column]
+
+
+@dataclass(frozen=True, slots=True)
+class WindowStatistics:
+    """Statistics of means over windows of one length; NaN without windows; a single window has no
+    `std_um`.
+    """
+
+    window_s: float  # 0: single ticks
+    count: int
+    mean_um: float
+    std_um: float
+    max_um: float
+    p99_7_um: float
+    in_band: float  # share within the band
+
+
+def group_starts(number: AnyArray) -> IntArray:
+    """Starts of the runs of equal numbers."""
+    return np.flatnonzero(np.concatenate(([True], number[1:] != number[:-1])))
+
+
+class SecondSums:
+    """Sums over whole seconds of the run, of several series at once,
+    from blocks in order of time.
+    """
+
+    def __init__(self, series: int) -> None:
+        self._parts: list[SecondsOf] = []
+        self._series = series
+
+    def add(self, time_s: Column, values: Column) -> None:
+        """Take in (n,) times and (series, n) values, all finite or NaN together."""
+        if not time_s.size:
+            return
+        second = np.floor(time_s + 1e-9).astype(np.int32)
+        starts = group_starts(second)
+        counts = np.diff(np.append(starts, time_s.size)).astype(np.float32)
+        self._parts.append((second[starts], counts, np.add.reduceat(values, starts, axis=1)))
+
+    def result(self) -> SecondsOf:
+        """(k,) seconds with ticks, (k,) numbers of ticks, (series, k) sums."""
+        if not self._parts:
+            return (
+                np.empty(0, dtype=np.int32),
+                np.empty(0, dtype=np.float32),
+                np.empty((self._series, 0)),
+            )
+        second, counts, sums = (
+            np.concatenate(parts, axis=-1) for parts in zip(*self._parts, strict=True)
+        )
+        starts = group_starts(second)  # two blocks may share a second
+        return (
+            second[starts],
+            np.add.reduceat(counts, starts),
+            np.add.reduceat(sums, starts, axis=1),
+        )
+
+
+def window_means(
+    second: Seconds, counts: Counts, sums: Column, window_s: int, rate_hz: float
+) -> tuple[Column, Column]:
+    """Middles (k,) in s and means of the windows with at least `least_ticks`, from (n,) sums of
+    `SecondSums`.
+    """
+    if not second.size:
+        return np.empty(0), np.empty(0)
+    number = second // window_s
+    starts = group_starts(number)
+    ticks, total = np.add.reduceat(counts, starts), np.add.reduceat(sums, starts)
+    whole = (ticks >= least_ticks(window_s, rate_hz)) & np.isfinite(total)
+    return np.asarray((number[starts][whole] + 0.5) * window_s, dtype=np.float64), total[
+        whole
+    ] / ticks[whole]
+
+
+def describe(means_um: Column, window_s: float, band_um: float) -> WindowStatistics:
+    """Statistics of the means of windows."""
+    if not means_um.size:
+        return WindowStatistics(window_s, 0, math.nan, math.nan, math.nan, math.nan, math.nan)
+    size_um = np.abs(means_um)
+    return WindowStatistics(
+        window_s,
+        int(means_um.size),
+        float(means_um.mean()),
+        float(means_um.std()) if means_um.size > 1 else math.nan,
+        float(size_um.max()),
+        float(np.quantile(size_um, 0.997)),
+        float((size_um <= band_um).mean()),
+    )

@@ -1,0 +1,90 @@
+"""Pictures of a recording as the viewer opens it, without a screen.
+
+Needs a Vulkan driver, for example Mesa's software one.
+"""
+
+import subprocess
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+from rerun.experimental import ViewerClient
+
+from membrane_ctrl.review.viewer.viewer import (
+    CursorTime,
+    free_port,
+    place_cursor,
+    proxy_url,
+    viewer_command,
+    viewer_environment,
+)
+
+# The viewer is ready when two consecutive pictures are equal, about 7 s for a short run on two
+# cores.
+_WAIT_S = 60.0
+_BETWEEN_S = 0.5
+
+
+def screenshot_of(source: Path | str, at: CursorTime | None = None) -> bytes:
+    """PNG of a recording as it opens, at a moment or its end, or of a server's page.
+
+    Raises RuntimeError if the viewer does not start (no Vulkan driver) or its picture keeps
+    changing.
+    """
+    with _headless() as viewer:
+        viewer.open(source if isinstance(source, str) else str(source.resolve()))
+        if isinstance(source, str):
+            pass
+        elif at is None:
+            viewer.set_time(play_state="following")
+        else:
+            place_cursor(viewer, at)
+        return _at_rest(viewer)
+
+
+def _at_rest(viewer: ViewerClient) -> bytes:
+    until_s = time.monotonic() + _WAIT_S
+    before = b""
+    while time.monotonic() < until_s:
+        picture = viewer.take_screenshot()
+        if picture == before:
+            return picture
+        before = picture
+        time.sleep(_BETWEEN_S)
+    raise RuntimeError(f"the viewer's picture still changes after {_WAIT_S:.0f} s")
+
+
+@contextmanager
+def _headless() -> Iterator[ViewerClient]:
+    """A headless viewer reachable only from this machine; `ViewerClient.spawn` would listen on
+    every interface.
+    """
+    port = free_port()
+    command = viewer_command(
+        "--headless", "--bind", "127.0.0.1", "--port", str(port), "--hide-welcome-screen"
+    )
+    with subprocess.Popen(
+        command, env=viewer_environment(), stdout=subprocess.DEVNULL, stderr=subprocess.PIPE
+    ) as process:
+        try:
+            yield _connect(port, process)
+        finally:
+            process.terminate()
+
+
+def _connect(port: int, process: subprocess.Popen[bytes]) -> ViewerClient:
+    until_s = time.monotonic() + _WAIT_S
+    while time.monotonic() < until_s and process.poll() is None:
+        try:
+            viewer = ViewerClient.connect(proxy_url("127.0.0.1", port))
+            viewer.take_screenshot(max_size=16)
+        except (RuntimeError, ConnectionError):
+            time.sleep(_BETWEEN_S)
+        else:
+            return viewer
+    process.terminate()
+    reason = process.stderr.read().decode(errors="replace").strip() if process.stderr else ""
+    raise RuntimeError(
+        f"the headless viewer did not start (Vulkan driver installed?): {reason[-300:]}"
+    )

@@ -1,0 +1,31 @@
+"""How much is recorded when the disk runs low: pictures are dropped first, numbers last."""
+
+from enum import IntEnum
+
+
+class DetailLevel(IntEnum):
+    """How much detail is recorded."""
+
+    ALL = 0
+    NO_PICTURES = 1  # thumbnails and maps are half of a recording
+    ESSENTIAL = 2  # events, tick inputs, summary: a few kB/s, enough to replay the run
+
+
+# In units of `recording.min_free_mb`, below which an alarm is raised and the rest is reserved for
+# the essential.
+PICTURES_FROM = 2.0
+_RERUN_FROM = 0.2
+# Hysteresis, or a level would come and go with every file.
+_HYSTERESIS = 1.1
+
+
+def detail_level(free_mb: float, min_free_mb: float, before: DetailLevel) -> DetailLevel:
+    """Level of detail for this much free space, given the previous level."""
+    level = _level(free_mb, min_free_mb)
+    return max(level, min(before, _level(free_mb / _HYSTERESIS, min_free_mb)))
+
+
+def _level(free_mb: float, min_free_mb: float) -> DetailLevel:
+    if free_mb < _RERUN_FROM * min_free_mb:
+        return DetailLevel.ESSENTIAL
+    return DetailLevel.NO_PICTURES if free_mb < PICTURES_FROM * min_free_mb else DetailLevel.ALL

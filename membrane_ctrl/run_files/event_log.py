@@ -1,0 +1,87 @@
+"""Reads the events of a run; unreadable lines are counted and skipped."""
+
+import errno
+from dataclasses import dataclass
+from pathlib import Path
+
+from membrane_ctrl.model import (
+    event_lines,
+    events,
+    file_checksums,
+    files,
+    plain_json,
+)
+from membrane_ctrl.run_files.annotations import ANNOTATIONS_FILE
+
+# Enough for a fault campaign of months; a line is about 150 bytes.
+EVENTS_BYTES_MAX = 64_000_000
+_RUN_MAX_S = 1e9  # thirty years
+
+
+@dataclass(frozen=True, slots=True)
+class LoggedEvent:
+    """A line of a run's events, and what it means."""
+
+    mono_s: float  # second of the run; 0 if the line does not say
+    event: events.Event
+    line: events.EventLine
+
+
+def logged(line: events.EventLine) -> LoggedEvent:
+    """What a line means; a mark made while the run went on (`ctl
+    mark`) is recorded as a command.
+    """
+    event = event_lines.from_dict(line)
+    if isinstance(event, events.CommandTaken) and event.command == "mark":
+        line = line | {"kind": "mark", "text": event.text or event.why}
+        event = event_lines.from_dict(line)
+    return LoggedEvent(float(line.get("mono_s") or 0.0), event, line)
+
+
+def read_events(folder: Path, notes: list[str]) -> tuple[LoggedEvent, ...]:
+    """Events and annotations in order of time; `notes` counts lines that are not JSON objects."""
+    told = _json_lines(folder / "events.jsonl", notes)
+    if not (folder / "events.jsonl").exists():
+        notes.append("events.jsonl: missing; states are taken from the telemetry")
+    later = _json_lines(folder / ANNOTATIONS_FILE, notes)
+    return tuple(sorted(map(logged, told + later), key=lambda each: each.mono_s))
+
+
+def _json_lines(path: Path, notes: list[str]) -> list[events.EventLine]:
+    try:
+        text = files.read_text(path, EVENTS_BYTES_MAX, errors="replace")
+        if plain_json.elements(text) > plain_json.ELEMENTS_MAX:
+            raise OSError(errno.EFBIG, f"more than {plain_json.ELEMENTS_MAX} elements")
+    except FileNotFoundError:
+        return []
+    except OSError as error:
+        notes.append(f"{path.name}: cannot be read ({error.strerror})")
+        return []
+    lines = [event_of(line) for line in text.splitlines()]
+    if broken := lines.count(None):
+        notes.append(
+            f"{path.name}: {broken} line{'s' * (broken > 1)} unreadable or untrustworthy: left out"
+        )
+    return [line for line in lines if line is not None]
+
+
+def event_of(line: str) -> events.EventLine | None:
+    """The event in a line, if valid: an object of a known form with a correct checksum and a
+    possible time.
+    """
+    try:
+        event = plain_json.loads(line)
+    except ValueError:
+        return None
+    if not isinstance(event, dict) or not file_checksums.take_checksum(event):
+        return None
+    moment_s = event.get("mono_s")
+    right = isinstance(event.get("kind", ""), str) and (moment_s is None or is_moment(moment_s))
+    return event if right else None
+
+
+def is_moment(value: object) -> bool:
+    """Whether a value is a possible time of a run; damaged and forged files may hold anything."""
+    return (
+        isinstance(value, (int, float)) and not isinstance(value, bool) and abs(value) < _RUN_MAX_S
+    )

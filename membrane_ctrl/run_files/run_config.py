@@ -1,0 +1,106 @@
+"""Reads the configuration of a run.
+
+Of a damaged configuration, or one of another version, the valid parts are used.
+"""
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+from pydantic import ValidationError
+
+from membrane_ctrl.config import toml_file
+from membrane_ctrl.config.schema import Config
+from membrane_ctrl.model import (
+    errors,
+    file_checksums,
+    files,
+)
+
+
+def understood(tables: dict[str, Any]) -> tuple[Config, list[str]]:
+    """Return a configuration without unknown keys and invalid values, and the names of those.
+
+    An unknown key says nothing about its neighbours: they keep their values.
+    """
+    tables = _copied(tables)
+    left_out: list[str] = []
+    while True:
+        try:
+            return Config.model_validate(tables), left_out
+        except ValidationError as error:
+            # all at once: removing ten thousand keys one by one would validate as many times
+            names = [_take_out(tables, found["loc"]) for found in error.errors(include_url=False)]
+        if not any(names):  # incompatible tables
+            return Config(), [*left_out, "tables that do not go together"]
+        left_out += filter(None, names)
+
+
+def _take_out(tables: dict[str, Any], location: Sequence[int | str]) -> str:
+    """Delete the deepest existing key of an error's location; returns its name, or ""."""
+    inside: Any = tables
+    path: list[str] = []
+    found: tuple[dict[str, Any], str] | None = None
+    for part in location:
+        # a location contains the tag of a union's member, the file does not
+        if isinstance(inside, dict) and isinstance(part, str) and part in inside:
+            found = inside, part
+            path.append(part)
+            inside = inside[part]
+        elif isinstance(inside, list) and isinstance(part, int) and part < len(inside):
+            inside = inside[part]
+    if found is None:
+        return ""
+    del found[0][found[1]]
+    return ".".join(path)
+
+
+def _copied(value: Any) -> Any:
+    if isinstance(value, dict):
+        return {key: _copied(inner) for key, inner in value.items()}
+    return [_copied(inner) for inner in value] if isinstance(value, list) else value
+
+
+_NAMED_MAX = 20
+
+
+def exact_config(folder: Path) -> Config:
+    """`config.toml` as it was in force. Raises InputError if this version does not understand all
+    of it.
+    """
+    return toml_file.load(folder / "config.toml", Config, follow=False)
+
+
+def read_config(folder: Path, notes: list[str]) -> Config:
+    """`config.toml`; keys that this version does not understand get their defaults, with a note."""
+    path = folder / "config.toml"
+    notes += _config_damage(path)
+    try:
+        tables = toml_file.read_toml(path, follow=False)
+    except errors.InputError as error:
+        notes.append(f"{error}; all defaults are used")
+        return Config()
+    try:
+        return toml_file.parse(tables, Config, "config.toml")
+    except errors.InputError as error:
+        config, left_out = understood(tables)
+        named = ", ".join(left_out[:_NAMED_MAX]) + (
+            f" and {len(left_out) - _NAMED_MAX} more" * (len(left_out) > _NAMED_MAX)
+        )
+        notes.append(f"{error}; omitted or at its default: {named}")
+        return config
+
+
+def _config_damage(path: Path) -> list[str]:
+    try:
+        text = files.read_text(path)
+    except (OSError, ValueError):  # reported by whoever reads it
+        return []
+    if not text:
+        return ["config.toml: empty; all defaults are used"]
+    right = file_checksums.comment_is_right(text)
+    return (
+        []
+        if right
+        else ["config.toml: checksum mismatch (damaged or edited); its values are doubtful"]
+    )

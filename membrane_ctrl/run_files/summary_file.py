@@ -1,0 +1,36 @@
+"""Reads `summary.json` of a run; `summary` computes its content."""
+
+from pathlib import Path
+from typing import Any
+
+from membrane_ctrl.model import (
+    file_checksums,
+    files,
+    plain_json,
+)
+from membrane_ctrl.run_files.event_log import is_moment
+
+_SUMMARY_SCHEMA = "membrane-summary/2"
+
+
+def read_summary(folder: Path, notes: list[str]) -> dict[str, Any] | None:
+    """`summary.json`; None with a note if it is missing or broken."""
+    path = folder / "summary.json"
+    try:
+        summary: Any = plain_json.loads(files.read_text(path))
+    except FileNotFoundError:
+        notes.append("summary.json: missing; the run is in progress, or its recorder was killed")
+        return None
+    except (OSError, ValueError) as error:
+        notes.append(f"summary.json: cannot be read ({error})")
+        return None
+    if not isinstance(summary, dict) or summary.get("schema") != _SUMMARY_SCHEMA:
+        notes.append(f"summary.json: not of schema {_SUMMARY_SCHEMA}; its figures are not used")
+        return {} if not isinstance(summary, dict) else summary
+    if not file_checksums.take_checksum(summary):
+        notes.append("summary.json: checksum mismatch (damaged or edited); it is not used")
+        return None
+    if not is_moment(summary.get("duration_s", 0.0) or 0.0):
+        notes.append("summary.json: impossible duration_s; it is not used")
+        del summary["duration_s"]
+    return summary
