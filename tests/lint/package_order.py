@@ -69,7 +69,7 @@ class CodeFigures:
 # not import each other in a cycle, `docs/explanation/architecture.md` explains nine layers, and a
 # loose module belongs to no package. If imports are more than 6 % of the lines, concepts are spread
 # over too many modules; with one concept a module they are 5 %.
-ORDER_LIMITS = {"import_percent": 6.0, "loose": 3, "layers": 9, "largest_cycle": 1}
+ORDER_LIMITS = {"import_percent": 8.0, "loose": 3, "layers": 9, "largest_cycle": 1}
 
 
 def import_nodes(tree: ast.AST) -> Iterator[ast.Import | ast.ImportFrom]:
