@@ -160,7 +160,7 @@ def test_a_path_that_the_user_named_may_lead_through_links(folder: Path, tmp_pat
 # Who else writes, and why it is no stranger's folder.
 _OWN = {
     # the recorder, and the log of a program beside a hold, in the folder that the run has just made
-    "processes/child.py",
+    "processes/command_process.py",
     "recorder/handover.py",
     "run_files/table_store/disk.py",
     "run_files/table_store/part_writer.py",
@@ -189,16 +189,17 @@ _OWN = {
     "calibration/session.py",
     "calibration/camera.py",
     "calibration/sets.py",
-    "calibration/report.py",
-    "geometry/spread_file.py",
-    "commissioning/devices.py",
+    "calibration/adopt.py",
+    "calibration/geometry_writer.py",
+    "geometry/prior_file.py",
+    "commissioning/first_config.py",
     "commissioning/new_driver.py",
     # shared memory
     "processes/frames.py",
     "processes/ring.py",
     # into memory, and from there by `model.files`
-    "measure/results.py",
-    "measure/figure_results.py",
+    "measure/result_files.py",
+    "measure/report_pdf.py",
     "measure/export_figure.py",
     "review/report/figures.py",
 }
