@@ -20,7 +20,7 @@ PACKAGES = ("membrane_ctrl", "firmware_iface", "tuning")
 _BUILD = "import sys; from setuptools import build_meta; build_meta.build_wheel(sys.argv[1])"
 _KERNEL = """
 import numpy as np
-from membrane_ctrl.review.statistics.spectra import allan_deviation
+from membrane_ctrl.review.statistics.allan_deviation import allan_deviation
 allan_deviation(np.arange(100.0), 1.0)
 """
 # what a user writes: mypy must find our types, and take them seriously
