@@ -2,7 +2,7 @@
 settled.
 
 Patterns are rendered once, when the screen is opened. A display returns when a picture is queued,
-not when it is lit: `wait` lasts for the settle time, which `firmware_iface.display_settling` measures.
+not when it is lit: `wait` lasts for the settle time, which `display_settling.py` measures.
 """
 
 from collections.abc import Sequence
