@@ -5,7 +5,6 @@ from typing import Annotated, Literal
 
 import typer
 
-from membrane_ctrl.calibration import camera_pose
 from membrane_ctrl.cli.options import (
     ConfigArgument,
     ConfigOption,
@@ -88,6 +87,7 @@ def calibrate_pose(
     json: JsonOption = False,
 ) -> int:
     """Determine the pose of the camera from the ring's ellipse in a full set."""
+    from membrane_ctrl.calibration import camera_pose
 
     options = camera_pose.PoseOptions(
         folder, geometry, tuple(prior or ()), radius_sigma_mm, out, json

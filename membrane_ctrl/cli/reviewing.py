@@ -9,7 +9,6 @@ import typer
 
 from membrane_ctrl.cli.options import FromOption, JsonOption, RunArgument, ToOption
 from membrane_ctrl.model import durations, errors
-from membrane_ctrl.review import run_times
 
 LogsOption = Annotated[Path, typer.Option("--logs", help="Folder of the runs.")]
 
@@ -280,7 +279,7 @@ def replay(
 ) -> int:
     """Replay a run's inputs through today's control code and report differences (exit 3)."""
     from membrane_ctrl.replay.command import replay_command
-    from membrane_ctrl.review import catalogue
+    from membrane_ctrl.review import catalogue, run_times
     from membrane_ctrl.run_files.run import open_run
 
     with _files_of_the_run():

@@ -22,8 +22,8 @@ from membrane_ctrl.processes.command_process import CommandProcess
 from tests.web.test_page import free_port
 
 WAITS = (
-    "from membrane_ctrl.processes.child import end_with_parent; end_with_parent(); import time; "
-    "time.sleep(60)"
+    "from membrane_ctrl.processes.command_process import end_with_parent; end_with_parent(); "
+    "import time; time.sleep(60)"
 )
 
 

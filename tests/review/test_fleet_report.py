@@ -16,7 +16,8 @@ import pytest
 
 from membrane_ctrl.cli import run as command
 from membrane_ctrl.model.errors import Exit
-from membrane_ctrl.review.report import fleet, html
+from membrane_ctrl.review.report import command as report_command
+from membrane_ctrl.review.report import fleet
 from tests.support.dask_cluster import PATIENT, cluster
 from tests.support.review_runs import written
 
@@ -62,7 +63,7 @@ def lab(tmp_path_factory: pytest.TempPathFactory) -> Path:
 @pytest.fixture
 def undrawn(monkeypatch: pytest.MonkeyPatch) -> None:
     """Pages without pictures, which take seconds."""
-    for module in (fleet, html):
+    for module in (fleet, report_command):
         monkeypatch.setattr(
             module, "render", lambda analysis, *_, **__: f"page of {analysis.run.name}"
         )
