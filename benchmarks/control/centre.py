@@ -106,7 +106,7 @@ def bound_um(case: str) -> float:
 
 def robust(draw: int, duration_s: float) -> float:
     """Standard deviation in µm on a bench whose gains, delay, lag and noises are up to 30 % off
-    what is told.
+    what the estimator assumes.
     """
     off = 1 + np.random.default_rng(draw).uniform(-0.3, 0.3, 8)
     told, loop = EstimatorConfig(), LoopConfig()

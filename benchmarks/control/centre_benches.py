@@ -1,7 +1,7 @@
 """Drawn benches of the second world: the estimate of the centre against the PID on the laser, in
 the same weather.
 
-Both are told what a session of `tune` finds: dead time, lag and curve of the pump, noise of the
+Both get what a session of `tune` finds: dead time, lag and curve of the pump, noise of the
 laser, effect of the weather. The PID is the best of six, chosen afterwards: SIMC with tc of 1, 2
 and 4 effective dead times (0.5 s at least), with and without the feed-forward of barometer and
 thermometer.

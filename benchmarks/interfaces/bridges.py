@@ -6,7 +6,7 @@ python -m benchmarks.interfaces.bridges FOLDER [--minutes 30] [--apart-minutes 1
 Phases: without doors, with doors, without doors. With doors, a client of each kind (mosquitto with
 aiomqtt, asyncua, caproto for Channel Access, p4p for PV Access) reads all names twice a second.
 Broker and clients are killed and started again four times each, then the door three times. A bare
-loop of the hold's rate, in a process of its own, tells what the machine does to any such loop.
+loop of the hold's rate, in a separate process, shows what the machine does to any such loop.
 FOLDER gets the raw lines; `--tell` prints the figures from them again.
 """
 
@@ -243,7 +243,7 @@ def _good(sweep: Line) -> bool:
 
 
 def age_figures(folder: Path, told: list[Line]) -> list[Figure]:
-    """How soon each client has all names anew after a restart, and how old they become between
+    """How soon each client has all names again after a restart, and how old they become between
     restarts.
     """
     ((_, begin_s, end_s),) = (each for each in _phases(told) if each[0] == "doors")

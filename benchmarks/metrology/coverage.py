@@ -5,7 +5,7 @@ A bench is drawn from the sigmas that `measure` states; the ray tracer of the tw
 code with the metrology, renders two sets minutes apart, and `measure`'s own steps measure them with
 the stated bench. Every second bench has sigmas of a hundredth, so that light, blur and motion
 count. The film has any Poisson ratio, and half of the films are stretched. The answers go to a
-file, line by line: a run that is stopped goes on where it was. `python -m
+file, line by line: a stopped run continues at the next line. `python -m
 benchmarks.metrology.coverage 60` measures up to 60 benches.
 """
 

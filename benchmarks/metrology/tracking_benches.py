@@ -4,8 +4,8 @@ The number of a bench gives its geometry, film, camera, pattern, disturbances an
 pictures are those of a world that shares no code with the product
 (`tests/worlds/crossed_fringes.py`). A figure is silently wrong if it is called ok and off by more
 than 5 sigma and 0.1 µm. A bench whose reference `measure` rejects, or whose fringes `track`
-refuses, does not count. Answers go to a file, line by line: a run that is stopped goes on where it
-was.
+refuses, does not count. Results go to a file, line by line: a stopped run continues at the next
+bench.
 
 python -m benchmarks.metrology.tracking_benches [--benches N] [--first K]
 """
@@ -181,7 +181,7 @@ def bench_of(number: int) -> tuple[Bench, Run]:
 
 
 def _planted(world: Bench, times: Array, random: np.random.Generator) -> dict[int, str]:
-    """Faults in frames that do not touch each other; the world is told of those that it shows
+    """Faults in frames that do not touch each other; the simulated world gets those that it shows
     itself.
     """
     places = np.sort(random.choice(np.arange(1, times.size // 2 - 1), 5, replace=False)) * 2
