@@ -76,7 +76,7 @@ class CentreEstimation:
             None if centre is None else CentreFilter(config.estimator, config.loop, centre)
         )
         self._tracks = config.shape.mode == "track"
-        self._mount_drift = MountDrift(config.shape, self.memory.mount_drift, config.by_optics)
+        self._mount_drift = MountDrift(config.shape, self.memory.mount_drift)
         self._stand = CameraMountGrowth(config.estimator, self.memory.stand)
         self._stand_most_um = _STAND_SHARE * config.limits.band_um
 
@@ -167,7 +167,11 @@ class CentreEstimation:
             *self._report_mount_growth(),
         ]
         news += self._mount_drift.step(
-            estimate.mount_um, estimate.jumped_sensors, inputs.now_s, context.dt_s
+            estimate.mount_um,
+            estimate.jumped_sensors,
+            inputs.now_s,
+            context.dt_s,
+            has_laser=self._follows(Sensor.LASER),
         )
         if self._follows(Sensor.OPTICS):
             sigma_um = math.hypot(estimate.sigma_um, self._stand.sigma_um)

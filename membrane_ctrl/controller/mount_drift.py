@@ -48,11 +48,8 @@ class MountDrift:
     to be the laser's is no drift.
     """
 
-    def __init__(
-        self, shape: ShapeConfig, memory: MountDriftState | None = None, by_optics: bool = False
-    ) -> None:
+    def __init__(self, shape: ShapeConfig, memory: MountDriftState | None = None) -> None:
         self._most_um = shape.trim_max_um
-        self._by_optics = by_optics
         self.memory = memory or MountDriftState()
 
     def start(self, mount_um: float) -> None:
@@ -66,14 +63,19 @@ class MountDrift:
         return self.memory.beyond_limit
 
     def step(
-        self, mount_um: float, jumped: Collection[Sensor], now_s: float, dt_s: float
+        self,
+        mount_um: float,
+        jumped: Collection[Sensor],
+        now_s: float,
+        dt_s: float,
+        has_laser: bool,
     ) -> list[Event]:
         """Follow the mount; returns the notice once the limit is passed, which only `start` takes
         back.
 
-        `jumped`: the sensors of which the estimate has found a jump in this tick. Optics that jump
-        again and again lead the estimate away in steps that each look like a knock; they are left
-        out as well.
+        `jumped`: the sensors of which the estimate has found a jump in this tick; `has_laser`: the
+        estimate follows the laser. Optics that jump again and again lead the estimate away in steps
+        that each look like a knock; they are left out as well.
         """
         memory = self.memory
         moved_um = mount_um - memory.last_um
@@ -84,7 +86,7 @@ class MountDrift:
             memory.optics_jumps.add(now_s, _OPTICS_JUMPS_MAX)
             if memory.optics_jumps.too_many(now_s, _OPTICS_JUMPS_MAX):
                 memory.beyond_limit = True
-                message = _UNSTEADY_ALONE_MESSAGE if self._by_optics else _UNSTEADY_MESSAGE
+                message = _UNSTEADY_MESSAGE if has_laser else _UNSTEADY_ALONE_MESSAGE
                 return [Maintenance("optics_unsteady", message)]
         laser_jumped = Sensor.LASER in jumped
         memory.jump_left_s = _JUMP_TAKES_S if laser_jumped else max(0.0, memory.jump_left_s - dt_s)

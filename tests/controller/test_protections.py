@@ -504,9 +504,18 @@ def test_optics_that_are_left_out_as_unsteady_count_as_missing_without_a_laser(
     held = settled(config_of(process_value), noisy_with_a_small_sigma()).fail(80.0, lose_laser)
     first = {"estimate": "displacement_missing", "optics": "film_unseen"}[process_value]
     assert held.faults[0] == first
-    assert "optics_unsteady" in held.notices
+    messages = {event.name: event.message for event in held.told(Maintenance)}  # type: ignore[attr-defined]
+    assert "no laser" in messages["optics_unsteady"]
     assert held.moved_um < 65.0
     assert held.state == State.FAULT
+
+
+def test_unsteady_optics_beside_a_laser_leave_the_mirror_to_the_laser() -> None:
+    held = settled(config_of("estimate"), noisy_with_a_small_sigma()).fail(60.0)
+    messages = {event.name: event.message for event in held.told(Maintenance)}  # type: ignore[attr-defined]
+    assert "the mirror follows the laser" in messages["optics_unsteady"]
+    assert held.faults == []
+    assert held.moved_um < 10.0
 
 
 def test_the_fault_of_unsteady_optics_without_a_laser_names_them() -> None:
