@@ -37,7 +37,7 @@ Camera  # the role that the camera drivers fill
 (
     _.common_covariance_um2,
     _.screen_points,
-    gradients,
+    evaluate_gradients,
     _.experiments,
 )  # a library: docs/explanation/metrology.md, docs/how-to/tuning.md
 _.frame_rms_adu, _.step_periods, _.sensitivity_sigma  # parts of a result

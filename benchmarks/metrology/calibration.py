@@ -29,11 +29,11 @@ from membrane_ctrl.metrology.calibration.solver import (
     Solution,
     first_states,
     fit_on,
-    solve,
+    solve_calibration,
 )
 from membrane_ctrl.metrology.frame_checks.set_check import check_set
 from membrane_ctrl.metrology.phase.frame_stack import FrameStack
-from membrane_ctrl.metrology.rays.bench_parameters import ALL, NAMES, sigmas
+from membrane_ctrl.metrology.rays.bench_parameters import ALL, NAMES, prior_sigmas
 from membrane_ctrl.metrology.rays.bench_poses import BenchGeometry, bench_at
 from membrane_ctrl.metrology.rays.forward_model import residual_mm
 from membrane_ctrl.metrology.rays.geometry import Geometry
@@ -75,7 +75,7 @@ def _camera(shrink: int) -> CameraConfig:
 
 
 def _off(seed: int) -> FloatArray:
-    own = sigmas()
+    own = prior_sigmas()
     return own * np.random.default_rng(1000 + seed).normal(size=own.size)
 
 
@@ -120,7 +120,7 @@ def _config(geometry: Geometry) -> GeometryConfig:
 
 def _problem(sets: tuple[SetPhases, ...], free: dict[str, float] | None = None) -> Problem:
     stated = Geometry.from_config(OpticsConfig(geometry=STATED, camera=_camera(4)))
-    return Problem(stated, sets, sigmas(free), References(0.0), 500.0)
+    return Problem(stated, sets, prior_sigmas(free), References(0.0), 500.0)
 
 
 def _plain(problem: Problem) -> Problem:
@@ -143,7 +143,11 @@ def _plain(problem: Problem) -> Problem:
             )
         )
     return Problem(
-        problem.stated, tuple(sets), sigmas(held), References(0.0, 1.0, 1e6), problem.radius_mm
+        problem.stated,
+        tuple(sets),
+        prior_sigmas(held),
+        References(0.0, 1.0, 1e6),
+        problem.radius_mm,
     )
 
 
@@ -181,8 +185,8 @@ def _accuracy() -> list[Figure]:
             BenchGeometry(problem.stated), sets[2], 500.0, -1e-3 * sets[2].displacement_um
         ).surface
         none.append(errors_um(stated, film, MOVED_UM[2]))
-        plain.append(_measured(solve(_plain(problem)), film))
-        full.append(_measured(solve(problem), film))
+        plain.append(_measured(solve_calibration(_plain(problem)), film))
+        full.append(_measured(solve_calibration(problem), film))
     where = f"({SEEDS} seeds, a quarter of the resolution)"
     rows = [
         at_most(
@@ -228,10 +232,10 @@ def _bowed() -> list[Figure]:
     held, freed, told = [], [], 0
     for seed in range(BOWED_SEEDS):
         film, sets = _rendered(seed, bow_mm=1.0)
-        solution = solve(_problem(sets))
+        solution = solve_calibration(_problem(sets))
         held.append(_measured(solution, film))
         told += bool(find_suspects(solution)) and find_suspects(solution)[0].name == "bow_mm"
-        solution = solve(_problem(sets, {"bow_mm": 1.5}))
+        solution = solve_calibration(_problem(sets, {"bow_mm": 1.5}))
         freed.append(errors_um(solution.states[2].surface, film, MOVED_UM[2]))
     return [
         at_least("screen bowed by 1 mm: named", told / BOWED_SEEDS, "share", 1.0),
@@ -256,12 +260,12 @@ def _bowed() -> list[Figure]:
 
 def _covariance() -> list[Figure]:
     """Error over claimed sigma, RMS over the seeds: the least and the largest of the parameters."""
-    own = sigmas()
+    own = prior_sigmas()
     free = own > 0
     ratios = []
     for seed in range(COVARIANCE_SEEDS):
         values = _off(seed)
-        solution = solve(_problem(_traced(values, seed)))
+        solution = solve_calibration(_problem(_traced(values, seed)))
         ratios.append((solution.values - values)[free] / solution.sigmas[free])
     rms = np.sqrt(np.mean(np.square(ratios), axis=0))
     names = solution.free

@@ -39,7 +39,7 @@ from membrane_ctrl.geometry.set_tables import ScreenMovedTable, move_screen
 from membrane_ctrl.measure.capture_set import CaptureHead, CaptureSet
 from membrane_ctrl.metrology.calibration import figure_uncertainty, verdict
 from membrane_ctrl.metrology.calibration.rim_edges import find_edges
-from membrane_ctrl.metrology.calibration.solver import Solution, fit_on, solve
+from membrane_ctrl.metrology.calibration.solver import Solution, fit_on, solve_calibration
 from membrane_ctrl.metrology.frame_checks.checked_set import Checked, RejectedSetError
 from membrane_ctrl.metrology.frame_checks.set_check import check_set
 from membrane_ctrl.metrology.phase.frame_stack import FrameStack
@@ -290,7 +290,7 @@ def calibrated(drawn: DrawnBench, seed: int) -> tuple[Solution, list[float]]:
     options = CalibrateOptions(
         (), None, Path(), (), 1.0, False, radius_sigma_mm=drawn.radius_sigma_mm
     )
-    return solve(problem_of(bundle, {}, options)), true_um
+    return solve_calibration(problem_of(bundle, {}, options)), true_um
 
 
 def bench(seed: int) -> dict[str, Any]:
@@ -311,7 +311,7 @@ def bench(seed: int) -> dict[str, Any]:
     middle = solution.problem.middle
     phases = _still(solution, middle)
     surface = fit_on(solution.bench, phases, 500.0, -1e-3 * phases.displacement_um).surface
-    claim = figure_uncertainty.propagate(solution, middle, 475.0)
+    claim = figure_uncertainty.propagate_to_figure(solution, middle, 475.0)
     sag_um, figure_um = errors_um(surface, drawn.film, true_um[middle])
     z = [(solution.values[k] - drawn.off.get(name, 0.0)) / s for k, (name, s) in _free(solution)]
     return answer | {

@@ -11,7 +11,7 @@ from pathlib import Path
 
 from membrane_ctrl.calibration.sets import CalibrateOptions, problem_of, read_sets
 from membrane_ctrl.config.schema import CameraConfig, GeometryConfig, OpticsConfig
-from membrane_ctrl.metrology.calibration.solver import solve
+from membrane_ctrl.metrology.calibration.solver import solve_calibration
 from membrane_ctrl.sim.optics.film_shape import typical_film
 from membrane_ctrl.sim.optics.simulate import simulate_set
 from membrane_ctrl.sim.optics.simulation_spec import Motion, SimulationSpec
@@ -44,7 +44,7 @@ def _time(shrink: int, count: int, limit_s: float) -> list[Figure]:
         for _ in range(2):  # the first compiles
             begin, busy = time.perf_counter(), time.process_time()
             options = CalibrateOptions(folders, None, Path(), (), 1.0, False)
-            solve(problem_of(read_sets(folders, None), {}, options))
+            solve_calibration(problem_of(read_sets(folders, None), {}, options))
             seconds, processors = time.perf_counter() - begin, time.process_time() - busy
     what = (
         f"{count} "

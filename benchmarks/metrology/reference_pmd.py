@@ -34,7 +34,7 @@ def design(x: FloatArray, y: FloatArray, radius_mm: float) -> FloatArray:
     """Derivatives of all terms but piston at some points, (2 n, terms - 1):
     the paper's matrix D.
     """
-    rho_x, rho_y = zernike.gradients(x / radius_mm, y / radius_mm)
+    rho_x, rho_y = zernike.evaluate_gradients(x / radius_mm, y / radius_mm)
     return np.concatenate([rho_x[1:], rho_y[1:]], axis=1).T / radius_mm
 
 
@@ -85,5 +85,5 @@ def _height(coeffs: FloatArray, x: FloatArray, y: FloatArray, radius_mm: float) 
     out = np.empty_like(x)
     for first in range(0, x.size, _CHUNK):
         part = slice(first, first + _CHUNK)
-        out[part] = coeffs @ zernike.values(x[part] / radius_mm, y[part] / radius_mm)
+        out[part] = coeffs @ zernike.evaluate_terms(x[part] / radius_mm, y[part] / radius_mm)
     return out

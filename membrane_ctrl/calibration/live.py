@@ -201,10 +201,12 @@ def _foreseen(
     solving = options.solving
     if solving.geometry is not None:
         optics = read_geometry(solving.geometry).over(optics)
-    known = bench_parameters.sigmas(known_sigmas(optics, freed(solving.free)))
+    known = bench_parameters.prior_sigmas(known_sigmas(optics, freed(solving.free)))
     sags_mm = [held.sag_at_mm(each) for each in sorted(setpoints)]
     try:
-        return foresight.foresee(optics, known, sags_mm, held.swing_adu, solving.laser_sigma_um)
+        return foresight.forecast_figure(
+            optics, known, sags_mm, held.swing_adu, solving.laser_sigma_um
+        )
     except ValueError as error:
         raise InputError(f"{link.name}: {error}; does [optics] describe this bench?") from None
 

@@ -42,7 +42,7 @@ def calibration_report(
     if solution is None or not solution.converged:
         return table
     middle = solution.problem.middle
-    claim = figure_uncertainty.propagate(solution, middle, analysis_radius_mm)
+    claim = figure_uncertainty.propagate_to_figure(solution, middle, analysis_radius_mm)
     scale, number = model_tests.laser_scale(solution), advice.number_advice(solution, middle)
     artefact = artefact_advice.artefact_advice(solution, middle)
     return table | {

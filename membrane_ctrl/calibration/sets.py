@@ -23,7 +23,7 @@ from membrane_ctrl.measure.measurement import Figures, SetFigure, stack_of
 from membrane_ctrl.metrology.calibration import rim_edges, screen_pose, set_state, verdict
 from membrane_ctrl.metrology.calibration.rim_edges import RADIUS_SIGMA_MM
 from membrane_ctrl.metrology.calibration.rim_equations import Rim
-from membrane_ctrl.metrology.calibration.solver import Problem, solve
+from membrane_ctrl.metrology.calibration.solver import Problem, solve_calibration
 from membrane_ctrl.metrology.figure.bin_figure import bin_figure
 from membrane_ctrl.metrology.figure.set_motion import FilmMotion
 from membrane_ctrl.metrology.frame_checks import bin_view
@@ -32,7 +32,7 @@ from membrane_ctrl.metrology.frame_checks.checked_set import Checked
 from membrane_ctrl.metrology.phase import phase_steps, screen_scale
 from membrane_ctrl.metrology.phase.frame_stack import bin_frames
 from membrane_ctrl.metrology.rays import set_phases
-from membrane_ctrl.metrology.rays.bench_parameters import LASER, NAMES, sigmas, usual_sigma
+from membrane_ctrl.metrology.rays.bench_parameters import LASER, NAMES, prior_sigmas, usual_sigma
 from membrane_ctrl.metrology.rays.geometry import Geometry
 from membrane_ctrl.metrology.reconstruction.bin_grid import BinGrid
 from membrane_ctrl.metrology.reconstruction.slope_noise import pixel_sigma_adu
@@ -154,7 +154,7 @@ def calibrate_command(options: CalibrateOptions) -> int:
     findings, solution = verdict.check_before_solving(problem), None
     if not findings:
         try:
-            solution = solve(problem, _progress())
+            solution = solve_calibration(problem, _progress())
             findings = _judged(verdict.check_solution(solution), bundle)
         except ValueError as error:
             findings = (verdict.CalibrationFinding(True, str(error)),)
@@ -426,7 +426,7 @@ def problem_of(bundle: Bundle, free: dict[str, float], options: CalibrateOptions
     if sum(math.isfinite(p.displacement_um) for p in bundle.sets if p.artefact is None) < 2:
         known[LASER.name] = 0.0  # no readings to scale
     rim = Rim.of(bundle.edges_px, radius_mm, options.radius_sigma_mm)
-    return Problem(geometry, bundle.sets, sigmas(known), references, radius_mm, rim)
+    return Problem(geometry, bundle.sets, prior_sigmas(known), references, radius_mm, rim)
 
 
 def _progress() -> Any:

@@ -153,7 +153,7 @@ def read_result(folder: Path) -> tuple[ExportedMap, dict[str, Any]]:
 def _fit(seen: ExportedMap, terms: int) -> grid_fit.GridFit:
     axes = seen.x_mm / seen.radius_mm, seen.y_mm / seen.radius_mm
     return grid_fit.GridFit(
-        axes[0], seen.measured, [zernike.fringe(j + 1) for j in range(terms)], axes[1]
+        axes[0], seen.measured, [zernike.fringe_set_orders(j + 1) for j in range(terms)], axes[1]
     )
 
 
@@ -186,7 +186,7 @@ def _zernike_table(
     """
     if index == "fringe":
         coeffs = 1e3 * _fit(seen, zernike.FRINGE_TERMS).coefficients(seen.height_mm)
-        orders = [zernike.fringe(j + 1) for j in range(zernike.FRINGE_TERMS)]
+        orders = [zernike.fringe_set_orders(j + 1) for j in range(zernike.FRINGE_TERMS)]
         radius, first, normalisation = seen.radius_mm, 1, "peak"
     else:
         own = table.get("zernike")
@@ -201,7 +201,11 @@ def _zernike_table(
         if coeffs.shape != (ZERNIKE_TERMS,) or not (np.isfinite(coeffs).all() and radius > 0):
             wanted = f"needs {ZERNIKE_TERMS} coefficients (it has {coeffs.size}) and a radius"
             raise errors.InputError(f"{where / 'result.json'}: zernike: {wanted}")
-        orders, first, normalisation = [zernike.noll(j + 1) for j in range(ZERNIKE_TERMS)], 1, "rms"
+        orders, first, normalisation = (
+            [zernike.noll_orders(j + 1) for j in range(ZERNIKE_TERMS)],
+            1,
+            "rms",
+        )
         if index == "osa":
             coeffs, orders, first = zernike.osa_from_noll(coeffs), sorted(orders), 0
     return {

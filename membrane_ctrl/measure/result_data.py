@@ -56,7 +56,7 @@ class MeasuredResult:
 
     def to_pandas(self) -> pd.DataFrame:
         """Zernike terms: `n`, `m`, `coeffs_um` and `sigma_um` by Noll's index."""
-        orders = np.array([zernike.noll(j) for j in NOLL_INDICES])
+        orders = np.array([zernike.noll_orders(j) for j in NOLL_INDICES])
         columns = {
             "n": orders[:, 0],
             "m": orders[:, 1],

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 
 from membrane_ctrl.metrology.frame_checks.frequency_series import AxisSeries
-from membrane_ctrl.metrology.phase.phase_steps import equal_shifts, phasors
+from membrane_ctrl.metrology.phase.phase_steps import compute_phasors, equal_shifts
 from membrane_ctrl.model.arrays import BoolArray, FloatArray
 from membrane_ctrl.model.files import open_plain
 
@@ -124,7 +124,7 @@ def lit_pixels(measurement: SofastMeasurement) -> BoolArray:
     bad frames.
     """
     series = (*measurement.frames_y, *measurement.frames_x)
-    swing = np.median([np.abs(phasors(steps, SHIFTS_RAD)) for steps in series], axis=0)
+    swing = np.median([np.abs(compute_phasors(steps, SHIFTS_RAD)) for steps in series], axis=0)
     return np.asarray(swing > _LIT_SHARE * np.percentile(swing, 95))
 
 

@@ -321,7 +321,7 @@ def _points() -> tuple[NDArray[np.float64], NDArray[np.float64]]:
 @cache
 def _terms() -> NDArray[np.float64]:
     """(terms, points) the Zernike terms."""
-    return zernike.values(*_points())
+    return zernike.evaluate_terms(*_points())
 
 
 def _grid(px: int = MAP_PX) -> tuple[NDArray[np.float64], NDArray[np.float64]]:

@@ -27,9 +27,9 @@ from membrane_ctrl.metrology.phase.frame_stack import FrameStack
 from membrane_ctrl.metrology.rays.bench_parameters import NAMES
 from membrane_ctrl.metrology.rays.bench_poses import bench_at
 from membrane_ctrl.metrology.rays.geometry import Geometry
-from membrane_ctrl.metrology.rays.ray_tracing import Points, Tracer, parabola
+from membrane_ctrl.metrology.rays.ray_tracing import Points, Tracer, make_parabola
 from membrane_ctrl.metrology.rays.rim_outline import find_outline
-from membrane_ctrl.metrology.reconstruction.surface_fit import solve
+from membrane_ctrl.metrology.reconstruction.surface_fit import fit_surface
 from membrane_ctrl.metrology.uncertainty.budget import Budget, Source
 from membrane_ctrl.metrology.uncertainty.height_map import height_matrix
 from membrane_ctrl.metrology.uncertainty.set_budget import SetBudget, assemble_budget
@@ -205,7 +205,7 @@ def test_what_bends_the_rays_or_moves_the_bench(name: str) -> None:
         points = Points.of(
             exact.geometry.rays(columns, rows), np.stack([seen.s_x_mm, seen.s_y_mm])[:, inside]
         )
-        surfaces.append(solve(exact, points, parabola(37.0, 500.0)).surface.parameters)
+        surfaces.append(fit_surface(exact, points, make_parabola(37.0, 500.0)).surface.parameters)
     budget = set_of_the_stated_bench().examined.budget
     row = next(source for source in budget.sources if source.name == name)
     heights = height_matrix(X[INSIDE], Y[INSIDE], 500.0)

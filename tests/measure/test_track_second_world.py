@@ -23,7 +23,7 @@ from membrane_ctrl.metrology.rays.surface import Surface, sag_gradient
 from membrane_ctrl.metrology.tracking.crossed_scene import CrossedScene
 from membrane_ctrl.metrology.tracking.frame_fit import FrameFit, FrameFitter
 from membrane_ctrl.metrology.tracking.scene_from_reference import make_scene
-from membrane_ctrl.metrology.tracking.step_solution import _split, solve_steps
+from membrane_ctrl.metrology.tracking.step_solution import _split_phases, solve_steps
 from membrane_ctrl.metrology.tracking.tracker import Tracker
 from membrane_ctrl.model.zernike_terms import NOLL_INDICES, ZERNIKE_TERMS
 from tests.studies.tracked_errors import (
@@ -374,7 +374,7 @@ def test_phases_of_dust_move_no_surface(still: Still) -> None:
     off_rad += random.normal(0.0, 1e-3, off_rad.shape)
     dusty = random.random(off_rad.shape[1]) < 0.002
     off_rad[:, dusty] += 0.2
-    moved_mm, _, left_rad = _split(
+    moved_mm, _, left_rad = _split_phases(
         still.fitter, off_rad, still.scene.light_adu[1:] * np.sqrt(still.scene.taper)
     )
     assert 1e6 * np.linalg.norm(moved_mm) < 5.0  # nm; 55 with the dust
@@ -420,7 +420,7 @@ class BentWorld(CrossedWorld):
         return super().sag_um(t) + self.deeper_um
 
     def _more_mm(self, x: Array, y: Array) -> Array:
-        terms = zernike.values(np.ravel(x) / RADIUS_MM, np.ravel(y) / RADIUS_MM)
+        terms = zernike.evaluate_terms(np.ravel(x) / RADIUS_MM, np.ravel(y) / RADIUS_MM)
         heights = [
             1e-3 * um * (terms[j - 1] - zernike.at_vertex()[j - 1])
             for j, um in self.more_um.items()
@@ -459,7 +459,7 @@ def cramer_rao_um(noise_adu: float) -> Array:
     for term in NOLL_INDICES[1:]:
         more, less = (light_of(BentWorld(**setup, more_um={term: a})) for a in (1.0, -1.0))  # type: ignore[arg-type]
         columns.append((more - less)[:3].sum(axis=0) / 2)
-    maps = zernike.values(*seen[3:].reshape(2, -1) / RADIUS_MM).reshape(
+    maps = zernike.evaluate_terms(*seen[3:].reshape(2, -1) / RADIUS_MM).reshape(
         ZERNIKE_TERMS, *seen.shape[1:]
     )
     every = np.array([*columns, *(wave * one for wave in seen[:3] for one in maps)]).reshape(

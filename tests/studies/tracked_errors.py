@@ -89,7 +89,7 @@ def compared(world: CrossedWorld, folder: Path) -> TrackedErrors:
         [world.height_um(t, RADIUS_MM * x, RADIUS_MM * y) - before_um for t in found["time_s"]]
     )
     heights_um, rim_um = np.split(moved_um, [-azimuth.size], axis=1)
-    columns = zernike.values(x, y).T[: -azimuth.size]
+    columns = zernike.evaluate_terms(x, y).T[: -azimuth.size]
     true_um = np.linalg.lstsq(columns, heights_um.T, rcond=None)[0].T
     error_um = found["coeffs_um"] - np.array(result["zernike"]["coeffs_um"]) - true_um
     given = np.isfinite(

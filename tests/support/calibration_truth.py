@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from membrane_ctrl.config.schema import OpticsConfig
 from membrane_ctrl.metrology.calibration.set_state import References
 from membrane_ctrl.metrology.calibration.solver import Problem, Solution, first_states, fit_on
-from membrane_ctrl.metrology.rays.bench_parameters import ALL, NAMES, sigmas
+from membrane_ctrl.metrology.rays.bench_parameters import ALL, NAMES, prior_sigmas
 from membrane_ctrl.metrology.rays.bench_poses import BenchGeometry, bench_at
 from membrane_ctrl.metrology.rays.forward_model import residual_mm
 from membrane_ctrl.metrology.rays.geometry import Geometry
@@ -51,7 +51,7 @@ def plain(truth: Truth) -> Problem:
     laser's scale.
     """
     held = {p.name: 0.0 for p in ALL if p.name not in ("a_mm", "b_mm", "alpha_deg")}
-    problem = truth.problem(sigmas(held))
+    problem = truth.problem(prior_sigmas(held))
     # what three parameters cannot explain counts as noise, or the hand's measurements would count
     # for nothing
     left = [

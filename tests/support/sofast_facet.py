@@ -23,7 +23,7 @@ from membrane_ctrl.measure.sofast_file import (
     read_floats,
     read_item,
 )
-from membrane_ctrl.metrology.phase.phase_steps import phasors
+from membrane_ctrl.metrology.phase.phase_steps import compute_phasors
 from membrane_ctrl.metrology.phase.temporal_unwrap import Unwrapped, unwrap_in_time
 from membrane_ctrl.metrology.rays.geometry import Geometry
 from membrane_ctrl.metrology.rays.screen_face import Face
@@ -286,7 +286,7 @@ def wrapped_phases(
     def phases(frames: FloatArray) -> FloatArray:
         seen = frames[..., mask]
         shown = seen if response is None else response.shown_levels(seen, black, white)
-        return np.stack([np.angle(phasors(steps, SHIFTS_RAD)) for steps in shown])
+        return np.stack([np.angle(compute_phasors(steps, SHIFTS_RAD)) for steps in shown])
 
     return phases(measurement.frames_x), phases(measurement.frames_y)
 

@@ -57,7 +57,7 @@ def calibrate_lens(views: Sequence[BoardView], stated: CameraConfig) -> Lens:
                 f"the board is seen in {len(good)} photographs; at least {LEAST_VIEWS} are "
                 "needed, tilted both ways"
             )
-        rms, matrix, lens, sigmas, errors = _fit(good, stated)
+        rms, matrix, lens, sigmas, errors = _fit_camera(good, stated)
         worst = int(np.argmax(errors))
         if errors[worst] <= _WORSE * float(np.median(errors)):
             break
@@ -71,13 +71,13 @@ def calibrate_lens(views: Sequence[BoardView], stated: CameraConfig) -> Lens:
         distortion=tuple(float(k) for k in lens[:4]),
         sigmas=dict(zip(_NAMES, map(float, values), strict=True)),
         rms_px=rms,
-        stated_rms_px=_rms_px(good, _matrix(stated), np.array(stated.distortion, float)),
+        stated_rms_px=_rms_px(good, _camera_matrix(stated), np.array(stated.distortion, float)),
         used=tuple(view.name for view in good),
         left_out=tuple(view.name for view in views if view.name not in names),
     )
 
 
-def _fit(
+def _fit_camera(
     views: Sequence[BoardView], stated: CameraConfig
 ) -> tuple[float, FloatArray, FloatArray, FloatArray, FloatArray]:
     """RMS, camera matrix, distortion, sigmas of the intrinsics, RMS of each view."""
@@ -86,16 +86,22 @@ def _fit(
     size = (stated.width_px, stated.height_px)
     try:
         rms, matrix, lens, _, _, sigmas, _, errors = cv2.calibrateCameraExtended(
-            places, seen, size, _matrix(stated), np.zeros(5), flags=_FLAGS
+            places, seen, size, _camera_matrix(stated), np.zeros(5), flags=_FLAGS
         )
     except cv2.error as error:
         raise ValueError(f"no lens fits the photographs: {str(error).splitlines()[0]}") from None
     if not np.isfinite(rms):
         raise ValueError("no lens fits the photographs")
-    return float(rms), np.asarray(matrix, float), _row(lens), _row(sigmas), _row(errors)
+    return (
+        float(rms),
+        np.asarray(matrix, float),
+        _flatten_row(lens),
+        _flatten_row(sigmas),
+        _flatten_row(errors),
+    )
 
 
-def _row(values: ArrayLike) -> FloatArray:
+def _flatten_row(values: ArrayLike) -> FloatArray:
     return np.asarray(values, float).ravel()
 
 
@@ -110,7 +116,7 @@ def _rms_px(views: Sequence[BoardView], matrix: FloatArray, lens: FloatArray) ->
     return float(np.sqrt(squares / count))
 
 
-def _matrix(camera: CameraConfig) -> FloatArray:
+def _camera_matrix(camera: CameraConfig) -> FloatArray:
     focal_px = camera.focal_mm / (camera.pixel_um * 1e-3)
     column, row = camera.principal
     return np.array([[focal_px, 0.0, column], [0.0, focal_px, row], [0.0, 0.0, 1.0]])

@@ -48,7 +48,7 @@ def surface_covariance(solution: Solution, index: int) -> FloatArray:
     return np.asarray(response[:, :-1] @ geometry @ response[:, :-1].T + np.outer(vertex, vertex))
 
 
-def propagate(solution: Solution, index: int, analysis_radius_mm: float) -> Propagated:
+def propagate_to_figure(solution: Solution, index: int, analysis_radius_mm: float) -> Propagated:
     """Propagate to the quantities of a figure like that of one set."""
     covariance = surface_covariance(solution, index)
     heights, plane = heights_over_disc(analysis_radius_mm / solution.problem.radius_mm)

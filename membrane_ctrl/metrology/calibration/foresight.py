@@ -13,8 +13,8 @@ import numpy as np
 
 from membrane_ctrl.config.schema import OpticsConfig
 from membrane_ctrl.metrology.calibration import set_state
-from membrane_ctrl.metrology.calibration.figure_uncertainty import Propagated, propagate
-from membrane_ctrl.metrology.calibration.solver import Problem, solve
+from membrane_ctrl.metrology.calibration.figure_uncertainty import Propagated, propagate_to_figure
+from membrane_ctrl.metrology.calibration.solver import Problem, solve_calibration
 from membrane_ctrl.metrology.phase import phase_steps, screen_scale
 from membrane_ctrl.metrology.rays import bench_poses, forward_model, set_phases
 from membrane_ctrl.metrology.rays.geometry import Geometry
@@ -37,7 +37,7 @@ _MOUNTED_MM[_HIGHER] = 0.01 / np.sqrt(_HIGHER.size) * (-1.0) ** np.arange(_HIGHE
 _ACROSS = 48
 
 
-def foresee(
+def forecast_figure(
     optics: OpticsConfig,
     sigmas: FloatArray,
     sags_mm: Sequence[float],
@@ -51,13 +51,17 @@ def foresee(
     set ends on the pattern.
     """
     geometry, middle_mm = Geometry.from_config(optics), sags_mm[len(sags_mm) // 2]
-    sets = [_set(geometry, optics, sag_mm, sag_mm - middle_mm, swing_adu) for sag_mm in sags_mm]
+    sets = [
+        _make_set(geometry, optics, sag_mm, sag_mm - middle_mm, swing_adu) for sag_mm in sags_mm
+    ]
     references = set_state.References(0.0, laser_sigma_um)
     problem = Problem(geometry, tuple(sets), sigmas, references, optics.mirror.radius_mm)
-    return propagate(solve(problem), len(sets) // 2, optics.mirror.analysis_radius_mm)
+    return propagate_to_figure(
+        solve_calibration(problem), len(sets) // 2, optics.mirror.analysis_radius_mm
+    )
 
 
-def _set(
+def _make_set(
     geometry: Geometry, optics: OpticsConfig, sag_mm: float, moved_mm: float, swing_adu: float
 ) -> set_phases.SetPhases:
     """The rays of a coarse grid, each with the noise of the pixels that it stands for."""

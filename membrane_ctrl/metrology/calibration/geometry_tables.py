@@ -57,7 +57,7 @@ def tables_of(solution: Solution, optics: OpticsConfig, origin: Origin) -> dict[
         **file_origin(SCHEMA),
         "geometry": geometry_of(solution, optics).model_dump(exclude_none=True),
         "covariance": {
-            "names": [*GENERAL_NAMES, *_optional(solution)],
+            "names": [*GENERAL_NAMES, *_list_free_options(solution)],
             "matrix": general_covariance(solution).tolist(),
         },
         "parameters": {
@@ -106,16 +106,16 @@ def general_form(geometry: Geometry, optics: OpticsConfig) -> GeometryConfig:
     bench's.
     """
     stated = optics.geometry.screen
-    right, down, forward = (_vector(row) for row in geometry.rotation)
+    right, down, forward = (_to_vector(row) for row in geometry.rotation)
     return GeometryConfig(
         reference_displacement_um=optics.geometry.reference_displacement_um,
         camera=CameraPoseConfig(
-            position_mm=_vector(geometry.pinhole_mm), rotation=(right, down, forward)
+            position_mm=_to_vector(geometry.pinhole_mm), rotation=(right, down, forward)
         ),
         screen=ScreenPoseConfig(
-            origin_mm=_vector(geometry.screen_origin_mm),
-            s_x=_vector(geometry.screen_s_x),
-            s_y=_vector(geometry.screen_s_y),
+            origin_mm=_to_vector(geometry.screen_origin_mm),
+            s_x=_to_vector(geometry.screen_s_x),
+            s_y=_to_vector(geometry.screen_s_y),
             bow_mm=geometry.face.bow_per_mm * BOW_RADIUS_MM**2,
             height_map=None if stated is None else stated.height_map,
         ),
@@ -138,7 +138,7 @@ def general_covariance(solution: Solution) -> FloatArray:
         )
         columns.append(np.concatenate([turn.pinhole_mm, turns[0], turn.origin_mm, turns[1]]))
     poses = np.stack(columns, axis=1)
-    optional = [bench_parameters.NAMES.index(name) for name in _optional(solution)]
+    optional = [bench_parameters.NAMES.index(name) for name in _list_free_options(solution)]
     used = [*range(len(bench_parameters.POSE)), *optional]
     matrix = np.eye(
         len(poses) + len(optional), len(used), k=len(bench_parameters.POSE) - len(poses)
@@ -148,7 +148,7 @@ def general_covariance(solution: Solution) -> FloatArray:
     return np.asarray((covariance + covariance.T) / 2)
 
 
-def _optional(solution: Solution) -> list[str]:
+def _list_free_options(solution: Solution) -> list[str]:
     return [
         parameter.name for parameter in bench_parameters.OPTIONAL if parameter.name in solution.free
     ]
@@ -161,5 +161,5 @@ def _turn_vector(cross: FloatArray) -> FloatArray:
     )
 
 
-def _vector(values: FloatArray) -> Vector3:
+def _to_vector(values: FloatArray) -> Vector3:
     return float(values[0]), float(values[1]), float(values[2])

@@ -115,7 +115,7 @@ def find_suspects(solution: solver.Solution) -> tuple[Suspect, ...]:
     """Held optical parameters that would remove more than noise from the residuals, the strongest
     first.
     """
-    sums = np.sum(_reduced(solution), axis=0)
+    sums = np.sum(_reduce_equations(solution), axis=0)
     response = figure_uncertainty.surface_response(solution, solution.problem.middle)[:, :-1]
     flat = disc_heights.remove_plane(*disc_heights.heights_over_disc(1.0))
     out = []
@@ -126,7 +126,7 @@ def find_suspects(solution: solver.Solution) -> tuple[Suspect, ...]:
         freed = solution.problem.sigmas.copy()
         freed[k] = bench_parameters.usual_sigma(name)
         moved = solver.solve_step(sums + solution.known(freed), freed)
-        fall = _squares(sums, solution) - moved.squares
+        fall = _sum_squares(sums, solution) - moved.squares
         sigma = float(np.sqrt(moved.covariance[k, k]))
         figure_um = 1e3 * float(np.std(flat @ (response @ moved.delta[: bench_poses.OPTICAL])))
         out.append(Suspect(name, float(moved.delta[k]), sigma, fall, figure_um))
@@ -138,9 +138,9 @@ def laser_scale(solution: solver.Solution) -> LaserScale:
     k = bench_parameters.NAMES.index(bench_parameters.LASER.name)
     free = solution.problem.sigmas.copy()
     free[k] = _LASER_SIGMA
-    sums = np.sum(_reduced(solution), axis=0)
+    sums = np.sum(_reduce_equations(solution), axis=0)
     moved = solver.solve_step(sums + solution.known(free), free)
-    fall = _squares(sums, solution) - moved.squares
+    fall = _sum_squares(sums, solution) - moved.squares
     return LaserScale(
         1 + float(solution.common[k] + moved.delta[k]), float(np.sqrt(moved.covariance[k, k])), fall
     )
@@ -148,25 +148,25 @@ def laser_scale(solution: solver.Solution) -> LaserScale:
 
 def compare_left_out_sets(solution: solver.Solution) -> tuple[LeftOut, ...]:
     """Each set against the others."""
-    reduced, sigmas = _reduced(solution), solution.problem.sigmas
+    reduced, sigmas = _reduce_equations(solution), solution.problem.sigmas
     own = solution.known(sigmas)
     everything = solver.solve_step(np.sum(reduced, axis=0) + own, sigmas).squares
     out = []
     for k, this in enumerate(reduced):
         others = np.sum([r for j, r in enumerate(reduced) if j != k], axis=0) + own
-        alone, freedom = _alone(this, sigmas)
+        alone, freedom = _fit_alone(this, sigmas)
         fall = everything - solver.solve_step(others, sigmas).squares - alone
         out.append(LeftOut(k, float(fall), freedom))
     return tuple(out)
 
 
-def elsewhere(solution: solver.Solution) -> list[tuple[int, float]]:
+def find_moved_screens(solution: solver.Solution) -> list[tuple[int, float]]:
     """Sets beside which the screen was moved, but not as stated: each with the fall if that place
     is free.
     """
-    reduced, out = _reduced(solution), []
+    reduced, out = _reduce_equations(solution), []
     everything, moved = (
-        _squares(np.sum(reduced, axis=0), solution),
+        _sum_squares(np.sum(reduced, axis=0), solution),
         np.arange(bench_poses.SCREEN_MOVE),
     )
     for k, each in enumerate(solution.equations):
@@ -183,7 +183,7 @@ def elsewhere(solution: solver.Solution) -> list[tuple[int, float]]:
                 without_hand, set_phases.MOVED
             ) - normal_equations.eliminate_first(sums, set_phases.MOVED)
         others = [*reduced[:k], replace(each, sums=free).reduced(), *reduced[k + 1 :]]
-        fall = everything - _squares(np.sum(others, axis=0), solution)
+        fall = everything - _sum_squares(np.sum(others, axis=0), solution)
         if chi2.sf(fall, moved.size) < SURE:
             out.append((k, float(fall)))
     return out
@@ -228,7 +228,7 @@ def _moved_by(
     """Amounts by which parameters moved in the sets, each by its share, and the fall of the sum of
     squares.
     """
-    reduced, hand = _reduced(solution), solution.problem.sigmas
+    reduced, hand = _reduce_equations(solution), solution.problem.sigmas
     sums = np.sum(
         [_with_more(each, columns, part) for each, part in zip(reduced, share, strict=True)], axis=0
     )
@@ -239,8 +239,8 @@ def _moved_by(
         hand > 0,
         np.ones(set_state.COMMON - len(bench_parameters.NAMES) + len(columns), bool),
     )
-    delta, squares = _solved(sums + known, np.flatnonzero(kept))
-    return tuple(delta[-len(columns) :].tolist()), _squares(
+    delta, squares = _solve_free(sums + known, np.flatnonzero(kept))
+    return tuple(delta[-len(columns) :].tolist()), _sum_squares(
         np.sum(reduced, axis=0), solution
     ) - squares
 
@@ -268,7 +268,7 @@ def leave_set_out(solution: solver.Solution, index: int) -> solver.Solution:
     )
 
 
-def _reduced(solution: solver.Solution) -> list[FloatArray]:
+def _reduce_equations(solution: solver.Solution) -> list[FloatArray]:
     return [each.reduced() for each in solution.equations]
 
 
@@ -282,17 +282,17 @@ def film_rise(solution: solver.Solution, film: set_state.FilmModel) -> float:
         rows = reference_rows.film_rows(state.surface, film)
         told = each.sums + rows.T @ rows if k in films else each.sums
         bound.append(replace(each, sums=told).reduced())
-    return _squares(np.sum(bound, axis=0), solution) - _squares(
-        np.sum(_reduced(solution), axis=0), solution
+    return _sum_squares(np.sum(bound, axis=0), solution) - _sum_squares(
+        np.sum(_reduce_equations(solution), axis=0), solution
     )
 
 
-def _squares(sums: FloatArray, solution: solver.Solution) -> float:
+def _sum_squares(sums: FloatArray, solution: solver.Solution) -> float:
     sigmas = solution.problem.sigmas
     return solver.solve_step(sums + solution.known(sigmas), sigmas).squares
 
 
-def _alone(reduced: FloatArray, sigmas: FloatArray) -> tuple[float, int]:
+def _fit_alone(reduced: FloatArray, sigmas: FloatArray) -> tuple[float, int]:
     """Least sum of squares of one set by itself, and how many numbers it determines; no prior."""
     free = np.flatnonzero(
         np.append(sigmas > 0, np.ones(set_state.COMMON - len(bench_parameters.NAMES), bool))
@@ -318,7 +318,7 @@ def _with_more(sums: FloatArray, columns: Sequence[int], share: float) -> FloatA
     return np.asarray(out)
 
 
-def _solved(sums: FloatArray, free: IntArray) -> tuple[FloatArray, float]:
+def _solve_free(sums: FloatArray, free: IntArray) -> tuple[FloatArray, float]:
     matrix, right = sums[np.ix_(free, free)], sums[free, -1]
     scale = 1 / np.sqrt(np.diag(matrix))
     found = scale * np.linalg.solve(matrix * np.outer(scale, scale), scale * right)

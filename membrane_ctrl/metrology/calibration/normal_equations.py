@@ -89,7 +89,7 @@ def linearise_set(
         parts = forward_model.linearise_points(
             there, poses, seen, state.surface, state.vertex_z_mm, *film_mm
         )
-        found, residual[:, some] = _fringes(parts, root[some], k > 0)
+        found, residual[:, some] = _sum_fringes(parts, root[some], k > 0)
         if k:
             told, sigmas = phases.elsewhere[k - 1].known(references.laser_sigma_um)
             hand = np.hstack([np.eye(set_phases.MOVED), (told - move)[:, None]]) / sigmas[:, None]
@@ -103,7 +103,7 @@ def linearise_set(
     return Equations(sums, residual, trust, rms, tuple(elsewhere))
 
 
-def _fringes(
+def _sum_fringes(
     parts: Iterable[forward_model.Chunk], root: FloatArray, moved: bool
 ) -> tuple[FloatArray, FloatArray]:
     """Sums of points, those of a moved screen with its own unknowns first, and their residuals (2,

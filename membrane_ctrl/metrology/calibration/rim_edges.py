@@ -47,7 +47,7 @@ def rim_edges(light: FloatArray, rough_px: FloatArray) -> FloatArray:
     """Edges of the light (2, n), to a fraction of a pixel, along normals of the ellipse through the
     rough rim.
     """
-    ellipse = _ellipse(rough_px)
+    ellipse = _fit_ellipse(rough_px)
     ahead = np.roll(ellipse, -1, axis=1) - np.roll(ellipse, 1, axis=1)
     normal = np.stack([ahead[1], -ahead[0]]) / np.hypot(*ahead)
     normal *= np.sign(np.sum(normal * (ellipse - ellipse.mean(axis=1, keepdims=True)), axis=0))
@@ -69,7 +69,7 @@ def rim_edges(light: FloatArray, rough_px: FloatArray) -> FloatArray:
     return np.asarray(ellipse[:, n] + normal[:, n] * at)
 
 
-def _ellipse(points_px: FloatArray) -> FloatArray:
+def _fit_ellipse(points_px: FloatArray) -> FloatArray:
     """(2, _POINTS) on the ellipse nearest to the points: the conic through them,
     by least squares.
     """

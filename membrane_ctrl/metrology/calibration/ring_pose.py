@@ -42,7 +42,7 @@ class RingPose:
 
     def bench(self, stated: Geometry) -> Geometry:
         """The stated bench with the camera at the rim's pose and the screen moved with alpha."""
-        return _bench(stated, self.values)
+        return _make_bench(stated, self.values)
 
 
 def ring_pose(
@@ -77,7 +77,7 @@ def ring_pose(
 
     def miss_px(x: FloatArray) -> FloatArray:
         return np.asarray(
-            (_radii_mm(_bench(stated, x * _UNITS), edges, rim_z) - radius_mm) / mm_per_px
+            (_radii_mm(_make_bench(stated, x * _UNITS), edges, rim_z) - radius_mm) / mm_per_px
         )
 
     from scipy.optimize import least_squares  # calibrations without a pose start sooner
@@ -86,7 +86,7 @@ def ring_pose(
     slopes, found = np.asarray(fit.jac, float), np.asarray(fit.x, float)
     rms_px = float(np.sqrt(np.mean(miss_px(found) ** 2)))
     inverse = np.linalg.inv(slopes.T @ slopes)
-    shared = inverse @ slopes.T @ _shared(edges, radius_sigma_mm / mm_per_px)
+    shared = inverse @ slopes.T @ _shared_misses(edges, radius_sigma_mm / mm_per_px)
     seen = np.linalg.inv(inverse * rms_px**2 + shared @ shared.T)
     both = np.linalg.inv(seen + np.eye(len(POSE_NAMES)))  # in units of the hand's sigmas
     return RingPose(
@@ -94,7 +94,7 @@ def ring_pose(
     )
 
 
-def _bench(stated: Geometry, own: FloatArray) -> Geometry:
+def _make_bench(stated: Geometry, own: FloatArray) -> Geometry:
     values = np.zeros(len(NAMES))
     values[_PLACES] = own
     return bench_at(stated, values).geometry
@@ -104,7 +104,7 @@ def _radii_mm(geometry: Geometry, edges: FloatArray, rim_z: HeightFunction) -> F
     return np.asarray(np.hypot(*on_rim(geometry, edges, rim_z)))
 
 
-def _shared(edges: FloatArray, radius_sigma_px: float) -> FloatArray:
+def _shared_misses(edges: FloatArray, radius_sigma_px: float) -> FloatArray:
     """Misses that the edges have in common, one sigma each, (n, 3).
 
     The radius; and the edge's own error as a rim that is larger, longer across, or longer along a

@@ -59,10 +59,12 @@ def reduce_weights(
         side_px if phases.artefact is None else across_px(phases) / _PATCHES for phases in sets
     ]
     patches = [_patch_means(*each) for each in zip(sets, left_mm, trust, sides_px, strict=True)]
-    together = _scatter(np.sum([patches[k] for k in films], axis=0) / np.sqrt(len(films)))
+    together = _reduced_chi_square(
+        np.sum([patches[k] for k in films], axis=0) / np.sqrt(len(films))
+    )
     alike = [together if phases.artefact is None else 0.0 for phases in sets]
     factors = [
-        max(1.0, _scatter(m) - _CHANCE, all_ - _CHANCE)
+        max(1.0, _reduced_chi_square(m) - _CHANCE, all_ - _CHANCE)
         for m, all_ in zip(patches, alike, strict=True)
     ]
     return tuple(
@@ -93,7 +95,7 @@ def _patch_means(
     return np.where(full, sums / np.sqrt(np.where(full, total, 1.0)), np.nan)
 
 
-def _scatter(means: FloatArray) -> float:
+def _reduced_chi_square(means: FloatArray) -> float:
     """Their variance, as if they were alone: those that the fit has taken are as good as gone."""
     known = means[np.isfinite(means)]
     free = known.size - forward_model.LOCAL

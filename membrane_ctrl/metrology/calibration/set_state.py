@@ -53,4 +53,4 @@ def rim_of(state: SetState) -> FloatArray:
 @cache
 def rim_beyond() -> FloatArray:
     """Height of the rim above the vertex by the round terms beyond the fit's."""
-    return np.asarray(terms_beyond_fit.beyond().sum(axis=1))
+    return np.asarray(terms_beyond_fit.beyond_series().sum(axis=1))

@@ -91,7 +91,7 @@ class Solution:
         """What is known besides the sets, as sums (COMMON + 1, squared), with these sigmas of the
         hand.
         """
-        return prior(sigmas, self.common) + self.at_rim
+        return make_prior(sigmas, self.common) + self.at_rim
 
     @property
     def free(self) -> list[str]:
@@ -108,7 +108,7 @@ class Solution:
         return np.asarray(np.sqrt(np.diag(self.covariance)[: len(bench_parameters.NAMES)]))
 
 
-def prior(sigmas: FloatArray, common: FloatArray) -> FloatArray:
+def make_prior(sigmas: FloatArray, common: FloatArray) -> FloatArray:
     """The knowledge without the sets, as sums (COMMON + 1, squared) about the present unknowns."""
     wide = np.append(sigmas, np.full(set_state.COMMON - len(bench_parameters.NAMES), _FREE_RING_MM))
     weight = np.divide(1, wide**2, out=np.zeros(set_state.COMMON), where=wide > 0)
@@ -144,7 +144,7 @@ def solve_step(sums: FloatArray, sigmas: FloatArray) -> SolverStep:
     return SolverStep(delta, covariance, float(sums[-1, -1] - right @ delta[free]))
 
 
-def solve(
+def solve_calibration(
     problem: Problem,
     progress: Callable[[int, float], None] | None = None,
     start: Solution | None = None,
@@ -159,15 +159,15 @@ def solve(
     if not problem.films:
         raise ValueError("no capture set of the film to calibrate with")
     with np.errstate(over="ignore", invalid="ignore"):  # the numbers show a divergence, below
-        return _solve(problem, progress, start)
+        return _solve_sets(problem, progress, start)
 
 
-def _solve(
+def _solve_sets(
     problem: Problem, progress: Callable[[int, float], None] | None, start: Solution | None
 ) -> Solution:
     if start is None and max(phases.sigma_mm.size for phases in problem.sets) > 2 * _FEW:
         some = replace(problem, sets=tuple(phases.thinned(_FEW) for phases in problem.sets))
-        start = _solve(some, progress, None)
+        start = _solve_sets(some, progress, None)
         if not start.converged:
             return start  # means about a diverged bench would be meaningless
         clean = fringe_waves.remove_fringe_waves(start.bench, problem.sets, start.states)
@@ -190,7 +190,7 @@ def _solve(
     # the step before was the first with new weights; they stay; a solution was near
     weighed = final = near = False
     while True:
-        linear = _linearise(problem, states, common, trust)
+        linear = _linearise_sets(problem, states, common, trust)
         at_rim = (
             np.zeros((common.size + 1,) * 2)
             if problem.rim is None
@@ -198,7 +198,7 @@ def _solve(
         )
         sums = (
             np.sum([each.reduced() for each in linear], axis=0)
-            + prior(problem.sigmas, common)
+            + make_prior(problem.sigmas, common)
             + at_rim
         )
         moved = solve_step(sums, problem.sigmas)
@@ -241,7 +241,7 @@ def _solve(
             )
         )
         delta = moved.delta * min(1.0, _FURTHEST / far) if far > 0 else moved.delta
-        states = tuple(_moved(s, each, delta) for s, each in zip(states, linear, strict=True))
+        states = tuple(_move_state(s, each, delta) for s, each in zip(states, linear, strict=True))
         common = common + delta
         # Weights are renewed where the steps have nearly converged (at every step, the two may
         # chase each other), and where points with too much weight lead astray before a solution was
@@ -255,7 +255,7 @@ def _solve(
             )
 
 
-def _linearise(
+def _linearise_sets(
     problem: Problem,
     states: Sequence[set_state.SetState],
     common: FloatArray,
@@ -274,7 +274,7 @@ def _linearise(
     )
 
 
-def _moved(
+def _move_state(
     state: set_state.SetState, linear: normal_equations.Equations, common_step: FloatArray
 ) -> set_state.SetState:
     own = linear.local_step(common_step)
@@ -297,10 +297,10 @@ def _moved(
 
 def first_states(problem: Problem) -> tuple[set_state.SetState, ...]:
     """The sets' surfaces with the stated geometry. Raises ValueError if there is none."""
-    return tuple(_first(problem, phases) for phases in problem.sets)
+    return tuple(_make_first_states(problem, phases) for phases in problem.sets)
 
 
-def _first(problem: Problem, phases: set_phases.SetPhases) -> set_state.SetState:
+def _make_first_states(problem: Problem, phases: set_phases.SetPhases) -> set_state.SetState:
     moved_um, artefact = phases.displacement_um - problem.references.reference_um, phases.artefact
     vertex_z_mm = -moved_um * 1e-3 if np.isfinite(moved_um) else 0.0
     radius_mm = problem.radius_mm
@@ -329,4 +329,6 @@ def fit_on(
     points = ray_tracing.Points.of(
         forward_model.camera_rays(bench.geometry, phases), phases.screen_mm * bench.pitch
     )
-    return surface_fit.solve(tracer, points, ray_tracing.parabola(_START_SAG_MM, radius_mm))
+    return surface_fit.fit_surface(
+        tracer, points, ray_tracing.make_parabola(_START_SAG_MM, radius_mm)
+    )

@@ -8,7 +8,12 @@ import numpy as np
 from scipy.stats import chi2
 
 from membrane_ctrl.metrology.calibration import model_tests, set_state
-from membrane_ctrl.metrology.calibration.solver import Problem, Solution, first_states, solve
+from membrane_ctrl.metrology.calibration.solver import (
+    Problem,
+    Solution,
+    first_states,
+    solve_calibration,
+)
 from membrane_ctrl.metrology.film import terms_beyond_fit
 from membrane_ctrl.metrology.rays import bench_parameters, bench_poses
 
@@ -79,15 +84,21 @@ def check_solution(solution: Solution) -> tuple[CalibrationFinding, ...]:
     sum of squares, less two for each number it frees (Akaike's rule), is the cause; the others wait
     until it is gone.
     """
-    film = _film(solution)
+    film = _judge_film(solution)
     if not solution.converged:
-        return (film[0][1] if film else _astray(solution),)
-    causes = [*film, *_elsewhere(solution), *_sets(solution), *_laser(solution), *_model(solution)]
+        return (film[0][1] if film else _judge_divergence(solution),)
+    causes = [
+        *film,
+        *_judge_screen_positions(solution),
+        *_judge_sets(solution),
+        *_judge_laser(solution),
+        *_judge_model(solution),
+    ]
     cause = [_of_still_sets(solution, max(causes, key=lambda each: each[0])[1])] if causes else []
-    return (*cause, *([] if causes else _scatter(solution)), *_spread(solution))
+    return (*cause, *([] if causes else _judge_scatter(solution)), *_judge_spread(solution))
 
 
-def _elsewhere(solution: Solution) -> list[tuple[float, CalibrationFinding]]:
+def _judge_screen_positions(solution: Solution) -> list[tuple[float, CalibrationFinding]]:
     """A screen that stood elsewhere than a set states, with the share that it explains."""
     says = "the screen was not where screen_moved says beside {}: correct shift_mm, or its sigmas"
     names = [phases.name for phases in solution.problem.sets]
@@ -96,7 +107,7 @@ def _elsewhere(solution: Solution) -> list[tuple[float, CalibrationFinding]]:
             fall - 2 * bench_poses.SCREEN_MOVE,
             CalibrationFinding(True, says.format(names[k]), (k,)),
         )
-        for k, fall in model_tests.elsewhere(solution)
+        for k, fall in model_tests.find_moved_screens(solution)
     ]
 
 
@@ -112,7 +123,7 @@ def _of_still_sets(solution: Solution, finding: CalibrationFinding) -> Calibrati
     if len(solution.problem.films) - len(moved) > 1:
         for k in reversed(moved):
             rest = model_tests.leave_set_out(rest, k)
-        causes = [*_sets(rest), *_laser(rest), *_model(rest)]
+        causes = [*_judge_sets(rest), *_judge_laser(rest), *_judge_model(rest)]
     if causes:
         return replace(max(causes, key=lambda each: each[0])[1], sets=())
     most = sets[max(moved, key=lambda k: sets[k].moved_um)]
@@ -123,14 +134,14 @@ def _of_still_sets(solution: Solution, finding: CalibrationFinding) -> Calibrati
     return CalibrationFinding(True, says, tuple(moved))
 
 
-def _film(solution: Solution) -> list[tuple[float, CalibrationFinding]]:
+def _judge_film(solution: Solution) -> list[tuple[float, CalibrationFinding]]:
     """A film that is not as the calibration was told, by a solution that knows nothing of it."""
     film_kind, problem = solution.problem.references.film, solution.problem
     if film_kind == "free":
         return []
     free = replace(problem, references=replace(problem.references, film="free"))
     try:
-        other = solve(free, start=solution if solution.converged else None)
+        other = solve_calibration(free, start=solution if solution.converged else None)
     except ValueError:
         return []
     freedom = len(terms_beyond_fit.BEYOND) * len(problem.sets)
@@ -145,7 +156,7 @@ def _film(solution: Solution) -> list[tuple[float, CalibrationFinding]]:
     return [(fall - 2 * freedom, CalibrationFinding(True, says))]
 
 
-def _sets(solution: Solution) -> list[tuple[float, CalibrationFinding]]:
+def _judge_sets(solution: Solution) -> list[tuple[float, CalibrationFinding]]:
     """A bumped camera, a bad set, sets that do not belong together, each with the share that it
     explains.
     """
@@ -155,7 +166,7 @@ def _sets(solution: Solution) -> list[tuple[float, CalibrationFinding]]:
             np.inf,
             CalibrationFinding(
                 True,
-                f"{names[k]} disagrees with all the others: {_doubt(solution.problem, k)}",
+                f"{names[k]} disagrees with all the others: {_describe_doubt(solution.problem, k)}",
                 (k,),
             ),
         )
@@ -188,9 +199,8 @@ def _sets(solution: Solution) -> list[tuple[float, CalibrationFinding]]:
                 model_tests.leave_set_out(solution, worst.index)
             )
         ):
-            says = (
-                f"{names[worst.index]} disagrees with all the others: {_why(solution, worst.index)}"
-            )
+            wrong_part = _name_wrong_part(solution, worst.index)
+            says = f"{names[worst.index]} disagrees with all the others: {wrong_part}"
             out.append((explained, CalibrationFinding(True, says, (worst.index,))))
         else:
             says = (
@@ -201,7 +211,7 @@ def _sets(solution: Solution) -> list[tuple[float, CalibrationFinding]]:
     return out
 
 
-def _doubt(problem: Problem, index: int) -> str:
+def _describe_doubt(problem: Problem, index: int) -> str:
     artefact = problem.sets[index].artefact
     return "it is of another bench" if artefact is None else artefact.doubt
 
@@ -216,18 +226,20 @@ def _of_others(solution: Solution) -> list[int]:
     ]
 
 
-def _astray(solution: Solution) -> CalibrationFinding:
+def _judge_divergence(solution: Solution) -> CalibrationFinding:
     """No common geometry was found: is there one without one of the sets, or for those before and
     after a moment?
     """
     problem, count = solution.problem, len(solution.problem.sets)
     for k in range(count if count > 2 else 0):
-        if _agree(replace(problem, sets=problem.sets[:k] + problem.sets[k + 1 :])):
-            says = f"{problem.sets[k].name} disagrees with all the others: {_doubt(problem, k)}"
+        if _have_common_bench(replace(problem, sets=problem.sets[:k] + problem.sets[k + 1 :])):
+            doubt = _describe_doubt(problem, k)
+            says = f"{problem.sets[k].name} disagrees with all the others: {doubt}"
             return CalibrationFinding(True, says, (k,))
     for k in range(2, count - 1):
         if all(
-            _agree(replace(problem, sets=part)) for part in (problem.sets[:k], problem.sets[k:])
+            _have_common_bench(replace(problem, sets=part))
+            for part in (problem.sets[:k], problem.sets[k:])
         ):
             says = (
                 f"the bench was changed between {problem.sets[k - 1].name} and "
@@ -240,13 +252,13 @@ def _astray(solution: Solution) -> CalibrationFinding:
     return CalibrationFinding(True, says)
 
 
-def _agree(problem: Problem) -> bool:
+def _have_common_bench(problem: Problem) -> bool:
     """Whether the sets share one bench; a few points of each are
     enough to show that they do not.
     """
     few = replace(problem, sets=tuple(phases.thinned(_FEW_POINTS) for phases in problem.sets))
     try:
-        solution = solve(few)
+        solution = solve_calibration(few)
     except ValueError:
         return False
     return solution.converged and not any(
@@ -254,7 +266,7 @@ def _agree(problem: Problem) -> bool:
     )
 
 
-def _why(solution: Solution, index: int) -> str:
+def _name_wrong_part(solution: Solution, index: int) -> str:
     """Whether it is one set's laser reading that is wrong, or its fringes."""
     rest, phases = model_tests.leave_set_out(solution, index), solution.problem.sets[index]
     if phases.artefact is not None:
@@ -270,7 +282,7 @@ def _why(solution: Solution, index: int) -> str:
     return "its fringes show another bench"
 
 
-def _scatter(solution: Solution) -> list[CalibrationFinding]:
+def _judge_scatter(solution: Solution) -> list[CalibrationFinding]:
     """Sets that hardly count beside the others, because their fringes are so much worse."""
     ratios = np.sqrt([each.variance for each in solution.equations])
     worse = np.flatnonzero(ratios > _SCATTER * np.median(ratios))
@@ -279,7 +291,7 @@ def _scatter(solution: Solution) -> list[CalibrationFinding]:
     return [CalibrationFinding(False, says.format(names[k], ratios[k]), (int(k),)) for k in worse]
 
 
-def _laser(solution: Solution) -> list[tuple[float, CalibrationFinding]]:
+def _judge_laser(solution: Solution) -> list[tuple[float, CalibrationFinding]]:
     laser = model_tests.laser_scale(solution)
     if not laser.sure:
         return []
@@ -290,7 +302,7 @@ def _laser(solution: Solution) -> list[tuple[float, CalibrationFinding]]:
     return [(laser.fall - 2, CalibrationFinding(True, says))]
 
 
-def _model(solution: Solution) -> list[tuple[float, CalibrationFinding]]:
+def _judge_model(solution: Solution) -> list[tuple[float, CalibrationFinding]]:
     found = model_tests.find_suspects(solution)
     if not found:
         return []
@@ -307,7 +319,7 @@ def _model(solution: Solution) -> list[tuple[float, CalibrationFinding]]:
     return [(first.fall - 2, CalibrationFinding(first.figure_um > _HARMLESS_UM, says))]
 
 
-def _spread(solution: Solution) -> tuple[CalibrationFinding, ...]:
+def _judge_spread(solution: Solution) -> tuple[CalibrationFinding, ...]:
     """What other sets would have determined."""
     problem = solution.problem
     moved = np.array([problem.sets[k].displacement_um for k in problem.films])

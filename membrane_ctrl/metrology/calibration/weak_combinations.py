@@ -37,7 +37,7 @@ class Combination:
 
 def condition_number(solution: Solution) -> float:
     """Of the free parameters' covariance in units of the hand measurements' sigmas."""
-    values = np.linalg.eigvalsh(_scaled(solution)[0])
+    values = np.linalg.eigvalsh(_scale_covariance(solution)[0])
     return float(values[-1] / values[0])
 
 
@@ -47,7 +47,7 @@ def weak_combinations(
     """Combinations that the sets leave undetermined, the worst first; `index` is the set whose
     surface shows it.
     """
-    covariance, free = _scaled(solution)
+    covariance, free = _scale_covariance(solution)
     values, vectors = np.linalg.eigh(covariance)
     out = []
     for value, vector in sorted(zip(values, vectors.T, strict=True), key=lambda pair: -pair[0]):
@@ -61,20 +61,20 @@ def weak_combinations(
             if abs(vector[k]) > _PART
         )
         out.append(
-            _described(
+            _describe_combination(
                 solution, index, analysis_radius_mm, float(np.sqrt(value)), parts, free, amounts
             )
         )
     return tuple(out)
 
 
-def _scaled(solution: Solution) -> tuple[FloatArray, IntArray]:
+def _scale_covariance(solution: Solution) -> tuple[FloatArray, IntArray]:
     free = np.flatnonzero(solution.problem.sigmas > 0)
     scale = solution.problem.sigmas[free]
     return solution.covariance[np.ix_(free, free)] / np.outer(scale, scale), free
 
 
-def _described(
+def _describe_combination(
     solution: Solution,
     index: int,
     radius_mm: float,
@@ -95,11 +95,11 @@ def _described(
     says = "; ".join(
         f"{amount:+.2g} {parameter.unit}: {parameter.says}" for parameter, amount in named
     )
-    effect = _effect(solution, index, moved_um, figure_um, plane)
+    effect = _name_effect(solution, index, moved_um, figure_um, plane)
     return Combination(left, parts, height, figure, f"{effect} ({says})")
 
 
-def _effect(
+def _name_effect(
     solution: Solution, index: int, moved_um: FloatArray, figure_um: FloatArray, plane: FloatArray
 ) -> str:
     """The name of a change of the surface: one of the motions of a rigid body, a scale, or a

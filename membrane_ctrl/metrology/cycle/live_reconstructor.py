@@ -155,7 +155,7 @@ class LiveReconstructor:
                 self._grid, tracer, self._near, phase_rad, optics.pattern, analysis_mm
             )
         except ValueError as error:
-            return rejected("full", times, readings, str(error))
+            return make_rejected_cycle("full", times, readings, str(error))
         self._watch.begin(state)
         return self._follow("full", state, times, readings)
 
@@ -171,7 +171,9 @@ class LiveReconstructor:
             frames, time_s, displacement_um, 2 * self._slots.steps, "fringes"
         )
         if self._tracked is None:
-            return rejected("fringes", times, readings, NOTHING_TO_FOLLOW, tracking_lost=True)
+            return make_rejected_cycle(
+                "fringes", times, readings, NOTHING_TO_FOLLOW, tracking_lost=True
+            )
         self._binner.clear()
         self._binner.add(frames, np.r_[self._slots.sinusoids].tolist())
         if self._bands_rad.size:
@@ -233,8 +235,8 @@ class LiveReconstructor:
         usable = ~saturated & (
             state.fresh[:, 4].min(axis=0) > full_decoder.FRINGE_SHARE * modulation_adu
         )
-        if reason := _lost(state.fresh[:, 3], usable):
-            return rejected(kind, times, readings, reason, tracking_lost=True)
+        if reason := _find_loss_reason(state.fresh[:, 3], usable):
+            return make_rejected_cycle(kind, times, readings, reason, tracking_lost=True)
         fit = self._fit(state, usable, readings)
         cycle = cycle_errors.Cycle(self._tracer(readings), state, fit, self._sums(), readings)
         errors = self._watch.look(cycle)
@@ -322,7 +324,9 @@ class LiveReconstructor:
         state.points.screen_mm -= state.offset_mm
         complete = np.count_nonzero(usable) > MATRIX_KEPT_SHARE * usable.size
         normal = state.normal if complete else None
-        return surface_fit.solve(self._tracer(readings), state.points, state.surface, normal=normal)
+        return surface_fit.fit_surface(
+            self._tracer(readings), state.points, state.surface, normal=normal
+        )
 
     def _estimate(
         self,
@@ -387,7 +391,7 @@ def _per_frame(
     return times, readings
 
 
-def _lost(change_rad: FloatArray, usable: BoolArray) -> str:
+def _find_loss_reason(change_rad: FloatArray, usable: BoolArray) -> str:
     """Why the phases (2, n) cannot be followed; empty if they can."""
     seen = max(1, int(np.count_nonzero(usable)))
     beyond = int(np.count_nonzero(usable & (np.abs(change_rad).max(axis=0) > GUARD_RAD)))
@@ -405,7 +409,7 @@ def _finite_mean(values: FloatArray) -> float:
     return float(finite.mean()) if finite.size else float("nan")
 
 
-def rejected(
+def make_rejected_cycle(
     kind: Kind, times: FloatArray, readings: FloatArray, reason: str, tracking_lost: bool = False
 ) -> ShapeEstimate:
     """A cycle without a figure."""

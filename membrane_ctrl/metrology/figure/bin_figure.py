@@ -49,7 +49,7 @@ def bin_figure(optics: OpticsConfig, checked: Checked, film: FilmMotion | None =
     scale = screen_scale.mm_per_rad(optics.pattern)
     points = state.points.subset(np.ones(state.index.size, bool))
     points.screen_mm[:] = followed[:, 0] * scale - state.offset_mm
-    fit = surface_fit.solve(checked.tracer, points, state.surface)
+    fit = surface_fit.fit_surface(checked.tracer, points, state.surface)
     checked.tracer.intersect(points, fit.surface)
     swing = followed[:, 4]
     noise = slope_noise.pixel_sigma_adu(optics.camera.noise_adu) / checked.binned.bin_px

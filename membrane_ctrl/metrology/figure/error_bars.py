@@ -72,15 +72,19 @@ def figure_bars(
     squares = np.zeros(len(fields(Quantities)))
     for _ in range(_TRIALS):
         change = np.tensordot(random.normal(size=len(root)), modes, axes=1)
-        squares += _change(nominal, rough(thin.plus(change))) ** 2 / _TRIALS
-    for change in _white(seen, evaluate.aperture_mm, cell_slope, random) if cell_slope > 0 else ():
+        squares += _compute_change(nominal, rough(thin.plus(change))) ** 2 / _TRIALS
+    for change in (
+        _propagate_white_noise(seen, evaluate.aperture_mm, cell_slope, random)
+        if cell_slope > 0
+        else ()
+    ):
         moved = np.array(astuple(evaluate(seen.plus(change)).numbers))
         squares += (moved - astuple(found.numbers)) ** 2 / _WHITE_TRIALS
     terms = np.stack([1e3 * rough.fringe.coefficients(mode[0]) for mode in modes])
     return FigureBars(Quantities(*np.sqrt(squares)), np.sqrt(np.sum(terms**2, axis=0)))
 
 
-def _change(nominal: Figure, moved: Figure) -> FloatArray:
+def _compute_change(nominal: Figure, moved: Figure) -> FloatArray:
     """Change of all numbers; of an encircled share, the mean over its neighbours, since few rays
     make it jump.
     """
@@ -93,7 +97,7 @@ def _change(nominal: Figure, moved: Figure) -> FloatArray:
     return np.asarray(change)
 
 
-def _white(
+def _propagate_white_noise(
     seen: SurfaceMap, aperture_mm: float, cell_slope: float, random: np.random.Generator
 ) -> Iterator[FloatArray]:
     """What white noise of the cells' slopes does to height and slopes, (3, n, n).

@@ -114,7 +114,9 @@ def measure_pixels(optics: OpticsConfig, checked: Checked) -> PixelPoints:
     index = row * stack.size_px[1] + column
     in_bin = row // bin_px * columns + column // bin_px
     tracer, surface = checked.tracer, checked.state.surface
-    points = ray_tracing.Points.of(_rays(tracer.geometry, column, row), np.empty((2, index.size)))
+    points = ray_tracing.Points.of(
+        _trace_pixel_rays(tracer.geometry, column, row), np.empty((2, index.size))
+    )
     del row, column
     points.t_mm[:] = (tracer.vertex_z_mm - tracer.geometry.pinhole_mm[2]) / points.rays[2]
     tracer.intersect(points, surface, newton=4)
@@ -150,7 +152,7 @@ def measure_pixels(optics: OpticsConfig, checked: Checked) -> PixelPoints:
     return PixelPoints(index, points.subset(keep), swing, rest, moved)
 
 
-def _rays(geometry: Geometry, column: IntArray, row: IntArray) -> FloatArray:
+def _trace_pixel_rays(geometry: Geometry, column: IntArray, row: IntArray) -> FloatArray:
     """Rays of pixels, in parts, because the intermediate results are larger."""
     out = np.empty((3, column.size))
     for start in range(0, column.size, _PART):
@@ -201,11 +203,11 @@ def reconstruct_full(
     # the bins solve from the start; the pixels continue where that has nearly converged
     rough_points = checked.state.points.subset(np.ones(checked.state.index.size, bool))
     tolerance = _LAST_CHANGE_MM * surface_fit.CONTRACTION
-    begin = start or ray_tracing.parabola(_START_SAG_MM, tracer.radius_mm)
-    rough = surface_fit.solve(tracer, rough_points, begin, tolerance_mm=tolerance)
+    begin = start or ray_tracing.make_parabola(_START_SAG_MM, tracer.radius_mm)
+    rough = surface_fit.fit_surface(tracer, rough_points, begin, tolerance_mm=tolerance)
     tracer.intersect(points, rough.surface, newton=2)
-    points.weights[:] = tukey(_slopes_left(tracer, points, rough.surface)[1])
-    fit = surface_fit.solve(
+    points.weights[:] = tukey_weights(_slopes_left(tracer, points, rough.surface)[1])
+    fit = surface_fit.fit_surface(
         tracer,
         points,
         rough.surface,
@@ -240,7 +242,7 @@ def _slopes_left(
     return field, np.hypot(field[2] - field[4], field[3] - field[5])
 
 
-def tukey(residual: FloatArray) -> FloatArray:
+def tukey_weights(residual: FloatArray) -> FloatArray:
     """Tukey's weights (1 - (r / c)^2)^2, with c in robust sigmas (median of a Rayleigh
     distribution: 1.177 sigma).
     """

@@ -18,7 +18,7 @@ from membrane_ctrl.metrology.figure.surface_map import SurfaceMap
 from membrane_ctrl.metrology.numerics import grid_fit, zernike
 from membrane_ctrl.model.arrays import FloatArray
 
-_FRINGE = [zernike.fringe(j) for j in range(1, zernike.FRINGE_TERMS + 1)]
+_FRINGE = [zernike.fringe_set_orders(j) for j in range(1, zernike.FRINGE_TERMS + 1)]
 _PVR_TERMS = 36  # by definition, whatever the fit's own number
 _RINGS = 96  # knots of the rotationally invariant part: 5 mm on a 1 m mirror
 ENERGY_SHARES = (0.5, 0.8, 0.95)  # of the encircled energy
@@ -101,7 +101,7 @@ class FigureOf:
         found = np.stack([*-slopes, np.ones(slopes.shape[1])])
         found /= np.linalg.norm(found, axis=0)
         angle = np.linalg.norm(found - normals, axis=0)
-        focus_mm, spot = _spot(sphere, points, found)
+        focus_mm, spot = _compute_spot(sphere, points, found)
         c = sphere.curvature_per_mm
         radius_mm = 1 / c if c != 0 else np.nan
         numbers = Quantities(
@@ -111,20 +111,20 @@ class FigureOf:
             1e6 * sphere.tilt_x,
             1e6 * sphere.tilt_y,
             float(np.ptp(deviation)),
-            _rms(deviation),
-            float(np.ptp(smooth)) + 3 * _rms(deviation - smooth),
+            _compute_rms(deviation),
+            float(np.ptp(smooth)) + 3 * _compute_rms(deviation - smooth),
             float(np.ptp(rotational)),
-            _rms(deviation - rotational),
-            1e6 * _rms(angle),
+            _compute_rms(deviation - rotational),
+            1e6 * _compute_rms(angle),
             focus_mm,
-            _rms(spot),
+            _compute_rms(spot),
             *(float(value) for value in np.quantile(spot, ENERGY_SHARES)),
         )
         fringe_um = 1e3 * self.fringe.coefficients(seen.height_mm)
         return Figure(numbers, sphere, whole, round_part, fit, fringe_um, spot)
 
 
-def _rms(values: FloatArray) -> float:
+def _compute_rms(values: FloatArray) -> float:
     return float(np.sqrt(np.mean(np.square(values))))
 
 
@@ -154,7 +154,7 @@ class _Rings:
         return np.asarray((1 - self._share) * knots[self._low] + self._share * knots[self._low + 1])
 
 
-def _spot(
+def _compute_spot(
     sphere: best_sphere.Sphere, points_mm: FloatArray, normals: FloatArray
 ) -> tuple[float, FloatArray]:
     """Best focus above the origin in mm, and the distances (n,) of the rays from their middle

@@ -34,7 +34,7 @@ def radial_profile(axis_mm: FloatArray, height_mm: FloatArray, rim_mm: float) ->
     x, y = np.meshgrid(axis_mm, axis_mm)
     seen = np.isfinite(height_mm)
     r, h = np.hypot(x[seen], y[seen]), height_mm[seen]
-    shape = hencky_bowl.profile(r / rim_mm)
+    shape = hencky_bowl.bowl_profile(r / rim_mm)
     shape_mean, h_mean = shape.mean(), h.mean()
     # least squares with a free offset: a dimple at the vertex must not shift the whole comparison
     sag = float(np.sum((shape - shape_mean) * (h - h_mean)) / np.sum((shape - shape_mean) ** 2))
@@ -50,7 +50,7 @@ def radial_profile(axis_mm: FloatArray, height_mm: FloatArray, rim_mm: float) ->
                 (r[inside].mean(), left[inside].mean(), *np.percentile(left[inside], [2.5, 97.5]))
             )
     radius, mean, low, high = np.array(rows).T
-    bowl = sag * hencky_bowl.profile(radius / rim_mm) + h_mean - sag * shape_mean
+    bowl = sag * hencky_bowl.bowl_profile(radius / rim_mm) + h_mean - sag * shape_mean
     return RadialProfile(
         radius, bowl + mean, bowl + low, bowl + high, bowl, sag, pressure_pa(sag, rim_mm)
     )

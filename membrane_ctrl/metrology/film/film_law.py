@@ -45,7 +45,7 @@ HarmonicCause = Literal["prestrain", "flat", "round"]
 
 
 @cache
-def _universal() -> tuple[FloatArray, FloatArray, FloatArray]:
+def _universal_series() -> tuple[FloatArray, FloatArray, FloatArray]:
     """F, F' and G = integral of dx / F from 0, as power series in x."""
     force, square = (
         np.zeros(_SERIES_TERMS),
@@ -65,19 +65,19 @@ def _ring_strain(slackness: AnyArray, poisson: FloatArray | float) -> AnyArray:
     """Strain e / q^(2/3) of the hoop at the ring; falls, ever more slowly, as the film gets
     slacker.
     """
-    force, slope, _ = _universal()
+    force, slope, _ = _universal_series()
     at_ring = (1 - poisson) * series.polyval(slackness, force) + 2 * slackness * series.polyval(
         slackness, slope
     )
     return np.asarray(slackness ** (-1 / 3) * at_ring)
 
 
-def _sag(slackness: AnyArray) -> AnyArray:
+def _normalised_sag(slackness: AnyArray) -> AnyArray:
     """Sag / (a q^(1/3))."""
-    return np.asarray(slackness ** (-2 / 3) * series.polyval(slackness, _universal()[2]) / 4)
+    return np.asarray(slackness ** (-2 / 3) * series.polyval(slackness, _universal_series()[2]) / 4)
 
 
-def _slackness(falls: Callable[[AnyArray], AnyArray], wanted: FloatArray) -> FloatArray:
+def _invert_for_slackness(falls: Callable[[AnyArray], AnyArray], wanted: FloatArray) -> FloatArray:
     """Where a convex falling function has the wanted values: Newton from the left, which never
     overshoots.
 
@@ -125,7 +125,7 @@ class FilmLaw:
         """The film under a load q. Raises ValueError as `under`."""
         wanted = np.asarray(self.prestrain / load ** (2 / 3))
         return Bowl(
-            _slackness(lambda s: _ring_strain(s, self.poisson), wanted),
+            _invert_for_slackness(lambda s: _ring_strain(s, self.poisson), wanted),
             load,
             self.poisson,
             self.radius_mm,
@@ -136,10 +136,11 @@ class FilmLaw:
         at its ring.
         """
         depth = np.asarray(sag_mm) / self.radius_mm
-        s = _slackness(
-            lambda s: _ring_strain(s, self.poisson) / _sag(s) ** 2, self.prestrain / depth**2
+        s = _invert_for_slackness(
+            lambda s: _ring_strain(s, self.poisson) / _normalised_sag(s) ** 2,
+            self.prestrain / depth**2,
         )
-        return Bowl(s, (depth / _sag(s)) ** 3, self.poisson, self.radius_mm)
+        return Bowl(s, (depth / _normalised_sag(s)) ** 3, self.poisson, self.radius_mm)
 
     def pressure_pa(self, bowl: "Bowl") -> FloatArray:
         """The pressure under a bowl of this film."""
@@ -158,20 +159,22 @@ class Bowl:
     @property
     def sag_mm(self) -> FloatArray:
         """Depth of the vertex below the ring."""
-        return np.asarray(self.radius_mm * np.cbrt(self.load) * _sag(self.slackness))
+        return np.asarray(self.radius_mm * np.cbrt(self.load) * _normalised_sag(self.slackness))
 
     def height_mm(self, rho: FloatArray) -> FloatArray:
         """Height above the vertex at rho = r / a."""
-        return np.asarray(self._scale_mm * series.polyval(self.slackness * rho**2, _universal()[2]))
+        return np.asarray(
+            self._scale_mm * series.polyval(self.slackness * rho**2, _universal_series()[2])
+        )
 
     def rise_mm(self, rho: FloatArray) -> FloatArray:
         """dh / drho."""
-        force = series.polyval(self.slackness * rho**2, _universal()[0])
+        force = series.polyval(self.slackness * rho**2, _universal_series()[0])
         return np.asarray(2 * rho * self.slackness * self._scale_mm / force)
 
     def stresses(self, rho: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Radial and hoop force per length, in E t."""
-        force, slope, _ = _universal()
+        force, slope, _ = _universal_series()
         x, scale = self.slackness * rho**2, self.load ** (2 / 3) * np.cbrt(1 / self.slackness)
         radial = scale * series.polyval(x, force)
         return radial, radial + 2 * scale * x * series.polyval(x, slope)
@@ -213,10 +216,13 @@ class Bowl:
         nodes, weights = legendre.leggauss(_NODES)
         rho = (nodes + 1) / 2
         rise, stresses = self.rise_mm(rho) / self.radius_mm, self.stresses(rho)
-        height, climb = _powers(rho, order)
+        height, climb = _radial_powers(rho, order)
         zero = np.zeros_like(height)
         # in the plane, (u, v) = rho^(m-1) P (1, -1) and rho^(m+1) P (1, 1) are smooth at the vertex
-        (less, less_r), (more, more_r) = _powers(rho, order - 1), _powers(rho, order + 1)
+        (less, less_r), (more, more_r) = (
+            _radial_powers(rho, order - 1),
+            _radial_powers(rho, order + 1),
+        )
         u, u_r = np.vstack([zero, less, more]), np.vstack([zero, less_r, more_r])
         v, v_r = np.vstack([zero, -less, more]), np.vstack([zero, -less_r, more_r])
         w, w_r = np.vstack([height, zero, zero]), np.vstack([climb, zero, zero])
@@ -244,7 +250,7 @@ class Bowl:
         return np.asarray(np.linalg.solve(system, right)[:_WAVE_TERMS])
 
 
-def _powers(rho: FloatArray, power: int) -> tuple[FloatArray, FloatArray]:
+def _radial_powers(rho: FloatArray, power: int) -> tuple[FloatArray, FloatArray]:
     """rho^power P_k(2 rho^2 - 1) and its derivative, (_WAVE_TERMS, n)."""
     x, table = 2 * rho**2 - 1, np.eye(_WAVE_TERMS)
     value, slope = legendre.legval(x, table), legendre.legval(x, legendre.legder(table))

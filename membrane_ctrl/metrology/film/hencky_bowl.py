@@ -53,7 +53,7 @@ def zernike_projection() -> FloatArray:
 
 
 @cache
-def excess() -> FloatArray:
+def excess_series() -> FloatArray:
     """Power series in v of the part of a bowl of unit sag that the terms cannot represent."""
     coef = profile_legendre().coef.copy()
     coef[:EXCESS_DEGREE] = 0.0
@@ -70,6 +70,6 @@ def excess_rms() -> float:
     return float(np.sqrt(np.sum(squares[EXCESS_DEGREE:])))
 
 
-def profile(rho: FloatArray) -> FloatArray:
+def bowl_profile(rho: FloatArray) -> FloatArray:
     """Depth of a bowl of unit sag at rho = r / R, 0 at the vertex and 1 at the rim."""
     return np.asarray(profile_legendre()(np.square(rho)))

@@ -139,7 +139,7 @@ def _round_projection(reach: float) -> tuple[FloatArray, FloatArray, FloatArray]
     excess = (
         2
         * rho
-        * polynomial.polyval(rho**2, polynomial.polyder(hencky_bowl.excess()))
+        * polynomial.polyval(rho**2, polynomial.polyder(hencky_bowl.excess_series()))
         / hencky_bowl.excess_rms()
     )
     return rho, weight, np.asarray(np.linalg.pinv((np.stack([*slopes, excess]) * weight).T))
@@ -191,11 +191,11 @@ def _fit_round(
     far = True
     for _ in range(_ITERATIONS):
         finite[:] = _finite_terms_mm(*bent(x), reach)
-        slopes, rest = _slopes(predict, x), target - predict(x)
+        slopes, rest = _numerical_slopes(predict, x), target - predict(x)
         tried = average_over_misfits(
             slopes, rest, noise, misfits[-far:], known - x, precision, seen_mm
         )  # far: one will do
-        step = tried.mean * _inside(x, tried.mean)
+        step = tried.mean * _limit_step(x, tried.mean)
         x = x + step
         near = np.all(np.abs(step[:3]) < 0.05 * np.sqrt(np.diag(tried.covariance)[:3]))
         if near and not far:
@@ -207,7 +207,7 @@ def _fit_round(
     )
 
 
-def _inside(x: FloatArray, step: FloatArray) -> float:
+def _limit_step(x: FloatArray, step: FloatArray) -> float:
     """The part of a step that stays among films: Poisson ratio in 0 .. 0.5, loads by less than a
     factor of two.
     """
@@ -224,7 +224,7 @@ def _inside(x: FloatArray, step: FloatArray) -> float:
     return scale
 
 
-def _slopes(predict: Callable[[FloatArray], FloatArray], x: FloatArray) -> FloatArray:
+def _numerical_slopes(predict: Callable[[FloatArray], FloatArray], x: FloatArray) -> FloatArray:
     columns = []
     for k in range(x.size):
         step = np.zeros(x.size)

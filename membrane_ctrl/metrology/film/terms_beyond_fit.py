@@ -19,7 +19,7 @@ BEYOND = (EXCESS_DEGREE + 1, EXCESS_DEGREE + 2, EXCESS_DEGREE + 3)
 
 
 @cache
-def beyond() -> FloatArray:
+def beyond_series() -> FloatArray:
     """Power series in v, (len(BEYOND), EXCESS_TERMS), of the round terms beyond the fit's, each 0
     at the vertex.
     """
@@ -35,7 +35,7 @@ def beyond() -> FloatArray:
 
 
 @cache
-def _family() -> tuple[FloatArray, FloatArray]:
+def _film_family() -> tuple[FloatArray, FloatArray]:
     """`EXCESS_DEGREE` (n,) and `BEYOND` (n, 3), unit RMS, of films of unit sag, from a drum to the
     slackest.
     """
@@ -65,6 +65,6 @@ def beyond_of(excess_mm: float, sag_mm: float) -> FloatArray:
         / np.sqrt(2 * np.array([hencky_bowl.EXCESS_DEGREE, *terms_beyond_fit.BEYOND]) + 1)
         / hencky_bowl.excess_rms()
     )
-    first, others = _family()
+    first, others = _film_family()
     there = [np.interp(excess_mm * own[0] / sag_mm, first, other) for other in others.T]
     return np.asarray(sag_mm * np.array(there) - excess_mm * own[1:])

@@ -149,7 +149,9 @@ def remove_bands(
     x, y = steps = [_Steps(stack, binned, one, index) for one in axes]
     (across, other), rows = sorted(steps, key=_Steps.along), np.arange(binned.means.shape[1])
     across.solve(known)  # fringes along the rows look like bands
-    while (found := _more(across.rad_per_row, across.left(), rows)).size > across.rad_per_row.size:
+    while (
+        found := _add_frequency(across.rad_per_row, across.left(), rows)
+    ).size > across.rad_per_row.size:
         across.solve(found)
     if not found.size or max(across.unexplained, other.solve(found)) > _UNEXPLAINED:
         return stack, binned, _NONE
@@ -172,7 +174,7 @@ def describe_bands(gain: FloatArray | None) -> str:
     )
 
 
-def _more(rad_per_row: FloatArray, power: FloatArray, rows: IntArray) -> FloatArray:
+def _add_frequency(rad_per_row: FloatArray, power: FloatArray, rows: IntArray) -> FloatArray:
     """Frequencies, with one more if the power shows a wave that is none of them."""
     clear = clear_power(power, 1)
     peak = np.argmax(

@@ -31,7 +31,7 @@ def absolute_phases_of_bins(
 ) -> FloatArray:
     """Absolute phases of the bins, (2, rows, columns); NaN where not valid."""
     if anchor is not None:
-        return _followed(view, anchor)
+        return _follow_anchor(view, anchor)
     return absolute_phases(stack, binned, view, optics.pattern)
 
 
@@ -51,7 +51,7 @@ def absolute_phases(
     return out
 
 
-def _followed(view: bin_view.BinView, anchor: Anchor) -> FloatArray:
+def _follow_anchor(view: bin_view.BinView, anchor: Anchor) -> FloatArray:
     """Phases next to the anchor's. Raises NoFigureError if the film moved too far to tell."""
     change = np.angle(np.exp(1j * (view.phase_rad - anchor.phase_rad)))
     seen = view.mask & np.isfinite(anchor.phase_rad).all(axis=0)
@@ -81,7 +81,7 @@ def confirm_orders(
         phase = phase_rad[k][seen]
         bits = {bit: (binned.means[gray[bit - 1]] > view.light)[seen] for bit in good}
         explained = [
-            shift for shift in range(-7, 8) if _explains(phase + 2 * math.pi * shift, bits)
+            shift for shift in range(-7, 8) if _explain_bits(phase + 2 * math.pi * shift, bits)
         ]
         if explained != [0]:
             raise RejectedSetError(
@@ -89,7 +89,7 @@ def confirm_orders(
             )
 
 
-def _explains(phase_rad: FloatArray, bits: dict[int, BoolArray]) -> bool:
+def _explain_bits(phase_rad: FloatArray, bits: dict[int, BoolArray]) -> bool:
     """Whether these orders lie in the pattern and show these bits, away from the bits' edges."""
     if np.min(phase_rad) < -1.5 * math.pi or np.max(phase_rad) > 15.5 * math.pi:
         return False

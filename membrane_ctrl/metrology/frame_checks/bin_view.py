@@ -60,7 +60,7 @@ def combine_frames(
         phase.append(np.arctan2(sine, cosine))
         saturated |= binned.saturated[frames].any(axis=0)
     third = _third_estimate(stack, binned, excluded) if estimate is None else estimate
-    seen = _middle([*swing] if third is None else [*swing, third])
+    seen = _median_of_maps([*swing] if third is None else [*swing, third])
     brightest = float(np.percentile(seen, 95))
     if not brightest > _LEAST_SWING_ADU:
         raise NoFigureError(f"no fringes: their largest swing is {brightest:.2g} ADU")
@@ -68,7 +68,9 @@ def combine_frames(
     mask &= np.minimum(*swing) > FRINGE_SHARE * seen
     mask &= ~saturated
     every = light if third is None else [*light, third]
-    return BinView((used[0], used[1]), np.stack(phase), np.stack(swing), _middle(every, mask), mask)
+    return BinView(
+        (used[0], used[1]), np.stack(phase), np.stack(swing), _median_of_maps(every, mask), mask
+    )
 
 
 def _third_estimate(
@@ -80,7 +82,7 @@ def _third_estimate(
     return np.asarray(binned.means[white].astype(float) - binned.means[black])
 
 
-def _middle(maps: list[FloatArray], where: BoolArray | None = None) -> FloatArray:
+def _median_of_maps(maps: list[FloatArray], where: BoolArray | None = None) -> FloatArray:
     """Median of two or three maps, each scaled to the median of the first (over its brighter half
     by default).
     """

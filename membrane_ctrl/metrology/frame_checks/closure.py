@@ -60,7 +60,7 @@ class Closure:
         )
 
 
-def closure(frames: ArrayLike, shifts_rad: Sequence[float] | FloatArray) -> Closure:
+def compute_closure(frames: ArrayLike, shifts_rad: Sequence[float] | FloatArray) -> Closure:
     """Agreement of the frames with a sinusoid of unknown mean, amplitude and phase in each pixel.
 
     Raises ValueError for fewer than four frames, or steps that determine no phase.
@@ -72,11 +72,13 @@ def closure(frames: ArrayLike, shifts_rad: Sequence[float] | FloatArray) -> Clos
     shifts_rad : (N,) array
         Phase steps.
     """
-    stack, shifts = _checked(frames, shifts_rad)
+    stack, shifts = _check_frames(frames, shifts_rad)
     residual = step_residual(stack, shifts)
     design = np.stack([np.ones_like(shifts), np.cos(shifts), -np.sin(shifts)], axis=1)
     free = 1 - np.einsum("kp,pk->k", design, step_weights(shifts))  # diagonal of P
-    return _summary(residual, np.broadcast_to(free[:, None], residual.shape), len(shifts) - 3)
+    return _summarise_residual(
+        residual, np.broadcast_to(free[:, None], residual.shape), len(shifts) - 3
+    )
 
 
 def closure_with_phase(
@@ -87,13 +89,13 @@ def closure_with_phase(
 
     An error of the phase shows in all frames, as amplitude times error: it hides faults below that.
     """
-    stack, shifts = _checked(frames, shifts_rad)
+    stack, shifts = _check_frames(frames, shifts_rad)
     carrier = np.cos(np.ravel(phase_rad) + shifts[:, None])
     carrier -= carrier.mean(axis=0)
     carrier /= np.maximum(np.linalg.norm(carrier, axis=0), _TINY)
     centred = stack - stack.mean(axis=0)
     residual = centred - carrier * np.sum(carrier * centred, axis=0)
-    return _summary(residual, 1 - 1 / len(shifts) - carrier**2, len(shifts) - 2)
+    return _summarise_residual(residual, 1 - 1 / len(shifts) - carrier**2, len(shifts) - 2)
 
 
 def closure_with_level(
@@ -108,7 +110,7 @@ def closure_with_level(
     Linear in cosine and sine with the mean known; the phasor's length, which should be the
     amplitude, is one more equation. To first order in the noise that is the fit of the phase alone.
     """
-    stack, shifts = _checked(frames, shifts_rad)
+    stack, shifts = _check_frames(frames, shifts_rad)
     centred, amplitude = stack - np.ravel(mean_adu), np.ravel(amplitude_adu)
     design = np.stack([np.cos(shifts), -np.sin(shifts)], axis=1)
     rest = [np.arange(len(shifts)) != k for k in range(len(shifts))]
@@ -137,7 +139,7 @@ def _level_rss(centred: FloatArray, design: FloatArray, amplitude: FloatArray) -
     return float(np.mean(rss + (length - amplitude) ** 2 / variance))
 
 
-def _checked(
+def _check_frames(
     frames: ArrayLike, shifts_rad: Sequence[float] | FloatArray
 ) -> tuple[FloatArray, FloatArray]:
     """Frames as (N, pixels) and shifts; four frames at least, as three always agree."""
@@ -151,7 +153,7 @@ def _checked(
     return stack, shifts
 
 
-def _summary(residual: FloatArray, free: FloatArray, freedom: int) -> Closure:
+def _summarise_residual(residual: FloatArray, free: FloatArray, freedom: int) -> Closure:
     """From the residual (N, pixels), the diagonal of P there, and the degrees of freedom of a
     pixel.
     """

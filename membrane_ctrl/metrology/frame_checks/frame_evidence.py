@@ -75,14 +75,20 @@ def measure_frames(
     """Evidence of all readable frames."""
     scene = scene.thinned()
     readings = np.nan_to_num(stack.displacement_um - np.nan_to_num(stack.mean_reading_um))
-    templates = [_template(stack, scene, k, float(reading)) for k, reading in enumerate(readings)]
+    templates = [
+        _make_template(stack, scene, k, float(reading)) for k, reading in enumerate(readings)
+    ]
     waves = [template.wave() for template in templates]
     out = {}
     for k in readable:
         seen = binned.means[k].reshape(-1)[scene.index].astype(float)
         saturated = float(np.mean(binned.saturated[k].reshape(-1)[scene.index]))
-        out[k] = _evidence(
-            seen, templates[k], scene.light, saturated, _best(seen, waves, scene.light, k)
+        out[k] = _make_evidence(
+            seen,
+            templates[k],
+            scene.light,
+            saturated,
+            _find_best_pattern(seen, waves, scene.light, k),
         )
     return out
 
@@ -117,9 +123,11 @@ def estimate_light_and_film(
     for own, others in (used, used[::-1]):
         aside, found = stack.weights(others)[0] @ means[others], []
         for k in own:
-            template = _template(stack, scene, k, float(told_um[k]))
+            template = _make_template(stack, scene, k, float(told_um[k]))
             columns = np.vstack([template.columns, template.columns[1] * contrast])
-            found.append(_evidence(means[k], replace(template, columns=columns), aside, 0.0, k))
+            found.append(
+                _make_evidence(means[k], replace(template, columns=columns), aside, 0.0, k)
+            )
         seen = np.array([[each.level, each.swing] for each in found]).T
         light[:, own] = seen / seen.mean(axis=1, keepdims=True)
         film_um = np.append(film_um, told_um[own] + [each.moved_um for each in found])
@@ -145,7 +153,9 @@ class _Template:
         return self.sure, (wave - wave.mean()) / (wave.size * max(wave.std(), 1e-6))
 
 
-def _template(stack: FrameStack, scene: SampledBins, frame: int, reading_um: float) -> _Template:
+def _make_template(
+    stack: FrameStack, scene: SampledBins, frame: int, reading_um: float
+) -> _Template:
     pattern = stack.patterns[frame]
     ones = np.ones(scene.index.size)
     if pattern.role in ("white", "black"):
@@ -172,7 +182,7 @@ def _template(stack: FrameStack, scene: SampledBins, frame: int, reading_um: flo
     return _Template("sin", np.stack(columns), ones.astype(bool))
 
 
-def _solve(
+def _solve_coefficients(
     seen: FloatArray, template: _Template, light: FloatArray
 ) -> tuple[FloatArray, FloatArray, float]:
     """Coefficients, their noise if the rest is noise, and the RMS of the rest over the light."""
@@ -190,10 +200,10 @@ def _solve(
     )
 
 
-def _evidence(
+def _make_evidence(
     seen: FloatArray, template: _Template, light: FloatArray, saturated: float, shows: int
 ) -> FrameEvidence:
-    solved, sigma, rest = _solve(seen, template, light)
+    solved, sigma, rest = _solve_coefficients(seen, template, light)
     if template.role == "sin":
         swing = float(np.hypot(solved[1], solved[2]))
         step = float(np.arctan2(solved[2], solved[1]))
@@ -209,7 +219,7 @@ def _evidence(
     return FrameEvidence(float(solved[0]), 0.0, 0.0, 0.0, 0.0, rest, saturated, shows)
 
 
-def _best(
+def _find_best_pattern(
     seen: FloatArray, waves: list[tuple[BoolArray, FloatArray]], light: FloatArray, own: int
 ) -> int:
     """The pattern that the frame looks like most: largest correlation of the picture over the

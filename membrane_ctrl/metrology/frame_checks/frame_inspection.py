@@ -90,7 +90,7 @@ def inspect_frames(
     trusted = {k: e for k, e in evidence.items() if k not in excluded}
     flags = [*_judge_sinusoids(stack, evidence, trusted), *_judge_gray(stack, evidence, trusted)]
     twins = find_identical_frames(stack)
-    flags = [_named(stack, flag, evidence, twins) for flag in flags]
+    flags = [_name_pattern(stack, flag, evidence, twins) for flag in flags]
     return sorted(flags, key=lambda flag: -flag.severity)
 
 
@@ -117,10 +117,10 @@ def _judge_sinusoid(
     trusted: dict[int, FrameEvidence],
 ) -> list[Flag]:
     """One sinusoid against those of its axis and, for the light, against those of both."""
-    step_limit, step = _limit([o.step_rad for o in same], STEP_RAD)
-    moved_limit, moved_um = _limit([o.moved_um for o in same], MOVED_UM)
-    level_limit, level = _limit([o.level for o in every], 0.0)
-    swing_limit, swing = _limit([o.swing for o in same], 0.0)
+    step_limit, step = _compute_limit([o.step_rad for o in same], STEP_RAD)
+    moved_limit, moved_um = _compute_limit([o.moved_um for o in same], MOVED_UM)
+    level_limit, level = _compute_limit([o.level for o in every], 0.0)
+    swing_limit, swing = _compute_limit([o.swing for o in same], 0.0)
     rest = float(np.median([o.rest for o in same]))
     saturated = float(np.median([o.saturated for o in same]))
     worst = {
@@ -170,7 +170,7 @@ def _judge_gray(
     good = [evidence[k] for k in gray if k in trusted and evidence[k].lit > _NO_EDGE]
     if not good:
         return []
-    bright_limit, bright = _limit([e.level for e in good], 0.0)
+    bright_limit, bright = _compute_limit([e.level for e in good], 0.0)
     flags = []
     for k in gray:
         e = evidence[k]
@@ -223,7 +223,7 @@ def _judge_flat(frame: int, e: FrameEvidence, bright: float, white: bool) -> lis
     ]
 
 
-def _named(
+def _name_pattern(
     stack: FrameStack, flag: Flag, evidence: dict[int, FrameEvidence], twins: dict[int, int]
 ) -> Flag:
     """Add the frame whose picture it is, if that is known."""
@@ -242,7 +242,7 @@ def _named(
     return flag
 
 
-def _limit(values: list[float], floor: float) -> tuple[float, float]:
+def _compute_limit(values: list[float], floor: float) -> tuple[float, float]:
     """Limit and middle of a figure over the trusted frames."""
     if not values:
         return max(floor, 1e-9), 0.0

@@ -23,11 +23,11 @@ import numpy as np
 
 from membrane_ctrl.metrology.frame_checks.closure import (
     Closure,
-    closure,
     closure_with_level,
     closure_with_phase,
+    compute_closure,
 )
-from membrane_ctrl.metrology.phase.phase_steps import phasors
+from membrane_ctrl.metrology.phase.phase_steps import compute_phasors
 from membrane_ctrl.metrology.phase.temporal_unwrap import predict_phase, unwrap_in_time
 from membrane_ctrl.model.arrays import FloatArray
 from membrane_ctrl.model.shape_estimate import Verdict
@@ -56,7 +56,9 @@ class AxisSeries:
 
     def phases_rad(self) -> FloatArray:
         """Wrapped phases (F, n)."""
-        return np.stack([np.angle(phasors(steps, self.shifts_rad)) for steps in self.frames])
+        return np.stack(
+            [np.angle(compute_phasors(steps, self.shifts_rad)) for steps in self.frames]
+        )
 
     def inconsistent_share(self) -> float:
         """Share of the pixels whose frequencies disagree."""
@@ -108,7 +110,7 @@ def check_series(axes: tuple[AxisSeries, ...], black: FloatArray, white: FloatAr
     mended, failures = [], []
     for axis in axes:
         for index in range(len(axis.periods)):
-            found, axis = _mend(axis, index, limits[axis.axis][index], axes)
+            found, axis = _repair_series(axis, index, limits[axis.axis][index], axes)
             flags += found
         mended.append(axis)
         bad = [
@@ -132,14 +134,16 @@ def check_series(axes: tuple[AxisSeries, ...], black: FloatArray, white: FloatAr
     return SeriesCheck("ok", "", (), tuple(mended))
 
 
-def _amplitude(steps: FloatArray, shifts_rad: FloatArray) -> float:
-    return max(float(np.median(np.abs(phasors(steps, shifts_rad)))), 1e-9)
+def _series_amplitude(steps: FloatArray, shifts_rad: FloatArray) -> float:
+    return max(float(np.median(np.abs(compute_phasors(steps, shifts_rad)))), 1e-9)
 
 
 def _closure_share(axis: AxisSeries, index: int) -> float:
     """Of one series, over its amplitude."""
     steps = axis.frames[index]
-    return closure(steps, axis.shifts_rad).rms_adu / _amplitude(steps, axis.shifts_rad)
+    return compute_closure(steps, axis.shifts_rad).rms_adu / _series_amplitude(
+        steps, axis.shifts_rad
+    )
 
 
 def _closure_limits(axes: tuple[AxisSeries, ...]) -> dict[str, list[float]]:
@@ -159,14 +163,14 @@ def _closure_limits(axes: tuple[AxisSeries, ...]) -> dict[str, list[float]]:
     return {axis.axis: [limit((axis.axis, k)) for k in range(len(axis.periods))] for axis in axes}
 
 
-def _mend(
+def _repair_series(
     axis: AxisSeries, index: int, limit: float, axes: tuple[AxisSeries, ...]
 ) -> tuple[list[SeriesFlag], AxisSeries]:
     """Flags of one series, and the axis with the series repaired as far as possible."""
     disagree = _closure_share(axis, index) > limit
     if not disagree and axis.inconsistent_share() <= INCONSISTENT_SHARE:
         return [], axis
-    swapped = _exchange(axis, index, limit)
+    swapped = _find_exchange(axis, index, limit)
     if swapped is not None:
         (a, b), better = swapped
         flags = [
@@ -175,10 +179,10 @@ def _mend(
         return flags, better
     if not disagree:
         return [], axis
-    closures = _closures(axis, index)
+    closures = _compute_closures(axis, index)
     clearest = max(closures, key=lambda found: found.gain)
     step, reason = clearest.suspect, "does not agree with the other steps"
-    twin = _twin(axis, index, axes)
+    twin = _find_twin(axis, index, axes)
     if twin is not None:
         step, reason = twin
     elif step is None or clearest.gain < GAIN:
@@ -186,7 +190,7 @@ def _mend(
     flags = [SeriesFlag(axis.axis, index, step, reason)]
     if index + 1 == len(axis.periods):  # a wrong coarser one makes the next disagree; this has none
         left = min(float(found.without_rms_adu[step]) for found in closures)
-        if left > LEFT_TIMES * limit * _amplitude(axis.frames[index], axis.shifts_rad):
+        if left > LEFT_TIMES * limit * _series_amplitude(axis.frames[index], axis.shifts_rad):
             return flags, axis  # it is not the only one
     steps = axis.frames[index].copy()
     count = len(steps)
@@ -194,15 +198,15 @@ def _mend(
     return flags, axis.with_frames(index, steps)
 
 
-def _closures(axis: AxisSeries, index: int) -> tuple[Closure, Closure]:
+def _compute_closures(axis: AxisSeries, index: int) -> tuple[Closure, Closure]:
     """Closures that can name a frame: with the other frequencies' phase known, and with the level
     of the next.
     """
     neighbour = index - 1 if index + 1 == len(axis.periods) else index + 1
     steps, near = axis.frames[index], axis.frames[neighbour]
-    amplitude = np.abs(phasors(near, axis.shifts_rad))
+    amplitude = np.abs(compute_phasors(near, axis.shifts_rad))
     # a finer fringe is blurred: the same all over the picture to a good approximation
-    amplitude *= _amplitude(steps, axis.shifts_rad) / max(float(np.median(amplitude)), 1e-9)
+    amplitude *= _series_amplitude(steps, axis.shifts_rad) / max(float(np.median(amplitude)), 1e-9)
     expected = predict_phase(axis.phases_rad(), axis.periods, index)
     return (
         closure_with_phase(steps, axis.shifts_rad, expected),
@@ -210,7 +214,7 @@ def _closures(axis: AxisSeries, index: int) -> tuple[Closure, Closure]:
     )
 
 
-def _exchange(
+def _find_exchange(
     axis: AxisSeries, index: int, limit: float
 ) -> tuple[tuple[int, int], AxisSeries] | None:
     """The only exchange of two steps after which they agree, among themselves and with the other
@@ -229,10 +233,12 @@ def _exchange(
     return found[0] if len(found) == 1 else None
 
 
-def _twin(axis: AxisSeries, index: int, axes: tuple[AxisSeries, ...]) -> tuple[int, str] | None:
+def _find_twin(
+    axis: AxisSeries, index: int, axes: tuple[AxisSeries, ...]
+) -> tuple[int, str] | None:
     """A step that shows the picture of an earlier frame, and which one."""
     earlier: list[tuple[str, FloatArray]] = []
-    amplitude = _amplitude(axis.frames[index], axis.shifts_rad)
+    amplitude = _series_amplitude(axis.frames[index], axis.shifts_rad)
     for series in axes:
         for k, steps in enumerate(series.frames):
             for step, frame in enumerate(steps):

@@ -49,14 +49,14 @@ class _Series:
     @property
     def phasor(self) -> FloatArray:
         """(bins,), complex."""
-        return np.asarray(phase_steps.phasors(self.seen, self.shifts_rad))
+        return np.asarray(phase_steps.compute_phasors(self.seen, self.shifts_rad))
 
     def share(self) -> float:
         """What a sinusoid leaves of the frames, over its amplitude; NaN for three steps, which
         always agree.
         """
         return (
-            self._over_amplitude(closure.closure(self.seen, self.shifts_rad).rms_adu)
+            self._over_amplitude(closure.compute_closure(self.seen, self.shifts_rad).rms_adu)
             if len(self.frames) > 3
             else np.nan
         )
@@ -69,7 +69,7 @@ class _Series:
         place.
         """
         if len(self.frames) > 4:
-            return closure.closure(self.seen, self.shifts_rad)
+            return closure.compute_closure(self.seen, self.shifts_rad)
         known = np.isfinite(place_mm)
         expected = 2 * np.pi * place_mm[known] / self.period_mm - np.pi
         return closure.closure_with_phase(self.seen[:, known], self.shifts_rad, expected)
@@ -84,17 +84,17 @@ def check_frequencies(stack: FrameStack, optics: OpticsConfig) -> Checked:
     count = len(finest)
     coarser = {k: reason for k, reason in stack.unusable.items() if k >= count}
     flags |= {k: frame_faults.flag_unreadable(k, reason) for k, reason in coarser.items()}
-    mask = _fringes(stack, binned)
+    mask = _find_fringes(stack, binned)
     while True:
         series = list(_all_series(stack, binned, optics, mask, flags))
-        places = [_places(series, axis, optics) for axis in range(2)]
+        places = [_locate_bins(series, axis, optics) for axis in range(2)]
         bad = _bad_frame(stack, series, places)
         if bad is None:
             break
         flags[bad.frame] = bad
     named = tuple(flags[k] for k in sorted(flags))
     absolute = np.stack(
-        [_absolute(series, axis, places[axis], optics, mask, named) for axis in range(2)]
+        [_unwrap_finest(series, axis, places[axis], optics, mask, named) for axis in range(2)]
     )
     light = binned.means[finest].mean(axis=0).astype(float)
     fine = FrameStack(
@@ -110,14 +110,14 @@ def check_frequencies(stack: FrameStack, optics: OpticsConfig) -> Checked:
     return replace(checked, flags=checked.flags + named)
 
 
-def _fringes(stack: FrameStack, binned: Binned) -> BoolArray:
+def _find_fringes(stack: FrameStack, binned: Binned) -> BoolArray:
     """Bins (rows, columns) where all periods swing, the median of their swings at least."""
     swings = []
     for axis in pattern_sequence.AXES:
         for period in sorted({pattern.period_mm for pattern in stack.patterns}):
-            frames = _steps(stack, axis, period, ())
+            frames = _make_series(stack, axis, period, ())
             shifts = stack.shifts_rad(frames)
-            swings.append(np.abs(phase_steps.phasors(binned.means[frames], shifts)))
+            swings.append(np.abs(phase_steps.compute_phasors(binned.means[frames], shifts)))
     swing = np.median(swings, axis=0)
     return np.asarray(
         (swing > full_decoder.CONTRAST_SHARE * np.percentile(swing, 95))
@@ -125,7 +125,9 @@ def _fringes(stack: FrameStack, binned: Binned) -> BoolArray:
     )
 
 
-def _steps(stack: FrameStack, axis: str, period_mm: float, left_out: Collection[int]) -> list[int]:
+def _make_series(
+    stack: FrameStack, axis: str, period_mm: float, left_out: Collection[int]
+) -> list[int]:
     return [
         k
         for k, p in enumerate(stack.patterns)
@@ -145,7 +147,7 @@ def _all_series(
     """
     for k, axis in enumerate(pattern_sequence.AXES):
         for period in sorted({pattern.period_mm for pattern in stack.patterns}):
-            frames = _steps(stack, axis, period, left_out)
+            frames = _make_series(stack, axis, period, left_out)
             shifts, period_mm = stack.shifts_rad(frames), period or optics.pattern.period_mm
             try:
                 phase_steps.step_weights(shifts)
@@ -159,7 +161,7 @@ def _all_series(
             yield _Series(k, period_mm, frames, shifts, binned.means[frames][:, mask].astype(float))
 
 
-def _places(series: list[_Series], axis: int, optics: OpticsConfig) -> FloatArray:
+def _locate_bins(series: list[_Series], axis: int, optics: OpticsConfig) -> FloatArray:
     """Places (bins,) from the pattern's low edge; NaN where the periods do not tell."""
     own = [one for one in series if one.axis == axis]
     wrapped = np.stack([np.angle(one.phasor) + np.pi for one in own])
@@ -205,7 +207,7 @@ def _bad_frame(stack: FrameStack, series: list[_Series], places: list[FloatArray
     return max(found, key=lambda flag: flag.severity, default=None)
 
 
-def _absolute(
+def _unwrap_finest(
     series: list[_Series],
     axis: int,
     place_mm: FloatArray,

@@ -61,18 +61,20 @@ def check_set(
         stack, frame_stack.bin_frames(stack, 2**optics.camera.bits - 1)
     )
     try:
-        found = _check(stack, binned, optics, anchor)
+        found = _check_rounds(stack, binned, optics, anchor)
     except RejectedSetError as error:
         put_back = _put_back(stack, binned, optics, anchor)
         if put_back is None:
-            raise RejectedSetError(str(error) + _doubt(stack, error.flags), error.flags) from None
+            raise RejectedSetError(
+                str(error) + _find_doubt(stack, error.flags), error.flags
+            ) from None
         return put_back
     return (
         found if _believable_surface(found) else _put_back(stack, binned, optics, anchor) or found
     )
 
 
-def _doubt(stack: frame_stack.FrameStack, flags: tuple[frame_faults.Flag, ...]) -> str:
+def _find_doubt(stack: frame_stack.FrameStack, flags: tuple[frame_faults.Flag, ...]) -> str:
     """Where many frames differ from the prediction, the doubt that the prediction, that is the
     geometry, is wrong.
 
@@ -118,7 +120,7 @@ def _put_back(
             order = list(range(len(stack.patterns)))
             order[a], order[b] = b, a
             try:
-                checked = _check(
+                checked = _check_rounds(
                     stack.reordered(order), binned.reordered(order), optics, anchor, rounds=2
                 )
             except RejectedSetError:
@@ -136,7 +138,7 @@ def _flag_swapped(frame: int, shown: str, swapped_with: int) -> frame_faults.Fla
     )
 
 
-def _check(
+def _check_rounds(
     stack: frame_stack.FrameStack,
     binned: frame_stack.Binned,
     optics: OpticsConfig,
@@ -158,9 +160,11 @@ def _check(
     flags: list[frame_faults.Flag] = []
     for done in range(rounds + 1):
         try:
-            attempt = _attempt(stack, binned, optics, geometry, grid, near, excluded, anchor)
+            attempt = _attempt_fit(stack, binned, optics, geometry, grid, near, excluded, anchor)
         except (bin_view.NoFigureError, ValueError) as error:
-            raise RejectedSetError(str(error), _merged(_believable(stack, flags), known)) from None
+            raise RejectedSetError(
+                str(error), _merge_flags(_keep_believable(stack, flags), known)
+            ) from None
         readable = [k for k in range(len(stack.patterns)) if k not in stack.unusable]
         seen = frame_evidence.measure_frames(stack, binned, attempt.scene, readable)
         flags = frame_inspection.inspect_frames(stack, seen, excluded)
@@ -182,7 +186,7 @@ def _check(
                 stack = replace(stack, light=light)  # a round with the light that each frame had
                 continue
             confirm_orders(
-                stack, attempt.phase_rad, binned, attempt.view, excluded, _merged(flags, known)
+                stack, attempt.phase_rad, binned, attempt.view, excluded, _merge_flags(flags, known)
             )
             shape = attempt.view.mask.shape
             fitted = (
@@ -198,7 +202,7 @@ def _check(
                 )
             )
             return Checked(
-                stack, binned, *fitted, _merged(flags, known), film_um, noise_um, light_left
+                stack, binned, *fitted, _merge_flags(flags, known), film_um, noise_um, light_left
             )
         pair = next((flag for flag in fresh if flag.swapped_with is not None), None)
         if (
@@ -218,7 +222,7 @@ def _check(
         known |= chosen
         excluded |= set(chosen)
     reason = "the frames do not agree, whichever are left out"
-    raise RejectedSetError(reason, _merged(_believable(stack, flags), known))
+    raise RejectedSetError(reason, _merge_flags(_keep_believable(stack, flags), known))
 
 
 @dataclass(frozen=True)
@@ -230,7 +234,7 @@ class _Attempt:
     scene: frame_evidence.SampledBins
 
 
-def _attempt(
+def _attempt_fit(
     stack: frame_stack.FrameStack,
     binned: frame_stack.Binned,
     optics: OpticsConfig,
@@ -268,14 +272,14 @@ def _of_sinusoids(
     return [flag for flag in flags if stack.patterns[flag.frame].role == "sin"]
 
 
-def _believable(
+def _keep_believable(
     stack: frame_stack.FrameStack, flags: list[frame_faults.Flag]
 ) -> list[frame_faults.Flag]:
     """While sinusoids are wrong the prediction may be wrong too: then only they are named."""
     return _of_sinusoids(stack, flags) or flags
 
 
-def _merged(
+def _merge_flags(
     flags: list[frame_faults.Flag], known: dict[int, frame_faults.Flag]
 ) -> tuple[frame_faults.Flag, ...]:
     """All flags in the order of the frames; the latest inspection takes precedence, earlier

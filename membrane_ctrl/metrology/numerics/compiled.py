@@ -20,12 +20,12 @@ _OPTIONS: dict[str, Any] = {
 _FOLDER = Path(__file__).parents[1]  # of all kernels
 
 
-def kernel(function: Callable[..., Any]) -> Any:
+def compile_kernel(function: Callable[..., Any]) -> Any:
     """Compile a loop; the result is cached on disk and runs without the interpreter lock."""
     return _recompiled_if_stale(njit(**_OPTIONS)(function))
 
 
-def step(function: Callable[..., Any]) -> Any:
+def compile_step(function: Callable[..., Any]) -> Any:
     """Compile what a loop does to one point. Inlined by force: a loop with a call in it uses no
     vector units.
     """
@@ -42,7 +42,7 @@ def _recompiled_if_stale(dispatcher: Any) -> Any:
     file = getattr(dispatcher._cache, "_cache_file", None)  # None where no folder is writable
     if file is not None:
         source = Path(dispatcher.py_func.__code__.co_filename)
-        sources = _sources(_FOLDER if _FOLDER in source.parents else source.parent)
+        sources = _source_checksum(_FOLDER if _FOLDER in source.parents else source.parent)
         file._source_stamp = file._source_stamp, sources, ZERNIKE_TERMS
         load = file._load_index
 
@@ -59,7 +59,9 @@ def _recompiled_if_stale(dispatcher: Any) -> Any:
 
 
 @cache
-def _sources(folder: Path) -> int:
+def _source_checksum(folder: Path) -> int:
     """Checksum of the kernels in a folder."""
     texts = [path.read_bytes() for path in sorted(folder.rglob("*.py"))]
-    return zlib.crc32(b"".join(text for text in texts if b"@kernel" in text or b"@step" in text))
+    return zlib.crc32(
+        b"".join(text for text in texts if b"@compile_kernel" in text or b"@compile_step" in text)
+    )

@@ -4,10 +4,10 @@ import math
 
 import numpy as np
 
-from membrane_ctrl.metrology.numerics.compiled import step
+from membrane_ctrl.metrology.numerics.compiled import compile_step
 
 
-@step
+@compile_step
 def cos_sin(x):  # type: ignore[no-untyped-def]
     """Cosine and sine of a phase in single precision, to 1e-6 within three turns.
 

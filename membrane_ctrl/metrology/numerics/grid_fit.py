@@ -5,7 +5,7 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.polynomial.legendre import legvander, poly2leg
 
-from membrane_ctrl.metrology.numerics.zernike import term
+from membrane_ctrl.metrology.numerics.zernike import radial_polynomial
 from membrane_ctrl.model.arrays import BoolArray, FloatArray
 
 
@@ -34,7 +34,7 @@ class GridFit:
             [np.pad(p, (0, degree + 1 - p.size)) for p in map(poly2leg, np.eye(degree + 1))]
         )
         self._terms = np.stack(
-            [to_legendre.T @ term(n, m, degree) @ to_legendre for n, m in orders]
+            [to_legendre.T @ radial_polynomial(n, m, degree) @ to_legendre for n, m in orders]
         )
         self._x, self._y = legvander(x, degree), legvander(x if y is None else y, degree)
         self._mask = mask

@@ -2,10 +2,10 @@
 
 import numpy as np
 
-from membrane_ctrl.metrology.numerics.compiled import kernel
+from membrane_ctrl.metrology.numerics.compiled import compile_kernel
 
 
-@kernel
+@compile_kernel
 def sums_by(number, values, count):  # type: ignore[no-untyped-def]
     """Sums (k, count) of values (k, n) over the columns of each `number` (n,), which is below
     `count`.

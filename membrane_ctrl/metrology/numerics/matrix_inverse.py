@@ -2,11 +2,11 @@
 
 import numpy as np
 
-from membrane_ctrl.metrology.numerics.compiled import kernel
+from membrane_ctrl.metrology.numerics.compiled import compile_kernel
 
 
-@kernel
-def invert(matrix):  # type: ignore[no-untyped-def]
+@compile_kernel
+def invert_in_place(matrix):  # type: ignore[no-untyped-def]
     """Inverse of a symmetric positive matrix in place by Gauss-Jordan; False, and no usable result,
     if it is not one.
 

@@ -18,7 +18,7 @@ FEW = 4096  # points: waking a thread takes longer
 
 
 @cache
-def _pool() -> ThreadPoolExecutor:
+def _thread_pool() -> ThreadPoolExecutor:
     return ThreadPoolExecutor(WORKERS - 1, thread_name_prefix="metrology")
 
 
@@ -31,6 +31,6 @@ def split_over_threads(run: Callable[[int, int], T], count: int, fewest: int = 0
     if count < fewest:
         return [run(0, count)]
     edges = [count * k // WORKERS for k in range(WORKERS + 1)]
-    others = [_pool().submit(run, start, stop) for start, stop in pairwise(edges[1:])]
+    others = [_thread_pool().submit(run, start, stop) for start, stop in pairwise(edges[1:])]
     first = run(edges[0], edges[1])
     return [first, *(other.result() for other in others)]

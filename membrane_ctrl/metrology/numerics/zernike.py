@@ -19,7 +19,7 @@ from membrane_ctrl.model.zernike_terms import NOLL_INDICES, ZERNIKE_DEGREE, ZERN
 FRINGE_TERMS = 37  # by definition of the set, whatever the fit's own number
 
 
-def noll(j: int) -> tuple[int, int]:
+def noll_orders(j: int) -> tuple[int, int]:
     """Radial order n and azimuthal order m (negative: sine) of Noll's index j >= 1."""
     if j < 1:
         raise ValueError(f"Noll's index starts at 1, got {j}")
@@ -33,11 +33,11 @@ def osa_from_noll(per_term: FloatArray) -> FloatArray:
     """Values (terms, ...) in the order of OSA/ANSI's index from 0, of the same terms in Noll's
     order.
     """
-    orders = [noll(j) for j in NOLL_INDICES]
+    orders = [noll_orders(j) for j in NOLL_INDICES]
     return np.asarray(per_term)[sorted(range(ZERNIKE_TERMS), key=orders.__getitem__)]
 
 
-def fringe(j: int) -> tuple[int, int]:
+def fringe_set_orders(j: int) -> tuple[int, int]:
     """Radial and azimuthal order (negative: sine) of the Fringe set's index 1..37; the last is n =
     12, m = 0.
     """
@@ -56,18 +56,18 @@ def monomial_table() -> FloatArray:
     """Coefficients (terms, degree + 1, degree + 1): Z_j = sum over p, q of table[j - 1, p, q] x^p
     y^q.
     """
-    table = np.stack([_polynomial(j) for j in NOLL_INDICES])
+    table = np.stack([_term_polynomial(j) for j in NOLL_INDICES])
     table.setflags(write=False)
     return table
 
 
-def _polynomial(j: int) -> FloatArray:
+def _term_polynomial(j: int) -> FloatArray:
     """One of the terms, with unit RMS over the disc."""
-    n, m = noll(j)
-    return math.sqrt(n + 1 if m == 0 else 2 * (n + 1)) * term(n, m, ZERNIKE_DEGREE)
+    n, m = noll_orders(j)
+    return math.sqrt(n + 1 if m == 0 else 2 * (n + 1)) * radial_polynomial(n, m, ZERNIKE_DEGREE)
 
 
-def term(n: int, m: int, degree: int) -> FloatArray:
+def radial_polynomial(n: int, m: int, degree: int) -> FloatArray:
     """Polynomial (degree + 1, degree + 1) in x and y of a term without normalisation, R(1) = 1;
     sine for m < 0.
     """
@@ -84,12 +84,12 @@ def term(n: int, m: int, degree: int) -> FloatArray:
     return out
 
 
-def polynomial(coeffs: FloatArray) -> FloatArray:
+def sum_polynomial(coeffs: FloatArray) -> FloatArray:
     """The sum of the terms as one polynomial (degree + 1, degree + 1) in x and y."""
     return np.asarray(np.tensordot(coeffs, monomial_table(), axes=1))
 
 
-def values(x: FloatArray, y: FloatArray, table: FloatArray | None = None) -> FloatArray:
+def evaluate_terms(x: FloatArray, y: FloatArray, table: FloatArray | None = None) -> FloatArray:
     """All terms, (terms, ...), at points of the unit disc; or the polynomials of a table like
     theirs.
     """
@@ -102,14 +102,14 @@ def values(x: FloatArray, y: FloatArray, table: FloatArray | None = None) -> Flo
     return np.asarray(np.tensordot(table[:, p, q], powers_x[p] * powers_y[q], axes=1))
 
 
-def gradients(x: FloatArray, y: FloatArray) -> tuple[FloatArray, FloatArray]:
+def evaluate_gradients(x: FloatArray, y: FloatArray) -> tuple[FloatArray, FloatArray]:
     """d/dx and d/dy of all terms, each (terms, ...), at points of the unit disc."""
-    return values(x, y, differentiate(monomial_table(), 1)), values(
-        x, y, differentiate(monomial_table(), 2)
+    return evaluate_terms(x, y, differentiate_table(monomial_table(), 1)), evaluate_terms(
+        x, y, differentiate_table(monomial_table(), 2)
     )
 
 
-def differentiate(table: FloatArray, axis: int) -> FloatArray:
+def differentiate_table(table: FloatArray, axis: int) -> FloatArray:
     """Derivative of polynomials whose powers run along `axis` (1: x, 2: y), in the same shape."""
     powers = np.arange(ZERNIKE_DEGREE + 1).reshape([-1 if k == axis else 1 for k in range(3)])
     out = np.roll(table * powers, -1, axis=axis)
@@ -123,5 +123,5 @@ def at_vertex() -> FloatArray:
 
 def at_rim() -> FloatArray:
     """Mean over azimuth (terms,) of all terms on the rim: only m = 0 is left, with R(1) = 1."""
-    orders = [noll(j) for j in NOLL_INDICES]
+    orders = [noll_orders(j) for j in NOLL_INDICES]
     return np.array([math.sqrt(n + 1) if m == 0 else 0.0 for n, m in orders])

@@ -13,7 +13,7 @@ from collections.abc import Container, Sequence
 
 import numpy as np
 
-from membrane_ctrl.metrology.numerics.compiled import kernel
+from membrane_ctrl.metrology.numerics.compiled import compile_kernel
 from membrane_ctrl.metrology.numerics.threads import split_over_threads
 from membrane_ctrl.model.arrays import Image
 
@@ -21,7 +21,7 @@ _NEVER = np.uint32(2**32 - 1)  # above any pixel
 FOLLOWED_ROWS = 5  # of `track`: absolute phase, its cosine and sine, change (rad), modulation (ADU)
 
 
-@kernel
+@compile_kernel
 def _add_lines(frame, first, last, line):  # type: ignore[no-untyped-def]
     for c in range(line.size):
         line[c] = frame[first, c]
@@ -30,8 +30,8 @@ def _add_lines(frame, first, last, line):  # type: ignore[no-untyped-def]
             line[c] += frame[row, c]
 
 
-@kernel
-def _peak(frame, first, last, width):  # type: ignore[no-untyped-def]
+@compile_kernel
+def _find_peak(frame, first, last, width):  # type: ignore[no-untyped-def]
     top = frame[first, 0]
     for row in range(first, last):
         for c in range(width):
@@ -40,14 +40,14 @@ def _peak(frame, first, last, width):  # type: ignore[no-untyped-def]
     return top
 
 
-@kernel
-def _halve(line, out):  # type: ignore[no-untyped-def]
+@compile_kernel
+def _halve_line(line, out):  # type: ignore[no-untyped-def]
     for b in range(out.size):
         out[b] = line[2 * b] + line[2 * b + 1]
 
 
-@kernel
-def _fold(line, bin_px, out):  # type: ignore[no-untyped-def]
+@compile_kernel
+def _fold_line(line, bin_px, out):  # type: ignore[no-untyped-def]
     for b in range(out.size):
         total = np.uint32(0)
         for c in range(b * bin_px, b * bin_px + bin_px):
@@ -55,7 +55,7 @@ def _fold(line, bin_px, out):  # type: ignore[no-untyped-def]
         out[b] = total
 
 
-@kernel
+@compile_kernel
 def _count_saturated(frame, first, last, bin_px, full_scale, out):  # type: ignore[no-untyped-def]
     for row in range(first, last):
         for b in range(out.size):
@@ -64,7 +64,7 @@ def _count_saturated(frame, first, last, bin_px, full_scale, out):  # type: igno
                     out[b] += np.uint32(1)
 
 
-@kernel
+@compile_kernel
 def _bin_rows(frame, bin_px, full_scale, line, sums, saturated, start, stop):  # type: ignore[no-untyped-def]
     """Sums of the bin rows [start, stop) into `sums`; their saturated pixels are added to
     `saturated`.
@@ -78,13 +78,13 @@ def _bin_rows(frame, bin_px, full_scale, line, sums, saturated, start, stop):  #
         here, there, side = line[0], line[1], bin_px
         while side % 2 == 0 and side > 2:
             side //= 2
-            _halve(here, there[: sums.shape[1] * side])
+            _halve_line(here, there[: sums.shape[1] * side])
             here, there = there, here
         if side == 2:
-            _halve(here, sums[row])
+            _halve_line(here, sums[row])
         else:
-            _fold(here, side, sums[row])
-        if _peak(frame, first, last, width) >= full_scale:
+            _fold_line(here, side, sums[row])
+        if _find_peak(frame, first, last, width) >= full_scale:
             _count_saturated(frame, first, last, bin_px, full_scale, saturated[row])
 
 

@@ -5,7 +5,7 @@ import numpy as np
 from membrane_ctrl.config.schema import PatternConfig
 from membrane_ctrl.metrology.phase.gray_code import absolute_phase, gray_orders
 from membrane_ctrl.metrology.phase.pattern_sequence import FullSlots
-from membrane_ctrl.metrology.phase.phase_steps import phasors
+from membrane_ctrl.metrology.phase.phase_steps import compute_phasors
 from membrane_ctrl.metrology.phase.screen_scale import inside_pattern
 from membrane_ctrl.model.arrays import FloatArray
 
@@ -32,7 +32,7 @@ def decode_full(images: FloatArray, pattern: PatternConfig, shifts_rad: FloatArr
     valid = contrast > CONTRAST_SHARE * np.percentile(contrast, 95)
     phases = []
     for sinusoids, gray, shifts in zip(slots.sinusoids, slots.gray, shifts_rad, strict=True):
-        z = phasors(images[sinusoids], shifts)
+        z = compute_phasors(images[sinusoids], shifts)
         k1, k2 = gray_orders(images[gray], white, black)
         phases.append(absolute_phase(np.angle(z), k1, k2))
         valid &= (np.abs(z) > FRINGE_SHARE * contrast) & inside_pattern(phases[-1], pattern)

@@ -13,7 +13,7 @@ GRAY_BITS = 4  # 16 half periods: enough for the 8 periods a configuration may a
 AXES = ("x", "y")
 
 
-def sinusoids(axis: str, steps: int) -> tuple[Pattern, ...]:
+def sinusoid_patterns(axis: str, steps: int) -> tuple[Pattern, ...]:
     """The N phase steps of one axis: I = A + B cos(phi + 2 pi k / N), k = 0..N-1 (N = 4: the
     paper's eq. 1).
     """
@@ -28,14 +28,16 @@ def gray_codes(axis: str) -> tuple[Pattern, ...]:
 def full_sequence(pattern: PatternConfig) -> tuple[Pattern, ...]:
     """All images of a full cycle: 2 (N + 4) + 2."""
     by_axis = (
-        image for axis in AXES for image in (*sinusoids(axis, pattern.steps), *gray_codes(axis))
+        image
+        for axis in AXES
+        for image in (*sinusoid_patterns(axis, pattern.steps), *gray_codes(axis))
     )
     return (*by_axis, Pattern("white"), Pattern("black"))
 
 
 def fringe_sequence(pattern: PatternConfig) -> tuple[Pattern, ...]:
     """The images of a fringes-only cycle: 2 N."""
-    return tuple(image for axis in AXES for image in sinusoids(axis, pattern.steps))
+    return tuple(image for axis in AXES for image in sinusoid_patterns(axis, pattern.steps))
 
 
 class FullSlots:

@@ -6,9 +6,9 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from membrane_ctrl.metrology.numerics.compiled import kernel
+from membrane_ctrl.metrology.numerics.compiled import compile_kernel
 from membrane_ctrl.metrology.numerics.threads import split_over_threads
-from membrane_ctrl.metrology.phase.phasor_kernels import arctan2, still
+from membrane_ctrl.metrology.phase.phasor_kernels import branchless_arctan2, remove_phasor_motion
 from membrane_ctrl.model.arrays import AnyArray, ComplexArray, FloatArray, IntArray
 
 _BLOCK = 512
@@ -26,8 +26,8 @@ class StepCombination:
     mirror: ComplexArray = field(default_factory=lambda: np.zeros(2, complex))
 
 
-@kernel
-def _combine(sums, index, weights, first, out):  # type: ignore[no-untyped-def]
+@compile_kernel
+def _combine_sums(sums, index, weights, first, out):  # type: ignore[no-untyped-def]
     """out[p] = sum over frames of weight times bin sum."""
     for p in range(out.size):
         out[p] = 0.0
@@ -37,14 +37,14 @@ def _combine(sums, index, weights, first, out):  # type: ignore[no-untyped-def]
             out[p] += weight * sums[k, index[first + p]]
 
 
-@kernel
-def _still(c, s, slope, turn, mirror):  # type: ignore[no-untyped-def]
+@compile_kernel
+def _remove_motion(c, s, slope, turn, mirror):  # type: ignore[no-untyped-def]
     for p in range(c.size):
-        c[p], s[p] = still(c[p], s[p], slope[p], turn, mirror)
+        c[p], s[p] = remove_phasor_motion(c[p], s[p], slope[p], turn, mirror)
 
 
-@kernel
-def _angle(c, s, last_cos, last_sin, change, size):  # type: ignore[no-untyped-def]
+@compile_kernel
+def _relative_angle(c, s, last_cos, last_sin, change, size):  # type: ignore[no-untyped-def]
     """Angle of c + i s relative to the last phase, and its length;
     normalises c + i s to length 1.
     """
@@ -52,25 +52,29 @@ def _angle(c, s, last_cos, last_sin, change, size):  # type: ignore[no-untyped-d
         length = math.sqrt(c[p] * c[p] + s[p] * s[p])
         scale = 1 / (length + 1e-300)
         x, y = c[p] * scale, s[p] * scale
-        change[p] = arctan2(y * last_cos[p] - x * last_sin[p], x * last_cos[p] + y * last_sin[p])
+        change[p] = branchless_arctan2(
+            y * last_cos[p] - x * last_sin[p], x * last_cos[p] + y * last_sin[p]
+        )
         size[p] = length
         c[p] = x
         s[p] = y
 
 
-@kernel
-def _track(sums, index, cosine, sine, turn, mirror, slope, last, out, start, stop):  # type: ignore[no-untyped-def]
+@compile_kernel
+def _track_phases(sums, index, cosine, sine, turn, mirror, slope, last, out, start, stop):  # type: ignore[no-untyped-def]
     """Phase of each point, counted from the last one, in blocks that
     stay in the first-level cache.
     """
     for first in range(start, stop, _BLOCK):
         end = min(first + _BLOCK, stop)
         c, s = out[1, first:end], out[2, first:end]
-        _combine(sums, index, cosine, first, c)
-        _combine(sums, index, sine, first, s)
+        _combine_sums(sums, index, cosine, first, c)
+        _combine_sums(sums, index, sine, first, s)
         if turn[1] != 0:
-            _still(c, s, slope[first:end], turn, mirror)
-        _angle(c, s, last[1, first:end], last[2, first:end], out[3, first:end], out[4, first:end])
+            _remove_motion(c, s, slope[first:end], turn, mirror)
+        _relative_angle(
+            c, s, last[1, first:end], last[2, first:end], out[3, first:end], out[4, first:end]
+        )
         for p in range(first, end):
             out[0, p] = last[0, p] + out[3, p]
 
@@ -103,7 +107,7 @@ def update_phases(
     def run(start: int, stop: int) -> None:
         for k, steps in enumerate(combined):
             weights = (steps.cosine, steps.sine, steps.turn, steps.mirror)
-            _track(
+            _track_phases(
                 sums[k], index, *weights, sensitivity_rad_per_um[k], last[k], out[k], start, stop
             )
 

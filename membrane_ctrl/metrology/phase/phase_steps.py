@@ -53,7 +53,7 @@ def equal_shifts(steps: int) -> FloatArray:
     return 2 * math.pi * np.arange(steps) / steps
 
 
-def phasors(frames: ArrayLike, shifts_rad: Sequence[float] | FloatArray) -> ComplexArray:
+def compute_phasors(frames: ArrayLike, shifts_rad: Sequence[float] | FloatArray) -> ComplexArray:
     """Phasor C + iS per pixel from a stack of frames (N, ...): its angle is the phase, its length
     the amplitude B.
     """

@@ -2,11 +2,11 @@
 
 import math
 
-from membrane_ctrl.metrology.numerics.compiled import step
+from membrane_ctrl.metrology.numerics.compiled import compile_step
 
 
-@step
-def arctan2(y, x):  # type: ignore[no-untyped-def]
+@compile_step
+def branchless_arctan2(y, x):  # type: ignore[no-untyped-def]
     """Angle in [-pi, pi] without a branch, so that loops over it use vector units; (0, 0) gives 0.
 
     The ratio of the smaller to the larger is halved in angle once, tan(a/2) = t / (1 + sqrt(1 +
@@ -27,8 +27,8 @@ def arctan2(y, x):  # type: ignore[no-untyped-def]
     return -angle if y < 0 else angle
 
 
-@step
-def still(c, s, q, turn, mirror):  # type: ignore[no-untyped-def]
+@compile_step
+def remove_phasor_motion(c, s, q, turn, mirror):  # type: ignore[no-untyped-def]
     """The phasor c + i s without the film's motion, to second order (see `motion`)."""
     half = q * q / 2
     t_re, t_im = 1 - q * turn[0].imag - half * turn[1].real, q * turn[0].real - half * turn[1].imag

@@ -5,10 +5,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from membrane_ctrl.metrology.numerics.compiled import kernel
+from membrane_ctrl.metrology.numerics.compiled import compile_kernel
 from membrane_ctrl.metrology.numerics.threads import split_over_threads
 from membrane_ctrl.metrology.phase.phase_change import StepCombination
-from membrane_ctrl.metrology.phase.phasor_kernels import arctan2, still
+from membrane_ctrl.metrology.phase.phasor_kernels import branchless_arctan2, remove_phasor_motion
 from membrane_ctrl.model.arrays import BoolArray, FloatArray, Image, IntArray, Singles
 
 
@@ -24,8 +24,8 @@ class PixelPhases:
     saturated: BoolArray  # (n,): whether a frame is saturated there
 
 
-@kernel
-def _phases(  # type: ignore[no-untyped-def]
+@compile_kernel
+def _compute_phases(  # type: ignore[no-untyped-def]
     frames, index, fade, weights, design, turn, mirror, slope, reference, limit, out, start, stop
 ):
     """Rows of `out` (2, n): swing (negative where saturated) and rest; `reference` (n,) is replaced
@@ -55,8 +55,8 @@ def _phases(  # type: ignore[no-untyped-def]
                 - s * design[k, 2]
             )
             rest += left * left
-        c, s = still(c, s, slope[p], turn, mirror)
-        wrapped = arctan2(s, c)
+        c, s = remove_phasor_motion(c, s, slope[p], turn, mirror)
+        wrapped = branchless_arctan2(s, c)
         reference[p] = wrapped + 2 * math.pi * math.floor(
             (reference[p] - wrapped) / (2 * math.pi) + 0.5
         )
@@ -101,7 +101,7 @@ def pixel_phases(
     fixed = (fade, np.linalg.pinv(design), design, combined.turn, combined.mirror)
 
     def run(start: int, stop: int) -> None:
-        _phases(
+        _compute_phases(
             flat,
             index,
             *fixed,

@@ -4,12 +4,12 @@ import math
 
 import numpy as np
 
-from membrane_ctrl.metrology.numerics.compiled import kernel
+from membrane_ctrl.metrology.numerics.compiled import compile_kernel
 from membrane_ctrl.model.arrays import BoolArray, FloatArray, IntArray
 
 
-@kernel
-def _flood(phase, mask, out, region, queue):  # type: ignore[no-untyped-def]
+@compile_kernel
+def _flood_region(phase, mask, out, region, queue):  # type: ignore[no-untyped-def]
     """Breadth-first: each pixel takes the period nearest to the neighbour that reached it. Returns
     the regions.
     """
@@ -55,7 +55,9 @@ def unwrap_regions(wrapped_rad: FloatArray, mask: BoolArray) -> tuple[FloatArray
     """
     out = np.full(wrapped_rad.shape, np.nan)
     region = np.full(wrapped_rad.shape, -1, np.int64)
-    _flood(np.ascontiguousarray(wrapped_rad), mask, out, region, np.empty(mask.size, np.int64))
+    _flood_region(
+        np.ascontiguousarray(wrapped_rad), mask, out, region, np.empty(mask.size, np.int64)
+    )
     return out, region
 
 

@@ -20,9 +20,11 @@ def _from_heights() -> tuple[FloatArray, FloatArray, FloatArray]:
     k = np.arange(1024)
     rho, theta = np.sqrt((k + 0.5) / k.size), k * np.pi * (3 - np.sqrt(5))
     x, y = rho * np.cos(theta), rho * np.sin(theta)
-    excess = series.polyval(rho**2, hencky_bowl.excess()) / hencky_bowl.excess_rms()
-    own = zernike.values(x, y).T @ parameter_to_coeffs() + np.outer(excess, np.eye(PARAMETERS)[-1])
-    beyond = series.polyval(rho**2, terms_beyond_fit.beyond().T).T
+    excess = series.polyval(rho**2, hencky_bowl.excess_series()) / hencky_bowl.excess_rms()
+    own = zernike.evaluate_terms(x, y).T @ parameter_to_coeffs() + np.outer(
+        excess, np.eye(PARAMETERS)[-1]
+    )
+    beyond = series.polyval(rho**2, terms_beyond_fit.beyond_series().T).T
     return x, y, np.linalg.pinv(np.hstack([own, beyond]))
 
 

@@ -78,7 +78,7 @@ ALL = (*POSE, *OPTIONAL, LASER)
 NAMES = tuple(parameter.name for parameter in ALL)
 
 
-def sigmas(free: Mapping[str, float] | None = None) -> FloatArray:
+def prior_sigmas(free: Mapping[str, float] | None = None) -> FloatArray:
     """Prior standard deviations (len(NAMES),) in the order of `NAMES`; 0 holds a parameter.
 
     Without `free` only the poses and the laser's scale are free. The command `calibrate` passes a

@@ -82,14 +82,14 @@ def poses_at(stated: Geometry, values: AnyArray) -> Poses:
     in_radians = [np.pi / 180 if parameter.unit == "deg" else 1.0 for parameter in POSE]
     a, b, alpha, x, y, turn_x, turn_y, turn_z, yaw, pitch, roll = values[: len(POSE)] * in_radians
     f0, o0 = stated.pinhole_mm, stated.screen_origin_mm
-    hinge = _hinge(f0, o0)
-    up, back = _turn(hinge, alpha), _turn(hinge, -alpha)
+    hinge = _hinge_axis(f0, o0)
+    up, back = _turn_matrix(hinge, alpha), _turn_matrix(hinge, -alpha)
     rows = stated.screen_axes
     return Poses(
         pinhole_mm=(1 + a / np.linalg.norm(f0)) * (up @ f0),
-        camera=_turns(pitch, yaw, roll) @ stated.rotation @ up.T,
+        camera=_combine_turns(pitch, yaw, roll) @ stated.rotation @ up.T,
         origin_mm=back @ ((1 + b / np.linalg.norm(o0)) * o0 + x * rows[0] + y * rows[1]),
-        screen=_turns(turn_x, turn_y, turn_z) @ rows @ back.T,
+        screen=_combine_turns(turn_x, turn_y, turn_z) @ rows @ back.T,
     )
 
 
@@ -116,7 +116,7 @@ def screen_elsewhere(
     by the six.
     """
     there, rows = bench.geometry, bench.geometry.screen_axes
-    origin_mm, screen = _moved(there.screen_origin_mm, rows, move)
+    origin_mm, screen = _move_screen(there.screen_origin_mm, rows, move)
     by_turn = screen @ rows.T
     derivatives = [
         replace(
@@ -126,19 +126,22 @@ def screen_elsewhere(
     ]
     for step in 1j * _COMPLEX_STEP * np.eye(SCREEN_MOVE):
         parts = (
-            part.imag / _COMPLEX_STEP for part in _moved(there.screen_origin_mm, rows, move + step)
+            part.imag / _COMPLEX_STEP
+            for part in _move_screen(there.screen_origin_mm, rows, move + step)
         )
         derivatives.append(Poses(np.zeros(3), np.zeros((3, 3)), *parts))
     moved = replace(there, screen_origin_mm=origin_mm, screen_s_x=screen[0], screen_s_y=screen[1])
     return replace(bench, geometry=moved), derivatives
 
 
-def _moved(origin_mm: FloatArray, rows: FloatArray, move: AnyArray) -> tuple[AnyArray, AnyArray]:
+def _move_screen(
+    origin_mm: FloatArray, rows: FloatArray, move: AnyArray
+) -> tuple[AnyArray, AnyArray]:
     """A screen's origin and rows after a move."""
-    return origin_mm + rows.T @ move[:3], _turns(*np.pi / 180 * move[3:]) @ rows
+    return origin_mm + rows.T @ move[:3], _combine_turns(*np.pi / 180 * move[3:]) @ rows
 
 
-def _hinge(pinhole_mm: FloatArray, origin_mm: FloatArray) -> FloatArray:
+def _hinge_axis(pinhole_mm: FloatArray, origin_mm: FloatArray) -> FloatArray:
     """Unit vector about which alpha turns."""
     across = np.cross(pinhole_mm, origin_mm)
     length = float(np.linalg.norm(across))
@@ -147,13 +150,13 @@ def _hinge(pinhole_mm: FloatArray, origin_mm: FloatArray) -> FloatArray:
     return across / length
 
 
-def _turns(x: Any, y: Any, z: Any) -> AnyArray:
+def _combine_turns(x: Any, y: Any, z: Any) -> AnyArray:
     """Turns about x, y and z, the last one first."""
     i, j, k = np.eye(3)
-    return np.asarray(_turn(i, x) @ _turn(j, y) @ _turn(k, z))
+    return np.asarray(_turn_matrix(i, x) @ _turn_matrix(j, y) @ _turn_matrix(k, z))
 
 
-def _turn(axis: FloatArray, angle: Any) -> AnyArray:
+def _turn_matrix(axis: FloatArray, angle: Any) -> AnyArray:
     """Rodrigues' matrix of a turn about a unit vector."""
     x, y, z = axis
     cross = np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])

@@ -40,7 +40,7 @@ from membrane_ctrl.metrology.rays.bench_poses import (
 )
 from membrane_ctrl.metrology.rays.geometry import Geometry
 from membrane_ctrl.metrology.rays.lens_derivatives import lens_derivatives
-from membrane_ctrl.metrology.rays.ray_tracing import Points, Tracer, parabola
+from membrane_ctrl.metrology.rays.ray_tracing import Points, Tracer, make_parabola
 from membrane_ctrl.metrology.rays.screen_face import BOW_RADIUS_MM
 from membrane_ctrl.metrology.rays.set_phases import SetPhases
 from membrane_ctrl.metrology.rays.surface import PARAMETERS, Surface
@@ -79,7 +79,7 @@ def place_rays(
     """The set's rays, followed to the surface."""
     points = Points.of(camera_rays(bench.geometry, phases), phases.screen_mm)
     tracer = Tracer(bench.geometry, surface.radius_mm, vertex_z_mm)
-    tracer.start(points, parabola(surface.sag_mm, surface.radius_mm))
+    tracer.start(points, make_parabola(surface.sag_mm, surface.radius_mm))
     tracer.intersect(points, surface, newton=4)  # from some mm: 0.1 mm, 1 nm, 1e-16 mm
     return points
 
@@ -99,7 +99,10 @@ def residual_mm(
         part = phases.subset(some)
         shape = None if isinstance(phases.artefact, SeenScreen) else surface
         points = place_rays(there, part, surface, vertex_z_mm)
-        met = [_meet(there, points, shape, part).screen_mm for part in _parts(points.t_mm.size)]
+        met = [
+            _intersect_screen(there, points, shape, part).screen_mm
+            for part in _split_points(points.t_mm.size)
+        ]
         out[:, some] = part.screen_mm - np.concatenate(met, axis=1) / bench.pitch
     return out
 
@@ -140,12 +143,12 @@ def linearise_points(
     """
     points = place_rays(bench, phases, surface, vertex_z_mm)
     shape = None if isinstance(phases.artefact, SeenScreen) else surface
-    for part in _parts(points.t_mm.size):
-        meet = _meet(bench, points, shape, part)
+    for part in _split_points(points.t_mm.size):
+        meet = _intersect_screen(bench, points, shape, part)
         lens = lens_derivatives(
             bench.geometry, phases.column_px[part], phases.row_px[part], meet.ray
         )
-        derivatives = _derivatives(bench, turns, shape, meet, lens)
+        derivatives = _compute_derivatives(bench, turns, shape, meet, lens)
         # both are small enough to be linear
         by_motion = derivatives[:, MOTION]
         predicted = (
@@ -156,7 +159,7 @@ def linearise_points(
         yield Chunk(part, phases.screen_mm[:, part] - predicted, derivatives)
 
 
-def _parts(count: int) -> Iterator[slice]:
+def _split_points(count: int) -> Iterator[slice]:
     return (slice(first, min(first + _CHUNK, count)) for first in range(0, count, _CHUNK))
 
 
@@ -175,7 +178,9 @@ class _Meeting:
     screen_mm: FloatArray
 
 
-def _meet(bench: BenchGeometry, points: Points, surface: Surface | None, part: slice) -> _Meeting:
+def _intersect_screen(
+    bench: BenchGeometry, points: Points, surface: Surface | None, part: slice
+) -> _Meeting:
     """Reflect the rays and follow them to the face, by Newton's steps from the plane unless it is
     one.
     """
@@ -199,7 +204,7 @@ def _meet(bench: BenchGeometry, points: Points, surface: Surface | None, part: s
     return _Meeting(d, t, place, n, u, k, axes.T @ at, face, at[:2])
 
 
-def _derivatives(
+def _compute_derivatives(
     bench: BenchGeometry, turns: list[Poses], surface: Surface | None, m: _Meeting, lens: FloatArray
 ) -> FloatArray:
     """(2, COLUMNS + further poses, m) by the formulas above, right to left: the effect of a change
@@ -263,7 +268,7 @@ def _by_surface(
         by_terms = by_height[axis] * height - slope
         out[axis, :PARAMETERS], out[axis, BEYOND] = by_terms[:PARAMETERS], by_terms[PARAMETERS:]
     out[:, PARAMETERS] = by_height
-    deeper = np.einsum("j,ajm->am", _deeper(), out[:, :PARAMETERS]) - by_height
+    deeper = np.einsum("j,ajm->am", _sag_direction(), out[:, :PARAMETERS]) - by_height
     out[0, MOTION], out[1, MOTION] = deeper[0] / 2, -deeper[1] / 2
     return by_pinhole, by_ray
 
@@ -276,7 +281,7 @@ def depth_derivative(by_motion: FloatArray) -> FloatArray:
 
 
 @cache
-def _deeper() -> FloatArray:
+def _sag_direction() -> FloatArray:
     """Change (parameters,) of the surface's parameters by 1 mm of sag; the vertex goes down by as
     much.
     """

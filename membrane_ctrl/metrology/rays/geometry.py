@@ -12,7 +12,7 @@ import numpy as np
 
 from membrane_ctrl.config.schema import OpticsConfig
 from membrane_ctrl.config.sight import poses
-from membrane_ctrl.metrology.rays.lens_distortion import distort, undistort
+from membrane_ctrl.metrology.rays.lens_distortion import distort_points, undistort_points
 from membrane_ctrl.metrology.rays.screen_face import Face
 from membrane_ctrl.model.arrays import ArrayLike, FloatArray
 
@@ -62,7 +62,7 @@ class Geometry:
         x = (columns - self.principal_px[0]) / self.focal_px
         y = (rows - self.principal_px[1]) / self.focal_px
         if any(self.distortion):
-            x, y = undistort(x, y, self.distortion)
+            x, y = undistort_points(x, y, self.distortion)
         camera = np.stack([x, y, np.ones_like(x)])
         camera /= np.linalg.norm(camera, axis=0)
         return np.asarray(np.tensordot(self.rotation.T, camera, axes=1))
@@ -83,11 +83,11 @@ class Geometry:
         return np.asarray(origin + np.tensordot(self.screen_axes.T, in_screen, axes=1))
 
 
-def project(geometry: Geometry, world_mm: FloatArray) -> FloatArray:
+def project_points(geometry: Geometry, world_mm: FloatArray) -> FloatArray:
     """Column and row (2, n) of world points (3, n), through the lens."""
     camera = geometry.rotation @ (world_mm - geometry.pinhole_mm[:, None])
     through = camera[:2] / camera[2]
     if any(geometry.distortion):
-        through = distort(through[0], through[1], geometry.distortion)
+        through = distort_points(through[0], through[1], geometry.distortion)
     column, row = geometry.focal_px * through
     return np.stack([column + geometry.principal_px[0], row + geometry.principal_px[1]])

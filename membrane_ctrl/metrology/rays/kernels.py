@@ -15,7 +15,7 @@ import math
 import numpy as np
 
 from membrane_ctrl.metrology.film import hencky_bowl
-from membrane_ctrl.metrology.numerics.compiled import kernel, step
+from membrane_ctrl.metrology.numerics.compiled import compile_kernel, compile_step
 from membrane_ctrl.metrology.rays import screen_face
 from membrane_ctrl.model.zernike_terms import ZERNIKE_DEGREE
 
@@ -30,8 +30,8 @@ PRODUCT_MONOMIALS = (PRODUCT_DEGREE + 1) * (PRODUCT_DEGREE + 2) // 2  # p + q <=
 PRODUCTS = PRODUCT_MONOMIALS + 2 * SLOPE_MONOMIALS + 2
 
 
-@step
-def evaluate(poly, excess, amplitude, x, y):  # type: ignore[no-untyped-def]
+@compile_step
+def evaluate_surface(poly, excess, amplitude, x, y):  # type: ignore[no-untyped-def]
     """Height, dh/dx, dh/dy and the excess' own d/dv at a point in
     radii (Horner's rule in x and y).
     """
@@ -56,8 +56,8 @@ def evaluate(poly, excess, amplitude, x, y):  # type: ignore[no-untyped-def]
     return h + amplitude * e, hx + 2 * amplitude * ev * x, hy + 2 * amplitude * ev * y, ev
 
 
-@kernel
-def _load(rays, t, first, count, block):  # type: ignore[no-untyped-def]
+@compile_kernel
+def _load_block(rays, t, first, count, block):  # type: ignore[no-untyped-def]
     for p in range(count):
         block[0, p] = rays[0, first + p]
         block[1, p] = rays[1, first + p]
@@ -65,8 +65,8 @@ def _load(rays, t, first, count, block):  # type: ignore[no-untyped-def]
         block[3, p] = t[first + p]
 
 
-@kernel
-def _newton(block, count, pinhole, poly, excess, amplitude, radius, vertex_z):  # type: ignore[no-untyped-def]
+@compile_kernel
+def _newton_step(block, count, pinhole, poly, excess, amplitude, radius, vertex_z):  # type: ignore[no-untyped-def]
     """One Newton step on F_z + t d_z = vertex_z + h(x, y); rows of `block` are d_x, d_y, d_z, t.
 
     The derivative along the ray is d_z - h_x d_x - h_y d_y: never 0 for a ray that is steeper than
@@ -75,26 +75,28 @@ def _newton(block, count, pinhole, poly, excess, amplitude, radius, vertex_z):  
     fx, fy, fz = pinhole[0], pinhole[1], pinhole[2]
     for p in range(count):
         dx, dy, dz, t = block[0, p], block[1, p], block[2, p], block[3, p]
-        h, hx, hy, _ev = evaluate(
+        h, hx, hy, _ev = evaluate_surface(
             poly, excess, amplitude, (fx + t * dx) / radius, (fy + t * dy) / radius
         )
         block[3, p] = t - (fz + t * dz - vertex_z - h) / (dz - (hx * dx + hy * dy) / radius)
 
 
-@kernel
-def intersect(rays, t, pinhole, poly, excess, amplitude, radius, vertex_z, newton, start, stop):  # type: ignore[no-untyped-def]
+@compile_kernel
+def intersect_surface(  # type: ignore[no-untyped-def]
+    rays, t, pinhole, poly, excess, amplitude, radius, vertex_z, newton, start, stop
+):
     """Newton steps towards the surface, in place in `t`."""
     block = np.empty((4, _BLOCK))
     for first in range(start, stop, _BLOCK):
         count = min(_BLOCK, stop - first)
-        _load(rays, t, first, count, block)
+        _load_block(rays, t, first, count, block)
         for _ in range(newton):
-            _newton(block, count, pinhole, poly, excess, amplitude, radius, vertex_z)
+            _newton_step(block, count, pinhole, poly, excess, amplitude, radius, vertex_z)
         t[first : first + count] = block[3, :count]
 
 
-@step
-def bisector(dx, dy, dz, qx, qy, qz):  # type: ignore[no-untyped-def]
+@compile_step
+def bisector_slopes(dx, dy, dz, qx, qy, qz):  # type: ignore[no-untyped-def]
     """Slopes of the mirror that turns the ray d towards q: its normal halves the angle between -d
     and q.
     """
@@ -103,7 +105,7 @@ def bisector(dx, dy, dz, qx, qy, qz):  # type: ignore[no-untyped-def]
     return -(qx * scale - dx) / nz, -(qy * scale - dy) / nz
 
 
-@step
+@compile_step
 def measured_slope(rays, t, screen, w, pinhole, plane, p):  # type: ignore[no-untyped-def]
     """x, y and both measured slopes at point p, from exact vectors; the screen point is w off the
     plane.
@@ -113,7 +115,7 @@ def measured_slope(rays, t, screen, w, pinhole, plane, p):  # type: ignore[no-un
     y = pinhole[1] + t[p] * dy
     z = pinhole[2] + t[p] * dz
     a, b = screen[0, p], screen[1, p]
-    gx, gy = bisector(
+    gx, gy = bisector_slopes(
         dx,
         dy,
         dz,
@@ -124,8 +126,8 @@ def measured_slope(rays, t, screen, w, pinhole, plane, p):  # type: ignore[no-un
     return x, y, gx, gy
 
 
-@kernel
-def _lift(screen, face, first, count, out):  # type: ignore[no-untyped-def]
+@compile_kernel
+def _look_up_face(screen, face, first, count, out):  # type: ignore[no-untyped-def]
     """Deviation of the face at some points, in a separate loop: a look-up prevents vector
     instructions.
     """
@@ -136,7 +138,7 @@ def _lift(screen, face, first, count, out):  # type: ignore[no-untyped-def]
         out[k], _wa, _wb = screen_face.face_height(face, screen[0, first + k], screen[1, first + k])
 
 
-@kernel
+@compile_kernel
 def _add_moments(values, x, powers_y, count, sums, first):  # type: ignore[no-untyped-def]
     """sums[first + k] += sum over points of values x^p y^q, p outer, q inner, p + q < rows of
     powers_y.
@@ -156,8 +158,8 @@ def _add_moments(values, x, powers_y, count, sums, first):  # type: ignore[no-un
             values[p] *= x[p]
 
 
-@kernel
-def _powers(y, powers_y, count):  # type: ignore[no-untyped-def]
+@compile_kernel
+def _compute_powers(y, powers_y, count):  # type: ignore[no-untyped-def]
     for p in range(count):
         powers_y[0, p] = 1.0
     for j in range(1, powers_y.shape[0]):
@@ -165,7 +167,7 @@ def _powers(y, powers_y, count):  # type: ignore[no-untyped-def]
             powers_y[j, p] = powers_y[j - 1, p] * y[p]
 
 
-@kernel
+@compile_kernel
 def residual_sums(  # type: ignore[no-untyped-def]
     rays, t, screen, weights, pinhole, plane, face, poly, excess, amplitude, radius, start, stop
 ):
@@ -186,12 +188,12 @@ def residual_sums(  # type: ignore[no-untyped-def]
         x_square = 0.0
         y_square = 0.0
         w_sum = 0.0
-        _lift(screen, face, first, count, off)
+        _look_up_face(screen, face, first, count, off)
         for k in range(count):
             x, y, gx, gy = measured_slope(rays, t, screen, off[k], pinhole, plane, first + k)
             xs[k] = x / radius
             ys[k] = y / radius
-            _h, hx, hy, ev = evaluate(poly, excess, amplitude, xs[k], ys[k])
+            _h, hx, hy, ev = evaluate_surface(poly, excess, amplitude, xs[k], ys[k])
             w = weights[first + k]
             ax = gx - hx / radius
             ay = gy - hy / radius
@@ -207,13 +209,13 @@ def residual_sums(  # type: ignore[no-untyped-def]
         sums[2 * SLOPE_MONOMIALS + 2] += x_square
         sums[2 * SLOPE_MONOMIALS + 3] += y_square
         sums[2 * SLOPE_MONOMIALS + 4] += w_sum
-        _powers(ys, powers_y, count)
+        _compute_powers(ys, powers_y, count)
         _add_moments(rx, xs, powers_y, count, sums, 0)
         _add_moments(ry, xs, powers_y, count, sums, SLOPE_MONOMIALS)
     return sums
 
 
-@kernel
+@compile_kernel
 def product_sums(rays, t, weights, pinhole, excess, radius, start, stop):  # type: ignore[no-untyped-def]
     """Moments from which the normal matrix is made.
 
@@ -231,13 +233,13 @@ def product_sums(rays, t, weights, pinhole, excess, radius, start, stop):  # typ
             p = first + k
             xs[k] = (pinhole[0] + t[p] * rays[0, p]) / radius
             ys[k] = (pinhole[1] + t[p] * rays[1, p]) / radius
-            _h, _hx, _hy, ev = evaluate(flat, excess, 0.0, xs[k], ys[k])
+            _h, _hx, _hy, ev = evaluate_surface(flat, excess, 0.0, xs[k], ys[k])
             ws[k] = weights[p]
             ex[k] = weights[p] * ev * xs[k]
             ey[k] = weights[p] * ev * ys[k]
             sums[PRODUCTS - 2] += ex[k] * ev * xs[k]
             sums[PRODUCTS - 1] += ey[k] * ev * ys[k]
-        _powers(ys, powers_y, count)
+        _compute_powers(ys, powers_y, count)
         _add_moments(ws, xs, powers_y, count, sums, 0)
         _add_moments(ex, xs, powers_y[:ZERNIKE_DEGREE], count, sums, PRODUCT_MONOMIALS)
         _add_moments(
@@ -246,7 +248,7 @@ def product_sums(rays, t, weights, pinhole, excess, radius, start, stop):  # typ
     return sums
 
 
-@kernel
+@compile_kernel
 def slope_field(  # type: ignore[no-untyped-def]
     rays, t, screen, pinhole, plane, face, poly, excess, amplitude, radius, out, start, stop
 ):
@@ -254,11 +256,11 @@ def slope_field(  # type: ignore[no-untyped-def]
     off = np.empty(_BLOCK)
     for first in range(start, stop, _BLOCK):
         count = min(_BLOCK, stop - first)
-        _lift(screen, face, first, count, off)
+        _look_up_face(screen, face, first, count, off)
         for k in range(count):
             p = first + k
             x, y, gx, gy = measured_slope(rays, t, screen, off[k], pinhole, plane, p)
-            _h, hx, hy, _ev = evaluate(poly, excess, amplitude, x / radius, y / radius)
+            _h, hx, hy, _ev = evaluate_surface(poly, excess, amplitude, x / radius, y / radius)
             out[0, p] = x
             out[1, p] = y
             out[2, p] = gx
@@ -267,7 +269,7 @@ def slope_field(  # type: ignore[no-untyped-def]
             out[5, p] = hy / radius
 
 
-@kernel
+@compile_kernel
 def predict_screen(  # type: ignore[no-untyped-def]
     rays, t, pinhole, plane, face, poly, excess, amplitude, radius, out, start, stop
 ):
@@ -283,7 +285,7 @@ def predict_screen(  # type: ignore[no-untyped-def]
             x = pinhole[0] + t[p] * dx
             y = pinhole[1] + t[p] * dy
             z = pinhole[2] + t[p] * dz
-            _h, hx, hy, _ev = evaluate(poly, excess, amplitude, x / radius, y / radius)
+            _h, hx, hy, _ev = evaluate_surface(poly, excess, amplitude, x / radius, y / radius)
             nx, ny = -hx / radius, -hy / radius
             turn = 2 * (dx * nx + dy * ny + dz) / (nx * nx + ny * ny + 1)
             ux, uy, uz = dx - turn * nx, dy - turn * ny, dz - turn
@@ -298,7 +300,7 @@ def predict_screen(  # type: ignore[no-untyped-def]
         _onto_face(out, tangents, face, first, count)
 
 
-@kernel
+@compile_kernel
 def _onto_face(out, tangents, face, first, count):  # type: ignore[no-untyped-def]
     """From where rays cross the plane to where they meet the face, by Newton's steps on w = face(s
     + w tangent).

@@ -13,7 +13,7 @@ from membrane_ctrl.metrology.rays.surface import Surface
 from membrane_ctrl.model.arrays import BoolArray, FloatArray, IntArray
 
 HeightFunction = Callable[[FloatArray, FloatArray], FloatArray]  # x_mm, y_mm -> h_mm
-_EXCESS = hencky_bowl.excess() / hencky_bowl.excess_rms()
+_EXCESS = hencky_bowl.excess_series() / hencky_bowl.excess_rms()
 
 
 @dataclass
@@ -75,7 +75,7 @@ class Tracer:
         shape = surface.polynomial, surface.excess, 1.0, self.radius_mm
 
         def run(start: int, stop: int) -> None:
-            kernels.intersect(
+            kernels.intersect_surface(
                 points.rays,
                 points.t_mm,
                 self._pinhole,
@@ -96,7 +96,9 @@ class Tracer:
 
         def run(start: int, stop: int) -> FloatArray:
             rays, t = points.rays, points.t_mm
-            kernels.intersect(rays, t, self._pinhole, *shape, self.vertex_z_mm, newton, start, stop)
+            kernels.intersect_surface(
+                rays, t, self._pinhole, *shape, self.vertex_z_mm, newton, start, stop
+            )
             fixed = (
                 rays,
                 t,
@@ -175,6 +177,6 @@ class Tracer:
         )
 
 
-def parabola(sag_mm: float, radius_mm: float) -> HeightFunction:
+def make_parabola(sag_mm: float, radius_mm: float) -> HeightFunction:
     """The paper's starting shape."""
     return lambda x, y: sag_mm * (x * x + y * y) / radius_mm**2

@@ -10,7 +10,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from membrane_ctrl.metrology.rays.geometry import Geometry, project
+from membrane_ctrl.metrology.rays.geometry import Geometry, project_points
 from membrane_ctrl.model.arrays import FloatArray
 
 _POINTS = 180
@@ -63,7 +63,7 @@ def find_outline(
     """
     theta = 2 * np.pi * np.arange(_POINTS) / _POINTS
     circle = np.stack([rim_mm * np.cos(theta), rim_mm * np.sin(theta), np.full(_POINTS, rim_z_mm)])
-    expected = project(geometry, circle)
+    expected = project_points(geometry, circle)
     middle = expected.mean(axis=1)
     reach = np.linspace(_FROM, _TO, _SAMPLES)
     lines = middle[:, None, None] + (expected - middle[:, None])[:, :, None] * reach

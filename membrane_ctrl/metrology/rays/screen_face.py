@@ -12,7 +12,7 @@ from typing import NamedTuple
 import numpy as np
 
 from membrane_ctrl.config.optics import HeightMapConfig, ScreenPoseConfig
-from membrane_ctrl.metrology.numerics.compiled import kernel, step
+from membrane_ctrl.metrology.numerics.compiled import compile_kernel, compile_step
 from membrane_ctrl.model.arrays import FloatArray
 
 BOW_RADIUS_MM = 200.0  # where `bow_mm` is counted: half the paper's pattern, rounded
@@ -33,7 +33,7 @@ class Face(NamedTuple):
     def of(cls, screen: ScreenPoseConfig | None) -> "Face":
         """The face that a configuration describes; a plane for None."""
         bow_mm = 0.0 if screen is None else screen.bow_mm
-        cells, low, pitch = _cells(None if screen is None else screen.height_map)
+        cells, low, pitch = _make_cells(None if screen is None else screen.height_map)
         return cls(bow_mm / BOW_RADIUS_MM**2, cells, low, pitch)
 
     @property
@@ -47,22 +47,24 @@ class Face(NamedTuple):
         """
         flat = np.ascontiguousarray(screen_mm.reshape(2, -1))
         out = np.empty((3, flat.shape[1]))
-        _heights(self, flat, out)
+        _evaluate_heights(self, flat, out)
         return out.reshape(3, *screen_mm.shape[1:])
 
 
-def _cells(config: HeightMapConfig | None) -> tuple[FloatArray, FloatArray, FloatArray]:
+def _make_cells(config: HeightMapConfig | None) -> tuple[FloatArray, FloatArray, FloatArray]:
     """Cells, first nodes and distances of the nodes of a map."""
     if config is None:
         return np.zeros((0, 0, _ORDER, _ORDER)), np.zeros(2), np.ones(2)
-    along_y = _taylor(np.array(config.heights_mm), np.array(config.s_y_mm))
-    both = _taylor(along_y.transpose(2, 0, 1), np.array(config.s_x_mm))  # column, n, row, m
+    along_y = _spline_coefficients(np.array(config.heights_mm), np.array(config.s_y_mm))
+    both = _spline_coefficients(
+        along_y.transpose(2, 0, 1), np.array(config.s_x_mm)
+    )  # column, n, row, m
     ends = np.array([(axis[0], axis[-1], len(axis) - 1) for axis in (config.s_x_mm, config.s_y_mm)])
     cells = np.ascontiguousarray(both.transpose(2, 0, 3, 1))
     return cells, ends[:, 0].copy(), (ends[:, 1] - ends[:, 0]) / ends[:, 2]
 
 
-def _taylor(values: FloatArray, nodes_mm: FloatArray) -> FloatArray:
+def _spline_coefficients(values: FloatArray, nodes_mm: FloatArray) -> FloatArray:
     """Coefficients (cells, 4, ...) of the spline through values (nodes, ...), in powers of the
     share of a cell.
     """
@@ -79,13 +81,13 @@ def _taylor(values: FloatArray, nodes_mm: FloatArray) -> FloatArray:
     return out
 
 
-@step
+@compile_step
 def is_plane(face):  # type: ignore[no-untyped-def]
     """Whether nothing stands off."""
     return face.bow_per_mm == 0 and face.cells_mm.shape[0] == 0
 
 
-@step
+@compile_step
 def face_height(face, a, b):  # type: ignore[no-untyped-def]
     """w, dw/ds_x and dw/ds_y at a point."""
     w = face.bow_per_mm * (a * a + b * b)
@@ -118,7 +120,7 @@ def face_height(face, a, b):  # type: ignore[no-untyped-def]
     return w, wa, wb
 
 
-@kernel
-def _heights(face, screen_mm, out):  # type: ignore[no-untyped-def]
+@compile_kernel
+def _evaluate_heights(face, screen_mm, out):  # type: ignore[no-untyped-def]
     for p in range(screen_mm.shape[1]):
         out[0, p], out[1, p], out[2, p] = face_height(face, screen_mm[0, p], screen_mm[1, p])

@@ -53,13 +53,17 @@ class Surface:
     @cached_property
     def polynomial(self) -> FloatArray:
         """The Zernike part as a polynomial (degree + 1, degree + 1) in x / R, y / R."""
-        return zernike.polynomial(self.coeffs_mm)
+        return zernike.sum_polynomial(self.coeffs_mm)
 
     @cached_property
     def excess(self) -> FloatArray:
         """The excess as a power series in (r / R)^2, in mm."""
-        own = self.hencky_mm * hencky_bowl.excess()
-        return own + np.array(self.beyond_mm) @ terms_beyond_fit.beyond() if self.beyond_mm else own
+        own = self.hencky_mm * hencky_bowl.excess_series()
+        return (
+            own + np.array(self.beyond_mm) @ terms_beyond_fit.beyond_series()
+            if self.beyond_mm
+            else own
+        )
 
     @property
     def sag_mm(self) -> float:
@@ -117,14 +121,14 @@ def parameter_to_coeffs() -> FloatArray:
     out = np.zeros((ZERNIKE_TERMS, PARAMETERS))
     out[1:, :-1] = np.eye(ZERNIKE_TERMS - 1)
     out[0, :-1] = -zernike.at_vertex()[1:]
-    out[0, -1] = -hencky_bowl.excess()[0] / hencky_bowl.excess_rms()
+    out[0, -1] = -hencky_bowl.excess_series()[0] / hencky_bowl.excess_rms()
     return out
 
 
 @cache
 def sag_gradient() -> FloatArray:
     """d sag / d parameters (parameters,): mean over the rim minus the vertex, term by term."""
-    excess = hencky_bowl.excess()
+    excess = hencky_bowl.excess_series()
     rim_minus_vertex = (excess.sum() - excess[0]) / hencky_bowl.excess_rms()
     return np.append((zernike.at_rim() - zernike.at_vertex())[1:], rim_minus_vertex)
 
@@ -139,8 +143,8 @@ def height_probe() -> FloatArray:
     k = np.arange(512)
     rho, theta = np.sqrt((k + 0.5) / 511.5), k * np.pi * (3 - np.sqrt(5))
     x, y = rho * np.cos(theta), rho * np.sin(theta)
-    excess = series.polyval(rho**2, hencky_bowl.excess()) / hencky_bowl.excess_rms()
-    terms = np.vstack([zernike.values(x, y), excess])
+    excess = series.polyval(rho**2, hencky_bowl.excess_series()) / hencky_bowl.excess_rms()
+    terms = np.vstack([zernike.evaluate_terms(x, y), excess])
     return np.asarray(
         terms[:-1].T @ parameter_to_coeffs() + np.outer(terms[-1], np.eye(PARAMETERS)[-1])
     )

@@ -16,10 +16,10 @@ def evaluate_basis(x: FloatArray, y: FloatArray) -> tuple[FloatArray, FloatArray
     vertex.
     """
     v = x * x + y * y
-    excess = hencky_bowl.excess() / hencky_bowl.excess_rms()
+    excess = hencky_bowl.excess_series() / hencky_bowl.excess_rms()
     bowl = series.polyval(v, excess) - excess[0]
     grows = 2 * series.polyval(v, series.polyder(excess))
-    powers, tables = _monomials(x, y), _tables()
+    powers, tables = _evaluate_monomials(x, y), _term_tables()
     heights, slopes_x, slopes_y = (table @ powers for table in tables)
     heights -= zernike.at_vertex()[1:, None]
     return (
@@ -33,13 +33,13 @@ def evaluate_round_basis(x: FloatArray, y: FloatArray) -> tuple[FloatArray, Floa
     """Heights and slopes (k, n) of the terms of `film_law.BEYOND` in radii,
     each 0 at the vertex.
     """
-    v, terms = x * x + y * y, terms_beyond_fit.beyond()
+    v, terms = x * x + y * y, terms_beyond_fit.beyond_series()
     heights = [series.polyval(v, term) for term in terms]
     grows = np.array([2 * series.polyval(v, series.polyder(term)) for term in terms])
     return np.array(heights), grows * x, grows * y
 
 
-def _monomials(x: FloatArray, y: FloatArray) -> FloatArray:
+def _evaluate_monomials(x: FloatArray, y: FloatArray) -> FloatArray:
     """x^p y^q, p + q <= ZERNIKE_DEGREE, p outer, (terms, n)."""
     out, column = [], np.ones_like(x)
     for p in range(ZERNIKE_DEGREE + 1):
@@ -52,15 +52,15 @@ def _monomials(x: FloatArray, y: FloatArray) -> FloatArray:
 
 
 @cache
-def _tables() -> tuple[FloatArray, FloatArray, FloatArray]:
+def _term_tables() -> tuple[FloatArray, FloatArray, FloatArray]:
     """Z_j, dZ_j/dx and dZ_j/dy, j = 2, 3, ..., as coefficients (terms - 1,
-    terms) of `_monomials`.
+    terms) of `_evaluate_monomials`.
     """
     p, q = np.array(
         [(p, q) for p in range(ZERNIKE_DEGREE + 1) for q in range(ZERNIKE_DEGREE + 1 - p)]
     ).T
     table = zernike.monomial_table()
     height, of_x, of_y = (
-        t[1:, p, q] for t in (table, *(zernike.differentiate(table, axis) for axis in (1, 2)))
+        t[1:, p, q] for t in (table, *(zernike.differentiate_table(table, axis) for axis in (1, 2)))
     )
     return np.ascontiguousarray(height), np.ascontiguousarray(of_x), np.ascontiguousarray(of_y)

@@ -13,7 +13,7 @@ Source: R. Southwell's model of slopes, J. Opt. Soc. Am. 70, 998 (1980); A. Bran
 
 import numpy as np
 
-from membrane_ctrl.metrology.numerics.compiled import kernel
+from membrane_ctrl.metrology.numerics.compiled import compile_kernel
 from membrane_ctrl.model.arrays import FloatArray
 
 _COARSEST = 8
@@ -22,8 +22,8 @@ _COARSEST = 8
 _OVER_CORRECTION = 1.8
 
 
-@kernel
-def _smooth(right, down, rhs, h, forward):  # type: ignore[no-untyped-def]
+@compile_kernel
+def _smooth_sweep(right, down, rhs, h, forward):  # type: ignore[no-untyped-def]
     """One Gauss-Seidel sweep; `right[i, j]` links (i, j) to (i, j + 1), `down[i, j]` to (i + 1,
     j).
     """
@@ -50,8 +50,8 @@ def _smooth(right, down, rhs, h, forward):  # type: ignore[no-untyped-def]
                 h[i, j] = (rhs[i, j] + total) / weight
 
 
-@kernel
-def _apply(right, down, h, out):  # type: ignore[no-untyped-def]
+@compile_kernel
+def _apply_laplacian(right, down, h, out):  # type: ignore[no-untyped-def]
     """The Laplacian of h."""
     rows, columns = h.shape
     out[:, :] = 0.0
@@ -67,22 +67,22 @@ def _apply(right, down, h, out):  # type: ignore[no-untyped-def]
                 out[i + 1, j] -= flow
 
 
-@kernel
-def _restrict(fine, coarse):  # type: ignore[no-untyped-def]
+@compile_kernel
+def _restrict_to_coarse(fine, coarse):  # type: ignore[no-untyped-def]
     coarse[:, :] = 0.0
     for i in range(fine.shape[0]):
         for j in range(fine.shape[1]):
             coarse[i // 2, j // 2] += fine[i, j]
 
 
-@kernel
-def _prolong(coarse, fine, scale):  # type: ignore[no-untyped-def]
+@compile_kernel
+def _prolong_to_fine(coarse, fine, scale):  # type: ignore[no-untyped-def]
     for i in range(fine.shape[0]):
         for j in range(fine.shape[1]):
             fine[i, j] += scale * coarse[i // 2, j // 2]
 
 
-@kernel
+@compile_kernel
 def _coarser_links(right, down, coarse_right, coarse_down):  # type: ignore[no-untyped-def]
     """Links that cross from one joined cell to the next, summed."""
     rows, columns = right.shape
@@ -132,7 +132,7 @@ class MaskedLaplacian:
             direction *= product / last
             direction += z
             last = product
-            _apply(*self._links[0], direction, out)
+            _apply_laplacian(*self._links[0], direction, out)
             step = product / float(np.vdot(direction, out))
             h += step * direction
             residual -= step * out
@@ -143,16 +143,16 @@ class MaskedLaplacian:
         right, down = self._links[level]
         h, residual, _ = self._memory[level]
         h[:] = 0.0
-        _smooth(right, down, rhs, h, True)
+        _smooth_sweep(right, down, rhs, h, True)
         if level + 1 == len(self._links):
             for _ in range(2 * _COARSEST):
-                _smooth(right, down, rhs, h, False)
-                _smooth(right, down, rhs, h, True)
+                _smooth_sweep(right, down, rhs, h, False)
+                _smooth_sweep(right, down, rhs, h, True)
         else:
-            _apply(right, down, h, residual)
+            _apply_laplacian(right, down, h, residual)
             np.subtract(rhs, residual, out=residual)
             coarse = self._memory[level + 1][2]
-            _restrict(residual, coarse)
-            _prolong(self._cycle(level + 1, coarse), h, _OVER_CORRECTION)
-        _smooth(right, down, rhs, h, False)
+            _restrict_to_coarse(residual, coarse)
+            _prolong_to_fine(self._cycle(level + 1, coarse), h, _OVER_CORRECTION)
+        _smooth_sweep(right, down, rhs, h, False)
         return np.asarray(h)

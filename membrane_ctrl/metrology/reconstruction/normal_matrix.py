@@ -34,7 +34,8 @@ def slope_tables() -> tuple[FloatArray, FloatArray]:
     each, on the unit disc."""
     rows, columns = np.array(_POWERS).T
     tables = [
-        zernike.differentiate(zernike.monomial_table(), axis)[1:, rows, columns] for axis in (1, 2)
+        zernike.differentiate_table(zernike.monomial_table(), axis)[1:, rows, columns]
+        for axis in (1, 2)
     ]
     return tables[0], tables[1]
 
@@ -67,9 +68,9 @@ class NormalMatrix:
         """From the moments of `kernels.product_sums`. Raises ValueError if the points do not
         determine a surface.
         """
-        x, y = _assemble(products, radius_mm)
+        x, y = _assemble_matrix(products, radius_mm)
         inverse = x + y
-        if not matrix_inverse.invert(inverse):
+        if not matrix_inverse.invert_in_place(inverse):
             raise ValueError(
                 f"the measured points do not determine the {PARAMETERS} parameters of the surface"
             )
@@ -80,7 +81,7 @@ class NormalMatrix:
         return np.asarray(self.inverse @ right)
 
 
-def _assemble(products: FloatArray, radius_mm: float) -> tuple[FloatArray, FloatArray]:
+def _assemble_matrix(products: FloatArray, radius_mm: float) -> tuple[FloatArray, FloatArray]:
     count = kernels.PRODUCT_MONOMIALS
     hankel = products[:count][_product_index()]
     crosses = products[count : count + _M], products[count + _M : count + 2 * _M]

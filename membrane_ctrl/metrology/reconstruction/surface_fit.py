@@ -41,7 +41,7 @@ class Fit:
     weight_sum: float  # sum of the weights
 
 
-def solve(
+def fit_surface(
     tracer: Tracer,
     points: Points,
     start: HeightFunction | Surface,
@@ -76,7 +76,7 @@ def solve(
     changes: list[float] = []
     step = None
     while len(changes) < max_iterations:
-        step = _step(tracer, points, surface, normal, newton=0 if placed else 1)
+        step = _gauss_newton_step(tracer, points, surface, normal, newton=0 if placed else 1)
         placed = False
         surface = Surface.from_parameters(surface.parameters + step.delta, tracer.radius_mm)
         changes.append(float(np.max(np.abs(height_probe() @ step.delta))))
@@ -105,7 +105,7 @@ class _Step:
     delta: FloatArray
 
 
-def _step(
+def _gauss_newton_step(
     tracer: Tracer, points: Points, surface: Surface, normal: NormalMatrix | None, newton: int
 ) -> _Step:
     """One Gauss-Newton step, after moving the points onto the surface by Newton steps (0: they

@@ -67,13 +67,15 @@ def select_points(
     if index.size < _MIN_POINTS:
         raise ValueError(f"only {index.size} bins see the pattern in the mirror")
     points = ray_tracing.Points.of(grid.rays[:, index], screen_scale.screen_mm(phase_rad, pattern))
-    fit = surface_fit.solve(tracer, points, ray_tracing.parabola(_START_SAG_MM, tracer.radius_mm))
+    fit = surface_fit.fit_surface(
+        tracer, points, ray_tracing.make_parabola(_START_SAG_MM, tracer.radius_mm)
+    )
     for wanted in (_inside_radius, _without_outliers):
         keep = wanted(tracer, points, fit.surface, analysis_radius_mm)
         points, index, phase_rad = points.subset(keep), index[keep], phase_rad[:, keep]
         if index.size < _MIN_POINTS:
             raise ValueError(f"only {index.size} bins see the pattern inside the analysis radius")
-        fit = surface_fit.solve(tracer, points, fit.surface)
+        fit = surface_fit.fit_surface(tracer, points, fit.surface)
     tracer.intersect(points, fit.surface)
     field = tracer.slope_field(points, fit.surface)
     # area of the mirror, seen from above, in a bundle of rays: solid angle t^2 / |d . (-h_x, -h_y,

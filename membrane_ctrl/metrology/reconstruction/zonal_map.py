@@ -12,7 +12,7 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 
-from membrane_ctrl.metrology.numerics.compiled import kernel
+from membrane_ctrl.metrology.numerics.compiled import compile_kernel
 from membrane_ctrl.metrology.numerics.threads import split_over_threads
 from membrane_ctrl.metrology.reconstruction.masked_laplacian import MaskedLaplacian
 from membrane_ctrl.model.arrays import FloatArray
@@ -53,8 +53,8 @@ class ResidualGrid:
         )
 
 
-@kernel
-def _scatter(field, weights, first_mm, step_mm, sums, start, stop):  # type: ignore[no-untyped-def]
+@compile_kernel
+def _scatter_samples(field, weights, first_mm, step_mm, sums, start, stop):  # type: ignore[no-untyped-def]
     n = sums.shape[1]
     for p in range(start, stop):
         w = weights[p]
@@ -88,7 +88,7 @@ def residual_grid(field: FloatArray, weights: FloatArray, radius_mm: float) -> R
 
     def run(start: int, stop: int) -> FloatArray:
         sums = np.zeros((3, axis.size, axis.size))
-        _scatter(field, weights, axis[0], axis[1] - axis[0], sums, start, stop)
+        _scatter_samples(field, weights, axis[0], axis[1] - axis[0], sums, start, stop)
         return sums
 
     sums, *others = split_over_threads(run, field.shape[1])

@@ -10,7 +10,7 @@ from functools import cached_property
 
 import numpy as np
 
-from membrane_ctrl.metrology.numerics.compiled import kernel
+from membrane_ctrl.metrology.numerics.compiled import compile_kernel
 from membrane_ctrl.model.arrays import AnyArray, BoolArray, IntArray, Singles
 
 _SIDE = 4  # bins along a cell's side: planes are 1 % off for the highest terms at the rim
@@ -99,8 +99,8 @@ class Cells:
         )
 
 
-@kernel
-def combine(slow, factors, start, planes):  # type: ignore[no-untyped-def]
+@compile_kernel
+def combine_planes(slow, factors, start, planes):  # type: ignore[no-untyped-def]
     """Planes (3 x 64) of a block's cells: of level `start`, plus (k, 3 x 64) times their factors
     (k,).
     """
@@ -110,8 +110,8 @@ def combine(slow, factors, start, planes):  # type: ignore[no-untyped-def]
             planes[q] += factors[k] * slow[k, q]
 
 
-@kernel
-def project(slow, planes, out):  # type: ignore[no-untyped-def]
+@compile_kernel
+def project_planes(slow, planes, out):  # type: ignore[no-untyped-def]
     """Add the products (k,) of planes (3 x 64) with others (k, 3 x 64)."""
     for k in range(out.size):
         total = np.float32(0)
@@ -120,8 +120,8 @@ def project(slow, planes, out):  # type: ignore[no-untyped-def]
         out[k] += total
 
 
-@kernel
-def spread(planes, offset, out):  # type: ignore[no-untyped-def]
+@compile_kernel
+def spread_planes(planes, offset, out):  # type: ignore[no-untyped-def]
     """Values (16, 64) of a block's bins on the planes of its cells."""
     for j in range(CELL_BINS):
         for q in range(BLOCK_CELLS):
@@ -132,8 +132,8 @@ def spread(planes, offset, out):  # type: ignore[no-untyped-def]
             )
 
 
-@kernel
-def moments(values, offset, planes):  # type: ignore[no-untyped-def]
+@compile_kernel
+def compute_moments(values, offset, planes):  # type: ignore[no-untyped-def]
     """Moments of values (16, 64) over a block's cells."""
     planes[:] = 0
     for j in range(CELL_BINS):

@@ -79,7 +79,7 @@ class FrameFitter:
         self._basis = self._cells.planes(scene.basis)
         self.light_adu = scene.light_adu.astype(np.float32)
         self._traced = scene.surface
-        self._base = _reduced(scene.phase_rad(scene.surface))
+        self._base = _reduce_phase(scene.phase_rad(scene.surface))
         self._inverse: FloatArray | None = None
         self._out = np.empty((4, scene.index.size), np.float32)
         self._slow, self._pull = (
@@ -171,7 +171,7 @@ class FrameFitter:
         moved = shape.parameters - self._traced.parameters
         if np.max(np.abs(height_probe() @ moved)) > _LINEAR_MM:
             self._traced, moved = shape, np.zeros(PARAMETERS)
-            self._base = _reduced(self.scene.phase_rad(shape))
+            self._base = _reduce_phase(self.scene.phase_rad(shape))
         changes, shifts = (
             np.vstack([moved, light]).astype(np.float32),
             np.array(shifts_rad, np.float32),
@@ -221,7 +221,7 @@ class FrameFitter:
         matrix[_UNKNOWNS:, _UNKNOWNS:] = (bands * weights) @ bands.T
         scale = 1 / np.sqrt(np.maximum(np.diag(matrix), 1e-30))
         matrix *= np.outer(scale, scale)
-        if not matrix_inverse.invert(matrix):
+        if not matrix_inverse.invert_in_place(matrix):
             return None
         return np.asarray(matrix * np.outer(scale, scale))
 
@@ -287,6 +287,6 @@ class FrameFitter:
         return np.stack([1e3 * np.linalg.solve(matrix, 2 * math.pi * j.sum(axis=1)) for j in means])
 
 
-def _reduced(phase_rad: FloatArray) -> Singles:
+def _reduce_phase(phase_rad: FloatArray) -> Singles:
     """Phases within one turn, where single precision is worth 1e-7 rad."""
     return np.asarray(np.remainder(phase_rad, 2 * math.pi), np.float32)

@@ -2,17 +2,17 @@
 
 import numpy as np
 
-from membrane_ctrl.metrology.numerics.compiled import kernel
+from membrane_ctrl.metrology.numerics.compiled import compile_kernel
 from membrane_ctrl.metrology.numerics.fast_cosine import cos_sin
 from membrane_ctrl.metrology.rays.surface import PARAMETERS
 from membrane_ctrl.metrology.tracking.bin_cells import (
     BLOCK_BINS,
     BLOCK_CELLS,
     CELL_BINS,
-    combine,
-    moments,
-    project,
-    spread,
+    combine_planes,
+    compute_moments,
+    project_planes,
+    spread_planes,
 )
 
 _AT = (
@@ -28,8 +28,8 @@ _AT = (
 _TRUSTED = np.float32(0.6)
 
 
-@kernel
-def _light(rows, base, light, response, begin):  # type: ignore[no-untyped-def]
+@compile_kernel
+def _compute_light(rows, base, light, response, begin):  # type: ignore[no-untyped-def]
     """Derivatives of the light of a block's bins, as in `light_waves`, in place of the changes of
     phases and maps.
     """
@@ -58,9 +58,9 @@ def _light(rows, base, light, response, begin):  # type: ignore[no-untyped-def]
         rows[5 * BLOCK_BINS + k] = level + swing_x * cx + swing_y * cy
 
 
-@kernel
-def _weigh(rows, edge, gain, seen, reach, begin):  # type: ignore[no-untyped-def]
-    """Turn what `_light` leaves into e w r times the derivatives (5 rows), then `out` of
+@compile_kernel
+def _weigh_derivatives(rows, edge, gain, seen, reach, begin):  # type: ignore[no-untyped-def]
+    """Turn what `_compute_light` leaves into e w r times the derivatives (5 rows), then `out` of
     `light_left` (4 rows).
     """
     zero, one = np.float32(0), np.float32(1)
@@ -79,20 +79,20 @@ def _weigh(rows, edge, gain, seen, reach, begin):  # type: ignore[no-untyped-def
         rows[8 * BLOCK_BINS + k] = w * edge[p] * shown * shown
 
 
-@kernel
-def _block(b, base, light, slow, offset, response, changes, shifts, planes, rows):  # type: ignore[no-untyped-def]
-    """`_light` of block b."""
+@compile_kernel
+def _compute_block(b, base, light, slow, offset, response, changes, shifts, planes, rows):  # type: ignore[no-untyped-def]
+    """`_compute_light` of block b."""
     squares = rows.reshape(-1, CELL_BINS, BLOCK_CELLS)
     for k in range(5):
         at, factors = _AT[k], changes[max(k - 1, 0)]
-        combine(
+        combine_planes(
             slow[b, at : at + factors.size], factors, shifts[k] if k < 2 else np.float32(1), planes
         )
-        spread(planes, offset[b], squares[k])
-    _light(rows, base, light, response, b * BLOCK_BINS)
+        spread_planes(planes, offset[b], squares[k])
+    _compute_light(rows, base, light, response, b * BLOCK_BINS)
 
 
-@kernel
+@compile_kernel
 def light_waves(base, light, slow, offset, response, changes, shifts, out):  # type: ignore[no-untyped-def]
     """Derivatives (6, n) of the light of n bins by phi_x, phi_y and relative changes of A, B_x, B_y
     and of all.
@@ -101,11 +101,11 @@ def light_waves(base, light, slow, offset, response, changes, shifts, out):  # t
     """
     rows, planes = np.empty(6 * BLOCK_BINS, np.float32), np.empty(3 * BLOCK_CELLS, np.float32)
     for b in range(offset.shape[0]):
-        _block(b, base, light, slow, offset, response, changes, shifts, planes, rows)
+        _compute_block(b, base, light, slow, offset, response, changes, shifts, planes, rows)
         out[:, b * BLOCK_BINS : (b + 1) * BLOCK_BINS] = rows.reshape(6, BLOCK_BINS)
 
 
-@kernel
+@compile_kernel
 def light_left(  # type: ignore[no-untyped-def]
     base, light, slow, offset, response, changes, shifts, edge, gain, seen, reach, right, out
 ):
@@ -123,10 +123,10 @@ def light_left(  # type: ignore[no-untyped-def]
     squares = rows.reshape(-1, CELL_BINS, BLOCK_CELLS)
     right[:] = 0
     for b in range(offset.shape[0]):
-        _block(b, base, light, slow, offset, response, changes, shifts, planes, rows)
-        _weigh(rows, edge, gain, seen, reach, b * BLOCK_BINS)
+        _compute_block(b, base, light, slow, offset, response, changes, shifts, planes, rows)
+        _weigh_derivatives(rows, edge, gain, seen, reach, b * BLOCK_BINS)
         out[:, b * BLOCK_BINS : (b + 1) * BLOCK_BINS] = rows.reshape(9, BLOCK_BINS)[5:]
         for k in range(5):
             at, sums = _AT[k], right[max(k - 1, 0)]
-            moments(squares[k], offset[b], planes)
-            project(slow[b, at : at + sums.size], planes, sums)
+            compute_moments(squares[k], offset[b], planes)
+            project_planes(slow[b, at : at + sums.size], planes, sums)

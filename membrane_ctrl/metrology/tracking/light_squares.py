@@ -23,7 +23,7 @@ class Squares:
     """
 
     def __init__(self, scene: CrossedScene) -> None:
-        self._number = _squares(scene.position_mm, scene.surface.radius_mm, 12)
+        self._number = _assign_squares(scene.position_mm, scene.surface.radius_mm, 12)
         self._count = np.bincount(self._number)
         self._whole = self._count > 0.5 * np.median(
             self._count
@@ -79,7 +79,7 @@ class Squares:
         return np.asarray(chosen[self._number])
 
 
-def _squares(position_mm: FloatArray, radius_mm: float, across: int) -> IntArray:
+def _assign_squares(position_mm: FloatArray, radius_mm: float, across: int) -> IntArray:
     """Number (n,) of the square of the mirror, so many across, that each bin is in; numbers without
     gaps.
     """

@@ -98,7 +98,7 @@ class LiveTracker:
             self._tracker = self._anchored(frames, np.asarray(displacement_um, float))
         except (bin_view.NoFigureError, ValueError) as error:
             times, readings = np.asarray(time_s, float), np.asarray(displacement_um, float)
-            return live_reconstructor.rejected(
+            return live_reconstructor.make_rejected_cycle(
                 "full", times, readings, f"no anchor for tracking: {error}"
             )
         self._step, self._stepped_s, self._covariance_until_s = 0, -math.inf, -math.inf
@@ -115,7 +115,7 @@ class LiveTracker:
         reading_um = round(float(np.asarray(displacement_um)[0]), _UM)
         if self._tracker is None:
             none = np.array([at_s]), np.array([reading_um])
-            return live_reconstructor.rejected(
+            return live_reconstructor.make_rejected_cycle(
                 "track", *none, live_reconstructor.NOTHING_TO_FOLLOW, tracking_lost=True
             )
         shown = self.pattern
@@ -130,7 +130,7 @@ class LiveTracker:
                     at_s + COVARIANCE_S,
                 )
             found = replace(found, covariance_um2=self._covariance_um2)
-        return _estimate(found, reading_um, self._astray(found), self._urad_per_rad)
+        return _make_estimate(found, reading_um, self._astray(found), self._urad_per_rad)
 
     def prepare(self) -> None:
         """Do ahead what the next frame needs, while its pattern settles."""
@@ -193,7 +193,7 @@ def crossed_patterns(periods: int) -> tuple[Pattern, ...]:
     )
 
 
-def _estimate(
+def _make_estimate(
     found: TrackedFrame, reading_um: float, tracking_lost: bool, urad: float
 ) -> ShapeEstimate:
     """The figure of a frame as control and recorder take it; `urad` of slope turn the phases by 1

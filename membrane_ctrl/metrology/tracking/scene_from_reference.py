@@ -70,13 +70,13 @@ def make_scene(
             f"{seen}, {_LEAST_FRINGES} at least tell light from shape: use a shorter period"
         )
     bin_px = _bin_px(checked, figure, traced * rad_per_mm)
-    response, level_range = _response(
+    response, level_range = _measure_response(
         checked, figure, traced, screen_scale.mm_per_rad(optics.pattern), optics
     )
-    fine = _pictures(
+    fine = _make_pictures(
         checked, figure, traced, screen_scale.mm_per_rad(optics.pattern), level_range, contrast
     )
-    coarse = _coarser(fine, bin_px // fine_px)
+    coarse = _average_squares(fine, bin_px // fine_px)
     rows, columns = camera.height_px // bin_px, camera.width_px // bin_px
     coarse = coarse[:, :rows, :columns].reshape(5, -1)
     known = np.isfinite(coarse).all(axis=0)
@@ -104,7 +104,7 @@ def make_scene(
         points=points,
         beyond_mm=coarse[:2, index] + bias,
         light_adu=coarse[2:, index].copy(),
-        basis=zernike.values(*position / shape.radius_mm).astype(np.float32),
+        basis=zernike.evaluate_terms(*position / shape.radius_mm).astype(np.float32),
         taper=taper,
         edge=taper,
         position_mm=position,
@@ -114,7 +114,7 @@ def make_scene(
     )
 
 
-def _pictures(
+def _make_pictures(
     checked: Checked,
     figure: bin_figure.BinFigure,
     traced: FloatArray,
@@ -173,14 +173,14 @@ def _rad_per_bin(
     )
 
 
-def _coarser(fine: FloatArray, side: int) -> FloatArray:
+def _average_squares(fine: FloatArray, side: int) -> FloatArray:
     """Means over squares of `side`; NaN unless all of a square is known."""
     rows, columns = fine.shape[1] // side, fine.shape[2] // side
     squares = fine[:, : rows * side, : columns * side].reshape(len(fine), rows, side, columns, side)
     return np.asarray(squares.mean(axis=(2, 4)))
 
 
-def _response(
+def _measure_response(
     checked: Checked,
     figure: bin_figure.BinFigure,
     traced_mm: FloatArray,

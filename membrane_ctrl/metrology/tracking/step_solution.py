@@ -26,11 +26,11 @@ _FITS, _FAILS = 0.95, 0.05
 
 def are_steps_separable(shifts_rad: FloatArray) -> bool:
     """Whether steps (N, 2) of x and y separate the two axes."""
-    design = _design(np.zeros((2, len(shifts_rad))), np.asarray(shifts_rad).T)
+    design = _make_design(np.zeros((2, len(shifts_rad))), np.asarray(shifts_rad).T)
     return len(design) >= ENOUGH_STEPS and bool(np.linalg.cond(design) < 10)
 
 
-def _design(phase_rad: FloatArray, shifts_rad: FloatArray) -> FloatArray:
+def _make_design(phase_rad: FloatArray, shifts_rad: FloatArray) -> FloatArray:
     """Rows (..., 5) of level, cosine and sine of x, of y; phases and shifts are (2, ...)."""
     x, y = phase_rad + shifts_rad
     return np.stack([np.ones_like(x), np.cos(x), -np.sin(x), np.cos(y), -np.sin(y)], axis=-1)
@@ -51,7 +51,7 @@ def solve_steps(
     for k, (fit, shifts) in enumerate(zip(fits, shifts_rad, strict=True)):
         phases = scene.phase_rad(fit.surface)
         maps = 1 + fit.light @ scene.basis
-        design[:, k] = _design(phases, shifts[:, None]) * maps[[0, 1, 1, 2, 2]].T
+        design[:, k] = _make_design(phases, shifts[:, None]) * maps[[0, 1, 1, 2, 2]].T
         rest[:, k] = seen_adu[k] - scene.harmonics_adu(phases + shifts[:, None])
     turned = np.swapaxes(design, 1, 2)
     solved = np.linalg.solve(turned @ design, turned @ rest[..., None])[..., 0]
@@ -60,7 +60,7 @@ def solve_steps(
     weights = np.stack([fit.weights for fit in fits])
     good = (weights > _FITS).all(axis=0) | (weights < _FAILS).all(axis=0)
     good &= (swing > 0.2 * np.median(swing, axis=1)[:, None]).all(axis=0)
-    moved, variance, left_rad = _split(fitter, off_rad, swing * good * np.sqrt(scene.taper))
+    moved, variance, left_rad = _split_phases(fitter, off_rad, swing * good * np.sqrt(scene.taper))
     light = np.stack([solved[:, 0], *swing])
     light = np.where(good, light, scene.light_adu)
     beyond_mm = scene.beyond_mm + good * left_rad / scene.rad_per_mm
@@ -71,7 +71,7 @@ def solve_steps(
     )
 
 
-def _split(
+def _split_phases(
     fitter: FrameFitter, off_rad: FloatArray, weight: FloatArray
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
     """Phases (2, n) as a change of the surface's parameters (parameters,), its variance, and what

@@ -111,13 +111,14 @@ class Budget:
         its plane).
         """
         squares = {
-            name: np.sum(means * covariance_mm2) for name, means in _products(self.disc).items()
+            name: np.sum(means * covariance_mm2)
+            for name, means in _mean_products(self.disc).items()
         }
         return {name: 1e3 * math.sqrt(max(float(square), 0.0)) for name, square in squares.items()}
 
 
 @lru_cache
-def _products(disc: float) -> dict[str, FloatArray]:
+def _mean_products(disc: float) -> dict[str, FloatArray]:
     """Means (parameters, parameters) over a disc of products of what two parameters do to sag,
     height and figure.
     """

@@ -91,9 +91,9 @@ class LiveErrors:
         if spread is None:
             return cls(frames, vertex, none + np.nan, none, none)
         try:
-            here = _shared(bench, spread, blur_px)
+            here = _shared_effects(bench, spread, blur_px)
             per_um = (
-                _shared(trial_bench.moved_film(bench, _FAR_UM), spread, blur_px) - here
+                _shared_effects(trial_bench.moved_film(bench, _FAR_UM), spread, blur_px) - here
             ) / _FAR_UM
             x_mm, y_mm = (
                 trial_bench.moved_film(bench, sign * _FAR_UM / 2).screen_mm for sign in (1, -1)
@@ -125,10 +125,12 @@ class LiveErrors:
         It is from light and film as `seen` and taken out, from the laser's readings (2 N,) of the
         frames, and from the film's displacement since the reference.
         """
-        light, film_um = _LEFT * _rms(seen.level, seen.swing), _LEFT * _rms(seen.moved_um)
+        light, film_um = _LEFT * _make_rms(seen.level, seen.swing), _LEFT * _make_rms(seen.moved_um)
         if np.isfinite(readings_um).all():  # motion is taken out to first order
             film_um += _SECOND_ORDER * float(np.std(readings_um))
-        x_to_y_um = laser_errors.left_by_laser_um(readings_um, _rms(seen.moved_um), laser_noise_um)
+        x_to_y_um = laser_errors.left_by_laser_um(
+            readings_um, _make_rms(seen.moved_um), laser_noise_um
+        )
         vertex_um = laser_errors.vertex_um(readings_um, laser_noise_um)
         if not np.isfinite(readings_um).all():  # half of that motion is in the frames' mean
             vertex_um = math.hypot(vertex_um, x_to_y_um / 2)
@@ -144,7 +146,7 @@ class LiveErrors:
         return np.asarray(sum(effect @ effect.T for effect in effects) + shared_mm2)
 
 
-def _shared(
+def _shared_effects(
     bench: trial_bench.TrialBench, spread: geometry_spread.GeometrySpread, blur_px: float
 ) -> FloatArray:
     """Effects (parameters, k) of what all cycles share. Raises ArithmeticError if a fit at the
@@ -318,5 +320,5 @@ class ErrorWatch:
         )
 
 
-def _rms(*parts: FloatArray) -> float:
+def _make_rms(*parts: FloatArray) -> float:
     return math.sqrt(float(np.mean(np.square(parts))))

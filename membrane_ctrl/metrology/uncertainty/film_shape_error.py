@@ -15,7 +15,7 @@ _HEAVY = 1e3  # weight of the sag beside the heights
 
 
 @cache
-def _alike() -> FloatArray:
+def _most_similar_surfaces() -> FloatArray:
     """(parameters, k) parameters of the surfaces most like the round terms beyond the fit's, with
     their sag.
     """
@@ -55,7 +55,9 @@ def law_effect(
     )
     left = np.hstack([b - absorbed.T @ a for a, b in zip(of, beyond, strict=True)]).T
     weights = np.sqrt(np.tile(patches.count, 2))
-    answer = (absorbed - _alike()) @ np.linalg.pinv(left * weights[:, None]) * radius_mm
+    answer = (
+        (absorbed - _most_similar_surfaces()) @ np.linalg.pinv(left * weights[:, None]) * radius_mm
+    )
     return answer @ (patches.slopes.ravel() * weights), slope_variance * float(np.sum(answer**2))
 
 

@@ -113,7 +113,9 @@ def stated_spread(geometry: GeometryConfig) -> GeometrySpread | None:
     )
 
 
-def changed(geometry: GeometryConfig, names: tuple[str, ...], change: ArrayLike) -> GeometryConfig:
+def change_geometry(
+    geometry: GeometryConfig, names: tuple[str, ...], change: ArrayLike
+) -> GeometryConfig:
     """The geometry changed by (k,) amounts. Raises ValueError if the names belong to the other
     form.
     """
@@ -127,19 +129,19 @@ def changed(geometry: GeometryConfig, names: tuple[str, ...], change: ArrayLike)
         return geometry.model_copy(update={n: getattr(geometry, n) + d for n, d in amounts.items()})
     if unknown := set(names) - set(GENERAL_NAMES):
         raise ValueError(f"{min(unknown)}: the geometry is given by two poses")
-    turn = _turn(amounts, "camera")
-    rows = [_vector(turn @ np.array(row)) for row in camera.rotation]
+    turn = _turn_vector(amounts, "camera")
+    rows = [_to_vector(turn @ np.array(row)) for row in camera.rotation]
     moved_camera = CameraPoseConfig(
-        position_mm=_shifted(camera.position_mm, amounts, "camera"),
+        position_mm=_shift_point(camera.position_mm, amounts, "camera"),
         rotation=(rows[0], rows[1], rows[2]),
     )
-    turn = _turn(amounts, "screen")
+    turn = _turn_vector(amounts, "screen")
     origin_mm, s_x, s_y = screen.pose
     moved_screen = screen.model_copy(
         update={
-            "origin_mm": _shifted(origin_mm, amounts, "screen"),
-            "s_x": _vector(turn @ np.array(s_x)),
-            "s_y": _vector(turn @ np.array(s_y)),
+            "origin_mm": _shift_point(origin_mm, amounts, "screen"),
+            "s_x": _to_vector(turn @ np.array(s_x)),
+            "s_y": _to_vector(turn @ np.array(s_y)),
         }
     )
     return geometry.model_copy(update={"camera": moved_camera, "screen": moved_screen})
@@ -154,25 +156,25 @@ def moved_bench(
     """
     amounts = dict(zip(names, np.asarray(change, float).tolist(), strict=True))
     general = tuple(name for name in names if name in GENERAL_NAMES)
-    geometry = changed(optics.geometry, general, [amounts.pop(name) for name in general])
+    geometry = change_geometry(optics.geometry, general, [amounts.pop(name) for name in general])
     values = np.array([amounts.get(name, 0.0) for name in bench_parameters.NAMES])
     return bench_poses.bench_at(
         Geometry.from_config(optics.model_copy(update={"geometry": geometry})), values
     )
 
 
-def _turn(amounts: dict[str, float], thing: str) -> FloatArray:
+def _turn_vector(amounts: dict[str, float], thing: str) -> FloatArray:
     vector = [amounts.get(f"{thing}_turn_{axis}_rad", 0.0) for axis in "xyz"]
     return np.asarray(cv2.Rodrigues(np.array(vector))[0])
 
 
-def _shifted(place_mm: Vector3, amounts: dict[str, float], thing: str) -> Vector3:
-    return _vector(
+def _shift_point(place_mm: Vector3, amounts: dict[str, float], thing: str) -> Vector3:
+    return _to_vector(
         np.array(place_mm) + [amounts.get(f"{thing}_shift_{axis}_mm", 0.0) for axis in "xyz"]
     )
 
 
-def _vector(values: FloatArray) -> Vector3:
+def _to_vector(values: FloatArray) -> Vector3:
     x, y, z = values.tolist()
     return x, y, z
 

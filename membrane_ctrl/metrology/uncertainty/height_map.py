@@ -52,9 +52,9 @@ class HeightMap:
 def height_matrix(x_mm: FloatArray, y_mm: FloatArray, radius_mm: float) -> FloatArray:
     """Matrix (points, parameters) from parameters to heights, 0 at the vertex."""
     x, y = np.asarray(x_mm) / radius_mm, np.asarray(y_mm) / radius_mm
-    out = np.asarray(zernike.values(x, y).T @ parameter_to_coeffs())
+    out = np.asarray(zernike.evaluate_terms(x, y).T @ parameter_to_coeffs())
     out[:, -1] += (
-        np.polynomial.polynomial.polyval(x * x + y * y, hencky_bowl.excess())
+        np.polynomial.polynomial.polyval(x * x + y * y, hencky_bowl.excess_series())
         / hencky_bowl.excess_rms()
     )
     return out

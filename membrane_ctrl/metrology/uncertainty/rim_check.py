@@ -6,7 +6,7 @@ import math
 
 import numpy as np
 
-from membrane_ctrl.metrology.rays.geometry import project
+from membrane_ctrl.metrology.rays.geometry import project_points
 from membrane_ctrl.metrology.rays.rim_outline import Outline
 from membrane_ctrl.metrology.uncertainty.geometry_spread import GeometrySpread
 from membrane_ctrl.metrology.uncertainty.trial_bench import TrialBench
@@ -34,7 +34,7 @@ def rim_widening(bench: TrialBench, spread: GeometrySpread, outline: Outline | N
     rim = np.stack([radius_mm * np.cos(theta), radius_mm * np.sin(theta), rim_z_mm])
 
     def seen(names: tuple[str, ...], change: FloatArray) -> FloatArray:
-        points = project(bench.geometry(names, change).geometry, rim)
+        points = project_points(bench.geometry(names, change).geometry, rim)
         middle = points.mean(axis=1)
         return np.append(middle, np.mean(np.hypot(*(points - middle[:, None]))))
 

@@ -67,7 +67,7 @@ def assemble_budget(
     )
     sigmas = optics.geometry.sigmas or SigmasConfig()
     moved = FilmMotion.of(checked)
-    film, doubts = _film(bench, spread, moved)
+    film, doubts = _film_source(bench, spread, moved)
     blur = image_blur.blur_source(bench, _blur_px(checked))
     disc = optics.mirror.analysis_radius_mm / optics.mirror.radius_mm
     if budget.Budget((blur,), disc).total()["height_rms_um"] > _BLUR_UM:
@@ -83,7 +83,7 @@ def assemble_budget(
         *bench_sources.geometry_sources(bench, spread, rim_widening(bench, spread, outline)),
         *bench_sources.bench_sources(bench, sigmas),
         *film,
-        _vertex(bench, sigmas, checked, film[0].sigma),
+        _vertex_source(bench, sigmas, checked, film[0].sigma),
         film_shape_source(full, slope_variance),
         blur,
         *frame_effects.frame_sources(
@@ -104,7 +104,7 @@ def _blur_px(checked: Checked) -> float:
     return estimate_blur_px(checked.phase_rad, contrasts, index, checked.binned.bin_px)
 
 
-def _vertex(
+def _vertex_source(
     bench: TrialBench, sigmas: SigmasConfig, checked: Checked, moved_um: float
 ) -> budget.Source:
     """Where the vertex is: by the laser, or nobody knows; half a motion from x to y is in the
@@ -127,7 +127,7 @@ def _film_um(film: FilmMotion) -> float:
     return math.hypot(*left, film.noise_um)
 
 
-def _film(
+def _film_source(
     bench: TrialBench, spread: GeometrySpread, film: FilmMotion
 ) -> tuple[list[budget.Source], list[str]]:
     """The film's motion from x to y: by the laser, else by the fringes."""

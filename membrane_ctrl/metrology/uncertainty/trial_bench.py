@@ -126,7 +126,7 @@ class TrialBench:
             # centimetres
             try:
                 normal = NormalMatrix.from_points(tracer, points)
-                fit = surface_fit.solve(
+                fit = surface_fit.fit_surface(
                     tracer, points, self.surface, normal=normal, max_iterations=steps
                 )
             except ValueError:

@@ -163,7 +163,7 @@ def find_modes(
     good = np.isfinite(coeffs_um).all(axis=1)
     grid_hz = np.arange(_LEAST_HZ, most_hz, 1 / (_GRID * PIECE_S))
     # the first term only puts the vertex at 0: it would weigh what moves the vertex twice
-    pieces, terms = _pieces(time_s[good], coeffs_um[good, 1:], grid_hz)
+    pieces, terms = _split_frames(time_s[good], coeffs_um[good, 1:], grid_hz)
     if sum(piece.time_s[-1] - piece.time_s[0] for piece in pieces) < 0.9 * LEAST_S:
         return None
     found: list[VibrationMode] = []
@@ -178,15 +178,15 @@ def find_modes(
             piece.noise(np.where(away[:, None], before, np.abs(spectrum) ** 2), away)
             for spectrum, before, piece, away in zip(spectra, whole, pieces, gone, strict=True)
         ]
-        seen = _evidence(spectra, noises, pieces)
-        if seen.max() < margin * _threshold(seen, grid_hz.size):
+        seen = _compute_evidence(spectra, noises, pieces)
+        if seen.max() < margin * _compute_threshold(seen, grid_hz.size):
             break
-        k, rivals = _likeliest(seen, np.sum([~piece.blind for piece in pieces], axis=0))
-        frequency, sigma = _refined(seen, grid_hz, k)
+        k, rivals = _find_likeliest(seen, np.sum([~piece.blind for piece in pieces], axis=0))
+        frequency, sigma = _refine_frequency(seen, grid_hz, k)
         used = [
             p for p, piece in enumerate(pieces) if not piece.blind[k]
         ]  # others have drift there
-        amplitude_nm, shape = _shape(
+        amplitude_nm, shape = _compute_shape(
             *zip(*((spectra[p][k], pieces[p], noises[p][k]) for p in used), strict=True)
         )
         own = shape[1:] / np.linalg.norm(shape[1:])
@@ -198,26 +198,28 @@ def find_modes(
             aliases = _aliases_hz(rates_hz, frequency, most_hz) or tuple(grid_hz[rivals].tolist())
             found.append(VibrationMode(frequency, sigma, amplitude_nm, shape, evidence, aliases))
         terms = [
-            piece.without(part, frequency, np.eye(own.size) if again else _onto(own, noise[k]))
+            piece.without(
+                part, frequency, np.eye(own.size) if again else _projection_onto(own, noise[k])
+            )
             for piece, part, noise in zip(pieces, terms, noises, strict=True)
         ]
         gone = [away | piece.goes_with(frequency) for piece, away in zip(pieces, gone, strict=True)]
-    return tuple(_sole(mode, found) for mode in found)
+    return tuple(_drop_false_aliases(mode, found) for mode in found)
 
 
-def _sole(mode: VibrationMode, found: list[VibrationMode]) -> VibrationMode:
+def _drop_false_aliases(mode: VibrationMode, found: list[VibrationMode]) -> VibrationMode:
     """The mode without aliases that are themselves modes: they stood out when it was gone."""
     others_hz = np.array([other.frequency_hz for other in found])
     kept = (alias for alias in mode.aliases_hz if np.abs(others_hz - alias).min() > _APART_HZ)
     return replace(mode, aliases_hz=tuple(kept))
 
 
-def _pieces(
+def _split_frames(
     time_s: FloatArray, coeffs_um: FloatArray, grid_hz: FloatArray
 ) -> tuple[list[_Piece], list[FloatArray]]:
     """The frames in pieces, and their terms without drift."""
     pieces, terms = [], []
-    for frames in _runs(time_s):
+    for frames in _find_runs(time_s):
         t = time_s[frames]
         rate_hz = 1 / float(np.median(np.diff(t)))
         alias_hz = np.abs(grid_hz - rate_hz * np.round(grid_hz / rate_hz))
@@ -230,7 +232,7 @@ def _pieces(
     return pieces, terms
 
 
-def _runs(time_s: FloatArray) -> list[slice]:
+def _find_runs(time_s: FloatArray) -> list[slice]:
     """Frames of one rate without a gap, in pieces of about the same length."""
     from scipy import ndimage
 
@@ -259,7 +261,7 @@ def _without_drift(time_s: FloatArray, terms_um: FloatArray) -> FloatArray:
     return np.asarray(np.clip(left, -6 * spread, 6 * spread))
 
 
-def _evidence(
+def _compute_evidence(
     spectra: list[ComplexArray], noises: list[FloatArray], pieces: list[_Piece]
 ) -> FloatArray:
     """T (frequencies,): the largest eigenvalue over the shapes, with terms and pieces in units of
@@ -280,7 +282,7 @@ def _evidence(
     return np.asarray(np.linalg.eigvalsh(parts @ parts.transpose(0, 2, 1))[:, -1])
 
 
-def _threshold(seen: FloatArray, frequencies: int) -> float:
+def _compute_threshold(seen: FloatArray, frequencies: int) -> float:
     """T that chance exceeds at any of the frequencies with `_CHANCE`, for a gamma distribution of
     these quantiles.
     """
@@ -295,7 +297,7 @@ def _threshold(seen: FloatArray, frequencies: int) -> float:
     return float(middle / stats.gamma.median(order) * stats.gamma.isf(_CHANCE / frequencies, order))
 
 
-def _likeliest(seen: FloatArray, visible: IntArray) -> tuple[int, list[int]]:
+def _find_likeliest(seen: FloatArray, visible: IntArray) -> tuple[int, list[int]]:
     """The frequency with the largest T, and others that explain the frames as well.
 
     Of equal ones it is the one that all its pieces show, then the lowest.
@@ -334,7 +336,7 @@ def _aliases_hz(rates_hz: list[float], frequency_hz: float, most_hz: float) -> t
     )
 
 
-def _refined(seen: FloatArray, grid_hz: FloatArray, k: int) -> tuple[float, float]:
+def _refine_frequency(seen: FloatArray, grid_hz: FloatArray, k: int) -> tuple[float, float]:
     """Frequency and its standard deviation from the parabola through three values of T."""
     step = grid_hz[1] - grid_hz[0]
     if not 0 < k < seen.size - 1:
@@ -347,7 +349,7 @@ def _refined(seen: FloatArray, grid_hz: FloatArray, k: int) -> tuple[float, floa
     return float(grid_hz[k] + offset * step), float(step / np.sqrt(-bend))
 
 
-def _shape(
+def _compute_shape(
     lines: Sequence[ComplexArray], pieces: Sequence[_Piece], noises: Sequence[FloatArray]
 ) -> tuple[float, FloatArray]:
     """Amplitude in nm and terms (terms,) of unit RMS with the ring at rest, from X (terms - 1,) of
@@ -374,7 +376,7 @@ def _shape(
     ), np.asarray(shape)
 
 
-def _onto(shape: FloatArray, noise: FloatArray) -> FloatArray:
+def _projection_onto(shape: FloatArray, noise: FloatArray) -> FloatArray:
     """What takes terms to their part in a shape, (terms - 1, terms - 1), told by those with little
     noise.
 
@@ -391,5 +393,8 @@ def _scatter_hz(lines: list[FloatArray], grid_hz: FloatArray, k: int) -> float:
     """
     reach = round(_APART_HZ * _GRID * PIECE_S)
     first, last = max(k - reach, 0), min(k + reach + 1, grid_hz.size)
-    own = [_refined(line, grid_hz, first + int(np.argmax(line[first:last])))[0] for line in lines]
+    own = [
+        _refine_frequency(line, grid_hz, first + int(np.argmax(line[first:last])))[0]
+        for line in lines
+    ]
     return float(np.std(own, ddof=1) / np.sqrt(len(own))) if len(own) > 1 else 0.0

@@ -334,7 +334,7 @@ def _draw(path: Path, modes: Sequence[SeenMode], begin_s: float) -> Path:
         )
         over_time.set(xlabel="time (min)", ylabel="frequency (Hz)")
         height = np.where(
-            np.hypot(x, y) <= 1, np.tensordot(mode.shape, zernike.values(x, y), 1), np.nan
+            np.hypot(x, y) <= 1, np.tensordot(mode.shape, zernike.evaluate_terms(x, y), 1), np.nan
         )
         most = float(np.nanmax(np.abs(height)))
         shape.imshow(

@@ -17,26 +17,26 @@ from membrane_ctrl.metrology.calibration.geometry_tables import (
     general_covariance,
     tables_of,
 )
-from membrane_ctrl.metrology.calibration.solver import Solution, solve
-from membrane_ctrl.metrology.rays.bench_parameters import NAMES, sigmas
+from membrane_ctrl.metrology.calibration.solver import Solution, solve_calibration
+from membrane_ctrl.metrology.rays.bench_parameters import NAMES, prior_sigmas
 from membrane_ctrl.metrology.rays.bench_poses import bench_at
 from membrane_ctrl.metrology.rays.geometry import Geometry
 from membrane_ctrl.metrology.uncertainty.geometry_spread import (
     GENERAL_NAMES,
     GeometrySpread,
-    changed,
+    change_geometry,
 )
 from membrane_ctrl.model.geometry_hash import content_hash
 from tests.support.calibration_truth import OPTICS, make
 
 ORIGIN = Origin("2026-01-01T00:00:00+00:00", ("a", "b"), 1.0, 2.0, 1.5, 3.0, ("a note",))
-FREE = sigmas({"bow_mm": 1.5, "k1": 0.02, "pitch_relative": 1e-3})
+FREE = prior_sigmas({"bow_mm": 1.5, "k1": 0.02, "pitch_relative": 1e-3})
 
 
 @pytest.fixture(scope="module")
 def solution() -> Solution:
     truth = make(FREE * 0.3, seed=4, points=1500)
-    return solve(truth.problem(FREE))
+    return solve_calibration(truth.problem(FREE))
 
 
 def test_the_file_says_the_calibrated_bench(solution: Solution) -> None:
@@ -59,7 +59,7 @@ def test_the_file_says_the_calibrated_bench(solution: Solution) -> None:
 
 def test_only_what_was_free_is_written() -> None:
     truth = make(np.zeros(len(NAMES)), seed=4, points=1200)
-    tables = tables_of(solve(truth.problem(sigmas())), OPTICS, ORIGIN)
+    tables = tables_of(solve_calibration(truth.problem(prior_sigmas())), OPTICS, ORIGIN)
     assert not {"camera", "pattern"} & set(tables)
     assert tables["geometry"]["screen"]["bow_mm"] == 0
 
@@ -78,7 +78,9 @@ def test_a_stated_bow_and_map_are_kept() -> None:
     assert bench.geometry.face.bow_per_mm * 200.0**2 == pytest.approx(2.0)
     assert bench.geometry.face.cells_mm.size
     truth = make(np.zeros(len(NAMES)), seed=4, points=1200)
-    screen = tables_of(solve(truth.problem(sigmas())), optics, ORIGIN)["geometry"]["screen"]
+    screen = tables_of(solve_calibration(truth.problem(prior_sigmas())), optics, ORIGIN)[
+        "geometry"
+    ]["screen"]
     assert ScreenPoseConfig.model_validate(screen).height_map == stated.screen.height_map
 
 
@@ -107,7 +109,9 @@ def test_the_covariance_is_that_of_drawn_parameters(solution: Solution) -> None:
         shift = there.pinhole_mm - here.pinhole_mm, there.screen_origin_mm - here.screen_origin_mm
         turns = (_turn(here.rotation, there.rotation), _turn(_rows(here), _rows(there)))
         change = np.concatenate([shift[0], turns[0], shift[1], turns[1]])
-        moved = Geometry.from_config(OpticsConfig(geometry=changed(config, GENERAL_NAMES, change)))
+        moved = Geometry.from_config(
+            OpticsConfig(geometry=change_geometry(config, GENERAL_NAMES, change))
+        )
         assert np.allclose(moved.rotation, there.rotation, atol=1e-9)
         assert np.allclose(moved.screen_s_x, there.screen_s_x, atol=1e-9)
         scaled = change / np.where(spread.sigmas > 0, spread.sigmas, 1.0)

@@ -8,14 +8,14 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from membrane_ctrl.metrology.calibration.figure_uncertainty import propagate
+from membrane_ctrl.metrology.calibration.figure_uncertainty import propagate_to_figure
 from membrane_ctrl.metrology.calibration.point_averages import average_points
 from membrane_ctrl.metrology.calibration.rim_equations import Rim
 from membrane_ctrl.metrology.calibration.screen_advice import screen_advice
 from membrane_ctrl.metrology.calibration.screen_pose import screen_seen
-from membrane_ctrl.metrology.calibration.solver import Problem, Solution, solve
+from membrane_ctrl.metrology.calibration.solver import Problem, Solution, solve_calibration
 from membrane_ctrl.metrology.calibration.verdict import check_solution
-from membrane_ctrl.metrology.rays.bench_parameters import NAMES, sigmas, usual_sigma
+from membrane_ctrl.metrology.rays.bench_parameters import NAMES, prior_sigmas, usual_sigma
 from membrane_ctrl.metrology.rays.bench_poses import OPTICAL, bench_at, pose_derivatives
 from membrane_ctrl.metrology.rays.forward_model import (
     COLUMNS,
@@ -24,7 +24,7 @@ from membrane_ctrl.metrology.rays.forward_model import (
     residual_mm,
     screen_views,
 )
-from membrane_ctrl.metrology.rays.geometry import project
+from membrane_ctrl.metrology.rays.geometry import project_points
 from membrane_ctrl.metrology.rays.set_phases import ANYWHERE, Elsewhere, SetPhases
 from membrane_ctrl.metrology.rays.surface import Surface
 from membrane_ctrl.sim.optics.bench_poses import CameraPose, ScreenPose
@@ -40,7 +40,7 @@ from tests.support.calibration_truth import (
 )
 
 # a screen whose pitch is known from its data sheet, moved along a rail
-SIGMAS = sigmas({name: usual_sigma(name) for name in NAMES} | {"pitch_relative": 1e-4})
+SIGMAS = prior_sigmas({name: usual_sigma(name) for name in NAMES} | {"pitch_relative": 1e-4})
 SAGS_MM = (33.0, 37.0)
 SHIFT_MM, SHIFT_SIGMA_MM, TURN_SIGMA_DEG = (0.0, 0.0, -300.0), 0.05, 0.5
 DEEPER_UM = 2.0  # the film beside the moved screen
@@ -60,7 +60,9 @@ def bench_of(seed: int) -> tuple[FloatArray, Truth, Problem]:
     )
     theta = np.linspace(0, 2 * np.pi, 120, endpoint=False)
     x, y = 500.0 * np.cos(theta), 500.0 * np.sin(theta)
-    edges = project(bench_at(STATED, values).geometry, np.stack([x, y, truth.film.height_mm(x, y)]))
+    edges = project_points(
+        bench_at(STATED, values).geometry, np.stack([x, y, truth.film.height_mm(x, y)])
+    )
     return values, truth, replace(truth.problem(SIGMAS, sets), rim=Rim(edges, 500.0, 0.2))
 
 
@@ -141,7 +143,7 @@ def seen_directly(
 def assert_true(solution: Solution, values: FloatArray, truth: Truth, index: int) -> None:
     """Nothing is found wrong, the film of 37 mm is within the claim, and so are all parameters."""
     assert not any(finding.fatal for finding in check_solution(solution))
-    claim = propagate(solution, index, 475.0)
+    claim = propagate_to_figure(solution, index, 475.0)
     only = replace(solution.problem, sets=(solution.problem.sets[index],))
     # `calibration_truth` counts the film of 37 mm as set 2
     sag_um, figure_um = calibrated_errors_um(
@@ -168,9 +170,9 @@ def test_a_moved_screen_and_the_screen_itself_sharpen_the_sag_and_tell_the_truth
         "both": direct + far,
     }
     for name, sets in rows.items():
-        solution = solve(replace(problem, sets=sets))
+        solution = solve_calibration(replace(problem, sets=sets))
         assert_true(solution, values, truth, len(sets) - 1)
-        sag_um[name] = propagate(solution, len(sets) - 1, 475.0).sag_um
+        sag_um[name] = propagate_to_figure(solution, len(sets) - 1, 475.0).sag_um
     assert sag_um["film"] > 14
     assert sag_um["far"] < 0.85 * sag_um["film"]
     assert sag_um["direct"] < 0.5 * sag_um["film"]
@@ -188,7 +190,7 @@ def test_a_screen_seen_through_its_cover_glass_is_no_other_screen(seed: int) -> 
     glass_mm = float(np.random.default_rng(seed).uniform(0.5, 2.0))
     tilts = ((0.0, 25.0), seed), ((25.0, 0.0), seed + 50)
     direct = tuple(seen_directly(values, *each, glass_mm=glass_mm) for each in tilts)
-    solution = solve(replace(problem, sets=(*direct, *problem.sets)))
+    solution = solve_calibration(replace(problem, sets=(*direct, *problem.sets)))
     assert_true(solution, values, truth, 3)
     assert [state.elsewhere[0][-2] for state in solution.states[:2]] == pytest.approx(
         [glass_mm] * 2, rel=0.3
@@ -200,19 +202,19 @@ def test_a_screen_seen_through_its_cover_glass_is_no_other_screen(seed: int) -> 
 )
 def test_advised_screens_keep_their_promise(seed: int) -> None:
     values, truth, problem = bench_of(seed)
-    alone = solve(problem)
+    alone = solve_calibration(problem)
     first, second = screen_advice(alone, 1)
     assert (first.sets, second.sets) == ("screen", "screen_moved")
-    assert second.sag_um < first.sag_um < 0.6 * propagate(alone, 1, 475.0).sag_um
+    assert second.sag_um < first.sag_um < 0.6 * propagate_to_figure(alone, 1, 475.0).sag_um
     direct = seen_directly(values, (0.0, 25.0), seed), seen_directly(values, (25.0, 0.0), seed + 50)
-    obeyed = solve(replace(problem, sets=(*direct, *problem.sets)))
-    assert propagate(obeyed, 3, 475.0).sag_um == pytest.approx(first.sag_um, rel=0.2)
+    obeyed = solve_calibration(replace(problem, sets=(*direct, *problem.sets)))
+    assert propagate_to_figure(obeyed, 3, 475.0).sag_um == pytest.approx(first.sag_um, rel=0.2)
     (left,) = screen_advice(obeyed, 3)
     assert left.sag_um == pytest.approx(second.sag_um, rel=0.2)
     far = with_moved_screen(values, truth, problem.sets[1], seed)
-    both = solve(replace(problem, sets=(*direct, problem.sets[0], far)))
+    both = solve_calibration(replace(problem, sets=(*direct, problem.sets[0], far)))
     assert_true(both, values, truth, 3)
-    assert propagate(both, 3, 475.0).sag_um == pytest.approx(second.sag_um, rel=0.2)
+    assert propagate_to_figure(both, 3, 475.0).sag_um == pytest.approx(second.sag_um, rel=0.2)
     assert screen_advice(both, 3) == ()
 
 
@@ -220,7 +222,9 @@ def test_a_screen_that_stood_elsewhere_than_stated_is_named() -> None:
     values, truth, problem = bench_of(4)
     first, second = problem.sets
     moved = with_moved_screen(values, truth, second, 4, off_mm=3.0)
-    solution = solve(replace(problem, sets=(seen_directly(values, (0.0, 25.0), 4), first, moved)))
+    solution = solve_calibration(
+        replace(problem, sets=(seen_directly(values, (0.0, 25.0), 4), first, moved))
+    )
     (finding,) = (each for each in check_solution(solution) if each.fatal)
     assert finding.says.startswith("the screen was not where screen_moved says beside set1")
 
@@ -234,7 +238,9 @@ def test_a_screen_seen_through_another_lens_is_named() -> None:
     wrong = seen_directly(other, (-20.0, 10.0), 7, "later")
     says = [
         each.says
-        for each in check_solution(solve(replace(problem, sets=(*known, *problem.sets, wrong))))
+        for each in check_solution(
+            solve_calibration(replace(problem, sets=(*known, *problem.sets, wrong)))
+        )
         if each.fatal
     ]
     assert says == [
@@ -296,12 +302,12 @@ def test_derivatives_of_moved_and_seen_screens_are_those_of_the_rays() -> None:
 def test_means_of_many_points_keep_the_places_of_the_screen_apart() -> None:
     values, truth, problem = bench_of(6)
     moved = with_moved_screen(values, truth, problem.sets[1], 6)
-    solution = solve(replace(problem, sets=(problem.sets[0], moved)))
+    solution = solve_calibration(replace(problem, sets=(problem.sets[0], moved)))
     few = average_points(solution.bench, moved, solution.states[1], 300)
     assert few.screen is not None
     assert 150 < np.count_nonzero(few.screen == 0) < 450
     assert 150 < np.count_nonzero(few.screen == 1) < 450
-    again = solve(replace(problem, sets=(problem.sets[0], few)), start=solution)
+    again = solve_calibration(replace(problem, sets=(problem.sets[0], few)), start=solution)
     assert np.abs((again.values - solution.values)[FREE] / solution.sigmas[FREE]).max() < 1
 
 
@@ -314,7 +320,7 @@ def test_the_start_of_a_seen_screen_does_not_matter() -> None:
         screen, origin_mm=screen.origin_mm + np.array([5.0, -3.0, 10.0]), axes=turned @ screen.axes
     )
     first, second = (
-        solve(replace(problem, sets=(replace(direct, artefact=each), *problem.sets)))
+        solve_calibration(replace(problem, sets=(replace(direct, artefact=each), *problem.sets)))
         for each in (screen, other)
     )
     assert np.abs((first.values - second.values)[FREE] / first.sigmas[FREE]).max() < 0.05

@@ -10,29 +10,31 @@ import numpy as np
 import pytest
 
 from membrane_ctrl.metrology.calibration.advice import number_advice
-from membrane_ctrl.metrology.calibration.figure_uncertainty import propagate
+from membrane_ctrl.metrology.calibration.figure_uncertainty import propagate_to_figure
 from membrane_ctrl.metrology.calibration.rim_equations import Rim
 from membrane_ctrl.metrology.calibration.robust_weights import RobustWeights, reduce_weights
 from membrane_ctrl.metrology.calibration.set_state import FilmModel
-from membrane_ctrl.metrology.calibration.solver import Solution, solve
+from membrane_ctrl.metrology.calibration.solver import Solution, solve_calibration
 from membrane_ctrl.metrology.calibration.verdict import check_solution
 from membrane_ctrl.metrology.film.film_law import FilmLaw
 from membrane_ctrl.metrology.film.hencky_bowl import excess_rms
 from membrane_ctrl.metrology.film.terms_beyond_fit import beyond_of
-from membrane_ctrl.metrology.rays.bench_parameters import NAMES, sigmas
+from membrane_ctrl.metrology.rays.bench_parameters import NAMES, prior_sigmas
 from membrane_ctrl.metrology.rays.bench_poses import bench_at
-from membrane_ctrl.metrology.rays.geometry import project
+from membrane_ctrl.metrology.rays.geometry import project_points
 from membrane_ctrl.metrology.rays.set_phases import SetPhases
 from tests.support.calibration_truth import SAGS_MM, STATED, Truth, calibrated_errors_um, make
 from tests.support.metrology_truth import hencky_depth
 
-SIGMAS = sigmas()
+SIGMAS = prior_sigmas()
 VALUES = 0.7 * SIGMAS * np.random.default_rng(8).normal(size=len(NAMES))
 
 
 def solved(truth: Truth, film: FilmModel, rim: Rim | None = None) -> Solution:
     problem = truth.problem(SIGMAS)
-    return solve(replace(problem, references=replace(problem.references, film=film), rim=rim))
+    return solve_calibration(
+        replace(problem, references=replace(problem.references, film=film), rim=rim)
+    )
 
 
 @pytest.mark.campaign
@@ -44,7 +46,7 @@ def test_a_film_that_is_not_henckys_is_refused_and_the_advice_holds() -> None:
     obeyed = solved(truth, "free")
     assert check_solution(obeyed) == ()
     sag_um, figure_um = calibrated_errors_um(obeyed, truth)
-    claim = propagate(obeyed, 2, 475.0)
+    claim = propagate_to_figure(obeyed, 2, 475.0)
     assert abs(sag_um) < 3 * claim.sag_um < 20
     assert figure_um < 3 * claim.figure_rms_um
 
@@ -80,17 +82,19 @@ def test_the_rim_knows_the_size_and_better_measurements_are_advised() -> None:
     truth = make(VALUES, 6, points=600)
     theta = np.linspace(0, 2 * np.pi, 200, endpoint=False)
     x, y = 500.0 * np.cos(theta), 500.0 * np.sin(theta)
-    edges = project(bench_at(STATED, VALUES).geometry, np.stack([x, y, truth.film.height_mm(x, y)]))
+    edges = project_points(
+        bench_at(STATED, VALUES).geometry, np.stack([x, y, truth.film.height_mm(x, y)])
+    )
     with_rim, without = solved(truth, "free", Rim(edges, 500.0, 0.02)), solved(truth, "free")
-    claims = [propagate(solution, 2, 475.0).sag_um for solution in (with_rim, without)]
+    claims = [propagate_to_figure(solution, 2, 475.0).sag_um for solution in (with_rim, without)]
     assert claims[0] < 0.95 * claims[1]
     assert abs(calibrated_errors_um(with_rim, truth)[0]) < 3 * claims[0]
     best = number_advice(without, 2)
     assert best is not None
     better = SIGMAS.copy()
     better[NAMES.index(best.name)] = best.sigma
-    obeyed = solve(truth.problem(better))
-    assert propagate(obeyed, 2, 475.0).sag_um == pytest.approx(best.sag_um, rel=0.05)
+    obeyed = solve_calibration(truth.problem(better))
+    assert propagate_to_figure(obeyed, 2, 475.0).sag_um == pytest.approx(best.sag_um, rel=0.05)
 
 
 def test_residuals_that_neighbours_share_lower_the_trust_and_noise_does_not() -> None:
@@ -122,6 +126,6 @@ def test_a_film_that_moved_from_the_x_to_the_y_frames_is_found_to_have_moved() -
         sets.append(
             replace(both, screen_mm=np.stack([x.screen_mm[0, :size], y.screen_mm[1, :size]]))
         )
-    solution = solve(there.problem(SIGMAS, tuple(sets)))
+    solution = solve_calibration(there.problem(SIGMAS, tuple(sets)))
     assert check_solution(solution) == ()
     assert [1e3 * state.motion_mm for state in solution.states] == pytest.approx(moved_um, abs=0.3)

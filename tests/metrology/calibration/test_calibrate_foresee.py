@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from membrane_ctrl.config.schema import CameraConfig, OpticsConfig
-from membrane_ctrl.metrology.calibration.foresight import foresee
-from membrane_ctrl.metrology.rays.bench_parameters import sigmas
+from membrane_ctrl.metrology.calibration.foresight import forecast_figure
+from membrane_ctrl.metrology.rays.bench_parameters import prior_sigmas
 
 
 # docs/how-to/calibration.md: claims of calibrations of the twin's film, sag and figure in µm
@@ -16,7 +16,7 @@ def test_it_is_what_sets_of_a_mounted_film_claim(
     range_mm: float, sag_um: float, figure_um: float
 ) -> None:
     sags_mm = (37.0 + range_mm * np.linspace(-0.5, 0.5, 5)).tolist()
-    claim = foresee(OpticsConfig(), sigmas(), sags_mm, 80.0, 1.0)
+    claim = forecast_figure(OpticsConfig(), prior_sigmas(), sags_mm, 80.0, 1.0)
     assert claim.sag_um == pytest.approx(sag_um, rel=0.15)
     assert claim.figure_rms_um == pytest.approx(figure_um, rel=0.15)
 
@@ -26,4 +26,4 @@ def test_a_bench_that_sees_no_fringes_is_named() -> None:
         camera=CameraConfig(principal_px=(-9000.0, 1023.5))
     )  # looks past the mirror
     with pytest.raises(ValueError, match="sees no fringes in the mirror"):
-        foresee(optics, sigmas(), [36.0, 38.0], 80.0, 1.0)
+        forecast_figure(optics, prior_sigmas(), [36.0, 38.0], 80.0, 1.0)

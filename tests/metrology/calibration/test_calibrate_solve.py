@@ -12,15 +12,15 @@ import pytest
 
 from membrane_ctrl.calibration.sets import known_sigmas
 from membrane_ctrl.config.optics import SigmasConfig
-from membrane_ctrl.metrology.calibration.figure_uncertainty import propagate
+from membrane_ctrl.metrology.calibration.figure_uncertainty import propagate_to_figure
 from membrane_ctrl.metrology.calibration.fringe_waves import remove_fringe_waves
-from membrane_ctrl.metrology.calibration.solver import Solution, solve
+from membrane_ctrl.metrology.calibration.solver import Solution, solve_calibration
 from membrane_ctrl.metrology.calibration.verdict import check_solution
 from membrane_ctrl.metrology.calibration.weak_combinations import (
     condition_number,
     weak_combinations,
 )
-from membrane_ctrl.metrology.rays.bench_parameters import NAMES, sigmas
+from membrane_ctrl.metrology.rays.bench_parameters import NAMES, prior_sigmas
 from tests.support.calibration_truth import (
     OPTICS,
     Truth,
@@ -31,7 +31,7 @@ from tests.support.calibration_truth import (
     stated_errors_um,
 )
 
-SIGMAS = sigmas()
+SIGMAS = prior_sigmas()
 SEEDS = range(12)
 
 
@@ -43,7 +43,7 @@ def drawn(seed: int) -> np.ndarray:
 @cache
 def solved(seed: int) -> tuple[Truth, Solution]:
     truth = make(drawn(seed), seed, points=600)
-    return truth, solve(truth.problem(SIGMAS))
+    return truth, solve_calibration(truth.problem(SIGMAS))
 
 
 def rms(values: list[float]) -> float:
@@ -61,7 +61,7 @@ def test_sag_and_figure_are_right_after_and_wrong_before() -> None:
 
 def test_a_plain_fit_of_a_b_alpha_is_not_enough() -> None:
     truths = [solved(seed)[0] for seed in (0, 1, 2)]
-    errors = [calibrated_errors_um(solve(plain(truth)), truth) for truth in truths]
+    errors = [calibrated_errors_um(solve_calibration(plain(truth)), truth) for truth in truths]
     assert rms([figure for _, figure in errors]) > 10
     assert rms([sag for sag, _ in errors]) > 10
 
@@ -79,7 +79,7 @@ def test_the_covariance_is_true() -> None:
 def test_the_claim_for_a_figure_is_true() -> None:
     ratios = []
     for truth, solution in map(solved, SEEDS):
-        claim = propagate(solution, 2, 475.0)
+        claim = propagate_to_figure(solution, 2, 475.0)
         sag, figure = calibrated_errors_um(solution, truth)
         ratios.append((sag / claim.sag_um, figure / claim.figure_rms_um))
         assert claim.height_rms_um > claim.figure_rms_um
@@ -90,11 +90,11 @@ def test_the_claim_for_a_figure_is_true() -> None:
 
 
 def test_a_bow_is_solved_when_it_is_free() -> None:
-    free = sigmas({"bow_mm": 1.5})
+    free = prior_sigmas({"bow_mm": 1.5})
     errors = []
     for seed in (1, 2, 3):
         truth = make(drawn(seed), seed, points=600, bow_mm=1.0)
-        solution = solve(truth.problem(free))
+        solution = solve_calibration(truth.problem(free))
         k = NAMES.index("bow_mm")
         assert abs(solution.values[k] - 1.0) < 4 * solution.sigmas[k] < 0.2
         surface = solution.states[2].surface
@@ -107,7 +107,7 @@ def test_a_bow_is_solved_when_it_is_free() -> None:
 def test_many_bins_are_averaged_and_nothing_is_lost() -> None:
     values = drawn(5)
     many = make(values, 5, points=40_000)
-    few = solve(many.problem(SIGMAS))
+    few = solve_calibration(many.problem(SIGMAS))
     assert max(phases.sigma_mm.size for phases in few.problem.sets) < 10_000
     claimed = solved(5)[1].sigmas
     assert np.allclose(few.sigmas[SIGMAS > 0], claimed[SIGMAS > 0], rtol=0.15)
@@ -121,9 +121,9 @@ def test_a_lens_or_a_screen_off_by_a_thousandth_is_within_the_claim(name: str) -
     truth = make(values, seed=3, points=600)
     pitch = 1 + values[NAMES.index("pitch_relative")]  # which the trace does not have
     sets = tuple(replace(phases, screen_mm=phases.screen_mm / pitch) for phases in truth.sets)
-    solution = solve(truth.problem(sigmas(known_sigmas(OPTICS, {})), sets))
+    solution = solve_calibration(truth.problem(prior_sigmas(known_sigmas(OPTICS, {})), sets))
     sag_um, figure_um = calibrated_errors_um(solution, truth)
-    claim = propagate(solution, 2, 475.0)
+    claim = propagate_to_figure(solution, 2, 475.0)
     assert abs(sag_um) < 2 * claim.sag_um < 50.0
     assert figure_um < 2 * claim.figure_rms_um
 
@@ -141,12 +141,12 @@ def test_a_set_whose_light_differed_between_its_frames_is_not_of_another_bench()
     """It counted as one: the first such sets of random benches were refused by that name."""
     truth = make(drawn(9), seed=9, points=30_000)
     spoilt = with_waves(truth, 6 * float(truth.sets[3].sigma_mm.mean()))
-    solution = solve(spoilt.problem(sigmas()))
+    solution = solve_calibration(spoilt.problem(prior_sigmas()))
     assert not [finding.says for finding in check_solution(solution) if finding.fatal]
     clean = np.sqrt([each.variance for each in solution.equations])
     assert clean[3] < 2.5 * np.median(clean)  # second order is left
-    unknown = solve(
-        with_waves(truth, 6 * float(truth.sets[3].sigma_mm.mean()), 0.0).problem(sigmas())
+    unknown = solve_calibration(
+        with_waves(truth, 6 * float(truth.sets[3].sigma_mm.mean()), 0.0).problem(prior_sigmas())
     )
     left = np.sqrt([each.variance for each in unknown.equations])
     assert left[3] > 3 * np.median(left)
@@ -177,7 +177,7 @@ def test_outliers_do_not_move_the_solution() -> None:
     screen_mm = truth.sets[1].screen_mm.copy()
     screen_mm[:, ::50] += 0.5
     sets = (truth.sets[0], replace(truth.sets[1], screen_mm=screen_mm), *truth.sets[2:])
-    solution = solve(truth.problem(SIGMAS, sets))
+    solution = solve_calibration(truth.problem(SIGMAS, sets))
     moved = np.abs(solution.values - clean.values)[SIGMAS > 0] / clean.sigmas[SIGMAS > 0]
     assert solution.converged
     assert moved.max() < 1.0
@@ -186,7 +186,7 @@ def test_outliers_do_not_move_the_solution() -> None:
 def test_what_is_not_determined_is_named() -> None:
     assert condition_number(solved(0)[1]) > 1e6
     near = make(drawn(0), 0, points=600, sags_mm=(36.5, 37.0, 37.5))
-    weak = weak_combinations(solve(near.problem(SIGMAS)), 1, 475.0)
+    weak = weak_combinations(solve_calibration(near.problem(SIGMAS)), 1, 475.0)
     assert all(0.5 < each.left <= 1.01 for each in weak)
     assert [each.left for each in weak] == sorted((each.left for each in weak), reverse=True)
     shifted = [each for each in weak if any(name == "screen_x_mm" for name, _ in each.parts)]
@@ -198,7 +198,7 @@ def test_what_is_not_determined_is_named() -> None:
 
 def test_one_step_settles_from_the_solution() -> None:
     truth, solution = solved(2)
-    again = solve(truth.problem(SIGMAS), start=solution)
+    again = solve_calibration(truth.problem(SIGMAS), start=solution)
     assert len(again.changes) < len(solution.changes)
     assert np.all(
         np.abs(again.values - solution.values)[SIGMAS > 0] < 0.05 * solution.sigmas[SIGMAS > 0]
@@ -208,13 +208,15 @@ def test_one_step_settles_from_the_solution() -> None:
 def test_progress_is_told() -> None:
     truth, _ = solved(3)
     told: list[tuple[int, float]] = []
-    solution = solve(truth.problem(SIGMAS), lambda count, change: told.append((count, change)))
+    solution = solve_calibration(
+        truth.problem(SIGMAS), lambda count, change: told.append((count, change))
+    )
     assert [count for count, _ in told] == list(range(1, len(solution.changes) + 1))
 
 
 def test_no_sets_is_an_error() -> None:
     with pytest.raises(ValueError, match="no capture set"):
-        solve(solved(0)[0].problem(SIGMAS, ()))
+        solve_calibration(solved(0)[0].problem(SIGMAS, ()))
 
 
 def test_what_a_set_calls_exact_has_the_tolerance_of_a_data_sheet() -> None:
@@ -228,6 +230,10 @@ def test_what_a_set_calls_exact_has_the_tolerance_of_a_data_sheet() -> None:
     )
     known = known_sigmas(optics, {"k1": 0.01})
     assert (known["k1"], known["focal_relative"], known["pitch_relative"]) == (0.01, 0.01, 1e-3)
-    held, free = (solve(truth.problem(own)) for own in (SIGMAS, sigmas(known)))
-    assert abs(calibrated_errors_um(held, truth)[0]) > 5 * propagate(held, 2, 475.0).sag_um
-    assert abs(calibrated_errors_um(free, truth)[0]) < 2 * propagate(free, 2, 475.0).sag_um
+    held, free = (solve_calibration(truth.problem(own)) for own in (SIGMAS, prior_sigmas(known)))
+    assert (
+        abs(calibrated_errors_um(held, truth)[0]) > 5 * propagate_to_figure(held, 2, 475.0).sag_um
+    )
+    assert (
+        abs(calibrated_errors_um(free, truth)[0]) < 2 * propagate_to_figure(free, 2, 475.0).sag_um
+    )

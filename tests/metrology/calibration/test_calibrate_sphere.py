@@ -11,14 +11,14 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from membrane_ctrl.metrology.calibration.artefact_advice import artefact_advice
-from membrane_ctrl.metrology.calibration.figure_uncertainty import propagate
+from membrane_ctrl.metrology.calibration.figure_uncertainty import propagate_to_figure
 from membrane_ctrl.metrology.calibration.rim_equations import Rim
-from membrane_ctrl.metrology.calibration.solver import Problem, Solution, solve
+from membrane_ctrl.metrology.calibration.solver import Problem, Solution, solve_calibration
 from membrane_ctrl.metrology.calibration.verdict import check_before_solving, check_solution
 from membrane_ctrl.metrology.rays.artefacts import Artefact
-from membrane_ctrl.metrology.rays.bench_parameters import NAMES, sigmas, usual_sigma
+from membrane_ctrl.metrology.rays.bench_parameters import NAMES, prior_sigmas, usual_sigma
 from membrane_ctrl.metrology.rays.bench_poses import bench_at
-from membrane_ctrl.metrology.rays.geometry import project
+from membrane_ctrl.metrology.rays.geometry import project_points
 from membrane_ctrl.metrology.rays.set_phases import SetPhases
 from membrane_ctrl.metrology.rays.surface import Surface
 from membrane_ctrl.model.zernike_terms import ZERNIKE_TERMS
@@ -34,7 +34,7 @@ from tests.support.calibration_truth import (
     make,
 )
 
-SIGMAS = sigmas({name: usual_sigma(name) for name in NAMES})
+SIGMAS = prior_sigmas({name: usual_sigma(name) for name in NAMES})
 SAGS_MM = (33.0, 35.0, 37.0)
 PIXELS = 2448 * 2048
 
@@ -55,7 +55,9 @@ def bench_of(
     sets = tuple(replace(phases, screen_mm=phases.screen_mm / pitch) for phases in truth.sets)
     theta = np.linspace(0, 2 * np.pi, 120, endpoint=False)
     x, y = 500.0 * np.cos(theta), 500.0 * np.sin(theta)
-    edges = project(bench_at(STATED, values).geometry, np.stack([x, y, truth.film.height_mm(x, y)]))
+    edges = project_points(
+        bench_at(STATED, values).geometry, np.stack([x, y, truth.film.height_mm(x, y)])
+    )
     return truth, replace(truth.problem(SIGMAS, sets), rim=Rim(edges, 500.0, 0.2))
 
 
@@ -96,7 +98,7 @@ def with_known(problem: Problem, *known: SetPhases) -> Solution:
     """The solution with artefacts, first in the list."""
     more = replace(problem, sets=(*known, *problem.sets))
     assert check_before_solving(more) == ()
-    return solve(more)
+    return solve_calibration(more)
 
 
 def sphere(
@@ -120,11 +122,11 @@ def middle_errors_um(solution: Solution, truth: Truth) -> tuple[float, float]:
 def test_the_sphere_that_is_advised_gives_what_was_promised(seed: int) -> None:
     values = drawn(seed)
     truth, problem = bench_of(values, seed)
-    alone = solve(problem)
+    alone = solve_calibration(problem)
     advice = artefact_advice(alone, 2)
     assert advice is not None
     assert {"a_mm", "b_mm"} <= set(advice.together)
-    assert advice.sag_um < 7 < 12 < propagate(alone, 2, 475.0).sag_um
+    assert advice.sag_um < 7 < 12 < propagate_to_figure(alone, 2, 475.0).sag_um
     rng = np.random.default_rng(seed)
     relative = advice.curvature_radius_sigma_mm / advice.curvature_radius_mm
     stated = sphere(advice.radius_mm, advice.curvature_radius_mm, relative, advice.vertex_sigma_mm)
@@ -133,7 +135,7 @@ def test_the_sphere_that_is_advised_gives_what_was_promised(seed: int) -> None:
         problem, looked_at(values, stated, curvature, advice.vertex_sigma_mm * rng.normal(), seed)
     )
     assert check_solution(obeyed) == ()
-    claim = propagate(obeyed, 3, 475.0)
+    claim = propagate_to_figure(obeyed, 3, 475.0)
     assert claim.sag_um == pytest.approx(advice.sag_um, rel=0.1)
     sag_um, figure_um = middle_errors_um(obeyed, truth)
     assert abs(sag_um) < 3 * claim.sag_um
@@ -166,11 +168,11 @@ def test_one_set_of_the_film_is_enough_beside_a_sphere_and_a_flat_is_true_but_ad
     seen = looked_at(values, stated, stated.curvature_per_mm, 0.0, 5)
     one = with_known(replace(problem, sets=problem.sets[2:]), seen)
     claims = {
-        "sphere": propagate(one, 1, 475.0).sag_um,
-        "film": propagate(solve(problem), 2, 475.0).sag_um,
+        "sphere": propagate_to_figure(one, 1, 475.0).sag_um,
+        "film": propagate_to_figure(solve_calibration(problem), 2, 475.0).sag_um,
     }
     beside = with_known(problem, looked_at(values, flat, 0.0, 0.0, 6))
-    claims["flat"] = propagate(beside, 3, 475.0).sag_um
+    claims["flat"] = propagate_to_figure(beside, 3, 475.0).sag_um
     assert check_solution(one) == check_solution(beside) == ()
     assert claims["sphere"] < 7
     assert 0.8 * claims["film"] < claims["flat"] < claims["film"]
@@ -216,4 +218,8 @@ def test_a_sphere_with_the_form_error_that_is_stated_is_believed() -> None:
     known = SetPhases("known", column[inside], row[inside], seen, sigma, np.nan, artefact=stated)
     solution = with_known(problem, known)
     assert check_solution(solution) == ()
-    assert abs(middle_errors_um(solution, truth)[0]) < 3 * propagate(solution, 3, 475.0).sag_um < 18
+    assert (
+        abs(middle_errors_um(solution, truth)[0])
+        < 3 * propagate_to_figure(solution, 3, 475.0).sag_um
+        < 18
+    )

@@ -14,18 +14,18 @@ from membrane_ctrl.metrology.calibration.model_tests import (
     find_camera_bumps,
     find_suspects,
 )
-from membrane_ctrl.metrology.calibration.solver import solve
+from membrane_ctrl.metrology.calibration.solver import solve_calibration
 from membrane_ctrl.metrology.calibration.verdict import (
     CalibrationFinding,
     check_before_solving,
     check_solution,
 )
 from membrane_ctrl.metrology.cycle.geometry_monitors import CYCLES, DriftMonitor
-from membrane_ctrl.metrology.rays.bench_parameters import NAMES, sigmas
+from membrane_ctrl.metrology.rays.bench_parameters import NAMES, prior_sigmas
 from membrane_ctrl.metrology.rays.set_phases import SetPhases
 from tests.support.calibration_truth import SAGS_MM, Truth, make
 
-SIGMAS = sigmas()
+SIGMAS = prior_sigmas()
 VALUES = SIGMAS * np.random.default_rng(3).normal(size=len(NAMES))
 Edit = Callable[[SetPhases], SetPhases]
 
@@ -45,7 +45,7 @@ def judged(
     truth: Truth, sets: tuple[SetPhases, ...] | None = None
 ) -> tuple[CalibrationFinding, ...]:
     problem = truth.problem(SIGMAS, sets)
-    return check_before_solving(problem) or check_solution(solve(problem))
+    return check_before_solving(problem) or check_solution(solve_calibration(problem))
 
 
 def edited(edit: Edit, *which: int) -> tuple[SetPhases, ...]:
@@ -61,7 +61,7 @@ ALL_SETS = tuple(range(len(SAGS_MM)))
 
 def test_good_sets_have_nothing_against_them() -> None:
     assert judged(good()) == ()
-    solution = solve(good().problem(SIGMAS))
+    solution = solve_calibration(good().problem(SIGMAS))
     assert find_suspects(solution) == ()
     assert find_camera_bumps(solution) == ()
     assert all(each.fall < 3 * each.freedom for each in compare_left_out_sets(solution))
@@ -123,8 +123,8 @@ def test_sets_that_are_too_close_are_refused() -> None:
 
 def test_without_a_laser_fringes_and_ring_say_it() -> None:
     silent = edited(reading(lambda d: float("nan")), 1, 2, 3, 4)
-    held = good().problem(sigmas({"laser_relative": 0.0}), silent)
-    solution = solve(held)
+    held = good().problem(prior_sigmas({"laser_relative": 0.0}), silent)
+    solution = solve_calibration(held)
     (finding,) = check_before_solving(held) or check_solution(solution)
     assert not finding.fatal
     assert "the sag rests on fringes and ring alone" in finding.says
@@ -158,7 +158,7 @@ def test_bins_are_not_averaged_about_a_bench_that_was_not_found() -> None:
     other = VALUES.copy()
     other[NAMES.index("camera_yaw_deg")] += 1.0
     mixed = make(VALUES, 3, points=8200, sags_mm=(34.0, 36.0, 40.0), bumped={2: other})
-    solution = solve(mixed.problem(SIGMAS))
+    solution = solve_calibration(mixed.problem(SIGMAS))
     assert not solution.converged
     kept = solution.problem.sets[2].screen_mm
     assert kept.shape[1] > 1000
@@ -186,7 +186,7 @@ def test_a_bow_is_told_by_its_pattern() -> None:
     assert finding.fatal
     assert "the pattern of bow_mm = " in finding.says
     assert "--free bow_mm" in finding.says
-    solution = solve(bent.problem(SIGMAS))
+    solution = solve_calibration(bent.problem(SIGMAS))
     assert find_suspects(solution)[0].value == pytest.approx(1.0, abs=0.15)
     # a tenth of a hundredth is seen by nobody
     assert judged(make(VALUES, 3, points=600, bow_mm=0.001)) == ()

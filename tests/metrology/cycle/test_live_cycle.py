@@ -25,7 +25,7 @@ from membrane_ctrl.metrology.rays.geometry import Geometry
 from membrane_ctrl.metrology.uncertainty.geometry_spread import (
     PAPER_SPREAD,
     GeometrySpread,
-    changed,
+    change_geometry,
 )
 from membrane_ctrl.model.shape_estimate import ShapeEstimate
 from membrane_ctrl.model.zernike_terms import ZERNIKE_TERMS
@@ -378,7 +378,7 @@ def test_the_geometrys_covariance_is_what_wrong_geometries_do() -> None:
     for name, sigma in zip(PAPER_SPREAD.names, PAPER_SPREAD.sigmas, strict=True):
         ends = []
         for sign in (1.0, -1.0):
-            geometry = changed(OPTICS.geometry, (name,), [sign * sigma])
+            geometry = change_geometry(OPTICS.geometry, (name,), [sign * sigma])
             wrong = LiveReconstructor(OPTICS.model_copy(update={"geometry": geometry}), 2)
             ends.append(wrong.full(frames, times, where).coeffs_um)
         far += np.outer(ends[0] - ends[1], ends[0] - ends[1]) / 4

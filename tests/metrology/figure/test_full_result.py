@@ -14,12 +14,12 @@ from membrane_ctrl.metrology.figure.pixel_figure import (
     FullResult,
     measure_pixels,
     reconstruct_full,
-    tukey,
+    tukey_weights,
 )
 from membrane_ctrl.metrology.figure.set_motion import FilmMotion
 from membrane_ctrl.metrology.frame_checks.set_check import check_set
 from membrane_ctrl.metrology.phase.frame_stack import FrameStack
-from membrane_ctrl.metrology.rays.ray_tracing import HeightFunction, parabola
+from membrane_ctrl.metrology.rays.ray_tracing import HeightFunction, make_parabola
 from membrane_ctrl.metrology.rays.surface import Surface
 from membrane_ctrl.model.zernike_terms import ZERNIKE_TERMS
 from membrane_ctrl.sim.optics.camera import OpticsRenderer
@@ -90,7 +90,12 @@ def test_a_hencky_bowl_with_millimetres_of_figure() -> None:
 
 @pytest.mark.parametrize(
     "start",
-    [parabola(10.0, 500.0), parabola(100.0, 500.0), cone(40.0, 500.0), v_fold(40.0, 500.0)],
+    [
+        make_parabola(10.0, 500.0),
+        make_parabola(100.0, 500.0),
+        cone(40.0, 500.0),
+        v_fold(40.0, 500.0),
+    ],
     ids=["shallow", "deep", "cone", "V-fold"],
 )
 def test_all_starts_agree(start: HeightFunction) -> None:
@@ -257,7 +262,7 @@ def test_dust_has_no_say() -> None:
 def test_tukey_keeps_noise_and_drops_outliers() -> None:
     residual = np.abs(np.random.default_rng(1).normal(size=10_000))
     residual[::100] = 50.0
-    weights = tukey(residual)
+    weights = tukey_weights(residual)
     assert np.all(weights[::100] == 0)
     assert np.median(weights) > 0.95
 

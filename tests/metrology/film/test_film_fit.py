@@ -76,7 +76,9 @@ def _round_terms(height_mm: Polynomial) -> FloatArray:
         np.sqrt(2 * k + 1) * Legendre.basis(k, domain=[0, 1]).deriv()(rho**2)
         for k in range(1, len(ROUND))
     ]
-    slopes.append(Polynomial(hencky_bowl.excess()).deriv()(rho**2) / hencky_bowl.excess_rms())
+    slopes.append(
+        Polynomial(hencky_bowl.excess_series()).deriv()(rho**2) / hencky_bowl.excess_rms()
+    )
     design = np.stack([2 * rho * slope for slope in slopes], axis=1)
     return np.linalg.lstsq(design, 2 * rho * height_mm.deriv()(rho**2), rcond=None)[0]
 

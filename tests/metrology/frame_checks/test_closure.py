@@ -4,9 +4,9 @@ import numpy as np
 import pytest
 
 from membrane_ctrl.metrology.frame_checks.closure import (
-    closure,
     closure_with_level,
     closure_with_phase,
+    compute_closure,
 )
 from membrane_ctrl.metrology.phase.phase_steps import equal_shifts
 
@@ -34,7 +34,7 @@ def checks(frames, shifts, phase, mean, amplitude):
         closure_with_phase(frames, shifts, phase),
         closure_with_level(frames, shifts, mean, amplitude),
     ]
-    return out if len(shifts) == 4 else [closure(frames, shifts), *out]
+    return out if len(shifts) == 4 else [compute_closure(frames, shifts), *out]
 
 
 @pytest.mark.parametrize("steps", [4, 5, 8])
@@ -68,7 +68,7 @@ def test_a_partly_stale_frame_is_named(share):
 def test_four_steps_alone_see_the_fault_but_blame_all_alike():
     frames, shifts, *_ = scene(4)
     frames[1] += 30
-    result = closure(frames, shifts)
+    result = compute_closure(frames, shifts)
     assert result.rms_adu == pytest.approx(
         15, rel=0.01
     )  # (I0 - I1 + I2 - I3) / 2 for one degree of freedom
@@ -80,7 +80,7 @@ def test_four_steps_alone_see_the_fault_but_blame_all_alike():
 @pytest.mark.parametrize("shifts", [equal_shifts(6), np.array([0.0, 1.1, 2.9, 3.3, 5.2, 5.9])])
 def test_leaving_out_equals_fitting_again_without(shifts):
     frames = np.random.default_rng(3).normal(100, 20, (6, 50))
-    result = closure(frames, shifts)
+    result = compute_closure(frames, shifts)
     for k in range(6):
         rest = np.arange(6) != k
         design = np.stack([np.ones(5), np.cos(shifts[rest]), np.sin(shifts[rest])], axis=1)
@@ -132,17 +132,17 @@ def test_images_and_lists_of_pixels_give_the_same():
 
 def test_three_steps_always_agree_and_are_refused():
     with pytest.raises(ValueError, match="four or more"):
-        closure(np.zeros((3, 10)), equal_shifts(3))
+        compute_closure(np.zeros((3, 10)), equal_shifts(3))
 
 
 def test_no_pixels_are_refused():
     with pytest.raises(ValueError, match="no pixels"):
-        closure(np.zeros((4, 0)), equal_shifts(4))
+        compute_closure(np.zeros((4, 0)), equal_shifts(4))
 
 
 def test_steps_without_a_phase_are_refused():
     with pytest.raises(ValueError, match="do not determine"):
-        closure(np.zeros((4, 10)), [0.0, np.pi, 0.0, np.pi])
+        compute_closure(np.zeros((4, 10)), [0.0, np.pi, 0.0, np.pi])
 
 
 def test_a_pixel_without_any_fringe_weighs_no_more_than_others():

@@ -12,16 +12,16 @@ from membrane_ctrl.metrology.numerics import compiled
 
 KERNELS = """
 from cached_steps import added
-from membrane_ctrl.metrology.numerics.compiled import kernel
+from membrane_ctrl.metrology.numerics.compiled import compile_kernel
 
-@kernel
+@compile_kernel
 def total(point):
     return added(point.x, point.y)
 """
 STEPS = """
-from membrane_ctrl.metrology.numerics.compiled import step
+from membrane_ctrl.metrology.numerics.compiled import compile_step
 
-@step
+@compile_step
 def added(x, y):
     return x + y
 """
@@ -55,7 +55,7 @@ def total(folder: Path, module: str) -> tuple[float, int]:
     for name in MODULES:
         sys.modules.pop(name, None)
     importlib.invalidate_caches()
-    compiled._sources.cache_clear()
+    compiled._source_checksum.cache_clear()
 
     point = importlib.import_module(module).Point(1.0, 2.0)
     kernel = importlib.import_module("cached_kernels").total

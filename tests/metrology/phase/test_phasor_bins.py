@@ -7,11 +7,11 @@ import math
 import numpy as np
 import pytest
 
-from membrane_ctrl.metrology.numerics.compiled import kernel
+from membrane_ctrl.metrology.numerics.compiled import compile_kernel
 from membrane_ctrl.metrology.phase.bin_sums import FOLLOWED_ROWS, Binner
 from membrane_ctrl.metrology.phase.phase_change import update_phases
 from membrane_ctrl.metrology.phase.phase_steps import equal_shifts, step_weights
-from membrane_ctrl.metrology.phase.phasor_kernels import arctan2
+from membrane_ctrl.metrology.phase.phasor_kernels import branchless_arctan2
 from membrane_ctrl.metrology.reconstruction.film_motion import combine_steps, worth_correcting
 
 RNG = np.random.default_rng(7)
@@ -63,10 +63,10 @@ def test_wrong_frames_are_refused(frame: np.ndarray, message: str) -> None:
         Binner(8, 8, 4, 255, 1).add([frame], [0])
 
 
-@kernel
+@compile_kernel
 def _all_arctan2(y, x, out):  # type: ignore[no-untyped-def]
     for k in range(y.size):
-        out[k] = arctan2(y[k], x[k])
+        out[k] = branchless_arctan2(y[k], x[k])
 
 
 def test_arctan2_is_the_librarys() -> None:

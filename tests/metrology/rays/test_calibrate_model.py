@@ -10,7 +10,7 @@ import pytest
 from membrane_ctrl.config.schema import CameraConfig, GeometryConfig, OpticsConfig
 from membrane_ctrl.metrology.calibration.point_averages import average_points
 from membrane_ctrl.metrology.calibration.set_state import SetState
-from membrane_ctrl.metrology.rays.bench_parameters import ALL, NAMES, POSE, sigmas
+from membrane_ctrl.metrology.rays.bench_parameters import ALL, NAMES, POSE, prior_sigmas
 from membrane_ctrl.metrology.rays.bench_poses import (
     OPTICAL,
     BenchGeometry,
@@ -152,15 +152,15 @@ def test_pose_derivatives_are_exact() -> None:
 
 
 def test_sigmas_free_and_hold() -> None:
-    own = sigmas({"bow_mm": 2.0, "a_mm": 0.0})
+    own = prior_sigmas({"bow_mm": 2.0, "a_mm": 0.0})
     assert own[NAMES.index("bow_mm")] == 2.0
     assert own[NAMES.index("a_mm")] == 0.0
     assert own[NAMES.index("k1")] == 0.0
     assert own[NAMES.index("b_mm")] > 0
     with pytest.raises(ValueError, match="radius_mm is not a parameter"):
-        sigmas({"radius_mm": 1.0})
+        prior_sigmas({"radius_mm": 1.0})
     with pytest.raises(ValueError, match="a_mm: a sigma"):
-        sigmas({"a_mm": -1.0})
+        prior_sigmas({"a_mm": -1.0})
 
 
 def test_camera_over_the_screen_is_refused() -> None:

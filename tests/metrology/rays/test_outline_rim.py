@@ -7,7 +7,7 @@ import pytest
 
 from membrane_ctrl.metrology.figure.radial_profile import pressure_pa, radial_profile
 from membrane_ctrl.metrology.film import hencky_bowl
-from membrane_ctrl.metrology.rays.geometry import Geometry, project
+from membrane_ctrl.metrology.rays.geometry import Geometry, project_points
 from membrane_ctrl.metrology.rays.rim_outline import find_outline
 from tests.support.rendered_sets import FILM, bench, good_set
 
@@ -55,7 +55,7 @@ def test_points_are_projected_along_their_rays() -> None:
     geometry = Geometry.from_config(bench().model_copy(update={"camera": camera}))
     columns, rows = np.array([10.0, 150, 290]), np.array([12.0, 100, 240])
     there = geometry.pinhole_mm[:, None] + 2000 * geometry.rays(columns, rows)
-    assert project(geometry, there) == pytest.approx(np.stack([columns, rows]), abs=1e-6)
+    assert project_points(geometry, there) == pytest.approx(np.stack([columns, rows]), abs=1e-6)
 
 
 def test_a_rim_that_is_half_outside_the_picture_is_found_by_its_other_half() -> None:
@@ -79,14 +79,14 @@ def test_no_rim_in_the_dark_or_in_even_light() -> None:
 
 def test_the_vertex_projects_to_the_principal_point() -> None:
     geometry = Geometry.from_config(bench())
-    assert project(geometry, np.zeros((3, 1)))[:, 0] == pytest.approx(geometry.principal_px)
+    assert project_points(geometry, np.zeros((3, 1)))[:, 0] == pytest.approx(geometry.principal_px)
 
 
 def test_profile_of_a_hencky_bowl() -> None:
     axis = np.linspace(-475, 475, 191)
     x, y = np.meshgrid(axis, axis)
     r = np.hypot(x, y)
-    height = 37.1 * hencky_bowl.profile(np.minimum(r / 500, 1.0)) + 0.1 * x / 475
+    height = 37.1 * hencky_bowl.bowl_profile(np.minimum(r / 500, 1.0)) + 0.1 * x / 475
     profile = radial_profile(axis, np.where(r <= 475, height, np.nan), 500.0)
     assert profile.sag_mm == pytest.approx(37.1, abs=1e-6)
     assert profile.pressure_pa == pytest.approx(600, rel=0.005)

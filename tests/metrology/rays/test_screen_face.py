@@ -22,7 +22,7 @@ from membrane_ctrl.metrology.rays.ray_tracing import Points, Tracer
 from membrane_ctrl.metrology.rays.screen_face import Face
 from membrane_ctrl.metrology.rays.set_phases import SetPhases
 from membrane_ctrl.metrology.rays.surface import Surface
-from membrane_ctrl.metrology.uncertainty.geometry_spread import GENERAL_NAMES, changed
+from membrane_ctrl.metrology.uncertainty.geometry_spread import GENERAL_NAMES, change_geometry
 from membrane_ctrl.sim.optics.bench_poses import camera_pose, screen_pose
 from membrane_ctrl.sim.optics.film_shape import FilmShape
 from membrane_ctrl.sim.optics.trace import trace
@@ -168,14 +168,14 @@ def test_the_live_cycle_has_the_face() -> None:
 
 def test_both_forms_of_the_geometry_carry_the_face() -> None:
     short = GeometryConfig(a_mm=2672.0, b_mm=2871.0, alpha_deg=90.0, screen=CROOKED)
-    assert changed(short, ("a_mm",), [1.0]).screen == CROOKED
+    assert change_geometry(short, ("a_mm",), [1.0]).screen == CROOKED
     camera = CameraPoseConfig(
         position_mm=(0, 0, 2672), rotation=((1, 0, 0), (0, -1, 0), (0, 0, -1))
     )
     posed = CROOKED.model_copy(
         update={"origin_mm": (0, 0, 2871), "s_x": (-1, 0, 0), "s_y": (0, 1, 0)}
     )
-    moved = changed(
+    moved = change_geometry(
         GeometryConfig(camera=camera, screen=posed), GENERAL_NAMES, np.full(12, 0.01)
     ).screen
     assert moved is not None

@@ -13,17 +13,17 @@ from membrane_ctrl.config.optics import (
     OpticsConfig,
     ScreenPoseConfig,
 )
-from membrane_ctrl.metrology.numerics.matrix_inverse import invert
-from membrane_ctrl.metrology.numerics.zernike import gradients
+from membrane_ctrl.metrology.numerics.matrix_inverse import invert_in_place
+from membrane_ctrl.metrology.numerics.zernike import evaluate_gradients
 from membrane_ctrl.metrology.rays.geometry import Geometry
-from membrane_ctrl.metrology.rays.ray_tracing import Points, Tracer, parabola
+from membrane_ctrl.metrology.rays.ray_tracing import Points, Tracer, make_parabola
 from membrane_ctrl.metrology.rays.surface import Surface, sag_gradient
 from membrane_ctrl.metrology.reconstruction.normal_matrix import NormalMatrix
 from membrane_ctrl.metrology.reconstruction.slope_noise import (
     parameter_covariance,
     slope_per_screen,
 )
-from membrane_ctrl.metrology.reconstruction.surface_fit import Fit, solve
+from membrane_ctrl.metrology.reconstruction.surface_fit import Fit, fit_surface
 from membrane_ctrl.model.zernike_terms import NOLL_INDICES, ZERNIKE_TERMS
 from tests.support.metrology_truth import (
     OPTICS,
@@ -39,7 +39,7 @@ from tests.support.metrology_truth import (
 
 GEOMETRY = Geometry.from_config(OPTICS)
 TRACER = Tracer(GEOMETRY, RADIUS_MM)
-START = parabola(40.0, RADIUS_MM)
+START = make_parabola(40.0, RADIUS_MM)
 # a bowl of the fitted terms: deep, with every symmetry
 _AMOUNTS_MM = {
     4: 10.7,
@@ -76,7 +76,7 @@ def _error_mm(surface: Surface, film: TrueFilm) -> np.ndarray:
 
 
 def test_shape_of_the_fitted_terms_is_exact() -> None:
-    fit = solve(TRACER, _points(_seen("terms")), START)
+    fit = fit_surface(TRACER, _points(_seen("terms")), START)
     assert fit.converged
     assert len(fit.changes_mm) <= 5
     assert np.abs(_error_mm(fit.surface, TERMS)).max() <= 1e-6
@@ -84,13 +84,13 @@ def test_shape_of_the_fitted_terms_is_exact() -> None:
 
 
 def test_true_hencky_bowl_with_aberrations() -> None:
-    error = _error_mm(solve(TRACER, _points(_seen("bowl")), START).surface, BOWL)
+    error = _error_mm(fit_surface(TRACER, _points(_seen("bowl")), START).surface, BOWL)
     assert np.sqrt(np.mean(error**2)) <= 0.1e-3
     assert np.abs(error).max() <= 0.5e-3
 
 
 def test_hencky_amplitude_is_the_bowls_sag() -> None:
-    fit = solve(TRACER, _points(_seen("bowl")), START)
+    fit = fit_surface(TRACER, _points(_seen("bowl")), START)
     assert fit.surface.hencky_mm == pytest.approx(37.1, abs=0.01)
     assert fit.surface.sag_mm == pytest.approx(
         37.1, abs=1e-5
@@ -100,14 +100,16 @@ def test_hencky_amplitude_is_the_bowls_sag() -> None:
 @pytest.mark.parametrize(
     "start",
     [
-        *(parabola(h, RADIUS_MM) for h in (10.0, 100.0)),
+        *(make_parabola(h, RADIUS_MM) for h in (10.0, 100.0)),
         cone(40.0, RADIUS_MM),
         v_fold(40.0, RADIUS_MM),
     ],
     ids=["parabola 10", "parabola 100", "cone", "V-fold"],
 )
 def test_all_starts_end_in_one_surface(start) -> None:  # type: ignore[no-untyped-def]
-    ends = [solve(TRACER, _points(_seen("bowl")), s, tolerance_mm=1e-12) for s in (START, start)]
+    ends = [
+        fit_surface(TRACER, _points(_seen("bowl")), s, tolerance_mm=1e-12) for s in (START, start)
+    ]
     grid = np.meshgrid(*[np.linspace(-350, 350, 40)] * 2)
     assert np.abs(ends[0].surface.height(*grid) - ends[1].surface.height(*grid)).max() <= 1e-9
     within = next(k for k, change in enumerate(ends[1].changes_mm, 1) if change < 1e-6)
@@ -118,23 +120,23 @@ def test_all_starts_end_in_one_surface(start) -> None:  # type: ignore[no-untype
 
 def test_kept_normal_matrix_has_the_same_end() -> None:
     points = _points(_seen("bowl"))
-    renewed = solve(TRACER, points, START, tolerance_mm=1e-12)
+    renewed = fit_surface(TRACER, points, START, tolerance_mm=1e-12)
     TRACER.start(points, START)
     of_the_start = NormalMatrix.from_points(TRACER, points)
-    kept = solve(TRACER, points, START, normal=of_the_start, tolerance_mm=1e-12)
+    kept = fit_surface(TRACER, points, START, normal=of_the_start, tolerance_mm=1e-12)
     assert kept.surface.parameters == pytest.approx(renewed.surface.parameters, abs=1e-10)
 
 
 def test_warm_start_needs_two_steps_after_a_micrometre() -> None:
     points = _points(_seen("bowl"))
-    first = solve(TRACER, points, START, tolerance_mm=1e-10)
+    first = fit_surface(TRACER, points, START, tolerance_mm=1e-10)
     deeper = TrueFilm(37.101, BOWL.terms_mm)
     moved = look(GEOMETRY, deeper, *pixel_grid(SMALL, 2), vertex_z_mm=-0.001)
     tracer = Tracer(GEOMETRY, RADIUS_MM, vertex_z_mm=-0.001)
     same = min(moved.rays.shape[1], points.t_mm.size)
     assert same == points.t_mm.size == moved.rays.shape[1]
     points.screen_mm[:] = moved.screen_mm
-    warm = solve(tracer, points, first.surface, normal=first.normal)
+    warm = fit_surface(tracer, points, first.surface, normal=first.normal)
     assert len(warm.changes_mm) <= 2
     assert (
         np.abs(_error_mm(warm.surface, deeper)).max()
@@ -148,8 +150,8 @@ def test_vertex_shift_that_is_known_does_no_harm() -> None:
     """
     deeper = TrueFilm(38.1, BOWL.terms_mm)
     seen = look(GEOMETRY, deeper, *pixel_grid(SMALL, 3), vertex_z_mm=-1.0)
-    known = solve(Tracer(GEOMETRY, RADIUS_MM, vertex_z_mm=-1.0), _points(seen), START)
-    unknown = solve(TRACER, _points(seen), START)
+    known = fit_surface(Tracer(GEOMETRY, RADIUS_MM, vertex_z_mm=-1.0), _points(seen), START)
+    unknown = fit_surface(TRACER, _points(seen), START)
     assert np.abs(_error_mm(known.surface, deeper)).max() <= 1e-5
     assert np.abs(_error_mm(unknown.surface, deeper)).max() > 1e-3
 
@@ -176,7 +178,7 @@ def test_any_pose_with_a_distorting_lens() -> None:
     camera = SMALL.model_copy(update={"distortion": (-0.15, 0.03, 1e-3, -5e-4)})
     geometry = Geometry.from_config(OpticsConfig(geometry=config, camera=camera))
     seen = look(geometry, TERMS, *pixel_grid(camera, 3))
-    fit = solve(Tracer(geometry, RADIUS_MM), _points(seen), START)
+    fit = fit_surface(Tracer(geometry, RADIUS_MM), _points(seen), START)
     assert np.abs(_error_mm(fit.surface, TERMS)).max() <= 1e-6
 
 
@@ -210,10 +212,10 @@ def test_measured_slopes_are_those_of_the_papers_scalar_equations() -> None:
 
 def test_piston_makes_the_papers_normal_matrix_singular_and_ours_is_not() -> None:
     points = _points(_seen("bowl"))
-    fit = solve(TRACER, points, START)
+    fit = fit_surface(TRACER, points, START)
     assert np.linalg.cond(fit.normal.x + fit.normal.y) < 200
     x, y = TRACER.position_mm(points) / RADIUS_MM
-    gx, gy = gradients(x, y)
+    gx, gy = evaluate_gradients(x, y)
     papers = gx @ gx.T + gy @ gy.T
     assert np.linalg.matrix_rank(papers) == ZERNIKE_TERMS - 1
     assert (fit.normal.x + fit.normal.y)[:-1, :-1] * RADIUS_MM**2 == pytest.approx(
@@ -224,35 +226,35 @@ def test_piston_makes_the_papers_normal_matrix_singular_and_ours_is_not() -> Non
 def test_points_that_determine_nothing_are_refused() -> None:
     points = _points(_seen("bowl")).subset(np.arange(_seen("bowl").rays.shape[1]) < 5)
     with pytest.raises(ValueError, match="do not determine"):
-        solve(TRACER, points, START)
+        fit_surface(TRACER, points, START)
 
 
 def test_nan_does_not_pass_as_converged() -> None:
     points = _points(_seen("bowl"))
-    normal: NormalMatrix = solve(TRACER, points, START).normal
+    normal: NormalMatrix = fit_surface(TRACER, points, START).normal
     points.screen_mm[0, 7] = np.nan
-    assert not solve(TRACER, points, START, normal=normal).converged
+    assert not fit_surface(TRACER, points, START, normal=normal).converged
 
 
 def test_weight_zero_leaves_a_point_out() -> None:
     seen = _seen("bowl")
     points = _points(seen)
-    clean = solve(TRACER, points, START).surface.parameters
+    clean = fit_surface(TRACER, points, START).surface.parameters
     points.screen_mm[:, ::50] += 5.0
     points.weights[::50] = 0
-    assert solve(TRACER, points, START).surface.parameters == pytest.approx(clean, abs=1e-6)
+    assert fit_surface(TRACER, points, START).surface.parameters == pytest.approx(clean, abs=1e-6)
 
 
 def test_covariance_is_the_scatter_of_noisy_sets() -> None:
     """Parameters, and the sag, over 200 sets with 20 µm of noise on the screen: to 10 %."""
     seen = _seen("bowl", 4)
     points = _points(seen)
-    clean: Fit = solve(TRACER, points, START, tolerance_mm=1e-10)
+    clean: Fit = fit_surface(TRACER, points, START, tolerance_mm=1e-10)
     rng = np.random.default_rng(8)
     found = []
     for _ in range(200):
         points.screen_mm[:] = seen.screen_mm + rng.normal(0, 0.02, seen.screen_mm.shape)
-        noisy = solve(TRACER, points, clean.surface, normal=clean.normal)
+        noisy = fit_surface(TRACER, points, clean.surface, normal=clean.normal)
         found.append(noisy.surface.parameters)
     scatter = np.array(found)
     gain = slope_per_screen(GEOMETRY, RADIUS_MM, 37.1)
@@ -268,8 +270,8 @@ def test_inverse_is_numpys_and_refuses_what_is_not_positive() -> None:
     root = rng.normal(size=(36, 50))
     matrix = root @ root.T
     inverse = matrix.copy()
-    assert invert(inverse)
+    assert invert_in_place(inverse)
     assert inverse == pytest.approx(np.linalg.inv(matrix), rel=1e-9, abs=1e-12)
     deficient = root[:, :20] @ root[:, :20].T
-    assert not invert(deficient)
-    assert not invert(np.full((2, 2), np.nan))
+    assert not invert_in_place(deficient)
+    assert not invert_in_place(np.full((2, 2), np.nan))

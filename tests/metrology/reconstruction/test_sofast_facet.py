@@ -11,12 +11,12 @@ import pytest
 from membrane_ctrl.measure import sofast_file
 from membrane_ctrl.measure.sofast_file import SHIFTS_RAD, axis_series, lit_pixels
 from membrane_ctrl.metrology.frame_checks.closure import (
-    closure,
     closure_with_level,
     closure_with_phase,
+    compute_closure,
 )
 from membrane_ctrl.metrology.frame_checks.frequency_series import check_series
-from membrane_ctrl.metrology.phase.phase_steps import phasors
+from membrane_ctrl.metrology.phase.phase_steps import compute_phasors
 from membrane_ctrl.metrology.phase.temporal_unwrap import predict_phase, unwrap_in_time
 from tests.support import sofast_facet
 from tests.support.facet import measure_on, solve_facet
@@ -145,9 +145,11 @@ def test_slopes_hardly_depend_on_the_surface_that_places_the_points(golden, seen
 def test_the_response_calibration_does_not_fit_these_frames(measurement, response, mask):
     black, white = measurement.black[mask], measurement.white[mask]
     for frames in (*measurement.frames_x, *measurement.frames_y):
-        as_seen = closure(frames[..., mask], SHIFTS_RAD).rms_adu / np.median(white)
+        as_seen = compute_closure(frames[..., mask], SHIFTS_RAD).rms_adu / np.median(white)
         as_shown = (
-            closure(response.shown_levels(frames[..., mask], black, white), SHIFTS_RAD).rms_adu
+            compute_closure(
+                response.shown_levels(frames[..., mask], black, white), SHIFTS_RAD
+            ).rms_adu
             / 255
         )
         assert as_shown > 2.5 * as_seen
@@ -173,9 +175,9 @@ def named(frames, periods, index):
     """
     if index == 0:
         neighbour = frames[1]
-        level = neighbour.mean(axis=0), np.abs(phasors(neighbour, SHIFTS_RAD))
+        level = neighbour.mean(axis=0), np.abs(compute_phasors(neighbour, SHIFTS_RAD))
         return closure_with_level(frames[0], SHIFTS_RAD, *level)
-    wrapped = np.angle(np.stack([phasors(steps, SHIFTS_RAD) for steps in frames]))
+    wrapped = np.angle(np.stack([compute_phasors(steps, SHIFTS_RAD) for steps in frames]))
     return closure_with_phase(frames[index], SHIFTS_RAD, predict_phase(wrapped, periods, index))
 
 
@@ -183,7 +185,7 @@ def named(frames, periods, index):
 def test_no_frame_of_this_set_is_stale(measurement, mask, axis):
     frames, periods = frame_series(measurement, mask, axis)
     for index, steps in enumerate(frames):
-        assert closure(steps, SHIFTS_RAD).rms_adu < 2.5
+        assert compute_closure(steps, SHIFTS_RAD).rms_adu < 2.5
         assert named(frames, periods, index).gain < 1.2
 
 
@@ -193,7 +195,7 @@ def test_no_frame_of_this_set_is_stale(measurement, mask, axis):
 def test_a_stale_frame_put_into_it_is_named(measurement, mask, axis, index, step):
     frames, periods = frame_series(measurement, mask, axis)
     frames[index, step] = frames[index, step - 1]
-    assert closure(frames[index], SHIFTS_RAD).rms_adu > 20
+    assert compute_closure(frames[index], SHIFTS_RAD).rms_adu > 20
     found = named(frames, periods, index)
     assert found.suspect == step
     assert found.gain > 5
@@ -204,7 +206,7 @@ def test_unwrapping_alone_does_not_notice_a_stale_frame_of_the_finest_fringe(mea
     frames, periods = frame_series(measurement, mask, "x")
     frames[3, 1] = frames[3, 0]
     stale = good.copy()
-    stale[3] = np.angle(phasors(frames[3], SHIFTS_RAD))
+    stale[3] = np.angle(compute_phasors(frames[3], SHIFTS_RAD))
     position = unwrap_in_time(stale, periods)
     assert position.consistent.all()
     error_mm = 8727 * (position.screens - unwrap_in_time(good, periods).screens)

@@ -21,7 +21,7 @@ from membrane_ctrl.metrology.tracking.live_tracker import (
     LOST_S,
     REJECTED_S,
     LiveTracker,
-    _estimate,
+    _make_estimate,
 )
 from membrane_ctrl.metrology.tracking.tracked_frame import rejected_frame
 from membrane_ctrl.metrology.vibrations.mode_follower import Stethoscope
@@ -135,7 +135,7 @@ def test_a_rounded_term_is_no_minus_zero() -> None:
         sag_um=0.0,
         sag_sigma_um=0.0,
     )
-    assert not np.signbit(_estimate(frame, math.nan, False, 1.0).coeffs_um).any()
+    assert not np.signbit(_make_estimate(frame, math.nan, False, 1.0).coeffs_um).any()
 
 
 def test_the_pattern_steps_at_first_and_then_now_and_then(bench: Bench) -> None:

@@ -17,7 +17,7 @@ from membrane_ctrl.metrology.uncertainty.geometry_spread import (
     PAPER_SPREAD,
     SHORT_NAMES,
     GeometrySpread,
-    changed,
+    change_geometry,
     stated_spread,
 )
 
@@ -59,7 +59,7 @@ def test_stated_sigmas() -> None:
 
 
 def test_short_form_changes_in_its_numbers() -> None:
-    moved = changed(SHORT, ("alpha_deg", "a_mm"), [0.3, -2.0])
+    moved = change_geometry(SHORT, ("alpha_deg", "a_mm"), [0.3, -2.0])
     assert (moved.a_mm, moved.b_mm, moved.alpha_deg) == (2670.0, 2871.0, pytest.approx(81.2))
 
 
@@ -67,7 +67,9 @@ def test_general_form_is_shifted_and_turned_about_its_own_origin() -> None:
     general = _general()
     names = ("camera_shift_z_mm", "camera_turn_y_rad", "screen_turn_z_rad")
     before = Geometry.from_config(OpticsConfig(geometry=general))
-    after = Geometry.from_config(OpticsConfig(geometry=changed(general, names, [3.0, 1e-3, 2e-3])))
+    after = Geometry.from_config(
+        OpticsConfig(geometry=change_geometry(general, names, [3.0, 1e-3, 2e-3]))
+    )
     assert after.pinhole_mm - before.pinhole_mm == pytest.approx([0, 0, 3.0])
     assert after.screen_origin_mm == pytest.approx(before.screen_origin_mm)
     # d v = w x v to first order
@@ -79,7 +81,7 @@ def test_general_form_is_shifted_and_turned_about_its_own_origin() -> None:
 
 
 def test_nothing_named_changes_nothing() -> None:
-    assert changed(_general(), (), []) == _general()
+    assert change_geometry(_general(), (), []) == _general()
 
 
 @pytest.mark.parametrize(
@@ -104,6 +106,6 @@ def test_names_of_the_other_form() -> None:
     with pytest.raises(
         ValueError, match="camera_shift_x_mm: the geometry is given by a, b and alpha"
     ):
-        changed(SHORT, GENERAL_NAMES[:1], [1.0])
+        change_geometry(SHORT, GENERAL_NAMES[:1], [1.0])
     with pytest.raises(ValueError, match="a_mm: the geometry is given by two poses"):
-        changed(_general(), PAPER_SPREAD.names[:1], [1.0])
+        change_geometry(_general(), PAPER_SPREAD.names[:1], [1.0])

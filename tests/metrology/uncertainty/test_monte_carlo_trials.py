@@ -16,7 +16,7 @@ from membrane_ctrl.metrology.rays.surface import Surface
 from membrane_ctrl.metrology.uncertainty.geometry_spread import (
     PAPER_SPREAD,
     GeometrySpread,
-    changed,
+    change_geometry,
 )
 from membrane_ctrl.metrology.uncertainty.height_map import HeightMap
 from membrane_ctrl.metrology.uncertainty.linear_covariance import (
@@ -132,7 +132,7 @@ def test_geometry_is_that_of_a_whole_measurement() -> None:
     """
     change = np.array([2.0, -2.0, 0.3])
     other = OPTICS.model_copy(
-        update={"geometry": changed(OPTICS.geometry, PAPER_SPREAD.names, change)}
+        update={"geometry": change_geometry(OPTICS.geometry, PAPER_SPREAD.names, change)}
     )
     checked, figure = _first()
     there = (
