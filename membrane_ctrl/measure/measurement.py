@@ -1,5 +1,6 @@
 """Measures one capture set on disk in full, for `measure` and every analysis of many sets."""
 
+import math
 import time
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -39,6 +40,8 @@ class Measurement:
         Mean laser reading during the sinusoids, to which the figure belongs; NaN without readings.
     timing_s : dict
         Seconds for "load", "phase" and "reconstruct".
+    rejected_saturated_fraction : float
+        Share of bins clipped at white in a set without a figure; NaN if it was not determined.
     """
 
     head: CaptureHead
@@ -49,6 +52,7 @@ class Measurement:
     full: FullResult | None
     displacement_um: float
     timing_s: dict[str, float]
+    rejected_saturated_fraction: float = math.nan
 
     def flagged_files(self) -> list[dict[str, str]]:
         """The flagged frames by file name."""
@@ -76,7 +80,15 @@ def measure_set(folder: str | Path, geometry: GeometryFile | None = None) -> Mea
         timing = {"load": loaded - begin, "phase": time.perf_counter() - loaded, "reconstruct": 0.0}
         mean_um = capture.head.mean_reading_um
         return Measurement(
-            capture.head, "rejected", str(error), error.flags, None, None, mean_um, timing
+            capture.head,
+            "rejected",
+            str(error),
+            error.flags,
+            None,
+            None,
+            mean_um,
+            timing,
+            error.saturated_fraction,
         )
     pixels = measure_pixels(optics, checked)
     middle = time.perf_counter()

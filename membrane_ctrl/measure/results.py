@@ -136,7 +136,11 @@ def result_table(
         "modulation_median_adu": None
         if full is None
         else full.quality.modulation_share * full_scale,
-        "saturated_fraction": None if full is None else full.quality.saturated_fraction,
+        "saturated_fraction": number_or_null(
+            measurement.rejected_saturated_fraction
+            if full is None
+            else full.quality.saturated_fraction
+        ),
         "flagged_frames": measurement.flagged_files(),
     }
     return {
@@ -190,6 +194,10 @@ def details_table(
         "ignored_keys": list(measurement.head.ignored),
         "noise_seen_adu": number_or_null(noise_seen_adu(measurement)),
     }
+    if measurement.checked is not None:
+        clip = measurement.checked.binned.clip
+        black_adu = None if clip.black_adu < 0 else clip.black_adu
+        table["clip_levels_adu"] = {"white": clip.white_adu, "black": black_adu}
     if full is not None:
         residual_um = 1e3 * full.residual_mm[np.isfinite(full.residual_mm)]
         table |= {

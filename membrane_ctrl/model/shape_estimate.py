@@ -182,10 +182,24 @@ class Quality:
     """Figures of one cycle."""
 
     modulation_share: float  # median fringe amplitude over the sensor's full scale
-    saturated_fraction: float  # share of the points with a saturated pixel
+    saturated_fraction: float  # share of the points with a pixel clipped at white
     valid_fraction: float  # share of the analysis area that gave a slope
     residual_urad: float  # RMS of measured minus fitted slopes
     converged: bool  # whether the fit converged
+    black_fraction: float = 0.0  # share of the points with a pixel clipped at black
+
+
+def describe_saturation(fraction: float) -> str:
+    """Return what is wrong with pictures of which this share is clipped at white."""
+    return f"{fraction:.1%} of the pixels are saturated: shorten the exposure"
+
+
+def describe_black_clipping(fraction: float) -> str:
+    """Return what is wrong with pictures of which this share is clipped at black."""
+    return (
+        f"{fraction:.1%} of the pixels are clipped at black: raise the camera's black level "
+        "(offset)"
+    )
 
 
 def judge(quality: Quality) -> tuple[Verdict, str]:
@@ -198,7 +212,11 @@ def judge(quality: Quality) -> tuple[Verdict, str]:
         ),
         (
             q.saturated_fraction <= SATURATED_REJECTED_FRACTION,
-            f"{q.saturated_fraction:.1%} of the points saturated",
+            describe_saturation(q.saturated_fraction),
+        ),
+        (
+            q.black_fraction <= SATURATED_REJECTED_FRACTION,
+            describe_black_clipping(q.black_fraction),
         ),
         (
             q.valid_fraction >= VALID_REJECTED_FRACTION,
@@ -210,8 +228,9 @@ def judge(quality: Quality) -> tuple[Verdict, str]:
     degraded = (
         (q.modulation_share >= MODULATION_DEGRADED_SHARE, rejected[0][1]),
         (q.saturated_fraction <= SATURATED_DEGRADED_FRACTION, rejected[1][1]),
-        (q.valid_fraction >= VALID_DEGRADED_FRACTION, rejected[2][1]),
-        (q.residual_urad <= RESIDUAL_DEGRADED_URAD, rejected[4][1]),
+        (q.black_fraction <= SATURATED_DEGRADED_FRACTION, rejected[2][1]),
+        (q.valid_fraction >= VALID_DEGRADED_FRACTION, rejected[3][1]),
+        (q.residual_urad <= RESIDUAL_DEGRADED_URAD, rejected[5][1]),
     )
     for fine, reason in rejected:
         if not fine:

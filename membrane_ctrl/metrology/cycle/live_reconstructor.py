@@ -16,6 +16,7 @@ import numpy as np
 from membrane_ctrl.config.schema import OpticsConfig
 from membrane_ctrl.metrology.film import hencky_bowl
 from membrane_ctrl.metrology.frame_checks import band_removal
+from membrane_ctrl.metrology.frame_checks.clipping import ClippedShares
 from membrane_ctrl.metrology.phase import (
     bin_sums,
     full_decoder,
@@ -24,6 +25,7 @@ from membrane_ctrl.metrology.phase import (
     phase_steps,
     screen_scale,
 )
+from membrane_ctrl.metrology.phase.clip_levels import ClipLevels, find_clip_levels
 from membrane_ctrl.metrology.phase.frame_stack import Binned, FrameStack
 from membrane_ctrl.metrology.rays import geometry, ray_tracing, surface
 from membrane_ctrl.metrology.reconstruction import (
@@ -141,6 +143,8 @@ class LiveReconstructor:
         if self._reference_um is None and np.isfinite(readings).any():
             self._reference_um = float(readings[np.isfinite(readings)][0])
         self._binner.clear()
+        shown = [frames[k] for k in sinusoids]
+        self._binner.white_adu = find_clip_levels(shown, self._full_scale_adu).white_adu
         self._binner.add(frames, range(len(frames)), watched=sinusoids)
         self._take_bands(np.zeros(0))
         optics = self._optics
@@ -155,7 +159,9 @@ class LiveReconstructor:
                 self._grid, tracer, self._near, phase_rad, optics.pattern, analysis_mm
             )
         except ValueError as error:
-            return make_rejected_cycle("full", times, readings, str(error))
+            saturated = float(np.mean(self._binner.saturated.ravel()[self._near] > 0))
+            cause = ClippedShares(saturated, 0.0).cause
+            return make_rejected_cycle("full", times, readings, cause or str(error))
         self._watch.begin(state)
         return self._follow("full", state, times, readings)
 
@@ -267,7 +273,10 @@ class LiveReconstructor:
         slots = np.r_[self._slots.sinusoids]
         means = (self._binner.sums[slots] / self._bin_px**2).astype(np.float32)
         binned = Binned(
-            self._bin_px, means, np.broadcast_to(self._binner.saturated > 0, means.shape)
+            self._bin_px,
+            means,
+            np.broadcast_to(self._binner.saturated > 0, means.shape),
+            ClipLevels(self._binner.white_adu),
         )
         none = np.empty(
             (len(slots), self._optics.camera.height_px, 0), np.uint8

@@ -184,7 +184,7 @@ def _axis_phases(
         index,
         sensitivity,
         reference,
-        2**optics.camera.bits - 1,
+        checked.binned.clip,
         gain,
     )
 

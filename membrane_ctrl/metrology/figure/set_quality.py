@@ -6,6 +6,7 @@ import numpy as np
 
 from membrane_ctrl.config.schema import OpticsConfig
 from membrane_ctrl.metrology.frame_checks.checked_set import Checked
+from membrane_ctrl.metrology.frame_checks.clipping import clipped_shares
 from membrane_ctrl.metrology.reconstruction import surface_fit
 from membrane_ctrl.model.shape_estimate import Quality
 
@@ -15,11 +16,12 @@ def set_quality(
 ) -> Quality:
     area = math.pi * optics.mirror.analysis_radius_mm**2
     used = [k for axis in checked.view.used for k in axis]
-    saturated = checked.binned.saturated[used].any(axis=0) & checked.near
-    seen = (checked.view.mask & checked.near) | saturated
+    clipped = checked.binned.saturated[used].any(axis=0)
+    shares = clipped_shares(checked.binned, used, (checked.view.mask | clipped) & checked.near)
     return Quality(
         modulation_share=swing_adu / (2**optics.camera.bits - 1),
-        saturated_fraction=float(np.mean(saturated[seen])) if seen.any() else 0.0,
+        saturated_fraction=shares.white,
+        black_fraction=shares.black,
         valid_fraction=min(1.0, float(np.sum(checked.state.area_mm2)) / area),
         residual_urad=1e6 * math.hypot(fit.residual_x, fit.residual_y) / math.sqrt(2),
         converged=fit.converged,

@@ -61,11 +61,20 @@ class Checked:
 
 
 class RejectedSetError(bin_view.NoFigureError):
-    """A set that gives no figure, with the bad frames."""
+    """A set that gives no figure, with the bad frames.
 
-    def __init__(self, reason: str, flags: tuple[frame_faults.Flag, ...]) -> None:
+    `saturated_fraction` is the share of bins clipped at white; NaN if it was not determined.
+    """
+
+    def __init__(
+        self,
+        reason: str,
+        flags: tuple[frame_faults.Flag, ...],
+        saturated_fraction: float = math.nan,
+    ) -> None:
         super().__init__(reason)
         self.flags = flags
+        self.saturated_fraction = saturated_fraction
 
 
 def vertex_z_mm(optics: OpticsConfig, displacement_um: float) -> float:

@@ -106,7 +106,8 @@ def check_frequencies(stack: FrameStack, optics: OpticsConfig) -> Checked:
     try:
         checked = check_set(fine, optics, Anchor(absolute, light))
     except RejectedSetError as error:
-        raise RejectedSetError(str(error), error.flags + named) from None
+        flagged = error.flags + named
+        raise RejectedSetError(str(error), flagged, error.saturated_fraction) from None
     return replace(checked, flags=checked.flags + named)
 
 

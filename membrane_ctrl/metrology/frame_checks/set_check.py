@@ -16,6 +16,7 @@ from membrane_ctrl.config.schema import OpticsConfig
 from membrane_ctrl.metrology.frame_checks import (
     band_removal,
     bin_view,
+    clipping,
     frame_evidence,
     frame_faults,
     frame_inspection,
@@ -65,9 +66,8 @@ def check_set(
     except RejectedSetError as error:
         put_back = _put_back(stack, binned, optics, anchor)
         if put_back is None:
-            raise RejectedSetError(
-                str(error) + _find_doubt(stack, error.flags), error.flags
-            ) from None
+            reason = str(error) + _find_doubt(stack, error.flags)
+            raise RejectedSetError(reason, error.flags, error.saturated_fraction) from None
         return put_back
     return (
         found if _believable_surface(found) else _put_back(stack, binned, optics, anchor) or found
@@ -162,9 +162,12 @@ def _check_rounds(
         try:
             attempt = _attempt_fit(stack, binned, optics, geometry, grid, near, excluded, anchor)
         except (bin_view.NoFigureError, ValueError) as error:
-            raise RejectedSetError(
-                str(error), _merge_flags(_keep_believable(stack, flags), known)
-            ) from None
+            used = [k for axis in AXES for k in stack.sinusoids(axis) if k not in excluded]
+            clipped = clipping.clipped_shares_of_lit(
+                binned, used, near.reshape(binned.means[0].shape)
+            )
+            named = _merge_flags(_keep_believable(stack, flags), known)
+            raise RejectedSetError(clipped.cause or str(error), named, clipped.white) from None
         readable = [k for k in range(len(stack.patterns)) if k not in stack.unusable]
         seen = frame_evidence.measure_frames(stack, binned, attempt.scene, readable)
         flags = frame_inspection.inspect_frames(stack, seen, excluded)

@@ -106,6 +106,8 @@ class Binner:
     ----------
     sums : (slots, rows, columns) uint32 array
         Sum of each bin of each frame.
+    white_adu : int
+        Value from which a pixel counts as saturated; may be changed between frames.
     saturated : (rows, columns) uint32 array
         Saturated pixels of each bin over the frames since `clear`.
     """
@@ -115,7 +117,7 @@ class Binner:
     ) -> None:
         self._size = (height_px, width_px)
         self.bin_px = bin_px
-        self._full_scale = np.uint32(full_scale_adu)
+        self.white_adu = full_scale_adu
         shape = (height_px // bin_px, width_px // bin_px)
         self.sums = np.zeros((slots, *shape), np.uint32)
         self.saturated = np.zeros(shape, np.uint32)
@@ -140,9 +142,8 @@ class Binner:
                 )
             if frame.dtype not in (np.uint8, np.uint16):
                 raise ValueError(f"frame has {frame.dtype} pixels, not uint8 or uint16")
-        limits = [
-            self._full_scale if watched is None or slot in watched else _NEVER for slot in slots
-        ]
+        clipped = np.uint32(self.white_adu)
+        limits = [clipped if watched is None or slot in watched else _NEVER for slot in slots]
         width = self.sums.shape[2] * self.bin_px
 
         def run(start: int, stop: int) -> None:

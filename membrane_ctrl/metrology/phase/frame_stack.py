@@ -6,6 +6,7 @@ import numpy as np
 
 from firmware_iface.roles import Pattern
 from membrane_ctrl.metrology.phase.bin_sums import Binner
+from membrane_ctrl.metrology.phase.clip_levels import ClipLevels, find_clip_levels
 from membrane_ctrl.metrology.phase.pattern_sequence import AXES
 from membrane_ctrl.metrology.phase.phase_steps import step_design, step_weights
 from membrane_ctrl.model.arrays import BoolArray, FloatArray, Image, Singles
@@ -87,11 +88,17 @@ class Binned:
 
     bin_px: int  # side of a bin
     means: Singles  # (frames, rows, columns): in the frames' units
-    saturated: BoolArray  # (frames, rows, columns): bins with a saturated pixel
+    saturated: BoolArray  # (frames, rows, columns): bins with a pixel clipped at white or black
+    clip: ClipLevels
+    # (frames, rows, columns): bins with a pixel clipped at black; None: the camera does not clip
+    # there
+    black: BoolArray | None = None
 
     def reordered(self, order: list[int]) -> "Binned":
         """As `FrameStack.reordered`."""
-        return replace(self, means=self.means[order], saturated=self.saturated[order])
+        black = None if self.black is None else self.black[order]
+        means, saturated = self.means[order], self.saturated[order]
+        return replace(self, means=means, saturated=saturated, black=black)
 
 
 def bin_side_px(size_px: tuple[int, int]) -> int:
@@ -100,9 +107,14 @@ def bin_side_px(size_px: tuple[int, int]) -> int:
 
 
 def bin_frames(stack: FrameStack, full_scale_adu: int) -> Binned:
-    """Means and saturation of each frame over bins."""
+    """Means of each frame over bins, and which bins are clipped.
+
+    The camera may clip below its full scale (`find_clip_levels`).
+    """
     bin_px = bin_side_px(stack.size_px)
-    binner = Binner(*stack.size_px, bin_px, full_scale_adu, 1)
+    sinusoids = [k for axis in AXES for k in stack.sinusoids(axis) if k not in stack.unusable]
+    clip = find_clip_levels([stack.frames[k] for k in sinusoids], full_scale_adu)
+    binner = Binner(*stack.size_px, bin_px, clip.white_adu, 1)
     shape = (len(stack.patterns), *binner.saturated.shape)
     means, saturated = np.empty(shape, np.float32), np.empty(shape, bool)
     for k, frame in enumerate(stack.frames):
@@ -110,4 +122,18 @@ def bin_frames(stack: FrameStack, full_scale_adu: int) -> Binned:
         binner.add([frame], [0])
         np.multiply(binner.sums[0], 1 / bin_px**2, out=means[k], casting="unsafe")
         saturated[k] = binner.saturated > 0
-    return Binned(bin_px, means, saturated)
+    if clip.black_adu < 0:
+        return Binned(bin_px, means, saturated, clip)
+    black = _find_black_bins(stack.frames, bin_px, clip.black_adu)
+    return Binned(bin_px, means, saturated | black, clip, black)
+
+
+def _find_black_bins(frames: Image, bin_px: int, black_adu: int) -> BoolArray:
+    """Return the bins (frames, rows, columns) with a pixel at this level or below."""
+    count, height, width = frames.shape
+    rows, columns = height // bin_px, width // bin_px
+    black = np.empty((count, rows, columns), bool)
+    for k, frame in enumerate(frames):
+        blocks = frame[: rows * bin_px, : columns * bin_px].reshape(rows, bin_px, columns, bin_px)
+        black[k] = blocks.min(axis=(1, 3)) <= black_adu
+    return black

@@ -7,6 +7,7 @@ import numpy as np
 
 from membrane_ctrl.metrology.numerics.compiled import compile_kernel
 from membrane_ctrl.metrology.numerics.threads import split_over_threads
+from membrane_ctrl.metrology.phase.clip_levels import ClipLevels
 from membrane_ctrl.metrology.phase.phase_change import StepCombination
 from membrane_ctrl.metrology.phase.phasor_kernels import branchless_arctan2, remove_phasor_motion
 from membrane_ctrl.model.arrays import BoolArray, FloatArray, Image, IntArray, Singles
@@ -21,12 +22,25 @@ class PixelPhases:
     rest_adu: (
         Singles  # (n,): root of the sum of squares that the sinusoid leaves; 0 for three frames
     )
-    saturated: BoolArray  # (n,): whether a frame is saturated there
+    saturated: BoolArray  # (n,): whether a frame is clipped there, at white or at black
 
 
 @compile_kernel
 def _compute_phases(  # type: ignore[no-untyped-def]
-    frames, index, fade, weights, design, turn, mirror, slope, reference, limit, out, start, stop
+    frames,
+    index,
+    fade,
+    weights,
+    design,
+    turn,
+    mirror,
+    slope,
+    reference,
+    white,
+    black,
+    out,
+    start,
+    stop,
 ):
     """Rows of `out` (2, n): swing (negative where saturated) and rest; `reference` (n,) is replaced
     by the phase.
@@ -39,9 +53,11 @@ def _compute_phases(  # type: ignore[no-untyped-def]
         c = 0.0
         s = 0.0
         top = 0.0
+        bottom = white
         for k in range(steps):
             value = float(frames[k, place])
             top = max(top, value)
+            bottom = min(bottom, value)
             value *= fade[k, row]
             mean += weights[0, k] * value
             c += weights[1, k] * value
@@ -61,7 +77,7 @@ def _compute_phases(  # type: ignore[no-untyped-def]
             (reference[p] - wrapped) / (2 * math.pi) + 0.5
         )
         swing = math.sqrt(c * c + s * s)
-        out[0, p] = -swing if top >= limit else swing
+        out[0, p] = -swing if top >= white or bottom <= black else swing
         out[1, p] = math.sqrt(rest)
 
 
@@ -72,7 +88,7 @@ def pixel_phases(
     index: IntArray,
     sensitivity_rad_per_um: FloatArray,
     reference_rad: FloatArray,
-    full_scale_adu: int,
+    clip: ClipLevels,
     gain: FloatArray | None = None,
 ) -> PixelPhases:
     """Phases of one axis.
@@ -91,6 +107,8 @@ def pixel_phases(
         Change of phase per µm of displacement; zeros if no motion is corrected.
     reference_rad : (n,) array
         Absolute phase to within half a period; not changed.
+    clip : ClipLevels
+        Levels at which the camera clips.
     gain : (N, height) array, optional
         Of the light of the rows of each frame.
     """
@@ -107,7 +125,8 @@ def pixel_phases(
             *fixed,
             sensitivity_rad_per_um,
             phase,
-            float(full_scale_adu),
+            float(clip.white_adu),
+            float(clip.black_adu),
             out,
             start,
             stop,

@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from firmware_iface.roles import Pattern
 from membrane_ctrl.cli import run
 from membrane_ctrl.metrology.frame_checks.band_removal import remove_bands
+from membrane_ctrl.metrology.phase.clip_levels import ClipLevels
 from membrane_ctrl.metrology.phase.frame_stack import FrameStack, bin_frames
 from membrane_ctrl.metrology.phase.pixel_phases import pixel_phases
 from membrane_ctrl.metrology.reconstruction.film_motion import combine_steps
@@ -177,7 +178,14 @@ def test_pixels_are_measured_without_the_bands() -> None:
     assert gain is not None
     index, phase = np.flatnonzero(INSIDE), phases()[1]
     still = combine_steps(stack.weights([4, 5, 6, 7]), stack.shifts_rad([4, 5, 6, 7]), 1)
-    fixed = stack.design([4, 5, 6, 7]), still, index, np.zeros(index.size), phase[INSIDE], 4095
+    fixed = (
+        stack.design([4, 5, 6, 7]),
+        still,
+        index,
+        np.zeros(index.size),
+        phase[INSIDE],
+        ClipLevels(4095),
+    )
     seen, bare = (
         pixel_phases(stack.frames[4:], *fixed, gain[4:]),
         pixel_phases(stack.frames[4:], *fixed),
