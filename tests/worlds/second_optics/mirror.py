@@ -57,7 +57,6 @@ class Mirror:
     wrinkles: Wrinkles | None = None
 
     def __post_init__(self) -> None:
-        self._solver = FilmSolver(self.material, self.ring)
         self._solved: dict[int, tuple[Shape, FloatArray]] = {}
 
     def load(self, displacement_um: float = 0.0) -> float:
@@ -117,8 +116,8 @@ class Mirror:
         return np.array(terms)
 
     @cached_property
-    def _anchor(self) -> tuple[Shape, FloatArray]:
-        return self._solver.solve(self.sag_mm / self.radius_mm)
+    def _solver(self) -> FilmSolver:
+        return FilmSolver(self.material, self.ring)
 
     def _node(self, index: int) -> Shape:
         if index not in self._solved:

@@ -1,0 +1,88 @@
+"""Drawing benches of the second world, and the tables of their answers."""
+
+from __future__ import annotations
+
+from collections import Counter
+from typing import Any
+
+import numpy as np
+import pytest
+
+from benchmarks.metrology.second_world import blamed, held, is_true, page, refusals, wrong_oks
+from tests.studies.second_benches import draw_bench
+
+
+def answer(seed: int, verdict: str, off: float, planted: dict[str, float], reason: str = "") -> Any:
+    """An answer whose every error is `off` sigma."""
+    one: dict[str, Any] = {"verdict": verdict, "reason": reason, "flagged": []}
+    if verdict in ("ok", "degraded"):
+        one |= {"error_um": [off] * 19, "sigma_um": [1.0] * 19}
+    given: dict[str, Any] = {"seed": seed, "fine": bool(seed % 2), "planted": planted}
+    given |= {"sets": [one, one]}
+    if "error_um" in one:
+        given |= {"change_error_um": [0.1] * 19, "change_sigma_um": [1.0] * 19}
+    return given
+
+
+GIVEN = [
+    answer(0, "ok", 0.5, {}),
+    answer(1, "ok", 3.5, {"flicker": 0.01}),
+    answer(2, "rejected", 0, {"overexposed": 1.6}, "60 % of the pixels are saturated"),
+    answer(3, "rejected", 0, {"blur, px of a quarter": 1.0}, "the picture is overexposed"),
+    answer(4, "refused", 0, {}, "only 0 bins see the pattern in the mirror"),
+    answer(5, "degraded", 2.5, {"stale frame": 3.0}, "1 frame flagged"),
+]
+
+
+def test_the_share_of_intervals_counts_usable_sets_alone() -> None:
+    share, width, size = held(GIVEN, "height", slice(0, 1))
+    assert (share, size) == (1 / 3, 3)  # 0.5 of 0.5, 3.5, 2.5
+    assert width == pytest.approx(0.6745 / 2.5)
+
+
+def test_a_wrong_ok_is_found_by_its_seed() -> None:
+    assert [one["seed"] for _, one in wrong_oks(GIVEN)] == [1]
+
+
+def test_a_refusal_is_true_only_if_its_cause_was_planted() -> None:
+    assert [is_right for is_right, _, _ in refusals(GIVEN)] == [True, False, False]
+
+
+@pytest.mark.parametrize(
+    ("statement", "cause"),
+    [
+        ("x_sin_3.png: stale: shows x_sin_2", "stale frame"),
+        ("the picture is blurred by 1.2 px (1 sigma): focus the camera", "blur, px of a quarter"),
+        ("the rim is 8.2 mm off the prediction", "geometry by hand"),
+        ("12.0 % of the pixels are saturated; shorten the exposure", "overexposed"),
+    ],
+)
+def test_a_statement_blames_its_cause(statement: str, cause: str) -> None:
+    _, causes = blamed(statement)
+    assert is_true(causes, [cause])
+    assert not is_true(causes, ["gamma above 1"])
+
+
+def test_the_page_lists_the_worst_cases() -> None:
+    text = page(GIVEN, [])
+    assert "| 1 | 3.5 sigma | flicker 0.01 | `ok` |" in text
+    assert "| 3 | - | blur, px of a quarter; " not in text
+    assert "| `ok` beyond 3 sigma, of all benches | 1, 16.7 % | 0.5 % |" in text
+
+
+def test_a_seed_draws_the_same_bench_at_any_resolution() -> None:
+    for seed in (0, 7):
+        coarse, fine = draw_bench(seed, 0.125), draw_bench(seed, 0.25)
+        assert coarse.planted == fine.planted
+        assert coarse.world.mirror.material == fine.world.mirror.material
+        places = (coarse.world.bench.camera.place_mm, fine.world.bench.camera.place_mm)
+        assert np.array_equal(*places)
+
+
+def test_all_causes_are_drawn_and_a_bench_has_about_three() -> None:
+    counts: Counter[str] = Counter()
+    benches = 300
+    for seed in range(benches):
+        counts.update(draw_bench(seed, 0.05).planted.keys())
+    assert 3 < counts.total() / benches < 6
+    assert {"second reflection, share", "previous picture, share", "no laser"} <= set(counts)
