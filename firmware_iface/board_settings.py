@@ -49,7 +49,7 @@ class BoardSettingsError(ValueError):
     """The file is unusable; the message names the key and the remedy."""
 
 
-def record(table: Mapping[str, Any]) -> bytes:
+def make_record(table: Mapping[str, Any]) -> bytes:
     """The record of a board's settings.
 
     `table`, as read from TOML, has `unit_id`, `baud`, `parity` ("N", "E", "O"), `silence_us` (by
@@ -65,7 +65,7 @@ def record(table: Mapping[str, Any]) -> bytes:
     Raises BoardSettingsError (an unknown or missing key, or a value outside what the board takes).
     """
     _check_keys("", table, _KEYS)
-    baud = _whole(table, "baud", 1200, 1_000_000, 115_200)
+    baud = _read_whole(table, "baud", 1200, 1_000_000, 115_200)
     silence_us = _standard_silence_us(baud)
     parity = table.get("parity", "E")
     if parity not in _PARITIES:
@@ -74,15 +74,15 @@ def record(table: Mapping[str, Any]) -> bytes:
     _check_keys("channel.", channels, set(CHANNELS))
     body = struct.pack(
         ">6I",
-        _whole(table, "unit_id", 1, 247, 1),
+        _read_whole(table, "unit_id", 1, 247, 1),
         baud,
         _PARITIES.index(parity),
-        _whole(table, "silence_us", silence_us, 1_000_000, silence_us),
-        round(1000 * _number(table, "pressure_limit_pa", 0.001, 100_000.0)),
-        round(50_000 * _number(table, "pump_limit_fraction", 0.00002, 1.0)),
+        _read_whole(table, "silence_us", silence_us, 1_000_000, silence_us),
+        round(1000 * _read_number(table, "pressure_limit_pa", 0.001, 100_000.0)),
+        round(50_000 * _read_number(table, "pump_limit_fraction", 0.00002, 1.0)),
     )
-    body += b"".join(_scale(name, channels.get(name, {})) for name in CHANNELS)
-    body += _protection(table)
+    body += b"".join(_read_scale(name, channels.get(name, {})) for name in CHANNELS)
+    body += _pack_protection(table)
     head = struct.pack(">2I", _MAGIC, 8 + len(body) + 4)
     return head + body + struct.pack(">I", zlib.crc32(head + body))
 
@@ -91,13 +91,13 @@ def _standard_silence_us(baud: int) -> int:
     return _FAST_SILENCE_US if baud > _FAST_BAUD else -int(-_SILENCE_BITS * 1e6 // baud)
 
 
-def _protection(table: Mapping[str, Any]) -> bytes:
+def _pack_protection(table: Mapping[str, Any]) -> bytes:
     """Pack which protections are fitted, and the times of the gauge's guard in ms."""
     fitted = table.get("gauge_fitted", True)
     if not isinstance(fitted, bool):
         raise BoardSettingsError(f"gauge_fitted is {fitted!r}, expected true or false")
-    timeout_ms = round(1000 * _number(table, "gauge_timeout_s", 0.1, 60.0, GAUGE_TIMEOUT_S))
-    frozen_s = _number(table, "gauge_frozen_s", 0.0, 600.0, GAUGE_FROZEN_S)
+    timeout_ms = round(1000 * _read_number(table, "gauge_timeout_s", 0.1, 60.0, GAUGE_TIMEOUT_S))
+    frozen_s = _read_number(table, "gauge_frozen_s", 0.0, 600.0, GAUGE_FROZEN_S)
     if 0.0 < frozen_s < 1.0:
         raise BoardSettingsError(
             f"gauge_frozen_s is {frozen_s:g}, expected 0 or a number within 1..600"
@@ -120,7 +120,7 @@ def _interlock_mask(table: Mapping[str, Any]) -> int:
     return sum(1 << number for number in inputs)
 
 
-def _scale(name: str, table: Mapping[str, Any]) -> bytes:
+def _read_scale(name: str, table: Mapping[str, Any]) -> bytes:
     _check_keys(f"channel.{name}.", table, _CHANNEL_KEYS)
     counts_per_unit = default_map().register(name).counts_per_unit
     points = table.get("points", [[0, 0.0], [1, 1 / counts_per_unit]])
@@ -146,7 +146,7 @@ def _check_keys(where: str, table: Mapping[str, Any], known: set[str]) -> None:
         )
 
 
-def _whole(table: Mapping[str, Any], key: str, least: int, most: int, default: int) -> int:
+def _read_whole(table: Mapping[str, Any], key: str, least: int, most: int, default: int) -> int:
     value = table.get(key, default)
     if isinstance(value, bool) or not isinstance(value, int) or not least <= value <= most:
         raise BoardSettingsError(
@@ -155,7 +155,7 @@ def _whole(table: Mapping[str, Any], key: str, least: int, most: int, default: i
     return value
 
 
-def _number(
+def _read_number(
     table: Mapping[str, Any], key: str, least: float, most: float, default: float | None = None
 ) -> float:
     value = table.get(key, default)
@@ -176,7 +176,7 @@ def main(arguments: list[str] | None = None) -> int:
     options = parser.parse_args(arguments)
     try:
         options.target.write_bytes(
-            record(tomllib.loads(options.source.read_text(encoding="utf-8")))
+            make_record(tomllib.loads(options.source.read_text(encoding="utf-8")))
         )
     except (OSError, UnicodeDecodeError, tomllib.TOMLDecodeError, BoardSettingsError) as error:
         print(f"{options.source}: {error}", file=sys.stderr)

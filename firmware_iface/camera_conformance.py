@@ -110,7 +110,7 @@ def list_checks(bench: type[CameraBench]) -> list[Check]:
 
 def check_identity(bench: CameraBench) -> None:
     """Opening gives the identity; the description names port and settings."""
-    with _driver(bench) as driver:
+    with _open_driver(bench) as driver:
         identity = driver.open()
         require(bool(identity.kind), "open returns an identity without a kind")
         described = driver.describe()
@@ -124,7 +124,7 @@ def check_identity(bench: CameraBench) -> None:
 
 def check_pictures(bench: CameraBench) -> None:
     """Every frame is what the sensor sees at its exposure, in the configured size and type."""
-    with _camera(bench) as camera:
+    with _open_camera(bench) as camera:
         for _ in range(_REPEATS):
             scene = bench.change_scene()
             _require_picture(camera.grab(), scene, "a frame")
@@ -138,7 +138,7 @@ def check_given_array_is_not_kept(bench: CameraBench) -> None:
     """The array for a frame is memory that others use: a driver keeps no reference to it after
     `fetch`.
     """
-    with _camera(bench) as camera:
+    with _open_camera(bench) as camera:
         out = np.zeros(bench.sensor.shape, bench.sensor.dtype)
         kept = weakref.ref(out)
         camera.grab(out)
@@ -153,7 +153,7 @@ def check_time_stamps(bench: CameraBench) -> None:
     """A frame's time is the start of its exposure on the given clock; an exposure lasts as long as
     configured.
     """
-    with _camera(bench) as camera:
+    with _open_camera(bench) as camera:
         earlier_s = bench.clock.now()
         for _ in range(_REPEATS):
             before_s = bench.clock.now()
@@ -176,7 +176,7 @@ def check_screen_may_change_after_exposure(bench: CameraBench) -> None:
     """What changes between `expose` and `fetch` is not in the frame;
     each exposure is fetched once.
     """
-    with _camera(bench) as camera:
+    with _open_camera(bench) as camera:
         scene = bench.change_scene()
         camera.expose()
         if isinstance(camera.driver, roles.ExposingCamera):
@@ -192,7 +192,7 @@ def check_screen_may_change_after_exposure(bench: CameraBench) -> None:
 
 def check_abandoned_exposure(bench: CameraBench) -> None:
     """An exposure that is never fetched does not answer the next one."""
-    with _camera(bench) as camera:
+    with _open_camera(bench) as camera:
         bench.change_scene()
         camera.expose()
         scene = bench.change_scene()
@@ -202,19 +202,19 @@ def check_abandoned_exposure(bench: CameraBench) -> None:
 
 def check_lost_frame(bench: CameraBench) -> None:
     """A lost frame is a FrameLostError, and the next exposure works."""
-    with _camera(bench) as camera:
+    with _open_camera(bench) as camera:
         camera.grab()
         bench.change_scene()
         bench.lose_frame()
         camera.expose()
         require_error(camera.fetch, roles.FrameLostError)
         scene = bench.change_scene()
-        _require_picture(_retake(camera), scene, "the frame after a lost one")
+        _require_picture(_retake_frame(camera), scene, "the frame after a lost one")
 
 
 def check_late_frame(bench: CameraBench) -> None:
     """A late frame is lost, and never taken for the next one."""
-    with _camera(bench) as camera:
+    with _open_camera(bench) as camera:
         camera.grab()
         bench.change_scene()
         bench.delay_frame()
@@ -222,12 +222,12 @@ def check_late_frame(bench: CameraBench) -> None:
         require_error(camera.fetch, roles.FrameLostError)
         for _ in range(_REPEATS):
             scene = bench.change_scene()
-            _require_picture(_retake(camera), scene, "a frame after a late one")
+            _require_picture(_retake_frame(camera), scene, "a frame after a late one")
 
 
 def check_frozen_camera(bench: CameraBench) -> None:
     """An old frame is never returned as a new one."""
-    with _camera(bench) as camera:
+    with _open_camera(bench) as camera:
         bench.change_scene()
         camera.grab()
         bench.change_scene()
@@ -237,7 +237,7 @@ def check_frozen_camera(bench: CameraBench) -> None:
 
 def check_unplugged(bench: CameraBench) -> None:
     """A camera that is gone is a LinkDownError, and is opened again once it is back."""
-    with _camera(bench) as camera:
+    with _open_camera(bench) as camera:
         camera.grab()
         bench.unplug()
         require_error(camera.grab, roles.LinkError)
@@ -251,7 +251,7 @@ def check_unplugged(bench: CameraBench) -> None:
 def check_other_sensor(bench: CameraBench) -> None:
     """A camera with a sensor of another size is refused, with both sizes."""
     other = replace(bench.sensor, width_px=bench.sensor.width_px + 16)
-    with _driver(bench, other) as driver:
+    with _open_driver(bench, other) as driver:
         message = require_error(driver.open, roles.DeviceRefusedError)
         for width_px in (bench.sensor.width_px, other.width_px):
             require(
@@ -262,12 +262,12 @@ def check_other_sensor(bench: CameraBench) -> None:
 
 def check_closing(bench: CameraBench) -> None:
     """Closing never raises, closed or open, and a closed camera can be opened again."""
-    with _driver(bench) as driver:
+    with _open_driver(bench) as driver:
         driver.close()
         driver.open()
         driver.close()
         driver.close()
-    with _camera(bench) as camera:
+    with _open_camera(bench) as camera:
         for _ in range(_REPEATS):
             camera.open()
             scene = bench.change_scene()
@@ -292,7 +292,7 @@ _CHECKS: dict[Check, tuple[str, ...]] = {
 
 
 @contextmanager
-def _driver(
+def _open_driver(
     bench: CameraBench, sensor: roles.SensorFormat | None = None
 ) -> Iterator[roles.OpticalDevice]:
     driver = bench.make(sensor or bench.sensor)
@@ -303,14 +303,14 @@ def _driver(
 
 
 @contextmanager
-def _camera(bench: CameraBench) -> Iterator[GuardedCamera]:
-    with _driver(bench) as driver:
+def _open_camera(bench: CameraBench) -> Iterator[GuardedCamera]:
+    with _open_driver(bench) as driver:
         camera = GuardedCamera(driver, bench.sensor, bench.clock.now, "camera under test")
         camera.open()
         yield camera
 
 
-def _retake(camera: GuardedCamera) -> roles.Frame:
+def _retake_frame(camera: GuardedCamera) -> roles.Frame:
     camera.expose()
     return camera.fetch()
 

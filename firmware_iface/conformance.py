@@ -238,7 +238,7 @@ class Conformance(board_under_test.BoardUnderTest):
         }
         for block in self._registers.blocks:
             for register in block.registers:
-                for raw in _outside(register):
+                for raw in _words_outside_limits(register):
                     words = block.encode(right)
                     at = register.address - block.address
                     words[at : at + register.words] = [
@@ -491,7 +491,7 @@ def _time_s(values: dict[str, float]) -> float:
     return values["device_time_s"] + values["device_time_fraction_s"]
 
 
-def _outside(register: register_map.Register) -> list[int]:
+def _words_outside_limits(register: register_map.Register) -> list[int]:
     """Words just outside a register's limits, where the type has such; of a claim only 0 is."""
     if register.access != "rw" or math.isinf(register.maximum):
         return []

@@ -10,7 +10,7 @@ from contextlib import contextmanager
 
 import numpy as np
 
-from firmware_iface.display_patterns import checkerboard
+from firmware_iface.display_patterns import make_checkerboard
 from firmware_iface.requirement import require, require_error
 from firmware_iface.roles import DeviceRefusedError, Display, Levels, LinkDownError, LinkError
 
@@ -70,7 +70,7 @@ def list_checks(bench: type[DisplayBench]) -> list[Check]:
 
 def check_identity(bench: DisplayBench) -> None:
     """Opening gives the identity; the description names port and settings."""
-    with _display(bench) as display:
+    with _open_display(bench) as display:
         identity = display.open()
         require(bool(identity.kind), "open returns an identity without a kind")
         described = display.describe()
@@ -86,8 +86,8 @@ def check_pictures(bench: DisplayBench) -> None:
     """Every pixel has the level that was sent: no scaling, no smoothing, no correction."""
     shape = bench.height_px, bench.width_px
     greys = [np.full(shape, level, np.uint8) for level in (0, 1, 127, 254, 255)]
-    pictures = [*greys, checkerboard(bench.width_px, bench.height_px), bench.make_picture()]
-    with _display(bench) as display:
+    pictures = [*greys, make_checkerboard(bench.width_px, bench.height_px), bench.make_picture()]
+    with _open_display(bench) as display:
         display.open()
         for picture in pictures:
             display.show(display.prepare(picture.copy()))
@@ -99,7 +99,7 @@ def check_prepared_pictures(bench: DisplayBench) -> None:
     made from.
     """
     pictures = [bench.make_picture() for _ in range(_REPEATS)]
-    with _display(bench) as display:
+    with _open_display(bench) as display:
         display.open()
         sources = [picture.copy() for picture in pictures]
         prepared = [display.prepare(source) for source in sources]
@@ -114,7 +114,7 @@ def check_prepared_pictures(bench: DisplayBench) -> None:
 def check_unplugged(bench: DisplayBench) -> None:
     """A display that is gone is a LinkDownError, and is opened again once it is back."""
     picture = bench.make_picture()
-    with _display(bench) as display:
+    with _open_display(bench) as display:
         display.open()
         shown = display.prepare(picture)
         bench.unplug()
@@ -130,7 +130,7 @@ def check_unplugged(bench: DisplayBench) -> None:
 def check_other_size(bench: DisplayBench) -> None:
     """A panel of another size is refused, with both sizes."""
     other_px = bench.width_px + 16
-    with _display(bench, other_px) as display:
+    with _open_display(bench, other_px) as display:
         message = require_error(display.open, DeviceRefusedError)
         for width_px in (bench.width_px, other_px):
             require(
@@ -141,7 +141,7 @@ def check_other_size(bench: DisplayBench) -> None:
 
 def check_closing(bench: DisplayBench) -> None:
     """Closing never raises, closed or open, and a closed display can be opened again."""
-    with _display(bench) as display:
+    with _open_display(bench) as display:
         display.close()
         for _ in range(_REPEATS):
             display.open()
@@ -163,7 +163,7 @@ _CHECKS: dict[Check, tuple[str, ...]] = {
 
 
 @contextmanager
-def _display(bench: DisplayBench, width_px: int | None = None) -> Iterator[Display]:
+def _open_display(bench: DisplayBench, width_px: int | None = None) -> Iterator[Display]:
     display = bench.make(width_px or bench.width_px, bench.height_px)
     try:
         yield display

@@ -68,7 +68,7 @@ def pattern_light(pattern: Pattern, raster: ScreenRaster) -> NDArray[np.float32]
     Raises ValueError for a role or Gray bit that is unknown.
     """
     inside = {
-        axis: _inside(raster.from_low_edge_mm(axis), 2 * raster.half_side_mm) for axis in "xy"
+        axis: _is_inside(raster.from_low_edge_mm(axis), 2 * raster.half_side_mm) for axis in "xy"
     }
     lit = {axis: inside[axis].astype(np.float32) for axis in "xy"}
     if pattern.role in ("white", "black"):
@@ -76,26 +76,26 @@ def pattern_light(pattern: Pattern, raster: ScreenRaster) -> NDArray[np.float32]
     if pattern.role == "crossed":
         period_mm = 2 * raster.half_side_mm / pattern.index
         for axis, shift_rad in (("x", pattern.shift_rad), ("y", pattern.shift_y_rad)):
-            wave = _profile(
+            wave = _pattern_profile(
                 Pattern("sin", axis, shift_rad=shift_rad), raster.from_low_edge_mm(axis), period_mm
             )
             lit[axis] = 0.5 * wave.astype(np.float32)
         return np.add.outer(lit["y"], lit["x"]) * np.outer(inside["y"], inside["x"])
-    profile = _profile(pattern, raster.from_low_edge_mm(pattern.axis), raster.period_mm)
+    profile = _pattern_profile(pattern, raster.from_low_edge_mm(pattern.axis), raster.period_mm)
     lit[pattern.axis] *= profile.astype(np.float32)
     return np.outer(lit["y"], lit["x"])
 
 
-def checkerboard(width_px: int, height_px: int) -> NDArray[np.uint8]:
+def make_checkerboard(width_px: int, height_px: int) -> NDArray[np.uint8]:
     """Black and white pixel by pixel, which no scaler reproduces."""
     return np.asarray(np.indices((height_px, width_px)).sum(axis=0) % 2 * 255, np.uint8)
 
 
-def _inside(s_mm: FloatArray, side_mm: float) -> NDArray[np.bool_]:
+def _is_inside(s_mm: FloatArray, side_mm: float) -> NDArray[np.bool_]:
     return (s_mm >= 0) & (s_mm < side_mm)
 
 
-def _profile(pattern: Pattern, s_mm: FloatArray, period_mm: float) -> FloatArray:
+def _pattern_profile(pattern: Pattern, s_mm: FloatArray, period_mm: float) -> FloatArray:
     if pattern.role == "sin":  # phi = 2 pi s / T - pi
         phi = 2 * math.pi * s_mm / period_mm - math.pi
         return np.asarray(0.5 + 0.5 * np.cos(phi + pattern.shift_rad))

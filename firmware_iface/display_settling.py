@@ -47,7 +47,7 @@ def share_left(frame: ArrayLike, before: ArrayLike, after: ArrayLike) -> float:
     )
 
 
-def settling(delay_s: ArrayLike, left: ArrayLike, noise: float = 0.0) -> Settling:
+def fit_settling(delay_s: ArrayLike, left: ArrayLike, noise: float = 0.0) -> Settling:
     """Latency, time constant and the time to wait.
 
     `delay_s` (K,) are the starts of the exposures after the command, from any number of steps;

@@ -18,7 +18,7 @@ DOCS_PATH = _HERE.parent / "docs" / "reference" / "registers.md"
 _SOURCE = "firmware_iface/registers.toml with python -m firmware_iface.generate"
 
 
-def markdown(registers: RegisterMap) -> str:
+def make_markdown(registers: RegisterMap) -> str:
     """The map as a page for people."""
     lines = [
         "# Registers of the membrane pump board",
@@ -83,19 +83,19 @@ def c_header(registers: RegisterMap) -> str:
         "#ifndef MEMBRANE_BOARD_H",
         "#define MEMBRANE_BOARD_H",
         "",
-        _define("MAP_VERSION", f"{registers.map_version}u"),
-        _define("DEVICE_KIND", f"0x{registers.device_kind:04X}u"),
-        _define("I32_NO_VALUE", f"({I32_NO_VALUE + 1} - 1)", "there is no value"),
+        _format_define("MAP_VERSION", f"{registers.map_version}u"),
+        _format_define("DEVICE_KIND", f"0x{registers.device_kind:04X}u"),
+        _format_define("I32_NO_VALUE", f"({I32_NO_VALUE + 1} - 1)", "there is no value"),
     ]
     for block in registers.blocks:
         lines += ["", f"/* {block.name} ({block.access}): {block.meaning} */"]
-        lines += [_define(f"BLOCK_{block.name}_ADDRESS", f"{block.address}u")]
-        lines += [_define(f"BLOCK_{block.name}_WORDS", f"{block.count}u")]
+        lines += [_format_define(f"BLOCK_{block.name}_ADDRESS", f"{block.address}u")]
+        lines += [_format_define(f"BLOCK_{block.name}_WORDS", f"{block.count}u")]
         for register in block.registers:
             lines += _c_register(register)
     lines += ["", "/* bits of latched_faults and clear_faults */"]
     lines += [
-        _define(f"FAULT_{fault.name}", f"0x{fault.mask:04X}u", fault.meaning)
+        _format_define(f"FAULT_{fault.name}", f"0x{fault.mask:04X}u", fault.meaning)
         for fault in registers.faults
     ]
     return "\n".join([*lines, "", "#endif"]) + "\n"
@@ -159,25 +159,27 @@ def c_table(registers: RegisterMap) -> str:
 
 def _c_register(register: Register) -> list[str]:
     lines = [
-        _define(
+        _format_define(
             f"{register.name}_ADDRESS",
             f"{register.address}u",
             f"{register.type}: {register.meaning}",
         )
     ]
     if register.counts_per_unit != 1:
-        lines.append(_define(f"{register.name}_COUNTS_PER_UNIT", str(register.counts_per_unit)))
+        lines.append(
+            _format_define(f"{register.name}_COUNTS_PER_UNIT", str(register.counts_per_unit))
+        )
     if register.access == "rw":
         lines.append(
-            _define(f"{register.name}_MIN_RAW", f"{register.to_raw(register.minimum):.0f}")
+            _format_define(f"{register.name}_MIN_RAW", f"{register.to_raw(register.minimum):.0f}")
         )
         lines.append(
-            _define(f"{register.name}_MAX_RAW", f"{register.to_raw(register.maximum):.0f}")
+            _format_define(f"{register.name}_MAX_RAW", f"{register.to_raw(register.maximum):.0f}")
         )
     return lines
 
 
-def _define(name: str, value: str, comment: str = "") -> str:
+def _format_define(name: str, value: str, comment: str = "") -> str:
     return f"#define MEMBRANE_{name.upper()} {value}" + (f" /* {comment} */" if comment else "")
 
 
@@ -191,7 +193,7 @@ def main(arguments: list[str] | None = None) -> int:
     registers = default_map()
     stale = False
     files = {
-        DOCS_PATH: markdown(registers),
+        DOCS_PATH: make_markdown(registers),
         HEADER_PATH: c_header(registers),
         TABLE_PATH: c_table(registers),
     }

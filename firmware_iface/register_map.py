@@ -197,7 +197,7 @@ def make_block(name: str, access: str, meaning: str, registers: Sequence[Registe
 @cache
 def default_map() -> RegisterMap:
     """The map that comes with this package."""
-    return load(DEFAULT_PATH)
+    return load_map(DEFAULT_PATH)
 
 
 @cache
@@ -207,19 +207,19 @@ def known_maps() -> dict[int, RegisterMap]:
     return {version: newest.of_version(version) for version in range(1, newest.map_version + 1)}
 
 
-def load(path: Path) -> RegisterMap:
+def load_map(path: Path) -> RegisterMap:
     """Read and check a map.
 
     Raises RegisterMapError for a file that is not a map, and for overlaps, gaps, wrong order,
     unknown types or keys, missing limits and names that do not end in their unit.
     """
     try:
-        return parse(tomllib.loads(path.read_text(encoding="utf-8")))
+        return parse_map(tomllib.loads(path.read_text(encoding="utf-8")))
     except (OSError, tomllib.TOMLDecodeError, RegisterMapError) as error:
         raise RegisterMapError(f"{path}: {error}") from error
 
 
-def parse(table: Mapping[str, Any]) -> RegisterMap:
+def parse_map(table: Mapping[str, Any]) -> RegisterMap:
     """A map from its TOML table. Raises RegisterMapError."""
     if table.get("schema") != SCHEMA:
         raise RegisterMapError(f'schema is {table.get("schema")!r}, expected "{SCHEMA}"')

@@ -269,7 +269,7 @@ class RoleBench:
         """
         if self._watchdog is not None and not self._watchdog.done():
             return
-        error = "was not started" if self._watchdog is None else _ending(self._watchdog)
+        error = "was not started" if self._watchdog is None else _describe_ending(self._watchdog)
         self._tripped = True
         with contextlib.suppress(Exception):
             await self._devices.pump.set_pump(0.0)
@@ -292,7 +292,7 @@ async def _stopped(tasks: list[asyncio.Task[None]]) -> None:
     await asyncio.gather(*tasks, return_exceptions=True)
 
 
-def _ending(task: asyncio.Task[None]) -> str:
+def _describe_ending(task: asyncio.Task[None]) -> str:
     """How a task ended that should run forever."""
     error = None if task.cancelled() else task.exception()
     return "was cancelled" if error is None else f"ended with {type(error).__name__}: {error}"

@@ -70,7 +70,7 @@ class Role:
 _ROLE = "role"
 
 
-def _sensor(name: str, reads: str, unit: str, needed: bool = False) -> dict[str, Role]:
+def _declare_sensor(name: str, reads: str, unit: str, needed: bool = False) -> dict[str, Role]:
     """Return the metadata of a field of `BenchReading` that the sensor of a role fills. Parameters:
     see `Role`.
     """
@@ -100,10 +100,14 @@ class BenchReading:
     displacement_um: float
     displacement_quality: int
     gauge_pressure_pa: float = field(
-        metadata=_sensor("gauge_pressure", "gauge_pressure_pa", "Pa", needed=True)
+        metadata=_declare_sensor("gauge_pressure", "gauge_pressure_pa", "Pa", needed=True)
     )
-    ambient_pressure_pa: float = field(metadata=_sensor("barometer", "ambient_pressure_pa", "Pa"))
-    air_temperature_c: float = field(metadata=_sensor("thermometer", "air_temperature_c", "°C"))
+    ambient_pressure_pa: float = field(
+        metadata=_declare_sensor("barometer", "ambient_pressure_pa", "Pa")
+    )
+    air_temperature_c: float = field(
+        metadata=_declare_sensor("thermometer", "air_temperature_c", "°C")
+    )
     gas_temperature_c: float
     pump_fraction: float
     vent_fraction: float

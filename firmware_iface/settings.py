@@ -36,28 +36,28 @@ class Section(BaseModel):
         """
         for name, value in table.items() if isinstance(table, dict) else ():
             field = cls.model_fields.get(name)
-            kinds = set() if field is None else _kinds(field.annotation)
+            kinds = set() if field is None else _list_kinds(field.annotation)
             if kinds == {bool} and not isinstance(value, bool):
                 raise ValueError(f"{name}: {value!r}: write true or false")
-            if kinds and _has(value, bool) and not kinds & {bool, Any}:
+            if kinds and _has_kind(value, bool) and not kinds & {bool, Any}:
                 raise ValueError(f"{name}: {str(value).lower()} is neither a number nor a text")
-            if _has(value, str) and kinds & {int, float} and not kinds & {str, Any}:
+            if _has_kind(value, str) and kinds & {int, float} and not kinds & {str, Any}:
                 raise ValueError(
                     f"{name}: {value!r}: write a number, without quotes, with a decimal point"
                 )
         return table
 
 
-def _has(value: Any, kind: Any) -> bool:
+def _has_kind(value: Any, kind: Any) -> bool:
     return isinstance(value, kind) or (
-        isinstance(value, list | tuple) and any(_has(part, kind) for part in value)
+        isinstance(value, list | tuple) and any(_has_kind(part, kind) for part in value)
     )
 
 
-def _kinds(annotation: Any) -> set[Any]:
+def _list_kinds(annotation: Any) -> set[Any]:
     """Return the types in an annotation; of a literal, that of its values."""
     inner = [
-        _kinds(part) if not isinstance(part, int | str) else {type(part)}
+        _list_kinds(part) if not isinstance(part, int | str) else {type(part)}
         for part in get_args(annotation)
     ]
     return (

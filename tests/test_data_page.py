@@ -18,7 +18,7 @@ import pytest
 from membrane_ctrl.cli import run
 from membrane_ctrl.review import open_run
 from membrane_ctrl.review.report.json import report_table
-from membrane_ctrl.review.statistics.analysis import analyse
+from membrane_ctrl.review.statistics.analysis import analyse_run
 from tests.support.dask_cluster import PATIENT
 from tests.support.review_runs import written
 
@@ -49,7 +49,7 @@ def lab(tmp_path_factory: pytest.TempPathFactory) -> Path:
 @pytest.fixture(scope="module")
 def reported(lab: Path) -> Figures:
     """The figures of `report`."""
-    tables = [report_table(analyse(open_run(lab / "logs" / name))) for name in NIGHTS]
+    tables = [report_table(analyse_run(open_run(lab / "logs" / name))) for name in NIGHTS]
     return {
         table["run"]: (table["ticks"], table["ticks_settled"], table["std_single_ticks_um"])
         for table in tables

@@ -15,7 +15,7 @@ from patience import patient_check
 from firmware_iface.emulators.pump_board import BoardSample
 from membrane_ctrl.cli import run
 from membrane_ctrl.config.schema import Config, DevicesConfig
-from membrane_ctrl.config.toml_file import dump, load
+from membrane_ctrl.config.toml_file import dump_toml, load_toml
 from membrane_ctrl.control_port.server import metrics_text
 from membrane_ctrl.model.run_status import RunStatus
 from membrane_ctrl.model.telemetry import FIELDS, TelemetryRow
@@ -65,7 +65,7 @@ def _without_optics(devices: DevicesConfig) -> DevicesConfig:
 async def test_the_example_passes_check(
     example: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    config = load(example, Config)
+    config = load_toml(example, Config)
     plant = StillPlant()
     if config.devices is None:
         assert await asyncio.to_thread(run, ["check", str(example), "--json"]) == 0
@@ -76,7 +76,7 @@ async def test_the_example_passes_check(
             await lab.start()
         )  # those: tests/acquisition/test_example_optics.py
         path = tmp_path / "moved.toml"
-        path.write_text(dump(config.model_copy(update={"devices": devices})))
+        path.write_text(dump_toml(config.model_copy(update={"devices": devices})))
         with patient_check():
             code = await asyncio.to_thread(run, ["check", str(path), "--json"])
     finally:
@@ -95,7 +95,7 @@ async def test_check_names_every_broken_device_and_the_remedy(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setenv("COLUMNS", "200")
-    config = load(EXAMPLES[0].with_name("all-serial.toml"), Config)
+    config = load_toml(EXAMPLES[0].with_name("all-serial.toml"), Config)
     assert config.devices is not None
     assert config.devices.barometer is not None
     lab = Lab(StillPlant(), config.devices)
@@ -103,7 +103,7 @@ async def test_check_names_every_broken_device_and_the_remedy(
         devices = await lab.start()
         lab.wires[config.devices.barometer.port].unplug()  # type: ignore[union-attr]
         path = tmp_path / "moved.toml"
-        path.write_text(dump(config.model_copy(update={"devices": devices})))
+        path.write_text(dump_toml(config.model_copy(update={"devices": devices})))
         with patient_check():
             code = await asyncio.to_thread(run, ["check", str(path)])
     finally:
@@ -172,13 +172,13 @@ def test_a_wrong_devices_table_is_one_line(
 def test_a_preset_refuses_what_its_device_does_not_have(
     change: dict[str, object], words: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    config = load(EXAMPLES[0].with_name("all-modbus-tcp.toml"), Config)
+    config = load_toml(EXAMPLES[0].with_name("all-modbus-tcp.toml"), Config)
     assert config.devices is not None
     assert config.devices.pump is not None
     pump = config.devices.pump.model_copy(update=change)
     path = tmp_path / "lab.toml"
     path.write_text(
-        dump(
+        dump_toml(
             config.model_copy(update={"devices": config.devices.model_copy(update={"pump": pump})})
         )
     )

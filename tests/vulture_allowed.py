@@ -17,6 +17,7 @@ _.put_nowait, maxsize, _.MaximumPacketSize  # aiomqtt and paho use these
     alarms_main,
     console_main,
     recorder_main,
+    serve_bench,
 )  # named as text to the child process that imports them
 _.pump_readback_fraction, _.vent_readback_fraction  # fields of a row, read by their place
 _.effective_samples, _.pump_scale, _.pump_sigma  # written by `asdict`

@@ -107,7 +107,9 @@ def _step(name: str) -> None:
         from tuning.options import TuneOptions, find_author_name
 
         options = TuneOptions(
-            config=schema.Config() if config is None else toml_file.load(config, schema.Config),
+            config=schema.Config()
+            if config is None
+            else toml_file.load_toml(config, schema.Config),
             twin=twin,
             where=Where(socket, run, logs=logs),
             logs=logs,
@@ -154,11 +156,11 @@ def history(logs: LogsOption = Path("logs"), json: JsonOption = False) -> int:
     """List which gains were kept, reverted or rolled back, when, by whom and why."""
     import json as json_module
 
-    from membrane_ctrl.sessions.folder import plain
+    from membrane_ctrl.sessions.folder import to_plain
     from tuning.journal import format_history, read_entries
 
     found = read_entries(logs)
-    print(json_module.dumps(plain(found)) if json else format_history(found))
+    print(json_module.dumps(to_plain(found)) if json else format_history(found))
     return 0
 
 

@@ -70,7 +70,7 @@ def _replace(path: Path, before: str, after: str) -> None:
     changed meanwhile.
     """
     target = path.resolve()
-    with errors.writing(path):
+    with errors.convert_write_errors(path):
         mode = target.stat().st_mode
         if files.read_text(target) != before:
             raise InputError(f"{path}: has changed meanwhile; repeat `tune save`")

@@ -4,7 +4,7 @@ import contextlib
 from collections.abc import Callable, Iterator
 
 from membrane_ctrl.config.schema import Config
-from membrane_ctrl.model.errors import DeviceError, InputError, writing
+from membrane_ctrl.model.errors import DeviceError, InputError, convert_write_errors
 from membrane_ctrl.sessions.folder import (
     SessionFolder,
     create_session,
@@ -40,7 +40,7 @@ def open_on_hold(
         with progress.catching():
             try:
                 rig.end_experiment()  # of a session that was killed
-                with writing(folder.path, DeviceError):
+                with convert_write_errors(folder.path, DeviceError):
                     yield folder, rig, progress
                 progress.note("ended", "done")
             except BaseException as error:

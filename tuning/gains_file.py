@@ -68,12 +68,12 @@ def save_gains(path: Path, gains: GainsFile) -> None:
     """Write a gains file atomically, without the setpoint, which belongs to the hold."""
     origin = program.file_origin(SCHEMA)
     table = gains.model_dump(mode="json", by_alias=True, exclude={"loop": {"setpoint_um"}})
-    files.write_text_atomic(files.users(path), tomli_w.dumps({**table, **origin}))
+    files.write_text_atomic(files.resolve_user_path(path), tomli_w.dumps({**table, **origin}))
 
 
 def load_gains(path: Path) -> GainsFile:
     """Read a gains file. Raises InputError (one line: file, field, remedy)."""
-    return config_file.load(path, GainsFile)
+    return config_file.load_toml(path, GainsFile)
 
 
 def require_sound(gains: GainsFile, where: str, running: LoopConfig) -> None:

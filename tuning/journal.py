@@ -74,9 +74,9 @@ def append_entry(logs: Path, what: GainsEntry) -> None:
     symbolic links are not followed.
     """
     path = logs / "tuning" / _FILE
-    with errors.writing(path):
+    with errors.convert_write_errors(path):
         files.make_folder(path.parent)
-        files.append_text(path, json.dumps(plain.plain(what), allow_nan=False) + "\n")
+        files.append_text(path, json.dumps(plain.to_plain(what), allow_nan=False) + "\n")
         files.sync_data(path)
 
 
@@ -94,7 +94,7 @@ def read_entries(logs: Path) -> list[GainsEntry]:
     found: list[GainsEntry] = []
     for line in text.splitlines():
         try:
-            found.append(plain.built(GainsEntry, plain_json.loads(line)))
+            found.append(plain.build_value(GainsEntry, plain_json.loads(line)))
         except (ValueError, TypeError, KeyError):
             continue
     return found

@@ -23,7 +23,7 @@ from membrane_ctrl.controller.snapshot import continue_from, take_snapshot
 from membrane_ctrl.controller.tick_codec import SNAPSHOT_MESSAGE_BYTES, pack_snapshot
 from membrane_ctrl.hold.virtual_run import TruthShape, VirtualRun, VirtualTick
 from membrane_ctrl.metrology.film.hencky_bowl import zernike_projection
-from membrane_ctrl.processes.ring import RingWriter, ring
+from membrane_ctrl.processes.ring import RingWriter, open_ring
 from membrane_ctrl.sim.plant import Plant
 from membrane_ctrl.sim.virtual_bench import VirtualBench
 from tests.support.figures import Figure, at_most
@@ -48,7 +48,7 @@ def run() -> list[Figure]:
     starts_s: list[float] = []
     snapshot = b""
     with ExitStack() as stack:
-        writer = RingWriter(stack.enter_context(ring(4, SNAPSHOT_MESSAGE_BYTES)))
+        writer = RingWriter(stack.enter_context(open_ring(4, SNAPSHOT_MESSAGE_BYTES)))
         stack.callback(writer.close)
         for number, tick in enumerate(_ticks(virtual), start=1):
             before_s = time.perf_counter()

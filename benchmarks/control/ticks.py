@@ -17,7 +17,7 @@ from pathlib import Path
 import numpy as np
 
 from firmware_iface.drivers.pump_board import PumpBoard
-from firmware_iface.emulators.modbus_pdu import respond
+from firmware_iface.emulators.modbus_pdu import answer_request
 from firmware_iface.emulators.pump_board import BoardSample
 from firmware_iface.emulators.serial_device import PtyWire
 from firmware_iface.links.serial_port import SerialSettings
@@ -80,7 +80,7 @@ async def _measure(duration_s: float) -> list[Figure]:
     emulator = PumpBoardEmulator(_StillPlant(), port=0)
     await emulator.start()
     bus = RtuBusEmulator(
-        SerialSettings(BAUD, parity="E"), {1: partial(respond, table=emulator.state)}
+        SerialSettings(BAUD, parity="E"), {1: partial(answer_request, table=emulator.state)}
     )
     figures = []
     with tempfile.TemporaryDirectory() as folder:

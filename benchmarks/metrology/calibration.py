@@ -43,7 +43,7 @@ from membrane_ctrl.sim.optics.bench_poses import CameraPose, ScreenError, Screen
 from membrane_ctrl.sim.optics.camera import OpticsRenderer
 from membrane_ctrl.sim.optics.film_shape import FilmShape, typical_film
 from membrane_ctrl.sim.optics.pattern_levels import pattern_sequence
-from membrane_ctrl.sim.optics.trace import trace
+from membrane_ctrl.sim.optics.trace import trace_rays
 from tests.support.figures import Figure, at_least, at_most
 
 FloatArray = NDArray[np.float64]
@@ -290,7 +290,9 @@ def _traced(values: FloatArray, seed: int) -> tuple[SetPhases, ...]:
         count = int(POINTS / 0.43)  # share of the picture that sees the mirror
         column, row = rng.uniform(0, width - 1, count), rng.uniform(0, height - 1, count)
         rays = geometry.rays(column, row).T
-        met = trace(camera, rays, film.terms, film.sag_at_mm(moved_um), -1e-3 * moved_um, screen)
+        met = trace_rays(
+            camera, rays, film.terms, film.sag_at_mm(moved_um), -1e-3 * moved_um, screen
+        )
         inside = (met.x_mm**2 + met.y_mm**2 < 475.0**2) & np.isfinite(met.s_x_mm)
         seen = np.stack([met.s_x_mm, met.s_y_mm])[:, inside]
         seen = seen + rng.normal(0, sigma_mm, seen.shape)

@@ -28,7 +28,7 @@ from benchmarks.metrology.calibration import errors_um
 from membrane_ctrl.calibration.sets import (
     Bundle,
     CalibrateOptions,
-    join,
+    join_moved_screen,
     phases_of,
     phases_of_screen,
     problem_of,
@@ -53,7 +53,7 @@ from membrane_ctrl.model.zernike_terms import ZERNIKE_TERMS
 from membrane_ctrl.sim.optics.bench_poses import camera_pose
 from membrane_ctrl.sim.optics.film_shape import FilmShape, typical_film
 from membrane_ctrl.sim.optics.pattern_levels import Light
-from membrane_ctrl.sim.optics.simulation_spec import leaning
+from membrane_ctrl.sim.optics.simulation_spec import make_artefact_shape
 from tests.studies.resumable_answers import answers
 from tests.support.figures import Figure, at_most
 from tests.worlds.misstated_bench import (
@@ -172,7 +172,7 @@ class DrawnBench:
             SPHERE.curvature_per_mm + SPHERE.curvature_sigma_per_mm * rng.standard_normal()
         )
         form_um = 1e3 * SPHERE.form_sigma_mm * rng.standard_normal(ZERNIKE_TERMS)
-        shape = leaning(curvature_mm, radius_mm, *rng.uniform(-2e-3, 2e-3, 2), form_um)
+        shape = make_artefact_shape(curvature_mm, radius_mm, *rng.uniform(-2e-3, 2e-3, 2), form_um)
         mirror = self.stated.mirror.model_copy(
             update={"radius_mm": radius_mm, "analysis_radius_mm": 0.95 * radius_mm}
         )
@@ -266,7 +266,9 @@ def _with_more_screens(drawn: DrawnBench, sets: list[SetPhases], seed: int) -> N
     stated = drawn.stated.model_copy(update={"geometry": geometry})
     for k, moved_um in enumerate(TWO_UM):
         stack, _ = drawn.set_at(moved_um, seed + k, there)
-        join(sets, Path(f"far{k}"), phases_of(f"far{k}", check_set(stack, stated), stated), RAIL)
+        join_moved_screen(
+            sets, Path(f"far{k}"), phases_of(f"far{k}", check_set(stack, stated), stated), RAIL
+        )
     sets += [drawn.screen_set(f"screen{k}", k * math.pi / 2, seed + 5 + k) for k in range(2)]
 
 

@@ -28,7 +28,7 @@ import numpy as np
 import psutil
 
 from benchmarks.records.memory_acquisition import acquisition_figures
-from membrane_ctrl.alarms.process import AlarmsSpec, watch
+from membrane_ctrl.alarms.process import AlarmsSpec, watch_run
 from membrane_ctrl.config.schema import Config, LoopConfig, RecordingConfig, ShapeConfig
 from membrane_ctrl.console.process import ConsoleSpec, console_main
 from membrane_ctrl.controller.tick_codec import MESSAGE_BYTES, RECORD, TICK
@@ -36,8 +36,8 @@ from membrane_ctrl.model.clock import RunClock
 from membrane_ctrl.model.shape_estimate import pack_estimate, unpack_estimate
 from membrane_ctrl.model.telemetry import FIELDS, ROW_BYTES
 from membrane_ctrl.processes.child import Child
-from membrane_ctrl.processes.event_pipe import pipe
-from membrane_ctrl.processes.ring import RingAddress, RingWriter, ring
+from membrane_ctrl.processes.event_pipe import make_pipe
+from membrane_ctrl.processes.ring import RingAddress, RingWriter, open_ring
 from membrane_ctrl.recorder import process
 from membrane_ctrl.recorder.process import RecorderSpec
 from membrane_ctrl.run_files.run_folder import create_run_folder
@@ -89,7 +89,7 @@ def quiet_console(spec: ConsoleSpec) -> None:
 
 def mute_alarms(spec: AlarmsSpec) -> None:
     """The alarms without a target."""
-    watch(spec, [lambda notice: True], lambda event: None, lambda: True)
+    watch_run(spec, [lambda notice: True], lambda event: None, lambda: True)
 
 
 def run() -> list[Figure]:
@@ -116,7 +116,7 @@ def _fed_figures(folder: Path, stack: ExitStack) -> list[Figure]:
         "shapes": (256, 1 << 16),
         "events": (1024, 4096),
     }
-    rings = {name: stack.enter_context(ring(*size)) for name, size in sizes.items()}
+    rings = {name: stack.enter_context(open_ring(*size)) for name, size in sizes.items()}
     writers = {name: RingWriter(address) for name, address in rings.items()}
     for writer in writers.values():
         stack.callback(writer.close)
@@ -139,7 +139,7 @@ def _fed_figures(folder: Path, stack: ExitStack) -> list[Figure]:
 def _children(
     config: Config, clock: RunClock, rings: dict[str, RingAddress], run_dir: Path
 ) -> tuple[list[Child], Connection]:
-    ours, theirs = pipe()
+    ours, theirs = make_pipe()
     spec = RecorderSpec(
         run_dir,
         "week",

@@ -13,9 +13,9 @@ from membrane_ctrl.config.schema import CameraConfig, Config, OpticsConfig, Shap
 from membrane_ctrl.model.clock import RunClock
 from membrane_ctrl.model.telemetry import FIELDS, ROW_BYTES, TelemetryRow
 from membrane_ctrl.processes.child import Child
-from membrane_ctrl.processes.event_pipe import pipe
+from membrane_ctrl.processes.event_pipe import make_pipe
 from membrane_ctrl.processes.frames import FrameRing
-from membrane_ctrl.processes.ring import RingReader, RingWriter, ring
+from membrane_ctrl.processes.ring import RingReader, RingWriter, open_ring
 from membrane_ctrl.sim.truth import TRUTH_BYTES, Truth
 from tests.support.figures import Figure, at_most
 
@@ -32,13 +32,13 @@ _PATIENCE_S = 1800.0
 def acquisition_figures() -> list[Figure]:
     """Growth from the cycle `WARM_CYCLES` to the cycle `CYCLES`."""
     with ExitStack() as stack:
-        telemetry = stack.enter_context(ring(4096, ROW_BYTES))
-        shapes = stack.enter_context(ring(64, 1 << 16))
-        truths = stack.enter_context(ring(16, TRUTH_BYTES))
+        telemetry = stack.enter_context(open_ring(4096, ROW_BYTES))
+        shapes = stack.enter_context(open_ring(64, 1 << 16))
+        truths = stack.enter_context(open_ring(16, TRUTH_BYTES))
         frames = FrameRing.for_optics(_CONFIG.optics)
         stack.callback(frames.close)
         clock = RunClock.start()
-        ours, theirs = pipe()
+        ours, theirs = make_pipe()
         spec = AcquisitionSpec(_CONFIG, clock, telemetry, shapes, truths, frames.address)
         child = Child(
             "acquisition",

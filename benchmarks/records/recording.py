@@ -17,7 +17,7 @@ from pathlib import Path
 from membrane_ctrl.config.schema import Config
 from membrane_ctrl.controller.tick_codec import MESSAGE_BYTES
 from membrane_ctrl.model.clock import RunClock
-from membrane_ctrl.processes.ring import RingReader, RingWriter, ring
+from membrane_ctrl.processes.ring import RingReader, RingWriter, open_ring
 from membrane_ctrl.recorder.recorder import Recorder
 from membrane_ctrl.recorder.rerun_recording import Recording
 from membrane_ctrl.recorder.segment_optimizer import Optimizer
@@ -105,7 +105,7 @@ def recorded(config: Config, duration_s: float) -> Recorded:
 def _measured(folder: Path, stack: ExitStack, config: Config, duration_s: float) -> Recorded:
     clock = HandClock(0.0, datetime.now(UTC))
     run_dir = create_run_folder(folder, "day", clock.origin_utc, config)
-    addresses = {name: stack.enter_context(ring(*size)) for name, size in _RINGS.items()}
+    addresses = {name: stack.enter_context(open_ring(*size)) for name, size in _RINGS.items()}
     readers = {name: RingReader(address) for name, address in addresses.items()}
     writers = {name: RingWriter(address) for name, address in addresses.items()}
     for end in (*readers.values(), *writers.values()):

@@ -76,14 +76,14 @@ def load_driver(name: str, kind: DriverKind) -> Any:
 
     Raises ValueError if none or several do, or if it cannot be loaded.
     """
-    return _load(name, kind.name, list_installed(kind.group))
+    return _load_entry(name, kind.name, list_installed(kind.group))
 
 
 def load_emulator(name: str, kind: DriverKind) -> Any:
     """Import the emulator class of the device of this driver.
     Raises ValueError as `load_driver`.
     """
-    return _load(
+    return _load_entry(
         name, f"{kind.name.removesuffix('driver')}emulator", list_installed(kind.emulators)
     )
 
@@ -93,7 +93,7 @@ def has_emulator(name: str, kind: DriverKind) -> bool:
     return any(entry.name == name for entry in list_installed(kind.emulators))
 
 
-def _load(name: str, what: str, entries: list["EntryPoint"]) -> Any:
+def _load_entry(name: str, what: str, entries: list["EntryPoint"]) -> Any:
     found = [entry for entry in entries if entry.name == name]
     if not found:
         known = ", ".join(entry.name for entry in entries) or "none"

@@ -101,7 +101,7 @@ def parse_ascii(line: bytes) -> ProparMessage | None:
     return ProparMessage(0, raw[1], raw[2:])
 
 
-def request(parameters: Sequence[InstrumentParameter]) -> bytes:
+def make_request(parameters: Sequence[InstrumentParameter]) -> bytes:
     """Data that asks for parameters of one process or several, each under its place in the list as
     its index.
     """
@@ -125,7 +125,7 @@ def write_data(parameter: InstrumentParameter, value: int) -> bytes:
     )
 
 
-def values(data: bytes) -> list[tuple[int, int, bytes]]:
+def parse_values(data: bytes) -> list[tuple[int, int, bytes]]:
     """Index of process, index of parameter and raw value of each parameter in data of an answer or
     a write.
 
@@ -222,9 +222,9 @@ class ProparParameters:
     async def _asked(self, *parameters: InstrumentParameter) -> list[bytes]:
         """Raw values of several parameters, from one message."""
         what = f"reading {parameters[0].name}"
-        answer = await self._transact(request(parameters), what)
+        answer = await self._transact(make_request(parameters), what)
         try:
-            found = values(answer)
+            found = parse_values(answer)
         except (ValueError, IndexError) as error:
             raise LinkError(f"{self.name}: {what}: the answer is malformed ({error})") from error
         if answer[0] != VALUES or [(group, index) for group, index, _ in found] != [
@@ -240,7 +240,7 @@ class ProparParameters:
         """Data of the answer with the question's sequence number; a status other than 0 raises."""
         what = f"{self.name}: {what}"
         question = self._question(data, what)
-        fence = self._question(request([MEASURE]), f"{self.name}: asking anew after a loss")
+        fence = self._question(make_request([MEASURE]), f"{self.name}: asking anew after a loss")
         answer = await self._exchange.ask(question, self._timeout_s, fence)
         message = split_binary(answer)[0][-1]
         if message.data[0] != STATUS:
@@ -254,10 +254,12 @@ class ProparParameters:
     def _question(self, data: bytes, what: str) -> exchange.Question:
         self._sequence = (self._sequence + 1) % _SEQUENCES
         frame = binary_frame(ProparMessage(self._sequence, self._node, data))
-        return exchange.Question(frame, _taker(self._sequence, self._node), 2 * _ANSWER_BYTES, what)
+        return exchange.Question(
+            frame, _make_frame_filter(self._sequence, self._node), 2 * _ANSWER_BYTES, what
+        )
 
 
-def _taker(sequence: int, node: int) -> Callable[[bytes], bytes | None]:
+def _make_frame_filter(sequence: int, node: int) -> Callable[[bytes], bytes | None]:
     """Finds the answer with this sequence number; discards others, which are late."""
 
     def take(heard: bytes) -> bytes | None:

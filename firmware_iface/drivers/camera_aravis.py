@@ -78,7 +78,7 @@ class AravisCamera:
         the camera does not take).
         """
         self.close()
-        library, config = arv.aravis(), self.config
+        library, config = arv.load_aravis(), self.config
         try:
             self._camera = library.call("arv_camera_new", config.camera.encode() or None)
             if not self._camera:
@@ -104,7 +104,7 @@ class AravisCamera:
             self._discard_pending()
         if self._stream is None:
             self.open()
-        library = arv.aravis()
+        library = arv.load_aravis()
         while buffer := library.call("arv_stream_try_pop_buffer", self._stream):
             library.call("arv_stream_push_buffer", self._stream, buffer)  # arrived unrequested
         time_s = self._now()
@@ -125,7 +125,7 @@ class AravisCamera:
         if self._pending is None or self._stream is None:
             raise roles.LinkError(f"{self._name}: no exposure to fetch")
         (time_s, out), self._pending = self._pending, None
-        library = arv.aravis()
+        library = arv.load_aravis()
         timeout_us = round(1e6 * self.config.timeout_s)
         buffer = library.call("arv_stream_timeout_pop_buffer", self._stream, timeout_us)
         if not buffer:
@@ -152,7 +152,7 @@ class AravisCamera:
         """Release the camera. Never raises."""
         self._stop_stream()
         if self._camera is not None:
-            arv.aravis().call("g_object_unref", self._camera)
+            arv.load_aravis().call("g_object_unref", self._camera)
         self._camera = self._pending = None
 
     def _abandon(self) -> None:
@@ -161,7 +161,7 @@ class AravisCamera:
         """
         left = [instance for instance in (self._stream, self._camera) if instance is not None]
         self._stream = self._camera = self._pending = None
-        unref = arv.aravis().call
+        unref = arv.load_aravis().call
         threading.Thread(
             target=lambda: [unref("g_object_unref", instance) for instance in left], daemon=True
         ).start()
@@ -181,7 +181,7 @@ class AravisCamera:
 
     def _identity(self) -> roles.DeviceIdentity:
         words = (
-            arv.aravis().text(f"arv_camera_get_{word}", self._camera)
+            arv.load_aravis().text(f"arv_camera_get_{word}", self._camera)
             for word in ("vendor_name", "model_name", "device_serial_number")
         )
         vendor, model, serial = words
@@ -191,7 +191,7 @@ class AravisCamera:
         """Check control: a GigE Vision camera lets anyone read, but ignores writes except its
         controller's.
         """
-        call = arv.aravis().call
+        call = arv.load_aravis().call
         device = call("arv_camera_get_device", self._camera)
         call("arv_device_set_range_check_policy", device, _RANGE_CHECKED)
         if call("arv_camera_is_gv_device", self._camera) and not call(
@@ -200,7 +200,7 @@ class AravisCamera:
             raise arv.AravisError("another controller", arv.NOT_CONTROLLER)
 
     def _apply(self) -> None:
-        call, camera, config = arv.aravis().call, self._camera, self.config
+        call, camera, config = arv.load_aravis().call, self._camera, self.config
         sensor = [ctypes.c_int() for _ in range(2)]
         call("arv_camera_get_sensor_size", camera, *map(ctypes.byref, sensor))
         if (found := (sensor[0].value, sensor[1].value)) != self._size:
@@ -245,7 +245,7 @@ class AravisCamera:
         return arv.PIXEL_FORMATS[self.config.pixel_format]
 
     def _start_stream(self) -> None:
-        library, camera = arv.aravis(), self._camera
+        library, camera = arv.load_aravis(), self._camera
         gige = bool(library.call("arv_camera_is_gv_device", camera))
         if gige:
             library.call(
@@ -271,7 +271,7 @@ class AravisCamera:
         """The first frame after a start may be exposed up to 0.1 s after its trigger, with the next
         pattern lit.
         """
-        library = arv.aravis()
+        library = arv.load_aravis()
         library.call("arv_camera_software_trigger", self._camera)
         wait_us = round(1e6 * (self.config.timeout_s + self.config.exposure_ms / 1000.0))
         if buffer := library.call("arv_stream_timeout_pop_buffer", self._stream, wait_us):
@@ -280,7 +280,7 @@ class AravisCamera:
     def _stop_stream(self) -> None:
         if self._stream is None:
             return
-        library = arv.aravis()
+        library = arv.load_aravis()
         with suppress(roles.LinkError):
             library.call("arv_camera_stop_acquisition", self._camera)
         library.call("g_object_unref", self._stream)
@@ -291,7 +291,7 @@ class AravisCamera:
         trigger.
         """
         self._pending = None
-        library = arv.aravis()
+        library = arv.load_aravis()
         timeout_us = round(1e6 * self.config.timeout_s)
         buffer = library.call("arv_stream_timeout_pop_buffer", self._stream, timeout_us)
         if buffer:
@@ -311,7 +311,7 @@ class AravisCamera:
 
     def _pixels(self, buffer: int, out: roles.Pixels | None) -> roles.Pixels:
         """Copy a whole frame's pixels."""
-        library = arv.aravis()
+        library = arv.load_aravis()
         found = tuple(
             library.call(f"arv_buffer_get_image_{word}", buffer)
             for word in ("height", "width", "pixel_format")

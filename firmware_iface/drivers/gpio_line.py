@@ -139,7 +139,7 @@ class GpioLines:
             finally:
                 self._busy.release()
             with contextlib.suppress(RuntimeError):  # the event loop has ended meanwhile
-                loop.call_soon_threadsafe(_settle, answer, result, failure)
+                loop.call_soon_threadsafe(_settle_future, answer, result, failure)
 
         threading.Thread(target=run, name="gpio", daemon=True).start()
         try:
@@ -165,7 +165,7 @@ class GpioLines:
         return LinkDownError(f"{self._chip}: {what}")
 
 
-def _settle(answer: asyncio.Future[Any], result: Any, failure: Exception | None) -> None:
+def _settle_future(answer: asyncio.Future[Any], result: Any, failure: Exception | None) -> None:
     """Give the thread's result to the caller, if it still waits."""
     if answer.done():
         return

@@ -76,7 +76,7 @@ class KeyenceDlRs1a(exchange.LineDriver):
 
     async def _identify(self) -> roles.DeviceIdentity:
         every = await self._link.query("M0", _ALL, _ALL_CHARS)
-        _refuse(self._link.name, every[2])
+        _raise_refusal(self._link.name, every[2])
         values = every[1][1:].split(",")
         if self._config.amplifier >= len(values):
             raise roles.DeviceRefusedError(
@@ -93,7 +93,7 @@ class KeyenceDlRs1a(exchange.LineDriver):
         if (
             errors[2] != _NOT_READABLE
         ):  # amplifiers without this number: the value shows their head error
-            _refuse(self._link.name, errors[2])
+            _raise_refusal(self._link.name, errors[2])
         if bits := int(errors[1] or 0):
             raise roles.DeviceRefusedError(
                 f"{self._link.name}: amplifier in error (state {bits:016b}); see its manual"
@@ -125,7 +125,7 @@ class KeyenceDlRs1a(exchange.LineDriver):
     async def _reading(self) -> tuple[int, float, bool]:
         """Quality, displacement and whether the gate passed it."""
         answer = await self._link.query(self._read_command, self._read_answer)
-        _refuse(self._link.name, answer[2])
+        _raise_refusal(self._link.name, answer[2])
         text = answer[1]
         if len(text.partition(".")[2]) != self._decimals:
             raise roles.LinkError(
@@ -148,6 +148,6 @@ class KeyenceDlRs1a(exchange.LineDriver):
         )
 
 
-def _refuse(name: str, code: str | None) -> None:
+def _raise_refusal(name: str, code: str | None) -> None:
     if code is not None:
         raise roles.DeviceRefusedError(f"{name}: error {code} ({ERRORS.get(int(code), 'unknown')})")

@@ -67,7 +67,7 @@ class ValueMap:
         return self.limits[0] <= value <= self.limits[1]
 
 
-def preset(name: str) -> dict[str, Any]:
+def load_preset(name: str) -> dict[str, Any]:
     """The defaults of a preset. Raises ValueError for an unknown one."""
     path = PRESETS / f"{name}.toml"
     if not path.is_file():
@@ -83,7 +83,7 @@ def make_map(given: dict[str, Any], preset_name: str = "") -> tuple[ValueMap, bo
     Raises ValueError (an unknown preset, a missing key, an address or a raw value that the device
     does not have).
     """
-    defaults = preset(preset_name) if preset_name else {}
+    defaults = load_preset(preset_name) if preset_name else {}
     raw_limits, address_limits = (
         defaults.pop("raw_limits", None),
         defaults.pop("address_limits", None),

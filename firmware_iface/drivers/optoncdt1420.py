@@ -185,7 +185,7 @@ class Optoncdt1420:
         await self._command(setting)
         text = await self._command(name)
         found = re.search(rf"^\s*{name} +(.+?)\s*$", text, re.MULTILINE)
-        if found is None or _plain(found[1]) != _plain(setting.split()[1]):
+        if found is None or _format_rate(found[1]) != _format_rate(setting.split()[1]):
             raise roles.DeviceRefusedError(
                 f"{self._port.name}: set {setting!r}, read back {text.strip()[:60]!r}"
             )
@@ -226,7 +226,7 @@ class Optoncdt1420:
             values = self._taken()
             good = values[values <= _RAW_MAX]
             if len(good):
-                self._gate.passes(self._displacement_um(middle(good)))
+                self._gate.passes(self._displacement_um(middle_mean(good)))
 
     async def displacement(self) -> roles.DisplacementSample:
         """Mean of the middle half of all values since the last call; waits for one when there is
@@ -256,7 +256,7 @@ class Optoncdt1420:
             return roles.DisplacementSample(
                 math.nan, int(codes[np.argmax(counts)]), self._counted, self._arrived_s
             )
-        raw = middle(good)
+        raw = middle_mean(good)
         displacement_um = self._displacement_um(raw)
         if not self._gate.passes(displacement_um):
             raise roles.LinkError(
@@ -331,13 +331,13 @@ class Optoncdt1420:
         }
 
 
-def _plain(value: str) -> str:
+def _format_rate(value: str) -> str:
     """A rate without unit and trailing zeros, anything else unchanged."""
     rate = _RATE.fullmatch(value)
     return f"{float(rate[1]):g}" if rate else value
 
 
-def middle(values: NDArray[np.int64]) -> float:
+def middle_mean(values: NDArray[np.int64]) -> float:
     """Mean of the middle half of values (n,), the median of a few."""
     if len(values) < _MIDDLE_MIN:
         return float(np.median(values))

@@ -34,7 +34,7 @@ class PygameDisplay:
         """
         self.close()
         config = self._config
-        self._pygame = pygame = _pygame()
+        self._pygame = pygame = _import_pygame()
         size = (config.width_px, config.height_px)
         try:
             pygame.display.init()
@@ -103,7 +103,7 @@ class PygameDisplay:
             )
 
 
-def _pygame() -> Any:
+def _import_pygame() -> Any:
     """The library, without its greeting and without a GPU. Raises LinkError with the remedy if not
     installed.
     """

@@ -128,10 +128,12 @@ class Ventus(exchange.LineDriver):
 
     async def _write_and_read(self, writes: dict[int, float], *registers: int) -> dict[int, float]:
         """Write and read in one exchange: a write has no answer of its own."""
-        lines = [f"#W{register},{_text(register, value)}" for register, value in writes.items()]
+        lines = [
+            f"#W{register},{_format_value(register, value)}" for register, value in writes.items()
+        ]
         lines += [f"#R{register}" for register in registers]
         answer = await self._link.query(
-            "\n".join(lines), _registers(*registers), 24 * len(registers)
+            "\n".join(lines), _make_answer_form(*registers), 24 * len(registers)
         )
         return {
             register: float(value)
@@ -152,11 +154,11 @@ class Ventus(exchange.LineDriver):
         return f"full drive {self._power_max_mw:g} mW"
 
 
-def _registers(*registers: int) -> re.Pattern[str]:
+def _make_answer_form(*registers: int) -> re.Pattern[str]:
     """The form of the answers to `#R` of these, in order."""
     return re.compile("".join(rf"#R{register},({_NUMBER})\r?\n" for register in registers))
 
 
-def _text(register: int, value: float) -> str:
+def _format_value(register: int, value: float) -> str:
     """Power values are floats and written with three decimals, the others are integers."""
     return f"{value:.3f}" if register == SET_VALUE else f"{value:.0f}"

@@ -58,7 +58,7 @@ class KeyenceDlRs1aEmulator(LineDevice):
         values = {
             "033": f"{self.error_state:05d}",
             "037": self._judged(int(amplifier)),
-            "038": _text(self._measured_mm(int(amplifier))),
+            "038": _format_value(self._measured_mm(int(amplifier))),
         }
         return f"SR,{amplifier},{number},{values[number]}" if number in values else "ER,SR,22"
 
@@ -70,7 +70,7 @@ class KeyenceDlRs1aEmulator(LineDevice):
         return f"SW,{amplifier},{number}"
 
     def _judged(self, amplifier: int) -> str:
-        return _text(self._measured_mm(amplifier) - self.zero_shift_mm)
+        return _format_value(self._measured_mm(amplifier) - self.zero_shift_mm)
 
     def _measured_mm(self, amplifier: int) -> float:
         if amplifier:
@@ -80,7 +80,7 @@ class KeyenceDlRs1aEmulator(LineDevice):
         return self._value_mm
 
 
-def _text(value_mm: float) -> str:
+def _format_value(value_mm: float) -> str:
     """Page 11: sign, two digits, three decimals; page 12 without a value."""
     if math.isnan(value_mm):
         return "+EE.EEE"

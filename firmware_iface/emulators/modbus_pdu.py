@@ -40,10 +40,10 @@ class RegisterTable(Protocol):
         """All of it or nothing. Raises RegisterRefusal."""
 
 
-def respond(pdu: bytes, table: RegisterTable) -> bytes:
+def answer_request(pdu: bytes, table: RegisterTable) -> bytes:
     """The answer to a request: function code and data, or an exception."""
     try:
-        return pdu[:1] + _respond(pdu[0], pdu[1:], table)
+        return pdu[:1] + _answer_function(pdu[0], pdu[1:], table)
     except RegisterRefusal as refusal:
         return exception_pdu(pdu, refusal.code)
     except struct.error:  # the request is shorter than its function code needs
@@ -55,7 +55,7 @@ def exception_pdu(pdu: bytes, code: int) -> bytes:
     return bytes([pdu[0] | 0x80, code])
 
 
-def _respond(function_code: int, data: bytes, table: RegisterTable) -> bytes:
+def _answer_function(function_code: int, data: bytes, table: RegisterTable) -> bytes:
     if function_code == READ_HOLDING:
         address, count = struct.unpack(">HH", data)
         return _words_read(table, address, count)

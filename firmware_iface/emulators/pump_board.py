@@ -443,6 +443,6 @@ class PumpBoardEmulator:
     def answer(self, pdu: bytes) -> modbus_server.Answer:
         """Carry out a request."""
         self._advance()
-        reply = modbus_pdu.respond(pdu, self.state)
+        reply = modbus_pdu.answer_request(pdu, self.state)
         self._actuate()
         return modbus_server.Answer(reply)

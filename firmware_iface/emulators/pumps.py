@@ -290,7 +290,7 @@ class ProparDevice(serial_device.SerialDevice):
         return bytes([bronkhorst_propar.STATUS, _COMMAND_ERROR, 0])
 
     def _written(self, data: bytes) -> int:
-        for process, number, raw in bronkhorst_propar.values(data):
+        for process, number, raw in bronkhorst_propar.parse_values(data):
             parameter = _BY_PLACE.get((process, number))
             if parameter is None:
                 return _PARAMETER_ERROR

@@ -135,7 +135,7 @@ class PtyWire:
         )  # the second is kept open, or the first would report a hang-up
         tty.setraw(program_end)
         line = termios.tcgetattr(program_end)
-        line[_SPEED] = line[_SPEED + 1] = _speed(self._device)
+        line[_SPEED] = line[_SPEED + 1] = _read_baud_rate(self._device)
         termios.tcsetattr(program_end, termios.TCSANOW, line)
         os.set_blocking(device_end, False)
         self.path.symlink_to(os.ttyname(program_end))
@@ -169,9 +169,9 @@ class PtyWire:
     def _seen(self, data: bytes) -> bytes:
         """The bytes as the other end receives them: at another baud rate, garbage."""
         assert self._ends is not None
-        same = termios.tcgetattr(self._ends[0])[_SPEED] == _speed(self._device)
+        same = termios.tcgetattr(self._ends[0])[_SPEED] == _read_baud_rate(self._device)
         return data if same else bytes((7 * byte + 0xA5) % 256 for byte in data)
 
 
-def _speed(device: SerialDevice) -> int:
+def _read_baud_rate(device: SerialDevice) -> int:
     return int(getattr(termios, f"B{device.settings.baud}"))

@@ -191,7 +191,7 @@ class FoundCamera:
 
 
 @cache
-def aravis() -> Aravis:
+def load_aravis() -> Aravis:
     """The library, loaded once. Raises LinkError with the remedy when it is not installed."""
     try:
         return Aravis()
@@ -203,7 +203,7 @@ def find_cameras() -> Iterator[FoundCamera]:
     """All GenICam cameras on USB and on the network (takes about a second). Raises LinkError
     without the library.
     """
-    library = aravis()
+    library = load_aravis()
     library.call("arv_update_device_list")
     for index in range(library.call("arv_get_n_devices")):
         words = (

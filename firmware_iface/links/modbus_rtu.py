@@ -26,7 +26,7 @@ _READS_BITS = (modbus_link.READ_COILS, modbus_link.READ_DISCRETE)
 _TOKENS = 2**16
 
 
-def crc16(data: bytes) -> int:
+def compute_crc16(data: bytes) -> int:
     """The CRC of Modbus: polynomial 0xA001 (reflected 0x8005), start 0xFFFF;
     sent low byte first.
     """
@@ -48,7 +48,7 @@ _CRC_TABLE = tuple(_table_entry(index) for index in range(256))
 def rtu_frame(unit_id: int, pdu: bytes) -> bytes:
     """Unit, PDU and CRC."""
     body = bytes([unit_id]) + pdu
-    return body + struct.pack("<H", crc16(body))
+    return body + struct.pack("<H", compute_crc16(body))
 
 
 def parse_rtu_url(url: str) -> tuple[str, serial_port.SerialSettings]:
@@ -306,6 +306,6 @@ def take_reply(
         return None
     if len(heard) > length:
         raise LinkError(f"{what}: {len(heard)} bytes instead of {length}")
-    if crc16(heard):  # over a frame with its own CRC the sum is 0
+    if compute_crc16(heard):  # over a frame with its own CRC the sum is 0
         raise LinkError(f"{what}: wrong checksum; noise on the line, or wrong baud rate")
     return heard[1:-2]

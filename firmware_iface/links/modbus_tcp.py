@@ -268,11 +268,11 @@ class GuardedModbusTcp:
                     f"{what}: connection given up, no answer to several requests"
                 ) from error
             raise LinkError(f"{what}: no valid answer within {self._timeout_s:g} s") from error
-        _check(reply, function_code, client.ctx.request_transaction_id, what)
+        _check_reply(reply, function_code, client.ctx.request_transaction_id, what)
         return reply
 
 
-def _check(reply: ModbusPDU, function_code: int, transaction_id: int, what: str) -> None:
+def _check_reply(reply: ModbusPDU, function_code: int, transaction_id: int, what: str) -> None:
     """Whether this is the answer to that request; raises LinkError or DeviceRefusedError."""
     if reply.transaction_id != transaction_id:
         raise LinkError(

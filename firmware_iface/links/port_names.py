@@ -27,7 +27,7 @@ def serial_ports(comports: Callable[[], Iterable[Any]] = list_ports.comports) ->
     """The serial ports of this machine, by path; `usb_name` is empty
     when the port is not on USB.
     """
-    return sorted((_info(port) for port in comports()), key=lambda port: port.path)
+    return sorted((_make_port_info(port) for port in comports()), key=lambda port: port.path)
 
 
 def check_port_name(name: str) -> str:
@@ -57,14 +57,14 @@ def port_path(name: str, comports: Callable[[], Iterable[Any]] = list_ports.comp
     if not found:
         raise LinkDownError(f"{name}: no such USB adapter is plugged in")
     if len(found) > 1:
-        choice = ", ".join(sorted(_info(port).usb_name for port in found))
+        choice = ", ".join(sorted(_make_port_info(port).usb_name for port in found))
         raise DeviceRefusedError(
             f"{name}: {len(found)} adapters match; name one by its serial number: {choice}"
         )
     return str(found[0].device)
 
 
-def _info(port: Any) -> PortInfo:
+def _make_port_info(port: Any) -> PortInfo:
     usb_name = ""
     if port.vid is not None:
         usb_name = f"usb:{port.vid:04X}:{port.pid:04X}" + (

@@ -154,7 +154,7 @@ class SerialPort:
         self.close()
         path = self._locate()
         self._back_off.attempted(self._clock())
-        self._serial = _opened(path, self._port, self._settings)
+        self._serial = _open_serial(path, self._port, self._settings)
         self._receiver = receiver
         asyncio.get_running_loop().add_reader(self._serial.fileno(), self._readable)
 
@@ -228,7 +228,7 @@ class SerialPort:
         return error
 
 
-def _opened(path: str, name: str, settings: SerialSettings) -> Any:
+def _open_serial(path: str, name: str, settings: SerialSettings) -> Any:
     try:
         port = serial.Serial(
             path,
@@ -240,7 +240,7 @@ def _opened(path: str, name: str, settings: SerialSettings) -> Any:
             exclusive=True,
         )
     except (OSError, ValueError, termios.error) as error:  # SerialException is an OSError
-        code = _errno(error)
+        code = _find_errno(error)
         remedy = _REMEDIES.get(code, str(error))
         if code in (errno.ENOTTY, errno.EISDIR):
             raise DeviceRefusedError(f"{name}: {remedy}") from error
@@ -254,7 +254,7 @@ def _opened(path: str, name: str, settings: SerialSettings) -> Any:
     return port
 
 
-def _errno(error: BaseException) -> int:
+def _find_errno(error: BaseException) -> int:
     """Error number of a SerialException or of the termios.error that caused it; else 0."""
     for source in (error, error.__context__):
         for code in (getattr(source, "errno", None), *getattr(source, "args", ())[:1]):

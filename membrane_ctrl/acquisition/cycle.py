@@ -114,7 +114,7 @@ class ShapeCycle:
         """Do ahead what the next figure needs: not while it is waited for. That cycle tells of a
         failure.
         """
-        with suppress(exposures.StageError), exposures.during("reconstruction"):
+        with suppress(exposures.StageError), exposures.convert_stage_errors("reconstruction"):
             self._reconstructor.prepare()
 
     def _judge(self, estimate: ShapeEstimate) -> None:
@@ -136,7 +136,7 @@ class ShapeCycle:
         # to come
         displacement_um = np.array([self._laser.at(frame.time_s) for frame in frames])
         time_s = np.array([frame.time_s for frame in frames])
-        with exposures.during("reconstruction"):
+        with exposures.convert_stage_errors("reconstruction"):
             reconstruct = (
                 self._reconstructor.full if kind == "full" else self._reconstructor.fringes
             )

@@ -29,7 +29,7 @@ def require_optics(devices: DevicesConfig) -> None:
         isinstance(table, settings.ExternalSection) for table in (devices.camera, devices.screen)
     ):
         return
-    ours, theirs = event_pipe.pipe()
+    ours, theirs = event_pipe.make_pipe()
     loading = child.Child("driver check", f"{__name__}:report_problem", (devices, theirs), _NICE)
     loading.start()
     theirs.close()

@@ -41,7 +41,7 @@ class StageError(Exception):
 
 
 @contextmanager
-def during(stage: Stage) -> Iterator[None]:
+def convert_stage_errors(stage: Stage) -> Iterator[None]:
     """Turn any exception of the block into a StageError."""
     try:
         yield
@@ -135,11 +135,11 @@ class Exposures:
             if pending is not None:
                 taken.append(self._store(*pending, cycle, then=pattern))
                 exposed_s = taken[-1].time_s
-            with during("screen"):
+            with convert_stage_errors("screen"):
                 self._screen.wait()
             self._clock.sleep(max(0.0, exposed_s + self._interval_s - self._clock.now()))
             slot = self._frames.begin()
-            with during("camera"):
+            with convert_stage_errors("camera"):
                 self._camera.expose(slot.pixels)
             pending = pattern, slot
         if pending is not None:
@@ -154,7 +154,7 @@ class Exposures:
     def _show(self, pattern: Pattern) -> None:
         """Send a pattern to the screen, unless it stands there."""
         if pattern != self._shown:
-            with during("screen"):
+            with convert_stage_errors("screen"):
                 self._screen.begin(pattern)
             self._shown = pattern
 
@@ -171,20 +171,20 @@ class Exposures:
     def _fetch(self, pattern: Pattern, slot: FrameSlot, then: Pattern | None) -> Frame:
         """Fetch the frame; retake a lost one with its own pattern on the screen."""
         for tried in range(1, TRIES + 1):
-            with during("camera"):
+            with convert_stage_errors("camera"):
                 try:
                     frame = self._camera.fetch()
                     break
                 except FrameLostError:
                     if tried == TRIES:
                         raise
-            with during("screen"):
+            with convert_stage_errors("screen"):
                 self._screen.begin(pattern)
                 self._screen.wait()
-            with during("camera"):
+            with convert_stage_errors("camera"):
                 self._camera.expose(slot.pixels)
         if tried > 1 and then is not None:
-            with during("screen"):
+            with convert_stage_errors("screen"):
                 self._screen.begin(then)
         return frame
 

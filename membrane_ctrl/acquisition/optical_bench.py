@@ -62,7 +62,9 @@ class DisplayTest:
         """Any problem with pixel-for-pixel display, else empty."""
         white, black = self._still(self._grey(255)), self._still(self._grey(0))
         return checkerboard_check.checkerboard_problem(
-            self._still(display_patterns.checkerboard(self._size[1], self._size[0])), white, black
+            self._still(display_patterns.make_checkerboard(self._size[1], self._size[0])),
+            white,
+            black,
         )
 
     def settling(self) -> display_settling.Settling:
@@ -76,8 +78,10 @@ class DisplayTest:
         left: list[float] = []
         noise = 0.0
         for one, other in ((0, 255), (64, 160)):
-            pictures = {level: _thin(self._still(self._grey(level))) for level in (one, other)}
-            again = _thin(self._still(self._grey(one)))
+            pictures = {
+                level: _thin_pixels(self._still(self._grey(level))) for level in (one, other)
+            }
+            again = _thin_pixels(self._still(self._grey(one)))
             noise = max(noise, display_settling.share_left(again, pictures[other], pictures[one]))
             for before, after in ((one, other), (other, one)) * _TIMES:
                 self._still(self._grey(before))
@@ -88,7 +92,7 @@ class DisplayTest:
                     left.append(
                         display_settling.share_left(pixels, pictures[before], pictures[after])
                     )
-        found = display_settling.settling(delays_s, left, noise)
+        found = display_settling.fit_settling(delays_s, left, noise)
         self.settle_s = found.settle_s
         return found
 
@@ -114,18 +118,18 @@ class DisplayTest:
         begun_s = self._clock.now()
         while self._clock.now() - begun_s < _FOLLOWED_S:
             frame = self._camera.grab()
-            yield frame.time_s - begun_s, _thin(frame.pixels)
+            yield frame.time_s - begun_s, _thin_pixels(frame.pixels)
 
     def _grey(self, level: int) -> roles.Levels:
         return np.full(self._size, level, np.uint8)
 
 
-def _thin(pixels: roles.Pixels) -> roles.Pixels:
+def _thin_pixels(pixels: roles.Pixels) -> roles.Pixels:
     """Every fourth pixel both ways (the same colour on a Bayer sensor), enough for block means."""
     return pixels[::4, ::4].copy()
 
 
-def told(name: str, measure: Callable[[], str]) -> str:
+def format_finding(name: str, measure: Callable[[], str]) -> str:
     """A finding with its subject, or an empty text. A failed measurement is a finding."""
     try:
         problem = measure()
@@ -158,10 +162,10 @@ def configured_bench(config: Config, clock: CycleClock) -> OpticalBench:
         raise roles.LinkError(
             "no camera: name one in [devices.camera], or set shape.enabled = false"
         )
-    camera = _camera(config, devices.camera, clock)
+    camera = _make_camera(config, devices.camera, clock)
     if devices.screen is None:
         return OpticalBench(camera, camera.driver)  # its pictures are those of the patterns
-    return OpticalBench(camera, _screen(config, devices.screen, clock))
+    return OpticalBench(camera, _make_screen(config, devices.screen, clock))
 
 
 def emulated_bench(config: Config, clock: CycleClock, optics: TwinOptics) -> OpticalBench:
@@ -178,19 +182,19 @@ def emulated_bench(config: Config, clock: CycleClock, optics: TwinOptics) -> Opt
     if isinstance(devices.screen, ExternalScreenConfig) and drivers.has_emulator(
         devices.screen.name, drivers.SCREENS
     ):
-        raster = _raster(config, devices.screen)
+        raster = _make_raster(config, devices.screen)
         panel = driver_loading.make_emulator(
             devices.screen,
             _SCREEN,
             drivers.SCREENS,
             lambda levels: optics.screen.show_picture(levels, raster),
         )
-        screen = _screen(config, devices.screen, clock, panel)
+        screen = _make_screen(config, devices.screen, clock, panel)
     if isinstance(devices.camera, ExternalCameraConfig) and drivers.has_emulator(
         devices.camera.name, drivers.CAMERAS
     ):
         sensor = driver_loading.make_emulator(devices.camera, _CAMERA, drivers.CAMERAS, optics.view)
-        camera = _camera(config, devices.camera, clock, sensor)
+        camera = _make_camera(config, devices.camera, clock, sensor)
     return OpticalBench(camera, screen)
 
 
@@ -200,7 +204,7 @@ def exposure_s(config: Config) -> float:
     return 0.0 if camera is None else camera.frame_exposure_s or 0.0
 
 
-def _camera(config: Config, section: Any, clock: CycleClock, *library: Any) -> GuardedCamera:
+def _make_camera(config: Config, section: Any, clock: CycleClock, *library: Any) -> GuardedCamera:
     """The camera of a table; `library` stands for the library that its driver calls."""
     stated = config.optics.camera
     sensor = roles.SensorFormat(stated.width_px, stated.height_px, stated.bits)
@@ -212,18 +216,18 @@ def _camera(config: Config, section: Any, clock: CycleClock, *library: Any) -> G
         raise InputError(f"{_CAMERA}: {error}") from None
 
 
-def _screen(config: Config, section: Any, clock: CycleClock, *library: Any) -> PatternScreen:
-    """The screen of a table, as `_camera`."""
+def _make_screen(config: Config, section: Any, clock: CycleClock, *library: Any) -> PatternScreen:
+    """The screen of a table, as `_make_camera`."""
     patterns = full_sequence(config.optics.pattern)
     if config.shape.mode == "track":
         patterns += crossed_patterns(config.shape.track_periods)
     shown = driver_loading.make_driver(section, _SCREEN, drivers.SCREENS, *library)
     waits = roles.DriverClock(clock.now, clock.sleep)
     name = f"screen {driver_loading.name_of(section)}"
-    return PatternScreen(shown, _raster(config, section), patterns, waits, name)
+    return PatternScreen(shown, _make_raster(config, section), patterns, waits, name)
 
 
-def _raster(config: Config, screen: ScreenSection) -> display_patterns.ScreenRaster:
+def _make_raster(config: Config, screen: ScreenSection) -> display_patterns.ScreenRaster:
     """The screen's pixels and the pattern region. Raises LinkError if the region does not fit."""
     pattern = config.optics.pattern
     try:
@@ -269,24 +273,26 @@ def open_bench(bench: OpticalBench, config: Config, clock: CycleClock) -> BenchF
     measured: list[str] = []
     problems: list[str] = []
     if section.self_test:
-        problems += [_exposure(config, test), told("screen", test.checkerboard)]
+        problems += [_check_exposure(config, test), format_finding("screen", test.checkerboard)]
     if section.settle_ms is not None:
         screen.settle_s = test.settle_s = section.settle_ms / 1000.0
     else:
-        problems.append(told("screen", lambda: _settle(screen, test, measured)))
+        problems.append(format_finding("screen", lambda: _measure_settling(screen, test, measured)))
     if section.linearise:
-        problems.append(told("screen", lambda: _linearise(screen, test, measured)))
+        problems.append(format_finding("screen", lambda: _measure_response(screen, test, measured)))
     return BenchFindings(who, tuple(measured), tuple(filter(None, problems)))
 
 
-def _exposure(config: Config, test: DisplayTest) -> str:
+def _check_exposure(config: Config, test: DisplayTest) -> str:
     exposure_ms = 1000.0 * exposure_s(config)
     if not exposure_ms:  # the remedy would have no unit
         return ""
-    return told("camera", lambda: test.exposure((1 << config.optics.camera.bits) - 1, exposure_ms))
+    return format_finding(
+        "camera", lambda: test.exposure((1 << config.optics.camera.bits) - 1, exposure_ms)
+    )
 
 
-def _settle(screen: PatternScreen, test: DisplayTest, measured: list[str]) -> str:
+def _measure_settling(screen: PatternScreen, test: DisplayTest, measured: list[str]) -> str:
     found = test.settling()
     screen.settle_s = found.settle_s
     measured.append(
@@ -296,7 +302,7 @@ def _settle(screen: PatternScreen, test: DisplayTest, measured: list[str]) -> st
     return ""
 
 
-def _linearise(screen: PatternScreen, test: DisplayTest, measured: list[str]) -> str:
+def _measure_response(screen: PatternScreen, test: DisplayTest, measured: list[str]) -> str:
     curve = test.response()
     screen.linearise(curve)
     measured.append(f"screen response corrected (gamma {curve.gamma:.2f})")

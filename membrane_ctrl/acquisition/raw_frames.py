@@ -153,8 +153,8 @@ class RawFrames:
         reference = None
         if found.kind == "fringes" and self._reference is not None:
             self._reference_needed, reference = True, f"../{self._reference.name}"
-        table = _description(found, self._optics, self._patterns, reference)
-        done = self._writer.submit(_write, path, table, found)
+        table = _make_set_table(found, self._optics, self._patterns, reference)
+        done = self._writer.submit(_write_set, path, table, found)
         self._writing.append(_Write(cycle, path, found.size_bytes, done))
         return path
 
@@ -217,7 +217,7 @@ class RawFrames:
         return None  # a stopped or partly overwritten cycle
 
 
-def _write(folder: Path, table: dict[str, Any], content: _Set) -> None:
+def _write_set(folder: Path, table: dict[str, Any], content: _Set) -> None:
     """Write a set completely or not at all. Raises OSError, cv2.error."""
     try:
         folder.mkdir(parents=True, exist_ok=True)
@@ -235,18 +235,20 @@ def _write(folder: Path, table: dict[str, Any], content: _Set) -> None:
         raise
 
 
-def _description(
+def _make_set_table(
     content: _Set, optics: OpticsConfig, patterns: dict[str, Pattern], reference: str | None
 ) -> dict[str, Any]:
     table: dict[str, Any] = {**program.file_origin("membrane-capture/1"), "kind": content.kind}
     if reference is not None:
         table["reference"] = reference
     table |= optics.model_dump(mode="json", exclude_none=True)
-    table["frames"] = list(_rows(content.heads, patterns))
+    table["frames"] = list(_make_frame_rows(content.heads, patterns))
     return table
 
 
-def _rows(heads: Iterable[FrameHead], patterns: dict[str, Pattern]) -> Iterable[dict[str, Any]]:
+def _make_frame_rows(
+    heads: Iterable[FrameHead], patterns: dict[str, Pattern]
+) -> Iterable[dict[str, Any]]:
     for head in heads:
         pattern = patterns[head.pattern]
         row: dict[str, Any] = {"file": f"{head.pattern}.png", "role": pattern.role}

@@ -118,19 +118,19 @@ def apprise_senders(config: AlarmsConfig, run: str) -> list[Send]:
     Raises DeviceError without Apprise, InputError for a bad file or URL. The error gives only the
     URL's line: it may hold a password.
     """
-    apprise = _apprise()
+    apprise = _import_apprise()
     assert config.urls_file is not None
     lists = [name for name in (config.urls_file, config.escalation_urls_file) if name is not None]
-    return [partial(_send, _services(apprise, Path(name)), run) for name in lists]
+    return [partial(_send_message, _make_services(apprise, Path(name)), run) for name in lists]
 
 
-def _send(targets: Sequence[Service], run: str, message: AlarmMessage) -> bool:
+def _send_message(targets: Sequence[Service], run: str, message: AlarmMessage) -> bool:
     kind = _TYPES[message.kind] or {"warning": "warning", "critical": "failure"}[message.severity]
     title = f"membrane-ctrl {message.severity} {message.kind}: {message.name}"
     return send_to_all(targets, title, f"{message.text}\nrun: {run}", kind)
 
 
-def _services(apprise: Any, path: Path) -> list[Service]:
+def _make_services(apprise: Any, path: Path) -> list[Service]:
     services = []
     for number, url in enumerate(read_urls(path), start=1):
         plugin = apprise.Apprise.instantiate(url)
@@ -140,7 +140,7 @@ def _services(apprise: Any, path: Path) -> list[Service]:
     return services
 
 
-def _apprise() -> Any:
+def _import_apprise() -> Any:
     try:
         return importlib.import_module("apprise")
     except ImportError:
@@ -266,10 +266,10 @@ def alarms_main(spec: AlarmsSpec, status: Any) -> None:
     child.leave_at_stop()
     senders = apprise_senders(spec.config, spec.run)
     with limited_memory():
-        watch(spec, senders, event_pipe.event_sender(status), child.parent_lives)
+        watch_run(spec, senders, event_pipe.event_sender(status), child.parent_lives)
 
 
-def watch(
+def watch_run(
     spec: AlarmsSpec,
     senders: Sequence[Send],
     report: Callable[[Event], None],
@@ -280,7 +280,7 @@ def watch(
     """
     clock = spec.clock
     outboxes = [
-        Outbox(_reporting(send, to, report)) for send, to in zip(senders, _TO, strict=False)
+        Outbox(_report_failures(send, to, report)) for send, to in zip(senders, _TO, strict=False)
     ]
     watcher = Watcher(spec.config, outboxes, clock.now())
     with (
@@ -306,7 +306,7 @@ def watch(
             outbox.step(clock.now())
 
 
-def _reporting(send: Send, to: str, report: Callable[[Event], None]) -> Send:
+def _report_failures(send: Send, to: str, report: Callable[[Event], None]) -> Send:
     def sending(message: AlarmMessage) -> bool:
         through = send(message)
         report(

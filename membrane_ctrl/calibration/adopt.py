@@ -51,9 +51,9 @@ def adopt_geometry(new: Path, place: Path) -> Path | None:
 
     Raises DeviceError if it cannot be written; the old one then stays in place.
     """
-    with errors.writing(place, errors.DeviceError):
+    with errors.convert_write_errors(place, errors.DeviceError):
         place.parent.mkdir(parents=True, exist_ok=True)
-        place = files.users(place)
+        place = files.resolve_user_path(place)
         kept = _backup_path(place) if place.exists() else None
         if kept is not None:
             files.write_bytes_atomic(kept, files.read_bytes(place, files.SMALL_BYTES, follow=True))

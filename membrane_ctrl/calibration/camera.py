@@ -75,7 +75,7 @@ def draw_board(out: Path, board_text: str, square_px: int, width_px: int, height
         out.parent.mkdir(parents=True, exist_ok=True)
         written, picture = cv2.imencode(out.suffix, levels)
         if written:
-            files.write_bytes_atomic(files.users(out), picture.tobytes())
+            files.write_bytes_atomic(files.resolve_user_path(out), picture.tobytes())
     except (OSError, cv2.error):
         written = False
     if not written:

@@ -12,7 +12,7 @@ from membrane_ctrl.metrology.calibration import geometry_tables, solver, verdict
 from membrane_ctrl.metrology.cycle import geometry_monitors
 from membrane_ctrl.metrology.rays import set_phases
 from membrane_ctrl.model import errors
-from membrane_ctrl.model.files import users, write_text_atomic
+from membrane_ctrl.model.files import resolve_user_path, write_text_atomic
 
 
 def write_geometry(
@@ -42,9 +42,9 @@ def write_geometry(
         notes=tuple(finding.says for finding in findings),
     )
     tables = geometry_tables.tables_of(solution, optics, origin)
-    with errors.writing(path):
+    with errors.convert_write_errors(path):
         path.parent.mkdir(parents=True, exist_ok=True)
-        write_text_atomic(users(path), tomli_w.dumps(tables))  # never half a geometry
+        write_text_atomic(resolve_user_path(path), tomli_w.dumps(tables))  # never half a geometry
     return str(tables["calibration"]["hash"])
 
 

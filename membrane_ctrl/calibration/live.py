@@ -13,7 +13,12 @@ from membrane_ctrl.calibration.adopt import adopt_geometry, compare_geometries
 from membrane_ctrl.calibration.procedure import Procedure
 from membrane_ctrl.calibration.session import CalibrationHead, CalibrationSession
 from membrane_ctrl.calibration.setpoints import HeldMirror, plan_setpoints_um, setpoint_reach
-from membrane_ctrl.calibration.sets import CalibrateOptions, calibrate_command, freed, known_sigmas
+from membrane_ctrl.calibration.sets import (
+    CalibrateOptions,
+    calibrate_command,
+    known_sigmas,
+    parse_freed,
+)
 from membrane_ctrl.calibration.sweep import CaptureLink, Sweep
 from membrane_ctrl.config.schema import CameraConfig, GeometryConfig, OpticsConfig
 from membrane_ctrl.control_port.ctl import Where
@@ -49,7 +54,7 @@ def calibrate_live(options: LiveOptions) -> int:
     """Take a session's missing sets, solve, and adopt the result if a person agrees.
 
     Returns the exit code."""
-    freed(options.solving.free)  # check these before the mirror moves
+    parse_freed(options.solving.free)  # check these before the mirror moves
     for path in options.solving.priors:
         read_prior(path)
     session = None
@@ -91,9 +96,9 @@ def take_sets(
             missing = tuple(range(sets))
         procedure.check(head)
         minutes = sum(procedure.times_s(head, missing)) / 60
-        progress.say(_plan(head, len(missing), held, minutes))
-        progress.say(_worth(link, head, held, options))
-        _agree(f"move the mirror through {len(missing)} setpoints?", options.yes)
+        progress.say(_format_plan(head, len(missing), held, minutes))
+        progress.say(_format_forecast(link, head, held, options))
+        _require_agreement(f"move the mirror through {len(missing)} setpoints?", options.yes)
         sweep.claim(held.setpoint_um)
         session = session or sessions.begin_session(
             options.where.logs, options.name, head, link.config
@@ -117,23 +122,23 @@ def solve_and_adopt(session: CalibrationSession, options: LiveOptions) -> int:
         return code
     optics, place = read_head(session.sets[0]).optics, session.config.optics.geometry_file
     for line in compare_geometries(
-        optics, _origin(session, place), read_geometry(session.geometry)
+        optics, _set_origin(session, place), read_geometry(session.geometry)
     ):
-        _say(line)
+        _print_progress(line)
     if place is None:
-        _say(
+        _print_progress(
             "not adopted: the configuration names no optics.geometry_file; the geometry is "
             f"{session.geometry}"
         )
-    elif not _asked(f"adopt it as {place}?", options.yes):
-        _say(
+    elif not _ask_person(f"adopt it as {place}?", options.yes):
+        _print_progress(
             f"not adopted; `membrane-ctrl calibrate --live --session {session.path} --yes` "
             "adopts it"
         )
     else:
         kept = adopt_geometry(session.geometry, place)
         before = f"; the previous one is {kept}" if kept else ""
-        _say(f"adopted: {place}{before}; the next hold uses it")
+        _print_progress(f"adopted: {place}{before}; the next hold uses it")
     return code
 
 
@@ -159,7 +164,7 @@ def _written_out(optics: OpticsConfig) -> tuple[GeometryConfig, CameraConfig]:
     return optics.geometry.model_copy(update={"reference_displacement_um": None}), camera
 
 
-def _plan(head: CalibrationHead, missing: int, held: HeldMirror, minutes: float) -> str:
+def _format_plan(head: CalibrationHead, missing: int, held: HeldMirror, minutes: float) -> str:
     low_um, high_um = min(head.setpoints_um), max(head.setpoints_um)
     return (
         f"{missing} of {len(head.setpoints_um)} sets from {low_um:g} to {high_um:g} µm "
@@ -171,9 +176,11 @@ def _plan(head: CalibrationHead, missing: int, held: HeldMirror, minutes: float)
     )
 
 
-def _worth(link: CaptureLink, head: CalibrationHead, held: HeldMirror, options: LiveOptions) -> str:
+def _format_forecast(
+    link: CaptureLink, head: CalibrationHead, held: HeldMirror, options: LiveOptions
+) -> str:
     """How well the sets will determine the geometry, and how much better a wider range would."""
-    here = _foreseen(link, held, head.setpoints_um, options)
+    here = _forecast_figure(link, held, head.setpoints_um, options)
     line = (
         f"a figure after these sets: sag +- {here.sag_um:.1f} µm, figure +- "
         f"{here.figure_rms_um:.1f} µm RMS"
@@ -185,7 +192,9 @@ def _worth(link: CaptureLink, head: CalibrationHead, held: HeldMirror, options: 
         (low_um + high_um - verdict.GOOD_SPREAD_UM) / 2,
         (low_um + high_um + verdict.GOOD_SPREAD_UM) / 2,
     )
-    best = _foreseen(link, held, np.linspace(*ends, len(head.setpoints_um)).tolist(), options)
+    best = _forecast_figure(
+        link, held, np.linspace(*ends, len(head.setpoints_um)).tolist(), options
+    )
     reach = setpoint_reach(held, link.config)
     return (
         f"{line}; {verdict.GOOD_SPREAD_UM:.0f} µm of range would give {best.sag_um:.1f} and "
@@ -194,14 +203,14 @@ def _worth(link: CaptureLink, head: CalibrationHead, held: HeldMirror, options: 
     )
 
 
-def _foreseen(
+def _forecast_figure(
     link: CaptureLink, held: HeldMirror, setpoints: Sequence[float], options: LiveOptions
 ) -> figure_uncertainty.Propagated:
     optics = read_run_geometry(link.run_dir, link.config).optics
     solving = options.solving
     if solving.geometry is not None:
         optics = read_geometry(solving.geometry).over(optics)
-    known = bench_parameters.prior_sigmas(known_sigmas(optics, freed(solving.free)))
+    known = bench_parameters.prior_sigmas(known_sigmas(optics, parse_freed(solving.free)))
     sags_mm = [held.sag_at_mm(each) for each in sorted(setpoints)]
     try:
         return foresight.forecast_figure(
@@ -211,7 +220,7 @@ def _foreseen(
         raise InputError(f"{link.name}: {error}; does [optics] describe this bench?") from None
 
 
-def _origin(session: CalibrationSession, place: Path | None) -> GeometryOrigin:
+def _set_origin(session: CalibrationSession, place: Path | None) -> GeometryOrigin:
     """Origin of the sets' geometry: the file if it is unchanged, else the numbers' hash."""
     optics = read_head(session.sets[0]).optics
     if place is not None and place.exists():
@@ -222,15 +231,15 @@ def _origin(session: CalibrationSession, place: Path | None) -> GeometryOrigin:
     return stated_origin(optics)
 
 
-def _agree(question: str, yes: bool) -> None:
+def _require_agreement(question: str, yes: bool) -> None:
     """Raises InputError unless a person agrees."""
     if not yes and not sys.stdin.isatty():
         raise InputError(f"{question} Not a terminal: confirm with --yes")
-    if not _asked(question, yes):
+    if not _ask_person(question, yes):
         raise InputError("nothing was moved")
 
 
-def _asked(question: str, yes: bool) -> bool:
+def _ask_person(question: str, yes: bool) -> bool:
     if yes:
         return True
     if not sys.stdin.isatty():
@@ -239,5 +248,5 @@ def _asked(question: str, yes: bool) -> bool:
     return sys.stdin.readline().strip().lower() in ("y", "yes")
 
 
-def _say(line: str) -> None:
+def _print_progress(line: str) -> None:
     print(line, file=sys.stderr)

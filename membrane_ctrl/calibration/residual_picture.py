@@ -10,7 +10,7 @@ from matplotlib.figure import Figure
 from membrane_ctrl.measure.result_files import write_picture
 from membrane_ctrl.metrology.calibration import solver
 from membrane_ctrl.model.arrays import FloatArray
-from membrane_ctrl.model.files import users
+from membrane_ctrl.model.files import resolve_user_path
 
 _INCHES = 2.6  # a panel
 _DPI = 110
@@ -40,7 +40,7 @@ def draw_residuals(path: Path, solution: solver.Solution) -> None:
             panel.tick_params(labelsize=6)
     panels[0][0].invert_yaxis()  # rows count downwards; the axes are shared
     figure.colorbar(colours, ax=panels, label="seen minus predicted, µm on the screen")
-    write_picture(users(path), figure, _DPI)
+    write_picture(resolve_user_path(path), figure, _DPI)
 
 
 def _cell_edges(solution: solver.Solution) -> tuple[FloatArray, FloatArray]:

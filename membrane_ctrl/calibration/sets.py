@@ -124,7 +124,7 @@ class Bundle:
     edges_px: tuple[FloatArray, ...] = ()  # of the rim, in the sets that show it
 
 
-def _judged(
+def _judge_sets(
     findings: Sequence[verdict.CalibrationFinding], bundle: Bundle
 ) -> tuple[verdict.CalibrationFinding, ...]:
     """The findings with the notes; a refusal of sets that may be of different benches says so
@@ -146,7 +146,7 @@ def calibrate_command(options: CalibrateOptions) -> int:
     priors = [prior_file.read_prior(path) for path in options.priors]
     free = {
         name: sigma for prior in priors for name, sigma in prior.content.sigmas.items()
-    } | freed(options.free)
+    } | parse_freed(options.free)
     begin = time.perf_counter()
     bundle = with_priors(read_sets(options.folders, options.geometry, options.reference_um), priors)
     read = time.perf_counter()
@@ -154,8 +154,8 @@ def calibrate_command(options: CalibrateOptions) -> int:
     findings, solution = verdict.check_before_solving(problem), None
     if not findings:
         try:
-            solution = solve_calibration(problem, _progress())
-            findings = _judged(verdict.check_solution(solution), bundle)
+            solution = solve_calibration(problem, _make_progress_line())
+            findings = _judge_sets(verdict.check_solution(solution), bundle)
         except ValueError as error:
             findings = (verdict.CalibrationFinding(True, str(error)),)
     timing = {"read": read - begin, "solve": time.perf_counter() - read}
@@ -167,7 +167,7 @@ def calibrate_command(options: CalibrateOptions) -> int:
     )
     if solution is not None and options.pictures:
         path = options.out.with_name(f"{options.out.stem}-residuals.png")
-        with errors.writing(path):  # also for a refused solution, where it helps most
+        with errors.convert_write_errors(path):  # also for a refused solution, where it helps most
             path.parent.mkdir(parents=True, exist_ok=True)
             draw_residuals(path, solution)
     report = calibration_report(solution, findings, bundle.optics.mirror.analysis_radius_mm)
@@ -185,7 +185,7 @@ def calibrate_command(options: CalibrateOptions) -> int:
     return errors.Exit.DONE if usable else errors.Exit.REJECTED
 
 
-def freed(texts: Sequence[str]) -> dict[str, float]:
+def parse_freed(texts: Sequence[str]) -> dict[str, float]:
     """`--free NAME[=SIGMA]` as sigmas. Raises InputError."""
     out = {}
     for text in texts:
@@ -229,7 +229,7 @@ def read_sets(
     edges: list[FloatArray] = []
     heads = {folder: read_head(folder, stated) for folder in folders}
     # those with the screen in its place first: the others belong to them
-    for folder in terminal.counted(
+    for folder in terminal.track_progress(
         sorted(folders, key=lambda each: heads[each].screen_moved is not None), "sets"
     ):
         head = heads[folder]
@@ -259,7 +259,7 @@ def read_sets(
         first = next((k for k, phases in enumerate(sets) if phases.artefact is None), 0)
         _same_rig(used[first], benches[first], folder, bench, sets[first].artefact is head.artefact)
     for each in elsewhere:
-        join(sets, *each)
+        join_moved_screen(sets, *each)
     films = [k for k, phases in enumerate(sets) if phases.artefact is None]
     if not films:
         raise errors.InputError(f"{folders[0]}: {_NO_FILM}")
@@ -312,7 +312,7 @@ def phases_of_screen(capture: CaptureSet) -> set_phases.SetPhases:
     return set_phases.SetPhases(name, *place, sigma_mm, math.nan, **known)
 
 
-def join(
+def join_moved_screen(
     sets: list[set_phases.SetPhases],
     folder: Path,
     phases: set_phases.SetPhases,
@@ -429,7 +429,7 @@ def problem_of(bundle: Bundle, free: dict[str, float], options: CalibrateOptions
     return Problem(geometry, bundle.sets, prior_sigmas(known), references, radius_mm, rim)
 
 
-def _progress() -> Any:
+def _make_progress_line() -> Any:
     """A line that counts, on a terminal only."""
     if not sys.stderr.isatty():
         return None

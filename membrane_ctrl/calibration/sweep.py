@@ -70,9 +70,9 @@ class Sweep:
         return HeldMirror(
             setpoint_um=newest.target_um,
             sag_mm=1e-3 * shape.sag_um,
-            pressure_pa=_mean([row.gauge_pressure_pa for row in rows]),
+            pressure_pa=_mean_of_finite([row.gauge_pressure_pa for row in rows]),
             # the mean flow replaces the leak, whose own estimate needs a while of hold
-            leak_um_per_s=_mean(leaks or [row.i_um_per_s for row in rows]),
+            leak_um_per_s=_mean_of_finite(leaks or [row.i_um_per_s for row in rows]),
             swing_adu=shape.modulation_median_adu,
             shape_on=newest.shape_state != telemetry.ShapeState.OFF,
         )
@@ -143,7 +143,7 @@ class Sweep:
 
     def _inside(self, rows: deque[telemetry.TelemetryRow]) -> bool:
         last = [row.error_um for row in rows if rows[-1].mono_s - row.mono_s <= _MEAN_S]
-        return abs(_mean(last)) < self._limits.band_um
+        return abs(_mean_of_finite(last)) < self._limits.band_um
 
     def _ask(self, kind: Kind, value: float = math.nan) -> None:
         self._link.ask(Command(kind, "calibration", WHY, value=value))
@@ -168,6 +168,6 @@ class Sweep:
         return news
 
 
-def _mean(values: list[float]) -> float:
+def _mean_of_finite(values: list[float]) -> float:
     finite = [value for value in values if math.isfinite(value)]
     return sum(finite) / len(finite) if finite else math.nan

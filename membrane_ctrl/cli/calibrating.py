@@ -11,7 +11,7 @@ from membrane_ctrl.cli.options import (
     JsonOption,
     PriorOption,
     SetArgument,
-    configured,
+    load_configuration,
 )
 from membrane_ctrl.model.errors import InputError
 
@@ -68,7 +68,7 @@ def calibrate_camera(
     from membrane_ctrl.calibration import camera
 
     return camera.calibrate_camera(
-        camera.CameraOptions(photographs, board, configured(config), out, json)
+        camera.CameraOptions(photographs, board, load_configuration(config), out, json)
     )
 
 
@@ -99,7 +99,7 @@ def calibrate_display(config: ConfigArgument, json: JsonOption = False) -> int:
     """Measure settle time and gamma of the screen with the camera."""
     from membrane_ctrl.calibration.display import calibrate_display as run
 
-    return run(configured(config), str(config), json)
+    return run(load_configuration(config), str(config), json)
 
 
 def calibrate(

@@ -32,7 +32,7 @@ AuthorityOption = Annotated[
 ]
 
 
-def _number(text: str) -> float:
+def _parse_number(text: str) -> float:
     try:
         return parse_number(text)
     except ValueError as error:
@@ -40,10 +40,10 @@ def _number(text: str) -> float:
 
 
 SetpointArgument = Annotated[
-    float, typer.Argument(metavar="UM", help="Setpoint, µm.", parser=_number)
+    float, typer.Argument(metavar="UM", help="Setpoint, µm.", parser=_parse_number)
 ]
 FlowArgument = Annotated[
-    float, typer.Argument(metavar="FLOW", help="Flow, µm/s of the centre.", parser=_number)
+    float, typer.Argument(metavar="FLOW", help="Flow, µm/s of the centre.", parser=_parse_number)
 ]
 OnArgument = Annotated[bool, typer.Argument(metavar="on|off")]
 TextArgument = Annotated[str, typer.Argument(metavar="TEXT", help="The remark.")]
@@ -98,7 +98,7 @@ ctl_app = typer.Typer(
 )
 
 
-def _common(
+def _make_common_fields(
     why: WhyOption = "",
     take_over: TakeOverOption = False,
     run: RunOption = None,
@@ -121,7 +121,7 @@ def _common(
     )
 
 
-def _add(action: str, does: str, own: Callable[..., dict[str, Any]]) -> None:
+def _add_command(action: str, does: str, own: Callable[..., dict[str, Any]]) -> None:
     """Add a command with the common options and the parameters of `own`, which makes its part of
     the request.
     """
@@ -131,13 +131,16 @@ def _add(action: str, does: str, own: Callable[..., dict[str, Any]]) -> None:
         from membrane_ctrl.control_port.ctl import ctl
 
         part = own(**{name: given.pop(name) for name in parameters})
-        fields, where, as_json = _common(**given)
+        fields, where, as_json = _make_common_fields(**given)
         return ctl({"do": action, **fields, **part}, where, as_json)
 
     command.__signature__ = inspect.Signature(  # type: ignore[attr-defined]
         [
             parameter.replace(kind=inspect.Parameter.KEYWORD_ONLY)
-            for parameter in (*parameters.values(), *inspect.signature(_common).parameters.values())
+            for parameter in (
+                *parameters.values(),
+                *inspect.signature(_make_common_fields).parameters.values(),
+            )
         ]
     )
     # a negative setpoint or a text that begins with a dash is not an option
@@ -213,16 +216,16 @@ def add_actions() -> None:
 
     if ctl_app.registered_commands:
         return
-    _add("status", "Show the status once.", _plain)
+    _add_command("status", "Show the status once.", _plain)
     ctl_app.command("fleet")(_fleet)
-    _add("watch", "Print a status line repeatedly until the run ends.", _watch)
+    _add_command("watch", "Print a status line repeatedly until the run ends.", _watch)
     for kind, rule in TABLE.items():
         if kind in _OWN or not (
             rule.needs or kind.startswith("shape_")
         ):  # `tune` is a separate command
-            _add(kind, rule.does, _OWN.get(kind, _plain))
+            _add_command(kind, rule.does, _OWN.get(kind, _plain))
     for name, kind in SAME_AS.items():
-        _add(name, TABLE[kind].does, _OWN.get(kind, _plain))
-    _add("shape", "Switch the shape loop on or off.", _shape)
-    _add("quiet", "Acknowledge the alarms: no reminders, no escalation.", _plain)
-    _add("release", "Release command, so that someone else may take it.", _plain)
+        _add_command(name, TABLE[kind].does, _OWN.get(kind, _plain))
+    _add_command("shape", "Switch the shape loop on or off.", _shape)
+    _add_command("quiet", "Acknowledge the alarms: no reminders, no escalation.", _plain)
+    _add_command("release", "Release command, so that someone else may take it.", _plain)

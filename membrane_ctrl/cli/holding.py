@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from membrane_ctrl.cli.ctl import ctl_app
-from membrane_ctrl.cli.options import ConfigArgument, ConfigOption, JsonOption, configured
+from membrane_ctrl.cli.options import ConfigArgument, ConfigOption, JsonOption, load_configuration
 from membrane_ctrl.model import durations, errors, terminal
 
 if TYPE_CHECKING:
@@ -87,7 +87,7 @@ def hold(
     """Hold the mirror until told to stop."""
     settings = _started(_with_devices(config, devices, twin), from_flat)
     duration_s = None if duration is None else durations.parse_duration_s(duration)
-    terminal.progress("loading the control program")
+    terminal.print_progress("loading the control program")
     from membrane_ctrl.hold.hold_options import HoldOptions
     from membrane_ctrl.hold.start import hold_mirror
 
@@ -104,7 +104,7 @@ def hold(
         autotune=autotune,
         lab=devices is not None,
     )
-    with errors.named(devices or config):
+    with errors.name_source_in_errors(devices or config):
         return hold_mirror(options)
 
 
@@ -124,7 +124,7 @@ def twin(
         return errors.Exit.DONE
     from membrane_ctrl.sim.twin_command import serve_twin
 
-    return serve_twin(_started(configured(config), from_flat), speed)
+    return serve_twin(_started(load_configuration(config), from_flat), speed)
 
 
 @twin_app.command()
@@ -146,7 +146,7 @@ def play(
         from membrane_ctrl.hold.scenarios import list_scenarios
 
         return list_scenarios()
-    terminal.progress("loading the simulated bench")
+    terminal.print_progress("loading the simulated bench")
     from membrane_ctrl.hold.play import play_scenario
 
     return play_scenario(scenario, logs, name, real_time)
@@ -168,16 +168,16 @@ def safe(
     """Stop a configuration's pump, whichever program controls it; leave the vent as it is."""
     from membrane_ctrl.commissioning.safe import make_safe
 
-    with errors.named(config):
-        return make_safe(configured(config), str(config), logs, latch)
+    with errors.name_source_in_errors(config):
+        return make_safe(load_configuration(config), str(config), logs, latch)
 
 
 def check(config: ConfigArgument, json: JsonOption = False) -> int:
     """Validate a configuration, probe its devices, and show what a hold would do."""
-    loaded = configured(config)  # first: a mistake shows at once
+    loaded = load_configuration(config)  # first: a mistake shows at once
     from membrane_ctrl.commissioning.check import check_config
 
-    with errors.named(config):
+    with errors.name_source_in_errors(config):
         return check_config(loaded, str(config), json)
 
 
@@ -266,7 +266,9 @@ def alarm_test(
     """Send a test message to every address of the alarms."""
     from membrane_ctrl.alarms.process import send_test_alarm
 
-    return send_test_alarm(configured(config), str(config or "the defaults"), escalated, json)
+    return send_test_alarm(
+        load_configuration(config), str(config or "the defaults"), escalated, json
+    )
 
 
 def _with_devices(config: Path | None, devices: Path | None, twin: bool) -> "Config":
@@ -274,13 +276,17 @@ def _with_devices(config: Path | None, devices: Path | None, twin: bool) -> "Con
     alone.
     """
     if devices is None:
-        return configured(config)
-    lab = configured(devices)
+        return load_configuration(config)
+    lab = load_configuration(devices)
     if not twin:
         raise errors.InputError("--devices needs --twin; otherwise --config names the devices")
     if lab.devices is None:
         raise errors.InputError(f"{devices}: devices: missing; nothing to emulate")
-    return lab if config is None else configured(config).model_copy(update={"devices": lab.devices})
+    return (
+        lab
+        if config is None
+        else load_configuration(config).model_copy(update={"devices": lab.devices})
+    )
 
 
 def _started(config: "Config", from_flat: bool) -> "Config":
@@ -311,9 +317,9 @@ def explain(
     """Explain a key, or all keys of a table or driver: meaning, unit, range, default, when to
     change it.
     """
-    from membrane_ctrl.config.reference import explained
+    from membrane_ctrl.config.reference import find_explained
 
-    found = explained(key)
+    found = find_explained(key)
     if json:
         print(
             dumps(
@@ -333,9 +339,9 @@ def explain(
 @config_app.command()
 def reference() -> int:
     """Print every key of the configuration as one page of Markdown."""
-    from membrane_ctrl.config.reference import page
+    from membrane_ctrl.config.reference import make_reference_page
 
-    print(page(), end="")
+    print(make_reference_page(), end="")
     return 0
 
 

@@ -11,7 +11,7 @@ from membrane_ctrl.cli.options import (
     SeedOption,
     SetArgument,
     TrialsOption,
-    configured,
+    load_configuration,
 )
 
 StatedOption = Annotated[
@@ -329,7 +329,7 @@ def simulate(
 
     options = SimulateOptions(
         folder=set_dir,
-        config=configured(config),
+        config=load_configuration(config),
         sag_mm=sag_mm,
         figure=figure,
         steps=steps,

@@ -43,7 +43,7 @@ SeedOption = Annotated[int, typer.Option(min=0, help="Seed of the random numbers
 TrialsOption = Annotated[int, typer.Option(min=2, help="Monte Carlo trials.")]
 
 
-def configured(path: Path | None) -> "Config":
+def load_configuration(path: Path | None) -> "Config":
     """Return the configuration of a file, or the defaults without one; raises `InputError`.
 
     The file names in it are relative to its own folder, not to the current one.
@@ -52,29 +52,31 @@ def configured(path: Path | None) -> "Config":
 
     if path is None:
         return schema.Config()
-    config = toml_file.load(path, schema.Config)
+    config = toml_file.load_toml(path, schema.Config)
     optics, port, alarms = config.optics, config.port, config.alarms
     folder = path.resolve().parent
     if optics.geometry_file is not None:
-        optics = _beside(optics, folder, "geometry_file")
+        optics = _resolve_beside(optics, folder, "geometry_file")
     if port.tls is not None:
-        tls = _beside(port.tls, folder, "certificate_file", "key_file", "client_ca_file")
+        tls = _resolve_beside(port.tls, folder, "certificate_file", "key_file", "client_ca_file")
         port = port.model_copy(update={"tls": tls})
-    alarms = _beside(alarms, folder, "urls_file", "escalation_urls_file")
+    alarms = _resolve_beside(alarms, folder, "urls_file", "escalation_urls_file")
     doors = config.doors
     if doors.mqtt is not None:
         doors = doors.model_copy(
-            update={"mqtt": _beside(doors.mqtt, folder, "password_file", "ca_file")}
+            update={"mqtt": _resolve_beside(doors.mqtt, folder, "password_file", "ca_file")}
         )
     if doors.opcua is not None:
-        opcua = _beside(doors.opcua, folder, "users_file", "certificate_file", "key_file")
+        opcua = _resolve_beside(doors.opcua, folder, "users_file", "certificate_file", "key_file")
         doors = doors.model_copy(update={"opcua": opcua})
-    web = config.web and _beside(config.web, folder, "users_file", "certificate_file", "key_file")
+    web = config.web and _resolve_beside(
+        config.web, folder, "users_file", "certificate_file", "key_file"
+    )
     update = {"optics": optics, "port": port, "alarms": alarms, "doors": doors, "web": web}
     return config.model_copy(update=update)
 
 
-def _beside(section: S, folder: Path, *names: str) -> S:
+def _resolve_beside(section: S, folder: Path, *names: str) -> S:
     """Return the section with its file names relative to a folder; unset ones stay unset."""
     given = {name: getattr(section, name) for name in names}
     made = {

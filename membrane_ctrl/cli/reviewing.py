@@ -283,7 +283,7 @@ def replay(
     from membrane_ctrl.run_files.run import open_run
 
     with _files_of_the_run():
-        folder = catalogue.resolve(run_dir)
+        folder = catalogue.resolve_run(run_dir)
         from_s, to_s = run_times.part_s(open_run(folder).origin_utc, start, end)
         return replay_command(folder, max(0.0, from_s), to_s, to_test, json, state)
 
@@ -300,7 +300,7 @@ def repair(
     from membrane_ctrl.review import catalogue
 
     with _files_of_the_run():
-        return repair_command(catalogue.resolve(run_dir), in_place, json)
+        return repair_command(catalogue.resolve_run(run_dir), in_place, json)
 
 
 @contextlib.contextmanager

@@ -69,7 +69,7 @@ def check_config(config: Config, source: str, as_json: bool) -> int:
     if config.devices is not None:
         bench.require_separate_ports(config.devices)
         driver_check.require_optics(config.devices)
-    probes, circuits = _probed(config)
+    probes, circuits = _probe_all(config)
     for probe in probes:
         findings |= dict.fromkeys(cross_check(config, probe.facts))
     would = _what_would_happen(config)
@@ -92,7 +92,7 @@ def check_config(config: Config, source: str, as_json: bool) -> int:
         print(plain_json.dumps(report))
     else:
         warnings = [finding.line(source) for finding in findings if finding.severity == "warning"]
-        _show(source, probes, circuits, would, warnings)
+        _print_probes(source, probes, circuits, would, warnings)
     refused = [finding.line(source) for finding in findings if finding.severity == "error"]
     if refused:
         raise errors.FindingsError(refused)
@@ -108,7 +108,7 @@ def check_config(config: Config, source: str, as_json: bool) -> int:
     return errors.Exit.DONE
 
 
-def _probed(config: Config) -> tuple[list[DeviceProbe], list[interlock_check.InterlockProbe]]:
+def _probe_all(config: Config) -> tuple[list[DeviceProbe], list[interlock_check.InterlockProbe]]:
     """Probe devices and interlocks, except those (including the
     screen) that another program uses.
     """
@@ -137,7 +137,7 @@ async def _probes(devices: DevicesConfig, laser: bool) -> list[DeviceProbe]:
     return await probe_roles(role_drivers.make_role_devices(devices))
 
 
-def _show(
+def _print_probes(
     source: str,
     probes: list[DeviceProbe],
     circuits: list[interlock_check.InterlockProbe],
@@ -197,16 +197,16 @@ def _what_would_happen(config: Config) -> dict[str, str]:
         f"{limits.displacement_max_um:g} µm and {limits.gauge_pressure_max_pa:g} Pa",
         "gains": run_status.gains_words(loop.model_dump(), None),
         "feed-forward": " and ".join(feedforward) or "off",
-        "geometry": _geometry(config),
+        "geometry": _describe_geometry(config),
         "shape loop": figures if shape.enabled else "off",
-        "locks": _locks(config),
-        "control port": _port(config.port),
-        "alarms": _alarms(config.alarms),
+        "locks": _describe_locks(config),
+        "control port": _describe_port(config.port),
+        "alarms": _describe_alarms(config.alarms),
         "bridges": describe_bridges(config.doors),
     }
 
 
-def _port(port: PortConfig) -> str:
+def _describe_port(port: PortConfig) -> str:
     """Where the control port would listen. Raises InputError for unusable certificates or group."""
     if not port.enabled:
         return "off"
@@ -221,7 +221,7 @@ def _port(port: PortConfig) -> str:
     return ", ".join(ways)
 
 
-def _locks(config: Config) -> str:
+def _describe_locks(config: Config) -> str:
     """The locks that keep a hold down."""
     if config.devices is None:
         return "none"
@@ -229,7 +229,7 @@ def _locks(config: Config) -> str:
     return lock_store.locked_line([each.lock for each in found]) if found else "none"
 
 
-def _alarms(alarms: AlarmsConfig) -> str:
+def _describe_alarms(alarms: AlarmsConfig) -> str:
     """Who would get alarms. Raises InputError or DeviceError if they cannot be sent."""
     require_sendable(alarms)
     if alarms.urls_file is None:
@@ -237,7 +237,7 @@ def _alarms(alarms: AlarmsConfig) -> str:
     return f"{len(alarms.rules)} rules besides faults, to those in {alarms.urls_file}"
 
 
-def _geometry(config: Config) -> str:
+def _describe_geometry(config: Config) -> str:
     """The geometry that cycles would use. Raises InputError for an unusable file."""
     there = read_configured_geometry(config)
     origin = there.origin
@@ -359,9 +359,9 @@ def probe_optics(config: Config) -> list[DeviceProbe]:
     except roles.LinkError as error:
         return [DeviceProbe("camera", name, problem=str(error))]
     try:
-        name = _where(optics)
+        name = _find_optics_ports(optics)
         found = optical_bench.open_bench(optics, config, clock)
-        p50_ms, p99_ms, median_adu = _grab(optics)
+        p50_ms, p99_ms, median_adu = _time_exposures(optics)
     except roles.LinkError as error:
         return [DeviceProbe("camera", name, problem=str(error))]
     finally:
@@ -371,12 +371,12 @@ def probe_optics(config: Config) -> list[DeviceProbe]:
     return [DeviceProbe("camera", name, found.camera, reading, p50_ms, p99_ms, problems, notes)]
 
 
-def _where(optics: optical_bench.OpticalBench) -> str:
+def _find_optics_ports(optics: optical_bench.OpticalBench) -> str:
     parts = [device.describe()["port"] for device in (optics.camera, optics.screen)]
     return ", ".join(dict.fromkeys(parts))
 
 
-def _grab(optics: optical_bench.OpticalBench) -> tuple[float, float, float]:
+def _time_exposures(optics: optical_bench.OpticalBench) -> tuple[float, float, float]:
     """Duration of some exposures (p50, p99) in ms, and median count of the last."""
     took_ms, median_adu = [], math.nan
     for _ in range(_GRABS):

@@ -41,13 +41,13 @@ def write_first_config(path: Path, twin: bool, ask: bool) -> int:
         if ask
         else {"devices": {"board": _TWIN.format(port=Config().twin.port)}}
     )
-    parsed = toml_file.parse(tables, Config, str(path))
+    parsed = toml_file.parse_tables(tables, Config, str(path))
     if parsed.devices is not None:
         bench.require_separate_ports(parsed.devices)
     text = "\n".join(
         [_HEAD.format(name=path.name), *_comment_found(found), *_format_tables("", tables)]
     )
-    with errors.writing(path), path.open("x", encoding="utf-8") as file:
+    with errors.convert_write_errors(path), path.open("x", encoding="utf-8") as file:
         file.write(text + "\n")
     first = "" if ask else "start `membrane-ctrl twin`, then "
     typer.echo(f"{path}: written; {first}run `membrane-ctrl check {path}`", err=True)
@@ -74,7 +74,7 @@ def _ask_devices(found: list[FoundDevice]) -> TomlTable:
     """Ask for the devices; everything that follows from their absence is set as well."""
     for line in _comment_found(found):
         typer.echo(line, err=True)
-    board = _ask(
+    board = _ask_question(
         "pump board, tcp://HOST:PORT or rtu:///dev/ttyUSB0?baud=115200 (empty: single instruments)"
     )
     section: TomlTable = {"board": board} if board else {}
@@ -103,32 +103,36 @@ def _shows_patterns(camera: TomlTable) -> bool:
 
 def _ask_role(role: str, optional: bool) -> TomlTable:
     """Ask for the driver of a role and for the keys that it requires; empty without a driver."""
-    sections = toml_file.sections(DevicesConfig.model_fields[role].annotation)
-    known = {driver: section for section in sections for driver in toml_file.tags(section)}
+    sections = toml_file.list_sections(DevicesConfig.model_fields[role].annotation)
+    known = {
+        driver: section for section in sections for driver in toml_file.list_driver_names(section)
+    }
     question = f"{role}: driver, {' or '.join(known)}" + (" (empty: none)" if optional else "")
     while True:
-        driver = _ask(question)
+        driver = _ask_question(question)
         if not driver and optional:
             return {}
         if driver not in known:
-            typer.echo(f"{driver!r} is no driver; {toml_file.hint(driver, [*known])}", err=True)
+            typer.echo(
+                f"{driver!r} is no driver; {toml_file.suggest_word(driver, [*known])}", err=True
+            )
             continue
         table: TomlTable = {"driver": driver}
         for name, field in known[driver].model_fields.items():
             if name == "raw" or (
                 field.is_required() and name != "driver"
             ):  # only a preset replaces `raw`
-                answer = _ask(f"  {name} ({_key_meaning(f'{driver}.{name}').rstrip('.')})")
+                answer = _ask_question(f"  {name} ({_key_meaning(f'{driver}.{name}').rstrip('.')})")
                 table[name] = answer if field.annotation is str else _parse_answer(answer)
         try:
-            toml_file.parse(table, known[driver], role)
+            toml_file.parse_tables(table, known[driver], role)
         except errors.InputError as error:
             typer.echo(f"{error}; once more", err=True)
             continue
         return {role: table}
 
 
-def _ask(question: str) -> str:
+def _ask_question(question: str) -> str:
     return str(
         typer.prompt(question, default="", show_default=False, prompt_suffix=": ", err=True)
     ).strip()
@@ -145,7 +149,7 @@ def _parse_answer(answer: str) -> Any:
 
 
 def _key_meaning(key: str) -> str:
-    return reference.explained(key)[0].keys[0].meaning
+    return reference.find_explained(key)[0].keys[0].meaning
 
 
 def _format_tables(prefix: str, tables: TomlTable) -> list[str]:

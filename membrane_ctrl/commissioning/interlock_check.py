@@ -76,7 +76,9 @@ async def _board_circuits(devices: DevicesConfig) -> dict[int, InterlockProbe]:
         problem = str(error)
     finally:
         await board.close()
-    return {bit: _probe(devices, bit, bool(open_mask >> bit & 1), problem) for bit in inputs}
+    return {
+        bit: _probe_interlock(devices, bit, bool(open_mask >> bit & 1), problem) for bit in inputs
+    }
 
 
 async def _polled_circuits(
@@ -96,12 +98,14 @@ async def _polled_circuits(
         problem = f"{len(closed)} circuits in the answer, expected {len(polled.bits)}"
         closed = (False,) * len(polled.bits)
     return {
-        bit: _probe(devices, bit, not is_closed, problem)
+        bit: _probe_interlock(devices, bit, not is_closed, problem)
         for bit, is_closed in zip(polled.bits, closed, strict=True)
     }
 
 
-def _probe(devices: DevicesConfig, bit: int, is_open: bool, problem: str) -> InterlockProbe:
+def _probe_interlock(
+    devices: DevicesConfig, bit: int, is_open: bool, problem: str
+) -> InterlockProbe:
     interlock = devices.interlocks[bit]
     source = device_places.circuit_place("", interlock, device_places.plain_link).words
     state = OPEN if is_open else CLOSED

@@ -87,9 +87,11 @@ def write_package(name: str, role: str, folder: Path) -> int:
     _require_free(name)
     if role not in ROLES_OF_DRIVERS:
         raise errors.InputError(
-            f"--role {role}: no such role; {toml_file.hint(role, list(ROLES_OF_DRIVERS))}"
+            f"--role {role}: no such role; {toml_file.suggest_word(role, list(ROLES_OF_DRIVERS))}"
         )
-    words = _names(name, role) | (_optics(name, role) if role in _OPTICS else _instrument(role))
+    words = _make_driver_names(name, role) | (
+        _make_optics_tables(name, role) if role in _OPTICS else _make_instrument_terms(role)
+    )
     target = (
         folder / f"{words['dashed']}-driver"
     )  # with a dash, Python never takes the folder for the module
@@ -108,7 +110,7 @@ def write_package(name: str, role: str, folder: Path) -> int:
         f"test_{name}.py": f"{prefix}test.txt",
         "lab.toml": lab,
     }
-    with errors.writing(target):
+    with errors.convert_write_errors(target):
         if target.exists() or target.is_symlink():
             raise errors.InputError(
                 f"{target}: exists already, and is not overwritten; choose another name"
@@ -132,24 +134,28 @@ def _require_free(name: str) -> None:
     if not _NAME.fullmatch(name) or len(name) > _LONGEST:
         rule = f"use at most {_LONGEST} small letters, digits and _, such as acme_gauge"
         raise errors.InputError(f"{name}: not a name for a driver; {rule}")
-    built_in = {tag for section in toml_file.sections(DevicesConfig) for tag in _drivers(section)}
+    built_in = {
+        tag for section in toml_file.list_sections(DevicesConfig) for tag in _find_drivers(section)
+    }
     if name in built_in or keyword.iskeyword(name) or importlib.util.find_spec(name) is not None:
         raise errors.InputError(
             f"{name}: taken by a driver or a Python module; choose another name"
         )
 
 
-def _drivers(section: type[Any]) -> set[str]:
+def _find_drivers(section: type[Any]) -> set[str]:
     """Return the names of all drivers in a table and the tables below it."""
     inner = [
         each
         for field in section.model_fields.values()
-        for each in toml_file.sections(field.annotation)
+        for each in toml_file.list_sections(field.annotation)
     ]
-    return {str(tag) for tag in toml_file.tags(section)}.union(*(_drivers(each) for each in inner))
+    return {str(tag) for tag in toml_file.list_driver_names(section)}.union(
+        *(_find_drivers(each) for each in inner)
+    )
 
 
-def _names(name: str, role: str) -> dict[str, Any]:
+def _make_driver_names(name: str, role: str) -> dict[str, Any]:
     """Return what every template calls the driver and its entry point groups."""
     kind = {"camera": drivers.CAMERAS, "screen": drivers.SCREENS}.get(role, drivers.SENSORS)
     return {
@@ -164,17 +170,17 @@ def _names(name: str, role: str) -> dict[str, Any]:
     }
 
 
-def _optics(name: str, role: str) -> dict[str, Any]:
+def _make_optics_tables(name: str, role: str) -> dict[str, Any]:
     """Return what the configuration of a camera or screen has beside it."""
     tables = {device: table.format(name=name) for device, table in _OPTICS[role].items()}
-    return {**tables, "others": _tables(_OTHERS)}
+    return {**tables, "others": _format_devices(_OTHERS)}
 
 
-def _tables(devices: dict[str, str]) -> str:
+def _format_devices(devices: dict[str, str]) -> str:
     return "".join(f"[devices.{role}]\n{table}\n" for role, table in devices.items())
 
 
-def _instrument(role: str) -> dict[str, Any]:
+def _make_instrument_terms(role: str) -> dict[str, Any]:
     """Return what the templates of an instrument say of its role."""
     reads = roles.ROLES[role].reads
     words = _WORDS[reads]
@@ -194,7 +200,7 @@ def _instrument(role: str) -> dict[str, Any]:
         "second": second,
         "barometer": str(role == "barometer").lower(),
         "thermometer": str(role == "thermometer").lower(),
-        "others": _tables(others),
+        "others": _format_devices(others),
     }
 
 

@@ -47,10 +47,10 @@ def make_safe(config: Config, source: str, logs_dir: Path | None = None, latch: 
             print(asyncio.run(_after_a_run(config.devices)), file=sys.stderr)
         return Exit.DONE
     folder = logs_dir or Path(config.recording.logs_dir)
-    stopped = _tried(config.devices)
+    stopped = _try_to_stop(config.devices)
     by_hold = _lock_hold(config, folder)
     if not stopped.lasts:  # the hold may have commanded the pump again before it was locked
-        stopped = _tried(config.devices)
+        stopped = _try_to_stop(config.devices)
     if stopped.problem and not by_hold.locked:
         raise DeviceError(f"{stopped.problem}; cut the pump's power if it runs")
     for line in (stopped.words, by_hold.words):
@@ -70,7 +70,7 @@ class _Stopped:
     lasts: bool = False
 
 
-def _tried(devices: DevicesConfig) -> _Stopped:
+def _try_to_stop(devices: DevicesConfig) -> _Stopped:
     try:
         return asyncio.run(_stop(devices))
     except DeviceError as error:
@@ -90,7 +90,7 @@ async def _stop(devices: DevicesConfig) -> _Stopped:
         raise DeviceError(str(error)) from None
     finally:
         await board.close()
-    return _Stopped(_words(devices, reading), lasts=identity.map_version > 1)
+    return _Stopped(_describe_reading(devices, reading), lasts=identity.map_version > 1)
 
 
 async def _stop_instrument(devices: DevicesConfig) -> _Stopped:
@@ -107,7 +107,7 @@ async def _stop_instrument(devices: DevicesConfig) -> _Stopped:
     return _Stopped(f"{devices.name}: pump {fraction:g}")
 
 
-def _words(devices: DevicesConfig, reading: BenchReading) -> str:
+def _describe_reading(devices: DevicesConfig, reading: BenchReading) -> str:
     latched = f", faults latched {reading.latched_faults:#x}" if reading.latched_faults else ""
     return (
         f"{devices.name}: pump {reading.pump_fraction:g}, vent {reading.vent_fraction:.2f}{latched}"
@@ -127,7 +127,7 @@ async def _after_a_run(devices: DevicesConfig) -> str:
         identity = await bench.retry_connecting(board.identify, devices.board)
         if identity.map_version == 1:
             await board.stop()
-        return _words(devices, await _standing(board, devices.watchdog_s))
+        return _describe_reading(devices, await _standing(board, devices.watchdog_s))
     except LinkError as error:
         raise DeviceError(f"{error}; the board's watchdog stops the pump by itself") from None
     finally:

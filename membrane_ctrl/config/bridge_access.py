@@ -30,12 +30,16 @@ def bridge_accesses(doors: DoorsConfig) -> list[BridgeAccess]:
         where = f"OPC UA on {opcua.host}:{opcua.port}" + (", encrypted" if opcua.encrypted else "")
         known = opcua.users_file is not None
         who = (
-            f"the users in {opcua.users_file}, each by its role" if known else _anybody(opcua.host)
+            f"the users in {opcua.users_file}, each by its role"
+            if known
+            else _is_open_to_anybody(opcua.host)
         )
         found.append(BridgeAccess("doors.opcua", where, who, not known))
     if doors.epics is not None:
         where = f"EPICS on {doors.epics.host}"
-        found.append(BridgeAccess("doors.epics", where, _anybody(doors.epics.host), True))
+        found.append(
+            BridgeAccess("doors.epics", where, _is_open_to_anybody(doors.epics.host), True)
+        )
     return found
 
 
@@ -52,7 +56,7 @@ def describe_bridges(doors: DoorsConfig) -> str:
     return "; ".join(f"{each.where}: {each.who} may {may}" for each in accesses)
 
 
-def _anybody(host: str) -> str:
+def _is_open_to_anybody(host: str) -> str:
     return (
         "every program on this machine" if host in LOCAL_HOSTS else "every program on the network"
     )

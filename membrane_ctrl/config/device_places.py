@@ -65,7 +65,7 @@ def list_places(
         key = f"devices.{role}"
         match section:
             case settings.ModbusMapConfig():
-                yield from _registers(f"{key}.address", section, name_link)
+                yield from _list_registers(f"{key}.address", section, name_link)
             case settings.BronkhorstModbusConfig():
                 unit = f"unit {section.unit_id} of {section.link}"
                 device = (name_link(section.link), section.unit_id)
@@ -80,11 +80,11 @@ def list_places(
         yield circuit_place(f"devices.interlocks.{index}", interlock, name_link)
 
 
-def _registers(
+def _list_registers(
     key: str, section: settings.ModbusMapConfig, name_link: Callable[[str], Hashable]
 ) -> Iterator[DevicePlace]:
     """Yield each register of a value."""
-    defaults = _preset(section.preset)
+    defaults = _load_preset(section.preset)
     function = section.function or defaults.get("function", "holding")
     kind = section.type or defaults.get("type", "u16")
     for address in range(section.address, section.address + _WORDS.get(kind, 1)):
@@ -94,7 +94,7 @@ def _registers(
         )
 
 
-def _preset(name: str) -> dict[str, Any]:
+def _load_preset(name: str) -> dict[str, Any]:
     """Defaults of a preset; none for an unknown one, which is refused when the devices are made."""
     if not name:
         return {}
@@ -103,7 +103,7 @@ def _preset(name: str) -> dict[str, Any]:
     )  # imports the links, which most readers of a configuration need not
 
     try:
-        return modbus_map.preset(name)
+        return modbus_map.load_preset(name)
     except ValueError:
         return {}
 

@@ -94,7 +94,11 @@ class ScreenPoseConfig(Section):
         given = [value is not None for value in (self.origin_mm, self.s_x, self.s_y)]
         if any(given) and not all(given):
             raise ValueError("origin_mm, s_x and s_y belong together: give all or none")
-        if self.s_x is not None and self.s_y is not None and not _orthonormal((self.s_x, self.s_y)):
+        if (
+            self.s_x is not None
+            and self.s_y is not None
+            and not _is_orthonormal((self.s_x, self.s_y))
+        ):
             raise ValueError("s_x and s_y are not two unit vectors at a right angle")
         return self
 
@@ -131,7 +135,7 @@ class CameraPoseConfig(Section):
     def _is_rotation(self) -> "CameraPoseConfig":
         (a, b, c), (d, e, f), (g, h, i) = self.rotation
         determinant = a * (e * i - f * h) - b * (d * i - f * g) + c * (d * h - e * g)
-        if not _orthonormal(self.rotation) or determinant < 0:
+        if not _is_orthonormal(self.rotation) or determinant < 0:
             raise ValueError(
                 "rotation is not a rotation matrix (rows: right, down, forward in world)"
             )
@@ -355,7 +359,7 @@ def _or_file(schema: dict[str, Any]) -> None:
     schema["required"].remove("heights_mm")
 
 
-def _orthonormal(rows: tuple[Vector3, ...]) -> bool:
+def _is_orthonormal(rows: tuple[Vector3, ...]) -> bool:
     """Whether the rows are unit vectors at right angles."""
     products = [(sum(x * y for x, y in zip(a, b, strict=True)), a is b) for a in rows for b in rows]
     return all(abs(product - same) <= (_UNIT if same else _SQUARE) for product, same in products)

@@ -21,7 +21,7 @@ from pydantic.json_schema import GenerateJsonSchema
 from firmware_iface import drivers
 from firmware_iface.roles import ROLES
 from membrane_ctrl.config.schema import Config
-from membrane_ctrl.config.toml_file import hint, sections
+from membrane_ctrl.config.toml_file import list_sections, suggest_word
 from membrane_ctrl.model.errors import InputError
 
 _ADVICE = re.compile(r"(?<=[.;?])\s+(?=(?:Change|Leave|Lower|Raise|Set)\b)")
@@ -106,7 +106,10 @@ def json_schema(root: type[BaseModel] = Config) -> dict[str, Any]:
     constant.
     """
     schema = root.model_json_schema(schema_generator=_TomlSchema)
-    texts, chosen = _texts(root), set(re.findall(r'"\w+": "#/\$defs/(\w+)"', json.dumps(schema)))
+    texts, chosen = (
+        _collect_texts(root),
+        set(re.findall(r'"\w+": "#/\$defs/(\w+)"', json.dumps(schema))),
+    )
     for name, table in [*schema.get("$defs", {}).items(), (root.__name__, schema)]:
         for key, field in table["properties"].items():
             if text := texts.get((name, key)):
@@ -121,18 +124,20 @@ def json_schema(root: type[BaseModel] = Config) -> dict[str, Any]:
 
 
 @cache
-def tables() -> tuple[TableHelp, ...]:
+def list_tables() -> tuple[TableHelp, ...]:
     """Every table of a configuration in the order of the schema, each once. Raises KeyError for an
     unknown unit.
     """
     schema = json_schema()
     places: dict[str, list[tuple[str, Any]]] = {}
-    for place, name, default in _places(schema, "", schema, Config().model_dump(mode="json")):
+    for place, name, default in _walk_tables(schema, "", schema, Config().model_dump(mode="json")):
         places.setdefault(name, []).append((place, default))
-    return tuple(_table(schema["$defs"][name], found) for name, found in places.items())
+    return tuple(_make_table(schema["$defs"][name], found) for name, found in places.items())
 
 
-def _places(schema: Any, prefix: str, table: Any, defaults: Any) -> Iterator[tuple[str, str, Any]]:
+def _walk_tables(
+    schema: Any, prefix: str, table: Any, defaults: Any
+) -> Iterator[tuple[str, str, Any]]:
     """Yield each table below another, outermost first: its place, the name of its class, its
     defaults.
     """
@@ -145,10 +150,10 @@ def _places(schema: Any, prefix: str, table: Any, defaults: Any) -> Iterator[tup
             ):  # below a table that is absent by default
                 inner = []
             yield place, name, inner
-            yield from _places(schema, f"{place}.", schema["$defs"][name], inner)
+            yield from _walk_tables(schema, f"{place}.", schema["$defs"][name], inner)
 
 
-def _table(table: Any, found: list[tuple[str, Any]]) -> TableHelp:
+def _make_table(table: Any, found: list[tuple[str, Any]]) -> TableHelp:
     defaults = next((default for _, default in found if isinstance(default, dict)), {})
     required = table.get("required", ())
     keys = []
@@ -159,9 +164,13 @@ def _table(table: Any, found: list[tuple[str, Any]]) -> TableHelp:
             continue  # a table of its own, or the name of this one
         meaning, *advice = _ADVICE.split(" ".join(field.get("description", "").split()), maxsplit=1)
         default = (
-            "required" if name in required else _shown(defaults.get(name, field.get("default")))
+            "required"
+            if name in required
+            else _format_default(defaults.get(name, field.get("default")))
         )
-        keys.append(Key(name, unit_of(name), _range(field), default, meaning, "".join(advice)))
+        keys.append(
+            Key(name, unit_of(name), _describe_range(field), default, meaning, "".join(advice))
+        )
     driver = table["properties"].get("driver", {}).get("const", "")
     places = tuple(dict.fromkeys(place for place, _ in found))
     many = any(isinstance(default, list) for _, default in found)
@@ -170,14 +179,14 @@ def _table(table: Any, found: list[tuple[str, Any]]) -> TableHelp:
     )
 
 
-def explained(word: str) -> tuple[TableHelp, ...]:
+def find_explained(word: str) -> tuple[TableHelp, ...]:
     """The tables, or parts of them, that a word names: `loop`, `loop.kp_per_s`, `kp_per_s`,
     `devices.pump`, `ventus`.
 
     Raises InputError with the nearest names.
     """
     wanted, found, known = word.strip("[]` "), [], []
-    for table in tables():
+    for table in list_tables():
         prefixes = [name for name in (*table.places, table.driver) if name]
         names = {
             key.name: {key.name, *(f"{prefix}.{key.name}" for prefix in prefixes)}
@@ -197,7 +206,7 @@ def explained(word: str) -> tuple[TableHelp, ...]:
         near = (
             f"did you mean {' or '.join(inside)}?"
             if inside
-            else hint(wanted, known, "see `config reference`")
+            else suggest_word(wanted, known, "see `config reference`")
         )
         raise InputError(f"{word}: no such key or table; {near}")
     return tuple(found)
@@ -217,7 +226,7 @@ def _of_other_packages(word: str) -> list[TableHelp]:
             raise InputError(str(error)) from None
         places = [(place, None) for place in _places_of_driver(driver, kind)]
         try:
-            table = _table(json_schema(driver.Settings), places)
+            table = _make_table(json_schema(driver.Settings), places)
         except Exception as error:  # whatever its settings are
             raise InputError(
                 f"{word}: its settings cannot be shown: {type(error).__name__}: {error}"
@@ -247,17 +256,19 @@ def unit_of(name: str) -> str:
     return f"{_UNITS.get(words[-3], '1')}/{_UNITS[words[-1]]}"
 
 
-def _range(field: Any) -> str:
+def _describe_range(field: Any) -> str:
     """Return the valid values of a key, in words."""
     if "const" in field or "enum" in field:
         return ", ".join(str(value) for value in field.get("enum", [field.get("const")]))
     kind = field.get("type", "")
     if kind in ("number", "integer"):
-        return _limits(field) + (", whole" if kind == "integer" else "")
+        return _list_limits(field) + (", whole" if kind == "integer" else "")
     if kind == "array":
         parts = field.get("prefixItems")
         return (
-            f"{len(parts)} x ({_range(parts[0])})" if parts else f"list of {_range(field['items'])}"
+            f"{len(parts)} x ({_describe_range(parts[0])})"
+            if parts
+            else f"list of {_describe_range(field['items'])}"
         )
     if kind == "boolean":
         return "true, false"
@@ -272,7 +283,7 @@ def _range(field: Any) -> str:
     )
 
 
-def _limits(field: Any) -> str:
+def _list_limits(field: Any) -> str:
     """Return the limits of a number; a key of another package may lack one or both."""
     lows = [f"above {field['exclusiveMinimum']:g}"] if "exclusiveMinimum" in field else []
     lows += [f"{field['minimum']:g}"] if "minimum" in field else []
@@ -283,19 +294,19 @@ def _limits(field: Any) -> str:
     return f"{lows[0] if lows else 'any'} .. {highs[0] if highs else 'any'}"
 
 
-def _shown(default: Any) -> str:
+def _format_default(default: Any) -> str:
     """Return a default as in TOML; "none" for an absent key."""
     if isinstance(default, list) and default and isinstance(default[0], dict):
         return f"{len(default)} tables"
     return "none" if default is None else json.dumps(default)
 
 
-def _texts(root: type[BaseModel]) -> dict[tuple[str, str], str]:
+def _collect_texts(root: type[BaseModel]) -> dict[tuple[str, str], str]:
     """Return the text below each key of the schema's classes, or of the class that defines the key
     for them.
     """
     found: dict[tuple[str, str], str] = {}
-    for section in _classes(root):
+    for section in _list_classes(root):
         for base in reversed(section.__mro__):
             if issubclass(base, BaseModel) and base is not BaseModel:
                 below = _texts_of_module(inspect.getmodule(base)).get(base.__name__, {})
@@ -319,18 +330,18 @@ def _texts_of_module(module: Any) -> dict[str, dict[str, str]]:
     return found
 
 
-def _classes(section: type[BaseModel]) -> Iterator[type[BaseModel]]:
+def _list_classes(section: type[BaseModel]) -> Iterator[type[BaseModel]]:
     yield section
     for field in section.model_fields.values():
-        for inner in sections(field.annotation):
-            yield from _classes(inner)
+        for inner in list_sections(field.annotation):
+            yield from _list_classes(inner)
 
 
-def page() -> str:
+def make_reference_page() -> str:
     """docs/reference/configuration.md."""
     lines = _PAGE.splitlines()
-    for table in tables():
-        lines += ["", f"## {_heading(table)}", "", f"`{table.title}`: {table.meaning}"]
+    for table in list_tables():
+        lines += ["", f"## {_make_heading(table)}", "", f"`{table.title}`: {table.meaning}"]
         if table.keys:
             lines += [
                 "",
@@ -350,11 +361,11 @@ def page() -> str:
     return "\n".join([*lines, ""])
 
 
-def _heading(table: TableHelp) -> str:
+def _make_heading(table: TableHelp) -> str:
     """Return a heading of the page, which names no other table."""
     if not table.driver:
         return table.places[0]
-    if sum(other.driver == table.driver for other in tables()) == 1:
+    if sum(other.driver == table.driver for other in list_tables()) == 1:
         return table.driver
     devices = ", ".join(place.removeprefix("devices.") for place in table.places)
     return f"{table.driver}: {devices}"

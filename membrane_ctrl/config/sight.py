@@ -37,7 +37,7 @@ class Doubt:
     remedy: str
 
 
-def poses(
+def compute_poses(
     geometry: GeometryConfig,
 ) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray, FloatArray]:
     """Pinhole (3,), rotation (3, 3), O', s_x and s_y (3,) in world, from either form
@@ -63,9 +63,9 @@ def poses(
     )
 
 
-def sight(optics: OpticsConfig, sag_mm: float) -> Sight:
+def trace_view(optics: OpticsConfig, sag_mm: float) -> Sight:
     """Follow the camera's rays to a bowl of this depth and on to the screen's plane."""
-    pinhole, rotation, origin, s_x, s_y = poses(optics.geometry)
+    pinhole, rotation, origin, s_x, s_y = compute_poses(optics.geometry)
     camera, pattern, mirror = optics.camera, optics.pattern, optics.mirror
     radius = (
         np.sqrt((np.arange(_RINGS) + 0.5) / _RINGS) * mirror.analysis_radius_mm
@@ -98,7 +98,7 @@ def sight(optics: OpticsConfig, sag_mm: float) -> Sight:
     return Sight(float(shown[1:].mean()), float((shown & lit)[1:].mean()), centre_off_mm)
 
 
-def doubt(optics: OpticsConfig, depth_known: bool = True) -> Doubt | None:
+def find_doubt(optics: OpticsConfig, depth_known: bool = True) -> Doubt | None:
     """What is not plausible about a geometry, if anything.
 
     If the film's depth is not known, the geometry has the benefit of the doubt: that of the depth
@@ -108,7 +108,7 @@ def doubt(optics: OpticsConfig, depth_known: bool = True) -> Doubt | None:
         [optics.mirror.sag_mm] if depth_known else (_DEPTHS * optics.mirror.radius_mm).tolist()
     )
     best = max(
-        (sight(optics, depth_mm) for depth_mm in depths_mm), key=lambda found: found.measured
+        (trace_view(optics, depth_mm) for depth_mm in depths_mm), key=lambda found: found.measured
     )
     if best.measured >= _GOOD:
         return None
@@ -143,7 +143,7 @@ def _angle_hint(optics: OpticsConfig, alpha_deg: float, depths_mm: list[float]) 
         if 0.0 < meant_deg < 180.0:
             geometry = optics.geometry.model_copy(update={"alpha_deg": meant_deg})
             meant = optics.model_copy(update={"geometry": geometry})
-            if max(sight(meant, depth_mm).measured for depth_mm in depths_mm) >= _GOOD:
+            if max(trace_view(meant, depth_mm).measured for depth_mm in depths_mm) >= _GOOD:
                 return f"{word} it is {meant_deg:.1f} deg"
     return (
         "measure alpha_deg from the mirror's plane; check a_mm, b_mm, [pattern] and mirror.sag_mm"

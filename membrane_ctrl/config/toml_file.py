@@ -26,7 +26,7 @@ _PARTS_MAX = 50
 _QUOTED_PART = re.compile(r"""["']\s*\.""")
 
 
-def load(path: str | Path, model: type[Model], follow: bool = True) -> Model:
+def load_toml(path: str | Path, model: type[Model], follow: bool = True) -> Model:
     """Read a TOML file as `model`; `follow` is False in a folder from an untrusted source
     (`model.files`).
 
@@ -37,7 +37,7 @@ def load(path: str | Path, model: type[Model], follow: bool = True) -> Model:
     optics = tables.get("optics")
     if isinstance(optics, dict):
         with_height_map(optics.get("geometry"), path, follow)
-    return parse(tables, model, str(path))
+    return parse_tables(tables, model, str(path))
 
 
 def read_toml(path: Path, follow: bool = True) -> dict[str, Any]:
@@ -66,10 +66,10 @@ def read_toml(path: Path, follow: bool = True) -> dict[str, Any]:
             f"{path}: not valid TOML: not UTF-8 text (UTF-16, perhaps); save it as UTF-8"
         ) from None
     except ValueError as error:  # of TOML, of a number with thousands of digits
-        raise InputError(f"{path}: not valid TOML: {_cause(str(error), text)}") from None
+        raise InputError(f"{path}: not valid TOML: {_describe_cause(str(error), text)}") from None
 
 
-def _cause(message: str, text: str) -> str:
+def _describe_cause(message: str, text: str) -> str:
     """Return the parser's message, with the usual cause for two that do not tell it."""
     found = re.search(r"at line (\d+)", message)
     line = text.split("\n")[int(found[1]) - 1].strip() if found else ""
@@ -116,15 +116,19 @@ def with_height_map(geometry: Any, where: Path, follow: bool = True) -> None:
     table["heights_mm"] = [row for row in rows if row]
 
 
-def parse(tables: dict[str, Any], model: type[Model], where: str) -> Model:
-    """Validate tables from `where`. Raises InputError like `load`."""
+def parse_tables(tables: dict[str, Any], model: type[Model], where: str) -> Model:
+    """Validate tables from `where`. Raises InputError like `load_toml`."""
     try:
         return model.model_validate(tables)
     except ValidationError as error:
-        raise InputError(f"{where}: {describe(_telling(error.errors()), model)}") from None
+        raise InputError(
+            f"{where}: {describe_error(_choose_error(error.errors()), model)}"
+        ) from None
 
 
-def prune(table: dict[str, Any], model: type[BaseModel], prefix: str = "") -> tuple[str, ...]:
+def prune_unknown_keys(
+    table: dict[str, Any], model: type[BaseModel], prefix: str = ""
+) -> tuple[str, ...]:
     """Remove unknown keys, so that sets from newer versions can be read; returns their names."""
     ignored: list[str] = []
     known = {(field.alias or name): field.annotation for name, field in model.model_fields.items()}
@@ -141,34 +145,35 @@ def prune(table: dict[str, Any], model: type[BaseModel], prefix: str = "") -> tu
         inner = table[key] if isinstance(table[key], list) else [table[key]]
         for item in inner:
             if nested and isinstance(item, dict):
-                ignored += prune(item, nested[0], f"{prefix}{key}.")
+                ignored += prune_unknown_keys(item, nested[0], f"{prefix}{key}.")
     return tuple(dict.fromkeys(ignored))
 
 
-def dump(config: BaseModel) -> str:
+def dump_toml(config: BaseModel) -> str:
     """TOML text of a configuration with every default; omits fields that are None."""
     return tomli_w.dumps(config.model_dump(mode="json", exclude_none=True))
 
 
-def describe(error: ErrorDetails, model: type[BaseModel]) -> str:
+def describe_error(error: ErrorDetails, model: type[BaseModel]) -> str:
     """One line for a validation error: the field, the problem and the remedy."""
-    path, parent = _walk(model, error["loc"])
+    path, parent = _walk_location(model, error["loc"])
     field = ".".join(str(part) for part in path)
     kind, fields = error["type"], {} if parent is None else parent.model_fields
     if kind == "extra_forbidden":
         key = str(error["loc"][-1])
-        home = next(_homes(model, key), "")
-        return f"{field}: unknown key; {hint(key, [*fields], home and f'it belongs in [{home}]')}"
-    inner = sections(fields[path[-1]].annotation) if path and path[-1] in fields else []
+        home = next(_find_tables_with_key(model, key), "")
+        otherwise = home and f"it belongs in [{home}]"
+        return f"{field}: unknown key; {suggest_word(key, [*fields], otherwise)}"
+    inner = list_sections(fields[path[-1]].annotation) if path and path[-1] in fields else []
     if kind.startswith("union_tag"):
         choices = _sections_at(model, path)
         tag, known = (
             str(error["ctx"].get("tag", "")),
-            [str(tag) for section in choices for tag in tags(section)],
+            [str(tag) for section in choices for tag in list_driver_names(section)],
         )
         return (
             f"{field}.driver: {f'{tag!r} is not known here' if tag else 'missing'}; "
-            f"{hint(tag, known)}"
+            f"{suggest_word(tag, known)}"
         )
     message = error["msg"].removeprefix("Value error, ").partition(" for <class")[0]
     if kind == "value_error":  # some begin with the key
@@ -199,7 +204,7 @@ def describe(error: ErrorDetails, model: type[BaseModel]) -> str:
     return f"{field}: {message[:1].lower()}{message[1:]}{shown}"
 
 
-def hint(word: str, known: list[str], otherwise: str = "") -> str:
+def suggest_word(word: str, known: list[str], otherwise: str = "") -> str:
     """Return the nearest known word as a question; else `otherwise`, or all that are known."""
     near = difflib.get_close_matches(word, known, n=1, cutoff=0.5)
     if near:
@@ -207,22 +212,22 @@ def hint(word: str, known: list[str], otherwise: str = "") -> str:
     return otherwise or (f"known: {', '.join(known)}" if known else "remove it")
 
 
-def _homes(model: type[BaseModel], key: str, prefix: str = "") -> Iterator[str]:
+def _find_tables_with_key(model: type[BaseModel], key: str, prefix: str = "") -> Iterator[str]:
     """Yield the tables that have a key."""
     for name, field in model.model_fields.items():
-        for section in sections(field.annotation):
+        for section in list_sections(field.annotation):
             if key in section.model_fields:
                 yield f"{prefix}{name}"
-            yield from _homes(section, key, f"{prefix}{name}.")
+            yield from _find_tables_with_key(section, key, f"{prefix}{name}.")
 
 
-def _telling(errors: list[ErrorDetails]) -> ErrorDetails:
+def _choose_error(errors: list[ErrorDetails]) -> ErrorDetails:
     """The most helpful error: an unknown key is often a misspelling of one reported missing."""
     misspelt = [error for error in errors if error["type"] == "extra_forbidden"]
     return misspelt[0] if misspelt and errors[0]["type"] == "missing" else errors[0]
 
 
-def _walk(
+def _walk_location(
     model: type[BaseModel], location: tuple[int | str, ...]
 ) -> tuple[list[int | str], type[BaseModel] | None]:
     """Return the path of a key as in the file, and its section (None if unknown).
@@ -235,14 +240,14 @@ def _walk(
     members: list[type[BaseModel]] = []
     for place, part in enumerate(location):
         last = place + 1 == len(location)
-        if tagged := [m for m in members if part in tags(m)]:
+        if tagged := [m for m in members if part in list_driver_names(m)]:
             inside, members = tagged[0], []
             continue
         path.append(part)
         if last or isinstance(part, int):
             continue
         field = None if inside is None else inside.model_fields.get(part)
-        members = [] if field is None else sections(field.annotation)
+        members = [] if field is None else list_sections(field.annotation)
         inside = members[0] if members else None
     return path, inside
 
@@ -256,18 +261,18 @@ def _sections_at(model: type[BaseModel], path: list[int | str]) -> list[type[Bas
         if isinstance(name, int):
             continue
         fields = [section.model_fields[name] for section in found if name in section.model_fields]
-        found = [inner for field in fields for inner in sections(field.annotation)]
+        found = [inner for field in fields for inner in list_sections(field.annotation)]
     return found
 
 
-def sections(annotation: Any) -> list[type[BaseModel]]:
+def list_sections(annotation: Any) -> list[type[BaseModel]]:
     """Return all sections that a field may hold."""
     if isinstance(annotation, type) and issubclass(annotation, BaseModel):
         return [annotation]
-    return [section for inner in get_args(annotation) for section in sections(inner)]
+    return [section for inner in get_args(annotation) for section in list_sections(inner)]
 
 
-def tags(section: type[BaseModel]) -> tuple[Any, ...]:
+def list_driver_names(section: type[BaseModel]) -> tuple[Any, ...]:
     """Return the values of `driver` that select this section."""
     driver = section.model_fields.get("driver")
     return () if driver is None else get_args(driver.annotation)

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from statistics import fmean, pstdev
 
 from membrane_ctrl.config.schema import Config
-from membrane_ctrl.console.why import duration, go_on, number, why
+from membrane_ctrl.console.why import explain_state, format_duration, format_number, go_on
 from membrane_ctrl.control.leak_estimate import JUDGE_S, TOO_TIGHT_UM_PER_S
 from membrane_ctrl.model import (
     acquisition_events,
@@ -196,7 +196,7 @@ class ConsoleModel:
             fault=fault_words(status.fault),
             remedy=status.fault.remedy if status.fault else "",
             faults=status.faults,
-            last_fault=f"{fault_words(status.last_fault)} at {duration(status.last_fault_s)}"
+            last_fault=f"{fault_words(status.last_fault)} at {format_duration(status.last_fault_s)}"
             * bool(status.faults),
             too_tight=self._too_tight(now_s),
             gains=run_status.gains_words(vars(in_force.loop), status.trial_left_s),
@@ -219,7 +219,9 @@ class ConsoleModel:
         status = self._status
         if status.row is None:
             return status.why or "starting: no tick yet"
-        return why(status.row, status.why, fault_words(status.fault), self._config, status.paused)
+        return explain_state(
+            status.row, status.why, fault_words(status.fault), self._config, status.paused
+        )
 
     def _shape(self, now_s: float) -> ShapeView:
         estimate, since, row, status = (
@@ -268,4 +270,5 @@ def fault_words(fault: events.Fault | None) -> str:
 
 def event_line(line: events.EventLine) -> str:
     """Format an event as one line of a log."""
-    return f"{number(line.get('mono_s', math.nan), 1):>9} s  {event_lines.from_dict(line).sentence}"
+    time_s = format_number(line.get("mono_s", math.nan), 1)
+    return f"{time_s:>9} s  {event_lines.from_dict(line).sentence}"

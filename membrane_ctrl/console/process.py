@@ -39,7 +39,7 @@ _PLAIN_S = 1.0
 _HANGS_S = 15.0
 
 
-def line(view: model.ConsoleView) -> str:
+def format_line(view: model.ConsoleView) -> str:
     """Format the view as one line."""
     row = view.row
     if view.silent_s or row is None:
@@ -48,9 +48,13 @@ def line(view: model.ConsoleView) -> str:
     parts = [
         f"{view.elapsed_s:9.1f} s  {view.state.name.lower():7}",
         row.labelled("error_um", sign=True, width=7),
-        f"pump {why.percent(row.pump_fraction):>5}",
+        f"pump {why.format_percent(row.pump_fraction):>5}",
         row.labelled("leak_um_per_s") + (" TOO TIGHT" if view.too_tight else ""),
-        *([f"held by {why.holders(row)}"] if math.isfinite(row.estimate_sigma_um) else []),
+        *(
+            [f"held by {why.list_used_sensors(row)}"]
+            if math.isfinite(row.estimate_sigma_um)
+            else []
+        ),
         f"shape {_shape_words(view)} {row.labelled('trim_um', sign=True)}",
         row.labelled("lateness_ms"),
         view.why,
@@ -60,7 +64,7 @@ def line(view: model.ConsoleView) -> str:
         parts.append(view.go_on)
     parts += view.notices
     if math.isfinite(view.left_s):
-        parts.append(f"{why.duration(view.left_s)} left")
+        parts.append(f"{why.format_duration(view.left_s)} left")
     return "  ".join(parts)
 
 
@@ -68,7 +72,7 @@ def _shape_words(view: model.ConsoleView) -> str:
     shape = view.shape
     if shape.estimate is None:
         return shape.note or shape.state.name.lower()
-    return f"{shape.state.name.lower()} {shape.estimate.verdict} {why.duration(shape.age_s)}"
+    return f"{shape.state.name.lower()} {shape.estimate.verdict} {why.format_duration(shape.age_s)}"
 
 
 @dataclass(frozen=True, slots=True)
@@ -108,18 +112,20 @@ def console_main(spec: ConsoleSpec, status: Connection | None = None) -> None:
                 time.sleep(_LOOK_S)
 
         try:
-            _draw(spec, feed, rounds)
+            _draw_console(spec, feed, rounds)
         except (
             OSError
         ):  # no reader: `2>&1 | head`, a closed terminal; another console would not help
             rounds(feed.update)
 
 
-def _draw(spec: ConsoleSpec, feed: _Feed, rounds: Callable[[Callable[[], object]], None]) -> None:
+def _draw_console(
+    spec: ConsoleSpec, feed: _Feed, rounds: Callable[[Callable[[], object]], None]
+) -> None:
     """Draw on a terminal, or print lines. Raises OSError when stderr is closed."""
     console = Console(stderr=True)
     drawable = console.is_terminal and not console.is_dumb_terminal
-    with _live(console, spec, feed) if drawable else _plain(spec, feed) as show:
+    with _draw_on_terminal(console, spec, feed) if drawable else _print_lines(spec, feed) as show:
         rounds(show)
 
 
@@ -168,7 +174,9 @@ class _Feed:
 
 
 @contextmanager
-def _live(console: Console, spec: ConsoleSpec, feed: _Feed) -> Iterator[Callable[[], None]]:
+def _draw_on_terminal(
+    console: Console, spec: ConsoleSpec, feed: _Feed
+) -> Iterator[Callable[[], None]]:
     """Show the console on the terminal's alternate page while in the foreground; restore the main
     page afterwards.
     """
@@ -180,7 +188,7 @@ def _live(console: Console, spec: ConsoleSpec, feed: _Feed) -> Iterator[Callable
         redirect_stdout=False,
         redirect_stderr=False,
     )
-    with _keys(spec) as (reader, desk):
+    with _open_keyboard(spec) as (reader, desk):
 
         def show() -> None:
             feed.update()
@@ -200,11 +208,13 @@ def _live(console: Console, spec: ConsoleSpec, feed: _Feed) -> Iterator[Callable
             yield show
         finally:
             live.stop()
-    print(line(feed.model.view(spec.clock.now())), file=sys.stderr)  # a last line that remains
+    print(
+        format_line(feed.model.view(spec.clock.now())), file=sys.stderr
+    )  # a last line that remains
 
 
 @contextmanager
-def _keys(spec: ConsoleSpec) -> Iterator[tuple[key_reader.KeyReader | None, keys.Desk]]:
+def _open_keyboard(spec: ConsoleSpec) -> Iterator[tuple[key_reader.KeyReader | None, keys.Desk]]:
     """The keyboard, if there is one and the control port takes what it asks for."""
     desk = keys.Desk(requests.request_sender(spec.socket or _SOCKET, spec.run_dir.name))
     reader = None
@@ -219,7 +229,7 @@ def _keys(spec: ConsoleSpec) -> Iterator[tuple[key_reader.KeyReader | None, keys
 
 
 @contextmanager
-def _plain(spec: ConsoleSpec, feed: _Feed) -> Iterator[Callable[[], None]]:
+def _print_lines(spec: ConsoleSpec, feed: _Feed) -> Iterator[Callable[[], None]]:
     """Print a line per second, and important events at once."""
     due_s = spec.clock.now()
 
@@ -233,7 +243,7 @@ def _plain(spec: ConsoleSpec, feed: _Feed) -> Iterator[Callable[[], None]]:
         ]
         now_s = spec.clock.now()
         if now_s >= due_s:
-            lines.append(line(feed.model.view(now_s)))
+            lines.append(format_line(feed.model.view(now_s)))
             due_s = now_s - (now_s - due_s) % _PLAIN_S + _PLAIN_S
         for each in lines:
             print(each, file=sys.stderr, flush=True)

@@ -14,7 +14,12 @@ from rich.text import Text
 from membrane_ctrl.config.schema import Config
 from membrane_ctrl.console.keys import HELP
 from membrane_ctrl.console.model import ConsoleView, ShapeView
-from membrane_ctrl.console.why import duration, holders, number, percent
+from membrane_ctrl.console.why import (
+    format_duration,
+    format_number,
+    format_percent,
+    list_used_sensors,
+)
 from membrane_ctrl.model import columns, telemetry
 from membrane_ctrl.model.columns import COLUMNS, MISSING, PUBLISHED, TERMS, columns_of
 from membrane_ctrl.model.event_base import Event, LogLevel
@@ -156,18 +161,20 @@ class ConsolePage:
         """
         view = self._view
         time_left = (
-            f"{duration(view.left_s)} left" if math.isfinite(view.left_s) else "until stopped"
+            f"{format_duration(view.left_s)} left"
+            if math.isfinite(view.left_s)
+            else "until stopped"
         )
         title = Text.assemble(" ", (view.state.name.lower(), _STATE_STYLES.get(view.state, "bold")))
-        title.append(f" for {duration(view.state_age_s)} ")
-        trend = () if "trend" in omitted else _trend(view, self._config, trend_s, rows)
-        figures = _figures(view, self._config, trend, omitted)
+        title.append(f" for {format_duration(view.state_age_s)} ")
+        trend = () if "trend" in omitted else _make_trend_items(view, self._config, trend_s, rows)
+        figures = _make_figures_table(view, self._config, trend, omitted)
         parts: list[RenderableType] = [
-            _headline(view, self._config),
+            _make_headline(view, self._config),
             *([] if "" in omitted else [Text()]),
             figures,
         ]
-        parts += _help(below) if self._help else _events(view, below)
+        parts += _make_help_lines(below) if self._help else _make_event_lines(view, below)
         if self._foot:
             style = "bold yellow" if self._asks else "dim"
             parts.append(Text(self._foot, style=style, no_wrap=True, overflow="ellipsis"))
@@ -177,7 +184,7 @@ class ConsolePage:
             title=title,
             title_align="left",
             subtitle=Text(
-                f" run {duration(view.elapsed_s)}, {time_left} · {self._run} ",
+                f" run {format_duration(view.elapsed_s)}, {time_left} · {self._run} ",
                 style="dim",
                 overflow="ellipsis",
             ),
@@ -186,7 +193,7 @@ class ConsolePage:
         )
 
 
-def _events(view: ConsoleView, lines: int) -> list[RenderableType]:
+def _make_event_lines(view: ConsoleView, lines: int) -> list[RenderableType]:
     """The last events in so many lines, the newest at the bottom."""
     if lines < _EVENTS_MIN:
         return [Text()] * lines
@@ -212,7 +219,7 @@ def _style_event(event: Event) -> str:
     return "green" if event.closes else "default"
 
 
-def _help(lines: int) -> list[RenderableType]:
+def _make_help_lines(lines: int) -> list[RenderableType]:
     """The keys, and the commands that do the same from elsewhere, as far as the lines go."""
     made: list[RenderableType] = [Text()]
     for key, does, command in HELP:
@@ -225,7 +232,7 @@ def _help(lines: int) -> list[RenderableType]:
     return [*made, *[Text()] * lines][:lines]
 
 
-def _headline(view: ConsoleView, config: Config) -> Text:
+def _make_headline(view: ConsoleView, config: Config) -> Text:
     """The standing fault, else why the pump is where it is."""
     if view.silent_s:
         return Text(f"no tick for {view.silent_s:.1f} s", style="bold red")
@@ -242,7 +249,7 @@ def _headline(view: ConsoleView, config: Config) -> Text:
     return line.append(f"\n{view.go_on}", style="default") if view.go_on else line
 
 
-def _figures(
+def _make_figures_table(
     view: ConsoleView, config: Config, trend: Sequence[tuple[str, Text]], omitted: Sequence[str]
 ) -> Table:
     table = Table.grid(padding=(0, 1))
@@ -253,18 +260,18 @@ def _figures(
         table.add_row("", "waiting for the first tick")
         return table
     for label, line in (
-        ("error", _error(view, config)),
+        ("error", _format_error(view, config)),
         *trend,
-        ("mirror", _mirror(row)),
+        ("mirror", _format_mirror(row)),
         ("gains", Text(view.gains)),
-        ("pump", _pump(row, view.flow_most_um_per_s)),
-        ("flow", _flow(row)),
-        ("gas", _gas(view, row)),
+        ("pump", _format_pump(row, view.flow_most_um_per_s)),
+        ("flow", _format_flow(row)),
+        ("gas", _format_gas(view, row)),
         ("", Text()),
-        *_shape(view.shape, row),
+        *_make_shape_items(view.shape, row),
         ("", Text()),
-        ("lateness", _lateness(view, row)),
-        ("faults", _faults(view)),
+        ("lateness", _format_lateness(view, row)),
+        ("faults", _format_faults(view)),
     ):
         if label not in omitted:
             table.add_row(label, line)
@@ -275,7 +282,7 @@ def _figures(
     return table
 
 
-def _error(view: ConsoleView, config: Config) -> Text:
+def _format_error(view: ConsoleView, config: Config) -> Text:
     row = view.row
     assert row is not None
     inside = abs(row.error_um) <= config.limits.band_um
@@ -288,12 +295,15 @@ def _error(view: ConsoleView, config: Config) -> Text:
     )
     text.append(f"   last minute: mean {mean}, std {std} {error.unit}, ", style="default")
     text.append(
-        f"{percent(view.in_band_fraction)} within ±{config.limits.band_um:g}", style="default"
+        f"{format_percent(view.in_band_fraction)} within ±{config.limits.band_um:g}",
+        style="default",
     )
     return text
 
 
-def _trend(view: ConsoleView, config: Config, seconds: int, rows: int) -> list[tuple[str, Text]]:
+def _make_trend_items(
+    view: ConsoleView, config: Config, seconds: int, rows: int
+) -> list[tuple[str, Text]]:
     """The bars of the last seconds with their labels; a blank label is not an item that can be
     omitted.
     """
@@ -303,7 +313,7 @@ def _trend(view: ConsoleView, config: Config, seconds: int, rows: int) -> list[t
     return list(zip(labels, signed_bars(shown, full_um, config.limits.band_um, rows), strict=True))
 
 
-def _others(row: telemetry.TelemetryRow, *groups: columns.Group) -> str:
+def _list_other_columns(row: telemetry.TelemetryRow, *groups: columns.Group) -> str:
     """Known values of the published columns of some groups that have no place of their own."""
     shown = [
         each.name for each in PUBLISHED if each.plot.group in groups and each.name not in _PLACED
@@ -311,15 +321,16 @@ def _others(row: telemetry.TelemetryRow, *groups: columns.Group) -> str:
     return "".join(f"  {row.labelled(name)}" for name in shown if math.isfinite(getattr(row, name)))
 
 
-def _mirror(row: telemetry.TelemetryRow) -> Text:
+def _format_mirror(row: telemetry.TelemetryRow) -> Text:
     text = Text.assemble("reading ", (row.quantity("displacement_um", sign=True), "bold"))
     text.append(
         "  "
-        f"{row.labelled('setpoint_um', sign=True)}{_others(row, columns.Group.LOOP, columns.Group.ESTIMATE)}"  # noqa: E501
+        f"{row.labelled('setpoint_um', sign=True)}{_list_other_columns(row, columns.Group.LOOP, columns.Group.ESTIMATE)}"  # noqa: E501
     )
     if math.isfinite(row.estimate_sigma_um):
         text.append(
-            f"  centre ± {row.quantity('estimate_sigma_um')} by {holders(row)}", style="green"
+            f"  centre ± {row.quantity('estimate_sigma_um')} by {list_used_sensors(row)}",
+            style="green",
         )
     if math.isfinite(row.truth_displacement_um):
         text.append(f"  truth {row.quantity('truth_displacement_um', sign=True)}", style="cyan")
@@ -327,20 +338,23 @@ def _mirror(row: telemetry.TelemetryRow) -> Text:
     return text
 
 
-def _pump(row: telemetry.TelemetryRow, most_um_per_s: float) -> Text:
+def _format_pump(row: telemetry.TelemetryRow, most_um_per_s: float) -> Text:
     flow = COLUMNS["flow_um_per_s"]
     text = level_bar(row.pump_fraction, _BAR_WIDTH)
     text.append(
-        f" {percent(row.pump_fraction)}, {flow.format_value(row.flow_um_per_s)} of ",
+        f" {format_percent(row.pump_fraction)}, {flow.format_value(row.flow_um_per_s)} of ",
         style="default",
     )
-    text.append(f"{most_um_per_s:g} {flow.unit}{_others(row, columns.Group.PUMP)}", style="default")
+    text.append(
+        f"{most_um_per_s:g} {flow.unit}{_list_other_columns(row, columns.Group.PUMP)}",
+        style="default",
+    )
     if row.vent_fraction > 0:
-        text.append(f"  vent {percent(row.vent_fraction)} open", style="yellow")
+        text.append(f"  vent {format_percent(row.vent_fraction)} open", style="yellow")
     return text
 
 
-def _flow(row: telemetry.TelemetryRow) -> Text:
+def _format_flow(row: telemetry.TelemetryRow) -> Text:
     terms = columns_of(TERMS)
     parts = [
         f"{each.label} {each.format_value(getattr(row, each.name), sign=True)}" for each in terms
@@ -348,47 +362,52 @@ def _flow(row: telemetry.TelemetryRow) -> Text:
     return Text(f"{'  '.join(parts)} {terms[0].unit}")
 
 
-def _gas(view: ConsoleView, row: telemetry.TelemetryRow) -> Text:
+def _format_gas(view: ConsoleView, row: telemetry.TelemetryRow) -> Text:
     text = Text(row.labelled("leak_um_per_s"))
     if view.too_tight:
         text.append(" too tight: open the bleed", style="bold yellow")
-    return text.append(_others(row, columns.Group.ENVIRONMENT))
+    return text.append(_list_other_columns(row, columns.Group.ENVIRONMENT))
 
 
-def _shape(shape: ShapeView, row: telemetry.TelemetryRow) -> list[tuple[str, RenderableType]]:
+def _make_shape_items(
+    shape: ShapeView, row: telemetry.TelemetryRow
+) -> list[tuple[str, RenderableType]]:
     state = Text(shape.state.name.lower(), style=_SHAPE_STYLES.get(shape.state, "default"))
     state.append(
-        f"  {row.labelled('trim_um', sign=True)}{_others(row, columns.Group.SHAPE)}",
+        f"  {row.labelled('trim_um', sign=True)}{_list_other_columns(row, columns.Group.SHAPE)}",
         style="default",
     )
     estimate = shape.estimate
-    change = number(shape.sag_change_um, 3, sign=True)
+    change = format_number(shape.sag_change_um, 3, sign=True)
     if change != MISSING:
-        sigma = number(shape.change_sigma_um, 3)
+        sigma = format_number(shape.change_sigma_um, 3)
         state.append(
-            f"  sag {change} ± {sigma} µm since {duration(shape.reference_s)}", style="default"
+            f"  sag {change} ± {sigma} µm since {format_duration(shape.reference_s)}",
+            style="default",
         )
     if shape.note:
         state.append(f"  {shape.note}", style="yellow")
     if estimate is None:
         return [("shape", state), ("cycle", Text("none yet", style="dim"))]
     cycle = Text(estimate.verdict, style=_VERDICT_STYLES[estimate.verdict])
-    cycle.append(f"  {duration(shape.age_s)} ago, {estimate.kind}, ", style="default")
-    cycle.append(f"residual {number(estimate.slope_residual_urad, 1, 'µrad')}, ", style="default")
-    cycle.append(f"in {number(1e3 * estimate.latency_s, 0, 'ms')}", style="default")
+    cycle.append(f"  {format_duration(shape.age_s)} ago, {estimate.kind}, ", style="default")
+    cycle.append(
+        f"residual {format_number(estimate.slope_residual_urad, 1, 'µrad')}, ", style="default"
+    )
+    cycle.append(f"in {format_number(1e3 * estimate.latency_s, 0, 'ms')}", style="default")
     cycle.append(
         f"  {shape.rejected}/{shape.cycles} rejected", style="yellow" if shape.rejected else "dim"
     )
     return [("shape", state), ("cycle", cycle)]
 
 
-def _lateness(view: ConsoleView, row: telemetry.TelemetryRow) -> Text:
+def _format_lateness(view: ConsoleView, row: telemetry.TelemetryRow) -> Text:
     late = COLUMNS["lateness_ms"]
     text = Text(
         f"{row.quantity('lateness_ms')}, worst of the minute "
         f"{late.format_value(view.lateness_max_ms)}"
     )
-    text.append(f" {late.unit}{_others(row, columns.Group.TIMING)}")
+    text.append(f" {late.unit}{_list_other_columns(row, columns.Group.TIMING)}")
     missed = int(row.missed_ticks)
     text.append(
         f", {missed} of {int(row.tick) + missed} ticks missed",
@@ -397,7 +416,7 @@ def _lateness(view: ConsoleView, row: telemetry.TelemetryRow) -> Text:
     return text
 
 
-def _faults(view: ConsoleView) -> Text:
+def _format_faults(view: ConsoleView) -> Text:
     if view.fault:
         text = Text(view.fault, style="bold red")
         return text.append(f"; {view.remedy}", style="default") if view.remedy else text

@@ -33,13 +33,13 @@ _GO_ON = {
 _WORTH_NAMING = 0.03  # of the flow: smaller contributions are not named
 
 
-def holders(row: TelemetryRow) -> str:
+def list_used_sensors(row: TelemetryRow) -> str:
     """The sensors that the estimate of the centre follows: laser and optics with their shares of
     its corrections.
     """
     seeing = {
-        f"laser {percent(1.0 - row.optics_share)}": row.laser_innovation,
-        f"optics {percent(row.optics_share)}": row.optics_innovation,
+        f"laser {format_percent(1.0 - row.optics_share)}": row.laser_innovation,
+        f"optics {format_percent(row.optics_share)}": row.optics_innovation,
         "barometer": row.barometer_innovation,
         "thermometer": row.thermometer_innovation,
     }
@@ -47,7 +47,9 @@ def holders(row: TelemetryRow) -> str:
     return ", ".join(words) or "nothing"
 
 
-def why(row: TelemetryRow, told: str, fault: str, config: Config, paused: bool = False) -> str:
+def explain_state(
+    row: TelemetryRow, told: str, fault: str, config: Config, paused: bool = False
+) -> str:
     """The line; `told` is the controller's last reason, `fault` describes the standing fault or is
     empty.
     """
@@ -64,12 +66,16 @@ def why(row: TelemetryRow, told: str, fault: str, config: Config, paused: bool =
     if state == State.INFLATE:
         to_go_um = row.target_um - row.filtered_um
         return (
-            f"{_flow(row)}: {'filling' if to_go_um > 0 else 'waiting for the leak'}, "
+            f"{_describe_pump_flow(row)}: {'filling' if to_go_um > 0 else 'waiting for the leak'}, "
             f"{abs(to_go_um):.1f} µm to go"
         )
     if abs(row.error_um) > config.limits.band_um:
-        return f"outside the band: {_outside(row)}"
-    return _balance(row) if state == State.HOLD else f"settling: {_balance(row)}"
+        return f"outside the band: {_describe_deviation(row)}"
+    return (
+        _describe_flow_terms(row)
+        if state == State.HOLD
+        else f"settling: {_describe_flow_terms(row)}"
+    )
 
 
 def _level_words(safe_level: SafeLevel, row: TelemetryRow, config: Config) -> str:
@@ -81,7 +87,7 @@ def _level_words(safe_level: SafeLevel, row: TelemetryRow, config: Config) -> st
     if row.vent_readback_fraction < _VENT_SHUT * row.vent_fraction:
         return (
             "pump is off; the vent is commanded open, but its read-back is "
-            f"{percent(row.vent_readback_fraction)}"
+            f"{format_percent(row.vent_readback_fraction)}"
         )
     return _LEVELS[safe_level]
 
@@ -106,22 +112,22 @@ def go_on(
     return f"go on: `{ctl} {command}`{key if keys else ''}" if command else ""
 
 
-def _outside(row: TelemetryRow) -> str:
+def _describe_deviation(row: TelemetryRow) -> str:
     """Direction of the deviation, and the pump's response to it (error = setpoint - reading)."""
     if row.error_um > 0:
         at_limit = row.flow_wanted_um_per_s > row.flow_um_per_s + 1e-6
         return (
             f"bowl {row.error_um:.1f} µm too shallow, "
-            f"{_flow(row)}{', its limit' if at_limit else ''}"
+            f"{_describe_pump_flow(row)}{', its limit' if at_limit else ''}"
         )
     waits = row.flow_um_per_s <= 0
     return (
         f"bowl {-row.error_um:.1f} µm too deep, "
-        f"{_flow(row)}{', only the leak can lower it' if waits else ''}"
+        f"{_describe_pump_flow(row)}{', only the leak can lower it' if waits else ''}"
     )
 
 
-def _balance(row: TelemetryRow) -> str:
+def _describe_flow_terms(row: TelemetryRow) -> str:
     """Contributions to the flow, largest first."""
     parts = {
         "integral": row.i_um_per_s,  # on average it balances the leak
@@ -133,16 +139,18 @@ def _balance(row: TelemetryRow) -> str:
     named = sorted(
         ((v, k) for k, v in parts.items() if abs(v) > least), key=lambda part: -abs(part[0])
     )
-    return f"{_flow(row)}: " + ", ".join(f"{value:+.2f} {name}" for value, name in named)
+    return f"{_describe_pump_flow(row)}: " + ", ".join(
+        f"{value:+.2f} {name}" for value, name in named
+    )
 
 
-def _flow(row: TelemetryRow) -> str:
+def _describe_pump_flow(row: TelemetryRow) -> str:
     if row.flow_um_per_s <= 0:
         return "pump is at 0"
     return f"pump gives {row.flow_um_per_s:.2f} µm/s"
 
 
-def number(value: float, digits: int, unit: str = "", sign: bool = False) -> str:
+def format_number(value: float, digits: int, unit: str = "", sign: bool = False) -> str:
     """Format `value` with its unit."""
     if not math.isfinite(value):
         return MISSING
@@ -150,12 +158,12 @@ def number(value: float, digits: int, unit: str = "", sign: bool = False) -> str
     return f"{figure} {unit}" if unit else figure
 
 
-def percent(fraction: float, digits: int = 0) -> str:
+def format_percent(fraction: float, digits: int = 0) -> str:
     """Format a fraction as a percentage."""
-    return number(100.0 * fraction, digits, "%")
+    return format_number(100.0 * fraction, digits, "%")
 
 
-def duration(seconds_s: float) -> str:
+def format_duration(seconds_s: float) -> str:
     """Format a time span: 7 s, 2:05, 3:02:05, 4 d 03:02:05."""
     if not math.isfinite(seconds_s):
         return MISSING

@@ -27,7 +27,7 @@ from membrane_ctrl.control.centre_estimate import (
     Sensor,
     SensorView,
 )
-from membrane_ctrl.control.filters import smoothing
+from membrane_ctrl.control.filters import lag_step_fraction
 from membrane_ctrl.control.gas_transit import Transit
 from membrane_ctrl.control.innovation_ramp import InnovationRamp
 from membrane_ctrl.control.noise_learning import LearnedFactor, ReadingNoise, configured_walk
@@ -255,7 +255,7 @@ class CentreFilter:
 
     def _predict(self, given: CentreReadings, dt_s: float) -> None:
         x, p, config = self.memory.x, self.memory.p, self._config
-        follow = smoothing(dt_s, self._gas_follows_air_s)
+        follow = lag_step_fraction(dt_s, self._gas_follows_air_s)
         x[_GAS] += self._transit.advance(given.flow_um_per_s, dt_s) - x[_LEAK] * dt_s
         x[_WARMTH] += follow * (x[_AIR] - x[_WARMTH])
         for matrix in (p, p.T):
@@ -378,7 +378,7 @@ class CentreFilter:
         elif leads:
             by_air = (
                 self._air_walk()
-                * (self._warmth_gain * smoothing(dt_s, self._gas_follows_air_s)) ** 2
+                * (self._warmth_gain * lag_step_fraction(dt_s, self._gas_follows_air_s)) ** 2
             )
             own = (centre := self._centre_walk()) / (centre + by_air)
             walks = ((self.memory.walks[0], own), (self.memory.walks[2], 1 - own))

@@ -13,7 +13,7 @@ import math
 from dataclasses import dataclass, field
 
 from membrane_ctrl.config.schema import LimitsConfig, MirrorConfig
-from membrane_ctrl.control.filters import LowPass, smoothing
+from membrane_ctrl.control.filters import LowPass, lag_step_fraction
 from membrane_ctrl.model.state_tree import Count, StateNode
 
 # 0.5 Pa of noise per sample are then 0.7 µm at 10 Hz and 2.3 µm at 1 Hz
@@ -104,7 +104,7 @@ class _Since:
         )
         if memory.share > 1.0:
             return f"{self.sensor} {by_laser_um:+.0f} µm, gauge {by_gauge_um:+.0f} µm"
-        share = smoothing(dt_s, self.follow_s)
+        share = lag_step_fraction(dt_s, self.follow_s)
         memory.laser_um += share * by_laser_um
         memory.trim_um += share * trimmed_um
         memory.root += share * (root - memory.root)

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from membrane_ctrl.model.state_tree import StateNode
 
 
-def smoothing(dt_s: float, time_constant_s: float) -> float:
+def lag_step_fraction(dt_s: float, time_constant_s: float) -> float:
     """Step fraction of a first-order lag, 1 - exp(-dt / T); 1 without a lag."""
     return -math.expm1(-dt_s / time_constant_s) if time_constant_s > 0 else 1.0
 
@@ -37,7 +37,7 @@ class LowPass(StateNode):
         if math.isnan(self.value):
             self.value = given
         share = dt_s / self.age_s if dt_s > 0 else 0.0
-        self.value += max(smoothing(dt_s, time_constant_s), share) * (given - self.value)
+        self.value += max(lag_step_fraction(dt_s, time_constant_s), share) * (given - self.value)
         return self.value
 
 
@@ -62,7 +62,7 @@ class LagRate(StateNode):
         self, given: float, dt_s: float, time_constant_s: float, step_max: float = math.inf
     ) -> float:
         """Mean rate per second over the step; `given` may be NaN."""
-        share = smoothing(dt_s, time_constant_s)
+        share = lag_step_fraction(dt_s, time_constant_s)
         if math.isfinite(given):
             if self.absent or abs(given - self.input) > step_max:
                 self.lag = given - self.rate_per_s * dt_s / share

@@ -4,7 +4,7 @@ from collections import deque
 from dataclasses import dataclass, field
 from itertools import islice
 
-from membrane_ctrl.control.filters import smoothing
+from membrane_ctrl.control.filters import lag_step_fraction
 from membrane_ctrl.model.state_tree import StateNode
 
 
@@ -44,7 +44,7 @@ class Transit:
         late = (1 - self._rest) * memory.flows[self._ticks] + self._rest * memory.flows[
             self._ticks + 1
         ]
-        moved = smoothing(dt_s, self._lag_s) * (late - memory.arriving)
+        moved = lag_step_fraction(dt_s, self._lag_s) * (late - memory.arriving)
         memory.arriving += moved
         return late * dt_s - self._lag_s * moved
 
@@ -65,5 +65,5 @@ class Transit:
         flow = self.memory.arriving
         for late in range(self._ticks, -1, -1):
             step_s = self._period_s * (self._rest if late == self._ticks else 1.0)
-            flow += smoothing(step_s, self._lag_s) * (self.memory.flows[late] - flow)
+            flow += lag_step_fraction(step_s, self._lag_s) * (self.memory.flows[late] - flow)
         return flow

@@ -110,7 +110,7 @@ class InnerLoop:
         # both poles of the loop, its own and the pump's or a faster one, by what a tick leaves
         # (docs/explanation/estimator.md)
         slow_per_s, fast_per_s = (
-            filters.smoothing(tick_s, s) / tick_s for s in (own_s, min(own_s, lag_s))
+            filters.lag_step_fraction(tick_s, s) / tick_s for s in (own_s, min(own_s, lag_s))
         )
         self._error_gain_per_s = lag_s * slow_per_s * fast_per_s if lag_s > 0 else slow_per_s
         self._due_gain = (1 - lag_s * slow_per_s) * (1 - lag_s * fast_per_s)
@@ -122,7 +122,7 @@ class InnerLoop:
         self._weight = setpoint_weight.SetpointWeight(
             loop.setpoint_weight, loop.ti_s, memory.weight
         )
-        self._pid = pid.Pid(_gains(loop), flow_max_um_per_s, memory.integrator)
+        self._pid = pid.Pid(_make_pid_gains(loop), flow_max_um_per_s, memory.integrator)
         self._feedforward = FeedForward(loop, memory.feedforward)
         self._limiter = flow_limiter.FlowLimiter(
             flow_max_um_per_s, loop.flow_rate_limit_um_per_s2, memory.limiter
@@ -342,7 +342,7 @@ class InnerLoop:
         self._limiter.flow_max_um_per_s = self._pid.flow_max_um_per_s = flow_max_um_per_s
         self._limiter.rate_um_per_s2 = loop.flow_rate_limit_um_per_s2
         self._feedforward.set_gains(loop)
-        self._pid.set_gains(_gains(loop))
+        self._pid.set_gains(_make_pid_gains(loop))
 
     def _filter_reading(self, displacement_um: float, dt_s: float) -> float:
         return self.memory.measured.update(displacement_um, dt_s, self._loop.measurement_filter_s)
@@ -428,5 +428,5 @@ class InnerLoop:
         )
 
 
-def _gains(loop: LoopConfig) -> pid.PidGains:
+def _make_pid_gains(loop: LoopConfig) -> pid.PidGains:
     return pid.PidGains(loop.kp_per_s, loop.ti_s, loop.td_s)

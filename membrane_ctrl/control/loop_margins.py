@@ -9,7 +9,7 @@ import math
 import numpy as np
 
 from membrane_ctrl.config.control import LoopConfig
-from membrane_ctrl.control.filters import smoothing
+from membrane_ctrl.control.filters import lag_step_fraction
 from membrane_ctrl.model.arrays import ComplexArray, FloatArray
 
 # docs/explanation/physics.md, inner loop; the tick itself takes 5 ms from sample to write
@@ -27,7 +27,7 @@ def open_loop(loop: LoopConfig, omega: FloatArray) -> ComplexArray:
     """
     dt_s = 1 / loop.rate_hz
     z = np.exp(1j * omega * dt_s)
-    share = smoothing(dt_s, loop.measurement_filter_s)
+    share = lag_step_fraction(dt_s, loop.measurement_filter_s)
     measurement_filter = share / (1 - (1 - share) / z)
     derivative = loop.td_s * (1 - 1 / z) / dt_s
     pi = loop.kp_per_s * (

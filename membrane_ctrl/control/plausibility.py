@@ -14,7 +14,7 @@ import math
 from dataclasses import dataclass, field
 
 from membrane_ctrl.control.film_monitor import SMOOTH_S, are_means_known
-from membrane_ctrl.control.filters import LowPass, smoothing
+from membrane_ctrl.control.filters import LowPass, lag_step_fraction
 from membrane_ctrl.model.events import FaultySensor
 from membrane_ctrl.model.shape_estimate import ShapeEstimate
 from membrane_ctrl.model.state_tree import Count, StateNode
@@ -91,7 +91,7 @@ class ReferenceMeans(StateNode):
         self, means: tuple[float, float, float], dt_s: float, time_constant_s: float
     ) -> None:
         """Move it towards the present means."""
-        share = smoothing(dt_s, time_constant_s)
+        share = lag_step_fraction(dt_s, time_constant_s)
         self.laser_um += share * (means[0] - self.laser_um)
         self.optics_um += share * (means[1] - self.optics_um)
         self.gauge_pa += share * (means[2] - self.gauge_pa)

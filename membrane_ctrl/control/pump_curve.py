@@ -56,21 +56,21 @@ class _Measured:
 
     def flow(self, fraction: float) -> float:
         return (
-            _between(self._fractions, self._flows, fraction)
+            _interpolate_clamped(self._fractions, self._flows, fraction)
             if fraction >= self._fractions[0]
             else 0.0
         )
 
     def fraction(self, flow_um_per_s: float) -> float:
-        return _between(self._flows, self._fractions, flow_um_per_s)
+        return _interpolate_clamped(self._flows, self._fractions, flow_um_per_s)
 
 
-def branch(pump: PumpConfig, flows_um_per_s: Sequence[float]) -> _StraightLine | _Measured:
+def make_branch(pump: PumpConfig, flows_um_per_s: Sequence[float]) -> _StraightLine | _Measured:
     """One branch of the pump's curve."""
     return _Measured(pump.curve_fraction, flows_um_per_s) if flows_um_per_s else _StraightLine(pump)
 
 
-def _between(xs: Sequence[float], ys: Sequence[float], x: float) -> float:
+def _interpolate_clamped(xs: Sequence[float], ys: Sequence[float], x: float) -> float:
     """Linear interpolation, clamped to the ends."""
     right = min(max(bisect_right(xs, x), 1), len(xs) - 1)
     low, high = xs[right - 1], xs[right]
@@ -145,8 +145,8 @@ class PumpCurve:
     def __init__(self, pump: PumpConfig, memory: PumpCurveState | None = None) -> None:
         self.memory = memory or PumpCurveState()
         self._start_fraction = pump.start_fraction
-        self._rising = branch(pump, pump.curve_um_per_s)
-        self._falling = branch(pump, pump.curve_falling_um_per_s or pump.curve_um_per_s)
+        self._rising = make_branch(pump, pump.curve_um_per_s)
+        self._falling = make_branch(pump, pump.curve_falling_um_per_s or pump.curve_um_per_s)
         # Below its first command a measured curve knows no running pump, on its falling branch
         # either
         self._least_fraction = max(

@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from membrane_ctrl.config.port import SOCKET_NAME, FleetConfig
-from membrane_ctrl.config.toml_file import load, read_toml
+from membrane_ctrl.config.toml_file import load_toml, read_toml
 from membrane_ctrl.control_port import sockets
 from membrane_ctrl.control_port.client import ANSWER_S, PortClient
 from membrane_ctrl.control_port.commander import CommandSession
@@ -73,7 +73,7 @@ def fleet(file: Path) -> dict[str, Where]:
         return None if name is None else file.resolve().parent / Path(name).expanduser()
 
     found = {}
-    for hold in load(file, FleetConfig).holds:
+    for hold in load_toml(file, FleetConfig).holds:
         socket = beside(hold.socket)
         files = (beside(hold.certificate_file), beside(hold.key_file), beside(hold.authority_file))
         found[hold.name] = Where(

@@ -130,7 +130,9 @@ def parse(line: bytes) -> Request:
     try:
         return Request.model_validate_json(line, strict=True)
     except ValidationError as error:
-        reason = toml_file.describe(error.errors(include_url=False)[0], Request).removeprefix(": ")
+        reason = toml_file.describe_error(error.errors(include_url=False)[0], Request).removeprefix(
+            ": "
+        )
         raise RequestError(_short(reason), _number_in(line)) from None
 
 

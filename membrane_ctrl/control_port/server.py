@@ -339,12 +339,12 @@ class Port:
         experiment = (
             None
             if request.experiment is None
-            else toml_file.parse(request.experiment, ExperimentSpec, "tune")
+            else toml_file.parse_tables(request.experiment, ExperimentSpec, "tune")
         )
         pump = (
             None
             if request.pump is None
-            else toml_file.parse(request.pump, schema.PumpConfig, "gains: pump")
+            else toml_file.parse_tables(request.pump, schema.PumpConfig, "gains: pump")
         )
         value, shape_s, step_um = (
             math.nan if number is None else number
@@ -378,7 +378,7 @@ class Port:
     def _new_loop(self, changes: dict[str, bool | float]) -> schema.LoopConfig:
         if "setpoint_um" in changes:
             raise errors.InputError("gains: setpoint_um: use the command setpoint")
-        loop = toml_file.parse(
+        loop = toml_file.parse_tables(
             {**self._hooks.loop().model_dump(), **changes}, schema.LoopConfig, "gains"
         )
         weak = cross_check_plant.weak_gains(loop)

@@ -211,7 +211,7 @@ def make_command_event(command: Command, refused: str) -> CommandTaken:
         why=command.why,
         value=_or_none(command.value),
         text=command.text or None,
-        loop=_settings(command),
+        loop=_list_settings(command),
         experiment=None
         if spec is None
         else spec.model_dump(exclude=None if spec.steps else {"steps"}),
@@ -225,7 +225,7 @@ def _or_none(value: float) -> float | None:
     return value if math.isfinite(value) else None
 
 
-def _settings(command: Command) -> dict[str, object] | None:
+def _list_settings(command: Command) -> dict[str, object] | None:
     """What a `gains` sets, for its event: the loop's keys, and the pump's table if that changes."""
     if command.loop is None:
         return None

@@ -46,14 +46,14 @@ def cross_check(
 ) -> tuple[cross_check_plant.ConfigFinding, ...]:
     """Findings on a configuration and, if given, on its board's limits; errors first."""
     say = cross_check_plant.ConfigFindings(config)
-    _finite(config, say)
+    _check_finite(config, say)
     if not say.found:  # the others compute with the values
         for judge in _RULES:
             judge(config, say)
         for judge_board in (
             cross_check_plant.judge_ranges,
             cross_check_interlocks.judge_interlock_board,
-            _board,
+            _check_board,
             _board_guards,
         ):
             judge_board(config, board or _UNKNOWN, say)
@@ -70,13 +70,13 @@ def require_sound(
     return findings
 
 
-def _finite(config: Config, say: cross_check_plant.ConfigFindings) -> None:
+def _check_finite(config: Config, say: cross_check_plant.ConfigFindings) -> None:
     """Refuse NaN, which the file's reader refuses too, but which a program may have set."""
-    for field, value in _numbers(config, ""):
+    for field, value in _list_numbers(config, ""):
         say.error(not math.isfinite(value), field, "is not a number", "set a finite value")
 
 
-def _numbers(value: Any, field: str) -> Iterator[tuple[str, float]]:
+def _list_numbers(value: Any, field: str) -> Iterator[tuple[str, float]]:
     if isinstance(value, BaseModel):
         inner: Iterable[tuple[Any, Any]] = (
             (name, getattr(value, name)) for name in type(value).model_fields
@@ -88,10 +88,10 @@ def _numbers(value: Any, field: str) -> Iterator[tuple[str, float]]:
             yield field, value
         return
     for name, part in inner:
-        yield from _numbers(part, f"{field}.{name}".lstrip("."))
+        yield from _list_numbers(part, f"{field}.{name}".lstrip("."))
 
 
-def _resume(config: Config, say: cross_check_plant.ConfigFindings) -> None:
+def _check_resume(config: Config, say: cross_check_plant.ConfigFindings) -> None:
     resume = config.resume
     known = [rule.name for rule in safety.TABLE]
     may = sorted(rule.name for rule in safety.TABLE if rule.may_resume)
@@ -124,7 +124,7 @@ def _resume(config: Config, say: cross_check_plant.ConfigFindings) -> None:
         )
 
 
-def _watchdog(config: Config, say: cross_check_plant.ConfigFindings) -> None:
+def _check_watchdog(config: Config, say: cross_check_plant.ConfigFindings) -> None:
     devices, limits = config.devices or _TWIN_BOARD, config.limits
     tick_s, watchdog_s = 1.0 / config.loop.rate_hz, devices.watchdog_s
     if config.devices is not None:
@@ -163,7 +163,7 @@ def _watchdog(config: Config, say: cross_check_plant.ConfigFindings) -> None:
     say.warn(limits.lateness_max_ms < 5.0, late, "a healthy machine can be that late", "set 100 ms")
 
 
-def _stale(config: Config, say: cross_check_plant.ConfigFindings) -> None:
+def _check_stale(config: Config, say: cross_check_plant.ConfigFindings) -> None:
     limits, tick_s = config.limits, 1.0 / config.loop.rate_hz
     why, least = (
         f"shorter than 1.5 ticks of {tick_s:g} s: every late tick would be a fault",
@@ -205,7 +205,7 @@ def _slowest_answers(devices: DevicesConfig) -> Iterator[tuple[str, float]]:
     yield slowest[0][0], sum(timeout_s for _, timeout_s in slowest)
 
 
-def _states(config: Config, say: cross_check_plant.ConfigFindings) -> None:
+def _check_states(config: Config, say: cross_check_plant.ConfigFindings) -> None:
     states, limits = config.states, config.limits
     for name, most_s in (
         ("hold_flow_max_s", _BLIND_S),
@@ -260,7 +260,7 @@ def _states(config: Config, say: cross_check_plant.ConfigFindings) -> None:
     say.error(pressure_pa < _GAUGE_NOISE_PA, vented, why, f"set at least {_GAUGE_NOISE_PA:g} Pa")
 
 
-def _limits(config: Config, say: cross_check_plant.ConfigFindings) -> None:
+def _check_limits(config: Config, say: cross_check_plant.ConfigFindings) -> None:
     limits, setpoint_um = config.limits, config.loop.setpoint_um
     trim_um = config.shape.trim_max_um if config.shape.enabled else 0.0
     above_um, below_um = (
@@ -297,7 +297,9 @@ def _limits(config: Config, say: cross_check_plant.ConfigFindings) -> None:
     say.error(limits.step_max_um >= above_um, "limits.step_max_um", why, "lower it")
 
 
-def _board(config: Config, board: BenchIdentity, say: cross_check_plant.ConfigFindings) -> None:
+def _check_board(
+    config: Config, board: BenchIdentity, say: cross_check_plant.ConfigFindings
+) -> None:
     """Check the limits that the board enforces itself."""
     own_pa = board.gauge_pressure_limit_pa
     above = config.limits.gauge_pressure_max_pa > own_pa
@@ -353,11 +355,11 @@ def _board_guards(
 
 
 _RULES = (
-    _resume,
-    _watchdog,
-    _stale,
-    _states,
-    _limits,
+    _check_resume,
+    _check_watchdog,
+    _check_stale,
+    _check_states,
+    _check_limits,
     cross_check_plant.judge_gauge,
     cross_check_plant.judge_film,
     cross_check_plant.judge_alarms,

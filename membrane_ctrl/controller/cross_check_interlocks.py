@@ -19,9 +19,9 @@ def judge_interlocks(config: Config, say: ConfigFindings) -> None:
     for index, interlock in enumerate(config.interlocks):
         field = f"devices.interlocks.{index}"
         if isinstance(interlock, PolledInterlockConfig):
-            _polled(field, interlock, say)
+            _check_polled(field, interlock, say)
         if isinstance(interlock, ModbusInputConfig):
-            _modbus(field, interlock, config, say)
+            _check_modbus(field, interlock, config, say)
         why = (
             "no vent is fitted: an open circuit only stops the pump, and the leak lowers the mirror"
         )
@@ -29,7 +29,7 @@ def judge_interlocks(config: Config, say: ConfigFindings) -> None:
         say.warn(without_vent, f"{field}.safe_level", why, "fit a vent (devices.vent)")
 
 
-def _polled(field: str, interlock: PolledInterlockConfig, say: ConfigFindings) -> None:
+def _check_polled(field: str, interlock: PolledInterlockConfig, say: ConfigFindings) -> None:
     period_s, age_max_s = interlock.period_s, interlock.age_max_s
     slowest_s = period_s + (
         interlock.timeout_s if isinstance(interlock, ModbusInputConfig) else 0.0
@@ -53,7 +53,9 @@ def _polled(field: str, interlock: PolledInterlockConfig, say: ConfigFindings) -
     )
 
 
-def _modbus(field: str, interlock: ModbusInputConfig, config: Config, say: ConfigFindings) -> None:
+def _check_modbus(
+    field: str, interlock: ModbusInputConfig, config: Config, say: ConfigFindings
+) -> None:
     coil = interlock.function == "coil"
     why = "a coil keeps what was written last: nothing detects that its writer has stopped"
     say.warn(coil, f"{field}.function", why, "wire the circuit to a discrete input")

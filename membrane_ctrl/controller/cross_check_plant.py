@@ -251,13 +251,13 @@ def judge_optics(config: Config, say: ConfigFindings) -> None:
         slow, least = shape.track_rate_hz < _TRACK_LEAST_HZ, f"set at least {_TRACK_LEAST_HZ:g} Hz"
         say.error(slow, "shape.track_rate_hz", "too few figures to hold the mirror by", least)
     camera = config.devices is not None and config.devices.camera is not None
-    _geometry("optics.geometry", config.optics, config.shape.enabled or camera, say)
+    _check_geometry("optics.geometry", config.optics, config.shape.enabled or camera, say)
     if config.twin.geometry is not None:
         true = config.optics.model_copy(update={"geometry": config.twin.geometry})
-        _geometry("twin.geometry", true, config.shape.enabled, say)
+        _check_geometry("twin.geometry", true, config.shape.enabled, say)
 
 
-def _geometry(field: str, optics: OpticsConfig, used: bool, say: ConfigFindings) -> None:
+def _check_geometry(field: str, optics: OpticsConfig, used: bool, say: ConfigFindings) -> None:
     geometry = optics.geometry
     for name in ("a", "b"):
         length_mm, sigma_mm = getattr(geometry, f"{name}_mm"), getattr(geometry, f"{name}_sigma_mm")
@@ -266,7 +266,7 @@ def _geometry(field: str, optics: OpticsConfig, used: bool, say: ConfigFindings)
     if geometry.camera is not None and geometry.camera.position_mm[2] <= 0.0:
         why = "the camera is behind the mirror"
         say.error(True, f"{field}.camera.position_mm", why, "z points out of the mirror")
-    elif used and (found := sight.doubt(optics)):
+    elif used and (found := sight.find_doubt(optics)):
         say.error(found.hopeless, f"{field}.{found.key}", found.why, found.remedy)
         say.warn(not found.hopeless, f"{field}.{found.key}", found.why, found.remedy)
 

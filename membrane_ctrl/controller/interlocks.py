@@ -75,7 +75,7 @@ class Interlocks:
         self.judged_mask = self.open_mask
         if state == State.LOWER:
             self.judged_mask &= ~memory.standby_mask
-        return [self._event(place) for place in _places(changed)]
+        return [self._event(place) for place in _iterate_set_bits(changed)]
 
     def _event(self, place: int) -> Event:
         if not self.open_mask >> place & 1:
@@ -93,18 +93,19 @@ class Interlocks:
     def safe_level(self) -> SafeLevel:
         """The deepest level that the judged interlocks demand."""
         return max(
-            (self._levels[place] for place in _places(self.judged_mask)), default=SafeLevel.NONE
+            (self._levels[place] for place in _iterate_set_bits(self.judged_mask)),
+            default=SafeLevel.NONE,
         )
 
     def describe_open(self, mask: int) -> str:
         """Names and texts of the interlocks of a mask, for people; empty for none."""
         return "; ".join(
             f"interlock {self._names[place]} is open: {self._texts[place]}"
-            for place in _places(mask)
+            for place in _iterate_set_bits(mask)
         )
 
 
-def _places(mask: int) -> Iterator[int]:
+def _iterate_set_bits(mask: int) -> Iterator[int]:
     """Yield the places of the set bits, lowest first."""
     for place in range(mask.bit_length()):
         if mask >> place & 1:

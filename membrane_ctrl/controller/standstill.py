@@ -217,9 +217,9 @@ class Standstill:
         most_um = (
             _RISE_MAX_UM
             + abs(self._loop.barometer_gain_um_per_pa)
-            * _range(block.ambient_pressure_pa for block in blocks)
+            * _find_range(block.ambient_pressure_pa for block in blocks)
             + abs(self._loop.temperature_gain_um_per_k)
-            * _range(block.air_temperature_c for block in blocks)
+            * _find_range(block.air_temperature_c for block in blocks)
         )
         checks = ((rise_um, most_um), (rise_pa, _PA_PER_UM * most_um))
         rises = [rise > most for rise, most in checks if math.isfinite(rise)]
@@ -228,7 +228,7 @@ class Standstill:
         return f"{rise_um:+.0f} µm, {rise_pa:+.1f} Pa in {over_s:.0f} s with the pump commanded off"
 
 
-def _range(values: Iterable[float]) -> float:
+def _find_range(values: Iterable[float]) -> float:
     """Largest minus smallest; 0 without a sensor."""
     finite = [value for value in values if math.isfinite(value)]
     return max(finite) - min(finite) if finite else 0.0

@@ -56,7 +56,7 @@ def standby(context: TickContext) -> State:
 
 def check(context: TickContext) -> State:
     """Require good sensors for a while and a film that responds before the pump may run."""
-    missing = _missing(context)
+    missing = _list_missing_checks(context)
     if missing == NO_REASON:
         context.last_good_s = context.now_s
     # occasional lost answers do not make a bad sensor
@@ -78,7 +78,7 @@ def check(context: TickContext) -> State:
         context.sinking.add(context.now_s, context.observer.displacement_um)
     if good_s < context.config.states.check_s or missing != NO_REASON:
         return State.CHECK
-    return _begin(context, max(0.0, -context.sinking.per_s))
+    return _begin_loop(context, max(0.0, -context.sinking.per_s))
 
 
 def inflate(context: TickContext) -> State:
@@ -87,7 +87,7 @@ def inflate(context: TickContext) -> State:
     """
     states = context.config.states
     lag = abs(context.loop.lag_um) / states.inflate_pause_um
-    output = _drive(context, context.loop.ramp_um if lag > 1.0 else context.setpoint_um)
+    output = _drive_pump(context, context.loop.ramp_um if lag > 1.0 else context.setpoint_um)
     to_go_um = context.setpoint_um - output.filtered_um
     unseen = NO_REASON if math.isfinite(to_go_um) else context.observer.missing_reason
     to_go = f"{to_go_um:.1f} µm to go" if math.isfinite(to_go_um) else unseen.text or "no reading"
@@ -117,7 +117,7 @@ def inflate(context: TickContext) -> State:
 
 def settle(context: TickContext) -> State:
     """Stay within the band for a while before `hold` begins."""
-    output = _drive(context, context.setpoint_um)
+    output = _drive_pump(context, context.setpoint_um)
     band_um = context.config.limits.band_um
     settled_s = context.measure_good_time_s(
         not abs(output.error_um) >= band_um
@@ -137,7 +137,9 @@ def settle(context: TickContext) -> State:
 def hold(context: TickContext) -> State:
     """Hold the mirror at its setpoint."""
     if context.paused:
-        context.drive_by(context.loop.stale(_given(context, context.setpoint_um), context.dt_s))
+        context.drive_by(
+            context.loop.stale(_make_loop_input(context, context.setpoint_um), context.dt_s)
+        )
         context.explain(
             WhyCode.PAUSED, f"paused by {context.asked_by}: the pump keeps its mean flow"
         )
@@ -148,7 +150,7 @@ def hold(context: TickContext) -> State:
             context.paused = False
         return State.HOLD
     context.good_since_s = math.nan
-    _explain_hold(context, _drive(context, context.setpoint_um))
+    _explain_hold(context, _drive_pump(context, context.setpoint_um))
     return State.HOLD
 
 
@@ -163,7 +165,9 @@ def manual(context: TickContext) -> State:
     over = _manual_over(context)
     flow_um_per_s = context.mean_flow_um_per_s if over else context.manual_um_per_s
     context.drive_by(
-        context.loop.follow(_given(context, context.setpoint_um), flow_um_per_s, context.dt_s)
+        context.loop.follow(
+            _make_loop_input(context, context.setpoint_um), flow_um_per_s, context.dt_s
+        )
     )
     if over:
         context.explain(WhyCode.MANUAL_OVER, f"manual is over: {over}")
@@ -177,7 +181,7 @@ def tune(context: TickContext) -> State:
     """Run an experiment inside its guard; however it ends, the loop resumes at the holding flow."""
     trial = context.trial
     assert trial is not None  # made by the command that leads here
-    given = _given(context, context.setpoint_um)
+    given = _make_loop_input(context, context.setpoint_um)
     measuring_um = math.nan if context.laser_doubted else context.observer.moving_laser_um
     seen_um = given.displacement_um if context.config.by_optics else measuring_um
     if context.config.by_optics and given.estimate is not None and math.isfinite(seen_um):
@@ -346,7 +350,7 @@ def _manual_over(context: TickContext) -> str:
 def _asked_elsewhere(context: TickContext) -> State | None:
     """The requested state, if it is not a hold."""
     if context.trial is not None:
-        _drive(
+        _drive_pump(
             context, context.setpoint_um
         )  # the loop runs this tick: otherwise the pump would be off for 20 ms
         requested = f"{context.asked_by} requested the experiment {context.trial.spec.kind}"
@@ -369,7 +373,7 @@ def _test_actuators(context: TickContext) -> State:
         context.pump_fraction, context.vent_fraction = part.pump_fraction, part.vent_fraction
         context.explain(WhyCode.TESTING_ACTUATORS, f"testing the actuators: {part.name}", part.name)
         return State.CHECK
-    if _missing(context) != NO_REASON:
+    if _list_missing_checks(context) != NO_REASON:
         return State.CHECK  # the loop starts from a reading
     failure = test.failure()
     if failure:
@@ -379,7 +383,7 @@ def _test_actuators(context: TickContext) -> State:
         context.explain(WhyCode.FILM_NOT_RESPONDING, responds, test.is_second)
         test.again()
         return State.CHECK
-    return _begin(context, test.leak_um_per_s)
+    return _begin_loop(context, test.leak_um_per_s)
 
 
 def _running_test(context: TickContext) -> actuator_test.ActuatorTest:
@@ -397,7 +401,7 @@ def _running_test(context: TickContext) -> actuator_test.ActuatorTest:
     return test
 
 
-def _begin(context: TickContext, leak_um_per_s: float) -> State:
+def _begin_loop(context: TickContext, leak_um_per_s: float) -> State:
     """Hand over to the loop at the flow that balances the leak, so that the integrator need not
     find it.
     """
@@ -410,15 +414,15 @@ def _begin(context: TickContext, leak_um_per_s: float) -> State:
     return State.INFLATE
 
 
-def _drive(context: TickContext, target_um: float) -> inner_loop.LoopOutput:
+def _drive_pump(context: TickContext, target_um: float) -> inner_loop.LoopOutput:
     """Let the loop drive the pump: automatic with a valid reading, held mean flow without one."""
     drive = context.loop.step if context.levels.safe_level == SafeLevel.NONE else context.loop.stale
-    output = drive(_given(context, target_um), context.dt_s)
+    output = drive(_make_loop_input(context, target_um), context.dt_s)
     context.drive_by(output)
     return output
 
 
-def _given(context: TickContext, target_um: float) -> inner_loop.LoopInput:
+def _make_loop_input(context: TickContext, target_um: float) -> inner_loop.LoopInput:
     reading = context.observer.reading
     return inner_loop.LoopInput(
         target_um=target_um,
@@ -430,7 +434,7 @@ def _given(context: TickContext, target_um: float) -> inner_loop.LoopInput:
     )
 
 
-def _missing(context: TickContext) -> Reason:
+def _list_missing_checks(context: TickContext) -> Reason:
     """What the checks still lack; `NO_REASON` if nothing is missing."""
     reading = context.observer.reading
     if reading is None:

@@ -54,5 +54,8 @@ class TickAssembler:
             else:
                 self._pieces.append(message[1:])
         return TickBatch(
-            np.frombuffer(b"".join(records), dtype=RECORD), telemetry.unpack(rows), tails, snapshots
+            np.frombuffer(b"".join(records), dtype=RECORD),
+            telemetry.unpack_rows(rows),
+            tails,
+            snapshots,
         )

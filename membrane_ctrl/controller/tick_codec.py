@@ -95,7 +95,7 @@ def pack_tick(tick: int, inputs: TickInputs, outputs: TickOutputs, row: bytes) -
 
     `tick` counts from 1, and `row` is the packed telemetry row of the outputs.
     """
-    tail = _tail(inputs)
+    tail = _pack_tail(inputs)
     reading, estimate = inputs.reading, inputs.estimate
     record = _STRUCT.pack(
         tick,
@@ -111,7 +111,7 @@ def pack_tick(tick: int, inputs: TickInputs, outputs: TickOutputs, row: bytes) -
         output_crc(outputs, row),
         len(tail),
     )
-    return [*_pieces(PIECE, tail), TICK + record + row]
+    return [*_split_message(PIECE, tail), TICK + record + row]
 
 
 def pack_row(tick: int, row: telemetry.TelemetryRow) -> bytes:
@@ -128,12 +128,12 @@ def pack_snapshot(tick: int, snapshot: bytes) -> bytes:
     return SNAPSHOT_HEAD.pack(tick) + snapshot
 
 
-def _pieces(kind: bytes, data: bytes) -> list[bytes]:
+def _split_message(kind: bytes, data: bytes) -> list[bytes]:
     step = MESSAGE_BYTES - len(kind)
     return [kind + data[start : start + step] for start in range(0, len(data), step)]
 
 
-def _tail(inputs: TickInputs) -> bytes:
+def _pack_tail(inputs: TickInputs) -> bytes:
     if not inputs.commands and not inputs.dead_tasks:
         return b""
     commands = _COMMANDS.dump_python(inputs.commands)

@@ -47,10 +47,10 @@ def doors(
         return
     import asyncio
 
-    from membrane_ctrl.cli.options import configured
+    from membrane_ctrl.cli.options import load_configuration
     from membrane_ctrl.doors.names import Door
 
-    settings = configured(config)
+    settings = load_configuration(config)
     if not any(getattr(settings.doors, name) for name in _LIBRARIES):
         raise errors.InputError(
             "no bridge is configured: add [doors.mqtt], [doors.opcua] or [doors.epics] "

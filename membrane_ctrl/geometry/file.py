@@ -94,7 +94,7 @@ class GeometryFile:
         if self.pitch is not None:
             pattern = pattern.model_copy(update=self.pitch.model_dump())
         parts = {"geometry": self.geometry, "camera": camera, "pattern": pattern}
-        return toml_file.parse({**dict(optics), **parts}, OpticsConfig, str(self.path))
+        return toml_file.parse_tables({**dict(optics), **parts}, OpticsConfig, str(self.path))
 
 
 def read_geometry(path: str | Path) -> GeometryFile:
@@ -111,8 +111,8 @@ def read_geometry(path: str | Path) -> GeometryFile:
     hashed = geometry_hash.content_hash(tables if "geometry" in tables else {"geometry": tables})
     text = tomli_w.dumps(tables)
     if isinstance(table, dict):
-        toml_file.prune(table, GeometryConfig)
-    geometry = toml_file.parse(table, GeometryConfig, str(path))
+        toml_file.prune_unknown_keys(table, GeometryConfig)
+    geometry = toml_file.parse_tables(table, GeometryConfig, str(path))
     if not calibrated:
         return GeometryFile(
             path, geometry, None, None, None, GeometryOrigin(hashed, str(path)), text
@@ -151,5 +151,5 @@ def _optional_table(
 ) -> Table | None:
     table = tables.get(name)
     if isinstance(table, dict):
-        toml_file.prune(table, model)
-    return None if table is None else toml_file.parse(table, model, f"{path}: {name}")
+        toml_file.prune_unknown_keys(table, model)
+    return None if table is None else toml_file.parse_tables(table, model, f"{path}: {name}")

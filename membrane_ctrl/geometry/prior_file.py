@@ -51,14 +51,14 @@ class Prior:
         if geometry.reference_displacement_um is None:
             known = {"reference_displacement_um": optics.geometry.reference_displacement_um}
             geometry = geometry.model_copy(update=known)
-        return toml_file.parse(
+        return toml_file.parse_tables(
             {**dict(optics), "geometry": geometry}, schema.OpticsConfig, str(self.path)
         )
 
 
 def read_prior(path: Path) -> Prior:
     """Read a prior. Raises InputError."""
-    content = toml_file.load(path, PriorFile)
+    content = toml_file.load_toml(path, PriorFile)
     if content.schema_ != SCHEMA:
         raise errors.InputError(
             f"{path}: schema = {content.schema_}: a prior has {SCHEMA}; pass a geometry with "
@@ -81,9 +81,9 @@ def write_prior(
         "of": list(made_of),
         "rms_px": rms_px,
     }
-    with errors.writing(path):
+    with errors.convert_write_errors(path):
         path.parent.mkdir(parents=True, exist_ok=True)
         files.write_text_atomic(
-            files.users(path),
+            files.resolve_user_path(path),
             tomli_w.dumps({**program.file_origin(SCHEMA), **tables, "made": made}),
         )

@@ -32,7 +32,7 @@ class RunGeometry:
         """
         if not self.text:
             return
-        with errors.writing(run_dir / GEOMETRY_COPY):
+        with errors.convert_write_errors(run_dir / GEOMETRY_COPY):
             files.write_text_atomic(run_dir / GEOMETRY_COPY, self.text)
 
 
@@ -73,6 +73,6 @@ def require_plausible(optics: OpticsConfig, where: Path, depth_known: bool = Tru
     """Raises InputError for a geometry from `where` with which less than half of the mirror can be
     measured.
     """
-    found = sight.doubt(optics, depth_known)
+    found = sight.find_doubt(optics, depth_known)
     if found is not None and found.hopeless:
         raise errors.InputError(f"{where}: geometry.{found.key}: {found.why}; {found.remedy}")

@@ -70,7 +70,7 @@ def move_screen(
     """The bench with its screen shifted in its own axes, and then turned by a matrix (3, 3) from
     world to world.
     """
-    pinhole, rotation, origin, s_x, s_y = sight.poses(geometry)
+    pinhole, rotation, origin, s_x, s_y = sight.compute_poses(geometry)
     origin = origin + np.array(shift_mm) @ np.stack([s_x, s_y, np.cross(s_x, s_y)])
     if turn is not None:
         s_x, s_y = turn @ s_x, turn @ s_y

@@ -32,7 +32,7 @@ def read_spread(path: Path) -> GeometrySpread | None:
     table = toml_file.read_toml(path).get("covariance")
     if table is None:
         return None
-    content = toml_file.parse(table, CovarianceTable, f"{path}: covariance")
+    content = toml_file.parse_tables(table, CovarianceTable, f"{path}: covariance")
     if any(len(row) != len(content.names) for row in content.matrix) or len(content.matrix) != len(
         content.names
     ):

@@ -24,9 +24,9 @@ from membrane_ctrl.model.durations import pause_s
 from membrane_ctrl.model.shape_estimate import ESTIMATE_BYTES_MAX
 from membrane_ctrl.processes.child import Child
 from membrane_ctrl.processes.command_process import CommandProcess
-from membrane_ctrl.processes.event_pipe import pipe
+from membrane_ctrl.processes.event_pipe import make_pipe
 from membrane_ctrl.processes.frame_address import FrameAddress
-from membrane_ctrl.processes.ring import RingAddress, ring
+from membrane_ctrl.processes.ring import RingAddress, open_ring
 
 # Restarting does not help a child that ends more often
 _MOST_PER_HOUR = 10
@@ -161,18 +161,18 @@ class Rings:
 def rings_for(config: Config, truth: RingAddress | None, stack: ExitStack) -> Rings:
     """Make the rings; the stack frees their memory."""
     kept = round(_TELEMETRY_KEPT_S * config.loop.rate_hz)
-    rows = stack.enter_context(ring(kept, telemetry.ROW_BYTES))
-    events = stack.enter_context(ring(_EVENTS_KEPT, EVENT_BYTES))
-    inputs = stack.enter_context(ring(kept, MESSAGE_BYTES))
-    snapshots = stack.enter_context(ring(_SNAPSHOTS_KEPT, SNAPSHOT_MESSAGE_BYTES))
+    rows = stack.enter_context(open_ring(kept, telemetry.ROW_BYTES))
+    events = stack.enter_context(open_ring(_EVENTS_KEPT, EVENT_BYTES))
+    inputs = stack.enter_context(open_ring(kept, MESSAGE_BYTES))
+    snapshots = stack.enter_context(open_ring(_SNAPSHOTS_KEPT, SNAPSHOT_MESSAGE_BYTES))
     camera = truth is not None or (config.devices is not None and config.devices.camera is not None)
     if not camera or not config.shape.enabled:
         return Rings(rows, events, inputs, snapshots, None, None, truth)
-    shapes = stack.enter_context(ring(_SHAPES_KEPT, ESTIMATE_BYTES_MAX))
-    return Rings(rows, events, inputs, snapshots, shapes, _frames(config, stack), truth)
+    shapes = stack.enter_context(open_ring(_SHAPES_KEPT, ESTIMATE_BYTES_MAX))
+    return Rings(rows, events, inputs, snapshots, shapes, _make_frame_ring(config, stack), truth)
 
 
-def _frames(config: Config, stack: ExitStack) -> FrameAddress:
+def _make_frame_ring(config: Config, stack: ExitStack) -> FrameAddress:
     from membrane_ctrl.processes.frames import FrameRing
 
     owner = FrameRing.for_optics(config.optics, config.recording.raw_before_fault_cycles)
@@ -225,7 +225,7 @@ class ChildProcesses:
             snapshots=rings.snapshots,
         )
         self._console = ManagedChild(
-            _makes(
+            _make_child_factory(
                 "screen",
                 "console",
                 5,
@@ -233,7 +233,7 @@ class ChildProcesses:
             )
         )
         self._recorder = ManagedChild(
-            _makes("recorder", "recorder", 5, lambda n: replace(recorder, resumes=n))
+            _make_child_factory("recorder", "recorder", 5, lambda n: replace(recorder, resumes=n))
         )
         self._acquisition = self._alarms = None
         if rings.shapes is not None and rings.frames is not None:
@@ -243,18 +243,21 @@ class ChildProcesses:
                 config, clock, rings.telemetry, rings.shapes, rings.truth, rings.frames, run_dir
             )
             self._acquisition = ManagedChild(
-                _makes("acquisition", "acquisition", 10, lambda n: cycles)
+                _make_child_factory("acquisition", "acquisition", 10, lambda n: cycles)
             )
         if config.alarms.urls_file:
             from membrane_ctrl.alarms.process import AlarmsSpec
 
             alarms = AlarmsSpec(clock, rings.telemetry, rings.events, config.alarms, run_dir.name)
-            self._alarms = ManagedChild(_makes("alarms", "alarms", 5, lambda n: alarms))
+            self._alarms = ManagedChild(
+                _make_child_factory("alarms", "alarms", 5, lambda n: alarms)
+            )
         self._page = None
         if config.web is not None and socket is not None:
             words = _page_words(config.web, run_dir, socket)
             self._page = ManagedChild(
-                lambda _: (CommandProcess("page", words, run_dir / "web.log", 10), pipe()[0]), False
+                lambda _: (CommandProcess("page", words, run_dir / "web.log", 10), make_pipe()[0]),
+                False,
             )
 
     @property
@@ -346,13 +349,13 @@ def _page_words(page: WebConfig, run_dir: Path, socket: Path) -> list[str]:
     return ["web", "--with-hold", *where, *given]
 
 
-def _makes(name: str, room: str, nice: int, spec: Callable[[int], object]) -> Make:
+def _make_child_factory(name: str, room: str, nice: int, spec: Callable[[int], object]) -> Make:
     """Return a maker of a room's children; `spec` maps the number of earlier children to the next
     one's argument.
     """
 
     def make(count: int) -> tuple[Child, Connection]:
-        ours, theirs = pipe()
+        ours, theirs = make_pipe()
         return Child(
             name, f"membrane_ctrl.{room}.process:{room}_main", (spec(count), theirs), nice
         ), ours

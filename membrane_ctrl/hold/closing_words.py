@@ -28,7 +28,7 @@ _NO_FAULT = (
 
 
 @dataclass(slots=True)
-class Closing:
+class RunEnd:
     """How a run ends, as its own process knows it: no disk is needed.
 
     Attributes
@@ -53,7 +53,7 @@ class Closing:
             self.fault = standing_fault_after(self.fault, event)
 
 
-def closing_lines(closing: Closing) -> list[str]:
+def closing_lines(closing: RunEnd) -> list[str]:
     """The lines about a fault: code and name, what was seen, what to do; nothing for a run that
     ended well.
     """
@@ -70,7 +70,7 @@ def closing_lines(closing: Closing) -> list[str]:
     ]
 
 
-def report(run_dir: Path, as_json: bool, closing: Closing | None = None) -> None:
+def print_closing_report(run_dir: Path, as_json: bool, closing: RunEnd | None = None) -> None:
     """Print how the run ended, a fault first, then its result and folder."""
     for line in closing_lines(closing) if closing is not None else ():
         print(line, file=sys.stderr)
@@ -83,7 +83,7 @@ def report(run_dir: Path, as_json: bool, closing: Closing | None = None) -> None
         return
     if summary_path.exists():
         summary = json.loads(summary_path.read_text(encoding="utf-8"))
-        for line in _headline(summary):
+        for line in _list_headlines(summary):
             print(line, file=sys.stderr)
         anew_s = summary["recorder"].get("folder_anew_s")
         if anew_s is not None:
@@ -104,7 +104,7 @@ def report(run_dir: Path, as_json: bool, closing: Closing | None = None) -> None
         )
 
 
-def _headline(summary: dict[str, object]) -> Iterator[str]:
+def _list_headlines(summary: dict[str, object]) -> Iterator[str]:
     labels: dict[str, tuple[str, Callable[[float], str]]] = {
         "true_std_um": ("true centre, standard deviation", lambda v: f"{v:.3f} µm"),
         "true_bias_um": ("true centre, bias", lambda v: f"{v:+.3f} µm"),

@@ -12,7 +12,7 @@ from membrane_ctrl.config import schema
 from membrane_ctrl.console import process, why
 from membrane_ctrl.controller import tick_codec
 from membrane_ctrl.hold import scenario_file, scenario_run, scenarios
-from membrane_ctrl.hold.closing_words import report
+from membrane_ctrl.hold.closing_words import print_closing_report
 from membrane_ctrl.model import clock, program, run_events, telemetry, terminal
 from membrane_ctrl.processes import child, ring
 from membrane_ctrl.recorder import rerun_recording
@@ -38,7 +38,7 @@ def play_scenario(word: str, logs_dir: Path, name: str | None, real_time: bool) 
     config = played.config.model_copy(update={"recording": schema.RecordingConfig()})
     with contextlib.ExitStack() as stack:
         addresses = {
-            n: stack.enter_context(ring.ring(*size)) for n, size in _ring_sizes(config).items()
+            n: stack.enter_context(ring.open_ring(*size)) for n, size in _ring_sizes(config).items()
         }
         writers = {
             n: stack.enter_context(contextlib.closing(ring.RingWriter(a)))
@@ -46,7 +46,9 @@ def play_scenario(word: str, logs_dir: Path, name: str | None, real_time: bool) 
         }
         run = scenario_run.ScenarioRun(played.model_copy(update={"config": config}), writers)
         run_dir = create_run_folder(logs_dir, name, run.virtual.clock.origin_utc, config)
-        terminal.progress(f"playing {why.duration(played.duration_s)} of: {played.title}")
+        terminal.print_progress(
+            f"playing {why.format_duration(played.duration_s)} of: {played.title}"
+        )
         ticks: scenario_run.Ticks = run.ticks()
         if real_time:
             real = clock.RunClock.start()
@@ -57,12 +59,14 @@ def play_scenario(word: str, logs_dir: Path, name: str | None, real_time: bool) 
                 stack,
             )
         else:
-            ticks = terminal.counted(
+            ticks = terminal.track_progress(
                 ticks, "playing", round(played.duration_s * config.loop.rate_hz)
             )
         with _stopped_by_signals(run):
-            _record(run, ticks, run_dir, name, addresses, _LIVE_ROUND_S if real_time else _ROUND_S)
-    report(run_dir, as_json=False, closing=run.closing)
+            _record_ticks(
+                run, ticks, run_dir, name, addresses, _LIVE_ROUND_S if real_time else _ROUND_S
+            )
+    print_closing_report(run_dir, as_json=False, closing=run.closing)
     return run.virtual.exit
 
 
@@ -78,7 +82,7 @@ def _ring_sizes(config: schema.Config) -> dict[str, tuple[int, int]]:
     }
 
 
-def _record(
+def _record_ticks(
     run: scenario_run.ScenarioRun,
     ticks: scenario_run.Ticks,
     run_dir: Path,

@@ -124,4 +124,4 @@ def load_scenario(path: Path, model: type[S]) -> S:
     """Read a scenario. Raises InputError: one line that names the file, the field and what would be
     right.
     """
-    return toml_file.load(path, model)
+    return toml_file.load_toml(path, model)

@@ -8,7 +8,7 @@ from collections.abc import Callable, Iterable, Iterator
 from typing import Any
 
 from membrane_ctrl.controller.commands import Command
-from membrane_ctrl.hold.closing_words import Closing
+from membrane_ctrl.hold.closing_words import RunEnd
 from membrane_ctrl.hold.scenario_file import INTERLOCK_SWITCHES, SWITCHES, Scenario, ScenarioStep
 from membrane_ctrl.hold.virtual_run import Rings, TruthShape, VirtualRun, VirtualTick
 from membrane_ctrl.metrology.film.hencky_bowl import zernike_projection
@@ -36,7 +36,7 @@ class ScenarioRun:
 
     def __init__(self, scenario: Scenario, rings: Rings | None = None) -> None:
         self.config = config = scenario.config
-        self.closing = Closing()
+        self.closing = RunEnd()
         steps = sorted(scenario.at, key=lambda at: at.time_s)
         mirror = plant.Plant(
             config.twin,

@@ -19,7 +19,7 @@ from membrane_ctrl.controller import cross_check
 from membrane_ctrl.geometry.run_geometry import read_configured_geometry
 from membrane_ctrl.hold import child_processes
 from membrane_ctrl.hold.autotune import start_autotune
-from membrane_ctrl.hold.closing_words import Closing, report
+from membrane_ctrl.hold.closing_words import RunEnd, print_closing_report
 from membrane_ctrl.hold.hold_options import HoldOptions
 from membrane_ctrl.hold.listeners import FaultLatch
 from membrane_ctrl.hold.lock_keeper import LockKeeper
@@ -77,7 +77,7 @@ def hold_mirror(options: HoldOptions) -> int:
         lock_storage = find_locks(config, options)  # before anything is cleared
         latched = open_latched_fault(config, logs_dir, options)
         resumes = None if latched is None else latched_fault.ResumeLog(logs_dir)
-        terminal.progress(f"connecting to {config.devices.name}")
+        terminal.print_progress(f"connecting to {config.devices.name}")
         board = asyncio.run(identify_board(make_bench(config.devices), config, options, resumes))
         run_dir = run_folder.create_run_folder(logs_dir, options.name, clock.origin_utc, config)
         geometry.keep(run_dir)
@@ -88,7 +88,7 @@ def hold_mirror(options: HoldOptions) -> int:
         children = child_processes.ChildProcesses(
             config, clock, rings, run_dir, options.name, options.duration_s, listeners.path
         )
-        terminal.progress(f"run folder {run_dir}; starting {', '.join(children.names)}")
+        terminal.print_progress(f"run folder {run_dir}; starting {', '.join(children.names)}")
         children.start(stack)
         if options.autotune:
             stack.callback(start_autotune(listeners.path, run_dir))
@@ -106,7 +106,7 @@ def hold_mirror(options: HoldOptions) -> int:
             make_latch=partial(FaultLatch, latched, resumes, run_dir.name, clock.utc),
             make_keeper=partial(LockKeeper, lock_storage),
         )
-        closing = Closing()
+        closing = RunEnd()
         try:
             asyncio.run(run_ticks(parts, closing))
             children.take_down()
@@ -116,5 +116,5 @@ def hold_mirror(options: HoldOptions) -> int:
             # the run had ended before: its own end counts
     assert closing.exit is not None
     with contextlib.suppress(OSError):  # the terminal was closed, or the pipe's reader has gone
-        report(run_dir, options.json, closing)
+        print_closing_report(run_dir, options.json, closing)
     return closing.exit

@@ -88,7 +88,9 @@ class Supervisor:
             return
         now_s = self._clock.now()
         stamped = {"time_utc": self._clock.utc(now_s).isoformat(), "mono_s": round(now_s, 6)}
-        self._wiring.events.put(_line(stamped | event.to_dict(), self._wiring.events.slot_bytes))
+        self._wiring.events.put(
+            _encode_event(stamped | event.to_dict(), self._wiring.events.slot_bytes)
+        )
 
     async def run(self, duration_s: float | None) -> errors.Exit:
         """Tick until the run is over; the pump is then off, or unreachable."""
@@ -274,7 +276,7 @@ def newest_of(reader: RingReader) -> Callable[[], shape_estimate.ShapeEstimate |
     return newest
 
 
-def _line(event: EventLine, most_bytes: int) -> bytes:
+def _encode_event(event: EventLine, most_bytes: int) -> bytes:
     """Encode an event for the ring; truncate its texts if it is too long."""
     line = json.dumps(event, allow_nan=False, default=str).encode()
     for most in _TEXT_CUTS:

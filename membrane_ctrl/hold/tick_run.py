@@ -15,7 +15,7 @@ from membrane_ctrl.control_port import server
 from membrane_ctrl.controller import commands, tick
 from membrane_ctrl.controller.controller import Controller
 from membrane_ctrl.hold import child_processes
-from membrane_ctrl.hold.closing_words import Closing
+from membrane_ctrl.hold.closing_words import RunEnd
 from membrane_ctrl.hold.hold_options import HoldOptions
 from membrane_ctrl.hold.listeners import FaultLatch, SystemdNotify
 from membrane_ctrl.hold.lock_keeper import LockKeeper
@@ -52,7 +52,7 @@ class HoldResources:
     ]
 
 
-async def run_ticks(parts: HoldResources, closing: Closing) -> None:
+async def run_ticks(parts: HoldResources, closing: RunEnd) -> None:
     """Run the ticks; `closing` gets the exit code and the fault in which the run ends."""
     from membrane_ctrl.metrology.film.hencky_bowl import zernike_projection
 

@@ -31,7 +31,7 @@ def check_settings(section: Any, where: str, kind: drivers.DriverKind) -> settin
             f"{where}: the {kind.name} {section.name} has no class Settings "
             "(docs/how-to/new-device.md)"
         )
-    return toml_file.parse(section.keys, expected, where)
+    return toml_file.parse_tables(section.keys, expected, where)
 
 
 def make_driver(section: Any, where: str, kind: drivers.DriverKind, *more: Any) -> Any:
@@ -51,7 +51,7 @@ def make_driver(section: Any, where: str, kind: drivers.DriverKind, *more: Any) 
         What a driver of this kind gets after its settings.
     """
     make = _load_driver(section, where, kind)
-    return _construct(make, check_settings(section, where, kind), where, more)
+    return _construct_driver(make, check_settings(section, where, kind), where, more)
 
 
 def make_emulator(
@@ -62,7 +62,7 @@ def make_emulator(
         make = drivers.load_emulator(section.name, kind)
     except ValueError as error:
         raise InputError(f"{where}: {error}") from error
-    return _construct(make, check_settings(section, where, kind), where, more)
+    return _construct_driver(make, check_settings(section, where, kind), where, more)
 
 
 def _load_driver(section: Any, where: str, kind: drivers.DriverKind) -> Any:
@@ -74,7 +74,9 @@ def _load_driver(section: Any, where: str, kind: drivers.DriverKind) -> Any:
         raise InputError(f"{where}: {error}") from error
 
 
-def _construct(make: Any, checked: settings.Section, where: str, more: tuple[Any, ...]) -> Any:
+def _construct_driver(
+    make: Any, checked: settings.Section, where: str, more: tuple[Any, ...]
+) -> Any:
     try:
         return make(checked, *more)
     except ValueError as error:  # a setting that it refuses

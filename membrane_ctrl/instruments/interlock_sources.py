@@ -23,7 +23,7 @@ Member = tuple[int, settings.ModbusInputConfig | settings.GpioLineConfig]
 
 def polled_sources(devices: DevicesConfig, links: ModbusLinks) -> list[PolledSource]:
     """The sources, not yet opened. Raises InputError for a link or a missing package."""
-    return [_source(members, links) for members in _by_device(devices).values()]
+    return [_make_source(members, links) for members in _by_device(devices).values()]
 
 
 def _by_device(devices: DevicesConfig) -> dict[Hashable, list[Member]]:
@@ -38,7 +38,7 @@ def _by_device(devices: DevicesConfig) -> dict[Hashable, list[Member]]:
     return groups
 
 
-def _source(members: list[Member], links: ModbusLinks) -> PolledSource:
+def _make_source(members: list[Member], links: ModbusLinks) -> PolledSource:
     bits = tuple(bit for bit, _ in members)
     source: roles.InterlockSource
     try:

@@ -135,12 +135,12 @@ def read_head(folder: str | Path, geometry: GeometryFile | None = None) -> Captu
         raise InputError(f"{folder}: no such capture set")
     tables = toml_file.read_toml(path, follow=False)
     toml_file.with_height_map(tables.get("geometry"), path, follow=False)
-    ignored = toml_file.prune(tables, CaptureFile)
+    ignored = toml_file.prune_unknown_keys(tables, CaptureFile)
     if geometry is not None:
         tables["geometry"] = geometry.geometry.model_dump(exclude_none=True)
     bits_stated = isinstance(tables.get("camera"), dict) and "bits" in tables["camera"]
-    content = toml_file.parse(tables, CaptureFile, str(path))
-    rows = _ordered(content, path)
+    content = toml_file.parse_tables(tables, CaptureFile, str(path))
+    rows = _order_rows(content, path)
     reference = None
     for row in content.frames:
         require_inside(row.file, folder, path)
@@ -152,7 +152,7 @@ def read_head(folder: str | Path, geometry: GeometryFile | None = None) -> Captu
     blamed = (
         path if geometry is None else geometry.path
     )  # the screen and the pattern may be incompatible
-    optics = toml_file.parse(
+    optics = toml_file.parse_tables(
         {name: getattr(content, name) for name in sections}, schema.OpticsConfig, str(blamed)
     )
     if geometry is not None:
@@ -171,8 +171,8 @@ def read_head(folder: str | Path, geometry: GeometryFile | None = None) -> Captu
         bits_stated=bits_stated,
         files=tuple(row.file for row, _ in rows),
         patterns=tuple(pattern for _, pattern in rows),
-        time_s=_column([row.time_s for row, _ in rows]),
-        displacement_um=_column([row.displacement_um for row, _ in rows]),
+        time_s=_to_number_column([row.time_s for row, _ in rows]),
+        displacement_um=_to_number_column([row.displacement_um for row, _ in rows]),
         pressure_pa=math.nan if content.pressure_pa is None else content.pressure_pa,
         ignored=ignored,
         geometry=stated_origin(optics) if geometry is None else geometry.origin,
@@ -200,10 +200,10 @@ def read_set(folder: str | Path, geometry: GeometryFile | None = None) -> Captur
         )
     with ThreadPoolExecutor(_READERS) as pool:
         images = list(pool.map(read_image, [head.folder / name for name in head.files]))
-    return assemble(head, images)
+    return assemble_set(head, images)
 
 
-def assemble(head: CaptureHead, images: Sequence[Image | str]) -> CaptureSet:
+def assemble_set(head: CaptureHead, images: Sequence[Image | str]) -> CaptureSet:
     """Collect frames of one size and depth in one array; a text in place of an image is the reason
     for its absence.
 
@@ -216,8 +216,11 @@ def assemble(head: CaptureHead, images: Sequence[Image | str]) -> CaptureSet:
             f"{path}: frames: none of the {len(images)} images is readable ({images[0]})"
         )
     camera = head.optics.camera
-    size, depth = (camera.height_px, camera.width_px), _most([image.dtype for image in good])
-    seen = _most([image.shape for image in good])
+    size, depth = (
+        (camera.height_px, camera.width_px),
+        _find_most_common([image.dtype for image in good]),
+    )
+    seen = _find_most_common([image.shape for image in good])
     if seen != size:
         said = f"{size[1]} x {size[0]}, but the images are {seen[1]} x {seen[0]}"
         raise InputError(f"{path}: camera.width_px, height_px: {said}")
@@ -237,13 +240,13 @@ def assemble(head: CaptureHead, images: Sequence[Image | str]) -> CaptureSet:
             )
         else:
             frames[k] = image
-    bits = _depth(head, frames, path)
+    bits = _find_sensor_bits(head, frames, path)
     optics = head.optics.model_copy(update={"camera": camera.model_copy(update={"bits": bits})})
     lost = tuple(k for k, image in enumerate(images) if isinstance(image, str))
     return CaptureSet(replace(head, optics=optics), frames, unusable, lost)
 
 
-def anchored(head: CaptureHead, reference: CaptureHead) -> CaptureHead:
+def anchor_head(head: CaptureHead, reference: CaptureHead) -> CaptureHead:
     """Head of a fringes set; its geometry holds for the stated displacement, else for its
     reference's.
 
@@ -292,7 +295,7 @@ def read_image(path: Path) -> Image | str:
     return image
 
 
-def _depth(head: CaptureHead, frames: Image, path: Path) -> int:
+def _find_sensor_bits(head: CaptureHead, frames: Image, path: Path) -> int:
     """Bits of the sensor: as stated, else the smallest usual depth
     that holds the brightest pixel.
     """
@@ -330,7 +333,7 @@ def reference_of(name: str, folder: Path, path: Path) -> Path:
         raise InputError(f"{path}: reference: {name!r} leads to no folder") from None
 
 
-def _ordered(content: CaptureFile, path: Path) -> list[tuple[FrameRow, Pattern]]:
+def _order_rows(content: CaptureFile, path: Path) -> list[tuple[FrameRow, Pattern]]:
     """Rows with their patterns in the order of the sequence. Raises InputError for missing or
     duplicate ones.
     """
@@ -396,9 +399,9 @@ def _coarser_mm(row: FrameRow, content: CaptureFile, path: Path) -> float:
     return row.period_mm
 
 
-def _column(values: list[float | None]) -> FloatArray:
+def _to_number_column(values: list[float | None]) -> FloatArray:
     return np.array([math.nan if value is None else value for value in values])
 
 
-def _most(values: list[Any]) -> Any:
+def _find_most_common(values: list[Any]) -> Any:
     return Counter(values).most_common(1)[0][0]

@@ -94,10 +94,10 @@ def export_command(
             f"--remove {unknown[0]}: give piston, tilt, power or sphere, separated by commas"
         )
     zernike_table = _zernike_table(terms, seen, table, result) if terms else None
-    seen = removed(seen, names)
+    seen = remove_parts(seen, names)
     suffix, write = _WRITERS[form]
-    target = files.users(out) if out else result.resolve() / f"figure{suffix}"
-    with errors.writing(target):
+    target = files.resolve_user_path(out) if out else result.resolve() / f"figure{suffix}"
+    with errors.convert_write_errors(target):
         data, step_mm = write(seen, zernike_table)
         files.write_bytes_atomic(target, data)
         if zernike_table is not None and form != "h5":
@@ -150,14 +150,14 @@ def read_result(folder: Path) -> tuple[ExportedMap, dict[str, Any]]:
     return ExportedMap(x, y, height, radius), table if isinstance(table, dict) else {}
 
 
-def _fit(seen: ExportedMap, terms: int) -> grid_fit.GridFit:
+def _fit_terms(seen: ExportedMap, terms: int) -> grid_fit.GridFit:
     axes = seen.x_mm / seen.radius_mm, seen.y_mm / seen.radius_mm
     return grid_fit.GridFit(
         axes[0], seen.measured, [zernike.fringe_set_orders(j + 1) for j in range(terms)], axes[1]
     )
 
 
-def removed(seen: ExportedMap, names: list[str]) -> ExportedMap:
+def remove_parts(seen: ExportedMap, names: list[str]) -> ExportedMap:
     """The map without the named parts.
 
     Piston, tilt and power are fitted together; what is not named stays. `sphere` leaves the
@@ -171,7 +171,7 @@ def removed(seen: ExportedMap, names: list[str]) -> ExportedMap:
         height[measured] = best_sphere.best_sphere(points).deviation(points)[0]
     places = [place for name in names for place in _REMOVABLE.get(name, ())]
     if places:
-        fit = _fit(seen, 4)
+        fit = _fit_terms(seen, 4)
         coefficients = np.zeros(4)
         coefficients[places] = fit.coefficients(height)[places]
         height = height - fit.values(coefficients)
@@ -185,7 +185,7 @@ def _zernike_table(
     map.
     """
     if index == "fringe":
-        coeffs = 1e3 * _fit(seen, zernike.FRINGE_TERMS).coefficients(seen.height_mm)
+        coeffs = 1e3 * _fit_terms(seen, zernike.FRINGE_TERMS).coefficients(seen.height_mm)
         orders = [zernike.fringe_set_orders(j + 1) for j in range(zernike.FRINGE_TERMS)]
         radius, first, normalisation = seen.radius_mm, 1, "peak"
     else:
@@ -305,7 +305,7 @@ def _codev_int(seen: ExportedMap, _: object) -> Written:
     return text.getvalue().encode(), 1e-3 / scale
 
 
-def _h5(seen: ExportedMap, table: dict[str, Any] | None) -> Written:
+def _write_hdf5(seen: ExportedMap, table: dict[str, Any] | None) -> Written:
     """HDF5: the map with its axes as NumPy keeps them, and the Zernike terms."""
     try:
         import h5py
@@ -337,6 +337,6 @@ _WRITERS: dict[str, tuple[str, Callable[[ExportedMap, dict[str, Any] | None], Wr
     "zygo-dat": (".dat", _zygo_dat),
     "zygo-xyz": (".xyz", _zygo_xyz),
     "codev-int": (".int", _codev_int),
-    "h5": (".h5", _h5),
+    "h5": (".h5", _write_hdf5),
     "fits": (".fits", _fits_file),
 }

@@ -7,7 +7,7 @@ from typing import Any
 from membrane_ctrl.measure.report_html import ReportTable, html_page
 from membrane_ctrl.measure.report_pdf import pdf_pages
 from membrane_ctrl.model.files import write_bytes_atomic, write_text_atomic
-from membrane_ctrl.model.terminal import plain
+from membrane_ctrl.model.terminal import escape_controls
 
 
 def write_report(
@@ -19,14 +19,16 @@ def write_report(
     `name` is for the title; `result` is the content of `result.json`; `drawn` are the pictures'
     files.
     """
-    title = plain(f"Measurement of {name}")
+    title = escape_controls(f"Measurement of {name}")
     tables = [] if result["figure"] is None else _list_tables(result["figure"])
     images = [(file.stem, file.read_bytes()) for file in drawn]
     write_text_atomic(
-        out / "report.html", html_page(title, [plain(line) for line in lines], tables, images)
+        out / "report.html",
+        html_page(title, [escape_controls(line) for line in lines], tables, images),
     )
     write_bytes_atomic(
-        out / "report.pdf", pdf_pages(title, [plain(line) for line in lines], tables, images)
+        out / "report.pdf",
+        pdf_pages(title, [escape_controls(line) for line in lines], tables, images),
     )
 
 

@@ -86,7 +86,7 @@ def figure_table(
     (docs/reference/figure.md).
     """
     numbers = {
-        name: quantity(
+        name: make_quantity(
             value, getattr(found.noise.numbers, name), getattr(found.geometry.numbers, name)
         )
         for name, value in vars(found.figure.numbers).items()
@@ -102,7 +102,7 @@ def figure_table(
     if found.power_um is None:
         missing["power_um"] = "no nominal radius: give --nominal-radius-mm"
     else:
-        numbers["power_um"] = quantity(*found.power_um)
+        numbers["power_um"] = make_quantity(*found.power_um)
     return {
         "aperture_radius_mm": found.aperture_mm,
         "centre_mm": [0.0, 0.0],
@@ -114,7 +114,9 @@ def figure_table(
     }
 
 
-def quantity(value: float, of_noise: float, of_geometry: float) -> dict[str, float | None] | None:
+def make_quantity(
+    value: float, of_noise: float, of_geometry: float
+) -> dict[str, float | None] | None:
     """A number with its error bars, null where there is none; None if the number does not exist."""
     if not math.isfinite(value):
         return None

@@ -58,7 +58,7 @@ class _Departure:
 def film_command(options: FilmOptions) -> int:
     """Fit the law to the sets, write the result and report it. Raises CommandError."""
     measured = Figures(None if options.geometry is None else file.read_geometry(options.geometry))
-    sets = [measured.of(folder) for folder in terminal.counted(options.folders, "sets")]
+    sets = [measured.of(folder) for folder in terminal.track_progress(options.folders, "sets")]
     mirror = sets[0].head.optics.mirror
     for one in sets:
         if one.head.artefact is not None:
@@ -69,28 +69,28 @@ def film_command(options: FilmOptions) -> int:
             raise errors.InputError(
                 f"{one.head.folder / 'capture.toml'}: mirror.radius_mm: not that of the first set"
             )
-    figures, source = _figures(sets, options.geometry)
+    figures, source = _read_figures(sets, options.geometry)
     try:
         fit = material_fit.fit_film(
             figures, mirror.radius_mm, mirror.analysis_radius_mm, options.gauge
         )
     except ValueError as error:
         raise errors.RejectedError(f"film: {error}") from None
-    departure = _departure(figures, fit, mirror.analysis_radius_mm)
-    notes = _notes(figures, fit, departure)
-    table = _table(figures, fit, departure, source, notes)
+    departure = _compute_departure(figures, fit, mirror.analysis_radius_mm)
+    notes = _list_limits(figures, fit, departure)
+    table = _make_fit_table(figures, fit, departure, source, notes)
     out = options.out.resolve() if options.out else options.folders[0].resolve().parent / "film"
-    with errors.writing(out):
+    with errors.convert_write_errors(out):
         files.make_folder(out)
         write_json(out / "film.json", table)
         if options.pictures:
-            _draw(out / "film.png", figures, fit, departure)
+            _draw_fit(out / "film.png", figures, fit, departure)
     print(f"written to {out}", file=sys.stderr)
-    print(json.dumps(table) if options.as_json else "\n".join(_lines(table, figures)))
+    print(json.dumps(table) if options.as_json else "\n".join(_format_fit(table, figures)))
     return 0
 
 
-def _figures(
+def _read_figures(
     sets: list[SetFigure], geometry: Path | None
 ) -> tuple[list[film_figure.FilmFigure], str]:
     """The sets' figures with their errors, and where the geometry's spread comes from."""
@@ -111,7 +111,7 @@ def _figures(
     return out, source
 
 
-def _departure(
+def _compute_departure(
     figures: list[film_figure.FilmFigure], fit: material_fit.FilmFit, reach_mm: float
 ) -> _Departure:
     radius = np.linspace(0.0, reach_mm, 96)
@@ -136,7 +136,7 @@ def _profile_mm(parameters_mm: FloatArray, radius_mm: float, at_mm: FloatArray) 
     return np.asarray(surface.height(at_mm * np.cos(angle), at_mm * np.sin(angle)).mean(axis=0))
 
 
-def _notes(
+def _list_limits(
     figures: list[film_figure.FilmFigure], fit: material_fit.FilmFit, departure: _Departure
 ) -> list[str]:
     """What these sets cannot tell, in words."""
@@ -169,7 +169,7 @@ def _notes(
     return notes
 
 
-def _table(
+def _make_fit_table(
     figures: list[film_figure.FilmFigure],
     fit: material_fit.FilmFit,
     departure: _Departure,
@@ -230,7 +230,7 @@ def _paper_prestrain(poisson: float, stiffness: FloatArray | float) -> float:
     return float(np.interp(_PAPER_EDGE_MM, float(hencky.sag_mm) - sags, strains))
 
 
-def _lines(table: dict[str, Any], figures: list[film_figure.FilmFigure]) -> list[str]:
+def _format_fit(table: dict[str, Any], figures: list[film_figure.FilmFigure]) -> list[str]:
     strain, poisson, stiffness = table["prestrain"], table["poisson"], table["stiffness_n_per_m"]
     sags = [figure.sag_mm for figure in figures]
     lines = [
@@ -265,7 +265,7 @@ def _lines(table: dict[str, Any], figures: list[film_figure.FilmFigure]) -> list
     ]
 
 
-def _draw(
+def _draw_fit(
     path: Path,
     figures: list[film_figure.FilmFigure],
     fit: material_fit.FilmFit,

@@ -46,18 +46,18 @@ def measure_command(options: MeasureOptions) -> int:
         options.out.resolve() if options.out else folder / "result"
     )  # follow a link that the user names
     light, outline = light_and_rim(measurement)
-    profile = _profile(measurement)
+    profile = _fit_radial_profile(measurement)
     bars = results.error_bars(measurement, geometry, outline)
     measurement = results.degrade_doubtful(measurement, bars)
     figure = figure_results.measured_figure(measurement, bars, options.nominal_radius_mm)
     block = figure_results.figure_table(measurement, figure, bars) if figure and bars else None
     result = results.result_table(measurement, bars, block)
     details = results.details_table(measurement, profile, outline, bars)
-    lines = _lines(measurement, profile, outline, bars) + (
+    lines = _format_measurement(measurement, profile, outline, bars) + (
         [] if figure is None else figure_results.figure_lines(figure)
     )
     begin = time.perf_counter()
-    with errors.writing(target):
+    with errors.convert_write_errors(target):
         results.write_result(target, measurement, result, details, bars)
         if figure is not None:
             figure_results.write_figure_maps(target / "figure.npz", figure)
@@ -93,7 +93,7 @@ def light_and_rim(measurement: Measurement) -> tuple[FloatArray, Outline | None]
     return light, find_outline(fine, checked.tracer.geometry, optics.mirror.radius_mm, rim_z)
 
 
-def _profile(measurement: Measurement) -> RadialProfile | None:
+def _fit_radial_profile(measurement: Measurement) -> RadialProfile | None:
     full = measurement.full
     if full is None:
         return None
@@ -102,7 +102,7 @@ def _profile(measurement: Measurement) -> RadialProfile | None:
     )
 
 
-def _lines(
+def _format_measurement(
     measurement: Measurement,
     profile: RadialProfile | None,
     outline: Outline | None,

@@ -9,7 +9,7 @@ import numpy as np
 
 from membrane_ctrl.geometry.file import GeometryFile
 from membrane_ctrl.geometry.run_geometry import require_plausible
-from membrane_ctrl.measure.capture_set import CaptureHead, CaptureSet, anchored, read_set
+from membrane_ctrl.measure.capture_set import CaptureHead, CaptureSet, anchor_head, read_set
 from membrane_ctrl.metrology.figure.bin_figure import BinFigure, bin_figure
 from membrane_ctrl.metrology.figure.pixel_figure import FullResult, measure_pixels, reconstruct_full
 from membrane_ctrl.metrology.frame_checks import frame_faults
@@ -72,7 +72,7 @@ def measure_set(folder: str | Path, geometry: GeometryFile | None = None) -> Mea
     )  # the set need not know its film's depth
     if capture.head.reference is not None:
         reference, anchor = read_anchor(capture.head.reference, geometry)
-        capture = replace(capture, head=anchored(capture.head, reference))
+        capture = replace(capture, head=anchor_head(capture.head, reference))
     optics, loaded = capture.head.optics, time.perf_counter()
     try:
         checked = checked_set(capture, anchor)
@@ -94,7 +94,7 @@ def measure_set(folder: str | Path, geometry: GeometryFile | None = None) -> Mea
     middle = time.perf_counter()
     full = reconstruct_full(optics, checked, pixels)
     end = time.perf_counter()
-    verdict, reason = shape_estimate.judge(full.quality)
+    verdict, reason = shape_estimate.judge_quality(full.quality)
     if verdict == "ok":
         verdict, reason = checked.verdict
     timing = {"load": loaded - begin, "phase": middle - loaded, "reconstruct": end - middle}
@@ -218,14 +218,14 @@ class Figures:
         anchor = None
         if capture.head.reference is not None:
             reference, anchor = self._anchored_by(capture.head.reference)
-            capture = replace(capture, head=anchored(capture.head, reference))
+            capture = replace(capture, head=anchor_head(capture.head, reference))
         optics = capture.head.optics
         try:
             checked = checked_set(capture, anchor)
         except RejectedSetError as error:
             raise errors.RejectedError(f"{folder}: rejected: {error}") from None
         figure = bin_figure(optics, checked)
-        verdict, reason = shape_estimate.judge(figure.quality)
+        verdict, reason = shape_estimate.judge_quality(figure.quality)
         if verdict == "rejected":
             raise errors.RejectedError(f"{folder}: rejected: {reason}")
         if verdict == "ok":

@@ -18,7 +18,7 @@ from membrane_ctrl.metrology.figure.pixel_figure import FullResult
 from membrane_ctrl.metrology.figure.surface_map import SurfaceMap
 from membrane_ctrl.metrology.rays import rim_outline
 from membrane_ctrl.model.arrays import FloatArray
-from membrane_ctrl.model.terminal import plain
+from membrane_ctrl.model.terminal import escape_controls
 
 if TYPE_CHECKING:  # half a second to load, and most measurements make no recording
     pass
@@ -255,7 +255,7 @@ def _draw_modulation(
 def _draw_frames(measurement: Measurement) -> Figure:
     """Draw one tile per frame, the flagged ones with their reason."""
     names = [pattern.name for pattern in measurement.head.patterns]
-    reasons = {flag.frame: plain(flag.reason) for flag in measurement.flags}
+    reasons = {flag.frame: escape_controls(flag.reason) for flag in measurement.flags}
     figure, axes = new_sheet(9, 0.28 * len(names) + 1.2)
     colours = ["tab:red" if k in reasons else "tab:green" for k in range(len(names))]
     axes.barh(range(len(names)), 1.0, color=colours, alpha=0.5)
@@ -266,7 +266,9 @@ def _draw_frames(measurement: Measurement) -> Figure:
     axes.set_yticks(range(len(names)), names)
     axes.invert_yaxis()
     axes.set(xticks=[], xlim=(0, 1))
-    axes.set_title(plain(f"{measurement.verdict} {measurement.reason}")[:110], parse_math=False)
+    axes.set_title(
+        escape_controls(f"{measurement.verdict} {measurement.reason}")[:110], parse_math=False
+    )
     return figure
 
 

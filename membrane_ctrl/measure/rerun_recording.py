@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from membrane_ctrl.measure.measurement import Measurement
-from membrane_ctrl.model.files import move, scratch_folder
+from membrane_ctrl.model.files import move_file, scratch_folder
 from membrane_ctrl.model.zernike_terms import NOLL_INDICES
 
 if TYPE_CHECKING:  # half a second to load, and most measurements make no recording
@@ -38,7 +38,7 @@ def open_recording(
         finally:
             recording.disconnect()
         try:
-            move(folder / path.name, path)
+            move_file(folder / path.name, path)
         except OSError as error:
             raise OSError(f"{path.name}: {error.strerror}") from None
 

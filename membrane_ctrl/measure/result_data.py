@@ -74,21 +74,25 @@ class MeasuredResult:
             "height_mm": (
                 ("y_mm", "x_mm"),
                 self.height.height_mm,
-                _labels("mm", "height above the vertex"),
+                _make_axis_labels("mm", "height above the vertex"),
             ),
             "coeffs_um": (
                 "noll",
                 self._coeffs_um(),
-                _labels("µm", "Zernike coefficients, orthonormal"),
+                _make_axis_labels("µm", "Zernike coefficients, orthonormal"),
             ),
             "coeffs_sigma_um": (
                 "noll",
                 self._sigma_um(),
-                _labels("µm", "1 sigma of the coefficients"),
+                _make_axis_labels("µm", "1 sigma of the coefficients"),
             ),
         }
         for name, values in self.sigmas_um.items():
-            variables[name] = (("sigma_y_mm", "sigma_x_mm"), values, _labels("µm", _SIGMAS[name]))
+            variables[name] = (
+                ("sigma_y_mm", "sigma_x_mm"),
+                values,
+                _make_axis_labels("µm", _SIGMAS[name]),
+            )
         coordinates: dict[str, Any] = {
             "x_mm": self.height.x_mm,
             "y_mm": self.height.y_mm,
@@ -100,13 +104,13 @@ class MeasuredResult:
         return xarray.Dataset(variables, coords=coordinates, attrs=self._about())
 
     def _coeffs_um(self) -> FloatArray:
-        return _numbers(self.table, "zernike")
+        return _read_coefficients(self.table, "zernike")
 
     def _sigma_um(self) -> FloatArray:
-        return _numbers(self.table, "uncertainty")
+        return _read_coefficients(self.table, "uncertainty")
 
     def _about(self) -> dict[str, str | float]:
-        quality, terms = (_table(self.table, name) for name in ("quality", "zernike"))
+        quality, terms = (_require_table(self.table, name) for name in ("quality", "zernike"))
         texts = {key: str(self.table.get(key, "")) for key in ("schema", "program", "commit")}
         about = {
             "verdict": str(quality.get("verdict", "")),
@@ -196,7 +200,7 @@ class StabilityResult:
             variables["sd_um"] = (
                 ("y_mm", "x_mm"),
                 sd_um,
-                _labels("µm", "standard deviation of the height"),
+                _make_axis_labels("µm", "standard deviation of the height"),
             )
             coordinates |= {"x_mm": x_mm, "y_mm": y_mm}
         about = {key: str(self.table.get(key, "")) for key in ("schema", "program", "commit")}
@@ -218,18 +222,18 @@ def open_stability(folder: str | Path) -> StabilityResult:
     return StabilityResult(Path(folder), table)
 
 
-def _labels(unit: str, meaning: str) -> dict[str, str]:
+def _make_axis_labels(unit: str, meaning: str) -> dict[str, str]:
     return {"units": unit, "long_name": meaning}
 
 
-def _table(table: dict[str, Any], name: str) -> dict[str, Any]:
+def _require_table(table: dict[str, Any], name: str) -> dict[str, Any]:
     found = table.get(name)
     return found if isinstance(found, dict) else {}
 
 
-def _numbers(table: dict[str, Any], name: str) -> FloatArray:
+def _read_coefficients(table: dict[str, Any], name: str) -> FloatArray:
     """(terms,) the coefficients of a block; NaN where there are none."""
-    found = _table(table, name).get("coeffs_um")
+    found = _require_table(table, name).get("coeffs_um")
     try:
         numbers = np.array(found, dtype=np.float64)
     except (TypeError, ValueError):

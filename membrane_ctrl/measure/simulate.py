@@ -60,17 +60,25 @@ def simulate_command(options: SimulateOptions) -> int:
             f"{options.folder}: is not empty; simulate needs a new or empty folder"
         )
     try:
-        spec = specification(options)
-        with errors.writing(options.folder):
+        spec = make_specification(options)
+        with errors.convert_write_errors(options.folder):
             if options.track:
                 simulate.simulate_track(
-                    options.folder, spec, options.track, options.rate_hz, _progress(options.track)
+                    options.folder,
+                    spec,
+                    options.track,
+                    options.rate_hz,
+                    _make_progress_counter(options.track),
                 )
             elif options.sets == 1:
                 simulate.simulate_set(options.folder, spec)
             else:
                 simulate.simulate_run(
-                    options.folder, spec, options.sets, options.interval_s, _progress(options.sets)
+                    options.folder,
+                    spec,
+                    options.sets,
+                    options.interval_s,
+                    _make_progress_counter(options.sets),
                 )
     except ValueError as error:
         raise errors.InputError(f"simulate: {error}") from None
@@ -81,9 +89,9 @@ def simulate_command(options: SimulateOptions) -> int:
     return 0
 
 
-def specification(options: SimulateOptions) -> simulation_spec.SimulationSpec:
+def make_specification(options: SimulateOptions) -> simulation_spec.SimulationSpec:
     """The set described by the options. Raises ValueError naming an impossible one."""
-    optics = _optics(options)
+    optics = _adjust_optics(options)
     if (options.artefact or options.screen_moved_mm) and (options.sets > 1 or options.track):
         raise ValueError("--artefact, --screen-moved-mm: one set, for `calibrate`")
     if options.artefact.startswith("screen:"):
@@ -103,7 +111,9 @@ def _of_film(options: SimulateOptions, optics: OpticsConfig) -> simulation_spec.
         options.sag_mm, radius_mm, options.seed, twin.film_prestrain, twin.film_poisson
     )
     return replace(
-        _bare(options, optics, mounted if options.figure else replace(mounted, zernike_um=())),
+        _make_rest_specification(
+            options, optics, mounted if options.figure else replace(mounted, zernike_um=())
+        ),
         stiffness_n_per_m=twin.film_stiffness_n_per_m,
         disturbances=twin.disturbances,
         drum_nm=twin.drum_nm,
@@ -112,7 +122,7 @@ def _of_film(options: SimulateOptions, optics: OpticsConfig) -> simulation_spec.
     )
 
 
-def _bare(
+def _make_rest_specification(
     options: SimulateOptions, optics: OpticsConfig, shape: film_shape.FilmShape
 ) -> simulation_spec.SimulationSpec:
     """A set of a surface at rest."""
@@ -154,9 +164,9 @@ def _of_artefact(options: SimulateOptions, optics: OpticsConfig) -> simulation_s
             "curvature_radius_sigma_mm": _RADIUS_KNOWN * curvature_mm,
         }
     lean_x, lean_y = np.random.default_rng(options.seed).uniform(-_LEANS, _LEANS, 2).tolist()
-    shape = simulation_spec.leaning(curvature_mm, radius_mm, lean_x, lean_y)
+    shape = simulation_spec.make_artefact_shape(curvature_mm, radius_mm, lean_x, lean_y)
     mirror = type(optics.mirror)(radius_mm=radius_mm, analysis_radius_mm=_USED * radius_mm)
-    spec = _bare(options, optics.model_copy(update={"mirror": mirror}), shape)
+    spec = _make_rest_specification(options, optics.model_copy(update={"mirror": mirror}), shape)
     return replace(spec, artefact=table, laser=False)
 
 
@@ -172,7 +182,9 @@ def _with_screen_moved(
     }
     # one move of one bench, whatever the set's own seed
     rng = np.random.default_rng(int(abs(options.screen_moved_mm)))
-    rail, turn = (_turn(np.radians(_TURN_KNOWN_DEG) * rng.normal(size=3)) for _ in range(2))
+    rail, turn = (
+        _rotation_matrix(np.radians(_TURN_KNOWN_DEG) * rng.normal(size=3)) for _ in range(2)
+    )
     x, y, z = rail @ shift_mm + _SHIFT_KNOWN_MM * rng.normal(size=3)
     there = move_screen(optics.geometry, (x, y, z), turn)
     spec = _of_film(options, optics.model_copy(update={"geometry": there}))
@@ -189,11 +201,11 @@ def _of_screen(options: SimulateOptions, optics: OpticsConfig) -> simulation_spe
         distance_mm = float(options.artefact.removeprefix("screen:"))
     except ValueError:
         raise ValueError(f"--artefact {options.artefact}: screen:DISTANCE, mm") from None
-    pinhole, (right, down, forward), *_ = sight.poses(optics.geometry)
+    pinhole, (right, down, forward), *_ = sight.compute_poses(optics.geometry)
     side, roll = np.random.default_rng(options.seed).uniform(0, 2 * math.pi, 2)
-    turn = _turn(_TILTED_RAD * (math.cos(side) * right + math.sin(side) * down)) @ _turn(
-        roll * forward
-    )
+    turn = _rotation_matrix(
+        _TILTED_RAD * (math.cos(side) * right + math.sin(side) * down)
+    ) @ _rotation_matrix(roll * forward)
     before = {
         "origin_mm": pinhole + distance_mm * forward,
         "s_x": turn @ right,
@@ -203,18 +215,18 @@ def _of_screen(options: SimulateOptions, optics: OpticsConfig) -> simulation_spe
         update={name: tuple(value.tolist()) for name, value in before.items()}
     )
     there = move_screen(optics.geometry, (0.0, 0.0, 0.0)).model_copy(update={"screen": screen})
-    shape = simulation_spec.leaning(math.inf, optics.mirror.radius_mm, 0.0, 0.0)
-    spec = _bare(options, optics.model_copy(update={"geometry": there}), shape)
+    shape = simulation_spec.make_artefact_shape(math.inf, optics.mirror.radius_mm, 0.0, 0.0)
+    spec = _make_rest_specification(options, optics.model_copy(update={"geometry": there}), shape)
     stated = spec.stated_geometry or optics.geometry
     return replace(spec, artefact={"form": "screen"}, laser=False, stated_geometry=stated)
 
 
-def _turn(vector: FloatArray) -> FloatArray:
+def _rotation_matrix(vector: FloatArray) -> FloatArray:
     """Matrix (3, 3) of a turn about a vector by its length."""
     return np.asarray(cv2.Rodrigues(vector)[0], np.float64)
 
 
-def _optics(options: SimulateOptions) -> OpticsConfig:
+def _adjust_optics(options: SimulateOptions) -> OpticsConfig:
     """The configuration's optics with the depth, noise, steps and size from the options."""
     optics = options.config.optics
     camera, pattern = optics.camera, optics.pattern
@@ -243,7 +255,7 @@ def _optics(options: SimulateOptions) -> OpticsConfig:
     )
 
 
-def _progress(total: int) -> Callable[[int], None] | None:
+def _make_progress_counter(total: int) -> Callable[[int], None] | None:
     """Count sets, or frames, in one line, on a terminal only."""
     if not sys.stderr.isatty():
         return None

@@ -317,10 +317,10 @@ def stability_command(options: StabilityOptions) -> int:
     folders = set_folders(options.folder, out)
     size_px, analysis_radius_mm = common_size(folders)
     points = points_mm(options.points, analysis_radius_mm)
-    with errors.writing(out):
+    with errors.convert_write_errors(out):
         files.make_folder(out)
         with StabilityRun(out, points, options.trials, options.seed, options.geometry) as run:
-            _analyse(folders, figures, run)
+            _analyse_sets(folders, figures, run)
         if run.used == 0:
             raise errors.RejectedError(
                 f"{options.folder}: none of the {len(folders)} sets gave a figure "
@@ -405,9 +405,9 @@ def points_mm(given: tuple[str, ...], analysis_radius_mm: float) -> dict[str, tu
     return points or running_statistics.default_points_mm(analysis_radius_mm)
 
 
-def _analyse(folders: list[Path], figures: measurement.Figures, run: StabilityRun) -> None:
+def _analyse_sets(folders: list[Path], figures: measurement.Figures, run: StabilityRun) -> None:
     """Analyse the sets one after the other, with a bar on a terminal; name and skip bad ones."""
-    for number, folder in enumerate(terminal.counted(folders, "sets")):
+    for number, folder in enumerate(terminal.track_progress(folders, "sets")):
         try:
             run.add(folder.name, number, figures.of(folder))
         except errors.CommandError as error:

@@ -111,7 +111,7 @@ def log_stability(
         Map of standard deviations, rows along y, NaN outside.
     """
     terms = zernike_labels(first=2)
-    with open_recording(path, "membrane_ctrl_stability", _blueprint(pictures)) as recording:
+    with open_recording(path, "membrane_ctrl_stability", _make_blueprint(pictures)) as recording:
         recording.log("stability/report", rr.TextDocument("\n".join(lines)), static=True)
         # row 0 of a picture is at the top, i.e. at +y
         sd = rr.Tensor(sd_um[::-1].astype(np.float32), dim_names=["y", "x"])
@@ -128,7 +128,7 @@ def log_stability(
         log_pictures(recording, "stability/pictures", pictures)
 
 
-def _blueprint(pictures: Sequence[Path]) -> rrb.Blueprint:
+def _make_blueprint(pictures: Sequence[Path]) -> rrb.Blueprint:
     """Show plots over the whole run; the default is a minute around the cursor."""
     always = rr.TimeRangeBoundary.infinite()
     axis = rrb.TimeAxis(view_range=rr.TimeRange(start=always, end=always))

@@ -101,15 +101,15 @@ def track_command(
     track = track_set(folder, None if geometry is None else read_geometry(geometry))
     passed_s = time.perf_counter() - begin
     out = out.resolve() if out else folder / "result"
-    table = _table(track)
-    with errors.writing(out):
+    table = _make_track_table(track)
+    with errors.convert_write_errors(out):
         files.make_folder(out)
         write_arrays(out / "track.npz", **track.columns())
         if pictures:
-            _show(out, track, _lines(table))
+            _write_pictures(out, track, _format_track(table))
     rate = len(track.frames) / passed_s
     print(f"written to {out}; {rate:.1f} frames/s with reading them", file=sys.stderr)
-    print(json.dumps(table) if as_json else "\n".join(_lines(table)))
+    print(json.dumps(table) if as_json else "\n".join(_format_track(table)))
     return int(errors.Exit.DONE if table["usable"] else errors.Exit.REJECTED)
 
 
@@ -123,7 +123,11 @@ def track_set(folder: Path, geometry: GeometryFile | None = None) -> Track:
     size = (optics.camera.height_px, optics.camera.width_px)
     try:
         scene = make_scene(
-            optics, reference.checked, _measured(reference), crossed.period_mm, crossed.contrast
+            optics,
+            reference.checked,
+            _measure_reference(reference),
+            crossed.period_mm,
+            crossed.contrast,
         )
         tracker = Tracker(
             scene,
@@ -135,7 +139,7 @@ def track_set(folder: Path, geometry: GeometryFile | None = None) -> Track:
     except ValueError as error:
         raise errors.InputError(f"{path}: pattern.crossed.period_mm: {error}") from None
     shifts = np.array([(row.shift_x_rad, row.shift_y_rad) for row in content.frames])
-    pictures = _pictures(
+    pictures = _read_pictures(
         content, folder, size, np.dtype(np.uint8 if optics.camera.bits == 8 else np.uint16)
     )
     times = np.array([row.time_s for row in content.frames])
@@ -150,7 +154,7 @@ def track_set(folder: Path, geometry: GeometryFile | None = None) -> Track:
     if stepped := bool(good) and len(good) == len(first):
         part = slice(0, ENOUGH_STEPS)
         found, first = tracker.anchor(good, shifts[part], times[part], readings[part]), []
-    rest = terminal.counted(chain(first, pictures), "frames", len(times) - len(found))
+    rest = terminal.track_progress(chain(first, pictures), "frames", len(times) - len(found))
     for k, picture in enumerate(rest, start=len(found)):
         at_s, reading = float(times[k]), float(readings[k])
         if isinstance(picture, str):
@@ -164,7 +168,7 @@ def track_set(folder: Path, geometry: GeometryFile | None = None) -> Track:
     )
 
 
-def _measured(reference: SetFigure) -> BinFigure:
+def _measure_reference(reference: SetFigure) -> BinFigure:
     """The reference's bins on the surface that `measure` gives: its weights differ from those of
     the bins' own fit.
 
@@ -186,9 +190,9 @@ def read_track(folder: Path) -> TrackFile:
         raise errors.InputError(
             f"{path}: kind: a {tables['kind']} set; use `membrane-ctrl measure`"
         )
-    for key in toml_file.prune(tables, TrackFile):
+    for key in toml_file.prune_unknown_keys(tables, TrackFile):
         print(f"{path}: {key}: unknown key, ignored", file=sys.stderr)
-    content = toml_file.parse(tables, TrackFile, str(path))
+    content = toml_file.parse_tables(tables, TrackFile, str(path))
     for row in content.frames:
         require_inside(row.file, folder, path)
     for before, after in pairwise(content.frames):
@@ -222,7 +226,7 @@ def _require_reference(content: TrackFile, reference: SetFigure, path: Path) -> 
         )
 
 
-def _pictures(
+def _read_pictures(
     content: TrackFile, folder: Path, size: tuple[int, int], depth: np.dtype[Any]
 ) -> Iterator[Image | str]:
     """The frames one after the other; a text where there is none. Raises InputError for another
@@ -242,7 +246,7 @@ def _pictures(
         yield picture
 
 
-def _table(track: Track) -> dict[str, Any]:
+def _make_track_table(track: Track) -> dict[str, Any]:
     """The result in numbers."""
     used = [frame for frame in track.frames if frame.verdict != "rejected"]
     sag, sigma = (
@@ -265,7 +269,7 @@ def _table(track: Track) -> dict[str, Any]:
     }
 
 
-def _lines(table: dict[str, Any]) -> list[str]:
+def _format_track(table: dict[str, Any]) -> list[str]:
     """The result as lines of text."""
     verdicts = ", ".join(
         f"{count} {verdict}" for verdict, count in table["verdicts"].items() if count
@@ -286,7 +290,7 @@ def _lines(table: dict[str, Any]) -> list[str]:
     return lines
 
 
-def _show(out: Path, track: Track, lines: Sequence[str]) -> None:
+def _write_pictures(out: Path, track: Track, lines: Sequence[str]) -> None:
     """Write `track.png` and `track.rrd`. Raises OSError."""
     import rerun as rr
 
@@ -299,7 +303,7 @@ def _show(out: Path, track: Track, lines: Sequence[str]) -> None:
         if np.isfinite(sag_um).any()
         else None
     )
-    drawn = [_draw(out / "track.png", columns, change_um, track.residual_adu)]
+    drawn = [_draw_track(out / "track.png", columns, change_um, track.residual_adu)]
     with open_recording(out / "track.rrd", "membrane_ctrl_track") as recording:
         recording.log("track/report", rr.TextDocument("\n".join(lines)), static=True)
         at = [rr.TimeColumn("run_time", duration=time_s)]
@@ -320,7 +324,7 @@ def _show(out: Path, track: Track, lines: Sequence[str]) -> None:
         log_pictures(recording, "track/pictures", drawn)
 
 
-def _draw(
+def _draw_track(
     path: Path, columns: dict[str, Any], change_um: FloatArray | None, residual_adu: FloatArray
 ) -> Path:
     """Draw the terms over time, the sag with its band, and what the fits left."""

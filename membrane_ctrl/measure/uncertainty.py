@@ -64,7 +64,7 @@ def run_everywhere(
         workers = (os.cpu_count() or 1) if trials * len(benches) >= _WORTH_PROCESSES else 1
     try:
         with run_jobs(job, batches, min(workers, len(batches)), scheduler) as results:
-            return np.concatenate(list(terminal.counted(results, "trials", len(batches))))
+            return np.concatenate(list(terminal.track_progress(results, "trials", len(batches))))
     except ArithmeticError as error:
         raise errors.InputError(f"uncertainty: {error}") from None
 
@@ -122,18 +122,24 @@ def uncertainty_command(options: UncertaintyOptions) -> int:
         scheduler=options.scheduler,
     )
     seconds = time.perf_counter() - begin
-    result = _spread(benches, spread, parameters, _budget(folders, given, options.geometry))
+    result = _compute_spread(
+        benches, spread, parameters, _compute_budget(folders, given, options.geometry)
+    )
     mirror = sets[0].head.optics.mirror
     grid = height_map.HeightMap.over(mirror.analysis_radius_mm, mirror.radius_mm)
-    table = _table(options, sets, spread, source, result, grid) | {"timing_s": {"trials": seconds}}
+    table = _make_comparison_table(options, sets, spread, source, result, grid) | {
+        "timing_s": {"trials": seconds}
+    }
     out = options.out.resolve() if options.out else options.folder / "uncertainty"
     own, *other = (one.figure.fit.surface.parameters for one in sets)
-    _write(out, grid, result, 1e3 * grid.matrix @ (own - other[0] if other else own), table)
-    print(json.dumps(table) if options.as_json else "\n".join(_lines(table)))
+    _write_comparison(
+        out, grid, result, 1e3 * grid.matrix @ (own - other[0] if other else own), table
+    )
+    print(json.dumps(table) if options.as_json else "\n".join(_format_comparison(table)))
     return 0
 
 
-def _budget(
+def _compute_budget(
     folders: Sequence[Path], given: file.GeometryFile | None, geometry: Path | None
 ) -> FloatArray:
     """Covariance (parameters, parameters), mm^2, of the only set by its budget, or of its change
@@ -154,7 +160,7 @@ def _budget(
     )
 
 
-def _spread(
+def _compute_spread(
     benches: list[trial_bench.TrialBench],
     spread: geometry_spread.GeometrySpread,
     parameters: FloatArray,
@@ -171,7 +177,7 @@ def _spread(
     )
 
 
-def _table(
+def _make_comparison_table(
     options: UncertaintyOptions,
     sets: list[SetFigure],
     spread: geometry_spread.GeometrySpread,
@@ -204,7 +210,7 @@ def _table(
     }
 
 
-def _write(
+def _write_comparison(
     out: Path,
     grid: height_map.HeightMap,
     result: Spread,
@@ -214,7 +220,7 @@ def _write(
     from membrane_ctrl.measure.stability_pictures import draw_uncertainty
 
     rmse, whole = (grid.picture(1e3 * grid.sigma(c)) for c in (result.covariance, result.budget))
-    with errors.writing(out):
+    with errors.convert_write_errors(out):
         files.make_folder(out)
         write_json(out / "uncertainty.json", table)
         write_arrays(
@@ -227,7 +233,7 @@ def _write(
     print(f"written to {out}", file=sys.stderr)
 
 
-def _lines(table: dict[str, Any]) -> list[str]:
+def _format_comparison(table: dict[str, Any]) -> list[str]:
     what = "height" if table["against"] is None else "change of height"
     return [
         f"{what}: mean RMSE {table['rmse_um']['mean']:.4g} µm, largest "

@@ -212,7 +212,7 @@ class TelemetryColumn:
 _TABLE_KEY = "column"
 
 
-def column(
+def declare_column(
     label: str,
     description: str,
     plot: Plot,
@@ -266,20 +266,20 @@ class ColumnValues:
     columns.
     """
 
-    mono_s: float = column(
+    mono_s: float = declare_column(
         "time", "the run's clock at the start of the tick", RECORD, "", decimals=3
     )
-    tick: float = column(
+    tick: float = declare_column(
         "tick", "number of the tick, from 1", RECORD, "/tick/record", colour=GREY, kind=Kind.COUNT
     )
-    dt_s: float = column(
+    dt_s: float = declare_column(
         "time between ticks",
         "true time since the last tick, clamped",
         INTERVAL,
         "/tick/dt",
         decimals=4,
     )
-    lateness_ms: float = column(
+    lateness_ms: float = declare_column(
         "lateness",
         "start of the tick after its deadline",
         LATENESS,
@@ -287,7 +287,7 @@ class ColumnValues:
         decimals=1,
         published=True,
     )
-    missed_ticks: float = column(
+    missed_ticks: float = declare_column(
         "missed ticks",
         "ticks missed so far in the run",
         MISSED,
@@ -297,10 +297,10 @@ class ColumnValues:
         kind=Kind.COUNT,
         published=True,
     )
-    state: float = column(
+    state: float = declare_column(
         "state", "state of the controller", CODES, "/tick/record", colour=GREEN, kind=Kind.CODE
     )
-    shape_state: float = column(
+    shape_state: float = declare_column(
         "shape loop",
         "state of the shape loop",
         CODES,
@@ -308,10 +308,10 @@ class ColumnValues:
         colour=VIOLET,
         kind=Kind.CODE,
     )
-    safe_level: float = column(
+    safe_level: float = declare_column(
         "safe level", "active safe level", CODES, "/tick/record", colour=YELLOW, kind=Kind.CODE
     )
-    fault: float = column(
+    fault: float = declare_column(
         "fault",
         "code of the standing fault; 0 without one",
         CODES,
@@ -320,7 +320,7 @@ class ColumnValues:
         kind=Kind.CODE,
         aggregation=Aggregation.LARGEST,
     )
-    target_um: float = column(
+    target_um: float = declare_column(
         "target",
         "end of the setpoint's ramp",
         POSITION,
@@ -329,7 +329,7 @@ class ColumnValues:
         width=1.0,
         published=True,
     )
-    setpoint_um: float = column(
+    setpoint_um: float = declare_column(
         "setpoint",
         "setpoint of the loop, with the trim",
         POSITION,
@@ -337,7 +337,7 @@ class ColumnValues:
         colour=ORANGE,
         published=True,
     )
-    displacement_um: float = column(
+    displacement_um: float = declare_column(
         "reading",
         "reading of the laser; of the optics where they replace it",
         POSITION,
@@ -346,23 +346,23 @@ class ColumnValues:
         width=1.0,
         published=True,
     )
-    filtered_um: float = column(
+    filtered_um: float = declare_column(
         "process value",
         "what the loop holds: the filtered reading, or the estimate of the centre",
         POSITION,
         "/loop/position",
     )
-    error_um: float = column(
+    error_um: float = declare_column(
         "error", "setpoint minus process value", ERROR, "/loop/error", published=True
     )
-    p_um_per_s: float = column("P", "proportional term", TERMS, "/loop/terms", decimals=3)
-    i_um_per_s: float = column(
+    p_um_per_s: float = declare_column("P", "proportional term", TERMS, "/loop/terms", decimals=3)
+    i_um_per_s: float = declare_column(
         "I", "integral term", TERMS, "/loop/terms", colour=ORANGE, decimals=3
     )
-    d_um_per_s: float = column(
+    d_um_per_s: float = declare_column(
         "D", "derivative term", TERMS, "/loop/terms", colour=VIOLET, decimals=3
     )
-    feedforward_um_per_s: float = column(
+    feedforward_um_per_s: float = declare_column(
         "feed-forward",
         "flow for known disturbances and the setpoint's ramp",
         TERMS,
@@ -371,7 +371,7 @@ class ColumnValues:
         decimals=3,
         aggregation=_EXTREMES,
     )
-    flow_wanted_um_per_s: float = column(
+    flow_wanted_um_per_s: float = declare_column(
         "flow wanted",
         "flow that the loop asks for; what exceeds the flow is beyond its limits",
         FLOW,
@@ -379,7 +379,7 @@ class ColumnValues:
         colour=GREY,
         decimals=3,
     )
-    flow_um_per_s: float = column(
+    flow_um_per_s: float = declare_column(
         "flow",
         "the pump's flow, as motion of the centre",
         FLOW,
@@ -387,7 +387,7 @@ class ColumnValues:
         decimals=3,
         published=True,
     )
-    pump_fraction: float = column(
+    pump_fraction: float = declare_column(
         "pump",
         "pump command, share of full scale",
         DRIVE,
@@ -395,7 +395,7 @@ class ColumnValues:
         decimals=3,
         published=True,
     )
-    vent_fraction: float = column(
+    vent_fraction: float = declare_column(
         "vent",
         "vent command, share of full scale",
         DRIVE,
@@ -404,7 +404,7 @@ class ColumnValues:
         decimals=3,
         published=True,
     )
-    pump_readback_fraction: float = column(
+    pump_readback_fraction: float = declare_column(
         "pump read-back",
         "pump command that the device reports",
         DRIVE,
@@ -413,7 +413,7 @@ class ColumnValues:
         width=1.0,
         decimals=3,
     )
-    vent_readback_fraction: float = column(
+    vent_readback_fraction: float = declare_column(
         "vent read-back",
         "vent command that the device reports",
         DRIVE,
@@ -422,7 +422,7 @@ class ColumnValues:
         width=1.0,
         decimals=3,
     )
-    gauge_pressure_pa: float = column(
+    gauge_pressure_pa: float = declare_column(
         "gauge pressure",
         "pressure in the mirror above ambient",
         GAUGE,
@@ -430,7 +430,7 @@ class ColumnValues:
         decimals=1,
         published=True,
     )
-    ambient_pressure_pa: float = column(
+    ambient_pressure_pa: float = declare_column(
         "ambient pressure",
         "reading of the barometer",
         AMBIENT,
@@ -439,7 +439,7 @@ class ColumnValues:
         decimals=1,
         published=True,
     )
-    air_temperature_c: float = column(
+    air_temperature_c: float = declare_column(
         "air temperature",
         "temperature of the air around the mirror",
         TEMPERATURES,
@@ -447,14 +447,14 @@ class ColumnValues:
         colour=ORANGE,
         published=True,
     )
-    gas_temperature_c: float = column(
+    gas_temperature_c: float = declare_column(
         "gas temperature",
         "temperature of the gas in the mirror",
         TEMPERATURES,
         "/gas/temperature",
         published=True,
     )
-    displacement_quality: float = column(
+    displacement_quality: float = declare_column(
         "displacement quality",
         "quality code of the laser's reading; 0 is good, missing where the optics hold "
         "without a laser",
@@ -464,14 +464,14 @@ class ColumnValues:
         decimals=0,
         aggregation=_EXTREMES,
     )
-    sample_counter: float = column(
+    sample_counter: float = declare_column(
         "sample counter",
         "the board's count of its samples",
         RECORD,
         "/tick/record",
         kind=Kind.COUNT,
     )
-    device_time_s: float = column(
+    device_time_s: float = declare_column(
         "device time",
         "the board's clock at its sample",
         RECORD,
@@ -479,7 +479,7 @@ class ColumnValues:
         colour=ORANGE,
         decimals=3,
     )
-    leak_um_per_s: float = column(
+    leak_um_per_s: float = declare_column(
         "leak",
         "estimated leak, as motion of the centre",
         FLOW,
@@ -489,7 +489,7 @@ class ColumnValues:
         decimals=3,
         published=True,
     )
-    trim_um: float = column(
+    trim_um: float = declare_column(
         "trim",
         "the shape loop's part of the setpoint",
         TRIM,
@@ -498,7 +498,7 @@ class ColumnValues:
         width=2.0,
         published=True,
     )
-    truth_displacement_um: float = column(
+    truth_displacement_um: float = declare_column(
         "true centre",
         "true displacement of the centre; twin only",
         POSITION,
@@ -506,7 +506,7 @@ class ColumnValues:
         colour=GREEN,
         width=2.0,
     )
-    truth_laser_bias_um: float = column(
+    truth_laser_bias_um: float = declare_column(
         "true drift of the laser's mount",
         "part of the reading that is no motion of the mirror; twin only",
         RECORD,
@@ -514,21 +514,21 @@ class ColumnValues:
         colour=RED,
     )
     # the estimate of the centre (docs/explanation/estimator.md), which is then the process value
-    estimate_sigma_um: float = column(
+    estimate_sigma_um: float = declare_column(
         "estimate of the centre, 1 σ",
         "standard deviation of the estimate; missing where the laser is held",
         ESTIMATE_SIGMA,
         "/estimate/sigma",
         decimals=3,
     )
-    optics_share: float = column(
+    optics_share: float = declare_column(
         "share of the optics",
         "share of the optics in the estimate's corrections; the laser has the rest",
         OPTICS_SHARE,
         "/estimate/optics_share",
         decimals=3,
     )
-    laser_innovation: float = column(
+    laser_innovation: float = declare_column(
         "laser innovation",
         "reading less expectation, in standard deviations; missing while it is not used",
         INNOVATIONS,
@@ -536,10 +536,10 @@ class ColumnValues:
         colour=GREY,
         width=1.0,
     )
-    optics_innovation: float = column(
+    optics_innovation: float = declare_column(
         "optics innovation", "as the laser's", INNOVATIONS, "/estimate/innovations"
     )
-    barometer_innovation: float = column(
+    barometer_innovation: float = declare_column(
         "barometer innovation",
         "as the laser's",
         INNOVATIONS,
@@ -547,7 +547,7 @@ class ColumnValues:
         colour=ORANGE,
         width=1.0,
     )
-    thermometer_innovation: float = column(
+    thermometer_innovation: float = declare_column(
         "thermometer innovation",
         "as the laser's",
         INNOVATIONS,
@@ -555,7 +555,7 @@ class ColumnValues:
         colour=RED,
         width=1.0,
     )
-    interlocks_open: float = column(
+    interlocks_open: float = declare_column(
         "open interlocks",
         "bit i: interlock i of the configuration is open or lost; missing without interlocks "
         "or without a reading",

@@ -65,7 +65,7 @@ def os_reason(error: OSError) -> str:
 
 
 @contextmanager
-def writing(
+def convert_write_errors(
     target: Path, kind: type[CommandError] = InputError, remedy: str = ""
 ) -> Iterator[None]:
     """Turn an OSError of the block, which writes `target`, into a command's error with the reason
@@ -78,7 +78,7 @@ def writing(
 
 
 @contextmanager
-def named(source: Path | None) -> Iterator[None]:
+def name_source_in_errors(source: Path | None) -> Iterator[None]:
     """Put the file before an error of the block that begins with a key of it, such as
     `devices.pump: ...`.
     """

@@ -40,8 +40,8 @@ class Event:
     kind : str
         Kind of the lines.
     sentence : str
-        Template of the sentence (`prose.fill`) over the keys of the line and properties of the
-        class.
+        Template of the sentence (`prose.fill_template`) over the keys of the line and properties
+        of the class.
     level : LogLevel
     opens, closes : tuple of Topic
         Topics of the notices that it may open or close.
@@ -118,7 +118,7 @@ class Event:
             for name, v in values.items()
         }
         try:
-            filled = prose.fill(template, shown)
+            filled = prose.fill_template(template, shown)
         except (ValueError, TypeError):  # a number that is none
             filled = None
         return list_fields(line) if filled is None else filled
@@ -220,7 +220,7 @@ class UnknownEvent(Event):
         """Its message, else its fields."""
         message = self.line.get("message")
         if isinstance(message, str) and message:
-            return prose.fill("{message}", {"message": message}) or message
+            return prose.fill_template("{message}", {"message": message}) or message
         return list_fields(self.line)
 
     def to_dict(self) -> EventLine:

@@ -21,7 +21,7 @@ from membrane_ctrl.model.run_events import UnreadableEvent
 _EMPTY: dict[object, object] = {str: "", int: 0, float: math.nan, bool: False}
 
 
-def parse(message: bytes) -> EventLine:
+def parse_event(message: bytes) -> EventLine:
     """The event in a ring message; anything but a JSON object becomes an event that says so."""
     try:
         event = json.loads(message)

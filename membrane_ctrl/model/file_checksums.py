@@ -20,13 +20,13 @@ _LINE = re.compile(re.escape(_COMMENT) + r"([0-9a-f]{8})\n")
 def dumps_checked(table: dict[str, Any], indent: int | None = None) -> str:
     """JSON text of an object, with its checksum."""
     plain = json.loads(dumps(table))
-    return dumps({**plain, KEY: _crc(plain)}, indent)
+    return dumps({**plain, KEY: _table_crc(plain)}, indent)
 
 
 def take_checksum(table: dict[str, Any]) -> bool:
     """Remove an object's checksum after reading; True if correct or missing."""
     said = table.pop(KEY, None)
-    return said is None or said == _crc(table)
+    return said is None or said == _table_crc(table)
 
 
 def with_comment(text: str) -> str:
@@ -42,5 +42,5 @@ def comment_is_right(text: str) -> bool:
     return int(line[1], 16) == zlib.crc32(text[line.end() :].encode())
 
 
-def _crc(table: dict[str, Any]) -> str:
+def _table_crc(table: dict[str, Any]) -> str:
     return f"{zlib.crc32(json.dumps(table, sort_keys=True, separators=(',', ':')).encode()):08x}"

@@ -42,7 +42,7 @@ def folder_handle(folder: Path) -> Iterator[int]:
     try:
         descriptor = os.open(folder, _FOLDER)
     except OSError as error:
-        raise _told(error, folder) from None
+        raise _clarify_error(error, folder) from None
     try:
         yield descriptor
     finally:
@@ -60,8 +60,8 @@ def open_plain(path: Path, follow: bool = False) -> BinaryIO:
             descriptor = os.open(path, _READ & ~os.O_NOFOLLOW)
         else:
             folder = stack.enter_context(folder_handle(path.parent))
-            descriptor = _opened(path, _READ, folder)
-    return os.fdopen(_plain(descriptor, path), "rb")
+            descriptor = _open_checked(path, _READ, folder)
+    return os.fdopen(_require_regular(descriptor, path), "rb")
 
 
 def read_bytes(path: Path, most_bytes: int, follow: bool = False) -> bytes:
@@ -87,7 +87,7 @@ def read_text(
     return read_bytes(path, most_bytes, follow).decode("utf-8", errors)
 
 
-def users(path: Path) -> Path:
+def resolve_user_path(path: Path) -> Path:
     """A path named by the user, with its folder's links resolved; writing replaces the file itself,
     link or not.
     """
@@ -107,7 +107,7 @@ def write_bytes_atomic(path: Path, data: bytes) -> None:
     with folder_handle(path.parent) as folder:
         part = f".{path.name}.part"
         try:
-            with _fresh(part, folder, path) as file:
+            with _open_fresh(part, folder, path) as file:
                 file.write(data)
                 file.flush()
                 os.fsync(file.fileno())
@@ -121,7 +121,7 @@ def write_bytes_atomic(path: Path, data: bytes) -> None:
 def fresh_file(path: Path) -> BinaryIO:
     """Open a new file for piecewise writing, replacing an old one. Raises OSError."""
     with folder_handle(path.parent) as folder:
-        return _fresh(path.name, folder, path)
+        return _open_fresh(path.name, folder, path)
 
 
 def fresh_text(path: Path) -> TextIO:
@@ -132,7 +132,7 @@ def fresh_text(path: Path) -> TextIO:
 def append_text(path: Path, text: str) -> None:
     """Append to a plain file without hard links; make it if missing. Raises OSError."""
     with folder_handle(path.parent) as folder:
-        descriptor = _plain(_opened(path, _APPEND, folder), path)
+        descriptor = _require_regular(_open_checked(path, _APPEND, folder), path)
         with os.fdopen(descriptor, "ab") as file:
             # a second name may belong to a file elsewhere
             if os.fstat(file.fileno()).st_nlink > 1:
@@ -142,7 +142,7 @@ def append_text(path: Path, text: str) -> None:
             file.write(text.encode("utf-8", "backslashreplace"))
 
 
-def move(source: Path, target: Path) -> None:
+def move_file(source: Path, target: Path) -> None:
     """Replace a file, or a link but not its target, by another file. Raises OSError."""
     with folder_handle(source.parent) as from_folder, folder_handle(target.parent) as folder:
         try:
@@ -151,7 +151,7 @@ def move(source: Path, target: Path) -> None:
             raise type(error)(error.errno, error.strerror, str(target)) from None
 
 
-def remove(path: Path) -> None:
+def remove_file(path: Path) -> None:
     """Remove a file or a link, if it is there. Raises OSError."""
     with folder_handle(path.parent) as folder, contextlib.suppress(FileNotFoundError):
         os.unlink(path.name, dir_fd=folder)
@@ -181,20 +181,20 @@ def sync_data(path: Path) -> None:
         os.fdatasync(file.fileno())
 
 
-def _opened(path: Path, flags: int, folder: int) -> int:
+def _open_checked(path: Path, flags: int, folder: int) -> int:
     try:
         return os.open(path.name, flags, 0o644, dir_fd=folder)
     except OSError as error:
-        raise _told(error, path) from None
+        raise _clarify_error(error, path) from None
 
 
-def _fresh(name: str, folder: int, path: Path) -> BinaryIO:
+def _open_fresh(name: str, folder: int, path: Path) -> BinaryIO:
     with contextlib.suppress(FileNotFoundError):
         os.unlink(name, dir_fd=folder)
-    return os.fdopen(_opened(path.with_name(name), _NEW, folder), "wb")
+    return os.fdopen(_open_checked(path.with_name(name), _NEW, folder), "wb")
 
 
-def _plain(descriptor: int, path: Path) -> int:
+def _require_regular(descriptor: int, path: Path) -> int:
     """The descriptor of a regular file; closes any other. Raises OSError."""
     mode = os.fstat(descriptor).st_mode
     if stat.S_ISREG(mode):
@@ -205,7 +205,7 @@ def _plain(descriptor: int, path: Path) -> int:
     raise OSError(errno.EINVAL, "not a plain file (a pipe or a device)", str(path))
 
 
-def _told(error: OSError, path: Path) -> OSError:
+def _clarify_error(error: OSError, path: Path) -> OSError:
     """A clearer error: Linux reports a refused link in two ways, without naming folder or link."""
     if path.is_symlink():
         return OSError(errno.ELOOP, "is a link, and links are not followed here", str(path))

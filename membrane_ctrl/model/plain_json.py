@@ -18,14 +18,14 @@ _DIGITS_MAX = 19  # enough for a 64-bit counter; longer numbers are floats
 def dumps(value: Any, indent: int | None = None) -> str:
     """JSON text; NaN and infinity become null, unsupported types become their `str`."""
     return json.dumps(
-        _finite(value), ensure_ascii=False, default=str, allow_nan=False, indent=indent
+        _replace_non_finite(value), ensure_ascii=False, default=str, allow_nan=False, indent=indent
     )
 
 
 def loads(text: str) -> Any:
     """The value of a JSON text. Raises ValueError, also for excessive depth."""
     try:
-        value = json.loads(text, parse_int=_number)
+        value = json.loads(text, parse_int=_parse_number)
     except RecursionError:
         raise ValueError("nested too deep") from None
     inside = [value] if isinstance(value, (dict, list)) else []
@@ -41,20 +41,20 @@ def loads(text: str) -> Any:
     raise ValueError("nested too deep")
 
 
-def elements(text: str) -> int:
+def count_elements(text: str) -> int:
     """Upper bound on the number of values in a JSON text."""
     return text.count(",") + text.count("[") + text.count("{")
 
 
-def _number(text: str) -> int | float:
+def _parse_number(text: str) -> int | float:
     return int(text) if len(text) <= _DIGITS_MAX else float(text)
 
 
-def _finite(value: Any) -> Any:
+def _replace_non_finite(value: Any) -> Any:
     if isinstance(value, float) and not math.isfinite(value):
         return None
     if isinstance(value, dict):
-        return {key: _finite(item) for key, item in value.items()}
+        return {key: _replace_non_finite(item) for key, item in value.items()}
     if isinstance(value, (list, tuple)):
-        return [_finite(item) for item in value]
+        return [_replace_non_finite(item) for item in value]
     return value

@@ -32,7 +32,7 @@ def program_commit() -> str:
     The first call of a process may start git, which takes some 20 ms. So call it before the first
     tick.
     """
-    built = _matching(_read_line(PACKAGE / BUILD_FILE))
+    built = _find_match(_read_line(PACKAGE / BUILD_FILE))
     return built or find_commit(PACKAGE.parent)
 
 
@@ -107,14 +107,14 @@ def _describe_with_git(checkout: Path) -> str:
         )
     except (OSError, subprocess.SubprocessError):
         return ""
-    return _matching(done.stdout.decode(errors="replace").strip()) if done.returncode == 0 else ""
+    return _find_match(done.stdout.decode(errors="replace").strip()) if done.returncode == 0 else ""
 
 
 def _read_head(git: Path) -> str:
     head = _read_line(git / "HEAD")
     name = head.removeprefix("ref: ")
     found = _read_line(git / name) if name != head and ".." not in Path(name).parts else head
-    return _matching(found)[:_COMMIT_DIGITS]
+    return _find_match(found)[:_COMMIT_DIGITS]
 
 
 def _read_line(path: Path) -> str:
@@ -125,5 +125,5 @@ def _read_line(path: Path) -> str:
         return ""
 
 
-def _matching(text: str) -> str:
+def _find_match(text: str) -> str:
     return text if _COMMIT.fullmatch(text) else ""

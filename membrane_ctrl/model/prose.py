@@ -17,7 +17,7 @@ def fields_of(template: str) -> frozenset[str]:
     return frozenset(_FIELD.findall(template))
 
 
-def fill(template: str, values: Mapping[str, object]) -> str | None:
+def fill_template(template: str, values: Mapping[str, object]) -> str | None:
     """Fill a template such as `Fault {name}: {cause}[ ({seen})]`.
 
     Parameters

@@ -114,11 +114,13 @@ class RunStatus:
                 return replace(self, locks=(*self.locks, lock))
             case events.LockRemoved(word=word):
                 kept_locks = tuple(lock for lock in self.locks if lock.word != word)
-                return replace(self, locks=kept_locks, unstored=_without(self.unstored, word))
+                return replace(
+                    self, locks=kept_locks, unstored=_remove_standing(self.unstored, word)
+                )
             case run_events.LockNotStored():
                 return replace(self, unstored={**self.unstored, event.word: event.message})
             case run_events.LockStored():
-                return replace(self, unstored=_without(self.unstored, event.word))
+                return replace(self, unstored=_remove_standing(self.unstored, event.word))
             case events.GainsReverted():
                 return replace(self, loop=self.kept_loop, trial_ends_s=math.nan)
             case acquisition_events.GeometryInForce():
@@ -161,5 +163,5 @@ def _concerns_recording(key: NoticeKey) -> bool:
     return key.topic is Topic.RECORDING or key == NoticeKey(Topic.CHILD, child_events.RECORDER)
 
 
-def _without(standing: Mapping[str, str], name: str) -> Mapping[str, str]:
+def _remove_standing(standing: Mapping[str, str], name: str) -> Mapping[str, str]:
     return {key: words for key, words in standing.items() if key != name}

@@ -202,7 +202,7 @@ def describe_black_clipping(fraction: float) -> str:
     )
 
 
-def judge(quality: Quality) -> tuple[Verdict, str]:
+def judge_quality(quality: Quality) -> tuple[Verdict, str]:
     """The worst verdict and its reason; NaN anywhere is a rejection."""
     q = quality
     rejected = (

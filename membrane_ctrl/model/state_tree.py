@@ -103,7 +103,7 @@ class ArrayShape:
 _ADAPTERS: dict[type[StateNode], TypeAdapter[Any]] = {}
 
 
-def _adapter(kind: type[StateNode]) -> TypeAdapter[Any]:
+def _make_adapter(kind: type[StateNode]) -> TypeAdapter[Any]:
     """The encoder and decoder of a tree, made once: that takes as long as many ticks."""
     if kind not in _ADAPTERS:
         _ADAPTERS[kind] = TypeAdapter(kind)
@@ -118,7 +118,7 @@ def encode_state(node: StateNode) -> bytes:
     ValueError
         A value is not of its declared type.
     """
-    encoded: bytes = _adapter(type(node)).dump_json(node, warnings="error")
+    encoded: bytes = _make_adapter(type(node)).dump_json(node, warnings="error")
     return encoded
 
 
@@ -146,47 +146,47 @@ def decode_state(data: bytes, kind: type[T], most_bytes: int) -> T:
     if len(data) > most_bytes:
         raise StateError(f"{len(data)} bytes where at most {most_bytes} are expected")
     try:
-        node: T = _adapter(kind).validate_json(data)
+        node: T = _make_adapter(kind).validate_json(data)
     except ValidationError as error:
-        raise StateError(_describe(error)) from None
+        raise StateError(_describe_first_error(error)) from None
     # a missing field would have got its default
-    found, expected = _parse(data), _parse(encode_state(node))
+    found, expected = _parse_json(data), _parse_json(encode_state(node))
     if found != expected:
-        where = next(_missing(found, expected, ""), "not the values that this program writes")
+        where = next(_find_missing(found, expected, ""), "not the values that this program writes")
         raise StateError(f"another layout: {where}")
     return node
 
 
-def _parse(data: bytes) -> Any:
+def _parse_json(data: bytes) -> Any:
     """The values of JSON; NaN as a text, which equals itself."""
     return json.loads(data, parse_constant=str)
 
 
-def _describe(error: ValidationError) -> str:
+def _describe_first_error(error: ValidationError) -> str:
     """The first wrong value of many: its place, what is wrong, and the value."""
     first = error.errors(include_url=False)[0]
     place = ".".join(str(part) for part in first["loc"])
     return f"{place or 'the whole'}: {first['msg']} ({str(first['input'])[:40]})"
 
 
-def _missing(found: Any, expected: Any, place: str) -> Iterator[str]:
+def _find_missing(found: Any, expected: Any, place: str) -> Iterator[str]:
     """Yield the places of the expected tree that the other one lacks."""
     if isinstance(expected, dict) and isinstance(found, dict):
         for name in expected:
             if name in found:
-                yield from _missing(found[name], expected[name], f"{place}.{name}")
+                yield from _find_missing(found[name], expected[name], f"{place}.{name}")
             else:
                 yield f"{place}.{name}".lstrip(".") + " is missing"
     if isinstance(expected, list) and isinstance(found, list):
         for index, (one, other) in enumerate(zip(found, expected, strict=False)):
-            yield from _missing(one, other, f"{place}.{index}")
+            yield from _find_missing(one, other, f"{place}.{index}")
 
 
 def to_plain(node: StateNode) -> dict[str, Any]:
     """The tree as dicts, lists and numbers, for people and for tests;
     arrays are lists of numbers.
     """
-    plain: dict[str, Any] = _adapter(type(node)).dump_python(node)
+    plain: dict[str, Any] = _make_adapter(type(node)).dump_python(node)
     return {name: _with_lists(value) for name, value in plain.items()}
 
 
@@ -200,19 +200,20 @@ def _with_lists(value: Any) -> Any:
     return getattr(value, "name", value)
 
 
-def describe(node: StateNode) -> list[str]:
+def describe_tree(node: StateNode) -> list[str]:
     """The tree for people: a line `place  value` for each value; a large array is one line with its
     range.
     """
     return [
-        f"{place:<48} {text}" for place, text in _leaves(_adapter(type(node)).dump_python(node), "")
+        f"{place:<48} {text}"
+        for place, text in _list_leaves(_make_adapter(type(node)).dump_python(node), "")
     ]
 
 
 _SHOWN_NUMBERS = 8  # of an array
 
 
-def _leaves(value: Any, place: str) -> Iterator[tuple[str, str]]:
+def _list_leaves(value: Any, place: str) -> Iterator[tuple[str, str]]:
     if isinstance(value, np.ndarray) and value.size > _SHOWN_NUMBERS:
         shape = " x ".join(str(length) for length in value.shape)
         finite = value[np.isfinite(value)]
@@ -220,10 +221,10 @@ def _leaves(value: Any, place: str) -> Iterator[tuple[str, str]]:
         yield place, f"{shape} numbers, {span}"
     elif isinstance(value, Mapping) and value:
         for name, part in value.items():
-            yield from _leaves(part, f"{place}.{getattr(name, 'name', name)}".lstrip("."))
+            yield from _list_leaves(part, f"{place}.{getattr(name, 'name', name)}".lstrip("."))
     elif isinstance(value, list | tuple | deque) and value and isinstance(value[0], Mapping):
         for index, part in enumerate(value):
-            yield from _leaves(part, f"{place}.{index}")
+            yield from _list_leaves(part, f"{place}.{index}")
     else:
         yield place, str(_with_lists(value))
 
@@ -243,20 +244,22 @@ def find_differences(one: StateNode, other: StateNode, within: float = 0.0) -> l
     list of str
         `place: one value, other value`.
     """
-    adapter = _adapter(type(one))
-    return list(_differences(adapter.dump_python(one), adapter.dump_python(other), "", within))
+    adapter = _make_adapter(type(one))
+    return list(_find_differences(adapter.dump_python(one), adapter.dump_python(other), "", within))
 
 
-def _differences(one: Any, other: Any, place: str, within: float) -> Iterator[str]:
+def _find_differences(one: Any, other: Any, place: str, within: float) -> Iterator[str]:
     if isinstance(one, np.ndarray) and isinstance(other, np.ndarray):
         one, other = one.tolist(), other.tolist()
     if isinstance(one, Mapping) and isinstance(other, Mapping):
         for key in dict.fromkeys([*one, *other]):
             inner = f"{place}.{getattr(key, 'name', key)}".lstrip(".")
-            yield from _differences(one.get(key, "absent"), other.get(key, "absent"), inner, within)
+            yield from _find_differences(
+                one.get(key, "absent"), other.get(key, "absent"), inner, within
+            )
     elif _is_list(one) and _is_list(other) and len(one) == len(other):
         for index, (part, part_of_other) in enumerate(zip(one, other, strict=True)):
-            yield from _differences(part, part_of_other, f"{place}.{index}", within)
+            yield from _find_differences(part, part_of_other, f"{place}.{index}", within)
     elif not _is_same(one, other, within):
         yield f"{place}: {_with_lists(one)!r}, {_with_lists(other)!r}"
 

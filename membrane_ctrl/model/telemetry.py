@@ -105,17 +105,17 @@ Rows = FloatArray
 COLUMN: dict[str, int] = {name: place for place, name in enumerate(FIELDS)}
 
 
-def unpack(messages: Sequence[bytes]) -> Rows:
+def unpack_rows(messages: Sequence[bytes]) -> Rows:
     """Packed `TelemetryRow`s as a table (n, len(FIELDS))."""
     return np.frombuffer(b"".join(messages), dtype="<f8").reshape(-1, len(FIELDS))
 
 
-def column(rows: Rows, name: str) -> FloatArray:
+def get_column(rows: Rows, name: str) -> FloatArray:
     """One field of all rows, (n,)."""
     return rows[:, COLUMN[name]]
 
 
-def columns(rows: Rows) -> dict[str, Column]:
+def get_columns(rows: Rows) -> dict[str, Column]:
     """All fields of rows by name, (n,) each."""
     return dict(zip(FIELDS, rows.T, strict=True))
 
@@ -127,7 +127,7 @@ def true_error_um(ticks: Mapping[str, Column]) -> Column:
     return ticks["target_um"] - ticks["truth_displacement_um"]
 
 
-def changes(codes: FloatArray, before: float) -> list[tuple[int, int]]:
+def find_changes(codes: FloatArray, before: float) -> list[tuple[int, int]]:
     """Changes of a code: (row, new code) for each, comparing the first row with `before` (NaN:
     none).
     """

@@ -29,16 +29,16 @@ _REFUSED = frozenset({"Cc", "Cf", "Cs", "Zl", "Zp"})
 _KEPT = frozenset("\n\t")
 
 
-def plain(text: str) -> str:
+def escape_controls(text: str) -> str:
     """The text with every character that a terminal might execute replaced by its JSON escape."""
     if text.isprintable():
         return text
-    return "".join(_escape(letter) if _refused(letter) else letter for letter in text)
+    return "".join(_escape_letter(letter) if _is_refused(letter) else letter for letter in text)
 
 
 def one_line(text: str) -> str:
-    """As `plain`, in one line: spaces replace line ends."""
-    return plain(" ".join(text.split("\n")))
+    """As `escape_controls`, in one line: spaces replace line ends."""
+    return escape_controls(" ".join(text.split("\n")))
 
 
 @contextlib.contextmanager
@@ -73,7 +73,7 @@ def live_line(text: str, end: str = "") -> None:
     stream.flush()
 
 
-def counted(items: Iterable[_T], what: str, total: int | None = None) -> Iterable[_T]:
+def track_progress(items: Iterable[_T], what: str, total: int | None = None) -> Iterable[_T]:
     """Yield the items, with a progress bar on stderr if that is a terminal."""
     from rich.progress import track
 
@@ -96,7 +96,11 @@ class Plain:
         from rich.segment import Segment
 
         for segment in rich.render(self._inner, options):
-            yield segment if segment.control else Segment(plain(segment.text), segment.style)
+            yield (
+                segment
+                if segment.control
+                else Segment(escape_controls(segment.text), segment.style)
+            )
 
 
 class _Cells:
@@ -114,7 +118,7 @@ class _Text:
 
     def write(self, text: str) -> int:
         """Write a text, reduced to plain text."""
-        self._stream.write(plain(text))
+        self._stream.write(escape_controls(text))
         return len(text)
 
     def writelines(self, lines: Any) -> None:
@@ -126,16 +130,16 @@ class _Text:
         return getattr(self._stream, name)
 
 
-def _refused(letter: str) -> bool:
+def _is_refused(letter: str) -> bool:
     return letter not in _KEPT and unicodedata.category(letter) in _REFUSED
 
 
-def _escape(letter: str) -> str:
+def _escape_letter(letter: str) -> str:
     units = letter.encode("utf-16-be", "surrogatepass")
     return "".join(f"\\u{int.from_bytes(units[k : k + 2]):04x}" for k in range(0, len(units), 2))
 
 
-def progress(words: str) -> None:
+def print_progress(words: str) -> None:
     """Print a line of progress on stderr; a reader that has gone is no error."""
     with contextlib.suppress(OSError):
         print(words, file=sys.stderr, flush=True)

@@ -42,7 +42,7 @@ class Child:
     def __init__(self, name: str, target: str, args: tuple[Any, ...], nice: int) -> None:
         self.name = name
         self._process = SPAWN_CONTEXT.Process(
-            target=_main, args=(target, args, nice), name=name, daemon=True
+            target=_run_target, args=(target, args, nice), name=name, daemon=True
         )
 
     def start(self) -> None:
@@ -104,7 +104,7 @@ def parent_lives() -> bool:
     return parent is None or os.getppid() == parent.pid
 
 
-def _main(target: str, args: tuple[Any, ...], nice: int) -> None:
+def _run_target(target: str, args: tuple[Any, ...], nice: int) -> None:
     """Run the target, then exit at once: the interpreter's shutdown would complain about arrays in
     shared memory.
     """

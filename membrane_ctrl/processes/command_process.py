@@ -27,7 +27,7 @@ class CommandProcess:
         """Start the program without waiting."""
         program = [sys.executable, "-m", "membrane_ctrl", *self._arguments]
         stdin = subprocess.PIPE if "--with-hold" in self._arguments else subprocess.DEVNULL
-        with contextlib.suppress(OSError), _appending(self._log) as log:
+        with contextlib.suppress(OSError), _open_log(self._log) as log:
             self._process = subprocess.Popen(
                 program, stdin=stdin, stdout=log, stderr=log, process_group=0
             )
@@ -69,7 +69,7 @@ class CommandProcess:
 
 
 @contextlib.contextmanager
-def _appending(log: Path) -> Iterator[int]:
+def _open_log(log: Path) -> Iterator[int]:
     """A file that only its user may read: the output may hold the link that lets in; or nothing if
     it cannot be.
     """

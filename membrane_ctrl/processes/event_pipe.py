@@ -9,7 +9,7 @@ from membrane_ctrl.model import events
 from membrane_ctrl.processes.child import SPAWN_CONTEXT
 
 
-def pipe() -> Any:
+def make_pipe() -> Any:
     """Make a two-way pipe between this process and a child."""
     return SPAWN_CONTEXT.Pipe()
 
@@ -24,13 +24,13 @@ def event_sender(status: Connection | None) -> Callable[[events.Event], None]:
 
     def report(event: events.Event) -> None:
         try:
-            status.send({key: _short(value) for key, value in event.to_dict().items()})
+            status.send({key: _shorten_value(value) for key, value in event.to_dict().items()})
         except OSError:  # full, or closed at the other end
             return
 
     return report
 
 
-def _short(value: Any) -> Any:
+def _shorten_value(value: Any) -> Any:
     """Shorten a message so that a pipe takes it whole or not at all."""
     return value[:1000] if isinstance(value, str) else value

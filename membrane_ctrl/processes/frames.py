@@ -49,11 +49,11 @@ class FrameRing:
 
     def __init__(self, slots: int, height_px: int, width_px: int, dtype: str = "uint8") -> None:
         self.address = FrameAddress("", slots, height_px, width_px, dtype)
-        size_bytes = _ALIGN_BYTES + slots * _stride(self.address)
+        size_bytes = _ALIGN_BYTES + slots * _slot_bytes(self.address)
         self._memory = SharedMemory(create=True, size=size_bytes)
         self.address = FrameAddress(self._memory.name, slots, height_px, width_px, dtype)
         try:
-            _reserve(self._memory.name, size_bytes)
+            _reserve_memory(self._memory.name, size_bytes)
         except OSError as error:
             self.close()
             raise OSError(
@@ -157,7 +157,7 @@ class _FrameSlots:
         self._words = memory.buf.cast(
             "Q"
         )  # each assignment is one store (`membrane_ctrl.processes.ring`)
-        self._stride = _stride(address)
+        self._stride = _slot_bytes(address)
         shape = (address.height_px, address.width_px)
         # frombuffer holds the memory, so that closing it under a live view raises;
         # ndarray(buffer=...) would let it be unmapped, and the next access to a pixel would crash
@@ -212,12 +212,12 @@ class _FrameSlots:
         return _ALIGN_BYTES + (index % len(self._pixels)) * self._stride
 
 
-def _stride(address: FrameAddress) -> int:
+def _slot_bytes(address: FrameAddress) -> int:
     pixel_bytes = prod((address.height_px, address.width_px, np.dtype(address.dtype).itemsize))
     return _ALIGN_BYTES + (pixel_bytes + 8 + _ALIGN_BYTES - 1) // _ALIGN_BYTES * _ALIGN_BYTES
 
 
-def _reserve(name: str, size_bytes: int) -> None:
+def _reserve_memory(name: str, size_bytes: int) -> None:
     path = _SHARED_MEMORY_FOLDER / name.lstrip("/")
     if not path.exists():  # not Linux: shared memory is not a folder there
         return

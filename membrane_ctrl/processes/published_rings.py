@@ -34,23 +34,23 @@ def attach_rings(run_dir: Path) -> dict[str, RingReader]:
     """
     readers: dict[str, RingReader] = {}
     with ExitStack() as stack:
-        for name, address in _addresses(run_dir / _FILE).items():
-            readers[name] = RingReader(address, _mapped(address))
+        for name, address in _read_addresses(run_dir / _FILE).items():
+            readers[name] = RingReader(address, _map_memory(address))
             stack.callback(readers[name].close)
             readers[name].latest()
         stack.pop_all()
     return readers
 
 
-def _addresses(path: Path) -> dict[str, RingAddress]:
+def _read_addresses(path: Path) -> dict[str, RingAddress]:
     text = read_bytes(path, _FILE_BYTES_MAX)
     try:
-        return {name: _address(name, values) for name, values in json.loads(text).items()}
+        return {name: _parse_address(name, values) for name, values in json.loads(text).items()}
     except (ValueError, TypeError, AttributeError, KeyError, RecursionError) as error:
         raise RingError(f"{_FILE} is damaged: {error}") from None
 
 
-def _address(ring: str, values: dict[str, Any]) -> RingAddress:
+def _parse_address(ring: str, values: dict[str, Any]) -> RingAddress:
     name, slots, slot_bytes = values["name"], values["slots"], values["slot_bytes"]
     if (
         ring not in _RINGS
@@ -62,7 +62,7 @@ def _address(ring: str, values: dict[str, Any]) -> RingAddress:
     return RingAddress(name, slots, slot_bytes)
 
 
-def _mapped(address: RingAddress) -> mmap:
+def _map_memory(address: RingAddress) -> mmap:
     """Map the ring's memory read-only. Raises OSError, RingError."""
     with open_plain(_SHARED_MEMORY_FOLDER / address.name) as file:
         found, size_bytes = os.fstat(file.fileno()), address.size_bytes

@@ -46,7 +46,7 @@ class RingAddress:
     @property
     def size_bytes(self) -> int:
         """Size of the shared memory. Raises RingError for impossible dimensions."""
-        size_bytes = _HEADER_BYTES + self.slots * _stride(self.slot_bytes)
+        size_bytes = _HEADER_BYTES + self.slots * _slot_stride(self.slot_bytes)
         if self.slots < 1 or self.slot_bytes < 0 or size_bytes > _RING_BYTES_MAX:
             raise RingError(f"a ring cannot have {self.slots} slots of {self.slot_bytes} bytes")
         return size_bytes
@@ -86,7 +86,7 @@ class _Slots:
         self.bytes = whole[:size_bytes]
         self.words = self.bytes.cast("Q")
         self._views[:0] = self.words, self.bytes
-        self.count, self._stride = address.slots, _stride(address.slot_bytes)
+        self.count, self._stride = address.slots, _slot_stride(address.slot_bytes)
         head = [self.words[word] for word in (_IS_RING, _SLOTS, _SLOT_BYTES)]
         if head != [_MAGIC, address.slots, address.slot_bytes]:
             raise RingError(f"{address.name}: not the expected ring of {address.slots} slots")
@@ -127,7 +127,7 @@ class RingWriter:
         first, last = self._slots.span(self._next)
         sequence = self._next + 1
         words[first] = sequence
-        words[first + 1] = _seal(message, sequence)
+        words[first + 1] = _message_seal(message, sequence)
         self._slots.bytes[8 * first + 16 : 8 * first + 16 + length] = message
         words[last] = sequence
         self._next = sequence
@@ -207,7 +207,9 @@ class RingReader:
         message = bytes(slots.bytes[8 * first + 16 : 8 * first + 16 + length])
         before = slots.words[first]
         return (
-            message if before == after == index + 1 and seal == _seal(message, index + 1) else None
+            message
+            if before == after == index + 1 and seal == _message_seal(message, index + 1)
+            else None
         )
 
     def close(self) -> None:
@@ -216,7 +218,7 @@ class RingReader:
 
 
 @contextmanager
-def ring(slots: int, slot_bytes: int) -> Iterator[RingAddress]:
+def open_ring(slots: int, slot_bytes: int) -> Iterator[RingAddress]:
     """A ring for the duration of a `with` block."""
     owner = Ring(slots, slot_bytes)
     try:
@@ -225,10 +227,10 @@ def ring(slots: int, slot_bytes: int) -> Iterator[RingAddress]:
         owner.close()
 
 
-def _seal(message: bytes, sequence: int) -> int:
+def _message_seal(message: bytes, sequence: int) -> int:
     """Length and CRC-32 of a message, in one word."""
     return len(message) | zlib.crc32(message, sequence & 0xFFFFFFFF) << 32
 
 
-def _stride(slot_bytes: int) -> int:
+def _slot_stride(slot_bytes: int) -> int:
     return (slot_bytes + _SLOT_OVERHEAD + 7) // 8 * 8

@@ -14,9 +14,14 @@ from membrane_ctrl.run_files import plot_marks, shapes, streams
 
 def run_blueprint(config: Config) -> rrb.Blueprint:
     """The layout of a run; it has a shape tab only if the shape is measured."""
-    tabs = [_overview(config), _loop(config), _environment(config), _timing()]
+    tabs = [
+        _make_overview(config),
+        _make_loop_tab(config),
+        _make_environment_tab(config),
+        _make_timing_tab(),
+    ]
     if config.shape.enabled:
-        tabs.insert(2, _shape(config))
+        tabs.insert(2, _make_shape_tab(config))
     return rrb.Blueprint(
         rrb.Tabs(*tabs, active_tab=0),
         rrb.TimePanel(state="collapsed", timeline="utc"),
@@ -36,7 +41,7 @@ def _whole_run() -> rrb.TimeAxis:
     return rrb.TimeAxis(view_range=everything)
 
 
-def _plot(
+def _make_plot(
     name: str, *paths: str, span: tuple[float, float] | None = None, marks: bool = False
 ) -> rrb.TimeSeriesView:
     """Plot entities; lines of commands and faults only with a span, as they would stretch any other
@@ -53,24 +58,24 @@ def _plot(
     )
 
 
-def _ticks(plot: Plot, detail: str = "") -> rrb.TimeSeriesView:
+def _make_ticks_plot(plot: Plot, detail: str = "") -> rrb.TimeSeriesView:
     """Plot columns as they are recorded: every tick around events, else one a second."""
-    return _plot(plot_title(plot, detail), *streams.entities_of(plot))
+    return _make_plot(plot_title(plot, detail), *streams.entities_of(plot))
 
 
 def _figure_plot(plot: Plot) -> rrb.TimeSeriesView:
     """Plot columns of the measured figures."""
-    return _plot(figure_plot_title(plot), figure_columns.figure_columns_of(plot)[0].entity)
+    return _make_plot(figure_plot_title(plot), figure_columns.figure_columns_of(plot)[0].entity)
 
 
-def _means(plot: Plot) -> rrb.TimeSeriesView:
+def _make_means_plot(plot: Plot) -> rrb.TimeSeriesView:
     """Plot the mean of each second."""
-    return _plot(
+    return _make_plot(
         plot_title(plot, "mean of each second"), *map(streams.mean_path, streams.entities_of(plot))
     )
 
 
-def _error(config: Config) -> rrb.TimeSeriesView:
+def _make_error_plot(config: Config) -> rrb.TimeSeriesView:
     return _around_band(
         config,
         "Error of each second: least, mean, greatest, µm",
@@ -82,10 +87,10 @@ def _error(config: Config) -> rrb.TimeSeriesView:
 def _around_band(config: Config, name: str, *paths: str) -> rrb.TimeSeriesView:
     """Plot over twice the band: the start, tens of µm off, would make the hold invisible."""
     band_um = config.limits.band_um
-    return _plot(name, "/loop/band", *paths, span=(-2 * band_um, 2 * band_um), marks=True)
+    return _make_plot(name, "/loop/band", *paths, span=(-2 * band_um, 2 * band_um), marks=True)
 
 
-def _lanes() -> rrb.StateTimelineView:
+def _make_lanes() -> rrb.StateTimelineView:
     contents = [
         "+ /state/controller",
         "+ /state/shape_loop",
@@ -112,12 +117,12 @@ def _text_log() -> rrb.TextLogView:
     )
 
 
-def _overview(config: Config) -> rrb.Vertical:
+def _make_overview(config: Config) -> rrb.Vertical:
     plots = rrb.Vertical(
-        _error(config),
-        _means(columns.POSITION),
-        rrb.Horizontal(_means(columns.DRIVE), _means(columns.FLOW)),
-        _lanes(),
+        _make_error_plot(config),
+        _make_means_plot(columns.POSITION),
+        rrb.Horizontal(_make_means_plot(columns.DRIVE), _make_means_plot(columns.FLOW)),
+        _make_lanes(),
         row_shares=[3, 1.6, 1.6, 2.6],
     )
     page = rrb.TextDocumentView(name="Summary", origin=SUMMARY_PATH)
@@ -132,7 +137,7 @@ def _overview(config: Config) -> rrb.Vertical:
 _TICKS = "every tick around events, else one a second"
 
 
-def learned(config: Config) -> dict[str, tuple[str, ...]]:
+def list_learned_plots(config: Config) -> dict[str, tuple[str, ...]]:
     """Plots of what a loop of this configuration learns: the paths of each, by name."""
     found: dict[str, tuple[str, ...]] = {}
     if config.pump.probe_um:
@@ -145,9 +150,9 @@ def learned(config: Config) -> dict[str, tuple[str, ...]]:
 LOOP_PLOTS = tuple(plot for plot in plots_of(Group.LOOP, Group.PUMP) if plot != columns.ERROR)
 
 
-def _loop(config: Config) -> rrb.Vertical:
-    further = [_plot(name, *paths) for name, paths in learned(config).items()]
-    plots = [*map(_ticks, LOOP_PLOTS), *further]
+def _make_loop_tab(config: Config) -> rrb.Vertical:
+    further = [_make_plot(name, *paths) for name, paths in list_learned_plots(config).items()]
+    plots = [*map(_make_ticks_plot, LOOP_PLOTS), *further]
     return rrb.Vertical(
         _around_band(
             config,
@@ -160,41 +165,43 @@ def _loop(config: Config) -> rrb.Vertical:
     )
 
 
-def _environment(config: Config) -> rrb.Vertical:
+def _make_environment_tab(config: Config) -> rrb.Vertical:
     return rrb.Vertical(
-        *map(_means, plots_of(Group.ENVIRONMENT)), _error(config), name="Environment"
+        *map(_make_means_plot, plots_of(Group.ENVIRONMENT)),
+        _make_error_plot(config),
+        name="Environment",
     )
 
 
-def _map(kind: str, name: str) -> rrb.Spatial2DView:
+def _make_map(kind: str, name: str) -> rrb.Spatial2DView:
     return rrb.Spatial2DView(name=name, origin=f"/shape/map/{kind}")
 
 
-def _shape(config: Config) -> rrb.Vertical:
+def _make_shape_tab(config: Config) -> rrb.Vertical:
     maps = rrb.Horizontal(
-        _map("height", "Height, mm"),
-        _map("difference", "Change since hold began, µm"),
+        _make_map("height", "Height, mm"),
+        _make_map("difference", "Change since hold began, µm"),
         rrb.Tabs(
-            _map("difference_no_defocus", "Less piston, tilt, defocus"),
-            _map("difference_no_tilt", "Less piston, tilt"),
+            _make_map("difference_no_defocus", "Less piston, tilt, defocus"),
+            _make_map("difference_no_tilt", "Less piston, tilt"),
             active_tab=0,
         ),
-        _map("scatter", "Standard deviation, µm"),
-        _map("uncertainty", "Noise of a cycle, 1σ, µm"),
+        _make_map("scatter", "Standard deviation, µm"),
+        _make_map("uncertainty", "Noise of a cycle, 1σ, µm"),
         rrb.TextDocumentView(name="Colours", origin="/shape/legend"),
     )
     band_um = config.limits.band_um
     rows = [
         maps,
         rrb.Horizontal(
-            _plot(
+            _make_plot(
                 figure_plot_title(figure_columns.SAG_CHANGE, "trim"),
                 streams.SAG.path,
                 *streams.entities_of(columns.TRIM),
                 span=(-band_um, band_um),
                 marks=True,
             ),
-            _plot(
+            _make_plot(
                 figure_plot_title(figure_columns.LOW_ORDERS, "since the hold began"),
                 streams.CHANGE.path,
                 span=(-band_um / 4, band_um / 4),
@@ -209,7 +216,7 @@ def _shape(config: Config) -> rrb.Vertical:
             _figure_plot(figure_columns.SLOPE_RESIDUAL),
             _figure_plot(figure_columns.FRINGE_QUALITY),
             _figure_plot(figure_columns.LATENCY),
-            *(_ticks(plot) for plot in plots_of(Group.SHAPE) if plot != columns.TRIM),
+            *(_make_ticks_plot(plot) for plot in plots_of(Group.SHAPE) if plot != columns.TRIM),
         ),
     ]
     if config.shape.mode == "track":
@@ -236,6 +243,6 @@ def frame_names(config: Config) -> tuple[str, ...]:
     return tuple(f"{axis}_sin_{k}" for axis in "xy" for k in (0, 1))
 
 
-def _timing() -> rrb.Vertical:
-    ticks = [_ticks(plot, _TICKS) for plot in plots_of(Group.TIMING)]
+def _make_timing_tab() -> rrb.Vertical:
+    ticks = [_make_ticks_plot(plot, _TICKS) for plot in plots_of(Group.TIMING)]
     return rrb.Vertical(*ticks, _figure_plot(figure_columns.LATENCY), name="Timing")

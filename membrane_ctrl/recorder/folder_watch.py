@@ -12,7 +12,7 @@ class FolderWatch:
 
     def __init__(self, run_dir: Path) -> None:
         self._run_dir = run_dir
-        self._descriptor = _opened(run_dir)
+        self._descriptor = _open_folder(run_dir)
         # an `rm -r` that meets a newly written file leaves the folder, but without its content
         self._has_config = (run_dir / run_folder.CONFIG).exists()
 
@@ -37,7 +37,7 @@ class FolderWatch:
         self._run_dir.mkdir(parents=True, exist_ok=True)
         run_folder.write_heads(self._run_dir, config)
         self.close()
-        self._descriptor = _opened(self._run_dir)
+        self._descriptor = _open_folder(self._run_dir)
         self._has_config = True
 
     def close(self) -> None:
@@ -47,7 +47,7 @@ class FolderWatch:
             self._descriptor = None
 
 
-def _opened(folder: Path) -> int | None:
+def _open_folder(folder: Path) -> int | None:
     try:
         return os.open(folder, os.O_RDONLY | os.O_DIRECTORY)
     except OSError:

@@ -73,7 +73,7 @@ def save_state(run_dir: Path, state: RecorderState) -> None:
     part = run_dir / f"{_NAME}.part"
     with files.fresh_file(part) as file:
         file.write(encode_state(state))
-    files.move(part, run_dir / _NAME)
+    files.move_file(part, run_dir / _NAME)
 
 
 def load_state(run_dir: Path) -> RecorderState | None:

@@ -80,7 +80,7 @@ class Housekeeping:
         now_utc = self._clock.utc(self._clock.now())
         retention.delete_remains(self._run_dir.parent)
         runs = retention.deletable_runs(self._run_dir.parent, self._run_dir, now_utc)
-        gone = retention.expired(
+        gone = retention.find_expired(
             runs, retention.size_bytes(self._run_dir), config.keep_gb, config.keep_days, now_utc
         )
         # a folder that a person has moved away is no longer an error

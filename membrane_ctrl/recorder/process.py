@@ -66,7 +66,7 @@ def recorder_main(spec: RecorderSpec, status: Connection | None = None) -> None:
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     signal.signal(STOP, lambda *_: asked.set())
     prepare_rerun()
-    if not _record(spec, event_sender(status), asked.is_set, lambda: not parent_lives()):
+    if not _record_run(spec, event_sender(status), asked.is_set, lambda: not parent_lives()):
         os._exit(0)  # everything is written; Rerun's exit handler would wait for a dead writer
 
 
@@ -78,7 +78,7 @@ def prepare_rerun() -> None:
     os.environ["MIMALLOC_PURGE_DELAY"] = "0"
 
 
-def _record(
+def _record_run(
     spec: RecorderSpec,
     report: Callable[[Event], None],
     asked: Callable[[], bool],

@@ -36,17 +36,19 @@ class QuietFilter:
         codes = rows[:, [telemetry.COLUMN[name] for name in _CODES]]
         before = np.vstack((self._codes, codes[:-1]))
         lively = (codes != before).any(axis=1) | (
-            np.abs(telemetry.column(rows, "error_um")) > self._band_um
+            np.abs(telemetry.get_column(rows, "error_um")) > self._band_um
         )
         self._codes = codes[-1]
         if lively.any():
-            self._lively_until_s = float(telemetry.column(rows, "mono_s")[lively][-1]) + _AFTER_S
+            self._lively_until_s = (
+                float(telemetry.get_column(rows, "mono_s")[lively][-1]) + _AFTER_S
+            )
             held, self._held = self._held, []
             return np.concatenate((*held, rows))
         now_s = float(rows[-1, telemetry.COLUMN["mono_s"]])
         if now_s < self._lively_until_s:
             return rows
-        kept = telemetry.column(rows, "tick") % self._every == 0
+        kept = telemetry.get_column(rows, "tick") % self._every == 0
         self._held.append(rows[~kept])
         self._held = [
             part

@@ -122,7 +122,9 @@ class Recorder:
         if "shapes" in self._feeds:
             for message in self._feeds["shapes"].drain():
                 self._errors.guarded("shape estimate", partial(self._take_shape, message))
-        self.take_events([event_lines.parse(message) for message in self._feeds["events"].drain()])
+        self.take_events(
+            [event_lines.parse_event(message) for message in self._feeds["events"].drain()]
+        )
 
     def take_events(self, new: list[EventLine]) -> None:
         """Take events; an "end" among them ends the run."""

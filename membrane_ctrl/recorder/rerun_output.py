@@ -161,11 +161,11 @@ class RerunOutput:
         """
         if not len(rows):
             return
-        state = telemetry.column(rows, "state")
-        for row, code in telemetry.changes(state, self.state):
+        state = telemetry.get_column(rows, "state")
+        for row, code in telemetry.find_changes(state, self.state):
             if code == telemetry.State.HOLD:
                 self.shapes.rebase(
-                    float(telemetry.column(rows, "mono_s")[row]) + telemetry.SETTLED_AFTER_S
+                    float(telemetry.get_column(rows, "mono_s")[row]) + telemetry.SETTLED_AFTER_S
                 )
         self.state = float(state[-1])
 

@@ -118,17 +118,19 @@ class Recording:
             *streams.SHAPE_STREAMS,
             streams.VIBRATIONS,
         ):
-            stream.log(block.path, _styled(rr.SeriesLines, block), static=True)
+            stream.log(block.path, _style_lines(rr.SeriesLines, block), static=True)
         for block in (
-            streams.band(self._config.limits.band_um),
+            streams.make_band(self._config.limits.band_um),
             streams.CHANGE,
             streams.SAG,
             streams.PUMP,
         ):
-            stream.log(block.path, _styled(rr.Measurements.from_fields, block), static=True)
+            stream.log(block.path, _style_lines(rr.Measurements.from_fields, block), static=True)
         for block in plot_marks.MARKS:  # the average of the lines in a pixel would be none
             stream.log(
-                block.path, _styled(rr.SeriesLines, block, aggregation_policy="Off"), static=True
+                block.path,
+                _style_lines(rr.SeriesLines, block, aggregation_policy="Off"),
+                static=True,
             )
         bars = rr.BarChart(
             np.zeros(ZERNIKE_TERMS - 1), abscissa=NOLL_INDICES[1:]
@@ -250,7 +252,7 @@ def _panics_are_errors() -> Iterator[None]:
         raise RuntimeError(f"Rerun failed on it ({str(error)[:80]})") from None
 
 
-def _styled(
+def _style_lines(
     archetype: Callable[..., rr.AsComponents], stream: streams.Stream, **more: object
 ) -> rr.AsComponents:
     """Names, colours and widths of a stream's lines."""

@@ -95,7 +95,7 @@ class ShapeStreams:
             return
         self._next_frame_s = estimate.time_s + FRAME_INTERVAL_S
         time_s = np.array([estimate.time_s])
-        for stream, values in _quality(estimate).items():
+        for stream, values in _make_quality_scalars(estimate).items():
             self._recording.scalars(stream.path, time_s, np.array([values]))
         if estimate.verdict != self._verdict:
             self._verdict = estimate.verdict
@@ -112,7 +112,7 @@ class ShapeStreams:
             self._next_map_s, self._scatter = -math.inf, shapes.Scatter()
         self._scatter.add(estimate.coeffs_um)
         self._recording.scalars(streams.ZERNIKE.path, time_s, estimate.coeffs_um[np.newaxis])
-        for stream, (values, variances) in _changes(estimate, self.reference).items():
+        for stream, (values, variances) in _make_change_scalars(estimate, self.reference).items():
             self._recording.measurements(
                 stream.path, time_s, np.array([values]), np.array([variances])
             )
@@ -161,7 +161,7 @@ class ShapeStreams:
             terms_um = (estimate.coeffs_um - reference.coeffs_um)[1:]
             self._recording.log(shapes.BARS_PATH, time_s, rr.BarChart.from_fields(values=terms_um))
             self._recording.page(
-                "/shape/legend", time_s, _legend(estimate, reference, self._colours)
+                "/shape/legend", time_s, _make_legend(estimate, reference, self._colours)
             )
 
     def _send_map(
@@ -175,7 +175,7 @@ class ShapeStreams:
         self._colours[kind] = f"{'0 to ' if least_um is None else '±'}{span[1]:.3g} {unit}"
 
 
-def _legend(
+def _make_legend(
     estimate: shape_estimate.ShapeEstimate,
     reference: shape_estimate.ShapeEstimate,
     colours: dict[str, str],
@@ -201,7 +201,9 @@ def _legend(
     )
 
 
-def _quality(estimate: shape_estimate.ShapeEstimate) -> dict[streams.Stream, list[float]]:
+def _make_quality_scalars(
+    estimate: shape_estimate.ShapeEstimate,
+) -> dict[streams.Stream, list[float]]:
     return {
         streams.RESIDUAL: [estimate.slope_residual_urad],
         streams.QUALITY: [estimate.valid_fraction, estimate.saturated_fraction],
@@ -210,7 +212,7 @@ def _quality(estimate: shape_estimate.ShapeEstimate) -> dict[streams.Stream, lis
     }
 
 
-def _changes(
+def _make_change_scalars(
     estimate: shape_estimate.ShapeEstimate, reference: shape_estimate.ShapeEstimate
 ) -> dict[streams.Stream, tuple[list[float], list[float]]]:
     """Values and variances; these are this cycle's own,

@@ -35,7 +35,7 @@ class TelemetryStreams:
         self._recording = recording
         self._overview_every_s = overview_every_s
         self._band_um = config.limits.band_um
-        self._band = streams.band(self._band_um)
+        self._band = streams.make_band(self._band_um)
         self._quiet = QuietFilter(config.loop.rate_hz, config.recording.quiet_hz, self._band_um)
         self._codes: dict[str, float] = {}
         self._rest = np.empty((0, len(telemetry.FIELDS)))  # not in the overview yet
@@ -59,12 +59,12 @@ class TelemetryStreams:
 
     def _send_overview(self, rows: telemetry.Rows, last: bool = False) -> None:
         """Send a row for each second, some seconds at a time, and the band."""
-        waiting_s = telemetry.column(self._rest, "mono_s")
-        fresh = telemetry.column(rows, "mono_s") > waiting_s.max(
+        waiting_s = telemetry.get_column(self._rest, "mono_s")
+        fresh = telemetry.get_column(rows, "mono_s") > waiting_s.max(
             initial=-math.inf
         )  # not if sent again after a failure
         self._rest = rows = np.concatenate((self._rest, rows[fresh]))
-        time_s = telemetry.column(rows, "mono_s")
+        time_s = telemetry.get_column(rows, "mono_s")
         second = np.floor(time_s)
         if second[-1] - second[0] < self._overview_every_s and not last:
             return
@@ -76,30 +76,30 @@ class TelemetryStreams:
         )
         means = np.concatenate([streams.mean_row(part) for part in whole])
         errors_um = np.concatenate([streams.overview_um(part) for part in whole])
-        true_um = telemetry.true_error_um(telemetry.columns(means))[:, np.newaxis]
+        true_um = telemetry.true_error_um(telemetry.get_columns(means))[:, np.newaxis]
         blocks = [(stream.path, stream.values(means)) for stream in streams.MEANS]
         blocks += [(streams.OVERVIEW.path, errors_um), (streams.TRUE_MEAN.path, true_um)]
         for path, values in blocks:
             there = np.isfinite(values).any(axis=1)
             if there.any():
                 self._recording.scalars(
-                    path, telemetry.column(means, "mono_s")[there], values[there]
+                    path, telemetry.get_column(means, "mono_s")[there], values[there]
                 )
 
     def _send_streams(self, rows: telemetry.Rows) -> None:
-        time_s = telemetry.column(rows, "mono_s")
+        time_s = telemetry.get_column(rows, "mono_s")
         blocks = [(stream.path, stream.values(rows)) for stream in streams.STREAMS]
-        true_um = telemetry.true_error_um(telemetry.columns(rows))
+        true_um = telemetry.true_error_um(telemetry.get_columns(rows))
         blocks.append((streams.TRUE_ERROR.path, true_um[:, np.newaxis]))
         for path, values in blocks:
             if np.isfinite(values).any():
                 self._recording.scalars(path, time_s, values)
 
     def _send_lanes(self, rows: telemetry.Rows) -> None:
-        time_s = telemetry.column(rows, "mono_s")
+        time_s = telemetry.get_column(rows, "mono_s")
         for lane in state_lanes.TELEMETRY_LANES:
-            codes = telemetry.column(rows, lane.field)
-            found = telemetry.changes(codes, self._codes.get(lane.field, math.nan))
+            codes = telemetry.get_column(rows, lane.field)
+            found = telemetry.find_changes(codes, self._codes.get(lane.field, math.nan))
             if found:
                 words = [lane.word(code) for _, code in found]
                 self._recording.columns(

@@ -31,21 +31,23 @@ def summary_page(summary: Mapping[str, Any], status: RunStatus, config: Config) 
     held, states = summary["held"], summary["states"]
     faults_s, whole_s = held["faults_s"], max(summary["duration_s"], 1e-9)
     rows = {
-        "held": _span(held["held_s"]),
-        f"std of 1 s means, {'true centre' if held['of'] == 'true' else 'reading'}": _um(
+        "held": _format_span(held["held_s"]),
+        f"std of 1 s means, {'true centre' if held['of'] == 'true' else 'reading'}": _format_um(
             held["std_um"]
         ),
-        "mean error": _um(held["mean_um"], "+"),
-        f"1 s means within ±{config.limits.band_um:g} µm": _share(held["in_band"]),
+        "mean error": _format_um(held["mean_um"], "+"),
+        f"1 s means within ±{config.limits.band_um:g} µm": _format_share(held["in_band"]),
         "faults": str(summary["fault_count"] or "none"),
         "last fault": str(summary["faults"][-1].get("name", "")) if summary["faults"] else "",
-        "time in faults": f"{_span(faults_s)} ({_share(faults_s / whole_s)})" if faults_s else "",
-        "paused": _span(held["paused_s"]) if held["paused_s"] >= 1.0 else "",
-        "leak": _um(summary["leak_um_per_s"], unit="µm/s"),
+        "time in faults": f"{_format_span(faults_s)} ({_format_share(faults_s / whole_s)})"
+        if faults_s
+        else "",
+        "paused": _format_span(held["paused_s"]) if held["paused_s"] >= 1.0 else "",
+        "leak": _format_um(summary["leak_um_per_s"], unit="µm/s"),
         "shape cycles": f"{summary['cycles']}, {summary['cycles_rejected']} rejected"
         if summary["cycles"]
         else "",
-        "geometry": _geometry(summary["geometry"]),
+        "geometry": _format_geometry(summary["geometry"]),
         "gains": gains_words(
             status.loop or vars(config.loop), status.trial_ends_s - summary["duration_s"]
         ),
@@ -53,28 +55,28 @@ def summary_page(summary: Mapping[str, Any], status: RunStatus, config: Config) 
         "not recorded": "; ".join(status.recording_problems),
     }
     state = states[-1]["state"] if states else "not started"
-    lines = [f"| {name} | {_cell(words)} |" for name, words in rows.items() if words]
-    return "\n".join((f"| {state} | {_cell(status.why)} |", "|---|---|", *lines)) + "\n"
+    lines = [f"| {name} | {_format_cell(words)} |" for name, words in rows.items() if words]
+    return "\n".join((f"| {state} | {_format_cell(status.why)} |", "|---|---|", *lines)) + "\n"
 
 
-def _geometry(geometry: Mapping[str, Any]) -> str:
+def _format_geometry(geometry: Mapping[str, Any]) -> str:
     words = [str(geometry[key]) for key in ("hash", "file") if geometry.get(key)]
     calibrated = geometry.get("calibrated_utc")
     return ", ".join([*words, f"calibrated {calibrated}"] if calibrated else words)
 
 
-def _um(value: float | None, sign: str = "", unit: str = "µm") -> str:
+def _format_um(value: float | None, sign: str = "", unit: str = "µm") -> str:
     return f"{value:{sign}.3g} {unit}" if value is not None and math.isfinite(value) else ""
 
 
-def _share(value: float | None) -> str:
+def _format_share(value: float | None) -> str:
     return f"{100 * value:.4g} %" if value is not None and math.isfinite(value) else ""
 
 
-def _span(seconds: float) -> str:
+def _format_span(seconds: float) -> str:
     """As `0:09:12`."""
     return str(timedelta(seconds=round(seconds)))
 
 
-def _cell(words: str) -> str:
+def _format_cell(words: str) -> str:
     return for_people(words).replace("|", "/")

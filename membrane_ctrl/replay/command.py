@@ -36,7 +36,7 @@ from membrane_ctrl.model import (
 from membrane_ctrl.model.arithmetic import describe_arithmetic
 from membrane_ctrl.model.errors import Exit, InputError
 from membrane_ctrl.model.program import file_origin
-from membrane_ctrl.model.state_tree import describe, to_plain
+from membrane_ctrl.model.state_tree import describe_tree, to_plain
 from membrane_ctrl.replay import replay as replays
 from membrane_ctrl.replay.numbers import NUMBERS_WITHIN, RecordedRows
 from membrane_ctrl.run_files import event_log, inputs_file, run_config, table_specs
@@ -135,7 +135,7 @@ def replay_command(
         raise InputError(f"--from {from_s:g}s is not before --to {to_s:g}s")
     run = open_recorded(folder)
     started_s = time.perf_counter()
-    begin, found = _replayed(run, from_s, to_s)
+    begin, found = _replay_part(run, from_s, to_s)
     took_s = time.perf_counter() - started_s
     if not found.ticks:
         part = "" if math.isinf(to_s) else f" up to {to_s:g} s"
@@ -143,7 +143,7 @@ def replay_command(
         raise InputError(f"{folder}: no tick to replay{part}{why and ': '}{why}")
     if found.last_s < from_s:
         raise InputError(f"{folder}: --from {from_s:g}s: the record ends at {found.last_s:.1f} s")
-    report = _report(run, found, begin, to_s)
+    report = _make_report(run, found, begin, to_s)
     remembered = found.state if state else None
     if as_json:
         print(
@@ -152,11 +152,11 @@ def replay_command(
             )
         )
     else:
-        print("\n".join(_lines(report)))
+        print("\n".join(_format_report(report)))
         if remembered is not None:
             print(
                 f"state      after the tick at {found.last_s:.3f} s:",
-                *describe(remembered),
+                *describe_tree(remembered),
                 sep="\n",
             )
     rate = found.ticks / took_s if took_s else math.inf
@@ -173,7 +173,7 @@ def replay_command(
     return int(Exit.DONE if report["verdict"] in ("identical", "same numbers") else Exit.REJECTED)
 
 
-def _replayed(run: RecordedRun, from_s: float, to_s: float) -> tuple[int, replays.Replay]:
+def _replay_part(run: RecordedRun, from_s: float, to_s: float) -> tuple[int, replays.Replay]:
     """Start at the last snapshot before `from_s`, or at the run's start without a snapshot of
     today's layout.
     """
@@ -181,38 +181,44 @@ def _replayed(run: RecordedRun, from_s: float, to_s: float) -> tuple[int, replay
     begin = replays.tick_to_begin_with(inputs, from_s)
     if begin > 1:
         try:
-            return begin, _replay(run, replays.recorded_ticks(inputs, begin), from_s, to_s)
+            return begin, _replay_ticks(run, replays.recorded_ticks(inputs, begin), from_s, to_s)
         except UnknownSnapshotError as error:
             print(f"from the run's start: {error}", file=sys.stderr)
     try:
-        return 1, _replay(run, replays.recorded_ticks(run.inputs), from_s, to_s)
+        return 1, _replay_ticks(run, replays.recorded_ticks(run.inputs), from_s, to_s)
     except UnknownSnapshotError as error:  # a snapshot after a gap
         print(f"without snapshots: {error}", file=sys.stderr)
         run.inputs.damage.clear()  # the second pass reports it again
-        return 1, _replay(run, replays.recorded_ticks(run.inputs, snapshots=False), from_s, to_s)
+        return 1, _replay_ticks(
+            run, replays.recorded_ticks(run.inputs, snapshots=False), from_s, to_s
+        )
 
 
-def _replay(
+def _replay_ticks(
     run: RecordedRun,
     ticks: Iterator[replays.RecordedTick | replays.Gap],
     from_s: float,
     to_s: float,
 ) -> replays.Replay:
     comparison = replays.Comparison(ColumnChoice(run.inputs.columns), run.recorded_rows(from_s))
-    return replays.replay(run.config, ticks, zernike_projection(), from_s, to_s, comparison)
+    return replays.replay_record(run.config, ticks, zernike_projection(), from_s, to_s, comparison)
 
 
-def _report(run: RecordedRun, found: replays.Replay, begin: int, to_s: float) -> dict[str, Any]:
+def _make_report(
+    run: RecordedRun, found: replays.Replay, begin: int, to_s: float
+) -> dict[str, Any]:
     # make no claim about the time after the log or the inputs end
     end_s = min(to_s, run.told_until_s, found.last_s)
     today = [decision for decision in found.decisions if decision.time_s <= end_s]
     recorded = [d for d in run.decisions if found.begin_s <= d.time_s <= end_s + DECISION_SLACK_S]
     in_time = sum(decision.time_s <= end_s for decision in recorded)
-    decisions = replays.unmatched(recorded[: max(in_time, len(today))], today, DECISION_SLACK_S)
+    decisions = replays.find_unmatched(
+        recorded[: max(in_time, len(today))], today, DECISION_SLACK_S
+    )
     first = found.different_rows[0] if found.different else None
     differences = run.differences(found.different_rows)
     return {
-        "verdict": _verdict(found, bool(decisions), bool(run.inputs.damage)),
+        "verdict": _make_verdict(found, bool(decisions), bool(run.inputs.damage)),
         "recorded_by": run.inputs.program,
         "begin_s": found.begin_s,
         "from_snapshot": begin > 1,
@@ -238,7 +244,7 @@ def _report(run: RecordedRun, found: replays.Replay, begin: int, to_s: float) ->
     }
 
 
-def _verdict(found: replays.Replay, decisions_differ: bool, damaged: bool) -> str:
+def _make_verdict(found: replays.Replay, decisions_differ: bool, damaged: bool) -> str:
     """The verdict: identical only if all was compared; decisions after a gap prove nothing about
     the code.
     """
@@ -250,7 +256,7 @@ def _verdict(found: replays.Replay, decisions_differ: bool, damaged: bool) -> st
     return "same numbers" if found.near else "identical"
 
 
-def _lines(report: dict[str, Any]) -> list[str]:
+def _format_report(report: dict[str, Any]) -> list[str]:
     """The report as lines of text."""
     lines = [
         f"verdict    {report['verdict']}: {report['compared']} of {report['ticks']} ticks "
@@ -338,8 +344,10 @@ def write_incident(
         raise InputError(f"{folder}: already exists; choose another name")
     folder.mkdir()
     kept = RunTables(folder)
-    for frame in _between(run.inputs.since(found.begin_s), begin, to_s):
-        kept.add_ticks(TickBatch(frame.records, _rows(frame.records), frame.tails, frame.snapshots))
+    for frame in _select_between(run.inputs.since(found.begin_s), begin, to_s):
+        kept.add_ticks(
+            TickBatch(frame.records, _make_input_rows(frame.records), frame.tails, frame.snapshots)
+        )
         for estimate in frame.estimates.values():
             kept.add_shape(estimate)
         kept.sync()
@@ -354,7 +362,7 @@ def write_incident(
         ],
     }
     (folder / "incident.toml").write_text(tomli_w.dumps(about), encoding="utf-8")
-    (folder / "config.toml").write_text(toml_file.dump(run.config), encoding="utf-8")
+    (folder / "config.toml").write_text(toml_file.dump_toml(run.config), encoding="utf-8")
     size = sum(path.stat().st_size for path in folder.rglob("*") if path.is_file())
     if size > _BYTES_MAX:
         shutil.rmtree(folder)
@@ -365,7 +373,7 @@ def write_incident(
     return folder
 
 
-def _rows(records: Records) -> telemetry.Rows:
+def _make_input_rows(records: Records) -> telemetry.Rows:
     """Telemetry rows holding only the fields that repeat the ticks' inputs, NaN elsewhere."""
     rows = np.full((len(records), len(telemetry.FIELDS)), np.nan)
     for name, column in table_specs.ROW_COLUMNS.items():
@@ -373,7 +381,7 @@ def _rows(records: Records) -> telemetry.Rows:
     return rows
 
 
-def _between(
+def _select_between(
     frames: inputs_file.InputsReader, begin: int, to_s: float
 ) -> Iterator[inputs_file.InputsFrame]:
     before: dict[

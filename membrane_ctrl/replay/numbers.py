@@ -46,7 +46,7 @@ class RecordedRows:
             return None
         today = np.frombuffer(row.pack())
         with np.errstate(invalid="ignore"):
-            near = np.isfinite(today) & (np.abs(today - recorded) <= _tolerances(today))
+            near = np.isfinite(today) & (np.abs(today - recorded) <= _compute_tolerances(today))
         same = near | (today == recorded) | (np.isnan(today) & np.isnan(recorded)) | ~self._known
         return tuple(
             name for name, is_same in zip(telemetry.FIELDS, same, strict=True) if not is_same
@@ -65,7 +65,7 @@ class RecordedRows:
         return self._rows[place] if self._ticks[place] == tick else None
 
 
-def _tolerances(values: FloatArray) -> FloatArray:
+def _compute_tolerances(values: FloatArray) -> FloatArray:
     """How far each column of a recorded row may be from a computed one with these values."""
     size = np.abs(values)
     recorded = np.where(_EXACT, 0.0, _SINGLE * size)

@@ -38,7 +38,7 @@ def repair_command(run_dir: Path, in_place: bool, as_json: bool) -> int:
 
     Raises InputError if it is not a run folder, or the run is still in progress.
     """
-    findings = repair(run_dir, in_place)
+    findings = repair_run(run_dir, in_place)
     if as_json:
         rows = [{"file": f.file, "state": f.state, "action": f.action} for f in findings]
         print(json.dumps({"run": run_dir.resolve().name, "files": rows}))
@@ -55,7 +55,7 @@ def repair_command(run_dir: Path, in_place: bool, as_json: bool) -> int:
     return int(errors.Exit.DONE)
 
 
-def repair(run_dir: Path, in_place: bool = False) -> list[FileFinding]:
+def repair_run(run_dir: Path, in_place: bool = False) -> list[FileFinding]:
     """Repair every file of a run that a crash may have torn.
 
     Repaired files go to `repaired/` or replace the originals; the part cut off the event log stays
@@ -86,7 +86,7 @@ def _now_s(folder: Path) -> float:
     try:
         with files.fresh_file(probe) as file:
             now_s = os.fstat(file.fileno()).st_mtime
-        files.remove(probe)
+        files.remove_file(probe)
     except OSError as error:
         raise errors.InputError(
             f"{folder}: cannot be written ({error.strerror}); copy the run first"
@@ -94,7 +94,7 @@ def _now_s(folder: Path) -> float:
     return now_s
 
 
-def _target(path: Path, in_place: bool) -> Path:
+def _make_target(path: Path, in_place: bool) -> Path:
     if in_place:
         return path
     return files.make_folder(path.parent / REPAIRED) / path.name
@@ -108,7 +108,7 @@ def _repair_events(run_dir: Path, in_place: bool) -> list[FileFinding]:
     good, torn = _split_events(data)
     if not torn:
         return [FileFinding(path.name, "whole", "")]
-    target = _target(path, in_place)
+    target = _make_target(path, in_place)
     files.write_bytes_atomic(target.with_name(f"{path.name}.torn"), torn)
     files.write_bytes_atomic(target, good)
     where = target.relative_to(run_dir)
@@ -194,7 +194,7 @@ def _repair_summary(run_dir: Path, in_place: bool) -> FileFinding:
     if there and _is_whole_object(files.read_bytes(path, files.SMALL_BYTES)):
         return FileFinding(path.name, "whole", "")
     table = rebuild_summary(run_dir)
-    target = _target(path, in_place or not there)
+    target = _make_target(path, in_place or not there)
     files.write_text_atomic(target, plain_json.dumps(table, indent=2) + "\n")
     state = "unreadable" if there else "missing"
     return FileFinding(
@@ -208,10 +208,10 @@ def rebuild_summary(run_dir: Path) -> dict[str, Any]:
     path = run_dir / "events.jsonl"
     last_s = -np.inf
     for rows in _all_rows(run_dir):
-        new = rows[telemetry.column(rows, "mono_s") > last_s]
+        new = rows[telemetry.get_column(rows, "mono_s") > last_s]
         if len(new):
             last_s = float(new[-1, telemetry.COLUMN["mono_s"]])
-            summary.add_rows(new[np.isfinite(telemetry.column(new, "state"))])
+            summary.add_rows(new[np.isfinite(telemetry.get_column(new, "state"))])
     ticks = 0
     for frame in inputs_file.InputsReader(run_dir):
         ticks += len(frame.records)

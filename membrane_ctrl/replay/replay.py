@@ -115,7 +115,7 @@ class Comparison:
     rows: RecordedRows | None = None
 
 
-def replay(
+def replay_record(
     config: Config,
     record: Iterable[RecordedTick | Gap],
     sag_sensitivity: FloatArray,
@@ -154,13 +154,13 @@ def replay(
                 same_past, remembered = True, True
         elif item.snapshot and found.state_differences is None:
             found.state_differences = _compare_state(item, controller, comparison)
-        outputs = _ticked(controller, item, remembered)
+        outputs = _run_tick(controller, item, remembered)
         found.ticks += 1
         found.last_s = item.inputs.now_s
         found.finished = outputs.finished
         found.decisions += decisions_of((item.inputs.now_s, event) for event in outputs.events)
         if item.inputs.now_s >= from_s and same_past:
-            _compare(item, outputs, found, comparison)
+            _compare_tick(item, outputs, found, comparison)
     found.state = controller.memory
     return found
 
@@ -181,7 +181,7 @@ def _compare_state(
     return StateDifferences(item.inputs.now_s, fields) if fields else None
 
 
-def _ticked(controller: Controller, item: RecordedTick, remembered: bool) -> TickOutputs:
+def _run_tick(controller: Controller, item: RecordedTick, remembered: bool) -> TickOutputs:
     """Run a tick. Ticks never raise by themselves: one that does after a snapshot proves that it
     was forged.
     """
@@ -194,7 +194,7 @@ def _ticked(controller: Controller, item: RecordedTick, remembered: bool) -> Tic
         raise UnknownSnapshotError(f"the snapshot cannot be used: {what}") from None
 
 
-def _compare(
+def _compare_tick(
     item: RecordedTick, outputs: TickOutputs, found: Replay, comparison: Comparison
 ) -> None:
     found.compared += 1
@@ -286,7 +286,7 @@ def without_repeats(decisions: list[Decision]) -> list[Decision]:
     return kept
 
 
-def unmatched(recorded: list[Decision], today: list[Decision], slack_s: float) -> list[str]:
+def find_unmatched(recorded: list[Decision], today: list[Decision], slack_s: float) -> list[str]:
     """Differences between two lists of decisions, as sentences; times may differ by `slack_s`."""
     said: list[str] = []
     recorded, today = without_repeats(recorded), without_repeats(today)
@@ -299,11 +299,11 @@ def unmatched(recorded: list[Decision], today: list[Decision], slack_s: float) -
             or then.what != now.what
             or abs(then.time_s - now.time_s) > slack_s
         ):
-            said.append(f"recorded: {_told(then)}; today: {_told(now)}")
+            said.append(f"recorded: {_describe_decision(then)}; today: {_describe_decision(now)}")
             if then is None or now is None or then.what != now.what:
                 break  # all later ones are shifted against each other
     return said
 
 
-def _told(decision: Decision | None) -> str:
+def _describe_decision(decision: Decision | None) -> str:
     return "nothing more" if decision is None else f"{decision.what} at {decision.time_s:.2f} s"

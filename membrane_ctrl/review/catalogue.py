@@ -90,10 +90,10 @@ class Filter:
         )
 
 
-def entries(logs_dir: Path, wanted: Filter | None = None) -> list[RunEntry]:
+def list_entries(logs_dir: Path, wanted: Filter | None = None) -> list[RunEntry]:
     """The runs of a folder, oldest first. Raises InputError if there is no such folder."""
     require_folder(logs_dir)
-    found = [_entry_or_why(folder) for folder in folders(logs_dir)]
+    found = [_entry_or_why(folder) for folder in list_run_folders(logs_dir)]
     return [item for item in found if wanted is None or wanted.takes(item)]
 
 
@@ -107,14 +107,14 @@ def require_folder(logs_dir: Path) -> None:
 def _entry_or_why(folder: Path) -> RunEntry:
     """An entry; an unreadable folder gives a line that says so, not an error."""
     try:
-        return entry(folder)
+        return read_entry(folder)
     except OSError as error:
         began, why = origin_of(folder, ()), f"cannot be read ({errors.os_reason(error)})"
         nan = math.nan
         return RunEntry(folder, began, nan, nan, nan, 0, why, nan, nan, "", nan, 0, False, "")
 
 
-def entry(folder: Path) -> RunEntry:
+def read_entry(folder: Path) -> RunEntry:
     """One run's line, from its small files only; without a summary, also from the end of its 1 s
     level.
     """
@@ -122,7 +122,7 @@ def entry(folder: Path) -> RunEntry:
     log = event_log.read_events(folder, notes)
     summary: dict[str, Any] = summary_file.read_summary(folder, notes) or {}
     config = run_config.read_config(folder, notes)
-    told, duration_s = summary.get("held"), _number(summary.get("duration_s"))
+    told, duration_s = summary.get("held"), _read_number(summary.get("duration_s"))
     held = told if isinstance(told, dict) else {}
     pump = next(
         (each.event for each in reversed(log) if isinstance(each.event, events.PumpLearned)), None
@@ -131,13 +131,13 @@ def entry(folder: Path) -> RunEntry:
         folder=folder,
         started_utc=origin_of(folder, log),
         duration_s=duration_s if math.isfinite(duration_s) else _recorded_s(folder),
-        std_um=_number(held.get("std_um")),
-        in_band=_number(held.get("in_band")),
+        std_um=_read_number(held.get("std_um")),
+        in_band=_read_number(held.get("in_band")),
         faults=sum(isinstance(each.event, events.Fault) for each in log),
         exit=str(summary.get("exit", "open")),
         kp_per_s=config.loop.kp_per_s,
         ti_s=config.loop.ti_s,
-        configuration=_hash(folder / "config.toml"),
+        configuration=_read_hash(folder / "config.toml"),
         size_mb=retention.size_bytes(folder) / 1e6,
         marks=sum(isinstance(each.event, run_events.Mark) for each in log),
         kept=(folder / KEPT_FILE).exists(),
@@ -150,15 +150,16 @@ def entry(folder: Path) -> RunEntry:
             "",
         ),
         **{
-            name: _number(held.get(name)) for name in ("held_s", "faults_s", "paused_s", "moving_s")
+            name: _read_number(held.get(name))
+            for name in ("held_s", "faults_s", "paused_s", "moving_s")
         },
-        pump_scale=math.nan if pump is None else _number(pump.scale),
-        pump_sigma=math.nan if pump is None else _number(pump.sigma),
+        pump_scale=math.nan if pump is None else _read_number(pump.scale),
+        pump_sigma=math.nan if pump is None else _read_number(pump.sigma),
         ended_in=_fault_of_end(log, summary.get("exit")),
     )
 
 
-def resolve(run: str | Path, logs_dir: str | Path = "logs") -> Path:
+def resolve_run(run: str | Path, logs_dir: str | Path = "logs") -> Path:
     """Find the run's folder: a path; a run's name, or the end of it, below `logs`; or `last`.
 
     Raises InputError if no run, or more than one, matches.
@@ -166,7 +167,7 @@ def resolve(run: str | Path, logs_dir: str | Path = "logs") -> Path:
     run, logs_dir = Path(run), Path(logs_dir)
     if run.exists() or not logs_dir.is_dir():
         return run
-    known = folders(logs_dir)
+    known = list_run_folders(logs_dir)
     if str(run) == "last" and known:
         return known[-1]
     near = [folder for folder in known if folder.name == str(run)]
@@ -178,7 +179,7 @@ def resolve(run: str | Path, logs_dir: str | Path = "logs") -> Path:
     return near[0] if near else run
 
 
-def folders(logs_dir: Path) -> list[Path]:
+def list_run_folders(logs_dir: Path) -> list[Path]:
     """The folders of runs, by name; hidden ones are remains of deleted runs."""
     return [
         folder
@@ -216,11 +217,11 @@ def _recorded_s(folder: Path) -> float:
     return math.nan if newest is None else float(newest.as_py()) + _LEVEL_S
 
 
-def _number(value: object) -> float:
+def _read_number(value: object) -> float:
     return float(value) if isinstance(value, (int, float)) else math.nan
 
 
-def _hash(path: Path) -> str:
+def _read_hash(path: Path) -> str:
     try:
         return hashlib.sha256(files.read_bytes(path, files.SMALL_BYTES)).hexdigest()[:8]
     except OSError:

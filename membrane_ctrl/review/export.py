@@ -10,7 +10,7 @@ import pyarrow.csv
 import pyarrow.parquet
 
 from membrane_ctrl.model import errors, program
-from membrane_ctrl.model.files import make_folder, move, scratch_folder, write_text_atomic
+from membrane_ctrl.model.files import make_folder, move_file, scratch_folder, write_text_atomic
 from membrane_ctrl.model.telemetry import FIELDS
 from membrane_ctrl.review import catalogue
 from membrane_ctrl.review.run_times import part_s
@@ -39,7 +39,7 @@ EVENTS = "events"
 _SHAPE_COLUMNS = ("hencky_um", "sag_um", "sag_sigma_um", "displacement_um")
 
 
-def export(
+def export_run(
     run: Run,
     to: str,
     out: str | Path,
@@ -67,22 +67,22 @@ def export(
     """
     if to not in FORMATS:
         raise errors.InputError(f"--format {to}: known: {', '.join(FORMATS)}")
-    fields, extras = _selected(streams)
+    fields, extras = _select_streams(streams)
     out = Path(out)
     refuse_originals(out)
-    with errors.writing(out, errors.DeviceError):
+    with errors.convert_write_errors(out, errors.DeviceError):
         make_folder(out)
         # beside existing files, so that a failed export leaves those unchanged
         with scratch_folder(out, ".export-") as folder:
-            files = (_hdf5 if to == "hdf5" else _files)(
+            files = (_write_hdf5 if to == "hdf5" else _list_files)(
                 run, to, folder, fields, extras, start_s, end_s
             )
             for path in files:
-                move(path, out / path.name)
+                move_file(path, out / path.name)
             return [out / path.name for path in files]
 
 
-def _files(
+def _list_files(
     run: Run,
     to: str,
     out: Path,
@@ -96,16 +96,16 @@ def _files(
         blocks = (
             named_table(block, run.origin_utc) for block in run.tick_blocks(fields, start_s, end_s)
         )
-        written += _tables(blocks, out / f"ticks.{to}", to, _origin(run))
+        written += _write_tables(blocks, out / f"ticks.{to}", to, _make_origin(run))
         _say_if_missing(run, bool(written))
     if SHAPES in extras and (shapes := run.cycles(start_s, end_s)).num_rows:
-        written += _tables(iter([shapes]), out / f"shapes.{to}", to, _origin(run))
+        written += _write_tables(iter([shapes]), out / f"shapes.{to}", to, _make_origin(run))
     if EVENTS in extras and (lines := _event_lines(run, start_s, end_s)):
         path = out / "events.jsonl"
         write_text_atomic(path, "".join(f"{line}\n" for line in lines))
         written.append(path)
     if not written:
-        raise _nothing(run)
+        raise _make_nothing_error(run)
     return written
 
 
@@ -118,13 +118,13 @@ def _say_if_missing(run: Run, telemetry: bool) -> None:
         run.notes.append("no telemetry in this part of the run: no ticks are exported")
 
 
-def _nothing(run: Run) -> errors.InputError:
+def _make_nothing_error(run: Run) -> errors.InputError:
     return errors.InputError(
         "; ".join((f"{run.folder}: nothing to export of the requested data", *run.notes))
     )
 
 
-def _selected(streams: Sequence[str]) -> tuple[tuple[str, ...], set[str]]:
+def _select_streams(streams: Sequence[str]) -> tuple[tuple[str, ...], set[str]]:
     """The requested telemetry fields and other tables."""
     if not streams:
         return FIELDS, {SHAPES, EVENTS}
@@ -146,7 +146,7 @@ def _selected(streams: Sequence[str]) -> tuple[tuple[str, ...], set[str]]:
     return (tuple(dict.fromkeys(["mono_s", *fields])) if fields else ()), extras
 
 
-def _origin(run: Run) -> dict[str, str]:
+def _make_origin(run: Run) -> dict[str, str]:
     """Metadata of an exported file; CSV has none."""
     times = {
         "run": run.name,
@@ -156,7 +156,9 @@ def _origin(run: Run) -> dict[str, str]:
     return program.file_origin("membrane-export/1") | times
 
 
-def _tables(tables: Iterator[pa.Table], path: Path, to: str, origin: dict[str, str]) -> list[Path]:
+def _write_tables(
+    tables: Iterator[pa.Table], path: Path, to: str, origin: dict[str, str]
+) -> list[Path]:
     """Write tables of one schema one after the other; without tables, write nothing."""
     writer = None
     try:
@@ -171,7 +173,7 @@ def _tables(tables: Iterator[pa.Table], path: Path, to: str, origin: dict[str, s
     return [path] if writer is not None else []
 
 
-def _hdf5(
+def _write_hdf5(
     run: Run,
     to: str,
     out: Path,
@@ -188,7 +190,7 @@ def _hdf5(
             f"--format {to} needs h5py: pip install 'membrane-ctrl[sofast]'"
         ) from None
     with h5py.File(path, "w") as file:
-        file.attrs.update(_origin(run))
+        file.attrs.update(_make_origin(run))
         for block in run.tick_blocks(fields, start_s, end_s) if fields else ():
             for name, values in block.items():
                 place = f"ticks/{name}"
@@ -216,7 +218,7 @@ def _hdf5(
             file.create_dataset("events", data=lines, dtype=h5py.string_dtype())
         empty = not len(file)
     if empty:
-        raise _nothing(run)
+        raise _make_nothing_error(run)
     return [path]
 
 
@@ -224,9 +226,9 @@ def export_command(
     run: Path, form: str, out: Path | None, streams: list[str], start: str | None, end: str | None
 ) -> int:
     """Write a run for other programs and report where."""
-    opened = open_run(catalogue.resolve(run))
+    opened = open_run(catalogue.resolve_run(run))
     folder = out.resolve() if out else opened.folder / "export"
-    files = export(opened, form, folder, streams, *part_s(opened.origin_utc, start, end))
+    files = export_run(opened, form, folder, streams, *part_s(opened.origin_utc, start, end))
     for note in opened.notes:
         print(f"note: {note}")
     for path in files:

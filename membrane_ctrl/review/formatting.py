@@ -3,7 +3,7 @@
 import math
 
 
-def span(seconds: float) -> str:
+def format_span(seconds: float) -> str:
     """A duration: `41 s`, `30 min 5 s`, `7 h 59 min`, `30 d 4 h`."""
     if not math.isfinite(seconds):
         return "?"
@@ -19,7 +19,7 @@ def span(seconds: float) -> str:
     return f"{whole} s"
 
 
-def number(value: float | None, digits: int = 3) -> str:
+def format_number(value: float | None, digits: int = 3) -> str:
     """A number to the given digits; a dash for none."""
     if value is None or not math.isfinite(value):
         return "–"
@@ -35,7 +35,9 @@ def one_line(text: str) -> str:
 _MOVING_LEAST_S = 60.0
 
 
-def beside(faults_s: float, paused_s: float, moving_s: float, whole_s: float) -> list[str]:
+def format_time_beside(
+    faults_s: float, paused_s: float, moving_s: float, whole_s: float
+) -> list[str]:
     """What there was beside the hold, with its share of the whole time; NaN where that is not
     known.
     """
@@ -46,6 +48,6 @@ def beside(faults_s: float, paused_s: float, moving_s: float, whole_s: float) ->
     )
     told = [(name, time_s) for name, time_s, least_s in parts if time_s > least_s]
     return [
-        f"{name} {span(time_s)} ({100 * time_s / max(whole_s, time_s):.3g} %)"
+        f"{name} {format_span(time_s)} ({100 * time_s / max(whole_s, time_s):.3g} %)"
         for name, time_s in told
     ]

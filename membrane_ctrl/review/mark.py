@@ -20,7 +20,7 @@ def mark_command(words: Sequence[str], at: str | None) -> int:
         raise errors.InputError(
             "review mark: TEXT is empty: write `review mark RUN TEXT --at 03:12`"
         )
-    opened = open_run(catalogue.resolve(Path(words[0])))
+    opened = open_run(catalogue.resolve_run(Path(words[0])))
     at_s = moment_s(at, opened.origin_utc)
     if not 0 <= at_s <= end_s(opened):
         raise not_in(opened, f"--at {at}")

@@ -19,10 +19,10 @@ def to_prune(
     if keep_days is None and keep_gb is None:
         raise errors.InputError("runs prune: give --keep-days, --keep-gb or both")
     runs = retention.deletable_runs(logs_dir, logs_dir / "none", now_utc)
-    return retention.expired(runs, 0, keep_gb, keep_days, now_utc)
+    return retention.find_expired(runs, 0, keep_gb, keep_days, now_utc)
 
 
-def prune(runs: Sequence[retention.OldRun]) -> dict[Path, str]:
+def prune_runs(runs: Sequence[retention.OldRun]) -> dict[Path, str]:
     """Delete the folders of runs, skipping undeletable ones. Returns those that stay, and why."""
     stay: dict[Path, str] = {}
     for run in runs:

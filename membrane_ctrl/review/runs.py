@@ -14,7 +14,7 @@ from rich.table import Table
 from membrane_ctrl.model import errors, events, plain_json, terminal
 from membrane_ctrl.model.run_events import Ended, Mark
 from membrane_ctrl.review import catalogue, prune
-from membrane_ctrl.review.formatting import beside, number, one_line, span
+from membrane_ctrl.review.formatting import format_number, format_span, format_time_beside, one_line
 from membrane_ctrl.run_files.run import open_run
 
 
@@ -22,22 +22,24 @@ def list_command(
     logs: Sequence[Path], wanted: catalogue.Filter, since: str | None, until: str | None, json: bool
 ) -> int:
     """Print the table of the folders' runs that pass a filter, oldest first."""
-    wanted = replace(wanted, since_utc=_day(since), until_utc=_day(until))
+    wanted = replace(wanted, since_utc=_parse_day(since), until_utc=_parse_day(until))
     folders = {folder.resolve(): folder for folder in logs}  # each once
-    found = [entry for folder in folders.values() for entry in catalogue.entries(folder, wanted)]
+    found = [
+        entry for folder in folders.values() for entry in catalogue.list_entries(folder, wanted)
+    ]
     found.sort(key=lambda entry: entry.name)  # which begins with its start
     if json:
         print(plain_json.dumps([catalogue.as_dict(entry) for entry in found], indent=1))
     else:
-        _console().print(_table(found))
+        _make_console().print(_make_table(found))
     return 0
 
 
 def show_command(run: Path, json: bool) -> int:
     """Print one run: its line of the catalogue, its states and faults, its missing parts."""
-    opened = open_run(catalogue.resolve(run))
+    opened = open_run(catalogue.resolve_run(run))
     opened.look_through()
-    entry = catalogue.entry(opened.folder)
+    entry = catalogue.read_entry(opened.folder)
     if json:
         table = catalogue.as_dict(entry) | {
             "recorded_by": opened.recorded_by,
@@ -46,8 +48,10 @@ def show_command(run: Path, json: bool) -> int:
         }
         print(plain_json.dumps(table, indent=1))
         return 0
-    _console().print(_table([entry]))
-    if besides := beside(entry.faults_s, entry.paused_s, entry.moving_s, entry.duration_s):
+    _make_console().print(_make_table([entry]))
+    if besides := format_time_beside(
+        entry.faults_s, entry.paused_s, entry.moving_s, entry.duration_s
+    ):
         print(f"  not counted as held: {', '.join(besides)}")
     if opened.recorded_by:
         print(f"  recorded by {one_line(opened.recorded_by)}")
@@ -70,7 +74,7 @@ def prune_command(
 ) -> int:
     """List the runs that the retention rule would delete; delete them only with `delete`."""
     gone = prune.to_prune(logs, datetime.now(UTC), keep_days, keep_gb)
-    stay = prune.prune([run for run, _ in gone]) if delete else {}
+    stay = prune.prune_runs([run for run, _ in gone]) if delete else {}
     gone = [(run, why) for run, why in gone if run.folder not in stay]
     if json:
         table = [
@@ -93,7 +97,7 @@ def prune_command(
     return errors.Exit.DEVICE_FAILED if stay else 0
 
 
-def _day(text: str | None) -> datetime | None:
+def _parse_day(text: str | None) -> datetime | None:
     """A date or a time, in UTC."""
     if text is None:
         return None
@@ -104,12 +108,12 @@ def _day(text: str | None) -> datetime | None:
     return moment if moment.tzinfo else moment.replace(tzinfo=UTC)
 
 
-def _console() -> Console:
+def _make_console() -> Console:
     """A console as wide as the terminal or, for a file or pipe, the table."""
     return terminal.table_console(width=None if sys.stdout.isatty() else 170)
 
 
-def _table(found: list[catalogue.RunEntry]) -> Table:
+def _make_table(found: list[catalogue.RunEntry]) -> Table:
     """The table; runs of several folders have names from where these part."""
     common = os.path.commonpath([entry.folder.parent for entry in found]) if found else ""
     table = Table(box=None, header_style="bold", pad_edge=False)
@@ -121,13 +125,13 @@ def _table(found: list[catalogue.RunEntry]) -> Table:
         table.add_row(
             one_line(str(entry.folder.relative_to(common))),
             f"{entry.started_utc:%Y-%m-%d %H:%M}",
-            span(entry.duration_s),
-            span(entry.held_s),
-            number(entry.std_um),
+            format_span(entry.duration_s),
+            format_span(entry.held_s),
+            format_number(entry.std_um),
             "–" if math.isnan(entry.in_band) else f"{100 * entry.in_band:.4g} %",
             str(entry.faults),
-            number(entry.kp_per_s),
-            number(entry.ti_s),
+            format_number(entry.kp_per_s),
+            format_number(entry.ti_s),
             entry.configuration,
             f"{entry.size_mb:.1f}",
             one_line(entry.exit)

@@ -9,7 +9,7 @@ from membrane_ctrl.model.arrays import Column
 _POINTS = 80  # of a run's small line
 
 
-def sparkline(values: Sequence[float] | Column, width: int = 160, height: int = 28) -> str:
+def render_sparkline(values: Sequence[float] | Column, width: int = 160, height: int = 28) -> str:
     """A small SVG line; gaps where values are missing."""
     y = np.asarray(values, dtype=np.float64)
     if y.size > _POINTS:

@@ -27,7 +27,9 @@ def add_mark(folder: Path, origin_utc: datetime, mono_s: float, text: str) -> ev
     Raises DeviceError if the folder cannot be written.
     """
     moment = datetime.fromtimestamp(origin_utc.timestamp() + mono_s, UTC)
-    mark = run_events.Mark(text, _user(), made_utc=datetime.now(UTC).isoformat(timespec="seconds"))
+    mark = run_events.Mark(
+        text, _user_name(), made_utc=datetime.now(UTC).isoformat(timespec="seconds")
+    )
     line = {"time_utc": moment.isoformat(), "mono_s": mono_s} | mark.to_dict()
     line["program"] = program.program_identity()
     try:
@@ -40,7 +42,7 @@ def add_mark(folder: Path, origin_utc: datetime, mono_s: float, text: str) -> ev
     return line
 
 
-def _user() -> str:
+def _user_name() -> str:
     try:
         return getpass.getuser()
     except (KeyError, OSError):

@@ -21,11 +21,11 @@ _HYSTERESIS = 1.1
 
 def detail_level(free_mb: float, min_free_mb: float, before: DetailLevel) -> DetailLevel:
     """Level of detail for this much free space, given the previous level."""
-    level = _level(free_mb, min_free_mb)
-    return max(level, min(before, _level(free_mb / _HYSTERESIS, min_free_mb)))
+    level = _level_for_free_space(free_mb, min_free_mb)
+    return max(level, min(before, _level_for_free_space(free_mb / _HYSTERESIS, min_free_mb)))
 
 
-def _level(free_mb: float, min_free_mb: float) -> DetailLevel:
+def _level_for_free_space(free_mb: float, min_free_mb: float) -> DetailLevel:
     if free_mb < _RERUN_FROM * min_free_mb:
         return DetailLevel.ESSENTIAL
     return DetailLevel.NO_PICTURES if free_mb < PICTURES_FROM * min_free_mb else DetailLevel.ALL

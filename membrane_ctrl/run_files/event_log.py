@@ -27,7 +27,7 @@ class LoggedEvent:
     line: events.EventLine
 
 
-def logged(line: events.EventLine) -> LoggedEvent:
+def parse_logged_line(line: events.EventLine) -> LoggedEvent:
     """What a line means; a mark made while the run went on (`ctl
     mark`) is recorded as a command.
     """
@@ -44,13 +44,13 @@ def read_events(folder: Path, notes: list[str]) -> tuple[LoggedEvent, ...]:
     if not (folder / "events.jsonl").exists():
         notes.append("events.jsonl: missing; states are taken from the telemetry")
     later = _json_lines(folder / ANNOTATIONS_FILE, notes)
-    return tuple(sorted(map(logged, told + later), key=lambda each: each.mono_s))
+    return tuple(sorted(map(parse_logged_line, told + later), key=lambda each: each.mono_s))
 
 
 def _json_lines(path: Path, notes: list[str]) -> list[events.EventLine]:
     try:
         text = files.read_text(path, EVENTS_BYTES_MAX, errors="replace")
-        if plain_json.elements(text) > plain_json.ELEMENTS_MAX:
+        if plain_json.count_elements(text) > plain_json.ELEMENTS_MAX:
             raise OSError(errno.EFBIG, f"more than {plain_json.ELEMENTS_MAX} elements")
     except FileNotFoundError:
         return []

@@ -119,17 +119,19 @@ class InputsReader:
         for inputs in self._reader(table_specs.INPUTS).tables(names, self._from_s):
             if inputs.column_names != names:
                 continue
-            numbers = _numbers(inputs, "tick")
+            numbers = _record_column(inputs, "tick")
             same = rows.until(int(numbers.max()))
             if same is None:
                 continue
-            _, here, there = np.intersect1d(numbers, _numbers(same, "tick"), return_indices=True)
+            _, here, there = np.intersect1d(
+                numbers, _record_column(same, "tick"), return_indices=True
+            )
             records = np.zeros(here.size, dtype=RECORD)
             records["tick"] = numbers[here]
             for name in table_specs.INPUT_FIELDS:
-                records[name] = _numbers(inputs, "time_s" if name == "now_s" else name)[here]
+                records[name] = _record_column(inputs, "time_s" if name == "now_s" else name)[here]
             for name, column in _ROW_COLUMNS.items():
-                records[name] = _numbers(same, column)[there]
+                records[name] = _record_column(same, column)[there]
             yield records
 
     def _texts(self, spec: TableSpec) -> Iterator[_TextRow]:
@@ -141,18 +143,18 @@ class InputsReader:
 
     def _snapshot_times_s(self) -> Iterator[float]:
         for table in self._reader(table_specs.SNAPSHOTS).tables(["time_s"]):
-            yield from _numbers(table, "time_s").tolist()
+            yield from _record_column(table, "time_s").tolist()
 
     def _estimates(self, spec: TableSpec) -> Iterator[shape_estimate.ShapeEstimate]:
         names = list(shapes.ESTIMATE_COLUMNS)
         for table in self._reader(spec).tables(names, self._from_s - _SHAPE_BEFORE_S):
             try:
-                yield from shapes.estimates(table.select(names))
+                yield from shapes.read_estimates(table.select(names))
             except (ValueError, LookupError) as error:
                 self.damage.append(f"{spec.name}: a row group holds no estimates ({error})")
 
 
-def _numbers(table: pa.Table, name: str) -> AnyArray:
+def _record_column(table: pa.Table, name: str) -> AnyArray:
     """A column as it goes into a record: integers as such, missing readings as NaN."""
     column = table.column(name).combine_chunks()
     if pa.types.is_integer(column.type):
@@ -170,7 +172,7 @@ class _TickRows:
     def until(self, tick: int) -> pa.Table | None:
         """The rows up to a tick that were not handed out before; None without any."""
         parts = [] if self._waiting is None else [self._waiting]
-        while not parts or int(_numbers(parts[-1], "tick")[-1]) < tick:
+        while not parts or int(_record_column(parts[-1], "tick")[-1]) < tick:
             table = next(self._tables, None)
             if table is None:
                 break
@@ -179,7 +181,7 @@ class _TickRows:
         if not parts:
             return None
         joined = pa.concat_tables(parts)
-        count = int(np.searchsorted(_numbers(joined, "tick"), tick, side="right"))
+        count = int(np.searchsorted(_record_column(joined, "tick"), tick, side="right"))
         self._waiting = joined.slice(count) if count < joined.num_rows else None
         return joined.slice(0, count)
 

@@ -65,10 +65,14 @@ def make_dataset(table: pa.Table, labels: Labels, about: Mapping[str, str]) -> x
     """
     xarray = import_optional("xarray", "data")
     times = _naive_utc(table.column("time_utc"))
-    coordinates = {_TIME: times, "time_s": (_TIME, _values(table.column("time_s")), {"units": "s"})}
+    coordinates = {
+        _TIME: times,
+        "time_s": (_TIME, _column_values(table.column("time_s")), {"units": "s"}),
+    }
     names = [name for name in table.column_names if name not in named_tables.TIMES]
     variables = {
-        name: (_TIME, _values(table.column(name)), dict(labels.get(name, {}))) for name in names
+        name: (_TIME, _column_values(table.column(name)), dict(labels.get(name, {})))
+        for name in names
     }
     return xarray.Dataset(variables, coords=coordinates, attrs=dict(about))
 
@@ -110,16 +114,16 @@ def make_cycles_dataset(
     )
     origin = np.datetime64(origin_utc.replace(tzinfo=None), "us")
     coordinates = {
-        _TIME: origin + _microseconds(found.time_s),
+        _TIME: origin + _to_microseconds(found.time_s),
         "time_s": (_TIME, found.time_s, {"units": "s"}),
-        "covariance_time": origin + _microseconds(found.covariance_time_s[kept]),
+        "covariance_time": origin + _to_microseconds(found.covariance_time_s[kept]),
         "noll": NOLL_INDICES,
         "noll_other": NOLL_INDICES,
     }
     return xarray.Dataset(variables, coords=coordinates, attrs=dict(about))
 
 
-def _microseconds(time_s: np.ndarray) -> np.ndarray:
+def _to_microseconds(time_s: np.ndarray) -> np.ndarray:
     return np.rint(time_s * 1e6).astype("timedelta64[us]")
 
 
@@ -128,7 +132,7 @@ def _naive_utc(column: pa.ChunkedArray) -> np.ndarray:
     return np.asarray(column.cast(pa.timestamp("us")).to_numpy())
 
 
-def _values(column: pa.ChunkedArray) -> np.ndarray:
+def _column_values(column: pa.ChunkedArray) -> np.ndarray:
     if pa.types.is_dictionary(column.type):
         column = column.cast(pa.string())
     if pa.types.is_string(column.type):

@@ -57,7 +57,7 @@ class LatchedFile:
         latched.
         """
         try:
-            content = _content(self.path)
+            content = _read_content(self.path)
             if content is None:
                 return None
             table = json.loads(content)
@@ -139,7 +139,7 @@ class ResumeLog:
         full.
         """
         try:
-            content = _content(self.path)
+            content = _read_content(self.path)
             stamps = [] if content is None else _read_stamps(content)
             ages_s = [(now - datetime.fromisoformat(stamp)).total_seconds() for stamp in stamps]
         except (OSError, ValueError, KeyError, TypeError, AttributeError, RecursionError):
@@ -164,7 +164,7 @@ def _read_stamps(content: bytes) -> list[str]:
     return stamps
 
 
-def _content(path: Path) -> bytes | None:
+def _read_content(path: Path) -> bytes | None:
     """The content; None if there is nothing, not even a dangling link. Raises OSError or
     ValueError.
     """

@@ -45,13 +45,13 @@ def first_level(ticks: Mapping[str, Column]) -> Columns:
     time_s = ticks["mono_s"]
     if not time_s.size:
         return {name: np.empty(0) for name in NAMES}
-    starts, window = _windows(time_s, WINDOWS_S[0])
-    level: Columns = {"time_s": window, "rows": _counts(starts, time_s.size)}
-    level |= _codes(ticks, starts)
+    starts, window = _find_windows(time_s, WINDOWS_S[0])
+    level: Columns = {"time_s": window, "rows": _count_rows(starts, time_s.size)}
+    level |= _reduce_codes(ticks, starts)
     for name in SIGNALS:
         values = telemetry.true_error_um(ticks) if name == TRUE_ERROR_COLUMN.name else ticks[name]
         level[f"min_{name}"] = np.fmin.reduceat(values, starts)
-        level[f"mean_{name}"] = _mean(values, np.ones(values.size), starts)
+        level[f"mean_{name}"] = _weighted_mean(values, np.ones(values.size), starts)
         level[f"max_{name}"] = np.fmax.reduceat(values, starts)
     return level
 
@@ -63,12 +63,12 @@ def coarser_level(level: Mapping[str, Column], window_s: float) -> Columns:
     """
     if not level["time_s"].size:
         return {name: np.empty(0) for name in level}
-    starts, window = _windows(level["time_s"], window_s)
+    starts, window = _find_windows(level["time_s"], window_s)
     coarse: Columns = {"time_s": window, "rows": np.add.reduceat(level["rows"], starts)}
-    coarse |= _codes(level, starts)
+    coarse |= _reduce_codes(level, starts)
     for name, values in level.items():
         if name.startswith("mean_"):
-            coarse[name] = _mean(values, level["rows"], starts)
+            coarse[name] = _weighted_mean(values, level["rows"], starts)
         elif name.startswith(("min_", "max_")):
             coarse[name] = (np.fmin if name.startswith("min_") else np.fmax).reduceat(
                 values, starts
@@ -76,7 +76,7 @@ def coarser_level(level: Mapping[str, Column], window_s: float) -> Columns:
     return coarse
 
 
-def _windows(time_s: Column, window_s: float) -> tuple[NDArray[np.intp], Column]:
+def _find_windows(time_s: Column, window_s: float) -> tuple[NDArray[np.intp], Column]:
     """First row of each non-empty window, and the windows' starts in s."""
     # a small fraction of a window: 59.9999999 means 60
     number = np.floor(time_s / window_s + 1e-9)
@@ -84,11 +84,11 @@ def _windows(time_s: Column, window_s: float) -> tuple[NDArray[np.intp], Column]
     return starts, number[starts] * window_s
 
 
-def _counts(starts: NDArray[np.intp], size: int) -> Column:
+def _count_rows(starts: NDArray[np.intp], size: int) -> Column:
     return np.diff(np.append(starts, size)).astype(np.float64)
 
 
-def _codes(table: Mapping[str, Column], starts: NDArray[np.intp]) -> Columns:
+def _reduce_codes(table: Mapping[str, Column], starts: NDArray[np.intp]) -> Columns:
     size = next(iter(table.values())).size
     last = np.append(starts[1:], size) - 1
     codes = {
@@ -99,7 +99,7 @@ def _codes(table: Mapping[str, Column], starts: NDArray[np.intp]) -> Columns:
     }
 
 
-def _mean(values: Column, weights: Column, starts: NDArray[np.intp]) -> Column:
+def _weighted_mean(values: Column, weights: Column, starts: NDArray[np.intp]) -> Column:
     there = np.isfinite(values)
     total = np.add.reduceat(np.where(there, weights, 0.0), starts)
     # sum relative to a nearby value: a double can then hold 1e5 Pa and a change of mPa without loss

@@ -22,15 +22,15 @@ _COUNTS = ("rows", *(each.name for each in COLUMNS.values() if each.kind is Kind
 _TIME_MAX_S = 1e9  # thirty years: a damaged file may hold any time
 
 
-def _words(codes: type[IntEnum]) -> dict[int, str]:
+def _code_words(codes: type[IntEnum]) -> dict[int, str]:
     return {int(code): code.name.lower() for code in codes}
 
 
 # By column: the name of each code.
 WORDS: dict[str, dict[int, str]] = {
-    "state": _words(telemetry.State),
-    "shape_state": _words(telemetry.ShapeState),
-    "safe_level": _words(telemetry.SafeLevel),
+    "state": _code_words(telemetry.State),
+    "shape_state": _code_words(telemetry.ShapeState),
+    "safe_level": _code_words(telemetry.SafeLevel),
     "fault": {0: "none"} | {rule.code: rule.name for rule in safety.TABLE},
 }
 
@@ -55,31 +55,31 @@ def named_table(columns: Mapping[str, NDArray[Any]], origin_utc: datetime) -> pa
     time_s = np.asarray(
         columns["mono_s"] if "mono_s" in columns else columns["time_s"], dtype=np.float64
     )
-    table = {"time_s": _nullable(time_s), "time_utc": _utc(time_s, origin_utc)}
+    table = {"time_s": _null_non_finite(time_s), "time_utc": _to_utc(time_s, origin_utc)}
     for name, values in columns.items():
         if name in WORDS:
-            table[name] = _named(values, WORDS[name])
+            table[name] = _name_codes(values, WORDS[name])
         elif name not in TIMES:
             table[name] = (
-                _nullable(values).cast(pa.int64(), safe=False)
+                _null_non_finite(values).cast(pa.int64(), safe=False)
                 if name in _COUNTS
-                else _nullable(values)
+                else _null_non_finite(values)
             )
     return pa.table(table)
 
 
-def _nullable(values: NDArray[Any]) -> pa.Array:
+def _null_non_finite(values: NDArray[Any]) -> pa.Array:
     return pa.array(values, from_pandas=True)  # NaN is null
 
 
-def _utc(time_s: Column, origin_utc: datetime) -> pa.Array:
+def _to_utc(time_s: Column, origin_utc: datetime) -> pa.Array:
     possible = np.abs(time_s) < _TIME_MAX_S
     since_us = np.rint(np.where(possible, time_s, 0.0) * 1e6).astype("timedelta64[us]")
     origin = np.datetime64(round(origin_utc.timestamp() * 1e6), "us")
     return pa.array(origin + since_us, pa.timestamp("us", "UTC"), mask=~possible)
 
 
-def _named(codes: Column, words: Mapping[int, str]) -> pa.Array:
+def _name_codes(codes: Column, words: Mapping[int, str]) -> pa.Array:
     """Names of codes; one that this version does not know is `code 99`."""
     there = np.isfinite(codes)
     found, places = np.unique(np.where(there, codes, 0.0), return_inverse=True)

@@ -35,9 +35,9 @@ def recorded_rate_hz(folder: Path) -> float | None:
     spacing_s = _spacing_s(*_first_rows(folder, table_specs.TICKS, ("dt_s", "lateness_ms")))
     spacing_s = spacing_s[spacing_s > 0]
     if spacing_s.size:
-        return _whole(1 / float(np.median(spacing_s)))
+        return _require_whole(1 / float(np.median(spacing_s)))
     (rows,) = _first_rows(folder, table_specs.LEVELS[levels.WINDOWS_S[0]], ("rows",))
-    return _whole(float(np.median(rows))) if rows.size else None
+    return _require_whole(float(np.median(rows))) if rows.size else None
 
 
 def _first_rows(folder: Path, spec: TableSpec, names: Sequence[str]) -> list[FloatArray]:
@@ -53,6 +53,6 @@ def _spacing_s(dt_s: FloatArray, late_ms: FloatArray) -> FloatArray:
     return dt_s[1:] - 1e-3 * np.diff(np.nan_to_num(late_ms))
 
 
-def _whole(rate_hz: float) -> float:
+def _require_whole(rate_hz: float) -> float:
     whole_hz = float(round(rate_hz))
     return whole_hz if abs(rate_hz - whole_hz) <= _WHOLE * rate_hz else rate_hz

@@ -73,7 +73,7 @@ def _may_run(folder: Path, now_utc: datetime) -> bool:
     return now_utc - datetime.fromtimestamp(newest_s, UTC) < _ABANDONED_AFTER
 
 
-def expired(
+def find_expired(
     runs: Sequence[OldRun],
     present_bytes: int,
     keep_gb: float | None,

@@ -236,7 +236,7 @@ class Run:
         self, spec: TableSpec, names: Sequence[str], start_s: float, end_s: float
     ) -> Iterator[Block]:
         for table in self._table(spec).tables(names, start_s, end_s):
-            yield {name: _array(table, name) for name in names}
+            yield {name: _to_array(table, name) for name in names}
 
     def _table(self, spec: TableSpec) -> TableReader:
         return TableReader(self.folder, spec, self.notes)
@@ -268,7 +268,7 @@ class Run:
         spec = table_specs.LEVELS[window_s]
         blocks = list(self._blocks(spec, names, start_s, end_s))
         time_s = np.concatenate([block["time_s"] for block in blocks] or [np.empty(0)])
-        missing = _holes(time_s, window_s, start_s)
+        missing = _find_gaps(time_s, window_s, start_s)
         until_s = float(time_s[-1]) + window_s if time_s.size else start_s
         continues = self._table(spec).known_until_s >= end_s
         if not time_s.size or (
@@ -383,25 +383,27 @@ def open_run(path: str | Path) -> Run:
             "events.jsonl: at least the last line is missing: the run has ended without an "
             "end event"
         )
-    notes += _missing(folder, summary)
+    notes += _find_missing_parts(folder, summary)
     config = at_recorded_rate(run_config.read_config(folder, notes), folder, notes)
     return Run(folder, config, log, summary, origin_of(folder, log), notes, head.recorded_by)
 
 
-def _missing(folder: Path, summary: dict[str, Any] | None) -> list[str]:
+def _find_missing_parts(folder: Path, summary: dict[str, Any] | None) -> list[str]:
     """Missing parts of tables, found by their numbers, their manifests and the summary's count."""
     account = (summary or {}).get("recorder")
     counted = account.get("tables") if isinstance(account, dict) else None
     notes: list[str] = []
     for spec in table_specs.ALL:
         table = TableReader(folder, spec, notes)
-        table.note_missing(_count(counted.get(spec.name) if isinstance(counted, dict) else 0))
+        table.note_missing(
+            _plausible_count(counted.get(spec.name) if isinstance(counted, dict) else 0)
+        )
         if spec is table_specs.TICKS and not table.exists:
             notes.append("the table of ticks is missing")
     return notes
 
 
-def _count(value: object) -> int:
+def _plausible_count(value: object) -> int:
     """Number of parts according to the summary, if plausible."""
     return value if isinstance(value, int) and 0 <= value <= _PARTS_MAX else 0
 
@@ -427,7 +429,7 @@ def origin_of(folder: Path, log: Sequence[event_log.LoggedEvent]) -> datetime:
     return datetime.fromtimestamp(folder.stat().st_mtime, UTC)
 
 
-def _holes(time_s: Column, window_s: float, start_s: float) -> list[tuple[float, float]]:
+def _find_gaps(time_s: Column, window_s: float, start_s: float) -> list[tuple[float, float]]:
     """Gaps before and between a level's windows, left by damaged batches."""
     if not time_s.size:
         return []
@@ -445,7 +447,7 @@ def _with_time(names: Sequence[str]) -> tuple[str, ...]:
     return tuple(dict.fromkeys(("mono_s", *names)))
 
 
-def _array(table: pa.Table, name: str) -> Column:
+def _to_array(table: pa.Table, name: str) -> Column:
     if name not in table.column_names:
         return np.full(table.num_rows, np.nan)
     values = np.asarray(table.column(name).to_numpy())

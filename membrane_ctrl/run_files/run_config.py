@@ -18,12 +18,12 @@ from membrane_ctrl.model import (
 )
 
 
-def understood(tables: dict[str, Any]) -> tuple[Config, list[str]]:
+def keep_understood(tables: dict[str, Any]) -> tuple[Config, list[str]]:
     """Return a configuration without unknown keys and invalid values, and the names of those.
 
     An unknown key says nothing about its neighbours: they keep their values.
     """
-    tables = _copied(tables)
+    tables = _copy_value(tables)
     left_out: list[str] = []
     while True:
         try:
@@ -55,10 +55,10 @@ def _take_out(tables: dict[str, Any], location: Sequence[int | str]) -> str:
     return ".".join(path)
 
 
-def _copied(value: Any) -> Any:
+def _copy_value(value: Any) -> Any:
     if isinstance(value, dict):
-        return {key: _copied(inner) for key, inner in value.items()}
-    return [_copied(inner) for inner in value] if isinstance(value, list) else value
+        return {key: _copy_value(inner) for key, inner in value.items()}
+    return [_copy_value(inner) for inner in value] if isinstance(value, list) else value
 
 
 _NAMED_MAX = 20
@@ -68,7 +68,7 @@ def exact_config(folder: Path) -> Config:
     """`config.toml` as it was in force. Raises InputError if this version does not understand all
     of it.
     """
-    return toml_file.load(folder / "config.toml", Config, follow=False)
+    return toml_file.load_toml(folder / "config.toml", Config, follow=False)
 
 
 def read_config(folder: Path, notes: list[str]) -> Config:
@@ -81,9 +81,9 @@ def read_config(folder: Path, notes: list[str]) -> Config:
         notes.append(f"{error}; all defaults are used")
         return Config()
     try:
-        return toml_file.parse(tables, Config, "config.toml")
+        return toml_file.parse_tables(tables, Config, "config.toml")
     except errors.InputError as error:
-        config, left_out = understood(tables)
+        config, left_out = keep_understood(tables)
         named = ", ".join(left_out[:_NAMED_MAX]) + (
             f" and {len(left_out) - _NAMED_MAX} more" * (len(left_out) > _NAMED_MAX)
         )

@@ -42,19 +42,19 @@ def create_run_folder(logs_dir: Path, name: str, started_utc: datetime, config: 
         _require_free(logs_dir, config.recording.min_free_mb)
         run_dir = _make_unique(logs_dir, f"{started_utc.astimezone(UTC):%Y%m%dT%H%M%SZ}-{name}")
     except OSError as error:
-        raise _unwritable(logs_dir, error) from None
+        raise _make_unwritable_error(logs_dir, error) from None
     try:
         write_heads(run_dir, config)
     except OSError as error:
         shutil.rmtree(run_dir, ignore_errors=True)
-        raise _unwritable(run_dir, error) from None
+        raise _make_unwritable_error(run_dir, error) from None
     return run_dir
 
 
 def write_heads(run_dir: Path, config: Config) -> None:
     """Write `run.json`, and `config.toml` with every default. Raises OSError."""
     run_head.write_run_head(run_dir)
-    text = f"# {program.program_identity()}\n{toml_file.dump(config)}"
+    text = f"# {program.program_identity()}\n{toml_file.dump_toml(config)}"
     files.write_text_atomic(run_dir / CONFIG, file_checksums.with_comment(text))
 
 
@@ -83,7 +83,7 @@ def _make_unique(logs_dir: Path, name: str) -> Path:
     raise FileExistsError(17, "a thousand runs of this second and name exist")
 
 
-def _unwritable(folder: Path, error: OSError) -> errors.DeviceError:
+def _make_unwritable_error(folder: Path, error: OSError) -> errors.DeviceError:
     reason = errors.os_reason(error)
     return errors.DeviceError(
         f"{folder}: cannot be written ({reason}); give a writable folder with --logs DIR"

@@ -53,7 +53,7 @@ class RunTables:
         """Add ticks, in order."""
         if not len(batch.rows):
             return
-        row = {name: telemetry.column(batch.rows, name) for name in telemetry.FIELDS}
+        row = {name: telemetry.get_column(batch.rows, name) for name in telemetry.FIELDS}
         self._writer(table_specs.TICKS).add(_tick_rows(row))
         self._writer(table_specs.INPUTS).add(_input_rows(batch))
         self._add_rare(batch)
@@ -108,7 +108,7 @@ class RunTables:
         marks = [
             row
             for row, line in zip(rows, lines, strict=True)
-            if event_log.logged(line).line["kind"] == "mark"
+            if event_log.parse_logged_line(line).line["kind"] == "mark"
         ]
         self._add_dicts(table_specs.MARKS, marks)
 

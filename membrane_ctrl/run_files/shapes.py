@@ -110,7 +110,9 @@ def from_tables(figures: Iterable[pa.Table], covariances: Iterable[pa.Table]) ->
     by time.
     """
     parts = [
-        _figures(table) for table in figures if {"time_s", "coeffs_um"} <= set(table.column_names)
+        _read_figures(table)
+        for table in figures
+        if {"time_s", "coeffs_um"} <= set(table.column_names)
     ]
     kept = [table for table in covariances if table.num_columns == 2]
     names = (*NUMBERS, "coeffs_um", "verdict")
@@ -121,11 +123,11 @@ def from_tables(figures: Iterable[pa.Table], covariances: Iterable[pa.Table]) ->
         {name: np.concatenate([part[name] for part in parts]) for name in names} if parts else empty
     )
     order = np.argsort(joined["time_s"], kind="stable")
-    matrices = [_matrix(table.column("covariance_um2"), ZERNIKE_TERMS**2) for table in kept]
+    matrices = [_to_matrix(table.column("covariance_um2"), ZERNIKE_TERMS**2) for table in kept]
     return Shapes(
         **{name: values[order] for name, values in joined.items()},
         covariance_time_s=np.concatenate(
-            [np.empty(0), *(_numbers(table, "time_s") for table in kept)]
+            [np.empty(0), *(_read_numbers(table, "time_s") for table in kept)]
         ),
         covariance_um2=np.concatenate([np.empty((0, ZERNIKE_TERMS**2)), *matrices]).reshape(
             -1, ZERNIKE_TERMS, ZERNIKE_TERMS
@@ -133,14 +135,14 @@ def from_tables(figures: Iterable[pa.Table], covariances: Iterable[pa.Table]) ->
     )
 
 
-def _figures(table: pa.Table) -> dict[str, AnyArray]:
+def _read_figures(table: pa.Table) -> dict[str, AnyArray]:
     count = table.num_rows
     verdicts = (
         table.column("verdict").to_pylist() if "verdict" in table.column_names else ["ok"] * count
     )
-    figures: dict[str, AnyArray] = {name: _numbers(table, name) for name in NUMBERS}
+    figures: dict[str, AnyArray] = {name: _read_numbers(table, name) for name in NUMBERS}
     return figures | {
-        "coeffs_um": _matrix(table.column("coeffs_um"), ZERNIKE_TERMS),
+        "coeffs_um": _to_matrix(table.column("coeffs_um"), ZERNIKE_TERMS),
         "verdict": np.array([verdict or "" for verdict in verdicts]),
     }
 
@@ -158,14 +160,14 @@ ESTIMATE_COLUMNS = (
 )
 
 
-def estimates(table: pa.Table) -> Iterator[shape_estimate.ShapeEstimate]:
+def read_estimates(table: pa.Table) -> Iterator[shape_estimate.ShapeEstimate]:
     """The estimates in the recorder's table, as given to the controller. Raises ValueError if they
     are invalid.
     """
     names = ESTIMATE_COLUMNS[:-2]
     heads = zip(*(table.column(name).to_pylist() for name in names), strict=True)
-    coeffs = _matrix(table.column("coeffs_um"), ZERNIKE_TERMS)
-    uppers = _matrix(
+    coeffs = _to_matrix(table.column("coeffs_um"), ZERNIKE_TERMS)
+    uppers = _to_matrix(
         table.column("upper_um2"), table.schema.field("upper_um2").type.list_size
     ).astype(np.float32)
     for head, row, upper in zip(heads, coeffs, uppers, strict=True):
@@ -174,13 +176,13 @@ def estimates(table: pa.Table) -> Iterator[shape_estimate.ShapeEstimate]:
         yield shape_estimate.unpack_estimate(shape_estimate.packed_parts(named, row, upper))
 
 
-def _numbers(table: pa.Table, name: str) -> Column:
+def _read_numbers(table: pa.Table, name: str) -> Column:
     if name not in table.column_names:
         return np.full(table.num_rows, np.nan)
     return np.asarray(table.column(name).to_numpy(), dtype=np.float64)
 
 
-def _matrix(cells: pa.ChunkedArray, width: int) -> Column:
+def _to_matrix(cells: pa.ChunkedArray, width: int) -> Column:
     """A column of fixed-size lists as (n, width) numbers; a missing list is a row of NaN."""
     rows = (
         cells.combine_chunks().fill_null([math.nan] * width)
@@ -218,7 +220,7 @@ def height_map_mm(estimate: shape_estimate.ShapeEstimate) -> Map:
     (MAP_PX, MAP_PX) float32
         mm; row 0 at the top (+y), NaN outside the disc.
     """
-    return _spread(_surface(estimate).height(*_points()))
+    return _value_range(_unit_surface(estimate).height(*_disc_points()))
 
 
 def difference_map_um(
@@ -231,15 +233,15 @@ def difference_map_um(
 
 def change_map_um(parameters_um: Column) -> Map:
     """Height of a change of the parameters (`Shapes.parameters_um`), µm, as `height_map_mm`."""
-    return _spread(parameters_um @ _basis())
+    return _value_range(parameters_um @ _height_basis())
 
 
 def deviation_map_um(parameters_um: Column) -> Map:
     """Standard deviation of the height over at least two cycles with (n, terms + 1) parameters,
     µm.
     """
-    variance = np.einsum("jp,jp->p", _basis(), np.cov(parameters_um.T) @ _basis())
-    return _spread(np.sqrt(np.maximum(variance, 0.0)))
+    variance = np.einsum("jp,jp->p", _height_basis(), np.cov(parameters_um.T) @ _height_basis())
+    return _value_range(np.sqrt(np.maximum(variance, 0.0)))
 
 
 def without_terms(height: AnyArray, terms: int) -> AnyArray:
@@ -249,7 +251,7 @@ def without_terms(height: AnyArray, terms: int) -> AnyArray:
     3 terms are piston and tilt, 4 defocus as well.
     """
     there = np.isfinite(height)
-    x, y = (axis[there] for axis in _grid(len(height)))
+    x, y = (axis[there] for axis in _disc_grid(len(height)))
     # spans the same as the Zernike terms, which take 70 ms
     basis, left = np.stack((np.ones_like(x), x, y, x**2 + y**2))[:terms], height.copy()
     left[there] -= np.linalg.lstsq(basis.T, height[there].astype(np.float64), rcond=None)[0] @ basis
@@ -260,8 +262,8 @@ def uncertainty_map_um(covariance_um2: NDArray[np.float64]) -> Map:
     """Standard deviation of the height, µm: sqrt of z C z' with the row z of the terms at each
     point.
     """
-    variance = np.einsum("jp,jp->p", _terms(), covariance_um2 @ _terms())
-    return _spread(np.sqrt(np.maximum(variance, 0.0)))
+    variance = np.einsum("jp,jp->p", _term_values(), covariance_um2 @ _term_values())
+    return _value_range(np.sqrt(np.maximum(variance, 0.0)))
 
 
 class Scatter:
@@ -286,45 +288,45 @@ class Scatter:
 
 def outside_disc() -> NDArray[np.uint8]:
     """1 where a map has no value, (MAP_PX, MAP_PX)."""
-    return (~_inside()).astype(np.uint8)
+    return (~_inside_disc()).astype(np.uint8)
 
 
-def _surface(estimate: shape_estimate.ShapeEstimate) -> Surface:
+def _unit_surface(estimate: shape_estimate.ShapeEstimate) -> Surface:
     """The surface over the unit disc: maps do not depend on the mirror's size."""
     return Surface(estimate.coeffs_um * 1e-3, estimate.hencky_um * 1e-3, 1.0)
 
 
-def _spread(values: NDArray[np.float64]) -> Map:
+def _value_range(values: NDArray[np.float64]) -> Map:
     picture = np.full((MAP_PX, MAP_PX), np.nan, dtype=np.float32)
-    picture[_inside()] = values
+    picture[_inside_disc()] = values
     return picture
 
 
 @cache
-def _basis() -> NDArray[np.float64]:
+def _height_basis() -> NDArray[np.float64]:
     """(terms + 1, points) height per unit of each parameter."""
-    return height_basis(*_points())
+    return height_basis(*_disc_points())
 
 
 @cache
-def _inside() -> NDArray[np.bool_]:
-    x, y = _grid()
+def _inside_disc() -> NDArray[np.bool_]:
+    x, y = _disc_grid()
     return np.asarray(np.hypot(x, y) <= 1.0)
 
 
 @cache
-def _points() -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    x, y = _grid()
-    return x[_inside()], y[_inside()]
+def _disc_points() -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    x, y = _disc_grid()
+    return x[_inside_disc()], y[_inside_disc()]
 
 
 @cache
-def _terms() -> NDArray[np.float64]:
+def _term_values() -> NDArray[np.float64]:
     """(terms, points) the Zernike terms."""
-    return zernike.evaluate_terms(*_points())
+    return zernike.evaluate_terms(*_disc_points())
 
 
-def _grid(px: int = MAP_PX) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+def _disc_grid(px: int = MAP_PX) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Pixel centres on the unit disc's square."""
     axis = (np.arange(px) + 0.5) * 2 / px - 1
     x, y = np.meshgrid(axis, -axis)

@@ -27,7 +27,7 @@ from membrane_ctrl.model.columns import (
     columns_of,
     plots_of,
 )
-from membrane_ctrl.model.telemetry import Rows, column
+from membrane_ctrl.model.telemetry import Rows, get_column
 
 
 @dataclass(frozen=True, slots=True)
@@ -51,10 +51,10 @@ class Stream:
 
     def values(self, rows: Rows) -> FloatArray:
         """(n, lines) block of the stream."""
-        return np.stack([column(rows, line.field) for line in self.lines], axis=1)
+        return np.stack([get_column(rows, line.field) for line in self.lines], axis=1)
 
 
-def _line(each: TelemetryColumn) -> Line:
+def _make_line(each: TelemetryColumn) -> Line:
     return Line(each.name, each.legend, each.colour, each.width)
 
 
@@ -62,7 +62,7 @@ def _telemetry_streams() -> tuple[Stream, ...]:
     by_entity: dict[str, list[Line]] = {}
     for each in BY_GROUP:
         if each.entity:
-            by_entity.setdefault(each.entity, []).append(_line(each))
+            by_entity.setdefault(each.entity, []).append(_make_line(each))
     return tuple(Stream(path, tuple(lines)) for path, lines in by_entity.items())
 
 
@@ -81,7 +81,7 @@ def mean_path(entity: str) -> str:
 
 
 # Computed here from the rows, so that plots need no arithmetic.
-TRUE_ERROR = Stream(TRUE_ERROR_COLUMN.entity, (_line(TRUE_ERROR_COLUMN),))
+TRUE_ERROR = Stream(TRUE_ERROR_COLUMN.entity, (_make_line(TRUE_ERROR_COLUMN),))
 _ERROR = COLUMNS["error_um"]
 
 
@@ -108,14 +108,14 @@ TRUE_MEAN = replace(TRUE_ERROR, path=mean_path(TRUE_ERROR.path))
 DERIVED: tuple[Stream, ...] = (TRUE_ERROR, OVERVIEW, *MEANS, TRUE_MEAN)
 
 
-def band(band_um: float) -> Stream:
+def make_band(band_um: float) -> Stream:
     """The area in which the error is to stay, drawn as the deviation of a line without width."""
     return Stream("/loop/band", (Line("", f"band ±{band_um:g} {_ERROR.unit}", GREEN, 0.0),))
 
 
 def _figure_stream(plot: Plot) -> Stream:
     shown = figure_columns.figure_columns_of(plot)
-    return Stream(shown[0].entity, tuple(map(_line, shown)))
+    return Stream(shown[0].entity, tuple(map(_make_line, shown)))
 
 
 ZERNIKE = _figure_stream(figure_columns.TERMS)
@@ -132,7 +132,7 @@ SHAPE_STREAMS: tuple[Stream, ...] = (ZERNIKE, RESIDUAL, QUALITY, MODULATION, LAT
 
 def overview_um(rows: Rows) -> FloatArray:
     """(1, 3) least, mean and greatest error of the rows; NaN if no row has an error."""
-    error = column(rows, "error_um")
+    error = get_column(rows, "error_um")
     error = error[np.isfinite(error)]
     if not error.size:
         return np.full((1, 3), np.nan)

@@ -79,28 +79,28 @@ class Summary(StateNode):
         """Add (n, len(FIELDS)) telemetry rows, in order."""
         if not len(rows):
             return
-        time_s = telemetry.column(rows, "mono_s")
-        for row, code in telemetry.changes(telemetry.column(rows, "state"), self.state):
+        time_s = telemetry.get_column(rows, "mono_s")
+        for row, code in telemetry.find_changes(telemetry.get_column(rows, "state"), self.state):
             self.transitions += 1
             if len(self.states) < _LISTED_MAX:
                 name = telemetry.State(code).name.lower()
                 self.states.append(EnteredState(name, float(time_s[row])))
-        parts = self.parts.of(telemetry.columns(rows))
+        parts = self.parts.of(telemetry.get_columns(rows))
         for name, part in parts.items():
-            self.parts_s[name] += float(telemetry.column(rows, "dt_s")[part].sum())
-        settled = telemetry.columns(rows[parts["held"]])
-        self.state = float(telemetry.column(rows, "state")[-1])
+            self.parts_s[name] += float(telemetry.get_column(rows, "dt_s")[part].sum())
+        settled = telemetry.get_columns(rows[parts["held"]])
+        self.state = float(telemetry.get_column(rows, "state")[-1])
         true_um = telemetry.true_error_um(settled)
         self.true_um.add(true_um)
         self.true_1s_um.add(settled["mono_s"], true_um)
         reading_um = settled["setpoint_um"] - settled["displacement_um"]
         self.reading_um.add(reading_um)
         self.reading_1s_um.add(settled["mono_s"], reading_um)
-        self.lateness_ms.add(telemetry.column(rows, "lateness_ms"))
+        self.lateness_ms.add(telemetry.get_column(rows, "lateness_ms"))
         self.rows += len(rows)
-        self.missed_ticks = int(telemetry.column(rows, "missed_ticks")[-1])
+        self.missed_ticks = int(telemetry.get_column(rows, "missed_ticks")[-1])
         self.time_s = max(self.time_s, float(time_s[-1]))
-        leak = telemetry.column(rows, "leak_um_per_s")
+        leak = telemetry.get_column(rows, "leak_um_per_s")
         leak = leak[np.isfinite(leak)]
         self.leak_um_per_s = float(leak[-1]) if leak.size else self.leak_um_per_s
 
@@ -161,12 +161,13 @@ class Summary(StateNode):
             | {f"{name}_s": time_s for name, time_s in self.parts_s.items()},
             "reading_std_um": self.reading_um.std,
             "leak_um_per_s": self.leak_um_per_s,
-            "lateness_ms": _quantiles(self.lateness_ms) | {"max": self.lateness_ms.largest},
+            "lateness_ms": _histogram_quantiles(self.lateness_ms)
+            | {"max": self.lateness_ms.largest},
             "ticks": self.rows + dropped.get("inputs", 0),
             "missed_ticks": self.missed_ticks,
             "cycles": self.cycles,
             "cycles_rejected": self.rejected,
-            "cycle_latency_ms": _quantiles(self.latency_ms),
+            "cycle_latency_ms": _histogram_quantiles(self.latency_ms),
             "geometry": self.geometry,
             "states": [asdict(each) for each in self.states],
             "transitions": self.transitions,
@@ -179,5 +180,5 @@ class Summary(StateNode):
         }
 
 
-def _quantiles(histogram: LogHistogram) -> dict[str, float]:
+def _histogram_quantiles(histogram: LogHistogram) -> dict[str, float]:
     return {"p50": histogram.quantile(0.50), "p99": histogram.quantile(0.99)}

@@ -36,14 +36,14 @@ _SNAPSHOT_GROUP_ROWS = 50
 _THUMBNAIL_GROUP_ROWS = 500
 
 
-def _field(
+def _make_field(
     name: str, kind: pa.DataType, description: str, unit: str | None = None, **more: str
 ) -> pa.Field:
     about = {"description": description, "unit": unit_of(name) if unit is None else unit, **more}
     return pa.field(name, kind, metadata={key: text for key, text in about.items() if text})
 
 
-def _spec(
+def _make_spec(
     name: str,
     fields: list[pa.Field],
     time_name: str = "time_s",
@@ -67,10 +67,10 @@ def with_origin(spec: TableSpec) -> TableSpec:
 
 def _tick_field(column: TelemetryColumn) -> pa.Field:
     if column.kind is not Kind.QUANTITY:
-        return _field(column.name, pa.int64(), column.description)
+        return _make_field(column.name, pa.int64(), column.description)
     if is_exact(column.name):
-        return _field(column.name, pa.float64(), column.description)
-    return _field(column.name, pa.float32(), column.description)
+        return _make_field(column.name, pa.float64(), column.description)
+    return _make_field(column.name, pa.float32(), column.description)
 
 
 def is_exact(name: str) -> bool:
@@ -81,10 +81,10 @@ def is_exact(name: str) -> bool:
 def _input_field(name: str) -> pa.Field:
     kind = pa.from_numpy_dtype(RECORD[name])
     if name == "now_s":
-        return _field("time_s", kind, COLUMNS["mono_s"].description)
+        return _make_field("time_s", kind, COLUMNS["mono_s"].description)
     if name in COLUMNS:
-        return _field(name, kind, f"{COLUMNS[name].description}, as it was read")
-    return _field(
+        return _make_field(name, kind, f"{COLUMNS[name].description}, as it was read")
+    return _make_field(
         name, kind, _INPUT_TEXTS.get(name, f"{name.replace('_', ' ')} of the tick's reading")
     )
 
@@ -96,24 +96,25 @@ _INPUT_TEXTS = {
     "tail_bytes": "size of the tick's commands and ended tasks in the table of rare inputs",
 }
 
-TICKS = _spec("ticks", [_tick_field(column) for column in COLUMNS.values()], "mono_s")
-INPUTS = _spec(
-    "inputs", [_field("tick", pa.int64(), "number of the tick"), *map(_input_field, INPUT_FIELDS)]
+TICKS = _make_spec("ticks", [_tick_field(column) for column in COLUMNS.values()], "mono_s")
+INPUTS = _make_spec(
+    "inputs",
+    [_make_field("tick", pa.int64(), "number of the tick"), *map(_input_field, INPUT_FIELDS)],
 )
-RARE = _spec(
+RARE = _make_spec(
     "rare",
     [
-        _field("time_s", pa.float64(), "start of the tick"),
-        _field("tick", pa.int64(), "number of the tick"),
-        _field("json", pa.string(), "commands and ended tasks of the tick"),
+        _make_field("time_s", pa.float64(), "start of the tick"),
+        _make_field("tick", pa.int64(), "number of the tick"),
+        _make_field("json", pa.string(), "commands and ended tasks of the tick"),
     ],
 )
-SNAPSHOTS = _spec(
+SNAPSHOTS = _make_spec(
     "snapshots",
     [
-        _field("time_s", pa.float64(), "start of the tick"),
-        _field("tick", pa.int64(), "number of the tick"),
-        _field("json", pa.string(), "what the controller remembers before the tick"),
+        _make_field("time_s", pa.float64(), "start of the tick"),
+        _make_field("tick", pa.int64(), "number of the tick"),
+        _make_field("json", pa.string(), "what the controller remembers before the tick"),
     ],
     group_rows=_SNAPSHOT_GROUP_ROWS,
 )
@@ -122,27 +123,27 @@ SNAPSHOTS = _spec(
 def _shape_fields() -> list[pa.Field]:
     return [
         *(
-            _field(name, pa.float64(), RECORDED_COLUMNS[name].description)
+            _make_field(name, pa.float64(), RECORDED_COLUMNS[name].description)
             for name in shape_estimate.NUMBERS
         ),
-        _field("cycle", pa.int64(), "number of the cycle or frame"),
-        _field(
+        _make_field("cycle", pa.int64(), "number of the cycle or frame"),
+        _make_field(
             "tracking_lost",
             pa.bool_(),
             "phases cannot be tracked from here: a full cycle is needed",
         ),
-        _field("kind", pa.string(), "full, fringes or track"),
-        _field("verdict", pa.string(), "ok, degraded or rejected"),
-        _field("reason", pa.string(), "why it is not ok"),
-        _field(
+        _make_field("kind", pa.string(), "full, fringes or track"),
+        _make_field("verdict", pa.string(), "ok, degraded or rejected"),
+        _make_field("reason", pa.string(), "why it is not ok"),
+        _make_field(
             "coeffs_um", pa.list_(pa.float64(), ZERNIKE_TERMS), "Zernike coefficients, Noll 1..."
         ),
-        _field(
+        _make_field(
             "sigma_um",
             pa.list_(pa.float32(), ZERNIKE_TERMS),
             "standard deviation of changes of the coefficients",
         ),
-        _field(
+        _make_field(
             "upper_um2",
             pa.list_(pa.float32(), COVARIANCE_UPPER_SIZE),
             "upper half of the coefficients' covariance, row by row",
@@ -152,13 +153,13 @@ def _shape_fields() -> list[pa.Field]:
 
 
 _SHAPE_LAYOUT = (("zernike_terms", str(ZERNIKE_TERMS)),)
-SHAPES = _spec("shapes", _shape_fields(), group_rows=_SHAPE_GROUP_ROWS, layout=_SHAPE_LAYOUT)
-TRACKED = _spec("tracked", _shape_fields(), group_rows=_SHAPE_GROUP_ROWS, layout=_SHAPE_LAYOUT)
-COVARIANCES = _spec(
+SHAPES = _make_spec("shapes", _shape_fields(), group_rows=_SHAPE_GROUP_ROWS, layout=_SHAPE_LAYOUT)
+TRACKED = _make_spec("tracked", _shape_fields(), group_rows=_SHAPE_GROUP_ROWS, layout=_SHAPE_LAYOUT)
+COVARIANCES = _make_spec(
     "covariances",
     [
-        _field("time_s", pa.float64(), "time of the cycle"),
-        _field(
+        _make_field("time_s", pa.float64(), "time of the cycle"),
+        _make_field(
             "covariance_um2",
             pa.list_(pa.float32(), ZERNIKE_TERMS**2),
             "covariance of the coefficients, row by row; of a cycle in "
@@ -172,15 +173,15 @@ COVARIANCES = _spec(
 
 def _level_field(name: str) -> pa.Field:
     if name == "time_s":
-        return _field(name, pa.float64(), "start of the window")
+        return _make_field(name, pa.float64(), "start of the window")
     if name == "rows":
-        return _field(name, pa.int64(), "ticks in the window")
+        return _make_field(name, pa.int64(), "ticks in the window")
     if name in COLUMNS:
-        return _field(name, pa.int64(), COLUMNS[name].description)
+        return _make_field(name, pa.int64(), COLUMNS[name].description)
     how, _, signal = name.partition("_")
     column = COLUMNS.get(signal, TRUE_ERROR_COLUMN)
     wide = column.unit == "Pa"
-    return _field(
+    return _make_field(
         name,
         pa.float64() if wide else pa.float32(),
         f"{_HOW[how]} of: {column.description}",
@@ -197,28 +198,28 @@ def level_table(window_s: float) -> str:
 
 
 LEVELS: dict[float, TableSpec] = {
-    window_s: _spec(level_table(window_s), [_level_field(name) for name in levels.NAMES])
+    window_s: _make_spec(level_table(window_s), [_level_field(name) for name in levels.NAMES])
     for window_s in levels.WINDOWS_S
 }
 
 _EVENT_FIELDS = [
-    _field("number", pa.int64(), "of the event in the run, from 1"),
-    _field("time_s", pa.float64(), "when it was reported"),
-    _field("time_utc", pa.timestamp("us", "UTC"), "the same in UTC"),
-    _field("kind", pa.string(), "kind of the event"),
-    _field("text", pa.string(), "sentence for people"),
-    _field("data", pa.string(), "the line of events.jsonl"),
+    _make_field("number", pa.int64(), "of the event in the run, from 1"),
+    _make_field("time_s", pa.float64(), "when it was reported"),
+    _make_field("time_utc", pa.timestamp("us", "UTC"), "the same in UTC"),
+    _make_field("kind", pa.string(), "kind of the event"),
+    _make_field("text", pa.string(), "sentence for people"),
+    _make_field("data", pa.string(), "the line of events.jsonl"),
 ]
 # events of several processes may be reported out of order
-EVENTS = _spec("events", _EVENT_FIELDS, "number")
-MARKS = _spec("marks", _EVENT_FIELDS, "number")
-THUMBNAILS = _spec(
+EVENTS = _make_spec("events", _EVENT_FIELDS, "number")
+MARKS = _make_spec("marks", _EVENT_FIELDS, "number")
+THUMBNAILS = _make_spec(
     "thumbnails",
     [
-        _field("number", pa.int64(), "of the picture in the run, from 1"),
-        _field("time_s", pa.float64(), "middle of the exposure"),
-        _field("pattern", pa.string(), "the pattern on the screen"),
-        _field("jpeg", pa.binary(), "the picture"),
+        _make_field("number", pa.int64(), "of the picture in the run, from 1"),
+        _make_field("time_s", pa.float64(), "middle of the exposure"),
+        _make_field("pattern", pa.string(), "the pattern on the screen"),
+        _make_field("jpeg", pa.binary(), "the picture"),
     ],
     "number",
     _THUMBNAIL_GROUP_ROWS,

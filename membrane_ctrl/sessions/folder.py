@@ -32,37 +32,37 @@ _LARGEST = 1e60  # no quantity is near it; its fourth power is still finite
 _PLAIN_BYTES_MAX = 64_000_000  # candidates with their curves take a few megabytes
 
 
-def plain(value: Any) -> Any:
+def to_plain(value: Any) -> Any:
     """Plain JSON data; numbers that are not finite become words."""
     if isinstance(value, BaseModel):
         return value.model_dump(mode="json")
     if is_dataclass(value) and not isinstance(value, type):
-        return {field.name: plain(getattr(value, field.name)) for field in fields(value)}
+        return {field.name: to_plain(getattr(value, field.name)) for field in fields(value)}
     if isinstance(value, np.ndarray):
-        return plain(value.tolist())
+        return to_plain(value.tolist())
     if isinstance(value, (list, tuple)):
-        return [plain(item) for item in value]
+        return [to_plain(item) for item in value]
     if isinstance(value, dict):
-        return {str(key): plain(item) for key, item in value.items()}
+        return {str(key): to_plain(item) for key, item in value.items()}
     if isinstance(value, float) and not math.isfinite(value):
         return str(value)
     return value
 
 
-def built(kind: type[T], data: Any) -> T:
+def build_value(kind: type[T], data: Any) -> T:
     """Build a value of a type from its plain form. Raises TypeError, ValueError or KeyError if it
     is invalid.
     """
-    return cast(T, _built(kind, data))
+    return cast(T, _build_plain(kind, data))
 
 
-def _built(kind: Any, data: Any) -> Any:
+def _build_plain(kind: Any, data: Any) -> Any:
     origin, arguments = get_origin(kind), get_args(kind)
     if origin in (Union, types.UnionType):
         return (
             None
             if data is None
-            else _built(next(a for a in arguments if a is not type(None)), data)
+            else _build_plain(next(a for a in arguments if a is not type(None)), data)
         )
     if origin is Literal:
         if data not in arguments:
@@ -70,7 +70,7 @@ def _built(kind: Any, data: Any) -> Any:
         return data
     if origin is tuple:
         inner = [arguments[0]] * len(data) if arguments[-1] is Ellipsis else arguments
-        return tuple(_built(a, item) for a, item in zip(inner, data, strict=True))
+        return tuple(_build_plain(a, item) for a, item in zip(inner, data, strict=True))
     if origin is np.ndarray:
         return np.array(data, dtype=float)
     if isinstance(kind, type) and issubclass(kind, BaseModel):
@@ -78,7 +78,7 @@ def _built(kind: Any, data: Any) -> Any:
     if is_dataclass(kind):
         hints = get_type_hints(kind)
         return cast(Any, kind)(
-            **{f.name: _built(hints[f.name], data[f.name]) for f in fields(kind)}
+            **{f.name: _build_plain(hints[f.name], data[f.name]) for f in fields(kind)}
         )
     value = kind(data)
     if isinstance(value, float) and _LARGEST < abs(value) < math.inf:
@@ -89,7 +89,7 @@ def _built(kind: Any, data: Any) -> Any:
 SCHEMA = "membrane-session/1"  # of all JSON files of a tuning session
 
 
-def write(path: Path, value: Any, schema: str = SCHEMA) -> None:
+def write_session_file(path: Path, value: Any, schema: str = SCHEMA) -> None:
     """Write a JSON file of a session atomically.
 
     Parameters
@@ -99,11 +99,13 @@ def write(path: Path, value: Any, schema: str = SCHEMA) -> None:
     schema : str
         Format with version, which the file states beside the program that writes it.
     """
-    table = {**program.file_origin(schema), **plain(value)}
-    files.write_text_atomic(files.users(path), json.dumps(table, indent=1, allow_nan=False) + "\n")
+    table = {**program.file_origin(schema), **to_plain(value)}
+    files.write_text_atomic(
+        files.resolve_user_path(path), json.dumps(table, indent=1, allow_nan=False) + "\n"
+    )
 
 
-def read(path: Path, kind: type[T], schema: str = SCHEMA) -> T:
+def read_session_file(path: Path, kind: type[T], schema: str = SCHEMA) -> T:
     """Read a JSON file of a session.
 
     Parameters
@@ -120,11 +122,11 @@ def read(path: Path, kind: type[T], schema: str = SCHEMA) -> T:
         One line: the file is missing, of another format, or invalid.
     """
     try:
-        table = plain_json.loads(files.read_text(files.users(path), _PLAIN_BYTES_MAX))
+        table = plain_json.loads(files.read_text(files.resolve_user_path(path), _PLAIN_BYTES_MAX))
         if not isinstance(table, dict):
             raise ValueError("no JSON object")
         program.remove_origin(table, schema)
-        return built(kind, table)
+        return build_value(kind, table)
     except FileNotFoundError:
         raise errors.InputError(f"{path}: no such file") from None
     except (OSError, ValueError, TypeError, KeyError, ValidationError) as error:
@@ -175,7 +177,7 @@ class SessionFolder:
         """The content of a file for people. Raises InputError if it is not a regular file."""
         path = self.file(name)
         try:
-            return files.read_bytes(files.users(path), _BYTES_MAX)
+            return files.read_bytes(files.resolve_user_path(path), _BYTES_MAX)
         except OSError as error:
             raise errors.InputError(f"{path}: {errors.os_reason(error)}") from None
 
@@ -195,7 +197,7 @@ class SessionFolder:
         or the file is damaged.
         """
         self.require(step)
-        return read(self.file(name), kind)
+        return read_session_file(self.file(name), kind)
 
     def done(self, step: str) -> bool:
         """Whether the step has left its result."""
@@ -228,8 +230,8 @@ def based_on(
     session.begin(STEPS[0])
     head = replace(session.head, before=before)
     config = session.config.model_copy(update={"loop": before, "pump": pump})
-    files.write_text_atomic(session.file("config.toml"), toml_file.dump(config))
-    write(session.file("session.json"), head)
+    files.write_text_atomic(session.file("config.toml"), toml_file.dump_toml(config))
+    write_session_file(session.file("session.json"), head)
     return SessionFolder(session.path, head, config)
 
 
@@ -275,9 +277,9 @@ def begin_session(
     Raises InputError for a bad name, DeviceError if it cannot be written.
     """
     path = fresh_folder(parent, name, datetime.fromisoformat(head.created_utc))
-    with errors.writing(path, errors.DeviceError):
-        files.write_text_atomic(path / "config.toml", toml_file.dump(config))
-        write(path / "session.json", head, head_schema)
+    with errors.convert_write_errors(path, errors.DeviceError):
+        files.write_text_atomic(path / "config.toml", toml_file.dump_toml(config))
+        write_session_file(path / "session.json", head, head_schema)
     return path
 
 
@@ -285,8 +287,8 @@ def read_session(path: Path, kind: type[H], head_schema: str = SCHEMA) -> tuple[
     """Read head and configuration of a session whose `session.json` has the format `head_schema`.
     Raises InputError if it is not one.
     """
-    head = read(path / "session.json", kind, head_schema)
-    return head, toml_file.load(path / "config.toml", schema.Config)
+    head = read_session_file(path / "session.json", kind, head_schema)
+    return head, toml_file.load_toml(path / "config.toml", schema.Config)
 
 
 def now_utc() -> str:

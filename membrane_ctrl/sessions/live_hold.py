@@ -105,9 +105,9 @@ class LiveHold:
         if client.greeting["run"] != run_dir.resolve().name:
             raise errors.InputError(f"{run_dir}: is not running; {client.greeting['run']} is")
         answer = client.status()
-        loop = _settings(schema.LoopConfig, answer, "loop")
-        pump = _settings(schema.PumpConfig, answer, "pump")
-        config = toml_file.load(run_dir / "config.toml", schema.Config)
+        loop = _read_settings(schema.LoopConfig, answer, "loop")
+        pump = _read_settings(schema.PumpConfig, answer, "pump")
+        config = toml_file.load_toml(run_dir / "config.toml", schema.Config)
         self.config = config.model_copy(update={"loop": loop, "pump": pump})
         self.name, self.run_dir = run_dir.name, run_dir
         if session:
@@ -185,7 +185,7 @@ class LiveHold:
                 telemetry.TelemetryRow.unpack(message) for message in messages.get("telemetry", ())
             ),
             events=tuple(
-                event_lines.from_dict(event_lines.parse(message))
+                event_lines.from_dict(event_lines.parse_event(message))
                 for message in messages.get("events", ())
             ),
             shapes=tuple(
@@ -202,7 +202,7 @@ class LiveHold:
             reader.close()
 
 
-def _settings(kind: type[_S], answer: Message, key: str) -> _S:
+def _read_settings(kind: type[_S], answer: Message, key: str) -> _S:
     """Settings in an answer. Raises DeviceError if they are not there, or not settings."""
     try:
         return kind.model_validate(answer.get(key))
@@ -277,7 +277,7 @@ class Progress:
         """Start a step with its planned duration, and that of the later steps."""
         self._step, self._planned_s, self._after_s = step, planned_s, after_s
         self._done_s = self._shown_s = 0.0
-        self._print(f"{step}" + (f": about {_clock(planned_s)}" if planned_s else ""))
+        self._print(f"{step}" + (f": about {_format_clock(planned_s)}" if planned_s else ""))
         self.note("step", step, planned_s=planned_s, after_s=after_s)
 
     def __call__(self, seconds: float) -> None:
@@ -291,8 +291,8 @@ class Progress:
         self._shown_s = self._done_s
         left_s = max(0.0, self._planned_s - self._done_s)
         line = (
-            f"{self._step}: {_clock(self._done_s)}, {_clock(left_s)} left, session "
-            f"{_clock(left_s + self._after_s)}"
+            f"{self._step}: {_format_clock(self._done_s)}, {_format_clock(left_s)} left, session "
+            f"{_format_clock(left_s + self._after_s)}"
         )
         terminal.live_line(line) if self._live else self._print(line)
 
@@ -321,7 +321,7 @@ class Progress:
         self.note("asks", question, among=among)
         self._asking = True
         try:
-            while among and self.log is not None and not _typed(_POLL_S):
+            while among and self.log is not None and not _has_typed_line(_POLL_S):
                 if (given := self.log.answer(question, among)) is not None:
                     self.say(f"{given.by} answers on the page: {given.said or 'none'}")
                     return given.said
@@ -348,7 +348,7 @@ class Progress:
                 signal.signal(number, handler)
 
 
-def _typed(within_s: float) -> bool:
+def _has_typed_line(within_s: float) -> bool:
     """Whether a line waits on the terminal, or its end; also if it cannot tell."""
     try:
         return bool(select.select([sys.stdin], [], [], within_s)[0])
@@ -356,5 +356,5 @@ def _typed(within_s: float) -> bool:
         return True
 
 
-def _clock(seconds: float) -> str:
+def _format_clock(seconds: float) -> str:
     return f"{int(seconds) // 60}:{int(seconds) % 60:02d}"

@@ -34,7 +34,7 @@ class LiveLog:
     """
 
     def __init__(self, session: Path, rate_hz: float, told: Callable[[str], None]) -> None:
-        self._path, self._told = files.users(session / NAME), told
+        self._path, self._told = files.resolve_user_path(session / NAME), told
         self._ticks_a_point = max(1, round(EVERY_S * rate_hz))
         self._every_s = self._ticks_a_point / rate_hz
         self._rows: list[telemetry.TelemetryRow] = []
@@ -55,7 +55,7 @@ class LiveLog:
         ]
         if groups:
             points = {
-                name: [_mean([getattr(row, name) for row in group]) for group in groups]
+                name: [_mean_of_finite([getattr(row, name) for row in group]) for group in groups]
                 for name in _COLUMNS
             }
             self._append({"every_s": self._every_s, **points})
@@ -82,7 +82,9 @@ class LiveLog:
             given = plain_json.loads(text)
             fits = given["to"] == question and given["said"] in ("", *among)
             return (
-                PageAnswer(given["said"], terminal.one_line(_line(given["by"]))) if fits else None
+                PageAnswer(given["said"], terminal.one_line(_parse_line(given["by"])))
+                if fits
+                else None
             )
         except (ValueError, TypeError, KeyError):
             return None
@@ -112,10 +114,10 @@ class PageAnswer:
 def give_answer(session: Path, question: str, given: PageAnswer) -> None:
     """Leave the answer to a question where the session finds it. Raises OSError."""
     text = json.dumps({"to": question, "said": given.said, "by": given.by})
-    files.write_text_atomic(files.users(session / ANSWER), text + "\n")
+    files.write_text_atomic(files.resolve_user_path(session / ANSWER), text + "\n")
 
 
-def _mean(values: list[float]) -> float | None:
+def _mean_of_finite(values: list[float]) -> float | None:
     good = [value for value in values if math.isfinite(value)]
     return round(sum(good) / len(good), 4) if good else None
 
@@ -158,7 +160,7 @@ class LiveReader:
         """
         points: dict[str, list[float]] = {name: [] for name in ("time_s", *_COLUMNS)}
         try:
-            data = files.read_bytes(files.users(self.session / NAME), _BYTES_MAX)
+            data = files.read_bytes(files.resolve_user_path(self.session / NAME), _BYTES_MAX)
         except OSError:
             return points
         whole = data.rfind(b"\n") + 1
@@ -177,19 +179,19 @@ class LiveReader:
         now = self.progress
         if "step" in entry:
             planned_s, after_s = float(entry["planned_s"]), float(entry["after_s"])
-            begun = (*now.begun_s, (self.time_s, _line(entry["step"])))[-_LINES_MAX:]
+            begun = (*now.begun_s, (self.time_s, _parse_line(entry["step"])))[-_LINES_MAX:]
             self.progress = Progressed(
                 begun[-1][1], planned_s, after_s, said=now.said, begun_s=begun
             )
         elif "said" in entry:
             self.progress = replace(
-                now, said=(*now.said, _line(entry["said"]))[-_LINES_MAX:], asks="", among=()
+                now, said=(*now.said, _parse_line(entry["said"]))[-_LINES_MAX:], asks="", among=()
             )
         elif "asks" in entry:
-            among = tuple(_line(name) for name in entry.get("among", ())[:_ANSWERS_MAX])
-            self.progress = replace(now, asks=_line(entry["asks"]), among=among)
+            among = tuple(_parse_line(name) for name in entry.get("among", ())[:_ANSWERS_MAX])
+            self.progress = replace(now, asks=_parse_line(entry["asks"]), among=among)
         else:
-            self.progress = replace(now, ended=_line(entry["ended"]), asks="", among=())
+            self.progress = replace(now, ended=_parse_line(entry["ended"]), asks="", among=())
 
     def _draw(self, entry: dict[str, Any], points: dict[str, list[float]]) -> None:
         every_s = float(entry["every_s"])
@@ -210,5 +212,5 @@ class LiveReader:
         self.progress = replace(self.progress, done_s=self.progress.done_s + count * every_s)
 
 
-def _line(text: object) -> str:
+def _parse_line(text: object) -> str:
     return str(text)[:_LINE_MAX]

@@ -54,7 +54,7 @@ class BenchReport:
         return f"tcp://127.0.0.1:{self.port}"
 
 
-def serve(spec: BenchSpec, ready: Connection) -> None:
+def serve_bench(spec: BenchSpec, ready: Connection) -> None:
     """Serve the bench in a spawned process until `processes.STOP`, or until `linger_s` after the
     parent's end.
 

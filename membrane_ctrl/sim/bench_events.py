@@ -40,7 +40,7 @@ class AmbientChange:
 
     def apply(self, on: Surroundings) -> None:
         """Add the change."""
-        on.ambient_pa[:] += self.change_pa * _progress(on.time_s, self.at_s, self.over_s)
+        on.ambient_pa[:] += self.change_pa * _event_share(on.time_s, self.at_s, self.over_s)
 
 
 @dataclass(frozen=True, slots=True)
@@ -53,7 +53,7 @@ class AirTemperatureChange:
 
     def apply(self, on: Surroundings) -> None:
         """Add the change."""
-        on.air_k[:] += self.change_k * _progress(on.time_s, self.at_s, self.over_s)
+        on.air_k[:] += self.change_k * _event_share(on.time_s, self.at_s, self.over_s)
 
 
 @dataclass(frozen=True, slots=True)
@@ -128,7 +128,7 @@ class PressureWeather:
             on.ambient_pa[:] += self.std_pa * np.sqrt(2 / periods_s.size) * wave
 
 
-def _progress(time_s: Series, at_s: float, over_s: float) -> Series:
+def _event_share(time_s: Series, at_s: float, over_s: float) -> Series:
     """0 before the event, 1 after it, a straight line while it lasts."""
     if over_s <= 0:
         return (time_s >= at_s).astype(np.float64)

@@ -37,7 +37,7 @@ class Hencky:
     profile: FloatArray
 
 
-def _reciprocal(series: FloatArray) -> FloatArray:
+def _reciprocal_series(series: FloatArray) -> FloatArray:
     """Power series of 1 / series, to the same length."""
     inverse = np.zeros_like(series)
     inverse[0] = 1.0 / series[0]
@@ -51,7 +51,7 @@ def _force_series(b0: float) -> FloatArray:
     b = np.zeros(_TERMS)
     b[0] = b0
     for k in range(1, _TERMS):
-        g = _reciprocal(b[:k])
+        g = _reciprocal_series(b[:k])
         b[k] = -np.dot(g, g[::-1]) / (8.0 * 4.0 * k * (k + 1))
     return b
 
@@ -68,7 +68,7 @@ def solve_hencky(poisson: float = POISSON_PET) -> Hencky:
     def rim_condition(b0: float) -> float:
         return float(np.dot(2.0 * k + 1.0 - poisson, _force_series(b0)))
 
-    slope = _reciprocal(
+    slope = _reciprocal_series(
         _force_series(brentq(rim_condition, 0.40, 0.60, xtol=1e-15))
     )  # 4 dW/du, without q^(1/3)
     fall = slope / (k + 1)

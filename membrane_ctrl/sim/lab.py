@@ -11,7 +11,7 @@ from functools import partial
 from pathlib import Path
 
 from firmware_iface import drivers, settings
-from firmware_iface.drivers.modbus_map import ValueMap, make_map, preset
+from firmware_iface.drivers.modbus_map import ValueMap, load_preset, make_map
 from firmware_iface.emulators import (
     input_module,
     keyence_dl_rs1a,
@@ -167,9 +167,11 @@ class Lab:
                 case settings.ModbusInputConfig():
                     bits[interlock.link, interlock.unit_id][interlock.function][
                         interlock.address
-                    ] = _closed
+                    ] = _read_closed_circuit
                 case settings.GpioLineConfig():
-                    bits[_gpio_url(interlock.chip), 1]["discrete"][interlock.line] = _closed
+                    bits[_gpio_url(interlock.chip), 1]["discrete"][interlock.line] = (
+                        _read_closed_circuit
+                    )
         for (url, unit), tables in bits.items():
             self._modules[url][unit] = input_module.InputModule(tables["discrete"], tables["coil"])
 
@@ -246,7 +248,7 @@ class Lab:
                 else:
                     sensors[value_map] = self._sensor(role)
                 if section.preset:
-                    low, high = preset(section.preset).get("raw_limits", raw_limits)
+                    low, high = load_preset(section.preset).get("raw_limits", raw_limits)
                     raw_limits = (low, high)
             self._tables[link][unit_id] = MapDevice(sensors, outputs, constants, raw_limits)
 
@@ -278,7 +280,7 @@ class Lab:
         return drive
 
 
-def _closed() -> bool:
+def _read_closed_circuit() -> bool:
     """A closed circuit."""
     return True
 
@@ -348,6 +350,6 @@ class MapDevice:
 def respond_to_input(pdu: bytes, table: modbus_pdu.RegisterTable) -> bytes:
     """`respond`, and "read input registers" (function 4) answered from the same registers."""
     if pdu[0] != _READ_INPUT:
-        return modbus_pdu.respond(pdu, table)
-    reply = modbus_pdu.respond(bytes([modbus_pdu.READ_HOLDING]) + pdu[1:], table)
+        return modbus_pdu.answer_request(pdu, table)
+    reply = modbus_pdu.answer_request(bytes([modbus_pdu.READ_HOLDING]) + pdu[1:], table)
     return bytes([reply[0] - modbus_pdu.READ_HOLDING + _READ_INPUT]) + reply[1:]

@@ -47,7 +47,7 @@ class PumpModel:
         self._start = config.start_fraction
         self._stall = config.stall_fraction
         self._ml_per_s_per_fraction = flow_full_ml_per_s / (1 - config.dead_fraction)
-        self._branches = _branches(config, twin.pump_shape, flow_full_ml_per_s)
+        self._branches = _make_branches(config, twin.pump_shape, flow_full_ml_per_s)
         self._play_ml_per_s = 0.0
         self._follow = -math.expm1(-step_s / twin.pump_lag_s)
         self._running = False
@@ -88,7 +88,7 @@ class PumpModel:
         return self._tube.popleft()
 
 
-def _branches(
+def _make_branches(
     config: PumpConfig, shape: str, full_ml_per_s: float
 ) -> tuple[list[float], list[float]] | None:
     """Flow in mL/s at each level of the command, rising and falling; None for the straight line."""

@@ -31,7 +31,7 @@ class Sensors:
         return BoardSample(
             displacement_um=float("nan")
             if lost
-            else _quantised(reading_um, config.laser_resolution_um),
+            else _quantise_value(reading_um, config.laser_resolution_um),
             displacement_quality=LASER_NO_LIGHT if lost else LASER_GOOD,
             gauge_pressure_pa=truth.gauge_pressure_pa + GAUGE_NOISE_PA * gauge,
             ambient_pressure_pa=truth.ambient_pressure_pa + config.barometer_noise_pa * ambient,
@@ -42,5 +42,5 @@ class Sensors:
         )
 
 
-def _quantised(value: float, resolution: float) -> float:
+def _quantise_value(value: float, resolution: float) -> float:
     return round(value / resolution) * resolution if resolution > 0 else value

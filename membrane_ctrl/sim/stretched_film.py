@@ -39,8 +39,8 @@ def solve_stretched_film(
     x, weight = legendre.leggauss(6 * _SHAPES)
     v = (x + 1) / 2
     r, area = np.sqrt(v), weight / 4
-    (wide, wide_r), (deep, deep_r) = _shapes(v)
-    vertex = _shapes(np.zeros(1))[1][0][:, 0]
+    (wide, wide_r), (deep, deep_r) = _shape_functions(v)
+    vertex = _shape_functions(np.zeros(1))[1][0][:, 0]
 
     def forces(u: FloatArray, u_r: FloatArray, w_r: FloatArray) -> tuple[FloatArray, FloatArray]:
         along, around = (
@@ -79,14 +79,16 @@ def solve_stretched_film(
     if np.abs(gradient(found)).max() > 1e-11 or pull.min() < 0.2 * pull[0]:
         raise ValueError(f"prestrain = {prestrain:g}: the film would be slack at its ring")
     at = (chebyshev.chebpts2(8 * _PROFILE_DEGREE) + 1) / 2
-    (out, _), (down, _) = (tables for tables in _shapes(at))
+    (out, _), (down, _) = (tables for tables in _shape_functions(at))
     rho2 = (np.sqrt(at) + u @ out) ** 2
     profile = Chebyshev.fit(rho2, 1 - w @ down / depth, _PROFILE_DEGREE, domain=[0, 1])
     powers = profile.convert(domain=[-1, 1], kind=Polynomial, window=[-1, 1]).coef
     return float(load[0]), np.concatenate([[0.0], powers[1:]])
 
 
-def _shapes(v: FloatArray) -> tuple[tuple[FloatArray, FloatArray], tuple[FloatArray, FloatArray]]:
+def _shape_functions(
+    v: FloatArray,
+) -> tuple[tuple[FloatArray, FloatArray], tuple[FloatArray, FloatArray]]:
     """Displacements outward, r (1 - v) P(v), and down, (1 - v) P(v), with v = r^2, and their
     derivatives along r.
     """

@@ -19,7 +19,7 @@ def serve_twin(config: Config, speed: float) -> int:
         start_bench(
             replace(bench_spec(config, clock.RunClock.start()), speed=speed, linger_s=0.0), stack
         )
-        terminal.progress("stop it with Ctrl-C")
+        terminal.print_progress("stop it with Ctrl-C")
         signal.pthread_sigmask(signal.SIG_BLOCK, _STOPS)
         stopped = signal.sigwait(_STOPS)
     return errors.Exit.INTERRUPTED if stopped == signal.SIGINT else errors.Exit.DONE

@@ -20,9 +20,9 @@ def start_bench(spec: BenchSpec, stack: contextlib.ExitStack) -> BenchReport:
     """Start the bench process, which the stack ends, and wait until it listens; print where. Raises
     DeviceError.
     """
-    terminal.progress(f"starting the twin: waiting until it listens, at most {_READY_S:g} s")
-    ours, theirs = event_pipe.pipe()
-    process = child.Child("twin", "membrane_ctrl.sim.bench:serve", (spec, theirs), nice=0)
+    terminal.print_progress(f"starting the twin: waiting until it listens, at most {_READY_S:g} s")
+    ours, theirs = event_pipe.make_pipe()
+    process = child.Child("twin", "membrane_ctrl.sim.bench:serve_bench", (spec, theirs), nice=0)
     stack.callback(process.stop, 2.0)
     process.start()
     report: BenchReport = (
@@ -32,7 +32,7 @@ def start_bench(spec: BenchSpec, stack: contextlib.ExitStack) -> BenchReport:
         raise errors.DeviceError(report.error)
     if spec.lab is None:
         moved = f" (port {spec.port} is taken)" if spec.port not in (0, report.port) else ""
-        terminal.progress(f"the twin listens on {report.url}{moved}, Modbus unit 1")
+        terminal.print_progress(f"the twin listens on {report.url}{moved}, Modbus unit 1")
     return report
 
 
@@ -67,7 +67,7 @@ class TwinProcess:
                 f"devices.interlocks: {len(config.interlocks)} of them; the twin's pump board has "
                 f"{settings.BOARD_INPUTS} inputs: use --devices, or fewer"
             )
-        truth = stack.enter_context(ring.ring(_TRUTHS_KEPT, TRUTH_BYTES))
+        truth = stack.enter_context(ring.open_ring(_TRUTHS_KEPT, TRUTH_BYTES))
         spec = replace(bench_spec(config, clock), truth=truth, lab=config.devices if lab else None)
         report = start_bench(spec, stack)
         watchdog = (

@@ -163,7 +163,7 @@ class MemoryLink:
 
     async def read_holding(self, address: int, count: int) -> list[int]:
         self._begin()
-        with _refusals(self.name):
+        with _raise_refusals(self.name):
             words = self._bench.board.read(address, count)
         self._answer()
         return words
@@ -176,7 +176,7 @@ class MemoryLink:
 
     async def write_registers(self, address: int, words: Sequence[int]) -> None:
         self._begin()
-        with _refusals(self.name):
+        with _raise_refusals(self.name):
             self._bench.board.write(address, words)
         self._bench.drive()
         self._answer()
@@ -197,7 +197,7 @@ class MemoryLink:
 
 
 @contextlib.contextmanager
-def _refusals(name: str) -> Iterator[None]:
+def _raise_refusals(name: str) -> Iterator[None]:
     """A refusal of the board, as the link's error."""
     try:
         yield

@@ -58,7 +58,7 @@ def web(
     if context.invoked_subcommand is not None:
         return
     from membrane_ctrl.config.port import WebConfig
-    from membrane_ctrl.config.toml_file import parse
+    from membrane_ctrl.config.toml_file import parse_tables
     from membrane_ctrl.control_port import ctl
     from membrane_ctrl.processes.command_process import end_with_parent
 
@@ -71,7 +71,9 @@ def web(
     given = {"host": host, "port": port, "names": tuple(name or ())}
     given |= {"public_url": public_url, "trusted_proxies": tuple(trusted_proxy or ())}
     kept = {"users_file": users, "certificate_file": certificate, "key_file": key}
-    page = parse(given | {key: file and str(file) for key, file in kept.items()}, WebConfig, "web")
+    page = parse_tables(
+        given | {key: file and str(file) for key, file in kept.items()}, WebConfig, "web"
+    )
     if with_hold:
         end_with_parent()
     serve({"": ctl.Where(socket, run, logs=logs)} if fleet is None else ctl.fleet(fleet), page)
@@ -90,7 +92,7 @@ def add_user(
     found = known_users(text, str(file))
     password = typer.prompt("Password", hide_input=True, confirmation_prompt=sys.stdin.isatty())
     found[name] = known_user(name, role, password)
-    with errors.writing(file, errors.DeviceError):
+    with errors.convert_write_errors(file, errors.DeviceError):
         files.write_text_atomic(file, "".join(f"{each.line()}\n" for each in found.values()))
         file.chmod(0o600)
     print(f"{file}: {len(found)} users", file=sys.stderr)

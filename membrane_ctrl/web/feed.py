@@ -28,7 +28,7 @@ from membrane_ctrl.model.columns import PUBLISHED
 from membrane_ctrl.model.run_events import Mark
 from membrane_ctrl.processes import published_rings, ring
 from membrane_ctrl.review import catalogue
-from membrane_ctrl.run_files.event_log import logged
+from membrane_ctrl.run_files.event_log import parse_logged_line
 from membrane_ctrl.run_files.run import open_run
 
 PERIOD_S = 0.5  # as fast as people read changing figures
@@ -208,7 +208,7 @@ class HoldFeed:
     def _take(self, message: Message, greeting: Message, rings: dict[str, ring.RingReader]) -> None:
         if "event" in message:
             utc = datetime.now(UTC)
-            event = logged(message["event"]).event
+            event = parse_logged_line(message["event"]).event
             self._events.append(f"{utc:%H:%M:%S} UTC  {event.sentence}")
             if isinstance(event, Mark):
                 self.marks.append((utc.timestamp(), event.text))
@@ -230,9 +230,9 @@ class HoldFeed:
         if reader is None:
             self.seconds.add(utc_s, {name: _number(newest.get(name)) for name in SIGNALS})
             return
-        rows = telemetry.unpack(reader.drain())
+        rows = telemetry.unpack_rows(reader.drain())
         if len(rows):
-            ticks = telemetry.columns(rows)
+            ticks = telemetry.get_columns(rows)
             at_s = utc_s + ticks["mono_s"] - ticks["mono_s"][-1]
             for place, tick_s in enumerate(at_s):
                 self.seconds.add(
@@ -304,7 +304,7 @@ def history(
 
 @lru_cache(maxsize=32)  # each list opens every run of its folder
 def _entries(logs: Path, _turn: float) -> list[catalogue.RunEntry]:
-    return catalogue.entries(logs)
+    return catalogue.list_entries(logs)
 
 
 def marks(

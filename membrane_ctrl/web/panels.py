@@ -20,7 +20,7 @@ from membrane_ctrl.controller.commands import Role
 from membrane_ctrl.model import errors
 from membrane_ctrl.model.columns import COLUMNS
 from membrane_ctrl.review import catalogue
-from membrane_ctrl.review.sparkline import sparkline
+from membrane_ctrl.review.sparkline import render_sparkline
 from membrane_ctrl.run_files.run import open_run
 from membrane_ctrl.sessions import folder as folders
 from membrane_ctrl.sessions.live_log import ANSWER, LiveReader, PageAnswer, Progressed, give_answer
@@ -104,9 +104,9 @@ def run_lines(logs: Path) -> list[RunLine]:
     """The runs of a folder, newest first."""
     if not logs.is_dir():
         return []
-    entries = sorted(catalogue.entries(logs), key=lambda entry: entry.started_utc, reverse=True)[
-        :_MOST
-    ]
+    entries = sorted(
+        catalogue.list_entries(logs), key=lambda entry: entry.started_utc, reverse=True
+    )[:_MOST]
     return [
         RunLine(entry, _picture(entry.folder, entry.exit != "open" and entry.duration_s))
         for entry in entries
@@ -117,7 +117,9 @@ def run_lines(logs: Path) -> list[RunLine]:
 def _picture(folder: Path, ended: float | bool) -> str:
     """The error over the run; kept for runs that have ended, which no longer change."""
     with suppress(OSError, ValueError):
-        return sparkline(open_run(folder).level(60.0, names=("mean_error_um",))["mean_error_um"])
+        return render_sparkline(
+            open_run(folder).level(60.0, names=("mean_error_um",))["mean_error_um"]
+        )
     return ""
 
 

@@ -10,7 +10,7 @@ import pytest
 from acquisition_fakes import VirtualClock
 
 from firmware_iface.roles import Frame
-from membrane_ctrl.acquisition.optical_bench import DisplayTest, told
+from membrane_ctrl.acquisition.optical_bench import DisplayTest, format_finding
 from tests.worlds.panel import EmulatedPanel, PanelResponse
 
 EXPOSURE_S, TRANSFER_S = 0.01, 0.005
@@ -63,13 +63,15 @@ def test_response_is_the_panels() -> None:
 
 def test_findings_name_what_they_are_about() -> None:
     dark = display_test(Bench(PanelResponse(), white_adu=20.0))
-    assert told("camera", lambda: dark.exposure(255, 20.0)).startswith("camera: white gives only 2")
+    assert format_finding("camera", lambda: dark.exposure(255, 20.0)).startswith(
+        "camera: white gives only 2"
+    )
     bright = display_test(Bench(PanelResponse(), white_adu=400.0))
-    assert "saturated" in told("camera", lambda: bright.exposure(255, 20.0))
+    assert "saturated" in format_finding("camera", lambda: bright.exposure(255, 20.0))
     right = display_test(Bench(PanelResponse()))
-    assert told("camera", lambda: right.exposure(255, 20.0)) == ""
-    assert told("screen", right.checkerboard) == ""
+    assert format_finding("camera", lambda: right.exposure(255, 20.0)) == ""
+    assert format_finding("screen", right.checkerboard) == ""
     nothing = display_test(Bench(PanelResponse(), white_adu=0.0))
-    assert told("screen", lambda: str(nothing.response())).startswith(
+    assert format_finding("screen", lambda: str(nothing.response())).startswith(
         "screen: the camera sees no ramp"
     )

@@ -12,7 +12,7 @@ import pytest
 
 from membrane_ctrl.acquisition.laser_history import HALF_WINDOW_S, LaserHistory
 from membrane_ctrl.model.telemetry import FIELDS, ROW_BYTES, TelemetryRow
-from membrane_ctrl.processes.ring import RingAddress, RingWriter, ring
+from membrane_ctrl.processes.ring import RingAddress, RingWriter, open_ring
 
 NOTHING = TelemetryRow(**dict.fromkeys(FIELDS, math.nan))
 
@@ -29,7 +29,7 @@ def row(mono_s: float, displacement_um: float, counter: float, quality: float = 
 
 @pytest.fixture
 def address() -> Iterator[RingAddress]:
-    with ring(256, ROW_BYTES) as address:
+    with open_ring(256, ROW_BYTES) as address:
         yield address
 
 

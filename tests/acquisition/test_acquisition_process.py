@@ -24,7 +24,7 @@ from membrane_ctrl.model.shape_estimate import ShapeEstimate, unpack_estimate
 from membrane_ctrl.model.telemetry import FIELDS, ROW_BYTES, TelemetryRow
 from membrane_ctrl.processes.child import STOP
 from membrane_ctrl.processes.frames import FrameReader, FrameRing
-from membrane_ctrl.processes.ring import RingReader, RingWriter, ring
+from membrane_ctrl.processes.ring import RingReader, RingWriter, open_ring
 from membrane_ctrl.sim.truth import TRUTH_BYTES, Truth
 
 pytestmark = pytest.mark.real_time
@@ -48,9 +48,9 @@ class Run:
     """The rings of a run and a real acquisition process on them."""
 
     def __init__(self, stack: ExitStack, twin: bool = True) -> None:
-        telemetry = stack.enter_context(ring(4096, ROW_BYTES))
-        shapes = stack.enter_context(ring(64, 1 << 16))
-        truths = stack.enter_context(ring(16, TRUTH_BYTES))
+        telemetry = stack.enter_context(open_ring(4096, ROW_BYTES))
+        shapes = stack.enter_context(open_ring(64, 1 << 16))
+        truths = stack.enter_context(open_ring(16, TRUTH_BYTES))
         frames = FrameRing.for_optics(CONFIG.optics)
         stack.callback(frames.close)
         self.clock = RunClock.start()

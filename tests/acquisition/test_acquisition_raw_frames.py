@@ -19,7 +19,7 @@ from membrane_ctrl.config.schema import CameraConfig, OpticsConfig, RecordingCon
 from membrane_ctrl.measure.capture_set import read_head
 from membrane_ctrl.model.telemetry import FIELDS, ROW_BYTES, TelemetryRow
 from membrane_ctrl.processes.frames import FrameRing, FrameWriter
-from membrane_ctrl.processes.ring import RingWriter, ring
+from membrane_ctrl.processes.ring import RingWriter, open_ring
 
 OPTICS = OpticsConfig(camera=CameraConfig(width_px=16, height_px=8))
 
@@ -30,7 +30,7 @@ class Keeping:
     def __init__(self, stack: ExitStack, folder: Path, **recording: int | float) -> None:
         frames = FrameRing.for_optics(OPTICS, 2)
         stack.callback(frames.close)
-        telemetry = stack.enter_context(ring(64, ROW_BYTES))
+        telemetry = stack.enter_context(open_ring(64, ROW_BYTES))
         self._frames = stack.enter_context(closing(FrameWriter(frames.address)))
         self._telemetry = stack.enter_context(closing(RingWriter(telemetry)))
         settings = RecordingConfig(min_free_mb=recording.pop("min_free_mb", 1), **recording)  # type: ignore[arg-type]

@@ -17,13 +17,13 @@ from membrane_ctrl.acquisition.process import acquisition_main
 from membrane_ctrl.acquisition.spec import AcquisitionSpec
 from membrane_ctrl.cli import run as command
 from membrane_ctrl.config.schema import Config
-from membrane_ctrl.config.toml_file import dump
+from membrane_ctrl.config.toml_file import dump_toml
 from membrane_ctrl.metrology.phase.pattern_sequence import full_sequence
 from membrane_ctrl.model.clock import RunClock
 from membrane_ctrl.model.shape_estimate import ShapeEstimate, unpack_estimate
 from membrane_ctrl.model.telemetry import ROW_BYTES
 from membrane_ctrl.processes.frames import FrameRing
-from membrane_ctrl.processes.ring import RingReader, ring
+from membrane_ctrl.processes.ring import RingReader, open_ring
 from membrane_ctrl.sim.optics.camera import OpticsRenderer
 from membrane_ctrl.sim.optics.film_shape import typical_film
 from tests.support.virtual_display import screenshot, virtual_display
@@ -97,8 +97,8 @@ class Run:
     """The acquisition process of a run without a twin."""
 
     def __init__(self, stack: ExitStack, config: Config, run_dir: Path) -> None:
-        telemetry = stack.enter_context(ring(64, ROW_BYTES))
-        shapes = stack.enter_context(ring(64, 1 << 16))
+        telemetry = stack.enter_context(open_ring(64, ROW_BYTES))
+        shapes = stack.enter_context(open_ring(64, 1 << 16))
         frames = FrameRing.for_optics(config.optics)
         stack.callback(frames.close)
         self._clock = RunClock.start()
@@ -190,11 +190,11 @@ def test_check_names_what_is_wrong_with_the_screen(
     screen = CONFIG.devices.screen.model_copy(update={"width_px": 640})
     devices = CONFIG.devices.model_copy(update={"screen": screen})
     path = tmp_path / "lab.toml"
-    path.write_text(dump(CONFIG.model_copy(update={"devices": devices})))
+    path.write_text(dump_toml(CONFIG.model_copy(update={"devices": devices})))
     assert command(["check", str(path), "--json"]) == 4
     probes = {probe["role"]: probe for probe in json.loads(capsys.readouterr().out)["devices"]}
     assert "is 420 x 300, [devices.screen] says 640 x 300" in probes["camera"]["problem"]
-    path.write_text(dump(CONFIG))
+    path.write_text(dump_toml(CONFIG))
     assert command(["check", str(path), "--json"]) == 4  # there is no board
     probes = {probe["role"]: probe for probe in json.loads(capsys.readouterr().out)["devices"]}
     assert probes["camera"]["problem"] == ""

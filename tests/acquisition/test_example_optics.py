@@ -17,7 +17,7 @@ import pytest
 
 from firmware_iface.emulators.pump_board import BoardSample
 from membrane_ctrl.config.schema import Config, DevicesConfig
-from membrane_ctrl.config.toml_file import dump, load
+from membrane_ctrl.config.toml_file import dump_toml, load_toml
 from membrane_ctrl.sim.lab import Lab
 from tests.support.virtual_display import screenshot, virtual_display
 from tests.worlds.gige_camera import GigeCameraEmulator, gige_camera
@@ -29,7 +29,7 @@ SHRINK = 4
 
 
 def _example() -> Config:
-    example = load(
+    example = load_toml(
         Path(__file__).parents[2] / "membrane_ctrl" / "examples" / "paper-bench.toml", Config
     )
     camera = example.optics.camera
@@ -86,7 +86,7 @@ def camera(tmp_path: Path) -> Iterator[GigeCameraEmulator]:
 
 async def check(config: Config, path: Path) -> tuple[int, dict[str, Any], str]:
     """Exit code, the camera's probe, standard error."""
-    path.write_text(dump(config), encoding="utf-8")  # noqa: ASYNC240
+    path.write_text(dump_toml(config), encoding="utf-8")  # noqa: ASYNC240
     patient = Path(__file__).parents[1] / "patience.py"
     command = [sys.executable, str(patient), "check", str(path), "--json"]
     pipe = asyncio.subprocess.PIPE

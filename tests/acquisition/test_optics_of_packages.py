@@ -21,7 +21,7 @@ from membrane_ctrl.acquisition import driver_check, optical_bench
 from membrane_ctrl.acquisition.cycle import CycleDone, CycleFailed, ShapeCycle
 from membrane_ctrl.acquisition.cycle_plan import CyclePlan
 from membrane_ctrl.config.schema import Config
-from membrane_ctrl.config.toml_file import dump, load
+from membrane_ctrl.config.toml_file import dump_toml, load_toml
 from membrane_ctrl.metrology.cycle.live_reconstructor import LiveReconstructor
 from membrane_ctrl.metrology.phase.pattern_sequence import fringe_sequence, full_sequence
 from membrane_ctrl.model.errors import InputError
@@ -226,8 +226,8 @@ def test_a_package_that_hangs_is_not_waited_for(
 def test_this_process_loads_no_package(site: Path, tmp_path: Path) -> None:
     config = configured({"exposure_ms": 5.0})
     path = tmp_path / "config.toml"
-    path.write_text(dump(config))
-    assert load(path, Config) == config
+    path.write_text(dump_toml(config))
+    assert load_toml(path, Config) == config
     assert config.devices is not None
     driver_check.require_optics(config.devices)
     assert "studio_optics" not in sys.modules

@@ -33,7 +33,7 @@ from membrane_ctrl.model.clock import RunClock
 from membrane_ctrl.model.program import program_identity, stated_program
 from membrane_ctrl.model.shape_estimate import ShapeEstimate, pack_estimate
 from membrane_ctrl.model.telemetry import FIELDS, TelemetryRow
-from membrane_ctrl.processes.ring import RingReader, RingWriter, ring
+from membrane_ctrl.processes.ring import RingReader, RingWriter, open_ring
 from membrane_ctrl.recorder.recorder import Recorder
 from membrane_ctrl.recorder.rerun_recording import Recording
 from membrane_ctrl.run_files.run_folder import create_run_folder
@@ -73,7 +73,7 @@ class Hold:
         self.config = config
         self.folder = create_run_folder(logs, "week", self.clock.origin_utc, config)
         sizes = {"inputs": (600, MESSAGE_BYTES), "events": (64, 8192), "shapes": (64, 1 << 16)}
-        addresses = {name: stack.enter_context(ring(*size)) for name, size in sizes.items()}
+        addresses = {name: stack.enter_context(open_ring(*size)) for name, size in sizes.items()}
         self.rings = {name: RingWriter(address) for name, address in addresses.items()}
         readers = {name: RingReader(address) for name, address in addresses.items()}
         self.events = RingReader(addresses["events"])

@@ -22,7 +22,7 @@ from membrane_ctrl.alarms.process import (
     apprise_senders,
     read_urls,
     require_sendable,
-    watch,
+    watch_run,
 )
 from membrane_ctrl.cli import run
 from membrane_ctrl.config.port import AlarmsConfig
@@ -32,7 +32,7 @@ from membrane_ctrl.model.events import Event, EventLine
 from membrane_ctrl.model.port_events import AlarmTold
 from membrane_ctrl.model.telemetry import FIELDS, ROW_BYTES, TelemetryRow
 from membrane_ctrl.processes.event_pipe import event_sender
-from membrane_ctrl.processes.ring import RingWriter, ring
+from membrane_ctrl.processes.ring import RingWriter, open_ring
 
 CONFIG = AlarmsConfig(silent_s=5.0)
 ROW = TelemetryRow(*(0.0 for _ in FIELDS))
@@ -177,10 +177,10 @@ def spec(telemetry: object, events: object) -> AlarmsSpec:
 
 def test_the_process_ends_with_the_run_and_says_why_it_ended() -> None:
     sender, reports = FakeSender(), list[Event]()
-    with ring(16, ROW_BYTES) as telemetry, ring(16, 4096) as events:
+    with open_ring(16, ROW_BYTES) as telemetry, open_ring(16, 4096) as events:
         writer = RingWriter(events)
         writer.put(message(kind="end", exit="safety_trip"))
-        watch(spec(telemetry, events), [sender], reports.append, lambda: True)
+        watch_run(spec(telemetry, events), [sender], reports.append, lambda: True)
         writer.close()
     assert told(sender) == [("run_ended", "raised")]
     assert [(r.alarm, r.sent) for r in reports if isinstance(r, AlarmTold)] == [("run_ended", True)]
@@ -191,8 +191,8 @@ def test_a_control_process_that_vanishes_is_told() -> None:
 
     theirs, ours = Pipe()
     theirs.close()
-    with ring(16, ROW_BYTES) as telemetry, ring(16, 4096) as events:
-        watch(spec(telemetry, events), [sender], event_sender(ours), lambda: False)
+    with open_ring(16, ROW_BYTES) as telemetry, open_ring(16, 4096) as events:
+        watch_run(spec(telemetry, events), [sender], event_sender(ours), lambda: False)
     assert told(sender) == [("control_gone", "raised")]
 
 

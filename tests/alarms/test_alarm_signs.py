@@ -5,7 +5,7 @@ import pytest
 from membrane_ctrl.alarms.book import sign_of_value, signs_of
 from membrane_ctrl.config.port import AlarmRule
 from membrane_ctrl.config.schema import Config
-from membrane_ctrl.config.toml_file import parse
+from membrane_ctrl.config.toml_file import parse_tables
 from membrane_ctrl.model.errors import InputError
 from membrane_ctrl.model.event_lines import from_dict
 from membrane_ctrl.model.events import EventLine
@@ -145,7 +145,7 @@ def test_the_text_names_value_and_limit() -> None:
 )
 def test_rules_that_are_none_are_one_line(alarms: dict[str, object], says: str) -> None:
     with pytest.raises(InputError, match=says):
-        parse({"alarms": alarms}, Config, "lab.toml")
+        parse_tables({"alarms": alarms}, Config, "lab.toml")
 
 
 def test_the_notice_of_a_lock_names_text_author_time_and_word() -> None:

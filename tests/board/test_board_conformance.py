@@ -13,7 +13,7 @@ from pathlib import Path
 
 import pytest
 
-from firmware_iface.board_settings import record
+from firmware_iface.board_settings import make_record
 from firmware_iface.conformance import Conformance, examine
 from firmware_iface.drivers.pump_board import PumpBoard
 from firmware_iface.roles import BenchCommand
@@ -72,7 +72,7 @@ def host_program(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def host_board(host_program: Path, tmp_path: Path) -> Iterator[dict[str, str]]:
     """The firmware as a program: where its line, its TCP port and its film are."""
     settings = tmp_path / "settings.bin"
-    settings.write_bytes(record({**SETTINGS, "silence_us": 50_000}))
+    settings.write_bytes(make_record({**SETTINGS, "silence_us": 50_000}))
     with subprocess.Popen(
         [str(host_program), str(settings)], stdout=subprocess.PIPE, text=True
     ) as process:
@@ -160,7 +160,7 @@ async def test_the_host_program_has_a_film(host_program: Path, tmp_path: Path) -
     wire = FilmWire(film)
     await wire.start()
     settings = tmp_path / "settings.bin"
-    settings.write_bytes(record(SETTINGS))
+    settings.write_bytes(make_record(SETTINGS))
     process = await asyncio.create_subprocess_exec(
         str(host_program), str(settings), str(wire.port), stdout=asyncio.subprocess.PIPE
     )

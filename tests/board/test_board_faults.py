@@ -12,7 +12,7 @@ from pathlib import Path
 
 import pytest
 
-from firmware_iface.board_settings import record
+from firmware_iface.board_settings import make_record
 from firmware_iface.register_map import default_map
 from tests.board.virtual_board import NO_VALUE, SETTINGS, VirtualBoard, rtu_frame
 
@@ -176,7 +176,7 @@ def test_every_damaged_bit_of_what_the_board_decides_by_resets_it_in_a_milliseco
     assert [length > 200 for _, length in spans] == [True, True]
     for start, length in spans:
         for offset in range(0, length, 4):
-            virtual_board.power_on(record(SETTINGS))
+            virtual_board.power_on(make_record(SETTINGS))
             run_pump(virtual_board, 10.0)
             word = ctypes.c_uint32.from_address(start + offset)
             word.value ^= 1 << chance.randrange(32)
@@ -198,7 +198,7 @@ def test_damage_anywhere_in_the_firmware_s_memory_never_drives_the_pump_unfed(
     chance = random.Random(2)
     spans = [memory[name] for name in ("now", "inverse", "frame", "stalled_ticks", "clients")]
     for _ in range(300):
-        virtual_board.power_on(record(SETTINGS))
+        virtual_board.power_on(make_record(SETTINGS))
         run_pump(virtual_board, 0.05)
         start, length = chance.choice(spans)
         byte = ctypes.c_uint8.from_address(start + chance.randrange(length))
@@ -214,7 +214,7 @@ def test_a_board_without_valid_settings_has_no_values_and_no_pump(
     virtual_board: VirtualBoard, damage: str
 ) -> None:
     records = (
-        record({**SETTINGS, "unit_id": 9, "silence_us": 2000 + tried}) for tried in range(5000)
+        make_record({**SETTINGS, "unit_id": 9, "silence_us": 2000 + tried}) for tried in range(5000)
     )
     good = next(
         found for found in records if found[-1] == 0
@@ -284,7 +284,7 @@ def test_a_line_cut_within_a_request_stops_the_pump_after_the_period(
 ) -> None:
     frame = rtu_frame(1, command(2))
     for kept in range(len(frame)):
-        virtual_board.power_on(record(SETTINGS))
+        virtual_board.power_on(make_record(SETTINGS))
         run_pump(virtual_board, 0.05)
         virtual_board.hear(frame[:kept])
         virtual_board.pass_us(51_000)

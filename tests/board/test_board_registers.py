@@ -11,9 +11,9 @@ import struct
 
 import pytest
 
-from firmware_iface.board_settings import record
+from firmware_iface.board_settings import make_record
 from firmware_iface.emulators import pump_board
-from firmware_iface.emulators.modbus_pdu import respond
+from firmware_iface.emulators.modbus_pdu import answer_request
 from firmware_iface.register_map import Block, default_map
 from tests.board.virtual_board import NO_VALUE, SETTINGS, VirtualBoard
 
@@ -46,7 +46,7 @@ class Twins:
         self.chance = chance
         self.raws = [0, 0, 101_325_000, 210_000, 220_000, 0]
         self.interlocks = 0xFFFF
-        board.power_on(record({**SETTINGS, **_PROTECTION}))
+        board.power_on(make_record({**SETTINGS, **_PROTECTION}))
         self._wire()
         self.python_ms = 0
         self._sampled = self._sample()
@@ -101,7 +101,9 @@ class Twins:
     def ask(self, pdu: bytes) -> None:
         said = self.c.ask(pdu)
         self._follow(self.c.answered_us)
-        assert said == respond(pdu, self.python), f"request {pdu.hex()} at {self.c.answered_us} us"
+        assert said == answer_request(pdu, self.python), (
+            f"request {pdu.hex()} at {self.c.answered_us} us"
+        )
         self.c.pass_us(1000 * _SETTLED_MS)
         self._follow(self.c.now_us)
         assert self.c.outputs == tuple(

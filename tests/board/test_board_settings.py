@@ -68,7 +68,7 @@ _GOOD: dict[str, Any] = {"pressure_limit_pa": 800.0, "pump_limit_fraction": 0.5}
 )
 def test_a_wrong_table_is_refused_with_its_key(change: dict[str, Any], said: str) -> None:
     with pytest.raises(board_settings.BoardSettingsError) as found:
-        board_settings.record({**_GOOD, **change})
+        board_settings.make_record({**_GOOD, **change})
     assert str(found.value).startswith(said)
 
 
@@ -78,7 +78,7 @@ def test_the_command_writes_a_record_or_says_one_line(
     source, target = tmp_path / "board.toml", tmp_path / "settings.bin"
     source.write_text("pressure_limit_pa = 800.0\npump_limit_fraction = 1.0\n")
     assert board_settings.main([str(source), str(target)]) == 0
-    assert target.read_bytes() == board_settings.record(
+    assert target.read_bytes() == board_settings.make_record(
         {"pressure_limit_pa": 800.0, "pump_limit_fraction": 1.0}
     )
     for text in ("unit_id = 1\n", "unit_id = \n", "\0"):

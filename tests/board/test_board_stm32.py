@@ -26,7 +26,7 @@ from pathlib import Path
 import pytest
 
 from firmware_iface import conformance, roles
-from firmware_iface.board_settings import record
+from firmware_iface.board_settings import make_record
 from firmware_iface.drivers.pump_board import PumpBoard
 from firmware_iface.emulators.optoncdt1420 import three_bytes
 from tests.board.gdb_wire import StoppedBoard, stopped
@@ -88,7 +88,7 @@ async def stm32(folder: Path) -> AsyncIterator[Stm32]:
     """
     image, settings = make(folder, "stm32f4-qemu.bin", "settings.bin")
     table = tomllib.loads((PORT / "board.toml").read_text(encoding="utf-8"))
-    settings.write_bytes(record({**table, "gauge_fitted": False}))
+    settings.write_bytes(make_record({**table, "gauge_fitted": False}))
     lasers: asyncio.Queue[asyncio.StreamWriter] = asyncio.Queue()
     server = await asyncio.start_server(lambda _, writer: lasers.put_nowait(writer), "127.0.0.1", 0)
     port = server.sockets[0].getsockname()[1]

@@ -12,7 +12,7 @@ from typing import Any
 
 import pytest
 
-from firmware_iface.board_settings import record
+from firmware_iface.board_settings import make_record
 from firmware_iface.register_map import default_map
 from tests.board.test_board_faults import command, run_pump, sensors, write
 from tests.board.virtual_board import NO_VALUE, SETTINGS, VirtualBoard
@@ -264,7 +264,7 @@ def _sealed(words: list[int]) -> bytes:
 
 
 def _record_words() -> list[int]:
-    return list(struct.unpack(f">{_WORDS}I", record(SETTINGS)))[:-1]
+    return list(struct.unpack(f">{_WORDS}I", make_record(SETTINGS)))[:-1]
 
 
 def test_a_record_of_an_earlier_board_means_that_the_gauge_is_fitted(

@@ -9,7 +9,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from firmware_iface.board_settings import record
+from firmware_iface.board_settings import make_record
 from firmware_iface.emulators.rtu_bus import bitwise_crc
 from firmware_iface.links.modbus_link import exception_error
 
@@ -34,7 +34,7 @@ class VirtualBoard:
         self._path = library
         self.chip = ctypes.CDLL(str(library))
         self.now_us = self.answered_us = 0
-        self.power_on(record(settings))
+        self.power_on(make_record(settings))
 
     def power_on(self, settings: bytes) -> None:
         """Supply off and on, with this record in the flash."""

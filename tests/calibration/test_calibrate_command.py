@@ -23,7 +23,7 @@ from membrane_ctrl.metrology.calibration.verdict import CalibrationFinding
 from membrane_ctrl.sim.optics.bench_poses import ScreenError
 from membrane_ctrl.sim.optics.film_shape import FilmShape, typical_film
 from membrane_ctrl.sim.optics.simulate import simulate_set
-from membrane_ctrl.sim.optics.simulation_spec import Motion, SimulationSpec, leaning
+from membrane_ctrl.sim.optics.simulation_spec import Motion, SimulationSpec, make_artefact_shape
 
 # 16-bit frames of large pixels, each with the noise of the 256 of the paper's camera that it stands
 # for
@@ -287,14 +287,14 @@ def test_a_refusal_of_sets_with_different_references_names_these_first() -> None
         CalibrationFinding(False, "wide"),
     )
     bundle = sets.Bundle((), OpticsConfig(), 0.0, ("no rim",), "the sets state two references")
-    found = sets._judged([crept, wide], bundle)
+    found = sets._judge_sets([crept, wide], bundle)
     assert [(each.fatal, each.says) for each in found] == [
         (True, "the sets state two references; if it was not: camera or screen crept"),
         (False, "wide"),
         (False, "no rim"),
     ]
     assert found[0].sets == (1,)
-    one = sets._judged([crept], replace(bundle, apart=""))
+    one = sets._judge_sets([crept], replace(bundle, apart=""))
     assert [each.says for each in one] == ["camera or screen crept", "no rim"]
 
 
@@ -325,7 +325,7 @@ SPHERE = {
 
 @pytest.fixture(scope="module")
 def sphere(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    shape = leaning(3400.0, 450.0, 1e-3, -5e-4)
+    shape = make_artefact_shape(3400.0, 450.0, 1e-3, -5e-4)
     mirror = MirrorConfig(radius_mm=450.0, analysis_radius_mm=440.0)
     return set_of(
         tmp_path_factory.mktemp("known") / "sphere", shape, mirror, artefact=SPHERE, laser=False

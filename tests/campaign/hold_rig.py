@@ -27,7 +27,7 @@ from membrane_ctrl.model.clock import RunClock
 from membrane_ctrl.model.errors import Exit
 from membrane_ctrl.model.events import Event
 from membrane_ctrl.model.telemetry import ROW_BYTES, State
-from membrane_ctrl.processes.ring import RingWriter, ring
+from membrane_ctrl.processes.ring import RingWriter, open_ring
 from membrane_ctrl.sim.virtual_bench import VirtualBench
 
 _LOOK_S = 0.01
@@ -158,7 +158,7 @@ async def a_hold(
     rig = HoldRig(plant, bench, now, config)
     with ExitStack() as stack:
         rings = {
-            name: stack.enter_context(ring(16, size))
+            name: stack.enter_context(open_ring(16, size))
             for name, size in (("t", ROW_BYTES), ("e", 4096))
         }
         telemetry, events = (RingWriter(rings[name]) for name in ("t", "e"))

@@ -21,7 +21,7 @@ from process_cases import CLOCK, DISK, HANG_S, UPSET, WALL_CLOCK, ProcessCase
 
 from membrane_ctrl.config.schema import LimitsConfig
 from membrane_ctrl.model.errors import Exit
-from membrane_ctrl.replay.repair import repair
+from membrane_ctrl.replay.repair import repair_run
 from membrane_ctrl.run_files.latched_fault import LatchedFile
 from membrane_ctrl.run_files.run import open_run
 
@@ -102,7 +102,7 @@ def judged(case: ProcessCase, run: Run, code: int, pump_s: float) -> ProcessResu
     if not (
         run_dir / "summary.json"
     ).exists():  # controller and recorder are dead: a person repairs it
-        repair(run_dir)
+        repair_run(run_dir)
     summary = json.loads((run_dir / "summary.json").read_text())
     faults = run.faults()
     said = faults[0] if faults else ""

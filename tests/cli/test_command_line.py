@@ -48,7 +48,8 @@ def test_the_quick_commands_load_what_they_need_alone(words: list[str]) -> None:
 
 def test_hold_says_what_it_does_before_it_loads_the_control_program() -> None:
     code = "from membrane_ctrl.model import terminal\nfrom membrane_ctrl.cli import run\n"
-    code += "terminal.progress = lambda words: sys.exit(str('membrane_ctrl.hold' in sys.modules))\n"
+    code += "terminal.print_progress = "
+    code += "lambda words: sys.exit(str('membrane_ctrl.hold' in sys.modules))\n"
     code += "run(['hold', '--twin'])"
     said = subprocess.run(
         [sys.executable, "-c", f"import sys\n{code}"], capture_output=True, text=True, check=False

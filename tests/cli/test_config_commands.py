@@ -14,7 +14,7 @@ from test_examples import StillPlant
 from membrane_ctrl.cli import run
 from membrane_ctrl.commissioning import devices, first_config
 from membrane_ctrl.config.schema import Config
-from membrane_ctrl.config.toml_file import load
+from membrane_ctrl.config.toml_file import load_toml
 from membrane_ctrl.sim.lab import Lab
 
 FOUND = [devices.FoundDevice("port", "/dev/ttyUSB0: FTDI", 'port = "usb:0403:6001"')]
@@ -43,7 +43,7 @@ async def test_the_first_configuration_passes_check_against_the_twin(
     assert run(["config", "init", str(path), *options]) == 0
     text = path.read_text()
     assert ("FTDI" in text) == (not options)
-    config = load(path, Config)
+    config = load_toml(path, Config)
     assert config == Config.model_validate({"devices": {"board": "tcp://127.0.0.1:5020"}})
     assert config.devices is not None
     lab = Lab(StillPlant(), config.devices)
@@ -85,7 +85,7 @@ def test_a_folder_that_is_not_there_is_named(
 def test_a_board_is_asked_for(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     path = tmp_path / "lab.toml"
     assert answered(monkeypatch, path, "tcp://10.0.0.9:502", "") == 0
-    config = load(path, Config)
+    config = load_toml(path, Config)
     assert config.devices is not None
     assert config.devices.board == "tcp://10.0.0.9:502"
     assert not config.shape.enabled  # no camera was named
@@ -111,7 +111,7 @@ def test_single_instruments_are_asked_for_and_what_they_lack_is_switched_off(
     assert (
         answered(monkeypatch, path, "", *laser, *pump, *gauge, *vent, "", "", "uvc", *screen) == 0
     )
-    config = load(path, Config)
+    config = load_toml(path, Config)
     assert config.devices is not None
     assert {*config.devices.roles()} == {"displacement", "pump", "gauge_pressure", "vent"}
     assert config.devices.vent is not None

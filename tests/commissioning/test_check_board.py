@@ -14,7 +14,7 @@ from test_safe_state import Bench
 from firmware_iface.emulators.pump_board import StoredSettings
 from membrane_ctrl.commissioning.check import check_config
 from membrane_ctrl.config.schema import Config
-from membrane_ctrl.config.toml_file import parse
+from membrane_ctrl.config.toml_file import parse_tables
 
 
 @pytest.fixture
@@ -26,7 +26,7 @@ def bench(version: int, tmp_path: Path) -> Iterator[Bench]:
 
 def check(bench: Bench, as_json: bool) -> None:
     """Check a configuration that has the board; its devices can be used."""
-    config = parse(tomllib.loads(slow_machine(str(bench.devices.board))), Config, "lab.toml")
+    config = parse_tables(tomllib.loads(slow_machine(str(bench.devices.board))), Config, "lab.toml")
     with patient_check():
         assert check_config(config, "lab.toml", as_json) == 0
 

@@ -57,7 +57,7 @@ def test_without_aravis_the_rest_is_listed_and_the_remedy_named(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     monkeypatch.setattr(aravis, "_LIBRARY", "libaravis-not-there.so")
-    aravis.aravis.cache_clear()
+    aravis.load_aravis.cache_clear()
     monkeypatch.setattr(devices, "serial_ports", lambda: [PortInfo("/dev/ttyS0", "", "n/a")])
     assert run(["devices", "--json"]) == 0
     found = json.loads(capsys.readouterr().out)
@@ -65,4 +65,4 @@ def test_without_aravis_the_rest_is_listed_and_the_remedy_named(
     assert "apt install libaravis-0.8-0" in found["notes"][0]
     assert run(["devices"]) == 0
     assert "/dev/ttyS0" in capsys.readouterr().out
-    aravis.aravis.cache_clear()
+    aravis.load_aravis.cache_clear()

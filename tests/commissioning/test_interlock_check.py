@@ -24,7 +24,7 @@ from membrane_ctrl.commissioning.interlock_check import (
     probe_interlocks,
 )
 from membrane_ctrl.config.schema import Config
-from membrane_ctrl.config.toml_file import parse
+from membrane_ctrl.config.toml_file import parse_tables
 from membrane_ctrl.controller.cross_check import cross_check
 from membrane_ctrl.model.errors import DeviceError, FindingsError, InputError
 from tests.config.test_device_places import roles
@@ -82,7 +82,7 @@ class Rig:
             "timeout_s": 0.4,
             "interlocks": [DOOR, air, STOP],
         }
-        return parse({"devices": devices}, Config, "lab.toml")
+        return parse_tables({"devices": devices}, Config, "lab.toml")
 
 
 @pytest_asyncio.fixture
@@ -153,7 +153,7 @@ async def test_a_lost_signal_is_an_error_after_the_report(
 async def test_inputs_of_a_board_of_an_earlier_map_are_refused(rig: Rig) -> None:
     board = PumpBoardEmulator(rig.plant, registers=register_map.known_maps()[2])
     await board.start()
-    config = parse(
+    config = parse_tables(
         {
             "devices": {
                 "board": f"tcp://127.0.0.1:{board.port}",
@@ -172,7 +172,9 @@ async def test_inputs_of_a_board_of_an_earlier_map_are_refused(rig: Rig) -> None
 
 def test_a_missing_package_is_one_line(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "gpiod", None)
-    config = parse({"devices": {"board": "tcp://b", "interlocks": [STOP]}}, Config, "lab.toml")
+    config = parse_tables(
+        {"devices": {"board": "tcp://b", "interlocks": [STOP]}}, Config, "lab.toml"
+    )
     assert config.devices is not None
     with pytest.raises(InputError, match=r"devices\.interlocks\.0: .*membrane-ctrl\[gpio\]"):
         asyncio.run(probe_interlocks(config.devices))
@@ -186,7 +188,7 @@ def findings(
     tables = roles() if without_board else {"devices": {"board": "tcp://b"}}
     tables["devices"]["interlocks"] = [table]
     prefix = "devices.interlocks.0."
-    found = cross_check(parse(tables, Config, "lab.toml"), board)
+    found = cross_check(parse_tables(tables, Config, "lab.toml"), board)
     return {
         one.field.removeprefix(prefix): one.severity
         for one in found
@@ -236,6 +238,8 @@ def test_a_module_on_the_pumps_serial_line_is_warned_of_and_counted_among_its_an
     tables["devices"]["interlocks"] = [
         AIR | {"link": line, "unit_id": 9, "timeout_s": 0.3, "age_max_s": 1.0}
     ]
-    found = {one.field: one.severity for one in cross_check(parse(tables, Config, "lab.toml"))}
+    found = {
+        one.field: one.severity for one in cross_check(parse_tables(tables, Config, "lab.toml"))
+    }
     assert found["devices.interlocks.0.link"] == "warning"
     assert found["devices.pump.timeout_s"] == "error"  # 0.2 s and 0.3 s before the watchdog's 0.5 s

@@ -20,7 +20,7 @@ from firmware_iface import drivers, role_bench, roles
 from firmware_iface.emulators.pump_board import BoardSample
 from membrane_ctrl.cli import run
 from membrane_ctrl.config.schema import Config
-from membrane_ctrl.config.toml_file import dump, load
+from membrane_ctrl.config.toml_file import dump_toml, load_toml
 from membrane_ctrl.instruments import role_drivers
 from membrane_ctrl.model.errors import InputError
 from membrane_ctrl.sim.lab import Lab
@@ -129,12 +129,12 @@ class StillPlant:
 async def test_check_reads_an_installed_driver_through_its_emulator(
     gauge: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    config = load(gauge / "lab.toml", Config)
+    config = load_toml(gauge / "lab.toml", Config)
     assert config.devices is not None
     lab = Lab(StillPlant(), config.devices)
     try:
         path = tmp_path / "moved.toml"
-        path.write_text(dump(config.model_copy(update={"devices": await lab.start()})))
+        path.write_text(dump_toml(config.model_copy(update={"devices": await lab.start()})))
         with patient_check(5.0):
             code = await asyncio.to_thread(run, ["check", str(path), "--json"])
     finally:
@@ -199,8 +199,8 @@ def test_a_configuration_runs_nothing(
     is read without the driver.
     """
     path = tmp_path / "config.toml"
-    path.write_text(dump(configured(baud=9600, of_its_own={"deep": [1, 2]})))
-    read = load(path, Config)
+    path.write_text(dump_toml(configured(baud=9600, of_its_own={"deep": [1, 2]})))
+    read = load_toml(path, Config)
     assert read == configured(baud=9600, of_its_own={"deep": [1, 2]})
     assert "acme_gauge" not in sys.modules
     lying = tmp_path / "lying"

@@ -17,7 +17,7 @@ from firmware_iface import camera_conformance, display_conformance
 from membrane_ctrl.cli import run
 from membrane_ctrl.commissioning import devices
 from membrane_ctrl.config.schema import Config
-from membrane_ctrl.config.toml_file import load
+from membrane_ctrl.config.toml_file import load_toml
 from tests.support.studio_package import install_studio
 
 CONFORMANCE = {"camera": camera_conformance, "screen": display_conformance}
@@ -52,7 +52,7 @@ def test_what_is_written_conforms(role: str, loaded: Path, monkeypatch: pytest.M
 
 @pytest.mark.parametrize("role", CONFORMANCE)
 def test_its_configuration_is_complete(role: str, tmp_path: Path) -> None:
-    config = load(written(tmp_path, role) / "lab.toml", Config)
+    config = load_toml(written(tmp_path, role) / "lab.toml", Config)
     assert config.devices is not None
     assert config.shape.enabled
     tables = {"camera": config.devices.camera, "screen": config.devices.screen}

@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 from membrane_ctrl.config.schema import Config
-from membrane_ctrl.config.toml_file import dump, load
+from membrane_ctrl.config.toml_file import dump_toml, load_toml
 from membrane_ctrl.model.errors import InputError
 
 
@@ -55,7 +55,7 @@ def test_each_mistake_is_one_line_naming_file_and_field(
     path = tmp_path / "lab.toml"
     path.write_text(text)
     with pytest.raises(InputError) as caught:
-        load(path, Config)
+        load_toml(path, Config)
     line = str(caught.value)
     assert "\n" not in line
     assert str(path) in line
@@ -65,9 +65,9 @@ def test_each_mistake_is_one_line_naming_file_and_field(
 
 def test_a_missing_file_and_a_folder_are_named(tmp_path: Path) -> None:
     with pytest.raises(InputError, match="no such file"):
-        load(tmp_path / "none.toml", Config)
+        load_toml(tmp_path / "none.toml", Config)
     with pytest.raises(InputError, match="is a folder"):
-        load(tmp_path, Config)
+        load_toml(tmp_path, Config)
 
 
 OPTICS = "[optics.geometry]\na_mm = 2672.0\nb_mm = 2871.0\nalpha_deg = 80.9\n"
@@ -77,15 +77,15 @@ GRID = "[optics.geometry.screen.height_map]\ns_x_mm = [-250, 250]\ns_y_mm = [-25
 def test_a_screens_height_map_may_be_a_file(tmp_path: Path) -> None:
     (tmp_path / "screen.txt").write_text("# mm\n0.1, 0.2\n0.3 0.4\n\n0.5, 0.6  # top\n")
     (tmp_path / "lab.toml").write_text(f"{OPTICS}{GRID}file = 'screen.txt'\n")
-    config = load(tmp_path / "lab.toml", Config)
+    config = load_toml(tmp_path / "lab.toml", Config)
     screen = config.optics.geometry.screen
     assert screen is not None
     assert screen.height_map is not None
     assert screen.height_map.heights_mm == ((0.1, 0.2), (0.3, 0.4), (0.5, 0.6))
     # the run's own configuration holds the numbers
     (tmp_path / "screen.txt").unlink()
-    (tmp_path / "config.toml").write_text(dump(config))
-    assert load(tmp_path / "config.toml", Config) == config
+    (tmp_path / "config.toml").write_text(dump_toml(config))
+    assert load_toml(tmp_path / "config.toml", Config) == config
 
 
 @pytest.mark.parametrize(
@@ -101,7 +101,7 @@ def test_a_screens_height_map_may_be_a_file(tmp_path: Path) -> None:
 def test_a_wrong_height_map_is_one_line(tmp_path: Path, tail: str, words: list[str]) -> None:
     (tmp_path / "lab.toml").write_text(OPTICS + GRID + tail)
     with pytest.raises(InputError) as caught:
-        load(tmp_path / "lab.toml", Config)
+        load_toml(tmp_path / "lab.toml", Config)
     for word in [str(tmp_path / "lab.toml"), *words]:
         assert word in str(caught.value)
 
@@ -110,11 +110,11 @@ def test_what_is_written_reads_back_the_same() -> None:
     config = Config.model_validate(
         {"loop": {"rate_hz": 20}, "devices": {"board": "tcp://10.0.0.9:502"}}
     )
-    assert Config.model_validate(tomllib.loads(dump(config))) == config
+    assert Config.model_validate(tomllib.loads(dump_toml(config))) == config
 
 
 def test_every_default_is_written_out() -> None:
-    tables = tomllib.loads(dump(Config()))
+    tables = tomllib.loads(dump_toml(Config()))
     assert tables["loop"]["ti_s"] == Config().loop.ti_s
     assert set(tables) == set(Config.model_fields) - {"devices", "web"}
 
@@ -163,7 +163,7 @@ def test_the_line_says_what_to_write_instead(tmp_path: Path, text: bytes, words:
     path = tmp_path / "lab.toml"
     path.write_bytes(text)
     with pytest.raises(InputError) as caught:
-        load(path, Config)
+        load_toml(path, Config)
     line = str(caught.value)
     assert "\n" not in line
     for word in [str(path), *words]:
@@ -183,5 +183,5 @@ def test_the_line_says_what_to_write_instead(tmp_path: Path, text: bytes, words:
 def test_what_editors_write_is_read(tmp_path: Path, text: bytes) -> None:
     (tmp_path / "lab.toml").write_bytes(text)
     (tmp_path / "link.toml").symlink_to("lab.toml")
-    config = load(tmp_path / "link.toml", Config)
+    config = load_toml(tmp_path / "link.toml", Config)
     assert config.loop.kp_per_s == (0.5 if b"kp" in text else Config().loop.kp_per_s)

@@ -13,11 +13,11 @@ from jsonschema import Draft202012Validator
 
 from membrane_ctrl.config import reference
 from membrane_ctrl.config.schema import Config
-from membrane_ctrl.config.toml_file import dump, sections, tags
+from membrane_ctrl.config.toml_file import dump_toml, list_driver_names, list_sections
 from membrane_ctrl.model.errors import InputError
 
 ROOT = Path(__file__).parents[2]
-ALL = [(table.title, key) for table in reference.tables() for key in table.keys]
+ALL = [(table.title, key) for table in reference.list_tables() for key in table.keys]
 # pure numbers, a camera's own unit, the unit of another key
 WITHOUT_UNIT = {
     "change_max",
@@ -46,13 +46,13 @@ def test_no_key_of_the_schema_is_left_out() -> None:
     """Counted from the classes, which the reference itself does not walk."""
     missing, told = (
         [],
-        {(table.driver, key.name) for table in reference.tables() for key in table.keys},
+        {(table.driver, key.name) for table in reference.list_tables() for key in table.keys},
     )
     todo: list[Any] = [Config]
     for section in todo:
-        driver = (tags(section) or ("",))[0]
+        driver = (list_driver_names(section) or ("",))[0]
         for name, field in section.model_fields.items():
-            inner = sections(field.annotation)
+            inner = list_sections(field.annotation)
             todo += inner
             if not inner and name != "driver" and (driver, name) not in told:
                 missing.append((section.__name__, name))
@@ -90,15 +90,15 @@ def test_a_quantity_has_its_unit() -> None:
     ],
 )
 def test_a_word_finds_its_keys(word: str, titles: list[str], names: list[str]) -> None:
-    found = reference.explained(word)
+    found = reference.find_explained(word)
     assert [table.title for table in found] == titles
     assert [key.name for table in found for key in table.keys] == names
 
 
 def test_a_role_shows_each_of_its_drivers() -> None:
-    found = {table.driver for table in reference.explained("devices.pump")}
+    found = {table.driver for table in reference.find_explained("devices.pump")}
     assert found == {"bronkhorst_modbus", "bronkhorst_propar", "external", "modbus_map", "ventus"}
-    assert {table.driver for table in reference.explained("devices.pump.serial")} == {
+    assert {table.driver for table in reference.find_explained("devices.pump.serial")} == {
         "bronkhorst_modbus",
         "bronkhorst_propar",
     }
@@ -115,7 +115,7 @@ def test_a_role_shows_each_of_its_drivers() -> None:
 )
 def test_a_near_miss_gets_a_suggestion(word: str, near: str) -> None:
     with pytest.raises(InputError, match=near) as caught:
-        reference.explained(word)
+        reference.find_explained(word)
     assert "no such key or table" in str(caught.value)
 
 
@@ -143,7 +143,7 @@ def test_the_editor_accepts_the_examples(example: Path) -> None:
 
 
 def test_the_editor_accepts_what_a_run_writes_and_a_height_map_in_a_file() -> None:
-    assert problems(dump(Config())) == []
+    assert problems(dump_toml(Config())) == []
     grid = "[optics.geometry.screen.height_map]\ns_x_mm = [-250, 250]\ns_y_mm = [-250, 250]\n"
     assert problems(grid + "file = 'screen.txt'\n") == []
 

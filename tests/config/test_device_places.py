@@ -9,7 +9,7 @@ import pytest
 from firmware_iface.drivers import bronkhorst, bronkhorst_modbus
 from membrane_ctrl.config import device_places
 from membrane_ctrl.config.schema import Config
-from membrane_ctrl.config.toml_file import parse
+from membrane_ctrl.config.toml_file import parse_tables
 from membrane_ctrl.instruments import bench
 from membrane_ctrl.model.errors import InputError
 
@@ -43,7 +43,7 @@ def interlock(name: str, **keys: Any) -> Table:
 
 def refusal(tables: Table) -> str:
     with pytest.raises(InputError) as caught:
-        parse(tables, Config, "lab.toml")
+        parse_tables(tables, Config, "lab.toml")
     line = str(caught.value)
     assert "\n" not in line
     assert line.startswith("lab.toml: ")
@@ -224,11 +224,11 @@ SOUND = {
 
 @pytest.mark.parametrize("tables", SOUND.values(), ids=SOUND.keys())
 def test_devices_may_be_shared(tables: Table) -> None:
-    parse(tables, Config, "lab.toml")
+    parse_tables(tables, Config, "lab.toml")
 
 
 def test_at_the_start_two_names_of_one_host_are_one_device() -> None:
-    config = parse(
+    config = parse_tables(
         roles(pump=value("tcp://localhost", 10), vent=value("tcp://127.0.0.2", 10)),
         Config,
         "lab.toml",

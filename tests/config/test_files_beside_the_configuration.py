@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from membrane_ctrl.cli.options import configured
+from membrane_ctrl.cli.options import load_configuration
 
 TEXT = """
 [optics]
@@ -27,7 +27,7 @@ def test_each_file_is_a_path_from_the_configurations_folder(
     (tmp_path / "lab" / "bench.toml").write_text(TEXT)
     monkeypatch.chdir(tmp_path)
     monkeypatch.setenv("HOME", str(tmp_path / "home"))
-    config = configured(Path("lab/bench.toml"))
+    config = load_configuration(Path("lab/bench.toml"))
     assert config.port.tls is not None
     assert config.optics.geometry_file == tmp_path / "lab" / "geometry.toml"
     assert config.port.tls.certificate_file == str(tmp_path / "lab" / "keys" / "bench.pem")
@@ -41,4 +41,4 @@ def test_each_file_is_a_path_from_the_configurations_folder(
 
 def test_what_is_not_named_stays_unnamed(tmp_path: Path) -> None:
     (tmp_path / "bench.toml").write_text("")
-    assert configured(tmp_path / "bench.toml") == configured(None)
+    assert load_configuration(tmp_path / "bench.toml") == load_configuration(None)

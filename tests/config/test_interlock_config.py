@@ -9,7 +9,7 @@ import pytest
 
 from membrane_ctrl.config import reference
 from membrane_ctrl.config.schema import INTERLOCKS_MAX, Config
-from membrane_ctrl.config.toml_file import dump, parse
+from membrane_ctrl.config.toml_file import dump_toml, parse_tables
 from membrane_ctrl.model.errors import InputError
 
 DOOR = {"driver": "board_input", "name": "door", "text": "shut the door", "input": 0}
@@ -23,7 +23,7 @@ def parsed(*interlocks: dict[str, Any], board: str | None = "tcp://b") -> Config
         value = {"driver": "modbus_map", "link": "tcp://plc", "raw": [0, 1], "value": [0.0, 1.0]}
         places = {"displacement": 0, "pump": 1, "gauge_pressure": 2}
         devices |= {role: value | {"address": address} for role, address in places.items()}
-    return parse({"devices": devices}, Config, "lab.toml")
+    return parse_tables({"devices": devices}, Config, "lab.toml")
 
 
 def test_a_door_stops_the_pump_unless_another_level_is_set() -> None:
@@ -80,10 +80,10 @@ def test_a_written_file_is_read_back() -> None:
         DOOR,
         {"driver": "modbus_input", "name": "air", "text": "x", "link": "tcp://plc", "address": 3},
     )
-    assert parse(tomllib.loads(dump(config)), Config, "lab.toml") == config
+    assert parse_tables(tomllib.loads(dump_toml(config)), Config, "lab.toml") == config
 
 
 def test_config_explain_shows_the_table_as_a_list() -> None:
-    (table,) = reference.explained("gpio_line")
+    (table,) = reference.find_explained("gpio_line")
     assert table.title == '[[devices.interlocks]] driver = "gpio_line"'
     assert {"name", "text", "safe_level", "wiring"} <= {key.name for key in table.keys}

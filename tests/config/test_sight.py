@@ -11,18 +11,18 @@ import numpy as np
 import pytest
 
 from membrane_ctrl.config.schema import Config, GeometryConfig, OpticsConfig, PatternConfig
-from membrane_ctrl.config.sight import doubt, poses, sight
-from membrane_ctrl.config.toml_file import parse
+from membrane_ctrl.config.sight import compute_poses, find_doubt, trace_view
+from membrane_ctrl.config.toml_file import parse_tables
 from membrane_ctrl.controller.cross_check import cross_check
 from membrane_ctrl.sim.optics.bench_poses import camera_pose, screen_pose
 from membrane_ctrl.sim.optics.film_shape import FilmShape
-from membrane_ctrl.sim.optics.trace import trace
+from membrane_ctrl.sim.optics.trace import trace_rays
 
 SHORT = {"a_mm": 2672.0, "b_mm": 2871.0, "alpha_deg": 80.9}
 
 
 def optics_of(geometry: dict[str, Any] | None = None, **tables: dict[str, Any]) -> OpticsConfig:
-    return parse({"geometry": SHORT | (geometry or {}), **tables}, OpticsConfig, "test")
+    return parse_tables({"geometry": SHORT | (geometry or {}), **tables}, OpticsConfig, "test")
 
 
 def turned(axis: int, degrees: float) -> np.ndarray[Any, Any]:
@@ -44,7 +44,7 @@ def general(
     """The paper's bench in the general form, with parts of it turned
     in world or moved along s_x.
     """
-    pinhole, rotation, origin, s_x, s_y = poses(GeometryConfig(**SHORT))
+    pinhole, rotation, origin, s_x, s_y = compute_poses(GeometryConfig(**SHORT))
     none = np.eye(3)
     camera, screen, everything = (
         none if turn is None else turn for turn in (camera, screen, everything)
@@ -59,7 +59,7 @@ def general(
             "s_y": tuple(s_y),
         },
     }
-    return parse({"geometry": table}, OpticsConfig, "test")
+    return parse_tables({"geometry": table}, OpticsConfig, "test")
 
 
 # Below the film, with a pattern so large that its back would show it.
@@ -101,7 +101,7 @@ BEHIND = general(everything=turned(0, 180.0)).model_copy(
 def test_a_bench_that_cannot_measure_names_the_reason_and_the_key(
     optics: OpticsConfig, key: str, words: str
 ) -> None:
-    found = doubt(optics)
+    found = find_doubt(optics)
     assert found is not None
     assert (found.hopeless, found.key) == (True, key), found
     assert words in f"{found.why}; {found.remedy}"
@@ -154,7 +154,7 @@ def scaled(factor: float) -> OpticsConfig:
     ],
 )
 def test_an_odd_bench_that_can_measure_is_not_doubted(optics: OpticsConfig) -> None:
-    assert doubt(optics) is None
+    assert find_doubt(optics) is None
 
 
 @pytest.mark.parametrize("alpha_deg", [80.9, 60.0, 45.0, 30.0])
@@ -173,24 +173,24 @@ def test_the_share_is_that_of_the_twin_s_exact_rays(alpha_deg: float) -> None:
     )
     rays = rays / np.linalg.norm(rays, axis=1)[:, None] @ camera.rotation
     film = FilmShape(37.1, 500.0)
-    hits = trace(camera, rays, film.terms, film.sag_mm, 0.0, screen)
+    hits = trace_rays(camera, rays, film.terms, film.sag_mm, 0.0, screen)
     lit = np.maximum(np.abs(hits.s_x_mm), np.abs(hits.s_y_mm)) <= 4 * 49.82
     true = lit[hits.on_film(475.0)].mean()
-    assert sight(optics, 37.1).measured == pytest.approx(true, abs=0.04)
+    assert trace_view(optics, 37.1).measured == pytest.approx(true, abs=0.04)
 
 
 def test_a_film_of_unknown_depth_has_the_benefit_of_the_doubt() -> None:
     flatter = optics_of(mirror={"sag_mm": 3.71})
-    assert doubt(flatter, depth_known=False) is None
+    assert find_doubt(flatter, depth_known=False) is None
     for alpha_deg in (30.0, 1.41):
-        found = doubt(optics_of({"alpha_deg": alpha_deg}), depth_known=False)
+        found = find_doubt(optics_of({"alpha_deg": alpha_deg}), depth_known=False)
         assert found is not None
         assert found.hopeless
 
 
 def test_less_than_the_whole_mirror_is_a_warning_and_unused_optics_are_not_judged() -> None:
     def findings(alpha_deg: float, **tables: Any) -> list[tuple[str, str]]:
-        config = parse(
+        config = parse_tables(
             {"optics": {"geometry": SHORT | {"alpha_deg": alpha_deg}}} | tables, Config, "test"
         )
         return [(found.severity, found.field) for found in cross_check(config)]

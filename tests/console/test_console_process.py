@@ -24,7 +24,7 @@ from membrane_ctrl.model.shape_estimate import pack_estimate
 from membrane_ctrl.model.telemetry import ROW_BYTES
 from membrane_ctrl.processes import child
 from membrane_ctrl.processes.child import STOP
-from membrane_ctrl.processes.ring import RingWriter, ring
+from membrane_ctrl.processes.ring import RingWriter, open_ring
 
 pytestmark = pytest.mark.real_time
 
@@ -35,9 +35,9 @@ class Run:
     """Rings with a made-up run in them, and a console process that shows it."""
 
     def __init__(self, stack: ExitStack) -> None:
-        telemetry = stack.enter_context(ring(256, ROW_BYTES))
-        events = stack.enter_context(ring(16, 4096))
-        shapes = stack.enter_context(ring(4, 1 << 16))
+        telemetry = stack.enter_context(open_ring(256, ROW_BYTES))
+        events = stack.enter_context(open_ring(16, 4096))
+        shapes = stack.enter_context(open_ring(4, 1 << 16))
         self.spec = ConsoleSpec(
             RunClock.start(), telemetry, events, shapes, Path("logs/demo"), Config(), 60.0
         )

@@ -12,9 +12,9 @@ from rich.console import Console
 
 from membrane_ctrl.config.schema import Config
 from membrane_ctrl.console.model import ConsoleModel, event_line
-from membrane_ctrl.console.process import line
+from membrane_ctrl.console.process import format_line
 from membrane_ctrl.console.view import ConsolePage, full_scale, level_bar, signed_bars
-from membrane_ctrl.console.why import duration, number, percent
+from membrane_ctrl.console.why import format_duration, format_number, format_percent
 from membrane_ctrl.model.event_lines import from_dict
 from membrane_ctrl.model.telemetry import SafeLevel, ShapeState, State
 
@@ -175,7 +175,7 @@ def test_who_waits_for_a_person_says_how_to_go_on() -> None:
     )
     view = model.view(0.0)
     assert view.go_on == "go on: `membrane-ctrl ctl --socket x/control.sock ack`"
-    assert line(view).endswith(view.go_on)
+    assert format_line(view).endswith(view.go_on)
     model.take_row(HOLDING)
     assert model.view(0.0).go_on == ""
     model.take_event(
@@ -201,7 +201,7 @@ def test_each_lock_is_shown_first_with_text_author_time_and_word_until_it_is_rem
     page = " ".join(" ".join(drawn(model, 0.0)).replace("│", " ").split())
     for author, word in (("unix:ann", "bofak"), ("page:bob", "gumil")):
         assert f'LOCKED "hands inside" by {author} (s), 2026-01-02, word {word}' in page
-        assert f'LOCKED "hands inside" by {author} (s), 2026-01-02, word {word}' in line(
+        assert f'LOCKED "hands inside" by {author} (s), 2026-01-02, word {word}' in format_line(
             model.view(0.0)
         )
     assert model.view(0.0).go_on == "go on: ask unix:ann, then `ctl unlock bofak`"
@@ -230,10 +230,10 @@ def test_trouble_with_the_recording_is_seen_until_it_is_over() -> None:
     )
     low = "Disk almost full: less than 500 MB free; delete old runs"
     assert any(f"notice {low}" in " ".join(row.split()) for row in drawn(model))
-    assert line(model.view(75.0)).count(low) == 1
+    assert format_line(model.view(75.0)).count(low) == 1
     model.take_event(event(76.0, "recorder_recovered", what="disk", message="disk works again"))
     assert not any("notice" in row for row in drawn(model))
-    assert "500 MB" not in line(model.view(75.0))
+    assert "500 MB" not in format_line(model.view(75.0))
 
 
 def test_of_many_notices_the_first_are_shown() -> None:
@@ -267,11 +267,11 @@ def test_before_the_first_tick_and_with_nothing_known() -> None:
         )
     )
     assert not any("nan" in row for row in drawn(model))
-    assert "nan" not in line(model.view(0.0))
+    assert "nan" not in format_line(model.view(0.0))
 
 
 def test_plain_line_has_the_second_in_it() -> None:
-    said = line(held().view(75.0))
+    said = format_line(held().view(75.0))
     for words in (
         "75.0 s  hold",
         "error",
@@ -282,8 +282,8 @@ def test_plain_line_has_the_second_in_it() -> None:
     ):
         assert words in said
     assert "\n" not in said
-    assert "no tick for 10.0 s" in line(held().view(84.98))
-    assert line(ConsoleModel(CONFIG).view(0.0)).endswith("no tick yet")
+    assert "no tick for 10.0 s" in format_line(held().view(84.98))
+    assert format_line(ConsoleModel(CONFIG).view(0.0)).endswith("no tick yet")
 
 
 def test_plain_events() -> None:
@@ -344,7 +344,7 @@ def test_level_bar(fraction: float, bar: str) -> None:
 
 def test_words() -> None:
     spans_s = (0.9, 59.9, 60.0, 3599.0, 3600.0, 90061.0, math.nan)
-    assert [duration(s) for s in spans_s] == [
+    assert [format_duration(s) for s in spans_s] == [
         "0 s",
         "59 s",
         "1:00",
@@ -353,6 +353,6 @@ def test_words() -> None:
         "1 d 01:01:01",
         "–",
     ]
-    assert number(-0.125, 2, "µm", sign=True) == "-0.12 µm"
-    assert number(math.inf, 2, "µm") == "–"
-    assert percent(0.254) == "25 %"
+    assert format_number(-0.125, 2, "µm", sign=True) == "-0.12 µm"
+    assert format_number(math.inf, 2, "µm") == "–"
+    assert format_percent(0.254) == "25 %"

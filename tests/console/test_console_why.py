@@ -9,14 +9,14 @@ import pytest
 from console_feed import HOLDING
 
 from membrane_ctrl.config.schema import Config
-from membrane_ctrl.console.why import holders, why
+from membrane_ctrl.console.why import explain_state, list_used_sensors
 from membrane_ctrl.model.telemetry import SafeLevel, State, TelemetryRow
 
 CONFIG = Config()
 
 
 def line(told: str = "", fault: str = "", **changes: float) -> str:
-    return why(replace(HOLDING, **changes), told, fault, CONFIG)
+    return explain_state(replace(HOLDING, **changes), told, fault, CONFIG)
 
 
 def test_hold_names_what_the_flow_is_made_of_largest_first() -> None:
@@ -80,10 +80,10 @@ def test_a_bench_without_a_vent_is_never_said_to_have_it_open() -> None:
     row = replace(
         HOLDING, safe_level=SafeLevel.VENT, vent_fraction=1.0, vent_readback_fraction=math.nan
     )
-    said = why(row, "", "over pressure", NO_VENT)
+    said = explain_state(row, "", "over pressure", NO_VENT)
     assert said == "pump is off; no vent is fitted, the leak lowers the mirror: over pressure"
     assert (
-        why(row, "", "over pressure", WITH_VENT)
+        explain_state(row, "", "over pressure", WITH_VENT)
         == "pump is off and the vent is open: over pressure"
     )
 
@@ -122,7 +122,7 @@ def test_there_is_always_a_line(state: State, safe_level: SafeLevel) -> None:
     empty = replace(
         TelemetryRow(*[math.nan] * 35), state=state, safe_level=safe_level, flow_um_per_s=0.0
     )
-    said = why(empty, "", "", CONFIG)
+    said = explain_state(empty, "", "", CONFIG)
     assert "pump" in said
     assert "nan" not in said
 
@@ -135,11 +135,14 @@ def test_the_sensors_that_hold_the_mirror_are_named_with_their_shares() -> None:
         laser_innovation=-0.4,
         optics_innovation=0.1,
     )
-    assert holders(row) == "laser 7 %, optics 93 %"
-    assert holders(
+    assert list_used_sensors(row) == "laser 7 %, optics 93 %"
+    assert list_used_sensors(
         replace(row, laser_innovation=math.nan, optics_share=1.0, barometer_innovation=0.0)
     ) == ("optics 100 %, barometer")
-    assert holders(replace(row, laser_innovation=math.nan, optics_innovation=math.nan)) == "nothing"
+    assert (
+        list_used_sensors(replace(row, laser_innovation=math.nan, optics_innovation=math.nan))
+        == "nothing"
+    )
 
 
 def test_a_mirror_held_by_the_optics_alone_is_not_called_unheld() -> None:

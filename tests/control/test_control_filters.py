@@ -6,15 +6,15 @@ import math
 
 import pytest
 
-from membrane_ctrl.control.filters import LagRate, LowPass, smoothing
+from membrane_ctrl.control.filters import LagRate, LowPass, lag_step_fraction
 
 LAG_S = 0.2
 
 
 def test_smoothing_composes_over_steps() -> None:
     """Two steps equal one step of their sum."""
-    assert (1 - smoothing(0.3, 2.0)) * (1 - smoothing(0.5, 2.0)) == pytest.approx(
-        1 - smoothing(0.8, 2.0)
+    assert (1 - lag_step_fraction(0.3, 2.0)) * (1 - lag_step_fraction(0.5, 2.0)) == pytest.approx(
+        1 - lag_step_fraction(0.8, 2.0)
     )
 
 

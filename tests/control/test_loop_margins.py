@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from membrane_ctrl.config.schema import LoopConfig
-from membrane_ctrl.control.filters import smoothing
+from membrane_ctrl.control.filters import lag_step_fraction
 from membrane_ctrl.control.loop_margins import DEAD_S, PUMP_LAG_S, open_loop, peak_sensitivity
 
 
@@ -30,7 +30,7 @@ def excursion(loop: LoopConfig, last_s: float = 60.0) -> float:
     mirror, flow, filtered, before, integral = 1.0, 0.0, 1.0, 1.0, 0.0
     errors = []
     for _ in range(round(last_s / dt_s)):
-        filtered += smoothing(dt_s, loop.measurement_filter_s) * (mirror - filtered)
+        filtered += lag_step_fraction(dt_s, loop.measurement_filter_s) * (mirror - filtered)
         command = loop.kp_per_s * (-filtered + integral - loop.td_s * (filtered - before) / dt_s)
         integral -= filtered * dt_s / loop.ti_s
         before = filtered

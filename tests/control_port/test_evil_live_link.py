@@ -19,7 +19,7 @@ from tests.control_port import evil_holds as evil
 def run_folder(folder: Path) -> None:
     """The folder of the run that the peers name."""
     (folder / "evil").mkdir()
-    (folder / "evil" / "config.toml").write_text(toml_file.dump(Config()))
+    (folder / "evil" / "config.toml").write_text(toml_file.dump_toml(Config()))
 
 
 @pytest.mark.parametrize("line", evil.ANSWERS.values(), ids=evil.ANSWERS)

@@ -18,7 +18,7 @@ from firmware_iface.emulators.pump_board import BoardSample
 from firmware_iface.roles import BenchIdentity
 from membrane_ctrl.cli import run
 from membrane_ctrl.config.schema import Config
-from membrane_ctrl.config.toml_file import load, parse
+from membrane_ctrl.config.toml_file import load_toml, parse_tables
 from membrane_ctrl.controller.cross_check import cross_check
 from membrane_ctrl.controller.safety import TABLE
 from membrane_ctrl.model.errors import InputError
@@ -26,7 +26,7 @@ from tests.worlds.faulty_board import PumpBoardEmulator
 
 EXAMPLES = Path(__file__).parents[2] / "membrane_ctrl" / "examples"
 BOARD = {"board": "tcp://127.0.0.1:1"}
-ROLES = load(EXAMPLES / "all-modbus-tcp.toml", Config).devices.model_dump(exclude_none=True)  # type: ignore[union-attr]
+ROLES = load_toml(EXAMPLES / "all-modbus-tcp.toml", Config).devices.model_dump(exclude_none=True)  # type: ignore[union-attr]
 
 
 def config_of(changes: dict[str, Any], devices: dict[str, Any] | None = None) -> Config:
@@ -39,7 +39,7 @@ def config_of(changes: dict[str, Any], devices: dict[str, Any] | None = None) ->
             table[part] = {**table.get(part, {})}
             table = table[part]
         table[key] = value
-    return parse(tables, Config, "test")
+    return parse_tables(tables, Config, "test")
 
 
 def severity_of(config: Config, field: str, board: BenchIdentity | None = None) -> str:
@@ -54,7 +54,7 @@ def test_the_defaults_and_the_examples_are_sound() -> None:
     for example in sorted(EXAMPLES.glob("*.toml")):
         found = [
             finding
-            for finding in cross_check(load(example, Config))
+            for finding in cross_check(load_toml(example, Config))
             if finding.field != "devices.vent"
         ]
         assert found == [], example
@@ -363,9 +363,9 @@ def test_values_set_by_a_program_must_be_numbers_too() -> None:
 )
 def test_true_is_not_accepted_as_a_number(text: str) -> None:
     with pytest.raises(InputError, match=r"true.* is neither a number nor a text"):
-        parse(tomllib.loads(text), Config, "lab.toml")
+        parse_tables(tomllib.loads(text), Config, "lab.toml")
     assert (
-        parse({"states": {"actuator_test": False}}, Config, "lab.toml").states.actuator_test
+        parse_tables({"states": {"actuator_test": False}}, Config, "lab.toml").states.actuator_test
         is False
     )
 

@@ -15,7 +15,7 @@ from typing import Any
 import pytest
 
 from membrane_ctrl.config.schema import Config
-from membrane_ctrl.config.toml_file import parse
+from membrane_ctrl.config.toml_file import parse_tables
 from membrane_ctrl.controller.commands import Command
 from membrane_ctrl.controller.cross_check import cross_check
 from membrane_ctrl.hold.virtual_run import VirtualRun
@@ -85,7 +85,7 @@ def draw(chance: random.Random) -> Config | None:
             value = getattr(getattr(default, section), key) * chance.choice(FACTORS[name])
         tables.setdefault(section, {})[key] = value
     try:
-        return parse(tables, Config, "drawn")
+        return parse_tables(tables, Config, "drawn")
     except InputError:
         return None
 

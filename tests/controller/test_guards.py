@@ -31,7 +31,7 @@ from membrane_ctrl.control_port.sockets import Listeners
 from membrane_ctrl.controller.controller import Controller
 from membrane_ctrl.controller.tick import TickInputs, TickOutputs
 from membrane_ctrl.hold.child_processes import ChildProcesses, rings_for
-from membrane_ctrl.hold.closing_words import Closing
+from membrane_ctrl.hold.closing_words import RunEnd
 from membrane_ctrl.hold.hold_options import HoldOptions
 from membrane_ctrl.hold.listeners import FaultLatch, SystemdNotify
 from membrane_ctrl.hold.lock_keeper import LockKeeper
@@ -43,7 +43,7 @@ from membrane_ctrl.model.errors import Exit
 from membrane_ctrl.model.events import Event, EventLine
 from membrane_ctrl.model.run_events import LatchFailed
 from membrane_ctrl.model.telemetry import FIELDS, ROW_BYTES, TelemetryRow
-from membrane_ctrl.processes.ring import RingReader, RingWriter, ring
+from membrane_ctrl.processes.ring import RingReader, RingWriter, open_ring
 from membrane_ctrl.run_files.latched_fault import LatchedFile, ResumeLog
 from tests.support.virtual_time import run_virtual
 
@@ -122,7 +122,7 @@ class Bench:
             async def run() -> Exit:
                 asyncio.get_running_loop().call_later(BREAKS_S, breaks, self)
                 children, clock = cast(ChildProcesses, self.children), cast(RunClock, LoopClock())
-                closing = Closing()
+                closing = RunEnd()
                 parts = HoldResources(
                     bench=self.bench,
                     config=CONFIG,
@@ -240,7 +240,7 @@ def test_the_last_command_of_every_run_is_pump_off_with_the_vent_unchanged() -> 
         bench = Recording(RoleDevices(Instrument(), Instrument(), Instrument(600.0)), 0.5)
         await bench.open()
         with ExitStack() as stack:
-            writer = RingWriter(stack.enter_context(ring(16, ROW_BYTES)))
+            writer = RingWriter(stack.enter_context(open_ring(16, ROW_BYTES)))
             stack.callback(writer.close)
             wiring, clock = Wiring(bench, writer, writer), cast(RunClock, LoopClock())
             with pytest.raises(ZeroDivisionError):
@@ -283,7 +283,7 @@ def test_missed_deadlines_are_skipped_and_lateness_is_reported_in_milliseconds()
         bench = Slow(RoleDevices(Instrument(), Instrument(), Instrument(600.0)), 0.5)
         await bench.open()
         with ExitStack() as stack:
-            writer = RingWriter(stack.enter_context(ring(16, ROW_BYTES)))
+            writer = RingWriter(stack.enter_context(open_ring(16, ROW_BYTES)))
             stack.callback(writer.close)
             wiring, clock = Wiring(bench, writer, writer), cast(RunClock, LoopClock())
             await Supervisor(cast(Controller, Noting()), wiring, clock, 10.0).run(None)
@@ -327,9 +327,9 @@ def test_the_reason_for_a_failing_reconnection_is_reported_once() -> None:
         bench = Taken(RoleDevices(Instrument(), Instrument(), Instrument(600.0)), 0.5)
         await bench.open()
         with ExitStack() as stack:
-            address = stack.enter_context(ring(16, 4096))
+            address = stack.enter_context(open_ring(16, 4096))
             writer, reader = RingWriter(address), RingReader(address)
-            telemetry = RingWriter(stack.enter_context(ring(16, ROW_BYTES)))
+            telemetry = RingWriter(stack.enter_context(open_ring(16, ROW_BYTES)))
             for end in (writer, reader, telemetry):
                 stack.callback(end.close)
             wiring, clock = Wiring(bench, telemetry, writer), cast(RunClock, LoopClock())

@@ -28,7 +28,7 @@ from membrane_ctrl.metrology.film.hencky_bowl import zernike_projection
 from membrane_ctrl.model.errors import Exit
 from membrane_ctrl.model.state_tree import find_differences
 from membrane_ctrl.model.telemetry import State
-from membrane_ctrl.replay.replay import RecordedTick, replay
+from membrane_ctrl.replay.replay import RecordedTick, replay_record
 from tests.support.incidents import check_incident, read_incident
 from tests.worlds.controller_runs import STORIES, record_story
 from tests.worlds.virtual_record import CONFIG, kept_ticks, laser_lost, snapshot_at, write_record
@@ -224,7 +224,7 @@ def test_random_damage_is_refused_or_replayed_without_a_traceback() -> None:
             data[place : place + random_of.randint(0, 3)] = random_of.choice(_SCRAPS)
         begun = replace(ticks[0], snapshot=bytes(data))
         try:
-            replay(CONFIG, [begun, *ticks[1:]], zernike_projection())
+            replay_record(CONFIG, [begun, *ticks[1:]], zernike_projection())
         except UnknownSnapshotError:
             outcomes["refused"] += 1
         else:
@@ -264,7 +264,7 @@ def test_a_tick_that_raises_after_a_forged_snapshot_is_the_snapshots_fault() -> 
     )  # no gauge pressure, by which it divides
     forged = take_snapshot(controller)
     with pytest.raises(UnknownSnapshotError, match="cannot be used: ZeroDivisionError at 13"):
-        replay(CONFIG, [RecordedTick(MIDDLE, inputs, 0, forged)], zernike_projection())
+        replay_record(CONFIG, [RecordedTick(MIDDLE, inputs, 0, forged)], zernike_projection())
 
 
 def test_numbers_words_and_containers_come_back_as_they_were() -> None:

@@ -30,10 +30,10 @@ from firmware_iface.drivers.bronkhorst_propar import (
     ascii_frame,
     binary_frame,
     parse_ascii,
+    parse_values,
     split_binary,
-    values,
 )
-from firmware_iface.emulators.modbus_pdu import respond
+from firmware_iface.emulators.modbus_pdu import answer_request
 from firmware_iface.emulators.pumps import ANALOG_INPUT, BronkhorstRegisters, Instrument
 from firmware_iface.emulators.serial_device import PtyWire
 from firmware_iface.links.modbus_rtu import RtuBus
@@ -67,7 +67,9 @@ def propar(instrument: Instrument) -> Made:
 
 
 def modbus(instrument: Instrument) -> Made:
-    device = RtuBusEmulator(LINE, {3: partial(respond, table=BronkhorstRegisters(instrument))})
+    device = RtuBusEmulator(
+        LINE, {3: partial(answer_request, table=BronkhorstRegisters(instrument))}
+    )
     wire = MemoryWire(device)
     return device, lambda: ModbusParameters(RtuBus(wire).device(3, 0.2)), wire
 
@@ -88,7 +90,7 @@ def test_the_frames_of_the_manual() -> None:
     assert said == [b":080302214042F6E979\r\n"]
     answer = parse_ascii(said[0])
     assert answer is not None
-    assert values(answer.data) == [(0x21, 0, bytes.fromhex("42F6E979"))]
+    assert parse_values(answer.data) == [(0x21, 0, bytes.fromhex("42F6E979"))]
 
 
 def test_the_registers_of_the_manual() -> None:

@@ -287,9 +287,9 @@ def test_aravis_own_tool_gets_frames(emulator: GigeCameraEmulator) -> None:
 
 def test_without_the_library_the_remedy_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(aravis, "_LIBRARY", "libaravis-not-there.so")
-    aravis.aravis.cache_clear()
+    aravis.load_aravis.cache_clear()
     try:
         with pytest.raises(LinkError, match=r"apt install libaravis-0\.8-0"):
             guarded().open()
     finally:
-        aravis.aravis.cache_clear()
+        aravis.load_aravis.cache_clear()

@@ -14,7 +14,7 @@ from counting_plant import CountingPlant, ManualClock
 
 from firmware_iface.conformance import CheckResult, Conformance, examine
 from firmware_iface.drivers.pump_board import PumpBoard
-from firmware_iface.emulators.modbus_pdu import ILLEGAL_VALUE, RegisterRefusal, respond
+from firmware_iface.emulators.modbus_pdu import ILLEGAL_VALUE, RegisterRefusal, answer_request
 from firmware_iface.emulators.pump_board import BoardSample, BoardState, StoredSettings
 from firmware_iface.emulators.serial_device import PtyWire
 from firmware_iface.links.modbus_tcp import GuardedModbusTcp
@@ -303,7 +303,7 @@ async def test_the_emulator_conforms_over_rtu_and_in_real_time(tmp_path: Path) -
     await board.start()
     settings = SerialSettings(115_200, parity="E")
     wire = PtyWire(
-        RtuBusEmulator(settings, {1: partial(respond, table=board.state)}), tmp_path / "tty"
+        RtuBusEmulator(settings, {1: partial(answer_request, table=board.state)}), tmp_path / "tty"
     )
     wire.plug()
     try:

@@ -13,9 +13,9 @@ from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
 from firmware_iface.checkerboard_check import checkerboard_problem
-from firmware_iface.display_patterns import ScreenRaster, checkerboard, pattern_light
+from firmware_iface.display_patterns import ScreenRaster, make_checkerboard, pattern_light
 from firmware_iface.display_response import RAMP_LEVELS, linear_response, measured_response
-from firmware_iface.display_settling import settling, share_left
+from firmware_iface.display_settling import fit_settling, share_left
 from firmware_iface.exposure_check import exposure_problem
 from firmware_iface.roles import Pattern
 from tests.worlds.panel import EmulatedPanel, PanelResponse
@@ -76,7 +76,7 @@ def test_settling_finds_what_was_put_in(latency_s: float, tau_s: float, seed: in
     left = np.exp(-np.maximum(delay_s - latency_s, 0) / tau_s) + np.abs(
         generator.normal(0, 0.002, 150)
     )
-    found = settling(delay_s, left, noise=0.002)
+    found = fit_settling(delay_s, left, noise=0.002)
     true_s = latency_s + tau_s * math.log(256)
     assert 0.85 * true_s < found.settle_s < 1.5 * true_s + 0.02
 
@@ -85,16 +85,16 @@ def test_a_slow_tail_is_believed() -> None:
     delay_s = np.linspace(0, 0.5, 100)
     left = 0.8 * np.exp(-delay_s / 0.01) + 0.2 * np.exp(-delay_s / 0.08)
     seen_s = float(delay_s[left > 1 / 32][-1])
-    assert settling(delay_s, left).settle_s > seen_s
+    assert fit_settling(delay_s, left).settle_s > seen_s
 
 
 def test_a_display_that_never_settles_is_said() -> None:
     with pytest.raises(ValueError, match=r"50 % of a step is left after 0\.50 s"):
-        settling(np.linspace(0, 0.5, 50), np.full(50, 0.5))
+        fit_settling(np.linspace(0, 0.5, 50), np.full(50, 0.5))
 
 
 def test_a_display_faster_than_the_first_frame() -> None:
-    found = settling([0.004, 0.02, 0.04], [0.001, 0.001, 0.0])
+    found = fit_settling([0.004, 0.02, 0.04], [0.001, 0.001, 0.0])
     assert found.settle_s == 0.004
     assert math.isnan(found.tau_s)
 
@@ -168,7 +168,7 @@ def seen_through(levels: np.ndarray, scale: float = 1.0) -> np.ndarray:
 
 def test_checkerboard_shown_as_sent_and_scaled() -> None:
     white, black = seen_through(np.full((256, 1280), 255)), seen_through(np.zeros((256, 1280)))
-    board = checkerboard(1280, 256)
+    board = make_checkerboard(1280, 256)
     assert checkerboard_problem(seen_through(board), white, black) == ""
     assert "bands" in checkerboard_problem(seen_through(board, 1366 / 1360), white, black)
     half = np.full((256, 1280), 127.5)  # mixed everywhere

@@ -12,9 +12,15 @@ from typing import Any
 
 import pytest
 
-from firmware_iface.emulators.modbus_pdu import respond
+from firmware_iface.emulators.modbus_pdu import answer_request
 from firmware_iface.emulators.rtu_bus import bitwise_crc
-from firmware_iface.links.modbus_rtu import RtuBus, crc16, parse_rtu_url, rtu_frame, take_reply
+from firmware_iface.links.modbus_rtu import (
+    RtuBus,
+    compute_crc16,
+    parse_rtu_url,
+    rtu_frame,
+    take_reply,
+)
 from firmware_iface.links.serial_port import SerialSettings
 from firmware_iface.roles import DeviceRefusedError, LinkDownError, LinkError
 from tests.support.virtual_time import run_virtual, stand_still
@@ -45,7 +51,7 @@ class Bus:
 
     def __init__(self, echo_test: bool = True) -> None:
         self.tables = {1: Words(), 2: Words()}
-        slaves = {unit: partial(respond, table=table) for unit, table in self.tables.items()}
+        slaves = {unit: partial(answer_request, table=table) for unit, table in self.tables.items()}
         self.emulator = RtuBusEmulator(LINE, slaves, echo_test=echo_test)
         self.wire = MemoryWire(self.emulator)
         self.bus = RtuBus(self.wire, quiet_s=TIMEOUT_S)
@@ -83,7 +89,7 @@ def on_bus(test: Callable[[Bus], Coroutine[Any, Any, None]], echo_test: bool = T
     ],
 )
 def test_crc_vectors(body: bytes, crc: int) -> None:
-    assert crc16(body) == crc
+    assert compute_crc16(body) == crc
     assert bitwise_crc(body) == crc
 
 

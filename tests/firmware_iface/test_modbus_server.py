@@ -8,7 +8,7 @@ from collections.abc import Sequence
 
 import pytest
 
-from firmware_iface.emulators.modbus_pdu import RegisterRefusal, respond
+from firmware_iface.emulators.modbus_pdu import RegisterRefusal, answer_request
 from firmware_iface.emulators.modbus_server import Answer, ModbusTcpServer
 
 
@@ -48,12 +48,12 @@ class Table:
     ],
 )
 def test_answers(request_pdu: bytes, answer: bytes) -> None:
-    assert respond(request_pdu, Table()) == answer
+    assert answer_request(request_pdu, Table()) == answer
 
 
 def test_a_refused_read_write_writes_nothing() -> None:
     table = Table()
-    assert respond(struct.pack(">BHHHHBH", 23, 9, 2, 1, 1, 2, 99), table) == bytes([0x97, 2])
+    assert answer_request(struct.pack(">BHHHHBH", 23, 9, 2, 1, 1, 2, 99), table) == bytes([0x97, 2])
     assert table.words[1] == 1
 
 

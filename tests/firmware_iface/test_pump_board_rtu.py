@@ -12,7 +12,7 @@ from counting_plant import CountingPlant, ManualClock
 from pymodbus.client import ModbusSerialClient
 
 from firmware_iface.drivers.pump_board import PumpBoard
-from firmware_iface.emulators.modbus_pdu import respond
+from firmware_iface.emulators.modbus_pdu import answer_request
 from firmware_iface.emulators.serial_device import PtyWire
 from firmware_iface.links.serial_port import SerialSettings
 from firmware_iface.register_map import default_map
@@ -26,7 +26,7 @@ SETTINGS = SerialSettings(115_200, parity="E")
 @pytest.fixture
 async def wire(board: PumpBoardEmulator, tmp_path: Path) -> AsyncIterator[PtyWire]:
     made = PtyWire(
-        RtuBusEmulator(SETTINGS, {1: partial(respond, table=board.state)}), tmp_path / "tty"
+        RtuBusEmulator(SETTINGS, {1: partial(answer_request, table=board.state)}), tmp_path / "tty"
     )
     made.plug()
     yield made

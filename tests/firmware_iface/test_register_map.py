@@ -19,8 +19,8 @@ from firmware_iface.register_map import (
     RegisterMapError,
     default_map,
     known_maps,
-    load,
-    parse,
+    load_map,
+    parse_map,
 )
 
 
@@ -173,29 +173,29 @@ def test_a_wrong_register_is_named(
     table: dict[str, Any], block: int, register: int, changes: dict[str, Any], message: str
 ) -> None:
     with pytest.raises(RegisterMapError, match=message):
-        parse(_edit(table, block, register, **changes))
+        parse_map(_edit(table, block, register, **changes))
 
 
 def test_a_wrong_frame_of_the_map_is_named(table: dict[str, Any]) -> None:
     with pytest.raises(RegisterMapError, match="schema is 'other'"):
-        parse(table | {"schema": "other"})
+        parse_map(table | {"schema": "other"})
     with pytest.raises(RegisterMapError, match="map_version is missing"):
-        parse({key: value for key, value in table.items() if key != "map_version"})
+        parse_map({key: value for key, value in table.items() if key != "map_version"})
     with pytest.raises(RegisterMapError, match="block identity: access is 'w'"):
-        parse(table | {"block": [table["block"][0] | {"access": "w"}]})
+        parse_map(table | {"block": [table["block"][0] | {"access": "w"}]})
     with pytest.raises(RegisterMapError, match="block identity has no registers"):
-        parse(table | {"block": [table["block"][0] | {"registers": []}]})
+        parse_map(table | {"block": [table["block"][0] | {"registers": []}]})
     with pytest.raises(RegisterMapError, match="fault bits"):
-        parse(table | {"fault": [table["fault"][0], table["fault"][0]]})
+        parse_map(table | {"fault": [table["fault"][0], table["fault"][0]]})
 
 
 def test_a_file_that_cannot_be_read_is_named(tmp_path: Path) -> None:
     with pytest.raises(RegisterMapError, match=r"nowhere\.toml"):
-        load(tmp_path / "nowhere.toml")
+        load_map(tmp_path / "nowhere.toml")
     broken = tmp_path / "broken.toml"
     broken.write_text("schema = ", encoding="utf-8")
     with pytest.raises(RegisterMapError, match=r"broken\.toml"):
-        load(broken)
+        load_map(broken)
 
 
 def test_a_block_longer_than_a_transaction_is_refused(table: dict[str, Any]) -> None:
@@ -205,4 +205,4 @@ def test_a_block_longer_than_a_transaction_is_refused(table: dict[str, Any]) -> 
     ]
     spare = {"name": "spare", "access": "ro", "meaning": "spare", "registers": many}
     with pytest.raises(RegisterMapError, match="block spare has 126 words"):
-        parse(table | {"block": [*table["block"], spare]})
+        parse_map(table | {"block": [*table["block"], spare]})

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from firmware_iface import display_conformance
-from firmware_iface.display_patterns import ScreenRaster, checkerboard, pattern_light
+from firmware_iface.display_patterns import ScreenRaster, make_checkerboard, pattern_light
 from firmware_iface.display_response import DisplayResponse
 from firmware_iface.drivers.screen_pygame import PygameDisplay
 from firmware_iface.pattern_screen import PatternScreen
@@ -113,8 +113,8 @@ def test_every_pattern_is_on_the_screen_byte_for_byte(
 
 
 def test_a_checkerboard_is_not_scaled(screen: PatternScreen, framebuffer: Path) -> None:
-    screen.show_levels(checkerboard(WIDTH_PX, HEIGHT_PX))
-    assert np.array_equal(screenshot(framebuffer)[:, :, 1], checkerboard(WIDTH_PX, HEIGHT_PX))
+    screen.show_levels(make_checkerboard(WIDTH_PX, HEIGHT_PX))
+    assert np.array_equal(screenshot(framebuffer)[:, :, 1], make_checkerboard(WIDTH_PX, HEIGHT_PX))
 
 
 def test_light_is_made_linear(screen: PatternScreen, framebuffer: Path) -> None:

@@ -11,11 +11,11 @@ from pathlib import Path
 import numpy as np
 
 from membrane_ctrl.cli import run
-from membrane_ctrl.config.toml_file import dump
+from membrane_ctrl.config.toml_file import dump_toml
 from membrane_ctrl.model.clock import RunClock
 from membrane_ctrl.model.file_checksums import dumps_checked, with_comment
 from membrane_ctrl.model.program import file_origin
-from membrane_ctrl.model.telemetry import unpack
+from membrane_ctrl.model.telemetry import unpack_rows
 from membrane_ctrl.model.zernike_terms import ZERNIKE_TERMS
 from membrane_ctrl.recorder.rerun_recording import LAYOUT, Recording
 from membrane_ctrl.recorder.rerun_telemetry import TelemetryStreams
@@ -37,8 +37,8 @@ def good_run(logs: Path) -> Path:
     folder.mkdir(parents=True)
     ticks = kept_ticks(_SECONDS)
     write_record(folder, ticks, snapshots={101: snapshot_at(ticks, 101)})
-    (folder / "config.toml").write_text(with_comment(dump(CONFIG)))
-    rows = unpack([outputs.row.pack() for _, outputs in ticks])
+    (folder / "config.toml").write_text(with_comment(dump_toml(CONFIG)))
+    rows = unpack_rows([outputs.row.pack() for _, outputs in ticks])
     summary = Summary.for_config(CONFIG)
     summary.add_rows(rows)
     _write_segment(folder, rows)
@@ -132,7 +132,7 @@ def good_live(folder: Path, sets: Path) -> None:
         "setpoints_um": [0.0, 0.0],
     }
     (folder / "session.json").write_text(json.dumps(head))
-    (folder / "config.toml").write_text(dump(CONFIG))
+    (folder / "config.toml").write_text(dump_toml(CONFIG))
 
 
 def good_sets(folder: Path) -> Path:

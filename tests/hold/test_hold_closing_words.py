@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 
 from membrane_ctrl import cli
-from membrane_ctrl.hold.closing_words import Closing, closing_lines, report
+from membrane_ctrl.hold.closing_words import RunEnd, closing_lines, print_closing_report
 from membrane_ctrl.model.errors import Exit
 from membrane_ctrl.model.events import Cleared, Event, Fault, StateEntered
 from membrane_ctrl.model.standing_fault import fault_of_end, standing_fault_after
@@ -18,7 +18,7 @@ from membrane_ctrl.review import catalogue
 
 
 def words(run_dir: Path, capsys: pytest.CaptureFixture[str]) -> str:
-    report(run_dir, as_json=False)
+    print_closing_report(run_dir, as_json=False)
     return capsys.readouterr().err
 
 
@@ -90,9 +90,9 @@ def test_a_run_that_ends_in_a_fault_states_the_fault_first(
     tmp_path: Path,
     capsys: pytest.CaptureFixture[str],
 ) -> None:
-    closing = Closing(exit_, fault, 205.5)
+    closing = RunEnd(exit_, fault, 205.5)
     (tmp_path / "summary.json").write_text(json.dumps({"recorder": {}, "missed_ticks": 3}))
-    report(tmp_path, False, closing)
+    print_closing_report(tmp_path, False, closing)
     lines = capsys.readouterr().err.splitlines()
     count = len(closing_lines(closing))
     first = "\n".join(lines[:count])
@@ -105,7 +105,7 @@ def test_the_fault_is_printed_without_a_disk_and_with_json(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     for as_json in (False, True):
-        report(tmp_path / "gone", as_json, Closing(Exit.SAFETY_TRIP, FAULT, 1.0))
+        print_closing_report(tmp_path / "gone", as_json, RunEnd(Exit.SAFETY_TRIP, FAULT, 1.0))
         printed = capsys.readouterr()
         assert printed.err.startswith("FAULT 14 laser_implausible")
         assert printed.out == ("{}\n" if as_json else "")
@@ -156,7 +156,7 @@ def test_exit_code_words_summary_and_catalogue_agree(
     logs = tmp_path / "logs"
     assert cli.run(["twin", "play", str(scene), "--logs", str(logs)]) == code
     said = capsys.readouterr().err.splitlines()
-    (entry,) = catalogue.entries(logs)
+    (entry,) = catalogue.list_entries(logs)
     summary = json.loads((entry.folder / "summary.json").read_text())
     assert summary["exit"] == entry.exit == Exit(code).name.lower()
     assert summary["end"]["exit_code"] == code

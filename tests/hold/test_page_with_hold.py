@@ -15,7 +15,7 @@ from pathlib import Path
 import pytest
 
 from membrane_ctrl.cli import run
-from membrane_ctrl.cli.options import configured
+from membrane_ctrl.cli.options import load_configuration
 from membrane_ctrl.hold.child_processes import _page_words
 from membrane_ctrl.model.errors import Exit, InputError
 from membrane_ctrl.processes.command_process import CommandProcess
@@ -32,7 +32,7 @@ def test_the_page_gets_its_settings(tmp_path: Path) -> None:
         "[web]\nhost = '0.0.0.0'\nport = 7481\nnames = ['bench.lab']\n"
         "users_file = 'users'\ncertificate_file = 'bench.pem'\nkey_file = 'bench.key'\n"
     )
-    config = configured(tmp_path / "lab.toml")
+    config = load_configuration(tmp_path / "lab.toml")
     assert config.web is not None
     words = _page_words(config.web, tmp_path / "logs" / "run", tmp_path / "a.sock")
     pairs = dict(zip(words[2::2], words[3::2], strict=True))
@@ -59,7 +59,7 @@ def test_the_page_gets_its_settings(tmp_path: Path) -> None:
 def test_impossible_page_settings_are_refused(tmp_path: Path, text: str, says: str) -> None:
     (tmp_path / "lab.toml").write_text(text)
     with pytest.raises(InputError, match=says):
-        configured(tmp_path / "lab.toml")
+        load_configuration(tmp_path / "lab.toml")
 
 
 def test_without_the_library_of_the_page_no_hold_begins(

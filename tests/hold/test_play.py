@@ -12,7 +12,7 @@ from membrane_ctrl.config.schema import RecordingConfig
 from membrane_ctrl.hold import play
 from membrane_ctrl.hold.scenario_file import Scenario, load_scenario
 from membrane_ctrl.hold.scenario_run import ScenarioRun
-from membrane_ctrl.hold.scenarios import find_scenario, shipped
+from membrane_ctrl.hold.scenarios import find_scenario, list_scenario_files
 from membrane_ctrl.model.clock import RunClock
 from membrane_ctrl.model.errors import Exit, InputError
 from membrane_ctrl.run_files.run import open_run
@@ -82,10 +82,10 @@ def test_names_have_titles_and_accept_dashes_for_underscores(
 ) -> None:
     assert cli.run(["twin", "play"]) == Exit.DONE
     lines = capsys.readouterr().out.splitlines()
-    assert [line.split()[0] for line in lines] == [path.stem for path in shipped()]
+    assert [line.split()[0] for line in lines] == [path.stem for path in list_scenario_files()]
     assert all(
         load_scenario(path, Scenario).title in line
-        for path, line in zip(shipped(), lines, strict=True)
+        for path, line in zip(list_scenario_files(), lines, strict=True)
     )
     assert find_scenario("calm-night") == find_scenario("calm_night")
     assert cli.run(["twin", "play", "bright_day"]) == Exit.BAD_INPUT

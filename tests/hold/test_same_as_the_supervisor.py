@@ -22,7 +22,7 @@ from membrane_ctrl.model.clock import RunClock
 from membrane_ctrl.model.errors import Exit
 from membrane_ctrl.model.shape_estimate import ShapeEstimate, pack_estimate, unpack_estimate
 from membrane_ctrl.model.telemetry import FIELDS, ROW_BYTES
-from membrane_ctrl.processes.ring import RingReader, RingWriter, ring
+from membrane_ctrl.processes.ring import RingReader, RingWriter, open_ring
 from membrane_ctrl.sim.plant import Plant
 from membrane_ctrl.sim.virtual_bench import VirtualBench
 from tests.support.virtual_time import run_virtual as in_virtual_time
@@ -101,7 +101,9 @@ def supervised(upset: Upset) -> tuple[list[TickOutputs], Exit]:
     async def hold() -> Exit:
         with ExitStack() as stack:
             sizes = {"telemetry": ROW_BYTES, "events": 4096, "shapes": 1 << 15}
-            addresses = {name: stack.enter_context(ring(16, size)) for name, size in sizes.items()}
+            addresses = {
+                name: stack.enter_context(open_ring(16, size)) for name, size in sizes.items()
+            }
             telemetry, events, shapes = (RingWriter(addresses[name]) for name in sizes)
             reader = RingReader(addresses["shapes"])
             for end in (telemetry, events, shapes, reader):

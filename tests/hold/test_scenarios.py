@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 
 from membrane_ctrl.hold.scenario_file import load_scenario
-from membrane_ctrl.hold.scenarios import shipped
+from membrane_ctrl.hold.scenarios import list_scenario_files
 from membrane_ctrl.model.errors import InputError
 from tests.support.scenario import CheckedScenario, failures, play
 
@@ -16,7 +16,7 @@ LONGEST_S = 1000.0
 
 
 @pytest.mark.parametrize(
-    "path", [*shipped(), *sorted(FOLDER.glob("*.toml"))], ids=lambda path: path.stem
+    "path", [*list_scenario_files(), *sorted(FOLDER.glob("*.toml"))], ids=lambda path: path.stem
 )
 def test_scenario(path: Path) -> None:
     whole = load_scenario(path, CheckedScenario)

@@ -19,7 +19,7 @@ from membrane_ctrl.model.clock import RunClock
 from membrane_ctrl.model.errors import Exit
 from membrane_ctrl.model.event_lines import from_dict
 from membrane_ctrl.model.telemetry import ROW_BYTES
-from membrane_ctrl.processes.ring import RingReader, RingWriter, ring
+from membrane_ctrl.processes.ring import RingReader, RingWriter, open_ring
 from membrane_ctrl.sim.plant import Plant
 from membrane_ctrl.sim.virtual_bench import VirtualBench
 
@@ -61,7 +61,7 @@ async def test_the_snapshot_is_the_one_before_its_tick(monkeypatch: pytest.Monke
             "inputs": (2000, MESSAGE_BYTES),
             "snapshots": (8, SNAPSHOT_MESSAGE_BYTES),
         }
-        addresses = {name: stack.enter_context(ring(*size)) for name, size in sizes.items()}
+        addresses = {name: stack.enter_context(open_ring(*size)) for name, size in sizes.items()}
         writers = {name: RingWriter(address) for name, address in addresses.items()}
         inputs, snapshots = RingReader(addresses["inputs"]), RingReader(addresses["snapshots"])
         for end in (*writers.values(), inputs, snapshots):
@@ -81,7 +81,7 @@ async def test_the_snapshot_is_the_one_before_its_tick(monkeypatch: pytest.Monke
 
 def test_an_event_that_is_too_long_for_its_slot_is_cut() -> None:
     with ExitStack() as stack:
-        address = stack.enter_context(ring(4, 4096))
+        address = stack.enter_context(open_ring(4, 4096))
         writer, reader = RingWriter(address), RingReader(address)
         for end in (writer, reader):
             stack.callback(end.close)
@@ -100,7 +100,8 @@ def test_an_event_that_is_too_long_for_its_slot_is_cut() -> None:
 async def test_an_unreadable_shape_is_reported_once_and_the_hold_continues() -> None:
     with ExitStack() as stack:
         addresses = {
-            name: stack.enter_context(ring(64, 4096)) for name in ("telemetry", "events", "shapes")
+            name: stack.enter_context(open_ring(64, 4096))
+            for name in ("telemetry", "events", "shapes")
         }
         writers = {name: RingWriter(address) for name, address in addresses.items()}
         shapes, events = RingReader(addresses["shapes"]), RingReader(addresses["events"])

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from membrane_ctrl.model.prose import fields_of, fill, for_people
+from membrane_ctrl.model.prose import fields_of, fill_template, for_people
 
 
 @pytest.mark.parametrize(
@@ -21,7 +21,7 @@ from membrane_ctrl.model.prose import fields_of, fill, for_people
 def test_parts_without_a_value_are_left_out(
     values: dict[str, object], sentence: str | None
 ) -> None:
-    assert fill("{a}[ ({b})][ {c:g}]", values) == sentence
+    assert fill_template("{a}[ ({b})][ {c:g}]", values) == sentence
 
 
 def test_the_fields_of_a_template() -> None:

@@ -23,7 +23,7 @@ from membrane_ctrl.model.state_tree import (
     StateError,
     StateNode,
     decode_state,
-    describe,
+    describe_tree,
     encode_state,
     find_differences,
     to_plain,
@@ -247,7 +247,7 @@ def test_a_tree_is_described_value_by_value() -> None:
         empty: Annotated[FloatArray, ArrayShape((9,))]
         tree: Tree
 
-    lines = describe(Wide(np.diag([1.0, 2.0, math.nan]), np.full(9, math.nan), full()))
+    lines = describe_tree(Wide(np.diag([1.0, 2.0, math.nan]), np.full(9, math.nan), full()))
     assert [line.split(maxsplit=1) for line in lines[:2]] == [
         ["wide", "3 x 3 numbers, 0 to 2"],
         ["empty", "9 numbers, none finite"],

@@ -14,12 +14,12 @@ from rich.text import Text
 from membrane_ctrl.cli import run
 from membrane_ctrl.model.terminal import (
     Plain,
-    counted,
+    escape_controls,
     live_line,
     one_line,
     only_text,
-    plain,
     table_console,
+    track_progress,
 )
 
 # title, bell, carriage return, backspace, C1 of one byte, a line drawn backwards, an invisible tag,
@@ -38,8 +38,8 @@ class Terminal(io.StringIO):
 
 
 def test_control_characters_become_their_escapes_and_text_stays_text() -> None:
-    assert plain(HOSTILE) == ESCAPED
-    assert plain("µm, 3 °C\n\tänd – ok\n") == "µm, 3 °C\n\tänd – ok\n"
+    assert escape_controls(HOSTILE) == ESCAPED
+    assert escape_controls("µm, 3 °C\n\tänd – ok\n") == "µm, 3 °C\n\tänd – ok\n"
     assert one_line("a\nb") == "a b"
 
 
@@ -85,7 +85,7 @@ def test_a_bar_is_drawn_while_items_are_taken_and_lines_beside_it_stay_text(
     monkeypatch.setattr(sys, "stderr", terminal)
     monkeypatch.setenv("TERM", "xterm")
     with only_text():
-        for number in counted(iter(range(3)), "sets", 3):
+        for number in track_progress(iter(range(3)), "sets", 3):
             print(one_line(f"{number}{HOSTILE}"), file=sys.stderr)
     sent = terminal.getvalue()
     assert "\x1b[2K" in sent  # the bar moves the cursor
@@ -106,7 +106,7 @@ def test_a_live_line_replaces_itself_and_its_text_moves_no_cursor(
 
 
 def test_without_a_terminal_there_is_no_bar(capsys: pytest.CaptureFixture[str]) -> None:
-    assert list(counted([1, 2], "sets")) == [1, 2]
+    assert list(track_progress([1, 2], "sets")) == [1, 2]
     assert capsys.readouterr() == ("", "")
 
 

@@ -9,7 +9,7 @@ from multiprocessing.context import SpawnProcess
 import pytest
 
 from membrane_ctrl.processes.child import Child
-from membrane_ctrl.processes.event_pipe import pipe
+from membrane_ctrl.processes.event_pipe import make_pipe
 
 
 def test_what_is_sent_to_the_whole_group_is_not_for_the_children() -> None:
@@ -17,7 +17,7 @@ def test_what_is_sent_to_the_whole_group_is_not_for_the_children() -> None:
         number: signal.getsignal(number)
         for number in (signal.SIGINT, signal.SIGQUIT, signal.SIGHUP, signal.SIGTERM)
     }
-    ours, theirs = pipe()
+    ours, theirs = make_pipe()
     child = Child("waits", "multiprocessing.connection:wait", ([theirs],), nice=0)
     child.start()
     try:

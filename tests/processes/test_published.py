@@ -14,12 +14,12 @@ from pathlib import Path
 import pytest
 
 from membrane_ctrl.processes.published_rings import attach_rings, publish_rings
-from membrane_ctrl.processes.ring import RingAddress, RingError, RingWriter, ring
+from membrane_ctrl.processes.ring import RingAddress, RingError, RingWriter, open_ring
 
 
 @pytest.fixture
 def address() -> Iterator[RingAddress]:
-    with ring(4, 16) as found:
+    with open_ring(4, 16) as found:
         yield found
 
 
@@ -109,7 +109,7 @@ def test_shared_memory_of_another_user_is_refused(
 
 
 def test_shared_memory_of_another_size_is_refused(tmp_path: Path) -> None:
-    with ring(8, 16) as larger:
+    with open_ring(8, 16) as larger:
         named(tmp_path, name=larger.name, slots=4, slot_bytes=16)
         with pytest.raises(RingError, match="bytes, not the"):
             attach_rings(tmp_path)
@@ -128,7 +128,7 @@ def test_shared_memory_that_is_no_ring_is_refused(tmp_path: Path) -> None:
 
 
 def test_a_run_that_is_over_has_none(tmp_path: Path) -> None:
-    with ring(4, 16) as address:
+    with open_ring(4, 16) as address:
         publish_rings(tmp_path, {"telemetry": address})
     with pytest.raises(FileNotFoundError):
         attach_rings(tmp_path)

@@ -13,11 +13,11 @@ from multiprocessing.shared_memory import SharedMemory
 
 import pytest
 
-from membrane_ctrl.processes.ring import RingAddress, RingError, RingReader, RingWriter, ring
+from membrane_ctrl.processes.ring import RingAddress, RingError, RingReader, RingWriter, open_ring
 
 
 def test_messages_arrive_in_order_and_once() -> None:
-    with ring(8, 16) as address:
+    with open_ring(8, 16) as address:
         writer, reader = RingWriter(address), RingReader(address)
         writer.put(b"one")
         writer.put(b"")
@@ -31,7 +31,7 @@ def test_messages_arrive_in_order_and_once() -> None:
 
 
 def test_a_slow_reader_loses_the_oldest_and_counts_them() -> None:
-    with ring(4, 8) as address:
+    with open_ring(4, 8) as address:
         writer, reader = RingWriter(address), RingReader(address)
         for number in range(11):
             writer.put(struct.pack("<q", number))
@@ -42,7 +42,7 @@ def test_a_slow_reader_loses_the_oldest_and_counts_them() -> None:
 
 
 def test_readers_do_not_disturb_each_other() -> None:
-    with ring(8, 8) as address:
+    with open_ring(8, 8) as address:
         writer, first, second = RingWriter(address), RingReader(address), RingReader(address)
         writer.put(b"a")
         assert first.drain() == [b"a"]
@@ -56,14 +56,14 @@ def test_readers_do_not_disturb_each_other() -> None:
 
 
 def test_latest_of_an_empty_ring_is_none() -> None:
-    with ring(2, 8) as address:
+    with open_ring(2, 8) as address:
         reader = RingReader(address)
         assert reader.latest() is None
         reader.close()
 
 
 def test_a_message_longer_than_a_slot_is_refused_and_leaves_the_ring_whole() -> None:
-    with ring(2, 4) as address:
+    with open_ring(2, 4) as address:
         writer, reader = RingWriter(address), RingReader(address)
         with pytest.raises(ValueError, match="5 bytes"):
             writer.put(b"12345")
@@ -87,7 +87,7 @@ def _hammer(address: RingAddress, go: multiprocessing.synchronize.Event) -> None
 
 def test_the_counter_never_goes_back_beside_a_racing_writer() -> None:
     context = multiprocessing.get_context("spawn")
-    with ring(64, 32) as address:
+    with open_ring(64, 32) as address:
         go = context.Event()
         process = context.Process(target=_hammer, args=(address, go))
         process.start()
@@ -138,7 +138,7 @@ def _stores(address: RingAddress) -> tuple[bytes, list[tuple[int, bytes]]]:
 @pytest.mark.parametrize("seen", range(32))
 def test_whatever_part_of_a_put_is_visible_no_message_is_torn(seen: int) -> None:
     """ARM64 may show a reader any of a put's stores first; a writer may be killed after each."""
-    with ring(2, 16) as address:
+    with open_ring(2, 16) as address:
         before, stores = _stores(address)
         assert len(stores) == 5  # sequence, length and CRC, message, sequence, counter
         memory = SharedMemory(address.name)
@@ -160,7 +160,7 @@ def test_whatever_part_of_a_put_is_visible_no_message_is_torn(seen: int) -> None
 
 
 def test_a_slot_that_is_never_whole_costs_one_message_and_hangs_nobody() -> None:
-    with ring(4, 8) as address:
+    with open_ring(4, 8) as address:
         writer, reader = RingWriter(address), RingReader(address)
         memory = SharedMemory(address.name)
         writer.put(b"a")
@@ -185,7 +185,7 @@ def test_a_slot_that_is_never_whole_costs_one_message_and_hangs_nobody() -> None
     ],
 )
 def test_a_ring_that_is_not_the_one_it_is_said_to_be_is_refused(told: RingAddress) -> None:
-    with ring(4, 16) as address, pytest.raises(RingError):
+    with open_ring(4, 16) as address, pytest.raises(RingError):
         RingReader(replace(told, name=address.name))
 
 
@@ -231,7 +231,7 @@ def _write_for_ever(address: RingAddress, started: multiprocessing.synchronize.E
 
 def test_no_torn_message_beside_a_racing_writer_and_its_last_words_survive_its_death() -> None:
     context = multiprocessing.get_context("spawn")
-    with ring(4, 4096) as address:
+    with open_ring(4, 4096) as address:
         started = context.Event()
         process = context.Process(target=_write_for_ever, args=(address, started))
         process.start()

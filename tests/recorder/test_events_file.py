@@ -10,12 +10,12 @@ from pathlib import Path
 import pytest
 
 from membrane_ctrl.model.event_base import UnknownEvent
-from membrane_ctrl.model.event_lines import parse
+from membrane_ctrl.model.event_lines import parse_event
 from membrane_ctrl.model.events import Event
 from membrane_ctrl.model.run_events import Mark
 from membrane_ctrl.recorder import events_file
 from membrane_ctrl.recorder.events_file import EventsFile
-from membrane_ctrl.run_files.event_log import logged
+from membrane_ctrl.run_files.event_log import parse_logged_line
 
 
 def lines(path: Path) -> list[dict[str, object]]:
@@ -92,7 +92,7 @@ def test_too_many_waiting_events_are_counted_as_lost(
 
 @pytest.mark.parametrize("message", [b"{half", b"\xff\xfe", b"[1, 2]", b""])
 def test_a_message_that_is_no_event_becomes_one_that_says_so(message: bytes) -> None:
-    assert parse(message)["kind"] == "unreadable_event"
+    assert parse_event(message)["kind"] == "unreadable_event"
 
 
 @pytest.mark.parametrize(
@@ -114,10 +114,10 @@ def test_a_message_that_is_no_event_becomes_one_that_says_so(message: bytes) -> 
     ],
 )
 def test_a_line_of_a_run_as_what_it_means(line: dict[str, object], event: Event) -> None:
-    each = logged({"mono_s": 2, **line})
+    each = parse_logged_line({"mono_s": 2, **line})
     assert (each.mono_s, each.event) == (2.0, event)
     assert each.line["kind"] == event.kind
 
 
 def test_a_line_that_says_no_time_stands_at_the_start() -> None:
-    assert logged({"kind": "of tomorrow", "mono_s": None}).mono_s == 0.0
+    assert parse_logged_line({"kind": "of tomorrow", "mono_s": None}).mono_s == 0.0

@@ -6,13 +6,13 @@ from collections.abc import Iterator
 
 import pytest
 
-from membrane_ctrl.processes.ring import RingAddress, RingReader, RingWriter, ring
+from membrane_ctrl.processes.ring import RingAddress, RingReader, RingWriter, open_ring
 from membrane_ctrl.recorder.feed import Feed
 
 
 @pytest.fixture
 def address() -> Iterator[RingAddress]:
-    with ring(8, 16) as found:
+    with open_ring(8, 16) as found:
         yield found
 
 

@@ -22,7 +22,7 @@ from membrane_ctrl.controller.tick_codec import MESSAGE_BYTES
 from membrane_ctrl.model.clock import RunClock
 from membrane_ctrl.model.file_checksums import dumps_checked
 from membrane_ctrl.model.shape_estimate import pack_estimate
-from membrane_ctrl.processes.ring import RingReader, RingWriter, ring
+from membrane_ctrl.processes.ring import RingReader, RingWriter, open_ring
 from membrane_ctrl.recorder import events_file
 from membrane_ctrl.recorder.recorder import Recorder
 from membrane_ctrl.recorder.rerun_output import RETRY_S
@@ -95,7 +95,7 @@ def make_bench(run_dir: Path, config: Config) -> Iterator[Bench]:
     clock = HandClock(0.0, STARTED_UTC)
     with ExitStack() as stack:
         sizes = {"inputs": (2000, MESSAGE_BYTES), "events": (64, 4000), "shapes": (8, 30_000)}
-        addresses = {name: stack.enter_context(ring(*size)) for name, size in sizes.items()}
+        addresses = {name: stack.enter_context(open_ring(*size)) for name, size in sizes.items()}
         readers = {name: RingReader(address) for name, address in addresses.items()}
         writers = {name: RingWriter(address) for name, address in addresses.items()}
         recording = FlakyRecording(run_dir, "test", clock, config)
@@ -231,7 +231,7 @@ def test_a_run_folder_taken_away_is_begun_anew_and_said(tmp_path: Path, how: str
         assert said == [f"{what}, without the earlier data"]
         assert "recorder_recovered" not in bench.kinds()
         assert times_s(bench) == [1, 2]
-    assert config_file.load(run_dir / "config.toml", Config) == config
+    assert config_file.load_toml(run_dir / "config.toml", Config) == config
     assert json.loads((run_dir / "events.jsonl").read_text())["kind"] == "mark"
     found = json.loads((run_dir / "summary.json").read_text())
     assert (found["ticks"], found["recorder"]["folder_anew_s"]) == (150, 1.0)

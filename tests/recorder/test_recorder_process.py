@@ -26,11 +26,11 @@ from membrane_ctrl.controller.tick_codec import MESSAGE_BYTES
 from membrane_ctrl.model.clock import RunClock
 from membrane_ctrl.model.recorder_events import RecorderError
 from membrane_ctrl.model.shape_estimate import pack_estimate
-from membrane_ctrl.model.telemetry import COLUMN, unpack
+from membrane_ctrl.model.telemetry import COLUMN, unpack_rows
 from membrane_ctrl.model.zernike_terms import ZERNIKE_TERMS
 from membrane_ctrl.processes.child import STOP
 from membrane_ctrl.processes.event_pipe import event_sender
-from membrane_ctrl.processes.ring import RingWriter, ring
+from membrane_ctrl.processes.ring import RingWriter, open_ring
 from membrane_ctrl.recorder.process import RecorderSpec, recorder_main
 from membrane_ctrl.run_files.run_folder import create_run_folder
 from membrane_ctrl.run_files.streams import STREAMS
@@ -64,7 +64,7 @@ def feed(tmp_path: Path) -> Iterator[Feed]:
     run_dir = create_run_folder(tmp_path, "test", clock.origin_utc, Config())
     with ExitStack() as stack:
         addresses = [
-            stack.enter_context(ring(slots, size))
+            stack.enter_context(open_ring(slots, size))
             for slots, size in ((2000, MESSAGE_BYTES), (64, 4000), (16, 30_000))
         ]
         writers = [RingWriter(address) for address in addresses]
@@ -143,7 +143,7 @@ def test_every_row_event_and_shape_is_found_again(feed: Feed) -> None:
         assert process.exitcode == 0
         assert [report["kind"] for report in received(status)] == ["recorder_done"]
     path = feed.spec.run_dir / "test-000.rrd"
-    table = unpack([row.pack() for row in rows])
+    table = unpack_rows([row.pack() for row in rows])
     for stream in STREAMS:
         columns = table[:, [COLUMN[line.field] for line in stream.lines]]
         if np.isfinite(columns).any():
@@ -196,7 +196,7 @@ def recorder_in_process(spec: RecorderSpec) -> list[dict[str, Any]]:
     from membrane_ctrl.recorder import process
 
     reports: list[dict[str, Any]] = []
-    process._record(
+    process._record_run(
         spec, lambda event: reports.append(event.to_dict()), lambda: False, lambda: False
     )
     return reports
@@ -211,7 +211,7 @@ def test_without_an_end_event_the_run_still_gets_one(
     from membrane_ctrl.recorder import process
 
     feed.inputs.put(message_of(rows_of(0.02)[0]))
-    process._record(feed.spec, lambda message: None, lambda: asked, lambda: orphan)
+    process._record_run(feed.spec, lambda message: None, lambda: asked, lambda: orphan)
     assert summary_of(feed.spec.run_dir)["exit"] == word
     assert summary_of(feed.spec.run_dir)["ticks"] == 1
     assert has_footer(feed.spec.run_dir / "test-000.rrd")

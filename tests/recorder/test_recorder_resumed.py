@@ -20,7 +20,7 @@ from membrane_ctrl.model.events import Event
 from membrane_ctrl.model.file_checksums import dumps_checked
 from membrane_ctrl.model.shape_estimate import pack_estimate
 from membrane_ctrl.model.state_tree import find_differences
-from membrane_ctrl.processes.ring import RingAddress, RingReader, RingWriter, ring
+from membrane_ctrl.processes.ring import RingAddress, RingReader, RingWriter, open_ring
 from membrane_ctrl.recorder.events_file import EventsFile
 from membrane_ctrl.recorder.handover import load_state, save_state
 from membrane_ctrl.recorder.recorder import Recorder
@@ -53,9 +53,9 @@ class Run:
         self.run_dir, self.config = run_dir, config
         self._stack = stack
         self.addresses: dict[str, RingAddress] = {
-            "inputs": stack.enter_context(ring(rows_kept, MESSAGE_BYTES)),
-            "events": stack.enter_context(ring(64, 4000)),
-            "shapes": stack.enter_context(ring(8, 30_000)),
+            "inputs": stack.enter_context(open_ring(rows_kept, MESSAGE_BYTES)),
+            "events": stack.enter_context(open_ring(64, 4000)),
+            "shapes": stack.enter_context(open_ring(8, 30_000)),
         }
         self.writers = {name: RingWriter(address) for name, address in self.addresses.items()}
         for writer in self.writers.values():

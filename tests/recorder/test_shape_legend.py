@@ -12,17 +12,17 @@ from membrane_ctrl.config.schema import Config
 from membrane_ctrl.model.clock import RunClock
 from membrane_ctrl.model.zernike_terms import ZERNIKE_TERMS
 from membrane_ctrl.recorder.rerun_recording import Recording
-from membrane_ctrl.recorder.rerun_shapes import ShapeStreams, _legend
+from membrane_ctrl.recorder.rerun_shapes import ShapeStreams, _make_legend
 from tests.support.rrd_reading import scalars, strings
 from tests.worlds.synthetic_run import shape_of
 
 
 def test_both_error_bars_of_the_sag_are_told_apart() -> None:
     shape = shape_of(1.0, 3)
-    assert "± 0.100 µm in a change\n" in _legend(
+    assert "± 0.100 µm in a change\n" in _make_legend(
         shape, shape, {}
     )  # nothing is stated of what they share
-    assert "± 0.100 µm in a change, ± 21.8 µm shared by all cycles\n" in _legend(
+    assert "± 0.100 µm in a change, ± 21.8 µm shared by all cycles\n" in _make_legend(
         replace(shape, geometry_sag_sigma_um=21.84), shape, {}
     )
 

@@ -7,7 +7,7 @@ import numpy as np
 from membrane_ctrl.config.schema import Config
 from membrane_ctrl.model import acquisition_events, events
 from membrane_ctrl.model.run_status import RunStatus
-from membrane_ctrl.model.telemetry import unpack
+from membrane_ctrl.model.telemetry import unpack_rows
 from membrane_ctrl.recorder.summary_page import summary_page
 from membrane_ctrl.run_files.summary import Summary
 from tests.worlds.synthetic_run import rows_of, shape_of
@@ -34,7 +34,7 @@ def test_before_anything_happened() -> None:
 
 def test_figures_are_those_of_the_summary() -> None:
     summary = Summary.for_config(Config())
-    summary.add_rows(unpack([row.pack() for row in rows_of(30.0)]))
+    summary.add_rows(unpack_rows([row.pack() for row in rows_of(30.0)]))
     summary.add_shape(shape_of(20.0, 1, verdict="rejected"))
     for event in (
         FAULT,

@@ -10,7 +10,7 @@ import pytest
 
 from membrane_ctrl.config.schema import Config
 from membrane_ctrl.model.clock import RunClock
-from membrane_ctrl.model.telemetry import unpack
+from membrane_ctrl.model.telemetry import unpack_rows
 from membrane_ctrl.recorder.rerun_events import send_events
 from membrane_ctrl.recorder.rerun_recording import Recording
 from membrane_ctrl.recorder.rerun_shapes import ShapeStreams
@@ -30,7 +30,7 @@ HOLD_GREEN = (0, 127, 92)
 def run_dir(tmp_path: Path) -> Path:
     recording = Recording(tmp_path, "test", RunClock.start(), Config())
     recording.next_segment()
-    TelemetryStreams(recording, Config()).send(unpack([row.pack() for row in rows_of(30.0)]))
+    TelemetryStreams(recording, Config()).send(unpack_rows([row.pack() for row in rows_of(30.0)]))
     send_events(recording, [{"kind": "state", "mono_s": 6.0, "to": "hold"}])
     shapes = ShapeStreams(recording)
     for cycle in range(10):

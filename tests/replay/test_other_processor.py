@@ -45,11 +45,11 @@ def elsewhere(monkeypatch: pytest.MonkeyPatch) -> None:
 @pytest.fixture
 def off_by(monkeypatch: pytest.MonkeyPatch) -> Callable[[float], None]:
     """Compute every lag wrong by a share."""
-    smoothing = filters.smoothing
+    smoothing = filters.lag_step_fraction
 
     def compute_wrong(share: float) -> None:
         monkeypatch.setattr(
-            filters, "smoothing", lambda dt_s, lag_s: smoothing(dt_s, lag_s) * (1.0 + share)
+            filters, "lag_step_fraction", lambda dt_s, lag_s: smoothing(dt_s, lag_s) * (1.0 + share)
         )
 
     return compute_wrong

@@ -13,15 +13,15 @@ import pytest
 
 from membrane_ctrl.cli import run
 from membrane_ctrl.model.errors import Exit, InputError
-from membrane_ctrl.model.telemetry import unpack
-from membrane_ctrl.replay.repair import rebuild_summary, repair
+from membrane_ctrl.model.telemetry import unpack_rows
+from membrane_ctrl.replay.repair import rebuild_summary, repair_run
 from membrane_ctrl.run_files.run_tables import RunTables
 from membrane_ctrl.run_files.summary import Summary
 from tests.worlds.nights import batch_of
 from tests.worlds.virtual_record import CONFIG, kept_ticks, write_record
 
 TICKS = kept_ticks(26.0)
-ROWS = unpack([outputs.row.pack() for _, outputs in TICKS])
+ROWS = unpack_rows([outputs.row.pack() for _, outputs in TICKS])
 
 
 @pytest.fixture(scope="module")
@@ -51,7 +51,7 @@ def cut(path: Path, share: float) -> None:
 
 def test_a_killed_recorders_run_is_readable_and_no_original_is_touched(folder: Path) -> None:
     before = contents(folder)
-    findings = {finding.file: finding.state for finding in repair(folder)}
+    findings = {finding.file: finding.state for finding in repair_run(folder)}
     assert findings["events.jsonl"] == findings["inputs"] == "whole"
     assert findings["ticks (1 journals)"] == "open"
     assert findings["summary.json"] == "missing"
@@ -62,13 +62,13 @@ def test_a_killed_recorders_run_is_readable_and_no_original_is_touched(folder: P
 
 def test_in_place_makes_parts_of_the_journals(folder: Path) -> None:
     cut(folder / "events.jsonl", 0.9)
-    repair(folder, in_place=True)
+    repair_run(folder, in_place=True)
     assert not list(folder.rglob("*.journal"))
     assert pq.read_table(folder / "ticks" / "ticks-0000.parquet").num_rows == len(TICKS)
     assert not (folder / "repaired").exists()
     assert (folder / "events.jsonl.torn").stat().st_size > 0
     assert all(json.loads(line) for line in (folder / "events.jsonl").read_text().splitlines())
-    assert {finding.state for finding in repair(folder)} == {"whole"}
+    assert {finding.state for finding in repair_run(folder)} == {"whole"}
 
 
 @pytest.mark.parametrize(
@@ -85,7 +85,7 @@ def test_a_torn_tail_of_the_event_log_is_cut_and_kept(folder: Path, tail: bytes)
     path = folder / "events.jsonl"
     good = path.read_bytes()
     path.write_bytes(good + tail)
-    repair(folder)
+    repair_run(folder)
     assert (folder / "repaired" / "events.jsonl").read_bytes() == good
     assert (folder / "repaired" / "events.jsonl.torn").read_bytes() == tail
     assert path.read_bytes() == good + tail
@@ -129,10 +129,10 @@ def test_a_run_without_an_end_has_crashed(folder: Path) -> None:
 @pytest.mark.parametrize("text", ["", "{", "[]", "\x00\x00"])
 def test_an_unreadable_summary_is_an_original_too(folder: Path, text: str) -> None:
     (folder / "summary.json").write_text(text)
-    repair(folder)
+    repair_run(folder)
     assert (folder / "summary.json").read_text() == text
     assert json.loads((folder / "repaired" / "summary.json").read_text())["rebuilt"] is True
-    repair(folder, in_place=True)
+    repair_run(folder, in_place=True)
     assert json.loads((folder / "summary.json").read_text())["ticks"] == len(TICKS)
 
 
@@ -140,7 +140,7 @@ def test_a_run_with_nothing_but_its_configuration_is_no_error(folder: Path) -> N
     (folder / "events.jsonl").unlink()
     for path in folder.glob("*/"):
         shutil.rmtree(path)
-    states = {finding.file: finding.state for finding in repair(folder)}
+    states = {finding.file: finding.state for finding in repair_run(folder)}
     assert states == {"events.jsonl": "missing", "summary.json": "missing"}
     assert json.loads((folder / "summary.json").read_text())["ticks"] == 0
 
@@ -150,7 +150,7 @@ def test_a_damaged_configuration_is_named_and_keeps_nothing_from_being_mended(
     folder: Path, config: bytes
 ) -> None:
     (folder / "config.toml").write_bytes(config)
-    findings = {finding.file: finding for finding in repair(folder)}
+    findings = {finding.file: finding for finding in repair_run(folder)}
     assert "config.toml" in findings["config.toml"].action
     assert findings["summary.json"].state == "missing"
     assert json.loads((folder / "summary.json").read_text())["rebuilt"]
@@ -166,13 +166,13 @@ def test_what_cannot_be_read_is_one_line(folder: Path, capsys: pytest.CaptureFix
 def test_a_run_that_is_still_recorded_is_left_alone(folder: Path) -> None:
     (folder / ".recorder-state").write_bytes(b"")
     with pytest.raises(InputError, match="still being recorded"):
-        repair(folder)
+        repair_run(folder)
 
 
 def test_the_command_says_what_it_did(
     folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    repair(folder, in_place=True)
+    repair_run(folder, in_place=True)
     (folder / "summary.json").unlink()
     cut(folder / "inputs" / "inputs-0000.parquet", 0.5)
     assert run(["repair", str(folder), "--json"]) == Exit.DONE

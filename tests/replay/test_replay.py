@@ -28,7 +28,7 @@ from membrane_ctrl.model.events import Fault
 from membrane_ctrl.model.file_checksums import with_comment
 from membrane_ctrl.model.shape_estimate import pack_estimate, unpack_estimate
 from membrane_ctrl.replay import replay as replay_module
-from membrane_ctrl.replay.replay import Gap, RecordedTick, recorded_ticks, replay
+from membrane_ctrl.replay.replay import Gap, RecordedTick, recorded_ticks, replay_record
 from membrane_ctrl.run_files import table_specs
 from membrane_ctrl.run_files.inputs_file import InputsReader
 from tests.support.incidents import check_incident, read_incident
@@ -117,7 +117,7 @@ def test_a_difference_is_found_at_its_first_tick(
 
 def test_a_changed_gain_shows_as_another_pump_but_the_same_states(record: Path) -> None:
     config = CONFIG.model_copy(update={"loop": LoopConfig(kp_per_s=0.5)})
-    found = replay(config, recorded_ticks(InputsReader(record)), zernike_projection())
+    found = replay_record(config, recorded_ticks(InputsReader(record)), zernike_projection())
     assert found.different > 100
     assert [d.what for d in found.decisions if d.what.startswith("state")] == [
         "state check",
@@ -131,7 +131,7 @@ def test_a_changed_gain_shows_as_another_pump_but_the_same_states(record: Path) 
 def test_another_configuration_than_the_run_had_is_named(
     record: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    text = with_comment(config_file.dump(CONFIG)).replace("kp_per_s = 0.61", "kp_per_s = 0.5")
+    text = with_comment(config_file.dump_toml(CONFIG)).replace("kp_per_s = 0.61", "kp_per_s = 0.5")
     (record / "config.toml").write_text(text)
     assert run(["replay", str(record)]) == Exit.REJECTED
     assert "config.toml: checksum mismatch" in capsys.readouterr().out

@@ -8,7 +8,7 @@ from dataclasses import replace
 import pytest
 
 from membrane_ctrl.model.telemetry import FIELDS, TelemetryRow
-from membrane_ctrl.replay.replay import Decision, differing_fields, unmatched
+from membrane_ctrl.replay.replay import Decision, differing_fields, find_unmatched
 
 CHECK, HOLD, FAULT = (
     Decision(1.0, "state", "check"),
@@ -44,12 +44,12 @@ def at(decision: Decision, time_s: float) -> Decision:
 def test_decisions_are_the_same_ones_within_the_slack_until_one_is_another(
     recorded: list[Decision], today: list[Decision], said: list[str]
 ) -> None:
-    assert unmatched(recorded, today, 1.0) == said
+    assert find_unmatched(recorded, today, 1.0) == said
 
 
 def test_each_time_that_is_off_is_told() -> None:
     late = [at(CHECK, 3.0), at(HOLD, 8.0)]
-    assert len(unmatched([CHECK, HOLD], late, 1.0)) == 2
+    assert len(find_unmatched([CHECK, HOLD], late, 1.0)) == 2
 
 
 def test_a_value_that_came_or_went_is_a_difference_and_no_value_twice_is_none() -> None:

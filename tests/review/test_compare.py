@@ -12,9 +12,9 @@ import pytest
 from scipy import signal
 
 from membrane_ctrl.review import open_run
-from membrane_ctrl.review.statistics.analysis import Analysis, analyse
-from membrane_ctrl.review.statistics.compare import compare
-from membrane_ctrl.review.statistics.difference_tests import mean_p, spread_p, windowed
+from membrane_ctrl.review.statistics.analysis import Analysis, analyse_run
+from membrane_ctrl.review.statistics.compare import compare_analyses
+from membrane_ctrl.review.statistics.difference_tests import mean_p, spread_p, window_means
 from tests.studies.comparison_rates import rates
 from tests.support.review_runs import written
 
@@ -31,7 +31,7 @@ def series(
 
 
 def long_windows(values: np.ndarray, window_s: float) -> np.ndarray:
-    return np.stack(windowed(values[0], values[1], window_s))
+    return np.stack(window_means(values[0], values[1], window_s))
 
 
 @pytest.mark.parametrize("window_s", [1.0, 4.0, 60.0])
@@ -101,13 +101,13 @@ def test_blocks_that_remember_each_other_count_for_fewer() -> None:
 def analyses(tmp_path_factory: pytest.TempPathFactory) -> list[Analysis]:
     logs: Path = tmp_path_factory.mktemp("compare")
     return [
-        analyse(open_run(written(logs, HOURS, seed=seed, name=f"2026112{seed}T180000Z-n")))
+        analyse_run(open_run(written(logs, HOURS, seed=seed, name=f"2026112{seed}T180000Z-n")))
         for seed in (1, 2)
     ]
 
 
 def test_every_row_is_tested_or_says_why_not(analyses: list[Analysis]) -> None:
-    rows = {row.name: row for row in compare(*analyses)}
+    rows = {row.name: row for row in compare_analyses(*analyses)}
     assert all(
         math.isfinite(row.p_value) or row.note.startswith("no test") for row in rows.values()
     )
@@ -120,7 +120,7 @@ def test_every_row_is_tested_or_says_why_not(analyses: list[Analysis]) -> None:
 
 
 def test_too_short_is_said(tmp_path: Path, analyses: list[Analysis]) -> None:
-    short = analyse(open_run(written(tmp_path, 0.05, seed=3)))
-    rows = {row.name: row for row in compare(analyses[0], short)}
+    short = analyse_run(open_run(written(tmp_path, 0.05, seed=3)))
+    rows = {row.name: row for row in compare_analyses(analyses[0], short)}
     assert rows["reading, std of 60 s"].note == "no test: too short"
     assert rows["reading, std of 60 s"].said == ""

@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from membrane_ctrl.model.telemetry import COLUMN, Rows, column
-from membrane_ctrl.review.events.door_steps import quantum, update_s
+from membrane_ctrl.model.telemetry import COLUMN, Rows, get_column
+from membrane_ctrl.review.events.door_steps import reading_resolution_pa, update_s
 from membrane_ctrl.review.events.found import pressure_steps
 from membrane_ctrl.review.events.found_event import FoundEvent
 from membrane_ctrl.run_files.levels import TICK_FIELDS, first_level
@@ -17,7 +17,7 @@ AMBIENT = COLUMN["ambient_pressure_pa"]
 
 
 def doors_in(rows: Rows) -> list[FoundEvent]:
-    return pressure_steps(first_level({name: column(rows, name) for name in TICK_FIELDS}))
+    return pressure_steps(first_level({name: get_column(rows, name) for name in TICK_FIELDS}))
 
 
 def repeated(rows: Rows, period_s: float) -> None:
@@ -56,7 +56,7 @@ def test_a_slow_and_coarse_barometer_tells_of_a_door() -> None:
 @pytest.mark.parametrize("size_pa", [10.0, -25.0])
 def test_a_door_that_takes_its_time_has_its_size(over_s: float, size_pa: float) -> None:
     rows, _ = night(10, HOURS, "typical", [])
-    rows[:, AMBIENT] += size_pa * np.clip((column(rows, "mono_s") - 3000.3) / over_s, 0, 1)
+    rows[:, AMBIENT] += size_pa * np.clip((get_column(rows, "mono_s") - 3000.3) / over_s, 0, 1)
     (found,) = doors_in(rows)
     assert found.time_s == pytest.approx(3000.3 + over_s / 2, abs=3.0)
     assert found.size == pytest.approx(size_pa, abs=2.0)
@@ -80,6 +80,6 @@ def test_how_often_and_how_finely_a_barometer_tells() -> None:
     assert update_s(np.repeat(fine, 7)) == 7
     assert update_s(np.full(100, np.nan)) == 1
     assert update_s(np.repeat([1e5, 1e5 + 20.0], 1000)) == 1
-    assert quantum(np.round(fine / 4) * 4) == pytest.approx(4.0)
-    assert quantum(fine) < 0.1
-    assert quantum(np.full(100, np.nan)) == 0.0
+    assert reading_resolution_pa(np.round(fine / 4) * 4) == pytest.approx(4.0)
+    assert reading_resolution_pa(fine) < 0.1
+    assert reading_resolution_pa(np.full(100, np.nan)) == 0.0

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from membrane_ctrl.metrology.film.hencky_bowl import zernike_projection
-from membrane_ctrl.model.telemetry import COLUMN, Rows, State, column
+from membrane_ctrl.model.telemetry import COLUMN, Rows, State, get_column
 from membrane_ctrl.review.events.found import (
     find_events,
     laser_losses,
@@ -16,7 +16,7 @@ from membrane_ctrl.review.events.found import (
     weather_losses,
 )
 from membrane_ctrl.review.events.found_event import FoundEvent
-from membrane_ctrl.review.events.steps import confidence, steps
+from membrane_ctrl.review.events.steps import find_steps, step_confidence
 from membrane_ctrl.run_files.levels import TICK_FIELDS, Columns, first_level
 from tests.studies.events_found import matched
 from tests.worlds.nights import DOOR, GLITCH, JUMP, LATE, LEAK, LOST, Planted, night
@@ -26,7 +26,7 @@ HOURS = 2.0
 
 
 def level_of(rows: Rows) -> Columns:
-    return first_level({name: column(rows, name) for name in TICK_FIELDS})
+    return first_level({name: get_column(rows, name) for name in TICK_FIELDS})
 
 
 def found_in(events: list[Planted], seed: int = 1, scenario: str = "typical") -> list[FoundEvent]:
@@ -67,7 +67,7 @@ def test_what_was_planted_is_found_and_nothing_else(event: Planted) -> None:
 
 def test_a_change_of_noise_is_found() -> None:
     rows, _ = night(3, HOURS, "typical", [])
-    later = column(rows, "mono_s") > 3600
+    later = get_column(rows, "mono_s") > 3600
     rows[later, COLUMN["error_um"]] *= 2.5
     found = noise_changes(level_of(rows))
     assert [round(item.size, 1) for item in found] == [pytest.approx(2.5, rel=0.2)]
@@ -80,7 +80,7 @@ def test_a_change_of_noise_is_found() -> None:
 )
 def test_lost_weather_is_found_once_it_was_there(field: str, kind: str) -> None:
     rows, _ = night(4, 0.2, "quiet", [])
-    time_s = column(rows, "mono_s")
+    time_s = get_column(rows, "mono_s")
     rows[
         (time_s < 20.0) | ((time_s >= 300.0) & (time_s < 360.0)) | (time_s == 100.0), COLUMN[field]
     ] = np.nan
@@ -94,7 +94,7 @@ def test_lost_weather_is_found_once_it_was_there(field: str, kind: str) -> None:
 def test_what_a_bench_is_held_by_is_what_it_has_lost(quality: float, kind: str) -> None:
     rows, _ = night(4, 0.2, "quiet", [])
     rows[:, COLUMN["displacement_quality"]] = quality  # figures have no code
-    time_s = column(rows, "mono_s")
+    time_s = get_column(rows, "mono_s")
     rows[(time_s >= 300.0) & (time_s < 304.0), COLUMN["displacement_um"]] = np.nan
     (found,) = laser_losses(level_of(rows))
     assert (found.kind, found.time_s, found.size) == (kind, 300.0, 4.0)
@@ -105,16 +105,16 @@ def test_a_step_and_a_gap() -> None:
     values = rng.normal(size=2000)
     values[1200:] += 20.0
     values[500:520] = np.nan
-    found = steps(values, half=3, skip=1, least=5.0, least_sigmas=6.0)
+    found = find_steps(values, half=3, skip=1, least=5.0, least_sigmas=6.0)
     assert [step.row for step in found] == [pytest.approx(1200, abs=2)]
     assert found[0].size == pytest.approx(20.0, abs=2.0)
-    assert steps(values[:5], 3, 1, 1.0, 1.0) == []
+    assert find_steps(values[:5], 3, 1, 1.0, 1.0) == []
 
 
 def test_confidence_falls_with_the_places_looked_at() -> None:
-    assert confidence(6.0, 1000) > 0.99999
-    assert confidence(3.0, 1) == pytest.approx(0.9973, abs=1e-4)
-    assert confidence(3.0, 10_000) == 0.0
+    assert step_confidence(6.0, 1000) > 0.99999
+    assert step_confidence(3.0, 1) == pytest.approx(0.9973, abs=1e-4)
+    assert step_confidence(3.0, 10_000) == 0.0
 
 
 def test_a_mirror_that_is_moved_makes_no_jump_of_its_figure() -> None:
@@ -122,7 +122,7 @@ def test_a_mirror_that_is_moved_makes_no_jump_of_its_figure() -> None:
     no event.
     """
     rows, shapes = night(1, 0.5, "quiet", [])
-    time_s = column(rows, "mono_s")
+    time_s = get_column(rows, "mono_s")
     moved_um = np.interp(time_s, [300, 317, 1000, 1017], [0, 60, 60, 0])
     rows[:, COLUMN["state"]] = np.where(time_s < 200, State.INFLATE, State.HOLD)
     estimates = []

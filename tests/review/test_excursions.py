@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from membrane_ctrl.model.telemetry import COLUMN, Rows, column
+from membrane_ctrl.model.telemetry import COLUMN, Rows, get_column
 from membrane_ctrl.review.events.found import find_events
 from membrane_ctrl.review.events.found_event import FoundEvent
 from membrane_ctrl.run_files.levels import TICK_FIELDS, first_level
@@ -18,14 +18,16 @@ AT_S = 1500.0
 
 def found_in(rows: Rows, band_um: float = BAND_UM) -> list[FoundEvent]:
     return find_events(
-        first_level({name: column(rows, name) for name in TICK_FIELDS}), from_estimates([]), band_um
+        first_level({name: get_column(rows, name) for name in TICK_FIELDS}),
+        from_estimates([]),
+        band_um,
     )
 
 
 def bumped(events: list[Planted], size_um: float, scenario: str = "typical") -> Rows:
     """The error goes and comes back within some 15 s, too slowly for a glitch."""
     rows, _ = night(31, 1.0, scenario, events)
-    bump = size_um * np.exp(-0.5 * ((column(rows, "mono_s") - AT_S - 10) / 4) ** 2)
+    bump = size_um * np.exp(-0.5 * ((get_column(rows, "mono_s") - AT_S - 10) / 4) ** 2)
     rows[:, COLUMN["error_um"]] -= bump
     rows[:, COLUMN["displacement_um"]] += bump
     return rows
@@ -48,7 +50,7 @@ def test_the_band_is_the_runs() -> None:
 def test_a_door_and_a_fault_explain_it() -> None:
     assert [f.kind for f in found_in(bumped([Planted(DOOR, AT_S + 2, 12.0)], 5.0))] == [DOOR]
     rows = bumped([], 5.0)
-    time_s = column(rows, "mono_s")
+    time_s = get_column(rows, "mono_s")
     rows[(time_s >= AT_S) & (time_s < AT_S + 3), COLUMN["fault"]] = 10
     assert found_in(rows) == []
 
@@ -56,7 +58,7 @@ def test_a_door_and_a_fault_explain_it() -> None:
 def test_a_pause_explains_it() -> None:
     """A loop that waits has no estimate of the leak."""
     rows = bumped([], 5.0)
-    time_s = column(rows, "mono_s")
+    time_s = get_column(rows, "mono_s")
     paused = (time_s >= AT_S - 30) & (time_s < AT_S)
     rows[paused, COLUMN["leak_um_per_s"]] = np.nan
     assert found_in(rows) == []
@@ -66,7 +68,7 @@ def test_a_pause_explains_it() -> None:
 def test_a_setpoint_on_its_way_explains_it(to_um: float) -> None:
     rows = bumped([], 5.0)
     over_s = abs(to_um) / 3.5
-    moved_um = np.interp(column(rows, "mono_s"), [AT_S, AT_S + over_s], [0.0, to_um])
+    moved_um = np.interp(get_column(rows, "mono_s"), [AT_S, AT_S + over_s], [0.0, to_um])
     for name in ("setpoint_um", "displacement_um", "filtered_um"):
         rows[:, COLUMN[name]] += moved_um
     assert found_in(rows) == []
@@ -74,7 +76,7 @@ def test_a_setpoint_on_its_way_explains_it(to_um: float) -> None:
 
 def test_one_that_is_not_held_is_none() -> None:
     rows = bumped([], 5.0)
-    rows[column(rows, "mono_s") < AT_S + 60, COLUMN["state"]] = 3
+    rows[get_column(rows, "mono_s") < AT_S + 60, COLUMN["state"]] = 3
     assert "excursion" not in {f.kind for f in found_in(rows)}
 
 

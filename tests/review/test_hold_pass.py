@@ -8,10 +8,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from membrane_ctrl.model.telemetry import COLUMN, column
+from membrane_ctrl.model.telemetry import COLUMN, get_column
 from membrane_ctrl.review import open_run
-from membrane_ctrl.review.report.json import report_table, verdict
-from membrane_ctrl.review.statistics.analysis import analyse
+from membrane_ctrl.review.report.json import make_verdict, report_table
+from membrane_ctrl.review.statistics.analysis import analyse_run
 from membrane_ctrl.review.statistics.held_time import HeldTime
 from tests.worlds.nights import CONFIG, night, write_run
 
@@ -20,11 +20,11 @@ HOURS = 0.1
 
 def test_the_true_centre_counts_where_the_laser_is_blind(tmp_path: Path) -> None:
     rows, shapes = night(1, HOURS, "typical", [])
-    blind = (column(rows, "mono_s") >= 100) & (column(rows, "mono_s") < 160)
+    blind = (get_column(rows, "mono_s") >= 100) & (get_column(rows, "mono_s") < 160)
     rows[:, COLUMN["truth_displacement_um"]] = np.where(blind, -3.0, 0.1)
     rows[blind, COLUMN["displacement_um"]] = np.nan
     write_run(tmp_path / "run", iter([(rows, shapes)]))
-    analysis = analyse(open_run(tmp_path / "run"))
+    analysis = analyse_run(open_run(tmp_path / "run"))
     assert analysis.reading is not None
     assert analysis.true is not None
     seconds, minutes = analysis.true.windows[0], analysis.true.windows[2]
@@ -35,31 +35,31 @@ def test_the_true_centre_counts_where_the_laser_is_blind(tmp_path: Path) -> None
     assert analysis.benefit is not None
     assert analysis.benefit.with_um == pytest.approx(seconds.std_um, rel=1e-9)
     assert report_table(analysis)["held_without_reading_s"] == pytest.approx(60, abs=0.2)
-    assert "(1 min of it without a reading)" in verdict(analysis)[1]
+    assert "(1 min of it without a reading)" in make_verdict(analysis)[1]
 
 
 def test_ticks_that_were_missed_are_left_out(tmp_path: Path) -> None:
     rows, _ = night(1, HOURS, "typical", [])
-    there = ~np.isin(column(rows, "tick"), [1203, 1204, 1205])
+    there = ~np.isin(get_column(rows, "tick"), [1203, 1204, 1205])
     write_run(tmp_path / "run", iter([(rows[there], [])]))
-    analysis = analyse(open_run(tmp_path / "run"), 60.5, 140.3)
+    analysis = analyse_run(open_run(tmp_path / "run"), 60.5, 140.3)
     assert analysis.benefit is not None
     assert analysis.ticks.hold_s == pytest.approx(79.8, abs=0.1)
 
 
 def test_a_setpoint_on_its_way_is_told_from_what_counts(tmp_path: Path) -> None:
     rows, _ = night(1, HOURS, "quiet", [])
-    time_s = column(rows, "mono_s")
+    time_s = get_column(rows, "mono_s")
     rows[:, COLUMN["setpoint_um"]] = np.interp(time_s, [100, 190], [-90.0, 0.0])
     rows[:, COLUMN["target_um"]] = np.where(time_s < 100, -90.0, 0.0)
     write_run(tmp_path / "run", iter([(rows, [])]))
-    analysis = analyse(open_run(tmp_path / "run"))
+    analysis = analyse_run(open_run(tmp_path / "run"))
     assert analysis.ticks.hold_s == pytest.approx(360, abs=0.5)
     assert analysis.ticks.settled_s == pytest.approx(360 - 90 - 5 - 5, abs=0.5)
     assert report_table(analysis)["settled_s"] == analysis.ticks.settled_s
     assert (
         "Held for 4 min 20 s of 6 min (moving or settling 1 min 40 s (27.8 %))"
-        in verdict(analysis)[1]
+        in make_verdict(analysis)[1]
     )
 
 
@@ -69,7 +69,7 @@ def test_a_tick_just_behind_its_second_belongs_to_it(tmp_path: Path) -> None:
     rows[:, COLUMN["mono_s"]] = 0.2 * (1 + np.arange(len(rows))) + 1e-3 * late_ms - 5e-4  # 5 Hz
     rows[:, COLUMN["lateness_ms"]], rows[:, COLUMN["dt_s"]] = late_ms, 0.2
     write_run(tmp_path / "run", iter([(rows, [])]))
-    analysis = analyse(open_run(tmp_path / "run"))
+    analysis = analyse_run(open_run(tmp_path / "run"))
     assert analysis.reading is not None
     assert analysis.reading.windows[0].count == pytest.approx(2 * HOURS * 3600 - 5, abs=1)
 
@@ -93,7 +93,7 @@ def test_a_flow_that_only_lags_is_not_at_a_limit(tmp_path: Path) -> None:
     rows[::4, COLUMN["flow_wanted_um_per_s"]] = -0.1
     rows[1::4, COLUMN["flow_wanted_um_per_s"]] = CONFIG.loop.flow_max_um_per_s + 0.1
     write_run(tmp_path / "run", iter([(rows, [])]))
-    assert analyse(open_run(tmp_path / "run")).ticks.pump.saturated_share == pytest.approx(
+    assert analyse_run(open_run(tmp_path / "run")).ticks.pump.saturated_share == pytest.approx(
         0.5, abs=1e-3
     )
 
@@ -124,6 +124,6 @@ def test_the_limit_of_the_flow_is_that_of_the_curve_in_force(tmp_path: Path) -> 
         log.writelines(
             json.dumps({"time_utc": "2026-11-21T18:00:00+00:00", **event}) + "\n" for event in told
         )
-    assert analyse(open_run(tmp_path / "run")).ticks.pump.saturated_share == pytest.approx(
+    assert analyse_run(open_run(tmp_path / "run")).ticks.pump.saturated_share == pytest.approx(
         2 / 3, abs=1e-2
     )

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from membrane_ctrl.model.telemetry import COLUMN, Rows, column
+from membrane_ctrl.model.telemetry import COLUMN, Rows, get_column
 from membrane_ctrl.review.events.found import laser_glitches
 from membrane_ctrl.review.events.found_event import FoundEvent
 from membrane_ctrl.run_files.levels import TICK_FIELDS, first_level
@@ -17,14 +17,14 @@ READING = COLUMN["displacement_um"]
 
 
 def glitches_in(rows: Rows) -> list[FoundEvent]:
-    return laser_glitches(first_level({name: column(rows, name) for name in TICK_FIELDS}))
+    return laser_glitches(first_level({name: get_column(rows, name) for name in TICK_FIELDS}))
 
 
 def wrong_for(rows: Rows, size_um: float, lasts_s: float) -> None:
     """A reading that is wrong for a while; the loop takes it back at the leak's speed, and
     afterwards again.
     """
-    time_s = column(rows, "mono_s")
+    time_s = get_column(rows, "mono_s")
     there = (time_s >= AT_S) & (time_s < AT_S + lasts_s)
     taken = np.minimum(1.2 * np.clip(time_s - AT_S, 0, lasts_s), abs(size_um))
     taken -= np.minimum(1.2 * np.clip(time_s - AT_S - lasts_s, 0, None), taken)
@@ -59,7 +59,7 @@ def test_a_door_is_no_glitch(open_s: float, period_s: float) -> None:
 
 def test_a_loop_that_follows_at_full_speed_does_not_end_a_glitch() -> None:
     rows, _ = night(25, HOURS, "typical", [])
-    time_s = column(rows, "mono_s")
+    time_s = get_column(rows, "mono_s")
     there = (time_s >= AT_S) & (time_s < AT_S + 8)
     after = 12.0 * (time_s >= AT_S + 8) - 1.2 * np.clip(time_s - AT_S - 8, 0, 10)
     rows[:, READING] += there * np.minimum(0.0, -12.0 + 4.0 * (time_s - AT_S)) + after
@@ -73,7 +73,7 @@ def test_a_loop_that_follows_at_full_speed_does_not_end_a_glitch() -> None:
 
 def test_two_glitches_are_two() -> None:
     rows, _ = night(26, HOURS, "typical", [])
-    time_s = column(rows, "mono_s")
+    time_s = get_column(rows, "mono_s")
     for at_s in (AT_S, AT_S + 15):
         rows[(time_s >= at_s) & (time_s < at_s + 4), READING] += 10.0
     assert [round(g.time_s - AT_S) for g in glitches_in(rows)] == [
@@ -84,7 +84,7 @@ def test_two_glitches_are_two() -> None:
 
 def test_a_reading_that_stays_away_is_no_glitch() -> None:
     rows, _ = night(23, HOURS, "typical", [])
-    rows[column(rows, "mono_s") > AT_S, READING] += 10.0
+    rows[get_column(rows, "mono_s") > AT_S, READING] += 10.0
     assert glitches_in(rows) == []
 
 

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from membrane_ctrl.model.clock import RunClock
-from membrane_ctrl.model.telemetry import Rows, column, unpack
+from membrane_ctrl.model.telemetry import Rows, get_column, unpack_rows
 from membrane_ctrl.recorder.handover import RecorderState, save_state
 from membrane_ctrl.recorder.rerun_recording import Recording
 from membrane_ctrl.review import open_run
@@ -21,7 +21,7 @@ from tests.support.rrd_reading import entities, scalars, strings
 from tests.worlds.nights import CONFIG, batch_of
 from tests.worlds.synthetic_run import STARTED_UTC, rows_of, shape_of
 
-ROWS: Rows = unpack([row.pack() for row in rows_of(12.0)])
+ROWS: Rows = unpack_rows([row.pack() for row in rows_of(12.0)])
 HOLD = {"mono_s": 6.0, "kind": "state", "state": "hold", "from": "settle", "why": ""}
 
 
@@ -66,8 +66,8 @@ def test_the_view_has_every_row_of_a_growing_run_once(run: LiveRun) -> None:
         assert view.send_new()
     view.finish()
     time_s, error_um = scalars(run.file, "/loop/error")
-    assert np.allclose(time_s, column(ROWS, "mono_s"))
-    assert np.allclose(error_um[:, 0], column(ROWS, "error_um"), rtol=1e-6)
+    assert np.allclose(time_s, get_column(ROWS, "mono_s"))
+    assert np.allclose(error_um[:, 0], get_column(ROWS, "error_um"), rtol=1e-6)
     assert len(scalars(run.file, "/shape/zernike")[0]) == 12
     assert "/frames/crossed" in entities(run.file)
     ((at_s, text),) = strings(run.file, "/events", "TextLog:text")
@@ -106,7 +106,7 @@ def test_a_long_run_begins_some_minutes_back(run: LiveRun, monkeypatch: pytest.M
     view.finish()
     assert RECENT_S > 60.0
     time_s, _ = scalars(run.file, "/loop/error")
-    assert time_s[0] == pytest.approx(column(ROWS, "mono_s")[-1] - 3.0, abs=0.05)
+    assert time_s[0] == pytest.approx(get_column(ROWS, "mono_s")[-1] - 3.0, abs=0.05)
 
 
 def test_damaged_rows_are_left_out(run: LiveRun) -> None:

@@ -19,14 +19,14 @@ from membrane_ctrl.model.telemetry import (
     SETTLED_AFTER_S,
     ShapeState,
     State,
-    column,
-    columns,
+    get_column,
+    get_columns,
 )
 from membrane_ctrl.review import open_run
-from membrane_ctrl.review.report.html import render
+from membrane_ctrl.review.report.html import render_report
 from membrane_ctrl.review.report.json import report_table
-from membrane_ctrl.review.statistics.analysis import analyse
-from membrane_ctrl.review.statistics.compare import compare
+from membrane_ctrl.review.statistics.analysis import analyse_run
+from membrane_ctrl.review.statistics.compare import compare_analyses
 from membrane_ctrl.review.statistics.error_series import fill_short_gaps
 from membrane_ctrl.review.statistics.without_feedforward import WithoutFeedforward
 from membrane_ctrl.run_files.hold_parts import HoldParts
@@ -43,13 +43,13 @@ def quiet_run(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 def test_windows_are_those_of_the_ticks(quiet_run: Path) -> None:
     rows, _ = night(1, HOURS, "typical", [])
-    time_s = column(rows, "mono_s")
-    reading = (column(rows, "setpoint_um") - column(rows, "displacement_um"))[
+    time_s = get_column(rows, "mono_s")
+    reading = (get_column(rows, "setpoint_um") - get_column(rows, "displacement_um"))[
         time_s >= time_s[0] + SETTLED_AFTER_S
     ]
     seconds = reading[np.floor(time_s[-reading.size :]) >= np.ceil(time_s[-reading.size])]
     means = seconds[: seconds.size // 10 * 10].reshape(-1, 10).mean(axis=1)
-    analysis = analyse(open_run(quiet_run))
+    analysis = analyse_run(open_run(quiet_run))
     assert analysis.reading is not None
     window = analysis.reading.windows[0]
     assert window.count == pytest.approx(means.size, abs=2)
@@ -65,7 +65,7 @@ def test_settled_is_five_seconds_of_hold_at_the_target() -> None:
     rows[400:450, COLUMN["setpoint_um"]] = 3.0  # a ramp
     hold_parts = HoldParts(2.0)
     mask = np.concatenate(
-        [hold_parts.of(columns(part))["held"] for part in np.split(rows, (150, 151, 430))]
+        [hold_parts.of(get_columns(part))["held"] for part in np.split(rows, (150, 151, 430))]
     )
     expected, unsettled_s = [], np.nan
     for time_s, state, setpoint_um in rows[
@@ -109,15 +109,15 @@ def test_the_benefit_of_the_feedforward_is_that_of_a_loop_without() -> None:
 
 def test_the_report_needs_no_segment(tmp_path: Path) -> None:
     folder = written(tmp_path, 0.05)
-    before = plain_json.dumps(report_table(analyse(open_run(folder))))
+    before = plain_json.dumps(report_table(analyse_run(open_run(folder))))
     (folder / "night-000.rrd").write_bytes(b"no recording")
-    assert plain_json.dumps(report_table(analyse(open_run(folder)))) == before
+    assert plain_json.dumps(report_table(analyse_run(open_run(folder)))) == before
     (folder / "night-000.rrd").unlink()
-    assert plain_json.dumps(report_table(analyse(open_run(folder)))) == before
+    assert plain_json.dumps(report_table(analyse_run(open_run(folder)))) == before
 
 
 def test_shape_figures(quiet_run: Path) -> None:
-    shape = analyse(open_run(quiet_run)).shape
+    shape = analyse_run(open_run(quiet_run)).shape
     assert shape is not None
     assert shape.cycles == HOURS * 900
     assert [round(pair.lag_s) for pair in shape.pairs] == [60, 600]
@@ -131,7 +131,7 @@ def test_shape_figures(quiet_run: Path) -> None:
 
 
 def test_report_is_plain_json(quiet_run: Path) -> None:
-    table = json.loads(plain_json.dumps(report_table(analyse(open_run(quiet_run)))))
+    table = json.loads(plain_json.dumps(report_table(analyse_run(open_run(quiet_run)))))
     assert table["schema"] == "membrane-report/1"
     assert table["reading"]["windows"][0]["window_s"] == 1
     assert table["anomalies"] == []
@@ -168,7 +168,7 @@ def test_the_page_carries_everything_itself(tmp_path: Path) -> None:
             + "\n"
         )
     tags = Tags()
-    page = render(analyse(open_run(folder)))
+    page = render_report(analyse_run(open_run(folder)))
     tags.feed(page)
     assert tags.count["svg"] >= 5
     assert tags.loaded == []
@@ -189,15 +189,15 @@ def test_command_writes_page_and_json(
 
 
 def test_alike_runs_do_not_differ_and_unlike_ones_do(quiet_run: Path, tmp_path: Path) -> None:
-    ours = analyse(open_run(quiet_run))
-    twin = analyse(open_run(written(tmp_path, HOURS, seed=7, name="20261122T180000Z-twin")))
-    alike = {d.name: d.said for d in compare(ours, twin)}
+    ours = analyse_run(open_run(quiet_run))
+    twin = analyse_run(open_run(written(tmp_path, HOURS, seed=7, name="20261122T180000Z-twin")))
+    alike = {d.name: d.said for d in compare_analyses(ours, twin)}
     assert alike["reading, std of 1 s"] == "no significant difference"
     rows, shapes = night(7, HOURS, "gusty", [])
     rows[:, COLUMN["displacement_um"]] *= 1.5
     write_run(tmp_path / "20261123T180000Z-worse", iter([(rows, shapes)]))
-    worse = analyse(open_run(tmp_path / "20261123T180000Z-worse"))
-    unlike = {d.name: d.said for d in compare(ours, worse)}
+    worse = analyse_run(open_run(tmp_path / "20261123T180000Z-worse"))
+    unlike = {d.name: d.said for d in compare_analyses(ours, worse)}
     assert unlike["reading, std of 1 s"] == "smaller"
 
 
@@ -218,9 +218,9 @@ def test_a_run_that_never_held(tmp_path: Path) -> None:
     rows, _ = night(1, 0.05, "typical", [])
     rows[:, COLUMN["state"]] = State.INFLATE
     write_run(tmp_path / "run", iter([(rows, [])]))
-    analysis = analyse(open_run(tmp_path / "run"))
+    analysis = analyse_run(open_run(tmp_path / "run"))
     assert report_table(analysis)["verdict"] == "bad"
-    assert "Not held" in render(analysis)
+    assert "Not held" in render_report(analysis)
 
 
 def test_a_mark_may_say_anything(quiet_run: Path, tmp_path: Path) -> None:
@@ -229,7 +229,7 @@ def test_a_mark_may_say_anything(quiet_run: Path, tmp_path: Path) -> None:
     texts = ["$\\frac{$ <b>", "日本 $", "two\nlines", "long " * 100]
     for number, text in enumerate(texts):
         assert command(["review", "mark", str(folder), text, "--at", f"+{100 + number}s"]) == 0
-    page = render(analyse(open_run(folder)))
+    page = render_report(analyse_run(open_run(folder)))
     assert all(html.escape(" ".join(text.split())) in page for text in texts)
     assert "<b>" not in page.split("<svg")[1]
 
@@ -245,7 +245,7 @@ def test_a_shape_loop_that_does_not_track_is_named(
     write_run(tmp_path / "run", iter([(rows, [])]))
     seen = [
         odd.seen
-        for odd in analyse(open_run(tmp_path / "run")).anomalies
+        for odd in analyse_run(open_run(tmp_path / "run")).anomalies
         if odd.name == "shape loop"
     ]
     assert [text.split(" of ")[0] for text in seen] == (
@@ -254,23 +254,23 @@ def test_a_shape_loop_that_does_not_track_is_named(
 
 
 def test_one_window_has_no_spread(quiet_run: Path) -> None:
-    analysis = analyse(open_run(quiet_run), 59.5, 125.0)
+    analysis = analyse_run(open_run(quiet_run), 59.5, 125.0)
     assert analysis.reading is not None
     minutes = analysis.reading.windows[2]
     assert (minutes.count, np.isnan(minutes.std_um), np.isfinite(minutes.max_um)) == (1, True, True)
 
 
 def test_no_window_has_no_share(quiet_run: Path) -> None:
-    analysis = analyse(open_run(quiet_run), 59.5, 95.0)
+    analysis = analyse_run(open_run(quiet_run), 59.5, 95.0)
     assert analysis.reading is not None
     assert analysis.reading.windows[2].count == 0
-    assert "– %" not in render(analysis)
+    assert "– %" not in render_report(analysis)
 
 
 def test_nothing_to_report(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     folder = written(tmp_path, 0.02)
     with pytest.raises(InputError, match="nothing to report"):
-        analyse(open_run(folder), 1e6, 2e6)
+        analyse_run(open_run(folder), 1e6, 2e6)
     assert command(["report", str(tmp_path / "absent")]) == 2
     assert "no such run" in capsys.readouterr().err
 

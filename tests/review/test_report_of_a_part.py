@@ -8,9 +8,9 @@ from pathlib import Path
 import pytest
 
 from membrane_ctrl.cli import run as command
-from membrane_ctrl.model.telemetry import COLUMN, column
+from membrane_ctrl.model.telemetry import COLUMN, get_column
 from membrane_ctrl.review import open_run
-from membrane_ctrl.review.statistics.analysis import analyse
+from membrane_ctrl.review.statistics.analysis import analyse_run
 from tests.support.review_runs import written
 from tests.worlds.nights import night, write_run
 
@@ -23,7 +23,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     2 at 200 s.
     """
     rows, shapes = night(1, HOURS, "typical", [])
-    time_s = column(rows, "mono_s")
+    time_s = get_column(rows, "mono_s")
     rows[:, COLUMN["missed_ticks"]] = 5.0 * (time_s > 60) + 2.0 * (time_s > 200)
     folder = tmp_path_factory.mktemp("part") / "20261121T180000Z-part"
     write_run(folder, iter([(rows, shapes)]))
@@ -36,7 +36,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def _seen(folder: Path, start_s: float, end_s: float) -> dict[str, str]:
-    return {odd.name: odd.seen for odd in analyse(open_run(folder), start_s, end_s).anomalies}
+    return {odd.name: odd.seen for odd in analyse_run(open_run(folder), start_s, end_s).anomalies}
 
 
 def test_faults_and_missed_ticks_of_a_part_are_its_own(folder: Path) -> None:

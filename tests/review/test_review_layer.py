@@ -13,7 +13,7 @@ import pytest
 from rerun.chunk import RrdReader
 
 from membrane_ctrl.config.schema import Config
-from membrane_ctrl.recorder.blueprint import learned
+from membrane_ctrl.recorder.blueprint import list_learned_plots
 from membrane_ctrl.review import open_run
 from membrane_ctrl.review.viewer.blueprints import ReviewBlueprint, labels_of
 from membrane_ctrl.review.viewer.command import ReviewOptions, make_review
@@ -144,7 +144,7 @@ def test_what_was_learned_of_the_pump_is_drawn_with_its_error(night: Path, tmp_p
 def test_the_loop_s_tab_has_what_the_loop_learns(
     config: dict[str, dict[str, Any]], plots: int
 ) -> None:
-    assert len(learned(Config.model_validate(config))) == plots
+    assert len(list_learned_plots(Config.model_validate(config))) == plots
     tab = ReviewBlueprint(("",), "utc", None, Config.model_validate(config))._loop()
     assert len(list(tab.contents)) == 5 + plots
 

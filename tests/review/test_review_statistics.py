@@ -8,9 +8,14 @@ import pytest
 from scipy import signal
 
 from membrane_ctrl.review.statistics.allan_deviation import allan_deviation
-from membrane_ctrl.review.statistics.drift import slope
+from membrane_ctrl.review.statistics.drift import fit_slope
 from membrane_ctrl.review.statistics.error_series import slow_spectrum
-from membrane_ctrl.review.statistics.power_spectrum import Spectrum, bands, power_spectrum, unseen_s
+from membrane_ctrl.review.statistics.power_spectrum import (
+    Spectrum,
+    band_rms,
+    power_spectrum,
+    unseen_s,
+)
 
 RATE_HZ = 10.0
 
@@ -88,7 +93,7 @@ def test_the_bands_of_a_long_hold_add_up_and_slow_motion_is_in_its_own(
     values = np.sin(2 * np.pi * time_s / period_s) + 0.1 * np.random.default_rng(6).normal(
         size=time_s.size
     )
-    found = bands(*spectra(values, 50))
+    found = band_rms(*spectra(values, 50))
     powers = {band.low_hz: band.rms_um**2 for band in found if np.isfinite(band.rms_um)}
     assert np.sqrt(sum(powers.values())) == pytest.approx(values.std(), rel=0.01)
     own = next(band for band in found if band.low_hz < 1 / period_s <= band.high_hz)
@@ -106,14 +111,14 @@ def test_a_lost_light_leaves_the_slow_bands() -> None:
     values[250_000:260_000] = np.nan  # not bridged
     fast, slow = spectra(values, 10)
     assert slow.segments >= 2
-    assert next(band for band in bands(fast, slow) if band.low_hz == 1e-4).rms_um == pytest.approx(
-        0.707, rel=0.03
-    )
+    assert next(
+        band for band in band_rms(fast, slow) if band.low_hz == 1e-4
+    ).rms_um == pytest.approx(0.707, rel=0.03)
 
 
 def test_too_short_for_a_band_is_said() -> None:
-    assert all(np.isnan(band.rms_um) for band in bands(*spectra(np.full(100, np.nan), 10)))
-    found = bands(*spectra(np.random.default_rng(7).normal(size=600), 10))
+    assert all(np.isnan(band.rms_um) for band in band_rms(*spectra(np.full(100, np.nan), 10)))
+    found = band_rms(*spectra(np.random.default_rng(7).normal(size=600), 10))
     assert [np.isnan(band.from_hz) for band in found] == [True, True, True, False, False, False]
     assert found[3].from_hz > found[3].low_hz
 
@@ -126,7 +131,7 @@ def test_the_interval_of_the_slope_covers_the_truth_as_often_as_it_says(memory: 
     covered = 0
     for _ in range(200):
         noise = signal.lfilter([1.0], [1.0, -memory], rng.normal(size=500))[100:]
-        found = slope(time_s, true_per_hour * time_s / 3600 + noise)
+        found = fit_slope(time_s, true_per_hour * time_s / 3600 + noise)
         covered += found.low <= true_per_hour <= found.high
     assert 180 <= covered <= 199
 
@@ -143,7 +148,7 @@ def test_the_interval_of_a_short_record_knows_that_the_line_took_up_its_wander(
     for _ in range(200):
         noise = rng.normal(size=count) * np.sqrt(1 - memory**2)
         noise[0] = rng.normal()
-        found = slope(time_s, np.asarray(signal.lfilter([1.0], [1.0, -memory], noise)))
+        found = fit_slope(time_s, np.asarray(signal.lfilter([1.0], [1.0, -memory], noise)))
         covered += found.low <= 0.0 <= found.high
     assert 0.89 <= covered / 200 <= 0.98
 
@@ -152,7 +157,7 @@ def test_a_slope_is_seen_and_too_few_values_say_nothing() -> None:
     time_s = 60.0 * np.arange(100)
     values = 0.5 * time_s / 3600 + 0.01 * np.random.default_rng(5).normal(size=100)
     values[10] = np.nan
-    found = slope(time_s, values)
+    found = fit_slope(time_s, values)
     assert found.significant
     assert found.per_hour == pytest.approx(0.5, abs=0.02)
-    assert np.isnan(slope(time_s[:4], values[:4]).per_hour)
+    assert np.isnan(fit_slope(time_s[:4], values[:4]).per_hour)

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from membrane_ctrl.model.telemetry import unpack
+from membrane_ctrl.model.telemetry import unpack_rows
 from membrane_ctrl.review import open_run
 from membrane_ctrl.review.viewer.command import ReviewOptions, make_review
 from membrane_ctrl.run_files.run import Run
@@ -25,7 +25,7 @@ def run(tmp_path: Path) -> Run:
     """30 s with a set of two pictures a second."""
     folder = create_run_folder(tmp_path, "night", STARTED_UTC, CONFIG)
     tables = RunTables(folder, STARTED_UTC)
-    tables.add_ticks(batch_of(unpack([row.pack() for row in rows_of(float(SETS))])))
+    tables.add_ticks(batch_of(unpack_rows([row.pack() for row in rows_of(float(SETS))])))
     for number in range(SETS):
         for pattern in PATTERNS:
             tables.add_thumbnail(number + 0.5, pattern, f"{pattern} {number}".encode())

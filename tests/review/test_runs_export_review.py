@@ -23,12 +23,12 @@ from rerun.chunk import RrdReader
 from membrane_ctrl.cli import run as command
 from membrane_ctrl.config.schema import LoopConfig
 from membrane_ctrl.model.errors import DeviceError, InputError
-from membrane_ctrl.model.telemetry import column
+from membrane_ctrl.model.telemetry import get_column
 from membrane_ctrl.model.zernike_terms import NOLL_INDICES
 from membrane_ctrl.review import open_run
-from membrane_ctrl.review.catalogue import Filter, entries, resolve
-from membrane_ctrl.review.export import export
-from membrane_ctrl.review.formatting import number, one_line, span
+from membrane_ctrl.review.catalogue import Filter, list_entries, resolve_run
+from membrane_ctrl.review.export import export_run
+from membrane_ctrl.review.formatting import format_number, format_span, one_line
 from membrane_ctrl.review.prune import to_prune
 from membrane_ctrl.review.report import html
 from membrane_ctrl.review.report.pump_history import pump_change, pump_history
@@ -101,11 +101,11 @@ def test_a_pump_that_wears_over_the_weeks_is_told(tmp_path: Path) -> None:
     )
     assert pump_change(seen, 0.12) == said
     assert pump_change(seen, 0.25) == ""
-    page = html._history(seen, 0.12)
-    assert html._text(said) in page
+    page = html._render_history(seen, 0.12)
+    assert html._escape_text(said) in page
     assert "0.800 ± 0.030" in page
     assert "<svg" in page
-    assert html._text(said) not in html._history(seen, 0.25)
+    assert html._escape_text(said) not in html._render_history(seen, 0.25)
     assert pump_change([], 0.12) == ""
 
 
@@ -120,36 +120,41 @@ def test_a_change_within_its_error_or_of_another_curve_is_none(tmp_path: Path) -
 
 
 def test_the_catalogue_lists_and_filters(logs: Path) -> None:
-    assert [entry.std_um for entry in entries(logs)] == [0.1, 0.3, 0.2]
+    assert [entry.std_um for entry in list_entries(logs)] == [0.1, 0.3, 0.2]
     since = datetime(2026, 11, 22, tzinfo=UTC)
     # what is written in a run's events counts as its start, not its name
-    assert len(entries(logs, Filter(since_utc=since))) == 0
-    assert [e.name[:8] for e in entries(logs, Filter(most_std_um=0.2))] == ["20261121", "20261123"]
-    assert entries(logs, Filter(with_faults=True)) == []
-    assert len(entries(logs, Filter(configuration=entries(logs)[0].configuration[:4]))) == 3
-    assert [e.name[:8] for e in entries(logs, Filter(text="1122"))] == ["20261122"]
+    assert len(list_entries(logs, Filter(since_utc=since))) == 0
+    assert [e.name[:8] for e in list_entries(logs, Filter(most_std_um=0.2))] == [
+        "20261121",
+        "20261123",
+    ]
+    assert list_entries(logs, Filter(with_faults=True)) == []
+    assert (
+        len(list_entries(logs, Filter(configuration=list_entries(logs)[0].configuration[:4]))) == 3
+    )
+    assert [e.name[:8] for e in list_entries(logs, Filter(text="1122"))] == ["20261122"]
 
 
 def test_a_run_without_an_end_is_as_long_as_what_it_has(tmp_path: Path) -> None:
     folder = written(tmp_path, 0.1)
     (folder / "summary.json").unlink()
-    assert [entry.exit for entry in entries(tmp_path, Filter(least_s=359.0))] == ["open"]
-    assert entries(tmp_path, Filter(least_s=370.0)) == []
+    assert [entry.exit for entry in list_entries(tmp_path, Filter(least_s=359.0))] == ["open"]
+    assert list_entries(tmp_path, Filter(least_s=370.0)) == []
     shutil.rmtree(folder / "ticks_1s")
-    assert np.isnan(entries(tmp_path)[0].duration_s)
+    assert np.isnan(list_entries(tmp_path)[0].duration_s)
 
 
 def test_a_run_is_found_by_part_of_its_name(logs: Path) -> None:
-    assert resolve(Path("1122"), logs).name == "20261122T180000Z-night"
-    assert resolve(Path("last"), logs).name == "20261123T180000Z-night"
+    assert resolve_run(Path("1122"), logs).name == "20261122T180000Z-night"
+    assert resolve_run(Path("last"), logs).name == "20261123T180000Z-night"
     with pytest.raises(InputError, match="several runs match"):
-        resolve(Path("night"), logs)
+        resolve_run(Path("night"), logs)
     second = logs / "20261122T180000Z-night-2"  # a second run in the same second
     leftover = logs / ".deleted-20261123T180000Z-night"
     for copy in (second, leftover):
         shutil.copytree(logs / "20261122T180000Z-night", copy)
-    assert resolve(Path("20261122T180000Z-night"), logs).name == "20261122T180000Z-night"
-    assert [entry.name[:8] for entry in entries(logs)] == [
+    assert resolve_run(Path("20261122T180000Z-night"), logs).name == "20261122T180000Z-night"
+    assert [entry.name[:8] for entry in list_entries(logs)] == [
         "20261121",
         "20261122",
         "20261122",
@@ -198,15 +203,15 @@ def test_prune_spares_what_is_kept_and_says_before_it_does(tmp_path: Path) -> No
     assert [run.folder.name[:8] for run, _ in gone] == ["20261102", "20261103"]
     # by today's clock the one without a summary may still run
     assert command(["runs", "prune", "--logs", str(tmp_path), "--keep-gb", "0"]) == 0
-    assert len(entries(tmp_path)) == 6
+    assert len(list_entries(tmp_path)) == 6
     assert command(["runs", "prune", "--logs", str(tmp_path), "--keep-gb", "0", "--delete"]) == 0
-    assert [run.name[:8] for run in entries(tmp_path)] == ["20261101", "20261102"]
+    assert [run.name[:8] for run in list_entries(tmp_path)] == ["20261101", "20261102"]
 
 
 @pytest.mark.parametrize("to", ["parquet", "csv", "hdf5"])
 def test_exports_hold_the_ticks(tmp_path: Path, to: str) -> None:
     rows, shapes = night(1, 0.03, "typical", [])
-    files = export(open_run(written(tmp_path, 0.03)), to, tmp_path / "out")
+    files = export_run(open_run(written(tmp_path, 0.03)), to, tmp_path / "out")
     assert all(path.exists() for path in files)
     if to == "hdf5":
         with h5py.File(tmp_path / "out" / "run.h5") as file:
@@ -216,23 +221,23 @@ def test_exports_hold_the_ticks(tmp_path: Path, to: str) -> None:
         error = read(tmp_path / "out" / f"ticks.{to}").column("error_um").to_numpy()
         table = read(tmp_path / "out" / f"shapes.{to}")
         coeffs = np.column_stack([table.column(f"z{j}_um").to_numpy() for j in NOLL_INDICES])
-    assert same(error, column(rows, "error_um"), 1e-4)
+    assert same(error, get_column(rows, "error_um"), 1e-4)
     np.testing.assert_allclose(coeffs, [shape.coeffs_um for shape in shapes])
 
 
 def test_export_of_some_streams_and_a_part(tmp_path: Path) -> None:
     run = open_run(written(tmp_path, 0.03))
-    files = export(run, "parquet", tmp_path / "o", ["/loop/error", "pump_fraction"], 10.0, 20.0)
+    files = export_run(run, "parquet", tmp_path / "o", ["/loop/error", "pump_fraction"], 10.0, 20.0)
     table = pyarrow.parquet.read_table(files[0])
     assert ([path.name for path in files], table.num_rows) == (["ticks.parquet"], 100)
     assert table.column_names == ["time_s", "time_utc", "error_um", "pump_fraction"]
     with pytest.raises(InputError, match="/loop/eror"):
-        export(run, "csv", tmp_path / "o", ["/loop/eror"])
+        export_run(run, "csv", tmp_path / "o", ["/loop/eror"])
     with pytest.raises(InputError, match="xls"):
-        export(run, "xls", tmp_path / "o")
+        export_run(run, "xls", tmp_path / "o")
     (tmp_path / "file").touch()
     with pytest.raises(DeviceError, match="cannot be written"):
-        export(run, "csv", tmp_path / "file")
+        export_run(run, "csv", tmp_path / "file")
 
 
 def test_the_end_of_an_exported_part_is_given_as_everywhere(tmp_path: Path) -> None:
@@ -281,14 +286,18 @@ def test_moments_that_are_none(text: str) -> None:
 
 def test_words() -> None:
     assert one_line("a door\n\x1b[31mµ") == "a door  [31mµ"
-    assert [span(s) for s in (41, 65, 3600, 28_740, 2_606_400)] == [
+    assert [format_span(s) for s in (41, 65, 3600, 28_740, 2_606_400)] == [
         "41 s",
         "1 min 5 s",
         "1 h",
         "7 h 59 min",
         "30 d 4 h",
     ]
-    assert (span(float("nan")), number(float("nan")), number(0.12345)) == ("?", "–", "0.123")
+    assert (format_span(float("nan")), format_number(float("nan")), format_number(0.12345)) == (
+        "?",
+        "–",
+        "0.123",
+    )
 
 
 def entities(path: Path) -> dict[str, int]:

@@ -9,11 +9,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from membrane_ctrl.hold.closing_words import _headline
-from membrane_ctrl.model.telemetry import COLUMN, Rows, columns, true_error_um
+from membrane_ctrl.hold.closing_words import _list_headlines
+from membrane_ctrl.model.telemetry import COLUMN, Rows, get_columns, true_error_um
 from membrane_ctrl.review import open_run
-from membrane_ctrl.review.report.json import report_table, verdict
-from membrane_ctrl.review.statistics.analysis import analyse
+from membrane_ctrl.review.report.json import make_verdict, report_table
+from membrane_ctrl.review.statistics.analysis import analyse_run
 from membrane_ctrl.run_files.summary import Summary
 from tests.support.review_runs import segment
 from tests.support.rrd_reading import scalars
@@ -31,14 +31,14 @@ def rows() -> Rows:
 
 
 def test_every_place_shows_the_same_sign(tmp_path: Path, rows: Rows) -> None:
-    assert true_error_um(columns(rows)).mean() == pytest.approx(SHALLOW_UM)
+    assert true_error_um(get_columns(rows)).mean() == pytest.approx(SHALLOW_UM)
     summary = Summary.for_config(CONFIG)
     summary.add_rows(rows)
     table = summary.as_dict({}, {})
     folder = tmp_path / "20261121T180000Z-shallow"
     write_run(folder, iter([(rows, [])]))
     run = open_run(folder)
-    analysis = analyse(run)
+    analysis = analyse_run(run)
     report = report_table(analysis)
     _, recorded = scalars(segment(folder, rows), "/truth/error")
     shown = {
@@ -49,5 +49,5 @@ def test_every_place_shows_the_same_sign(tmp_path: Path, rows: Rows) -> None:
         "Rerun": float(recorded.mean()),
     }
     assert all(value == pytest.approx(SHALLOW_UM, abs=0.2) for value in shown.values()), shown
-    assert f"mean {report['true']['windows'][0]['mean_um']:+.3f} µm" in verdict(analysis)[1]
-    assert any(line.endswith(f"{table['true_bias_um']:+.3f} µm") for line in _headline(table))
+    assert f"mean {report['true']['windows'][0]['mean_um']:+.3f} µm" in make_verdict(analysis)[1]
+    assert any(line.endswith(f"{table['true_bias_um']:+.3f} µm") for line in _list_headlines(table))

@@ -12,11 +12,11 @@ import pytest
 
 from membrane_ctrl.cli import run as command
 from membrane_ctrl.model import file_checksums
-from membrane_ctrl.model.telemetry import Rows, columns, unpack
+from membrane_ctrl.model.telemetry import Rows, get_columns, unpack_rows
 from membrane_ctrl.review import open_run
-from membrane_ctrl.review.catalogue import entry
+from membrane_ctrl.review.catalogue import read_entry
 from membrane_ctrl.review.report.json import report_table
-from membrane_ctrl.review.statistics.analysis import analyse
+from membrane_ctrl.review.statistics.analysis import analyse_run
 from membrane_ctrl.run_files.hold_parts import HoldParts
 from membrane_ctrl.run_files.summary import Summary
 from tests.support.scenario import CheckedScenario, play
@@ -42,7 +42,9 @@ def rows() -> Rows:
         "at": at,
         "expect": {},
     }
-    return unpack([tick.row.pack() for tick in play(CheckedScenario.model_validate(about)).ticks])
+    return unpack_rows(
+        [tick.row.pack() for tick in play(CheckedScenario.model_validate(about)).ticks]
+    )
 
 
 @pytest.fixture(scope="module")
@@ -61,16 +63,16 @@ def folder(rows: Rows, tmp_path_factory: pytest.TempPathFactory) -> Path:
 def test_the_parts_are_those_that_were_asked_for_in_any_blocks(rows: Rows, batch: int) -> None:
     parts = HoldParts(2.0)
     blocks = [
-        parts.of(columns(rows[first : first + batch])) for first in range(0, len(rows), batch)
+        parts.of(get_columns(rows[first : first + batch])) for first in range(0, len(rows), batch)
     ]
     found = {name: np.concatenate([block[name] for block in blocks]) for name in blocks[0]}
     assert np.sum([*found.values()], axis=0).max() == 1
-    time_s = columns(rows)["mono_s"]
+    time_s = get_columns(rows)["mono_s"]
     assert time_s[found["paused"]][[0, -1]] == pytest.approx([160.1, 200.0], abs=0.2)
     assert time_s[found["faults"]][[0, -1]] == pytest.approx([320.3, 328.5], abs=1.0)
     assert not found["held"][(time_s > 60.2) & (time_s < 70.0)].any()
     strayed = np.flatnonzero(found["moving"] & (time_s > 200.1) & (time_s < 300.0))
-    assert np.abs(columns(rows)["error_um"][strayed[0]]) > 20.0
+    assert np.abs(get_columns(rows)["error_um"][strayed[0]]) > 20.0
     assert time_s[strayed[-1]] - time_s[strayed[0]] > 10.0
     assert found["held"][time_s > 345.0].mean() > 0.9
 
@@ -78,8 +80,8 @@ def test_the_parts_are_those_that_were_asked_for_in_any_blocks(rows: Rows, batch
 def test_every_place_states_the_same_quality(
     folder: Path, rows: Rows, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    report = report_table(analyse(open_run(folder)))
-    listed = entry(folder)
+    report = report_table(analyse_run(open_run(folder)))
+    listed = read_entry(folder)
     window = report["true"]["windows"][0]
     assert window["std_um"] < 0.5
     assert (listed.std_um, listed.in_band) == pytest.approx(
@@ -111,4 +113,4 @@ def test_a_summary_of_no_length_is_shown(
 
 def test_a_summary_of_another_schema_gives_no_figures(folder: Path) -> None:
     (folder / "summary.json").write_text('{"schema": "membrane-summary/0", "true_std_um": 2.24}')
-    assert np.isnan(entry(folder).std_um)
+    assert np.isnan(read_entry(folder).std_um)

@@ -9,9 +9,9 @@ import pytest
 
 from membrane_ctrl.model.telemetry import COLUMN
 from membrane_ctrl.review import open_run
-from membrane_ctrl.review.statistics.analysis import analyse
+from membrane_ctrl.review.statistics.analysis import analyse_run
 from membrane_ctrl.run_files.recorded_rate import recorded_rate_hz
-from membrane_ctrl.run_files.run_config import understood
+from membrane_ctrl.run_files.run_config import keep_understood
 from tests.support.review_runs import tables, written
 from tests.worlds.nights import night
 
@@ -45,7 +45,7 @@ def test_values_that_cannot_be_are_at_their_defaults_one_by_one() -> None:
         "pump": 7,
         "gone": [{"x": 1}],
     }
-    config, left_out = understood(tables)
+    config, left_out = keep_understood(tables)
     assert sorted(left_out) == ["gone", "limits.older", "loop.kp_per_s", "pump"]
     assert (config.loop.rate_hz, config.loop.ti_s, config.limits.band_um) == (10.0, 9.0, 3.0)
     assert tables["pump"] == 7
@@ -53,7 +53,7 @@ def test_values_that_cannot_be_are_at_their_defaults_one_by_one() -> None:
 
 @pytest.mark.parametrize("text", [None, "", "[loop]\nrate_hz = 50.0\n"])
 def test_the_rate_is_that_of_the_ticks(folder: Path, text: str | None) -> None:
-    right = analyse(open_run(folder))
+    right = analyse_run(open_run(folder))
     path = folder / "config.toml"
     kept = path.read_text()
     path.unlink()
@@ -62,7 +62,7 @@ def test_the_rate_is_that_of_the_ticks(folder: Path, text: str | None) -> None:
     run = open_run(folder)
     path.write_text(kept)
     assert any("ticks at 10 Hz" in note for note in run.notes)
-    found = analyse(run)
+    found = analyse_run(run)
     assert found.ticks.hold_s == pytest.approx(HOURS * 3600, abs=1)
     assert found.reading is not None
     assert right.reading is not None

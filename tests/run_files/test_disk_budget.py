@@ -15,7 +15,7 @@ from membrane_ctrl.model.recorder_events import RecorderError, RecorderRecovered
 from membrane_ctrl.recorder.housekeeping import RETENTION_INTERVAL_S, Housekeeping
 from membrane_ctrl.recorder.recorder_errors import RecorderErrors
 from membrane_ctrl.run_files.detail_level import DetailLevel, detail_level
-from membrane_ctrl.run_files.retention import OldRun, deletable_runs, delete_run, expired
+from membrane_ctrl.run_files.retention import OldRun, deletable_runs, delete_run, find_expired
 
 NOW = datetime(2026, 11, 21, 12, tzinfo=UTC)
 
@@ -50,7 +50,8 @@ def gone(
     runs: list[OldRun], keep_gb: float | None, keep_days: float | None, present_gb: float = 0.0
 ) -> list[str]:
     return [
-        run.folder.name for run, _ in expired(runs, int(present_gb * 1e9), keep_gb, keep_days, NOW)
+        run.folder.name
+        for run, _ in find_expired(runs, int(present_gb * 1e9), keep_gb, keep_days, NOW)
     ]
 
 

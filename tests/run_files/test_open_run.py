@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from membrane_ctrl.model.errors import InputError
-from membrane_ctrl.model.telemetry import FIELDS, column
+from membrane_ctrl.model.telemetry import FIELDS, get_column
 from membrane_ctrl.review import open_run
 from membrane_ctrl.run_files.levels import (
     CODES,
@@ -25,7 +25,7 @@ from tests.worlds.nights import night
 
 
 def level_of(rows: np.ndarray) -> dict[str, np.ndarray]:
-    return first_level({name: column(rows, name) for name in TICK_FIELDS})
+    return first_level({name: get_column(rows, name) for name in TICK_FIELDS})
 
 
 def test_every_field_comes_back(tmp_path: Path) -> None:
@@ -33,7 +33,7 @@ def test_every_field_comes_back(tmp_path: Path) -> None:
     table = open_run(written(tmp_path, 0.1)).ticks()
     assert table.column_names == ["time_s", "time_utc", *FIELDS[1:]]
     for name in {*FIELDS[1:]} - {*CODES}:
-        assert same(table.column(name).to_numpy(), column(rows, name), 1e-4), name
+        assert same(table.column(name).to_numpy(), get_column(rows, name), 1e-4), name
     back = open_run(tmp_path / "20261121T180000Z-night").shapes()
     np.testing.assert_allclose(back.coeffs_um, [shape.coeffs_um for shape in shapes])
     np.testing.assert_allclose(back.covariance_um2[0], shapes[0].covariance_um2, rtol=1e-6)
@@ -57,8 +57,8 @@ def test_levels_are_least_mean_and_greatest_of_their_windows(
 ) -> None:
     rows, _ = night(1, 0.1, "typical", [])
     level = open_run(written(tmp_path, 0.1)).level(window_s)
-    number = np.floor(column(rows, "mono_s") / window_s)
-    pressure = column(rows, "ambient_pressure_pa")
+    number = np.floor(get_column(rows, "mono_s") / window_s)
+    pressure = get_column(rows, "ambient_pressure_pa")
     for k in (0, level["time_s"].size // 2, level["time_s"].size - 1):
         inside = pressure[number == level["time_s"][k] / window_s]
         assert level["rows"][k] == inside.size

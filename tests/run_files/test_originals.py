@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 from membrane_ctrl.cli import run as command
-from membrane_ctrl.review.export import export
+from membrane_ctrl.review.export import export_run
 from membrane_ctrl.run_files.annotations import ANNOTATIONS_FILE
 from membrane_ctrl.run_files.run import open_run
 from tests.support.review_runs import written
@@ -47,7 +47,7 @@ def test_nothing_is_exported_over_a_run(tmp_path: Path, capsys: Capsys, inside: 
 @pytest.mark.parametrize("to", ["csv", "hdf5"])
 def test_an_export_that_fails_leaves_the_one_before(tmp_path: Path, to: str) -> None:
     folder, out = written(tmp_path, 0.01), tmp_path / "out"
-    export(open_run(folder), to, out)
+    export_run(open_run(folder), to, out)
     before = contents(out)
     assert command(["export", str(folder), "--format", to, "--out", str(out), "--from", "+9h"]) == 2
     assert contents(out) == before

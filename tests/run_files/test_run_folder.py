@@ -34,7 +34,7 @@ def test_configuration_is_written_whole_and_reads_back(tmp_path: Path) -> None:
     config = Config.model_validate({"loop": {"setpoint_um": 12.5}})
     run_dir = run_folder.create_run_folder(tmp_path, "demo", STARTED_UTC, config)
     text = (run_dir / "config.toml").read_text()
-    assert config_file.load(run_dir / "config.toml", Config) == config
+    assert config_file.load_toml(run_dir / "config.toml", Config) == config
     assert "barometer_gain_um_per_pa" in text  # a default nobody asked for
     assert "None" not in text
     assert {path.name for path in run_dir.iterdir()} == {"config.toml", "run.json"}

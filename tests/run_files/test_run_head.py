@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 
 from membrane_ctrl.config.schema import Config
-from membrane_ctrl.config.toml_file import load
+from membrane_ctrl.config.toml_file import load_toml
 from membrane_ctrl.model.file_checksums import dumps_checked
 from membrane_ctrl.model.program import program_identity, stated_program
 from membrane_ctrl.run_files.run_folder import create_run_folder
@@ -29,7 +29,7 @@ def test_a_new_run_states_format_and_program(folder: Path) -> None:
     assert read_run_head(folder, notes) == RunHead(FORMAT, program_identity())
     assert notes == []
     assert program_identity() in (folder / "config.toml").read_text()
-    assert load(folder / "config.toml", Config) == Config()
+    assert load_toml(folder / "config.toml", Config) == Config()
 
 
 def test_a_run_without_head_has_an_unknown_program(tmp_path: Path) -> None:

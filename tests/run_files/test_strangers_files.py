@@ -15,13 +15,13 @@ from membrane_ctrl.model.files import (
     append_text,
     fresh_file,
     make_folder,
-    move,
+    move_file,
     open_plain,
     read_bytes,
     read_text,
-    remove,
+    remove_file,
+    resolve_user_path,
     scratch_folder,
-    users,
     write_text_atomic,
 )
 
@@ -64,7 +64,7 @@ def test_nor_is_a_file_in_a_linked_folder(folder: Path, secret: Path) -> None:
         lambda path: write_text_atomic(path, "x"),
         lambda path: append_text(path, "x"),
         fresh_file,
-        remove,
+        remove_file,
     ):
         with pytest.raises(OSError, match="is a link, and links are not followed here"):
             act(folder / "columns" / secret.name)
@@ -102,10 +102,10 @@ def test_a_fresh_file_and_a_moved_one_take_a_links_place(folder: Path, secret: P
     with fresh_file(folder / "a") as file:
         file.write(b"mine")
     (folder / "b").symlink_to(secret)
-    move(folder / "a", folder / "b")
+    move_file(folder / "a", folder / "b")
     assert [(path.name, path.read_text()) for path in folder.iterdir()] == [("b", "mine")]
-    remove(folder / "b")
-    remove(folder / "b")  # not there: nothing to do
+    remove_file(folder / "b")
+    remove_file(folder / "b")  # not there: nothing to do
     assert secret.read_text() == "secret"
 
 
@@ -153,7 +153,7 @@ def test_an_error_names_the_file(folder: Path) -> None:
 
 def test_a_path_that_the_user_named_may_lead_through_links(folder: Path, tmp_path: Path) -> None:
     (tmp_path / "short").symlink_to(folder)
-    write_text_atomic(users(tmp_path / "short" / "a"), "mine")
+    write_text_atomic(resolve_user_path(tmp_path / "short" / "a"), "mine")
     assert (folder / "a").read_text() == "mine"
 
 

@@ -14,7 +14,7 @@ import pytest
 from membrane_ctrl.config.schema import Config
 from membrane_ctrl.model.clock import RunClock
 from membrane_ctrl.model.event_lines import from_dict
-from membrane_ctrl.model.telemetry import COLUMN, FIELDS, changes, column, unpack
+from membrane_ctrl.model.telemetry import COLUMN, FIELDS, find_changes, get_column, unpack_rows
 from membrane_ctrl.processes.frames import FrameRing, FrameWriter
 from membrane_ctrl.recorder.rerun_recording import Recording
 from membrane_ctrl.recorder.rerun_shapes import ShapeStreams
@@ -38,7 +38,7 @@ def test_no_two_streams_share_an_entity() -> None:
 
 
 def test_overview_is_least_mean_and_greatest() -> None:
-    rows = unpack([row.pack() for row in rows_of(2.0)])
+    rows = unpack_rows([row.pack() for row in rows_of(2.0)])
     errors = [row.error_um for row in rows_of(2.0)]
     assert overview_um(rows)[0] == pytest.approx([min(errors), np.mean(errors), max(errors)])
     assert np.isnan(overview_um(rows * np.nan)).all()
@@ -46,8 +46,8 @@ def test_overview_is_least_mean_and_greatest() -> None:
 
 def test_changes_are_found_at_the_edges_too() -> None:
     codes = np.array([4.0, 4.0, 8.0, np.nan, 8.0])
-    assert changes(codes, 4.0) == [(2, 8), (4, 8)]
-    assert changes(codes, np.nan) == [(0, 4), (2, 8), (4, 8)]
+    assert find_changes(codes, 4.0) == [(2, 8), (4, 8)]
+    assert find_changes(codes, np.nan) == [(0, 4), (2, 8), (4, 8)]
 
 
 def test_codes_have_words() -> None:
@@ -60,17 +60,17 @@ def test_codes_have_words() -> None:
 
 
 def test_means_are_of_what_is_there() -> None:
-    rows = unpack([row.pack() for row in rows_of(0.1)]).copy()
+    rows = unpack_rows([row.pack() for row in rows_of(0.1)]).copy()
     rows[:, COLUMN["pump_fraction"]] = [0.1, np.nan, 0.3, np.nan, 0.5]
     mean = mean_row(rows)
-    assert column(mean, "pump_fraction") == pytest.approx([0.3])
-    assert column(mean, "mono_s") == pytest.approx([0.04])
-    assert np.isnan(column(mean, "gas_temperature_c")).all()
+    assert get_column(mean, "pump_fraction") == pytest.approx([0.3])
+    assert get_column(mean, "mono_s") == pytest.approx([0.04])
+    assert np.isnan(get_column(mean, "gas_temperature_c")).all()
 
 
 @pytest.mark.parametrize("block", [37, 50, 430])
 def test_overviews_have_a_point_for_every_second(tmp_path: Path, block: int) -> None:
-    rows = unpack([row.pack() for row in rows_of(20.0)])
+    rows = unpack_rows([row.pack() for row in rows_of(20.0)])
     recording = Recording(tmp_path, "test", RunClock.start(), Config())
     recording.next_segment()
     telemetry = TelemetryStreams(recording, Config())

@@ -13,7 +13,14 @@ from membrane_ctrl.config.schema import Config
 from membrane_ctrl.model import plain_json
 from membrane_ctrl.model.events import Fault
 from membrane_ctrl.model.state_tree import decode_state, encode_state
-from membrane_ctrl.model.telemetry import SETTLED_AFTER_S, Rows, State, TelemetryRow, column, unpack
+from membrane_ctrl.model.telemetry import (
+    SETTLED_AFTER_S,
+    Rows,
+    State,
+    TelemetryRow,
+    get_column,
+    unpack_rows,
+)
 from membrane_ctrl.run_files.hold_parts import held_at
 from membrane_ctrl.run_files.summary import SCHEMA, Summary
 from tests.worlds.synthetic_run import RATE_HZ, rows_of, shape_of
@@ -22,7 +29,7 @@ HOLD_FROM_S = 6.0
 
 
 def table(rows: list[TelemetryRow]) -> Rows:
-    return unpack([row.pack() for row in rows])
+    return unpack_rows([row.pack() for row in rows])
 
 
 def summary_of(rows: list[TelemetryRow], batch: int = 50) -> dict[str, object]:
@@ -38,22 +45,22 @@ def test_true_figures_agree_with_numpy(batch: int) -> None:
     rows = rows_of(40.0)
     values = table(rows)
     found = summary_of(rows, batch)
-    settled = values[column(values, "mono_s") >= HOLD_FROM_S + SETTLED_AFTER_S]
-    true_um = column(settled, "target_um") - column(settled, "truth_displacement_um")
+    settled = values[get_column(values, "mono_s") >= HOLD_FROM_S + SETTLED_AFTER_S]
+    true_um = get_column(settled, "target_um") - get_column(settled, "truth_displacement_um")
     per_second = true_um[: len(true_um) // 50 * 50].reshape(-1, 50).mean(axis=1)
     assert found["true_std_um"] == pytest.approx(true_um.std(), rel=1e-9)
     assert found["true_bias_um"] == pytest.approx(true_um.mean(), rel=1e-6, abs=1e-12)
     assert found["in_band_1s_fraction"] == 1.0
     assert found["sag_error_um"]["start"] == pytest.approx(per_second[0])  # type: ignore[index]
     assert found["band_1s_windows"] in (len(per_second), len(per_second) - 1)
-    reading_um = column(settled, "displacement_um") - column(settled, "setpoint_um")
+    reading_um = get_column(settled, "displacement_um") - get_column(settled, "setpoint_um")
     assert found["reading_std_um"] == pytest.approx(reading_um.std(), rel=1e-9)
 
 
 def test_counters_states_and_lateness() -> None:
     rows = rows_of(20.0)
     found = summary_of(rows)
-    lateness = column(table(rows), "lateness_ms")
+    lateness = get_column(table(rows), "lateness_ms")
     assert found["schema"] == SCHEMA
     assert found["ticks"] == 20 * RATE_HZ
     assert found["states"] == [
@@ -99,9 +106,9 @@ def test_rows_of_a_setpoint_ramp_do_not_count() -> None:
     ]
     found = summary_of(moved)
     values = table(rows)
-    time_s = column(values, "mono_s")
+    time_s = get_column(values, "mono_s")
     counted = values[((time_s >= 11.0) & (time_s < 20.0)) | (time_s >= 25.0 + SETTLED_AFTER_S)]
-    true_um = column(counted, "truth_displacement_um") - column(counted, "target_um")
+    true_um = get_column(counted, "truth_displacement_um") - get_column(counted, "target_um")
     assert found["true_std_um"] == pytest.approx(true_um.std(), rel=0.02)
     assert found["in_band_1s_fraction"] == 1.0
 
@@ -175,7 +182,7 @@ def test_lists_do_not_grow_with_a_flickering_state() -> None:
     summary = Summary.for_config(Config())
     rows = table(rows_of(60.0))
     rows = rows.copy()
-    column(rows, "state")[:] = np.arange(len(rows)) % 2
+    get_column(rows, "state")[:] = np.arange(len(rows)) % 2
     summary.add_rows(rows)
     for _ in range(3000):
         summary.add_event({"kind": "fault"})

@@ -12,7 +12,7 @@ import pytest
 
 from membrane_ctrl.model.telemetry import FIELDS, SafeLevel, State
 from membrane_ctrl.review import open_run
-from membrane_ctrl.review.export import export
+from membrane_ctrl.review.export import export_run
 from membrane_ctrl.run_files.named_tables import named_table
 from membrane_ctrl.run_files.run import Run
 from tests.support.review_runs import tables
@@ -130,7 +130,7 @@ def test_a_part_without_data_has_the_same_columns(folder: Path) -> None:
 
 
 def test_a_csv_has_words_and_empty_cells(folder: Path, tmp_path: Path) -> None:
-    export(open_run(folder), "csv", tmp_path, ["state", "displacement_um", "shapes"])
+    export_run(open_run(folder), "csv", tmp_path, ["state", "displacement_um", "shapes"])
     lines = (tmp_path / "ticks.csv").read_text().splitlines()
     assert lines[0] == '"time_s","time_utc","state","displacement_um"'
     assert lines[101].endswith('"settle",')

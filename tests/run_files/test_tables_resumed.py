@@ -8,13 +8,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from membrane_ctrl.model.telemetry import Rows, unpack
+from membrane_ctrl.model.telemetry import Rows, unpack_rows
 from membrane_ctrl.run_files.run import open_run
 from membrane_ctrl.run_files.run_tables import RunTables
 from tests.worlds.nights import batch_of
 from tests.worlds.synthetic_run import rows_of, shape_of
 
-ROWS: Rows = unpack([row.pack() for row in rows_of(200.0)])
+ROWS: Rows = unpack_rows([row.pack() for row in rows_of(200.0)])
 SECONDS = range(200)
 KILLED = (3, 61, 62, 150)  # twice in a row among them
 

@@ -20,8 +20,8 @@ from firmware_iface.register_map import default_map
 from membrane_ctrl.config.schema import PumpConfig, TwinConfig
 from membrane_ctrl.model.clock import RunClock
 from membrane_ctrl.processes.child import STOP
-from membrane_ctrl.processes.ring import RingReader, RingWriter, ring
-from membrane_ctrl.sim.bench import BenchReport, BenchSpec, LiveBench, serve
+from membrane_ctrl.processes.ring import RingReader, RingWriter, open_ring
+from membrane_ctrl.sim.bench import BenchReport, BenchSpec, LiveBench, serve_bench
 from membrane_ctrl.sim.bench_events import AmbientChange
 from membrane_ctrl.sim.truth import TRUTH_BYTES, Truth
 
@@ -44,7 +44,7 @@ def spec(**changes: object) -> BenchSpec:
 @contextmanager
 def bench(what: BenchSpec) -> Iterator[tuple[BaseProcess, BenchReport]]:
     here, there = SPAWN.Pipe()
-    process = SPAWN.Process(target=serve, args=(what, there))
+    process = SPAWN.Process(target=serve_bench, args=(what, there))
     process.start()
     there.close()
     try:
@@ -111,7 +111,7 @@ class Client:
 def test_serves_the_plant_in_real_time_and_publishes_the_truth() -> None:
     clock = RunClock.start()
     with (
-        ring(4096, TRUTH_BYTES) as address,
+        open_ring(4096, TRUTH_BYTES) as address,
         bench(spec(clock=clock, truth=address)) as (process, report),
         Client(report.port) as client,
     ):
@@ -189,7 +189,7 @@ def test_ctrl_c_is_for_the_controller() -> None:
 
 def _parent(what: BenchSpec, out: Connection) -> None:
     here, there = SPAWN.Pipe()
-    process = SPAWN.Process(target=serve, args=(what, there))
+    process = SPAWN.Process(target=serve_bench, args=(what, there))
     process.start()
     assert here.poll(START_S)
     out.send((process.pid, here.recv()))
@@ -283,7 +283,7 @@ def test_a_stall_is_caught_up_in_pieces_and_the_counter_counts_all() -> None:
 
 
 def test_truth_is_stamped_on_the_runs_clock() -> None:
-    with ring(8, TRUTH_BYTES) as address:
+    with open_ring(8, TRUTH_BYTES) as address:
         writer, reader = RingWriter(address), RingReader(address)
         bench_, clock = live(writer, speed=10.0, events=(AmbientChange(0.0, 20.0),))
         clock.time_s += 2.0

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from membrane_ctrl.config.schema import Config
-from membrane_ctrl.model.telemetry import column
+from membrane_ctrl.model.telemetry import get_column
 from membrane_ctrl.review.events.found import find_events
 from membrane_ctrl.review.events.found_event import FoundEvent
 from membrane_ctrl.run_files.levels import TICK_FIELDS, first_level
@@ -22,7 +22,7 @@ def search(seed: int, scenario: str, hours: float = 8.0) -> tuple[list[Planted],
     rng = np.random.default_rng(1000 + seed)
     events = planted(rng, hours)
     rows, estimates = night(seed, hours, scenario, events)
-    level = first_level({name: column(rows, name) for name in TICK_FIELDS})
+    level = first_level({name: get_column(rows, name) for name in TICK_FIELDS})
     shapes: Shapes = from_estimates(estimates)
     return events, find_events(level, shapes, Config().limits.band_um)
 

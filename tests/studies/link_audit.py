@@ -22,7 +22,7 @@ from firmware_iface.drivers.keyence_dl_rs1a import KeyenceDlRs1a
 from firmware_iface.drivers.optoncdt1420 import Optoncdt1420
 from firmware_iface.drivers.vaisala_ptb330 import VaisalaPtb330
 from firmware_iface.drivers.ventus import Ventus
-from firmware_iface.emulators.modbus_pdu import respond
+from firmware_iface.emulators.modbus_pdu import answer_request
 from firmware_iface.emulators.modbus_server import Answer, ModbusTcpServer
 from firmware_iface.emulators.pumps import Instrument
 from firmware_iface.links.modbus_link import ModbusLink
@@ -118,7 +118,7 @@ class _Registers:
 async def _rtu(transactions: int, audit: Audit, seed: int) -> None:
     """Two slaves on one bus."""
     tables = {1: _Registers(), 2: _Registers()}
-    slaves = {unit: partial(respond, table=table) for unit, table in tables.items()}
+    slaves = {unit: partial(answer_request, table=table) for unit, table in tables.items()}
     emulator = RtuBusEmulator(SerialSettings(115_200), slaves, echo_test=bool(seed % 2), seed=seed)
     emulator.draw_faults = random_faults(seed)
     bus = RtuBus(MemoryWire(emulator), quiet_s=TIMEOUT_S)
@@ -132,7 +132,7 @@ async def _tcp(transactions: int, audit: Audit, seed: int) -> None:
     dice, table = random.Random(seed + 1), _Registers()
 
     def answer(unit: int, pdu: bytes) -> Answer:
-        reply = respond(pdu, table)
+        reply = answer_request(pdu, table)
         if dice.random() >= HIT:
             return Answer(reply)
         kinds: list[Callable[[], Answer]] = [

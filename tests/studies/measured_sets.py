@@ -15,7 +15,7 @@ from membrane_ctrl.metrology.rays.rim_outline import find_outline
 from membrane_ctrl.metrology.rays.surface import parameter_to_coeffs, sag_gradient
 from membrane_ctrl.metrology.uncertainty.height_map import height_matrix
 from membrane_ctrl.metrology.uncertainty.set_budget import SetBudget, assemble_budget
-from membrane_ctrl.model.shape_estimate import judge
+from membrane_ctrl.model.shape_estimate import judge_quality
 from membrane_ctrl.sim.optics.film_shape import FilmShape
 from tests.worlds.misstated_bench import (
     FloatArray,
@@ -36,7 +36,7 @@ def measured(stack: FrameStack, stated: OpticsConfig) -> tuple[FullResult, SetBu
     examined = assemble_budget(
         stated, checked, full, geometry_spread(stated, None)[0], 0.5, outline
     )
-    verdict = judge(full.quality)[0]
+    verdict = judge_quality(full.quality)[0]
     if verdict == "ok" and (checked.flags or examined.doubts):
         verdict = "degraded"
     return full, examined, verdict

@@ -20,7 +20,7 @@ from membrane_ctrl.metrology.rays.set_phases import SetPhases
 from membrane_ctrl.metrology.rays.surface import Surface
 from membrane_ctrl.sim.optics.bench_poses import CameraPose, ScreenPose
 from membrane_ctrl.sim.optics.film_shape import FilmShape, typical_film
-from membrane_ctrl.sim.optics.trace import trace
+from membrane_ctrl.sim.optics.trace import trace_rays
 
 FloatArray = NDArray[np.float64]
 
@@ -111,7 +111,7 @@ def _traced(
         geometry.screen_origin_mm, geometry.screen_s_x, geometry.screen_s_y, bow_mm / 200.0**2
     )
     rays = geometry.rays(column, row).T
-    met = trace(
+    met = trace_rays(
         camera, rays, film.terms_at(moved_um), film.sag_at_mm(moved_um), -1e-3 * moved_um, screen
     )
     inside = (met.x_mm**2 + met.y_mm**2 < 475.0**2) & np.isfinite(met.s_x_mm)

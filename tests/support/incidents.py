@@ -10,7 +10,7 @@ from membrane_ctrl.config.schema import Config
 from membrane_ctrl.controller.snapshot import UnknownSnapshotError
 from membrane_ctrl.metrology.film.hencky_bowl import zernike_projection
 from membrane_ctrl.model import errors
-from membrane_ctrl.replay.replay import Decision, recorded_ticks, replay, unmatched
+from membrane_ctrl.replay.replay import Decision, find_unmatched, recorded_ticks, replay_record
 from membrane_ctrl.run_files import inputs_file
 
 # A decision may come this much earlier or later after a change of the control code, and still be
@@ -45,10 +45,12 @@ def read_incident(folder: Path) -> Incident:
 def check_incident(incident: Incident) -> list[str]:
     """Replay an incident; where today's decisions are not the expected ones, as sentences."""
     inputs = inputs_file.InputsReader(incident.folder)
-    config = config_file.load(incident.folder / "config.toml", Config)
+    config = config_file.load_toml(incident.folder / "config.toml", Config)
     begin = next((int(frame.records["tick"][0]) for frame in inputs if len(frame.records)), 1)
     try:
-        found = replay(config, recorded_ticks(inputs, begin), zernike_projection(), 0.0, math.inf)
+        found = replay_record(
+            config, recorded_ticks(inputs, begin), zernike_projection(), 0.0, math.inf
+        )
     except UnknownSnapshotError as error:
         return [f"{error}: make the incident again from its run"]
-    return [*inputs.damage, *unmatched(incident.expected, found.decisions, _SLACK_S)]
+    return [*inputs.damage, *find_unmatched(incident.expected, found.decisions, _SLACK_S)]

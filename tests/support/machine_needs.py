@@ -12,7 +12,7 @@ from pathlib import Path
 
 import pytest
 
-from firmware_iface.links.aravis import aravis
+from firmware_iface.links.aravis import load_aravis
 from firmware_iface.roles import LinkError
 
 _PACKAGES = {
@@ -97,7 +97,7 @@ def _is_there(need: str) -> bool:
 
 def _aravis_is_there() -> bool:
     try:
-        aravis()
+        load_aravis()
     except LinkError:
         return False
     return True

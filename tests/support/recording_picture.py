@@ -6,12 +6,12 @@ from pathlib import Path
 
 from rerun.experimental import ViewerClient
 
-from membrane_ctrl.review.viewer.screenshot import _at_rest, _headless
+from membrane_ctrl.review.viewer.screenshot import _at_rest, _start_headless_viewer
 
 
 def screenshot(run_dir: Path, tab: str = "Overview") -> bytes:
     """PNG of all segments of the run at its end, with a tab of its layout."""
-    with _headless() as viewer:
+    with _start_headless_viewer() as viewer:
         viewer.open([str(path.resolve()) for path in sorted(run_dir.glob("*.rrd"))])
         _show_tab(viewer, tab)
         viewer.set_time("utc", play_state="following")

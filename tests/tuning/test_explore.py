@@ -126,12 +126,12 @@ def template(tmp_path_factory: pytest.TempPathFactory) -> Path:
         (ends_s, ends_s),
         experiment.Finished(experiment.ExperimentEnd.COMPLETED, "done"),
     )
-    folder.write(opened.file("experiments.json"), head)
+    folder.write_session_file(opened.file("experiments.json"), head)
     identify.run_identify(opened)
     quiet = quiet_hold()
     record_file.save_record(opened.file("quiet.npz"), quiet)
     found = identify.load_identified(opened).identified.model
-    folder.write(
+    folder.write_session_file(
         opened.file("disturbance.json"), disturbance.observe_disturbance(quiet, found, LOOP)
     )
     design.run_design(opened)
@@ -167,7 +167,7 @@ def test_a_short_session_takes_the_weather_from_before_its_experiments(
 def test_a_hold_lost_in_the_verification_is_what_is_told(template: Path, tmp_path: Path) -> None:
     """Not that it then takes no gains; the verification is still to be done."""
     opened = copy_of(template, tmp_path)
-    folder.write(opened.file("applied.json"), {})
+    folder.write_session_file(opened.file("applied.json"), {})
 
     class Lost:
         dt_s, told, pump = 0.02, 0, PumpConfig()
@@ -205,7 +205,7 @@ def test_a_close_verification_goes_on_for_as_long_again(
 ) -> None:
     """Ten minutes tell a standard deviation to 13 %."""
     opened = copy_of(template, tmp_path)
-    folder.write(opened.file("applied.json"), {})
+    folder.write_session_file(opened.file("applied.json"), {})
     left, told = list(growths), []
     held = SimpleNamespace(followed_by=lambda more: held)
     rig = SimpleNamespace(
@@ -248,7 +248,7 @@ def test_a_folder_that_cannot_be_explored_is_refused(tmp_path: Path) -> None:
 
 def test_saved_gains_are_the_next_to_be_applied(template: Path, tmp_path: Path) -> None:
     opened = copy_of(template, tmp_path)
-    folder.write(opened.file("preview.json"), preview.Previewed((), ()))
+    folder.write_session_file(opened.file("preview.json"), preview.Previewed((), ()))
     save = saver(of_path(opened.path, tmp_path), "ada")
     assert save is not None
     assert "tune apply" in save(GAINS[0])

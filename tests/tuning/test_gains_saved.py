@@ -11,7 +11,7 @@ import pytest
 
 from membrane_ctrl.cli import run
 from membrane_ctrl.config.schema import Config, LoopConfig, PumpConfig
-from membrane_ctrl.config.toml_file import load
+from membrane_ctrl.config.toml_file import load_toml
 from membrane_ctrl.model.errors import Exit
 from membrane_ctrl.sessions import folder as plain
 from tuning import same_bench
@@ -47,7 +47,9 @@ def kept_session(logs: Path, kept: bool = True, config: Config | None = None) ->
     """A session that verified `AFTER`, and its line in the journal."""
     session = plain.create_session(logs, "s1", "eve", "a-run", config or Config(), BEFORE)
     reason = "" if kept else "the readings show a sensitivity of 2.3"
-    plain.write(session.file("verified.json"), Verified(kept, reason, (), BEFORE, AFTER))
+    plain.write_session_file(
+        session.file("verified.json"), Verified(kept, reason, (), BEFORE, AFTER)
+    )
     append_entry(
         logs,
         make_entry(
@@ -68,7 +70,7 @@ def test_the_next_hold_starts_with_the_kept_gains_and_comments_stay(
     session, path = kept_session(tmp_path / "logs"), tmp_path / "lab.toml"
     path.touch(0o600)
     assert saved(path, "--yes") == Exit.DONE
-    assert load(path, Config).loop == AFTER.model_copy(update={"setpoint_um": 5.0})
+    assert load_toml(path, Config).loop == AFTER.model_copy(update={"setpoint_um": 5.0})
     assert tomllib.loads(path.read_text()) == tomllib.loads(TEXT) | {
         "loop": {"setpoint_um": 5.0, **GAINS}
     }
@@ -224,7 +226,7 @@ def test_a_link_leads_to_the_file_that_is_written(tmp_path: Path) -> None:
     path.symlink_to(target)
     assert saved(path, "--yes") == Exit.DONE
     assert path.is_symlink()
-    assert load(target, Config).loop.kp_per_s == 0.448
+    assert load_toml(target, Config).loop.kp_per_s == 0.448
 
 
 def test_what_cannot_be_edited_says_what_to_set(
@@ -246,10 +248,12 @@ CURVE = PumpConfig(
 def mapped_session(logs: Path, text: str) -> Path:
     """A session that measured a curve, slowed the gains and went no further."""
     (logs / "before.toml").write_text(text)
-    config = load(logs / "before.toml", Config)
+    config = load_toml(logs / "before.toml", Config)
     session = plain.create_session(logs, "s2", "eve", "a-run", config, config.loop)
     found = PumpMap((0.1, 1.0), (0.0, 6.0), (0.0, 0.1), CURVE, 1.2, 1.0, 0.2, 600.0, True)
-    plain.write(session.file("pump_map.json"), MappedPump(found, config.pump, 1.0, 0.02))
+    plain.write_session_file(
+        session.file("pump_map.json"), MappedPump(found, config.pump, 1.0, 0.02)
+    )
     loop = config.loop.model_copy(update={"kp_per_s": 0.3, "flow_max_um_per_s": 6.0})
     return plain.based_on(session, loop, CURVE).path
 
@@ -260,7 +264,7 @@ def test_a_measured_curve_is_saved_with_the_gains_that_suit_it(
     text = TEXT + "[pump]\nstall_fraction = 0.1  # as wired\n"
     session, path = mapped_session(tmp_path, text), tmp_path / "lab.toml"
     assert saved(path, str(session), "--yes", text=text) == Exit.DONE
-    now = load(path, Config)
+    now = load_toml(path, Config)
     assert now.pump == CURVE
     assert (now.loop.kp_per_s, now.loop.flow_max_um_per_s) == (0.3, 6.0)
     assert "# agreed with optics" in path.read_text()
@@ -278,7 +282,7 @@ def test_a_hold_by_the_estimate_is_given_the_curve_with_what_was_measured_of_the
         "tuning.estimator_levels.derive_estimator_levels", lambda folder: {"pump_delay_s": 1.1}
     )
     assert saved(path, str(session), "--yes", text=text) == Exit.DONE
-    now = load(path, Config)
+    now = load_toml(path, Config)
     assert (now.estimator.pump_delay_s, now.pump, now.loop.flow_max_um_per_s) == (1.1, CURVE, 6.0)
     capsys.readouterr()
     other = text + "[pump]\nflow_full_um_per_s = 9.0\n"
@@ -314,10 +318,10 @@ def test_gains_and_time_constant_of_two_sessions_are_saved_at_once_and_a_named_o
     gains, path = kept_session(tmp_path / "logs"), tmp_path / "lab.toml"
     kept_time_constant(tmp_path / "logs")
     assert saved(path, "--yes") == Exit.DONE
-    found = load(path, Config)
+    found = load_toml(path, Config)
     assert (found.loop.kp_per_s, found.shape.time_constant_s) == (0.448, 62.5)
     assert saved(path, str(gains), "--yes") == Exit.DONE
-    assert load(path, Config).shape.time_constant_s == Config().shape.time_constant_s
+    assert load_toml(path, Config).shape.time_constant_s == Config().shape.time_constant_s
 
 
 def test_a_time_constant_that_was_not_kept_or_rolled_back_is_not_saved(tmp_path: Path) -> None:

@@ -14,7 +14,7 @@ import pytest
 
 from membrane_ctrl.cli import run
 from membrane_ctrl.config.schema import Config, LoopConfig, PumpConfig
-from membrane_ctrl.config.toml_file import dump, load
+from membrane_ctrl.config.toml_file import dump_toml, load_toml
 from membrane_ctrl.control.experiments import operating_point
 from membrane_ctrl.control.experiments.spec import ExperimentSpec, PumpStep
 from membrane_ctrl.control.pump_curve import PumpCurve
@@ -214,7 +214,7 @@ def tuned(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, *words: str) -> int:
     """Exit code of `tune` on that hold."""
     monkeypatch.setattr(twin_hold, "TwinHold", ForeignHold)
     config = tmp_path / "foreign.toml"
-    config.write_text(dump(foreign_config(rate_hz=20.0)))
+    config.write_text(dump_toml(foreign_config(rate_hz=20.0)))
     return run(["tune", *words, "--twin", "--config", str(config), "--logs", str(tmp_path)])
 
 
@@ -737,7 +737,7 @@ def test_a_whole_session_on_a_pump_that_nobody_told_it_of(
         run(["tune", "save", "--config", str(config), "--logs", str(tmp_path), "--yes"])
         == Exit.DONE
     )
-    saved = load(config, Config)
+    saved = load_toml(config, Config)
     flow = PumpCurve(saved.pump)
     assert all(abs(flow.flow(d) - pump.settled(d)) < 0.03 * 6.0 for d in np.linspace(0.25, 1.0, 50))
 

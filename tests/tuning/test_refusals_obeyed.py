@@ -13,7 +13,7 @@ import pytest
 
 from membrane_ctrl.cli import run
 from membrane_ctrl.config.schema import Config
-from membrane_ctrl.config.toml_file import dump
+from membrane_ctrl.config.toml_file import dump_toml
 from membrane_ctrl.model.errors import Exit
 from tests.worlds.foreign_plant import ForeignPlant, ForeignPump, foreign_bench, foreign_config
 from tuning import twin_hold
@@ -122,7 +122,7 @@ def obeyed(
     config = logs / "lab.toml"
 
     def tuned(words: tuple[str, ...]) -> tuple[int, str]:
-        config.write_text(dump(foreign_config(**loop)))
+        config.write_text(dump_toml(foreign_config(**loop)))
         code = run(["tune", *words, "--twin", "--config", str(config), "--logs", str(logs)])
         return code, capsys.readouterr().err
 

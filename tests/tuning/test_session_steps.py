@@ -399,11 +399,11 @@ class Outer:
 
 def test_results_come_back_from_their_file_as_they_were(tmp_path: Path) -> None:
     value = Outer(Inner((1.0, math.inf, -2.5), LOOP), True, "x")
-    plain.write(tmp_path / "a.json", value)
-    assert plain.read(tmp_path / "a.json", Outer) == value
+    plain.write_session_file(tmp_path / "a.json", value)
+    assert plain.read_session_file(tmp_path / "a.json", Outer) == value
     (tmp_path / "a.json").write_text("{}")
     with pytest.raises(InputError, match="damaged"):
-        plain.read(tmp_path / "a.json", Outer)
+        plain.read_session_file(tmp_path / "a.json", Outer)
 
 
 def test_a_record_with_any_wrong_byte_is_one_line(tmp_path: Path) -> None:
@@ -450,7 +450,7 @@ def test_the_journal_follows_no_link(tmp_path: Path, place: str) -> None:
 
 def test_each_json_file_of_a_session_states_format_and_program(tmp_path: Path) -> None:
     opened = plain.create_session(tmp_path, "night", "ann", "twin", Config(), LOOP)
-    plain.write(opened.file("applied.json"), {"trial_s": 3.0})
+    plain.write_session_file(opened.file("applied.json"), {"trial_s": 3.0})
     for name in ("session.json", "applied.json"):
         table = json.loads(opened.file(name).read_text())
         assert table["schema"] == plain.SCHEMA

@@ -15,7 +15,7 @@ from membrane_ctrl.control.experiments.excursion_guard import ExcursionGuard
 from membrane_ctrl.control.experiments.experiment import BenchSample, Experiment, Finished
 from membrane_ctrl.control.experiments.operating_point import OperatingPoint, choose_filters
 from membrane_ctrl.control.experiments.patterned import Patterned
-from membrane_ctrl.control.experiments.patterns import doublets, multisine, steps
+from membrane_ctrl.control.experiments.patterns import make_doublets, make_multisine, make_steps
 from membrane_ctrl.control.experiments.relay import Relay
 from membrane_ctrl.sim.bench_events import AmbientChange, LaserDropout
 from tests.studies.tuning_sessions import Case, TwinBench
@@ -187,10 +187,10 @@ def test_a_mirror_that_is_too_tight_is_told_to_open_the_bleed() -> None:
     rig = Rig(TwinBench(case, 1), case.loop(), PumpConfig(), case.holding_flow_um_per_s)
     around = rig.around(rig.hold(60.0).part(20.0, 60.0))
     with pytest.raises(ValueError, match="open the bleed"):
-        doublets(around, 1.0)
+        make_doublets(around, 1.0)
 
 
-@pytest.mark.parametrize("make", [steps, doublets, multisine])
+@pytest.mark.parametrize("make", [make_steps, make_doublets, make_multisine])
 @pytest.mark.parametrize("gain", [1 / 3, 1.0, 3.0])
 def test_patterns_stay_in_the_pump_and_near_the_centre(make: object, gain: float) -> None:
     assert callable(make)
@@ -203,7 +203,7 @@ def test_patterns_stay_in_the_pump_and_near_the_centre(make: object, gain: float
     assert np.ptp(flow) > 0.2
 
 
-@pytest.mark.parametrize("make", [steps, multisine])
+@pytest.mark.parametrize("make", [make_steps, make_multisine])
 def test_patterns_run_on_the_twin_within_the_limit(make: object) -> None:
     assert callable(make)
     case = Case()

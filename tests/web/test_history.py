@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 
 from membrane_ctrl.control_port.ctl import Where
-from membrane_ctrl.review.sparkline import sparkline
+from membrane_ctrl.review.sparkline import render_sparkline
 from membrane_ctrl.web import figures
 from membrane_ctrl.web.feed import HoldFeed, Seconds, Series, history, marks, thinned
 
@@ -123,9 +123,9 @@ def test_values_that_are_missing_stay_missing() -> None:
 
 
 def test_sparklines_and_charts_are_drawn_of_anything() -> None:
-    assert sparkline([1.0]) == ""
-    assert sparkline([math.nan, 1.0, 2.0, math.nan, 3.0]).count("M") == 2
-    assert 'd="M' in sparkline([5.0, 5.0])
+    assert render_sparkline([1.0]) == ""
+    assert render_sparkline([math.nan, 1.0, 2.0, math.nan, 3.0]).count("M") == 2
+    assert 'd="M' in render_sparkline([5.0, 5.0])
     series = Series(
         np.array([1.0, 2.0]),
         np.array([0.0, math.nan]),

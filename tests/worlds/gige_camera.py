@@ -23,7 +23,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from firmware_iface.links.aravis import PIXEL_FORMATS, aravis
+from firmware_iface.links.aravis import PIXEL_FORMATS, load_aravis
 from firmware_iface.roles import LinkError
 from tests.support.machine_needs import require
 
@@ -72,7 +72,7 @@ class GigeCameraEmulator:
         address: str = "127.0.0.1",
         serial: str = "EMU1",
     ) -> None:
-        self._aravis = aravis()
+        self._aravis = load_aravis()
         self._expose = expose
         self._size = (width_px, height_px)
         self._address, self._serial = address, serial
@@ -189,7 +189,7 @@ def gige_camera(
 
 def _description() -> str:
     """The fake camera's own GenICam description, with the pixel formats that it lacks."""
-    library = aravis()
+    library = load_aravis()
     camera = library.call("arv_fake_camera_new", b"XML")
     size = c_size_t()
     start = library.call("arv_fake_camera_get_genicam_xml", camera, ctypes.byref(size))

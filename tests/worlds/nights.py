@@ -284,7 +284,7 @@ def write_run(folder: Path, parts: Iterator[tuple[Rows, list[ShapeEstimate]]]) -
     come in a run.
     """
     folder.mkdir(parents=True)
-    (folder / "config.toml").write_text(config_file.dump(CONFIG), encoding="utf-8")
+    (folder / "config.toml").write_text(config_file.dump_toml(CONFIG), encoding="utf-8")
     tables = RunTables(folder)
     end_s = 0.0
     minute = round(60 * RATE_HZ)

@@ -82,7 +82,7 @@ async def hold(logs: Path, number: int) -> None:
             "events": (64, 4096),
             "shapes": (8, ESTIMATE_BYTES_MAX),
         }
-        rings = {name: stack.enter_context(ring.ring(*size)) for name, size in sizes.items()}
+        rings = {name: stack.enter_context(ring.open_ring(*size)) for name, size in sizes.items()}
         writers = {
             name: stack.enter_context(contextlib.closing(ring.RingWriter(each)))
             for name, each in rings.items()

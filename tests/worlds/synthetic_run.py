@@ -8,7 +8,7 @@ from datetime import UTC, datetime
 import numpy as np
 
 from membrane_ctrl.model.shape_estimate import ShapeEstimate, Verdict
-from membrane_ctrl.model.telemetry import SafeLevel, ShapeState, State, TelemetryRow, unpack
+from membrane_ctrl.model.telemetry import SafeLevel, ShapeState, State, TelemetryRow, unpack_rows
 from membrane_ctrl.model.zernike_terms import ZERNIKE_TERMS
 from tests.worlds.nights import messages_of
 
@@ -72,7 +72,7 @@ def _row(k: int, rng: np.random.Generator, truth: bool) -> TelemetryRow:
 
 def message_of(row: TelemetryRow) -> bytes:
     """A tick as it crosses to the recorder."""
-    return messages_of(unpack([row.pack()]))[0]
+    return messages_of(unpack_rows([row.pack()]))[0]
 
 
 def shape_of(time_s: float, cycle: int, verdict: Verdict = "ok", seed: int = 0) -> ShapeEstimate:

@@ -138,7 +138,7 @@ def write_record(
 
 def write_head(folder: Path, ticks: list[tuple[TickInputs, TickOutputs]]) -> None:
     """Configuration and events of a run."""
-    (folder / "config.toml").write_text(config_file.dump(CONFIG))
+    (folder / "config.toml").write_text(config_file.dump_toml(CONFIG))
     lines = [
         json.dumps({"mono_s": inputs.now_s + 1e-4, **event.to_dict()})
         for inputs, outputs in ticks

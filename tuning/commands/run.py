@@ -3,7 +3,7 @@
 from pathlib import Path
 from types import ModuleType
 
-from membrane_ctrl.model.errors import DeviceError, RejectedError, writing
+from membrane_ctrl.model.errors import DeviceError, RejectedError, convert_write_errors
 from membrane_ctrl.sessions.folder import STEPS, SessionFolder
 from membrane_ctrl.sessions.live_hold import Progress
 from tuning import connection, journal
@@ -68,7 +68,7 @@ def run_step(step: str, options: TuneOptions) -> int:
         choose.require_answer(options.yes, options.choose)
     if step not in _MOVES:
         folder = connection.find_session(options, None)
-        with writing(folder.path, DeviceError):
+        with convert_write_errors(folder.path, DeviceError):
             _run_anywhere(step, folder, options)
             _report(step, folder, Progress())
     else:

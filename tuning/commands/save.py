@@ -25,7 +25,7 @@ def save_to_configuration(path: Path, name: Path | None, logs: Path, author: str
 
     Raises InputError if the gains were not kept, or are not for this configuration.
     """
-    config = toml_file.load(path, schema.Config)
+    config = toml_file.load_toml(path, schema.Config)
     if config.estimator.process_value != "laser":
         return _save_estimator(
             path, newest_session(logs) if name is None else open_session(name), config, yes
@@ -87,7 +87,7 @@ def _save_estimator(path: Path, folder: SessionFolder, config: schema.Config, ye
         loop = config.loop.model_copy(update=folder.head.before.model_dump(include=keys))
         tables = {"pump": pump, "loop": loop}
     known = config.estimator.model_dump() | estimator_levels.derive_estimator_levels(folder)
-    estimator = toml_file.parse(known, schema.EstimatorConfig, str(folder.path))
+    estimator = toml_file.parse_tables(known, schema.EstimatorConfig, str(folder.path))
     tables["estimator"] = estimator
     require_sound(config.model_copy(update=tables), str(path))
     changed = {name: list_changes(getattr(config, name), table) for name, table in tables.items()}

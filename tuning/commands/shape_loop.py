@@ -34,7 +34,7 @@ def tune_shape_loop(options: TuneOptions) -> int:
             found = shape_loop_fit.fit_shape_loop(levels, steady, assumed)
         except ValueError as error:
             raise RejectedError(f"shape loop: {error}") from None
-        plain.write(folder.file("outer.json"), found)
+        plain.write_session_file(folder.file("outer.json"), found)
         progress.say(
             f"optical sag per µm of the laser {found.scale:.3f}, noise {found.sigma_um:.2f} "
             "µm per cycle of "
@@ -65,7 +65,7 @@ def tune_shape_loop(options: TuneOptions) -> int:
             times_s,
         )
         journal.append_entry(options.logs, journal.make_entry(what, *told_of))
-        plain.write(folder.file("outer_verified.json"), done)
+        plain.write_session_file(folder.file("outer_verified.json"), done)
         progress.say(
             f"taken back: {done.reason}"
             if done.reason

@@ -28,7 +28,7 @@ def watch_hold(options: TuneOptions) -> int:
         except ValueError as error:
             raise InputError(f"watch: {error}") from None
     if options.json:
-        print(json.dumps(plain.plain(found)))
+        print(json.dumps(plain.to_plain(found)))
     progress.say(
         f"std {found.std_um:.3f} µm, {found.ratio:.2f} of the lower bound "
         f"({found.ratio_designed:.2f} expected); "

@@ -36,14 +36,14 @@ def save_record(path: Path, record: Record) -> None:
     np.savez_compressed(
         file, dt_s=np.float64(record.dt_s), sha256=np.array(record.sha256()), **columns
     )
-    files.write_bytes_atomic(files.users(path), file.getvalue())
+    files.write_bytes_atomic(files.resolve_user_path(path), file.getvalue())
 
 
 def load_record(path: Path) -> Record:
     """Read a record. Raises InputError if it is missing, damaged, or altered."""
     try:
         with (
-            files.open_plain(files.users(path)) as file,
+            files.open_plain(files.resolve_user_path(path)) as file,
             np.load(file, allow_pickle=False) as found,
         ):
             if sum(member.file_size for member in found.zip.infolist()) > _BYTES_MAX:

@@ -16,7 +16,7 @@ import numpy as np
 from scipy.optimize import minimize_scalar
 from scipy.signal import lfilter
 
-from membrane_ctrl.control.filters import smoothing
+from membrane_ctrl.control.filters import lag_step_fraction
 from tuning.identification import plant_model
 from tuning.identification.noise_spectrum import (
     Coloured,
@@ -66,7 +66,7 @@ class WeatherFit:
 
 def lag_series(series: Series, lag_s: float, dt_s: float) -> Series:
     """First-order lag that starts at its first input."""
-    share = smoothing(dt_s, lag_s)
+    share = lag_step_fraction(dt_s, lag_s)
     followed = np.asarray(lfilter([share], [1.0, share - 1.0], series - series[0]), dtype=float)
     return followed + float(series[0])
 

@@ -3,7 +3,7 @@
 import html
 from pathlib import Path
 
-from membrane_ctrl.model.files import users, write_text_atomic
+from membrane_ctrl.model.files import resolve_user_path, write_text_atomic
 from membrane_ctrl.sessions.folder import STEPS, SessionFolder
 from tuning.report.recording import write_recording
 from tuning.steps import design, identify, observe, preview, verify
@@ -37,7 +37,7 @@ def write_report(folder: SessionFolder) -> Path:
         "<!doctype html><meta charset=utf-8>"
         f"<title>{html.escape(head.name)}</title><style>{_STYLE}</style>"
     )
-    write_text_atomic(users(path), text + "\n".join(parts))
+    write_text_atomic(resolve_user_path(path), text + "\n".join(parts))
     write_recording(folder)
     return path
 

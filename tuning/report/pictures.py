@@ -5,7 +5,7 @@ from pathlib import Path
 from matplotlib.figure import Figure
 
 from membrane_ctrl.measure.result_files import write_picture
-from membrane_ctrl.model.files import users
+from membrane_ctrl.model.files import resolve_user_path
 from membrane_ctrl.sessions.folder import FILES, SessionFolder
 
 SPECTRUM_SEGMENT_S = 40.0
@@ -14,7 +14,7 @@ _DPI = 100
 
 def save_figure(path: Path, figure: Figure) -> None:
     """Write a picture to a file of the session."""
-    write_picture(users(path), figure, _DPI)
+    write_picture(resolve_user_path(path), figure, _DPI)
 
 
 def is_outdated(folder: SessionFolder, picture: str, *steps: str) -> bool:

@@ -5,7 +5,7 @@ import rerun as rr
 import rerun.blueprint as rrb
 
 from membrane_ctrl.model.arrays import AnyArray
-from membrane_ctrl.model.files import move, users
+from membrane_ctrl.model.files import move_file, resolve_user_path
 from membrane_ctrl.sessions.folder import SessionFolder
 from tuning.identification import plant_model, record_file
 from tuning.identification.record import Record
@@ -17,7 +17,7 @@ _TIMELINE = "session_time"
 def write_recording(folder: SessionFolder) -> None:
     """Write `session.rrd` with the steps done so far."""
     stream = rr.RecordingStream("membrane_ctrl_tune", recording_id=folder.path.name)
-    path = users(folder.file("session.rrd"))
+    path = resolve_user_path(folder.file("session.rrd"))
     part = path.with_name(f".{path.name}.part")
     part.unlink(missing_ok=True)
     stream.save(part, default_blueprint=_blueprint())
@@ -38,7 +38,7 @@ def write_recording(folder: SessionFolder) -> None:
         _record(stream, "after", record_file.load_record(folder.file("verify.npz")))
     stream.flush()
     stream.disconnect()
-    move(part, path)
+    move_file(part, path)
 
 
 def _experiments(stream: rr.RecordingStream, folder: SessionFolder) -> None:

@@ -71,7 +71,7 @@ def run_apply(
     loop = load_checked_gains(session)
     session.begin("apply")
     rig.set_gains(loop, f"session {session.path.name}", _APPLY_S)
-    folder.write(session.file("applied.json"), {"trial_s": _APPLY_S, "loop": loop})
+    folder.write_session_file(session.file("applied.json"), {"trial_s": _APPLY_S, "loop": loop})
     return loop
 
 

@@ -49,7 +49,7 @@ def run_characterise(
     if plan is experiments.SHORT and done.held is not None:
         record_file.save_record(session.file(HELD_RECORD), done.held)
     head = ExperimentsHead(done.around, done.relays_s, done.pulses_s, done.finished)
-    folder.write(session.file("experiments.json"), head)
+    folder.write_session_file(session.file("experiments.json"), head)
     return done
 
 

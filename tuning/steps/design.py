@@ -71,11 +71,11 @@ def run_design(session: folder.SessionFolder, reason: str = "tuning session") ->
         loop=made.loop,
     )
     files.write_text_atomic(
-        files.users(session.file("candidates.md")),
+        files.resolve_user_path(session.file("candidates.md")),
         candidate_table.format_markdown(made.candidates) + "\n",
     )
     kept = Design(made.candidates, made.least_std_um, made.preview, made.robustness)
-    folder.write(session.file("proposal.json"), kept)
+    folder.write_session_file(session.file("proposal.json"), kept)
     save_gains(session.file("gains.toml"), gains)
     return gains
 

@@ -38,7 +38,7 @@ def run_identify(session: folder.SessionFolder) -> IdentifiedPlant:
     except ValueError as error:
         raise errors.RejectedError(f"identify: {error}") from None
     found = IdentifiedPlant(all_of_it.identified, all_of_it.quality, done.record.sha256())
-    folder.write(session.file("identified.json"), found)
+    folder.write_session_file(session.file("identified.json"), found)
     return found
 
 

@@ -69,7 +69,7 @@ def has_pump_map(session: folder.SessionFolder) -> bool:
 
 def load_pump_map(session: folder.SessionFolder) -> MappedPump:
     """Result of the pump map."""
-    return folder.read(session.file("pump_map.json"), MappedPump)
+    return folder.read_session_file(session.file("pump_map.json"), MappedPump)
 
 
 def map_pump(
@@ -97,7 +97,7 @@ def map_pump(
     rig.good = loop, found.pump
     session = folder.based_on(session, loop, found.pump)
     done = MappedPump(found, before, gain, sigma)
-    folder.write(session.file("pump_map.json"), done)
+    folder.write_session_file(session.file("pump_map.json"), done)
     return done, session
 
 

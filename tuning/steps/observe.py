@@ -37,7 +37,7 @@ def run_observe(
     except ValueError as error:
         raise errors.RejectedError(f"observe: {error}") from None
     record_file.save_record(session.file("quiet.npz"), record)
-    folder.write(session.file("disturbance.json"), disturbance)
+    folder.write_session_file(session.file("disturbance.json"), disturbance)
     return disturbance
 
 

@@ -38,7 +38,7 @@ def run_preview(session: folder.SessionFolder) -> Previewed:
         for loop in (session.head.before, gains.loop)
     )
     done = Previewed(present, proposed)
-    folder.write(session.file("preview.json"), done)
+    folder.write_session_file(session.file("preview.json"), done)
     return done
 
 

@@ -84,7 +84,7 @@ def run_verify(
     done = Verified(not reason, reason, tuple(looks), before, after)
     if record is not None:
         record_file.save_record(session.file("verify.npz"), record)
-    folder.write(session.file("verified.json"), done)
+    folder.write_session_file(session.file("verified.json"), done)
     return done
 
 

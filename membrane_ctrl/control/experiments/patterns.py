@@ -14,7 +14,7 @@ Pattern = Callable[[float], float]
 _SHARE = 0.25  # of the excursion limit: the weather, the pull and the laser's noise need the rest
 
 
-def steps(around: operating_point.OperatingPoint, gain: float, hold_s: float = 2.0) -> Pattern:
+def make_steps(around: operating_point.OperatingPoint, gain: float, hold_s: float = 2.0) -> Pattern:
     """Up, back, down, back, each for `hold_s`: easy to judge by eye."""
     up, down = operating_point.require_room(around)
     size = min(up, down, _SHARE * around.limit_um / (gain * hold_s))
@@ -22,7 +22,9 @@ def steps(around: operating_point.OperatingPoint, gain: float, hold_s: float = 2
     return lambda time_s: levels[int(time_s / hold_s) % 4]
 
 
-def doublets(around: operating_point.OperatingPoint, gain: float, pulse_s: float = 0.3) -> Pattern:
+def make_doublets(
+    around: operating_point.OperatingPoint, gain: float, pulse_s: float = 0.3
+) -> Pattern:
     """Short pulses up, each followed by an equal one down: many steep edges, which separate dead
     time from lag.
 
@@ -35,7 +37,7 @@ def doublets(around: operating_point.OperatingPoint, gain: float, pulse_s: float
     return lambda time_s: size if time_s % period_s < pulse_s else -down
 
 
-def multisine(
+def make_multisine(
     around: operating_point.OperatingPoint,
     gain: float,
     slowest_rad_per_s: float = 0.3,

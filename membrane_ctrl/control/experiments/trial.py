@@ -9,14 +9,14 @@ from membrane_ctrl.control.experiments import (
     operating_point,
     patterned,
 )
-from membrane_ctrl.control.experiments.patterns import doublets, multisine, steps
+from membrane_ctrl.control.experiments.patterns import make_doublets, make_multisine, make_steps
 from membrane_ctrl.control.experiments.pump_steps import PumpSteps, PumpStepsState
 from membrane_ctrl.control.experiments.relay import Relay, RelayState, begin_relay
 from membrane_ctrl.control.experiments.spec import ExperimentSpec
 from membrane_ctrl.control.pump_curve import PumpCurve
 from membrane_ctrl.model.state_tree import StateNode
 
-PATTERNS = {"steps": steps, "doublets": doublets, "multisine": multisine}
+PATTERNS = {"steps": make_steps, "doublets": make_doublets, "multisine": make_multisine}
 
 
 @dataclass(slots=True)

@@ -8,14 +8,14 @@ from membrane_ctrl.model.errors import Exit, InputError
 _FOLDER = Path(__file__).parent
 
 
-def shipped() -> list[Path]:
+def list_scenario_files() -> list[Path]:
     """Files of the scenarios; a name is the file's without its suffix."""
     return sorted(_FOLDER.glob("*.toml"))
 
 
 def list_scenarios() -> int:
     """Print names and titles."""
-    for path in shipped():
+    for path in list_scenario_files():
         print(f"{path.stem:18} {read_toml(path)['title']}")
     return Exit.DONE
 
@@ -23,7 +23,7 @@ def list_scenarios() -> int:
 def find_scenario(word: str) -> Path:
     """The file of a scenario, given its name or a path. Raises InputError."""
     named = _FOLDER / f"{word.replace('-', '_')}.toml"
-    path = named if named in shipped() else Path(word)
+    path = named if named in list_scenario_files() else Path(word)
     if not path.is_file():
         raise InputError(
             f"{word}: no such scenario; `membrane-ctrl twin play` lists them, or name a file"

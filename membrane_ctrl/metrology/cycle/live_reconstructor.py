@@ -37,7 +37,7 @@ from membrane_ctrl.metrology.reconstruction import (
 )
 from membrane_ctrl.metrology.uncertainty import cycle_errors, geometry_spread
 from membrane_ctrl.model.arrays import AnyArray, ArrayLike, BoolArray, FloatArray, Image
-from membrane_ctrl.model.shape_estimate import Kind, Quality, ShapeEstimate, judge
+from membrane_ctrl.model.shape_estimate import Kind, Quality, ShapeEstimate, judge_quality
 from membrane_ctrl.model.zernike_terms import ZERNIKE_TERMS
 
 # Beyond this change of phase a point may have been taken for its neighbour a period away. 0.9 of
@@ -363,7 +363,7 @@ class LiveReconstructor:
         covariance = slope_noise.parameter_covariance(fit.normal, slope_variance) + errors.own_mm2
         to_coeffs = surface.parameter_to_coeffs()
         gradient = surface.sag_gradient()
-        verdict, reason = judge(quality)
+        verdict, reason = judge_quality(quality)
         if verdict == "ok" and self._doubt:
             verdict, reason = "degraded", self._doubt
         return ShapeEstimate(

@@ -11,7 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from membrane_ctrl.config.schema import OpticsConfig
-from membrane_ctrl.config.sight import poses
+from membrane_ctrl.config.sight import compute_poses
 from membrane_ctrl.metrology.rays.lens_distortion import distort_points, undistort_points
 from membrane_ctrl.metrology.rays.screen_face import Face
 from membrane_ctrl.model.arrays import ArrayLike, FloatArray
@@ -39,7 +39,7 @@ class Geometry:
     def from_config(cls, optics: OpticsConfig) -> "Geometry":
         """The geometry a configuration describes."""
         camera = optics.camera
-        pinhole, rotation, origin, s_x, s_y = poses(optics.geometry)
+        pinhole, rotation, origin, s_x, s_y = compute_poses(optics.geometry)
         return cls(
             pinhole_mm=pinhole,
             rotation=rotation,

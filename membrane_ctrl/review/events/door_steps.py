@@ -50,12 +50,12 @@ def door_steps(
         Relative to nearby differences of equally long windows.
     """
     every = update_s(mean_pa)
-    floor_pa = _ROUNDING * quantum(reading_pa)
+    floor_pa = _ROUNDING * reading_resolution_pa(reading_pa)
     values = mean_pa[::every]
     # at least two values: a step may fall on the one between
     lags = tuple(lag for lag in LAGS if lag <= 2 or lag * every <= LAGS[-1])
-    found = _candidates(values, lags, floor_pa, least_pa, least_sigmas)
-    chosen = sorted(_chosen(found, values.size), key=lambda place: int(found.row[place]))
+    found = _find_candidates(values, lags, floor_pa, least_pa, least_sigmas)
+    chosen = sorted(_choose_strongest(found, values.size), key=lambda place: int(found.row[place]))
     result = []
     for place in chosen:
         row, lag = int(found.row[place]), int(found.lag[place])
@@ -84,7 +84,7 @@ def update_s(mean_pa: Column) -> int:
     return between_s if 2 < between_s <= _SLOWEST_S else 1
 
 
-def quantum(reading_pa: Column) -> float:
+def reading_resolution_pa(reading_pa: Column) -> float:
     """The resolution of the readings, Pa: about the smallest change;
     almost 0 for a fine barometer.
     """
@@ -93,7 +93,7 @@ def quantum(reading_pa: Column) -> float:
     return float(np.quantile(change, _LOW_SHARE)) if change.size else 0.0
 
 
-def _candidates(
+def _find_candidates(
     values: Column, lags: tuple[int, ...], floor_pa: float, least_pa: float, least_sigmas: float
 ) -> _Candidates:
     parts = []
@@ -110,7 +110,7 @@ def _candidates(
     return _Candidates(row, lag_of, size, score)
 
 
-def _chosen(found: _Candidates, rows: int) -> list[int]:
+def _choose_strongest(found: _Candidates, rows: int) -> list[int]:
     """The windows that stand out most; others nearby with the same sign belong to the same step."""
     reach = LAGS[-1]
     taken = np.zeros((2, rows), dtype=bool)

@@ -5,8 +5,8 @@ from collections.abc import Sequence
 import numpy as np
 
 from membrane_ctrl.model.telemetry import State
-from membrane_ctrl.review.events.found_event import FoundEvent, Level, runs, widened
-from membrane_ctrl.review.events.steps import differences
+from membrane_ctrl.review.events.found_event import FoundEvent, Level, find_stretches, widen_flags
+from membrane_ctrl.review.events.steps import mean_differences
 
 # After the cause: the time for the loop to return to the band (a leak of 1.2 µm/s and 40 µm: 32 s).
 BACK_S = 30
@@ -18,7 +18,7 @@ TIMED_S = 5.0
 _TIMED_TO_MINUTES = ("leak step", "noise change")
 
 
-def excursions(level: Level, band_um: float, known: Sequence[FoundEvent]) -> list[FoundEvent]:
+def find_excursions(level: Level, band_um: float, known: Sequence[FoundEvent]) -> list[FoundEvent]:
     """The 1 s mean of the error leaves the band without a fault, pause, ramp or event that explains
     it.
     """
@@ -26,14 +26,14 @@ def excursions(level: Level, band_um: float, known: Sequence[FoundEvent]) -> lis
     out = (np.abs(error_um) > band_um) & (level["state"] == State.HOLD)
     paused = np.isnan(level["mean_leak_um_per_s"])  # a loop that waits has no estimate of the leak
     setpoint_um = error_um + level["mean_displacement_um"]
-    ramped = np.abs(differences(setpoint_um, RAMP_HALF_S, 1)) > band_um
-    out &= ~widened((level["fault"] > 0) | paused | ramped, BACK_S)
+    ramped = np.abs(mean_differences(setpoint_um, RAMP_HALF_S, 1)) > band_um
+    out &= ~widen_flags((level["fault"] > 0) | paused | ramped, BACK_S)
     for event in known:
         from_s = event.start_s if event.kind in _TIMED_TO_MINUTES else event.time_s - TIMED_S
         first, end = np.searchsorted(time_s, [from_s, event.end_s + BACK_S])
         out[first:end] = False
     found = []
-    for a, b in runs(out, BACK_S):
+    for a, b in find_stretches(out, BACK_S):
         worst = a + int(np.nanargmax(np.abs(error_um[a : b + 1])))
         found.append(
             FoundEvent(

@@ -75,7 +75,7 @@ def find_events(
     """
     found: list[found_event.FoundEvent] = []
     if level["time_s"].size:
-        even = _even(level)
+        even = _fill_missing_seconds(level)
         finders: Iterable[Callable[[found_event.Level], list[found_event.FoundEvent]]] = (
             pressure_steps,
             leak_steps,
@@ -87,7 +87,7 @@ def find_events(
         )
         for finder in finders:
             found += finder(even)
-        found += excursions.excursions(even, band_um, found)
+        found += excursions.find_excursions(even, band_um, found)
     found += shape_jumps.shape_jumps(shapes, hold_parts.held_at(level, shapes.time_s))
     return sorted(found, key=lambda event: event.time_s)
 
@@ -101,7 +101,7 @@ def pressure_steps(level: found_event.Level) -> list[found_event.FoundEvent]:
     places = values.size * len(door_steps.LAGS)
     return [
         found_event.event_around(
-            "pressure step", level, s.row, 1, s.size, "Pa", steps.confidence(s.sigmas, places)
+            "pressure step", level, s.row, 1, s.size, "Pa", steps.step_confidence(s.sigmas, places)
         )
         for s in found
     ]
@@ -109,13 +109,13 @@ def pressure_steps(level: found_event.Level) -> list[found_event.FoundEvent]:
 
 def leak_steps(level: found_event.Level) -> list[found_event.FoundEvent]:
     """Steps of the holding flow that the weather (the feed-forward) does not explain."""
-    minutes = levels.coarser_level(_held(level), 60.0)
+    minutes = levels.coarser_level(_select_held(level), 60.0)
     whole = minutes["rows"] > 0.5 * np.nanmedian(minutes["rows"])
     leak = minutes["mean_flow_um_per_s"] - np.nan_to_num(minutes["mean_feedforward_um_per_s"])
     leak = np.where(whole, leak, np.nan)
     if not np.isfinite(leak).any():
         return []
-    found = steps.steps(
+    found = steps.find_steps(
         leak, half=LEAK_HALF_MIN, skip=1, least=LEAK_LEAST_UM_PER_S, least_sigmas=LEAK_LEAST_SIGMAS
     )
     before = [float(np.nanmean(leak[max(0, s.row - LEAK_HALF_MIN) : s.row])) for s in found]
@@ -127,7 +127,7 @@ def leak_steps(level: found_event.Level) -> list[found_event.FoundEvent]:
             60,
             100 * s.size / old,
             "%",
-            steps.confidence(s.sigmas, leak.size),
+            steps.step_confidence(s.sigmas, leak.size),
         )
         for s, old in zip(found, before, strict=True)
         if old > 0 and abs(s.size) >= LEAK_LEAST_SHARE * old
@@ -142,11 +142,13 @@ def laser_glitches(level: found_event.Level) -> list[found_event.FoundEvent]:
     stepped[[round(step.time_s - level["time_s"][0]) for step in pressure_steps(level)]] = True
     # a slow barometer shows a door late
     slow_s = door_steps.update_s(barometer)
-    stepped = found_event.widened(stepped, DOOR_MOVES_S + (slow_s if slow_s > 1 else 0))
-    usable = (level["state"] == State.HOLD) & ~stepped & ~found_event.widened(lost, LOST_MOVES_S)
-    calm = ~found_event.widened(~np.isfinite(barometer), DOOR_MOVES_S)
+    stepped = found_event.widen_flags(stepped, DOOR_MOVES_S + (slow_s if slow_s > 1 else 0))
+    usable = (
+        (level["state"] == State.HOLD) & ~stepped & ~found_event.widen_flags(lost, LOST_MOVES_S)
+    )
+    calm = ~found_event.widen_flags(~np.isfinite(barometer), DOOR_MOVES_S)
     low_um, mean_um, high_um = (level[f"{kind}_displacement_um"] for kind in ("min", "mean", "max"))
-    found = reading_glitches.glitches(low_um, mean_um, high_um, usable, calm)
+    found = reading_glitches.find_glitches(low_um, mean_um, high_um, usable, calm)
     time_s = level["time_s"]
     spans = [(float(time_s[g.first]), float(time_s[g.last])) for g in found]
     return [
@@ -157,7 +159,7 @@ def laser_glitches(level: found_event.Level) -> list[found_event.FoundEvent]:
             b_s + 30,
             g.size_um,
             "µm",
-            steps.confidence(g.sigmas, time_s.size),
+            steps.step_confidence(g.sigmas, time_s.size),
         )
         for g, (a_s, b_s) in zip(found, spans, strict=True)
     ]
@@ -171,7 +173,7 @@ def laser_losses(level: found_event.Level) -> list[found_event.FoundEvent]:
     bad = (quality > 0) | ~seen
     bad &= (level["state"] == State.HOLD) & (level["rows"] > 0)
     by_optics = seen.any() and not np.isfinite(quality).any()  # their readings have no code
-    return _losses("optics lost" if by_optics else "laser lost", bad, level, 1)
+    return _find_losses("optics lost" if by_optics else "laser lost", bad, level, 1)
 
 
 def weather_losses(level: found_event.Level) -> list[found_event.FoundEvent]:
@@ -179,11 +181,11 @@ def weather_losses(level: found_event.Level) -> list[found_event.FoundEvent]:
     found: list[found_event.FoundEvent] = []
     for name, kind in _WEATHER.items():
         there = np.isfinite(level[name])
-        found += _losses(kind, ~there & (np.cumsum(there) > 0) & (level["rows"] > 0), level, 5)
+        found += _find_losses(kind, ~there & (np.cumsum(there) > 0) & (level["rows"] > 0), level, 5)
     return found
 
 
-def _losses(
+def _find_losses(
     kind: str, lost: BoolArray, level: found_event.Level, join: int
 ) -> list[found_event.FoundEvent]:
     time_s = level["time_s"]
@@ -191,7 +193,7 @@ def _losses(
         found_event.FoundEvent(
             kind, float(time_s[a]), time_s[a] - 5, time_s[b] + 6, b - a + 1.0, "s", 1.0
         )
-        for a, b in found_event.runs(lost, join)
+        for a, b in found_event.find_stretches(lost, join)
     ]
 
 
@@ -210,14 +212,14 @@ def lateness_bursts(level: found_event.Level) -> list[found_event.FoundEvent]:
             "ms",
             1.0,
         )
-        for a, b in found_event.runs(late, int(LATE_BURST_S))
+        for a, b in found_event.find_stretches(late, int(LATE_BURST_S))
         if int(late[a : b + 1].sum()) >= LATE_BURST_LEAST
     ]
 
 
 def noise_changes(level: found_event.Level) -> list[found_event.FoundEvent]:
     """The spread of the error changes for minutes."""
-    held = _held(level)
+    held = _select_held(level)
     minute = np.floor(held["time_s"] / 60).astype(int)
     error = held["mean_error_um"]
     there = np.isfinite(error)
@@ -229,7 +231,7 @@ def noise_changes(level: found_event.Level) -> list[found_event.FoundEvent]:
     mean = np.bincount(number, error, size) / np.maximum(count, 1)
     spread = np.sqrt(np.bincount(number, (error - mean[number]) ** 2, size) / np.maximum(count, 1))
     value = np.where((count >= 50) & (spread > 0), np.log(np.maximum(spread, 1e-12)), np.nan)
-    found = steps.steps(
+    found = steps.find_steps(
         value, SPREAD_HALF_MIN, 1, least=float(SPREAD_LEAST), least_sigmas=SPREAD_LEAST_SIGMAS
     )
     time_s = {"time_s": (first + np.arange(size)) * 60.0}
@@ -241,13 +243,13 @@ def noise_changes(level: found_event.Level) -> list[found_event.FoundEvent]:
             60,
             float(np.exp(s.size)),
             "times",
-            steps.confidence(s.sigmas, size),
+            steps.step_confidence(s.sigmas, size),
         )
         for s in found
     ]
 
 
-def _held(level: found_event.Level) -> found_event.Level:
+def _select_held(level: found_event.Level) -> found_event.Level:
     """The level with NaN where the mirror was not held,
     so that the start of a hold is not a step.
     """
@@ -259,7 +261,7 @@ def _held(level: found_event.Level) -> found_event.Level:
     }
 
 
-def _even(level: found_event.Level) -> found_event.Level:
+def _fill_missing_seconds(level: found_event.Level) -> found_event.Level:
     """The level with a row for every second; NaN for missing ones."""
     second = np.rint(level["time_s"]).astype(np.int64)
     place = second - second[0]

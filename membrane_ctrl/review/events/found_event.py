@@ -37,14 +37,14 @@ def event_around(
     )
 
 
-def widened(flags: BoolArray, rows: int) -> BoolArray:
+def widen_flags(flags: BoolArray, rows: int) -> BoolArray:
     """True flags, widened by `rows` on each side."""
     return np.asarray(
         ndimage.maximum_filter1d(flags, 2 * rows + 1, mode="constant", cval=0), dtype=bool
     )
 
 
-def runs(flags: BoolArray, join: int) -> list[tuple[int, int]]:
+def find_stretches(flags: BoolArray, join: int) -> list[tuple[int, int]]:
     """First and last row of each stretch of true rows, joining those at most `join` apart."""
     rows = np.flatnonzero(flags)
     if not rows.size:

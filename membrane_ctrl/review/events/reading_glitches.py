@@ -9,7 +9,7 @@ import numpy as np
 from scipy import ndimage
 
 from membrane_ctrl.model.arrays import BoolArray, Column
-from membrane_ctrl.review.events.steps import differences, local_sigma
+from membrane_ctrl.review.events.steps import local_sigma, mean_differences
 
 # A laser's noise is 1 µm; the film cannot make a spike of a single tick.
 GLITCH_LEAST_UM = 4.0
@@ -35,7 +35,7 @@ class Glitch:
     sigmas: float
 
 
-def glitches(
+def find_glitches(
     low_um: Column, mean_um: Column, high_um: Column, usable: BoolArray, calm: BoolArray
 ) -> list[Glitch]:
     """Spikes and longer glitches, each once.
@@ -53,15 +53,18 @@ def glitches(
     """
     if not np.isfinite(mean_um).any():
         return []
-    size_um = _farthest(low_um, mean_um, high_um)
-    long = [_sized(glitch, size_um) for glitch in _pairs(_edges(mean_um, usable & calm))]
+    size_um = _largest_deviation(low_um, mean_um, high_um)
+    long = [
+        _measure_size(glitch, size_um)
+        for glitch in _pair_edges(_find_edges(mean_um, usable & calm))
+    ]
     apart = usable.copy()
     for glitch in long:
         apart[max(0, glitch.first - _EDGE_S) : glitch.last + _EDGE_S + 1] = False
-    return sorted(long + _spikes(size_um, mean_um, apart), key=lambda glitch: glitch.first)
+    return sorted(long + _find_spikes(size_um, mean_um, apart), key=lambda glitch: glitch.first)
 
 
-def _farthest(low_um: Column, mean_um: Column, high_um: Column) -> Column:
+def _largest_deviation(low_um: Column, mean_um: Column, high_um: Column) -> Column:
     """(n,) per second, the largest deviation of a reading from the surrounding seconds."""
     rows = np.arange(mean_um.size)
     there = np.isfinite(mean_um)
@@ -72,7 +75,7 @@ def _farthest(low_um: Column, mean_um: Column, high_um: Column) -> Column:
     return np.where(above >= below, above, -below)
 
 
-def _sized(glitch: Glitch, size_um: Column) -> Glitch:
+def _measure_size(glitch: Glitch, size_um: Column) -> Glitch:
     """Take the size of a short glitch from its readings: the mean of a second dilutes it."""
     if glitch.last - glitch.first > _BASE_S // 2:
         return glitch
@@ -80,12 +83,12 @@ def _sized(glitch: Glitch, size_um: Column) -> Glitch:
     return replace(glitch, size_um=float(part[np.nanargmax(np.abs(part))]))
 
 
-def _spikes(size_um: Column, mean_um: Column, usable: BoolArray) -> list[Glitch]:
+def _find_spikes(size_um: Column, mean_um: Column, usable: BoolArray) -> list[Glitch]:
     """A reading far from the surrounding seconds, with the mirror unmoved before and after."""
     far = np.abs(size_um)
     usual = float(np.nanmedian(far))
     sigma = local_sigma(far - usual)
-    moved = np.nan_to_num(np.abs(differences(mean_um, 1, 1)))
+    moved = np.nan_to_num(np.abs(mean_differences(mean_um, 1, 1)))
     enough = np.fmax(GLITCH_LEAST_UM, GLITCH_LEAST_SIGMAS * sigma)
     found = np.flatnonzero((far - usual > enough) & (moved < _MOVED_MOST * far) & usable)
     found = found[np.concatenate(([True], np.diff(found) > 2))] if found.size else found
@@ -93,7 +96,7 @@ def _spikes(size_um: Column, mean_um: Column, usable: BoolArray) -> list[Glitch]
     return [Glitch(int(row), int(row), float(size_um[row]), float(score[row])) for row in found]
 
 
-def _edges(mean_um: Column, usable: BoolArray) -> list[Glitch]:
+def _find_edges(mean_um: Column, usable: BoolArray) -> list[Glitch]:
     """Steps of the reading within two seconds, each a glitch without an end; `first` is the second
     of the step.
     """
@@ -115,32 +118,32 @@ def _edges(mean_um: Column, usable: BoolArray) -> list[Glitch]:
     return found
 
 
-def _pairs(edges: list[Glitch]) -> list[Glitch]:
+def _pair_edges(edges: list[Glitch]) -> list[Glitch]:
     """Pairs of opposite edges; unpaired edges are not glitches."""
     found: list[Glitch] = []
     for place, edge in enumerate(edges):
         if found and edge.first <= found[-1].last:
             continue
-        back = _back(edge, edges[place + 1 : place + 1 + GLITCH_LONGEST_S])
+        back = _find_return_edge(edge, edges[place + 1 : place + 1 + GLITCH_LONGEST_S])
         if back is not None:
             found.append(Glitch(edge.first, back.first, edge.size_um, edge.sigmas))
     return found
 
 
-def _back(edge: Glitch, later: list[Glitch]) -> Glitch | None:
+def _find_return_edge(edge: Glitch, later: list[Glitch]) -> Glitch | None:
     """The largest opposite edge before the next equal one:
     a loop at full speed makes smaller ones.
     """
     best = None
     for other in later:
-        if other.first > edge.first + GLITCH_LONGEST_S or _alike(edge.size_um, other.size_um):
+        if other.first > edge.first + GLITCH_LONGEST_S or _are_similar(edge.size_um, other.size_um):
             break
-        if _alike(edge.size_um, -other.size_um) and (
+        if _are_similar(edge.size_um, -other.size_um) and (
             best is None or abs(other.size_um) > abs(best.size_um)
         ):
             best = other
     return best
 
 
-def _alike(size_um: float, other_um: float) -> bool:
+def _are_similar(size_um: float, other_um: float) -> bool:
     return size_um * other_um > 0 and _EDGES_ALIKE <= abs(size_um / other_um) <= 1 / _EDGES_ALIKE

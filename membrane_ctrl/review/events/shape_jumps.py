@@ -5,7 +5,7 @@ import numpy as np
 from membrane_ctrl.metrology.film.hencky_bowl import zernike_projection
 from membrane_ctrl.model.arrays import BoolArray
 from membrane_ctrl.review.events.found_event import FoundEvent, event_around
-from membrane_ctrl.review.events.steps import confidence, differences
+from membrane_ctrl.review.events.steps import mean_differences, step_confidence
 from membrane_ctrl.run_files.shapes import Shapes
 
 JUMP_LEAST_UM = 0.3
@@ -26,7 +26,7 @@ def shape_jumps(shapes: Shapes, held: BoolArray) -> list[FoundEvent]:
         return []
     # all terms of a month take 190 MB (36 of them)
     terms = shapes.coeffs_um[good, 4:11] - np.outer(shapes.sag_um[good], zernike_projection()[4:11])
-    change = np.stack([differences(term, JUMP_HALF_CYCLES, 0) for term in terms.T])
+    change = np.stack([mean_differences(term, JUMP_HALF_CYCLES, 0) for term in terms.T])
     size = np.sqrt((change**2).sum(axis=0))
     scale = np.nanmedian(size)
     sigma = _SIGMA_OVER_MAD * float(np.nanmedian(np.abs(size - scale))) + 1e-12
@@ -47,7 +47,7 @@ def shape_jumps(shapes: Shapes, held: BoolArray) -> list[FoundEvent]:
             60,
             float(size[row]),
             "µm",
-            confidence(float(score[row]), size.size),
+            step_confidence(float(score[row]), size.size),
         )
         for row in best
     ]

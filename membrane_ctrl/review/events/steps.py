@@ -20,7 +20,7 @@ class FoundStep:
     sigmas: float  # its size over the noise of such differences
 
 
-def steps(
+def find_steps(
     values: Column, half: int, skip: int, least: float, least_sigmas: float
 ) -> list[FoundStep]:
     """Steps of at least `least` and `least_sigmas`, each once.
@@ -38,7 +38,7 @@ def steps(
     least_sigmas : float
         Relative to the robust spread of nearby differences.
     """
-    difference = differences(values, half, skip)
+    difference = mean_differences(values, half, skip)
     sigma = local_sigma(difference)
     size = np.nan_to_num(np.abs(difference))
     score = np.where(sigma > 0, size / np.maximum(sigma, 1e-300), np.inf)
@@ -52,7 +52,7 @@ def steps(
     return [FoundStep(int(row), float(difference[row]), float(score[row])) for row in rows]
 
 
-def differences(values: Column, half: int, skip: int) -> Column:
+def mean_differences(values: Column, half: int, skip: int) -> Column:
     """(n,) mean of the `half` values after a place minus that before it; NaN at the ends and at
     gaps.
     """
@@ -88,7 +88,7 @@ def local_sigma(values: Column, share: float = 0.5) -> Column:
     return result
 
 
-def confidence(sigmas: float, looked_at: int) -> float:
+def step_confidence(sigmas: float, looked_at: int) -> float:
     """1 minus the probability that (normal) noise alone makes a step this high anywhere in
     `looked_at` places.
     """

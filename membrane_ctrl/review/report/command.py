@@ -7,12 +7,12 @@ from pathlib import Path
 
 from membrane_ctrl.model import errors, files, plain_json
 from membrane_ctrl.review import catalogue
-from membrane_ctrl.review.report.html import render
-from membrane_ctrl.review.report.json import report_table, verdict
+from membrane_ctrl.review.report.html import render_report
+from membrane_ctrl.review.report.json import make_verdict, report_table
 from membrane_ctrl.review.report.pump_history import pump_change, pump_history
 from membrane_ctrl.review.run_times import part_s
 from membrane_ctrl.review.statistics import compare
-from membrane_ctrl.review.statistics.analysis import Analysis, analyse
+from membrane_ctrl.review.statistics.analysis import Analysis, analyse_run
 from membrane_ctrl.run_files.run import Run, open_run
 
 # A terminal shows no more at once; the page has them all.
@@ -29,14 +29,14 @@ def report_command(
 ) -> int:
     """Write `report.html` and `report.json`; see `membrane-ctrl report --help`."""
     began_s = time.monotonic()
-    opened = open_run(catalogue.resolve(run))
-    analysis = analyse(opened, *part_s(opened.origin_utc, start, end))
+    opened = open_run(catalogue.resolve_run(run))
+    analysis = analyse_run(opened, *part_s(opened.origin_utc, start, end))
     other = (
         None
         if compare_with is None
-        else _other(open_run(catalogue.resolve(compare_with)), start, end)
+        else _open_other(open_run(catalogue.resolve_run(compare_with)), start, end)
     )
-    differences = [] if other is None else compare.compare(analysis, other)
+    differences = [] if other is None else compare.compare_analyses(analysis, other)
     history = pump_history(opened.folder)
     table = report_table(analysis) | {"pump_over_runs": [asdict(seen) for seen in history]}
     if other is not None:
@@ -50,13 +50,15 @@ def report_command(
         }
     folder = out.resolve() if out else opened.folder / "report"  # follow a link that the user names
     text = plain_json.dumps(table, indent=1)
-    page = render(analysis, other, differences, history)
-    with errors.writing(folder, errors.DeviceError, "; choose another folder with --out"):
+    page = render_report(analysis, other, differences, history)
+    with errors.convert_write_errors(
+        folder, errors.DeviceError, "; choose another folder with --out"
+    ):
         write_report(folder, text, page)
     if json:
         print(text)
         return 0
-    _say(analysis, other, folder, time.monotonic() - began_s)
+    _print_result(analysis, other, folder, time.monotonic() - began_s)
     if said := pump_change(history, opened.config.pump.change_max):
         print(f"note: {said}", file=sys.stderr)
     return 0
@@ -69,18 +71,18 @@ def write_report(folder: Path, text: str, page: str) -> None:
     files.write_text_atomic(folder / "report.html", page)
 
 
-def _other(run: Run, start: str | None, end: str | None) -> Analysis:
+def _open_other(run: Run, start: str | None, end: str | None) -> Analysis:
     """The run to compare with: the same part if counted from the start, else all, as times of day
     differ.
     """
     from_start = all(text is None or text.strip().startswith("+") for text in (start, end))
-    return analyse(run, *part_s(run.origin_utc, start, end)) if from_start else analyse(run)
+    return analyse_run(run, *part_s(run.origin_utc, start, end)) if from_start else analyse_run(run)
 
 
-def _say(analysis: Analysis, other: Analysis | None, folder: Path, took_s: float) -> None:
+def _print_result(analysis: Analysis, other: Analysis | None, folder: Path, took_s: float) -> None:
     for note in analysis.run.notes:
         print(f"note: {note}", file=sys.stderr)
-    print(verdict(analysis)[1])
+    print(make_verdict(analysis)[1])
     for event in analysis.found[:_SHOWN_MOST]:
         print(
             f"  {analysis.run.utc(event.time_s):%Y-%m-%d %H:%M:%S}  {event.kind}, "
@@ -90,5 +92,5 @@ def _say(analysis: Analysis, other: Analysis | None, folder: Path, took_s: float
         print(f"  and {len(analysis.found) - _SHOWN_MOST} more in the report")
     if other is not None:
         part = "" if not analysis.is_part else ", same part" if other.is_part else ", all of it"
-        print(f"against {other.run.name}{part}: {verdict(other)[1]}")
+        print(f"against {other.run.name}{part}: {make_verdict(other)[1]}")
     print(f"{folder / 'report.html'} ({took_s:.1f} s)")

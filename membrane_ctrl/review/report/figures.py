@@ -25,8 +25,8 @@ from membrane_ctrl.model.columns import (
     plots_of,
 )
 from membrane_ctrl.model.telemetry import State
-from membrane_ctrl.review.formatting import one_line, span
-from membrane_ctrl.review.report.json import timeline
+from membrane_ctrl.review.formatting import format_span, one_line
+from membrane_ctrl.review.report.json import make_timeline
 from membrane_ctrl.review.report.pump_history import PumpSeen
 from membrane_ctrl.review.statistics import power_spectrum, shape_review
 from membrane_ctrl.review.statistics.analysis import Analysis
@@ -85,7 +85,7 @@ def on_white(colour: Colour) -> str:
 
 
 @contextmanager
-def picture(
+def make_picture(
     rows: int = 1, columns: int = 1, height_in: float = 3.0, **subplots: Any
 ) -> Iterator[tuple[Figure, Any]]:
     """A figure in the report's style and its axes, as `Figure.subplots` gives them."""
@@ -94,7 +94,7 @@ def picture(
         yield figure, figure.subplots(rows, columns, **subplots)
 
 
-def svg(figure: Figure) -> str:
+def render_svg(figure: Figure) -> str:
     """The figure as an `<svg>` element that scales with the page."""
     with mpl.rc_context(_STYLE), warnings.catch_warnings():
         # text stays text in the page, in the reader's fonts
@@ -163,12 +163,12 @@ def hours_or_less(time_s: Column | float, span_s: float) -> tuple[Any, str]:
     return np.asarray(time_s), "s"
 
 
-def overview(analysis: Analysis) -> str:
+def draw_overview(analysis: Analysis) -> str:
     """Error with its envelope, the band, states, detected events and marks."""
     level, band_um = broken_at_gaps(analysis.level), analysis.run.config.limits.band_um
     span_s = analysis.ticks.end_s - analysis.ticks.start_s
     time, unit = hours_or_less(level["time_s"], span_s)
-    with picture(2, 1, 4.2, sharex=True, height_ratios=[8, 1.1]) as (figure, (plot, lane)):
+    with make_picture(2, 1, 4.2, sharex=True, height_ratios=[8, 1.1]) as (figure, (plot, lane)):
         plot.axhspan(-band_um, band_um, color=GREEN, alpha=0.09, lw=0)
         ends = level["min_error_um"], level["max_error_um"]
         plot.fill_between(time, *ends, color=GREY, alpha=0.35, lw=0, label="minimum to maximum")
@@ -181,21 +181,21 @@ def overview(analysis: Analysis) -> str:
             )
         plot.set_ylim(-3 * band_um, 3 * band_um)
         plot.set(ylabel=plot_title(ERROR), title="The run at a glance")
-        _found(plot, analysis, span_s)
+        _draw_found_events(plot, analysis, span_s)
         plot.legend(loc="upper right", ncols=3)
-        _lane(lane, analysis, span_s)
+        _draw_lane(lane, analysis, span_s)
         lane.set_xlabel(f"time since {analysis.run.origin_utc:%Y-%m-%d %H:%M:%S} UTC, {unit}")
-        return svg(figure)
+        return render_svg(figure)
 
 
-def _found(plot: Any, analysis: Analysis, span_s: float) -> None:
+def _draw_found_events(plot: Any, analysis: Analysis, span_s: float) -> None:
     top = plot.get_ylim()[1]
     for found in analysis.found:
         at, _ = hours_or_less(found.time_s, span_s)
         colour = _FOUND_COLOURS.get(found.kind, RED)
         plot.axvline(at, color=colour, lw=0.8, ls=":")
         plot.plot([at], [0.96 * top], marker="v", ms=5, color=colour, clip_on=False)
-    for noted in timeline(analysis):
+    for noted in make_timeline(analysis):
         if isinstance(event := noted.event, (events.Fault, run_events.Mark)):
             at, _ = hours_or_less(noted.mono_s, span_s)
             colour, text = (
@@ -217,11 +217,11 @@ def _found(plot: Any, analysis: Analysis, span_s: float) -> None:
             )
 
 
-def _lane(lane: Any, analysis: Analysis, span_s: float) -> None:
+def _draw_lane(lane: Any, analysis: Analysis, span_s: float) -> None:
     """States as coloured bars, named where there is room."""
     states = [
         (at.mono_s, at.event.state)
-        for at in timeline(analysis)
+        for at in make_timeline(analysis)
         if isinstance(at.event, events.StateEntered)
     ]
     edges_s = [start_s for start_s, _ in states]
@@ -259,7 +259,7 @@ def everything_else(analysis: Analysis) -> str:
     }
     shown = {plot: columns for plot, columns in plots.items() if columns and plot != ERROR}
     rows = max(1, math.ceil(len(shown) / 2))
-    with picture(rows, 2, 2.1 * rows, sharex=True, squeeze=False) as (figure, axes):
+    with make_picture(rows, 2, 2.1 * rows, sharex=True, squeeze=False) as (figure, axes):
         for axis, (plot, columns) in zip(axes.flat, shown.items(), strict=False):
             _draw_columns(axis, time, level, columns)
             axis.set_title(plot_title(plot))
@@ -267,7 +267,7 @@ def everything_else(analysis: Analysis) -> str:
             axis.set_axis_off()
         for axis in axes[-1]:
             axis.set_xlabel(unit)
-        return svg(figure)
+        return render_svg(figure)
 
 
 def _has_values(level: Mapping[str, Column], each: TelemetryColumn) -> bool:
@@ -291,10 +291,10 @@ def _draw_columns(
     axis.ticklabel_format(useOffset=False)
 
 
-def distributions(analysis: Analysis) -> str:
+def draw_distributions(analysis: Analysis) -> str:
     """Histogram, Allan deviation, spectrum."""
     reading, true = analysis.reading, analysis.true
-    with picture(1, 3, 3.3) as (figure, (histogram, allan, spectrum)):
+    with make_picture(1, 3, 3.3) as (figure, (histogram, allan, spectrum)):
         edges, counts = analysis.ticks.histogram_um, analysis.ticks.histogram_counts
         merged = counts.reshape(-1, 5).sum(axis=1)
         middle = edges[:-1].reshape(-1, 5).mean(axis=1) + (edges[1] - edges[0]) / 2
@@ -311,7 +311,7 @@ def distributions(analysis: Analysis) -> str:
                 allan.loglog(
                     series.allan.tau_s, series.allan.deviation, "o-", ms=3, color=colour, label=name
                 )
-            frequency_hz, power = power_spectrum.density(series.spectrum, series.slow)
+            frequency_hz, power = power_spectrum.combine_densities(series.spectrum, series.slow)
             if np.isfinite(power).any():
                 spectrum.loglog(frequency_hz, np.sqrt(power), color=colour, lw=0.8, label=name)
         allan.set(title="Overlapping Allan deviation", xlabel="τ, s", ylabel="µm")
@@ -319,14 +319,14 @@ def distributions(analysis: Analysis) -> str:
         for plot in (allan, spectrum):
             if plot.lines:
                 plot.legend(loc="best")
-        return svg(figure)
+        return render_svg(figure)
 
 
 def pump_history(history: Sequence[PumpSeen], change_max: float) -> str:
     """The pump against the newest run's curve over the runs of the bench, and the leak of each."""
     first = next(seen for seen in history if seen.same_curve)
     days = [seen.started_utc for seen in history]
-    with picture(1, 2, 2.6) as (figure, (scale, leak)):
+    with make_picture(1, 2, 2.6) as (figure, (scale, leak)):
         scale.errorbar(
             days, [s.scale for s in history], [s.sigma for s in history], fmt="o-", color=BLUE, ms=4
         )
@@ -337,7 +337,7 @@ def pump_history(history: Sequence[PumpSeen], change_max: float) -> str:
         leak.set(title="Leak, with any offset of the curve, µm/s")
         for plot in (scale, leak):
             plot.tick_params(axis="x", rotation=20)
-        return svg(figure)
+        return render_svg(figure)
 
 
 # The paper's stability plots, from the live cycles. More points than pixels only make the file
@@ -346,7 +346,7 @@ _LINE_POINTS = 1500
 _POINT_COLOURS = {"A": BLUE, "B": ORANGE, "C": VIOLET}
 
 
-def stability(shape: shape_review.ShapeReview) -> str:
+def draw_stability(shape: shape_review.ShapeReview) -> str:
     """Heights at A, B, C; camera against laser; the map of the standard deviation; drift of the
     terms.
     """
@@ -360,16 +360,19 @@ def stability(shape: shape_review.ShapeReview) -> str:
     }
     lines = broken_at_gaps({name: values[::every] for name, values in lines.items()})
     time, unit = hours_or_less(lines["time_s"], span_s)
-    with picture(2, 2, 6.2, width_ratios=[1.9, 1]) as (figure, plots):
+    with make_picture(2, 2, 6.2, width_ratios=[1.9, 1]) as (figure, plots):
         points, sd, loops, drift = plots.ravel()
         for name in shape.points_um:
             points.plot(time, lines[name], color=_POINT_COLOURS[name], lw=0.9, label=name)
+        start = format_span(shape.time_s[0])
         points.set(
-            title=f"Height at A, B and C since the settled cycle at {span(shape.time_s[0])}, µm",
+            title=f"Height at A, B and C since the settled cycle at {start}, µm",
             xlabel=unit,
         )
         points.legend(loc="upper right", ncols=3)
-        _map(figure, sd, shape.sd_um, "Standard deviation of the height, µm", "viridis", (0, None))
+        _draw_map(
+            figure, sd, shape.sd_um, "Standard deviation of the height, µm", "viridis", (0, None)
+        )
         for name, (x, y) in shape_review.POINTS.items():
             sd.plot(x, y, "o", ms=4, mfc="none", mec="white")
             sd.annotate(
@@ -379,11 +382,11 @@ def stability(shape: shape_review.ShapeReview) -> str:
         loops.plot(time, lines["sag"], color=BLUE, lw=0.9, label="sag by the camera")
         loops.set(title="Change of the centre by laser and by camera, µm", xlabel=unit)
         loops.legend(loc="upper right", ncols=2)
-        _drift(drift, shape)
-        return svg(figure)
+        _draw_drift(drift, shape)
+        return render_svg(figure)
 
 
-def _drift(plot: Any, shape: shape_review.ShapeReview) -> None:
+def _draw_drift(plot: Any, shape: shape_review.ShapeReview) -> None:
     noll = zernike_terms.NOLL_INDICES[1:]
     rate = np.array([term.per_hour for term in shape.drift_um_per_hour])
     reach = np.array([(term.high - term.low) / 2 for term in shape.drift_um_per_hour])
@@ -395,11 +398,14 @@ def _drift(plot: Any, shape: shape_review.ShapeReview) -> None:
     plot.set(title="Drift of the terms, µm/h (95 %)", xlabel="Noll index")
 
 
-def pairs(shape: shape_review.ShapeReview) -> str:
+def draw_pairs(shape: shape_review.ShapeReview) -> str:
     """Height change of cycles 1 and 10 minutes apart, the same less its low terms, and its
     uncertainty.
     """
-    with picture(len(shape.pairs), 3, 2.8 * len(shape.pairs), squeeze=False) as (figure, plots):
+    with make_picture(len(shape.pairs), 3, 2.8 * len(shape.pairs), squeeze=False) as (
+        figure,
+        plots,
+    ):
         for (change, less, sigma), pair in zip(plots, shape.pairs, strict=True):
             title = f"Change over {pair.lag_s:.0f} s, µm (RMS {pair.rms_um:.3f})"
             for plot, values, said in (
@@ -409,7 +415,7 @@ def pairs(shape: shape_review.ShapeReview) -> str:
                 most = (
                     float(np.nanquantile(np.abs(values), 0.99)) or 1e-3
                 )  # a few pixels must not hide the rest
-                _map(figure, plot, values, said, "RdBu_r", (-most, most))
+                _draw_map(figure, plot, values, said, "RdBu_r", (-most, most))
             if pair.sigma_um is None:
                 sigma.text(
                     0.5, 0.5, "no covariance was recorded", ha="center", transform=sigma.transAxes
@@ -417,11 +423,11 @@ def pairs(shape: shape_review.ShapeReview) -> str:
                 sigma.set_axis_off()
             else:
                 title = f"Its uncertainty, 1 σ, µm (mean {pair.mean_sigma_um:.4f})"
-                _map(figure, sigma, pair.sigma_um, title, "viridis", (0, None))
-        return svg(figure)
+                _draw_map(figure, sigma, pair.sigma_um, title, "viridis", (0, None))
+        return render_svg(figure)
 
 
-def _map(
+def _draw_map(
     figure: Any,
     plot: Any,
     values: Column,

@@ -24,14 +24,14 @@ from membrane_ctrl.model import (
 )
 from membrane_ctrl.processes.worker_pool import run_jobs
 from membrane_ctrl.review import catalogue
-from membrane_ctrl.review.formatting import beside, number, span
+from membrane_ctrl.review.formatting import format_number, format_span, format_time_beside
 from membrane_ctrl.review.report.command import write_report
-from membrane_ctrl.review.report.html import html_page, html_table, render
-from membrane_ctrl.review.report.json import report_table, timeline
+from membrane_ctrl.review.report.html import html_page, html_table, render_report
+from membrane_ctrl.review.report.json import make_timeline, report_table
 from membrane_ctrl.review.report.pump_history import pump_history
 from membrane_ctrl.review.run_times import part_s
-from membrane_ctrl.review.sparkline import sparkline
-from membrane_ctrl.review.statistics.analysis import Analysis, analyse
+from membrane_ctrl.review.sparkline import render_sparkline
+from membrane_ctrl.review.statistics.analysis import Analysis, analyse_run
 from membrane_ctrl.run_files.run import open_run
 
 SCHEMA = "membrane-fleet-report/1"
@@ -81,18 +81,23 @@ def run_report(start: str | None, end: str | None, folder: Path) -> RunReport:
     """
     try:
         run = open_run(folder)
-        analysis = analyse(run, *part_s(run.origin_utc, start, end))
+        analysis = analyse_run(run, *part_s(run.origin_utc, start, end))
         history = pump_history(folder)
         table = report_table(analysis) | {"pump_over_runs": [asdict(seen) for seen in history]}
-        text, curve = plain_json.dumps(table, indent=1), sparkline(analysis.level["mean_error_um"])
-        return RunReport(_line(analysis, table), text, render(analysis, history=history), curve)
+        text, curve = (
+            plain_json.dumps(table, indent=1),
+            render_sparkline(analysis.level["mean_error_um"]),
+        )
+        return RunReport(
+            _make_fleet_line(analysis, table), text, render_report(analysis, history=history), curve
+        )
     except errors.CommandError as error:
         return RunReport({"problem": "; ".join(error.lines).removeprefix(f"{folder}: ")})
     except Exception as error:  # one strange folder must not end the reports of the others
         return RunReport({"problem": f"cannot be reported: {type(error).__name__}: {error}"})
 
 
-def _line(analysis: Analysis, table: dict[str, Any]) -> dict[str, Any]:
+def _make_fleet_line(analysis: Analysis, table: dict[str, Any]) -> dict[str, Any]:
     """The figures of the run's own report that the fleet's page shows, and the names in its event
     log.
     """
@@ -111,7 +116,9 @@ def _line(analysis: Analysis, table: dict[str, Any]) -> dict[str, Any]:
         "of": "true centre" if table["true"] else "reading",
         "state": states[-1] if states else "",
         "faults": [
-            each.event.name for each in timeline(analysis) if isinstance(each.event, events.Fault)
+            each.event.name
+            for each in make_timeline(analysis)
+            if isinstance(each.event, events.Fault)
         ],
         "alarms": sorted(alarms),
         "found": len(table["found"]),
@@ -125,10 +132,10 @@ def folders_of(given: Sequence[Path]) -> list[Path]:
     """
     found: list[Path] = []
     for each in given:
-        folder, inside = catalogue.resolve(each).resolve(), []
+        folder, inside = catalogue.resolve_run(each).resolve(), []
         if folder.is_dir() and not catalogue.may_be_run(folder):
             with suppress(OSError):  # its line will tell
-                inside = catalogue.folders(folder)
+                inside = catalogue.list_run_folders(folder)
         found += inside or [folder]
     return list(dict.fromkeys(found))
 
@@ -142,10 +149,10 @@ def fleet_command(options: FleetOptions) -> int:
     workers = options.workers or min(os.cpu_count() or 1, len(folders))
     job, rows, lines = partial(run_report, options.start, options.end), [], []
     with (
-        errors.writing(out, errors.DeviceError, "; choose another folder with --out"),
+        errors.convert_write_errors(out, errors.DeviceError, "; choose another folder with --out"),
         run_jobs(job, folders, workers, options.scheduler) as results,
     ):
-        counted = terminal.counted(results, "runs", len(folders))
+        counted = terminal.track_progress(results, "runs", len(folders))
         for folder, report in zip(folders, counted, strict=True):
             name = folder.relative_to(common)
             line = {"name": str(name), "mirror": folder.parent.name} | report.line
@@ -153,13 +160,13 @@ def fleet_command(options: FleetOptions) -> int:
                 line["report"] = str(name / "report.html")
                 write_report(out / name, report.text, report.page)
             lines.append(line)
-            rows.append(_row(line, report.curve))
+            rows.append(_make_row(line, report.curve))
         if all("problem" in line for line in lines):
             raise errors.FindingsError([f"{line['name']}: {line['problem']}" for line in lines])
         text = plain_json.dumps({**program.file_origin(SCHEMA), "runs": lines}, indent=1)
         files.make_folder(out)
         files.write_text_atomic(out / "fleet.json", text + "\n")
-        files.write_text_atomic(out / "fleet.html", _page(lines, rows))
+        files.write_text_atomic(out / "fleet.html", _make_page(lines, rows))
     if options.as_json:
         print(text)
     else:
@@ -186,7 +193,7 @@ _HEAD = (
 )
 
 
-def _row(line: dict[str, Any], curve: str) -> list[str]:
+def _make_row(line: dict[str, Any], curve: str) -> list[str]:
     """A row of the page's table; its texts come from files, so they are escaped."""
     name = escape(line["name"])
     if "problem" in line:
@@ -200,7 +207,9 @@ def _row(line: dict[str, Any], curve: str) -> list[str]:
         ]
     in_band = line["in_band"]
     share = "–" if in_band is None or in_band != in_band else f"{100 * in_band:.4g} %"
-    rest = beside(line["faults_s"], line["paused_s"], line["moving_s"], line["duration_s"])
+    rest = format_time_beside(
+        line["faults_s"], line["paused_s"], line["moving_s"], line["duration_s"]
+    )
     faults = (
         f"{len(line['faults'])}: {', '.join(dict.fromkeys(line['faults']))}"
         if line["faults"]
@@ -212,10 +221,10 @@ def _row(line: dict[str, Any], curve: str) -> list[str]:
         curve,
         escape(f"{line['state']}, {line['exit'] or 'open'}"),
         escape(
-            f"{span(line['settled_s'])} of {span(line['duration_s'])}"
+            f"{format_span(line['settled_s'])} of {format_span(line['duration_s'])}"
             + (f" ({', '.join(rest)})" if rest else "")
         ),
-        *(number(line[key]) for key in ("std_um", "mean_um")),
+        *(format_number(line[key]) for key in ("std_um", "mean_um")),
         share,
         escape(faults),
         escape(", ".join(line["alarms"])) or "none",
@@ -225,7 +234,7 @@ def _row(line: dict[str, Any], curve: str) -> list[str]:
     ]
 
 
-def _page(lines: Sequence[dict[str, Any]], rows: Sequence[Sequence[str]]) -> str:
+def _make_page(lines: Sequence[dict[str, Any]], rows: Sequence[Sequence[str]]) -> str:
     failed = sum("problem" in line for line in lines)
     odd = sum(line.get("verdict") in ("look", "bad") for line in lines)
     said = f"{len(lines)} runs: {odd} to look at, {failed} cannot be reported."

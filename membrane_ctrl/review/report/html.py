@@ -7,9 +7,9 @@ import shlex
 from collections.abc import Iterable, Sequence
 
 from membrane_ctrl.model import program
-from membrane_ctrl.review.formatting import beside, number, span
+from membrane_ctrl.review.formatting import format_number, format_span, format_time_beside
 from membrane_ctrl.review.report import figures
-from membrane_ctrl.review.report.json import timeline, verdict
+from membrane_ctrl.review.report.json import make_timeline, make_verdict
 from membrane_ctrl.review.report.pump_history import PumpSeen, pump_change
 from membrane_ctrl.review.statistics import compare, drift, power_spectrum, shape_review
 from membrane_ctrl.review.statistics.analysis import Analysis
@@ -51,49 +51,56 @@ READING = "reading (in the loop)"
 TRUE = "true centre (twin)"
 
 
-def render(
+def render_report(
     analysis: Analysis,
     other: Analysis | None = None,
     differences: Sequence[compare.Difference] = (),
     history: Sequence[PumpSeen] = (),
 ) -> str:
     """HTML of a report, optionally with another run and the differences from it
-    (`compare.compare`).
+    (`compare.compare_analyses`).
 
     `history`: the pump in this and earlier runs (`pump_history`).
     """
     run = analysis.run
-    word, sentence = verdict(analysis)
+    word, sentence = make_verdict(analysis)
     parts = [
-        f"<header><h1>{_text(run.name)}</h1>"
+        f"<header><h1>{_escape_text(run.name)}</h1>"
         f"<p class='when'>{run.utc(analysis.ticks.start_s):%Y-%m-%d %H:%M:%S} UTC, "
-        f"{span(analysis.ticks.end_s - analysis.ticks.start_s)}</p></header>",
-        f"<p class='verdict {word}'>{_text(sentence)}</p>",
-        _anomalies(analysis),
-        f"<figure>{figures.overview(analysis)}</figure>",
-        _section("Detected events", _found(analysis)),
-        _section("Hold quality", _windows(analysis) + _details(analysis)),
-        f"<figure>{figures.distributions(analysis)}</figure>",
-        _section("Pump, leak, feed-forward, ticks", _pump(analysis)),
+        f"{format_span(analysis.ticks.end_s - analysis.ticks.start_s)}</p></header>",
+        f"<p class='verdict {word}'>{_escape_text(sentence)}</p>",
+        _render_anomalies(analysis),
+        f"<figure>{figures.draw_overview(analysis)}</figure>",
+        _render_section("Detected events", _render_found(analysis)),
+        _render_section("Hold quality", _render_windows(analysis) + _render_details(analysis)),
+        f"<figure>{figures.draw_distributions(analysis)}</figure>",
+        _render_section("Pump, leak, feed-forward, ticks", _render_pump(analysis)),
         f"<figure>{figures.everything_else(analysis)}</figure>",
     ]
     if analysis.shape is not None:
-        parts.append(_section("Figure", _shape(analysis.shape)))
-        parts.append(f"<figure>{figures.stability(analysis.shape)}</figure>")
+        parts.append(_render_section("Figure", _render_shape(analysis.shape)))
+        parts.append(f"<figure>{figures.draw_stability(analysis.shape)}</figure>")
         if analysis.shape.pairs:
-            parts.append(f"<figure>{figures.pairs(analysis.shape)}</figure>")
+            parts.append(f"<figure>{figures.draw_pairs(analysis.shape)}</figure>")
     if len(history) > 1:
-        parts.append(_section("Pump over the runs", _history(history, run.config.pump.change_max)))
+        parts.append(
+            _render_section(
+                "Pump over the runs", _render_history(history, run.config.pump.change_max)
+            )
+        )
     if other is not None:
         parts.append(
-            _section(f"Against {_text(other.run.name)}", _compared(analysis, other, differences))
+            _render_section(
+                f"Against {_escape_text(other.run.name)}",
+                _render_comparison(analysis, other, differences),
+            )
         )
-        parts.append(f"<figure>{figures.overview(other)}</figure>")
-    parts.append(_section("Timeline", _timeline(analysis)))
-    recorded = f", recorded by {_text(run.recorded_by)}" if run.recorded_by else ""
+        parts.append(f"<figure>{figures.draw_overview(other)}</figure>")
+    parts.append(_render_section("Timeline", _render_timeline(analysis)))
+    recorded = f", recorded by {_escape_text(run.recorded_by)}" if run.recorded_by else ""
     parts.append(
         f"<footer>{program.program_identity()}, report of "
-        f"{_text(str(run.folder.name))}{recorded}</footer>"
+        f"{_escape_text(str(run.folder.name))}{recorded}</footer>"
     )
     return html_page(run.name, "".join(parts))
 
@@ -103,46 +110,53 @@ def html_page(title: str, body: str) -> str:
     return (
         "<!doctype html><html lang='en'><head><meta charset='utf-8'>"
         "<meta name='viewport' content='width=device-width, initial-scale=1'>"
-        f"<title>{_text(title)}</title><style>{STYLE}</style></head><body><main>{body}</main></body></html>"
+        f"<title>{_escape_text(title)}</title><style>{STYLE}</style></head><body><main>{body}</main></body></html>"
     )
 
 
-def _anomalies(analysis: Analysis) -> str:
-    items = "".join(f"<li><b>{_text(a.name)}</b> {_text(a.seen)}</li>" for a in analysis.anomalies)
+def _render_anomalies(analysis: Analysis) -> str:
+    items = "".join(
+        f"<li><b>{_escape_text(a.name)}</b> {_escape_text(a.seen)}</li>" for a in analysis.anomalies
+    )
     return f"<ul class='odd'>{items}</ul>" if items else ""
 
 
-def _found(analysis: Analysis) -> str:
+def _render_found(analysis: Analysis) -> str:
     if not analysis.found:
         return (
             "<p>None: no door, leak step, laser glitch or loss, lateness burst, noise change, "
             "excursion or jump.</p>"
         )
-    name = _text(shlex.quote(analysis.run.name))
+    name = _escape_text(shlex.quote(analysis.run.name))
     rows = [
         [
             f"{analysis.run.utc(event.time_s):%Y-%m-%d %H:%M:%S}",
             event.kind,
-            f"{number(event.size)} {_text(event.unit)}",
+            f"{format_number(event.size)} {_escape_text(event.unit)}",
             f"{event.confidence:.3f}",
             f"<code>membrane-ctrl review {name} --from +{max(event.start_s, 1):.0f}s --to "
             f"+{event.end_s:.0f}s</code>",
         ]
         for event in analysis.found[:_LINES_MOST]
     ]
-    return html_table(["UTC", "what", "size", "confidence", "look at it"], rows) + _more(
+    return html_table(["UTC", "what", "size", "confidence", "look at it"], rows) + _format_rest(
         len(analysis.found)
     )
 
 
-def _windows(analysis: Analysis) -> str:
+def _render_windows(analysis: Analysis) -> str:
     rows = [
         [
             name,
             f"{window.window_s:g} s",
             f"{window.count}",
-            *(number(v) for v in (window.mean_um, window.std_um, window.p99_7_um, window.max_um)),
-            f"{number(100 * window.in_band, 6)} %" if window.count else number(window.in_band),
+            *(
+                format_number(v)
+                for v in (window.mean_um, window.std_um, window.p99_7_um, window.max_um)
+            ),
+            f"{format_number(100 * window.in_band, 6)} %"
+            if window.count
+            else format_number(window.in_band),
         ]
         for name, series in ((READING, analysis.reading), (TRUE, analysis.true))
         for window in (() if series is None else series.windows)
@@ -153,46 +167,51 @@ def _windows(analysis: Analysis) -> str:
     )
 
 
-def _details(analysis: Analysis) -> str:
+def _render_details(analysis: Analysis) -> str:
     series, name = (analysis.reading, READING) if analysis.true is None else (analysis.true, TRUE)
     if series is None:
         return ""
     ticks = analysis.ticks
-    single = (
-        f"std {number(ticks.raw_reading.std)} µm, {100 * ticks.raw_in_band:.2f} % within the band"
-    )
-    return _facts(
+    std_um = format_number(ticks.raw_reading.std)
+    single = f"std {std_um} µm, {100 * ticks.raw_in_band:.2f} % within the band"
+    return _render_facts(
         [
-            (f"drift, {name}", _slope(series.drift, "µm/h")),
+            (f"drift, {name}", _format_slope(series.drift, "µm/h")),
             (
                 "not counted as held",
                 ", ".join(
-                    beside(
+                    format_time_beside(
                         ticks.faults_s, ticks.paused_s, ticks.moving_s, ticks.end_s - ticks.start_s
                     )
                 )
                 or "nothing",
             ),
-            ("single readings", f"{single}; {number(ticks.unread_s)} s held without readings"),
-            (f"RMS by frequency, {name}", _bands(series)),
+            (
+                "single readings",
+                f"{single}; {format_number(ticks.unread_s)} s held without readings",
+            ),
+            (f"RMS by frequency, {name}", _render_bands(series)),
         ]
     )
 
 
-def _bands(series: ErrorSeries) -> str:
+def _render_bands(series: ErrorSeries) -> str:
     there = [
         band
-        for band in power_spectrum.bands(series.spectrum, series.slow)
+        for band in power_spectrum.band_rms(series.spectrum, series.slow)
         if band.rms_um == band.rms_um
     ]
     if not there:
         return "too short to say"
-    said = [f"{number(b.from_hz)}–{number(b.high_hz)} Hz: {number(b.rms_um)} µm" for b in there]
-    unresolved = span(power_spectrum.unseen_s(there))
+    said = [
+        f"{format_number(b.from_hz)}–{format_number(b.high_hz)} Hz: {format_number(b.rms_um)} µm"
+        for b in there
+    ]
+    unresolved = format_span(power_spectrum.unseen_s(there))
     return f"{'; '.join(said)}; not resolved: motion slower than {unresolved}"
 
 
-def _pump(analysis: Analysis) -> str:
+def _render_pump(analysis: Analysis) -> str:
     pump, ticks, late = analysis.ticks.pump, analysis.ticks, analysis.ticks.lateness_ms
     median, least, most = analysis.leak_um_per_s
     benefit = analysis.benefit
@@ -204,47 +223,50 @@ def _pump(analysis: Analysis) -> str:
         ),
         (
             "wear",
-            f"{number(pump.starts_per_hour)} starts and {number(pump.travel_per_hour)} full "
-            "strokes an hour",
+            f"{format_number(pump.starts_per_hour)} starts and "
+            f"{format_number(pump.travel_per_hour)} full strokes an hour",
         ),
         ("at a limit", f"{100 * pump.saturated_share:.2f} % of ticks"),
-        ("leak", f"{number(median)} µm/s (from {number(least)} to {number(most)})"),
+        (
+            "leak",
+            f"{format_number(median)} µm/s (from {format_number(least)} to {format_number(most)})",
+        ),
         (
             "lateness",
-            f"p50 {number(late.quantile(0.5))}, p99 {number(late.quantile(0.99))}, maximum "
-            f"{number(late.largest)} ms; {ticks.missed_ticks} ticks missed",
+            f"p50 {format_number(late.quantile(0.5))}, p99 {format_number(late.quantile(0.99))}, "
+            f"maximum {format_number(late.largest)} ms; {ticks.missed_ticks} ticks missed",
         ),
     ]
     if benefit is not None:
         said = (
-            f"std of 1 s means {number(benefit.with_um)} µm, without it "
-            f"{number(benefit.without_um)} µm (computed)"
+            f"std of 1 s means {format_number(benefit.with_um)} µm, without it "
+            f"{format_number(benefit.without_um)} µm (computed)"
         )
         facts.insert(4, ("feed-forward", said))
-    return _facts(facts)
+    return _render_facts(facts)
 
 
-def _history(history: Sequence[PumpSeen], change_max: float) -> str:
+def _render_history(history: Sequence[PumpSeen], change_max: float) -> str:
     rows = [
         [
             f"{seen.started_utc:%Y-%m-%d %H:%M}",
-            _text(seen.run),
+            _escape_text(seen.run),
             f"{seen.scale:.3f} ± {seen.sigma:.3f}",
-            number(seen.leak_um_per_s),
+            format_number(seen.leak_um_per_s),
         ]
         for seen in history[-_LINES_MOST:]
     ]
     said = pump_change(history, change_max)
-    warning = f"<ul class='odd'><li><b>pump</b> {_text(said)}</li></ul>" if said else ""
+    warning = f"<ul class='odd'><li><b>pump</b> {_escape_text(said)}</li></ul>" if said else ""
     table = html_table(
         ["UTC", "run", "flow / curve of the newest run", "leak and offset µm/s"], rows
     )
     return f"{warning}<figure>{figures.pump_history(history, change_max)}</figure>{table}"
 
 
-def _shape(shape: shape_review.ShapeReview) -> str:
+def _render_shape(shape: shape_review.ShapeReview) -> str:
     drifting = [
-        f"Z{j} {_slope(term, 'µm/h')}"
+        f"Z{j} {_format_slope(term, 'µm/h')}"
         for j, term in enumerate(shape.drift_um_per_hour, 2)
         if term.significant
     ]
@@ -252,81 +274,85 @@ def _shape(shape: shape_review.ShapeReview) -> str:
         ("cycles", f"{shape.time_s.size} used of {shape.cycles}, {shape.rejected} rejected"),
         (
             "changes are since",
-            f"the first settled one, at {span(float(shape.time_s[0]))} of the run",
+            f"the first settled one, at {format_span(float(shape.time_s[0]))} of the run",
         ),
-        ("standard deviation", f"{number(shape.mean_sd_um)} µm, mean over the area"),
+        ("standard deviation", f"{format_number(shape.mean_sd_um)} µm, mean over the area"),
         (
             "A, B, C",
-            ", ".join(f"{name} {number(float(v.std()))} µm" for name, v in shape.points_um.items()),
+            ", ".join(
+                f"{name} {format_number(float(v.std()))} µm" for name, v in shape.points_um.items()
+            ),
         ),
         ("drifting terms", ", ".join(drifting) or "none"),
-        ("sag by camera − laser", _slope(shape.disagreement, "µm/h")),
+        ("sag by camera − laser", _format_slope(shape.disagreement, "µm/h")),
     ]
     facts += [
         (
             f"{pair.lag_s:.0f} s apart",
-            f"RMS change {number(pair.rms_um)} µm (pair shown), {number(pair.all_rms_um)} µm "
-            f"(all {pair.pairs}); "
-            f"uncertainty {number(pair.mean_sigma_um)} µm",
+            f"RMS change {format_number(pair.rms_um)} µm (pair shown), "
+            f"{format_number(pair.all_rms_um)} µm (all {pair.pairs}); "
+            f"uncertainty {format_number(pair.mean_sigma_um)} µm",
         )
         for pair in shape.pairs
     ]
-    return _facts(facts)
+    return _render_facts(facts)
 
 
-def _compared(
+def _render_comparison(
     analysis: Analysis, other: Analysis, differences: Sequence[compare.Difference]
 ) -> str:
     rows = [
         [
             d.name,
-            number(d.ours),
-            number(d.theirs),
+            format_number(d.ours),
+            format_number(d.theirs),
             d.unit,
             d.said,
-            number(d.p_value, 2),
-            _text(d.note),
+            format_number(d.p_value, 2),
+            _escape_text(d.note),
         ]
         for d in differences
     ]
-    _, sentence = verdict(other)
+    _, sentence = make_verdict(other)
     if analysis.is_part and not other.is_part:
         sentence = f"Part of this run against the whole other run. {sentence}"
     table = html_table(["", "this run", "other run", "", "difference", "p", ""], rows)
-    return f"<p>{_text(sentence)}</p>{table}"
+    return f"<p>{_escape_text(sentence)}</p>{table}"
 
 
-def _timeline(analysis: Analysis) -> str:
-    told = timeline(analysis)
+def _render_timeline(analysis: Analysis) -> str:
+    told = make_timeline(analysis)
     rows = [
         [
             f"{analysis.run.utc(each.mono_s):%Y-%m-%d %H:%M:%S}",
-            _text(each.event.kind),
-            _text(each.event.sentence),
+            _escape_text(each.event.kind),
+            _escape_text(each.event.sentence),
         ]
         for each in told[:_LINES_MOST]
     ]
-    return html_table(["UTC", "what", ""], rows) + _more(len(told))
+    return html_table(["UTC", "what", ""], rows) + _format_rest(len(told))
 
 
-def _slope(slope: drift.FittedSlope, unit: str) -> str:
+def _format_slope(slope: drift.FittedSlope, unit: str) -> str:
     if slope.per_hour != slope.per_hour:
         return "too short to say"
     said = f"{slope.per_hour:+.3g} {unit} (95 %: {slope.low:+.3g} to {slope.high:+.3g})"
     return said if slope.significant else f"{said}, not significant"
 
 
-def _more(count: int) -> str:
+def _format_rest(count: int) -> str:
     return f"<p>{count - _LINES_MOST} more in the JSON report.</p>" if count > _LINES_MOST else ""
 
 
-def _section(title: str, body: str) -> str:
+def _render_section(title: str, body: str) -> str:
     return f"<section><h2>{title}</h2>{body}</section>"
 
 
-def _facts(facts: Iterable[tuple[str, str]]) -> str:
+def _render_facts(facts: Iterable[tuple[str, str]]) -> str:
     return (
-        "<dl>" + "".join(f"<dt>{_text(name)}</dt><dd>{said}</dd>" for name, said in facts) + "</dl>"
+        "<dl>"
+        + "".join(f"<dt>{_escape_text(name)}</dt><dd>{said}</dd>" for name, said in facts)
+        + "</dl>"
     )
 
 
@@ -340,5 +366,5 @@ def html_table(head: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
     )
 
 
-def _text(text: str) -> str:
+def _escape_text(text: str) -> str:
     return html.escape(text)

@@ -6,11 +6,11 @@ from typing import Any, Literal
 
 from membrane_ctrl.model import events, program
 from membrane_ctrl.model.telemetry import State
-from membrane_ctrl.review.formatting import beside, span
+from membrane_ctrl.review.formatting import format_span, format_time_beside
 from membrane_ctrl.review.statistics import drift, power_spectrum, shape_review
 from membrane_ctrl.review.statistics.analysis import Analysis
 from membrane_ctrl.review.statistics.error_series import ErrorSeries
-from membrane_ctrl.run_files.event_log import LoggedEvent, logged
+from membrane_ctrl.run_files.event_log import LoggedEvent, parse_logged_line
 
 Word = Literal["good", "look", "bad"]
 
@@ -20,32 +20,35 @@ _GRAVE = {"fault", "band left", "never settled"}
 _UNREAD_LEAST_S = 1.0
 
 
-def verdict(analysis: Analysis) -> tuple[Word, str]:
+def make_verdict(analysis: Analysis) -> tuple[Word, str]:
     """A word that selects the colour, and the verdict as a sentence."""
     run, ticks = analysis.run, analysis.ticks
     series = analysis.true or analysis.reading
-    whole = span(ticks.end_s - ticks.start_s)
+    whole = format_span(ticks.end_s - ticks.start_s)
     names = [anomaly.name for anomaly in analysis.anomalies]
     word: Word = "bad" if _GRAVE & set(names) else "look" if names else "good"
     if series is None or not series.windows[0].count:
-        return "bad", f"Not held: no second of {whole} counts as settled{_what(names)}."
+        return "bad", f"Not held: no second of {whole} counts as settled{_join_names(names)}."
     seconds = series.windows[0]
     who = "true centre" if analysis.true else "reading"
     std = f"std {seconds.std_um:.3f} µm, " if seconds.count > 1 else ""
     share = 100 * seconds.in_band
     parts = []
     if ticks.unread_s >= _UNREAD_LEAST_S:
-        parts.append(f"{span(ticks.unread_s)} of it without a reading")
-    parts += beside(ticks.faults_s, ticks.paused_s, ticks.moving_s, ticks.end_s - ticks.start_s)
+        parts.append(f"{format_span(ticks.unread_s)} of it without a reading")
+    parts += format_time_beside(
+        ticks.faults_s, ticks.paused_s, ticks.moving_s, ticks.end_s - ticks.start_s
+    )
     but = f" ({', '.join(parts)})" if parts else ""
     return word, (
-        f"Held for {span(ticks.settled_s)} of {whole}{but}; {share:.6g} % of its seconds within "
-        f"±{run.config.limits.band_um:g} µm ({who}: {std}mean {seconds.mean_um:+.3f} µm)"
-        f"{_what(names)}."
+        f"Held for {format_span(ticks.settled_s)} of {whole}{but}; "
+        f"{share:.6g} % of its seconds within ±{run.config.limits.band_um:g} µm "
+        f"({who}: {std}mean {seconds.mean_um:+.3f} µm)"
+        f"{_join_names(names)}."
     )
 
 
-def _what(names: list[str]) -> str:
+def _join_names(names: list[str]) -> str:
     return f"; check: {', '.join(dict.fromkeys(names))}" if names else "; nothing unusual"
 
 
@@ -55,7 +58,7 @@ SCHEMA = "membrane-report/1"
 def report_table(analysis: Analysis) -> dict[str, Any]:
     """All figures of the report (`membrane-report/1`); NaN where there is none."""
     run, ticks = analysis.run, analysis.ticks
-    word, sentence = verdict(analysis)
+    word, sentence = make_verdict(analysis)
     late = ticks.lateness_ms
     return {
         **program.file_origin(SCHEMA),
@@ -78,8 +81,8 @@ def report_table(analysis: Analysis) -> dict[str, Any]:
         "band_um": run.config.limits.band_um,
         "in_band_single_ticks": ticks.raw_in_band,
         "std_single_ticks_um": ticks.raw_reading.std,
-        "reading": _series(analysis.reading),
-        "true": _series(analysis.true),
+        "reading": _make_series(analysis.reading),
+        "true": _make_series(analysis.true),
         "histogram": {
             "edges_um": list(ticks.histogram_um),
             "counts": [int(n) for n in ticks.histogram_counts],
@@ -93,16 +96,16 @@ def report_table(analysis: Analysis) -> dict[str, Any]:
             "std_1s_without_um": analysis.benefit.without_um,
         },
         "lateness_ms": {"p50": late.quantile(0.5), "p99": late.quantile(0.99), "max": late.largest},
-        "timeline": [each.line for each in timeline(analysis)],
+        "timeline": [each.line for each in make_timeline(analysis)],
         "found": [asdict(event) for event in analysis.found],
-        "shape": None if analysis.shape is None else _shape(analysis.shape),
+        "shape": None if analysis.shape is None else _make_shape(analysis.shape),
         "anomalies": [asdict(anomaly) for anomaly in analysis.anomalies],
         "notes": list(run.notes),
         "exit": None if not run.summary else run.summary.get("exit"),
     }
 
 
-def timeline(analysis: Analysis) -> list[LoggedEvent]:
+def make_timeline(analysis: Analysis) -> list[LoggedEvent]:
     """Notable events, in order; without events, states from the telemetry."""
     told = [each for each in analysis.run.log if each.event.notable]
     if not any(isinstance(each.event, events.StateEntered) for each in told):
@@ -116,34 +119,34 @@ def timeline(analysis: Analysis) -> list[LoggedEvent]:
             for row in range(codes.size)
             if math.isfinite(codes[row]) and (row == 0 or codes[row] != codes[row - 1])
         )
-        told = sorted([*told, *map(logged, lines)], key=lambda each: each.mono_s)
+        told = sorted([*told, *map(parse_logged_line, lines)], key=lambda each: each.mono_s)
     return [each for each in told if analysis.part_s[0] <= each.mono_s < analysis.part_s[1]]
 
 
-def _series(series: ErrorSeries | None) -> dict[str, Any] | None:
+def _make_series(series: ErrorSeries | None) -> dict[str, Any] | None:
     if series is None:
         return None
     return {
         "windows": [asdict(window) for window in series.windows],
-        "drift_um_per_hour": _slope(series.drift),
+        "drift_um_per_hour": _make_slope(series.drift),
         "allan": {
             "tau_s": list(series.allan.tau_s),
             "deviation_um": list(series.allan.deviation),
             "windows": [int(n) for n in series.allan.windows],
         },
         "bands_rms_um": [
-            asdict(band) for band in power_spectrum.bands(series.spectrum, series.slow)
+            asdict(band) for band in power_spectrum.band_rms(series.spectrum, series.slow)
         ],
         "spectrum_segments": series.spectrum.segments,
         "slow_spectrum_segments": series.slow.segments,
     }
 
 
-def _slope(slope: drift.FittedSlope) -> dict[str, float | bool]:
+def _make_slope(slope: drift.FittedSlope) -> dict[str, float | bool]:
     return asdict(slope) | {"significant": slope.significant}
 
 
-def _shape(shape: shape_review.ShapeReview) -> dict[str, Any]:
+def _make_shape(shape: shape_review.ShapeReview) -> dict[str, Any]:
     return {
         "cycles": shape.cycles,
         "rejected": shape.rejected,
@@ -152,9 +155,9 @@ def _shape(shape: shape_review.ShapeReview) -> dict[str, Any]:
         "mean_sd_um": shape.mean_sd_um,
         "points_sd_um": {name: float(values.std()) for name, values in shape.points_um.items()},
         "drift_um_per_hour": {
-            f"Z{j}": _slope(term) for j, term in enumerate(shape.drift_um_per_hour, 2)
+            f"Z{j}": _make_slope(term) for j, term in enumerate(shape.drift_um_per_hour, 2)
         },
-        "sag_minus_laser_um_per_hour": _slope(shape.disagreement),
+        "sag_minus_laser_um_per_hour": _make_slope(shape.disagreement),
         "sag_std_um": float(shape.sag_um.std()),
         "laser_std_um": float(shape.laser_um.std()),
         "pairs": [

@@ -74,8 +74,8 @@ def pump_history(newest: Path) -> list[PumpSeen]:
             latest = latest or pump
             fraction = pump_curve.PumpCurve(latest).fraction(0.5 * latest.flow_full_um_per_s)
             share = pump_curve.PumpCurve(pump).flow(fraction) / (0.5 * latest.flow_full_um_per_s)
-            leak = _finite((summary_file.read_summary(folder, []) or {}).get("leak_um_per_s"))
-            seen = (share * _finite(learned.scale), share * _finite(learned.sigma), leak)
+            leak = _to_finite((summary_file.read_summary(folder, []) or {}).get("leak_um_per_s"))
+            seen = (share * _to_finite(learned.scale), share * _to_finite(learned.sigma), leak)
             if seen[0] > 0 and seen[1] > 0:
                 watched = {"probe_um", "change_max"}
                 same = pump.model_dump(exclude=watched) == latest.model_dump(exclude=watched)
@@ -93,5 +93,5 @@ def _last_learned(log: Sequence[LoggedEvent]) -> tuple[events.PumpLearned, dict[
     return told
 
 
-def _finite(value: object) -> float:
+def _to_finite(value: object) -> float:
     return float(value) if isinstance(value, int | float) else math.nan

@@ -81,7 +81,7 @@ class Analysis:
         return any(map(math.isfinite, self.part_s))
 
 
-def analyse(run: Run, start_s: float = -math.inf, end_s: float = math.inf) -> Analysis:
+def analyse_run(run: Run, start_s: float = -math.inf, end_s: float = math.inf) -> Analysis:
     """Analyse a run or a part of it.
 
     Parameters
@@ -109,10 +109,10 @@ def analyse(run: Run, start_s: float = -math.inf, end_s: float = math.inf) -> An
     level = run.level(level_s, start_s, end_s)
     reading = describe_error(run, ticks, READING)
     true = describe_error(run, ticks, TRUE)
-    benefit = _benefit(run, ticks, true is not None)
-    leak = _leak(level)
+    benefit = _compute_benefit(run, ticks, true is not None)
+    leak = _compute_leak(level)
     odd = find_anomalies(
-        run, (start_s, end_s), ticks, reading, true, leak[0], _tracking(level), found, shape
+        run, (start_s, end_s), ticks, reading, true, leak[0], _tracking_share(level), found, shape
     )
     return Analysis(
         run=run,
@@ -142,7 +142,7 @@ def _found_and_shape(
     return tuple(find_events(seconds, shapes, run.config.limits.band_um)), shape
 
 
-def _benefit(run: Run, ticks: HoldPass, true: bool) -> Benefit | None:
+def _compute_benefit(run: Run, ticks: HoldPass, true: bool) -> Benefit | None:
     second, counts, sums = ticks.seconds[TRUE if true else READING]
     if not np.isfinite(sums[KEPT_AWAY]).any():
         return None
@@ -154,7 +154,7 @@ def _benefit(run: Run, ticks: HoldPass, true: bool) -> Benefit | None:
     return Benefit(float(held.std()), float(without[1].std()), without) if held.size else None
 
 
-def _leak(level: Block) -> tuple[float, float, float]:
+def _compute_leak(level: Block) -> tuple[float, float, float]:
     leak = level["mean_leak_um_per_s"][level["state"] == telemetry.State.HOLD]
     leak = leak[np.isfinite(leak)]
     if not leak.size:
@@ -162,7 +162,7 @@ def _leak(level: Block) -> tuple[float, float, float]:
     return float(np.median(leak)), float(leak.min()), float(leak.max())
 
 
-def _tracking(level: Block) -> float:
+def _tracking_share(level: Block) -> float:
     """Share of the held time in which the shape loop moved the setpoint."""
     state = level["shape_state"][level["state"] == telemetry.State.HOLD]
     state = state[np.isfinite(state)]

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 from membrane_ctrl.model import events
 from membrane_ctrl.review.events.found_event import FoundEvent
-from membrane_ctrl.review.formatting import span
+from membrane_ctrl.review.formatting import format_span
 from membrane_ctrl.review.statistics import shape_review
 from membrane_ctrl.review.statistics.drift import FittedSlope
 from membrane_ctrl.review.statistics.error_series import ErrorSeries
@@ -75,7 +75,8 @@ def find_anomalies(
         odd.append(
             Anomaly(
                 "paused",
-                f"{span(ticks.paused_s)}: the pump gave its mean flow, nothing held the mirror",
+                f"{format_span(ticks.paused_s)}: the pump gave its mean flow, "
+                "nothing held the mirror",
             )
         )
     if ticks.missed_ticks:

@@ -10,7 +10,7 @@ from membrane_ctrl.control.shape_reference import SHAPES
 from membrane_ctrl.model.arrays import Column
 from membrane_ctrl.model.telemetry import ShapeState, State
 from membrane_ctrl.review.statistics.analysis import Analysis
-from membrane_ctrl.review.statistics.difference_tests import mean_p, spread_p, windowed
+from membrane_ctrl.review.statistics.difference_tests import mean_p, spread_p, window_means
 from membrane_ctrl.review.statistics.drift import FittedSlope
 from membrane_ctrl.review.statistics.error_series import ErrorSeries
 
@@ -43,7 +43,7 @@ class Difference:
         return "larger" if self.ours > self.theirs else "smaller"
 
 
-def compare(ours: Analysis, theirs: Analysis) -> list[Difference]:
+def compare_analyses(ours: Analysis, theirs: Analysis) -> list[Difference]:
     """Differences of two analyses.
 
     Means are tested between blocks: each run gives one every five minutes, and Welch's t test asks
@@ -61,25 +61,25 @@ def compare(ours: Analysis, theirs: Analysis) -> list[Difference]:
                 if name == "true centre"
                 else 0.0
             )
-            tracks = name == "true centre" and (_tracks(ours) or _tracks(theirs))
-            found += _series(name, a, b, offset_um, tracks)
+            tracks = name == "true centre" and (_is_tracking(ours) or _is_tracking(theirs))
+            found += _compare_series(name, a, b, offset_um, tracks)
     if ours.benefit is not None and theirs.benefit is not None:
         without = ours.benefit.without_um, theirs.benefit.without_um
         p_value = spread_p(ours.benefit.without_seconds_um, theirs.benefit.without_seconds_um)
-        found.append(_tested("without feed-forward", "µm", *without, p_value))
-    found += _loop(ours, theirs)
+        found.append(_make_tested_row("without feed-forward", "µm", *without, p_value))
+    found += _compare_loop(ours, theirs)
     if ours.shape is not None and theirs.shape is not None:
-        found += _figure(ours, theirs)
+        found += _compare_figure(ours, theirs)
     return found
 
 
-def _series(
+def _compare_series(
     name: str, a: ErrorSeries, b: ErrorSeries, offset_um: float, tracks: bool
 ) -> list[Difference]:
     first = a.windows[0], b.windows[0]
     mean = mean_p(a.seconds_um, b.seconds_um, offset=offset_um)
     found = [
-        _tested(
+        _make_tested_row(
             f"{name}, mean",
             "µm",
             first[0].mean_um,
@@ -87,24 +87,26 @@ def _series(
             mean,
             _of_mean(offset_um, tracks),
         ),
-        _tested(
+        _make_tested_row(
             f"{name}, std of 1 s",
             "µm",
             first[0].std_um,
             first[1].std_um,
             spread_p(a.seconds_um, b.seconds_um),
         ),
-        _tested(
+        _make_tested_row(
             f"{name}, drift", "µm/h", a.drift.per_hour, b.drift.per_hour, _slope_p(a.drift, b.drift)
         ),
     ]
     for x, y in zip(a.windows[1:], b.windows[1:], strict=True):
         parts = [
-            np.stack(windowed(series.seconds_um[0], series.seconds_um[1], x.window_s))
+            np.stack(window_means(series.seconds_um[0], series.seconds_um[1], x.window_s))
             for series in (a, b)
         ]
         p_value = spread_p(parts[0], parts[1], x.window_s)
-        found.append(_tested(f"{name}, std of {x.window_s:g} s", "µm", x.std_um, y.std_um, p_value))
+        found.append(
+            _make_tested_row(f"{name}, std of {x.window_s:g} s", "µm", x.std_um, y.std_um, p_value)
+        )
     return found
 
 
@@ -114,10 +116,10 @@ def _of_mean(offset_um: float, tracks: bool) -> str:
     return f"{_STRETCHES}, and ignores the reference of the shape loop" if tracks else ""
 
 
-def _loop(ours: Analysis, theirs: Analysis) -> list[Difference]:
+def _compare_loop(ours: Analysis, theirs: Analysis) -> list[Difference]:
     mine, other = ours.ticks, theirs.ticks
     leak, pump, late = (
-        [_held(analysis, name) for analysis in (ours, theirs)]
+        [_select_held(analysis, name) for analysis in (ours, theirs)]
         for name in ("mean_leak_um_per_s", "mean_pump_fraction", "max_lateness_ms")
     )
     window_s = max(ours.level_s, theirs.level_s)
@@ -130,7 +132,7 @@ def _loop(ours: Analysis, theirs: Analysis) -> list[Difference]:
     elif math.isnan(late_p):
         late_note = _SHORT
     return [
-        _tested(
+        _make_tested_row(
             "leak",
             "µm/s",
             ours.leak_um_per_s[0],
@@ -138,7 +140,7 @@ def _loop(ours: Analysis, theirs: Analysis) -> list[Difference]:
             mean_p(leak[0], leak[1], window_s),
             _STRETCHES,
         ),
-        _tested(
+        _make_tested_row(
             "pump, mean",
             "of full",
             mine.pump.mean_fraction,
@@ -165,7 +167,7 @@ def _loop(ours: Analysis, theirs: Analysis) -> list[Difference]:
     ]
 
 
-def _figure(ours: Analysis, theirs: Analysis) -> list[Difference]:
+def _compare_figure(ours: Analysis, theirs: Analysis) -> list[Difference]:
     assert ours.shape is not None
     assert theirs.shape is not None
     cycle_s = max(float(np.median(np.diff(shape.time_s))) for shape in (ours.shape, theirs.shape))
@@ -181,7 +183,7 @@ def _figure(ours: Analysis, theirs: Analysis) -> list[Difference]:
     least = float(np.minimum(1.0, len(points) * np.min(points)))
     parting = ours.shape.disagreement, theirs.shape.disagreement
     return [
-        _tested(
+        _make_tested_row(
             "figure, mean SD",
             "µm",
             ours.shape.mean_sd_um,
@@ -189,27 +191,27 @@ def _figure(ours: Analysis, theirs: Analysis) -> list[Difference]:
             least,
             "tested at A, B and C",
         ),
-        _tested(
+        _make_tested_row(
             "sag − laser", "µm/h", parting[0].per_hour, parting[1].per_hour, _slope_p(*parting)
         ),
     ]
 
 
-def _tested(
+def _make_tested_row(
     name: str, unit: str, ours: float, theirs: float, p_value: float, note: str = ""
 ) -> Difference:
     """A row with a test; it states if that was not possible."""
     return Difference(name, unit, ours, theirs, p_value, _SHORT if math.isnan(p_value) else note)
 
 
-def _held(analysis: Analysis, name: str) -> Column:
+def _select_held(analysis: Analysis, name: str) -> Column:
     """(2, n): times and values of the level while held."""
     level = analysis.level
     held = (level["state"] == State.HOLD) & np.isfinite(level[name])
     return np.stack((level["time_s"][held], level[name][held]))
 
 
-def _tracks(analysis: Analysis) -> bool:
+def _is_tracking(analysis: Analysis) -> bool:
     return bool((analysis.level.get("shape_state", np.empty(0)) == ShapeState.TRACKING).any())
 
 
@@ -221,7 +223,7 @@ def _reference_um(analysis: Analysis) -> float:
     there are too few cycles.
     """
     shape = analysis.shape
-    if shape is None or shape.time_s.size < 2 * SHAPES or not _tracks(analysis):
+    if shape is None or shape.time_s.size < 2 * SHAPES or not _is_tracking(analysis):
         return 0.0
     scatter_um = float(np.std(np.diff(shape.sag_um - shape.laser_um))) / math.sqrt(2)
     return scatter_um / math.sqrt(SHAPES)

@@ -33,7 +33,7 @@ def block_s(a_s: Column, b_s: Column, window_s: float) -> float:
     return max(min(_BLOCK_S, min(spans_s) / _LEAST_BLOCKS), _LEAST_VALUES * window_s)
 
 
-def blocks(time_s: Column, values: Column, length_s: float) -> tuple[Column, Column]:
+def block_statistics(time_s: Column, values: Column, length_s: float) -> tuple[Column, Column]:
     """Mean and log variance of each block; the logarithm is corrected for its bias from the number
     of values.
     """
@@ -53,7 +53,7 @@ def blocks(time_s: Column, values: Column, length_s: float) -> tuple[Column, Col
     return np.asarray(mean[kept], dtype=np.float64), np.log(variance[varies]) - bias[varies]
 
 
-def windowed(time_s: Column, values: Column, window_s: float) -> tuple[Column, Column]:
+def window_means(time_s: Column, values: Column, window_s: float) -> tuple[Column, Column]:
     """Middles and means of longer windows, those with nine tenths of their seconds."""
     if not time_s.size:
         return time_s, values
@@ -75,7 +75,9 @@ def spread_p(a: Column, b: Column, window_s: float = 1.0) -> float:
     squares says; it sees what is slower or rarer than a block.
     """
     length_s = block_s(a[0], b[0], window_s)
-    within = welch_p(blocks(a[0], a[1], length_s)[1], blocks(b[0], b[1], length_s)[1])
+    within = welch_p(
+        block_statistics(a[0], a[1], length_s)[1], block_statistics(b[0], b[1], length_s)[1]
+    )
     both = [p for p in (within, _variances_p(a[1], b[1])) if math.isfinite(p)]
     return min(1.0, len(both) * min(both)) if both else math.nan
 
@@ -114,7 +116,10 @@ def mean_p(a: Column, b: Column, window_s: float = 1.0, offset: float = 0.0) -> 
     """
     length_s = block_s(a[0], b[0], window_s)
     return welch_p(
-        blocks(a[0], a[1], length_s)[0], blocks(b[0], b[1], length_s)[0], offset, correlated=True
+        block_statistics(a[0], a[1], length_s)[0],
+        block_statistics(b[0], b[1], length_s)[0],
+        offset,
+        correlated=True,
     )
 
 

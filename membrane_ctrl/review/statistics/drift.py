@@ -31,7 +31,7 @@ class FittedSlope:
         return bool(self.low > 0 or self.high < 0)
 
 
-def slope(time_s: Column, values: Column) -> FittedSlope:
+def fit_slope(time_s: Column, values: Column) -> FittedSlope:
     """Slope of values against time.
 
     The variance of the ordinary slope is multiplied by the integrated autocorrelation time of the

@@ -7,13 +7,17 @@ from scipy import fft
 
 from membrane_ctrl.model.arrays import Column, Singles
 from membrane_ctrl.review.statistics import allan_deviation, power_spectrum
-from membrane_ctrl.review.statistics.drift import FittedSlope, slope
+from membrane_ctrl.review.statistics.drift import FittedSlope, fit_slope
 from membrane_ctrl.review.statistics.hold_pass import (
     ERROR,
     READING,
     HoldPass,
 )
-from membrane_ctrl.review.statistics.window_means import WindowStatistics, describe, window_means
+from membrane_ctrl.review.statistics.window_means import (
+    WindowStatistics,
+    describe_windows,
+    window_means,
+)
 from membrane_ctrl.run_files.run import Run
 
 WINDOWS_S = (1, 4, 60)
@@ -52,18 +56,19 @@ def describe_error(run: Run, ticks: HoldPass, which: int) -> ErrorSeries | None:
     means = {w: window_means(second, counts, sums[ERROR], w, rate_hz) for w in WINDOWS_S}
     grid = ticks.reading_um if which == READING else ticks.true_um
     grid = fill_short_gaps(
-        grid[_first(grid) : grid.size - _first(grid[::-1])], round(FILLED_S * rate_hz)
+        grid[_places_before_first(grid) : grid.size - _places_before_first(grid[::-1])],
+        round(FILLED_S * rate_hz),
     )
     longest = max(1, min(grid.size // 4, round(_ALLAN_LONGEST_S * rate_hz)))
     lengths = 2 ** np.arange(int(np.log2(longest)) + 1)
     minutes = ticks.hold_s >= _SLOPE_MINUTES_FROM_S
     return ErrorSeries(
-        windows=tuple(describe(means[w][1], w, band_um) for w in WINDOWS_S),
+        windows=tuple(describe_windows(means[w][1], w, band_um) for w in WINDOWS_S),
         seconds_um=np.stack(means[1]),
         allan=allan_deviation.allan_deviation(grid, 1 / rate_hz, lengths),
         spectrum=power_spectrum.power_spectrum(grid, rate_hz),
         slow=slow_spectrum(*means[1]),
-        drift=slope(*means[60 if minutes else 1]),
+        drift=fit_slope(*means[60 if minutes else 1]),
     )
 
 
@@ -97,6 +102,6 @@ def fill_short_gaps(values: Singles, most: int) -> Singles:
     return filled
 
 
-def _first(grid: Singles) -> int:
+def _places_before_first(grid: Singles) -> int:
     """Places before the first value."""
     return int(np.argmax(np.isfinite(grid)))

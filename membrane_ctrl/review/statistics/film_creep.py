@@ -51,7 +51,7 @@ def fit_creep(time_s: FloatArray, y: FloatArray, ahead_s: float) -> FilmCreep:
     time.
     """
     order = np.argsort(time_s)
-    time_s, y = _blocks(np.asarray(time_s, float)[order], np.asarray(y, float)[order])
+    time_s, y = _average_blocks(np.asarray(time_s, float)[order], np.asarray(y, float)[order])
     if time_s.size < LEAST:
         raise ValueError(
             f"{time_s.size} readings are too few for a law of creep; {LEAST} are needed"
@@ -62,7 +62,7 @@ def fit_creep(time_s: FloatArray, y: FloatArray, ahead_s: float) -> FilmCreep:
             f"readings over {span_s / 3600:.1f} h say nothing of {ahead_s / 3600:.0f} h ahead"
         )
     t = np.append((time_s - time_s[0]) / span_s, 1 + ahead_s / span_s)
-    found = np.array([_one(t, y, *each) for each in product(_ONSETS, _BENDS, _LASTING)])
+    found = np.array([_fit_law(t, y, *each) for each in product(_ONSETS, _BENDS, _LASTING)])
     weight = np.exp(found[:, 0] - np.max(found[:, 0]))
     weight /= weight.sum()
     _, drifts, variances, decades, scatters = found.T
@@ -71,7 +71,7 @@ def fit_creep(time_s: FloatArray, y: FloatArray, ahead_s: float) -> FilmCreep:
     return FilmCreep(span_s, float(weight @ decades), drift, sigma, float(weight @ scatters))
 
 
-def _blocks(time_s: FloatArray, y: FloatArray) -> tuple[FloatArray, FloatArray]:
+def _average_blocks(time_s: FloatArray, y: FloatArray) -> tuple[FloatArray, FloatArray]:
     """Means over blocks of equal time."""
     span_s = float(np.ptp(time_s)) if time_s.size else 0.0
     if time_s.size <= _BLOCKS or span_s == 0:
@@ -82,7 +82,7 @@ def _blocks(time_s: FloatArray, y: FloatArray) -> tuple[FloatArray, FloatArray]:
     return np.bincount(block, time_s)[full] / count[full], np.bincount(block, y)[full] / count[full]
 
 
-def _one(
+def _fit_law(
     t: FloatArray, y: FloatArray, onset: float, bend: float, lasting: float
 ) -> tuple[float, float, float, float, float]:
     """One law: log evidence, drift to the last t from the one before, its variance, drift per

@@ -34,7 +34,7 @@ def film_run_command(
     runs = [open_run(folder) for folder in folders]
     radius_mm = runs[0].config.optics.mirror.radius_mm
     time_s, sag_mm, pressure_pa = (
-        np.concatenate(part) for part in zip(*map(_readings, runs), strict=True)
+        np.concatenate(part) for part in zip(*map(_read_cycles, runs), strict=True)
     )
     law = FilmLaw(prestrain, poisson, 1.0, radius_mm)
     try:
@@ -46,22 +46,22 @@ def film_run_command(
     now = law.with_sag(sag_mm[np.argmax(time_s)])
     softer = FilmLaw(prestrain, poisson, math.exp(-1e-3), radius_mm).under(law.pressure_pa(now))
     um_per_log = -1e6 * float(softer.sag_mm - now.sag_mm)
-    table = _table(runs, stiffness, creep, um_per_log) | {
+    table = _make_table(runs, stiffness, creep, um_per_log) | {
         "prestrain": prestrain,
         "poisson": poisson,
     }
     folder = (out or runs[-1].folder / "film").resolve()
-    with errors.writing(folder):
+    with errors.convert_write_errors(folder):
         files.make_folder(folder)
         write_json(folder / "creep.json", table)
         if pictures:
-            _draw(folder / "creep.png", (time_s - time_s.min()) / 3600, stiffness / 1e3)
+            _draw_stiffness(folder / "creep.png", (time_s - time_s.min()) / 3600, stiffness / 1e3)
     print(f"written to {folder}", file=sys.stderr)
-    print(json.dumps(table) if as_json else "\n".join(_lines(table)))
+    print(json.dumps(table) if as_json else "\n".join(_format_table(table)))
     return 0
 
 
-def _readings(run: Run) -> tuple[FloatArray, FloatArray, FloatArray]:
+def _read_cycles(run: Run) -> tuple[FloatArray, FloatArray, FloatArray]:
     """UTC in s, sag in mm and gauge pressure in Pa of the cycles of a run that gave a figure."""
     shapes, level = run.shapes(), run.level(_LEVEL_S, names=(_GAUGE,))
     known = np.isfinite(level[_GAUGE])
@@ -80,7 +80,7 @@ def _readings(run: Run) -> tuple[FloatArray, FloatArray, FloatArray]:
     )
 
 
-def _table(
+def _make_table(
     runs: Sequence[Run], stiffness: FloatArray, creep: FilmCreep, um_per_log: float
 ) -> dict[str, Any]:
     return {
@@ -98,7 +98,7 @@ def _table(
     }
 
 
-def _lines(table: dict[str, Any]) -> list[str]:
+def _format_table(table: dict[str, Any]) -> list[str]:
     drift = table["tomorrow_um"]
     low, high = (drift["value"] + sign * _SURE * drift["sigma"] for sign in (-1, 1))
     creeps = f"creep      {table['percent_per_decade']:+.3g} % of E t in a decade of time"
@@ -114,7 +114,7 @@ def _lines(table: dict[str, Any]) -> list[str]:
     ]
 
 
-def _draw(path: Path, hours: FloatArray, stiffness_kn_per_m: FloatArray) -> None:
+def _draw_stiffness(path: Path, hours: FloatArray, stiffness_kn_per_m: FloatArray) -> None:
     from matplotlib.figure import Figure
 
     drawing = Figure(figsize=(8, 4), layout="constrained")

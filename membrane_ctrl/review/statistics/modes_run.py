@@ -91,8 +91,8 @@ def modes_command(folders: Sequence[Path], out: Path | None, as_json: bool, pict
     times: list[float] = []
     searches: list[tuple[VibrationMode, ...] | None] = []
     for folder in folders:
-        time_s, coeffs_um, origin_s = _frames(folder)
-        for part in terminal.counted(_minutes(time_s), "searches"):
+        time_s, coeffs_um, origin_s = _read_frames(folder)
+        for part in terminal.track_progress(_choose_minutes(time_s), "searches"):
             times.append(origin_s + float(time_s[part].mean()))
             searches.append(find_modes(time_s[part], coeffs_um[part]))
     done = [(at_s, lines) for at_s, lines in zip(times, searches, strict=True) if lines is not None]
@@ -100,20 +100,22 @@ def modes_command(folders: Sequence[Path], out: Path | None, as_json: bool, pict
         raise errors.RejectedError(
             f"{folders[0]}: less than {LEAST_S:g} s of frames at a steady rate"
         )
-    modes, passing = _together(np.array([at_s for at_s, _ in done]), [lines for _, lines in done])
-    table = _table(folders, modes, passing, len(done))
+    modes, passing = _group_lines(
+        np.array([at_s for at_s, _ in done]), [lines for _, lines in done]
+    )
+    table = _make_table(folders, modes, passing, len(done))
     out = (out or folders[-1] / "modes").resolve()
-    with errors.writing(out):
+    with errors.convert_write_errors(out):
         files.make_folder(out)
         write_json(out / "modes.json", table)
         if pictures and modes:
-            _show(out, modes, min(times), _lines(table))
+            _write_pictures(out, modes, min(times), _format_table(table))
     print(f"written to {out}", file=sys.stderr)
-    print(json.dumps(table) if as_json else "\n".join(_lines(table)))
+    print(json.dumps(table) if as_json else "\n".join(_format_table(table)))
     return 0
 
 
-def _frames(folder: Path) -> tuple[FloatArray, FloatArray, float]:
+def _read_frames(folder: Path) -> tuple[FloatArray, FloatArray, float]:
     """Times, terms (n, terms) with NaN where rejected, and the UTC of time 0.
     Raises CommandError.
     """
@@ -164,7 +166,7 @@ def _frames(folder: Path) -> tuple[FloatArray, FloatArray, float]:
     return time_s, coeffs_um, origin_s
 
 
-def _minutes(time_s: FloatArray) -> list[slice]:
+def _choose_minutes(time_s: FloatArray) -> list[slice]:
     """Minutes of frames, evenly spread if there are many."""
     _, first = np.unique(np.floor((time_s - time_s[0]) / SEARCH_S), return_index=True)
     edges = [*first, time_s.size]
@@ -174,7 +176,7 @@ def _minutes(time_s: FloatArray) -> list[slice]:
     return [slice(edges[k], edges[k + 1]) for k in chosen]
 
 
-def _together(
+def _group_lines(
     times_s: FloatArray, searches: Sequence[tuple[VibrationMode, ...]]
 ) -> tuple[list[SeenMode], int]:
     """Lines of neighbouring frequencies in at least half of the searches, the strongest first; how
@@ -200,7 +202,7 @@ def _together(
     return usual, len(seen) - sum(len(mode.lines) for mode in usual)
 
 
-def _table(
+def _make_table(
     folders: Sequence[Path], modes: Sequence[SeenMode], passing: int, searches: int
 ) -> dict[str, Any]:
     return {
@@ -225,7 +227,7 @@ def _table(
     }
 
 
-def _lines(table: dict[str, Any]) -> list[str]:
+def _format_table(table: dict[str, Any]) -> list[str]:
     lines = [f"searches   {table['searches']} of a minute at most"]
     for mode in table["modes"]:
         terms = np.argsort(np.abs(mode["shape"]))[::-1][:3]
@@ -252,15 +254,17 @@ def _lines(table: dict[str, Any]) -> list[str]:
     return lines
 
 
-def _show(out: Path, modes: Sequence[SeenMode], begin_s: float, lines: Sequence[str]) -> None:
+def _write_pictures(
+    out: Path, modes: Sequence[SeenMode], begin_s: float, lines: Sequence[str]
+) -> None:
     """Write `modes.png` and `modes.rrd`. Raises OSError."""
     import rerun as rr
 
     from membrane_ctrl.measure.rerun_recording import log_pictures, open_recording
 
-    picture = _draw(out / "modes.png", modes, begin_s)
+    picture = _draw_modes(out / "modes.png", modes, begin_s)
     with open_recording(
-        out / "modes.rrd", "membrane_ctrl_modes", _layout(len(modes), picture)
+        out / "modes.rrd", "membrane_ctrl_modes", _make_layout(len(modes), picture)
     ) as recording:
         recording.log("modes/report", rr.TextDocument("\n".join(lines)), static=True)
         for k, mode in enumerate(modes, start=1):
@@ -281,7 +285,7 @@ def _show(out: Path, modes: Sequence[SeenMode], begin_s: float, lines: Sequence[
         log_pictures(recording, "modes/pictures", [picture])
 
 
-def _layout(count: int, picture: Path) -> "rrb.Blueprint":
+def _make_layout(count: int, picture: Path) -> "rrb.Blueprint":
     """Changes of the frequencies and amplitudes beside the picture and the report."""
     import rerun as rr
 
@@ -316,7 +320,7 @@ def _layout(count: int, picture: Path) -> "rrb.Blueprint":
     )
 
 
-def _draw(path: Path, modes: Sequence[SeenMode], begin_s: float) -> Path:
+def _draw_modes(path: Path, modes: Sequence[SeenMode], begin_s: float) -> Path:
     """Draw the frequencies over time and the shapes of the strongest modes."""
     from membrane_ctrl.measure.pictures import new_sheet
 

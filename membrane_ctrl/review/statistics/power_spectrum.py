@@ -88,13 +88,13 @@ class Band:
     rms_um: float  # NaN if nothing is resolved
 
 
-def bands(fast: Spectrum, slow: Spectrum) -> list[Band]:
+def band_rms(fast: Spectrum, slow: Spectrum) -> list[Band]:
     """RMS in each of `BANDS_HZ`: from the ticks' spectrum where it resolves a band, else from the 1
     s means.
     """
     edges = [*BANDS_HZ, float(fast.frequency_hz[-1])]
     return [
-        _band(slow if _is_slow(fast, slow, low, high) else fast, low, high)
+        _integrate_band(slow if _is_slow(fast, slow, low, high) else fast, low, high)
         for low, high in pairwise(edges)
     ]
 
@@ -106,7 +106,7 @@ def unseen_s(found: list[Band]) -> float:
     )
 
 
-def density(fast: Spectrum, slow: Spectrum) -> tuple[Column, Column]:
+def combine_densities(fast: Spectrum, slow: Spectrum) -> tuple[Column, Column]:
     """Frequencies (Hz) and one density, which uses the 1 s means below the resolution of the ticks'
     spectrum.
     """
@@ -131,7 +131,7 @@ def _is_slow(fast: Spectrum, slow: Spectrum, low_hz: float, high_hz: float) -> b
     return not fast.segments or low_hz < _RESOLVED_LINES * float(fast.frequency_hz[1])
 
 
-def _band(spectrum: Spectrum, low_hz: float, high_hz: float) -> Band:
+def _integrate_band(spectrum: Spectrum, low_hz: float, high_hz: float) -> Band:
     first_hz = max(low_hz, float(spectrum.frequency_hz[1]))
     rms_um = spectrum.band_rms(low_hz, high_hz)
     return Band(low_hz, high_hz, first_hz if rms_um == rms_um else math.nan, rms_um)

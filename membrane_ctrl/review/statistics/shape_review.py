@@ -6,7 +6,7 @@ import numpy as np
 
 from membrane_ctrl.model.arrays import BoolArray, Column
 from membrane_ctrl.model.zernike_terms import ZERNIKE_TERMS
-from membrane_ctrl.review.statistics.drift import FittedSlope, slope
+from membrane_ctrl.review.statistics.drift import FittedSlope, fit_slope
 from membrane_ctrl.run_files.shapes import Shapes, height_basis
 
 MAP_PX = 128
@@ -72,7 +72,7 @@ def review_shapes(shapes: Shapes, held: BoolArray, analysis_share: float) -> Sha
     area = _Area(analysis_share)
     parameters = good.parameters_um()
     parameters -= parameters[0].copy()
-    sd_um = np.sqrt(np.maximum(_quadratic(area.basis, np.cov(parameters.T)), 0.0))
+    sd_um = np.sqrt(np.maximum(_quadratic_form(area.basis, np.cov(parameters.T)), 0.0))
     x, y = (np.array([point[axis] for point in POINTS.values()]) for axis in (0, 1))
     points = parameters @ height_basis(x, y)
     sag_um = good.sag_um - good.sag_um[0]
@@ -84,12 +84,14 @@ def review_shapes(shapes: Shapes, held: BoolArray, analysis_share: float) -> Sha
         points_um=dict(zip(POINTS, points.T, strict=True)),
         sd_um=area.map(sd_um),
         mean_sd_um=float(sd_um.mean()),
-        drift_um_per_hour=tuple(_slope(good.time_s, term) for term in good.coeffs_um[:, 1:].T),
+        drift_um_per_hour=tuple(_fit_slope(good.time_s, term) for term in good.coeffs_um[:, 1:].T),
         sag_um=sag_um,
         laser_um=laser_um,
-        disagreement=_slope(good.time_s, sag_um - laser_um),
+        disagreement=_fit_slope(good.time_s, sag_um - laser_um),
         pairs=tuple(
-            pair for lag_s in PAIRS_S if (pair := _pair(good, parameters, area, lag_s)) is not None
+            pair
+            for lag_s in PAIRS_S
+            if (pair := _choose_pair(good, parameters, area, lag_s)) is not None
         ),
     )
 
@@ -112,7 +114,7 @@ class _Area:
         return picture
 
 
-def _pair(good: Shapes, parameters: Column, area: _Area, lag_s: float) -> CyclePair | None:
+def _choose_pair(good: Shapes, parameters: Column, area: _Area, lag_s: float) -> CyclePair | None:
     """The pair nearest to the run's middle, and the RMS of all pairs as far apart (within half a
     cycle).
     """
@@ -131,7 +133,7 @@ def _pair(good: Shapes, parameters: Column, area: _Area, lag_s: float) -> CycleP
     covariances = [good.covariance_near(float(time_s[k])) for k in (first, second)]
     sigma_um = None
     if covariances[0] is not None and covariances[1] is not None:
-        variance = _quadratic(area.basis[:ZERNIKE_TERMS], covariances[0] + covariances[1])
+        variance = _quadratic_form(area.basis[:ZERNIKE_TERMS], covariances[0] + covariances[1])
         sigma_um = np.sqrt(np.maximum(variance, 0.0))
     return CyclePair(
         first_s=float(time_s[first]),
@@ -145,13 +147,13 @@ def _pair(good: Shapes, parameters: Column, area: _Area, lag_s: float) -> CycleP
     )
 
 
-def _quadratic(basis: Column, covariance: Column) -> Column:
+def _quadratic_form(basis: Column, covariance: Column) -> Column:
     """b' C b at each point (column of the basis)."""
     return np.asarray(np.einsum("jp,jp->p", basis, covariance @ basis))
 
 
-def _slope(time_s: Column, values: Column) -> FittedSlope:
+def _fit_slope(time_s: Column, values: Column) -> FittedSlope:
     every = max(1, time_s.size // _SLOPE_VALUES)
     whole = time_s.size // every * every
     means = [part[:whole].reshape(-1, every).mean(axis=1) for part in (time_s, values)]
-    return slope(means[0], means[1])
+    return fit_slope(means[0], means[1])

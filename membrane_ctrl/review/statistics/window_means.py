@@ -88,7 +88,7 @@ def window_means(
     ] / ticks[whole]
 
 
-def describe(means_um: Column, window_s: float, band_um: float) -> WindowStatistics:
+def describe_windows(means_um: Column, window_s: float, band_um: float) -> WindowStatistics:
     """Statistics of the means of windows."""
     if not means_um.size:
         return WindowStatistics(window_s, 0, math.nan, math.nan, math.nan, math.nan, math.nan)

@@ -163,7 +163,8 @@ class ReviewBlueprint:
 
     def _loop(self) -> rrb.Vertical:
         further = [
-            self._plot(name, *paths) for name, paths in blueprint.learned(self.config).items()
+            self._plot(name, *paths)
+            for name, paths in blueprint.list_learned_plots(self.config).items()
         ]
         plots = [*map(self._ticks, blueprint.LOOP_PLOTS), *further]
         return rrb.Vertical(

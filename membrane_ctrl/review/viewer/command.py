@@ -53,13 +53,13 @@ def review_command(options: ReviewOptions) -> int:
     _require_sense(options)
     if options.every:
         return _show_every_run(options)
-    runs = [open_run(catalogue.resolve(path)) for path in options.runs]
+    runs = [open_run(catalogue.resolve_run(path)) for path in options.runs]
     with (
         job_control.ends_as_by_ctrl_c(),
         tempfile.TemporaryDirectory(prefix="membrane-review-") as folder,
     ):
         if options.live:
-            return viewer.live(runs[0], options.web, options.port)
+            return viewer.show_live_run(runs[0], options.web, options.port)
         for target in (options.save, options.screenshot):
             if target is not None:
                 _require_writable(target, runs)
@@ -70,21 +70,25 @@ def review_command(options: ReviewOptions) -> int:
             for run in runs:
                 for note in run.notes:
                     print(f"note: {run.name}: {note}", file=sys.stderr)
-        return _show(file, options, cursor)
+        return _show_file(file, options, cursor)
 
 
-def _show(file: Path, options: ReviewOptions, cursor: viewer.CursorTime | None) -> int:
+def _show_file(file: Path, options: ReviewOptions, cursor: viewer.CursorTime | None) -> int:
     if options.screenshot is not None:
-        return _picture(options.screenshot, file, cursor)
+        return _write_picture(options.screenshot, file, cursor)
     if options.save is not None:
         print(file)
         return 0
     return (
-        viewer.serve(file, options.bind, options.port) if options.web else viewer.show(file, cursor)
+        viewer.serve_source(file, options.bind, options.port)
+        if options.web
+        else viewer.show_source(file, cursor)
     )
 
 
-def _picture(target: Path, source: Path | str, cursor: viewer.CursorTime | None = None) -> int:
+def _write_picture(
+    target: Path, source: Path | str, cursor: viewer.CursorTime | None = None
+) -> int:
     try:
         target.write_bytes(screenshot.screenshot_of(source, cursor))
     except RuntimeError as error:
@@ -93,7 +97,7 @@ def _picture(target: Path, source: Path | str, cursor: viewer.CursorTime | None 
 
 
 def _show_every_run(options: ReviewOptions) -> int:
-    found = catalogue.entries(options.logs)
+    found = catalogue.list_entries(options.logs)
     if not found:
         raise errors.InputError(f"{options.logs}: contains no run")
     with (
@@ -104,10 +108,12 @@ def _show_every_run(options: ReviewOptions) -> int:
         print(f"catalogue of {len(found)} runs for Rerun clients: {served.url}", file=sys.stderr)
         try:
             if options.screenshot is not None:
-                return _picture(options.screenshot, served.page)
+                return _write_picture(options.screenshot, served.page)
             if options.web:
-                return viewer.serve(served.page, options.bind, options.port, served.add_timelines)
-            return viewer.show(served.page, meanwhile=served.add_timelines)
+                return viewer.serve_source(
+                    served.page, options.bind, options.port, served.add_timelines
+                )
+            return viewer.show_source(served.page, meanwhile=served.add_timelines)
         finally:
             served.close()
 
@@ -151,7 +157,7 @@ def _require_writable(target: Path, runs: Sequence[Run]) -> None:
     """Check the target before the work, not after it."""
     if any(target.resolve().parent == run.folder.resolve() for run in runs):
         raise errors.InputError(f"{target}: is in a folder of the recorder; choose another folder")
-    with errors.writing(target, errors.DeviceError, "; choose another place"):
+    with errors.convert_write_errors(target, errors.DeviceError, "; choose another place"):
         new = not target.exists()
         target.open("ab").close()
         if new:
@@ -178,8 +184,8 @@ def make_review(
         Where to put the time cursor: the requested moment, or the start of the part.
     """
     runs = _with_telemetry(runs)
-    span_s = _span(runs[0], options)
-    zeros_s = _zeros(runs, options.align)
+    span_s = _requested_part(runs[0], options)
+    zeros_s = _find_zero_seconds(runs, options.align)
     labels = blueprints.labels_of([run.name for run in runs])
     layer = Layer(file, runs[0].name if len(runs) == 1 else " and ".join(labels))
     for run, label, zero_s in zip(runs, labels, zeros_s, strict=True):
@@ -220,7 +226,7 @@ def _with_telemetry(runs: Sequence[Run]) -> list[Run]:
     return there
 
 
-def _span(run: Run, options: ReviewOptions) -> tuple[float, float] | None:
+def _requested_part(run: Run, options: ReviewOptions) -> tuple[float, float] | None:
     """The requested part of the run, in seconds."""
     if options.start is not None or options.end is not None:
         start_s, end_s = run_times.part_s(run.origin_utc, options.start, options.end)
@@ -236,13 +242,13 @@ def _span(run: Run, options: ReviewOptions) -> tuple[float, float] | None:
         if not -_AROUND_S <= at_s <= run_times.end_s(run) + _AROUND_S:
             raise run_times.not_in(run, f"--at {options.at}")
     elif options.around is not None:
-        at_s = _around(run, options.around)
+        at_s = _find_event_time(run, options.around)
     else:
         return None
     return at_s - _AROUND_S, at_s + _AROUND_S
 
 
-def _around(run: Run, what: str) -> float:
+def _find_event_time(run: Run, what: str) -> float:
     """Time of the first event, recorded or detected, whose kind, name, state, text or command
     contains `what`.
     """
@@ -270,7 +276,7 @@ def _around(run: Run, what: str) -> float:
     )
 
 
-def _zeros(runs: Sequence[Run], align: str) -> list[float]:
+def _find_zero_seconds(runs: Sequence[Run], align: str) -> list[float]:
     """The second of each run at 0 on the timeline."""
     if len(runs) == 1 or align == "start":
         return [0.0] * len(runs)
@@ -324,7 +330,10 @@ class RunCatalogue:
     def __init__(self, entries: Sequence[catalogue.RunEntry], folder: Path) -> None:
         self._folder = folder
         self._entries = entries
-        rows = [_row(entry, folder / f"row-{number}.rrd") for number, entry in enumerate(entries)]
+        rows = [
+            _write_properties(entry, folder / f"row-{number}.rrd")
+            for number, entry in enumerate(entries)
+        ]
         self._server = rr.server.Server(host="127.0.0.1", datasets={_DATASET: rows})
         # the public client would need datafusion, which takes 115 MB
         self._dataset = rr.catalog.DatasetEntry(
@@ -382,7 +391,7 @@ class RunCatalogue:
         self._dataset.register_blueprint((self._folder / "run.rbl").as_uri())
 
 
-def _row(entry: catalogue.RunEntry, file: Path) -> Path:
+def _write_properties(entry: catalogue.RunEntry, file: Path) -> Path:
     """Write a recording that has only the run's properties; unknown ones are omitted."""
     values = catalogue.as_dict(entry) | {"started_utc": f"{entry.started_utc:%Y-%m-%d %H:%M:%S}"}
     values["geometry"] = entry.geometry[:8]

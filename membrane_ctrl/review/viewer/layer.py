@@ -19,7 +19,7 @@ from membrane_ctrl.model.columns import DRAWN, Plot, aggregated_of, plots_of
 from membrane_ctrl.model.figure_columns import LOW_ORDER_COLUMNS
 from membrane_ctrl.model.prose import for_people
 from membrane_ctrl.model.run_status import RunStatus
-from membrane_ctrl.model.telemetry import FIELDS, changes
+from membrane_ctrl.model.telemetry import FIELDS, find_changes
 from membrane_ctrl.recorder import rerun_shapes
 from membrane_ctrl.recorder.state_lanes import TELEMETRY_LANES
 from membrane_ctrl.recorder.summary_page import SUMMARY_PATH, summary_page
@@ -152,7 +152,7 @@ class Layer:
                 self._style(stream.path, _names_and_colours(stream))
                 self._scalars(stream.path, level["time_s"], values)
         ends = level["time_s"][[0, -1]] if level["time_s"].size else np.empty(0)
-        band = streams.band(band_um)
+        band = streams.make_band(band_um)
         square = np.full((ends.size, 1), band_um**2)
         self._measured(
             band.path, [(band.lines[0].name, GREEN)], ends, np.zeros_like(square), square, 0.0
@@ -179,7 +179,7 @@ class Layer:
             self._stream.log(
                 path, rr.StateConfiguration(values=words, labels=words, colors=colours), static=True
             )
-            found = changes(level[lane.field], np.nan)
+            found = find_changes(level[lane.field], np.nan)
             if found:
                 times = np.append(
                     level["time_s"][[row for row, _ in found]], level["time_s"][-1] + 1.0
@@ -215,14 +215,17 @@ class Layer:
         seen = [f for f in found if part_s[0] <= f.time_s <= part_s[1]]
         if seen:
             texts = [
-                f"{f.kind}, {_size(f.size, f.unit)} (confidence {f.confidence:.3f})" for f in seen
+                f"{f.kind}, {_format_size(f.size, f.unit)} (confidence {f.confidence:.3f})"
+                for f in seen
             ]
             self._log(
                 run, "/found", np.array([f.time_s for f in seen]), texts, ["WARN"] * len(seen)
             )
         for kind in dict.fromkeys(f.kind for f in found):
             alike = sorted((f for f in found if f.kind == kind), key=lambda f: f.size)
-            ends = " to ".join(dict.fromkeys(_size(f.size, f.unit) for f in (alike[0], alike[-1])))
+            ends = " to ".join(
+                dict.fromkeys(_format_size(f.size, f.unit) for f in (alike[0], alike[-1]))
+            )
             name = f"{kind}, {ends}" if len(alike) == 1 else f"{len(alike)} of {kind}, {ends}"
             path = f"/found/lines/{kind.replace(' ', '_')}"
             self._style(path, [(name, _FOUND_COLOURS.get(kind, _OTHER_FOUND))], 1.0, vertical=True)
@@ -246,10 +249,10 @@ class Layer:
         )
         if not len(good):
             return
-        shown = good.select(_some(len(good), SHAPES_MOST))
+        shown = good.select(_thin_evenly(len(good), SHAPES_MOST))
         parameters = shown.parameters_um() - shown.parameters_um()[0]
         terms = [j - 1 for j in LOW_ORDER_COLUMNS]
-        variances = _variances(shown)[:, terms]
+        variances = _coefficient_variances(shown)[:, terms]
         self._measured(
             streams.CHANGE.path,
             _names_and_colours(streams.CHANGE),
@@ -282,7 +285,7 @@ class Layer:
             span = rerun_shapes.colour_span(deviation, None)
             self._map("scatter", deviation, span)
             colours["scatter"] = f"0 to {span[1]:.2g} µm"
-        wanted = np.flatnonzero(_some(time_s.size, MAPS_MOST))
+        wanted = np.flatnonzero(_thin_evenly(time_s.size, MAPS_MOST))
         whole = [shapes.change_map_um(parameters[row]) for row in wanted]
         for kind, (terms, least_um) in rerun_shapes.CHANGES.items():
             changes = [shapes.without_terms(change, terms) for change in whole]
@@ -306,7 +309,7 @@ class Layer:
 
     def _set_time(self, at_s: float) -> None:
         """Set the moment of the run for what is logged next."""
-        since = _nanoseconds(np.array([at_s - self._shift_s, at_s]))
+        since = _to_nanoseconds(np.array([at_s - self._shift_s, at_s]))
         self._stream.set_time("run_time", duration=since[0])
         self._stream.set_time("utc", timestamp=self._origin + since[1])
 
@@ -375,8 +378,8 @@ class Layer:
 
     def _columns(self, path: str, time_s: Column, columns: Iterable[rr.ComponentColumn]) -> None:
         indexes = [
-            rr.TimeColumn("run_time", duration=_nanoseconds(time_s - self._shift_s)),
-            rr.TimeColumn("utc", timestamp=self._origin + _nanoseconds(time_s)),
+            rr.TimeColumn("run_time", duration=_to_nanoseconds(time_s - self._shift_s)),
+            rr.TimeColumn("utc", timestamp=self._origin + _to_nanoseconds(time_s)),
         ]
         self._stream.send_columns(self._prefix + path, indexes=indexes, columns=columns)
 
@@ -405,11 +408,11 @@ def _summary_page(run: Run) -> str:
     return f"**{name}**\n\n{page}\nIntervals and spectra: `membrane-ctrl report {name}`\n"
 
 
-def _size(size: float, unit: str) -> str:
+def _format_size(size: float, unit: str) -> str:
     return for_people(f"{size:+.3g} {unit}" if unit in _SIGNED else f"{size:.3g} {unit}")
 
 
-def _variances(cycles: shapes.Shapes) -> Column:
+def _coefficient_variances(cycles: shapes.Shapes) -> Column:
     """(n, terms) variances of the coefficients, of the covariance recorded last before each cycle;
     0 without any.
     """
@@ -425,7 +428,7 @@ def _of_run(colour: Colour, number: int) -> Colour:
     return (red // 2, green // 2, blue // 2) if colour == GREY else (red, green, blue)
 
 
-def _nanoseconds(time_s: Column) -> AnyArray:
+def _to_nanoseconds(time_s: Column) -> AnyArray:
     return np.round(np.asarray(time_s, dtype=np.float64) * 1e9).astype("timedelta64[ns]")
 
 
@@ -435,7 +438,7 @@ def _end_s(run: Run) -> float:
     return float(duration) if isinstance(duration, (int, float)) else end_s(run)
 
 
-def _some(count: int, most: int) -> BoolArray:
+def _thin_evenly(count: int, most: int) -> BoolArray:
     """(count,) True at no more than `most` evenly spaced places, including the first."""
     chosen = np.zeros(count, dtype=bool)
     chosen[:: max(1, -(-count // most))] = True

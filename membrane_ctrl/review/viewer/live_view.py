@@ -90,7 +90,7 @@ class LiveView:
         if state is not None:
             self._output.shapes.reference, self._output.state = state.reference, state.state
         self._summary = run.summary or {}
-        self._now_s = _newest(run.folder, table_specs.TICKS.time_name, table_specs.TICKS)
+        self._now_s = _open_newest(run.folder, table_specs.TICKS.time_name, table_specs.TICKS)
         after_s = self._now_s - RECENT_S
         self._ticks = TableFollower(run.folder, table_specs.TICKS, after_s)
         self._figures = tuple(
@@ -98,24 +98,24 @@ class LiveView:
             for spec in (table_specs.SHAPES, table_specs.TRACKED)
         )
         self._events = TableFollower(run.folder, table_specs.EVENTS)
-        newest = _newest(run.folder, "number", table_specs.THUMBNAILS)
+        newest = _open_newest(run.folder, "number", table_specs.THUMBNAILS)
         self._thumbnails = TableFollower(
             run.folder, table_specs.THUMBNAILS, newest - _RECENT_THUMBNAILS
         )
 
     def send_new(self) -> bool:
         """Send the new rows; False if there are none."""
-        rows = _rows(self._ticks.read_new())
-        events = _events(self._events.read_new())
-        figures = _estimates([table for each in self._figures for table in each.read_new()])
-        thumbnails = _thumbnails(self._thumbnails.read_new())
+        rows = _read_rows(self._ticks.read_new())
+        events = _read_events(self._events.read_new())
+        figures = _read_estimates([table for each in self._figures for table in each.read_new()])
+        thumbnails = _read_thumbnails(self._thumbnails.read_new())
         for line in events:
             mono_s = float(line.get("mono_s") or 0.0)
             self._status = self._status.after_event(from_dict(line), mono_s)
         if not (len(rows) or events or figures or thumbnails):
             return False
         if len(rows):
-            self._now_s = float(telemetry.column(rows, "mono_s")[-1])
+            self._now_s = float(telemetry.get_column(rows, "mono_s")[-1])
         self._output.send(self._now_s, rows, events, figures, thumbnails, DetailLevel.ALL)
         return True
 
@@ -161,12 +161,12 @@ def follow_run(
         sleep(LOOK_S)
 
 
-def _newest(folder: Path, name: str, spec: TableSpec) -> float:
+def _open_newest(folder: Path, name: str, spec: TableSpec) -> float:
     found = TableReader(folder, spec, []).newest(name)
     return 0.0 if found is None or found.as_py() is None else float(found.as_py())
 
 
-def _rows(tables: Sequence[pa.Table]) -> telemetry.Rows:
+def _read_rows(tables: Sequence[pa.Table]) -> telemetry.Rows:
     if not tables:
         return np.empty((0, len(telemetry.FIELDS)))
     joined = pa.concat_tables(tables)
@@ -174,7 +174,7 @@ def _rows(tables: Sequence[pa.Table]) -> telemetry.Rows:
     return np.column_stack(columns)
 
 
-def _events(tables: Sequence[pa.Table]) -> list[EventLine]:
+def _read_events(tables: Sequence[pa.Table]) -> list[EventLine]:
     lines: list[EventLine] = []
     for text in chain.from_iterable(table.column("data").to_pylist() for table in tables):
         with suppress(ValueError, TypeError):  # damaged
@@ -184,16 +184,16 @@ def _events(tables: Sequence[pa.Table]) -> list[EventLine]:
     return lines
 
 
-def _estimates(tables: Sequence[pa.Table]) -> list[ShapeEstimate]:
+def _read_estimates(tables: Sequence[pa.Table]) -> list[ShapeEstimate]:
     names = list(shapes.ESTIMATE_COLUMNS)
     estimates: list[ShapeEstimate] = []
     for table in tables:
         with suppress(ValueError, LookupError):  # damaged
-            estimates += shapes.estimates(table.select(names))
+            estimates += shapes.read_estimates(table.select(names))
     return estimates
 
 
-def _thumbnails(tables: Sequence[pa.Table]) -> list[Thumbnail]:
+def _read_thumbnails(tables: Sequence[pa.Table]) -> list[Thumbnail]:
     return [
         Thumbnail(row["time_s"], row["pattern"], row["jpeg"])
         for table in tables

@@ -32,7 +32,7 @@ def screenshot_of(source: Path | str, at: CursorTime | None = None) -> bytes:
     Raises RuntimeError if the viewer does not start (no Vulkan driver) or its picture keeps
     changing.
     """
-    with _headless() as viewer:
+    with _start_headless_viewer() as viewer:
         viewer.open(source if isinstance(source, str) else str(source.resolve()))
         if isinstance(source, str):
             pass
@@ -56,7 +56,7 @@ def _at_rest(viewer: ViewerClient) -> bytes:
 
 
 @contextmanager
-def _headless() -> Iterator[ViewerClient]:
+def _start_headless_viewer() -> Iterator[ViewerClient]:
     """A headless viewer reachable only from this machine; `ViewerClient.spawn` would listen on
     every interface.
     """
@@ -68,12 +68,12 @@ def _headless() -> Iterator[ViewerClient]:
         command, env=viewer_environment(), stdout=subprocess.DEVNULL, stderr=subprocess.PIPE
     ) as process:
         try:
-            yield _connect(port, process)
+            yield _connect_viewer(port, process)
         finally:
             process.terminate()
 
 
-def _connect(port: int, process: subprocess.Popen[bytes]) -> ViewerClient:
+def _connect_viewer(port: int, process: subprocess.Popen[bytes]) -> ViewerClient:
     until_s = time.monotonic() + _WAIT_S
     while time.monotonic() < until_s and process.poll() is None:
         try:

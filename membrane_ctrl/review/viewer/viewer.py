@@ -55,7 +55,7 @@ def viewer_command(*arguments: str) -> list[str]:
     return [str(Path(rerun_cli.__file__).parent / "rerun"), *arguments]
 
 
-def show(
+def show_source(
     source: Path | str, at: CursorTime | None = None, meanwhile: Meanwhile = lambda _: None
 ) -> int:
     """Open a file or a server's page on this machine's screen; return when the window is closed.
@@ -70,7 +70,9 @@ def show(
             put_cursor(process, port, at)
         meanwhile(lambda: process.poll() is None)
 
-    return _run(viewer_command("--bind", "127.0.0.1", "--port", str(port), str(source)), started)
+    return _run_viewer(
+        viewer_command("--bind", "127.0.0.1", "--port", str(port), str(source)), started
+    )
 
 
 def put_cursor(
@@ -93,9 +95,11 @@ def put_cursor(
         time.sleep(_CURSOR_AGAIN_S)
 
 
-def serve(source: Path | str, bind: str, port: int, meanwhile: Meanwhile = lambda _: None) -> int:
+def serve_source(
+    source: Path | str, bind: str, port: int, meanwhile: Meanwhile = lambda _: None
+) -> int:
     """Serve a file, or a page for a server's data, to browsers until interrupted; `meanwhile` as
-    for `show`.
+    for `show_source`.
 
     Raises DeviceError if it cannot listen there, or the viewer does not start. `bind` is 127.0.0.1,
     or an address of this machine for remote viewers; `port` is that of the page, 0 for a free one.
@@ -103,7 +107,7 @@ def serve(source: Path | str, bind: str, port: int, meanwhile: Meanwhile = lambd
     port = port or free_port()
     _require_listening(bind, port)
     data_port = free_port()
-    url = source if isinstance(source, str) else proxy_url(_host(bind), data_port)
+    url = source if isinstance(source, str) else proxy_url(_find_host(bind), data_port)
     _say_where(bind, port, url)
     options = [
         "--serve-web",
@@ -114,13 +118,13 @@ def serve(source: Path | str, bind: str, port: int, meanwhile: Meanwhile = lambd
         "--web-viewer-port",
         str(port),
     ]
-    return _run(
+    return _run_viewer(
         viewer_command(*options, str(source)),
         lambda process: meanwhile(lambda: process.poll() is None),
     )
 
 
-def live(run: Run, web: bool, port: int = 0) -> int:
+def show_live_run(run: Run, web: bool, port: int = 0) -> int:
     """Show a run in progress, made from its tables, without affecting the run.
 
     The view is sent to a separate server, to which the viewer (or, with `web`, a browser) connects.
@@ -176,7 +180,7 @@ def _require_screen() -> None:
         )
 
 
-def _host(bind: str) -> str:
+def _find_host(bind: str) -> str:
     return "127.0.0.1" if bind == "127.0.0.1" else socket.gethostname()
 
 
@@ -188,7 +192,7 @@ def _say_where(bind: str, port: int, url: str) -> None:
     """Print the address of the page that shows a server's data, and how to reach it from another
     machine.
     """
-    print(f"open http://{_host(bind)}:{port}/?url={quote(url, safe='')}", file=sys.stderr)
+    print(f"open http://{_find_host(bind)}:{port}/?url={quote(url, safe='')}", file=sys.stderr)
     if bind == "127.0.0.1":
         data_port = urlsplit(url).port
         tunnel = (
@@ -218,7 +222,7 @@ def free_port() -> int:
         return int(probe.getsockname()[1])
 
 
-def _run(
+def _run_viewer(
     command: list[str], started: Callable[[subprocess.Popen[bytes]], None] = lambda _: None
 ) -> int:
     try:

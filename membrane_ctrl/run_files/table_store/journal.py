@@ -43,7 +43,7 @@ class JournalWriter:
         disk.make_folder(path.parent)
         self._descriptor = disk.create(path)
         try:
-            self._append(_frame(0, 0, schema.serialize()))
+            self._append(_pack_frame(0, 0, schema.serialize()))
             disk.sync_folder(path.parent)
         except OSError:
             disk.close(self._descriptor)
@@ -52,7 +52,7 @@ class JournalWriter:
 
     def append(self, first_row: int, batch: pa.RecordBatch) -> None:
         """Append a batch and sync it: all of it or nothing. Raises OSError."""
-        self._append(_frame(first_row, batch.num_rows, batch.serialize()))
+        self._append(_pack_frame(first_row, batch.num_rows, batch.serialize()))
 
     def _append(self, frame: bytes) -> None:
         try:
@@ -69,7 +69,7 @@ class JournalWriter:
         self._disk.close(self._descriptor)
 
 
-def _frame(first_row: int, rows: int, message: pa.Buffer) -> bytes:
+def _pack_frame(first_row: int, rows: int, message: pa.Buffer) -> bytes:
     packed: bytes = _CODEC.compress(message, asbytes=True)
     head = _HEAD.pack(MAGIC, first_row, rows, len(packed), message.size, 0)[: -_CRC.size]
     return head + _CRC.pack(zlib.crc32(packed, zlib.crc32(head))) + packed
@@ -122,12 +122,12 @@ def _frame_at(data: bytes, start: int) -> JournalFrame | int:
 
 def read_schema(frame: JournalFrame) -> pa.Schema:
     """The schema in a journal's first frame. Raises pa.ArrowException, OSError or ValueError."""
-    return pa.ipc.read_schema(_unpacked(frame))
+    return pa.ipc.read_schema(_unpack_frame(frame))
 
 
 def read_batch(frame: JournalFrame, schema: pa.Schema) -> pa.RecordBatch:
     """The record batch in a frame. Raises pa.ArrowException, OSError or ValueError."""
-    message = pa.ipc.read_message(_unpacked(frame))
+    message = pa.ipc.read_message(_unpack_frame(frame))
     if message.type != "record batch" or _is_compressed(memoryview(message.metadata)):
         raise ValueError("a frame that no recorder writes")
     batch = pa.ipc.read_record_batch(message, schema)
@@ -145,7 +145,7 @@ def read_batch(frame: JournalFrame, schema: pa.Schema) -> pa.RecordBatch:
     return batch
 
 
-def _unpacked(frame: JournalFrame) -> pa.Buffer:
+def _unpack_frame(frame: JournalFrame) -> pa.Buffer:
     return _CODEC.decompress(pa.py_buffer(frame.packed), decompressed_size=frame.unpacked_bytes)
 
 
@@ -214,7 +214,7 @@ def read_journal(
             lost_bytes += frame.end - frame.start
         follows = batch is None or frame.first_row == first_row + count
         if waiting and (lost_bytes or not follows or count >= group_rows):
-            yield _joined(first_row, waiting)
+            yield _join_batches(first_row, waiting)
             waiting, count = [], 0
         if lost_bytes:
             yield LostBytes(lost_bytes, False)
@@ -223,12 +223,12 @@ def read_journal(
             waiting.append(batch)
             count += batch.num_rows
     if waiting:
-        yield _joined(first_row, waiting)
+        yield _join_batches(first_row, waiting)
     if place < len(data):
         yield LostBytes(len(data) - place, True)
 
 
-def _joined(first_row: int, batches: list[pa.RecordBatch]) -> JournalBlock:
+def _join_batches(first_row: int, batches: list[pa.RecordBatch]) -> JournalBlock:
     return JournalBlock(first_row, pa.Table.from_batches(batches).combine_chunks())
 
 

@@ -82,7 +82,7 @@ def append_entry(disk: Disk, folder: Path, entry: PartEntry) -> None:
     """
     path = folder / MANIFEST
     line = file_checksums.dumps_checked(entry.model_dump()) + "\n"
-    size_bytes, whole_bytes = _sizes(path)
+    size_bytes, whole_bytes = _measure_sizes(path)
     descriptor = disk.open_to_append(path)
     try:
         if whole_bytes < size_bytes:
@@ -97,7 +97,7 @@ def append_entry(disk: Disk, folder: Path, entry: PartEntry) -> None:
         disk.close(descriptor)
 
 
-def _sizes(path: Path) -> tuple[int, int]:
+def _measure_sizes(path: Path) -> tuple[int, int]:
     """Bytes of the manifest, and of its whole lines."""
     try:
         data = read_bytes(path, MANIFEST_BYTES_MAX)

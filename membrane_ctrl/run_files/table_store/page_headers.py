@@ -33,7 +33,9 @@ def measure_chunk(data: bytes) -> ChunkSize:
     place = unpacked_bytes = values = 0
     while place < len(data):
         header, place = _read_struct(data, place, 0)
-        kind, unpacked, packed = (_number(header, field) for field in (_TYPE, _UNPACKED, _PACKED))
+        kind, unpacked, packed = (
+            _read_number(header, field) for field in (_TYPE, _UNPACKED, _PACKED)
+        )
         count = _values_of(header)
         if packed < 0 or unpacked < 0 or count < 0 or place + packed > len(data):
             raise ValueError("a page that does not lie within its column")
@@ -43,7 +45,7 @@ def measure_chunk(data: bytes) -> ChunkSize:
     return ChunkSize(unpacked_bytes, values)
 
 
-def _number(fields: Fields, field: int) -> int:
+def _read_number(fields: Fields, field: int) -> int:
     value = fields.get(field)
     if not isinstance(value, int):
         raise ValueError("a page header without its sizes")
@@ -54,7 +56,7 @@ def _values_of(header: Fields) -> int:
     for field in (_DATA_PAGE, _DICTIONARY_PAGE, _DATA_PAGE_2):
         inner = header.get(field)
         if isinstance(inner, dict):
-            return _number(inner, _NUM_VALUES)
+            return _read_number(inner, _NUM_VALUES)
     return 0
 
 
@@ -65,7 +67,7 @@ def _read_struct(data: bytes, place: int, depth: int) -> tuple[Fields, int]:
     fields: Fields = {}
     number = 0
     while True:
-        head = _byte(data, place)
+        head = _read_byte(data, place)
         place += 1
         if head == 0:
             return fields, place
@@ -73,8 +75,8 @@ def _read_struct(data: bytes, place: int, depth: int) -> tuple[Fields, int]:
         if step:
             number += step
         else:
-            zigzag, place = _varint(data, place)
-            number = _signed(zigzag)
+            zigzag, place = _read_varint(data, place)
+            number = _decode_zigzag(zigzag)
         if kind in (_TRUE, _FALSE):
             continue
         value, place = _read_value(data, place, kind, depth)
@@ -87,8 +89,8 @@ def _read_value(
 ) -> tuple["int | Fields | None", int]:
     """A value, None if it is neither a number nor a structure, and the place after it."""
     if kind in (_I16, _I32, _I64):
-        zigzag, place = _varint(data, place)
-        return _signed(zigzag), place
+        zigzag, place = _read_varint(data, place)
+        return _decode_zigzag(zigzag), place
     if kind == _STRUCT:
         return _read_struct(data, place, depth + 1)
     if kind == _BYTE:
@@ -96,7 +98,7 @@ def _read_value(
     if kind == _DOUBLE:
         return None, place + 8
     if kind == _BINARY:
-        size, place = _varint(data, place)
+        size, place = _read_varint(data, place)
         return None, place + size
     if kind in (_LIST, _SET):
         return None, _skip_list(data, place, depth)
@@ -104,11 +106,11 @@ def _read_value(
 
 
 def _skip_list(data: bytes, place: int, depth: int) -> int:
-    head = _byte(data, place)
+    head = _read_byte(data, place)
     place += 1
     count, kind = head >> 4, head & 0x0F
     if count == 15:
-        count, place = _varint(data, place)
+        count, place = _read_varint(data, place)
     if count > _LIST_MAX:
         raise ValueError("a page header with a long list")
     for _ in range(count):
@@ -119,21 +121,21 @@ def _skip_list(data: bytes, place: int, depth: int) -> int:
     return place
 
 
-def _byte(data: bytes, place: int) -> int:
+def _read_byte(data: bytes, place: int) -> int:
     if place >= len(data):
         raise ValueError("a page header that is cut off")
     return data[place]
 
 
-def _varint(data: bytes, place: int) -> tuple[int, int]:
+def _read_varint(data: bytes, place: int) -> tuple[int, int]:
     value = 0
     for shift in range(_VARINT_BYTES_MAX):
-        byte = _byte(data, place + shift)
+        byte = _read_byte(data, place + shift)
         value |= (byte & 0x7F) << (7 * shift)
         if byte < 0x80:
             return value, place + shift + 1
     raise ValueError("a page header with a number that is too long")
 
 
-def _signed(zigzag: int) -> int:
+def _decode_zigzag(zigzag: int) -> int:
     return (zigzag >> 1) ^ -(zigzag & 1)

@@ -157,7 +157,7 @@ class PartReader:
             if total_bytes > GROUP_BYTES_MAX:
                 raise ValueError("more than a recorder writes")
         table = self._parquet.read_row_group(number, columns=list(names), use_threads=False)
-        return _plain(table.select(list(names)))
+        return _decode_dictionaries(table.select(list(names)))
 
     def _checked_bytes(
         self, number: int, place: int, chunk: pq.ColumnChunkMetaData, rows: int
@@ -196,11 +196,12 @@ class PartReader:
         if self._entry is None:
             return True
         return (
-            self._size_bytes == self._entry.size_bytes and _sha256(self._file) == self._entry.sha256
+            self._size_bytes == self._entry.size_bytes
+            and _hash_file(self._file) == self._entry.sha256
         )
 
 
-def _sha256(file: BinaryIO) -> str:
+def _hash_file(file: BinaryIO) -> str:
     found = hashlib.sha256()
     file.seek(0)
     while data := file.read(_HASH_BYTES):
@@ -208,7 +209,7 @@ def _sha256(file: BinaryIO) -> str:
     return found.hexdigest()
 
 
-def _plain(table: pa.Table) -> pa.Table:
+def _decode_dictionaries(table: pa.Table) -> pa.Table:
     """A table without dictionaries. Raises ValueError if its texts would take more than a recorder
     writes.
     """

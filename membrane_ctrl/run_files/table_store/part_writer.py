@@ -53,7 +53,7 @@ def write_part(
     try:
         times_s = _write_groups(file, first_row, groups, time_name)
         disk.sync(file.descriptor)
-        entry = _entry(scratch, number, first_row, file, times_s) if times_s else None
+        entry = _make_entry(scratch, number, first_row, file, times_s) if times_s else None
     except Exception:
         disk.remove(scratch)
         raise
@@ -114,7 +114,7 @@ def _write_groups(
 def _new_writer(
     file: _HashedFile, schema: pa.Schema, first_group: pa.Table, time_name: str
 ) -> pq.ParquetWriter:
-    encodings = dict(_encodings(first_group.slice(0, _TRIAL_ROWS)))
+    encodings = dict(_choose_encodings(first_group.slice(0, _TRIAL_ROWS)))
     dictionaries = [path for path, encoding in encodings.items() if encoding == _DICTIONARY]
     others = {path: encoding for path, encoding in encodings.items() if encoding != _DICTIONARY}
     return pq.ParquetWriter(
@@ -129,7 +129,7 @@ def _new_writer(
     )
 
 
-def _encodings(rows: pa.Table) -> Iterator[tuple[str, str]]:
+def _choose_encodings(rows: pa.Table) -> Iterator[tuple[str, str]]:
     """The smallest encoding of each column, by its path in Parquet."""
     for field in rows.schema:
         values = rows.column(field.name)
@@ -143,11 +143,14 @@ def _encodings(rows: pa.Table) -> Iterator[tuple[str, str]]:
         else:
             yield (
                 path,
-                min(_candidates(kind), key=lambda encoding: _trial_bytes(values, path, encoding)),
+                min(
+                    _list_candidates(kind),
+                    key=lambda encoding: _trial_bytes(values, path, encoding),
+                ),
             )
 
 
-def _candidates(kind: pa.DataType) -> list[str]:
+def _list_candidates(kind: pa.DataType) -> list[str]:
     """Encodings worth a trial: readings are short decimals, computed numbers are not."""
     if pa.types.is_floating(kind):
         return ["BYTE_STREAM_SPLIT", "PLAIN", _DICTIONARY]
@@ -176,7 +179,7 @@ def _trial_bytes(values: pa.ChunkedArray, path: str, encoding: str) -> int:
     return int(sink.getvalue().size)
 
 
-def _entry(
+def _make_entry(
     path: Path, number: int, first_row: int, file: _HashedFile, times_s: list[tuple[float, float]]
 ) -> PartEntry:
     """The manifest's line for a file just written."""

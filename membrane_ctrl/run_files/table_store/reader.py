@@ -148,7 +148,7 @@ class TableReader:
             except FileNotFoundError:
                 continue
             except _FAULTS as error:
-                self._note(path, f"cannot be read ({_reason(error)})")
+                self._note(path, f"cannot be read ({_describe_reason(error)})")
 
     def _file_tables(
         self,
@@ -197,7 +197,7 @@ class TableReader:
         except FileNotFoundError:
             return  # `note_missing` says so
         except _FAULTS as error:
-            self._note(path, f"cannot be read ({_reason(error)})")
+            self._note(path, f"cannot be read ({_describe_reason(error)})")
 
     def _journal_tables(self, path: Path, data: bytes, names: Sequence[str]) -> Iterator[pa.Table]:
         try:
@@ -209,7 +209,7 @@ class TableReader:
                 if known:
                     yield block.table.select(known)
         except _FAULTS as error:
-            self._note(path, f"cannot be read ({_reason(error)})")
+            self._note(path, f"cannot be read ({_describe_reason(error)})")
 
     def _known(self, path: Path, schema: pa.Schema, names: Sequence[str]) -> list[str]:
         """The columns of a file that are what a recorder writes under their names.
@@ -271,7 +271,7 @@ def _span_of(lost: LostGroup) -> str:
     return f"rows from {lost.first_s:.2f} s to {lost.last_s:.2f} s are"
 
 
-def _reason(error: BaseException) -> str:
+def _describe_reason(error: BaseException) -> str:
     if isinstance(error, PartError):
         return str(error)
     return (

@@ -165,7 +165,7 @@ class TableWriter:
         """Seal what a dead recorder left, and find the number and the time of the last row."""
         numbers = sorted(
             number
-            for path in _files(self._folder)
+            for path in _list_part_files(self._folder)
             if (number := spec.file_number(path)) is not None
         )
         if not numbers:
@@ -195,5 +195,5 @@ class TableWriter:
         self.until_s = max(self.until_s, last_s)
 
 
-def _files(folder: Path) -> list[Path]:
+def _list_part_files(folder: Path) -> list[Path]:
     return [*folder.glob(f"*{spec.PART_SUFFIX}"), *folder.glob(f"*{spec.JOURNAL_SUFFIX}")]

@@ -68,7 +68,7 @@ def camera_pose(geometry: GeometryConfig) -> CameraPose:
     """
     if geometry.camera is not None:
         return CameraPose(np.array(geometry.camera.position_mm), np.array(geometry.camera.rotation))
-    a_mm, _, alpha = _short(geometry)
+    a_mm, _, alpha = _find_short_form(geometry)
     forward = np.array([-cos(alpha), 0.0, -sin(alpha)])
     right = np.array([sin(alpha), 0.0, -cos(alpha)])  # world +x as far as it is across the axis
     return CameraPose(-a_mm * forward, np.stack([right, np.cross(forward, right), forward]))
@@ -83,12 +83,12 @@ def screen_pose(geometry: GeometryConfig, error: ScreenError | None = None) -> S
     if given is not None:
         origin, s_x, s_y = (np.array(vector) for vector in given)
     else:
-        _, b_mm, alpha = _short(geometry)
+        _, b_mm, alpha = _find_short_form(geometry)
         origin = b_mm * np.array([-cos(alpha), 0.0, sin(alpha)])
         s_x, s_y = np.array([-sin(alpha), 0.0, -cos(alpha)]), np.array([0.0, 1.0, 0.0])
     error = error or ScreenError()
-    s_y = _turned(s_y, s_x, radians(error.tilt_about_x_deg))
-    s_x = _turned(s_x, s_y, radians(error.tilt_about_y_deg))
+    s_y = _rotate_vector(s_y, s_x, radians(error.tilt_about_x_deg))
+    s_x = _rotate_vector(s_x, s_y, radians(error.tilt_about_y_deg))
     return ScreenPose(
         origin, s_x, s_y, (face.bow_mm + error.bow_mm) / _BOW_RADIUS_MM**2, face.height_map
     )
@@ -102,12 +102,12 @@ def pixel_directions(
     """
     focal_px = camera.focal_mm * 1000.0 / camera.pixel_um
     c0, r0 = camera.principal
-    x, y = _undistorted((columns - c0) / focal_px, (rows - r0) / focal_px, camera.distortion)
+    x, y = _undistort_points((columns - c0) / focal_px, (rows - r0) / focal_px, camera.distortion)
     in_world = np.stack([x, y, np.ones_like(x)], axis=1) @ pose.rotation
     return np.asarray(in_world / np.linalg.norm(in_world, axis=1, keepdims=True), dtype=np.float64)
 
 
-def _undistorted(
+def _undistort_points(
     x_d: FloatArray, y_d: FloatArray, distortion: tuple[float, ...]
 ) -> tuple[FloatArray, FloatArray]:
     """Undo OpenCV's lens model, x_d = x radial(r^2) + tangential(x, y), by fixed-point iteration to
@@ -131,7 +131,7 @@ def _undistorted(
     )
 
 
-def _short(geometry: GeometryConfig) -> tuple[float, float, float]:
+def _find_short_form(geometry: GeometryConfig) -> tuple[float, float, float]:
     """a in mm, b in mm, alpha in rad; the configuration ensures that one of the two forms is
     complete.
     """
@@ -140,7 +140,7 @@ def _short(geometry: GeometryConfig) -> tuple[float, float, float]:
     return geometry.a_mm, geometry.b_mm, radians(geometry.alpha_deg)
 
 
-def _turned(vector: FloatArray, axis: FloatArray, angle_rad: float) -> FloatArray:
+def _rotate_vector(vector: FloatArray, axis: FloatArray, angle_rad: float) -> FloatArray:
     """A vector across the unit `axis`, turned about it (Rodrigues,
     whose third term vanishes here).
     """

@@ -28,10 +28,10 @@ from membrane_ctrl.sim.optics.film_terms import FilmTerms
 from membrane_ctrl.sim.optics.node_interpolation import cubic_weights, node_positions
 from membrane_ctrl.sim.optics.pattern_levels import Light, level_table
 from membrane_ctrl.sim.optics.pixel_noise import noise_bank, normal_quantiles
-from membrane_ctrl.sim.optics.shade import shade, vignetting
-from membrane_ctrl.sim.optics.shade_crossed import shade_crossed
-from membrane_ctrl.sim.optics.shade_panel import PanelPicture, shade_panel
-from membrane_ctrl.sim.optics.trace import Trace, trace
+from membrane_ctrl.sim.optics.shade import shade_rows, vignetting_loss
+from membrane_ctrl.sim.optics.shade_crossed import shade_crossed_rows
+from membrane_ctrl.sim.optics.shade_panel import PanelPicture, shade_panel_rows
+from membrane_ctrl.sim.optics.trace import Trace, trace_rays
 
 # Nodes this far apart on the mirror put a typical film's phase < 1e-4 rad off the exact trace
 # (asserted in the tests)
@@ -48,10 +48,10 @@ _NO_PATTERN = Pattern("picture")  # of a panel whose pixels are given
 class OpticsRenderer:
     """Renders the camera's picture of any pattern at any displacement of the film.
 
-    The film is traced at nodes (see `shade`) and, unless `exact`, at displacements _CELL_UM apart:
-    a parabola through the three nearest gives the maps at any other, so that a moving film costs
-    nothing until it leaves its cell. `exact` traces every pixel at every displacement: slow, for
-    sets that must be exact. At `reference_um` the vertex is at the origin of the geometry. Each
+    The film is traced at nodes (see module `shade`) and, unless `exact`, at displacements _CELL_UM
+    apart: a parabola through the three nearest gives the maps at any other, so that a moving film
+    costs nothing until it leaves its cell. `exact` traces every pixel at every displacement: slow,
+    for sets that must be exact. At `reference_um` the vertex is at the origin of the geometry. Each
     picture has its own pixel noise (`camera.noise_adu`). Raises ValueError if the film's rim is not
     the configured one.
     """
@@ -98,7 +98,7 @@ class OpticsRenderer:
         self._side_mm = (
             self.optics.pattern.periods * self.optics.pattern.period_mm
         )  # of the pattern's region
-        self._loss = vignetting(camera.width_px, camera.height_px, self.light.vignetting)
+        self._loss = vignetting_loss(camera.width_px, camera.height_px, self.light.vignetting)
         if self.disturbances != DisturbancesConfig():
             self._disturber = self._disturbed()
 
@@ -167,7 +167,7 @@ class OpticsRenderer:
 
         def paint(nodes: FloatArray, seed: int, picture: Pixels, start: int, stop: int) -> None:
             noise = normal_quantiles(), noise_adu, seed
-            shade_panel(
+            shade_panel_rows(
                 nodes,
                 self._weights,
                 radius_mm,
@@ -190,7 +190,7 @@ class OpticsRenderer:
         dark, white, full = self._levels(gain)
 
         def paint(nodes: FloatArray, seed: int, picture: Pixels, start: int, stop: int) -> None:
-            shade(
+            shade_rows(
                 nodes,
                 self._weights,
                 int(pattern.axis == "y"),
@@ -235,7 +235,7 @@ class OpticsRenderer:
         shape, scale = (tuple(np.array(each, np.float32)) for each in (shape, scale))
 
         def paint(nodes: FloatArray, seed: int, picture: Pixels, start: int, stop: int) -> None:
-            shade_crossed(
+            shade_crossed_rows(
                 nodes, weights, shape, scale, loss, (noise_bank(), seed), picture, start, stop
             )
 
@@ -264,7 +264,9 @@ class OpticsRenderer:
         vertex_z_mm = -(displacement_um - self.reference_um) / 1000.0
         sag_mm = self.film.sag_at_mm(displacement_um)
         film = film or self.film.terms_at(displacement_um)
-        return trace(self._camera_pose, directions, film, sag_mm, vertex_z_mm, self._screen_pose)
+        return trace_rays(
+            self._camera_pose, directions, film, sag_mm, vertex_z_mm, self._screen_pose
+        )
 
     def _nodes(self, displacement_um: float) -> FloatArray:
         """Traced maps at the nodes, (3, rows, columns), at this displacement (Lagrange through the

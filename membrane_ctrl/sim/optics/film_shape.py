@@ -14,8 +14,8 @@ import numpy as np
 from membrane_ctrl.model.arrays import FloatArray
 from membrane_ctrl.model.zernike_terms import ZERNIKE_TERMS
 from membrane_ctrl.sim import hencky, stretched_film
-from membrane_ctrl.sim.optics.film_terms import FilmTerms, height_and_slopes, heights
-from membrane_ctrl.sim.optics.zernike_polynomials import polynomial
+from membrane_ctrl.sim.optics.film_terms import FilmTerms, film_heights, height_and_slopes
+from membrane_ctrl.sim.optics.zernike_polynomials import zernike_polynomial
 
 MAX_FILM_TERMS = 66  # Noll's, up to radial order 10: finer errors are ripples, wrinkles and bumps
 # of a mounted film, up to radial order 7; the film does not depend on how many are fitted
@@ -149,7 +149,7 @@ class FilmShape:
         self, x_mm: FloatArray, y_mm: FloatArray, displacement_um: float = 0.0
     ) -> FloatArray:
         """Height above the vertex at points of any (equal) shape."""
-        flat = heights(
+        flat = film_heights(
             self.terms_at(displacement_um),
             self.sag_at_mm(displacement_um),
             np.ravel(x_mm),
@@ -172,7 +172,7 @@ class FilmShape:
         coeffs[: len(own_um)] = own_um
         coeffs[3] += 1000.0 * self.sag_at_mm(displacement_um) / (2.0 * sqrt(3.0))
         coeffs[0] = 0.0
-        coeffs[0] = -polynomial(coeffs)[0, 0]
+        coeffs[0] = -zernike_polynomial(coeffs)[0, 0]
         return coeffs
 
 
@@ -188,7 +188,7 @@ def _film_terms(film: FilmShape) -> FilmTerms:
         radius_mm=film.radius_mm,
         offset_mm=0.0,
         bowl=bowl_series(film.bowl, film.sag_mm, film.radius_mm),
-        poly_mm=polynomial(np.array(film.zernike_um, dtype=np.float64) / 1000.0),
+        poly_mm=zernike_polynomial(np.array(film.zernike_um, dtype=np.float64) / 1000.0),
         ripples=np.array(ripples, dtype=np.float64).reshape(-1, 4),
         wrinkles=np.array(wrinkles, dtype=np.float64).reshape(-1, 3),
         bumps=np.array(bumps, dtype=np.float64).reshape(-1, 4),

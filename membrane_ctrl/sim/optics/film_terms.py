@@ -80,7 +80,7 @@ def height_and_slopes(
 
 
 @njit(cache=True)
-def heights(terms: FilmTerms, sag_mm: float, x_mm: FloatArray, y_mm: FloatArray) -> FloatArray:
+def film_heights(terms: FilmTerms, sag_mm: float, x_mm: FloatArray, y_mm: FloatArray) -> FloatArray:
     """Heights in mm above the vertex at the points (x, y), all (n,)."""
     h_mm = np.empty(x_mm.size)
     for n in range(x_mm.size):

@@ -9,7 +9,9 @@ from membrane_ctrl.sim.optics.node_interpolation import interpolate_cubic, inter
 from membrane_ctrl.sim.optics.pixel_noise import GOLDEN, LOW_16, MIX_1, random_64_bits
 
 
-def vignetting(width_px: int, height_px: int, corner_loss: float) -> tuple[FloatArray, FloatArray]:
+def vignetting_loss(
+    width_px: int, height_px: int, corner_loss: float
+) -> tuple[FloatArray, FloatArray]:
     """Loss by column and by row; their sum is corner_loss (distance from the middle / distance of
     the corner)^2.
     """
@@ -22,7 +24,7 @@ def vignetting(width_px: int, height_px: int, corner_loss: float) -> tuple[Float
 
 
 @njit(cache=True)
-def _level(s_mm: float, values: FloatArray, cell_mm: float, smooth: bool) -> float:
+def _look_up_level(s_mm: float, values: FloatArray, cell_mm: float, smooth: bool) -> float:
     """Value of the table at s from the region's low edge; the caller ensures 0 <= s < side."""
     place = s_mm / cell_mm
     cell = int(place)
@@ -34,7 +36,7 @@ def _level(s_mm: float, values: FloatArray, cell_mm: float, smooth: bool) -> flo
 
 
 @njit(cache=True, nogil=True)
-def shade(
+def shade_rows(
     # (3, rows, columns): s_x, s_y (from the low edges of the region, mm), squared distance from the
     # vertex (mm^2); a disturbed bench has two more: factor of the screen's light, and counts of the
     # room's
@@ -88,7 +90,9 @@ def shade(
                     s_y_mm = interpolate_cubic(line_y, cell, weights, k)
                     light = leak
                     if 0.0 <= s_x_mm < side_mm and 0.0 <= s_y_mm < side_mm:
-                        light = _level(s_y_mm if axis == 1 else s_x_mm, values, cell_mm, smooth)
+                        light = _look_up_level(
+                            s_y_mm if axis == 1 else s_x_mm, values, cell_mm, smooth
+                        )
                     if disturbed:
                         light *= interpolate_cubic(line_factor, cell, weights, k)
                         counts += interpolate_cubic(line_room, cell, weights, k)

@@ -16,7 +16,7 @@ _FLOAT = np.float32
 
 
 @njit(cache=True, fastmath=True)
-def _cosine(turns: float) -> float:
+def _cosine_of_turns(turns: float) -> float:
     """Cosine of an angle in turns, to 2e-6."""
     t = turns - np.floor(turns + _FLOAT(0.5))
     u = t * t
@@ -41,7 +41,7 @@ def _crossed_pixels(  # type: ignore[no-untyped-def]
         y = w0 * lines[1, c] + w1 * lines[1, c + 1] + w2 * lines[1, c + 2] + w3 * lines[1, c + 3]
         r2 = w0 * lines[2, c] + w1 * lines[2, c + 1] + w2 * lines[2, c + 2] + w3 * lines[2, c + 3]
         level = _FLOAT(0.5) + _FLOAT(0.25) * (
-            _cosine(x * rate + first_x) + _cosine(y * rate + first_y)
+            _cosine_of_turns(x * rate + first_x) + _cosine_of_turns(y * rate + first_y)
         )
         inside = (abs(x - half_mm) < half_mm) & (abs(y - half_mm) < half_mm)
         levels[c] = level if inside else none
@@ -73,7 +73,7 @@ def _crossed_pixels(  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, nogil=True)
-def shade_crossed(
+def shade_crossed_rows(
     nodes: FloatArray,  # as in `shade`
     weights: Singles,  # (4, step): of `cubic_weights`, transposed
     # periods per mm, phases of x and y at the low edge in turns, half a side of the region (mm),

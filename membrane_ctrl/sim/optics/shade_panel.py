@@ -45,7 +45,7 @@ class PanelPicture:
 
 
 @njit(cache=True, nogil=True)
-def shade_panel(
+def shade_panel_rows(
     nodes: FloatArray,  # as in `shade`
     weights: FloatArray,  # (step, 4) of `cubic_weights`
     radius_mm: float,  # of the film's rim

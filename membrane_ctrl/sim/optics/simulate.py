@@ -36,10 +36,10 @@ def capture_table(spec: SimulationSpec, readings_um: FloatArray) -> dict[str, An
     """The content of `capture.toml` (schema membrane-capture/1); `readings_um` (frames,) are the
     laser's readings.
     """
-    geometry = _written(spec.stated_geometry or spec.optics.geometry)
+    geometry = _make_config_table(spec.stated_geometry or spec.optics.geometry)
     if spec.laser:
         geometry["reference_displacement_um"] = spec.reference_um
-    camera = _written(spec.optics.camera)
+    camera = _make_config_table(spec.optics.camera)
     if spec.optics.camera.bits == 8:
         del camera["bits"]  # the default of readers
     camera["principal_px"] = list(spec.optics.camera.principal)
@@ -49,10 +49,10 @@ def capture_table(spec: SimulationSpec, readings_um: FloatArray) -> dict[str, An
     if spec.film.bowl == "hencky" and spec.film.sag_mm > 0:
         table["pressure_pa"] = spec.pressure_pa(_mean_um(spec))
     table |= {
-        "pattern": _written(spec.optics.pattern),
+        "pattern": _make_config_table(spec.optics.pattern),
         "geometry": geometry,
         "camera": camera,
-        "mirror": _written(spec.optics.mirror),
+        "mirror": _make_config_table(spec.optics.mirror),
         **({"artefact": dict(spec.artefact)} if spec.artefact else {}),
         **({"screen_moved": dict(spec.screen_moved)} if spec.screen_moved else {}),
         "frames": [
@@ -103,7 +103,7 @@ def write_truth(folder: Path, spec: SimulationSpec) -> None:
         "coeffs_um": None if coeffs_um is None else coeffs_um.tolist(),
         "frame_displacement_um": displacement_um.tolist(),
         "film": film,
-        "geometry": _written(spec.optics.geometry)
+        "geometry": _make_config_table(spec.optics.geometry)
         | {"reference_displacement_um": spec.reference_um},
         "light": asdict(spec.light),
         "screen_error": None if spec.screen_error is None else asdict(spec.screen_error),
@@ -120,7 +120,7 @@ def _mean_um(spec: SimulationSpec) -> float:
     return float(np.mean(fringes))
 
 
-def _written(section: settings.Section) -> dict[str, Any]:
+def _make_config_table(section: settings.Section) -> dict[str, Any]:
     """A configuration table as written, without absent fields and empty lists."""
     return {
         key: value
@@ -158,7 +158,7 @@ def simulate_set(folder: str | Path, spec: SimulationSpec) -> None:
     """Write one capture set and its truth. Raises OSError if the folder or a file cannot be
     written.
     """
-    _write_set(Path(folder), spec, _renderer(spec))
+    _write_set(Path(folder), spec, _make_renderer(spec))
 
 
 def simulate_run(
@@ -186,8 +186,8 @@ def simulate_run(
             f"interval_s = {interval_s:g} is shorter than the {len(spec.patterns)} frames of "
             "the first set"
         )
-    spec = _anchored(spec)
-    renderer = _renderer(spec)
+    spec = _anchor_specification(spec)
+    renderer = _make_renderer(spec)
     for number in range(sets):
         if number == 0:
             this = spec
@@ -221,8 +221,8 @@ def simulate_track(
         raise ValueError(
             "track: one frame or more, at a rate above 0, of a film that moves by motion"
         )
-    spec = _anchored(spec)
-    renderer, target = _renderer(spec), Path(folder) / "track"
+    spec = _anchor_specification(spec)
+    renderer, target = _make_renderer(spec), Path(folder) / "track"
     _write_set(Path(folder) / "full", spec, renderer)
     target.mkdir(parents=True, exist_ok=True)
     start_s = spec.start_s + len(spec.patterns) * spec.frame_interval_s
@@ -260,7 +260,7 @@ def simulate_track(
         "kind": "track",
         "reference": "../full",
     }
-    table |= {"pattern": _written(pattern_mm) | {"crossed": crossed}, "frames": rows}
+    table |= {"pattern": _make_config_table(pattern_mm) | {"crossed": crossed}, "frames": rows}
     (target / "capture.toml").write_bytes(tomli_w.dumps(table).encode())
     sag_um = np.array([1e3 * spec.film.sag_at_mm(float(d)) for d in displacement_um])
     truth: dict[str, Any] = {"time_s": time_s, "displacement_um": displacement_um, "sag_um": sag_um}
@@ -272,7 +272,7 @@ def simulate_track(
     np.savez_compressed(target / "truth.npz", **truth)
 
 
-def _anchored(spec: SimulationSpec) -> SimulationSpec:
+def _anchor_specification(spec: SimulationSpec) -> SimulationSpec:
     """The specification with an explicit reference displacement of the geometry, common to all sets
     of a run.
     """
@@ -300,7 +300,7 @@ class _SeenDirectly(OpticsRenderer):
         return Trace(np.zeros(len(along)), np.zeros(len(along)), *seen_mm)
 
 
-def _renderer(spec: SimulationSpec) -> OpticsRenderer:
+def _make_renderer(spec: SimulationSpec) -> OpticsRenderer:
     kind = _SeenDirectly if spec.artefact.get("form") == "screen" else OpticsRenderer
     return kind(
         spec.optics,
@@ -321,7 +321,7 @@ def _write_set(folder: Path, spec: SimulationSpec, renderer: OpticsRenderer) -> 
     readings_um = noise + [spec.displacement_um(frame) for frame in range(len(spec.patterns))]
     faults = {(fault.kind, fault.frame) for fault in spec.faults}
     before: roles.Pixels | None = None
-    for pattern, exposure in zip(spec.patterns, _exposures(spec), strict=True):
+    for pattern, exposure in zip(spec.patterns, _list_exposures(spec), strict=True):
         if ("stale", pattern.name) in faults and before is not None:
             picture = before
         else:
@@ -338,7 +338,7 @@ def _write_set(folder: Path, spec: SimulationSpec, renderer: OpticsRenderer) -> 
     write_truth(folder, spec)
 
 
-def _exposures(spec: SimulationSpec) -> list[_Exposure]:
+def _list_exposures(spec: SimulationSpec) -> list[_Exposure]:
     """The true pattern, film position and exposure time of each frame."""
     exposures = [
         _Exposure(pattern, spec.displacement_um(frame), spec.time_s(frame))

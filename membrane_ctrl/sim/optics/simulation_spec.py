@@ -102,7 +102,7 @@ class Motion:
         return self.start_um + self.drift_um_per_s * time_s + swing
 
 
-def leaning(
+def make_artefact_shape(
     curvature_mm: float,
     radius_mm: float,
     lean_x: float,
@@ -120,7 +120,7 @@ def leaning(
         return film_shape.FilmShape(0.0, radius_mm, "paraboloid", tuple(coeffs_um.tolist()))
     rho, theta = np.meshgrid(np.sqrt((np.arange(40) + 0.5) / 40), 2 * pi * np.arange(40) / 40)
     x, y = (rho * np.cos(theta)).ravel(), (rho * np.sin(theta)).ravel()
-    terms = [zernike_polynomials.polynomial(row) for row in np.eye(coeffs_um.size)]
+    terms = [zernike_polynomials.zernike_polynomial(row) for row in np.eye(coeffs_um.size)]
     design = np.stack([np.polynomial.polynomial.polyval2d(x, y, term) for term in terms], axis=1)
     # the centre is at R (-lean_x, -lean_y, 1) / length
     centre = curvature_mm * np.array([-lean_x, -lean_y, 1.0]) / sqrt(1 + lean_x**2 + lean_y**2)

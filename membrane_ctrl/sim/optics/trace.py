@@ -35,7 +35,7 @@ class Trace:
         return self.x_mm**2 + self.y_mm**2 <= radius_mm**2
 
 
-def trace(
+def trace_rays(
     camera: CameraPose,
     directions: FloatArray,
     film: FilmTerms,
@@ -47,7 +47,7 @@ def trace(
 
     The film is the surface z = vertex_z_mm + h(x, y), its bowl `sag_mm` deep.
     """
-    hits = _trace(
+    hits = _trace_kernel(
         camera.position_mm,
         np.ascontiguousarray(directions),
         film,
@@ -103,7 +103,7 @@ def _plane_point(
 
 
 @njit(cache=True)
-def _trace(
+def _trace_kernel(
     start: FloatArray,
     directions: FloatArray,
     film: FilmTerms,

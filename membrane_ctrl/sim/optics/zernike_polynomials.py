@@ -29,7 +29,7 @@ def noll_orders(j: int) -> tuple[int, int]:
 
 
 @cache
-def _monomials(j: int) -> dict[tuple[int, int], float]:
+def _zernike_monomials(j: int) -> dict[tuple[int, int], float]:
     """Z_j as {(i, k): coefficient of x^i y^k}.
 
     R_n^m(rho) = sum_s (-1)^s (n-s)! / (s! ((n+m)/2-s)! ((n-m)/2-s)!) rho^(n-2s); with
@@ -58,7 +58,7 @@ def _monomials(j: int) -> dict[tuple[int, int], float]:
     return terms
 
 
-def polynomial(coeffs: FloatArray) -> FloatArray:
+def zernike_polynomial(coeffs: FloatArray) -> FloatArray:
     """Sum of Zernike terms, coefficients (J,) of Noll's j = 1..J, as a polynomial of the unit
     disc's x and y.
 
@@ -69,6 +69,6 @@ def polynomial(coeffs: FloatArray) -> FloatArray:
     degree = max((noll_orders(j)[0] for j in used), default=0)
     matrix = np.zeros((degree + 1, degree + 1))
     for j in used:
-        for (i, k), factor in _monomials(j).items():
+        for (i, k), factor in _zernike_monomials(j).items():
             matrix[i, k] += coeffs[j - 1] * factor
     return matrix

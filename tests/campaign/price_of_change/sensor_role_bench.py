@@ -19,7 +19,7 @@ from firmware_iface.roles import NO_READING
 from membrane_ctrl.cli import run
 from membrane_ctrl.commissioning import first_config as wizard
 from membrane_ctrl.config.schema import Config, DevicesConfig, LimitsConfig
-from membrane_ctrl.config.toml_file import dump, load
+from membrane_ctrl.config.toml_file import dump_toml, load_toml
 from membrane_ctrl.controller.safety import SafetyTable
 from membrane_ctrl.model.telemetry import State
 from membrane_ctrl.sim.lab import Lab
@@ -49,13 +49,13 @@ async def checked(path: Path) -> dict[str, str]:
     """Readings of the devices of a configuration, by role, as `check` finds them at emulated
     instruments.
     """
-    config = load(path, Config)
+    config = load_toml(path, Config)
     assert config.devices is not None
     lab = Lab(StillPlant(), config.devices)
     printed = io.StringIO()
     try:
         moved = path.with_name("moved.toml")
-        moved.write_text(dump(config.model_copy(update={"devices": await lab.start()})))
+        moved.write_text(dump_toml(config.model_copy(update={"devices": await lab.start()})))
         with contextlib.redirect_stdout(printed):
             await asyncio.to_thread(run, ["check", str(moved), "--json"])
     finally:

@@ -28,7 +28,7 @@ from membrane_ctrl.metrology.rays.geometry import project_points
 from membrane_ctrl.metrology.rays.set_phases import ANYWHERE, Elsewhere, SetPhases
 from membrane_ctrl.metrology.rays.surface import Surface
 from membrane_ctrl.sim.optics.bench_poses import CameraPose, ScreenPose
-from membrane_ctrl.sim.optics.trace import trace
+from membrane_ctrl.sim.optics.trace import trace_rays
 from tests.support import calibration_truth
 from tests.support.calibration_truth import (
     PIXEL_SIGMA_MM,
@@ -86,7 +86,7 @@ def with_moved_screen(
     moved_um = 1e3 * (SAGS_MM[int(base.name[-1])] - calibration_truth.NOMINAL_MM) + DEEPER_UM
     camera, film = CameraPose(there.pinhole_mm, there.rotation), truth.film
     rays = there.rays(column, row).T
-    met = trace(
+    met = trace_rays(
         camera, rays, film.terms_at(moved_um), film.sag_at_mm(moved_um), -1e-3 * moved_um, screen
     )
     seen = np.stack([met.s_x_mm, met.s_y_mm])

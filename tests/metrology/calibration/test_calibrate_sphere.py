@@ -23,8 +23,8 @@ from membrane_ctrl.metrology.rays.set_phases import SetPhases
 from membrane_ctrl.metrology.rays.surface import Surface
 from membrane_ctrl.model.zernike_terms import ZERNIKE_TERMS
 from membrane_ctrl.sim.optics.bench_poses import CameraPose, ScreenPose
-from membrane_ctrl.sim.optics.simulation_spec import leaning
-from membrane_ctrl.sim.optics.trace import trace
+from membrane_ctrl.sim.optics.simulation_spec import make_artefact_shape
+from membrane_ctrl.sim.optics.trace import trace_rays
 from tests.support.calibration_truth import (
     PIXEL_SIGMA_MM,
     STATED,
@@ -207,11 +207,11 @@ def test_a_sphere_with_the_form_error_that_is_stated_is_believed() -> None:
     truth, problem = bench_of(values, 7)
     stated, geometry = sphere(250.0, 3400.0, 1e-4, 0.05), bench_at(STATED, values).geometry
     form_um = 1e3 * stated.form_sigma_mm * rng.normal(size=ZERNIKE_TERMS)
-    shape = leaning(3400.0, 250.0, *rng.uniform(-2e-3, 2e-3, 2), form_um)
+    shape = make_artefact_shape(3400.0, 250.0, *rng.uniform(-2e-3, 2e-3, 2), form_um)
     column, row = rng.uniform(0, 2447, 20_000), rng.uniform(0, 2047, 20_000)
     camera = CameraPose(geometry.pinhole_mm, geometry.rotation)
     screen = ScreenPose(geometry.screen_origin_mm, geometry.screen_s_x, geometry.screen_s_y)
-    met = trace(camera, geometry.rays(column, row).T, shape.terms, shape.sag_mm, 0.0, screen)
+    met = trace_rays(camera, geometry.rays(column, row).T, shape.terms, shape.sag_mm, 0.0, screen)
     inside = np.flatnonzero(np.hypot(met.x_mm, met.y_mm) < 237.0)
     sigma = np.full(inside.size, PIXEL_SIGMA_MM / np.sqrt(PIXELS / 20_000))
     seen = np.stack([met.s_x_mm, met.s_y_mm])[:, inside] / bench_at(STATED, values).pitch

@@ -7,7 +7,7 @@ from dataclasses import replace
 
 import pytest
 
-from membrane_ctrl.model.shape_estimate import Quality, judge
+from membrane_ctrl.model.shape_estimate import Quality, judge_quality
 
 GOOD = Quality(
     modulation_share=0.35,
@@ -19,7 +19,7 @@ GOOD = Quality(
 
 
 def test_good_cycle() -> None:
-    assert judge(GOOD) == ("ok", "")
+    assert judge_quality(GOOD) == ("ok", "")
 
 
 @pytest.mark.parametrize(
@@ -39,10 +39,10 @@ def test_good_cycle() -> None:
     ],
 )
 def test_each_limit(change: dict[str, float], verdict: str, reason: str) -> None:
-    found, why = judge(replace(GOOD, **change))
+    found, why = judge_quality(replace(GOOD, **change))
     assert found == verdict
     assert reason in why
 
 
 def test_rejection_wins_over_degradation() -> None:
-    assert judge(replace(GOOD, valid_fraction=0.8, residual_urad=3000.0))[0] == "rejected"
+    assert judge_quality(replace(GOOD, valid_fraction=0.8, residual_urad=3000.0))[0] == "rejected"

@@ -15,7 +15,7 @@ from membrane_ctrl.metrology.frame_checks.checked_set import RejectedSetError
 from membrane_ctrl.metrology.frame_checks.set_check import check_set
 from membrane_ctrl.metrology.phase.clip_levels import find_clip_levels
 from membrane_ctrl.metrology.phase.frame_stack import FrameStack
-from membrane_ctrl.model.shape_estimate import Verdict, judge
+from membrane_ctrl.model.shape_estimate import Verdict, judge_quality
 from tests.worlds.light_bench import LightEffects, quarter_bench, render_set
 
 Pictures = NDArray[np.uint8] | NDArray[np.uint16]
@@ -29,7 +29,7 @@ def measured(stack: FrameStack, bits: int = 8) -> tuple[Verdict, str, float]:
     except RejectedSetError as error:
         return "rejected", str(error), error.saturated_fraction
     full = reconstruct_full(optics, checked, measure_pixels(optics, checked))
-    return *judge(full.quality), full.quality.saturated_fraction
+    return *judge_quality(full.quality), full.quality.saturated_fraction
 
 
 def altered(

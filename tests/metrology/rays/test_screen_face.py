@@ -25,7 +25,7 @@ from membrane_ctrl.metrology.rays.surface import Surface
 from membrane_ctrl.metrology.uncertainty.geometry_spread import GENERAL_NAMES, change_geometry
 from membrane_ctrl.sim.optics.bench_poses import camera_pose, screen_pose
 from membrane_ctrl.sim.optics.film_shape import FilmShape
-from membrane_ctrl.sim.optics.trace import trace
+from membrane_ctrl.sim.optics.trace import trace_rays
 from tests.support.metrology_truth import SMALL, pixel_grid
 from tests.support.rendered_sets import FILM, bench, good_set
 
@@ -99,7 +99,7 @@ def test_rays_meet_the_face_where_the_twin_says() -> None:
     optics = _optics(CROOKED)
     geometry = Geometry.from_config(optics)
     rays = geometry.rays(*pixel_grid(SMALL, stride=3))
-    seen = trace(
+    seen = trace_rays(
         camera_pose(optics.geometry),
         rays.T,
         FilmShape(37.1).terms,

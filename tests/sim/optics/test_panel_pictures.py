@@ -7,7 +7,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from firmware_iface.display_patterns import ScreenRaster, checkerboard, pattern_light
+from firmware_iface.display_patterns import ScreenRaster, make_checkerboard, pattern_light
 from firmware_iface.display_response import linear_response
 from firmware_iface.roles import Pattern
 from membrane_ctrl.config.optics import CameraConfig, DisturbancesConfig, OpticsConfig
@@ -65,7 +65,7 @@ def test_a_shifted_picture_is_seen_shifted(renderer: OpticsRenderer) -> None:
 
 
 def test_the_lens_does_not_resolve_a_checkerboard(renderer: OpticsRenderer) -> None:
-    board = PanelPicture(checkerboard(RASTER.width_px, RASTER.height_px), RASTER)
+    board = PanelPicture(make_checkerboard(RASTER.width_px, RASTER.height_px), RASTER)
     grey = PanelPicture(np.full((RASTER.height_px, RASTER.width_px), 127, np.uint8), RASTER)
     lit = seen(renderer, grey, 0.0) > 60.0
     assert np.mean(lit) > 0.3

@@ -27,7 +27,7 @@ from membrane_ctrl.sim.optics.film_shape import (
     bowl_series,
     typical_film,
 )
-from membrane_ctrl.sim.optics.film_terms import height_and_slopes, heights
+from membrane_ctrl.sim.optics.film_terms import film_heights, height_and_slopes
 from membrane_ctrl.sim.optics.zernike_polynomials import noll_orders
 
 RICH = FilmShape(
@@ -213,13 +213,17 @@ def test_a_drum_mode_moves_the_film_inside_its_ring(mode: DrumMode) -> None:
     x, y = (side.ravel() for side in np.meshgrid(*2 * [np.linspace(-500.0, 500.0, 141)]))
     inside = np.hypot(x, y) < 500.0
     x, y = x[inside], y[inside]
-    moved_um = 1e3 * (heights(mode.moved(film), 37.1, x, y) - heights(film.terms, 37.1, x, y))
+    moved_um = 1e3 * (
+        film_heights(mode.moved(film), 37.1, x, y) - film_heights(film.terms, 37.1, x, y)
+    )
     wanted = jv(mode.lobes, jn_zeros(mode.lobes, mode.circles)[-1] * np.hypot(x, y) / 500.0)
     wanted *= np.cos(mode.lobes * np.arctan2(y, x))
     assert moved_um == pytest.approx(wanted / np.sqrt(np.mean(wanted**2)), abs=0.02)
     angle = np.linspace(0, 2 * np.pi, 36)
     ring = 500.0 * np.cos(angle), 500.0 * np.sin(angle)
     assert (
-        np.abs(heights(mode.moved(film), 37.1, *ring) - heights(film.terms, 37.1, *ring)).max()
+        np.abs(
+            film_heights(mode.moved(film), 37.1, *ring) - film_heights(film.terms, 37.1, *ring)
+        ).max()
         < 1e-7
     )

@@ -8,7 +8,7 @@ from numpy.polynomial.polynomial import polyval2d
 from prysm.polynomials import noll_to_nm, zernike_nm
 
 from membrane_ctrl.sim.optics.film_shape import MAX_FILM_TERMS
-from membrane_ctrl.sim.optics.zernike_polynomials import noll_orders, polynomial
+from membrane_ctrl.sim.optics.zernike_polynomials import noll_orders, zernike_polynomial
 
 FILM_INDICES = range(1, MAX_FILM_TERMS + 1)
 
@@ -16,7 +16,7 @@ FILM_INDICES = range(1, MAX_FILM_TERMS + 1)
 def _values(j: int, x: np.ndarray, y: np.ndarray) -> np.ndarray:
     coeffs = np.zeros(j)
     coeffs[j - 1] = 1.0
-    return polyval2d(x, y, polynomial(coeffs))
+    return polyval2d(x, y, zernike_polynomial(coeffs))
 
 
 def test_the_low_terms_have_nolls_names() -> None:

@@ -22,7 +22,7 @@ from membrane_ctrl.sim.optics.bench_poses import (
 )
 from membrane_ctrl.sim.optics.camera import OpticsRenderer
 from membrane_ctrl.sim.optics.film_shape import FilmShape
-from membrane_ctrl.sim.optics.trace import Trace, trace
+from membrane_ctrl.sim.optics.trace import Trace, trace_rays
 
 A_MM, B_MM, ALPHA = 2672.0, 2871.0, np.radians(80.9)
 GEOMETRY = OpticsConfig().geometry
@@ -48,7 +48,7 @@ def test_the_law_of_reflection_holds(film: FilmShape, error: ScreenError | None)
     columns, rows = rng.uniform(700.0, 1750.0, 300), rng.uniform(500.0, 1550.0, 300)
     camera, screen = camera_pose(GEOMETRY), screen_pose(GEOMETRY, error)
     directions = _rays(columns, rows)
-    hits = trace(camera, directions, film.terms, 37.2, -0.1, screen)
+    hits = trace_rays(camera, directions, film.terms, 37.2, -0.1, screen)
     assert hits.on_film(500.0).all()
 
     p = np.stack([hits.x_mm, hits.y_mm, film.height_mm(hits.x_mm, hits.y_mm, 100.0) - 0.1], axis=1)
@@ -72,7 +72,7 @@ def test_the_law_of_reflection_holds(film: FilmShape, error: ScreenError | None)
 
 def test_the_chief_ray_runs_from_f_over_o_to_its_end() -> None:
     c0, r0 = CameraConfig().principal
-    hits = trace(
+    hits = trace_rays(
         camera_pose(GEOMETRY),
         _rays(np.array([c0]), np.array([r0])),
         FilmShape(37.1).terms,
@@ -107,7 +107,7 @@ def test_light_from_a_paraboloids_focus_leaves_parallel_to_its_axis() -> None:
     tx, ty = (v.ravel() for v in np.meshgrid(angles, angles))
     directions = _unit(np.stack([tx, ty, -np.ones_like(tx)], axis=1))
     film = FilmShape(sag_mm, radius_mm, "paraboloid")
-    hits = trace(camera, directions, film.terms, sag_mm, 0.0, screen_pose(straight))
+    hits = trace_rays(camera, directions, film.terms, sag_mm, 0.0, screen_pose(straight))
     np.testing.assert_allclose(hits.s_x_mm, -hits.x_mm, atol=1e-9)
     np.testing.assert_allclose(hits.s_y_mm, hits.y_mm, atol=1e-9)
 
@@ -121,7 +121,7 @@ def test_in_the_plane_y_0_s_x_is_the_papers_distance_to_a() -> None:
     )  # even in y: stays in the plane
     columns = np.linspace(700.0, 1750.0, 40)
     rows = np.full(40, CameraConfig().principal[1])
-    hits = trace(
+    hits = trace_rays(
         camera_pose(GEOMETRY),
         _rays(columns, rows),
         flat_in_y.terms,
@@ -150,7 +150,7 @@ def test_in_the_plane_y_0_s_x_is_the_papers_distance_to_a() -> None:
 
 def test_the_picture_is_upright() -> None:
     c0, r0 = CameraConfig().principal
-    hits = trace(
+    hits = trace_rays(
         camera_pose(GEOMETRY),
         _rays(np.array([c0 + 500, c0]), np.array([r0, r0 - 500])),
         FilmShape(37.1).terms,
@@ -164,7 +164,7 @@ def test_the_picture_is_upright() -> None:
 
 def test_a_flat_film_shows_the_screen_as_a_plane_mirror_does() -> None:
     columns, rows = np.array([1000.0, 1400.0]), np.array([1200.0, 900.0])
-    hits = trace(
+    hits = trace_rays(
         camera_pose(GEOMETRY),
         _rays(columns, rows),
         FilmShape(0.0).terms,
@@ -252,7 +252,7 @@ def test_a_screen_behind_the_film_is_never_reached() -> None:
         np.array([0.0, 0.0, -1000.0]), np.array([-1.0, 0.0, 0.0]), np.array([0.0, 1.0, 0.0])
     )
     c0, r0 = CameraConfig().principal
-    hits = trace(
+    hits = trace_rays(
         camera_pose(GEOMETRY),
         _rays(np.array([c0]), np.array([r0])),
         FilmShape(37.1).terms,
@@ -265,7 +265,7 @@ def test_a_screen_behind_the_film_is_never_reached() -> None:
 
 
 def test_rays_beside_the_film_are_not_on_it() -> None:
-    hits = trace(
+    hits = trace_rays(
         camera_pose(GEOMETRY),
         _rays(np.array([5.0]), np.array([5.0])),
         FilmShape(37.1).terms,
@@ -278,7 +278,9 @@ def test_rays_beside_the_film_are_not_on_it() -> None:
 
 def test_rays_that_look_up_never_meet_the_film() -> None:
     up = np.array([[0.0, 0.0, 1.0], [1.0, 0.0, 0.0]])
-    hits = trace(camera_pose(GEOMETRY), up, FilmShape(37.1).terms, 37.1, 0.0, screen_pose(GEOMETRY))
+    hits = trace_rays(
+        camera_pose(GEOMETRY), up, FilmShape(37.1).terms, 37.1, 0.0, screen_pose(GEOMETRY)
+    )
     assert np.isnan(hits.x_mm).all()
     assert not hits.on_film(500.0).any()
 
