@@ -255,6 +255,14 @@ class FrameFitter:
         )
         return np.asarray(seen * np.outer(grown, grown))
 
+    def phase_errors(self, fit: FrameFit, shifts_rad: Shifts) -> tuple[Singles, Singles]:
+        """Products (2, n) of a frame's residual with the light's derivatives by both phases, and
+        the squares of these derivatives (2, n), both weighted as the fit does.
+        """
+        waves = self._waves(shifts_rad, fit.surface, fit.light)[:2]
+        weights = self.scene.edge * fit.weights
+        return waves * (weights * fit.residual_adu), waves**2 * weights
+
     def in_squares(self, slow: Singles, values: AnyArray) -> FloatArray:
         """Sums (rows, squares) over squares of the mirror whose errors count as independent.
 

@@ -23,6 +23,7 @@ from membrane_ctrl.metrology.tracking import (
     step_means,
     tracked_frame,
 )
+from membrane_ctrl.metrology.tracking.bench_watch import BenchWatch
 from membrane_ctrl.metrology.tracking.crossed_scene import CrossedScene
 from membrane_ctrl.metrology.tracking.frame_fit import FrameFit, FrameFitter
 from membrane_ctrl.metrology.tracking.frame_verdict import Finding
@@ -32,6 +33,7 @@ from membrane_ctrl.metrology.tracking.step_solution import (
     solve_steps,
 )
 from membrane_ctrl.metrology.tracking.tracked_frame import TrackedFrame
+from membrane_ctrl.metrology.uncertainty.motion_evidence import MotionFinding
 from membrane_ctrl.model.arrays import BoolArray, FloatArray, Image, Singles
 from membrane_ctrl.model.zernike_terms import ZERNIKE_TERMS
 
@@ -40,6 +42,9 @@ _OUT_USUAL = 0.01  # dust and glints
 _REACH_SIGMAS = 7.0
 _FIRST_REACH = 1e6  # everything counts
 _KNOCK_UM, _KNOCK_UM_PER_S = 2.0, 0.5  # RMS of a tilt that neither film nor air makes: 8 µrad
+# Effects of a motion of the bench on the figure (RMS without tilt): beyond the first, a proven
+# motion degrades a frame; beyond the second, one that camera, screen or mirror may have made
+_BENCH_UM, _TILTED_UM = 0.03, 0.1
 # with less, frames of a still mirror may be the same; here a pixel in 90 differs
 _BLIND_NOISE_ADU = 0.01
 _OTHER_BINS = 0.03  # change of their share with weight with which the errors change, too
@@ -87,6 +92,7 @@ class Tracker:
         self._anchor_light = math.nan
         self._orders = lost_orders.LostOrders(self._fitter)
         self._orders.require_telling()
+        self._watch = BenchWatch(self._fitter)
         self._knocked = ""
         # its time, parameters: of the last five steps
         self._mean_place: tuple[float, FloatArray] | None = None
@@ -173,6 +179,7 @@ class Tracker:
         places = [surface.Surface.from_parameters(place, radius_mm) for place in seen_at]
         fits = [replace(fit, surface=place) for fit, place in zip(fits, places, strict=True)]
         scene, moved, moved_mm2 = solve_steps(self._fitter, fits, seen_adu, np.array(shifts_rad))
+        self._watch.take_scene(scene)
         self._mean_place = float(np.mean(time_s)), seen_at.mean(axis=0) + moved
         self._places_mm2 = dict(zip(shifts_rad, place_mm2 + moved_mm2, strict=True))
         self._anchor_light /= float(
@@ -300,10 +307,13 @@ class Tracker:
         if doubt is not None and doubt.verdict == "rejected":
             return tracked_frame.rejected_frame(time_s, doubt.reason, rest, doubt.lost)
         self._accept(fit, light, shifts_rad, time_s, displacement_um)
+        covariance_mm2 = self._covariance_mm2(fit, shifts_rad, time_s)
+        motion = self._watch.find(fit, shifts_rad, self._fitter, covariance_mm2)
+        doubt = doubt or self._bench_doubt(motion, covariance_mm2, fit, time_s)
         worst = doubt or next(iter(faults), None) or Finding("ok", "")
         if worst.verdict == "ok":
             self._remember(shifts_rad, self._clear, fit, time_s)
-        found = self._result(fit, shifts_rad, time_s, worst, rest)
+        found = self._result(fit, covariance_mm2 + motion.covariance_mm2, time_s, worst, rest)
         return replace(found, saturated_share=float(np.mean(saturated)))
 
     def mean_residual_adu(self) -> FloatArray:
@@ -428,14 +438,33 @@ class Tracker:
         if not math.isfinite(self._anchor_light):
             self._anchor_light = light
 
-    def _result(
-        self,
-        fit: FrameFit,
-        shifts_rad: tuple[float, float],
-        time_s: float,
-        fault: Finding,
-        rest: float,
-    ) -> TrackedFrame:
+    def _bench_doubt(
+        self, motion: MotionFinding, covariance_mm2: FloatArray, fit: FrameFit, time_s: float
+    ) -> Finding | None:
+        """Whether the bench has moved by so much that the figure must not be used.
+
+        What is less is in the error bars alone.
+        """
+        if motion.is_sure and motion.figure_um > _BENCH_UM:
+            self._knocked = (
+                f"knocked: {motion.describe()} at {time_s:.2f} s or before; check camera and screen"
+            )
+            return Finding("degraded", self._knocked, True)
+        own_um = 1e3 * math.sqrt(float(np.trace(covariance_mm2[2:, 2:])))
+        if motion.figure_um > max(own_um, _TILTED_UM):
+            urad = self._watch.tilt_urad(fit.surface)
+            return Finding(
+                "degraded",
+                f"tilted by {urad:.0f} µrad since the reference: camera, screen or mirror moved, "
+                f"and the figure may be {motion.figure_um:.2f} µm off",
+                True,
+            )
+        return None
+
+    def _covariance_mm2(
+        self, fit: FrameFit, shifts_rad: tuple[float, float], time_s: float
+    ) -> FloatArray:
+        """Covariance (parameters, parameters) of a frame's fit, on a bench that has not moved."""
         if (
             self._jumps.add(shifts_rad, fit.surface.parameters)
             or time_s >= self._covariance_s + _SIGMA_EVERY_S
@@ -449,7 +478,17 @@ class Tracker:
         apart_mm2 = self._place_mm2(shifts_rad) + self._jumps.variance_mm2(
             np.mean(places_mm2, axis=0)
         )
-        covariance_mm2 = self._fit_mm2 + np.diag(apart_mm2)
+        return np.asarray(self._fit_mm2 + np.diag(apart_mm2))
+
+    def _result(
+        self,
+        fit: FrameFit,
+        covariance_mm2: FloatArray,
+        time_s: float,
+        fault: Finding,
+        rest: float,
+    ) -> TrackedFrame:
+        used = float(np.mean(fit.weights > 0))
         to_coeffs, gradient = surface.parameter_to_coeffs(), surface.sag_gradient()
         return TrackedFrame(
             time_s=time_s,

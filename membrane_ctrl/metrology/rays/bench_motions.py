@@ -1,0 +1,157 @@
+"""Small rigid motions of camera, screen, lens and mirror, and what each does to the screen points.
+
+A bench is known by its calibration. What moves afterwards changes the screen points that the
+camera's pixels see, in a way that the geometry determines. Each motion has three shifts and three
+turns about axes of the moved body:
+
+| body   | axes                                        | turns about                    |
+|--------|---------------------------------------------|--------------------------------|
+| camera | x right, y down, z forward                  | the pinhole                    |
+| screen | s_x, s_y, normal towards the mirror         | O'                             |
+| mirror | world x, y, z                               | the vertex                     |
+| lens   | image shifts along x and y, and focal length | none                           |
+"""
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from membrane_ctrl.metrology.rays import ray_tracing
+from membrane_ctrl.metrology.rays.geometry import Geometry
+from membrane_ctrl.metrology.rays.surface import Surface
+from membrane_ctrl.model.arrays import FloatArray
+
+# Step of the central differences. 100 µm or 100 µrad: a motion so small is linear to 1e-4, and a
+# trace of 1e-9 mm is exact to 1e-8 of its effect.
+_STEP = 1e-1
+_MM_PER_UM, _RAD_PER_URAD = 1e-3, 1e-6
+_NEWTON_STEPS = 3  # from 0.1 mm off: below 1e-12 mm
+
+
+@dataclass(frozen=True)
+class MotionGroup:
+    """A motion whose direction is free: one or two components, in µm or µrad each."""
+
+    name: str  # for a person: what moved, and how
+    components: int
+    unit: str  # of the components: "µm", "µrad", or "ppm" of the focal length
+    # How far a body may move between a reference and a frame without any sign of it, in `unit`.
+    # 3 µm: a steel mount of a metre in a quarter of a kelvin. That of the mirror is in those of
+    # camera and screen, since only their places relative to it count.
+    allowance: float = 3.0
+    # the figure relative to camera and screen changes as the mirror itself does
+    is_of_mirror: bool = False
+
+
+GROUPS = (
+    MotionGroup("the camera shifted sideways", 2, "µm"),
+    MotionGroup("the camera shifted along its axis", 1, "µm"),
+    MotionGroup("the camera turned", 2, "µrad"),
+    MotionGroup("the camera rolled about its axis", 1, "µrad"),
+    MotionGroup("the screen shifted sideways", 2, "µm"),
+    MotionGroup("the screen shifted along its normal", 1, "µm"),
+    MotionGroup("the screen tilted", 2, "µrad"),
+    MotionGroup("the screen rolled in its plane", 1, "µrad"),
+    MotionGroup("the mirror shifted sideways", 2, "µm", allowance=0.0),
+    MotionGroup("the mirror shifted along z", 1, "µm", allowance=0.0),
+    MotionGroup("the mirror tilted", 2, "µrad", allowance=0.0, is_of_mirror=True),
+    MotionGroup("the mirror rolled about z", 1, "µrad", allowance=0.0),
+    MotionGroup("the picture shifted on the sensor", 2, "µrad"),
+    MotionGroup("the focal length changed", 1, "ppm", allowance=1.0),
+)
+
+
+def group_columns() -> list[slice]:
+    """Of each group, its columns among all components."""
+    ends = np.cumsum([group.components for group in GROUPS]).tolist()
+    return [slice(end - group.components, end) for group, end in zip(GROUPS, ends, strict=True)]
+
+
+COMPONENTS = sum(group.components for group in GROUPS)
+
+
+@dataclass(frozen=True)
+class _Moved:
+    """A bench after a motion."""
+
+    geometry: Geometry
+    rays: FloatArray  # (3, n) in world
+
+
+def screen_changes(
+    geometry: Geometry, rays: FloatArray, t_mm: FloatArray, surface: Surface, vertex_z_mm: float
+) -> FloatArray:
+    """Change of the seen screen points by each component of the motions.
+
+    Parameters
+    ----------
+    geometry : Geometry
+        The bench before the motion.
+    rays : (3, n) array
+        Unit vectors of pixels or bins, in world.
+    t_mm : (n,) array
+        Their lengths to the surface.
+    surface, vertex_z_mm
+        The film.
+
+    Returns
+    -------
+    (COMPONENTS, 2, n) array
+        In mm per µm or µrad (ppm), in the order of `GROUPS`.
+    """
+    out = np.empty((COMPONENTS, 2, rays.shape[1]))
+    in_camera = geometry.rotation @ rays
+    for k in range(COMPONENTS):
+        seen = []
+        for sign in (1.0, -1.0):
+            components = np.zeros(COMPONENTS)
+            components[k] = sign * _STEP / _MM_PER_UM
+            moved = _bench_after(geometry, in_camera, components)
+            points = ray_tracing.Points(moved.rays, out[k], np.ones(t_mm.size), t_mm.copy())
+            tracer = ray_tracing.Tracer(moved.geometry, surface.radius_mm, vertex_z_mm)
+            tracer.intersect(points, surface, newton=_NEWTON_STEPS)
+            seen.append(tracer.predict_screen(points, surface))
+        out[k] = (seen[0] - seen[1]) / (2 * _STEP / _MM_PER_UM)
+    return out
+
+
+def _bench_after(geometry: Geometry, in_camera: FloatArray, components: FloatArray) -> _Moved:
+    """The bench after a motion; `in_camera` (3, n) are the rays in the camera's frame."""
+    camera_x, camera_y, camera_z, camera_rx, camera_ry, camera_rz = components[:6]
+    screen_x, screen_y, screen_z, screen_rx, screen_ry, screen_rz = components[6:12]
+    mirror_x, mirror_y, mirror_z, mirror_rx, mirror_ry, mirror_rz = components[12:18]
+    image_x, image_y, focal = components[18:]
+    # The lens: pixels see other directions.
+    across = in_camera[:2] / in_camera[2] * (1 - 1e-6 * focal)
+    across = across - _RAD_PER_URAD * np.array([[image_x], [image_y]])
+    seen = np.vstack([across, np.ones(across.shape[1])])
+    seen /= np.linalg.norm(seen, axis=0)
+    # Camera and screen, about their own axes.
+    shift_mm = _MM_PER_UM * np.array([camera_x, camera_y, camera_z])
+    pinhole = geometry.pinhole_mm + geometry.rotation.T @ shift_mm
+    turn = _turn_matrix(camera_rx, camera_ry, camera_rz)
+    rotation = turn.T @ geometry.rotation
+    shift_mm = _MM_PER_UM * np.array([screen_x, screen_y, screen_z])
+    axes = geometry.screen_axes
+    origin = geometry.screen_origin_mm + axes.T @ shift_mm
+    axes = _turn_matrix(screen_rx, screen_ry, screen_rz).T @ axes
+    # The mirror: the others move the opposite way.
+    back = _turn_matrix(mirror_rx, mirror_ry, mirror_rz).T
+    shift_mm = _MM_PER_UM * np.array([mirror_x, mirror_y, mirror_z])
+    rotation, axes = rotation @ back.T, axes @ back.T
+    moved = replace(
+        geometry,
+        pinhole_mm=back @ (pinhole - shift_mm),
+        rotation=rotation,
+        screen_origin_mm=back @ (origin - shift_mm),
+        screen_s_x=axes[0],
+        screen_s_y=axes[1],
+    )
+    return _Moved(moved, np.ascontiguousarray(rotation.T @ seen))
+
+
+def _turn_matrix(x_urad: float, y_urad: float, z_urad: float) -> FloatArray:
+    """Turn (3, 3) by a small vector of angles, exact to third order."""
+    x, y, z = _RAD_PER_URAD * np.array([x_urad, y_urad, z_urad])
+    cross = np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
+    return np.asarray(np.eye(3) + cross + cross @ cross / 2)

@@ -1,0 +1,128 @@
+"""Whether camera, screen, lens or mirror have moved since the reference of a tracked set.
+
+A frame is fitted with the reference's geometry. A camera that turns by 5 µrad looks like a film
+with other coma. Each frame is therefore compared with the signatures of all small motions
+(`motion_evidence`): the ring's tilt since the reference, and the light that the fit leaves along
+slopes that no surface has. Five steps of the pattern make new phases for the bins; what they take
+for the bins' own is added to the evidence, so that a motion is not lost in a new anchor.
+"""
+
+import math
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from membrane_ctrl.metrology.numerics.grouped_sums import sums_by
+from membrane_ctrl.metrology.rays import bench_motions, ray_tracing
+from membrane_ctrl.metrology.rays.surface import Surface
+from membrane_ctrl.metrology.tracking.crossed_scene import CrossedScene
+from membrane_ctrl.metrology.tracking.frame_fit import FrameFit, FrameFitter, Shifts
+from membrane_ctrl.metrology.uncertainty.motion_evidence import (
+    MotionEffects,
+    MotionFinding,
+    Observation,
+    find_motion,
+    ring_tilt,
+)
+from membrane_ctrl.model.arrays import AnyArray, FloatArray
+
+_BLOCKS = 14  # squares along the diameter whose errors count as independent, as in `FrameFitter`
+
+
+@dataclass(frozen=True)
+class _Scores:
+    """Products with the slopes that no surface has."""
+
+    left: FloatArray  # q (components,)
+    covariance: FloatArray  # (components, components): from the scatter of squares of the mirror
+    gram: FloatArray  # G (components, components)
+
+
+@dataclass
+class BenchWatch:
+    """Compares frames with the signatures of motions.
+
+    Parameters
+    ----------
+    fitter : FrameFitter
+        Of the reference's scene.
+    """
+
+    fitter: FrameFitter
+    _effects: MotionEffects = field(init=False)
+    _reference: CrossedScene = field(init=False)
+    _anchor: _Scores = field(init=False)  # what the bins' own phases took
+
+    def __post_init__(self) -> None:
+        scene = self._reference = self.fitter.scene
+        cells = scene.cells
+        # Motions vary slowly over the mirror: one ray in the middle of each cell is enough.
+        rays = cells.planes(scene.points.rays)[:, 0].astype(float)
+        rays /= np.linalg.norm(rays, axis=0)
+        points = ray_tracing.Points.of(rays, np.zeros((2, rays.shape[1])))
+        scene.tracer.start(points, scene.surface.height)
+        scene.tracer.intersect(points, scene.surface, newton=2)
+        changes_mm = bench_motions.screen_changes(
+            scene.tracer.geometry,
+            points.rays,
+            points.t_mm,
+            scene.surface,
+            scene.tracer.vertex_z_mm,
+        )
+        jacobian = self.fitter.jacobian[:, :, 0].astype(float)
+        weights = cells.sums(self._bin_weights(scene)).astype(float)
+        self._effects = MotionEffects.of(scene.rad_per_mm * changes_mm, jacobian, weights)
+        place = (scene.position_mm / scene.surface.radius_mm + 1) / 2 * _BLOCKS
+        column, row = np.floor(cells.planes(place)[:, 0]).astype(int)
+        self._square = (row + 1) * (_BLOCKS + 2) + column + 1
+        none = np.zeros(bench_motions.COMPONENTS)
+        square = np.zeros((none.size, none.size))
+        self._anchor = _Scores(none, square, self._effects.gram(weights))
+
+    @staticmethod
+    def _bin_weights(scene: CrossedScene) -> FloatArray:
+        """Weights (2, n) of the phases of x and y: mean squares of the light's derivatives."""
+        return np.asarray(scene.light_adu[1:] ** 2 * scene.edge / 2)
+
+    def take_scene(self, scene: CrossedScene) -> None:
+        """Keep what the bins' own phases of a new scene have taken since the reference."""
+        weights = self._bin_weights(scene)
+        moved_rad = (scene.beyond_mm - self._reference.beyond_mm) * scene.rad_per_mm
+        self._anchor = self._scores(weights * moved_rad, weights)
+
+    def _scores(self, values: AnyArray, weights: AnyArray) -> _Scores:
+        """Of weighted phase errors (2, n) of the bins and their weights (2, n)."""
+        cells = self._reference.cells
+        sums = cells.sums(values).astype(float)
+        left = self._effects.left
+        parts = np.einsum("kan,an->kn", left, sums)
+        squares = sums_by(self._square, parts, (_BLOCKS + 2) ** 2)
+        gram = self._effects.gram(cells.sums(weights).astype(float))
+        return _Scores(parts.sum(axis=1), squares @ squares.T, gram)
+
+    def find(
+        self, fit: FrameFit, shifts_rad: Shifts, fitter: FrameFitter, covariance_mm2: FloatArray
+    ) -> MotionFinding:
+        """The motions that explain a frame.
+
+        `fitter` is that of the frame, `covariance_mm2` (parameters, parameters) that of its fit.
+        """
+        slopes, weights = fitter.phase_errors(fit, shifts_rad)
+        now, before = self._scores(slopes, weights), self._anchor
+        # A frame shows less than five steps where a hand covers it: both in the frame's weights.
+        share = np.trace(now.gram) / np.trace(before.gram)
+        moved_mm = fit.surface.parameters - self._reference.surface.parameters
+        ring = ring_tilt()
+        seen = Observation(
+            ring_mm=ring @ moved_mm,
+            ring_mm2=ring @ covariance_mm2 @ ring.T,
+            left=now.left + share * before.left,
+            left_covariance=now.covariance + share**2 * before.covariance,
+            gram=now.gram,
+        )
+        return find_motion(self._effects, seen)
+
+    def tilt_urad(self, shape: Surface) -> float:
+        """Tilt of the ring since the reference."""
+        moved_mm = shape.parameters - self._reference.surface.parameters
+        return 1e6 * math.hypot(*(ring_tilt() @ moved_mm)) / shape.radius_mm
