@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -89,6 +90,26 @@ def true_values_um(mirror: Mirror, truth: Truth, points_mm: FloatArray) -> Float
     terms = truth.zernike_um[list(TERMS)]
     heights_um = 1e3 * mirror.height_mm(*points_mm, truth.displacement_um)
     return np.concatenate([[truth.sag_um], terms, heights_um])
+
+
+@dataclass(frozen=True)
+class MeasuredSurface:
+    """A figure: the parameters of the fit in mm, and the rows of its budget."""
+
+    verdict: str
+    parameters_mm: FloatArray
+    rows: list[dict[str, Any]]
+
+
+def measure_surface(folder: Path) -> MeasuredSurface:
+    """Measure a set that must give a figure. Raises AssertionError with its reason otherwise."""
+    measurement = measure_set(folder)
+    assert measurement.full is not None, measurement.reason
+    _, outline = light_and_rim(measurement)
+    bars = results.error_bars(measurement, None, outline)
+    assert bars is not None
+    parameters_mm = measurement.full.surface.parameters
+    return MeasuredSurface(measurement.verdict, parameters_mm, bars.budget.rows())
 
 
 def measured_errors(

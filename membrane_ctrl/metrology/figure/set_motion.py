@@ -15,6 +15,7 @@ from membrane_ctrl.model.arrays import FloatArray
 LASER_NOISE_UM = 1.0  # repeatability of the bench's laser
 # standard deviation of the film's place: less is hardly seen, and leaves 0.06 µm in the figure
 _STILL_UM = 0.2
+SEEN_BY_LASER = 2.0  # sigmas beyond which the laser's reading of a motion counts by itself
 # motion from x to y over its RMS among the frames of an axis: 3.3 for a random walk, 7.2 for a
 # drift, of four steps
 X_TO_Y = 5.0
@@ -64,8 +65,12 @@ class FilmMotion:
         least, most = (
             motion_share(math.sqrt(part * within_um2), laser_um) for part in (moving, 1.0)
         )
-        # noise may hide a motion, which the laser tells by itself where it is beyond 2 sigma
-        share = float(np.clip(1 - (2 * laser_um) ** 2 / max(x_to_y_um**2, 1e-12), least, most))
+        # A film that rests within both axes may still step between them. Beyond 2 sigma of the
+        # laser that step is measured, however little the film moves from frame to frame.
+        beyond_noise = 1 - (SEEN_BY_LASER * laser_um) ** 2 / max(x_to_y_um**2, 1e-12)
+        if beyond_noise > 0:
+            most = 1.0
+        share = max(least, beyond_noise)
         # the figure is that of all readings' mean, also where a frame is left out
         about_um = readings_um[[*x, *y]].mean() - checked.stack.mean_reading_um
         parts = np.nan_to_num(

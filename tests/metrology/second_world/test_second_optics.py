@@ -55,7 +55,7 @@ def test_the_package_shares_no_code_with_the_product() -> None:
 def test_splines_between_traced_rays_are_exact(mirror: Mirror) -> None:
     world = World(mirror, EIGHTH, samples=1)
     places_mm, film_mm = world.screen_map(30.0)
-    maps = world._maps_at_rest(30.0)
+    maps = world._maps(30.0, time_s=0.0)
     seen = np.hypot(*film_mm) < 495
     assert np.abs(maps.screen - places_mm)[:, seen].max() < 2e-3  # mm: 3e-7 rad of slope
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
+from functools import cached_property
 from pathlib import Path
 from typing import Any
 
@@ -11,7 +12,7 @@ import cv2
 import numpy as np
 import tomli_w
 from numpy.typing import NDArray
-from scipy.interpolate import RectBivariateSpline
+from scipy.interpolate import make_interp_spline
 from scipy.ndimage import gaussian_filter
 
 from tests.worlds.second_optics import patterns
@@ -90,7 +91,7 @@ class World:
 
     def __post_init__(self) -> None:
         self._rng = np.random.default_rng((4711, self.seed))
-        self._at_rest: dict[int, _Maps] = {}
+        self._at_rest: dict[int, FloatArray] = {}
         radius = 0.95 * np.sqrt(self._rng.random(self.effects.dust))
         angle = 2 * np.pi * self._rng.random(self.effects.dust)
         self._dust = np.stack([radius * np.cos(angle), radius * np.sin(angle)], axis=1)
@@ -302,58 +303,66 @@ class World:
         """Of this moment; a bench at rest is traced at a few displacements only."""
         camera, screen = self.effects.camera_motion, self.effects.screen_motion
         if camera is None and screen is None:
-            return self._maps_at_rest(displacement_um)
+            tilt, film = self._slow_maps
+            return _Maps(self._spread(self._nodes_at_rest(displacement_um)[:2]), tilt, film)
         still = np.zeros(6)
         bench = self.bench.moved(
             still if camera is None else camera(time_s), still if screen is None else screen(time_s)
         )
-        return self._traced(bench, displacement_um)
+        maps = self._spread(self._traced(bench, displacement_um))
+        return _Maps(maps[0:2], maps[2:4], maps[4:6])
 
-    def _maps_at_rest(self, displacement_um: float) -> _Maps:
+    def _nodes_at_rest(self, displacement_um: float) -> FloatArray:
+        """Traced values at the nodes, by a parabola through three displacements."""
         middle = round(displacement_um / NODE_UM)
         f = displacement_um / NODE_UM - middle
-        nodes = (
-            [self._node(middle)] if abs(f) < 1e-9 else [self._node(middle + k) for k in (-1, 0, 1)]
-        )
-        if len(nodes) == 1:
-            return nodes[0]
-        shares = [np.float32(s) for s in (f * (f - 1) / 2, (1 - f) * (1 + f), f * (f + 1) / 2)]
+        if abs(f) < 1e-9:
+            return self._node(middle)
+        below, here, above = (self._node(middle + k) for k in (-1, 0, 1))
+        return f * (f - 1) / 2 * below + (1 - f) * (1 + f) * here + f * (f + 1) / 2 * above
 
-        def mixed(name: str) -> Singles:
-            return np.asarray(
-                sum(share * getattr(node, name) for share, node in zip(shares, nodes, strict=True))
-            )
-
-        return _Maps(mixed("screen"), nodes[1].tilt, mixed("film"))
-
-    def _node(self, index: int) -> _Maps:
+    def _node(self, index: int) -> FloatArray:
         if index not in self._at_rest:
-            for known in [k for k in self._at_rest if abs(k - index) > 2]:
-                del self._at_rest[known]
             self._at_rest[index] = self._traced(self.bench, NODE_UM * index)
         return self._at_rest[index]
 
-    def _traced(self, bench: Bench, displacement_um: float) -> _Maps:
-        """Maps of a bench: rays at nodes, splines between them."""
-        width, height = bench.size_px
-        node_mm = WRINKLED_NODE_MM if self.mirror.wrinkles else NODE_MM
-        pixel_mm = float(np.linalg.norm(bench.camera.place_mm)) / bench.focal_px
-        columns = _nodes(width, node_mm / pixel_mm)
-        rows = _nodes(height, node_mm / pixel_mm)
+    def _traced(self, bench: Bench, displacement_um: float) -> FloatArray:
+        """Screen, tilt and film (6, rows, columns) of the rays at the nodes."""
+        columns, rows = self._node_places
         column, row = np.meshgrid(columns, rows)
         seen = trace(bench, self.mirror, column.ravel(), row.ravel(), displacement_um)
-        fine_columns, fine_rows = _samples(width, self.samples), _samples(height, self.samples)
+        values = np.concatenate([seen.screen_mm, seen.tilt, seen.film])
+        return values.reshape(6, rows.size, columns.size)
 
-        def spread(values: FloatArray) -> Singles:
-            maps = [
-                RectBivariateSpline(rows, columns, value.reshape(column.shape), kx=5, ky=5)(
-                    fine_rows, fine_columns
-                )
-                for value in values
-            ]
-            return np.asarray(maps, np.float32)
+    @cached_property
+    def _slow_maps(self) -> tuple[Singles, Singles]:
+        """Viewing angles and places on the film: they hardly change with the displacement."""
+        maps = self._spread(self._node(0)[2:])
+        return maps[0:2], maps[2:4]
 
-        return _Maps(spread(seen.screen_mm), spread(seen.tilt), spread(seen.film))
+    def _spread(self, values: FloatArray) -> Singles:
+        """Values of all samples from those at the nodes (maps, rows, columns): splines."""
+        by_row, by_column = self._spline_matrices
+        return np.stack([(by_row @ (each @ by_column)).astype(np.float32) for each in values])
+
+    @cached_property
+    def _node_places(self) -> tuple[FloatArray, FloatArray]:
+        """Columns and rows of the traced rays."""
+        node_mm = WRINKLED_NODE_MM if self.mirror.wrinkles else NODE_MM
+        pixel_mm = float(np.linalg.norm(self.bench.camera.place_mm)) / self.bench.focal_px
+        width, height = self.bench.size_px
+        return _nodes(width, node_mm / pixel_mm), _nodes(height, node_mm / pixel_mm)
+
+    @cached_property
+    def _spline_matrices(self) -> tuple[FloatArray, FloatArray]:
+        """Splines of degree 5: (samples, nodes) along rows, (nodes, samples) along columns."""
+        columns, rows = self._node_places
+        width, height = self.bench.size_px
+        by_row = make_interp_spline(rows, np.eye(rows.size), k=5)(_samples(height, self.samples))
+        by_column = make_interp_spline(columns, np.eye(columns.size), k=5)(
+            _samples(width, self.samples)
+        )
+        return by_row, np.ascontiguousarray(by_column.T)
 
 
 def _nodes(size_px: int, step_px: float) -> FloatArray:
@@ -401,5 +410,5 @@ def _write(
 ) -> None:
     folder.mkdir(parents=True, exist_ok=True)
     for name, frame in zip(names, frames, strict=True):
-        cv2.imwrite(str(folder / name), frame, [cv2.IMWRITE_PNG_COMPRESSION, 1])
+        cv2.imwrite(str(folder / name), frame, [cv2.IMWRITE_PNG_COMPRESSION, 0])
     (folder / "capture.toml").write_text(tomli_w.dumps(table), encoding="utf-8")

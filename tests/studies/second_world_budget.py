@@ -1,0 +1,271 @@
+"""Each row of the uncertainty budget against the error that its cause plants in the second world.
+
+A plant is one cause of the size of the row's sigma (or of the size given here, where the set itself
+measures the sigma). The stated sigma of the row and the error that the planted cause adds are both
+RMS heights over the analysis radius. Random causes are planted several times and averaged. If the
+row is right, the ratio of the two is about 1.
+"""
+
+from __future__ import annotations
+
+import tempfile
+from collections.abc import Callable
+from dataclasses import dataclass, field, replace
+from functools import cache
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from membrane_ctrl.metrology.uncertainty.height_map import height_matrix
+from tests.studies.second_world_errors import MeasuredSurface, measure_surface
+from tests.worlds.second_optics import (
+    FRAME_S,
+    HAND_SIGMAS,
+    Bench,
+    Effects,
+    Material,
+    Mirror,
+    Panel,
+    Sensor,
+    Stated,
+    World,
+    Wrinkles,
+)
+
+FloatArray = NDArray[np.float64]
+
+AGREES = 1.5  # ratio of stated sigma and caused error, either way
+ROWS_OF_PIXELS = {"principal_x_mm": "principal_x_px", "principal_y_mm": "principal_y_px"}
+FRAMES = 18
+DISC = 0.95  # analysis radius over the ring's
+QUIET = Sensor(bits=16, read_adu=0.5, full_well=0.0)
+STILL = Effects(sensor=QUIET, psf_px=0.0, laser_noise_um=0.0)
+
+
+@dataclass(frozen=True)
+class Plant:
+    """One cause, and the rows of the budget that should cover it.
+
+    Attributes
+    ----------
+    rows : tuple of str
+        Names in the budget; their variances are added.
+    says : str
+        The cause with its size.
+    errors : mapping
+        Errors of the bench, named as in `HAND_SIGMAS`.
+    effects : function from a seed
+    film : Mirror or None
+        Another film than the sound one.
+    trials : int
+        Of a random cause.
+    own_rows : bool
+        Whether the planted set itself measures the sigma; else the rows are those of the sound set.
+    """
+
+    rows: tuple[str, ...]
+    says: str
+    errors: dict[str, float] = field(default_factory=dict)
+    effects: Callable[[int], Effects] = lambda _: STILL
+    film: Mirror | None = None
+    trials: int = 1
+    own_rows: bool = True
+    displacement_um: float = 0.0
+
+
+@dataclass(frozen=True)
+class Comparison:
+    """Stated sigma and caused error of one plant, RMS heights in µm."""
+
+    plant: Plant
+    stated_um: float
+    caused_um: float
+
+    @property
+    def ratio(self) -> float:
+        """Stated over caused."""
+        return self.stated_um / max(self.caused_um, 1e-9)
+
+    @property
+    def agrees(self) -> bool:
+        """Whether they agree within `AGREES`."""
+        return 1 / AGREES <= self.ratio <= AGREES
+
+
+def _walk(seed: int, step_um: float) -> Callable[[float], float]:
+    places = step_um * np.random.default_rng((77, seed)).standard_normal(FRAMES)
+    return lambda time_s: float(places[min(round(time_s / FRAME_S), FRAMES - 1)])
+
+
+def _later(step_um: float) -> Callable[[float], float]:
+    """The film is deeper in the y frames (from frame 8)."""
+    return lambda time_s: step_um * (time_s > 7.5 * FRAME_S)
+
+
+def _geometry_plants() -> list[Plant]:
+    plants = []
+    for name, sigma in HAND_SIGMAS.items():
+        if name == "laser_relative":
+            continue
+        row = ROWS_OF_PIXELS.get(name, name)
+        plants.append(Plant((row,), f"{name} {sigma:g}", {name: sigma}, own_rows=False))
+    return plants
+
+
+PLANTS = (
+    *_geometry_plants(),
+    Plant(
+        ("vertex_um",),
+        "laser's scale 1e-3, 2 mm from the reference",
+        effects=lambda _: replace(STILL, laser_scale=1 + HAND_SIGMAS["laser_relative"]),
+        displacement_um=2000.0,
+    ),
+    Plant(
+        ("vertex_um", "film_x_to_y_um"),
+        "laser's noise 1 µm",
+        effects=lambda _: replace(STILL, laser_noise_um=1.0),
+        trials=6,
+    ),
+    Plant(
+        ("film_x_to_y_um", "film_seen_um", "vertex_um"),
+        "film 50 µm deeper in y, no laser",
+        effects=lambda _: replace(STILL, laser=False, film_motion_um=_later(50.0)),
+    ),
+    Plant(
+        ("film_x_to_y_um", "film_seen_um", "vertex_um"),
+        "film 5 µm deeper in y, no laser",
+        effects=lambda _: replace(STILL, laser=False, film_motion_um=_later(5.0)),
+    ),
+    Plant(
+        ("film_x_to_y_um", "film_um"),
+        "film 50 µm deeper in y, with laser",
+        effects=lambda _: replace(STILL, film_motion_um=_later(50.0)),
+    ),
+    Plant(
+        ("film_um",),
+        "film moves by 1 µm RMS from frame to frame, with laser",
+        effects=lambda seed: replace(STILL, film_motion_um=_walk(seed, 1.0)),
+        trials=4,
+    ),
+    Plant(
+        ("film_um",),
+        "film moves by 20 µm RMS from frame to frame, with laser",
+        effects=lambda seed: replace(STILL, film_motion_um=_walk(seed, 20.0)),
+        trials=4,
+    ),
+    Plant(
+        ("light_relative",),
+        "light differs by 5e-4 from frame to frame",
+        effects=lambda _: replace(STILL, flicker=5e-4),
+        trials=6,
+    ),
+    Plant(
+        ("light_relative",),
+        "light differs by 1 % from frame to frame",
+        effects=lambda _: replace(STILL, flicker=0.01),
+        trials=6,
+    ),
+    Plant(
+        ("light_relative",),
+        "ambient light grows by 3 %",
+        effects=lambda _: replace(STILL, ambient=0.03),
+    ),
+    Plant(
+        ("noise_adu",),
+        "pixel noise of 3 of 255",
+        effects=lambda _: replace(STILL, sensor=replace(QUIET, read_adu=3 * 257.0)),
+        trials=6,
+    ),
+    Plant(
+        ("blur_px",),
+        "blur of 1 px of a quarter",
+        effects=lambda _: replace(STILL, psf_px=1.0),
+    ),
+    Plant(
+        ("slope_urad", "blur_px"),
+        "gamma 2.2",
+        effects=lambda _: replace(STILL, panel=Panel(gamma=2.2)),
+    ),
+    Plant(
+        ("slope_urad", "blur_px"),
+        "gamma 1.6, 0.3 more from one side to the other",
+        effects=lambda _: replace(STILL, panel=Panel(gamma=1.6, gamma_by_angle=0.3)),
+    ),
+    Plant(("slope_urad",), "20 spots of dust", effects=lambda _: replace(STILL, dust=20), trials=3),
+    Plant(
+        ("film_law", "slope_urad"),
+        "Poisson ratio 0.42",
+        film=Mirror(material=Material(poisson=0.42)),
+    ),
+    Plant(
+        ("film_law", "slope_urad"),
+        "pre-strain 5e-4",
+        film=Mirror(material=Material(prestrain=(5e-4, 5e-4, 0.0))),
+    ),
+    Plant(
+        ("film_law", "slope_urad"),
+        "orthotropic film, E2/E1 0.9",
+        film=Mirror(material=Material(ratio=0.9, direction_rad=0.5)),
+    ),
+    Plant(
+        ("film_law", "slope_urad"),
+        "wrinkles of 5 µm at the rim",
+        film=Mirror(wrinkles=Wrinkles(5.0)),
+    ),
+)
+
+
+def compare(plant: Plant, resolution: float = 0.25) -> Comparison:
+    """Measure the sound and the planted bench: stated sigma and caused error."""
+    sound, sound_error_mm = _sound(resolution, plant.displacement_um)
+    bench = Bench.paper(resolution).changed(plant.errors)
+    squares, stated_squares = [], []
+    for trial in range(plant.trials):
+        mirror = plant.film or SOUND_FILM
+        effects = plant.effects(trial)
+        if effects.psf_px:
+            effects = replace(effects, psf_px=effects.psf_px * 4 * resolution)
+        measured, error_mm = _measured(mirror, bench, effects, trial, plant.displacement_um)
+        squares.append(_mean_square_um2(error_mm - sound_error_mm))
+        stated_squares.append(_stated_um(measured if plant.own_rows else sound, plant.rows) ** 2)
+    return Comparison(plant, float(np.mean(stated_squares)) ** 0.5, float(np.mean(squares)) ** 0.5)
+
+
+SOUND_FILM = Mirror()
+
+
+@cache
+def _sound(resolution: float, displacement_um: float) -> tuple[MeasuredSurface, FloatArray]:
+    return _measured(SOUND_FILM, Bench.paper(resolution), STILL, 0, displacement_um)
+
+
+def _measured(
+    mirror: Mirror, bench: Bench, effects: Effects, seed: int, displacement_um: float
+) -> tuple[MeasuredSurface, FloatArray]:
+    """The measured surface, and its height less the true one at points of the disc, in mm."""
+    with tempfile.TemporaryDirectory() as folder:
+        world = World(mirror, bench, effects, Stated(), seed)
+        truth = world.write_set(Path(folder), displacement_um)
+        found = measure_surface(Path(folder))
+    x_mm, y_mm = _points_mm()
+    heights_mm = height_matrix(x_mm, y_mm, mirror.radius_mm) @ found.parameters_mm
+    return found, heights_mm - mirror.height_mm(x_mm, y_mm, truth.displacement_um)
+
+
+@cache
+def _points_mm() -> tuple[FloatArray, FloatArray]:
+    """Points spread evenly over the analysis radius."""
+    rank = np.arange(400) + 0.5
+    radius_mm = 500 * DISC * np.sqrt(rank / rank.size)
+    angle = np.pi * (1 + 5**0.5) * rank
+    return radius_mm * np.cos(angle), radius_mm * np.sin(angle)
+
+
+def _mean_square_um2(height_mm: FloatArray) -> float:
+    return float(np.mean((1e3 * height_mm) ** 2))
+
+
+def _stated_um(found: MeasuredSurface, rows: tuple[str, ...]) -> float:
+    sizes = [row["height_rms_um"] for row in found.rows if row["name"] in rows]
+    return float(np.sqrt(np.sum(np.square(sizes))))
