@@ -179,6 +179,7 @@ class Observer:
             same_s=self._laser_same_s,
             displacement_um=self.displacement_um if self._by_optics else _good_quality_um(reading),
             guard_um=self.guard_um,
+            optics_guard_um=self.optics_guard_um,
             laser_stuck=self.laser_stuck,
             displacement_valid=math.isfinite(self.displacement_um),
             jumps=self.memory.laser_jumps.count,

@@ -77,9 +77,10 @@ class Observation:
     laser_gauge_apart: str = ""
     held_by_optics: bool = False  # the optics show the centre, or must: the laser may be missing
     unseen_film: str = ""  # on a bench held without a laser: why the film is not seen, if so
-    guard_um: float = (
-        math.nan
-    )  # the displacement by the laser, or by the optics where they may replace it
+    # the displacement by the laser, or by the optics where they may replace it
+    guard_um: float = math.nan
+    # the displacement by the optics, beside a laser as well, where the loop may follow them
+    optics_guard_um: float = math.nan
     laser_stuck: bool = False  # it repeats one value to the last bit
     # excess gas the film takes, unless an independent sensor shows it standing still
     gas_excess: str = ""
@@ -95,15 +96,26 @@ class Observation:
         return self.reading.vent_fraction
 
     @property
-    def depth_um(self) -> float:
-        """Displacement that the limits judge: the laser's raw reading, or what replaces a missing
-        or stuck one.
+    def deepest_um(self) -> float:
+        """The largest displacement that a sensor shows, µm; NaN without one.
+
+        A laser that fails may repeat an old value with noise, which no check of the laser alone
+        recognises. Each limit therefore judges the sensor that is nearest to it.
         """
-        return (
-            self.guard_um
-            if math.isnan(self.displacement_um) or self.laser_stuck
-            else self.displacement_um
-        )
+        return max(self._shown_um, default=math.nan)
+
+    @property
+    def shallowest_um(self) -> float:
+        """The smallest displacement that a sensor shows, µm; NaN without one."""
+        return min(self._shown_um, default=math.nan)
+
+    @property
+    def _shown_um(self) -> list[float]:
+        """Displacements by laser and optics, without those that are missing."""
+        laser_um = self.displacement_um
+        if math.isnan(laser_um) or self.laser_stuck:
+            laser_um = self.guard_um  # what replaces the laser
+        return [um for um in (laser_um, self.optics_guard_um) if not math.isnan(um)]
 
 
 @dataclass(frozen=True, slots=True)
@@ -191,9 +203,9 @@ TABLE: tuple[Rule, ...] = (
         seen_in=_TWICE,
         states=ALWAYS,
         remedy="check the laser against a ruler, then the setpoint and the limits",
-        seen=lambda o: f"{o.depth_um:.1f} µm",
-        broken=lambda o, c: o.depth_um > c.displacement_max_um,
-        unseen=lambda o: math.isnan(o.depth_um),
+        seen=lambda o: f"{o.deepest_um:.1f} µm",
+        broken=lambda o, c: o.deepest_um > c.displacement_max_um,
+        unseen=lambda o: math.isnan(o.deepest_um),
     ),
     Rule(
         code=35,
@@ -468,9 +480,9 @@ TABLE: tuple[Rule, ...] = (
         seen_in=_TWICE,
         states=HOLDING,
         remedy="look for a leak or a laser that was moved",
-        seen=lambda o: f"{o.depth_um:.1f} µm",
-        broken=lambda o, c: o.depth_um < c.displacement_min_um,
-        unseen=lambda o: math.isnan(o.depth_um),
+        seen=lambda o: f"{o.shallowest_um:.1f} µm",
+        broken=lambda o, c: o.shallowest_um < c.displacement_min_um,
+        unseen=lambda o: math.isnan(o.shallowest_um),
     ),
     Rule(
         code=23,

@@ -539,14 +539,27 @@ def test_figures_with_late_times_never_leave_the_mirror_to_the_prediction_alone(
     assert held.moved_um < 65.0
 
 
-def test_healthy_optics_end_manual_flow_while_the_laser_is_frozen() -> None:
-    held = settled(config_of("estimate"))
-    held.command(Command("manual", "a test", value=5.0))
+def freeze_laser_with_noise(held: Bench) -> Fail:
+    """Let the laser show where the mirror was when it failed, with 1 µm of noise."""
     rng = np.random.default_rng(7)
 
     def freeze_with_noise(wrong: Wrong, since_s: float) -> None:
         moved_um = held.bench.plant.truth().displacement_um - held.start_um
         wrong.laser_offset_um = rng.standard_normal() - moved_um
 
-    held.fail(60.0, freeze_with_noise)
+    return freeze_with_noise
+
+
+def test_healthy_optics_end_manual_flow_while_the_laser_is_frozen() -> None:
+    held = settled(config_of("estimate"))
+    held.command(Command("manual", "a test", value=5.0))
+    held.fail(60.0, freeze_laser_with_noise(held))
     assert held.moved_um < 65.0
+
+
+def test_the_displacement_limit_holds_by_the_optics_while_the_laser_is_frozen() -> None:
+    held = settled(config_of("estimate", limits=LimitsConfig(displacement_max_um=30.0)))
+    held.command(Command("manual", "a test", value=5.0))
+    held.fail(40.0, freeze_laser_with_noise(held))
+    assert held.faults == ["over_displacement"]
+    assert held.moved_um < 36.0

@@ -200,6 +200,23 @@ def test_the_hard_limits_open_the_vent_in_every_state(name: str, state: State) -
     assert (rule.name, rule.safe_level) == (name, SafeLevel.VENT)
 
 
+@pytest.mark.parametrize(
+    ("name", "optics_um"),
+    [
+        ("over_displacement", LIMITS.displacement_max_um + 0.1),
+        ("under_displacement", LIMITS.displacement_min_um - 0.1),
+    ],
+)
+def test_each_displacement_limit_judges_the_sensor_that_is_nearest_to_it(
+    name: str, optics_um: float
+) -> None:
+    rule = next(rule for rule in TABLE if rule.name == name)
+    beside_a_laser = replace(GOOD, optics_guard_um=optics_um)
+    assert rule.broken(beside_a_laser, LIMITS)
+    assert rule.seen(beside_a_laser) == f"{optics_um:.1f} µm"
+    assert rule.broken(replace(BAD[name], optics_guard_um=0.0), LIMITS)
+
+
 @pytest.mark.parametrize("side", [-1.0, 1.0])
 def test_following_error_is_judged_in_both_directions(side: float) -> None:
     table = SafetyTable(LIMITS)
