@@ -1,5 +1,6 @@
 """How well a geometry is known: the covariance in its file, or the sigmas that it states."""
 
+from enum import StrEnum
 from pathlib import Path
 
 import numpy as np
@@ -18,6 +19,14 @@ from membrane_ctrl.metrology.uncertainty.geometry_spread import (
 from membrane_ctrl.model.errors import InputError
 
 _NAMED = 6  # inputs without a stated sigma; the others are counted
+
+
+class KnownBy(StrEnum):
+    """What a geometry's uncertainty rests on."""
+
+    CALIBRATION = "calibration"  # a covariance in its file
+    STATED = "stated sigmas"  # its own sigmas of a, b and alpha
+    DATA_SHEETS = "data sheets"  # the sigmas of the paper's instruments
 
 
 class CovarianceTable(Section):
@@ -67,6 +76,13 @@ def geometry_spread(optics: schema.OpticsConfig, file: Path | None) -> tuple[Geo
     return (PAPER_SPREAD if stated is None else stated).with_others(others), _sigma_sources(
         geometry, stated is not None
     )
+
+
+def find_known_by(optics: schema.OpticsConfig, file: Path | None) -> KnownBy:
+    """What `geometry_spread` of the same arguments rests on. Raises InputError."""
+    if file is not None and read_spread(file) is not None:
+        return KnownBy.CALIBRATION
+    return KnownBy.DATA_SHEETS if stated_spread(optics.geometry) is None else KnownBy.STATED
 
 
 def _sigma_sources(geometry: schema.GeometryConfig, poses: bool) -> str:

@@ -107,7 +107,7 @@ def figure_table(
         "aperture_radius_mm": found.aperture_mm,
         "centre_mm": [0.0, 0.0],
         "cell_mm": measurement.full.grid.step_mm if measurement.full else None,
-        "geometry_spread": bars.source,
+        "geometry_spread": bars.statement.source,
         "numbers": {name: item for name, item in numbers.items() if item is not None},
         "not_given": missing,
         "zernike": _zernike_tables(measurement, found, bars),

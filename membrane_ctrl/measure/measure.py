@@ -125,7 +125,7 @@ def _format_measurement(
         f"sag       {full.surface.sag_mm:.4f} mm, 1 sigma {of_noise:.2g} µm from noise and "
         "the film, "
         f"{of_geometry:.3g} µm from the geometry",
-        f"geometry  {bars.source}",
+        f"geometry  {bars.statement.describe()}",
         f"budget    1 sigma of height {total['height_rms_um']:.3g} µm RMS, without its plane "
         f"{total['figure_rms_um']:.3g} µm; largest: {largest}",
         f"Hencky    {profile.sag_mm:.4f} mm, {profile.pressure_pa:.0f} Pa under the paper's film",
@@ -139,8 +139,10 @@ def _format_measurement(
         f"{np.count_nonzero(full.weights)} pixels",
     ]
     if outline is not None:
+        rim = bars.statement.rim
+        sigmas = "" if rim is None else f", {rim.sigmas:.1f} sigma of the stated geometry"
         lines.append(
             f"rim       {outline.offset_mm:.1f} mm off the prediction, "
-            f"{outline.size_ratio:.4f} of the predicted size"
+            f"{outline.size_ratio:.4f} of the predicted size{sigmas}"
         )
     return lines

@@ -7,12 +7,14 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
-from membrane_ctrl.geometry.spread_file import geometry_spread
+from membrane_ctrl.geometry.spread_file import find_known_by, geometry_spread
+from membrane_ctrl.measure.geometry_statement import GeometryState, GeometryStatement
 from membrane_ctrl.measure.measurement import Measurement, noise_seen_adu
+from membrane_ctrl.measure.result_files import number_or_null, write_arrays, write_json
 from membrane_ctrl.metrology.figure import radial_profile
 from membrane_ctrl.metrology.figure.pixel_figure import FullResult
 from membrane_ctrl.metrology.rays import surface
@@ -20,13 +22,9 @@ from membrane_ctrl.metrology.rays.rim_outline import Outline
 from membrane_ctrl.metrology.reconstruction import slope_noise
 from membrane_ctrl.metrology.uncertainty import height_map, set_budget
 from membrane_ctrl.metrology.uncertainty.budget import Budget
-from membrane_ctrl.model import errors, program, zernike_terms
+from membrane_ctrl.model import errors, program, shape_estimate, zernike_terms
 from membrane_ctrl.model.arrays import FloatArray
 from membrane_ctrl.model.files import make_folder
-
-if TYPE_CHECKING:  # matplotlib takes a second to load
-    pass
-from membrane_ctrl.measure.result_files import number_or_null, write_arrays, write_json
 
 
 @dataclass(frozen=True)
@@ -36,7 +34,7 @@ class ErrorBars:
     """
 
     budget: Budget
-    source: str  # source of the geometry's covariance
+    statement: GeometryStatement  # how well the geometry is known, and by what
     doubts: tuple[str, ...]  # what the set says of its own errors, and what to do
     grid: height_map.HeightMap  # grid of `maps_um`
     # 1 sigma of the mean slope of a cell of the height map, from pixel noise
@@ -103,15 +101,32 @@ def error_bars(
         float(variance.mean()) / float(np.median(full.grid.count[full.grid.count > 0]))
     )
     zonal_um = 1e3 * full.grid.noise_mm(cell_slope)
-    return ErrorBars(seen.budget, source, seen.doubts, grid, cell_slope, zonal_um)
+    statement = GeometryStatement.of(find_known_by(optics, geometry), source, seen.rim)
+    return ErrorBars(seen.budget, statement, seen.doubts, grid, cell_slope, zonal_um)
 
 
 def degrade_doubtful(measurement: Measurement, bars: ErrorBars | None) -> Measurement:
-    """The measurement with the verdict that its error bars allow: a doubt degrades an `ok`."""
-    if bars is None or not bars.doubts or measurement.verdict == "rejected":
+    """The measurement with the verdict that its error bars allow.
+
+    A doubt degrades an `ok`. A geometry that the rim contradicts degrades it, too; with slopes that
+    no film of the fit's shapes has, it is a misfit that nothing stated explains, and the figure is
+    not usable.
+    """
+    if bars is None or measurement.verdict == "rejected" or measurement.full is None:
+        return measurement
+    residual_urad = measurement.full.quality.residual_urad
+    contradicted = bars.statement.state is GeometryState.CONTRADICTED
+    if contradicted and residual_urad > shape_estimate.RESIDUAL_DEGRADED_URAD:
+        reason = (
+            f"slope residual {residual_urad:.0f} µrad, and {bars.statement.doubt}; no stated "
+            "uncertainty explains both"
+        )
+        return replace(measurement, verdict="rejected", reason=reason)
+    doubts = [doubt for doubt in (*bars.doubts, bars.statement.doubt) if doubt]
+    if not doubts:
         return measurement
     known = [measurement.reason] if measurement.reason else []
-    return replace(measurement, verdict="degraded", reason="; ".join([*known, *bars.doubts]))
+    return replace(measurement, verdict="degraded", reason="; ".join([*known, *doubts]))
 
 
 def result_table(
@@ -157,6 +172,7 @@ def result_table(
         "uncertainty": None if bars is None else bars.budget.total() | {"coverage_factor": 1},
         "budget": [] if bars is None else bars.budget.rows(),
         "geometry": measurement.head.geometry.table(),
+        "geometry_known": None if bars is None else bars.statement.table(),
         "timing_s": measurement.timing_s,
         "figure": figure,
     }
@@ -215,7 +231,7 @@ def details_table(
         table["sag_sigma_um"] = {
             "noise": number_or_null(of_noise),
             "geometry": number_or_null(of_geometry),
-            "geometry_spread": bars.source,
+            "geometry_spread": bars.statement.source,
         }
     if outline is not None:
         table["rim"] = {

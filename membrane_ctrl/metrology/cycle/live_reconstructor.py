@@ -15,7 +15,7 @@ import numpy as np
 
 from membrane_ctrl.config.schema import OpticsConfig
 from membrane_ctrl.metrology.film import hencky_bowl
-from membrane_ctrl.metrology.frame_checks import band_removal
+from membrane_ctrl.metrology.frame_checks import band_removal, picture_orientation
 from membrane_ctrl.metrology.frame_checks.clipping import ClippedShares
 from membrane_ctrl.metrology.phase import (
     bin_sums,
@@ -163,7 +163,17 @@ class LiveReconstructor:
             cause = ClippedShares(saturated, 0.0).cause
             return make_rejected_cycle("full", times, readings, cause or str(error))
         self._watch.begin(state)
-        return self._follow("full", state, times, readings)
+        estimate = self._follow("full", state, times, readings)
+        if estimate.slope_residual_urad <= picture_orientation.SUSPICIOUS_URAD:
+            return estimate
+        near_px = np.stack([self._grid.column_px, self._grid.row_px])[:, self._near]
+        orientation = picture_orientation.find_orientation(
+            optics, tracer.vertex_z_mm, near_px, phase_rad
+        )
+        if orientation is None:
+            return estimate
+        self._tracked = None
+        return rejected("full", times, readings, orientation.describe())
 
     def fringes(
         self, frames: Sequence[Image], time_s: ArrayLike, displacement_um: ArrayLike

@@ -20,6 +20,7 @@ from membrane_ctrl.metrology.frame_checks import (
     frame_evidence,
     frame_faults,
     frame_inspection,
+    picture_orientation,
 )
 from membrane_ctrl.metrology.frame_checks.bin_orders import absolute_phases_of_bins, confirm_orders
 from membrane_ctrl.metrology.frame_checks.checked_set import (
@@ -66,12 +67,51 @@ def check_set(
     except RejectedSetError as error:
         put_back = _put_back(stack, binned, optics, anchor)
         if put_back is None:
+            phase_rad = _phases_alone(stack, binned, optics, anchor)
+            _require_stated_orientation(optics, stack, phase_rad, binned.bin_px)
             reason = str(error) + _find_doubt(stack, error.flags)
             raise RejectedSetError(reason, error.flags, error.saturated_fraction) from None
-        return put_back
-    return (
-        found if _believable_surface(found) else _put_back(stack, binned, optics, anchor) or found
+        found = put_back
+    if not _believable_surface(found):
+        found = _put_back(stack, binned, optics, anchor) or found
+    _require_stated_orientation(optics, stack, found.phase_rad, binned.bin_px)
+    return found
+
+
+def _phases_alone(
+    stack: frame_stack.FrameStack,
+    binned: frame_stack.Binned,
+    optics: OpticsConfig,
+    anchor: Anchor | None,
+) -> FloatArray | None:
+    """Absolute phases (2, rows, columns) of the bins by the frames alone; None if they give none.
+
+    For a set whose frames contradict the geometry: no frame is left out because of it.
+    """
+    excluded = set(stack.unusable)
+    excluded |= {flag.frame for flag in frame_inspection.find_obvious_faults(stack, binned)}
+    light = None if anchor is None else anchor.light
+    try:
+        view = bin_view.combine_frames(stack, binned, excluded, light)
+        return absolute_phases_of_bins(stack, binned, view, anchor, optics)
+    except (bin_view.NoFigureError, ValueError):
+        return None
+
+
+def _require_stated_orientation(
+    optics: OpticsConfig, stack: frame_stack.FrameStack, phase_rad: FloatArray | None, bin_px: int
+) -> None:
+    """Raise RejectedSetError if pictures or pattern are turned or mirrored."""
+    if phase_rad is None:
+        return
+    row, column = np.indices(phase_rad.shape[1:]).reshape(2, -1)
+    places_px = np.asarray(bin_px * np.stack([column, row]) + (bin_px - 1) / 2, float)
+    at_z_mm = vertex_z_mm(optics, stack.mean_reading_um)
+    orientation = picture_orientation.find_orientation(
+        optics, at_z_mm, places_px, phase_rad.reshape(2, -1)
     )
+    if orientation is not None:
+        raise RejectedSetError(orientation.describe(), ())
 
 
 def _find_doubt(stack: frame_stack.FrameStack, flags: tuple[frame_faults.Flag, ...]) -> str:

@@ -1,8 +1,9 @@
-"""The rim in the picture against the geometry's prediction, and by how much its sigmas are too
-small.
+"""The rim in the picture against the geometry's prediction: does the stated uncertainty explain
+it?
 """
 
 import math
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -13,42 +14,82 @@ from membrane_ctrl.metrology.uncertainty.trial_bench import TrialBench
 from membrane_ctrl.model.arrays import FloatArray
 
 # A good pose leaves 0.4 mm and 0.0007 (simulated, a fifth of the sensor's pixels); rings are round
-# to about 1 mm.
-_RIM_OFF_MM, _RIM_SIZE = 3.0, 0.005
+# to about 1 mm. Of that, 1 sigma:
+_RING_SIGMA_MM, _RING_SIZE_SIGMA = 1.0, 0.0017
+# Twice what the sigmas allow is nothing to wonder at: sigmas are then widened until they allow half
+# of the misfit.
+_USUAL_SIGMAS = 2.0
+# Correlations between the inputs are left out, so sigmas are somewhat too large: beyond this a
+# sound bench is rarer than 1 in 10,000.
+_CONTRADICTING_SIGMAS = 4.0
 
 
-def rim_failed(outline: Outline) -> bool:
-    """Whether the rim is too far from where the camera's pose puts it."""
-    return abs(outline.offset_mm) > _RIM_OFF_MM or abs(outline.size_ratio - 1) > _RIM_SIZE
+@dataclass(frozen=True)
+class RimMisfit:
+    """How far the rim in the picture is from the geometry's prediction.
 
-
-def rim_widening(bench: TrialBench, spread: GeometrySpread, outline: Outline | None) -> float:
-    """By how much the geometry's sigmas are too small for the rim that was seen; at least 1.
-
-    Twice what they allow is nothing to wonder at.
+    Attributes
+    ----------
+    offset_mm : float
+        Distance of the two centres on the mirror.
+    size_ratio : float
+        Radius seen over radius predicted.
+    sigmas : float
+        The larger of the two misfits, in standard deviations that the geometry's stated
+        uncertainty and the ring's roundness give it.
     """
-    if outline is None:
-        return 1.0
-    theta, radius_mm = np.linspace(0, 2 * np.pi, 60, endpoint=False), bench.surface.radius_mm
+
+    offset_mm: float
+    size_ratio: float
+    sigmas: float
+
+    @property
+    def widening(self) -> float:
+        """Factor by which the geometry's sigmas are too small for this rim; at least 1."""
+        return max(1.0, self.sigmas / _USUAL_SIGMAS)
+
+    @property
+    def contradicts(self) -> bool:
+        """Whether no stated uncertainty explains the misfit."""
+        return self.sigmas > _CONTRADICTING_SIGMAS
+
+    def describe(self) -> str:
+        """The misfit in words."""
+        return (
+            f"the rim is {self.offset_mm:.1f} mm off the prediction and {self.size_ratio:.4f} of "
+            f"its size, {self.sigmas:.1f} sigma of the stated geometry"
+        )
+
+
+def measure_rim_misfit(bench: TrialBench, spread: GeometrySpread, outline: Outline) -> RimMisfit:
+    """Compare the rim in the picture with the prediction and its uncertainty."""
+    theta = np.linspace(0, 2 * np.pi, 60, endpoint=False)
+    radius_mm = bench.surface.radius_mm
     rim_z_mm = np.full(theta.size, bench.vertex_z_mm + bench.surface.sag_mm)
-    rim = np.stack([radius_mm * np.cos(theta), radius_mm * np.sin(theta), rim_z_mm])
+    rim_mm = np.stack([radius_mm * np.cos(theta), radius_mm * np.sin(theta), rim_z_mm])
 
-    def seen(names: tuple[str, ...], change: FloatArray) -> FloatArray:
-        points = project_points(bench.geometry(names, change).geometry, rim)
-        middle = points.mean(axis=1)
-        return np.append(middle, np.mean(np.hypot(*(points - middle[:, None]))))
+    def predict_px(names: tuple[str, ...], change: FloatArray) -> FloatArray:
+        """Column and row of the rim's middle, and its mean radius, in pixels."""
+        points_px = project_points(bench.geometry(names, change).geometry, rim_mm)
+        middle_px = points_px.mean(axis=1)
+        mean_radius_px = np.mean(np.hypot(*(points_px - middle_px[:, None])))
+        return np.append(middle_px, mean_radius_px)
 
-    nominal = seen((), np.zeros(0))
-    off = [
-        seen((n,), np.array([s])) - nominal
-        for n, s in zip(spread.names, spread.sigmas, strict=True)
+    nominal_px = predict_px((), np.zeros(0))
+    changes_px = [
+        predict_px((name,), np.array([sigma])) - nominal_px
+        for name, sigma in zip(spread.names, spread.sigmas, strict=True)
     ]
     # correlations are left out: they make the rim better known than its parts, and the scale then
     # too small
-    sigmas = np.sqrt(np.sum(np.square(off), axis=0)) if off else np.zeros(3)
-    place_mm = float(np.hypot(sigmas[0], sigmas[1])) * radius_mm / nominal[2]
-    far = max(
-        abs(outline.offset_mm) / math.hypot(place_mm, _RIM_OFF_MM / 3),
-        abs(outline.size_ratio - 1) / math.hypot(float(sigmas[2] / nominal[2]), _RIM_SIZE / 3),
+    sigmas_px = np.sqrt(np.sum(np.square(changes_px), axis=0)) if changes_px else np.zeros(3)
+    place_sigma_mm = float(np.hypot(sigmas_px[0], sigmas_px[1])) * radius_mm / nominal_px[2]
+    size_sigma = float(sigmas_px[2] / nominal_px[2])
+    return RimMisfit(
+        outline.offset_mm,
+        outline.size_ratio,
+        max(
+            abs(outline.offset_mm) / math.hypot(place_sigma_mm, _RING_SIGMA_MM),
+            abs(outline.size_ratio - 1) / math.hypot(size_sigma, _RING_SIZE_SIGMA),
+        ),
     )
-    return max(1.0, far / 2)

@@ -25,7 +25,7 @@ from membrane_ctrl.metrology.uncertainty.film_shape_error import film_shape_sour
 from membrane_ctrl.metrology.uncertainty.geometry_spread import GeometrySpread
 from membrane_ctrl.metrology.uncertainty.image_blur import estimate_blur_px
 from membrane_ctrl.metrology.uncertainty.laser_errors import vertex_um
-from membrane_ctrl.metrology.uncertainty.rim_check import rim_failed, rim_widening
+from membrane_ctrl.metrology.uncertainty.rim_check import RimMisfit, measure_rim_misfit
 from membrane_ctrl.metrology.uncertainty.trial_bench import TrialBench
 from membrane_ctrl.metrology.uncertainty.unseen_motion import estimate_unseen_motion
 
@@ -37,10 +37,21 @@ _SEEN_UM, _SEEN_SHARE, _TOLD_SHARE = 0.1, 0.05, 0.02
 
 @dataclass(frozen=True)
 class SetBudget:
-    """Budget of a figure, and what makes it doubtful."""
+    """Budget of a figure, and what makes it doubtful.
+
+    Attributes
+    ----------
+    budget : Budget
+        The rows.
+    doubts : tuple of str
+        What the frames say against the figure, and what to do.
+    rim : RimMisfit or None
+        What the rim says of the geometry; None if the picture does not show it.
+    """
 
     budget: budget.Budget
     doubts: tuple[str, ...]
+    rim: RimMisfit | None
 
 
 def assemble_budget(
@@ -72,15 +83,10 @@ def assemble_budget(
     disc = optics.mirror.analysis_radius_mm / optics.mirror.radius_mm
     if budget.Budget((blur,), disc).total()["height_rms_um"] > _BLUR_UM:
         doubts.append(f"the picture is blurred by {blur.sigma:.1f} px (1 sigma): focus the camera")
-    if outline is not None and rim_failed(outline):
-        doubts.append(
-            f"the rim is {outline.offset_mm:.1f} mm off the prediction and "
-            f"{outline.size_ratio:.4f} of its size: "
-            "check the camera's pose, the lens and mirror.radius_mm"
-        )
+    rim = None if outline is None else measure_rim_misfit(bench, spread, outline)
     slope_variance = full.slope_variance(optics, shifts, noise_adu)
     sources = [
-        *bench_sources.geometry_sources(bench, spread, rim_widening(bench, spread, outline)),
+        *bench_sources.geometry_sources(bench, spread, 1.0 if rim is None else rim.widening),
         *bench_sources.bench_sources(bench, sigmas),
         *film,
         _vertex_source(bench, sigmas, checked, film[0].sigma),
@@ -95,7 +101,7 @@ def assemble_budget(
         ),
         *residual_patches.pixel_sources(full, slope_variance, noise_adu),
     ]
-    return SetBudget(budget.Budget(tuple(sources), disc), tuple(doubts))
+    return SetBudget(budget.Budget(tuple(sources), disc), tuple(doubts), rim)
 
 
 def _blur_px(checked: Checked) -> float:

@@ -1,0 +1,147 @@
+"""Whether the pictures or the pattern are turned or mirrored against the stated bench.
+
+A camera that hangs upside down, a driver that mirrors its pictures or a screen whose axes are
+exchanged gives phases that decode without a fault, and a surface that is wrong by more than any
+stated uncertainty. Each such orientation has its own rays or screen points, so each is tried: the
+surface is fitted to the bins as if the pictures (or the screen's axes) were turned back, and the
+slopes that the fit leaves decide. An orientation is named only if it explains the slopes much
+better than the stated one; one that explains them as well is named beside it. (A bench that is
+symmetric about the plane of camera and screen cannot distinguish pictures that are mirrored top to
+bottom from a pattern that is.)
+"""
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+
+from membrane_ctrl.config.schema import OpticsConfig
+from membrane_ctrl.metrology.phase import screen_scale
+from membrane_ctrl.metrology.rays.geometry import Geometry
+from membrane_ctrl.metrology.rays.ray_tracing import Points, Tracer, parabola
+from membrane_ctrl.metrology.reconstruction import surface_fit
+from membrane_ctrl.model.arrays import FloatArray
+
+# A sound film leaves 2 to 5 µrad, wrinkles and gamma tens, a wrong orientation hundreds.
+SUSPICIOUS_URAD = 20.0
+# how much less an orientation must leave than the stated one; within how much two are equal
+_BETTER = 4.0
+_EQUAL = 2.0
+# bins that are fitted: the slopes left need no more, and 15 fits of them take 0.1 s
+_BINS = 1500
+_LEAST_BINS = 200  # of the surface's 37 parameters' points; fewer would be fitted by anything
+_TOLERANCE_MM = 1e-3  # of the height: slopes are then known to a microradian
+# of the bins that see the stated mirror; a picture turned by 90 degrees keeps the middle
+_LEAST_SEEN = 0.5
+
+# How pictures, and the pattern, may be turned; and the matrix that turns columns and rows (or x and
+# y of the pattern) about the middle back.
+_TURNS = (
+    ("rotated by 180 degrees", "rotated by 180 degrees", ((-1, 0), (0, -1))),
+    ("mirrored left to right", "mirrored left to right", ((-1, 0), (0, 1))),
+    ("mirrored top to bottom", "mirrored top to bottom", ((1, 0), (0, -1))),
+    ("rotated by 90 degrees clockwise", "rotated by 90 degrees", ((0, 1), (-1, 0))),
+    ("rotated by 90 degrees counter-clockwise", "rotated by -90 degrees", ((0, -1), (1, 0))),
+    ("shown with columns and rows exchanged", "shown with x and y exchanged", ((0, 1), (1, 0))),
+    (
+        "rotated by 180 degrees and shown with columns and rows exchanged",
+        "rotated by 180 degrees and shown with x and y exchanged",
+        ((0, -1), (-1, 0)),
+    ),
+)
+
+
+@dataclass(frozen=True)
+class Orientation:
+    """An orientation of pictures or pattern that explains what the stated one does not.
+
+    Attributes
+    ----------
+    what : tuple of str
+        What is turned, and how; several if they explain the slopes equally well.
+    stated_urad, found_urad : float
+        RMS of the slopes that the fit leaves in the stated orientation, and in this one.
+    """
+
+    what: tuple[str, ...]
+    stated_urad: float
+    found_urad: float
+
+    def describe(self) -> str:
+        """One sentence with the cause, its evidence and the remedy."""
+        return (
+            f"{', or '.join(self.what)}: with that undone the slopes that the fit leaves fall from "
+            f"{self.stated_urad:.0f} to {self.found_urad:.0f} µrad; turn it back, or state the "
+            "poses of camera and screen as they are"
+        )
+
+
+def find_orientation(
+    optics: OpticsConfig, vertex_z_mm: float, places_px: FloatArray, phase_rad: FloatArray
+) -> Orientation | None:
+    """Look for an orientation that explains the phases better than the stated one.
+
+    Parameters
+    ----------
+    optics : OpticsConfig
+        The stated bench.
+    vertex_z_mm : float
+        Height of the vertex in world.
+    places_px : (2, n) array
+        Columns and rows of the bins.
+    phase_rad : (2, n) array
+        Their absolute phases; NaN where unknown.
+
+    Returns
+    -------
+    Orientation or None
+        None if the stated one is not suspicious, or if no other is clearly better.
+    """
+    known = np.flatnonzero(np.isfinite(phase_rad).all(axis=0))
+    known = known[:: max(1, known.size // _BINS)]
+    places_px = places_px[:, known]
+    screen_mm = screen_scale.screen_mm(phase_rad[:, known], optics.pattern)
+    tracer = Tracer(Geometry.from_config(optics), optics.mirror.radius_mm, vertex_z_mm)
+    stated_urad, seen = _residual_urad(optics, tracer, places_px, screen_mm)
+    if stated_urad <= SUSPICIOUS_URAD:
+        return None
+    camera = optics.camera
+    middle_px = np.array([[camera.width_px - 1], [camera.height_px - 1]]) / 2
+    residuals_urad: dict[str, float] = {}
+    for of_pictures, of_pattern, turn in _TURNS:
+        turned_px = middle_px + np.array(turn) @ (places_px - middle_px)
+        turned_mm = np.array(turn) @ screen_mm
+        for name, places, points in (
+            (f"the pictures are {of_pictures}", turned_px, screen_mm),
+            (f"the pattern on the screen is {of_pattern}", places_px, turned_mm),
+        ):
+            residual_urad, count = _residual_urad(optics, tracer, places, points)
+            if count >= _LEAST_SEEN * seen:
+                residuals_urad[name] = residual_urad
+    best_urad = min(residuals_urad.values(), default=math.inf)
+    if not best_urad * _BETTER < stated_urad:
+        return None
+    equal = tuple(name for name, urad in residuals_urad.items() if urad <= _EQUAL * best_urad)
+    return Orientation(equal, stated_urad, best_urad)
+
+
+def _residual_urad(
+    optics: OpticsConfig, tracer: Tracer, places_px: FloatArray, screen_mm: FloatArray
+) -> tuple[float, int]:
+    """RMS of measured minus fitted slopes, µrad (infinite without a fit), and the bins used."""
+    rays = tracer.geometry.rays(*places_px)
+    path_mm = (tracer.vertex_z_mm - tracer.geometry.pinhole_mm[2]) / rays[2]
+    x_mm, y_mm = (tracer.geometry.pinhole_mm[:, None] + path_mm * rays)[:2]
+    inside = np.hypot(x_mm, y_mm) <= optics.mirror.analysis_radius_mm
+    count = int(np.count_nonzero(inside))
+    if count < _LEAST_BINS:
+        return math.inf, count
+    points = Points.of(rays[:, inside], screen_mm[:, inside])
+    start = parabola(optics.mirror.sag_mm, tracer.radius_mm)
+    try:
+        fit = surface_fit.solve(tracer, points, start, tolerance_mm=_TOLERANCE_MM)
+    except (ValueError, ArithmeticError, np.linalg.LinAlgError):
+        return math.inf, count
+    if not fit.converged:
+        return math.inf, count
+    return 1e6 * math.hypot(fit.residual_x, fit.residual_y) / math.sqrt(2), count

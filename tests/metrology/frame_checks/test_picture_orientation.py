@@ -1,0 +1,107 @@
+"""Pictures or a pattern that are turned or mirrored against the stated bench are named."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from membrane_ctrl.metrology.cycle.live_reconstructor import LiveReconstructor
+from membrane_ctrl.metrology.frame_checks.checked_set import Checked, RejectedSetError
+from membrane_ctrl.metrology.frame_checks.picture_orientation import SUSPICIOUS_URAD
+from membrane_ctrl.metrology.frame_checks.set_check import check_set
+from membrane_ctrl.metrology.phase.frame_stack import FrameStack
+from membrane_ctrl.sim.optics.film_shape import FilmShape, Wrinkle
+from tests.support.rendered_sets import bench, good_set
+
+Image = NDArray[np.uint8]
+
+
+def residual_urad(checked: Checked) -> float:
+    """RMS of measured minus fitted slopes of the bins, µrad."""
+    field = checked.tracer.slope_field(checked.state.points, checked.state.surface)
+    return 1e6 * float(np.sqrt(np.mean(np.square(field[2:4] - field[4:6]))))
+
+
+def rotate_quarter(picture: Image, quarters: int) -> Image:
+    """A camera rotated by quarters of a turn counter-clockwise, seen by the same sensor."""
+    return on_sensor(np.rot90(picture, quarters), picture.shape)
+
+
+def on_sensor(picture: Image, shape: tuple[int, ...]) -> Image:
+    """The middle of a picture on a sensor of another format; dark where it shows nothing."""
+    out = np.zeros(shape, picture.dtype)
+    size = np.minimum(shape, picture.shape)
+    to, of = (np.array(shape) - size) // 2, (np.array(picture.shape) - size) // 2
+    out[to[0] : to[0] + size[0], to[1] : to[1] + size[1]] = picture[
+        of[0] : of[0] + size[0], of[1] : of[1] + size[1]
+    ]
+    return out
+
+
+TURNED: dict[str, Callable[[Image], Image]] = {
+    "the pictures are rotated by 180 degrees": lambda picture: picture[::-1, ::-1],
+    "the pictures are mirrored left to right": lambda picture: picture[:, ::-1],
+    "the pictures are mirrored top to bottom": lambda picture: picture[::-1],
+    "the pictures are rotated by 90 degrees counter-clockwise": lambda p: rotate_quarter(p, 1),
+    "the pictures are rotated by 90 degrees clockwise": lambda p: rotate_quarter(p, 3),
+    "the pictures are shown with columns and rows exchanged": lambda p: on_sensor(p.T, p.shape),
+}
+
+
+def turned(stack: FrameStack, turn: Callable[[Image], Image]) -> FrameStack:
+    """The set by a camera whose pictures are turned."""
+    return replace(stack, frames=np.stack([turn(frame) for frame in stack.frames]))
+
+
+def with_axes_exchanged(stack: FrameStack) -> FrameStack:
+    """The set of a screen whose x and y are exchanged: x frames show what y frames should."""
+    names = [pattern.name for pattern in stack.patterns]
+    other = {"x": "y", "y": "x"}
+    order = [
+        names.index(other[name[0]] + name[1:]) if name[:2] in ("x_", "y_") else frame
+        for frame, name in enumerate(names)
+    ]
+    return replace(stack, frames=stack.frames[order])
+
+
+@pytest.mark.parametrize("what", TURNED)
+@pytest.mark.parametrize("steps", [3, 4])
+def test_turned_pictures_are_named_and_rejected(what: str, steps: int) -> None:
+    stack = turned(good_set(bench(steps)), TURNED[what])
+    with pytest.raises(RejectedSetError) as rejected:
+        check_set(stack, bench(steps))
+    assert str(rejected.value).startswith(what)
+    assert not rejected.value.flags  # no single frame is blamed
+
+
+def test_a_screen_with_exchanged_axes_is_named() -> None:
+    with pytest.raises(RejectedSetError, match="pattern on the screen is shown with x and y"):
+        check_set(with_axes_exchanged(good_set(bench())), bench())
+
+
+def test_a_bowl_without_any_aberration_shows_the_orientation_too() -> None:
+    bowl = good_set(bench(), film=FilmShape(37.1, 500.0))
+    assert check_set(bowl, bench()).verdict == ("ok", "")
+    with pytest.raises(RejectedSetError, match="rotated by 180 degrees"):
+        check_set(turned(bowl, TURNED["the pictures are rotated by 180 degrees"]), bench())
+
+
+@pytest.mark.parametrize("what", TURNED)
+def test_a_full_cycle_names_turned_pictures(what: str) -> None:
+    stack = turned(good_set(bench()), TURNED[what])
+    nothing = np.full(len(stack.frames), np.nan)
+    live = LiveReconstructor(bench(), bin_px=1)
+    estimate = live.full(list(stack.frames), 0.1 * np.arange(len(stack.frames)), nothing)
+    assert estimate.verdict == "rejected"
+    assert estimate.reason.startswith(what)
+
+
+def test_wrinkles_are_no_orientation() -> None:
+    """They leave more slope than is suspicious, and no turn explains them."""
+    wrinkles = FilmShape(37.1, 500.0, wrinkles=(Wrinkle(60.0, lobes=12),))
+    checked = check_set(good_set(bench(), film=wrinkles), bench())
+    assert residual_urad(checked) > SUSPICIOUS_URAD
