@@ -11,6 +11,7 @@ from typing import Any
 
 from membrane_ctrl.geometry.spread_file import KnownBy
 from membrane_ctrl.metrology.uncertainty.rim_check import RimMisfit
+from membrane_ctrl.metrology.uncertainty.slope_misfit import SlopeMisfit
 
 
 class GeometryState(StrEnum):
@@ -18,7 +19,7 @@ class GeometryState(StrEnum):
 
     CALIBRATED = "calibrated"  # it has a covariance from a calibration, and the rim agrees
     UNCALIBRATED = "uncalibrated"  # rulers or data sheets; the rim agrees with their sigmas
-    CONTRADICTED = "contradicted"  # the rim is where no stated uncertainty puts it
+    CONTRADICTED = "contradicted"  # rim or slopes are what no stated uncertainty explains
 
 
 _NEXT_STEP = {
@@ -42,27 +43,39 @@ class GeometryStatement:
         Where its uncertainty is from.
     rim : RimMisfit or None
         The rim against the prediction; None if the picture does not show it.
+    slopes : SlopeMisfit
+        Slopes that belong to no surface.
     """
 
     state: GeometryState
     source: str
     rim: RimMisfit | None
+    slopes: SlopeMisfit
 
     @classmethod
-    def of(cls, known_by: KnownBy, source: str, rim: RimMisfit | None) -> "GeometryStatement":
-        """Judge by what the uncertainty rests on, and by the rim."""
-        if rim is not None and rim.contradicts:
-            return cls(GeometryState.CONTRADICTED, source, rim)
-        calibrated = known_by is KnownBy.CALIBRATION
-        state = GeometryState.CALIBRATED if calibrated else GeometryState.UNCALIBRATED
-        return cls(state, source, rim)
+    def of(
+        cls, known_by: KnownBy, source: str, rim: RimMisfit | None, slopes: SlopeMisfit
+    ) -> "GeometryStatement":
+        """Judge by what the uncertainty rests on, by the rim and by the slopes."""
+        state = GeometryState.UNCALIBRATED
+        if slopes.contradicts or (rim is not None and rim.contradicts):
+            state = GeometryState.CONTRADICTED
+        elif known_by is KnownBy.CALIBRATION:
+            state = GeometryState.CALIBRATED
+        return cls(state, source, rim, slopes)
 
     @property
-    def doubt(self) -> str:
+    def doubts(self) -> tuple[str, ...]:
         """What it says against the figure; empty unless it is contradicted."""
-        if self.state is not GeometryState.CONTRADICTED or self.rim is None:
-            return ""
-        return f"{self.rim.describe()}: {_NEXT_STEP[self.state]}"
+        found = []
+        if self.rim is not None and self.rim.contradicts:
+            found.append(f"{self.rim.describe()}: {_NEXT_STEP[GeometryState.CONTRADICTED]}")
+        if self.slopes.contradicts:
+            found.append(
+                f"{self.slopes.describe()}: cause unknown; it looks like a camera, screen or lens "
+                "that is not as stated, or like light from a second reflection"
+            )
+        return tuple(found)
 
     def describe(self) -> str:
         """State, source and the next step in words."""
@@ -79,4 +92,6 @@ class GeometryStatement:
             "rim_offset_mm": None if rim is None else rim.offset_mm,
             "rim_size_ratio": None if rim is None else rim.size_ratio,
             "rim_sigmas": None if rim is None else rim.sigmas,
+            "slopes_of_no_surface_urad": self.slopes.seen_urad,
+            "slopes_explained_urad": self.slopes.explained_urad,
         }

@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 
 from membrane_ctrl.geometry.spread_file import find_known_by, geometry_spread
-from membrane_ctrl.measure.geometry_statement import GeometryState, GeometryStatement
+from membrane_ctrl.measure.geometry_statement import GeometryStatement
 from membrane_ctrl.measure.measurement import Measurement, noise_seen_adu
 from membrane_ctrl.measure.result_files import number_or_null, write_arrays, write_json
 from membrane_ctrl.metrology.figure import radial_profile
@@ -101,32 +101,25 @@ def error_bars(
         float(variance.mean()) / float(np.median(full.grid.count[full.grid.count > 0]))
     )
     zonal_um = 1e3 * full.grid.noise_mm(cell_slope)
-    statement = GeometryStatement.of(find_known_by(optics, geometry), source, seen.rim)
+    statement = GeometryStatement.of(find_known_by(optics, geometry), source, seen.rim, seen.slopes)
     return ErrorBars(seen.budget, statement, seen.doubts, grid, cell_slope, zonal_um)
 
 
 def degrade_doubtful(measurement: Measurement, bars: ErrorBars | None) -> Measurement:
     """The measurement with the verdict that its error bars allow.
 
-    A doubt degrades an `ok`. A geometry that the rim contradicts degrades it, too; with slopes that
-    no film of the fit's shapes has, it is a misfit that nothing stated explains, and the figure is
-    not usable.
+    A doubt degrades an `ok`, and so does a geometry that rim or slopes contradict. Slopes that
+    belong to no surface and that nothing stated explains make the figure unusable.
     """
-    if bars is None or measurement.verdict == "rejected" or measurement.full is None:
+    if bars is None or measurement.verdict == "rejected":
         return measurement
-    residual_urad = measurement.full.quality.residual_urad
-    contradicted = bars.statement.state is GeometryState.CONTRADICTED
-    if contradicted and residual_urad > shape_estimate.RESIDUAL_DEGRADED_URAD:
-        reason = (
-            f"slope residual {residual_urad:.0f} µrad, and {bars.statement.doubt}; no stated "
-            "uncertainty explains both"
-        )
-        return replace(measurement, verdict="rejected", reason=reason)
-    doubts = [doubt for doubt in (*bars.doubts, bars.statement.doubt) if doubt]
+    statement = bars.statement
+    doubts = [*bars.doubts, *statement.doubts]
     if not doubts:
         return measurement
     known = [measurement.reason] if measurement.reason else []
-    return replace(measurement, verdict="degraded", reason="; ".join([*known, *doubts]))
+    verdict: shape_estimate.Verdict = "rejected" if statement.slopes.unusable else "degraded"
+    return replace(measurement, verdict=verdict, reason="; ".join([*known, *doubts]))
 
 
 def result_table(

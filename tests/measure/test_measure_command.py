@@ -379,14 +379,37 @@ def test_an_image_that_ends_too_early(
     assert "libpng" not in capfd.readouterr().err
 
 
-def test_a_pose_that_the_rim_contradicts_is_asked_about(
+def test_a_rim_within_the_stated_sigmas_leaves_the_set_ok_and_uncalibrated(
     capture_set: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    assert measured(capture_set, tmp_path / "good")[0] == 0
-    assert "check the camera's pose" not in capsys.readouterr().out
     rewrite(capture_set, lambda table: table["geometry"].update(a_mm=2640.0))
-    assert measured(capture_set, tmp_path / "wrong")[0] == 0
-    assert "check the camera's pose" in capsys.readouterr().out
+    assert measured(capture_set, tmp_path / "result")[0] == 0
+    said = capsys.readouterr().out
+    assert said.startswith("verdict   ok\n")
+    assert "geometry  uncalibrated: " in said
+    assert "membrane-ctrl calibrate" in said
+    known = json.loads((tmp_path / "result/result.json").read_text())["geometry_known"]
+    assert known["state"] == "uncalibrated"
+    assert 1.0 < known["rim_sigmas"] < 2.0
+
+
+def test_a_rim_that_no_stated_sigma_explains_contradicts_the_geometry(
+    capture_set: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    small = {name: 0.01 * sigma for name, sigma in SigmasConfig().model_dump().items()}
+
+    def misstate(table: dict[str, Any]) -> None:
+        table["geometry"].update(
+            a_mm=2640.0, a_sigma_mm=0.5, b_sigma_mm=0.5, alpha_sigma_deg=0.01, sigmas=small
+        )
+
+    rewrite(capture_set, misstate)
+    assert measured(capture_set, tmp_path / "result")[0] == 0
+    said = capsys.readouterr().out
+    assert said.startswith("verdict   degraded: the rim is ")
+    assert "check the camera's pose" in said
+    known = json.loads((tmp_path / "result/result.json").read_text())["geometry_known"]
+    assert known["state"] == "contradicted"
 
 
 FACET = Path(__file__).parents[2].parent / "shared" / "data" / "sofast" / "measurement_facet.h5"
@@ -411,7 +434,10 @@ def test_error_bars(made: Path, tmp_path: Path, capsys: pytest.CaptureFixture[st
     said = capsys.readouterr().out
     assert "from noise" in said
     assert "largest: principal_x_px" in said
-    assert "geometry  no sigma is stated for any input; data-sheet defaults apply" in said
+    assert (
+        "geometry  uncalibrated: no sigma is stated for any input; data-sheet defaults apply"
+        in said
+    )
     details = json.loads((tmp_path / "details.json").read_text())["sag_sigma_um"]
     sigma = np.load(tmp_path / "sigma.npz")
     assert (

@@ -173,7 +173,7 @@ class LiveReconstructor:
         if orientation is None:
             return estimate
         self._tracked = None
-        return rejected("full", times, readings, orientation.describe())
+        return make_rejected_cycle("full", times, readings, orientation.describe())
 
     def fringes(
         self, frames: Sequence[Image], time_s: ArrayLike, displacement_um: ArrayLike

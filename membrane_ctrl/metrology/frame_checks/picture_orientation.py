@@ -18,7 +18,7 @@ import numpy as np
 from membrane_ctrl.config.schema import OpticsConfig
 from membrane_ctrl.metrology.phase import screen_scale
 from membrane_ctrl.metrology.rays.geometry import Geometry
-from membrane_ctrl.metrology.rays.ray_tracing import Points, Tracer, parabola
+from membrane_ctrl.metrology.rays.ray_tracing import Points, Tracer, make_parabola
 from membrane_ctrl.metrology.reconstruction import surface_fit
 from membrane_ctrl.model.arrays import FloatArray
 
@@ -137,9 +137,9 @@ def _residual_urad(
     if count < _LEAST_BINS:
         return math.inf, count
     points = Points.of(rays[:, inside], screen_mm[:, inside])
-    start = parabola(optics.mirror.sag_mm, tracer.radius_mm)
+    start = make_parabola(optics.mirror.sag_mm, tracer.radius_mm)
     try:
-        fit = surface_fit.solve(tracer, points, start, tolerance_mm=_TOLERANCE_MM)
+        fit = surface_fit.fit_surface(tracer, points, start, tolerance_mm=_TOLERANCE_MM)
     except (ValueError, ArithmeticError, np.linalg.LinAlgError):
         return math.inf, count
     if not fit.converged:

@@ -12,8 +12,6 @@ import numpy as np
 
 from membrane_ctrl.model.arrays import ArrayLike, BoolArray, FloatArray, IntArray
 
-pass
-
 
 def gray_orders(gray: ArrayLike, white: ArrayLike, black: ArrayLike) -> tuple[IntArray, IntArray]:
     """Fringe orders from the Gray-code frames.

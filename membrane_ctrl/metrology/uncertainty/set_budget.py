@@ -26,6 +26,7 @@ from membrane_ctrl.metrology.uncertainty.geometry_spread import GeometrySpread
 from membrane_ctrl.metrology.uncertainty.image_blur import estimate_blur_px
 from membrane_ctrl.metrology.uncertainty.laser_errors import vertex_um
 from membrane_ctrl.metrology.uncertainty.rim_check import RimMisfit, measure_rim_misfit
+from membrane_ctrl.metrology.uncertainty.slope_misfit import SlopeMisfit, measure_slope_misfit
 from membrane_ctrl.metrology.uncertainty.trial_bench import TrialBench
 from membrane_ctrl.metrology.uncertainty.unseen_motion import estimate_unseen_motion
 
@@ -47,11 +48,14 @@ class SetBudget:
         What the frames say against the figure, and what to do.
     rim : RimMisfit or None
         What the rim says of the geometry; None if the picture does not show it.
+    slopes : SlopeMisfit
+        Slopes that belong to no surface.
     """
 
     budget: budget.Budget
     doubts: tuple[str, ...]
     rim: RimMisfit | None
+    slopes: SlopeMisfit
 
 
 def assemble_budget(
@@ -84,6 +88,7 @@ def assemble_budget(
     if budget.Budget((blur,), disc).total()["height_rms_um"] > _BLUR_UM:
         doubts.append(f"the picture is blurred by {blur.sigma:.1f} px (1 sigma): focus the camera")
     rim = None if outline is None else measure_rim_misfit(bench, spread, outline)
+    slopes = measure_slope_misfit(bench, spread, full.grid, full.residual_mm)
     slope_variance = full.slope_variance(optics, shifts, noise_adu)
     sources = [
         *bench_sources.geometry_sources(bench, spread, 1.0 if rim is None else rim.widening),
@@ -101,7 +106,7 @@ def assemble_budget(
         ),
         *residual_patches.pixel_sources(full, slope_variance, noise_adu),
     ]
-    return SetBudget(budget.Budget(tuple(sources), disc), tuple(doubts), rim)
+    return SetBudget(budget.Budget(tuple(sources), disc), tuple(doubts), rim, slopes)
 
 
 def _blur_px(checked: Checked) -> float:

@@ -26,8 +26,6 @@ from membrane_ctrl.metrology.reconstruction.normal_matrix import NormalMatrix
 from membrane_ctrl.metrology.uncertainty.geometry_spread import moved_bench
 from membrane_ctrl.model.arrays import ArrayLike, BoolArray, FloatArray
 
-pass
-
 # 170 a parameter: errors of a geometry are smooth and need fewer; a trial then takes about a
 # millisecond
 TRIAL_POINTS = 6000
@@ -105,8 +103,13 @@ class TrialBench:
     def solve(
         self, there: BenchGeometry, disturbance_mm: FloatArray | float = 0.0, linear: bool = False
     ) -> FloatArray:
-        """Parameters (parameters,) in mm of the surface on another bench, the screen points (2, n)
-        off by a disturbance.
+        """Parameters (parameters,) in mm of the surface that `fit` finds."""
+        return self.fit(there, disturbance_mm, linear).surface.parameters
+
+    def fit(
+        self, there: BenchGeometry, disturbance_mm: FloatArray | float = 0.0, linear: bool = False
+    ) -> surface_fit.Fit:
+        """Fit the surface on another bench, the screen points (2, n) off by a disturbance.
 
         One step suffices for a `linear` answer: the next would change it by 1/300.
 
@@ -133,7 +136,7 @@ class TrialBench:
                 fit = None
         if fit is None or not (fit.converged or (linear and np.isfinite(fit.changes_mm[-1]))):
             raise ArithmeticError("a trial did not converge: the geometry's spread is too wide")
-        return fit.surface.parameters
+        return fit
 
     def geometry(self, names: tuple[str, ...] = (), change: ArrayLike = ()) -> BenchGeometry:
         """The nominal bench, or changed."""
