@@ -145,8 +145,8 @@ def _draw_sensor(
     rng: np.random.Generator, sometimes: Callable[[str, float, float], float], resolution: float
 ) -> Sensor:
     deep = bool(rng.random() < 0.3)
-    exposure = float(rng.uniform(0.7, 1.1))
-    exposure *= sometimes("overexposed", 0.04, rng.uniform(1.3, 2.5)) or 1.0
+    usual = float(rng.uniform(0.7, 1.1))
+    exposure = sometimes("overexposed", 0.04, rng.uniform(1.3, 2.5)) or usual
     container = "plain"
     if deep and sometimes("12 bits left-aligned", 0.3, 1.0):
         container = "left-aligned"
