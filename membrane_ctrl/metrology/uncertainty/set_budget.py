@@ -26,6 +26,7 @@ from membrane_ctrl.metrology.uncertainty.geometry_spread import GeometrySpread
 from membrane_ctrl.metrology.uncertainty.image_blur import estimate_blur_px
 from membrane_ctrl.metrology.uncertainty.laser_errors import vertex_um
 from membrane_ctrl.metrology.uncertainty.rim_check import RimMisfit, measure_rim_misfit
+from membrane_ctrl.metrology.uncertainty.set_moment import moment_source
 from membrane_ctrl.metrology.uncertainty.slope_misfit import SlopeMisfit, measure_slope_misfit
 from membrane_ctrl.metrology.uncertainty.trial_bench import TrialBench
 from membrane_ctrl.metrology.uncertainty.unseen_motion import estimate_unseen_motion
@@ -94,6 +95,7 @@ def assemble_budget(
         *bench_sources.geometry_sources(bench, spread, 1.0 if rim is None else rim.widening),
         *bench_sources.bench_sources(bench, sigmas),
         *film,
+        *filter(None, [moment_source(checked, moved, optics.mirror.radius_mm)]),
         _vertex_source(bench, sigmas, checked, film[0].sigma),
         film_shape_source(full, slope_variance),
         blur,

@@ -1,0 +1,83 @@
+"""The sag of a set whose film moves while no laser reads its place."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from membrane_ctrl.metrology.uncertainty.set_moment import moment_sigma_um
+from tests.studies.second_world_errors import drawn_points_mm, measured_errors
+from tests.worlds.second_optics import FRAME_S, Bench, Effects, Mirror, World
+
+FRAMES = 18
+SINUSOIDS = (np.arange(4.0), np.arange(8.0, 12.0))
+MOVED_UM = 5.0
+Course = Callable[[float], float]
+COURSES: dict[str, Course] = {
+    "linear": lambda time_s: MOVED_UM * time_s / ((FRAMES - 1) * FRAME_S),
+    "step": lambda time_s: MOVED_UM * (time_s > 1.5 * FRAME_S),
+    "oscillating": lambda time_s: MOVED_UM / 2 * math.sin(2 * math.pi * time_s / 0.64),
+}
+
+
+def places_um(course: Course) -> np.ndarray[tuple[int], np.dtype[np.float64]]:
+    """Of the film at all frames."""
+    return np.array([course(FRAME_S * k) for k in range(FRAMES)])
+
+
+def about_means(course: Course) -> np.ndarray[tuple[int], np.dtype[np.float64]]:
+    """At the sinusoids, each axis about its own mean, as the fringes show it."""
+    seen = [places_um(course)[axis.astype(int)] for axis in SINUSOIDS]
+    return np.concatenate([axis - axis.mean() for axis in seen])
+
+
+def moment_um(course: Course) -> float:
+    """The film's mean place over the set less that over the sinusoids."""
+    every = places_um(course)
+    used = np.concatenate(SINUSOIDS).astype(int)
+    return float(every.mean() - every[used].mean())
+
+
+@pytest.mark.parametrize("name", COURSES)
+def test_the_sigma_is_as_large_as_what_the_film_moves_beyond_the_sinusoids(name: str) -> None:
+    course = COURSES[name]
+    sigma_um = moment_sigma_um(SINUSOIDS, about_means(course), 0.1, FRAMES)
+    assert abs(moment_um(course)) < 1.2 * sigma_um < 1.6
+
+
+def test_a_film_at_rest_has_the_sigma_of_the_fringes_noise() -> None:
+    random, found = np.random.default_rng(1), []
+    for _ in range(50):
+        noise = random.normal(0, 0.1, 8)
+        centred = np.concatenate([axis - axis.mean() for axis in np.split(noise, [4])])
+        found.append(moment_sigma_um(SINUSOIDS, centred, 0.1, FRAMES))
+    assert 0.1 < np.mean(found) < 0.25
+
+
+@pytest.mark.parametrize("name", COURSES)
+def test_a_change_of_the_sag_is_within_its_bar_whatever_moment_is_meant(
+    name: str, tmp_path: Path
+) -> None:
+    """Film that moved by 5 µm during a set without a laser: the sag was 2 sigma off its mean over
+    the set.
+    """
+    points = drawn_points_mm(np.random.default_rng(1), 20)
+    found = []
+    for seed, course in enumerate((None, COURSES[name])):
+        effects = Effects(laser=False, film_motion_um=course)
+        world = World(Mirror(), Bench.paper(0.125), effects, seed=1 + seed)
+        folder = tmp_path / f"set{seed}"
+        truth = world.write_set(folder)
+        found.append(measured_errors(folder, world.mirror, truth, points))
+    before, moving = found
+    assert before.error_um is not None
+    assert moving.error_um is not None
+    error_um = moving.error_um - before.error_um
+    ratio = error_um / moving.change_sigma_um(before)
+    assert np.abs(ratio).max() < 2.0
+    of_mean_um = error_um[0] - moment_um(COURSES[name])
+    assert abs(of_mean_um) < 1.1 * moving.change_sigma_um(before)[0]
