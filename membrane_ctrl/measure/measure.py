@@ -138,6 +138,12 @@ def _format_measurement(
         f"{full.fit.changes_mm[-1]:.1e} mm, "
         f"{np.count_nonzero(full.weights)} pixels",
     ]
+    held = None if measurement.checked is None else measurement.checked.held
+    if held is not None and held.corrected:
+        lines.append(
+            f"panel     each frame showed {held.share:.2%} +- {held.sigma:.2%} of the previous "
+            "picture, which was taken out: wait longer before each frame"
+        )
     if outline is not None:
         rim = bars.statement.rim
         sigmas = "" if rim is None else f", {rim.sigmas:.1f} sigma of the stated geometry"

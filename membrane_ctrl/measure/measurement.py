@@ -135,7 +135,11 @@ def stack_of(capture: CaptureSet) -> frame_stack.FrameStack:
         first = capture.lost[0]
         raise RejectedSetError(f"{capture.head.files[first]} is {capture.unusable[first]}", flags)
     return frame_stack.FrameStack(
-        capture.frames, capture.head.patterns, capture.head.displacement_um, capture.unusable
+        capture.frames,
+        capture.head.patterns,
+        capture.head.displacement_um,
+        capture.unusable,
+        before=frame_stack.find_frames_before(capture.head.time_s),
     )
 
 

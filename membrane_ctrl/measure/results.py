@@ -206,6 +206,13 @@ def details_table(
     if measurement.checked is not None:
         clip = measurement.checked.binned.clip
         black_adu = None if clip.black_adu < 0 else clip.black_adu
+        held = measurement.checked.held
+        table["held_share"] = {
+            "rise": number_or_null(held.rise),
+            "fall": number_or_null(held.fall),
+            "sigma": number_or_null(held.sigma),
+            "taken_out": held.corrected,
+        }
         table["clip_levels_adu"] = {"white": clip.white_adu, "black": black_adu}
     if full is not None:
         residual_um = 1e3 * full.residual_mm[np.isfinite(full.residual_mm)]

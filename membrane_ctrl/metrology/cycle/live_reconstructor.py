@@ -13,9 +13,14 @@ from dataclasses import replace
 
 import numpy as np
 
+from firmware_iface.roles import Pattern
 from membrane_ctrl.config.schema import OpticsConfig
 from membrane_ctrl.metrology.film import hencky_bowl
-from membrane_ctrl.metrology.frame_checks import band_removal, picture_orientation
+from membrane_ctrl.metrology.frame_checks import (
+    band_removal,
+    held_light,
+    picture_orientation,
+)
 from membrane_ctrl.metrology.frame_checks.clipping import ClippedShares
 from membrane_ctrl.metrology.phase import (
     bin_sums,
@@ -107,6 +112,7 @@ class LiveReconstructor:
         )
         self._patterns = tuple(replace(pattern, shift_rad=float(shift)) for pattern, shift in told)
         self._bands_rad, self._doubt = np.zeros(0), ""
+        self._held = held_light.UNKNOWN
         self._full_scale_adu = 2**optics.camera.bits - 1
         size = (optics.camera.height_px, optics.camera.width_px)
         self._binner = bin_sums.Binner(*size, bin_px, self._full_scale_adu, self._slots.count)
@@ -162,7 +168,8 @@ class LiveReconstructor:
             saturated = float(np.mean(self._binner.saturated.ravel()[self._near] > 0))
             cause = ClippedShares(saturated, 0.0).cause
             return make_rejected_cycle("full", times, readings, cause or str(error))
-        self._watch.begin(state)
+        self._remove_held_of_full(state)
+        self._watch.begin(state, self._held)
         estimate = self._follow("full", state, times, readings)
         if estimate.slope_residual_urad <= picture_orientation.SUSPICIOUS_URAD:
             return estimate
@@ -194,6 +201,7 @@ class LiveReconstructor:
         self._binner.add(frames, np.r_[self._slots.sinusoids].tolist())
         if self._bands_rad.size:
             self._take_bands(self._bands_rad)
+        self._remove_held_of_fringes()
         return self._follow("fringes", self._tracked, times, readings)
 
     def prepare(self) -> None:
@@ -281,17 +289,8 @@ class LiveReconstructor:
         one.
         """
         slots = np.r_[self._slots.sinusoids]
-        means = (self._binner.sums[slots] / self._bin_px**2).astype(np.float32)
-        binned = Binned(
-            self._bin_px,
-            means,
-            np.broadcast_to(self._binner.saturated > 0, means.shape),
-            ClipLevels(self._binner.white_adu),
-        )
-        none = np.empty(
-            (len(slots), self._optics.camera.height_px, 0), np.uint8
-        )  # the bins are enough
-        stack = FrameStack(none, self._patterns, np.full(len(slots), math.nan), {})
+        binned = self._binned(self._binner.sums[slots])
+        stack = self._stack_without_frames(self._patterns)
         stack, binned, found = band_removal.remove_bands(stack, binned, known)
         self._bands_rad, self._doubt = (
             found if not known.size else known,
@@ -303,6 +302,46 @@ class LiveReconstructor:
             )
         elif found.size:
             self._binner.sums[slots] = np.rint(binned.means * self._bin_px**2)
+
+    def _remove_held_of_full(self, state: tracked_points.TrackedPoints) -> None:
+        """Find what each frame of a full cycle shows of the previous one, and take it out.
+
+        The first frame has none: its pattern is shown ahead, while the former cycle is computed.
+        """
+        patterns = list(pattern_sequence.full_sequence(self._optics.pattern))
+        for slots, shifts in zip(self._slots.sinusoids, self._shifts_rad, strict=True):
+            for slot, shift in zip(range(slots.start, slots.stop), shifts, strict=True):
+                patterns[slot] = replace(patterns[slot], shift_rad=float(shift))
+        stack = self._stack_without_frames(tuple(patterns))
+        binned = self._binned(self._binner.sums[: self._slots.count])
+        # The saturated bins of a sinusoid are known; those of other frames need not be
+        phase_rad = state.accepted[:, 0]
+        self._held, without = held_light.find_held_light(stack, binned, state.index, phase_rad)
+        if self._held.corrected:
+            slots = np.r_[self._slots.sinusoids]
+            self._binner.sums[slots] = np.rint(without.means[slots] * self._bin_px**2)
+        self._doubt = self._doubt or held_light.describe_held_light(self._held)
+
+    def _remove_held_of_fringes(self) -> None:
+        """Take out of a fringes-only cycle what the last full cycle found."""
+        if not self._held.corrected:
+            return
+        slots = np.r_[self._slots.sinusoids]
+        stack = self._stack_without_frames(self._patterns)
+        binned = self._binned(self._binner.sums[slots])
+        without = held_light.remove_held_light(stack, binned, self._held)
+        self._binner.sums[slots] = np.rint(without.means * self._bin_px**2)
+
+    def _stack_without_frames(self, patterns: tuple[Pattern, ...]) -> FrameStack:
+        """The patterns of a cycle whose bins are enough."""
+        none = np.empty((len(patterns), self._optics.camera.height_px, 0), np.uint8)
+        return FrameStack(none, patterns, np.full(len(patterns), math.nan), {})
+
+    def _binned(self, sums: AnyArray) -> Binned:
+        """Sums of frames as means."""
+        means = (sums / self._bin_px**2).astype(np.float32)
+        saturated = np.broadcast_to(self._binner.saturated > 0, means.shape)
+        return Binned(self._bin_px, means, saturated, ClipLevels(self._binner.white_adu))
 
     def _sums(self) -> list[AnyArray]:
         """Bin sums (N, bins) of the sinusoids of x and of y."""

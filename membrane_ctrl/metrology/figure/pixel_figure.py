@@ -17,13 +17,14 @@ from membrane_ctrl.metrology.phase import (
     phase_steps,
     screen_scale,
 )
+from membrane_ctrl.metrology.phase.frame_stack import FrameStack
 from membrane_ctrl.metrology.phase.pixel_phases import PixelPhases, pixel_phases
 from membrane_ctrl.metrology.rays import ray_tracing
 from membrane_ctrl.metrology.rays.geometry import Geometry
 from membrane_ctrl.metrology.rays.surface import Surface
 from membrane_ctrl.metrology.reconstruction import film_motion, slope_noise, surface_fit, zonal_map
 from membrane_ctrl.metrology.reconstruction.normal_matrix import NormalMatrix
-from membrane_ctrl.model.arrays import FloatArray, IntArray, Singles
+from membrane_ctrl.model.arrays import FloatArray, Image, IntArray, Singles
 from membrane_ctrl.model.shape_estimate import Quality
 
 _START_SAG_MM = 40.0  # the paper's starting parabola
@@ -186,7 +187,20 @@ def _axis_phases(
         reference,
         checked.binned.clip,
         gain,
+        _gather_previous(stack, used),
+        stack.held_shares,
     )
+
+
+def _gather_previous(stack: FrameStack, used: list[int]) -> Image | None:
+    """The frame before each of these, itself without one; None if they hold nothing of it."""
+    if not any(stack.held_shares):
+        return None
+    previous = [stack.before_of(frame) for frame in used]
+    gathered: Image = stack.frames[
+        [frame if before < 0 else before for frame, before in zip(used, previous, strict=True)]
+    ]
+    return gathered
 
 
 def reconstruct_full(

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from membrane_ctrl.config.schema import OpticsConfig
-from membrane_ctrl.metrology.frame_checks import band_removal, bin_view, frame_faults
+from membrane_ctrl.metrology.frame_checks import band_removal, bin_view, frame_faults, held_light
 from membrane_ctrl.metrology.phase import frame_stack
 from membrane_ctrl.metrology.rays import ray_tracing
 from membrane_ctrl.metrology.reconstruction import tracked_points
@@ -38,6 +38,7 @@ class Checked:
     film_um: FloatArray
     film_noise_um: float  # 1 sigma of each of these places
     light_left: float  # RMS of their light, relative, that the phases do not know of
+    held: held_light.HeldLight = held_light.UNKNOWN  # of the previous picture in each frame
 
     @property
     def verdict(self) -> tuple[Verdict, str]:
@@ -47,8 +48,9 @@ class Checked:
                 "degraded",
                 f"{len(self.flags)} frame(s) flagged; the figure excludes the affected data",
             )
-        doubt = band_removal.describe_bands(self.stack.gain)
-        return ("degraded", doubt) if doubt else ("ok", "")
+        bands = band_removal.describe_bands(self.stack.gain)
+        doubts = [each for each in (bands, held_light.describe_held_light(self.held)) if each]
+        return ("degraded", "; ".join(doubts)) if doubts else ("ok", "")
 
     def places_px(self, index: IntArray) -> FloatArray:
         """Column and row (2, n) of bins' centres."""

@@ -97,11 +97,13 @@ def check_frequencies(stack: FrameStack, optics: OpticsConfig) -> Checked:
         [_unwrap_finest(series, axis, places[axis], optics, mask, named) for axis in range(2)]
     )
     light = binned.means[finest].mean(axis=0).astype(float)
+    former = [stack.before_of(frame) for frame in range(count)]
     fine = FrameStack(
         stack.frames[:count],
         stack.patterns[:count],
         stack.displacement_um[:count],
         {k: reason for k, reason in stack.unusable.items() if k < count},
+        before=tuple(before if before < count else -1 for before in former),
     )
     try:
         checked = check_set(fine, optics, Anchor(absolute, light))

@@ -20,6 +20,7 @@ from membrane_ctrl.metrology.frame_checks import (
     frame_evidence,
     frame_faults,
     frame_inspection,
+    held_light,
     picture_orientation,
 )
 from membrane_ctrl.metrology.frame_checks.bin_orders import absolute_phases_of_bins, confirm_orders
@@ -198,7 +199,8 @@ def _check_rounds(
     known |= {flag.frame: flag for flag in frame_inspection.find_obvious_faults(stack, binned)}
     excluded = set(known)
     flags: list[frame_faults.Flag] = []
-    for done in range(rounds + 1):
+    taken, held, held_rounds = binned, held_light.UNKNOWN, held_light.ROUNDS
+    for done in range(rounds + held_light.ROUNDS + 1):
         try:
             attempt = _attempt_fit(stack, binned, optics, geometry, grid, near, excluded, anchor)
         except (bin_view.NoFigureError, ValueError) as error:
@@ -208,6 +210,17 @@ def _check_rounds(
             )
             named = _merge_flags(_keep_believable(stack, flags), known)
             raise RejectedSetError(clipped.cause or str(error), named, clipped.white) from None
+        if held_rounds:
+            found = held_light.estimate_held_light(stack, binned, attempt.scene, excluded)
+            held = held_light.add_held_light(held, found)
+            held_rounds -= 1
+            if held.corrected and held_light.is_worth_another_round(found):
+                if not any(stack.held_shares):
+                    stack = held_light.add_first_predecessor(stack, taken, attempt.scene, held)
+                stack = replace(stack, held_shares=(held.rise, held.fall))
+                binned = held_light.remove_held_light(stack, taken, held)
+                continue
+            held_rounds = 0
         readable = [k for k in range(len(stack.patterns)) if k not in stack.unusable]
         seen = frame_evidence.measure_frames(stack, binned, attempt.scene, readable)
         flags = frame_inspection.inspect_frames(stack, seen, excluded)
@@ -224,7 +237,7 @@ def _check_rounds(
             left = light - (1.0 if stack.light is None else stack.light)
             if (
                 np.abs(left).max() > (_UNEVEN if stack.light is None else _LIGHT_KNOWN)
-                and done < rounds
+                and done < rounds + held_light.ROUNDS
             ):
                 stack = replace(stack, light=light)  # a round with the light that each frame had
                 continue
@@ -245,7 +258,14 @@ def _check_rounds(
                 )
             )
             return Checked(
-                stack, binned, *fitted, _merge_flags(flags, known), film_um, noise_um, light_left
+                stack,
+                binned,
+                *fitted,
+                _merge_flags(flags, known),
+                film_um,
+                noise_um,
+                light_left,
+                held,
             )
         pair = next((flag for flag in fresh if flag.swapped_with is not None), None)
         if (
@@ -256,6 +276,7 @@ def _check_rounds(
             order = list(range(len(stack.patterns)))
             order[pair.frame], order[pair.swapped_with] = pair.swapped_with, pair.frame
             stack, binned = stack.reordered(order), binned.reordered(order)
+            taken = taken.reordered(order)
             known |= {
                 flag.frame: flag for flag in flags if flag.frame in (pair.frame, pair.swapped_with)
             }

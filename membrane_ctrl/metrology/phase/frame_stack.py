@@ -28,6 +28,11 @@ class FrameStack:
     light: FloatArray | None = None
     # (frames, height): of the light of each row, where bands of a backlight are known
     gain: FloatArray | None = None
+    # (frames,): the frame that was taken before each; -1: none of the set. None: the patterns were
+    # taken in their order
+    before: tuple[int, ...] | None = None
+    # of that frame's picture which each one still shows, where it is brighter, where darker
+    held_shares: tuple[float, float] = (0.0, 0.0)
 
     def sinusoids(self, axis: str) -> list[int]:
         """Frames that show the sinusoids of an axis."""
@@ -42,6 +47,17 @@ class FrameStack:
     def single(self, role: str) -> int | None:
         """The white or the black frame."""
         return next((k for k, p in enumerate(self.patterns) if p.role == role), None)
+
+    def before_of(self, frame: int) -> int:
+        """The frame that was taken before this one; -1: none of the set, or no picture."""
+        before = frame - 1 if self.before is None else self.before[frame]
+        return -1 if before in self.unusable else before
+
+    @property
+    def last_taken(self) -> int:
+        """The frame that was taken last."""
+        followed = {self.before_of(frame) for frame in range(len(self.patterns))}
+        return next(frame for frame in range(len(self.patterns)) if frame not in followed)
 
     def shifts_rad(self, frames: list[int]) -> FloatArray:
         """Phase steps of sinusoids."""
@@ -64,7 +80,10 @@ class FrameStack:
     def reordered(self, order: list[int]) -> "FrameStack":
         """The same with other pictures for the patterns: frame k shows what `order[k]` did."""
         gain = None if self.gain is None else self.gain[order]
-        return replace(self, frames=self.frames[order], light=None, gain=gain)
+        place = {taken: frame for frame, taken in enumerate(order)}
+        former = [self.before_of(taken) for taken in order]
+        before = tuple(place[taken] if taken >= 0 else -1 for taken in former)
+        return replace(self, frames=self.frames[order], light=None, gain=gain, before=before)
 
     @property
     def readings_um(self) -> FloatArray:
@@ -80,6 +99,16 @@ class FrameStack:
     def size_px(self) -> tuple[int, int]:
         """Height and width."""
         return self.frames.shape[1], self.frames.shape[2]
+
+
+def find_frames_before(time_s: FloatArray) -> tuple[int, ...] | None:
+    """Return the frame that was taken before each; None if not all times are known."""
+    if not np.isfinite(time_s).all() or np.unique(time_s).size < time_s.size:
+        return None
+    order = np.argsort(time_s)
+    before = np.full(time_s.size, -1)
+    before[order[1:]] = order[:-1]
+    return tuple(before.tolist())
 
 
 @dataclass(frozen=True)

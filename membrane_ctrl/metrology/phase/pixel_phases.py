@@ -28,6 +28,9 @@ class PixelPhases:
 @compile_kernel
 def _compute_phases(  # type: ignore[no-untyped-def]
     frames,
+    previous,
+    rise,
+    fall,
     index,
     fade,
     weights,
@@ -58,18 +61,18 @@ def _compute_phases(  # type: ignore[no-untyped-def]
             value = float(frames[k, place])
             top = max(top, value)
             bottom = min(bottom, value)
+            more = value - float(previous[k, place])
+            value += (rise if more > 0 else fall) * more
             value *= fade[k, row]
             mean += weights[0, k] * value
             c += weights[1, k] * value
             s += weights[2, k] * value
         rest = 0.0
         for k in range(steps):
-            left = (
-                float(frames[k, place]) * fade[k, row]
-                - mean * design[k, 0]
-                - c * design[k, 1]
-                - s * design[k, 2]
-            )
+            value = float(frames[k, place])
+            more = value - float(previous[k, place])
+            value += (rise if more > 0 else fall) * more
+            left = value * fade[k, row] - mean * design[k, 0] - c * design[k, 1] - s * design[k, 2]
             rest += left * left
         c, s = remove_phasor_motion(c, s, slope[p], turn, mirror)
         wrapped = branchless_arctan2(s, c)
@@ -90,6 +93,8 @@ def pixel_phases(
     reference_rad: FloatArray,
     clip: ClipLevels,
     gain: FloatArray | None = None,
+    previous: Image | None = None,
+    held_shares: tuple[float, float] = (0.0, 0.0),
 ) -> PixelPhases:
     """Phases of one axis.
 
@@ -111,16 +116,25 @@ def pixel_phases(
         Levels at which the camera clips.
     gain : (N, height) array, optional
         Of the light of the rows of each frame.
+    previous : (N, height, width) array, optional
+        The frames taken before each.
+    held_shares : two floats
+        Shares of those that the frames still show, where they are brighter and where darker.
     """
     flat = frames.reshape(len(frames), -1)
     phase = reference_rad.copy()
     out = np.empty((2, index.size), np.float32)
     fade = np.ones(frames.shape[:2]) if gain is None else 1 / gain
+    before = flat if previous is None else previous.reshape(flat.shape)
+    rise, fall = (share / (1 - share) for share in held_shares)
     fixed = (fade, np.linalg.pinv(design), design, combined.turn, combined.mirror)
 
     def run(start: int, stop: int) -> None:
         _compute_phases(
             flat,
+            before,
+            rise,
+            fall,
             index,
             *fixed,
             sensitivity_rad_per_um,

@@ -15,6 +15,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from membrane_ctrl.config.optics import OpticsConfig, SigmasConfig
+from membrane_ctrl.metrology.frame_checks.held_light import UNKNOWN, HeldLight
 from membrane_ctrl.metrology.phase import phase_steps, screen_scale
 from membrane_ctrl.metrology.rays import ray_tracing
 from membrane_ctrl.metrology.rays.surface import PARAMETERS
@@ -35,6 +36,7 @@ from membrane_ctrl.metrology.uncertainty import (
     trial_bench,
 )
 from membrane_ctrl.metrology.uncertainty.cycle_frames import FrameErrors, estimate_frame_errors
+from membrane_ctrl.metrology.uncertainty.held_light_error import held_light_of_cycles
 from membrane_ctrl.model.arrays import AnyArray, FloatArray, IntArray
 
 # Some points determine light and place of a frame to 1e-4 and 20 nm, a tenth of what they leave
@@ -221,6 +223,7 @@ class ErrorWatch:
         self._shifts_rad, self._laser_noise_um, self._spread = shifts_rad, laser_noise_um, spread
         self._weights = np.stack([phase_steps.step_weights(shifts) for shifts in shifts_rad])
         self._errors: LiveErrors | None = None
+        self._held = UNKNOWN
         self._asked: IntArray = np.empty(0, int)  # of the tracked points
         self._reference_um = math.nan  # displacement of the reference cycle
         # of the bins asked then: phases less those of the surface
@@ -237,8 +240,12 @@ class ErrorWatch:
             else self._errors.common_mm2
         )
 
-    def begin(self, state: tracked_points.TrackedPoints) -> None:
-        """Choose from the points of a full cycle those that are asked."""
+    def begin(self, state: tracked_points.TrackedPoints, held: HeldLight = UNKNOWN) -> None:
+        """Choose from the points of a full cycle those that are asked.
+
+        `held` is what its frames showed of the previous ones.
+        """
+        self._held = held
         places_px = self._places_px[:, state.index]
         self._asked = np.flatnonzero(
             trial_bench.spread_evenly(places_px, self._optics.camera.width_px, POINTS)
@@ -308,8 +315,10 @@ class ErrorWatch:
                 self._optics, tracer, fit.surface, some, places_px[:, at], exact, at.size
             )
 
+        few = bench(asked)
+        left = np.column_stack([left, held_light_of_cycles(few, self._shifts_rad, self._held)])
         return LiveErrors.of(
-            bench(asked),
+            few,
             bench(many),
             self._shifts_rad,
             light[:, many],

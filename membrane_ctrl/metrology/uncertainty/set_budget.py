@@ -23,6 +23,7 @@ from membrane_ctrl.metrology.uncertainty import (
 )
 from membrane_ctrl.metrology.uncertainty.film_shape_error import film_shape_source
 from membrane_ctrl.metrology.uncertainty.geometry_spread import GeometrySpread
+from membrane_ctrl.metrology.uncertainty.held_light_error import held_light_source
 from membrane_ctrl.metrology.uncertainty.image_blur import estimate_blur_px
 from membrane_ctrl.metrology.uncertainty.laser_errors import vertex_um
 from membrane_ctrl.metrology.uncertainty.rim_check import RimMisfit, measure_rim_misfit
@@ -106,6 +107,7 @@ def assemble_budget(
             _film_um(moved),
             math.hypot(frame_effects.LIGHT, checked.light_left),
         ),
+        held_light_source(bench, checked.stack, checked.view.used, checked.held),
         *residual_patches.pixel_sources(full, slope_variance, noise_adu),
     ]
     return SetBudget(budget.Budget(tuple(sources), disc), tuple(doubts), rim, slopes)

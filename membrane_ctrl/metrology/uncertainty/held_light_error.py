@@ -1,0 +1,77 @@
+"""Error of the figure by what each frame still shows of the previous picture."""
+
+import math
+from dataclasses import replace
+
+import numpy as np
+
+from membrane_ctrl.metrology.frame_checks.held_light import HeldLight
+from membrane_ctrl.metrology.phase import phase_steps, screen_scale
+from membrane_ctrl.metrology.phase.frame_stack import FrameStack
+from membrane_ctrl.metrology.phase.gray_code import gray_bit
+from membrane_ctrl.metrology.phase.pattern_sequence import AXES, fringe_sequence
+from membrane_ctrl.metrology.uncertainty.budget import Source
+from membrane_ctrl.metrology.uncertainty.trial_bench import TrialBench
+from membrane_ctrl.model.arrays import FloatArray
+
+_SAYS = "what each frame still shows of the previous picture"
+
+
+def held_light_source(
+    bench: TrialBench, stack: FrameStack, used: tuple[list[int], list[int]], held: HeldLight
+) -> Source:
+    """Return the row of the budget; without an estimate its uncertainty is 0, and so stated."""
+    sigma = held.left if math.isfinite(held.left) else 0.0
+    effect = held_light_effect(bench, stack, used)
+    # The panel holds the same share in all sets of a bench, but each set estimates its own
+    return Source("held_share", _SAYS, sigma, sigma * effect[:, None], common=False, paired=False)
+
+
+def held_light_of_cycles(bench: TrialBench, shifts_rad: FloatArray, held: HeldLight) -> FloatArray:
+    """Return the error (parameters,), mm, that live cycles share: that of their fringes.
+
+    `shifts_rad` (2, N) are the steps of x and y.
+    """
+    patterns = fringe_sequence(bench.optics.pattern)
+    shifted = tuple(
+        replace(pattern, shift_rad=float(shift))
+        for pattern, shift in zip(patterns, shifts_rad.ravel(), strict=True)
+    )
+    count = len(shifted)
+    stack = FrameStack(np.empty((count, 0, 0), np.uint8), shifted, np.full(count, np.nan), {})
+    used = (stack.sinusoids(AXES[0]), stack.sinusoids(AXES[1]))
+    sigma = held.left if math.isfinite(held.left) else 0.0
+    return sigma * held_light_effect(bench, stack, used)
+
+
+def held_light_effect(
+    bench: TrialBench, stack: FrameStack, used: tuple[list[int], list[int]]
+) -> FloatArray:
+    """Return the change of the parameters (parameters,), mm, per unit of the share."""
+    scale = screen_scale.mm_per_rad(bench.optics.pattern)
+    centre_rad = screen_scale.centre_phase_rad(bench.optics.pattern)
+    angle = bench.screen_mm / scale + centre_rad
+    off = np.zeros_like(bench.screen_mm)
+    for axis, frames in enumerate(used):
+        _, cosine, sine = phase_steps.step_weights(stack.shifts_rad(frames))
+        for k, frame in enumerate(frames):
+            previous = stack.before_of(frame)
+            if previous < 0:
+                continue
+            change = _wave(stack, previous, angle) - _wave(stack, frame, angle)
+            off[axis] -= (
+                scale * change * (cosine[k] * np.sin(angle[axis]) - sine[k] * np.cos(angle[axis]))
+            )
+    solved = bench.solve(bench.geometry(), off, linear=True)
+    return np.asarray(solved - bench.surface.parameters)
+
+
+def _wave(stack: FrameStack, frame: int, angle: FloatArray) -> FloatArray:
+    """Light (n,) of a frame about its mean, over the amplitude of the fringes."""
+    pattern = stack.patterns[frame]
+    if pattern.role in ("white", "black"):
+        return np.full(angle.shape[1], 1.0 if pattern.role == "white" else -1.0)
+    along = angle[AXES.index(pattern.axis)]
+    if pattern.role == "gray":
+        return np.asarray(2.0 * gray_bit(along, pattern.index)[0] - 1.0)
+    return np.asarray(np.cos(along + pattern.shift_rad))
