@@ -93,6 +93,8 @@ def estimate_held_light(
         return UNKNOWN
     (rise, rise_sigma), (fall, fall_sigma) = (_middle(way) for way in found)
     sigma = math.hypot(rise_sigma, fall_sigma) / math.sqrt(2)
+    if len(found[0]) == 1:  # no scatter: only their difference shows whether they are true
+        sigma = math.hypot(sigma, rise - fall)
     return HeldLight(rise, fall, math.hypot(sigma, _FLOOR))
 
 

@@ -199,10 +199,11 @@ def _check_rounds(
     known |= {flag.frame: flag for flag in frame_inspection.find_obvious_faults(stack, binned)}
     excluded = set(known)
     flags: list[frame_faults.Flag] = []
-    taken, held, held_rounds = binned, held_light.UNKNOWN, held_light.ROUNDS
-    for done in range(rounds + held_light.ROUNDS + 1):
+    taken = binned  # as the camera took them
+    for done in range(rounds + 1):
         try:
-            attempt = _attempt_fit(stack, binned, optics, geometry, grid, near, excluded, anchor)
+            bench = _Bench(optics, geometry, grid, near, anchor)
+            stack, binned, attempt, held = _attempt_without_held(stack, taken, bench, excluded)
         except (bin_view.NoFigureError, ValueError) as error:
             used = [k for axis in AXES for k in stack.sinusoids(axis) if k not in excluded]
             clipped = clipping.clipped_shares_of_lit(
@@ -210,17 +211,6 @@ def _check_rounds(
             )
             named = _merge_flags(_keep_believable(stack, flags), known)
             raise RejectedSetError(clipped.cause or str(error), named, clipped.white) from None
-        if held_rounds:
-            found = held_light.estimate_held_light(stack, binned, attempt.scene, excluded)
-            held = held_light.add_held_light(held, found)
-            held_rounds -= 1
-            if held.corrected and held_light.is_worth_another_round(found):
-                if not any(stack.held_shares):
-                    stack = held_light.add_first_predecessor(stack, taken, attempt.scene, held)
-                stack = replace(stack, held_shares=(held.rise, held.fall))
-                binned = held_light.remove_held_light(stack, taken, held)
-                continue
-            held_rounds = 0
         readable = [k for k in range(len(stack.patterns)) if k not in stack.unusable]
         seen = frame_evidence.measure_frames(stack, binned, attempt.scene, readable)
         flags = frame_inspection.inspect_frames(stack, seen, excluded)
@@ -237,7 +227,7 @@ def _check_rounds(
             left = light - (1.0 if stack.light is None else stack.light)
             if (
                 np.abs(left).max() > (_UNEVEN if stack.light is None else _LIGHT_KNOWN)
-                and done < rounds + held_light.ROUNDS
+                and done < rounds
             ):
                 stack = replace(stack, light=light)  # a round with the light that each frame had
                 continue
@@ -275,8 +265,7 @@ def _check_rounds(
         ):
             order = list(range(len(stack.patterns)))
             order[pair.frame], order[pair.swapped_with] = pair.swapped_with, pair.frame
-            stack, binned = stack.reordered(order), binned.reordered(order)
-            taken = taken.reordered(order)
+            stack, taken = stack.reordered(order), taken.reordered(order)
             known |= {
                 flag.frame: flag for flag in flags if flag.frame in (pair.frame, pair.swapped_with)
             }
@@ -298,30 +287,65 @@ class _Attempt:
     scene: frame_evidence.SampledBins
 
 
+@dataclass(frozen=True)
+class _Bench:
+    """What all attempts to fit a set share."""
+
+    optics: OpticsConfig
+    geometry: Geometry
+    grid: bin_grid.BinGrid
+    near: BoolArray
+    anchor: Anchor | None
+
+
+def _attempt_without_held(
+    stack: frame_stack.FrameStack,
+    taken: frame_stack.Binned,
+    bench: _Bench,
+    excluded: set[int],
+) -> tuple[frame_stack.FrameStack, frame_stack.Binned, _Attempt, held_light.HeldLight]:
+    """Fit the bins without what the frames show of the previous ones.
+
+    Returns the stack that states those shares, the bins without them, the fit, and the shares.
+    Raises NoFigureError or ValueError if there is no fit.
+    """
+    stack = replace(stack, held_shares=(0.0, 0.0))
+    binned, held = taken, held_light.UNKNOWN
+    attempt = _attempt_fit(stack, binned, bench, excluded)
+    for _ in range(held_light.ROUNDS):
+        found = held_light.estimate_held_light(stack, binned, attempt.scene, excluded)
+        held = held_light.add_held_light(held, found)
+        if not held.corrected or not held_light.is_worth_another_round(found):
+            break
+        if not any(stack.held_shares):
+            stack = held_light.add_first_predecessor(stack, taken, attempt.scene, held)
+        stack = replace(stack, held_shares=(held.rise, held.fall))
+        binned = held_light.remove_held_light(stack, taken, held)
+        attempt = _attempt_fit(stack, binned, bench, excluded)
+    return stack, binned, attempt, held
+
+
 def _attempt_fit(
     stack: frame_stack.FrameStack,
     binned: frame_stack.Binned,
-    optics: OpticsConfig,
-    geometry: Geometry,
-    grid: bin_grid.BinGrid,
-    near: BoolArray,
+    bench: _Bench,
     excluded: set[int],
-    anchor: Anchor | None,
 ) -> _Attempt:
     """Fit the bins without the excluded frames. Raises NoFigureError
     or ValueError if that fails.
     """
+    optics, anchor = bench.optics, bench.anchor
     tracer = ray_tracing.Tracer(
-        geometry, optics.mirror.radius_mm, vertex_z_mm(optics, stack.mean_reading_um)
+        bench.geometry, optics.mirror.radius_mm, vertex_z_mm(optics, stack.mean_reading_um)
     )
     view = bin_view.combine_frames(
         stack, binned, excluded, None if anchor is None else anchor.light
     )
     phase = absolute_phases_of_bins(stack, binned, view, anchor, optics)
-    candidates = np.flatnonzero(near)
+    candidates = np.flatnonzero(bench.near)
     flat = phase.reshape(2, -1)[:, candidates]
     state = tracked_points.select_points(
-        grid, tracer, candidates, flat, optics.pattern, optics.mirror.analysis_radius_mm
+        bench.grid, tracer, candidates, flat, optics.pattern, optics.mirror.analysis_radius_mm
     )
     predicted = tracer.predict_screen(state.points, state.surface) / mm_per_rad(optics.pattern)
     light = view.light.reshape(-1)[state.index]
