@@ -19,7 +19,7 @@ from membrane_ctrl.metrology.frame_checks.set_check import check_set
 from membrane_ctrl.metrology.phase.frame_stack import FrameStack, find_frames_before
 from membrane_ctrl.metrology.phase.pattern_sequence import fringe_sequence
 from membrane_ctrl.metrology.uncertainty.set_budget import assemble_budget
-from membrane_ctrl.model.shape_estimate import judge
+from membrane_ctrl.model.shape_estimate import judge_quality
 from tests.worlds.light_bench import LightEffects, quarter_bench, render_frames, render_set
 
 OPTICS = quarter_bench()
@@ -44,7 +44,7 @@ def held_row_um(checked: Checked) -> tuple[float, str, tuple[str, ...]]:
     full = reconstruct_full(OPTICS, checked, measure_pixels(OPTICS, checked))
     budget = assemble_budget(OPTICS, checked, full, geometry_spread(OPTICS, None)[0], 0.4, None)
     row = next(row for row in budget.budget.rows() if row["name"] == "held_share")
-    verdict = judge(full.quality)[0]
+    verdict = judge_quality(full.quality)[0]
     return row["height_rms_um"], checked.verdict[0] if verdict == "ok" else verdict, budget.doubts
 
 
