@@ -206,6 +206,10 @@ class InterlockBench:
         )
         return (*self._bench.dead_guards(), *ended)
 
+    def link_state(self) -> roles.LinkState:
+        """The bench's; interlocks never delay a reading."""
+        return self._bench.link_state()
+
     async def close(self) -> None:
         """Close the bench first, then the sources. Never raises."""
         await self._bench.close()

@@ -26,8 +26,7 @@ from firmware_iface import roles
 
 T = TypeVar("T")
 WATCHDOG_BIT = 0  # in latched_faults, as on the pump board
-# displacement_quality when the sensor itself does not answer; no instrument's code
-NO_ANSWER = 0xFFFF
+NO_ANSWER = roles.NO_ANSWER
 _ANY = (-math.inf, math.inf)
 _RETRY_S = 0.1  # between two attempts to open a lost sensor; its link has the longer back-off
 
@@ -78,6 +77,8 @@ class RoleBench:
         self._fed_s = math.inf
         self._commanded = 0.0
         self._tripped = False
+        self._silent: dict[str, str] = {}  # why a sensor gave no valid answer, by role
+        self._answered_s: dict[str, float] = {}  # when, by role, in this reading
         self.identities: dict[str, roles.DeviceIdentity] = {}
 
     async def open(self) -> roles.BenchIdentity:
@@ -122,6 +123,7 @@ class RoleBench:
         the watchdog has ended).
         """
         await self._require_watchdog()
+        self._answered_s.clear()
         sensors = asyncio.ensure_future(self._sensors())  # never raises
         try:
             pump, vent = await self._actuators()
@@ -178,6 +180,12 @@ class RoleBench:
         """The software watchdog, if its task has ended while the bench is open."""
         return () if self._watchdog is None or not self._watchdog.done() else ("software watchdog",)
 
+    def link_state(self) -> roles.LinkState:
+        """Sensors without a valid answer to the last reading, and the device that answered last."""
+        answered_s = self._answered_s
+        slowest = max(answered_s, key=answered_s.__getitem__) if answered_s else ""
+        return roles.LinkState(tuple(self._silent.items()), slowest)
+
     async def close(self) -> None:
         """Close every device, the pump first. Never raises."""
         await self._stop_reopening()
@@ -200,10 +208,10 @@ class RoleBench:
         """Read-back of pump and vent; NaN for a vent that the bench does not have."""
         vent = self._devices.vent
         if vent is None:
-            return await answer("pump", self._devices.pump.pump_fraction()), math.nan
+            return await self._asked("pump", self._devices.pump.pump_fraction()), math.nan
         asked = (
-            answer("pump", self._devices.pump.pump_fraction()),
-            answer("vent", vent.vent_fraction()),
+            self._asked("pump", self._devices.pump.pump_fraction()),
+            self._asked("vent", vent.vent_fraction()),
         )
         found = await asyncio.gather(*asked, return_exceptions=True)
         _raise_first(found)
@@ -216,7 +224,8 @@ class RoleBench:
         self._last_sample = replace(self._last_sample, displacement_um=math.nan, quality=NO_ANSWER)
         if laser is not None and "displacement" not in self._tasks:
             try:
-                self._last_sample = await answer("displacement", laser.displacement())
+                self._last_sample = await self._asked("displacement", laser.displacement())
+                self._silent.pop("displacement", None)
             except roles.LinkError as error:
                 self._failed("displacement", error)
         return self._last_sample
@@ -227,13 +236,22 @@ class RoleBench:
         if device is None or role.name in self._tasks:
             return math.nan
         try:
-            value: float = await answer(role.name, getattr(device, role.reads)())
+            value: float = await self._asked(role.name, getattr(device, role.reads)())
         except roles.LinkError as error:
             self._failed(role.name, error)
             return math.nan
+        self._silent.pop(role.name, None)
         return value
 
+    async def _asked(self, role: str, asked: Awaitable[T]) -> T:
+        """`answer`, with its time noted."""
+        try:
+            return await answer(role, asked)
+        finally:
+            self._answered_s[role] = self._clock()
+
     def _failed(self, role: str, error: roles.LinkError) -> None:
+        self._silent[role] = str(error)
         if isinstance(error, roles.LinkDownError) and role not in self._tasks:
             self._tasks[role] = asyncio.create_task(self._reopen(role), name=f"open {role} again")
 
@@ -243,9 +261,14 @@ class RoleBench:
         """
         device = self._devices.by_role()[role]
         while True:
-            with contextlib.suppress(roles.LinkError):
+            try:
                 if await answer(role, device.open()) == self.identities[role]:
                     break
+                self._silent[role] = "another device than before answers; open the bench again"
+            except roles.LinkWaitsError:
+                pass  # the failure that it waits after says more
+            except roles.LinkError as error:
+                self._silent[role] = str(error)
             await asyncio.sleep(_RETRY_S)
         del self._tasks[role]
 

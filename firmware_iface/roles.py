@@ -77,6 +77,9 @@ def _declare_sensor(name: str, reads: str, unit: str, needed: bool = False) -> d
     return {_ROLE: Role(name, reads, unit, needed)}
 
 
+# `BenchReading.displacement_quality` when the sensor itself does not answer; no instrument's code
+NO_ANSWER = 0xFFFF
+
 # bits of `BenchReading.foreign`
 FOREIGN_CLAIM, FOREIGN_PERIOD = 1, 2
 
@@ -184,6 +187,25 @@ class BenchIdentity:
     interlocks_fitted: int = 0
 
 
+@dataclass(frozen=True, slots=True)
+class LinkState:
+    """What a bench knows of the links to its single devices; a bench of one device knows nothing.
+
+    Attributes
+    ----------
+    silent : tuple of (str, str)
+        Role of each sensor that gave no valid answer to the last reading, and why, for people.
+    slowest : str
+        Role of the device that answered the last reading last.
+    """
+
+    silent: tuple[tuple[str, str], ...] = ()
+    slowest: str = ""
+
+
+NO_LINK_STATE = LinkState()
+
+
 class Bench(Protocol):
     """Displacement sensor, pressure sensors, thermometers, pump and vent, however many devices fill
     the roles.
@@ -206,6 +228,9 @@ class Bench(Protocol):
 
     def dead_guards(self) -> tuple[str, ...]:
         """Names of this bench's guards that no longer run; checked in every tick."""
+
+    def link_state(self) -> LinkState:
+        """How the single devices answered the last reading."""
 
     async def close(self) -> None:
         """Close the link; the caller has written the safe state before. Never raises."""

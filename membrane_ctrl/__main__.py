@@ -3,6 +3,7 @@
 Kept thin: child processes started with `spawn` import this module again.
 """
 
+import logging
 import os
 import sys
 
@@ -12,6 +13,8 @@ def main() -> None:
     # Matrices are small: a second thread of OpenBLAS would only wait, for a third of the CPU time
     # of `measure`
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
+    # It logs each folder that it cannot write; it works without one
+    logging.getLogger("matplotlib").setLevel(logging.ERROR)
     from membrane_ctrl.cli import run
 
     sys.exit(run(sys.argv[1:]))

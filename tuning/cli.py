@@ -104,7 +104,8 @@ def _step(name: str) -> None:
     ) -> int:
         from membrane_ctrl.config import schema, toml_file
         from membrane_ctrl.control_port.ctl import Where
-        from tuning.options import TuneOptions, find_author_name
+        from membrane_ctrl.model.account import account_name
+        from tuning.options import TuneOptions
 
         options = TuneOptions(
             config=schema.Config()
@@ -115,7 +116,7 @@ def _step(name: str) -> None:
             logs=logs,
             session=session,
             name=session_name,
-            author=author or find_author_name(),
+            author=author or account_name(),
             reason=reason,
             limit_um=limit_um,
             observe_s=durations.parse_duration_s(observe),
@@ -179,10 +180,10 @@ def save(
     """Save the kept gains of a session into a configuration, so that the next hold starts with
     them.
     """
+    from membrane_ctrl.model.account import account_name
     from tuning.commands import save
-    from tuning.options import find_author_name
 
-    return save.save_to_configuration(config, session, logs, author or find_author_name(), yes)
+    return save.save_to_configuration(config, session, logs, author or account_name(), yes)
 
 
 @app.command()
@@ -210,11 +211,11 @@ def explore(
     """Explore gains by hand: a page with sliders, on the fitted plant in the recorded weather; a
     session live.
     """
+    from membrane_ctrl.model.account import account_name
     from tuning.commands.live_page import NEEDS_BOKEH
-    from tuning.options import find_author_name
 
     try:
         from tuning.explore.page import explore
     except ModuleNotFoundError:
         raise errors.InputError(NEEDS_BOKEH.format("tune explore")) from None
-    return explore(folder, logs, port, author or find_author_name())
+    return explore(folder, logs, port, author or account_name())

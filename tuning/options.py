@@ -1,7 +1,5 @@
 """Options of the subcommands of `tune`."""
 
-import contextlib
-import getpass
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -46,10 +44,3 @@ class TuneOptions:
         """
         early = tuple(stage for stage in STAGES[:-1] if stage[0] < self.verify_s)
         return (*early, (self.verify_s, STAGES[-1][1]))
-
-
-def find_author_name() -> str:
-    """Login name."""
-    with contextlib.suppress(OSError, KeyError):
-        return getpass.getuser()
-    return "unknown"

@@ -206,7 +206,12 @@ class Optoncdt1420:
                 f"no answer within {self._config.timeout_s:g} s; is it on, wired and set to "
                 f"{self._port.settings}?"
             )
-            if self._heard:
+            if self._heard.strip() == command.encode("ascii"):
+                hint = (
+                    "only what was sent comes back: the sensor is silent and the adapter echoes, "
+                    "or the line's two directions are joined"
+                )
+            elif self._heard:
                 hint = (
                     f"{len(self._heard)} bytes but no prompt within {self._config.timeout_s:g} "
                     "s; wrong baud rate?"

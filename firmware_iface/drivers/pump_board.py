@@ -253,6 +253,10 @@ class PumpBoard:
         """None: the watchdog is the board's own, and its state is in each reading."""
         return ()
 
+    def link_state(self) -> roles.LinkState:
+        """Nothing: there is one link, whose errors are raised."""
+        return roles.NO_LINK_STATE
+
     async def close(self) -> None:
         """Disarm the watchdog, which gives the claim back, and close the link; never raises.
 

@@ -107,7 +107,7 @@ class VaisalaPtb330(exchange.LineDriver):
     async def _identify(self) -> roles.DeviceIdentity:
         try:
             about = await self._link.query("?", _IDENTITY, 1000)
-        except roles.LinkDownError:
+        except (roles.LinkDownError, roles.DeviceRefusedError):
             raise
         except roles.LinkError as error:
             raise roles.DeviceRefusedError(f"{error} (or it is not a PTB330)") from error

@@ -9,6 +9,9 @@ to the next one. Three rules keep them apart.
    been quiet for `quiet_s`.
 3. Then comes a *fence*: a harmless question with an unmistakable answer. Devices answer in order,
    so once the fence is answered, any earlier answer has come (and was discarded) or never will.
+
+Two faults of the line have signatures of their own, so that they are named: what was sent comes
+back before the answer (local echo of an RS-485 adapter), and a valid answer comes after its time.
 """
 
 import asyncio
@@ -17,9 +20,18 @@ from collections import defaultdict
 from collections.abc import Awaitable, Callable
 from dataclasses import dataclass
 
+from firmware_iface.links.late_answers import LateAnswers
 from firmware_iface.links.serial_port import SerialPort
-from firmware_iface.roles import DeviceIdentity, LinkDownError, LinkError
+from firmware_iface.roles import DeviceIdentity, DeviceRefusedError, LinkDownError, LinkError
 
+_ECHO = (
+    "the adapter echoes what is sent; switch its local echo off (on RS-485, disable the receiver "
+    "while sending)"
+)
+_ONLY_ECHO = (
+    "only what was sent comes back: the device is silent and the adapter echoes, or the line's "
+    "two directions are joined"
+)
 _SHOWN_BYTES = 24
 # after this many questions without a valid answer the line is closed: its owner then reopens it,
 # which also applies the settings that a device loses with its power
@@ -42,6 +54,19 @@ class Question:
         int  # length of the longest answer: its time on the wire is added to the device's own
     )
     what: str  # for messages: device and request
+    # a valid answer may equal the question: then an echo cannot be recognised by it
+    answer_repeats: bool = False
+    # a valid answer shows that the device can be read: the next `open` may follow at once
+    reads: bool = True
+
+
+@dataclass(slots=True)
+class _Abandoned:
+    """A question that was not answered in time, and the bytes since it was asked."""
+
+    question: Question
+    asked_s: float
+    heard: bytes
 
 
 class SerialExchange:
@@ -68,9 +93,14 @@ class SerialExchange:
         self._noisy = False
         self._last_byte_s = 0.0
         self._heard = b""
-        self._take: Callable[[bytes], bytes | None] | None = None
-        self._answer_bytes = 0
+        self._question: Question | None = None  # the last one
         self._answer: asyncio.Future[bytes] | None = None
+        self._abandoned: _Abandoned | None = None  # the last question without an answer in time
+        # the last question that was answered by its own bytes; the same bytes once more are the
+        # device's answer after an echo
+        self._repeated = b""
+        self._echoes = False
+        self._late = LateAnswers()
 
     def connect(self, greeting: bytes = b"") -> None:
         """Open the line; discard outstanding answers to an earlier user.
@@ -82,6 +112,7 @@ class SerialExchange:
         self._sure.clear()
         self._failures = 0
         self._noisy = True
+        self._abandoned, self._repeated, self._echoes = None, b"", False
         self._last_byte_s = asyncio.get_running_loop().time()
         if greeting:
             self.port.write(greeting)
@@ -138,7 +169,8 @@ class SerialExchange:
             ) from error
         self._failures = 0
         self._sure.add(key)
-        self.port.succeeded()
+        if question.reads:
+            self.port.succeeded()
         return answer
 
     async def _settle(self, what: str, timeout_s: float) -> None:
@@ -158,10 +190,15 @@ class SerialExchange:
 
     async def _ask(self, question: Question, timeout_s: float) -> bytes:
         self._require_open(question.what)
+        if self._echoes:
+            self._echoes, self._repeated = False, b""
+            raise DeviceRefusedError(f"{question.what}: {_ECHO}")
+        loop = asyncio.get_running_loop()
         self.port.write(question.data)
-        self._heard, self._take = b"", question.take
-        self._answer_bytes = question.answer_bytes
-        answer: asyncio.Future[bytes] = asyncio.get_running_loop().create_future()
+        self._heard, self._question = b"", question
+        asked_s = loop.time()
+        self._late.note_question()
+        answer: asyncio.Future[bytes] = loop.create_future()
         self._answer = answer
         wire_s = (len(question.data) + question.answer_bytes) * self.port.settings.char_s
         try:
@@ -171,14 +208,23 @@ class SerialExchange:
         finally:
             self._answer = None
         if not answer.done():
+            if self._heard == question.data:
+                raise DeviceRefusedError(f"{question.what}: {_ONLY_ECHO}")
+            self._abandoned = _Abandoned(question, asked_s, self._heard)
             raise LinkError(f"{question.what}: {self._missing(timeout_s)}")
-        return answer.result()
+        self._late.note_in_time()
+        self._abandoned = None
+        heard = answer.result()
+        self._repeated = question.data if self._heard == question.data else b""
+        return heard
 
     def _require_open(self, what: str) -> None:
         if not self.port.is_open:
             raise LinkDownError(f"{what}: not connected")
 
     def _missing(self, timeout_s: float) -> str:
+        if slow := self._late.explain():
+            return f"no answer within {timeout_s:g} s; {slow}"
         if not self._heard:
             return (
                 f"no answer within {timeout_s:g} s; is it on, wired and set to "
@@ -193,22 +239,58 @@ class SerialExchange:
     def received(self, data: bytes) -> None:
         """Bytes came (called by the port)."""
         self._last_byte_s = asyncio.get_running_loop().time()
-        if self._answer is None or self._answer.done() or self._take is None:
+        is_late = self._completes_abandoned(data)
+        if self._answer is None or self._answer.done() or self._question is None:
             self._noisy |= bool(data.strip(self._blank))  # unsolicited
+            self._echoes |= self._is_second_copy(data)
             return
+        question = self._question
         self._heard += data
-        if len(self._heard) > self._answer_bytes + _EXTRA_BYTES_MAX:
+        if len(self._heard) > question.answer_bytes + _EXTRA_BYTES_MAX:
             self._answer.set_exception(
                 LinkError(f"{self.port.name}: {len(self._heard)} bytes without an answer")
             )
             return
+        is_echo = self._heard.startswith(question.data)
+        if is_echo and not question.answer_repeats:
+            if len(self._heard) > len(question.data):
+                self._answer.set_exception(DeviceRefusedError(f"{question.what}: {_ECHO}"))
+            return
         try:
-            answer = self._take(self._heard)
+            answer = question.take(self._heard)
         except LinkError as error:
-            self._answer.set_exception(error)
+            if question.data.startswith(self._heard) and not is_echo:
+                return  # it may be the beginning of an echo
+            if is_echo or self._is_second_copy(self._heard):
+                self._answer.set_exception(DeviceRefusedError(f"{question.what}: {_ECHO}"))
+            elif is_late:
+                self._answer.set_exception(LinkError(f"{question.what}: {self._late.explain()}"))
+            else:
+                self._answer.set_exception(error)
         else:
             if answer is not None:
                 self._answer.set_result(answer)
+
+    def _is_second_copy(self, heard: bytes) -> bool:
+        """Whether these bytes answer a question that its own bytes had answered before."""
+        return bool(self._repeated) and heard.startswith(self._repeated)
+
+    def _completes_abandoned(self, data: bytes) -> bool:
+        """Whether these bytes complete the answer to an abandoned question; notes its delay."""
+        abandoned = self._abandoned
+        if abandoned is None:
+            return False
+        abandoned.heard = (abandoned.heard + data)[-_EXTRA_BYTES_MAX:]
+        try:
+            answer = abandoned.question.take(abandoned.heard)
+        except LinkError:
+            self._abandoned = None
+            return False
+        if answer is None:
+            return False
+        self._late.note_late(self._last_byte_s - abandoned.asked_s)
+        self._abandoned = None
+        return True
 
     def lost(self, error: LinkDownError) -> None:
         """The line is gone (called by the port)."""

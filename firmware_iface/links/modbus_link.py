@@ -29,6 +29,19 @@ EXCEPTIONS = {
     10: "gateway path unavailable",
     11: "no device behind the gateway",
 }
+# what to do; the other codes are explained by the device's manual
+_REMEDIES = {
+    1: "is this the device that the configuration names?",
+    2: "is this the device that the configuration names, and its register map?",
+    4: "the device has failed: see its manual",
+    10: "the gateway is overloaded or its serial port is off: check the gateway's settings",
+    11: "the gateway answers, but nothing on its serial line: check unit_id, and the device's "
+    "power, wiring, baud rate and parity",
+}
+SHORT_REPLY = (
+    "the device or a gateway cuts its answers: check the gateway's buffer, and that this is the "
+    "device that the configuration names"
+)
 _REFUSALS = (1, 2, 3)  # the request itself is wrong for this device; the others may be temporary
 _BUSY = 6
 
@@ -101,4 +114,5 @@ def exception_error(what: str, code: int) -> LinkError:
     kind = (
         DeviceRefusedError if code in _REFUSALS else DeviceBusyError if code == _BUSY else LinkError
     )
-    return kind(f"{what}: exception {code} ({EXCEPTIONS.get(code, 'unknown')})")
+    remedy = f"; {_REMEDIES[code]}" if code in _REMEDIES else ""
+    return kind(f"{what}: exception {code} ({EXCEPTIONS.get(code, 'unknown')}){remedy}")

@@ -161,7 +161,7 @@ class GuardedModbusRtu:
         """
         what = f"{self.name}: writing {address}"
         pdu = struct.pack(">BHH", modbus_link.WRITE_SINGLE, address, word)
-        if (await self._transact(pdu, _WRITE_BYTES, what)) != pdu:
+        if (await self._transact(pdu, _WRITE_BYTES, what, repeats=True)) != pdu:
             raise LinkError(f"{what}: the reply confirms another write")
 
     async def write_registers(self, address: int, words: Sequence[int]) -> None:
@@ -202,8 +202,10 @@ class GuardedModbusRtu:
         )  # the first coil is the lowest bit of the first byte
         return [bool(packed >> place & 1) for place in range(count)]
 
-    async def _transact(self, pdu: bytes, answer_bytes: int, what: str) -> bytes:
-        question = self._question(pdu, answer_bytes, what)
+    async def _transact(
+        self, pdu: bytes, answer_bytes: int, what: str, repeats: bool = False
+    ) -> bytes:
+        question = self._question(pdu, answer_bytes, what, repeats=repeats)
         reply = await self._bus.exchange.ask(
             question, self._timeout_s, self._fence_question(), self._unit_id
         )
@@ -216,11 +218,20 @@ class GuardedModbusRtu:
             return None
         pdu = struct.pack(">BHH", modbus_link.DIAGNOSTICS, 0, self._bus.next_token())
         return self._question(
-            pdu, _WRITE_BYTES, f"{self.name}: echo test after a loss (function 8)", pdu
+            pdu,
+            _WRITE_BYTES,
+            f"{self.name}: echo test after a loss (function 8)",
+            pdu,
+            repeats=True,
         )
 
     def _question(
-        self, pdu: bytes, answer_bytes: int, what: str, exactly: bytes = b""
+        self,
+        pdu: bytes,
+        answer_bytes: int,
+        what: str,
+        exactly: bytes = b"",
+        repeats: bool = False,
     ) -> exchange.Question:
         def take(heard: bytes) -> bytes | None:
             reply = take_reply(heard, self._unit_id, pdu[0], answer_bytes, what)
@@ -233,7 +244,9 @@ class GuardedModbusRtu:
                 raise LinkError(f"{what}: the echo differs from what was sent")
             return reply
 
-        return exchange.Question(rtu_frame(self._unit_id, pdu), take, answer_bytes, what)
+        reads = pdu[0] in _READS_REGISTERS + _READS_BITS
+        frame = rtu_frame(self._unit_id, pdu)
+        return exchange.Question(frame, take, answer_bytes, what, repeats, reads)
 
 
 class ModbusLinks:
@@ -299,7 +312,10 @@ def take_reply(
         raise LinkError(f"{what}: answer has function code {heard[1]}, expected {function_code}")
     data_bytes = answer_bytes - 5
     if length == answer_bytes and function_code in _READS_REGISTERS and heard[2] != data_bytes:
-        raise LinkError(f"{what}: {heard[2] / 2:g} registers instead of {data_bytes // 2}")
+        raise LinkError(
+            f"{what}: {heard[2] / 2:g} registers instead of {data_bytes // 2}; "
+            f"{modbus_link.SHORT_REPLY}"
+        )
     if length == answer_bytes and function_code in _READS_BITS and heard[2] != data_bytes:
         raise LinkError(f"{what}: {heard[2]} bytes of bits instead of {data_bytes}")
     if len(heard) < length:

@@ -15,11 +15,13 @@ from pymodbus.exceptions import ConnectionException, ModbusIOException
 from pymodbus.pdu import ExceptionResponse, ModbusPDU
 
 from firmware_iface.links import serial_port
+from firmware_iface.links.late_answers import LateAnswers
 from firmware_iface.links.modbus_link import (
     READ_COILS,
     READ_DISCRETE,
     READ_HOLDING,
     READ_INPUT,
+    SHORT_REPLY,
     WRITE_MULTIPLE,
     WRITE_SINGLE,
     bytes_of_bits,
@@ -44,6 +46,7 @@ _UNANSWERED_MAX = 3
 # busy for
 # seconds.
 _REPLY_BYTES_MAX = 1024
+_REMEMBERED_REQUESTS = 16
 
 
 class GuardedModbusTcp:
@@ -52,7 +55,7 @@ class GuardedModbusTcp:
     One request is in flight at a time. After its caller is cancelled, a sent request still runs to
     its reply or timeout, so that nothing is abandoned on the wire. Nothing is sent twice or
     reconnects automatically: the owner calls `connect`, which refuses to try before its back-off
-    (0.1 s, doubling to 5 s) is over.
+    (0.1 s, doubling to 5 s, until the device can be read) is over.
     """
 
     def __init__(
@@ -69,6 +72,8 @@ class GuardedModbusTcp:
         self._in_flight: asyncio.Task[ModbusPDU] | None = None
         self._back_off = serial_port.BackOff()
         self._received_bytes = 0  # since the last request was sent
+        self._asked_s: dict[int, float] = {}  # the newest requests, by transaction number
+        self._late = LateAnswers()
 
     @property
     def name(self) -> str:
@@ -93,6 +98,7 @@ class GuardedModbusTcp:
             raise LinkWaitsError(f"{self.name}: next attempt to connect in {wait_s:.1f} s")
         await self.close()
         self._back_off.attempted(self._clock())
+        self._asked_s.clear()
 
         def changed(connected: bool) -> None:
             if not connected:
@@ -117,13 +123,14 @@ class GuardedModbusTcp:
 
     def _bound_replies(self, client: AsyncModbusTcpClient) -> None:
         """Give up the connection to a peer that sends more than a device does, before the library
-        reads it.
+        reads it. Measure how late its replies are.
         """
         read = client.ctx.data_received
         self._received_bytes = 0
 
         def read_if_bounded(data: bytes) -> None:
             self._received_bytes += len(data)
+            self._note_reply(int.from_bytes(data[:2], "big"), client.ctx.request_transaction_id)
             if self._received_bytes <= _REPLY_BYTES_MAX:
                 read(data)
                 return
@@ -131,6 +138,23 @@ class GuardedModbusTcp:
             client.close()
 
         client.ctx.data_received = read_if_bounded  # type: ignore[method-assign]
+
+    def _note_request(self, transaction: int) -> None:
+        """Remember when a request is sent, to recognise its reply if that comes late."""
+        self._late.note_question()
+        self._asked_s[transaction] = self._clock()
+        while len(self._asked_s) > _REMEMBERED_REQUESTS:
+            del self._asked_s[next(iter(self._asked_s))]
+
+    def _note_reply(self, transaction: int, newest: int) -> None:
+        """Measure how late a reply comes that nobody waits for; `newest` is the present request."""
+        asked_s = self._asked_s.pop(transaction, None)
+        if asked_s is None:
+            return
+        if transaction == newest:
+            self._late.note_in_time()
+        else:
+            self._late.note_late(self._clock() - asked_s)
 
     async def read_holding(self, address: int, count: int) -> list[int]:
         """Read `count` holding registers (function code 3).
@@ -166,7 +190,6 @@ class GuardedModbusTcp:
             raise LinkError(
                 f"{what}: the reply confirms {list(reply.registers)} in {reply.address}"
             )
-        self._back_off.succeeded()
 
     async def write_registers(self, address: int, words: Sequence[int]) -> None:
         """Write holding registers (function code 16) and check the echo.
@@ -185,7 +208,6 @@ class GuardedModbusTcp:
             raise LinkError(
                 f"{what}: the reply confirms {reply.count} registers from {reply.address}"
             )
-        self._back_off.succeeded()
 
     async def _read(self, function_code: int, address: int, count: int) -> list[int]:
         what = f"{self.name}: reading {address}..{address + count - 1}"
@@ -200,8 +222,10 @@ class GuardedModbusTcp:
 
         reply = await self._exchange(send, function_code, what)
         if len(reply.registers) != count:
-            raise LinkError(f"{what}: {len(reply.registers)} registers instead of {count}")
-        self._back_off.succeeded()
+            raise LinkError(
+                f"{what}: {len(reply.registers)} registers instead of {count}; {SHORT_REPLY}"
+            )
+        self._back_off.succeeded(self._clock())
         return list(reply.registers)
 
     async def _read_bits(self, function_code: int, address: int, count: int) -> list[bool]:
@@ -219,7 +243,7 @@ class GuardedModbusTcp:
             raise LinkError(
                 f"{what}: {len(reply.bits)} bits in the reply, expected {8 * bytes_of_bits(count)}"
             )
-        self._back_off.succeeded()
+        self._back_off.succeeded(self._clock())
         return [bool(bit) for bit in reply.bits[:count]]
 
     async def close(self) -> None:
@@ -258,16 +282,20 @@ class GuardedModbusTcp:
         if client is None or not client.connected:
             raise LinkDownError(f"{what}: not connected")
         self._received_bytes = 0
+        self._note_request(client.ctx.next_tid + 1)
         try:
             reply = await send(client)
         except ConnectionException as error:
             raise LinkDownError(f"{what}: not connected") from error
         except ModbusIOException as error:
+            slow = f"; {explained}" if (explained := self._late.explain()) else ""
             if not client.connected:
                 raise LinkDownError(
-                    f"{what}: connection given up, no answer to several requests"
+                    f"{what}: connection given up, no answer to several requests{slow}"
                 ) from error
-            raise LinkError(f"{what}: no valid answer within {self._timeout_s:g} s") from error
+            raise LinkError(
+                f"{what}: no valid answer within {self._timeout_s:g} s{slow}"
+            ) from error
         _check_reply(reply, function_code, client.ctx.request_transaction_id, what)
         return reply
 

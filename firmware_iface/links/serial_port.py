@@ -22,6 +22,9 @@ from firmware_iface.roles import Clock, DeviceRefusedError, LinkDownError, LinkE
 # fast enough for a replugged cable, slow enough not to hammer a server that accepts and hangs up
 FIRST_S = 0.1
 LONGEST_S = 5.0
+# A connection that has been read for so long is good. A younger one may be one of many that open,
+# identify the device and then fail
+PROVEN_S = 1.0
 _READ_BYTES = 65_536
 # a missing port costs only one look-up: no reason to back off, and a replug must be found at once
 _ABSENT_S = 0.1
@@ -39,15 +42,16 @@ _REMEDIES = {
 
 
 class BackOff:
-    """Doubling waits between attempts.
+    """Doubling waits between attempts to connect.
 
-    Every attempt counts as failed until `succeeded` is called, so a connection dropped before the
-    first valid answer is not a success.
+    An attempt counts as failed until the device has been read for `PROVEN_S`: a connection that is
+    opened, or dropped after its first answers, is no success. The first retry after an answer is
+    free.
     """
 
     def __init__(self) -> None:
         self._wait_s = 0.0
-        self._earliest_s = float("-inf")
+        self._attempt_s = self._earliest_s = float("-inf")
 
     def remaining_s(self, now_s: float) -> float:
         """Time until the next attempt is due; 0 when it is."""
@@ -56,12 +60,15 @@ class BackOff:
     def attempted(self, now_s: float) -> None:
         """An attempt begins."""
         self._wait_s = min(max(2 * self._wait_s, FIRST_S), LONGEST_S)
+        self._attempt_s = now_s
         self._earliest_s = now_s + self._wait_s
 
-    def succeeded(self) -> None:
-        """Note a valid answer: the next attempt may follow at once."""
-        self._wait_s = 0.0
-        self._earliest_s = float("-inf")
+    def succeeded(self, now_s: float) -> None:
+        """Note a valid answer to a read."""
+        if now_s - self._attempt_s >= PROVEN_S:
+            self._wait_s = 0.0
+        if self._wait_s <= FIRST_S:
+            self._earliest_s = float("-inf")
 
 
 @dataclass(frozen=True, slots=True)
@@ -179,8 +186,8 @@ class SerialPort:
             )
 
     def succeeded(self) -> None:
-        """Note a valid answer: the next `open` may follow at once."""
-        self._back_off.succeeded()
+        """Note a valid answer to a read (see `BackOff`)."""
+        self._back_off.succeeded(self._clock())
 
     def close(self) -> None:
         """Close; never raises."""

@@ -3,7 +3,6 @@ devices.
 """
 
 import contextlib
-import getpass
 import json
 import sys
 from dataclasses import asdict
@@ -14,6 +13,7 @@ from membrane_ctrl.controller.commands import Command
 from membrane_ctrl.controller.locks import decide_unlock
 from membrane_ctrl.instruments import device_claim, lock_store
 from membrane_ctrl.model import files
+from membrane_ctrl.model.account import account_name
 from membrane_ctrl.model.errors import DeviceError, Exit, InputError, os_reason
 from membrane_ctrl.model.lock import describe_lock
 
@@ -72,7 +72,7 @@ def remove_lock(word: str) -> int:
     """
     store = lock_store.LockStore.of_machine()
     found = {each.lock: each for each in store.find_locks()}
-    remover = f"unix:{getpass.getuser()}"
+    remover = f"unix:{account_name()}"
     unlocking = decide_unlock(Command("unlock", remover, text=word, account=remover), tuple(found))
     if unlocking.lock is None:
         raise InputError(f"refused: {unlocking.refused}")

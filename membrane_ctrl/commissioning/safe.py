@@ -6,7 +6,6 @@ hangs. It claims no device, arms no watchdog and opens no sensor.
 """
 
 import asyncio
-import getpass
 import math
 import sys
 from dataclasses import dataclass
@@ -24,6 +23,7 @@ from membrane_ctrl.instruments import (
     lock_store,
     role_drivers,
 )
+from membrane_ctrl.model.account import account_name
 from membrane_ctrl.model.errors import DeviceError, Exit, InputError, os_reason
 from membrane_ctrl.model.lock import Lock
 
@@ -183,7 +183,7 @@ def _store_lock(devices: DevicesConfig) -> None:
     DeviceError.
     """
     store, keys = lock_store.LockStore.of_machine(), lock_keys.device_keys(devices)
-    account = f"unix:{getpass.getuser()}"
+    account = f"unix:{account_name()}"
     word = lock_store.draw_word({each.lock.word for each in store.find_locks()})
     set_utc = datetime.now(UTC).isoformat(timespec="seconds")
     lock = Lock(word, _TEXT, account, account, "membrane-ctrl safe", set_utc)

@@ -4,7 +4,7 @@ from itertools import pairwise
 from pathlib import Path
 from typing import Annotated, Any
 
-from pydantic import ConfigDict, Field, model_validator
+from pydantic import AfterValidator, ConfigDict, Field, model_validator
 
 from firmware_iface.settings import Micrometres, Section
 
@@ -12,6 +12,22 @@ Length = Annotated[float, Field(ge=-1e6, le=1e6)]  # of whatever unit: a kilomet
 Vector3 = tuple[Length, Length, Length]
 Sigma = Annotated[float, Field(ge=0, le=1e5)]  # of whatever unit; 0: exact
 Axis = Annotated[tuple[Length, ...], Field(min_length=2, max_length=500)]
+
+_DISTORTION_LENGTHS = (0, 4, 5, 8)
+
+
+def _check_distortion(numbers: tuple[float, ...]) -> tuple[float, ...]:
+    """Raise ValueError for a number of coefficients that no lens model has."""
+    if len(numbers) in _DISTORTION_LENGTHS:
+        return numbers
+    raise ValueError(
+        f"{len(numbers)} coefficients; give none, 4 (k1, k2, p1, p2), 5 (and k3) or 8 (and k3, k4, "
+        "k5, k6), with 0 for those that the lens does not need"
+    )
+
+
+Distortion = Annotated[tuple[Length, ...], AfterValidator(_check_distortion)]
+"""Coefficients of a lens: OpenCV's k1, k2, p1, p2[, k3[, k4, k5, k6]]."""
 
 _EVEN = 1e-6  # of the node spacing: rounding of written decimals
 _UNIT, _SQUARE = (
@@ -254,7 +270,7 @@ class CameraConfig(Section):
     """Principal point (column, row); the sensor's middle when absent. Set it from
     `calibrate-camera`.
     """
-    distortion: tuple[Length, ...] = ()
+    distortion: Distortion = ()
     """OpenCV's k1, k2, p1, p2[, k3[, k4, k5, k6]]. Set it from `calibrate-camera`."""
     noise_adu: Annotated[float, Field(ge=0, le=65_535)] = 0.4
     """Noise of a pixel, for the error bars. Change it to the measured one."""

@@ -5,11 +5,12 @@ use.
 import math
 from dataclasses import dataclass, field
 
-from firmware_iface.roles import NO_READING, BenchCommand, BenchReading
+from firmware_iface.roles import NO_ANSWER, NO_READING, BenchCommand, BenchReading
 from membrane_ctrl.config.schema import Config
 from membrane_ctrl.controller import safety, tick
 from membrane_ctrl.controller.figure_gate import FigureGate, FigureGateState
 from membrane_ctrl.controller.jumps import JumpGate
+from membrane_ctrl.controller.link_report import NO_LINK_TROUBLE
 from membrane_ctrl.model.reason import NO_REASON, Reason, WhyCode, make_reason
 from membrane_ctrl.model.state_tree import StateNode
 
@@ -71,6 +72,8 @@ class Observer:
         Those two are by figures: the laser is missing or stuck, or not used.
     figures : FigureGate
         The figures that may be used.
+    link : LinkReport
+        This tick's, of the links to the devices.
     """
 
     def __init__(self, config: Config, memory: ObserverState | None = None) -> None:
@@ -87,6 +90,7 @@ class Observer:
         self.laser_um = self.displacement_um = self.guard_um = self.gauge_pressure_pa = math.nan
         self.optics_guard_um = math.nan
         self.optics_replace_laser = False
+        self.link = NO_LINK_TROUBLE
 
     def note_command(self, command: BenchCommand) -> None:
         """Note the tick's command for comparison with the next read-backs."""
@@ -103,6 +107,7 @@ class Observer:
         `may_follow_optics`: the estimate uses the figures; otherwise they replace no laser.
         """
         reading = self.reading = inputs.reading
+        self.link = inputs.link
         now_s = inputs.now_s
         memory = self.memory
         if math.isnan(memory.last_read_s):  # ages count from the first tick
@@ -156,7 +161,12 @@ class Observer:
             return NO_REASON
         if self._by_optics:
             return self.figures.explain_unseen()
-        quality = self.reading.displacement_quality if self.reading else "unknown"
+        if not self._has_answer(self.reading):
+            why = self.link.explain_silence("displacement")
+            shown = f"no valid answer: {why}" if why else "no valid answer"
+            return make_reason(WhyCode.NO_READING, shown)
+        assert self.reading is not None  # otherwise there is no answer
+        quality = self.reading.displacement_quality
         return make_reason(WhyCode.NO_READING, f"no valid laser reading (quality {quality})")
 
     @property
@@ -194,7 +204,15 @@ class Observer:
             lateness_ms=inputs.lateness_ms,
             dead_tasks=inputs.dead_tasks,
             reading=reading or NO_READING,
+            answered=self._has_answer(reading),
+            link=inputs.link,
         )
+
+    def _has_answer(self, reading: BenchReading | None) -> bool:
+        """Whether the device that shows the displacement gave a valid answer in this tick."""
+        if reading is None:
+            return False
+        return self._by_optics or reading.displacement_quality != NO_ANSWER
 
     def _gate(self, reading: BenchReading | None, fresh: bool) -> float:
         """The displacement if it is finite, good, new, and within reach of the last good one; else

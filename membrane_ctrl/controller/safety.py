@@ -13,6 +13,7 @@ from dataclasses import dataclass, field
 
 from firmware_iface.roles import FOREIGN_CLAIM, FOREIGN_PERIOD, NO_READING, BenchReading
 from membrane_ctrl.config.schema import LimitsConfig
+from membrane_ctrl.controller.link_report import NO_LINK_TROUBLE, LinkReport
 from membrane_ctrl.model.events import Fault
 from membrane_ctrl.model.state_tree import Count, StateNode
 from membrane_ctrl.model.telemetry import SafeLevel, State
@@ -89,11 +90,23 @@ class Observation:
     interlock_words: str = ""  # the open ones with their texts
     # all sensors as they answered in this tick, for properties without memory
     reading: BenchReading = NO_READING
+    answered: bool = True  # the device that shows the displacement gave a valid answer
+    link: LinkReport = NO_LINK_TROUBLE
 
     @property
     def vent_fraction(self) -> float:
         """The vent's read-back; NaN without one."""
         return self.reading.vent_fraction
+
+    @property
+    def is_unanswered(self) -> bool:
+        """There is no displacement, because its device gave no valid answer."""
+        return not self.displacement_valid and not self.answered
+
+    def is_late_by_link(self, lateness_max_ms: float) -> bool:
+        """The tick is late, and without the last one's waiting for the devices it would not be."""
+        late_by_itself_ms = self.lateness_ms - self.link.wait_ms
+        return self.lateness_ms > lateness_max_ms >= late_by_itself_ms
 
     @property
     def deepest_um(self) -> float:
@@ -178,6 +191,11 @@ class Rule:
             latching=self.latching,
             remedy=self.remedy,
         )
+
+
+def _join_seen(*parts: str) -> str:
+    """What was seen, in words; empty parts are left out."""
+    return "; ".join(part for part in parts if part)
 
 
 TABLE: tuple[Rule, ...] = (
@@ -287,18 +305,19 @@ TABLE: tuple[Rule, ...] = (
         states=CONNECTED,
         may_resume=True,
         remedy="check cable, power and address; the board's watchdog has stopped the pump",
+        seen=lambda o: o.link.message,
         broken=lambda o, c: not o.link_up,
     ),
     Rule(
         code=31,
         name="device_silent",
-        cause="the link is up, but the device did not answer in time",
+        cause="the link is up, but the device gave no valid answer in time",
         limit="limits.stale_s",
         safe_level=SafeLevel.PUMP_OFF,
         states=CONNECTED,
         may_resume=True,
-        remedy="check the board; its watchdog has stopped the pump",
-        seen=lambda o: f"{o.reading_age_s:.2f} s",
+        remedy="mend the link as its message states; the board's watchdog has stopped the pump",
+        seen=lambda o: _join_seen(f"{o.reading_age_s:.2f} s", o.link.message),
         broken=lambda o, c: o.reading_age_s > c.stale_s,
     ),
     Rule(
@@ -311,6 +330,21 @@ TABLE: tuple[Rule, ...] = (
         remedy="find the other program that controls the board, and stop one of the two",
         seen=lambda o: " and ".join(words for bit, words in _FOREIGN.items() if o.foreign & bit),
         broken=lambda o, c: o.foreign != 0,
+    ),
+    # before `watchdog_tripped`: the same, with the cause that the link's own times show
+    Rule(
+        code=38,
+        name="watchdog_by_link",
+        cause="the board's watchdog stopped the pump while the link held up the program",
+        limit="limits.lateness_max_ms",
+        safe_level=SafeLevel.PUMP_OFF,
+        states=CONNECTED,
+        may_resume=True,
+        remedy="find why the device or the network answers late; this machine is not the cause",
+        seen=lambda o: _join_seen(o.link.explain_wait(), o.link.message),
+        broken=lambda o, c: (
+            o.watchdog_tripped and (o.link.wait_ms > c.lateness_max_ms or bool(o.link.message))
+        ),
     ),
     Rule(
         code=32,
@@ -447,6 +481,19 @@ TABLE: tuple[Rule, ...] = (
         remedy="look for something in the beam or a bumped laser",
         broken=lambda o, c: o.jumps > 0 and not o.held_by_optics,
     ),
+    # before `displacement_missing`: the laser is judged only by its answers
+    Rule(
+        code=27,
+        name="no_answer",
+        cause="no valid answer from the device that measures the displacement, or from the pump",
+        limit="3 ticks in a row",
+        safe_level=SafeLevel.HOLD_FLOW,
+        seen_in=_A_FEW,
+        may_resume=True,
+        remedy="mend the link as its message states; nothing is known of the laser",
+        seen=lambda o: o.link.explain_silence("displacement"),
+        broken=lambda o, c: o.is_unanswered,
+    ),
     Rule(
         code=10,
         name="displacement_missing",
@@ -467,7 +514,7 @@ TABLE: tuple[Rule, ...] = (
         seen_in=(10, 10),
         may_resume=True,
         remedy="check the pressure sensor: without it over-pressure is not seen",
-        seen=lambda o: f"{o.gauge_pressure_pa:.1f} Pa",
+        seen=lambda o: o.link.explain_silence("gauge_pressure"),
         broken=lambda o, c: not math.isfinite(o.gauge_pressure_pa) and o.reading_age_s == 0,
         unseen=lambda o: o.reading_age_s > 0,
     ),
@@ -519,6 +566,19 @@ TABLE: tuple[Rule, ...] = (
         seen=lambda o: o.unfit,
         broken=lambda o, c: bool(o.unfit),
     ),
+    # before `late`: without the waiting, the tick would be in time
+    Rule(
+        code=42,
+        name="link_slow",
+        cause="the devices answer so late that the mirror cannot be controlled",
+        limit="limits.lateness_max_ms",
+        safe_level=SafeLevel.RAMP_DOWN,
+        seen_in=(5, 10),
+        may_resume=True,
+        remedy="find why the device or the network answers late; this machine is not the cause",
+        seen=lambda o: _join_seen(o.link.explain_wait(), o.link.message),
+        broken=lambda o, c: o.is_late_by_link(c.lateness_max_ms),
+    ),
     Rule(
         code=40,
         name="late",
@@ -528,7 +588,7 @@ TABLE: tuple[Rule, ...] = (
         seen_in=(5, 10),
         may_resume=True,
         remedy="move other work off this machine",
-        seen=lambda o: f"{o.lateness_ms:.0f} ms",
+        seen=lambda o: _join_seen(f"{o.lateness_ms:.0f} ms", o.link.explain_wait()),
         broken=lambda o, c: o.lateness_ms > c.lateness_max_ms,
     ),
 )

@@ -438,7 +438,10 @@ def _list_missing_checks(context: TickContext) -> Reason:
     """What the checks still lack; `NO_REASON` if nothing is missing."""
     reading = context.observer.reading
     if reading is None:
-        return make_reason(WhyCode.NO_ANSWER, "no answer from the device")
+        why = context.observer.link.message
+        return make_reason(
+            WhyCode.NO_ANSWER, f"no answer from the device{f': {why}' if why else ''}"
+        )
     unseen = context.observer.missing_reason
     if unseen != NO_REASON:
         return unseen

@@ -2,9 +2,9 @@
 
 See docs/how-to/replay.md.
 
-A tick is one fixed record and its telemetry row; rare data (commands, ended tasks) precede it as
-JSON, in pieces. A shape estimate is referred to by its time: the recorder has it from its own ring.
-A checksum of all outputs tells whether a replay is identical.
+A tick is one fixed record and its telemetry row; rare data (commands, ended tasks, trouble with the
+links) precede it as JSON, in pieces. A shape estimate is referred to by its time: the recorder has
+it from its own ring. A checksum of all outputs tells whether a replay is identical.
 """
 
 import json
@@ -20,6 +20,7 @@ from pydantic import TypeAdapter
 
 from firmware_iface.roles import SENSORS, BenchReading
 from membrane_ctrl.controller.commands import Command
+from membrane_ctrl.controller.link_report import NO_LINK_TROUBLE, LinkReport
 from membrane_ctrl.controller.tick import TickInputs, TickOutputs
 from membrane_ctrl.controller.tick_checksum import output_crc
 from membrane_ctrl.model import shape_estimate, telemetry
@@ -83,6 +84,7 @@ ROW_OFFSET = len(TICK) + RECORD.itemsize
 MESSAGE_BYTES = ROW_OFFSET + telemetry.ROW_BYTES
 # Plain tables in, plain tables out, whatever a command carries; floats survive bit by bit.
 _COMMANDS = TypeAdapter(tuple[Command, ...])
+_LINK = TypeAdapter(LinkReport)
 _reading_values = attrgetter(*_READING)  # ten times as fast as `astuple`
 _NO_READING = tuple(math.nan if code == "f8" else 0 for code in _READING.values())
 SNAPSHOT_BYTES_MAX = 1 << 18  # one takes 8 kB, with the estimator's covariance 70 kB
@@ -134,10 +136,15 @@ def _split_message(kind: bytes, data: bytes) -> list[bytes]:
 
 
 def _pack_tail(inputs: TickInputs) -> bytes:
-    if not inputs.commands and not inputs.dead_tasks:
+    is_common = not inputs.commands and not inputs.dead_tasks and inputs.link == NO_LINK_TROUBLE
+    if is_common:
         return b""
-    commands = _COMMANDS.dump_python(inputs.commands)
-    return json.dumps({"commands": commands, "dead_tasks": inputs.dead_tasks}).encode()
+    rare = {
+        "commands": _COMMANDS.dump_python(inputs.commands),
+        "dead_tasks": inputs.dead_tasks,
+        "link": _LINK.dump_python(inputs.link),
+    }
+    return json.dumps(rare).encode()
 
 
 def unpack_tick(
@@ -151,7 +158,7 @@ def unpack_tick(
     values: dict[str, Any] = dict(zip(RECORD.names or (), record.item(), strict=True))
     if len(tail) != values["tail_bytes"]:
         raise LookupError(f"commands of tick {values['tick']} are missing")
-    rest = json.loads(tail) if tail else {"commands": [], "dead_tasks": []}
+    rest = json.loads(tail) if tail else {"commands": [], "dead_tasks": [], "link": {}}
     estimate_time_s = values["estimate_time_s"]
     if not math.isnan(estimate_time_s) and estimate_time_s not in estimates:
         raise LookupError(f"the shape of {estimate_time_s:.3f} s is missing")
@@ -168,6 +175,7 @@ def unpack_tick(
         estimate=estimates.get(estimate_time_s),
         commands=_COMMANDS.validate_python(tuple(rest["commands"])),
         dead_tasks=tuple(rest["dead_tasks"]),
+        link=_LINK.validate_python(rest.get("link", {})),
         truth_displacement_um=values["truth_displacement_um"],
         truth_laser_bias_um=values["truth_laser_bias_um"],
     )

@@ -12,6 +12,7 @@ import tomli_w
 
 from firmware_iface.settings import Section
 from membrane_ctrl.config import toml_file
+from membrane_ctrl.config.optics import Distortion
 from membrane_ctrl.config.schema import CameraConfig, GeometryConfig, OpticsConfig
 from membrane_ctrl.model import errors, geometry_hash
 
@@ -26,7 +27,7 @@ class LensTable(Section):
     pixel_um: float
     focal_mm: float
     principal_px: tuple[float, float]
-    distortion: tuple[float, ...] = ()
+    distortion: Distortion = ()
 
     def over(self, camera: CameraConfig, where: Path) -> CameraConfig:
         """The camera with this lens. Raises InputError, naming the file, for a different camera."""

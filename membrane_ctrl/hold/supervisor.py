@@ -18,13 +18,16 @@ from firmware_iface.roles import (
     BenchReading,
     LinkDownError,
     LinkError,
+    LinkState,
     LinkWaitsError,
 )
 from membrane_ctrl.controller.commands import AT_END, Command
 from membrane_ctrl.controller.controller import Controller
+from membrane_ctrl.controller.link_report import LinkReport
 from membrane_ctrl.controller.snapshot import take_snapshot
 from membrane_ctrl.controller.tick import TickInputs, TickOutputs
 from membrane_ctrl.controller.tick_codec import pack_row, pack_snapshot, pack_tick
+from membrane_ctrl.hold.link_watch import FailureCounter, WaitMeter
 from membrane_ctrl.model import clock, errors, run_events, shape_estimate
 from membrane_ctrl.model.events import Event, EventLine
 from membrane_ctrl.processes.ring import RingReader, RingWriter
@@ -32,6 +35,8 @@ from membrane_ctrl.processes.ring import RingReader, RingWriter
 _CHILD_WATCH_S = 0.5  # checking on a child costs a system call
 # On average a replay runs through half of this to reach its part
 SNAPSHOT_EVERY_S = 300.0
+# In a row: a single lost answer of a sensor is no fault of its link
+_SENSOR_FAILURES = 3
 _TEXT_CUTS = (
     200,
     20,
@@ -69,7 +74,10 @@ class Supervisor:
         self._period_s = 1.0 / rate_hz
         self._pending: list[Command] = []
         self._link_up = True
-        self._link_error = ""
+        self._waits = WaitMeter(clock.now)
+        self._link_error = ""  # why the last reading or command got no valid answer
+        self._link_failures = FailureCounter(self._report_link)
+        self._sensor_failures: dict[str, FailureCounter] = {}
         self._inputs_error = self._shape_error = ""
         self._next_watch_s = 0.0
         self._next_snapshot_s = SNAPSHOT_EVERY_S
@@ -96,6 +104,7 @@ class Supervisor:
         """Tick until the run is over; the pump is then off, or unreachable."""
         deadline_s = last_s = self._clock.now()
         ends_s = math.inf if duration_s is None else deadline_s + duration_s
+        self._waits.stalls.start()
         try:
             while True:
                 deadline_s += self._period_s
@@ -113,6 +122,7 @@ class Supervisor:
                 if outputs.finished is not None:
                     return outputs.finished
         finally:
+            self._waits.stalls.stop()
             await self.leave()
 
     async def leave(self) -> None:
@@ -127,9 +137,17 @@ class Supervisor:
         """
         wiring = self._wiring
         self.ticks += 1
+        wait_ms = (
+            self._waits.take_wait_ms()
+        )  # of the last tick, which this one's lateness is due to
         if not self._link_up:
             await self._reconnect()
         reading = await self._read() if self._link_up else None
+        link = LinkReport(wait_ms, self._link_error, self._watch_sensors(now_s))
+        if self._link_up:
+            if not self._link_error:
+                self._link_failures.note_success(now_s)
+            self._link_error = ""
         if now_s >= self._next_watch_s:
             self._next_watch_s = now_s + _CHILD_WATCH_S
             self._guarded("children", self._watch)
@@ -145,6 +163,7 @@ class Supervisor:
             estimate=self._newest_shape(),
             commands=commands,
             dead_tasks=(*wiring.bench.dead_guards(), *self._broken.values()),
+            link=link,
             truth_displacement_um=truth_um,
             truth_laser_bias_um=bias_um,
         )
@@ -198,27 +217,26 @@ class Supervisor:
 
     async def _read(self) -> BenchReading | None:
         try:
-            reading = await self._wiring.bench.read()
+            return await self._waits.measure(self._wiring.bench.read())
         except LinkError as error:
             self._link_failed(error)
             return None
-        return reading
 
     async def _reconnect(self) -> None:
         """Try the lost link again; the link itself paces the attempts."""
         try:
-            await self._wiring.bench.open()
+            await self._waits.measure(self._wiring.bench.open())
         except LinkWaitsError:
             return
         except LinkError as error:  # e.g. the device answers, but another program holds it
             self._link_failed(error)
             return
         self._link_up, self._link_error = True, ""
-        self.tell(run_events.Link("connected again", up=True))
+        self._link_failures.note_connection()
 
     async def _clear_board(self, mask: int) -> None:
         try:
-            await self._wiring.bench.clear_faults(mask)
+            await self._waits.measure(self._wiring.bench.clear_faults(mask))
         except LinkError as error:
             self._link_failed(error)
 
@@ -227,16 +245,35 @@ class Supervisor:
         if not self._link_up:
             return
         try:
-            await self._wiring.bench.write(command)
+            await self._waits.measure(self._wiring.bench.write(command))
         except LinkError as error:
             self._link_failed(error)
 
     def _link_failed(self, error: LinkError) -> None:
         if isinstance(error, LinkDownError):
             self._link_up = False
-        if str(error) != self._link_error:
-            self._link_error = str(error)
-            self.tell(run_events.Link(str(error), up=False))
+        self._link_error = str(error)
+        self._link_failures.note_failure(self._link_error, self._clock.now())
+
+    def _report_link(self, message: str, works: bool, count: int) -> None:
+        self.tell(run_events.Link(message, works, count if count > 1 else None))
+
+    def _watch_sensors(self, now_s: float) -> LinkState:
+        """How the single devices answered; reports those that do not."""
+        state = self._wiring.bench.link_state()
+        silent = dict(state.silent)
+        for role in silent.keys() - self._sensor_failures.keys():
+            report = partial(self._report_sensor, role)
+            self._sensor_failures[role] = FailureCounter(report, _SENSOR_FAILURES)
+        for role, failures in self._sensor_failures.items():
+            if role in silent:
+                failures.note_failure(silent[role], now_s)
+            else:
+                failures.note_success(now_s)
+        return state
+
+    def _report_sensor(self, role: str, message: str, works: bool, count: int) -> None:
+        self.tell(run_events.SensorLink(role, message, works, count if count > 1 else None))
 
     def _newest_shape(self) -> shape_estimate.ShapeEstimate | None:
         if self._wiring.shapes is None:

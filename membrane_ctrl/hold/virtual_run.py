@@ -199,6 +199,9 @@ class _AtOnce:
     def dead_guards(self) -> tuple[str, ...]:
         return ("virtual task",) if self._bench.wrong.dead_task else ()
 
+    def link_state(self) -> roles.LinkState:
+        return roles.NO_LINK_STATE
+
     async def close(self) -> None:
         self._bench.close()
 

@@ -54,15 +54,43 @@ class NoClaim(Event, kind="no_claim", level=LogLevel.WARNING):
 class Link(
     Event,
     kind="link",
-    sentence="Link to the pump board: {message}",
+    sentence="Link to the pump board: {message}[ ({count} failures since the last report)]",
     opens=(Topic.LINK,),
     closes=(Topic.LINK,),
     delay_s=GLITCH_S,
 ):
-    """The link to the board failed or returned."""
+    """The link to the board, or to the pump of a bench of single devices, failed or returned."""
 
     message: str
     up: bool
+    count: int | None = None  # of failures since the last such event, if more than one
+
+    @property
+    def stands(self) -> bool:
+        """Whether it failed."""
+        return not self.up
+
+    @property
+    def level(self) -> LogLevel:
+        """A failure is a warning."""
+        return LogLevel.INFO if self.up else LogLevel.WARNING
+
+
+class SensorLink(
+    Event,
+    kind="sensor_link",
+    sentence="Link to {role}: {message}[ ({count} failures since the last report)]",
+    opens=(Topic.LINK,),
+    closes=(Topic.LINK,),
+    subject="role",
+    delay_s=GLITCH_S,
+):
+    """The link to a sensor with a line of its own failed or returned."""
+
+    role: str
+    message: str
+    up: bool
+    count: int | None = None  # of failures since the last such event, if more than one
 
     @property
     def stands(self) -> bool:

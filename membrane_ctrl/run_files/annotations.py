@@ -1,11 +1,11 @@
 """Marks made after a run; they go to a separate file, as the recording is never changed."""
 
-import getpass
 import json
 from datetime import UTC, datetime
 from pathlib import Path
 
 from membrane_ctrl.model import errors, events, files, program, run_events
+from membrane_ctrl.model.account import account_name
 
 ANNOTATIONS_FILE = "annotations.jsonl"
 
@@ -28,7 +28,7 @@ def add_mark(folder: Path, origin_utc: datetime, mono_s: float, text: str) -> ev
     """
     moment = datetime.fromtimestamp(origin_utc.timestamp() + mono_s, UTC)
     mark = run_events.Mark(
-        text, _user_name(), made_utc=datetime.now(UTC).isoformat(timespec="seconds")
+        text, account_name(), made_utc=datetime.now(UTC).isoformat(timespec="seconds")
     )
     line = {"time_utc": moment.isoformat(), "mono_s": mono_s} | mark.to_dict()
     line["program"] = program.program_identity()
@@ -40,10 +40,3 @@ def add_mark(folder: Path, origin_utc: datetime, mono_s: float, text: str) -> ev
             f"{folder / ANNOTATIONS_FILE}: cannot be written ({reason})"
         ) from None
     return line
-
-
-def _user_name() -> str:
-    try:
-        return getpass.getuser()
-    except (KeyError, OSError):
-        return ""

@@ -16,7 +16,15 @@ from campaign_run import config_of
 from campaign_times import RATE_HZ, TICK_S, WATCHDOG_S
 from campaign_world import WatchedPlant, World
 
-from firmware_iface.roles import Bench, BenchCommand, BenchIdentity, BenchReading, LinkError
+from firmware_iface.roles import (
+    NO_LINK_STATE,
+    Bench,
+    BenchCommand,
+    BenchIdentity,
+    BenchReading,
+    LinkError,
+    LinkState,
+)
 from membrane_ctrl.config.schema import Config
 from membrane_ctrl.controller.commands import Command
 from membrane_ctrl.controller.controller import Controller
@@ -75,6 +83,9 @@ class BoardBench:
 
     def dead_guards(self) -> tuple[str, ...]:
         return self.guards
+
+    def link_state(self) -> LinkState:
+        return NO_LINK_STATE
 
     async def write(self, command: BenchCommand) -> None:
         self.now().write(command)

@@ -9,6 +9,7 @@ import pytest
 
 from firmware_iface.roles import FOREIGN_CLAIM, FOREIGN_PERIOD
 from membrane_ctrl.config.schema import LimitsConfig
+from membrane_ctrl.controller.link_report import LinkReport
 from membrane_ctrl.controller.safety import TABLE, Observation, Rule, SafetyTable
 from membrane_ctrl.model.telemetry import SafeLevel, State
 
@@ -48,6 +49,7 @@ BAD = {
     "gauge_jump": replace(GOOD, gauge_jumps=1),
     "displacement_jump": replace(GOOD, jumps=1),
     "displacement_missing": replace(GOOD, displacement_valid=False),
+    "no_answer": replace(GOOD, displacement_valid=False, answered=False),
     "pressure_missing": replace(GOOD, gauge_pressure_pa=math.nan),
     "following_error": replace(GOOD, error_um=-LIMITS.following_error_max_um - 0.1),
     "overdue": replace(GOOD, overdue="waited too long"),
@@ -60,6 +62,16 @@ BAD = {
     ),
     "locked": replace(GOOD, locked="hands inside"),
     "late": replace(GOOD, lateness_ms=LIMITS.lateness_max_ms + 1),
+    "link_slow": replace(GOOD, lateness_ms=LIMITS.lateness_max_ms + 1, link=LinkReport(50.0)),
+    "watchdog_by_link": replace(
+        GOOD, watchdog_tripped=True, link=LinkReport(LIMITS.lateness_max_ms + 1)
+    ),
+}
+
+
+# A rule that names the link as the cause, and the one that it stands before
+BY_LINK = {"no_answer": "displacement_missing", "link_slow": "late"} | {
+    "watchdog_by_link": "watchdog_tripped"
 }
 
 
@@ -69,6 +81,37 @@ def judge_alone(rule: Rule) -> SafetyTable:
 
 def test_every_rule_has_a_case_here() -> None:
     assert {rule.name for rule in TABLE} == set(BAD)
+
+
+@pytest.mark.parametrize("name", BY_LINK)
+def test_a_links_fault_comes_first_and_is_as_safe(name: str) -> None:
+    """Same level and window in the same states, so that only the cause differs."""
+    rules = {rule.name: rule for rule in TABLE}
+    link, other = rules[name], rules[BY_LINK[name]]
+    assert (link.safe_level, link.seen_in, link.states) == (
+        other.safe_level,
+        other.seen_in,
+        other.states,
+    )
+    table = SafetyTable(LIMITS)
+    for _ in range(link.needed_ticks):
+        tripped = table.judge(State.HOLD, BAD[name]).rule
+    assert tripped is link
+    table = SafetyTable(LIMITS)
+    for _ in range(link.needed_ticks):
+        tripped = table.judge(State.HOLD, BAD[other.name]).rule
+    assert tripped is other
+
+
+def test_a_late_tick_that_the_link_explains_only_in_part_is_late() -> None:
+    table = SafetyTable(LIMITS)
+    lateness_ms = 3 * LIMITS.lateness_max_ms
+    late = replace(GOOD, lateness_ms=lateness_ms, link=LinkReport(0.5 * lateness_ms))
+    for _ in range(5):
+        tripped = table.judge(State.HOLD, late).rule
+    assert tripped is not None
+    assert tripped.name == "late"
+    assert "150 ms of waiting" in tripped.seen(late)
 
 
 def test_codes_and_names_are_unique() -> None:

@@ -92,6 +92,9 @@ class FakeBench:
     def dead_guards(self) -> tuple[str, ...]:
         return ("inner",)
 
+    def link_state(self) -> roles.LinkState:
+        return roles.NO_LINK_STATE
+
     async def close(self) -> None:
         self.calls.append("close")
 

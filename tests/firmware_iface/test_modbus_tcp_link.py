@@ -10,8 +10,9 @@ import pytest
 from counting_plant import ManualClock
 
 from firmware_iface.emulators.modbus_server import Answer, ModbusTcpServer
+from firmware_iface.links.late_answers import LateAnswers
 from firmware_iface.links.modbus_tcp import GuardedModbusTcp
-from firmware_iface.links.serial_port import FIRST_S, LONGEST_S, BackOff
+from firmware_iface.links.serial_port import FIRST_S, LONGEST_S, PROVEN_S, BackOff
 from firmware_iface.roles import DeviceRefusedError, LinkDownError, LinkError
 
 NEVER_S = 30.0  # a timeout that no test waits for
@@ -369,3 +370,76 @@ async def test_a_peer_that_sends_without_end_is_given_up_before_it_delays_the_pr
         await link.read_holding(0, 2)
     assert loop.time() - began_s < 1.0
     assert not link.connected
+
+
+async def test_short_replies_to_long_reads_do_not_let_the_link_be_hammered(setup: Setup) -> None:
+    """A gateway with a small buffer: the identity can be read, the sensors cannot."""
+
+    def cut(transaction: int, unit: int, pdu: bytes) -> list[bytes]:
+        (count,) = struct.unpack_from(">H", pdu, 3)
+        return [frame(transaction, unit, good_read([1] * min(count, 8)))]
+
+    setup.server.reply = cut
+    link = setup.link()
+    for _ in range(300):  # three seconds at 100 Hz
+        try:
+            await link.connect()
+            await link.read_holding(0, 2)
+            await link.read_holding(16, 26)
+        except LinkError:
+            await link.close()
+            setup.clock.now_s += 0.01
+    assert setup.server.accepted <= 7  # at 0, 0, 0.1, 0.3, 0.7, 1.5 s
+
+
+async def test_a_write_does_not_end_the_back_off(setup: Setup) -> None:
+    setup.server.reply = lambda transaction, unit, pdu: [frame(transaction, unit, pdu[:5])]
+    link = await setup.connected()
+    setup.clock.now_s += 0.05
+    await link.write_register(0, 1)
+    assert link.retry_in_s == pytest.approx(FIRST_S - 0.05)
+
+
+async def test_a_reply_after_its_time_out_is_named_with_its_delay(setup: Setup) -> None:
+    """The second request gets the reply to the first."""
+    first: list[bytes] = []
+
+    def keep(transaction: int, unit: int, pdu: bytes) -> list[bytes]:
+        first.append(frame(transaction, unit, good_read([1])))
+        setup.clock.now_s += 0.35
+        return first[:1] if len(first) == 2 else []
+
+    setup.server.reply = keep
+    link = await setup.connected(SOON_S)
+    with pytest.raises(LinkError, match="no valid answer within") as alone:
+        await link.read_holding(0, 1)
+    assert "late" not in str(alone.value)
+    with pytest.raises(LinkError, match=r"answers come late, the last one 0\.70 s"):
+        await link.read_holding(0, 1)
+
+
+async def test_a_line_that_is_cut_after_a_late_reply_is_not_called_slow(setup: Setup) -> None:
+    late = LateAnswers()
+    late.note_question()
+    late.note_late(0.35)
+    for _ in range(3):
+        late.note_question()
+        assert "0.35 s" in late.explain()
+    late.note_question()
+    assert late.explain() == ""
+    late.note_late(0.2)
+    late.note_in_time()
+    assert late.explain() == ""
+
+
+def test_a_young_connection_does_not_end_the_back_off() -> None:
+    back_off = BackOff()
+    back_off.attempted(0.0)
+    back_off.succeeded(0.01)  # the first retry is free
+    assert back_off.remaining_s(0.01) == 0
+    back_off.attempted(0.02)
+    back_off.succeeded(0.03)
+    assert back_off.remaining_s(0.03) == pytest.approx(0.19)
+    back_off.succeeded(0.02 + PROVEN_S)
+    back_off.attempted(2.0)
+    assert back_off.remaining_s(2.0) == pytest.approx(FIRST_S)

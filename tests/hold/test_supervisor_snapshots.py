@@ -7,7 +7,7 @@ from contextlib import ExitStack
 
 import pytest
 
-from firmware_iface.roles import BenchCommand, BenchIdentity, BenchReading
+from firmware_iface.roles import NO_LINK_STATE, BenchCommand, BenchIdentity, BenchReading, LinkState
 from membrane_ctrl.config.schema import Config
 from membrane_ctrl.controller.controller import Controller
 from membrane_ctrl.controller.snapshot import continue_from
@@ -47,6 +47,9 @@ class PromptBench:
 
     def dead_guards(self) -> tuple[str, ...]:
         return ()
+
+    def link_state(self) -> LinkState:
+        return NO_LINK_STATE
 
     async def close(self) -> None:
         self._bench.close()

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import asyncio
 import random
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -19,6 +20,8 @@ from firmware_iface.emulators import (
 from firmware_iface.links.serial_port import Receiver, SerialPort
 from firmware_iface.roles import LinkDownError
 
+_FEW = 8  # registers that a gateway with a small buffer still passes
+
 
 @dataclass(slots=True)
 class SerialFaults:
@@ -35,6 +38,8 @@ class SerialFaults:
     question_bit_errors: int = 0  # so many bits of each question are flipped
     cut_bytes: int = 0  # so many bytes are missing at the end of each answer
     frozen: bool = False  # the measured value does not change
+    # the program's adapter returns each question as it sends it
+    echo: bool = False
 
 
 class SerialDevice(serial_device.SerialDevice):
@@ -52,6 +57,15 @@ class SerialDevice(serial_device.SerialDevice):
     @property
     def frozen(self) -> bool:  # type: ignore[override]
         return self.faults.frozen
+
+    def hear(self, data: bytes) -> None:
+        if self.faults.echo:
+            self._later(
+                asyncio.get_running_loop().time() + len(data) * self.settings.char_s,
+                self._sent,
+                data,
+            )
+        super().hear(data)
 
     def arrived(self, data: bytes) -> None:
         faults = self._drawn()
@@ -126,10 +140,10 @@ class ProparDevice(SerialDevice, pumps.ProparDevice):
 
 class RtuBusEmulator(SerialDevice, rtu_bus.RtuBusEmulator):
     """A bus whose answers carry the next unit id, the next function code, or an exception (0:
-    off).
+    off). `short_replies`: answers to reads of many registers lack the last.
     """
 
-    wrong_unit = wrong_function = False
+    wrong_unit = wrong_function = short_replies = False
     exception_code = 0
 
     def answer(self, unit: int, pdu: bytes) -> bytes:
@@ -137,6 +151,8 @@ class RtuBusEmulator(SerialDevice, rtu_bus.RtuBusEmulator):
             return bytes([unit]) + modbus_pdu.exception_pdu(pdu, self.exception_code)
         if not (body := super().answer(unit, pdu)):
             return b""
+        if self.short_replies and pdu[0] == modbus_pdu.READ_HOLDING and body[2] > 2 * _FEW:
+            body = body[:2] + bytes([body[2] - 2]) + body[3:-2]
         return bytes([body[0] + self.wrong_unit, body[1] + self.wrong_function]) + body[2:]
 
 

@@ -4,7 +4,7 @@ read.
 
 import asyncio
 
-from firmware_iface.roles import BenchCommand, BenchIdentity, BenchReading
+from firmware_iface.roles import NO_LINK_STATE, BenchCommand, BenchIdentity, BenchReading, LinkState
 from membrane_ctrl.config.schema import Config
 from membrane_ctrl.sim.plant import Plant
 from membrane_ctrl.sim.virtual_bench import VirtualBench
@@ -43,6 +43,9 @@ class LoopBench:
 
     def dead_guards(self) -> tuple[str, ...]:
         return ()
+
+    def link_state(self) -> LinkState:
+        return NO_LINK_STATE
 
     async def close(self) -> None:
         self.now().close()

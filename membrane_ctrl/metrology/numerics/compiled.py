@@ -6,13 +6,11 @@ from functools import cache
 from pathlib import Path
 from typing import Any
 
-from numba import njit
-
+from membrane_ctrl.model.kernel_cache import compile_loop
 from membrane_ctrl.model.zernike_terms import ZERNIKE_TERMS
 
 # Sums may be reordered, which vector units need; NaN and infinity keep their meaning.
 _OPTIONS: dict[str, Any] = {
-    "cache": True,
     "nogil": True,
     "error_model": "numpy",
     "fastmath": {"reassoc", "contract", "nsz", "arcp"},
@@ -22,14 +20,14 @@ _FOLDER = Path(__file__).parents[1]  # of all kernels
 
 def compile_kernel(function: Callable[..., Any]) -> Any:
     """Compile a loop; the result is cached on disk and runs without the interpreter lock."""
-    return _recompiled_if_stale(njit(**_OPTIONS)(function))
+    return _recompiled_if_stale(compile_loop(**_OPTIONS)(function))
 
 
 def compile_step(function: Callable[..., Any]) -> Any:
     """Compile what a loop does to one point. Inlined by force: a loop with a call in it uses no
     vector units.
     """
-    return _recompiled_if_stale(njit(forceinline=True, **_OPTIONS)(function))
+    return _recompiled_if_stale(compile_loop(forceinline=True, **_OPTIONS)(function))
 
 
 def _recompiled_if_stale(dispatcher: Any) -> Any:

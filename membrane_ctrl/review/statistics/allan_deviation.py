@@ -3,9 +3,9 @@
 from dataclasses import dataclass
 
 import numpy as np
-from numba import njit
 
 from membrane_ctrl.model.arrays import AnyArray, Column, IntArray
+from membrane_ctrl.model.kernel_cache import compile_loop
 
 
 @dataclass(frozen=True, slots=True)
@@ -57,7 +57,7 @@ def allan_deviation(values: AnyArray, period_s: float, lengths: IntArray | None 
     return Allan(tau[kept], deviation, windows[kept])
 
 
-@njit(cache=True)
+@compile_loop()
 def _second_differences(total: Column, gaps: AnyArray, m: int) -> tuple[float, int]:
     square = 0.0
     count = 0

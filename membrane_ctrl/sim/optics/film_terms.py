@@ -4,9 +4,9 @@ from math import cos, exp, sin
 from typing import NamedTuple
 
 import numpy as np
-from numba import njit
 
 from membrane_ctrl.model.arrays import FloatArray
+from membrane_ctrl.model.kernel_cache import compile_loop
 
 
 class FilmTerms(NamedTuple):
@@ -26,7 +26,7 @@ class FilmTerms(NamedTuple):
     bumps: FloatArray
 
 
-@njit(cache=True)
+@compile_loop()
 def height_and_slopes(
     terms: FilmTerms, sag_mm: float, x_mm: float, y_mm: float
 ) -> tuple[float, float, float]:
@@ -79,7 +79,7 @@ def height_and_slopes(
     return h, hx, hy
 
 
-@njit(cache=True)
+@compile_loop()
 def film_heights(terms: FilmTerms, sag_mm: float, x_mm: FloatArray, y_mm: FloatArray) -> FloatArray:
     """Heights in mm above the vertex at the points (x, y), all (n,)."""
     h_mm = np.empty(x_mm.size)

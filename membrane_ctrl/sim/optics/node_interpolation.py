@@ -6,9 +6,9 @@ is interpolated.
 """
 
 import numpy as np
-from numba import njit
 
 from membrane_ctrl.model.arrays import FloatArray, Singles
+from membrane_ctrl.model.kernel_cache import compile_loop
 
 
 def node_positions(pixels: int, step: int) -> FloatArray:
@@ -32,7 +32,7 @@ def cubic_weights(step: int) -> FloatArray:
     )
 
 
-@njit(cache=True)
+@compile_loop()
 def interpolate_cubic(line: FloatArray, cell: int, w: FloatArray, k: int) -> float:
     """Value of a cubic through the nodes cell .. cell + 3, at the k-th of the places between."""
     return float(
@@ -43,7 +43,7 @@ def interpolate_cubic(line: FloatArray, cell: int, w: FloatArray, k: int) -> flo
     )
 
 
-@njit(cache=True)
+@compile_loop()
 def interpolate_row(
     nodes: FloatArray, k: int, node: int, w: FloatArray | Singles, line: FloatArray | Singles
 ) -> None:

@@ -4,9 +4,9 @@ from functools import cache
 from statistics import NormalDist
 
 import numpy as np
-from numba import njit
 
 from membrane_ctrl.model.arrays import Singles
+from membrane_ctrl.model.kernel_cache import compile_loop
 
 GOLDEN, MIX_1, MIX_2 = (
     np.uint64(0x9E3779B97F4A7C15),
@@ -24,7 +24,7 @@ def normal_quantiles() -> Singles:
     return np.asarray(values / values.std(), dtype=np.float32)
 
 
-@njit(cache=True)
+@compile_loop()
 def random_64_bits(state: np.uint64) -> np.uint64:
     """SplitMix64's output for a state that grows by `GOLDEN` (Steele et al., 2014): four 16-bit
     numbers.

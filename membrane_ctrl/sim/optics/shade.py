@@ -1,10 +1,10 @@
 """Turns traced nodes into counts: one compiled pass, about ten nanoseconds per pixel."""
 
 import numpy as np
-from numba import njit
 
 from firmware_iface.roles import Pixels
 from membrane_ctrl.model.arrays import FloatArray, Singles
+from membrane_ctrl.model.kernel_cache import compile_loop
 from membrane_ctrl.sim.optics.node_interpolation import interpolate_cubic, interpolate_row
 from membrane_ctrl.sim.optics.pixel_noise import GOLDEN, LOW_16, MIX_1, random_64_bits
 
@@ -23,7 +23,7 @@ def vignetting_loss(
     return per_px2 * columns**2, per_px2 * rows**2
 
 
-@njit(cache=True)
+@compile_loop()
 def _look_up_level(s_mm: float, values: FloatArray, cell_mm: float, smooth: bool) -> float:
     """Value of the table at s from the region's low edge; the caller ensures 0 <= s < side."""
     place = s_mm / cell_mm
@@ -35,7 +35,7 @@ def _look_up_level(s_mm: float, values: FloatArray, cell_mm: float, smooth: bool
     return float(values[cell] + fraction * (values[cell + 1] - values[cell]))
 
 
-@njit(cache=True, nogil=True)
+@compile_loop(nogil=True)
 def shade_rows(
     # (3, rows, columns): s_x, s_y (from the low edges of the region, mm), squared distance from the
     # vertex (mm^2); a disturbed bench has two more: factor of the screen's light, and counts of the

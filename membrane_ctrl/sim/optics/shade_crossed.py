@@ -5,17 +5,17 @@ node, then those at k + 1. A hold that tracks takes twenty such pictures a secon
 """
 
 import numpy as np
-from numba import njit
 
 from firmware_iface.roles import Pixels
 from membrane_ctrl.model.arrays import FloatArray, Singles
+from membrane_ctrl.model.kernel_cache import compile_loop
 from membrane_ctrl.sim.optics.node_interpolation import interpolate_row
 from membrane_ctrl.sim.optics.pixel_noise import GOLDEN, MIX_1, random_64_bits
 
 _FLOAT = np.float32
 
 
-@njit(cache=True, fastmath=True)
+@compile_loop(fastmath=True)
 def _cosine_of_turns(turns: float) -> float:
     """Cosine of an angle in turns, to 2e-6."""
     t = turns - np.floor(turns + _FLOAT(0.5))
@@ -25,7 +25,7 @@ def _cosine_of_turns(turns: float) -> float:
     return _FLOAT(1.0) + u * (_FLOAT(-19.7392063) + u * middle)  # type: ignore[no-any-return]
 
 
-@njit(cache=True, fastmath=True)
+@compile_loop(fastmath=True)
 def _crossed_pixels(  # type: ignore[no-untyped-def]
     lines, weights, loss, noise, pattern, scale, levels, rooms, counts
 ):
@@ -72,7 +72,7 @@ def _crossed_pixels(  # type: ignore[no-untyped-def]
         counts[c] = seen if seen < full else full
 
 
-@njit(cache=True, nogil=True)
+@compile_loop(nogil=True)
 def shade_crossed_rows(
     nodes: FloatArray,  # as in `shade`
     weights: Singles,  # (4, step): of `cubic_weights`, transposed

@@ -4,11 +4,11 @@ from dataclasses import dataclass
 
 import cv2
 import numpy as np
-from numba import njit
 
 from firmware_iface.display_patterns import ScreenRaster
 from firmware_iface.roles import Levels, Pixels
 from membrane_ctrl.model.arrays import FloatArray, Singles
+from membrane_ctrl.model.kernel_cache import compile_loop
 from membrane_ctrl.sim.optics.node_interpolation import interpolate_cubic, interpolate_row
 from membrane_ctrl.sim.optics.pattern_levels import Light, screen_light
 from membrane_ctrl.sim.optics.pixel_noise import GOLDEN, LOW_16, MIX_1, random_64_bits
@@ -44,7 +44,7 @@ class PanelPicture:
         )
 
 
-@njit(cache=True, nogil=True)
+@compile_loop(nogil=True)
 def shade_panel_rows(
     nodes: FloatArray,  # as in `shade`
     weights: FloatArray,  # (step, 4) of `cubic_weights`
@@ -88,7 +88,7 @@ def shade_panel_rows(
             out[row, column] = min(max(counts + 0.5, 0.0), full)
 
 
-@njit(cache=True)
+@compile_loop()
 def _pixel_light(picture: Singles, column: float, row: float, outside: float) -> float:
     """Light at a place of a picture, between its pixels by bilinear interpolation."""
     first_column, first_row = int(np.floor(column)), int(np.floor(row))

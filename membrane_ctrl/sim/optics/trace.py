@@ -5,9 +5,9 @@ Newton on the true surface.
 from dataclasses import dataclass
 
 import numpy as np
-from numba import njit
 
 from membrane_ctrl.model.arrays import BoolArray, FloatArray
+from membrane_ctrl.model.kernel_cache import compile_loop
 from membrane_ctrl.sim.optics.bench_poses import CameraPose, ScreenPose
 from membrane_ctrl.sim.optics.film_terms import FilmTerms, height_and_slopes
 from membrane_ctrl.sim.optics.screen_face import TOLERANCE_MM, project_onto_face
@@ -60,7 +60,7 @@ def trace_rays(
     return Trace(hits[0], hits[1], s_x_mm, s_y_mm)
 
 
-@njit(cache=True)
+@compile_loop()
 def _film_distance(
     start: FloatArray,
     direction: FloatArray,
@@ -86,7 +86,7 @@ def _film_distance(
     return float(np.nan)
 
 
-@njit(cache=True)
+@compile_loop()
 def _plane_point(
     p: FloatArray, direction: FloatArray, origin: FloatArray, axes: FloatArray
 ) -> tuple[float, float, float, float]:
@@ -102,7 +102,7 @@ def _plane_point(
     return q[0] + t * r[0], q[1] + t * r[1], r[0] / r[2], r[1] / r[2]
 
 
-@njit(cache=True)
+@compile_loop()
 def _trace_kernel(
     start: FloatArray,
     directions: FloatArray,
