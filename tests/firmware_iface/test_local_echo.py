@@ -17,7 +17,7 @@ from firmware_iface.drivers.modbus_map import ModbusValue, ValueMap
 from firmware_iface.drivers.optoncdt1420 import Optoncdt1420
 from firmware_iface.drivers.vaisala_ptb330 import VaisalaPtb330
 from firmware_iface.drivers.ventus import Ventus
-from firmware_iface.emulators.modbus_pdu import respond
+from firmware_iface.emulators.modbus_pdu import answer_request
 from firmware_iface.emulators.pumps import BronkhorstRegisters, Instrument
 from firmware_iface.links.modbus_rtu import RtuBus
 from firmware_iface.links.serial_port import SerialSettings
@@ -58,12 +58,12 @@ class Registers:
 
 
 def gauge() -> tuple[SerialDevice, Any]:
-    device = RtuBusEmulator(LINE, {1: partial(respond, table=Registers())})
+    device = RtuBusEmulator(LINE, {1: partial(answer_request, table=Registers())})
     return device, ModbusValue(RtuBus(MemoryWire(device)).device(1, 0.1), PRESSURE)
 
 
 def bronkhorst_rtu() -> tuple[SerialDevice, Any]:
-    device = RtuBusEmulator(LINE, {3: partial(respond, table=BronkhorstRegisters(FLOW))})
+    device = RtuBusEmulator(LINE, {3: partial(answer_request, table=BronkhorstRegisters(FLOW))})
     return device, BronkhorstFlow(ModbusParameters(RtuBus(MemoryWire(device)).device(3, 0.1)))
 
 
@@ -177,7 +177,7 @@ def test_the_answer_to_a_write_may_equal_the_question() -> None:
             def write(self, address: int, new: Any) -> None:
                 words[address : address + len(new)] = new
 
-        device = RtuBusEmulator(LINE, {1: partial(respond, table=Table())})
+        device = RtuBusEmulator(LINE, {1: partial(answer_request, table=Table())})
         link = RtuBus(MemoryWire(device)).device(1, 0.1)
         await link.connect()
         await link.write_register(1, 7)

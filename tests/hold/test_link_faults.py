@@ -17,7 +17,7 @@ import pytest
 from firmware_iface import roles
 from firmware_iface.drivers.keyence_dl_rs1a import KeyenceDlRs1a
 from firmware_iface.drivers.pump_board import PumpBoard
-from firmware_iface.emulators.modbus_pdu import respond
+from firmware_iface.emulators.modbus_pdu import answer_request
 from firmware_iface.links.modbus_rtu import RtuBus
 from firmware_iface.links.serial_port import SerialSettings
 from firmware_iface.role_bench import RoleBench, RoleDevices
@@ -69,7 +69,7 @@ class BoardOnALine:
         now_s = asyncio.get_running_loop().time()
         self.virtual.advance(now_s - self._at_s)
         self._at_s = now_s
-        reply = respond(pdu, self.virtual.board)
+        reply = answer_request(pdu, self.virtual.board)
         self.virtual.drive()
         return reply
 
