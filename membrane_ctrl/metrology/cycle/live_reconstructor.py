@@ -15,6 +15,7 @@ import numpy as np
 
 from firmware_iface.roles import Pattern
 from membrane_ctrl.config.schema import OpticsConfig
+from membrane_ctrl.metrology.cycle import cycle_motion
 from membrane_ctrl.metrology.film import hencky_bowl
 from membrane_ctrl.metrology.frame_checks import (
     band_removal,
@@ -41,6 +42,7 @@ from membrane_ctrl.metrology.reconstruction import (
     tracked_points,
 )
 from membrane_ctrl.metrology.uncertainty import cycle_errors, geometry_spread
+from membrane_ctrl.metrology.uncertainty.motion_evidence import find_motion_doubt
 from membrane_ctrl.model.arrays import AnyArray, ArrayLike, BoolArray, FloatArray, Image
 from membrane_ctrl.model.shape_estimate import Kind, Quality, ShapeEstimate, judge_quality
 from membrane_ctrl.model.zernike_terms import ZERNIKE_TERMS
@@ -125,6 +127,7 @@ class LiveReconstructor:
         self._pixel_sigma_adu = slope_noise.pixel_sigma_adu(optics.camera.noise_adu)
         self._tracked: tracked_points.TrackedPoints | None = None
         bench = (optics, self._grid, self._binner.saturated.shape, bin_px)
+        self._motion: cycle_motion.CycleMotion | None = None
         self._watch = cycle_errors.ErrorWatch(*bench, self._shifts_rad, laser_noise_um, spread)
 
     def full(
@@ -274,7 +277,7 @@ class LiveReconstructor:
             residual_urad=1e6 * math.hypot(fit.residual_x, fit.residual_y) / math.sqrt(2),
             converged=fit.converged,
         )
-        estimate = self._estimate(kind, fit, errors, quality, times, readings)
+        estimate = self._estimate(kind, state, fit, errors, quality, times, readings)
         if estimate.verdict == "rejected":
             self._tracer(readings).start(
                 state.points, state.surface.height
@@ -389,6 +392,7 @@ class LiveReconstructor:
     def _estimate(
         self,
         kind: Kind,
+        state: tracked_points.TrackedPoints,
         fit: surface_fit.Fit,
         errors: cycle_errors.CycleErrors,
         quality: Quality,
@@ -410,11 +414,15 @@ class LiveReconstructor:
         )
         slope_variance = gain @ (self._mm_per_rad**2 * (noise_rad2 + changed_rad2))
         covariance = slope_noise.parameter_covariance(fit.normal, slope_variance) + errors.own_mm2
+        by_motion_mm2, moved = self._find_motion(state, fit, errors, covariance, readings)
+        covariance = covariance + by_motion_mm2
         to_coeffs = surface.parameter_to_coeffs()
         gradient = surface.sag_gradient()
         verdict, reason = judge_quality(quality)
         if verdict == "ok" and self._doubt:
             verdict, reason = "degraded", self._doubt
+        if verdict == "ok" and moved:
+            verdict, reason = "degraded", moved
         return ShapeEstimate(
             time_s=_finite_mean(times),
             kind=kind,
@@ -432,6 +440,37 @@ class LiveReconstructor:
             verdict=verdict,
             reason=reason,
         )
+
+    def _find_motion(
+        self,
+        state: tracked_points.TrackedPoints,
+        fit: surface_fit.Fit,
+        errors: cycle_errors.CycleErrors,
+        covariance_mm2: FloatArray,
+        readings: FloatArray,
+    ) -> tuple[FloatArray, str]:
+        """What motions of the bench since the reference cycle may have done to the figure: the
+        covariance (parameters, parameters), and why it must not be used as it is.
+
+        After a motion the next cycle is the reference: what has moved stays there.
+        """
+        none = np.zeros_like(covariance_mm2)
+        if not np.isfinite(covariance_mm2).all():
+            return none, ""
+        index = state.index[errors.points]
+        if errors.is_reference or self._motion is None:
+            points = state.points.subset(errors.points)
+            self._motion = cycle_motion.CycleMotion.of(
+                self._tracer(readings), points, index, fit.surface, covariance_mm2
+            )
+            return none, ""
+        changed_mm = self._mm_per_rad * errors.changed_rad
+        motion = self._motion.find(fit.surface, index, changed_mm, covariance_mm2)
+        tilt_urad = self._motion.tilt_urad(fit.surface)
+        doubt = find_motion_doubt(motion, covariance_mm2, tilt_urad)
+        if doubt:
+            self._watch.renew_reference()
+        return motion.covariance_mm2, doubt
 
 
 def _per_frame(

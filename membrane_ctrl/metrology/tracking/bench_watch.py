@@ -20,12 +20,12 @@ from membrane_ctrl.metrology.tracking.frame_fit import FrameFit, FrameFitter, Sh
 from membrane_ctrl.metrology.uncertainty.motion_evidence import (
     MotionEffects,
     MotionFinding,
-    Observation,
-    find_motion,
+    MotionTest,
     ring_tilt,
 )
 from membrane_ctrl.model.arrays import AnyArray, FloatArray
 
+_LOOK_EVERY_S = 0.4
 _BLOCKS = 14  # squares along the diameter whose errors count as independent, as in `FrameFitter`
 
 
@@ -75,7 +75,9 @@ class BenchWatch:
         place = (scene.position_mm / scene.surface.radius_mm + 1) / 2 * _BLOCKS
         column, row = np.floor(cells.planes(place)[:, 0]).astype(int)
         self._square = (row + 1) * (_BLOCKS + 2) + column + 1
-        none = np.zeros(bench_motions.COMPONENTS)
+        self._test: MotionTest | None = None
+        self._tested_s = math.nan
+        self._left = none = np.zeros(bench_motions.COMPONENTS)
         square = np.zeros((none.size, none.size))
         self._anchor = _Scores(none, square, self._effects.gram(weights))
 
@@ -89,6 +91,7 @@ class BenchWatch:
         weights = self._bin_weights(scene)
         moved_rad = (scene.beyond_mm - self._reference.beyond_mm) * scene.rad_per_mm
         self._anchor = self._scores(weights * moved_rad, weights)
+        self._test = None
 
     def _scores(self, values: AnyArray, weights: AnyArray) -> _Scores:
         """Of weighted phase errors (2, n) of the bins and their weights (2, n)."""
@@ -101,26 +104,40 @@ class BenchWatch:
         return _Scores(parts.sum(axis=1), squares @ squares.T, gram)
 
     def find(
-        self, fit: FrameFit, shifts_rad: Shifts, fitter: FrameFitter, covariance_mm2: FloatArray
+        self,
+        fit: FrameFit,
+        shifts_rad: Shifts,
+        fitter: FrameFitter,
+        covariance_mm2: FloatArray,
+        time_s: float,
     ) -> MotionFinding:
         """The motions that explain a frame.
 
         `fitter` is that of the frame, `covariance_mm2` (parameters, parameters) that of its fit.
+        The slopes that no surface has are looked at twice a second: they cost a tenth of a fit.
         """
-        slopes, weights = fitter.phase_errors(fit, shifts_rad)
-        now, before = self._scores(slopes, weights), self._anchor
-        # A frame shows less than five steps where a hand covers it: both in the frame's weights.
-        share = np.trace(now.gram) / np.trace(before.gram)
+        if self._test is None or not abs(time_s - self._tested_s) < _LOOK_EVERY_S:
+            self._tested_s = time_s
+            self._look(fit, shifts_rad, fitter, covariance_mm2)
+        assert self._test is not None
         moved_mm = fit.surface.parameters - self._reference.surface.parameters
+        return self._test.find(ring_tilt() @ moved_mm, self._left)
+
+    def _look(
+        self, fit: FrameFit, shifts_rad: Shifts, fitter: FrameFitter, covariance_mm2: FloatArray
+    ) -> None:
+        """Take a frame's products with the slopes that no surface has, and their covariance."""
+        now, before = self._scores(*fitter.phase_errors(fit, shifts_rad)), self._anchor
+        # A frame shows less than five steps where a hand covers it: both in the frame's weights.
+        share = float(np.trace(now.gram) / np.trace(before.gram))
         ring = ring_tilt()
-        seen = Observation(
-            ring_mm=ring @ moved_mm,
-            ring_mm2=ring @ covariance_mm2 @ ring.T,
-            left=now.left + share * before.left,
-            left_covariance=now.covariance + share**2 * before.covariance,
-            gram=now.gram,
+        self._left = now.left + share * before.left
+        self._test = MotionTest(
+            self._effects,
+            ring @ covariance_mm2 @ ring.T,
+            now.covariance + share**2 * before.covariance,
+            now.gram,
         )
-        return find_motion(self._effects, seen)
 
     def tilt_urad(self, shape: Surface) -> float:
         """Tilt of the ring since the reference."""

@@ -33,7 +33,7 @@ from membrane_ctrl.metrology.tracking.step_solution import (
     solve_steps,
 )
 from membrane_ctrl.metrology.tracking.tracked_frame import TrackedFrame
-from membrane_ctrl.metrology.uncertainty.motion_evidence import MotionFinding
+from membrane_ctrl.metrology.uncertainty.motion_evidence import MotionFinding, find_motion_doubt
 from membrane_ctrl.model.arrays import BoolArray, FloatArray, Image, Singles
 from membrane_ctrl.model.zernike_terms import ZERNIKE_TERMS
 
@@ -42,9 +42,6 @@ _OUT_USUAL = 0.01  # dust and glints
 _REACH_SIGMAS = 7.0
 _FIRST_REACH = 1e6  # everything counts
 _KNOCK_UM, _KNOCK_UM_PER_S = 2.0, 0.5  # RMS of a tilt that neither film nor air makes: 8 µrad
-# Effects of a motion of the bench on the figure (RMS without tilt): beyond the first, a proven
-# motion degrades a frame; beyond the second, one that camera, screen or mirror may have made
-_BENCH_UM, _TILTED_UM = 0.03, 0.1
 # with less, frames of a still mirror may be the same; here a pixel in 90 differs
 _BLIND_NOISE_ADU = 0.01
 _OTHER_BINS = 0.03  # change of their share with weight with which the errors change, too
@@ -308,8 +305,8 @@ class Tracker:
             return tracked_frame.rejected_frame(time_s, doubt.reason, rest, doubt.lost)
         self._accept(fit, light, shifts_rad, time_s, displacement_um)
         covariance_mm2 = self._covariance_mm2(fit, shifts_rad, time_s)
-        motion = self._watch.find(fit, shifts_rad, self._fitter, covariance_mm2)
-        doubt = doubt or self._bench_doubt(motion, covariance_mm2, fit, time_s)
+        motion = self._watch.find(fit, shifts_rad, self._fitter, covariance_mm2, time_s)
+        doubt = doubt or self._bench_doubt(motion, covariance_mm2, fit)
         worst = doubt or next(iter(faults), None) or Finding("ok", "")
         if worst.verdict == "ok":
             self._remember(shifts_rad, self._clear, fit, time_s)
@@ -439,27 +436,17 @@ class Tracker:
             self._anchor_light = light
 
     def _bench_doubt(
-        self, motion: MotionFinding, covariance_mm2: FloatArray, fit: FrameFit, time_s: float
+        self, motion: MotionFinding, covariance_mm2: FloatArray, fit: FrameFit
     ) -> Finding | None:
         """Whether the bench has moved by so much that the figure must not be used.
 
         What is less is in the error bars alone.
         """
-        if motion.is_sure and motion.figure_um > _BENCH_UM:
-            self._knocked = (
-                f"knocked: {motion.describe()} at {time_s:.2f} s or before; check camera and screen"
-            )
-            return Finding("degraded", self._knocked, True)
-        own_um = 1e3 * math.sqrt(float(np.trace(covariance_mm2[2:, 2:])))
-        if motion.figure_um > max(own_um, _TILTED_UM):
-            urad = self._watch.tilt_urad(fit.surface)
-            return Finding(
-                "degraded",
-                f"tilted by {urad:.0f} µrad since the reference: camera, screen or mirror moved, "
-                f"and the figure may be {motion.figure_um:.2f} µm off",
-                True,
-            )
-        return None
+        tilt_urad = self._watch.tilt_urad(fit.surface)
+        reason = find_motion_doubt(motion, covariance_mm2, tilt_urad)
+        if motion.is_sure and reason:
+            self._knocked = reason
+        return Finding("degraded", reason, True) if reason else None
 
     def _covariance_mm2(
         self, fit: FrameFit, shifts_rad: tuple[float, float], time_s: float

@@ -193,6 +193,10 @@ class CycleErrors:
     # (2,): variance of the phases' change since the reference that no surface explains
     changed_rad2: FloatArray
     asked: int  # points it is known at
+    points: IntArray  # (n,): of the tracked points, those that were asked
+    # (2, n): their phases less the surface's, less those of the reference cycle; NaN where unknown
+    changed_rad: FloatArray
+    is_reference: bool  # whether later cycles are compared with this one
 
 
 class ErrorWatch:
@@ -269,7 +273,8 @@ class ErrorWatch:
             self._errors = self._sensitivities(cycle, asked, seen)
         moved_um = self._moved_um(cycle.readings_um)
         left_rad = state.fresh[:, 0, asked] - phase_rad - seen.waves_rad
-        if math.isnan(moved_um):
+        is_reference = math.isnan(moved_um)
+        if is_reference:
             self._reference_rad[:, index], moved_um = left_rad, 0.0
         changed_rad = left_rad - self._reference_rad[:, index]
         known = np.isfinite(changed_rad[0])
@@ -278,8 +283,18 @@ class ErrorWatch:
         )
         own_mm2 = self._errors.own_mm2(seen, cycle.readings_um, self._laser_noise_um, moved_um)
         return CycleErrors(
-            self._errors.correction_mm(seen), own_mm2, changed_rad2, int(np.count_nonzero(known))
+            self._errors.correction_mm(seen),
+            own_mm2,
+            changed_rad2,
+            int(np.count_nonzero(known)),
+            asked,
+            changed_rad,
+            is_reference,
         )
+
+    def renew_reference(self) -> None:
+        """Compare later cycles with the next one: the bench has moved."""
+        self._reference_um = math.nan
 
     def _moved_um(self, readings_um: FloatArray) -> float:
         """The film's displacement since the reference cycle; NaN if that is to be this one."""

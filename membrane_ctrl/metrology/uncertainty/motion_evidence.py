@@ -38,6 +38,9 @@ _KNOCK, _KNOCK_PER_TILT = 100.0, 5.0
 _CHANCE_GAIN = 9.0  # of each component of a group: below it there is no motion beyond the allowance
 _SURE_GAIN = 25.0  # decrease of chi-square: 5 sigma
 _PLAUSIBLE_GAIN = 9.0  # below the best: 3 sigma
+# Effects on the figure (RMS without tilt): beyond the first, a proven motion degrades it; beyond
+# the second, one that camera, screen or mirror may have made
+_PROVEN_UM, _POSSIBLE_UM = 0.03, 0.1
 _FIGURE = slice(FIRST_FIGURE_INDEX - 2, None)  # of the parameters: without tilt
 
 
@@ -70,17 +73,6 @@ class MotionEffects:
         """G (components, components)."""
         flat = self.left.reshape(len(self.left), -1)
         return np.asarray((flat * weights.ravel()) @ flat.T)
-
-
-@dataclass(frozen=True)
-class Observation:
-    """What the frames show against the reference."""
-
-    ring_mm: FloatArray  # c (2,)
-    ring_mm2: FloatArray  # its covariance (2, 2)
-    left: FloatArray  # q (components,)
-    left_covariance: FloatArray  # (components, components)
-    gram: FloatArray  # G (components, components)
 
 
 @dataclass(frozen=True)
@@ -125,37 +117,93 @@ class MotionFinding:
         return f"it looks like {best.describe()}, or {second.describe()}"
 
 
-def find_motion(effects: MotionEffects, seen: Observation) -> MotionFinding:
-    """Estimate every group of motions from an observation."""
-    groups = list(enumerate(group_columns()))
-    evidence = [_evidence(effects, seen, columns) for _, columns in groups]
-    mirror = next(number for number, group in enumerate(GROUPS) if group.is_of_mirror)
-    tilt_urad = float(np.linalg.norm(np.linalg.solve(*evidence[mirror])))
-    knock = max(_KNOCK, _KNOCK_PER_TILT * tilt_urad)
-    fits: list[GroupFit] = []
-    undetected = np.zeros((len(effects.figure_mm),) * 2)
-    for (number, columns), (information, right) in zip(groups, evidence, strict=True):
-        one = np.eye(len(right))
-        amount = np.asarray(np.linalg.solve(information + one / knock**2, right), float)
-        fits.append(GroupFit(number, amount, float(right @ amount)))
-        if GROUPS[number].allowance > 0:
-            effect = effects.figure_mm[:, columns]
-            spread = np.linalg.inv(information + one / GROUPS[number].allowance ** 2)
-            undetected += effect @ spread @ effect.T
-    fits.sort(key=lambda fit: -fit.gain)
-    worst, figure_um = _worst_effect(effects, fits)
-    return MotionFinding(tuple(fits), undetected + np.outer(worst, worst), figure_um)
+def find_motion_doubt(motion: MotionFinding, own_mm2: FloatArray, tilt_urad: float) -> str:
+    """Why a figure must not be used as it is; empty if the error bars suffice.
+
+    Parameters
+    ----------
+    motion : MotionFinding
+    own_mm2 : (parameters, parameters) array
+        Covariance of the figure on a bench that has not moved.
+    tilt_urad : float
+        Of the ring since the reference.
+    """
+    if motion.is_sure and motion.figure_um > _PROVEN_UM:
+        return f"knocked: {motion.describe()}; check camera and screen"
+    own_um = 1e3 * math.sqrt(float(np.trace(own_mm2[_FIGURE, _FIGURE])))
+    if motion.figure_um > max(own_um, _POSSIBLE_UM):
+        return (
+            f"tilted by {tilt_urad:.0f} µrad since the reference: camera, screen or mirror moved, "
+            f"and the figure may be {motion.figure_um:.2f} µm off"
+        )
+    return ""
 
 
-def _evidence(
-    effects: MotionEffects, seen: Observation, columns: slice
-) -> tuple[FloatArray, FloatArray]:
-    """A (k, k) and b (k,) of a group of k components."""
-    by_ring = ring_tilt() @ effects.figure_mm[:, columns]
-    ring = by_ring.T @ np.linalg.inv(seen.ring_mm2)
-    gram, scatter = seen.gram[columns, columns], seen.left_covariance[columns, columns]
-    left = gram @ np.linalg.pinv(scatter, rcond=1e-9, hermitian=True)
-    return ring @ by_ring + left @ gram, ring @ seen.ring_mm + left @ seen.left[columns]
+@dataclass(frozen=True)
+class _GroupTest:
+    """How a group of k components is estimated."""
+
+    columns: slice
+    by_ring: FloatArray  # h^T C_c^-1 (k, 2)
+    by_left: FloatArray  # G C_q^-1 (k, k)
+    information: FloatArray  # A (k, k)
+
+    def weigh(self, ring_mm: FloatArray, left: FloatArray) -> FloatArray:
+        """b (k,)."""
+        return np.asarray(self.by_ring @ ring_mm + self.by_left @ left[self.columns])
+
+
+class MotionTest:
+    """Estimates motions from observations of the same covariance.
+
+    Parameters
+    ----------
+    effects : MotionEffects
+    ring_mm2 : (2, 2) array
+        Covariance C_c of the ring's tilt.
+    left_covariance, gram : (components, components) arrays
+        C_q and G of the slopes that no surface has.
+    """
+
+    def __init__(
+        self,
+        effects: MotionEffects,
+        ring_mm2: FloatArray,
+        left_covariance: FloatArray,
+        gram: FloatArray,
+    ) -> None:
+        self._effects = effects
+        self._tests: list[_GroupTest] = []
+        self._undetected_mm2 = np.zeros((len(effects.figure_mm),) * 2)
+        ring_weight = np.linalg.inv(ring_mm2)
+        for group, columns in zip(GROUPS, group_columns(), strict=True):
+            tilt = ring_tilt() @ effects.figure_mm[:, columns]
+            by_ring = tilt.T @ ring_weight
+            own = gram[columns, columns]
+            scatter = left_covariance[columns, columns]
+            by_left = own @ np.linalg.pinv(scatter, rcond=1e-9, hermitian=True)
+            information = by_ring @ tilt + by_left @ own
+            self._tests.append(_GroupTest(columns, by_ring, by_left, information))
+            if group.allowance > 0:
+                allowed = np.eye(len(own)) / group.allowance**2
+                effect = effects.figure_mm[:, columns]
+                spread = np.linalg.inv(information + allowed)
+                self._undetected_mm2 += effect @ spread @ effect.T
+
+    def find(self, ring_mm: FloatArray, left: FloatArray) -> MotionFinding:
+        """Estimate every group from the ring's tilt c (2,) and the products q (components,)."""
+        weighed = [test.weigh(ring_mm, left) for test in self._tests]
+        mirror = next(number for number, group in enumerate(GROUPS) if group.is_of_mirror)
+        tilt = np.linalg.solve(self._tests[mirror].information, weighed[mirror])
+        knock = max(_KNOCK, _KNOCK_PER_TILT * float(np.linalg.norm(tilt)))
+        fits: list[GroupFit] = []
+        for number, (test, right) in enumerate(zip(self._tests, weighed, strict=True)):
+            known = test.information + np.eye(len(right)) / knock**2
+            amount = np.asarray(np.linalg.solve(known, right), float)
+            fits.append(GroupFit(number, amount, float(right @ amount)))
+        fits.sort(key=lambda fit: -fit.gain)
+        worst, figure_um = _worst_effect(self._effects, fits)
+        return MotionFinding(tuple(fits), self._undetected_mm2 + np.outer(worst, worst), figure_um)
 
 
 def _worst_effect(effects: MotionEffects, fits: list[GroupFit]) -> tuple[FloatArray, float]:

@@ -22,6 +22,7 @@ from membrane_ctrl.metrology.phase.pattern_sequence import fringe_sequence, full
 from membrane_ctrl.metrology.rays.bench_parameters import NAMES
 from membrane_ctrl.metrology.rays.bench_poses import bench_at
 from membrane_ctrl.metrology.rays.geometry import Geometry
+from membrane_ctrl.metrology.uncertainty import motion_evidence
 from membrane_ctrl.metrology.uncertainty.geometry_spread import (
     PAPER_SPREAD,
     GeometrySpread,
@@ -260,6 +261,14 @@ def test_noisy_laser_still_helps() -> None:
     assert _error_um(live, live.fringes(frames, times, readings), float(where.mean()))[0] <= 0.5
 
 
+@pytest.fixture
+def rigid(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A bench that cannot move: the bars are those of the cycles alone."""
+    groups = tuple(replace(group, allowance=0.0) for group in motion_evidence.GROUPS)
+    monkeypatch.setattr(motion_evidence, "GROUPS", groups)
+
+
+@pytest.mark.usefixtures("rigid")
 def test_predicted_sigma_is_the_scatter_of_cycles() -> None:
     live = _live(bin_px=2)
     estimates = [live.fringes(*_render("fringes")) for _ in range(60)]
@@ -512,6 +521,7 @@ def test_what_a_wrong_geometry_makes_of_a_told_motion_is_in_the_bar() -> None:
     assert np.max(ratios) < 4
 
 
+@pytest.mark.usefixtures("rigid")
 def test_the_bar_grows_with_the_displacement_until_a_new_reference() -> None:
     """A wrong geometry makes an error of each change: 1e-3 of it,
     which no cycle shows by itself.
