@@ -12,7 +12,8 @@ T = TypeVar("T")
 Report = Callable[[str, bool, int], None]
 """Message, whether the link works, and the failures since the last report."""
 
-_BEAT_S = 0.02
+# no multiple of a tick's period, so that the two timers are not due at the same time
+_BEAT_S = 0.0207
 _WAIT_MIN_S = 0.02  # of a tick: shorter waits delay nothing
 _GOOD_S = 1.0  # without a failure until the link counts as good: one that comes and goes is one
 _FIRST_REPEAT_S, _LAST_REPEAT_S = 1.0, 60.0
