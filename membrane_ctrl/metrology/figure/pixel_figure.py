@@ -50,6 +50,7 @@ class FullResult:
     # (n,): residual of the frames after the sinusoids: noise, motion, the display's harmonics
     rest_adu: Singles
     grid: zonal_map.ResidualGrid  # mean slope residuals in cells
+    fit_grid: zonal_map.ResidualGrid  # the same, each pixel with its weight in the fit
     residual_mm: (
         FloatArray  # (m, m): height over the fit, 0 at the vertex; NaN where nothing was measured
     )
@@ -233,6 +234,7 @@ def reconstruct_full(
     grid = zonal_map.residual_grid(
         field, (left < _NO_SLOPE).astype(float), optics.mirror.analysis_radius_mm
     )
+    fit_grid = zonal_map.residual_grid(field, points.weights, optics.mirror.analysis_radius_mm)
     return FullResult(
         fit=replace(fit, changes_mm=(*rough.changes_mm, *fit.changes_mm)),
         index=pixels.index,
@@ -240,6 +242,7 @@ def reconstruct_full(
         swing_adu=pixels.swing_adu,
         rest_adu=pixels.rest_adu,
         grid=grid,
+        fit_grid=fit_grid,
         residual_mm=zonal_map.integrate_residual(grid),
         quality=set_quality(optics, checked, fit, float(np.median(pixels.swing_adu))),
         moved=pixels.moved,

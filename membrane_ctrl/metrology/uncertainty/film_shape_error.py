@@ -62,7 +62,10 @@ def law_effect(
 
 
 def film_shape_source(full: FullResult, slope_variance: FloatArray) -> budget.Source:
-    patches, variance = residual_patches.Patches.of_grid(full.grid), float(slope_variance.mean())
+    patches, variance = (
+        residual_patches.Patches.of_grid(full.fit_grid),
+        float(slope_variance.mean()),
+    )
     effect, noise = law_effect(patches, full.surface.radius_mm, full.fit.normal.inverse, variance)
     says = "film that is not Hencky's: round slopes that no term explains"
     return budget.Source("film_law", says, math.nan, effect[:, None], common=False, noise_mm2=noise)

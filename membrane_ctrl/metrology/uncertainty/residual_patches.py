@@ -25,7 +25,7 @@ def pixel_sources(
     middle = slope_variance[0] * full.fit.normal.x + slope_variance[1] * full.fit.normal.y
     noise = inverse @ np.linalg.cholesky(middle)
     yield Source("noise_adu", "noise of the pixels", noise_adu, noise, False, False)
-    left = Patches.of_grid(full.grid).effects(full.surface.radius_mm, inverse)
+    left = Patches.of_grid(full.fit_grid).effects(full.surface.radius_mm, inverse)
     left_urad = 1e6 * math.hypot(full.fit.residual_x, full.fit.residual_y)
     says = "slopes that the fit leaves: gamma, light, dust, ripple"
     yield Source(
@@ -59,7 +59,11 @@ class Patches:
 
     @classmethod
     def of_grid(cls, grid: ResidualGrid) -> "Patches":
-        """Of a measured set."""
+        """Of a measured set; in the grid each pixel has its weight in the fit.
+
+        The fit's matrix is made with the same weights. Slopes that the fit left out, of wrinkles at
+        the rim, would seem to move it by millimetres.
+        """
         seen, (x, y) = grid.count > 0, np.meshgrid(grid.axis_mm, grid.axis_mm)
         slopes = np.stack([grid.slope_x[seen], grid.slope_y[seen]])
         return cls.of(
