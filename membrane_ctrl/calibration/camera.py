@@ -2,21 +2,31 @@
 
 import json
 import sys
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import cv2
 import numpy as np
+from numpy.typing import NDArray
 
 from membrane_ctrl.config.schema import CameraConfig, Config
 from membrane_ctrl.geometry.prior_file import write_prior
 from membrane_ctrl.measure.images import IMAGE_BYTES_MAX, decoded_image
 from membrane_ctrl.metrology.calibration.board import Board, on_screen
-from membrane_ctrl.metrology.calibration.board_lens import BoardView, Lens, calibrate_lens
+from membrane_ctrl.metrology.calibration.board_lens import (
+    LEAST_CORNERS,
+    BoardView,
+    Lens,
+    calibrate_lens,
+)
+from membrane_ctrl.metrology.calibration.board_size import find_other_board
 from membrane_ctrl.metrology.rays.bench_parameters import usual_sigma
 from membrane_ctrl.model import errors, files
 
+_TRIED_BOARDS = 3  # photographs in which a board of another size is looked for
+_UNSEEN = "another kind of board, a blurred one, or one that is hardly in the picture"
 _IMAGES = (".png", ".tif", ".tiff", ".bmp", ".jpg", ".jpeg")
 
 
@@ -38,11 +48,13 @@ def calibrate_camera(options: CameraOptions) -> int:
     CommandError.
     """
     board, camera = _parse_board(options.board), options.config.optics.camera
-    views = [_read_view(path, board, camera) for path in _list_photographs(options.folder)]
+    paths = _list_photographs(options.folder)
+    views = [_read_view(path, board, camera) for path in paths]
     try:
         lens = calibrate_lens(views, camera)
     except ValueError as error:
-        raise errors.RejectedError(f"{options.folder}: {error}") from None
+        why = f"{error}{_explain_unseen_board(board, paths, views, camera)}"
+        raise errors.RejectedError(f"{options.folder}: {why}") from None
     tables = {"camera": _camera_table(camera, lens), "sigmas": lens.sigmas}
     write_prior(options.out, tables, "calibrate-camera", lens.used, lens.rms_px)
     report = {
@@ -103,7 +115,29 @@ def _list_photographs(folder: Path) -> list[Path]:
     return found
 
 
+def _explain_unseen_board(
+    board: Board, paths: Sequence[Path], views: Sequence[BoardView], camera: CameraConfig
+) -> str:
+    """Why most photographs do not show the board: the size that they show instead, if any."""
+    unseen = [
+        path for path, view in zip(paths, views, strict=True) if len(view.place) < LEAST_CORNERS
+    ]
+    if 2 * len(unseen) <= len(views):
+        return ""
+    spread = unseen[:: max(1, len(unseen) // _TRIED_BOARDS)][:_TRIED_BOARDS]
+    other = find_other_board(board, [_read_photograph(path, camera) for path in spread])
+    if other is None:
+        whole = "; a chessboard must be whole in the picture" if board.kind == "chessboard" else ""
+        return f" (no board of another size is found either; cause unknown: {_UNSEEN}{whole})"
+    return f" (they show a board of {other}, squares, not corners: give --board {other})"
+
+
 def _read_view(path: Path, board: Board, camera: CameraConfig) -> BoardView:
+    place, seen_px = board.corners(_read_photograph(path, camera))
+    return BoardView(path.name, place, seen_px)
+
+
+def _read_photograph(path: Path, camera: CameraConfig) -> NDArray[np.uint8]:
     try:
         image = decoded_image(
             files.read_bytes(path, IMAGE_BYTES_MAX), cv2.IMREAD_GRAYSCALE | cv2.IMREAD_ANYDEPTH
@@ -119,8 +153,7 @@ def _read_view(path: Path, board: Board, camera: CameraConfig) -> BoardView:
         )
     if image.dtype != np.uint8:  # the detectors take 8 bits only, which suffice for corners
         image = (np.asarray(image, float) * (255.0 / max(1, int(image.max())))).astype(np.uint8)
-    place, seen_px = board.corners(np.asarray(image, np.uint8))
-    return BoardView(path.name, place, seen_px)
+    return np.asarray(image, np.uint8)
 
 
 def _camera_table(camera: CameraConfig, lens: Lens) -> dict[str, Any]:

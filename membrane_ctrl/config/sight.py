@@ -9,11 +9,12 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from membrane_ctrl.config.schema import GeometryConfig, OpticsConfig
+from membrane_ctrl.config.schema import CameraConfig, GeometryConfig, OpticsConfig
 from membrane_ctrl.model.arrays import FloatArray
 
 _LEAST, _GOOD = 0.5, 0.9  # shares of the mirror: from less than half, the terms are not determined
 _RINGS, _SPOKES = 20, 36
+_FOLD_RANGE, _FOLD_STEPS = 4.0, 4001  # of the picture's corner, to look for a fold of the lens
 _DEPTHS = np.linspace(0.0, 0.5, 26)  # of any bowl, over its radius
 
 
@@ -31,10 +32,11 @@ class Sight:
 class Doubt:
     """Why a geometry is not plausible, and what to check."""
 
-    hopeless: bool  # less than half of the mirror can be measured
-    key: str  # of the geometry
+    hopeless: bool  # less than half of the mirror can be measured, or it is seen twice
+    key: str  # of the table
     why: str
     remedy: str
+    table: str = "geometry"  # of the optics
 
 
 def compute_poses(
@@ -98,12 +100,71 @@ def trace_view(optics: OpticsConfig, sag_mm: float) -> Sight:
     return Sight(float(shown[1:].mean()), float((shown & lit)[1:].mean()), centre_off_mm)
 
 
+def find_lens_fold_px(camera: CameraConfig) -> float:
+    """Distance from the principal point at which the lens model folds; infinite without a fold.
+
+    From there on, points farther from the axis come nearer to it in the picture, which no lens
+    does. A fold beyond the picture's corners does not count.
+    """
+    column, row = camera.principal
+    corner_px = math.hypot(
+        max(column, camera.width_px - 1 - column), max(row, camera.height_px - 1 - row)
+    )
+    focal_px = camera.focal_mm / (1e-3 * camera.pixel_um)
+    # far enough for a picture that the model shrinks
+    tangent = np.linspace(0.0, _FOLD_RANGE * corner_px / focal_px, _FOLD_STEPS)
+    pictured_px = focal_px * _distort_radius(tangent, camera.distortion)
+    falls = np.diff(pictured_px) <= 0
+    if not falls.any():
+        return math.inf
+    fold_px = float(pictured_px[np.argmax(falls)])
+    return fold_px if fold_px < corner_px else math.inf
+
+
+def _distort_radius(tangent: FloatArray, distortion: tuple[float, ...]) -> FloatArray:
+    """Radial part of OpenCV's model: distance from the axis behind the lens, of that before it."""
+    k1, k2, _, _, k3, k4, k5, k6 = (*distortion, *[0.0] * 8)[:8]
+    square: FloatArray = tangent**2
+    above = 1 + square * (k1 + square * (k2 + square * k3))
+    below = 1 + square * (k4 + square * (k5 + square * k6))
+    return np.asarray(tangent * above / below)
+
+
+def find_lens_doubt(optics: OpticsConfig) -> Doubt | None:
+    """A lens model that folds within the picture: hopeless if within that of the mirror."""
+    camera, mirror = optics.camera, optics.mirror
+    fold_px = find_lens_fold_px(camera)
+    if math.isinf(fold_px):
+        return None
+    pinhole, rotation, *_ = compute_poses(optics.geometry)
+    spoke = 2 * np.pi * np.arange(_SPOKES) / _SPOKES
+    rim = mirror.analysis_radius_mm * np.stack([np.cos(spoke), np.sin(spoke), 0 * spoke], axis=1)
+    seen = (rim - pinhole) @ rotation.T
+    # before the lens, to compare with where the fold begins
+    tangent = np.hypot(seen[:, 0], seen[:, 1]) / seen[:, 2]
+    nearer = np.linspace(0.0, float(tangent.max()), _FOLD_STEPS)
+    in_mirror = bool((np.diff(_distort_radius(nearer, camera.distortion)) <= 0).any())
+    where = "within the mirror's picture" if in_mirror else "within the picture, beside the mirror"
+    why = (
+        f"the lens model folds {fold_px:.0f} px from the principal point, {where}: farther points "
+        "would be pictured nearer"
+    )
+    remedy = (
+        "check signs and order (k1, k2, p1, p2, k3, ...) and focal_mm; calibrate the lens with "
+        "photographs that fill the picture"
+    )
+    return Doubt(in_mirror, "distortion", why, remedy, "camera")
+
+
 def find_doubt(optics: OpticsConfig, depth_known: bool = True) -> Doubt | None:
     """What is not plausible about a geometry, if anything.
 
     If the film's depth is not known, the geometry has the benefit of the doubt: that of the depth
     that suits it best.
     """
+    fold = find_lens_doubt(optics)
+    if fold is not None:
+        return fold
     depths_mm = (
         [optics.mirror.sag_mm] if depth_known else (_DEPTHS * optics.mirror.radius_mm).tolist()
     )

@@ -267,8 +267,9 @@ def _check_geometry(field: str, optics: OpticsConfig, used: bool, say: ConfigFin
         why = "the camera is behind the mirror"
         say.error(True, f"{field}.camera.position_mm", why, "z points out of the mirror")
     elif used and (found := sight.find_doubt(optics)):
-        say.error(found.hopeless, f"{field}.{found.key}", found.why, found.remedy)
-        say.warn(not found.hopeless, f"{field}.{found.key}", found.why, found.remedy)
+        key = f"{field.removesuffix('geometry')}{found.table}.{found.key}"
+        say.error(found.hopeless, key, found.why, found.remedy)
+        say.warn(not found.hopeless, key, found.why, found.remedy)
 
 
 def judge_alarms(config: Config, say: ConfigFindings) -> None:

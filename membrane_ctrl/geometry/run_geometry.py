@@ -75,4 +75,4 @@ def require_plausible(optics: OpticsConfig, where: Path, depth_known: bool = Tru
     """
     found = sight.find_doubt(optics, depth_known)
     if found is not None and found.hopeless:
-        raise errors.InputError(f"{where}: geometry.{found.key}: {found.why}; {found.remedy}")
+        raise errors.InputError(f"{where}: {found.table}.{found.key}: {found.why}; {found.remedy}")

@@ -25,6 +25,7 @@ from membrane_ctrl.config.origin import OriginSection
 from membrane_ctrl.geometry.file import GeometryFile, GeometryOrigin, stated_origin
 from membrane_ctrl.geometry.set_tables import ArtefactTable, ScreenMovedTable, move_screen
 from membrane_ctrl.measure.images import IMAGE_BYTES_MAX, decoded_image
+from membrane_ctrl.measure.pixel_format import find_pixel_mistake, find_size_mistake
 from membrane_ctrl.metrology.phase.pattern_sequence import fringe_sequence, full_sequence
 from membrane_ctrl.metrology.rays.artefacts import Artefact
 from membrane_ctrl.model.arrays import FloatArray, Image
@@ -223,7 +224,9 @@ def assemble_set(head: CaptureHead, images: Sequence[Image | str]) -> CaptureSet
     seen = _find_most_common([image.shape for image in good])
     if seen != size:
         said = f"{size[1]} x {size[0]}, but the images are {seen[1]} x {seen[0]}"
-        raise InputError(f"{path}: camera.width_px, height_px: {said}")
+        packing = find_size_mistake(seen, size, depth)
+        cause = f"; {packing}, have this size: unpack them to one value a pixel" if packing else ""
+        raise InputError(f"{path}: camera.width_px, height_px: {said}{cause}")
     frames: Image = np.zeros((len(images), *size), depth)
     unusable: dict[int, str] = {}
     for k, image in enumerate(images):
@@ -240,6 +243,11 @@ def assemble_set(head: CaptureHead, images: Sequence[Image | str]) -> CaptureSet
             )
         else:
             frames[k] = image
+    if mistake := find_pixel_mistake(frames):
+        raise InputError(
+            f"{path}: frames: {mistake}: put right, neighbouring pixels differ several times "
+            "less; convert the camera's data accordingly and write the images again"
+        )
     bits = _find_sensor_bits(head, frames, path)
     optics = head.optics.model_copy(update={"camera": camera.model_copy(update={"bits": bits})})
     lost = tuple(k for k, image in enumerate(images) if isinstance(image, str))

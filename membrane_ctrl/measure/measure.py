@@ -3,11 +3,12 @@
 import json
 import sys
 import time
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
 
+from membrane_ctrl.config import sight
 from membrane_ctrl.geometry.file import read_geometry
 from membrane_ctrl.measure import figure_report, figure_results, results
 from membrane_ctrl.measure.measurement import Measurement, measure_set
@@ -47,8 +48,15 @@ def measure_command(options: MeasureOptions) -> int:
     )  # follow a link that the user names
     light, outline = light_and_rim(measurement)
     profile = _fit_radial_profile(measurement)
-    bars = results.error_bars(measurement, geometry, outline)
+    try:
+        bars = results.error_bars(measurement, geometry, outline)
+    except errors.InputError as error:
+        reason = _name_lens_fold(measurement, str(error), explains=True)
+        raise errors.InputError(reason) from None
     measurement = results.degrade_doubtful(measurement, bars)
+    contradicted = bars is not None and bool(bars.statement.doubts)
+    reason = _name_lens_fold(measurement, measurement.reason, explains=contradicted)
+    measurement = replace(measurement, reason=reason)
     figure = figure_results.measured_figure(measurement, bars, options.nominal_radius_mm)
     block = figure_results.figure_table(measurement, figure, bars) if figure and bars else None
     result = results.result_table(measurement, bars, block)
@@ -75,6 +83,19 @@ def measure_command(options: MeasureOptions) -> int:
     print(f"written to {target} in {time.perf_counter() - begin:.1f} s", file=sys.stderr)
     print(json.dumps(result) if options.as_json else "\n".join(lines))
     return int(errors.Exit.REJECTED if measurement.verdict == "rejected" else errors.Exit.DONE)
+
+
+def _name_lens_fold(measurement: Measurement, reason: str, explains: bool) -> str:
+    """The reason, with a lens model that folds within the picture.
+
+    `explains`: the frames contradict the geometry, which such a model explains; otherwise it is
+    only mentioned.
+    """
+    doubt = sight.find_lens_doubt(measurement.head.optics)
+    if doubt is None or not reason:
+        return reason
+    fold = f"camera.distortion: {doubt.why}; {doubt.remedy}"
+    return f"{fold}; it shows as: {reason}" if explains else f"{reason}; {fold}"
 
 
 def light_and_rim(measurement: Measurement) -> tuple[FloatArray, Outline | None]:

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from membrane_ctrl.config.schema import Config, GeometryConfig, OpticsConfig, PatternConfig
-from membrane_ctrl.config.sight import compute_poses, find_doubt, trace_view
+from membrane_ctrl.config.sight import compute_poses, find_doubt, find_lens_fold_px, trace_view
 from membrane_ctrl.config.toml_file import parse_tables
 from membrane_ctrl.controller.cross_check import cross_check
 from membrane_ctrl.sim.optics.bench_poses import camera_pose, screen_pose
@@ -205,3 +205,45 @@ def test_less_than_the_whole_mirror_is_a_warning_and_unused_optics_are_not_judge
     assert findings(80.9, twin={"geometry": SHORT | {"alpha_deg": 30.0}}) == [
         ("error", "twin.geometry.alpha_deg")
     ]
+
+
+FOLDS = [
+    ((-12.0, 0.0, 0.0, 0.0), True),
+    ((0.0, -300.0, 0.0, 0.0), True),
+    ((-0.01, 0.0, 0.0, 0.0, -5000.0), True),
+    ((-3.5, 0.0, 0.0, 0.0), False),  # beside the mirror
+]
+
+
+@pytest.mark.parametrize(("distortion", "hopeless"), FOLDS)
+def test_a_lens_that_folds_within_the_picture_is_named(
+    distortion: tuple[float, ...], hopeless: bool
+) -> None:
+    found = find_doubt(optics_of(camera={"distortion": distortion}))
+    assert found is not None
+    assert (found.table, found.key, found.hopeless) == ("camera", "distortion", hopeless)
+    assert "folds" in found.why
+
+
+@pytest.mark.parametrize(
+    "distortion",
+    [
+        (),
+        (-0.3, 0.0, 0.0, 0.0),
+        (0.5, 0.0, 1e-3, -1e-3),
+        (-0.01, 0.0, 0.0, 0.0, 0.1, 0.0, 0.0, 0.1),
+        (-1.2, 0.0, 0.0, 0.0),  # folds beyond the corners
+    ],
+)
+def test_a_lens_that_does_not_fold_within_the_picture_is_sound(
+    distortion: tuple[float, ...],
+) -> None:
+    assert find_doubt(optics_of(camera={"distortion": distortion})) is None
+
+
+def test_the_fold_is_where_the_radial_part_is_largest() -> None:
+    """r (1 + k1 r^2) is largest at r^2 = -1 / (3 k1), and two thirds of that are pictured."""
+    camera = optics_of(camera={"distortion": (-12.0, 0.0, 0.0, 0.0)}).camera
+    radius = math.sqrt(1 / 36)
+    expected_px = 2 / 3 * radius * camera.focal_mm / (1e-3 * camera.pixel_um)
+    assert find_lens_fold_px(camera) == pytest.approx(expected_px, rel=1e-3)

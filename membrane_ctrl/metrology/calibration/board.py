@@ -17,6 +17,7 @@ Levels = AnyArray
 MODULES = 8
 _MARKER_SHARE = 6 / MODULES
 _MARKERS = 1000  # of the dictionary
+DICTIONARY = cv2.aruco.DICT_4X4_1000
 
 
 @dataclass(frozen=True)
@@ -79,7 +80,7 @@ class Board:
         return place, np.asarray(seen, float).reshape(-1, 2)
 
     def _charuco(self) -> Any:
-        dictionary = cv2.aruco.getPredefinedDictionary(cv2.aruco.DICT_4X4_1000)
+        dictionary = cv2.aruco.getPredefinedDictionary(DICTIONARY)
         return cv2.aruco.CharucoBoard((self.columns, self.rows), 1.0, _MARKER_SHARE, dictionary)
 
 

@@ -14,6 +14,8 @@ import pytest
 from membrane_ctrl.cli import run
 from membrane_ctrl.config.schema import CameraConfig, OpticsConfig
 from membrane_ctrl.geometry.prior_file import read_prior
+from membrane_ctrl.metrology.calibration.board import Board
+from membrane_ctrl.metrology.calibration.board_size import find_other_board
 from membrane_ctrl.model.errors import InputError
 from tests.support.board_photograph import Photographer, photographs
 
@@ -148,3 +150,34 @@ def test_priors_that_are_none_are_refused(tmp_path: Path) -> None:
         (tmp_path / "p.toml").write_text(text)
         with pytest.raises(InputError, match=says):
             read_prior(tmp_path / "p.toml")
+
+
+@pytest.mark.parametrize(
+    ("shown", "stated", "named"),
+    [
+        ("chessboard:10x7", "chessboard:9x6", "--board chessboard:10x7"),  # corners for squares
+        ("chessboard:8x5", "chessboard:12x9", "--board chessboard:8x5"),
+        ("charuco:10x7", "charuco:9x6", "--board charuco:10x7"),
+        ("charuco:10x7", "charuco:7x10", "--board charuco:10x7"),
+    ],
+)
+def test_a_board_of_another_size_is_named(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], shown: str, stated: str, named: str
+) -> None:
+    (tmp_path / "lab.toml").write_text(CONFIG)
+    (tmp_path / "photographs").mkdir()
+    board = Board.parse(shown)
+    margin = SQUARE_PX
+    picture = cv2.copyMakeBorder(
+        board.draw(SQUARE_PX), *[margin] * 4, cv2.BORDER_CONSTANT, value=255
+    )
+    for k, image in enumerate(photographs(TRUE, np.asarray(picture, np.uint8), SQUARE_PX, 5, 3)):
+        cv2.imwrite(str(tmp_path / "photographs" / f"{k}.png"), image)
+    assert run(words(tmp_path, tmp_path / "prior.toml", stated)) == 3
+    assert named in capsys.readouterr().err
+
+
+def test_photographs_of_no_board_name_none() -> None:
+    wall = np.random.default_rng(2).integers(90, 110, (171, 204), np.uint8)
+    for stated in ("chessboard:10x7", "charuco:10x7"):
+        assert find_other_board(Board.parse(stated), [wall, wall]) is None

@@ -1,0 +1,140 @@
+"""Pictures whose bytes were put together wrongly: in the other order, or from packed pixels.
+
+Neighbouring pixels of a picture are similar. Wrongly combined bytes are not: bits of little weight
+stand where those of large weight belong. So each usual mistake is undone on trial, and a mistake is
+named only if the picture becomes several times smoother. Sources: GenICam's pixel format naming
+convention 2.4 (Mono12p, Mono10p), GigE Vision 2.2 (Mono12Packed).
+"""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from membrane_ctrl.model.arrays import FloatArray, Image
+
+_SMOOTHER = (
+    3.0  # a picture of the right bytes is at least this much smoother than one of wrong ones
+)
+_ROUGH = 0.05  # of its own scatter: a smoother picture is right, whatever a trial makes of it
+_PICTURES = 5  # with the largest scatter: dark ones show noise alone
+_COARSE = 8  # of the pixels, one in so many each way shows the scatter of a picture
+_ROWS = 256  # of a picture are enough
+
+
+@dataclass(frozen=True)
+class Mistake:
+    """How a picture may have been put together wrongly, and how to undo it on trial."""
+
+    name: str
+    undo: Callable[[Image], FloatArray]
+
+
+def find_pixel_mistake(frames: Image) -> str:
+    """Name the mistake that explains rough pictures; empty if none does.
+
+    Parameters
+    ----------
+    frames : (frames, height, width) array
+        uint8 or uint16.
+    """
+    if frames.shape[1] < 2 or frames.shape[2] < 2 * _PERIODS_MAX:
+        return ""
+    scatter = frames[:, ::_COARSE, ::_COARSE].std(axis=(1, 2))
+    chosen = [k for k in np.argsort(scatter)[::-1][:_PICTURES] if scatter[k] > 0]
+    if not chosen:
+        return ""
+    if frames.dtype == np.uint8:
+        # rows that follow each other: packed pixels run on from one row to the next
+        middle = frames.shape[1] // 2
+        rows = slice(max(0, middle - _ROWS // 2), middle + _ROWS // 2)
+        return _find_packing([frames[k][rows] for k in chosen])
+    step = max(1, frames.shape[1] // _ROWS)
+    return _find_word_mistake([np.ascontiguousarray(frames[k][::step]) for k in chosen])
+
+
+def find_size_mistake(seen: tuple[int, ...], stated: tuple[int, int], dtype: np.dtype) -> str:
+    """Name the packing that explains a picture of another size than stated; empty if none does.
+
+    Both sizes are (height, width).
+    """
+    if len(seen) != 2 or seen[0] != stated[0]:
+        return ""
+    ratio = seen[1] / stated[1]
+    bytes_per_pixel = ratio * np.dtype(dtype).itemsize
+    packings = {1.5: "12-bit pixels, packed two in three bytes", 1.25: "10-bit pixels, packed"}
+    if bytes_per_pixel == 2.0 and dtype == np.uint8:
+        return "16-bit pixels whose two bytes stand side by side"
+    return packings.get(bytes_per_pixel, "")
+
+
+def _swap_bytes(picture: Image) -> FloatArray:
+    return picture.byteswap().astype(float)
+
+
+def _turn_columns(first: int, bits: int) -> Callable[[Image], FloatArray]:
+    """Rotate the 12 bits of every other pixel to the left, beginning with column `first`."""
+
+    def turn(picture: Image) -> FloatArray:
+        turned = picture.astype(np.uint32)
+        part = turned[:, first::2]
+        turned[:, first::2] = (part << bits | part >> (12 - bits)) & 0xFFF
+        return turned.astype(float)
+
+    return turn
+
+
+_WORD_MISTAKES = (
+    Mistake("the two bytes of each pixel are in the wrong order", _swap_bytes),
+    # in the first pixel of a pair the low bits stand before the high ones
+    Mistake("12-bit pixels were unpacked as Mono12p, but are Mono12Packed", _turn_columns(0, 4)),
+    Mistake("12-bit pixels were unpacked as Mono12Packed, but are Mono12p", _turn_columns(0, 8)),
+)
+_PERIODS = {
+    2: "16-bit pixels were read as bytes",
+    3: "12-bit pixels, packed two in three bytes, were read as bytes",
+    5: "10-bit pixels, packed four in five bytes, were read as bytes",
+}
+_PERIODS_MAX = max(_PERIODS)
+
+
+def _measure_roughness(pictures: Sequence[FloatArray]) -> float:
+    """Mean step between neighbours in a row, of the pictures' scatter; 1.1 for pure noise."""
+    scatter = sum(float(picture.std()) for picture in pictures)
+    steps = sum(float(np.abs(np.diff(picture, axis=1)).mean()) for picture in pictures)
+    return steps / scatter if scatter > 0 else np.inf
+
+
+def _find_word_mistake(pictures: Sequence[Image]) -> str:
+    present = _measure_roughness([picture.astype(float) for picture in pictures])
+    if present < _ROUGH:
+        return ""
+    tried = {
+        mistake.name: _measure_roughness([mistake.undo(picture) for picture in pictures])
+        for mistake in _WORD_MISTAKES
+    }
+    best, *others = sorted(tried, key=tried.__getitem__)
+    if tried[best] * _SMOOTHER > min(present, tried[others[0]]):
+        return ""
+    return best
+
+
+def _find_packing(pictures: Sequence[Image]) -> str:
+    """Name the period of bytes in which some are smooth and some are noise.
+
+    In a picture of whole pixels every column is as rough as its neighbours; in one of packed pixels
+    every second, third or fifth byte has the high bits, and another the low ones.
+    """
+    streams = [picture.astype(float).ravel() for picture in pictures]
+    if _measure_roughness([stream[np.newaxis] for stream in streams]) < _ROUGH:
+        return ""
+    found: dict[int, float] = {}
+    for period in _PERIODS:
+        steps = np.zeros(period)
+        for stream in streams:
+            whole = stream[: len(stream) // period * period].reshape(-1, period)
+            steps += np.abs(np.diff(whole, axis=0)).mean(axis=0)
+        found[period] = float(steps.max() / steps.min()) if steps.min() > 0 else np.inf
+    best, *others = sorted(found, key=found.__getitem__, reverse=True)
+    is_clear = found[best] >= _SMOOTHER * max(1.0, found[others[0]])
+    return _PERIODS[best] if is_clear else ""
