@@ -20,6 +20,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from membrane_ctrl.model.errors import CommandError
+from membrane_ctrl.model.program import program_commit
 from tests.studies.second_world_errors import drawn_points_mm, measured_errors
 from tests.worlds.second_optics import (
     FRAME_S,
@@ -217,6 +218,7 @@ def bench_answer(seed: int, resolution: float = 0.25) -> dict[str, Any]:
     answer: dict[str, Any] = {
         "seed": seed,
         "fine": drawn.fine,
+        "commit": program_commit(),
         "laser": drawn.world.effects.laser,
         "planted": drawn.planted,
         "sets": [],
@@ -237,6 +239,7 @@ def bench_answer(seed: int, resolution: float = 0.25) -> dict[str, Any]:
                 answer["sets"].append({"verdict": "crash", "reason": last, "flagged": []})
                 continue
             said = {"verdict": one.verdict, "reason": one.reason, "flagged": list(one.flagged)}
+            said |= {"geometry": one.geometry}
             if one.error_um is not None and one.sigma_um is not None:
                 said |= {"error_um": one.error_um.tolist(), "sigma_um": one.sigma_um.tolist()}
                 found.append(one)

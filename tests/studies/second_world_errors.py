@@ -52,6 +52,7 @@ class MeasuredErrors:
     rows: FloatArray
     budget: Budget | None
     residual_urad: float = float("nan")
+    geometry: str = ""
 
     @property
     def worst_sigmas(self) -> float:
@@ -136,4 +137,5 @@ def measured_errors(
         rows,
         bars.budget,
         full.quality.residual_urad,
+        bars.statement.state.value,
     )

@@ -230,8 +230,8 @@ class FilmSolver:
             change[2][:, columns] = along_x[:, None] * by_y + along_y[:, None] * by_x
         gradient = sum(change[k].T @ (weight * stress[k]) for k in range(3))
 
-        scaled = np.einsum("kl,lpn->kpn", self._root, change * np.sqrt(weight)[:, None])
-        scaled = scaled.reshape(-1, 3 * size)
+        change *= np.sqrt(weight)[:, None]
+        scaled = (self._root @ change.reshape(3, -1)).reshape(-1, 3 * size)
         matrix = scaled.T @ scaled
         tension = (
             by_x.T @ ((2 * weight * stress[0])[:, None] * by_x)
