@@ -1,10 +1,10 @@
 """Verdicts and error bars of `measure` on random benches of the second optical world.
 
-`python -m benchmarks.metrology.second_world 500` measures up to 500 benches (two sets each, a
-quarter of the resolution) and writes docs/measurements/second-world.md from the answers. The
-answers go to a file, a line of JSON a bench: a stopped run continues where it was. With `--full`
-the benches are rendered at full size; their answers go to a file of their own. `--page` writes the
-page from the answers that are there.
+`python -m benchmarks.metrology.second_world 500` measures up to 500 benches (two sets each) at a
+quarter of the resolution and writes docs/measurements/second-world.md from all answers that there
+are. The answers go to a file for each resolution, a line of JSON a bench: a stopped run continues
+where it was. `second_world 20 full` measures at full size, `second_world 500 eighth` at an eighth;
+`second_world page` writes the page from the answers that are there.
 """
 
 from __future__ import annotations
@@ -13,7 +13,7 @@ import json
 import re
 import sys
 from collections import Counter
-from collections.abc import Callable, Iterable
+from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
 
@@ -24,8 +24,7 @@ from tests.studies.second_benches import bench_answer
 from tests.support.figures import Figure, at_least, at_most
 
 BENCHES = 500
-ANSWERS = Path("logs/second_world.jsonl")
-FULL_ANSWERS = Path("logs/second_world_full.jsonl")
+RESOLUTIONS = {"quarter": 0.25, "eighth": 0.125, "full": 1.0}
 PAGE = Path("docs/measurements/second-world.md")
 
 PARTS = {"sag": slice(0, 1), "Z4..Z11": slice(1, 9), "map at 10 points": slice(9, None)}
@@ -160,9 +159,21 @@ def named_causes(given: list[dict[str, Any]]) -> Counter[tuple[str, bool]]:
     return counts
 
 
+def answers_file(resolution: str) -> Path:
+    """File of the answers at a resolution."""
+    return Path(f"logs/second_world_{resolution}.jsonl")
+
+
+def measured_benches(count: int, resolution: str) -> list[dict[str, Any]]:
+    """The first benches at a resolution; the missing ones are measured."""
+    return answers(
+        answers_file(resolution), count, lambda seed: bench_answer(seed, RESOLUTIONS[resolution])
+    )
+
+
 def run(count: int = BENCHES) -> list[Figure]:
     """Coverage by quantity, wrong `ok`s and true causes."""
-    given = answers(ANSWERS, count, bench_answer)
+    given = measured_benches(count, "quarter")
     figures = []
     for fine in (False, True):
         some = [one for one in given if one["fine"] == fine]
@@ -187,14 +198,32 @@ def _geometry(fine: bool) -> str:
     return "sigmas of a hundredth" if fine else "sigmas by hand"
 
 
-def page(given: list[dict[str, Any]], full: list[dict[str, Any]]) -> str:
-    """The page of the answers, as Markdown."""
-    parts = [HEAD, _coverage_table(given), _verdict_text(given), "## By planted cause\n"]
-    parts += [_cause_table(given), "## Statements\n", STATEMENTS, _statement_table(given)]
-    parts += ["## Worst cases, by seed\n", WORST_TEXT, _worst_tables(given)]
-    if full:
-        parts += ["## Full size\n", _full_text(full), _coverage_table(full)]
+def page(by_resolution: dict[str, list[dict[str, Any]]]) -> str:
+    """The page of the answers at each resolution, as Markdown; the first has all tables."""
+    main_name, *others = [name for name, given in by_resolution.items() if given]
+    given = by_resolution[main_name]
+    parts = [HEAD, _origin_text(main_name, given), _coverage_table(given), _verdict_text(given)]
+    parts += ["## By planted cause\n", _cause_table(given), "## Statements\n", STATEMENTS]
+    parts += [_statement_table(given), "## Worst cases, by seed\n", WORST_TEXT]
+    parts += [_worst_tables(given)]
+    for name in others:
+        parts += [f"## At another resolution: {name}\n", _origin_text(name, by_resolution[name])]
+        parts += [_coverage_table(by_resolution[name]), _verdict_text(by_resolution[name])]
     return "\n".join(parts)
+
+
+def _origin_text(resolution: str, given: list[dict[str, Any]]) -> str:
+    commits = sorted({one["commit"].removesuffix("-dirty") for one in given})
+    size = "full size" if resolution == "full" else f"{_with_article(resolution)} of the resolution"
+    seconds = sum(one["cpu_s"] for one in given) / len(given)
+    return (
+        f"{len(given)} benches at {size}, {seconds:.1f} s of a core each, "
+        f"commit {', '.join(commits)}.\n"
+    )
+
+
+def _with_article(resolution: str) -> str:
+    return f"an {resolution}" if resolution == "eighth" else f"a {resolution}"
 
 
 def _coverage_table(given: list[dict[str, Any]]) -> str:
@@ -288,13 +317,6 @@ def _worst_tables(given: list[dict[str, Any]]) -> str:
     return "\n".join([*lines, ""])
 
 
-def _full_text(full: list[dict[str, Any]]) -> str:
-    return (
-        f"The first {len(full)} benches, rendered and measured at 2448 x 2048 "
-        "(`python -m benchmarks.metrology.second_world 20 --full`).\n"
-    )
-
-
 def _planted(one: dict[str, Any]) -> str:
     sizes = [
         name if size == 1.0 else f"{name.removesuffix(', share')} {size:.2g}"
@@ -314,10 +336,10 @@ shares no code with the metrology or with the simulator (`tests/worlds/second_op
 orthotropic film of finite strains on an uneven ring, its own ray tracer, lens, bent screen, glass,
 air, panel and camera. Every input of the geometry is off at random; half of the benches have the
 sigmas of a hand measurement, half those of a hundredth. About three effects come on top; the table
-by cause lists them. Two sets a bench, 120 s apart, a quarter of the resolution.
+by cause lists them. Two sets a bench, 120 s apart. The goal of 500 benches takes hours of a core.
 
-Share of the 95 % intervals that contain the truth (goal 93 to 97 %), and bar over scatter (1 is
-sharp), of sets that are `ok` or `degraded`:
+Tables give the share of the 95 % intervals that contain the truth (goal 93 to 97 %), and bar over
+scatter (1 is sharp), of sets that are `ok` or `degraded`.
 """
 
 STATEMENTS = """Each reason and each flagged frame of a first set names a cause or names none.
@@ -338,21 +360,19 @@ def read_answers(path: Path) -> list[dict[str, Any]]:
     return sorted(given, key=lambda one: int(one["seed"]))
 
 
-def _full_answer(seed: int) -> dict[str, Any]:
-    return bench_answer(seed, resolution=1.0)
-
-
 def main(arguments: list[str]) -> None:
     """Measure the benches that are missing, print the figures, write the page."""
     numbers = [int(argument) for argument in arguments if argument.isdigit()]
     count = numbers[0] if numbers else BENCHES
-    if "--full" in arguments:
-        measure: Callable[[int], dict[str, Any]] = _full_answer
-        answers(FULL_ANSWERS, count, measure)
-    elif "--page" not in arguments:
+    named = [argument for argument in arguments if argument in RESOLUTIONS]
+    if named:
+        measured_benches(count, named[0])
+    elif "page" not in arguments:
         for figure in run(count):
             print(f"{figure.name}: {figure.value:.1f} {figure.unit} {figure.reference_value or ''}")
-    PAGE.write_text(page(read_answers(ANSWERS), read_answers(FULL_ANSWERS)), encoding="utf-8")
+    given = {name: read_answers(answers_file(name)) for name in RESOLUTIONS}
+    by_size = dict(sorted(given.items(), key=lambda item: -len(item[1])))
+    PAGE.write_text(page(by_size), encoding="utf-8")
 
 
 if __name__ == "__main__":

@@ -37,6 +37,7 @@ def test_a_row_that_is_half_or_twice_its_cause_does_not_agree() -> None:
     ratios = {0.5: False, 0.7: True, 1.0: True, 1.4: True, 2.0: False}
     for ratio, agrees in ratios.items():
         assert Comparison(plant, ratio, 1.0).agrees == agrees
+    assert Comparison(plant, 0.04, 0.001).agrees  # both negligible
 
 
 def test_all_rows_of_a_sound_budget_have_a_plant() -> None:

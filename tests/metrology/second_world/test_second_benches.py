@@ -18,6 +18,7 @@ def answer(seed: int, verdict: str, off: float, planted: dict[str, float], reaso
     if verdict in ("ok", "degraded"):
         one |= {"error_um": [off] * 19, "sigma_um": [1.0] * 19}
     given: dict[str, Any] = {"seed": seed, "fine": bool(seed % 2), "planted": planted}
+    given |= {"commit": "0123456789ab-dirty", "cpu_s": 2.0}
     given |= {"sets": [one, one]}
     if "error_um" in one:
         given |= {"change_error_um": [0.1] * 19, "change_sigma_um": [1.0] * 19}
@@ -64,9 +65,11 @@ def test_a_statement_blames_its_cause(statement: str, cause: str) -> None:
 
 
 def test_the_page_lists_the_worst_cases() -> None:
-    text = page(GIVEN, [])
+    text = page({"quarter": GIVEN, "full": GIVEN[:2], "eighth": []})
     assert "| 1 | 3.5 sigma | flicker 0.01 | `ok` |" in text
-    assert "| 3 | - | blur, px of a quarter; " not in text
+    assert "| 4 | - |  | refused: only 0 bins see the pattern in the mirror |" in text
+    assert "6 benches at a quarter of the resolution, 2.0 s of a core each" in text
+    assert "2 benches at full size" in text
     assert "| `ok` beyond 3 sigma, of all benches | 1, 16.7 % | 0.5 % |" in text
 
 
