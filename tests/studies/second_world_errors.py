@@ -87,9 +87,10 @@ def drawn_points_mm(rng: np.random.Generator, count: int) -> FloatArray:
 
 
 def true_values_um(mirror: Mirror, truth: Truth, points_mm: FloatArray) -> FloatArray:
-    """The quantities of the true film."""
+    """The quantities of the true film; heights as a fit may have them, without wrinkles."""
     terms = truth.zernike_um[list(TERMS)]
-    heights_um = 1e3 * mirror.height_mm(*points_mm, truth.displacement_um)
+    smooth = mirror.without_wrinkles()
+    heights_um = 1e3 * smooth.height_mm(*points_mm, truth.displacement_um)
     return np.concatenate([[truth.sag_um], terms, heights_um])
 
 

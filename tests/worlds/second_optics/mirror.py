@@ -6,7 +6,7 @@ does not move; at displacement d the centre is at z = -d.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from math import factorial
 
@@ -58,6 +58,14 @@ class Mirror:
 
     def __post_init__(self) -> None:
         self._solved: dict[int, tuple[Shape, FloatArray]] = {}
+
+    def without_wrinkles(self) -> Mirror:
+        """The same film without its wrinkles, which no term of a fit represents."""
+        if self.wrinkles is None:
+            return self
+        smooth = replace(self, wrinkles=None)
+        smooth._solved = self._solved  # wrinkles are no part of the equilibrium
+        return smooth
 
     def load(self, displacement_um: float = 0.0) -> float:
         """Pressure over E1 t / R."""
