@@ -47,8 +47,9 @@ def table(found: list[Comparison]) -> str:
 def page(found: list[Comparison]) -> str:
     """The page."""
     agreeing = sum(one.agrees for one in found)
-    narrow = [one.plant.says for one in found if one.ratio < 1 / AGREES]
-    wide = [one.plant.says for one in found if one.ratio > AGREES]
+    missed = [one for one in found if not one.agrees]
+    narrow = [one.plant.says for one in missed if one.ratio < 1]
+    wide = [one.plant.says for one in missed if one.ratio > 1]
     summary = f"{agreeing} of {len(found)} agree."
     misses = [
         f"Bar too narrow: {'; '.join(narrow) or 'none'}.",
