@@ -5,13 +5,16 @@ whole set, or at its middle. The fringes of each axis show how the film moves fr
 next: a drift that both axes have is continued over the set, and of what is left, half is assumed to
 differ between the sinusoids and the other frames. A step between the axes leaves no trace here; by
 the sinusoids' mean the sag is right then, too.
+
+With a laser the figure holds for the mean of all its readings. Where a frame is left out, only the
+readings show how far the film was from there in the other frames, and their noise remains.
 """
 
 import math
 
 import numpy as np
 
-from membrane_ctrl.metrology.figure.set_motion import FilmMotion
+from membrane_ctrl.metrology.figure.set_motion import LASER_NOISE_UM, FilmMotion
 from membrane_ctrl.metrology.frame_checks.checked_set import Checked
 from membrane_ctrl.metrology.rays.surface import Surface
 from membrane_ctrl.metrology.uncertainty.budget import Source
@@ -53,13 +56,25 @@ def moment_sigma_um(
     return math.hypot(later * drift_um, later * rate_sigma_um, _UNEVEN_SHARE * uneven_um)
 
 
+def left_out_sigma_um(used: int, shown: int, laser_noise_um: float) -> float:
+    """1 sigma of the mean reading of the used sinusoids about that of all that were shown."""
+    return laser_noise_um * math.sqrt(1 / used - 1 / shown)
+
+
 def moment_source(checked: Checked, film: FilmMotion, radius_mm: float) -> Source | None:
-    """The row of the budget; None with a laser, whose mean reading states the moment."""
+    """The row of the budget; None with a laser, unless the film moved and a frame is left out."""
+    used = [np.array(frames, float) for frames in checked.view.used]
+    stack = checked.stack
     if math.isfinite(film.x_to_y_sigma_um):
-        return None
-    frames = np.array(checked.view.used[0], float), np.array(checked.view.used[1], float)
-    count_frames = len(checked.stack.patterns)
-    sigma_um = moment_sigma_um(frames, checked.film_um, checked.film_noise_um, count_frames)
+        count_used = sum(frames.size for frames in used)
+        if not film.worth_correcting or count_used == stack.readings_um.size:
+            return None
+        sigma_um = left_out_sigma_um(count_used, stack.readings_um.size, LASER_NOISE_UM)
+        says = "the laser's noise where a frame is left out while the film moves"
+    else:
+        frames = used[0], used[1]
+        count_frames = len(stack.patterns)
+        sigma_um = moment_sigma_um(frames, checked.film_um, checked.film_noise_um, count_frames)
+        says = "motion of the film during the set, without a laser"
     deeper_mm = Surface.hencky_bowl(1e-3 * sigma_um, radius_mm).parameters
-    says = "motion of the film during the set, without a laser"
     return Source("moment_um", says, sigma_um, deeper_mm[:, None], common=False, paired=False)

@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from membrane_ctrl.metrology.uncertainty.set_moment import moment_sigma_um
+from membrane_ctrl.metrology.uncertainty.set_moment import left_out_sigma_um, moment_sigma_um
 from tests.studies.second_world_errors import drawn_points_mm, measured_errors
 from tests.worlds.second_optics import FRAME_S, Bench, Effects, Mirror, World
 
@@ -81,3 +81,33 @@ def test_a_change_of_the_sag_is_within_its_bar_whatever_moment_is_meant(
     assert np.abs(ratio).max() < 2.0
     of_mean_um = error_um[0] - moment_um(COURSES[name])
     assert abs(of_mean_um) < 1.1 * moving.change_sigma_um(before)[0]
+
+
+def test_a_left_out_frame_leaves_the_laser_s_noise() -> None:
+    """Mean of seven readings less that of all eight, over many sets."""
+    readings_um = np.random.default_rng(1).normal(0.0, 1.5, (20_000, 8))
+    apart_um = readings_um[:, :7].mean(axis=1) - readings_um.mean(axis=1)
+    assert left_out_sigma_um(7, 8, 1.5) == pytest.approx(float(apart_um.std()), rel=0.02)
+    assert left_out_sigma_um(8, 8, 1.5) == 0.0
+
+
+def test_a_stale_frame_while_the_film_moves_is_in_the_bar_of_a_change(tmp_path: Path) -> None:
+    """The change of the sag was 5.5 sigma off: the laser's noise moved the film's mean place."""
+    places_um = np.cumsum(np.random.default_rng(4).normal(0.0, 4.0, (2, FRAMES)), axis=1)
+    points_mm = drawn_points_mm(np.random.default_rng(1), 5)
+    mirror, found = Mirror(), []
+    for k in range(2):
+        walk = places_um[k]
+        effects = Effects(
+            film_motion_um=lambda time_s, walk=walk: float(walk[round(time_s / FRAME_S)]),
+            stale_frame=2,
+        )
+        world = World(mirror, Bench.paper(0.125), effects, seed=k)
+        truth = world.write_set(tmp_path / f"set{k}")
+        found.append(measured_errors(tmp_path / f"set{k}", mirror, truth, points_mm))
+    first, second = found
+    assert first.error_um is not None
+    assert second.error_um is not None
+    sigma_um = second.change_sigma_um(first)[0]
+    assert abs(second.error_um[0] - first.error_um[0]) < 3 * sigma_um
+    assert 0.15 < sigma_um < 0.5
