@@ -19,6 +19,7 @@ from hypothesis import settings
 from steady_loop import SteadyLoop
 
 from membrane_ctrl.instruments import lock_store
+from tests.support import real_data
 from tests.support.undrawn import undrawn_figures
 
 # No test sees or leaves locks on this machine's devices, nor does a program that a module's fixture
@@ -45,6 +46,14 @@ def pytest_collection() -> Generator[None, object, object]:
     gc.freeze()
     gc.enable()
     return collected
+
+
+def pytest_terminal_summary(terminalreporter: pytest.TerminalReporter) -> None:
+    """Say so where tests of real frames were skipped."""
+    skipped = terminalreporter.stats.get("skipped", [])
+    reasons = [report.longrepr[2] for report in skipped if isinstance(report.longrepr, tuple)]
+    if note := real_data.describe_skipped_frames(reasons):
+        terminalreporter.write_line(note)
 
 
 def pytest_sessionfinish() -> None:

@@ -20,6 +20,7 @@ import tomli_w
 from membrane_ctrl.cli import run
 from membrane_ctrl.config.optics import SigmasConfig
 from membrane_ctrl.model.zernike_terms import ZERNIKE_TERMS
+from tests.support.real_data import SOFAST, WHY_SKIPPED
 
 SMALL = ["--shrink", "8"]
 
@@ -412,10 +413,10 @@ def test_a_rim_that_no_stated_sigma_explains_contradicts_the_geometry(
     assert known["state"] == "contradicted"
 
 
-FACET = Path(__file__).parents[2].parent / "shared" / "data" / "sofast" / "measurement_facet.h5"
+FACET = SOFAST / "measurement_facet.h5"
 
 
-@pytest.mark.skipif(not FACET.is_file(), reason="no measured facet")
+@pytest.mark.skipif(not FACET.is_file(), reason=WHY_SKIPPED)
 def test_frames_of_a_measured_facet(capsys: pytest.CaptureFixture[str]) -> None:
     assert run(["measure", str(FACET), "--json"]) == 0
     table = json.loads(capsys.readouterr().out)

@@ -3,7 +3,6 @@ every figure).
 """
 
 from itertools import product
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -20,10 +19,11 @@ from membrane_ctrl.metrology.phase.phase_steps import compute_phasors
 from membrane_ctrl.metrology.phase.temporal_unwrap import predict_phase, unwrap_in_time
 from tests.support import sofast_facet
 from tests.support.facet import measure_on, solve_facet
+from tests.support.real_data import SOFAST, WHY_SKIPPED
 from tests.support.sofast_facet import decode, sight, wrapped_phases
 
-DATA = Path(__file__).parents[3].parent / "shared" / "data" / "sofast"
-pytestmark = pytest.mark.skipif(not DATA.is_dir(), reason=f"no measured facet in {DATA}")
+DATA = SOFAST
+pytestmark = pytest.mark.skipif(not DATA.is_dir(), reason=WHY_SKIPPED)
 
 SCREENS = {
     "measured": ("display_distorted_2d", "expected_facet"),
