@@ -100,14 +100,14 @@ class ShapeCycle:
         """Take one cycle; None if it was stopped. Catches whatever devices and numerics raise."""
         self._cycle += 1
         try:
-            estimate = self._measure("full" if self._full_next else "fringes")
+            estimate = self._measure_shape("full" if self._full_next else "fringes")
         except exposures.StageError as error:
             self._failed_in_a_row += 1
             return CycleFailed(self._cycle, error.stage, str(error), pause_s(self._failed_in_a_row))
         if estimate is None:
             return None
         self._failed_in_a_row = 0
-        self._judge(estimate)
+        self._choose_next_kind(estimate)
         return CycleDone(estimate, pause_s(self._full_rejected_in_a_row - REJECTED_IN_A_ROW + 1))
 
     def prepare(self) -> None:
@@ -117,7 +117,7 @@ class ShapeCycle:
         with suppress(exposures.StageError), exposures.convert_stage_errors("reconstruction"):
             self._reconstructor.prepare()
 
-    def _judge(self, estimate: ShapeEstimate) -> None:
+    def _choose_next_kind(self, estimate: ShapeEstimate) -> None:
         """Decide the kind of the next cycle."""
         rejected = estimate.verdict == "rejected"
         if estimate.kind == "full":
@@ -126,7 +126,7 @@ class ShapeCycle:
         elif estimate.tracking_lost:
             self._full_next = True
 
-    def _measure(self, kind: Literal["full", "fringes"]) -> ShapeEstimate | None:
+    def _measure_shape(self, kind: Literal["full", "fringes"]) -> ShapeEstimate | None:
         patterns = self._plan.patterns(kind == "full")
         frames = self._exposures.take(patterns, self._cycle, self._stopping)
         if frames is None:

@@ -114,7 +114,7 @@ class Exposures:
         Raises StageError ("screen" or "camera", and the failure).
         """
         try:
-            return self._take(patterns, cycle, stopping)
+            return self._expose_in_order(patterns, cycle, stopping)
         except StageError:
             self._shown = None
             raise
@@ -122,7 +122,7 @@ class Exposures:
             if isinstance(self._camera, _Grabbing):  # frames left by a cycle that ended early
                 self._camera.forget()
 
-    def _take(
+    def _expose_in_order(
         self, patterns: Sequence[Pattern], cycle: int, stopping: Callable[[], bool]
     ) -> list[Frame] | None:
         taken: list[Frame] = []
@@ -131,9 +131,9 @@ class Exposures:
         for pattern in patterns:
             if stopping():
                 return None
-            self._show(pattern)
+            self._show_pattern(pattern)
             if pending is not None:
-                taken.append(self._store(*pending, cycle, then=pattern))
+                taken.append(self._store_frame(*pending, cycle, then=pattern))
                 exposed_s = taken[-1].time_s
             with convert_stage_errors("screen"):
                 self._screen.wait()
@@ -147,28 +147,30 @@ class Exposures:
                 patterns[0] if self._looks_ahead else None
             )  # both kinds of cycle start with the same pattern
             if ahead is not None:
-                self._show(ahead)
-            taken.append(self._store(*pending, cycle, then=ahead))
+                self._show_pattern(ahead)
+            taken.append(self._store_frame(*pending, cycle, then=ahead))
         return taken
 
-    def _show(self, pattern: Pattern) -> None:
+    def _show_pattern(self, pattern: Pattern) -> None:
         """Send a pattern to the screen, unless it stands there."""
         if pattern != self._shown:
             with convert_stage_errors("screen"):
                 self._screen.begin(pattern)
             self._shown = pattern
 
-    def _store(self, pattern: Pattern, slot: FrameSlot, cycle: int, then: Pattern | None) -> Frame:
+    def _store_frame(
+        self, pattern: Pattern, slot: FrameSlot, cycle: int, then: Pattern | None
+    ) -> Frame:
         """Fetch the exposure of `pattern` into its slot;
         the screen shows `then` before and after.
         """
-        frame = self._fetch(pattern, slot, then)
+        frame = self._fetch_frame(pattern, slot, then)
         if frame.pixels is not slot.pixels:
             slot.pixels[...] = frame.pixels
         slot.commit(pattern.name, frame.time_s, self._laser.at(frame.time_s), cycle)
         return Frame(slot.pixels, frame.time_s)
 
-    def _fetch(self, pattern: Pattern, slot: FrameSlot, then: Pattern | None) -> Frame:
+    def _fetch_frame(self, pattern: Pattern, slot: FrameSlot, then: Pattern | None) -> Frame:
         """Fetch the frame; retake a lost one with its own pattern on the screen."""
         for tried in range(1, TRIES + 1):
             with convert_stage_errors("camera"):

@@ -55,14 +55,20 @@ class DisplayTest:
 
     def exposure(self, full_scale_adu: int, exposure_ms: float) -> str:
         """Any problem with the camera's exposure, else empty."""
-        white, black = self._still(self._grey(255)), self._still(self._grey(0))
+        white, black = (
+            self._expose_still(self._make_grey(255)),
+            self._expose_still(self._make_grey(0)),
+        )
         return exposure_check.exposure_problem(white, black, full_scale_adu, exposure_ms)
 
     def checkerboard(self) -> str:
         """Any problem with pixel-for-pixel display, else empty."""
-        white, black = self._still(self._grey(255)), self._still(self._grey(0))
+        white, black = (
+            self._expose_still(self._make_grey(255)),
+            self._expose_still(self._make_grey(0)),
+        )
         return checkerboard_check.checkerboard_problem(
-            self._still(display_patterns.make_checkerboard(self._size[1], self._size[0])),
+            self._expose_still(display_patterns.make_checkerboard(self._size[1], self._size[0])),
             white,
             black,
         )
@@ -79,14 +85,15 @@ class DisplayTest:
         noise = 0.0
         for one, other in ((0, 255), (64, 160)):
             pictures = {
-                level: _thin_pixels(self._still(self._grey(level))) for level in (one, other)
+                level: _thin_pixels(self._expose_still(self._make_grey(level)))
+                for level in (one, other)
             }
-            again = _thin_pixels(self._still(self._grey(one)))
+            again = _thin_pixels(self._expose_still(self._make_grey(one)))
             noise = max(noise, display_settling.share_left(again, pictures[other], pictures[one]))
             for before, after in ((one, other), (other, one)) * _TIMES:
-                self._still(self._grey(before))
+                self._expose_still(self._make_grey(before))
                 for delay_s, pixels in list(
-                    self._follow(self._grey(after))
+                    self._expose_series(self._make_grey(after))
                 ):  # evaluated afterwards
                     delays_s.append(delay_s)
                     left.append(
@@ -98,19 +105,21 @@ class DisplayTest:
 
     def response(self) -> display_response.DisplayResponse:
         """Light against level. Raises ValueError if the camera sees no ramp."""
-        frames = [self._still(self._grey(level)) for level in display_response.RAMP_LEVELS]
+        frames = [
+            self._expose_still(self._make_grey(level)) for level in display_response.RAMP_LEVELS
+        ]
         swing = frames[-1].astype(np.float64) - frames[0]
         lit = swing > 0.5 * np.quantile(swing, 0.99)
         return display_response.measured_response(
             display_response.RAMP_LEVELS, [float(np.mean(frame[lit])) for frame in frames]
         )
 
-    def _still(self, levels: roles.Levels) -> roles.Pixels:
+    def _expose_still(self, levels: roles.Levels) -> roles.Pixels:
         self._screen.show_levels(levels)
         self._clock.sleep(self.settle_s)
         return self._camera.grab().pixels
 
-    def _follow(self, levels: roles.Levels) -> Iterator[tuple[float, roles.Pixels]]:
+    def _expose_series(self, levels: roles.Levels) -> Iterator[tuple[float, roles.Pixels]]:
         """Frames one after the other, each with the time from the command to the start of its
         exposure.
         """
@@ -120,7 +129,7 @@ class DisplayTest:
             frame = self._camera.grab()
             yield frame.time_s - begun_s, _thin_pixels(frame.pixels)
 
-    def _grey(self, level: int) -> roles.Levels:
+    def _make_grey(self, level: int) -> roles.Levels:
         return np.full(self._size, level, np.uint8)
 
 

@@ -86,7 +86,7 @@ class RawFrames:
 
     def after(self, estimate: ShapeEstimate) -> None:
         """Keep the frames of a finished cycle if they are due."""
-        self._collect()
+        self._collect_writes()
         self.look_for_fault()
         if estimate.kind == "track":
             return
@@ -99,7 +99,7 @@ class RawFrames:
         anchors = estimate.kind == "full" and estimate.verdict != "rejected"
         if not (due or anchors):
             return
-        kept = self._keep(estimate.cycle)
+        kept = self._copy_and_queue(estimate.cycle)
         if anchors and kept is not None:
             if self._reference is not None and not self._reference_needed:
                 self._writer.submit(shutil.rmtree, self._reference, ignore_errors=True)
@@ -107,9 +107,9 @@ class RawFrames:
 
     def capture(self, estimate: ShapeEstimate) -> Path:
         """Write a cycle's frames and wait; returns the set's folder. Raises OSError."""
-        kept = self._keep(estimate.cycle)
+        kept = self._copy_and_queue(estimate.cycle)
         wait(write.done for write in self._writing)
-        self._collect()
+        self._collect_writes()
         if kept is None or not (kept / "capture.toml").exists():
             raise OSError(
                 "the set could not be written completely: is the disk full, or slower than "
@@ -128,28 +128,28 @@ class RawFrames:
                 {head.cycle for head in self._frames.heads() if head.pattern in self._patterns}
             )
             for cycle in cycles[-self._recording.raw_before_fault_cycles :]:
-                self._keep(cycle)
+                self._copy_and_queue(cycle)
         self._in_fault = fault
 
     def close(self) -> None:
         """Check for a fault once more, write pending sets, detach."""
         self.look_for_fault()
         self._writer.shutdown()
-        self._collect()
+        self._collect_writes()
         self._frames.close()
         self._telemetry.close()
 
-    def _keep(self, cycle: int) -> Path | None:
+    def _copy_and_queue(self, cycle: int) -> Path | None:
         """Copy a cycle's frames and queue them for writing; None if impossible."""
         if cycle in self._kept:
             return self._kept[cycle]
-        self._collect()
-        found = self._copy(cycle)
-        against = self._against(found) if found is not None else ""
+        self._collect_writes()
+        found = self._copy_frames(cycle)
+        against = self._find_objection(found) if found is not None else ""
         if found is None or against:
             self._leave_out(against)
             return None
-        path = self._kept[cycle] = self._unused(cycle)
+        path = self._kept[cycle] = self._find_free_name(cycle)
         reference = None
         if found.kind == "fringes" and self._reference is not None:
             self._reference_needed, reference = True, f"../{self._reference.name}"
@@ -158,7 +158,7 @@ class RawFrames:
         self._writing.append(_Write(cycle, path, found.size_bytes, done))
         return path
 
-    def _against(self, found: _Set) -> str:
+    def _find_objection(self, found: _Set) -> str:
         """Why a set cannot be written now; empty if it can."""
         if len(self._writing) >= _WAITING_SETS:
             return "the disk is slower than the cycles"
@@ -181,7 +181,7 @@ class RawFrames:
                 acquisition_events.FramesLeftOut(self.left_out, f"frames are omitted: {why}")
             )
 
-    def _collect(self) -> None:
+    def _collect_writes(self) -> None:
         """Collect finished writes; drop a failed set, to which no other may refer."""
         done = [write for write in self._writing if write.done.done()]
         self._writing = [write for write in self._writing if write not in done]
@@ -195,7 +195,7 @@ class RawFrames:
                 self._reference = None
             self._leave_out(str(error))
 
-    def _unused(self, cycle: int) -> Path:
+    def _find_free_name(self, cycle: int) -> Path:
         """A free name for the set; a replacement acquisition counts its cycles from 1 again."""
         path, again = self._folder / f"cycle-{cycle:06d}", 1
         while path.exists():
@@ -203,7 +203,7 @@ class RawFrames:
             path = path.with_name(f"cycle-{cycle:06d}-{again}")
         return path
 
-    def _copy(self, cycle: int) -> _Set | None:
+    def _copy_frames(self, cycle: int) -> _Set | None:
         heads = [head for head in self._frames.heads() if head.cycle == cycle]
         copies = [self._frames.copy(head) for head in heads]
         names = {

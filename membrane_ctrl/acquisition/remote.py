@@ -42,7 +42,7 @@ class Remote:
         self._say_alive()
         try:
             while self._control.poll(min(timeout_s, _PARENT_CHECK_S)):
-                self._obey(self._control.recv())
+                self._execute_command(self._control.recv())
                 timeout_s = 0.0
         except (EOFError, OSError):  # the other end is closed
             self.stop = True
@@ -105,7 +105,7 @@ class Remote:
         except OSError:
             self.stop = True
 
-    def _obey(self, command: object) -> None:
+    def _execute_command(self, command: object) -> None:
         match command:
             case "pause":
                 self.paused = True

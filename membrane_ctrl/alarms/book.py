@@ -150,7 +150,7 @@ class AlarmBook:
         """Return the due messages."""
         messages: list[AlarmMessage] = []
         for name, alarm in list(self._alarms.items()):
-            kind = self._due(alarm, now_s)
+            kind = self._list_due(alarm, now_s)
             if kind is None:
                 continue
             if kind == "cleared":
@@ -165,7 +165,7 @@ class AlarmBook:
             )
         return messages
 
-    def _due(self, alarm: _Alarm, now_s: float) -> MessageKind | None:
+    def _list_due(self, alarm: _Alarm, now_s: float) -> MessageKind | None:
         config = self._config
         if now_s - alarm.gone_s >= config.clear_after_s:
             return "cleared"

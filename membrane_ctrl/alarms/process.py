@@ -202,8 +202,8 @@ class Watcher:
             self._take_event(json.loads(message), now_s)
         for row in rows:
             self._take_row(row, now_s)
-        self._listen(bool(rows), now_s)
-        self._send(now_s)
+        self._read_event(bool(rows), now_s)
+        self._send_due(now_s)
 
     def orphaned(self, now_s: float) -> None:
         """Report that the control process ended without an "end" event."""
@@ -211,7 +211,7 @@ class Watcher:
             "the control process ended without a report; the board's watchdog has stopped the pump"
         )
         self._book.take(Sign("control_gone", True, "critical", text), now_s)
-        self._send(now_s)
+        self._send_due(now_s)
 
     def _take_event(self, line: EventLine, now_s: float) -> None:
         event = event_lines.from_dict(line)
@@ -231,7 +231,7 @@ class Watcher:
             if sign is not None:
                 self._book.take(sign, now_s)
 
-    def _listen(self, heard: bool, now_s: float) -> None:
+    def _read_event(self, heard: bool, now_s: float) -> None:
         if heard:
             self._last_row_s = now_s
             self._book.take(Sign("silent", False), now_s)
@@ -239,7 +239,7 @@ class Watcher:
             text = f"no tick for {self._config.silent_s:g} s: the control process hangs"
             self._book.take(Sign("silent", True, "critical", text), now_s)
 
-    def _send(self, now_s: float) -> None:
+    def _send_due(self, now_s: float) -> None:
         for message in self._book.step(now_s):
             for outbox in self._outboxes[: 2 if message.escalated else 1]:
                 outbox.post(message)

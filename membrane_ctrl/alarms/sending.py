@@ -35,7 +35,9 @@ class Service:
         if not self._begun:
             return
         self._accepted = False
-        self._thread = threading.Thread(target=self._send, args=(title, body, kind), daemon=True)
+        self._thread = threading.Thread(
+            target=self._send_message, args=(title, body, kind), daemon=True
+        )
         self._thread.start()
 
     def accepted(self, until_s: float) -> bool:
@@ -47,7 +49,7 @@ class Service:
         self._thread.join(max(0.0, until_s - time.monotonic()))
         return not self._thread.is_alive() and self._accepted
 
-    def _send(self, title: str, body: str, kind: str) -> None:
+    def _send_message(self, title: str, body: str, kind: str) -> None:
         try:
             self._accepted = bool(self._plugin.notify(title=title, body=body, notify_type=kind))
         except Exception as error:  # plug-ins raise anything, and MemoryError at the limit

@@ -62,9 +62,9 @@ class Procedure:
             self.sweep.shape_loop(False)
             times_s = self.times_s(session.head, session.missing)
             for number, index in enumerate(session.missing):
-                self._take(session, index, times_s[number], sum(times_s[number + 1 :]))
+                self._take_set(session, index, times_s[number], sum(times_s[number + 1 :]))
 
-    def _take(
+    def _take_set(
         self, session: CalibrationSession, index: int, expected_s: float, after_s: float
     ) -> None:
         setpoint_um = session.head.setpoints_um[index]

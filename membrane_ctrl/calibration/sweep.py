@@ -55,7 +55,7 @@ class Sweep:
         rows: deque[telemetry.TelemetryRow] = deque()
         shape = None
         while shape is None or rows[-1].mono_s - rows[0].mono_s < _LOOK_S:
-            news = self._news()
+            news = self._read_news()
             rows.extend(news.rows)
             shape = next(
                 (each for each in reversed(news.shapes) if each.verdict != "rejected"), shape
@@ -79,7 +79,7 @@ class Sweep:
 
     def claim(self, setpoint_um: float) -> None:
         """Take command without a motion, by repeating the setpoint. Raises HoldError if refused."""
-        self._ask("setpoint", setpoint_um)
+        self._send_command("setpoint", setpoint_um)
 
     def go(self, setpoint_um: float, expected_s: float) -> None:
         """Ramp to a setpoint and settle.
@@ -87,12 +87,12 @@ class Sweep:
         Raises HoldError if the mirror is no longer held or someone else moves it; DeviceError if it
         does not arrive.
         """
-        self._ask("setpoint", setpoint_um)
+        self._send_command("setpoint", setpoint_um)
         patience_s = _LATE[0] * expected_s + _LATE[1]
         there: deque[telemetry.TelemetryRow] = deque()
         begin_s, obeyed = math.nan, False
         while True:
-            for row in self._news().rows:
+            for row in self._read_news().rows:
                 obeyed = obeyed or row.target_um == setpoint_um
                 if obeyed and row.target_um != setpoint_um:
                     raise HoldError(f"someone else moved the setpoint to {row.target_um:g} µm")
@@ -102,7 +102,11 @@ class Sweep:
                     there.clear()
                     continue
                 there.append(row)
-            if there and there[-1].mono_s - there[0].mono_s >= SETTLE_S and self._inside(there):
+            if (
+                there
+                and there[-1].mono_s - there[0].mono_s >= SETTLE_S
+                and self._are_within_band(there)
+            ):
                 return
             if self._last_s - begin_s > patience_s:
                 raise errors.DeviceError(
@@ -116,8 +120,8 @@ class Sweep:
         Raises HoldError if the hold refuses or the mirror is no longer held; RejectedError if both
         are bad.
         """
-        first = self._capture()
-        event = first if first.set else self._capture()
+        first = self._request_capture()
+        event = first if first.set else self._request_capture()
         if not event.set:
             raise errors.RejectedError(
                 f"no good set in two attempts: {first.failed}; {event.failed}"
@@ -126,29 +130,29 @@ class Sweep:
 
     def shape_loop(self, on: bool) -> None:
         """Switch the shape loop."""
-        self._ask("shape_on" if on else "shape_off")
+        self._send_command("shape_on" if on else "shape_off")
 
-    def _capture(self) -> acquisition_events.Capture:
-        self._ask("capture")
+    def _request_capture(self) -> acquisition_events.Capture:
+        self._send_command("capture")
         begin_s = self._last_s
         while self._last_s - begin_s < _SET_WITHIN_S:
             told = [
                 event
-                for event in self._news().events
+                for event in self._read_news().events
                 if isinstance(event, acquisition_events.Capture)
             ]
             if told:
                 return told[-1]
         return acquisition_events.Capture(failed=f"no set within {_SET_WITHIN_S:.0f} s")
 
-    def _inside(self, rows: deque[telemetry.TelemetryRow]) -> bool:
+    def _are_within_band(self, rows: deque[telemetry.TelemetryRow]) -> bool:
         last = [row.error_um for row in rows if rows[-1].mono_s - row.mono_s <= _MEAN_S]
         return abs(_mean_of_finite(last)) < self._limits.band_um
 
-    def _ask(self, kind: Kind, value: float = math.nan) -> None:
+    def _send_command(self, kind: Kind, value: float = math.nan) -> None:
         self._link.ask(Command(kind, "calibration", WHY, value=value))
 
-    def _news(self) -> News:
+    def _read_news(self) -> News:
         """New ticks, events and shapes. Raises HoldError if the mirror is no longer held."""
         news = self._link.news()
         for event in news.events:

@@ -57,7 +57,7 @@ class KeyReader:
             return ""
         with suppress(OSError, termios.error):  # nothing was typed, or the terminal has gone
             if not self._is_ours():  # also after the shell had the terminal
-                self._take()
+                self._read_keys()
             return _ESCAPE_SEQUENCE.sub(
                 "", self._decoder.decode(os.read(self._handle, _READ_BYTES))
             )
@@ -77,7 +77,7 @@ class KeyReader:
         suspend = modes[_CONTROL_CHARACTERS][termios.VSUSP]
         return not modes[_LINE_MODES] & termios.ICANON and bool(suspend == _NO_KEY)
 
-    def _take(self) -> None:
+    def _read_keys(self) -> None:
         modes = termios.tcgetattr(self._handle)
         modes[_LINE_MODES] &= ~(termios.ICANON | termios.ECHO)
         modes[_CONTROL_CHARACTERS][termios.VSUSP] = _NO_KEY

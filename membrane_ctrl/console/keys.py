@@ -53,22 +53,22 @@ class Desk:
         if not text:
             return
         if self._prompt == "mark":
-            self._write(text)
+            self._write_text(text)
         elif self._prompt == "stop":
             self._prompt = ""
             if text[0] in "yY":
-                self._ask({"do": "stop"})
+                self._send_request({"do": "stop"})
             else:
                 self._said = "not stopped"
         else:
-            self._command(text[0].lower(), paused)
+            self._run_command(text[0].lower(), paused)
 
-    def _command(self, key: str, paused: bool) -> None:
+    def _run_command(self, key: str, paused: bool) -> None:
         match key:
             case "h":
-                self._ask({"do": "hold"})
+                self._send_request({"do": "hold"})
             case "p":
-                self._ask({"do": "resume" if paused else "pause"})
+                self._send_request({"do": "resume" if paused else "pause"})
             case "m":
                 self._prompt, self._text = "mark", ""
             case "s":
@@ -78,12 +78,12 @@ class Desk:
             case "\x1a":
                 self._said = _SUSPENDED
 
-    def _write(self, text: str) -> None:
+    def _write_text(self, text: str) -> None:
         for letter in text:
             if letter in "\r\n":
                 self._prompt = ""
                 if self._text.strip():
-                    self._ask({"do": "mark", "text": self._text.strip()})
+                    self._send_request({"do": "mark", "text": self._text.strip()})
                 return
             if letter == "\x1b":
                 self._prompt = ""
@@ -93,6 +93,6 @@ class Desk:
             elif letter.isprintable():
                 self._text = (self._text + letter)[:_MARK_MAX]
 
-    def _ask(self, request: Request) -> None:
+    def _send_request(self, request: Request) -> None:
         self._said = f"{request['do']}: waiting for the answer"
         self._answer = self._send(request)

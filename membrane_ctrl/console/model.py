@@ -177,7 +177,7 @@ class ConsoleModel:
         age_s = now_s - row.mono_s if row else 0.0
         return ConsoleView(
             row=row,
-            why=self._why(),
+            why=self._explain_state(),
             locks=tuple(map(describe_lock, status.locks)),
             go_on=go_on(row, status.paused, self._ctl, self._keys, status.locks, status.latched)
             if row
@@ -203,7 +203,7 @@ class ConsoleModel:
             flow_most_um_per_s=in_force.loop.flow_most_um_per_s(in_force.pump),
             notices=tuple(notice.short_text for notice in status.other_notices),
             events=tuple(self._events),
-            shape=self._shape(now_s),
+            shape=self._make_shape_view(now_s),
         )
 
     def _too_tight(self, now_s: float) -> bool:
@@ -215,7 +215,7 @@ class ConsoleModel:
         )
         return row is not None and judged and row.leak_um_per_s < TOO_TIGHT_UM_PER_S
 
-    def _why(self) -> str:
+    def _explain_state(self) -> str:
         status = self._status
         if status.row is None:
             return status.why or "starting: no tick yet"
@@ -223,7 +223,7 @@ class ConsoleModel:
             status.row, status.why, fault_words(status.fault), self._config, status.paused
         )
 
-    def _shape(self, now_s: float) -> ShapeView:
+    def _make_shape_view(self, now_s: float) -> ShapeView:
         estimate, since, row, status = (
             self._estimate,
             self._reference,

@@ -144,7 +144,7 @@ class ConsolePage:
         trend_s = options.max_width - _EDGES
 
         def spare(omitted: int) -> int:
-            panel = self._panel(trend_s, _DISPENSABLE[:omitted], rows=1, below=0)
+            panel = self._make_panel(trend_s, _DISPENSABLE[:omitted], rows=1, below=0)
             return height - len(console.render_lines(panel, options.update(height=None)))
 
         needed = len(HELP) + 1 if self._help else 0
@@ -153,9 +153,9 @@ class ConsolePage:
             (len(_DISPENSABLE), max(0, spare(len(_DISPENSABLE)))),
         )
         rows = 1 if self._help else 1 + max(0, min(_BAR_ROWS_MAX - 1, (below - _EVENTS_MIN) // 6))
-        yield self._panel(trend_s, _DISPENSABLE[:omitted], rows, below - 2 * (rows - 1))
+        yield self._make_panel(trend_s, _DISPENSABLE[:omitted], rows, below - 2 * (rows - 1))
 
-    def _panel(self, trend_s: int, omitted: Sequence[str], rows: int, below: int) -> Panel:
+    def _make_panel(self, trend_s: int, omitted: Sequence[str], rows: int, below: int) -> Panel:
         """The console without some items, `rows` lines on either side of the trend's zero, and
         `below` more.
         """

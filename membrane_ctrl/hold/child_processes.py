@@ -83,7 +83,7 @@ class ManagedChild:
         """Return reports and fate of the child since the last call; start the next one when due
         (some ms).
         """
-        said = self._said(now_s)
+        said = self._read_reports(now_s)
         if self.child.alive:
             if now_s > self._expected_s and not self._silent:
                 said.append(self._fell_silent(now_s))
@@ -131,7 +131,7 @@ class ManagedChild:
             self._replaced_s.popleft()
         return len(self._replaced_s) >= _MOST_PER_HOUR
 
-    def _said(self, now_s: float) -> list[events.Event]:
+    def _read_reports(self, now_s: float) -> list[events.Event]:
         said: list[events.Event] = []
         try:
             while self._line.poll():
@@ -261,28 +261,30 @@ class ChildProcesses:
             )
 
     @property
-    def _managed(self) -> list[ManagedChild]:
+    def _managed_children(self) -> list[ManagedChild]:
         found = (self._recorder, self._acquisition, self._alarms, self._console, self._page)
         return [each for each in found if each is not None]
 
     @property
     def names(self) -> list[str]:
         """Names of the processes."""
-        return [managed.child.name for managed in self._managed]
+        return [managed.child.name for managed in self._managed_children]
 
     def start(self, stack: ExitStack) -> None:
         """Start all children; the stack stops those that `take_down` has not."""
-        stack.callback(self._stop)
-        for managed in self._managed:
+        stack.callback(self._stop_children)
+        for managed in self._managed_children:
             managed.start(self._clock.now())
 
-    def _stop(self) -> None:
-        for managed in self._managed:
+    def _stop_children(self) -> None:
+        for managed in self._managed_children:
             managed.child.stop(_CHILD_STOPS_S)
 
     def reports(self) -> list[events.Event]:
         """The children's reports and replacements since the last call; never waits."""
-        return [event for managed in self._managed for event in managed.look(self._clock.now())]
+        return [
+            event for managed in self._managed_children for event in managed.look(self._clock.now())
+        ]
 
     def capture(self) -> events.Event | None:
         """Ask the acquisition to save and report a full set; returns an event if that is

@@ -76,52 +76,52 @@ class FaultLatch:
 
     def __exit__(self, *_: object) -> None:
         if self._file is not None:
-            self._disk.submit(self._settle, self._file)
+            self._disk.submit(self._finish_writing, self._file)
         self._disk.shutdown()
-        self._report()
+        self._report_failure()
 
     def heard(self, outputs: tick.TickOutputs) -> None:
         """After a tick: latch a fault; clear an acknowledged one."""
-        self._report()
+        self._report_failure()
         for event in outputs.events:
             match event:
                 case events.Fault():
                     self._fault = event
                 case events.StateEntered(state="fault"):
-                    self._latch(outputs.row.mono_s)
+                    self._latch_fault(outputs.row.mono_s)
                 case events.Resumed() if self._resumes is not None:
                     self._disk.submit(
-                        self._try, partial(self._resumes.add, self._utc(outputs.row.mono_s))
+                        self._try_write, partial(self._resumes.add, self._utc(outputs.row.mono_s))
                     )
                 case (
                     events.StateEntered(from_="fault")
                     | events.CommandTaken(command="ack", refused=None)
                 ) if self._file is not None:
-                    self._disk.submit(self._try, self._file.clear)
+                    self._disk.submit(self._try_write, self._file.clear)
 
-    def _latch(self, now_s: float) -> None:
+    def _latch_fault(self, now_s: float) -> None:
         words = {key: getattr(self._fault, key, "") for key in ("name", "cause", "seen", "remedy")}
         if self._file is not None:
-            self._write(partial(self._file.write, self._dated(words, now_s)))
+            self._write_file(partial(self._file.write, self._add_date(words, now_s)))
 
-    def _dated(self, words: dict[str, str], now_s: float) -> LatchedFault:
+    def _add_date(self, words: dict[str, str], now_s: float) -> LatchedFault:
         return LatchedFault(
             **words, time_utc=self._utc(now_s).isoformat(timespec="seconds"), run=self._run
         )
 
-    def _write(self, act: Callable[[], None]) -> None:
+    def _write_file(self, act: Callable[[], None]) -> None:
         self._last = act
-        self._disk.submit(self._try, act)
+        self._disk.submit(self._try_write, act)
 
-    def _settle(self, file: LatchedFile) -> None:
+    def _finish_writing(self, file: LatchedFile) -> None:
         """At the end of the run: retry a failed write once, and wait for the disk."""
         if self._failing:
-            self._try(self._last)
+            self._try_write(self._last)
         if not self._failing:
-            self._try(file.sync)
+            self._try_write(file.sync)
         file.release()
 
-    def _try(self, act: Callable[[], None]) -> None:
+    def _try_write(self, act: Callable[[], None]) -> None:
         try:
             act()
         except Exception as error:  # nothing else would see an exception of this thread
@@ -133,7 +133,7 @@ class FaultLatch:
                 self._news.append(run_events.LatchWritten())
                 self._failing = False
 
-    def _report(self) -> None:
+    def _report_failure(self) -> None:
         while self._news:
             self._tell(self._news.popleft())
 
@@ -158,7 +158,7 @@ class SystemdNotify:
         return self
 
     def __exit__(self, *_: object) -> None:
-        self._send("STOPPING=1")
+        self._send_message("STOPPING=1")
         self._socket.close()
 
     def told(self, event: events.Event) -> None:
@@ -179,11 +179,11 @@ class SystemdNotify:
         locked = f", {len(self._status.locks)} locks" if self._status.locks else ""
         problems = self._status.recording_problems
         trouble = f", recording: {'; '.join(problems)}" if problems else ""
-        self._send(
+        self._send_message(
             f"{ready}WATCHDOG=1\nSTATUS={telemetry.State(int(row.state)).name.lower()}{error}{fault}{locked}{trouble}"
         )
 
-    def _send(self, message: str) -> None:
+    def _send_message(self, message: str) -> None:
         if self._address:
             with contextlib.suppress(OSError):
                 self._socket.sendto(

@@ -84,9 +84,9 @@ class LockKeeper:
         return self
 
     def __exit__(self, *_: object) -> None:
-        self._disk.submit(self._retry)
+        self._disk.submit(self._retry_write)
         self._disk.shutdown()
-        self._report()
+        self._report_failure()
 
     def heard(self, outputs: tick.TickOutputs) -> None:
         """After a tick: store the locks that it set, and remove those that it removed.
@@ -97,18 +97,18 @@ class LockKeeper:
         """
         if self._storage is None:
             return
-        self._report()
+        self._report_failure()
         for event in outputs.events:
             match event:
                 case events.LockSet() if event.number or event.word not in self._files:
                     act = partial(self._store_lock, self._storage, _lock_of(event))
-                    self._start(event.number, event.word, act)
+                    self._start_write(event.number, event.word, act)
                 case events.LockRemoved():
                     act = partial(self._remove_file, self._storage, event.word)
-                    self._start(event.number, event.word, act)
+                    self._start_write(event.number, event.word, act)
         if time.monotonic() >= self._retry_at_s:
             self._retry_at_s = time.monotonic() + _RETRY_S
-            self._disk.submit(self._retry)
+            self._disk.submit(self._retry_write)
         if time.monotonic() >= self._look_at_s and (self._looking is None or self._looking.done()):
             self._look_at_s = time.monotonic() + _LOOK_S
             self._looking = self._disk.submit(self._find_new, self._storage)
@@ -129,8 +129,8 @@ class LockKeeper:
         """
         return self._outcomes.pop(number, None)
 
-    def _start(self, number: int, word: str, act: Callable[[], None]) -> None:
-        future = self._disk.submit(self._try, word, act)
+    def _start_write(self, number: int, word: str, act: Callable[[], None]) -> None:
+        future = self._disk.submit(self._try_write, word, act)
         if number:
             self._outcomes[number] = future
             while len(self._outcomes) > _OUTCOMES_MOST:
@@ -145,7 +145,7 @@ class LockKeeper:
             storage.store.remove_lock(file)
         self._files.pop(word, None)
 
-    def _try(self, word: str, act: Callable[[], None]) -> str:
+    def _try_write(self, word: str, act: Callable[[], None]) -> str:
         """Run an action of the disk thread; returns why it failed, or an empty text."""
         try:
             act()
@@ -177,11 +177,11 @@ class LockKeeper:
             self._files[lock.word] = each.file
             self._asked.append(Command("latch", AT_START, text=lock.text, lock=lock))
 
-    def _retry(self) -> None:
+    def _retry_write(self) -> None:
         for word, act in list(self._failed.items()):
-            self._try(word, act)
+            self._try_write(word, act)
 
-    def _report(self) -> None:
+    def _report_failure(self) -> None:
         while self._news:
             self._tell(self._news.popleft())
         while self._asked:

@@ -150,7 +150,7 @@ class Supervisor:
             self._link_error = ""
         if now_s >= self._next_watch_s:
             self._next_watch_s = now_s + _CHILD_WATCH_S
-            self._guarded("children", self._watch)
+            self._run_guarded("children", self._report_children)
         truth_um, bias_um = wiring.truth() if wiring.truth else (math.nan, math.nan)
         commands, self._pending = tuple(self._pending), []
         inputs = TickInputs(
@@ -172,11 +172,11 @@ class Supervisor:
         if outputs.clear_mask:
             await self._clear_board(outputs.clear_mask)
         await self._write(outputs.command)
-        self._record(inputs, outputs)
+        self._record_tick(inputs, outputs)
         for event in outputs.events:
             self.tell(event)
         for name, hear in wiring.heard.items():
-            self._guarded(name, partial(hear, outputs))
+            self._run_guarded(name, partial(hear, outputs))
         self._record_snapshot(now_s)
         return inputs, outputs
 
@@ -195,7 +195,7 @@ class Supervisor:
         except ValueError as error:  # a value of a wrong type, or too long
             self.tell(run_events.SnapshotNotRecorded(str(error)))
 
-    def _record(self, inputs: TickInputs, outputs: TickOutputs) -> None:
+    def _record_tick(self, inputs: TickInputs, outputs: TickOutputs) -> None:
         """Record the row, and the inputs for a replay; a value of the wrong type loses the inputs,
         not the row.
         """
@@ -286,14 +286,14 @@ class Supervisor:
                 self.tell(run_events.ShapeUnreadable(str(error)))
             return None
 
-    def _watch(self) -> None:
+    def _report_children(self) -> None:
         """Report what happened to the children; the hold continues without them."""
         for report in self._wiring.reports():
             self.tell(report)
             for name, told in self._wiring.told.items():
-                self._guarded(name, partial(told, report))
+                self._run_guarded(name, partial(told, report))
 
-    def _guarded(self, name: str, act: Callable[[], None]) -> None:
+    def _run_guarded(self, name: str, act: Callable[[], None]) -> None:
         """Run a part of the program; if it raises, the next tick sees the fault `dead_task`."""
         try:
             act()

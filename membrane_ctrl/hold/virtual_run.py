@@ -100,13 +100,13 @@ class VirtualRun:
         self.finished: errors.Exit | None = None
         self.clock = VirtualClock(0.0, datetime.now(UTC), lambda: self.now_s)
         wiring = Wiring(
-            _AtOnce(bench, self._altered),
+            _AtOnce(bench, self._alter_reading),
             telemetry=self._rings.get("telemetry"),
             events=self._rings.get("events"),
             inputs=self._rings.get("inputs"),
             snapshots=self._rings.get("snapshots"),
             shapes=self._newest_shape if shape else None,
-            truth=self._truth,
+            truth=self._record_truth,
         )
         self._supervisor = Supervisor(
             controller.Controller(config, sag_sensitivity), wiring, self.clock, config.loop.rate_hz
@@ -164,10 +164,10 @@ class VirtualRun:
         self._rings["shapes"].put(message)
         return shape_estimate.unpack_estimate(message)  # the record is then exact
 
-    def _truth(self) -> tuple[float, float]:
+    def _record_truth(self) -> tuple[float, float]:
         return self._bench.truth.displacement_um, self._bench.truth.laser_bias_um
 
-    def _altered(self, reading: roles.BenchReading) -> roles.BenchReading:
+    def _alter_reading(self, reading: roles.BenchReading) -> roles.BenchReading:
         altered = reading if self._alter is None else self._alter(self.now_s, reading)
         if altered is None:
             raise roles.LinkError("no reading")

@@ -101,7 +101,7 @@ class MeasuredResult:
         if self.sigmas_um:
             coordinates |= {"sigma_x_mm": self.sigma_mm[0], "sigma_y_mm": self.sigma_mm[1]}
         xarray = import_optional("xarray", "data")
-        return xarray.Dataset(variables, coords=coordinates, attrs=self._about())
+        return xarray.Dataset(variables, coords=coordinates, attrs=self._describe_source())
 
     def _coeffs_um(self) -> FloatArray:
         return _read_coefficients(self.table, "zernike")
@@ -109,7 +109,7 @@ class MeasuredResult:
     def _sigma_um(self) -> FloatArray:
         return _read_coefficients(self.table, "uncertainty")
 
-    def _about(self) -> dict[str, str | float]:
+    def _describe_source(self) -> dict[str, str | float]:
         quality, terms = (_require_table(self.table, name) for name in ("quality", "zernike"))
         texts = {key: str(self.table.get(key, "")) for key in ("schema", "program", "commit")}
         about = {

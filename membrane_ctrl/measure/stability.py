@@ -68,8 +68,8 @@ class StabilityRun:
         self._points_mm = dict(points_mm)
         self._trials, self._seed, self._geometry = trials, seed, geometry
         self._open = contextlib.ExitStack()
-        self._series = self._table(SERIES, stability_results.series_head(points_mm))
-        self._pair_rows = self._table("pairs.csv", _PAIR_HEAD)
+        self._series = self._make_part(SERIES, stability_results.series_head(points_mm))
+        self._pair_rows = self._make_part("pairs.csv", _PAIR_HEAD)
         self._grid: height_map.HeightMap | None = None
         self._point_matrix: FloatArray = np.zeros((len(points_mm), PARAMETERS))
         self._spread: geometry_spread.GeometrySpread | None = None
@@ -99,7 +99,7 @@ class StabilityRun:
     ) -> None:
         self._open.close()
 
-    def _table(self, name: str, head: Sequence[str]) -> Any:
+    def _make_part(self, name: str, head: Sequence[str]) -> Any:
         rows = csv.writer(
             self._open.enter_context(files.fresh_text(self._out / name)), lineterminator="\n"
         )
@@ -203,7 +203,7 @@ class StabilityRun:
             return []
         axis, sd = grid.axis_mm, grid.picture(self._sd_um())
         result_files.write_arrays(self._out / "sd.npz", x_mm=axis, y_mm=axis, sd_um=sd)
-        times, heights, coeffs = self._followed()
+        times, heights, coeffs = self._read_followed()
         drawn = [self._out / f"{name}.png" for name in ("stability", "zernike", "pairs")]
         stability_pictures.draw_stability(drawn[0], axis, sd, times, self._points_mm, heights)
         stability_pictures.draw_zernike(drawn[1], times, coeffs)
@@ -224,12 +224,12 @@ class StabilityRun:
         if self._grid is None:
             return
         sd_um = self._grid.picture(self._sd_um())
-        followed = (list(self._points_mm), *self._followed())
+        followed = (list(self._points_mm), *self._read_followed())
         stability_pictures.log_stability(
             self._out / "stability.rrd", *followed, sd_um, self.lines(), pictures
         )
 
-    def _followed(self) -> tuple[FloatArray, FloatArray, FloatArray]:
+    def _read_followed(self) -> tuple[FloatArray, FloatArray, FloatArray]:
         """Times, point heights and terms of the sets with a figure."""
         times, heights, coeffs = stability_results.read_series(
             self._out / SERIES, len(self._points_mm)

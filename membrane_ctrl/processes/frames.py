@@ -88,7 +88,7 @@ class FrameSlot:
 
     def commit(self, pattern: str, time_s: float, displacement_um: float, cycle: int) -> None:
         """Make the frame visible to readers."""
-        self._writer._commit(pattern, time_s, displacement_um, cycle)
+        self._writer._commit_frame(pattern, time_s, displacement_um, cycle)
 
 
 class FrameWriter:
@@ -104,7 +104,9 @@ class FrameWriter:
         self._slots.set_before(self._next)
         return FrameSlot(self, self._slots.pixels(self._next))
 
-    def _commit(self, pattern: str, time_s: float, displacement_um: float, cycle: int) -> None:
+    def _commit_frame(
+        self, pattern: str, time_s: float, displacement_um: float, cycle: int
+    ) -> None:
         self._slots.set_head(FrameHead(self._next, pattern, time_s, displacement_um, cycle))
         self._slots.set_after(self._next)
         self._next += 1

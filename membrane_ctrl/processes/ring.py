@@ -165,7 +165,7 @@ class RingReader:
             if self._read < oldest:
                 self.dropped += oldest - self._read
                 self._read = oldest
-            message = self._take(self._read)
+            message = self._read_slot(self._read)
             if message is None and self._not_there_yet():
                 break
             self._read += 1
@@ -184,7 +184,7 @@ class RingReader:
             if not written:
                 break
             self._read = written
-            if (message := self._take(written - 1)) is not None:
+            if (message := self._read_slot(written - 1)) is not None:
                 return message
         return None
 
@@ -198,7 +198,7 @@ class RingReader:
         self._looked_at = self._read
         return again
 
-    def _take(self, index: int) -> bytes | None:
+    def _read_slot(self, index: int) -> bytes | None:
         slots = self._slots
         first, last = slots.span(index)
         after = slots.words[last]

@@ -54,9 +54,9 @@ class EventsFile:
             # the first line may already be half written: keep it, drop the second
             del self._waiting[1]
             self.lost += 1
-        self._write()
+        self._write_lines()
 
-    def _write(self) -> None:
+    def _write_lines(self) -> None:
         if self._waiting and self._descriptor is None:
             self._descriptor = os.open(self._path, os.O_WRONLY | os.O_CREAT | os.O_APPEND, 0o644)
         while self._waiting and self._descriptor is not None:

@@ -40,14 +40,14 @@ class Housekeeping:
     def finish(self, closed: list[Path]) -> None:
         """At the end of the run, optimise closed segments, as far as time allows."""
         give_up_s = time.monotonic() + _OPTIMISE_LAST_S
-        self._take(closed)
+        self._queue_segments(closed)
         while True:
             self._errors.guarded("optimise", self._optimizer.poll)
             if not self._optimizer.busy or time.monotonic() > give_up_s:
                 return
             time.sleep(_LOOK_S)
 
-    def _take(self, closed: list[Path]) -> None:
+    def _queue_segments(self, closed: list[Path]) -> None:
         if self.detail == detail_level.DetailLevel.ALL:  # a second copy of a segment needs room
             for path in closed:
                 self._optimizer.add(path)
@@ -55,7 +55,7 @@ class Housekeeping:
     def look(self, now_s: float, closed: list[Path]) -> None:
         """Watch the disk and continue pending work; `closed` are segments to optimise."""
         self._errors.guarded("disk check", self._watch_disk)
-        self._take(closed)
+        self._queue_segments(closed)
         self._errors.guarded("optimise", self._optimizer.poll)
         if now_s >= self._retention_due_s:
             self._retention_due_s = now_s + RETENTION_INTERVAL_S
@@ -89,9 +89,9 @@ class Housekeeping:
             run,
             why,
         ) in gone:  # one by one: a folder that cannot be deleted must not block the others
-            self._errors.guarded(_RUN + run.folder.name, partial(self._delete, run, why))
+            self._errors.guarded(_RUN + run.folder.name, partial(self._delete_run, run, why))
 
-    def _delete(self, run: retention.OldRun, why: str) -> None:
+    def _delete_run(self, run: retention.OldRun, why: str) -> None:
         retention.delete_run(run)
         self._errors.report(recorder_events.RunDeleted(run.folder.name, why))
 

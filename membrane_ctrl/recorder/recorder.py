@@ -132,7 +132,7 @@ class Recorder:
             event = event_lines.from_dict(line)
             self._summary.add_event(line)
             self._errors.guarded(
-                "status", partial(self._follow, event, float(line.get("mono_s") or 0.0))
+                "status", partial(self._follow_event, event, float(line.get("mono_s") or 0.0))
             )
             self.urgent |= event.urgent
             self.ended |= isinstance(event, run_events.Ended)
@@ -142,7 +142,7 @@ class Recorder:
         )
         self._errors.guarded("events.jsonl", lambda: self._events_file.append(new))
 
-    def _follow(self, event: Event, mono_s: float) -> None:
+    def _follow_event(self, event: Event, mono_s: float) -> None:
         self._status = self._status.after_event(event, mono_s)
 
     def _take_shape(self, message: bytes) -> None:
@@ -183,7 +183,7 @@ class Recorder:
 
     def _summary_page(self) -> str:
         return summary_page.summary_page(
-            self._summary.as_dict(self._dropped(), {}), self._status, self._config
+            self._summary.as_dict(self._report_dropped(), {}), self._status, self._config
         )
 
     def _see_folder(self, now_s: float) -> None:
@@ -206,7 +206,7 @@ class Recorder:
         state = RecorderState(
             self._summary,
             {name: feed.position for name, feed in self._feeds.items()},
-            self._dropped(),
+            self._report_dropped(),
             self._rerun.shapes.reference,
             self._rerun.state,
             self._tables.open_windows,
@@ -218,7 +218,7 @@ class Recorder:
         )
         save_state(self._run_dir, state)
 
-    def _dropped(self) -> dict[str, int]:
+    def _report_dropped(self) -> dict[str, int]:
         return {name: feed.dropped for name, feed in self._feeds.items()}
 
     def finish(self, in_haste: bool = False) -> None:
@@ -245,7 +245,9 @@ class Recorder:
             "partial": self._began_anew and self._feeds["inputs"].dropped > 0,
         }
         text = (
-            file_checksums.dumps_checked(self._summary.as_dict(self._dropped(), account), indent=2)
+            file_checksums.dumps_checked(
+                self._summary.as_dict(self._report_dropped(), account), indent=2
+            )
             + "\n"
         )
         guarded(
@@ -259,4 +261,4 @@ class Recorder:
         if not in_haste:
             self._housekeeping.finish(closed)
         self._housekeeping.close()
-        self._errors.report(recorder_events.RecorderDone(self._dropped(), **account))
+        self._errors.report(recorder_events.RecorderDone(self._report_dropped(), **account))

@@ -68,7 +68,7 @@ class RerunOutput:
         """Send one second of data and sync it; False if Rerun lost it."""
         self._errors.guarded("shape reference", lambda: self._watch_hold(rows))
         if detail == DetailLevel.ESSENTIAL:
-            self._stop()
+            self._pause_output()
             return False
         self.shapes.pictures = detail == DetailLevel.ALL
         for _ in range(2):
@@ -90,12 +90,12 @@ class RerunOutput:
                 self._errors.report_error("recording", str(error))
             else:
                 self._errors.recovered("recording")
-                self._errors.guarded("disk sync", self._sync)
+                self._errors.guarded("disk sync", self._sync_file)
                 return True
         self._retry_s = now_s + RETRY_S
         return False
 
-    def _sync(self) -> None:
+    def _sync_file(self) -> None:
         try:
             self._recording.sync()
         except FileNotFoundError:  # deleted while in use
@@ -140,7 +140,7 @@ class RerunOutput:
         self._next_summary_s = -math.inf
         return True
 
-    def _stop(self) -> None:
+    def _pause_output(self) -> None:
         """Close the file while there is room for its footer; a new one starts when there is room
         again.
         """

@@ -79,7 +79,7 @@ class Recording:
             self._stream.flush(timeout_sec=_FLUSH_TIMEOUT_S)
         except (RuntimeError, OSError) as error:
             path.unlink(missing_ok=True)
-            self._abandon()
+            self._replace_stream()
             raise RecordingError(f"{path}: {error}") from None
         self.path = path
         self.segments += 1
@@ -87,7 +87,7 @@ class Recording:
     def _new_stream(self) -> rr.RecordingStream:
         return rr.RecordingStream(APPLICATION, recording_id=self._run_dir.name)
 
-    def _abandon(self) -> None:
+    def _replace_stream(self) -> None:
         """Continue with another stream and never touch the old one
         again (see the module's facts).
         """
@@ -199,7 +199,7 @@ class Recording:
         try:
             self._stream.flush(timeout_sec=_FLUSH_TIMEOUT_S)
         except (RuntimeError, OSError) as error:
-            self._abandon()
+            self._replace_stream()
             raise RecordingError(str(error)) from None
 
     def pause(self) -> None:

@@ -81,9 +81,9 @@ class RecordedRun:
         """Fields in which each row differs from the recorded one; None where the recording has
         none.
         """
-        return [self._differences(row) for row in rows]
+        return [self._compare_row(row) for row in rows]
 
-    def _differences(self, row: telemetry.TelemetryRow) -> dict[str, tuple[float, float]] | None:
+    def _compare_row(self, row: telemetry.TelemetryRow) -> dict[str, tuple[float, float]] | None:
         after_s = math.nextafter(row.mono_s, math.inf)
         recorded = next(
             open_run(self.folder).tick_blocks(telemetry.FIELDS, row.mono_s, after_s), None

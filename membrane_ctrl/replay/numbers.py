@@ -41,7 +41,7 @@ class RecordedRows:
 
         Rows are asked for in order of their ticks.
         """
-        recorded = self._find(row.tick)
+        recorded = self._find_row(row.tick)
         if recorded is None:
             return None
         today = np.frombuffer(row.pack())
@@ -52,7 +52,7 @@ class RecordedRows:
             name for name, is_same in zip(telemetry.FIELDS, same, strict=True) if not is_same
         )
 
-    def _find(self, tick: float) -> FloatArray | None:
+    def _find_row(self, tick: float) -> FloatArray | None:
         while not self._ticks.size or self._ticks[-1] < tick:
             block = next(self._blocks, None)
             if block is None:

@@ -58,7 +58,7 @@ class HoldParts(StateNode):
         paused = hold & ~faults & open_loop
         ramp_um = block["setpoint_um"] - np.nan_to_num(block["trim_um"]) - block["target_um"]
         began = hold & ~np.concatenate(([not math.isnan(self.since_s)], hold[:-1]))
-        away = paused | faults | self._straying(block, paused | (faults & hold))
+        away = paused | faults | self._find_straying(block, paused | (faults & hold))
         marks = np.where(hold & (began | away | ~(np.abs(ramp_um) <= ARRIVED_UM)), time_s, -np.inf)
         if not math.isnan(self.since_s) and time_s.size and hold[0]:
             marks[0] = max(marks[0], self.since_s)
@@ -73,7 +73,7 @@ class HoldParts(StateNode):
             "moving": hold & ~(held | paused | faults),
         }
 
-    def _straying(self, block: Mapping[str, Column], let_go: BoolArray) -> BoolArray:
+    def _find_straying(self, block: Mapping[str, Column], let_go: BoolArray) -> BoolArray:
         """(n,) the ticks outside the band from the moment that it is held again until it has stayed
         inside.
         """

@@ -53,37 +53,37 @@ class InputsReader:
     @property
     def exists(self) -> bool:
         """Whether the run has any recorded inputs."""
-        return self._reader(table_specs.INPUTS).exists
+        return self._open_reader(table_specs.INPUTS).exists
 
     @property
     def program(self) -> str:
         """The program that wrote them, with its commit; empty if unknown."""
-        return stated_program(self._reader(table_specs.INPUTS).metadata())
+        return stated_program(self._open_reader(table_specs.INPUTS).metadata())
 
     @property
     def arithmetic(self) -> str:
         """Processor and libraries that computed the recorded outputs; empty if unknown."""
-        return self._reader(table_specs.INPUTS).metadata().get("arithmetic", "")
+        return self._open_reader(table_specs.INPUTS).metadata().get("arithmetic", "")
 
     @property
     def columns(self) -> list[str]:
         """The columns of telemetry that the run recorded, in their order; all of today's if
         unreadable.
         """
-        return self._reader(table_specs.TICKS).column_names() or list(telemetry.FIELDS)
+        return self._open_reader(table_specs.TICKS).column_names() or list(telemetry.FIELDS)
 
     def __iter__(self) -> Iterator[InputsFrame]:
         """Yield all frames in order, each with the rare parts and shapes up to its end."""
         last = 0
-        rare = _Ahead((row.time_s, row) for row in self._texts(table_specs.RARE))
-        kept = _Ahead((row.time_s, row) for row in self._texts(table_specs.SNAPSHOTS))
+        rare = _Ahead((row.time_s, row) for row in self._iterate_texts(table_specs.RARE))
+        kept = _Ahead((row.time_s, row) for row in self._iterate_texts(table_specs.SNAPSHOTS))
         cycles = _Ahead(
-            (estimate.time_s, estimate) for estimate in self._estimates(table_specs.SHAPES)
+            (estimate.time_s, estimate) for estimate in self._iterate_estimates(table_specs.SHAPES)
         )
         tracked = _Ahead(
-            (estimate.time_s, estimate) for estimate in self._estimates(table_specs.TRACKED)
+            (estimate.time_s, estimate) for estimate in self._iterate_estimates(table_specs.TRACKED)
         )
-        for block in self._records():
+        for block in self._iterate_records():
             records = block[(block["tick"] > last) & (block["now_s"] >= self._from_s)]
             if not len(records):
                 continue
@@ -105,18 +105,20 @@ class InputsReader:
         found._from_s = max(times_s, default=-math.inf)
         return found
 
-    def _reader(self, spec: TableSpec) -> TableReader:
+    def _open_reader(self, spec: TableSpec) -> TableReader:
         return TableReader(self._folder, spec, self.damage)
 
-    def _records(self) -> Iterator[Records]:
+    def _iterate_records(self) -> Iterator[Records]:
         """Records of ticks, from the table of inputs and from their telemetry rows; of ticks that
         both have.
         """
         rows = _TickRows(
-            self._reader(table_specs.TICKS).tables(["tick", *_ROW_COLUMNS.values()], self._from_s)
+            self._open_reader(table_specs.TICKS).tables(
+                ["tick", *_ROW_COLUMNS.values()], self._from_s
+            )
         )
         names = table_specs.INPUTS.schema.names
-        for inputs in self._reader(table_specs.INPUTS).tables(names, self._from_s):
+        for inputs in self._open_reader(table_specs.INPUTS).tables(names, self._from_s):
             if inputs.column_names != names:
                 continue
             numbers = _record_column(inputs, "tick")
@@ -134,20 +136,20 @@ class InputsReader:
                 records[name] = _record_column(same, column)[there]
             yield records
 
-    def _texts(self, spec: TableSpec) -> Iterator[_TextRow]:
+    def _iterate_texts(self, spec: TableSpec) -> Iterator[_TextRow]:
         names = spec.schema.names
-        for table in self._reader(spec).tables(names, self._from_s):
+        for table in self._open_reader(spec).tables(names, self._from_s):
             if table.column_names == names:
                 rows = zip(*(table.column(name).to_pylist() for name in names), strict=True)
                 yield from (_TextRow(*values) for values in rows if None not in values)
 
     def _snapshot_times_s(self) -> Iterator[float]:
-        for table in self._reader(table_specs.SNAPSHOTS).tables(["time_s"]):
+        for table in self._open_reader(table_specs.SNAPSHOTS).tables(["time_s"]):
             yield from _record_column(table, "time_s").tolist()
 
-    def _estimates(self, spec: TableSpec) -> Iterator[shape_estimate.ShapeEstimate]:
+    def _iterate_estimates(self, spec: TableSpec) -> Iterator[shape_estimate.ShapeEstimate]:
         names = list(shapes.ESTIMATE_COLUMNS)
-        for table in self._reader(spec).tables(names, self._from_s - _SHAPE_BEFORE_S):
+        for table in self._open_reader(spec).tables(names, self._from_s - _SHAPE_BEFORE_S):
             try:
                 yield from shapes.read_estimates(table.select(names))
             except (ValueError, LookupError) as error:

@@ -66,12 +66,12 @@ class LatchedFile:
                 raise ValueError("a value that is no text")
             return LatchedFault(**table)
         except (OSError, ValueError, KeyError, TypeError, AttributeError, RecursionError) as error:
-            return self._unreadable(f"{type(error).__name__}: {error}")
+            return self._make_unreadable_fault(f"{type(error).__name__}: {error}")
 
     def write(self, fault: LatchedFault) -> None:
         """Latch, in place of an older fault. Raises OSError."""
         text = json.dumps({**file_origin(SCHEMA), **asdict(fault)}, indent=1) + "\n"
-        self._fill(text.encode())
+        self._fill_reserved(text.encode())
         self._reserve.replace(self.path)
         with contextlib.suppress(OSError):
             self.reserve()
@@ -80,9 +80,9 @@ class LatchedFile:
         """Reserve disk space for a fault, so that one on a full disk latches too.
         Raises OSError.
         """
-        self._fill(bytes(_RESERVE_BYTES))
+        self._fill_reserved(bytes(_RESERVE_BYTES))
 
-    def _fill(self, content: bytes) -> None:
+    def _fill_reserved(self, content: bytes) -> None:
         """Write to the reserved file, in its space. Removes anything in its place that is not a
         file.
         """
@@ -115,7 +115,7 @@ class LatchedFile:
         """Clear the latch, after a person or the resume rule decided so. Raises OSError."""
         self.path.unlink(missing_ok=True)
 
-    def _unreadable(self, why: str) -> LatchedFault:
+    def _make_unreadable_fault(self, why: str) -> LatchedFault:
         return LatchedFault(
             "unreadable",
             f"{self.path} cannot be read",

@@ -174,7 +174,7 @@ class Run:
         InputError
             If pandas is missing.
         """
-        return labelled.make_frame(self._named(table, names, start_s, end_s, window_s))
+        return labelled.make_frame(self._make_named_table(table, names, start_s, end_s, window_s))
 
     def to_xarray(
         self,
@@ -202,10 +202,10 @@ class Run:
                 self.shapes(), (start_s, end_s), self.origin_utc, about
             )
         spec = table_specs.TICKS if table == "ticks" else table_specs.LEVELS[window_s]
-        named = self._named(table, names, start_s, end_s, window_s)
+        named = self._make_named_table(table, names, start_s, end_s, window_s)
         return labelled.make_dataset(named, labelled.labels_of(spec), about)
 
-    def _named(
+    def _make_named_table(
         self,
         table: labelled.LabelledTable,
         names: Sequence[str] | None,
@@ -230,15 +230,15 @@ class Run:
         night.
         """
         wanted = _with_time(names)
-        return self._blocks(table_specs.TICKS, wanted, start_s, end_s)
+        return self._iterate_blocks(table_specs.TICKS, wanted, start_s, end_s)
 
-    def _blocks(
+    def _iterate_blocks(
         self, spec: TableSpec, names: Sequence[str], start_s: float, end_s: float
     ) -> Iterator[Block]:
-        for table in self._table(spec).tables(names, start_s, end_s):
+        for table in self._open_table(spec).tables(names, start_s, end_s):
             yield {name: _to_array(table, name) for name in names}
 
-    def _table(self, spec: TableSpec) -> TableReader:
+    def _open_table(self, spec: TableSpec) -> TableReader:
         return TableReader(self.folder, spec, self.notes)
 
     def _reaches_end(self, until_s: float) -> bool:
@@ -266,11 +266,11 @@ class Run:
                 f"levels are {', '.join(f'{w:g}' for w in levels.WINDOWS_S)} s, not {window_s:g}"
             )
         spec = table_specs.LEVELS[window_s]
-        blocks = list(self._blocks(spec, names, start_s, end_s))
+        blocks = list(self._iterate_blocks(spec, names, start_s, end_s))
         time_s = np.concatenate([block["time_s"] for block in blocks] or [np.empty(0)])
         missing = _find_gaps(time_s, window_s, start_s)
         until_s = float(time_s[-1]) + window_s if time_s.size else start_s
-        continues = self._table(spec).known_until_s >= end_s
+        continues = self._open_table(spec).known_until_s >= end_s
         if not time_s.size or (
             end_s - until_s > _HOLE_S if continues else not self._reaches_end(until_s)
         ):
@@ -307,10 +307,10 @@ class Run:
     def shapes(self) -> Shapes:
         """Every shape estimate of the run, cycles and tracked frames, as arrays."""
         figures = chain.from_iterable(
-            self._table(spec).tables(shapes.TABLE_COLUMNS)
+            self._open_table(spec).tables(shapes.TABLE_COLUMNS)
             for spec in (table_specs.SHAPES, table_specs.TRACKED)
         )
-        return shapes.from_tables(figures, self._table(table_specs.COVARIANCES).tables())
+        return shapes.from_tables(figures, self._open_table(table_specs.COVARIANCES).tables())
 
     def thumbnails(
         self, most: int, start_s: float = -np.inf, end_s: float = np.inf
@@ -329,7 +329,7 @@ class Run:
         list of dict
             `time_s`, `pattern` and `jpeg` of each, in order.
         """
-        places = list(self._table(table_specs.THUMBNAILS).tables(_PLACE_OF_THUMBNAIL))
+        places = list(self._open_table(table_specs.THUMBNAILS).tables(_PLACE_OF_THUMBNAIL))
         whole = [table for table in places if table.column_names == list(_PLACE_OF_THUMBNAIL)]
         if not whole:
             return []
@@ -340,15 +340,15 @@ class Run:
         for pattern in dict.fromkeys(patterns[within].tolist()):
             of_pattern = joined["number"].to_numpy()[within & (patterns == pattern)]
             numbers += of_pattern[:: max(1, -(-of_pattern.size // most))].tolist()
-        return list(self._pictures(numbers))
+        return list(self._read_pictures(numbers))
 
-    def _pictures(self, numbers: Sequence[int]) -> Iterator[dict[str, Any]]:
+    def _read_pictures(self, numbers: Sequence[int]) -> Iterator[dict[str, Any]]:
         """Rows of the table of thumbnails by their numbers, without damaged ones."""
         if not numbers:
             return
         names = (*_PLACE_OF_THUMBNAIL, "jpeg")
         wanted = pa.array(sorted(numbers))
-        reader = self._table(table_specs.THUMBNAILS)
+        reader = self._open_table(table_specs.THUMBNAILS)
         for table in reader.tables(names, float(min(numbers)), float(max(numbers)) + 1):
             if table.column_names == list(names):
                 chosen = table.filter(pa.compute.is_in(table["number"], wanted)).drop_null()
@@ -357,7 +357,7 @@ class Run:
     def look_through(self) -> None:
         """Check every file of every table, so that `notes` names all damage."""
         for spec in table_specs.ALL:
-            table = self._table(spec)
+            table = self._open_table(spec)
             table.check_all()
             for _ in table.tables([spec.time_name]):
                 pass

@@ -129,9 +129,9 @@ class SecondMeans(StateNode):
         counts = np.add.reduceat(np.append(self.count, np.ones(second.size - 1)), starts)
         sums = np.add.reduceat(np.append(self.sum, values[there]), starts)
         self.second, self.count, self.sum = float(second[-1]), float(counts[-1]), float(sums[-1])
-        self._take(counts[:-1], sums[:-1])
+        self._add_sums(counts[:-1], sums[:-1])
 
-    def _take(self, counts: Column, sums: Column) -> None:
+    def _add_sums(self, counts: Column, sums: Column) -> None:
         whole = counts >= self.least
         means = sums[whole] / counts[whole]
         self.means.add(means)
@@ -147,7 +147,7 @@ class SecondMeans(StateNode):
         the band.
         """
         all_of = copy.deepcopy(self)
-        all_of._take(np.array([self.count]), np.array([self.sum]))
+        all_of._add_sums(np.array([self.count]), np.array([self.sum]))
         count = all_of.means.count
         return {
             "seconds": count,

@@ -54,8 +54,8 @@ class RunTables:
         if not len(batch.rows):
             return
         row = {name: telemetry.get_column(batch.rows, name) for name in telemetry.FIELDS}
-        self._writer(table_specs.TICKS).add(_tick_rows(row))
-        self._writer(table_specs.INPUTS).add(_input_rows(batch))
+        self._open_writer(table_specs.TICKS).add(_tick_rows(row))
+        self._open_writer(table_specs.INPUTS).add(_input_rows(batch))
         self._add_rare(batch)
         self._add_levels({name: row[name] for name in levels.TICK_FIELDS})
 
@@ -77,7 +77,7 @@ class RunTables:
         for window_s, rows in self._windows.finished_rows(new):
             spec = table_specs.LEVELS[window_s]
             if rows["time_s"].size:
-                self._writer(spec).add(_nullable_rows(spec, rows))
+                self._open_writer(spec).add(_nullable_rows(spec, rows))
 
     def add_shape(self, estimate: shape_estimate.ShapeEstimate) -> None:
         """Add the result of a measurement cycle, or of a tracked frame."""
@@ -131,16 +131,16 @@ class RunTables:
         self._add_dicts(table_specs.THUMBNAILS, [row])
 
     def _next_number(self, spec: TableSpec) -> int:
-        return 1 + int(max(0.0, self._writer(spec).until_s))
+        return 1 + int(max(0.0, self._open_writer(spec).until_s))
 
     def _add_dicts(self, spec: TableSpec, rows: list[dict[str, Any]]) -> None:
         if rows:
             columns = [
                 pa.array([row[field.name] for row in rows], field.type) for field in spec.schema
             ]
-            self._writer(spec).add(pa.record_batch(columns, schema=spec.schema))
+            self._open_writer(spec).add(pa.record_batch(columns, schema=spec.schema))
 
-    def _writer(self, spec: TableSpec) -> TableWriter:
+    def _open_writer(self, spec: TableSpec) -> TableWriter:
         return self._writers[spec.name]
 
     @property
@@ -188,7 +188,7 @@ class RunTables:
     @property
     def lost_ticks(self) -> int:
         """Number of lost ticks."""
-        return self._writer(table_specs.TICKS).lost
+        return self._open_writer(table_specs.TICKS).lost
 
     @property
     def parts(self) -> dict[str, int]:

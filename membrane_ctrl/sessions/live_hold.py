@@ -111,7 +111,7 @@ class LiveHold:
         self.config = config.model_copy(update={"loop": loop, "pump": pump})
         self.name, self.run_dir = run_dir.name, run_dir
         if session:
-            self._claim(session)
+            self._claim_command(session)
         try:
             self._readers = attach_rings(run_dir)
         except (OSError, ValueError) as error:
@@ -120,7 +120,7 @@ class LiveHold:
             ) from None
         self._heard_s = time.monotonic()
 
-    def _claim(self, session: str) -> None:
+    def _claim_command(self, session: str) -> None:
         answer = self._client.ask(
             do="claim", text=session, why="session", take_over=self._take_over
         )
@@ -277,7 +277,7 @@ class Progress:
         """Start a step with its planned duration, and that of the later steps."""
         self._step, self._planned_s, self._after_s = step, planned_s, after_s
         self._done_s = self._shown_s = 0.0
-        self._print(f"{step}" + (f": about {_format_clock(planned_s)}" if planned_s else ""))
+        self._print_text(f"{step}" + (f": about {_format_clock(planned_s)}" if planned_s else ""))
         self.note("step", step, planned_s=planned_s, after_s=after_s)
 
     def __call__(self, seconds: float) -> None:
@@ -294,11 +294,11 @@ class Progress:
             f"{self._step}: {_format_clock(self._done_s)}, {_format_clock(left_s)} left, session "
             f"{_format_clock(left_s + self._after_s)}"
         )
-        terminal.live_line(line) if self._live else self._print(line)
+        terminal.live_line(line) if self._live else self._print_text(line)
 
     def say(self, line: str) -> None:
         """Print a permanent line, and note it in the log."""
-        self._print(line)
+        self._print_text(line)
         self.note("said", line)
 
     def note(self, what: str, line: str, **more: float | Sequence[str]) -> None:
@@ -306,7 +306,7 @@ class Progress:
         if self.log is not None:
             self.log.note(what, line, **more)
 
-    def _print(self, line: str) -> None:
+    def _print_text(self, line: str) -> None:
         terminal.live_line(line, "\n") if self._live else print(line, file=sys.stderr, flush=True)
 
     def ask(self, question: str, among: Sequence[str] = ()) -> str:

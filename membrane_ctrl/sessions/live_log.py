@@ -58,14 +58,14 @@ class LiveLog:
                 name: [_mean_of_finite([getattr(row, name) for row in group]) for group in groups]
                 for name in _COLUMNS
             }
-            self._append({"every_s": self._every_s, **points})
+            self._append_entry({"every_s": self._every_s, **points})
 
     def note(self, what: str, line: str, **more: float | Sequence[str]) -> None:
         """Note what happens: `step` (name, `planned_s`, `after_s`), `said`, `asks` (`among`), or
         `ended` (why).
         """
         self.flush()
-        self._append({what: line, "utc": folder.now_utc(), **more})
+        self._append_entry({what: line, "utc": folder.now_utc(), **more})
 
     def answer(self, question: str, among: Sequence[str]) -> "PageAnswer | None":
         """Take the answer to a question from the page; None if there is none, or it is to another,
@@ -89,7 +89,7 @@ class LiveLog:
         except (ValueError, TypeError, KeyError):
             return None
 
-    def _append(self, entry: dict[str, Any]) -> None:
+    def _append_entry(self, entry: dict[str, Any]) -> None:
         if not self._good:
             return
         try:
@@ -166,15 +166,15 @@ class LiveReader:
         whole = data.rfind(b"\n") + 1
         for line in data[self._offset : whole].splitlines():
             try:
-                self._take(plain_json.loads(line.decode("utf-8")), points)
+                self._take_entry(plain_json.loads(line.decode("utf-8")), points)
             except (ValueError, TypeError, KeyError, AttributeError, OverflowError):
                 continue
         self._offset = max(self._offset, whole)
         return points
 
-    def _take(self, entry: dict[str, Any], points: dict[str, list[float]]) -> None:
+    def _take_entry(self, entry: dict[str, Any], points: dict[str, list[float]]) -> None:
         if "every_s" in entry:
-            self._draw(entry, points)
+            self._take_points(entry, points)
             return
         now = self.progress
         if "step" in entry:
@@ -193,7 +193,7 @@ class LiveReader:
         else:
             self.progress = replace(now, ended=_parse_line(entry["ended"]), asks="", among=())
 
-    def _draw(self, entry: dict[str, Any], points: dict[str, list[float]]) -> None:
+    def _take_points(self, entry: dict[str, Any], points: dict[str, list[float]]) -> None:
         every_s = float(entry["every_s"])
         columns = {
             name: [math.nan if v is None else float(v) for v in entry[name]] for name in _COLUMNS

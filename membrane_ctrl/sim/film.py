@@ -39,7 +39,9 @@ class Film:
             * RADIUS_MM
             * (RADIUS_MM / (self.modulus_pa * self.thickness_um * 1e-3)) ** (1 / 3)
         )
-        return np.asarray(settled * np.cbrt(self._creep(age_s) / self._creep(SETTLED_S)))
+        return np.asarray(
+            settled * np.cbrt(self._creep_strain(age_s) / self._creep_strain(SETTLED_S))
+        )
 
     def volume_m3_per_root_pa(self, age_s: float | FloatArray) -> FloatArray:
         """Volume under the film over the cube root of the pressure: V = 0.5214 pi a^2 w."""
@@ -47,7 +49,7 @@ class Film:
             solve_hencky().volume * math.pi * RADIUS_MM**2 * 1e-9 * self.sag_mm_per_root_pa(age_s)
         )
 
-    def _creep(self, age_s: float | FloatArray) -> FloatArray:
+    def _creep_strain(self, age_s: float | FloatArray) -> FloatArray:
         return np.asarray(
             1 + self.creep_per_decade * np.log10(1 + np.asarray(age_s) / CREEP_START_S)
         )

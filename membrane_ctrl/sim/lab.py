@@ -53,10 +53,10 @@ class Lab:
         for role, section in devices.roles().items():
             if isinstance(section, settings.BronkhorstModbusConfig):
                 self._tables[section.link][section.unit_id] = pumps.BronkhorstRegisters(
-                    self._bronkhorst(role, section.serial)
+                    self._make_bronkhorst(role, section.serial)
                 )
             elif not isinstance(section, settings.ModbusMapConfig):
-                self.serial[section.port] = self._device(role, section)
+                self.serial[section.port] = self._make_device(role, section)
         self._map_devices()
         self._board: pump_board.PumpBoardEmulator | None = None
         if devices.board is not None:
@@ -64,10 +64,12 @@ class Lab:
             self._tables[devices.board][devices.unit_id] = self._board.state
         self._modules: defaultdict[str, dict[int, input_module.InputModule]] = defaultdict(dict)
         self._add_modules()
-        for url in self._urls:
+        for url in self._modbus_urls:
             if url.startswith("rtu:"):
                 _, line = modbus_rtu.parse_rtu_url(url)
-                handlers = {unit: partial(self._respond, url, unit) for unit in self._units(url)}
+                handlers = {
+                    unit: partial(self._answer_unit, url, unit) for unit in self._find_units(url)
+                }
                 self.serial[url] = rtu_bus.RtuBusEmulator(line, handlers)
 
     async def start(self) -> DevicesConfig:
@@ -80,10 +82,10 @@ class Lab:
                 device, Path(self._folder.name, f"tty{number}")
             )
             self.wires[port].plug()
-        for url in self._urls:
+        for url in self._modbus_urls:
             if url.startswith("tcp:"):
                 self._servers[url] = modbus_server.ModbusTcpServer(
-                    partial(self._answer, url), "127.0.0.1", 0
+                    partial(self._answer_unit_safely, url), "127.0.0.1", 0
                 )
                 await self._servers[url].start()
         interlocks = tuple(
@@ -92,8 +94,10 @@ class Lab:
         moved: dict[str, object] = {"interlocks": interlocks}
         if self._board is not None:
             await self._board.start()
-            moved["board"] = self._address(str(self._devices.board))
-        moved |= {role: self._moved(section) for role, section in self._devices.roles().items()}
+            moved["board"] = self._find_address(str(self._devices.board))
+        moved |= {
+            role: self._redirect_table(section) for role, section in self._devices.roles().items()
+        }
         return self._devices.model_copy(update=moved)
 
     async def stop(self) -> None:
@@ -107,11 +111,11 @@ class Lab:
         if self._folder is not None:
             self._folder.cleanup()
 
-    def _moved(self, section: settings.AnyDriver) -> settings.AnyDriver:
+    def _redirect_table(self, section: settings.AnyDriver) -> settings.AnyDriver:
         """The table with the emulator's address."""
         if not isinstance(section, settings.ON_MODBUS):
             return section.model_copy(update={"port": str(self.wires[section.port].path)})
-        return section.model_copy(update={"link": self._address(section.link)})
+        return section.model_copy(update={"link": self._find_address(section.link)})
 
     def _moved_interlock(self, interlock: settings.InterlockDriver) -> settings.InterlockDriver:
         """The interlock's table with the emulator's address; a GPIO line becomes an input of an
@@ -119,12 +123,12 @@ class Lab:
         """
         match interlock:
             case settings.ModbusInputConfig():
-                return interlock.model_copy(update={"link": self._address(interlock.link)})
+                return interlock.model_copy(update={"link": self._find_address(interlock.link)})
             case settings.GpioLineConfig():
                 common = interlock.model_dump(
                     include=set(settings.PolledInterlockConfig.model_fields)
                 )
-                link = self._address(_gpio_url(interlock.chip))
+                link = self._find_address(_gpio_url(interlock.chip))
                 return settings.ModbusInputConfig(
                     driver="modbus_input", link=link, address=interlock.line, **common
                 )
@@ -132,14 +136,14 @@ class Lab:
                 return interlock
 
     @property
-    def _urls(self) -> list[str]:
+    def _modbus_urls(self) -> list[str]:
         """Links of everything emulated on Modbus."""
         return list(dict.fromkeys((*self._tables, *self._modules)))
 
-    def _units(self, url: str) -> list[int]:
+    def _find_units(self, url: str) -> list[int]:
         return list(dict.fromkeys((*self._tables.get(url, {}), *self._modules.get(url, {}))))
 
-    def _respond(self, url: str, unit: int, pdu: bytes) -> bytes:
+    def _answer_unit(self, url: str, unit: int, pdu: bytes) -> bytes:
         """The answer of a unit: its bits from the module, everything else from its registers."""
         module = self._modules.get(url, {}).get(unit)
         found = module.respond(pdu) if module is not None else None
@@ -150,10 +154,10 @@ class Lab:
             return modbus_pdu.exception_pdu(pdu, modbus_pdu.ILLEGAL_FUNCTION)
         return respond_to_input(pdu, table)
 
-    def _answer(self, url: str, unit: int, pdu: bytes) -> modbus_server.Answer:
-        if unit not in self._units(url):
+    def _answer_unit_safely(self, url: str, unit: int, pdu: bytes) -> modbus_server.Answer:
+        if unit not in self._find_units(url):
             return modbus_server.Answer(modbus_pdu.exception_pdu(pdu, _GATEWAY_NO_RESPONSE))
-        return modbus_server.Answer(self._respond(url, unit, pdu))
+        return modbus_server.Answer(self._answer_unit(url, unit, pdu))
 
     def _add_modules(self) -> None:
         """One module for all interlocks at the same unit, and one for each GPIO chip; every circuit
@@ -175,48 +179,51 @@ class Lab:
         for (url, unit), tables in bits.items():
             self._modules[url][unit] = input_module.InputModule(tables["discrete"], tables["coil"])
 
-    def _address(self, url: str) -> str:
+    def _find_address(self, url: str) -> str:
         """Address of the emulators of a Modbus URL."""
         if url in self._servers:
             return f"tcp://127.0.0.1:{self._servers[url].port}"
         _, mark, options = url.partition("?")
         return f"rtu://{self.wires[url].path}{mark}{options}"
 
-    def _device(self, role: str, section: settings.AnyDriver) -> serial_device.SerialDevice:
+    def _make_device(self, role: str, section: settings.AnyDriver) -> serial_device.SerialDevice:
         match section:
             case settings.Optoncdt1420Config():
                 return optoncdt1420.Optoncdt1420Emulator(
-                    self._sensor(role),
+                    self._read_sensor(role),
                     round(section.range_mm or 50),
                     section.direction,
                     section.baud,
                 )
             case settings.KeyenceDlRs1aConfig():
                 return keyence_dl_rs1a.KeyenceDlRs1aEmulator(
-                    self._sensor(role),
+                    self._read_sensor(role),
                     section.direction,
                     section.baud,
                     section.parity,
                     section.amplifier + 1,
                 )
             case settings.VaisalaPtb330Config():
-                return pressure_gauges.VaisalaPtb330Emulator(self._sensor(role), section.baud)
+                return pressure_gauges.VaisalaPtb330Emulator(self._read_sensor(role), section.baud)
             case settings.Mks937bConfig():
                 return pressure_gauges.Mks937bEmulator(
-                    self._sensor(role),
+                    self._read_sensor(role),
                     section.baud,
                     section.parity,
                     section.address,
                     section.channel,
                 )
             case settings.VentusConfig():
-                return pumps.VentusEmulator(self._actuator("pump"), section.power_max_mw)
+                return pumps.VentusEmulator(self._make_actuator("pump"), section.power_max_mw)
             case settings.BronkhorstProparConfig():
                 return pumps.ProparDevice(
-                    self._bronkhorst(role, section.serial), serial_port.SerialSettings(section.baud)
+                    self._make_bronkhorst(role, section.serial),
+                    serial_port.SerialSettings(section.baud),
                 )
             case settings.ExternalConfig():
-                end = self._actuator(role) if role in self._outputs else self._sensor(role)
+                end = (
+                    self._make_actuator(role) if role in self._outputs else self._read_sensor(role)
+                )
                 made: serial_device.SerialDevice = driver_loading.make_emulator(
                     section, f"devices.{role}", drivers.SENSORS, end
                 )
@@ -244,15 +251,15 @@ class Lab:
                 if value_map.identity is not None:
                     constants[value_map.identity[0]] = value_map.identity[1]
                 if role in self._outputs:
-                    outputs[value_map] = self._actuator(role)
+                    outputs[value_map] = self._make_actuator(role)
                 else:
-                    sensors[value_map] = self._sensor(role)
+                    sensors[value_map] = self._read_sensor(role)
                 if section.preset:
                     low, high = load_preset(section.preset).get("raw_limits", raw_limits)
                     raw_limits = (low, high)
             self._tables[link][unit_id] = MapDevice(sensors, outputs, constants, raw_limits)
 
-    def _bronkhorst(self, role: str, serial: str) -> pumps.Instrument:
+    def _make_bronkhorst(self, role: str, serial: str) -> pumps.Instrument:
         if role == "pump":
             return pumps.Instrument(
                 "DMFC",
@@ -260,19 +267,19 @@ class Lab:
                 _FLOW_FULL_MLN_MIN,
                 "mln/min",
                 None,
-                self._actuator(role),
+                self._make_actuator(role),
             )
-        gauge_pa = self._sensor(role)
+        gauge_pa = self._read_sensor(role)
         return pumps.Instrument(
             "DEPC", serial or "M20000002A", _PRESSURE_FULL_MBAR, "mbar(g)", lambda: gauge_pa() / 100
         )
 
-    def _sensor(self, role: str) -> Callable[[], float]:
+    def _read_sensor(self, role: str) -> Callable[[], float]:
         """Present value of a role's sensor, in the role's unit."""
         name = "displacement_um" if role == "displacement" else ROLES[role].reads
         return lambda: float(getattr(self._plant.sample(), name))
 
-    def _actuator(self, role: str) -> Callable[[float], None]:
+    def _make_actuator(self, role: str) -> Callable[[float], None]:
         def drive(fraction: float) -> None:
             self._outputs[role] = fraction
             self._plant.actuate(self._outputs["pump"], self._outputs["vent"])
@@ -318,7 +325,7 @@ class MapDevice:
             found.address + n: 0 for found in self._outputs for n in range(found.words)
         }
         for found, tell in self._outputs.items():
-            self._tell(found, tell)
+            self._apply_output(found, tell)
 
     def read(self, address: int, count: int) -> list[int]:
         """Words. Raises RegisterRefusal."""
@@ -339,9 +346,9 @@ class MapDevice:
             raise modbus_pdu.RegisterRefusal(modbus_pdu.ILLEGAL_VALUE)
         self._written.update(zip(places, words, strict=True))
         for found, tell in self._outputs.items():
-            self._tell(found, tell)
+            self._apply_output(found, tell)
 
-    def _tell(self, found: ValueMap, tell: Callable[[float], None]) -> None:
+    def _apply_output(self, found: ValueMap, tell: Callable[[float], None]) -> None:
         value = found.decode([self._written[found.address + n] for n in range(found.words)])
         # a current below 4 mA means a broken wire to the driven device: off
         tell(value if found.allows(value) else 0.0)

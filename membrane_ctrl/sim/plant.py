@@ -105,7 +105,7 @@ class Plant:
             if self._index + 1 == _BLOCK_STEPS:
                 self._load_block()
             now = min(steps, _BLOCK_STEPS - 1 - self._index)
-            self._run(self._index + 1, self._index + 1 + now)
+            self._run_steps(self._index + 1, self._index + 1 + now)
             steps -= now
 
     def sample(self) -> BoardSample:
@@ -139,7 +139,7 @@ class Plant:
             vent_um_per_s=um_per_ml * self._vent_ml_per_s_per_pa * self._vent_fraction * gauge_pa,
         )
 
-    def _run(self, start: int, stop: int) -> None:
+    def _run_steps(self, start: int, stop: int) -> None:
         """Steps `start` to `stop` of the block."""
         gas_step, gas, pump_step, pump = (
             self._gas.step,

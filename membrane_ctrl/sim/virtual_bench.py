@@ -68,7 +68,7 @@ class VirtualBench:
         self.plant = plant
         self.wrong = Wrong()
         self.interlocks = interlocks or VirtualInterlocks()
-        self._sample = self._sampled(None)
+        self._sample = self._sample_sensors(None)
         self.board = pump_board.BoardState(
             register_map.default_map(), self._sample, stored or pump_board.StoredSettings()
         )
@@ -78,7 +78,7 @@ class VirtualBench:
         """Let time pass: the plant moves, the board samples it, judges it and drives it."""
         self.plant.advance(duration_s)
         self.interlocks.advance(self.plant.time_s)
-        self._sample = self._sampled(self._sample)
+        self._sample = self._sample_sensors(self._sample)
         self.board.advance(self.plant.time_s, self._sample)
         self.drive()
 
@@ -121,7 +121,7 @@ class VirtualBench:
         """Disarm if the board allows it, and disconnect."""
         at_once(self._driver.close())
 
-    def _sampled(self, last: pump_board.BoardSample | None) -> pump_board.BoardSample:
+    def _sample_sensors(self, last: pump_board.BoardSample | None) -> pump_board.BoardSample:
         wrong = self.wrong
         self.truth = self.plant.truth()
         if wrong.samples_frozen and last is not None:

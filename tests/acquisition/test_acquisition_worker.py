@@ -36,7 +36,7 @@ class ScriptedRemote(Remote):
             return
         self.clock.now_s = max(self.clock.now_s, moment_s)
         self.script.pop(0)
-        self._obey(command)
+        self._execute_command(command)
 
     def report(self, state: str, message: str = "", **details: object) -> None:
         self.told.append((state, message))

@@ -257,7 +257,7 @@ def test_a_thread_that_raises_is_reported(tmp_path: Path) -> None:
     with FaultLatch(
         LatchedFile(tmp_path), None, "run", LoopClock().utc, told.append
     ) as fault_latch:
-        fault_latch._disk.submit(fault_latch._try, raises)
+        fault_latch._disk.submit(fault_latch._try_write, raises)
     assert told[0] == LatchFailed("broken")
 
 

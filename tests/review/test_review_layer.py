@@ -145,7 +145,7 @@ def test_the_loop_s_tab_has_what_the_loop_learns(
     config: dict[str, dict[str, Any]], plots: int
 ) -> None:
     assert len(list_learned_plots(Config.model_validate(config))) == plots
-    tab = ReviewBlueprint(("",), "utc", None, Config.model_validate(config))._loop()
+    tab = ReviewBlueprint(("",), "utc", None, Config.model_validate(config))._make_loop_tab()
     assert len(list(tab.contents)) == 5 + plots
 
 

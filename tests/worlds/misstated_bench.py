@@ -52,8 +52,8 @@ class BentRays(OpticsRenderer):
     air_k_per_m: float = 0.0
     glass_mm: float = 0.0
 
-    def _trace(self, directions: FloatArray, displacement_um: float) -> Trace:
-        found = super()._trace(directions, displacement_um)
+    def _trace_film(self, directions: FloatArray, displacement_um: float) -> Trace:
+        found = super()._trace_film(directions, displacement_um)
         start, bend = (
             self._camera_pose.position_mm,
             np.array([0.0, -AIR_PER_MM * self.air_k_per_m, 0.0]),
@@ -109,7 +109,9 @@ class BentRays(OpticsRenderer):
 class DirectRays(BentRays):
     """The screen itself before the camera, behind its glass."""
 
-    def _trace(self, directions: FloatArray, displacement_um: float, film: Any = None) -> Trace:
+    def _trace_film(
+        self, directions: FloatArray, displacement_um: float, film: Any = None
+    ) -> Trace:
         bend, none = np.array([0.0, -AIR_PER_MM * self.air_k_per_m, 0.0]), np.zeros(len(directions))
         start_mm = np.tile(self._camera_pose.position_mm, (len(directions), 1))
         return Trace(none, none, *self._behind_glass(start_mm, directions, bend).T)

@@ -162,7 +162,7 @@ class LiveReconstructor:
         phase_rad[:, self._binner.saturated.ravel()[self._near] > 0] = np.nan
         times, readings = times[sinusoids], readings[sinusoids]
         self._tracked = None  # until this cycle is accepted
-        tracer, analysis_mm = self._tracer(readings), optics.mirror.analysis_radius_mm
+        tracer, analysis_mm = self._make_tracer(readings), optics.mirror.analysis_radius_mm
         try:
             state = tracked_points.select_points(
                 self._grid, tracer, self._near, phase_rad, optics.pattern, analysis_mm
@@ -240,7 +240,7 @@ class LiveReconstructor:
         """Change of the coefficients (terms,) in µm per µm of sag of a Hencky bowl."""
         return hencky_bowl.zernike_projection().copy()
 
-    def _tracer(self, readings_um: FloatArray) -> ray_tracing.Tracer:
+    def _make_tracer(self, readings_um: FloatArray) -> ray_tracing.Tracer:
         """The bench with the vertex where the laser saw it, on average over the frames."""
         mean = _finite_mean(readings_um)
         known = self._reference_um is not None and math.isfinite(mean)
@@ -265,7 +265,7 @@ class LiveReconstructor:
         if reason := _find_loss_reason(state.fresh[:, 3], usable):
             return make_rejected_cycle(kind, times, readings, reason, tracking_lost=True)
         fit = self._fit(state, usable, readings)
-        cycle = cycle_errors.Cycle(self._tracer(readings), state, fit, self._sums(), readings)
+        cycle = cycle_errors.Cycle(self._make_tracer(readings), state, fit, self._sums(), readings)
         errors = self._watch.look(cycle)
         exact = fit.surface.parameters - errors.correction_mm
         fit = replace(fit, surface=surface.Surface.from_parameters(exact, fit.surface.radius_mm))
@@ -279,7 +279,7 @@ class LiveReconstructor:
         )
         estimate = self._estimate(kind, state, fit, errors, quality, times, readings)
         if estimate.verdict == "rejected":
-            self._tracer(readings).start(
+            self._make_tracer(readings).start(
                 state.points, state.surface.height
             )  # back onto the last good surface
         else:
@@ -386,7 +386,7 @@ class LiveReconstructor:
         complete = np.count_nonzero(usable) > MATRIX_KEPT_SHARE * usable.size
         normal = state.normal if complete else None
         return surface_fit.fit_surface(
-            self._tracer(readings), state.points, state.surface, normal=normal
+            self._make_tracer(readings), state.points, state.surface, normal=normal
         )
 
     def _estimate(

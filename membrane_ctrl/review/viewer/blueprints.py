@@ -47,13 +47,13 @@ class ReviewBlueprint:
     def made(self, tab: str = "overview", tabs: Sequence[str] = TABS) -> rrb.Blueprint:
         """The blueprint, with some of `TABS`, `tab` selected."""
         makers = {
-            "overview": self._overview,
-            "loop": self._loop,
-            "environment": self._environment,
-            "shape": self._shape,
-            "frames": self._frames,
-            "faults": self._faults,
-            "tuning": self._tuning,
+            "overview": self._make_overview,
+            "loop": self._make_loop_tab,
+            "environment": self._make_environment_tab,
+            "shape": self._make_shape_tab,
+            "frames": self._make_frames_row,
+            "faults": self._make_faults_tab,
+            "tuning": self._make_tuning_tab,
         }
         selection = None if self.span_ns is None else AbsoluteTimeRange(*self.span_ns)
         return rrb.Blueprint(
@@ -64,36 +64,38 @@ class ReviewBlueprint:
             auto_views=False,
         )
 
-    def _axis(self) -> rrb.TimeAxis:
+    def _make_axis(self) -> rrb.TimeAxis:
         start, end = rr.TimeRangeBoundary.infinite(), rr.TimeRangeBoundary.infinite()
         if self.span_ns is not None:
             start, end = (rr.TimeRangeBoundary.absolute(nanos=nanos) for nanos in self.span_ns)
         return rrb.TimeAxis(view_range=rr.TimeRange(start=start, end=end))
 
-    def _contents(self, paths: Sequence[str]) -> list[str]:
+    def _make_contents(self, paths: Sequence[str]) -> list[str]:
         return [f"+ {prefix_of(label)}{path}" for label in self.labels for path in paths]
 
-    def _plot(
+    def _make_plot(
         self, name: str, *paths: str, span: tuple[float, float] | None = None
     ) -> rrb.TimeSeriesView:
         return rrb.TimeSeriesView(
             name=name,
             origin="/",
-            contents=self._contents(paths),
-            axis_x=self._axis(),
+            contents=self._make_contents(paths),
+            axis_x=self._make_axis(),
             axis_y=None if span is None else rrb.ScalarAxis(range=span),
             plot_legend=rrb.PlotLegend(corner=rrb.Corner2D.LeftTop),  # over the oldest data
         )
 
-    def _ticks(self, plot: Plot) -> rrb.TimeSeriesView:
-        return self._plot(plot_title(plot), *streams.entities_of(plot))
+    def _make_ticks_plot(self, plot: Plot) -> rrb.TimeSeriesView:
+        return self._make_plot(plot_title(plot), *streams.entities_of(plot))
 
-    def _level(self, plot: Plot) -> rrb.TimeSeriesView:
-        return self._plot(plot_title(plot), *(stream.path for stream in overview_streams(plot)))
+    def _make_level_plot(self, plot: Plot) -> rrb.TimeSeriesView:
+        return self._make_plot(
+            plot_title(plot), *(stream.path for stream in overview_streams(plot))
+        )
 
-    def _figures(self, plot: Plot) -> rrb.TimeSeriesView:
+    def _make_figures_page(self, plot: Plot) -> rrb.TimeSeriesView:
         shown = figure_columns.figure_columns_of(plot)
-        return self._plot(figure_columns.figure_plot_title(plot), shown[0].entity)
+        return self._make_plot(figure_columns.figure_plot_title(plot), shown[0].entity)
 
     def _around_band(self, name: str, *paths: str) -> rrb.TimeSeriesView:
         """A plot of the error, with lines where something happened: these would stretch an axis of
@@ -101,15 +103,17 @@ class ReviewBlueprint:
         """
         band_um = self.config.limits.band_um
         span_um = (-3 * band_um, 3 * band_um)
-        return self._plot(name, "/loop/band", "/marks/**", "/found/lines/**", *paths, span=span_um)
+        return self._make_plot(
+            name, "/loop/band", "/marks/**", "/found/lines/**", *paths, span=span_um
+        )
 
-    def _error(self) -> rrb.TimeSeriesView:
+    def _make_error_plot(self) -> rrb.TimeSeriesView:
         return self._around_band(
             "Error: minimum, mean, maximum, µm",
             *(stream.path for stream in overview_streams(columns.ERROR)),
         )
 
-    def _lanes(self) -> rrb.StateTimelineView:
+    def _make_lanes(self) -> rrb.StateTimelineView:
         several = len(self.labels) > 1  # there is room for two lanes of each
         paths = (
             "/state/controller",
@@ -117,24 +121,27 @@ class ReviewBlueprint:
             *(() if several else ("/state/shape_loop", "/state/safe_level")),
         )
         return rrb.StateTimelineView(
-            name="States", origin="/", contents=self._contents(paths), time_view=self._axis()
+            name="States",
+            origin="/",
+            contents=self._make_contents(paths),
+            time_view=self._make_axis(),
         )
 
-    def _log(self, name: str, *paths: str) -> rrb.TextLogView:
+    def _make_log_view(self, name: str, *paths: str) -> rrb.TextLogView:
         hidden = TimelineColumn(
             self.timeline, visible=False
         )  # too narrow to read: the lines begin with it
         return rrb.TextLogView(
             name=name,
             origin="/",
-            contents=self._contents(paths),
+            contents=self._make_contents(paths),
             columns=rrb.TextLogColumns(
                 timeline_columns=[hidden], text_log_columns=["loglevel", "body"]
             ),
             format_options=rrb.TextLogFormat(monospace_body=False),
         )
 
-    def _pages(self) -> rrb.Tabs:
+    def _make_pages(self) -> rrb.Tabs:
         """A page of figures for each run."""
         names = [label or "Summary" for label in self.labels]
         origins = [prefix_of(label) + summary_page.SUMMARY_PATH for label in self.labels]
@@ -143,30 +150,31 @@ class ReviewBlueprint:
             active_tab=0,
         )
 
-    def _overview(self) -> rrb.Vertical:
+    def _make_overview(self) -> rrb.Vertical:
         plots = rrb.Vertical(
-            self._error(),
-            self._lanes(),
+            self._make_error_plot(),
+            self._make_lanes(),
             rrb.Horizontal(
-                *map(self._level, (columns.FLOW, columns.AMBIENT, columns.TEMPERATURES))
+                *map(self._make_level_plot, (columns.FLOW, columns.AMBIENT, columns.TEMPERATURES))
             ),
             row_shares=[3.6, 2.5, 2],
         )
         return rrb.Vertical(
-            rrb.Horizontal(plots, self._pages(), column_shares=[3.4, 1]),
+            rrb.Horizontal(plots, self._make_pages(), column_shares=[3.4, 1]),
             rrb.Horizontal(
-                self._log("Detected events, UTC", "/found"), self._log("Events, UTC", "/events")
+                self._make_log_view("Detected events, UTC", "/found"),
+                self._make_log_view("Events, UTC", "/events"),
             ),
             row_shares=[4.2, 1],
             name="overview",
         )
 
-    def _loop(self) -> rrb.Vertical:
+    def _make_loop_tab(self) -> rrb.Vertical:
         further = [
-            self._plot(name, *paths)
+            self._make_plot(name, *paths)
             for name, paths in blueprint.list_learned_plots(self.config).items()
         ]
-        plots = [*map(self._ticks, blueprint.LOOP_PLOTS), *further]
+        plots = [*map(self._make_ticks_plot, blueprint.LOOP_PLOTS), *further]
         return rrb.Vertical(
             self._around_band(
                 f"{plot_title(columns.ERROR, 'each tick')} (shown for short runs, or with "
@@ -178,27 +186,27 @@ class ReviewBlueprint:
             name="loop",
         )
 
-    def _environment(self) -> rrb.Vertical:
-        plots = [self._level(plot) for plot in plots_of(Group.PUMP, Group.ENVIRONMENT)]
+    def _make_environment_tab(self) -> rrb.Vertical:
+        plots = [self._make_level_plot(plot) for plot in plots_of(Group.PUMP, Group.ENVIRONMENT)]
         return rrb.Vertical(
-            self._error(), *plots, row_shares=[2, *(1 for _ in plots)], name="environment"
+            self._make_error_plot(), *plots, row_shares=[2, *(1 for _ in plots)], name="environment"
         )
 
-    def _shape(self) -> rrb.Vertical:
-        rows = [self._maps(label) for label in self.labels]
+    def _make_shape_tab(self) -> rrb.Vertical:
+        rows = [self._make_maps(label) for label in self.labels]
         plots = [
             rrb.Horizontal(
-                self._figures(figure_columns.SAG_CHANGE),
-                self._figures(figure_columns.LOW_ORDERS),
+                self._make_figures_page(figure_columns.SAG_CHANGE),
+                self._make_figures_page(figure_columns.LOW_ORDERS),
             ),
             rrb.Horizontal(
-                self._figures(figure_columns.SLOPE_RESIDUAL),
-                *map(self._level, plots_of(Group.SHAPE)),
+                self._make_figures_page(figure_columns.SLOPE_RESIDUAL),
+                *map(self._make_level_plot, plots_of(Group.SHAPE)),
             ),
         ]
         return rrb.Vertical(*rows, *plots, row_shares=[3] * len(rows) + [2.5, 1.5], name="shape")
 
-    def _maps(self, label: str) -> rrb.Horizontal:
+    def _make_maps(self, label: str) -> rrb.Horizontal:
         def view(kind: str, name: str) -> rrb.Spatial2DView:
             return rrb.Spatial2DView(
                 name=f"{label} {name}".strip(), origin=f"{prefix_of(label)}/shape/map/{kind}"
@@ -217,7 +225,7 @@ class ReviewBlueprint:
             column_shares=[1, 1, 1, 0.8],
         )
 
-    def _frames(self) -> rrb.Vertical:
+    def _make_frames_row(self) -> rrb.Vertical:
         """Thumbnails of the camera's frames, a row for each run."""
         names = blueprint.frame_names(self.config)
         rows = [
@@ -234,24 +242,29 @@ class ReviewBlueprint:
         ]
         return rrb.Vertical(*rows, name="frames")
 
-    def _faults(self) -> rrb.Vertical:
+    def _make_faults_tab(self) -> rrb.Vertical:
         return rrb.Vertical(
-            self._lanes(),
-            self._error(),
-            rrb.Horizontal(*map(self._level, (columns.LATENESS, columns.MISSED, columns.GAUGE))),
+            self._make_lanes(),
+            self._make_error_plot(),
             rrb.Horizontal(
-                self._log("Events, UTC", "/events"), self._log("Detected events, UTC", "/found")
+                *map(self._make_level_plot, (columns.LATENESS, columns.MISSED, columns.GAUGE))
+            ),
+            rrb.Horizontal(
+                self._make_log_view("Events, UTC", "/events"),
+                self._make_log_view("Detected events, UTC", "/found"),
             ),
             row_shares=[2.2, 3, 2, 2.8],
             name="faults",
         )
 
-    def _tuning(self) -> rrb.Vertical:
+    def _make_tuning_tab(self) -> rrb.Vertical:
         return rrb.Vertical(
-            self._ticks(columns.POSITION),
+            self._make_ticks_plot(columns.POSITION),
             self._around_band(plot_title(columns.ERROR), *streams.entities_of(columns.ERROR)),
-            rrb.Horizontal(self._ticks(columns.TERMS), self._ticks(columns.FLOW)),
-            self._ticks(columns.INTERVAL),
+            rrb.Horizontal(
+                self._make_ticks_plot(columns.TERMS), self._make_ticks_plot(columns.FLOW)
+            ),
+            self._make_ticks_plot(columns.INTERVAL),
             name="tuning",
         )
 

@@ -135,30 +135,30 @@ class Layer:
         seconds = level if level_s == 1.0 else run.level(1.0, names=LEVEL_COLUMNS)
         cycles = run.shapes()
         found = find_events(seconds, cycles, run.config.limits.band_um)
-        self._page(SUMMARY_PATH, _summary_page(run))
-        self._overviews(level, run.config.limits.band_um)
+        self._send_page(SUMMARY_PATH, _summary_page(run))
+        self._send_overviews(level, run.config.limits.band_um)
         if not self._overview_only:
-            self._ticks(run, part_s)
-        self._lanes(level)
-        self._events(run, found, part_s)
-        self._figure(cycles.select(hold_parts.held_at(level, cycles.time_s)), part_s)
+            self._send_ticks(run, part_s)
+        self._send_lanes(level)
+        self._send_events(run, found, part_s)
+        self._send_figure(cycles.select(hold_parts.held_at(level, cycles.time_s)), part_s)
         if not self._overview_only:
-            self._thumbnails(run, part_s)
+            self._send_thumbnails(run, part_s)
 
-    def _overviews(self, level: Block, band_um: float) -> None:
+    def _send_overviews(self, level: Block, band_um: float) -> None:
         for stream in OVERVIEWS:
             values = np.column_stack([level[line.field] for line in stream.lines])
             if np.isfinite(values).any():
-                self._style(stream.path, _names_and_colours(stream))
-                self._scalars(stream.path, level["time_s"], values)
+                self._send_style(stream.path, _names_and_colours(stream))
+                self._send_scalars(stream.path, level["time_s"], values)
         ends = level["time_s"][[0, -1]] if level["time_s"].size else np.empty(0)
         band = streams.make_band(band_um)
         square = np.full((ends.size, 1), band_um**2)
-        self._measured(
+        self._send_measured(
             band.path, [(band.lines[0].name, GREEN)], ends, np.zeros_like(square), square, 0.0
         )
 
-    def _ticks(self, run: Run, part_s: tuple[float, float]) -> None:
+    def _send_ticks(self, run: Run, part_s: tuple[float, float]) -> None:
         rows_expected = run.config.loop.rate_hz * (
             min(part_s[1], _end_s(run)) - max(part_s[0], 0.0)
         )
@@ -168,10 +168,10 @@ class Layer:
             for stream in streams.STREAMS:
                 values = np.column_stack([block[line.field] for line in stream.lines])
                 if np.isfinite(values).any():
-                    self._style(stream.path, _names_and_colours(stream))
-                    self._scalars(stream.path, block["mono_s"], values)
+                    self._send_style(stream.path, _names_and_colours(stream))
+                    self._send_scalars(stream.path, block["mono_s"], values)
 
-    def _lanes(self, level: Block) -> None:
+    def _send_lanes(self, level: Block) -> None:
         for lane in TELEMETRY_LANES:
             path = self._prefix + lane.path
             words = list(lane.colours)
@@ -187,9 +187,11 @@ class Layer:
                 states = pa.array(
                     [*(lane.word(code) for _, code in found), None]
                 )  # the lane ends with the run
-                self._columns(lane.path, times, rr.StateChange.columns(state=states))
+                self._send_columns(lane.path, times, rr.StateChange.columns(state=states))
 
-    def _events(self, run: Run, found: Sequence[FoundEvent], part_s: tuple[float, float]) -> None:
+    def _send_events(
+        self, run: Run, found: Sequence[FoundEvent], part_s: tuple[float, float]
+    ) -> None:
         told = [
             e
             for e in run.log
@@ -198,18 +200,18 @@ class Layer:
         if told:
             levels = [each.event.level.value for each in told]
             texts = [each.event.sentence for each in told]
-            self._log(run, "/events", np.array([each.mono_s for each in told]), texts, levels)
+            self._send_log(run, "/events", np.array([each.mono_s for each in told]), texts, levels)
         for stream, time_s, values in plot_marks.mark_lines(
             [(each.mono_s, each.event) for each in run.log]
         ):
-            self._style(stream.path, _names_and_colours(stream), 2.0, vertical=True)
-            self._columns(stream.path, time_s, rr.Scalars.columns(scalars=values))
+            self._send_style(stream.path, _names_and_colours(stream), 2.0, vertical=True)
+            self._send_columns(stream.path, time_s, rr.Scalars.columns(scalars=values))
         pump = [(e.mono_s, e.event) for e in run.log if isinstance(e.event, events.PumpLearned)]
         if pump:
             values = np.array([(told.scale, told.correction) for _, told in pump])
             variances = np.array([(told.sigma**2, 0.0) for _, told in pump])
             lines = _names_and_colours(streams.PUMP)
-            self._measured(
+            self._send_measured(
                 streams.PUMP.path, lines, np.array([at_s for at_s, _ in pump]), values, variances
             )
         seen = [f for f in found if part_s[0] <= f.time_s <= part_s[1]]
@@ -218,7 +220,7 @@ class Layer:
                 f"{f.kind}, {_format_size(f.size, f.unit)} (confidence {f.confidence:.3f})"
                 for f in seen
             ]
-            self._log(
+            self._send_log(
                 run, "/found", np.array([f.time_s for f in seen]), texts, ["WARN"] * len(seen)
             )
         for kind in dict.fromkeys(f.kind for f in found):
@@ -228,11 +230,13 @@ class Layer:
             )
             name = f"{kind}, {ends}" if len(alike) == 1 else f"{len(alike)} of {kind}, {ends}"
             path = f"/found/lines/{kind.replace(' ', '_')}"
-            self._style(path, [(name, _FOUND_COLOURS.get(kind, _OTHER_FOUND))], 1.0, vertical=True)
+            self._send_style(
+                path, [(name, _FOUND_COLOURS.get(kind, _OTHER_FOUND))], 1.0, vertical=True
+            )
             time_s, values = plot_marks.vertical_lines(np.array([f.time_s for f in alike]))
-            self._columns(path, time_s, rr.Scalars.columns(scalars=values))
+            self._send_columns(path, time_s, rr.Scalars.columns(scalars=values))
 
-    def _log(
+    def _send_log(
         self, run: Run, path: str, time_s: Column, texts: list[str], levels: list[str]
     ) -> None:
         """Log lines that begin with the time of day."""
@@ -240,9 +244,9 @@ class Layer:
             f"{self._label}{run.utc(at_s):%H:%M:%S} {text}"
             for at_s, text in zip(time_s.tolist(), texts, strict=True)
         ]
-        self._columns(path, time_s, rr.TextLog.columns(text=lines, level=levels))
+        self._send_columns(path, time_s, rr.TextLog.columns(text=lines, level=levels))
 
-    def _figure(self, cycles: shapes.Shapes, part_s: tuple[float, float]) -> None:
+    def _send_figure(self, cycles: shapes.Shapes, part_s: tuple[float, float]) -> None:
         """Changes since the first cycle of the hold."""
         good = cycles.select(
             (cycles.verdict != "rejected") & np.isfinite(cycles.coeffs_um).all(axis=1)
@@ -253,7 +257,7 @@ class Layer:
         parameters = shown.parameters_um() - shown.parameters_um()[0]
         terms = [j - 1 for j in LOW_ORDER_COLUMNS]
         variances = _coefficient_variances(shown)[:, terms]
-        self._measured(
+        self._send_measured(
             streams.CHANGE.path,
             _names_and_colours(streams.CHANGE),
             shown.time_s,
@@ -265,15 +269,15 @@ class Layer:
         )
         variances = np.nan_to_num(np.column_stack((shown.sag_sigma_um**2, np.zeros(len(shown)))))
         sag = streams.SAG
-        self._measured(sag.path, _names_and_colours(sag), shown.time_s, change, variances)
+        self._send_measured(sag.path, _names_and_colours(sag), shown.time_s, change, variances)
         residual_urad = shown.slope_residual_urad[:, np.newaxis]
-        self._style(streams.RESIDUAL.path, _names_and_colours(streams.RESIDUAL))
-        self._scalars(streams.RESIDUAL.path, shown.time_s, residual_urad)
+        self._send_style(streams.RESIDUAL.path, _names_and_colours(streams.RESIDUAL))
+        self._send_scalars(streams.RESIDUAL.path, shown.time_s, residual_urad)
         seen = (shown.time_s >= part_s[0]) & (shown.time_s <= part_s[1])
         seen |= ~seen.any()  # nothing measured there: show all rather than no map
-        self._maps(shown.time_s[seen], parameters[seen])
+        self._send_maps(shown.time_s[seen], parameters[seen])
 
-    def _maps(self, time_s: Column, parameters: Column) -> None:
+    def _send_maps(self, time_s: Column, parameters: Column) -> None:
         """Maps of change, each kind on one scale for playback, and of the standard deviation over
         the part.
         """
@@ -283,7 +287,7 @@ class Layer:
         if time_s.size > 1:
             deviation = shapes.deviation_map_um(parameters)
             span = rerun_shapes.colour_span(deviation, None)
-            self._map("scatter", deviation, span)
+            self._send_map("scatter", deviation, span)
             colours["scatter"] = f"0 to {span[1]:.2g} µm"
         wanted = np.flatnonzero(_thin_evenly(time_s.size, MAPS_MOST))
         whole = [shapes.change_map_um(parameters[row]) for row in wanted]
@@ -292,14 +296,14 @@ class Layer:
             span = rerun_shapes.colour_span(np.stack(changes), least_um)
             colours[kind] = f"±{span[1]:.2g} µm"
             for row, change in zip(wanted, changes, strict=True):
-                self._map(kind, change, span, float(time_s[row]))
+                self._send_map(kind, change, span, float(time_s[row]))
         rows = "".join(
             f"| {shapes.MAPS[kind].replace(' so far', '')} | {words} |\n"
             for kind, words in colours.items()
         )
-        self._page("/shape/legend", f"| map | colours |\n|---|---|\n{rows}\n{_COLOUR_WORDS}")
+        self._send_page("/shape/legend", f"| map | colours |\n|---|---|\n{rows}\n{_COLOUR_WORDS}")
 
-    def _thumbnails(self, run: Run, part_s: tuple[float, float]) -> None:
+    def _send_thumbnails(self, run: Run, part_s: tuple[float, float]) -> None:
         """Pictures of camera frames, each from its moment on."""
         for each in run.thumbnails(THUMBNAILS_MOST, *part_s):
             self._set_time(each["time_s"])
@@ -313,7 +317,7 @@ class Layer:
         self._stream.set_time("run_time", duration=since[0])
         self._stream.set_time("utc", timestamp=self._origin + since[1])
 
-    def _map(
+    def _send_map(
         self, kind: str, values: shapes.Map, span: tuple[float, float], at_s: float | None = None
     ) -> None:
         """Log a map at a second of the run, or for all of it."""
@@ -324,12 +328,12 @@ class Layer:
             self._set_time(at_s)
         self._stream.log(path, rerun_shapes.map_picture(picture, span), static=at_s is None)
 
-    def _page(self, path: str, text: str) -> None:
+    def _send_page(self, path: str, text: str) -> None:
         self._stream.log(
             self._prefix + path, rr.TextDocument(text, media_type="text/markdown"), static=True
         )
 
-    def _named(self, lines: Iterable[tuple[str, Colour]], width: float) -> dict[str, Any]:
+    def _send_names(self, lines: Iterable[tuple[str, Colour]], width: float) -> dict[str, Any]:
         """Names, colours and widths of the lines of an entity; those of overlaid runs tell the runs
         apart.
         """
@@ -342,7 +346,7 @@ class Layer:
             "widths": [width] * len(names),
         }
 
-    def _style(
+    def _send_style(
         self,
         path: str,
         lines: Iterable[tuple[str, Colour]],
@@ -351,11 +355,11 @@ class Layer:
     ) -> None:
         # the average of the lines in a pixel would be none
         style = rr.SeriesLines(
-            **self._named(lines, width), aggregation_policy="Off" if vertical else None
+            **self._send_names(lines, width), aggregation_policy="Off" if vertical else None
         )
         self._stream.log(self._prefix + path, style, static=True)
 
-    def _measured(
+    def _send_measured(
         self,
         path: str,
         lines: Iterable[tuple[str, Colour]],
@@ -365,18 +369,20 @@ class Layer:
         width: float = 1.5,
     ) -> None:
         """Log values with a shaded area of one standard deviation."""
-        style = rr.Measurements.from_fields(**self._named(lines, width))
+        style = rr.Measurements.from_fields(**self._send_names(lines, width))
         self._stream.log(self._prefix + path, style, static=True)
         drawn = broken_at_gaps({"time_s": time_s, "values": values, "variances": variances})
         columns = rr.Measurements.columns(values=drawn["values"], variances=drawn["variances"])
-        self._columns(path, drawn["time_s"], columns)
+        self._send_columns(path, drawn["time_s"], columns)
 
-    def _scalars(self, path: str, time_s: Column, values: Column) -> None:
+    def _send_scalars(self, path: str, time_s: Column, values: Column) -> None:
         if time_s.size:
             drawn = broken_at_gaps({"time_s": time_s, "values": values})
-            self._columns(path, drawn["time_s"], rr.Scalars.columns(scalars=drawn["values"]))
+            self._send_columns(path, drawn["time_s"], rr.Scalars.columns(scalars=drawn["values"]))
 
-    def _columns(self, path: str, time_s: Column, columns: Iterable[rr.ComponentColumn]) -> None:
+    def _send_columns(
+        self, path: str, time_s: Column, columns: Iterable[rr.ComponentColumn]
+    ) -> None:
         indexes = [
             rr.TimeColumn("run_time", duration=_to_nanoseconds(time_s - self._shift_s)),
             rr.TimeColumn("utc", timestamp=self._origin + _to_nanoseconds(time_s)),

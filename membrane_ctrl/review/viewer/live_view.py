@@ -63,8 +63,8 @@ class LiveRecording(rerun_recording.Recording):
         self._send_statics()
         self.flush()
 
-    def _abandon(self) -> None:
-        super()._abandon()
+    def _replace_stream(self) -> None:
+        super()._replace_stream()
         self._is_connected = False
 
 

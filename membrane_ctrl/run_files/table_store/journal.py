@@ -43,7 +43,7 @@ class JournalWriter:
         disk.make_folder(path.parent)
         self._descriptor = disk.create(path)
         try:
-            self._append(_pack_frame(0, 0, schema.serialize()))
+            self._append_frame(_pack_frame(0, 0, schema.serialize()))
             disk.sync_folder(path.parent)
         except OSError:
             disk.close(self._descriptor)
@@ -52,9 +52,9 @@ class JournalWriter:
 
     def append(self, first_row: int, batch: pa.RecordBatch) -> None:
         """Append a batch and sync it: all of it or nothing. Raises OSError."""
-        self._append(_pack_frame(first_row, batch.num_rows, batch.serialize()))
+        self._append_frame(_pack_frame(first_row, batch.num_rows, batch.serialize()))
 
-    def _append(self, frame: bytes) -> None:
+    def _append_frame(self, frame: bytes) -> None:
         try:
             self._disk.write(self._descriptor, frame)
             self._disk.sync(self._descriptor)

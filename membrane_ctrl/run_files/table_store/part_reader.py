@@ -66,7 +66,7 @@ class PartReader:
             self._size_bytes = os.fstat(self._file.fileno()).st_size
             if self._size_bytes > PART_BYTES_MAX:
                 raise PartError(f"{self._size_bytes / 1e6:.0f} MB, which no recorder writes")
-            self._parquet = self._opened(self._footer())
+            self._parquet = self._open_with_footer(self._read_footer())
         except _FAULTS as error:
             self._file.close()
             raise error if isinstance(error, PartError) else PartError(_first_line(error)) from None
@@ -103,14 +103,14 @@ class PartReader:
             if known is not None and (known.last_s < start_s or known.first_s >= end_s):
                 continue
             try:
-                yield self._group(number, metadata.row_group(number), names)
+                yield self._read_group(number, metadata.row_group(number), names)
             except _FAULTS as error:
                 first_s, last_s = (
                     (known.first_s, known.last_s) if known is not None else (None, None)
                 )
                 yield LostGroup(first_s, last_s, _first_line(error))
 
-    def _footer(self) -> bytes:
+    def _read_footer(self) -> bytes:
         """The footer, from the manifest if that of the file differs. Raises PartError."""
         expected = unpack_footer(self._entry.footer) if self._entry else None
         tail = self._bytes_at(max(0, self._size_bytes - TAIL_BYTES), TAIL_BYTES)
@@ -127,7 +127,7 @@ class PartReader:
             raise PartError("its footer is damaged or missing")
         return found
 
-    def _opened(self, footer: bytes) -> pq.ParquetFile:
+    def _open_with_footer(self, footer: bytes) -> pq.ParquetFile:
         limits = {
             "thrift_string_size_limit": FOOTER_BYTES_MAX,
             "thrift_container_size_limit": _THRIFT_ITEMS_MAX,
@@ -144,7 +144,9 @@ class PartReader:
             **limits,
         )
 
-    def _group(self, number: int, group: pq.RowGroupMetaData, names: Sequence[str]) -> pa.Table:
+    def _read_group(
+        self, number: int, group: pq.RowGroupMetaData, names: Sequence[str]
+    ) -> pa.Table:
         if group.num_rows > GROUP_ROWS_MAX:
             raise ValueError("more rows than a recorder writes")
         wanted = set(names)

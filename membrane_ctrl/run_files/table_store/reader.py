@@ -48,7 +48,7 @@ class TableReader:
         self.numbers = sorted(found | set(self._entries))[:_NUMBERS_MAX]
         for entry in self._entries.values():
             for text in entry.damage:
-                self._note(self._part(entry.number), f"its journal was damaged, {text}")
+                self._note_damage(self._read_part(entry.number), f"its journal was damaged, {text}")
 
     @property
     def exists(self) -> bool:
@@ -63,14 +63,14 @@ class TableReader:
     def note_missing(self, count: int = 0) -> None:
         """Note the parts that are missing, of `count` known ones."""
         for number in range(max([count, *(n + 1 for n in self.numbers)])):
-            if not self._part(number).exists() and not self._journal(number).exists():
+            if not self._read_part(number).exists() and not self._read_journal(number).exists():
                 entry = self._entries.get(number)
                 rows = (
                     f"rows from {entry.first_s:.2f} s to {entry.last_s:.2f} s are"
                     if entry
                     else "its rows are"
                 )
-                self._note(self._part(number), f"missing; {rows} left out")
+                self._note_damage(self._read_part(number), f"missing; {rows} left out")
 
     def tables(
         self,
@@ -92,7 +92,7 @@ class TableReader:
             if entry is not None and (entry.last_s < start_s or entry.first_s >= end_s):
                 continue
             for table in self._file_tables(number, entry, with_time, start_s, end_s):
-                rows = self._between(table, start_s, end_s)
+                rows = self._select_between(table, start_s, end_s)
                 if rows.num_rows:
                     yield rows.select([name for name in wanted if name in rows.column_names])
 
@@ -127,10 +127,12 @@ class TableReader:
 
     def _schema_of(self, number: int) -> pa.Schema | None:
         try:
-            if self._part(number).exists():
-                with PartReader(self._part(number), self._entries.get(number)) as part:
+            if self._read_part(number).exists():
+                with PartReader(self._read_part(number), self._entries.get(number)) as part:
                     return part.schema
-            frames = journal.find_frames(read_bytes(self._journal(number), journal.FILE_BYTES_MAX))
+            frames = journal.find_frames(
+                read_bytes(self._read_journal(number), journal.FILE_BYTES_MAX)
+            )
             return journal.read_schema(frames[0]) if frames and not frames[0].rows else None
         except _FAULTS:
             return None
@@ -138,17 +140,17 @@ class TableReader:
     def check_all(self) -> None:
         """Compare every part with its SHA-256, and note those that differ."""
         for number, entry in self._entries.items():
-            path = self._part(number)
+            path = self._read_part(number)
             try:
                 with PartReader(path, entry) as part:
                     if not part.is_unchanged():
-                        self._note(
+                        self._note_damage(
                             path, "its SHA-256 is not that of the manifest: damaged or changed"
                         )
             except FileNotFoundError:
                 continue
             except _FAULTS as error:
-                self._note(path, f"cannot be read ({_describe_reason(error)})")
+                self._note_damage(path, f"cannot be read ({_describe_reason(error)})")
 
     def _file_tables(
         self,
@@ -159,10 +161,10 @@ class TableReader:
         end_s: float,
     ) -> Iterator[pa.Table]:
         """Tables of a part, or of its journal if there is no part yet."""
-        if self._part(number).exists():
+        if self._read_part(number).exists():
             yield from self._part_tables(number, entry, names, start_s, end_s)
             return
-        path = self._journal(number)
+        path = self._read_journal(number)
         try:
             data = read_bytes(path, journal.FILE_BYTES_MAX)
         except FileNotFoundError:  # sealed in the meantime, or missing
@@ -171,7 +173,7 @@ class TableReader:
             )
             return
         except OSError as error:
-            self._note(path, f"cannot be read ({error.strerror})")
+            self._note_damage(path, f"cannot be read ({error.strerror})")
             return
         yield from self._journal_tables(path, data, names)
 
@@ -183,46 +185,46 @@ class TableReader:
         start_s: float,
         end_s: float,
     ) -> Iterator[pa.Table]:
-        path = self._part(number)
+        path = self._read_part(number)
         try:
             with PartReader(path, entry) as part:
-                known = self._known(path, part.schema, names)
+                known = self._select_known(path, part.schema, names)
                 for text in part.notes:
-                    self._note(path, text)
+                    self._note_damage(path, text)
                 for group in part.groups(known, start_s, end_s) if known else ():
                     if isinstance(group, LostGroup):
-                        self._note(path, f"{_span_of(group)} left out ({group.why})")
+                        self._note_damage(path, f"{_span_of(group)} left out ({group.why})")
                     else:
                         yield group
         except FileNotFoundError:
             return  # `note_missing` says so
         except _FAULTS as error:
-            self._note(path, f"cannot be read ({_describe_reason(error)})")
+            self._note_damage(path, f"cannot be read ({_describe_reason(error)})")
 
     def _journal_tables(self, path: Path, data: bytes, names: Sequence[str]) -> Iterator[pa.Table]:
         try:
             for block in journal.read_journal(data, self._table.group_rows, self._table.schema):
                 if isinstance(block, journal.LostBytes):
-                    self._note(path, describe_lost_bytes(block))
+                    self._note_damage(path, describe_lost_bytes(block))
                     continue
-                known = self._known(path, block.table.schema, names)
+                known = self._select_known(path, block.table.schema, names)
                 if known:
                     yield block.table.select(known)
         except _FAULTS as error:
-            self._note(path, f"cannot be read ({_describe_reason(error)})")
+            self._note_damage(path, f"cannot be read ({_describe_reason(error)})")
 
-    def _known(self, path: Path, schema: pa.Schema, names: Sequence[str]) -> list[str]:
+    def _select_known(self, path: Path, schema: pa.Schema, names: Sequence[str]) -> list[str]:
         """The columns of a file that are what a recorder writes under their names.
 
         None without the time, or if the file states another layout.
         """
         if (other := self._other_layout(schema)) is not None:
-            self._note(path, other)
+            self._note_damage(path, other)
             return []
         known = [name for name in names if self._is_ours(schema, name)]
         absent = sorted(set(names) - set(known))
         if absent:
-            self._note(path, f"without {', '.join(absent)}")
+            self._note_damage(path, f"without {', '.join(absent)}")
         return known if self._table.time_name in known or self._table.time_name not in names else []
 
     def _other_layout(self, schema: pa.Schema) -> str | None:
@@ -246,20 +248,20 @@ class TableReader:
             kind = kind.value_type
         return bool(kind == self._table.schema.field(name).type)
 
-    def _between(self, table: pa.Table, start_s: float, end_s: float) -> pa.Table:
+    def _select_between(self, table: pa.Table, start_s: float, end_s: float) -> pa.Table:
         if start_s == -math.inf and end_s == math.inf:
             return table
         time_s = table.column(self._table.time_name).to_numpy()
         first, last = np.searchsorted(time_s, [start_s, end_s])
         return table.slice(first, max(0, last - first))
 
-    def _part(self, number: int) -> Path:
+    def _read_part(self, number: int) -> Path:
         return spec.part_path(self._folder, number)
 
-    def _journal(self, number: int) -> Path:
+    def _read_journal(self, number: int) -> Path:
         return spec.journal_path(self._folder, number)
 
-    def _note(self, path: Path, text: str) -> None:
+    def _note_damage(self, path: Path, text: str) -> None:
         line = f"{path.parent.name}/{path.name}: {text}"
         if line not in self._notes:
             self._notes.append(line)

@@ -100,7 +100,7 @@ class OpticsRenderer:
         )  # of the pattern's region
         self._loss = vignetting_loss(camera.width_px, camera.height_px, self.light.vignetting)
         if self.disturbances != DisturbancesConfig():
-            self._disturber = self._disturbed()
+            self._disturber = self._disturb_nodes()
 
     def blank(self) -> Pixels:
         """An empty picture, (H, W): uint8 for an 8-bit camera, uint16 for any deeper one."""
@@ -133,8 +133,8 @@ class OpticsRenderer:
                 f"{camera.width_px}) {depth}"
             )
         self._pictures += 1
-        paint = self._painter(shown, gain)
-        nodes, times_s = self._nodes(displacement_um), np.array([[time_s]])
+        paint = self._make_painter(shown, gain)
+        nodes, times_s = self._interpolate_nodes(displacement_um), np.array([[time_s]])
         if self._disturber is not None:
             nodes, times_s = (
                 nodes + self._disturber.rays(time_s),
@@ -152,16 +152,20 @@ class OpticsRenderer:
         other.result()
         return picture
 
-    def _painter(self, shown: Pattern | PanelPicture, gain: float) -> Callable[..., None]:
+    def _make_painter(self, shown: Pattern | PanelPicture, gain: float) -> Callable[..., None]:
         """What shades rows of a picture of what is shown."""
         if isinstance(shown, PanelPicture):
-            return self._pixelled(shown, gain)
-        return self._crossed(shown, gain) if shown.role == "crossed" else self._striped(shown, gain)
+            return self._make_panel_painter(shown, gain)
+        return (
+            self._make_crossed_painter(shown, gain)
+            if shown.role == "crossed"
+            else self._make_stripe_painter(shown, gain)
+        )
 
-    def _pixelled(self, panel: PanelPicture, gain: float) -> Callable[..., None]:
+    def _make_panel_painter(self, panel: PanelPicture, gain: float) -> Callable[..., None]:
         """Shades rows of a picture of a panel's pixels."""
         noise_adu, radius_mm = self.optics.camera.noise_adu, self.film.radius_mm
-        dark, white, full = self._levels(gain)
+        dark, white, full = self._compute_levels(gain)
         scale = np.array([dark, white, self.light.leak, full])
         light, places = panel.light_of_pixels(self.light), panel.places
 
@@ -183,11 +187,11 @@ class OpticsRenderer:
 
         return paint
 
-    def _striped(self, pattern: Pattern, gain: float) -> Callable[..., None]:
+    def _make_stripe_painter(self, pattern: Pattern, gain: float) -> Callable[..., None]:
         """Shades rows of a picture of a pattern along one axis."""
         config, noise_adu = self.optics.pattern, self.optics.camera.noise_adu
         table = level_table(pattern, config, self.light)
-        dark, white, full = self._levels(gain)
+        dark, white, full = self._compute_levels(gain)
 
         def paint(nodes: FloatArray, seed: int, picture: Pixels, start: int, stop: int) -> None:
             shade_rows(
@@ -207,7 +211,7 @@ class OpticsRenderer:
 
         return paint
 
-    def _crossed(self, pattern: Pattern, gain: float) -> Callable[..., None]:
+    def _make_crossed_painter(self, pattern: Pattern, gain: float) -> Callable[..., None]:
         """Shades rows of a picture of crossed fringes."""
         if pattern.index < 1:
             raise ValueError(f"pattern {pattern.name!r}: crossed fringes need 1 or more periods")
@@ -220,7 +224,7 @@ class OpticsRenderer:
             self._side_mm / 2,
             self.film.radius_mm**2,
         )
-        dark, white, full = self._levels(gain)
+        dark, white, full = self._compute_levels(gain)
         scale: tuple[float, ...] = (
             dark,
             white,
@@ -241,7 +245,7 @@ class OpticsRenderer:
 
         return paint
 
-    def _levels(self, gain: float) -> tuple[float, float, float]:
+    def _compute_levels(self, gain: float) -> tuple[float, float, float]:
         """Counts without light, of a white screen above that, and full scale."""
         full = float(2**self.optics.camera.bits - 1)
         dark = self.light.dark_fraction * full
@@ -256,9 +260,9 @@ class OpticsRenderer:
             np.arange(float(camera.width_px)), np.arange(float(camera.height_px))
         )
         directions = pixel_directions(camera, self._camera_pose, columns.ravel(), rows.ravel())
-        return self._trace(directions, displacement_um)
+        return self._trace_film(directions, displacement_um)
 
-    def _trace(
+    def _trace_film(
         self, directions: FloatArray, displacement_um: float, film: FilmTerms | None = None
     ) -> Trace:
         vertex_z_mm = -(displacement_um - self.reference_um) / 1000.0
@@ -268,24 +272,24 @@ class OpticsRenderer:
             self._camera_pose, directions, film, sag_mm, vertex_z_mm, self._screen_pose
         )
 
-    def _nodes(self, displacement_um: float) -> FloatArray:
+    def _interpolate_nodes(self, displacement_um: float) -> FloatArray:
         """Traced maps at the nodes, (3, rows, columns), at this displacement (Lagrange through the
         nearest three).
         """
         if self.exact:
-            return self._traced(displacement_um)
+            return self._trace_nodes(displacement_um)
         nearest = float(np.floor(displacement_um / _CELL_UM + 0.5))
         f = displacement_um / _CELL_UM - nearest
-        below, here, above = (self._traced((nearest + k) * _CELL_UM) for k in (-1, 0, 1))
+        below, here, above = (self._trace_nodes((nearest + k) * _CELL_UM) for k in (-1, 0, 1))
         return (
             0.5 * f * (f - 1.0) * below + (1.0 - f) * (1.0 + f) * here + 0.5 * f * (f + 1.0) * above
         )
 
-    def _traced(self, displacement_um: float) -> FloatArray:
+    def _trace_nodes(self, displacement_um: float) -> FloatArray:
         if displacement_um in self._traces:
             self._traces.move_to_end(displacement_um)
             return self._traces[displacement_um]
-        maps = self._maps(self._trace(self._directions, displacement_um))
+        maps = self._make_maps(self._trace_film(self._directions, displacement_um))
         self._traces[displacement_um] = maps
         while len(self._traces) > (1 if self.exact else _KEPT_TRACES):
             self._traces.popitem(last=False)
@@ -297,28 +301,30 @@ class OpticsRenderer:
         """
         if mode not in self._swings:
             still, moved = (
-                self._maps(self._trace(self._directions, 0.0, film))
+                self._make_maps(self._trace_film(self._directions, 0.0, film))
                 for film in (self.film.terms_at(0.0), mode.moved(self.film))
             )
             self._swings[mode] = moved - still
         return self._swings[mode]
 
-    def _disturbed(self) -> Disturber:
+    def _disturb_nodes(self) -> Disturber:
         """The disturbances, for the nodes of a film at displacement 0."""
-        pose, still = self._camera_pose, self._trace(self._directions, 0.0)
+        pose, still = self._camera_pose, self._trace_film(self._directions, 0.0)
         self._camera_pose = replace(
             pose, position_mm=pose.position_mm * (1 + 1 / np.linalg.norm(pose.position_mm))
         )
-        maps, grown = (self._maps(found) for found in (still, self._trace(self._directions, 0.0)))
+        maps, grown = (
+            self._make_maps(found) for found in (still, self._trace_film(self._directions, 0.0))
+        )
         self._camera_pose = pose
         x_mm, y_mm = (place.reshape(maps.shape[1:]) for place in (still.x_mm, still.y_mm))
         row_share = (self._rows + 0.5) / self.optics.camera.height_px - 0.5
-        full = self._levels(1.0)[2]
+        full = self._compute_levels(1.0)[2]
         places = maps[0], maps[1], x_mm, y_mm, row_share
         nodes = Nodes(*places, self._side_mm, self.film.radius_mm, full, grown - maps)
         return Disturber(self.disturbances, nodes, self.seed)
 
-    def _maps(self, found: Trace) -> FloatArray:
+    def _make_maps(self, found: Trace) -> FloatArray:
         """Screen point from the region's low edges, squared distance from the vertex: (3, rows,
         columns).
         """
@@ -397,7 +403,7 @@ class TwinOptics:
     @property
     def film(self) -> FilmShape:
         """The film; its sag belongs to displacement 0."""
-        return self._looked().film
+        return self._render_view().film
 
     def expose(self, out: Pixels | None) -> Frame:
         """Take one picture of the screen now."""
@@ -412,13 +418,13 @@ class TwinOptics:
         return self._expose(self.screen.shown or _DARK, None).pixels
 
     def _expose(self, shown: Pattern | PanelPicture, out: Pixels | None) -> Frame:
-        renderer = self._looked()
+        renderer = self._render_view()
         time_s = self._clock.now()
         return Frame(
             renderer.render(shown, self._truth().displacement_um, out, time_s=time_s), time_s
         )
 
-    def _looked(self) -> OpticsRenderer:
+    def _render_view(self) -> OpticsRenderer:
         if self._renderer is None:
             position = self._truth()
             sag_mm = position.sag_mm - position.displacement_um / 1000.0

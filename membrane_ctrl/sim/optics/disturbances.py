@@ -84,7 +84,7 @@ class Disturber:
     def light(self, time_s: float, pattern: Pattern) -> FloatArray:
         """Factor of the screen's light, and counts of the room's, (2, rows, columns)."""
         wanted, nodes = self._wanted, self._nodes
-        factor = self._dust_at(time_s) * self._backlight(self.row_times_s(time_s))
+        factor = self._dust_at(time_s) * self._backlight_factor(self.row_times_s(time_s))
         factor = factor * math.exp(-wanted.dimming_fraction_per_h * time_s / 3600.0)
         if wanted.brightness_fraction:
             half_mm = nodes.side_mm / 2
@@ -92,7 +92,7 @@ class Disturber:
                 time_s, nodes.s_x_mm - half_mm, nodes.s_y_mm - half_mm
             )
         if wanted.sticking_fraction and pattern.role == "crossed":
-            factor *= 1.0 - wanted.sticking_fraction * self._stuck(time_s, pattern)
+            factor *= 1.0 - wanted.sticking_fraction * self._retained_level(time_s, pattern)
         swing = _SWING * math.sin(2 * math.pi * time_s / _SWING_S)
         room_adu = (
             wanted.ambient_fraction
@@ -115,7 +115,7 @@ class Disturber:
             self._dust = change, passes
         return self._dust[1].copy()
 
-    def _backlight(self, middle_s: FloatArray) -> FloatArray:
+    def _backlight_factor(self, middle_s: FloatArray) -> FloatArray:
         """Light of an exposure over the mean: how much of it falls into the pulses of the
         backlight.
         """
@@ -131,7 +131,7 @@ class Disturber:
         lit = pulses(hz * (middle_s + half_s)) - pulses(hz * (middle_s - half_s))
         return np.asarray(lit / (_LIT_SHARE * hz * _EXPOSURE_S))
 
-    def _stuck(self, time_s: float, pattern: Pattern) -> FloatArray:
+    def _retained_level(self, time_s: float, pattern: Pattern) -> FloatArray:
         """Level, 0 to 1, of the picture that the panel remembers: the mean of the patterns shown so
         far.
         """

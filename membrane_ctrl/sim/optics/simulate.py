@@ -286,7 +286,9 @@ def _anchor_specification(spec: SimulationSpec) -> SimulationSpec:
 class _SeenDirectly(OpticsRenderer):
     """The screen itself before the camera; there is no film."""
 
-    def _trace(self, directions: FloatArray, displacement_um: float, film: Any = None) -> Trace:
+    def _trace_film(
+        self, directions: FloatArray, displacement_um: float, film: Any = None
+    ) -> Trace:
         screen = self._screen_pose
         axes = np.stack([screen.s_x, screen.s_y, np.cross(screen.s_x, screen.s_y)])
         start, along = (
