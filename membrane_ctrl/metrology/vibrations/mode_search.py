@@ -30,46 +30,43 @@ from membrane_ctrl.model.zernike_terms import ZERNIKE_TERMS
 
 ComplexArray = NDArray[np.complex128]
 
-PIECE_S = 10.0  # a line of 48 Hz with a quality of 500 is as wide as the resolution of that, 0.1 Hz
+# Resolution 0.1 Hz: as wide as a line of 48 Hz with a quality of 500.
+PIECE_S = 10.0
 LEAST_S = 20.0
-_LEAST_HZ = 1.2  # slower than that is weather, leak and control
-_GRID = 4  # frequencies per resolution
-_TAKEN = (
-    -2.1,
-    -1.4,
-    -0.7,
-    0.0,
-    0.7,
-    1.4,
-    2.1,
-)  # resolutions about a line that go with it: it may be damped
-_SHORTEST = 0.6  # shorter frames of one rate, in pieces, are left out
-_GRAIN_UM = 1e-3  # of a hold's terms: they have at least the noise of rounding
-_HALF, _OTHER_RATE = (
-    12,
-    0.04,
-)  # intervals on each side, and change of their median; busy machines scatter by as much
-_GAP = 4.5  # intervals: as long a pause ends a piece
-_MOST = 24
-_CHANCE = 1e-9  # of a false line in one search
-# difference of T, a factor of 2e4 in likelihood, below which two frequencies are equally possible
-_ALIKE = 10.0
-# of T: what a line leaves where its alias is as slow as drift, and another frequency takes for
-# itself
-_LEAKED = 0.1
-_MISSING = 0.9  # of T for each piece: below it, some of the pieces do not show the line
-_MARGIN = 1.5  # of T at one rate: errors of the noise's spectrum are the same in all pieces
-_APART_HZ = 0.3  # closer ones are one line
-_SAME = 0.004  # relative: two searches see one mode, whatever the shapes
-_FAR, _SIMILAR = (
-    0.05,
-    0.8,
-)  # relative, and correlation: two searches see one mode whose frequency has moved
-
 SEARCH_S = 60.0
 LEAST_RATE_HZ = 4.0  # of the frames; a cycle of eight gives 0.5
-# relative, told from here on: none of 1 %, which is 2 % of the film's tension, is missed
+# Relative change of frequency that is reported: 1 %, which is 2 % of the film's tension, is
+# always found.
 MOVED = 0.009
+_LEAST_HZ = 1.2  # below it are weather, leak and control
+_GRID = 4  # frequencies per resolution
+# Offsets, in resolutions, that are removed with a line: a damped line is broad.
+_REMOVED_OFFSETS = (-2.1, -1.4, -0.7, 0.0, 0.7, 1.4, 2.1)
+_SHORTEST = 0.6  # shorter runs of frames of one rate, in pieces, are not used
+_GRAIN_UM = 1e-3  # resolution of a hold's terms: they have at least the noise of rounding
+# A change of the frame rate: intervals on each side, and relative change of their medians.
+# The intervals of a busy computer scatter by as much.
+_HALF = 12
+_OTHER_RATE = 0.04
+_GAP = 4.5  # intervals: a pause as long as this ends a piece
+_MOST_MODES = 24
+_CHANCE = 1e-9  # probability of a false line in one search
+# Difference of T, a factor of 2e4 in likelihood, below which two frequencies are equally possible.
+_EQUALLY_LIKELY = 10.0
+# Share of T that a line leaves where its alias is as slow as drift, and that another frequency
+# takes over.
+_LEAKED = 0.1
+_MISSING = 0.9  # share of T per piece, below which some of the pieces do not show the line
+# Factor of the threshold at one rate: errors of the noise's spectrum are the same in all pieces.
+_MARGIN = 1.5
+_APART_HZ = 0.3  # closer lines are one
+_SAME = 0.004  # relative difference of frequency: two searches see one mode, whatever the shapes
+# Relative difference of frequency, and correlation of the shapes: two searches see one mode whose
+# frequency has moved.
+_FAR = 0.05
+_SIMILAR = 0.8
+_MEDIAN_OF_POWER = np.log(2)  # median over mean of an exponential distribution
+_GAUSSIAN_QUANTILE = 1.2816  # distance of the 10 % quantile from the median, in sigmas
 
 
 @dataclass(frozen=True)
@@ -87,11 +84,14 @@ class VibrationMode(StateNode):
     aliases_hz: tuple[float, ...] = ()
 
     def is_like(self, other: "VibrationMode") -> bool:
-        """Whether two searches see one mode: nearly its frequency,
-        or its shape somewhat beside it.
+        """Whether two searches see one mode: nearly the same frequency, or the same shape at a
+        frequency that has moved.
         """
         change = abs(self.frequency_hz / other.frequency_hz - 1)
-        return change < _SAME or (change < _FAR and abs(float(self.shape @ other.shape)) > _SIMILAR)
+        if change < _SAME:
+            return True
+        correlation = abs(float(self.shape @ other.shape))
+        return change < _FAR and correlation > _SIMILAR
 
 
 @dataclass(frozen=True)
@@ -113,98 +113,134 @@ class _Piece:
     def goes_with(self, frequency_hz: float) -> BoolArray:
         """The frequencies (frequencies,) that have nearly the alias of a line."""
         alias_hz = abs(frequency_hz - self.rate_hz * round(frequency_hz / self.rate_hz))
-        return np.asarray(np.abs(self.alias_hz - alias_hz) < (_TAKEN[-1] + 1) / PIECE_S)
+        reach_hz = (_REMOVED_OFFSETS[-1] + 1) / PIECE_S
+        return np.asarray(np.abs(self.alias_hz - alias_hz) < reach_hz)
 
     def noise(self, power: FloatArray, gone: BoolArray) -> FloatArray:
-        """Noise (frequencies, terms - 1) under the lines, a function of the alias that falls with
-        it: drift, then white.
+        """Noise (frequencies, terms - 1) under the lines: a function of the alias that falls
+        with it, from drift to white noise.
 
-        Medians over bands of half an octave (power is exponential: its median is ln 2 of its mean),
-        none larger than that of a slower band, in which a line has less to say. What is `gone` with
-        a line is left out if other power is there; a slow band that a line has emptied would leave
-        no noise to it and to all the faster ones.
+        It is the median of `power` (frequencies, terms - 1) over bands of half an octave, never
+        larger than in a slower band, where a line has less influence. The frequencies `gone` with a
+        line are left out while most of the band remains: an emptied slow band would leave no noise
+        for itself and all faster ones.
         """
-        slowest_hz, levels, middles = _LEAST_HZ / 2, [], []
+        # Bands of half an octave, from below the slowest line to the fastest alias.
+        slowest_hz = _LEAST_HZ / 2
         octaves = np.log2(self.alias_hz.max() / slowest_hz)
         edges = np.geomspace(slowest_hz, self.alias_hz.max() * 1.001, 3 + int(2 * octaves))
+        levels = []
+        middles = []
         for low, high in pairwise(edges):
             inside = (self.alias_hz >= low) & (self.alias_hz < high)
-            left = inside & ~gone
-            if inside.any():
-                levels.append(
-                    np.median(power[left if 2 * left.sum() > inside.sum() else inside], axis=0)
-                    / np.log(2)
-                )
-                middles.append(np.log(np.sqrt(low * high)))
+            if not inside.any():
+                continue
+            remaining = inside & ~gone
+            most_remains = 2 * remaining.sum() > inside.sum()
+            band = remaining if most_remains else inside
+            levels.append(np.median(power[band], axis=0) / _MEDIAN_OF_POWER)
+            middles.append(np.log(np.sqrt(low * high)))
+
+        # Falling with frequency, and not below the rounding of the recorded terms.
         rounding = np.sum(self.window**2) * _GRAIN_UM**2 / 12
-        logs = np.log(np.maximum(np.minimum.accumulate(levels, axis=0), rounding))
-        at = np.log(np.maximum(self.alias_hz, slowest_hz))
-        return np.exp(
-            np.column_stack([np.interp(at, middles, logs[:, j]) for j in range(power.shape[1])])
-        )
+        falling = np.minimum.accumulate(levels, axis=0)
+        logs = np.log(np.maximum(falling, rounding))
+
+        # Interpolated between the bands in the logarithms of frequency and power.
+        log_alias = np.log(np.maximum(self.alias_hz, slowest_hz))
+        columns = [np.interp(log_alias, middles, column) for column in logs.T]
+        return np.exp(np.column_stack(columns))
 
     def without(self, terms_um: FloatArray, frequency_hz: float, shapes: FloatArray) -> FloatArray:
-        """The terms without oscillations about a frequency that `shapes` (terms - 1, terms - 1)
-        projects on; others stay."""
+        """The terms (n, terms - 1) without the oscillations about a frequency that the projection
+        `shapes` (terms - 1, terms - 1) selects.
+        """
         times = 2 * np.pi * (self.time_s - self.time_s[0])
-        phases = [(frequency_hz + offset / PIECE_S) * times for offset in _TAKEN]
-        base = np.column_stack([wave(phase) for phase in phases for wave in (np.cos, np.sin)])
-        return np.asarray(terms_um - base @ np.linalg.lstsq(base, terms_um @ shapes, rcond=None)[0])
+        waves = []
+        for offset in _REMOVED_OFFSETS:
+            phase = (frequency_hz + offset / PIECE_S) * times
+            waves += [np.cos(phase), np.sin(phase)]
+        base = np.column_stack(waves)
+        amplitudes = np.linalg.lstsq(base, terms_um @ shapes, rcond=None)[0]
+        return np.asarray(terms_um - base @ amplitudes)
 
 
 def find_modes(
     time_s: FloatArray, coeffs_um: FloatArray, most_hz: float = 100.0
 ) -> tuple[VibrationMode, ...] | None:
-    """Vibrations in terms (n, terms) of frames at times (n,), NaN where a frame was rejected; the
-    strongest first.
+    """Find the vibrations in tracked terms.
 
-    None if there are less than 20 s of frames at a steady rate.
+    Parameters
+    ----------
+    time_s : (n,) array
+        Times of the frames.
+    coeffs_um : (n, terms) array
+        Terms of each frame; NaN where a frame was rejected.
+    most_hz : float
+        Highest frequency to search.
+
+    Returns
+    -------
+    tuple of VibrationMode or None
+        The modes, the strongest first; None if there are less than 20 s of frames at a steady rate.
     """
     good = np.isfinite(coeffs_um).all(axis=1)
     grid_hz = np.arange(_LEAST_HZ, most_hz, 1 / (_GRID * PIECE_S))
-    # the first term only puts the vertex at 0: it would weigh what moves the vertex twice
+    # The first term only puts the vertex at 0: it would count what moves the vertex twice.
     pieces, terms = _split_frames(time_s[good], coeffs_um[good, 1:], grid_hz)
     if sum(piece.time_s[-1] - piece.time_s[0] for piece in pieces) < 0.9 * LEAST_S:
         return None
-    found: list[VibrationMode] = []
     margin = _MARGIN if _one_rate([piece.rate_hz for piece in pieces]) else 1.0
-    whole = [np.abs(piece.projected(part)) ** 2 for piece, part in zip(pieces, terms, strict=True)]
-    gone = [
-        np.zeros(grid_hz.size, bool) for _ in pieces
-    ]  # frequencies whose aliases went with a line
-    for _ in range(_MOST):
-        spectra = [piece.projected(part) for piece, part in zip(pieces, terms, strict=True)]
-        noises = [
-            piece.noise(np.where(away[:, None], before, np.abs(spectrum) ** 2), away)
-            for spectrum, before, piece, away in zip(spectra, whole, pieces, gone, strict=True)
-        ]
+    visible = np.sum([~piece.blind for piece in pieces], axis=0)
+    whole_power = [np.abs(spectrum) ** 2 for spectrum in _project_pieces(pieces, terms)]
+    # For each piece, the frequencies whose aliases were removed with a line.
+    gone = [np.zeros(grid_hz.size, bool) for _ in pieces]
+
+    found: list[VibrationMode] = []
+    for _ in range(_MOST_MODES):
+        # Evidence at each frequency, in units of the noise that the lines found so far leave.
+        spectra = _project_pieces(pieces, terms)
+        noises = []
+        for spectrum, before, piece, away in zip(spectra, whole_power, pieces, gone, strict=True):
+            power = np.where(away[:, None], before, np.abs(spectrum) ** 2)
+            noises.append(piece.noise(power, away))
         seen = _compute_evidence(spectra, noises, pieces)
         if seen.max() < margin * _compute_threshold(seen, grid_hz.size):
             break
-        k, rivals = _find_likeliest(seen, np.sum([~piece.blind for piece in pieces], axis=0))
+
+        # The strongest line: its frequency, amplitude and shape. In the other pieces its alias is
+        # as slow as drift.
+        k, rivals = _find_likeliest(seen, visible)
         frequency, sigma = _refine_frequency(seen, grid_hz, k)
-        used = [
-            p for p, piece in enumerate(pieces) if not piece.blind[k]
-        ]  # others have drift there
+        used = [p for p, piece in enumerate(pieces) if not piece.blind[k]]
         amplitude_nm, shape = _compute_shape(
-            *zip(*((spectra[p][k], pieces[p], noises[p][k]) for p in used), strict=True)
+            [spectra[p][k] for p in used],
+            [pieces[p] for p in used],
+            [noises[p][k] for p in used],
         )
         own = shape[1:] / np.linalg.norm(shape[1:])
-        sigma = max(sigma, _scatter_hz([np.abs(spectra[p] @ own) ** 2 for p in used], grid_hz, k))
-        again = any(abs(frequency - mode.frequency_hz) < _APART_HZ for mode in found)
-        if not again:
+        own_power = [np.abs(spectra[p] @ own) ** 2 for p in used]
+        sigma = max(sigma, _scatter_hz(own_power, grid_hz, k))
+        is_known = any(abs(frequency - mode.frequency_hz) < _APART_HZ for mode in found)
+        if not is_known:
             evidence = float(seen[k] - np.median(seen))
             rates_hz = [pieces[p].rate_hz for p in used]
             aliases = _aliases_hz(rates_hz, frequency, most_hz) or tuple(grid_hz[rivals].tolist())
             found.append(VibrationMode(frequency, sigma, amplitude_nm, shape, evidence, aliases))
-        terms = [
-            piece.without(
-                part, frequency, np.eye(own.size) if again else _projection_onto(own, noise[k])
-            )
-            for piece, part, noise in zip(pieces, terms, noises, strict=True)
-        ]
+
+        # Remove its shape; if it was found before, all shapes at its frequency.
+        remaining = []
+        for piece, part, noise in zip(pieces, terms, noises, strict=True):
+            shapes = np.eye(own.size) if is_known else _projection_onto(own, noise[k])
+            remaining.append(piece.without(part, frequency, shapes))
+        terms = remaining
         gone = [away | piece.goes_with(frequency) for piece, away in zip(pieces, gone, strict=True)]
     return tuple(_drop_false_aliases(mode, found) for mode in found)
+
+
+def _project_pieces(pieces: Sequence[_Piece], terms: Sequence[FloatArray]) -> list[ComplexArray]:
+    """X (frequencies, terms - 1) of each piece."""
+    return [piece.projected(part) for piece, part in zip(pieces, terms, strict=True)]
 
 
 def _drop_false_aliases(mode: VibrationMode, found: list[VibrationMode]) -> VibrationMode:
@@ -223,7 +259,8 @@ def _split_frames(
         t = time_s[frames]
         rate_hz = 1 / float(np.median(np.diff(t)))
         alias_hz = np.abs(grid_hz - rate_hz * np.round(grid_hz / rate_hz))
-        middle, half = (t[0] + t[-1]) / 2, (t[-1] - t[0]) / 2 + 1 / rate_hz
+        middle = (t[0] + t[-1]) / 2
+        half = (t[-1] - t[0]) / 2 + 1 / rate_hz
         window = np.cos(np.pi / 2 * (t - middle) / half) ** 2
         waves = np.exp(-2j * np.pi * grid_hz[:, None] * (t - t[0]))
         blind = (alias_hz < _LEAST_HZ) | (alias_hz > rate_hz / 2 - 2 / PIECE_S)
@@ -240,10 +277,16 @@ def _find_runs(time_s: FloatArray) -> list[slice]:
     if intervals.size <= 2 * _HALF:
         return []
     usual = ndimage.median_filter(intervals, 2 * _HALF + 1, mode="nearest")
-    before, after = usual[: -2 * _HALF], usual[2 * _HALF :]
-    other = np.append(0, np.abs(after - before) > _OTHER_RATE * before)
-    begins, ceases = (np.flatnonzero(np.diff(np.append(other, 0)) == sign) for sign in (1, -1))
-    ends = np.union1d((begins + ceases) // 2 + _HALF, np.flatnonzero(intervals > _GAP * usual))
+    # The rate changes in the middle of each stretch where the medians on both sides differ.
+    before = usual[: -2 * _HALF]
+    after = usual[2 * _HALF :]
+    differs = np.append(0, np.abs(after - before) > _OTHER_RATE * before)
+    edges_of_stretches = np.diff(np.append(differs, 0))
+    begins = np.flatnonzero(edges_of_stretches == 1)
+    ceases = np.flatnonzero(edges_of_stretches == -1)
+    rate_changes = (begins + ceases) // 2 + _HALF
+    gaps = np.flatnonzero(intervals > _GAP * usual)
+    ends = np.union1d(rate_changes, gaps)
     pieces = []
     for first, last in pairwise([0, *(ends + 1), time_s.size]):
         lasts_s = time_s[last - 1] - time_s[first]
@@ -256,9 +299,10 @@ def _find_runs(time_s: FloatArray) -> list[slice]:
 def _without_drift(time_s: FloatArray, terms_um: FloatArray) -> FloatArray:
     """Terms less a cubic, clipped at six robust deviations."""
     base = np.column_stack([np.linspace(-1, 1, time_s.size) ** power for power in range(4)])
-    left = terms_um - base @ np.linalg.lstsq(base, terms_um, rcond=None)[0]
-    spread = np.maximum(1.4826 * np.median(np.abs(left), axis=0), _GRAIN_UM)
-    return np.asarray(np.clip(left, -6 * spread, 6 * spread))
+    cubic = base @ np.linalg.lstsq(base, terms_um, rcond=None)[0]
+    rest = terms_um - cubic
+    spread = np.maximum(1.4826 * np.median(np.abs(rest), axis=0), _GRAIN_UM)
+    return np.asarray(np.clip(rest, -6 * spread, 6 * spread))
 
 
 def _compute_evidence(
@@ -267,18 +311,21 @@ def _compute_evidence(
     """T (frequencies,): the largest eigenvalue over the shapes, with terms and pieces in units of
     their noise.
     """
-    white = np.stack(
-        [spectrum / np.sqrt(noise) for spectrum, noise in zip(spectra, noises, strict=True)], axis=1
-    )
+    scaled = [spectrum / np.sqrt(noise) for spectrum, noise in zip(spectra, noises, strict=True)]
+    white = np.stack(scaled, axis=1)  # (frequencies, pieces, terms - 1)
+
+    # The covariance of the terms' noise, from the quiet half: lines and their aliases are in the
+    # other one.
     power = np.sum(np.abs(white) ** 2, axis=2)
-    quiet = white[
-        power <= np.median(power, axis=0)
-    ]  # lines, and their aliases, are in the other half
+    quiet = white[power <= np.median(power, axis=0)]
     values, vectors = np.linalg.eigh(np.real(quiet.conj().T @ quiet) / len(quiet))
     kept = values > 1e-3 * values[-1]
-    alone = (white @ vectors[:, kept]) / np.sqrt(values[kept])
-    alone[np.stack([piece.blind for piece in pieces], axis=1)] = 0
-    parts = np.concatenate([alone.real, alone.imag], axis=1)
+    independent = (white @ vectors[:, kept]) / np.sqrt(values[kept])
+    independent[np.stack([piece.blind for piece in pieces], axis=1)] = 0
+
+    # Real and imaginary parts of all pieces are rows of one matrix; the largest eigenvalue of its
+    # square is the power of the best common shape.
+    parts = np.concatenate([independent.real, independent.imag], axis=1)
     return np.asarray(np.linalg.eigvalsh(parts @ parts.transpose(0, 2, 1))[:, -1])
 
 
@@ -288,13 +335,16 @@ def _compute_threshold(seen: FloatArray, frequencies: int) -> float:
     """
     from scipy import stats
 
-    heard = seen[seen > 0]  # to the others all pieces are blind
-    # of the lower half, where neither lines nor their aliases are
-    low, middle = np.quantile(heard, [0.1, 0.5]) if heard.size else (0.0, 0.0)
+    visible = seen[seen > 0]  # all pieces are blind to the others
+    if not visible.size:
+        return float("inf")
+    # Quantiles of the lower half, where neither lines nor their aliases are.
+    low, middle = np.quantile(visible, [0.1, 0.5])
     if not middle > low:
         return float("inf")  # nothing moves at all
-    order = max((1.2816 * middle / (middle - low)) ** 2, 1.0)
-    return float(middle / stats.gamma.median(order) * stats.gamma.isf(_CHANCE / frequencies, order))
+    order = max((_GAUSSIAN_QUANTILE * middle / (middle - low)) ** 2, 1.0)
+    scale = middle / stats.gamma.median(order)
+    return float(scale * stats.gamma.isf(_CHANCE / frequencies, order))
 
 
 def _find_likeliest(seen: FloatArray, visible: IntArray) -> tuple[int, list[int]]:
@@ -302,16 +352,23 @@ def _find_likeliest(seen: FloatArray, visible: IntArray) -> tuple[int, list[int]
 
     Of equal ones it is the one that all its pieces show, then the lowest.
     """
+    # Peaks of T that are nearly as high as the highest, and not its flanks.
     best = int(np.argmax(seen))
-    inner, near = seen[1:-1], seen[best] - max(_ALIKE, _LEAKED * seen[best])
+    inner = seen[1:-1]
+    near = seen[best] - max(_EQUALLY_LIKELY, _LEAKED * seen[best])
     peaks = 1 + np.flatnonzero((inner >= seen[:-2]) & (inner > seen[2:]) & (inner > near))
     apart = round(_APART_HZ * _GRID * PIECE_S)
-    alike = [best, *(int(k) for k in peaks if abs(k - best) > apart)]
-    each = {k: seen[k] / visible[k] for k in alike}
-    alike = [k for k in alike if each[k] > _MISSING * max(each.values())]
-    most = max(seen[k] for k in alike)
-    likeliest = min(k for k in alike if seen[k] > most - 0.1)
-    return likeliest, sorted(k for k in alike if k != likeliest and seen[k] > most - _ALIKE)
+    candidates = [best, *(int(k) for k in peaks if abs(k - best) > apart)]
+
+    # Those that all their pieces show.
+    per_piece = {k: seen[k] / visible[k] for k in candidates}
+    most_per_piece = max(per_piece.values())
+    candidates = [k for k in candidates if per_piece[k] > _MISSING * most_per_piece]
+
+    most = max(seen[k] for k in candidates)
+    likeliest = min(k for k in candidates if seen[k] > most - 0.1)
+    rivals = [k for k in candidates if k != likeliest and seen[k] > most - _EQUALLY_LIKELY]
+    return likeliest, sorted(rivals)
 
 
 def _one_rate(rates_hz: list[float]) -> bool:
@@ -331,9 +388,8 @@ def _aliases_hz(rates_hz: list[float], frequency_hz: float, most_hz: float) -> t
         for m in range(int(most_hz / rate_hz) + 1)
         for sign in (-1, 1)
     }
-    return tuple(
-        sorted(f for f in every if _LEAST_HZ < f < most_hz and abs(f - frequency_hz) > _APART_HZ)
-    )
+    in_range = sorted(f for f in every if _LEAST_HZ < f < most_hz)
+    return tuple(f for f in in_range if abs(f - frequency_hz) > _APART_HZ)
 
 
 def _refine_frequency(seen: FloatArray, grid_hz: FloatArray, k: int) -> tuple[float, float]:
@@ -358,43 +414,46 @@ def _compute_shape(
     All terms are in phase. A piece that has the line among slow motion, which is a shape too, has
     little weight.
     """
-    waves = np.array(
-        [2 * line / piece.window.sum() for line, piece in zip(lines, pieces, strict=True)]
-    )
-    weights = np.array(
-        [
-            piece.window.sum() ** 2 / noise.mean()
-            for piece, noise in zip(pieces, noises, strict=True)
-        ]
-    )
-    terms = np.linalg.eigh(np.real((weights[:, None] * waves).conj().T @ waves))[1][:, -1]
+    # Complex amplitudes (pieces, terms - 1) and weights (pieces,), the inverse of their noise.
+    window_sums = np.array([piece.window.sum() for piece in pieces])
+    waves = 2 * np.array(lines) / window_sums[:, None]
+    weights = window_sums**2 / np.array([noise.mean() for noise in noises])
+
+    # The common shape is the largest eigenvector of their weighted products.
+    products = np.real((weights[:, None] * waves).conj().T @ waves)
+    terms = np.linalg.eigh(products)[1][:, -1]
+
+    # The first term puts the ring at rest; then unit RMS, with the largest term positive.
     shape = np.append(-terms @ zernike.at_rim()[1:], terms)
     size = float(np.linalg.norm(shape))
     shape *= np.sign(shape[np.argmax(np.abs(shape))]) / size
-    return float(
-        1e3 * size * np.sqrt(np.average(np.abs(waves @ terms) ** 2, weights=weights))
-    ), np.asarray(shape)
+
+    mean_square = np.average(np.abs(waves @ terms) ** 2, weights=weights)
+    amplitude_nm = float(1e3 * size * np.sqrt(mean_square))
+    return amplitude_nm, np.asarray(shape)
 
 
 def _projection_onto(shape: FloatArray, noise: FloatArray) -> FloatArray:
-    """What takes terms to their part in a shape, (terms - 1, terms - 1), told by those with little
-    noise.
+    """Projection of terms onto a shape, (terms - 1, terms - 1), weighted by their noise.
 
-    The film's slow motion is mostly one term: by all of them alike, it would be taken for the
-    shape's other terms.
+    The film's slow motion is mostly one term: with equal weights it would count as the shape's
+    other terms.
     """
     weighed = shape / noise
     return np.outer(weighed, shape) / (weighed @ shape)
 
 
 def _scatter_hz(lines: list[FloatArray], grid_hz: FloatArray, k: int) -> float:
-    """Standard error of the mean of the pieces' own frequencies: a damped line wanders by its
-    width.
+    """Standard error of the mean of the pieces' own frequencies: that of a damped line varies by
+    its width.
     """
+    if len(lines) < 2:
+        return 0.0
     reach = round(_APART_HZ * _GRID * PIECE_S)
-    first, last = max(k - reach, 0), min(k + reach + 1, grid_hz.size)
-    own = [
-        _refine_frequency(line, grid_hz, first + int(np.argmax(line[first:last])))[0]
-        for line in lines
-    ]
-    return float(np.std(own, ddof=1) / np.sqrt(len(own))) if len(own) > 1 else 0.0
+    first = max(k - reach, 0)
+    last = min(k + reach + 1, grid_hz.size)
+    own_hz = []
+    for line in lines:
+        peak = first + int(np.argmax(line[first:last]))
+        own_hz.append(_refine_frequency(line, grid_hz, peak)[0])
+    return float(np.std(own_hz, ddof=1) / np.sqrt(len(own_hz)))
