@@ -19,6 +19,7 @@ from membrane_ctrl.model.columns import AGGREGATED, COLUMNS, TRUE_ERROR_COLUMN, 
 from membrane_ctrl.model.state_tree import ArrayShape, StateNode
 
 Columns = dict[str, Column]
+_StoredColumns = dict[str, Annotated[Column, ArrayShape((-1,))]]
 
 WINDOWS_S: tuple[float, ...] = (1.0, 10.0, 60.0)
 # Minimum, mean and maximum of these, and the codes, as the table of columns says.
@@ -31,17 +32,29 @@ NAMES: tuple[str, ...] = (
     *CODES,
     *(f"{kind}_{name}" for name in SIGNALS for kind in ("min", "mean", "max")),
 )
-# The telemetry fields from which levels are computed.
+# The telemetry fields from which levels are computed, each once.
+_RECORDED_SIGNALS = tuple(name for name in SIGNALS if name in COLUMNS)
 _OF_TRUE_ERROR = ("target_um", "truth_displacement_um")
 TICK_FIELDS: tuple[str, ...] = tuple(
-    dict.fromkeys(
-        ("mono_s", *CODES, *(name for name in SIGNALS if name in COLUMNS), *_OF_TRUE_ERROR)
-    )
+    dict.fromkeys(("mono_s", *CODES, *_RECORDED_SIGNALS, *_OF_TRUE_ERROR))
 )
+# Share of a window within which a time counts as the window's start: 59.9999999 means 60.
+_ROUNDING = 1e-9
 
 
 def first_level(ticks: Mapping[str, Column]) -> Columns:
-    """The 1 s level of consecutive ticks; incomplete windows are included."""
+    """The 1 s level of consecutive ticks.
+
+    Parameters
+    ----------
+    ticks : mapping of str to (n,) array
+        `TICK_FIELDS` of the ticks, in order of time.
+
+    Returns
+    -------
+    dict of str to (windows,) array
+        `NAMES`; incomplete windows are included.
+    """
     time_s = ticks["mono_s"]
     if not time_s.size:
         return {name: np.empty(0) for name in NAMES}
@@ -69,19 +82,23 @@ def coarser_level(level: Mapping[str, Column], window_s: float) -> Columns:
     for name, values in level.items():
         if name.startswith("mean_"):
             coarse[name] = _weighted_mean(values, level["rows"], starts)
-        elif name.startswith(("min_", "max_")):
-            coarse[name] = (np.fmin if name.startswith("min_") else np.fmax).reduceat(
-                values, starts
-            )
+        elif name.startswith("min_"):
+            coarse[name] = np.fmin.reduceat(values, starts)
+        elif name.startswith("max_"):
+            coarse[name] = np.fmax.reduceat(values, starts)
     return coarse
 
 
 def _find_windows(time_s: Column, window_s: float) -> tuple[NDArray[np.intp], Column]:
     """First row of each non-empty window, and the windows' starts in s."""
-    # a small fraction of a window: 59.9999999 means 60
-    number = np.floor(time_s / window_s + 1e-9)
-    starts = np.flatnonzero(np.concatenate(([True], number[1:] != number[:-1])))
+    number = _window_numbers(time_s, window_s)
+    is_first = np.concatenate(([True], number[1:] != number[:-1]))
+    starts = np.flatnonzero(is_first)
     return starts, number[starts] * window_s
+
+
+def _window_numbers(time_s: Column, window_s: float) -> Column:
+    return np.asarray(np.floor(time_s / window_s + _ROUNDING))
 
 
 def _count_rows(starts: NDArray[np.intp], size: int) -> Column:
@@ -89,27 +106,33 @@ def _count_rows(starts: NDArray[np.intp], size: int) -> Column:
 
 
 def _reduce_codes(table: Mapping[str, Column], starts: NDArray[np.intp]) -> Columns:
+    """The codes at the end of each window; of those in `_LARGEST` the largest."""
     size = next(iter(table.values())).size
     last = np.append(starts[1:], size) - 1
-    codes = {
-        name: np.asarray(table[name], dtype=np.float64)[last] for name in CODES if name in table
-    }
-    return codes | {
-        name: np.fmax.reduceat(table[name], starts) for name in _LARGEST if name in table
-    }
+    reduced: Columns = {}
+    for name in CODES:
+        if name not in table:
+            continue
+        if name in _LARGEST:
+            reduced[name] = np.fmax.reduceat(table[name], starts)
+        else:
+            reduced[name] = np.asarray(table[name], dtype=np.float64)[last]
+    return reduced
 
 
 def _weighted_mean(values: Column, weights: Column, starts: NDArray[np.intp]) -> Column:
-    there = np.isfinite(values)
-    total = np.add.reduceat(np.where(there, weights, 0.0), starts)
-    # sum relative to a nearby value: a double can then hold 1e5 Pa and a change of mPa without loss
-    base = np.where(there, values, 0.0)[starts]
-    offset = np.repeat(base, np.diff(np.append(starts, values.size)))
-    summed = np.add.reduceat(np.where(there, (values - offset) * weights, 0.0), starts)
-    return np.where(total > 0, base + summed / np.where(total > 0, total, 1.0), np.nan)
-
-
-_StoredColumns = dict[str, Annotated[Column, ArrayShape((-1,))]]
+    """Mean of the finite values of each window; NaN for a window without any."""
+    is_finite = np.isfinite(values)
+    total = np.add.reduceat(np.where(is_finite, weights, 0.0), starts)
+    # Sums are relative to the window's first value: a double then holds 1e5 Pa and a change of mPa
+    # without loss.
+    base = np.where(is_finite, values, 0.0)[starts]
+    row_counts = np.diff(np.append(starts, values.size))
+    offset = np.repeat(base, row_counts)
+    weighted = np.where(is_finite, (values - offset) * weights, 0.0)
+    divisor = np.where(total > 0, total, 1.0)
+    mean = base + np.add.reduceat(weighted, starts) / divisor
+    return np.where(total > 0, mean, np.nan)
 
 
 def _no_ticks() -> Columns:
@@ -139,29 +162,35 @@ class OpenWindows(StateNode):
             _require_columns(rows, NAMES)
 
     def finished_rows(self, new: Columns | None) -> Iterator[tuple[float, Columns]]:
-        """Take the `TICK_FIELDS` of ticks, and yield the rows of each level, by its window in s,
-        that are finished.
+        """Add ticks, and yield the finished rows of each level.
 
-        None: the run is over, all are finished.
+        Parameters
+        ----------
+        new : dict of str to (n,) array, or None
+            `TICK_FIELDS` of the ticks after the last ones; None at the end of the run, when all
+            windows are finished.
+
+        Yields
+        ------
+        tuple of float and dict of str to (rows,) array
+            The level's window in s, and its finished rows.
         """
+        is_over = new is None
         ticks = self.ticks
         if new is not None:
             ticks = {name: np.concatenate((ticks[name], new[name])) for name in TICK_FIELDS}
-        done = (
-            ticks["mono_s"].size if new is None else _first_of_last(ticks["mono_s"], WINDOWS_S[0])
-        )
-        self.ticks = {name: values[done:] for name, values in ticks.items()}
-        level = first_level({name: values[:done] for name, values in ticks.items()})
+        done = _finished_count(ticks["mono_s"], WINDOWS_S[0], is_over)
+        finished, self.ticks = _split_rows(ticks, done)
+        level = first_level(finished)
         yield WINDOWS_S[0], level
+        # Each level is made from the finished rows of the finer one.
         for coarse_s in WINDOWS_S[1:]:
             waiting = self.levels.get(coarse_s)
             if waiting is not None:
                 level = {name: np.concatenate((waiting[name], level[name])) for name in NAMES}
-            done = (
-                level["time_s"].size if new is None else _first_of_last(level["time_s"], coarse_s)
-            )
-            self.levels[coarse_s] = {name: values[done:] for name, values in level.items()}
-            level = coarser_level({name: values[:done] for name, values in level.items()}, coarse_s)
+            done = _finished_count(level["time_s"], coarse_s, is_over)
+            finished, self.levels[coarse_s] = _split_rows(level, done)
+            level = coarser_level(finished, coarse_s)
             yield coarse_s, level
 
 
@@ -172,9 +201,16 @@ def _require_columns(rows: Columns, names: tuple[str, ...]) -> None:
         raise ValueError("columns of different lengths")
 
 
-def _first_of_last(time_s: np.ndarray, window_s: float) -> int:
-    """Number of rows before the last row's window, which may be unfinished."""
-    if not time_s.size:
-        return 0
-    number = np.floor(time_s / window_s + 1e-9)
+def _finished_count(time_s: Column, window_s: float, is_over: bool) -> int:
+    """Number of rows in finished windows: while the run goes on, those before the last window."""
+    if is_over or not time_s.size:
+        return time_s.size
+    number = _window_numbers(time_s, window_s)
     return int(np.searchsorted(number, number[-1]))
+
+
+def _split_rows(table: Columns, count: int) -> tuple[Columns, Columns]:
+    """The first `count` rows of a table, and the others."""
+    first = {name: values[:count] for name, values in table.items()}
+    others = {name: values[count:] for name, values in table.items()}
+    return first, others

@@ -46,37 +46,51 @@ def door_steps(
         One-second means, NaN where missing.
     reading_pa : (n,) array
         One reading per second, which shows the barometer's resolution.
+    least_pa : float
+        Smallest step.
     least_sigmas : float
-        Relative to nearby differences of equally long windows.
+        Smallest step relative to nearby differences of equally long windows.
+
+    Returns
+    -------
+    list of FoundStep
+        In order of time, each at its steepest second.
     """
+    # A slow barometer repeats each value: one row per new value.
     every = update_s(mean_pa)
     floor_pa = _ROUNDING * reading_resolution_pa(reading_pa)
     values = mean_pa[::every]
-    # at least two values: a step may fall on the one between
+
+    # Windows that differ from the weather, the strongest ones first. At least two values long: a
+    # step may fall on the one between.
     lags = tuple(lag for lag in LAGS if lag <= 2 or lag * every <= LAGS[-1])
     found = _find_candidates(values, lags, floor_pa, least_pa, least_sigmas)
-    chosen = sorted(_choose_strongest(found, values.size), key=lambda place: int(found.row[place]))
+    chosen = _choose_strongest(found, values.size)
+
     result = []
-    for place in chosen:
-        row, lag = int(found.row[place]), int(found.lag[place])
-        size = (
-            _whole_size(values, row, lag, float(found.size[place]))
-            if every == 1
-            else float(found.size[place])
-        )
-        changes = np.abs(np.diff(mean_pa[row * every : (row + lag) * every + 1]))
-        steepest = row * every + 1 + int(np.argmax(np.nan_to_num(changes)))
+    for place in sorted(chosen, key=lambda place: int(found.row[place])):
+        row = int(found.row[place])
+        lag = int(found.lag[place])
+        size = float(found.size[place])
+        if every == 1:
+            size = _whole_size(values, row, lag, size)
+        first = row * every
+        last = (row + lag) * every
+        changes = np.abs(np.diff(mean_pa[first : last + 1]))
+        steepest = first + 1 + int(np.argmax(np.nan_to_num(changes)))
         result.append(FoundStep(steepest, size, float(found.score[place])))
     return result
 
 
 def update_s(mean_pa: Column) -> int:
     """Seconds for which the barometer repeats a value; 1 if most seconds have a new one."""
-    new = np.concatenate(([False], np.nan_to_num(np.diff(mean_pa)) != 0))
+    changes = np.nan_to_num(np.diff(mean_pa))
+    new = np.concatenate(([False], changes != 0))
     if np.count_nonzero(new) > _ALWAYS_NEW * np.count_nonzero(np.isfinite(mean_pa)):
         return 1
-    # a new value within a second changes two means
-    begins = np.flatnonzero(new & ~np.concatenate(([False], new[:-1])))
+    # A new value within a second changes two means: the first one counts.
+    new_before = np.concatenate(([False], new[:-1]))
+    begins = np.flatnonzero(new & ~new_before)
     if begins.size < 2:
         return 1
     between_s = int(np.quantile(np.diff(begins), _LOW_SHARE, method="lower"))
@@ -85,42 +99,52 @@ def update_s(mean_pa: Column) -> int:
 
 
 def reading_resolution_pa(reading_pa: Column) -> float:
-    """The resolution of the readings, Pa: about the smallest change;
-    almost 0 for a fine barometer.
+    """The resolution of the readings, Pa: about the smallest change; almost 0 for a fine
+    barometer.
     """
     change = np.abs(np.diff(reading_pa))
     change = change[np.isfinite(change) & (change > 0)]
-    return float(np.quantile(change, _LOW_SHARE)) if change.size else 0.0
+    if not change.size:
+        return 0.0
+    return float(np.quantile(change, _LOW_SHARE))
 
 
 def _find_candidates(
     values: Column, lags: tuple[int, ...], floor_pa: float, least_pa: float, least_sigmas: float
 ) -> _Candidates:
+    """Windows whose ends differ by at least `least_pa`, and by `least_sigmas` of the weather's
+    differences nearby.
+    """
     parts = []
     for lag in lags:  # one after the other: each takes 20 MB for a month
         change = values[lag:] - values[:-lag]
+        size = np.abs(change)
         sigma = np.fmax(local_sigma(change, _USUAL_SHARE), max(floor_pa, 1e-9))
-        rows = np.flatnonzero(
-            (np.abs(change) >= least_pa) & (np.abs(change) >= least_sigmas * sigma)
-        )
-        parts.append(
-            (rows, np.full(rows.size, lag), change[rows], np.abs(change[rows]) / sigma[rows])
-        )
-    row, lag_of, size, score = (np.concatenate(columns) for columns in zip(*parts, strict=True))
-    return _Candidates(row, lag_of, size, score)
+        rows = np.flatnonzero((size >= least_pa) & (size >= least_sigmas * sigma))
+        scores = size[rows] / sigma[rows]
+        parts.append(_Candidates(rows, np.full(rows.size, lag), change[rows], scores))
+    return _Candidates(
+        np.concatenate([part.row for part in parts]),
+        np.concatenate([part.lag for part in parts]),
+        np.concatenate([part.size for part in parts]),
+        np.concatenate([part.score for part in parts]),
+    )
 
 
 def _choose_strongest(found: _Candidates, rows: int) -> list[int]:
     """The windows that stand out most; others nearby with the same sign belong to the same step."""
     reach = LAGS[-1]
-    taken = np.zeros((2, rows), dtype=bool)
+    # Rows near a chosen window, of falling and of rising steps.
+    covered = {False: np.zeros(rows, dtype=bool), True: np.zeros(rows, dtype=bool)}
     chosen = []
     for place in np.argsort(-found.score, kind="stable"):
-        row, end = int(found.row[place]), int(found.row[place] + found.lag[place])
-        same = taken[int(found.size[place] > 0)]
-        if not same[row:end].any():
-            same[max(0, row - reach) : end + reach] = True
-            chosen.append(int(place))
+        row = int(found.row[place])
+        end = row + int(found.lag[place])
+        rises = bool(found.size[place] > 0)
+        if covered[rises][row:end].any():
+            continue
+        covered[rises][max(0, row - reach) : end + reach] = True
+        chosen.append(int(place))
     return chosen
 
 
