@@ -47,8 +47,9 @@ from membrane_ctrl.metrology.rays.surface import PARAMETERS, Surface
 from membrane_ctrl.metrology.rays.surface_basis import evaluate_basis, evaluate_round_basis
 from membrane_ctrl.model.arrays import BoolArray, FloatArray
 
-# of one set: its surface's parameters, the height of its vertex, its round terms beyond them, and
-# by how much the film was deeper in the x frames than in the y frames
+# Columns of the derivatives. First the set's own unknowns: its surface's parameters, the height of
+# its vertex, its round terms beyond them, and by how much the film was deeper in the x frames than
+# in the y frames; then the optical parameters.
 BEYOND = slice(PARAMETERS + 1, PARAMETERS + 1 + len(terms_beyond_fit.BEYOND))
 MOTION = BEYOND.stop
 LOCAL = MOTION + 1
@@ -91,8 +92,23 @@ def residual_mm(
     vertex_z_mm: float,
     elsewhere: Sequence[FloatArray] = (),
 ) -> FloatArray:
-    """Seen minus predicted screen points (2, n); `elsewhere` are the
-    moves (MOVED,) of the screen.
+    """Seen minus predicted screen points.
+
+    Parameters
+    ----------
+    bench : BenchGeometry
+    phases : SetPhases
+        Screen points of n bins.
+    surface : Surface
+    vertex_z_mm : float
+        Height of the vertex.
+    elsewhere : sequence of (MOVED,) arrays
+        Moves of the screen, one for each further place of it.
+
+    Returns
+    -------
+    (2, n) array
+        In mm.
     """
     out = np.empty_like(phases.screen_mm)
     for _, there, _, some in screen_views(bench, [], phases, elsewhere):
@@ -114,8 +130,9 @@ def screen_views(
     were seen so.
     """
     if isinstance(phases.artefact, SeenScreen):
-        # it stands somewhere before the camera: the bench's poses do not matter
-        camera, (s_x, s_y, _) = bench.geometry, phases.artefact.axes @ bench.geometry.rotation
+        # The screen stands somewhere before the camera: the bench's poses do not matter.
+        camera = bench.geometry
+        s_x, s_y, _ = phases.artefact.axes @ camera.rotation
         origin_mm = camera.pinhole_mm + camera.rotation.T @ phases.artefact.origin_mm
         there = replace(camera, screen_origin_mm=origin_mm, screen_s_x=s_x, screen_s_y=s_y)
         still = Poses(np.zeros(3), np.zeros((3, 3)), np.zeros(3), np.zeros((3, 3)))
@@ -138,8 +155,25 @@ def linearise_points(
     motion_mm: float = 0.0,
     deeper_mm: float = 0.0,
 ) -> Iterator[Chunk]:
-    """Residuals with derivatives, some points at a time. `turns`: the `pose_derivatives`, and any
-    further.
+    """Residuals with derivatives, some points at a time.
+
+    Parameters
+    ----------
+    bench : BenchGeometry
+    turns : list of Poses
+        The `pose_derivatives`, and any further.
+    phases : SetPhases
+    surface : Surface
+    vertex_z_mm : float
+        Height of the vertex.
+    motion_mm : float
+        By how much the film was deeper in the x frames than in the y frames.
+    deeper_mm : float
+        By how much it was deeper in all frames.
+
+    Yields
+    ------
+    Chunk
     """
     points = place_rays(bench, phases, surface, vertex_z_mm)
     shape = None if isinstance(phases.artefact, SeenScreen) else surface
@@ -149,7 +183,7 @@ def linearise_points(
             bench.geometry, phases.column_px[part], phases.row_px[part], meet.ray
         )
         derivatives = _compute_derivatives(bench, turns, shape, meet, lens)
-        # both are small enough to be linear
+        # Motion and depth are small enough to be linear.
         by_motion = derivatives[:, MOTION]
         predicted = (
             meet.screen_mm / bench.pitch
@@ -184,17 +218,28 @@ def _intersect_screen(
     """Reflect the rays and follow them to the face, by Newton's steps from the plane unless it is
     one.
     """
-    geometry, d = bench.geometry, points.rays[:, part]
-    t = np.zeros(d.shape[1]) if surface is None else points.t_mm[part]
-    place, n, u = geometry.pinhole_mm[:, None] + t * d, d, d
-    if surface is not None:
+    # The ray P = F + t d, reflected at the film; without a film it reaches the screen directly.
+    geometry = bench.geometry
+    d = points.rays[:, part]
+    if surface is None:
+        t = np.zeros(d.shape[1])
+        place = geometry.pinhole_mm[:, None] + t * d
+        n = d
+        u = d
+    else:
+        t = points.t_mm[part]
+        place = geometry.pinhole_mm[:, None] + t * d
         hx, hy = surface.slopes(place[0], place[1])
         n = np.stack([-hx, -hy, np.ones_like(hx)])
         u = d - 2 * np.sum(d * n, axis=0) / np.sum(n * n, axis=0) * n
+
+    # S = P + k u on the screen, in its own axes: on the plane, then by Newton's steps on the face.
     axes = geometry.screen_axes
-    start, along = axes @ (place - geometry.screen_origin_mm[:, None]), axes @ u
+    start = axes @ (place - geometry.screen_origin_mm[:, None])
+    along = axes @ u
     k = -start[2] / along[2]
-    for _ in range(0 if geometry.face.is_plane else kernels.FACE_STEPS):
+    steps = 0 if geometry.face.is_plane else kernels.FACE_STEPS
+    for _ in range(steps):
         at = start + k * along
         w, by_x, by_y = geometry.face.heights(at[:2])
         k = k - (at[2] - w) / (along[2] - by_x * along[0] - by_y * along[1])
@@ -210,27 +255,41 @@ def _compute_derivatives(
     """(2, COLUMNS + further poses, m) by the formulas above, right to left: the effect of a change
     of P, u, n, d.
     """
-    geometry, axes = bench.geometry, bench.geometry.screen_axes
-    across, onto = axes[:2] @ m.leaves, np.sum(m.face * m.leaves, axis=0)  # E u, N u
+    geometry = bench.geometry
+    axes = geometry.screen_axes
+    across = axes[:2] @ m.leaves  # E u
+    onto = np.sum(m.face * m.leaves, axis=0)  # N u
     by_point = axes[:2, :, None] - across[:, None] * (m.face / onto)  # T
     out = np.zeros((2, COLUMNS + len(turns) - len(POSE), m.t_mm.size))
-    by_pinhole, by_ray = by_point, by_point * m.reach_mm
-    if surface is not None:
+
+    # The surface's own columns, and the effect of the pinhole and of the ray (equations 1 to 3).
+    if surface is None:
+        by_pinhole = by_point
+        by_ray = by_point * m.reach_mm
+    else:
         by_pinhole, by_ray = _by_surface(surface, m, by_point, out)
+
+    # Poses of camera and screen (equation 4).
     in_camera = geometry.rotation @ m.ray
     for j, turn in enumerate(turns):
         moved = axes.T @ (turn.screen @ m.from_origin) - turn.origin_mm[:, None]
         of_ray = turn.camera.T @ in_camera
         column = np.einsum("acm,c->am", by_pinhole, turn.pinhole_mm)
         column += np.einsum("acm,cm->am", by_ray, of_ray) + np.einsum("acm,cm->am", by_point, moved)
-        out[:, LOCAL + j if j < len(POSE) else COLUMNS + j - len(POSE)] = column
+        place = LOCAL + j if j < len(POSE) else COLUMNS + j - len(POSE)
+        out[:, place] = column
+
+    # Lens, bow of the screen, and glass over its pixels, which bends oblique rays: by 1 mm of it.
     first = LOCAL + len(POSE)
     out[:, first : first + len(lens)] = np.einsum("acm,lcm->alm", by_ray, lens)
     square = m.screen_mm[0] ** 2 + m.screen_mm[1] ** 2
     out[:, COLUMNS - 2] = across * square / onto / BOW_RADIUS_MM**2
-    if surface is None:  # by 1 mm of glass over the pixels, which bends rays that lean
+    if surface is None:
         sine = across / np.linalg.norm(m.leaves, axis=0) / _GLASS_INDEX
-        out[:, MOTION] = depth_derivative(sine / np.sqrt(1 - np.sum(sine**2, axis=0))) / 4
+        tangent = sine / np.sqrt(1 - np.sum(sine**2, axis=0))
+        out[:, MOTION] = depth_derivative(tangent) / 4
+
+    # From mm on the panel to stated mm, and the scale itself.
     out /= bench.pitch
     out[:, COLUMNS - 1] = -m.screen_mm / bench.pitch**2
     return out
@@ -242,34 +301,44 @@ def _by_surface(
     """Fill in the surface's own columns; returns the effect of a change of the pinhole and of the
     ray, (2, 3, m).
     """
-    d, n, k = m.ray, m.normal, m.reach_mm
-    nn, nd = np.sum(n * n, axis=0), np.sum(n * d, axis=0)
-    ray = by_point * k  # T k, of u
+    d = m.ray
+    n = m.normal
+    nn = np.sum(n * n, axis=0)
+    nd = np.sum(n * d, axis=0)
+
+    # By the reflected ray, T k, and by the normal, T k B (equation 3).
+    ray = by_point * m.reach_mm
     along = np.einsum("acm,cm->am", ray, n)
     by_normal = -2 / nn * (along[:, None] * d + nd * ray - 2 * nd / nn * along[:, None] * n)
+
+    # By the point on the film, whose normal turns with it (equation 2).
     hxx, hxy, hyy = surface.curvatures(m.place[0], m.place[1])
     by_place = by_point.copy()
     by_place[:, 0] -= by_normal[:, 0] * hxx + by_normal[:, 1] * hxy
     by_place[:, 1] -= by_normal[:, 0] * hxy + by_normal[:, 1] * hyy
+
+    # By the film's height, the pinhole and the ray (equation 1).
     by_height = np.einsum("acm,cm->am", by_place, d) / nd
     by_pinhole = by_place - by_height[:, None] * n  # by_place G
     by_ray = by_pinhole * m.t_mm + ray - 2 / nn * along[:, None] * n
-    x, y, scale = (
-        m.place[0] / surface.radius_mm,
-        m.place[1] / surface.radius_mm,
-        1 / surface.radius_mm,
-    )
-    height, height_x, height_y = (
-        np.vstack(parts)
-        for parts in zip(evaluate_basis(x, y), evaluate_round_basis(x, y), strict=True)
-    )
+
+    # By the parameters: each changes height and slopes by those of its term.
+    x = m.place[0] / surface.radius_mm
+    y = m.place[1] / surface.radius_mm
+    scale = 1 / surface.radius_mm
+    bases = zip(evaluate_basis(x, y), evaluate_round_basis(x, y), strict=True)
+    height, height_x, height_y = (np.vstack(parts) for parts in bases)
     for axis in range(2):
         slope = (by_normal[axis, 0] * height_x + by_normal[axis, 1] * height_y) * scale
         by_terms = by_height[axis] * height - slope
-        out[axis, :PARAMETERS], out[axis, BEYOND] = by_terms[:PARAMETERS], by_terms[PARAMETERS:]
+        out[axis, :PARAMETERS] = by_terms[:PARAMETERS]
+        out[axis, BEYOND] = by_terms[PARAMETERS:]
     out[:, PARAMETERS] = by_height
+
+    # By the film's motion from the x frames to the y frames: half of it to each side.
     deeper = np.einsum("j,ajm->am", _sag_direction(), out[:, :PARAMETERS]) - by_height
-    out[0, MOTION], out[1, MOTION] = deeper[0] / 2, -deeper[1] / 2
+    out[0, MOTION] = deeper[0] / 2
+    out[1, MOTION] = -deeper[1] / 2
     return by_pinhole, by_ray
 
 

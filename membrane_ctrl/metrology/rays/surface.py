@@ -23,14 +23,12 @@ PARAMETERS = ZERNIKE_TERMS  # all but piston, which follows from h(0) = 0, and t
 class Surface:
     """Height above the vertex, h(0, 0) = 0, over a disc."""
 
-    coeffs_mm: (
-        FloatArray  # (terms,): in Noll's order, orthonormal; piston is whatever makes h(0, 0) = 0
-    )
+    # (terms,): in Noll's order, orthonormal; piston is whatever makes h(0, 0) = 0
+    coeffs_mm: FloatArray
     hencky_mm: float  # amplitude of the excess, as the sag of the Hencky bowl it belongs to
     radius_mm: float  # radius of the Zernike disc
-    beyond_mm: tuple[
-        float, ...
-    ] = ()  # of `film_law.BEYOND`: a calibration's; a measurement has none
+    # of `film_law.BEYOND`: a calibration's; a measurement has none
+    beyond_mm: tuple[float, ...] = ()
 
     @classmethod
     def from_parameters(cls, parameters: FloatArray, radius_mm: float) -> "Surface":
@@ -58,12 +56,10 @@ class Surface:
     @cached_property
     def excess(self) -> FloatArray:
         """The excess as a power series in (r / R)^2, in mm."""
-        own = self.hencky_mm * hencky_bowl.excess_series()
-        return (
-            own + np.array(self.beyond_mm) @ terms_beyond_fit.beyond_series()
-            if self.beyond_mm
-            else own
-        )
+        excess = self.hencky_mm * hencky_bowl.excess_series()
+        if self.beyond_mm:
+            excess = excess + np.array(self.beyond_mm) @ terms_beyond_fit.beyond_series()
+        return excess
 
     @property
     def sag_mm(self) -> float:
@@ -72,28 +68,35 @@ class Surface:
 
     def height(self, x_mm: FloatArray, y_mm: FloatArray) -> FloatArray:
         """Height in mm at points (...) in mm."""
-        x, y = np.asarray(x_mm) / self.radius_mm, np.asarray(y_mm) / self.radius_mm
+        x = np.asarray(x_mm) / self.radius_mm
+        y = np.asarray(y_mm) / self.radius_mm
         bowl = series.polyval2d(x, y, self.polynomial)
         return np.asarray(bowl + series.polyval(x * x + y * y, self.excess))
 
     def slopes(self, x_mm: FloatArray, y_mm: FloatArray) -> tuple[FloatArray, FloatArray]:
         """dh/dx and dh/dy."""
-        x, y = x_mm / self.radius_mm, y_mm / self.radius_mm
-        grows = 2 * series.polyval(x * x + y * y, series.polyder(self.excess))
-        of_x, of_y = (
-            series.polyval2d(x, y, series.polyder(self.polynomial, axis=axis)) for axis in (0, 1)
-        )
-        return (of_x + grows * x) / self.radius_mm, (of_y + grows * y) / self.radius_mm
+        x = x_mm / self.radius_mm
+        y = y_mm / self.radius_mm
+        # The excess e(v), v = x^2 + y^2, has the slopes 2 e'(v) x and 2 e'(v) y.
+        excess_slope = 2 * series.polyval(x * x + y * y, series.polyder(self.excess))
+        terms_x = series.polyval2d(x, y, series.polyder(self.polynomial, axis=0))
+        terms_y = series.polyval2d(x, y, series.polyder(self.polynomial, axis=1))
+        slope_x = (terms_x + excess_slope * x) / self.radius_mm
+        slope_y = (terms_y + excess_slope * y) / self.radius_mm
+        return slope_x, slope_y
 
     def curvatures(
         self, x_mm: FloatArray, y_mm: FloatArray
     ) -> tuple[FloatArray, FloatArray, FloatArray]:
         """h_xx, h_xy and h_yy in 1/mm."""
-        x, y = x_mm / self.radius_mm, y_mm / self.radius_mm
+        x = x_mm / self.radius_mm
+        y = y_mm / self.radius_mm
         v = x * x + y * y
+        # Derivatives of the excess e(v): 2 e'(v), and 4 e''(v) times the product of coordinates.
         first = 2 * series.polyval(v, series.polyder(self.excess))
         second = 4 * series.polyval(v, series.polyder(self.excess, 2))
-        by_x, by_y = (series.polyder(self.polynomial, axis=axis) for axis in (0, 1))
+        by_x = series.polyder(self.polynomial, axis=0)
+        by_y = series.polyder(self.polynomial, axis=1)
         hxx = series.polyval2d(x, y, series.polyder(by_x, axis=0)) + first + second * x * x
         hxy = series.polyval2d(x, y, series.polyder(by_x, axis=1)) + second * x * y
         hyy = series.polyval2d(x, y, series.polyder(by_y, axis=1)) + first + second * y * y
@@ -101,12 +104,16 @@ class Surface:
 
     def on_grid(self, axis_mm: FloatArray) -> FloatArray:
         """Height in mm and its slopes along x and y, (3, n, n), on a square grid; rows along y."""
-        axis, bowl = axis_mm / self.radius_mm, self.polynomial.T
+        axis = axis_mm / self.radius_mm
+        terms = self.polynomial.T  # rows are powers of y
+        terms_x = series.polyder(terms, axis=1)
+        terms_y = series.polyder(terms, axis=0)
+        out = np.stack([series.polygrid2d(axis, axis, part) for part in (terms, terms_x, terms_y)])
+
         v = axis**2 + axis[:, None] ** 2
-        steeper = 2 * series.polyval(v, series.polyder(self.excess))
-        terms = [bowl, *(series.polyder(bowl, axis=k) for k in (1, 0))]
-        out = np.stack([series.polygrid2d(axis, axis, term) for term in terms])
-        out += np.stack([series.polyval(v, self.excess), steeper * axis, steeper * axis[:, None]])
+        excess = series.polyval(v, self.excess)
+        excess_slope = 2 * series.polyval(v, series.polyder(self.excess))
+        out += np.stack([excess, excess_slope * axis, excess_slope * axis[:, None]])
         out[1:] /= self.radius_mm
         return np.asarray(out)
 
@@ -141,10 +148,9 @@ def height_probe() -> FloatArray:
     Enough to see the largest height of such a surface to a few per cent.
     """
     k = np.arange(512)
-    rho, theta = np.sqrt((k + 0.5) / 511.5), k * np.pi * (3 - np.sqrt(5))
-    x, y = rho * np.cos(theta), rho * np.sin(theta)
+    rho = np.sqrt((k + 0.5) / 511.5)
+    theta = k * np.pi * (3 - np.sqrt(5))
+    terms = zernike.evaluate_terms(rho * np.cos(theta), rho * np.sin(theta))
     excess = series.polyval(rho**2, hencky_bowl.excess_series()) / hencky_bowl.excess_rms()
-    terms = np.vstack([zernike.evaluate_terms(x, y), excess])
-    return np.asarray(
-        terms[:-1].T @ parameter_to_coeffs() + np.outer(terms[-1], np.eye(PARAMETERS)[-1])
-    )
+    by_excess = np.outer(excess, np.eye(PARAMETERS)[-1])
+    return np.asarray(terms.T @ parameter_to_coeffs() + by_excess)

@@ -42,15 +42,10 @@ class ResidualGrid:
         The height's density over the plane of waves k is (slope step / k)^2, from the fastest that
         the grid holds to the slowest that the fit of the terms leaves.
         """
-        fastest, slowest = (
-            2 * math.sqrt(math.pi) / self.step_mm,
-            math.pi * FIT_CYCLES / float(self.axis_mm[-1]),
-        )
-        return (
-            cell_slope
-            * self.step_mm
-            * math.sqrt(max(math.log(fastest / slowest), 0.0) / (2 * math.pi))
-        )
+        fastest = 2 * math.sqrt(math.pi) / self.step_mm
+        slowest = math.pi * FIT_CYCLES / float(self.axis_mm[-1])
+        integral = max(math.log(fastest / slowest), 0.0) / (2 * math.pi)
+        return cell_slope * self.step_mm * math.sqrt(integral)
 
 
 @compile_kernel
@@ -78,12 +73,18 @@ def residual_grid(field: FloatArray, weights: FloatArray, radius_mm: float) -> R
         Rows of `Tracer.slope_field`.
     weights : (n,) array
         0 leaves a pixel out.
+    radius_mm : float
+        Radius of the analysis: half the grid's side.
+
+    Returns
+    -------
+    ResidualGrid
+        As fine as the number of pixels allows, at most `_CELLS_A_SIDE` cells a side.
     """
-    half = (
-        min(_CELLS_A_SIDE, int(math.sqrt(4 / math.pi * max(field.shape[1], 1) / _PIXELS_A_CELL)))
-        // 2
-    )
-    half = max(half, 2)
+    # The pixels fill a disc: pi / 4 of the square's cells.
+    pixels = max(field.shape[1], 1)
+    filled_side = int(math.sqrt(4 / math.pi * pixels / _PIXELS_A_CELL))
+    half = max(min(_CELLS_A_SIDE, filled_side) // 2, 2)
     axis: FloatArray = radius_mm / half * np.arange(-half, half + 1, dtype=np.float64)
 
     def run(start: int, stop: int) -> FloatArray:
@@ -105,21 +106,30 @@ def integrate_residual(grid: ResidualGrid) -> FloatArray:
     Slopes cannot tell the relative height of parts that are not connected (a hair across the
     mirror): each is put on the fitted surface, mean 0.
     """
+    # Links of each cell to its right and lower neighbours.
     seen = grid.count > 0
     right = np.zeros(seen.shape)
     down = np.zeros(seen.shape)
     right[:, :-1] = seen[:, :-1] & seen[:, 1:]
     down[:-1] = seen[:-1] & seen[1:]
+
+    # Rise along each link, by the mean slope of its two cells.
     rise_x = np.zeros(seen.shape)
     rise_y = np.zeros(seen.shape)
     rise_x[:, :-1] = right[:, :-1] * (grid.slope_x[:, :-1] + grid.slope_x[:, 1:]) * grid.step_mm / 2
     rise_y[:-1] = down[:-1] * (grid.slope_y[:-1] + grid.slope_y[1:]) * grid.step_mm / 2
+
+    # Normal equations of the least squares: a Laplacian.
     rhs = -rise_x - rise_y
     rhs[:, 1:] += rise_x[:, :-1]
     rhs[1:] += rise_y[:-1]
     height = MaskedLaplacian(right, down).solve(rhs)
+
+    # Each connected part has mean 0; then the vertex is at 0.
     _, parts = cv2.connectedComponents(seen.astype(np.uint8), connectivity=4)
-    means = np.bincount(parts.ravel(), height.ravel()) / np.maximum(np.bincount(parts.ravel()), 1)
+    sizes = np.bincount(parts.ravel())
+    sums = np.bincount(parts.ravel(), height.ravel())
+    means = sums / np.maximum(sizes, 1)
     height = np.where(seen, height - means[parts], np.nan)
     return height - _at_vertex(height)
 
