@@ -98,7 +98,7 @@ _.requests, _.released, consumer  # of the stand-in for the package gpiod, whose
 _.enters  # a rule's level for people, in the generated page
 _.by_password  # a login in one call, for tests and programs
 PageLoop  # named as text to uvicorn
-_.culprit  # in the template of a sentence
+_.faulty_sensor  # in the template of a sentence
 # fields of a hold's messages: declared to be checked, and read by their keys
 (
     _.state,

@@ -24,7 +24,8 @@ def confirm_and_replace(
     )
     print("\n".join(shown))
     if not yes and not (
-        sys.stdin.isatty() and Progress().ask(f"save to {path}? [y/N]").lower() in ("y", "yes")
+        sys.stdin.isatty()
+        and Progress().ask_question(f"save to {path}? [y/N]").lower() in ("y", "yes")
     ):
         print(f"{path} is unchanged; --yes saves without asking", file=sys.stderr)
         return False

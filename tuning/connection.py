@@ -35,18 +35,18 @@ def open_on_hold(
         folder = find_session(options, link, fresh)
         rig = HoldRig(link, options.author, progress)
         rig.good = folder.head.before, folder.config.pump
-        progress.log = LiveLog(folder.path, rig.loop.rate_hz, progress.say)
-        rig.seen = progress.log.tick
-        with progress.catching():
+        progress.log = LiveLog(folder.path, rig.loop.rate_hz, progress.print_line)
+        rig.seen = progress.log.add_tick
+        with progress.catch_signals():
             try:
                 rig.end_experiment()  # of a session that was killed
                 with convert_write_errors(folder.path, DeviceError):
                     yield folder, rig, progress
-                progress.note("ended", "done")
+                progress.log_entry("ended", "done")
             except BaseException as error:
                 _go_back(rig, progress)
-                progress.note("ended", str(error) or "interrupted")
-                progress.say(again.format(folder.path))
+                progress.log_entry("ended", str(error) or "interrupted")
+                progress.print_line(again.format(folder.path))
                 if isinstance(error, HoldError):
                     raise DeviceError(str(error)) from None
                 raise
@@ -57,11 +57,11 @@ def _go_back(rig: HoldRig, progress: Progress) -> None:
     try:
         rig.go_back()
     except HoldError as error:
-        progress.say(
+        progress.print_line(
             f"could not restore the last good gains ({error}); gains on trial revert automatically"
         )
         return
-    progress.say("holding the mirror with the last good gains")
+    progress.print_line("holding the mirror with the last good gains")
 
 
 def connect_to_hold(
@@ -92,7 +92,7 @@ def find_session(options: TuneOptions, link: HoldLink | None, fresh: bool = Fals
         with contextlib.suppress(InputError):
             begun = newest_session(options.logs)
     of = None if begun is None else (begun.head.source, begun.head.name)
-    if begun is not None and of == (link.name, options.name) and not begun.done("verify"):
+    if begun is not None and of == (link.name, options.name) and not begun.is_done("verify"):
         return same_bench.continue_on_hold(begun, link)
     return create_session(
         options.logs, options.name, options.author, link.name, link.config, link.config.loop

@@ -29,8 +29,8 @@ def continue_on_hold(folder: SessionFolder, link: HoldLink) -> SessionFolder:
     where = f"the hold {link.name}"
     require_same_bench(where, link.config, folder)
     known = [folder.head.before]
-    if folder.done("design"):  # its own gains may be on trial
-        known.append(gains_file.load_gains(folder.file("gains.toml")).loop)
+    if folder.is_done("design"):  # its own gains may be on trial
+        known.append(gains_file.load_gains(folder.file_path("gains.toml")).loop)
     running = link.config.loop
     for key in GAIN_KEYS:
         if all(getattr(running, key) != getattr(loop, key) for loop in known):

@@ -74,7 +74,7 @@ class TwinHold:
                     "loop.ti_s; else see `membrane-ctrl check`"
                 )
 
-    def ask(self, command: Command) -> None:
+    def send_command(self, command: Command) -> None:
         """Run the tick that executes the command. Raises HoldError if it is refused."""
         self._pending = (command,)
         answer = self._advance(1)
@@ -83,7 +83,7 @@ class TwinHold:
             if isinstance(event, CommandTaken) and event.refused:
                 raise HoldError(f"refused: {event.refused}")
 
-    def news(self) -> News:
+    def read_news(self) -> News:
         """Return half a second of twin time."""
         early, self._early = self._early, News((), (), ())
         return _joined(early, self._advance(round(_NEWS_S * self.config.loop.rate_hz)))
@@ -101,7 +101,7 @@ class TwinHold:
             if self._run.finished is not None:
                 break
             commands, self._pending = self._pending, ()
-            tick = self._run.tick(commands)
+            tick = self._run.run_tick(commands)
             if tick is not None:
                 rows.append(tick.row)
                 events += tick.events

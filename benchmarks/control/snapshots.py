@@ -96,7 +96,7 @@ def _ticks(virtual: VirtualRun) -> Iterator[VirtualTick]:
     virtual._shape_period_s = 0.06
     commands: tuple[Command, ...] = (Command("hold", "benchmark"),)
     while virtual.now_s < DURATION_S:
-        tick = virtual.tick(commands)
+        tick = virtual.run_tick(commands)
         commands = ()
         assert tick is not None
         yield tick

@@ -45,9 +45,9 @@ def _hold(shape: bool) -> None:
 
     bench = VirtualBench(plant)
     run = VirtualRun(config, bench, zernike_projection(), TruthShape(bench, config, 1))
-    run.tick((Command("hold", "benchmark"),))
+    run.run_tick((Command("hold", "benchmark"),))
     while run.now_s < VIRTUAL_S:
-        run.tick()
+        run.run_tick()
 
 
 def _times_real(shape: bool) -> float:

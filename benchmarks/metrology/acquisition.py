@@ -66,7 +66,7 @@ class PanelScene:
         renderer = OpticsRenderer(OPTICS, typical_film(37.1, 500.0, 1), seed=1)
         patterns = full_sequence(OPTICS.pattern)
         self._pictures: dict[Shown, Any] = {
-            pattern: renderer.render(pattern, 0.0).copy() for pattern in patterns
+            pattern: renderer.render_picture(pattern, 0.0).copy() for pattern in patterns
         }
         self._white, self._black = (
             self._pictures[Pattern("white")],
@@ -200,7 +200,7 @@ def run() -> list[Figure]:
         camera.open()
         screen.screen.open()
         test = DisplayTest(screen, camera, clock, WIDTH_PX, HEIGHT_PX)
-        found = test.settling()
+        found = test.measure_settling()
         screen.screen.settle_s = found.settle_s
         ring = FrameRing.for_optics(OPTICS)
         stack.callback(ring.close)
@@ -278,7 +278,7 @@ def _true_settle_ms() -> float:
 
 def _take(cycle: ShapeCycle) -> float:
     begin_s = time.perf_counter()
-    done = cycle.take()
+    done = cycle.run_cycle()
     assert isinstance(done, CycleDone), done
     assert done.estimate.verdict == "ok", done.estimate.reason
     return time.perf_counter() - begin_s

@@ -97,7 +97,7 @@ def _rendered(
         renderer = OpticsRenderer(
             true, film, screen_error=ScreenError(bow_mm=bow_mm), seed=100 * seed + k
         )
-        frames = np.stack([renderer.render(pattern, moved_um) for pattern in shown])
+        frames = np.stack([renderer.render_picture(pattern, moved_um) for pattern in shown])
         reading_um = moved_um / (1 + values[NAMES.index("laser_relative")]) + rng.normal(0, 1.0)
         stack = FrameStack(frames, tuple(shown), np.full(len(shown), reading_um), {})
         sets.append(phases_of(f"{k}", check_set(stack, stated), stated))

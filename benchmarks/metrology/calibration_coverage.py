@@ -147,7 +147,7 @@ class DrawnBench:
         self, renderer: BentRays, moved_um: float, pattern: Any, more_um: float, gain: float
     ) -> FloatArray:
         """A picture of the set at a displacement, as `Room.stack` asks for it."""
-        return renderer.render(pattern, moved_um + more_um, gain=gain).astype(float)
+        return renderer.render_picture(pattern, moved_um + more_um, gain=gain).astype(float)
 
     def set_at(
         self, moved_um: float, seed: int, there: OpticsConfig | None = None

@@ -78,7 +78,7 @@ def bench(seed: int) -> dict[str, Any]:
     )
 
     def render(pattern: Any, displacement_um: float, gain: float) -> FloatArray:
-        return renderer.render(pattern, displacement_um, gain=gain).astype(float)
+        return renderer.render_picture(pattern, displacement_um, gain=gain).astype(float)
 
     radius, angle = 475 * np.sqrt(rng.random(POINTS)), 2 * np.pi * rng.random(POINTS)
     points_mm = np.stack([radius * np.cos(angle), radius * np.sin(angle)])

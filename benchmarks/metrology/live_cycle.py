@@ -31,9 +31,13 @@ def run() -> list[Figure]:
     """All figures; nearly all of the time is the reference's."""
     renderer = OpticsRenderer(OPTICS, FILM, seed=1)
     live = LiveReconstructor(OPTICS)
-    full = [renderer.render(pattern, 0.0).copy() for pattern in full_sequence(OPTICS.pattern)]
+    full = [
+        renderer.render_picture(pattern, 0.0).copy() for pattern in full_sequence(OPTICS.pattern)
+    ]
     patterns = fringe_sequence(OPTICS.pattern)
-    cycles = [[renderer.render(pattern, d).copy() for pattern in patterns] for d in MOVED_UM]
+    cycles = [
+        [renderer.render_picture(pattern, d).copy() for pattern in patterns] for d in MOVED_UM
+    ]
     times, still = 0.1 * np.arange(18), np.zeros(18)
 
     live.full(full, times, still)  # compiles

@@ -53,7 +53,7 @@ def _measured(shrink: int) -> tuple[FullResult, float, float]:
     optics = OpticsConfig(camera=camera)
     renderer = OpticsRenderer(optics, FILM, seed=1)
     shown = pattern_sequence("full", optics.pattern)
-    frames = np.stack([renderer.render(pattern, 0.0) for pattern in shown])
+    frames = np.stack([renderer.render_picture(pattern, 0.0) for pattern in shown])
     stack = FrameStack(frames, tuple(shown), np.zeros(len(shown)), {})
     seconds = []
     for _ in range(3):  # one result at a time in memory

@@ -39,11 +39,13 @@ def run() -> list[Figure]:
         )
         simulate_run(Path(folder), spec, MEASURED + 1)
         figures = Figures()
-        second = figures.of(Path(folder) / "0001")  # reads the reference as well
+        second = figures.measure_folder(Path(folder) / "0001")  # reads the reference as well
         swing_adu = second.figure.quality.modulation_share * (2**OPTICS.camera.bits - 1)
         run_trials([second.bench()], PAPER_SPREAD, 1, range(2))  # compiles
         begin = time.perf_counter()
-        benches = [figures.of(Path(folder) / f"{k + 1:04d}").bench() for k in range(MEASURED)]
+        benches = [
+            figures.measure_folder(Path(folder) / f"{k + 1:04d}").bench() for k in range(MEASURED)
+        ]
         set_s = (time.perf_counter() - begin) / MEASURED
     begin = time.perf_counter()
     trials = run_trials(benches, PAPER_SPREAD, 1, range(TRIALS))

@@ -36,18 +36,21 @@ def run() -> list[Figure]:
     """All figures, of the twin's frames in memory; the film moves by tenths of a micrometre."""
     with tempfile.TemporaryDirectory() as folder:
         simulate_set(Path(folder) / "full", SimulationSpec(OPTICS, FILM))
-        reference = Figures().of(Path(folder) / "full")
+        reference = Figures().measure_folder(Path(folder) / "full")
     scene = make_scene(reference.head.optics, reference.checked, reference.figure, 12.455)
     camera = OPTICS.camera
     tracker = Tracker(scene, (camera.height_px, camera.width_px), 255, camera.noise_adu)
     renderer = OpticsRenderer(OPTICS, FILM, seed=2)
     shown = [Pattern("crossed", "", 32, float(x), shift_y_rad=float(y)) for x, y in STEPS]
     tracker.anchor(
-        [renderer.render(p, 0.0) for p in shown], STEPS, np.arange(5) / 20, np.full(5, math.nan)
+        [renderer.render_picture(p, 0.0) for p in shown],
+        STEPS,
+        np.arange(5) / 20,
+        np.full(5, math.nan),
     )
     moved_um = 0.2 * np.sin(np.arange(FRAMES))
-    frames = [renderer.render(shown[0], float(um)) for um in moved_um]
-    tracker.follow(renderer.render(shown[0], 0.0), (0.0, 0.0), 0.5)
+    frames = [renderer.render_picture(shown[0], float(um)) for um in moved_um]
+    tracker.follow(renderer.render_picture(shown[0], 0.0), (0.0, 0.0), 0.5)
     begin, busy = time.perf_counter(), time.process_time()
     found = [tracker.follow(frame, (0.0, 0.0), 1 + k / 20) for k, frame in enumerate(frames)]
     passed_s, busy_s = time.perf_counter() - begin, time.process_time() - busy

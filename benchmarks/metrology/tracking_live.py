@@ -53,10 +53,12 @@ def _camera(shown: Synchronized[int], ready: Any, done: Any) -> None:
         for seed in range(NOISES + 1)
     ]
     pictures = [
-        [renderers[0].render(pattern, 0.0).copy()] for pattern in full_sequence(OPTICS.pattern)
+        [renderers[0].render_picture(pattern, 0.0).copy()]
+        for pattern in full_sequence(OPTICS.pattern)
     ]
     pictures += [
-        [r.render(pattern, 0.0).copy() for r in renderers] for pattern in crossed_patterns(PERIODS)
+        [r.render_picture(pattern, 0.0).copy() for r in renderers]
+        for pattern in crossed_patterns(PERIODS)
     ]
     counts = [0] * len(pictures)
 
@@ -126,18 +128,18 @@ def _measured(screen: Panel) -> list[Figure]:
         cycle = ShapeCycle(camera, screen, tracker, plan, writer, clock, LaserAtRest())
         cycle.want_full()
         for _ in range(30):  # the anchor, its five steps, and what is compiled
-            assert isinstance(cycle.take(), CycleDone)
-            cycle.prepare()
+            assert isinstance(cycle.run_cycle(), CycleDone)
+            cycle.prepare_next()
         verdicts, late_ms, due_s = [], [], clock.now()
         begin_s, busy_s = clock.now(), time.process_time()
         for _ in range(FRAMES):
             clock.sleep(max(due_s - clock.now(), 0.0))
             due_s = max(due_s + tracker.slower / RATE_HZ, clock.now())
-            one = cycle.take()
+            one = cycle.run_cycle()
             assert isinstance(one, CycleDone)
             verdicts.append(one.estimate.verdict)
             late_ms.append(1e3 * (clock.now() - one.estimate.time_s) - EXPOSURE_MS / 2)
-            cycle.prepare()
+            cycle.prepare_next()
         passed_s, busy_s = clock.now() - begin_s, time.process_time() - busy_s
         lost = driver.counts.incomplete + driver.counts.missing
     good = verdicts.count("ok")

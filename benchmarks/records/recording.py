@@ -119,8 +119,8 @@ def _measured(folder: Path, stack: ExitStack, config: Config, duration_s: float)
         HandClock.moment_s = (number + 1) * WRITE_S
         part.put(writers)
         begun_s = time.process_time()
-        recorder.drain()
-        recorder.write()
+        recorder.drain_rings()
+        recorder.write_second()
         busy_s += time.process_time() - begun_s
     ended = json.dumps({"kind": "end", "exit": "done", "mono_s": duration_s})
     writers["events"].put(ended.encode())
@@ -145,9 +145,9 @@ def _optimised_s(run_dir: Path) -> float:
     begun_s = time.perf_counter()
     optimizer = Optimizer(run_dir)
     for path in sorted(run_dir.glob("*.rrd")):
-        optimizer.add(path)
-    while optimizer.busy:
-        optimizer.poll()
+        optimizer.add_segment(path)
+    while optimizer.is_busy:
+        optimizer.poll_worker()
         time.sleep(0.05)
     return time.perf_counter() - begun_s
 

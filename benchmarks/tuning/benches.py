@@ -256,7 +256,7 @@ def _options(config: Config, logs: Path, limit_um: float, short: bool = False) -
 def _kept(bench: DrawnBench, logs: Path, config: Config) -> dict[str, Any]:
     folder = newest_session(logs)
     done = verify.load_verified(folder)
-    gains = gains_file.load_gains(folder.file("gains.toml"))
+    gains = gains_file.load_gains(folder.file_path("gains.toml"))
     sigma = design.load_candidates(folder)[1].sigma
     found: dict[str, Any] = {
         "kept": done.kept,
@@ -280,7 +280,7 @@ def _held(name: str, bench: DrawnBench, config: Config) -> dict[str, Any]:
     try:
         hold = twin_hold_of(bench, config, 2)
         while hold.rows[-1].mono_s < SETTLE_S + (GUSTY_HOLD_S if bench.gusts else HOLD_S):
-            hold.news()
+            hold.read_news()
     except HoldError as error:
         return {f"{name}_error": str(error)}
     true_um = np.array([row.truth_displacement_um for row in hold.rows if row.mono_s > SETTLE_S])

@@ -96,7 +96,7 @@ class ShapeCycle:
         """Make the next cycle a full one."""
         self._full_next = True
 
-    def take(self) -> CycleDone | CycleFailed | None:
+    def run_cycle(self) -> CycleDone | CycleFailed | None:
         """Take one cycle; None if it was stopped. Catches whatever devices and numerics raise."""
         self._cycle += 1
         try:
@@ -110,7 +110,7 @@ class ShapeCycle:
         self._choose_next_kind(estimate)
         return CycleDone(estimate, pause_s(self._full_rejected_in_a_row - REJECTED_IN_A_ROW + 1))
 
-    def prepare(self) -> None:
+    def prepare_next(self) -> None:
         """Do ahead what the next figure needs: not while it is waited for. That cycle tells of a
         failure.
         """
@@ -127,8 +127,8 @@ class ShapeCycle:
             self._full_next = True
 
     def _measure_shape(self, kind: Literal["full", "fringes"]) -> ShapeEstimate | None:
-        patterns = self._plan.patterns(kind == "full")
-        frames = self._exposures.take(patterns, self._cycle, self._stopping)
+        patterns = self._plan.list_patterns(kind == "full")
+        frames = self._exposures.expose_patterns(patterns, self._cycle, self._stopping)
         if frames is None:
             return None
         arrived_s = self._clock.now()

@@ -27,25 +27,25 @@ def keep_cycling(
     due_s = clock.now()
     while not remote.stop:
         if remote.paused:
-            remote.report("paused", "until told to resume")
+            remote.report_state("paused", "until told to resume")
             while remote.paused and not remote.stop:
-                remote.listen(math.inf)
+                remote.take_commands(math.inf)
             due_s = clock.now()
             continue
         remaining_s = due_s - clock.now()
         if remaining_s > 0:
-            remote.listen(remaining_s)
+            remote.take_commands(remaining_s)
             continue
         captures = remote.take_capture()
         if remote.take_full() or captures:
             taking.want_full()
-        result = taking.take()
+        result = taking.run_cycle()
         _report_result(result, remote, publish)
         if captures:
-            remote.tell(_capture_event(result, keep))
+            remote.send_event(_capture_event(result, keep))
         pause_s = result.pause_s if result is not None else 0.0
         due_s = next_deadline_s(due_s, period_s(), clock.now() + pause_s)
-        taking.prepare()
+        taking.prepare_next()
 
 
 def next_deadline_s(last_s: float, period_s: float, earliest_s: float) -> float:
@@ -90,6 +90,8 @@ def _report_result(
                 if estimate.reason
                 else estimate.verdict
             )
-            remote.report("running", verdict, cycle=estimate.cycle)
+            remote.report_state("running", verdict, cycle=estimate.cycle)
         case CycleFailed(number, stage, message, pause_s):
-            remote.report("retrying", f"{stage}: {message}; again in {pause_s:g} s", cycle=number)
+            remote.report_state(
+                "retrying", f"{stage}: {message}; again in {pause_s:g} s", cycle=number
+            )

@@ -19,7 +19,7 @@ class CyclePlan:
     frame_interval_s: float
     standing: Callable[[], Pattern] | None = None
 
-    def patterns(self, full: bool) -> Sequence[Pattern]:
+    def list_patterns(self, full: bool) -> Sequence[Pattern]:
         """Of the next cycle."""
         if full:
             return self.full

@@ -106,7 +106,7 @@ class Exposures:
         self._interval_s = interval_s
         self._shown: Pattern | None = None
 
-    def take(
+    def expose_patterns(
         self, patterns: Sequence[Pattern], cycle: int, stopping: Callable[[], bool]
     ) -> list[Frame] | None:
         """Take frames of these patterns, in order; None if `stopping` before an exposure.
@@ -120,7 +120,7 @@ class Exposures:
             raise
         finally:
             if isinstance(self._camera, _Grabbing):  # frames left by a cycle that ended early
-                self._camera.forget()
+                self._camera.discard_frame()
 
     def _expose_in_order(
         self, patterns: Sequence[Pattern], cycle: int, stopping: Callable[[], bool]
@@ -206,7 +206,7 @@ class _Grabbing:
         frame, self._frame = self._frame, None
         return frame
 
-    def forget(self) -> None:
+    def discard_frame(self) -> None:
         self._frame = None
 
 

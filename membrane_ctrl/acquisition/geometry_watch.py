@@ -49,7 +49,7 @@ class GeometryWatch:
             self._sigma_mm_adu / estimate.modulation_median_adu,
         )
 
-    def after(self, estimate: shape_estimate.ShapeEstimate) -> events.Event | None:
+    def check_estimate(self, estimate: shape_estimate.ShapeEstimate) -> events.Event | None:
         """Returns a notice when a new calibration becomes due, and when no longer."""
         if self._monitors is None or estimate.verdict == "rejected" or estimate.kind == "track":
             return None

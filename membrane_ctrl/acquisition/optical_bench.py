@@ -38,7 +38,7 @@ _TIMES = 3
 class DisplayTest:
     """Measures a display with the camera that sees it, both open.
 
-    It waits `settle_s` before a still picture; `settling` shortens that.
+    It waits `settle_s` before a still picture; `measure_settling` shortens that.
     """
 
     def __init__(
@@ -53,7 +53,7 @@ class DisplayTest:
         self._size = (height_px, width_px)
         self.settle_s = LONG_S
 
-    def exposure(self, full_scale_adu: int, exposure_ms: float) -> str:
+    def check_exposure(self, full_scale_adu: int, exposure_ms: float) -> str:
         """Any problem with the camera's exposure, else empty."""
         white, black = (
             self._expose_still(self._make_grey(255)),
@@ -61,7 +61,7 @@ class DisplayTest:
         )
         return exposure_check.exposure_problem(white, black, full_scale_adu, exposure_ms)
 
-    def checkerboard(self) -> str:
+    def check_checkerboard(self) -> str:
         """Any problem with pixel-for-pixel display, else empty."""
         white, black = (
             self._expose_still(self._make_grey(255)),
@@ -73,7 +73,7 @@ class DisplayTest:
             black,
         )
 
-    def settling(self) -> display_settling.Settling:
+    def measure_settling(self) -> display_settling.Settling:
         """Time from a command to the light, over steps both ways between black, white and two
         greys.
 
@@ -103,7 +103,7 @@ class DisplayTest:
         self.settle_s = found.settle_s
         return found
 
-    def response(self) -> display_response.DisplayResponse:
+    def measure_response(self) -> display_response.DisplayResponse:
         """Light against level. Raises ValueError if the camera sees no ramp."""
         frames = [
             self._expose_still(self._make_grey(level)) for level in display_response.RAMP_LEVELS
@@ -282,7 +282,10 @@ def open_bench(bench: OpticalBench, config: Config, clock: CycleClock) -> BenchF
     measured: list[str] = []
     problems: list[str] = []
     if section.self_test:
-        problems += [_check_exposure(config, test), format_finding("screen", test.checkerboard)]
+        problems += [
+            _check_exposure(config, test),
+            format_finding("screen", test.check_checkerboard),
+        ]
     if section.settle_ms is not None:
         screen.settle_s = test.settle_s = section.settle_ms / 1000.0
     else:
@@ -297,12 +300,12 @@ def _check_exposure(config: Config, test: DisplayTest) -> str:
     if not exposure_ms:  # the remedy would have no unit
         return ""
     return format_finding(
-        "camera", lambda: test.exposure((1 << config.optics.camera.bits) - 1, exposure_ms)
+        "camera", lambda: test.check_exposure((1 << config.optics.camera.bits) - 1, exposure_ms)
     )
 
 
 def _measure_settling(screen: PatternScreen, test: DisplayTest, measured: list[str]) -> str:
-    found = test.settling()
+    found = test.measure_settling()
     screen.settle_s = found.settle_s
     measured.append(
         f"screen settles in {1000 * found.settle_s:.0f} ms "
@@ -312,7 +315,7 @@ def _measure_settling(screen: PatternScreen, test: DisplayTest, measured: list[s
 
 
 def _measure_response(screen: PatternScreen, test: DisplayTest, measured: list[str]) -> str:
-    curve = test.response()
+    curve = test.measure_response()
     screen.linearise(curve)
     measured.append(f"screen response corrected (gamma {curve.gamma:.2f})")
     return ""

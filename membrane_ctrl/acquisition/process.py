@@ -32,8 +32,8 @@ def acquisition_main(spec: AcquisitionSpec, control: Connection) -> None:
 
         run_acquisition(spec, remote)
     except Exception as error:
-        remote.report(
+        remote.report_state(
             "failed", f"{type(error).__name__}: {error}", traceback=traceback.format_exc()
         )
         raise SystemExit(1) from None
-    remote.report("stopped")
+    remote.report_state("stopped")

@@ -84,7 +84,7 @@ class RawFrames:
         self._reference_needed = False
         self.left_out = 0
 
-    def after(self, estimate: ShapeEstimate) -> None:
+    def keep_due_frames(self, estimate: ShapeEstimate) -> None:
         """Keep the frames of a finished cycle if they are due."""
         self._collect_writes()
         self.look_for_fault()
@@ -105,7 +105,7 @@ class RawFrames:
                 self._writer.submit(shutil.rmtree, self._reference, ignore_errors=True)
             self._reference, self._reference_needed = kept, bool(due)
 
-    def capture(self, estimate: ShapeEstimate) -> Path:
+    def write_capture(self, estimate: ShapeEstimate) -> Path:
         """Write a cycle's frames and wait; returns the set's folder. Raises OSError."""
         kept = self._copy_and_queue(estimate.cycle)
         wait(write.done for write in self._writing)

@@ -34,7 +34,7 @@ class Remote:
         self.stop = False
         self.paused = False
 
-    def listen(self, timeout_s: float = 0.0) -> None:
+    def take_commands(self, timeout_s: float = 0.0) -> None:
         """Take pending commands; if there are none, wait up to `timeout_s` (at most 0.2 s)."""
         if not child.parent_lives():
             self.stop = True
@@ -47,12 +47,12 @@ class Remote:
         except (EOFError, OSError):  # the other end is closed
             self.stop = True
 
-    def interrupts(self) -> bool:
+    def is_interrupting(self) -> bool:
         """Whether a running cycle should end now."""
-        self.listen()
+        self.take_commands()
         return self.stop or self.paused
 
-    def end(self) -> None:
+    def request_stop(self) -> None:
         """Stop, as if commanded."""
         self.stop = True
 
@@ -66,7 +66,7 @@ class Remote:
         wanted, self._capture = self._capture, False
         return wanted
 
-    def report(
+    def report_state(
         self,
         state: AcquisitionState,
         message: str = "",
@@ -83,11 +83,11 @@ class Remote:
         self._said = (state, message)
         self._send(acquisition_events.AcquisitionState(state, message, cycle, traceback))
 
-    def tell(self, event: events.Event) -> None:
+    def send_event(self, event: events.Event) -> None:
         """Record an event; it may be dropped like a report."""
         self._send(event)
 
-    def prepared(self) -> None:
+    def start_line_checks(self) -> None:
         """From now on, the line is checked between any two exposures."""
         self._step_s = _STEP_S
         self._alive_due_s = 0.0
@@ -118,7 +118,7 @@ class Remote:
             case "stop":
                 self.stop = True
             case _:
-                self.report(
+                self.report_state(
                     "running",
                     f"unknown command {command!r}: use pause, resume, full, capture or stop",
                 )

@@ -42,11 +42,11 @@ def run_acquisition(spec: AcquisitionSpec, remote: Remote) -> None:
     compiling kernel cannot check for it; afterwards it ends the cycle at its next exposure. Raises
     LinkError if no camera is configured, or its patterns do not fit on the screen.
     """
-    remote.listen()  # the first report, which allows silence until all this is done
-    remote.report("preparing", "rendering the first picture, compiling")
+    remote.take_commands()  # the first report, which allows silence until all this is done
+    remote.report_state("preparing", "rendering the first picture, compiling")
     config, clock = spec.config, WaitingClock(spec.clock)
     geometry = run_geometry.read_run_geometry(spec.run_dir, config)
-    remote.tell(geometry_watch.geometry_event(geometry))
+    remote.send_event(geometry_watch.geometry_event(geometry))
     plan = _cycle_plan(config, geometry.optics)
     with ExitStack() as stack:
         if spec.truth is None:
@@ -54,7 +54,7 @@ def run_acquisition(spec: AcquisitionSpec, remote: Remote) -> None:
             _warm_up(config, plan, TYPICAL_FILM, clock)
         else:
             bench = _make_twin_bench(spec.truth, config, plan, clock, remote, stack)
-        signal.signal(child.STOP, lambda number, frame: remote.end())
+        signal.signal(child.STOP, lambda number, frame: remote.request_stop())
         stack.callback(bench.close)
         _open_bench(bench, config, clock, remote)
         if remote.stop:
@@ -81,24 +81,24 @@ def run_acquisition(spec: AcquisitionSpec, remote: Remote) -> None:
             slots,
             clock,
             laser,
-            stopping=remote.interrupts,
+            stopping=remote.is_interrupting,
         )
 
         def publish(estimate: ShapeEstimate) -> None:
             shapes.put(pack_estimate(estimate))
-            for notice in (drift.after(estimate), *hear(estimate)):
+            for notice in (drift.check_estimate(estimate), *hear(estimate)):
                 if notice is not None:
-                    remote.tell(notice)
+                    remote.send_event(notice)
             if raw is not None:
-                raw.after(estimate)
+                raw.keep_due_frames(estimate)
 
         def keep(estimate: ShapeEstimate) -> Path:
             if raw is None:
                 raise OSError("the run has no folder")
-            return raw.capture(estimate)
+            return raw.write_capture(estimate)
 
-        remote.prepared()
-        remote.report("running", "first cycle")
+        remote.start_line_checks()
+        remote.report_state("running", "first cycle")
         cycle_loop.keep_cycling(taking, remote, publish, clock, period_s, keep)
 
 
@@ -148,7 +148,7 @@ def _make_twin_bench(
     """Camera and screen at the twin's mirror, once its bench has published the film's position."""
     truth = stack.enter_context(closing(TwinTruth(address)))
     while not truth.known and not remote.stop:
-        remote.listen(_TRUTH_LOOK_S)
+        remote.take_commands(_TRUTH_LOOK_S)
     optics = TwinOptics(config.optics, config.twin, truth, clock)
     if not remote.stop:
         _warm_up(config, plan, truth(), clock)
@@ -180,14 +180,14 @@ def _open_bench(
             found = optical_bench.open_bench(bench, config, clock)
             who = (f"camera: {found.camera}",) if found.camera else ()
             for line in (*who, *found.measured, *found.problems):
-                remote.report("preparing", line)
+                remote.report_state("preparing", line)
             return
         except LinkError as error:
             failures += 1
-            remote.report("retrying", str(error))
+            remote.report_state("retrying", str(error))
         again_s = clock.now() + pause_s(failures)
         while not remote.stop and (remaining_s := again_s - clock.now()) > 0:
-            remote.listen(remaining_s)
+            remote.take_commands(remaining_s)
 
 
 def _make_raw_frames(
@@ -202,6 +202,6 @@ def _make_raw_frames(
         return None
     folder, recording = spec.run_dir / "raw", spec.config.recording
     raw = raw_frames.RawFrames(
-        folder, optics, plan, recording, spec.frames, spec.telemetry, remote.tell
+        folder, optics, plan, recording, spec.frames, spec.telemetry, remote.send_event
     )
     return stack.enter_context(closing(raw))

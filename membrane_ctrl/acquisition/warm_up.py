@@ -71,7 +71,7 @@ def warm_up(
         (False, reconstructor.fringes, still),
     ):
         taken = []
-        for pattern in plan.patterns(full):
+        for pattern in plan.list_patterns(full):
             bench.screen.show(pattern)
             taken.append(bench.camera.grab().pixels)
         displacement_um = position.displacement_um + np.resize(motion_um, len(taken))

@@ -95,10 +95,10 @@ class _Alarm:
     acknowledged: bool = False
 
     @property
-    def told(self) -> bool:
+    def is_reported(self) -> bool:
         return math.isfinite(self.told_s)
 
-    def end(self, about: str) -> None:
+    def end_condition(self, about: str) -> None:
         """End one of its conditions, or all with ""; reminders name one that still stands."""
         if about:
             self.standing.pop(about, None)
@@ -115,12 +115,12 @@ class AlarmBook:
         self._config = config
         self._alarms: dict[str, _Alarm] = {}
 
-    def standing(self, name: str) -> bool:
+    def note_standing(self, name: str) -> bool:
         """The condition of this alarm stands."""
         alarm = self._alarms.get(name)
         return alarm is not None and math.isinf(alarm.gone_s)
 
-    def take(self, sign: Sign, now_s: float) -> None:
+    def take_sign(self, sign: Sign, now_s: float) -> None:
         """Take a sign."""
         alarm = self._alarms.get(sign.name)
         if alarm is None or (sign.bad and sign.anew and math.isfinite(alarm.gone_s)):
@@ -128,23 +128,23 @@ class AlarmBook:
                 self._alarms[sign.name] = _Alarm(sign, now_s, standing={sign.about: sign})
             return
         if not sign.bad:
-            alarm.end(sign.about)
+            alarm.end_condition(sign.about)
             if alarm.standing:
                 return
-            if alarm.told:
+            if alarm.is_reported:
                 alarm.gone_s = min(alarm.gone_s, now_s)
             else:  # cleared before any message
                 del self._alarms[sign.name]
             return
         alarm.gone_s = math.inf
         alarm.standing[sign.about] = sign
-        if not alarm.told or alarm.sign.about not in alarm.standing:
+        if not alarm.is_reported or alarm.sign.about not in alarm.standing:
             alarm.sign = sign
 
-    def acknowledge(self) -> None:
+    def acknowledge_all(self) -> None:
         """Acknowledge all raised alarms: no more reminders, no escalation."""
         for alarm in self._alarms.values():
-            alarm.acknowledged |= alarm.told
+            alarm.acknowledged |= alarm.is_reported
 
     def step(self, now_s: float) -> list[AlarmMessage]:
         """Return the due messages."""
@@ -169,7 +169,7 @@ class AlarmBook:
         config = self._config
         if now_s - alarm.gone_s >= config.clear_after_s:
             return "cleared"
-        if not alarm.told:
+        if not alarm.is_reported:
             return "raised" if now_s - alarm.since_s >= alarm.sign.for_s else None
         if alarm.acknowledged or math.isfinite(alarm.gone_s):
             return None

@@ -59,7 +59,7 @@ class Outbox:
         self.failures = 0  # since the last success
         self.dropped = 0
 
-    def post(self, message: AlarmMessage) -> None:
+    def queue_message(self, message: AlarmMessage) -> None:
         """Queue a message."""
         self._waiting.append(message)
         if len(self._waiting) > _KEPT:
@@ -67,7 +67,7 @@ class Outbox:
             self.dropped += 1
 
     @property
-    def empty(self) -> bool:
+    def is_empty(self) -> bool:
         """All messages are sent."""
         return not self._waiting
 
@@ -192,11 +192,11 @@ class Watcher:
         self._status = RunStatus()
 
     @property
-    def ended(self) -> bool:
+    def has_ended(self) -> bool:
         """The "end" event has arrived."""
         return self._status.ended
 
-    def look(self, rows: Sequence[bytes], events: Sequence[bytes], now_s: float) -> None:
+    def process_news(self, rows: Sequence[bytes], events: Sequence[bytes], now_s: float) -> None:
         """Take rows and events, and send due messages."""
         for message in events:
             self._take_event(json.loads(message), now_s)
@@ -205,12 +205,12 @@ class Watcher:
         self._read_event(bool(rows), now_s)
         self._send_due(now_s)
 
-    def orphaned(self, now_s: float) -> None:
+    def report_orphan(self, now_s: float) -> None:
         """Report that the control process ended without an "end" event."""
         text = (
             "the control process ended without a report; the board's watchdog has stopped the pump"
         )
-        self._book.take(Sign("control_gone", True, "critical", text), now_s)
+        self._book.take_sign(Sign("control_gone", True, "critical", text), now_s)
         self._send_due(now_s)
 
     def _take_event(self, line: EventLine, now_s: float) -> None:
@@ -220,29 +220,31 @@ class Watcher:
         match event:
             case port_events.AlarmsAcknowledged() | CommandTaken(command="ack"):
                 # whoever sends `ack` has seen the alarms, even if the hold refuses it
-                self._book.acknowledge()
+                self._book.acknowledge_all()
         for sign in signs:
-            self._book.take(sign, now_s)
+            self._book.take_sign(sign, now_s)
 
     def _take_row(self, message: bytes, now_s: float) -> None:
         row = TelemetryRow.unpack(message)
         for rule in self._config.rules:
-            sign = sign_of_value(rule, getattr(row, rule.field), self._book.standing(rule.name))
+            sign = sign_of_value(
+                rule, getattr(row, rule.field), self._book.note_standing(rule.name)
+            )
             if sign is not None:
-                self._book.take(sign, now_s)
+                self._book.take_sign(sign, now_s)
 
     def _read_event(self, heard: bool, now_s: float) -> None:
         if heard:
             self._last_row_s = now_s
-            self._book.take(Sign("silent", False), now_s)
-        elif now_s - self._last_row_s >= self._config.silent_s and not self.ended:
+            self._book.take_sign(Sign("silent", False), now_s)
+        elif now_s - self._last_row_s >= self._config.silent_s and not self.has_ended:
             text = f"no tick for {self._config.silent_s:g} s: the control process hangs"
-            self._book.take(Sign("silent", True, "critical", text), now_s)
+            self._book.take_sign(Sign("silent", True, "critical", text), now_s)
 
     def _send_due(self, now_s: float) -> None:
         for message in self._book.step(now_s):
             for outbox in self._outboxes[: 2 if message.escalated else 1]:
-                outbox.post(message)
+                outbox.queue_message(message)
         for outbox in self._outboxes:
             outbox.step(now_s)
 
@@ -292,15 +294,15 @@ def watch_run(
                 parent_lives()
             )  # before the rings: a dying parent has written its last message first
             report(child_events.Alive(_SENDING_S))
-            watcher.look(telemetry.drain(), events.drain(), clock.now())
-            if watcher.ended or not lives:
+            watcher.process_news(telemetry.drain(), events.drain(), clock.now())
+            if watcher.has_ended or not lives:
                 break
             report(child_events.Alive(_IDLE_S))
             time.sleep(_LOOK_S)
-        if not watcher.ended:
-            watcher.orphaned(clock.now())
+        if not watcher.has_ended:
+            watcher.report_orphan(clock.now())
     give_up_s = clock.now() + _LAST_S
-    while not all(outbox.empty for outbox in outboxes) and clock.now() < give_up_s:
+    while not all(outbox.is_empty for outbox in outboxes) and clock.now() < give_up_s:
         time.sleep(_LOOK_S)
         for outbox in outboxes:
             outbox.step(clock.now())

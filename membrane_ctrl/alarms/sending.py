@@ -29,7 +29,7 @@ class Service:
         self._begun = False
         self._accepted = False
 
-    def begin(self, title: str, body: str, kind: str) -> None:
+    def begin_sending(self, title: str, body: str, kind: str) -> None:
         """Begin to send, unless the last attempt still hangs."""
         self._begun = self._thread is None or not self._thread.is_alive()
         if not self._begun:
@@ -40,9 +40,9 @@ class Service:
         )
         self._thread.start()
 
-    def accepted(self, until_s: float) -> bool:
-        """Whether the service has accepted the message of the last `begin`, by a time of the
-        monotonic clock.
+    def has_accepted(self, until_s: float) -> bool:
+        """Whether the service has accepted the message of the last `begin_sending`, by a time of
+        the monotonic clock.
         """
         if self._thread is None or not self._begun:  # what still hangs is an earlier message
             return False
@@ -64,9 +64,9 @@ def send_to_all(services: Sequence[Service], title: str, body: str, kind: str) -
     """
     until_s = time.monotonic() + SERVICE_S
     for service in services:
-        service.begin(title, body, kind)
+        service.begin_sending(title, body, kind)
     accepted = [
-        service.accepted(until_s) for service in services
+        service.has_accepted(until_s) for service in services
     ]  # wait for all: each gets every message
     return any(accepted)
 

@@ -24,7 +24,7 @@ def compare_geometries(
     ]
     rows = zip(
         _tape_lengths(Geometry.from_config(optics)),
-        _tape_lengths(Geometry.from_config(new.over(optics))),
+        _tape_lengths(Geometry.from_config(new.apply_to_optics(optics))),
         strict=True,
     )
     lines += [f"{name:<28}{before:>12.3f}{after:>12.3f}" for (name, before), (_, after) in rows]

@@ -43,7 +43,7 @@ def calibrate_pose(options: PoseOptions) -> int:
     capture = capture_set.read_set(options.folder, geometry)
     optics = capture.head.optics
     for path in options.priors:
-        optics = read_prior(path).over(optics)
+        optics = read_prior(path).apply_to_optics(optics)
     capture = replace(capture, head=replace(capture.head, optics=optics))
     stated = Geometry.from_config(optics)
     light, (rim_z, rim_mean_mm) = _white_minus_black(capture), _rim_height(capture)

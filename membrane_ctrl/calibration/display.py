@@ -50,7 +50,7 @@ def measure_display(
     bench.camera.open()
     bench.screen.open()
     test = optical_bench.DisplayTest(bench.screen, bench.camera, clock, width_px, height_px)
-    return test.settling(), test.response()
+    return test.measure_settling(), test.measure_response()
 
 
 def display_report(

@@ -62,7 +62,7 @@ def calibrate_live(options: LiveOptions) -> int:
         if options.range_um is not None or options.sets is not None:
             raise InputError("--session has its own setpoints: omit --range-um and --sets")
         session = sessions.resume_session(options.session)
-    if session is None or session.missing:
+    if session is None or session.missing_indices:
         with live_hold(
             options.where,
             options.take_over,
@@ -84,27 +84,27 @@ def take_sets(
     progress = Progress()
     sweep = Sweep(link, link.config.limits, progress)
     try:
-        held = sweep.look()
+        held = sweep.observe_hold()
         procedure = Procedure(link, sweep, held, progress)
         if session is not None:
-            head, missing = session.head, session.missing
+            head, missing = session.head, session.missing_indices
             _same_bench(link, session)
         else:
             reach, sets = setpoint_reach(held, link.config), options.sets or USUAL_SETS
             wanted = plan_setpoints_um(held, reach, options.range_um, sets)
             head = CalibrationHead(link.name, now_utc(), held.setpoint_um, held.shape_on, wanted)
             missing = tuple(range(sets))
-        procedure.check(head)
+        procedure.check_setpoints(head)
         minutes = sum(procedure.times_s(head, missing)) / 60
-        progress.say(_format_plan(head, len(missing), held, minutes))
-        progress.say(_format_forecast(link, head, held, options))
+        progress.print_line(_format_plan(head, len(missing), held, minutes))
+        progress.print_line(_format_forecast(link, head, held, options))
         _require_agreement(f"move the mirror through {len(missing)} setpoints?", options.yes)
-        sweep.claim(held.setpoint_um)
+        sweep.claim_command(held.setpoint_um)
         session = session or sessions.begin_session(
             options.where.logs, options.name, head, link.config
         )
-        progress.say(f"session: {session.path}")
-        procedure.take(session)
+        progress.print_line(f"session: {session.path}")
+        procedure.take_sets(session)
     except HoldError as error:
         raise DeviceError(str(error)) from None
     return session
@@ -116,19 +116,24 @@ def solve_and_adopt(session: CalibrationSession, options: LiveOptions) -> int:
     """
     start_um = session.head.start_um
     code = calibrate_command(
-        replace(options.solving, folders=session.sets, out=session.geometry, reference_um=start_um)
+        replace(
+            options.solving,
+            folders=session.set_folders,
+            out=session.geometry_path,
+            reference_um=start_um,
+        )
     )
     if code != Exit.DONE:
         return code
-    optics, place = read_head(session.sets[0]).optics, session.config.optics.geometry_file
+    optics, place = read_head(session.set_folders[0]).optics, session.config.optics.geometry_file
     for line in compare_geometries(
-        optics, _set_origin(session, place), read_geometry(session.geometry)
+        optics, _set_origin(session, place), read_geometry(session.geometry_path)
     ):
         _print_progress(line)
     if place is None:
         _print_progress(
             "not adopted: the configuration names no optics.geometry_file; the geometry is "
-            f"{session.geometry}"
+            f"{session.geometry_path}"
         )
     elif not _ask_person(f"adopt it as {place}?", options.yes):
         _print_progress(
@@ -136,7 +141,7 @@ def solve_and_adopt(session: CalibrationSession, options: LiveOptions) -> int:
             "adopts it"
         )
     else:
-        kept = adopt_geometry(session.geometry, place)
+        kept = adopt_geometry(session.geometry_path, place)
         before = f"; the previous one is {kept}" if kept else ""
         _print_progress(f"adopted: {place}{before}; the next hold uses it")
     return code
@@ -145,7 +150,7 @@ def solve_and_adopt(session: CalibrationSession, options: LiveOptions) -> int:
 def _same_bench(link: CaptureLink, session: CalibrationSession) -> None:
     """Raises InputError if the hold's geometry differs from that of the sets so far."""
     now = read_run_geometry(link.run_dir, link.config).optics
-    for folder in session.sets:
+    for folder in session.set_folders:
         if not folder.exists():
             continue
         then = read_head(folder).optics
@@ -209,7 +214,7 @@ def _forecast_figure(
     optics = read_run_geometry(link.run_dir, link.config).optics
     solving = options.solving
     if solving.geometry is not None:
-        optics = read_geometry(solving.geometry).over(optics)
+        optics = read_geometry(solving.geometry).apply_to_optics(optics)
     known = bench_parameters.prior_sigmas(known_sigmas(optics, parse_freed(solving.free)))
     sags_mm = [held.sag_at_mm(each) for each in sorted(setpoints)]
     try:
@@ -222,7 +227,7 @@ def _forecast_figure(
 
 def _set_origin(session: CalibrationSession, place: Path | None) -> GeometryOrigin:
     """Origin of the sets' geometry: the file if it is unchanged, else the numbers' hash."""
-    optics = read_head(session.sets[0]).optics
+    optics = read_head(session.set_folders[0]).optics
     if place is not None and place.exists():
         with contextlib.suppress(InputError):  # a damaged file does no harm here
             file = read_geometry(place)

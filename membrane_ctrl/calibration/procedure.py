@@ -31,7 +31,7 @@ class Procedure:
         stops = [self.held.setpoint_um, *(head.setpoints_um[k] for k in missing), head.start_um]
         return [move_and_set_s(self.held, a, b, self.link.config) for a, b in pairwise(stops)]
 
-    def check(self, head: CalibrationHead) -> None:
+    def check_setpoints(self, head: CalibrationHead) -> None:
         """Raises InputError if the setpoints are out of reach, or the mirror cannot be moved both
         ways.
         """
@@ -52,34 +52,34 @@ class Procedure:
                 "open the bleed (loop.bleed_fraction), or give the pump more reserve"
             )
 
-    def take(self, session: CalibrationSession) -> None:
+    def take_sets(self, session: CalibrationSession) -> None:
         """Take the missing sets and move the mirror back.
 
         Raises HoldError if the mirror is no longer held or someone else moves it (it is then left
         alone); DeviceError, RejectedError or KeyboardInterrupt after the mirror has moved back.
         """
-        with self.progress.catching(), self._coming_back(session):
+        with self.progress.catch_signals(), self._coming_back(session):
             self.sweep.shape_loop(False)
-            times_s = self.times_s(session.head, session.missing)
-            for number, index in enumerate(session.missing):
+            times_s = self.times_s(session.head, session.missing_indices)
+            for number, index in enumerate(session.missing_indices):
                 self._take_set(session, index, times_s[number], sum(times_s[number + 1 :]))
 
     def _take_set(
         self, session: CalibrationSession, index: int, expected_s: float, after_s: float
     ) -> None:
         setpoint_um = session.head.setpoints_um[index]
-        what = f"set {index + 1} of {len(session.sets)} at {setpoint_um:+g} µm"
-        self.progress.begin(what, expected_s, after_s)
-        self.sweep.go(setpoint_um, expected_s)
-        event = self.sweep.take()
-        session.keep(index, self.link.run_dir / str(event.set))
-        self.progress.say(
+        what = f"set {index + 1} of {len(session.set_folders)} at {setpoint_um:+g} µm"
+        self.progress.begin_step(what, expected_s, after_s)
+        self.sweep.go_to_setpoint(setpoint_um, expected_s)
+        event = self.sweep.take_set()
+        session.keep_set(index, self.link.run_dir / str(event.set))
+        self.progress.print_line(
             f"{what}: {event.verdict}" + (f" ({event.reason})" if event.reason else "")
         )
 
     @contextlib.contextmanager
     def _coming_back(self, session: CalibrationSession) -> Iterator[None]:
-        say = self.progress.say
+        say = self.progress.print_line
         try:
             yield
         except HoldError:
@@ -91,9 +91,9 @@ class Procedure:
             raise
         except BaseException:
             self.progress.interrupted = False
+            missing_count = len(session.missing_indices)
             say(
-                f"stopped with {len(session.missing)} sets missing; continue with --session "
-                f"{session.path}"
+                f"stopped with {missing_count} sets missing; continue with --session {session.path}"
             )
             with contextlib.suppress(HoldError, errors.DeviceError):
                 self._come_back(session)
@@ -104,12 +104,16 @@ class Procedure:
         head = session.head
         far_um = max(head.setpoints_um, key=lambda each: abs(each - head.start_um))
         back_s = move_and_set_s(self.held, far_um, head.start_um, self.link.config)
-        self.progress.begin(f"back to {head.start_um:g} µm (Ctrl-C stops waiting)", back_s, 0.0)
+        self.progress.begin_step(
+            f"back to {head.start_um:g} µm (Ctrl-C stops waiting)", back_s, 0.0
+        )
         try:
-            self.sweep.go(head.start_um, back_s)
+            self.sweep.go_to_setpoint(head.start_um, back_s)
         except KeyboardInterrupt:
             off = "; then switch the shape loop on (ctl shape on)" if head.shape_on else ""
-            self.progress.say(f"left: the hold continues its ramp to {head.start_um:g} µm{off}")
+            self.progress.print_line(
+                f"left: the hold continues its ramp to {head.start_um:g} µm{off}"
+            )
             raise
         if head.shape_on:
             self.sweep.shape_loop(True)

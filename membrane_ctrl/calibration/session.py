@@ -32,25 +32,25 @@ class CalibrationSession:
     config: schema.Config
 
     @property
-    def sets(self) -> tuple[Path, ...]:
+    def set_folders(self) -> tuple[Path, ...]:
         """Folders of all sets, existing or not."""
         return tuple(
             self.path / "sets" / f"set-{k + 1}" for k in range(len(self.head.setpoints_um))
         )
 
     @property
-    def missing(self) -> tuple[int, ...]:
+    def missing_indices(self) -> tuple[int, ...]:
         """Indices of the missing sets."""
-        return tuple(k for k, folder in enumerate(self.sets) if not folder.exists())
+        return tuple(k for k, folder in enumerate(self.set_folders) if not folder.exists())
 
     @property
-    def geometry(self) -> Path:
+    def geometry_path(self) -> Path:
         """Path of the result."""
         return self.path / "geometry.toml"
 
-    def keep(self, index: int, taken: Path) -> None:
+    def keep_set(self, index: int, taken: Path) -> None:
         """Copy a set from the run's folder, atomically. Raises DeviceError."""
-        folder = self.sets[index]
+        folder = self.set_folders[index]
         part = folder.with_name(f".{folder.name}.part")
         try:
             folder.parent.mkdir(exist_ok=True)

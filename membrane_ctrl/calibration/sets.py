@@ -236,7 +236,7 @@ def read_sets(
         if head.artefact == "screen":
             phases = phases_of_screen(read_set(folder, stated))
         else:
-            figure = figures.of(folder)
+            figure = figures.measure_folder(folder)
             head = figure.head
             phases = replace(
                 phases_of(folder.name, figure.checked, head.optics), artefact=figure.artefact
@@ -348,7 +348,7 @@ def with_priors(bundle: Bundle, priors: Sequence[prior_file.Prior]) -> Bundle:
     """
     optics = bundle.optics
     for prior in priors:
-        optics = prior.over(optics)
+        optics = prior.apply_to_optics(optics)
     return replace(bundle, optics=optics)
 
 

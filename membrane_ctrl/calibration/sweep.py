@@ -48,7 +48,7 @@ class Sweep:
         self._last_s = math.nan
         self._why = ""
 
-    def look(self) -> HeldMirror:
+    def observe_hold(self) -> HeldMirror:
         """Observe the held mirror for some seconds and a shape. Raises HoldError, or DeviceError
         without a camera.
         """
@@ -77,11 +77,11 @@ class Sweep:
             shape_on=newest.shape_state != telemetry.ShapeState.OFF,
         )
 
-    def claim(self, setpoint_um: float) -> None:
+    def claim_command(self, setpoint_um: float) -> None:
         """Take command without a motion, by repeating the setpoint. Raises HoldError if refused."""
         self._send_command("setpoint", setpoint_um)
 
-    def go(self, setpoint_um: float, expected_s: float) -> None:
+    def go_to_setpoint(self, setpoint_um: float, expected_s: float) -> None:
         """Ramp to a setpoint and settle.
 
         Raises HoldError if the mirror is no longer held or someone else moves it; DeviceError if it
@@ -114,7 +114,7 @@ class Sweep:
                     "s; paused, or too tight?"
                 )
 
-    def take(self) -> acquisition_events.Capture:
+    def take_set(self) -> acquisition_events.Capture:
         """Request a set; repeat a bad one once.
 
         Raises HoldError if the hold refuses or the mirror is no longer held; RejectedError if both
@@ -150,11 +150,11 @@ class Sweep:
         return abs(_mean_of_finite(last)) < self._limits.band_um
 
     def _send_command(self, kind: Kind, value: float = math.nan) -> None:
-        self._link.ask(Command(kind, "calibration", WHY, value=value))
+        self._link.send_command(Command(kind, "calibration", WHY, value=value))
 
     def _read_news(self) -> News:
         """New ticks, events and shapes. Raises HoldError if the mirror is no longer held."""
-        news = self._link.news()
+        news = self._link.read_news()
         for event in news.events:
             if isinstance(event, events.StateEntered):
                 self._why = f" ({event.why})"

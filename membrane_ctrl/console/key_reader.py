@@ -34,7 +34,7 @@ class Keyboard:
                 return cls(os.ttyname(0), termios.tcgetattr(0))
         return None
 
-    def restore(self) -> None:
+    def restore_modes(self) -> None:
         """Restore the modes after a killed console; in the background they are the shell's."""
         with suppress(OSError, termios.error):
             if job_control.in_foreground(0):

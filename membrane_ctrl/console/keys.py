@@ -30,12 +30,12 @@ class Desk:
         self.help = False
 
     @property
-    def asks(self) -> bool:
+    def is_asking(self) -> bool:
         """Whether the last line waits for the operator."""
         return bool(self._prompt)
 
     @property
-    def foot(self) -> str:
+    def bottom_line(self) -> str:
         """The console's last line."""
         if self._answer is not None and self._answer.done():
             self._said, self._answer = self._answer.result(), None
@@ -46,7 +46,7 @@ class Desk:
                 return "stop the run? y: yes, any other key: no"
         return f"{self._said}   · {_FOOT}" if self._said else _FOOT
 
-    def typed(self, text: str, paused: bool) -> None:
+    def process_keys(self, text: str, paused: bool) -> None:
         """Take what was typed. Of several characters at once only the first is a command: the rest
         may be a paste.
         """

@@ -42,7 +42,7 @@ class Trend:
         if math.isfinite(value):
             self._seconds[-1][1].append(value)
 
-    def means(self) -> tuple[float, ...]:
+    def second_means(self) -> tuple[float, ...]:
         """Mean of each of the last `TREND_S` seconds, oldest first; NaN for a gap."""
         if not self._seconds:
             return (math.nan,) * TREND_S
@@ -54,7 +54,7 @@ class Trend:
             known.get(second, math.nan) for second in range(newest - TREND_S + 1, newest + 1)
         )
 
-    def values(self) -> list[float]:
+    def finite_values(self) -> list[float]:
         """Every finite value of the last minute, oldest first."""
         if not self._seconds:
             return []
@@ -136,7 +136,7 @@ class ConsoleModel:
         self._events: deque[events.EventLine] = deque(maxlen=_EVENTS_KEPT)
 
     @property
-    def ended(self) -> bool:
+    def has_ended(self) -> bool:
         """The "end" event has arrived."""
         return self._status.ended
 
@@ -168,11 +168,11 @@ class ConsoleModel:
             ):
                 self._reference = estimate
 
-    def view(self, now_s: float) -> ConsoleView:
+    def make_view(self, now_s: float) -> ConsoleView:
         """The content at a time of the run's clock."""
         status, row = self._status, self._status.row
         in_force = self._config.with_gains(status.loop)
-        errors = self._error.values()
+        errors = self._error.finite_values()
         band_um = self._config.limits.band_um
         age_s = now_s - row.mono_s if row else 0.0
         return ConsoleView(
@@ -188,11 +188,11 @@ class ConsoleModel:
             state_age_s=max(0.0, now_s - self._status.since_s),
             elapsed_s=now_s,
             left_s=max(0.0, self._duration_s - (now_s - self._started_s if row else 0.0)),
-            trend_um=self._error.means(),
+            trend_um=self._error.second_means(),
             error_mean_um=fmean(errors) if errors else math.nan,
             error_std_um=pstdev(errors) if errors else math.nan,
             in_band_fraction=fmean(abs(e) <= band_um for e in errors) if errors else math.nan,
-            lateness_max_ms=max(self._lateness.values(), default=math.nan),
+            lateness_max_ms=max(self._lateness.finite_values(), default=math.nan),
             fault=fault_words(status.fault),
             remedy=status.fault.remedy if status.fault else "",
             faults=status.faults,

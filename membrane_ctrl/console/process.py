@@ -47,16 +47,16 @@ def format_line(view: model.ConsoleView) -> str:
         return f"{view.elapsed_s:9.1f} s  {silent}"
     parts = [
         f"{view.elapsed_s:9.1f} s  {view.state.name.lower():7}",
-        row.labelled("error_um", sign=True, width=7),
+        row.format_labelled("error_um", sign=True, width=7),
         f"pump {why.format_percent(row.pump_fraction):>5}",
-        row.labelled("leak_um_per_s") + (" TOO TIGHT" if view.too_tight else ""),
+        row.format_labelled("leak_um_per_s") + (" TOO TIGHT" if view.too_tight else ""),
         *(
             [f"held by {why.list_used_sensors(row)}"]
             if math.isfinite(row.estimate_sigma_um)
             else []
         ),
-        f"shape {_shape_words(view)} {row.labelled('trim_um', sign=True)}",
-        row.labelled("lateness_ms"),
+        f"shape {_shape_words(view)} {row.format_labelled('trim_um', sign=True)}",
+        row.format_labelled("lateness_ms"),
         view.why,
     ]
     parts += [f"LOCKED {lock}" for lock in view.locks]
@@ -106,7 +106,7 @@ def console_main(spec: ConsoleSpec, status: Connection | None = None) -> None:
     with closing(_Feed(spec)) as feed:
 
         def rounds(show: Callable[[], object]) -> None:
-            while not feed.model.ended and child.parent_lives():
+            while not feed.model.has_ended and child.parent_lives():
                 show()
                 report(child_events.Alive(_HANGS_S))
                 time.sleep(_LOOK_S)
@@ -132,7 +132,7 @@ def _draw_console(
 def give_back_terminal(keyboard: key_reader.Keyboard | None = None) -> None:
     """Restore the terminal's main page, cursor and modes after a killed console."""
     if keyboard is not None:
-        keyboard.restore()
+        keyboard.restore_modes()
     with suppress(OSError):
         terminal = getattr(
             sys.stderr, "rich_proxied_file", sys.stderr
@@ -195,12 +195,14 @@ def _draw_on_terminal(
             if not job_control.in_foreground(handle):
                 live.stop()
                 return
-            view = feed.model.view(spec.clock.now())
+            view = feed.model.make_view(spec.clock.now())
             if reader is None:
                 page = ConsolePage(view, spec.config, run)
             else:
-                desk.typed(reader.read(), view.paused)
-                page = ConsolePage(view, spec.config, run, desk.foot, desk.asks, desk.help)
+                desk.process_keys(reader.read(), view.paused)
+                page = ConsolePage(
+                    view, spec.config, run, desk.bottom_line, desk.is_asking, desk.help
+                )
             live.start()
             live.update(terminal.Plain(page), refresh=True)
 
@@ -209,7 +211,7 @@ def _draw_on_terminal(
         finally:
             live.stop()
     print(
-        format_line(feed.model.view(spec.clock.now())), file=sys.stderr
+        format_line(feed.model.make_view(spec.clock.now())), file=sys.stderr
     )  # a last line that remains
 
 
@@ -243,7 +245,7 @@ def _print_lines(spec: ConsoleSpec, feed: _Feed) -> Iterator[Callable[[], None]]
         ]
         now_s = spec.clock.now()
         if now_s >= due_s:
-            lines.append(format_line(feed.model.view(now_s)))
+            lines.append(format_line(feed.model.make_view(now_s)))
             due_s = now_s - (now_s - due_s) % _PLAIN_S + _PLAIN_S
         for each in lines:
             print(each, file=sys.stderr, flush=True)

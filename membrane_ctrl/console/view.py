@@ -288,7 +288,7 @@ def _format_error(view: ConsoleView, config: Config) -> Text:
     inside = abs(row.error_um) <= config.limits.band_um
     style = "bold green" if inside else "bold red" if math.isfinite(row.error_um) else "dim"
     error = COLUMNS["error_um"]
-    text = Text(f"{row.quantity('error_um', sign=True):>10}", style=style)
+    text = Text(f"{row.format_quantity('error_um', sign=True):>10}", style=style)
     mean, std = (
         error.format_value(view.error_mean_um, sign=True),
         error.format_value(view.error_std_um),
@@ -318,23 +318,29 @@ def _list_other_columns(row: telemetry.TelemetryRow, *groups: columns.Group) -> 
     shown = [
         each.name for each in PUBLISHED if each.plot.group in groups and each.name not in _PLACED
     ]
-    return "".join(f"  {row.labelled(name)}" for name in shown if math.isfinite(getattr(row, name)))
+    return "".join(
+        f"  {row.format_labelled(name)}" for name in shown if math.isfinite(getattr(row, name))
+    )
 
 
 def _format_mirror(row: telemetry.TelemetryRow) -> Text:
-    text = Text.assemble("reading ", (row.quantity("displacement_um", sign=True), "bold"))
+    text = Text.assemble("reading ", (row.format_quantity("displacement_um", sign=True), "bold"))
     text.append(
         "  "
-        f"{row.labelled('setpoint_um', sign=True)}{_list_other_columns(row, columns.Group.LOOP, columns.Group.ESTIMATE)}"  # noqa: E501
+        f"{row.format_labelled('setpoint_um', sign=True)}{_list_other_columns(row, columns.Group.LOOP, columns.Group.ESTIMATE)}"  # noqa: E501
     )
     if math.isfinite(row.estimate_sigma_um):
         text.append(
-            f"  centre ± {row.quantity('estimate_sigma_um')} by {list_used_sensors(row)}",
+            f"  centre ± {row.format_quantity('estimate_sigma_um')} by {list_used_sensors(row)}",
             style="green",
         )
     if math.isfinite(row.truth_displacement_um):
-        text.append(f"  truth {row.quantity('truth_displacement_um', sign=True)}", style="cyan")
-        text.append(f" (laser {row.quantity('truth_laser_bias_um', sign=True)})", style="dim")
+        text.append(
+            f"  truth {row.format_quantity('truth_displacement_um', sign=True)}", style="cyan"
+        )
+        text.append(
+            f" (laser {row.format_quantity('truth_laser_bias_um', sign=True)})", style="dim"
+        )
     return text
 
 
@@ -363,7 +369,7 @@ def _format_flow(row: telemetry.TelemetryRow) -> Text:
 
 
 def _format_gas(view: ConsoleView, row: telemetry.TelemetryRow) -> Text:
-    text = Text(row.labelled("leak_um_per_s"))
+    text = Text(row.format_labelled("leak_um_per_s"))
     if view.too_tight:
         text.append(" too tight: open the bleed", style="bold yellow")
     return text.append(_list_other_columns(row, columns.Group.ENVIRONMENT))
@@ -373,10 +379,9 @@ def _make_shape_items(
     shape: ShapeView, row: telemetry.TelemetryRow
 ) -> list[tuple[str, RenderableType]]:
     state = Text(shape.state.name.lower(), style=_SHAPE_STYLES.get(shape.state, "default"))
-    state.append(
-        f"  {row.labelled('trim_um', sign=True)}{_list_other_columns(row, columns.Group.SHAPE)}",
-        style="default",
-    )
+    trim = row.format_labelled("trim_um", sign=True)
+    others = _list_other_columns(row, columns.Group.SHAPE)
+    state.append(f"  {trim}{others}", style="default")
     estimate = shape.estimate
     change = format_number(shape.sag_change_um, 3, sign=True)
     if change != MISSING:
@@ -404,7 +409,7 @@ def _make_shape_items(
 def _format_lateness(view: ConsoleView, row: telemetry.TelemetryRow) -> Text:
     late = COLUMNS["lateness_ms"]
     text = Text(
-        f"{row.quantity('lateness_ms')}, worst of the minute "
+        f"{row.format_quantity('lateness_ms')}, worst of the minute "
         f"{late.format_value(view.lateness_max_ms)}"
     )
     text.append(f" {late.unit}{_list_other_columns(row, columns.Group.TIMING)}")

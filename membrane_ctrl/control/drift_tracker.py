@@ -35,17 +35,17 @@ class DriftTracker(StateNode):
         self.value_um = 0.0
         self.rate_um_per_s = 0.0
 
-    def at(self, time_s: float, memory_s: float) -> float:
+    def drift_at(self, time_s: float, memory_s: float) -> float:
         """Value in µm expected at a time (not before the last reading's); a rate is believed for
         one memory.
         """
         return self.value_um + self.rate_um_per_s * min(time_s - self.time_s, memory_s)
 
-    def take(self, reading_um: float, time_s: float, memory_s: float) -> None:
+    def add_reading(self, reading_um: float, time_s: float, memory_s: float) -> None:
         """Take a reading, later than the last one, into the memory."""
         dt_s = time_s - self.time_s
         beta = math.exp(-dt_s / memory_s)
-        expected_um = self.at(time_s, memory_s)
+        expected_um = self.drift_at(time_s, memory_s)
         residual_um = reading_um - expected_um
         self.value_um = expected_um + (1.0 - beta**2) * residual_um
         self.rate_um_per_s += (1.0 - beta) ** 2 * residual_um / dt_s

@@ -90,8 +90,8 @@ class InnerLoopState(StateNode):
 class InnerLoop:
     """Two-degree-of-freedom PI(D) with feed-forward, on flow as a speed of the mirror's centre.
 
-    Call exactly one of `step`, `stale`, `follow` and `resume` per tick; the first three may follow
-    each other without a bump.
+    Call exactly one of `step`, `step_without_reading`, `follow_flow` and `resume_at_mean` per tick;
+    the first three may follow each other without a bump.
     """
 
     def __init__(
@@ -141,7 +141,7 @@ class InnerLoop:
 
     @property
     def mean_flow_um_per_s(self) -> float:
-        """The mean flow, which `stale` puts out."""
+        """The mean flow, which `step_without_reading` puts out."""
         return self._pid.integral_um_per_s
 
     @property
@@ -173,17 +173,17 @@ class InnerLoop:
         self._stand_at(displacement_um)
         self._ramp.place(math.nan)  # placed by the first step, which knows the trim
         self._pid.place(self._limiter.place(flow_um_per_s))
-        self._curve.stopped()
-        self.memory.leak.pause()
+        self._curve.note_stop()
+        self.memory.leak.skip_step()
 
     def step(self, given: LoopInput, dt_s: float) -> LoopOutput:
         """Run one automatic tick, on the estimate if there is one; `dt_s` must exceed 0.
 
-        Without either, the reading counts as missing (`stale`).
+        Without either, the reading counts as missing (`step_without_reading`).
         """
         self.memory.learned = False
         if given.estimate is None and not math.isfinite(given.displacement_um):
-            return self.stale(given, dt_s)
+            return self.step_without_reading(given, dt_s)
         weather_um_per_s = self._feedforward.update(
             given.ambient_pressure_pa, given.air_temperature_c, dt_s
         )
@@ -210,13 +210,13 @@ class InnerLoop:
                 given.displacement_um, self._curve.flow(fraction), dt_s
             )
         else:
-            self._drift.spoil()
+            self._drift.discard_segment()
         if given.estimate is None:
             self.memory.leak.update(
                 self._flow(fraction) - weather_um_per_s, given.displacement_um, filtered_um, dt_s
             )
         else:
-            self.memory.leak.take(given.estimate.leak_um_per_s, filtered_um, dt_s)
+            self.memory.leak.add_loss(given.estimate.leak_um_per_s, filtered_um, dt_s)
         return self._output(
             terms, known_um_per_s + ramp_um_per_s, wanted_um_per_s, fraction, filtered_um
         )
@@ -252,7 +252,7 @@ class InnerLoop:
         terms = pid.PidTerms(p_um_per_s, self._pid.integral_um_per_s, 0.0)
         return terms, ramp_um_per_s
 
-    def stale(self, given: LoopInput, dt_s: float) -> LoopOutput:
+    def step_without_reading(self, given: LoopInput, dt_s: float) -> LoopOutput:
         """One tick without control: the integrator is frozen and put out, for it is the mean flow.
 
         Repeating the last reading instead would integrate its error: 5 times the excursion
@@ -264,7 +264,7 @@ class InnerLoop:
         if not math.isnan(self._ramp.value_um):
             self.memory.setpoint_um = self._ramp.value_um + given.trim_um
         self._feedforward.update(math.nan, math.nan, dt_s)
-        self.memory.leak.pause()
+        self.memory.leak.skip_step()
         self._spoil()
         mean_um_per_s = self._pid.integral_um_per_s
         self._limiter.limit(mean_um_per_s, dt_s)
@@ -273,7 +273,7 @@ class InnerLoop:
             pid.PidTerms(0.0, mean_um_per_s, 0.0), 0.0, mean_um_per_s, fraction, filtered_um
         )
 
-    def follow(self, given: LoopInput, flow_um_per_s: float, dt_s: float) -> LoopOutput:
+    def follow_flow(self, given: LoopInput, flow_um_per_s: float, dt_s: float) -> LoopOutput:
         """Run one tick with an external flow (manual, tuning, ramp-down), within the pump's range.
 
         The setpoint stands at the last finite reading and the integrator at the flow, so that
@@ -298,7 +298,7 @@ class InnerLoop:
                 pumped_um_per_s, given.displacement_um, self.memory.measured.value, dt_s
             )
         else:
-            self.memory.leak.pause()
+            self.memory.leak.skip_step()
         terms = pid.PidTerms(0.0, self._pid.integral_um_per_s, 0.0)
         filtered_um = self.memory.measured.value if seen else math.nan
         return replace(
@@ -306,25 +306,25 @@ class InnerLoop:
             error_um=math.nan,
         )
 
-    def resume(self, given: LoopInput, mean_um_per_s: float, dt_s: float) -> LoopOutput:
-        """`follow` with the flow that holds the mirror on average: what answers the weather then
-        comes on top.
+    def resume_at_mean(self, given: LoopInput, mean_um_per_s: float, dt_s: float) -> LoopOutput:
+        """`follow_flow` with the flow that holds the mirror on average: the feed-forward of the
+        weather is added to it.
 
-        Were the weather's present share taken out of the mean, as `follow` does for a flow that a
-        person has set, the integrator would stand wrong by a gust's worth.
+        If the weather's present share were taken out of the mean, as `follow_flow` does for a flow
+        that a person has set, the integrator would be wrong by the present gust.
         """
-        output = self.follow(given, mean_um_per_s, dt_s)
+        output = self.follow_flow(given, mean_um_per_s, dt_s)
         self._pid.place(self._limiter.flow_um_per_s)
         return output
 
     def follow_raw(self, given: LoopInput, fraction: float, dt_s: float) -> LoopOutput:
-        """`follow` with a raw pump command, which is output unchanged; whether the pump runs is
-        unknown.
+        """`follow_flow` with a raw pump command, which is output unchanged; whether the pump runs
+        is unknown.
         """
         flow_um_per_s = self._flow(fraction)
-        output = self.follow(given, flow_um_per_s, dt_s)
-        self._curve.stopped()
-        self.memory.leak.pause()
+        output = self.follow_flow(given, flow_um_per_s, dt_s)
+        self._curve.note_stop()
+        self.memory.leak.skip_step()
         output = replace(output, feedforward_um_per_s=0.0, leak_um_per_s=math.nan)
         return replace(output, flow_um_per_s=self._flow(fraction), pump_fraction=fraction)
 
@@ -356,7 +356,7 @@ class InnerLoop:
 
     def _spoil(self) -> None:
         self.memory.learned = False
-        self._drift.spoil()
+        self._drift.discard_segment()
 
     def set_pump(self, pump: PumpConfig) -> None:
         """Take another curve of the pump: the mean flow becomes what
@@ -373,7 +373,7 @@ class InnerLoop:
         )
         self.set_gains(self._loop)
         self._pid.place(self._limiter.place(self._curve.flow(mean_fraction)))
-        self.memory.leak.pause()
+        self.memory.leak.skip_step()
 
     def _stand_at(self, setpoint_um: float) -> None:
         """Put everything that follows the setpoint to rest there."""

@@ -67,15 +67,15 @@ class LeakEstimate(StateNode):
         """
         jumps = abs(displacement_um - filtered_um) > JUMP_UM
         if math.isfinite(self.last_um) and not jumps:
-            self.take(pumped_um_per_s - (filtered_um - self.last_um) / dt_s, filtered_um, dt_s)
+            self.add_loss(pumped_um_per_s - (filtered_um - self.last_um) / dt_s, filtered_um, dt_s)
         self.last_um = displacement_um if jumps else filtered_um  # where the filter will be
 
-    def take(self, loss_um_per_s: float, centre_um: float, dt_s: float) -> None:
+    def add_loss(self, loss_um_per_s: float, centre_um: float, dt_s: float) -> None:
         """Take a step's loss that is known, and where it ends."""
         self.elapsed_s = min(self.elapsed_s + dt_s, WINDOW_S)
         self.mean_um_per_s += dt_s / self.elapsed_s * (loss_um_per_s - self.mean_um_per_s)
         self.last_um = centre_um
 
-    def pause(self) -> None:
+    def skip_step(self) -> None:
         """Skip a step without a reading."""
         self.last_um = math.nan

@@ -35,9 +35,9 @@ class LeakGrowth(StateNode):
         """Forget the usual consumption."""
         self.usual.reset(math.nan)
         self.flow.reset(math.nan)
-        self.moves()
+        self.note_ramp()
 
-    def moves(self) -> None:
+    def note_ramp(self) -> None:
         """The setpoint ramps: the mean includes the ramp's gas,
         with the error of the pump's map.
         """

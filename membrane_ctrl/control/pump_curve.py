@@ -158,7 +158,7 @@ class PumpCurve:
         """The smallest flow of a running pump."""
         return self._falling.flow(self._least_fraction)
 
-    def stopped(self) -> None:
+    def note_stop(self) -> None:
         """Note that something else stopped the pump: the next flow starts it."""
         self.memory.kick_left_s = KICK_S
         self.memory.flow_um_per_s = 0.0
@@ -177,7 +177,7 @@ class PumpCurve:
     def command(self, flow_um_per_s: float, dt_s: float) -> float:
         """Command for a flow; a stopped pump gets a start pulse."""
         if flow_um_per_s <= 0.5 * self.least_flow_um_per_s:
-            self.stopped()
+            self.note_stop()
             return 0.0
         memory = self.memory
         branch = self._rising if flow_um_per_s > memory.flow_um_per_s else self._falling

@@ -119,7 +119,7 @@ class PumpDrift:
             memory.sign * amplitude_um * PROBE_RAD_PER_S * math.sin(PROBE_RAD_PER_S * memory.time_s)
         )
 
-    def spoil(self) -> None:
+    def discard_segment(self) -> None:
         """The segment cannot be used: no reading, or the flow was not the loop's."""
         self.memory.whole = False
 

@@ -210,7 +210,7 @@ class ShapeLoop:
         memory, reference = self.memory, self.memory.reference
         if memory.state == telemetry.ShapeState.WAITING:
             memory.admitted_s = estimate.time_s
-            reference.take(estimate)
+            reference.add_estimate(estimate)
             taken = f"reference: shape {reference.count} of {reference.wanted}"
             memory.reason = make_reason(ShapeCode.REFERENCE, taken)
             if reference.complete:
@@ -224,7 +224,7 @@ class ShapeLoop:
             estimate.coeffs_um, reference.coeffs_um, estimate.covariance_um2, self._sensitivity
         )
         drift_um = estimate.displacement_um - reference.displacement_um - change.change_um
-        apart_um = drift_um - memory.drift.at(estimate.time_s, self._time_constant_s)
+        apart_um = drift_um - memory.drift.drift_at(estimate.time_s, self._time_constant_s)
         if abs(apart_um) > self._config.disagreement_max_um:
             apart = (
                 f"camera and laser disagree by {apart_um:+.1f} µm: check the laser's mount, or "
@@ -234,7 +234,7 @@ class ShapeLoop:
             return
         memory.admitted_s = estimate.time_s
         memory.change = change
-        memory.drift.take(drift_um, estimate.time_s, self._time_constant_s)
+        memory.drift.add_reading(drift_um, estimate.time_s, self._time_constant_s)
         memory.state = telemetry.ShapeState.TRACKING
         memory.reason = NO_REASON
 
@@ -242,7 +242,7 @@ class ShapeLoop:
         """Move the trim to the drift, bounded in rate and range."""
         config = self._config
         memory = self.memory
-        goal_um = memory.base_um + memory.drift.at(now_s, self._time_constant_s)
+        goal_um = memory.base_um + memory.drift.drift_at(now_s, self._time_constant_s)
         bounded_um = min(max(goal_um, -config.trim_max_um), config.trim_max_um)
         step_um = config.trim_rate_max_um_per_s * dt_s
         memory.trim_um += min(max(bounded_um - memory.trim_um, -step_um), step_um)

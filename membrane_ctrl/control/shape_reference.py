@@ -55,7 +55,7 @@ class ReferenceMean(StateNode):
         """Whether there are enough."""
         return self.count >= self.wanted
 
-    def take(self, estimate: shape_estimate.ShapeEstimate) -> None:
+    def add_estimate(self, estimate: shape_estimate.ShapeEstimate) -> None:
         """Take one more; of single frames, one per `TRACKED_EVERY_S`."""
         of_frame = estimate.kind == "track"
         if self.taken and of_frame and estimate.time_s < self.taken[-1].time_s + TRACKED_EVERY_S:

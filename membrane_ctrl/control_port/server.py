@@ -76,7 +76,7 @@ class Port:
         self._turns = ReadingTurns()
         self._over = False
 
-    def heard(self, outputs: tick.TickOutputs) -> None:
+    def handle_tick(self, outputs: tick.TickOutputs) -> None:
         """Note a tick's outputs, and answer the clients whose commands it took."""
         self._status = self._status.after_row(outputs.row)
         for event in outputs.events:
@@ -97,7 +97,7 @@ class Port:
             if future is not None and not future.done():
                 future.set_result(refusal)
 
-    def told(self, event: events.Event) -> None:
+    def note_report(self, event: events.Event) -> None:
         """Note a child process's report."""
         self._status = self._status.after_event(event)
         for session in self._sessions:

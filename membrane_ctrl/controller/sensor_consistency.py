@@ -185,7 +185,7 @@ class SensorConsistency:
             return events + self._rest()
         moves = state not in (State.SETTLE, State.HOLD) or abs(held.ramp_left_um) > self._far_um
         if moves:
-            self.memory.growth.moves()
+            self.memory.growth.note_ramp()
             self.memory.gas_excess = ""
         self._look_at_camera(held.figure)
         events += self._judge_weather(inputs, dt_s)
@@ -252,7 +252,7 @@ class SensorConsistency:
         """Reset: the mirror is not held, or not yet at its setpoint."""
         self.memory.laser_fault_s = 0.0
         self.laser_moved = False
-        self.memory.growth.moves()
+        self.memory.growth.note_ramp()
         self.memory.gas_excess = ""
         self._plausibility.reset()
         return self._judge(FaultySensor.NONE)

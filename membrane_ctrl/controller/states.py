@@ -138,7 +138,9 @@ def hold(context: TickContext) -> State:
     """Hold the mirror at its setpoint."""
     if context.paused:
         context.drive_by(
-            context.loop.stale(_make_loop_input(context, context.setpoint_um), context.dt_s)
+            context.loop.step_without_reading(
+                _make_loop_input(context, context.setpoint_um), context.dt_s
+            )
         )
         context.explain(
             WhyCode.PAUSED, f"paused by {context.asked_by}: the pump keeps its mean flow"
@@ -165,7 +167,7 @@ def manual(context: TickContext) -> State:
     over = _manual_over(context)
     flow_um_per_s = context.mean_flow_um_per_s if over else context.manual_um_per_s
     context.drive_by(
-        context.loop.follow(
+        context.loop.follow_flow(
             _make_loop_input(context, context.setpoint_um), flow_um_per_s, context.dt_s
         )
     )
@@ -195,13 +197,17 @@ def tune(context: TickContext) -> State:
     else:
         wanted = trial.step(measurement, context.dt_s)
     if isinstance(wanted, Finished):
-        context.drive_by(context.loop.resume(given, trial.spec.holding_flow_um_per_s, context.dt_s))
+        context.drive_by(
+            context.loop.resume_at_mean(given, trial.spec.holding_flow_um_per_s, context.dt_s)
+        )
         context.trial_ended = wanted
         ended = f"{trial.spec.kind} {'done' if wanted.completed else 'stopped'}: {wanted.reason}"
         context.explain(WhyCode.EXPERIMENT_ENDED, ended, trial.spec.kind, wanted.completed)
         return State.HOLD
     context.drive_by(
-        (context.loop.follow_raw if trial.raw else context.loop.follow)(given, wanted, context.dt_s)
+        (context.loop.follow_raw if trial.raw else context.loop.follow_flow)(
+            given, wanted, context.dt_s
+        )
     )
     tuning = f"tuning: {trial.spec.kind} requested by {context.asked_by}"
     context.explain(WhyCode.EXPERIMENT, tuning, trial.spec.kind, context.asked_by)
@@ -416,7 +422,9 @@ def _begin_loop(context: TickContext, leak_um_per_s: float) -> State:
 
 def _drive_pump(context: TickContext, target_um: float) -> inner_loop.LoopOutput:
     """Let the loop drive the pump: automatic with a valid reading, held mean flow without one."""
-    drive = context.loop.step if context.levels.safe_level == SafeLevel.NONE else context.loop.stale
+    drive = context.loop.step_without_reading
+    if context.levels.safe_level == SafeLevel.NONE:
+        drive = context.loop.step
     output = drive(_make_loop_input(context, target_um), context.dt_s)
     context.drive_by(output)
     return output

@@ -29,13 +29,13 @@ class TickAssembler:
 
     def add_snapshots(self, messages: list[bytes]) -> None:
         """Add messages of the ring of snapshots, for the ticks of
-        this or a later call of `take`.
+        this or a later call of `add_messages`.
         """
         for message in messages:
             (tick,) = SNAPSHOT_HEAD.unpack_from(message)
             self._snapshots[tick] = message[SNAPSHOT_HEAD.size :]
 
-    def take(self, messages: list[bytes]) -> TickBatch:
+    def add_messages(self, messages: list[bytes]) -> TickBatch:
         """Take messages in order; a tick may end in a later call than its first piece."""
         records: list[bytes] = []
         rows: list[bytes] = []

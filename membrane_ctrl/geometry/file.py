@@ -29,7 +29,7 @@ class LensTable(Section):
     principal_px: tuple[float, float]
     distortion: Distortion = ()
 
-    def over(self, camera: CameraConfig, where: Path) -> CameraConfig:
+    def apply_to_camera(self, camera: CameraConfig, where: Path) -> CameraConfig:
         """The camera with this lens. Raises InputError, naming the file, for a different camera."""
         for key in ("width_px", "height_px", "pixel_um"):
             if getattr(self, key) != getattr(camera, key):
@@ -64,7 +64,7 @@ class GeometryOrigin:
     file: str = ""  # path; empty for the set's own
     calibrated_utc: str = ""  # date; empty if not calibrated
 
-    def table(self) -> dict[str, str | None]:
+    def make_table(self) -> dict[str, str | None]:
         """The origin as a table for JSON."""
         return {
             "hash": self.hash,
@@ -85,13 +85,13 @@ class GeometryFile:
     origin: GeometryOrigin
     text: str  # content of the file, with the screen's height map included
 
-    def over(self, optics: OpticsConfig) -> OpticsConfig:
+    def apply_to_optics(self, optics: OpticsConfig) -> OpticsConfig:
         """The bench with this geometry instead of its own. Raises InputError for a different
         camera.
         """
         camera, pattern = optics.camera, optics.pattern
         if self.lens is not None:
-            camera = self.lens.over(camera, self.path)
+            camera = self.lens.apply_to_camera(camera, self.path)
         if self.pitch is not None:
             pattern = pattern.model_copy(update=self.pitch.model_dump())
         parts = {"geometry": self.geometry, "camera": camera, "pattern": pattern}

@@ -39,11 +39,11 @@ class Prior:
     path: Path
     content: PriorFile
 
-    def over(self, optics: schema.OpticsConfig) -> schema.OpticsConfig:
+    def apply_to_optics(self, optics: schema.OpticsConfig) -> schema.OpticsConfig:
         """The bench with this prior. Raises InputError for a different camera."""
         if self.content.camera is not None:
             optics = optics.model_copy(
-                update={"camera": self.content.camera.over(optics.camera, self.path)}
+                update={"camera": self.content.camera.apply_to_camera(optics.camera, self.path)}
             )
         if self.content.geometry is None:
             return optics

@@ -26,7 +26,7 @@ class RunGeometry:
     text: str = ""  # content of the file; empty without one
     note: str = ""  # why the stated geometry is used although the configuration names a file
 
-    def keep(self, run_dir: Path) -> None:
+    def copy_to_run(self, run_dir: Path) -> None:
         """Copy the file to the run's folder, for its cycles and later reviews.
         Raises InputError.
         """
@@ -66,7 +66,7 @@ def _read_if_present(path: Path | None, config: Config) -> RunGeometry:
         )
         return RunGeometry(optics, stated_origin(optics), note=note)
     file = read_geometry(path)
-    return RunGeometry(file.over(optics), file.origin, file.calibration, file.text)
+    return RunGeometry(file.apply_to_optics(optics), file.origin, file.calibration, file.text)
 
 
 def require_plausible(optics: OpticsConfig, where: Path, depth_known: bool = True) -> None:

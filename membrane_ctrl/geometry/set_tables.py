@@ -28,7 +28,7 @@ class ArtefactTable(Section):
     vertex_mm: Annotated[float, Field(ge=-1e3, le=1e3)] = 0.0
     vertex_sigma_mm: _Length = 1.0
 
-    def artefact(self, radius_mm: float, path: Path) -> Artefact | Literal["screen"]:
+    def make_artefact(self, radius_mm: float, path: Path) -> Artefact | Literal["screen"]:
         """The surface, over its disc, or the screen itself. Raises InputError."""
         if self.form == "screen":
             if len(self.model_fields_set) > 1:

@@ -79,7 +79,7 @@ class ManagedChild:
             return False
         return True
 
-    def look(self, now_s: float) -> list[events.Event]:
+    def check_child(self, now_s: float) -> list[events.Event]:
         """Return reports and fate of the child since the last call; start the next one when due
         (some ms).
         """
@@ -100,11 +100,11 @@ class ManagedChild:
         # at once, then at growing intervals: a child that dies at its start must not keep the
         # machine busy
         if now_s - self._ended_s >= pause_s(len(self._replaced_s)):
-            self.replace(now_s)
+            self.replace_child(now_s)
             said.append(child_events.ChildRestarted(name, self._count))
         return said
 
-    def replace(self, now_s: float) -> None:
+    def replace_child(self, now_s: float) -> None:
         """Start another child in its place."""
         self._line.close()
         self._count += 1
@@ -266,7 +266,7 @@ class ChildProcesses:
         return [each for each in found if each is not None]
 
     @property
-    def names(self) -> list[str]:
+    def process_names(self) -> list[str]:
         """Names of the processes."""
         return [managed.child.name for managed in self._managed_children]
 
@@ -280,13 +280,15 @@ class ChildProcesses:
         for managed in self._managed_children:
             managed.child.stop(_CHILD_STOPS_S)
 
-    def reports(self) -> list[events.Event]:
+    def read_reports(self) -> list[events.Event]:
         """The children's reports and replacements since the last call; never waits."""
         return [
-            event for managed in self._managed_children for event in managed.look(self._clock.now())
+            event
+            for managed in self._managed_children
+            for event in managed.check_child(self._clock.now())
         ]
 
-    def capture(self) -> events.Event | None:
+    def request_capture(self) -> events.Event | None:
         """Ask the acquisition to save and report a full set; returns an event if that is
         impossible.
         """
@@ -308,7 +310,7 @@ class ChildProcesses:
         if not recorder.join(_RECORDER_CLOSES_S):
             recorder.stop(0.0)  # recorder or disk hangs
         if recorder.exit_code != 0 and not self._summary.exists():  # a new one records the end
-            self._recorder.replace(self._clock.now())
+            self._recorder.replace_child(self._clock.now())
             self._recorder.child.join(_RECORDER_CLOSES_S)
         self._end_console()
         if self._alarms is not None:

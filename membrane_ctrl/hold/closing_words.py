@@ -45,7 +45,7 @@ class RunEnd:
     fault: events.Fault | None = None
     fault_s: float = math.nan
 
-    def heard(self, outputs: TickOutputs) -> None:
+    def handle_tick(self, outputs: TickOutputs) -> None:
         """Note a tick's events."""
         for event in outputs.events:
             if isinstance(event, events.Fault):

@@ -58,7 +58,7 @@ class FaultLatch:
         self._fault: events.Fault | None = None
 
     @property
-    def latched(self) -> str:
+    def latched_line(self) -> str:
         """The latched fault in one line; empty without one."""
         fault = None if self._file is None else self._file.read()
         return "" if fault is None else str(fault)
@@ -71,7 +71,7 @@ class FaultLatch:
     def __enter__(self) -> FaultLatch:
         if self._file is not None:
             with contextlib.suppress(OSError):  # a failure is reported when it matters
-                self._file.reserve()
+                self._file.reserve_space()
         return self
 
     def __exit__(self, *_: object) -> None:
@@ -80,7 +80,7 @@ class FaultLatch:
         self._disk.shutdown()
         self._report_failure()
 
-    def heard(self, outputs: tick.TickOutputs) -> None:
+    def handle_tick(self, outputs: tick.TickOutputs) -> None:
         """After a tick: latch a fault; clear an acknowledged one."""
         self._report_failure()
         for event in outputs.events:
@@ -91,7 +91,8 @@ class FaultLatch:
                     self._latch_fault(outputs.row.mono_s)
                 case events.Resumed() if self._resumes is not None:
                     self._disk.submit(
-                        self._try_write, partial(self._resumes.add, self._utc(outputs.row.mono_s))
+                        self._try_write,
+                        partial(self._resumes.add_resume, self._utc(outputs.row.mono_s)),
                     )
                 case (
                     events.StateEntered(from_="fault")
@@ -119,7 +120,7 @@ class FaultLatch:
             self._try_write(self._last)
         if not self._failing:
             self._try_write(file.sync)
-        file.release()
+        file.release_space()
 
     def _try_write(self, act: Callable[[], None]) -> None:
         try:
@@ -161,11 +162,11 @@ class SystemdNotify:
         self._send_message("STOPPING=1")
         self._socket.close()
 
-    def told(self, event: events.Event) -> None:
+    def note_report(self, event: events.Event) -> None:
         """Note a child's report for the next status line."""
         self._status = self._status.after_event(event)
 
-    def heard(self, outputs: tick.TickOutputs) -> None:
+    def handle_tick(self, outputs: tick.TickOutputs) -> None:
         """After a tick: notify, at most twice a second unless the state changes."""
         for event in outputs.events:
             self._status = self._status.after_event(event)
@@ -174,7 +175,9 @@ class SystemdNotify:
             return
         ready = "READY=1\n" if math.isinf(self._next_s) else ""
         self._next_s, self._state = row.mono_s + _NOTIFY_S, row.state
-        error = f", {row.labelled('error_um', sign=True)}" if math.isfinite(row.error_um) else ""
+        error = (
+            f", {row.format_labelled('error_um', sign=True)}" if math.isfinite(row.error_um) else ""
+        )
         fault = f", fault {row.fault:g}" if row.fault else ""
         locked = f", {len(self._status.locks)} locks" if self._status.locks else ""
         problems = self._status.recording_problems

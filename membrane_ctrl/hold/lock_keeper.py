@@ -88,7 +88,7 @@ class LockKeeper:
         self._disk.shutdown()
         self._report_failure()
 
-    def heard(self, outputs: tick.TickOutputs) -> None:
+    def handle_tick(self, outputs: tick.TickOutputs) -> None:
         """After a tick: store the locks that it set, and remove those that it removed.
 
         Parameters
@@ -113,7 +113,7 @@ class LockKeeper:
             self._look_at_s = time.monotonic() + _LOOK_S
             self._looking = self._disk.submit(self._find_new, self._storage)
 
-    def outcome(self, number: int) -> Future[str] | None:
+    def find_outcome(self, number: int) -> Future[str] | None:
         """Return the outcome of a request that set or removed a lock.
 
         Parameters

@@ -67,7 +67,7 @@ def play_scenario(word: str, logs_dir: Path, name: str | None, real_time: bool) 
                 run, ticks, run_dir, name, addresses, _LIVE_ROUND_S if real_time else _ROUND_S
             )
     print_closing_report(run_dir, as_json=False, closing=run.closing)
-    return run.virtual.exit
+    return run.virtual.exit_code
 
 
 def _ring_sizes(config: schema.Config) -> dict[str, tuple[int, int]]:
@@ -103,9 +103,9 @@ def _record_ticks(
         }
         recording = rerun_recording.Recording(run_dir, name, virtual.clock, config)
         files = recorder.Recorder(
-            run_dir, virtual.clock, config, readers, recording, None, virtual.tell
+            run_dir, virtual.clock, config, readers, recording, None, virtual.record_event
         )
-        virtual.tell(
+        virtual.record_event(
             run_events.Started(
                 "the twin in virtual time", "ordinary", "", program.program_identity()
             )
@@ -114,9 +114,9 @@ def _record_ticks(
         for _ in ticks:
             if virtual.now_s >= due_s:
                 due_s += round_s
-                files.drain()
-                files.write()
-        virtual.end()
+                files.drain_rings()
+                files.write_second()
+        virtual.end_run()
         files.finish()
 
 

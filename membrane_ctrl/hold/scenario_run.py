@@ -73,11 +73,11 @@ class ScenarioRun:
                     commands.append(due)
                 else:
                     due(self.bench)
-            tick = run.tick(tuple(commands))
+            tick = run.run_tick(tuple(commands))
             if tick is not None:
-                self.closing.heard(tick.outputs)
+                self.closing.handle_tick(tick.outputs)
             yield tick
-        self.closing.exit = run.exit
+        self.closing.exit = run.exit_code
 
     def stop(self, who: str) -> None:
         """End the run now."""

@@ -67,7 +67,9 @@ def hold_mirror(options: HoldOptions) -> int:
         # a second hold ends here, devices untouched
         listeners = sockets.listeners_for(options.config.port, logs_dir, stack)
         twin = (
-            TwinProcess.started(options.config, clock, stack, options.lab) if options.twin else None
+            TwinProcess.start_twin(options.config, clock, stack, options.lab)
+            if options.twin
+            else None
         )
         config = twin.config if twin else options.config
         assert config.devices is not None
@@ -80,7 +82,7 @@ def hold_mirror(options: HoldOptions) -> int:
         terminal.print_progress(f"connecting to {config.devices.name}")
         board = asyncio.run(identify_board(make_bench(config.devices), config, options, resumes))
         run_dir = run_folder.create_run_folder(logs_dir, options.name, clock.origin_utc, config)
-        geometry.keep(run_dir)
+        geometry.copy_to_run(run_dir)
         rings = child_processes.rings_for(config, twin.truth if twin else None, stack)
         published_rings.publish_rings(
             run_dir, {"telemetry": rings.telemetry, "events": rings.events, "shapes": rings.shapes}
@@ -88,7 +90,9 @@ def hold_mirror(options: HoldOptions) -> int:
         children = child_processes.ChildProcesses(
             config, clock, rings, run_dir, options.name, options.duration_s, listeners.path
         )
-        terminal.print_progress(f"run folder {run_dir}; starting {', '.join(children.names)}")
+        terminal.print_progress(
+            f"run folder {run_dir}; starting {', '.join(children.process_names)}"
+        )
         children.start(stack)
         if options.autotune:
             stack.callback(start_autotune(listeners.path, run_dir))

@@ -162,7 +162,7 @@ def _may_resume(name: str, config: Config, resumes: latched_fault.ResumeLog | No
     if len(resumes.ages_s(now)) >= config.resume.most_per_day:
         return False
     try:
-        resumes.add(now)
+        resumes.add_resume(now)
     except OSError:
         return False
     return True

@@ -58,8 +58,8 @@ class Wiring:
     truth: Callable[[], tuple[float, float]] | None = None
     reports: Callable[[], list[Event]] = list  # of the children since the last call
     # listeners to each tick's outputs and the children's reports; an exception in one is a fault
-    heard: Mapping[str, Callable[[TickOutputs], None]] = field(default_factory=dict)
-    told: Mapping[str, Callable[[Event], None]] = field(default_factory=dict)
+    tick_listeners: Mapping[str, Callable[[TickOutputs], None]] = field(default_factory=dict)
+    report_listeners: Mapping[str, Callable[[Event], None]] = field(default_factory=dict)
 
 
 class Supervisor:
@@ -86,11 +86,11 @@ class Supervisor:
         self.ticks = 0
         self.missed_ticks = 0
 
-    def ask(self, command: Command) -> None:
+    def queue_command(self, command: Command) -> None:
         """Hand a command to the next tick."""
         self._pending.append(command)
 
-    def tell(self, event: Event) -> None:
+    def record_event(self, event: Event) -> None:
         """Record an event, now."""
         if self._wiring.events is None:
             return
@@ -115,7 +115,7 @@ class Supervisor:
                 self.missed_ticks += skipped
                 deadline_s += skipped * self._period_s
                 if now_s >= ends_s:
-                    self.ask(Command("stop", AT_END))
+                    self.queue_command(Command("stop", AT_END))
                     ends_s = math.inf
                 _, outputs = await self.tick(now_s, round(now_s - last_s, 6), late_s)
                 last_s = now_s
@@ -174,8 +174,8 @@ class Supervisor:
         await self._write(outputs.command)
         self._record_tick(inputs, outputs)
         for event in outputs.events:
-            self.tell(event)
-        for name, hear in wiring.heard.items():
+            self.record_event(event)
+        for name, hear in wiring.tick_listeners.items():
             self._run_guarded(name, partial(hear, outputs))
         self._record_snapshot(now_s)
         return inputs, outputs
@@ -193,7 +193,7 @@ class Supervisor:
                 pack_snapshot(self.ticks + 1, take_snapshot(self._controller))
             )
         except ValueError as error:  # a value of a wrong type, or too long
-            self.tell(run_events.SnapshotNotRecorded(str(error)))
+            self.record_event(run_events.SnapshotNotRecorded(str(error)))
 
     def _record_tick(self, inputs: TickInputs, outputs: TickOutputs) -> None:
         """Record the row, and the inputs for a replay; a value of the wrong type loses the inputs,
@@ -210,7 +210,7 @@ class Supervisor:
         except (struct.error, TypeError, ValueError) as error:
             if not self._inputs_error:
                 self._inputs_error = str(error)
-                self.tell(run_events.InputsNotRecorded(self._inputs_error))
+                self.record_event(run_events.InputsNotRecorded(self._inputs_error))
             messages = [pack_row(self.ticks, outputs.row)]
         for message in messages:
             self._wiring.inputs.put(message)
@@ -256,7 +256,7 @@ class Supervisor:
         self._link_failures.note_failure(self._link_error, self._clock.now())
 
     def _report_link(self, message: str, works: bool, count: int) -> None:
-        self.tell(run_events.Link(message, works, count if count > 1 else None))
+        self.record_event(run_events.Link(message, works, count if count > 1 else None))
 
     def _watch_sensors(self, now_s: float) -> LinkState:
         """How the single devices answered; reports those that do not."""
@@ -273,7 +273,7 @@ class Supervisor:
         return state
 
     def _report_sensor(self, role: str, message: str, works: bool, count: int) -> None:
-        self.tell(run_events.SensorLink(role, message, works, count if count > 1 else None))
+        self.record_event(run_events.SensorLink(role, message, works, count if count > 1 else None))
 
     def _newest_shape(self) -> shape_estimate.ShapeEstimate | None:
         if self._wiring.shapes is None:
@@ -283,14 +283,14 @@ class Supervisor:
         except ValueError as error:  # the shape loop continues without it
             if str(error) != self._shape_error:
                 self._shape_error = str(error)
-                self.tell(run_events.ShapeUnreadable(str(error)))
+                self.record_event(run_events.ShapeUnreadable(str(error)))
             return None
 
     def _report_children(self) -> None:
         """Report what happened to the children; the hold continues without them."""
         for report in self._wiring.reports():
-            self.tell(report)
-            for name, told in self._wiring.told.items():
+            self.record_event(report)
+            for name, told in self._wiring.report_listeners.items():
                 self._run_guarded(name, partial(told, report))
 
     def _run_guarded(self, name: str, act: Callable[[], None]) -> None:

@@ -65,30 +65,37 @@ async def run_ticks(parts: HoldResources, closing: RunEnd) -> None:
         supervisor = Supervisor(controller, wiring, clock, config.loop.rate_hz)
         settings = (lambda: controller.loop_config, lambda: controller.pump_config)
         keeper = parts.make_keeper(
-            lambda event: _record_and_notify(event, supervisor, wiring), supervisor.ask
+            lambda event: _record_and_notify(event, supervisor, wiring), supervisor.queue_command
         )
         hooks = server.RunHooks(
-            supervisor.ask, supervisor.tell, clock.now, *settings, keeper.outcome
+            supervisor.queue_command,
+            supervisor.record_event,
+            clock.now,
+            *settings,
+            keeper.find_outcome,
         )
         port = parts.make_port(hooks)
-        latch = parts.make_latch(supervisor.tell)
+        latch = parts.make_latch(supervisor.record_event)
         systemd = SystemdNotify()
-        wiring.heard = {
-            "locks": keeper.heard,  # before the port, which asks for the outcome
-            "control port": port.heard,
-            "latched-fault file": latch.heard,
-            "systemd": systemd.heard,
-            "capture": partial(_forward_captures, children, supervisor.tell),
-            "closing words": closing.heard,
+        wiring.tick_listeners = {
+            "locks": keeper.handle_tick,  # before the port, which asks for the outcome
+            "control port": port.handle_tick,
+            "latched-fault file": latch.handle_tick,
+            "systemd": systemd.handle_tick,
+            "capture": partial(_forward_captures, children, supervisor.record_event),
+            "closing words": closing.handle_tick,
         }
-        wiring.told = {"control port": port.told, "systemd": systemd.told}
+        wiring.report_listeners = {
+            "control port": port.note_report,
+            "systemd": systemd.note_report,
+        }
         started = (
             config.devices.name,
             priority.raise_priority(),
             parts.board.cleared,
             program_identity(),
         )
-        supervisor.tell(run_events.Started(*started))
+        supervisor.record_event(run_events.Started(*started))
         exit_code = errors.Exit.DEVICE_FAILED
         try:
             _send_first_commands(supervisor, options.standby, latch, parts.board, keeper.at_start)
@@ -98,26 +105,26 @@ async def run_ticks(parts: HoldResources, closing: RunEnd) -> None:
                 with _stop_on_signals(supervisor), latch, keeper, systemd:
                     # last: the board's watchdog runs from here on
                     if (await connect_bench(bench, config.devices)).map_version == 1:
-                        supervisor.tell(run_events.NoClaim(NO_CLAIM))
+                        supervisor.record_event(run_events.NoClaim(NO_CLAIM))
                     closing.exit = exit_code = await supervisor.run(options.duration_s)
         except asyncio.CancelledError:  # a signal before the first tick
             exit_code = errors.Exit.INTERRUPTED if closing.exit is None else exit_code
             raise
         except LinkError as error:
-            supervisor.tell(run_events.Link(str(error), up=False))
+            supervisor.record_event(run_events.Link(str(error), up=False))
             raise errors.DeviceError(str(error)) from None
         finally:
             await bench.close()
             ticks, missed_ticks = supervisor.ticks, supervisor.missed_ticks
-            supervisor.tell(
+            supervisor.record_event(
                 run_events.Ended(exit_code.name.lower(), int(exit_code), ticks, missed_ticks)
             )
 
 
 def _record_and_notify(event: events.Event, supervisor: Supervisor, wiring: Wiring) -> None:
     """Record an event, and pass it on as a child's report."""
-    supervisor.tell(event)
-    for told in wiring.told.values():
+    supervisor.record_event(event)
+    for told in wiring.report_listeners.values():
         told(event)
 
 
@@ -135,7 +142,7 @@ def _make_wiring(parts: HoldResources, stack: contextlib.ExitStack) -> Wiring:
     )
     truth = parts.twin.truth_reader() if parts.twin else None
     newest_shape = newest_of(shapes) if shapes else None
-    reports = parts.children.reports
+    reports = parts.children.read_reports
     return Wiring(parts.bench, rows, events, inputs, snapshots, newest_shape, truth, reports)
 
 
@@ -150,13 +157,15 @@ def _send_first_commands(
     earlier runs.
     """
     for lock in locks:
-        supervisor.ask(commands.Command("latch", commands.AT_START, text=lock.text, lock=lock))
+        supervisor.queue_command(
+            commands.Command("latch", commands.AT_START, text=lock.text, lock=lock)
+        )
     if not standby:
-        supervisor.ask(commands.Command("hold", commands.AT_START))
-    elif latched := "; ".join(part for part in (latch.latched, board.latched) if part):
-        supervisor.ask(commands.Command("latched", commands.AT_START, text=latched))
+        supervisor.queue_command(commands.Command("hold", commands.AT_START))
+    elif latched := "; ".join(part for part in (latch.latched_line, board.latched) if part):
+        supervisor.queue_command(commands.Command("latched", commands.AT_START, text=latched))
     for age_s in latch.resumes_s:
-        supervisor.ask(commands.Command("resumed", commands.AT_START, value=age_s))
+        supervisor.queue_command(commands.Command("resumed", commands.AT_START, value=age_s))
 
 
 def _forward_captures(
@@ -168,7 +177,7 @@ def _forward_captures(
     for event in outputs.events:
         match event:
             case events.CommandTaken(command="capture", refused=None) if (
-                failed := children.capture()
+                failed := children.request_capture()
             ) is not None:
                 tell(failed)
 
@@ -184,7 +193,9 @@ def _stop_on_signals(supervisor: Supervisor) -> Iterator[None]:
         numbers.append(signal.SIGHUP)
     before = {number: signal.getsignal(number) for number in [*numbers, signal.SIGTSTP]}
     for number in numbers:
-        loop.add_signal_handler(number, supervisor.ask, commands.Command("stop", number.name))
+        loop.add_signal_handler(
+            number, supervisor.queue_command, commands.Command("stop", number.name)
+        )
     signal.signal(
         signal.SIGTSTP, signal.SIG_IGN
     )  # Ctrl-Z: without ticks the board's watchdog stops the pump

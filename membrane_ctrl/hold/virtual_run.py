@@ -113,7 +113,7 @@ class VirtualRun:
         )
         bench.open()
 
-    def tick(self, commands: tuple[commands.Command, ...] = ()) -> VirtualTick | None:
+    def run_tick(self, commands: tuple[commands.Command, ...] = ()) -> VirtualTick | None:
         """Advance one period and run a tick; None if the control process does not run."""
         self._steps += 1
         self.now_s = self._steps * self._period_s  # no sum, which would drift
@@ -124,7 +124,7 @@ class VirtualRun:
             self._supervisor.missed_ticks += 1
             return None
         for command in commands:
-            self._supervisor.ask(command)
+            self._supervisor.queue_command(command)
         dt_s = self.now_s - self._last_s
         late_s = 1e-3 * self._bench.wrong.late_ms + max(0.0, dt_s - 1.5 * self._period_s)
         inputs, outputs = virtual_bench.at_once(self._supervisor.tick(self.now_s, dt_s, late_s))
@@ -135,21 +135,24 @@ class VirtualRun:
             self._bench.close()
         return VirtualTick(inputs, outputs)
 
-    def tell(self, event: events.Event) -> None:
+    def record_event(self, event: events.Event) -> None:
         """Record an event, now."""
-        self._supervisor.tell(event)
+        self._supervisor.record_event(event)
 
     @property
-    def exit(self) -> errors.Exit:
+    def exit_code(self) -> errors.Exit:
         """The exit code; `INTERRUPTED` while the run has not ended."""
         return errors.Exit.INTERRUPTED if self.finished is None else self.finished
 
-    def end(self) -> None:
+    def end_run(self) -> None:
         """Record the end of the run."""
         supervisor = self._supervisor
-        self.tell(
+        self.record_event(
             run_events.Ended(
-                self.exit.name.lower(), int(self.exit), supervisor.ticks, supervisor.missed_ticks
+                self.exit_code.name.lower(),
+                int(self.exit_code),
+                supervisor.ticks,
+                supervisor.missed_ticks,
             )
         )
 

@@ -93,14 +93,14 @@ class CaptureHead:
     before_move: schema.GeometryConfig | None = None  # the geometry without that
 
     @property
-    def fringes(self) -> list[int]:
+    def finest_frames(self) -> list[int]:
         """Frames of the finest sinusoids, which are measured."""
         return [k for k, p in enumerate(self.patterns) if p.role == "sin" and not p.period_mm]
 
     @property
     def mean_reading_um(self) -> float:
         """Mean laser reading during them, to which the figure belongs; NaN unless all have one."""
-        return float(np.mean(self.displacement_um[self.fringes]))
+        return float(np.mean(self.displacement_um[self.finest_frames]))
 
 
 @dataclass(frozen=True)
@@ -157,7 +157,7 @@ def read_head(folder: str | Path, geometry: GeometryFile | None = None) -> Captu
         {name: getattr(content, name) for name in sections}, schema.OpticsConfig, str(blamed)
     )
     if geometry is not None:
-        optics = geometry.over(optics)
+        optics = geometry.apply_to_optics(optics)
     optics = _with_reference_displacement(
         optics, content.frames[0].displacement_um if reference is None else None
     )
@@ -179,7 +179,7 @@ def read_head(folder: str | Path, geometry: GeometryFile | None = None) -> Captu
         geometry=stated_origin(optics) if geometry is None else geometry.origin,
         artefact=None
         if content.artefact is None
-        else content.artefact.artefact(content.mirror.radius_mm, path),
+        else content.artefact.make_artefact(content.mirror.radius_mm, path),
         screen_moved=moved,
         before_move=before,
     )

@@ -65,14 +65,14 @@ class ExportedMap:
         return float(self.x_mm[-1] - self.x_mm[0]) / (self.x_mm.size - 1)
 
     @property
-    def measured(self) -> BoolArray:
+    def is_measured(self) -> BoolArray:
         """Cells with a height."""
         return np.isfinite(self.height_mm)
 
     def top_down(self, counts_per_mm: float, missing: int) -> IntArray:
         """Heights as whole numbers, first row at +y."""
         whole = np.where(
-            self.measured, np.rint(np.nan_to_num(self.height_mm) * counts_per_mm), missing
+            self.is_measured, np.rint(np.nan_to_num(self.height_mm) * counts_per_mm), missing
         )
         return whole[::-1].astype(np.int64)
 
@@ -153,7 +153,7 @@ def read_result(folder: Path) -> tuple[ExportedMap, dict[str, Any]]:
 def _fit_terms(seen: ExportedMap, terms: int) -> grid_fit.GridFit:
     axes = seen.x_mm / seen.radius_mm, seen.y_mm / seen.radius_mm
     return grid_fit.GridFit(
-        axes[0], seen.measured, [zernike.fringe_set_orders(j + 1) for j in range(terms)], axes[1]
+        axes[0], seen.is_measured, [zernike.fringe_set_orders(j + 1) for j in range(terms)], axes[1]
     )
 
 
@@ -163,7 +163,7 @@ def remove_parts(seen: ExportedMap, names: list[str]) -> ExportedMap:
     Piston, tilt and power are fitted together; what is not named stays. `sphere` leaves the
     deviation along the best sphere's normal, and then the other parts of that.
     """
-    height, measured = seen.height_mm, seen.measured
+    height, measured = seen.height_mm, seen.is_measured
     if "sphere" in names:
         rows, columns = np.nonzero(measured)
         points = np.stack([seen.x_mm[columns], seen.y_mm[rows], height[measured]])

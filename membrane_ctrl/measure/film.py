@@ -47,7 +47,7 @@ class _Departure:
     left_mm: FloatArray
 
     @property
-    def explained(self) -> float:
+    def explained_share(self) -> float:
         """Share of the departure that the law explains, RMS over the area."""
         weight = self.radius_mm
         return float(
@@ -58,7 +58,10 @@ class _Departure:
 def film_command(options: FilmOptions) -> int:
     """Fit the law to the sets, write the result and report it. Raises CommandError."""
     measured = Figures(None if options.geometry is None else file.read_geometry(options.geometry))
-    sets = [measured.of(folder) for folder in terminal.track_progress(options.folders, "sets")]
+    sets = [
+        measured.measure_folder(folder)
+        for folder in terminal.track_progress(options.folders, "sets")
+    ]
     mirror = sets[0].head.optics.mirror
     for one in sets:
         if one.head.artefact is not None:
@@ -97,7 +100,7 @@ def _read_figures(
     spread, source = spread_file.geometry_spread(sets[0].head.optics, geometry)
     out = []
     for one in sets:
-        bench, surface = one.bench(), one.figure.fit.surface
+        bench, surface = one.make_trial_bench(), one.figure.fit.surface
         noise, geometric = (
             linear_covariance.noise_covariance(bench),
             linear_covariance.geometry_jacobian(bench, spread) @ spread.root(),
@@ -161,7 +164,7 @@ def _list_limits(
             f"sags, {min(sags):.1f} to "
             f"{max(sags):.1f} mm, are too close"
         )
-    if departure.explained < 1 - _UNLIKE_LAW and np.abs(departure.seen_mm).max() > 0.1:
+    if departure.explained_share < 1 - _UNLIKE_LAW and np.abs(departure.seen_mm).max() > 0.1:
         notes.append(
             "the film departs from this law: it crept between the sets, its ring moved, or "
             "it is not elastic"
@@ -213,7 +216,7 @@ def _make_fit_table(
             if wave.seen
         ],
         "misfit_um": fit.misfit_um,
-        "explained": departure.explained,
+        "explained": departure.explained_share,
         "paper_prestrain": _paper_prestrain(
             float(law.poisson), law.stiffness_n_per_m if gauged else _STIFFNESS_N_PER_M
         ),
@@ -280,7 +283,7 @@ def _draw_fit(
         left.plot(departure.radius_mm, 1e3 * rest)
     seen.set(title="less Hencky's film of the paper", xlabel="radius (mm)", ylabel="mm")
     left.set(
-        title=f"less the law ({100 * departure.explained:.1f} % explained)",
+        title=f"less the law ({100 * departure.explained_share:.1f} % explained)",
         xlabel="radius (mm)",
         ylabel="µm",
     )

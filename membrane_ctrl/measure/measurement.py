@@ -194,7 +194,7 @@ class SetFigure:
         """What stood in the mirror's place; None: the film."""
         return None if self.head.artefact == "screen" else self.head.artefact
 
-    def bench(self) -> TrialBench:
+    def make_trial_bench(self) -> TrialBench:
         """The set's bench for Monte Carlo trials."""
         return TrialBench.of(self.head.optics, self.checked, self.figure)
 
@@ -212,7 +212,7 @@ class Figures:
             "no reference read yet"
         )
 
-    def of(self, folder: str | Path) -> SetFigure:
+    def measure_folder(self, folder: str | Path) -> SetFigure:
         """Read and measure a set.
 
         Raises InputError if the set or its reference is invalid; RejectedError if its frames give
@@ -235,7 +235,7 @@ class Figures:
         if verdict == "ok":
             verdict, reason = checked.verdict
         head = capture.head
-        middle_s = float(head.time_s[head.fringes].mean())
+        middle_s = float(head.time_s[head.finest_frames].mean())
         return SetFigure(head, checked, figure, verdict, reason, middle_s, head.mean_reading_um)
 
     def _anchored_by(self, reference: Path) -> tuple[CaptureHead, Anchor]:

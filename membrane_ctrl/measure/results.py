@@ -164,7 +164,7 @@ def result_table(
         "quality": quality,
         "uncertainty": None if bars is None else bars.budget.total() | {"coverage_factor": 1},
         "budget": [] if bars is None else bars.budget.rows(),
-        "geometry": measurement.head.geometry.table(),
+        "geometry": measurement.head.geometry.make_table(),
         "geometry_known": None if bars is None else bars.statement.table(),
         "timing_s": measurement.timing_s,
         "figure": figure,

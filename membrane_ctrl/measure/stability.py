@@ -107,7 +107,7 @@ class StabilityRun:
         return rows
 
     @property
-    def used(self) -> int:
+    def used_count(self) -> int:
         """Number of sets with a figure."""
         return self._parameters.count
 
@@ -116,7 +116,7 @@ class StabilityRun:
         """Reason of the first bad set."""
         return self._bad[0]["reason"] if self._bad else ""
 
-    def skip(self, name: str, reason: str) -> None:
+    def skip_set(self, name: str, reason: str) -> None:
         """Count a bad set."""
         self._bad_count += 1
         if len(self._bad) < _NAMED_BAD:
@@ -128,7 +128,7 @@ class StabilityRun:
         grid, spread = self._grid_for(one), self._spread_for(one)
         surface = one.figure.fit.surface
         parameters = surface.parameters
-        bench = one.bench()
+        bench = one.make_trial_bench()
         try:
             trials = monte_carlo.run_trials(
                 [bench], spread, self._seed, range(self._trials), number
@@ -156,15 +156,15 @@ class StabilityRun:
         for pair in self._finder.add(figure_pairs.Moment(name, one.time_s, parameters, trials)):
             self._add_pair(grid, pair)
 
-    def table(self) -> dict[str, Any]:
+    def make_table(self) -> dict[str, Any]:
         """The content of `stability.json`, less its head."""
         sd_um = self._sd_um()
         to_coeffs = parameter_to_coeffs()
         covariance = to_coeffs @ self._parameters.covariance @ to_coeffs.T
         return {
             "sets": {
-                "found": self.used + self._bad_count,
-                "used": self.used,
+                "found": self.used_count + self._bad_count,
+                "used": self.used_count,
                 "degraded": self.degraded,
                 "bad": self._bad_count,
                 "bad_sets": self._bad,
@@ -190,11 +190,11 @@ class StabilityRun:
             },
         }
 
-    def lines(self) -> list[str]:
+    def format_lines(self) -> list[str]:
         """The result as lines of text."""
-        return stability_results.format_stability(self.table())
+        return stability_results.format_stability(self.make_table())
 
-    def draw(self) -> list[Path]:
+    def draw_pictures(self) -> list[Path]:
         """Write the SD map and the pictures and return the latter; the series must be closed.
         Raises OSError.
         """
@@ -219,14 +219,14 @@ class StabilityRun:
         stability_pictures.draw_pairs(drawn[2], axis, maps)
         return drawn
 
-    def record(self, pictures: list[Path]) -> None:
+    def write_recording(self, pictures: list[Path]) -> None:
         """Write `stability.rrd`; the series must be closed. Raises OSError."""
         if self._grid is None:
             return
         sd_um = self._grid.picture(self._sd_um())
         followed = (list(self._points_mm), *self._read_followed())
         stability_pictures.log_stability(
-            self._out / "stability.rrd", *followed, sd_um, self.lines(), pictures
+            self._out / "stability.rrd", *followed, sd_um, self.format_lines(), pictures
         )
 
     def _read_followed(self) -> tuple[FloatArray, FloatArray, FloatArray]:
@@ -251,7 +251,7 @@ class StabilityRun:
             self._spread, self._source = spread_file.geometry_spread(
                 one.head.optics, self._geometry
             )
-            self._origin = one.head.geometry.table()
+            self._origin = one.head.geometry.make_table()
         return self._spread
 
     def _sd_um(self) -> FloatArray:
@@ -321,7 +321,7 @@ def stability_command(options: StabilityOptions) -> int:
         files.make_folder(out)
         with StabilityRun(out, points, options.trials, options.seed, options.geometry) as run:
             _analyse_sets(folders, figures, run)
-        if run.used == 0:
+        if run.used_count == 0:
             raise errors.RejectedError(
                 f"{options.folder}: none of the {len(folders)} sets gave a figure "
                 f"({run.first_reason})"
@@ -330,13 +330,13 @@ def stability_command(options: StabilityOptions) -> int:
             **program.file_origin("membrane-stability/1"),
             "run": str(options.folder),
             "size_px": size_px,
-        } | run.table()
+        } | run.make_table()
         result_files.write_json(out / "stability.json", table)
-        pictures = run.draw()
+        pictures = run.draw_pictures()
         if options.rerun:
-            run.record(pictures)
+            run.write_recording(pictures)
     print(f"written to {out}", file=sys.stderr)
-    print(json.dumps(table) if options.as_json else "\n".join(run.lines()))
+    print(json.dumps(table) if options.as_json else "\n".join(run.format_lines()))
     return 0
 
 
@@ -409,7 +409,7 @@ def _analyse_sets(folders: list[Path], figures: measurement.Figures, run: Stabil
     """Analyse the sets one after the other, with a bar on a terminal; name and skip bad ones."""
     for number, folder in enumerate(terminal.track_progress(folders, "sets")):
         try:
-            run.add(folder.name, number, figures.of(folder))
+            run.add(folder.name, number, figures.measure_folder(folder))
         except errors.CommandError as error:
-            run.skip(folder.name, str(error))
+            run.skip_set(folder.name, str(error))
             print(terminal.one_line(f"skipped {folder.name}: {error}"), file=sys.stderr)

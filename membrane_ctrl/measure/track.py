@@ -83,7 +83,7 @@ class Track:
         FloatArray  # (rows, columns): mean of what the fits left, over the bins; NaN outside
     )
 
-    def columns(self) -> dict[str, Any]:
+    def make_columns(self) -> dict[str, Any]:
         """The arrays of `track.npz`."""
         numbers = ("time_s", "coeffs_um", "sigma_um", "hencky_um", "sag_um", "sag_sigma_um")
         words = ("verdict", "reason")
@@ -104,7 +104,7 @@ def track_command(
     table = _make_track_table(track)
     with errors.convert_write_errors(out):
         files.make_folder(out)
-        write_arrays(out / "track.npz", **track.columns())
+        write_arrays(out / "track.npz", **track.make_columns())
         if pictures:
             _write_pictures(out, track, _format_track(table))
     rate = len(track.frames) / passed_s
@@ -117,7 +117,7 @@ def track_set(folder: Path, geometry: GeometryFile | None = None) -> Track:
     """The figures of a set's frames. Raises InputError if the set or its reference is invalid."""
     content = read_track(folder)
     path = folder / "capture.toml"
-    reference = Figures(geometry).of(reference_of(content.reference, folder, path))
+    reference = Figures(geometry).measure_folder(reference_of(content.reference, folder, path))
     _require_reference(content, reference, path)
     crossed, optics = content.pattern.crossed, reference.head.optics
     size = (optics.camera.height_px, optics.camera.width_px)
@@ -296,7 +296,7 @@ def _write_pictures(out: Path, track: Track, lines: Sequence[str]) -> None:
 
     from membrane_ctrl.measure.rerun_recording import log_pictures, open_recording
 
-    columns = track.columns()
+    columns = track.make_columns()
     time_s, sag_um, sigma_um = columns["time_s"], columns["sag_um"], columns["sag_sigma_um"]
     change_um = (
         columns["coeffs_um"] - np.nanmean(columns["coeffs_um"], axis=0)

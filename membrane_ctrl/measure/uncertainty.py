@@ -104,10 +104,10 @@ def uncertainty_command(options: UncertaintyOptions) -> int:
         Figures(given),
         [folder for folder in (options.folder, options.against) if folder is not None],
     )
-    sets = [figures.of(folder) for folder in folders]
+    sets = [figures.measure_folder(folder) for folder in folders]
     spread, source = spread_file.geometry_spread(sets[0].head.optics, options.geometry)
     print(f"geometry: {source}", file=sys.stderr)
-    benches = [one.bench() for one in sets]
+    benches = [one.make_trial_bench() for one in sets]
     if len({bench.optics.geometry for bench in benches}) > 1:
         raise errors.InputError(
             f"{options.against}: geometry: differs from {options.folder}; a pair needs one bench"
@@ -199,7 +199,7 @@ def _make_comparison_table(
         ],
         "trials": options.trials,
         "seed": options.seed,
-        "geometry": sets[0].head.geometry.table()
+        "geometry": sets[0].head.geometry.make_table()
         | {"names": list(spread.names), "sigmas": spread.sigmas.tolist(), "source": source},
         "rmse_um": {"mean": float(rmse.mean()), "max": float(rmse.max())},
         "linear_um": {"mean": float(linear.mean()), "max": float(linear.max())},

@@ -222,7 +222,7 @@ class FaultySensor(StrEnum):
 class Plausibility(
     Event,
     kind="plausibility",
-    sentence="Laser and camera disagree[, {culprit} is wrong][ ({readings})]. Do: check the laser's "  # noqa: E501
+    sentence="Laser and camera disagree[, {faulty_sensor} is wrong][ ({readings})]. Do: check the laser's "  # noqa: E501
     "mount, the "
     "camera and the screen",
     level=LogLevel.WARNING,
@@ -240,7 +240,7 @@ class Plausibility(
         return self.faulty is not FaultySensor.NONE
 
     @property
-    def culprit(self) -> str:
+    def faulty_sensor(self) -> str:
         """The wrong one; empty if that is not known."""
         return {FaultySensor.LASER: "the laser", FaultySensor.OPTICS: "the camera"}.get(
             self.faulty, ""

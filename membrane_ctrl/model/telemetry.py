@@ -54,7 +54,7 @@ class SafeLevel(IntEnum):
 class TelemetryRow(ColumnValues):
     """What one tick read, decided and wrote: its columns, and its bytes."""
 
-    def quantity(self, name: str, sign: bool = False, width: int = 0) -> str:
+    def format_quantity(self, name: str, sign: bool = False, width: int = 0) -> str:
         """Return the value of a column for people, with its unit: `+0.25 µm`.
 
         Parameters
@@ -73,11 +73,11 @@ class TelemetryRow(ColumnValues):
         column = COLUMNS[name]
         return f"{column.format_value(getattr(self, name), sign):>{width}} {column.unit}".rstrip()
 
-    def labelled(self, name: str, sign: bool = False, width: int = 0) -> str:
+    def format_labelled(self, name: str, sign: bool = False, width: int = 0) -> str:
         """Return a value with label and unit, `error +0.25 µm`;
-        parameters as those of `quantity`.
+        parameters as those of `format_quantity`.
         """
-        return f"{COLUMNS[name].short_label} {self.quantity(name, sign, width)}"
+        return f"{COLUMNS[name].short_label} {self.format_quantity(name, sign, width)}"
 
     def pack(self) -> bytes:
         """The row as doubles in field order."""

@@ -36,13 +36,13 @@ class EventsFile:
         self._descriptor: int | None = None
         self.lost = 0
 
-    def unwritten(self, events: Sequence[EventLine]) -> list[EventLine]:
+    def select_unwritten(self, events: Sequence[EventLine]) -> list[EventLine]:
         """The events that no earlier recorder of the run has written."""
         return [
             event for event in events if dumps_checked(event).encode() + b"\n" not in self._written
         ]
 
-    def append(self, events: Sequence[EventLine]) -> None:
+    def append_events(self, events: Sequence[EventLine]) -> None:
         """Write events, after those still waiting. Raises OSError (full disk)."""
         for event in events:
             line = dumps_checked(event).encode() + b"\n"
@@ -76,7 +76,7 @@ class EventsFile:
         """
         gone = self._descriptor is not None  # not opened yet: nothing was lost
         self.close()
-        self.append(recent if gone else [])
+        self.append_events(recent if gone else [])
 
     def close(self) -> None:
         """Close the file."""

@@ -20,7 +20,7 @@ class Feed:
         self.position = position
         self.dropped = dropped
 
-    def drain(self) -> list[bytes]:
+    def drain_messages(self) -> list[bytes]:
         """Unrecorded messages since the last call."""
         messages = self._reader.drain()
         lost = self._reader.dropped - self._lost_by_reader

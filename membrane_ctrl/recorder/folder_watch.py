@@ -16,7 +16,7 @@ class FolderWatch:
         # an `rm -r` that meets a newly written file leaves the folder, but without its content
         self._has_config = (run_dir / run_folder.CONFIG).exists()
 
-    def gone(self) -> bool:
+    def is_gone(self) -> bool:
         """Whether the folder or its content was removed or moved. Raises OSError (not if it is
         missing).
         """
@@ -32,7 +32,7 @@ class FolderWatch:
 
     def begin_anew(self, config: Config) -> None:
         """Make the folder again, with its configuration. Raises OSError; the folder is then still
-        `gone`.
+        `is_gone`.
         """
         self._run_dir.mkdir(parents=True, exist_ok=True)
         run_folder.write_heads(self._run_dir, config)

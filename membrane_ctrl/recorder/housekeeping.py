@@ -37,29 +37,29 @@ class Housekeeping:
         self._retention_due_s = 0.0
         self.detail = detail_level.DetailLevel.ALL
 
-    def finish(self, closed: list[Path]) -> None:
+    def optimise_remaining(self, closed: list[Path]) -> None:
         """At the end of the run, optimise closed segments, as far as time allows."""
         give_up_s = time.monotonic() + _OPTIMISE_LAST_S
         self._queue_segments(closed)
         while True:
-            self._errors.guarded("optimise", self._optimizer.poll)
-            if not self._optimizer.busy or time.monotonic() > give_up_s:
+            self._errors.run_guarded("optimise", self._optimizer.poll_worker)
+            if not self._optimizer.is_busy or time.monotonic() > give_up_s:
                 return
             time.sleep(_LOOK_S)
 
     def _queue_segments(self, closed: list[Path]) -> None:
         if self.detail == detail_level.DetailLevel.ALL:  # a second copy of a segment needs room
             for path in closed:
-                self._optimizer.add(path)
+                self._optimizer.add_segment(path)
 
-    def look(self, now_s: float, closed: list[Path]) -> None:
+    def watch_disk(self, now_s: float, closed: list[Path]) -> None:
         """Watch the disk and continue pending work; `closed` are segments to optimise."""
-        self._errors.guarded("disk check", self._watch_disk)
+        self._errors.run_guarded("disk check", self._watch_disk)
         self._queue_segments(closed)
-        self._errors.guarded("optimise", self._optimizer.poll)
+        self._errors.run_guarded("optimise", self._optimizer.poll_worker)
         if now_s >= self._retention_due_s:
             self._retention_due_s = now_s + RETENTION_INTERVAL_S
-            self._errors.guarded("retention", self._delete_old)
+            self._errors.run_guarded("retention", self._delete_old)
 
     def _watch_disk(self) -> None:
         left_mb, least_mb = run_folder.free_mb(self._run_dir), self._config.min_free_mb
@@ -70,7 +70,7 @@ class Housekeeping:
                 "disk", f"{self._run_dir}: {limit}; delete old runs", recorder_events.DiskLow
             )
         else:
-            self._errors.recovered("disk")
+            self._errors.report_recovered("disk")
 
     def _delete_old(self) -> None:
         config = self._config
@@ -84,12 +84,12 @@ class Housekeeping:
             runs, retention.size_bytes(self._run_dir), config.keep_gb, config.keep_days, now_utc
         )
         # a folder that a person has moved away is no longer an error
-        self._errors.forget(_RUN, but={_RUN + run.folder.name for run, _ in gone})
+        self._errors.clear_errors(_RUN, but={_RUN + run.folder.name for run, _ in gone})
         for (
             run,
             why,
         ) in gone:  # one by one: a folder that cannot be deleted must not block the others
-            self._errors.guarded(_RUN + run.folder.name, partial(self._delete_run, run, why))
+            self._errors.run_guarded(_RUN + run.folder.name, partial(self._delete_run, run, why))
 
     def _delete_run(self, run: retention.OldRun, why: str) -> None:
         retention.delete_run(run)

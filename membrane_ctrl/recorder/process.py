@@ -108,12 +108,12 @@ def _record_run(
     while not recorder.ended:
         # asked before draining, so that this round still sees a dying parent's last messages
         exit_word = "killed" if orphan() else "terminated" if asked() else ""
-        recorder.drain()
+        recorder.drain_rings()
         if exit_word and not recorder.ended:
             recorder.take_events([_end_event(spec.clock, exit_word)])
         elif recorder.urgent or time.monotonic() >= next_write_s:
             next_write_s = time.monotonic() + spec.flush_s
-            recorder.write()
+            recorder.write_second()
             report(Alive(_ROUND_S))
         if not recorder.ended:
             time.sleep(POLL_S)

@@ -29,7 +29,7 @@ class QuietFilter:
         self._lively_until_s = math.inf
         self._held: list[telemetry.Rows] = []
 
-    def take(self, rows: telemetry.Rows) -> telemetry.Rows:
+    def select_rows(self, rows: telemetry.Rows) -> telemetry.Rows:
         """The rows to send now, in order of time; rows held back follow when something happens."""
         if self._every == 1 or not len(rows):
             return rows

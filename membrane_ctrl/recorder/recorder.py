@@ -62,7 +62,7 @@ class Recorder:
     ended : bool
         The run's "end" event has arrived.
     urgent : bool
-        A message has arrived for which `write` should not wait.
+        A message has arrived for which `write_second` should not wait.
     """
 
     def __init__(
@@ -112,18 +112,18 @@ class Recorder:
         self._rows_lost = before.rows_lost
         self.ended = self.urgent = False
 
-    def drain(self) -> None:
+    def drain_rings(self) -> None:
         """Take all ring messages; events go to `events.jsonl` at once."""
-        self._messages += self._feeds["inputs"].drain()
+        self._messages += self._feeds["inputs"].drain_messages()
         if (
             "snapshots" in self._feeds
         ):  # behind the ticks: then those of all drained ticks are there
-            self._assembler.add_snapshots(self._feeds["snapshots"].drain())
+            self._assembler.add_snapshots(self._feeds["snapshots"].drain_messages())
         if "shapes" in self._feeds:
-            for message in self._feeds["shapes"].drain():
-                self._errors.guarded("shape estimate", partial(self._take_shape, message))
+            for message in self._feeds["shapes"].drain_messages():
+                self._errors.run_guarded("shape estimate", partial(self._take_shape, message))
         self.take_events(
-            [event_lines.parse_event(message) for message in self._feeds["events"].drain()]
+            [event_lines.parse_event(message) for message in self._feeds["events"].drain_messages()]
         )
 
     def take_events(self, new: list[EventLine]) -> None:
@@ -131,16 +131,17 @@ class Recorder:
         for line in new:
             event = event_lines.from_dict(line)
             self._summary.add_event(line)
-            self._errors.guarded(
+            self._errors.run_guarded(
                 "status", partial(self._follow_event, event, float(line.get("mono_s") or 0.0))
             )
             self.urgent |= event.urgent
             self.ended |= isinstance(event, run_events.Ended)
         self._events += new
-        self._errors.guarded(
-            "table of events", lambda: self._tables.add_events(self._events_file.unwritten(new))
+        self._errors.run_guarded(
+            "table of events",
+            lambda: self._tables.add_events(self._events_file.select_unwritten(new)),
         )
-        self._errors.guarded("events.jsonl", lambda: self._events_file.append(new))
+        self._errors.run_guarded("events.jsonl", lambda: self._events_file.append_events(new))
 
     def _follow_event(self, event: Event, mono_s: float) -> None:
         self._status = self._status.after_event(event, mono_s)
@@ -149,25 +150,25 @@ class Recorder:
         estimate = shape_estimate.unpack_estimate(message)
         self._summary.add_shape(estimate)
         self._shapes.append(estimate)
-        self._errors.guarded("table of shapes", lambda: self._tables.add_shape(estimate))
+        self._errors.run_guarded("table of shapes", lambda: self._tables.add_shape(estimate))
 
-    def write(self) -> None:
+    def write_second(self) -> None:
         """Write everything since the last call to disk, and sync it."""
         now_s = self._clock.now()
-        self._errors.guarded("new run folder", lambda: self._see_folder(now_s))
-        batch = self._assembler.take(self._messages)
+        self._errors.run_guarded("new run folder", lambda: self._see_folder(now_s))
+        batch = self._assembler.add_messages(self._messages)
         rows, shapes, new_events = batch.rows, self._shapes, self._events
         self._messages, self._shapes, self._events = [], [], []
         self.urgent = False
-        guarded = self._errors.guarded
+        guarded = self._errors.run_guarded
         guarded("summary", lambda: self._summary.add_rows(rows))
         guarded("table of ticks", lambda: self._tables.add_ticks(batch))
         guarded("table of thumbnails", lambda: self._take_thumbnails(now_s))
-        guarded("tables", self._tables.sync)
-        guarded("parts of tables", self._tables.seal)
+        guarded("tables", self._tables.sync_tables)
+        guarded("parts of tables", self._tables.seal_full_journal)
         closed, self._rerun.closed = self._rerun.closed, []
-        self._housekeeping.look(now_s, closed)
-        if not self._rerun.send(
+        self._housekeeping.watch_disk(now_s, closed)
+        if not self._rerun.send_second(
             now_s, rows, new_events, shapes, self._thumbnails, self._housekeeping.detail
         ):
             self._rows_lost += len(rows)
@@ -190,7 +191,7 @@ class Recorder:
         """Continue in a new folder if the run's was removed: writing to a deleted file raises no
         error.
         """
-        if not self._folder.gone():
+        if not self._folder.is_gone():
             return
         self._folder.begin_anew(self._config)
         self._folder_anew_s = now_s
@@ -225,17 +226,17 @@ class Recorder:
         """Drain once more, close the recording with its footer, write `summary.json`, optimise
         unless `in_haste`.
         """
-        self.drain()
-        self.write()
-        guarded = self._errors.guarded
+        self.drain_rings()
+        self.write_second()
+        guarded = self._errors.run_guarded
         guarded("recording", self._rerun.close)
         guarded("tables", self._tables.close)
         account = {
-            "segments": self._rerun.segments,
-            "tables": self._tables.parts,
+            "segments": self._rerun.next_segment,
+            "tables": self._tables.part_counts,
             "errors": self._errors.errors,
             "rows_lost": self._rows_lost,
-            "table_rows_lost": self._tables.lost,
+            "table_rows_lost": self._tables.lost_rows,
             "events_lost": self._events_lost + self._events_file.lost,
             "input_ticks_lost": self._input_ticks_lost + self._tables.lost_ticks,
             "restarts": self._resumes,
@@ -259,6 +260,6 @@ class Recorder:
         # last, as it is optional: this process may be killed now
         closed, self._rerun.closed = self._rerun.closed, []
         if not in_haste:
-            self._housekeeping.finish(closed)
+            self._housekeeping.optimise_remaining(closed)
         self._housekeeping.close()
         self._errors.report(recorder_events.RecorderDone(self._report_dropped(), **account))

@@ -21,7 +21,7 @@ class RecorderErrors:
         self.errors = errors
         self._trouble: dict[str, str] = {}
 
-    def guarded(self, what: str, action: Callable[[], None]) -> None:
+    def run_guarded(self, what: str, action: Callable[[], None]) -> None:
         """Run a call; report its failure and let the recorder continue."""
         try:
             action()
@@ -35,25 +35,25 @@ class RecorderErrors:
                 f"({Path(place.filename).name}:{place.lineno})",
             )
         else:
-            self.recovered(what)
+            self.report_recovered(what)
 
     def report_error(
         self, what: str, message: str, as_: type[RecorderError | DiskLow] = RecorderError
     ) -> None:
-        """Report an error once until it changes; `what` identifies it for `recovered`."""
+        """Report an error once until it changes; `what` identifies it for `report_recovered`."""
         if self._trouble.get(what) != message:
             self._trouble[what] = message
             self.errors += as_ is RecorderError
             self.report(as_(what, message))
 
-    def recovered(self, what: str) -> None:
+    def report_recovered(self, what: str) -> None:
         """Report that `what` works again, if it had failed."""
         if self._trouble.pop(what, None) is not None:
             self.report(RecorderRecovered(what, f"{what} works again"))
 
-    def forget(self, prefix: str, but: set[str]) -> None:
+    def clear_errors(self, prefix: str, but: set[str]) -> None:
         """Report as over all errors that start with `prefix` and are not in `but`: their cause has
         gone.
         """
         for what in [what for what in self._trouble if what.startswith(prefix) and what not in but]:
-            self.recovered(what)
+            self.report_recovered(what)

@@ -29,14 +29,14 @@ def send_events(recording: rerun_recording.Recording, events: Sequence[EventLine
         for clock, (_, event) in zip(clock_times, timed, strict=True)
     ]
     levels = [event.level.value for _, event in timed]
-    recording.columns(EVENTS_PATH, time_s, rr.TextLog.columns(text=texts, level=levels))
+    recording.send_columns(EVENTS_PATH, time_s, rr.TextLog.columns(text=texts, level=levels))
     for stream, marks_s, values in plot_marks.mark_lines(timed):
-        recording.scalars(stream.path, marks_s, values)
+        recording.send_scalars(stream.path, marks_s, values)
     of_pump = [(at_s, event) for at_s, event in timed if isinstance(event, PumpLearned)]
     if of_pump:
         values = np.array([[event.scale, event.correction] for _, event in of_pump])
         squares = np.array([[event.sigma**2, 0.0] for _, event in of_pump])
-        recording.measurements(
+        recording.send_measurements(
             streams.PUMP.path, np.array([at_s for at_s, _ in of_pump]), values, squares
         )
     for at_s, event in timed:
@@ -44,4 +44,4 @@ def send_events(recording: rerun_recording.Recording, events: Sequence[EventLine
             heard = [math.nan if value is None else value for value in event.frequency_hz]
             padded = [*heard, *VIBRATIONS_MOST * [math.nan]]
             values = np.array([padded[:VIBRATIONS_MOST]])
-            recording.scalars(streams.VIBRATIONS.path, np.array([at_s]), values)
+            recording.send_scalars(streams.VIBRATIONS.path, np.array([at_s]), values)

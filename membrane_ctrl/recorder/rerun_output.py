@@ -52,11 +52,11 @@ class RerunOutput:
         self._retry_s = 0.0
 
     @property
-    def segments(self) -> int:
+    def next_segment(self) -> int:
         """Number of the next file."""
         return self._recording.segments
 
-    def send(
+    def send_second(
         self,
         now_s: float,
         rows: telemetry.Rows,
@@ -66,7 +66,7 @@ class RerunOutput:
         detail: DetailLevel,
     ) -> bool:
         """Send one second of data and sync it; False if Rerun lost it."""
-        self._errors.guarded("shape reference", lambda: self._watch_hold(rows))
+        self._errors.run_guarded("shape reference", lambda: self._watch_hold(rows))
         if detail == DetailLevel.ESSENTIAL:
             self._pause_output()
             return False
@@ -76,21 +76,21 @@ class RerunOutput:
                 now_s
             ):
                 return False
-            self._errors.guarded("telemetry streams", lambda: self._telemetry.send(rows))
-            self._errors.guarded(
+            self._errors.run_guarded("telemetry streams", lambda: self._telemetry.send_rows(rows))
+            self._errors.run_guarded(
                 "event streams", lambda: rerun_events.send_events(self._recording, events)
             )
-            self._errors.guarded("shape streams", lambda: self._send_shapes(shapes))
-            self._errors.guarded("thumbnails", lambda: self._send_thumbnails(thumbnails))
-            self._errors.guarded("summary page", lambda: self._send_summary(now_s, events))
+            self._errors.run_guarded("shape streams", lambda: self._send_shapes(shapes))
+            self._errors.run_guarded("thumbnails", lambda: self._send_thumbnails(thumbnails))
+            self._errors.run_guarded("summary page", lambda: self._send_summary(now_s, events))
             try:
                 self._recording.flush()
             except rerun_recording.RecordingError as error:
                 self._alive = False
                 self._errors.report_error("recording", str(error))
             else:
-                self._errors.recovered("recording")
-                self._errors.guarded("disk sync", self._sync_file)
+                self._errors.report_recovered("recording")
+                self._errors.run_guarded("disk sync", self._sync_file)
                 return True
         self._retry_s = now_s + RETRY_S
         return False
@@ -104,12 +104,12 @@ class RerunOutput:
 
     def _send_shapes(self, shapes: list[shape_estimate.ShapeEstimate]) -> None:
         for estimate in shapes:
-            self.shapes.send(estimate)
+            self.shapes.send_estimate(estimate)
 
     def _send_thumbnails(self, thumbnails: Sequence[Thumbnail]) -> None:
         for each in thumbnails:
             picture = rr.EncodedImage(contents=each.jpeg, media_type="image/jpeg")
-            self._recording.log(f"/frames/{each.pattern}", each.time_s, picture)
+            self._recording.log_component(f"/frames/{each.pattern}", each.time_s, picture)
 
     def _send_summary(self, now_s: float, events: list[EventLine]) -> None:
         if now_s < self._next_summary_s and not any(from_dict(event).notable for event in events):
@@ -118,7 +118,7 @@ class RerunOutput:
         self._next_summary_s = now_s + (
             summary_page.SUMMARY_EARLY_INTERVAL_S if early else summary_page.SUMMARY_INTERVAL_S
         )
-        self._recording.page(summary_page.SUMMARY_PATH, now_s, self._summary())
+        self._recording.send_page(summary_page.SUMMARY_PATH, now_s, self._summary())
 
     def _begin_segment(self, now_s: float) -> bool:
         if now_s < self._retry_s:
@@ -146,7 +146,7 @@ class RerunOutput:
         """
         if self._alive:
             self._alive = False
-            self._errors.guarded("recording", self._recording.pause)
+            self._errors.run_guarded("recording", self._recording.pause)
 
     def leave_folder(self) -> None:
         """Continue at once in the folder that replaces the run's removed one."""
@@ -164,7 +164,7 @@ class RerunOutput:
         state = telemetry.get_column(rows, "state")
         for row, code in telemetry.find_changes(state, self.state):
             if code == telemetry.State.HOLD:
-                self.shapes.rebase(
+                self.shapes.set_reference(
                     float(telemetry.get_column(rows, "mono_s")[row]) + telemetry.SETTLED_AFTER_S
                 )
         self.state = float(state[-1])
@@ -172,7 +172,7 @@ class RerunOutput:
     def close(self) -> None:
         """Write the footer; the last segment is then among `closed`. Raises RecordingError."""
         last = self._recording.path
-        self._errors.guarded("telemetry streams", self._telemetry.finish)
+        self._errors.run_guarded("telemetry streams", self._telemetry.send_waiting)
         self._recording.close()
         if last is not None:
             self.closed.append(last)

@@ -158,7 +158,9 @@ class Recording:
         for kind in shapes.MAPS:
             stream.log(f"/shape/map/{kind}/outside", outside, static=True)
 
-    def columns(self, path: str, time_s: FloatArray, columns: Iterable[rr.ComponentColumn]) -> None:
+    def send_columns(
+        self, path: str, time_s: FloatArray, columns: Iterable[rr.ComponentColumn]
+    ) -> None:
         """Send rows of one entity at (n,) times of the run."""
         nanoseconds = np.round(time_s * 1e9).astype("timedelta64[ns]")
         indexes = [
@@ -167,26 +169,26 @@ class Recording:
         ]
         self._stream.send_columns(path, indexes=indexes, columns=columns)
 
-    def scalars(self, path: str, time_s: FloatArray, values: FloatArray) -> None:
+    def send_scalars(self, path: str, time_s: FloatArray, values: FloatArray) -> None:
         """Send (n, m) values of one entity at (n,) times of the run."""
-        self.columns(path, time_s, rr.Scalars.columns(scalars=values))
+        self.send_columns(path, time_s, rr.Scalars.columns(scalars=values))
 
-    def measurements(
+    def send_measurements(
         self, path: str, time_s: FloatArray, values: FloatArray, variances: FloatArray
     ) -> None:
         """Send (n, m) values of one entity with their variances at (n,) times of the run."""
-        self.columns(path, time_s, rr.Measurements.columns(values=values, variances=variances))
+        self.send_columns(path, time_s, rr.Measurements.columns(values=values, variances=variances))
 
-    def log(self, path: str, time_s: float, archetype: rr.AsComponents) -> None:
+    def log_component(self, path: str, time_s: float, archetype: rr.AsComponents) -> None:
         """Send one component at one time of the run."""
         nanoseconds = np.timedelta64(round(time_s * 1e9), "ns")
         self._stream.set_time(RUN_TIME, duration=nanoseconds)
         self._stream.set_time(UTC, timestamp=self._origin + nanoseconds)
         self._stream.log(path, archetype)
 
-    def page(self, path: str, time_s: float, markdown: str) -> None:
+    def send_page(self, path: str, time_s: float, markdown: str) -> None:
         """Send a page of text at one time of the run."""
-        self.log(path, time_s, rr.TextDocument(markdown, media_type="text/markdown"))
+        self.log_component(path, time_s, rr.TextDocument(markdown, media_type="text/markdown"))
 
     def lay_out_again(self) -> None:
         """Send the blueprint with the next segment, which is now the first in the folder."""

@@ -54,7 +54,7 @@ def map_picture(values: AnyArray, span: tuple[float, float]) -> rr.DepthImage:
 
 class ShapeStreams:
     """Sends estimates to a recording. Changes are against the first
-    good one that `rebase` lets be.
+    good one that `set_reference` lets be.
     """
 
     def __init__(self, recording: rerun_recording.Recording) -> None:
@@ -76,13 +76,13 @@ class ShapeStreams:
         self._next_difference_s = -math.inf
         self._verdict = ""
 
-    def rebase(self, from_s: float) -> None:
+    def set_reference(self, from_s: float) -> None:
         """Take the first estimate from a moment on as the reference, and show the maps against it
         at once.
         """
         self._reference_from_s = from_s
 
-    def send(self, estimate: shape_estimate.ShapeEstimate) -> None:
+    def send_estimate(self, estimate: shape_estimate.ShapeEstimate) -> None:
         """Send one estimate at the middle of its exposures; if rejected, only quality and verdict.
 
         Of single frames of one verdict, one a second is sent.
@@ -96,10 +96,10 @@ class ShapeStreams:
         self._next_frame_s = estimate.time_s + FRAME_INTERVAL_S
         time_s = np.array([estimate.time_s])
         for stream, values in _make_quality_scalars(estimate).items():
-            self._recording.scalars(stream.path, time_s, np.array([values]))
+            self._recording.send_scalars(stream.path, time_s, np.array([values]))
         if estimate.verdict != self._verdict:
             self._verdict = estimate.verdict
-            self._recording.columns(
+            self._recording.send_columns(
                 state_lanes.VERDICT.path, time_s, rr.StateChange.columns(state=[estimate.verdict])
             )
         if estimate.verdict == "rejected":
@@ -111,9 +111,9 @@ class ShapeStreams:
             self.reference, self._next_difference_s = estimate, -math.inf
             self._next_map_s, self._scatter = -math.inf, shapes.Scatter()
         self._scatter.add(estimate.coeffs_um)
-        self._recording.scalars(streams.ZERNIKE.path, time_s, estimate.coeffs_um[np.newaxis])
+        self._recording.send_scalars(streams.ZERNIKE.path, time_s, estimate.coeffs_um[np.newaxis])
         for stream, (values, variances) in _make_change_scalars(estimate, self.reference).items():
-            self._recording.measurements(
+            self._recording.send_measurements(
                 stream.path, time_s, np.array([values]), np.array([variances])
             )
         if estimate.kind == "track":
@@ -134,7 +134,9 @@ class ShapeStreams:
         terms = np.zeros((self._fall[0].size, WATERFALL_COLUMNS), np.float16)
         terms[:, -len(self._fall) :] = np.array(self._fall).T
         most_um = max(WATERFALL_LEAST_UM, float(np.abs(terms).max()))
-        self._recording.log(shapes.WATERFALL_PATH, time_s, map_picture(terms, (-most_um, most_um)))
+        self._recording.log_component(
+            shapes.WATERFALL_PATH, time_s, map_picture(terms, (-most_um, most_um))
+        )
         self._colours["waterfall"] = f"±{most_um:.3g} µm"
 
     def _send_maps(
@@ -159,8 +161,10 @@ class ShapeStreams:
                     kind, "µm", time_s, shapes.without_terms(difference_um, terms), least_um
                 )
             terms_um = (estimate.coeffs_um - reference.coeffs_um)[1:]
-            self._recording.log(shapes.BARS_PATH, time_s, rr.BarChart.from_fields(values=terms_um))
-            self._recording.page(
+            self._recording.log_component(
+                shapes.BARS_PATH, time_s, rr.BarChart.from_fields(values=terms_um)
+            )
+            self._recording.send_page(
                 "/shape/legend", time_s, _make_legend(estimate, reference, self._colours)
             )
 
@@ -171,7 +175,7 @@ class ShapeStreams:
         span = colour_span(values, least_um)
         # millimetres need more than three digits
         picture = map_picture(values if unit == "mm" else values.astype(np.float16), span)
-        self._recording.log(f"/shape/map/{kind}", time_s, picture)
+        self._recording.log_component(f"/shape/map/{kind}", time_s, picture)
         self._colours[kind] = f"{'0 to ' if least_um is None else '±'}{span[1]:.3g} {unit}"
 
 

@@ -44,15 +44,15 @@ class TelemetryStreams:
         """Restart every lane: a new file does not know the last state of the previous one."""
         self._codes.clear()
 
-    def send(self, rows: telemetry.Rows) -> None:
+    def send_rows(self, rows: telemetry.Rows) -> None:
         """Send (n, len(FIELDS)) rows; omit streams without any finite value."""
         if not len(rows):
             return
-        self._send_streams(self._quiet.take(rows))
+        self._send_streams(self._quiet.select_rows(rows))
         self._send_overview(rows)
         self._send_lanes(rows)
 
-    def finish(self) -> None:
+    def send_waiting(self) -> None:
         """Send what waits for its time."""
         if len(self._rest):
             self._send_overview(self._rest[:0], last=True)
@@ -71,29 +71,29 @@ class TelemetryStreams:
         whole = np.split(rows, np.flatnonzero(np.diff(second)) + 1)
         self._rest = rows[:0] if last else whole.pop()
         square = np.full((2, 1), self._band_um**2)
-        self._recording.measurements(
+        self._recording.send_measurements(
             self._band.path, time_s[[0, -1]], np.zeros_like(square), square
         )
         means = np.concatenate([streams.mean_row(part) for part in whole])
         errors_um = np.concatenate([streams.overview_um(part) for part in whole])
         true_um = telemetry.true_error_um(telemetry.get_columns(means))[:, np.newaxis]
-        blocks = [(stream.path, stream.values(means)) for stream in streams.MEANS]
+        blocks = [(stream.path, stream.select_values(means)) for stream in streams.MEANS]
         blocks += [(streams.OVERVIEW.path, errors_um), (streams.TRUE_MEAN.path, true_um)]
         for path, values in blocks:
             there = np.isfinite(values).any(axis=1)
             if there.any():
-                self._recording.scalars(
+                self._recording.send_scalars(
                     path, telemetry.get_column(means, "mono_s")[there], values[there]
                 )
 
     def _send_streams(self, rows: telemetry.Rows) -> None:
         time_s = telemetry.get_column(rows, "mono_s")
-        blocks = [(stream.path, stream.values(rows)) for stream in streams.STREAMS]
+        blocks = [(stream.path, stream.select_values(rows)) for stream in streams.STREAMS]
         true_um = telemetry.true_error_um(telemetry.get_columns(rows))
         blocks.append((streams.TRUE_ERROR.path, true_um[:, np.newaxis]))
         for path, values in blocks:
             if np.isfinite(values).any():
-                self._recording.scalars(path, time_s, values)
+                self._recording.send_scalars(path, time_s, values)
 
     def _send_lanes(self, rows: telemetry.Rows) -> None:
         time_s = telemetry.get_column(rows, "mono_s")
@@ -101,8 +101,8 @@ class TelemetryStreams:
             codes = telemetry.get_column(rows, lane.field)
             found = telemetry.find_changes(codes, self._codes.get(lane.field, math.nan))
             if found:
-                words = [lane.word(code) for _, code in found]
-                self._recording.columns(
+                words = [lane.name_code(code) for _, code in found]
+                self._recording.send_columns(
                     lane.path,
                     time_s[[row for row, _ in found]],
                     rr.StateChange.columns(state=words),

@@ -45,7 +45,7 @@ def quiet_environment() -> dict[str, str]:
 
 
 class Optimizer:
-    """Works through closed segments beside the recorder; call `poll` now and then.
+    """Works through closed segments beside the recorder; call `poll_worker` now and then.
 
     Removes half-done files left by a killed recorder.
     """
@@ -57,11 +57,11 @@ class Optimizer:
         self._process: subprocess.Popen[bytes] | None = None
         self._source = self._part = Path()
 
-    def add(self, path: Path) -> None:
+    def add_segment(self, path: Path) -> None:
         """Queue a closed segment."""
         self._waiting.append(path)
 
-    def poll(self) -> None:
+    def poll_worker(self) -> None:
         """Put a finished file in place and start the next. Raises OSError, also for a failed
         optimisation.
         """
@@ -93,7 +93,7 @@ class Optimizer:
         raise OSError(f"{self._source.name} is not optimised: rrd optimize ended with {code}")
 
     @property
-    def busy(self) -> bool:
+    def is_busy(self) -> bool:
         """Whether a segment is in progress or queued."""
         return self._process is not None or bool(self._waiting)
 

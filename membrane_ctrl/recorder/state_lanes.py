@@ -26,7 +26,7 @@ class Lane:
     words: dict[int, str]
     colours: dict[str, int]
 
-    def word(self, code: int) -> str:
+    def name_code(self, code: int) -> str:
         """The word for a code; an unknown code is shown as a number."""
         return self.words.get(code, f"code {code}")
 

@@ -59,7 +59,7 @@ class RecordedRun:
     config_damage: str = ""  # why this is not the run's configuration
 
     @property
-    def elsewhere(self) -> str:
+    def foreign_arithmetic(self) -> str:
         """Where its outputs were computed, if not on this processor with these libraries; else
         empty.
         """
@@ -71,11 +71,11 @@ class RecordedRun:
         else None.
         """
         names = [name for name in self.inputs.columns if name in telemetry.COLUMN]
-        if not self.elsewhere and len(names) == len(self.inputs.columns):
+        if not self.foreign_arithmetic and len(names) == len(self.inputs.columns):
             return None
         return RecordedRows(open_run(self.folder).tick_blocks(["tick", *names], from_s))
 
-    def differences(
+    def find_differences(
         self, rows: Sequence[telemetry.TelemetryRow]
     ) -> list[dict[str, tuple[float, float]] | None]:
         """Fields in which each row differs from the recorded one; None where the recording has
@@ -177,7 +177,7 @@ def _replay_part(run: RecordedRun, from_s: float, to_s: float) -> tuple[int, rep
     """Start at the last snapshot before `from_s`, or at the run's start without a snapshot of
     today's layout.
     """
-    inputs = run.inputs.since(from_s)
+    inputs = run.inputs.start_at_snapshot(from_s)
     begin = replays.tick_to_begin_with(inputs, from_s)
     if begin > 1:
         try:
@@ -216,7 +216,7 @@ def _make_report(
         recorded[: max(in_time, len(today))], today, DECISION_SLACK_S
     )
     first = found.different_rows[0] if found.different else None
-    differences = run.differences(found.different_rows)
+    differences = run.find_differences(found.different_rows)
     return {
         "verdict": _make_verdict(found, bool(decisions), bool(run.inputs.damage)),
         "recorded_by": run.inputs.program,
@@ -224,7 +224,7 @@ def _make_report(
         "from_snapshot": begin > 1,
         "ticks": found.ticks,
         "compared": found.compared,
-        "computed_on": run.elsewhere or None,
+        "computed_on": run.foreign_arithmetic or None,
         "unknown_columns": list(ColumnChoice(run.inputs.columns).unknown),
         "near": found.near,
         "different": found.different,
@@ -344,20 +344,20 @@ def write_incident(
         raise InputError(f"{folder}: already exists; choose another name")
     folder.mkdir()
     kept = RunTables(folder)
-    for frame in _select_between(run.inputs.since(found.begin_s), begin, to_s):
+    for frame in _select_between(run.inputs.start_at_snapshot(found.begin_s), begin, to_s):
         kept.add_ticks(
             TickBatch(frame.records, _make_input_rows(frame.records), frame.tails, frame.snapshots)
         )
         for estimate in frame.estimates.values():
             kept.add_shape(estimate)
-        kept.sync()
+        kept.sync_tables()
     kept.close()
     about = {
         **file_origin(SCHEMA),
         "what": f"replay of {run.folder.resolve().name}",
         "recorded_by": run.inputs.program,
         "decisions": [
-            {"time_s": round(d.time_s, 3), "what": d.what}
+            {"time_s": round(d.time_s, 3), "what": d.description}
             for d in replays.without_repeats(found.decisions)
         ],
     }

@@ -166,7 +166,7 @@ def _look_at_tables(run_dir: Path) -> list[FileFinding]:
         table = TableReader(run_dir, spec, notes)
         table.note_missing()
         table.check_all()
-        for _ in table.tables():
+        for _ in table.iterate_tables():
             pass
         findings += [FileFinding(spec.name, "damaged", note) for note in notes]
     return findings

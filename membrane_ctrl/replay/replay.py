@@ -43,7 +43,7 @@ class Decision:
     name: str  # of the state or fault
 
     @property
-    def what(self) -> str:
+    def description(self) -> str:
         """The decision in words."""
         return f"{self.kind} {self.name}"
 
@@ -296,14 +296,16 @@ def find_unmatched(recorded: list[Decision], today: list[Decision], slack_s: flo
         if (
             then is None
             or now is None
-            or then.what != now.what
+            or then.description != now.description
             or abs(then.time_s - now.time_s) > slack_s
         ):
             said.append(f"recorded: {_describe_decision(then)}; today: {_describe_decision(now)}")
-            if then is None or now is None or then.what != now.what:
+            if then is None or now is None or then.description != now.description:
                 break  # all later ones are shifted against each other
     return said
 
 
 def _describe_decision(decision: Decision | None) -> str:
-    return "nothing more" if decision is None else f"{decision.what} at {decision.time_s:.2f} s"
+    return (
+        "nothing more" if decision is None else f"{decision.description} at {decision.time_s:.2f} s"
+    )

@@ -74,7 +74,7 @@ class Filter:
     configuration: str | None = None
     text: str | None = None
 
-    def takes(self, entry: RunEntry) -> bool:
+    def accepts_entry(self, entry: RunEntry) -> bool:
         """Whether an entry meets the criteria."""
         return (
             (self.since_utc is None or entry.started_utc >= self.since_utc)
@@ -94,7 +94,7 @@ def list_entries(logs_dir: Path, wanted: Filter | None = None) -> list[RunEntry]
     """The runs of a folder, oldest first. Raises InputError if there is no such folder."""
     require_folder(logs_dir)
     found = [_entry_or_why(folder) for folder in list_run_folders(logs_dir)]
-    return [item for item in found if wanted is None or wanted.takes(item)]
+    return [item for item in found if wanted is None or wanted.accepts_entry(item)]
 
 
 def require_folder(logs_dir: Path) -> None:
@@ -213,7 +213,7 @@ def _fault_of_end(log: Sequence[event_log.LoggedEvent], exit_: object) -> str:
 
 def _recorded_s(folder: Path) -> float:
     """End of a run's 1 s level."""
-    newest = TableReader(folder, table_specs.LEVELS[_LEVEL_S], []).newest("time_s")
+    newest = TableReader(folder, table_specs.LEVELS[_LEVEL_S], []).read_newest("time_s")
     return math.nan if newest is None else float(newest.as_py()) + _LEVEL_S
 
 

@@ -210,7 +210,7 @@ def _write_hdf5(
         if fields:
             _say_if_missing(run, "ticks" in file)
         shapes = run.shapes()
-        shapes = shapes.select((shapes.time_s >= start_s) & (shapes.time_s < end_s))
+        shapes = shapes.select_cycles((shapes.time_s >= start_s) & (shapes.time_s < end_s))
         if SHAPES in extras and len(shapes):
             for name in ("time_s", "coeffs_um", *_SHAPE_COLUMNS):
                 file.create_dataset(f"shapes/{name}", data=getattr(shapes, name))

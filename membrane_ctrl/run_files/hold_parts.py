@@ -45,7 +45,7 @@ class HoldParts(StateNode):
     let_go_s: float = math.nan  # last moment that nothing held it; NaN: it has been back since
     away_s: float = math.nan  # last moment that it was outside the band since
 
-    def of(self, block: Mapping[str, Column]) -> dict[str, BoolArray]:
+    def classify_block(self, block: Mapping[str, Column]) -> dict[str, BoolArray]:
         """(n,) masks of the next block by the names of `PARTS`; no tick is in two."""
         time_s, hold = block["mono_s"], block["state"] == telemetry.State.HOLD
         faults = block["safe_level"] > 0

@@ -58,12 +58,12 @@ class InputsReader:
     @property
     def program(self) -> str:
         """The program that wrote them, with its commit; empty if unknown."""
-        return stated_program(self._open_reader(table_specs.INPUTS).metadata())
+        return stated_program(self._open_reader(table_specs.INPUTS).read_metadata())
 
     @property
     def arithmetic(self) -> str:
         """Processor and libraries that computed the recorded outputs; empty if unknown."""
-        return self._open_reader(table_specs.INPUTS).metadata().get("arithmetic", "")
+        return self._open_reader(table_specs.INPUTS).read_metadata().get("arithmetic", "")
 
     @property
     def columns(self) -> list[str]:
@@ -88,14 +88,14 @@ class InputsReader:
             if not len(records):
                 continue
             last, until_s = int(records["tick"][-1]), float(records["now_s"][-1])
-            tails = {row.tick: row.json.encode() for row in rare.until(until_s)}
-            snapshots = {row.tick: row.json.encode() for row in kept.until(until_s)}
-            estimates = [*cycles.until(until_s), *tracked.until(until_s)]
+            tails = {row.tick: row.json.encode() for row in rare.take_until_time(until_s)}
+            snapshots = {row.tick: row.json.encode() for row in kept.take_until_time(until_s)}
+            estimates = [*cycles.take_until_time(until_s), *tracked.take_until_time(until_s)]
             yield InputsFrame(
                 records, tails, snapshots, {found.time_s: found for found in estimates}
             )
 
-    def since(self, time_s: float) -> InputsReader:
+    def start_at_snapshot(self, time_s: float) -> InputsReader:
         """A reader that starts at the last snapshot before this time of the run, or at the run's
         start.
         """
@@ -113,16 +113,16 @@ class InputsReader:
         both have.
         """
         rows = _TickRows(
-            self._open_reader(table_specs.TICKS).tables(
+            self._open_reader(table_specs.TICKS).iterate_tables(
                 ["tick", *_ROW_COLUMNS.values()], self._from_s
             )
         )
         names = table_specs.INPUTS.schema.names
-        for inputs in self._open_reader(table_specs.INPUTS).tables(names, self._from_s):
+        for inputs in self._open_reader(table_specs.INPUTS).iterate_tables(names, self._from_s):
             if inputs.column_names != names:
                 continue
             numbers = _record_column(inputs, "tick")
-            same = rows.until(int(numbers.max()))
+            same = rows.take_until_tick(int(numbers.max()))
             if same is None:
                 continue
             _, here, there = np.intersect1d(
@@ -138,18 +138,18 @@ class InputsReader:
 
     def _iterate_texts(self, spec: TableSpec) -> Iterator[_TextRow]:
         names = spec.schema.names
-        for table in self._open_reader(spec).tables(names, self._from_s):
+        for table in self._open_reader(spec).iterate_tables(names, self._from_s):
             if table.column_names == names:
                 rows = zip(*(table.column(name).to_pylist() for name in names), strict=True)
                 yield from (_TextRow(*values) for values in rows if None not in values)
 
     def _snapshot_times_s(self) -> Iterator[float]:
-        for table in self._open_reader(table_specs.SNAPSHOTS).tables(["time_s"]):
+        for table in self._open_reader(table_specs.SNAPSHOTS).iterate_tables(["time_s"]):
             yield from _record_column(table, "time_s").tolist()
 
     def _iterate_estimates(self, spec: TableSpec) -> Iterator[shape_estimate.ShapeEstimate]:
         names = list(shapes.ESTIMATE_COLUMNS)
-        for table in self._open_reader(spec).tables(names, self._from_s - _SHAPE_BEFORE_S):
+        for table in self._open_reader(spec).iterate_tables(names, self._from_s - _SHAPE_BEFORE_S):
             try:
                 yield from shapes.read_estimates(table.select(names))
             except (ValueError, LookupError) as error:
@@ -171,7 +171,7 @@ class _TickRows:
         self._tables = tables
         self._waiting: pa.Table | None = None
 
-    def until(self, tick: int) -> pa.Table | None:
+    def take_until_tick(self, tick: int) -> pa.Table | None:
         """The rows up to a tick that were not handed out before; None without any."""
         parts = [] if self._waiting is None else [self._waiting]
         while not parts or int(_record_column(parts[-1], "tick")[-1]) < tick:
@@ -204,7 +204,7 @@ class _Ahead(Generic[T]):
         self._timed = timed
         self._next = next(timed, None)
 
-    def until(self, time_s: float) -> Iterator[T]:
+    def take_until_time(self, time_s: float) -> Iterator[T]:
         """The items up to a time that were not handed out before."""
         while self._next is not None and self._next[0] <= time_s:
             yield self._next[1]

@@ -97,7 +97,7 @@ def make_cycles_dataset(
         Attributes of the dataset.
     """
     xarray = import_optional("xarray", "data")
-    found = found.select((found.time_s >= part_s[0]) & (found.time_s < part_s[1]))
+    found = found.select_cycles((found.time_s >= part_s[0]) & (found.time_s < part_s[1]))
     kept = (found.covariance_time_s >= part_s[0]) & (found.covariance_time_s < part_s[1])
     labels = labels_of(table_specs.SHAPES) | labels_of(table_specs.COVARIANCES)
     numbers = [name for name in shapes.NUMBERS if name != "time_s"]

@@ -74,9 +74,9 @@ class LatchedFile:
         self._fill_reserved(text.encode())
         self._reserve.replace(self.path)
         with contextlib.suppress(OSError):
-            self.reserve()
+            self.reserve_space()
 
-    def reserve(self) -> None:
+    def reserve_space(self) -> None:
         """Reserve disk space for a fault, so that one on a full disk latches too.
         Raises OSError.
         """
@@ -95,7 +95,7 @@ class LatchedFile:
             file.write(content)
             file.truncate()
 
-    def release(self) -> None:
+    def release_space(self) -> None:
         """Release that space."""
         with contextlib.suppress(OSError):
             self._reserve.unlink(missing_ok=True)
@@ -147,7 +147,7 @@ class ResumeLog:
         # a future one (the clock was set back) counts as just now
         return tuple(sorted((max(0.0, age_s) for age_s in ages_s if age_s < _DAY_S), reverse=True))
 
-    def add(self, when: datetime) -> None:
+    def add_resume(self, when: datetime) -> None:
         """Add one and drop those older than a day. Raises OSError."""
         kept = [when - timedelta(seconds=age_s) for age_s in self.ages_s(when)][-_RESUMES_MOST:]
         scratch = self.path.with_name(f".{self.path.name}.new")

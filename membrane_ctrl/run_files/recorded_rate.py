@@ -42,7 +42,7 @@ def recorded_rate_hz(folder: Path) -> float | None:
 
 def _first_rows(folder: Path, spec: TableSpec, names: Sequence[str]) -> list[FloatArray]:
     """Columns of the first rows that can be read; empty arrays without any."""
-    table = next(TableReader(folder, spec, []).tables(names), None)
+    table = next(TableReader(folder, spec, []).iterate_tables(names), None)
     if table is None or table.column_names != list(names):
         return [np.empty(0) for _ in names]
     return [np.asarray(table.column(name).to_numpy(), dtype=np.float64) for name in names]

@@ -145,7 +145,7 @@ class Run:
         """
         found = self.shapes()
         wanted = (found.time_s >= start_s) & (found.time_s < end_s)
-        return named_tables.named_table(found.select(wanted).columns(), self.origin_utc)
+        return named_tables.named_table(found.select_cycles(wanted).make_columns(), self.origin_utc)
 
     def to_pandas(
         self,
@@ -235,7 +235,7 @@ class Run:
     def _iterate_blocks(
         self, spec: TableSpec, names: Sequence[str], start_s: float, end_s: float
     ) -> Iterator[Block]:
-        for table in self._open_table(spec).tables(names, start_s, end_s):
+        for table in self._open_table(spec).iterate_tables(names, start_s, end_s):
             yield {name: _to_array(table, name) for name in names}
 
     def _open_table(self, spec: TableSpec) -> TableReader:
@@ -307,10 +307,12 @@ class Run:
     def shapes(self) -> Shapes:
         """Every shape estimate of the run, cycles and tracked frames, as arrays."""
         figures = chain.from_iterable(
-            self._open_table(spec).tables(shapes.TABLE_COLUMNS)
+            self._open_table(spec).iterate_tables(shapes.TABLE_COLUMNS)
             for spec in (table_specs.SHAPES, table_specs.TRACKED)
         )
-        return shapes.from_tables(figures, self._open_table(table_specs.COVARIANCES).tables())
+        return shapes.from_tables(
+            figures, self._open_table(table_specs.COVARIANCES).iterate_tables()
+        )
 
     def thumbnails(
         self, most: int, start_s: float = -np.inf, end_s: float = np.inf
@@ -329,7 +331,7 @@ class Run:
         list of dict
             `time_s`, `pattern` and `jpeg` of each, in order.
         """
-        places = list(self._open_table(table_specs.THUMBNAILS).tables(_PLACE_OF_THUMBNAIL))
+        places = list(self._open_table(table_specs.THUMBNAILS).iterate_tables(_PLACE_OF_THUMBNAIL))
         whole = [table for table in places if table.column_names == list(_PLACE_OF_THUMBNAIL)]
         if not whole:
             return []
@@ -349,7 +351,7 @@ class Run:
         names = (*_PLACE_OF_THUMBNAIL, "jpeg")
         wanted = pa.array(sorted(numbers))
         reader = self._open_table(table_specs.THUMBNAILS)
-        for table in reader.tables(names, float(min(numbers)), float(max(numbers)) + 1):
+        for table in reader.iterate_tables(names, float(min(numbers)), float(max(numbers)) + 1):
             if table.column_names == list(names):
                 chosen = table.filter(pa.compute.is_in(table["number"], wanted)).drop_null()
                 yield from chosen.select(names[1:]).to_pylist()
@@ -359,7 +361,7 @@ class Run:
         for spec in table_specs.ALL:
             table = self._open_table(spec)
             table.check_all()
-            for _ in table.tables([spec.time_name]):
+            for _ in table.iterate_tables([spec.time_name]):
                 pass
 
 

@@ -82,7 +82,7 @@ class LogHistogram(StateNode):
         self.count += values.size
         self.largest = float(np.fmax(self.largest, values.max()))
 
-    def quantile(self, share: float) -> float:
+    def find_quantile(self, share: float) -> float:
         """The value not exceeded by `share` of all values; NaN without values."""
         if not self.count:
             return math.nan

@@ -54,8 +54,8 @@ class RunTables:
         if not len(batch.rows):
             return
         row = {name: telemetry.get_column(batch.rows, name) for name in telemetry.FIELDS}
-        self._open_writer(table_specs.TICKS).add(_tick_rows(row))
-        self._open_writer(table_specs.INPUTS).add(_input_rows(batch))
+        self._open_writer(table_specs.TICKS).add_rows(_tick_rows(row))
+        self._open_writer(table_specs.INPUTS).add_rows(_input_rows(batch))
         self._add_rare(batch)
         self._add_levels({name: row[name] for name in levels.TICK_FIELDS})
 
@@ -77,7 +77,7 @@ class RunTables:
         for window_s, rows in self._windows.finished_rows(new):
             spec = table_specs.LEVELS[window_s]
             if rows["time_s"].size:
-                self._open_writer(spec).add(_nullable_rows(spec, rows))
+                self._open_writer(spec).add_rows(_nullable_rows(spec, rows))
 
     def add_shape(self, estimate: shape_estimate.ShapeEstimate) -> None:
         """Add the result of a measurement cycle, or of a tracked frame."""
@@ -138,7 +138,7 @@ class RunTables:
             columns = [
                 pa.array([row[field.name] for row in rows], field.type) for field in spec.schema
             ]
-            self._open_writer(spec).add(pa.record_batch(columns, schema=spec.schema))
+            self._open_writer(spec).add_rows(pa.record_batch(columns, schema=spec.schema))
 
     def _open_writer(self, spec: TableSpec) -> TableWriter:
         return self._writers[spec.name]
@@ -148,13 +148,13 @@ class RunTables:
         """Unfinished windows of the levels, for a successor."""
         return self._windows
 
-    def sync(self) -> None:
+    def sync_tables(self) -> None:
         """Bring all rows to the disk. Raises OSError (full disk), after all tables were tried: they
         wait.
         """
-        self._for_each(TableWriter.sync)
+        self._for_each(TableWriter.sync_rows)
 
-    def seal(self) -> None:
+    def seal_full_journal(self) -> None:
         """Make a part of one journal that is full. Raises OSError (full disk); call again later."""
         for writer in self._writers.values():
             if writer.seal_next():
@@ -181,21 +181,21 @@ class RunTables:
             raise failure
 
     @property
-    def lost(self) -> int:
+    def lost_rows(self) -> int:
         """Number of lost rows, over all tables."""
-        return sum(writer.lost for writer in self._writers.values())
+        return sum(writer.lost_rows for writer in self._writers.values())
 
     @property
     def lost_ticks(self) -> int:
         """Number of lost ticks."""
-        return self._open_writer(table_specs.TICKS).lost
+        return self._open_writer(table_specs.TICKS).lost_rows
 
     @property
-    def parts(self) -> dict[str, int]:
+    def part_counts(self) -> dict[str, int]:
         """Number of parts per table: a reader that finds fewer knows that the last ones are
         missing.
         """
-        return {name: writer.parts for name, writer in self._writers.items()}
+        return {name: writer.part_count for name, writer in self._writers.items()}
 
 
 def _tick_rows(row: Mapping[str, Column]) -> pa.RecordBatch:

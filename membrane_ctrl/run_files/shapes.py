@@ -53,7 +53,7 @@ class Shapes:
     def __len__(self) -> int:
         return int(self.time_s.size)
 
-    def select(self, wanted: NDArray[np.bool_]) -> Shapes:
+    def select_cycles(self, wanted: NDArray[np.bool_]) -> Shapes:
         """The cycles for which `wanted` (n,) is true, with all covariances."""
         if wanted.all():
             return self  # a month of 36 coefficients is 190 MB
@@ -62,7 +62,7 @@ class Shapes:
             **parts, covariance_time_s=self.covariance_time_s, covariance_um2=self.covariance_um2
         )
 
-    def columns(self) -> dict[str, Column | NDArray[np.str_]]:
+    def make_columns(self) -> dict[str, Column | NDArray[np.str_]]:
         """Columns of a table with one row per cycle: time, terms from Z1, sag, quality, verdict."""
         coeffs = dict(zip(zernike_columns(), np.ascontiguousarray(self.coeffs_um.T), strict=True))
         numbers = {name: getattr(self, name) for name in NUMBERS}

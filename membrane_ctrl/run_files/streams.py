@@ -49,7 +49,7 @@ class Stream:
     path: str
     lines: tuple[Line, ...]
 
-    def values(self, rows: Rows) -> FloatArray:
+    def select_values(self, rows: Rows) -> FloatArray:
         """(n, lines) block of the stream."""
         return np.stack([get_column(rows, line.field) for line in self.lines], axis=1)
 

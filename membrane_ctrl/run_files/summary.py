@@ -85,7 +85,7 @@ class Summary(StateNode):
             if len(self.states) < _LISTED_MAX:
                 name = telemetry.State(code).name.lower()
                 self.states.append(EnteredState(name, float(time_s[row])))
-        parts = self.parts.of(telemetry.get_columns(rows))
+        parts = self.parts.classify_block(telemetry.get_columns(rows))
         for name, part in parts.items():
             self.parts_s[name] += float(telemetry.get_column(rows, "dt_s")[part].sum())
         settled = telemetry.get_columns(rows[parts["held"]])
@@ -181,4 +181,4 @@ class Summary(StateNode):
 
 
 def _histogram_quantiles(histogram: LogHistogram) -> dict[str, float]:
-    return {"p50": histogram.quantile(0.50), "p99": histogram.quantile(0.99)}
+    return {"p50": histogram.find_quantile(0.50), "p99": histogram.find_quantile(0.99)}

@@ -169,57 +169,57 @@ class SessionFolder:
     head: SessionHead
     config: schema.Config
 
-    def file(self, name: str) -> Path:
+    def file_path(self, name: str) -> Path:
         """Path of a file in the folder."""
         return self.path / name
 
-    def content(self, name: str) -> bytes:
+    def read_content(self, name: str) -> bytes:
         """The content of a file for people. Raises InputError if it is not a regular file."""
-        path = self.file(name)
+        path = self.file_path(name)
         try:
             return files.read_bytes(files.resolve_user_path(path), _BYTES_MAX)
         except OSError as error:
             raise errors.InputError(f"{path}: {errors.os_reason(error)}") from None
 
-    def candidates(self) -> str:
+    def read_candidates(self) -> str:
         """The table of candidates, Markdown with at least a head, a rule and a row. Raises
         InputError.
         """
-        text = self.content("candidates.md").decode("utf-8", "replace")
+        text = self.read_content("candidates.md").decode("utf-8", "replace")
         if len(text.splitlines()) < 3:
             raise errors.InputError(
-                f"{self.file('candidates.md')}: damaged; repeat the step design"
+                f"{self.file_path('candidates.md')}: damaged; repeat the step design"
             )
         return text
 
-    def result(self, step: str, name: str, kind: type[T]) -> T:
+    def read_result(self, step: str, name: str, kind: type[T]) -> T:
         """Read a step's result. Raises InputError if the step is not done,
         or the file is damaged.
         """
-        self.require(step)
-        return read_session_file(self.file(name), kind)
+        self.require_done(step)
+        return read_session_file(self.file_path(name), kind)
 
-    def done(self, step: str) -> bool:
+    def is_done(self, step: str) -> bool:
         """Whether the step has left its result."""
-        return self.file(FILES[step][0]).exists()
+        return self.file_path(FILES[step][0]).exists()
 
-    def require(self, *steps: str) -> None:
+    def require_done(self, *steps: str) -> None:
         """Raises InputError naming the first step that is not done."""
         for step in steps:
-            if not self.done(step):
+            if not self.is_done(step):
                 raise errors.InputError(
                     f"{self.path}: {step} is missing; run `membrane-ctrl tune {step}` first"
                 )
 
-    def begin(self, step: str) -> None:
+    def begin_step(self, step: str) -> None:
         """Prepare a step, possibly again: remove its results and those of later steps."""
         for later in STEPS[STEPS.index(step) :]:
             for name in FILES[later]:
                 try:
-                    self.file(name).unlink(missing_ok=True)
+                    self.file_path(name).unlink(missing_ok=True)
                 except OSError as error:  # a folder in its place
                     raise errors.InputError(
-                        f"{self.file(name)}: cannot be removed ({errors.os_reason(error)})"
+                        f"{self.file_path(name)}: cannot be removed ({errors.os_reason(error)})"
                     ) from None
 
 
@@ -227,11 +227,11 @@ def based_on(
     session: SessionFolder, before: schema.LoopConfig, pump: schema.PumpConfig
 ) -> SessionFolder:
     """The session, begun anew on other gains and another curve of the pump, which are in force."""
-    session.begin(STEPS[0])
+    session.begin_step(STEPS[0])
     head = replace(session.head, before=before)
     config = session.config.model_copy(update={"loop": before, "pump": pump})
-    files.write_text_atomic(session.file("config.toml"), toml_file.dump_toml(config))
-    write_session_file(session.file("session.json"), head)
+    files.write_text_atomic(session.file_path("config.toml"), toml_file.dump_toml(config))
+    write_session_file(session.file_path("session.json"), head)
     return SessionFolder(session.path, head, config)
 
 

@@ -59,11 +59,11 @@ class HoldLink(Protocol):
         """Source of the data: a run folder, or the twin."""
         ...
 
-    def ask(self, command: Command) -> None:
+    def send_command(self, command: Command) -> None:
         """Hand a command to the next tick. Raises HoldError with the reason if refused."""
         ...
 
-    def news(self) -> News:
+    def read_news(self) -> News:
         """Wait briefly, then return the news. Raises HoldError if the hold has ended."""
         ...
 
@@ -128,7 +128,7 @@ class LiveHold:
         if not answer["ok"]:
             raise errors.InputError(f"{session}: refused: {answer['refused']}")
 
-    def ask(self, command: Command) -> None:
+    def send_command(self, command: Command) -> None:
         """Send a command through the port, which determines our name."""
         request: dict[str, object] = {
             "do": command.kind,
@@ -154,7 +154,7 @@ class LiveHold:
         if not answer["ok"]:
             raise HoldError(f"refused: {answer['refused']}")
 
-    def news(self) -> News:
+    def read_news(self) -> News:
         """The news of a fifth of a second."""
         time.sleep(_NEWS_S)
         self._require_command()
@@ -273,12 +273,12 @@ class Progress:
         self._asking = False
         self.interrupted = False
 
-    def begin(self, step: str, planned_s: float, after_s: float) -> None:
+    def begin_step(self, step: str, planned_s: float, after_s: float) -> None:
         """Start a step with its planned duration, and that of the later steps."""
         self._step, self._planned_s, self._after_s = step, planned_s, after_s
         self._done_s = self._shown_s = 0.0
         self._print_text(f"{step}" + (f": about {_format_clock(planned_s)}" if planned_s else ""))
-        self.note("step", step, planned_s=planned_s, after_s=after_s)
+        self.log_entry("step", step, planned_s=planned_s, after_s=after_s)
 
     def __call__(self, seconds: float) -> None:
         """Note additional recorded seconds."""
@@ -296,51 +296,53 @@ class Progress:
         )
         terminal.live_line(line) if self._live else self._print_text(line)
 
-    def say(self, line: str) -> None:
+    def print_line(self, line: str) -> None:
         """Print a permanent line, and note it in the log."""
         self._print_text(line)
-        self.note("said", line)
+        self.log_entry("said", line)
 
-    def note(self, what: str, line: str, **more: float | Sequence[str]) -> None:
+    def log_entry(self, what: str, line: str, **more: float | Sequence[str]) -> None:
         """Note in the log, if there is one."""
         if self.log is not None:
-            self.log.note(what, line, **more)
+            self.log.log_entry(what, line, **more)
 
     def _print_text(self, line: str) -> None:
         terminal.live_line(line, "\n") if self._live else print(line, file=sys.stderr, flush=True)
 
-    def ask(self, question: str, among: Sequence[str] = ()) -> str:
+    def ask_question(self, question: str, among: Sequence[str] = ()) -> str:
         """Ask on the terminal, and on the page too if the answers are `among` some; the first
         answer counts.
 
         It is empty at the end of the input, and for none of them. Ctrl-C interrupts at once.
         """
         if self.log is not None:
-            self.log.answer("", ())  # one that came too late for the last question
+            self.log.take_answer("", ())  # one that came too late for the last question
         print(f"{question} ", end="", file=sys.stderr, flush=True)
-        self.note("asks", question, among=among)
+        self.log_entry("asks", question, among=among)
         self._asking = True
         try:
             while among and self.log is not None and not _has_typed_line(_POLL_S):
-                if (given := self.log.answer(question, among)) is not None:
-                    self.say(f"{given.by} answers on the page: {given.said or 'none'}")
+                if (given := self.log.take_answer(question, among)) is not None:
+                    self.print_line(f"{given.by} answers on the page: {given.said or 'none'}")
                     return given.said
             return sys.stdin.readline().strip()
         finally:
             self._asking = False
 
     @contextlib.contextmanager
-    def catching(self) -> Iterator[None]:
+    def catch_signals(self) -> Iterator[None]:
         """Note Ctrl-C and SIGTERM, and raise them at the next tick,
         not in the middle of a command.
         """
 
-        def note(number: int, frame: FrameType | None) -> None:
+        def note_signal(number: int, frame: FrameType | None) -> None:
             if self._asking:
                 raise KeyboardInterrupt
             self.interrupted = True
 
-        former = {number: signal.signal(number, note) for number in (signal.SIGINT, signal.SIGTERM)}
+        former = {
+            number: signal.signal(number, note_signal) for number in (signal.SIGINT, signal.SIGTERM)
+        }
         try:
             yield
         finally:

@@ -41,13 +41,13 @@ class LiveLog:
         self._good = True
         self._end = "\n"  # of a line torn when an earlier part of the session was killed
 
-    def tick(self, row: telemetry.TelemetryRow) -> None:
+    def add_tick(self, row: telemetry.TelemetryRow) -> None:
         """Take a tick; every second's means are written."""
         self._rows.append(row)
         if len(self._rows) == _POINTS * self._ticks_a_point:
-            self.flush()
+            self.write_means()
 
-    def flush(self) -> None:
+    def write_means(self) -> None:
         """Write the means of the ticks so far."""
         rows, self._rows = self._rows, []
         groups = [
@@ -60,14 +60,14 @@ class LiveLog:
             }
             self._append_entry({"every_s": self._every_s, **points})
 
-    def note(self, what: str, line: str, **more: float | Sequence[str]) -> None:
+    def log_entry(self, what: str, line: str, **more: float | Sequence[str]) -> None:
         """Note what happens: `step` (name, `planned_s`, `after_s`), `said`, `asks` (`among`), or
         `ended` (why).
         """
-        self.flush()
+        self.write_means()
         self._append_entry({what: line, "utc": folder.now_utc(), **more})
 
-    def answer(self, question: str, among: Sequence[str]) -> "PageAnswer | None":
+    def take_answer(self, question: str, among: Sequence[str]) -> "PageAnswer | None":
         """Take the answer to a question from the page; None if there is none, or it is to another,
         or not `among`.
         """
@@ -139,12 +139,12 @@ class Progressed:
 
 @dataclass(slots=True)
 class LiveReader:
-    """Follows a log: `read` takes what is new.
+    """Follows a log: `read_new` takes what is new.
 
     Attributes
     ----------
     progress : Progressed
-        The state after the last `read`.
+        The state after the last `read_new`.
     time_s : float
         Seconds of hold that the picture shows.
     """
@@ -154,7 +154,7 @@ class LiveReader:
     time_s: float = 0.0
     _offset: int = 0
 
-    def read(self) -> dict[str, list[float]]:
+    def read_new(self) -> dict[str, list[float]]:
         """New points: `time_s` and the columns, NaN for missing values.
         Nothing if there is no log.
         """

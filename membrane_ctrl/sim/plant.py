@@ -80,7 +80,7 @@ class Plant:
         gauge_pa = ((film.NOMINAL_SAG_MM + 1e-3 * twin.start_error_um) / self._sag[0]) ** 3
         self._gas = fill_gas(gauge_pa, self._air_k[0], self._ambient_pa[0], self._volume[0])
         self._inflow_ml_per_s = self._leak_ml_per_s_per_pa * self._leak[0] * gauge_pa
-        self._pump_fraction = self._pump.hold(self._inflow_ml_per_s)
+        self._pump_fraction = self._pump.settle_at_flow(self._inflow_ml_per_s)
 
     @property
     def time_s(self) -> float:
@@ -166,7 +166,7 @@ class Plant:
 
     def _load_block(self) -> None:
         """Surroundings and creep of the next block, as lists: indexing them gives plain floats."""
-        block = self._disturbance.block(_BLOCK_STEPS)
+        block = self._disturbance.next_steps(_BLOCK_STEPS)
         age_s = self._loaded_s + block.time_s
         self._ambient_pa: list[float] = block.ambient_pa.tolist()
         self._air_k: list[float] = block.air_k.tolist()

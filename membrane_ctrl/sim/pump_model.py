@@ -54,7 +54,7 @@ class PumpModel:
         self._flow_ml_per_s = 0.0
         self._tube = deque([0.0] * round(twin.pump_delay_s / step_s))
 
-    def hold(self, flow_ml_per_s: float) -> float:
+    def settle_at_flow(self, flow_ml_per_s: float) -> float:
         """Settle at the command that delivers this flow, and return it.
 
         The pump stays off if the flow is too small to keep it running.

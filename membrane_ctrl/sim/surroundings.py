@@ -33,7 +33,7 @@ class OrnsteinUhlenbeck:
         self._rng = rng
         self._value = std * float(rng.standard_normal())
 
-    def block(self, steps: int) -> Series:
+    def next_values(self, steps: int) -> Series:
         """The next values, (steps,)."""
         decay = self._decay
         kicks = (self._kick * self._rng.standard_normal(steps)).tolist()
@@ -63,14 +63,14 @@ class Disturbance:
         self._step_s = step_s
         self._next = 0
 
-    def block(self, steps: int) -> Surroundings:
+    def next_steps(self, steps: int) -> Surroundings:
         """The next `steps` steps."""
         time_s: Series = np.arange(self._next, self._next + steps, dtype=np.float64) * self._step_s
         self._next += steps
         block = Surroundings(
             time_s=time_s,
-            ambient_pa=gas.STANDARD_AMBIENT_PA + self._pressure.block(steps),
-            air_k=gas.REFERENCE_K + self._temperature.block(steps),
+            ambient_pa=gas.STANDARD_AMBIENT_PA + self._pressure.next_values(steps),
+            air_k=gas.REFERENCE_K + self._temperature.next_values(steps),
             leak_factor=np.ones(steps),
             laser_bias_um=np.multiply(self._drift_um_per_s, time_s),
             laser_lost=np.zeros(steps),

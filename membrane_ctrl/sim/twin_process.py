@@ -54,7 +54,7 @@ class TwinProcess:
     truth: ring.RingAddress  # where the twin publishes its mirror's true state
 
     @classmethod
-    def started(
+    def start_twin(
         cls, config: Config, clock: RunClock, stack: contextlib.ExitStack, lab: bool = False
     ) -> "TwinProcess":
         """Start the twin and wait until it listens; the stack ends it. Raises DeviceError, e.g. for

@@ -80,9 +80,9 @@ class VirtualBench:
         self.interlocks.advance(self.plant.time_s)
         self._sample = self._sample_sensors(self._sample)
         self.board.advance(self.plant.time_s, self._sample)
-        self.drive()
+        self.drive_actuators()
 
-    def drive(self) -> None:
+    def drive_actuators(self) -> None:
         """Drive the actuators as the board commands, as far as they follow."""
         wrong = self.wrong
         pump, vent = self.board.pump_fraction * wrong.pump_share, self.board.vent_fraction
@@ -94,7 +94,7 @@ class VirtualBench:
     def power_cycle(self) -> None:
         """The board restarts: outputs off, watchdog off, faults lost."""
         self.board.restart()
-        self.drive()
+        self.drive_actuators()
 
     def open(self) -> roles.BenchIdentity:
         """Connect and arm. Raises LinkError."""
@@ -178,7 +178,7 @@ class MemoryLink:
         self._begin()
         with _raise_refusals(self.name):
             self._bench.board.write(address, words)
-        self._bench.drive()
+        self._bench.drive_actuators()
         self._answer()
 
     async def close(self) -> None:

@@ -267,12 +267,12 @@ class SessionWatch:
             return None
         if self._reader is None or self._reader.session != newest.path:
             self._reader = LiveReader(newest.path)
-        self._reader.read()
-        done = frozenset(step for step in folders.STEPS if newest.done(step))
+        self._reader.read_new()
+        done = frozenset(step for step in folders.STEPS if newest.is_done(step))
         progress = self._reader.progress
         with suppress(errors.InputError):
             if progress.among:
-                return SessionSeen(newest.path, done, progress, _table(newest.candidates()))
+                return SessionSeen(newest.path, done, progress, _table(newest.read_candidates()))
         return SessionSeen(newest.path, done, progress)
 
 

@@ -48,12 +48,12 @@ class Bench:
         )
 
     def done(self) -> CycleDone:
-        result = self.cycle.take()
+        result = self.cycle.run_cycle()
         assert isinstance(result, CycleDone)
         return result
 
     def failed(self) -> CycleFailed:
-        result = self.cycle.take()
+        result = self.cycle.run_cycle()
         assert isinstance(result, CycleFailed)
         return result
 
@@ -173,7 +173,7 @@ def test_numerics_that_raise_are_an_event(bench: Bench) -> None:
 
 def test_a_failure_ahead_of_a_cycle_is_told_by_the_cycle(bench: Bench) -> None:
     bench.reconstructor.singular = True
-    bench.cycle.prepare()
+    bench.cycle.prepare_next()
     assert bench.reconstructor.prepared == 1
     assert bench.failed().stage == "reconstruction"
 
@@ -186,7 +186,7 @@ def test_camera_with_pixels_of_its_own_is_copied(bench: Bench) -> None:
 
 def test_stopped_cycle_has_no_result_and_is_taken_again(bench: Bench) -> None:
     bench.exposures_left = 5
-    assert bench.cycle.take() is None
+    assert bench.cycle.run_cycle() is None
     assert bench.camera.frames == 5
     assert bench.reconstructor.calls == []
     bench.exposures_left = 100

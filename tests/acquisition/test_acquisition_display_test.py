@@ -48,7 +48,7 @@ def display_test(bench: Bench) -> DisplayTest:
 @pytest.mark.parametrize("tau_s", [0.006, 0.012, 0.02])
 def test_settle_time_is_enough_and_not_much_more(tau_s: float) -> None:
     response = PanelResponse(tau_s=tau_s)
-    found = display_test(Bench(response)).settling()
+    found = display_test(Bench(response)).measure_settling()
     earliest_s = response.latency_s + tau_s * math.log(256)
     worst_s = earliest_s + 1 / response.refresh_hz
     # gamma makes a first-order panel slower upwards and faster downwards
@@ -56,22 +56,22 @@ def test_settle_time_is_enough_and_not_much_more(tau_s: float) -> None:
 
 
 def test_response_is_the_panels() -> None:
-    assert display_test(Bench(PanelResponse(), gamma=1.9)).response().gamma == pytest.approx(
-        1.9, rel=0.03
-    )
+    assert display_test(
+        Bench(PanelResponse(), gamma=1.9)
+    ).measure_response().gamma == pytest.approx(1.9, rel=0.03)
 
 
 def test_findings_name_what_they_are_about() -> None:
     dark = display_test(Bench(PanelResponse(), white_adu=20.0))
-    assert format_finding("camera", lambda: dark.exposure(255, 20.0)).startswith(
+    assert format_finding("camera", lambda: dark.check_exposure(255, 20.0)).startswith(
         "camera: white gives only 2"
     )
     bright = display_test(Bench(PanelResponse(), white_adu=400.0))
-    assert "saturated" in format_finding("camera", lambda: bright.exposure(255, 20.0))
+    assert "saturated" in format_finding("camera", lambda: bright.check_exposure(255, 20.0))
     right = display_test(Bench(PanelResponse()))
-    assert format_finding("camera", lambda: right.exposure(255, 20.0)) == ""
-    assert format_finding("screen", right.checkerboard) == ""
+    assert format_finding("camera", lambda: right.check_exposure(255, 20.0)) == ""
+    assert format_finding("screen", right.check_checkerboard) == ""
     nothing = display_test(Bench(PanelResponse(), white_adu=0.0))
-    assert format_finding("screen", lambda: str(nothing.response())).startswith(
+    assert format_finding("screen", lambda: str(nothing.measure_response())).startswith(
         "screen: the camera sees no ramp"
     )

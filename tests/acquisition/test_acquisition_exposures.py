@@ -105,7 +105,7 @@ def test_transfer_costs_nothing_while_the_next_pattern_settles(
 ) -> None:
     clock = VirtualClock()
     exposures, camera = split(frames[0], clock)
-    taken = exposures.take(FRINGES, 1, lambda: False)
+    taken = exposures.expose_patterns(FRINGES, 1, lambda: False)
     assert taken is not None
     assert clock.now_s == pytest.approx(8 * (SETTLE_S + EXPOSE_S) + TRANSFER_S)
     assert camera.seen == [pattern.name for pattern in FRINGES]
@@ -119,13 +119,13 @@ def test_the_next_cycle_finds_its_first_pattern_settling(
 ) -> None:
     clock = VirtualClock()
     exposures, camera = split(frames[0], clock)
-    exposures.take(FRINGES, 1, lambda: False)
+    exposures.expose_patterns(FRINGES, 1, lambda: False)
     assert camera.screen.shown[-1] == FRINGES[0].name
 
 
 def test_the_interval_between_exposures_is_kept(frames: tuple[FrameWriter, FrameReader]) -> None:
     exposures, _ = split(frames[0], VirtualClock(), interval_s=0.3)
-    taken = exposures.take(FRINGES, 1, lambda: False)
+    taken = exposures.expose_patterns(FRINGES, 1, lambda: False)
     assert taken is not None
     assert np.diff([frame.time_s for frame in taken]) == pytest.approx(0.3)
 
@@ -136,7 +136,7 @@ def test_a_lost_frame_is_taken_again_with_its_own_pattern(
 ) -> None:
     exposures, camera = split(frames[0], VirtualClock())
     camera.lose = lost
-    taken = exposures.take(FRINGES, 1, lambda: False)
+    taken = exposures.expose_patterns(FRINGES, 1, lambda: False)
     assert taken is not None
     assert camera.seen == [pattern.name for pattern in FRINGES]
     assert camera.exposures == 8 + len(lost)
@@ -149,7 +149,7 @@ def test_three_in_a_row_are_a_failure_of_the_camera(
     exposures, camera = split(frames[0], VirtualClock())
     camera.lose = {3, 4, 5}
     with pytest.raises(StageError, match="not whole") as failed:
-        exposures.take(FRINGES, 1, lambda: False)
+        exposures.expose_patterns(FRINGES, 1, lambda: False)
     assert failed.value.stage == "camera"
     # they keep the pixels of a slot alive
     failed.value.__traceback__ = failed.value.__cause__ = None
@@ -158,14 +158,14 @@ def test_three_in_a_row_are_a_failure_of_the_camera(
 
 def test_stopping_is_asked_before_every_exposure(frames: tuple[FrameWriter, FrameReader]) -> None:
     exposures, camera = split(frames[0], VirtualClock())
-    assert exposures.take(FRINGES, 1, lambda: camera.exposures == 3) is None
+    assert exposures.expose_patterns(FRINGES, 1, lambda: camera.exposures == 3) is None
     assert camera.exposures == 3
 
 
 def test_plain_roles_are_used_step_by_step(frames: tuple[FrameWriter, FrameReader]) -> None:
     clock = VirtualClock()
     screen, camera = FakeScreen(), FakeCamera(clock)
-    taken = Exposures(camera, screen, frames[0], clock, FakeLaser(), 0.0).take(
+    taken = Exposures(camera, screen, frames[0], clock, FakeLaser(), 0.0).expose_patterns(
         FRINGES, 1, lambda: False
     )
     assert taken is not None
@@ -184,8 +184,10 @@ def test_a_stopped_cycle_holds_no_pixels(plain: bool) -> None:
         if plain:
             camera = FakeCamera(clock)
             exposures = Exposures(camera, FakeScreen(), writer, clock, FakeLaser(), 0.0)
-            assert exposures.take(FRINGES, 1, lambda: camera.frames == 3) is None
+            assert exposures.expose_patterns(FRINGES, 1, lambda: camera.frames == 3) is None
         else:
             exposures, split_camera = split(writer, clock)
-            assert exposures.take(FRINGES, 1, lambda: split_camera.exposures == 3) is None
+            assert (
+                exposures.expose_patterns(FRINGES, 1, lambda: split_camera.exposures == 3) is None
+            )
             split_camera._out = None  # like a closed camera

@@ -53,7 +53,7 @@ def test_a_residual_that_has_grown_is_said_once_and_its_end_too() -> None:
     told = []
     for residual_urad in (2.9, 4.5, 2.9):
         cycle = replace(CYCLE, slope_residual_urad=residual_urad)
-        told += [event for _ in range(CYCLES) if (event := drift.after(cycle)) is not None]
+        told += [event for _ in range(CYCLES) if (event := drift.check_estimate(cycle)) is not None]
     assert [event.kind for event in told] == ["maintenance", "maintenance_over"]
     assert {event.name for event in told} == {"calibrate"}
     assert told[0].message.startswith("calibrate again: the fit leaves 4.50 µrad")
@@ -62,13 +62,13 @@ def test_a_residual_that_has_grown_is_said_once_and_its_end_too() -> None:
 def test_a_ring_that_seems_to_tilt_is_said_and_a_deeper_bowl_is_not() -> None:
     drift = GeometryWatch(in_force(), 4)
     deeper = replace(CYCLE, coeffs_um=CYCLE.coeffs_um + 2000.0 * zernike_projection())
-    assert not any(drift.after(deeper) for _ in range(CYCLES))
+    assert not any(drift.check_estimate(deeper) for _ in range(CYCLES))
     tilted = CYCLE.coeffs_um.copy()
     tilted[1] += 4.0  # 2 x of the radius a unit: 8 µm at the rim, 5.7 µm RMS around it
     told = [
         event
         for _ in range(CYCLES)
-        if (event := drift.after(replace(CYCLE, coeffs_um=tilted))) is not None
+        if (event := drift.check_estimate(replace(CYCLE, coeffs_um=tilted))) is not None
     ]
     assert [event.name for event in told] == ["calibrate"]
     assert "the ring is seen 5.7 µm RMS from where it was" in told[0].message
@@ -82,16 +82,16 @@ def test_the_noise_of_weaker_fringes_is_no_drift() -> None:
     noise_urad = weak.noise_urad(faded)
     assert noise_urad == pytest.approx(20 * weak.noise_urad(CYCLE))
     cycle = replace(faded, slope_residual_urad=float(np.hypot(2.83, noise_urad)))
-    assert not any(weak.after(cycle) for _ in range(2 * CYCLES))
+    assert not any(weak.check_estimate(cycle) for _ in range(2 * CYCLES))
 
 
 def test_rejected_cycles_and_stated_geometries_say_nothing() -> None:
     rejected = replace(CYCLE, verdict="rejected", slope_residual_urad=900.0)
     drift = GeometryWatch(in_force(), 4)
-    assert not any(drift.after(rejected) for _ in range(2 * CYCLES))
+    assert not any(drift.check_estimate(rejected) for _ in range(2 * CYCLES))
     by_hand = GeometryWatch(in_force(None), 4)
     assert not any(
-        by_hand.after(replace(CYCLE, slope_residual_urad=50.0)) for _ in range(2 * CYCLES)
+        by_hand.check_estimate(replace(CYCLE, slope_residual_urad=50.0)) for _ in range(2 * CYCLES)
     )
 
 

@@ -50,10 +50,10 @@ class Keeping:
             slot.pixels[...] = 10 * self.cycle + number
             slot.commit(pattern.name, 0.1 * number, 12.5, self.cycle)
         if whole:
-            self.raw.after(estimate(kind, cycle=self.cycle))
+            self.raw.keep_due_frames(estimate(kind, cycle=self.cycle))
 
     def capture(self, cycle: int) -> Path:
-        return self.raw.capture(estimate("full", cycle=cycle))
+        return self.raw.write_capture(estimate("full", cycle=cycle))
 
     def fault(self, code: int) -> None:
         nothing = TelemetryRow(**dict.fromkeys(FIELDS, 0.0))

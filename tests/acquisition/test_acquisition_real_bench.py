@@ -72,7 +72,7 @@ class Sight:
         self._pictures = {}
         for shown in full_sequence(pattern):
             levels = np.rint(255 * pattern_light(shown, raster).astype(np.float64)).astype(np.uint8)
-            self._pictures[levels.tobytes()] = renderer.render(shown, 0.0).copy()
+            self._pictures[levels.tobytes()] = renderer.render_picture(shown, 0.0).copy()
         self._dark = np.zeros((256, 306), np.uint8)
 
     def expose(self, exposure_ms: float, gain: int) -> Any:

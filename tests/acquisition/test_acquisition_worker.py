@@ -28,7 +28,7 @@ class ScriptedRemote(Remote):
         self.stop = self.paused = self._full = self._capture = False
         self.events: list[dict[str, object]] = []
 
-    def listen(self, timeout_s: float = 0.0) -> None:
+    def take_commands(self, timeout_s: float = 0.0) -> None:
         assert self.script, "nothing more will happen"
         moment_s, command = self.script[0]
         if self.clock.now_s + timeout_s < moment_s:
@@ -38,10 +38,10 @@ class ScriptedRemote(Remote):
         self.script.pop(0)
         self._execute_command(command)
 
-    def report(self, state: str, message: str = "", **details: object) -> None:
+    def report_state(self, state: str, message: str = "", **details: object) -> None:
         self.told.append((state, message))
 
-    def tell(self, event: Event) -> None:
+    def send_event(self, event: Event) -> None:
         self.events.append(event.to_dict())
 
 
@@ -57,11 +57,11 @@ class ScriptedCycle:
         self.prepared_s: list[float] = []
         self.prepares_s: list[float] = []
 
-    def prepare(self) -> None:
+    def prepare_next(self) -> None:
         self.prepared_s.append(self.clock.now_s)
         self.clock.sleep(self.prepares_s.pop(0) if self.prepares_s else 0.0)
 
-    def take(self) -> CycleDone | CycleFailed | None:
+    def run_cycle(self) -> CycleDone | CycleFailed | None:
         self.started_s.append(self.clock.now_s)
         self.clock.sleep(self.duration_s)
         return (
@@ -213,20 +213,20 @@ def test_commands_over_a_real_connection(line: tuple[Connection, Connection]) ->
     remote = Remote(theirs)
     for command in ("pause", "full"):
         ours.send(command)
-    assert remote.interrupts()
+    assert remote.is_interrupting()
     assert remote.paused
     assert [remote.take_full(), remote.take_full()] == [True, False]
     ours.send("resume")
-    assert not remote.interrupts()
+    assert not remote.is_interrupting()
     ours.send("stop")
-    assert remote.interrupts()
+    assert remote.is_interrupting()
     assert remote.stop
 
 
 def test_unknown_command_is_answered(line: tuple[Connection, Connection]) -> None:
     ours, theirs = line
     ours.send("dance")
-    Remote(theirs).listen()
+    Remote(theirs).take_commands()
     assert ours.recv()["kind"] == "alive"
     assert "unknown command 'dance'" in ours.recv()["message"]
 
@@ -237,8 +237,8 @@ def test_it_promises_its_next_word_sooner_once_it_is_prepared(
     ours, theirs = line
     remote = Remote(theirs)
     for _ in range(5):
-        remote.listen()
-    remote.prepared()
+        remote.take_commands()
+    remote.start_line_checks()
     words = [ours.recv() for _ in range(2)]
     assert not ours.poll(), "not more than one a second"
     assert [word["kind"] for word in words] == ["alive", "alive"]
@@ -251,17 +251,17 @@ def test_closed_line_and_dead_parent_stop_the_process(
     ours, theirs = line
     with monkeypatch.context() as orphaned:
         orphaned.setattr(child, "parent_lives", lambda: False)
-        assert Remote(theirs).interrupts()
-    assert not Remote(theirs).interrupts()
+        assert Remote(theirs).is_interrupting()
+    assert not Remote(theirs).is_interrupting()
     ours.close()
-    assert Remote(theirs).interrupts()
+    assert Remote(theirs).is_interrupting()
 
 
 def test_reports_never_wait_for_a_reader(line: tuple[Connection, Connection]) -> None:
     ours, theirs = line
     remote = Remote(theirs)
     for number in range(3000):  # far more than the pipe holds
-        remote.report("running", f"{number:0200}", cycle=1)
+        remote.report_state("running", f"{number:0200}", cycle=1)
     assert not remote.stop
     assert ours.recv() == {
         "kind": "acquisition",
@@ -275,7 +275,7 @@ def test_the_same_report_is_sent_once(line: tuple[Connection, Connection]) -> No
     ours, theirs = line
     remote = Remote(theirs)
     for cycle in (1, 2, 3):
-        remote.report("running", "ok", cycle=cycle)
-    remote.report("running", "rejected: dark", cycle=4)
+        remote.report_state("running", "ok", cycle=cycle)
+    remote.report_state("running", "rejected: dark", cycle=4)
     assert [ours.recv()["cycle"] for _ in range(2)] == [1, 4]
     assert not ours.poll()

@@ -110,7 +110,7 @@ def test_the_figure_is_that_of_the_twins_own_optics(site: Path, stack: ExitStack
     own = config.model_copy(update={"devices": None})
     reference, _ = cycles_of(own, stack)
     for kind in ("full", "fringes"):
-        found, expected = figure(cycles.take()), figure(reference.take())
+        found, expected = figure(cycles.run_cycle()), figure(reference.run_cycle())
         assert found.kind == kind
         assert np.abs(found.coeffs_um[3:] - expected.coeffs_um[3:]).max() < 0.5
         assert found.sag_um == pytest.approx(expected.sag_um, abs=5.0)
@@ -129,7 +129,7 @@ def test_either_of_them_may_be_the_twins_own(role: str, site: Path, stack: ExitS
     ]
     assert not isinstance(ours, GuardedCamera | PatternScreen)
     assert isinstance(theirs, GuardedCamera | PatternScreen)
-    figure(cycles.take())
+    figure(cycles.run_cycle())
 
 
 def test_each_mistake_costs_a_cycle_and_is_named(site: Path, stack: ExitStack) -> None:
@@ -145,7 +145,7 @@ def test_each_mistake_costs_a_cycle_and_is_named(site: Path, stack: ExitStack) -
     failed: list[str] = []
     good_since = 0
     while len(failed) < len(mistakes):
-        taken = cycles.take()
+        taken = cycles.run_cycle()
         if isinstance(taken, CycleFailed):
             assert taken.stage == "camera"
             failed.append(taken.message)
@@ -155,12 +155,12 @@ def test_each_mistake_costs_a_cycle_and_is_named(site: Path, stack: ExitStack) -
             good_since += 1
         assert good_since < 4
     assert failed == list(mistakes.values())
-    figure(cycles.take())
+    figure(cycles.run_cycle())
 
 
 def test_a_late_frame_is_taken_again(site: Path, stack: ExitStack) -> None:
     cycles, bench = cycles_of(configured({"faults": ["late"], "fault_every": 5}), stack)
-    figure(cycles.take())
+    figure(cycles.run_cycle())
     assert bench.camera.driver._exposures == len(full_sequence(configured().optics.pattern)) + 1
 
 

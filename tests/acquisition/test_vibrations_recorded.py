@@ -121,23 +121,23 @@ class Hold:
         HandClock.moment_s = estimate.time_s
         self.rings["shapes"].put(pack_estimate(estimate))
         for event in self.hear(estimate):
-            self.supervisor.tell(event_lines.from_dict(event.to_dict()))
+            self.supervisor.record_event(event_lines.from_dict(event.to_dict()))
         self.taken += 1
         if self.taken % 50 == 0:
-            self.recorder.drain()
+            self.recorder.drain_rings()
 
     def settle(self, now_s: float) -> None:
         """The recorder writes, and the alarms look."""
         HandClock.moment_s = now_s
-        self.recorder.drain()
-        self.recorder.write()
-        self.watcher.look([ROW], self.events.drain(), now_s)
+        self.recorder.drain_rings()
+        self.recorder.write_second()
+        self.watcher.process_news([ROW], self.events.drain(), now_s)
 
     def end(self) -> None:
-        self.supervisor.tell(run_events.Ended("done", 0, len(TICKS), 0))
-        self.recorder.drain()
+        self.supervisor.record_event(run_events.Ended("done", 0, len(TICKS), 0))
+        self.recorder.drain_rings()
         self.recorder.finish(in_haste=True)
-        self.watcher.look([ROW], self.events.drain(), HandClock.moment_s)
+        self.watcher.process_news([ROW], self.events.drain(), HandClock.moment_s)
         assert set(self.troubles) <= {"recorder_done"}
 
     @property
@@ -255,7 +255,7 @@ class Film:
         renderer = OpticsRenderer(self.optics, FILM, seed=3, modes=modes)
         hold.ticks(at_s)
         still = [
-            renderer.render(p, float(self.moved_um[0]))
+            renderer.render_picture(p, float(self.moved_um[0]))
             for p in pattern_sequence.full_sequence(self.optics.pattern)
         ]
         full = self.tracker.full(still, at_s + 13.0 + 0.1 * np.arange(18), np.full(18, np.nan))
@@ -264,7 +264,7 @@ class Film:
         since_s = 2.0
         while since_s < 61.0 * searches + 3.0:
             time_s, um = at_s + 13.0 + since_s, float(self.moved_um[round(50 * since_s)])
-            picture = renderer.render(self.tracker.pattern, um, time_s=time_s)
+            picture = renderer.render_picture(self.tracker.pattern, um, time_s=time_s)
             hold.take(self.tracker.fringes([picture], np.array([time_s]), np.array([np.nan])))
             since_s += self.tracker.slower / 20
         hold.settle(HandClock.moment_s + 0.1)

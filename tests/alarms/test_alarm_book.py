@@ -26,14 +26,14 @@ def kinds(notices: list[AlarmMessage]) -> list[str]:
 
 def book_with_a_told_alarm() -> AlarmBook:
     book = AlarmBook(CONFIG)
-    book.take(BAD, 0.0)
+    book.take_sign(BAD, 0.0)
     assert kinds(book.step(10.0)) == ["raised"]
     return book
 
 
 def test_a_condition_must_stand_for_its_time() -> None:
     book = AlarmBook(CONFIG)
-    book.take(BAD, 0.0)
+    book.take_sign(BAD, 0.0)
     assert book.step(9.9) == []
     assert book.step(10.0) == [AlarmMessage("raised", "leak", "warning", "it leaks")]
     assert book.step(11.0) == [], "told once"
@@ -42,23 +42,23 @@ def test_a_condition_must_stand_for_its_time() -> None:
 def test_what_goes_before_its_time_is_told_to_nobody() -> None:
     book = AlarmBook(CONFIG)
     for start_s in range(0, 100, 10):
-        book.take(BAD, float(start_s))
-        book.take(GOOD, start_s + 9.0)
+        book.take_sign(BAD, float(start_s))
+        book.take_sign(GOOD, start_s + 9.0)
         assert book.step(start_s + 9.5) == []
 
 
 def test_it_is_over_when_it_stays_away_and_not_before() -> None:
     book = book_with_a_told_alarm()
     for start_s in range(20, 200, 20):  # flaps every 20 s
-        book.take(GOOD, float(start_s))
+        book.take_sign(GOOD, float(start_s))
         assert book.step(start_s + 9.0) == []
-        book.take(BAD, start_s + 10.0)
+        book.take_sign(BAD, start_s + 10.0)
         assert book.step(start_s + 11.0) == []
-    book.take(GOOD, 300.0)
-    book.take(GOOD, 320.0)
+    book.take_sign(GOOD, 300.0)
+    book.take_sign(GOOD, 320.0)
     assert book.step(329.9) == []
     assert kinds(book.step(330.0)) == ["cleared"]
-    book.take(BAD, 400.0)
+    book.take_sign(BAD, 400.0)
     assert kinds(book.step(410.0)) == ["raised"], "a new alarm"
 
 
@@ -70,7 +70,7 @@ def test_nobody_acknowledges_more_people_are_told() -> None:
     assert book.step(911.0) == []
     (notice,) = book.step(910.0 + 3600.0)
     assert (notice.kind, notice.escalated) == ("reminder", True)
-    book.take(GOOD, 5000.0)
+    book.take_sign(GOOD, 5000.0)
     (notice,) = book.step(5030.0)
     assert (notice.kind, notice.escalated) == ("cleared", True), (
         "who was woken is told that it is over"
@@ -79,25 +79,25 @@ def test_nobody_acknowledges_more_people_are_told() -> None:
 
 def test_acknowledged_it_is_quiet_until_it_is_over() -> None:
     book = book_with_a_told_alarm()
-    book.acknowledge()
+    book.acknowledge_all()
     assert book.step(1e6) == []
-    book.take(GOOD, 1e6)
+    book.take_sign(GOOD, 1e6)
     assert kinds(book.step(1e6 + 30.0)) == ["cleared"]
 
 
 def test_an_acknowledgement_is_not_for_what_comes_later() -> None:
     book = AlarmBook(CONFIG)
-    book.take(BAD, 0.0)
-    book.acknowledge()  # no notice of it was sent yet
+    book.take_sign(BAD, 0.0)
+    book.acknowledge_all()  # no notice of it was sent yet
     assert kinds(book.step(10.0)) == ["raised"]
     assert kinds(book.step(910.0)) == ["escalated"]
 
 
 def test_a_good_sign_of_nothing_is_nothing() -> None:
     book = AlarmBook(CONFIG)
-    book.take(GOOD, 0.0)
+    book.take_sign(GOOD, 0.0)
     assert book.step(1e6) == []
-    assert not book.standing("leak")
+    assert not book.note_standing("leak")
 
 
 @given(st.lists(st.tuples(st.booleans(), st.floats(0.1, 100.0)), max_size=60))
@@ -105,7 +105,7 @@ def test_raised_and_cleared_take_turns(changes: list[tuple[bool, float]]) -> Non
     book = AlarmBook(CONFIG)
     now_s, told = 0.0, []
     for bad, wait_s in changes:
-        book.take(BAD if bad else GOOD, now_s)
+        book.take_sign(BAD if bad else GOOD, now_s)
         now_s += wait_s
         told += [kind for kind in kinds(book.step(now_s)) if kind in ("raised", "cleared")]
     assert told == (["raised", "cleared"] * len(told))[: len(told)]
@@ -114,7 +114,7 @@ def test_raised_and_cleared_take_turns(changes: list[tuple[bool, float]]) -> Non
 @pytest.mark.parametrize("name", ["fault", "silent"])
 def test_alarms_stand_beside_each_other(name: str) -> None:
     book = book_with_a_told_alarm()
-    book.take(Sign(name, True, "critical", "!"), 20.0)
+    book.take_sign(Sign(name, True, "critical", "!"), 20.0)
     (notice,) = book.step(20.0)
     assert (notice.name, notice.severity) == (name, "critical")
 
@@ -130,7 +130,7 @@ class Disk:
 
     def hear(self, event: Event) -> None:
         for sign in signs_of(event.notice_changes(self.status.notices)):
-            self.book.take(sign, self.now_s)
+            self.book.take_sign(sign, self.now_s)
         self.status = self.status.after_event(event)
 
     def step(self, now_s: float) -> list[tuple[str, str]]:
@@ -145,11 +145,11 @@ def test_trouble_with_the_disk_is_over_with_the_last_of_it_and_not_with_the_firs
     disk.step(5.0)
     disk.recorder_errors.report_error("state file", "state file: x")
     disk.step(6.0)
-    disk.recorder_errors.recovered("state file")
+    disk.recorder_errors.report_recovered("state file")
     assert disk.step(37.0) == []
-    assert disk.book.standing("recorder")
+    assert disk.book.note_standing("recorder")
     assert disk.step(910.0) == [("escalated", LOW)]
-    disk.recorder_errors.recovered("disk")
+    disk.recorder_errors.report_recovered("disk")
     assert disk.step(940.0) == [("cleared", LOW)]
 
 
@@ -158,7 +158,7 @@ def test_a_reminder_names_what_still_stands() -> None:
     disk.recorder_errors.report_error("disk", "less than 500 MB free", DiskLow)
     disk.recorder_errors.report_error("state file", "state file: x")
     disk.step(0.0)
-    disk.recorder_errors.recovered("disk")
+    disk.recorder_errors.report_recovered("disk")
     assert disk.step(900.0) == [("escalated", NOT_RECORDED)]
 
 
@@ -168,7 +168,7 @@ def test_another_recorder_begins_without_the_formers_trouble_and_tells_its_own()
     disk.step(0.0)
     disk.hear(ChildRestarted("recorder", 1))
     disk.step(1.0)
-    assert not disk.book.standing("recorder")
+    assert not disk.book.note_standing("recorder")
     RecorderErrors(disk.hear).report_error("disk", "less than 500 MB free", DiskLow)
     assert disk.step(40.0) == [], "the same alarm, not told off and told again"
     assert disk.step(900.0) == [("escalated", LOW)]

@@ -65,10 +65,12 @@ def told(sender: FakeSender) -> list[tuple[str, str]]:
 def test_a_fault_that_was_held_for_too_long_is_told_as_latched() -> None:
     sender = FakeSender()
     watcher = Watcher(CONFIG, [Outbox(sender)], 0.0)
-    watcher.look(
+    watcher.process_news(
         [ROW.pack()], [message(kind="fault", name="displacement_missing", latching=False)], 1.0
     )
-    watcher.look([ROW.pack()], [message(kind="state", state="fault", **{"from": "hold"})], 31.0)
+    watcher.process_news(
+        [ROW.pack()], [message(kind="state", state="fault", **{"from": "hold"})], 31.0
+    )
     assert [(notice.name, notice.severity) for notice in sender.through] == [
         ("glitch", "warning"),
         ("fault", "critical"),
@@ -79,14 +81,16 @@ def test_a_fault_that_was_held_for_too_long_is_told_as_latched() -> None:
 def test_the_next_fault_is_told_however_soon_it_comes_after_an_acknowledgement() -> None:
     sender = FakeSender()
     watcher = Watcher(CONFIG, [Outbox(sender)], 0.0)
-    watcher.look([ROW.pack()], [message(kind="fault", name="late", latching=True)], 1.0)
+    watcher.process_news([ROW.pack()], [message(kind="fault", name="late", latching=True)], 1.0)
     acknowledged = [
         message(kind="command", command="ack"),
         message(kind="state", state="standby", **{"from": "fault"}),
     ]
-    watcher.look([ROW.pack()], acknowledged, 2.0)
-    watcher.look([ROW.pack()], [message(kind="fault", name="over_pressure", latching=True)], 10.0)
-    watcher.look([ROW.pack()], [], 10.0 + CONFIG.escalate_after_s)
+    watcher.process_news([ROW.pack()], acknowledged, 2.0)
+    watcher.process_news(
+        [ROW.pack()], [message(kind="fault", name="over_pressure", latching=True)], 10.0
+    )
+    watcher.process_news([ROW.pack()], [], 10.0 + CONFIG.escalate_after_s)
     assert told(sender) == [("fault", "raised"), ("fault", "raised"), ("fault", "escalated")]
     assert sender.through[-1].text.startswith("Fault over_pressure")
 
@@ -94,9 +98,11 @@ def test_the_next_fault_is_told_however_soon_it_comes_after_an_acknowledgement()
 def test_a_fault_is_told_at_once_and_its_end_too() -> None:
     sender = FakeSender()
     watcher = Watcher(CONFIG, [Outbox(sender)], 0.0)
-    watcher.look([ROW.pack()], [message(kind="fault", name="late", latching=True)], 1.0)
-    watcher.look([ROW.pack()], [message(kind="state", state="standby", **{"from": "fault"})], 2.0)
-    watcher.look([ROW.pack()], [], 33.0)
+    watcher.process_news([ROW.pack()], [message(kind="fault", name="late", latching=True)], 1.0)
+    watcher.process_news(
+        [ROW.pack()], [message(kind="state", state="standby", **{"from": "fault"})], 2.0
+    )
+    watcher.process_news([ROW.pack()], [], 33.0)
     assert told(sender) == [("fault", "raised"), ("fault", "cleared")]
 
 
@@ -105,23 +111,23 @@ def test_a_value_out_of_its_limits() -> None:
     watcher = Watcher(CONFIG, [Outbox(sender)], 0.0)
     bad, good = replace(ROW, error_um=-20.0).pack(), ROW.pack()
     for now_s in range(30):
-        watcher.look([bad], [], float(now_s))
+        watcher.process_news([bad], [], float(now_s))
     assert told(sender) == []
-    watcher.look([bad], [], 30.0)
+    watcher.process_news([bad], [], 30.0)
     assert told(sender) == [("out_of_band", "raised")]
-    watcher.look([good], [], 31.0)
-    watcher.look([good], [], 61.0)
+    watcher.process_news([good], [], 31.0)
+    watcher.process_news([good], [], 61.0)
     assert told(sender)[1:] == [("out_of_band", "cleared")]
 
 
 def test_a_loop_that_falls_silent_is_told_and_a_slow_start_is_not() -> None:
     sender = FakeSender()
     watcher = Watcher(CONFIG, [Outbox(sender)], 0.0)
-    watcher.look([], [], 30.0)
-    watcher.look([ROW.pack()], [], 31.0)
-    watcher.look([], [], 35.9)
+    watcher.process_news([], [], 30.0)
+    watcher.process_news([ROW.pack()], [], 31.0)
+    watcher.process_news([], [], 35.9)
     assert told(sender) == []
-    watcher.look([], [], 36.0)
+    watcher.process_news([], [], 36.0)
     assert told(sender) == [("silent", "raised")]
 
 
@@ -129,15 +135,15 @@ def test_an_escalation_is_tried_until_it_is_through_and_keeps_nobody_else_waitin
     sender, behind = FakeSender(), FakeSender()
     behind.down = True
     watcher = Watcher(CONFIG, [Outbox(sender), Outbox(behind)], 0.0)
-    watcher.look([ROW.pack()], [message(kind="fault", latching=True)], 0.0)
+    watcher.process_news([ROW.pack()], [message(kind="fault", latching=True)], 0.0)
     late_s = CONFIG.escalate_after_s
-    watcher.look([ROW.pack()], [], late_s)
-    watcher.look([ROW.pack()], [message(kind="link", message="lost")], late_s + 1.0)
-    watcher.look([ROW.pack()], [], late_s + 7.0)
+    watcher.process_news([ROW.pack()], [], late_s)
+    watcher.process_news([ROW.pack()], [message(kind="link", message="lost")], late_s + 1.0)
+    watcher.process_news([ROW.pack()], [], late_s + 7.0)
     assert told(sender) == [("fault", "raised"), ("fault", "escalated"), ("link", "raised")]
     assert told(behind) == []
     behind.down = False
-    watcher.look([ROW.pack()], [], late_s + 11.0)
+    watcher.process_news([ROW.pack()], [], late_s + 11.0)
     assert told(behind) == [("fault", "escalated")]
 
 
@@ -147,9 +153,9 @@ def test_an_escalation_is_tried_until_it_is_through_and_keeps_nobody_else_waitin
 def test_an_acknowledgement_keeps_the_others_asleep(event: EventLine) -> None:
     sender = FakeSender()
     watcher = Watcher(CONFIG, [Outbox(sender)], 0.0)
-    watcher.look([ROW.pack()], [message(kind="fault", latching=True)], 0.0)
-    watcher.look([ROW.pack()], [message(**event)], 1.0)
-    watcher.look([ROW.pack()], [], 10_000.0)
+    watcher.process_news([ROW.pack()], [message(kind="fault", latching=True)], 0.0)
+    watcher.process_news([ROW.pack()], [message(**event)], 1.0)
+    watcher.process_news([ROW.pack()], [], 10_000.0)
     assert told(sender) == [("fault", "raised")]
 
 
@@ -158,7 +164,7 @@ def test_a_network_that_is_down_is_tried_later_and_later_in_order() -> None:
     sender.down = True
     outbox = Outbox(sender)
     for number in range(60):
-        outbox.post(replace(TEST, name=str(number)))
+        outbox.queue_message(replace(TEST, name=str(number)))
     assert outbox.dropped == 10
     for now_s in range(100):
         outbox.step(float(now_s))
@@ -167,7 +173,7 @@ def test_a_network_that_is_down_is_tried_later_and_later_in_order() -> None:
     sender.down = False
     outbox.step(150.0)
     assert [notice.name for notice in sender.through] == [str(n) for n in range(10, 60)]
-    assert outbox.empty
+    assert outbox.is_empty
     assert not outbox.failures
 
 

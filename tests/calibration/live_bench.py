@@ -100,19 +100,19 @@ class LiveBench:
         self.name = self.run_dir.name
         self._told: tuple[Event, ...] = ()
 
-    def ask(self, command: Command) -> None:
+    def send_command(self, command: Command) -> None:
         self.asked.append(command)
-        self.hold.ask(command)
+        self.hold.send_command(command)
         if command.kind == "capture":
             self._capture()
         if self.interrupts_again and self.captures and command.kind == "setpoint":
             signal.raise_signal(signal.SIGINT)
         if len(self.asked) == self.meddles_at:
-            self.hold.ask(Command("setpoint", "another", value=77.0))
+            self.hold.send_command(Command("setpoint", "another", value=77.0))
 
-    def news(self) -> News:
+    def read_news(self) -> News:
         told, self._told = self._told, ()
-        news = self.hold.news()
+        news = self.hold.read_news()
         return News(news.rows, news.events + told, () if self.blind else news.shapes)
 
     def close(self) -> None:

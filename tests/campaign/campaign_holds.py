@@ -160,7 +160,7 @@ async def faults_that_outlive_the_run() -> list[str]:
 
         async with a_hold(on_board) as rig:
             with FaultLatch(file, None, "run", LoopClock().utc, rig.events.append) as fault_latch:
-                rig.listeners.append(fault_latch.heard)
+                rig.listeners.append(fault_latch.handle_tick)
                 board_of(rig).virtual.wrong.late_ms = 0.0
                 board_of(rig).virtual.wrong.gauge_offset_pa = 60.0
                 await rig.until(State.FAULT)
@@ -172,7 +172,7 @@ async def faults_that_outlive_the_run() -> list[str]:
                 locked = CommandTaken("latch", "somebody", "", text="later")
                 denied = CommandTaken("ack", "somebody", "", refused="not now")
                 for event in (locked, denied):
-                    fault_latch.heard(cast(TickOutputs, _Told(rig.heard[-1], (event,))))
+                    fault_latch.handle_tick(cast(TickOutputs, _Told(rig.heard[-1], (event,))))
             rig.must(
                 file.read() == first,
                 "the first cause was replaced, or cleared by a refused acknowledgement",

@@ -141,13 +141,13 @@ def run_case(case: Case, at: Situation, seed: int) -> Result:
             injection.update(run.now_s)
             watch.wrong_s = injection.last_on_s
             script.arrange(bench.wrong)
-            watch.look(run.tick(script.commands(run.now_s)), run.now_s)
+            watch.look(run.run_tick(script.commands(run.now_s)), run.now_s)
             script.follow(watch.state)
         watch.before_the_stop(run.now_s)
         stop: tuple[Command, ...] = (Command("stop", "campaign"),)
         while run.now_s < begins_s + AFTERMATH_S + THE_STOP_S:
             injection.update(run.now_s)
-            watch.look(run.tick(stop), run.now_s)
+            watch.look(run.run_tick(stop), run.now_s)
             stop = ()
         watch.after_the_stop(run)
     said = watch.names.get(watch.code, "")
@@ -209,7 +209,7 @@ def _begins_s(config: Config, world: World, at: Situation) -> float:
         while not script.there:
             assert run.now_s < GIVE_UP_S, f"{at.name} was not reached: {key}"
             script.arrange(bench.wrong)
-            tick = run.tick(script.commands(run.now_s))
+            tick = run.run_tick(script.commands(run.now_s))
             assert tick is not None
             script.follow(State(int(tick.row.state)))
         _BEGINS[key] = run.now_s

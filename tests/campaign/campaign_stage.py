@@ -46,7 +46,7 @@ class Stage:
 
     def tick(self, *commands: Command) -> None:
         """One period."""
-        tick = self.run.tick(commands)
+        tick = self.run.run_tick(commands)
         if tick is not None:
             self.state = State(int(tick.row.state))
 

@@ -135,7 +135,7 @@ def run_week(process_value: ProcessValue, climate: Climate, seed: int, days: flo
     while run.finished is None and run.now_s < days * DAY_S:
         due = tuple(command for at_s, command in asked if at_s <= run.now_s)
         asked = asked[len(due) :]
-        tick = run.tick(due)
+        tick = run.run_tick(due)
         assert tick is not None
         ticks += 1
         held += int(math.isfinite(tick.row.setpoint_um))

@@ -155,7 +155,7 @@ class HoldRig:
     def ask(self, *kinds: str) -> None:
         """Commands for the next tick."""
         for kind in kinds:
-            self.supervisor.ask(Command(cast(Any, kind), "story"))
+            self.supervisor.queue_command(Command(cast(Any, kind), "story"))
 
 
 @contextlib.asynccontextmanager
@@ -176,7 +176,7 @@ async def a_hold(
         stack.callback(telemetry.close)
         stack.callback(events.close)
         wiring = Wiring(bench, telemetry, events)
-        wiring.heard = {
+        wiring.tick_listeners = {
             "rows": rig.heard.append,
             "listeners": lambda outputs: _tell_all(rig, outputs),
         }

@@ -353,7 +353,7 @@ def run_cell(
     awaited = State.INFLATE if undertaking is Undertaking.INFLATE else State.HOLD
     row = None
     while row is None or State(int(row.state)) != awaited:
-        tick = run.tick(first)
+        tick = run.run_tick(first)
         first = ()
         assert tick is not None
         row = tick.row
@@ -361,11 +361,11 @@ def run_cell(
     if undertaking is not Undertaking.INFLATE:
         until_s = run.now_s + WARM_S
         while run.now_s < until_s:
-            run.tick()
+            run.run_tick()
     begins = _begin(undertaking, config, HOLDING_FLOW_UM_PER_S)
     if begins is not None:
-        run.tick((begins,))
-        run.tick()
+        run.run_tick((begins,))
+        run.run_tick()
     lying.begin(run.now_s)
     figures.since_s = run.now_s
     return _watch(run, bench, run.now_s + lasts_s, WAYS_UM.get(undertaking, 0.0))
@@ -382,7 +382,7 @@ def _watch(run: VirtualRun, bench: VirtualBench, until_s: float, way_um: float) 
     notice = fault = ""
     state = State.HOLD
     while run.finished is None and run.now_s < until_s:
-        tick = run.tick()
+        tick = run.run_tick()
         if tick is None:
             break
         row, truth = tick.row, bench.truth

@@ -330,7 +330,7 @@ def tell(faults: Sequence[SensorFault], seed: int, camera: bool, from_start: boo
         if run.now_s >= moved_s:
             moved_s = math.inf
             commands = (*commands, Command("setpoint", "campaign", value=30.0))
-        tick = run.tick(commands)
+        tick = run.run_tick(commands)
         commands = ()
         if tick is not None:
             watch.look(tick.row, tick.events, run.now_s)

@@ -102,7 +102,7 @@ def _quiet_hours(
     while run.finished is None and run.now_s < end_s:
         due = tuple(command for at_s, command in asked if at_s <= run.now_s)
         asked = asked[len(due) :]
-        tick = run.tick(due)
+        tick = run.run_tick(due)
         faults = (
             [event for event in tick.events if isinstance(event, Fault)] if tick is not None else []
         )

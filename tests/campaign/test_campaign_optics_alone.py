@@ -96,7 +96,7 @@ def test_rendered_frames_alone_start_settle_and_hold_a_mirror_through_another_an
     while run.now_s < 60.0:
         if abs(run.now_s - 42.0) < 0.01:
             source.anchored = False  # as after a second without the order
-        tick = run.tick(() if rows else (Command("hold", "a test", "it runs"),))
+        tick = run.run_tick(() if rows else (Command("hold", "a test", "it runs"),))
         assert tick is not None
         rows.append(tick.row)
         events += tick.events

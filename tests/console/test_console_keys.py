@@ -39,7 +39,7 @@ def typed(*texts: str, paused: bool = False) -> tuple[Desk, list[Request]]:
     port = Port()
     desk = Desk(port)
     for text in texts:
-        desk.typed(text, paused)
+        desk.process_keys(text, paused)
     return desk, port.asked
 
 
@@ -77,32 +77,32 @@ def test_what_keys_ask_for(texts: list[str], paused: bool, asked: list[Request])
 
 def test_the_last_line_shows_question_text_and_answer() -> None:
     desk = Desk(Port("refused: not now"))
-    assert "h hold" in desk.foot
-    assert not desk.asks
-    desk.typed("s", False)
-    assert desk.asks
-    assert "stop the run?" in desk.foot
-    desk.typed("x", False)
-    assert "not stopped" in desk.foot
-    desk.typed("m", False)
-    desk.typed("door", False)
-    assert "mark: door" in desk.foot
-    desk.typed("\r", False)
-    assert desk.foot.startswith("mark: refused: not now")
-    desk.typed("\x1a", False)
-    assert "Ctrl-Z" in desk.foot
+    assert "h hold" in desk.bottom_line
+    assert not desk.is_asking
+    desk.process_keys("s", False)
+    assert desk.is_asking
+    assert "stop the run?" in desk.bottom_line
+    desk.process_keys("x", False)
+    assert "not stopped" in desk.bottom_line
+    desk.process_keys("m", False)
+    desk.process_keys("door", False)
+    assert "mark: door" in desk.bottom_line
+    desk.process_keys("\r", False)
+    assert desk.bottom_line.startswith("mark: refused: not now")
+    desk.process_keys("\x1a", False)
+    assert "Ctrl-Z" in desk.bottom_line
     assert not desk.help
-    desk.typed("?", False)
+    desk.process_keys("?", False)
     assert desk.help
 
 
 def test_until_the_answer_comes_it_waits() -> None:
     answer: Future[str] = Future()
     desk = Desk(lambda request: answer)
-    desk.typed("h", False)
-    assert desk.foot.startswith("hold: waiting")
+    desk.process_keys("h", False)
+    assert desk.bottom_line.startswith("hold: waiting")
     answer.set_result("hold: done")
-    assert desk.foot.startswith("hold: done")
+    assert desk.bottom_line.startswith("hold: done")
 
 
 @pytest.fixture

@@ -40,7 +40,7 @@ def drawn(
 ) -> list[str]:
     console = Console(width=width, height=height, record=True, file=io.StringIO())
     console.print(
-        ConsolePage(model.view(now_s), CONFIG, "logs/20261121T031200Z-demo", foot, help_=help_)
+        ConsolePage(model.make_view(now_s), CONFIG, "logs/20261121T031200Z-demo", foot, help_=help_)
     )
     return console.export_text().rstrip("\n").splitlines()
 
@@ -173,16 +173,16 @@ def test_who_waits_for_a_person_says_how_to_go_on() -> None:
     model.take_event(
         event(0.0, "command", command="latched", who="command line", why="", text="over_pressure")
     )
-    view = model.view(0.0)
+    view = model.make_view(0.0)
     assert view.go_on == "go on: `membrane-ctrl ctl --socket x/control.sock ack`"
     assert format_line(view).endswith(view.go_on)
     model.take_row(HOLDING)
-    assert model.view(0.0).go_on == ""
+    assert model.make_view(0.0).go_on == ""
     model.take_event(
         event(0.0, "why", why="held up by ann: the pump keeps its mean flow", code="paused")
     )
-    assert model.view(0.0).paused
-    assert model.view(0.0).go_on.endswith("resume` or key p")
+    assert model.make_view(0.0).paused
+    assert model.make_view(0.0).go_on.endswith("resume` or key p")
 
 
 def test_each_lock_is_shown_first_with_text_author_time_and_word_until_it_is_removed() -> None:
@@ -202,15 +202,15 @@ def test_each_lock_is_shown_first_with_text_author_time_and_word_until_it_is_rem
     for author, word in (("unix:ann", "bofak"), ("page:bob", "gumil")):
         assert f'LOCKED "hands inside" by {author} (s), 2026-01-02, word {word}' in page
         assert f'LOCKED "hands inside" by {author} (s), 2026-01-02, word {word}' in format_line(
-            model.view(0.0)
+            model.make_view(0.0)
         )
-    assert model.view(0.0).go_on == "go on: ask unix:ann, then `ctl unlock bofak`"
+    assert model.make_view(0.0).go_on == "go on: ask unix:ann, then `ctl unlock bofak`"
     removed = {"text": "", "author": "", "set_utc": "", "remover": "", "how": "word", "number": 2}
     model.take_event(event(0.0, "unlock", word="bofak", **removed))
-    assert model.view(0.0).go_on == "go on: ask page:bob, then `ctl unlock gumil`"
+    assert model.make_view(0.0).go_on == "go on: ask page:bob, then `ctl unlock gumil`"
     model.take_event(event(0.0, "unlock", word="gumil", **removed))
-    assert model.view(0.0).locks == ()
-    assert "hold" in model.view(0.0).go_on
+    assert model.make_view(0.0).locks == ()
+    assert "hold" in model.make_view(0.0).go_on
 
 
 def test_fault_and_its_remedy_are_seen() -> None:
@@ -230,10 +230,10 @@ def test_trouble_with_the_recording_is_seen_until_it_is_over() -> None:
     )
     low = "Disk almost full: less than 500 MB free; delete old runs"
     assert any(f"notice {low}" in " ".join(row.split()) for row in drawn(model))
-    assert format_line(model.view(75.0)).count(low) == 1
+    assert format_line(model.make_view(75.0)).count(low) == 1
     model.take_event(event(76.0, "recorder_recovered", what="disk", message="disk works again"))
     assert not any("notice" in row for row in drawn(model))
-    assert "500 MB" not in format_line(model.view(75.0))
+    assert "500 MB" not in format_line(model.make_view(75.0))
 
 
 def test_of_many_notices_the_first_are_shown() -> None:
@@ -267,11 +267,11 @@ def test_before_the_first_tick_and_with_nothing_known() -> None:
         )
     )
     assert not any("nan" in row for row in drawn(model))
-    assert "nan" not in format_line(model.view(0.0))
+    assert "nan" not in format_line(model.make_view(0.0))
 
 
 def test_plain_line_has_the_second_in_it() -> None:
-    said = format_line(held().view(75.0))
+    said = format_line(held().make_view(75.0))
     for words in (
         "75.0 s  hold",
         "error",
@@ -282,8 +282,8 @@ def test_plain_line_has_the_second_in_it() -> None:
     ):
         assert words in said
     assert "\n" not in said
-    assert "no tick for 10.0 s" in format_line(held().view(84.98))
-    assert format_line(ConsoleModel(CONFIG).view(0.0)).endswith("no tick yet")
+    assert "no tick for 10.0 s" in format_line(held().make_view(84.98))
+    assert format_line(ConsoleModel(CONFIG).make_view(0.0)).endswith("no tick yet")
 
 
 def test_plain_events() -> None:

@@ -85,21 +85,21 @@ def test_missing_reading_gives_the_mean_flow(missing: float) -> None:
 def test_returning_reading_continues_from_the_mean_flow() -> None:
     inner, _ = settled()
     for _ in range(500):
-        inner.stale(given_at(math.nan), DT_S)
+        inner.step_without_reading(given_at(math.nan), DT_S)
     out = inner.step(given_at(0.0), DT_S)
     assert out.flow_wanted_um_per_s == pytest.approx(1.24)
 
 
 def test_manual_outputs_the_given_flow() -> None:
     inner, _ = settled()
-    assert inner.follow(given_at(0.0), 2.5, DT_S).flow_um_per_s == pytest.approx(2.5)
-    assert inner.follow(given_at(0.0), 99.0, DT_S).pump_fraction == pytest.approx(1.0)
-    assert inner.follow(given_at(0.0), -1.0, DT_S).pump_fraction == 0.0
+    assert inner.follow_flow(given_at(0.0), 2.5, DT_S).flow_um_per_s == pytest.approx(2.5)
+    assert inner.follow_flow(given_at(0.0), 99.0, DT_S).pump_fraction == pytest.approx(1.0)
+    assert inner.follow_flow(given_at(0.0), -1.0, DT_S).pump_fraction == 0.0
 
 
 def test_ramp_down_works_without_a_reading() -> None:
     inner = InnerLoop(LOOP, PUMP)
-    out = inner.follow(given_at(math.nan), 1.0, DT_S)
+    out = inner.follow_flow(given_at(math.nan), 1.0, DT_S)
     assert out.flow_um_per_s == pytest.approx(1.0)
     assert math.isnan(out.filtered_um)
 
@@ -112,7 +112,7 @@ def test_manual_to_automatic_is_bumpless(
     inner, _ = settled(displacement_um=displacement)
     for k in range(100):
         reading = LoopInput(0.0, trim, displacement, 101_325.0 + slope * k * DT_S, 20.0)
-        out = inner.follow(reading, flow, DT_S)
+        out = inner.follow_flow(reading, flow, DT_S)
     there = LoopInput(
         out.filtered_um - trim, trim, displacement, 101_325.0 + slope * 100 * DT_S, 20.0
     )
@@ -124,8 +124,8 @@ def test_a_gust_at_the_end_of_an_experiment_does_not_shift_the_mean_flow() -> No
     inner, _ = settled()
     for k in range(100):
         risen = LoopInput(0.0, 0.0, 0.0, 101_325.0 + 5.0 * k * DT_S, 20.0)
-        inner.follow(risen, 1.2, DT_S)
-    inner.resume(risen, 1.2, DT_S)
+        inner.follow_flow(risen, 1.2, DT_S)
+    inner.resume_at_mean(risen, 1.2, DT_S)
     assert inner.mean_flow_um_per_s == pytest.approx(1.2)
     for _ in range(250):
         out = inner.step(risen, DT_S)
@@ -134,7 +134,7 @@ def test_a_gust_at_the_end_of_an_experiment_does_not_shift_the_mean_flow() -> No
 
 def test_automatic_to_manual_at_the_present_flow_is_bumpless() -> None:
     inner, before = settled()
-    after = inner.follow(given_at(0.0), before.flow_um_per_s, DT_S)
+    after = inner.follow_flow(given_at(0.0), before.flow_um_per_s, DT_S)
     assert after.pump_fraction == pytest.approx(before.pump_fraction)
 
 
@@ -195,9 +195,9 @@ def test_the_command_is_finite_and_in_range_for_any_input(
         if call == "step":
             out = inner.step(reading, dt_s)
         elif call == "stale":
-            out = inner.stale(reading, dt_s)
+            out = inner.step_without_reading(reading, dt_s)
         else:
-            out = inner.follow(reading, reading.trim_um, dt_s)
+            out = inner.follow_flow(reading, reading.trim_um, dt_s)
         assert out.pump_fraction == 0.0 or PUMP.stall_fraction < out.pump_fraction <= 1.0
         assert 0.0 <= out.flow_um_per_s <= PUMP.flow_full_um_per_s + 1e-9
         assert 0.0 <= out.i_um_per_s <= LOOP.flow_max_um_per_s

@@ -19,7 +19,7 @@ def run(
     """A mirror that moves by the balance of flow, leak and weather (µm/s), read with the laser's
     filtered noise.
     """
-    estimate.pause()  # the centre of each run starts at 0
+    estimate.skip_step()  # the centre of each run starts at 0
     rng, centre_um = np.random.default_rng(3), 0.0
     for _ in range(round(seconds / DT_S)):
         centre_um += (flow - leak + weather) * DT_S
@@ -63,7 +63,7 @@ def test_a_gap_in_the_readings_is_left_out() -> None:
     """Motion of the centre during the gap is no rate."""
     estimate = LeakEstimate()
     run(estimate, 1.0, 60.0)
-    estimate.pause()
+    estimate.skip_step()
     estimate.update(1.0, 500.0, 500.0, DT_S)
     assert estimate.leak_um_per_s == pytest.approx(1.0, abs=0.02)
 

@@ -135,7 +135,7 @@ def test_a_probe_segment_with_a_gap_is_discarded() -> None:
     drift = PumpDrift(0.1, 0.15)
     for k in range(round(20 * SEGMENT_S / DT_S)):
         if k % 200 == 0:
-            drift.spoil()
+            drift.discard_segment()
         assert not drift.step(math.sin(0.1 * k), 1.24 + drift.flow_um_per_s(0.1), DT_S)
     assert drift.known == PumpScale()
 

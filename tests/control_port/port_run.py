@@ -94,7 +94,7 @@ class PortRun:
         self, events: tuple[Event, ...] = (), answers: tuple[tuple[int, str], ...] = ()
     ) -> None:
         row = replace(ROW, state=self.state)
-        self.port.heard(TickOutputs(BenchCommand(0.0, 0.0), row, events, None, answers))
+        self.port.handle_tick(TickOutputs(BenchCommand(0.0, 0.0), row, events, None, answers))
 
     def of_kind(self, kind: str) -> list[EventLine]:
         return [event for event in self.events if event["kind"] == kind]

@@ -31,9 +31,9 @@ def test_each_trouble_stands_until_its_own_end() -> None:
     low = "Disk almost full: less than 500 MB free"
     failed = "Not recorded: state file: y. Do: check the disk and the folder of the run"
     assert trouble.words == f"{low}; {failed}"
-    recorder_errors.recovered("state file")
+    recorder_errors.report_recovered("state file")
     assert trouble.words == low
-    recorder_errors.recovered("disk")
+    recorder_errors.report_recovered("disk")
     assert trouble.words == ""
     recorder_errors.report_error("recording", "x" * 5000)
     assert trouble.words == f"Not recorded: {'x' * 286}", "it is in every line of the log"

@@ -49,9 +49,9 @@ def test_the_twin_is_not_inflated_with_a_dead_actuator_at_any_rate(
         for name, value in wrong.items():
             setattr(bench.wrong, name, value)
         run = VirtualRun(config, bench, zernike_projection())
-        ticks = [run.tick((Command("hold", "test"),))]
+        ticks = [run.run_tick((Command("hold", "test"),))]
         while run.now_s < 25.0 and run.finished is None:
-            ticks.append(run.tick())
+            ticks.append(run.run_tick())
         states = {tick.row.state for tick in ticks if tick is not None}
         assert State.INFLATE not in states, seed
 

@@ -98,7 +98,7 @@ def test_the_pump_is_handed_over_to_a_person_and_back_without_a_gap() -> None:
     asked = {1: "hold", 1000: "manual", 1500: "hold"}
     for number in range(1, 2000):
         commands = (Command(asked[number], "engineer", value=1.2),) if number in asked else ()
-        tick = run.tick(commands)
+        tick = run.run_tick(commands)
         assert tick is not None
         rows.append(tick.row)
     assert {State(row.state) for row in rows[1000:1499]} == {State.MANUAL}
@@ -116,7 +116,7 @@ def test_the_operator_line_names_the_sender_of_the_command_only() -> None:
     said = [
         event.why
         for number in range(1, 1200)
-        if (tick := run.tick((asked[number],) if number in asked else ())) is not None
+        if (tick := run.run_tick((asked[number],) if number in asked else ())) is not None
         for event in tick.events
         if isinstance(event, Why)
     ]

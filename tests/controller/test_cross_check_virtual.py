@@ -117,7 +117,7 @@ def tell(config: Config, event: str) -> Story:
             if not story.held:
                 return story
             setattr(bench.wrong, event, True)
-        tick = run.tick(commands)
+        tick = run.run_tick(commands)
         commands = ()
         away_um = bench.truth.displacement_um - config.loop.setpoint_um
         story.highest_um = max(story.highest_um, away_um)

@@ -38,7 +38,7 @@ def held(
     ticks: list[VirtualTick] = []
     while run.now_s < until_s:
         fail(bench.wrong, FROM_S <= run.now_s < UNTIL_S)
-        tick = run.tick(() if ticks else (Command("hold", "a test", "it runs"),))
+        tick = run.run_tick(() if ticks else (Command("hold", "a test", "it runs"),))
         if tick is None:  # the run has ended
             break
         ticks.append(tick)
@@ -154,7 +154,7 @@ def test_a_replay_from_a_snapshot_is_the_same_to_the_last_bit() -> None:
     for n in range(600):
         if n == 500:
             fresh = continue_from(take_snapshot(controller), CONFIG, zernike_projection())
-        tick = run.tick(() if n else (Command("hold", "a test", "it runs"),))
+        tick = run.run_tick(() if n else (Command("hold", "a test", "it runs"),))
         assert tick is not None
         if fresh is not None:
             assert fresh.tick(tick.inputs) == tick.outputs

@@ -103,7 +103,7 @@ class Bench:
         self.folder = folder
         self.events: list[EventLine] = []
         self.reports: Callable[[], list[Event]] = list
-        self.children = SimpleNamespace(reports=lambda: self.reports())
+        self.children = SimpleNamespace(read_reports=lambda: self.reports())
 
     def hold(self, breaks: Callable[[Bench], None]) -> Exit:
         """Hold in standby until something breaks after three seconds, and a stop after twenty."""
@@ -192,7 +192,7 @@ def test_without_a_fault_the_hold_ends_as_requested(bench: Bench) -> None:
 
 def test_a_start_passes_the_resumes_of_the_day_to_the_controller(bench: Bench) -> None:
     for hours in (30.0, 2.0, 1.0):
-        ResumeLog(bench.folder).add(datetime.now(UTC) - timedelta(hours=hours))
+        ResumeLog(bench.folder).add_resume(datetime.now(UTC) - timedelta(hours=hours))
     bench.hold(lambda bench: None)
     told = [event["value"] for event in bench.events if event.get("command") == "resumed"]
     assert told == [pytest.approx(7200.0, abs=60.0), pytest.approx(3600.0, abs=60.0)]
@@ -212,7 +212,7 @@ def test_a_software_watchdog_that_ended_is_a_fault(bench: Bench) -> None:
 def test_a_listener_that_raises_is_a_fault(
     bench: Bench, monkeypatch: pytest.MonkeyPatch, kind: type, name: str
 ) -> None:
-    exit_code = bench.hold(breaking(monkeypatch, kind, "heard"))
+    exit_code = bench.hold(breaking(monkeypatch, kind, "handle_tick"))
     judged(bench, exit_code, f"{name} (RuntimeError: broken)")
 
 

@@ -80,7 +80,7 @@ class Rig:
         self.events: list[Event] = []
 
     def tick(self, *commands: Command) -> VirtualTick:
-        made = self.run.tick(commands)
+        made = self.run.run_tick(commands)
         assert made is not None
         self.ticks.append(made)
         self.events += made.events
@@ -387,7 +387,7 @@ def test_a_replay_decides_the_same_to_the_last_bit() -> None:
         for number, tick in enumerate(rig.ticks, 1)
         for message in pack_tick(number, tick.inputs, tick.outputs, tick.row.pack())
     ]
-    batch = TickAssembler().take(packed)
+    batch = TickAssembler().add_messages(packed)
     controller = Controller(CONFIG, zernike_projection())
     again = [
         controller.tick(unpack_tick(record, batch.tails.get(int(record["tick"]), b""), {}))

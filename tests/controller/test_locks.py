@@ -217,7 +217,7 @@ def test_a_replay_of_the_recorded_inputs_decides_the_same() -> None:
         outputs = mirror.controller.tick(inputs)
         messages = pack_tick(mirror.ticks, inputs, outputs, outputs.row.pack())
         assert max(map(len, messages)) <= MESSAGE_BYTES
-        taken = TickAssembler().take(messages)
+        taken = TickAssembler().add_messages(messages)
         (record,) = taken.records
         replayed = again.controller.tick(unpack_tick(record, taken.tails[mirror.ticks], {}))
         assert replayed.events == outputs.events
@@ -234,7 +234,7 @@ def test_inputs_of_earlier_versions_have_neither_lock_nor_account() -> None:
     }
     inputs = TickInputs(1.0, 0.1, None, commands=(command,))
     outputs = in_state(State.STANDBY).controller.tick(inputs)
-    taken = TickAssembler().take(pack_tick(1, inputs, outputs, outputs.row.pack()))
+    taken = TickAssembler().add_messages(pack_tick(1, inputs, outputs, outputs.row.pack()))
     tail = json.dumps({"commands": [plain], "dead_tasks": []}).encode()
     record = taken.records[0].copy()
     record["tail_bytes"] = len(tail)

@@ -76,9 +76,9 @@ class Bench:
         self._failed_s = math.inf
         self.run = VirtualRun(self.config, self.bench, zernike_projection(), self._figure)
         self.ticks: list[VirtualTick] = []
-        tick = self.run.tick((Command("hold", "a test"),))
+        tick = self.run.run_tick((Command("hold", "a test"),))
         while tick is not None and State(int(tick.row.state)) != State.HOLD:
-            tick = self.run.tick()
+            tick = self.run.run_tick()
         self._pass(self.settle_s, lambda wrong, since_s: None)
         self.ticks.clear()
 
@@ -92,15 +92,15 @@ class Bench:
         begins_s = self.run.now_s
         while self.run.now_s < begins_s + seconds - 1e-6 and self.run.finished is None:
             fail(self.bench.wrong, self.run.now_s - begins_s)
-            tick = self.run.tick()
+            tick = self.run.run_tick()
             assert tick is not None
             self.ticks.append(tick)
 
     def command(self, command: Command) -> None:
         """Give a command, and let it take effect."""
-        tick = self.run.tick((command,))
+        tick = self.run.run_tick((command,))
         assert tick is not None
-        self.run.tick()
+        self.run.run_tick()
 
     def fail(self, seconds: float, fail: Fail = lambda wrong, since_s: None) -> Bench:
         """Let the sensor fail for a while, or until the run ends; afterwards the outcome can be

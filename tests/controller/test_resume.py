@@ -259,7 +259,7 @@ def test_only_the_start_of_a_run_reports_earlier_resumes(who: str, possible: boo
     )
     bench = VirtualBench(Plant(config.twin, config.pump))
     run = VirtualRun(config, bench, zernike_projection())
-    run.tick(
+    run.run_tick(
         (
             Command("resumed", who, value=7200.0),
             Command("resumed", who, value=60.0),
@@ -269,7 +269,7 @@ def test_only_the_start_of_a_run_reports_earlier_resumes(who: str, possible: boo
     resumed = 0
     for tick in range(400):
         bench.wrong.unreachable = 200 <= tick < 210
-        made = run.tick()
+        made = run.run_tick()
         resumed += sum(event.kind == "resumed" for event in made.events) if made else 0
     assert resumed == possible
     assert (run.finished is None) == possible

@@ -334,7 +334,11 @@ def test_an_incident_begins_in_the_middle(
     window = ("--from", "13.5s", "--to", "16s")
     assert run(["replay", str(record), *window, "--to-test", "laser-lost"]) == Exit.DONE
     incident = read_incident(tmp_path / "tests" / "incidents" / "laser-lost")
-    assert [decision.what for decision in incident.expected if "shape" not in decision.what] == [
+    assert [
+        decision.description
+        for decision in incident.expected
+        if "shape" not in decision.description
+    ] == [
         "state hold",
         "fault displacement_missing",
         "cleared displacement_missing",

@@ -67,7 +67,7 @@ class Held:
 
     def go(self, duration_s: float, *commands: Command) -> None:
         for _ in range(round(duration_s * CONFIG.loop.rate_hz)):
-            tick = self._run.tick(commands)
+            tick = self._run.run_tick(commands)
             commands = ()
             if tick is not None:
                 self.rows.append(tick.row)
@@ -466,11 +466,11 @@ def test_a_trial_without_duration_is_refused() -> None:
 def test_the_command_is_recorded_without_loss() -> None:
     """A replay gets the experiment that the run got."""
     held = Held()
-    tick = held._run.tick((tune(), gains(0.3, 5.0)))
+    tick = held._run.run_tick((tune(), gains(0.3, 5.0)))
     assert tick is not None
     inputs, outputs = replace(tick.inputs, truth_displacement_um=0.0), tick.outputs
     messages = pack_tick(1, inputs, outputs, outputs.row.pack())
-    batch = TickAssembler().take(messages)
+    batch = TickAssembler().add_messages(messages)
     again = unpack_tick(batch.records[0], batch.tails[1], {})
     assert again.commands[0].experiment == inputs.commands[0].experiment
     assert isinstance(again.commands[1].loop, LoopConfig)

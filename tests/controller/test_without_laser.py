@@ -70,7 +70,7 @@ def held(
     while run.now_s < until_s:
         fail(bench.wrong, run.now_s)
         number = len(ticks) + 1
-        tick = run.tick((asked[number],) if number in asked else ())
+        tick = run.run_tick((asked[number],) if number in asked else ())
         if tick is None:
             break
         ticks.append(tick)
@@ -275,8 +275,8 @@ def test_a_camera_that_returns_after_a_freeze_keeps_its_zero() -> None:
 
     run = VirtualRun(BY_OPTICS, bench, zernike_projection(), figure)
     run._shape_period_s = 0.06
-    ticks = [run.tick((Command("hold", "a test", "it runs"),))]
-    ticks += [run.tick() for _ in range(1700)]
+    ticks = [run.run_tick((Command("hold", "a test", "it runs"),))]
+    ticks += [run.run_tick() for _ in range(1700)]
     assert all(ticks)
     (fault,) = told(ticks, Fault)
     assert fault.seen == "the camera repeats one figure to the last bit"
@@ -299,8 +299,8 @@ def test_a_new_anchor_of_the_tracking_does_not_move_the_mirror(config: Config) -
 
     run = VirtualRun(config, bench, zernike_projection(), figure)
     run._shape_period_s = 0.06
-    ticks = [run.tick((Command("hold", "a test", "it runs"),))]
-    ticks += [run.tick() for _ in range(1399)]
+    ticks = [run.run_tick((Command("hold", "a test", "it runs"),))]
+    ticks += [run.run_tick() for _ in range(1399)]
     assert all(ticks)
     assert np.abs(true_um(ticks, 20.0) - true_um(ticks, 17.0, 20.0).mean()).max() < 0.3
 

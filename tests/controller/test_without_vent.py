@@ -50,14 +50,14 @@ def reasons(bench: Config, *asked: str, seconds: float = 5.0) -> tuple[list[str]
             vent_fraction=math.nan if without else reading.vent_fraction,
         ),
     )
-    tick = run.tick((Command("hold", "ann"),))
+    tick = run.run_tick((Command("hold", "ann"),))
     while tick is not None and tick.row.state != State.HOLD:
-        tick = run.tick()
+        tick = run.run_tick()
     said: list[str] = []
     commands = tuple(Command(kind, "ann") for kind in asked)  # type: ignore[arg-type]
     excess_pa[0] = 0.0 if asked else 400.0
     for number in range(round(seconds * 20)):
-        tick = run.tick(commands if number == 0 else ())
+        tick = run.run_tick(commands if number == 0 else ())
         assert tick is not None
         said += [event.why for event in tick.events if isinstance(event, Why)]
     return said, SafeLevel(int(tick.row.safe_level))

@@ -133,7 +133,7 @@ def test_the_hold_takes_the_setpoint_back_from_a_killed_session(logs: Path) -> N
 
     def setpoint_um() -> float:
         assert time.monotonic() < give_up_s
-        return watcher.news().rows[-1].setpoint_um
+        return watcher.read_news().rows[-1].setpoint_um
 
     while setpoint_um() < 3.0:
         pass
@@ -141,7 +141,7 @@ def test_the_hold_takes_the_setpoint_back_from_a_killed_session(logs: Path) -> N
     doomed.wait(PATIENCE_S)
     while setpoint_um() > 0.01:
         pass
-    assert watcher.news().rows[-1].state == State.HOLD
+    assert watcher.read_news().rows[-1].state == State.HOLD
     watcher.close()
 
 

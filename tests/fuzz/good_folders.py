@@ -74,7 +74,7 @@ def _write_segment(folder: Path, rows: object) -> None:
     streams = TelemetryStreams(recording, CONFIG)
     recording.next_segment()
     streams.start_segment()
-    streams.send(rows)  # type: ignore[arg-type]
+    streams.send_rows(rows)  # type: ignore[arg-type]
     recording.close()
     (folder / LAYOUT).unlink(missing_ok=True)
 

@@ -54,14 +54,14 @@ def calibrated(path: Path, **more: object) -> Path:
 
 def test_lens_and_pitch_of_a_calibrated_file_count(tmp_path: Path) -> None:
     file = read_geometry(calibrated(tmp_path / "g.toml", camera=LENS, pattern={"period_mm": 49.9}))
-    optics = file.over(OpticsConfig(camera=CAMERA, pattern=PatternConfig(steps=5)))
+    optics = file.apply_to_optics(OpticsConfig(camera=CAMERA, pattern=PatternConfig(steps=5)))
     assert optics.geometry.a_mm == 2674.0
     assert optics.camera.focal_mm == 16.1
     assert optics.camera.principal == (150.0, 127.0)
     assert optics.camera.noise_adu == CAMERA.noise_adu
     assert (optics.pattern.period_mm, optics.pattern.steps) == (49.9, 5)
     assert file.calibration is not None
-    assert file.origin.table() == {
+    assert file.origin.make_table() == {
         "hash": file.calibration.hash,
         "file": str(file.path),
         "calibrated_utc": "2026-01-02T03:04:05+00:00",
@@ -77,7 +77,7 @@ def test_the_camera_of_a_set_counts_for_nothing_elsewhere(tmp_path: Path) -> Non
     path.write_text(tomli_w.dumps({**tables, "camera": {"focal_mm": 25.0}}))
     file = read_geometry(path)
     assert file.calibration is None
-    assert file.over(OpticsConfig(camera=CAMERA)).camera == CAMERA
+    assert file.apply_to_optics(OpticsConfig(camera=CAMERA)).camera == CAMERA
 
 
 def test_a_lens_of_another_camera_is_refused(tmp_path: Path) -> None:
@@ -85,7 +85,7 @@ def test_a_lens_of_another_camera_is_refused(tmp_path: Path) -> None:
     with pytest.raises(
         InputError, match=r"g\.toml: camera\.width_px = 306, the frames' camera has 2448"
     ):
-        file.over(OpticsConfig())
+        file.apply_to_optics(OpticsConfig())
 
 
 def test_numbers_that_were_changed_after_the_calibration_are_refused(tmp_path: Path) -> None:
@@ -110,7 +110,7 @@ def test_a_run_measures_with_the_file_as_it_was_at_its_start(tmp_path: Path) -> 
     path = calibrated(tmp_path / "g.toml")
     config = Config(optics=OpticsConfig(geometry_file=path))
     begun = read_configured_geometry(config)
-    begun.keep(tmp_path)
+    begun.copy_to_run(tmp_path)
     assert begun.optics.geometry.a_mm == 2674.0
     path.unlink()
     kept = read_run_geometry(tmp_path, config)
@@ -138,7 +138,7 @@ def test_a_height_map_beside_the_file_is_kept_with_the_run(tmp_path: Path) -> No
     (lab / "g.toml").write_text(tomli_w.dumps({**tables, "covariance": covariance}))
     config = Config(optics=OpticsConfig(geometry_file=lab / "g.toml"))
     begun = read_configured_geometry(config)
-    begun.keep(run_dir)
+    begun.copy_to_run(run_dir)
     kept = read_run_geometry(run_dir, config)
     assert kept.optics == begun.optics
     assert kept.origin.hash == begun.origin.hash
@@ -152,7 +152,7 @@ def test_without_a_file_yet_the_hand_counts_and_it_is_said(tmp_path: Path) -> No
     there = read_configured_geometry(config)
     assert there.optics == config.optics
     assert "g.toml does not exist yet: [optics.geometry] is used" in there.note
-    there.keep(tmp_path)
+    there.copy_to_run(tmp_path)
     assert not (tmp_path / GEOMETRY_COPY).exists()
     assert read_run_geometry(tmp_path, config).note == there.note
     assert read_configured_geometry(Config()).note == ""

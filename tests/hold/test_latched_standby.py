@@ -19,7 +19,7 @@ CONFIG = Config(
 
 
 def refusals(run: VirtualRun, *commands: Command) -> list[str]:
-    tick = run.tick(commands)
+    tick = run.run_tick(commands)
     assert tick is not None
     return [event.refused or "" for event in tick.events if isinstance(event, CommandTaken)]
 
@@ -30,12 +30,12 @@ def test_hold_is_refused_until_the_fault_is_acknowledged() -> None:
     (refused,) = refusals(run, Command("hold", "night shift"))
     assert "over_pressure: 801 Pa" in refused
     for _ in range(50):
-        tick = run.tick()
+        tick = run.run_tick()
         assert tick is not None
         assert tick.row.state == State.STANDBY
         assert tick.row.pump_fraction == 0.0
     assert refusals(run, Command("ack", "engineer"), Command("hold", "engineer")) == ["", ""]
-    tick = run.tick()
+    tick = run.run_tick()
     assert tick is not None
     assert tick.row.state == State.CHECK
 

@@ -57,7 +57,7 @@ def keeper(
 
 
 def outcome(kept: LockKeeper, number: int) -> str:
-    future = kept.outcome(number)
+    future = kept.find_outcome(number)
     assert future is not None
     return future.result(5.0)
 
@@ -70,12 +70,12 @@ def test_a_lock_or_its_removal_is_on_the_disk_before_its_outcome(
     tmp_path: Path,
 ) -> None:
     with keeper(tmp_path, []) as kept:
-        kept.heard(outputs(SET))
+        kept.handle_tick(outputs(SET))
         assert outcome(kept, 3) == ""
         assert words(tmp_path) == ["bofak"]
-        assert kept.outcome(3) is None
-        assert kept.outcome(99) is None
-        kept.heard(outputs(REMOVED))
+        assert kept.find_outcome(3) is None
+        assert kept.find_outcome(99) is None
+        kept.handle_tick(outputs(REMOVED))
         assert outcome(kept, 4) == ""
     assert words(tmp_path) == []
 
@@ -87,10 +87,10 @@ def test_a_lock_of_an_earlier_run_is_not_stored_twice_and_is_removed_from_its_fi
     at_start = LockSet("bofak", "hands inside", "unix:ann", "", "", "", 0)
     with keeper(tmp_path, []) as kept:
         assert [lock.word for lock in kept.at_start] == ["bofak"]
-        kept.heard(outputs(at_start))
+        kept.handle_tick(outputs(at_start))
     assert words(tmp_path) == ["bofak"]
     with keeper(tmp_path, []) as kept:
-        kept.heard(outputs(at_start, REMOVED))
+        kept.handle_tick(outputs(at_start, REMOVED))
     assert words(tmp_path) == []
 
 
@@ -106,11 +106,11 @@ def test_on_a_full_disk_the_outcome_says_so_and_the_lock_is_stored_once_there_is
     with keeper(tmp_path, told) as kept:
         with monkeypatch.context() as patch:
             patch.setattr(os, "fsync", full)
-            kept.heard(outputs(SET))
+            kept.handle_tick(outputs(SET))
             assert "no space left" in outcome(kept, 3)
-            kept.heard(outputs())
+            kept.handle_tick(outputs())
             assert words(tmp_path) == []
-        until(lambda: kept.heard(outputs()), lambda: words(tmp_path) == ["bofak"])
+        until(lambda: kept.handle_tick(outputs()), lambda: words(tmp_path) == ["bofak"])
     assert [type(event) for event in told] == [LockNotStored, LockStored]
 
 
@@ -128,9 +128,9 @@ def test_a_lock_that_was_removed_before_there_was_room_is_not_stored_later(
     with keeper(tmp_path, []) as kept:
         with monkeypatch.context() as patch:
             patch.setattr(os, "fsync", full)
-            kept.heard(outputs(SET))
+            kept.handle_tick(outputs(SET))
             assert outcome(kept, 3) != ""
-        kept.heard(outputs(REMOVED))
+        kept.handle_tick(outputs(REMOVED))
         assert outcome(kept, 4) == ""
     assert words(tmp_path) == []
 
@@ -139,11 +139,11 @@ def test_a_removal_that_fails_is_tried_again_at_the_end(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     with keeper(tmp_path, []) as kept:
-        kept.heard(outputs(SET))
+        kept.handle_tick(outputs(SET))
         assert outcome(kept, 3) == ""
         with monkeypatch.context() as patch:
             patch.setattr(os, "unlink", full)
-            kept.heard(outputs(REMOVED))
+            kept.handle_tick(outputs(REMOVED))
             assert outcome(kept, 4) != ""
         assert words(tmp_path) == ["bofak"]
     assert words(tmp_path) == []
@@ -157,24 +157,24 @@ def test_a_lock_that_another_program_stores_becomes_a_command_once(
     other = LockStore([tmp_path])
     other.write_lock(Lock("tarep", "of an earlier run", "unix:ann"), DEVICES)
     with keeper(tmp_path, [], asked) as kept:
-        kept.heard(outputs(SET))
+        kept.handle_tick(outputs(SET))
         assert outcome(kept, 3) == ""
         other.write_lock(
             Lock("gumil", "on another bench", "unix:bob"), {"10.0.0.6 port 502 unit 1"}
         )
         (tmp_path / "damaged.json").write_text("{")
         other.write_lock(Lock("bofak", "made safe by hand", "unix:bob"), DEVICES)
-        until(lambda: kept.heard(outputs()), lambda: bool(asked))
+        until(lambda: kept.handle_tick(outputs()), lambda: bool(asked))
         for _ in range(20):
-            kept.heard(outputs())
+            kept.handle_tick(outputs())
             time.sleep(0.005)
         (command,) = asked
         assert (command.kind, command.text) == ("latch", "made safe by hand")
         lock = command.lock
         assert lock is not None
         assert lock.word not in ("bofak", "tarep")
-        kept.heard(outputs(LockSet(lock.word, lock.text, lock.author, "", "", "", 0)))
-        kept.heard(outputs(LockRemoved(lock.word, "", "", "", "page:bob", "word", 9)))
+        kept.handle_tick(outputs(LockSet(lock.word, lock.text, lock.author, "", "", "", 0)))
+        kept.handle_tick(outputs(LockRemoved(lock.word, "", "", "", "page:bob", "word", 9)))
         assert outcome(kept, 9) == ""
     texts = [each.lock.text for each in other.find_locks(DEVICES) if each.devices]
     assert texts == ["of an earlier run", "hands inside"]
@@ -182,8 +182,8 @@ def test_a_lock_that_another_program_stores_becomes_a_command_once(
 
 def test_the_twin_stores_nothing() -> None:
     with LockKeeper(None, lambda _: None) as kept:
-        kept.heard(outputs(SET, REMOVED))
-        assert kept.outcome(3) is None
+        kept.handle_tick(outputs(SET, REMOVED))
+        assert kept.find_outcome(3) is None
         assert kept.at_start == ()
 
 

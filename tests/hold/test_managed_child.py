@@ -59,8 +59,8 @@ def make_managed() -> tuple[ManagedChild, Agency]:
 def test_the_messages_of_the_child_are_passed_on() -> None:
     managed, agency = make_managed()
     agency.theirs[0].send({"kind": "disk_low", "what": "disk", "message": "full"})
-    assert managed.look(0.0) == [DiskLow("disk", "full")]
-    assert managed.look(0.5) == []
+    assert managed.check_child(0.0) == [DiskLow("disk", "full")]
+    assert managed.check_child(0.5) == []
 
 
 def test_a_message_reaches_the_present_child_only() -> None:
@@ -75,11 +75,11 @@ def test_a_dead_child_is_replaced_at_once_and_reported() -> None:
     managed, agency = make_managed()
     agency.theirs[0].send({"kind": "last words"})
     managed.child.kill()
-    assert kinds(managed.look(3.0)) == ["last words", "child_ended", "child_restarted"]
+    assert kinds(managed.check_child(3.0)) == ["last words", "child_ended", "child_restarted"]
     assert agency.numbers == [0, 1]
     assert managed.child.alive
     agency.theirs[1].send({"kind": "hello"})
-    assert kinds(managed.look(3.5)) == ["hello"]
+    assert kinds(managed.check_child(3.5)) == ["hello"]
 
 
 def test_replacements_are_delayed_increasingly_and_limited_to_ten_an_hour() -> None:
@@ -89,7 +89,7 @@ def test_replacements_are_delayed_increasingly_and_limited_to_ten_an_hour() -> N
     for half_second in range(2 * 3600):
         if managed.child.alive:
             managed.child.kill()
-        events = kinds(managed.look(0.5 * half_second))
+        events = kinds(managed.check_child(0.5 * half_second))
         said += events
         if "child_restarted" in events:
             restarted_s.append(0.5 * half_second)
@@ -107,21 +107,21 @@ def test_after_an_hour_it_is_tried_again() -> None:
     for second in range(3000):
         if managed.child.alive:
             managed.child.kill()
-        managed.look(float(second))
+        managed.check_child(float(second))
     assert agency.numbers[-1] == 10
-    assert kinds(managed.look(3700.0)) == ["child_restarted"]
+    assert kinds(managed.check_child(3700.0)) == ["child_restarted"]
 
 
 def test_a_child_that_stops_its_heartbeat_is_killed_and_replaced() -> None:
     managed, agency = make_managed()
     agency.theirs[0].send(Alive(5.0).to_dict())
-    assert managed.look(10.0) == []
-    assert managed.look(15.0) == []
-    (silent,) = managed.look(15.5)
+    assert managed.check_child(10.0) == []
+    assert managed.check_child(15.0) == []
+    (silent,) = managed.check_child(15.5)
     assert silent == ChildSilent("recorder", 0.5, killed=True)
-    assert kinds(managed.look(16.0)) == ["child_ended", "child_restarted"]
+    assert kinds(managed.check_child(16.0)) == ["child_ended", "child_restarted"]
     agency.theirs[1].send(Alive(5.0).to_dict())
-    assert managed.look(17.0) == []
+    assert managed.check_child(17.0) == []
 
 
 @pytest.mark.parametrize(("moment_s", "said"), [(59.0, []), (61.0, ["child_silent"])])
@@ -129,7 +129,7 @@ def test_a_child_that_never_sends_a_heartbeat_is_not_waited_for(
     moment_s: float, said: list[str]
 ) -> None:
     managed, _ = make_managed()
-    assert kinds(managed.look(moment_s)) == said
+    assert kinds(managed.check_child(moment_s)) == said
 
 
 def test_a_child_beyond_its_replacements_is_not_killed_and_may_recover() -> None:
@@ -137,27 +137,27 @@ def test_a_child_beyond_its_replacements_is_not_killed_and_may_recover() -> None
     for second in range(0, 1200, 2):
         if len(agency.numbers) <= 10 and managed.child.alive:
             managed.child.kill()
-        managed.look(float(second))
+        managed.check_child(float(second))
     agency.theirs[-1].send(Alive(5.0).to_dict())
-    assert managed.look(1200.0) == []
-    (silent,) = managed.look(1206.0)
+    assert managed.check_child(1200.0) == []
+    (silent,) = managed.check_child(1206.0)
     assert not silent.to_dict()["killed"]
     assert managed.child.alive
-    assert managed.look(1207.0) == [], "said once"
+    assert managed.check_child(1207.0) == [], "said once"
     agency.theirs[-1].send(Alive(5.0).to_dict())
-    managed.look(1208.0)
-    assert kinds(managed.look(1214.0)) == ["child_silent"]
+    managed.check_child(1208.0)
+    assert kinds(managed.check_child(1214.0)) == ["child_silent"]
 
 
 def test_a_program_may_be_silent_and_its_end_is_reported_once() -> None:
     agency = Agency()
     page = ManagedChild(agency.make, reports=False)
     page.start(0.0)
-    assert page.look(1e6) == []
+    assert page.check_child(1e6) == []
     page.child.kill()
-    assert kinds(page.look(1e6)) == ["child_ended", "child_restarted"]
-    assert page.look(1e6 + 3000.0) == []
+    assert kinds(page.check_child(1e6)) == ["child_ended", "child_restarted"]
+    assert page.check_child(1e6 + 3000.0) == []
     page.child.kill()
-    assert kinds(page.look(1e6 + 3001.0)) == ["child_ended"]
-    assert page.look(1e6 + 3001.5) == []
-    assert kinds(page.look(1e6 + 3010.0)) == ["child_restarted"]
+    assert kinds(page.check_child(1e6 + 3001.0)) == ["child_ended"]
+    assert page.check_child(1e6 + 3001.5) == []
+    assert kinds(page.check_child(1e6 + 3010.0)) == ["child_restarted"]

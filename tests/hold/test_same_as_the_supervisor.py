@@ -115,12 +115,12 @@ def supervised(upset: Upset) -> tuple[list[TickOutputs], Exit]:
                 events,
                 shapes=newest_of(reader),
                 truth=bench.truth,
-                heard={"test": heard.append},
+                tick_listeners={"test": heard.append},
             )
             controller = Controller(CONFIG, zernike_projection())
             await bench.open()
             supervisor = Supervisor(controller, wiring, cast(RunClock, LoopClock()), RATE_HZ)
-            supervisor.ask(HOLD)
+            supervisor.queue_command(HOLD)
             return await supervisor.run(LASTS_S)
 
     return heard, in_virtual_time(hold())
@@ -140,7 +140,7 @@ def virtual(upset: Upset) -> tuple[list[TickOutputs], Exit | None]:
     while run.finished is None:
         next_s = run.now_s + 1.0 / RATE_HZ
         upset_between(bench, upset, run.now_s, next_s)
-        tick = run.tick((HOLD,) * (next_s == 1.0 / RATE_HZ) + (STOP,) * (next_s == LASTS_S))
+        tick = run.run_tick((HOLD,) * (next_s == 1.0 / RATE_HZ) + (STOP,) * (next_s == LASTS_S))
         assert tick is not None
         outputs.append(tick.outputs)
     return outputs, run.finished

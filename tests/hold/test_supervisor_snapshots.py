@@ -76,7 +76,7 @@ async def test_the_snapshot_is_the_one_before_its_tick(monkeypatch: pytest.Monke
         assert await supervisor.run(0.4) == Exit.DONE
         assembler = TickAssembler()
         assembler.add_snapshots(snapshots.drain())
-        batch = assembler.take(inputs.drain())
+        batch = assembler.add_messages(inputs.drain())
     assert batch.snapshots
     for tick, snapshot in batch.snapshots.items():
         assert continue_from(snapshot, CONFIG, zernike_projection()).memory.ticks == tick - 1
@@ -95,7 +95,7 @@ def test_an_event_that_is_too_long_for_its_slot_is_cut() -> None:
         texts = dict.fromkeys(
             ("cause", "seen", "limit", "remedy"), "\N{LOUDLY CRYING FACE}" * 10_000
         )
-        supervisor.tell(from_dict({"kind": "fault", "name": "tick_error", **texts}))
+        supervisor.record_event(from_dict({"kind": "fault", "name": "tick_error", **texts}))
         (told,) = reader.drain()
     assert json.loads(told)["name"] == "tick_error"
 

@@ -53,9 +53,9 @@ def test_ready_once_then_the_watchdog_twice_a_second_and_at_each_change(
 ) -> None:
     with SystemdNotify() as notify:
         for tick in range(101):
-            notify.heard(outputs(tick * 0.02, State.CHECK))
-        notify.heard(outputs(2.02, State.HOLD, -0.42))
-        notify.heard(outputs(2.04, State.FAULT, fault=20))
+            notify.handle_tick(outputs(tick * 0.02, State.CHECK))
+        notify.handle_tick(outputs(2.02, State.HOLD, -0.42))
+        notify.handle_tick(outputs(2.04, State.FAULT, fault=20))
     messages = said(systemd)
     assert messages[0] == ["READY=1", "WATCHDOG=1", "STATUS=check"]
     assert messages[1:5] == [["WATCHDOG=1", "STATUS=check"]] * 4
@@ -70,7 +70,7 @@ def test_trouble_with_the_recording_is_in_the_status_until_it_is_over(
     systemd: socket.socket,
 ) -> None:
     with SystemdNotify() as notify:
-        notify.told(
+        notify.note_report(
             from_dict(
                 {
                     "kind": "disk_low",
@@ -79,11 +79,11 @@ def test_trouble_with_the_recording_is_in_the_status_until_it_is_over(
                 }
             )
         )
-        notify.heard(outputs(0.0, State.HOLD, fault=20))
-        notify.told(
+        notify.handle_tick(outputs(0.0, State.HOLD, fault=20))
+        notify.note_report(
             from_dict({"kind": "recorder_recovered", "what": "disk", "message": "disk works again"})
         )
-        notify.heard(outputs(1.0, State.HOLD))
+        notify.handle_tick(outputs(1.0, State.HOLD))
     messages = said(systemd)
     assert messages[0][1:] == [
         "WATCHDOG=1",
@@ -97,15 +97,15 @@ def test_without_systemd_or_after_its_end_nothing_happens(
 ) -> None:
     monkeypatch.delenv("NOTIFY_SOCKET", raising=False)
     with SystemdNotify() as notify:
-        notify.heard(outputs(0.0, State.HOLD))
+        notify.handle_tick(outputs(0.0, State.HOLD))
     with SystemdNotify(str(tmp_path / "nobody")) as notify:
-        notify.heard(outputs(0.0, State.HOLD))
+        notify.handle_tick(outputs(0.0, State.HOLD))
 
 
 def test_a_full_socket_is_not_waited_for(systemd: socket.socket) -> None:
     with SystemdNotify() as notify:
         for tick in range(5000):
-            notify.heard(outputs(float(tick), State.HOLD))
+            notify.handle_tick(outputs(float(tick), State.HOLD))
     assert 0 < len(said(systemd)) < 5000
 
 

@@ -32,7 +32,7 @@ class Story:
             self.ticks.append(self._ticked())
 
     def _ticked(self, *commands: Command) -> VirtualTick:
-        tick = self.run.tick(commands)
+        tick = self.run.run_tick(commands)
         assert tick is not None
         return tick
 
@@ -42,7 +42,7 @@ class Story:
     def stall(self, duration_s: float) -> None:
         self.bench.wrong.stalled = True
         for _ in range(round(duration_s * CONFIG.loop.rate_hz)):
-            self.run.tick()
+            self.run.run_tick()
         self.bench.wrong.stalled = False
 
 
@@ -110,6 +110,8 @@ def test_a_board_that_was_stopped_before_the_hold_began_is_a_fault_of_its_check(
     bench = VirtualBench(Plant(CONFIG.twin, CONFIG.pump), watchdog_s=0.5)
     run = VirtualRun(CONFIG, bench, zernike_projection())
     bench.board.write(bench.board.registers.register("stop").address, [1])
-    ticks = [tick for _ in range(10) if (tick := run.tick((Command("hold", "test"),))) is not None]
+    ticks = [
+        tick for _ in range(10) if (tick := run.run_tick((Command("hold", "test"),))) is not None
+    ]
     assert faults(ticks) == ["board_fault"]
     assert {tick.outputs.command.pump_fraction for tick in ticks} == {0.0}

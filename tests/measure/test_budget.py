@@ -109,7 +109,7 @@ def measured(
         pattern_sequence("full", STATED.pattern),
     )
     frames = np.stack(
-        [renderer.render(p, moved_um / 2 * (1 if p.axis == "y" else -1)) for p in shown]
+        [renderer.render_picture(p, moved_um / 2 * (1 if p.axis == "y" else -1)) for p in shown]
     )
     if blur_px:
         frames = np.stack([cv2.GaussianBlur(frame, (0, 0), blur_px) for frame in frames])

@@ -133,7 +133,7 @@ def test_harmonics_of_the_panel_are_no_motion_of_the_reference(tmp_path: Path) -
     """
     disturbed = {"bend": 0.08, "noise_adu": 0.05, "bits": 16, "laser_um": 1.0}
     CrossedWorld(seed=1, **CLEAN | FEW_FRINGES | disturbed).write_reference(tmp_path / "full")  # type: ignore[arg-type]
-    checked = Figures().of(tmp_path / "full").checked
+    checked = Figures().measure_folder(tmp_path / "full").checked
     assert checked.film_um.std() < 0.15
     assert FilmMotion.of(checked).moved_um < 0.05
 
@@ -228,7 +228,7 @@ class Still:
 def still(tmp_path_factory: pytest.TempPathFactory) -> Still:
     folder = tmp_path_factory.mktemp("still") / "full"
     CrossedWorld(seed=1, **SIZE | CLEAN).write_reference(folder)  # type: ignore[arg-type]
-    reference = Figures().of(folder)
+    reference = Figures().measure_folder(folder)
     scene = make_scene(
         reference.head.optics, reference.checked, reference.figure, SIDE_MM / CROSSED
     )
@@ -501,7 +501,7 @@ def test_jumps_lose_no_order_silently(
     setup = CLEAN | SIZE
     still = BentWorld(**setup)  # type: ignore[arg-type]
     still.write_reference(tmp_path / "full")
-    reference = Figures().of(tmp_path / "full")
+    reference = Figures().measure_folder(tmp_path / "full")
     optics = reference.head.optics
     scene = make_scene(optics, reference.checked, reference.figure, SIDE_MM / CROSSED)
     tracker = Tracker(scene, (205, 245), 255, optics.camera.noise_adu)

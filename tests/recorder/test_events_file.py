@@ -24,8 +24,8 @@ def lines(path: Path) -> list[dict[str, object]]:
 
 def test_events_are_lines_in_their_order(tmp_path: Path) -> None:
     file = EventsFile(tmp_path / "events.jsonl")
-    file.append([{"kind": "state", "mono_s": 1.0}, {"kind": "fault", "value": float("nan")}])
-    file.append([{"kind": "end", "exit": 5}])
+    file.append_events([{"kind": "state", "mono_s": 1.0}, {"kind": "fault", "value": float("nan")}])
+    file.append_events([{"kind": "end", "exit": 5}])
     assert [line["kind"] for line in lines(tmp_path / "events.jsonl")] == ["state", "fault", "end"]
     assert lines(tmp_path / "events.jsonl")[1]["value"] is None
     file.close()
@@ -37,10 +37,10 @@ def test_faults_and_the_end_are_synced_at_once(
     synced: list[int] = []
     monkeypatch.setattr(os, "fsync", synced.append)
     file = EventsFile(tmp_path / "events.jsonl")
-    file.append([{"kind": "state"}])
+    file.append_events([{"kind": "state"}])
     assert len(synced) == 0
-    file.append([{"kind": "fault"}])
-    file.append([{"kind": "end"}])
+    file.append_events([{"kind": "fault"}])
+    file.append_events([{"kind": "end"}])
     assert len(synced) == 2
     file.close()
 
@@ -61,11 +61,11 @@ def test_a_disk_that_was_full_tears_no_line(
     monkeypatch.setattr(events_file.os, "write", write)
     file = EventsFile(tmp_path / "events.jsonl")
     with pytest.raises(OSError):
-        file.append([{"kind": "state", "number": k} for k in range(3)])
+        file.append_events([{"kind": "state", "number": k} for k in range(3)])
     with pytest.raises(OSError):
-        file.append([{"kind": "state", "number": 3}])
+        file.append_events([{"kind": "state", "number": 3}])
     room[0] = 10_000
-    file.append([])
+    file.append_events([])
     assert [line["number"] for line in lines(tmp_path / "events.jsonl")] == [0, 1, 2, 3]
     file.close()
 
@@ -76,10 +76,10 @@ def test_too_many_waiting_events_are_counted_as_lost(
     monkeypatch.setattr(events_file, "_WAITING_MAX", 5)
     file = EventsFile(tmp_path / "missing" / "events.jsonl")
     with pytest.raises(OSError):
-        file.append([{"number": k} for k in range(8)])
+        file.append_events([{"number": k} for k in range(8)])
     assert file.lost == 3
     (tmp_path / "missing").mkdir()
-    file.append([])
+    file.append_events([])
     assert [line["number"] for line in lines(tmp_path / "missing" / "events.jsonl")] == [
         0,
         4,

@@ -19,7 +19,7 @@ def second(number: int, state: float = 4.0, error_um: float = 0.1) -> Rows:
 
 
 def counts(filter_: QuietFilter, seconds: range) -> list[int]:
-    return [len(filter_.take(second(number))) for number in seconds]
+    return [len(filter_.select_rows(second(number))) for number in seconds]
 
 
 def test_every_tick_for_a_minute_then_ten_a_second() -> None:
@@ -31,24 +31,24 @@ def test_every_tick_for_a_minute_then_ten_a_second() -> None:
 def test_a_change_brings_the_ten_seconds_before_it_back() -> None:
     quiet = QuietFilter(50.0, 10.0, 2.0)
     counts(quiet, range(200))
-    sent = quiet.take(second(200, state=8.0))
+    sent = quiet.select_rows(second(200, state=8.0))
     time_s = sent[:, COLUMN["mono_s"]]
     assert len(sent) == 50 + 10 * 40
     assert np.all(np.diff(time_s) > 0)
     assert 189.9 < time_s[0] < 190.1
-    assert len(quiet.take(second(201, state=8.0))) == 50
+    assert len(quiet.select_rows(second(201, state=8.0))) == 50
 
 
 def test_an_error_outside_the_band_is_no_quiet() -> None:
     quiet = QuietFilter(50.0, 10.0, 2.0)
     counts(quiet, range(200))
-    assert len(quiet.take(second(200, error_um=-2.1))) >= 50
+    assert len(quiet.select_rows(second(200, error_um=-2.1))) >= 50
 
 
 def test_no_row_is_sent_twice_or_lost_where_something_happens() -> None:
     quiet = QuietFilter(50.0, 10.0, 2.0)
     sent = np.concatenate(
-        [quiet.take(second(n, state=8.0 if n == 150 else 4.0)) for n in range(220)]
+        [quiet.select_rows(second(n, state=8.0 if n == 150 else 4.0)) for n in range(220)]
     )
     ticks = np.sort(sent[:, COLUMN["tick"]])
     assert np.all(np.diff(ticks) > 0)

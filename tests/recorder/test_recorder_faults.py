@@ -78,8 +78,8 @@ class Bench:
         HandClock.moment_s = float(number)
         for row in rows_of(number + 1.0)[-50:]:
             self.writers["inputs"].put(message_of(row))
-        self.recorder.drain()
-        self.recorder.write()
+        self.recorder.drain_rings()
+        self.recorder.write_second()
 
     def kinds(self) -> list[str]:
         return [report["kind"] for report in self.reports]
@@ -245,8 +245,8 @@ def test_segments_are_changed_in_time_without_losing_a_row(bench: Bench) -> None
     HandClock.moment_s = Config().recording.segment_s + 1
     for row in rows_of(3.0)[-50:]:
         bench.writers["inputs"].put(message_of(row))
-    bench.recorder.drain()
-    bench.recorder.write()
+    bench.recorder.drain_rings()
+    bench.recorder.write_second()
     bench.recorder.finish(in_haste=True)
     assert sorted(path.name for path in bench.run_dir.glob("*.rrd")) == [
         "test-000.rrd",

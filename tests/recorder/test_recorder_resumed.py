@@ -83,9 +83,9 @@ class Run:
         for row in ROWS[50 * number : 50 * number + 50]:
             self.writers["inputs"].put(message_of(row))
         self.event("mark", number)
-        recorder.drain()
+        recorder.drain_rings()
         if write:
-            recorder.write()
+            recorder.write_second()
 
     def event(self, kind: str, number: float) -> None:
         self.writers["events"].put(json.dumps({"mono_s": number, "kind": kind}).encode())
@@ -121,7 +121,7 @@ def test_the_next_recorder_goes_on_and_everything_is_there_once(
     for number in range(6, 12):
         run.second(second, number)
     run.event("end", 12.0)
-    second.drain()
+    second.drain_rings()
     second.finish(in_haste=True)
     ticks = recorded(tmp_path)[:, 1]
     assert np.array_equal(np.sort(ticks), np.arange(600))
@@ -259,7 +259,7 @@ def test_without_what_the_first_knew_the_statistics_begin_with_what_the_ring_has
     second = run.recorder(1)
     run.second(second, 1)
     run.event("end", 2.0)
-    second.drain()
+    second.drain_rings()
     second.finish(in_haste=True)
     assert run.summary["recorder"]["partial"] is partial
     assert run.summary["ticks"] == ticks
@@ -274,7 +274,7 @@ def test_half_a_line_of_the_event_log_is_written_again_whole(tmp_path: Path) -> 
     lines = [dumps_checked({"kind": kind}).encode() + b"\n" for kind in "abc"]
     path.write_bytes(lines[0] + lines[1] + lines[2][:5])
     file = EventsFile(path, resumed=True)
-    file.append([{"kind": "b"}, {"kind": "c"}])
+    file.append_events([{"kind": "b"}, {"kind": "c"}])
     file.close()
     assert path.read_bytes() == b"".join(lines)
 
@@ -284,9 +284,9 @@ def test_a_fault_does_not_wait_for_its_second(tmp_path: Path, stack: ExitStack) 
     recorder = run.recorder(0)
     run.second(recorder, 0)
     run.event("fault", 1.0)
-    recorder.drain()
+    recorder.drain_rings()
     assert recorder.urgent
-    recorder.write()
+    recorder.write_second()
     assert not recorder.urgent
 
 
@@ -304,7 +304,7 @@ def test_on_the_last_megabytes_rerun_stops_and_goes_on_when_there_is_room(
     left_mb["now"] = 5000.0
     run.second(recorder, 2)
     run.event("end", 3.0)
-    recorder.drain()
+    recorder.drain_rings()
     recorder.finish(in_haste=True)
     assert {int(moment) for moment in scalars(tmp_path / "test-001.rrd", "/loop/error")[0]} == {2}
     assert [report["kind"] for report in run.reports] == [
@@ -358,7 +358,7 @@ def test_closed_segments_are_optimised_beside_the_recording(
     assert optimizer._process is not None
     optimizer._process.wait(30.0)
     run.second(recorder, 12)
-    assert not optimizer.busy
+    assert not optimizer.is_busy
     recorder.finish()
     for name in ("test-000.rrd", "test-001.rrd"):  # the last one as well
         assert chunks(tmp_path / name) == 1
@@ -384,12 +384,12 @@ def test_a_segment_that_cannot_be_optimised_stays_as_it_is(tmp_path: Path) -> No
     path = tmp_path / "test-000.rrd"
     path.write_bytes(b"no recording")
     optimizer = Optimizer(tmp_path)
-    optimizer.add(path)
-    optimizer.poll()
+    optimizer.add_segment(path)
+    optimizer.poll_worker()
     assert optimizer._process is not None
     optimizer._process.wait(30.0)
     with pytest.raises(OSError, match="is not optimised"):
-        optimizer.poll()
+        optimizer.poll_worker()
     assert path.read_bytes() == b"no recording"
     assert list(tmp_path.iterdir()) == [path]
 
@@ -398,8 +398,8 @@ def test_what_is_under_way_at_the_end_is_given_up(tmp_path: Path) -> None:
     path = tmp_path / "test-000.rrd"
     path.write_bytes(b"no recording")
     optimizer = Optimizer(tmp_path)
-    optimizer.add(path)
-    optimizer.poll()
+    optimizer.add_segment(path)
+    optimizer.poll_worker()
     optimizer.close()
-    assert not optimizer.busy
+    assert not optimizer.is_busy
     assert list(tmp_path.iterdir()) == [path]

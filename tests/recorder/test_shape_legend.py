@@ -34,7 +34,7 @@ def test_colours_of_changes_are_around_zero_and_those_of_others_from_it(tmp_path
     for cycle, tilt_um in enumerate((0.0, 5.0)):
         first = shape_of(0.0, 0)
         coeffs_um = first.coeffs_um + tilt_um * (np.arange(ZERNIKE_TERMS) == 1)
-        shapes.send(replace(first, time_s=700.0 * cycle, cycle=cycle, coeffs_um=coeffs_um))
+        shapes.send_estimate(replace(first, time_s=700.0 * cycle, cycle=cycle, coeffs_um=coeffs_um))
     recording.close()
     path = tmp_path / "test-000.rrd"
 
@@ -65,7 +65,7 @@ def test_of_twenty_frames_a_second_the_timeline_has_one_and_every_change_of_verd
         lost = 105 <= k < 110
         coeffs_um = first.coeffs_um + 0.3 * (np.arange(ZERNIKE_TERMS) == 11) * (k >= 100)
         verdict = "rejected" if lost else "ok"
-        streams.send(
+        streams.send_estimate(
             replace(first, time_s=k / 20, kind="track", coeffs_um=coeffs_um, verdict=verdict)
         )
     recording.close()

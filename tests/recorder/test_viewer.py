@@ -30,11 +30,13 @@ HOLD_GREEN = (0, 127, 92)
 def run_dir(tmp_path: Path) -> Path:
     recording = Recording(tmp_path, "test", RunClock.start(), Config())
     recording.next_segment()
-    TelemetryStreams(recording, Config()).send(unpack_rows([row.pack() for row in rows_of(30.0)]))
+    TelemetryStreams(recording, Config()).send_rows(
+        unpack_rows([row.pack() for row in rows_of(30.0)])
+    )
     send_events(recording, [{"kind": "state", "mono_s": 6.0, "to": "hold"}])
     shapes = ShapeStreams(recording)
     for cycle in range(10):
-        shapes.send(shape_of(3.0 * cycle, cycle))
+        shapes.send_estimate(shape_of(3.0 * cycle, cycle))
     recording.close()
     return tmp_path
 

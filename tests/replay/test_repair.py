@@ -188,7 +188,7 @@ def test_with_tables_the_statistics_are_of_every_tick(folder: Path) -> None:
         shutil.rmtree(path)
     tables = RunTables(folder)
     tables.add_ticks(batch_of(ROWS))
-    tables.sync()  # and then it was killed
+    tables.sync_tables()  # and then it was killed
     expected = Summary.for_config(CONFIG)
     expected.add_rows(ROWS)
     wanted = expected.as_dict({}, {})

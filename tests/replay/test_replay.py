@@ -119,7 +119,7 @@ def test_a_changed_gain_shows_as_another_pump_but_the_same_states(record: Path) 
     config = CONFIG.model_copy(update={"loop": LoopConfig(kp_per_s=0.5)})
     found = replay_record(config, recorded_ticks(InputsReader(record)), zernike_projection())
     assert found.different > 100
-    assert [d.what for d in found.decisions if d.what.startswith("state")] == [
+    assert [d.description for d in found.decisions if d.description.startswith("state")] == [
         "state check",
         "state inflate",
         "state settle",
@@ -195,8 +195,8 @@ def test_a_long_command_comes_in_pieces_and_whole_again() -> None:
         "a slot is as large as a tick, whatever columns and sensors it has"
     )
     assembler = TickAssembler()
-    assert not len(assembler.take(messages[:4]).records)
-    batch = assembler.take(messages[4:])
+    assert not len(assembler.add_messages(messages[:4]).records)
+    batch = assembler.add_messages(messages[4:])
     back = unpack_tick(batch.records[0], batch.tails[1], {})
     assert repr(back.commands) == repr(commands)
     assert back.dead_tasks == ("link",)
@@ -207,7 +207,7 @@ def test_a_command_whose_pieces_were_overwritten_is_a_gap_not_another_command() 
     messages = pack_tick(
         1, replace(inputs, commands=(Command("mark", "x", text="y" * 2000),)), outputs, b""
     )
-    batch = TickAssembler().take(messages[2:])
+    batch = TickAssembler().add_messages(messages[2:])
     with pytest.raises(LookupError, match="commands of tick 1"):
         unpack_tick(batch.records[0], batch.tails[1], {})
 

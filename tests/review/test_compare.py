@@ -116,11 +116,11 @@ def test_every_row_is_tested_or_says_why_not(analyses: list[Analysis]) -> None:
         "lateness p99",
     }
     assert "stretches" in rows["leak"].note
-    assert not any(row.said in {"larger", "smaller"} for row in rows.values())
+    assert not any(row.verdict_text in {"larger", "smaller"} for row in rows.values())
 
 
 def test_too_short_is_said(tmp_path: Path, analyses: list[Analysis]) -> None:
     short = analyse_run(open_run(written(tmp_path, 0.05, seed=3)))
     rows = {row.name: row for row in compare_analyses(analyses[0], short)}
     assert rows["reading, std of 60 s"].note == "no test: too short"
-    assert rows["reading, std of 60 s"].said == ""
+    assert rows["reading, std of 60 s"].verdict_text == ""

@@ -32,7 +32,7 @@ def test_the_interval_of_tomorrow_holds_the_truth() -> None:
         both = chain(rng, np.append(time_s, time_s[-1] + DAY_S))
         creep = fit_creep(time_s, both[:-1] + noise, DAY_S)
         z.append((creep.drift - (both[-1] - both[-2])) / creep.drift_sigma)
-        sure += creep.sure
+        sure += creep.is_certain
     held = float(np.mean(np.abs(z) < 1.96))
     assert held > 0.8, (held, np.sqrt(np.mean(np.square(z))))
     assert sure > 8  # the bars are not merely wide
@@ -44,7 +44,7 @@ def test_a_film_that_does_not_creep_is_not_said_to() -> None:
         fit_creep(np.linspace(0, 5 * DAY_S, 50), 1e-5 * rng.normal(size=50), DAY_S)
         for _ in range(10)
     ]
-    assert sum(creep.sure for creep in found) <= 2
+    assert sum(creep.is_certain for creep in found) <= 2
 
 
 def test_too_few_readings_and_too_far_ahead_are_errors() -> None:

@@ -65,7 +65,7 @@ def undrawn(monkeypatch: pytest.MonkeyPatch) -> None:
     """Pages without pictures, which take seconds."""
     for module in (fleet, report_command):
         monkeypatch.setattr(
-            module, "render", lambda analysis, *_, **__: f"page of {analysis.run.name}"
+            module, "render_report", lambda analysis, *_, **__: f"page of {analysis.run.name}"
         )
 
 

@@ -79,9 +79,9 @@ def test_time_held_is_that_between_ticks() -> None:
     held = np.array([False, True, True, True, False, True, True, True])
     for cut in (1, 3, 5, 7):
         time = HeldTime()
-        time.add(time_s[:cut], held[:cut])
-        time.add(time_s[:0], held[:0])
-        time.add(time_s[cut:], held[cut:])
+        time.add_times(time_s[:cut], held[:cut])
+        time.add_times(time_s[:0], held[:0])
+        time.add_times(time_s[cut:], held[cut:])
         # the minute without a tick is not known
         assert time.result_s(0.1) == pytest.approx(0.5 + 0.5 + 0.1 + 0.1 + 0.1)
 

@@ -37,7 +37,7 @@ class LiveRun:
     def second(self, number: int) -> None:
         self.tables.add_ticks(batch_of(ROWS[50 * number : 50 * number + 50]))
         self.tables.add_shape(shape_of(float(number), number))
-        self.tables.sync()
+        self.tables.sync_tables()
 
     def view(self) -> LiveView:
         recording = Recording(self.out, "view", RunClock(0.0, STARTED_UTC), CONFIG)
@@ -64,7 +64,7 @@ def test_the_view_has_every_row_of_a_growing_run_once(run: LiveRun) -> None:
     for number in range(4, 12):
         run.second(number)
         assert view.send_new()
-    view.finish()
+    view.send_waiting()
     time_s, error_um = scalars(run.file, "/loop/error")
     assert np.allclose(time_s, get_column(ROWS, "mono_s"))
     assert np.allclose(error_um[:, 0], get_column(ROWS, "error_um"), rtol=1e-6)
@@ -80,7 +80,7 @@ def test_the_run_itself_is_not_changed(run: LiveRun) -> None:
     before = sorted(path.relative_to(run.folder) for path in run.folder.rglob("*"))
     view = run.view()
     view.send_new()
-    view.finish()
+    view.send_waiting()
     assert sorted(path.relative_to(run.folder) for path in run.folder.rglob("*")) == before
 
 
@@ -91,7 +91,7 @@ def test_the_page_has_the_figures_that_the_recorder_handed_on(run: LiveRun) -> N
     save_state(run.folder, RecorderState(summary))
     view = run.view()
     view.send_new()
-    view.finish()
+    view.send_waiting()
     ((_, page),) = strings(run.file, "/summary", "TextDocument:text")
     assert page.startswith("| hold |")
     assert f"of {len(ROWS)}" in page
@@ -103,7 +103,7 @@ def test_a_long_run_begins_some_minutes_back(run: LiveRun, monkeypatch: pytest.M
         run.second(number)
     view = run.view()
     view.send_new()
-    view.finish()
+    view.send_waiting()
     assert RECENT_S > 60.0
     time_s, _ = scalars(run.file, "/loop/error")
     assert time_s[0] == pytest.approx(get_column(ROWS, "mono_s")[-1] - 3.0, abs=0.05)
@@ -119,7 +119,7 @@ def test_damaged_rows_are_left_out(run: LiveRun) -> None:
         journal.write_bytes(data)
     view = run.view()
     assert view.send_new()
-    view.finish()
+    view.send_waiting()
     assert len(scalars(run.file, "/loop/error")[0]) == 100
 
 

@@ -65,7 +65,10 @@ def test_settled_is_five_seconds_of_hold_at_the_target() -> None:
     rows[400:450, COLUMN["setpoint_um"]] = 3.0  # a ramp
     hold_parts = HoldParts(2.0)
     mask = np.concatenate(
-        [hold_parts.of(get_columns(part))["held"] for part in np.split(rows, (150, 151, 430))]
+        [
+            hold_parts.classify_block(get_columns(part))["held"]
+            for part in np.split(rows, (150, 151, 430))
+        ]
     )
     expected, unsettled_s = [], np.nan
     for time_s, state, setpoint_um in rows[
@@ -191,13 +194,13 @@ def test_command_writes_page_and_json(
 def test_alike_runs_do_not_differ_and_unlike_ones_do(quiet_run: Path, tmp_path: Path) -> None:
     ours = analyse_run(open_run(quiet_run))
     twin = analyse_run(open_run(written(tmp_path, HOURS, seed=7, name="20261122T180000Z-twin")))
-    alike = {d.name: d.said for d in compare_analyses(ours, twin)}
+    alike = {d.name: d.verdict_text for d in compare_analyses(ours, twin)}
     assert alike["reading, std of 1 s"] == "no significant difference"
     rows, shapes = night(7, HOURS, "gusty", [])
     rows[:, COLUMN["displacement_um"]] *= 1.5
     write_run(tmp_path / "20261123T180000Z-worse", iter([(rows, shapes)]))
     worse = analyse_run(open_run(tmp_path / "20261123T180000Z-worse"))
-    unlike = {d.name: d.said for d in compare_analyses(ours, worse)}
+    unlike = {d.name: d.verdict_text for d in compare_analyses(ours, worse)}
     assert unlike["reading, std of 1 s"] == "smaller"
 
 

@@ -158,6 +158,6 @@ def test_a_slope_is_seen_and_too_few_values_say_nothing() -> None:
     values = 0.5 * time_s / 3600 + 0.01 * np.random.default_rng(5).normal(size=100)
     values[10] = np.nan
     found = fit_slope(time_s, values)
-    assert found.significant
+    assert found.is_significant
     assert found.per_hour == pytest.approx(0.5, abs=0.02)
     assert np.isnan(fit_slope(time_s[:4], values[:4]).per_hour)

@@ -63,7 +63,8 @@ def folder(rows: Rows, tmp_path_factory: pytest.TempPathFactory) -> Path:
 def test_the_parts_are_those_that_were_asked_for_in_any_blocks(rows: Rows, batch: int) -> None:
     parts = HoldParts(2.0)
     blocks = [
-        parts.of(get_columns(rows[first : first + batch])) for first in range(0, len(rows), batch)
+        parts.classify_block(get_columns(rows[first : first + batch]))
+        for first in range(0, len(rows), batch)
     ]
     found = {name: np.concatenate([block[name] for block in blocks]) for name in blocks[0]}
     assert np.sum([*found.values()], axis=0).max() == 1

@@ -127,15 +127,15 @@ def test_the_recorder_deletes_old_runs_at_its_start_and_each_hour_and_says_which
     reports: list[Event] = []
     config = RecordingConfig(keep_days=30.0, min_free_mb=1.0)
     keeping = Housekeeping(present, HandClock(0.0, NOW), config, RecorderErrors(reports.append))
-    keeping.look(0.0, [])
+    keeping.watch_disk(0.0, [])
     assert [report.to_dict()["run"] for report in reports] == [
         "20261001T110000Z-old",
         "20261002T110000Z-old",
     ]
     make_run(logs, "20260901T110000Z-brought")
-    keeping.look(RETENTION_INTERVAL_S - 1, [])
+    keeping.watch_disk(RETENTION_INTERVAL_S - 1, [])
     assert len(reports) == 2
-    keeping.look(RETENTION_INTERVAL_S, [])
+    keeping.watch_disk(RETENTION_INTERVAL_S, [])
     assert reports[2].to_dict()["run"] == "20260901T110000Z-brought"
     assert present.exists()
     keeping.close()
@@ -160,13 +160,13 @@ def test_one_run_that_cannot_go_keeps_no_other_and_remains_of_a_crash_go_too(
     reports: list[Event] = []
     config = RecordingConfig(keep_days=30.0, min_free_mb=1.0)
     keeping = Housekeeping(present, HandClock(0.0, NOW), config, RecorderErrors(reports.append))
-    keeping.look(0.0, [])
+    keeping.watch_disk(0.0, [])
     assert [report.kind for report in reports] == ["recorder_error", "run_deleted"]
-    keeping.look(RETENTION_INTERVAL_S, [])
+    keeping.watch_disk(RETENTION_INTERVAL_S, [])
     assert len(reports) == 2, "told once"
     monkeypatch.undo()
     (tmp_path / "20261001T110000Z-old").rename(tmp_path / "by-hand")
-    keeping.look(2 * RETENTION_INTERVAL_S, [])
+    keeping.watch_disk(2 * RETENTION_INTERVAL_S, [])
     assert isinstance(reports[2], RecorderRecovered)
     assert reports[2].what == "retention: 20261001T110000Z-old"
     keeping.close()

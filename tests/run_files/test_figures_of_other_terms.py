@@ -40,8 +40,8 @@ def write_rows(run_dir: Path, table: TableSpec, close: bool) -> Path:
     size = table.schema.field("covariance_um2").type.list_size
     values = pa.array(np.arange(ROWS * size, dtype=np.float32))
     columns = [pa.array(np.arange(float(ROWS))), pa.FixedSizeListArray.from_arrays(values, size)]
-    writer.add(pa.record_batch(columns, schema=table.schema))
-    writer.sync()
+    writer.add_rows(pa.record_batch(columns, schema=table.schema))
+    writer.sync_rows()
     if close:
         writer.close()
     place = spec.part_path if close else spec.journal_path
@@ -51,7 +51,7 @@ def write_rows(run_dir: Path, table: TableSpec, close: bool) -> Path:
 def read_rows(run_dir: Path) -> tuple[int, list[str]]:
     """Number of readable rows, and the notes."""
     notes: list[str] = []
-    tables = list(TableReader(run_dir, table_specs.COVARIANCES, notes).tables())
+    tables = list(TableReader(run_dir, table_specs.COVARIANCES, notes).iterate_tables())
     return sum(table.num_rows for table in tables if "covariance_um2" in table.column_names), notes
 
 

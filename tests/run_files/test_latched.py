@@ -124,55 +124,55 @@ def make(folder: Path, told: list[Event]) -> FaultLatch:
 def test_a_trip_is_latched_and_an_acknowledgement_clears_it(tmp_path: Path) -> None:
     told: list[Event] = []
     with make(tmp_path, told) as fault_latch:
-        fault_latch.heard(outputs(*TRIP))
+        fault_latch.handle_tick(outputs(*TRIP))
     found = LatchedFile(tmp_path).read()
     assert found == LatchedFault(
         "late", "ticks start too late", "150 ms", "less work", "2026-01-01T00:00:00+00:00", "run-7"
     )
     with make(tmp_path, told) as fault_latch:
-        fault_latch.heard(outputs(replace(ACK, refused="not now")))
+        fault_latch.handle_tick(outputs(replace(ACK, refused="not now")))
     assert LatchedFile(tmp_path).read() is not None
     with make(tmp_path, told) as fault_latch:
-        fault_latch.heard(outputs(ACK))
+        fault_latch.handle_tick(outputs(ACK))
     assert LatchedFile(tmp_path).read() is None
     assert not told
 
 
 def test_a_lock_is_no_latched_fault(tmp_path: Path) -> None:
     with make(tmp_path, []) as fault_latch:
-        fault_latch.heard(outputs(CommandTaken("latch", "unix:ann", "", text="hands inside")))
+        fault_latch.handle_tick(outputs(CommandTaken("latch", "unix:ann", "", text="hands inside")))
     assert LatchedFile(tmp_path).read() is None
 
 
 def test_a_resumed_fault_is_no_longer_latched(tmp_path: Path) -> None:
     with make(tmp_path, []) as fault_latch:
-        fault_latch.heard(outputs(*TRIP))
-        fault_latch.heard(outputs(StateEntered("standby", "fault", "resumes")))
+        fault_latch.handle_tick(outputs(*TRIP))
+        fault_latch.handle_tick(outputs(StateEntered("standby", "fault", "resumes")))
     assert LatchedFile(tmp_path).read() is None
 
 
 def test_a_forgiven_fault_is_not_latched(tmp_path: Path) -> None:
     with make(tmp_path, []) as fault_latch:
-        fault_latch.heard(outputs(TRIP[0]))
+        fault_latch.handle_tick(outputs(TRIP[0]))
     assert LatchedFile(tmp_path).read() is None
 
 
 def test_a_disk_that_fails_is_told(tmp_path: Path) -> None:
     told: list[Event] = []
     with make(tmp_path / "nowhere", told) as fault_latch:
-        fault_latch.heard(outputs(*TRIP))
+        fault_latch.handle_tick(outputs(*TRIP))
     assert [type(event) for event in told] == [LatchFailed]
 
 
 def test_a_disk_that_takes_files_again_is_told_once(tmp_path: Path) -> None:
     told: list[Event] = []
     with make(tmp_path / "later", told) as fault_latch:
-        fault_latch.heard(outputs(*TRIP))
+        fault_latch.handle_tick(outputs(*TRIP))
         while not told:
-            fault_latch.heard(outputs())
+            fault_latch.handle_tick(outputs())
         (tmp_path / "later").mkdir()
-        fault_latch.heard(outputs(*TRIP))
-        fault_latch.heard(outputs(*TRIP))
+        fault_latch.handle_tick(outputs(*TRIP))
+        fault_latch.handle_tick(outputs(*TRIP))
     assert [type(event) for event in told] == [LatchFailed, LatchWritten]
 
 
@@ -180,7 +180,7 @@ def test_the_twin_latches_nothing(tmp_path: Path) -> None:
     with FaultLatch(
         None, None, "run", lambda mono_s: datetime(2026, 1, 1, tzinfo=UTC), lambda event: None
     ) as fault_latch:
-        fault_latch.heard(outputs(*TRIP))
+        fault_latch.handle_tick(outputs(*TRIP))
     assert not list(tmp_path.iterdir())
 
 
@@ -213,8 +213,10 @@ def test_a_fault_on_a_full_disk_is_latched_in_the_room_that_was_kept(
 
     with make(tmp_path, told) as fault_latch:
         (reserve,) = tmp_path.iterdir()
-        monkeypatch.setattr(LatchedFile, "reserve", full)  # nothing new finds room from here on
-        fault_latch.heard(outputs(*TRIP))
+        monkeypatch.setattr(
+            LatchedFile, "reserve_space", full
+        )  # nothing new finds room from here on
+        fault_latch.handle_tick(outputs(*TRIP))
         fault_latch._disk.submit(lambda: None).result()
         assert not reserve.exists()
     assert told == []
@@ -230,7 +232,7 @@ NOW = datetime(2026, 1, 2, 12, tzinfo=UTC)
 def test_resumes_are_counted_for_a_day_and_beyond_a_restart(tmp_path: Path) -> None:
     assert ResumeLog(tmp_path).ages_s(NOW) == ()
     for hours in (30.0, 5.0, -1.0):  # the last one after the clock was set back
-        ResumeLog(tmp_path).add(NOW - timedelta(hours=hours))
+        ResumeLog(tmp_path).add_resume(NOW - timedelta(hours=hours))
     assert ResumeLog(tmp_path).ages_s(NOW) == (18_000.0, 0.0)
     stated = json.loads((tmp_path / RESUMES_NAME).read_text())
     assert (stated["schema"], stated_program(stated)) == (RESUMES_SCHEMA, program_identity())
@@ -265,5 +267,5 @@ def test_a_count_of_resumes_that_cannot_be_read_is_full(tmp_path: Path, content:
 def test_a_resume_of_the_run_is_counted_for_the_next_one(tmp_path: Path) -> None:
     with make(tmp_path, []) as fault_latch:
         assert fault_latch.resumes_s == ()
-        fault_latch.heard(outputs(Resumed("link_lost")))
+        fault_latch.handle_tick(outputs(Resumed("link_lost")))
     assert ResumeLog(tmp_path).ages_s(datetime(2026, 1, 1, 1, tzinfo=UTC)) == (3600.0,)

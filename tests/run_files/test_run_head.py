@@ -85,6 +85,6 @@ def test_every_table_states_format_program_and_commit(tmp_path: Path) -> None:
     tables = RunTables(tmp_path)
     tables.add_events([{"mono_s": 1.0, "kind": "why", "why": "x"}])
     tables.close()
-    found = TableReader(tmp_path, EVENTS, []).metadata()
+    found = TableReader(tmp_path, EVENTS, []).read_metadata()
     assert found["schema"] == "membrane-table/1"
     assert stated_program(found) == program_identity()

@@ -51,7 +51,7 @@ def test_changes_are_found_at_the_edges_too() -> None:
 
 
 def test_codes_have_words() -> None:
-    assert (STATE.word(4), FAULT.word(0), FAULT.word(20), FAULT.word(999)) == (
+    assert (STATE.name_code(4), FAULT.name_code(0), FAULT.name_code(20), FAULT.name_code(999)) == (
         "hold",
         "none",
         "over_pressure",
@@ -75,8 +75,8 @@ def test_overviews_have_a_point_for_every_second(tmp_path: Path, block: int) -> 
     recording.next_segment()
     telemetry = TelemetryStreams(recording, Config())
     for first in range(0, len(rows), block):
-        telemetry.send(rows[first : first + block])
-    telemetry.finish()
+        telemetry.send_rows(rows[first : first + block])
+    telemetry.send_waiting()
     recording.close()
     seconds = rows.reshape(20, 50, -1)
     for path, field in (
@@ -97,7 +97,7 @@ def test_low_orders_have_the_variances_of_their_cycle(tmp_path: Path) -> None:
     shapes = ShapeStreams(recording)
     first, second = shape_of(0.0, 0), shape_of(2.0, 1)
     for estimate in (first, second):
-        shapes.send(estimate)
+        shapes.send_estimate(estimate)
     recording.close()
     _, values = scalars(tmp_path / "test-000.rrd", "/shape/change", "Measurements:values")
     _, variances = scalars(tmp_path / "test-000.rrd", "/shape/change", "Measurements:variances")
@@ -137,8 +137,8 @@ def test_changes_of_the_figure_are_against_the_first_since_rebase(tmp_path: Path
     shapes = ShapeStreams(recording)
     for cycle in range(4):
         if cycle == 1:
-            shapes.rebase(1.5)
-        shapes.send(
+            shapes.set_reference(1.5)
+        shapes.send_estimate(
             replace(
                 shape_of(float(cycle), cycle), sag_um=100.0 * cycle, displacement_um=7.0 * cycle
             )

@@ -32,8 +32,8 @@ def run_dir(tmp_path: Path) -> Path:
     """A table of two parts, each of three row groups, and a journal."""
     writer = TableWriter(tmp_path, TABLE, disk=KillingDisk())
     for first in range(0, 150, 5):
-        writer.add(batch_of(range(first, first + 5), STEP_S))
-        writer.sync()
+        writer.add_rows(batch_of(range(first, first + 5), STEP_S))
+        writer.sync_rows()
         writer.seal_next()
     return tmp_path
 
@@ -41,7 +41,7 @@ def run_dir(tmp_path: Path) -> Path:
 def _counts(run_dir: Path, notes: list[str]) -> list[int]:
     """The counts of all readable rows; all their values are right."""
     found: list[int] = []
-    for table in TableReader(run_dir, TABLE, notes).tables():
+    for table in TableReader(run_dir, TABLE, notes).iterate_tables():
         counts = table.column("count").to_pylist()
         expected = batch_of(counts, STEP_S)
         for name in table.column_names:
@@ -98,7 +98,7 @@ def test_a_damaged_column_costs_nothing_of_the_others(run_dir: Path) -> None:
     data[start + 30] ^= 1
     path.write_bytes(data)
     notes: list[str] = []
-    tables = list(TableReader(run_dir, TABLE, notes).tables(["count"]))
+    tables = list(TableReader(run_dir, TABLE, notes).iterate_tables(["count"]))
     assert sum(table.num_rows for table in tables) == 150
     assert notes == []
 
@@ -190,16 +190,16 @@ def test_a_part_of_a_run_reads_only_its_row_groups(run_dir: Path) -> None:
     ):
         found = [
             c
-            for table in reader.tables(["count"], start_s, end_s)
+            for table in reader.iterate_tables(["count"], start_s, end_s)
             for c in table["count"].to_pylist()
         ]
         assert found == [count for count in range(150) if start_s <= count * STEP_S < end_s]
 
 
 def test_a_month_is_read_a_row_group_at_a_time(run_dir: Path) -> None:
-    sizes = [table.num_rows for table in TableReader(run_dir, TABLE, []).tables()]
+    sizes = [table.num_rows for table in TableReader(run_dir, TABLE, []).iterate_tables()]
     assert max(sizes) <= 20
-    assert TableReader(run_dir, TABLE, []).newest("count").as_py() == 149
+    assert TableReader(run_dir, TABLE, []).read_newest("count").as_py() == 149
 
 
 def test_the_bits_of_nan_and_missing_values_stay_apart(tmp_path: Path) -> None:
@@ -211,14 +211,16 @@ def test_the_bits_of_nan_and_missing_values_stay_apart(tmp_path: Path) -> None:
         "t", pa.schema([("time_s", pa.float64()), ("x", pa.float64())]), "time_s"
     )
     writer = TableWriter(tmp_path, table)
-    writer.add(pa.record_batch([pa.array([0.0, 1.0, 2.0, 3.0]), values], schema=table.schema))
-    writer.add(
+    writer.add_rows(pa.record_batch([pa.array([0.0, 1.0, 2.0, 3.0]), values], schema=table.schema))
+    writer.add_rows(
         pa.record_batch([pa.array([4.0]), pa.array([None], pa.float64())], schema=table.schema)
     )
-    writer.sync()
+    writer.sync_rows()
     for _ in range(2):
         read = (
-            pa.concat_tables(TableReader(tmp_path, table, []).tables()).column("x").combine_chunks()
+            pa.concat_tables(TableReader(tmp_path, table, []).iterate_tables())
+            .column("x")
+            .combine_chunks()
         )
         bits = np.frombuffer(read.buffers()[1], np.uint64)[:4]
         assert bits.tolist() == np.asarray(values.to_numpy()).view(np.uint64).tolist()
@@ -271,7 +273,7 @@ def test_columns_of_another_type_are_not_read(run_dir: Path) -> None:
     )
     pq.write_table(table, _part(run_dir, 0))
     notes: list[str] = []
-    tables = list(TableReader(run_dir, TABLE, notes).tables())
+    tables = list(TableReader(run_dir, TABLE, notes).iterate_tables())
     assert "value" not in tables[0].column_names
     assert "more" not in tables[0].column_names
     assert notes == ["numbers/numbers-0000.parquet: without value"]
@@ -287,7 +289,9 @@ def test_repeated_texts_take_no_memory(run_dir: Path) -> None:
     batch = pa.Table.from_batches([batch_of(range(rows), 0.05)]).set_column(4, "word", words)
     pq.write_table(batch, _part(run_dir, 0), use_dictionary=["word"], compression="zstd")
     notes: list[str] = []
-    assert sum(table.num_rows for table in TableReader(run_dir, TABLE, notes).tables()) == 90
+    assert (
+        sum(table.num_rows for table in TableReader(run_dir, TABLE, notes).iterate_tables()) == 90
+    )
     assert "more text than a recorder writes" in notes[0]
 
 
@@ -398,6 +402,6 @@ def test_names_that_are_no_files_of_the_table_are_ignored(run_dir: Path) -> None
 
 def test_read_counts_compares_every_value(tmp_path: Path) -> None:
     writer = TableWriter(tmp_path, TABLE)
-    writer.add(batch_of([1, 2]))
+    writer.add_rows(batch_of([1, 2]))
     writer.close()
     assert read_counts(tmp_path) == [1, 2]

@@ -22,8 +22,8 @@ TABLE = TableSpec(
 def add(writer: TableWriter, first: int, count: int = 10) -> None:
     numbers = np.arange(first, first + count)
     columns = [pa.array(numbers * 1.0), pa.array(numbers)]
-    writer.add(pa.record_batch(columns, schema=TABLE.schema))
-    writer.sync()
+    writer.add_rows(pa.record_batch(columns, schema=TABLE.schema))
+    writer.sync_rows()
 
 
 def read(follower: TableFollower) -> list[int]:
@@ -86,6 +86,6 @@ def test_a_journal_with_other_columns_is_left_out(tmp_path: Path) -> None:
     read(follower)
     other = TableSpec("things", pa.schema([("time_s", pa.float64())]), "time_s")
     writer = TableWriter(tmp_path, other)
-    writer.add(pa.record_batch([pa.array([1.0, math.inf])], schema=other.schema))
-    writer.sync()
+    writer.add_rows(pa.record_batch([pa.array([1.0, math.inf])], schema=other.schema))
+    writer.sync_rows()
     assert read(follower) == []

@@ -30,8 +30,8 @@ def _write_all(run_dir: Path, disk: KillingDisk, synced: list[int]) -> None:
     """
     writer = TableWriter(run_dir, TABLE, disk=disk)
     for count in range(ROWS):
-        writer.add(batch_of([count]))
-        writer.sync()
+        writer.add_rows(batch_of([count]))
+        writer.sync_rows()
         synced.append(count)
         writer.seal_next()
     writer.close()
@@ -69,8 +69,8 @@ def test_a_kill_at_any_call_loses_and_doubles_nothing(
 
     writer = TableWriter(tmp_path, TABLE, resumed=True, disk=KillingDisk())
     for count in range(max(0, len(synced) - 3), ROWS):  # the ring still has a few of the old rows
-        writer.add(batch_of([count]))
-        writer.sync()
+        writer.add_rows(batch_of([count]))
+        writer.sync_rows()
     writer.close()
     notes: list[str] = []
     assert read_counts(tmp_path, notes) == list(range(ROWS))
@@ -95,8 +95,8 @@ def _journal_of(run_dir: Path, rows: int) -> Path:
     """The journal of a recorder that was killed after so many rows."""
     writer = TableWriter(run_dir, TABLE)
     for count in range(rows):
-        writer.add(batch_of([count]))
-        writer.sync()
+        writer.add_rows(batch_of([count]))
+        writer.sync_rows()
     return spec.journal_path(run_dir / TABLE.name, 0)
 
 
@@ -130,7 +130,7 @@ def test_a_journal_cut_at_any_byte_is_continued(tmp_path: Path) -> None:
             path.write_bytes(whole[:cut])
             writer = TableWriter(tmp_path, TABLE, resumed=True)
             for count in range(max(0, place - 1), 8):
-                writer.add(batch_of([count]))
+                writer.add_rows(batch_of([count]))
             writer.close()
             assert read_counts(tmp_path) == list(range(8)), cut
 
@@ -138,8 +138,8 @@ def test_a_journal_cut_at_any_byte_is_continued(tmp_path: Path) -> None:
 def test_readers_see_each_row_as_soon_as_it_is_synced(tmp_path: Path) -> None:
     writer = TableWriter(tmp_path, TABLE)
     for count in range(30):
-        writer.add(batch_of([count]))
-        writer.sync()
+        writer.add_rows(batch_of([count]))
+        writer.sync_rows()
         assert read_counts(tmp_path) == list(range(count + 1))
         writer.seal_next()
 
@@ -148,8 +148,8 @@ def test_a_journal_sealed_while_it_is_read_is_read_from_its_part(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     writer = TableWriter(tmp_path, TABLE)
-    writer.add(batch_of(range(10)))
-    writer.sync()
+    writer.add_rows(batch_of(range(10)))
+    writer.sync_rows()
     reader = TableReader(tmp_path, TABLE, [])
     exists = Path.exists
 
@@ -162,7 +162,9 @@ def test_a_journal_sealed_while_it_is_read_is_read_from_its_part(
 
     monkeypatch.setattr(Path, "exists", sealed_after)
     assert [
-        count for table in reader.tables(["count"]) for count in table.column("count").to_pylist()
+        count
+        for table in reader.iterate_tables(["count"])
+        for count in table.column("count").to_pylist()
     ] == [*range(10)]
 
 
@@ -172,45 +174,45 @@ def test_a_full_disk_loses_nothing_within_ten_minutes(tmp_path: Path, free_bytes
     writer = TableWriter(tmp_path, TABLE, disk=disk)
     step_s = 60.0
     for count in range(5):
-        writer.add(batch_of([count], step_s))
-        writer.sync()
+        writer.add_rows(batch_of([count], step_s))
+        writer.sync_rows()
     disk.free_bytes = free_bytes
     before = _counts(tmp_path)
     for count in range(5, 15):
-        writer.add(batch_of([count], step_s))
+        writer.add_rows(batch_of([count], step_s))
         with contextlib.suppress(OSError):
-            writer.sync()
+            writer.sync_rows()
         assert _counts(tmp_path)[: len(before)] == before, "what was readable stays readable"
     disk.free_bytes = 1 << 40
-    writer.add(batch_of([15], step_s))
+    writer.add_rows(batch_of([15], step_s))
     writer.close()
     assert _counts(tmp_path) == list(range(16))
-    assert writer.lost == 0
+    assert writer.lost_rows == 0
 
 
 def test_a_disk_that_is_full_for_longer_loses_only_what_exceeds_ten_minutes(tmp_path: Path) -> None:
     disk = FullDisk()
     writer = TableWriter(tmp_path, TABLE, disk=disk)
-    writer.add(batch_of([0], 60.0))
-    writer.sync()
+    writer.add_rows(batch_of([0], 60.0))
+    writer.sync_rows()
     disk.free_bytes = 0
     for count in range(1, 31):
-        writer.add(batch_of([count], 60.0))
+        writer.add_rows(batch_of([count], 60.0))
         with pytest.raises(OSError, match="No space"):
-            writer.sync()
+            writer.sync_rows()
     kept = round(WAIT_S / 60.0) + 1
     disk.free_bytes = 1 << 40
     writer.close()
     assert _counts(tmp_path) == [0, *range(31 - kept, 31)]
-    assert writer.lost == 30 - kept
+    assert writer.lost_rows == 30 - kept
 
 
 def test_a_disk_that_is_full_while_sealing_keeps_the_journal(tmp_path: Path) -> None:
     disk = FullDisk()
     writer = TableWriter(tmp_path, TABLE, disk=disk)
     for count in range(14):
-        writer.add(batch_of([count]))
-        writer.sync()
+        writer.add_rows(batch_of([count]))
+        writer.sync_rows()
     for free_bytes in (0, 1, 500, 2000):
         disk.free_bytes = free_bytes
         with pytest.raises(OSError, match="No space"):
@@ -226,11 +228,11 @@ def test_a_removed_folder_starts_again_with_what_waits(tmp_path: Path) -> None:
     import shutil
 
     writer = TableWriter(tmp_path, TABLE)
-    writer.add(batch_of([0]))
-    writer.sync()
+    writer.add_rows(batch_of([0]))
+    writer.sync_rows()
     shutil.rmtree(tmp_path / TABLE.name)
     writer.leave_folder()
-    writer.add(batch_of([1]))
+    writer.add_rows(batch_of([1]))
     writer.close()
     assert read_counts(tmp_path) == [1]
 
@@ -238,6 +240,6 @@ def test_a_removed_folder_starts_again_with_what_waits(tmp_path: Path) -> None:
 def _counts(run_dir: Path) -> list[int]:
     return [
         count
-        for table in TableReader(run_dir, TABLE, []).tables(["count"])
+        for table in TableReader(run_dir, TABLE, []).iterate_tables(["count"])
         for count in table["count"].to_pylist()
     ]

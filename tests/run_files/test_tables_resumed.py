@@ -32,7 +32,7 @@ def ticks_of(folder: Path) -> np.ndarray:
 def feed(tables: RunTables, number: int) -> None:
     tables.add_ticks(batch_of(second(number)))
     tables.add_shape(shape_of(float(number), number))
-    tables.sync()
+    tables.sync_tables()
 
 
 @pytest.mark.parametrize("repeated", [0, 1], ids=["the state was newer", "the state was older"])

@@ -126,7 +126,7 @@ def test_more_than_the_twins_board_has_inputs_are_refused() -> None:
         contextlib.ExitStack() as stack,
         pytest.raises(InputError, match="17 of them; the twin's pump board has 16"),
     ):
-        twin_process.TwinProcess.started(config, RunClock.start(), stack)
+        twin_process.TwinProcess.start_twin(config, RunClock.start(), stack)
 
 
 def test_virtual_circuits_open_and_lose_their_signals_as_their_sources_do() -> None:

@@ -25,7 +25,9 @@ def test_ornstein_uhlenbeck_has_the_scenarios_spread_and_memory(
     std, correlation_s = SCENARIOS[scenario][quantity]
     step_s = correlation_s / 10
     noise = OrnsteinUhlenbeck(std, correlation_s, step_s, np.random.default_rng(3))
-    values = np.concatenate([noise.block(1000) for _ in range(200)])  # 20 000 correlation times
+    values = np.concatenate(
+        [noise.next_values(1000) for _ in range(200)]
+    )  # 20 000 correlation times
     assert values.std() == pytest.approx(std, rel=0.03)
     assert values.mean() == pytest.approx(0.0, abs=0.04 * std)
     after_one_constant = np.corrcoef(values[:-10], values[10:])[0, 1]
@@ -35,7 +37,7 @@ def test_ornstein_uhlenbeck_has_the_scenarios_spread_and_memory(
 def test_blocks_join_without_a_seam() -> None:
     def values(blocks: list[int]) -> np.ndarray:
         noise = OrnsteinUhlenbeck(1.0, 30.0, 0.005, np.random.default_rng(5))
-        return np.concatenate([noise.block(n) for n in blocks])
+        return np.concatenate([noise.next_values(n) for n in blocks])
 
     assert np.array_equal(values([600]), values([1, 99, 500]))
 

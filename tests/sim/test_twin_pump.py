@@ -61,13 +61,13 @@ def test_answers_after_transport_and_lag(pump: PumpModel) -> None:
 
 
 def test_hold_is_where_the_pump_stays(pump: PumpModel) -> None:
-    command = pump.hold(1.4)
+    command = pump.settle_at_flow(1.4)
     assert [pump.step(command) for _ in range(100)] == pytest.approx([1.4] * 100)
 
 
 @pytest.mark.parametrize("flow_ml_per_s", [0.2, 7.0])
 def test_hold_of_a_flow_it_cannot_keep_leaves_it_off(pump: PumpModel, flow_ml_per_s: float) -> None:
-    assert pump.hold(flow_ml_per_s) == 0.0
+    assert pump.settle_at_flow(flow_ml_per_s) == 0.0
     assert pump.step(0.2) == 0.0
 
 
@@ -146,4 +146,4 @@ def test_the_twin_follows_a_measured_curve() -> None:
     config = PumpConfig(curve_fraction=(0.2, 0.5, 1.0), curve_um_per_s=(0.0, 1.0, 4.0))
     pump = PumpModel(config, 4.0, STEP_S)
     assert [settle(pump, command) for command in (0.5, 1.0)] == pytest.approx([1.0, 4.0], rel=1e-3)
-    assert pump.hold(1.0) == pytest.approx(0.5, abs=1e-3)
+    assert pump.settle_at_flow(1.0) == pytest.approx(0.5, abs=1e-3)

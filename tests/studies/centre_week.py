@@ -173,7 +173,7 @@ class _Week:
             given_k = self._stand_k[place] = now_k + (given_k - now_k) / (RATE_HZ * STAND_S / 2)
         self.bench.wrong.camera_offset_um = STAND_UM_PER_K * given_k
         commands, self._pending = tuple(self._pending), []
-        tick = self.run.tick(commands)
+        tick = self.run.run_tick(commands)
         if tick is not None:
             self._judge(tick)
         return tick

@@ -76,7 +76,7 @@ def answer(effect: Effect, seed: int) -> tuple[FloatArray, FloatArray, str, tupl
 
     def render(pattern: Any, displacement_um: float, gain: float) -> FloatArray:
         place_um = displacement_um + effect.between_um * (pattern.axis == "y")
-        return renderer.render(pattern, place_um, gain=gain).astype(float)
+        return renderer.render_picture(pattern, place_um, gain=gain).astype(float)
 
     radius, angle = 475 * np.sqrt(rng.random(POINTS)), 2 * np.pi * rng.random(POINTS)
     points_mm = np.stack([radius * np.cos(angle), radius * np.sin(angle)])

@@ -63,7 +63,7 @@ def hold(
         now_s, sample = plant.time_s, plant.sample()
         out: LoopOutput
         if lost_s[0] <= now_s < lost_s[1]:
-            out = controller.stale(LoopInput(0.0, 0.0, np.nan, np.nan, np.nan), dt_s)
+            out = controller.step_without_reading(LoopInput(0.0, 0.0, np.nan, np.nan, np.nan), dt_s)
         else:
             reading = sample.displacement_um, sample.ambient_pressure_pa, sample.air_temperature_c
             out = controller.step(LoopInput(target_um(now_s), 0.0, *reading), dt_s)

@@ -115,7 +115,7 @@ def soak(
     upsets = _upsets(seed) if faults else iter(())
     due_s, name, lasts_s = next(upsets, (np.inf, "", 0.0))
     until_s, tally, start_s = np.inf, SoakTally(), time.process_time()
-    tick = run.tick((Command("hold", "soak"),))
+    tick = run.run_tick((Command("hold", "soak"),))
     with contextlib.suppress(KeyboardInterrupt):
         while run.now_s < days * DAY_S and run.finished is None:
             if tick is not None:
@@ -129,7 +129,7 @@ def soak(
             if run.now_s >= until_s:
                 _switch(bench, name, False)
                 until_s, name, lasts_s = np.inf, following, after_s
-            tick = run.tick()
+            tick = run.run_tick()
     tally.days = run.now_s / DAY_S
     tally.rss_mb, tally.wall_s = rss_mb(), time.process_time() - start_s
     return tally
@@ -190,10 +190,10 @@ def _dropout_excursion_um(seed: int) -> float:
         config.twin, config.pump, (LaserDropout(LASER_LOST_S, LASER_BACK_S - LASER_LOST_S),)
     )
     run = VirtualRun(config, VirtualBench(plant), zernike_projection())
-    run.tick((Command("hold", "soak"),))
+    run.run_tick((Command("hold", "soak"),))
     worst_um = 0.0
     while run.now_s < LASER_BACK_S + 1.0:
-        tick = run.tick()
+        tick = run.run_tick()
         if tick is not None and run.now_s >= LASER_LOST_S:
             worst_um = max(worst_um, abs(tick.row.truth_displacement_um - tick.row.target_um))
     return worst_um

@@ -78,7 +78,9 @@ def _frames(
 ) -> NDArray[np.uint8]:
     renderer = OpticsRenderer(optics, film, light, seed=seed)
     shown = patterns(optics, shifts_rad)
-    return np.stack([renderer.render(p, d) for p, d in zip(shown, readings_um, strict=True)])
+    return np.stack(
+        [renderer.render_picture(p, d) for p, d in zip(shown, readings_um, strict=True)]
+    )
 
 
 def faulty_set(kind: str, frame: str, steps: int = 4, gamma: float = 1.0) -> FrameStack:
@@ -89,11 +91,11 @@ def faulty_set(kind: str, frame: str, steps: int = 4, gamma: float = 1.0) -> Fra
     if kind == "repeated":
         frames[place] = frames[place - 1]
     elif kind == "stale":
-        frames[place] = renderer.render(shown[place - 1], 0.0)
+        frames[place] = renderer.render_picture(shown[place - 1], 0.0)
     elif kind == "swapped":
         frames[[place, place + 1]] = frames[[place + 1, place]]
     elif kind == "moved":
-        frames[place] = renderer.render(shown[place], 200.0)
+        frames[place] = renderer.render_picture(shown[place], 200.0)
     else:
-        frames[place] = renderer.render(shown[place], 0.0, gain=GAINS[kind])
+        frames[place] = renderer.render_picture(shown[place], 0.0, gain=GAINS[kind])
     return stack

@@ -44,7 +44,7 @@ def segment(folder: Path, rows: Rows) -> Path:
     recording.next_segment()
     streams = TelemetryStreams(recording, config)
     for first in range(0, len(rows), 10):
-        streams.send(rows[first : first + 10])
+        streams.send_rows(rows[first : first + 10])
     recording.close()
     return folder / "night-000.rrd"
 
@@ -54,11 +54,11 @@ def tables(folder: Path, rows: Rows, shapes: list[ShapeEstimate], close: bool = 
     made = RunTables(folder)
     for first in range(0, len(rows), 10):
         if first % _SYNC_ROWS == 0:
-            made.sync()
+            made.sync_tables()
         made.add_ticks(batch_of(rows[first : first + 10]))
     for estimate in shapes:
         made.add_shape(estimate)
-    made.sync()
+    made.sync_tables()
     if close:
         made.close()
 

@@ -139,7 +139,7 @@ def batch_of(counts: Sequence[int], step_s: float = STEP_S) -> pa.RecordBatch:
 def read_counts(run_dir: Path, notes: list[str] | None = None) -> list[int]:
     """The counts of all readable rows, each row compared with what was written."""
     found: list[int] = []
-    for table in TableReader(run_dir, TABLE, [] if notes is None else notes).tables():
+    for table in TableReader(run_dir, TABLE, [] if notes is None else notes).iterate_tables():
         counts = table.column("count").to_pylist()
         expected = pa.Table.from_batches([batch_of(counts)])
         for name in TABLE.schema.names:

@@ -117,7 +117,7 @@ def template(tmp_path_factory: pytest.TempPathFactory) -> Path:
         tmp_path_factory.mktemp("logs"), "made", "tester", "made up", Config(loop=LOOP), LOOP
     )
     record = synthetic.record(PLANT, samples=6000)
-    record_file.save_record(opened.file("experiments.npz"), record)
+    record_file.save_record(opened.file_path("experiments.npz"), record)
     around = operating_point.OperatingPoint(PLANT.holding_flow_um_per_s, 0.4, 5.3, 1.0)
     ends_s = record.duration_s
     head = characterise.ExperimentsHead(
@@ -126,13 +126,13 @@ def template(tmp_path_factory: pytest.TempPathFactory) -> Path:
         (ends_s, ends_s),
         experiment.Finished(experiment.ExperimentEnd.COMPLETED, "done"),
     )
-    folder.write_session_file(opened.file("experiments.json"), head)
+    folder.write_session_file(opened.file_path("experiments.json"), head)
     identify.run_identify(opened)
     quiet = quiet_hold()
-    record_file.save_record(opened.file("quiet.npz"), quiet)
+    record_file.save_record(opened.file_path("quiet.npz"), quiet)
     found = identify.load_identified(opened).identified.model
     folder.write_session_file(
-        opened.file("disturbance.json"), disturbance.observe_disturbance(quiet, found, LOOP)
+        opened.file_path("disturbance.json"), disturbance.observe_disturbance(quiet, found, LOOP)
     )
     design.run_design(opened)
     return opened.path
@@ -146,8 +146,8 @@ def test_a_session_gives_plant_weather_and_proposal(template: Path, tmp_path: Pa
     opened = copy_of(template, tmp_path)
     found = of_path(opened.path, tmp_path)
     assert found.model.gain == pytest.approx(PLANT.gain, rel=0.05)
-    assert found.proposed == Gains.of(gains_file.load_gains(opened.file("gains.toml")).loop)
-    opened.begin("design")
+    assert found.proposed == Gains.of(gains_file.load_gains(opened.file_path("gains.toml")).loop)
+    opened.begin_step("design")
     assert of_path(opened.path, tmp_path).proposed is None
 
 
@@ -157,17 +157,17 @@ def test_a_short_session_takes_the_weather_from_before_its_experiments(
     """The hold is not asked for more."""
     opened = copy_of(template, tmp_path)
     before = observe.load_disturbance(opened)
-    shutil.copy(opened.file("quiet.npz"), opened.file("held.npz"))
+    shutil.copy(opened.file_path("quiet.npz"), opened.file_path("held.npz"))
     assert observe.run_observe(opened, SimpleNamespace(loop=LOOP)) == before  # type: ignore[arg-type]
     assert SHORT.typical_s == pytest.approx(300.0, abs=1.0)
-    opened.begin("characterise")
-    assert not opened.file("held.npz").exists()
+    opened.begin_step("characterise")
+    assert not opened.file_path("held.npz").exists()
 
 
 def test_a_hold_lost_in_the_verification_is_what_is_told(template: Path, tmp_path: Path) -> None:
     """Not that it then takes no gains; the verification is still to be done."""
     opened = copy_of(template, tmp_path)
-    folder.write_session_file(opened.file("applied.json"), {})
+    folder.write_session_file(opened.file_path("applied.json"), {})
 
     class Lost:
         dt_s, told, pump = 0.02, 0, PumpConfig()
@@ -182,7 +182,7 @@ def test_a_hold_lost_in_the_verification_is_what_is_told(template: Path, tmp_pat
 
     with pytest.raises(HoldError, match="the mirror is not held"):
         verify.run_verify(opened, Lost())  # type: ignore[arg-type]
-    assert not opened.done("verify")
+    assert not opened.is_done("verify")
 
 
 @pytest.mark.parametrize(
@@ -205,7 +205,7 @@ def test_a_close_verification_goes_on_for_as_long_again(
 ) -> None:
     """Ten minutes tell a standard deviation to 13 %."""
     opened = copy_of(template, tmp_path)
-    folder.write_session_file(opened.file("applied.json"), {})
+    folder.write_session_file(opened.file_path("applied.json"), {})
     left, told = list(growths), []
     held = SimpleNamespace(followed_by=lambda more: held)
     rig = SimpleNamespace(
@@ -248,23 +248,23 @@ def test_a_folder_that_cannot_be_explored_is_refused(tmp_path: Path) -> None:
 
 def test_saved_gains_are_the_next_to_be_applied(template: Path, tmp_path: Path) -> None:
     opened = copy_of(template, tmp_path)
-    folder.write_session_file(opened.file("preview.json"), preview.Previewed((), ()))
+    folder.write_session_file(opened.file_path("preview.json"), preview.Previewed((), ()))
     save = saver(of_path(opened.path, tmp_path), "ada")
     assert save is not None
     assert "tune apply" in save(GAINS[0])
     assert Gains.of(apply.load_checked_gains(opened)) == GAINS[0]
-    assert gains_file.load_gains(opened.file("gains.toml")).author == "ada"
-    assert not opened.done("preview")  # it was of other gains
+    assert gains_file.load_gains(opened.file_path("gains.toml")).author == "ada"
+    assert not opened.is_done("preview")  # it was of other gains
 
 
 @pytest.mark.parametrize("gains", [Gains(9.0, 1.0, 0.0, 0.1), Gains(1.2, 4.0, 0.0, 0.1)])
 def test_gains_without_margin_are_not_saved(gains: Gains, template: Path, tmp_path: Path) -> None:
     opened = copy_of(template, tmp_path)
-    before = opened.file("gains.toml").read_bytes()
+    before = opened.file_path("gains.toml").read_bytes()
     save = saver(of_path(opened.path, tmp_path), "ada")
     assert save is not None
     assert re.search("Not saved: .*(unstable|sensitivity)", save(gains))
-    assert opened.file("gains.toml").read_bytes() == before
+    assert opened.file_path("gains.toml").read_bytes() == before
 
 
 _ROW = "Bokeh.documents[0].get_model_by_name('table').text"
@@ -291,7 +291,7 @@ async def test_the_page_in_a_browser(template: Path, tmp_path: Path) -> None:
             await tab.until(_ROW)
             await tab.value(_MOVE.format("speed", 0.5))
             await tab.value(_MOVE.format("damping", 12.0))
-            loop = gains_file.load_gains(opened.file("gains.toml")).loop
+            loop = gains_file.load_gains(opened.file_path("gains.toml")).loop
             slowed_s = 10**0.5 + PLANT.delay_s + CALM.dt_s / 2 + loop.measurement_filter_s
             shown = json.loads(await tab.until(_GAINS_NEAR.format(12.0 * slowed_s)))
             assert shown["kp_per_s"] == pytest.approx(1 / (PLANT.gain * slowed_s), rel=0.1)
@@ -303,7 +303,7 @@ async def test_the_page_in_a_browser(template: Path, tmp_path: Path) -> None:
                 "Bokeh.documents[0].get_model_by_name('now').text.includes('Nothing recorded yet')"
             )
         assert (tmp_path / "page.png").stat().st_size > 30_000
-        assert gains_file.load_gains(opened.file("gains.toml")).loop.ti_s == pytest.approx(
+        assert gains_file.load_gains(opened.file_path("gains.toml")).loop.ti_s == pytest.approx(
             shown["ti_s"], rel=1e-3
         )
         await _is_refused(url)

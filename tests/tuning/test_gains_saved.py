@@ -48,7 +48,7 @@ def kept_session(logs: Path, kept: bool = True, config: Config | None = None) ->
     session = plain.create_session(logs, "s1", "eve", "a-run", config or Config(), BEFORE)
     reason = "" if kept else "the readings show a sensitivity of 2.3"
     plain.write_session_file(
-        session.file("verified.json"), Verified(kept, reason, (), BEFORE, AFTER)
+        session.file_path("verified.json"), Verified(kept, reason, (), BEFORE, AFTER)
     )
     append_entry(
         logs,
@@ -252,7 +252,7 @@ def mapped_session(logs: Path, text: str) -> Path:
     session = plain.create_session(logs, "s2", "eve", "a-run", config, config.loop)
     found = PumpMap((0.1, 1.0), (0.0, 6.0), (0.0, 0.1), CURVE, 1.2, 1.0, 0.2, 600.0, True)
     plain.write_session_file(
-        session.file("pump_map.json"), MappedPump(found, config.pump, 1.0, 0.02)
+        session.file_path("pump_map.json"), MappedPump(found, config.pump, 1.0, 0.02)
     )
     loop = config.loop.model_copy(update={"kp_per_s": 0.3, "flow_max_um_per_s": 6.0})
     return plain.based_on(session, loop, CURVE).path

@@ -50,15 +50,15 @@ def logged(path: Path) -> LiveLog:
 
 def held(log: LiveLog, seconds: float, displacement_um: float = 0.5) -> None:
     for tick in range(round(seconds * RATE_HZ)):
-        log.tick(row(tick, displacement_um))
+        log.add_tick(row(tick, displacement_um))
 
 
 def test_a_reader_beside_the_session_sees_what_it_does(tmp_path: Path) -> None:
     log, reader = logged(tmp_path), LiveReader(tmp_path)
-    assert reader.read()["time_s"] == []
-    log.note("step", "observe", planned_s=300.0, after_s=320.0)
+    assert reader.read_new()["time_s"] == []
+    log.log_entry("step", "observe", planned_s=300.0, after_s=320.0)
     held(log, 2.0)
-    first = reader.read()
+    first = reader.read_new()
     assert first["time_s"] == pytest.approx([0.2 * n for n in range(1, 11)])
     assert first["displacement_um"] == pytest.approx([0.5] * 10)
     assert first["flow_um_per_s"] == pytest.approx([1.2] * 10)
@@ -68,10 +68,10 @@ def test_a_reader_beside_the_session_sees_what_it_does(tmp_path: Path) -> None:
         2.0,
     )
     held(log, 1.0, math.nan)
-    log.note("said", "observe: laser noise 1.00 µm")
-    log.note("step", "design", planned_s=0.0, after_s=320.0)
-    log.note("asks", "apply which?")
-    more = reader.read()
+    log.log_entry("said", "observe: laser noise 1.00 µm")
+    log.log_entry("step", "design", planned_s=0.0, after_s=320.0)
+    log.log_entry("asks", "apply which?")
+    more = reader.read_new()
     assert more["time_s"][0] == pytest.approx(2.2)
     assert all(math.isnan(value) for value in more["displacement_um"])
     assert reader.progress == Progressed(
@@ -84,18 +84,18 @@ def test_a_reader_beside_the_session_sees_what_it_does(tmp_path: Path) -> None:
         ("observe: laser noise 1.00 µm",),
         ((0.0, "observe"), (3.0, "design")),
     )
-    assert reader.read()["time_s"] == []
+    assert reader.read_new()["time_s"] == []
 
 
 def test_a_line_torn_by_a_kill_costs_no_other_line(tmp_path: Path) -> None:
     log = logged(tmp_path)
-    log.note("step", "observe", planned_s=300.0, after_s=0.0)
+    log.log_entry("step", "observe", planned_s=300.0, after_s=0.0)
     path = tmp_path / NAME
     path.write_bytes(path.read_bytes() + b'{"said": "hal')
     again = logged(tmp_path)
-    again.note("step", "verify", planned_s=600.0, after_s=0.0)
+    again.log_entry("step", "verify", planned_s=600.0, after_s=0.0)
     reader = LiveReader(tmp_path)
-    reader.read()
+    reader.read_new()
     assert reader.progress.step == "verify"
     assert [step for _, step in reader.progress.begun_s] == ["observe", "verify"]
 
@@ -108,7 +108,7 @@ def test_a_foreign_log_harms_nobody(tmp_path: Path) -> None:
         b'{"step": {}, "planned_s": "x", "after_s": 1}\n{"said": "' + b"a" * 9000 + b'"}\n'
     )
     reader = LiveReader(tmp_path)
-    assert reader.read()["time_s"] == []
+    assert reader.read_new()["time_s"] == []
     assert [len(line) for line in reader.progress.said] == [500]
 
 
@@ -116,8 +116,8 @@ def test_a_full_disk_ends_the_log_and_says_so_once(tmp_path: Path) -> None:
     said: list[str] = []
     (tmp_path / NAME).mkdir()
     log = LiveLog(tmp_path, RATE_HZ, said.append)
-    log.note("said", "one")
-    log.note("said", "two")
+    log.log_entry("said", "one")
+    log.log_entry("said", "two")
     assert len(said) == 1
     assert NAME in said[0]
 
@@ -163,9 +163,9 @@ def test_the_page_says_what_a_session_does(
 def test_the_page_s_text_is_text(tmp_path: Path) -> None:
     opened = folder.create_session(tmp_path, "s", "eve", "twin", Config(), LoopConfig())
     log = logged(opened.path)
-    log.note("step", "characterise", planned_s=10.0, after_s=0.0)
+    log.log_entry("step", "characterise", planned_s=10.0, after_s=0.0)
     held(log, 2.0)
-    log.note("said", "<script>alert(1)</script>")
+    log.log_entry("said", "<script>alert(1)</script>")
     page = LivePage(opened)
     assert "&lt;script&gt;" in page._said.text
     assert len(page._points.data["minutes"]) == 10
@@ -236,8 +236,8 @@ class AskedPage(LiveLog):
             typed,
         )
 
-    def note(self, what: str, line: str, **more: object) -> None:
-        super().note(what, line, **more)  # type: ignore[arg-type]
+    def log_entry(self, what: str, line: str, **more: object) -> None:
+        super().log_entry(what, line, **more)  # type: ignore[arg-type]
         if what == "asks":
             if self._typed:
                 os.write(self._keyboard, self._typed.encode())
@@ -262,10 +262,10 @@ def test_a_question_is_answered_on_the_page(
 ) -> None:
     give_answer(tmp_path, "which?", PageAnswer("lively", "bob"))  # to an earlier question: too late
     log = AskedPage(tmp_path, answer(said, by="anna\x1b[2J"))
-    assert progress_of(log).ask("which?", ("lively", "calm")) == said
+    assert progress_of(log).ask_question("which?", ("lively", "calm")) == said
     assert f"answers on the page: {said or 'none'}" in capsys.readouterr().err
     reader = LiveReader(tmp_path)
-    reader.read()
+    reader.read_new()
     (line,) = reader.progress.said
     assert line.startswith("anna")
     assert "\x1b" not in line
@@ -288,18 +288,18 @@ def test_the_terminal_answers_as_ever_and_an_unfit_answer_of_the_page_does_not(
     tmp_path: Path, keyboard: int, unfit: str
 ) -> None:
     log = AskedPage(tmp_path, unfit, keyboard=keyboard, typed="lively\n")
-    assert progress_of(log).ask("which?", ("lively", "calm")) == "lively"
-    assert log.answer("which?", ("lively", "calm")) is None
+    assert progress_of(log).ask_question("which?", ("lively", "calm")) == "lively"
+    assert log.take_answer("which?", ("lively", "calm")) is None
     assert not (tmp_path / ANSWER).exists()
 
 
 def test_who_sees_the_question_sees_its_answers(tmp_path: Path) -> None:
     log, reader = logged(tmp_path), LiveReader(tmp_path)
-    log.note("asks", "which?", among=("lively", "calm"))
-    reader.read()
+    log.log_entry("asks", "which?", among=("lively", "calm"))
+    reader.read_new()
     assert (reader.progress.asks, reader.progress.among) == ("which?", ("lively", "calm"))
-    log.note("asks", "sure?")
-    reader.read()
+    log.log_entry("asks", "sure?")
+    reader.read_new()
     assert (reader.progress.asks, reader.progress.among) == ("sure?", ())
     (tmp_path / NAME).write_text('{"asks": "which?", "among": 5}\n')
-    LiveReader(tmp_path).read()
+    LiveReader(tmp_path).read_new()

@@ -203,7 +203,7 @@ class ForeignHold(TwinHold):
         super().__init__(config, bench=foreign_bench(self.plant))
         ForeignHold.last = self
         for _ in range(40):
-            self.news()
+            self.read_news()
         self.bench.wrong.pump_stuck_fraction = self.stuck_fraction
 
     def close(self) -> None:
@@ -232,7 +232,7 @@ def test_a_stuck_pump_is_told(
     assert link.rows[-1].state == State.HOLD
     link.bench.wrong.pump_stuck_fraction = math.nan
     for _ in range(240):
-        link.news()
+        link.read_news()
     assert all(
         abs(row.truth_displacement_um) < 3.0 for row in link.rows[-400:]
     )  # with the former gains and curve
@@ -355,7 +355,7 @@ def test_first_pulses_are_longer_and_at_once_after_a_fall_and_shorter_after_a_ri
         survey = PumpSurvey(0.5)
         run = PumpRun(DT_S, *np.array([np.zeros(10), np.linspace(0.0, end_um, 10), np.zeros(10)]))
         for _ in range(times):
-            survey.take(run, completed)
+            survey.add_run(run, completed)
         steps = survey.steps()
         assert (steps[0].fraction > 0) == (end_um < 0 and not completed)
         return [step.duration_s for step in steps if step.fraction > 0]

@@ -104,7 +104,7 @@ class Hold(TwinHold):
         plant = self.refusal.then if self.obeyed and self.refusal.then else self.refusal.plant
         super().__init__(config, bench=foreign_bench(plant()))
         for _ in range(0 if self.obeyed else 40):
-            self.news()
+            self.read_news()
         for name, value in ({} if self.obeyed else self.refusal.wrong).items():
             setattr(self.bench.wrong, name, value)
 

@@ -42,7 +42,7 @@ def held(events: Sequence[BenchEvent] = (), **twin: object) -> tuple[TwinHold, H
 
 def still_held(link: TwinHold) -> bool:
     for _ in range(80):
-        link.news()
+        link.read_news()
     return link.rows[-1].state == State.HOLD and all(
         abs(row.truth_displacement_um) < 2.0 for row in link.rows[-250:]
     )
@@ -63,14 +63,14 @@ def test_a_lost_laser_ends_the_relay_by_name() -> None:
     link, rig = held()
     rig.hold(20.0)
     around = rig.around(rig.hold(20.0), 10.0)
-    news, seen = link.news, []
+    news, seen = link.read_news, []
 
     def dark_later():  # type: ignore[no-untyped-def]
         seen.append(news())
         link.bench.wrong.no_light = 20 <= len(seen) < 26
         return seen[-1]
 
-    link.news = dark_later  # type: ignore[method-assign]
+    link.read_news = dark_later  # type: ignore[method-assign]
     record, finished = rig.perform(make_spec("relay", around, 60.0))
     assert not finished.completed
     assert "laser" in finished.reason or "safety table" in finished.reason
@@ -123,16 +123,16 @@ class Outer(TwinHold):
         super().__init__(*given)  # type: ignore[arg-type]
         Outer.last, self.trials, self.begun_s, self.gone = self, 0, math.inf, False
 
-    def ask(self, command: Command) -> None:
+    def send_command(self, command: Command) -> None:
         """Counts the trials of the session."""
         if self.gone and self.lost:
             raise HoldError("the connection is lost")
-        super().ask(command)
+        super().send_command(command)
         self.trials += math.isfinite(command.value)
         if self.trials > self.when[0]:
             self.begun_s = min(self.begun_s, self.rows[-1].mono_s)
 
-    def news(self) -> News:
+    def read_news(self) -> News:
         """No more of them once the connection is lost."""
         if not self.gone and self.rows[-1].mono_s > self.begun_s + self.when[1]:
             self.gone = True
@@ -140,7 +140,7 @@ class Outer(TwinHold):
                 signal.raise_signal(signal.SIGINT)
         if self.gone and self.lost:
             raise HoldError("the connection is lost")
-        return super().news()
+        return super().read_news()
 
     def close(self) -> None:
         """The hold outlives its session."""

@@ -116,7 +116,7 @@ def test_a_session_killed_at_any_moment_has_whole_steps_only(killed: Killed) -> 
         if not (path / "session.json").exists():
             continue
         opened = open_session(path)
-        steps = [step for step in STEPS if opened.done(step)]
+        steps = [step for step in STEPS if opened.is_done(step)]
         assert steps == list(STEPS[: len(steps)])
         if (
             steps and steps[-1] not in reached
@@ -153,13 +153,13 @@ def test_a_session_killed_in_any_step_goes_on_with_it(
     at = next(
         path
         for path in reversed(killed.folders)
-        if (path / "session.json").exists() and not open_session(path).done(step)
+        if (path / "session.json").exists() and not open_session(path).is_done(step)
     )
     path = Path(shutil.copytree(at, tmp_path / "tuning" / "20260101T000000Z-first"))
     kept = {file.name: file.stat().st_mtime_ns for file in path.glob("*.npz")}
     assert tune_twin(tmp_path, "run", "--resume", str(path), "--yes", *TIMES) == Exit.DONE
     opened = open_session(path)
-    assert all(opened.done(each) for each in STEPS)
+    assert all(opened.is_done(each) for each in STEPS)
     assert verify.load_verified(opened).kept
     assert [line.what for line in journal.read_entries(tmp_path)] == ["kept"]
     done = [name for each in STEPS[: STEPS.index(step)] for name in FILES[each] if name in kept]
@@ -174,11 +174,11 @@ def done(logs: Path, tmp_path: Path) -> SessionFolder:
 
 
 def test_it_leaves_gains_that_are_kept_and_justified(done: SessionFolder) -> None:
-    assert all(done.done(step) for step in STEPS)
+    assert all(done.is_done(step) for step in STEPS)
     verified = verify.load_verified(done)
     assert verified.kept, verified.reason
     assert all(stage.growth < stage.growth_max for stage in verified.stages)
-    gains = load_gains(done.file("gains.toml"))
+    gains = load_gains(done.file_path("gains.toml"))
     assert (gains.author, gains.reason) == ("eve", "new film")
     assert gains.data_sha256 == characterise.load_experiments(done).record.sha256()
     assert gains.plant.gain == pytest.approx(1.0, abs=0.06)
@@ -193,12 +193,12 @@ def test_it_leaves_gains_that_are_kept_and_justified(done: SessionFolder) -> Non
 
 
 def test_the_report_stands_alone_and_the_recording_is_there(done: SessionFolder) -> None:
-    text = done.file("report.html").read_text(encoding="utf-8")
+    text = done.file_path("report.html").read_text(encoding="utf-8")
     assert text.count("data:image/png;base64,") == 4
     assert "://" not in text  # base64 may spell "http" by chance
     for word in ("ziegler-nichols", "eve", "Verification", "kept"):
         assert word in text
-    assert done.file("session.rrd").stat().st_size > 100_000
+    assert done.file_path("session.rrd").stat().st_size > 100_000
 
 
 @pytest.mark.parametrize(
@@ -216,14 +216,14 @@ def test_a_picture_is_drawn_anew_when_what_it_shows_is(
 ) -> None:
     names = {"experiments.png", "weather.png", "candidates.png", "verify.png"}
     for name in names:
-        os.utime(done.file(name), ns=(10**18, 2 * 10**18))
-    for path in set(done.path.iterdir()) - {done.file(name) for name in names}:
+        os.utime(done.file_path(name), ns=(10**18, 2 * 10**18))
+    for path in set(done.path.iterdir()) - {done.file_path(name) for name in names}:
         os.utime(path, ns=(10**18, 10**18))
     if renewed in names:
-        done.file(renewed).unlink()
+        done.file_path(renewed).unlink()
     elif renewed is not None:
         os.utime(
-            done.file(renewed), ns=(10**18, 2 * 10**18)
+            done.file_path(renewed), ns=(10**18, 2 * 10**18)
         )  # at the same moment: which was first is not known
     seen: set[str] = set()
     monkeypatch.setattr(pictures, "write_picture", lambda path, figure, dpi: seen.add(path.name))
@@ -232,14 +232,14 @@ def test_a_picture_is_drawn_anew_when_what_it_shows_is(
 
 
 def test_calculating_steps_can_be_repeated_without_a_hold(done: SessionFolder) -> None:
-    before = load_gains(done.file("gains.toml"))
+    before = load_gains(done.file_path("gains.toml"))
     found = identify.run_identify(done)
-    assert not done.done("observe")  # what stood on the old fit is gone
+    assert not done.is_done("observe")  # what stood on the old fit is gone
     assert found.identified.model.gain == pytest.approx(before.plant.gain, rel=1e-6)
 
 
 def test_a_step_whose_data_are_missing_names_the_step_to_run(done: SessionFolder) -> None:
-    done.begin("observe")
+    done.begin_step("observe")
     with pytest.raises(
         InputError, match="observe is missing; run `membrane-ctrl tune observe` first"
     ):
@@ -321,7 +321,7 @@ def test_without_a_laser_there_is_no_shape_loop_to_tune(
 
 @pytest.mark.parametrize("name", ["experiments.npz", "experiments.json", "identified.json"])
 def test_damaged_files_are_named(done: SessionFolder, name: str) -> None:
-    path = done.file(name)
+    path = done.file_path(name)
     path.write_bytes(path.read_bytes()[:-200])
     step = identify.load_identified if name == "identified.json" else identify.run_identify
     with pytest.raises(InputError, match=f"{name}: damaged"):
@@ -329,7 +329,7 @@ def test_damaged_files_are_named(done: SessionFolder, name: str) -> None:
 
 
 def test_an_identified_plant_of_other_experiments_is_refused(done: SessionFolder) -> None:
-    path = done.file("identified.json")
+    path = done.file_path("identified.json")
     good = json.loads(path.read_text())
     shorter = good["identified"] | {"residual_um": good["identified"]["residual_um"][:-1]}
     for forged in (good | {"data_sha256": "0" * 64}, good | {"identified": shorter}):
@@ -344,7 +344,7 @@ def test_an_identified_plant_of_other_experiments_is_refused(done: SessionFolder
 def test_noise_that_is_no_number_ends_the_design_in_one_line(
     done: SessionFolder, white: float | str
 ) -> None:
-    path = done.file("disturbance.json")
+    path = done.file_path("disturbance.json")
     weather = json.loads(path.read_text())
     path.write_text(json.dumps(weather | {"rest": weather["rest"] | {"white": white}}))
     with pytest.raises(
@@ -355,7 +355,7 @@ def test_noise_that_is_no_number_ends_the_design_in_one_line(
 
 def edited(done: SessionFolder, **changed: float) -> None:
     """Edit the gains file by hand."""
-    path = done.file("gains.toml")
+    path = done.file_path("gains.toml")
     lines = path.read_text().splitlines()
     path.write_text(
         "\n".join(
@@ -437,7 +437,7 @@ def test_an_interrupt_gives_the_mirror_back_with_the_last_good_gains(
     code = tune_twin(tmp_path, step, "--session", str(done.path), *TIMES)
     assert code == Exit.INTERRUPTED
     for _ in range(20):
-        Kept.last.news()
+        Kept.last.read_news()
     assert Kept.last.rows[-1].state == State.HOLD
     assert kp_of(Kept.last) == pytest.approx(done.head.before.kp_per_s, rel=0.02)
 
@@ -484,7 +484,7 @@ def test_rolling_back_sets_the_gains_of_before(
     config = CONFIG + "kp_per_s = 0.3\n"
     assert tune_twin(copied, "rollback", config=config) == Exit.DONE
     for _ in range(12):
-        Kept.last.news()
+        Kept.last.read_news()
     assert kp_of(Kept.last) == pytest.approx(0.61, rel=0.02)
 
 
@@ -507,10 +507,10 @@ def asked(
     """Exit code of `tune apply` answered so, and the gain that then holds the mirror."""
     monkeypatch.setattr(sys, "stdin", Terminal(answers))
     monkeypatch.setattr(twin_hold, "TwinHold", Kept)
-    done.begin("apply")
+    done.begin_step("apply")
     code = tune_twin(tmp_path, "apply", "--session", str(done.path), *words)
     for _ in range(20):
-        Kept.last.news()
+        Kept.last.read_news()
     assert Kept.last.rows[-1].state == State.HOLD
     return code, kp_of(Kept.last)
 
@@ -525,7 +525,7 @@ def test_the_candidate_that_a_person_chooses_is_the_one_that_is_applied(
         done, tmp_path, monkeypatch, "fast\nziegler-nichols\npresent\nsimc-slow\n"
     )
     chosen = next(row for row in design.load_design(done).candidates if row.name == "simc-slow")
-    gains = load_gains(done.file("gains.toml"))
+    gains = load_gains(done.file_path("gains.toml"))
     assert code == Exit.DONE
     assert kp_per_s == pytest.approx(chosen.gains.kp_per_s, rel=0.02)
     assert (gains.candidate, gains.loop.kp_per_s) == ("simc-slow", chosen.gains.kp_per_s)
@@ -545,7 +545,7 @@ def test_the_candidate_that_a_person_chooses_is_the_one_that_is_applied(
     ] == 2 * ordered  # the figures, and what gets better and worse
     assert "in force" in said
     assert "simc-slow is on trial" in said
-    assert "simc-slow is chosen" in done.file("report.html").read_text()
+    assert "simc-slow is chosen" in done.file_path("report.html").read_text()
 
 
 @pytest.mark.parametrize(
@@ -559,13 +559,13 @@ def test_no_answer_applies_nothing(
     answers: str,
     code: Exit,
 ) -> None:
-    before = done.file("gains.toml").read_bytes()
+    before = done.file_path("gains.toml").read_bytes()
     assert asked(done, tmp_path, monkeypatch, answers) == (
         code,
         pytest.approx(done.head.before.kp_per_s, rel=0.02),
     )
-    assert done.file("gains.toml").read_bytes() == before
-    assert not done.done("apply")
+    assert done.file_path("gains.toml").read_bytes() == before
+    assert not done.is_done("apply")
     said = capsys.readouterr().err
     assert ("nothing is applied; `membrane-ctrl tune apply" in said) == (code == Exit.DONE)
 
@@ -580,7 +580,7 @@ def test_the_proposal_is_the_same_load_where_it_answers_a_load_no_worse(
     opened = open_session(Path(shutil.copytree(done.path, tmp_path / "copy")))
     monkeypatch.setattr(design, "load_candidates", lambda folder: (tuple(rows), rows[0]))
     apply.select_candidate(opened, "same-load")
-    assert load_gains(opened.file("gains.toml")).candidate == "least-variance"
+    assert load_gains(opened.file_path("gains.toml")).candidate == "least-variance"
 
 
 @pytest.mark.parametrize("name", ["fast", "ziegler-nichols", "present"])
@@ -590,7 +590,7 @@ def test_a_refused_name_applies_nothing(
     code, kp_per_s = asked(done, tmp_path, monkeypatch, "simc\n", "--choose", name)
     assert code == Exit.BAD_INPUT
     assert kp_per_s == pytest.approx(done.head.before.kp_per_s, rel=0.02)
-    assert not done.done("apply")
+    assert not done.is_done("apply")
 
 
 @pytest.mark.parametrize(
@@ -638,7 +638,7 @@ def test_edited_gains_are_a_candidate_of_their_own(done: SessionFolder) -> None:
 
 
 def test_margins_of_what_is_kept(done: SessionFolder) -> None:
-    gains = load_gains(done.file("gains.toml"))
+    gains = load_gains(done.file_path("gains.toml"))
     found = compute_margins(Gains.of(gains.loop), gains.plant.model, 0.02)
     assert found.stable
     assert found.ms < 1.45
@@ -669,7 +669,7 @@ def test_ticks_from_before_the_answer_are_not_recorded() -> None:
 def test_what_cannot_be_written_ends_in_one_line(
     done: SessionFolder, capsys: pytest.CaptureFixture[str], name: str
 ) -> None:
-    path = done.file(name)
+    path = done.file_path(name)
     path.unlink()
     path.mkdir()
     assert command_line(["tune", "identify", "--session", str(done.path)]) == Exit.DEVICE_FAILED
@@ -680,7 +680,7 @@ def test_what_cannot_be_written_ends_in_one_line(
 
 
 def test_a_picture_replaces_a_pipe_that_nobody_reads(done: SessionFolder) -> None:
-    path = done.file("experiments.png")
+    path = done.file_path("experiments.png")
     path.unlink()
     os.mkfifo(path)
     assert command_line(["tune", "identify", "--session", str(done.path)]) == Exit.DONE

@@ -450,9 +450,9 @@ def test_the_journal_follows_no_link(tmp_path: Path, place: str) -> None:
 
 def test_each_json_file_of_a_session_states_format_and_program(tmp_path: Path) -> None:
     opened = plain.create_session(tmp_path, "night", "ann", "twin", Config(), LOOP)
-    plain.write_session_file(opened.file("applied.json"), {"trial_s": 3.0})
+    plain.write_session_file(opened.file_path("applied.json"), {"trial_s": 3.0})
     for name in ("session.json", "applied.json"):
-        table = json.loads(opened.file(name).read_text())
+        table = json.loads(opened.file_path(name).read_text())
         assert table["schema"] == plain.SCHEMA
         assert stated_program(table) == program_identity()
     assert plain.open_session(opened.path).head == opened.head
@@ -472,7 +472,7 @@ def test_a_gains_file_states_format_and_program(tmp_path: Path) -> None:
 @pytest.mark.parametrize("content", ["{}", "[]", "3", '{"schema": "membrane-live-calibration/1"}'])
 def test_a_session_of_another_format_is_refused(tmp_path: Path, content: str) -> None:
     opened = plain.create_session(tmp_path, "night", "ann", "twin", Config(), LOOP)
-    opened.file("session.json").write_text(content)
+    opened.file_path("session.json").write_text(content)
     with pytest.raises(InputError, match=r"session\.json: damaged"):
         plain.open_session(opened.path)
 
@@ -481,7 +481,7 @@ def test_a_folder_in_place_of_a_result_is_one_line(tmp_path: Path) -> None:
     (tmp_path / "proposal.json").mkdir()
     session = plain.SessionFolder(tmp_path, plain.SessionHead("", "", "", "", LOOP), Config())
     with pytest.raises(InputError, match="cannot be removed"):
-        session.begin("design")
+        session.begin_step("design")
 
 
 def test_nothing_to_roll_back_is_said(tmp_path: Path) -> None:

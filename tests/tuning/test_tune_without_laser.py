@@ -112,12 +112,12 @@ def ticks() -> TicksByFigures:
 
 
 def test_a_tick_waits_for_the_figure_after_it_and_has_what_both_show(ticks: TicksByFigures) -> None:
-    assert ticks.take([row(1.00), row(1.02)], [figure(0.99, 37_100.0)]) == []
-    early, late = ticks.take([row(1.04)], [figure(1.03, 37_104.0)])
+    assert ticks.add_rows([row(1.00), row(1.02)], [figure(0.99, 37_100.0)]) == []
+    early, late = ticks.add_rows([row(1.04)], [figure(1.03, 37_104.0)])
     assert (early.mono_s, late.mono_s) == (1.00, 1.02)
     assert [early.displacement_um, late.displacement_um] == pytest.approx([1.0, 3.0])
     assert [
-        tick.displacement_um for tick in ticks.take([], [figure(1.05, 37_100.0)])
+        tick.displacement_um for tick in ticks.add_rows([], [figure(1.05, 37_100.0)])
     ] == pytest.approx([2.0])
 
 
@@ -132,20 +132,20 @@ def test_a_figure_that_does_not_show_the_mirror_is_not_used(
         "older": [replace(wrong, time_s=0.98)],
         "none": [],
     }[kind]
-    assert ticks.take([row(1.02)], [figure(0.99, 37_100.0), *spoilt]) == []
-    (tick,) = ticks.take([], [figure(1.05, 37_106.0)])
+    assert ticks.add_rows([row(1.02)], [figure(0.99, 37_100.0), *spoilt]) == []
+    (tick,) = ticks.add_rows([], [figure(1.05, 37_106.0)])
     assert tick.displacement_um == pytest.approx(3.0)
 
 
 def test_ticks_that_no_figure_shows_are_lost_readings_and_not_a_straight_line(
     ticks: TicksByFigures,
 ) -> None:
-    taken = ticks.take([row(0.9), row(1.0)], [figure(0.95, 37_100.0)])
+    taken = ticks.add_rows([row(0.9), row(1.0)], [figure(0.95, 37_100.0)])
     assert math.isnan(taken[0].displacement_um)  # before the first figure
-    dark = ticks.take([row(1.0 + 0.02 * n) for n in range(1, 100)], [])
+    dark = ticks.add_rows([row(1.0 + 0.02 * n) for n in range(1, 100)], [])
     assert dark  # nothing waits for ever
     assert all(math.isnan(tick.displacement_um) for tick in dark)
-    rest = ticks.take([row(2.99)], [figure(2.985, 37_100.0), figure(3.035, 37_110.0)])
+    rest = ticks.add_rows([row(2.99)], [figure(2.985, 37_100.0), figure(3.035, 37_110.0)])
     assert [math.isnan(tick.displacement_um) for tick in rest[-2:]] == [True, False]
     assert rest[-1].displacement_um == pytest.approx(1.0)
 
@@ -158,7 +158,7 @@ def test_readings_are_as_far_apart_as_figures_are(
     asked_hz: float, comes_s: float, expected_s: float
 ) -> None:
     ticks = TicksByFigures(by_optics(asked_hz))
-    ticks.take([], [figure(comes_s * n, 37_100.0 + n) for n in range(1, 20)])
+    ticks.add_rows([], [figure(comes_s * n, 37_100.0 + n) for n in range(1, 20)])
     assert ticks.interval_s == pytest.approx(expected_s)
 
 
@@ -180,7 +180,7 @@ def held_std_um(config: Config, plant: ForeignPlant, late_s: float) -> float:
     """Of the true centre in five minutes of hold."""
     link = TwinHold(config, bench=foreign_bench(plant), figures=LateFigures(plant, 5, late_s))
     while link.rows[-1].mono_s < link.rows[0].mono_s + 340.0:
-        link.news()
+        link.read_news()
     return float(
         np.std(
             [tick.truth_displacement_um for tick in link.rows[round(40.0 * config.loop.rate_hz) :]]

@@ -112,7 +112,7 @@ async def test_a_viewer_sees_the_hold_and_pauses_it(tmp_path: Path) -> None:
         )
         await tab.until("document.body.innerText.includes('pause: done')")
         assert [(command.kind, command.why) for command in run.asked] == [("pause", "web: link")]
-        run.port.told(Mark(HOSTILE, "anna"))
+        run.port.note_report(Mark(HOSTILE, "anna"))
         await tab.until("document.body.innerText.includes('onerror')")
         assert await tab.value("document.title") == "membrane_ctrl"
         await tab.screenshot(tmp_path / "page.png")
@@ -267,15 +267,15 @@ async def test_a_candidate_is_chosen_on_the_page(
     (path / "candidates.md").write_text(CANDIDATES)
     progress = Progress()
     progress.log = LiveLog(path, 50.0, print)
-    progress.note("step", "design", planned_s=0.0, after_s=600.0)
-    progress.say("design: K 0.520 1/s, Ti 2.10 s: std 0.210 -> 0.130 µm")
+    progress.log_entry("step", "design", planned_s=0.0, after_s=600.0)
+    progress.print_line("design: K 0.520 1/s, Ti 2.10 s: std 0.210 -> 0.130 µm")
     keyboard, terminal = os.openpty()  # nobody types
     with os.fdopen(keyboard), os.fdopen(terminal) as stdin:
         monkeypatch.setattr(sys, "stdin", stdin)
         async with viewed(tmp_path) as (_, tab):
             names = ("least-variance", "simc-slow")
             asking = asyncio.create_task(
-                asyncio.to_thread(progress.ask, "apply which candidate?", names)
+                asyncio.to_thread(progress.ask_question, "apply which candidate?", names)
             )
             await tab.value(PRESS.format("TUNE"))
             await tab.until("document.body.innerText.includes('0.160 +- 0.009')")

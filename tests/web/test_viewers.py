@@ -114,14 +114,14 @@ def test_the_newest_session_is_followed(tmp_path: Path) -> None:
     assert watch.look() is None
     path = create_session(tmp_path, "first", "eve", "twin", Config(), LoopConfig()).path
     log = LiveLog(path, 50.0, print)
-    log.note("step", "observe", planned_s=60.0, after_s=0.0)
+    log.log_entry("step", "observe", planned_s=60.0, after_s=0.0)
     for number in range(300):
-        log.note("said", f"line {number}")
+        log.log_entry("said", f"line {number}")
     seen = watch.look()
     assert seen is not None
     assert (seen.head, seen.done) == (f"{path.name}: observe", frozenset())
-    log.note("said", "line 300")
-    log.note("asks", "apply which?", among=("calm", "lively"))
+    log.log_entry("said", "line 300")
+    log.log_entry("asks", "apply which?", among=("calm", "lively"))
     (path / "candidates.md").write_text(
         "| candidate | Ms |\n|---|---:|\n| calm | 1.3 |\n| torn\n| lively | 1.6 |\n"
     )
@@ -132,7 +132,7 @@ def test_the_newest_session_is_followed(tmp_path: Path) -> None:
     assert later.head == f"{path.name}: observe, asks: apply which?"
     assert later.done == {"identify"}
     assert later.candidates == (("candidate", "Ms"), ("calm", "1.3"), ("lively", "1.6"))
-    log.note("ended", "stopped")
+    log.log_entry("ended", "stopped")
     second = create_session(tmp_path, "second", "eve", "twin", Config(), LoopConfig()).path
     newest = watch.look()
     assert newest is not None
@@ -154,7 +154,7 @@ def test_an_answer_that_no_session_takes_is_withdrawn(
     log = LiveLog(tmp_path, 50.0, print)
     taken: list[PageAnswer | None] = []
     monkeypatch.setattr(
-        panels.time, "sleep", lambda _: taken.append(log.answer("which?", ("calm",)))
+        panels.time, "sleep", lambda _: taken.append(log.take_answer("which?", ("calm",)))
     )
     assert panels.answered(tmp_path, "which?", given).done
     assert taken == [given]

@@ -49,7 +49,7 @@ async def test_a_hold_is_followed_asked_and_found_again(tmp_path: Path) -> None:
             assert refused.text.startswith(
                 "setpoint refused: setpoint 1e+09 µm is outside the limits"
             )
-            run.port.told(Mark("door <b>opened</b>", "anna"))
+            run.port.note_report(Mark("door <b>opened</b>", "anna"))
             await until(lambda: any("door" in line for line in feed.seen.events))
             assert [text for _, text in feed.marks] == ["door <b>opened</b>"]
         await until(lambda: feed.seen.silent)

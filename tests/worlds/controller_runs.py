@@ -247,7 +247,7 @@ def record_story(story: Story) -> tuple[Ticks, ControllerState]:
             snapshot = take_snapshot(run._supervisor._controller)
             run._supervisor._controller = continue_from(snapshot, config, zernike_projection())
         due = [time_s for time_s in waiting if time_s <= run.now_s + 1e-9]
-        tick = run.tick(tuple(waiting.pop(time_s) for time_s in due))
+        tick = run.run_tick(tuple(waiting.pop(time_s) for time_s in due))
         if tick is not None:
             ticks.append((tick.inputs, tick.outputs))
     return ticks, run._supervisor._controller.memory

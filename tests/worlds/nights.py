@@ -292,8 +292,8 @@ def write_run(folder: Path, parts: Iterator[tuple[Rows, list[ShapeEstimate]]]) -
         for first in range(0, len(rows), minute):
             tables.add_ticks(batch_of(rows[first : first + minute]))
             if first // minute % _SYNC_MINUTES == 0:
-                tables.sync()
-                tables.seal()
+                tables.sync_tables()
+                tables.seal_full_journal()
         for estimate in shapes:
             tables.add_shape(estimate)
         end_s = float(rows[-1, COLUMN["mono_s"]])

@@ -99,7 +99,7 @@ def parts_of(config: Config, duration_s: float, part_s: float) -> Iterator[RunPa
     for place in range(round(duration_s / part_s)):
         made = RunPart()
         for _ in range(round(part_s * config.loop.rate_hz)):
-            tick = run.tick((Command("hold", "benchmark"),) if number == 0 else ())
+            tick = run.run_tick((Command("hold", "benchmark"),) if number == 0 else ())
             if tick is not None:
                 number += 1
                 _take(made, tick, number)

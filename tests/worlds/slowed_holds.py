@@ -113,11 +113,11 @@ async def hold(logs: Path, number: int) -> None:
             PortConfig(),
             listeners,
             run.name,
-            RunHooks(supervisor.ask, supervisor.tell, clock.now, *settings),
+            RunHooks(supervisor.queue_command, supervisor.record_event, clock.now, *settings),
         )
-        wiring.heard = {"control port": port.heard, "noted": noted}
+        wiring.tick_listeners = {"control port": port.handle_tick, "noted": noted}
         await board.open()
-        supervisor.ask(Command("hold", "the test"))
+        supervisor.queue_command(Command("hold", "the test"))
         try:
             async with port.open():
                 exit_ = await supervisor.run(None)

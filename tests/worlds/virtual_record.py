@@ -60,7 +60,7 @@ def run_virtual(
     while run.finished is None:
         if run.now_s + 1.0 / config.loop.rate_hz >= stop_at_s:
             commands, stop_at_s = (*commands, Command("stop", "duration")), float("inf")
-        tick = run.tick(commands)
+        tick = run.run_tick(commands)
         commands = ()
         if tick is not None:
             yield tick
@@ -108,7 +108,7 @@ def batches_of(
                 messages += pack_tick(place, inputs, outputs, outputs.row.pack())
             if inputs.estimate is not None:
                 shapes.append(inputs.estimate)
-        batches.append((assembler.take(messages), shapes))
+        batches.append((assembler.add_messages(messages), shapes))
     return batches
 
 
@@ -119,7 +119,7 @@ def write_tables(folder: Path, batches: list[Batch], close: bool = True) -> None
         for estimate in shapes:
             tables.add_shape(estimate)
         tables.add_ticks(batch)
-        tables.sync()
+        tables.sync_tables()
     if close:
         tables.close()
 

@@ -64,7 +64,7 @@ def choose_candidate(folder: SessionFolder, yes: bool, name: str, progress: Prog
 def _ask_for_candidate(folder: SessionFolder, progress: Progress) -> str | None:
     """Ask until the answer is a candidate that may be applied, or empty."""
     while True:
-        answer = progress.ask(
+        answer = progress.ask_question(
             "apply which candidate? (Enter: none)", design.list_applicable(folder)
         )
         if not answer:
@@ -72,4 +72,4 @@ def _ask_for_candidate(folder: SessionFolder, progress: Progress) -> str | None:
         try:
             return design.find_candidate(folder, answer).name
         except InputError as error:
-            progress.say(str(error))
+            progress.print_line(str(error))

@@ -17,8 +17,8 @@ def compare_sessions(a: SessionFolder, b: SessionFolder) -> str:
     Raises InputError if one of the sessions has no design yet.
     """
     for each in (a, b):
-        each.require("design")
-    files = [gains_file.load_gains(each.file("gains.toml")) for each in (a, b)]
+        each.require_done("design")
+    files = [gains_file.load_gains(each.file_path("gains.toml")) for each in (a, b)]
     return "\n".join([*_plants(a, b, files), "", *_gains(files), "", *_crossed(a, b, files)])
 
 

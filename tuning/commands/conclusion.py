@@ -12,9 +12,9 @@ from tuning.steps import verify
 def conclude(folder: SessionFolder, options: TuneOptions) -> int:
     """Print where the session is, and return the exit code: rejected if its gains were not kept."""
     if options.json:
-        done = [step for step in STEPS if folder.done(step)]
+        done = [step for step in STEPS if folder.is_done(step)]
         print(json.dumps({"session": str(folder.path), "done": done}))
     else:
         print(f"session: {folder.path}", file=sys.stderr)
-    refused = folder.done("verify") and not verify.load_verified(folder).kept
+    refused = folder.is_done("verify") and not verify.load_verified(folder).kept
     return Exit.REJECTED if refused else Exit.DONE

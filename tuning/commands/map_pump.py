@@ -22,10 +22,10 @@ def run_map_pump(options: TuneOptions) -> int:
 def measure_pump(
     folder: SessionFolder, rig: HoldRig, limit_um: float, progress: Progress
 ) -> SessionFolder:
-    progress.begin("pump", PUMP_TYPICAL_S, 0.0)
+    progress.begin_step("pump", PUMP_TYPICAL_S, 0.0)
     mapped, folder = map_pump.map_pump(folder, rig, limit_um)
     found, pump = mapped.found, mapped.found.pump
-    progress.say(
+    progress.print_line(
         f"pump: {len(pump.curve_fraction)} points from {pump.curve_um_per_s[0]:.2f} µm/s at "
         f"{pump.curve_fraction[0]:.3f} to {pump.flow_full_um_per_s:.2f} µm/s at "
         f"{pump.curve_fraction[-1]:.3f}, "
@@ -36,7 +36,7 @@ def measure_pump(
         f"{found.delay_s:.2f} s "
         f"with a lag of {found.lag_s:.2f} s; leak {found.leak_um_per_s:.2f} µm/s"
     )
-    progress.say(
+    progress.print_line(
         f"pump: steps of the flow on this curve give k {mapped.gain:.2f} +- "
         f"{mapped.gain_sigma:.2f}; curve and gains "
         f"({describe_gains(rig.loop)}) stay until the hold ends; `membrane-ctrl tune save "
@@ -44,5 +44,5 @@ def measure_pump(
         "saves them for the next one"
     )
     if found.leak_um_per_s < TOO_TIGHT_UM_PER_S:
-        progress.say(TOO_TIGHT)
+        progress.print_line(TOO_TIGHT)
     return folder

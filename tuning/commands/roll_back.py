@@ -34,7 +34,7 @@ def roll_back(options: TuneOptions) -> int:
     )
     told = journal.make_entry("rolled_back", *told_of)
     journal.append_entry(options.logs, told)
-    progress.say(
+    progress.print_line(
         (
             f"back to the gains before {kept.session}: K {kept.before.kp_per_s:g} 1/s, Ti "
             f"{kept.before.ti_s:g} s"
@@ -44,5 +44,5 @@ def roll_back(options: TuneOptions) -> int:
     for saved in {
         line.reason for line in journal.read_entries(options.logs) if line.what == "saved"
     }:
-        progress.say(f"{saved} was saved with gains of a session: check its [loop]")
+        progress.print_line(f"{saved} was saved with gains of a session: check its [loop]")
     return Exit.DONE

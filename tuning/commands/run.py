@@ -40,15 +40,15 @@ def run_session(options: TuneOptions) -> int:
     choose.require_answer(options.yes, options.choose)
     with connection.open_on_hold(options) as (folder, rig, progress):
         if options.page:
-            progress.say(f"live page: {serve_live_page(folder, options)}session")
+            progress.print_line(f"live page: {serve_live_page(folder, options)}session")
         try:
             _run_steps(
-                [step for step in STEPS if not folder.done(step)], folder, rig, options, progress
+                [step for step in STEPS if not folder.is_done(step)], folder, rig, options, progress
             )
         except characterise.PumpUnknownError as error:
             if map_pump.has_pump_map(folder):
                 raise
-            progress.say(str(error))
+            progress.print_line(str(error))
             folder = measure_pump(folder, rig, options.limit_um, progress)
             _run_steps(list(STEPS), folder, rig, options, progress)
         _note_verified(
@@ -87,13 +87,13 @@ def _run_steps(
             no_gains = _NO_GAINS.format(folder.path)
             if steps == [step]:
                 raise RejectedError(f"{step}: {no_gains}")
-            progress.say(no_gains)
+            progress.print_line(no_gains)
             return
         candidate = ""
         if step == "apply":
             chosen = choose.choose_candidate(folder, options.yes, options.choose, progress)
             if chosen is None:
-                progress.say(
+                progress.print_line(
                     f"nothing is applied; `membrane-ctrl tune apply --session {folder.path}` "
                     "applies a candidate later"
                 )
@@ -117,7 +117,7 @@ def _run_on_hold(
     """Run one step of a session that has a hold; `candidate` is for `apply`."""
 
     def report_stage(stage: Stage) -> None:
-        progress.say(
+        progress.print_line(
             f"  after {stage.time_s:.0f} s: std {stage.std_um:.3f} µm, "
             f"{stage.growth:.2f} of the previous gains"
         )
@@ -150,13 +150,13 @@ def _run_anywhere(step: str, folder: SessionFolder, options: TuneOptions) -> Non
 def _report(step: str, folder: SessionFolder, progress: Progress) -> None:
     """Update the report and print the step's result in one line."""
     page.write_report(folder)
-    progress.say(f"{step}: {_MODULES[step].describe_result(folder)}")
+    progress.print_line(f"{step}: {_MODULES[step].describe_result(folder)}")
 
 
 def _note_verified(folder: SessionFolder, logs: Path, reason: str, again: bool = False) -> None:
     """Note the verification in the journal, unless it is there; `again` if it was repeated."""
     name = folder.path.name
-    if not folder.done("verify"):
+    if not folder.is_done("verify"):
         return
     if not again and any(
         line.session == name and line.shape_s is None for line in journal.read_entries(logs)
@@ -182,4 +182,6 @@ def _announce(progress: Progress, options: TuneOptions, step: str, after: list[s
         "observe": 0.0 if options.short else options.observe_s,
         "verify": SETTLE_LEAST_S + options.verify_s,
     }
-    progress.begin(step, planned.get(step, 0.0), sum(planned.get(later, 0.0) for later in after))
+    progress.begin_step(
+        step, planned.get(step, 0.0), sum(planned.get(later, 0.0) for later in after)
+    )

@@ -33,7 +33,7 @@ def save_to_configuration(path: Path, name: Path | None, logs: Path, author: str
     folder, shape_s = _named(name, logs)
     keys: tuple[str, ...] = GAIN_KEYS
     gains, pump = config.loop, config.pump
-    if shape_s is None or folder.done("verify") or map_pump.has_pump_map(folder):
+    if shape_s is None or folder.is_done("verify") or map_pump.has_pump_map(folder):
         gains, pump = _kept(folder), folder.config.pump
         same = config
         if map_pump.has_pump_map(folder) and config.pump == map_pump.load_pump_map(folder).before:
@@ -121,7 +121,7 @@ def _kept(folder: SessionFolder) -> schema.LoopConfig:
     Raises InputError if there are none, or they were rolled back.
     """
     if map_pump.has_pump_map(folder) and not (
-        folder.done("verify") and verify.load_verified(folder).kept
+        folder.is_done("verify") and verify.load_verified(folder).kept
     ):
         return folder.head.before
     done = verify.load_verified(folder)

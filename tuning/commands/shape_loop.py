@@ -26,7 +26,9 @@ def tune_shape_loop(options: TuneOptions) -> int:
         progress,
     ):
         before_s = folder.config.shape.time_constant_s
-        progress.begin("shape loop", shape_loop_fit.TYPICAL_S + options.observe_s, options.verify_s)
+        progress.begin_step(
+            "shape loop", shape_loop_fit.TYPICAL_S + options.observe_s, options.verify_s
+        )
         rig.hold(options.observe_s)
         steady = [shape for shape in rig.shapes if shape.verdict != "rejected"]
         levels = shape_loop_fit.run_step_experiment(rig)
@@ -34,8 +36,8 @@ def tune_shape_loop(options: TuneOptions) -> int:
             found = shape_loop_fit.fit_shape_loop(levels, steady, assumed)
         except ValueError as error:
             raise RejectedError(f"shape loop: {error}") from None
-        plain.write_session_file(folder.file("outer.json"), found)
-        progress.say(
+        plain.write_session_file(folder.file_path("outer.json"), found)
+        progress.print_line(
             f"optical sag per µm of the laser {found.scale:.3f}, noise {found.sigma_um:.2f} "
             "µm per cycle of "
             f"{found.cycle_s:.1f} s, drift {'' if found.drift_seen else 'below '}"
@@ -50,7 +52,7 @@ def tune_shape_loop(options: TuneOptions) -> int:
             progress,
         ):
             return conclude(folder, options)
-        progress.begin("trial of the time constant", options.verify_s, 0.0)
+        progress.begin_step("trial of the time constant", options.verify_s, 0.0)
         earlier = [*steady, *(shape for level in levels for shape in level)]
         times_s = (before_s, found.time_constant_s)
         done = shape_loop_trial.try_time_constant(rig, times_s, earlier, assumed, options.verify_s)
@@ -65,8 +67,8 @@ def tune_shape_loop(options: TuneOptions) -> int:
             times_s,
         )
         journal.append_entry(options.logs, journal.make_entry(what, *told_of))
-        plain.write_session_file(folder.file("outer_verified.json"), done)
-        progress.say(
+        plain.write_session_file(folder.file_path("outer_verified.json"), done)
+        progress.print_line(
             f"taken back: {done.reason}"
             if done.reason
             else f"kept until the hold ends: the next shape is predicted to {done.error_um:.2f} "
@@ -95,8 +97,12 @@ def _to_be_tried(
     if unfit:
         raise RejectedError(f"shape loop: {unfit}")
     if abs(after_s / before_s - 1) < 0.1:
-        progress.say(f"the present time constant, {before_s:.0f} s, fits")
+        progress.print_line(f"the present time constant, {before_s:.0f} s, fits")
         return False
     asked = not options.yes and sys.stdin.isatty()
-    answer = progress.ask(f"try it instead of {before_s:.0f} s? [y/N]", ("yes",)) if asked else ""
+    answer = (
+        progress.ask_question(f"try it instead of {before_s:.0f} s? [y/N]", ("yes",))
+        if asked
+        else ""
+    )
     return options.yes or answer.lower() in ("y", "yes")

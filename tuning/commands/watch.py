@@ -15,12 +15,12 @@ def watch_hold(options: TuneOptions) -> int:
     from tuning.proposal.loop_health import judge_health
 
     folder = connection.find_session(options, None)
-    folder.require("design")
-    made = gains_file.load_gains(folder.file("gains.toml"))
+    folder.require_done("design")
+    made = gains_file.load_gains(folder.file_path("gains.toml"))
     with connection.connect_to_hold(options) as link:
         progress = Progress()
         rig = HoldRig(link, options.author, progress)
-        progress.begin("watch", options.observe_s, 0.0)
+        progress.begin_step("watch", options.observe_s, 0.0)
         try:
             found = judge_health(*rig.hold_about(options.observe_s), rig.loop, made)
         except HoldError as error:
@@ -29,11 +29,11 @@ def watch_hold(options: TuneOptions) -> int:
             raise InputError(f"watch: {error}") from None
     if options.json:
         print(json.dumps(plain.to_plain(found)))
-    progress.say(
+    progress.print_line(
         f"std {found.std_um:.3f} µm, {found.ratio:.2f} of the lower bound "
         f"({found.ratio_designed:.2f} expected); "
         f"k {found.gain:.2f} +- {found.gain_sigma:.2f}; leak {found.leak_um_per_s:.2f} µm/s"
     )
     for suggestion in found.suggestions:
-        progress.say(f"a tuning session is due: {suggestion}")
+        progress.print_line(f"a tuning session is due: {suggestion}")
     return Exit.REJECTED if found.suggestions else Exit.DONE

@@ -57,8 +57,8 @@ def of_session(opened: folder.SessionFolder) -> Workpiece:
         observe.load_disturbance(opened),
     )
     proposed = None
-    if opened.done("design"):
-        proposed = closed_loop.Gains.of(gains_file.load_gains(opened.file("gains.toml")).loop)
+    if opened.is_done("design"):
+        proposed = closed_loop.Gains.of(gains_file.load_gains(opened.file_path("gains.toml")).loop)
     source = f"Plant and weather of the session {opened.path.name}."
     return Workpiece(source, model, weather, opened.head.before, proposed, opened)
 

@@ -89,7 +89,7 @@ class LivePage:
 
     def _look(self) -> None:
         """Take what is new into the page."""
-        points = self._log.read()
+        points = self._log.read_new()
         if points["time_s"]:
             minutes = [at_s / 60 for at_s in points["time_s"]]
             self._points.stream({"minutes": minutes, **{name: points[name] for name in _COLOURS}})
@@ -102,7 +102,7 @@ class LivePage:
                 "minutes": minutes,
                 "step": list(begun.values()),
             }
-        done = {step for step in folder.STEPS if self._session.done(step)}
+        done = {step for step in folder.STEPS if self._session.is_done(step)}
         silent_s = time.time() - _changed_s(self._session.path / live_log.NAME)
         self._now.text = html.escape(status(progress, done, silent_s, self._session.path))
         self._steps.text = _STYLE + _step_list(progress, done)

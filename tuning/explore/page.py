@@ -339,7 +339,7 @@ def saver(of: Workpiece, author: str) -> Save | None:
         return None
 
     def save(gains: closed_loop.Gains) -> str:
-        path = opened.file("gains.toml")
+        path = opened.file_path("gains.toml")
         try:
             loop = gains.applied_to(gains_file.load_gains(path).loop)
             found = candidate.evaluate_candidate(
@@ -354,7 +354,7 @@ def saver(of: Workpiece, author: str) -> Save | None:
             }
             made = gains_file.load_gains(path).model_copy(update=edits)
             gains_file.require_sound(made, "these gains", opened.config.loop)
-            opened.begin("preview")  # what followed was of other gains
+            opened.begin_step("preview")  # what followed was of other gains
             gains_file.save_gains(path, made)
         except (ValueError, errors.InputError) as error:
             return f"Not saved: {str(error).splitlines()[0]}"

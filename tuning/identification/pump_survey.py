@@ -65,7 +65,7 @@ _FIRST_PULSES_S = (0.3, 0.6, 1.2, 2.4, 2.4, 2.4, 2.4)
 
 @dataclass
 class PumpSurvey:
-    """The rounds of a survey, as a step machine: `steps` to give, `take` what came of them.
+    """The rounds of a survey, as a step machine: `steps` to give, `add_run` what came of them.
 
     Attributes
     ----------
@@ -92,7 +92,7 @@ class PumpSurvey:
         """Of all experiments so far."""
         return sum(run.dt_s * run.fraction.size for run in self.runs)
 
-    def take(self, run: PumpRun, completed: bool) -> None:
+    def add_run(self, run: PumpRun, completed: bool) -> None:
         """Learn from a run; one that its guard stopped counts as well, and the next ones go less
         far.
         """

@@ -88,6 +88,6 @@ def _predicted(times_s: Series, gaps_um: Series, memory_s: float, last: int) -> 
     for time_s, gap_um in zip(
         times_s[1:].tolist(), (gaps_um[1:] - gaps_um[0]).tolist(), strict=True
     ):
-        errors_um.append(gap_um - tracker.at(time_s, memory_s))
-        tracker.take(gap_um, time_s, memory_s)
+        errors_um.append(gap_um - tracker.drift_at(time_s, memory_s))
+        tracker.add_reading(gap_um, time_s, memory_s)
     return float(np.sqrt(np.mean(np.square(errors_um[-last:])))) if last else math.nan

@@ -18,8 +18,8 @@ def make_table(heads: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
 
 def embed_picture(folder: SessionFolder, name: str) -> str:
     """Return a picture of the session as an element of the page; empty if it is missing."""
-    path = folder.file(name)
+    path = folder.file_path(name)
     if not path.exists():
         return ""
-    data = base64.b64encode(folder.content(name)).decode()
+    data = base64.b64encode(folder.read_content(name)).decode()
     return f'<img alt="{path.stem}" src="data:image/png;base64,{data}">'

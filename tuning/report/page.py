@@ -21,7 +21,7 @@ def write_report(folder: SessionFolder) -> Path:
     """Draw the finished steps, write `report.html` and return its path."""
     draw_pictures(folder)
     head = folder.head
-    done = [step for step in STEPS if folder.done(step)]
+    done = [step for step in STEPS if folder.is_done(step)]
     parts = [
         f"<h1>Tuning session {html.escape(head.name)}</h1>",
         f"<p>{html.escape(head.author)}, {head.created_utc}, on {html.escape(head.source)}; "
@@ -32,7 +32,7 @@ def write_report(folder: SessionFolder) -> Path:
         *preview.make_report_part(folder),
         *verify.make_report_part(folder),
     ]
-    path = folder.file("report.html")
+    path = folder.file_path("report.html")
     text = (
         "<!doctype html><meta charset=utf-8>"
         f"<title>{html.escape(head.name)}</title><style>{_STYLE}</style>"

@@ -19,9 +19,9 @@ def save_figure(path: Path, figure: Figure) -> None:
 
 def is_outdated(folder: SessionFolder, picture: str, *steps: str) -> bool:
     """Whether the picture is no file, or older than a result of one of the steps."""
-    path = folder.file(picture)
+    path = folder.file_path(picture)
     if path.is_symlink() or not path.is_file():
         return True
-    results = [folder.file(name) for step in steps for name in FILES[step]]
+    results = [folder.file_path(name) for step in steps for name in FILES[step]]
     newest_ns = max(each.stat().st_mtime_ns for each in results if each.exists())
     return newest_ns >= path.stat().st_mtime_ns

@@ -17,16 +17,16 @@ _TIMELINE = "session_time"
 def write_recording(folder: SessionFolder) -> None:
     """Write `session.rrd` with the steps done so far."""
     stream = rr.RecordingStream("membrane_ctrl_tune", recording_id=folder.path.name)
-    path = resolve_user_path(folder.file("session.rrd"))
+    path = resolve_user_path(folder.file_path("session.rrd"))
     part = path.with_name(f".{path.name}.part")
     part.unlink(missing_ok=True)
     stream.save(part, default_blueprint=_blueprint())
-    if folder.done("characterise"):
+    if folder.is_done("characterise"):
         _experiments(stream, folder)
-    if folder.done("observe"):
-        _record(stream, "before", record_file.load_record(folder.file("quiet.npz")))
-    if folder.done("design"):
-        markdown = folder.candidates()
+    if folder.is_done("observe"):
+        _record(stream, "before", record_file.load_record(folder.file_path("quiet.npz")))
+    if folder.is_done("design"):
+        markdown = folder.read_candidates()
         stream.log(
             "candidates/table", rr.TextDocument(markdown, media_type="text/markdown"), static=True
         )
@@ -34,8 +34,8 @@ def write_recording(folder: SessionFolder) -> None:
         stds = [row.predicted.std_um for row in rows if row.predicted is not None]
         stream.log("candidates/std_um", rr.BarChart(stds), static=True)
         stream.log("candidates/ms", rr.BarChart([row.margins.ms for row in rows]), static=True)
-    if folder.file("verify.npz").exists():
-        _record(stream, "after", record_file.load_record(folder.file("verify.npz")))
+    if folder.file_path("verify.npz").exists():
+        _record(stream, "after", record_file.load_record(folder.file_path("verify.npz")))
     stream.flush()
     stream.disconnect()
     move_file(part, path)
@@ -44,7 +44,7 @@ def write_recording(folder: SessionFolder) -> None:
 def _experiments(stream: rr.RecordingStream, folder: SessionFolder) -> None:
     record = characterise.load_experiments(folder).record
     _record(stream, "experiment", record)
-    if not folder.done("identify"):
+    if not folder.is_done("identify"):
         return
     found = identify.load_identified(folder).identified
     time_s = np.arange(len(record)) * record.dt_s

@@ -65,9 +65,9 @@ class Rig:
         while True:
             wanted = guard.step(self._last, self.dt_s)
             if isinstance(wanted, experiment.Finished):
-                self._loop.resume(self._given(0.0), holding_flow_um_per_s, self.dt_s)
+                self._loop.resume_at_mean(self._given(0.0), holding_flow_um_per_s, self.dt_s)
                 return Record.from_samples(self.dt_s, flows, samples), wanted
-            out = self._loop.follow(self._given(0.0), wanted, self.dt_s)
+            out = self._loop.follow_flow(self._given(0.0), wanted, self.dt_s)
             flows.append(out.flow_um_per_s)
             samples.append(self._last)
             self._last = self._bench.exchange(out.pump_fraction, self._config.bleed_fraction)

@@ -85,7 +85,9 @@ class HoldRig:
     ) -> tuple[list[telemetry.TelemetryRow], experiment.Finished]:
         """As `perform`, with the ticks instead of a record."""
         self._events.clear()
-        self._link.ask(Command("tune", self._who, f"tuning session: {spec.kind}", experiment=spec))
+        self._link.send_command(
+            Command("tune", self._who, f"tuning session: {spec.kind}", experiment=spec)
+        )
         rows: list[telemetry.TelemetryRow] = []
         begun = False
         while not begun or rows[-1].state == telemetry.State.TUNE:
@@ -113,12 +115,12 @@ class HoldRig:
         told = Command(
             "gains", self._who, why, trial_s, loop=loop, shape_time_constant_s=shape_s, pump=pump
         )
-        self._link.ask(replace(told, setpoint_step_um=setpoint_step_um))
+        self._link.send_command(replace(told, setpoint_step_um=setpoint_step_um))
         self.loop, self.pump = loop, pump or self.pump
 
     def keep(self) -> None:
         """Keep the gains that are on trial."""
-        self._link.ask(Command("keep", self._who, "verified"))
+        self._link.send_command(Command("keep", self._who, "verified"))
 
     def go_back(self) -> None:
         """End any running experiment and set the last good gains and curve."""
@@ -133,7 +135,7 @@ class HoldRig:
         self._take()
         if self._state != telemetry.State.TUNE:
             return
-        self._link.ask(Command("hold", self._who, "tuning session interrupted"))
+        self._link.send_command(Command("hold", self._who, "tuning session interrupted"))
         while not self._rows or self._rows[-1].state == telemetry.State.TUNE:
             self._rows.clear()
             self._take()
@@ -205,10 +207,10 @@ class HoldRig:
         return self._rows.popleft()
 
     def _take(self) -> None:
-        news = self._link.news()
+        news = self._link.read_news()
         self._state = news.rows[-1].state if news.rows else self._state
         self._rows.extend(
-            news.rows if self._figures is None else self._figures.take(news.rows, news.shapes)
+            news.rows if self._figures is None else self._figures.add_rows(news.rows, news.shapes)
         )
         self._events.extend(news.events)
         self.shapes += news.shapes

@@ -36,7 +36,7 @@ class TicksByFigures:
         """Time between figures: as asked for, or the median so far if that is longer."""
         return max(self._asked_s, float(np.median(self._intervals_s)) if self._intervals_s else 0.0)
 
-    def take(
+    def add_rows(
         self, rows: Sequence[telemetry.TelemetryRow], shapes: Sequence[shape_estimate.ShapeEstimate]
     ) -> list[telemetry.TelemetryRow]:
         """Return the ticks that are complete, of these and earlier ones; NaN where no figure shows

@@ -14,8 +14,8 @@ _APPLY_S = 900.0
 
 def load_checked_gains(session: folder.SessionFolder) -> schema.LoopConfig:
     """The session's gains for its hold. Raises InputError if they must not be applied."""
-    session.require("design")
-    path = session.file("gains.toml")
+    session.require_done("design")
+    path = session.file_path("gains.toml")
     gains = load_gains(path)
     require_sound(gains, str(path), session.config.loop)
     return adapt_to_hold(gains.loop, session.head.before)
@@ -29,7 +29,7 @@ def select_candidate(session: folder.SessionFolder, name: str) -> None:
     selected = design.find_candidate(session, name)
     assert selected.predicted is not None  # else refused
     _, present_choice = design.load_candidates(session)
-    path = session.file("gains.toml")
+    path = session.file_path("gains.toml")
     gains = load_gains(path)
     update = {
         "candidate": selected.name,
@@ -37,7 +37,7 @@ def select_candidate(session: folder.SessionFolder, name: str) -> None:
         "loop": selected.gains.applied_to(gains.loop),
     }
     save_gains(path, gains.model_copy(update=update))
-    if selected.name != present_choice.name and session.done("preview"):
+    if selected.name != present_choice.name and session.is_done("preview"):
         run_preview(session)
 
 
@@ -69,14 +69,16 @@ def run_apply(
         select_candidate(session, candidate)
     rig.catch_up()  # the ticks until now are of no step: a person was choosing
     loop = load_checked_gains(session)
-    session.begin("apply")
+    session.begin_step("apply")
     rig.set_gains(loop, f"session {session.path.name}", _APPLY_S)
-    folder.write_session_file(session.file("applied.json"), {"trial_s": _APPLY_S, "loop": loop})
+    folder.write_session_file(
+        session.file_path("applied.json"), {"trial_s": _APPLY_S, "loop": loop}
+    )
     return loop
 
 
 def describe_result(session: folder.SessionFolder) -> str:
     """The gains on trial in one line."""
-    loop = load_gains(session.file("gains.toml")).loop
+    loop = load_gains(session.file_path("gains.toml")).loop
     name = design.compare_with_present(session).candidate
     return f"{name} is on trial: {describe_gains(loop)}"

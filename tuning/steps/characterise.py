@@ -37,7 +37,7 @@ def run_characterise(
 
     It is a PumpUnknownError if the pump's curve may be the cause.
     """
-    session.begin("characterise")
+    session.begin_step("characterise")
     try:
         done = experiments.run_experiments(rig, limit_um, plan)
     except experiments.ExperimentError as error:
@@ -45,18 +45,18 @@ def run_characterise(
         raise kind(f"characterise: {error}") from None
     except ValueError as error:
         raise PumpUnknownError(f"characterise: {error}") from None
-    record_file.save_record(session.file("experiments.npz"), done.record)
+    record_file.save_record(session.file_path("experiments.npz"), done.record)
     if plan is experiments.SHORT and done.held is not None:
-        record_file.save_record(session.file(HELD_RECORD), done.held)
+        record_file.save_record(session.file_path(HELD_RECORD), done.held)
     head = ExperimentsHead(done.around, done.relays_s, done.pulses_s, done.finished)
-    folder.write_session_file(session.file("experiments.json"), head)
+    folder.write_session_file(session.file_path("experiments.json"), head)
     return done
 
 
 def load_experiments(session: folder.SessionFolder) -> experiments.Experiments:
     """Results of the experiments."""
-    head = session.result("characterise", "experiments.json", ExperimentsHead)
-    record = record_file.load_record(session.file("experiments.npz"))
+    head = session.read_result("characterise", "experiments.json", ExperimentsHead)
+    record = record_file.load_record(session.file_path("experiments.npz"))
     return experiments.Experiments(head.around, record, head.relays_s, head.pulses_s, head.finished)
 
 

@@ -46,7 +46,7 @@ def run_design(session: folder.SessionFolder, reason: str = "tuning session") ->
     proposal.
     """
     found, disturbance = load_identified(session), load_disturbance(session)
-    session.begin("design")
+    session.begin_step("design")
     before = session.head.before
     try:
         made = design.propose_gains(
@@ -71,18 +71,18 @@ def run_design(session: folder.SessionFolder, reason: str = "tuning session") ->
         loop=made.loop,
     )
     files.write_text_atomic(
-        files.resolve_user_path(session.file("candidates.md")),
+        files.resolve_user_path(session.file_path("candidates.md")),
         candidate_table.format_markdown(made.candidates) + "\n",
     )
     kept = Design(made.candidates, made.least_std_um, made.preview, made.robustness)
-    folder.write_session_file(session.file("proposal.json"), kept)
-    save_gains(session.file("gains.toml"), gains)
+    folder.write_session_file(session.file_path("proposal.json"), kept)
+    save_gains(session.file_path("gains.toml"), gains)
     return gains
 
 
 def load_design(session: folder.SessionFolder) -> Design:
     """The candidates."""
-    return session.result("design", "proposal.json", Design)
+    return session.read_result("design", "proposal.json", Design)
 
 
 def load_candidates(
@@ -91,7 +91,7 @@ def load_candidates(
     """The candidates, and the one in `gains.toml`, which is a further one if that was edited by
     hand.
     """
-    rows, loop = load_design(session).candidates, load_gains(session.file("gains.toml")).loop
+    rows, loop = load_design(session).candidates, load_gains(session.file_path("gains.toml")).loop
     gains = closed_loop.Gains.of(loop)
     for row in rows:
         if row.gains == gains:
@@ -141,7 +141,7 @@ def compare_with_present(session: folder.SessionFolder) -> Traded:
 
 def describe_result(session: folder.SessionFolder) -> str:
     """The gains in `gains.toml` in one line."""
-    gains = load_gains(session.file("gains.toml"))
+    gains = load_gains(session.file_path("gains.toml"))
     ratio = gains.predicted_std_um / gains.least_std_um
     return (
         f"{describe_gains(gains.loop)}: {compare_with_present(session)}; "
@@ -151,14 +151,14 @@ def describe_result(session: folder.SessionFolder) -> str:
 
 def make_report_part(session: folder.SessionFolder) -> list[str]:
     """The candidates, for the report."""
-    if not session.done("design"):
+    if not session.is_done("design"):
         return []
     kept = load_design(session)
-    gains = load_gains(session.file("gains.toml"))
+    gains = load_gains(session.file_path("gains.toml"))
     loop = gains.loop
     traded = compare_with_present(session)
     by = "chosen" if gains.candidate else "proposed"
-    lines = session.candidates().splitlines()
+    lines = session.read_candidates().splitlines()
     cells = [[cell.strip() for cell in line.strip("|").split("|")] for line in lines]
     return [
         "<h2>Candidates</h2>",
@@ -175,10 +175,12 @@ def make_report_part(session: folder.SessionFolder) -> list[str]:
 
 def draw_picture(session: folder.SessionFolder) -> None:
     """Draw the candidates side by side, unless the picture is up to date."""
-    if session.done("design") and is_outdated(session, _PICTURE, "identify", "observe", "design"):
+    if session.is_done("design") and is_outdated(
+        session, _PICTURE, "identify", "observe", "design"
+    ):
         model = load_identified(session).identified.model
         dt_s = load_quiet_record(session).dt_s
-        _draw_candidates(session.file(_PICTURE), load_design(session), model, dt_s)
+        _draw_candidates(session.file_path(_PICTURE), load_design(session), model, dt_s)
 
 
 def _draw_candidates(path: Path, kept: Design, model: plant_model.PlantModel, dt_s: float) -> None:

@@ -32,19 +32,19 @@ class IdentifiedPlant:
 def run_identify(session: folder.SessionFolder) -> IdentifiedPlant:
     """Fit the model and judge it; a refused fit is kept too, for the report."""
     done = load_experiments(session)
-    session.begin("identify")
+    session.begin_step("identify")
     try:
         all_of_it = experiments.fit_experiments(done)
     except ValueError as error:
         raise errors.RejectedError(f"identify: {error}") from None
     found = IdentifiedPlant(all_of_it.identified, all_of_it.quality, done.record.sha256())
-    folder.write_session_file(session.file("identified.json"), found)
+    folder.write_session_file(session.file_path("identified.json"), found)
     return found
 
 
 def load_identified(session: folder.SessionFolder) -> IdentifiedPlant:
     """The identified plant. Raises InputError also if it comes from other data."""
-    found = session.result("identify", "identified.json", IdentifiedPlant)
+    found = session.read_result("identify", "identified.json", IdentifiedPlant)
     record = load_experiments(session).record
     steps = len(record) - 1
     if found.data_sha256 != record.sha256() or found.identified.residual_um.shape != (steps,):
@@ -79,7 +79,7 @@ def describe_result(session: folder.SessionFolder) -> str:
 def make_report_part(session: folder.SessionFolder) -> list[str]:
     """Experiments and fit, for the report; the experiments alone before they are fitted."""
     parts = ["<h2>Experiments and fit</h2>", embed_picture(session, _PICTURE)]
-    if not session.done("identify"):
+    if not session.is_done("identify"):
         return parts
     found = load_identified(session)
     fit = found.identified
@@ -105,9 +105,11 @@ def make_report_part(session: folder.SessionFolder) -> list[str]:
 
 def draw_picture(session: folder.SessionFolder) -> None:
     """Draw the experiments and, once fitted, the model's response, unless they are up to date."""
-    if session.done("characterise") and is_outdated(session, _PICTURE, "characterise", "identify"):
-        fit = load_identified(session).identified if session.done("identify") else None
-        _draw_experiments(session.file(_PICTURE), load_experiments(session).record, fit)
+    if session.is_done("characterise") and is_outdated(
+        session, _PICTURE, "characterise", "identify"
+    ):
+        fit = load_identified(session).identified if session.is_done("identify") else None
+        _draw_experiments(session.file_path(_PICTURE), load_experiments(session).record, fit)
 
 
 def _draw_experiments(path: Path, record: Record, found: plant_fit.Identified | None) -> None:

@@ -64,12 +64,12 @@ class MappedPump:
 
 def has_pump_map(session: folder.SessionFolder) -> bool:
     """Whether the session is based on a curve that it has measured."""
-    return session.file("pump_map.json").exists()
+    return session.file_path("pump_map.json").exists()
 
 
 def load_pump_map(session: folder.SessionFolder) -> MappedPump:
     """Result of the pump map."""
-    return folder.read_session_file(session.file("pump_map.json"), MappedPump)
+    return folder.read_session_file(session.file_path("pump_map.json"), MappedPump)
 
 
 def map_pump(
@@ -97,7 +97,7 @@ def map_pump(
     rig.good = loop, found.pump
     session = folder.based_on(session, loop, found.pump)
     done = MappedPump(found, before, gain, sigma)
-    folder.write_session_file(session.file("pump_map.json"), done)
+    folder.write_session_file(session.file_path("pump_map.json"), done)
     return done, session
 
 
@@ -133,7 +133,7 @@ def _surveyed(rig: HoldRig, limit_um: float) -> pump_map.PumpMap:
         spec = experiments.make_spec("pump_map", around, 600.0).model_copy(update={"steps": steps})
         rows, finished = rig.performed(spec)
         run = make_pump_run(rows, rig.dt_s)
-        survey.take(run, finished.completed)
+        survey.add_run(run, finished.completed)
         if survey.dark >= _DARK_MOST:
             raise ValueError(finished.reason)
         with contextlib.suppress(ValueError):  # none yet

@@ -29,26 +29,26 @@ def run_observe(
     weather.
     """
     model = load_identified(session).identified.model
-    session.begin("observe")
-    held = session.file(HELD_RECORD)
+    session.begin_step("observe")
+    held = session.file_path(HELD_RECORD)
     record = record_file.load_record(held) if held.exists() else rig.hold(duration_s)
     try:
         disturbance = observe_disturbance(record, model, rig.loop)
     except ValueError as error:
         raise errors.RejectedError(f"observe: {error}") from None
-    record_file.save_record(session.file("quiet.npz"), record)
-    folder.write_session_file(session.file("disturbance.json"), disturbance)
+    record_file.save_record(session.file_path("quiet.npz"), record)
+    folder.write_session_file(session.file_path("disturbance.json"), disturbance)
     return disturbance
 
 
 def load_disturbance(session: folder.SessionFolder) -> DisturbanceModel:
     """The observed disturbance."""
-    return session.result("observe", "disturbance.json", DisturbanceModel)
+    return session.read_result("observe", "disturbance.json", DisturbanceModel)
 
 
 def load_quiet_record(session: folder.SessionFolder) -> Record:
     """The record of the quiet hold."""
-    return record_file.load_record(session.file("quiet.npz"))
+    return record_file.load_record(session.file_path("quiet.npz"))
 
 
 def describe_result(session: folder.SessionFolder) -> str:
@@ -63,7 +63,7 @@ def describe_result(session: folder.SessionFolder) -> str:
 
 def make_report_part(session: folder.SessionFolder) -> list[str]:
     """The weather, for the report."""
-    if not session.done("observe"):
+    if not session.is_done("observe"):
         return []
     weather = load_disturbance(session)
     return [
@@ -76,10 +76,10 @@ def make_report_part(session: folder.SessionFolder) -> list[str]:
 
 def draw_picture(session: folder.SessionFolder) -> None:
     """Draw the spectrum of the quiet hold, unless it is up to date."""
-    if session.done("observe") and is_outdated(session, _PICTURE, "identify", "observe"):
+    if session.is_done("observe") and is_outdated(session, _PICTURE, "identify", "observe"):
         model = load_identified(session).identified.model
         quiet = load_quiet_record(session)
-        _draw_weather(session.file(_PICTURE), quiet, model, load_disturbance(session))
+        _draw_weather(session.file_path(_PICTURE), quiet, model, load_disturbance(session))
 
 
 def _draw_weather(

@@ -25,10 +25,10 @@ def run_preview(session: folder.SessionFolder) -> Previewed:
     """Simulate present and proposed gains on the fitted twin with its one-sided pump, for several
     weather seeds.
     """
-    session.require("design")
+    session.require_done("design")
     found, disturbance = load_identified(session), load_disturbance(session)
-    gains = load_gains(session.file("gains.toml"))
-    session.begin("preview")
+    gains = load_gains(session.file_path("gains.toml"))
+    session.begin_step("preview")
     pump, model = session.config.pump, found.identified.model
     present, proposed = (
         tuple(
@@ -38,13 +38,13 @@ def run_preview(session: folder.SessionFolder) -> Previewed:
         for loop in (session.head.before, gains.loop)
     )
     done = Previewed(present, proposed)
-    folder.write_session_file(session.file("preview.json"), done)
+    folder.write_session_file(session.file_path("preview.json"), done)
     return done
 
 
 def load_preview(session: folder.SessionFolder) -> Previewed:
     """Result of the preview."""
-    return session.result("preview", "preview.json", Previewed)
+    return session.read_result("preview", "preview.json", Previewed)
 
 
 def describe_result(session: folder.SessionFolder) -> str:
@@ -64,7 +64,7 @@ def describe_result(session: folder.SessionFolder) -> str:
 
 def make_report_part(session: folder.SessionFolder) -> list[str]:
     """The preview, for the report."""
-    if not session.done("preview"):
+    if not session.is_done("preview"):
         return []
     done = load_preview(session)
     rows = [

@@ -48,10 +48,12 @@ def run_verify(
     """Hold with the new gains and judge them in stages; keep them,
     or restore the old ones at once.
     """
-    session.require("apply")
+    session.require_done("apply")
     after, before = load_checked_gains(session), session.head.before
-    accepted = load_gains(session.file("gains.toml")).candidate == load_candidates(session)[1].name
-    session.begin("verify")
+    accepted = (
+        load_gains(session.file_path("gains.toml")).candidate == load_candidates(session)[1].name
+    )
+    session.begin_step("verify")
     model, weather = load_identified(session).identified.model, load_disturbance(session)
     trial = verification.VerificationTrial(model, weather, before, after, accepted, rig.pump)
     trial_s = verification.settling_time_s(after) + 2 * stages[-1][0] + _SPARE_S
@@ -83,14 +85,14 @@ def run_verify(
         rig.keep()
     done = Verified(not reason, reason, tuple(looks), before, after)
     if record is not None:
-        record_file.save_record(session.file("verify.npz"), record)
-    folder.write_session_file(session.file("verified.json"), done)
+        record_file.save_record(session.file_path("verify.npz"), record)
+    folder.write_session_file(session.file_path("verified.json"), done)
     return done
 
 
 def load_verified(session: folder.SessionFolder) -> Verified:
     """Result of the verification."""
-    return session.result("verify", "verified.json", Verified)
+    return session.read_result("verify", "verified.json", Verified)
 
 
 def describe_result(session: folder.SessionFolder) -> str:
@@ -106,7 +108,7 @@ def describe_result(session: folder.SessionFolder) -> str:
 
 def make_report_part(session: folder.SessionFolder) -> list[str]:
     """The verification, for the report."""
-    if not session.done("verify"):
+    if not session.is_done("verify"):
         return []
     done = load_verified(session)
     verdict = "kept" if done.kept else f"reverted: {done.reason}"
@@ -132,12 +134,16 @@ def make_report_part(session: folder.SessionFolder) -> list[str]:
 
 def draw_picture(session: folder.SessionFolder) -> None:
     """Draw the spectra before and after, and each stage, unless the picture is up to date."""
-    if session.done("verify") and is_outdated(session, _PICTURE, "identify", "observe", "verify"):
-        path = session.file("verify.npz")
+    if session.is_done("verify") and is_outdated(
+        session, _PICTURE, "identify", "observe", "verify"
+    ):
+        path = session.file_path("verify.npz")
         after = record_file.load_record(path) if path.exists() else None
         before = load_quiet_record(session)
         model = load_identified(session).identified.model
-        _draw_verification(session.file(_PICTURE), before, after, model, load_verified(session))
+        _draw_verification(
+            session.file_path(_PICTURE), before, after, model, load_verified(session)
+        )
 
 
 def _draw_verification(

@@ -149,7 +149,7 @@ class _Piece:
         # Interpolated between the bands in the logarithms of frequency and power.
         log_alias = np.log(np.maximum(self.alias_hz, slowest_hz))
         columns = [np.interp(log_alias, middles, column) for column in logs.T]
-        return np.exp(np.column_stack(columns))
+        return np.asarray(np.exp(np.column_stack(columns)))
 
     def without(self, terms_um: FloatArray, frequency_hz: float, shapes: FloatArray) -> FloatArray:
         """The terms (n, terms - 1) without the oscillations about a frequency that the projection

@@ -390,7 +390,7 @@ def _draw_drift(plot: Any, shape: shape_review.ShapeReview) -> None:
     noll = zernike_terms.NOLL_INDICES[1:]
     rate = np.array([term.per_hour for term in shape.drift_um_per_hour])
     reach = np.array([(term.high - term.low) / 2 for term in shape.drift_um_per_hour])
-    colours = [RED if term.significant else GREY for term in shape.drift_um_per_hour]
+    colours = [RED if term.is_significant else GREY for term in shape.drift_um_per_hour]
     if np.isfinite(rate).any():
         plot.bar(noll, rate, yerr=reach, color=colours, error_kw={"lw": 0.7, "ecolor": "#555"})
         # a wandering term with a meaningless interval would hide all the others

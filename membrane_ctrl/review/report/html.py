@@ -233,7 +233,8 @@ def _render_pump(analysis: Analysis) -> str:
         ),
         (
             "lateness",
-            f"p50 {format_number(late.quantile(0.5))}, p99 {format_number(late.quantile(0.99))}, "
+            f"p50 {format_number(late.find_quantile(0.5))}, "
+            f"p99 {format_number(late.find_quantile(0.99))}, "
             f"maximum {format_number(late.largest)} ms; {ticks.missed_ticks} ticks missed",
         ),
     ]
@@ -268,7 +269,7 @@ def _render_shape(shape: shape_review.ShapeReview) -> str:
     drifting = [
         f"Z{j} {_format_slope(term, 'µm/h')}"
         for j, term in enumerate(shape.drift_um_per_hour, 2)
-        if term.significant
+        if term.is_significant
     ]
     facts = [
         ("cycles", f"{shape.time_s.size} used of {shape.cycles}, {shape.rejected} rejected"),
@@ -307,7 +308,7 @@ def _render_comparison(
             format_number(d.ours),
             format_number(d.theirs),
             d.unit,
-            d.said,
+            d.verdict_text,
             format_number(d.p_value, 2),
             _escape_text(d.note),
         ]
@@ -337,7 +338,7 @@ def _format_slope(slope: drift.FittedSlope, unit: str) -> str:
     if slope.per_hour != slope.per_hour:
         return "too short to say"
     said = f"{slope.per_hour:+.3g} {unit} (95 %: {slope.low:+.3g} to {slope.high:+.3g})"
-    return said if slope.significant else f"{said}, not significant"
+    return said if slope.is_significant else f"{said}, not significant"
 
 
 def _format_rest(count: int) -> str:

@@ -95,7 +95,11 @@ def report_table(analysis: Analysis) -> dict[str, Any]:
             "std_1s_with_um": analysis.benefit.with_um,
             "std_1s_without_um": analysis.benefit.without_um,
         },
-        "lateness_ms": {"p50": late.quantile(0.5), "p99": late.quantile(0.99), "max": late.largest},
+        "lateness_ms": {
+            "p50": late.find_quantile(0.5),
+            "p99": late.find_quantile(0.99),
+            "max": late.largest,
+        },
         "timeline": [each.line for each in make_timeline(analysis)],
         "found": [asdict(event) for event in analysis.found],
         "shape": None if analysis.shape is None else _make_shape(analysis.shape),
@@ -143,7 +147,7 @@ def _make_series(series: ErrorSeries | None) -> dict[str, Any] | None:
 
 
 def _make_slope(slope: drift.FittedSlope) -> dict[str, float | bool]:
-    return asdict(slope) | {"significant": slope.significant}
+    return asdict(slope) | {"significant": slope.is_significant}
 
 
 def _make_shape(shape: shape_review.ShapeReview) -> dict[str, Any]:

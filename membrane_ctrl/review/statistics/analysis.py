@@ -135,7 +135,7 @@ def _found_and_shape(
 ) -> tuple[tuple[FoundEvent, ...], shape_review.ShapeReview | None]:
     """Run the analyses that need the cycles, which are released before the ticks are read."""
     shapes = run.shapes()
-    shapes = shapes.select((shapes.time_s >= start_s) & (shapes.time_s < end_s))
+    shapes = shapes.select_cycles((shapes.time_s >= start_s) & (shapes.time_s < end_s))
     mirror = run.config.optics.mirror
     held = held_at(seconds, shapes.time_s)
     shape = shape_review.review_shapes(shapes, held, mirror.analysis_radius_mm / mirror.radius_mm)

@@ -69,7 +69,7 @@ def find_anomalies(
             )
         if seconds.count and abs(seconds.mean_um) > _BIAS_MOST_UM:
             odd.append(Anomaly("bias", f"{seconds.mean_um:+.3f} µm on average"))
-        if series.drift.significant:
+        if series.drift.is_significant:
             odd.append(Anomaly("drift", _describe_slope(series.drift, "µm/h")))
     if ticks.paused_s:
         odd.append(
@@ -83,8 +83,8 @@ def find_anomalies(
         odd.append(
             Anomaly("missed ticks", f"{ticks.missed_ticks} of {ticks.ticks + ticks.missed_ticks}")
         )
-    if ticks.lateness_ms.quantile(0.99) > _LATE_P99_MOST_MS:
-        odd.append(Anomaly("late ticks", f"p99 is {ticks.lateness_ms.quantile(0.99):.1f} ms"))
+    if ticks.lateness_ms.find_quantile(0.99) > _LATE_P99_MOST_MS:
+        odd.append(Anomaly("late ticks", f"p99 is {ticks.lateness_ms.find_quantile(0.99):.1f} ms"))
     if leak_um_per_s < _LEAK_LEAST_UM_PER_S:
         odd.append(
             Anomaly(
@@ -112,7 +112,7 @@ def find_anomalies(
     if shape is not None:
         if shape.rejected > _REJECTED_MOST * shape.cycles:
             odd.append(Anomaly("rejected cycles", f"{shape.rejected} of {shape.cycles}"))
-        if shape.disagreement.significant:
+        if shape.disagreement.is_significant:
             odd.append(
                 Anomaly("camera and laser diverge", _describe_slope(shape.disagreement, "µm/h"))
             )

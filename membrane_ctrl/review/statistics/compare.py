@@ -34,7 +34,7 @@ class Difference:
     note: str = ""  # why there is no test, or a caveat of the test; may be empty
 
     @property
-    def said(self) -> str:
+    def verdict_text(self) -> str:
         """The verdict in words."""
         if math.isnan(self.p_value):
             return ""
@@ -159,8 +159,8 @@ def _compare_loop(ours: Analysis, theirs: Analysis) -> list[Difference]:
         Difference(
             "lateness p99",
             "ms",
-            mine.lateness_ms.quantile(0.99),
-            other.lateness_ms.quantile(0.99),
+            mine.lateness_ms.find_quantile(0.99),
+            other.lateness_ms.find_quantile(0.99),
             late_p,
             late_note,
         ),

@@ -26,7 +26,7 @@ class FittedSlope:
     effective_samples: float  # equivalent number of independent samples; NaN with too few values
 
     @property
-    def significant(self) -> bool:
+    def is_significant(self) -> bool:
         """Whether 0 is outside the interval."""
         return bool(self.low > 0 or self.high < 0)
 

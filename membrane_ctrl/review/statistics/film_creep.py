@@ -39,7 +39,7 @@ class FilmCreep:
     scatter: float  # of a reading about the law
 
     @property
-    def sure(self) -> bool:
+    def is_certain(self) -> bool:
         """Whether the film creeps at all, beyond doubt."""
         return abs(self.drift) > 2 * self.drift_sigma
 

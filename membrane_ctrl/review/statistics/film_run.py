@@ -94,7 +94,7 @@ def _make_table(
             "value": creep.drift * um_per_log,
             "sigma": creep.drift_sigma * abs(um_per_log),
         },
-        "creeps": creep.sure,
+        "creeps": creep.is_certain,
     }
 
 

@@ -16,7 +16,7 @@ class HeldTime:
         self._last = (math.nan, False)
         self.held_s = 0.0
 
-    def add(self, time_s: Column, held: BoolArray) -> None:
+    def add_times(self, time_s: Column, held: BoolArray) -> None:
         """Take in (n,) times and whether the mirror was held."""
         if not time_s.size:
             return

@@ -108,7 +108,7 @@ class _Collector:
 
     def add(self, block: Mapping[str, Column]) -> None:
         time_s = block["mono_s"]
-        parts = self._parts.of(block)
+        parts = self._parts.classify_block(block)
         mask = parts["held"]
         kept_away = self._without.kept_away_um(block["feedforward_um_per_s"])[mask]
         self._ticks += time_s.size
@@ -117,7 +117,7 @@ class _Collector:
             float(time_s[-1]),
         )
         for name, part in {"hold": block["state"] == State.HOLD, **parts}.items():
-            self._times[name].add(time_s, part)
+            self._times[name].add_times(time_s, part)
         missed = block["missed_ticks"][np.isfinite(block["missed_ticks"])]
         if missed.size:
             self._missed_before = (

@@ -70,7 +70,7 @@ class SeenMode:
         return np.asarray(np.linalg.svd(together, full_matrices=False)[2][0])
 
     @property
-    def moved(self) -> float:
+    def relative_change(self) -> float:
         """Relative change from the first searches to the last, three of each; 0 with fewer than six
         in all.
 
@@ -218,7 +218,7 @@ def _make_table(
                 "aliases_hz": list(mode.lines[0].aliases_hz)
                 if all(line.aliases_hz for line in mode.lines)
                 else [],
-                "moved": mode.moved,
+                "moved": mode.relative_change,
                 "shape": mode.shape.tolist(),
             }
             for mode in modes

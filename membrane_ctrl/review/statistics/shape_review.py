@@ -64,7 +64,7 @@ def review_shapes(shapes: Shapes, held: BoolArray, analysis_share: float) -> Sha
     analysis_share : float
         Radius of the analysis area over the mirror's.
     """
-    good = shapes.select(
+    good = shapes.select_cycles(
         held & (shapes.verdict != "rejected") & np.isfinite(shapes.coeffs_um).all(axis=1)
     )
     if len(good) < _LEAST_CYCLES:
@@ -82,7 +82,7 @@ def review_shapes(shapes: Shapes, held: BoolArray, analysis_share: float) -> Sha
         cycles=len(shapes),
         rejected=int((shapes.verdict == "rejected").sum()),
         points_um=dict(zip(POINTS, points.T, strict=True)),
-        sd_um=area.map(sd_um),
+        sd_um=area.make_map(sd_um),
         mean_sd_um=float(sd_um.mean()),
         drift_um_per_hour=tuple(_fit_slope(good.time_s, term) for term in good.coeffs_um[:, 1:].T),
         sag_um=sag_um,
@@ -108,7 +108,7 @@ class _Area:
         self.basis = height_basis(x[self._inside], y[self._inside])
         self.gram = self.basis @ self.basis.T / self.basis.shape[1]
 
-    def map(self, values: Column) -> Column:
+    def make_map(self, values: Column) -> Column:
         picture = np.full((MAP_PX, MAP_PX), np.nan)
         picture[self._inside] = values
         return picture
@@ -138,8 +138,8 @@ def _choose_pair(good: Shapes, parameters: Column, area: _Area, lag_s: float) ->
     return CyclePair(
         first_s=float(time_s[first]),
         lag_s=float(time_s[second] - time_s[first]),
-        change_um=area.map(change_um),
-        sigma_um=None if sigma_um is None else area.map(sigma_um),
+        change_um=area.make_map(change_um),
+        sigma_um=None if sigma_um is None else area.make_map(sigma_um),
         rms_um=float(np.sqrt((change_um**2).mean())),
         mean_sigma_um=float("nan") if sigma_um is None else float(sigma_um.mean()),
         all_rms_um=float(np.sqrt((all_rms**2).mean())),

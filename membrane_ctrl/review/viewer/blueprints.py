@@ -44,7 +44,7 @@ class ReviewBlueprint:
     span_ns: tuple[int, int] | None
     config: Config
 
-    def made(self, tab: str = "overview", tabs: Sequence[str] = TABS) -> rrb.Blueprint:
+    def make_blueprint(self, tab: str = "overview", tabs: Sequence[str] = TABS) -> rrb.Blueprint:
         """The blueprint, with some of `TABS`, `tab` selected."""
         makers = {
             "overview": self._make_overview,

@@ -194,7 +194,7 @@ def make_review(
             if span_s is None
             else (span_s[0] - zeros_s[0] + zero_s, span_s[1] - zeros_s[0] + zero_s)
         )
-        layer.add(run, label, zero_s, part_s)
+        layer.add_run(run, label, zero_s, part_s)
     by_clock = len(runs) == 1 or options.align == "utc"
     timeline = "utc" if by_clock else "run_time"
     zero_ns = round(1e9 * runs[0].origin_utc.timestamp()) if by_clock else -round(1e9 * zeros_s[0])
@@ -204,7 +204,7 @@ def make_review(
         else (zero_ns + round(1e9 * span_s[0]), zero_ns + round(1e9 * span_s[1]))
     )
     blueprint = blueprints.ReviewBlueprint(labels, timeline, shown_ns, runs[0].config)
-    layer.blueprint(blueprint.made(options.tab))
+    layer.send_blueprint(blueprint.make_blueprint(options.tab))
     layer.close()
     if shown_ns is None:
         return None
@@ -362,7 +362,7 @@ class RunCatalogue:
     def _add_timeline(self, entry: catalogue.RunEntry, file: Path) -> None:
         layer = Layer(file, entry.name, overview_only=True)
         try:
-            layer.add(open_run(entry.folder))
+            layer.add_run(open_run(entry.folder))
         finally:
             layer.close()
         self._dataset.register([file.as_uri()], layer_name="timeline").wait()
@@ -384,7 +384,7 @@ class RunCatalogue:
         started = SortBy("property:run:started_utc", direction="Descending")
         table = TableBlueprint(table_layout=TableLayout(columns=columns + hidden), sort_by=started)
         coarse = blueprints.ReviewBlueprint(("",), "utc", None, Config())
-        runs = coarse.made(tabs=blueprints.COARSE_TABS)
+        runs = coarse.make_blueprint(tabs=blueprints.COARSE_TABS)
         table.save(APPLICATION, self._folder / "table.rbl")
         runs.save(APPLICATION, self._folder / "run.rbl")
         self._dataset.register_blueprint((self._folder / "table.rbl").as_uri(), segment_table=True)

@@ -100,7 +100,7 @@ class Layer:
         self._shift_s = 0.0
         self._origin = np.datetime64(0, "ns")
 
-    def blueprint(self, blueprint: rr.blueprint.Blueprint) -> None:
+    def send_blueprint(self, blueprint: rr.blueprint.Blueprint) -> None:
         """The layout in which the file opens."""
         self._stream.send_blueprint(blueprint)
 
@@ -109,7 +109,7 @@ class Layer:
         self._stream.flush()
         self._stream.disconnect()
 
-    def add(
+    def add_run(
         self, run: Run, label: str = "", zero_s: float = 0.0, part_s: tuple[float, float] = ALL
     ) -> None:
         """Add a run.
@@ -141,7 +141,7 @@ class Layer:
             self._send_ticks(run, part_s)
         self._send_lanes(level)
         self._send_events(run, found, part_s)
-        self._send_figure(cycles.select(hold_parts.held_at(level, cycles.time_s)), part_s)
+        self._send_figure(cycles.select_cycles(hold_parts.held_at(level, cycles.time_s)), part_s)
         if not self._overview_only:
             self._send_thumbnails(run, part_s)
 
@@ -185,7 +185,7 @@ class Layer:
                     level["time_s"][[row for row, _ in found]], level["time_s"][-1] + 1.0
                 )
                 states = pa.array(
-                    [*(lane.word(code) for _, code in found), None]
+                    [*(lane.name_code(code) for _, code in found), None]
                 )  # the lane ends with the run
                 self._send_columns(lane.path, times, rr.StateChange.columns(state=states))
 
@@ -248,12 +248,12 @@ class Layer:
 
     def _send_figure(self, cycles: shapes.Shapes, part_s: tuple[float, float]) -> None:
         """Changes since the first cycle of the hold."""
-        good = cycles.select(
+        good = cycles.select_cycles(
             (cycles.verdict != "rejected") & np.isfinite(cycles.coeffs_um).all(axis=1)
         )
         if not len(good):
             return
-        shown = good.select(_thin_evenly(len(good), SHAPES_MOST))
+        shown = good.select_cycles(_thin_evenly(len(good), SHAPES_MOST))
         parameters = shown.parameters_um() - shown.parameters_um()[0]
         terms = [j - 1 for j in LOW_ORDER_COLUMNS]
         variances = _coefficient_variances(shown)[:, terms]

@@ -116,10 +116,10 @@ class LiveView:
             return False
         if len(rows):
             self._now_s = float(telemetry.get_column(rows, "mono_s")[-1])
-        self._output.send(self._now_s, rows, events, figures, thumbnails, DetailLevel.ALL)
+        self._output.send_second(self._now_s, rows, events, figures, thumbnails, DetailLevel.ALL)
         return True
 
-    def finish(self) -> None:
+    def send_waiting(self) -> None:
         """Send what waits for further rows; the run is over."""
         self._output.close()
 
@@ -156,13 +156,13 @@ def follow_run(
         if view.send_new():
             continue
         if is_over:
-            view.finish()
+            view.send_waiting()
             return
         sleep(LOOK_S)
 
 
 def _open_newest(folder: Path, name: str, spec: TableSpec) -> float:
-    found = TableReader(folder, spec, []).newest(name)
+    found = TableReader(folder, spec, []).read_newest(name)
     return 0.0 if found is None or found.as_py() is None else float(found.as_py())
 
 

@@ -46,7 +46,7 @@ class TableFollower:
 
     def _read_files(self) -> Iterator[pa.Table]:
         first = math.nextafter(self._after, math.inf)
-        for table in TableReader(self._run_dir, self._table, []).tables(start_s=first):
+        for table in TableReader(self._run_dir, self._table, []).iterate_tables(start_s=first):
             if table.column_names == self._table.schema.names:
                 yield table
 

@@ -50,7 +50,7 @@ class JournalWriter:
             disk.remove(path)
             raise
 
-    def append(self, first_row: int, batch: pa.RecordBatch) -> None:
+    def append_batch(self, first_row: int, batch: pa.RecordBatch) -> None:
         """Append a batch and sync it: all of it or nothing. Raises OSError."""
         self._append_frame(_pack_frame(first_row, batch.num_rows, batch.serialize()))
 

@@ -87,7 +87,7 @@ class PartReader:
         text = (self.schema.metadata or {}).get(FIRST_ROW, b"0")
         return int(text) if text.isdigit() and len(text) < 18 else 0
 
-    def groups(
+    def iterate_groups(
         self, names: Sequence[str], start_s: float, end_s: float
     ) -> Iterator[pa.Table | LostGroup]:
         """Columns of the row groups that may have rows from `start_s` up to `end_s`; the file has

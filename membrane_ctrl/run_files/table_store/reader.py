@@ -72,7 +72,7 @@ class TableReader:
                 )
                 self._note_damage(self._read_part(number), f"missing; {rows} left out")
 
-    def tables(
+    def iterate_tables(
         self,
         names: Sequence[str] | None = None,
         start_s: float = -math.inf,
@@ -96,7 +96,7 @@ class TableReader:
                 if rows.num_rows:
                     yield rows.select([name for name in wanted if name in rows.column_names])
 
-    def newest(self, name: str) -> pa.Scalar | None:
+    def read_newest(self, name: str) -> pa.Scalar | None:
         """A column's value in the last readable row; None without one."""
         for number in reversed(self.numbers):
             found = list(
@@ -106,7 +106,7 @@ class TableReader:
                 return found[-1].column(name)[-1]
         return None
 
-    def metadata(self) -> dict[str, str]:
+    def read_metadata(self) -> dict[str, str]:
         """The table's own metadata, as in its first readable file: schema, program, commit."""
         for number in self.numbers:
             schema = self._schema_of(number)
@@ -191,7 +191,7 @@ class TableReader:
                 known = self._select_known(path, part.schema, names)
                 for text in part.notes:
                     self._note_damage(path, text)
-                for group in part.groups(known, start_s, end_s) if known else ():
+                for group in part.iterate_groups(known, start_s, end_s) if known else ():
                     if isinstance(group, LostGroup):
                         self._note_damage(path, f"{_span_of(group)} left out ({group.why})")
                     else:

@@ -32,7 +32,9 @@ def seal_journal(disk: Disk, folder: Path, number: int, table: spec.TableSpec) -
         return
     rows = _JournalRows(read_bytes(source, FILE_BYTES_MAX), table)
     try:
-        entry = write_part(disk, target, number, rows.first_row, rows.groups(), table.time_name)
+        entry = write_part(
+            disk, target, number, rows.first_row, rows.iterate_groups(), table.time_name
+        )
     except (ValueError, pa.ArrowException) as error:
         raise OSError(f"{source.name}: cannot be sealed ({error})") from None
     if entry is not None:
@@ -51,7 +53,7 @@ class _JournalRows:
         self._first = self._next_block()
         self.first_row = self._first.first_row if self._first is not None else 0
 
-    def groups(self) -> Iterator[pa.Table]:
+    def iterate_groups(self) -> Iterator[pa.Table]:
         """Tables of about `group_rows` rows."""
         waiting: list[pa.Table] = []
         count = 0

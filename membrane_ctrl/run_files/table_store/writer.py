@@ -60,9 +60,9 @@ class TableWriter:
         if resumed:
             self._continue_after_kill()
 
-    def add(self, batch: pa.RecordBatch) -> None:
+    def add_rows(self, batch: pa.RecordBatch) -> None:
         """Take rows; those not later than the last one taken are dropped. They are on the disk
-        after `sync`.
+        after `sync_rows`.
         """
         time_s = batch.column(self._table.time_name).to_numpy(zero_copy_only=False)
         if time_s.size and time_s[0] <= self.until_s:
@@ -72,7 +72,7 @@ class TableWriter:
         self.until_s = float(time_s[-1])
         self._waiting.append(batch)
 
-    def sync(self) -> None:
+    def sync_rows(self) -> None:
         """Bring all rows taken to the disk.
 
         Raises OSError (full disk): they wait for the next call, those of the last `WAIT_S` at most.
@@ -87,7 +87,7 @@ class TableWriter:
             if self._journal is None:
                 self._begin_journal(first_s)
             assert self._journal is not None
-            self._journal.append(self._next_row, batch)
+            self._journal.append_batch(self._next_row, batch)
         except OSError:
             self._close_journal()  # another one follows what this one could not take
             self._give_up_oldest()
@@ -139,7 +139,7 @@ class TableWriter:
         """Bring all rows to the disk and seal all journals. Raises OSError: unsealed journals are
         kept.
         """
-        self.sync()
+        self.sync_rows()
         self._close_journal()
         while self.seal_next():
             pass
@@ -152,12 +152,12 @@ class TableWriter:
         self._sealable.clear()
 
     @property
-    def lost(self) -> int:
+    def lost_rows(self) -> int:
         """Rows that no file has: given up, or still waiting for the disk."""
         return self._given_up + sum(int(batch.num_rows) for batch in self._waiting)
 
     @property
-    def parts(self) -> int:
+    def part_count(self) -> int:
         """Number of parts and journals begun."""
         return self._number
 

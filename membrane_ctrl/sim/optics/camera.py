@@ -102,14 +102,14 @@ class OpticsRenderer:
         if self.disturbances != DisturbancesConfig():
             self._disturber = self._disturb_nodes()
 
-    def blank(self) -> Pixels:
+    def make_blank_picture(self) -> Pixels:
         """An empty picture, (H, W): uint8 for an 8-bit camera, uint16 for any deeper one."""
         shape = (self.optics.camera.height_px, self.optics.camera.width_px)
         if self.optics.camera.bits == 8:
             return np.empty(shape, np.uint8)
         return np.empty(shape, np.uint16)
 
-    def render(
+    def render_picture(
         self,
         shown: Pattern | PanelPicture,
         displacement_um: float,
@@ -120,12 +120,12 @@ class OpticsRenderer:
         """The picture of what is shown, (H, W), at a displacement; `gain` is the exposure over the
         nominal one.
 
-        `out` (as of `blank`) is filled and returned; otherwise a new array is made. The vibrations
-        are those of `time_s`. Raises ValueError if the pattern is unknown or `out` has another
-        shape or type.
+        `out` (as of `make_blank_picture`) is filled and returned; otherwise a new array is made.
+        The vibrations are those of `time_s`. Raises ValueError if the pattern is unknown or `out`
+        has another shape or type.
         """
         camera = self.optics.camera
-        picture = self.blank() if out is None else out
+        picture = self.make_blank_picture() if out is None else out
         depth = np.dtype(np.uint8 if camera.bits == 8 else np.uint16)
         if picture.shape != (camera.height_px, camera.width_px) or picture.dtype != depth:
             raise ValueError(
@@ -137,14 +137,14 @@ class OpticsRenderer:
         nodes, times_s = self._interpolate_nodes(displacement_um), np.array([[time_s]])
         if self._disturber is not None:
             nodes, times_s = (
-                nodes + self._disturber.rays(time_s),
+                nodes + self._disturber.ray_disturbance(time_s),
                 self._disturber.row_times_s(time_s),
             )
         for mode in self.modes:
             nodes = nodes + mode.swing_um(times_s) * self._swing_maps(mode)
         if self._disturber is not None:
             pattern = shown if isinstance(shown, Pattern) else _NO_PATTERN
-            nodes = np.concatenate([nodes, self._disturber.light(time_s, pattern)])
+            nodes = np.concatenate([nodes, self._disturber.light_disturbance(time_s, pattern)])
         seed = (self.seed << 32) + self._pictures
         middle = camera.height_px // 2
         other = _second_hand().submit(paint, nodes, seed, picture, middle, camera.height_px)
@@ -302,7 +302,7 @@ class OpticsRenderer:
         if mode not in self._swings:
             still, moved = (
                 self._make_maps(self._trace_film(self._directions, 0.0, film))
-                for film in (self.film.terms_at(0.0), mode.moved(self.film))
+                for film in (self.film.terms_at(0.0), mode.displace_film(self.film))
             )
             self._swings[mode] = moved - still
         return self._swings[mode]
@@ -421,7 +421,8 @@ class TwinOptics:
         renderer = self._render_view()
         time_s = self._clock.now()
         return Frame(
-            renderer.render(shown, self._truth().displacement_um, out, time_s=time_s), time_s
+            renderer.render_picture(shown, self._truth().displacement_um, out, time_s=time_s),
+            time_s,
         )
 
     def _render_view(self) -> OpticsRenderer:

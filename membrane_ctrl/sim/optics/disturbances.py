@@ -69,7 +69,7 @@ class Disturber:
         """Middle of the exposure of each row of nodes, (rows, 1)."""
         return time_s + self._wanted.rolling_s * self._nodes.row_share[:, None]
 
-    def rays(self, time_s: float) -> FloatArray:
+    def ray_disturbance(self, time_s: float) -> FloatArray:
         """What to add to the renderer's maps, (3, rows, columns): the stand's growth, and air that
         bends the rays.
         """
@@ -78,17 +78,19 @@ class Disturber:
         moved = _GROWTH_MM_PER_K * warm_k * nodes.grown
         if wanted.seeing_um:
             for k, air in enumerate(self._air):
-                moved[k] += 1e-3 * wanted.seeing_um * air.at(time_s, nodes.x_mm, nodes.y_mm)
+                moved[k] += (
+                    1e-3 * wanted.seeing_um * air.evaluate_at(time_s, nodes.x_mm, nodes.y_mm)
+                )
         return moved
 
-    def light(self, time_s: float, pattern: Pattern) -> FloatArray:
+    def light_disturbance(self, time_s: float, pattern: Pattern) -> FloatArray:
         """Factor of the screen's light, and counts of the room's, (2, rows, columns)."""
         wanted, nodes = self._wanted, self._nodes
         factor = self._dust_at(time_s) * self._backlight_factor(self.row_times_s(time_s))
         factor = factor * math.exp(-wanted.dimming_fraction_per_h * time_s / 3600.0)
         if wanted.brightness_fraction:
             half_mm = nodes.side_mm / 2
-            factor *= 1.0 + wanted.brightness_fraction * self._bright.at(
+            factor *= 1.0 + wanted.brightness_fraction * self._bright.evaluate_at(
                 time_s, nodes.s_x_mm - half_mm, nodes.s_y_mm - half_mm
             )
         if wanted.sticking_fraction and pattern.role == "crossed":

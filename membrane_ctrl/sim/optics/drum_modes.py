@@ -27,7 +27,7 @@ class DrumMode:
             1e-3 * self.amplitude_nm * np.sin(2 * math.pi * self.frequency_hz * time_s + self.lobes)
         )
 
-    def moved(self, film: FilmShape) -> FilmTerms:
+    def displace_film(self, film: FilmShape) -> FilmTerms:
         """The film displaced by 1 µm RMS, its ring at rest."""
         from scipy import special
 

@@ -36,7 +36,7 @@ class RandomField:
         self._amplitudes = rng.standard_normal(2 * _WAVES)
         self._time_s = -math.inf
 
-    def at(self, time_s: float, x_mm: FloatArray, y_mm: FloatArray) -> FloatArray:
+    def evaluate_at(self, time_s: float, x_mm: FloatArray, y_mm: FloatArray) -> FloatArray:
         """The field at places of the square; beyond it that of its edge."""
         if time_s > self._time_s:
             keep = math.exp(-(time_s - self._time_s) / self._memory_s)

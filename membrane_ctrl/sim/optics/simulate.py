@@ -245,7 +245,7 @@ def simulate_track(
             row["displacement_um"] = float(displacement_um[k] + noise_um[k])
         _write_png(
             target / row["file"],
-            renderer.render(pattern, float(displacement_um[k]), time_s=float(time_s[k])),
+            renderer.render_picture(pattern, float(displacement_um[k]), time_s=float(time_s[k])),
         )
         rows.append(row)
         if on_frame is not None:
@@ -328,7 +328,9 @@ def _write_set(folder: Path, spec: SimulationSpec, renderer: OpticsRenderer) -> 
             picture = before
         else:
             um, gain = exposure.displacement_um, exposure.gain
-            picture = renderer.render(exposure.pattern, um, gain=gain, time_s=exposure.time_s)
+            picture = renderer.render_picture(
+                exposure.pattern, um, gain=gain, time_s=exposure.time_s
+            )
         before = picture
         if ("wrong_size", pattern.name) in faults:
             picture = picture[:-1]

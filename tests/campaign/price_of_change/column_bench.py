@@ -48,7 +48,7 @@ def console_page(row: TelemetryRow) -> str:
     model = ConsoleModel(config)
     model.take_row(row)
     console = Console(width=WIDTH, height=HEIGHT, record=True, file=io.StringIO())
-    console.print(ConsolePage(model.view(row.mono_s), config, "logs/a-run"))
+    console.print(ConsolePage(model.make_view(row.mono_s), config, "logs/a-run"))
     return console.export_text()
 
 
@@ -68,7 +68,7 @@ def viewer_plots(entity: str) -> dict[str, bool]:
     or the means of its seconds.
     """
     config = Config()
-    review = ReviewBlueprint(("",), "utc", None, config).made()
+    review = ReviewBlueprint(("",), "utc", None, config).make_blueprint()
     found = {}
     for name, blueprint in (("run", run_blueprint(config)), ("review", review)):
         found[name] = entity in " ".join(_contents(blueprint))

@@ -47,7 +47,7 @@ def hold_with(field: str, value: float) -> list[dict[str, Any]]:
     commands: tuple[Command, ...] = (Command("hold", "campaign"),)
     found: list[dict[str, Any]] = []
     while run.now_s < ENDS_S:
-        tick = run.tick(commands)
+        tick = run.run_tick(commands)
         commands = ()
         if tick is not None and run.now_s >= BEGINS_S:
             found += [

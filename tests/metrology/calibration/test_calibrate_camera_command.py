@@ -70,12 +70,12 @@ def test_from_photographs_to_a_prior(
     prior = read_prior(out)
     assert prior.content.sigmas == report["sigmas"]
     camera = CameraConfig(width_px=408, height_px=342, pixel_um=20.7, noise_adu=0.7)
-    found = prior.over(OpticsConfig(camera=camera)).camera
+    found = prior.apply_to_optics(OpticsConfig(camera=camera)).camera
     assert found.noise_adu == 0.7
     focal_px = found.focal_mm / 20.7e-3
     assert abs(focal_px - TRUE.focal_px) < 5 * focal_px * report["sigmas"]["focal_relative"]
     with pytest.raises(InputError, match="a calibrated lens is valid only for its own camera"):
-        prior.over(OpticsConfig())
+        prior.apply_to_optics(OpticsConfig())
 
 
 def test_what_was_gained_is_said(

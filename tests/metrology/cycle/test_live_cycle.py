@@ -57,7 +57,8 @@ def _render(
     where = np.broadcast_to(np.asarray(displacement_um, float), len(patterns)).copy()
     renderer = _renderer(optics, light or Light())
     frames = [
-        renderer.render(pattern, d).copy() for pattern, d in zip(patterns, where, strict=True)
+        renderer.render_picture(pattern, d).copy()
+        for pattern, d in zip(patterns, where, strict=True)
     ]
     return frames, 0.1 * np.arange(len(patterns)), where
 
@@ -142,7 +143,9 @@ def test_knock_that_looks_like_a_small_tilt_the_other_way() -> None:
     live = _live()
     tilted = FilmShape(37.1, 500.0, "hencky", (0, 5.5e-3 * 500e3 / 2, *ZERNIKE_UM[2:]))
     renderer = OpticsRenderer(OPTICS, tilted, seed=6)
-    frames = [renderer.render(pattern, 0.0).copy() for pattern in fringe_sequence(OPTICS.pattern)]
+    frames = [
+        renderer.render_picture(pattern, 0.0).copy() for pattern in fringe_sequence(OPTICS.pattern)
+    ]
     estimate = live.fringes(frames, np.arange(8.0), np.zeros(8))
     assert (estimate.verdict, estimate.reason) == (
         "rejected",
@@ -358,7 +361,7 @@ def _render_unequal(kind: str, displacement_um: float) -> Frames:
         replace(p, shift_rad=float(UNEQUAL["xy".index(p.axis), p.index])) if p.role == "sin" else p
         for p in patterns
     ]
-    return [_renderer().render(pattern, displacement_um).copy() for pattern in shown]
+    return [_renderer().render_picture(pattern, displacement_um).copy() for pattern in shown]
 
 
 def test_unequal_steps() -> None:

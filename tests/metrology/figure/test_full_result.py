@@ -200,7 +200,8 @@ def test_the_frames_say_what_light_they_had_and_where_the_film_was(
     )
     gains = 1 + flicker * rng.standard_normal(len(shown))
     frames = [
-        renderer.render(*one, gain=gain) for *one, gain in zip(shown, place_um, gains, strict=True)
+        renderer.render_picture(*one, gain=gain)
+        for *one, gain in zip(shown, place_um, gains, strict=True)
     ]
     checked = check_set(stack_of(np.stack(frames), shown), optics)
     light = np.ones((2, len(gains))) if checked.stack.light is None else checked.stack.light

@@ -43,7 +43,8 @@ class Case:
         renderer = OpticsRenderer(self.optics(), FILM, Light(gamma=self.gamma), seed=2)
         shown = pattern_sequence("frequencies", self.optics().pattern, coarser_mm=self.coarser_mm)
         pictures = {
-            p.name: renderer.render(p, 0.0, gain=(gains or {}).get(p.name, 1.0)) for p in shown
+            p.name: renderer.render_picture(p, 0.0, gain=(gains or {}).get(p.name, 1.0))
+            for p in shown
         }
         if swap is not None:
             a, b = swap

@@ -57,7 +57,7 @@ class Bench:
         self.taken += 1
         renderer = OpticsRenderer(OPTICS, film, seed=100 + self.taken)
         return np.asarray(
-            renderer.render(
+            renderer.render_picture(
                 Pattern("crossed", "", 32, shifts[0], shift_y_rad=shifts[1]), moved_um, gain=gain
             ),
             np.uint8,
@@ -74,7 +74,7 @@ class Bench:
 def reference(tmp_path_factory: pytest.TempPathFactory) -> SetFigure:
     folder = tmp_path_factory.mktemp("track") / "full"
     simulate_set(folder, SimulationSpec(OPTICS, FILM))
-    return Figures().of(folder)
+    return Figures().measure_folder(folder)
 
 
 @pytest.mark.parametrize(

@@ -60,7 +60,7 @@ class Bench:
 
     def full(self, moved_um: float = 0.0) -> ShapeEstimate:
         frames = [
-            self.renderer.render(p, moved_um)
+            self.renderer.render_picture(p, moved_um)
             for p in pattern_sequence.full_sequence(OPTICS.pattern)
         ]
         self.time_s += 2.0
@@ -69,7 +69,7 @@ class Bench:
     def frame(
         self, moved_um: float = 0.0, reading_um: float = math.nan, gain: float = 1.0
     ) -> ShapeEstimate:
-        picture = self.renderer.render(self.tracker.pattern, moved_um, gain=gain)
+        picture = self.renderer.render_picture(self.tracker.pattern, moved_um, gain=gain)
         self.picture = np.rint(picture * self.stains).clip(0, 255).astype(np.uint8)
         return self.again(reading_um)
 
@@ -243,13 +243,13 @@ def test_a_hold_hears_the_films_vibrations_and_no_others() -> None:
     renderer = OpticsRenderer(optics, FILM, seed=3, modes=modes)
     film_um, listener, told = held_um(126.0), Stethoscope(), []
     still = [
-        renderer.render(p, float(film_um[0]))
+        renderer.render_picture(p, float(film_um[0]))
         for p in pattern_sequence.full_sequence(optics.pattern)
     ]
     assert tracker.full(still, 0.1 * np.arange(18), np.full(18, math.nan)).verdict == "ok"
     time_s = 2.0
     while time_s < 125.0:
-        picture = renderer.render(
+        picture = renderer.render_picture(
             tracker.pattern, float(film_um[round(50 * time_s)]), time_s=time_s
         )
         told += listener.after(tracker.fringes([picture], np.array([time_s]), np.array([math.nan])))

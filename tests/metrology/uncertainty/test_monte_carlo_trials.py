@@ -43,7 +43,7 @@ def _renderer() -> OpticsRenderer:
 def _stack(displacement_um: float = 0.0, frames: str = "full") -> FrameStack:
     """A set as the camera sees it, with noise that is new each time."""
     shown = [p for p in patterns(OPTICS) if frames == "full" or p.role == "sin"]
-    pictures = np.stack([_renderer().render(p, displacement_um) for p in shown])
+    pictures = np.stack([_renderer().render_picture(p, displacement_um) for p in shown])
     return stack_of(pictures, shown, np.full(len(shown), displacement_um))
 
 
@@ -82,7 +82,7 @@ def test_figure_of_a_moving_film() -> None:
     shown = [p for p in patterns(OPTICS) if p.role == "sin"]
     where_um = 5 * np.sin(2 * np.pi * 0.3 * 0.1 * np.arange(8))
     frames = np.stack(
-        [_renderer().render(p, float(d)) for p, d in zip(shown, where_um, strict=True)]
+        [_renderer().render_picture(p, float(d)) for p, d in zip(shown, where_um, strict=True)]
     )
     x, y = np.meshgrid(MAP.axis_mm, MAP.axis_mm)
     errors = {}

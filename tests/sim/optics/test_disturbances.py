@@ -44,7 +44,7 @@ def bench(
 
 def lit(film: FilmShape) -> np.ndarray:
     """Pixels that see the screen, away from its edges."""
-    picture = bench(film).render(WHITE, 0.0).astype(float)
+    picture = bench(film).render_picture(WHITE, 0.0).astype(float)
     eroded = picture > 0
     for axis in (0, 1):
         eroded &= np.roll(picture, 2, axis) > 0
@@ -54,7 +54,10 @@ def lit(film: FilmShape) -> np.ndarray:
 
 def gain(film: FilmShape, renderer: OpticsRenderer, pattern: Pattern, time_s: float) -> np.ndarray:
     """Light over that of an undisturbed bench where there is some."""
-    seen, plain = renderer.render(pattern, 0.0, time_s=time_s), bench(film).render(pattern, 0.0)
+    seen, plain = (
+        renderer.render_picture(pattern, 0.0, time_s=time_s),
+        bench(film).render_picture(pattern, 0.0),
+    )
     bright = lit(film) & (plain > 0.1 * FULL)
     return np.asarray(seen[bright] / plain[bright])
 
@@ -75,7 +78,10 @@ def test_waves_are_as_long_as_asked_and_forget_themselves(length_mm: float) -> N
     field = RandomField(length_mm, 10.0, 500.0, np.random.default_rng(1))
     x = np.linspace(-490.0, 490.0, 400)
     lines = np.array(
-        [field.at(50.0 * k, x[None], np.full((1, 400), 20.0 * k - 400))[0] for k in range(40)]
+        [
+            field.evaluate_at(50.0 * k, x[None], np.full((1, 400), 20.0 * k - 400))[0]
+            for k in range(40)
+        ]
     )
     assert lines.std() == pytest.approx(1.0, abs=0.15)
     slope = np.diff(lines, axis=1).std() / (
@@ -91,7 +97,7 @@ def test_the_screen_dims_by_the_share_of_an_hour(film: FilmShape) -> None:
 
 
 def test_room_light_falls_on_the_mirror_only_and_more_on_one_side(film: FilmShape) -> None:
-    seen = bench(film, ambient_fraction=0.1).render(BLACK, 0.0, time_s=0.0) / FULL
+    seen = bench(film, ambient_fraction=0.1).render_picture(BLACK, 0.0, time_s=0.0) / FULL
     mirror = seen > 0
     assert seen[mirror].mean() == pytest.approx(0.1, abs=0.005)
     assert mirror.mean() == pytest.approx(
@@ -113,7 +119,9 @@ def test_pulses_of_the_backlight_show_as_stripes_of_a_rolling_shutter(
     light.
     """
     renderer = bench(film, backlight_hz=hz, rolling_s=rolls)
-    picture = renderer.render(WHITE, 0.0, time_s=0.3) / bench(film).render(WHITE, 0.0).clip(1)
+    picture = renderer.render_picture(WHITE, 0.0, time_s=0.3) / bench(film).render_picture(
+        WHITE, 0.0
+    ).clip(1)
     middle = picture[40:90, 70:80].mean(axis=1)
     assert np.ptp(middle) == pytest.approx(ripple, abs=0.0035)
 
@@ -124,8 +132,8 @@ def test_a_panel_keeps_what_it_has_shown_for_hours(film: FilmShape) -> None:
         0.975, abs=1e-3
     )  # of nothing yet: half of it
     after = gain(film, renderer, crossed(), 36_000.0)
-    level = bench(film).render(crossed(), 0.0)[
-        lit(film) & (bench(film).render(crossed(), 0.0) > 0.1 * FULL)
+    level = bench(film).render_picture(crossed(), 0.0)[
+        lit(film) & (bench(film).render_picture(crossed(), 0.0) > 0.1 * FULL)
     ]
     assert after == pytest.approx(1 - 0.05 * level / level.max(), abs=4e-3)
     assert gain(film, renderer, WHITE, 36_000.0) == pytest.approx(1.0, abs=1e-3)
@@ -142,14 +150,14 @@ def test_dust_lies_still_and_then_elsewhere(film: FilmShape) -> None:
 
 def test_a_stand_that_grows_takes_the_camera_along(film: FilmShape) -> None:
     """A quarter of the swing's period after the start it is warmest: 2 K of 60 µm each."""
-    seen = bench(film, stand_k=2.0).render(crossed(), 0.0, time_s=300.0).astype(float)
+    seen = bench(film, stand_k=2.0).render_picture(crossed(), 0.0, time_s=300.0).astype(float)
     geometry = OPTICS.geometry.model_copy(update={"a_mm": OPTICS.geometry.a_mm + 0.12})
     there = (
         bench(film, OPTICS.model_copy(update={"geometry": geometry}))
-        .render(crossed(), 0.0)
+        .render_picture(crossed(), 0.0)
         .astype(float)
     )
-    here = bench(film).render(crossed(), 0.0).astype(float)
+    here = bench(film).render_picture(crossed(), 0.0).astype(float)
     on = lit(film)
     assert np.abs(seen - there)[on].max() < 0.05 * np.abs(here - there)[on].max()
 
@@ -157,19 +165,19 @@ def test_a_stand_that_grows_takes_the_camera_along(film: FilmShape) -> None:
 def test_warm_air_bends_the_rays_as_far_as_asked(film: FilmShape) -> None:
     renderer = bench(film, seeing_um=100.0)
     assert renderer._disturber is not None
-    moved_mm = np.array([renderer._disturber.rays(30.0 * k)[:2] for k in range(40)])
+    moved_mm = np.array([renderer._disturber.ray_disturbance(30.0 * k)[:2] for k in range(40)])
     assert 1e3 * moved_mm.std() == pytest.approx(100.0, rel=0.2)
-    assert not renderer._disturber.rays(5000.0)[2].any()
+    assert not renderer._disturber.ray_disturbance(5000.0)[2].any()
 
 
 def test_rows_of_a_rolling_shutter_see_a_vibration_at_their_own_time(film: FilmShape) -> None:
     rolls, still = bench(film, drum_nm=50_000.0, rolling_s=0.02), bench(film, drum_nm=50_000.0)
-    seen = rolls.render(crossed(), 0.0, time_s=1.0).astype(float)
+    seen = rolls.render_picture(crossed(), 0.0, time_s=1.0).astype(float)
     for row in (40, 64, 90):
-        own = still.render(crossed(), 0.0, time_s=1.0 + 0.02 * ((row + 0.5) / 128 - 0.5)).astype(
-            float
-        )
-        other = still.render(crossed(), 0.0, time_s=1.0).astype(float)
+        own = still.render_picture(
+            crossed(), 0.0, time_s=1.0 + 0.02 * ((row + 0.5) / 128 - 0.5)
+        ).astype(float)
+        other = still.render_picture(crossed(), 0.0, time_s=1.0).astype(float)
         assert np.abs(seen - own)[row].max() < 0.02 * FULL
         assert row == 64 or np.abs(seen - other)[row].max() > 2 * np.abs(seen - own)[row].max()
 
@@ -182,12 +190,14 @@ def test_equal_seeds_and_times_give_equal_pictures_and_others_do_not(film: FilmS
         "sticking_fraction": 0.02,
         "ambient_fraction": 0.01,
     }
-    first, again = ([bench(film, **every).render(crossed(), 0.0, time_s=3.0)] for _ in range(2))
+    first, again = (
+        [bench(film, **every).render_picture(crossed(), 0.0, time_s=3.0)] for _ in range(2)
+    )
     assert np.array_equal(first, again)
     renderer = bench(film, **every)
     renderer.seed = 6
     renderer.__post_init__()
-    assert not np.array_equal(renderer.render(crossed(), 0.0, time_s=3.0), first[0])
+    assert not np.array_equal(renderer.render_picture(crossed(), 0.0, time_s=3.0), first[0])
 
 
 def test_simulate_disturbs_a_tracking_set_and_tells_its_vibrations(tmp_path: Path) -> None:

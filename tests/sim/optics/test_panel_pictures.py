@@ -43,7 +43,7 @@ def picture(pattern: Pattern) -> PanelPicture:
 def seen(
     renderer: OpticsRenderer, shown: Pattern | PanelPicture, displacement_um: float
 ) -> FloatArray:
-    return renderer.render(shown, displacement_um).astype(np.float64)
+    return renderer.render_picture(shown, displacement_um).astype(np.float64)
 
 
 @pytest.mark.parametrize("displacement_um", [0.0, 1234.0])

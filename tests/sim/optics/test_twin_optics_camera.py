@@ -52,7 +52,8 @@ def test_a_frame_shows_the_pattern_on_the_film_where_it_stands(
     expected = OpticsRenderer(clean_optics, film, reference_um=-25.0)
     for frame, displacement_um in ((first, -25.0), (second, 40.0)):
         np.testing.assert_array_equal(
-            frame.pixels, expected.render(Pattern("sin", "x", 1, np.pi / 2), displacement_um)
+            frame.pixels,
+            expected.render_picture(Pattern("sin", "x", 1, np.pi / 2), displacement_um),
         )
     assert (first.pixels != second.pixels).mean() > 0.3
 
@@ -70,7 +71,9 @@ def test_a_stated_reference_is_kept(clean_optics: OpticsConfig, film: FilmShape)
     optics = clean_optics.model_copy(update={"geometry": geometry})
     twin = _optics(optics, Bench(), film)
     twin.screen.show(Pattern("sin", "y"))
-    expected = OpticsRenderer(optics, film, reference_um=900.0).render(Pattern("sin", "y"), -25.0)
+    expected = OpticsRenderer(optics, film, reference_um=900.0).render_picture(
+        Pattern("sin", "y"), -25.0
+    )
     np.testing.assert_array_equal(twin.camera.grab().pixels, expected)
 
 

@@ -28,7 +28,7 @@ def _phases(renderer: OpticsRenderer, axis: str, displacement_um: float) -> np.n
     """Wrapped phase seen in four rendered pictures (the paper's eq. 1)."""
     patterns = [Pattern("sin", axis, k, k * np.pi / 2) for k in range(4)]
     i1, i2, i3, i4 = (
-        renderer.render(p, displacement_um).astype(np.float64).ravel() for p in patterns
+        renderer.render_picture(p, displacement_um).astype(np.float64).ravel() for p in patterns
     )
     return np.arctan2(i4 - i2, i1 - i3)
 
@@ -45,7 +45,7 @@ def test_sinusoids_are_as_bright_as_the_interfaces_say(
     hits = renderer.trace_pixels(12.0)
     s_mm = (hits.s_x_mm if axis == "x" else hits.s_y_mm) + SIDE_MM / 2
     for shift in (0.0, 0.7, 4.0):
-        seen = renderer.render(Pattern("sin", axis, 0, shift), 12.0).ravel()
+        seen = renderer.render_picture(Pattern("sin", axis, 0, shift), 12.0).ravel()
         wanted = 65535 * (0.5 + 0.5 * np.cos(2 * np.pi * s_mm / 49.82 - np.pi + shift))
         assert np.abs(seen - wanted)[_region(hits)].max() < 0.51
 
@@ -59,7 +59,8 @@ def test_gray_bits_read_together_are_the_half_period(
     on = _region(hits)
     s_mm = (hits.s_x_mm if axis == "x" else hits.s_y_mm)[on] + SIDE_MM / 2
     bits = [
-        renderer.render(Pattern("gray", axis, bit), 0.0).ravel()[on] > 32768 for bit in (1, 2, 3, 4)
+        renderer.render_picture(Pattern("gray", axis, bit), 0.0).ravel()[on] > 32768
+        for bit in (1, 2, 3, 4)
     ]
     value = np.zeros(on.sum(), dtype=int)
     binary = np.zeros(on.sum(), dtype=bool)
@@ -76,7 +77,7 @@ def test_white_black_and_what_is_not_the_film(clean_optics: OpticsConfig, film: 
     on = renderer.trace_pixels(0.0).on_film(499.0)
     beside = ~renderer.trace_pixels(0.0).on_film(501.0)
     white, black = (
-        renderer.render(Pattern(role), 0.0).ravel() / 65535 for role in ("white", "black")
+        renderer.render_picture(Pattern(role), 0.0).ravel() / 65535 for role in ("white", "black")
     )
     np.testing.assert_allclose(white[on], 0.9, atol=1e-5)
     np.testing.assert_allclose(black[on], 0.1 + 0.05 * 0.8, atol=1e-5)
@@ -90,7 +91,7 @@ def test_beyond_the_pattern_region_the_screen_is_dark(clean_optics: OpticsConfig
     hits = renderer.trace_pixels(0.0)
     outside = hits.on_film(499.0) & ((np.abs(hits.s_x_mm) > 200.0) | (np.abs(hits.s_y_mm) > 200.0))
     assert outside.sum() > 1000
-    assert renderer.render(Pattern("white"), 0.0).ravel()[outside].max() == 0
+    assert renderer.render_picture(Pattern("white"), 0.0).ravel()[outside].max() == 0
 
 
 @pytest.mark.parametrize(
@@ -134,7 +135,7 @@ def test_crossed_fringes_are_what_traced_rays_see(film: FilmShape, gamma: float,
     width, height = 245, 205
     camera = CameraConfig(width_px=width, height_px=height, pixel_um=34.5, bits=bits, noise_adu=0.0)
     renderer = OpticsRenderer(OpticsConfig(camera=camera), film, Light(gamma=gamma))
-    picture = renderer.render(
+    picture = renderer.render_picture(
         Pattern("crossed", "", 32, 0.7, shift_y_rad=1.9), 3.0, gain=0.9
     ).astype(float)
     hits = renderer.trace_pixels(3.0)
@@ -162,8 +163,8 @@ def test_noise_of_crossed_fringes_is_as_configured_and_new_in_each_row_and_pictu
     )
     renderer = OpticsRenderer(optics, film)
     pattern = Pattern("crossed", "", 32)
-    clean = OpticsRenderer(replace_noise(optics), film).render(pattern, 0.0).astype(float)
-    first, second = (renderer.render(pattern, 0.0) - clean for _ in range(2))
+    clean = OpticsRenderer(replace_noise(optics), film).render_picture(pattern, 0.0).astype(float)
+    first, second = (renderer.render_picture(pattern, 0.0) - clean for _ in range(2))
     assert first.std() == pytest.approx(40.0, rel=0.01)
     assert abs(first.mean()) < 1.0
     assert abs(np.corrcoef(first.ravel(), second.ravel())[0, 1]) < 0.02
@@ -190,8 +191,8 @@ def test_noise_has_the_configured_deviation_and_is_new_in_each_picture(film: Fil
     # not rounded
     light = Light(dark_fraction=0.4, white_fraction=0.8, vignetting=0.0)
     renderer = OpticsRenderer(optics, film, light, seed=4)
-    still = OpticsRenderer(clean, film, light).render(Pattern("white"), 0.0).astype(float)
-    one, two = (renderer.render(Pattern("white"), 0.0) - still for _ in range(2))
+    still = OpticsRenderer(clean, film, light).render_picture(Pattern("white"), 0.0).astype(float)
+    one, two = (renderer.render_picture(Pattern("white"), 0.0) - still for _ in range(2))
     for noise in (one, two):
         assert noise.std() == pytest.approx(20.0, rel=0.02)
         assert abs(noise.mean()) < 0.3
@@ -205,7 +206,7 @@ def test_noise_has_the_configured_deviation_and_is_new_in_each_picture(film: Fil
 
 def test_the_same_seed_gives_the_same_pictures(small_optics: OpticsConfig, film: FilmShape) -> None:
     one, again, other = (
-        OpticsRenderer(small_optics, film, seed=seed).render(Pattern("white"), 3.0)
+        OpticsRenderer(small_optics, film, seed=seed).render_picture(Pattern("white"), 3.0)
         for seed in (7, 7, 8)
     )
     np.testing.assert_array_equal(one, again)
@@ -216,16 +217,20 @@ def test_too_long_an_exposure_saturates_at_full_scale(
     small_optics: OpticsConfig, film: FilmShape
 ) -> None:
     renderer = OpticsRenderer(small_optics, film)
-    assert renderer.render(Pattern("white"), 0.0).max() < 255
-    long = renderer.render(Pattern("white"), 0.0, gain=2.0)
+    assert renderer.render_picture(Pattern("white"), 0.0).max() < 255
+    long = renderer.render_picture(Pattern("white"), 0.0, gain=2.0)
     assert long.dtype == np.uint8
     assert (long == 255).mean() > 0.45
 
 
 def test_gamma_bends_the_levels(clean_optics: OpticsConfig, film: FilmShape) -> None:
-    linear = OpticsRenderer(clean_optics, film, LINEAR).render(Pattern("sin", "x"), 0.0) / 65535
+    linear = (
+        OpticsRenderer(clean_optics, film, LINEAR).render_picture(Pattern("sin", "x"), 0.0) / 65535
+    )
     light = Light(dark_fraction=0.0, white_fraction=1.0, leak=0.0, gamma=2.2, vignetting=0.0)
-    bent = OpticsRenderer(clean_optics, film, light).render(Pattern("sin", "x"), 0.0) / 65535
+    bent = (
+        OpticsRenderer(clean_optics, film, light).render_picture(Pattern("sin", "x"), 0.0) / 65535
+    )
     np.testing.assert_allclose(bent, linear**2.2, atol=3e-5)
 
 
@@ -233,7 +238,7 @@ def test_vignetting_takes_light_from_the_corners(
     clean_optics: OpticsConfig, film: FilmShape
 ) -> None:
     light = Light(dark_fraction=0.0, white_fraction=1.0, leak=0.0, vignetting=0.3)
-    white = OpticsRenderer(clean_optics, film, light).render(Pattern("white"), 0.0) / 65535
+    white = OpticsRenderer(clean_optics, film, light).render_picture(Pattern("white"), 0.0) / 65535
     distance2 = ((127 - 127.5) ** 2 + (60 - 152.5) ** 2) / (127.5**2 + 152.5**2)
     assert white[127, 152] == pytest.approx(1.0, abs=1e-4)
     assert white[127, 60] == pytest.approx(1.0 - 0.3 * distance2, abs=1e-4)
@@ -241,12 +246,12 @@ def test_vignetting_takes_light_from_the_corners(
 
 def test_a_picture_can_land_in_a_given_buffer(small_optics: OpticsConfig, film: FilmShape) -> None:
     renderer = OpticsRenderer(small_optics, film)
-    buffer = renderer.blank()
-    assert renderer.render(Pattern("white"), 0.0, buffer) is buffer
+    buffer = renderer.make_blank_picture()
+    assert renderer.render_picture(Pattern("white"), 0.0, buffer) is buffer
     assert buffer.max() > 150
     for wrong in (np.empty((10, 10), np.uint8), np.empty((256, 306), np.uint16)):
         with pytest.raises(ValueError, match=r"out is .* not \(256, 306\) uint8"):
-            renderer.render(Pattern("white"), 0.0, wrong)
+            renderer.render_picture(Pattern("white"), 0.0, wrong)
 
 
 def test_a_film_of_another_radius_is_refused(small_optics: OpticsConfig) -> None:
@@ -261,7 +266,7 @@ def test_unknown_patterns_are_refused(
     small_optics: OpticsConfig, film: FilmShape, pattern: Pattern
 ) -> None:
     with pytest.raises(ValueError, match="role must be"):
-        OpticsRenderer(small_optics, film).render(pattern, 0.0)
+        OpticsRenderer(small_optics, film).render_picture(pattern, 0.0)
 
 
 @pytest.mark.parametrize(

@@ -91,7 +91,7 @@ def test_each_frame_is_taken_at_its_own_displacement(tmp_path: Path, spec: Simul
     assert 0.3 < (readings - displacement_um).std() < 2.0
     for frame in (0, 3, 9, 16):
         pattern = moving.patterns[frame]
-        expected = renderer.render(pattern, displacement_um[frame])
+        expected = renderer.render_picture(pattern, displacement_um[frame])
         np.testing.assert_array_equal(_picture(tmp_path, pattern.name), expected)
 
 
