@@ -461,7 +461,7 @@ class LiveReconstructor:
         if errors.is_reference or self._motion is None:
             points = state.points.subset(errors.points)
             self._motion = cycle_motion.CycleMotion.of(
-                self._tracer(readings), points, index, fit.surface, covariance_mm2
+                self._make_tracer(readings), points, index, fit.surface, covariance_mm2
             )
             return none, ""
         changed_mm = self._mm_per_rad * errors.changed_rad
