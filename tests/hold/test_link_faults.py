@@ -96,7 +96,7 @@ async def hold(bench: roles.Bench, spoil: Callable[[], None], config: Config = C
     controller = Controller(config, zernike_projection())
     supervisor = Supervisor(controller, Wiring(bench), cast(RunClock, LoopClock()), 50.0)
     supervisor.tell = run.events.append  # type: ignore[method-assign]
-    supervisor.ask(Command("hold", "test"))
+    supervisor.queue_command(Command("hold", "test"))
     task = asyncio.create_task(supervisor.run(None))
     await asyncio.sleep(BEFORE_S)
     assert not run.faults

@@ -25,7 +25,7 @@ Film = Callable[[Array, Array, float], Array]
 def optics(tmp_path_factory: pytest.TempPathFactory) -> OpticsConfig:
     folder = tmp_path_factory.mktemp("cycle") / "full"
     MovingBench(seed=1, **SIZE | CLEAN).write_reference(folder)  # type: ignore[arg-type]
-    return Figures().of(folder).head.optics
+    return Figures().measure_folder(folder).head.optics
 
 
 def frames_of(world: MovingBench, at_s: float) -> list[NDArray[np.uint8]]:
