@@ -50,7 +50,7 @@ def a_gateway_repeats_the_last_write() -> list[str]:
     def repeat() -> str:
         board.write(command.address, written[-1])
         board.read(sensors.address, sensors.count)
-        stage.bench.drive()
+        stage.bench.drive_actuators()
         return stage.still() if stage.run.now_s > died_s + WATCHDOG_S + 3 * TICK_S else ""
 
     stage.wait(5.0, repeat)
@@ -92,7 +92,7 @@ def a_stranger_writes_the_command() -> list[str]:
         before = stage.plant.pump_given
         with contextlib.suppress(RegisterRefusal):
             stage.bench.board.write(command.address, command.encode(values | {"heartbeat": number}))
-        stage.bench.drive()
+        stage.bench.drive_actuators()
         stage.must(stage.plant.pump_given == before, "a stranger's command arrives")
     return stage.violations
 
@@ -125,7 +125,7 @@ def faults_are_cleared_and_the_pump_stands() -> list[str]:
     stage.wait(2.0)
     stage.bench.open()
     stage.bench.clear_faults(0xFFFF)
-    stage.bench.drive()
+    stage.bench.drive_actuators()
     stage.must(not stage.still(), "clearing the faults starts the pump")
     stage.bench.power_cycle()
     stage.must(not stage.still(), "the pump runs after a restart of the board")
@@ -204,7 +204,7 @@ def anybody_may_stop_the_pump() -> list[str]:
         other = another_client(stage)
         at_once(other.identify())
         at_once(other.stop())
-        stage.bench.drive()
+        stage.bench.drive_actuators()
         stage.wait(60.0, stage.still)
         stage.must(stage.state == State.FAULT, "the hold does not notice that it was stopped")
         if stage.violations:

@@ -70,7 +70,7 @@ class BoardOnALine:
         self.virtual.advance(now_s - self._at_s)
         self._at_s = now_s
         reply = answer_request(pdu, self.virtual.board)
-        self.virtual.drive()
+        self.virtual.drive_actuators()
         return reply
 
 
@@ -95,7 +95,7 @@ async def hold(bench: roles.Bench, spoil: Callable[[], None], config: Config = C
     await bench.open()
     controller = Controller(config, zernike_projection())
     supervisor = Supervisor(controller, Wiring(bench), cast(RunClock, LoopClock()), 50.0)
-    supervisor.tell = run.events.append  # type: ignore[method-assign]
+    supervisor.record_event = run.events.append  # type: ignore[method-assign]
     supervisor.queue_command(Command("hold", "test"))
     task = asyncio.create_task(supervisor.run(None))
     await asyncio.sleep(BEFORE_S)
