@@ -13,16 +13,12 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
+from membrane_ctrl.model import program
 from membrane_ctrl.model.arrays import FloatArray
 from membrane_ctrl.model.files import read_bytes, write_bytes_atomic, write_text_atomic
 
 if TYPE_CHECKING:  # matplotlib takes a second to load
     from matplotlib.figure import Figure
-
-
-# Uncertainty of a measured height without trials: every part is linear
-# (`metrology.uncertainty.budget`), some hundred solutions of thinned points. The Monte Carlo of the
-# `uncertainty` command agrees within 10 %.
 
 _ARRAYS_BYTES = 100_000_000
 
@@ -33,9 +29,10 @@ def write_json(path: Path, table: dict[str, Any]) -> None:
 
 
 def write_arrays(path: Path, **arrays: NDArray[Any]) -> None:
-    """Write an `.npz`. Raises OSError."""
+    """Write an `.npz`, with its origin as one more array. Raises OSError."""
     file = io.BytesIO()
-    np.savez(file, allow_pickle=False, **arrays)
+    origin = program.describe_origin(f"membrane-{path.stem}/1")
+    np.savez(file, allow_pickle=False, origin=np.array(origin), **arrays)
     write_bytes_atomic(path, file.getvalue())
 
 

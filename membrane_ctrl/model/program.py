@@ -5,6 +5,7 @@ source archive carries the commit in `BUILD_FILE`, which the build writes (`setu
 checkout, git describes it. The commit of any other folder is empty.
 """
 
+import json
 import os
 import re
 import subprocess
@@ -46,6 +47,11 @@ def file_origin(schema: str) -> dict[str, str]:
     that wrote it.
     """
     return {"schema": schema, "program": f"{NAME} {__version__}", "commit": program_commit()}
+
+
+def describe_origin(schema: str) -> str:
+    """`file_origin` as one line of JSON, for a file of arrays."""
+    return json.dumps(file_origin(schema))
 
 
 def remove_origin(table: dict[str, Any], schema: str) -> None:

@@ -40,7 +40,9 @@ def test_every_frame_has_a_figure(demo: Path, capsys: pytest.CaptureFixture[str]
     assert table["verdicts"] == {"ok": FRAMES, "degraded": 0, "rejected": 0}, table["reasons"]
     assert table["stepped"]
     with np.load(demo / "track/result/track.npz", allow_pickle=False) as found:
+        assert json.loads(str(found["origin"]))["schema"] == "membrane-track/1"
         assert set(found) == {
+            "origin",
             "time_s",
             "coeffs_um",
             "sigma_um",

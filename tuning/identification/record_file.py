@@ -9,7 +9,7 @@ from pathlib import Path
 
 import numpy as np
 
-from membrane_ctrl.model import errors, files
+from membrane_ctrl.model import errors, files, program
 from tuning.identification.record import COLUMNS, Record
 
 _BYTES_MAX = 200_000_000  # four columns of a day at 50 Hz are 140 MB
@@ -34,7 +34,11 @@ def save_record(path: Path, record: Record) -> None:
     file = io.BytesIO()
     columns = {name: getattr(record, name) for name in COLUMNS}
     np.savez_compressed(
-        file, dt_s=np.float64(record.dt_s), sha256=np.array(record.sha256()), **columns
+        file,
+        origin=np.array(program.describe_origin("membrane-tuning-record/1")),
+        dt_s=np.float64(record.dt_s),
+        sha256=np.array(record.sha256()),
+        **columns,
     )
     files.write_bytes_atomic(files.resolve_user_path(path), file.getvalue())
 

@@ -12,7 +12,7 @@ import tomli_w
 
 from firmware_iface import roles, settings
 from membrane_ctrl.model.arrays import FloatArray
-from membrane_ctrl.model.program import file_origin
+from membrane_ctrl.model.program import describe_origin, file_origin
 from membrane_ctrl.sim.optics.camera import OpticsRenderer
 from membrane_ctrl.sim.optics.drum_modes import drum_modes
 from membrane_ctrl.sim.optics.screen_face import project_onto_face
@@ -94,7 +94,10 @@ def write_truth(folder: Path, spec: SimulationSpec) -> None:
     }
     if coeffs_um is not None:
         maps["coeffs_um"] = coeffs_um
-    np.savez_compressed(folder / "truth.npz", displacement_um=displacement_um, **maps)
+    origin = np.array(describe_origin("membrane-truth/1"))
+    np.savez_compressed(
+        folder / "truth.npz", origin=origin, displacement_um=displacement_um, **maps
+    )
     film = {name: value for name, value in asdict(spec.film).items() if name != "terms"}
     truth = {
         **file_origin("membrane-simulation/1"),
@@ -269,7 +272,9 @@ def simulate_track(
         truth["coeffs_um"] = np.array(coeffs)
     if renderer.modes:
         truth["drum_um"] = np.stack([mode.swing_um(time_s) for mode in renderer.modes], axis=1)
-    np.savez_compressed(target / "truth.npz", **truth)
+    np.savez_compressed(
+        target / "truth.npz", origin=np.array(describe_origin("membrane-truth/1")), **truth
+    )
 
 
 def _anchor_specification(spec: SimulationSpec) -> SimulationSpec:
