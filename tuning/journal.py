@@ -8,11 +8,12 @@ from pathlib import Path
 from typing import Literal
 
 from membrane_ctrl.config.schema import LoopConfig
-from membrane_ctrl.model import errors, files, plain_json
+from membrane_ctrl.model import errors, files, plain_json, program
 from membrane_ctrl.sessions import folder as plain
 from tuning.identification import loop_figures
 
 _FILE = "journal.jsonl"
+_SCHEMA = "membrane-tuning-journal/1"
 What = Literal["kept", "taken_back", "rolled_back", "saved"]
 
 
@@ -76,7 +77,8 @@ def append_entry(logs: Path, what: GainsEntry) -> None:
     path = logs / "tuning" / _FILE
     with errors.convert_write_errors(path):
         files.make_folder(path.parent)
-        files.append_text(path, json.dumps(plain.to_plain(what), allow_nan=False) + "\n")
+        line = {**program.file_origin(_SCHEMA), **plain.to_plain(what)}
+        files.append_text(path, json.dumps(line, allow_nan=False) + "\n")
         files.sync_data(path)
 
 
@@ -94,8 +96,10 @@ def read_entries(logs: Path) -> list[GainsEntry]:
     found: list[GainsEntry] = []
     for line in text.splitlines():
         try:
-            found.append(plain.build_value(GainsEntry, plain_json.loads(line)))
-        except (ValueError, TypeError, KeyError):
+            table = plain_json.loads(line)
+            program.remove_origin(table, _SCHEMA)
+            found.append(plain.build_value(GainsEntry, table))
+        except (ValueError, TypeError, KeyError, AttributeError):
             continue
     return found
 
