@@ -16,7 +16,7 @@ back before the answer (local echo of an RS-485 adapter), and a valid answer com
 
 import asyncio
 import re
-from collections import defaultdict
+from collections import defaultdict, deque
 from collections.abc import Awaitable, Callable
 from dataclasses import dataclass
 
@@ -40,6 +40,7 @@ _FAILURES_MAX = 5
 # the memory
 _EXTRA_BYTES_MAX = 4096
 _SHOWN_CHARS = 60
+_ABANDONED_MAX = 4  # questions whose late answers are recognised
 _LINE_ENDS = b"\r\n"
 
 
@@ -95,7 +96,8 @@ class SerialExchange:
         self._heard = b""
         self._question: Question | None = None  # the last one
         self._answer: asyncio.Future[bytes] | None = None
-        self._abandoned: _Abandoned | None = None  # the last question without an answer in time
+        # the last questions without a valid answer in time, oldest first
+        self._abandoned: deque[_Abandoned] = deque(maxlen=_ABANDONED_MAX)
         # the last question that was answered by its own bytes; the same bytes once more are the
         # device's answer after an echo
         self._repeated = b""
@@ -112,7 +114,8 @@ class SerialExchange:
         self._sure.clear()
         self._failures = 0
         self._noisy = True
-        self._abandoned, self._repeated, self._echoes = None, b"", False
+        self._abandoned.clear()
+        self._repeated, self._echoes = b"", False
         self._last_byte_s = asyncio.get_running_loop().time()
         if greeting:
             self.port.write(greeting)
@@ -210,10 +213,13 @@ class SerialExchange:
         if not answer.done():
             if self._heard == question.data:
                 raise DeviceRefusedError(f"{question.what}: {_ONLY_ECHO}")
-            self._abandoned = _Abandoned(question, asked_s, self._heard)
+            self._abandoned.append(_Abandoned(question, asked_s, self._heard))
             raise LinkError(f"{question.what}: {self._missing(timeout_s)}")
+        if answer.exception() is not None:  # its own answer may still come
+            self._abandoned.append(_Abandoned(question, asked_s, b""))
+            return answer.result()
         self._late.note_in_time()
-        self._abandoned = None
+        self._abandoned.clear()
         heard = answer.result()
         self._repeated = question.data if self._heard == question.data else b""
         return heard
@@ -277,20 +283,18 @@ class SerialExchange:
 
     def _completes_abandoned(self, data: bytes) -> bool:
         """Whether these bytes complete the answer to an abandoned question; notes its delay."""
-        abandoned = self._abandoned
-        if abandoned is None:
-            return False
-        abandoned.heard = (abandoned.heard + data)[-_EXTRA_BYTES_MAX:]
-        try:
-            answer = abandoned.question.take(abandoned.heard)
-        except LinkError:
-            self._abandoned = None
-            return False
-        if answer is None:
-            return False
-        self._late.note_late(self._last_byte_s - abandoned.asked_s)
-        self._abandoned = None
-        return True
+        for abandoned in self._abandoned:
+            abandoned.heard = (abandoned.heard + data)[-_EXTRA_BYTES_MAX:]
+            try:
+                answer = abandoned.question.take(abandoned.heard)
+            except LinkError:  # the answer to another one
+                abandoned.heard = b""
+                continue
+            if answer is not None:
+                self._late.note_late(self._last_byte_s - abandoned.asked_s)
+                self._abandoned.remove(abandoned)
+                return True
+        return False
 
     def lost(self, error: LinkDownError) -> None:
         """The line is gone (called by the port)."""

@@ -63,7 +63,8 @@ def check(context: TickContext) -> State:
     gone = not context.now_s - context.last_good_s <= context.config.limits.stale_s
     good_s = context.measure_good_time_s(not gone)
     if context.state_age_s > context.config.states.check_timeout_s + context.observer.waited_s:
-        why = missing.text or "readings come and go, or the actuator test is not done"
+        unsteady = "readings come and go, or the actuator test is not done"
+        why = missing.text or _explain_slow_link(context) or unsteady
         context.overdue = (
             f"sensors still not good after {context.config.states.check_timeout_s:g} s: {why}"
         )
@@ -440,6 +441,14 @@ def _make_loop_input(context: TickContext, target_um: float) -> inner_loop.LoopI
         air_temperature_c=reading.air_temperature_c if reading else math.nan,
         estimate=context.estimate,
     )
+
+
+def _explain_slow_link(context: TickContext) -> str:
+    """That the ticks wait for the devices too long to check anything; empty if they do not."""
+    link = context.observer.link
+    if link.wait_ms <= context.config.limits.lateness_max_ms:
+        return ""
+    return f"the last tick had {link.explain_wait()}, whose answers are late"
 
 
 def _list_missing_checks(context: TickContext) -> Reason:

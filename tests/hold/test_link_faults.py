@@ -89,20 +89,25 @@ class Run:
         return [event for event in self.events if isinstance(event, Link | SensorLink)]
 
 
-async def hold(bench: roles.Bench, spoil: Callable[[], None], config: Config = CONFIG) -> Run:
+async def hold(
+    bench: roles.Bench,
+    spoil: Callable[[], None],
+    before_s: float = BEFORE_S,
+    after_s: float = AFTER_S,
+) -> Run:
     """Run a hold, spoil its line, and return what followed."""
     run = Run()
     await bench.open()
-    controller = Controller(config, zernike_projection())
+    controller = Controller(CONFIG, zernike_projection())
     supervisor = Supervisor(controller, Wiring(bench), cast(RunClock, LoopClock()), 50.0)
     supervisor.record_event = run.events.append  # type: ignore[method-assign]
     supervisor.queue_command(Command("hold", "test"))
     task = asyncio.create_task(supervisor.run(None))
-    await asyncio.sleep(BEFORE_S)
+    await asyncio.sleep(before_s)
     assert not run.faults
     run.events.clear()
     spoil()
-    await asyncio.sleep(AFTER_S)
+    await asyncio.sleep(after_s)
     task.cancel()
     await asyncio.gather(task, return_exceptions=True)
     await bench.close()
@@ -110,11 +115,15 @@ async def hold(bench: roles.Bench, spoil: Callable[[], None], config: Config = C
 
 
 def hold_board(
-    spoil: Callable[[BoardOnALine], None], timeout_s: float = 0.2, watchdog_s: float = 0.5
+    spoil: Callable[[BoardOnALine], None],
+    timeout_s: float = 0.2,
+    watchdog_s: float = 0.5,
+    before_s: float = BEFORE_S,
+    after_s: float = AFTER_S,
 ) -> Run:
     async def run() -> Run:
         board = BoardOnALine(timeout_s, watchdog_s)
-        return await hold(board.bench, partial(spoil, board))
+        return await hold(board.bench, partial(spoil, board), before_s, after_s)
 
     return run_virtual(run())
 
@@ -129,6 +138,12 @@ def test_late_replies_that_are_awaited_are_a_slow_link() -> None:
     assert [fault.name for fault in run.faults] == ["link_slow"]
     assert "this machine is not the cause" in run.faults[0].remedy
     assert "of waiting for the device" in run.faults[0].seen
+
+
+def test_late_replies_keep_the_sensors_from_being_checked() -> None:
+    run = hold_board(be_late, timeout_s=0.5, watchdog_s=5.0, before_s=0.2, after_s=20.0)
+    assert [fault.name for fault in run.faults] == ["overdue"]
+    assert "ms of waiting for the device" in run.faults[0].seen
 
 
 def test_a_watchdog_that_late_replies_starve_is_the_links_fault() -> None:
@@ -155,6 +170,7 @@ def test_a_stopped_program_is_not_a_slow_link() -> None:
 def test_replies_after_the_time_out_are_named_with_their_delay() -> None:
     run = hold_board(be_late)
     assert run.faults[0].name in ("no_answer", "device_silent")
+    assert "answers come late, the last one 0.3" in run.faults[-1].seen
     assert any("answers come late, the last one 0.3" in event.message for event in run.links)
 
 
