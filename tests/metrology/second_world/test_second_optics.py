@@ -10,6 +10,7 @@ import cv2
 import numpy as np
 import pytest
 
+from membrane_ctrl.measure.track import read_track
 from tests.studies.second_world_errors import drawn_points_mm, measured_errors
 from tests.worlds import second_optics
 from tests.worlds.second_optics import (
@@ -150,3 +151,16 @@ def test_a_set_on_disk_has_the_documented_names(mirror: Mirror, tmp_path: Path) 
     World(mirror, Bench.paper(0.05)).write_set(tmp_path / "set")
     for picture in full_set():
         assert cv2.imread(str(tmp_path / "set" / f"{picture.name}.png"), 0) is not None
+
+
+def test_a_tracking_set_is_one_that_the_product_reads(mirror: Mirror, tmp_path: Path) -> None:
+    world = World(mirror, Bench.paper(0.05))
+    world.write_set(tmp_path / "full")
+    displacements_um = world.write_track(tmp_path / "track", tmp_path / "full", 7, begin_s=5.0)
+    content = read_track(tmp_path / "track")
+    assert content.reference == "../full"
+    assert [frame.time_s for frame in content.frames[:2]] == pytest.approx([5.0, 5.12])
+    shifts_rad = [(frame.shift_x_rad, frame.shift_y_rad) for frame in content.frames]
+    assert shifts_rad[1] == pytest.approx((2 * np.pi / 5, 4 * np.pi / 5))
+    assert shifts_rad[5:] == [(0.0, 0.0), (0.0, 0.0)]
+    assert displacements_um.tolist() == [0.0] * 7
