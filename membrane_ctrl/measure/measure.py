@@ -14,10 +14,13 @@ from membrane_ctrl.measure import figure_report, figure_results, results
 from membrane_ctrl.measure.measurement import Measurement, measure_set
 from membrane_ctrl.measure.sofast_command import check_sofast_file
 from membrane_ctrl.metrology.figure.radial_profile import RadialProfile, radial_profile
+from membrane_ctrl.metrology.frame_checks.checked_set import Checked
 from membrane_ctrl.metrology.rays.rim_outline import Outline, find_outline
 from membrane_ctrl.model import errors
 from membrane_ctrl.model.arrays import FloatArray
 
+_NOT_LINEAR = 0.1  # of the response's exponent
+_UNEVEN = 0.1  # of the light
 _NAMED = 4  # inputs that contribute most
 
 
@@ -98,6 +101,30 @@ def _name_lens_fold(measurement: Measurement, reason: str, explains: bool) -> st
     return f"{fold}; it shows as: {reason}" if explains else f"{reason}; {fold}"
 
 
+def _describe_light(checked: Checked | None) -> list[str]:
+    """What the frames show of panel and camera, where it differs from an ideal one."""
+    if checked is None:
+        return []
+    lines = []
+    held, response = checked.held, checked.response
+    if held.corrected:
+        lines.append(
+            f"panel     each frame showed {held.share:.2%} +- {held.sigma:.2%} of the previous "
+            "picture, which was taken out: wait longer before each frame"
+        )
+    if abs(response.exponent - 1) > _NOT_LINEAR:
+        lines.append(
+            f"response  panel and camera together: counts rise as level^{response.exponent:.2f}"
+        )
+    if max(abs(response.edge_loss), response.side_loss) > _UNEVEN:
+        lines.append(
+            f"light     {response.edge_loss:.0%} less at the mirror's edge than in its middle, "
+            f"{response.side_loss:.0%} less from side to side: the panel's viewing angle, or the "
+            "lens; it changes no phase"
+        )
+    return lines
+
+
 def light_and_rim(measurement: Measurement) -> tuple[FloatArray, Outline | None]:
     """Light of the picture in bins, and the rim found in it."""
     checked, optics = measurement.checked, measurement.head.optics
@@ -159,12 +186,7 @@ def _format_measurement(
         f"{full.fit.changes_mm[-1]:.1e} mm, "
         f"{np.count_nonzero(full.weights)} pixels",
     ]
-    held = None if measurement.checked is None else measurement.checked.held
-    if held is not None and held.corrected:
-        lines.append(
-            f"panel     each frame showed {held.share:.2%} +- {held.sigma:.2%} of the previous "
-            "picture, which was taken out: wait longer before each frame"
-        )
+    lines += _describe_light(measurement.checked)
     if outline is not None:
         rim = bars.statement.rim
         sigmas = "" if rim is None else f", {rim.sigmas:.1f} sigma of the stated geometry"

@@ -213,6 +213,17 @@ def details_table(
             "sigma": number_or_null(held.sigma),
             "taken_out": held.corrected,
         }
+        response, second = measurement.checked.response, measurement.checked.second
+        table["response_exponent"] = number_or_null(response.exponent)
+        table["light_loss"] = {
+            "edge": number_or_null(response.edge_loss),
+            "side": number_or_null(response.side_loss),
+        }
+        table["second_image"] = {
+            "share": number_or_null(second.share),
+            "sigma": number_or_null(second.sigma),
+            "shift_mm": [number_or_null(second.mm_per_rad * s) for s in second.shift_rad],
+        }
         table["clip_levels_adu"] = {"white": clip.white_adu, "black": black_adu}
     if full is not None:
         residual_um = 1e3 * full.residual_mm[np.isfinite(full.residual_mm)]

@@ -55,6 +55,7 @@ OWN_ROWS = (
     "noise_adu",
     "held_share",
     "moment_um",
+    "second_image",
 )
 FRAMES = 18
 DISC = 0.95  # analysis radius over the ring's
@@ -224,6 +225,7 @@ PLANTS = (
     ),
     Plant(
         OWN_ROWS,
+        ("second_image",),
         "second reflection of 1 %, 12 and 5 mm beside the first",
         effects=lambda _: replace(STILL, panel=Panel(ghost=Ghost(0.01))),
     ),

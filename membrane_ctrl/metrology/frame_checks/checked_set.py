@@ -6,7 +6,14 @@ from dataclasses import dataclass
 import numpy as np
 
 from membrane_ctrl.config.schema import OpticsConfig
-from membrane_ctrl.metrology.frame_checks import band_removal, bin_view, frame_faults, held_light
+from membrane_ctrl.metrology.frame_checks import (
+    band_removal,
+    bin_view,
+    frame_faults,
+    held_light,
+    light_response,
+    second_reflection,
+)
 from membrane_ctrl.metrology.phase import frame_stack
 from membrane_ctrl.metrology.rays import ray_tracing
 from membrane_ctrl.metrology.reconstruction import tracked_points
@@ -39,6 +46,8 @@ class Checked:
     film_noise_um: float  # 1 sigma of each of these places
     light_left: float  # RMS of their light, relative, that the phases do not know of
     held: held_light.HeldLight = held_light.UNKNOWN  # of the previous picture in each frame
+    second: second_reflection.SecondReflection = second_reflection.UNKNOWN
+    response: light_response.LightResponse = light_response.UNKNOWN
 
     @property
     def verdict(self) -> tuple[Verdict, str]:
@@ -48,9 +57,14 @@ class Checked:
                 "degraded",
                 f"{len(self.flags)} frame(s) flagged; the figure excludes the affected data",
             )
-        bands = band_removal.describe_bands(self.stack.gain)
-        doubts = [each for each in (bands, held_light.describe_held_light(self.held)) if each]
-        return ("degraded", "; ".join(doubts)) if doubts else ("ok", "")
+        doubts = (
+            band_removal.describe_bands(self.stack.gain),
+            held_light.describe_held_light(self.held),
+            second_reflection.describe_second_reflection(self.second),
+            light_response.describe_response(self.response),
+        )
+        reason = "; ".join(doubt for doubt in doubts if doubt)
+        return ("degraded", reason) if reason else ("ok", "")
 
     def places_px(self, index: IntArray) -> FloatArray:
         """Column and row (2, n) of bins' centres."""

@@ -39,6 +39,7 @@ _FLOOR = 3e-5
 # Each round finds nine tenths of the rest, since the light that it compares with has its share, too
 ROUNDS = 5
 _KNOWN = 2e-5
+_UNKNOWN_SIGMA = 0.03  # a share that is not better known is no estimate
 _GREAT_SHARE = 0.05  # beyond, what the correction leaves is no longer small
 
 
@@ -95,6 +96,8 @@ def estimate_held_light(
     sigma = math.hypot(rise_sigma, fall_sigma) / math.sqrt(2)
     if len(found[0]) == 1:  # no scatter: only their difference shows whether they are true
         sigma = math.hypot(sigma, rise - fall)
+    if sigma > _UNKNOWN_SIGMA:
+        return UNKNOWN
     return HeldLight(rise, fall, math.hypot(sigma, _FLOOR))
 
 

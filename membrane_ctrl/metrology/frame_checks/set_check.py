@@ -21,7 +21,9 @@ from membrane_ctrl.metrology.frame_checks import (
     frame_faults,
     frame_inspection,
     held_light,
+    light_response,
     picture_orientation,
+    second_reflection,
 )
 from membrane_ctrl.metrology.frame_checks.bin_orders import absolute_phases_of_bins, confirm_orders
 from membrane_ctrl.metrology.frame_checks.checked_set import (
@@ -247,6 +249,18 @@ def _check_rounds(
                     np.mean(np.square(left[:, [k for axis in attempt.view.used for k in axis]]))
                 )
             )
+            second = second_reflection.find_second_reflection(
+                stack, binned, attempt.scene, excluded, optics.pattern
+            )
+            place = np.array(attempt.tracer.position_mm(attempt.state.points))
+            response = light_response.estimate_response(
+                stack,
+                binned,
+                attempt.state.index,
+                place / optics.mirror.radius_mm,
+                excluded,
+                attempt.view.used,
+            )
             return Checked(
                 stack,
                 binned,
@@ -256,6 +270,8 @@ def _check_rounds(
                 noise_um,
                 light_left,
                 held,
+                second,
+                response,
             )
         pair = next((flag for flag in fresh if flag.swapped_with is not None), None)
         if (

@@ -316,10 +316,11 @@ class ErrorWatch:
             w[0] @ sums[:, state.index] for w, sums in zip(self._weights, cycle.sums, strict=True)
         ]
         light = np.stack(levels) / self._bin_px**2 / state.fresh[:, 4]
-        phases = np.full((2, self._places_px.shape[1]), np.nan)
-        phases[:, state.index] = state.fresh[:, 0]
+        scale = screen_scale.mm_per_rad(self._optics.pattern)
+        predicted_rad = tracer.predict_screen(state.points, fit.surface) / scale
+        swings = state.fresh[:, 4]
         blur_px = image_blur.estimate_blur_px(
-            phases.reshape(2, *self._shape), 1 / light, state.index, self._bin_px
+            predicted_rad, swings, state.index, self._shape, self._bin_px
         )
         places_px, width_px = self._places_px[:, state.index], self._optics.camera.width_px
         many = np.flatnonzero(trial_bench.spread_evenly(places_px, width_px, _WAVE_POINTS))

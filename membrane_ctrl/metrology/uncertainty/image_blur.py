@@ -29,33 +29,49 @@ def blur_source(bench: TrialBench, sigma_px: float) -> Source:
 
 
 def estimate_blur_px(
-    phase_rad: FloatArray, contrasts: FloatArray, index: IntArray, bin_px: int
+    predicted_rad: FloatArray,
+    swings: FloatArray,
+    index: IntArray,
+    shape: tuple[int, int],
+    bin_px: int,
 ) -> float:
     """Width of the blur, a Gauss's sigma in pixels: the contrast falls with the fringes' frequency.
 
-    log(swing / light) = const - sigma^2 |grad phase|^2 / 2, for x and y each with its own constant.
-    A bin of m pixels is itself a blur of (m^2 - 1) / 12.
+    A blur divides the swing of fringes by exp(sigma^2 |grad phase|^2 / 2), so that
+
+        log(swing_x / swing_y) = const - sigma^2 (|grad phase_x|^2 - |grad phase_y|^2) / 2.
+
+    Whatever acts on the light of a place in the same way for x and y cancels: a panel that is
+    darker or has less contrast at an angle, vignetting, stray light, the responses of panel and
+    camera. A bin of m pixels is itself a blur of (m^2 - 1) / 12.
 
     Parameters
     ----------
-    phase_rad : (2, rows, columns) array
-        Phases of x and y of the bins; NaN where unknown.
-    contrasts : (2, n) array
-        Swing over light of some bins.
+    predicted_rad : (2, n) array
+        Phases of x and y of some bins by the fitted surface. Measured ones have the waves of the
+        responses' harmonics, which the swings have, too.
+    swings : (2, n) array
+        Swings of their fringes.
     index : (n,) int array
         Those bins.
+    shape : two int
+        Rows and columns of the bins.
     bin_px : int
         Side of a bin.
     """
-    slopes, contrasts_left = [], []
-    for axis in range(2):
-        steep = (
-            np.sum(np.square(np.gradient(phase_rad[axis])), axis=0).reshape(-1)[index] / bin_px**2
-        )
-        contrast = np.log(contrasts[axis])
-        known = np.isfinite(steep) & np.isfinite(contrast)
-        slopes.append(steep[known] - steep[known].mean())
-        contrasts_left.append(contrast[known] - contrast[known].mean())
-    steep, contrast = np.concatenate(slopes), np.concatenate(contrasts_left)
-    square = -2 * float(steep @ contrast) / max(float(steep @ steep), 1e-300) - (bin_px**2 - 1) / 12
-    return math.sqrt(max(square, 0.0))
+    steep = []
+    for phase in predicted_rad:
+        grid = np.full(shape, np.nan)
+        grid.reshape(-1)[index] = phase
+        square = np.sum(np.square(np.gradient(grid)), axis=0)
+        steep.append(square.reshape(-1)[index] / bin_px**2)
+    steeper = steep[0] - steep[1]
+    with np.errstate(divide="ignore", invalid="ignore"):
+        contrast = np.log(swings[0]) - np.log(swings[1])
+    known = np.isfinite(steeper) & np.isfinite(contrast)
+    if not known.any():
+        return 0.0
+    steeper = steeper[known] - steeper[known].mean()
+    contrast = contrast[known] - contrast[known].mean()
+    slope = float(steeper @ contrast) / max(float(steeper @ steeper), 1e-300)
+    return math.sqrt(max(-2 * slope - (bin_px**2 - 1) / 12, 0.0))

@@ -12,6 +12,7 @@ from membrane_ctrl.metrology.figure.set_motion import (
     FilmMotion,
 )
 from membrane_ctrl.metrology.frame_checks.checked_set import Checked
+from membrane_ctrl.metrology.phase import screen_scale
 from membrane_ctrl.metrology.rays.rim_outline import Outline
 from membrane_ctrl.metrology.uncertainty import (
     bench_sources,
@@ -27,6 +28,7 @@ from membrane_ctrl.metrology.uncertainty.held_light_error import held_light_sour
 from membrane_ctrl.metrology.uncertainty.image_blur import estimate_blur_px
 from membrane_ctrl.metrology.uncertainty.laser_errors import vertex_um
 from membrane_ctrl.metrology.uncertainty.rim_check import RimMisfit, measure_rim_misfit
+from membrane_ctrl.metrology.uncertainty.second_reflection_error import second_reflection_source
 from membrane_ctrl.metrology.uncertainty.set_moment import moment_source
 from membrane_ctrl.metrology.uncertainty.slope_misfit import SlopeMisfit, measure_slope_misfit
 from membrane_ctrl.metrology.uncertainty.trial_bench import TrialBench
@@ -85,7 +87,7 @@ def assemble_budget(
     sigmas = optics.geometry.sigmas or SigmasConfig()
     moved = FilmMotion.of(checked)
     film, doubts = _film_source(bench, spread, moved)
-    blur = image_blur.blur_source(bench, _blur_px(checked))
+    blur = image_blur.blur_source(bench, _blur_px(optics, checked))
     disc = optics.mirror.analysis_radius_mm / optics.mirror.radius_mm
     if budget.Budget((blur,), disc).total()["height_rms_um"] > _BLUR_UM:
         doubts.append(f"the picture is blurred by {blur.sigma:.1f} px (1 sigma): focus the camera")
@@ -107,16 +109,21 @@ def assemble_budget(
             _film_um(moved),
             math.hypot(frame_effects.LIGHT, checked.light_left),
         ),
+        second_reflection_source(bench, checked.second),
         held_light_source(bench, checked.stack, checked.view.used, checked.held),
         *residual_patches.pixel_sources(full, slope_variance, noise_adu),
     ]
     return SetBudget(budget.Budget(tuple(sources), disc), tuple(doubts), rim, slopes)
 
 
-def _blur_px(checked: Checked) -> float:
-    index, light = checked.state.index, checked.view.light.reshape(-1)
-    contrasts = checked.view.swing_adu.reshape(2, -1)[:, index] / light[index]
-    return estimate_blur_px(checked.phase_rad, contrasts, index, checked.binned.bin_px)
+def _blur_px(optics: OpticsConfig, checked: Checked) -> float:
+    state, shape = checked.state, checked.phase_rad.shape[1:]
+    screen_mm = checked.tracer.predict_screen(state.points, state.surface)
+    predicted_rad = screen_mm / screen_scale.mm_per_rad(optics.pattern)
+    swings = checked.view.swing_adu.reshape(2, -1)[:, state.index]
+    return estimate_blur_px(
+        predicted_rad, swings, state.index, (shape[0], shape[1]), checked.binned.bin_px
+    )
 
 
 def _vertex_source(

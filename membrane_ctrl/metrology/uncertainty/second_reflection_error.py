@@ -1,0 +1,45 @@
+"""Error of the figure by a second image of the screen."""
+
+import math
+
+import numpy as np
+
+from membrane_ctrl.metrology.frame_checks.second_reflection import HIDDEN_RAD, SecondReflection
+from membrane_ctrl.metrology.phase import screen_scale
+from membrane_ctrl.metrology.uncertainty.budget import Source
+from membrane_ctrl.metrology.uncertainty.trial_bench import TrialBench
+from membrane_ctrl.model.arrays import FloatArray
+
+_SAYS = "second image of the screen, by another reflecting surface"
+# Of the smallest share that is found, in sigmas; the RMS of the sine of an unknown place
+_HIDDEN_SIGMAS = 3.0
+_RMS_SINE = 0.7
+
+
+def second_reflection_source(bench: TrialBench, seen: SecondReflection) -> Source:
+    """Return the row of the budget: what was found, or what may hide in the noise.
+
+    A set that cannot show a second image has a row of 0.
+    """
+    sigma = seen.sigma if math.isfinite(seen.sigma) else 0.0
+    share = seen.share if seen.found else _HIDDEN_SIGMAS * sigma
+    scale = screen_scale.mm_per_rad(bench.optics.pattern)
+    effects = []
+    for axis in range(2):
+        off = np.zeros_like(bench.screen_mm)
+        off[axis] = scale * share * _phase_error(bench.screen_mm[axis] / scale, seen, axis)
+        solved = bench.solve(bench.geometry(), off, linear=True)
+        effects.append(solved - bench.surface.parameters)
+    if seen.found:  # one image: its effects on x and y belong together
+        effects = [effects[0] + effects[1]]
+    return Source("second_image", _SAYS, share, np.stack(effects, axis=1))
+
+
+def _phase_error(phase: FloatArray, seen: SecondReflection, axis: int) -> FloatArray | float:
+    """Error of the phase over the share; `phase` (n,) is counted from the pattern's middle."""
+    if not seen.found:
+        return _RMS_SINE
+    shift = seen.shift_rad[axis]
+    if not math.isfinite(shift):
+        return math.sin(HIDDEN_RAD)
+    return np.asarray(np.sin((seen.scale[axis] - 1) * phase + shift))
