@@ -75,8 +75,9 @@ def describe_response(found: LightResponse) -> str:
     if not found.exponent < _LEAST_EXPONENT:
         return ""
     return (
-        f"the camera's response is not linear: its counts rise about as light^{found.exponent:.2f}: "
-        "switch its gamma off (or the panel, which was linear, is corrected)"
+        "the camera's response is not linear: its counts rise about as "
+        f"light^{found.exponent:.2f}: switch its gamma off (or the panel, which was linear, is "
+        "corrected)"
     )
 
 

@@ -25,7 +25,7 @@ from membrane_ctrl.metrology.phase.gray_code import gray_bit
 from membrane_ctrl.metrology.phase.pattern_sequence import AXES
 from membrane_ctrl.model.arrays import BoolArray, FloatArray
 
-_BINS = 1000
+_BINS = 800
 HIDDEN_RAD = 0.4  # from a Gray bit's edge: blur and the size of a bin
 _SCALES = (1.0, 0.95, 1.05, 0.9, 1.1, 0.75, 1.25, 0.5, 1.5, -0.5, -0.75, -1.0, -1.3)
 _SAME_SCALE = 0.06
@@ -173,22 +173,23 @@ def _compare_places(
     """
     images = _Images(phase, bits, sures, bright, centre_rad)
     found = _score_places(images, _coarse_places(centre_rad), lefts, bases)
-    if not len(found):
+    if not found.size:
         return None
     _, _, _, scale, shift = found[np.argmax(found[:, 0])]
-    near = [(scale, shift + step) for step in np.arange(-_STEP_RAD, _STEP_RAD, _CELL_RAD)]
+    near = [(scale, shift + np.arange(-_STEP_RAD, _STEP_RAD, _CELL_RAD))]
     fine = _score_places(images, near, lefts, bases)
     _, share, power, scale, shift = fine[np.argmax(fine[:, 0])]
+    best = images.at(scale, np.array([shift]))
     # what is left without the best image shows how much chance explains
     without = [
         left - share * _free_of_own(one, basis)
-        for left, one, basis in zip(lefts, images.at(scale, shift), bases, strict=True)
+        for left, one, basis in zip(lefts, best[:, 0], bases, strict=True)
     ]
-    others = _score_places(images, _coarse_places(centre_rad)[::_EVERY], without, bases)
+    others = _score_places(images, _coarse_places(centre_rad, _EVERY), without, bases)
     chance = float(np.median(np.abs(others[:, 0]))) / _CHANCE_MEDIAN
     sigma = math.sqrt(chance / float(np.median(others[:, 2])))
-    mirrored = _score_places(images, [(2 - scale, -shift)], lefts, bases)
-    stray = bool(len(mirrored)) and float(mirrored[0, 1]) > _STRAY_SHARE * float(share)
+    mirrored = _score_places(images, [(2 - scale, np.array([-shift]))], lefts, bases)
+    stray = bool(mirrored.size) and float(mirrored[0, 1]) > _STRAY_SHARE * float(share)
     clear = 0.0 if stray or share < 0 else float(share**2 * power) / max(chance, 1e-30)
     return _Place(float(share), sigma, clear, float(scale), float(shift))
 
@@ -212,12 +213,12 @@ class _Images:
         self._table = np.stack(shown)
         self._bright = bright * np.stack(sures)
 
-    def at(self, scale: float, shift_rad: float) -> FloatArray:
-        """Light (frames, n) of an image of the same brightness as the first."""
-        place = scale * self._phase + shift_rad + self._reach_rad
-        cell = np.rint(place / _CELL_RAD).astype(int)
+    def at(self, scale: float, shifts_rad: FloatArray) -> FloatArray:
+        """Light (frames, shifts, n) of images of the same brightness as the first."""
+        place = scale * self._phase + shifts_rad[:, None] + self._reach_rad
+        cell = np.rint(place / _CELL_RAD).astype(np.int32)
         shown = self._table[:, np.clip(cell, 0, self._table.shape[1] - 1)]
-        return np.asarray(shown * self._bright)
+        return np.asarray(shown * self._bright[:, None])
 
 
 def _white_light(
@@ -231,36 +232,34 @@ def _white_light(
     return scene.light * float(np.median(more.reshape(-1)[scene.index] / scene.light))
 
 
-def _coarse_places(centre_rad: float) -> list[tuple[float, float]]:
-    """Scales and shifts, without those of the first image itself."""
-    shifts = np.arange(-1.5 * centre_rad, 1.5 * centre_rad, _STEP_RAD)
-    return [
-        (scale, float(shift))
-        for scale in _SCALES
-        for shift in shifts
-        if abs(scale - 1) > _SAME_SCALE or abs(shift) > HIDDEN_RAD
-    ]
+def _coarse_places(centre_rad: float, every: int = 1) -> list[tuple[float, FloatArray]]:
+    """Scales with their shifts, without those of the first image itself."""
+    shifts = np.arange(-1.5 * centre_rad, 1.5 * centre_rad, every * _STEP_RAD)
+    apart = shifts[np.abs(shifts) > HIDDEN_RAD]
+    return [(scale, shifts if abs(scale - 1) > _SAME_SCALE else apart) for scale in _SCALES]
 
 
 def _score_places(
     images: _Images,
-    places: list[tuple[float, float]],
+    places: list[tuple[float, FloatArray]],
     lefts: list[FloatArray],
     bases: list[tuple[FloatArray, FloatArray]],
 ) -> FloatArray:
     """Rows (k, 5) of explained power with the share's sign, share, power, scale and shift."""
-    seen, scores = np.stack(lefts), []
-    for scale, shift in places:
-        image = images.at(scale, shift)
-        whole = float(np.sum(image**2))
-        own = sum(
-            float((solve @ one) @ (columns @ one))
-            for one, (columns, solve) in zip(image, bases, strict=True)
-        )
-        power, along = whole - own, float(np.sum(seen * image))
-        if power > _LEAST_DETERMINED * whole + 1e-9:
-            scores.append((along * abs(along) / power, along / power, power, scale, shift))
-    return np.array(scores).reshape(-1, 5)
+    scores = [np.zeros((0, 5))]
+    for scale, shifts in places:
+        image = images.at(scale, shifts)
+        whole = np.sum(image**2, axis=(0, 2))
+        power, along = whole.copy(), np.zeros(shifts.size)
+        for one, left, (columns, solve) in zip(image, lefts, bases, strict=True):
+            power -= np.sum((one @ solve.T) * (one @ columns.T), axis=1)
+            along += one @ left
+        seen = power > _LEAST_DETERMINED * whole + 1e-9
+        power, along, shifts = power[seen], along[seen], shifts[seen]
+        scales = np.full(shifts.size, scale)
+        rows = (along * np.abs(along) / power, along / power, power, scales, shifts)
+        scores.append(np.stack(rows, axis=1))
+    return np.concatenate(scores)
 
 
 def _free_of_own(image: FloatArray, basis: tuple[FloatArray, FloatArray]) -> FloatArray:
