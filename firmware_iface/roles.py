@@ -16,6 +16,14 @@ Clock = Callable[[], float]  # seconds on any monotonic axis
 
 # The mask of `Bench.clear_faults` that clears all latches
 ALL_FAULTS = 0xFFFF
+_ROLE = "role"
+# `BenchReading.displacement_quality` when the sensor itself does not answer; no instrument's code
+NO_ANSWER = 0xFFFF
+# bits of `BenchReading.foreign`
+FOREIGN_CLAIM, FOREIGN_PERIOD = 1, 2
+ACTUATORS = ("pump", "vent")
+# One lost packet destroys a frame; three in a row are not an accident
+TRIES = 3
 
 
 class LinkError(Exception):
@@ -67,21 +75,11 @@ class Role:
     needed: bool = False
 
 
-_ROLE = "role"
-
-
 def _declare_sensor(name: str, reads: str, unit: str, needed: bool = False) -> dict[str, Role]:
     """Return the metadata of a field of `BenchReading` that the sensor of a role fills. Parameters:
     see `Role`.
     """
     return {_ROLE: Role(name, reads, unit, needed)}
-
-
-# `BenchReading.displacement_quality` when the sensor itself does not answer; no instrument's code
-NO_ANSWER = 0xFFFF
-
-# bits of `BenchReading.foreign`
-FOREIGN_CLAIM, FOREIGN_PERIOD = 1, 2
 
 
 @dataclass(frozen=True, slots=True)
@@ -156,7 +154,6 @@ ROLES: dict[str, Role] = {
         *(role for role in SENSORS.values() if not role.needed),
     )
 }
-ACTUATORS = ("pump", "vent")
 
 
 @dataclass(frozen=True, slots=True)
@@ -407,10 +404,6 @@ class Camera(Protocol):
 
     def close(self) -> None:
         """Release the camera."""
-
-
-# One lost packet destroys a frame; three in a row are not an accident
-TRIES = 3
 
 
 class FrameLostError(LinkError):

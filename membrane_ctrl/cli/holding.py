@@ -30,6 +30,7 @@ FlatOption = Annotated[
         "--from-flat", help="Start with a flat simulated mirror; filling it takes two hours."
     ),
 ]
+_WIDTH = 100
 
 
 def add_commands(app: typer.Typer) -> None:
@@ -300,7 +301,6 @@ config_app = typer.Typer(
     rich_markup_mode="markdown",
     help="Explain the keys of a configuration; write a first one.",
 )
-_WIDTH = 100
 
 
 @config_app.command()

@@ -14,6 +14,11 @@ Sigma = Annotated[float, Field(ge=0, le=1e5)]  # of whatever unit; 0: exact
 Axis = Annotated[tuple[Length, ...], Field(min_length=2, max_length=500)]
 
 _DISTORTION_LENGTHS = (0, 4, 5, 8)
+_EVEN = 1e-6  # of the node spacing: rounding of written decimals
+_UNIT, _SQUARE = (
+    1.1e-5,
+    1e-6,
+)  # of the squared length, from rounding to five digits, and of the cosine
 
 
 def _check_distortion(numbers: tuple[float, ...]) -> tuple[float, ...]:
@@ -28,12 +33,6 @@ def _check_distortion(numbers: tuple[float, ...]) -> tuple[float, ...]:
 
 Distortion = Annotated[tuple[Length, ...], AfterValidator(_check_distortion)]
 """Coefficients of a lens: OpenCV's k1, k2, p1, p2[, k3[, k4, k5, k6]]."""
-
-_EVEN = 1e-6  # of the node spacing: rounding of written decimals
-_UNIT, _SQUARE = (
-    1.1e-5,
-    1e-6,
-)  # of the squared length, from rounding to five digits, and of the cosine
 
 
 class HeightMapConfig(Section):

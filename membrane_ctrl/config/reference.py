@@ -55,6 +55,22 @@ _UNITS = {
     "s2": "s2",
     "um": "µm",
 }
+_PAGE = """\
+# Configuration
+
+Made from the schema by `make generate`; do not edit.
+
+The configuration is one TOML file in UTF-8. Omitted keys use their defaults; most benches need only `[devices]`.
+`membrane-ctrl config init` writes a first file, `membrane-ctrl check` checks it, and
+`membrane-ctrl config explain KEY` shows a part of this page.
+
+An editor can complete and check keys. Write the schema beside the file with
+`membrane-ctrl config schema > membrane-ctrl.schema.json`, and make `#:schema ./membrane-ctrl.schema.json` the file's
+first line (taplo, or Even Better TOML in VS Code). The schema knows each key by itself; `check` also compares keys
+with each other and with the devices.
+
+Relative file names start at the configuration's folder. Numbers have a decimal point. The default `none` means that
+the key is absent."""  # noqa: E501
 
 
 @dataclass(frozen=True, slots=True)
@@ -369,21 +385,3 @@ def _make_heading(table: TableHelp) -> str:
         return table.driver
     devices = ", ".join(place.removeprefix("devices.") for place in table.places)
     return f"{table.driver}: {devices}"
-
-
-_PAGE = """\
-# Configuration
-
-Made from the schema by `make generate`; do not edit.
-
-The configuration is one TOML file in UTF-8. Omitted keys use their defaults; most benches need only `[devices]`.
-`membrane-ctrl config init` writes a first file, `membrane-ctrl check` checks it, and
-`membrane-ctrl config explain KEY` shows a part of this page.
-
-An editor can complete and check keys. Write the schema beside the file with
-`membrane-ctrl config schema > membrane-ctrl.schema.json`, and make `#:schema ./membrane-ctrl.schema.json` the file's
-first line (taplo, or Even Better TOML in VS Code). The schema knows each key by itself; `check` also compares keys
-with each other and with the devices.
-
-Relative file names start at the configuration's folder. Numbers have a decimal point. The default `none` means that
-the key is absent."""  # noqa: E501

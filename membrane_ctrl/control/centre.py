@@ -62,6 +62,7 @@ _OPTICS_JUMP_SHARE = 0.3
 _ONE: FloatArray = np.eye(
     _PLANT + CLONES
 )  # a reading's expectation is a sum of states: one of them, as a row
+_STATES = _PLANT + CLONES
 
 
 @dataclass(slots=True)
@@ -74,9 +75,6 @@ class SensorWatch(StateNode):
     pull: float = 0.0  # recent sum of gains on the centre
     far: Count = 0  # readings in a row beyond the outer limit
     far_since_s: float = math.nan
-
-
-_STATES = _PLANT + CLONES
 
 
 @dataclass(slots=True)

@@ -26,6 +26,8 @@ from membrane_ctrl.control.centre_estimate import CentreEstimate
 from membrane_ctrl.control.feedforward import FeedForward, FeedForwardState
 from membrane_ctrl.model.state_tree import StateNode
 
+_AT_TARGET_UM = 0.1  # of the ramp: the pump is probed only then
+
 
 @dataclass(frozen=True, slots=True)
 class LoopInput:
@@ -61,7 +63,6 @@ class LoopOutput(StateNode):
     too_tight: bool = False  # the mirror loses too little gas to be held within the band
 
 
-_AT_TARGET_UM = 0.1  # of the ramp: the pump is probed only then
 NO_OUTPUT = LoopOutput()  # for a tick in which the loop did not run
 
 

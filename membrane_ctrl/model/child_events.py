@@ -3,6 +3,8 @@
 from membrane_ctrl.model.event_base import Event, LogLevel
 from membrane_ctrl.model.notices import GLITCH_S, NoticeChanges, NoticeKey, Notices, Topic
 
+RECORDER = "recorder"  # its name as a child
+
 
 class Alive(Event, kind="alive", sentence="Alive for {for_s:g} s"):
     """A child's sign of life; sent only on its pipe."""
@@ -75,6 +77,3 @@ class ChildGivenUp(
 
     child: str
     restarts: int
-
-
-RECORDER = "recorder"  # its name as a child

@@ -46,6 +46,7 @@ UNIT_SUFFIXES: dict[str, str] = {
 
 # What a unit measures, where the unit alone gives it.
 QUANTITY_OF_UNIT: dict[str, str] = {"Pa": "pressure", "°C": "temperature"}
+_TABLE_KEY = "column"
 
 
 def unit_of(name: str) -> str:
@@ -207,9 +208,6 @@ class TelemetryColumn:
             return MISSING
         plus = "+" if sign else ""
         return f"{value:{plus}z.{self.decimals}f}"
-
-
-_TABLE_KEY = "column"
 
 
 def declare_column(

@@ -7,16 +7,15 @@ import re
 from membrane_ctrl.model.errors import InputError
 from membrane_ctrl.model.numbers import parse_number
 
+_SECONDS = {"d": 86400.0, "h": 3600.0, "m": 60.0, "s": 1.0}
+_PART = re.compile(r"([0-9]+(?:\.[0-9]+)?)([dhms])")
+
 
 def pause_s(failures: int, first_s: float = 1.0, longest_s: float = 60.0) -> float:
     """Wait after a number of consecutive failures: `first_s`, doubled with each; 0 without a
     failure.
     """
     return 0.0 if failures < 1 else min(longest_s, first_s * 2.0 ** min(failures - 1, 32))
-
-
-_SECONDS = {"d": 86400.0, "h": 3600.0, "m": 60.0, "s": 1.0}
-_PART = re.compile(r"([0-9]+(?:\.[0-9]+)?)([dhms])")
 
 
 def parse_duration_s(text: str) -> float:

@@ -21,6 +21,31 @@ from membrane_ctrl.model.zernike_terms import COVARIANCE_UPPER_SIZE, ZERNIKE_TER
 
 Kind = Literal["full", "fringes", "track"]
 Verdict = Literal["ok", "degraded", "rejected"]
+_WORDS = {"kind": get_args(Kind), "verdict": get_args(Verdict)}
+_ARRAYS = ("coeffs_um", "covariance_um2")
+_OTHERS = {"reason", "cycle", "tracking_lost"}
+_UPPER = np.triu_indices(ZERNIKE_TERMS)
+_LINE_BYTES_MAX = 8192  # the numbers take 0.5 kB; the rest is room for a reason
+_COEFFS_BYTES = 8 * ZERNIKE_TERMS
+ESTIMATE_BYTES_MAX = (
+    _LINE_BYTES_MAX + 1 + _COEFFS_BYTES + 4 * COVARIANCE_UPPER_SIZE
+)  # of `pack_estimate`
+_LARGEST = 1e300  # excludes infinity, and integers that a float cannot hold
+# Fringes weaker than this share of the sensor's range: at 2 % (5 of 255) the phase noise exceeds
+# 0.06 rad per pixel and rounding no longer averages out; at 6 % something is wrong with exposure,
+# focus or screen.
+MODULATION_REJECTED_SHARE = 0.02
+MODULATION_DEGRADED_SHARE = 0.06
+# Saturated pixels bend the phase by harmonics; their bins are omitted, so a few (glints) do no
+# harm.
+SATURATED_REJECTED_FRACTION = 0.20
+SATURATED_DEGRADED_FRACTION = 0.005
+# Terms over a disc with a quarter missing are extrapolated there.
+VALID_REJECTED_FRACTION = 0.5
+VALID_DEGRADED_FRACTION = 0.9
+# Wrinkles and ripple leave a few tens of microradians; a wrong fringe order leaves 8700 locally.
+RESIDUAL_REJECTED_URAD = 1000.0
+RESIDUAL_DEGRADED_URAD = 200.0
 
 
 @dataclass(frozen=True, slots=True)
@@ -60,20 +85,10 @@ class ShapeEstimate:
     tracking_lost: bool = False
 
 
-_WORDS = {"kind": get_args(Kind), "verdict": get_args(Verdict)}
-_ARRAYS = ("coeffs_um", "covariance_um2")
-_OTHERS = {"reason", "cycle", "tracking_lost"}
 NUMBERS = tuple(
     field.name for field in fields(ShapeEstimate) if field.name not in {*_WORDS, *_ARRAYS, *_OTHERS}
 )
 _KEYS = {*NUMBERS, *_WORDS, *_OTHERS, "terms"}
-_UPPER = np.triu_indices(ZERNIKE_TERMS)
-_LINE_BYTES_MAX = 8192  # the numbers take 0.5 kB; the rest is room for a reason
-_COEFFS_BYTES = 8 * ZERNIKE_TERMS
-ESTIMATE_BYTES_MAX = (
-    _LINE_BYTES_MAX + 1 + _COEFFS_BYTES + 4 * COVARIANCE_UPPER_SIZE
-)  # of `pack_estimate`
-_LARGEST = 1e300  # excludes infinity, and integers that a float cannot hold
 
 
 def pack_estimate(estimate: ShapeEstimate) -> bytes:
@@ -158,23 +173,6 @@ def _require_valid(head: Any) -> None:
         raise ValueError("shape estimate: cycle or reason has a wrong type")
     if not isinstance(head["tracking_lost"], bool):
         raise ValueError("shape estimate: tracking_lost is neither true nor false")
-
-
-# Fringes weaker than this share of the sensor's range: at 2 % (5 of 255) the phase noise exceeds
-# 0.06 rad per pixel and rounding no longer averages out; at 6 % something is wrong with exposure,
-# focus or screen.
-MODULATION_REJECTED_SHARE = 0.02
-MODULATION_DEGRADED_SHARE = 0.06
-# Saturated pixels bend the phase by harmonics; their bins are omitted, so a few (glints) do no
-# harm.
-SATURATED_REJECTED_FRACTION = 0.20
-SATURATED_DEGRADED_FRACTION = 0.005
-# Terms over a disc with a quarter missing are extrapolated there.
-VALID_REJECTED_FRACTION = 0.5
-VALID_DEGRADED_FRACTION = 0.9
-# Wrinkles and ripple leave a few tens of microradians; a wrong fringe order leaves 8700 locally.
-RESIDUAL_REJECTED_URAD = 1000.0
-RESIDUAL_DEGRADED_URAD = 200.0
 
 
 @dataclass(frozen=True)

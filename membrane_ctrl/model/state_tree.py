@@ -28,6 +28,7 @@ from pydantic_core import CoreSchema, core_schema
 T = TypeVar("T", bound="StateNode")
 
 Count = Annotated[int, Field(ge=0, lt=2**53)]  # a number of events, a mask of bits
+_SHOWN_NUMBERS = 8  # of an array
 
 
 class StateError(ValueError):
@@ -208,9 +209,6 @@ def describe_tree(node: StateNode) -> list[str]:
         f"{place:<48} {text}"
         for place, text in _list_leaves(_make_adapter(type(node)).dump_python(node), "")
     ]
-
-
-_SHOWN_NUMBERS = 8  # of an array
 
 
 def _list_leaves(value: Any, place: str) -> Iterator[tuple[str, str]]:

@@ -16,6 +16,16 @@ import numpy as np
 from membrane_ctrl.model.arrays import Column, FloatArray
 from membrane_ctrl.model.columns import COLUMNS, ColumnValues
 
+FIELDS: tuple[str, ...] = tuple(COLUMNS)
+_STRUCT = struct.Struct(f"<{len(FIELDS)}d")
+ROW_BYTES = _STRUCT.size
+# A mirror counts as settled this long after hold began and after each setpoint ramp: three
+# closed-loop time constants of 1.45 s (docs/explanation/physics.md, inner loop) leave 5 % of a
+# step, of which the `settle` state has
+# already taken most.
+SETTLED_AFTER_S = 5.0
+COLUMN: dict[str, int] = {name: place for place, name in enumerate(FIELDS)}
+
 
 class State(IntEnum):
     """States of the controller (docs/explanation/architecture.md)."""
@@ -89,20 +99,10 @@ class TelemetryRow(ColumnValues):
         return cls(*_STRUCT.unpack(message))
 
 
-FIELDS: tuple[str, ...] = tuple(COLUMNS)
 _values = attrgetter(*FIELDS)  # astuple would copy deeply: 15 us per tick
-_STRUCT = struct.Struct(f"<{len(FIELDS)}d")
-ROW_BYTES = _STRUCT.size
 
-
-# A mirror counts as settled this long after hold began and after each setpoint ramp: three
-# closed-loop time constants of 1.45 s (docs/explanation/physics.md, inner loop) leave 5 % of a
-# step, of which the `settle` state has
-# already taken most.
-SETTLED_AFTER_S = 5.0
 
 Rows = FloatArray
-COLUMN: dict[str, int] = {name: place for place, name in enumerate(FIELDS)}
 
 
 def unpack_rows(messages: Sequence[bytes]) -> Rows:

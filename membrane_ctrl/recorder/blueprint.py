@@ -11,6 +11,10 @@ from membrane_ctrl.model.figure_columns import figure_plot_title
 from membrane_ctrl.recorder.summary_page import SUMMARY_PATH
 from membrane_ctrl.run_files import plot_marks, shapes, streams
 
+_NO_TIME = TimelineColumn("utc", visible=False)  # too narrow to read: the lines begin with it
+_TICKS = "every tick around events, else one a second"
+LOOP_PLOTS = tuple(plot for plot in plots_of(Group.LOOP, Group.PUMP) if plot != columns.ERROR)
+
 
 def run_blueprint(config: Config) -> rrb.Blueprint:
     """The layout of a run; it has a shape tab only if the shape is measured."""
@@ -103,9 +107,6 @@ def _make_lanes() -> rrb.StateTimelineView:
     )
 
 
-_NO_TIME = TimelineColumn("utc", visible=False)  # too narrow to read: the lines begin with it
-
-
 def _text_log() -> rrb.TextLogView:
     return rrb.TextLogView(
         name="Events, UTC",
@@ -134,9 +135,6 @@ def _make_overview(config: Config) -> rrb.Vertical:
     )
 
 
-_TICKS = "every tick around events, else one a second"
-
-
 def list_learned_plots(config: Config) -> dict[str, tuple[str, ...]]:
     """Plots of what a loop of this configuration learns: the paths of each, by name."""
     found: dict[str, tuple[str, ...]] = {}
@@ -145,9 +143,6 @@ def list_learned_plots(config: Config) -> dict[str, tuple[str, ...]]:
     if config.estimator.process_value != "laser":
         found |= {plot_title(plot): streams.entities_of(plot) for plot in plots_of(Group.ESTIMATE)}
     return found
-
-
-LOOP_PLOTS = tuple(plot for plot in plots_of(Group.LOOP, Group.PUMP) if plot != columns.ERROR)
 
 
 def _make_loop_tab(config: Config) -> rrb.Vertical:

@@ -11,6 +11,9 @@ from membrane_ctrl.model.file_checksums import dumps_checked
 
 # Events that wait while the disk is full; a fault campaign makes a few hundred.
 _WAITING_MAX = 10_000
+# A killed recorder saved its progress up to a second earlier: at most this many events may come
+# twice.
+_TAIL_BYTES = 1_000_000
 
 
 class EventsFile:
@@ -83,11 +86,6 @@ class EventsFile:
         if self._descriptor is not None:
             os.close(self._descriptor)
             self._descriptor = None
-
-
-# A killed recorder saved its progress up to a second earlier: at most this many events may come
-# twice.
-_TAIL_BYTES = 1_000_000
 
 
 def _mend_tail(path: Path) -> frozenset[bytes]:

@@ -4,6 +4,13 @@ from dataclasses import dataclass
 
 from membrane_ctrl.run_files import named_tables
 
+_CALM = 0x5A5A5AFF
+_BUSY = 0x56B4E9FF
+_GOOD = 0x009E73FF
+_WARN = 0xE69F00FF
+_BAD = 0xD55E00FF
+_FAULTS = named_tables.WORDS["fault"]
+
 
 @dataclass(frozen=True, slots=True)
 class Lane:
@@ -30,12 +37,6 @@ class Lane:
         """The word for a code; an unknown code is shown as a number."""
         return self.words.get(code, f"code {code}")
 
-
-_CALM = 0x5A5A5AFF
-_BUSY = 0x56B4E9FF
-_GOOD = 0x009E73FF
-_WARN = 0xE69F00FF
-_BAD = 0xD55E00FF
 
 STATE = Lane(
     "/state/controller",
@@ -65,7 +66,6 @@ SAFE_LEVEL = Lane(
     named_tables.WORDS["safe_level"],
     {"none": _CALM, "hold_flow": _WARN, "ramp_down": _WARN, "pump_off": _BAD, "vent": _BAD},
 )
-_FAULTS = named_tables.WORDS["fault"]
 FAULT = Lane(
     "/state/fault", "fault", _FAULTS, dict.fromkeys(_FAULTS.values(), _BAD) | {"none": _CALM}
 )

@@ -9,6 +9,12 @@ from firmware_iface.roles import Pixels
 from membrane_ctrl.processes.frame_address import FrameAddress
 from membrane_ctrl.processes.frames import FrameHead, FrameReader
 
+# Raw frames would be 1.7 TB a day; eight thumbnails every half minute are about 0.2 GB (no video:
+# docs/reference/recording.md).
+THUMBNAIL_INTERVAL_S = 30.0
+THUMBNAIL_HEIGHT_PX = 256
+_JPEG_QUALITY = 80
+
 
 @dataclass(frozen=True, slots=True)
 class Thumbnail:
@@ -17,13 +23,6 @@ class Thumbnail:
     time_s: float  # middle of the exposure
     pattern: str
     jpeg: bytes
-
-
-# Raw frames would be 1.7 TB a day; eight thumbnails every half minute are about 0.2 GB (no video:
-# docs/reference/recording.md).
-THUMBNAIL_INTERVAL_S = 30.0
-THUMBNAIL_HEIGHT_PX = 256
-_JPEG_QUALITY = 80
 
 
 class Thumbnails:

@@ -46,6 +46,15 @@ from membrane_ctrl.run_files.run_tables import RunTables, as_recorded
 # The parts of a run folder that a replay needs: configuration, inputs, recorded decisions, recorded
 # rows.
 
+_FIELDS_SHOWN = 10  # of a state that differs; `--json` has all
+# An event is stamped when it is reported, at the end of its tick.
+DECISION_SLACK_S = 0.5
+SCHEMA = "membrane-incident/1"
+INCIDENTS = Path("tests/incidents")
+_NAME = re.compile(r"[a-z0-9][a-z0-9_-]{0,63}")
+# An incident is kept in the repository, which must not hold more than this.
+_BYTES_MAX = 4_000_000
+
 
 @dataclass(frozen=True, slots=True)
 class RecordedRun:
@@ -109,11 +118,6 @@ def open_recorded(folder: Path) -> RecordedRun:
     right = file_checksums.comment_is_right(files.read_text(folder / "config.toml"))
     damage = "" if right else "config.toml: checksum mismatch (damaged or edited)"
     return RecordedRun(folder, config, inputs, decisions, told_until_s, damage)
-
-
-_FIELDS_SHOWN = 10  # of a state that differs; `--json` has all
-# An event is stamped when it is reported, at the end of its tick.
-DECISION_SLACK_S = 0.5
 
 
 def replay_command(
@@ -310,13 +314,6 @@ def _format_report(report: dict[str, Any]) -> list[str]:
         )
     lines += [f"damage     {sentence}" for sentence in report["damage"]]
     return lines
-
-
-SCHEMA = "membrane-incident/1"
-INCIDENTS = Path("tests/incidents")
-_NAME = re.compile(r"[a-z0-9][a-z0-9_-]{0,63}")
-# An incident is kept in the repository, which must not hold more than this.
-_BYTES_MAX = 4_000_000
 
 
 def write_incident(

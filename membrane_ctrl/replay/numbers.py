@@ -17,6 +17,8 @@ from membrane_ctrl.run_files import table_specs
 
 NUMBERS_WITHIN = 1e-9  # of a number's size, at least of 1 unit
 _SINGLE = 2.0**-24  # share of a number by which single precision may miss it
+_CODES = np.array([column.kind is not Kind.QUANTITY for column in COLUMNS.values()])
+_EXACT = np.array([table_specs.is_exact(name) for name in COLUMNS])
 
 
 class RecordedRows:
@@ -71,7 +73,3 @@ def _compute_tolerances(values: FloatArray) -> FloatArray:
     recorded = np.where(_EXACT, 0.0, _SINGLE * size)
     found: FloatArray = np.where(_CODES, 0.0, recorded + NUMBERS_WITHIN * np.maximum(size, 1.0))
     return found
-
-
-_CODES = np.array([column.kind is not Kind.QUANTITY for column in COLUMNS.values()])
-_EXACT = np.array([table_specs.is_exact(name) for name in COLUMNS])

@@ -19,6 +19,11 @@ from membrane_ctrl.run_files.named_tables import named_table
 from membrane_ctrl.run_files.run import Run, open_run
 from membrane_ctrl.run_files.streams import STREAMS
 
+FORMATS = ("parquet", "csv", "hdf5")
+SHAPES = "shapes"
+EVENTS = "events"
+_SHAPE_COLUMNS = ("hencky_um", "sag_um", "sag_sigma_um", "displacement_um")
+
 
 def refuse_originals(folder: Path) -> None:
     """Raises InputError if a folder belongs to any run, or to its tables.
@@ -31,12 +36,6 @@ def refuse_originals(folder: Path) -> None:
         raise errors.InputError(
             f"{folder}: this folder contains the recorder's files; choose another folder"
         )
-
-
-FORMATS = ("parquet", "csv", "hdf5")
-SHAPES = "shapes"
-EVENTS = "events"
-_SHAPE_COLUMNS = ("hencky_um", "sag_um", "sag_sigma_um", "displacement_um")
 
 
 def export_run(

@@ -2,6 +2,9 @@
 
 import math
 
+# Every hold starts with some seconds that do not count; more means a ramping setpoint.
+_MOVING_LEAST_S = 60.0
+
 
 def format_span(seconds: float) -> str:
     """A duration: `41 s`, `30 min 5 s`, `7 h 59 min`, `30 d 4 h`."""
@@ -29,10 +32,6 @@ def format_number(value: float | None, digits: int = 3) -> str:
 def one_line(text: str) -> str:
     """A person's text in one line: spaces replace line ends and other unprintable characters."""
     return "".join(letter if letter.isprintable() else " " for letter in text)
-
-
-# Every hold starts with some seconds that do not count; more means a ramping setpoint.
-_MOVING_LEAST_S = 60.0
 
 
 def format_time_beside(

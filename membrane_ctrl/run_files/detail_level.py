@@ -2,6 +2,13 @@
 
 from enum import IntEnum
 
+# In units of `recording.min_free_mb`, below which an alarm is raised and the rest is reserved for
+# the essential.
+PICTURES_FROM = 2.0
+_RERUN_FROM = 0.2
+# Hysteresis, or a level would come and go with every file.
+_HYSTERESIS = 1.1
+
 
 class DetailLevel(IntEnum):
     """How much detail is recorded."""
@@ -9,14 +16,6 @@ class DetailLevel(IntEnum):
     ALL = 0
     NO_PICTURES = 1  # thumbnails and maps are half of a recording
     ESSENTIAL = 2  # events, tick inputs, summary: a few kB/s, enough to replay the run
-
-
-# In units of `recording.min_free_mb`, below which an alarm is raised and the rest is reserved for
-# the essential.
-PICTURES_FROM = 2.0
-_RERUN_FROM = 0.2
-# Hysteresis, or a level would come and go with every file.
-_HYSTERESIS = 1.1
 
 
 def detail_level(free_mb: float, min_free_mb: float, before: DetailLevel) -> DetailLevel:

@@ -17,6 +17,8 @@ from membrane_ctrl.model import (
     files,
 )
 
+_NAMED_MAX = 20
+
 
 def keep_understood(tables: dict[str, Any]) -> tuple[Config, list[str]]:
     """Return a configuration without unknown keys and invalid values, and the names of those.
@@ -59,9 +61,6 @@ def _copy_value(value: Any) -> Any:
     if isinstance(value, dict):
         return {key: _copy_value(inner) for key, inner in value.items()}
     return [_copy_value(inner) for inner in value] if isinstance(value, list) else value
-
-
-_NAMED_MAX = 20
 
 
 def exact_config(folder: Path) -> Config:

@@ -11,6 +11,13 @@ from membrane_ctrl.model.arrays import Column, FloatArray, IntArray
 from membrane_ctrl.model.state_tree import ArrayShape, Count, StateNode
 
 Values = FloatArray
+# Range and resolution of a histogram. The values are times in ms.
+_LOWEST, _HIGHEST = 1e-3, 1e5
+_BIN_RATIO = 1.02
+_LOG_RATIO = math.log(_BIN_RATIO)
+_BINS = math.ceil(math.log(_HIGHEST / _LOWEST) / _LOG_RATIO)
+# A window with fewer of its ticks than this says nothing of its length.
+_LEAST_SHARE = 0.9
 
 
 @dataclass(slots=True)
@@ -49,13 +56,6 @@ class Moments(StateNode):
         return math.sqrt(self.squares / self.count) if self.count else math.nan
 
 
-# Range and resolution of a histogram. The values are times in ms.
-_LOWEST, _HIGHEST = 1e-3, 1e5
-_BIN_RATIO = 1.02
-_LOG_RATIO = math.log(_BIN_RATIO)
-_BINS = math.ceil(math.log(_HIGHEST / _LOWEST) / _LOG_RATIO)
-
-
 @dataclass(slots=True)
 class LogHistogram(StateNode):
     """Quantiles of positive values from bins of equal ratio. The first and the last bin also count
@@ -88,10 +88,6 @@ class LogHistogram(StateNode):
             return math.nan
         place = int(np.searchsorted(np.cumsum(self.bins), share * self.count))
         return _LOWEST * math.exp((place + 0.5) * _LOG_RATIO)
-
-
-# A window with fewer of its ticks than this says nothing of its length.
-_LEAST_SHARE = 0.9
 
 
 def least_ticks(window_s: float, rate_hz: float) -> float:

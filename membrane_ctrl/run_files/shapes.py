@@ -20,6 +20,43 @@ from membrane_ctrl.model import shape_estimate
 from membrane_ctrl.model.arrays import AnyArray, Column
 from membrane_ctrl.model.zernike_terms import FIRST_FIGURE_INDEX, ZERNIKE_TERMS, zernike_columns
 
+NUMBERS = (
+    "time_s",
+    "hencky_um",
+    "sag_um",
+    "sag_sigma_um",
+    "displacement_um",
+    "slope_residual_urad",
+    "valid_fraction",
+    "latency_s",
+)
+# Columns read from the recorder's tables.
+TABLE_COLUMNS = (*NUMBERS, "verdict", "coeffs_um")
+# All columns of an estimate.
+ESTIMATE_COLUMNS = (
+    *shape_estimate.NUMBERS,
+    "cycle",
+    "tracking_lost",
+    "kind",
+    "verdict",
+    "reason",
+    "coeffs_um",
+    "upper_um2",
+)
+BARS_PATH = "/shape/change_bars"
+WATERFALL_PATH = "/shape/waterfall"
+WATERFALL_TERMS = slice(FIRST_FIGURE_INDEX - 1, None)  # tilts are hundreds of times larger
+# The maps below `/shape/map/`, and their names for people.
+MAPS = {
+    "height": "height",
+    "difference": "change",
+    "difference_no_tilt": "less piston, tilt",
+    "difference_no_defocus": "less piston, tilt, defocus",
+    "scatter": "standard deviation",
+    "uncertainty": "noise of a cycle, 1σ",
+}
+MAP_PX = 96  # far finer than what the terms can change over
+
 
 @dataclass(frozen=True, slots=True)
 class Shapes:
@@ -83,26 +120,10 @@ class Shapes:
         return np.asarray(self.covariance_um2[np.argmin(np.abs(self.covariance_time_s - time_s))])
 
 
-NUMBERS = (
-    "time_s",
-    "hencky_um",
-    "sag_um",
-    "sag_sigma_um",
-    "displacement_um",
-    "slope_residual_urad",
-    "valid_fraction",
-    "latency_s",
-)
-
-
 def height_basis(x: Column, y: Column) -> Column:
     """(terms + 1, points): height above the vertex per unit of each parameter."""
     units = np.eye(ZERNIKE_TERMS + 1)
     return np.stack([Surface(unit[:-1], unit[-1], 1.0).height(x, y) for unit in units])
-
-
-# Columns read from the recorder's tables.
-TABLE_COLUMNS = (*NUMBERS, "verdict", "coeffs_um")
 
 
 def from_tables(figures: Iterable[pa.Table], covariances: Iterable[pa.Table]) -> Shapes:
@@ -147,19 +168,6 @@ def _read_figures(table: pa.Table) -> dict[str, AnyArray]:
     }
 
 
-# All columns of an estimate.
-ESTIMATE_COLUMNS = (
-    *shape_estimate.NUMBERS,
-    "cycle",
-    "tracking_lost",
-    "kind",
-    "verdict",
-    "reason",
-    "coeffs_um",
-    "upper_um2",
-)
-
-
 def read_estimates(table: pa.Table) -> Iterator[shape_estimate.ShapeEstimate]:
     """The estimates in the recorder's table, as given to the controller. Raises ValueError if they
     are invalid.
@@ -194,22 +202,7 @@ def _to_matrix(cells: pa.ChunkedArray, width: int) -> Column:
     )
 
 
-BARS_PATH = "/shape/change_bars"
-WATERFALL_PATH = "/shape/waterfall"
-WATERFALL_TERMS = slice(FIRST_FIGURE_INDEX - 1, None)  # tilts are hundreds of times larger
-# The maps below `/shape/map/`, and their names for people.
-MAPS = {
-    "height": "height",
-    "difference": "change",
-    "difference_no_tilt": "less piston, tilt",
-    "difference_no_defocus": "less piston, tilt, defocus",
-    "scatter": "standard deviation",
-    "uncertainty": "noise of a cycle, 1σ",
-}
-
 Map = NDArray[np.float32]
-
-MAP_PX = 96  # far finer than what the terms can change over
 
 
 def height_map_mm(estimate: shape_estimate.ShapeEstimate) -> Map:

@@ -29,6 +29,12 @@ from membrane_ctrl.model.columns import (
 )
 from membrane_ctrl.model.telemetry import Rows, get_column
 
+_ERROR = COLUMNS["error_um"]
+# A point per second all over the run: the others have every tick around events and one per second
+# in quiet times, and a line that changes its density looks as if the mirror had changed.
+_MEAN_PLOTS = (POSITION, *plots_of(Group.PUMP, Group.ENVIRONMENT))
+_MEANS = frozenset(each.entity for plot in _MEAN_PLOTS for each in columns_of(plot))
+
 
 @dataclass(frozen=True, slots=True)
 class Line:
@@ -82,7 +88,6 @@ def mean_path(entity: str) -> str:
 
 # Computed here from the rows, so that plots need no arithmetic.
 TRUE_ERROR = Stream(TRUE_ERROR_COLUMN.entity, (_make_line(TRUE_ERROR_COLUMN),))
-_ERROR = COLUMNS["error_um"]
 
 
 def _line_of_second(what: str, colour: Colour, width: float) -> Line:
@@ -97,10 +102,6 @@ OVERVIEW = Stream(
         _line_of_second("greatest", GREY, 1.0),
     ),
 )
-# A point per second all over the run: the others have every tick around events and one per second
-# in quiet times, and a line that changes its density looks as if the mirror had changed.
-_MEAN_PLOTS = (POSITION, *plots_of(Group.PUMP, Group.ENVIRONMENT))
-_MEANS = frozenset(each.entity for plot in _MEAN_PLOTS for each in columns_of(plot))
 MEANS = tuple(
     replace(stream, path=mean_path(stream.path)) for stream in STREAMS if stream.path in _MEANS
 )

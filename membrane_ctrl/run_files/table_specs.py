@@ -34,6 +34,14 @@ _SHAPE_GROUP_ROWS = 3_000
 # A row of these holds up to 70 kB, and a replay reads one.
 _SNAPSHOT_GROUP_ROWS = 50
 _THUMBNAIL_GROUP_ROWS = 500
+_INPUT_TEXTS = {
+    "flags": "bit 0: the link was up; bit 1: there was a reading",
+    "estimate_time_s": "time of the shape estimate that arrived in this tick; NaN without one",
+    "output_crc": "CRC-32 of the tick's outputs",
+    "tail_bytes": "size of the tick's commands and ended tasks in the table of rare inputs",
+}
+_SHAPE_LAYOUT = (("zernike_terms", str(ZERNIKE_TERMS)),)
+_HOW = {"min": "least value", "mean": "mean", "max": "greatest value"}
 
 
 def _make_field(
@@ -88,13 +96,6 @@ def _input_field(name: str) -> pa.Field:
         name, kind, _INPUT_TEXTS.get(name, f"{name.replace('_', ' ')} of the tick's reading")
     )
 
-
-_INPUT_TEXTS = {
-    "flags": "bit 0: the link was up; bit 1: there was a reading",
-    "estimate_time_s": "time of the shape estimate that arrived in this tick; NaN without one",
-    "output_crc": "CRC-32 of the tick's outputs",
-    "tail_bytes": "size of the tick's commands and ended tasks in the table of rare inputs",
-}
 
 TICKS = _make_spec("ticks", [_tick_field(column) for column in COLUMNS.values()], "mono_s")
 INPUTS = _make_spec(
@@ -152,7 +153,6 @@ def _shape_fields() -> list[pa.Field]:
     ]
 
 
-_SHAPE_LAYOUT = (("zernike_terms", str(ZERNIKE_TERMS)),)
 SHAPES = _make_spec("shapes", _shape_fields(), group_rows=_SHAPE_GROUP_ROWS, layout=_SHAPE_LAYOUT)
 TRACKED = _make_spec("tracked", _shape_fields(), group_rows=_SHAPE_GROUP_ROWS, layout=_SHAPE_LAYOUT)
 COVARIANCES = _make_spec(
@@ -187,9 +187,6 @@ def _level_field(name: str) -> pa.Field:
         f"{_HOW[how]} of: {column.description}",
         column.unit,
     )
-
-
-_HOW = {"min": "least value", "mean": "mean", "max": "greatest value"}
 
 
 def level_table(window_s: float) -> str:

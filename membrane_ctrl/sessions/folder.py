@@ -30,6 +30,20 @@ from membrane_ctrl.model import errors, files, plain_json, program
 T = TypeVar("T")
 _LARGEST = 1e60  # no quantity is near it; its fourth power is still finite
 _PLAIN_BYTES_MAX = 64_000_000  # candidates with their curves take a few megabytes
+SCHEMA = "membrane-session/1"  # of all JSON files of a tuning session
+STEPS = ("characterise", "identify", "observe", "design", "preview", "apply", "verify")
+# The results of a step; the first file marks it as done.
+FILES: dict[str, tuple[str, ...]] = {
+    "characterise": ("experiments.json", "experiments.npz", "held.npz"),
+    "identify": ("identified.json",),
+    "observe": ("disturbance.json", "quiet.npz"),
+    "design": ("gains.toml", "proposal.json", "candidates.md"),
+    "preview": ("preview.json",),
+    "apply": ("applied.json",),
+    "verify": ("verified.json", "verify.npz"),
+}
+_BYTES_MAX = 16_000_000  # a picture is some 100 kB
+_NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]{0,63}")
 
 
 def to_plain(value: Any) -> Any:
@@ -86,9 +100,6 @@ def _build_plain(kind: Any, data: Any) -> Any:
     return value
 
 
-SCHEMA = "membrane-session/1"  # of all JSON files of a tuning session
-
-
 def write_session_file(path: Path, value: Any, schema: str = SCHEMA) -> None:
     """Write a JSON file of a session atomically.
 
@@ -133,21 +144,6 @@ def read_session_file(path: Path, kind: type[T], schema: str = SCHEMA) -> T:
         raise errors.InputError(
             f"{path}: damaged ({str(error).splitlines()[0]}); repeat the step that wrote it"
         ) from None
-
-
-STEPS = ("characterise", "identify", "observe", "design", "preview", "apply", "verify")
-# The results of a step; the first file marks it as done.
-FILES: dict[str, tuple[str, ...]] = {
-    "characterise": ("experiments.json", "experiments.npz", "held.npz"),
-    "identify": ("identified.json",),
-    "observe": ("disturbance.json", "quiet.npz"),
-    "design": ("gains.toml", "proposal.json", "candidates.md"),
-    "preview": ("preview.json",),
-    "apply": ("applied.json",),
-    "verify": ("verified.json", "verify.npz"),
-}
-_BYTES_MAX = 16_000_000  # a picture is some 100 kB
-_NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]{0,63}")
 
 
 @dataclass(frozen=True, slots=True)

@@ -29,6 +29,11 @@ from membrane_ctrl.processes.published_rings import attach_rings
 from membrane_ctrl.sessions.live_log import LiveLog
 
 _S = TypeVar("_S", bound=BaseModel)
+_NEWS_S = 0.2
+_STARTS_S = 120.0  # from its command line to its control port
+_POLL_S = 1.0
+_SILENT_S = 5.0  # after this long without a tick, the run has ended or hangs
+_EVERY_S = {True: 1.0, False: 60.0}
 
 
 class HoldError(Exception):
@@ -70,12 +75,6 @@ class HoldLink(Protocol):
     def close(self) -> None:
         """Hang up."""
         ...
-
-
-_NEWS_S = 0.2
-_STARTS_S = 120.0  # from its command line to its control port
-_POLL_S = 1.0
-_SILENT_S = 5.0  # after this long without a tick, the run has ended or hangs
 
 
 class LiveHold:
@@ -256,8 +255,6 @@ def _require_unlocked(client: PortClient) -> None:
 
 # Progress of a step and the time left, on stderr: a live line on a terminal, otherwise a line per
 # minute.
-
-_EVERY_S = {True: 1.0, False: 60.0}
 
 
 class Progress:

@@ -23,6 +23,15 @@ from tuning.steps import identify, observe
 # it accepts.
 _LONGEST_S, _SHORTEST_S = 3600.0, 2.0 * noise_spectrum.SLOWEST_S
 _COLUMNS = ("flow_um_per_s", "displacement_um", "ambient_pressure_pa", "air_temperature_c")
+STEP_UM = 1.0
+# Shortest and longest closed-loop time constant that the slider offers, in delays of the plant;
+# SIMC recommends 1.
+DELAYS = (0.3, 30.0)
+# Integral time in closed-loop time constants: 4 is SIMC's, critically damped; 2 oscillates, 16
+# forgives much
+DAMPINGS = (2.0, 16.0)
+_SETTLINGS = 25.0  # duration of the responses in delays and closed-loop time constants
+_POINTS_MAX = 6000
 
 
 @dataclass(frozen=True, slots=True)
@@ -118,17 +127,6 @@ def _plant_for(logs: Path, leak_um_per_s: float) -> tuple[plant_model.PlantModel
         leak = leak_um_per_s if math.isfinite(leak_um_per_s) else 0.0
         plant = plant_model.PlantModel(1.0, loop_margins.DEAD_S, loop_margins.PUMP_LAG_S, leak)
         return plant, "plant as the configuration assumes it (no session has identified it)"
-
-
-STEP_UM = 1.0
-# Shortest and longest closed-loop time constant that the slider offers, in delays of the plant;
-# SIMC recommends 1.
-DELAYS = (0.3, 30.0)
-# Integral time in closed-loop time constants: 4 is SIMC's, critically damped; 2 oscillates, 16
-# forgives much
-DAMPINGS = (2.0, 16.0)
-_SETTLINGS = 25.0  # duration of the responses in delays and closed-loop time constants
-_POINTS_MAX = 6000
 
 
 @dataclass(frozen=True, slots=True)

@@ -76,6 +76,32 @@ _DARKER: dict[Colour, str] = {
     colours.WHITE: "#444b55",
     colours.YELLOW: "#a89b00",
 }
+# An occasional missing cycle or second is not a gap.
+_STEPS = 3.0
+_LEAST_S = 5.0
+_STATE_COLOURS = {
+    State.STANDBY: "#c9ccd1",
+    State.CHECK: "#9ecae1",
+    State.INFLATE: "#56b4e9",
+    State.SETTLE: ORANGE,
+    State.HOLD: GREEN,
+    State.MANUAL: VIOLET,
+    State.TUNE: "#f0e442",
+    State.LOWER: ORANGE,
+    State.FAULT: RED,
+}
+# Of a mark's text: more would not fit beside its line; the timeline has the full text.
+_LETTERS_MOST = 40
+_FOUND_COLOURS = {
+    "pressure step": VIOLET,
+    "leak step": ORANGE,
+    "noise change": ORANGE,
+    "shape jump": BLUE,
+}
+# The paper's stability plots, from the live cycles. More points than pixels only make the file
+# large.
+_LINE_POINTS = 1500
+_POINT_COLOURS = {"A": BLUE, "B": ORANGE, "C": VIOLET}
 
 
 def on_white(colour: Colour) -> str:
@@ -110,11 +136,6 @@ def render_svg(figure: Figure) -> str:
     )
 
 
-# An occasional missing cycle or second is not a gap.
-_STEPS = 3.0
-_LEAST_S = 5.0
-
-
 def broken_at_gaps(columns: Mapping[str, Column], time_name: str = "time_s") -> dict[str, Column]:
     """Columns with a row of NaN in every gap, so that a plot does not bridge it with a straight
     line.
@@ -132,27 +153,6 @@ def broken_at_gaps(columns: Mapping[str, Column], time_name: str = "time_s") -> 
     }
     broken[time_name] = np.insert(time_s, before + 1, time_s[before] + steps_s[before] / 2)
     return broken
-
-
-_STATE_COLOURS = {
-    State.STANDBY: "#c9ccd1",
-    State.CHECK: "#9ecae1",
-    State.INFLATE: "#56b4e9",
-    State.SETTLE: ORANGE,
-    State.HOLD: GREEN,
-    State.MANUAL: VIOLET,
-    State.TUNE: "#f0e442",
-    State.LOWER: ORANGE,
-    State.FAULT: RED,
-}
-# Of a mark's text: more would not fit beside its line; the timeline has the full text.
-_LETTERS_MOST = 40
-_FOUND_COLOURS = {
-    "pressure step": VIOLET,
-    "leak step": ORANGE,
-    "noise change": ORANGE,
-    "shape jump": BLUE,
-}
 
 
 def hours_or_less(time_s: Column | float, span_s: float) -> tuple[Any, str]:
@@ -338,12 +338,6 @@ def pump_history(history: Sequence[PumpSeen], change_max: float) -> str:
         for plot in (scale, leak):
             plot.tick_params(axis="x", rotation=20)
         return render_svg(figure)
-
-
-# The paper's stability plots, from the live cycles. More points than pixels only make the file
-# large.
-_LINE_POINTS = 1500
-_POINT_COLOURS = {"A": BLUE, "B": ORANGE, "C": VIOLET}
 
 
 def draw_stability(shape: shape_review.ShapeReview) -> str:

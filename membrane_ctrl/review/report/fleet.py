@@ -50,6 +50,21 @@ _SAME = (
     "exit",
 )
 _STYLE = "main{max-width:none}td svg{width:160px}td:first-child{white-space:normal}"
+_HEAD = (
+    "run",
+    "started, UTC",
+    "error",
+    "state",
+    "held",
+    "std µm",
+    "mean µm",
+    "in band",
+    "faults",
+    "alarms",
+    "events",
+    "ticks missed",
+    "check",
+)
 
 
 @dataclass(frozen=True, slots=True)
@@ -174,23 +189,6 @@ def fleet_command(options: FleetOptions) -> int:
             print(terminal.one_line(f"{line['name']}: {line.get('sentence') or line['problem']}"))
         print(out / "fleet.html")
     return errors.Exit.DONE
-
-
-_HEAD = (
-    "run",
-    "started, UTC",
-    "error",
-    "state",
-    "held",
-    "std µm",
-    "mean µm",
-    "in band",
-    "faults",
-    "alarms",
-    "events",
-    "ticks missed",
-    "check",
-)
 
 
 def _make_row(line: dict[str, Any], curve: str) -> list[str]:

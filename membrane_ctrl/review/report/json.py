@@ -18,6 +18,7 @@ Word = Literal["good", "look", "bad"]
 _GRAVE = {"fault", "band left", "never settled"}
 # Any laser misses single readings.
 _UNREAD_LEAST_S = 1.0
+SCHEMA = "membrane-report/1"
 
 
 def make_verdict(analysis: Analysis) -> tuple[Word, str]:
@@ -50,9 +51,6 @@ def make_verdict(analysis: Analysis) -> tuple[Word, str]:
 
 def _join_names(names: list[str]) -> str:
     return f"; check: {', '.join(dict.fromkeys(names))}" if names else "; nothing unusual"
-
-
-SCHEMA = "membrane-report/1"
 
 
 def report_table(analysis: Analysis) -> dict[str, Any]:

@@ -15,15 +15,6 @@ from membrane_ctrl.review.statistics.hold_pass import (
 )
 from membrane_ctrl.run_files.run import Run
 
-
-@dataclass(frozen=True, slots=True)
-class Anomaly:
-    """One anomaly: its name and the observation."""
-
-    name: str
-    seen: str
-
-
 # Noise alone leaves 95 % of single ticks in the band; a hold keeps all of its seconds there.
 _IN_BAND_LEAST = 0.999
 _BIAS_MOST_UM = 0.1
@@ -36,6 +27,14 @@ _UNTRACKED_MOST_S = 60.0
 _LEAK_LEAST_UM_PER_S = 0.4
 # A one-sided pump is at 0 now and then in typical weather (2 % on the twin).
 _SATURATED_MOST = 0.05
+
+
+@dataclass(frozen=True, slots=True)
+class Anomaly:
+    """One anomaly: its name and the observation."""
+
+    name: str
+    seen: str
 
 
 def find_anomalies(

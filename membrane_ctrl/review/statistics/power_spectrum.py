@@ -15,6 +15,13 @@ _SEGMENTS = 8
 _LONGEST = 1 << 15
 # Segments transformed at once, to bound the memory.
 _BATCH = 32
+# Decades of frequency with an RMS; the last ends at half the tick rate. The first is that of days.
+BANDS_HZ = (1e-5, 1e-4, 1e-3, 1e-2, 0.1, 1.0)
+# A Hann window leaks two lines to each side: from the fourth line on, a band contains no slower
+# motion.
+_RESOLVED_LINES = 4
+# Above this, one-second means attenuate the signal (0.1 Hz: by 2 %).
+_SLOW_MOST_HZ = 0.1
 
 
 @dataclass(frozen=True, slots=True)
@@ -65,15 +72,6 @@ def power_spectrum(values: AnyArray, rate_hz: float, length: int | None = None) 
     # add the negative frequencies; 0 and, for an even length, half the rate have none
     density[1 : -1 if length % 2 == 0 else None] *= 2
     return Spectrum(frequency_hz, density, count)
-
-
-# Decades of frequency with an RMS; the last ends at half the tick rate. The first is that of days.
-BANDS_HZ = (1e-5, 1e-4, 1e-3, 1e-2, 0.1, 1.0)
-# A Hann window leaks two lines to each side: from the fourth line on, a band contains no slower
-# motion.
-_RESOLVED_LINES = 4
-# Above this, one-second means attenuate the signal (0.1 Hz: by 2 %).
-_SLOW_MOST_HZ = 0.1
 
 
 @dataclass(frozen=True, slots=True)

@@ -25,6 +25,26 @@ from membrane_ctrl.run_files.run import Run, open_run
 _THIS_MACHINE = "127.0.0.1"
 # Time shown around --at or --around.
 _AROUND_S = 120.0
+_DATASET = "runs"
+# Property of a recording to its heading; the properties are an interface
+# (docs/reference/interfaces.md).
+PROPERTIES = {
+    "started_utc": "started, UTC",
+    "duration_s": "length, s",
+    "held_s": "held, s",
+    "std_um": "std, µm",
+    "in_band": "in band",
+    "faults": "faults",
+    "faults_share": "time in faults",
+    "kp_per_s": "Kp, 1/s",
+    "ti_s": "Ti, s",
+    "pump_scale": "pump / curve",
+    "pump_sigma": "±",
+    "geometry": "geometry",
+    "configuration": "configuration",
+    "exit": "end",
+    "marks": "marks",
+}
 
 
 @dataclass(frozen=True, slots=True)
@@ -292,28 +312,6 @@ def _hold_s(run: Run) -> float:
             return each.mono_s
     held_s = level["time_s"][level["state"] == telemetry.State.HOLD]
     return float(held_s[0]) if held_s.size else 0.0
-
-
-_DATASET = "runs"
-# Property of a recording to its heading; the properties are an interface
-# (docs/reference/interfaces.md).
-PROPERTIES = {
-    "started_utc": "started, UTC",
-    "duration_s": "length, s",
-    "held_s": "held, s",
-    "std_um": "std, µm",
-    "in_band": "in band",
-    "faults": "faults",
-    "faults_share": "time in faults",
-    "kp_per_s": "Kp, 1/s",
-    "ti_s": "Ti, s",
-    "pump_scale": "pump / curve",
-    "pump_sigma": "±",
-    "geometry": "geometry",
-    "configuration": "configuration",
-    "exit": "end",
-    "marks": "marks",
-}
 
 
 class RunCatalogue:

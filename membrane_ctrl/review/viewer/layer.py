@@ -39,6 +39,20 @@ SHAPES_MOST = 20_000
 MAPS_MOST = 40
 THUMBNAILS_MOST = 40  # of each pattern
 _RUN_COLOURS: tuple[Colour, ...] = (BLUE, ORANGE, GREEN, VIOLET, RED)
+_EXTREMES = {"min": "minimum", "max": "maximum"}
+_COLOUR_WORDS = (
+    "Change: cyan below, dark 0, yellow above. Others: violet to yellow. 99 % of the maps are in "
+    "their range."
+)
+_SIGNED = {"Pa", "µm", "%"}
+_OTHER_FOUND: Colour = (255, 150, 150)  # a lost laser's line must differ from that of its fault
+_FOUND_COLOURS = {
+    "pressure step": VIOLET,
+    "leak step": ORANGE,
+    "noise change": ORANGE,
+    "shape jump": BLUE,
+}
+ALL = (-np.inf, np.inf)
 
 
 def overview_streams(plot: Plot) -> tuple[streams.Stream, ...]:
@@ -65,24 +79,7 @@ def overview_streams(plot: Plot) -> tuple[streams.Stream, ...]:
     return tuple(streams.Stream(path, tuple(lines)) for path, lines in by_entity.items())
 
 
-_EXTREMES = {"min": "minimum", "max": "maximum"}
 OVERVIEWS = tuple(stream for plot in plots_of(*DRAWN) for stream in overview_streams(plot))
-
-_COLOUR_WORDS = (
-    "Change: cyan below, dark 0, yellow above. Others: violet to yellow. 99 % of the maps are in "
-    "their range."
-)
-_SIGNED = {"Pa", "µm", "%"}
-_OTHER_FOUND: Colour = (255, 150, 150)  # a lost laser's line must differ from that of its fault
-_FOUND_COLOURS = {
-    "pressure step": VIOLET,
-    "leak step": ORANGE,
-    "noise change": ORANGE,
-    "shape jump": BLUE,
-}
-
-
-ALL = (-np.inf, np.inf)
 
 
 class Layer:
