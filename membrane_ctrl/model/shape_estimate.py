@@ -66,7 +66,9 @@ class ShapeEstimate:
     # its displacement
     covariance_um2: FloatArray
     sag_um: float  # height at `mirror.radius_mm`, mean over azimuth, above the vertex
-    sag_sigma_um: float  # its standard deviation from `covariance_um2`
+    # its standard deviation from `covariance_um2`, without motions of the bench that are too small
+    # to be found: cycles and frames share those, and the estimator has a state for them
+    sag_sigma_um: float
     displacement_um: float  # mean laser reading during the exposures (NaN without a laser)
     # RMS of measured minus fitted slopes; of "track" the slopes that would leave as much light as
     # the fit does

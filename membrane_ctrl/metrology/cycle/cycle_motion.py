@@ -40,6 +40,8 @@ class CycleMotion:
         Bins of the points, ascending.
     square : (n,) array
         Square of the mirror that each point is in.
+    changed_mm : (2, n) array
+        As in `find`, of the reference.
     """
 
     effects: MotionEffects
@@ -47,6 +49,7 @@ class CycleMotion:
     covariance_mm2: FloatArray
     index: IntArray
     square: IntArray
+    changed_mm: FloatArray
 
     @classmethod
     def of(
@@ -56,6 +59,7 @@ class CycleMotion:
         index: IntArray,
         surface: Surface,
         covariance_mm2: FloatArray,
+        changed_mm: FloatArray,
     ) -> "CycleMotion":
         """At points that stand on the reference's surface; `index` (n,) are their bins."""
         order = np.argsort(index)
@@ -76,7 +80,7 @@ class CycleMotion:
         column, row = np.floor((place + 1) / 2 * _SQUARES).astype(int)
         effects = MotionEffects.of(changes, jacobian, np.ones((2, index.size)))
         square = (row + 1) * (_SQUARES + 2) + column + 1
-        return cls(effects, surface, covariance_mm2, index, square)
+        return cls(effects, surface, covariance_mm2, index, square, changed_mm[:, order])
 
     def find(
         self,
@@ -94,11 +98,12 @@ class CycleMotion:
         index : (n,) array
             Bins at which the next is known.
         changed_mm : (2, n) array
-            Screen points that no surface explains, less those of the reference; NaN where unknown.
+            Screen points that no surface explains, less those of a common cycle; NaN where unknown.
         covariance_mm2 : (parameters, parameters) array
             Of the cycle's parameters.
         """
         place = np.minimum(np.searchsorted(self.index, index), self.index.size - 1)
+        changed_mm = changed_mm - self.changed_mm[:, place]
         known = np.isfinite(changed_mm).all(axis=0) & (self.index[place] == index)
         place = place[known]
         left = self.effects.left[:, :, place]

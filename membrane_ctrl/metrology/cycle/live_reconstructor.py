@@ -42,7 +42,7 @@ from membrane_ctrl.metrology.reconstruction import (
     tracked_points,
 )
 from membrane_ctrl.metrology.uncertainty import cycle_errors, geometry_spread
-from membrane_ctrl.metrology.uncertainty.motion_evidence import find_motion_doubt
+from membrane_ctrl.metrology.uncertainty.motion_evidence import MotionFinding, find_motion_doubt
 from membrane_ctrl.model.arrays import AnyArray, ArrayLike, BoolArray, FloatArray, Image
 from membrane_ctrl.model.shape_estimate import Kind, Quality, ShapeEstimate, judge_quality
 from membrane_ctrl.model.zernike_terms import ZERNIKE_TERMS
@@ -414,8 +414,9 @@ class LiveReconstructor:
         )
         slope_variance = gain @ (self._mm_per_rad**2 * (noise_rad2 + changed_rad2))
         covariance = slope_noise.parameter_covariance(fit.normal, slope_variance) + errors.own_mm2
-        by_motion_mm2, moved = self._find_motion(state, fit, errors, covariance, readings)
-        covariance = covariance + by_motion_mm2
+        motion, moved = self._find_motion(state, fit, errors, covariance, readings)
+        steady = covariance if motion is None else covariance + motion.found_mm2
+        covariance = steady if motion is None else steady + motion.allowed_mm2
         to_coeffs = surface.parameter_to_coeffs()
         gradient = surface.sag_gradient()
         verdict, reason = judge_quality(quality)
@@ -430,7 +431,7 @@ class LiveReconstructor:
             hencky_um=1e3 * fit.surface.hencky_mm,
             covariance_um2=1e6 * to_coeffs @ covariance @ to_coeffs.T,
             sag_um=1e3 * fit.surface.sag_mm,
-            sag_sigma_um=1e3 * math.sqrt(gradient @ covariance @ gradient),
+            sag_sigma_um=1e3 * math.sqrt(gradient @ steady @ gradient),
             geometry_sag_sigma_um=1e3 * math.sqrt(gradient @ self._watch.common_mm2 @ gradient),
             displacement_um=_finite_mean(readings),
             slope_residual_urad=quality.residual_urad,
@@ -448,29 +449,30 @@ class LiveReconstructor:
         errors: cycle_errors.CycleErrors,
         covariance_mm2: FloatArray,
         readings: FloatArray,
-    ) -> tuple[FloatArray, str]:
-        """What motions of the bench since the reference cycle may have done to the figure: the
-        covariance (parameters, parameters), and why it must not be used as it is.
+    ) -> tuple[MotionFinding | None, str]:
+        """The motions of the bench since the reference cycle, and why the figure must not be used
+        as it is; None for the reference itself.
 
         After a motion the next cycle is the reference: what has moved stays there.
         """
-        none = np.zeros_like(covariance_mm2)
-        if not np.isfinite(covariance_mm2).all():
-            return none, ""
+        if self._doubt or not np.isfinite(covariance_mm2).all():
+            if errors.is_reference:  # a disturbed cycle is none
+                self._motion = None
+            return None, ""
         index = state.index[errors.points]
+        changed_mm = self._mm_per_rad * errors.changed_rad
         if errors.is_reference or self._motion is None:
             points = state.points.subset(errors.points)
             self._motion = cycle_motion.CycleMotion.of(
-                self._make_tracer(readings), points, index, fit.surface, covariance_mm2
+                self._make_tracer(readings), points, index, fit.surface, covariance_mm2, changed_mm
             )
-            return none, ""
-        changed_mm = self._mm_per_rad * errors.changed_rad
+            return None, ""
         motion = self._motion.find(fit.surface, index, changed_mm, covariance_mm2)
         tilt_urad = self._motion.tilt_urad(fit.surface)
         doubt = find_motion_doubt(motion, covariance_mm2, tilt_urad)
         if doubt:
             self._watch.renew_reference()
-        return motion.covariance_mm2, doubt
+        return motion, doubt
 
 
 def _per_frame(

@@ -25,7 +25,7 @@ from membrane_ctrl.metrology.uncertainty.motion_evidence import (
 )
 from membrane_ctrl.model.arrays import AnyArray, FloatArray
 
-_LOOK_EVERY_S = 0.4
+_RENEWED_EVERY_S = 0.4
 _BLOCKS = 14  # squares along the diameter whose errors count as independent, as in `FrameFitter`
 
 
@@ -77,7 +77,7 @@ class BenchWatch:
         self._square = (row + 1) * (_BLOCKS + 2) + column + 1
         self._test: MotionTest | None = None
         self._tested_s = math.nan
-        self._left = none = np.zeros(bench_motions.COMPONENTS)
+        self._before = none = np.zeros(bench_motions.COMPONENTS)
         square = np.zeros((none.size, none.size))
         self._anchor = _Scores(none, square, self._effects.gram(weights))
 
@@ -114,24 +114,25 @@ class BenchWatch:
         """The motions that explain a frame.
 
         `fitter` is that of the frame, `covariance_mm2` (parameters, parameters) that of its fit.
-        The slopes that no surface has are looked at twice a second: they cost a tenth of a fit.
+        How well all is known is renewed twice a second: it costs a fifth of a fit.
         """
-        if self._test is None or not abs(time_s - self._tested_s) < _LOOK_EVERY_S:
+        errors, weights = fitter.phase_errors(fit, shifts_rad)
+        if self._test is None or not abs(time_s - self._tested_s) < _RENEWED_EVERY_S:
             self._tested_s = time_s
-            self._look(fit, shifts_rad, fitter, covariance_mm2)
+            self._renew_test(self._scores(errors, weights), covariance_mm2)
         assert self._test is not None
+        sums = self._reference.cells.sums(errors).astype(float)
+        signatures = self._effects.left.reshape(len(self._before), -1)
+        left = signatures @ sums.ravel() + self._before
         moved_mm = fit.surface.parameters - self._reference.surface.parameters
-        return self._test.find(ring_tilt() @ moved_mm, self._left)
+        return self._test.find(ring_tilt() @ moved_mm, left)
 
-    def _look(
-        self, fit: FrameFit, shifts_rad: Shifts, fitter: FrameFitter, covariance_mm2: FloatArray
-    ) -> None:
-        """Take a frame's products with the slopes that no surface has, and their covariance."""
-        now, before = self._scores(*fitter.phase_errors(fit, shifts_rad)), self._anchor
+    def _renew_test(self, now: _Scores, covariance_mm2: FloatArray) -> None:
+        """Take from a frame how well ring and slopes are known."""
+        before, ring = self._anchor, ring_tilt()
         # A frame shows less than five steps where a hand covers it: both in the frame's weights.
         share = float(np.trace(now.gram) / np.trace(before.gram))
-        ring = ring_tilt()
-        self._left = now.left + share * before.left
+        self._before = share * before.left
         self._test = MotionTest(
             self._effects,
             ring @ covariance_mm2 @ ring.T,

@@ -207,7 +207,7 @@ def _make_estimate(
         hencky_um=round(found.hencky_um, _UM),
         covariance_um2=found.covariance_um2,
         sag_um=round(found.sag_um, _UM + 1),  # a camera that repeats itself is known by equal sags
-        sag_sigma_um=round(found.sag_sigma_um, _UM + 1),
+        sag_sigma_um=round(found.steady_sag_sigma_um, _UM + 1),
         displacement_um=reading_um,
         slope_residual_urad=round(found.rest_share * urad, 2),
         valid_fraction=round(found.used_share, _SHARE),

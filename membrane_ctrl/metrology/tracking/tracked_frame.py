@@ -31,6 +31,9 @@ class TrackedFrame:
     saturated_share: float = 0.0  # of the bins
     # the mirror may not be where the last good frame left it: a new reference is needed
     lost: bool = False
+    # standard deviation of the sag without motions of the bench that are too small to be found,
+    # which all frames share
+    steady_sag_sigma_um: float = math.nan
 
     @property
     def sigma_um(self) -> FloatArray:

@@ -310,7 +310,12 @@ class Tracker:
         worst = doubt or next(iter(faults), None) or Finding("ok", "")
         if worst.verdict == "ok":
             self._remember(shifts_rad, self._clear, fit, time_s)
-        found = self._result(fit, covariance_mm2 + motion.covariance_mm2, time_s, worst, rest)
+        steady_mm2 = covariance_mm2 + motion.found_mm2
+        gradient = surface.sag_gradient()
+        found = self._result(fit, steady_mm2 + motion.allowed_mm2, time_s, worst, rest)
+        found = replace(
+            found, steady_sag_sigma_um=1e3 * math.sqrt(gradient @ steady_mm2 @ gradient)
+        )
         return replace(found, saturated_share=float(np.mean(saturated)))
 
     def mean_residual_adu(self) -> FloatArray:

@@ -13,8 +13,9 @@ Each group of motions (`bench_motions.GROUPS`) is estimated as if it were the on
 
     a = (A + 1 / K^2)^-1 b,  A = h^T C_c^-1 h + G C_q^-1 G,  b = h^T C_c^-1 c + G C_q^-1 q,  h = H S
 
-with the covariances C_c and C_q of both observations. K is the size of a knock: some motions leave
-so little that their estimate is noise alone. The gain b^T a is the decrease of chi-square.
+with the covariances C_c and C_q of both observations. K is the size of a knock (`MotionGroup`):
+some motions leave so little that their estimate is noise alone. The gain b^T a is the decrease of
+chi-square.
 
 Motions that are too small to be found are an error of the figure, too: each group adds
 S (A + 1 / tau^2)^-1 S^T to the covariance, where tau, its allowance, is how far a body may move
@@ -28,14 +29,14 @@ from functools import cache
 import numpy as np
 
 from membrane_ctrl.metrology.rays import rim_harmonics
-from membrane_ctrl.metrology.rays.bench_motions import GROUPS, group_columns
+from membrane_ctrl.metrology.rays.bench_motions import AXIAL_UM, GROUPS, group_columns
 from membrane_ctrl.model.arrays import FloatArray
 from membrane_ctrl.model.zernike_terms import FIRST_FIGURE_INDEX, ZERNIKE_DEGREE
 
-# K: 100 µm or µrad, or some times what the mirror would have tilted: a camera that turns tilts the
-# ring by a fourth, a screen that shifts by a fifth of it
-_KNOCK, _KNOCK_PER_TILT = 100.0, 5.0
-_CHANCE_GAIN = 9.0  # of each component of a group: below it there is no motion beyond the allowance
+# K is at least some times what the mirror would have tilted: a camera that turns tilts the ring by
+# a fourth, a screen that shifts by a fifth of it
+_KNOCK_PER_TILT = 5.0
+_CHANCE_GAIN = 4.0  # of each component of a group: below it there is no motion beyond the allowance
 _SURE_GAIN = 25.0  # decrease of chi-square: 5 sigma
 _PLAUSIBLE_GAIN = 9.0  # below the best: 3 sigma
 # Effects on the figure (RMS without tilt): beyond the first, a proven motion degrades it; beyond
@@ -94,9 +95,16 @@ class MotionFinding:
     """The motions that explain an observation."""
 
     fits: tuple[GroupFit, ...]  # most likely first
-    # (parameters, parameters): what motions may have done to the figure
-    covariance_mm2: FloatArray
+    # (parameters, parameters): what motions beyond chance may have done to the figure, and what
+    # motions may have done that are too small to be found; the latter is common to all frames
+    found_mm2: FloatArray
+    allowed_mm2: FloatArray
     figure_um: float  # RMS of the worst plausible effect, without tilt
+
+    @property
+    def covariance_mm2(self) -> FloatArray:
+        """What motions may have done to the figure, (parameters, parameters)."""
+        return self.found_mm2 + self.allowed_mm2
 
     @property
     def excess_gain(self) -> float:
@@ -133,7 +141,7 @@ def find_motion_doubt(motion: MotionFinding, own_mm2: FloatArray, tilt_urad: flo
     own_um = 1e3 * math.sqrt(float(np.trace(own_mm2[_FIGURE, _FIGURE])))
     if motion.figure_um > max(own_um, _POSSIBLE_UM):
         return (
-            f"tilted by {tilt_urad:.0f} µrad since the reference: camera, screen or mirror moved, "
+            f"tilted by {tilt_urad:.2g} µrad since the reference: camera, screen or mirror moved, "
             f"and the figure may be {motion.figure_um:.2f} µm off"
         )
     return ""
@@ -147,10 +155,16 @@ class _GroupTest:
     by_ring: FloatArray  # h^T C_c^-1 (k, 2)
     by_left: FloatArray  # G C_q^-1 (k, k)
     information: FloatArray  # A (k, k)
+    spread: FloatArray  # (A + 1 / K^2)^-1 (k, k), with K of the group
 
     def weigh(self, ring_mm: FloatArray, left: FloatArray) -> FloatArray:
         """b (k,)."""
         return np.asarray(self.by_ring @ ring_mm + self.by_left @ left[self.columns])
+
+
+def _spread(information: FloatArray, size: float) -> FloatArray:
+    """Covariance (k, k) of a group whose components are of this size unless seen otherwise."""
+    return np.asarray(np.linalg.inv(information + np.eye(len(information)) / size**2))
 
 
 class MotionTest:
@@ -183,27 +197,29 @@ class MotionTest:
             scatter = left_covariance[columns, columns]
             by_left = own @ np.linalg.pinv(scatter, rcond=1e-9, hermitian=True)
             information = by_ring @ tilt + by_left @ own
-            self._tests.append(_GroupTest(columns, by_ring, by_left, information))
+            spread = _spread(information, group.knock)
+            self._tests.append(_GroupTest(columns, by_ring, by_left, information, spread))
             if group.allowance > 0:
-                allowed = np.eye(len(own)) / group.allowance**2
                 effect = effects.figure_mm[:, columns]
-                spread = np.linalg.inv(information + allowed)
-                self._undetected_mm2 += effect @ spread @ effect.T
+                allowed = _spread(information, group.allowance)
+                self._undetected_mm2 += effect @ allowed @ effect.T
 
     def find(self, ring_mm: FloatArray, left: FloatArray) -> MotionFinding:
         """Estimate every group from the ring's tilt c (2,) and the products q (components,)."""
         weighed = [test.weigh(ring_mm, left) for test in self._tests]
         mirror = next(number for number, group in enumerate(GROUPS) if group.is_of_mirror)
         tilt = np.linalg.solve(self._tests[mirror].information, weighed[mirror])
-        knock = max(_KNOCK, _KNOCK_PER_TILT * float(np.linalg.norm(tilt)))
+        tilt_knock = _KNOCK_PER_TILT * float(np.linalg.norm(tilt))
         fits: list[GroupFit] = []
         for number, (test, right) in enumerate(zip(self._tests, weighed, strict=True)):
-            known = test.information + np.eye(len(right)) / knock**2
-            amount = np.asarray(np.linalg.solve(known, right), float)
+            spread = test.spread
+            if tilt_knock > GROUPS[number].knock:
+                spread = _spread(test.information, tilt_knock)
+            amount = spread @ right
             fits.append(GroupFit(number, amount, float(right @ amount)))
         fits.sort(key=lambda fit: -fit.gain)
         worst, figure_um = _worst_effect(self._effects, fits)
-        return MotionFinding(tuple(fits), self._undetected_mm2 + np.outer(worst, worst), figure_um)
+        return MotionFinding(tuple(fits), np.outer(worst, worst), self._undetected_mm2, figure_um)
 
 
 def _worst_effect(effects: MotionEffects, fits: list[GroupFit]) -> tuple[FloatArray, float]:
@@ -213,7 +229,10 @@ def _worst_effect(effects: MotionEffects, fits: list[GroupFit]) -> tuple[FloatAr
     """
     worst, figure_um = np.zeros(len(effects.figure_mm)), -math.inf
     for fit in fits:
-        if fit.gain < fits[0].gain - _PLAUSIBLE_GAIN or GROUPS[fit.group].is_of_mirror:
+        group = GROUPS[fit.group]
+        if group.is_of_mirror or group.knock <= AXIAL_UM:  # no error; within the allowance
+            continue
+        if fit.gain < fits[0].gain - _PLAUSIBLE_GAIN:
             continue
         columns = group_columns()[fit.group]
         chance = _CHANCE_GAIN * GROUPS[fit.group].components

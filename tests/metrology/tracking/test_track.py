@@ -126,7 +126,7 @@ def test_every_frame_gives_the_figure_within_its_error_bar(bench: Bench) -> None
     truth = np.array([FILM.sag_at_mm(um) for um in moved]) * 1e3
     error = np.array([frame.sag_um for frame in frames]) - truth
     sigma = frames[0].sag_sigma_um
-    assert 0.02 < sigma < 0.06  # 0.023 of it are motions of the bench too small to be found
+    assert 0.05 < sigma < 0.15  # 0.1 of it are motions along an axis, which no frame shows
     assert np.abs(error - error.mean()).max() < 4 * sigma  # the anchor's own error is common
     change_um = frames[3].coeffs_um - frames[0].coeffs_um  # a bowl deeper by 3.2 µm has only m = 0
     odd = [j for j in NOLL_INDICES[1:] if noll_orders(j)[1] != 0]
