@@ -192,9 +192,9 @@ def test_a_hand_makes_the_error_bars_larger_while_it_is_there(bench: Bench) -> N
         terms = np.median(covered.sigma_um[1:] / before.sigma_um[1:])
         grown.append(
             [
-                covered.sag_sigma_um / before.sag_sigma_um,
+                covered.steady_sag_sigma_um / before.steady_sag_sigma_um,
                 terms,
-                after.sag_sigma_um / before.sag_sigma_um,
+                after.steady_sag_sigma_um / before.steady_sag_sigma_um,
             ]
         )
     sag, terms, back = np.mean(
