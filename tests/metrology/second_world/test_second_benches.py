@@ -8,8 +8,8 @@ from typing import Any
 import numpy as np
 import pytest
 
-from benchmarks.metrology.second_world import blamed, held, is_true, page, refusals, wrong_oks
 from tests.studies.second_benches import draw_bench
+from tests.studies.second_world_tables import blamed, held, is_true, page, refusals, wrong_oks
 
 
 def answer(seed: int, verdict: str, off: float, planted: dict[str, float], reason: str = "") -> Any:
