@@ -345,7 +345,7 @@ def test_an_incident_begins_in_the_middle(
     ]
     assert incident.expected[0].time_s > 13.0
     assert check_incident(incident) == []
-    monkeypatch.setattr("tests.support.incidents.replay", _refuse)
+    monkeypatch.setattr("tests.support.incidents.replay_record", _refuse)
     assert "make the incident again" in check_incident(incident)[0]
 
 
