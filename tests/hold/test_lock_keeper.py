@@ -227,7 +227,7 @@ class Latch:
 
 def test_a_run_in_standby_begins_with_its_locks_and_its_latched_fault_as_commands() -> None:
     asked: list[Command] = []
-    supervisor, latch = cast(Any, SimpleNamespace(ask=asked.append)), cast(Any, Latch())
+    supervisor, latch = cast(Any, SimpleNamespace(queue_command=asked.append)), cast(Any, Latch())
     lock = Lock("bofak", "hands inside", "unix:ann", "unix:ann")
     _send_first_commands(
         supervisor, True, latch, BoardAtStart(latched="the board has latched"), (lock,)
