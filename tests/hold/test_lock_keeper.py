@@ -222,7 +222,7 @@ def test_in_standby_it_starts_with_the_locks() -> None:
 class Latch:
     """The latched fault of an earlier run."""
 
-    latched, resumes_s = "over_pressure", ()
+    latched_line, resumes_s = "over_pressure", ()
 
 
 def test_a_run_in_standby_begins_with_its_locks_and_its_latched_fault_as_commands() -> None:
