@@ -50,6 +50,7 @@ def calibrate_camera(options: CameraOptions) -> int:
     board, camera = _parse_board(options.board), options.config.optics.camera
     paths = _list_photographs(options.folder)
     views = [_read_view(path, board, camera) for path in paths]
+    _refuse_mirrored(paths, views, board, camera)
     try:
         lens = calibrate_lens(views, camera)
     except ValueError as error:
@@ -135,6 +136,23 @@ def _explain_unseen_board(
 def _read_view(path: Path, board: Board, camera: CameraConfig) -> BoardView:
     place, seen_px = board.corners(_read_photograph(path, camera))
     return BoardView(path.name, place, seen_px)
+
+
+def _refuse_mirrored(
+    paths: list[Path], views: list[BoardView], board: Board, camera: CameraConfig
+) -> None:
+    """Raise RejectedError for photographs whose markers are readable only from behind."""
+    mirrored = []
+    for path, view in zip(paths, views, strict=True):
+        if board.kind == "charuco" and len(view.place) < LEAST_CORNERS:
+            place, _ = board.corners(np.ascontiguousarray(_read_photograph(path, camera)[:, ::-1]))
+            if len(place) >= LEAST_CORNERS:
+                mirrored.append(path.name)
+    if mirrored:
+        raise errors.RejectedError(
+            f"{paths[0].parent}: mirrored photographs: {', '.join(mirrored)}; take them of the "
+            "board itself, not of its image in a mirror, and as the camera delivers them"
+        )
 
 
 def _read_photograph(path: Path, camera: CameraConfig) -> NDArray[np.uint8]:

@@ -21,9 +21,10 @@ from membrane_ctrl.geometry import file, prior_file, set_tables, spread_file
 from membrane_ctrl.measure.capture_set import CaptureSet, read_head, read_set
 from membrane_ctrl.measure.measurement import Figures, SetFigure, stack_of
 from membrane_ctrl.metrology.calibration import rim_edges, screen_pose, set_state, verdict
+from membrane_ctrl.metrology.calibration.film_waves import solve_any_film
 from membrane_ctrl.metrology.calibration.rim_edges import RADIUS_SIGMA_MM
 from membrane_ctrl.metrology.calibration.rim_equations import Rim
-from membrane_ctrl.metrology.calibration.solver import Problem, solve_calibration
+from membrane_ctrl.metrology.calibration.solver import Problem
 from membrane_ctrl.metrology.figure.bin_figure import bin_figure
 from membrane_ctrl.metrology.figure.set_motion import FilmMotion
 from membrane_ctrl.metrology.frame_checks import bin_view
@@ -154,8 +155,8 @@ def calibrate_command(options: CalibrateOptions) -> int:
     findings, solution = verdict.check_before_solving(problem), None
     if not findings:
         try:
-            solution = solve_calibration(problem, _make_progress_line())
-            findings = _judge_sets(verdict.check_solution(solution), bundle)
+            solution, judged = solve_any_film(problem, _make_progress_line())
+            findings = _judge_sets(judged, bundle)
         except ValueError as error:
             findings = (verdict.CalibrationFinding(True, str(error)),)
     timing = {"read": read - begin, "solve": time.perf_counter() - read}

@@ -22,6 +22,14 @@ from membrane_ctrl.model.arrays import FloatArray
 _STIFFNESS_N_PER_M, _POISSON, _PRESSURE_PA, _PAPER_EDGE_MM = 2.05e5, 0.3, 600.0, 3.0
 _TOGETHER = 0.98  # correlation of two numbers that the sets give only together
 _UNLIKE_LAW = 0.5  # of the departure from Hencky left unexplained: another law
+_SURELY_LEFT = 3.0  # sigmas
+_CAUSES: dict[str, str] = {
+    "prestrain": "pre-strain varies",
+    "flat": "ring not flat",
+    "round": "ring not round",
+    "modulus": "film stiffer in one direction",
+    "shear": "shear modulus not that of an isotropic film",
+}
 
 
 @dataclass(frozen=True)
@@ -45,14 +53,32 @@ class _Departure:
     radius_mm: FloatArray
     seen_mm: FloatArray
     left_mm: FloatArray
+    sigma_mm: FloatArray  # (n, points): of a profile, by noise, geometry and the law's misfit
 
     @property
-    def explained_share(self) -> float:
-        """Share of the departure that the law explains, RMS over the area."""
-        weight = self.radius_mm
-        return float(
-            1 - np.sqrt(np.sum(weight * self.left_mm**2) / np.sum(weight * self.seen_mm**2))
-        )
+    def seen_um(self) -> float:
+        """RMS over the area."""
+        return self._rms_um(self.seen_mm)
+
+    @property
+    def left_um(self) -> float:
+        """What the law leaves of it."""
+        return self._rms_um(self.left_mm)
+
+    @property
+    def sigma_um(self) -> float:
+        """1 sigma of `left_um`."""
+        return self._rms_um(self.sigma_mm)
+
+    @property
+    def contradicts(self) -> bool:
+        """Whether the law leaves most of the departure, beyond doubt."""
+        sure = self.left_um > _SURELY_LEFT * self.sigma_um
+        return sure and self.left_um > _UNLIKE_LAW * self.seen_um
+
+    def _rms_um(self, profiles_mm: FloatArray) -> float:
+        share = self.radius_mm / np.sum(self.radius_mm)
+        return 1e3 * float(np.sqrt(np.mean(np.sum(share * profiles_mm**2, axis=1))))
 
 
 def film_command(options: FilmOptions) -> int:
@@ -129,7 +155,26 @@ def _compute_departure(
         ]
         seen.append(profiles[0] - hencky.height_mm(radius / fit.law.radius_mm))
         left.append(profiles[1])
-    return _Departure(radius, np.array(seen), np.array(left))
+    sigma_mm = np.array(
+        [_profile_sigma_mm(one, fit, radius / fit.law.radius_mm) for one in figures]
+    )
+    return _Departure(radius, np.array(seen), np.array(left), sigma_mm)
+
+
+def _profile_sigma_mm(
+    figure: film_figure.FilmFigure, fit: material_fit.FilmFit, rho: FloatArray
+) -> FloatArray:
+    """Sigma (points,) of a round profile: noise, geometry, and the law's misfit."""
+    profiles = np.stack(
+        [
+            _profile_mm(unit, fit.law.radius_mm, rho * fit.law.radius_mm)
+            for unit in np.eye(figure.parameters_mm.size)
+        ]
+    )
+    misfit_mm = 1e-3 * fit.misfit_um * np.sqrt(np.sum(profiles[material_fit.ROUND] ** 2, axis=0))
+    own = np.einsum("ip,ij,jp->p", profiles, figure.noise_mm2, profiles)
+    geometric = np.sum((profiles.T @ figure.geometry_mm) ** 2, axis=1)
+    return np.asarray(np.sqrt(own + geometric + misfit_mm**2))
 
 
 def _profile_mm(parameters_mm: FloatArray, radius_mm: float, at_mm: FloatArray) -> FloatArray:
@@ -144,7 +189,11 @@ def _list_limits(
 ) -> list[str]:
     """What these sets cannot tell, in words."""
     gauged = [figure.pressure_pa for figure in figures if np.isfinite(figure.pressure_pa)]
-    notes = []
+    notes = [
+        f"{waves.order} waves of {waves.rms_um:.3g} µm RMS, cause unknown; it looks like "
+        + " or ".join(_CAUSES[cause] for cause in waves.likely[:2])
+        for waves in fit.unexplained
+    ]
     if not gauged:
         notes.append(
             "E t is not determined: no set states pressure_pa; pre-strain and nu need none"
@@ -164,7 +213,7 @@ def _list_limits(
             f"sags, {min(sags):.1f} to "
             f"{max(sags):.1f} mm, are too close"
         )
-    if departure.explained_share < 1 - _UNLIKE_LAW and np.abs(departure.seen_mm).max() > 0.1:
+    if departure.contradicts:
         notes.append(
             "the film departs from this law: it crept between the sets, its ring moved, or "
             "it is not elastic"
@@ -216,7 +265,11 @@ def _make_fit_table(
             if wave.seen
         ],
         "misfit_um": fit.misfit_um,
-        "explained": departure.explained_share,
+        "departure": {
+            "rms_um": departure.seen_um,
+            "left_um": departure.left_um,
+            "left_sigma_um": departure.sigma_um,
+        },
         "paper_prestrain": _paper_prestrain(
             float(law.poisson), law.stiffness_n_per_m if gauged else _STIFFNESS_N_PER_M
         ),
@@ -246,26 +299,37 @@ def _format_fit(table: dict[str, Any], figures: list[film_figure.FilmFigure]) ->
         lines.append(
             f"E t        {stiffness['value'] / 1e3:.2f} +- {stiffness['sigma'] / 1e3:.2g} kN/m"
         )
-    for wave in table["ring"]:
-        unit, scale = ("µm/m", 1e6) if wave["cause"] == "prestrain" else ("mm", 1.0)
-        what = {"prestrain": "pre-strain varies", "flat": "not flat", "round": "not round"}[
-            wave["cause"]
-        ]
-        amount, sigma = scale * np.hypot(*wave["cos_sin"]), scale * max(wave["sigmas"])
-        lines.append(
-            f"ring       {what}, {wave['order']} waves: {amount:.3g} +- {sigma:.2g} {unit}"
-        )
+    lines += [_wave_line(wave) for wave in table["ring"]]
     edges = [one["edge_from_hencky_mm"] for one in table["sets"]]
+    departure = table["departure"]
     return [
         *lines,
         f"Hencky     the measured edge is {min(edges):+.3f} to {max(edges):+.3f} mm from "
         "Hencky's film of 205 kN/m, "
-        f"nu 0.3; the law explains {100 * table['explained']:.1f} %",
+        f"nu 0.3: {departure['rms_um']:.3g} µm RMS, of which the law leaves "
+        f"{departure['left_um']:.2g} (1 sigma {departure['left_sigma_um']:.2g})",
         f"misfit     {table['misfit_um']:.3g} µm a term that no law explains; it is in the bars",
         f"paper      its 3 mm would be a pre-strain of {1e6 * table['paper_prestrain']:.0f} "
         "µm/m in this film",
         *(f"note       {note}" for note in table["notes"]),
     ]
+
+
+def _wave_line(wave: dict[str, Any]) -> str:
+    """Amount of one cause of waves, and its direction if it is the film's."""
+    unit, scale = {"prestrain": ("µm/m", 1e6), "modulus": ("%", 100.0), "shear": ("%", 100.0)}.get(
+        wave["cause"], ("mm", 1.0)
+    )
+    amount, sigma = scale * np.hypot(*wave["cos_sin"]), scale * max(wave["sigmas"])
+    head = "film" if wave["cause"] in ("modulus", "shear") else "ring"
+    cosine, sine = wave["cos_sin"]
+    along = ""
+    if wave["cause"] == "modulus":
+        along = f", along {np.degrees(np.arctan2(sine, cosine)) / 2 % 180:.0f} degrees"
+    return (
+        f"{head:<11}{_CAUSES[wave['cause']]}, {wave['order']} waves: {amount:.3g} +- {sigma:.2g} "
+        f"{unit}{along}"
+    )
 
 
 def _draw_fit(
@@ -283,7 +347,7 @@ def _draw_fit(
         left.plot(departure.radius_mm, 1e3 * rest)
     seen.set(title="less Hencky's film of the paper", xlabel="radius (mm)", ylabel="mm")
     left.set(
-        title=f"less the law ({100 * departure.explained_share:.1f} % explained)",
+        title=f"less the law ({departure.left_um:.2g} µm RMS left)",
         xlabel="radius (mm)",
         ylabel="µm",
     )

@@ -47,7 +47,10 @@ def test_the_material_is_found_and_shown(
         found = table[name]
         assert found["value"] == pytest.approx(true, abs=3 * found["sigma"]), name
         assert 0 < found["sigma"] < most, name
-    assert table["explained"] > 0.95
+    departure = table["departure"]
+    assert departure["rms_um"] > 500
+    assert departure["left_um"] < 15
+    assert departure["left_um"] < 3 * departure["left_sigma_um"]
     out = Path(sets[0]).parent / "film"
     assert json.loads((out / "film.json").read_text()) == table
     assert (out / "film.png").stat().st_size > 10_000

@@ -58,8 +58,8 @@ def test_round_terms_are_those_without_azimuthal_order() -> None:
     assert list(hencky_bowl.ROUND_NOLL) == [
         j for j in NOLL_INDICES if zernike.noll_orders(j)[1] == 0
     ]
-    assert terms_beyond_fit.BEYOND[0] == hencky_bowl.EXCESS_DEGREE + 1
-    assert terms_beyond_fit.BEYOND[-1] < hencky_bowl.EXCESS_TERMS
+    assert terms_beyond_fit.ROUND_DEGREES[0] == hencky_bowl.EXCESS_DEGREE + 1
+    assert terms_beyond_fit.ROUND_DEGREES[-1] < hencky_bowl.EXCESS_TERMS
 
 
 def test_the_excess_replaces_piston() -> None:

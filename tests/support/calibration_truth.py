@@ -21,6 +21,7 @@ from membrane_ctrl.metrology.rays.surface import Surface
 from membrane_ctrl.sim.optics.bench_poses import CameraPose, ScreenPose
 from membrane_ctrl.sim.optics.film_shape import FilmShape, typical_film
 from membrane_ctrl.sim.optics.trace import trace_rays
+from tests.worlds.second_optics import Mirror
 
 FloatArray = NDArray[np.float64]
 
@@ -38,7 +39,7 @@ class Truth:
     """What the sets were made of."""
 
     values: FloatArray
-    film: FilmShape
+    film: FilmShape | Mirror
     sets: tuple[SetPhases, ...]
 
     def problem(self, sigmas: FloatArray, sets: tuple[SetPhases, ...] | None = None) -> Problem:

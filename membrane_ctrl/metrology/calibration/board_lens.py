@@ -3,10 +3,16 @@
 The model is the one that the self-calibration frees: one focal length, k1, k2, p1, p2. Views that
 fit much worse than the others (blurred, a corner mistaken for its neighbour) are left out and
 named.
+
+The errors of the corners of one view are not independent: blur, light and the board's form shift
+them together. So the sigmas are those of the scatter between the views (jackknife: the fit is
+repeated without each of them), and of a board that is not flat. OpenCV's sigmas, of independent
+corners, are the least.
 """
 
+import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
@@ -17,6 +23,13 @@ from membrane_ctrl.model.arrays import ArrayLike, FloatArray
 LEAST_VIEWS = 4  # each has a pose of its own; with fewer the lens hides in the poses
 LEAST_CORNERS = 12  # of a view
 _WORSE = 3.0  # times the median view's error
+# Bow of a board over its longest side: paper on a plate, a screen
+FLATNESS = 2e-4
+_SPLIT_VIEWS = 2 * LEAST_VIEWS  # fewer views are not tested for two cameras
+_FOCAL_SPREAD = np.linspace(-0.08, 0.08, 33)  # of the focal length, tried on each view
+_SPLIT_SIGMAS = 5.0
+_SPLIT_BETTER = 0.8  # residual of two cameras over that of one
+_SPLIT_STEPS = 3  # in which each view goes to the camera that fits it better
 _FLAGS = cv2.CALIB_USE_INTRINSIC_GUESS | cv2.CALIB_FIX_ASPECT_RATIO | cv2.CALIB_FIX_K3
 _NAMES = ("focal_relative", "principal_x_px", "principal_y_px", "k1", "k2", "p1", "p2")
 
@@ -64,7 +77,13 @@ def calibrate_lens(views: Sequence[BoardView], stated: CameraConfig) -> Lens:
         good = good[:worst] + good[worst + 1 :]
     focal_px = float(matrix[0, 0])
     names = {view.name for view in good}
-    values = [sigmas[1] / focal_px, *sigmas[2:8]]  # OpenCV's order: fx, fy, cx, cy, k1, k2, p1, p2
+    found = _parameters(matrix, lens)
+    # OpenCV's order: fx, fy, cx, cy, k1, k2, p1, p2
+    independent = np.array([sigmas[1] / focal_px, *sigmas[2:8]])
+    scatter = _jackknife_sigmas(good, stated)
+    flatness = _parameters(*_fit_camera(_bowed_views(good), stated)[1:3]) - found
+    values = np.hypot(np.maximum(independent, scatter), flatness)
+    _refuse_two_cameras(good, stated, matrix, lens, rms)
     return Lens(
         focal_px=focal_px,
         principal_px=(float(matrix[0, 2]), float(matrix[1, 2])),
@@ -75,6 +94,97 @@ def calibrate_lens(views: Sequence[BoardView], stated: CameraConfig) -> Lens:
         used=tuple(view.name for view in good),
         left_out=tuple(view.name for view in views if view.name not in names),
     )
+
+
+def _parameters(matrix: FloatArray, lens: FloatArray) -> FloatArray:
+    """Logarithm of the focal length, principal point, k1, k2, p1, p2."""
+    return np.array([np.log(matrix[0, 0]), matrix[0, 2], matrix[1, 2], *lens[:4]])
+
+
+def _jackknife_sigmas(views: Sequence[BoardView], stated: CameraConfig) -> FloatArray:
+    """Sigmas (7,) of the parameters from fits without each view in turn."""
+    count = len(views)
+    without = np.array(
+        [
+            _parameters(*_fit_camera([*views[:k], *views[k + 1 :]], stated)[1:3])
+            for k in range(count)
+        ]
+    )
+    squares = np.sum((without - without.mean(axis=0)) ** 2, axis=0)
+    return np.asarray(np.sqrt((count - 1) / count * squares))
+
+
+def _bowed_views(views: Sequence[BoardView]) -> list[BoardView]:
+    """The views as if the board were bowed by `FLATNESS` of its longest side."""
+    every = np.concatenate([view.place for view in views])[:, :2]
+    middle = (every.max(axis=0) + every.min(axis=0)) / 2
+    side = float(np.max(np.ptp(every, axis=0)))
+    bowed = []
+    for view in views:
+        place = view.place.astype(float).copy()
+        square = np.sum((place[:, :2] - middle) ** 2, axis=1)
+        place[:, 2] += FLATNESS * side * (1 - square / (side / 2) ** 2)
+        bowed.append(replace(view, place=place))
+    return bowed
+
+
+def _refuse_two_cameras(
+    views: Sequence[BoardView],
+    stated: CameraConfig,
+    matrix: FloatArray,
+    lens: FloatArray,
+    rms: float,
+) -> None:
+    """Raise ValueError if the views fall into two groups with focal lengths of their own.
+
+    Each view is tried with focal lengths about the common one. The views are ordered by the best,
+    and split where the two groups fit best. The groups are of two cameras only if both focal
+    lengths differ by far more than their scatter, and the residual falls.
+    """
+    if len(views) < _SPLIT_VIEWS:
+        return
+    best = [_best_focal(view, matrix, lens) for view in views]
+    ordered = [views[k] for k in np.argsort(best)]
+    gaps = np.diff(np.sort(best))[LEAST_VIEWS - 1 : len(views) - LEAST_VIEWS]
+    split = LEAST_VIEWS + int(np.argmax(gaps))
+    groups = [ordered[:split], ordered[split:]]
+    fits = [_fit_camera(group, stated) for group in groups]
+    for _ in range(_SPLIT_STEPS):
+        left = np.array([[_rms_px([view], *fit[1:3]) for fit in fits] for view in views])
+        first = left[:, 0] < left[:, 1]
+        if min(np.count_nonzero(first), np.count_nonzero(~first)) < LEAST_VIEWS:
+            return
+        groups = [
+            [view for view, its in zip(views, mine, strict=True) if its] for mine in (first, ~first)
+        ]
+        fits = [_fit_camera(group, stated) for group in groups]
+    counts = [sum(len(view.place) for view in group) for group in groups]
+    squares = sum(fit[0] ** 2 * count for fit, count in zip(fits, counts, strict=True))
+    apart = abs(float(np.log(fits[0][1][0, 0] / fits[1][1][0, 0])))
+    scatter = math.hypot(*(_jackknife_focal(group, stated) for group in groups))
+    if apart > _SPLIT_SIGMAS * scatter and np.sqrt(squares / sum(counts)) < _SPLIT_BETTER * rms:
+        names = [", ".join(view.name for view in group) for group in groups]
+        focal = [float(fit[1][0, 0]) for fit in fits]
+        raise ValueError(
+            f"the photographs are of two cameras, or the focus was changed: {names[0]} have a "
+            f"focal length of {focal[0]:.1f} px, {names[1]} of {focal[1]:.1f} px"
+        )
+
+
+def _best_focal(view: BoardView, matrix: FloatArray, lens: FloatArray) -> float:
+    """Relative change of the focal length with which one view fits best."""
+    left = []
+    for change in _FOCAL_SPREAD:
+        tried = matrix.copy()
+        tried[0, 0] *= 1 + change
+        tried[1, 1] *= 1 + change
+        left.append(_rms_px([view], tried, lens))
+    return float(_FOCAL_SPREAD[int(np.argmin(left))])
+
+
+def _jackknife_focal(views: Sequence[BoardView], stated: CameraConfig) -> float:
+    """Relative sigma of the focal length of a group, from fits without each of its views."""
+    return float(_jackknife_sigmas(views, stated)[0])
 
 
 def _fit_camera(

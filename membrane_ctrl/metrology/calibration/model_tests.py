@@ -6,7 +6,7 @@ fall is a chi-square with as many degrees of freedom. Freed in turn: a parameter
 bent screen, a lens that distorts), the camera's pose for some of the sets, everything for one set.
 """
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -276,15 +276,45 @@ def film_rise(solution: solver.Solution, film: set_state.FilmModel) -> float:
     """By how much the sum of squares of a solution with a free film
     rises if the film is like that.
     """
-    bound = []
-    films = solution.problem.films
-    for k, (each, state) in enumerate(zip(solution.equations, solution.states, strict=True)):
-        rows = reference_rows.film_rows(state.surface, film)
-        told = each.sums + rows.T @ rows if k in films else each.sums
-        bound.append(replace(each, sums=told).reduced())
-    return _sum_squares(np.sum(bound, axis=0), solution) - _sum_squares(
-        np.sum(_reduce_equations(solution), axis=0), solution
+    bound = _change_film_rows(
+        solution, lambda state: (1.0, reference_rows.film_rows(state.surface, film))
     )
+    return sum_of_squares(bound) - sum_of_squares(solution)
+
+
+def bind_waves(solution: solver.Solution) -> solver.Solution:
+    """The equations of a solution with waves, for a film without; its unknowns stay."""
+    return _change_film_rows(
+        solution, lambda state: (1.0, reference_rows.wave_rows(state.surface, free=False))
+    )
+
+
+def wave_fall(solution: solver.Solution) -> float:
+    """By how much the sum of squares of a solution without waves falls if the film has them."""
+    without = _change_film_rows(
+        solution, lambda state: (-1.0, reference_rows.wave_rows(state.surface, free=False))
+    )
+    free = _change_film_rows(
+        without, lambda state: (1.0, reference_rows.wave_rows(state.surface, free=True))
+    )
+    return sum_of_squares(solution) - sum_of_squares(free)
+
+
+def sum_of_squares(solution: solver.Solution) -> float:
+    """Least sum of squares of the linearised equations."""
+    return _sum_squares(np.sum(_reduce_equations(solution), axis=0), solution)
+
+
+def _change_film_rows(
+    solution: solver.Solution,
+    rows_of: Callable[[set_state.SetState], tuple[float, FloatArray]],
+) -> solver.Solution:
+    """The solution with rows added to the equations of its films, or subtracted."""
+    changed = list(solution.equations)
+    for k in solution.problem.films:
+        sign, rows = rows_of(solution.states[k])
+        changed[k] = replace(changed[k], sums=changed[k].sums + sign * rows.T @ rows)
+    return replace(solution, equations=tuple(changed))
 
 
 def _sum_squares(sums: FloatArray, solution: solver.Solution) -> float:

@@ -14,7 +14,7 @@ from membrane_ctrl.metrology.calibration.set_state import (
     rim_of,
 )
 from membrane_ctrl.metrology.film import terms_beyond_fit
-from membrane_ctrl.metrology.film.terms_beyond_fit import beyond_of
+from membrane_ctrl.metrology.film.terms_beyond_fit import round_of
 from membrane_ctrl.metrology.rays import (
     bench_parameters,
     bench_poses,
@@ -28,6 +28,7 @@ from membrane_ctrl.metrology.rays.surface import PARAMETERS, Surface
 from membrane_ctrl.model.arrays import FloatArray
 
 _FREE_MM, _LAW_MM = 1e-3, 1e-7
+_HELD_MM = 1e-10  # the fringes of a full set know a wave to 1e-7
 _TILT_STEP = 1e-4
 
 
@@ -48,7 +49,7 @@ def reference_rows(
     ring = rows[:RING]
     ring[:, :PARAMETERS] = rim_harmonics()
     ring[0, PARAMETERS] = 1.0
-    ring[0, forward_model.BEYOND] = rim_beyond()
+    ring[:, forward_model.BEYOND] = rim_beyond()
     ring[:, forward_model.LOCAL + len(bench_parameters.NAMES) : -1] = -np.eye(RING)
     ring[:, -1] = common[len(bench_parameters.NAMES) :] - rim_of(state)
     ring /= references.ring_sigma_um * 1e-3
@@ -59,20 +60,38 @@ def reference_rows(
         laser[forward_model.LOCAL + bench_poses.OPTICAL] = moved_mm
         laser[-1] = -(1 + common[bench_poses.OPTICAL]) * moved_mm - state.vertex_z_mm
         laser /= references.laser_sigma_um * 1e-3
-    return np.vstack([rows, film_rows(state.surface, references.film)])
+    law = film_rows(state.surface, references.film)
+    return np.vstack([rows, law, wave_rows(state.surface, references.waves)])
 
 
 def film_rows(surface: Surface, film: FilmModel) -> FloatArray:
-    """What the film says of the terms beyond the fit's, as weighted rows [derivatives, miss]."""
-    rows = np.zeros((len(terms_beyond_fit.BEYOND), forward_model.LOCAL + COMMON + 1))
-    rows[:, forward_model.BEYOND] = np.eye(len(terms_beyond_fit.BEYOND))
-    rows[:, -1] = -np.array(surface.beyond_mm or [0.0] * len(terms_beyond_fit.BEYOND))
+    """What the film says of the round terms beyond the fit's, as weighted rows [derivatives,
+    miss].
+    """
+    rows = _beyond_rows(surface)[terms_beyond_fit.ROUND]
     if film == "prestressed":
         excess_mm, step_mm = surface.parameters[-1], 1e-5
-        here, there = (beyond_of(excess_mm + d, surface.sag_mm) for d in (0.0, step_mm))
+        here, there = (round_of(excess_mm + d, surface.sag_mm) for d in (0.0, step_mm))
         rows[:, PARAMETERS - 1] = (here - there) / step_mm
         rows[:, -1] += here
     return rows / (_FREE_MM if film == "free" else _LAW_MM)
+
+
+def wave_rows(surface: Surface, free: bool) -> FloatArray:
+    """The waves beyond the fit's as weighted rows [derivatives, miss]: of a film that may be
+    orthotropic, or 0.
+    """
+    sigmas_mm = [wave.sigma_mm if free else _HELD_MM for wave in terms_beyond_fit.WAVES]
+    return np.asarray(_beyond_rows(surface)[terms_beyond_fit.WAVE] / np.array(sigmas_mm)[:, None])
+
+
+def _beyond_rows(surface: Surface) -> FloatArray:
+    """Each term beyond the fit's is 0: rows [derivatives, miss] without weights."""
+    count = terms_beyond_fit.BEYOND_TERMS
+    rows = np.zeros((count, forward_model.LOCAL + COMMON + 1))
+    rows[:, forward_model.BEYOND] = np.eye(count)
+    rows[:, -1] = -np.array(surface.beyond_mm or [0.0] * count)
+    return rows
 
 
 def _artefact_rows(artefact: Artefact, state: SetState) -> FloatArray:
@@ -94,7 +113,7 @@ def _artefact_rows(artefact: Artefact, state: SetState) -> FloatArray:
     here = artefact.terms_mm(*tilt)
     form[:, -1] = (
         here
-        - np.append(surface.parameters, surface.beyond_mm or [0.0] * len(terms_beyond_fit.BEYOND))
+        - np.append(surface.parameters, surface.beyond_mm or [0.0] * terms_beyond_fit.BEYOND_TERMS)
     )[2:]
     for step, lean in zip(_TILT_STEP * np.eye(2), leans, strict=True):
         form[:, :PARAMETERS] -= np.outer(

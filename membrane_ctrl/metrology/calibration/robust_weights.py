@@ -98,5 +98,6 @@ def _patch_means(
 def _reduced_chi_square(means: FloatArray) -> float:
     """Their variance, as if they were alone: those that the fit has taken are as good as gone."""
     known = means[np.isfinite(means)]
-    free = known.size - forward_model.LOCAL
-    return float(np.sum(known**2) / free) if free > forward_model.LOCAL else 1.0
+    taken = forward_model.LOCAL_EVEN  # waves are small, and mostly held: they take little
+    free = known.size - taken
+    return float(np.sum(known**2) / free) if free > taken else 1.0

@@ -11,6 +11,7 @@ from membrane_ctrl.metrology.rays import bench_parameters
 from membrane_ctrl.metrology.rays.rim_harmonics import RING, rim_harmonics
 from membrane_ctrl.metrology.rays.surface import Surface
 from membrane_ctrl.model.arrays import FloatArray
+from membrane_ctrl.model.zernike_terms import ZERNIKE_DEGREE
 
 COMMON = len(bench_parameters.NAMES) + RING  # parameters of `NAMES`, then the ring
 # What the round terms beyond the fit's are. They are a micrometre of a 37 mm bowl, and a nanometre
@@ -39,18 +40,29 @@ class References:
     # the clamp creeps by less than a micrometre in the minutes that a calibration takes
     ring_sigma_um: float = 1.0  # how far the ring's harmonics may differ from set to set
     film: FilmModel = "free"  # what the film's round terms beyond the fit's are
+    waves: bool = False  # whether the film has waves beyond the fit's terms (`film_waves`)
 
 
 def rim_of(state: SetState) -> FloatArray:
     """Harmonics (RING,) of the rim's height in world."""
     out = rim_harmonics() @ state.surface.parameters
-    out[0] += state.vertex_z_mm + (
-        rim_beyond() @ state.surface.beyond_mm if state.surface.beyond_mm else 0.0
-    )
+    out[0] += state.vertex_z_mm
+    if state.surface.beyond_mm:
+        out += rim_beyond() @ state.surface.beyond_mm
     return np.asarray(out)
 
 
 @cache
 def rim_beyond() -> FloatArray:
-    """Height of the rim above the vertex by the round terms beyond the fit's."""
-    return np.asarray(terms_beyond_fit.beyond_series().sum(axis=1))
+    """Matrix (RING, BEYOND_TERMS) from the terms beyond the fit's to the harmonics of the rim's
+    height.
+    """
+    out = np.zeros((RING, terms_beyond_fit.BEYOND_TERMS))
+    out[0, terms_beyond_fit.ROUND] = terms_beyond_fit.round_series().sum(axis=1)
+    waves = out[:, terms_beyond_fit.WAVE]
+    for column, wave in enumerate(terms_beyond_fit.WAVES):
+        order = wave.azimuthal_order
+        if abs(order) <= ZERNIKE_DEGREE:
+            row = order if order > 0 else ZERNIKE_DEGREE - order
+            waves[row, column] = wave.rms_factor
+    return out

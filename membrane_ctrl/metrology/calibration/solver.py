@@ -282,7 +282,7 @@ def _move_state(
         state.surface.parameters + own[:PARAMETERS], state.surface.radius_mm
     )
     beyond_mm = (
-        np.array(state.surface.beyond_mm or [0.0] * len(terms_beyond_fit.BEYOND))
+        np.array(state.surface.beyond_mm or [0.0] * terms_beyond_fit.BEYOND_TERMS)
         + own[forward_model.BEYOND]
     )
     surface = replace(surface, beyond_mm=tuple(beyond_mm.tolist()))

@@ -87,15 +87,19 @@ def check_solution(solution: Solution) -> tuple[CalibrationFinding, ...]:
     film = _judge_film(solution)
     if not solution.converged:
         return (film[0][1] if film else _judge_divergence(solution),)
-    causes = [
-        *film,
+    causes = [*film, *list_causes(solution)]
+    cause = [_of_still_sets(solution, max(causes, key=lambda each: each[0])[1])] if causes else []
+    return (*cause, *([] if causes else _judge_scatter(solution)), *_judge_spread(solution))
+
+
+def list_causes(solution: Solution) -> list[tuple[float, CalibrationFinding]]:
+    """Errors of bench and sets that the equations show, each with what it explains."""
+    return [
         *_judge_screen_positions(solution),
         *_judge_sets(solution),
         *_judge_laser(solution),
         *_judge_model(solution),
     ]
-    cause = [_of_still_sets(solution, max(causes, key=lambda each: each[0])[1])] if causes else []
-    return (*cause, *([] if causes else _judge_scatter(solution)), *_judge_spread(solution))
 
 
 def _judge_screen_positions(solution: Solution) -> list[tuple[float, CalibrationFinding]]:
@@ -144,7 +148,7 @@ def _judge_film(solution: Solution) -> list[tuple[float, CalibrationFinding]]:
         other = solve_calibration(free, start=solution if solution.converged else None)
     except ValueError:
         return []
-    freedom = len(terms_beyond_fit.BEYOND) * len(problem.sets)
+    freedom = len(terms_beyond_fit.ROUND_DEGREES) * len(problem.sets)
     fall = model_tests.film_rise(other, film_kind)
     if not other.converged or chi2.sf(fall, freedom) > model_tests.SURE:
         return []

@@ -13,9 +13,14 @@ Hencky's film without pre-strain (nu = 0.3). It follows from the pressure, or, w
 and pressure, from the sag. F's nearest singularity, a film without stress at its ring, is at s =
 30.6.
 
-What varies with azimuth (pre-strain, a ring that is not flat or not round) is a small disturbance
-cos(m theta) of that film. Of all displacements that meet the ring's, the true one has the least
-energy (Ritz, `Bowl.harmonic`).
+What varies with azimuth (pre-strain, a ring that is not flat or not round, a film that is stiffer
+in one direction) is a small disturbance cos(m theta) of that film. Of all displacements that meet
+the ring's, the true one has the least energy (Ritz, `Bowl.harmonic`).
+
+An orthotropic film, in polar coordinates about its stiff direction, has the stiffnesses (Tsai and
+Pagano) Q_rr = U1 + U2 cos 2t + U3 cos 4t, Q_tt = U1 - U2 cos 2t + U3 cos 4t, Q_rt = U4 - U3 cos 4t,
+Q_rs = -U2 / 2 sin 2t - U3 sin 4t and Q_ts = -U2 / 2 sin 2t + U3 sin 4t. U2 pulls with two waves and
+U3 with four on the strains of the isotropic film, to first order.
 
 All that is Foeppl's: small slopes, pressure along z. It misses 1 % of the slopes at 37 mm of sag,
 which would be taken for a Poisson ratio that is lower by 0.05; `finite_rise_mm` does not.
@@ -41,7 +46,7 @@ _SERIES_TERMS = 80
 _WAVE_TERMS = 14  # of a disturbance: it converges tenfold a term
 _NODES = 48
 COMPLEX_STEP = 1e-30  # small enough that its square is nothing beside 1
-HarmonicCause = Literal["prestrain", "flat", "round"]
+HarmonicCause = Literal["prestrain", "flat", "round", "modulus", "shear"]
 
 
 @cache
@@ -190,9 +195,11 @@ class Bowl:
         ----------
         order : int
             m, from 1.
-        cause : "prestrain", "flat" or "round"
+        cause : "prestrain", "flat", "round", "modulus" or "shear"
             The ring's hoop of film is stretched by 1, raised by 1 mm, or 1 mm wider, each times
-            cos(m theta).
+            cos(m theta). Or the film's modulus along theta = 0 is larger than across by 1, of
+            their mean (m = 2 only), or its shear modulus is larger by 1, of that of an isotropic
+            film (m = 4 only).
 
         Returns
         -------
@@ -204,14 +211,21 @@ class Bowl:
         radial, hoop = (float(force) for force in self.stresses(one))
         nu = float(self.poisson)
         stretch = hoop - nu * radial - (radial - nu * hoop - rise**2 / 2)  # u / a - du/dr
-        ring = {"prestrain": (1.0, 0.0), "flat": (0.0, 1 / a), "round": (stretch / a, -rise / a)}[
-            cause
-        ]
-        return Legendre(a * self._ritz(order, *ring), domain=[0, 1])
+        ring = {"prestrain": (1.0, 0.0), "flat": (0.0, 1 / a), "round": (stretch / a, -rise / a)}
+        outward, upward = ring.get(cause, (0.0, 0.0))
+        of_film = {
+            "modulus": (0.5 / (1 - nu**2), 0.0),
+            "shear": (0.0, -0.25 / (1 + nu)),
+        }
+        return Legendre(
+            a * self._ritz(order, outward, upward, *of_film.get(cause, (0.0, 0.0))), domain=[0, 1]
+        )
 
-    def _ritz(self, order: int, outward: float, upward: float) -> FloatArray:
+    def _ritz(
+        self, order: int, outward: float, upward: float, two_waves: float, four_waves: float
+    ) -> FloatArray:
         """Coefficients (_WAVE_TERMS,) of the height / a with the least energy, given the ring's
-        displacements / a.
+        displacements / a and the film's stiffnesses U2 and U3 / (E t).
         """
         nodes, weights = legendre.leggauss(_NODES)
         rho = (nodes + 1) / 2
@@ -246,7 +260,13 @@ class Bowl:
             ]
         )
         system = np.block([[energy, ring.T], [ring, np.zeros((3, 3))]])
-        right = np.append(np.zeros(len(energy)), [outward, 0.0, upward])
+        # the forces of the uneven stiffness on the strains of the even film
+        along = stresses[0] - nu * stresses[1]
+        around = stresses[1] - nu * stresses[0]
+        pull = radial @ (two_waves * along * area) - hoop @ (two_waves * around * area)
+        pull -= shear @ (two_waves * (along + around) / 2 * area)
+        pull += (radial - hoop - shear) @ (four_waves * (along - around) * area)
+        right = np.append(-pull, [outward, 0.0, upward])
         return np.asarray(np.linalg.solve(system, right)[:_WAVE_TERMS])
 
 

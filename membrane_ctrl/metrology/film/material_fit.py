@@ -3,8 +3,8 @@ the ring's form.
 
 Each figure gives its rotationally symmetric numbers: with 36 terms Noll 4, 11, 22 and the excess.
 The law (`film_law`) predicts them from the pre-strain, the Poisson ratio and the set's own load q;
-the gauge says q = p a / (E t). Terms with azimuthal order 1 to 3 belong to the ring: a pre-strain
-that varies, a ring that is not flat or not round.
+the gauge says q = p a / (E t). Terms with azimuthal order 1 to 5 belong to the ring and to an
+orthotropic film (`ring_waves`).
 
 No film obeys a law exactly. Its misfit is a random figure of unknown size that stays, or grows
 with a power of the sag; both are taken from what the law leaves, here and in the terms that it
@@ -29,16 +29,23 @@ from membrane_ctrl.metrology.film.misfit_average import (
     shared_covariance,
 )
 from membrane_ctrl.metrology.film.radial_quadrature import slope_radii
-from membrane_ctrl.metrology.film.ring_waves import RingWave, azimuthal_terms, fit_ring
+from membrane_ctrl.metrology.film.ring_waves import (
+    CAUSES,
+    RingWave,
+    UnexplainedWaves,
+    azimuthal_terms,
+    fit_waves,
+    unexplained_term_mm,
+)
 from membrane_ctrl.model.arrays import FloatArray
-from membrane_ctrl.model.zernike_terms import ZERNIKE_DEGREE, ZERNIKE_TERMS
+from membrane_ctrl.model.zernike_terms import ZERNIKE_TERMS
 
 # What is known without the sets: films are stretched by some 0.1 %, and a polymer's Poisson ratio
 # is 0.25 to 0.45
 PRESTRAIN_SIGMA, POISSON, POISSON_SIGMA = 3e-3, 0.35, 0.1
 # Round terms among a figure's parameters: those of Noll's order from 2 on, then the excess
-_ROUND = np.array([*(j - 2 for j in hencky_bowl.ROUND_NOLL[1:]), ZERNIKE_TERMS - 1])
-_FREEDOM = np.append(np.ones(_ROUND.size - 1), 0.1)  # of a misfit: the excess has 10 % of a term's
+ROUND = np.array([*(j - 2 for j in hencky_bowl.ROUND_NOLL[1:]), ZERNIKE_TERMS - 1])
+_FREEDOM = np.append(np.ones(ROUND.size - 1), 0.1)  # of a misfit: the excess has 10 % of a term's
 _ITERATIONS = 40
 _LEAST_MM = 2e-4  # no film is trusted to follow the law more closely
 _NEGLECTED = 0.005  # what Hooke's law misses of a film, of sag^3 / radius^2: 1 µm at 37 mm
@@ -59,9 +66,10 @@ class FilmFit:
 
     law: FilmLaw  # its stiffness is meaningless without pressures
     covariance: FloatArray  # (3, 3): of pre-strain, Poisson ratio, relative stiffness
-    # (n, parameters): what it leaves; 0 where it says nothing (tilt, orders above 3)
+    # (n, parameters): what it leaves; 0 where it says nothing (tilt, orders above 5)
     left_mm: FloatArray
     waves: tuple[RingWave, ...]
+    unexplained: tuple[UnexplainedWaves, ...]
     misfit_um: float  # 1 sigma of a term
 
     @property
@@ -82,31 +90,21 @@ def fit_film(
             "one set cannot tell pre-strain from Poisson ratio: two or more pressures are needed"
         )
     reach = analysis_mm / radius_mm
-    seen_mm = _seen_mm(figures)
+    sags_mm = np.array([[one.sag_mm] for one in figures])
+    about = FilmLaw(0.0, POISSON, 1.0, radius_mm).with_sag(sags_mm)
+    seen_mm = max(unexplained_term_mm(figures, about, reach), _LEAST_MM)
     unknowns, covariance, size_mm = _fit_round(figures, radius_mm, reach, gauge, seen_mm)
     law = FilmLaw(float(unknowns[0]), float(unknowns[1]), float(np.exp(unknowns[2])), radius_mm)
     bowls = law.loaded(np.exp(unknowns[3:, None]))
-    waves, predicted = fit_ring(figures, bowls, reach, seen_mm)
-    predicted[:, _ROUND] = round_terms_mm(bowls, reach) + _finite_terms_mm(law, bowls, reach)
+    of_waves = fit_waves(figures, bowls, reach, seen_mm)
+    predicted = of_waves.added_mm
+    predicted[:, ROUND] = round_terms_mm(bowls, reach) + _finite_terms_mm(law, bowls, reach)
     known = np.zeros(ZERNIKE_TERMS, bool)
-    known[_ROUND] = True
-    for order in (1, 2, 3):
+    known[ROUND] = True
+    for order in CAUSES:
         known[azimuthal_terms(order).ravel()] = True
     left = np.where(known, np.array([each.parameters_mm for each in figures]) - predicted, 0.0)
-    return FilmFit(law, covariance, left, waves, 1e3 * size_mm)
-
-
-def _seen_mm(figures: Sequence[FilmFigure]) -> float:
-    """Size of a term that no law of this module has, from those with azimuthal orders of 4 and
-    more.
-    """
-    others = np.concatenate(
-        [azimuthal_terms(order).ravel() for order in range(4, ZERNIKE_DEGREE + 1)]
-    )
-    squares = [
-        each.parameters_mm[others] ** 2 - np.diag(each.noise_mm2)[others] for each in figures
-    ]
-    return float(np.sqrt(max(np.mean(squares), _LEAST_MM**2)))
+    return FilmFit(law, covariance, left, of_waves.waves, of_waves.unexplained, 1e3 * size_mm)
 
 
 def round_terms_mm(bowls: Bowl, reach: float) -> FloatArray:
@@ -155,8 +153,8 @@ def _fit_round(
     seen_mm = max(seen_mm, _NEGLECTED * sag_mm**3 / radius_mm**2)
     gauged = np.isfinite(pressure)
     log_q = np.log(pressure[gauged] * radius_mm * 1e-3)
-    data = np.array([each.parameters_mm[_ROUND] for each in figures]).ravel()
-    finite = np.zeros((count, len(_ROUND)))
+    data = np.array([each.parameters_mm[ROUND] for each in figures]).ravel()
+    finite = np.zeros((count, len(ROUND)))
 
     def bent(x: FloatArray) -> tuple[FilmLaw, Bowl]:
         law = FilmLaw(float(x[0]), float(x[1]), 1.0, radius_mm)
@@ -171,7 +169,7 @@ def _fit_round(
         + gauge.scale**2
         + np.diag((gauge.noise_pa / pressure[gauged]) ** 2)
     )
-    shared = shared_covariance(figures, _ROUND)
+    shared = shared_covariance(figures, ROUND)
     noise = np.zeros((len(data) + len(log_q),) * 2)
     noise[: len(data), : len(data)], noise[len(data) :, len(data) :] = shared, of_gauge
     misfits = np.zeros((GROWTHS.size, *noise.shape))

@@ -1,7 +1,12 @@
-"""Waves of the ring: its disturbances of azimuthal order 1 to 3, from the terms of these orders."""
+"""Waves of a figure: what the ring and an uneven film add, by azimuthal order.
+
+Each cause has a profile along the radius, and follows the sag in its own way: a ring that is not
+flat adds the same at any sag, an orthotropic film in proportion to it. A cause is stated only where
+these signatures explain the waves of its order; else the order's cause is unknown.
+"""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.polynomial import legendre
@@ -17,23 +22,64 @@ from membrane_ctrl.metrology.film.radial_quadrature import slope_radii
 from membrane_ctrl.model.arrays import FloatArray, IntArray
 from membrane_ctrl.model.zernike_terms import ZERNIKE_DEGREE, ZERNIKE_TERMS
 
-_RING_SIGMAS: dict[HarmonicCause, float] = {"prestrain": 1e-3, "flat": 1.0, "round": 2.0}  # mm
+# What may cause waves of each azimuthal order; a tilted ring (flat, 1) is not separable from a
+# tilted bench
+CAUSES: dict[int, tuple[HarmonicCause, ...]] = {
+    1: ("prestrain", "round"),
+    2: ("prestrain", "flat", "round", "modulus"),
+    3: ("prestrain", "flat", "round"),
+    4: ("flat", "shear"),
+    5: ("flat",),
+}
+# 1 sigma known before: a strain, mm, or a share of the modulus
+_CAUSE_SIGMAS: dict[HarmonicCause, float] = {
+    "prestrain": 1e-3,
+    "flat": 1.0,
+    "round": 2.0,
+    "modulus": 0.1,
+    "shear": 0.3,
+}
+_OF_FILM = ("modulus", "shear")
 _SURE = 4.0  # sigmas
+_FOEPPL = 0.03  # of an orthotropic film's wave: what finite slopes change of it
+_SECOND_ORDER = 2.0  # of the modulus' square: what it adds to four waves, as a share of the shear
+_UNEXPLAINED = 0.1  # of the waves of an order: more left over is another cause
+_LEAST_SEEN_MM = 2e-3  # RMS of an order's terms that is worth a statement
 
 
 @dataclass(frozen=True)
 class RingWave:
-    """One disturbance of the ring: amounts of cos(m theta) and sin(m theta), a strain or mm."""
+    """One cause of waves: amounts of cos(m theta) and sin(m theta), a strain, mm or a share."""
 
     cause: HarmonicCause
     order: int
     amounts: FloatArray  # (2,)
     sigmas: FloatArray  # (2,)
+    explained: bool  # whether all causes together explain the waves of this order
 
     @property
     def seen(self) -> bool:
         """Whether it is there beyond doubt."""
-        return bool(np.any(np.abs(self.amounts) > _SURE * self.sigmas))
+        return self.explained and bool(np.any(np.abs(self.amounts) > _SURE * self.sigmas))
+
+
+@dataclass(frozen=True)
+class UnexplainedWaves:
+    """Waves of an azimuthal order that no cause of the law has."""
+
+    order: int
+    rms_um: float  # over the disc
+    left_um: float
+    likely: tuple[HarmonicCause, ...]  # the causes that alone leave least, the best first
+
+
+@dataclass(frozen=True)
+class WaveFit:
+    """All causes, the orders without one, and what the causes add to the parameters."""
+
+    waves: tuple[RingWave, ...]
+    unexplained: tuple[UnexplainedWaves, ...]
+    added_mm: FloatArray  # (n, parameters)
 
 
 def azimuthal_terms(order: int) -> IntArray:
@@ -51,38 +97,118 @@ def azimuthal_terms(order: int) -> IntArray:
     return np.array([found[0], found[1]])
 
 
-def fit_ring(
-    figures: Sequence[FilmFigure], bowls: Bowl, reach: float, seen_mm: float
-) -> tuple[tuple[RingWave, ...], FloatArray]:
-    """Waves of the ring, and what they add to the figures' parameters (n, parameters)."""
+def fit_waves(figures: Sequence[FilmFigure], bowls: Bowl, reach: float, seen_mm: float) -> WaveFit:
+    """Causes of the waves in the figures.
+
+    Parameters
+    ----------
+    figures : sequence of FilmFigure
+        Figures of one film, (n,).
+    bowls : Bowl
+        The film of the law in each of them, (n, 1).
+    reach : float
+        Radius of the analysed disc in radii of the ring.
+    seen_mm : float
+        Size of a term that no law has.
+    """
     added = np.zeros((len(figures), ZERNIKE_TERMS))
-    waves = []
-    alike = misfit_covariances(figures)
-    for order in (1, 2, 3):
-        causes: list[HarmonicCause] = (
-            ["prestrain", "flat", "round"] if order > 1 else ["prestrain", "round"]
-        )
+    waves: list[RingWave] = []
+    unexplained: list[UnexplainedWaves] = []
+    for order, causes in CAUSES.items():
         terms = azimuthal_terms(order)
-        response = np.stack(
-            [_wave_terms_mm(bowls, order, cause, reach) for cause in causes], axis=-1
-        )
-        design = response.reshape(-1, len(causes))
-        precision = np.array([_RING_SIGMAS[cause] ** -2 for cause in causes])
-        found = []
-        for parity in (0, 1):
-            data = np.array([each.parameters_mm[terms[parity]] for each in figures]).ravel()
-            noise = shared_covariance(figures, terms[parity]) + 1e-14 * np.eye(data.size)
-            spread = np.stack([np.kron(part, np.eye(terms.shape[1])) for part in alike])
-            allowed = average_over_misfits(
-                design, data, noise, spread, np.zeros(len(causes)), precision, seen_mm
-            )
-            found.append(allowed)
-            added[:, terms[parity]] = (response @ allowed.mean).reshape(len(figures), -1)
+        response = wave_responses_mm(bowls, order, reach)
+        data = np.stack([[one.parameters_mm[part] for one in figures] for part in terms])
+        fits = [
+            _fit_parity(figures, terms[parity], causes, response, data[parity], seen_mm)
+            for parity in (0, 1)
+        ]
+        for parity, (amounts, _) in enumerate(fits):
+            added[:, terms[parity]] = response @ amounts
+        left = data - np.stack([response @ amounts for amounts, _ in fits])
+        rms_mm, left_mm = (float(np.sqrt(np.sum(part**2) / len(figures))) for part in (data, left))
+        explained = left_mm < max(_UNEXPLAINED * rms_mm, 2 * seen_mm)
+        if not explained and rms_mm > _LEAST_SEEN_MM:
+            likely = _rank_causes(causes, response, data)
+            unexplained.append(UnexplainedWaves(order, 1e3 * rms_mm, 1e3 * left_mm, likely))
         for k, cause in enumerate(causes):
-            amounts = np.array([each.mean[k] for each in found])
-            sigmas = np.sqrt([each.covariance[k, k] for each in found])
-            waves.append(RingWave(cause, order, amounts, sigmas))
-    return tuple(waves), added
+            amounts = np.array([found[k] for found, _ in fits])
+            sigmas = np.array([sigma[k] for _, sigma in fits])
+            waves.append(RingWave(cause, order, amounts, sigmas, explained))
+    return WaveFit(_widen_shear(waves), tuple(unexplained), added)
+
+
+def _widen_shear(waves: list[RingWave]) -> tuple[RingWave, ...]:
+    """The waves; the shear's sigma with what the square of the moduli's difference adds."""
+    moduli = max(float(np.hypot(*one.amounts)) for one in waves if one.cause == "modulus")
+    added = _SECOND_ORDER * moduli**2
+    return tuple(
+        replace(one, sigmas=np.hypot(one.sigmas, added)) if one.cause == "shear" else one
+        for one in waves
+    )
+
+
+def _fit_parity(
+    figures: Sequence[FilmFigure],
+    terms: IntArray,
+    causes: Sequence[HarmonicCause],
+    response: FloatArray,
+    data: FloatArray,
+    seen_mm: float,
+) -> tuple[FloatArray, FloatArray]:
+    """Amounts of the causes and their sigmas, from the cosine or the sine terms of an order."""
+    known = np.array([_CAUSE_SIGMAS[cause] for cause in causes])
+    noise = shared_covariance(figures, terms) + 1e-14 * np.eye(data.size)
+    spread = np.stack([np.kron(part, np.eye(terms.size)) for part in misfit_covariances(figures)])
+    of_film = [k for k, cause in enumerate(causes) if cause in _OF_FILM]
+    design, size_mm = response.reshape(-1, len(causes)), seen_mm
+    # twice: what finite slopes change of an orthotropic film's waves follows from their size
+    for _ in range(2):
+        found = average_over_misfits(
+            design, data.ravel(), noise, spread, np.zeros(len(causes)), known**-2, size_mm
+        )
+        waves_mm = response[..., of_film] @ found.mean[of_film]
+        size_mm = float(np.hypot(seen_mm, _FOEPPL * np.sqrt(np.mean(waves_mm**2))))
+    return found.mean, np.sqrt(np.diag(found.covariance))
+
+
+def _rank_causes(
+    causes: Sequence[HarmonicCause], response: FloatArray, data: FloatArray
+) -> tuple[HarmonicCause, ...]:
+    """The causes by what each leaves alone, the best first."""
+    left = []
+    for k in range(len(causes)):
+        column = response[..., k].ravel()
+        amounts = data.reshape(2, -1) @ column / (column @ column)
+        left.append(float(np.sum((data.reshape(2, -1) - np.outer(amounts, column)) ** 2)))
+    return tuple(causes[k] for k in np.argsort(left))
+
+
+def unexplained_term_mm(figures: Sequence[FilmFigure], bowls: Bowl, reach: float) -> float:
+    """RMS of a term that no cause explains, from the azimuthal orders of 4 and more; noise
+    subtracted.
+    """
+    squares, freedom = 0.0, 0
+    for order in range(4, ZERNIKE_DEGREE + 1):
+        for terms in azimuthal_terms(order):
+            data = np.array([one.parameters_mm[terms] for one in figures])
+            noise = sum(float(np.sum(np.diag(one.noise_mm2)[terms])) for one in figures)
+            # of a figure that stays, a ring that is not flat takes one number
+            taken = 1 if "flat" in CAUSES.get(order, ()) else 0
+            if taken:
+                columns = wave_responses_mm(bowls, order, reach)
+                columns = columns.reshape(-1, columns.shape[-1])
+                amounts = np.linalg.lstsq(columns, data.ravel(), rcond=None)[0]
+                data = data - (columns @ amounts).reshape(data.shape)
+            squares += (float(np.sum(data**2)) - noise) / len(figures)
+            freedom += terms.size - taken
+    return float(np.sqrt(max(squares / freedom, 0.0)))
+
+
+def wave_responses_mm(bowls: Bowl, order: int, reach: float) -> FloatArray:
+    """Zernike terms (n, k, causes) of one unit of each cause of an order."""
+    return np.stack(
+        [_wave_terms_mm(bowls, order, cause, reach) for cause in CAUSES[order]], axis=-1
+    )
 
 
 def _wave_terms_mm(bowls: Bowl, order: int, cause: HarmonicCause, reach: float) -> FloatArray:

@@ -111,7 +111,7 @@ def evaluate_gradients(x: FloatArray, y: FloatArray) -> tuple[FloatArray, FloatA
 
 def differentiate_table(table: FloatArray, axis: int) -> FloatArray:
     """Derivative of polynomials whose powers run along `axis` (1: x, 2: y), in the same shape."""
-    powers = np.arange(ZERNIKE_DEGREE + 1).reshape([-1 if k == axis else 1 for k in range(3)])
+    powers = np.arange(table.shape[axis]).reshape([-1 if k == axis else 1 for k in range(3)])
     out = np.roll(table * powers, -1, axis=axis)
     return np.asarray(out)
 

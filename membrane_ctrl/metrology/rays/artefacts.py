@@ -7,16 +7,18 @@ from functools import cache
 import numpy as np
 from numpy.polynomial import polynomial as series
 
-from membrane_ctrl.metrology.film import hencky_bowl, terms_beyond_fit
+from membrane_ctrl.metrology.film import hencky_bowl
 from membrane_ctrl.metrology.numerics import zernike
+from membrane_ctrl.metrology.rays import surface_basis
 from membrane_ctrl.metrology.rays.surface import PARAMETERS, parameter_to_coeffs
 from membrane_ctrl.model.arrays import FloatArray
 
 
 @cache
 def _from_heights() -> tuple[FloatArray, FloatArray, FloatArray]:
-    """x and y (n,) over the unit disc, and least squares (parameters + 3, n) from heights there to
-    the parameters and `BEYOND`."""
+    """x and y (n,) over the unit disc, and least squares (k, n) from heights there to the
+    parameters and the terms beyond the fit's.
+    """
     k = np.arange(1024)
     rho, theta = np.sqrt((k + 0.5) / k.size), k * np.pi * (3 - np.sqrt(5))
     x, y = rho * np.cos(theta), rho * np.sin(theta)
@@ -24,7 +26,7 @@ def _from_heights() -> tuple[FloatArray, FloatArray, FloatArray]:
     own = zernike.evaluate_terms(x, y).T @ parameter_to_coeffs() + np.outer(
         excess, np.eye(PARAMETERS)[-1]
     )
-    beyond = series.polyval(rho**2, terms_beyond_fit.beyond_series().T).T
+    beyond = surface_basis.evaluate_beyond_basis(x, y)[0].T
     return x, y, np.linalg.pinv(np.hstack([own, beyond]))
 
 
@@ -54,7 +56,7 @@ class Artefact:
 
     def terms_mm(self, tilt_x: float = 0.0, tilt_y: float = 0.0) -> FloatArray:
         """Parameters (parameters,) of the surface with these slopes at its vertex, and its terms
-        `BEYOND`.
+        beyond the fit's.
         """
         x, y, onto = _from_heights()
         return np.asarray(onto @ self._heights_mm(self.curvature_per_mm, x, y, tilt_x, tilt_y))

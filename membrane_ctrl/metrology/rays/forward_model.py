@@ -26,6 +26,7 @@ from dataclasses import dataclass, replace
 from functools import cache
 
 import numpy as np
+from numpy.polynomial.polynomial import polyval2d
 
 from membrane_ctrl.metrology.film import terms_beyond_fit
 from membrane_ctrl.metrology.rays import kernels
@@ -44,15 +45,16 @@ from membrane_ctrl.metrology.rays.ray_tracing import Points, Tracer, make_parabo
 from membrane_ctrl.metrology.rays.screen_face import BOW_RADIUS_MM
 from membrane_ctrl.metrology.rays.set_phases import SetPhases
 from membrane_ctrl.metrology.rays.surface import PARAMETERS, Surface
-from membrane_ctrl.metrology.rays.surface_basis import evaluate_basis, evaluate_round_basis
+from membrane_ctrl.metrology.rays.surface_basis import evaluate_basis, evaluate_beyond_basis
 from membrane_ctrl.model.arrays import BoolArray, FloatArray
 
 # Columns of the derivatives. First the set's own unknowns: its surface's parameters, the height of
-# its vertex, its round terms beyond them, and by how much the film was deeper in the x frames than
-# in the y frames; then the optical parameters.
-BEYOND = slice(PARAMETERS + 1, PARAMETERS + 1 + len(terms_beyond_fit.BEYOND))
+# its vertex, its terms beyond them (round ones and waves), and by how much the film was deeper in
+# the x frames than in the y frames; then the optical parameters.
+BEYOND = slice(PARAMETERS + 1, PARAMETERS + 1 + terms_beyond_fit.BEYOND_TERMS)
 MOTION = BEYOND.stop
 LOCAL = MOTION + 1
+LOCAL_EVEN = LOCAL - len(terms_beyond_fit.WAVES)  # of a film without waves beyond the fit's
 COLUMNS = LOCAL + OPTICAL
 _CHUNK = 8192  # points whose derivatives are in memory at a time: 8 MB
 _GLASS_INDEX = 1.52
@@ -82,7 +84,20 @@ def place_rays(
     tracer = Tracer(bench.geometry, surface.radius_mm, vertex_z_mm)
     tracer.start(points, make_parabola(surface.sag_mm, surface.radius_mm))
     tracer.intersect(points, surface, newton=4)  # from some mm: 0.1 mm, 1 nm, 1e-16 mm
+    if surface.beyond_mm:
+        _follow_waves(tracer, points, surface)
     return points
+
+
+def _follow_waves(tracer: Tracer, points: Points, surface: Surface) -> None:
+    """One more Newton step, to the waves that the kernels do not have: of less than a micrometre,
+    it is exact to 1e-13 mm.
+    """
+    x, y = tracer.position_mm(points)
+    hx, hy = surface.slopes(x, y)
+    raised = polyval2d(x / surface.radius_mm, y / surface.radius_mm, surface.waves)
+    d = points.rays
+    points.t_mm += raised / (d[2] - hx * d[0] - hy * d[1])
 
 
 def residual_mm(
@@ -326,7 +341,7 @@ def _by_surface(
     x = m.place[0] / surface.radius_mm
     y = m.place[1] / surface.radius_mm
     scale = 1 / surface.radius_mm
-    bases = zip(evaluate_basis(x, y), evaluate_round_basis(x, y), strict=True)
+    bases = zip(evaluate_basis(x, y), evaluate_beyond_basis(x, y), strict=True)
     height, height_x, height_y = (np.vstack(parts) for parts in bases)
     for axis in range(2):
         slope = (by_normal[axis, 0] * height_x + by_normal[axis, 1] * height_y) * scale

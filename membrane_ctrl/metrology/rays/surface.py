@@ -27,7 +27,7 @@ class Surface:
     coeffs_mm: FloatArray
     hencky_mm: float  # amplitude of the excess, as the sag of the Hencky bowl it belongs to
     radius_mm: float  # radius of the Zernike disc
-    # of `film_law.BEYOND`: a calibration's; a measurement has none
+    # of `terms_beyond_fit`, (BEYOND_TERMS,): a calibration's; a measurement has none
     beyond_mm: tuple[float, ...] = ()
 
     @classmethod
@@ -56,10 +56,28 @@ class Surface:
     @cached_property
     def excess(self) -> FloatArray:
         """The excess as a power series in (r / R)^2, in mm."""
-        excess = self.hencky_mm * hencky_bowl.excess_series()
-        if self.beyond_mm:
-            excess = excess + np.array(self.beyond_mm) @ terms_beyond_fit.beyond_series()
-        return excess
+        own = self.hencky_mm * hencky_bowl.excess_series()
+        if not self.beyond_mm:
+            return own
+        round_mm = np.array(self.beyond_mm[terms_beyond_fit.ROUND])
+        return np.asarray(own + round_mm @ terms_beyond_fit.round_series())
+
+    @cached_property
+    def waves(self) -> FloatArray:
+        """The waves beyond the fit's as a polynomial in x / R, y / R, in mm; (1, 1) without any."""
+        if not self.beyond_mm:
+            return np.zeros((1, 1))
+        waves_mm = np.array(self.beyond_mm[terms_beyond_fit.WAVE])
+        return np.asarray(np.tensordot(waves_mm, terms_beyond_fit.wave_polynomials(), axes=1))
+
+    @cached_property
+    def _whole(self) -> FloatArray:
+        """The Zernike part and the waves as one polynomial in x / R, y / R."""
+        if not self.beyond_mm:
+            return self.polynomial
+        out = self.waves.copy()
+        out[: self.polynomial.shape[0], : self.polynomial.shape[1]] += self.polynomial
+        return out
 
     @property
     def sag_mm(self) -> float:
@@ -70,7 +88,7 @@ class Surface:
         """Height in mm at points (...) in mm."""
         x = np.asarray(x_mm) / self.radius_mm
         y = np.asarray(y_mm) / self.radius_mm
-        bowl = series.polyval2d(x, y, self.polynomial)
+        bowl = series.polyval2d(x, y, self._whole)
         return np.asarray(bowl + series.polyval(x * x + y * y, self.excess))
 
     def slopes(self, x_mm: FloatArray, y_mm: FloatArray) -> tuple[FloatArray, FloatArray]:
@@ -79,8 +97,8 @@ class Surface:
         y = y_mm / self.radius_mm
         # The excess e(v), v = x^2 + y^2, has the slopes 2 e'(v) x and 2 e'(v) y.
         excess_slope = 2 * series.polyval(x * x + y * y, series.polyder(self.excess))
-        terms_x = series.polyval2d(x, y, series.polyder(self.polynomial, axis=0))
-        terms_y = series.polyval2d(x, y, series.polyder(self.polynomial, axis=1))
+        terms_x = series.polyval2d(x, y, series.polyder(self._whole, axis=0))
+        terms_y = series.polyval2d(x, y, series.polyder(self._whole, axis=1))
         slope_x = (terms_x + excess_slope * x) / self.radius_mm
         slope_y = (terms_y + excess_slope * y) / self.radius_mm
         return slope_x, slope_y
@@ -95,8 +113,8 @@ class Surface:
         # Derivatives of the excess e(v): 2 e'(v), and 4 e''(v) times the product of coordinates.
         first = 2 * series.polyval(v, series.polyder(self.excess))
         second = 4 * series.polyval(v, series.polyder(self.excess, 2))
-        by_x = series.polyder(self.polynomial, axis=0)
-        by_y = series.polyder(self.polynomial, axis=1)
+        by_x = series.polyder(self._whole, axis=0)
+        by_y = series.polyder(self._whole, axis=1)
         hxx = series.polyval2d(x, y, series.polyder(by_x, axis=0)) + first + second * x * x
         hxy = series.polyval2d(x, y, series.polyder(by_x, axis=1)) + second * x * y
         hyy = series.polyval2d(x, y, series.polyder(by_y, axis=1)) + first + second * y * y
@@ -105,7 +123,7 @@ class Surface:
     def on_grid(self, axis_mm: FloatArray) -> FloatArray:
         """Height in mm and its slopes along x and y, (3, n, n), on a square grid; rows along y."""
         axis = axis_mm / self.radius_mm
-        terms = self.polynomial.T  # rows are powers of y
+        terms = self._whole.T  # rows are powers of y
         terms_x = series.polyder(terms, axis=1)
         terms_y = series.polyder(terms, axis=0)
         out = np.stack([series.polygrid2d(axis, axis, part) for part in (terms, terms_x, terms_y)])

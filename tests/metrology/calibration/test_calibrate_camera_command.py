@@ -88,6 +88,19 @@ def test_what_was_gained_is_said(
     assert f"calibrate --prior {tmp_path / 'camera.toml'}" in said
 
 
+def test_mirrored_photographs_are_named(
+    bench: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    folder = tmp_path / "mirrored"
+    folder.mkdir()
+    for path in sorted((bench / "photographs").glob("[0-5].png")):
+        image = cv2.imread(str(path), cv2.IMREAD_UNCHANGED)
+        cv2.imwrite(str(folder / path.name), image[:, ::-1] if path.stem in "13" else image)
+    arguments = words(bench, tmp_path / "camera.toml")
+    assert run([arguments[0], str(folder), *arguments[2:]]) == 3
+    assert "mirrored photographs: 1.png, 3.png; take them" in capsys.readouterr().err
+
+
 def test_bad_input_is_one_line(
     bench: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

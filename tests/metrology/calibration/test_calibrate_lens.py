@@ -6,8 +6,10 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 
 from membrane_ctrl.config.schema import CameraConfig
+from membrane_ctrl.metrology.calibration import board_lens
 from membrane_ctrl.metrology.calibration.board import Board, on_screen
 from membrane_ctrl.metrology.calibration.board_lens import LEAST_VIEWS, BoardView, calibrate_lens
 from tests.support.board_photograph import Photographer, photographs
@@ -57,6 +59,59 @@ def test_a_view_that_does_not_fit_is_left_out_and_named(views: list[BoardView]) 
     lens = calibrate_lens([*views, bad], STATED)
     assert lens.left_out == ("blurred.png",)
     assert lens.rms_px < 0.3
+
+
+def corner_views(
+    count: int, seed: int, focal_px: float = 2400.0, shared_px: float = 0.0, bow: float = 0.0
+) -> list[BoardView]:
+    """Corners of a board, 11 squares wide; `shared_px` is an error that a view's corners share."""
+    rng = np.random.default_rng(seed)
+    column, row = (part.ravel() for part in np.meshgrid(np.arange(1, 12.0), np.arange(1, 9.0)))
+    place = np.stack([column, row, np.zeros_like(column)], axis=1)
+    views = []
+    for k in range(count):
+        degrees = [*rng.uniform(-35, 35, 2), rng.uniform(-20, 20)]
+        turn = Rotation.from_euler("xyz", degrees, degrees=True).as_matrix()
+        bent = place - [6.0, 4.5, 0.0]
+        bent[:, 2] += 11 * bow * (1 - np.sum(bent[:, :2] ** 2, axis=1) / 30)
+        x, y, z = (bent @ turn.T + [*rng.uniform(-1.5, 1.5, 2), rng.uniform(26, 34)]).T
+        seen_px = focal_px * np.stack([x / z, y / z], axis=1) + [605.0, 496.0]
+        u, v = ((seen_px - [600.0, 500.0]) / 600).T
+        field = np.stack([u, v, u**2, v**2, u * v, u**3])
+        seen_px += (shared_px * rng.normal(size=(2, 6)) @ field).T
+        seen_px += rng.normal(0, 0.05, seen_px.shape)
+        views.append(BoardView(f"{seed}-{k}.png", place, seen_px))
+    return views
+
+
+WIDE = CameraConfig(width_px=1200, height_px=1000, pixel_um=3.45, focal_mm=8.3)
+
+
+def test_errors_that_the_corners_of_a_view_share_are_in_the_sigmas(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """OpenCV's own sigma of the focal length would be 5 to 10 times too small here."""
+    monkeypatch.setattr(board_lens, "FLATNESS", 0.0)
+    off = []
+    for seed in range(6):
+        lens = calibrate_lens(corner_views(8, seed, shared_px=0.3), WIDE)
+        off.append(np.log(lens.focal_px / 2400.0) / lens.sigmas["focal_relative"])
+    assert 0.3 < np.sqrt(np.mean(np.square(off))) < 2.0
+
+
+def test_a_board_that_is_not_flat_is_in_the_sigmas() -> None:
+    lens = calibrate_lens(corner_views(8, 1, bow=board_lens.FLATNESS), WIDE)
+    off = abs(np.log(lens.focal_px / 2400.0))
+    assert 0.5 * lens.sigmas["focal_relative"] < off < 1.5 * lens.sigmas["focal_relative"]
+
+
+def test_photographs_of_two_cameras_are_named() -> None:
+    both = [*corner_views(5, 1), *corner_views(5, 2, focal_px=2450.0)]
+    with pytest.raises(ValueError, match="of two cameras, or the focus was changed") as refused:
+        calibrate_lens(both, WIDE)
+    first, second = str(refused.value).split(" px, ")
+    assert all(f"1-{k}.png" in first for k in range(5))
+    assert all(f"2-{k}.png" in second for k in range(5))
 
 
 def test_too_few_views_are_refused(views: list[BoardView]) -> None:

@@ -13,9 +13,11 @@ from prysm.polynomials import noll_to_nm, zernike_nm
 
 from membrane_ctrl.metrology.film import film_figure, hencky_bowl, material_fit
 from membrane_ctrl.metrology.film.film_law import FilmLaw
+from membrane_ctrl.metrology.rays.surface_basis import evaluate_basis
 from membrane_ctrl.model.zernike_terms import NOLL_INDICES, ZERNIKE_TERMS
 from membrane_ctrl.sim.stretched_film import solve_stretched_film
 from tests.support.metrology_truth import FloatArray
+from tests.worlds.second_optics import Material, Mirror, Ring
 
 RADIUS_MM, REACH = 500.0, 0.95
 ROUND = [j - 2 for j in NOLL_INDICES[1:] if noll_to_nm(j)[1] == 0] + [
@@ -190,3 +192,61 @@ def test_bars_cover_the_truth_of_random_films() -> None:
     assert np.all(np.mean(np.abs(z) < 1.96, axis=0) > 0.9)
     assert np.abs(z).max() < 4.5
     assert np.all(np.median(np.abs(z), axis=0) > 0.2)
+
+
+def _second_world_figures(mirror: Mirror) -> list[film_figure.FilmFigure]:
+    """Figures of a film of the second world by least squares of its slopes, at five pressures."""
+    rho, angle = np.meshgrid(REACH * np.sqrt((np.arange(40) + 0.5) / 40), np.arange(64) / 64)
+    x = (rho * np.cos(2 * np.pi * angle)).ravel()
+    y = (rho * np.sin(2 * np.pi * angle)).ravel()
+    _, by_x, by_y = evaluate_basis(x, y)
+    onto = np.linalg.pinv(np.hstack([by_x, by_y]).T)
+    rng = np.random.default_rng(1)
+    figures = []
+    for moved_um in (-4000.0, -2000.0, 0.0, 2000.0, 4000.0):
+        slopes = []
+        for dx, dy in ((1.0, 0.0), (0.0, 1.0)):
+            near, far = (
+                mirror.height_mm(500 * x + k * dx, 500 * y + k * dy, moved_um)
+                - mirror.height_mm(500 * x - k * dx, 500 * y - k * dy, moved_um)
+                for k in (1, 2)
+            )
+            slopes.append(RADIUS_MM * (8 * near - far) / 12)
+        seen = onto @ np.concatenate(slopes) + rng.normal(0, 3e-6, ZERNIKE_TERMS)
+        noise = 9e-12 * np.eye(ZERNIKE_TERMS)
+        pressure = mirror.load(moved_um) * STIFFNESS / 0.5 + rng.normal(0, 0.3)
+        none = np.zeros((ZERNIKE_TERMS, 1))
+        sag_mm = mirror.sag_mm + 1e-3 * moved_um
+        name = f"set{moved_um:.0f}"
+        figures.append(film_figure.FilmFigure(name, seen, noise, none, pressure, sag_mm))
+    return figures
+
+
+def test_an_orthotropic_film_is_named_with_its_direction_beside_an_uneven_ring() -> None:
+    """Finite strains and second order of the second world; the ring's own waves are found too."""
+    material = Material(0.88, 0.33, None, direction_rad=0.6, prestrain=(1e-4, 1e-4, 0.0))
+    ring = Ring({2: (4e-4, 1e-4), 3: (1e-4, 0.0)})
+    fit = _fit(_second_world_figures(Mirror(37.0, material=material, ring=ring)))
+    seen = {(wave.cause, wave.order): wave for wave in fit.waves if wave.seen}
+    assert set(seen) == {("modulus", 2), ("flat", 2), ("flat", 3)}
+    apart = 0.12 / 0.94  # of the mean modulus
+    modulus = seen["modulus", 2]
+    assert modulus.amounts == pytest.approx([apart * np.cos(1.2), apart * np.sin(1.2)], abs=5e-3)
+    assert modulus.sigmas.max() < 1e-2
+    assert seen["flat", 2].amounts == pytest.approx([0.2, 0.05], abs=0.01)
+    assert fit.unexplained == ()
+
+
+def test_waves_that_no_cause_has_are_named_as_unknown() -> None:
+    """Two waves whose profile and growth belong to no cause."""
+    figures = []
+    for figure in World().figures(6):
+        parameters = figure.parameters_mm.copy()
+        parameters[22] += 0.03 * (figure.sag_mm / 36) ** 4  # Noll 24: two waves, radial order 6
+        figures.append(replace(figure, parameters_mm=parameters))
+    fit = _fit(figures)
+    assert not any(wave.seen for wave in fit.waves if wave.order == 2)
+    (unknown,) = fit.unexplained
+    assert unknown.order == 2
+    assert unknown.left_um > 10
+    assert len(unknown.likely) >= 2

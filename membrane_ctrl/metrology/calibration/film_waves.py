@@ -1,0 +1,106 @@
+"""A film that is not isotropic, or whose ring is not flat: its waves beyond the fit's terms.
+
+Such waves are hundredths of a micrometre, but their slopes are far above the noise of a full set:
+without them the sets contradict each other, and every other test of the model blames something
+else. With them the sets determine the bench less well. So the sets are solved without waves first.
+Where waves would explain more than noise, the sets are solved with them, and what they explain is
+compared with what every other cause would explain in their place (Akaike's rule).
+"""
+
+from collections.abc import Callable
+from dataclasses import replace
+
+import numpy as np
+from scipy.stats import chi2
+
+from membrane_ctrl.metrology.calibration import model_tests, verdict
+from membrane_ctrl.metrology.calibration.solver import Problem, Solution, solve_calibration
+from membrane_ctrl.metrology.film import terms_beyond_fit
+
+_UNLIKELY = 1e-3  # probability that noise looks as much like waves: then they are tried
+
+
+def solve_any_film(
+    problem: Problem, progress: Callable[[int, float], None] | None = None
+) -> tuple[Solution, tuple[verdict.CalibrationFinding, ...]]:
+    """Calibrate with sets of any film, and judge the solution.
+
+    Parameters
+    ----------
+    problem : Problem
+        Sets of one bench; `references.waves` is chosen here.
+    progress : callable, optional
+        Gets the number of each step and its largest change in standard deviations.
+
+    Returns
+    -------
+    Solution
+        Without waves where the sets show none.
+    tuple of CalibrationFinding
+        As `verdict.check_solution` has them, with a note on the waves.
+
+    Raises
+    ------
+    ValueError
+        As `solve_calibration`.
+    """
+    failed: ValueError | None = None
+    even: Solution | None = None
+    try:
+        even = solve_calibration(problem, progress)
+    except ValueError as error:
+        failed = error
+    if even is not None and even.converged and not _may_have_waves(even):
+        return even, verdict.check_solution(even)
+    uneven = _solve_with_waves(problem, progress)
+    if uneven is not None and _waves_explain_most(uneven):
+        return uneven, (*verdict.check_solution(uneven), _note_on_waves(uneven))
+    if even is None:
+        raise failed or ValueError("the calibration diverges")
+    return even, verdict.check_solution(even)
+
+
+def _may_have_waves(solution: Solution) -> bool:
+    """Whether waves would lower the sum of squares by more than noise does."""
+    fall = model_tests.wave_fall(solution)
+    return bool(chi2.sf(fall, _count_freedom(solution)) < _UNLIKELY)
+
+
+def _solve_with_waves(
+    problem: Problem, progress: Callable[[int, float], None] | None
+) -> Solution | None:
+    references = replace(problem.references, waves=True)
+    try:
+        found = solve_calibration(replace(problem, references=references), progress)
+    except ValueError:
+        return None
+    return found if found.converged else None
+
+
+def _waves_explain_most(uneven: Solution) -> bool:
+    """Whether the waves explain more than any error of bench or sets would in their place."""
+    bound = model_tests.bind_waves(uneven)
+    fall = model_tests.sum_of_squares(bound) - model_tests.sum_of_squares(uneven)
+    explained = fall - 2 * _count_freedom(uneven)
+    others = [share for share, _ in verdict.list_causes(bound)]
+    return explained > max([0.0, *others])
+
+
+def _count_freedom(solution: Solution) -> int:
+    return len(terms_beyond_fit.WAVES) * len(solution.problem.films)
+
+
+def _note_on_waves(solution: Solution) -> verdict.CalibrationFinding:
+    """Size of the waves in the middle set, and what has such waves."""
+    waves_mm = np.array(
+        solution.states[solution.problem.middle].surface.beyond_mm[terms_beyond_fit.WAVE]
+    )
+    orders = np.array([abs(wave.azimuthal_order) for wave in terms_beyond_fit.WAVES])
+    most = int(orders[np.argmax(np.abs(waves_mm))])
+    rms_um = 1e3 * float(np.sqrt(np.sum(waves_mm**2)))
+    says = (
+        f"the film has waves beyond the fitted terms, {rms_um:.2g} µm RMS, most of azimuthal order "
+        f"{most}; they are part of the solution. It looks like a film that is stiffer in one "
+        "direction, or a ring that is not flat"
+    )
+    return verdict.CalibrationFinding(False, says)

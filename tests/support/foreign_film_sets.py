@@ -1,0 +1,87 @@
+"""Sets of phases of a film of the second world on a bench that is off."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from membrane_ctrl.metrology.rays.bench_parameters import NAMES
+from membrane_ctrl.metrology.rays.bench_poses import BenchGeometry, bench_at
+from membrane_ctrl.metrology.rays.set_phases import SetPhases
+from tests.support.calibration_truth import (
+    NOMINAL_MM,
+    PIXEL_SIGMA_MM,
+    PIXELS,
+    SAGS_MM,
+    STATED,
+    Truth,
+)
+from tests.worlds.second_optics import Mirror
+
+FloatArray = NDArray[np.float64]
+RADIUS_MM = 500.0
+_REACH_MM = 475.0
+_STEP_MM = 1.0
+
+
+def make_foreign_film(
+    mirror: Mirror,
+    values: FloatArray,
+    seed: int,
+    points: int = 600,
+    sags_mm: tuple[float, ...] = SAGS_MM,
+) -> Truth:
+    """Sets with as few points as that and the information of all pixels. The bow must be 0."""
+    rng = np.random.default_rng(seed)
+    sigma_mm = PIXEL_SIGMA_MM * np.sqrt(points / PIXELS)
+    bench = bench_at(STATED, values)
+    sets = []
+    for k, sag_mm in enumerate(sags_mm):
+        moved_um = 1e3 * (sag_mm - NOMINAL_MM)
+        column, row = (rng.uniform(0, size, int(points / 0.43)) for size in (2447, 2047))
+        seen, inside = _trace(bench, mirror, moved_um, column, row)
+        seen = seen + rng.normal(0, sigma_mm, seen.shape)
+        reading_um = moved_um / (1 + values[NAMES.index("laser_relative")]) + rng.normal(0, 1.0)
+        sigmas_mm = np.full(seen.shape[1], sigma_mm)
+        sets.append(SetPhases(f"set{k}", column[inside], row[inside], seen, sigmas_mm, reading_um))
+    return Truth(values, mirror, tuple(sets))
+
+
+def _trace(
+    bench: BenchGeometry, mirror: Mirror, moved_um: float, column: FloatArray, row: FloatArray
+) -> tuple[FloatArray, NDArray[np.bool_]]:
+    """Screen points (2, n) of the rays that meet the film inside 475 mm, and which those are."""
+    geometry = bench.geometry
+    rays = geometry.rays(column, row)
+    start = geometry.pinhole_mm[:, None]
+    t = (NOMINAL_MM - start[2]) / rays[2]
+    reaches = np.flatnonzero(np.hypot(*(start + t * rays)[:2]) < RADIUS_MM)
+    rays, t = rays[:, reaches], t[reaches]
+    for _ in range(5):
+        place = start + t * rays
+        normal = _normal(mirror, moved_um, place)
+        height_mm = mirror.height_mm(place[0], place[1], moved_um)
+        t = t - (place[2] + 1e-3 * moved_um - height_mm) / np.sum(rays * normal, axis=0)
+    place = start + t * rays
+    normal = _normal(mirror, moved_um, place)
+    leaves = rays - 2 * np.sum(rays * normal, axis=0) / np.sum(normal**2, axis=0) * normal
+    axes = geometry.screen_axes
+    from_screen = place - geometry.screen_origin_mm[:, None]
+    reach = -(axes[2] @ from_screen) / (axes[2] @ leaves)
+    met = np.hypot(place[0], place[1]) < _REACH_MM
+    inside = np.zeros(column.size, bool)
+    inside[reaches[met]] = True
+    return (axes[:2] @ (from_screen + reach * leaves))[:, met] / bench.pitch, inside
+
+
+def _normal(mirror: Mirror, moved_um: float, place: FloatArray) -> FloatArray:
+    """Normals (3, n), not of unit length; slopes by differences of fourth order."""
+    slopes = []
+    for dx, dy in ((_STEP_MM, 0.0), (0.0, _STEP_MM)):
+        near, far = (
+            mirror.height_mm(place[0] + k * dx, place[1] + k * dy, moved_um)
+            - mirror.height_mm(place[0] - k * dx, place[1] - k * dy, moved_um)
+            for k in (1, 2)
+        )
+        slopes.append((8 * near - far) / (12 * _STEP_MM))
+    return np.stack([-slopes[0], -slopes[1], np.ones_like(slopes[0])])
