@@ -225,12 +225,12 @@ CASES: tuple[Case, ...] = (
     _case("thermometer lost", wrong={"thermometer_lost": 1}),
     _case(
         "no answers",
-        "device_silent displacement_missing overdue",
+        "device_silent no_answer overdue",
         wrong={"silent": 1},
         moving=Reaction(SafeLevel.PUMP_OFF, STALE_S + _SOON),
         checking=Reaction(SafeLevel.PUMP_OFF, STALE_S + _SOON),
     ),
-    _case("no answers for 0.2 s", "displacement_missing", wrong={"silent": 1}, for_s=0.2),
+    _case("no answers for 0.2 s", "no_answer", wrong={"silent": 1}, for_s=0.2),
     _case("every 15th answer lost", wrong={"lost_every": 15}),
     _case("every 7th answer lost", wrong={"lost_every": 7}),
     _case(
@@ -339,7 +339,7 @@ CASES: tuple[Case, ...] = (
     ),
     _case(
         "no answers and late",
-        f"{_LOST} device_silent late",
+        f"{_LOST} device_silent no_answer late",
         wrong={"silent": 1, "late_ms": 150},
         moving=Reaction(SafeLevel.RAMP_DOWN, STALE_S + _SOON),
     ),

@@ -14,8 +14,8 @@ from membrane_ctrl.model.recorder_events import DiskLow, RecorderError, Recorder
 
 async def test_a_report_of_a_child_stands_in_the_status(tmp_path: Path) -> None:
     async with port_run(tmp_path) as run:
-        run.port.told(GeometryInForce("12ab", None, None, ""))
-        run.port.told(Maintenance("calibrate", "calibrate again"))
+        run.port.note_report(GeometryInForce("12ab", None, None, ""))
+        run.port.note_report(Maintenance("calibrate", "calibrate again"))
         status = run.port.status()
         assert status["notices"] == [
             {
@@ -26,7 +26,7 @@ async def test_a_report_of_a_child_stands_in_the_status(tmp_path: Path) -> None:
             }
         ]
         assert status["geometry"]["hash"] == "12ab"
-        run.port.told(MaintenanceOver("calibrate", "fits again"))
+        run.port.note_report(MaintenanceOver("calibrate", "fits again"))
         assert run.port.status()["notices"] == []
 
 
@@ -34,14 +34,14 @@ async def test_trouble_with_the_recording_stands_in_status_and_metrics_until_it_
     tmp_path: Path,
 ) -> None:
     async with port_run(tmp_path) as run:
-        run.port.told(DiskLow("disk", "less than 500 MB free"))
-        run.port.told(RecorderError("state file", "state file: x"))
-        run.port.told(RecorderRecovered("state file", "state file works again"))
+        run.port.note_report(DiskLow("disk", "less than 500 MB free"))
+        run.port.note_report(RecorderError("state file", "state file: x"))
+        run.port.note_report(RecorderRecovered("state file", "state file works again"))
         status = run.port.status()
         assert [notice["subject"] for notice in status["notices"]] == ["disk"]
         assert status["recording_ok"] is False
         assert "membrane_recording_ok 0.0" in run.port.metrics()
-        run.port.told(RecorderRecovered("disk", "disk works again"))
+        run.port.note_report(RecorderRecovered("disk", "disk works again"))
         status = run.port.status()
         assert status["notices"] == []
         assert status["recording_ok"] is True

@@ -47,8 +47,8 @@ _PATTERNS = frozenset({"match", "search", "fullmatch"})
 
 # Functions that may: `file:function` and why.
 EXCEPTIONS: dict[str, str] = {
-    "membrane_ctrl/config/toml_file.py:_cause": "the parser of TOML gives no more than a message",
-    "membrane_ctrl/config/toml_file.py:describe": "joins a message to its key; only a point or a colon depends on it",  # noqa: E501
+    "membrane_ctrl/config/toml_file.py:_describe_cause": "the parser of TOML gives no more than a message",  # noqa: E501
+    "membrane_ctrl/config/toml_file.py:describe_error": "joins a message to its key; only a point or a colon depends on it",  # noqa: E501
     "membrane_ctrl/model/errors.py:name_source_in_errors": "puts a file's name before a message; nothing but the message changes",  # noqa: E501
     "firmware_iface/driver_calls.py:_name_device": "puts a device's name before a message without it",  # noqa: E501
 }

@@ -179,6 +179,8 @@ _OWN = {
     "sessions/folder.py",
     "sessions/live_log.py",
     "web/panels.py",
+    # the user's own folder of compiled code, made if it is missing
+    "model/kernel_cache.py",
     # the machine's own folder of locks, whose owner and mode are checked
     "instruments/lock_store.py",
     # a new folder, a temporary one, or a file that the user has named

@@ -60,7 +60,7 @@ def artefact_advice(solution: Solution, index: int) -> ArtefactAdvice | None:
     seen = replace(phases, displacement_um=np.nan, artefact=sphere).subset(
         np.hypot(x_mm, y_mm) < _SPHERE_USED * sphere.radius_mm
     )
-    if seen.sigma_mm.size < 2 * forward_model.LOCAL:
+    if seen.sigma_mm.size < 2 * forward_model.LOCAL_EVEN:
         return None
     seen = replace(
         seen, screen_mm=seen.screen_mm - forward_model.residual_mm(bench, seen, shape, 0.0)

@@ -266,8 +266,8 @@ def test_geometry_that_sees_no_mirror_is_rejected() -> None:
         check_set(stack, blind)
 
 
-def test_a_picture_upside_down_is_asked_about() -> None:
+def test_a_picture_that_is_mirrored_is_named() -> None:
     stack = good_set(bench())
     stack.frames[:] = stack.frames[:, ::-1].copy()
-    with pytest.raises(RejectedSetError, match="check the geometry"):
+    with pytest.raises(RejectedSetError, match="mirrored top to bottom"):
         check_set(stack, bench())
