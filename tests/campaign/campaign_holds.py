@@ -106,6 +106,18 @@ async def a_slow_board() -> list[str]:
         return rig.violations + slow.violations
 
 
+async def a_slow_link_starves_the_watchdog() -> list[str]:
+    """Answers become slower than the board's watchdog waits: it stops the pump, by the link."""
+    async with a_hold(on_board) as rig:
+        board_of(rig).slow_s = 0.2
+        await asyncio.sleep(0.3)
+        board_of(rig).slow_s = 2.0 * WATCHDOG_S
+        await rig.until(State.FAULT)
+        await rig.wait(RAMP_S + 6.0)
+        await rig.wait(3.0, rig.still)
+        return rig.violations
+
+
 async def a_board_that_latched_stays_latched() -> list[str]:
     """Without an acknowledgement the board's over-pressure stays latched, whatever the supervisor
     does.
@@ -425,6 +437,7 @@ HOLDS: Sequence[Callable[[], Awaitable[list[str]]]] = (
     cancelled_while_it_vents,
     a_guard_ends,
     a_slow_board,
+    a_slow_link_starves_the_watchdog,
     a_board_that_latched_stays_latched,
     the_network_comes_back,
     faults_that_outlive_the_run,
