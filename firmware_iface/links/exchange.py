@@ -377,7 +377,10 @@ class LineLink:
                 raise LinkError(f"{what}: {text[:_SHOWN_CHARS]!r}... is not a valid answer")
             return None
 
-        return Question((command + self._end).encode("ascii"), take, longest, what)
+        asked = command + self._end
+        # a device may confirm a command by repeating it: that is no echo of the adapter
+        repeats = answer.fullmatch(asked) is not None
+        return Question(asked.encode("ascii"), take, longest, what, answer_repeats=repeats)
 
 
 class LineDriver:
