@@ -240,7 +240,7 @@ class ProparParameters:
         """Data of the answer with the question's sequence number; a status other than 0 raises."""
         what = f"{self.name}: {what}"
         question = self._question(data, what)
-        fence = self._question(make_request([MEASURE]), f"{self.name}: asking anew after a loss")
+        fence = self._question(make_request([MEASURE]), f"{self.name}: asking again after a loss")
         answer = await self._exchange.ask(question, self._timeout_s, fence)
         message = split_binary(answer)[0][-1]
         if message.data[0] != STATUS:

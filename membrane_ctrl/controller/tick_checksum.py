@@ -1,4 +1,4 @@
-"""Checksum of what a tick decided, which tells whether a replay is identical."""
+"""Checksum of what a tick decided, which shows whether a replay is identical."""
 
 import struct
 import zlib

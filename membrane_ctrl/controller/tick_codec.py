@@ -4,7 +4,7 @@ See docs/how-to/replay.md.
 
 A tick is one fixed record and its telemetry row; rare data (commands, ended tasks, trouble with the
 links) precede it as JSON, in pieces. A shape estimate is referred to by its time: the recorder has
-it from its own ring. A checksum of all outputs tells whether a replay is identical.
+it from its own ring. A checksum of all outputs shows whether a replay is identical.
 """
 
 import json
