@@ -153,7 +153,7 @@ def _draw_uncertainty(bars: ErrorBars) -> Figure:
         label="figure (without its plane)",
     )
     right.set_yticks(places, [row["name"] for row in rows], fontsize=8)
-    right.set(xscale="log", xlabel="um RMS", title="budget: contribution of each input, 1 sigma")
+    right.set(xscale="log", xlabel="µm RMS", title="budget: contribution of each input, 1 sigma")
     right.legend(loc="lower right")
     _plain_powers(right.xaxis)
     return figure
