@@ -72,8 +72,8 @@ LAYERS = {
         "membrane_ctrl/hold",
         "membrane_ctrl/review",
     },
-    8: {"membrane_ctrl/cli", "membrane_ctrl/web", "tuning"},
-    9: {"membrane_ctrl/__main__", "membrane_ctrl/doors"},
+    8: {"membrane_ctrl/cli", "membrane_ctrl/service", "tuning"},
+    9: {"membrane_ctrl/__main__", "membrane_ctrl/doors", "membrane_ctrl/web"},
 }
 
 

@@ -19,7 +19,7 @@ from membrane_ctrl.doors.epics_search import require_unserved
 from membrane_ctrl.doors.names import TABLE, Door, Published, Value
 from membrane_ctrl.instruments import device_claim
 from membrane_ctrl.model import errors, files
-from membrane_ctrl.web.access import Action
+from membrane_ctrl.service.access import Action
 
 # Clients may write the value of a command (level 0) only. EPICS by itself lets them write
 # everything, and the other fields (FLNK, SCAN, ASG) would send commands in chains, again and again,

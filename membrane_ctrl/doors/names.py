@@ -22,8 +22,8 @@ from membrane_ctrl.doors.hold_link import SendLimits, send_command
 from membrane_ctrl.model.columns import PUBLISHED, unit_of
 from membrane_ctrl.model.notices import Topic
 from membrane_ctrl.model.numbers import parse_number
-from membrane_ctrl.web.access import ACTIONS, STOP, Action, WebUser, may, outranks, request
-from membrane_ctrl.web.feed import HoldFeed, HoldSeen
+from membrane_ctrl.service.access import ACTIONS, STOP, Action, WebUser, may, outranks, request
+from membrane_ctrl.service.feed import HoldFeed, HoldSeen
 
 Value = float | str | None  # None: not known
 

@@ -86,7 +86,7 @@ def add_user(
     role: Annotated[str, typer.Argument(metavar="ROLE", help="read, operate or tune.")],
 ) -> None:
     """Add a user to a users file, or change one; asks for the password."""
-    from membrane_ctrl.web.access import known_user, known_users
+    from membrane_ctrl.service.access import known_user, known_users
 
     text = files.read_text(file) if file.exists() else ""
     found = known_users(text, str(file))

@@ -16,8 +16,8 @@ from membrane_ctrl.model.columns import COLUMNS
 from membrane_ctrl.model.shape_estimate import ShapeEstimate
 from membrane_ctrl.model.zernike_terms import FIRST_FIGURE_INDEX, zernike_labels
 from membrane_ctrl.run_files import shapes
-from membrane_ctrl.web.feed import Series
-from membrane_ctrl.web.work_pools import WorkPool
+from membrane_ctrl.service.feed import Series
+from membrane_ctrl.service.work_pools import WorkPool
 
 T = TypeVar("T")
 _GREY, _RULE = "#8a8a8a", "rgba(128, 128, 128, 0.3)"  # legible on white and on black

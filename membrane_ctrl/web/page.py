@@ -15,8 +15,7 @@ from nicegui import ui
 from membrane_ctrl.control_port.outcome import Outcome
 from membrane_ctrl.control_port.status import alarm_lines, lock_lines
 from membrane_ctrl.model.columns import MISSING, PUBLISHED
-from membrane_ctrl.web import figures
-from membrane_ctrl.web.access import (
+from membrane_ctrl.service.access import (
     ACTIONS,
     STOP,
     UNLOCK,
@@ -27,7 +26,16 @@ from membrane_ctrl.web.access import (
     outranks,
     request,
 )
-from membrane_ctrl.web.feed import SPANS_S, HoldFeed, history, marks
+from membrane_ctrl.service.feed import SPANS_S, HoldFeed, history, marks
+from membrane_ctrl.service.work_pools import (
+    FIGURES,
+    LIVE_CHARTS,
+    LONG_CHARTS,
+    SESSIONS,
+    PoolFullError,
+    pool_of_command,
+)
+from membrane_ctrl.web import figures
 from membrane_ctrl.web.panels import (
     CHOOSES,
     SessionWatch,
@@ -36,14 +44,6 @@ from membrane_ctrl.web.panels import (
     fresh,
     runs_panel,
     tell,
-)
-from membrane_ctrl.web.work_pools import (
-    FIGURES,
-    LIVE_CHARTS,
-    LONG_CHARTS,
-    SESSIONS,
-    PoolFullError,
-    pool_of_command,
 )
 
 _LOOK_S = 1.0

@@ -22,11 +22,11 @@ from membrane_ctrl.model.columns import COLUMNS
 from membrane_ctrl.review import catalogue
 from membrane_ctrl.review.sparkline import render_sparkline
 from membrane_ctrl.run_files.run import open_run
+from membrane_ctrl.service.access import WebUser, outranks
+from membrane_ctrl.service.feed import HoldFeed
+from membrane_ctrl.service.work_pools import ANSWERS, REPORTS, RUN_LISTS, PoolFullError
 from membrane_ctrl.sessions import folder as folders
 from membrane_ctrl.sessions.live_log import ANSWER, LiveReader, PageAnswer, Progressed, give_answer
-from membrane_ctrl.web.access import WebUser, outranks
-from membrane_ctrl.web.feed import HoldFeed
-from membrane_ctrl.web.work_pools import ANSWERS, REPORTS, RUN_LISTS, PoolFullError
 
 _MOST = 200  # runs in the table, newest first
 REPORT = "report.html"

@@ -16,16 +16,16 @@ from membrane_ctrl.config.port import WebConfig
 from membrane_ctrl.control_port import sockets
 from membrane_ctrl.control_port.ctl import Where
 from membrane_ctrl.model import errors, files
-from membrane_ctrl.web.access import Accounts, WebUser, known_users
-from membrane_ctrl.web.connections import ConnectionGuard, GuardedHttp, raise_file_limit
-from membrane_ctrl.web.feed import SIGNALS, SPANS_S, HoldFeed
+from membrane_ctrl.service.access import Accounts, WebUser, known_users
+from membrane_ctrl.service.connections import ConnectionGuard, GuardedHttp, raise_file_limit
+from membrane_ctrl.service.feed import SIGNALS, SPANS_S, HoldFeed
+from membrane_ctrl.service.login import LoginMiddleware
+from membrane_ctrl.service.public_address import public_address
+from membrane_ctrl.service.stop_route import stop_handler
+from membrane_ctrl.service.work_pools import REPORT_FILES, PoolFullError
 from membrane_ctrl.web.figures import REMOVED
-from membrane_ctrl.web.login import LoginMiddleware
 from membrane_ctrl.web.page import SharedViews, WebPage
 from membrane_ctrl.web.panels import REPORT, run_folder
-from membrane_ctrl.web.public_address import public_address
-from membrane_ctrl.web.stop_route import stop_handler
-from membrane_ctrl.web.work_pools import REPORT_FILES, PoolFullError
 
 _NICE = 5  # the hold comes first, also when the page was not started by one
 # a viewer may be silent for so long: a phone that changes cells, a machine that builds fifty pages
@@ -136,7 +136,7 @@ def serve(holds: dict[str, Where], page: WebConfig) -> None:
         ws_per_message_deflate=False,  # updates are small; fifty compressors are not
         ws_max_size=_MESSAGE_BYTES_MAX,
         http=partial(GuardedHttp, guard),
-        loop="membrane_ctrl.web.connections:PageLoop" if page.secure else "auto",
+        loop="membrane_ctrl.service.connections:PageLoop" if page.secure else "auto",
         proxy_headers=False,  # `PublicAddress.source_of` reads them, if the proxy is a trusted one
     )
 

@@ -19,7 +19,7 @@ from membrane_ctrl.control_port import answers, ctl
 from membrane_ctrl.control_port.client import PortClient
 from membrane_ctrl.control_port.ctl import Where
 from membrane_ctrl.model.errors import DeviceError
-from membrane_ctrl.web.feed import HoldFeed
+from membrane_ctrl.service.feed import HoldFeed
 from membrane_ctrl.web.panels import fleet_rows
 from tests.control_port import evil_holds as evil
 from tests.control_port.port_run import port_run
@@ -196,7 +196,7 @@ EVENTS = [
 def test_feeds_outlive_every_peer_and_leave_others_alone(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("membrane_ctrl.web.feed._AGAIN_S", 0.05)
+    monkeypatch.setattr("membrane_ctrl.service.feed._AGAIN_S", 0.05)
     peers = {f"greets_{name}": evil.greeting_with(line) for name, line in evil.GREETINGS.items()}
     peers |= {f"answers_{name}": evil.answering(line) for name, line in evil.ANSWERS.items()}
     peers |= {f"event_{number}": evil.streaming(line) for number, line in enumerate(EVENTS)}

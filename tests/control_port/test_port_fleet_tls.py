@@ -20,7 +20,7 @@ from membrane_ctrl.config.port import PortConfig, TlsConfig
 from membrane_ctrl.control_port import ctl
 from membrane_ctrl.control_port.ctl import fleet
 from membrane_ctrl.model.errors import Exit
-from membrane_ctrl.web.feed import HoldFeed
+from membrane_ctrl.service.feed import HoldFeed
 from tests.support.machine_needs import needs
 
 pytestmark = needs("openssl")
@@ -53,7 +53,7 @@ def lab(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def ports(monkeypatch: pytest.MonkeyPatch) -> Iterator[dict[str, int]]:
     """A port where nobody listens, and one that never answers."""
     monkeypatch.setattr(ctl, "_FLEET_S", 6.0)
-    monkeypatch.setattr("membrane_ctrl.web.feed.ANSWER_S", 3.0)
+    monkeypatch.setattr("membrane_ctrl.service.feed.ANSWER_S", 3.0)
     with ExitStack() as stack:
         away = socket.create_server(("127.0.0.1", 0))
         silent = stack.enter_context(socket.create_server(("127.0.0.1", 0)))

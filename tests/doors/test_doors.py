@@ -25,7 +25,7 @@ from membrane_ctrl.model.errors import DeviceError, InputError
 from membrane_ctrl.model.shape_estimate import ShapeEstimate
 from membrane_ctrl.model.telemetry import FIELDS
 from membrane_ctrl.model.zernike_terms import ZERNIKE_TERMS
-from membrane_ctrl.web.feed import HoldFeed, HoldSeen
+from membrane_ctrl.service.feed import HoldFeed, HoldSeen
 from tests.control_port.port_run import port_run
 
 PAGE = Path(__file__).parents[2] / "docs" / "how-to" / "bridges.md"

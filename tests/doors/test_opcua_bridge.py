@@ -23,7 +23,7 @@ from membrane_ctrl.config.port import DoorsConfig, OpcuaConfig
 from membrane_ctrl.control_port.safety_commands import SAFETY
 from membrane_ctrl.doors import opcua
 from membrane_ctrl.model.errors import DeviceError, InputError
-from membrane_ctrl.web.access import known_user
+from membrane_ctrl.service.access import known_user
 from tests.control_port.port_run import PortRun, port_run
 from tests.doors.test_doors import door_with, seen_hold
 from tests.web.test_page import free_port

@@ -21,11 +21,11 @@ from membrane_ctrl.config.schema import Config, LoopConfig
 from membrane_ctrl.model.errors import InputError
 from membrane_ctrl.model.events import LockSet
 from membrane_ctrl.model.run_events import Mark
+from membrane_ctrl.service.access import WebUser
 from membrane_ctrl.sessions.folder import create_session
 from membrane_ctrl.sessions.live_hold import Progress
 from membrane_ctrl.sessions.live_log import LiveLog
 from membrane_ctrl.web import cli, panels, server
-from membrane_ctrl.web.access import WebUser
 from tests.control_port.port_run import PortRun, port_run
 from tests.support.browser import Tab, browser_tab
 from tests.support.machine_needs import needs

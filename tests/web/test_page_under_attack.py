@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 
-from membrane_ctrl.web.access import known_user
+from membrane_ctrl.service.access import known_user
 from tests.control_port.port_run import PortRun, port_run
 from tests.support.service_attacks import ATTACKS, ROUTES, Viewer, attack
 from tests.web.test_page import served, ticking

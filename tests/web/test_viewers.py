@@ -10,12 +10,12 @@ from typing import Any
 import pytest
 
 from membrane_ctrl.config.schema import Config, LoopConfig
+from membrane_ctrl.service.access import WebUser
+from membrane_ctrl.service.work_pools import WorkPool
 from membrane_ctrl.sessions.folder import create_session
 from membrane_ctrl.sessions.live_log import ANSWER, LiveLog, PageAnswer
 from membrane_ctrl.web import panels, server
-from membrane_ctrl.web.access import WebUser
 from membrane_ctrl.web.figures import Shared
-from membrane_ctrl.web.work_pools import WorkPool
 
 
 async def test_what_all_see_is_made_once_and_again_when_it_is_old(

@@ -31,7 +31,7 @@ from membrane_ctrl.model.telemetry import TelemetryRow
 from membrane_ctrl.recorder.blueprint import run_blueprint
 from membrane_ctrl.review.viewer.blueprints import ReviewBlueprint
 from membrane_ctrl.run_files.run import open_run
-from membrane_ctrl.web.feed import HoldFeed, HoldSeen
+from membrane_ctrl.service.feed import HoldFeed, HoldSeen
 
 WIDTH, HEIGHT = 200, 60
 

@@ -8,9 +8,9 @@ import threading
 
 import pytest
 
-from membrane_ctrl.web import access, login_throttle
-from membrane_ctrl.web.access import Accounts, KnownUser
-from membrane_ctrl.web.login_throttle import Guess, LoginThrottle
+from membrane_ctrl.service import access, login_throttle
+from membrane_ctrl.service.access import Accounts, KnownUser
+from membrane_ctrl.service.login_throttle import Guess, LoginThrottle
 
 RIGHT, WRONG = "correct horse", "wrong wrong"
 

@@ -14,8 +14,8 @@ import pytest
 
 from membrane_ctrl.control_port.ctl import Where
 from membrane_ctrl.review.sparkline import render_sparkline
+from membrane_ctrl.service.feed import HoldFeed, Seconds, Series, history, marks, thinned
 from membrane_ctrl.web import figures
-from membrane_ctrl.web.feed import HoldFeed, Seconds, Series, history, marks, thinned
 
 NOW_S = 1_800_000_000.0
 

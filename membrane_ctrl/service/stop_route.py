@@ -10,10 +10,10 @@ from __future__ import annotations
 from collections.abc import Mapping
 from http import HTTPStatus
 
-from membrane_ctrl.web.access import STOP, WebUser, may, on_behalf, request
-from membrane_ctrl.web.feed import HoldFeed
-from membrane_ctrl.web.login import StopHandler
-from membrane_ctrl.web.work_pools import SAFETY_COMMANDS, PoolFullError
+from membrane_ctrl.service.access import STOP, WebUser, may, on_behalf, request
+from membrane_ctrl.service.feed import HoldFeed
+from membrane_ctrl.service.login import StopHandler
+from membrane_ctrl.service.work_pools import SAFETY_COMMANDS, PoolFullError
 
 
 def stop_handler(feeds: Mapping[str, HoldFeed]) -> StopHandler:

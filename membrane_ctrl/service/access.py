@@ -16,7 +16,7 @@ from membrane_ctrl.controller.commands import ANY, TABLE, Kind, Role
 from membrane_ctrl.model import errors
 from membrane_ctrl.model.columns import unit_of
 from membrane_ctrl.model.numbers import parse_number
-from membrane_ctrl.web.login_throttle import Admission, Guess, LoginThrottle
+from membrane_ctrl.service.login_throttle import Admission, Guess, LoginThrottle
 
 COOKIE = "membrane_ctrl"
 SESSION_S = 12 * 3600.0  # a shift; then log in again

@@ -25,10 +25,10 @@ from urllib.parse import parse_qs
 
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
-from membrane_ctrl.web.access import COOKIE, DEVICE_COOKIE, Accounts, WebUser
-from membrane_ctrl.web.connections import ConnectionGuard
-from membrane_ctrl.web.public_address import PublicAddress, host_name
-from membrane_ctrl.web.work_pools import KNOWN_PASSWORDS, STRANGERS_PASSWORDS, PoolFullError
+from membrane_ctrl.service.access import COOKIE, DEVICE_COOKIE, Accounts, WebUser
+from membrane_ctrl.service.connections import ConnectionGuard
+from membrane_ctrl.service.public_address import PublicAddress, host_name
+from membrane_ctrl.service.work_pools import KNOWN_PASSWORDS, STRANGERS_PASSWORDS, PoolFullError
 
 LOGIN_PATH = "/login"
 STOP_PATH = "/stop"

@@ -12,10 +12,10 @@ from typing import Any
 import pytest
 
 from membrane_ctrl.model.errors import InputError
-from membrane_ctrl.web import access
-from membrane_ctrl.web.access import Accounts, WebUser, known_user, known_users, on_behalf
-from membrane_ctrl.web.login import LoginMiddleware
-from membrane_ctrl.web.public_address import PublicAddress
+from membrane_ctrl.service import access
+from membrane_ctrl.service.access import Accounts, WebUser, known_user, known_users, on_behalf
+from membrane_ctrl.service.login import LoginMiddleware
+from membrane_ctrl.service.public_address import PublicAddress
 
 ADDRESS = PublicAddress(frozenset({"127.0.0.1", "localhost"}))
 HOST = "127.0.0.1:7480"

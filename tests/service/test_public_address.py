@@ -8,7 +8,7 @@ import pytest
 from pydantic import ValidationError
 
 from membrane_ctrl.config.port import WebConfig
-from membrane_ctrl.web.public_address import (
+from membrane_ctrl.service.public_address import (
     PublicAddress,
     host_name,
     normalised_origin,

@@ -9,8 +9,8 @@ from pathlib import Path
 
 import pytest
 
-from membrane_ctrl.web import connections
-from membrane_ctrl.web.connections import ConnectionGuard
+from membrane_ctrl.service import connections
+from membrane_ctrl.service.connections import ConnectionGuard
 from tests.support.service_attacks import ROUTES, Viewer, connect, request_bytes
 from tests.web.test_page_under_attack import PASSWORD, serving
 

@@ -17,8 +17,8 @@ from membrane_ctrl.control_port.protocol import encode, parse
 from membrane_ctrl.control_port.status import alarm_lines
 from membrane_ctrl.controller.commands import TABLE
 from membrane_ctrl.model.run_events import Mark
-from membrane_ctrl.web.access import ACTIONS, STOP, UNLOCK, WebUser, may, on_behalf, request
-from membrane_ctrl.web.feed import HoldFeed
+from membrane_ctrl.service.access import ACTIONS, STOP, UNLOCK, WebUser, may, on_behalf, request
+from membrane_ctrl.service.feed import HoldFeed
 from tests.control_port.port_run import ROW, port_run
 
 _LOOK_S = 0.02
