@@ -8,7 +8,8 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from membrane_ctrl.model import durations, errors
+from membrane_ctrl.model import durations
+from membrane_ctrl.model.optional import require_installed
 
 if TYPE_CHECKING:
     from tuning.options import TuneOptions
@@ -212,10 +213,8 @@ def explore(
     session live.
     """
     from membrane_ctrl.model.account import account_name
-    from tuning.commands.live_page import NEEDS_BOKEH
 
-    try:
-        from tuning.explore.page import explore
-    except ModuleNotFoundError:
-        raise errors.InputError(NEEDS_BOKEH.format("tune explore")) from None
+    require_installed("bokeh", "web", "`tune explore`")
+    from tuning.explore.page import explore
+
     return explore(folder, logs, port, author or account_name())

@@ -2,6 +2,7 @@
 (docs/reference/interfaces.md).
 """
 
+import os
 import sys
 from collections.abc import Sequence
 from pathlib import Path
@@ -10,12 +11,15 @@ from typing import Annotated
 import typer
 
 from membrane_ctrl.cli import calibrating, ctl, holding, optics, reviewing
+from membrane_ctrl.cli.completion import complete_example
 from membrane_ctrl.model import errors, program, terminal
+
+# a shell asks for completions with this variable set (Typer)
+_COMPLETION_VARIABLE = "_MEMBRANE_CTRL_COMPLETE"
 
 # Markdown, because Rich's own markup takes [devices] in a help text for a style
 app = typer.Typer(
     no_args_is_help=True,
-    add_completion=False,
     pretty_exceptions_enable=False,
     rich_markup_mode="markdown",
 )
@@ -27,7 +31,10 @@ def run(arguments: Sequence[str]) -> int:
     """
     with terminal.only_text():
         try:
-            _complete(arguments[0] if arguments else "")
+            if os.environ.get(_COMPLETION_VARIABLE):  # the words are in another variable
+                add_all_commands()
+            else:
+                _add_commands_for(arguments[0] if arguments else "")
             result = app(list(arguments), prog_name="membrane-ctrl", standalone_mode=False)
         except errors.CommandError as error:
             for line in error.lines:
@@ -48,23 +55,34 @@ def run(arguments: Sequence[str]) -> int:
         return int(result or 0)
 
 
-def _complete(word: str) -> None:
-    """Add what takes long to find, if `word` may mean it: the actions of `ctl`, the commands of
-    other packages.
+def add_all_commands() -> None:
+    """Add the commands that take long to find: for completion and for the manual pages."""
+    ctl.add_actions()
+    _add_commands_of_packages()
+
+
+def _add_commands_for(word: str) -> None:
+    """Add the commands that take long to find if `word`, the first of the command line, may name
+    one of them.
     """
-    names = {group.name for group in app.registered_groups}
+    groups = {group.name for group in app.registered_groups}
+    commands = {
+        each.name or getattr(each.callback, "__name__", "") for each in app.registered_commands
+    }
     if word == "ctl":
         ctl.add_actions()
-    elif word not in names | {
-        each.name or getattr(each.callback, "__name__", "") for each in app.registered_commands
-    }:
-        from importlib.metadata import entry_points
+    elif word not in groups | commands:
+        _add_commands_of_packages()
 
-        for entry in entry_points(
-            group="membrane_ctrl.subcommands"
-        ):  # tuning imports this package, not the reverse
-            if entry.name not in names:
-                app.add_typer(entry.load(), name=entry.name)
+
+def _add_commands_of_packages() -> None:
+    """Add the commands of packages that import this one, such as `tune`."""
+    from importlib.metadata import entry_points
+
+    groups = {group.name for group in app.registered_groups}
+    for entry in entry_points(group="membrane_ctrl.subcommands"):
+        if entry.name not in groups:
+            app.add_typer(entry.load(), name=entry.name)
 
 
 def _file_trouble(error: OSError) -> str:
@@ -87,7 +105,12 @@ def top(
 
 @app.command()
 def examples(
-    name: Annotated[str, typer.Argument(help="File to print; by default, list them.")] = "",
+    name: Annotated[
+        str,
+        typer.Argument(
+            help="File to print; by default, list them.", autocompletion=complete_example
+        ),
+    ] = "",
 ) -> None:
     """Print an example configuration or the service's unit: `membrane-ctrl examples
     paper-bench.toml > lab.toml`.
@@ -104,6 +127,24 @@ def examples(
         print(files[name].read_text(encoding="utf-8"), end="")
     else:
         raise errors.InputError(f"{name}: no such example; known: {', '.join(files)}")
+
+
+@app.command()
+def man(
+    folder: Annotated[
+        Path | None,
+        typer.Argument(
+            metavar="FOLDER", help="Folder for the pages; by default, that of this installation."
+        ),
+    ] = None,
+) -> None:
+    """Write a manual page of each command: `man membrane-ctrl-hold` then shows that of `hold`."""
+    from membrane_ctrl.cli.man_pages import write_man_pages
+
+    add_all_commands()
+    folder = folder or Path(sys.prefix) / "share" / "man" / "man1"
+    count = write_man_pages(folder, typer.main.get_command(app))
+    print(f"{folder}: {count} pages; `man membrane-ctrl` shows the first", file=sys.stderr)
 
 
 for _family in (holding, optics, calibrating, reviewing):

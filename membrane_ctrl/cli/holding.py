@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from membrane_ctrl.cli.completion import complete_scenario
 from membrane_ctrl.cli.ctl import ctl_app
 from membrane_ctrl.cli.options import ConfigArgument, ConfigOption, JsonOption, load_configuration
 from membrane_ctrl.model import durations, errors, terminal
@@ -132,7 +133,11 @@ def twin(
 def play(
     scenario: Annotated[
         str | None,
-        typer.Argument(metavar="SCENARIO", help="Name or file; without it, the names are listed."),
+        typer.Argument(
+            metavar="SCENARIO",
+            help="Name or file; without it, the names are listed.",
+            autocompletion=complete_scenario,
+        ),
     ] = None,
     real_time: Annotated[
         bool, typer.Option("--real-time", help="Play in real time, with the console.")

@@ -5,6 +5,8 @@ from typing import TYPE_CHECKING, Annotated, TypeVar
 
 import typer
 
+from membrane_ctrl.cli.completion import complete_run
+
 if TYPE_CHECKING:  # loading the configuration's tables takes longer than all commands' help
     from firmware_iface.settings import Section
     from membrane_ctrl.config.schema import Config
@@ -27,7 +29,12 @@ PriorOption = Annotated[
     ),
 ]
 RunArgument = Annotated[
-    Path, typer.Argument(metavar="RUN", help="Run folder, its name or part of the name, or `last`.")
+    Path,
+    typer.Argument(
+        metavar="RUN",
+        help="Run folder, its name or part of the name, or `last`.",
+        autocompletion=complete_run,
+    ),
 ]
 FromOption = Annotated[
     str | None,

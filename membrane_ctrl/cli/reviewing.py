@@ -7,10 +7,16 @@ from typing import Annotated
 
 import typer
 
+from membrane_ctrl.cli.completion import complete_run, find_logs
 from membrane_ctrl.cli.options import FromOption, JsonOption, RunArgument, ToOption
 from membrane_ctrl.model import durations, errors
 
 LogsOption = Annotated[Path, typer.Option("--logs", help="Folder of the runs.")]
+
+OneLogsOption = Annotated[
+    Path | None, typer.Option("--logs", help="Folder of the runs; `logs` by default.")
+]
+DEFAULT_LOGS = Path("logs")
 
 runs_app = typer.Typer(
     invoke_without_command=True, rich_markup_mode="markdown", help="List, show and prune runs."
@@ -29,7 +35,10 @@ def add_commands(app: typer.Typer) -> None:
 
 def review(
     runs: Annotated[
-        list[str] | None, typer.Argument(metavar="RUN...", help="One run, or several to overlay.")
+        list[str] | None,
+        typer.Argument(
+            metavar="RUN...", help="One run, or several to overlay.", autocompletion=complete_run
+        ),
     ] = None,
     every: Annotated[bool, typer.Option("--all", help="All runs of a folder, as a table.")] = False,
     logs: LogsOption = Path("logs"),
@@ -97,7 +106,9 @@ def report(
     runs: Annotated[
         list[Path],
         typer.Argument(
-            metavar="RUN...", help="Run folder, its name or part of the name, or `last`."
+            metavar="RUN...",
+            help="Run folder, its name or part of the name, or `last`.",
+            autocompletion=complete_run,
         ),
     ],
     out: Annotated[
@@ -208,17 +219,7 @@ def list_runs(
     from membrane_ctrl.review.runs import list_command
 
     if context.invoked_subcommand is not None:
-        sources = {name: context.get_parameter_source(name) for name in context.params}
-        given = [
-            name
-            for name, source in sources.items()
-            if source is not None and source.name == "COMMANDLINE"
-        ]
-        if given:  # `--logs` in front of `prune` would leave it with another folder than was meant
-            told = ", ".join(f"--{name.replace('_', '-')}" for name in given)
-            raise errors.InputError(
-                f"{told} in front of `{context.invoked_subcommand}` belongs after it"
-            )
+        _require_only_logs(context)
         return 0
     least_s = None if longer is None else durations.parse_duration_s(longer)
     wanted = Filter(
@@ -231,17 +232,39 @@ def list_runs(
     return list_command(logs or [Path("logs")], wanted, since, until, json)
 
 
+def _require_only_logs(context: typer.Context) -> None:
+    """Refuse filters in front of a subcommand, which would not apply to it; it takes `--logs` from
+    there.
+    """
+    sources = {name: context.get_parameter_source(name) for name in context.params}
+    given = [
+        name
+        for name, source in sources.items()
+        if source is not None and source.name == "COMMANDLINE" and name != "logs"
+    ]
+    if given:
+        named = ", ".join(f"--{name.replace('_', '-')}" for name in given)
+        raise errors.InputError(
+            f"{named}: filters the list of runs; leave it out with `{context.invoked_subcommand}`"
+        )
+    if len(context.params["logs"] or ()) > 1:
+        raise errors.InputError(f"--logs: one folder for `{context.invoked_subcommand}`")
+
+
 @runs_app.command("show")
-def show_run(run: RunArgument, json: JsonOption = False) -> int:
+def show_run(
+    context: typer.Context, run: RunArgument, logs: OneLogsOption = None, json: JsonOption = False
+) -> int:
     """Show one run: figures, states, faults, marks, what is missing."""
     from membrane_ctrl.review.runs import show_command
 
-    return show_command(run, json)
+    return show_command(run, find_logs(context) or DEFAULT_LOGS, json)
 
 
 @runs_app.command("prune")
 def prune_runs(
-    logs: LogsOption = Path("logs"),
+    context: typer.Context,
+    logs: OneLogsOption = None,
     keep_days: Annotated[
         float | None, typer.Option(min=0, max=1e5, help="Delete runs older than this many days.")
     ] = None,
@@ -261,7 +284,7 @@ def prune_runs(
     """
     from membrane_ctrl.review.runs import prune_command
 
-    return prune_command(logs, keep_days, keep_gb, delete, json)
+    return prune_command(find_logs(context) or DEFAULT_LOGS, keep_days, keep_gb, delete, json)
 
 
 def replay(

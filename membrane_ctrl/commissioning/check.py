@@ -21,6 +21,7 @@ from membrane_ctrl.acquisition import driver_check, optical_bench, waiting_clock
 from membrane_ctrl.alarms.process import require_sendable
 from membrane_ctrl.commissioning import interlock_check
 from membrane_ctrl.config.bridge_access import describe_bridges
+from membrane_ctrl.config.needed_packages import NeededPackage, missing_packages
 from membrane_ctrl.config.port import SOCKET_NAME, AlarmsConfig, PortConfig
 from membrane_ctrl.config.schema import Config, DevicesConfig
 from membrane_ctrl.control_port import sockets
@@ -72,6 +73,7 @@ def check_config(config: Config, source: str, as_json: bool) -> int:
     probes, circuits = _probe_all(config)
     for probe in probes:
         findings |= dict.fromkeys(cross_check(config, probe.facts))
+    missing = missing_packages(config)
     would = _what_would_happen(config)
     if config.interlocks:
         would["interlocks"] = interlock_check.describe_effect(circuits)
@@ -81,6 +83,7 @@ def check_config(config: Config, source: str, as_json: bool) -> int:
             for probe in probes
         ]
         found = [asdict(finding) for finding in findings]
+        found += [_describe_package(each) for each in missing]
         report = {
             "schema": "membrane-check/1",
             "source": source,
@@ -92,8 +95,10 @@ def check_config(config: Config, source: str, as_json: bool) -> int:
         print(plain_json.dumps(report))
     else:
         warnings = [finding.line(source) for finding in findings if finding.severity == "warning"]
+        warnings += [f"{source}: {each.missing_line}" for each in missing if not each.by_hold]
         _print_probes(source, probes, circuits, would, warnings)
     refused = [finding.line(source) for finding in findings if finding.severity == "error"]
+    refused += [f"{source}: {each.missing_line}" for each in missing if each.by_hold]
     if refused:
         raise errors.FindingsError(refused)
     wrong = [probe for probe in probes if probe.problem]
@@ -202,6 +207,7 @@ def _what_would_happen(config: Config) -> dict[str, str]:
         "locks": _describe_locks(config),
         "control port": _describe_port(config.port),
         "alarms": _describe_alarms(config.alarms),
+        "page": _describe_page(config),
         "bridges": describe_bridges(config.doors),
     }
 
@@ -219,6 +225,27 @@ def _describe_port(port: PortConfig) -> str:
     if port.metrics_port is not None:
         ways.append(f"metrics on 127.0.0.1:{port.metrics_port}")
     return ", ".join(ways)
+
+
+def _describe_package(needed: NeededPackage) -> dict[str, str]:
+    """A package that is missing, as the other findings are described."""
+    return {
+        "severity": "error" if needed.by_hold else "warning",
+        "field": needed.table,
+        "value": "",
+        "why": f"needs {needed.package}, which is not installed",
+        "remedy": needed.missing_line.partition(": ")[2],
+    }
+
+
+def _describe_page(config: Config) -> str:
+    """Where the page would be served."""
+    page = config.web
+    if page is None:
+        return "none: no [web]"
+    scheme = "https" if page.secure else "http"
+    who = f"users in {page.users_file}" if page.users_file else "whoever has its link"
+    return f"{page.public_url or f'{scheme}://{page.host}:{page.port}/'} for {who}"
 
 
 def _describe_locks(config: Config) -> str:

@@ -4,7 +4,7 @@ it to the lab's other systems.
 
 from __future__ import annotations
 
-import importlib.util
+import importlib
 import signal
 import sys
 from pathlib import Path
@@ -17,11 +17,7 @@ from membrane_ctrl.model import errors
 if TYPE_CHECKING:
     from membrane_ctrl.doors.names import Door
 
-_LIBRARIES = {
-    "opcua": "asyncua",
-    "epics": "softioc",
-    "mqtt": "aiomqtt",
-}  # each door's module, and what it needs
+_BRIDGES = ("opcua", "epics", "mqtt")  # tables of the configuration, and modules
 
 app = typer.Typer(
     invoke_without_command=True,
@@ -48,10 +44,14 @@ def doors(
     import asyncio
 
     from membrane_ctrl.cli.options import load_configuration
+    from membrane_ctrl.config.needed_packages import missing_packages
     from membrane_ctrl.doors.names import Door
 
     settings = load_configuration(config)
-    if not any(getattr(settings.doors, name) for name in _LIBRARIES):
+    for needed in missing_packages(settings):
+        if not needed.by_hold:
+            raise errors.InputError(needed.missing_line)
+    if not any(getattr(settings.doors, name) for name in _BRIDGES):
         raise errors.InputError(
             "no bridge is configured: add [doors.mqtt], [doors.opcua] or [doors.epics] "
             "(docs/how-to/bridges.md)"
@@ -98,17 +98,11 @@ def _first_error(group: BaseExceptionGroup[errors.CommandError]) -> errors.Comma
 
 
 def _opened(door: Door) -> list[Any]:
-    """The doors of the settings, to be awaited. Raises InputError for
-    one whose library is missing.
-    """
+    """The doors of the settings, to be awaited."""
     opened = []
-    for name, library in _LIBRARIES.items():
+    for name in _BRIDGES:
         settings = getattr(door.settings, name)
         if settings is None:
             continue
-        if importlib.util.find_spec(library) is None:
-            raise errors.InputError(
-                f"doors.{name} needs {library}: pip install 'membrane-ctrl[{name}]'"
-            )
         opened.append(importlib.import_module(f"membrane_ctrl.doors.{name}").serve(settings, door))
     return opened

@@ -23,6 +23,7 @@ from membrane_ctrl.metrology.figure.error_bars import LEAST_CELLS
 from membrane_ctrl.metrology.numerics import grid_fit, zernike
 from membrane_ctrl.model import errors, files, plain_json
 from membrane_ctrl.model.arrays import BoolArray, FloatArray, IntArray
+from membrane_ctrl.model.optional import import_optional
 from membrane_ctrl.model.zernike_terms import ZERNIKE_TERMS
 
 _REMOVABLE = {"piston": (0,), "tilt": (1, 2), "power": (3,)}  # places in the Fringe set
@@ -307,10 +308,7 @@ def _codev_int(seen: ExportedMap, _: object) -> Written:
 
 def _write_hdf5(seen: ExportedMap, table: dict[str, Any] | None) -> Written:
     """HDF5: the map with its axes as NumPy keeps them, and the Zernike terms."""
-    try:
-        import h5py
-    except ImportError:
-        raise errors.InputError("--format h5 needs h5py: pip install 'membrane-ctrl[h5]'") from None
+    h5py = import_optional("h5py", "h5", "--format h5")
     memory = io.BytesIO()
     with h5py.File(memory, "w") as file:
         for name, values in (

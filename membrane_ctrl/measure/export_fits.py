@@ -39,7 +39,7 @@ def fits_bytes(x_mm: FloatArray, y_mm: FloatArray, height_mm: FloatArray, remove
 
     Raises InputError if astropy is missing.
     """
-    fits = import_optional("astropy.io.fits", "fits")
+    fits = import_optional("astropy.io.fits", "fits", "--format fits")
     x_mm, y_mm, height_mm = _pad_to_square(x_mm, y_mm, height_mm)
     measured = np.isfinite(height_mm)
     lead_m = np.where(measured, _LEAD_PER_HEIGHT * _M_PER_MM * np.nan_to_num(height_mm), 0.0)

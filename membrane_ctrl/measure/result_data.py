@@ -63,7 +63,7 @@ class MeasuredResult:
             "coeffs_um": self._coeffs_um(),
             "sigma_um": self._sigma_um(),
         }
-        pandas = import_optional("pandas", "data")
+        pandas = import_optional("pandas", "data", "a frame")
         return pandas.DataFrame(columns, index=pandas.Index(NOLL_INDICES, name="noll"))
 
     def to_xarray(self) -> xr.Dataset:
@@ -100,7 +100,7 @@ class MeasuredResult:
         }
         if self.sigmas_um:
             coordinates |= {"sigma_x_mm": self.sigma_mm[0], "sigma_y_mm": self.sigma_mm[1]}
-        xarray = import_optional("xarray", "data")
+        xarray = import_optional("xarray", "data", "a dataset")
         return xarray.Dataset(variables, coords=coordinates, attrs=self._describe_source())
 
     def _coeffs_um(self) -> FloatArray:
@@ -160,7 +160,7 @@ class StabilityResult:
         """One row a set by its name (`series`), or one row a pair of sets (`pairs`). Raises
         InputError.
         """
-        pandas = import_optional("pandas", "data")
+        pandas = import_optional("pandas", "data", "a frame")
         path = self.folder / f"{table}.csv"
         names = ["set"] if table == "series" else ["earlier", "later"]
         try:
@@ -176,7 +176,7 @@ class StabilityResult:
         """Numbers along `set`, coefficients also along `noll`, and the map `sd_um` of standard
         deviations.
         """
-        xarray = import_optional("xarray", "data")
+        xarray = import_optional("xarray", "data", "a dataset")
         series = self.to_pandas()
         terms = [name for name in zernike_columns() if name in series]
         variables: dict[str, Any] = {

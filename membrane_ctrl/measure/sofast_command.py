@@ -26,7 +26,7 @@ def check_sofast_file(path: Path, as_json: bool) -> int:
     """
     try:
         measurement = read_sofast_file(path)
-    except (ValueError, OSError, ImportError) as error:
+    except (ValueError, OSError) as error:
         raise errors.InputError(str(error)) from None
     mask = lit_pixels(measurement)
     if np.count_nonzero(mask) < _LEAST_PIXELS:

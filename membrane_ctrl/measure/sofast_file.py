@@ -10,6 +10,7 @@ from membrane_ctrl.metrology.frame_checks.frequency_series import AxisSeries
 from membrane_ctrl.metrology.phase.phase_steps import compute_phasors, equal_shifts
 from membrane_ctrl.model.arrays import BoolArray, FloatArray
 from membrane_ctrl.model.files import open_plain
+from membrane_ctrl.model.optional import import_optional
 
 SOFAST_STEPS = 4  # SOFAST always takes four
 MM_PER_M = 1e3
@@ -36,7 +37,7 @@ class SofastMeasurement:
 
 
 def read_sofast_file(path: Path) -> SofastMeasurement:
-    """Read frames and their data. Raises ValueError, FileNotFoundError or ImportError with one
+    """Read frames and their data. Raises ValueError, FileNotFoundError or InputError with one
     line.
     """
     with open_hdf5(path) as file:
@@ -68,10 +69,7 @@ def read_sofast_file(path: Path) -> SofastMeasurement:
 
 def open_hdf5(path: Path) -> Any:
     """Open the file with h5py (untyped), an optional extra that only this reader needs."""
-    try:
-        import h5py
-    except ImportError:
-        raise ImportError("SOFAST files need h5py: pip install 'membrane-ctrl[sofast]'") from None
+    h5py = import_optional("h5py", "sofast", f"{path}, a SOFAST file,")
     try:
         open_plain(path, follow=True).close()  # h5py would wait forever for a pipe without a writer
         return h5py.File(path, "r")

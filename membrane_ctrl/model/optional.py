@@ -1,12 +1,29 @@
 """Libraries that only an extra of the package installs."""
 
 import importlib
+import importlib.util
 from types import ModuleType
 
 from membrane_ctrl.model import errors
 
 
-def import_optional(name: str, extra: str) -> ModuleType:
+def is_installed(name: str) -> bool:
+    """Whether a library can be imported; does not import it."""
+    return importlib.util.find_spec(name) is not None
+
+
+def describe_missing(user: str, name: str, extra: str) -> str:
+    """What needs a library that is missing, and how to install it, in one line."""
+    return f"{user} needs {name}: pip install 'membrane-ctrl[{extra}]'"
+
+
+def require_installed(name: str, extra: str, user: str) -> None:
+    """Raise InputError, with how to install it, if a library is missing; does not import it."""
+    if not is_installed(name):
+        raise errors.InputError(describe_missing(user, name, extra))
+
+
+def import_optional(name: str, extra: str, user: str) -> ModuleType:
     """Import a library. Raises InputError with how to install it.
 
     Parameters
@@ -15,8 +32,10 @@ def import_optional(name: str, extra: str) -> ModuleType:
         Such as `pandas`.
     extra : str
         The extra of this package that requires it, such as `data`.
+    user : str
+        What needs it, such as `--format h5`.
     """
     try:
         return importlib.import_module(name)
     except ImportError:
-        raise errors.InputError(f"needs {name}: pip install 'membrane-ctrl[{extra}]'") from None
+        raise errors.InputError(describe_missing(user, name, extra)) from None

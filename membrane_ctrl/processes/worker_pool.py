@@ -1,11 +1,11 @@
 """Runs a job for many items: in this process, on several processes, or on a Dask cluster."""
 
 import contextlib
-import importlib
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from typing import Any, TypeVar
 
 from membrane_ctrl.model import errors
+from membrane_ctrl.model.optional import import_optional
 from membrane_ctrl.processes.child import SPAWN_CONTEXT
 
 _CONNECT_S = 30
@@ -45,14 +45,7 @@ def run_jobs(
 
 
 def _dask_client(address: str) -> Any:
-    try:
-        distributed = importlib.import_module("distributed")
-    except ImportError:
-        text = (
-            "--scheduler: Dask is not installed; install the extra `dask` (pip install "
-            "'membrane-ctrl[dask]')"
-        )
-        raise errors.InputError(text) from None
+    distributed = import_optional("distributed", "dask", "--scheduler")
     try:
         return distributed.Client(address, timeout=_CONNECT_S)
     except ValueError as error:

@@ -11,6 +11,7 @@ import pyarrow.parquet
 
 from membrane_ctrl.model import errors, program
 from membrane_ctrl.model.files import make_folder, move_file, scratch_folder, write_text_atomic
+from membrane_ctrl.model.optional import import_optional
 from membrane_ctrl.model.telemetry import FIELDS
 from membrane_ctrl.review import catalogue
 from membrane_ctrl.review.run_times import part_s
@@ -182,12 +183,7 @@ def _write_hdf5(
     end_s: float,
 ) -> list[Path]:
     path = out / "run.h5"
-    try:
-        import h5py
-    except ImportError:
-        raise errors.InputError(
-            f"--format {to} needs h5py: pip install 'membrane-ctrl[sofast]'"
-        ) from None
+    h5py = import_optional("h5py", "h5", f"--format {to}")
     with h5py.File(path, "w") as file:
         file.attrs.update(_make_origin(run))
         for block in run.tick_blocks(fields, start_s, end_s) if fields else ():

@@ -35,9 +35,9 @@ def list_command(
     return 0
 
 
-def show_command(run: Path, json: bool) -> int:
+def show_command(run: Path, logs: Path, json: bool) -> int:
     """Print one run: its line of the catalogue, its states and faults, its missing parts."""
-    opened = open_run(catalogue.resolve_run(run))
+    opened = open_run(catalogue.resolve_run(run, logs))
     opened.look_through()
     entry = catalogue.read_entry(opened.folder)
     if json:

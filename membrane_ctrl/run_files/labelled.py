@@ -42,7 +42,7 @@ def make_frame(table: pa.Table) -> pd.DataFrame:
     """A table for people (`named_tables.named_table`) with its UTC as index; names of codes are
     categories.
     """
-    import_optional("pandas", "data")
+    import_optional("pandas", "data", "a frame")
     return table.to_pandas().set_index("time_utc")
 
 
@@ -63,7 +63,7 @@ def make_dataset(table: pa.Table, labels: Labels, about: Mapping[str, str]) -> x
     xarray.Dataset
         A missing number is NaN, a missing name an empty string.
     """
-    xarray = import_optional("xarray", "data")
+    xarray = import_optional("xarray", "data", "a dataset")
     times = _naive_utc(table.column("time_utc"))
     coordinates = {
         _TIME: times,
@@ -96,7 +96,7 @@ def make_cycles_dataset(
     about : mapping
         Attributes of the dataset.
     """
-    xarray = import_optional("xarray", "data")
+    xarray = import_optional("xarray", "data", "a dataset")
     found = found.select_cycles((found.time_s >= part_s[0]) & (found.time_s < part_s[1]))
     kept = (found.covariance_time_s >= part_s[0]) & (found.covariance_time_s < part_s[1])
     labels = labels_of(table_specs.SHAPES) | labels_of(table_specs.COVARIANCES)

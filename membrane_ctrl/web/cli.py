@@ -9,6 +9,7 @@ from typing import Annotated
 import typer
 
 from membrane_ctrl.model import errors, files
+from membrane_ctrl.model.optional import require_installed
 
 app = typer.Typer(
     invoke_without_command=True,
@@ -62,12 +63,9 @@ def web(
     from membrane_ctrl.control_port import ctl
     from membrane_ctrl.processes.command_process import end_with_parent
 
-    try:
-        from membrane_ctrl.web.server import serve
-    except ModuleNotFoundError as error:
-        if error.name != "nicegui":
-            raise
-        raise errors.InputError("web needs NiceGUI: pip install 'membrane-ctrl[web]'") from None
+    require_installed("nicegui", "web", "`web`")
+    from membrane_ctrl.web.server import serve
+
     given = {"host": host, "port": port, "names": tuple(name or ())}
     given |= {"public_url": public_url, "trusted_proxies": tuple(trusted_proxy or ())}
     kept = {"users_file": users, "certificate_file": certificate, "key_file": key}

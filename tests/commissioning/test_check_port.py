@@ -2,15 +2,25 @@
 
 from __future__ import annotations
 
+import importlib.util
 import json
+from collections.abc import Callable
 from pathlib import Path
 
 import pytest
 
 from membrane_ctrl.commissioning.check import check_config
-from membrane_ctrl.config.port import AlarmsConfig, PortConfig, TlsConfig
+from membrane_ctrl.config.port import (
+    AlarmsConfig,
+    DoorsConfig,
+    MqttConfig,
+    OpcuaConfig,
+    PortConfig,
+    TlsConfig,
+    WebConfig,
+)
 from membrane_ctrl.config.schema import Config
-from membrane_ctrl.model.errors import InputError
+from membrane_ctrl.model.errors import Exit, InputError
 
 
 def would(config: Config, capsys: pytest.CaptureFixture[str]) -> dict[str, str]:
@@ -45,6 +55,39 @@ def test_what_is_configured(
     assert said["control port"] == "/run/m.sock, metrics on 127.0.0.1:9464"
     assert said["alarms"] == f"2 rules besides faults, to those in {urls}"
     assert would(Config(port=PortConfig(enabled=False)), capsys)["control port"] == "off"
+
+
+def missing(*libraries: str) -> Callable[[str], object]:
+    """`find_spec` without some libraries."""
+    found = importlib.util.find_spec
+    return lambda name: None if name in libraries else found(name)
+
+
+def test_a_page_without_its_library_is_refused_as_by_a_hold(
+    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    config = Config(web=WebConfig())
+    assert would(config, capsys)["page"] == "http://127.0.0.1:7480/ for whoever has its link"
+    assert would(Config(), capsys)["page"] == "none: no [web]"
+    monkeypatch.setattr("importlib.util.find_spec", missing("nicegui"))
+    with pytest.raises(InputError) as refused:
+        check_config(config, "lab.toml", as_json=True)
+    line = "lab.toml: [web] needs nicegui: pip install 'membrane-ctrl[web]'"
+    assert refused.value.lines == (line,)
+    (finding,) = json.loads(capsys.readouterr().out)["findings"]
+    assert (finding["severity"], finding["field"]) == ("error", "web")
+    assert finding["remedy"] == "pip install 'membrane-ctrl[web]'"
+
+
+def test_a_bridge_without_its_library_is_named_and_the_hold_is_possible(
+    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("importlib.util.find_spec", missing("aiomqtt", "asyncua"))
+    config = Config(doors=DoorsConfig(mqtt=MqttConfig(host="broker"), opcua=OpcuaConfig()))
+    assert check_config(config, "lab.toml", as_json=False) == Exit.DONE
+    said = " ".join(capsys.readouterr().out.split())
+    assert "lab.toml: [doors.mqtt] needs aiomqtt: pip install 'membrane-ctrl[mqtt]'" in said
+    assert "lab.toml: [doors.opcua] needs asyncua: pip install 'membrane-ctrl[opcua]'" in said
 
 
 def test_files_that_are_not_there(tmp_path: Path) -> None:

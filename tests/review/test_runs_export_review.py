@@ -173,8 +173,36 @@ def test_runs_commands(logs: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert command(["runs", "prune", "--logs", str(logs)]) == 2
     assert command(["runs", "prune", "--logs", str(logs), "--keep-days", "1e12"]) == 2
     capsys.readouterr()
-    assert command(["runs", "--logs", str(logs), "prune", "--keep-gb", "0"]) == 2
-    assert "--logs in front of `prune`" in capsys.readouterr().err
+
+
+def test_runs_takes_its_folder_on_either_side_of_a_subcommand(
+    logs: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    for words in (
+        ["runs", "--logs", str(logs), "show", "122T18", "--json"],
+        ["runs", "show", "122T18", "--logs", str(logs), "--json"],
+        ["runs", "--logs", "absent", "show", "122T18", "--logs", str(logs), "--json"],
+    ):
+        assert command(words) == 0
+        assert json.loads(capsys.readouterr().out)["name"] == "20261122T180000Z-night"
+    for words in (
+        ["runs", "--logs", str(logs), "prune", "--keep-gb", "0", "--json"],
+        ["runs", "prune", "--logs", str(logs), "--keep-gb", "0", "--json"],
+    ):
+        assert command(words) == 0
+        gone = json.loads(capsys.readouterr().out)
+        assert len(gone["runs"]) == 3
+        assert not gone["deleted"]
+
+
+def test_filters_of_the_list_are_refused_with_a_subcommand(
+    logs: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert command(["runs", "--std-um", "1", "prune", "--keep-gb", "0"]) == 2
+    assert "--std-um: filters the list of runs; leave it out" in capsys.readouterr().err
+    twice = ["runs", "--logs", str(logs), "--logs", "other", "show", "122T18"]
+    assert command(twice) == 2
+    assert "--logs: one folder for `show`" in capsys.readouterr().err
 
 
 def test_runs_of_several_folders_are_one_list(

@@ -1,5 +1,6 @@
 """The scenarios that come with the program: their files, names and titles."""
 
+from difflib import get_close_matches
 from pathlib import Path
 
 from membrane_ctrl.config.toml_file import read_toml
@@ -22,10 +23,13 @@ def list_scenarios() -> int:
 
 def find_scenario(word: str) -> Path:
     """The file of a scenario, given its name or a path. Raises InputError."""
-    named = _FOLDER / f"{word.replace('-', '_')}.toml"
-    path = named if named in list_scenario_files() else Path(word)
-    if not path.is_file():
-        raise InputError(
-            f"{word}: no such scenario; `membrane-ctrl twin play` lists them, or name a file"
-        )
-    return path
+    files = {path.stem: path for path in list_scenario_files()}
+    name = word.replace("-", "_")
+    path = files.get(name) or Path(word)
+    if path.is_file():
+        return path
+    near = [each for each in files if name and name in each] or get_close_matches(name, files)
+    advice = f"did you mean {' or '.join(near)}? " if near else ""
+    raise InputError(
+        f"{word}: no such scenario; {advice}`membrane-ctrl twin play` lists them, or name a file"
+    )

@@ -1,0 +1,54 @@
+"""Packages of Python that a configuration needs beyond those of every installation."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+from membrane_ctrl.config.schema import Config
+from membrane_ctrl.model.optional import describe_missing, is_installed
+
+
+@dataclass(frozen=True, slots=True)
+class NeededPackage:
+    """A package that a table needs.
+
+    Attributes
+    ----------
+    table : str
+        Of the configuration, such as `doors.mqtt`.
+    package : str
+        As it is imported.
+    extra : str
+        The extra of this program that installs it.
+    by_hold : bool
+        Whether the hold itself needs it, not a program beside it.
+    """
+
+    table: str
+    package: str
+    extra: str
+    by_hold: bool
+
+    @property
+    def missing_line(self) -> str:
+        """What is missing, and how to install it."""
+        return describe_missing(f"[{self.table}]", self.package, self.extra)
+
+
+def needed_packages(config: Config) -> Iterator[NeededPackage]:
+    """The packages of the page and of the bridges.
+
+    Drivers and alarms name theirs where they are made (`GpioLine`, `require_sendable`).
+    """
+    if config.web is not None:
+        yield NeededPackage("web", "nicegui", "web", by_hold=True)
+    bridges = {"mqtt": "aiomqtt", "opcua": "asyncua", "epics": "softioc"}
+    for bridge, package in bridges.items():
+        if getattr(config.doors, bridge) is not None:
+            yield NeededPackage(f"doors.{bridge}", package, bridge, by_hold=False)
+
+
+def missing_packages(config: Config) -> list[NeededPackage]:
+    """Those that are not installed."""
+    return [each for each in needed_packages(config) if not is_installed(each.package)]
