@@ -72,17 +72,28 @@ def _add_commands_for(word: str) -> None:
     if word == "ctl":
         ctl.add_actions()
     elif word not in groups | commands:
-        _add_commands_of_packages()
+        _add_commands_of_packages(word)
 
 
-def _add_commands_of_packages() -> None:
-    """Add the commands of packages that import this one, such as `tune`."""
+def _add_commands_of_packages(word: str = "") -> None:
+    """Add the commands of packages that import this one, such as `tune`.
+
+    A package that cannot be imported takes away its own command only. Raises InputError if that is
+    `word`.
+    """
     from importlib.metadata import entry_points
 
     groups = {group.name for group in app.registered_groups}
     for entry in entry_points(group="membrane_ctrl.subcommands"):
-        if entry.name not in groups:
+        if entry.name in groups:
+            continue
+        try:
             app.add_typer(entry.load(), name=entry.name)
+        except ImportError as error:
+            if entry.name == word:
+                raise errors.InputError(
+                    f"{word}: its package cannot be imported ({error}); install it again"
+                ) from None
 
 
 def _file_trouble(error: OSError) -> str:

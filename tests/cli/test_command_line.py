@@ -5,6 +5,7 @@ from __future__ import annotations
 import re
 import subprocess
 import sys
+from importlib.metadata import EntryPoint
 from pathlib import Path
 
 import pytest
@@ -95,6 +96,16 @@ def test_a_misspelt_command_gets_a_suggestion(
 ) -> None:
     assert cli.run(words) == Exit.BAD_INPUT
     assert told in capsys.readouterr().err
+
+
+def test_a_package_that_cannot_be_imported_takes_away_its_own_command_only(
+    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    broken = EntryPoint("paint", "absent_package.cli:app", "membrane_ctrl.subcommands")
+    monkeypatch.setattr("importlib.metadata.entry_points", lambda group: [broken])
+    assert cli.run(["--version"]) == Exit.DONE
+    assert cli.run(["paint"]) == Exit.BAD_INPUT
+    assert "paint: its package cannot be imported (No module" in capsys.readouterr().err
 
 
 def test_help_loads_no_configuration() -> None:
