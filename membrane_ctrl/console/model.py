@@ -20,6 +20,7 @@ from membrane_ctrl.model import (
     telemetry,
 )
 from membrane_ctrl.model.lock import describe_lock
+from membrane_ctrl.run_files.held_error import HeldError, HeldErrorMeter
 
 MINUTE_S = 60
 TREND_S = 240  # the widest terminal shows this much
@@ -92,8 +93,8 @@ class ConsoleView:
     elapsed_s: float
     left_s: float  # from the first tick; infinite for a run without an end
     trend_um: tuple[float, ...]  # mean error of each of the last `TREND_S` seconds
-    error_mean_um: float  # of the last minute's error samples, as the next two
-    error_std_um: float
+    held: HeldError  # of the run until now
+    error_std_um: float  # of the last minute's error samples, as the next
     in_band_fraction: float
     lateness_max_ms: float  # the worst of the last minute
     fault: str  # the standing fault
@@ -129,6 +130,7 @@ class ConsoleModel:
         self._started_s = math.nan
         self._error = Trend()
         self._lateness = Trend()
+        self._held = HeldErrorMeter.for_config(config)
         self._estimate: shape_estimate.ShapeEstimate | None = None
         self._reference: shape_estimate.ShapeEstimate | None = None
         self._cycles = 0
@@ -147,6 +149,11 @@ class ConsoleModel:
         self._status = self._status.after_row(row)
         self._error.add(row.mono_s, row.error_um)
         self._lateness.add(row.mono_s, row.lateness_ms)
+
+    def add_rows(self, rows: telemetry.Rows) -> None:
+        """Add (n, len(FIELDS)) ticks to the figures of the whole run."""
+        if len(rows):
+            self._held.add_rows(rows)
 
     def take_event(self, line: events.EventLine) -> None:
         """Take one event, a line of `events.jsonl`."""
@@ -189,7 +196,7 @@ class ConsoleModel:
             elapsed_s=now_s,
             left_s=max(0.0, self._duration_s - (now_s - self._started_s if row else 0.0)),
             trend_um=self._error.second_means(),
-            error_mean_um=fmean(errors) if errors else math.nan,
+            held=self._held.result(),
             error_std_um=pstdev(errors) if errors else math.nan,
             in_band_fraction=fmean(abs(e) <= band_um for e in errors) if errors else math.nan,
             lateness_max_ms=max(self._lateness.finite_values(), default=math.nan),

@@ -158,8 +158,10 @@ class _Feed:
 
     def update(self) -> list[EventLine]:
         """Take all new messages; returns the events."""
-        for message in self._telemetry.drain():
+        messages = list(self._telemetry.drain())
+        for message in messages:
             self.model.take_row(telemetry.TelemetryRow.unpack(message))
+        self.model.add_rows(telemetry.unpack_rows(messages))
         for message in self._shapes.drain() if self._shapes else ():
             self.model.take_shape(shape_estimate.unpack_estimate(message))
         lines: list[EventLine] = [json.loads(message) for message in self._events.drain()]

@@ -25,6 +25,7 @@ from membrane_ctrl.model.columns import COLUMNS, MISSING, PUBLISHED, TERMS, colu
 from membrane_ctrl.model.event_base import Event, LogLevel
 from membrane_ctrl.model.event_lines import from_dict
 from membrane_ctrl.model.events import StateEntered
+from membrane_ctrl.run_files.held_error import HeldError
 
 _LOCKS_SHOWN = 3  # a low terminal needs room for the figures; `ctl status` lists all
 _NOTICES_SHOWN = 3
@@ -44,7 +45,19 @@ _BAR_ROWS_MAX = 6
 _EVENTS_MIN = 4  # lines with their heading: fewer are not worth a list
 _LEVEL_STYLES = {LogLevel.ERROR: "bold red", LogLevel.WARNING: "yellow"}
 # in a low terminal these are omitted first
-_DISPENSABLE = ("", "gains", "flow", "lateness", "cycle", "gas", "mirror", "trend", "shape", "pump")
+_DISPENSABLE = (
+    "",
+    "gains",
+    "flow",
+    "lateness",
+    "cycle",
+    "gas",
+    "mirror",
+    "trend",
+    "shape",
+    "held",
+    "pump",
+)
 # Published columns that the lines below show each in its own way; a line shows the others of its
 # group behind them.
 _PLACED = frozenset(
@@ -262,6 +275,7 @@ def _make_figures_table(
     for label, line in (
         ("error", _format_error(view, config)),
         *trend,
+        ("held", _format_held(view.held)),
         ("mirror", _format_mirror(row)),
         ("gains", Text(view.gains)),
         ("pump", _format_pump(row, view.flow_most_um_per_s)),
@@ -289,16 +303,20 @@ def _format_error(view: ConsoleView, config: Config) -> Text:
     style = "bold green" if inside else "bold red" if math.isfinite(row.error_um) else "dim"
     error = COLUMNS["error_um"]
     text = Text(f"{row.format_quantity('error_um', sign=True):>10}", style=style)
-    mean, std = (
-        error.format_value(view.error_mean_um, sign=True),
-        error.format_value(view.error_std_um),
-    )
-    text.append(f"   last minute: mean {mean}, std {std} {error.unit}, ", style="default")
+    std = error.format_value(view.error_std_um)
+    text.append(f"   last minute's readings: std {std} {error.unit}, ", style="default")
     text.append(
         f"{format_percent(view.in_band_fraction)} within ±{config.limits.band_um:g}",
         style="default",
     )
     return text
+
+
+def _format_held(held: HeldError) -> Text:
+    """The figures with which the run will end."""
+    if not held.seconds:
+        return Text("not for one second yet", style="dim")
+    return Text.assemble(f"{held.name}, 1 s means: ", (held.figures_text, "bold"))
 
 
 def _make_trend_items(

@@ -6,14 +6,16 @@ import json
 import math
 import shlex
 import sys
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 from membrane_ctrl.config.schema import RecordingConfig
 from membrane_ctrl.controller.tick import TickOutputs
 from membrane_ctrl.model import errors, events
 from membrane_ctrl.model.standing_fault import standing_fault_after
+from membrane_ctrl.run_files.held_error import HeldError
 
 _UNKNOWN_PUMP = (
     "DEVICE FAILED: the board did not answer while the run stopped, so that the state of the "
@@ -25,6 +27,11 @@ _NO_FAULT = (
     "SAFETY TRIP: the control program failed in the fault state",
     "  to do:    see the last lines of events.jsonl in the run folder, and report them",
 )
+_COUNTS = {
+    "cycles": "shape cycles",
+    "missed_ticks": "missed ticks",
+    "fault_count": "faults during the run",
+}
 
 
 @dataclass(slots=True)
@@ -104,16 +111,19 @@ def print_closing_report(run_dir: Path, as_json: bool, closing: RunEnd | None = 
         )
 
 
-def _list_headlines(summary: dict[str, object]) -> Iterator[str]:
-    labels: dict[str, tuple[str, Callable[[float], str]]] = {
-        "true_std_um": ("true centre, standard deviation", lambda v: f"{v:.3f} µm"),
-        "true_bias_um": ("true centre, bias", lambda v: f"{v:+.3f} µm"),
-        "in_band_1s_fraction": ("1 s means inside the band", lambda v: f"{100 * v:.1f} %"),
-        "cycles": ("shape cycles", lambda v: f"{v:.0f}"),
-        "missed_ticks": ("missed ticks", lambda v: f"{v:.0f}"),
-        "fault_count": ("faults during the run", lambda v: f"{v:.0f}"),
-    }
-    for key, (label, show) in labels.items():
+def _list_headlines(summary: dict[str, Any]) -> Iterator[str]:
+    """The lines of a run's figures."""
+    held = HeldError.from_table(summary.get("held") or {})
+    if held.seconds:
+        yield _format_headline(f"{held.name}, 1 s means", held.figures_text)
+        yield _format_headline("1 s means inside the band", held.in_band_text)
+    else:
+        yield _format_headline("held", "not for one second")
+    for key, label in _COUNTS.items():
         value = summary.get(key)
         if isinstance(value, (int, float)) and math.isfinite(value):
-            yield f"{label + ':':34}{show(value)}"
+            yield _format_headline(label, f"{value:.0f}")
+
+
+def _format_headline(label: str, text: str) -> str:
+    return f"{label + ':':34}{text}"

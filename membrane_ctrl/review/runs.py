@@ -1,6 +1,5 @@
 """The commands `membrane-ctrl runs`: list, show and prune runs."""
 
-import math
 import os
 import sys
 from collections.abc import Sequence
@@ -15,6 +14,7 @@ from membrane_ctrl.model import errors, events, plain_json, terminal
 from membrane_ctrl.model.run_events import Ended, Mark
 from membrane_ctrl.review import catalogue, prune
 from membrane_ctrl.review.formatting import format_number, format_span, format_time_beside, one_line
+from membrane_ctrl.run_files.held_error import HeldError, format_in_band, format_std_um
 from membrane_ctrl.run_files.run import open_run
 
 
@@ -49,6 +49,9 @@ def show_command(run: Path, logs: Path, json: bool) -> int:
         print(plain_json.dumps(table, indent=1))
         return 0
     _make_console().print(_make_table([entry]))
+    held = HeldError.from_table((opened.summary or {}).get("held") or {})
+    if held.seconds:
+        print(f"  {held.name}, 1 s means: {held.figures_text}; {held.in_band_text} in the band")
     if besides := format_time_beside(
         entry.faults_s, entry.paused_s, entry.moving_s, entry.duration_s
     ):
@@ -127,8 +130,8 @@ def _make_table(found: list[catalogue.RunEntry]) -> Table:
             f"{entry.started_utc:%Y-%m-%d %H:%M}",
             format_span(entry.duration_s),
             format_span(entry.held_s),
-            format_number(entry.std_um),
-            "–" if math.isnan(entry.in_band) else f"{100 * entry.in_band:.4g} %",
+            format_std_um(entry.std_um),
+            format_in_band(entry.in_band),
             str(entry.faults),
             format_number(entry.kp_per_s),
             format_number(entry.ti_s),

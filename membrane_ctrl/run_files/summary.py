@@ -19,8 +19,8 @@ from membrane_ctrl.model import (
 from membrane_ctrl.model.events import EventLine
 from membrane_ctrl.model.standing_fault import fault_of_end, standing_fault_after
 from membrane_ctrl.model.state_tree import Count, StateNode
-from membrane_ctrl.run_files.hold_parts import PARTS, HoldParts
-from membrane_ctrl.run_files.run_statistics import LogHistogram, Moments, SecondMeans, least_ticks
+from membrane_ctrl.run_files.held_error import HeldErrorMeter
+from membrane_ctrl.run_files.run_statistics import LogHistogram, Moments
 
 SCHEMA = "membrane-summary/2"
 
@@ -45,9 +45,7 @@ class Summary(StateNode):
     keys are null.
     """
 
-    parts: HoldParts
-    true_1s_um: SecondMeans
-    reading_1s_um: SecondMeans
+    held: HeldErrorMeter
     true_um: Moments = field(default_factory=Moments)
     reading_um: Moments = field(default_factory=Moments)
     lateness_ms: LogHistogram = field(default_factory=LogHistogram)
@@ -58,7 +56,6 @@ class Summary(StateNode):
     rejected: Count = 0
     leak_um_per_s: float = math.nan
     state: float = math.nan
-    parts_s: dict[str, float] = field(default_factory=lambda: dict.fromkeys(PARTS, 0.0))
     time_s: float = 0.0
     states: list[EnteredState] = field(default_factory=list)
     transitions: Count = 0
@@ -71,9 +68,7 @@ class Summary(StateNode):
     @classmethod
     def for_config(cls, config: Config) -> "Summary":
         """Return the empty summary of a run with this configuration."""
-        band_um = config.limits.band_um
-        least = least_ticks(1.0, config.loop.rate_hz)
-        return cls(HoldParts(band_um), SecondMeans(band_um, least), SecondMeans(band_um, least))
+        return cls(HeldErrorMeter.for_config(config))
 
     def add_rows(self, rows: telemetry.Rows) -> None:
         """Add (n, len(FIELDS)) telemetry rows, in order."""
@@ -85,17 +80,10 @@ class Summary(StateNode):
             if len(self.states) < _LISTED_MAX:
                 name = telemetry.State(code).name.lower()
                 self.states.append(EnteredState(name, float(time_s[row])))
-        parts = self.parts.classify_block(telemetry.get_columns(rows))
-        for name, part in parts.items():
-            self.parts_s[name] += float(telemetry.get_column(rows, "dt_s")[part].sum())
-        settled = telemetry.get_columns(rows[parts["held"]])
+        settled = telemetry.get_columns(rows[self.held.add_rows(rows)])
         self.state = float(telemetry.get_column(rows, "state")[-1])
-        true_um = telemetry.true_error_um(settled)
-        self.true_um.add(true_um)
-        self.true_1s_um.add(settled["mono_s"], true_um)
-        reading_um = settled["setpoint_um"] - settled["displacement_um"]
-        self.reading_um.add(reading_um)
-        self.reading_1s_um.add(settled["mono_s"], reading_um)
+        self.true_um.add(telemetry.true_error_um(settled))
+        self.reading_um.add(settled["setpoint_um"] - settled["displacement_um"])
         self.lateness_ms.add(telemetry.get_column(rows, "lateness_ms"))
         self.rows += len(rows)
         self.missed_ticks = int(telemetry.get_column(rows, "missed_ticks")[-1])
@@ -143,8 +131,8 @@ class Summary(StateNode):
         recorder : dict
             The recorder's own data: files, errors.
         """
-        true, means = self.true_um, self.true_1s_um.result()
-        held = means if means["seconds"] else self.reading_1s_um.result()
+        true, means = self.true_um, self.held.true_1s_um.result()
+        held = means if means["seconds"] else self.held.reading_1s_um.result()
         fault = fault_of_end(self._read_standing_fault(), self.end.get("exit"))
         return {
             **program.file_origin(SCHEMA),
@@ -156,9 +144,9 @@ class Summary(StateNode):
             "band_1s_windows": means["seconds"],
             "settled_after_s": telemetry.SETTLED_AFTER_S,
             "sag_error_um": {"start": means["first_um"], "end": means["last_um"]},
-            "held": {"of": "true" if means["seconds"] else "reading"}
+            "held": {"of": self.held.result().of}
             | held
-            | {f"{name}_s": time_s for name, time_s in self.parts_s.items()},
+            | {f"{name}_s": time_s for name, time_s in self.held.parts_s.items()},
             "reading_std_um": self.reading_um.std,
             "leak_um_per_s": self.leak_um_per_s,
             "lateness_ms": _histogram_quantiles(self.lateness_ms)

@@ -11,6 +11,7 @@ from membrane_ctrl.review.statistics import drift, power_spectrum, shape_review
 from membrane_ctrl.review.statistics.analysis import Analysis
 from membrane_ctrl.review.statistics.error_series import ErrorSeries
 from membrane_ctrl.run_files.event_log import LoggedEvent, parse_logged_line
+from membrane_ctrl.run_files.held_error import HeldError
 
 Word = Literal["good", "look", "bad"]
 
@@ -31,9 +32,13 @@ def make_verdict(analysis: Analysis) -> tuple[Word, str]:
     if series is None or not series.windows[0].count:
         return "bad", f"Not held: no second of {whole} counts as settled{_join_names(names)}."
     seconds = series.windows[0]
-    who = "true centre" if analysis.true else "reading"
-    std = f"std {seconds.std_um:.3f} µm, " if seconds.count > 1 else ""
-    share = 100 * seconds.in_band
+    held = HeldError(
+        "true" if analysis.true else "reading",
+        seconds.count,
+        seconds.mean_um,
+        seconds.std_um,
+        seconds.in_band,
+    )
     parts = []
     if ticks.unread_s >= _UNREAD_LEAST_S:
         parts.append(f"{format_span(ticks.unread_s)} of it without a reading")
@@ -43,8 +48,8 @@ def make_verdict(analysis: Analysis) -> tuple[Word, str]:
     but = f" ({', '.join(parts)})" if parts else ""
     return word, (
         f"Held for {format_span(ticks.settled_s)} of {whole}{but}; "
-        f"{share:.6g} % of its seconds within ±{run.config.limits.band_um:g} µm "
-        f"({who}: {std}mean {seconds.mean_um:+.3f} µm)"
+        f"{held.in_band_text} of its seconds within ±{run.config.limits.band_um:g} µm "
+        f"({held.name}: {held.figures_text})"
         f"{_join_names(names)}."
     )
 
