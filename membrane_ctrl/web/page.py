@@ -36,15 +36,11 @@ from membrane_ctrl.service.work_pools import (
     pool_of_command,
 )
 from membrane_ctrl.web import figures
-from membrane_ctrl.web.panels import (
-    CHOOSES,
-    SessionWatch,
-    TuningPanel,
-    fleet_panel,
-    fresh,
-    runs_panel,
-    tell,
-)
+from membrane_ctrl.web.fleet_panel import fleet_panel
+from membrane_ctrl.web.log_lines import find_new_lines
+from membrane_ctrl.web.messages import show_message
+from membrane_ctrl.web.runs_panel import runs_panel
+from membrane_ctrl.web.tuning_panel import CHOOSES, SessionWatch, TuningPanel
 
 _LOOK_S = 1.0
 _SESSION_DIGITS = 8
@@ -251,7 +247,7 @@ class WebPage:
         seen = self._feed.seen
         self._show_status()
         if seen.events != self._shown_events:
-            for line in fresh(self._shown_events, seen.events):
+            for line in find_new_lines(self._shown_events, seen.events):
                 self._events.push(line)
             self._shown_events = seen.events
 
@@ -362,7 +358,7 @@ class WebPage:
         if not may(
             self._user, self._feed.seen.role, action
         ):  # the role may have changed while the dialog was open
-            tell(f"{action.label}: needs the role {action.role}", good=False)
+            show_message(f"{action.label}: needs the role {action.role}", good=False)
             return
         try:
             asked = request(
@@ -372,11 +368,11 @@ class WebPage:
                 bool(take_over.value),
             )
         except ValueError as error:
-            tell(str(error), good=False)
+            show_message(str(error), good=False)
             return
         asked["on_behalf"] = on_behalf(self._user, self._session)
         try:
             outcome = await pool_of_command(action.do).run(self._feed.ask, asked)
         except PoolFullError as error:
             outcome = Outcome.failed(action.label, f"not sent: {error}")
-        tell(outcome.text, outcome.done)
+        show_message(outcome.text, outcome.done)

@@ -25,7 +25,7 @@ from membrane_ctrl.service.stop_route import stop_handler
 from membrane_ctrl.service.work_pools import REPORT_FILES, PoolFullError
 from membrane_ctrl.web.figures import REMOVED
 from membrane_ctrl.web.page import SharedViews, WebPage
-from membrane_ctrl.web.panels import REPORT, run_folder
+from membrane_ctrl.web.runs_panel import REPORT, run_folder
 
 _NICE = 5  # the hold comes first, also when the page was not started by one
 # a viewer may be silent for so long: a phone that changes cells, a machine that builds fifty pages

@@ -20,7 +20,7 @@ from membrane_ctrl.control_port.client import PortClient
 from membrane_ctrl.control_port.ctl import Where
 from membrane_ctrl.model.errors import DeviceError
 from membrane_ctrl.service.feed import HoldFeed
-from membrane_ctrl.web.panels import fleet_rows
+from membrane_ctrl.web.fleet_panel import fleet_rows
 from tests.control_port import evil_holds as evil
 from tests.control_port.port_run import port_run
 

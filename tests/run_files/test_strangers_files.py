@@ -178,7 +178,7 @@ _OWN = {
     "control_port/sockets.py",
     "sessions/folder.py",
     "sessions/live_log.py",
-    "web/panels.py",
+    "web/tuning_panel.py",
     # the user's own folder of compiled code, made if it is missing
     "model/kernel_cache.py",
     # the machine's own folder of locks, whose owner and mode are checked

@@ -16,7 +16,7 @@ from membrane_ctrl.control_port.ctl import Where, fleet
 from membrane_ctrl.model.errors import Exit, InputError
 from membrane_ctrl.model.telemetry import State
 from membrane_ctrl.service.feed import HoldFeed
-from membrane_ctrl.web.panels import fleet_rows
+from membrane_ctrl.web.fleet_panel import fleet_rows
 from tests.control_port.port_run import port_run
 from tests.support.browser import browser_tab
 from tests.support.machine_needs import needs

@@ -25,7 +25,7 @@ from membrane_ctrl.service.access import WebUser
 from membrane_ctrl.sessions.folder import create_session
 from membrane_ctrl.sessions.live_hold import Progress
 from membrane_ctrl.sessions.live_log import LiveLog
-from membrane_ctrl.web import cli, panels, server
+from membrane_ctrl.web import cli, runs_panel, server
 from tests.control_port.port_run import PortRun, port_run
 from tests.support.browser import Tab, browser_tab
 from tests.support.machine_needs import needs
@@ -329,18 +329,18 @@ def test_a_report_of_a_stranger_runs_in_a_sandbox(tmp_path: Path) -> None:
 
 def test_a_reader_starts_no_writing(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     started: list[tuple[str, ...]] = []
-    monkeypatch.setattr(panels, "_command", lambda *words: started.append(words) or "")
+    monkeypatch.setattr(runs_panel, "_command", lambda *words: started.append(words) or "")
     run = tmp_path / "run"
     run.mkdir()
     reader, operator = WebUser("bob", "read"), WebUser("anna", "operate")
-    assert "needs the role operate" in panels.report_problem(run, reader)
+    assert "needs the role operate" in runs_panel.report_problem(run, reader)
     assert started == []
-    assert panels.report_problem(run, operator) == ""
+    assert runs_panel.report_problem(run, operator) == ""
     assert started == [("report", str(run))]
-    (run / panels.REPORT).write_text("written")
-    assert panels.report_problem(run, reader) == "", "what exists may be read"
+    (run / runs_panel.REPORT).write_text("written")
+    assert runs_panel.report_problem(run, reader) == "", "what exists may be read"
     assert len(started) == 1
-    assert panels.run_folder(tmp_path, "run") == run
+    assert runs_panel.run_folder(tmp_path, "run") == run
     assert [
-        panels.run_folder(tmp_path, name) for name in ("../run", "/etc", "..", "", "a/b", ".x")
+        runs_panel.run_folder(tmp_path, name) for name in ("../run", "/etc", "..", "", "a/b", ".x")
     ] == [None] * 6

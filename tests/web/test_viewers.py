@@ -14,7 +14,7 @@ from membrane_ctrl.service.access import WebUser
 from membrane_ctrl.service.work_pools import WorkPool
 from membrane_ctrl.sessions.folder import create_session
 from membrane_ctrl.sessions.live_log import ANSWER, LiveLog, PageAnswer
-from membrane_ctrl.web import panels, server
+from membrane_ctrl.web import log_lines, server, tuning_panel
 from membrane_ctrl.web.figures import Shared
 
 
@@ -80,7 +80,7 @@ async def test_what_cannot_be_made_is_tried_again() -> None:
 def test_only_new_lines_are_shown(
     old: tuple[str, ...], new: tuple[str, ...], expected: tuple[str, ...]
 ) -> None:
-    assert panels.fresh(old, new) == expected
+    assert log_lines.find_new_lines(old, new) == expected
 
 
 @pytest.mark.parametrize("leaves", [True, False])
@@ -110,7 +110,7 @@ async def test_a_viewer_who_does_not_read_is_hung_up_on(
 
 
 def test_the_newest_session_is_followed(tmp_path: Path) -> None:
-    watch = panels.SessionWatch(tmp_path)
+    watch = tuning_panel.SessionWatch(tmp_path)
     assert watch.look() is None
     path = create_session(tmp_path, "first", "eve", "twin", Config(), LoopConfig()).path
     log = LiveLog(path, 50.0, print)
@@ -128,7 +128,7 @@ def test_the_newest_session_is_followed(tmp_path: Path) -> None:
     (path / "identified.json").write_text("{}")
     later = watch.look()
     assert later is not None
-    assert panels.fresh(seen.progress.said, later.progress.said) == ("line 300",)
+    assert log_lines.find_new_lines(seen.progress.said, later.progress.said) == ("line 300",)
     assert later.head == f"{path.name}: observe, asks: apply which?"
     assert later.done == {"identify"}
     assert later.candidates == (("candidate", "Ms"), ("calm", "1.3"), ("lively", "1.6"))
@@ -145,17 +145,19 @@ def test_an_answer_that_no_session_takes_is_withdrawn(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     slept: list[float] = []
-    monkeypatch.setattr(panels.time, "sleep", slept.append)
+    monkeypatch.setattr(tuning_panel.time, "sleep", slept.append)
     given = PageAnswer("calm", "anna")
-    not_taken = panels.answered(tmp_path, "which?", given)
+    not_taken = tuning_panel.answered(tmp_path, "which?", given)
     assert not_taken.text == "calm: not taken: the session no longer asks; see its terminal"
     assert not not_taken.done
     assert not (tmp_path / ANSWER).exists()
     log = LiveLog(tmp_path, 50.0, print)
     taken: list[PageAnswer | None] = []
     monkeypatch.setattr(
-        panels.time, "sleep", lambda _: taken.append(log.take_answer("which?", ("calm",)))
+        tuning_panel.time, "sleep", lambda _: taken.append(log.take_answer("which?", ("calm",)))
     )
-    assert panels.answered(tmp_path, "which?", given).done
+    assert tuning_panel.answered(tmp_path, "which?", given).done
     assert taken == [given]
-    assert panels.answered(tmp_path / "none", "which?", given).text.startswith("calm: not given: ")
+    assert tuning_panel.answered(tmp_path / "none", "which?", given).text.startswith(
+        "calm: not given: "
+    )

@@ -1,0 +1,202 @@
+"""The tab of the newest tuning session."""
+
+import time
+from collections.abc import Awaitable, Callable
+from contextlib import suppress
+from dataclasses import dataclass
+from pathlib import Path
+
+from nicegui import ui
+
+from membrane_ctrl.control_port.outcome import Outcome
+from membrane_ctrl.controller.commands import Role
+from membrane_ctrl.model import errors
+from membrane_ctrl.service.access import WebUser
+from membrane_ctrl.service.work_pools import ANSWERS
+from membrane_ctrl.sessions import folder as folders
+from membrane_ctrl.sessions.live_log import ANSWER, LiveReader, PageAnswer, Progressed, give_answer
+from membrane_ctrl.web.log_lines import find_new_lines
+from membrane_ctrl.web.messages import show_message
+
+CHOOSES: Role = "tune"  # as for `ctl gains`
+_LOOK_S = 1.0
+_TAKES = 5  # looks until a session that asks has taken an answer
+
+
+@dataclass(frozen=True, slots=True)
+class SessionSeen:
+    """The newest tuning session at one moment."""
+
+    path: Path
+    done: frozenset[str]  # its steps
+    progress: Progressed
+    candidates: tuple[
+        tuple[str, ...], ...
+    ] = ()  # their table, its head first, while the session waits for a choice
+
+    @property
+    def head(self) -> str:
+        """Where it is, in a line."""
+        step, asks, ended = self.progress.step, self.progress.asks, self.progress.ended
+        words = (step or "begun", asks and f"asks: {asks}", ended and f"ended: {ended}")
+        return f"{self.path.name}: {', '.join(filter(None, words))}"
+
+
+class SessionWatch:
+    """Follows the newest tuning session in a folder of runs, for all viewers."""
+
+    def __init__(self, logs: Path) -> None:
+        self._logs = logs
+        self._reader: LiveReader | None = None
+
+    def look(self) -> SessionSeen | None:
+        """The session now; None if there is none."""
+        try:
+            newest = folders.newest_session(self._logs)
+        except (errors.CommandError, OSError):
+            return None
+        if self._reader is None or self._reader.session != newest.path:
+            self._reader = LiveReader(newest.path)
+        self._reader.read_new()
+        done = frozenset(step for step in folders.STEPS if newest.is_done(step))
+        progress = self._reader.progress
+        with suppress(errors.InputError):
+            if progress.among:
+                return SessionSeen(newest.path, done, progress, _table(newest.read_candidates()))
+        return SessionSeen(newest.path, done, progress)
+
+
+def _table(markdown: str) -> tuple[tuple[str, ...], ...]:
+    """The cells of a Markdown table, without its rule."""
+    head, _, *rows = (
+        tuple(map(str.strip, line.strip("| ").split("|"))) for line in markdown.splitlines()
+    )
+    return head, *(row for row in rows if len(row) == len(head))
+
+
+def answered(session: Path, question: str, given: PageAnswer) -> Outcome:
+    """Give a session an answer; returns what became of it."""
+    what = given.said or "none of them"
+    try:
+        give_answer(session, question, given)
+    except OSError as error:
+        return Outcome.failed(what, f"not given: {errors.os_reason(error)}")
+    for _ in range(_TAKES):
+        if not (session / ANSWER).exists():
+            return Outcome.succeeded(what)
+        time.sleep(_LOOK_S)
+    with suppress(OSError):
+        (session / ANSWER).unlink()
+    return Outcome.failed(what, "not taken: the session no longer asks; see its terminal")
+
+
+class TuningPanel:
+    """The tab of the tuning session: its steps, what it has found, and the choice it waits for.
+
+    `look` returns the session now, `may` whether the viewer may choose.
+    """
+
+    def __init__(
+        self,
+        look: Callable[[], Awaitable[SessionSeen | None]],
+        user: WebUser,
+        may: Callable[[], bool],
+    ) -> None:
+        self._look, self._user, self._may = look, user, may
+        self._head = (
+            ui.label("No tuning session in this folder.")
+            .classes("text-subtitle1")
+            .props('role="status"')
+        )
+        self._steps = ui.row()
+        self._choice = ui.column().classes("w-full")
+        self._said = ui.log(max_lines=200).classes("w-full h-64").props('aria-label="results"')
+        self._said.set_visibility(False)
+        self._buttons: list[ui.button] = []
+        self._seen: SessionSeen | None = None
+        ui.timer(_LOOK_S, self._show)
+
+    async def _show(self) -> None:
+        seen, before = await self._look(), self._seen
+        for button in self._buttons:
+            if button.enabled != self._may():
+                button.set_enabled(self._may())
+        if seen is None or seen == before:
+            return
+        self._seen = seen
+        self._head.set_text(seen.head)
+        self._said.set_visibility(True)
+        if before is None or before.path != seen.path:
+            self._said.clear()
+            before = SessionSeen(seen.path, frozenset(), Progressed())
+            self._show_steps(seen)
+        for line in find_new_lines(before.progress.said, seen.progress.said):
+            self._said.push(line)
+        if (before.done, before.progress.step) != (seen.done, seen.progress.step):
+            self._show_steps(seen)
+        if (before.progress.asks, before.progress.among) != (
+            seen.progress.asks,
+            seen.progress.among,
+        ):
+            self._show_choice(seen)
+
+    def _show_steps(self, seen: SessionSeen) -> None:
+        self._steps.clear()
+        with self._steps:
+            for step in folders.STEPS:
+                colour = (
+                    "positive"
+                    if step in seen.done
+                    else "info"
+                    if step == seen.progress.step
+                    else "grey"
+                )
+                ui.badge(step, color=colour)
+
+    def _show_choice(self, seen: SessionSeen) -> None:
+        self._choice.clear()
+        self._buttons.clear()
+        if not seen.progress.among:
+            return
+        with self._choice:
+            ui.label(f"The session waits, here and on its terminal: {seen.progress.asks}").classes(
+                "text-bold"
+            )
+            if seen.candidates:
+                head, *rows = seen.candidates
+                columns = [
+                    {"name": name, "label": name, "field": name, "align": "left"} for name in head
+                ]
+                cells = [dict(zip(head, row, strict=True)) for row in rows]
+                ui.table(columns=columns, rows=cells, row_key=head[0]).classes("w-full").props(
+                    "dense"
+                )
+            with ui.row():
+                for name in (*seen.progress.among, ""):
+                    button = ui.button(
+                        name or "none", on_click=lambda _, said=name: self._answer(seen, said)
+                    )
+                    button.props("no-caps" if name else "no-caps flat").tooltip(
+                        f"needs the role {CHOOSES}"
+                    )
+                    button.set_enabled(self._may())
+                    self._buttons.append(button)
+
+    async def _answer(self, seen: SessionSeen, said: str) -> None:
+        """Ask for a confirmation, answer, and say what became of it."""
+        with ui.dialog() as dialog, ui.card():
+            ui.label(f"{seen.progress.asks} {said or 'none'}").classes("text-h6")
+            with ui.row():
+                ui.button("Do it", on_click=lambda: dialog.submit("yes")).props(
+                    "color=primary autofocus"
+                )
+                ui.button("Cancel", on_click=lambda: dialog.submit(""), color=None).props("flat")
+        sure = await dialog
+        if not dialog.is_deleted:  # with the viewer
+            dialog.delete()
+        if not sure or not self._may():
+            return
+        given = PageAnswer(said, self._user.name)
+        outcome = await ANSWERS.run(answered, seen.path, seen.progress.asks, given)
+        with self._steps:  # the button that was pressed is gone once the session has its answer
+            show_message(outcome.text, outcome.done)
