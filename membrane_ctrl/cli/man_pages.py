@@ -10,7 +10,7 @@ from typing import Any
 import typer
 
 from membrane_ctrl import __version__
-from membrane_ctrl.model import errors
+from membrane_ctrl.model import errors, files
 
 PROGRAM = "membrane-ctrl"
 _SECTION = 1
@@ -44,7 +44,7 @@ def write_man_pages(folder: Path, root: Any) -> int:
     with errors.convert_write_errors(folder, remedy="; name another folder"):
         folder.mkdir(parents=True, exist_ok=True)
         for name, text in pages.items():
-            (folder / f"{name}.{_SECTION}").write_text(text, encoding="utf-8")
+            files.write_text_atomic(folder / f"{name}.{_SECTION}", text)
     return len(pages)
 
 

@@ -185,6 +185,7 @@ _OWN = {
     "instruments/lock_store.py",
     # a new folder, a temporary one, or a file that the user has named
     "sim/optics/simulate.py",
+    "cli/man_pages.py",
     "replay/command.py",
     "review/viewer/command.py",
     "review/export.py",
