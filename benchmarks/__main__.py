@@ -46,6 +46,7 @@ BENCHMARKS = {
     "benches": "benchmarks.tuning",
     "recording": "benchmarks.records",
     "recording_tracked": "benchmarks.records",
+    "mirror_years": "benchmarks.records",
     "memory": "benchmarks.records",
     "tracking_long": "benchmarks.metrology",
     "soak": "benchmarks.control",

@@ -7,12 +7,15 @@ from __future__ import annotations
 import json
 import os
 import re
+import shutil
 import subprocess
 import sys
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
+import pyarrow as pa
+import pyarrow.parquet as pq
 import pytest
 
 from membrane_ctrl.cli import run
@@ -25,6 +28,7 @@ from tests.support.review_runs import written
 PAGE = Path(__file__).parents[1] / "docs" / "how-to" / "data.md"
 EXAMPLES = re.findall(r"```python\n(.*?)```", PAGE.read_text(encoding="utf-8"), re.DOTALL)
 NIGHTS = [f"2026112{day}T180000Z-night" for day in (1, 2, 3)]
+HOLD = 4  # the code of the state
 Figures = Mapping[str, tuple[int, int, float]]  # by run: ticks, settled ones, standard deviation
 
 
@@ -88,9 +92,7 @@ def test_report_has_figures_to_compare_with(reported: Figures) -> None:
 def test_a_library_gives_the_figures_of_report(
     library: str, lab: Path, reported: Figures, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    words = {"duckdb": "import duckdb", "polars": "import polars", "pandas": "import pandas"}[
-        library
-    ]
+    words = {"duckdb": "WITH marked", "polars": "import polars", "pandas": "import pandas"}[library]
     table = executed(example_with(words), lab, monkeypatch)["table"]
     check_figures(table.to_dicts() if library == "polars" else table.to_dict("records"), reported)
 
@@ -134,5 +136,35 @@ def test_the_other_examples_run(
     assert 0 < float(light.split()[0]) <= 1
 
 
+def test_minutes_of_many_mirrors_give_the_figures_of_their_ticks(
+    lab: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    shutil.copytree(lab / "logs", tmp_path / "here" / "north")
+    shutil.copytree(lab / "logs" / NIGHTS[0], tmp_path / "here" / "south" / NIGHTS[0])
+    rows = executed(example_with("figures_60s"), tmp_path / "here", monkeypatch)["table"]
+    found = {row["mirror"]: row for row in rows.to_dict("records")}
+    assert found.keys() == {"north", "south"}
+    for mirror, nights in (("north", NIGHTS), ("south", NIGHTS[:1])):
+        tables = [
+            pq.read_table(path, columns=["state", "error_um"])
+            for night in nights
+            for path in (lab / "logs" / night / "ticks").glob("*.parquet")
+        ]
+        ticks = pa.concat_tables(tables).to_pandas()
+        # A minute counts by its last state; the minutes in which a hold begins are a small part.
+        held = ticks[ticks["state"] == HOLD]["error_um"]
+        assert found[mirror]["ticks"] == pytest.approx(len(held), rel=0.15)
+        assert found[mirror]["std_um"] == pytest.approx(held.std(ddof=0), rel=0.3)
+        assert found[mirror]["change_um"] == 0  # one month
+
+
+def test_an_object_store_gives_the_ticks_of_report(
+    lab: Path, reported: Figures, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    found = executed(example_with("fsspec.filesystem"), lab, monkeypatch)
+    found["store"].rm("/logs", recursive=True)
+    assert found["ticks"] == sum(ticks for ticks, _, _ in reported.values())
+
+
 def test_no_example_is_left_out() -> None:
-    assert len(EXAMPLES) == 8
+    assert len(EXAMPLES) == 10

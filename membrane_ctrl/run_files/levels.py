@@ -2,8 +2,8 @@
 opens in seconds.
 
 A level is a dict of columns: `time_s` (start of the window, a multiple of its length), `rows`
-(ticks in it), the codes at its end (of some the largest) and `min_<signal>`, `mean_<signal>`,
-`max_<signal>`.
+(ticks in it), the codes at its end (of some the largest), `min_<signal>`, `mean_<signal>`,
+`max_<signal>`, and of some signals `std_<signal>`, the standard deviation of its ticks.
 """
 
 from collections.abc import Iterator, Mapping
@@ -17,6 +17,7 @@ from membrane_ctrl.model import telemetry
 from membrane_ctrl.model.arrays import Column
 from membrane_ctrl.model.columns import AGGREGATED, COLUMNS, TRUE_ERROR_COLUMN, Aggregation, Kind
 from membrane_ctrl.model.state_tree import ArrayShape, StateNode
+from membrane_ctrl.run_files.figure_minutes import OpenFigureMinute
 
 Columns = dict[str, Column]
 _StoredColumns = dict[str, Annotated[Column, ArrayShape((-1,))]]
@@ -24,6 +25,8 @@ _StoredColumns = dict[str, Annotated[Column, ArrayShape((-1,))]]
 WINDOWS_S: tuple[float, ...] = (1.0, 10.0, 60.0)
 # Minimum, mean and maximum of these, and the codes, as the table of columns says.
 SIGNALS: tuple[str, ...] = tuple(each.name for each in AGGREGATED)
+# Of these also the standard deviation of the ticks: that of a month follows from its windows.
+SPREAD_SIGNALS: tuple[str, ...] = ("error_um", TRUE_ERROR_COLUMN.name)
 CODES: tuple[str, ...] = tuple(each.name for each in COLUMNS.values() if each.kind is Kind.CODE)
 _LARGEST = tuple(name for name in CODES if COLUMNS[name].aggregation is Aggregation.LARGEST)
 NAMES: tuple[str, ...] = (
@@ -31,6 +34,7 @@ NAMES: tuple[str, ...] = (
     "rows",
     *CODES,
     *(f"{kind}_{name}" for name in SIGNALS for kind in ("min", "mean", "max")),
+    *(f"std_{name}" for name in SPREAD_SIGNALS),
 )
 # The telemetry fields from which levels are computed, each once.
 _RECORDED_SIGNALS = tuple(name for name in SIGNALS if name in COLUMNS)
@@ -64,8 +68,13 @@ def first_level(ticks: Mapping[str, Column]) -> Columns:
     for name in SIGNALS:
         values = telemetry.true_error_um(ticks) if name == TRUE_ERROR_COLUMN.name else ticks[name]
         level[f"min_{name}"] = np.fmin.reduceat(values, starts)
-        level[f"mean_{name}"] = _weighted_mean(values, np.ones(values.size), starts)
+        mean = _weighted_mean(values, np.ones(values.size), starts)
+        level[f"mean_{name}"] = mean
         level[f"max_{name}"] = np.fmax.reduceat(values, starts)
+        if name in SPREAD_SIGNALS:
+            squares = (values - _repeat_windows(mean, starts, values.size)) ** 2
+            variance = _weighted_mean(squares, np.ones(values.size), starts)
+            level[f"std_{name}"] = np.sqrt(variance)
     return level
 
 
@@ -86,7 +95,33 @@ def coarser_level(level: Mapping[str, Column], window_s: float) -> Columns:
             coarse[name] = np.fmin.reduceat(values, starts)
         elif name.startswith("max_"):
             coarse[name] = np.fmax.reduceat(values, starts)
+    for name in SPREAD_SIGNALS:
+        if {f"std_{name}", f"mean_{name}"} <= level.keys():
+            coarse[f"std_{name}"] = _coarser_std(level, coarse, name, starts)
     return coarse
+
+
+def _coarser_std(
+    level: Mapping[str, Column],
+    coarse: Mapping[str, Column],
+    name: str,
+    starts: NDArray[np.intp],
+) -> Column:
+    """Standard deviation of a signal in coarser windows.
+
+    The variance of a window is the mean of the variances within its parts, and of the squared
+    distances of their means from its own, both weighted by the number of ticks.
+    """
+    means = level[f"mean_{name}"]
+    distance = means - _repeat_windows(coarse[f"mean_{name}"], starts, means.size)
+    squares = level[f"std_{name}"] ** 2 + distance**2
+    return np.sqrt(_weighted_mean(squares, level["rows"], starts))
+
+
+def _repeat_windows(values: Column, starts: NDArray[np.intp], size: int) -> Column:
+    """The value of its window for each of `size` rows."""
+    row_counts = np.diff(np.append(starts, size))
+    return np.repeat(values, row_counts)
 
 
 def _find_windows(time_s: Column, window_s: float) -> tuple[NDArray[np.intp], Column]:
@@ -127,8 +162,7 @@ def _weighted_mean(values: Column, weights: Column, starts: NDArray[np.intp]) ->
     # Sums are relative to the window's first value: a double then holds 1e5 Pa and a change of mPa
     # without loss.
     base = np.where(is_finite, values, 0.0)[starts]
-    row_counts = np.diff(np.append(starts, values.size))
-    offset = np.repeat(base, row_counts)
+    offset = _repeat_windows(base, starts, values.size)
     weighted = np.where(is_finite, (values - offset) * weights, 0.0)
     divisor = np.where(total > 0, total, 1.0)
     mean = base + np.add.reduceat(weighted, starts) / divisor
@@ -146,6 +180,7 @@ class OpenWindows(StateNode):
     ticks: _StoredColumns = field(default_factory=_no_ticks)  # rows of the open 1 s window
     # by the coarser window in s: rows of the finer level in its open window
     levels: dict[float, _StoredColumns] = field(default_factory=dict)
+    figures: OpenFigureMinute = field(default_factory=OpenFigureMinute)
 
     def __post_init__(self) -> None:
         """Check the columns, which may have been read from a file.

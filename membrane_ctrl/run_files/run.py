@@ -289,6 +289,9 @@ class Run:
         self, window_s: float, start_s: float, end_s: float, names: Sequence[str]
     ) -> list[Block]:
         """Compute a part of a level from the next finer one or from the ticks."""
+        # The standard deviation of a longer window needs the means of its parts.
+        means = [name.replace("std_", "mean_", 1) for name in names if name.startswith("std_")]
+        names = tuple(dict.fromkeys((*names, *means)))
         finer = {coarse: fine for fine, coarse in pairwise(levels.WINDOWS_S)}
         if window_s in finer:
             return [

@@ -17,6 +17,7 @@ from membrane_ctrl.model.columns import COLUMNS, Kind
 from membrane_ctrl.model.event_lines import from_dict
 from membrane_ctrl.model.events import EventLine
 from membrane_ctrl.run_files import event_log, levels, table_specs
+from membrane_ctrl.run_files.figure_minutes import FigureMinute
 from membrane_ctrl.run_files.table_store.spec import TableSpec
 from membrane_ctrl.run_files.table_store.writer import TableWriter
 
@@ -93,12 +94,24 @@ class RunTables:
             "upper_um2": shape_estimate.upper_half(estimate.covariance_um2),
         }
         self._add_dicts(spec, [{**row, **numbers, **arrays}])
+        self._add_figure_minute(self._windows.figures.add_figure(estimate))
         if estimate.verdict != "rejected" and estimate.time_s >= self._covariance_due_s:
             self._covariance_due_s = estimate.time_s + table_specs.COVARIANCE_INTERVAL_S
             covariance = np.asarray(estimate.covariance_um2, dtype=np.float32).ravel()
             self._add_dicts(
                 table_specs.COVARIANCES, [{"time_s": estimate.time_s, "covariance_um2": covariance}]
             )
+
+    def _add_figure_minute(self, ended: FigureMinute | None) -> None:
+        if ended is None:
+            return
+        row = {
+            "time_s": ended.time_s,
+            "figures": ended.figures,
+            "coeffs_um": ended.coeffs_um.astype(np.float32),
+            "scatter_um": ended.scatter_um.astype(np.float32),
+        }
+        self._add_dicts(table_specs.FIGURE_MINUTES, [row])
 
     def add_events(self, lines: Sequence[EventLine]) -> None:
         """Add new lines of the event log; marks are also in a table of their own."""
@@ -163,6 +176,7 @@ class RunTables:
     def close(self) -> None:
         """Write the open windows and end all tables. Raises OSError."""
         self._add_levels(None)
+        self._add_figure_minute(self._windows.figures.end_minute())
         self._for_each(TableWriter.close)
 
     def leave_folder(self) -> None:

@@ -13,8 +13,8 @@ from membrane_ctrl.model.columns import COLUMNS, TRUE_ERROR_COLUMN, Kind, Teleme
 from membrane_ctrl.model.figure_columns import RECORDED_COLUMNS
 from membrane_ctrl.model.program import file_origin
 from membrane_ctrl.model.zernike_terms import COVARIANCE_UPPER_SIZE, ZERNIKE_TERMS
-from membrane_ctrl.run_files import levels
-from membrane_ctrl.run_files.table_store.spec import TableSpec
+from membrane_ctrl.run_files import figure_minutes, levels
+from membrane_ctrl.run_files.table_store.spec import LONG_PART_S, PART_S, TableSpec
 
 FORMAT = "membrane-table/1"
 # Fields of a tick's record that are no column of its telemetry row, and are not repeated in it: the
@@ -41,7 +41,12 @@ _INPUT_TEXTS = {
     "tail_bytes": "size of the tick's commands and ended tasks in the table of rare inputs",
 }
 _SHAPE_LAYOUT = (("zernike_terms", str(ZERNIKE_TERMS)),)
-_HOW = {"min": "least value", "mean": "mean", "max": "greatest value"}
+_HOW = {
+    "min": "least value",
+    "mean": "mean",
+    "max": "greatest value",
+    "std": "standard deviation of single ticks",
+}
 
 
 def _make_field(
@@ -57,9 +62,11 @@ def _make_spec(
     time_name: str = "time_s",
     group_rows: int = 30_000,
     layout: tuple[tuple[str, str], ...] = (),
+    part_s: float = PART_S,
 ) -> TableSpec:
     about = {"schema": FORMAT, "table": name, **dict(layout)}
-    return TableSpec(name, pa.schema(fields, metadata=about), time_name, group_rows, layout)
+    schema = pa.schema(fields, metadata=about)
+    return TableSpec(name, schema, time_name, group_rows, layout, part_s)
 
 
 def with_origin(spec: TableSpec) -> TableSpec:
@@ -195,9 +202,33 @@ def level_table(window_s: float) -> str:
 
 
 LEVELS: dict[float, TableSpec] = {
-    window_s: _make_spec(level_table(window_s), [_level_field(name) for name in levels.NAMES])
+    window_s: _make_spec(
+        level_table(window_s),
+        [_level_field(name) for name in levels.NAMES],
+        part_s=PART_S if window_s == levels.WINDOWS_S[0] else LONG_PART_S,
+    )
     for window_s in levels.WINDOWS_S
 }
+
+FIGURE_MINUTES = _make_spec(
+    f"figures_{figure_minutes.WINDOW_S:.0f}s",
+    [
+        _make_field("time_s", pa.float64(), "start of the window"),
+        _make_field("figures", pa.int64(), "usable cycles and tracked frames in the window"),
+        _make_field(
+            "coeffs_um",
+            pa.list_(pa.float32(), ZERNIKE_TERMS),
+            "mean of the Zernike coefficients, Noll 1...",
+        ),
+        _make_field(
+            "scatter_um",
+            pa.list_(pa.float32(), ZERNIKE_TERMS),
+            "standard deviation of single figures about that mean",
+        ),
+    ],
+    layout=_SHAPE_LAYOUT,
+    part_s=LONG_PART_S,
+)
 
 _EVENT_FIELDS = [
     _make_field("number", pa.int64(), "of the event in the run, from 1"),
@@ -231,6 +262,7 @@ ALL: tuple[TableSpec, ...] = (
     TRACKED,
     COVARIANCES,
     *LEVELS.values(),
+    FIGURE_MINUTES,
     EVENTS,
     MARKS,
     THUMBNAILS,

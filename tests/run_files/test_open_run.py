@@ -15,6 +15,7 @@ from membrane_ctrl.run_files.levels import (
     CODES,
     NAMES,
     SIGNALS,
+    SPREAD_SIGNALS,
     TICK_FIELDS,
     coarser_level,
     first_level,
@@ -75,6 +76,30 @@ def test_a_level_of_a_level_is_the_level_of_the_ticks() -> None:
         assert same(coarse[name], direct[name], 1e-9), name
 
 
+@pytest.mark.parametrize("window_s", [1.0, 10.0, 60.0])
+def test_a_window_has_the_standard_deviation_of_its_ticks(window_s: float) -> None:
+    rows, _ = night(2, 0.1, "typical", [])
+    time_s, error_um = get_column(rows, "mono_s"), get_column(rows, "error_um")
+    error_um[7] = np.nan  # a missing reading
+    level = coarser_level(coarser_level(level_of(rows), 10.0), 60.0)
+    if window_s < 60.0:
+        level = coarser_level(level_of(rows), window_s)
+    number = np.floor(time_s / window_s + 1e-9)
+    expected_um = [np.nanstd(error_um[number == each]) for each in np.unique(number)]
+    # The missing reading is one tick of the first windows' weights.
+    np.testing.assert_allclose(level["std_error_um"], expected_um, rtol=1e-2)
+    np.testing.assert_allclose(level["std_error_um"][1:], expected_um[1:], rtol=1e-9)
+
+
+def test_a_standard_deviation_is_made_where_its_level_is_missing(tmp_path: Path) -> None:
+    folder = written(tmp_path, 0.1)
+    whole = open_run(folder).level(60.0, names=["std_error_um"])
+    shutil.rmtree(folder / "ticks_60s")
+    shutil.rmtree(folder / "ticks_10s")
+    made = open_run(folder).level(60.0, names=["std_error_um"])
+    np.testing.assert_allclose(made["std_error_um"], whole["std_error_um"], rtol=1e-4)
+
+
 def test_nothing_finite_gives_nan_and_no_warning() -> None:
     rows, _ = night(2, 0.01, "typical", [])
     rows[:, FIELDS.index("trim_um")] = np.nan
@@ -82,7 +107,7 @@ def test_nothing_finite_gives_nan_and_no_warning() -> None:
     assert np.isnan(level["mean_trim_um"]).all()
     assert np.isfinite(level["mean_error_um"]).all()
     assert set(level) == set(NAMES)
-    assert len(SIGNALS) * 3 + 6 == len(NAMES)
+    assert len(SIGNALS) * 3 + len(SPREAD_SIGNALS) + 6 == len(NAMES)
 
 
 def test_a_killed_run_is_whole_in_its_tables(tmp_path: Path) -> None:

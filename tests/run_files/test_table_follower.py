@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pyarrow as pa
-import pytest
 
 from membrane_ctrl.run_files.table_store import spec
 from membrane_ctrl.run_files.table_store.follower import TableFollower
@@ -30,11 +30,9 @@ def read(follower: TableFollower) -> list[int]:
     return [number for table in follower.read_new() for number in table.column(1).to_pylist()]
 
 
-def test_each_row_is_read_once_while_journals_become_parts(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(spec, "PART_S", 30.0)
-    writer, follower = TableWriter(tmp_path, TABLE), TableFollower(tmp_path, TABLE)
+def test_each_row_is_read_once_while_journals_become_parts(tmp_path: Path) -> None:
+    table = replace(TABLE, part_s=30.0)
+    writer, follower = TableWriter(tmp_path, table), TableFollower(tmp_path, table)
     assert read(follower) == []
     found: list[int] = []
     for step in range(30):

@@ -6,6 +6,8 @@ from copy import deepcopy
 from pathlib import Path
 
 import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as pq
 import pytest
 
 from membrane_ctrl.model.telemetry import Rows, unpack_rows
@@ -58,6 +60,10 @@ def test_after_four_deaths_every_tick_window_and_shape_is_there_once(
         assert (np.diff(level["time_s"]) == window_s).all()
         assert level["rows"].sum() == len(ROWS)
     assert np.array_equal(run.shapes().time_s, np.array(SECONDS, dtype=float))
+    parts = sorted((tmp_path / "figures_60s").glob("*.parquet"))
+    minutes = pa.concat_tables(pq.read_table(part) for part in parts)
+    assert minutes.column("time_s").to_pylist() == [0.0, 60.0, 120.0, 180.0]
+    assert minutes.column("figures").to_pylist() == [60, 60, 60, 20]
     assert not list(tmp_path.rglob("*.journal"))
 
 

@@ -2,8 +2,8 @@
 
 A frame is a head of 32 bytes (magic, number of its first row, rows, packed bytes, unpacked bytes,
 CRC-32 of all else) and an Arrow IPC message packed with zstd. The first frame holds the schema,
-each other one a record batch. After a damaged stretch reading continues with the next frame whose
-checksum is right.
+each other one a record batch whose numbers are shuffled byte by byte (`byte_shuffle`). After a
+damaged stretch reading continues with the next frame whose checksum is right.
 
 Sizes are checked before memory is taken for them: a head states what its message unpacks to, and a
 message whose own buffers are compressed, as an Arrow writer may do, is refused.
@@ -18,6 +18,7 @@ from pathlib import Path
 
 import pyarrow as pa
 
+from membrane_ctrl.run_files.table_store.byte_shuffle import shuffle_batch, unshuffle_batch
 from membrane_ctrl.run_files.table_store.disk import Disk
 
 MAGIC = b"\x93MBRjrn\n"
@@ -52,7 +53,8 @@ class JournalWriter:
 
     def append_batch(self, first_row: int, batch: pa.RecordBatch) -> None:
         """Append a batch and sync it: all of it or nothing. Raises OSError."""
-        self._append_frame(_pack_frame(first_row, batch.num_rows, batch.serialize()))
+        message = shuffle_batch(batch).serialize()
+        self._append_frame(_pack_frame(first_row, batch.num_rows, message))
 
     def _append_frame(self, frame: bytes) -> None:
         try:
@@ -142,7 +144,7 @@ def read_batch(frame: JournalFrame, schema: pa.Schema) -> pa.RecordBatch:
             raise ValueError("lists of another length than those of the schema")
     if batch.num_rows != frame.rows or batch.nbytes > FRAME_BYTES_MAX:
         raise ValueError("a frame that does not hold its stated rows")
-    return batch
+    return unshuffle_batch(batch)
 
 
 def _unpack_frame(frame: JournalFrame) -> pa.Buffer:

@@ -7,6 +7,9 @@ import pyarrow as pa
 
 # A part holds at most this much of a run, so that a damaged file costs at most an hour.
 PART_S = 3600.0
+# Of a table that can be made from a finer one, and that is read for years: a part has a footer of
+# 10 kB, and hourly parts of minutes would be mostly footers.
+LONG_PART_S = 86_400.0
 # 10 minutes of ticks at 50 Hz.
 GROUP_ROWS = 30_000
 PART_SUFFIX = ".parquet"
@@ -32,6 +35,8 @@ class TableSpec:
     layout : tuple of (str, str)
         Names and values of the program's numbers on which the meaning of the columns depends. The
         schema's metadata state them as well. A file that states others is not read.
+    part_s : float
+        The longest part of a run that one file holds.
     """
 
     name: str
@@ -39,6 +44,7 @@ class TableSpec:
     time_name: str
     group_rows: int = GROUP_ROWS
     layout: tuple[tuple[str, str], ...] = ()
+    part_s: float = PART_S
 
 
 def part_path(folder: Path, number: int) -> Path:

@@ -1,4 +1,4 @@
-"""Writes a table of a run: rows to the journal within a second, journals to parts within an hour.
+"""Writes a table of a run: rows to the journal within a second, full journals to parts.
 
 A journal and the part made from it have the same number. Sealing a journal writes the part under
 another name, syncs and renames it, appends its line to the manifest, and removes the journal. A
@@ -97,7 +97,7 @@ class TableWriter:
 
     def _is_full(self, current: journal.JournalWriter) -> bool:
         return (
-            self.until_s - self._journal_from_s >= spec.PART_S
+            self.until_s - self._journal_from_s >= self._table.part_s
             or current.size_bytes >= journal.JOURNAL_BYTES_MOST
         )
 
