@@ -78,11 +78,8 @@ class Observation:
     laser_gauge_apart: str = ""
     held_by_optics: bool = False  # the optics show the centre, or must: the laser may be missing
     unseen_film: str = ""  # on a bench held without a laser: why the film is not seen, if so
-    # the displacement by the laser, or by the optics where they may replace it
-    guard_um: float = math.nan
-    # the displacement by the optics, beside a laser as well, where the loop may follow them
+    # the displacement by the optics, with or without a laser, where the loop may follow them
     optics_guard_um: float = math.nan
-    laser_stuck: bool = False  # it repeats one value to the last bit
     # excess gas the film takes, unless an independent sensor shows it standing still
     gas_excess: str = ""
     open_interlocks: int = 0  # bit i: interlock i of the configuration is open, or its signal lost
@@ -125,10 +122,8 @@ class Observation:
     @property
     def _shown_um(self) -> list[float]:
         """Displacements by laser and optics, without those that are missing."""
-        laser_um = self.displacement_um
-        if math.isnan(laser_um) or self.laser_stuck:
-            laser_um = self.guard_um  # what replaces the laser
-        return [um for um in (laser_um, self.optics_guard_um) if not math.isnan(um)]
+        shown_um = (self.displacement_um, self.optics_guard_um)
+        return [um for um in shown_um if not math.isnan(um)]
 
 
 @dataclass(frozen=True, slots=True)

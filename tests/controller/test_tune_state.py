@@ -25,7 +25,7 @@ from membrane_ctrl.controller.tick_codec import pack_tick, unpack_tick
 from membrane_ctrl.hold.virtual_run import VirtualRun
 from membrane_ctrl.metrology.film.hencky_bowl import zernike_projection
 from membrane_ctrl.model.events import EventLine
-from membrane_ctrl.model.telemetry import State
+from membrane_ctrl.model.telemetry import SafeLevel, State
 from membrane_ctrl.sim.bench_events import AmbientChange, BenchEvent
 from membrane_ctrl.sim.plant import Plant
 from membrane_ctrl.sim.virtual_bench import VirtualBench
@@ -183,6 +183,16 @@ def test_a_laser_found_faulty_ends_an_experiment_although_it_reads() -> None:
     held.go(CONFIG.limits.stuck_s + 1.0)
     assert held.state == State.HOLD
     assert not held.of("experiment")[-1]["completed"]
+
+
+def test_the_mean_flow_of_the_safety_table_ends_an_experiment_although_the_laser_reads() -> None:
+    held = Held()
+    held.go(4.0, tune(duration_s=60.0))
+    held.bench.wrong.gauge_offset_pa = -60.0  # a jump that no film can cause, within all limits
+    held.go(0.2)
+    assert held.rows[-1].safe_level == SafeLevel.HOLD_FLOW
+    assert held.state != State.TUNE
+    assert "mean flow" in held.of("experiment")[-1]["reason"]
 
 
 @pytest.mark.parametrize(
