@@ -27,6 +27,8 @@ from tests.support.undrawn import undrawn_figures
 _LOCKS_FOLDER = tempfile.mkdtemp(prefix="membrane-locks-")
 _NUMBERS = itertools.count()
 os.environ[lock_store.VARIABLE] = _LOCKS_FOLDER
+# No hold of a test starts a service, unless the test is about that.
+os.environ["MEMBRANE_CTRL_SERVICE"] = "false"
 
 settings.register_profile("seeded", derandomize=True, deadline=None)
 settings.load_profile("seeded")
@@ -100,6 +102,10 @@ def own_locks() -> Iterator[None]:
     os.environ[lock_store.VARIABLE] = str(folder)
     yield
     os.environ[lock_store.VARIABLE] = _LOCKS_FOLDER
+
+
+# No hold of a test starts a service, unless the test is about that.
+os.environ["MEMBRANE_CTRL_SERVICE"] = "false"
 
 
 @pytest.fixture(autouse=True)

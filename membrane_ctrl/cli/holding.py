@@ -84,6 +84,13 @@ def hold(
             "--autotune", help="Tune the loop on trial once the mirror is held; ten minutes."
         ),
     ] = False,
+    service: Annotated[
+        bool,
+        typer.Option(
+            envvar="MEMBRANE_CTRL_SERVICE",
+            help="Start a service with the page, unless one follows these runs.",
+        ),
+    ] = True,
     json: JsonOption = False,
 ) -> int:
     """Hold the mirror until told to stop."""
@@ -105,6 +112,8 @@ def hold(
         standby=standby,
         autotune=autotune,
         lab=devices is not None,
+        configuration=devices or config,
+        service=service,
     )
     with errors.name_source_in_errors(devices or config):
         return hold_mirror(options)

@@ -76,10 +76,7 @@ def load_configuration(path: Path | None) -> "Config":
     if doors.opcua is not None:
         opcua = _resolve_beside(doors.opcua, folder, "users_file", "certificate_file", "key_file")
         doors = doors.model_copy(update={"opcua": opcua})
-    web = config.web and _resolve_beside(
-        config.web, folder, "users_file", "certificate_file", "key_file"
-    )
-    update = {"optics": optics, "port": port, "alarms": alarms, "doors": doors, "web": web}
+    update = {"optics": optics, "port": port, "alarms": alarms, "doors": doors}
     return config.model_copy(update=update)
 
 

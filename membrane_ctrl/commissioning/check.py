@@ -38,6 +38,7 @@ from membrane_ctrl.instruments import (
 )
 from membrane_ctrl.model import errors, plain_json, run_status, terminal
 from membrane_ctrl.model.clock import RunClock
+from membrane_ctrl.model.optional import describe_missing, is_installed
 
 _READS = 100
 _LONGEST_S = 2.0  # slow devices get fewer reads
@@ -95,10 +96,9 @@ def check_config(config: Config, source: str, as_json: bool) -> int:
         print(plain_json.dumps(report))
     else:
         warnings = [finding.line(source) for finding in findings if finding.severity == "warning"]
-        warnings += [f"{source}: {each.missing_line}" for each in missing if not each.by_hold]
+        warnings += [f"{source}: {each.missing_line}" for each in missing]
         _print_probes(source, probes, circuits, would, warnings)
     refused = [finding.line(source) for finding in findings if finding.severity == "error"]
-    refused += [f"{source}: {each.missing_line}" for each in missing if each.by_hold]
     if refused:
         raise errors.FindingsError(refused)
     wrong = [probe for probe in probes if probe.problem]
@@ -230,7 +230,7 @@ def _describe_port(port: PortConfig) -> str:
 def _describe_package(needed: NeededPackage) -> dict[str, str]:
     """A package that is missing, as the other findings are described."""
     return {
-        "severity": "error" if needed.by_hold else "warning",
+        "severity": "warning",
         "field": needed.table,
         "value": "",
         "why": f"needs {needed.package}, which is not installed",
@@ -239,13 +239,12 @@ def _describe_package(needed: NeededPackage) -> dict[str, str]:
 
 
 def _describe_page(config: Config) -> str:
-    """Where the page would be served."""
-    page = config.web
-    if page is None:
-        return "none: no [web]"
-    scheme = "https" if page.secure else "http"
-    who = f"users in {page.users_file}" if page.users_file else "whoever has its link"
-    return f"{page.public_url or f'{scheme}://{page.host}:{page.port}/'} for {who}"
+    """Where the page would be."""
+    if not config.port.enabled:
+        return "none: port.enabled = false"
+    if not is_installed("nicegui"):
+        return f"none: {describe_missing('it', 'nicegui', 'web')}"
+    return "of the service, which the hold starts if none follows its runs"
 
 
 def _describe_locks(config: Config) -> str:

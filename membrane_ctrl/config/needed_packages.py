@@ -21,14 +21,11 @@ class NeededPackage:
         As it is imported.
     extra : str
         The extra of this program that installs it.
-    by_hold : bool
-        Whether the hold itself needs it, not a program beside it.
     """
 
     table: str
     package: str
     extra: str
-    by_hold: bool
 
     @property
     def missing_line(self) -> str:
@@ -37,16 +34,14 @@ class NeededPackage:
 
 
 def needed_packages(config: Config) -> Iterator[NeededPackage]:
-    """The packages of the page and of the bridges.
+    """The packages of the bridges.
 
     Drivers and alarms name theirs where they are made (`GpioLine`, `require_sendable`).
     """
-    if config.web is not None:
-        yield NeededPackage("web", "nicegui", "web", by_hold=True)
     bridges = {"mqtt": "aiomqtt", "opcua": "asyncua", "epics": "softioc"}
     for bridge, package in bridges.items():
         if getattr(config.doors, bridge) is not None:
-            yield NeededPackage(f"doors.{bridge}", package, bridge, by_hold=False)
+            yield NeededPackage(f"doors.{bridge}", package, bridge)
 
 
 def missing_packages(config: Config) -> list[NeededPackage]:

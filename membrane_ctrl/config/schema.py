@@ -36,7 +36,7 @@ from membrane_ctrl.config.optics import (
     OpticsConfig,
     PatternConfig,
 )
-from membrane_ctrl.config.port import AlarmsConfig, DoorsConfig, PortConfig, WebConfig
+from membrane_ctrl.config.port import AlarmsConfig, DoorsConfig, PortConfig
 
 __all__ = [
     "CameraConfig",
@@ -322,7 +322,6 @@ class Config(Section):
     port: PortConfig = PortConfig()
     alarms: AlarmsConfig = AlarmsConfig()
     doors: DoorsConfig = DoorsConfig()
-    web: WebConfig | None = None
 
     @model_validator(mode="after")
     def _consistent(self) -> "Config":
@@ -345,8 +344,6 @@ class Config(Section):
                 "devices: no device for displacement; without a laser set "
                 'estimator.process_value = "optics"'
             )
-        if self.web is not None and not self.port.enabled:
-            raise ValueError("web: the page asks the control port: set port.enabled = true")
         if self.devices is not None and self.devices.camera is not None:
             bits = self.devices.camera.frame_bits
             if bits not in (None, self.optics.camera.bits):

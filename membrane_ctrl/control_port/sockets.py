@@ -90,20 +90,25 @@ def _remove_stale(path: Path) -> None:
             f"{path}: exists and is not a socket; remove it, or choose another path with "
             "port.socket"
         )
+    if not is_listening(path):
+        path.unlink(missing_ok=True)
+        return
+    raise DeviceError(
+        f"{path}: another hold is listening there; stop it, or choose another path with port.socket"
+    )
+
+
+def is_listening(path: Path) -> bool:
+    """Whether a program listens on a socket file; one that hangs counts as well."""
     with socket.socket(socket.AF_UNIX) as probe, short(path) as address:
         probe.settimeout(_SOMEBODY_THERE_S)  # a hung listener's queue may be full
         try:
             probe.connect(address)
-        except ConnectionRefusedError:
-            path.unlink(missing_ok=True)
-            return
-        except FileNotFoundError:
-            return
+        except (ConnectionRefusedError, FileNotFoundError):
+            return False
         except (TimeoutError, BlockingIOError):
-            pass
-    raise DeviceError(
-        f"{path}: another hold is listening there; stop it, or choose another path with port.socket"
-    )
+            return True
+    return True
 
 
 def group_id(name: str) -> int:

@@ -49,8 +49,7 @@ def doors(
 
     settings = load_configuration(config)
     for needed in missing_packages(settings):
-        if not needed.by_hold:
-            raise errors.InputError(needed.missing_line)
+        raise errors.InputError(needed.missing_line)
     if not any(getattr(settings.doors, name) for name in _BRIDGES):
         raise errors.InputError(
             "no bridge is configured: add [doors.mqtt], [doors.opcua] or [doors.epics] "

@@ -9,7 +9,6 @@ from dataclasses import dataclass, replace
 from multiprocessing.connection import Connection
 from pathlib import Path
 
-from membrane_ctrl.config.port import WebConfig
 from membrane_ctrl.config.schema import Config
 from membrane_ctrl.controller.tick_codec import MESSAGE_BYTES, SNAPSHOT_MESSAGE_BYTES
 from membrane_ctrl.model import (
@@ -23,7 +22,6 @@ from membrane_ctrl.model.clock import RunClock
 from membrane_ctrl.model.durations import pause_s
 from membrane_ctrl.model.shape_estimate import ESTIMATE_BYTES_MAX
 from membrane_ctrl.processes.child import Child
-from membrane_ctrl.processes.command_process import CommandProcess
 from membrane_ctrl.processes.event_pipe import make_pipe
 from membrane_ctrl.processes.frame_address import FrameAddress
 from membrane_ctrl.processes.ring import RingAddress, open_ring
@@ -34,7 +32,7 @@ _HOUR_S = 3600.0
 # Until the first report: the interpreter may start on a busy machine
 _STARTS_S = 60.0
 
-Make = Callable[[int], tuple[Child | CommandProcess, Connection]]
+Make = Callable[[int], tuple[Child, Connection]]
 _TELEMETRY_KEPT_S = 60.0  # a recorder busy for this long (a slow disk) loses nothing
 _EVENTS_KEPT, EVENT_BYTES = 1024, 8192  # with all of the longest request
 _SHAPES_KEPT = 64
@@ -50,12 +48,11 @@ class ManagedChild:
     A child reports about once a second that it is alive, and how long it may now be silent
     (`child_events.Alive`). A stopped or hung child breaks that promise and is killed. `make` gets
     the number of earlier children and returns the next one, not yet started, with our end of its
-    pipe. A program reports nothing (`reports` is false): only its end is noticed.
+    pipe.
     """
 
-    def __init__(self, make: Make, reports: bool = True) -> None:
+    def __init__(self, make: Make) -> None:
         self._make = make
-        self._starts_s = _STARTS_S if reports else math.inf
         self._replaced_s: deque[float] = deque()
         self._count = 0
         self._ended_s: float | None = None
@@ -66,7 +63,7 @@ class ManagedChild:
 
     def start(self, now_s: float) -> None:
         """Start the first child."""
-        self._expected_s = now_s + self._starts_s
+        self._expected_s = now_s + _STARTS_S
         self.child.start()
 
     def send(self, word: str) -> bool:
@@ -110,7 +107,7 @@ class ManagedChild:
         self._count += 1
         self._replaced_s.append(now_s)
         self._ended_s, self._given_up, self._silent = None, False, False
-        self._expected_s = now_s + self._starts_s
+        self._expected_s = now_s + _STARTS_S
         self.child, self._line = self._make(self._count)
         self.child.start()
 
@@ -181,7 +178,7 @@ def _make_frame_ring(config: Config, stack: ExitStack) -> FrameAddress:
 
 
 class ChildProcesses:
-    """Recorder, console, acquisition, alarms and page of one run. The hold continues without them
+    """Recorder, console, acquisition and alarms of one run. The hold continues without them
     and reports it.
     """
 
@@ -252,17 +249,10 @@ class ChildProcesses:
             self._alarms = ManagedChild(
                 _make_child_factory("alarms", "alarms", 5, lambda n: alarms)
             )
-        self._page = None
-        if config.web is not None and socket is not None:
-            words = _page_words(config.web, run_dir, socket)
-            self._page = ManagedChild(
-                lambda _: (CommandProcess("page", words, run_dir / "web.log", 10), make_pipe()[0]),
-                False,
-            )
 
     @property
     def _managed_children(self) -> list[ManagedChild]:
-        found = (self._recorder, self._acquisition, self._alarms, self._console, self._page)
+        found = (self._recorder, self._acquisition, self._alarms, self._console)
         return [each for each in found if each is not None]
 
     @property
@@ -325,32 +315,6 @@ class ChildProcesses:
             console.stop(0.0)
         if console.exit_code != 0:
             give_back_terminal(self._keyboard)
-
-
-def _page_words(page: WebConfig, run_dir: Path, socket: Path) -> list[str]:
-    """The command line of the page."""
-    options = {
-        "--users": page.users_file,
-        "--certificate": page.certificate_file,
-        "--key": page.key_file,
-    }
-    given = [
-        word for option, file in options.items() if file is not None for word in (option, file)
-    ]
-    given += [word for name in page.names for word in ("--name", name)]
-    given += [word for proxy in page.trusted_proxies for word in ("--trusted-proxy", proxy)]
-    given += ["--public-url", page.public_url] if page.public_url else []
-    where = [
-        "--logs",
-        str(run_dir.parent),
-        "--socket",
-        str(socket),
-        "--host",
-        page.host,
-        "--port",
-        str(page.port),
-    ]
-    return ["web", "--with-hold", *where, *given]
 
 
 def _make_child_factory(name: str, room: str, nice: int, spec: Callable[[int], object]) -> Make:

@@ -77,8 +77,10 @@ def closing_lines(closing: RunEnd) -> list[str]:
     ]
 
 
-def print_closing_report(run_dir: Path, as_json: bool, closing: RunEnd | None = None) -> None:
-    """Print how the run ended, a fault first, then its result and folder."""
+def print_closing_report(
+    run_dir: Path, as_json: bool, closing: RunEnd | None = None, link: str = ""
+) -> None:
+    """Print how the run ended, a fault first, then its result, its folder and the page's link."""
     for line in closing_lines(closing) if closing is not None else ():
         print(line, file=sys.stderr)
     summary_path = run_dir / "summary.json"
@@ -109,6 +111,8 @@ def print_closing_report(run_dir: Path, as_json: bool, closing: RunEnd | None = 
             f"open it:    membrane-ctrl review {'last' if newest else shlex.quote(str(run_dir))}",
             file=sys.stderr,
         )
+    if link:
+        print(f"page:       {link}", file=sys.stderr)
 
 
 def _list_headlines(summary: dict[str, Any]) -> Iterator[str]:

@@ -22,3 +22,5 @@ class HoldOptions:
     autotune: bool = False  # a short tuning session once the mirror is held
     # the twin answers as the instruments of the configuration, not as the pump board
     lab: bool = False
+    configuration: Path | None = None  # the file
+    service: bool = False  # start a service with a page if none is there

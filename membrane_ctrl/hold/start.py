@@ -7,7 +7,6 @@ end, the safe state comes first, then the recording, then the rest.
 
 import asyncio
 import contextlib
-import importlib.util
 import sys
 from functools import partial
 from pathlib import Path
@@ -17,7 +16,7 @@ from membrane_ctrl.alarms.process import require_sendable
 from membrane_ctrl.control_port import server, sockets
 from membrane_ctrl.controller import cross_check
 from membrane_ctrl.geometry.run_geometry import read_configured_geometry
-from membrane_ctrl.hold import child_processes
+from membrane_ctrl.hold import child_processes, page_service
 from membrane_ctrl.hold.autotune import start_autotune
 from membrane_ctrl.hold.closing_words import RunEnd, print_closing_report
 from membrane_ctrl.hold.hold_options import HoldOptions
@@ -57,8 +56,6 @@ def hold_mirror(options: HoldOptions) -> int:
         if options.config.shape.enabled:
             driver_check.require_optics(options.config.devices)
     require_sendable(options.config.alarms)
-    if options.config.web is not None and importlib.util.find_spec("nicegui") is None:
-        raise errors.InputError("[web] needs NiceGUI: pip install 'membrane-ctrl[web]'")
     geometry = read_configured_geometry(options.config)
     clock = RunClock.start()
     # SIGTERM before and after the ticks cleans up as well
@@ -94,6 +91,7 @@ def hold_mirror(options: HoldOptions) -> int:
             f"run folder {run_dir}; starting {', '.join(children.process_names)}"
         )
         children.start(stack)
+        link = _start_service(options, logs_dir, stack)
         if options.autotune:
             stack.callback(start_autotune(listeners.path, run_dir))
         bench = make_bench(config.devices)  # a link belongs to the event loop that opened it
@@ -120,5 +118,17 @@ def hold_mirror(options: HoldOptions) -> int:
             # the run had ended before: its own end counts
     assert closing.exit is not None
     with contextlib.suppress(OSError):  # the terminal was closed, or the pipe's reader has gone
-        print_closing_report(run_dir, options.json, closing)
+        print_closing_report(run_dir, options.json, closing, link)
     return closing.exit
+
+
+def _start_service(options: HoldOptions, logs_dir: Path, stack: contextlib.ExitStack) -> str:
+    """Start the service if it is wanted and none is there; returns and prints the page's link."""
+    if not options.service or not options.config.port.enabled:
+        return ""
+    link = page_service.start_page_service(
+        logs_dir, options.configuration, stack, terminal.print_progress
+    )
+    if link:
+        terminal.print_progress(f"page: {link}")
+    return link

@@ -25,6 +25,7 @@ from membrane_ctrl.model.errors import DeviceError, os_reason
 from membrane_ctrl.model.lock import Lock, describe_locks
 from membrane_ctrl.model.lock_words import WORDS, distinct_word, word_of_number
 from membrane_ctrl.model.program import file_origin
+from membrane_ctrl.model.state_folder import find_state_folder
 
 VARIABLE = "MEMBRANE_CTRL_LOCKS"
 MACHINE_FOLDER = Path("/var/lib/membrane-ctrl/locks")
@@ -71,7 +72,7 @@ class LockStore:
         named = os.environ.get(VARIABLE, "")
         if named:
             return cls((Path(named).absolute(),))
-        own = _own_state_folder()
+        own = _find_own_folder()
         return cls((MACHINE_FOLDER,) if own is None else (MACHINE_FOLDER, own))
 
     def find_locks(self, devices: Collection[str] | None = None) -> list[StoredLock]:
@@ -216,15 +217,10 @@ def draw_word(taken: Collection[str]) -> str:
     return distinct_word(word_of_number(secrets.randbelow(WORDS)), taken)
 
 
-def _own_state_folder() -> Path | None:
-    """Return the user's own folder; None without a home."""
-    named = os.environ.get("XDG_STATE_HOME", "")
-    if named:
-        return Path(named).absolute() / "membrane-ctrl" / "locks"
-    try:
-        return Path.home() / ".local" / "state" / "membrane-ctrl" / "locks"
-    except RuntimeError:
-        return None
+def _find_own_folder() -> Path | None:
+    """Return the user's own folder of locks; None without a home."""
+    folder = find_state_folder()
+    return None if folder is None else folder / "locks"
 
 
 def _is_lock_name(name: str) -> bool:

@@ -20,16 +20,17 @@ from typing import Any
 import numpy as np
 
 from membrane_ctrl.control_port.client import ANSWER_S, PortClient
-from membrane_ctrl.control_port.ctl import Where, connected
+from membrane_ctrl.control_port.ctl import Where, connected, socket_path
 from membrane_ctrl.control_port.outcome import Outcome
 from membrane_ctrl.model import errors, shape_estimate, telemetry
 from membrane_ctrl.model.arrays import Column
-from membrane_ctrl.model.columns import PUBLISHED
+from membrane_ctrl.model.columns import MISSING, PUBLISHED
 from membrane_ctrl.model.run_events import Mark
 from membrane_ctrl.processes import published_rings, ring
 from membrane_ctrl.review import catalogue
 from membrane_ctrl.run_files.event_log import parse_logged_line
 from membrane_ctrl.run_files.run import open_run
+from membrane_ctrl.service.ended_run import EndedRun, EndKind, find_newest_run, read_ended_run
 
 PERIOD_S = 0.5  # as fast as people read changing figures
 SILENT_S = 5.0  # without a status, the hold hangs or the connection is lost
@@ -37,6 +38,8 @@ SIGNALS = tuple(each.name for each in PUBLISHED)
 _KEPT_S = 3600  # of seconds for the chart; the run's tables have the rest
 _EVENTS_KEPT = 200
 _AGAIN_S = 2.0
+_NO_HOLD = "no hold runs"
+_RECORDING_S = 30.0  # a recorder that lives has written within this time
 
 Message = dict[str, Any]
 
@@ -61,14 +64,24 @@ class HoldSeen:
     events: tuple[str, ...] = ()  # newest last
     figure: shape_estimate.ShapeEstimate | None = None
     reference: shape_estimate.ShapeEstimate | None = None  # the first usable figure that was seen
+    ended: EndedRun | None = None  # the newest run, if its hold has gone
 
     @property
     def silent(self) -> str:
         """Why the shown status must not be believed; empty if it may be."""
         if self.problem:
-            return self.problem
+            return self.problem if self.ended is None else self.ended.headline
         age_s = time.monotonic() - self.seen_s
         return f"no status for {age_s:.0f} s" if age_s > SILENT_S else ""
+
+    @property
+    def state_name(self) -> str:
+        """The hold's state as people read it; without a hold, how the newest run ended."""
+        if not self.silent:
+            return str(self.status.get("state", MISSING))
+        if self.problem and self.ended is not None:
+            return "fault" if self.ended.kind is EndKind.FAULT else "ended"
+        return "no contact"
 
 
 class Seconds:
@@ -115,6 +128,7 @@ class HoldFeed:
         )  # UTC seconds and text, since `met_s`
         self.met_s = math.inf  # UTC of the present contact's begin
         self._events: deque[str] = deque(maxlen=_EVENTS_KEPT)
+        self._files_read: tuple[Path, int, bool] | None = None  # of the ended run
         self._ending = threading.Event()
         self._client: PortClient | None = None
         self._thread = threading.Thread(target=self._follow, name="hold feed", daemon=True)
@@ -130,6 +144,16 @@ class HoldFeed:
         if self._where.tls or not self.seen.name:
             return None
         return self._where.run or self._where.logs / self.seen.name
+
+    @property
+    def until_s(self) -> float:
+        """UTC seconds of the end of the history: now, or the end of the newest run without a
+        hold.
+        """
+        seen = self.seen
+        if seen.problem and seen.ended is not None:
+            return seen.ended.ended_utc.timestamp()
+        return time.time()
 
     def open(self) -> None:
         """Start to follow."""
@@ -166,17 +190,42 @@ class HoldFeed:
                         "the run has ended" if self.seen.status else "the connection was closed"
                     )
             except errors.CommandError as error:
-                problem = "; ".join(error.lines)
+                problem = "; ".join(error.lines) if self._has_socket() else _NO_HOLD
             except (
                 Exception
             ) as error:  # whatever this hold causes, its feed tries again and the others continue
                 problem = f"{type(error).__name__}: {error}"
             self.seen = replace(self.seen, problem=problem, role="read")
+            self._read_ended_run()
             self._ending.wait(_AGAIN_S)
+
+    def _has_socket(self) -> bool:
+        """Whether a hold is or was there: one that ends removes its socket file."""
+        return bool(self._where.tls) or socket_path(self._where).exists()
+
+    def _read_ended_run(self) -> None:
+        """Without a hold, read how the newest run ended, whenever its files have changed."""
+        logs = self.logs
+        folder = None if logs is None else find_newest_run(logs)
+        if folder is None:
+            return
+        with suppress(OSError, ValueError, errors.CommandError):
+            size = (folder / "events.jsonl").stat().st_size
+            read = folder, size, (folder / "summary.json").exists()
+            is_final = self.seen.ended is not None and self.seen.ended.folder == folder
+            if read == self._files_read and is_final:
+                return
+            ended = read_ended_run(folder)
+            if ended.kind is EndKind.NO_RECORD and not _is_over(ended):
+                return
+            self._files_read = read
+            if ended.name != self.seen.name:
+                self.seen = HoldSeen(ended.name, problem=self.seen.problem)
+            self.seen = replace(self.seen, ended=ended, events=ended.events)
 
     def _watch(self, client: PortClient) -> None:
         greeting = client.greeting
-        if greeting["run"] != self.seen.name:
+        if greeting["run"] != self.seen.name or self.seen.ended is not None:
             self.seen = HoldSeen(str(greeting["run"]))
             self._events.clear()
         self.marks.clear()  # those made without contact are in the runs' logs only
@@ -248,6 +297,12 @@ class HoldFeed:
             )
 
 
+def _is_over(run: EndedRun) -> bool:
+    """Whether a run without a recorded end has recorded nothing for so long that it has ended."""
+    last_utc = run.read_utc or run.ended_utc
+    return (datetime.now(UTC) - last_utc).total_seconds() > _RECORDING_S
+
+
 def _number(value: object) -> float:
     return float(value) if isinstance(value, int | float) else math.nan
 
@@ -282,14 +337,15 @@ class Series:
 def history(
     feed: HoldFeed, logs: Path | None, signal: str, span_s: float, now_s: float | None = None
 ) -> Series:
-    """The last `span_s` seconds of a signal of `SIGNALS`, in at most `_POINTS_MAX` windows.
+    """The last `span_s` seconds of a signal of `SIGNALS`, in at most `_POINTS_MAX` windows; without
+    a hold, those before the end of the newest run.
 
     `logs` is the folder of the runs, None if it is on another machine: then only the last hour is
     known.
     """
     if signal not in SIGNALS:
         raise ValueError(f"{signal}: none of {', '.join(SIGNALS)}")
-    begin_s = (time.time() if now_s is None else now_s) - span_s
+    begin_s = (feed.until_s if now_s is None else now_s) - span_s
     live = _of_feed(feed, signal, begin_s)
     if span_s <= _LIVE_S and live.utc_s.size and live.utc_s[0] <= begin_s + 2.0:
         return thinned(live, span_s)
@@ -313,7 +369,7 @@ def marks(
     """UTC seconds and texts of the marks in the last `span_s` seconds, oldest first; `logs` as for
     `history`.
     """
-    begin_s = (time.time() if now_s is None else now_s) - span_s
+    begin_s = (feed.until_s if now_s is None else now_s) - span_s
     found = list(feed.marks)
     if logs is not None and logs.is_dir() and begin_s < feed.met_s:
         for entry in _entries(logs, time.monotonic() // _LISTED_S):

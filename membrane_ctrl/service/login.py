@@ -137,7 +137,7 @@ class LoginMiddleware:
             return Refusal(HTTPStatus.BAD_REQUEST, "malformed Host header")
         if name not in self._address.hosts:
             hint = (
-                "unknown host name: open the page by the address that `membrane-ctrl web` printed"
+                "unknown host name: open the page by the address that `membrane-ctrl serve` printed"
             )
             return Refusal(HTTPStatus.FORBIDDEN, hint)
         origin = headers.get("origin")
@@ -214,10 +214,12 @@ class LoginMiddleware:
             await self._admit(scope, send, user, "")
             return
         text = (
-            "Log in." if self._accounts.users else "Open the link that `membrane-ctrl web` printed."
+            "Log in."
+            if self._accounts.users
+            else "Open the link that `membrane-ctrl serve` printed."
         )
         if secret and not self._accounts.users:
-            text = f"This link is wrong, or of an earlier start. {text}"
+            text = f"This link is wrong, or of another user. {text}"
         await self._show_form(scope, send, HTTPStatus.UNAUTHORIZED, text)
 
     async def _admit(self, scope: Scope, send: Send, user: WebUser, device: str) -> None:

@@ -2,7 +2,7 @@
 
 Behind a reverse proxy the page cannot know its own address: the proxy may take off a prefix of the
 path, put its own name into `Host`, and end TLS. Headers such as `X-Forwarded-Prefix` may come from
-anybody. So the address is one setting (`web.public_url`), from which links, redirects, the cookie
+anybody. So the address is one setting (`public_url`), from which links, redirects, the cookie
 and the allowed origins are made.
 """
 
@@ -14,7 +14,8 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from urllib.parse import urlsplit
 
-from membrane_ctrl.config.port import LOCAL_HOSTS, WebConfig
+from membrane_ctrl.config.port import LOCAL_HOSTS
+from membrane_ctrl.config.service import ServiceConfig
 
 Network = ipaddress.IPv4Network | ipaddress.IPv6Network
 _HOST = re.compile(r"(?P<name>\[[0-9A-Fa-f:.]+\]|[A-Za-z0-9._-]+)(:(?P<port>[0-9]{1,5}))?")
@@ -96,7 +97,7 @@ class PublicAddress:
         return any(address in network for network in self.proxies)
 
 
-def public_address(page: WebConfig) -> PublicAddress:
+def public_address(page: ServiceConfig) -> PublicAddress:
     """Return what follows from the page's configuration."""
     hosts = {*LOCAL_HOSTS, page.host.lower(), *(name.lower() for name in page.names)}
     proxies = tuple(ipaddress.ip_network(each) for each in page.trusted_proxies)

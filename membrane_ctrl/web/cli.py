@@ -1,80 +1,116 @@
-"""`membrane-ctrl web`: serves the page."""
+"""`membrane-ctrl serve`: the service that follows, starts and ends holds, and its page."""
 
 from __future__ import annotations
 
+import math
 import sys
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import typer
 
-from membrane_ctrl.model import errors, files
+from membrane_ctrl.model import durations, errors, files
 from membrane_ctrl.model.optional import require_installed
 
 app = typer.Typer(
     invoke_without_command=True,
     rich_markup_mode="markdown",
-    help="Serve a page that shows the hold and sends commands to it.",
+    help="Serve the page and the interface for programs, before, during and after holds.",
 )
+_FILES = ("logs", "configurations", "users_file", "certificate_file", "key_file")
 
 
 @app.callback()
-def web(
+def serve(
     context: typer.Context,
-    logs: Annotated[Path, typer.Option("--logs", help="Folder of the runs.")] = Path("logs"),
-    socket: Annotated[
-        Path | None, typer.Option("--socket", help="Control port of the hold.")
+    config: Annotated[
+        Path | None, typer.Option("--config", help="Service file; other options go before it.")
     ] = None,
-    run: Annotated[Path | None, typer.Option("--run", help="Run folder of the hold.")] = None,
+    logs: Annotated[Path | None, typer.Option(help="Folder of the runs; logs by default.")] = None,
+    configurations: Annotated[
+        Path | None,
+        typer.Option(
+            help="Folder of the configurations to start holds with; by default, this one."
+        ),
+    ] = None,
     fleet: Annotated[
         Path | None, typer.Option("--fleet", help="File with several holds; see `ctl fleet`.")
     ] = None,
-    host: Annotated[str, typer.Option("--host", help="Address to listen on.")] = "127.0.0.1",
-    port: Annotated[int, typer.Option("--port", min=1, max=65535, help="TCP port.")] = 7480,
+    host: Annotated[str | None, typer.Option("--host", help="Address to listen on.")] = None,
+    port: Annotated[int | None, typer.Option("--port", min=1, max=65535, help="TCP port.")] = None,
     name: Annotated[
         list[str] | None, typer.Option("--name", help="Host name of the page; repeatable.")
     ] = None,
     public_url: Annotated[
-        str,
+        str | None,
         typer.Option(
             "--public-url",
             metavar="URL",
             help="Address that browsers open, behind a reverse proxy.",
         ),
-    ] = "",
+    ] = None,
     trusted_proxy: Annotated[
         list[str] | None,
         typer.Option(metavar="ADDRESS", help="Proxy whose X-Forwarded-For counts; repeatable."),
     ] = None,
     users: Annotated[
-        Path | None, typer.Option("--users", help="Names and passwords; see `web add-user`.")
+        Path | None, typer.Option("--users", help="Names and passwords; see `serve add-user`.")
     ] = None,
     certificate: Annotated[
-        Path | None, typer.Option("--certificate", help="TLS certificate of the page.")
+        Path | None, typer.Option("--certificate", help="TLS certificate of the service.")
     ] = None,
     key: Annotated[Path | None, typer.Option("--key", help="Key of that certificate.")] = None,
+    idle_end: Annotated[
+        str | None,
+        typer.Option(help="End after this long without viewers and holds, e.g. 1h.", hidden=True),
+    ] = None,
     with_hold: Annotated[bool, typer.Option("--with-hold", hidden=True)] = False,
 ) -> None:
-    """Serve the page until interrupted; without users, print a link that lets its holder in."""
+    """Serve until interrupted; without users, print a link that lets its holder in."""
     if context.invoked_subcommand is not None:
         return
-    from membrane_ctrl.config.port import WebConfig
-    from membrane_ctrl.config.toml_file import parse_tables
+    from membrane_ctrl.config.service import ServiceConfig
+    from membrane_ctrl.config.toml_file import parse_tables, read_toml
     from membrane_ctrl.control_port import ctl
     from membrane_ctrl.processes.command_process import end_with_parent
 
-    require_installed("nicegui", "web", "`web`")
+    require_installed("nicegui", "web", "`serve`")
     from membrane_ctrl.web.server import serve
 
-    given = {"host": host, "port": port, "names": tuple(name or ())}
-    given |= {"public_url": public_url, "trusted_proxies": tuple(trusted_proxy or ())}
-    kept = {"users_file": users, "certificate_file": certificate, "key_file": key}
-    page = parse_tables(
-        given | {key: file and str(file) for key, file in kept.items()}, WebConfig, "web"
-    )
+    given: dict[str, Any] = {
+        "logs": logs,
+        "configurations": configurations,
+        "host": host,
+        "port": port,
+        "names": name,
+        "public_url": public_url,
+        "trusted_proxies": trusted_proxy,
+        "users_file": users,
+        "certificate_file": certificate,
+        "key_file": key,
+    }
+    tables = {} if config is None else _resolve_files(read_toml(config), config.resolve().parent)
+    tables |= {
+        option: str(value) if isinstance(value, Path) else value
+        for option, value in given.items()
+        if value is not None
+    }
+    page = parse_tables(tables, ServiceConfig, str(config or "serve"))
     if with_hold:
         end_with_parent()
-    serve({"": ctl.Where(socket, run, logs=logs)} if fleet is None else ctl.fleet(fleet), page)
+    idle_s = math.inf if idle_end is None else durations.parse_duration_s(idle_end)
+    holds = {"": ctl.Where(logs=Path(page.logs))} if fleet is None else ctl.fleet(fleet)
+    serve(holds, page, idle_s)
+
+
+def _resolve_files(tables: dict[str, Any], folder: Path) -> dict[str, Any]:
+    """Return the tables of a service file with its files relative to its folder."""
+    return {
+        name: str(folder / Path(value).expanduser())
+        if name in _FILES and isinstance(value, str)
+        else value
+        for name, value in tables.items()
+    }
 
 
 @app.command("add-user")

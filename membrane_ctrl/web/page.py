@@ -27,6 +27,7 @@ from membrane_ctrl.service.access import (
     request,
 )
 from membrane_ctrl.service.feed import SPANS_S, HoldFeed, history, marks
+from membrane_ctrl.service.hold_starter import HoldStarter
 from membrane_ctrl.service.work_pools import (
     FIGURES,
     LIVE_CHARTS,
@@ -39,6 +40,7 @@ from membrane_ctrl.web import figures
 from membrane_ctrl.web.fleet_panel import fleet_panel
 from membrane_ctrl.web.log_lines import find_new_lines
 from membrane_ctrl.web.messages import show_message
+from membrane_ctrl.web.no_hold import NoHoldPanel
 from membrane_ctrl.web.runs_panel import runs_panel
 from membrane_ctrl.web.tuning_panel import CHOOSES, SessionWatch, TuningPanel
 
@@ -100,9 +102,15 @@ class WebPage:
     """The elements of a viewer's page, and what it is set to show."""
 
     def __init__(
-        self, feeds: Mapping[str, HoldFeed], hold: str, user: WebUser, views: SharedViews
+        self,
+        feeds: Mapping[str, HoldFeed],
+        hold: str,
+        user: WebUser,
+        views: SharedViews,
+        starter: HoldStarter | None = None,
     ) -> None:
         self._feeds, self._hold, self._user, self._views = feeds, hold, user, views
+        self._starter = starter
         self._feed = feeds[hold]
         self._logs = self._feed.logs
         self._utc = True
@@ -171,6 +179,8 @@ class WebPage:
     def _build_now(self) -> None:
         self._why = ui.label().classes("text-subtitle1").props('role="status"')
         self._alarm = ui.label().classes("text-negative text-bold").props('role="alert"')
+        if self._logs is not None:
+            self._no_hold = NoHoldPanel(self._feed, self._hold, self._user, self._starter)
         with ui.row().classes("w-full items-stretch no-wrap max-lg:flex-wrap"):
             with ui.column().classes("col-grow"):
                 self._numbers = self._build_numbers()
@@ -287,10 +297,11 @@ class WebPage:
         seen = self._feed.seen
         status, row = seen.status, seen.status.get("row") or {}
         silent = seen.silent
-        state = "no contact" if silent else str(status.get("state", MISSING))
+        state = seen.state_name
         self._name.set_text(" ".join(part for part in (self._hold, seen.name or "no hold") if part))
         self._state.set_text(state)
-        colour = "grey" if silent else _COLOURS.get(state, "warning")
+        ended_well = silent and state != "fault"
+        colour = "grey" if ended_well else _COLOURS.get(state, "warning")
         if colour != self._coloured:
             self._coloured = colour
             self._state.props(

@@ -16,11 +16,11 @@ from membrane_ctrl.review import catalogue
 from membrane_ctrl.review.sparkline import render_sparkline
 from membrane_ctrl.run_files.run import open_run
 from membrane_ctrl.service.access import WebUser, outranks
+from membrane_ctrl.service.ended_run import REPORT_NAME
 from membrane_ctrl.service.work_pools import REPORTS, RUN_LISTS, PoolFullError
 from membrane_ctrl.web.messages import show_message
 
 _MOST = 200  # runs in the table, newest first
-REPORT = "report.html"
 _CARD = """<div class="q-pa-xs col-12"><q-card flat bordered class="q-pa-sm">
 <q-checkbox dense v-model="props.selected" :label="props.row.run" />
 <div class="row justify-between q-mt-xs">
@@ -67,11 +67,25 @@ def run_folder(logs: Path, name: str) -> Path | None:
 
 def report_problem(folder: Path, user: WebUser) -> str:
     """Write the run's report if there is none; returns why there is none, or an empty text."""
-    if (folder / REPORT).exists():
+    if (folder / REPORT_NAME).exists():
         return ""
     if not outranks(user.role, "operate"):
         return f"{folder.name}: no report yet; writing one needs the role operate"
     return _command("report", str(folder))
+
+
+async def open_report(folder: Path, hold: str, user: WebUser) -> None:
+    """Open a run's report in a new tab; write it before if there is none."""
+    if not (folder / REPORT_NAME).exists():
+        show_message("Writing the report.")
+    try:
+        problem = await REPORTS.run(report_problem, folder, user)
+    except PoolFullError as error:
+        problem = str(error)
+    if problem:
+        show_message(problem, good=False)
+        return
+    ui.navigate.to(f"/report/{folder.name}?hold={quote(hold)}", new_tab=True)
 
 
 def runs_panel(
@@ -114,18 +128,8 @@ def runs_panel(
 
     async def report() -> None:
         folder = chosen()
-        if folder is None:
-            return
-        if not (folder / REPORT).exists():
-            show_message("Writing the report.")
-        try:
-            said = await REPORTS.run(report_problem, folder, user)
-        except PoolFullError as error:
-            said = str(error)
-        if said:
-            show_message(said, good=False)
-            return
-        ui.navigate.to(f"/report/{folder.name}?hold={quote(hold)}", new_tab=True)
+        if folder is not None:
+            await open_report(folder, hold, user)
 
     async def review() -> None:
         folder = chosen()

@@ -1,42 +1,52 @@
-"""Serves the page with NiceGUI: on localhost with a link, elsewhere with TLS and names."""
+"""Serves the page with NiceGUI, before, during and after holds: on localhost with a link, elsewhere
+with TLS and names.
+"""
 
 import asyncio
+import contextlib
+import math
 import os
 import ssl
 import sys
+import time
 from functools import partial
 from pathlib import Path
 
 from fastapi import Request
 from fastapi.responses import HTMLResponse, PlainTextResponse, Response
-from nicegui import app, ui
+from nicegui import Client, app, ui
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
-from membrane_ctrl.config.port import WebConfig
+from membrane_ctrl.config.service import ServiceConfig
 from membrane_ctrl.control_port import sockets
 from membrane_ctrl.control_port.ctl import Where
+from membrane_ctrl.control_port.service_link import link_key, publish_address
 from membrane_ctrl.model import errors, files
 from membrane_ctrl.service.access import Accounts, WebUser, known_users
 from membrane_ctrl.service.connections import ConnectionGuard, GuardedHttp, raise_file_limit
+from membrane_ctrl.service.ended_run import REPORT_NAME
 from membrane_ctrl.service.feed import SIGNALS, SPANS_S, HoldFeed
+from membrane_ctrl.service.hold_starter import HoldStarter
+from membrane_ctrl.service.idle_end import IdleEnd
 from membrane_ctrl.service.login import LoginMiddleware
 from membrane_ctrl.service.public_address import public_address
 from membrane_ctrl.service.stop_route import stop_handler
 from membrane_ctrl.service.work_pools import REPORT_FILES, PoolFullError
 from membrane_ctrl.web.figures import REMOVED
 from membrane_ctrl.web.page import SharedViews, WebPage
-from membrane_ctrl.web.runs_panel import REPORT, run_folder
+from membrane_ctrl.web.runs_panel import run_folder
 
 _NICE = 5  # the hold comes first, also when the page was not started by one
 # a viewer may be silent for so long: a phone that changes cells, a machine that builds fifty pages
 _AWAY_S = 20.0
 _STUCK_S = 20.0  # for a message to leave
 _REPORT_BYTES_MAX = 64_000_000
+_LOOK_AFTER_S = 10.0
 _MESSAGE_BYTES_MAX = 1_000_000  # of a browser over its web socket; the page has no uploads
 _FRESH = {"cache-control": "no-store"}
 
 
-def accounts_of(page: WebConfig) -> Accounts:
+def accounts_of(page: ServiceConfig) -> Accounts:
     """Who may log in. Raises InputError for a users file that is wrong."""
     users = {}
     if page.users_file is not None:
@@ -46,30 +56,63 @@ def accounts_of(page: WebConfig) -> Accounts:
             raise errors.InputError(f"{page.users_file}: {error}") from None
         if not users:
             raise errors.InputError(
-                f"{page.users_file}: no users; add one with `membrane-ctrl web add-user`"
+                f"{page.users_file}: no users; add one with `membrane-ctrl serve add-user`"
             )
-    return Accounts(users, attributes=public_address(page).cookie_attributes)
+    attributes = public_address(page).cookie_attributes
+    return Accounts(users, attributes=attributes, secret=link_key())
 
 
-def require_servable(page: WebConfig) -> None:
+def require_servable(page: ServiceConfig) -> None:
     """Raise InputError for files that are no certificate and its key, DeviceError for an address
     that is taken.
     """
     if page.certificate_file is not None and page.key_file is not None:
         context = ssl.SSLContext(ssl.PROTOCOL_TLS_SERVER)
         sockets.load_pair(context, Path(page.certificate_file), Path(page.key_file))
-    sockets.listen_tcp(page.host, page.port, "web").close()
+    sockets.listen_tcp(page.host, page.port, "port").close()
 
 
-def serve(holds: dict[str, Where], page: WebConfig) -> None:
-    """Serve the page of holds, by name, until interrupted. Raises as `accounts_of` and
-    `require_servable`.
+def serve(holds: dict[str, Where], page: ServiceConfig, idle_s: float = math.inf) -> None:
+    """Serve the page of holds, by name, until interrupted, or unused for a time.
+
+    Parameters
+    ----------
+    holds : dict of Where
+        The one with its runs in `page.logs` can be started here.
+    page : ServiceConfig
+    idle_s : float
+        Time without viewers and holds after which the service ends.
+
+    Raises
+    ------
+    InputError, DeviceError
+        As `accounts_of` and `require_servable`; another service has the folder of runs.
     """
     accounts = accounts_of(page)
     require_servable(page)
-    os.nice(max(0, _NICE - os.nice(0)))
     address = public_address(page)
-    feeds = {name: HoldFeed(where) for name, where in holds.items()}
+    logs = Path(page.logs)
+    # before the priority is lowered, which holds must not inherit
+    starter = HoldStarter(logs, Path(page.configurations), page.units)
+    os.nice(max(0, _NICE - os.nice(0)))
+    with contextlib.closing(starter), publish_address(logs, address.base_url, not accounts.users):
+        _run_server(
+            {name: HoldFeed(where) for name, where in holds.items()},
+            page,
+            accounts,
+            starter,
+            idle_s,
+        )
+
+
+def _run_server(
+    feeds: dict[str, HoldFeed],
+    page: ServiceConfig,
+    accounts: Accounts,
+    starter: HoldStarter,
+    idle_s: float,
+) -> None:
+    address = public_address(page)
     guard = ConnectionGuard(raise_file_limit())
     build_inside = app.build_middleware_stack
 
@@ -81,6 +124,19 @@ def serve(holds: dict[str, Where], page: WebConfig) -> None:
         return LoginMiddleware(inside, accounts, address, stop_handler(feeds), guard)
 
     app.build_middleware_stack = build_middleware_stack  # type: ignore[method-assign]
+    idle_end = IdleEnd(idle_s, time.monotonic())
+
+    def look_after() -> None:
+        """End a service that nobody uses; keep the log of a hold short."""
+        viewers = sum(client.has_socket_connection for client in Client.instances.values())
+        holding = any(not feed.seen.problem for feed in feeds.values())
+        idle_end.note_use(time.monotonic(), viewers, holding)
+        starter.limit_log()
+        if idle_end.is_due(time.monotonic()):
+            print("membrane-ctrl serve: unused; ends", file=sys.stderr, flush=True)
+            app.shutdown()
+
+    app.timer(_LOOK_AFTER_S, look_after)
     for feed in feeds.values():
         app.on_startup(feed.open)
         app.on_shutdown(feed.close)
@@ -90,7 +146,9 @@ def serve(holds: dict[str, Where], page: WebConfig) -> None:
     @ui.page("/", title="membrane_ctrl")
     def view(request: Request, hold: str = "") -> None:
         user: WebUser = request.scope["membrane_user"]
-        WebPage(feeds, hold if hold in feeds else next(iter(feeds)), user, views).build()
+        shown = hold if hold in feeds else next(iter(feeds))
+        is_ours = feeds[shown].logs == Path(page.logs)
+        WebPage(feeds, shown, user, views, starter if is_ours else None).build()
 
     @app.get("/chart")
     async def chart(hold: str, signal: str, span: str, utc: bool) -> Response:
@@ -121,7 +179,7 @@ def serve(holds: dict[str, Where], page: WebConfig) -> None:
             return PlainTextResponse(str(error), 503)
 
     link = address.base_url + ("" if accounts.users else f"?key={accounts.secret}")
-    print(f"membrane-ctrl web: open {link}", file=sys.stderr, flush=True)
+    print(f"membrane-ctrl serve: open {link}", file=sys.stderr, flush=True)
     ui.run(
         host=page.host,
         port=page.port,
@@ -168,7 +226,7 @@ class HangUp:
         if not left:
             user: WebUser = scope["membrane_user"]
             print(
-                f"membrane-ctrl web: viewer {user.name} does not read: hung up",
+                f"membrane-ctrl serve: viewer {user.name} does not read: hung up",
                 file=sys.stderr,
                 flush=True,
             )
@@ -180,7 +238,7 @@ def report_page(logs: Path | None, name: str) -> HTMLResponse:
     if folder is None:
         return HTMLResponse("no such run", 404)
     try:
-        text = files.read_bytes(folder / REPORT, _REPORT_BYTES_MAX).decode("utf-8", "replace")
+        text = files.read_bytes(folder / REPORT_NAME, _REPORT_BYTES_MAX).decode("utf-8", "replace")
     except (OSError, ValueError):  # ValueError: a name that no file can have
         return HTMLResponse("no report yet", 404)
     sandbox = "sandbox allow-scripts; default-src 'unsafe-inline' data:"

@@ -32,7 +32,7 @@ EXTRAS = ("nicegui", "fastapi", "starlette", "bokeh", "h5py", "distributed", "ap
 @pytest.mark.parametrize(
     ("words", "expected"),
     [
-        (["web"], "`web` needs nicegui: pip install 'membrane-ctrl[web]'"),
+        (["serve"], "`serve` needs nicegui: pip install 'membrane-ctrl[web]'"),
         (
             ["tune", "explore", "absent"],
             "`tune explore` needs bokeh: pip install 'membrane-ctrl[web]'",

@@ -17,7 +17,6 @@ from membrane_ctrl.config.port import (
     OpcuaConfig,
     PortConfig,
     TlsConfig,
-    WebConfig,
 )
 from membrane_ctrl.config.schema import Config
 from membrane_ctrl.model.errors import Exit, InputError
@@ -63,20 +62,15 @@ def missing(*libraries: str) -> Callable[[str], object]:
     return lambda name: None if name in libraries else found(name)
 
 
-def test_a_page_without_its_library_is_refused_as_by_a_hold(
+def test_where_the_page_would_be(
     capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    config = Config(web=WebConfig())
-    assert would(config, capsys)["page"] == "http://127.0.0.1:7480/ for whoever has its link"
-    assert would(Config(), capsys)["page"] == "none: no [web]"
+    assert would(Config(), capsys)["page"].startswith("of the service")
+    off = Config(port=PortConfig(enabled=False))
+    assert would(off, capsys)["page"] == "none: port.enabled = false"
     monkeypatch.setattr("importlib.util.find_spec", missing("nicegui"))
-    with pytest.raises(InputError) as refused:
-        check_config(config, "lab.toml", as_json=True)
-    line = "lab.toml: [web] needs nicegui: pip install 'membrane-ctrl[web]'"
-    assert refused.value.lines == (line,)
-    (finding,) = json.loads(capsys.readouterr().out)["findings"]
-    assert (finding["severity"], finding["field"]) == ("error", "web")
-    assert finding["remedy"] == "pip install 'membrane-ctrl[web]'"
+    line = "none: it needs nicegui: pip install 'membrane-ctrl[web]'"
+    assert would(Config(), capsys)["page"] == line
 
 
 def test_a_bridge_without_its_library_is_named_and_the_hold_is_possible(

@@ -116,7 +116,7 @@ def test_what_is_written_reads_back_the_same() -> None:
 def test_every_default_is_written_out() -> None:
     tables = tomllib.loads(dump_toml(Config()))
     assert tables["loop"]["ti_s"] == Config().loop.ti_s
-    assert set(tables) == set(Config.model_fields) - {"devices", "web"}
+    assert set(tables) == set(Config.model_fields) - {"devices"}
 
 
 @pytest.mark.parametrize(

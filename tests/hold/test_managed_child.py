@@ -147,17 +147,3 @@ def test_a_child_beyond_its_replacements_is_not_killed_and_may_recover() -> None
     agency.theirs[-1].send(Alive(5.0).to_dict())
     managed.check_child(1208.0)
     assert kinds(managed.check_child(1214.0)) == ["child_silent"]
-
-
-def test_a_program_may_be_silent_and_its_end_is_reported_once() -> None:
-    agency = Agency()
-    page = ManagedChild(agency.make, reports=False)
-    page.start(0.0)
-    assert page.check_child(1e6) == []
-    page.child.kill()
-    assert kinds(page.check_child(1e6)) == ["child_ended", "child_restarted"]
-    assert page.check_child(1e6 + 3000.0) == []
-    page.child.kill()
-    assert kinds(page.check_child(1e6 + 3001.0)) == ["child_ended"]
-    assert page.check_child(1e6 + 3001.5) == []
-    assert kinds(page.check_child(1e6 + 3010.0)) == ["child_restarted"]

@@ -7,7 +7,7 @@ from __future__ import annotations
 import pytest
 from pydantic import ValidationError
 
-from membrane_ctrl.config.port import WebConfig
+from membrane_ctrl.config.service import ServiceConfig
 from membrane_ctrl.service.public_address import (
     PublicAddress,
     host_name,
@@ -16,15 +16,15 @@ from membrane_ctrl.service.public_address import (
 )
 
 PROXIED = public_address(
-    WebConfig(public_url="https://Lab.example/mirror/".lower(), users_file="users")
+    ServiceConfig(public_url="https://Lab.example/mirror/".lower(), users_file="users")
 )
 
 
 def test_without_a_public_address_the_page_is_where_it_listens() -> None:
-    address = public_address(WebConfig(port=7480))
+    address = public_address(ServiceConfig(port=7480))
     assert (address.base_url, address.home, address.prefix) == ("http://127.0.0.1:7480/", "/", "")
     assert address.cookie_attributes == "HttpOnly; SameSite=Strict; Path=/"
-    assert public_address(WebConfig(host="::1")).base_url == "http://[::1]:7480/"
+    assert public_address(ServiceConfig(host="::1")).base_url == "http://[::1]:7480/"
     assert address.admits_origin("http://127.0.0.1:7480", "127.0.0.1:7480")
     assert not address.admits_origin("http://127.0.0.1:7481", "127.0.0.1:7480")
     assert not address.admits_origin("null", "127.0.0.1:7480")
@@ -95,20 +95,20 @@ def test_the_prefix_is_removed_once(path: str, inside: str) -> None:
 )
 def test_a_public_address_that_is_none_is_refused(url: str) -> None:
     with pytest.raises(ValidationError, match="public_url"):
-        WebConfig(public_url=url, users_file="users")
+        ServiceConfig(public_url=url, users_file="users")
 
 
 def test_a_public_address_on_other_machines_needs_tls_and_names() -> None:
     for url, users_file in (("http://lab.example/", "users"), ("https://lab.example/", None)):
         with pytest.raises(ValidationError, match="other machines need TLS and a login"):
-            WebConfig(public_url=url, users_file=users_file)
-    WebConfig(public_url="http://localhost:8080/mirror")
+            ServiceConfig(public_url=url, users_file=users_file)
+    ServiceConfig(public_url="http://localhost:8080/mirror")
 
 
 def test_a_proxy_that_is_no_address_is_refused() -> None:
     for text in ("proxy", "10.0.0.1/99", ""):
         with pytest.raises(ValidationError, match="trusted_proxies"):
-            WebConfig(trusted_proxies=(text,))
+            ServiceConfig(trusted_proxies=(text,))
 
 
 @pytest.mark.parametrize(
@@ -139,12 +139,12 @@ def test_a_proxy_that_is_no_address_is_refused() -> None:
 def test_the_source_is_the_client_if_a_trusted_proxy_names_it(
     peer: str, forwarded: list[str], source: str
 ) -> None:
-    address = public_address(WebConfig(trusted_proxies=("127.0.0.1", "192.0.2.0/24")))
+    address = public_address(ServiceConfig(trusted_proxies=("127.0.0.1", "192.0.2.0/24")))
     assert address.source_of(peer, forwarded) == source
 
 
 def test_without_a_trusted_proxy_no_header_counts() -> None:
-    assert public_address(WebConfig()).source_of("127.0.0.1", ["198.51.100.7"]) == "127.0.0.1"
+    assert public_address(ServiceConfig()).source_of("127.0.0.1", ["198.51.100.7"]) == "127.0.0.1"
 
 
 @pytest.mark.parametrize(

@@ -16,7 +16,8 @@ from pathlib import Path
 import pytest
 from typer.testing import CliRunner
 
-from membrane_ctrl.config.port import PortConfig, TlsConfig, WebConfig
+from membrane_ctrl.config.port import PortConfig, TlsConfig
+from membrane_ctrl.config.service import ServiceConfig
 from membrane_ctrl.model.errors import DeviceError, InputError
 from membrane_ctrl.web import cli, server
 from tests.control_port.port_certificates import Authority, tls_fleet
@@ -185,8 +186,8 @@ def test_an_address_that_is_taken_is_named() -> None:
         with pytest.raises(
             DeviceError, match=rf"web: cannot listen on 127.0.0.1:{port} \(address already in use\)"
         ):
-            server.require_servable(WebConfig(port=port))
-    server.require_servable(WebConfig(host="::1", port=port))
+            server.require_servable(ServiceConfig(port=port))
+    server.require_servable(ServiceConfig(host="::1", port=port))
 
 
 def test_half_a_pair_is_refused(lab: Path) -> None:

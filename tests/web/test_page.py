@@ -16,12 +16,13 @@ import pytest
 from pydantic import ValidationError
 from typer.testing import CliRunner
 
-from membrane_ctrl.config.port import WebConfig
 from membrane_ctrl.config.schema import Config, LoopConfig
+from membrane_ctrl.config.service import ServiceConfig
 from membrane_ctrl.model.errors import InputError
 from membrane_ctrl.model.events import LockSet
 from membrane_ctrl.model.run_events import Mark
 from membrane_ctrl.service.access import WebUser
+from membrane_ctrl.service.ended_run import REPORT_NAME
 from membrane_ctrl.sessions.folder import create_session
 from membrane_ctrl.sessions.live_hold import Progress
 from membrane_ctrl.sessions.live_log import LiveLog
@@ -41,7 +42,7 @@ def free_port() -> int:
 
 @asynccontextmanager
 async def served(folder: Path, *options: str) -> AsyncIterator[str]:
-    """`membrane-ctrl web` on a folder of runs; yields the link that it prints."""
+    """`membrane-ctrl serve` on a folder of runs; yields the link that it prints."""
     env = {
         name: value for name, value in os.environ.items() if name != "PYTEST_CURRENT_TEST"
     }  # NiceGUI looks for it
@@ -61,7 +62,7 @@ async def served(folder: Path, *options: str) -> AsyncIterator[str]:
         assert process.stderr is not None
         async with asyncio.timeout(_START_S):
             line = (await process.stderr.readline()).decode()
-        assert line.startswith("membrane-ctrl web: open http"), line
+        assert line.startswith("membrane-ctrl serve: open http"), line
         yield line.split()[-1]
     finally:
         process.terminate()
@@ -300,13 +301,13 @@ def test_other_machines_need_tls_and_names(tmp_path: Path) -> None:
     assert "host 0.0.0.0: other machines need TLS and a login" in str(done.exception)
     files = {"certificate_file": "c", "key_file": "k"}
     with pytest.raises(ValidationError, match="need TLS and a login"):
-        WebConfig(host="0.0.0.0", **files)
-    WebConfig(host="0.0.0.0", users_file="users", **files)
-    assert server.accounts_of(WebConfig()).users == {}
+        ServiceConfig(host="0.0.0.0", **files)
+    ServiceConfig(host="0.0.0.0", users_file="users", **files)
+    assert server.accounts_of(ServiceConfig()).users == {}
     empty = tmp_path / "users"
     empty.write_text("")
     with pytest.raises(InputError, match="no users; add one with"):
-        server.accounts_of(WebConfig(users_file=str(empty)))
+        server.accounts_of(ServiceConfig(users_file=str(empty)))
 
 
 @pytest.mark.parametrize("name", ["..", ".", "", "../secret", "a/b", ".hidden"])
@@ -337,7 +338,7 @@ def test_a_reader_starts_no_writing(tmp_path: Path, monkeypatch: pytest.MonkeyPa
     assert started == []
     assert runs_panel.report_problem(run, operator) == ""
     assert started == [("report", str(run))]
-    (run / runs_panel.REPORT).write_text("written")
+    (run / REPORT_NAME).write_text("written")
     assert runs_panel.report_problem(run, reader) == "", "what exists may be read"
     assert len(started) == 1
     assert runs_panel.run_folder(tmp_path, "run") == run

@@ -105,7 +105,7 @@ async def test_a_viewer_who_does_not_read_is_hung_up_on(
     scope = {"type": "websocket", "membrane_user": WebUser("anna", "read")}
     await server.HangUp(app)(scope, receive, send)  # type: ignore[arg-type]
     assert capsys.readouterr().err == (
-        "" if leaves else "membrane-ctrl web: viewer anna does not read: hung up\n"
+        "" if leaves else "membrane-ctrl serve: viewer anna does not read: hung up\n"
     )
 
 
