@@ -27,6 +27,9 @@ from tests.support.undrawn import undrawn_figures
 _LOCKS_FOLDER = tempfile.mkdtemp(prefix="membrane-locks-")
 _NUMBERS = itertools.count()
 os.environ[lock_store.VARIABLE] = _LOCKS_FOLDER
+# The keys of a test's services are its own.
+_STATE_FOLDER = tempfile.mkdtemp(prefix="membrane-state-")
+os.environ["XDG_STATE_HOME"] = _STATE_FOLDER
 # No hold of a test starts a service, unless the test is about that.
 os.environ["MEMBRANE_CTRL_SERVICE"] = "false"
 
@@ -60,6 +63,7 @@ def pytest_terminal_summary(terminalreporter: pytest.TerminalReporter) -> None:
 
 def pytest_sessionfinish() -> None:
     shutil.rmtree(_LOCKS_FOLDER, ignore_errors=True)
+    shutil.rmtree(_STATE_FOLDER, ignore_errors=True)
 
 
 @pytest.fixture
@@ -104,6 +108,9 @@ def own_locks() -> Iterator[None]:
     os.environ[lock_store.VARIABLE] = _LOCKS_FOLDER
 
 
+# The keys of a test's services are its own.
+_STATE_FOLDER = tempfile.mkdtemp(prefix="membrane-state-")
+os.environ["XDG_STATE_HOME"] = _STATE_FOLDER
 # No hold of a test starts a service, unless the test is about that.
 os.environ["MEMBRANE_CTRL_SERVICE"] = "false"
 

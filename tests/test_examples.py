@@ -50,7 +50,10 @@ def test_there_are_examples() -> None:
 def test_an_example_is_printed_as_it_is(capsys: pytest.CaptureFixture[str]) -> None:
     assert run(["examples"]) == 0
     listed = [line.split()[0] for line in capsys.readouterr().out.splitlines()]
-    assert set(listed) >= {path.name for path in EXAMPLES} | {"membrane-ctrl.service"}
+    assert set(listed) >= {path.name for path in EXAMPLES} | {
+        "membrane-hold@.service",
+        "membrane-service.service",
+    }
     assert run(["examples", "paper-bench.toml"]) == 0
     assert capsys.readouterr().out == EXAMPLES[0].with_name("paper-bench.toml").read_text()
     assert run(["examples", "../__init__.py"]) == 2

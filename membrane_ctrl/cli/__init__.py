@@ -132,7 +132,7 @@ def examples(
         for path in files.values():
             print(
                 f"{path.name:22} "
-                f"{path.read_text(encoding='utf-8').partition(chr(10))[0].lstrip('# ')}"
+                f"{path.read_text(encoding='utf-8').partition(chr(10))[0].lstrip('#/ ')}"
             )
     elif name in files:
         print(files[name].read_text(encoding="utf-8"), end="")

@@ -26,6 +26,7 @@ LOG_NAME = "service.log"
 _IDLE_WORDS = ("--idle-end", "1h")
 _NICE = 10
 _ENDS_S = 10.0
+_STARTS_S = 10.0
 
 
 def start_page_service(
@@ -65,25 +66,27 @@ def start_page_service(
             stack.callback(service.stop, _ENDS_S)
         else:
             _start_in_session([*words, *_IDLE_WORDS], logs / LOG_NAME)
-    except (errors.DeviceError, OSError) as error:
+    except (errors.DeviceError, OSError, subprocess.TimeoutExpired) as error:
         warn(f"no page: {error}")
         return ""
     return link
 
 
 def _start_in_session(words: list[str], log: Path) -> None:
-    """Start one of our commands in a session of its own, and forget it."""
+    """Start one of our commands in a session of its own, no child of this program, and forget it.
+    Raises OSError.
+    """
     handle = os.open(log, os.O_WRONLY | os.O_CREAT | os.O_TRUNC | os.O_APPEND, 0o600)
+    detached = ["nice", "-n", str(_NICE), "setsid", "--fork", sys.executable]
     with os.fdopen(handle, "wb") as output:
-        process = subprocess.Popen(
-            [sys.executable, "-m", "membrane_ctrl", *words],
+        subprocess.run(
+            [*detached, "-m", "membrane_ctrl", *words],
             stdin=subprocess.DEVNULL,
             stdout=output,
             stderr=output,
-            start_new_session=True,
+            check=False,
+            timeout=_STARTS_S,
         )
-    os.setpriority(os.PRIO_PROCESS, process.pid, _NICE)
-    process.returncode = 0  # it outlives this program: nobody waits for it
 
 
 def _find_free_port() -> int:

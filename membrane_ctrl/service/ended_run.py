@@ -14,12 +14,14 @@ from membrane_ctrl.model import errors, events, run_events
 from membrane_ctrl.model.errors import Exit
 from membrane_ctrl.model.standing_fault import fault_of_end, standing_fault_after
 from membrane_ctrl.model.telemetry import State
+from membrane_ctrl.run_files import table_specs
 from membrane_ctrl.run_files.event_log import LoggedEvent
 from membrane_ctrl.run_files.run import Run, open_run
+from membrane_ctrl.run_files.table_store.reader import TableReader
 
 REPORT_NAME = "report.html"
 _EVENTS_MOST = 200
-_LAST_TICKS_S = 60.0
+_LAST_TICKS_S = 1.0
 _STOP_BEFORE_END_S = 120.0  # a stop that is older ended nothing: the run went on
 _READ_BACK = ("pump_readback_fraction", "vent_readback_fraction", "state")
 # Words of the recorder for an end without the control process (`recorder/process.py`)
@@ -84,11 +86,6 @@ class EndedRun:
     def name(self) -> str:
         """Name of the run."""
         return self.folder.name
-
-    @property
-    def has_report(self) -> bool:
-        """Whether the run's report is written."""
-        return (self.folder / REPORT_NAME).exists()
 
     @property
     def cause(self) -> str:
@@ -173,10 +170,8 @@ def read_ended_run(folder: Path) -> EndedRun:
     run = open_run(folder)
     end = _find_end(run.log)
     end_s = end.mono_s if end is not None else (run.log[-1].mono_s if run.log else 0.0)
-    read_s, pump, vent, state = _read_last_tick(run, end_s)
-    exit_word = (
-        end.event.exit if end is not None and isinstance(end.event, run_events.Ended) else None
-    )
+    read_s, pump, vent, state = _read_last_tick(run)
+    exit_word = _exit_of(end)
     fault, fault_s = _find_fault(run.log, exit_word)
     stop = _find_stop(run.log, end_s)
     last_s = max(end_s, read_s) if math.isfinite(read_s) else end_s
@@ -261,18 +256,15 @@ def _find_stop(log: Sequence[LoggedEvent], end_s: float) -> events.CommandTaken 
     return None
 
 
-def _read_last_tick(run: Run, end_s: float) -> tuple[float, float, float, str]:
+def _read_last_tick(run: Run) -> tuple[float, float, float, str]:
     """Return time, pump, vent and state of the last tick; NaN and an empty state without one."""
     with suppress(OSError, ValueError, errors.CommandError):
-        blocks = [
-            block
-            for block in run.tick_blocks(("mono_s", *_READ_BACK), end_s - _LAST_TICKS_S)
-            if block["mono_s"].size
-        ]
+        newest = TableReader(run.folder, table_specs.TICKS, []).read_newest("mono_s")
+        names = ("mono_s", *_READ_BACK)
+        begin_s = math.inf if newest is None else float(newest.as_py()) - _LAST_TICKS_S
+        blocks = [block for block in run.tick_blocks(names, begin_s) if block["mono_s"].size]
         if blocks:
-            time_s, pump, vent, code = (
-                float(blocks[-1][name][-1]) for name in ("mono_s", *_READ_BACK)
-            )
+            time_s, pump, vent, code = (float(blocks[-1][name][-1]) for name in names)
             state = State(int(code)).name.lower() if math.isfinite(code) else ""
             return time_s, pump, vent, state
     return math.nan, math.nan, math.nan, ""

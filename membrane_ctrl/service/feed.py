@@ -196,14 +196,14 @@ class HoldFeed:
             ) as error:  # whatever this hold causes, its feed tries again and the others continue
                 problem = f"{type(error).__name__}: {error}"
             self.seen = replace(self.seen, problem=problem, role="read")
-            self._read_ended_run()
+            self.update_ended_run()
             self._ending.wait(_AGAIN_S)
 
     def _has_socket(self) -> bool:
         """Whether a hold is or was there: one that ends removes its socket file."""
         return bool(self._where.tls) or socket_path(self._where).exists()
 
-    def _read_ended_run(self) -> None:
+    def update_ended_run(self) -> None:
         """Without a hold, read how the newest run ended, whenever its files have changed."""
         logs = self.logs
         folder = None if logs is None else find_newest_run(logs)

@@ -103,15 +103,24 @@ class HoldStarter:
             found += [_read_configuration(file) for file in files if _is_configuration(file)]
         return [each for each in found if each.has_devices or each.problem or not self._units]
 
+    def is_running(self) -> bool:
+        """Whether the program that was started last still runs; False for a unit."""
+        with self._lock:
+            if self._process is None:
+                return False
+            code = self._process.poll()
+            if code is None:
+                return True
+            self._process = None
+            if code not in (errors.Exit.DONE, errors.Exit.INTERRUPTED):
+                self._failure = f"the hold ended with code {code}: {self._read_tail()}"
+            return False
+
     @property
     def failure(self) -> str:
         """Why the last start failed; empty if it did not, or while it lasts."""
+        self.is_running()
         with self._lock:
-            if self._process is not None and self._process.poll() is not None:
-                code = self._process.returncode
-                self._process = None
-                if code not in (errors.Exit.DONE, errors.Exit.INTERRUPTED):
-                    self._failure = f"the hold ended with code {code}: {self._read_tail()}"
             return self._failure
 
     def start_hold(self, name: str, who: str, options: StartOptions) -> Future[None]:

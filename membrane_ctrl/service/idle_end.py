@@ -4,8 +4,6 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-IDLE_S = 3600.0
-
 
 @dataclass(slots=True)
 class IdleEnd:

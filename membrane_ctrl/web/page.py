@@ -180,7 +180,7 @@ class WebPage:
         self._why = ui.label().classes("text-subtitle1").props('role="status"')
         self._alarm = ui.label().classes("text-negative text-bold").props('role="alert"')
         if self._logs is not None:
-            self._no_hold = NoHoldPanel(self._feed, self._hold, self._user, self._starter)
+            NoHoldPanel(self._feed, self._hold, self._user, self._starter)
         with ui.row().classes("w-full items-stretch no-wrap max-lg:flex-wrap"):
             with ui.column().classes("col-grow"):
                 self._numbers = self._build_numbers()

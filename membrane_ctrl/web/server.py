@@ -131,6 +131,7 @@ def _run_server(
         viewers = sum(client.has_socket_connection for client in Client.instances.values())
         holding = any(not feed.seen.problem for feed in feeds.values())
         idle_end.note_use(time.monotonic(), viewers, holding)
+        starter.is_running()  # takes the exit code of a hold that has ended
         starter.limit_log()
         if idle_end.is_due(time.monotonic()):
             print("membrane-ctrl serve: unused; ends", file=sys.stderr, flush=True)

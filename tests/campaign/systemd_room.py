@@ -15,7 +15,7 @@ from pathlib import Path
 import psutil
 
 SOURCE = Path(__file__).parents[2]
-_UNIT = "membrane-ctrl"
+_UNIT = "membrane-hold@lab"
 _UNITS = "/run/units"
 _PROGRAM = "/opt/membrane-ctrl/.venv/bin/membrane-ctrl"
 # not needed with an installed interpreter and package
@@ -29,7 +29,7 @@ mkdir -p {_UNITS}/{_UNIT}.service.d /run/told
 chown membrane /run/told
 printf '[Service]\\n{_PLACES}\\n' | tee {_UNITS}/{_UNIT}.service.d/room.conf > {_UNITS}/twin.service
 echo "ExecStart={_PROGRAM} twin --config /etc/membrane-ctrl/twin.toml" >> {_UNITS}/twin.service
-cp /opt/source/membrane_ctrl/examples/{_UNIT}.service {_UNITS}
+cp '/opt/source/membrane_ctrl/examples/membrane-hold@.service' {_UNITS}
 systemctl daemon-reload
 systemctl start systemd-journald.service
 """
@@ -142,7 +142,8 @@ class Room:
     def survivors(self) -> list[str]:
         """Processes that the service left behind."""
         return self.run(
-            f"cat /sys/fs/cgroup/system.slice/{_UNIT}.service/cgroup.procs 2> /dev/null || true"
+            f"group=$(systemctl show {_UNIT} -p ControlGroup --value); "
+            "[ -z $group ] || cat /sys/fs/cgroup$group/cgroup.procs 2> /dev/null || true"
         ).split()
 
     def until(self, what: Callable[[], bool], patience_s: float = 60.0) -> None:

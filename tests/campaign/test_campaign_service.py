@@ -91,7 +91,7 @@ def test_a_stop_is_clean_and_stays(room: Room) -> None:
     room.fresh()
     room.start()
     room.until(lambda: room.status_has("inflate"))
-    room.run("systemctl stop membrane-ctrl")
+    room.run("systemctl stop membrane-hold@lab")
     assert room.settled("inactive")
     assert "Deactivated successfully" in room.log()
     assert "pump 0" in room.log()
@@ -143,7 +143,7 @@ def test_a_trip_stays_down_and_the_next_start_names_it(room: Room) -> None:
     assert room.show("ExecMainStatus", "NRestarts") == {"ExecMainStatus": "5", "NRestarts": "0"}
     fault = json.loads(room.run(f"cat {LATCHED}"))["name"]
     assert fault == "link_lost"
-    room.run("systemctl start membrane-ctrl || true")
+    room.run("systemctl start membrane-hold@lab || true")
     assert room.show("ExecMainStatus")["ExecMainStatus"] == "4"
     assert f"a fault is latched: {fault}" in room.log()
 
@@ -161,7 +161,7 @@ def test_a_trip_stays_down_and_the_next_start_names_it(room: Room) -> None:
 def test_a_damaged_latched_fault_file_keeps_it_down(room: Room, damage: str) -> None:
     room.fresh()
     room.run(f"install -d -o membrane -g membrane {RUNS}; {damage}")
-    room.run("systemctl start membrane-ctrl || true")
+    room.run("systemctl start membrane-hold@lab || true")
     assert room.show("ActiveState", "ExecMainStatus") == {
         "ActiveState": "failed",
         "ExecMainStatus": "4",
@@ -174,7 +174,7 @@ def test_in_standby_it_runs_with_a_latched_fault_and_holds_only_after_a_person_a
 ) -> None:
     room.fresh()
     room.run(f"install -d -o membrane -g membrane {RUNS}; : > {LATCHED}; chown membrane {LATCHED}")
-    unit = "/run/units/membrane-ctrl.service"
+    unit = "/run/units/membrane-hold@.service"
     room.run(f"sed -i '/^ExecStart=/s/$/ --standby/' {unit}; systemctl daemon-reload")
     try:
         room.start()
@@ -185,7 +185,7 @@ def test_in_standby_it_runs_with_a_latched_fault_and_holds_only_after_a_person_a
         room.until(lambda: room.status_has("inflate"))
     finally:
         room.run(
-            f"cp /opt/source/membrane_ctrl/examples/membrane-ctrl.service {unit}; systemctl "
+            f"cp '/opt/source/membrane_ctrl/examples/membrane-hold@.service' {unit}; systemctl "
             "daemon-reload"
         )
 
@@ -205,7 +205,7 @@ def test_a_member_of_the_group_operates_and_a_stranger_does_not_come_near(room: 
 
 @needs("Xvfb", "xauth", "xhost", "xdpyinfo")
 def test_the_service_reaches_a_desktops_display_once_it_may(room: Room) -> None:
-    unit = "/opt/source/membrane_ctrl/examples/membrane-ctrl.service"
+    unit = "/opt/source/membrane_ctrl/examples/membrane-hold@.service"
     edits = (
         "-e 's,^ExecStart=.*,ExecStart=/usr/bin/xdpyinfo -display :7,' -e '/^ExecStopPost/d' -e "
         "'/^Restart/d'"

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import asyncio
 import json
+import os
 import re
 import signal
 import subprocess
@@ -29,6 +30,8 @@ import psutil
 import socketio
 from aiohttp import ClientConnectionError, ClientSession, CookieJar
 
+from membrane_ctrl.control_port.service_link import find_service
+from membrane_ctrl.hold.page_service import LOG_NAME
 from membrane_ctrl.run_files.run import open_run
 from tests.support.figures import Figure, at_most
 
@@ -160,7 +163,7 @@ def hold_with_page(folder: Path) -> Iterator[tuple[psutil.Process, psutil.Proces
     """A `hold --twin`, its page, the page's link and the folder of the run; the hold is stopped
     afterwards.
     """
-    (folder / "lab.toml").write_text("[twin]\nport = 0\n[web]\nport = 7489\n")
+    (folder / "lab.toml").write_text("[twin]\nport = 0\n")
     command = [
         sys.executable,
         "-m",
@@ -171,19 +174,21 @@ def hold_with_page(folder: Path) -> Iterator[tuple[psutil.Process, psutil.Proces
         str(folder / "lab.toml"),
     ]
     none = subprocess.DEVNULL
+    logs = folder / "logs"
+    # in CI the service is a child, which ends with the hold
+    env = os.environ | {"CI": "true", "MEMBRANE_CTRL_SERVICE": "true"}
     hold = psutil.Popen(
-        [*command, "--logs", str(folder / "logs")], stdin=none, stdout=none, stderr=none
+        [*command, "--logs", str(logs)], stdin=none, stdout=none, stderr=none, env=env
     )
     try:
         give_up_s = time.monotonic() + 120.0
-        while not (
-            found := [log for log in folder.glob("logs/*/web.log") if "?key=" in log.read_text()]
-        ):
+        while not (link := find_service(logs)):
             assert time.monotonic() < give_up_s, "the page does not start"
             time.sleep(0.5)
         time.sleep(_HOLDS_S)
         (page,) = (child for child in hold.children() if "--with-hold" in child.cmdline())
-        yield hold, page, found[0].read_text().split()[-1], found[0].parent
+        (run,) = (events.parent for events in logs.glob("*/events.jsonl"))
+        yield hold, page, link, run
     finally:
         hold.send_signal(signal.SIGINT)
         hold.wait(120.0)
@@ -237,7 +242,7 @@ def measure_viewers(
             begin_mb = page.memory_info().rss / 1e6
             phases = list(phases_of(link, page, count, cycles, beside))
             grown_mb = page.memory_info().rss / 1e6 - begin_mb
-            hung_up = (run_folder / "web.log").read_text().count("does not read: hung up")
+            hung_up = (run_folder.parent / LOG_NAME).read_text().count("does not read: hung up")
         judge(phases, run_folder)
     without, viewed = ([phase for phase in phases if phase.viewed is on] for on in (False, True))
     late_ms = [median(phase.late_p99_ms for phase in part) for part in (without, viewed)]

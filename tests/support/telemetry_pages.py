@@ -43,7 +43,7 @@ these columns: in the run's tables ([recording](recording.md)), in the viewer, a
 [Prometheus](control-port.md#metrics). A name ends in its unit: `_um` is µm. A value that is not known is missing: it
 is NaN, or null in tables.
 
-*Overview* is what the tables of 1, 10 and 60 s keep. *Shown* columns are on the [page](../how-to/web.md), on the console, in
+*Overview* is what the tables of 1, 10 and 60 s keep. *Shown* columns are on the [page](../how-to/service.md), on the console, in
 `ctl status`, in the dashboard and in the [bridges](../how-to/bridges.md). *Entity* is the path in the [viewer](rerun.md).
 """  # noqa: E501
 _HEAD = "| column | unit | label | what | overview | shown | entity |"

@@ -1,0 +1,166 @@
+"""The units of systemd: one for the service, one for each hold, and the rule that lets the service
+start holds.
+
+They are written from the files in `examples/`, with the path of this program and its user.
+"""
+
+from __future__ import annotations
+
+import pwd
+import subprocess
+import sys
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+from membrane_ctrl.model import errors, files
+
+EXAMPLES = Path(__file__).parents[1] / "examples"
+USER = "membrane"
+SERVICE_UNIT = "membrane-service.service"
+HOLD_UNIT = "membrane-hold@.service"
+_STATE = "/var/lib/membrane-ctrl"
+_CONFIGURATIONS = "/etc/membrane-ctrl"
+_PROGRAM = "/opt/membrane-ctrl/.venv/bin/membrane-ctrl"
+_TARGETS = {
+    SERVICE_UNIT: "etc/systemd/system",
+    HOLD_UNIT: "etc/systemd/system",
+    "50-membrane-ctrl.rules": "etc/polkit-1/rules.d",
+}
+_SETTINGS = "service.toml"
+_SETTINGS_TEXT = f"""# Settings of the service (docs/how-to/service.md).
+logs = "{_STATE}/logs"
+configurations = "{_CONFIGURATIONS}"
+units = true
+"""
+
+
+@dataclass(frozen=True, slots=True)
+class InstalledFile:
+    """A file that `service install` writes."""
+
+    path: Path
+    text: str
+
+
+def list_files(root: Path, program: Path) -> list[InstalledFile]:
+    """Return the files of the installation.
+
+    Parameters
+    ----------
+    root : Path
+        `/`, or the folder of a package or an image.
+    program : Path
+        `membrane-ctrl`, as the units call it.
+    """
+    return [
+        InstalledFile(
+            root / folder / name,
+            files.read_text(EXAMPLES / name).replace(_PROGRAM, str(program)),
+        )
+        for name, folder in _TARGETS.items()
+    ]
+
+
+def install_units(root: Path, program: Path) -> list[Path]:
+    """Write units, rule and, if there are none, settings; make the user; start the service.
+
+    Parameters
+    ----------
+    root : Path
+        Another folder than `/`: only write the files.
+    program : Path
+        `membrane-ctrl`, as the units call it.
+
+    Returns
+    -------
+    list of Path
+        What was written.
+
+    Raises
+    ------
+    InputError
+        The program's path cannot stand in a unit.
+    DeviceError
+        A file cannot be written, or a command of the system failed.
+    """
+    text = str(program)
+    if not program.is_absolute() or any(character in text for character in " \t\"'\\%$"):
+        raise errors.InputError(f"{program}: a unit needs an absolute path without spaces")
+    is_system = root == Path("/")
+    if is_system:
+        _make_user()
+    written = []
+    settings = root / _CONFIGURATIONS.lstrip("/") / _SETTINGS
+    wanted = list_files(root, program)
+    if not settings.exists():
+        wanted.append(InstalledFile(settings, _SETTINGS_TEXT))
+    for file in wanted:
+        with errors.convert_write_errors(file.path, errors.DeviceError, "; use sudo"):
+            file.path.parent.mkdir(parents=True, exist_ok=True)
+            files.write_text_atomic(file.path, file.text)
+            file.path.chmod(0o644)
+        written.append(file.path)
+    if is_system:
+        _run(["systemctl", "daemon-reload"])
+        _run(["systemctl", "enable", "--now", SERVICE_UNIT])
+    return written
+
+
+def remove_units(root: Path) -> list[Path]:
+    """Stop the service and remove units and rule; configurations, runs and user stay.
+
+    Returns
+    -------
+    list of Path
+        What was removed.
+
+    Raises
+    ------
+    DeviceError
+        A hold runs as a unit, a file cannot be removed, or a command of the system failed.
+    """
+    is_system = root == Path("/")
+    if is_system:
+        running = _run(["systemctl", "list-units", "--plain", "--no-legend", "membrane-hold@*"])
+        if running.strip():
+            unit = running.split()[0]
+            raise errors.DeviceError(f"{unit} runs; stop it before: systemctl stop {unit}")
+        if (root / _TARGETS[SERVICE_UNIT] / SERVICE_UNIT).exists():
+            _run(["systemctl", "disable", "--now", SERVICE_UNIT])
+    removed = []
+    for name, folder in _TARGETS.items():
+        path = root / folder / name
+        with errors.convert_write_errors(path, errors.DeviceError, "; use sudo"):
+            if path.exists():
+                path.unlink()
+                removed.append(path)
+    if is_system:
+        _run(["systemctl", "daemon-reload"])
+    return removed
+
+
+def own_program() -> Path:
+    """Return the path by which this program was called."""
+    return Path(sys.argv[0]).absolute()
+
+
+def _make_user() -> None:
+    """Make the user of service and holds, unless there is one."""
+    try:
+        pwd.getpwnam(USER)
+    except KeyError:
+        words = ["--system", "--user-group", "--home-dir", _STATE, "--shell", "/usr/sbin/nologin"]
+        _run(["useradd", *words, USER])
+
+
+def _run(words: Sequence[str]) -> str:
+    """Run a command of the system and return its output. Raises DeviceError."""
+    try:
+        done = subprocess.run(words, capture_output=True, text=True, check=False)
+    except OSError as error:
+        raise errors.DeviceError(f"{words[0]}: {errors.os_reason(error)}") from None
+    if done.returncode != 0:
+        reason = done.stderr.strip() or f"ended with code {done.returncode}"
+        raise errors.DeviceError(f"{' '.join(words)}: {reason}; use sudo")
+    return done.stdout

@@ -1,0 +1,180 @@
+"""A hold starts a service with its page if none follows its runs, and is not reached by its end."""
+
+from __future__ import annotations
+
+import os
+import signal
+import stat
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack, contextmanager, suppress
+from pathlib import Path
+
+import httpx
+import psutil
+import pytest
+
+from membrane_ctrl.control_port.service_link import add_key, find_service, publish_address
+from membrane_ctrl.hold import page_service
+from membrane_ctrl.hold.page_service import LOG_NAME, start_page_service
+from membrane_ctrl.model.errors import Exit
+from membrane_ctrl.processes.command_process import CommandProcess
+
+WAITS = (
+    "from membrane_ctrl.processes.command_process import end_with_parent; end_with_parent(); "
+    "import time; time.sleep(60)"
+)
+CONFIGURATION = "[twin]\nport = 0\nscenario = 'quiet'\n[shape]\nenabled = false\n"
+
+
+def until(found: Callable[[], object], patience_s: float = 120.0) -> None:
+    give_up_s = time.monotonic() + patience_s
+    while not found():
+        assert time.monotonic() < give_up_s
+        time.sleep(0.2)
+
+
+def test_a_service_that_is_there_is_used(tmp_path: Path) -> None:
+    with ExitStack() as stack, publish_address(tmp_path, "http://127.0.0.1:9/", has_link=True):
+        link = start_page_service(tmp_path, None, stack, pytest.fail)
+        assert link == add_key("http://127.0.0.1:9/")
+
+
+def test_without_the_library_of_the_page_one_line_says_so(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("importlib.util.find_spec", lambda name: None)
+    said: list[str] = []
+    with ExitStack() as stack:
+        assert start_page_service(tmp_path, None, stack, said.append) == ""
+    assert said == ["no page: it needs nicegui: pip install 'membrane-ctrl[web]'"]
+
+
+@pytest.mark.parametrize("ci", [True, False])
+def test_the_service_is_a_program_of_its_own(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, ci: bool
+) -> None:
+    """In CI it ends with the hold that started it; else it goes on."""
+    waits = tmp_path / "waits"
+    waits.write_text(f"#!{sys.executable}\nimport time\ntime.sleep(60)\n")
+    waits.chmod(0o755)
+    monkeypatch.setattr(sys, "executable", str(waits))
+    if ci:
+        monkeypatch.setenv("CI", "true")
+    else:
+        monkeypatch.delenv("CI", raising=False)
+    monkeypatch.setattr(page_service, "_find_free_port", lambda: 7499)
+    with ExitStack() as stack:
+        link = start_page_service(tmp_path, tmp_path / "lab.toml", stack, pytest.fail)
+        assert link == add_key("http://127.0.0.1:7499/")
+        own = os.getpriority(os.PRIO_PROCESS, 0)
+        until(lambda: services_of(tmp_path))
+        (child,) = services_of(tmp_path)
+        until(lambda: child.cmdline()[1] == str(waits))
+        assert child.nice() == max(own, 10)
+        words = child.cmdline()
+        assert words[words.index("--configurations") + 1] == str(tmp_path)
+        assert ("--with-hold" in words, "--idle-end" in words) == (ci, not ci)
+        assert (os.getsid(child.pid) == child.pid) is not ci
+        assert stat.S_IMODE((tmp_path / LOG_NAME).stat().st_mode) == 0o600
+    with suppress(psutil.NoSuchProcess):
+        assert child.is_running() is not ci
+        child.kill()
+        child.wait(30.0)
+
+
+def test_a_program_ends_when_its_parent_dies() -> None:
+    with subprocess.Popen([sys.executable, "-c", WAITS], stdin=subprocess.PIPE) as page:
+        assert page.stdin is not None
+        page.stdin.close()
+        assert page.wait(30.0) == -signal.SIGTERM
+
+
+def test_a_program_that_cannot_start_has_ended(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def refuse(*_: object, **__: object) -> None:
+        raise OSError("no more processes")
+
+    monkeypatch.setattr(subprocess, "Popen", refuse)
+    page = CommandProcess("page", ["serve", "--with-hold"], tmp_path / "gone" / "service.log", 10)
+    page.start()
+    assert (page.alive, page.exit_code) == (False, None)
+    page.kill()
+    page.stop(0.0)
+
+
+def services_of(logs: Path) -> list[psutil.Process]:
+    """The services of a folder of runs."""
+    found = []
+    for process in psutil.process_iter():
+        with suppress(psutil.Error):
+            words = process.cmdline()
+            if "serve" in words and str(logs) in words and "nice" not in words[0]:
+                found.append(process)
+    return found
+
+
+@contextmanager
+def holding(folder: Path) -> Iterator[subprocess.Popen[str]]:
+    """A hold of the twin that may start a service."""
+    (folder / "lab.toml").write_text(CONFIGURATION)
+    drop = {"PYTEST_CURRENT_TEST", "MEMBRANE_CTRL_SERVICE", "CI"}  # NiceGUI looks for the first
+    env = {name: value for name, value in os.environ.items() if name not in drop}
+    words = ["hold", "--twin", "--config", str(folder / "lab.toml"), "--logs", str(folder / "logs")]
+    with subprocess.Popen(
+        [sys.executable, "-m", "membrane_ctrl", *words],
+        stdin=subprocess.DEVNULL,
+        stderr=subprocess.PIPE,
+        env=env,
+        text=True,
+    ) as hold:
+        try:
+            yield hold
+        finally:
+            hold.kill()
+
+
+@pytest.mark.real_time
+def test_a_page_is_there_during_and_after_a_killed_hold_and_a_hold_outlives_it(
+    tmp_path: Path,
+) -> None:
+    logs = tmp_path / "logs"
+    services: list[psutil.Process] = []
+    try:
+        with holding(tmp_path) as hold:
+            until(lambda: find_service(logs))
+            link = str(find_service(logs))
+            services += services_of(logs)
+            (service,) = services
+            assert os.getsid(service.pid) == service.pid
+            with httpx.Client(follow_redirects=True, timeout=60.0) as browser:
+                until(lambda: "membrane_ctrl" in _text_of(browser, link))
+                service.kill()
+                service.wait(30.0)
+                assert find_service(logs) is None
+                assert hold.poll() is None, "the hold goes on"
+        with holding(tmp_path) as hold:
+            until(lambda: find_service(logs))
+            assert find_service(logs) == link, "a bookmark stays valid"
+            services += services_of(logs)
+            hold.send_signal(signal.SIGINT)
+            _, said = hold.communicate(timeout=120.0)
+            assert hold.returncode in (Exit.DONE, Exit.INTERRUPTED)
+            assert f"page:       {link}" in said
+            assert services[-1].is_running()
+    finally:
+        for each in services:
+            with suppress(psutil.NoSuchProcess):
+                each.kill()
+                each.wait(30.0)
+
+
+def _text_of(browser: httpx.Client, url: str) -> str:
+    with suppress(httpx.HTTPError):
+        answer = browser.get(url)
+        if answer.status_code == 200:
+            return answer.text
+    return ""

@@ -1,0 +1,80 @@
+"""Units, polkit rule and settings are written with this program's path, and removed again."""
+
+from __future__ import annotations
+
+import configparser
+import re
+from pathlib import Path
+
+import pytest
+from typer.testing import CliRunner
+
+from membrane_ctrl.config.service import ServiceConfig
+from membrane_ctrl.config.toml_file import load_toml
+from membrane_ctrl.model.errors import InputError
+from membrane_ctrl.service import cli
+from membrane_ctrl.service.hold_starter import options_file
+from membrane_ctrl.service.units import HOLD_UNIT, SERVICE_UNIT, USER, install_units
+
+UNITS = "etc/systemd/system"
+RULES = "etc/polkit-1/rules.d/50-membrane-ctrl.rules"
+SETTINGS = "etc/membrane-ctrl/service.toml"
+PROGRAM = Path("/srv/mirror/bin/membrane-ctrl")
+
+
+def unit_of(path: Path) -> configparser.SectionProxy:
+    parser = configparser.RawConfigParser(strict=False)
+    parser.optionxform = str  # type: ignore[assignment,method-assign]
+    parser.read(path)
+    return parser["Service"]
+
+
+def test_what_is_written_fits_together(tmp_path: Path) -> None:
+    install_units(tmp_path, PROGRAM)
+    settings = load_toml(tmp_path / SETTINGS, ServiceConfig)
+    hold, service = (unit_of(tmp_path / UNITS / name) for name in (HOLD_UNIT, SERVICE_UNIT))
+    assert settings.units
+    assert service["ExecStart"] == f"{PROGRAM} serve --config /{SETTINGS}"
+    start = f"{PROGRAM} hold --config {settings.configurations}/%i.toml --name %i --logs"
+    assert hold["ExecStart"] == f"{start} {settings.logs} --no-service $HOLD_OPTIONS"
+    assert f"safe --no-latch --logs {settings.logs}" in hold["ExecStopPost"]
+    assert hold["EnvironmentFile"] == f"-{options_file(Path(settings.logs), '%i')}"
+    assert hold["User"] == service["User"] == USER, "the rings check the user"
+    assert settings.logs.startswith(service["WorkingDirectory"])
+    rule = (tmp_path / RULES).read_text()
+    assert f'subject.user == "{USER}"' in rule
+    pattern = re.search(r"/(\^membrane-hold.*\$)/", rule)
+    assert pattern is not None
+    for unit, allowed in (
+        ("membrane-hold@lab.service", True),
+        ("membrane-hold@a.b-c.service", True),
+        ("membrane-service.service", False),
+        ("ssh.service", False),
+        ("xmembrane-hold@lab.service", False),
+        ("membrane-hold@../x.service", False),
+    ):
+        assert (re.search(pattern[1], unit) is not None) is allowed, unit
+
+
+def test_an_update_keeps_the_settings_and_removal_keeps_them_too(tmp_path: Path) -> None:
+    run = CliRunner().invoke
+    words = ["--root", str(tmp_path)]
+    assert run(cli.app, ["install", *words, "--program", str(PROGRAM)]).exit_code == 0
+    (tmp_path / SETTINGS).write_text('host = "0.0.0.0"\n')
+    other = "/other/bin/membrane-ctrl"
+    assert run(cli.app, ["install", *words, "--program", other]).exit_code == 0
+    assert other in (tmp_path / UNITS / HOLD_UNIT).read_text()
+    assert (tmp_path / SETTINGS).read_text() == 'host = "0.0.0.0"\n'
+    removed = run(cli.app, ["uninstall", *words])
+    assert removed.exit_code == 0
+    assert not any((tmp_path / UNITS).iterdir())
+    assert not (tmp_path / RULES).exists()
+    assert (tmp_path / SETTINGS).exists()
+    assert run(cli.app, ["uninstall", *words]).exit_code == 0, "twice is no error"
+
+
+@pytest.mark.parametrize("path", ["bin/membrane-ctrl", "/a b/membrane-ctrl", "/a%i/membrane-ctrl"])
+def test_a_path_that_a_unit_cannot_name_is_refused(tmp_path: Path, path: str) -> None:
+    with pytest.raises(InputError, match="absolute path without spaces"):
+        install_units(tmp_path, Path(path))
+    assert list(tmp_path.iterdir()) == []
