@@ -26,7 +26,9 @@ class Section(BaseModel):
     a number.
     """
 
-    model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
+    model_config = ConfigDict(
+        frozen=True, extra="forbid", allow_inf_nan=False, use_attribute_docstrings=True
+    )
 
     @model_validator(mode="before")
     @classmethod
@@ -98,7 +100,7 @@ class Optoncdt1420Config(Section):
     """
     direction: Direction = -1
     step_max_um: StepMax = 50.0
-    timeout_s: Timeout = 0.2
+    timeout_s: Annotated[float, Field(gt=0, le=5)] = 0.2
     """Longest wait for an answer, and for a new value after a reading. Raise it on a slow machine.
     """
 

@@ -5,14 +5,11 @@ Range and default come from pydantic, the unit from the key's name, meaning and 
 below the key.
 """
 
-import ast
-import inspect
 import json
 import re
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from functools import cache
-from itertools import pairwise
 from typing import Any
 
 from pydantic import BaseModel
@@ -21,7 +18,7 @@ from pydantic.json_schema import GenerateJsonSchema
 from firmware_iface import drivers
 from firmware_iface.roles import ROLES
 from membrane_ctrl.config.schema import Config
-from membrane_ctrl.config.toml_file import list_sections, suggest_word
+from membrane_ctrl.config.toml_file import suggest_word
 from membrane_ctrl.model.errors import InputError
 
 _ADVICE = re.compile(r"(?<=[.;?])\s+(?=(?:Change|Leave|Lower|Raise|Set)\b)")
@@ -122,14 +119,11 @@ def json_schema(root: type[BaseModel] = Config) -> dict[str, Any]:
     constant.
     """
     schema = root.model_json_schema(schema_generator=_TomlSchema)
-    texts, chosen = (
-        _collect_texts(root),
-        set(re.findall(r'"\w+": "#/\$defs/(\w+)"', json.dumps(schema))),
-    )
+    chosen = set(re.findall(r'"\w+": "#/\$defs/(\w+)"', json.dumps(schema)))
     for name, table in [*schema.get("$defs", {}).items(), (root.__name__, schema)]:
-        for key, field in table["properties"].items():
-            if text := texts.get((name, key)):
-                field["description"] = text
+        for field in table["properties"].values():
+            if "description" in field:
+                field["description"] = " ".join(field["description"].split())
             if field.get("default", 0) is None:
                 del field["default"]
         if (
@@ -315,42 +309,6 @@ def _format_default(default: Any) -> str:
     if isinstance(default, list) and default and isinstance(default[0], dict):
         return f"{len(default)} tables"
     return "none" if default is None else json.dumps(default)
-
-
-def _collect_texts(root: type[BaseModel]) -> dict[tuple[str, str], str]:
-    """Return the text below each key of the schema's classes, or of the class that defines the key
-    for them.
-    """
-    found: dict[tuple[str, str], str] = {}
-    for section in _list_classes(root):
-        for base in reversed(section.__mro__):
-            if issubclass(base, BaseModel) and base is not BaseModel:
-                below = _texts_of_module(inspect.getmodule(base)).get(base.__name__, {})
-                found |= {(section.__name__, key): text for key, text in below.items()}
-    return found
-
-
-@cache
-def _texts_of_module(module: Any) -> dict[str, dict[str, str]]:
-    """Return the text below each key of a module's classes, by class, read from its source."""
-    found: dict[str, dict[str, str]] = {}
-    for node in ast.parse(inspect.getsource(module)).body:
-        if not isinstance(node, ast.ClassDef):
-            continue
-        texts = found.setdefault(node.name, {})
-        for key, text in pairwise(node.body):
-            if not isinstance(key, ast.AnnAssign) or not isinstance(key.target, ast.Name):
-                continue
-            if isinstance(text, ast.Expr) and isinstance(text.value, ast.Constant):
-                texts[key.target.id] = " ".join(str(text.value.value).split())
-    return found
-
-
-def _list_classes(section: type[BaseModel]) -> Iterator[type[BaseModel]]:
-    yield section
-    for field in section.model_fields.values():
-        for inner in list_sections(field.annotation):
-            yield from _list_classes(inner)
 
 
 def make_reference_page() -> str:

@@ -4,59 +4,97 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-from membrane_ctrl.measure.report_html import ReportTable, html_page
 from membrane_ctrl.measure.report_pdf import pdf_pages
 from membrane_ctrl.model.files import write_bytes_atomic, write_text_atomic
 from membrane_ctrl.model.terminal import escape_controls
+from membrane_ctrl.report_pages.blocks import (
+    PageLines,
+    PagePicture,
+    PageSection,
+    PageTable,
+    ReportPage,
+)
+from membrane_ctrl.report_pages.render import render_page
+
+# On the page, these tables come before the pictures; the Zernike terms come after them.
+_TABLES_FIRST = 2
 
 
 def write_report(
     out: Path, name: str, lines: Sequence[str], result: dict[str, Any], drawn: Sequence[Path]
 ) -> None:
     """Write `report.html` and `report.pdf` of a measurement: its lines, numbers, terms and
-    pictures. Raises OSError.
+    pictures.
 
-    `name` is for the title; `result` is the content of `result.json`; `drawn` are the pictures'
-    files.
+    Parameters
+    ----------
+    out : Path
+        The folder.
+    name : str
+        Of the measured set, for the title.
+    lines : sequence of str
+        What the command printed.
+    result : dict
+        The content of `result.json`.
+    drawn : sequence of Path
+        The pictures' PNG files.
+
+    Raises
+    ------
+    OSError
+        If a file cannot be read or written.
     """
     title = escape_controls(f"Measurement of {name}")
-    tables = [] if result["figure"] is None else _list_tables(result["figure"])
-    images = [(file.stem, file.read_bytes()) for file in drawn]
-    write_text_atomic(
-        out / "report.html",
-        html_page(title, [escape_controls(line) for line in lines], tables, images),
+    safe_lines = [escape_controls(line) for line in lines]
+    tables = {} if result["figure"] is None else _make_tables(result["figure"])
+    pictures = [PagePicture(file.stem, file.read_bytes()) for file in drawn]
+    sections = [PageSection(heading, [table]) for heading, table in tables.items()]
+    page = ReportPage(
+        title,
+        [
+            PageSection("", [PageLines(safe_lines)]),
+            *sections[:_TABLES_FIRST],
+            *(PageSection(picture.name, [picture]) for picture in pictures),
+            *sections[_TABLES_FIRST:],
+        ],
     )
-    write_bytes_atomic(
-        out / "report.pdf",
-        pdf_pages(title, [escape_controls(line) for line in lines], tables, images),
-    )
+    write_text_atomic(out / "report.html", render_page(page))
+    write_bytes_atomic(out / "report.pdf", pdf_pages(title, safe_lines, tables, pictures))
 
 
-def _list_tables(figure: dict[str, Any]) -> list[ReportTable]:
-    """The numbers of the block `figure`, what it does not give, and its sets of terms."""
-
-    def cell(value: float | None) -> str:
-        return "unknown" if value is None else f"{value:.6g}"
-
-    rows: list[tuple[str, ...]] = [("number", "value", "1 sigma, noise", "1 sigma, geometry")]
-    rows += [(key, *(cell(item[part]) for part in item)) for key, item in figure["numbers"].items()]
+def _make_tables(figure: dict[str, Any]) -> dict[str, PageTable]:
+    """Return the numbers of the block `figure`, what it does not give, and its sets of terms, by
+    heading.
+    """
     where = (
         f"aperture: radius {figure['aperture_radius_mm']:g} mm about the vertex; cells of "
         f"{figure['cell_mm']:.3g} mm"
     )
-    tables: list[ReportTable] = [(f"Figure ({where})", rows)]
+    rows = [
+        (name, *map(_format_cell, number.values())) for name, number in figure["numbers"].items()
+    ]
+    head = ("number", "value", "1 sigma, noise", "1 sigma, geometry")
+    tables = {f"Figure ({where})": PageTable(head, rows)}
     if figure["not_given"]:
-        tables.append(("Not given", [("number", "reason"), *figure["not_given"].items()]))
+        reasons = list(figure["not_given"].items())
+        tables["Not given"] = PageTable(("number", "reason"), reasons)
     for terms in figure["zernike"]:
-        rows = [("j", "coefficient, µm", "1 sigma, noise", "1 sigma, geometry")]
-        columns = (terms[key] for key in ("coeffs_um", "sigma_noise_um", "sigma_geometry_um"))
-        rows += [
-            (str(j), *map(cell, row))
-            for j, row in enumerate(zip(*columns, strict=True), terms["first"])
-        ]
         heading = (
             f"Zernike terms, {terms['index']}, {terms['normalisation']} 1 over "
             f"{terms['radius_mm']:g} mm"
         )
-        tables.append((heading, rows))
+        tables[heading] = _tabulate_terms(terms)
     return tables
+
+
+def _tabulate_terms(terms: dict[str, Any]) -> PageTable:
+    columns = (terms["coeffs_um"], terms["sigma_noise_um"], terms["sigma_geometry_um"])
+    rows = [
+        (str(j), *map(_format_cell, row))
+        for j, row in enumerate(zip(*columns, strict=True), terms["first"])
+    ]
+    return PageTable(("j", "coefficient, µm", "1 sigma, noise", "1 sigma, geometry"), rows)
+
+
+def _format_cell(value: float | None) -> str:
+    return "unknown" if value is None else f"{value:.6g}"

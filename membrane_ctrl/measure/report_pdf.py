@@ -1,10 +1,10 @@
 """The pages of a measurement's report as PDF."""
 
 import io
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from textwrap import wrap
 
-from membrane_ctrl.measure.report_html import ReportTable
+from membrane_ctrl.report_pages.blocks import PagePicture, PageTable
 
 _PAGE_INCHES = (8.27, 11.69)  # A4, inches
 _LINES_A_PAGE = 64
@@ -13,17 +13,18 @@ _LINES_A_PAGE = 64
 def pdf_pages(
     title: str,
     lines: Sequence[str],
-    tables: Sequence[ReportTable],
-    images: Sequence[tuple[str, bytes]],
+    tables: Mapping[str, PageTable],
+    pictures: Sequence[PagePicture],
 ) -> bytes:
     """Pages of text, then two pictures on each."""
     from matplotlib import figure, image
     from matplotlib.backends.backend_pdf import PdfPages
 
     text = [title, "", *(part for line in lines for part in wrap(line, 100) or [""])]
-    for heading, rows in tables:
+    for heading, table in tables.items():
         text += ["", heading]
-        text += [part for row in rows for part in wrap("".join(f"{cell:26}" for cell in row), 104)]
+        for row in (table.head, *table.rows):
+            text += wrap("".join(f"{cell:26}" for cell in row), 104)
     file = io.BytesIO()
     with PdfPages(file) as pages:
         for first in range(0, len(text), _LINES_A_PAGE):
@@ -40,11 +41,11 @@ def pdf_pages(
                 parse_math=False,
             )
             pages.savefig(page)
-        for first in range(0, len(images), 2):
+        for first in range(0, len(pictures), 2):
             page = figure.Figure(figsize=_PAGE_INCHES)
-            for place, (_, data) in enumerate(images[first : first + 2]):
+            for place, picture in enumerate(pictures[first : first + 2]):
                 axes = page.add_axes((0.05, 0.51 - 0.48 * place, 0.9, 0.46))
-                axes.imshow(image.imread(io.BytesIO(data)))
+                axes.imshow(image.imread(io.BytesIO(picture.png)))
                 axes.set_axis_off()
             pages.savefig(page)
     return file.getvalue()

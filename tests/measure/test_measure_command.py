@@ -122,7 +122,7 @@ def test_pictures_report_and_recording(made: Path, tmp_path: Path) -> None:
         "figure",
     }
     page = (tmp_path / "report.html").read_text()
-    assert page.count("<img ") == page.count("src='data:image/png;base64,") == len(names)
+    assert page.count("<img ") == page.count('src="data:image/png;base64,') == len(names)
     assert not re.search("https?:|<script|<link", page)
     figure = json.loads((tmp_path / "result.json").read_text())["figure"]
     depth = 3400 - np.sqrt(3400**2 - 475**2)
@@ -130,7 +130,7 @@ def test_pictures_report_and_recording(made: Path, tmp_path: Path) -> None:
     assert told == pytest.approx(
         1e3 * (figure["numbers"]["sphere_sag_mm"]["value"] - depth), abs=1e-6
     )
-    assert f"<td>power_um<td>{told:.6g}<td>" in page
+    assert f"<td>power_um</td><td>{told:.6g}</td>" in page
     assert figure["not_given"] == {}
     document = (tmp_path / "report.pdf").read_bytes()
     assert document.startswith(b"%PDF-")

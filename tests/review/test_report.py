@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import html
 import json
 import shutil
 from html.parser import HTMLParser
@@ -10,6 +9,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from markupsafe import escape
 
 from membrane_ctrl.cli import run as command
 from membrane_ctrl.model import plain_json
@@ -23,8 +23,8 @@ from membrane_ctrl.model.telemetry import (
     get_columns,
 )
 from membrane_ctrl.review import open_run
-from membrane_ctrl.review.report.html import render_report
 from membrane_ctrl.review.report.json import report_table
+from membrane_ctrl.review.report.run_page import render_report
 from membrane_ctrl.review.statistics.analysis import analyse_run
 from membrane_ctrl.review.statistics.compare import compare_analyses
 from membrane_ctrl.review.statistics.error_series import fill_short_gaps
@@ -176,7 +176,7 @@ def test_the_page_carries_everything_itself(tmp_path: Path) -> None:
     assert tags.count["svg"] >= 5
     assert tags.loaded == []
     assert "pressure step" in page
-    assert html.escape("membrane-ctrl review 'a night' --from +") in page
+    assert str(escape("membrane-ctrl review 'a night' --from +")) in page
     assert "&lt;b&gt;knock&lt;/b&gt;" in page
 
 
@@ -233,7 +233,7 @@ def test_a_mark_may_say_anything(quiet_run: Path, tmp_path: Path) -> None:
     for number, text in enumerate(texts):
         assert command(["review", "mark", str(folder), text, "--at", f"+{100 + number}s"]) == 0
     page = render_report(analyse_run(open_run(folder)))
-    assert all(html.escape(" ".join(text.split())) in page for text in texts)
+    assert all(str(escape(" ".join(text.split()))) in page for text in texts)
     assert "<b>" not in page.split("<svg")[1]
 
 

@@ -1,4 +1,4 @@
-"""Saves the pictures of a report, and decides which are older than what they show."""
+"""Saves the pictures of a report, embeds them, and decides which are older than what they show."""
 
 from pathlib import Path
 
@@ -6,6 +6,7 @@ from matplotlib.figure import Figure
 
 from membrane_ctrl.measure.result_files import write_picture
 from membrane_ctrl.model.files import resolve_user_path
+from membrane_ctrl.report_pages.blocks import PagePicture
 from membrane_ctrl.sessions.folder import FILES, SessionFolder
 
 SPECTRUM_SEGMENT_S = 40.0
@@ -15,6 +16,14 @@ _DPI = 100
 def save_figure(path: Path, figure: Figure) -> None:
     """Write a picture to a file of the session."""
     write_picture(resolve_user_path(path), figure, _DPI)
+
+
+def embed_picture(folder: SessionFolder, name: str) -> list[PagePicture]:
+    """Return a picture of the session for its report; empty if it is missing."""
+    path = folder.file_path(name)
+    if not path.exists():
+        return []
+    return [PagePicture(path.stem, folder.read_content(name))]
 
 
 def is_outdated(folder: SessionFolder, picture: str, *steps: str) -> bool:

@@ -1,6 +1,5 @@
 """Fourth step of a session: compute the candidates and propose gains."""
 
-import html
 import math
 from dataclasses import dataclass
 from pathlib import Path
@@ -9,6 +8,7 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from membrane_ctrl.model import errors, files
+from membrane_ctrl.report_pages.blocks import PageSection, PageTable, PageText
 from membrane_ctrl.sessions import folder
 from tuning.gains_file import (
     GainsFile,
@@ -21,8 +21,7 @@ from tuning.journal import Traded
 from tuning.proposal import candidate, candidate_table, design, gain_search
 from tuning.proposal.preview import Preview
 from tuning.proposal.robustness import Robustness
-from tuning.report.html import embed_picture, make_table
-from tuning.report.pictures import is_outdated, save_figure
+from tuning.report.pictures import embed_picture, is_outdated, save_figure
 from tuning.sentences import describe_gains
 from tuning.steps.identify import load_identified
 from tuning.steps.observe import load_disturbance, load_quiet_record
@@ -149,10 +148,10 @@ def describe_result(session: folder.SessionFolder) -> str:
     )
 
 
-def make_report_part(session: folder.SessionFolder) -> list[str]:
-    """The candidates, for the report."""
+def make_report_part(session: folder.SessionFolder) -> PageSection | None:
+    """The candidates, for the report; None before the step is done."""
     if not session.is_done("design"):
-        return []
+        return None
     kept = load_design(session)
     gains = load_gains(session.file_path("gains.toml"))
     loop = gains.loop
@@ -160,17 +159,16 @@ def make_report_part(session: folder.SessionFolder) -> list[str]:
     by = "chosen" if gains.candidate else "proposed"
     lines = session.read_candidates().splitlines()
     cells = [[cell.strip() for cell in line.strip("|").split("|")] for line in lines]
-    return [
-        "<h2>Candidates</h2>",
-        make_table(cells[0], cells[2:]),
-        embed_picture(session, _PICTURE),
-        f"<p>{html.escape(traded.candidate)} is {by}: K {loop.kp_per_s:.3f} 1/s, "
-        f"Ti {loop.ti_s:.2f} s, filter {loop.measurement_filter_s:.2f} s. Present and new gains: "
-        f"{html.escape(str(traded))}. Lower bound of the std: {gains.least_std_um:.3f} µm. "
+    text = (
+        f"{traded.candidate} is {by}: K {loop.kp_per_s:.3f} 1/s, Ti {loop.ti_s:.2f} s, "
+        f"filter {loop.measurement_filter_s:.2f} s. Present and new gains: {traded}. "
+        f"Lower bound of the std: {gains.least_std_um:.3f} µm. "
         "The proposal over plants drawn from the fit: "
         f"Ms {kept.robustness.ms_p95:.2f}, std {kept.robustness.std_p95_um:.3f} µm at 95 %, "
-        f"{kept.robustness.stable_fraction:.0%} stable.</p>",
-    ]
+        f"{kept.robustness.stable_fraction:.0%} stable."
+    )
+    table = PageTable(cells[0], cells[2:])
+    return PageSection("Candidates", [table, *embed_picture(session, _PICTURE), PageText(text)])
 
 
 def draw_picture(session: folder.SessionFolder) -> None:

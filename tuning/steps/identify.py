@@ -1,6 +1,5 @@
 """Second step of a session: fit the plant to the experiments and judge the fit."""
 
-import html
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -9,11 +8,11 @@ from matplotlib.figure import Figure
 
 from membrane_ctrl.control.leak_estimate import TOO_TIGHT_UM_PER_S
 from membrane_ctrl.model import errors
+from membrane_ctrl.report_pages.blocks import PageBlock, PageSection, PageTable, PageText, TextMark
 from membrane_ctrl.sessions import folder
 from tuning.identification import experiments, fit_quality, plant_fit, plant_model
 from tuning.identification.record import Record
-from tuning.report.html import embed_picture, make_table
-from tuning.report.pictures import is_outdated, save_figure
+from tuning.report.pictures import embed_picture, is_outdated, save_figure
 from tuning.sentences import TOO_TIGHT
 from tuning.steps.characterise import PumpUnknownError, load_experiments
 
@@ -76,17 +75,21 @@ def describe_result(session: folder.SessionFolder) -> str:
     )
 
 
-def make_report_part(session: folder.SessionFolder) -> list[str]:
+def make_report_part(session: folder.SessionFolder) -> PageSection:
     """Experiments and fit, for the report; the experiments alone before they are fitted."""
-    parts = ["<h2>Experiments and fit</h2>", embed_picture(session, _PICTURE)]
-    if not session.is_done("identify"):
-        return parts
+    blocks: list[PageBlock] = [*embed_picture(session, _PICTURE)]
+    if session.is_done("identify"):
+        blocks += _describe_fit(session)
+    return PageSection("Experiments and fit", blocks)
+
+
+def _describe_fit(session: folder.SessionFolder) -> list[PageBlock]:
+    """Return the verdict on the data, the fitted values and the tests of the residuals."""
     found = load_identified(session)
     fit = found.identified
     model, sigma = fit.model, fit.sigma
-    colour = "refused" if found.quality.verdict == "refused" else "ok"
+    mark = TextMark.BAD if found.quality.verdict == "refused" else TextMark.GOOD
     reasons = "; ".join(found.quality.reasons)
-    parts.append(f"<p class={colour}>Data: {found.quality.verdict}. {html.escape(reasons)}</p>")
     rows = [
         ("gain k", f"{model.gain:.3f}", f"{sigma.gain:.3f}"),
         ("dead time (s)", f"{model.dead_time_s:.3f}", f"{sigma.dead_time_s:.3f}"),
@@ -94,13 +97,16 @@ def make_report_part(session: folder.SessionFolder) -> list[str]:
         ("delay, both (s)", f"{model.delay_s:.3f}", f"{sigma.delay_s:.3f}"),
         ("leak (µm/s)", f"{model.leak_um_per_s:.2f}", f"{sigma.leak_um_per_s:.2f}"),
     ]
-    parts.append(make_table(("", "value", "1 sigma"), rows))
-    parts.append(
-        f"<p>Residuals: whiteness p = {fit.whiteness_p:.3g}, independence of the flow p = "
+    tests = (
+        f"Residuals: whiteness p = {fit.whiteness_p:.3g}, independence of the flow p = "
         f"{fit.independence_p:.3g}, largest {fit.largest_residual:.1f} sigma. "
-        f"Data {found.data_sha256[:16]}.</p>"
+        f"Data {found.data_sha256[:16]}."
     )
-    return parts
+    return [
+        PageText(f"Data: {found.quality.verdict}. {reasons}", mark),
+        PageTable(("", "value", "1 sigma"), rows),
+        PageText(tests),
+    ]
 
 
 def draw_picture(session: folder.SessionFolder) -> None:

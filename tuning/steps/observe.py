@@ -8,12 +8,17 @@ from scipy.signal import welch
 
 from membrane_ctrl.config.schema import LoopConfig
 from membrane_ctrl.model import errors
+from membrane_ctrl.report_pages.blocks import PageSection, PageText
 from membrane_ctrl.sessions import folder
 from tuning.identification import plant_model, record_file
 from tuning.identification.disturbance import DisturbanceModel, observe_disturbance
 from tuning.identification.record import Record, Series
-from tuning.report.html import embed_picture
-from tuning.report.pictures import SPECTRUM_SEGMENT_S, is_outdated, save_figure
+from tuning.report.pictures import (
+    SPECTRUM_SEGMENT_S,
+    embed_picture,
+    is_outdated,
+    save_figure,
+)
 from tuning.rigs.hold_rig import HoldRig
 from tuning.steps.characterise import HELD_RECORD
 from tuning.steps.identify import load_identified
@@ -61,17 +66,17 @@ def describe_result(session: folder.SessionFolder) -> str:
     )
 
 
-def make_report_part(session: folder.SessionFolder) -> list[str]:
-    """The weather, for the report."""
+def make_report_part(session: folder.SessionFolder) -> PageSection | None:
+    """The weather, for the report; None before the step is done."""
     if not session.is_done("observe"):
-        return []
+        return None
     weather = load_disturbance(session)
-    return [
-        f"<h2>Weather</h2><p>Noise of a reading {weather.laser_um:.3f} µm. Every predicted std "
+    text = (
+        f"Noise of a reading {weather.laser_um:.3f} µm. Every predicted std "
         "rests on this record: ten other minutes of weather like it change it by "
-        f"{weather.unsteady:.0%} (1 sigma), and its fit has an error.</p>",
-        embed_picture(session, _PICTURE),
-    ]
+        f"{weather.unsteady:.0%} (1 sigma), and its fit has an error."
+    )
+    return PageSection("Weather", [PageText(text), *embed_picture(session, _PICTURE)])
 
 
 def draw_picture(session: folder.SessionFolder) -> None:

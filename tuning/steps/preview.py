@@ -3,10 +3,10 @@
 from dataclasses import dataclass
 from statistics import fmean
 
+from membrane_ctrl.report_pages.blocks import PageSection, PageTable
 from membrane_ctrl.sessions import folder
 from tuning.gains_file import load_gains
 from tuning.proposal import preview
-from tuning.report.html import make_table
 from tuning.steps.identify import load_identified
 from tuning.steps.observe import load_disturbance
 
@@ -62,10 +62,10 @@ def describe_result(session: folder.SessionFolder) -> str:
     )
 
 
-def make_report_part(session: folder.SessionFolder) -> list[str]:
-    """The preview, for the report."""
+def make_report_part(session: folder.SessionFolder) -> PageSection | None:
+    """The preview, for the report; None before the step is done."""
     if not session.is_done("preview"):
-        return []
+        return None
     done = load_preview(session)
     rows = [
         (
@@ -79,4 +79,4 @@ def make_report_part(session: folder.SessionFolder) -> list[str]:
         for seen in group
     ]
     heads = ("", "std", "bias", "load peak", "recovery s")
-    return ["<h2>Preview on the fitted twin</h2>", make_table(heads, rows)]
+    return PageSection("Preview on the fitted twin", [PageTable(heads, rows)])

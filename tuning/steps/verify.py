@@ -1,6 +1,5 @@
 """Last step of a session: judge the gains on trial; keep them or restore the previous ones."""
 
-import html
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -11,13 +10,18 @@ from matplotlib.figure import Figure
 from scipy.signal import welch
 
 from membrane_ctrl.config import schema
+from membrane_ctrl.report_pages.blocks import PageSection, PageTable, PageText, TextMark
 from membrane_ctrl.sessions import folder, live_hold
 from tuning.gains_file import load_gains
 from tuning.identification import closed_loop, plant_model, record_file
 from tuning.identification.record import Record
 from tuning.proposal import verification
-from tuning.report.html import embed_picture, make_table
-from tuning.report.pictures import SPECTRUM_SEGMENT_S, is_outdated, save_figure
+from tuning.report.pictures import (
+    SPECTRUM_SEGMENT_S,
+    embed_picture,
+    is_outdated,
+    save_figure,
+)
 from tuning.rigs.hold_rig import HoldRig
 from tuning.steps.apply import load_checked_gains
 from tuning.steps.design import load_candidates
@@ -106,13 +110,13 @@ def describe_result(session: folder.SessionFolder) -> str:
     )
 
 
-def make_report_part(session: folder.SessionFolder) -> list[str]:
-    """The verification, for the report."""
+def make_report_part(session: folder.SessionFolder) -> PageSection | None:
+    """The verification, for the report; None before the step is done."""
     if not session.is_done("verify"):
-        return []
+        return None
     done = load_verified(session)
     verdict = "kept" if done.kept else f"reverted: {done.reason}"
-    colour = "ok" if done.kept else "refused"
+    mark = TextMark.GOOD if done.kept else TextMark.BAD
     rows = [
         (
             f"{stage.time_s:.0f} s",
@@ -125,11 +129,10 @@ def make_report_part(session: folder.SessionFolder) -> list[str]:
         for stage in done.stages
     ]
     heads = ("after", "std µm", "previous µm", "ratio", "observed sensitivity", "")
-    return [
-        f"<h2>Verification</h2><p class={colour}>{html.escape(verdict)}</p>",
-        make_table(heads, rows),
-        embed_picture(session, _PICTURE),
-    ]
+    return PageSection(
+        "Verification",
+        [PageText(verdict, mark), PageTable(heads, rows), *embed_picture(session, _PICTURE)],
+    )
 
 
 def draw_picture(session: folder.SessionFolder) -> None:

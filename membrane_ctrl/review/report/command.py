@@ -7,9 +7,9 @@ from pathlib import Path
 
 from membrane_ctrl.model import errors, files, plain_json
 from membrane_ctrl.review import catalogue
-from membrane_ctrl.review.report.html import render_report
 from membrane_ctrl.review.report.json import make_verdict, report_table
 from membrane_ctrl.review.report.pump_history import pump_change, pump_history
+from membrane_ctrl.review.report.run_page import render_report
 from membrane_ctrl.review.run_times import part_s
 from membrane_ctrl.review.statistics import compare
 from membrane_ctrl.review.statistics.analysis import Analysis, analyse_run

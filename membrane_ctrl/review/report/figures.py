@@ -10,6 +10,7 @@ from typing import Any
 
 import matplotlib as mpl
 import numpy as np
+from markupsafe import Markup
 from matplotlib.figure import Figure
 
 from membrane_ctrl.model import colours, events, run_events, zernike_terms
@@ -120,7 +121,7 @@ def make_picture(
         yield figure, figure.subplots(rows, columns, **subplots)
 
 
-def render_svg(figure: Figure) -> str:
+def render_svg(figure: Figure) -> Markup:
     """The figure as an `<svg>` element that scales with the page."""
     with mpl.rc_context(_STYLE), warnings.catch_warnings():
         # text stays text in the page, in the reader's fonts
@@ -128,12 +129,11 @@ def render_svg(figure: Figure) -> str:
         buffer = io.StringIO()
         figure.savefig(buffer, format="svg", metadata={"Date": None})
     text = buffer.getvalue()
-    text = text[text.index("<svg") :]
-    return re.sub(
-        r'(<svg[^>]*?) width="[^"]*"',
-        r"\1",
-        re.sub(r'(<svg[^>]*?) height="[^"]*"', r"\1", text, count=1),
-    )
+    svg = text[text.index("<svg") :]
+    # Without its own size the drawing takes the width of the page
+    svg = re.sub(r'(<svg[^>]*?) height="[^"]*"', r"\1", svg, count=1)
+    svg = re.sub(r'(<svg[^>]*?) width="[^"]*"', r"\1", svg)
+    return Markup(svg)
 
 
 def broken_at_gaps(columns: Mapping[str, Column], time_name: str = "time_s") -> dict[str, Column]:
@@ -163,7 +163,7 @@ def hours_or_less(time_s: Column | float, span_s: float) -> tuple[Any, str]:
     return np.asarray(time_s), "s"
 
 
-def draw_overview(analysis: Analysis) -> str:
+def draw_overview(analysis: Analysis) -> Markup:
     """Error with its envelope, the band, states, detected events and marks."""
     level, band_um = broken_at_gaps(analysis.level), analysis.run.config.limits.band_um
     span_s = analysis.ticks.end_s - analysis.ticks.start_s
@@ -247,7 +247,7 @@ def _draw_lane(lane: Any, analysis: Analysis, span_s: float) -> None:
     lane.grid(False)
 
 
-def everything_else(analysis: Analysis) -> str:
+def everything_else(analysis: Analysis) -> Markup:
     """Position, flow, pump, gas, air, trim, timing: each plot of the table of columns that the run
     has values for.
     """
@@ -291,7 +291,7 @@ def _draw_columns(
     axis.ticklabel_format(useOffset=False)
 
 
-def draw_distributions(analysis: Analysis) -> str:
+def draw_distributions(analysis: Analysis) -> Markup:
     """Histogram, Allan deviation, spectrum."""
     reading, true = analysis.reading, analysis.true
     with make_picture(1, 3, 3.3) as (figure, (histogram, allan, spectrum)):
@@ -322,7 +322,7 @@ def draw_distributions(analysis: Analysis) -> str:
         return render_svg(figure)
 
 
-def pump_history(history: Sequence[PumpSeen], change_max: float) -> str:
+def pump_history(history: Sequence[PumpSeen], change_max: float) -> Markup:
     """The pump against the newest run's curve over the runs of the bench, and the leak of each."""
     first = next(seen for seen in history if seen.same_curve)
     days = [seen.started_utc for seen in history]
@@ -340,7 +340,7 @@ def pump_history(history: Sequence[PumpSeen], change_max: float) -> str:
         return render_svg(figure)
 
 
-def draw_stability(shape: shape_review.ShapeReview) -> str:
+def draw_stability(shape: shape_review.ShapeReview) -> Markup:
     """Heights at A, B, C; camera against laser; the map of the standard deviation; drift of the
     terms.
     """
@@ -392,7 +392,7 @@ def _draw_drift(plot: Any, shape: shape_review.ShapeReview) -> None:
     plot.set(title="Drift of the terms, µm/h (95 %)", xlabel="Noll index")
 
 
-def draw_pairs(shape: shape_review.ShapeReview) -> str:
+def draw_pairs(shape: shape_review.ShapeReview) -> Markup:
     """Height change of cycles 1 and 10 minutes apart, the same less its low terms, and its
     uncertainty.
     """

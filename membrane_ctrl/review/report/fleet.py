@@ -8,10 +8,11 @@ from contextlib import suppress
 from dataclasses import asdict, dataclass
 from datetime import datetime
 from functools import partial
-from html import escape
 from pathlib import Path
 from typing import Any
 from urllib.parse import quote
+
+from markupsafe import Markup
 
 from membrane_ctrl.model import (
     errors,
@@ -23,12 +24,14 @@ from membrane_ctrl.model import (
     terminal,
 )
 from membrane_ctrl.processes.worker_pool import run_jobs
+from membrane_ctrl.report_pages.blocks import PageSection, PageTable, PageText, ReportPage
+from membrane_ctrl.report_pages.render import render_page
 from membrane_ctrl.review import catalogue
 from membrane_ctrl.review.formatting import format_number, format_span, format_time_beside
 from membrane_ctrl.review.report.command import write_report
-from membrane_ctrl.review.report.html import html_page, html_table, render_report
 from membrane_ctrl.review.report.json import make_timeline, report_table
 from membrane_ctrl.review.report.pump_history import pump_history
+from membrane_ctrl.review.report.run_page import MARKS, render_report
 from membrane_ctrl.review.run_times import part_s
 from membrane_ctrl.review.sparkline import render_sparkline
 from membrane_ctrl.review.statistics.analysis import Analysis, analyse_run
@@ -49,7 +52,8 @@ _SAME = (
     "sentence",
     "exit",
 )
-_STYLE = "main{max-width:none}td svg{width:160px}td:first-child{white-space:normal}"
+_LINK = Markup("<a href='{address}'>{name}</a>")
+_NOT_REPORTED = Markup("<b>not reported</b>")
 _HEAD = (
     "run",
     "started, UTC",
@@ -192,53 +196,38 @@ def fleet_command(options: FleetOptions) -> int:
 
 
 def _make_row(line: dict[str, Any], curve: str) -> list[str]:
-    """A row of the page's table; its texts come from files, so they are escaped."""
-    name = escape(line["name"])
+    """Return the cells of a run's line, in the order of `_HEAD`."""
     if "problem" in line:
-        return [
-            name,
-            "",
-            "",
-            "<b>not reported</b>",
-            escape(line["problem"]),
-            *[""] * (len(_HEAD) - 5),
-        ]
+        cells = [line["name"], "", "", _NOT_REPORTED, line["problem"]]
+        return cells + [""] * (len(_HEAD) - len(cells))
     in_band = line["in_band"]
-    share = "–" if in_band is None or in_band != in_band else f"{100 * in_band:.4g} %"
+    known = in_band is not None and in_band == in_band
     rest = format_time_beside(
         line["faults_s"], line["paused_s"], line["moving_s"], line["duration_s"]
     )
-    faults = (
-        f"{len(line['faults'])}: {', '.join(dict.fromkeys(line['faults']))}"
-        if line["faults"]
-        else "0"
-    )
+    held = f"{format_span(line['settled_s'])} of {format_span(line['duration_s'])}"
+    faults = ", ".join(dict.fromkeys(line["faults"]))
     return [
-        f"<a href='{quote(line['report'])}'>{name}</a>",
+        _LINK.format(address=quote(line["report"]), name=line["name"]),
         f"{datetime.fromisoformat(line['started_utc']):%Y-%m-%d %H:%M}",
-        curve,
-        escape(f"{line['state']}, {line['exit'] or 'open'}"),
-        escape(
-            f"{format_span(line['settled_s'])} of {format_span(line['duration_s'])}"
-            + (f" ({', '.join(rest)})" if rest else "")
-        ),
-        *(format_number(line[key]) for key in ("std_um", "mean_um")),
-        share,
-        escape(faults),
-        escape(", ".join(line["alarms"])) or "none",
+        Markup(curve),
+        f"{line['state']}, {line['exit'] or 'open'}",
+        f"{held} ({', '.join(rest)})" if rest else held,
+        format_number(line["std_um"]),
+        format_number(line["mean_um"]),
+        f"{100 * in_band:.4g} %" if known else "–",
+        f"{len(line['faults'])}: {faults}" if faults else "0",
+        ", ".join(line["alarms"]) or "none",
         str(line["found"]),
         str(line["ticks_missed"]),
-        escape(", ".join(dict.fromkeys(line["anomalies"]))) or "nothing unusual",
+        ", ".join(dict.fromkeys(line["anomalies"])) or "nothing unusual",
     ]
 
 
 def _make_page(lines: Sequence[dict[str, Any]], rows: Sequence[Sequence[str]]) -> str:
     failed = sum("problem" in line for line in lines)
     odd = sum(line.get("verdict") in ("look", "bad") for line in lines)
-    said = f"{len(lines)} runs: {odd} to look at, {failed} cannot be reported."
     word = "bad" if failed else "look" if odd else "good"
-    head = (
-        f"<style>{_STYLE}</style><header><h1>Fleet</h1></header><p class='verdict "
-        f"{word}'>{said}</p>"
-    )
-    return html_page("Fleet", head + html_table(_HEAD, rows))
+    sentence = f"{len(lines)} runs: {odd} to look at, {failed} cannot be reported."
+    section = PageSection("", [PageText(sentence, MARKS[word]), PageTable(_HEAD, rows)])
+    return render_page(ReportPage("Fleet", [section], wide=True))

@@ -1,0 +1,1 @@
+"""Report pages: content as data, one template, one style."""

@@ -1,0 +1,339 @@
+"""The report of one run as a page: verdict, findings, hold quality, pump, figure and timeline."""
+
+import shlex
+from collections.abc import Sequence
+
+from markupsafe import Markup
+
+from membrane_ctrl.model import program
+from membrane_ctrl.report_pages.blocks import (
+    PageBlock,
+    PageDrawing,
+    PageFacts,
+    PageSection,
+    PageTable,
+    PageText,
+    PageWarnings,
+    ReportPage,
+    TextMark,
+)
+from membrane_ctrl.report_pages.render import render_page
+from membrane_ctrl.review.formatting import format_number, format_span, format_time_beside
+from membrane_ctrl.review.report import figures
+from membrane_ctrl.review.report.json import make_timeline, make_verdict
+from membrane_ctrl.review.report.pump_history import PumpSeen, pump_change
+from membrane_ctrl.review.statistics import compare, drift, power_spectrum, shape_review
+from membrane_ctrl.review.statistics.analysis import Analysis
+from membrane_ctrl.review.statistics.error_series import ErrorSeries
+
+# A month has thousands of lines; the JSON report has them all.
+_LINES_MOST = 200
+READING = "reading (in the loop)"
+TRUE = "true centre (twin)"
+MARKS = {"good": TextMark.GOOD, "look": TextMark.LOOK, "bad": TextMark.BAD}
+_EXAMINE = Markup(
+    "<code>membrane-ctrl review {run} --from +{start_s:.0f}s --to +{end_s:.0f}s</code>"
+)
+_NOTHING_FOUND = (
+    "None: no door, leak step, laser glitch or loss, lateness burst, noise change, excursion or "
+    "jump."
+)
+
+
+def render_report(
+    analysis: Analysis,
+    other: Analysis | None = None,
+    differences: Sequence[compare.Difference] = (),
+    history: Sequence[PumpSeen] = (),
+) -> str:
+    """Return a report's HTML, optionally with another run and the differences from it.
+
+    Parameters
+    ----------
+    analysis : Analysis
+        The run.
+    other : Analysis, optional
+        The run to compare with.
+    differences : sequence of Difference
+        Of the two runs (`compare.compare_analyses`).
+    history : sequence of PumpSeen
+        The pump in this and earlier runs (`pump_history`); shown if there are at least two.
+    """
+    sections = [
+        PageSection("", _list_headlines(analysis)),
+        PageSection("Detected events", _list_found(analysis)),
+        PageSection(
+            "Hold quality",
+            [
+                _tabulate_windows(analysis),
+                *_list_details(analysis),
+                PageDrawing(figures.draw_distributions(analysis)),
+            ],
+        ),
+        PageSection(
+            "Pump, leak, feed-forward, ticks",
+            [PageFacts(_pump_facts(analysis)), PageDrawing(figures.everything_else(analysis))],
+        ),
+    ]
+    if analysis.shape is not None:
+        sections.append(PageSection("Figure", _list_shape(analysis.shape)))
+    if len(history) > 1:
+        blocks = _list_history(history, analysis.run.config.pump.change_max)
+        sections.append(PageSection("Pump over the runs", blocks))
+    if other is not None:
+        blocks = _list_comparison(analysis, other, differences)
+        sections.append(PageSection(f"Against {other.run.name}", blocks))
+    sections.append(PageSection("Timeline", _list_timeline(analysis)))
+    return render_page(
+        ReportPage(
+            title=analysis.run.name,
+            sections=sections,
+            beside_heading=_describe_time(analysis),
+            footer=_describe_origin(analysis),
+        )
+    )
+
+
+def _describe_time(analysis: Analysis) -> str:
+    ticks = analysis.ticks
+    began = f"{analysis.run.utc(ticks.start_s):%Y-%m-%d %H:%M:%S} UTC"
+    return f"{began}, {format_span(ticks.end_s - ticks.start_s)}"
+
+
+def _describe_origin(analysis: Analysis) -> str:
+    run = analysis.run
+    recorded = f", recorded by {run.recorded_by}" if run.recorded_by else ""
+    return f"{program.program_identity()}, report of {run.folder.name}{recorded}"
+
+
+def _list_headlines(analysis: Analysis) -> list[PageBlock]:
+    """List what a reader needs first: the verdict, what is unusual, and the run at a glance."""
+    word, sentence = make_verdict(analysis)
+    blocks: list[PageBlock] = [PageText(sentence, MARKS[word])]
+    if analysis.anomalies:
+        blocks.append(PageWarnings([(each.name, each.seen) for each in analysis.anomalies]))
+    blocks.append(PageDrawing(figures.draw_overview(analysis)))
+    return blocks
+
+
+def _list_found(analysis: Analysis) -> list[PageBlock]:
+    if not analysis.found:
+        return [PageText(_NOTHING_FOUND)]
+    name = shlex.quote(analysis.run.name)
+    rows = [
+        [
+            f"{analysis.run.utc(event.time_s):%Y-%m-%d %H:%M:%S}",
+            event.kind,
+            f"{format_number(event.size)} {event.unit}",
+            f"{event.confidence:.3f}",
+            _EXAMINE.format(run=name, start_s=max(event.start_s, 1), end_s=event.end_s),
+        ]
+        for event in analysis.found[:_LINES_MOST]
+    ]
+    table = PageTable(["UTC", "what", "size", "confidence", "look at it"], rows)
+    return [table, *_list_rest(len(analysis.found))]
+
+
+def _tabulate_windows(analysis: Analysis) -> PageTable:
+    """Tabulate the hold's error by means over windows of increasing length."""
+    rows = []
+    for name, series in ((READING, analysis.reading), (TRUE, analysis.true)):
+        for window in () if series is None else series.windows:
+            in_band = format_number(window.in_band)
+            if window.count:
+                in_band = f"{format_number(100 * window.in_band, 6)} %"
+            errors_um = (window.mean_um, window.std_um, window.p99_7_um, window.max_um)
+            rows.append(
+                [
+                    name,
+                    f"{window.window_s:g} s",
+                    f"{window.count}",
+                    *map(format_number, errors_um),
+                    in_band,
+                ]
+            )
+    band = f"in ±{analysis.run.config.limits.band_um:g} µm"
+    head = ["", "means of", "count", "mean µm", "std µm", "p99.7 µm", "maximum µm", band]
+    return PageTable(head, rows)
+
+
+def _list_details(analysis: Analysis) -> list[PageBlock]:
+    series, name = (analysis.reading, READING) if analysis.true is None else (analysis.true, TRUE)
+    if series is None:
+        return []
+    ticks = analysis.ticks
+    whole_s = ticks.end_s - ticks.start_s
+    beside = format_time_beside(ticks.faults_s, ticks.paused_s, ticks.moving_s, whole_s)
+    std_um = format_number(ticks.raw_reading.std)
+    single = f"std {std_um} µm, {100 * ticks.raw_in_band:.2f} % within the band"
+    unread = f"{format_number(ticks.unread_s)} s held without readings"
+    facts = [
+        (f"drift, {name}", _format_slope(series.drift, "µm/h")),
+        ("not counted as held", ", ".join(beside) or "nothing"),
+        ("single readings", f"{single}; {unread}"),
+        (f"RMS by frequency, {name}", _format_bands(series)),
+    ]
+    return [PageFacts(facts)]
+
+
+def _format_bands(series: ErrorSeries) -> str:
+    there = [
+        band
+        for band in power_spectrum.band_rms(series.spectrum, series.slow)
+        if band.rms_um == band.rms_um
+    ]
+    if not there:
+        return "too short to say"
+    bands = [
+        f"{format_number(b.from_hz)}–{format_number(b.high_hz)} Hz: {format_number(b.rms_um)} µm"
+        for b in there
+    ]
+    unresolved = format_span(power_spectrum.unseen_s(there))
+    return f"{'; '.join(bands)}; not resolved: motion slower than {unresolved}"
+
+
+def _pump_facts(analysis: Analysis) -> list[tuple[str, str]]:
+    ticks = analysis.ticks
+    pump = ticks.pump
+    late = ticks.lateness_ms
+    median, least, most = analysis.leak_um_per_s
+    facts = [
+        (
+            "pump",
+            f"{100 * pump.mean_fraction:.1f} ± {100 * pump.std_fraction:.1f} % of full, running "
+            f"{100 * pump.running_share:.1f} % of the time",
+        ),
+        (
+            "wear",
+            f"{format_number(pump.starts_per_hour)} starts and "
+            f"{format_number(pump.travel_per_hour)} full strokes an hour",
+        ),
+        ("at a limit", f"{100 * pump.saturated_share:.2f} % of ticks"),
+        (
+            "leak",
+            f"{format_number(median)} µm/s (from {format_number(least)} to {format_number(most)})",
+        ),
+    ]
+    benefit = analysis.benefit
+    if benefit is not None:
+        facts.append(
+            (
+                "feed-forward",
+                f"std of 1 s means {format_number(benefit.with_um)} µm, without it "
+                f"{format_number(benefit.without_um)} µm (computed)",
+            )
+        )
+    facts.append(
+        (
+            "lateness",
+            f"p50 {format_number(late.find_quantile(0.5))}, "
+            f"p99 {format_number(late.find_quantile(0.99))}, "
+            f"maximum {format_number(late.largest)} ms; {ticks.missed_ticks} ticks missed",
+        )
+    )
+    return facts
+
+
+def _list_history(history: Sequence[PumpSeen], change_max: float) -> list[PageBlock]:
+    change = pump_change(history, change_max)
+    rows = [
+        [
+            f"{seen.started_utc:%Y-%m-%d %H:%M}",
+            seen.run,
+            f"{seen.scale:.3f} ± {seen.sigma:.3f}",
+            format_number(seen.leak_um_per_s),
+        ]
+        for seen in history[-_LINES_MOST:]
+    ]
+    head = ["UTC", "run", "flow / curve of the newest run", "leak and offset µm/s"]
+    return [
+        *([PageWarnings([("pump", change)])] if change else []),
+        PageDrawing(figures.pump_history(history, change_max)),
+        PageTable(head, rows),
+    ]
+
+
+def _list_shape(shape: shape_review.ShapeReview) -> list[PageBlock]:
+    drifting = [
+        f"Z{j} {_format_slope(term, 'µm/h')}"
+        for j, term in enumerate(shape.drift_um_per_hour, 2)
+        if term.is_significant
+    ]
+    first = format_span(float(shape.time_s[0]))
+    points = [
+        f"{name} {format_number(float(change_um.std()))} µm"
+        for name, change_um in shape.points_um.items()
+    ]
+    facts = [
+        ("cycles", f"{shape.time_s.size} used of {shape.cycles}, {shape.rejected} rejected"),
+        ("changes are since", f"the first settled one, at {first} of the run"),
+        ("standard deviation", f"{format_number(shape.mean_sd_um)} µm, mean over the area"),
+        ("A, B, C", ", ".join(points)),
+        ("drifting terms", ", ".join(drifting) or "none"),
+        ("sag by camera − laser", _format_slope(shape.disagreement, "µm/h")),
+    ]
+    facts += [(f"{pair.lag_s:.0f} s apart", _describe_pair(pair)) for pair in shape.pairs]
+    blocks: list[PageBlock] = [PageFacts(facts), PageDrawing(figures.draw_stability(shape))]
+    if shape.pairs:
+        blocks.append(PageDrawing(figures.draw_pairs(shape)))
+    return blocks
+
+
+def _describe_pair(pair: shape_review.CyclePair) -> str:
+    return (
+        f"RMS change {format_number(pair.rms_um)} µm (pair shown), "
+        f"{format_number(pair.all_rms_um)} µm (all {pair.pairs}); "
+        f"uncertainty {format_number(pair.mean_sigma_um)} µm"
+    )
+
+
+def _list_comparison(
+    analysis: Analysis, other: Analysis, differences: Sequence[compare.Difference]
+) -> list[PageBlock]:
+    _, sentence = make_verdict(other)
+    if analysis.is_part and not other.is_part:
+        sentence = f"Part of this run against the whole other run. {sentence}"
+    rows = [
+        [
+            d.name,
+            format_number(d.ours),
+            format_number(d.theirs),
+            d.unit,
+            d.verdict_text,
+            format_number(d.p_value, 2),
+            d.note,
+        ]
+        for d in differences
+    ]
+    return [
+        PageText(sentence),
+        PageTable(["", "this run", "other run", "", "difference", "p", ""], rows),
+        PageDrawing(figures.draw_overview(other)),
+    ]
+
+
+def _list_timeline(analysis: Analysis) -> list[PageBlock]:
+    timeline = make_timeline(analysis)
+    rows = [
+        [
+            f"{analysis.run.utc(each.mono_s):%Y-%m-%d %H:%M:%S}",
+            each.event.kind,
+            each.event.sentence,
+        ]
+        for each in timeline[:_LINES_MOST]
+    ]
+    return [PageTable(["UTC", "what", ""], rows), *_list_rest(len(timeline))]
+
+
+def _format_slope(slope: drift.FittedSlope, unit: str) -> str:
+    if slope.per_hour != slope.per_hour:
+        return "too short to say"
+    text = f"{slope.per_hour:+.3g} {unit} (95 %: {slope.low:+.3g} to {slope.high:+.3g})"
+    return text if slope.is_significant else f"{text}, not significant"
+
+
+def _list_rest(count: int) -> list[PageBlock]:
+    """List how many lines a table leaves out."""
+    if count <= _LINES_MOST:
+        return []
+    return [PageText(f"{count - _LINES_MOST} more in the JSON report.")]
