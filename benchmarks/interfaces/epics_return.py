@@ -23,10 +23,10 @@ import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
-from tests.control_port.port_run import port_run
 from tests.studies.bridge_clients import Told, lines
 from tests.support.figures import Figure, at_most, show
-from tests.web.test_page import free_port, ticking
+from tests.worlds.free_port import free_port
+from tests.worlds.port_run import keep_ticking, port_run
 
 NAMES = [f"mirror:{name}" for name in ("error_um", "leak_um_per_s", "z4_um")]
 FRESH_S, READ_S, AWAY_S, WATCH_S = 2.0, 0.5, 3.0, 15.0
@@ -129,7 +129,7 @@ async def measure(restarts: int, repeater: bool, folder: Path) -> list[Figure]:
         if repeater:
             stack.enter_context(started(Path(sys.executable).parent / "caproto-repeater"))
         async with port_run(folder) as run:
-            task = asyncio.create_task(ticking(run))
+            task = asyncio.create_task(keep_ticking(run))
             for name, file in files.items():
                 words = (
                     "-m",

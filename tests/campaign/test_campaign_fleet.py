@@ -24,8 +24,8 @@ import pytest
 from tests.support.browser import Tab, browser_tab
 from tests.support.figures import Figure, at_most, show
 from tests.support.machine_needs import needs
-from tests.web.test_fleet import fleet_file
 from tests.web.test_page import served
+from tests.worlds.fleet_file import fleet_file
 from tests.worlds.slowed_holds import slowed_holds
 
 pytestmark = [pytest.mark.real_time, pytest.mark.campaign, needs("chromium")]

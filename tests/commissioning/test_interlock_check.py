@@ -27,7 +27,7 @@ from membrane_ctrl.config.schema import Config
 from membrane_ctrl.config.toml_file import parse_tables
 from membrane_ctrl.controller.cross_check import cross_check
 from membrane_ctrl.model.errors import DeviceError, FindingsError, InputError
-from tests.config.test_device_places import roles
+from tests.worlds.role_tables import roles
 
 MAP_3 = BenchIdentity("board", 3, "1.1.0", 0.5, 800.0, 1.0, interlocks_fitted=0xFFFF)
 MAP_2 = BenchIdentity("board", 2, "1.0.0", 0.5, 800.0, 1.0)

@@ -12,29 +12,9 @@ from membrane_ctrl.config.schema import Config
 from membrane_ctrl.config.toml_file import parse_tables
 from membrane_ctrl.instruments import bench
 from membrane_ctrl.model.errors import InputError
+from tests.worlds.role_tables import roles, value
 
 Table = dict[str, Any]
-
-
-def value(link: str, address: int, **more: Any) -> Table:
-    return {
-        "driver": "modbus_map",
-        "link": link,
-        "address": address,
-        "raw": [0, 1],
-        "value": [0.0, 1.0],
-        **more,
-    }
-
-
-def roles(**changes: Table) -> Table:
-    tables: Table = {
-        "displacement": value("tcp://plc", 0),
-        "pump": value("tcp://plc", 10),
-        "gauge_pressure": value("tcp://plc", 20),
-        **changes,
-    }
-    return {"devices": tables}
 
 
 def interlock(name: str, **keys: Any) -> Table:

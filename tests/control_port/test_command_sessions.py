@@ -19,7 +19,7 @@ from membrane_ctrl.control_port.client import PortClient
 from membrane_ctrl.control_port.commander import Commander, CommandSession
 from membrane_ctrl.control_port.ctl import status_lines
 from membrane_ctrl.model.errors import DeviceError
-from tests.control_port.port_run import PortRun, port_run
+from tests.worlds.port_run import PortRun, port_run
 
 
 def client_of(run: PortRun, notices: list[str] | None = None) -> PortClient:

@@ -6,7 +6,6 @@ from pathlib import Path
 from typing import Any, get_args
 
 import pytest
-from port_run import ROW
 
 from membrane_ctrl.cli import run
 from membrane_ctrl.cli.ctl import add_actions, ctl_app
@@ -20,6 +19,7 @@ from membrane_ctrl.model.event_lines import from_dict
 from membrane_ctrl.model.events import MaintenanceOver
 from membrane_ctrl.model.run_status import RunStatus
 from membrane_ctrl.model.telemetry import State
+from tests.worlds.port_run import ROW
 
 ARGUMENTS = {
     "setpoint": "-12.5",

@@ -22,7 +22,7 @@ from membrane_ctrl.model.errors import DeviceError
 from membrane_ctrl.service.feed import HoldFeed
 from membrane_ctrl.web.fleet_panel import fleet_rows
 from tests.control_port import evil_holds as evil
-from tests.control_port.port_run import port_run
+from tests.worlds.port_run import port_run
 
 BIDI = "\u202e"
 

@@ -11,13 +11,13 @@ from pathlib import Path
 
 import pytest
 from port_certificates import Authority
-from port_run import PortRun, client, port_run
 from test_port_tls import address_of, greet
 
 from membrane_ctrl.config.port import PortConfig, TlsConfig
 from membrane_ctrl.control_port.client import PortClient
 from membrane_ctrl.control_port.endpoint import Endpoint, LetIn, Turns
 from membrane_ctrl.control_port.sockets import client_context, listen_tcp
+from tests.worlds.port_run import PortRun, client, port_run
 
 
 @pytest.fixture(scope="module")

@@ -13,7 +13,6 @@ from pathlib import Path
 
 import pytest
 from port_certificates import Authority, tls_fleet
-from port_run import PATIENCE_S, PortRun, port_run
 
 from membrane_ctrl.cli import run as command
 from membrane_ctrl.config.port import PortConfig, TlsConfig
@@ -22,6 +21,7 @@ from membrane_ctrl.control_port.ctl import fleet
 from membrane_ctrl.model.errors import Exit
 from membrane_ctrl.service.feed import HoldFeed
 from tests.support.machine_needs import needs
+from tests.worlds.port_run import PATIENCE_S, PortRun, port_run
 
 pytestmark = needs("openssl")
 

@@ -13,7 +13,6 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from port_run import LineClient, PortRun, client, port_run
 
 from membrane_ctrl.control_port import server
 from membrane_ctrl.control_port.ctl import fleet_line, status_lines
@@ -23,6 +22,7 @@ from membrane_ctrl.controller.commands import Command
 from membrane_ctrl.model.events import LockRemoved, LockSet
 from membrane_ctrl.model.run_events import LockNotStored, LockStored
 from membrane_ctrl.model.run_status import RunStatus
+from tests.worlds.port_run import LineClient, PortRun, client, port_run
 
 HOLD = Peer("unix:membrane", "tune", 1, is_own_user=True)
 ANN = Peer("unix:ann", "operate", 2)
@@ -201,7 +201,7 @@ def test_every_display_of_the_state_shows_all_locks() -> None:
             LockSet(word, "hands inside", author, author, "s", "2026-01-02T03:04:05+00:00", 1)
         )
     status = status.after_event(LockNotStored("gumil", "no space left"))
-    from port_run import ROW
+    from tests.worlds.port_run import ROW
 
     table = {"run": "r", **status_table(status.after_row(ROW))}
     first, second = lock_lines(table)

@@ -7,13 +7,12 @@ from dataclasses import replace
 from math import nan
 from pathlib import Path
 
-from port_run import ROW, port_run
-
 from membrane_ctrl.config.port import PortConfig
 from membrane_ctrl.control_port.server import metrics_text
 from membrane_ctrl.model.recorder_events import DiskLow
 from membrane_ctrl.model.run_status import RunStatus
 from membrane_ctrl.model.telemetry import FIELDS
+from tests.worlds.port_run import ROW, port_run
 
 SAMPLE = re.compile(r'[a-z_][a-z0-9_]*(\{state="[a-z]+"\})? (NaN|-?[0-9.e+-]+)')
 

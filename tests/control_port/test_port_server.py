@@ -14,7 +14,6 @@ from pathlib import Path
 import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
-from port_run import ROW, PortRun, client, port_run
 
 from membrane_ctrl.control_port.client import PortClient
 from membrane_ctrl.control_port.protocol import MESSAGE_BYTES, Peer
@@ -22,6 +21,7 @@ from membrane_ctrl.controller.commands import Command
 from membrane_ctrl.model.errors import DeviceError
 from membrane_ctrl.model.event_lines import from_dict
 from membrane_ctrl.model.telemetry import State
+from tests.worlds.port_run import ROW, PortRun, client, port_run
 
 ANN, BOB, EVE = Peer("unix:ann", "operate"), Peer("unix:bob", "operate"), Peer("unix:eve", "read")
 TOM = Peer("unix:tom", "tune")

@@ -10,7 +10,6 @@ from pathlib import Path
 
 import pytest
 from port_certificates import Authority
-from port_run import PortRun, port_run
 
 from membrane_ctrl.config.port import PortConfig, TlsConfig
 from membrane_ctrl.control_port.client import PortClient
@@ -18,6 +17,7 @@ from membrane_ctrl.control_port.protocol import Peer
 from membrane_ctrl.control_port.sockets import TlsListener, client_context
 from membrane_ctrl.model.errors import DeviceError, InputError
 from tests.support.machine_needs import needs
+from tests.worlds.port_run import PortRun, port_run
 
 pytestmark = needs("openssl")
 

@@ -4,12 +4,11 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from port_run import port_run
-
 from membrane_ctrl.model.acquisition_events import GeometryInForce
 from membrane_ctrl.model.events import Maintenance, MaintenanceOver, StateEntered, Why
 from membrane_ctrl.model.reason import WhyCode
 from membrane_ctrl.model.recorder_events import DiskLow, RecorderError, RecorderRecovered
+from tests.worlds.port_run import port_run
 
 
 async def test_a_report_of_a_child_stands_in_the_status(tmp_path: Path) -> None:

@@ -10,24 +10,11 @@ import pytest
 from firmware_iface.roles import FOREIGN_CLAIM, FOREIGN_PERIOD
 from membrane_ctrl.config.schema import LimitsConfig
 from membrane_ctrl.controller.link_report import LinkReport
-from membrane_ctrl.controller.safety import TABLE, Observation, Rule, SafetyTable
+from membrane_ctrl.controller.safety import TABLE, Rule, SafetyTable
 from membrane_ctrl.model.telemetry import SafeLevel, State
+from tests.worlds.quiet_observation import GOOD
 
 LIMITS = LimitsConfig()
-GOOD = Observation(
-    link_up=True,
-    reading_age_s=0.0,
-    advance_age_s=0.0,
-    displacement_um=0.0,
-    displacement_valid=True,
-    jumps=0,
-    error_um=0.0,
-    gauge_pressure_pa=600.0,
-    pump_mismatch=0.0,
-    watchdog_tripped=False,
-    board_faults=0,
-    lateness_ms=1.0,
-)
 BAD = {
     "over_pressure": replace(GOOD, gauge_pressure_pa=LIMITS.gauge_pressure_max_pa + 0.1),
     "over_displacement": replace(GOOD, displacement_um=LIMITS.displacement_max_um + 0.1),

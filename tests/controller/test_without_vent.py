@@ -18,7 +18,7 @@ from membrane_ctrl.model.events import Why
 from membrane_ctrl.model.telemetry import SafeLevel, State
 from membrane_ctrl.sim.plant import Plant
 from membrane_ctrl.sim.virtual_bench import VirtualBench
-from tests.config.test_device_places import roles, value
+from tests.worlds.role_tables import roles, value
 
 
 def config(vent: bool, **more: Any) -> Config:

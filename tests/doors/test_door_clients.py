@@ -17,10 +17,10 @@ from typing import Any
 import pytest
 
 from membrane_ctrl.doors.names import TABLE
-from tests.control_port.port_run import PortRun, port_run
 from tests.studies.bridge_clients import lines
 from tests.support.machine_needs import needs, program_path
-from tests.web.test_page import free_port, ticking
+from tests.worlds.free_port import free_port
+from tests.worlds.port_run import PortRun, keep_ticking, port_run
 
 PATIENCE_S = 180.0
 NO_NUMBER = "is not a plain decimal number such as -1.5 or 2e-3"
@@ -78,7 +78,7 @@ async def broker(port: int) -> AsyncIterator[None]:
 @asynccontextmanager
 async def held(folder: Path) -> AsyncIterator[PortRun]:
     async with port_run(folder) as run:
-        task = asyncio.create_task(ticking(run))
+        task = asyncio.create_task(keep_ticking(run))
         try:
             yield run
         finally:

@@ -26,7 +26,7 @@ from membrane_ctrl.model.shape_estimate import ShapeEstimate
 from membrane_ctrl.model.telemetry import FIELDS
 from membrane_ctrl.model.zernike_terms import ZERNIKE_TERMS
 from membrane_ctrl.service.feed import HoldFeed, HoldSeen
-from tests.control_port.port_run import port_run
+from tests.worlds.port_run import port_run
 
 PAGE = Path(__file__).parents[2] / "docs" / "how-to" / "bridges.md"
 STRANGE_NUMBERS = (

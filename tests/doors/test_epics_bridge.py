@@ -16,10 +16,10 @@ from membrane_ctrl.doors import epics
 from membrane_ctrl.doors.epics_search import find_server, require_unserved
 from membrane_ctrl.instruments import device_claim
 from membrane_ctrl.model.errors import DeviceError
-from tests.control_port.port_run import port_run
 from tests.doors.test_door_clients import SERVERS, doors, held, program
 from tests.doors.test_doors import door_with, seen_hold
-from tests.web.test_page import free_port
+from tests.worlds.free_port import free_port
+from tests.worlds.port_run import port_run
 
 
 async def test_a_second_bridge_of_the_same_records_on_this_machine_is_refused() -> None:

@@ -17,8 +17,8 @@ from membrane_ctrl.control_port.outcome import Outcome
 from membrane_ctrl.doors import command_lanes
 from membrane_ctrl.doors.hold_link import SendLimits, send_command
 from membrane_ctrl.model.telemetry import State
-from tests.control_port.port_run import port_run
 from tests.doors.test_doors import door_with, seen_hold
+from tests.worlds.port_run import port_run
 
 
 def limits(seconds: float, refusal: str = "") -> SendLimits:

@@ -28,12 +28,12 @@ from membrane_ctrl.doors.mqtt_owner import OwnerClaim
 from membrane_ctrl.doors.names import Door
 from membrane_ctrl.model.errors import DeviceError
 from membrane_ctrl.model.telemetry import State
-from tests.control_port.port_run import PortRun, port_run
 from tests.doors.test_door_clients import broker, program
 from tests.doors.test_doors import STRANGE_NUMBERS, door_with, seen_hold
 from tests.support.machine_needs import needs, program_path
 from tests.support.peak_memory import peak_mb, reset_peak
-from tests.web.test_page import free_port
+from tests.worlds.free_port import free_port
+from tests.worlds.port_run import PortRun, port_run
 
 pytestmark = [pytest.mark.real_time, needs("mosquitto")]
 BASE = "membrane/mirror"

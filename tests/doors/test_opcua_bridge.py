@@ -24,9 +24,9 @@ from membrane_ctrl.control_port.safety_commands import SAFETY
 from membrane_ctrl.doors import opcua
 from membrane_ctrl.model.errors import DeviceError, InputError
 from membrane_ctrl.service.access import known_user
-from tests.control_port.port_run import PortRun, port_run
 from tests.doors.test_doors import door_with, seen_hold
-from tests.web.test_page import free_port
+from tests.worlds.free_port import free_port
+from tests.worlds.port_run import PortRun, port_run
 
 ANSWER_S = 1.0
 PASSWORDS = {"anna": "the right one", "reto": "only to read"}

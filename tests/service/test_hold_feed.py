@@ -19,7 +19,7 @@ from membrane_ctrl.controller.commands import TABLE
 from membrane_ctrl.model.run_events import Mark
 from membrane_ctrl.service.access import ACTIONS, STOP, UNLOCK, WebUser, may, on_behalf, request
 from membrane_ctrl.service.feed import HoldFeed
-from tests.control_port.port_run import ROW, port_run
+from tests.worlds.port_run import ROW, port_run
 
 _LOOK_S = 0.02
 

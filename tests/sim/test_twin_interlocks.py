@@ -17,7 +17,7 @@ from membrane_ctrl.model.errors import InputError
 from membrane_ctrl.sim import twin_process
 from membrane_ctrl.sim.lab import Lab
 from membrane_ctrl.sim.virtual_interlocks import VirtualInterlocks
-from tests.config.test_device_places import roles
+from tests.worlds.role_tables import roles
 
 SOURCES: list[dict[str, Any]] = [
     {"driver": "board_input", "name": "door", "text": "x", "safe_level": "vent", "input": 9},

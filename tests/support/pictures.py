@@ -27,8 +27,8 @@ from membrane_ctrl.model.arrays import AnyArray
 from tests.support.browser import browser_tab
 from tests.support.recording_picture import screenshot
 from tests.support.review_runs import written
-from tests.web.test_fleet import fleet_file
 from tests.web.test_page import PRESS, served
+from tests.worlds.fleet_file import fleet_file
 from tests.worlds.nights import DOOR, GLITCH, JUMP, LEAK, Planted
 from tests.worlds.slowed_holds import slowed_holds
 from tests.worlds.virtual_record import kept_ticks, write_record

@@ -17,20 +17,11 @@ from membrane_ctrl.model.errors import Exit, InputError
 from membrane_ctrl.model.telemetry import State
 from membrane_ctrl.service.feed import HoldFeed
 from membrane_ctrl.web.fleet_panel import fleet_rows
-from tests.control_port.port_run import port_run
 from tests.support.browser import browser_tab
 from tests.support.machine_needs import needs
-from tests.web.test_page import served, ticking
-
-
-def fleet_file(folder: Path, *names: str) -> Path:
-    file = folder / "fleet.toml"
-    file.write_text(
-        "".join(f'[[holds]]\nname = "{name}"\nsocket = "{name}/control.sock"\n' for name in names)
-    )
-    for name in names:
-        (folder / name).mkdir(exist_ok=True)
-    return file
+from tests.web.test_page import served
+from tests.worlds.fleet_file import fleet_file
+from tests.worlds.port_run import keep_ticking, port_run
 
 
 async def test_the_terminal_lists_all_holds(
@@ -134,7 +125,7 @@ async def test_twenty_holds_on_one_page(tmp_path: Path) -> None:
     async with AsyncExitStack() as stack, AsyncExitStack() as last:
         runs = [await stack.enter_async_context(port_run(tmp_path / name)) for name in names[:-1]]
         runs.append(await last.enter_async_context(port_run(tmp_path / names[-1])))
-        tasks = [asyncio.create_task(ticking(run)) for run in runs]
+        tasks = [asyncio.create_task(keep_ticking(run)) for run in runs]
         try:
             link = await stack.enter_async_context(served(tmp_path, "--fleet", str(file)))
             tab = await stack.enter_async_context(browser_tab(link, tmp_path / "profile"))

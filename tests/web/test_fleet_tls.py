@@ -21,10 +21,11 @@ from membrane_ctrl.config.service import ServiceConfig
 from membrane_ctrl.model.errors import DeviceError, InputError
 from membrane_ctrl.web import cli, server
 from tests.control_port.port_certificates import Authority, tls_fleet
-from tests.control_port.port_run import port_run
 from tests.support.browser import Tab, browser_tab
 from tests.support.machine_needs import needs
-from tests.web.test_page import free_port, served, ticking
+from tests.web.test_page import served
+from tests.worlds.free_port import free_port
+from tests.worlds.port_run import keep_ticking, port_run
 
 PASSWORD = "membrane!"
 ROWS = "[...document.querySelectorAll('tbody tr')].map(r => r.innerText)"
@@ -98,7 +99,7 @@ async def test_names_and_certificates_decide(tmp_path: Path, lab: Path) -> None:
         for name in ("one", "two"):  # a hold admits few unknown connections of one address at once
             (tmp_path / name).mkdir()
             runs.append(await stack.enter_async_context(port_run(tmp_path / name, config)))
-        tasks = [asyncio.create_task(ticking(run)) for run in runs]
+        tasks = [asyncio.create_task(keep_ticking(run)) for run in runs]
         stack.callback(lambda: [task.cancel() for task in tasks])
         file = fleet_file(lab, *(run.listeners.addresses["tls"] for run in runs))
         options = ("--fleet", str(file), "--users", str(lab / "users"))

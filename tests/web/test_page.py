@@ -6,7 +6,6 @@ from __future__ import annotations
 
 import asyncio
 import os
-import socket
 import sys
 from collections.abc import AsyncIterator
 from contextlib import asynccontextmanager
@@ -27,17 +26,13 @@ from membrane_ctrl.sessions.folder import create_session
 from membrane_ctrl.sessions.live_hold import Progress
 from membrane_ctrl.sessions.live_log import LiveLog
 from membrane_ctrl.web import cli, runs_panel, server
-from tests.control_port.port_run import PortRun, port_run
 from tests.support.browser import Tab, browser_tab
 from tests.support.machine_needs import needs
+from tests.worlds.free_port import free_port
+from tests.worlds.port_run import PortRun, keep_ticking, port_run
 
 _START_S = 180.0
 HOSTILE = "<img src=x onerror=\"document.title='owned'\">"
-
-
-def free_port() -> int:
-    with socket.create_server(("127.0.0.1", 0)) as listener:
-        return int(listener.getsockname()[1])
 
 
 @asynccontextmanager
@@ -69,18 +64,11 @@ async def served(folder: Path, *options: str) -> AsyncIterator[str]:
         await process.wait()
 
 
-async def ticking(run: PortRun) -> None:
-    """A row every fifth of a second, as a hold would send."""
-    while True:
-        run.tick()
-        await asyncio.sleep(0.2)
-
-
 @asynccontextmanager
 async def viewed(tmp_path: Path, *options: str) -> AsyncIterator[tuple[PortRun, Tab]]:
     """A hold, the page of it, and a browser that has opened its link."""
     async with port_run(tmp_path) as run, served(tmp_path, *options) as link:
-        task = asyncio.create_task(ticking(run))
+        task = asyncio.create_task(keep_ticking(run))
         try:
             await asyncio.sleep(1.0)
             async with browser_tab(link, tmp_path / "profile") as tab:

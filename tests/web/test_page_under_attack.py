@@ -10,9 +10,9 @@ from pathlib import Path
 import pytest
 
 from membrane_ctrl.service.access import known_user
-from tests.control_port.port_run import PortRun, port_run
 from tests.support.service_attacks import ATTACKS, ROUTES, Viewer, attack
-from tests.web.test_page import served, ticking
+from tests.web.test_page import served
+from tests.worlds.port_run import PortRun, keep_ticking, port_run
 
 PASSWORD = "correct horse"
 STOP_S = 1.0
@@ -29,7 +29,7 @@ async def serving(folder: Path, *options: str) -> AsyncIterator[tuple[PortRun, s
     ]
     users.write_text("\n".join(lines))
     async with port_run(folder) as run, served(folder, "--users", str(users), *options) as url:
-        ticks = asyncio.create_task(ticking(run))
+        ticks = asyncio.create_task(keep_ticking(run))
         try:
             await asyncio.sleep(1.0)
             yield run, url

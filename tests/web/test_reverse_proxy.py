@@ -13,13 +13,14 @@ from pathlib import Path
 
 import pytest
 
-from tests.control_port.port_run import PortRun, port_run
 from tests.support.browser import browser_tab
 from tests.support.machine_needs import needs
 from tests.support.reverse_proxy import reverse_proxy
 from tests.support.service_attacks import ROUTES, Viewer, attack, request_bytes, status_of
-from tests.web.test_page import STOP, free_port, served, ticking
+from tests.web.test_page import STOP, served
 from tests.web.test_page_under_attack import PASSWORD, serving
+from tests.worlds.free_port import free_port
+from tests.worlds.port_run import PortRun, keep_ticking, port_run
 
 pytestmark = [pytest.mark.real_time, needs("nginx")]
 OWN_HOST = "proxy_set_header Host $http_host;"
@@ -167,7 +168,7 @@ async def test_a_browser_operates_the_hold_under_a_path(tmp_path: Path) -> None:
         reverse_proxy(tmp_path / "nginx", outside, "/mirror/", f"http://127.0.0.1:{inside}/"),
     ):
         assert link.startswith(f"{public}?key=")
-        ticks = asyncio.create_task(ticking(run))
+        ticks = asyncio.create_task(keep_ticking(run))
         try:
             await asyncio.sleep(1.0)
             async with browser_tab(link, tmp_path / "profile") as tab:

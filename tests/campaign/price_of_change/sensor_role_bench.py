@@ -23,7 +23,7 @@ from membrane_ctrl.config.toml_file import dump_toml, load_toml
 from membrane_ctrl.controller.safety import SafetyTable
 from membrane_ctrl.model.telemetry import State
 from membrane_ctrl.sim.lab import Lab
-from tests.controller.test_safety import GOOD
+from tests.worlds.quiet_observation import GOOD
 
 TICKS = 10
 

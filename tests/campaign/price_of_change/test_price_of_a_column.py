@@ -47,7 +47,7 @@ faults = []
 PAGE = f'''
 import pytest
 from tests.web import test_page
-from tests.control_port import port_run
+from tests.worlds import port_run
 from dataclasses import replace
 
 @pytest.mark.real_time

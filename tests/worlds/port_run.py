@@ -162,3 +162,10 @@ async def client(run: PortRun, peer: Peer | None = None) -> AsyncIterator[LineCl
         writer.close()
         with suppress(ConnectionError):
             await writer.wait_closed()
+
+
+async def keep_ticking(run: PortRun) -> None:
+    """A row every fifth of a second, as a hold would send."""
+    while True:
+        run.tick()
+        await asyncio.sleep(0.2)
