@@ -2,11 +2,12 @@
 
 import json
 import tomllib
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
 import typer
-from pydantic import TypeAdapter
+from pydantic import BaseModel, TypeAdapter
 
 from firmware_iface import roles, settings
 from membrane_ctrl.commissioning.devices import FoundDevice, find_cameras, find_displays, find_ports
@@ -83,6 +84,8 @@ def _ask_devices(found: list[FoundDevice]) -> TomlTable:
     section |= (camera := _ask_role("camera", optional=True))
     if camera and not _shows_patterns(camera["camera"]):
         section |= _ask_role("screen", optional=False)
+    if interlocks := _ask_interlocks(with_board=bool(board)):
+        section["interlocks"] = interlocks
     tables: TomlTable = {"devices": section}
     if not board:
         sensors = {"feedforward_barometer": "barometer", "feedforward_temperature": "thermometer"}
@@ -101,13 +104,36 @@ def _shows_patterns(camera: TomlTable) -> bool:
     return section.shows_patterns
 
 
+def _ask_interlocks(with_board: bool) -> list[TomlTable]:
+    """Ask for one interlock after the other; only a pump board has inputs of its own."""
+    known = _sections_by_driver("interlocks")
+    if not with_board:
+        del known["board_input"]
+    asked: list[TomlTable] = []
+    while table := _ask_table(
+        f"interlock {len(asked) + 1} (emergency stop, door, oxygen monitor)", known, optional=True
+    ):
+        asked.append(table)
+    return asked
+
+
 def _ask_role(role: str, optional: bool) -> TomlTable:
-    """Ask for the driver of a role and for the keys that it requires; empty without a driver."""
-    sections = toml_file.list_sections(DevicesConfig.model_fields[role].annotation)
-    known = {
+    """Ask for the device of a role; empty without one."""
+    table = _ask_table(role, _sections_by_driver(role), optional)
+    return {role: table} if table else {}
+
+
+def _sections_by_driver(field: str) -> dict[str, type[BaseModel]]:
+    """The sections of the configuration that a field of `[devices]` may hold."""
+    sections = toml_file.list_sections(DevicesConfig.model_fields[field].annotation)
+    return {
         driver: section for section in sections for driver in toml_file.list_driver_names(section)
     }
-    question = f"{role}: driver, {' or '.join(known)}" + (" (empty: none)" if optional else "")
+
+
+def _ask_table(name: str, known: Mapping[str, type[BaseModel]], optional: bool) -> TomlTable:
+    """Ask for a driver and for the keys that it requires; empty without a driver."""
+    question = f"{name}: driver, {' or '.join(known)}" + (" (empty: none)" if optional else "")
     while True:
         driver = _ask_question(question)
         if not driver and optional:
@@ -118,18 +144,18 @@ def _ask_role(role: str, optional: bool) -> TomlTable:
             )
             continue
         table: TomlTable = {"driver": driver}
-        for name, field in known[driver].model_fields.items():
-            if name == "raw" or (
-                field.is_required() and name != "driver"
+        for key, field in known[driver].model_fields.items():
+            if key == "raw" or (
+                field.is_required() and key != "driver"
             ):  # only a preset replaces `raw`
-                answer = _ask_question(f"  {name} ({_key_meaning(f'{driver}.{name}').rstrip('.')})")
-                table[name] = answer if field.annotation is str else _parse_answer(answer)
+                answer = _ask_question(f"  {key} ({_key_meaning(f'{driver}.{key}').rstrip('.')})")
+                table[key] = answer if field.annotation is str else _parse_answer(answer)
         try:
-            toml_file.parse_tables(table, known[driver], role)
+            toml_file.parse_tables(table, known[driver], name)
         except errors.InputError as error:
             typer.echo(f"{error}; once more", err=True)
             continue
-        return {role: table}
+        return table
 
 
 def _ask_question(question: str) -> str:
@@ -154,14 +180,31 @@ def _key_meaning(key: str) -> str:
 
 def _format_tables(prefix: str, tables: TomlTable) -> list[str]:
     """Return the lines of tables: each key with its meaning."""
-    lines = []
+    lines: list[str] = []
     for name, value in tables.items():
+        path = f"{prefix}{name}"
         if isinstance(value, dict):
-            plain = {key: inner for key, inner in value.items() if not isinstance(inner, dict)}
-            lines += [*([f"[{prefix}{name}]"] if plain else [])]
-            driver = plain.get("driver", f"{prefix}{name}")
-            for key, inner in plain.items():
-                meaning = "" if key == "driver" else f"  # {_key_meaning(f'{driver}.{key}')}"
-                lines.append(f"{key} = {json.dumps(inner, ensure_ascii=False)}{meaning}")
-            lines += [*([""] if plain else []), *_format_tables(f"{prefix}{name}.", value)]
+            plain = {key: inner for key, inner in value.items() if not _holds_tables(inner)}
+            if plain:
+                lines += [f"[{path}]", *_format_keys(path, plain), ""]
+            lines += _format_tables(f"{path}.", value)
+        elif _holds_tables(value):
+            for entry in value:
+                lines += [f"[[{path}]]", *_format_keys(path, entry), ""]
+    return lines
+
+
+def _holds_tables(value: Any) -> bool:
+    """Whether a value is a table, or a list of tables."""
+    is_list_of_tables = isinstance(value, list) and any(isinstance(each, dict) for each in value)
+    return isinstance(value, dict) or is_list_of_tables
+
+
+def _format_keys(path: str, table: TomlTable) -> list[str]:
+    """Return a line for each key of a table, with its meaning."""
+    driver = table.get("driver", path)
+    lines = []
+    for key, value in table.items():
+        meaning = "" if key == "driver" else f"  # {_key_meaning(f'{driver}.{key}')}"
+        lines.append(f"{key} = {json.dumps(value, ensure_ascii=False)}{meaning}")
     return lines

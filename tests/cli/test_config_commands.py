@@ -84,7 +84,7 @@ def test_a_folder_that_is_not_there_is_named(
 
 def test_a_board_is_asked_for(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     path = tmp_path / "lab.toml"
-    assert answered(monkeypatch, path, "tcp://10.0.0.9:502", "") == 0
+    assert answered(monkeypatch, path, "tcp://10.0.0.9:502", "", "") == 0
     config = load_toml(path, Config)
     assert config.devices is not None
     assert config.devices.board == "tcp://10.0.0.9:502"
@@ -109,7 +109,8 @@ def test_single_instruments_are_asked_for_and_what_they_lack_is_switched_off(
     screen = ["pygame", "1920", "1080", "0.4961"]
     vent = ["modbus_map", "tcp://10.0.0.1:502", "0", "[0, 20000]", "[0.0, 1.0]"]
     assert (
-        answered(monkeypatch, path, "", *laser, *pump, *gauge, *vent, "", "", "uvc", *screen) == 0
+        answered(monkeypatch, path, "", *laser, *pump, *gauge, *vent, "", "", "uvc", *screen, "")
+        == 0
     )
     config = load_toml(path, Config)
     assert config.devices is not None
@@ -128,6 +129,41 @@ def test_single_instruments_are_asked_for_and_what_they_lack_is_switched_off(
     assert "# Modbus address of the device." in path.read_text()
 
 
+def test_interlocks_are_asked_for_one_after_the_other(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    path = tmp_path / "lab.toml"
+    stop = ["board_input", "stop", "the emergency stop is pressed", "0"]
+    door = ["modbus_input", "Door", "x", "tcp://10.0.0.7", "3"]  # a capital letter first
+    door += ["modbus_input", "door", "the door is open", "tcp://10.0.0.7", "3"]
+    assert answered(monkeypatch, path, "tcp://10.0.0.9:502", "", *stop, *door, "") == 0
+    config = load_toml(path, Config)
+    assert config.devices is not None
+    assert [(each.driver, each.name, each.text) for each in config.devices.interlocks] == [
+        ("board_input", "stop", "the emergency stop is pressed"),
+        ("modbus_input", "door", "the door is open"),
+    ]
+    printed = capsys.readouterr().err
+    assert "interlock 1 (emergency stop, door, oxygen monitor): driver, board_input or" in printed
+    assert "once more" in printed
+    assert path.read_text().count("[[devices.interlocks]]") == 2
+
+
+def test_an_input_of_the_board_is_no_interlock_of_single_instruments(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    path = tmp_path / "lab.toml"
+    laser, pump = ["optoncdt1420", "/dev/x"], ["ventus", "/dev/y"]
+    gauge = ["mks_937b", "/dev/z"]
+    line = ["board_input", "gpio_line", "stop", "the emergency stop is pressed", "17"]
+    answers = ["", *laser, *pump, *gauge, "", "", "", "", *line, ""]
+    assert answered(monkeypatch, path, *answers) == 0
+    assert "'board_input' is no driver" in capsys.readouterr().err
+    config = load_toml(path, Config)
+    assert config.devices is not None
+    assert [each.driver for each in config.devices.interlocks] == ["gpio_line"]
+
+
 def test_answers_that_contradict_each_other_write_nothing(
     monkeypatch: pytest.MonkeyPatch, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -140,6 +176,7 @@ def test_answers_that_contradict_each_other_write_nothing(
         "/dev/x",
         "bronkhorst_propar",
         "/dev/y",
+        "",
         "",
         "",
         "",
@@ -157,7 +194,7 @@ def test_a_pump_and_a_gauge_on_one_register_write_nothing(
     laser = ["optoncdt1420", "/dev/x"]
     pump = ["modbus_map", "tcp://10.0.0.1", "7", "[0, 20000]", "[0.0, 1.0]"]
     gauge = ["modbus_map", "tcp://10.0.0.1:502", "7", "[0, 20000]", "[0.0, 1000.0]"]
-    assert answered(monkeypatch, path, "", *laser, *pump, *gauge, "", "", "", "") == 2
+    assert answered(monkeypatch, path, "", *laser, *pump, *gauge, "", "", "", "", "") == 2
     told = capsys.readouterr().err
     assert (
         "devices.pump.address and devices.gauge_pressure.address name the same holding register 7"
@@ -181,6 +218,7 @@ def test_two_names_of_one_serial_port_write_nothing(
         str(other),
         "mks_937b",
         "/dev/y",
+        "",
         "",
         "",
         "",
