@@ -20,7 +20,7 @@ pytestmark = [pytest.mark.campaign, pytest.mark.timeout(1800)]
 
 COLUMN, ENTITY, LABEL = "gas_warmth_c", "/gas/warmth", "warmth of the gas"
 ROW = f"""\
-{COLUMN}: float = column(
+{COLUMN}: float = declare_column(
     "{LABEL}",
     "gas less air temperature",
     Plot("Warmth", Group.ENVIRONMENT),
@@ -61,14 +61,19 @@ async def test_the_page_has_the_column(tmp_path, monkeypatch):
 '''
 
 
+def apply_change(source: ChangedSource) -> None:
+    """Make the change in a copy of the source."""
+    source.add_field("ColumnValues", ROW, before="error_um")
+    source.add_argument("TelemetryRow", "trim_um", COMPUTED)
+    assert source.count_places() == 2
+
+
 @pytest.fixture(scope="module")
 def source(tmp_path_factory: pytest.TempPathFactory) -> ChangedSource:
     """The product with one more column: two places differ."""
     source = ChangedSource.copy_to(tmp_path_factory.mktemp("column"))
     source.copy_more("tests", "docs", "benchmarks")
-    source.add_field("ColumnValues", ROW, before="error_um")
-    source.add_argument("TelemetryRow", "trim_um", COMPUTED)
-    assert source.count_places() == 2
+    apply_change(source)
     return source
 
 

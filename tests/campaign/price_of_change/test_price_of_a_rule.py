@@ -41,14 +41,19 @@ Rule(
 BENCH = Path(__file__).with_name("rule_bench.py")
 
 
+def apply_change(source: ChangedSource) -> None:
+    """Make the change in a copy of the source."""
+    source.add_field("Observation", FIELD)
+    source.add_row("Rule", ROW)
+    assert source.count_places() == 2
+
+
 @pytest.fixture(scope="module")
 def source(tmp_path_factory: pytest.TempPathFactory) -> ChangedSource:
     """The product with one more rule: two places differ."""
     source = ChangedSource.copy_to(tmp_path_factory.mktemp("rule"))
     source.copy_more("tests", "docs", "benchmarks")
-    source.add_field("Observation", FIELD)
-    source.add_row("Rule", ROW)
-    assert source.count_places() == 2
+    apply_change(source)
     return source
 
 

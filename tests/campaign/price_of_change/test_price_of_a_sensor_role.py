@@ -21,11 +21,11 @@ pytestmark = [pytest.mark.campaign, pytest.mark.real_time, pytest.mark.timeout(1
 ROLE, FIELD, LABEL = "second_gauge", "second_gauge_pressure_pa", "second gauge pressure"
 IN_ROLES = f"""\
 {FIELD}: float = field(
-    default=math.nan, metadata=_sensor("{ROLE}", "gauge_pressure_pa", "Pa")
+    default=math.nan, metadata=_declare_sensor("{ROLE}", "gauge_pressure_pa", "Pa")
 )
 """
 IN_COLUMNS = f"""\
-{FIELD}: float = column(
+{FIELD}: float = declare_column(
     "{LABEL}",
     "reading of the second gauge",
     GAUGE,
@@ -53,15 +53,20 @@ timeout_s = 0.9
 """
 
 
+def apply_change(source: ChangedSource) -> None:
+    """Make the change in a copy of the source."""
+    source.add_field("BenchReading", IN_ROLES)
+    source.add_field("ColumnValues", IN_COLUMNS, before="ambient_pressure_pa")
+    source.add_row("Rule", IN_SAFETY)
+    assert source.count_places() == 3
+
+
 @pytest.fixture(scope="module")
 def source(tmp_path_factory: pytest.TempPathFactory) -> ChangedSource:
     """The product with a second gauge: three places differ."""
     source = ChangedSource.copy_to(tmp_path_factory.mktemp("gauge"))
     source.copy_more("tests", "docs", "benchmarks")
-    source.add_field("BenchReading", IN_ROLES)
-    source.add_field("ColumnValues", IN_COLUMNS, before="ambient_pressure_pa")
-    source.add_row("Rule", IN_SAFETY)
-    assert source.count_places() == 3
+    apply_change(source)
     return source
 
 
